@@ -95,9 +95,9 @@ def agrees(accuracy: Mapping[str, Any]) -> bool:
         return False
     if same["boxes"] is not None and same["boxes"]["f1"] < LEAST_BOX_F1:
         return False
-    found, right = accuracy["truth"] or {}, accuracy["reference_truth"] or {}
+    figures, right = accuracy["truth"] or {}, accuracy["reference_truth"] or {}
     return all(
-        found[key] is not None and found[key] >= right[key] - MOST_LOST for key in right if right[key] is not None
+        figures[key] is not None and figures[key] >= right[key] - MOST_LOST for key in right if right[key] is not None
     )
 
 

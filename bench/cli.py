@@ -39,7 +39,7 @@ def _run(typed: list[str]) -> int:
 
 def with_command(typed: Sequence[str]) -> list[str]:
     """The arguments, with the default command in front if none was typed."""
-    if typed and typed[0] in (*COMMANDS, "-h", "--help", "--version"):
+    if typed and (typed[0] in ("-h", "--help", "--version") or not typed[0].startswith("-")):
         return list(typed)
     several = any(option.startswith(("--providers", "--precisions")) for option in typed)
     return ["matrix" if several else "run", *typed]

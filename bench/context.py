@@ -16,7 +16,7 @@ from typing import Any
 
 from edgeperc import __version__
 from edgeperc.system.extras import require
-from edgeperc.system.machine import cpu_model
+from edgeperc.system.machine import board, cpu_model, cpu_quota, has_hypervisor, read_text
 
 PACKAGES = (
     *("numpy", "numba", "onnxruntime", "onnxruntime-gpu", "onnxruntime-ep-openvino", "onnxruntime-ep-nv-tensorrt-rtx"),
@@ -37,15 +37,8 @@ def _psutil() -> Any:
     return require("psutil", "bench", "Measuring")
 
 
-def _read(path: Path) -> str | None:
-    try:
-        return path.read_text(errors="replace").strip()
-    except OSError:
-        return None
-
-
 def _number(path: Path) -> int | None:
-    text = _read(path)
+    text = read_text(path)
     return int(text) if text is not None and text.lstrip("-").isdigit() else None
 
 
@@ -53,14 +46,13 @@ def machine() -> dict[str, Any]:
     """The hardware and how it is set up."""
     psutil = _psutil()
     affinity = psutil.Process().cpu_affinity() if hasattr(psutil.Process, "cpu_affinity") else None
-    governors = {text for path in CPU.glob("cpu[0-9]*/cpufreq/scaling_governor") if (text := _read(path))}
+    governors = {text for path in CPU.glob("cpu[0-9]*/cpufreq/scaling_governor") if (text := read_text(path))}
     no_turbo, boost = _number(CPU / "intel_pstate/no_turbo"), _number(CPU / "cpufreq/boost")
-    quota = _read(Path("/sys/fs/cgroup/cpu.max"))
-    board = _read(Path("/sys/firmware/devicetree/base/model"))
+    quota, model = cpu_quota(), board()
     frequency = psutil.cpu_freq()
     return {
         "cpu": cpu_model(),
-        "board": board.rstrip("\0") if board else None,
+        "board": model.rstrip("\0") if model else None,
         "architecture": platform.machine(),
         "cores": psutil.cpu_count(logical=False),
         "logical_cores": psutil.cpu_count(),
@@ -71,15 +63,9 @@ def machine() -> dict[str, Any]:
         "cpu_quota": None if quota is None or quota.startswith("max") else quota,
         "memory_mb": round(psutil.virtual_memory().total / 1e6),
         "swap_mb": round(psutil.swap_memory().total / 1e6),
-        "hypervisor": _has_hypervisor(),
+        "hypervisor": has_hypervisor(),
         "energy_rails": sorted(EnergyMeter().rails) or None,
     }
-
-
-def _has_hypervisor() -> bool | None:
-    text = _read(Path("/proc/cpuinfo"))
-    # Only x86 shows it.
-    return None if text is None or "flags" not in text else " hypervisor" in text
 
 
 def software() -> dict[str, Any]:
@@ -106,9 +92,9 @@ def conditions() -> dict[str, Any]:
     psutil = _psutil()
     frequency = psutil.cpu_freq()
     sensors = psutil.sensors_temperatures() if hasattr(psutil, "sensors_temperatures") else {}
-    found = [each for group in sensors.values() for each in group if each.current]
+    sensors_read = [each for group in sensors.values() for each in group if each.current]
     throttles = [_number(path) for path in CPU.glob("cpu[0-9]*/thermal_throttle/*_throttle_count")]
-    quota = dict(line.split() for line in (_read(Path("/sys/fs/cgroup/cpu.stat")) or "").splitlines())
+    quota = dict(line.split() for line in (read_text(Path("/sys/fs/cgroup/cpu.stat")) or "").splitlines())
     times = psutil.cpu_times()
     battery = psutil.sensors_battery() if hasattr(psutil, "sensors_battery") else None
     # Time of guests is part of user and nice.
@@ -118,8 +104,8 @@ def conditions() -> dict[str, Any]:
     return {
         "at_s": time.perf_counter(),
         "mhz": frequency.current if frequency else None,
-        "temperature_c": max((each.current for each in found), default=None),
-        "critical_c": min((each.critical for each in found if each.critical), default=None),
+        "temperature_c": max((each.current for each in sensors_read), default=None),
+        "critical_c": min((each.critical for each in sensors_read if each.critical), default=None),
         "throttle_count": sum(n or 0 for n in throttles) if throttles else None,
         "quota_throttled": int(quota["nr_throttled"]) if "nr_throttled" in quota else None,
         "load_average": psutil.getloadavg()[0],
@@ -136,11 +122,11 @@ def busiest(seconds: float = 0.5) -> list[dict[str, Any]]:
     for process in processes:
         _ask(process.cpu_percent, 0.0)
     time.sleep(seconds)
-    found = [
+    loads = [
         {"name": _ask(process.name, "?"), "cores": round(_ask(process.cpu_percent, 0.0) / 100.0, 2)}
         for process in processes
     ]
-    return sorted((each for each in found if each["cores"] >= 0.05), key=lambda each: -each["cores"])[:5]
+    return sorted((load for load in loads if load["cores"] >= 0.05), key=lambda load: -load["cores"])[:5]
 
 
 def _ask(question: Callable[[], Any], otherwise: Any) -> Any:
@@ -159,45 +145,45 @@ def disturbances(
     before, after : from `conditions`.
     own_cpu_s : CPU time of the measured process itself [s].
     """
-    found = []
+    sentences = []
     wall_s = max(after["at_s"] - before["at_s"], 1e-9)
     others = (after["busy_s"] - before["busy_s"] - own_cpu_s) / wall_s
     if others > BUSY_CORES:
-        found.append(f"other processes kept {others:.1f} of {hardware['logical_cores']} cores busy")
+        sentences.append(f"other processes kept {others:.1f} of {hardware['logical_cores']} cores busy")
     stolen = (after["stolen_s"] - before["stolen_s"]) / wall_s / hardware["logical_cores"]
     if stolen > STOLEN_SHARE:
-        found.append(f"the hypervisor withheld {stolen:.0%} of the CPU time (steal)")
+        sentences.append(f"the hypervisor withheld {stolen:.0%} of the CPU time (steal)")
     for key, sentence in (
         ("throttle_count", "the CPU was throttled for heat {} times"),
         ("quota_throttled", "the container's CPU quota paused it {} times"),
     ):
         if before[key] is not None and after[key] is not None and after[key] > before[key]:
-            found.append(sentence.format(after[key] - before[key]))
+            sentences.append(sentence.format(after[key] - before[key]))
     hot, critical = after["temperature_c"], after["critical_c"]
     if hot is not None and critical is not None and hot > critical - HOT_MARGIN_C:
-        found.append(f"the CPU is at {hot:.0f} C; {critical:.0f} C is critical")
+        sentences.append(f"the CPU is at {hot:.0f} C; {critical:.0f} C is critical")
     if before["mhz"] and after["mhz"] and after["mhz"] < 0.9 * before["mhz"]:
-        found.append(f"the clock fell from {before['mhz']:.0f} to {after['mhz']:.0f} MHz")
+        sentences.append(f"the clock fell from {before['mhz']:.0f} to {after['mhz']:.0f} MHz")
     if after["on_battery"]:
-        found.append("the machine runs on battery")
-    return found
+        sentences.append("the machine runs on battery")
+    return sentences
 
 
 def lasting_disturbances(hardware: Mapping[str, Any], busy: list[dict[str, Any]]) -> list[str]:
     """List what disturbs every sample of a report, one sentence each."""
-    found = []
+    sentences = []
     governor = hardware["governor"]
     if governor not in (None, "performance"):
-        found.append(f"the frequency governor is {governor}, not performance: the clock follows the load")
+        sentences.append(f"the frequency governor is {governor}, not performance: the clock follows the load")
     if hardware["turbo"]:
-        found.append("turbo is on: the clock depends on heat and on the other cores")
+        sentences.append("turbo is on: the clock depends on heat and on the other cores")
     if hardware["cpu_quota"]:
-        found.append(f"a container's CPU quota applies ({hardware['cpu_quota']})")
+        sentences.append(f"a container's CPU quota applies ({hardware['cpu_quota']})")
     if busy:
-        found.append("busy before the start: " + ", ".join(f"{p['name']} ({p['cores']:g} cores)" for p in busy))
+        sentences.append("busy before the start: " + ", ".join(f"{p['name']} ({p['cores']:g} cores)" for p in busy))
     if hardware["hypervisor"]:
-        found.append("a virtual machine: other machines on its host, the clock and the heat are not visible")
-    return found
+        sentences.append("a virtual machine: other machines on its host, the clock and the heat are not visible")
+    return sentences
 
 
 def rss_mb() -> float:
@@ -208,7 +194,7 @@ def rss_mb() -> float:
 def peak_rss_mb() -> float | None:
     """Largest resident memory of this process so far [MB]."""
     # After fork and exec, getrusage starts from the parent's value.
-    for line in (_read(Path("/proc/self/status")) or "").splitlines():
+    for line in (read_text(Path("/proc/self/status")) or "").splitlines():
         if line.startswith("VmHWM:"):
             return int(line.split()[1]) * 1.024e-3
     memory = _psutil().Process().memory_info()
@@ -227,16 +213,9 @@ class EnergyMeter:
     The energy is that of whole packages or boards, including idle power and all other processes. Call `tick` often,
     because counters wrap, and because rails show only power, which is integrated here.
 
-    Parameters
-    ----------
-    root : Path
-        ``/sys``.
-
-    Attributes
-    ----------
+    root : Path; ``/sys``.
     rails : tuple of str
-    joules : dict of str to float
-        Since construction, by rail.
+    joules : dict of str to float; since construction, by rail.
     """
 
     def __init__(self, root: Path = Path("/sys")) -> None:
@@ -244,16 +223,16 @@ class EnergyMeter:
         for domain in sorted(root.glob("class/powercap/intel-rapl:*")):
             if _number(domain / "energy_uj") is not None:  # often readable by root only
                 span = _number(domain / "max_energy_range_uj") or 2**32
-                self._counters[f"{_read(domain / 'name')} ({domain.name})"] = domain / "energy_uj", span + 1
+                self._counters[f"{read_text(domain / 'name')} ({domain.name})"] = domain / "energy_uj", span + 1
         self._powers: dict[str, tuple[Path, Path]] = {}
         for label in sorted(root.glob("class/hwmon/hwmon*/in*_label")):
             number = label.name[2:].removesuffix("_label")
             volts, amperes = (label.with_name(f"{kind}{number}_input") for kind in ("in", "curr"))
-            if (_read(label.parent / "name") or "").startswith("ina") and None not in (
+            if (read_text(label.parent / "name") or "").startswith("ina") and None not in (
                 _number(volts),
                 _number(amperes),
             ):
-                self._powers[f"{_read(label)} ({label.parent.name})"] = volts, amperes
+                self._powers[f"{read_text(label)} ({label.parent.name})"] = volts, amperes
         self.rails = (*self._counters, *self._powers)
         self.joules = dict.fromkeys(self.rails, 0.0)
         self._last_s = time.perf_counter()

@@ -56,8 +56,8 @@ def scenario_names(setting: Mapping[str, Any]) -> list[str]:
 
 def setting_label(setting: Mapping[str, Any]) -> str:
     """Label of a setting: each model with its active precision and provider, and the threads."""
-    engines = [each for repeat in setting["repeats"][:1] for each in repeat["engines"]]
-    ran = "; ".join(f"{each['name']} {each['precision']}, {each['provider']}" for each in engines)
+    engines = [engine for repeat in setting["repeats"][:1] for engine in repeat["engines"]]
+    ran = "; ".join(f"{engine['name']} {engine['precision']}, {engine['provider']}" for engine in engines)
     turn = ", full turn" if setting.get("full_turn") else ""
     return f"{ran or setting['provider']}, {setting['n_threads'] or 'default'} threads{turn}"
 
@@ -100,5 +100,7 @@ def stage_medians(setting: Mapping[str, Any], name: str) -> dict[str, float]:
     parts = _parts(setting, name)
     stages = dict.fromkeys(stage for part in parts for stage in part["stage_ms"])
     values = {stage: [v for part in parts for v in part["stage_ms"].get(stage, ())] for stage in stages}
-    outside = [ms - sum(of[k] for of in part["stage_ms"].values()) for part in parts for k, ms in enumerate(part["ms"])]
+    outside = [
+        ms - sum(times[k] for times in part["stage_ms"].values()) for part in parts for k, ms in enumerate(part["ms"])
+    ]
     return {stage: percentile(v, 50.0) for stage, v in (values | {"outside": outside}).items() if v}

@@ -22,14 +22,9 @@ from edgeperc.types.sensor import get_sensor
 class Input:
     """Scans as files for measuring processes.
 
-    Attributes
-    ----------
-    files : tuple of Path
-        .npy, (n, 4) float32 in the sensor's raw unit of remission.
-    truth : tuple of SimulatedScan
-        Empty if there is no ground truth.
-    record : dict
-        For the report; two reports with the same ``sha256`` are of the same scans.
+    files : .npy, (n, 4) float32 in the sensor's raw unit of remission.
+    truth : empty if there is no ground truth.
+    record : for the report; two reports with the same ``sha256`` are of the same scans.
     """
 
     files: tuple[Path, ...]
@@ -98,8 +93,8 @@ def sized(n_points: int, sensor: str) -> NDArray[np.float32]:
         scans.append(simulated_scan(FIRST_SEED + len(scans), sensor).points)
     points = np.concatenate(scans)
     # In the sensor's own order, which decides how caches are used.
-    kept = np.sort(np.random.default_rng(0).choice(len(points), n_points, replace=False))
-    return raw(points[kept], sensor)
+    rows = np.sort(np.random.default_rng(0).choice(len(points), n_points, replace=False))
+    return raw(points[rows], sensor)
 
 
 def crowd(n_cars: int, sensor: str) -> NDArray[np.float32]:

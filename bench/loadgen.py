@@ -51,12 +51,12 @@ def single_stream(
             if not failed:
                 began = time.perf_counter()
                 try:
-                    found = perceive(scans[query.index])
+                    perception = perceive(scans[query.index])
                 except Exception as exc:  # this is LoadGen's thread; raised below, in ours
                     failed.append(exc)
                 else:
                     took_ms = 1e3 * (time.perf_counter() - began)
-                    timings.add(began - first, took_ms, took_ms, found.stage_ms)
+                    timings.add(began - first, took_ms, took_ms, perception.stage_ms)
             loadgen.QuerySamplesComplete([loadgen.QuerySampleResponse(query.id, 0, 0)])
         keep_going(timings)
 
@@ -85,9 +85,9 @@ def single_stream(
 def read_summary(folder: Path) -> dict[str, Any]:
     """Read the percentiles [ms], LoadGen's result and its summary."""
     text = (folder / SUMMARY).read_text(encoding="utf-8", errors="replace")
-    found: dict[str, Any] = {
+    figures: dict[str, Any] = {
         f"p{float(p):g}": int(ns) / 1e6
         for p, ns in re.findall(r"^([\d.]+) percentile latency \(ns\)\s*: (\d+)", text, re.M)
     }
     verdict = re.search(r"^Result is\s*: (\w+)", text, re.M)
-    return found | {"result": verdict[1] if verdict else None, "summary": text}
+    return figures | {"result": verdict[1] if verdict else None, "summary": text}

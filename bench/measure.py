@@ -1,4 +1,4 @@
-"""Measure one setting (repeats, accuracy, offline throughput, cold starts) and record it in a document at once."""
+"""Measure one setting (repeats, accuracy, offline throughput, cold starts) and record it in a document immediately."""
 
 from __future__ import annotations
 
@@ -52,8 +52,10 @@ def repeat(
         (result,) = measure([job if k == 0 else replace(job, predict=())], on_tick)
         predictions += result.pop("predictions")
         setting["repeats"].append(result)
-        for name, each in result["scenarios"].items():
-            for disturbance in disturbances(document["machine"], each["before"], each["after"], each["cpu_s"]):
+        for name, scenario in result["scenarios"].items():
+            for disturbance in disturbances(
+                document["machine"], scenario["before"], scenario["after"], scenario["cpu_s"]
+            ):
                 document["disturbances"].append(f"{name}, repeat {k + 1}: {disturbance}")
         if result["interrupted"]:
             raise KeyboardInterrupt
@@ -80,7 +82,7 @@ def reference(job: Job, files: Sequence[Path]) -> Reference:
 
 
 def accuracy_of(right: Reference, found: Sequence[Prediction], truth: Sequence[SimulatedScan]) -> dict[str, Any]:
-    """The accuracy of a setting, which is reported beside its speed."""
+    """The accuracy of a setting, which is reported with its speed."""
     accuracy: dict[str, Any] = {
         "reference": right.engines,
         "agreement": agreement(right.predictions, found),

@@ -9,8 +9,9 @@ from pathlib import Path
 from typing import TypeAlias
 
 from edgeperc.inference.providers import PROVIDERS
-from edgeperc.inference.session import PRECISIONS
-from edgeperc.zoo import DEFAULT
+from edgeperc.system.names import nearest
+from edgeperc.types.choices import DEFAULT_MODELS as DEFAULT
+from edgeperc.types.choices import PRECISIONS
 
 SINGLE_STREAM = "single-stream"
 Subparsers: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
@@ -175,7 +176,8 @@ def choices(known: Sequence[str]) -> Callable[[str], list[str]]:
         names = text.split(",")
         for name in names:
             if name not in (*known, "all"):
-                raise argparse.ArgumentTypeError(f"got {name!r}; expected all, or some of {', '.join(known)}")
+                close = nearest(name, known)
+                raise argparse.ArgumentTypeError(f"got {name!r}{close}; expected all, or some of {', '.join(known)}")
         return list(known) if "all" in names else list(dict.fromkeys(names))
 
     return parse
@@ -189,7 +191,9 @@ def provider(text: str) -> str:
             f"got {text!r}; the precision is an option of its own: --provider {name} --precision {precision}"
         )
     if name not in ("auto", *PROVIDERS):
-        raise argparse.ArgumentTypeError(f"got {text!r}; expected auto or one of {', '.join(PROVIDERS)}")
+        raise argparse.ArgumentTypeError(
+            f"got {text!r}{nearest(name, PROVIDERS)}; expected auto or one of {', '.join(PROVIDERS)}"
+        )
     return name
 
 

@@ -139,11 +139,11 @@ class LiveTable:
             self._next_s = now + 0.5
             self.clear()
             rows = [["scenario", "scans", *QUANTILES, "last"]]
-            for each, values in self.ms.items():
+            for stage, values in self.ms.items():
                 figures = summary(values)
                 rows.append(
                     [
-                        each,
+                        stage,
                         f"{len(values):,}",
                         *(number(figures[q]) for q in QUANTILES),
                         number(values[-1] if values else None),

@@ -27,7 +27,7 @@ def sections(document: Mapping[str, Any]) -> list[Section]:
 
 def _reliability(document: Mapping[str, Any]) -> Section:
     sentences = [] if document["complete"] else ["interrupted: only what was measured before is shown"]
-    sentences += [f"disturbed: {each}" for each in document["disturbances"]]
+    sentences += [f"disturbed: {sentence}" for sentence in document["disturbances"]]
     return Section("Reliability", sentences or ["no disturbance was seen"])
 
 
@@ -86,7 +86,7 @@ def _setting(setting: Mapping[str, Any]) -> list[Section]:
         parts.append(
             Section(
                 "Offline",
-                ["several processes at once, each back to back; counted while all of them run"],
+                ["several concurrent processes, each back to back; counted while all of them run"],
                 [head, *rows],
             )
         )
@@ -94,8 +94,8 @@ def _setting(setting: Mapping[str, Any]) -> list[Section]:
         steps = ("interpreter_s", "import_s", "read_s", "construct_s", "first_call_s", "total_s")
         head = ["start", *(step.removesuffix("_s").replace("_", " ") for step in steps), "peak RSS MB"]
         rows = [
-            [each["start"], *(number(each[step], 3) for step in steps), number(each["peak_rss_mb"], 0)]
-            for each in setting["cold_start"]
+            [start["start"], *(number(start[step], 3) for step in steps), number(start["peak_rss_mb"], 0)]
+            for start in setting["cold_start"]
         ]
         sentences = [
             "seconds from starting a process to its first result; the first start finds no compiled kernels; the peak "
@@ -114,11 +114,11 @@ def _setting(setting: Mapping[str, Any]) -> list[Section]:
 def _stages(setting: Mapping[str, Any], names: Sequence[str]) -> Section:
     rows = [["stage", *(f"{name}, {word}" for name in names for word in ("p50", "share"))]]
     medians = {name: stage_medians(setting, name) for name in names}
-    for stage in dict.fromkeys(stage for of in medians.values() for stage in of):
+    for stage in dict.fromkeys(stage for stages in medians.values() for stage in stages):
         row = [stage]
-        for of in medians.values():
-            total = sum(of.values())
-            row += [number(of.get(stage)), share(of[stage] / total if stage in of and total else None)]
+        for stages in medians.values():
+            total = sum(stages.values())
+            row += [number(stages.get(stage)), share(stages[stage] / total if stage in stages and total else None)]
         rows.append(row)
     return Section("Stages", ["medians in ms"], rows)
 
@@ -126,7 +126,7 @@ def _stages(setting: Mapping[str, Any], names: Sequence[str]) -> Section:
 def _starts(setting: Mapping[str, Any]) -> Section:
     rows = [["repeat", "construct s", "first call ms", "warm-up scans", "warm-up p50 ms", "peak RSS MB", "scans MB"]]
     for k, repeat in enumerate(setting["repeats"], start=1):
-        warm = [ms for each in repeat["scenarios"].values() for ms in each["warm_up_ms"]]
+        warm = [ms for scenario in repeat["scenarios"].values() for ms in scenario["warm_up_ms"]]
         rows.append(
             [
                 *(str(k), number(repeat["construct_s"], 3), number(repeat["first_call_ms"]), f"{len(warm):,}"),
@@ -138,19 +138,18 @@ def _starts(setting: Mapping[str, Any]) -> Section:
 
 def accuracy_sentences(accuracy: Mapping[str, Any]) -> list[str]:
     """Sentences on how far the results of a setting agree with the reference and the ground truth."""
-    found = accuracy["agreement"]
+    agreement = accuracy["agreement"]
     parts = []
     for kind in ("points", "cells"):
-        if found[kind] is not None:
-            parts.append(
-                f"{share(found[kind]['equal'])} of the {kind}' labels equal, mean IoU {share(found[kind]['mean_iou'])}"
-            )
-    if found["boxes"] is not None:
+        if agreement[kind] is not None:
+            equal, iou = (share(agreement[kind][name]) for name in ("equal", "mean_iou"))
+            parts.append(f"{equal} of the {kind}' labels equal, mean IoU {iou}")
+    if agreement["boxes"] is not None:
         parts.append(
-            "{n_both} common boxes of {n_found} found and {n_reference} of the reference".format(**found["boxes"])
+            "{n_both} common boxes of {n_found} found and {n_reference} of the reference".format(**agreement["boxes"])
         )
     reference = "; ".join(accuracy["reference"])
-    sentences = [f"compared with {reference} on {found['n_scans']} scans: {'; '.join(parts)}"]
+    sentences = [f"compared with {reference} on {agreement['n_scans']} scans: {'; '.join(parts)}"]
     if accuracy["truth"] is None:
         return [*sentences, "these scans have no ground truth; edgeperc eval evaluates labeled scans"]
     for name, kept in (("ground truth", "truth"), ("ground truth, reference", "reference_truth")):
@@ -189,8 +188,8 @@ def _matrix(document: Mapping[str, Any]) -> Section:
                     "yes" if accuracy["agrees"] else "no",
                 ]
             )
-    sentences = [f"skipped: {each}" for each in document["skipped"]]
-    sentences += [f"recommended for {each['name']}: {each['text']}" for each in document["recommended"]]
+    sentences = [f"skipped: {sentence}" for sentence in document["skipped"]]
+    sentences += [f"recommended for {sentence['name']}: {sentence['text']}" for sentence in document["recommended"]]
     return Section("Settings, back to back, ms", sentences, rows if len(rows) > 1 else [])
 
 

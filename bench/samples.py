@@ -37,9 +37,9 @@ def supported(p: float, n: int) -> bool:
 def summary(values: ArrayLike) -> dict[str, float | int | None]:
     """``n``, ``p50``, ``p90``, ``p99``, ``p99.9`` and ``max``; None if there are too few samples."""
     array = np.asarray(values, np.float64)
-    found: dict[str, float | int | None] = {"n": len(array)}
-    found |= {f"p{p:g}": percentile(array, p) if supported(p, len(array)) else None for p in PERCENTILES}
-    return found | {"max": float(array.max()) if len(array) else None}
+    figures: dict[str, float | int | None] = {"n": len(array)}
+    figures |= {f"p{p:g}": percentile(array, p) if supported(p, len(array)) else None for p in PERCENTILES}
+    return figures | {"max": float(array.max()) if len(array) else None}
 
 
 def noise_floor(repeats: Sequence[ArrayLike]) -> float | None:
@@ -52,15 +52,10 @@ def noise_floor(repeats: Sequence[ArrayLike]) -> float | None:
 class Verdict:
     """Result of comparing a run B with a run A.
 
-    Attributes
-    ----------
     word : {"faster", "slower", "no difference", "unusable"}
-    ratio : float
-        Median of B over that of A.
-    interval : tuple of 2 float
-        95 % bootstrap interval of the ratio.
-    noise : float
-        The larger `noise_floor` of the two runs; NaN if a run was not repeated.
+    ratio : median of B over that of A.
+    interval : 95 % bootstrap interval of the ratio.
+    noise : the larger `noise_floor` of the two runs; NaN if a run was not repeated.
     """
 
     word: str
@@ -113,14 +108,8 @@ def _resampled(repeats: Sequence[ArrayLike], rng: np.random.Generator) -> NDArra
 class Trend:
     """A straight line through samples.
 
-    Attributes
-    ----------
-    slope : float
-    error : float
-        Half of the slope's 95 % interval.
-    intercept : float
-    r2 : float
-        Share of the variance that the line explains; NaN if the variance is 0.
+    error : half of the slope's 95 % interval.
+    r2 : share of the variance that the line explains; NaN if the variance is 0.
     """
 
     slope: float

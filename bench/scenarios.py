@@ -35,14 +35,8 @@ class Clock:
 class Limits:
     """How long a scenario lasts: until all limits are reached.
 
-    Attributes
-    ----------
-    min_scans : int
-    min_seconds : float
-    warm_up_scans : int
-        Scans before the first one that counts.
-    stride : int
-        Only every ``stride``-th scan leaves a sample, because the samples of a long run would themselves be memory
+    warm_up_scans : scans before the first one that counts.
+    stride : only every ``stride``-th scan leaves a sample, because the samples of a long run would themselves be memory
         growth.
     """
 
@@ -56,28 +50,16 @@ class Limits:
 class Timings:
     """Measurements of one scenario, one number per scan, in order.
 
-    Attributes
-    ----------
-    n : int
-        Scans perceived, without the warm-up.
-    stride : int
-        Every ``stride``-th scan has a sample.
-    first_s : float
-        When the first scan that counts arrived, on the clock.
-    start_s : list of float
-        Start of each call since then [s].
-    ms : list of float
-        Wall time of each call, from scan to result.
-    age_ms : list of float
-        Time from the arrival of each scan to its result; equal to ``ms`` if scans do not arrive at a rate.
-    stage_ms : dict of str to list of float
-        As `edgeperc.Perception.stage_ms`.
-    warm_up_ms : list of float
-        Wall time of the calls before those that count.
-    missed : int
-        Results that were not complete when the next scan arrived.
-    skipped : int
-        Scans left out because a newer one had arrived before their turn; they have no sample.
+    n : scans perceived, without the warm-up.
+    stride : every ``stride``-th scan has a sample.
+    first_s : when the first scan that counts arrived, on the clock.
+    start_s : start of each call since then [s].
+    ms : wall time of each call, from scan to result.
+    age_ms : time from the arrival of each scan to its result; equal to ``ms`` if scans do not arrive at a rate.
+    stage_ms : as `edgeperc.Perception.stage_ms`.
+    warm_up_ms : wall time of the calls before those that count.
+    missed : results that were not complete when the next scan arrived.
+    skipped : scans left out because a newer one had arrived before their turn; they have no sample.
     """
 
     n: int = 0
@@ -143,9 +125,9 @@ def back_to_back(
     while keep_going(timings) and (timings.n < limits.min_scans or clock.now() - first < limits.min_seconds):
         scan = scans[timings.n % len(scans)]
         began = clock.now()
-        found = perceive(scan)
+        perception = perceive(scan)
         took_ms = 1e3 * (clock.now() - began)
-        timings.add(began - first, took_ms, took_ms, found.stage_ms)
+        timings.add(began - first, took_ms, took_ms, perception.stage_ms)
     return timings
 
 
@@ -180,10 +162,10 @@ def paced(
         scan, due = scans[k % len(scans)], first + k / rate_hz
         clock.sleep_until(due)
         began = clock.now()
-        found = perceive(scan)
+        perception = perceive(scan)
         done = clock.now()
         timings.missed += done > due + 1.0 / rate_hz
-        timings.add(began - first, 1e3 * (done - began), 1e3 * (done - due), found.stage_ms)
+        timings.add(began - first, 1e3 * (done - began), 1e3 * (done - due), perception.stage_ms)
         k += 1
     return timings
 

@@ -44,16 +44,9 @@ class WorkerError(EdgepercError):
 class Scenario:
     """How scans arrive: back to back, or at a rate.
 
-    Attributes
-    ----------
-    name : str
-    scans : tuple of Path
-        .npy files, (n, 4) float32 each, with remission in the sensor's raw unit.
-    limits : Limits
-    rate_hz : float or None
-        None for back to back.
-    application : bool
-        Also stream, track, write JSON and draw, as `Application` does.
+    scans : .npy files, (n, 4) float32 each, with remission in the sensor's raw unit.
+    rate_hz : none for back to back.
+    application : also stream, track, write JSON and draw, as `Application` does.
     """
 
     name: str
@@ -67,17 +60,10 @@ class Scenario:
 class Job:
     """The work of one process.
 
-    Attributes
-    ----------
-    models : tuple of str
-    provider, precision, n_threads, sensor, full_turn
-        As in `Perceiver`.
-    scenarios : tuple of Scenario
-        One after the other.
-    predict : tuple of Path
-        Scans whose predictions are returned; perceived after everything else.
-    loadgen : Path or None
-        Folder for MLPerf LoadGen's logs; if given, LoadGen drives the scenarios in place of `back_to_back`.
+    provider, precision, n_threads, sensor, full_turn : as in `Perceiver`.
+    scenarios : one after the other.
+    predict : scans whose predictions are returned; perceived after everything else.
+    loadgen : folder for MLPerf LoadGen's logs; if given, LoadGen drives the scenarios in place of `back_to_back`.
     """
 
     models: tuple[str, ...]
@@ -153,13 +139,13 @@ def _work(connection: Any, job: Job) -> dict[str, Any]:
             if stopped:
                 break
             watch = _Watch(connection, scenario)
-            own = [scans[path] for path in scenario.scans]
+            inputs = [scans[path] for path in scenario.scans]
             if job.loadgen is not None:
                 run: Callable[..., Timings] = partial(single_stream, folder=job.loadgen)
             else:
                 run = back_to_back if scenario.rate_hz is None else partial(paced, rate_hz=scenario.rate_hz)
             with closing(Application(perceive)) if scenario.application else nullcontext(perceive) as called:
-                timings = run(called, own, limits=scenario.limits, keep_going=watch, on_start=watch.start)
+                timings = run(called, inputs, limits=scenario.limits, keep_going=watch, on_start=watch.start)
             result["scenarios"][scenario.name] = watch.record(timings)
             stopped = watch.stopped
         result |= {"interrupted": stopped, "rss_mb": rss_mb(), "peak_rss_mb": peak_rss_mb()}
@@ -175,8 +161,8 @@ def _paths(job: Job) -> Iterator[Path]:
 
 
 def _predict(perceive: Perceive, scan: NDArray[np.float32]) -> Prediction:
-    found = perceive(scan)
-    return Prediction(found.points, found.top_view, found.boxes)
+    perception = perceive(scan)
+    return Prediction(perception.points, perception.top_view, perception.boxes)
 
 
 def _engines(perceive: Perceiver) -> list[dict[str, Any]]:
@@ -277,7 +263,7 @@ def _interrupts() -> Iterator[_Interrupts]:
 
 
 def measure(jobs: Sequence[Job], on_tick: OnTick = lambda name, ms: None) -> list[dict[str, Any]]:
-    """Run several jobs at once, each in a fresh process; all start when all are ready.
+    """Run several jobs concurrently, each in a fresh process; all start when all are ready.
 
     Ctrl-C asks the processes for their results so far, which are returned with ``"interrupted"`` set; a second one ends
     them. Call this from the main thread.

@@ -6,13 +6,12 @@ import math
 import os
 import threading
 import warnings
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import wraps
 from itertools import pairwise
 from numbers import Integral, Real
 from types import MappingProxyType
-from typing import Literal, NamedTuple, NoReturn, ParamSpec
+from typing import Literal, NamedTuple, NoReturn
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -32,6 +31,7 @@ from .preprocess.remission import RemissionMatcher
 from .preprocess.returns import about_too_near, returns
 from .system.compilation import Compilation, kernels_of
 from .system.lanes import Lanes, Stopwatch
+from .system.names import nearest
 from .types.card import ModelCard
 from .types.frame import ModelFrame
 from .types.mounting import Mounting
@@ -49,8 +49,6 @@ ADAPTATIONS: tuple[Adaptation, ...] = ("none", "remission", "interpolation", "bo
 # A wrong set-up shows in any scan. Several are checked, because one may have been taken in a tunnel or a depot.
 # A refused scan does not count.
 CHECKED_SCANS = 5
-
-_P = ParamSpec("_P")
 
 
 @dataclass(frozen=True)
@@ -97,29 +95,10 @@ def _card_of(model: str | os.PathLike[str]) -> ModelCard | None:
         return None
 
 
-def _renamed(**names: str) -> Callable[[Callable[_P, None]], Callable[_P, None]]:
-    """Refuse the old name of a keyword; the message gives the new name."""
-
-    def decorate(function: Callable[_P, None]) -> Callable[_P, None]:
-        @wraps(function)
-        def checked(*args: _P.args, **kwargs: _P.kwargs) -> None:
-            for old in names.keys() & kwargs.keys():
-                raise OptionError(f"{old}= was renamed; pass {names[old]}={kwargs[old]!r}")
-            function(*args, **kwargs)
-
-        return checked
-
-    return decorate
-
-
-def _check_choice(
-    option: str, value: object, choices: Sequence[object], renamed: Mapping[str, str] = MappingProxyType({})
-) -> None:
-    if isinstance(value, str) and value in renamed:
-        raise OptionError(f"{option}={value!r} was renamed; pass {option}={renamed[value]!r}")
+def _check_choice(option: str, value: object, choices: Sequence[object]) -> None:
     if value not in choices:
-        *others, last = map(str, choices)
-        raise OptionError(f"{option} is {value!r}; expected {', '.join(others)} or {last}")
+        *others, last = known = [*map(str, choices)]
+        raise OptionError(f"{option} is {value!r}{nearest(str(value), known)}; expected {', '.join(others)} or {last}")
 
 
 def _listed(models: object) -> list[str | os.PathLike[str]]:
@@ -162,8 +141,8 @@ class Perceiver:
         card shows a loss of at most 0.3 points (`edgeperc.zoo.choose`). Any other value is required.
     n_threads : int or None
         Threads of a network, one network after the other. None leaves it to the provider; on onnxruntime's CPU provider
-        the networks of the range image and of the top view then run at once, each on half of the cores. The results do
-        not depend on it.
+        the networks of the range image and of the top view then run concurrently, each on half of the cores. The
+        results do not depend on it.
     on_mismatch : {"refuse", "warn", "raise", "ignore"}
         What to do when one of the first five scans is unlike the training scans. ``"refuse"``: raise FitnessError,
         before anything is perceived, if a difference is gross (`findings.check_fitness` lists them), and warn
@@ -185,7 +164,7 @@ class Perceiver:
         part.
     full_turn : bool
         Run a range-image model once for each sector, four times for the shipped models. Every point then has a class,
-        and there are boxes beside and behind the vehicle.
+        and there are boxes next to and behind the vehicle.
     agree : bool or collection of str
         Correct the parts of the result by one another (`agreement.rules`): the clusters of points above the ground
         vote on their class, boxes support or complete labels, and no cell below an object is drivable. Boxes below
@@ -236,7 +215,6 @@ class Perceiver:
     sessions: tuple[Session, ...]
     providers: Mapping[str, str]
 
-    @_renamed(all_around="full_turn")
     def __init__(
         self,
         models: str | os.PathLike[str] | Sequence[str | os.PathLike[str]] | None = None,
@@ -254,7 +232,7 @@ class Perceiver:
         agree: bool | Collection[str] = True,
         trusted: bool = False,
     ) -> None:
-        _check_choice("adapt", adapt, ADAPTATIONS, {"neither": "none"})
+        _check_choice("adapt", adapt, ADAPTATIONS)
         _check_choice("on_mismatch", on_mismatch, ("refuse", "warn", "raise", "ignore"))
         _check_choice("boxes_from", boxes_from, ("both", "network", "clusters"))
         _check_choice("full_turn", full_turn, (True, False))

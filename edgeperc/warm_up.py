@@ -200,7 +200,7 @@ def _compile_clusters() -> None:
 def _compile_boxes() -> None:
     scan, labels = _made_up()
     clusters = np.where(scan.ground.mask, -1, 0).astype(np.int32)
-    for label in (1, 2):  # one cluster of a car; one of a person, without points beside it that would be clustered
+    for label in (1, 2):  # one cluster of a car; one of a person, without points next to it that would be clustered
         alike = np.where(scan.ground.mask, 0, label).astype(np.uint8)
         objects_from_points(scan.points, alike, labels.classes, height_m=scan.ground.height_m, clusters=clusters)
     join_boxes([UNCERTAIN], [UNCERTAIN])

@@ -42,10 +42,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _run(given: list[str]) -> int:
-    parser = build_parser()
-    if given[:1] == ["database"]:
-        parser.error(f'"{" ".join(given[:2])}" is now written {"-".join(given[:2])}; see edgeperc-export --help')
-    args = parser.parse_args(given)
+    args = build_parser().parse_args(given)
     try:
         return int(args.run(args))
     except ModuleNotFoundError as exc:

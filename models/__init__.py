@@ -15,6 +15,8 @@ from importlib import resources
 from pathlib import Path
 
 from edgeperc.errors import ModelFileError, ProviderError
+from edgeperc.system.names import nearest
+from edgeperc.types import choices
 from edgeperc.types.card import ModelCard
 from edgeperc.types.onnx_file import read_model
 
@@ -33,10 +35,10 @@ __all__ = [
     "shipped_models",
 ]
 
-DEFAULT = ("ssadnet", "pointseg")
+DEFAULT = choices.DEFAULT_MODELS
 """The best pair: drivable area and vehicles ahead, and a class for every point."""
 
-CAMERA = "camseg"
+CAMERA = choices.CAMERA
 """The model of a camera's images."""
 
 MAX_LOSS = 0.3
@@ -53,12 +55,6 @@ FASTEST = {"cpu": ("int8",), "openvino": ("int8", "bf16"), "qnn": ("int8",)}
 NPU_PROVIDERS = ("qnn",)
 """Providers that compute int8 on a device of its own, whatever the processor."""
 
-RENAMED = {
-    "ssadnet-edge": "ssadnet:fp32",
-    "ssadnet-edge-int8": "ssadnet:int8",
-    "pointseg-edge": "pointseg:fp32",
-    "pointseg-edge-int8": "pointseg:int8",
-}
 RESEARCH = ("kulseg", "lodnn-paper", "pointseg-full", "pointseg-sim", "ssadnet-full", "ssadnet-paper", "ssadnet-sim")
 
 
@@ -129,7 +125,7 @@ def resolve(model: str | os.PathLike[str]) -> tuple[Variant, ...]:
     Raises
     ------
     ModelFileError
-        No model has this name, or the file cannot be read. The message lists the names, or gives the new name.
+        No model has this name, or the file cannot be read. The message lists the names.
     CardError
         The file has no card, or its card cannot be read.
     """
@@ -144,22 +140,20 @@ def resolve(model: str | os.PathLike[str]) -> tuple[Variant, ...]:
     if not chosen:
         stored = " and ".join(map(str, of_name))
         raise ModelFileError(
-            f"no model is called {model!r}; {name} comes as {stored}. bf16 is no file: ask for precision 'bf16'"
+            f"no model is called {model!r}; {name} comes as {stored}. bf16 is not a file: ask for precision 'bf16'"
         )
     return chosen
 
 
 def _unknown(name: str) -> str:
-    if name in RENAMED:
-        new = RENAMED[name]
-        return f"model {name!r} is now called {new!r}; {new.partition(':')[0]!r} takes the best variant"
     if name in RESEARCH:
         return (
             f"{name!r} is a research model and is not installed; give the path models/research/{name}.onnx "
             "in edgeperc's source distribution or repository"
         )
     known = ", ".join(shipped_models()) or "none in this installation"
-    return f"no model is called {name!r}. Shipped: {known}. Or give the path of an .onnx file."
+    close = nearest(name, shipped_models())
+    return f"no model is called {name!r}{close}. Shipped: {known}. Or give the path of an .onnx file."
 
 
 def model_path(model: str | os.PathLike[str]) -> Path:

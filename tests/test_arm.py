@@ -19,7 +19,6 @@ from edgeperc.inference.session import golden_input
 from edgeperc.simulation.samples import simulated_scan
 from edgeperc.system import machine
 from edgeperc.zoo import DEFAULT, choose, model_path, resolve
-from edgeperc_bench import context
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 BOX = {"label": "car", "score": 0.9, "center": [10.0, 2.0, -1.0], "size": [4.0, 1.6, 1.5], "yaw": 3.14, "front": None}
@@ -31,8 +30,7 @@ def show_cpuinfo(monkeypatch: pytest.MonkeyPatch) -> Any:
     monkeypatch.setattr(sys, "platform", "linux")
 
     def show(text: str) -> None:
-        monkeypatch.setattr(machine, "_text", lambda path: text if path == Path("/proc/cpuinfo") else None)
-        monkeypatch.setattr(context, "_read", lambda path: text)
+        monkeypatch.setattr(machine, "read_text", lambda path: text if path == Path("/proc/cpuinfo") else None)
 
     return show
 
@@ -60,11 +58,11 @@ def test_arm_processors_without_a_name_have_different_fingerprints(show_cpuinfo:
 
 def test_a_hypervisor_is_unknown_on_arm(show_cpuinfo: Any) -> None:
     show_cpuinfo(cpuinfo("neoverse-n1"))
-    assert context._has_hypervisor() is None
+    assert machine.has_hypervisor() is None
     show_cpuinfo("flags\t\t: fpu vme")
-    assert context._has_hypervisor() is False
+    assert machine.has_hypervisor() is False
     show_cpuinfo("flags\t\t: fpu hypervisor vme")
-    assert context._has_hypervisor() is True
+    assert machine.has_hypervisor() is True
 
 
 @pytest.mark.parametrize(

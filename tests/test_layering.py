@@ -25,12 +25,13 @@ PACKAGES = {
 FLOORS = {
     "edgeperc": """
         errors
-        system.__init__ system.atomic system.clock system.extras system.kernel_stamp system.lanes system.names
+        system.__init__ system.atomic system.clock system.extras system.fields system.kernel_stamp system.lanes
+        system.names
         system.printable
         system.machine system.ray_cluster system.remote
         system.kernel_cache
         system.compilation
-        types.__init__ types.mounting types.onnx_file types.points types.views
+        types.__init__ types.choices types.mounting types.onnx_file types.points types.views
         types.card types.sensor
         types.perception
         types.frame types.geometry

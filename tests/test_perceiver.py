@@ -565,8 +565,7 @@ def test_two_models_of_one_view_are_refused() -> None:
         ({"models": 5}, "models is 5"),
         ({"models": ["pointseg", 5]}, "models is .*5"),
         ({"adapt": "some"}, "adapt is 'some'; expected none, remission, interpolation or both"),
-        ({"adapt": "neither"}, "pass adapt='none'"),
-        ({"all_around": True}, "pass full_turn=True"),
+        ({"adapt": "remision"}, r"adapt is 'remision' \(did you mean remission\?\); expected none"),
     ],
 )
 def test_wrong_options_are_named(arguments: dict[str, object], message: str) -> None:

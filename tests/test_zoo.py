@@ -53,11 +53,12 @@ def test_the_wheels_models_are_small() -> None:
 @pytest.mark.parametrize(
     ("model", "message"),
     [
-        ("pointseg-edge-int8", "now called 'pointseg:int8'"),
-        ("ssadnet-edge", "now called 'ssadnet:fp32'"),
         ("pointseg-sim", "models/research/pointseg-sim\\.onnx"),
         ("pointseg:bf16", "pointseg:fp32 and pointseg:int8.*ask for precision 'bf16'"),
-        ("pointnet", "no model is called 'pointnet'. Shipped: camseg, lodnn, pointseg, ssadnet"),
+        (
+            "pointnet",
+            "no model is called 'pointnet' \\(did you mean pointseg\\?\\). Shipped: camseg, lodnn, pointseg, ssadnet",
+        ),
         ("", "no model is called ''"),
         ("nowhere.onnx", "nowhere.onnx"),
     ],

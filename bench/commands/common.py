@@ -1,4 +1,4 @@
-"""Steps of several commands: start and write a document, prepare the scans, measure several processes at once."""
+"""Steps of several commands: start and write a document, prepare the scans, measure several concurrent processes."""
 
 from __future__ import annotations
 

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any
 
 from edgeperc import EdgepercError
 from edgeperc.inference.providers import PROVIDERS, available_providers
-from edgeperc.inference.session import PRECISIONS
 from edgeperc.system.machine import cpu_features, settings_path, write_settings
+from edgeperc.types.choices import PRECISIONS
 from edgeperc.zoo import DEFAULT, choose, resolve
 
 from ..document import pooled, repeats_ms, setting_label

@@ -16,7 +16,7 @@ def add_parser(subparsers: Subparsers) -> None:
     parser = subparsers.add_parser(
         "peers",
         parents=[model_options(), scan_options(), engine_options(), output_options()],
-        help="measure edgeperc beside torch, other engines and numpy (extra 'peers')",
+        help="compare edgeperc with torch, other engines and numpy (extra 'peers')",
         description="Measure edgeperc, the same networks in torch, torch.compile, onnxruntime, OpenVINO, MNN and ncnn "
         "with a pipeline in numpy, and the fastest matrix products and memory copies of this computer, all in turns. "
         "What is not installed is listed and left out.",

@@ -54,7 +54,7 @@ def add_parser(subparsers: Subparsers) -> None:
         "--sizes", 25, 1600, SIZES,
         "image sizes in per cent of the model's own pixels, with random weights (needs the extra 'export')",
     )  # fmt: skip
-    add_counts("--processes", 1, None, None, "numbers of processes at once")
+    add_counts("--processes", 1, None, None, "numbers of concurrent processes")
     parser.add_argument(
         "--plot", type=Path, metavar="FILE", help="draw the curves to a .svg or .png file (needs the extra 'view')"
     )

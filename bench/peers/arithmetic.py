@@ -1,7 +1,7 @@
 """Count the work of a network and measure the peak of this machine: together a lower bound for every latency.
 
 A network's multiplications are those of its convolutions and matrix products, counted from the ONNX graph; taps that
-only meet padding are counted separately, because an engine can skip them. The machine's peak is measured beside the
+only meet padding are counted separately, because an engine can skip them. The machine's peak is measured next to the
 networks, with the installed libraries: large matrix products, and a copy of more memory than any cache holds. The bound
 holds for direct convolution; Winograd's method needs fewer multiplications but more of all other operations.
 """
@@ -27,14 +27,10 @@ COPY_BYTES = 1 << 28
 class Cost:
     """The work of a network; traffic is counted in values, not bytes.
 
-    Attributes
-    ----------
-    macs : int
-        Multiply-accumulates including padding, as usually reported.
-    padding_macs : int
-        Multiply-accumulates with padding only; part of ``macs``.
-    weights, activations : int
-        Values that convolutions and matrix products read, and read or write; other operators can be fused into them.
+    macs : multiply-accumulates including padding, as usually reported.
+    padding_macs : multiply-accumulates with padding only; part of ``macs``.
+    weights, activations : values that convolutions and matrix products read, and read or write; other operators can be
+        fused into them.
     """
 
     macs: int
@@ -91,8 +87,8 @@ def cost(model: Path | Any) -> Cost:
 
 def n_taps_inside(n_here: int, n_there: int, kernel: int, stride: int, pad: int, dilation: int) -> int:
     """Number of pairs of a position and a tap, along one axis, that do not fall on padding."""
-    at = np.arange(n_here)[:, None] * stride - pad + np.arange(kernel) * dilation
-    return int(np.count_nonzero((at >= 0) & (at < n_there)))
+    places = np.arange(n_here)[:, None] * stride - pad + np.arange(kernel) * dilation
+    return int(np.count_nonzero((places >= 0) & (places < n_there)))
 
 
 def matrix_product(library: str, precision: str, n_threads: int) -> Callable[[], object]:

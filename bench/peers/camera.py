@@ -65,8 +65,8 @@ class NumpyCamera:
 
 def _table(n_in: int, n_out: int) -> NDArray[np.float32]:
     """Bilinear weights of half-pixel centers along one axis, (n_out, n_in)."""
-    at = (np.arange(n_out) + 0.5) * n_in / n_out - 0.5
-    return np.stack([np.interp(at, np.arange(n_in), row) for row in np.eye(n_in)], axis=1).astype(np.float32)
+    places = (np.arange(n_out) + 0.5) * n_in / n_out - 0.5
+    return np.stack([np.interp(places, np.arange(n_in), row) for row in np.eye(n_in)], axis=1).astype(np.float32)
 
 
 def small_unet(card: ModelCard, precision: str, n_threads: int) -> Callable[[NDArray[np.uint8]], Any]:

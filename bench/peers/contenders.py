@@ -49,24 +49,14 @@ PEAKS = (("numpy", "fp32"), ("torch", "fp32"), ("torch", "bf16"), ("torch", "int
 class Contender:
     """One row of a table.
 
-    Attributes
-    ----------
-    name : str
-    kind : str
-        A key of `turns.MAKERS`.
-    engine : str
-        A provider for the kinds ``"edgeperc"``, ``"default"`` and ``"session"``, else as `open_engine` or
+    kind : A key of `turns.MAKERS`.
+    engine : A provider for the kinds ``"edgeperc"``, ``"default"`` and ``"session"``, else as `open_engine` or
         `matrix_product` take it.
-    precision : str
-        As the provider or the engine takes it; empty if it has no choice.
-    paths : tuple of Path
-        Models.
-    cards : tuple of str
-        The models' cards, JSON.
-    image : Path or None
-        Input of a network alone, .npy.
-    inputs : tuple of Path
-        A camera's images, .npy, in place of the scans of the run.
+    precision : as the provider or the engine takes it; empty if it has no choice.
+    paths : models.
+    cards : the models' cards, JSON.
+    image : input of a network alone, .npy.
+    inputs : A camera's images, .npy, in place of the scans of the run.
     """
 
     name: str
@@ -158,7 +148,7 @@ def groups(
         ]
         pipelines = _pipelines([variant], provider, precision)
         if images:
-            pipelines = [replace(each, inputs=images) for each in (*pipelines, *_small_unet(variant))]
+            pipelines = [replace(pipeline, inputs=images) for pipeline in (*pipelines, *_small_unet(variant))]
         tables[f"{'Image' if images else 'Scan'} to result: {variant}"] = [
             *pipelines, *_full_networks([variant]), *alone, *peaks
         ]  # fmt: skip
@@ -177,14 +167,14 @@ def groups(
 
 def _pipelines(models: Sequence[Variant], provider: str, precision: str) -> list[Contender]:
     """All pipelines from scan to result. The first one is edgeperc's, the reference of the ratios."""
-    paths, cards = _paths(models), tuple(each.card.to_json() for each in models)
-    int8 = any(each.precision == "int8" for each in models)
-    own = dict.fromkeys(((provider, precision), ("cpu", "auto"), *([("openvino", "auto")] if int8 else OPENVINO)))
+    paths, cards = _paths(models), tuple(model.card.to_json() for model in models)
+    int8 = any(model.precision == "int8" for model in models)
+    settings = dict.fromkeys(((provider, precision), ("cpu", "auto"), *([("openvino", "auto")] if int8 else OPENVINO)))
     if (provider, precision) == ("auto", "auto") and available_providers() == ("cpu",):
-        del own["cpu", "auto"]  # the same as auto
+        del settings["cpu", "auto"]  # the same as auto
     others = (("onnxruntime", ""), *OPENVINO, *(() if int8 else (*SMALL, *TORCH)))  # torch cannot run the int8 graphs
     return [
-        *(Contender(f"edgeperc, {_label(name, kind)}", "edgeperc", name, kind, paths) for name, kind in own),
+        *(Contender(f"edgeperc, {_label(name, kind)}", "edgeperc", name, kind, paths) for name, kind in settings),
         *(Contender(f"numpy + {_label(name, kind)}", "pipeline", name, kind, paths, cards) for name, kind in others),
     ]
 
@@ -195,7 +185,7 @@ def _label(engine: str, precision: str) -> str:
 
 def _full_networks(models: Sequence[Variant]) -> list[Contender]:
     """The papers' networks of the same tasks, in torch; only a source checkout has their files."""
-    paths = tuple(each.path.parent / "research" / f"{each.name}-full.onnx" for each in models)
+    paths = tuple(model.path.parent / "research" / f"{model.name}-full.onnx" for model in models)
     if not all(path.exists() for path in paths):
         return []
     name, cards = " and ".join(path.stem for path in paths), tuple(ModelCard.read(path).to_json() for path in paths)
@@ -203,7 +193,7 @@ def _full_networks(models: Sequence[Variant]) -> list[Contender]:
 
 
 def _paths(models: Sequence[Variant]) -> tuple[Path, ...]:
-    return tuple(each.path for each in models)
+    return tuple(model.path for model in models)
 
 
 def _small_unet(variant: Variant) -> list[Contender]:

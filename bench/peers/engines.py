@@ -23,12 +23,8 @@ from .arithmetic import openvino_request
 class Engine:
     """A network ready to run.
 
-    Attributes
-    ----------
-    input : (C, H, W) float32
-        Write here, then `run`.
-    run : callable
-        Returns the outputs by their names in the graph, without the batch axis.
+    input : (C, H, W) float32; write here, then `run`.
+    run : returns the outputs by their names in the graph, without the batch axis.
     """
 
     input: NDArray[np.float32]
@@ -121,7 +117,7 @@ def _open_ncnn(path: Path, folder: Path, n_threads: int) -> Engine:
     import ncnn
 
     _, shape, names = _signature(path)
-    copied, spec = folder / path.name, importlib.util.find_spec("pnnx")  # pnnx writes beside the model
+    copied, spec = folder / path.name, importlib.util.find_spec("pnnx")  # pnnx writes next to the model
     copied.write_bytes(path.read_bytes())
     assert spec is not None
     assert spec.origin is not None

@@ -12,7 +12,7 @@ Every round handles the same scan once with each of these, in a new random order
 What is not installed is listed with the line that installs it, and left out. ``OMP_NUM_THREADS=1`` restricts Open3D to
 one core, as edgeperc always is.
 
-For every ground finder the command prints recall and precision, from the labels beside a SemanticKITTI scan
+For every ground finder the command prints recall and precision, from the labels next to a SemanticKITTI scan
 (``sequences/00/velodyne/000000.bin``), or from the simulator if no scan is given. Vegetation and unlabeled points do
 not count. ``--accuracy`` takes more scans and prints the means.
 """
@@ -135,7 +135,7 @@ def by_first_point(clusters: NDArray[np.signedinteger[Any]]) -> NDArray[np.int64
 
 
 def read_truth(scan: Path, n: int) -> Truth | None:
-    """The ground truth of a SemanticKITTI scan, from the labels beside it; None if there are none."""
+    """The ground truth of a SemanticKITTI scan, from the labels next to it; None if there are none."""
     path = scan.parent.parent / "labels" / f"{scan.stem}.label"
     if not path.is_file():
         return None
@@ -156,7 +156,7 @@ def simulated() -> tuple[Scan, Truth]:
 def recall_and_precision(mask: NDArray[np.bool_], truth: Truth) -> tuple[float, float]:
     """Recall and precision of a ground mask over the points that count."""
     ground, counts = truth
-    right, n_ground, n_found = (int(np.count_nonzero(of & counts)) for of in (mask & ground, ground, mask))
+    right, n_ground, n_found = (int(np.count_nonzero(mask_of & counts)) for mask_of in (mask & ground, ground, mask))
     return right / max(n_ground, 1), right / max(n_found, 1)
 
 
@@ -164,8 +164,10 @@ def table(title: str, ms: Mapping[str, NDArray[np.float64]], reference: str) -> 
     """Minimum and median of each call, and their ratios to the reference's."""
     rows = [["", "minimum, ms", "median, ms", "minimum x edgeperc", "median x edgeperc"]]
     for name, of_call in ms.items():
-        figures = [(float(of(of_call)), float(of(ms[reference]))) for of in (np.min, np.median)]
-        rows.append([name, *(number(own) for own, _ in figures), *(number(own / theirs, 1) for own, theirs in figures)])
+        figures = [(float(statistic(of_call)), float(statistic(ms[reference]))) for statistic in (np.min, np.median)]
+        rows.append(
+            [name, *(number(ours) for ours, _ in figures), *(number(ours / theirs, 1) for ours, theirs in figures)]
+        )
     return Section(title, (), rows)
 
 
@@ -200,11 +202,11 @@ def main() -> None:
     for path in arguments.accuracy:
         more = read_points(path)
         if (known := read_truth(path, len(more))) is None:
-            raise SystemExit(f"{path} has no labels beside it: expected ../labels/{path.stem}.label")
+            raise SystemExit(f"{path} has no labels next to it: expected ../labels/{path.stem}.label")
         scans.append((more, known))
 
     finders = ground_finders(peers)
-    ground_ms = measure({each: prepare(points) for each, prepare in finders.items()}, arguments.rounds)
+    ground_ms = measure({label: prepare(points) for label, prepare in finders.items()}, arguments.rounds)
     standing = points[~find_ground(points, mount_height_m=SENSOR.mount_height_m).mask]
     cluster_ms = measure(clusterers(standing, peers), arguments.rounds)
     print(f"{len(points):,} points of {name}, {len(standing):,} of them not ground; {arguments.rounds} rounds")
@@ -215,9 +217,9 @@ def main() -> None:
     ]
     if scans:
         rows = [["", "recall", "precision"]]
-        for each, prepare in finders.items():
+        for label, prepare in finders.items():
             figures = [recall_and_precision(prepare(scan)(), truth) for scan, truth in scans]
-            rows.append([each, *(share(float(mean)) for mean in np.mean(figures, axis=0))])
+            rows.append([label, *(share(float(mean)) for mean in np.mean(figures, axis=0))])
         parts.append(Section(f"Ground, means over {len(scans)} scans", (), rows))
     print(text(parts))
 

@@ -95,22 +95,22 @@ def vote(
     n_classes: int,
 ) -> NDArray[np.uint8]:
     """`edgeperc.objects.refine.label_points` of a view that is not a full turn, in numpy."""
-    found = np.where(pixel >= 0, labels.reshape(-1)[pixel], 0).astype(np.uint8)
+    classes = np.where(pixel >= 0, labels.reshape(-1)[pixel], 0).astype(np.uint8)
     hidden = np.flatnonzero((pixel >= 0) & (index.reshape(-1)[pixel] != np.arange(len(points))))
     distance = np.linalg.norm(points[:, :3].astype(np.float64), axis=1)
     ranges = np.pad(np.where(index >= 0, distance[index], np.inf), WINDOW, constant_values=np.inf)
     around = np.pad(labels, WINDOW)
     row, col = np.divmod(pixel[hidden], labels.shape[1])
     d_row, d_col = np.mgrid[: 2 * WINDOW + 1, : 2 * WINDOW + 1].reshape(2, -1)
-    at = row[:, None] + d_row, col[:, None] + d_col
-    gaps = np.abs(ranges[at] - distance[hidden, None])
+    cell = row[:, None] + d_row, col[:, None] + d_col
+    gaps = np.abs(ranges[cell] - distance[hidden, None])
     nearest = np.argsort(gaps, axis=1, kind="stable")[:, :N_VOTES]
-    votes = np.take_along_axis(around[at], nearest, axis=1).astype(np.int64)
+    votes = np.take_along_axis(around[cell], nearest, axis=1).astype(np.int64)
     votes[np.take_along_axis(gaps, nearest, axis=1) > MAX_RANGE_GAP_M] = n_classes
     same = (votes[:, :, None] == votes[:, None, :]).sum(axis=2) * (votes < n_classes)
     winner = np.take_along_axis(votes, same.argmax(axis=1)[:, None], axis=1)[:, 0]
-    found[hidden] = np.where(winner < n_classes, winner, 0)
-    return found
+    classes[hidden] = np.where(winner < n_classes, winner, 0)
+    return classes
 
 
 def _heights(projector: NumpyTopView | NumpyRangeImage, points: NDArray[np.float32]) -> NDArray[np.float32] | None:
@@ -139,7 +139,7 @@ def dense_boxes(card: ModelCard, logits: NDArray[np.float32], dense: NDArray[np.
     for k in range(len(rows)):
         place, size = (float(x[k]), float(y[k]), float(z[k])), tuple(sizes[k].tolist())
         box = Box("", float(1.0 / (1.0 + math.exp(-score[k]))), place, size, float(yaw[k]))
-        if any(iou(box, kept) > card.nms_iou for kept in boxes):
+        if any(iou(box, better) > card.nms_iou for better in boxes):
             continue
         reach = math.hypot(*size[:2]) / 2.0
         near_rows, near_cols = np.flatnonzero(abs(all_x - x[k]) < reach), np.flatnonzero(abs(all_y - y[k]) < reach)

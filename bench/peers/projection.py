@@ -66,7 +66,7 @@ def fill_copy(points: NDArray[np.float32], copy: NDArray[np.float32]) -> None:
 
 
 class _NumpyProjector:
-    """A projector in numpy: the kernel's computation in float32, on all points at once."""
+    """A projector in numpy: the kernel's computation in float32, on all points in one pass."""
 
     def __init__(self, view: TopViewGeometry | RangeImageGeometry, input: InputSpec) -> None:
         self.shape = (len(input.channels), view.height, view.width)

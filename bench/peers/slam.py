@@ -75,22 +75,13 @@ Odometry = Callable[[Sequence[Points]], Poses]
 class Drive:
     """Consecutive scans.
 
-    Attributes
-    ----------
-    name : str
     scans : list of (n, 4) float32
-    poses : (k, 4, 4) float64 or None
-        True poses of the sensor.
-    moving : list of (n,) bool, or None
-        Points on objects that move; None: from ``labels``.
-    usable : list of (n,) bool
-        Points for KISS-ICP.
-    known : list of (n,) bool
-        Points of which it is known whether they move.
-    labels : list of list of Box
-        True boxes of each scan, of all objects; empty if ``moving`` is known.
-    trained : bool
-        Whether a model was trained on one of the scans.
+    poses : (k, 4, 4) float64 or None; true poses of the sensor.
+    moving : list of (n,) bool, or None; points on objects that move; None: from ``labels``.
+    usable : list of (n,) bool; points for KISS-ICP.
+    known : list of (n,) bool; points of which it is known whether they move.
+    labels : true boxes of each scan, of all objects; empty if ``moving`` is known.
+    trained : whether a model was trained on one of the scans.
     """
 
     name: str
@@ -110,7 +101,7 @@ def drawn_streets(n_scans: int, wanted: Sequence[str] = ()) -> Iterator[Drive]:
             continue
         scans, poses, moving, usable = [], [], [], []
         scene = random_scene(seed, place)
-        moves = np.array([*(abs(each.speed_mps) > 0.5 for each in scene.objects), False])  # -1 is the background
+        moves = np.array([*(abs(thing.speed_mps) > 0.5 for thing in scene.objects), False])  # -1 is the background
         for _, pose, scan in simulate_sequence(scene, "hdl-64e", n_scans, RATE_HZ, speed, seed):
             scans.append(scan.points)
             poses.append(pose)
@@ -127,7 +118,7 @@ def real_drives(
     data = KittiObjects(root)
     for drive in sorted({*data.drives.values()}):
         names = [name for name, of in data.drives.items() if of == drive][:most]
-        if len(names) < least or (wanted and not any(drive.endswith(each) for each in wanted)):
+        if len(names) < least or (wanted and not any(drive.endswith(ending) for ending in wanted)):
             continue
         scans, known, labels, trained = [], [], [], False
         for name in names:
@@ -165,7 +156,7 @@ def moving_boxes(labels: Sequence[Sequence[Box]], poses: Poses) -> list[list[Box
         [
             box
             for index, box in enumerate(boxes)
-            if any(abs(k - at) <= MOVING_AROUND for at in moves.get(numbers[k].get(index, -1), []))
+            if any(abs(k - frame) <= MOVING_AROUND for frame in moves.get(numbers[k].get(index, -1), []))
         ]
         for k, boxes in enumerate(labels)
     ]
@@ -234,14 +225,8 @@ def kiss_icp(scans: Sequence[Points]) -> Poses:
 class Seen:
     """What is left out of the scans of a drive, and the median processor time of a scan.
 
-    Attributes
-    ----------
-    kept : dict of str to list of (n,) bool
-        By variant, in their order; without the second pass.
-    perceptions : list of Perception
-    poses : (k, 4, 4) float64
-        Of the sensor, as the tracker estimates them.
-    ms : float
+    kept : dict of str to list of (n,) bool; by variant, in their order; without the second pass.
+    poses : (k, 4, 4) float64; of the sensor, as the tracker estimates them.
     """
 
     kept: dict[str, list[NDArray[np.bool_]]]
@@ -253,18 +238,18 @@ class Seen:
 def look(perceive: Callable[..., Any], drive: Drive) -> Seen:
     """Perceive and track a drive, without its poses."""
     tracker, perceptions, poses, ms = Tracker(), list[Perception](), [], []
-    kept: dict[str, list[NDArray[np.bool_]]] = {name: [] for name in (ALL, MOVING, MOVABLE)}
+    masks: dict[str, list[NDArray[np.bool_]]] = {name: [] for name in (ALL, MOVING, MOVABLE)}
     for k, points in enumerate(drive.scans):
         started = time.process_time()
         perceptions.append(perceive(points, k / RATE_HZ))
         tracks = tracker(perceptions[-1])
         moving = moving_points(tracks, points)
-        kept[MOVING].append(~moving)
-        kept[MOVABLE].append(~(moving | movable_points(perceptions[-1], points)))
+        masks[MOVING].append(~moving)
+        masks[MOVABLE].append(~(moving | movable_points(perceptions[-1], points)))
         ms.append(1e3 * (time.process_time() - started))
-        kept[ALL].append(np.ones(len(points), np.bool_))
+        masks[ALL].append(np.ones(len(points), np.bool_))
         poses.append(tracks.T_world_sensor)
-    return Seen(kept, perceptions, np.array(poses), float(np.median(ms)))
+    return Seen(masks, perceptions, np.array(poses), float(np.median(ms)))
 
 
 def compared(
@@ -280,10 +265,10 @@ def compared(
             tracker, stays = Tracker(), []
             for points, perception, pose in zip(drive.scans, seen.perceptions, first, strict=True):
                 stays.append(~moving_points(tracker(perception, pose), points))
-            kept = stays
+            staying = stays
         else:
-            kept = seen.kept[name]
-        scans = chosen(drive, kept)
+            staying = seen.kept[name]
+        scans = chosen(drive, staying)
         started = time.process_time()
         poses, gap = closure(odometry, scans)
         ms = 1e3 * (time.process_time() - started) / (2 * len(scans) - 1)
@@ -293,11 +278,11 @@ def compared(
                 on_objects(points, boxes)
                 for points, boxes in zip(drive.scans, moving_boxes(drive.labels, poses), strict=True)
             ]
-        counted = [np.logical_and.reduce(masks) for masks in zip(kept, drive.known, drive.usable, strict=True)]
+        counted = [np.logical_and.reduce(masks) for masks in zip(staying, drive.known, drive.usable, strict=True)]
         n_still = sum(int(np.count_nonzero(known & ~moves)) for known, moves in zip(drive.known, moving, strict=True))
         n_lost = sum(
             int(np.count_nonzero(known & ~moves & ~mask))
-            for known, moves, mask in zip(drive.known, moving, kept, strict=True)
+            for known, moves, mask in zip(drive.known, moving, staying, strict=True)
         )
         way_m = float(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1).sum())
         known = any(mask.any() for mask in drive.known)
@@ -334,11 +319,11 @@ def per_cent(value: float) -> str:
 
 def on_objects(points: Points, boxes: Sequence[Box]) -> NDArray[np.bool_]:
     """The points (n, 4) inside boxes, above the ground, (n,) bool."""
-    found = np.zeros(len(points), np.bool_)
+    is_object = np.zeros(len(points), np.bool_)
     for box in boxes:
         bottom = box.center[2] - box.size[2] / 2.0
-        found |= inside(box, points, 0.1) & (points[:, 2] > bottom + GROUND_M)
-    return found
+        is_object |= inside(box, points, 0.1) & (points[:, 2] > bottom + GROUND_M)
+    return is_object
 
 
 def draw_maps(drive: Drive, seen: Seen, odometry: Odometry, path: Path) -> None:
@@ -346,10 +331,10 @@ def draw_maps(drive: Drive, seen: Seen, odometry: Odometry, path: Path) -> None:
     pyplot = require("matplotlib.pyplot", "view", "Drawing a picture")
     figure, axes = pyplot.subplots(3, 1, figsize=(9.0, 8.2), dpi=100, sharex=True, sharey=True)
     assert drive.moving is not None
-    for axis, (name, kept) in zip(axes, seen.kept.items(), strict=True):
-        poses = odometry(chosen(drive, kept))
+    for axis, (name, mask) in zip(axes, seen.kept.items(), strict=True):
+        poses = odometry(chosen(drive, mask))
         still, ghosts = [], []
-        for points, stays, moves, pose in zip(drive.scans, kept, drive.moving, poses, strict=True):
+        for points, stays, moves, pose in zip(drive.scans, mask, drive.moving, poses, strict=True):
             placed = points[:, :3] @ pose[:3, :3].T + pose[:3, 3]
             standing = stays & (points[:, 2] > -1.4)
             still.append(placed[standing & ~moves][::7])
@@ -388,7 +373,7 @@ def main() -> None:
     arguments = parser.parse_args()
     require("kiss_icp", "slam", "The comparison with KISS-ICP", package="kiss-icp")
     if arguments.picture and arguments.root is not None:
-        parser.error("--picture is of a drawn street; leave ROOT out")
+        parser.error("--picture shows a drawn street; leave ROOT out")
     perceive = Perceiver(sensor="hdl-64e", full_turn=True)
     drives = (
         drawn_streets(arguments.scans or 60, arguments.drive)

@@ -99,9 +99,9 @@ def every_second_beam(root: Path, out: Path) -> None:
         points = np.fromfile(path, np.float32).reshape(-1, 4)
         azimuth = np.arctan2(points[:, 1], points[:, 0]) % (2.0 * np.pi)
         beam = np.concatenate([[0], np.cumsum(np.diff(azimuth) < -np.pi)])
-        kept = points[beam % 2 == 0]
-        kept[:, 3] = 255.0 * kept[:, 3] ** 2
-        kept.tofile(out / "training/velodyne" / path.name)
+        sparse = points[beam % 2 == 0]
+        sparse[:, 3] = 255.0 * sparse[:, 3] ** 2
+        sparse.tofile(out / "training/velodyne" / path.name)
     full = get_sensor("hdl-64e")
     half = replace(
         full,

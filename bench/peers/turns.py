@@ -41,7 +41,7 @@ Calls = list[Callable[[], object]]
 
 
 def make_perceiver(contender: Contender, scans: Sequence[NDArray[Any]], sensor: str, n_threads: int) -> Calls:
-    """edgeperc itself; as by default, without a number of threads, both networks run at once, with one thread each."""
+    """edgeperc; as by default, without a number of threads, both networks run concurrently, each on one thread."""
     perceive = Perceiver(
         list(contender.paths),
         sensor=sensor,
@@ -172,8 +172,8 @@ def measure(
     running: list[tuple[Measured, Any, Any]] = []
     try:
         for contender in contenders:
-            measured.append(each := Measured(contender, missing=why_missing(contender)))
-            if each.missing:
+            measured.append(contest := Measured(contender, missing=why_missing(contender)))
+            if contest.missing:
                 continue
             note(contender.name)
             here, there = spawn.Pipe()
@@ -182,18 +182,18 @@ def measure(
             with _threads(n_threads):
                 process.start()
             there.close()
-            running.append((each, here, process))
-            if (content := _receive(each, here)) is not None:
-                each.predictions = content
+            running.append((contest, here, process))
+            if (content := _receive(contest, here)) is not None:
+                contest.predictions = content
         for _ in range(n_rounds):
             for k in rng.permutation(len(running)):
-                each, here, _ = running[k]
-                if each.missing:
+                contest, here, _ = running[k]
+                if contest.missing:
                     continue
                 time.sleep(PAUSE_S)
                 here.send("turn")
-                if (content := _receive(each, here)) is not None:
-                    each.rounds.append(content)
+                if (content := _receive(contest, here)) is not None:
+                    contest.rounds.append(content)
     finally:
         for _, here, _ in running:
             here.close()

@@ -26,6 +26,7 @@ from ..objects.cluster import MIN_PERSON_SHARE, PART_OF, find_clusters
 from ..objects.linkage import Strips
 from ..objects.persons import complete_persons
 from ..system.kernel_cache import njit
+from ..types import choices
 from ..types.mounting import MODEL_HEIGHT_M
 from ..types.perception import Box, PointLabels, TopView
 from ..types.points import read_only
@@ -41,9 +42,7 @@ from .votes import (
     find_persons_alone,
 )
 
-RULES = frozenset(
-    {"column", "share", "height", "cells", "fill", "person", "support", "ground", "boxes", "stand", "road"}
-)
+RULES = frozenset(choices.RULES)
 """Names of the rules, for ablations.
 
 ``"column"``: a person whose column of points goes on above a person's height is a pole. ``"share"``: a cluster loses a

@@ -9,17 +9,15 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+from ..inference import providers
+from ..types import choices
+from ..types.choices import DEFAULT_MODELS, DEFAULT_SENSOR
+
 Commands = Any  # what ArgumentParser.add_subparsers returns; argparse keeps its class private
 _WIDTH = 78
 
-# Copies of the values in `zoo`, `inference.session` and `agreement.rules`. Those modules import numpy, which
-# would delay --help.
-DEFAULT = ("ssadnet", "pointseg")
-CAMERA = "camseg"
-DEFAULT_SENSOR = "hdl-64e"
-PROVIDERS = ("auto", "cpu", "openvino", "cuda", "tensorrt", "tensorrt-rtx", "coreml", "directml", "qnn", "webgpu")
-RULES = ("boxes", "cells", "column", "fill", "ground", "height", "person", "road", "share", "stand", "support")
-PRECISIONS = ("auto", "fp32", "bf16", "int8")
+PROVIDERS = ("auto", *sorted(providers.PROVIDERS))
+PRECISIONS = ("auto", *choices.PRECISIONS)
 
 
 def add_command(
@@ -49,20 +47,6 @@ def add_command(
     )
     parser.set_defaults(command=command, usage_error=parser.error)
     return parser
-
-
-class Renamed(argparse.Action):
-    """An option that was renamed: using it is an error that names the new one (``const``)."""
-
-    def __call__(
-        self,
-        parser: argparse.ArgumentParser,
-        namespace: argparse.Namespace,
-        values: Any,
-        option_string: str | None = None,
-    ) -> None:
-        """End with usage error 2."""
-        parser.error(f"{option_string} is now {self.const}")
 
 
 def add_sensor(group: Any, *, required: bool = False, of_capture: bool = False) -> None:
@@ -130,7 +114,7 @@ def add_topic(group: Any) -> None:
     )
 
 
-def add_model(group: Any, default: Sequence[str] = DEFAULT) -> None:
+def add_model(group: Any, default: Sequence[str] = DEFAULT_MODELS) -> None:
     """Add ``--model``, which may be repeated."""
     group.add_argument(
         "--model",
@@ -183,9 +167,6 @@ def add_network(group: Any) -> None:
         help="run the range-image model on all four quarters of the turn, so that every point around the vehicle gets "
         "a class; the network takes four times as long (default: only the quarter ahead)",
     )
-    group.add_argument(
-        "--all-around", action=Renamed, nargs=0, const="--full-turn", default=argparse.SUPPRESS, help=argparse.SUPPRESS
-    )
 
 
 def add_boxes_from(group: Any) -> None:
@@ -214,7 +195,6 @@ def add_adapt(group: Any) -> None:
     """Add ``--adapt``."""
     group.add_argument(
         "--adapt",
-        type=_adaptation,
         choices=("both", "remission", "interpolation", "none"),
         default="both",
         help="how to adapt scans of a sensor other than the training sensor: remission maps its remission to the "
@@ -255,9 +235,3 @@ def add_figures_file(group: Any) -> None:
         metavar="FILE",
         help="write all figures to this JSON file, with the command line that produced them (default: tables only)",
     )
-
-
-def _adaptation(text: str) -> str:
-    if text == "neither":
-        raise argparse.ArgumentTypeError("neither is now none")
-    return text

@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..errors import MissingExtraError
-from .arguments import CAMERA, DEFAULT, Commands, add_command, add_model, add_network
+from ..types.choices import CAMERA, DEFAULT_MODELS
+from .arguments import Commands, add_command, add_model, add_network
 from .output import one_line, print_rows
 from .run import make_perceiver
 
@@ -72,7 +73,7 @@ def demo_command(arguments: argparse.Namespace) -> int:
     from ..zoo import shipped_models
 
     if arguments.camera and not arguments.model and CAMERA in shipped_models():
-        arguments.model = [*DEFAULT, CAMERA]
+        arguments.model = [*DEFAULT_MODELS, CAMERA]
     perceive = make_perceiver(arguments, sensor="hdl-64e", on_mismatch="ignore")
     scan = simulate(random_scene(*DEMO_SCENE), "hdl-64e", DEMO_SCENE[0])
     image = None
@@ -90,8 +91,8 @@ def demo_command(arguments: argparse.Namespace) -> int:
     if perception.top_view is not None:
         area_m2 = perception.top_view.drivable_area_m2
         rows.append(("drivable", f"{area_m2:.0f} m2 of the {_extent(perception)} ahead"))
-    found = [_box_text(box) for box in perception.boxes] or ["none"]
-    rows += [("boxes" if k == 0 else "", text) for k, text in enumerate(found)]
+    texts = [_box_text(box) for box in perception.boxes] or ["none"]
+    rows += [("boxes" if k == 0 else "", text) for k, text in enumerate(texts)]
     if perception.points is not None:
         true = np.bincount(scan.labels[perception.points.in_view], minlength=len(perception.points.classes))
         for k, (name, count) in enumerate(perception.points.counts().items()):
@@ -129,17 +130,17 @@ def _camera_rows(
     from ..simulation.camera import CAMERA_CLASSES, VOID, true_classes
     from ..types.perception import ImageLabels
 
-    rows = [("image", f"{calibration.width} x {calibration.height} pixels, drawn from the scene; it is no photograph")]
-    known, found, source = drawn.labels != VOID, perception.image, "the network's classes"
-    if found is None:
+    rows = [("image", f"{calibration.width} x {calibration.height} pixels, drawn from the scene, not a photograph")]
+    known, labels, source = drawn.labels != VOID, perception.image, "the network's classes"
+    if labels is None:
         rows.append(("camera", "no model of a camera's images ran"))
     else:
         names = [name.casefold() for name in CAMERA_CLASSES]
-        to_camvid = np.array([names.index(n) if (n := name.casefold()) in names else VOID for name in found.classes])
-        share = float(np.mean(to_camvid[found.labels[known]] == drawn.labels[known]))
+        to_camvid = np.array([names.index(n) if (n := name.casefold()) in names else VOID for name in labels.classes])
+        share = float(np.mean(to_camvid[labels.labels[known]] == drawn.labels[known]))
         rows.append(("camera", f"{100.0 * share:.0f} % of the pixels get their true class"))
         rows.append(("", "The network was trained on photographs; a drawing says little about its accuracy."))
-    if found is None or share < _GOOD_PIXELS:
+    if labels is None or share < _GOOD_PIXELS:
         perception = replace(perception, image=ImageLabels(drawn.labels, CAMERA_CLASSES))
         source = "the scene's true classes, not those of a network"
     painted = paint(perception, scan.points, calibration)

@@ -19,7 +19,8 @@ from typing import Any, Literal
 
 from .. import __version__
 from ..errors import EdgepercError, MissingExtraError
-from .arguments import DEFAULT, Commands, add_command
+from ..types.choices import DEFAULT_MODELS
+from .arguments import Commands, add_command
 from .output import many, one_line, print_columns, print_line
 
 # Extras for work on edgeperc itself, and the builds of onnxruntime, of which one at a time can be installed.
@@ -34,15 +35,10 @@ _REINSTALL = "pip install --force-reinstall edgeperc"
 class Finding:
     """One line of the report.
 
-    Attributes
-    ----------
-    name : str
-        What was examined, e.g. ``"cache folder"``.
-    state : {"ok", "note", "broken"}
-        ``"note"`` is something that edgeperc works without; ``"broken"`` something that it needs.
-    found : str
-    advice : str
-        A command or what to do; empty if nothing is to be done.
+    name : what was examined, e.g. ``"cache folder"``.
+    state : {"ok", "note", "broken"}; ``"note"`` is something that edgeperc works without; ``"broken"`` something that
+        it needs.
+    advice : A command or what to do; empty if nothing is to be done.
     """
 
     name: str
@@ -125,22 +121,22 @@ def _processor() -> Iterator[Finding]:
 
     present = cpu_features()
     for precision, features in (("int8", INT8_FEATURES), ("bf16", BF16_FEATURES)):
-        found = ", ".join(sorted(features & present))
+        present_here = ", ".join(sorted(features & present))
         yield Finding(
             precision,
-            "ok" if found else "note",
-            f"fast here ({found})" if found else "no instructions for it here; fp32 is used",
+            "ok" if present_here else "note",
+            f"fast here ({present_here})" if present_here else "no instructions for it here; fp32 is used",
         )
 
 
 def _installed(prefix: str = "") -> dict[str, str]:
     """Version of each installed distribution whose name has this beginning."""
-    found: dict[str, str] = {}
-    for each in importlib.metadata.distributions():
-        name = each.metadata["Name"]  # None if its folder is damaged
+    versions: dict[str, str] = {}
+    for distribution in importlib.metadata.distributions():
+        name = distribution.metadata["Name"]  # None if its folder is damaged
         if name and name.lower().replace("_", "-").startswith(prefix):
-            found.setdefault(name.lower().replace("_", "-"), each.version)
-    return found
+            versions.setdefault(name.lower().replace("_", "-"), distribution.version)
+    return versions
 
 
 def _packages() -> Iterator[Finding]:
@@ -194,8 +190,8 @@ def _kernels() -> Iterator[Finding]:
     if moved.tolist() != [[2.0, 2.0, 2.0, 1.0]]:
         yield Finding("kernels", "broken", f"a kernel gave {moved.tolist()}", "pip install --force-reinstall numba")
         return
-    kept = getattr(fill_moved, "_cache", None)
-    place = None if kept is None else kept.cache_path
+    cache = getattr(fill_moved, "_cache", None)
+    place = None if cache is None else cache.cache_path
     compiled = f"compiled or loaded in {took_s:.1f} s"
     if place is None:
         keep = "set NUMBA_CACHE_DIR to a folder that only you can write"
@@ -216,8 +212,8 @@ def _providers() -> Iterator[Finding]:
         if short not in present and find_spec(package) is not None:
             yield Finding(f"plugin {short}", "note", "installed, but finds no device on this computer")
     yield Finding("providers", "ok", f"{', '.join(present)}; 'edgeperc providers' says how to install others")
-    found = devices()
-    yield Finding("devices", "ok", ", ".join(found) or "this version of onnxruntime does not list them")
+    names = devices()
+    yield Finding("devices", "ok", ", ".join(names) or "this version of onnxruntime does not list them")
 
 
 def _caches() -> Iterator[Finding]:
@@ -238,14 +234,14 @@ def _caches() -> Iterator[Finding]:
         if name != "cache folder" and not part.exists():
             continue
         reason = _unwritable(part) or (unsafe_because(part.stat()) if part.exists() else None)
-        held = _size(part) if part.exists() else "not made yet"
+        content = _size(part) if part.exists() else "not made yet"
         if reason is None:
-            yield Finding(name, "ok", f"{part}: {held}, writable")
+            yield Finding(name, "ok", f"{part}: {content}, writable")
         else:
             again = "every start compiles again; set EDGEPERC_CACHE_DIR to a folder that only you can write"
-            yield Finding(name, "note", f"{part}: {held}, {reason}", again)
+            yield Finding(name, "note", f"{part}: {content}, {reason}", again)
     try:
-        measured = [read_setting(settings_path(), fingerprint(), digest(resolve(model))) for model in DEFAULT]
+        measured = [read_setting(settings_path(), fingerprint(), digest(resolve(model))) for model in DEFAULT_MODELS]
     except SettingsError as exc:
         yield Finding("settings", "note", one_line(exc))
         return
@@ -276,7 +272,7 @@ def _models() -> Iterator[Finding]:
     listed = page.read_text("utf-8") if page.is_file() else ""
     if not listed:
         yield Finding("MODELS.md", "note", "missing, so that the models' hashes are not compared", _REINSTALL)
-    found = set()
+    names = set()
     for entry in sorted(folder.iterdir(), key=lambda entry: entry.name):
         if not entry.name.endswith(".onnx"):
             continue
@@ -287,25 +283,25 @@ def _models() -> Iterator[Finding]:
             yield _broken(f"model {path.name}", exc, _REINSTALL)
             continue
         sha256 = hashlib.sha256(path.read_bytes()).hexdigest()
-        found.add(card.name)
+        names.add(card.name)
         if listed and sha256 not in listed:
             other = f"SHA-256 {sha256} is not in MODELS.md, so it is not the file of this release"
             yield Finding(f"model {path.name}", "broken", other, _REINSTALL)
         else:
             checked = "as in MODELS.md" if listed else "not compared"
             yield Finding(f"model {path.name}", "ok", f"{card.name} {card.version}, SHA-256 {sha256[:16]}... {checked}")
-    for name in DEFAULT:
-        if name not in found:
+    for name in DEFAULT_MODELS:
+        if name not in names:
             yield Finding(f"model {name}", "broken", "missing", _REINSTALL)
-    yield from _runs(found)
+    yield from _runs(names)
 
 
-def _runs(found: set[str]) -> Iterator[Finding]:
+def _runs(names: set[str]) -> Iterator[Finding]:
     """Whether the default models open and answer their golden inputs, with the provider that is chosen here."""
     from ..inference.session import Session
 
-    for name in DEFAULT:
-        if name in found:
+    for name in DEFAULT_MODELS:
+        if name in names:
             try:
                 yield Finding(f"runs {name}", "ok", Session(name).description)
             except MissingExtraError:  # `_packages` reports it
@@ -326,8 +322,8 @@ def _extras() -> Iterator[Finding]:
         return
     needed = [requirement(text) for text in metadata.get_all("Requires-Dist") or ()]
     versions = _installed()
-    for each, fault in _faults(needed, "", versions):
-        yield Finding(each, "broken", fault, f"pip install '{each}'")
+    for package, fault in _faults(needed, "", versions):
+        yield Finding(package, "broken", fault, f"pip install '{package}'")
     present = []
     for extra in sorted(metadata.get_all("Provides-Extra") or ()):
         faults = _faults(needed, extra, versions)
@@ -344,17 +340,19 @@ def _extras() -> Iterator[Finding]:
 def _faults(needed: list[Any], extra: str, versions: dict[str, str]) -> list[tuple[str, str]]:
     """Requirements of an extra, or of edgeperc itself, that are not met: each with what is wrong."""
     faults = []
-    for each in needed:
-        of_extra = each.marker is not None and "extra" in str(each.marker)
-        if of_extra != bool(extra) or (each.marker is not None and not each.marker.evaluate({"extra": extra})):
+    for requirement in needed:
+        of_extra = requirement.marker is not None and "extra" in str(requirement.marker)
+        if of_extra != bool(extra) or (
+            requirement.marker is not None and not requirement.marker.evaluate({"extra": extra})
+        ):
             continue
-        name = each.name.lower().replace("_", "-")
+        name = requirement.name.lower().replace("_", "-")
         if name == "edgeperc":  # an extra that consists of others
-            for other in sorted(each.extras):
+            for other in sorted(requirement.extras):
                 faults += _faults(needed, other, versions)
         elif name not in versions:
-            faults.append((str(each).partition(";")[0].strip(), f"{name} is missing"))
-        elif not each.specifier.contains(versions[name], prereleases=True):
-            wanted = f"{name} is {versions[name]}, expected {each.specifier}"
-            faults.append((str(each).partition(";")[0].strip(), wanted))
+            faults.append((str(requirement).partition(";")[0].strip(), f"{name} is missing"))
+        elif not requirement.specifier.contains(versions[name], prereleases=True):
+            wanted = f"{name} is {versions[name]}, expected {requirement.specifier}"
+            faults.append((str(requirement).partition(";")[0].strip(), wanted))
     return faults

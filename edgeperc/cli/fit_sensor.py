@@ -51,14 +51,14 @@ def fit_sensor_command(arguments: argparse.Namespace) -> int:
     from ..readers.captures import read_scans
     from ..types.sensor import get_sensor
 
-    found = find_scans(arguments.scans)
-    if found.empty:
-        raise PointsError(f"{found.empty[0]}: no scan in this folder; expected scans or captures")
+    files = find_scans(arguments.scans)
+    if files.empty:
+        raise PointsError(f"{files.empty[0]}: no scan in this folder; expected scans or captures")
     if arguments.out.suffix != ".json":
         raise SensorError(
             f"{arguments.out}: expected a name that ends in .json: --sensor reads other names as built-in sensors"
         )
-    scans = [points for path in found.paths for _, points in read_scans(path)]
+    scans = [points for path in files.paths for _, points in read_scans(path)]
     profile, functions = fit_sensor(scans, get_sensor(with_mounting(arguments.sensor, arguments)), arguments.to)
     assert profile.remission is not None
     arguments.out.parent.mkdir(parents=True, exist_ok=True)

@@ -165,21 +165,23 @@ def _suggest_ego_box(
     ((sensor, estimator),) = estimators.items()
     scans = (points for path in paths for _, points in read_scans(path, topic=arguments.topic))
     try:
-        found = suggest_ego_box(islice(scans, _MOST_SCANS), sensor, estimator.mounting())
+        suggestion = suggest_ego_box(islice(scans, _MOST_SCANS), sensor, estimator.mounting())
     except EdgepercError as exc:
         print_error(f"--suggest-ego-box: {exc}")
         return True
     if arguments.json:
-        print_line(json.dumps({"sensor": sensor.name, "suggested_ego_box": found.box, "n_places": found.n_places}))
-    elif found.box is None:
-        print_rows([("own vehicle", f"in {found.n_places} places, no return near the sensor stays where it is")])
+        print_line(
+            json.dumps({"sensor": sensor.name, "suggested_ego_box": suggestion.box, "n_places": suggestion.n_places})
+        )
+    elif suggestion.box is None:
+        print_rows([("own vehicle", f"in {suggestion.n_places} places, no return near the sensor stays where it is")])
     else:
-        option = " ".join(f"{value:g}" for axis in found.box for value in axis)
+        option = " ".join(f"{value:g}" for axis in suggestion.box for value in axis)
         print_rows(
             [
                 (
                     "own vehicle",
-                    f"returns in {found.n_directions} directions stay in {found.n_places} places: if the box",
+                    f"returns in {suggestion.n_directions} directions stay in {suggestion.n_places} places: if the box",
                 ),
                 ("", f"holds the own vehicle and nothing else, pass --ego-box {option}"),
             ]
@@ -242,7 +244,9 @@ def _model_rows(variants: Sequence[Variant]) -> list[tuple[str, str]]:
         rows.append(("boxes", f"{', '.join(card.box_classes)}, score from {card.score_threshold:g}"))
     rows += [(key, str(card.training[key])) for key in ("data", "licence") if key in card.training]
     rows += _accuracy_rows(card.metrics)
-    reduced = {name: of for variant in variants for name, of in variant.card.precisions.items() if name != "fp32"}
+    reduced = {
+        name: figures for variant in variants for name, figures in variant.card.precisions.items() if name != "fp32"
+    }
     for precision, agreement in reduced.items():
         loss, same = agreement.get("loss"), agreement.get("label_agreement")
         if isinstance(same, float):
@@ -254,7 +258,7 @@ def _model_rows(variants: Sequence[Variant]) -> list[tuple[str, str]]:
 def _accuracy_rows(metrics: Mapping[str, Any]) -> list[tuple[str, str]]:
     """The main figures on each evaluated kind of scans, over all distances, in per cent."""
     rows = []
-    for block, of in (("real", "KITTI"), ("semantickitti", "SemanticKITTI"), ("simulated", "simulation")):
+    for block, data in (("real", "KITTI"), ("semantickitti", "SemanticKITTI"), ("simulated", "simulation")):
         figures = metrics.get(block, {})
         points = figures.get("points", {}).get("all", {})
         parts = [f"IoU {name} {_percent(row.get('iou'))}" for name, row in points.items() if row.get("n_objects")]
@@ -267,7 +271,7 @@ def _accuracy_rows(metrics: Mapping[str, Any]) -> list[tuple[str, str]]:
         road = figures.get("road", {}).get("all", {})
         parts += [f"road F1 {_percent(road['f1'])}"] if road.get("f1") is not None else []
         if parts:
-            rows.append((f"on {of}", f"{figures.get('n_frames', '?')} scans, %: {', '.join(parts)}"))
+            rows.append((f"on {data}", f"{figures.get('n_frames', '?')} scans, %: {', '.join(parts)}"))
     return rows
 
 
@@ -332,52 +336,69 @@ def _scan_rows(
     path: Path, arguments: argparse.Namespace, estimators: dict[SensorProfile, MountingEstimator]
 ) -> tuple[list[tuple[str, str]], dict[str, Any]]:
     """Measure a scan and check which models suit it: rows to print, and the same measurements for JSON."""
-    import numpy as np
-
-    from ..ground.leveling import FROZEN_AFTER, MountingEstimator
-    from ..preprocess.condition import scale
-    from ..preprocess.findings import check_dropped, check_fitness
+    from ..preprocess.findings import check_dropped
     from ..preprocess.fitness import FitnessProfile
-    from ..preprocess.remission import RemissionMatcher
     from ..preprocess.returns import returns
-    from ..readers.captures import read_scans
     from ..types.frame import ModelFrame
     from ..types.sensor import get_sensor
-    from ..zoo import listed
 
     named, because = scan_sensor(path, arguments)
     sensor = get_sensor(named)
-    first: list[NDArray[np.float32]] = []
-    damage = ""
-    try:
-        first.extend(points for _, points in islice(read_scans(path, topic=arguments.topic), FROZEN_AFTER))
-    except PointsError as exc:
-        if not first:
-            raise
-        damage = str(exc)
-    points = first[0]
-    cleaned, dropped = zip(*(returns(each, sensor) for each in first), strict=True)
-    finite = cleaned[0][~np.isnan(cleaned[0][:, 0])].astype(np.float64)
+    scans, damage = _first_scans(path, arguments.topic)
+    cleaned, (dropped, *_) = zip(*(returns(scan, sensor) for scan in scans), strict=True)
     document: dict[str, Any] = {
         "scan": str(path),
-        "n_points": len(points),
-        "n_not_finite": dropped[0].not_finite,
-        "n_too_near": dropped[0].too_near,
-        "n_ego": dropped[0].ego,
+        "n_points": len(scans[0]),
+        "n_not_finite": dropped.not_finite,
+        "n_too_near": dropped.too_near,
+        "n_ego": dropped.ego,
         "sensor": sensor.name,
         "sensor_from": because,
     }
     rows = [
         ("scan", str(path)),
-        ("points", f"{len(points):,}, of which {_dropped_text(dropped[0], sensor)}"),
+        ("points", f"{len(scans[0]):,}, of which {_dropped_text(dropped, sensor)}"),
         ("sensor", f"{sensor.name}: {because}"),
     ]
     if damage:
-        rows.append(("damage", f"after {len(first)} scans: {damage}"))
-    unit = check_dropped(points, dropped[0], sensor)
+        rows.append(("damage", f"after {len(scans)} scans: {damage}"))
+    unit = check_dropped(scans[0], dropped, sensor)
     rows += [("unit", sentence) for sentence in unit]
-    if not len(finite):
+    extent_rows, extents = _extent_rows(cleaned[0])
+    if not extents:
         return rows, document
+    used, reported, remission_rows = _matched_remission(cleaned, sensor)
+    conditioned, estimator, mounting_rows, mounting = _mounting_rows(cleaned, sensor, used, estimators)
+    scan = ModelFrame(estimator.mounting()).move(conditioned[0])
+    (n_beams, _) = FitnessProfile.from_scans([scan]).beams
+    beams = ("beams", f"about {n_beams:.0f} rows of points ({sensor.name}: {sensor.n_beams})")
+    model_rows, findings = _suiting_models(scan, used, unit, reported)
+    document |= {**extents, "mounting": mounting, "beams": round(float(n_beams)), "models": findings}
+    return [*rows, *extent_rows, *remission_rows, *mounting_rows, beams, *model_rows], document
+
+
+def _first_scans(path: Path, topic: str | None) -> tuple[list[NDArray[np.float32]], str]:
+    """The scans that decide a mounting, and what damage comes after them."""
+    from ..ground.leveling import FROZEN_AFTER
+    from ..readers.captures import read_scans
+
+    scans: list[NDArray[np.float32]] = []
+    try:
+        scans.extend(points for _, points in islice(read_scans(path, topic=topic), FROZEN_AFTER))
+    except PointsError as exc:
+        if not scans:
+            raise
+        return scans, str(exc)
+    return scans, ""
+
+
+def _extent_rows(points: NDArray[np.float32]) -> tuple[list[tuple[str, str]], dict[str, list[float]]]:
+    """Extent, range, elevation and remission of the finite points; empty without any."""
+    import numpy as np
+
+    finite = points[~np.isnan(points[:, 0])].astype(np.float64)
+    if not len(finite):
+        return [], {}
     flat = np.hypot(finite[:, 0], finite[:, 1])
     measured = {
         **{f"{axis}_m": np.percentile(finite[:, k], [0, 100]) for k, axis in enumerate("xyz")},
@@ -385,35 +406,62 @@ def _scan_rows(
         "elevation_deg": np.percentile(np.degrees(np.arctan2(finite[:, 2], flat)), [0.5, 99.5]),
         "remission": np.percentile(finite[:, 3], [0, 5, 50, 95, 100]),
     }
-    document |= {name: [round(float(v), 4) for v in values] for name, values in measured.items()}
     extents = [f"{axis} {low:.1f} .. {high:.1f}" for axis in "xyz" for low, high in [measured[f"{axis}_m"]]]
-    rows += [
+    rows = [
         ("extent", f"{', '.join(extents)} m"),
         ("range", "{:.1f} .. {:.1f} m, median {:.1f} m".format(*measured["range_m"][[0, 2, 1]])),
         ("elevation", "{:.1f} .. {:.1f} deg (99 % of the points)".format(*measured["elevation_deg"])),
         ("remission", "min {:g}, 5 % {:g}, median {:g}, 95 % {:g}, max {:g}".format(*measured["remission"])),
     ]
-    matcher, used, said = RemissionMatcher(sensor), sensor, list[str]()
-    for each in cleaned:
-        matcher, used, more = matcher.add(each)
-        said += more
-    if used.remission is not None:
-        how = "" if used is sensor else f", {used.remission.source}"
-        rows.append(("", f"mapped to that of the {used.remission.to} by a {used.remission.kind}{how}"))
-    conditioned = [scale(each, used)[0] for each in cleaned]
-    own, reason = _estimated(MountingEstimator(sensor.mounting), conditioned)
-    estimators[sensor] = _estimated(estimators[sensor], conditioned)[0] if sensor in estimators else own
+    return rows, {name: [round(float(v), 4) for v in values] for name, values in measured.items()}
+
+
+def _matched_remission(
+    scans: Sequence[NDArray[np.float32]], sensor: SensorProfile
+) -> tuple[SensorProfile, list[str], list[tuple[str, str]]]:
+    """The profile with the remission function that the scans need, and what was reported on the way."""
+    from ..preprocess.remission import RemissionMatcher
+
+    matcher, used, reported = RemissionMatcher(sensor), sensor, list[str]()
+    for scan in scans:
+        matcher, used, sentences = matcher.add(scan)
+        reported += sentences
+    if used.remission is None:
+        return used, reported, []
+    how = "" if used is sensor else f", {used.remission.source}"
+    return used, reported, [("", f"mapped to that of the {used.remission.to} by a {used.remission.kind}{how}")]
+
+
+def _mounting_rows(
+    scans: Sequence[NDArray[np.float32]],
+    sensor: SensorProfile,
+    used: SensorProfile,
+    estimators: dict[SensorProfile, MountingEstimator],
+) -> tuple[list[NDArray[np.float32]], MountingEstimator, list[tuple[str, str]], dict[str, Any] | None]:
+    """Scaled scans and the mounting that they show; the sensor's estimator in ``estimators`` learns from them, too."""
+    from ..ground.leveling import MountingEstimator
+    from ..preprocess.condition import scale
+
+    conditioned = [scale(scan, used)[0] for scan in scans]
+    estimator, reason = _estimated(MountingEstimator(sensor.mounting), conditioned)
+    known = sensor in estimators
+    estimators[sensor] = _estimated(estimators[sensor], conditioned)[0] if known else estimator
     try:
-        estimate = own.estimate()
+        estimate = estimator.estimate()
     except MountingError:
-        rows.append(("mounting", f"cannot be estimated: {reason}"))
-        document["mounting"] = None
-    else:
-        rows.append(("mounting", str(estimate)))
-        document["mounting"] = estimate.to_dict()
-    scan = ModelFrame(own.mounting()).move(conditioned[0])
-    profile = FitnessProfile.from_scans([scan])
-    rows.append(("beams", f"about {profile.beams[0]:.0f} rows of points ({sensor.name}: {sensor.n_beams})"))
+        return conditioned, estimator, [("mounting", f"cannot be estimated: {reason}")], None
+    return conditioned, estimator, [("mounting", str(estimate))], estimate.to_dict()
+
+
+def _suiting_models(
+    scan: NDArray[np.float32], sensor: SensorProfile, unit: Sequence[str], reported: Sequence[str]
+) -> tuple[list[tuple[str, str]], dict[str, list[str] | None]]:
+    """For each model of scans, what speaks against it; None without a description of its training scans."""
+    from ..preprocess.findings import check_fitness
+    from ..preprocess.fitness import FitnessProfile
+    from ..zoo import listed
+
+    rows: list[tuple[str, str]] = []
     findings: dict[str, list[str] | None] = {}
     for card in {variant.name: variant.card for variant in listed()}.values():
         if card.view.kind == "camera":
@@ -422,10 +470,9 @@ def _scan_rows(
             findings[card.name] = None
             rows.append((card.name, "its card does not describe its training scans"))
             continue
-        found = (*unit, *check_fitness(scan, FitnessProfile.from_dict(card.fitness), used), *said)
-        findings[card.name] = list(found)
-        rows += [(card.name, f"as a scan of {sensor.name}: {sentence}") for sentence in found]
-        if not found:
+        sentences = [*unit, *check_fitness(scan, FitnessProfile.from_dict(card.fitness), sensor), *reported]
+        findings[card.name] = sentences
+        rows += [(card.name, f"as a scan of {sensor.name}: {sentence}") for sentence in sentences]
+        if not sentences:
             rows.append((card.name, f"suits this scan, taken as one of {sensor.name}"))
-    document |= {"beams": round(float(profile.beams[0])), "models": findings}
-    return rows, document
+    return rows, findings

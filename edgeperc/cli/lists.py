@@ -10,7 +10,8 @@ from dataclasses import fields
 from typing import Any
 
 from ..errors import SettingsError
-from .arguments import DEFAULT_SENSOR, Commands, add_command
+from ..types.choices import DEFAULT_SENSOR
+from .arguments import Commands, add_command
 from .output import print_columns, print_line
 
 
@@ -66,12 +67,12 @@ def models_command(arguments: argparse.Namespace) -> int:
     return _print(
         [{**_fields(model), "measured": setting} for model, setting in zip(listed, measured, strict=True)],
         {
-            "name": lambda of: of["name"],
-            "default": lambda of: _mark(of["default"]),
-            "for": lambda of: of["purpose"],
-            "size [MB]": lambda of: ", ".join(f"{precision} {mb:.1f}" for precision, mb in of["variants"].items()),
-            "measured here": lambda of: _measured(of["measured"]),
-            "licence": lambda of: of["licence"].partition(",")[0],
+            "name": lambda row: row["name"],
+            "default": lambda row: _mark(row["default"]),
+            "for": lambda row: row["purpose"],
+            "size [MB]": lambda row: ", ".join(f"{precision} {mb:.1f}" for precision, mb in row["variants"].items()),
+            "measured here": lambda row: _measured(row["measured"]),
+            "licence": lambda row: row["licence"].partition(",")[0],
         },
         arguments,
     )
@@ -84,14 +85,14 @@ def sensors_command(arguments: argparse.Namespace) -> int:
     return _print(
         [{**_fields(sensor), "default": sensor.name == DEFAULT_SENSOR} for sensor in sensors()],
         {
-            "name": lambda of: of["name"],
-            "default": lambda of: _mark(of["default"]),
-            "beams": lambda of: str(of["beams"]),
-            "elevations [deg]": lambda of: "{:g} .. {:g}".format(*of["field_of_view_deg"]),
-            "columns": lambda of: str(of["columns"]),
-            "remission": lambda of: "{:g} .. {:g}".format(*of["remission_range"]),
-            "range [m]": lambda of: "{:g} .. {:g}".format(*of["range_m"]),
-            "mapped to": lambda of: of["rendered_as"] or "-",
+            "name": lambda row: row["name"],
+            "default": lambda row: _mark(row["default"]),
+            "beams": lambda row: str(row["beams"]),
+            "elevations [deg]": lambda row: "{:g} .. {:g}".format(*row["field_of_view_deg"]),
+            "columns": lambda row: str(row["columns"]),
+            "remission": lambda row: "{:g} .. {:g}".format(*row["remission_range"]),
+            "range [m]": lambda row: "{:g} .. {:g}".format(*row["range_m"]),
+            "mapped to": lambda row: row["rendered_as"] or "-",
         },
         arguments,
     )
@@ -104,9 +105,9 @@ def providers_command(arguments: argparse.Namespace) -> int:
     return _print(
         [_fields(provider) for provider in providers()],
         {
-            "name": lambda of: of["name"],
-            "available": lambda of: _mark(of["available"]),
-            "installed by": lambda of: of["installed_by"],
+            "name": lambda row: row["name"],
+            "available": lambda row: _mark(row["available"]),
+            "installed by": lambda row: row["installed_by"],
         },
         arguments,
     )

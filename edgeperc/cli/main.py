@@ -20,12 +20,6 @@ from . import completion, demo, doctor, fit_sensor, info, lists, ros2, run
 from .evaluation import painting, scans, sensors, tracking
 from .program import Parser, run_program
 
-# Former two-part commands and their present names.
-_RENAMED = {
-    "eval sensors": "eval-sensors",
-    "eval tracking": "eval-tracking",
-    "adapt fit": "fit-sensor",
-}
 # Arguments of the library and the options that set them.
 _OPTIONS = {
     "agree": "--no-agreement",
@@ -63,10 +57,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _run(given: list[str]) -> int:
     parser = build_parser()
-    before = " ".join(given[:2])
-    if before in _RENAMED:
-        parser.error(f"{before!r} is now {_RENAMED[before]!r}: edgeperc {_RENAMED[before]} {shlex.join(given[2:])}")
-    if any("\0" in each for each in given):  # from Python; no shell passes it on
+    if any("\0" in argument for argument in given):  # from Python; no shell passes it on
         parser.error("an argument has a null character, which no file name and no value can have")
     known = argparse.Namespace(typed=shlex.join(["edgeperc", *given]), parser=parser)
     arguments = parser.parse_args(given, known)

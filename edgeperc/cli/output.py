@@ -17,7 +17,7 @@ from ..system.atomic import write_atomic
 from ..system.printable import printable
 
 FEW = " (n<10)"  # `edgeperc.evaluation.tables.FEWEST_OBJECTS`
-"""Beside names of classes with few objects."""
+"""Next to names of classes with few objects."""
 
 
 def one_line(text: object) -> str:

@@ -18,6 +18,7 @@ from types import FrameType
 from typing import Any, NoReturn, TextIO
 
 from ..errors import EdgepercError
+from ..system.names import nearest
 from ..system.printable import printable
 from .output import print_error, show_warning
 
@@ -25,7 +26,24 @@ _DELICATE = ("llvmlite.", "importlib._bootstrap", "edgeperc.sinks.kept_file", "l
 
 
 class Parser(argparse.ArgumentParser):
-    """A parser whose error messages may quote any argument, such as the name of a file from elsewhere."""
+    """A parser whose errors name the nearest option, command or choice, and may quote any argument from elsewhere."""
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> tuple[Any, list[str]]:
+        """Parse; an unknown option of a command is that command's error, with its usage."""
+        known, unknown = super().parse_known_args(args, namespace)
+        if unknown:
+            options = [argument.partition("=")[0] for argument in unknown if argument.startswith("--")]
+            close = "".join(nearest(option, self._option_string_actions) for option in options)
+            self.error(f"unrecognized arguments: {' '.join(unknown)}{close}")
+        return known, unknown
+
+    def _check_value(self, action: argparse.Action, value: Any) -> None:
+        try:
+            super()._check_value(action, value)
+        except argparse.ArgumentError as exc:
+            raise argparse.ArgumentError(
+                action, exc.message + nearest(str(value), map(str, action.choices or ()))
+            ) from exc
 
     def error(self, message: str) -> NoReturn:
         """Print the usage and the message, and exit with code 2."""
@@ -75,14 +93,14 @@ def run_program(program: str, command: Callable[[], int], message: Callable[[Exc
 
 def _unread() -> bool:
     """Whether the reader of stdout or stderr closed it. Such a stream is discarded from here on."""
-    found = False
+    is_closed = False
     for stream in (sys.stdout, sys.stderr):
         if _is_closed_pipe(stream):
             # Python flushes the streams again at exit, and would print an error.
             with Path(os.devnull).open("wb") as nowhere:
                 os.dup2(nowhere.fileno(), stream.fileno())
-            found = True
-    return found
+            is_closed = True
+    return is_closed
 
 
 def _is_closed_pipe(stream: TextIO) -> bool:

@@ -64,7 +64,7 @@ def add_engine(parser: argparse.ArgumentParser) -> None:
 def check_engine(arguments: argparse.Namespace, sinks: Sequence[str]) -> None:
     """Check for options that do not go with ``--engine ray`` or with URLs."""
     if arguments.workers is not None and arguments.engine != "ray":
-        arguments.usage_error("--workers is of --engine ray; add it")
+        arguments.usage_error("--workers needs --engine ray")
     in_order = [name for name in ("live", "track", "gif", "scan") if getattr(arguments, name)]
     in_order = [f"--{name.replace('_', '-')}" for name in (*in_order, *sinks)]
     if arguments.engine == "ray" and in_order:
@@ -72,13 +72,15 @@ def check_engine(arguments: argparse.Namespace, sinks: Sequence[str]) -> None:
             f"{in_order[0]} needs the scans in their order, and --engine ray perceives them side by side; leave out one"
         )
     if arguments.engine == "ray" and arguments.deskew:
-        arguments.usage_error("--deskew works with --engine local, not with ray; leave out one")
+        arguments.usage_error("--deskew needs --engine local")
     local = [name for name in in_order if name in ("--live", "--gif", "--labels-for")]
     urls = [path for path in (*arguments.paths, arguments.out) if isinstance(path, Remote)]
     if urls and local:
         arguments.usage_error(f"{local[0]} takes no URL such as {urls[0]}; copy the files to this computer")
     if arguments.engine == "ray" and any(url.url.startswith("memory:") for url in urls):
-        arguments.usage_error("memory:// is of one process, and --engine ray has several; pass another URL or a path")
+        arguments.usage_error(
+            "memory:// belongs to one process, and --engine ray has several; pass another URL or a path"
+        )
 
 
 def perceive_on_ray(
@@ -92,7 +94,7 @@ def perceive_on_ray(
 ) -> None:
     """Perceive scan files on a Ray cluster, and report them in their order.
 
-    Beside the files of a scan, ``.run/NAME.json`` records what they were made of: the scan, the options, the models,
+    Next to the files of a scan, ``.run/NAME.json`` records what they were made of: the scan, the options, the models,
     and what was learned from the first scans. A scan is not perceived again if its record says the same and its files
     have the recorded sizes. The first scans are always perceived again.
     """
@@ -132,14 +134,14 @@ def perceive_on_ray(
         workers=arguments.workers,
         n_threads=n_threads,
     )
-    said: set[str] = set()
+    reported: set[str] = set()
     n_kept = 0
     for done, (scan, answer) in enumerate(zip(scans[n_first:], answers, strict=True), start=n_first + 1):
         if isinstance(answer, Lost):
             answer = _Answer(report.text(scan, EdgepercError(answer.reason)), one_line(answer.reason), (), ())
         for message in answer.warnings:
             warnings.warn(message, stacklevel=2)
-        report.show(scan, _said_once(answer, said) if learned.is_settled else answer.text, answer.error)
+        report.show(scan, _said_once(answer, reported) if learned.is_settled else answer.text, answer.error)
         n_kept += answer.kept
         show(done, len(scans))
     if n_kept:
@@ -157,10 +159,10 @@ class _Answer:
     kept: bool = False
 
 
-def _said_once(answer: _Answer, said: set[str]) -> str:
+def _said_once(answer: _Answer, reported: set[str]) -> str:
     """The text without sentences of other scans: a perceiver says of its remission once what is wrong with it."""
-    text, again = answer.text, said & {*answer.fitness}
-    said |= {*answer.fitness}
+    text, again = answer.text, reported & {*answer.fitness}
+    reported |= {*answer.fitness}
     if again and text.startswith("{"):
         record = json.loads(text)
         record["fitness"] = [sentence for sentence in record["fitness"] if sentence not in again]
@@ -184,8 +186,8 @@ class _ScanWorker:
         files = self._files(target)
         record = target.parent / ".run" / f"{target.name}.json"
         made_of = hashlib.sha256(f"{self._made_of} {name} {_stamp(path)}".encode()).hexdigest()
-        if files and (kept := _kept(record, made_of, files)) is not None:
-            return kept
+        if files and (recorded := _kept(record, made_of, files)) is not None:
+            return recorded
         self._perceive.start_from(self._learned)
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
@@ -195,10 +197,13 @@ class _ScanWorker:
         ((_, outcome, _, _),) = outcomes
         if isinstance(outcome, EdgepercError):  # it names the absolute path
             outcome.args = (str(outcome).replace(str(path), str(name)),)
-        text, said = self._report.text(name, outcome), tuple(dict.fromkeys(str(each.message) for each in caught))
+        text, warned = (
+            self._report.text(name, outcome),
+            tuple(dict.fromkeys(str(warning.message) for warning in caught)),
+        )
         if isinstance(outcome, Exception):
-            return _Answer(text, str(outcome).removeprefix(f"{name}: "), (), said)
-        answer = _Answer(text, None, tuple(map(str, outcome.fitness)), said)
+            return _Answer(text, str(outcome).removeprefix(f"{name}: "), (), warned)
+        answer = _Answer(text, None, tuple(map(str, outcome.fitness)), warned)
         if files:
             sizes = {file.name: stamp[0] for file in files if (stamp := _stamp(file)) is not None}
             content = json.dumps({"made_of": made_of, "files": sizes, "answer": astuple(answer)}).encode()
@@ -219,10 +224,10 @@ def _kept(record: Path | Remote, made_of: str, files: Sequence[Path | Remote]) -
         stamps = {file.name: _stamp(file) for file in files}
         if any(stamp is None or stamp[0] != content["files"][name] for name, stamp in stamps.items()):
             return None
-        text, error, fitness, said, _ = content["answer"]
+        text, error, fitness, warned, _ = content["answer"]
     except (FileNotFoundError, KeyError, TypeError, ValueError):
         return None
-    return _Answer(text, error, tuple(fitness), tuple(said), kept=True)
+    return _Answer(text, error, tuple(fitness), tuple(warned), kept=True)
 
 
 def _stamp(file: Path | Remote) -> tuple[int, str] | None:
@@ -230,10 +235,10 @@ def _stamp(file: Path | Remote) -> tuple[int, str] | None:
     if isinstance(file, Remote):
         return file.stamp()
     try:
-        found = file.stat()
+        status = file.stat()
     except OSError:
         return None
-    return found.st_size, str(found.st_mtime_ns)
+    return status.st_size, str(status.st_mtime_ns)
 
 
 def _absolute(path: Path | Remote) -> Path | Remote:

@@ -21,14 +21,9 @@ if TYPE_CHECKING:
 class Report:
     """Prints the result of each scan, and counts scans and failures.
 
-    Attributes
-    ----------
-    n, n_failed : int
-        Number of scans, and of failed scans.
-    tracks : list of Tracks
-        Tracks of every scan, kept only for ``--gif``.
-    under : list of bytes
-        `edgeperc.view.flatten_scan` of every scan, drawn under the tracks.
+    n, n_failed : int; number of scans, and of failed scans.
+    tracks : list of Tracks; tracks of every scan, kept only for ``--gif``.
+    under : list of bytes; `edgeperc.view.flatten_scan` of every scan, drawn under the tracks.
     """
 
     def __init__(self, arguments: argparse.Namespace, images: Mapping[Path, Path | None]) -> None:

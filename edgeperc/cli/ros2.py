@@ -145,16 +145,16 @@ def ros2_command(arguments: argparse.Namespace) -> int:
         graph.close()
         raise
     print_line(f"{graph.name}: waiting for clouds on {arguments.topic}, publishing {arguments.prefix}/*")
-    n_answers, said = 0, ""
+    n_answers, reported = 0, ""
     with node:
         try:
             for outcome in node:
                 if isinstance(outcome, Exception):
-                    if str(outcome) != said:  # the same of every cloud is printed once; the diagnostics repeat it
+                    if str(outcome) != reported:  # the same of every cloud is printed once; the diagnostics repeat it
                         print_error(f"{arguments.topic}: {outcome}")
-                    said = str(outcome)
+                    reported = str(outcome)
                     continue
-                said = ""
+                reported = ""
                 n_answers += 1
                 if n_answers == 1:
                     print_line(f"perceiving: {many(outcome.perception.n_points, 'point')} in the first cloud")
@@ -174,12 +174,12 @@ def _open_graph(arguments: argparse.Namespace) -> Graph:
         from ..ros2.rclpy_graph import RclpyGraph
 
         if arguments.connect is not None:
-            arguments.usage_error("--connect is of Zenoh; leave it out, or leave out --rclpy")
+            arguments.usage_error("--connect needs Zenoh; leave it out, or leave out --rclpy")
         return RclpyGraph(arguments.name, ros_args=arguments.ros_args, **names)
     from ..ros2.zenoh_graph import ZenohGraph
 
     if arguments.ros_args:
-        arguments.usage_error("--ros-args is read by rclpy; add --rclpy, or pass the options of this command")
+        arguments.usage_error("--ros-args needs --rclpy; add it, or pass the options of this command")
     return ZenohGraph(arguments.name, connect=arguments.connect, **names)
 
 

@@ -15,10 +15,8 @@ from ..errors import EdgepercError, ImageError, ModelError, PointsError
 from ..records import PerceivedScan, Sink
 from ..system.extras import require
 from ..system.remote import Remote, location
+from ..types.choices import CAMERA, DEFAULT_MODELS, DEFAULT_SENSOR
 from .arguments import (
-    CAMERA,
-    DEFAULT,
-    DEFAULT_SENSOR,
     Commands,
     add_adapt,
     add_command,
@@ -201,7 +199,7 @@ def make_perceiver(
     from ..perceiver import Perceiver
 
     return Perceiver(
-        arguments.model or DEFAULT,
+        arguments.model or DEFAULT_MODELS,
         sensor=sensor,
         provider=arguments.provider,
         precision=arguments.precision,
@@ -228,10 +226,10 @@ def run_command(arguments: argparse.Namespace) -> int:
     names = output_names(scans, keep_folder=found.of_data_set) if kinds else []
     targets = [arguments.out / name for name in names] if kinds else [Path()] * len(scans)
     sources = {_real(source) for source in (*scans, *images.values()) if source is not None}
-    of = _pictures_of(arguments, images)
+    pictures = _pictures_of(arguments, images)
     whole = [getattr(arguments, name) for name in wanted_sinks(arguments)]
     for file in (
-        *(file for target in targets for file in _files_of(target, kinds, **of).values()),
+        *(file for target in targets for file in _files_of(target, kinds, **pictures).values()),
         *(value for value in whole if isinstance(value, Path)),
     ):
         if _real(file) in sources:
@@ -282,9 +280,9 @@ def _check_usage(arguments: argparse.Namespace, kinds: Sequence[str]) -> None:
     if arguments.live and (kinds or arguments.gif):
         arguments.usage_error(f"--live writes no files; leave out --{[*kinds, 'gif'][0]}")
     if (kinds or arguments.gif) and arguments.out is None:
-        arguments.usage_error(f"--{[*kinds, 'gif'][0]} writes files; add --out DIR")
+        arguments.usage_error(f"--{[*kinds, 'gif'][0]} needs --out DIR")
     if arguments.labels_for is not None and arguments.out is None:
-        arguments.usage_error("--labels-for writes files; add --out DIR")
+        arguments.usage_error("--labels-for needs --out DIR")
     if arguments.labels_for is not None and isinstance(arguments.out, Remote):
         arguments.usage_error(f"--labels-for writes to a folder of this computer, not to {arguments.out}")
     if arguments.out is not None and not kinds and not arguments.gif and arguments.labels_for is None:
@@ -292,15 +290,15 @@ def _check_usage(arguments: argparse.Namespace, kinds: Sequence[str]) -> None:
             "--out DIR has nothing to write; add --png, --html, --labels, --ply, --gif or --labels-for"
         )
     if arguments.static is not None and not (arguments.track or arguments.movable):
-        arguments.usage_error("--static leaves out what moves; add --track, or --movable for all that could move")
+        arguments.usage_error("--static needs --track, or --movable to leave out all that could move")
     if arguments.movable and arguments.static is None:
-        arguments.usage_error("--movable is of --static DIR; add it")
+        arguments.usage_error("--movable needs --static DIR")
     if arguments.gif and not arguments.track:
-        arguments.usage_error("--gif shows tracks; add --track")
+        arguments.usage_error("--gif needs --track")
     if arguments.deskew and (arguments.live or not (arguments.track or arguments.poses)):
         arguments.usage_error("--deskew needs --poses FILE or --track, and no --live")
     if arguments.poses is not None and not arguments.deskew:
-        arguments.usage_error("--poses is of --deskew; add it")
+        arguments.usage_error("--poses needs --deskew")
     if arguments.png:
         require("matplotlib", "view", "Drawing a picture")
     if arguments.gif:
@@ -317,20 +315,20 @@ def _images(arguments: argparse.Namespace, kinds: Sequence[str]) -> dict[Path, P
         from ..camera.calibration import read_kitti_calibration
 
         if not (images and scans and arguments.png):
-            arguments.usage_error("--calib is for the picture of images and their scans; add --scan and --png")
+            arguments.usage_error("--calib needs images with --scan and --png")
         read_kitti_calibration(arguments.calib)  # errors of the file come before the first image
     if not images:
         return {}
     if arguments.live or arguments.deskew:
         option = "--live" if arguments.live else "--deskew"
-        arguments.usage_error(f"{option} is of scans, and {next(iter(images))} is an image; leave it out")
+        arguments.usage_error(f"{option} needs scans, and {next(iter(images))} is an image; leave it out")
     of_scans = [kind for kind in (*kinds, *(["track"] if arguments.track else [])) if kind != "png"]
     of_scans += [name.replace("_", "-") for name in wanted_sinks(arguments)]
     if of_scans and not scans:
-        arguments.usage_error(f"--{of_scans[0]} is of scans; add --scan, or leave it out")
+        arguments.usage_error(f"--{of_scans[0]} needs --scan for images; add it, or leave --{of_scans[0]} out")
     require("PIL.Image", "camera", "Reading an image", package="pillow")
     if arguments.model is None:
-        arguments.model = [*DEFAULT, CAMERA] if scans else [CAMERA]
+        arguments.model = [*DEFAULT_MODELS, CAMERA] if scans else [CAMERA]
     return {image: scans[k] if scans else None for k, image in enumerate(images)}
 
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from ..errors import EdgepercError, ImageError
 from ..system.remote import Remote
-from .arguments import DEFAULT_SENSOR
+from ..types.choices import DEFAULT_SENSOR
 
 if TYPE_CHECKING:
     from ..readers.identify import KnownSensor
@@ -32,14 +32,9 @@ _LAYOUT_FOLDERS = ("velodyne", "velodyne_points", "data")
 class Scans(NamedTuple):
     """Scans found at the paths of a command line.
 
-    Attributes
-    ----------
-    paths : list of Path
-        Scan files and captures, each once.
-    empty : list of Path
-        Folders without scans.
-    of_data_set : bool
-        Whether a path is the root of a data set. Its sequences all number their scans from 0.
+    paths : scan files and captures, each once.
+    empty : folders without scans.
+    of_data_set : whether a path is the root of a data set. Its sequences all number their scans from 0.
     """
 
     paths: list[Path]
@@ -56,8 +51,8 @@ def scan_folders(root: Path) -> list[Path]:
 
     if scan_files(root):
         return [root]
-    found = (folder for layout in _LAYOUTS for folder in sorted(root.glob(layout)))
-    return [folder for folder in found if folder.is_dir() and scan_files(folder)]
+    folders = (folder for layout in _LAYOUTS for folder in sorted(root.glob(layout)))
+    return [folder for folder in folders if folder.is_dir() and scan_files(folder)]
 
 
 def find_scans(paths: Sequence[Path]) -> Scans:
@@ -70,18 +65,18 @@ def find_scans(paths: Sequence[Path]) -> Scans:
     scans: dict[str, Path] = {}
     empty, of_data_set = [], False
     for path in paths:
-        found = [path]
+        files = [path]
         if isinstance(path, Remote):
-            found = path.files(SCAN_SUFFIXES + CAPTURE_SUFFIXES)
-            of_data_set |= any(scan.parent != path for scan in found if scan != path)
-            empty += [] if found else [path]
+            files = path.files(SCAN_SUFFIXES + CAPTURE_SUFFIXES)
+            of_data_set |= any(scan.parent != path for scan in files if scan != path)
+            empty += [] if files else [path]
         elif path.is_dir() and not is_capture(path):
             folders = scan_folders(path)
-            found = [scan for folder in folders for scan in scan_files(folder)]
+            files = [scan for folder in folders for scan in scan_files(folder)]
             of_data_set |= folders not in ([], [path])
-            if not found:
+            if not files:
                 empty.append(path)
-        for scan in found:
+        for scan in files:
             scans.setdefault(_absolute(scan), scan)
     return Scans(list(scans.values()), empty, of_data_set)
 
@@ -97,16 +92,16 @@ def find_images(paths: Sequence[Path]) -> list[Path]:
     images: dict[str, Path] = {}
     others = []
     for path in paths:
-        found = [path] if path.suffix.lower() in IMAGE_SUFFIXES else []
+        files = [path] if path.suffix.lower() in IMAGE_SUFFIXES else []
         if isinstance(path, Remote):
-            if found:
+            if files:
                 raise ImageError(f"{path}: images are read from this computer; copy it, and pass its path")
             others.append(path)
             continue
         if path.is_dir() and not is_capture(path) and not scan_folders(path):
-            found = sorted(file for file in path.iterdir() if file.suffix.lower() in IMAGE_SUFFIXES)
-        images |= {_absolute(image): image for image in found}
-        others += [] if found else [path]
+            files = sorted(file for file in path.iterdir() if file.suffix.lower() in IMAGE_SUFFIXES)
+        images |= {_absolute(image): image for image in files}
+        others += [] if files else [path]
     if images and others:
         raise ImageError(f"{others[0]} is not an image, and {next(iter(images.values()))} is; pass scans after --scan")
     return [*images.values()]

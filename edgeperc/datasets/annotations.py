@@ -29,12 +29,12 @@ def read_labelcloud(path: Path) -> list[Box]:
     try:
         return [
             _box(
-                each["name"],
-                [each["centroid"][axis] for axis in "xyz"],
-                [each["dimensions"][name] for name in ("length", "width", "height")],
-                [_angle(each["rotations"][axis], known) for axis in "xyz"],
+                item["name"],
+                [item["centroid"][axis] for axis in "xyz"],
+                [item["dimensions"][name] for name in ("length", "width", "height")],
+                [_angle(item["rotations"][axis], known) for axis in "xyz"],
             )
-            for each in _read(path)["objects"]
+            for item in _read(path)["objects"]
         ]
     except (KeyError, OverflowError, TypeError, ValueError) as exc:
         raise PointsError(f"{path} holds no labels of labelCloud ({type(exc).__name__}: {exc})") from exc
@@ -43,7 +43,7 @@ def read_labelcloud(path: Path) -> list[Box]:
 def read_sustechpoints(path: Path) -> list[Box]:
     """Read ``label/NAME.json`` of SUSTechPOINTS. Parameters, results and errors as in `read_labelcloud`."""
     try:
-        parts = [(each["obj_type"], each["psr"]) for each in _read(path, list)]
+        parts = [(item["obj_type"], item["psr"]) for item in _read(path, list)]
         return [
             _box(name, *([psr[part][axis] for axis in "xyz"] for part in ("position", "scale", "rotation")))
             for name, psr in parts
@@ -59,23 +59,23 @@ def read_datumaro(path: Path) -> dict[str, list[Box]]:
         left out.
     Raises PointsError.
     """
-    document, found = _read(path), dict[str, list[Box]]()
+    document, boxes = _read(path), dict[str, list[Box]]()
     try:
         names = [str(label["name"]) for label in document["categories"]["label"]["labels"]]
         for item in document["items"]:
             name = str(item["id"]).rpartition("/")[2]
-            if name in found:
+            if name in boxes:
                 raise PointsError(f"{path} has two scans called {name}; expected one")
-            found[name] = [
-                _box(names[each["label_id"]], each["position"], each["scale"], each["rotation"])
-                for each in item["annotations"]
-                if each["type"] == "cuboid_3d" and not each.get("attributes", {}).get("outside", False)
+            boxes[name] = [
+                _box(names[annotation["label_id"]], annotation["position"], annotation["scale"], annotation["rotation"])
+                for annotation in item["annotations"]
+                if annotation["type"] == "cuboid_3d" and not annotation.get("attributes", {}).get("outside", False)
             ]
     except PointsError:
         raise
     except (AttributeError, IndexError, KeyError, OverflowError, TypeError, ValueError) as exc:
         raise PointsError(f"{path} holds no annotations of Datumaro ({type(exc).__name__}: {exc})") from exc
-    return found
+    return boxes
 
 
 def _read(path: Path, kind: type = dict) -> Any:

@@ -14,7 +14,7 @@ from ..readers.images import IMAGE_SUFFIXES, read_image
 from ..system.extras import require
 
 FOLDERS = {"train": "train", "validation": "val", "test": "test"}
-UNLABELED = ("unlabelled", "unlabeled", "void")
+UNLABELED = ("unlabeled", "unlabeled", "void")
 IGNORE = 255
 LEVEL = 0.95
 
@@ -64,16 +64,16 @@ class LabeledImages:
         """
         parts = {"held-back": ("validation", "test"), "all": tuple(FOLDERS)}.get(split, (split,))
         folders = [self.root / FOLDERS[part] for part in parts]
-        found = [
+        files = [
             file
             for folder in folders
             if folder.is_dir()
             for file in sorted(folder.iterdir())
             if file.suffix.lower() in IMAGE_SUFFIXES
         ]
-        if not found:
+        if not files:
             raise ImageError(f"{self.root} has no images of split {split}; expected some in {folders[0]}")
-        return found
+        return files
 
     def read(self, file: Path) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
         """Read an image and its labels.

@@ -42,12 +42,8 @@ IMAGE_SIZES = {
 class KittiCalibration:
     """Pose and projection of the left color camera.
 
-    Attributes
-    ----------
-    T_cam_velo : (4, 4) float64
-        Sensor frame to rectified camera frame.
-    P2 : (3, 4) float64
-        Rectified camera frame to the image of the left color camera.
+    T_cam_velo : (4, 4) float64; sensor frame to rectified camera frame.
+    P2 : (3, 4) float64; rectified camera frame to the image of the left color camera.
     """
 
     T_cam_velo: NDArray[np.float64]
@@ -136,13 +132,9 @@ class KittiCalibration:
 class KittiLabels:
     """Rows of a KITTI label file, in its own frame.
 
-    Attributes
-    ----------
-    kinds : tuple of str
-        Classes in lower case, ``"dontcare"`` among them.
-    numbers : (n, 14) float64
-        Truncation, occlusion, observation angle [rad]; left, top, right, bottom [px]; height, width, length, x, y, z
-        [m] and rotation [rad] as in `KittiCalibration.sensor_boxes`.
+    kinds : classes in lower case, ``"dontcare"`` among them.
+    numbers : (n, 14) float64; truncation, occlusion, observation angle [rad]; left, top, right, bottom [px]; height,
+        width, length, x, y, z [m] and rotation [rad] as in `KittiCalibration.sensor_boxes`.
     """
 
     kinds: tuple[str, ...]
@@ -153,20 +145,13 @@ class KittiLabels:
 class Frame:
     """One KITTI scan and its labels.
 
-    Attributes
-    ----------
-    name, drive : str
-    grade : str
-        ``"A"`` if the boxes were checked to fit the scan.
-    points : (n, 4) float32
-        x, y, z [m] in the sensor frame, remission.
-    boxes : tuple of Box
-        In the sensor frame, labels in lower case (car, van, truck, pedestrian, person_sitting, cyclist, tram, misc).
-    unlabeled : (k, 4) float64
-        Image rectangles (left, top, right, bottom) [px] in which objects are not labeled (DontCare).
-    calibration : KittiCalibration
-    labels : KittiLabels or None
-        The rows that ``boxes`` and ``unlabeled`` come from; None: unknown.
+    grade : ``"A"`` if the boxes were checked to fit the scan.
+    points : (n, 4) float32; x, y, z [m] in the sensor frame, remission.
+    boxes : in the sensor frame, labels in lower case (car, van, truck, pedestrian, person_sitting, cyclist, tram,
+        misc).
+    unlabeled : (k, 4) float64; image rectangles (left, top, right, bottom) [px] in which objects are not labeled
+        (DontCare).
+    labels : the rows that ``boxes`` and ``unlabeled`` come from; None: unknown.
     """
 
     name: str
@@ -227,9 +212,9 @@ def scan_hash(points: NDArray[np.float32]) -> str:
 class KittiObjects:
     """The labeled scans below a KITTI root (``training/velodyne``, ``label_2``, ``calib``), by drive.
 
-    ``frames.csv`` and ``frames-*.csv`` beside ``training`` list the drive of each scan (columns ``name``, ``drive`` and
-    optionally ``grade``). Scans without an entry are left out, because a model may have been trained on their drive.
-    Without any table, each scan counts as a drive of its own.
+    ``frames.csv`` and ``frames-*.csv`` next to ``training`` give the drive of each scan (columns ``name``,
+    ``drive`` and optionally ``grade``). Scans without an entry are left out, because a model may have been trained on
+    their drive. Without any table, each scan counts as a drive of its own.
 
     Parameters
     ----------
@@ -329,13 +314,8 @@ SEQUENCE_DRIVES = {
 class RoadFrame:
     """One SemanticKITTI scan with labels of road and vehicles.
 
-    Attributes
-    ----------
-    name, drive : str
-    points : (n, 4) float32
-        x, y, z [m] in the sensor frame, remission.
-    labels : (n,) uint8
-        Index into `ROAD_CLASSES`, `IGNORE` for unlabeled points.
+    points : (n, 4) float32; x, y, z [m] in the sensor frame, remission.
+    labels : (n,) uint8; index into `ROAD_CLASSES`, `IGNORE` for unlabeled points.
     """
 
     name: str
@@ -370,13 +350,13 @@ class SemanticKitti:
 
     def __init__(self, root: Path | str) -> None:
         self.root = Path(root)
-        found = sorted(self.root.glob("sequences/*/labels/*.label"))
-        if not found:
+        files = sorted(self.root.glob("sequences/*/labels/*.label"))
+        if not files:
             raise PointsError(
                 f"{self.root} has no sequences/*/labels/*.label; expected the root of a SemanticKITTI set"
             )
         self.drives = {
-            f"{path.parts[-3]}/{path.stem}": SEQUENCE_DRIVES.get(path.parts[-3], path.parts[-3]) for path in found
+            f"{path.parts[-3]}/{path.stem}": SEQUENCE_DRIVES.get(path.parts[-3], path.parts[-3]) for path in files
         }
 
     def names(self, split: str, *, fold: int | None = None) -> list[str]:

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import json
 import math
 import re
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from types import MappingProxyType
-from typing import Any
+from typing import Any, Literal
 
 from ..errors import PointsError, SensorError
 from ..simulation.samples import IGNORE
 from ..simulation.scene import POINT_CLASS_OF, POINT_CLASSES
-from ..system.names import check_name
+from ..system.fields import Fields
+from ..system.names import check_name, nearest
 from ..types.mounting import Mounting
 from ..types.sensor import SensorProfile, get_sensor
 from .splits import in_split
@@ -33,10 +32,8 @@ BACKGROUND, DRIVABLE, IGNORED, ANY = "background", "drivable", "ignore", "*"
 SUFFIXES = (".pcd.bin", ".bin", ".npy", ".npz", ".pcd", ".ply")
 _SENSOR_KEYS = {"like", "name", "elevations_deg", "columns", "remission_range", "min_range_m", "max_range_m"}
 _CLASS_NAME = re.compile(r"[a-z][a-z0-9 _-]{0,30}")
-_KEYS = {
-    *("schema", "name", "about", "files", "sensor", "mounting", "boxes", "box_format", "box_columns"),
-    *("points", "point_names", "labeled_deg", "labeled_m", "min_points", "drives", "splits"),
-}
+_FIELDS = Fields("the description", PointsError, "write what docs/howto/sensor.md lists", optional=("*",), exact=True)
+_MOUNTING = Fields("mounting", SensorError, optional=("*",), exact=True)
 
 
 def class_number(name: str, classes: Sequence[str] = POINT_CLASSES) -> int:
@@ -59,54 +56,40 @@ def class_number(name: str, classes: Sequence[str] = POINT_CLASSES) -> int:
 class ScanLayout:
     """What ``scans.json`` says of the scans of a folder.
 
-    Attributes
-    ----------
-    name : str
-        Name of the set, in tables and in cards.
-    files : str
-        ``"plain"``, or ``"semantickitti"``: the tree of that set; a scan is called ``SEQ/NAME``, and its drive is that
-        of its sequence (`datasets.SEQUENCE_DRIVES`).
-    sensor : SensorProfile
-        Its ``mounting`` is what is known of the mounting.
-    boxes, points : mapping of str to str
-        Class of a label file, in lower case -> class of edgeperc: ``car``, ``van``, ``truck``, ``pedestrian``,
-        ``person_sitting``, ``cyclist``, ``background``, a new name, or ``ignore`` (objects and points of which nothing
-        is known); for points also ``drivable``. The key ``*`` stands for all other classes.
-    box_format : str
-        ``"plain"``: ``label/NAME.txt``; ``"kitti"``: ``label_2/NAME.txt`` with ``calib/NAME.txt``; or what an
+    name : name of the set, in tables and in cards.
+    files : ``"plain"``, or ``"semantickitti"``: the tree of that set; a scan is called ``SEQ/NAME``, and its drive is
+        that of its sequence (`datasets.SEQUENCE_DRIVES`).
+    sensor : its ``mounting`` is what is known of the mounting.
+    boxes, points : class of a label file, in lower case -> class of edgeperc: ``car``, ``van``, ``truck``,
+        ``pedestrian``, ``person_sitting``, ``cyclist``, ``background``, a new name, or ``ignore`` (objects and points
+        of which nothing is known); for points also ``drivable``. The key ``*`` stands for all other classes.
+    box_format : ``"plain"``: ``label/NAME.txt``; ``"kitti"``: ``label_2/NAME.txt`` with ``calib/NAME.txt``; or what an
         annotation tool saves: ``"labelcloud"``: ``labels/NAME.json``, ``"sustechpoints"``: ``label/NAME.json``,
         ``"cvat"``: ``annotations/default.json`` of its format "Datumaro 3D".
-    box_columns : tuple of str
-        Columns of ``label/NAME.txt``. Columns that are not among `BOX_COLUMNS` are skipped; columns after the listed
-        ones are too.
-    point_names : mapping of int to str, or None
-        Names of the numbers in ``semseg``; None: ``semseg_classes.json`` has them.
-    labeled_deg : tuple of 2 float
-        Sector in which all objects have boxes, as azimuths counter-clockwise from x [deg].
-    labeled_m : float
-        Distance up to which all objects have boxes [m].
-    min_points : int
-        A box with fewer points need not be detected, and its object is not counted.
-    drives : str
-        ``"table"``: ``frames.csv`` names them, and without that file each scan is a drive of its own; ``"scan"``: each
-        scan is a drive of its own; ``"one"``: all scans are of one drive.
-    splits : mapping of str to tuple of str
-        ``"train"``, ``"validation"`` or ``"test"`` -> drives; ``*`` stands for all drives that are not listed. Drives
-        that no entry covers are for training and testing, as in `splits.in_split`.
+    box_columns : columns of ``label/NAME.txt``. Columns that are not among `BOX_COLUMNS` are skipped; columns after the
+        listed ones are too.
+    point_names : names of the numbers in ``semseg``; None: ``semseg_classes.json`` has them.
+    labeled_deg : sector in which all objects have boxes, as azimuths counter-clockwise from x [deg].
+    labeled_m : distance up to which all objects have boxes [m].
+    min_points : A box with fewer points need not be detected, and its object is not counted.
+    drives : ``"table"``: ``frames.csv`` names them, and without that file each scan is a drive of its own; ``"scan"``:
+        each scan is a drive of its own; ``"one"``: all scans are of one drive.
+    splits : ``"train"``, ``"validation"`` or ``"test"`` -> drives; ``*`` stands for all drives that are not listed.
+        Drives that no entry covers are for training and testing, as in `splits.in_split`.
     """
 
     name: str
     sensor: SensorProfile
     boxes: Mapping[str, str]
     points: Mapping[str, str]
-    files: str = "plain"
-    box_format: str = "plain"
+    files: Literal["plain", "semantickitti"] = "plain"
+    box_format: Literal["plain", "kitti", "labelcloud", "sustechpoints", "cvat"] = "plain"
     box_columns: tuple[str, ...] = BOX_COLUMNS
     point_names: Mapping[int, str] | None = None
     labeled_deg: tuple[float, float] = (-180.0, 180.0)
     labeled_m: float = math.inf
     min_points: int = 1
-    drives: str = "table"
+    drives: Literal["table", "scan", "one"] = "table"
     splits: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
     @classmethod
@@ -117,51 +100,32 @@ class ScanLayout:
         folder : folder of the profile that ``sensor`` names, if it is a file.
         Raises PointsError, SensorError.
         """
-        try:
-            given = json.loads(text)
-        except (RecursionError, ValueError) as exc:
-            raise PointsError(f"the description is not JSON ({exc}); expected an object with schema {SCHEMA}") from exc
-        if not isinstance(given, dict) or given.get("schema") != SCHEMA:
-            found = given.get("schema") if isinstance(given, dict) else type(given).__name__
-            raise PointsError(f"the description has schema {found!r:.60}; this edgeperc reads an object with {SCHEMA}")
-        if unknown := sorted(given.keys() - _KEYS):
-            raise PointsError(
-                f"unknown entries {', '.join(unknown)[:200]}; expected some of {', '.join(sorted(_KEYS))}"
-            )
+        given = _FIELDS.document(text, SCHEMA)
         boxes, points = (_classes(given, key) for key in ("boxes", "points"))
         if DRIVABLE in boxes.values():
             raise PointsError("boxes: a class of boxes cannot be drivable; give the area in drivable/, or by points")
-        name = given.get("name", "scans")
-        if not isinstance(name, str) or not re.fullmatch(r"[\w.-]{1,40}", name):
-            raise PointsError(f"name is {name!r:.60}; expected 1 to 40 letters, digits, '.', '_' or '-'")
-        check_name("name", name, PointsError)
-        own: dict[str, Any] = {"name": name, "sensor": _sensor(given, folder), "boxes": boxes, "points": points}
-        allowed = {"files": ("plain", "semantickitti"), "box_format": ("plain", *BOX_FILES)}
-        for key, choices in {**allowed, "drives": ("table", "scan", "one")}.items():
-            if key in given and given[key] not in choices:
-                raise PointsError(f"{key} is {given[key]!r:.60}; expected {' or '.join(choices)}")
-            own |= {key: given[key]} if key in given else {}
-        if "box_columns" in given:
-            own["box_columns"] = columns = tuple(map(str, _listed(given, "box_columns", str)))
-            if missing := [column for column in BOX_COLUMNS if columns.count(column) != 1]:
-                raise PointsError(f"box_columns is {columns}; expected {', '.join(missing)} once each")
+        values = {"name": "scans", **given, "sensor": _sensor(given, folder), "boxes": boxes, "points": points}
         if "point_names" in given:
-            own["point_names"] = point_names_of(given["point_names"], "point_names")
-        if "labeled_deg" in given:
-            low, high = own["labeled_deg"] = _pair(given, "labeled_deg")
-            if not -360.0 <= low < high <= 360.0 or high - low > 360.0:
-                raise PointsError(f"labeled_deg is {[low, high]}; expected the right and the left end, up to 360 apart")
-        if "labeled_m" in given:
-            own["labeled_m"] = _number(given["labeled_m"], "labeled_m")
-            if own["labeled_m"] <= 0.0:
-                raise PointsError(f"labeled_m is {given['labeled_m']}; expected a distance above 0")
-        if "min_points" in given:
-            own["min_points"] = least = given["min_points"]
-            if isinstance(least, bool) or not isinstance(least, int) or not 0 <= least <= 10**6:
-                raise PointsError(f"min_points is {least!r:.60}; expected a whole number from 0")
-        if "splits" in given:
-            own["splits"] = _splits(given["splits"])
-        return cls(**own)
+            values["point_names"] = point_names_of(given["point_names"], "point_names")
+        return _FIELDS.read(cls, {key: value for key, value in values.items() if key not in ("about", "mounting")})
+
+    def __post_init__(self) -> None:
+        if not re.fullmatch(r"[\w.-]{1,40}", self.name):
+            _FIELDS.refuse("name", self.name, "1 to 40 letters, digits, '.', '_' or '-'")
+        check_name("name", self.name, PointsError)
+        if missing := [column for column in BOX_COLUMNS if self.box_columns.count(column) != 1]:
+            _FIELDS.refuse("box_columns", self.box_columns, f"{', '.join(missing)} once each")
+        low, high = self.labeled_deg
+        if not -360.0 <= low < high <= 360.0 or high - low > 360.0:
+            _FIELDS.refuse("labeled_deg", [low, high], "the right and the left end, up to 360 apart")
+        if not self.labeled_m > 0.0:
+            _FIELDS.refuse("labeled_m", self.labeled_m, "a distance above 0")
+        _FIELDS.whole("min_points", self.min_points, 0, 10**6)
+        if not self.splits.keys() <= {"train", "validation", "test"}:
+            _FIELDS.refuse("splits", [*self.splits], "train, validation and test")
+        drives = [drive for listed in self.splits.values() for drive in listed]
+        if twice := sorted({drive for drive in drives if drives.count(drive) > 1}):
+            raise PointsError(f"splits lists {', '.join(twice)[:80]} twice; whole drives belong to one split")
 
     def in_split(self, drive: str, split: str, fold: int | None = None) -> bool:
         """Whether a drive belongs to a split, as `splits.in_split` says, with the description's own lists first.
@@ -192,8 +156,11 @@ def read_layout(layout: str | Path) -> ScanLayout:
     Raises PointsError, SensorError.
     """
     if isinstance(layout, str) and not layout.endswith(".json"):
-        if layout not in known_layouts():
-            raise PointsError(f"no layout {layout!r}; expected {', '.join(known_layouts())}, or a .json file")
+        known = known_layouts()
+        if layout not in known:
+            raise PointsError(
+                f"no layout {layout!r}{nearest(layout, known)}; expected {', '.join(known)}, or a .json file"
+            )
         layout = LAYOUTS / f"{layout}.json"
     path = Path(layout)
     try:
@@ -227,9 +194,7 @@ def class_of_name(name: str, classes: Mapping[str, str], path: Path, kind: str) 
 def _classes(given: Mapping[str, Any], key: str) -> Mapping[str, str]:
     entries = given.get(key, {})
     if not isinstance(entries, dict) or not all(isinstance(value, str) for value in entries.values()):
-        raise PointsError(
-            f'{key} is {entries!r:.80}; expected classes of the labels with ours, such as {{"Car": "car"}}'
-        )
+        _FIELDS.refuse(key, entries, 'classes of the labels with ours, such as {"Car": "car"}')
     classes = {name.lower(): value for name, value in entries.items()}
     if len(classes) < len(entries):
         raise PointsError(f"{key} has a class twice, in lower and upper case; give it once")
@@ -239,7 +204,7 @@ def _classes(given: Mapping[str, Any], key: str) -> Mapping[str, str]:
                 f"{key}: {name!r:.60} is mapped to {value!r:.60}; expected {', '.join(POINT_CLASS_OF)}, {BACKGROUND}, "
                 f"{DRIVABLE} (points), {IGNORED}, or a new name of lower-case letters, digits, spaces, _ and -"
             )
-    return MappingProxyType(classes)
+    return classes
 
 
 def _sensor(given: Mapping[str, Any], folder: Path | None) -> SensorProfile:
@@ -255,55 +220,22 @@ def _sensor(given: Mapping[str, Any], folder: Path | None) -> SensorProfile:
         else:
             raise PointsError("sensor: expected 'like' with the name of a sensor, or name, elevations_deg and columns")
     else:
-        raise PointsError(
-            f"sensor is {named!r:.80}; expected the name of a sensor, the .json file of a profile, or an object with "
-            f"some of {', '.join(sorted(_SENSOR_KEYS))}"
+        _FIELDS.refuse(
+            "sensor",
+            named,
+            "the name of a sensor, the .json file of a profile, or an object with some of "
+            f"{', '.join(sorted(_SENSOR_KEYS))}",
         )
     if "mounting" in given:
-        known, names = given["mounting"], {each.name for each in fields(Mounting)}
-        if not isinstance(known, dict) or not known.keys() <= names:
-            raise PointsError(f"mounting is {known!r:.80}; expected what is known of {', '.join(sorted(names))}")
-        sensor = replace(sensor, mounting=Mounting(**known))
+        sensor = replace(sensor, mounting=_MOUNTING.read(Mounting, given["mounting"], "mounting"))
     return sensor
-
-
-def _splits(given: object) -> Mapping[str, tuple[str, ...]]:
-    if not isinstance(given, dict) or not given.keys() <= {"train", "validation", "test"}:
-        raise PointsError(f"splits is {given!r:.80}; expected lists of drives for train, validation and test")
-    splits = {split: tuple(map(str, _listed(given, split, str))) for split in given}
-    drives = [drive for of_split in splits.values() for drive in of_split]
-    if twice := sorted({drive for drive in drives if drives.count(drive) > 1}):
-        raise PointsError(f"splits lists {', '.join(twice)[:80]} twice; whole drives belong to one split")
-    return MappingProxyType(splits)
 
 
 def point_names_of(given: object, source: str) -> Mapping[int, str]:
     """Names of points by number, checked."""
-    valid = isinstance(given, dict) and all(
+    if not isinstance(given, dict) or not all(
         isinstance(name, str) and re.fullmatch(r"[0-9]{1,5}", str(number)) and int(number) <= 0xFFFF
         for number, name in given.items()
-    )
-    if not valid:
-        raise PointsError(f'{source}: {given!r:.80}; expected names by number up to 65535, such as {{"1": "Road"}}')
-    assert isinstance(given, dict)
-    return MappingProxyType({int(number): name for number, name in given.items()})
-
-
-def _listed(given: Mapping[str, Any], key: str, kind: type) -> list[Any]:
-    values = given[key]
-    if not isinstance(values, list) or not all(isinstance(value, kind) for value in values):
-        raise PointsError(f"{key} is {values!r:.80}; expected a list of {kind.__name__}")
-    return values
-
-
-def _pair(given: Mapping[str, Any], key: str) -> tuple[float, float]:
-    values = given[key]
-    if not isinstance(values, list) or len(values) != 2:
-        raise PointsError(f"{key} is {values!r:.80}; expected two numbers")
-    return _number(values[0], key), _number(values[1], key)
-
-
-def _number(value: object, key: str) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= 1e9:
-        raise PointsError(f"{key} is {value!r:.60}; expected a number")
-    return float(value)
+    ):
+        _FIELDS.refuse(source, given, 'names by number up to 65535, such as {"1": "Road"}')
+    return {int(number): name for number, name in given.items()}

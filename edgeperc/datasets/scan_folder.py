@@ -10,7 +10,7 @@
     FOLDER/drivable/NAME.json     the drivable area: a list of polygons [[x, y], ...] or [[x, y, z], ...]
     FOLDER/frames.csv             columns name and drive
 
-A scan is labeled if it has at least one of the three label files. ``layouts/`` beside this module has descriptions of
+A scan is labeled if it has at least one of the three label files. ``layouts/`` next to this module has descriptions of
 public sets. With ``"files": "semantickitti"`` in the description, the folder is SemanticKITTI's root instead:
 ``sequences/SEQ/velodyne/NAME.bin`` and ``sequences/SEQ/labels/NAME.label``.
 """
@@ -280,8 +280,8 @@ class ScanFolder:
     def _scans(self) -> dict[str, Path]:
         scans: dict[str, Path] = {}
         nested = self.layout.files == "semantickitti"
-        found = self.root.glob("sequences/*/velodyne/*" if nested else "velodyne/*")
-        for path in sorted(found):
+        files = self.root.glob("sequences/*/velodyne/*" if nested else "velodyne/*")
+        for path in sorted(files):
             if path.name.startswith("."):
                 continue
             suffix = next((end for end in SUFFIXES if path.name.lower().endswith(end)), None)
@@ -350,7 +350,7 @@ class ScanFolder:
         raw: NDArray[Any] = data
         if path.suffix == ".label":
             if data.size % 4:
-                raise PointsError(f"{path}: {data.size} bytes are no uint32 labels; expected 4 bytes for each point")
+                raise PointsError(f"{path}: {data.size} bytes are not uint32 labels; expected 4 bytes for each point")
             raw = data.view("<u4") & 0xFFFF  # the upper 16 bits are the instance
         if len(raw) != n_points:
             raise PointsError(
@@ -358,12 +358,12 @@ class ScanFolder:
             )
         if self._point_numbers is None:
             self._point_numbers = self._numbers()
-        found = np.unique(raw)
-        known = found < len(self._point_numbers)
-        known[known] = self._point_numbers[found[known]] != IGNORE
+        numbers = np.unique(raw)
+        known = numbers < len(self._point_numbers)
+        known[known] = self._point_numbers[numbers[known]] != IGNORE
         if not known.all():
             raise PointsError(
-                f"{path}: no name for {', '.join(map(str, found[~known][:5]))}; add it to semseg_classes.json or, in "
+                f"{path}: no name for {', '.join(map(str, numbers[~known][:5]))}; add it to semseg_classes.json or, in "
                 "the description, to point_names"
             )
         return self._point_numbers[raw]

@@ -84,9 +84,9 @@ def in_split(drive: str, split: str, fold: int | None = None) -> bool:
         raise OptionError(f"split is {split!r}; expected train, validation, test or all")
     if fold is not None and fold not in range(len(FOLDS)):
         raise OptionError(f"fold is {fold!r:.80}; expected 0 to {len(FOLDS) - 1}")
-    own = fold_of(drive)
+    drive_fold = fold_of(drive)
     if drive in VALIDATION_DRIVES:
         return split == "all" or (split == "validation" and fold is None)
-    if own is None:
+    if drive_fold is None:
         return split in (("all", "test") if drive in TEST_DRIVES else ("all", "test", "train"))
-    return split in ("all", "validation" if own == fold else "train")
+    return split in ("all", "validation" if drive_fold == fold else "train")

@@ -24,16 +24,10 @@ from .tracking_metrics import box_iou, fill_assignment
 class Settings:
     """Association and life of the tracks of one class.
 
-    Attributes
-    ----------
-    by_distance : bool
-        Associate by the distance of the centers, instead of generalized 3-D IoU.
-    greedy : bool
-        Assign the best pair first, instead of the best sum.
-    least : float
-        Lowest affinity of a pair: generalized IoU, or the negative distance [m].
-    min_hits, max_age : int
-        Detections before a track is reported; scans without a detection after which it is deleted.
+    by_distance : associate by the distance of the centers, instead of generalized 3-D IoU.
+    greedy : assign the best pair first, instead of the best sum.
+    least : lowest affinity of a pair: generalized IoU, or the negative distance [m].
+    min_hits, max_age : detections before a track is reported; scans without a detection after which it is deleted.
     """
 
     by_distance: bool
@@ -89,23 +83,23 @@ class Ab3dmot:
         source = np.full(len(states), -1)
         for detection, track in self._pairs(given, states[:, _BACK]):
             source[track] = detection
-        found = source >= 0
-        self._missed = np.where(found, 0, self._missed + 1)
-        self._hits = self._hits + found
-        self._scores = np.where(found, np.append(scores, 0.0)[source], self._scores)
+        is_matched = source >= 0
+        self._missed = np.where(is_matched, 0, self._missed + 1)
+        self._hits = self._hits + is_matched
+        self._scores = np.where(is_matched, np.append(scores, 0.0)[source], self._scores)
 
         # Headings are known up to half a turn; the state turns to the detection's direction.
-        seen = given[source[found]][:, _ORDER]
-        mine = states[found]
+        seen = given[source[is_matched]][:, _ORDER]
+        mine = states[is_matched]
         off = np.abs(wrapped(seen[:, 3] - mine[:, 3])) > math.pi / 2.0
         mine[off, 3] += math.pi
         innovation = seen - mine[:, :N_SEEN]
         innovation[:, 3] = wrapped(innovation[:, 3])
-        spread = covariances[found]
+        spread = covariances[is_matched]
         gain = spread[:, :, :N_SEEN] @ np.linalg.inv(spread[:, :N_SEEN, :N_SEEN] + np.eye(N_SEEN))
-        states[found] = mine + (gain @ innovation[:, :, None])[:, :, 0]
+        states[is_matched] = mine + (gain @ innovation[:, :, None])[:, :, 0]
         states[:, 3] = wrapped(states[:, 3])
-        covariances[found] = spread - gain @ spread[:, :N_SEEN]
+        covariances[is_matched] = spread - gain @ spread[:, :N_SEEN]
 
         new = np.setdiff1d(np.arange(len(given)), source)
         born = np.zeros((len(new), N_STATE))
@@ -135,8 +129,8 @@ class Ab3dmot:
         made: list[tuple[int, int]] = []
         if self.settings.greedy:
             free = np.ones(affinity.shape, np.bool_)
-            for at in np.argsort(-affinity, axis=None, kind="stable").tolist():
-                i, j = divmod(at, len(tracks))
+            for index in np.argsort(-affinity, axis=None, kind="stable").tolist():
+                i, j = divmod(index, len(tracks))
                 if free[i, j]:
                     made.append((i, j))
                     free[i] = free[:, j] = False

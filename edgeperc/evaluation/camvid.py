@@ -60,10 +60,10 @@ def evaluate_images(
         for name, hashes in trained_on.items():
             if image_hash(image) in hashes:
                 raise SplitError(f"{name} was trained on {file}; evaluate other images, or ask for split 'train'")
-        found = perceive(image=image).image
-        assert found is not None
+        labels = perceive(image=image).image
+        assert labels is not None
         confusion = Confusion(card.classes, ignore=IGNORE)
-        confusion.update(found.labels, truth)
+        confusion.update(labels.labels, truth)
         counts.append(confusion.counts)
         on_image(done, len(files))
     return {
@@ -82,7 +82,7 @@ def image_figures(classes: Sequence[str], counts: NDArray[np.int64], n_resamples
     counts : (n, C, C) int64; of each image; rows are the truth.
     Returns: ``"n_images"``; ``"all"``: ``mean_iou`` over the classes that occur, ``mean_accuracy`` (mean recall of
         the classes), ``accuracy``, ``n_pixels``; ``"classes"``: ``iou``, ``precision``, ``recall``, ``n_pixels``,
-        ``n_images`` of each class. Shares have four decimals, None for those of no pixels, and beside each its
+        ``n_images`` of each class. Shares have four decimals, None for those of no pixels, and with each its
         ``..._interval``, None with fewer than two images.
     """
     n, n_classes, _ = counts.shape
@@ -106,9 +106,9 @@ def image_figures(classes: Sequence[str], counts: NDArray[np.int64], n_resamples
 
 def _rates(counts: NDArray[np.int64]) -> Mapping[str, NDArray[np.float64]]:
     """Rates of confusion matrices (m, C, C): per class (m, C), and over all (m,); NaN without pixels."""
-    hits, truth, found = np.diagonal(counts, axis1=1, axis2=2), counts.sum(axis=2), counts.sum(axis=1)
+    hits, truth, predicted = np.diagonal(counts, axis1=1, axis2=2), counts.sum(axis=2), counts.sum(axis=1)
     with np.errstate(divide="ignore", invalid="ignore"):
-        rates = {"iou": hits / (truth + found - hits), "precision": hits / found, "recall": hits / truth}
+        rates = {"iou": hits / (truth + predicted - hits), "precision": hits / predicted, "recall": hits / truth}
         accuracy = hits.sum(axis=1) / truth.sum(axis=1)
     means = {"mean_iou": _means(rates["iou"]), "mean_accuracy": _means(rates["recall"]), "accuracy": accuracy}
     return {**rates, **means}

@@ -34,7 +34,7 @@ CAUSES: dict[str, tuple[str, ...]] = {
 FAR_M = 30.0
 NEAR_M = 0.4
 LARGE_LENGTH_M, LARGE_HEIGHT_M = 8.0, 4.0  # a longer or higher cluster is a wall, a hedge or a bank
-POLE_RADIUS_M, POLE_HEIGHT_M = 0.3, 2.0  # a column of points that goes on above this height is no person
+POLE_RADIUS_M, POLE_HEIGHT_M = 0.3, 2.0  # a column of points that goes on above this height is not a person
 BUMPER_X_M, BUMPER_Y_M, BUMPER_Z_M = 4.5, 3.0, -1.5  # upper bounds of x, |y| and z; the road is at z = -1.73
 
 Counts = dict[tuple[str, ...], "Counter[Any]"]
@@ -61,8 +61,8 @@ def count_causes(
         they are missed, predicted ones if they are false. ``("errors", "scans")``: 1 by (error, cause, drive) with
         points. ``("errors", "objects")``: 1 by (error, cause, `object_key`) with missed points. The error `BUMPER`
         has all points in view that are labeled car at the bumper of the own vehicle, except those of true objects.
-        Where the truth is unknown, there may be a car beside the own one; the cause `FLOOR` counts the points on the
-        ground alone.
+        Where the truth is unknown, there may be a car next to the ego vehicle; the cause `FLOOR` counts the points
+        on the ground alone.
     """
     scan = _Scan(points, boxes)
     at_bumper = scan.at_bumper & in_view & (labels == 1) & ~((right > 0) & (right < len(POINT_CLASSES)))
@@ -108,18 +108,18 @@ class _Scan:
     @property
     def at_bumper(self) -> NDArray[np.bool_]:
         x, y, z = self.points[:, :3].T
-        at: NDArray[np.bool_] = (x < BUMPER_X_M) & (np.abs(y) < BUMPER_Y_M) & (z < BUMPER_Z_M)
-        return at
+        is_near: NDArray[np.bool_] = (x < BUMPER_X_M) & (np.abs(y) < BUMPER_Y_M) & (z < BUMPER_Z_M)
+        return is_near
 
     def within(self, mask: NDArray[np.bool_], boxes: Sequence[Box], margin_m: float = 0.0) -> NDArray[np.bool_]:
         """Points in one of the boxes."""
-        rows, found = np.flatnonzero(mask), np.zeros(len(mask), np.bool_)
+        rows, is_near = np.flatnonzero(mask), np.zeros(len(mask), np.bool_)
         for box in boxes:
-            found[rows] |= inside(box, self.points[rows], margin_m)
-        return found
+            is_near[rows] |= inside(box, self.points[rows], margin_m)
+        return is_near
 
     def near_objects(self, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Points in a true box, or beside one."""
+        """Points in a true box, or next to one."""
         return self.within(mask, self.boxes, NEAR_M)
 
     def on_large_structures(self, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -139,11 +139,11 @@ class _Scan:
 
     def on_poles(self, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """Points with a point higher than people above or below them, at most 0.3 m aside."""
-        found = np.zeros(len(mask), np.bool_)
+        is_pole = np.zeros(len(mask), np.bool_)
         tall = self.points[self.ground.height_m > POLE_HEIGHT_M, :2]
         tall = tall[np.argsort(tall[:, 1])]
         for row in np.flatnonzero(mask):
             x, y = self.points[row, :2]
             first, end = np.searchsorted(tall[:, 1], (y - POLE_RADIUS_M, y + POLE_RADIUS_M))
-            found[row] = (np.hypot(*(tall[first:end] - (x, y)).T) <= POLE_RADIUS_M).any()
-        return found
+            is_pole[row] = (np.hypot(*(tall[first:end] - (x, y)).T) <= POLE_RADIUS_M).any()
+        return is_pole

@@ -161,15 +161,15 @@ class _Evaluator:
         self._learned = learned
 
     def __call__(self, numbers: Sequence[int]) -> list[_Figures] | EdgepercError:
-        found = []
+        results = []
         try:
             for _, drive, evaluate in (self._scans[number] for number in numbers):
                 if drive is None:
                     self._perceive.start_from(self._learned)
-                found.append(evaluate())
+                results.append(evaluate())
         except EdgepercError as exc:
             return exc
-        return found
+        return results
 
 
 def _on_ray(job: _Job, perceive: Perceiver, scans: Sequence[_Scan], workers: int | None) -> Iterator[_Figures]:
@@ -182,10 +182,10 @@ def _on_ray(job: _Job, perceive: Perceiver, scans: Sequence[_Scan], workers: int
         first[k] = scans[k][2]()
     # Consecutive scans of one drive stay together; the others are apart.
     rest = (k for k in range(len(scans)) if k not in first)
-    groups = [[*each] for _, each in groupby(rest, lambda k: (scans[k][0], scans[k][1] or k))]
-    found = map_on_ray(_Evaluator, (job, perceive.learned), groups, workers=workers) if groups else iter(())
+    groups = [[*group] for _, group in groupby(rest, lambda k: (scans[k][0], scans[k][1] or k))]
+    results = map_on_ray(_Evaluator, (job, perceive.learned), groups, workers=workers) if groups else iter(())
     done = 0
-    for numbers, answer in zip(groups, found, strict=True):
+    for numbers, answer in zip(groups, results, strict=True):
         if isinstance(answer, EdgepercError):
             raise answer
         if isinstance(answer, Lost):
@@ -244,8 +244,10 @@ def _scans(judge: Judge, dataset: str | Path, split: str, fold: int | None) -> l
     else:
         sequences = SemanticKitti(root)
         names = _names(sequences, split, fold)
-        of = sequences.frame
-        scans = [("semantickitti", None, _later(judge.record, lambda n: judge.semantickitti(of(n)), n)) for n in names]
+        frame_of = sequences.frame
+        scans = [
+            ("semantickitti", None, _later(judge.record, lambda n: judge.semantickitti(frame_of(n)), n)) for n in names
+        ]
     if not scans:
         raise PointsError(f"{dataset} has no scans of the {split} drives (fold: {fold}); pass another split, or 'all'")
     return scans

@@ -24,16 +24,10 @@ FRAME_S = 0.1
 class Standing:
     """Counts of boxes of tracks that match a label, without ignored ones.
 
-    Attributes
-    ----------
-    n_boxes, n_tracks : int
-        Boxes, and tracks with at least one of them.
-    n_resolved : int
-        Boxes with a front (`edgeperc.Box.front`); for the others the heading is known up to half a turn.
-    n_right : int
-        Boxes with a front, whose heading is less than a quarter turn from the label's.
-    n_right_of_all : int
-        All boxes whose heading is less than a quarter turn from the label's.
+    n_boxes, n_tracks : boxes, and tracks with at least one of them.
+    n_resolved : boxes with a front (`edgeperc.Box.front`); for the others the heading is known up to half a turn.
+    n_right : boxes with a front, whose heading is less than a quarter turn from the label's.
+    n_right_of_all : all boxes whose heading is less than a quarter turn from the label's.
     """
 
     n_boxes: int = 0
@@ -65,10 +59,10 @@ def speeds(truth: Sequence[FrameTruth], tracks: Sequence[Tracks]) -> list[NDArra
     Returns list of (n,) float64: By frame [m/s]; NaN for an object without other frames nearby.
     """
     places: list[dict[int, NDArray[np.float64]]] = []
-    for frame, of in zip(truth, tracks, strict=True):
-        world = frame.boxes[:, :3] @ of.T_world_sensor[:3, :3].T + of.T_world_sensor[:3, 3]
+    for frame, result in zip(truth, tracks, strict=True):
+        world = frame.boxes[:, :3] @ result.T_world_sensor[:3, :3].T + result.T_world_sensor[:3, 3]
         places.append(dict(zip(frame.ids.tolist(), world[:, :2], strict=True)))
-    found = []
+    speeds_mps = []
     for k, here in enumerate(places):
         speed = np.full(len(truth[k].ids), np.nan)
         for i, one in enumerate(here):
@@ -76,8 +70,8 @@ def speeds(truth: Sequence[FrameTruth], tracks: Sequence[Tracks]) -> list[NDArra
             if near[-1] > near[0]:
                 way = places[near[-1]][one] - places[near[0]][one]
                 speed[i] = np.hypot(*way) / (FRAME_S * (near[-1] - near[0]))
-        found.append(speed)
-    return found
+        speeds_mps.append(speed)
+    return speeds_mps
 
 
 def count_headings(
@@ -91,24 +85,26 @@ def count_headings(
     """
     rows: list[tuple[int, int, bool, bool]] = []  # kind, track, resolved, right
     moved: set[int] = set()
-    for frame, of, speed in zip(truth, tracks, speeds(truth, tracks), strict=True):
-        mine = np.flatnonzero([label in labels for label in of.labels])
-        iou = box_iou(frame.boxes, of.boxes[mine])
+    for frame, result, speed in zip(truth, tracks, speeds(truth, tracks), strict=True):
+        mine = np.flatnonzero([label in labels for label in result.labels])
+        iou = box_iou(frame.boxes, result.boxes[mine])
         moves = speed > MOVING_MPS
         moved |= {*frame.ids[moves].tolist()}
         for i in np.flatnonzero(~frame.ignored & ~np.isnan(speed)).tolist():
             if iou[i].max(initial=0.0) < iou_threshold:
                 continue
-            at = mine[int(iou[i].argmax())]
-            right = bool(np.cos(of.boxes[at, 6] - frame.boxes[i, 6]) > 0.0)
+            track = mine[int(iou[i].argmax())]
+            right = bool(np.cos(result.boxes[track, 6] - frame.boxes[i, 6]) > 0.0)
             kind = 0 if moves[i] else 1 if int(frame.ids[i]) in moved else 2
-            rows.append((kind, int(of.ids[at]), bool(of.fronts[at] >= 0.5), right))
+            rows.append((kind, int(result.ids[track]), bool(result.fronts[track] >= 0.5), right))
     counted = []
     for kind in range(3):
-        own = [row for row in rows if row[0] == kind]
-        resolved = [row for row in own if row[2]]
+        of_kind = [row for row in rows if row[0] == kind]
+        resolved = [row for row in of_kind if row[2]]
         n_right = sum(row[3] for row in resolved)
         counted.append(
-            Standing(len(own), len({row[1] for row in own}), len(resolved), n_right, sum(row[3] for row in own))
+            Standing(
+                len(of_kind), len({row[1] for row in of_kind}), len(resolved), n_right, sum(row[3] for row in of_kind)
+            )
         )
     return Headings(*counted)

@@ -109,7 +109,7 @@ class Judge:
             (card,) = self.draw_road.cards
             if card.view != self.view or "drivable" not in card.classes:
                 raise ModelError(f"{card.name} does not draw the road that {cards[0].name} sees; expected one top view")
-            if any((card.name, card.version) == (own.name, own.version) for own in cards):
+            if any((card.name, card.version) == (judged.name, judged.version) for judged in cards):
                 raise ModelError(f"{card.name} {card.version} cannot draw its own truth; name another model")
             cards.append(card)
         self.trained_on = {} if training_scans else training_scans_of(cards)
@@ -146,23 +146,23 @@ class Judge:
         Returns record: Counts for `edgeperc.evaluation.tables.figures`.
         Returns mistakes: None if the objects of the scan are not labeled.
         """
-        found = self._perceive(truth.points)
-        return self._compare(truth, found, found.boxes)
+        perception = self._perceive(truth.points)
+        return self._compare(truth, perception, perception.boxes)
 
     def record_scan(self, frame: ScanFrame) -> tuple[Record, Mistakes | None]:
         """Evaluate one scan of a `ScanFolder`, perceived as a user's: its mounting is found from scans of its drive.
 
         Raises SplitError.
         """
-        truth, found, scan_boxes = self._perceive_frame(frame)
-        return self._compare(truth, found, scan_boxes)
+        truth, perception, scan_boxes = self._perceive_frame(frame)
+        return self._compare(truth, perception, scan_boxes)
 
     def record_boxes(self, frame: ScanFrame) -> Record:
         """As `record_scan`, of the boxes alone: `kitti_ap` and `center_ap`."""
-        truth, found, scan_boxes = self._perceive_frame(frame)
+        truth, perception, scan_boxes = self._perceive_frame(frame)
         tallies: dict[tuple[str, ...], Any] = {}
         if frame.boxes is not None:
-            self._count_ap(tallies, truth, found.boxes, scan_boxes)
+            self._count_ap(tallies, truth, perception.boxes, scan_boxes)
         return Record(truth.name, truth.drive, tallies)
 
     def _perceive_frame(self, frame: ScanFrame) -> tuple[Truth, Perception, Sequence[Box]]:
@@ -171,28 +171,30 @@ class Judge:
         if frame.drive != self.drive:
             self.perceive.reset_mounting()
             self.drive = frame.drive
-        found = self.perceive(frame.points)
-        boxes = ModelFrame(found.mounting).move_boxes(found.boxes)
-        truth = folder_truth(frame, found.mounting, self.view, self.point_classes)
-        return truth, replace(found, boxes=boxes), found.boxes
+        perception = self.perceive(frame.points)
+        boxes = ModelFrame(perception.mounting).move_boxes(perception.boxes)
+        truth = folder_truth(frame, perception.mounting, self.view, self.point_classes)
+        return truth, replace(perception, boxes=boxes), perception.boxes
 
-    def _compare(self, truth: Truth, found: Perception, scan_boxes: Sequence[Box]) -> tuple[Record, Mistakes | None]:
+    def _compare(
+        self, truth: Truth, perception: Perception, scan_boxes: Sequence[Box]
+    ) -> tuple[Record, Mistakes | None]:
         tallies: dict[tuple[str, ...], Any] = {}
         mistakes = None
         if truth.labels is not None:
             x, y = truth.points[:, 0], truth.points[:, 1]
             shown = (x > -2.0) & (x < 52.0) & (np.abs(y) < 27.0)
             mistakes = Mistakes(truth.name, truth.drive, truth.points[shown], np.zeros(int(shown.sum()), np.uint8))
-            if self.box_classes or found.points is not None:
+            if self.box_classes or perception.points is not None:
                 seen = (box for box, n in zip(truth.boxes, truth.returns, strict=True) if n >= FEWEST_RETURNS)
                 tallies["labeled",] = Counter(object_key(truth.drive, box) for box in seen)
             if self.box_classes:
-                mistakes = self._count_boxes(tallies, truth, found, mistakes)
-                self._count_ap(tallies, truth, found.boxes, scan_boxes)
-            if found.points is not None:
-                mistakes = self._count_points(tallies, truth, found.points, mistakes, shown)
-        if found.top_view is not None and self.mounted is None:
-            self._count_cells(tallies, truth, found.top_view)
+                mistakes = self._count_boxes(tallies, truth, perception, mistakes)
+                self._count_ap(tallies, truth, perception.boxes, scan_boxes)
+            if perception.points is not None:
+                mistakes = self._count_points(tallies, truth, perception.points, mistakes, shown)
+        if perception.top_view is not None and self.mounted is None:
+            self._count_cells(tallies, truth, perception.top_view)
         return Record(truth.name, truth.drive, tallies), mistakes
 
     def _perceive(self, points: NDArray[np.float32]) -> Perception:
@@ -201,11 +203,11 @@ class Judge:
         seen = points.copy()
         seen[:, :3] = (points[:, :3] - self.mounted.t) @ self.mounted.R
         self.perceive.reset_mounting()
-        found = self.perceive(seen)
-        return replace(found, boxes=self.mounted.move_boxes(found.boxes))
+        perception = self.perceive(seen)
+        return replace(perception, boxes=self.mounted.move_boxes(perception.boxes))
 
     def _count_boxes(
-        self, tallies: dict[tuple[str, ...], Any], truth: Truth, found: Perception, mistakes: Mistakes
+        self, tallies: dict[tuple[str, ...], Any], truth: Truth, perception: Perception, mistakes: Mistakes
     ) -> Mistakes:
         """Match boxes where the truth is known; predicted and true ones with their center elsewhere count for nothing.
 
@@ -216,7 +218,7 @@ class Judge:
         def known(box: Box) -> bool:
             return bool(truth.known(np.array([box.center]))[0])
 
-        predicted = [box for box in found.boxes if known(box)]
+        predicted = [box for box in perception.boxes if known(box)]
         returns = list(zip(truth.boxes, truth.returns, strict=True))
         classes, view = self.box_classes, self.detected_in
         detected = [b for b in predicted if b.label in classes and (view is None or view.holds(*b.center[:2]))]
@@ -226,9 +228,9 @@ class Judge:
             pairs = evaluator.update(detected, to_find, ignored=ignored, drive=truth.drive)
         every = tuple(name for classes, _ in ALL_ROUND.values() for name in classes)
         to_find, ignored = boxes_to_find(returns, None, every, known=known)
-        for group, (own, least_iou) in ALL_ROUND.items():
-            evaluator = tallies["all_round", group] = BoxEvaluator(least_iou, together=own)
-            guesses, rights = ([box for box in of if box.label in own] for of in (predicted, to_find))
+        for group, (names, least_iou) in ALL_ROUND.items():
+            evaluator = tallies["all_round", group] = BoxEvaluator(least_iou, together=names)
+            guesses, rights = ([box for box in boxes if box.label in names] for boxes in (predicted, to_find))
             evaluator.update(guesses, rights, ignored=ignored, drive=truth.drive)
         returns_of = {id(box): n for box, n in returns}
         return replace(
@@ -261,7 +263,7 @@ class Judge:
         self,
         tallies: dict[tuple[str, ...], Any],
         truth: Truth,
-        found: PointLabels,
+        predicted: PointLabels,
         mistakes: Mistakes,
         shown: NDArray[np.bool_],
     ) -> Mistakes:
@@ -271,9 +273,9 @@ class Judge:
         """
         assert self.from_sensor is not None
         assert truth.labels is not None
-        right = np.where(found.in_view, truth.labels, IGNORE).astype(np.uint8)
+        right = np.where(predicted.in_view, truth.labels, IGNORE).astype(np.uint8)
         range_m = np.hypot(truth.points[:, 0], truth.points[:, 1])
-        labels = _renamed(found.labels, found.classes, self.point_classes)
+        labels = _renamed(predicted.labels, predicted.classes, self.point_classes)
         tallies |= banded(("points",), self.point_classes, labels, right, range_m)
         sure = np.where((right > 0) & find_ground(truth.points).mask, IGNORE, right).astype(np.uint8)
         for box in truth.boxes:
@@ -281,37 +283,37 @@ class Judge:
                 sure[inside(box, truth.points)] = IGNORE
         tallies |= banded(("sure",), self.point_classes, labels, sure, range_m)
         if self.as_recorded:
-            pixels = _renamed(self.from_sensor.point_labels(truth.points), found.classes, POINT_CLASSES)
+            pixels = _renamed(self.from_sensor.point_labels(truth.points), predicted.classes, POINT_CLASSES)
             tallies |= banded(("pixels",), POINT_CLASSES, pixels, right, range_m)
         counted = right != IGNORE
         if self.point_classes == POINT_CLASSES:
             tallies |= count_causes(
-                truth.points, labels, truth.labels, counted, found.in_view, truth.boxes, truth.drive
+                truth.points, labels, truth.labels, counted, predicted.in_view, truth.boxes, truth.drive
             )
         tallies |= {("objects", band): Counter() for band in BANDS}
         by_box = {id(box) for box in (*mistakes.found, *(box for box, _ in mistakes.missed))}
         hit, missed = [*mistakes.found], [*mistakes.missed]
         for box in truth.boxes:
             kind, distance_m = class_number(box.label, self.point_classes), math.hypot(*box.center[:2])
-            own = inside(box, truth.points) & (right == kind)
-            n_own = int(np.count_nonzero(own))
-            if kind in (0, IGNORE) or n_own < FEWEST_RETURNS:
+            members = inside(box, truth.points) & (right == kind)
+            n_members = int(np.count_nonzero(members))
+            if kind in (0, IGNORE) or n_members < FEWEST_RETURNS:
                 continue
             for band, within_m in BANDS.items():
                 if within(distance_m, within_m):
                     tallies["objects", band][self.point_classes[kind], object_key(truth.drive, box)] += 1
             if id(box) in by_box or distance_m >= FARTHEST_M:
                 continue
-            if 2 * int(np.count_nonzero(labels[own] == kind)) >= n_own:
+            if 2 * int(np.count_nonzero(labels[members] == kind)) >= n_members:
                 hit.append(box)
             else:
-                missed.append((box, n_own))
+                missed.append((box, n_members))
         wrong = np.where(counted & (labels != right), np.where(right > 0, 1, 2), 0).astype(np.uint8)
         n_objects = int(np.count_nonzero(counted & ((right > 0) | (labels > 0))))
         share = int(np.count_nonzero(wrong)) / max(n_objects, 1)
         return replace(mistakes, wrong=wrong[shown], found=tuple(hit), missed=tuple(missed), wrong_share=share)
 
-    def _count_cells(self, tallies: dict[tuple[str, ...], Any], truth: Truth, found: TopView) -> None:
+    def _count_cells(self, tallies: dict[tuple[str, ...], Any], truth: Truth, view: TopView) -> None:
         """Count the labels of cells for each table, and the probability of road if the true road is known."""
         assert self.from_above is not None
         for table, (classes, right) in truth.cells.items():
@@ -319,14 +321,14 @@ class Judge:
                 classes, right = _without_vehicles(classes, right)
             if len(classes) < 2:
                 continue
-            labels = _renamed(found.labels, found.classes, classes)
+            labels = _renamed(view.labels, view.classes, classes)
             tallies |= banded(("segmentation", table), classes, labels, right, self.cell_range_m)
-        if truth.road is None or "drivable" not in found.classes:
+        if truth.road is None or "drivable" not in view.classes:
             return
         table, name = truth.road
         classes, right = truth.cells[table]
         road = np.where(right == IGNORE, IGNORE, right == classes.index(name)).astype(np.uint8)
-        for group, decided in (("decision", found.road), ("drivable", found.drivable)):
+        for group, decided in (("decision", view.road), ("drivable", view.drivable)):
             tallies |= banded((group,), ("other", name), decided.astype(np.uint8), road, self.cell_range_m)
         probability = self.from_above.probability("drivable")
         for band, within_m in BANDS.items():
@@ -383,23 +385,23 @@ def _perceiver(
 
 def _without_vehicles(classes: tuple[str, ...], right: NDArray[np.uint8]) -> tuple[tuple[str, ...], NDArray[np.uint8]]:
     """Remove vehicles from a table, for a model without vehicle classes: their cells become the first class."""
-    kept = tuple(name for name in classes if name not in (*VEHICLES, "vehicle"))
+    others = tuple(name for name in classes if name not in (*VEHICLES, "vehicle"))
     number = np.full(256, IGNORE, np.uint8)
-    number[: len(classes)] = [kept.index(name) if name in kept else 0 for name in classes]
-    return kept, number[right]
+    number[: len(classes)] = [others.index(name) if name in others else 0 for name in classes]
+    return others, number[right]
 
 
 def _renamed(labels: NDArray[np.uint8], names: Sequence[str], classes: Sequence[str]) -> NDArray[np.uint8]:
     """Convert a model's labels to those of a table; classes that the table lacks become its first class."""
     coarse = {"drivable": "road", **dict.fromkeys(VEHICLES, "vehicle")}
-    own = [name if name in classes else coarse.get(name, "") for name in names]
-    return np.array([classes.index(name) if name in classes else 0 for name in own], np.uint8)[labels]
+    renamed = [name if name in classes else coarse.get(name, "") for name in names]
+    return np.array([classes.index(name) if name in classes else 0 for name in renamed], np.uint8)[labels]
 
 
 def training_scans_of(cards: Sequence[ModelCard]) -> dict[str, set[str]]:
     """Read from cards the `scan_hash` of every real training scan, by name and version of the model."""
     frames = {f"{card.name} {card.version}": card.training.get("frames", {}) for card in cards}
-    return {name: set(of.values()) if isinstance(of, Mapping) else set() for name, of in frames.items()}
+    return {name: set(hashes.values()) if isinstance(hashes, Mapping) else set() for name, hashes in frames.items()}
 
 
 def check_unseen(trained_on: Mapping[str, set[str]], name: str, drive: str, points: NDArray[np.float32]) -> None:

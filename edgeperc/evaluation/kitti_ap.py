@@ -39,14 +39,10 @@ BIRDS_EYE, IN_3D = "bird's eye", "3-D"
 class Counts:
     """Matches of one scan, for one class and one rule.
 
-    Attributes
-    ----------
-    objects : tuple of ObjectKey
-        One for each object to find.
-    hits : tuple of float
-        Scores of the first pass: of the best detection of each object.
-    steps : tuple of (float, int, int)
-        Change of the number of true and of false positives as the threshold falls to a score, best score first.
+    objects : one for each object to find.
+    hits : scores of the first pass: of the best detection of each object.
+    steps : tuple of (float, int, int); change of the number of true and of false positives as the threshold falls to a
+        score, best score first.
     """
 
     objects: tuple[ObjectKey, ...]
@@ -202,7 +198,9 @@ def best_candidates(
 
 def candidate_recall(found: Sequence[Candidate], least_iou: float = 0.3) -> dict[str, tuple[float, int]]:
     """Share of the objects of each class with a candidate of at least this IoU, and the number of objects."""
-    by_class = {label: [each.iou >= least_iou for each in found if each.label == label] for label in CLASSES}
+    by_class = {
+        label: [candidate.iou >= least_iou for candidate in found if candidate.label == label] for label in CLASSES
+    }
     return {label: (sum(hits) / len(hits) if hits else math.nan, len(hits)) for label, hits in by_class.items()}
 
 
@@ -227,7 +225,7 @@ def count_matches(
     objects : sequence of ObjectKey, m
     optional : sequence of bool, m; objects that may be found but need not.
     small : sequence of bool, n; detections too small in the image: neither hits nor false positives.
-    excused : sequence of bool, n; detections that are no false positives, but may be hits.
+    excused : sequence of bool, n; detections that are not false positives, but may be hits.
     """
     candidates = [
         [(j, float(overlaps[j, k])) for j in np.flatnonzero(overlaps[:, k] > least_iou).tolist()]
@@ -286,11 +284,11 @@ def average_precisions(counts: Sequence[Counts]) -> tuple[float, float, float]:
     Returns ap: Mean of the best precision at recalls 1/40, 2/40 .. 1, read from the whole curve; for any number of
         objects. All are NaN without objects.
     """
-    n_truth = sum(len(each.objects) for each in counts)
+    n_truth = sum(len(count.objects) for count in counts)
     if n_truth == 0:
         return math.nan, math.nan, math.nan
-    hits = np.sort(np.array([score for each in counts for score in each.hits], np.float64))[::-1]
-    steps = np.array([step for each in counts for step in each.steps], np.float64).reshape(-1, 3)
+    hits = np.sort(np.array([score for count in counts for score in count.hits], np.float64))[::-1]
+    steps = np.array([step for count in counts for step in count.steps], np.float64).reshape(-1, 3)
     steps = steps[np.argsort(-steps[:, 0], kind="stable")]
     n_hits, n_false = np.cumsum(steps[:, 1:], axis=0).astype(np.int64).T
     curve = np.zeros(N_POSITIONS + 1)
@@ -330,7 +328,7 @@ def _rules(levels: Collection[str], of_ranges: str) -> Iterator[tuple[str, str, 
 
 
 def _objects(labels: KittiLabels) -> tuple[list[str], NDArray[np.float64]]:
-    """Classes and numbers of the rows that are no DontCare regions."""
+    """Classes and numbers of the rows that are not DontCare regions."""
     is_object = np.array([kind != "dontcare" for kind in labels.kinds], np.bool_)
     return [kind for kind in labels.kinds if kind != "dontcare"], labels.numbers[is_object]
 

@@ -26,16 +26,9 @@ class Confusion:
 
     A class without true and predicted labels has NaN scores.
 
-    Parameters
-    ----------
     classes : sequence of str
-    ignore : int
-        True label of cells or points that are not counted.
-
-    Attributes
-    ----------
-    counts : (C, C) int64
-        Rows are the truth, columns the prediction.
+    ignore : int; true label of cells or points that are not counted.
+    counts : (C, C) int64; rows are the truth, columns the prediction.
     """
 
     def __init__(self, classes: Sequence[str], *, ignore: int = 255) -> None:
@@ -101,9 +94,9 @@ class Confusion:
 
     def weighted_precision(self) -> float:
         """Mean of `precision`, weighted by the frequency of the classes (mAP as SSADNet table 3 defines it)."""
-        found = self.precision()
-        weights = self.counts.sum(axis=1) * ~np.isnan(found)
-        return float(_share(np.nansum(found * weights), weights.sum()))
+        precision = self.precision()
+        weights = self.counts.sum(axis=1) * ~np.isnan(precision)
+        return float(_share(np.nansum(precision * weights), weights.sum()))
 
 
 def average_precision(scores: ArrayLike, hits: ArrayLike, n_truth: int) -> float:
@@ -120,8 +113,8 @@ def average_precision(scores: ArrayLike, hits: ArrayLike, n_truth: int) -> float
         raise PointsError(f"got scores {values.shape} and hits {right.shape}; expected two lists of one length")
     if n_truth == 0:
         return float("nan")
-    found = np.cumsum(right[np.argsort(-values, kind="stable")], dtype=np.int64)
-    return _eleven_points(found, np.arange(1, len(found) + 1), n_truth)
+    n_right = np.cumsum(right[np.argsort(-values, kind="stable")], dtype=np.int64)
+    return _eleven_points(n_right, np.arange(1, len(n_right) + 1), n_truth)
 
 
 def _eleven_points(found: NDArray[np.int64], predicted: NDArray[np.int64], n_truth: int) -> float:
@@ -142,10 +135,8 @@ def interpolated_precision(
 class ProbabilitySweep:
     """Precision and recall of one class over all thresholds of its probability (KITTI road, LoDNN).
 
-    Attributes
-    ----------
-    counts : (2, 256) int64
-        Histograms of the probability in steps of 1/255. Row 0: cells of other classes. Row 1: cells of the class.
+    counts : (2, 256) int64; histograms of the probability in steps of 1/255. Row 0: cells of other classes. Row 1:
+        cells of the class.
     """
 
     def __init__(self) -> None:
@@ -174,9 +165,9 @@ class ProbabilitySweep:
 
     def max_f1(self) -> float:
         """Best F1 over the thresholds (KITTI road's MaxF); NaN if the class does not occur."""
-        found, predicted = self._above()
+        n_right, predicted = self._above()
         n_truth = self.counts[1].sum()
-        return float(np.max(2.0 * found / (predicted + n_truth))) if n_truth else float("nan")
+        return float(np.max(2.0 * n_right / (predicted + n_truth))) if n_truth else float("nan")
 
     def average_precision(self) -> float:
         """Eleven-point average precision over the thresholds; NaN if the class does not occur."""
@@ -185,33 +176,24 @@ class ProbabilitySweep:
 
     def _above(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """True positives and positives, (256,) each, from the highest threshold to the lowest."""
-        found = np.cumsum(self.counts[1, ::-1])
-        return found, np.cumsum(self.counts.sum(axis=0)[::-1])
+        n_right = np.cumsum(self.counts[1, ::-1])
+        return n_right, np.cumsum(self.counts.sum(axis=0)[::-1])
 
 
 @dataclass(frozen=True, slots=True)
 class BoxScores:
     """Scores of the boxes of one class, or of all classes together.
 
-    Attributes
-    ----------
-    ap : float
-        `average_precision`; NaN if there was no box to find.
-    precision, recall : float
-        Over all predictions with any score; NaN without predictions, or without boxes to find.
-    mean_iou_50, mean_iou_70 : float
-        Mean IoU of the predictions with an IoU of at least 0.5, or 0.7 (SSADNet table 5); NaN without any.
-    heading, axis : float
-        Share of the hits whose yaw is within 45 degrees of the true one: over the full turn, where front for rear is
-        wrong, and modulo half a turn. NaN without hits; a yaw that is not finite is wrong.
-    front_known : float
-        Share of the hits with a known front (`Box.front`); the yaw of the others counts as it is.
-    n_truth, n_predicted, n_hits : int
-        Ignored boxes are not counted.
-    n_objects, n_found : int
-        Distinct objects (`object_key`) of the boxes to find, and of the hits.
-    n_drives : int
-        Drives of the boxes to find.
+    ap : `average_precision`; NaN if there was no box to find.
+    precision, recall : over all predictions with any score; NaN without predictions, or without boxes to find.
+    mean_iou_50, mean_iou_70 : mean IoU of the predictions with an IoU of at least 0.5, or 0.7 (SSADNet table 5); NaN
+        without any.
+    heading, axis : share of the hits whose yaw is within 45 degrees of the true one: over the full turn, where front
+        for rear is wrong, and modulo half a turn. NaN without hits; a yaw that is not finite is wrong.
+    front_known : share of the hits with a known front (`Box.front`); the yaw of the others counts as it is.
+    n_truth, n_predicted, n_hits : ignored boxes are not counted.
+    n_objects, n_found : distinct objects (`object_key`) of the boxes to find, and of the hits.
+    n_drives : drives of the boxes to find.
     """
 
     ap: float
@@ -375,14 +357,14 @@ class BoxEvaluator:
     def _scores(self, matches: _Matches, within_m: tuple[float, float]) -> BoxScores:
         near, far = within_m
         ranges_m, truth_m = np.array(matches.ranges_m), np.array(matches.truth_m)
-        kept = (ranges_m >= near) & (ranges_m < far)
-        scores, overlaps = np.array(matches.scores)[kept], np.array(matches.overlaps)[kept]
+        in_range = (ranges_m >= near) & (ranges_m < far)
+        scores, overlaps = np.array(matches.scores)[in_range], np.array(matches.overlaps)[in_range]
         to_find = np.flatnonzero((truth_m >= near) & (truth_m < far))
         n_truth = len(to_find)
         hits = overlaps >= self.iou_threshold
         n_hits = int(np.count_nonzero(hits))
-        turns = np.array(matches.turns)[kept][hits]
-        fronts = np.array(matches.fronts, dtype=np.bool_)[kept][hits]
+        turns = np.array(matches.turns)[in_range][hits]
+        fronts = np.array(matches.fronts, dtype=np.bool_)[in_range][hits]
         objects = {matches.objects[k] for k in to_find}
         return BoxScores(
             ap=average_precision(scores, hits, n_truth),
@@ -397,7 +379,7 @@ class BoxEvaluator:
             n_predicted=len(hits),
             n_hits=n_hits,
             n_objects=len(objects),
-            n_found=len({matches.matched[k] for k in np.flatnonzero(kept)[hits]}),
+            n_found=len({matches.matched[k] for k in np.flatnonzero(in_range)[hits]}),
             n_drives=len({drive for drive, *_ in objects}),
         )
 

@@ -33,21 +33,13 @@ from ..view.content import drawable_boxes, drawable_points
 class Mistakes:
     """A scan compared with its ground truth, to be drawn.
 
-    Attributes
-    ----------
-    name, drive : str
-    points : (n, 4) float32
-        The points to draw: x, y, z [m] in the sensor frame, remission.
-    wrong : (n,) uint8
-        1: point of an object with another label. 2: background point with the label of an object. 0: all others.
-    found : tuple of Box
-        True boxes that were found.
-    missed : tuple of (Box, int)
-        True boxes that were not found, and the number of points in each.
-    false : tuple of Box
-        Predicted boxes where there is no object.
-    wrong_share : float
-        Wrong points divided by all points that are on objects or were labeled as objects.
+    points : (n, 4) float32; the points to draw: x, y, z [m] in the sensor frame, remission.
+    wrong : (n,) uint8; 1: point of an object with another label. 2: background point with the label of an object. 0:
+        all others.
+    found : true boxes that were found.
+    missed : tuple of (Box, int); true boxes that were not found, and the number of points in each.
+    false : predicted boxes where there is no object.
+    wrong_share : wrong points divided by all points that are on objects or were labeled as objects.
     """
 
     name: str

@@ -45,12 +45,8 @@ Tallies = Mapping[tuple[str, ...], Any]
 class Record:
     """Counts of one evaluated scan.
 
-    Attributes
-    ----------
-    name, drive : str
-    tallies : mapping of tuple of str to object
-        Counts, by the keys of their figures in the result, such as ``("points", "0-15 m")``. Counts of several scans
-        can be added.
+    tallies : counts, by the keys of their figures in the result, such as ``("points", "0-15 m")``. Counts of several
+        scans can be added.
     """
 
     name: str
@@ -81,9 +77,9 @@ def banded(
     labels, right, range_m = labels[known], right[known], range_m[known]
     confusions: dict[tuple[str, ...], Confusion] = {}
     for band, within_m in BANDS.items():
-        kept = within(range_m, within_m)
+        in_range = within(range_m, within_m)
         confusion = Confusion(classes)
-        confusion.update(labels[kept], right[kept])
+        confusion.update(labels[in_range], right[in_range])
         confusions |= {(*table, band): confusion}
     return confusions
 
@@ -95,7 +91,7 @@ def figures(records: Iterable[Record], n_resamples: int = 1000) -> dict[str, Any
     ----------
     records : iterable of Record
     n_resamples : int
-        Number of bootstrap resamples of the drives, for the 95 % intervals (``"iou_interval"`` beside ``"iou"``). An
+        Number of bootstrap resamples of the drives, for the 95 % intervals (``"iou_interval"`` for ``"iou"``). An
         interval is None if fewer than two drives have data for the figure.
 
     Returns
@@ -122,7 +118,7 @@ def figures(records: Iterable[Record], n_resamples: int = 1000) -> dict[str, Any
         - ``"errors"``: by error and cause (`causes.CAUSES`). ``"all"`` is a share of the true (missed) or predicted
           (false) points of the class, a cause a share of the error; ``"n_of"`` is the whole.
         - ``"bumper"``: points at the own bumper that are labeled car: all, and those on the ground. Where the truth is
-          unknown they may be of a real car beside the own one.
+          unknown they may be of a real car next to the ego vehicle.
         - ``"segmentation"``: by table and band. ``"road"``: by band.
     """
     by_drive: dict[str, list[Tallies]] = {}
@@ -155,44 +151,46 @@ def _summed(parts: Sequence[Tallies]) -> Tallies:
 
 
 def _figures(tallies: Tallies) -> dict[str, Any]:
-    found: dict[str, Any] = {}
+    figures: dict[str, Any] = {}
     for key, tally in tallies.items():
         group, band = key[0], key[-1]
         if group == "labeled":
-            found[group] = _labeled_rows(tally)
+            figures[group] = _labeled_rows(tally)
         elif group in ("points", "pixels"):
-            found.setdefault(group, {})[band] = _point_rows(tally, tallies["objects", band])
+            figures.setdefault(group, {})[band] = _point_rows(tally, tallies["objects", band])
         elif group == "sure":
             objects = tallies["objects", band]
             others = Counter({key: n for key, n in objects.items() if key[1][1] != SITTING})
-            found.setdefault(group, {})[band] = _point_rows(tally, others)
+            figures.setdefault(group, {})[band] = _point_rows(tally, others)
         elif group == "mean_scan":
             for name, iou in zip(tally.classes, tally.iou().tolist(), strict=True):
-                found["points"][band][name]["iou_by_drive"] = iou
+                figures["points"][band][name]["iou_by_drive"] = iou
         elif group == "boxes":
             bands = {name: _of_all(tally, within_m, "vehicle") for name, within_m in BANDS.items()}
-            found.setdefault(group, {})[key[1]] = {name: _with_mean(scores) for name, scores in bands.items()}
+            figures.setdefault(group, {})[key[1]] = {name: _with_mean(scores) for name, scores in bands.items()}
             if key[1] == "oriented":
-                found.setdefault("heading", {})[group] = {name: _heading_rows(scores) for name, scores in bands.items()}
+                figures.setdefault("heading", {})[group] = {
+                    name: _heading_rows(scores) for name, scores in bands.items()
+                }
         elif group == "all_round":
             for name, within_m in BANDS.items():
                 scores = _of_all(tally, within_m, key[1])
-                found.setdefault(group, {}).setdefault(name, {}).update(_box_rows(scores))
-                headings = found.setdefault("heading", {}).setdefault(group, {})
+                figures.setdefault(group, {}).setdefault(name, {}).update(_box_rows(scores))
+                headings = figures.setdefault("heading", {}).setdefault(group, {})
                 headings.setdefault(name, {}).update(_heading_rows(scores))
         elif group == "kitti":
-            found[group] = _kitti_rows(tally)
+            figures[group] = _kitti_rows(tally)
         elif group == "centers":
-            found[group] = _center_rows(tally)
+            figures[group] = _center_rows(tally)
         elif key == ("errors", "points"):
             scans, objects = tallies["errors", "scans"], tallies["errors", "objects"]
-            found["errors"] = {error: _error_rows(error, tally, scans, objects) for error in CAUSES}
-            found["bumper"] = {cause: _error_row(BUMPER, cause, tally, scans) for cause in ("all", FLOOR)}
+            figures["errors"] = {error: _error_rows(error, tally, scans, objects) for error in CAUSES}
+            figures["bumper"] = {cause: _error_row(BUMPER, cause, tally, scans) for cause in ("all", FLOOR)}
         elif group == "segmentation":
-            found.setdefault(group, {}).setdefault(key[1], {})[band] = _map_row(tally)
+            figures.setdefault(group, {}).setdefault(key[1], {})[band] = _map_row(tally)
         elif group == "road":
-            found.setdefault(group, {})[band] = _road_row(tally, tallies["decision", band], tallies["drivable", band])
-    return found
+            figures.setdefault(group, {})[band] = _road_row(tally, tallies["decision", band], tallies["drivable", band])
+    return figures
 
 
 def _labeled_rows(labeled: Counter[ObjectKey]) -> dict[str, Any]:
@@ -237,7 +235,7 @@ def _with_mean(scores_of: Mapping[str, BoxScores]) -> dict[str, Any]:
 
 
 def _box_rows(scores_of: Mapping[str, BoxScores]) -> dict[str, Any]:
-    names = [each.name for each in fields(BoxScores) if each.name not in _HEADING]
+    names = [score.name for score in fields(BoxScores) if score.name not in _HEADING]
     return {
         label: {name: getattr(scores, name) for name in names} | _few(scores.n_objects)
         for label, scores in scores_of.items()
@@ -248,7 +246,7 @@ def _kitti_rows(table: ApTable) -> dict[str, Any]:
     """By class, overlap and level or range."""
     rows: dict[str, Any] = {}
     for (label, overlap, level), counts in table.counts.items():
-        objects = [key for each in counts for key in each.objects]
+        objects = [key for count in counts for key in count.objects]
         scores = dict(zip(("ap_r40", "ap_r11", "ap"), average_precisions(counts), strict=True))
         row = scores | {"n_truth": len(objects)} | _distinct(objects)
         rows.setdefault(label, {}).setdefault(overlap, {})[level] = row
@@ -283,13 +281,13 @@ def _error_rows(
         n, whole = points[error, cause], points[error, "of" if cause == "all" else "all"]
         row = {"share": n / whole if whole else math.nan, "n_of": whole} | _error_row(error, cause, points, scans)
         if error.startswith("missed"):
-            row |= _distinct(key for *of, key in objects if of == [error, cause])
+            row |= _distinct(key for *kind, key in objects if kind == [error, cause])
         rows[cause] = row
     return rows
 
 
 def _error_row(error: str, cause: str, points: Counter[Any], scans: Counter[Any]) -> dict[str, Any]:
-    n_scans = [n for (*of, _), n in scans.items() if of == [error, cause]]
+    n_scans = [n for (*kind, _), n in scans.items() if kind == [error, cause]]
     return {"n_points": points[error, cause], "n_scans": sum(n_scans), "n_drives": len(n_scans)}
 
 
@@ -345,29 +343,31 @@ def _add_intervals(
     """Add the interval of each figure to ``whole``; ``drives`` holds the figures of single drives."""
     count = next((name for name in _COUNTS if name in whole), None)
     for key, value in list(whole.items()):
-        of_drives, of_samples = [each.get(key, {}) for each in drives], [each.get(key, {}) for each in samples]
+        of_drives, of_samples = [record.get(key, {}) for record in drives], [record.get(key, {}) for record in samples]
         if key == "iou" and isinstance(value, dict):
-            counts = {name: [each["n_cells_of"][name] for each in drives] for name in value}
+            counts = {name: [record["n_cells_of"][name] for record in drives] for name in value}
             whole["iou_interval"] = {
-                name: _interval(counts[name], [each[name] for each in of_samples], times) for name in value
+                name: _interval(counts[name], [record[name] for record in of_samples], times) for name in value
             }
         elif isinstance(value, dict):
             _add_intervals(value, of_drives, of_samples, times)
         elif count and isinstance(value, float):
-            values = [each.get(key, math.nan) for each in samples]
-            whole[f"{key}_interval"] = _interval([each.get(count, 0) for each in drives], values, times)
+            values = [record.get(key, math.nan) for record in samples]
+            whole[f"{key}_interval"] = _interval([record.get(count, 0) for record in drives], values, times)
         for cause in value if key == "bumper" else ():
-            n_points = [each[cause]["n_points"] if each else 0 for each in of_samples]
+            n_points = [record[cause]["n_points"] if record else 0 for record in of_samples]
             bounds = _interval([1] * len(drives), n_points, times)
             value[cause]["n_points_interval"] = bounds and [round(bound) for bound in bounds]
     for mean_of in ("mean_iou", "mean_ap"):
         # Means over different classes are not comparable, so only drives and resamples with all classes count.
         meant = [name for name, (value, _) in _parts(whole, mean_of).items() if not math.isnan(value)]
         if meant:
-            parts = [[_parts(each, mean_of).get(name, (math.nan, 0)) for name in meant] for each in (*drives, *samples)]
-            fewest = [min(n for _, n in each) for each in parts[: len(drives)]]
-            complete = [not any(math.isnan(value) for value, _ in each) for each in parts[len(drives) :]]
-            values = [each[mean_of] if same else math.nan for each, same in zip(samples, complete, strict=True)]
+            parts = [
+                [_parts(record, mean_of).get(name, (math.nan, 0)) for name in meant] for record in (*drives, *samples)
+            ]
+            fewest = [min(n for _, n in record) for record in parts[: len(drives)]]
+            complete = [not any(math.isnan(value) for value, _ in record) for record in parts[len(drives) :]]
+            values = [record[mean_of] if same else math.nan for record, same in zip(samples, complete, strict=True)]
             whole[f"{mean_of}_interval"] = _interval(fewest, values, times)
 
 
@@ -376,8 +376,8 @@ def _parts(row: Mapping[str, Any], mean_of: str) -> dict[str, tuple[float, int]]
     if mean_of == "mean_iou" and "iou" in row and "n_cells_of" in row:
         return {name: (value, row["n_cells_of"][name]) for name, value in row["iou"].items() if name != "vehicle"}
     if mean_of == "mean_ap" and mean_of in row:
-        rows = {name: each for name, each in row.items() if isinstance(each, dict) and "ap" in each}
-        return {name: (each["ap"], each["n_truth"]) for name, each in rows.items() if name != "vehicle"}
+        rows = {name: figures for name, figures in row.items() if isinstance(figures, dict) and "ap" in figures}
+        return {name: (figures["ap"], figures["n_truth"]) for name, figures in rows.items() if name != "vehicle"}
     return {}
 
 

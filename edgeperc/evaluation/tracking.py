@@ -245,12 +245,12 @@ def read_sequence(
     placed = calibration.sensor_boxes(values[:, 9:16])
     ignored = (values[:, 2] > MAX_TRUNCATION) | (values[:, 3] > MAX_OCCLUSION)
     truth: dict[str, tuple[FrameTruth, ...]] = {}
-    for of in classes:
-        neighbors = [kind for kind in NEIGHBORS[of] if (rules, kind) != ("ab3dmot", "person")]
-        mine = np.isin(kinds, [*KINDS[of], *neighbors])
-        excused = ignored | ~np.isin(kinds, KINDS[of])
+    for label in classes:
+        neighbors = [kind for kind in NEIGHBORS[label] if (rules, kind) != ("ab3dmot", "person")]
+        mine = np.isin(kinds, [*KINDS[label], *neighbors])
+        excused = ignored | ~np.isin(kinds, KINDS[label])
         in_frame = [np.flatnonzero(mine & (values[:, 0] == k)) for k in range(n_frames)]
-        truth[of] = tuple(
+        truth[label] = tuple(
             FrameTruth(values[rows, 1].astype(np.int64), placed[rows], excused[rows]) for rows in in_frame
         )
     unlabeled = kinds == "dontcare"
@@ -273,10 +273,10 @@ def _read_detections(
     """
     detections: list[list[Box]] = [[] for _ in range(n_frames)]
     image_boxes: list[list[NDArray[np.float64]]] = [[] for _ in range(n_frames)]
-    for of in classes:
-        folders = sorted((root / "detections").glob(f"*_{of.capitalize()}"))
+    for label in classes:
+        folders = sorted((root / "detections").glob(f"*_{label.capitalize()}"))
         if not folders:
-            raise TrackingError(f"{root}/detections has no folder *_{of.capitalize()}; expected one for each class")
+            raise TrackingError(f"{root}/detections has no folder *_{label.capitalize()}; expected one for each class")
         path = folders[0] / f"{name}.txt"
         try:
             lines = [line.split(",") for line in path.read_text().splitlines() if line.strip()]
@@ -291,7 +291,7 @@ def _read_detections(
         for frame, score, seen, row in zip(
             rows[:, 0].astype(np.int64), scores.tolist(), rows[:, 2:6], placed.tolist(), strict=True
         ):
-            detections[frame].append(Box(of, score, (row[0], row[1], row[2]), (row[3], row[4], row[5]), row[6]))
+            detections[frame].append(Box(label, score, (row[0], row[1], row[2]), (row[3], row[4], row[5]), row[6]))
             image_boxes[frame].append(seen)
     return detections, [np.array(of_frame).reshape(-1, 4) for of_frame in image_boxes]
 
@@ -341,29 +341,29 @@ def ab3dmot_sequence(sequence: TrackingSequence, classes: Sequence[str] = CLASSE
     list of FrameResult
         One for each frame. Classes without settings of AB3DMOT's have no tracks.
     """
-    trackers = {of: Ab3dmot(SETTINGS[of]) for of in classes if of in SETTINGS}
+    trackers = {label: Ab3dmot(SETTINGS[label]) for label in classes if label in SETTINGS}
     results = []
     for boxes in sequence.detections:
         parts, labels = [], []
-        for number, (of, tracker) in enumerate(trackers.items()):
-            mine = [k for k, box in enumerate(boxes) if box.label == of]
+        for number, (label, tracker) in enumerate(trackers.items()):
+            mine = [k for k, box in enumerate(boxes) if box.label == label]
             scores = np.clip([boxes[k].score for k in mine], 1e-15, 1.0 - 1e-15)
             ids, rows, logits, at = tracker.update(
                 [boxes[k] for k in mine], (np.log(scores) - np.log1p(-scores)).tolist()
             )
             sources = np.where(at >= 0, np.append(mine, -1).astype(np.int64)[at], -1)
             parts.append((len(trackers) * ids + number, rows, logits, sources))
-            labels += [of] * len(ids)
+            labels += [label] * len(ids)
         ids, rows, logits, sources = (np.concatenate(part) for part in zip(*parts, strict=True))
         results.append(FrameResult(ids, labels, rows, logits, sources))
     return results
 
 
-def _frame_truth(sequence: TrackingSequence, of: str, rules: str) -> list[FrameTruth]:
+def _frame_truth(sequence: TrackingSequence, label: str, rules: str) -> list[FrameTruth]:
     """True boxes of one class for the metrics, by frame."""
     if rules != "ab3dmot":
-        return [*sequence.truth[of]]
-    return [replace(frame, boxes=sequence.calibration.in_camera(frame.boxes)) for frame in sequence.truth[of]]
+        return [*sequence.truth[label]]
+    return [replace(frame, boxes=sequence.calibration.in_camera(frame.boxes)) for frame in sequence.truth[label]]
 
 
 def _frame_tracks(sequence: TrackingSequence, results: Sequence[FrameResult], of: str, rules: str) -> list[FrameTracks]:
@@ -449,9 +449,9 @@ def evaluate_kitti(
     names = list(sequences or sequence_names(root))
     # By tracker, class and sequence.
     pairs: dict[str, dict[str, list[tuple[Sequence[FrameTruth], Sequence[FrameTracks]]]]] = {
-        name: {of: [] for of in classes} for name in ("edgeperc", *(("ab3dmot",) if rival else ()))
+        name: {label: [] for label in classes} for name in ("edgeperc", *(("ab3dmot",) if rival else ()))
     }
-    headings = {of: Headings() for of in classes}
+    headings = {label: Headings() for label in classes}
     n_frames, seconds = 0, 0.0
     for done, name in enumerate(names, start=1):
         sequence = read_sequence(root, name, classes, (boxes or {}).get(name), rules=rules)
@@ -460,17 +460,18 @@ def evaluate_kitti(
         results = {"edgeperc": [FrameResult.of(in_frame) for in_frame in tracks]}
         if rival:
             results["ab3dmot"] = ab3dmot_sequence(sequence, classes)
-        for of in classes:
+        for label in classes:
             for method, reported in results.items():
-                pairs[method][of].append(
-                    (_frame_truth(sequence, of, rules), _frame_tracks(sequence, reported, of, rules))
+                pairs[method][label].append(
+                    (_frame_truth(sequence, label, rules), _frame_tracks(sequence, reported, label, rules))
                 )
-            headings[of] += count_headings(sequence.truth[of], tracks, KINDS[of], iou_threshold)
+            headings[label] += count_headings(sequence.truth[label], tracks, KINDS[label], iou_threshold)
         if on_sequence is not None:
             on_sequence(done, len(names))
     scores = {
         method: {
-            of: asdict(evaluate_tracks(each, iou_threshold, as_ab3dmot=rules == "ab3dmot")) for of, each in by.items()
+            label: asdict(evaluate_tracks(frames, iou_threshold, as_ab3dmot=rules == "ab3dmot"))
+            for label, frames in by.items()
         }
         for method, by in pairs.items()
     }
@@ -480,7 +481,7 @@ def evaluate_kitti(
         "rules": rules,
         "frames_per_s": n_frames / seconds,
         "classes": scores["edgeperc"],
-        "headings": {of: asdict(each) for of, each in headings.items()},
+        "headings": {label: asdict(frames) for label, frames in headings.items()},
         **({"rival": scores["ab3dmot"]} if rival else {}),
     }
 
@@ -513,10 +514,10 @@ def perceive_drive(
         A scan cannot be read.
     """
     trained_on = training_scans_of(perceive.cards)
-    found: list[list[Box]] = [[] for _ in range(1 + max(scans, default=-1))]
+    boxes: list[list[Box]] = [[] for _ in range(1 + max(scans, default=-1))]
     for frame, path in scans.items():
         points = read_points(path)
         check_unseen(trained_on, path.stem, drive, points)
-        found[frame] = list(perceive(points).boxes)
+        boxes[frame] = list(perceive(points).boxes)
         on_scan()
-    return found
+    return boxes

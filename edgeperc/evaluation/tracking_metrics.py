@@ -24,13 +24,9 @@ HOTA_ALPHAS = np.linspace(0.05, 0.95, 19)
 class FrameTruth:
     """True objects of one frame.
 
-    Attributes
-    ----------
-    ids : (n,) int64
-        Id of the object in each box, the same in all frames.
+    ids : (n,) int64; id of the object in each box, the same in all frames.
     boxes : (n, 7) float64
-    ignored : (n,) bool
-        Objects that a tracker may find but need not: occluded, truncated, or of a neighboring class.
+    ignored : (n,) bool; objects that a tracker may find but need not: occluded, truncated, or of a neighboring class.
     """
 
     ids: NDArray[np.int64]
@@ -42,14 +38,11 @@ class FrameTruth:
 class FrameTracks:
     """Tracks of one frame.
 
-    Attributes
-    ----------
     ids : (m,) int64
     boxes : (m, 7) float64
-    scores : (m,) float64
-        The score of a track is the mean over its frames.
-    excused : (m,) bool
-        Boxes that do not count as false positives: too small in the image, or in a region without labels.
+    scores : (m,) float64; the score of a track is the mean over its frames.
+    excused : (m,) bool; boxes that do not count as false positives: too small in the image, or in a region without
+        labels.
     """
 
     ids: NDArray[np.int64]
@@ -62,20 +55,13 @@ class FrameTracks:
 class Clear:
     """CLEAR-MOT counts of the tracks above one score (false alarms, missed and ID SW in KUL-Seg's Table 7).
 
-    Attributes
-    ----------
-    threshold : float
-        Lowest mean score of a counted track.
-    n_truth : int
-        True boxes, without ignored ones.
-    n_found : int
-        Matched true boxes, with ignored ones.
-    n_false, n_missed : int
-        False alarms and missed detections.
-    n_switches, n_fragments : int
-        How often the track of an object changed between frames, and how often it resumed after a gap.
-    mota, motp : float
-        Accuracy 1 - (missed + false + switches) / truth, NaN without true boxes; mean IoU of the matches, NaN
+    threshold : lowest mean score of a counted track.
+    n_truth : true boxes, without ignored ones.
+    n_found : matched true boxes, with ignored ones.
+    n_false, n_missed : false alarms and missed detections.
+    n_switches, n_fragments : how often the track of an object changed between frames, and how often it resumed after a
+        gap.
+    mota, motp : accuracy 1 - (missed + false + switches) / truth, NaN without true boxes; mean IoU of the matches, NaN
         without matches.
     """
 
@@ -99,10 +85,8 @@ class Clear:
 class Hota:
     """Higher order tracking accuracy, mean over the IoU thresholds 0.05, 0.10 .. 0.95 (Luiten et al., IJCV 2020).
 
-    Attributes
-    ----------
-    hota, deta, assa : float
-        HOTA, detection accuracy and association accuracy, in 0..1; NaN if there are neither true boxes nor tracks.
+    hota, deta, assa : HOTA, detection accuracy and association accuracy, in 0..1; NaN if there are neither true boxes
+        nor tracks.
     """
 
     hota: float
@@ -114,19 +98,12 @@ class Hota:
 class TrackingScores:
     """All figures of one class.
 
-    Attributes
-    ----------
-    samota, amota, amotp : float
-        Means over forty recalls of scaled MOTA, MOTA and MOTP (AB3DMOT); a recall that is never reached counts as 0.
-        NaN without true boxes.
-    all_tracks : Clear
-        Counts of all reported tracks, with any score.
-    best : Clear
-        Counts at the score threshold with the highest MOTA.
-    hota : Hota
-        At the same threshold.
-    n_frames, n_objects : int
-        Number of frames, and of true objects that are not ignored in every frame.
+    samota, amota, amotp : means over forty recalls of scaled MOTA, MOTA and MOTP (AB3DMOT); a recall that is never
+        reached counts as 0. NaN without true boxes.
+    all_tracks : counts of all reported tracks, with any score.
+    best : counts at the score threshold with the highest MOTA.
+    hota : at the same threshold.
+    n_frames, n_objects : number of frames, and of true objects that are not ignored in every frame.
     """
 
     samota: float
@@ -168,17 +145,17 @@ def recall_thresholds(scores: ArrayLike, n_truth: int) -> tuple[NDArray[np.float
         first recall that is not reached.
     """
     falling = np.sort(np.asarray(scores, dtype=np.float64))[::-1]
-    at: list[int] = []
+    ranks: list[int] = []
     recalls: list[float] = []
     recall = 0.0
     for rank in range(len(falling)):
         # The next rank is nearer. With equal distances rounding decides, so this is written as in KITTI's program.
         if rank < len(falling) - 1 and (rank + 2) / n_truth - recall < recall - (rank + 1) / n_truth:
             continue
-        at.append(rank)
+        ranks.append(rank)
         recalls.append(recall)
         recall += 1.0 / N_RECALLS
-    return falling[at[1:]], np.array(recalls[1:], np.float64)
+    return falling[ranks[1:]], np.array(recalls[1:], np.float64)
 
 
 def evaluate_tracks(
@@ -228,8 +205,8 @@ def evaluate_tracks(
         all_tracks=everything,
         best=best,
         hota=_hota(packed, best.threshold),
-        n_frames=sum(len(of.shapes) for of in packed),
-        n_objects=sum(len({*of.truth[~of.ignored].tolist()}) for of in packed),
+        n_frames=sum(len(sequence.shapes) for sequence in packed),
+        n_objects=sum(len({*sequence.truth[~sequence.ignored].tolist()}) for sequence in packed),
     )
 
 
@@ -272,10 +249,10 @@ class _Packed:
 
     def matched(self, threshold: float) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
         """Indices of the matched pairs, and which boxes of tracks are above the threshold."""
-        kept = (self.mean_score >= threshold)[self.track]
+        is_scored = (self.mean_score >= threshold)[self.track]
         most = 1.0 + float(self.shapes[:, 0].max(initial=0))  # one more pair outweighs any IoU
-        may = kept[self.column] & (self.iou >= self.iou_threshold)
-        return self.assigned(np.where(may, most + self.iou, 0.0)), kept
+        may = is_scored[self.column] & (self.iou >= self.iou_threshold)
+        return self.assigned(np.where(may, most + self.iou, 0.0)), is_scored
 
     def assigned(self, gain: NDArray[np.float64]) -> NDArray[np.int64]:
         """Indices of the pairs with the largest sum of gains in each frame; each box is in at most one pair."""
@@ -290,9 +267,9 @@ def _counted(ids: Sequence[NDArray[np.int64]]) -> tuple[NDArray[np.int64], int]:
 
 
 def _at_threshold(packed: Sequence[_Packed], threshold: float) -> Clear:
-    for of in packed:
-        if of.as_ab3dmot:
-            of.mean_score = of.averaged(of.mean_score[of.track])
+    for sequence in packed:
+        if sequence.as_ab3dmot:
+            sequence.mean_score = sequence.averaged(sequence.mean_score[sequence.track])
     return _clear(packed, threshold)[0]
 
 
@@ -301,22 +278,22 @@ def _clear(packed: Sequence[_Packed], threshold: float) -> tuple[Clear, NDArray[
     n_truth = n_found = n_false = n_missed = n_switches = n_fragments = 0
     total_overlap = 0.0
     scores = [np.zeros(0)]
-    for of in packed:
-        pair, unmatched = of.matched(threshold)
-        unmatched[of.column[pair]] = False
-        ids = np.full(len(of.truth), -1)
-        ids[of.row[pair]] = of.track[of.column[pair]]
-        switches, fragments = count_breaks(of.truth, ids, of.ignored, of.as_ab3dmot)
-        if of.as_ab3dmot:
-            of.once_matched[of.column[pair]] = True
-        n_truth += int(np.count_nonzero(~of.ignored))
+    for sequence in packed:
+        pair, unmatched = sequence.matched(threshold)
+        unmatched[sequence.column[pair]] = False
+        ids = np.full(len(sequence.truth), -1)
+        ids[sequence.row[pair]] = sequence.track[sequence.column[pair]]
+        switches, fragments = count_breaks(sequence.truth, ids, sequence.ignored, sequence.as_ab3dmot)
+        if sequence.as_ab3dmot:
+            sequence.once_matched[sequence.column[pair]] = True
+        n_truth += int(np.count_nonzero(~sequence.ignored))
         n_found += len(pair)
-        n_missed += int(np.count_nonzero((ids < 0) & ~of.ignored))
-        n_false += int(np.count_nonzero(unmatched & ~(of.excused & ~of.once_matched)))
+        n_missed += int(np.count_nonzero((ids < 0) & ~sequence.ignored))
+        n_false += int(np.count_nonzero(unmatched & ~(sequence.excused & ~sequence.once_matched)))
         n_switches += switches
         n_fragments += fragments
-        total_overlap += float(of.iou[pair].sum())
-        scores.append(of.mean_score[of.track[of.column[pair]]])
+        total_overlap += float(sequence.iou[pair].sum())
+        scores.append(sequence.mean_score[sequence.track[sequence.column[pair]]])
     mota = 1.0 - (n_missed + n_false + n_switches) / n_truth if n_truth else math.nan
     motp = total_overlap / n_found if n_found else math.nan
     counts = n_truth, n_found, n_false, n_missed, n_switches, n_fragments
@@ -327,29 +304,31 @@ def _hota(packed: Sequence[_Packed], threshold: float) -> Hota:
     """HOTA, without ignored true boxes, the tracks matched to them, and excused boxes of tracks."""
     n_found, n_truth, n_tracked = np.zeros(len(HOTA_ALPHAS)), 0, 0
     associated = np.zeros(len(HOTA_ALPHAS))
-    for of in packed:
-        pair, kept = of.matched(threshold)
-        real, counted = ~of.ignored, kept & ~of.excused
-        counted[of.column[pair]] = real[of.row[pair]]
-        in_truth = np.bincount(of.truth[real], minlength=int(of.truth.max(initial=-1)) + 1).astype(np.float64)
-        in_track = np.bincount(of.track[counted], minlength=of.n_tracks).astype(np.float64)
+    for sequence in packed:
+        pair, is_matched = sequence.matched(threshold)
+        real, counted = ~sequence.ignored, is_matched & ~sequence.excused
+        counted[sequence.column[pair]] = real[sequence.row[pair]]
+        in_truth = np.bincount(sequence.truth[real], minlength=int(sequence.truth.max(initial=-1)) + 1).astype(
+            np.float64
+        )
+        in_track = np.bincount(sequence.track[counted], minlength=sequence.n_tracks).astype(np.float64)
         either = in_truth[:, None] + in_track[None, :]
 
         # HOTA's global alignment: the overlap of each object with each track over the whole sequence.
-        shared = of.iou * real[of.row] * counted[of.column]
-        of_truth = np.bincount(of.row, shared, len(of.truth))[of.row]
-        of_track = np.bincount(of.column, shared, len(of.track))[of.column]
-        names = of.truth[of.row], of.track[of.column]
+        shared = sequence.iou * real[sequence.row] * counted[sequence.column]
+        of_truth = np.bincount(sequence.row, shared, len(sequence.truth))[sequence.row]
+        of_track = np.bincount(sequence.column, shared, len(sequence.track))[sequence.column]
+        names = sequence.truth[sequence.row], sequence.track[sequence.column]
         together = np.zeros(either.shape)
         np.add.at(together, names, shared / np.maximum(of_truth + of_track - shared, 1e-12))
         alignment = together / np.maximum(either - together, 1e-12)
 
-        made = of.assigned(alignment[names] * shared)
+        made = sequence.assigned(alignment[names] * shared)
         for k, alpha in enumerate(HOTA_ALPHAS):
-            found = made[of.iou[made] >= alpha - 1e-12]
+            hits = made[sequence.iou[made] >= alpha - 1e-12]
             counts = np.zeros(either.shape)
-            np.add.at(counts, (names[0][found], names[1][found]), 1.0)
-            n_found[k] += len(found)
+            np.add.at(counts, (names[0][hits], names[1][hits]), 1.0)
+            n_found[k] += len(hits)
             associated[k] += (counts * counts / np.maximum(either - counts, 1.0)).sum()
         n_truth += int(np.count_nonzero(real))
         n_tracked += int(np.count_nonzero(counted))
@@ -450,23 +429,23 @@ def count_breaks(
     switches = 0
     fragments = 0
     for one in range(truth.max() + 1 if len(truth) else 0):
-        own = np.flatnonzero(truth == one)
+        rows = np.flatnonzero(truth == one)
         hidden = True
-        for i in own:
+        for i in rows:
             hidden = hidden and ignored[i]
         if hidden:
             continue
-        last = ids[own[0]]
-        for f in range(1, len(own)):
-            now, before = ids[own[f]], ids[own[f - 1]]
-            if ignored[own[f]]:
+        last = ids[rows[0]]
+        for f in range(1, len(rows)):
+            now, before = ids[rows[f]], ids[rows[f - 1]]
+            if ignored[rows[f]]:
                 last = -1
                 continue
             if last != -1 and now != -1:
-                stays = f == len(own) - 1 or ids[own[f + 1]] != -1
+                stays = f == len(rows) - 1 or ids[rows[f + 1]] != -1
                 switches += last != now and before != -1
                 fragments += before != now and stays
-            elif late and f == len(own) - 1 and now != -1 and before != now:
+            elif late and f == len(rows) - 1 and now != -1 and before != now:
                 fragments += 1  # no track since its first box, or since an ignored one
             if now != -1:
                 last = now

@@ -45,15 +45,10 @@ VELODYNE_BYTE = (
 class Scan:
     """A labeled scan of another sensor.
 
-    Attributes
-    ----------
-    name : str
-    points : (n, 4) float32
-        x, y, z [m] in the sensor frame, raw remission.
-    labels : (n,) uint8
-        Index into `POINT_CLASSES`, `IGNORE` where unknown.
-    objects : frozenset of (str, ObjectKey) or None
-        Labeled objects within 50 m, by the class of their points; None if only points or pixels are labeled.
+    points : (n, 4) float32; x, y, z [m] in the sensor frame, raw remission.
+    labels : (n,) uint8; index into `POINT_CLASSES`, `IGNORE` where unknown.
+    objects : frozenset of (str, ObjectKey) or None; labeled objects within 50 m, by the class of their points; None if
+        only points or pixels are labeled.
     """
 
     name: str
@@ -145,13 +140,13 @@ def _distinct(objects: set[tuple[str, ObjectKey]] | None) -> dict[str, Any]:
 
 
 def _count(confusion: Confusion, perceive: Perceiver, scan: Scan) -> None:
-    found = perceive(scan.points).points
-    if found is None:
+    predicted = perceive(scan.points).points
+    if predicted is None:
         raise ModelError(f"{perceive.cards[0].name} labels no points; pass a range-image model")
     near = np.hypot(scan.points[:, 0], scan.points[:, 1]) < FARTHEST_M
-    known = found.in_view & near & (scan.labels != IGNORE)
-    own = np.array([POINT_CLASSES.index(c) if c in POINT_CLASSES else 0 for c in found.classes], np.uint8)
-    confusion.update(own[found.labels[known]], scan.labels[known])
+    known = predicted.in_view & near & (scan.labels != IGNORE)
+    numbers = np.array([POINT_CLASSES.index(c) if c in POINT_CLASSES else 0 for c in predicted.classes], np.uint8)
+    confusion.update(numbers[predicted.labels[known]], scan.labels[known])
 
 
 def _row(confusion: Confusion) -> dict[str, Any]:

@@ -33,28 +33,17 @@ Cells = dict[str, tuple[tuple[str, ...], NDArray[np.uint8]]]
 class Truth:
     """A scan and its ground truth.
 
-    Attributes
-    ----------
-    name, drive : str
-    points : (n, 4) float32
-        x, y, z [m] in the sensor frame, remission.
-    labels : (n,) uint8 or None
-        Index into `POINT_CLASSES`, or into the classes that `folder_truth` is given; `IGNORE` where unknown. None if
-        points and objects are not labeled.
-    boxes : tuple of Box
-        In the sensor frame.
-    returns : tuple of int
-        Number of returns from each box's object.
-    known : callable
-        Takes places (k, 3) [m] in the sensor frame and returns whether objects are labeled there, (k,) bool.
-    cells : mapping
-        By name of a table: its classes, and the true class of each cell (rows, columns) uint8, `IGNORE` where unknown.
-    road : tuple of 2 str, or None
-        The table, and its class that counts as drivable.
-    front : FrontTruth or None
-        KITTI's labels of the image, if the scan has them.
-    box_labels : frozenset of str or None
-        Classes that the boxes of the set tell apart; None: all.
+    points : (n, 4) float32; x, y, z [m] in the sensor frame, remission.
+    labels : (n,) uint8 or None; index into `POINT_CLASSES`, or into the classes that `folder_truth` is given; `IGNORE`
+        where unknown. None if points and objects are not labeled.
+    boxes : in the sensor frame.
+    returns : number of returns from each box's object.
+    known : takes places (k, 3) [m] in the sensor frame and returns whether objects are labeled there, (k,) bool.
+    cells : by name of a table: its classes, and the true class of each cell (rows, columns) uint8, `IGNORE` where
+        unknown.
+    road : the table, and its class that counts as drivable.
+    front : KITTI's labels of the image, if the scan has them.
+    box_labels : classes that the boxes of the set tell apart; None: all.
     """
 
     name: str

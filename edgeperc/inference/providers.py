@@ -21,7 +21,7 @@ PROVIDERS: Mapping[str, str] = {
     "cpu": "CPUExecutionProvider",
 }
 AUTO = ("cuda", "openvino", "cpu")
-# Providers that come as plugins beside stock onnxruntime: provider, then the package with its library.
+# Providers that come as plugins in addition to stock onnxruntime: provider, then the package with its library.
 PLUGINS = {
     "openvino": "onnxruntime_ep_openvino",
     "tensorrt-rtx": "onnxruntime_ep_nv_tensorrt_rtx",

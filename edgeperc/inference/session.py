@@ -39,7 +39,9 @@ from ..system.machine import (
     settings_path,
     usable_cores,
 )
+from ..system.names import nearest
 from ..system.printable import printable
+from ..types.choices import PRECISIONS
 from ..types.onnx_file import check_graph, read_model
 from ..zoo import Variant, choose, digest, resolve
 from .decode import fill_pixels
@@ -47,7 +49,6 @@ from .providers import AUTO, PLUGINS, PROVIDERS, SHARING, available_providers, l
 
 logger = logging.getLogger(__name__)
 
-PRECISIONS = ("fp32", "bf16", "int8")
 # Largest accepted deviation, in standard deviations of an output. The same graph in fp32 differs by 1e-5 between
 # engines; tripled weights of one layer give 0.5.
 MAX_GOLDEN_DEVIATION = {"fp32": 0.02, "bf16": 0.5, "int8": 0.5}
@@ -64,7 +65,8 @@ _Attempt = tuple[str, Variant, str, int | None]
 
 def _check_names(provider: str, precision: str) -> None:
     if precision not in ("auto", *PRECISIONS):
-        raise ProviderError(f"precision {precision!r} is unknown; expected auto, {', '.join(PRECISIONS)}")
+        close = nearest(precision, PRECISIONS)
+        raise ProviderError(f"precision {precision!r} is unknown{close}; expected auto, {', '.join(PRECISIONS)}")
     if provider == "auto" or provider in PROVIDERS:
         return
     short, _, suffix = provider.partition(":")
@@ -73,7 +75,8 @@ def _check_names(provider: str, precision: str) -> None:
             f"provider {provider!r}: the precision is an option of its own; ask for provider {short!r} and "
             f"precision {suffix!r}"
         )
-    raise ProviderError(f"provider {provider!r} is unknown; expected auto or one of {', '.join(PROVIDERS)}")
+    close = nearest(provider, PROVIDERS)
+    raise ProviderError(f"provider {provider!r} is unknown{close}; expected auto or one of {', '.join(PROVIDERS)}")
 
 
 class Session:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import reprlib
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, fields
 from typing import Any
@@ -12,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import CardError, PointsError
+from ..system.fields import Fields
 from ..system.kernel_cache import njit
 from ..types.points import read_only
 
@@ -277,6 +277,7 @@ def measure(points: NDArray[np.float32], azimuth_deg: tuple[float, float]) -> Me
 
 
 Range = tuple[float, float]
+_FIELDS = Fields("the card", CardError, "export the model again", exact=True)
 
 
 @dataclass(frozen=True)
@@ -352,22 +353,15 @@ class FitnessProfile:
 
         Raises CardError.
         """
-        names = {field.name for field in fields(cls)}
-        if not isinstance(document, Mapping) or set(document) != names:
-            raise CardError(f"the card's fitness entry must hold exactly {', '.join(sorted(names))}")
-        values: dict[str, Any] = {}
-        for name, value in document.items():
-            if name == "n_scans":
-                if not isinstance(value, int) or not 1 <= value <= 10**9:
-                    raise CardError(
-                        f"the card's fitness entry 'n_scans' is {reprlib.repr(value)}; expected 1 to 1e9 scans"
-                    )
-                values[name] = value
-            elif value is None and name in ("ground_m", "road_ahead"):
-                values[name] = None
-            else:
-                values[name] = _range(name, value)
-        return cls(**values)
+        profile = _FIELDS.read(cls, document, "fitness")
+        _FIELDS.whole("fitness.n_scans", profile.n_scans, 1, 10**9)
+        for name, (low, high) in _BOUNDS.items():
+            if (values := getattr(profile, name)) is not None:
+                _FIELDS.pair(f"fitness.{name}", values, low, high)
+                # left before right
+                if sorted(values, reverse=name == "azimuth_deg") != [*values]:
+                    _FIELDS.refuse(f"fitness.{name}", values, "the left edge or the lower value first")
+        return profile
 
 
 MEASURED = tuple(field.name for field in fields(FitnessProfile) if field.name not in ("n_scans", "azimuth_deg"))
@@ -387,19 +381,3 @@ _BOUNDS = {
     "ground_m": (-100.0, 100.0),
     "road_ahead": (-100.0, 100.0),
 }
-
-
-def _range(name: str, value: Any) -> Range:
-    """An entry of a card's profile."""
-    least, most = _BOUNDS[name]
-    try:
-        first, second = (float(v) for v in value)
-    except (TypeError, ValueError, OverflowError):
-        first = second = math.nan
-    low, high = (second, first) if name == "azimuth_deg" else (first, second)  # left before right
-    if not least <= low <= high <= most:
-        raise CardError(
-            f"the card's fitness entry {name!r} is {reprlib.repr(value)}; expected two numbers from {least:g} to "
-            f"{most:g}, the {'left edge' if name == 'azimuth_deg' else 'lower'} first"
-        )
-    return first, second

@@ -2,7 +2,3 @@
 
 `files` recognizes a file by its content and suffix and calls the parser; `captures` reads packet captures and bags.
 """
-
-from __future__ import annotations
-
-__all__: list[str] = []

@@ -52,12 +52,12 @@ def describe_apart(path: Path, kind: str, topic: str | None) -> dict[str, Any]:
 
     Raises PointsError.
     """
-    found: list[Any] = []
-    for _ in _serve({"path": str(path), "kind": kind, "topic": topic}, path, found):
+    descriptions: list[Any] = []
+    for _ in _serve({"path": str(path), "kind": kind, "topic": topic}, path, descriptions):
         break  # a scan was not asked for
-    if not found or not isinstance(found[0], dict):
+    if not descriptions or not isinstance(descriptions[0], dict):
         raise PointsError(f"{path}: the process that decodes captures replied nonsense; the capture is damaged")
-    description: dict[str, Any] = found[0]
+    description: dict[str, Any] = descriptions[0]
     return description
 
 
@@ -98,10 +98,8 @@ def _start(folder: str) -> subprocess.Popen[bytes]:
 class _Watch:
     """A thread that ends the process when a reply takes too long; not every system can wait for a pipe with a limit.
 
-    Attributes
-    ----------
-    since_s : float or None
-        Since when a reply is awaited, on the monotonic clock; None while the reader of the scans takes its time.
+    since_s : float or None; since when a reply is awaited, on the monotonic clock; None while the reader of the scans
+        takes its time.
     expired : bool
     """
 

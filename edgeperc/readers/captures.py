@@ -44,7 +44,7 @@ def read_scans(
     ----------
     source : str or path
         A scan file (`edgeperc.read_points`); a folder of scan files and captures, read in the order of their names; a
-        Velodyne ``.pcap``; an Ouster ``.osf``, or ``.pcap`` with its metadata beside it in a ``.json`` file whose name
+        Velodyne ``.pcap``; an Ouster ``.osf``, or ``.pcap`` with its metadata next to it in a ``.json`` file whose name
         has the same beginning; a ROS 1 ``.bag``, a ROS 2 bag's folder or one ``.mcap`` file. Bags are read for
         messages of type ``sensor_msgs/PointCloud2``. The first bytes of a file decide its format, not its name.
     topic : str, optional
@@ -158,21 +158,23 @@ def known_sensor(path: Path, topic: str | None = None) -> KnownSensor | None:
     """Like `sensor_of`, with how it is known."""
     kind = _readable_kind(path)
     if kind == "folder":
-        each = {file: known_sensor(file, topic) for file in scan_files(path)}
-        profiles = {None if known is None else known.profile for known in each.values()}
+        sensors = {file: known_sensor(file, topic) for file in scan_files(path)}
+        profiles = {None if known is None else known.profile for known in sensors.values()}
         if len(profiles) > 1:
             names = sorted({"scan files" if profile is None else profile.name for profile in profiles})
             raise SensorError(
                 f"{path}: the captures in this folder are of several sensors ({', '.join(names)}); read them one by one"
             )
-        return next(iter(each.values()), None)
+        return next(iter(sensors.values()), None)
     if kind == "scan":
         return None
     try:
         if kind == ".pcap":
             return of_packets(path, topic)
-        found = describe_apart(path, kind, topic)
-        return of_metadata(json.loads(found["metadata"]), "the metadata") if "metadata" in found else of_cloud(found)
+        description = describe_apart(path, kind, topic)
+        if "metadata" in description:
+            return of_metadata(json.loads(description["metadata"]), "the metadata")
+        return of_cloud(description)
     except SensorError as exc:
         raise SensorError(f"{path}: {exc}") from exc
     except PointsError as exc:
@@ -198,7 +200,7 @@ def _readable_kind(path: Path) -> str:
     if kind == ".pcapng":
         raise PointsError(f"{path}: a pcapng file; expected pcap. Run: editcap -F pcap {path.name} {path.stem}.pcap")
     if kind == ".db3":
-        raise PointsError(f"{path}: a .db3 is read with the folder it lies in; expected metadata.yaml beside it")
+        raise PointsError(f"{path}: a .db3 is read with the folder it lies in; expected metadata.yaml next to it")
     return kind
 
 

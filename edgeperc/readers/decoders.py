@@ -226,8 +226,8 @@ def _packet_scans(
     # Both libraries stop without an error if the file ends inside a packet, or has no packets of their sensors.
     n_packets = 0 if kind == ".osf" else sum(1 for _ in pcap_packets(path))
     if not n_scans:
-        held = "holds no scan" if kind == ".osf" else f"has {n_packets} packets, none from a supported LiDAR"
-        raise PointsError(f"the capture {held}; expected a Velodyne capture, or an Ouster capture with its metadata")
+        content = "holds no scan" if kind == ".osf" else f"has {n_packets} packets, none from a supported LiDAR"
+        raise PointsError(f"the capture {content}; expected a Velodyne capture, or an Ouster capture with its metadata")
 
 
 def _open_osf(path: Path) -> Any:

@@ -127,8 +127,8 @@ def _of_array(array: NDArray[Any], remission_field: str | None) -> _Read:
     return as_points(array, remission_field=remission_field), table_columns(array)
 
 
-def _of_columns(found: Columns, remission_field: str | None) -> _Read:
-    return assemble(*found, remission_field), found.fields
+def _of_columns(columns: Columns, remission_field: str | None) -> _Read:
+    return assemble(*columns, remission_field), columns.fields
 
 
 def _parse_raw(data: NDArray[np.uint8], columns: int, by_name: bool) -> NDArray[np.float32]:
@@ -226,12 +226,12 @@ def _unpack_member(data: NDArray[np.uint8], member: zipfile.ZipInfo) -> bytes:
     methods = {zipfile.ZIP_STORED: "", zipfile.ZIP_DEFLATED: "deflate", zipfile.ZIP_BZIP2: "bz2"}
     if member.compress_type not in methods or member.flag_bits & 1:
         raise PointsError(f"{member.filename!r} is encrypted, or compressed by another method than deflate or bzip2")
-    at = member.header_offset
+    offset = member.header_offset
     # The header in front of a member has a name and an extra field of its own.
-    if data[at : at + 4].tobytes() != b"PK\x03\x04" or at + 30 > data.size:
-        raise PointsError(f"{member.filename!r} does not begin at the byte {at:,} that the archive names")
-    at += 30 + int(data[at + 26 : at + 30].view("<u2").sum())
-    packed = data[at : at + member.compress_size].tobytes()
+    if data[offset : offset + 4].tobytes() != b"PK\x03\x04" or offset + 30 > data.size:
+        raise PointsError(f"{member.filename!r} does not begin at the byte {offset:,} that the archive names")
+    offset += 30 + int(data[offset + 26 : offset + 30].view("<u2").sum())
+    packed = data[offset : offset + member.compress_size].tobytes()
     content = inflate(packed, methods[member.compress_type], min(member.file_size, MAX_SCAN_BYTES))
     if len(content) != member.file_size or zlib.crc32(content) != member.CRC:
         raise PointsError(f"{member.filename!r} in the archive is damaged: its length or CRC-32 is wrong")

@@ -77,9 +77,9 @@ def of_packets(path: Path, topic: str | None = None) -> KnownSensor:
     refuse_hesai(path)
     files = metadata_beside(path)
     contents = [(file.name, json.loads(read_metadata(file))) for file in files]
-    chosen = [each for each in contents if topic is None or _serial(each[1]) == topic] or contents
+    chosen = [entry for entry in contents if topic is None or _serial(entry[1]) == topic] or contents
     known = [of_metadata(content, f"the metadata {name}") for name, content in chosen]
-    if len({each.profile for each in known}) > 1:
+    if len({entry.profile for entry in known}) > 1:
         raise SensorError(
             f"there is metadata of several sensors: {', '.join(name for name, _ in contents)}; say which by topic="
         )
@@ -133,14 +133,14 @@ def of_metadata(content: Any, source: str) -> KnownSensor:
     return KnownSensor(replace(profile, columns=columns), because)
 
 
-def of_cloud(found: Mapping[str, Any]) -> KnownSensor:
+def of_cloud(cloud: Mapping[str, Any]) -> KnownSensor:
     """The sensor of a point cloud of ROS: its maker by fields, frame and topic, its model by the angles of its rings.
 
-    found : ``topic``, ``frame``, ``fields`` and ``elevations_deg``, from `decoders.describe`.
+    cloud : ``topic``, ``frame``, ``fields`` and ``elevations_deg``, from `decoders.describe`.
     Raises SensorError.
     """
-    topic, frame, fields = str(found["topic"]), str(found["frame"]), [str(name) for name in found["fields"]]
-    rings = [np.nan if angle is None else float(angle) for angle in found["elevations_deg"]]
+    topic, frame, fields = str(cloud["topic"]), str(cloud["frame"]), [str(name) for name in cloud["fields"]]
+    rings = [np.nan if angle is None else float(angle) for angle in cloud["elevations_deg"]]
     if np.isnan(rings).all():
         rings = []
     words = f"{topic} {frame}".lower()

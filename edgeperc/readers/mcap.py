@@ -36,14 +36,8 @@ class Message(NamedTuple):
 class McapFile:
     """One .mcap file, read from front to back; an index is not needed.
 
-    Parameters
-    ----------
     path : Path
-
-    Attributes
-    ----------
-    channels : dict of int to Channel
-        Those of the summary, or those met so far.
+    channels : dict of int to Channel; those of the summary, or those met so far.
     """
 
     def __init__(self, path: Path) -> None:
@@ -78,8 +72,8 @@ class McapFile:
         with self._path.open("rb") as file:
             for kind, content in _records(file, 8, self._end):
                 if kind == _CHUNK:
-                    found = list(self._of_records(_split(_unpacked(content))))
-                    yield from sorted(found, key=lambda message: message.stamp_ns)
+                    records = list(self._of_records(_split(_unpacked(content))))
+                    yield from sorted(records, key=lambda message: message.stamp_ns)
                 elif kind == _DATA_END:
                     return
                 else:
@@ -98,46 +92,48 @@ class McapFile:
             self._schemas[struct.unpack_from("<H", content)[0]] = _text(content, 2)[0]
         elif kind == _CHANNEL:
             number, schema = struct.unpack_from("<HH", content)
-            topic, at = _text(content, 4)
-            self.channels[number] = Channel(topic, self._schemas.get(schema, ""), _text(content, at)[0])
+            topic, offset = _text(content, 4)
+            self.channels[number] = Channel(topic, self._schemas.get(schema, ""), _text(content, offset)[0])
 
 
-def _records(file: BinaryIO, at: int, end: int) -> Iterator[tuple[int, memoryview]]:
+def _records(file: BinaryIO, offset: int, end: int) -> Iterator[tuple[int, memoryview]]:
     """The kind and content of each record; those that are not needed are skipped."""
-    while at < end:
-        file.seek(at)
+    while offset < end:
+        file.seek(offset)
         head = file.read(9)
         kind, length = struct.unpack("<BQ", head) if len(head) == 9 else (0, end)
-        if at + 9 + length > end:
-            raise PointsError(f"the file is damaged or cut short: the record at byte {at:,} is not whole")
+        if offset + 9 + length > end:
+            raise PointsError(f"the file is damaged or cut short: the record at byte {offset:,} is not whole")
         if kind in (_HEADER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _DATA_END):
             if length > MAX_BYTES:
-                raise PointsError(f"the record at byte {at:,} has {length:,} bytes; expected at most {MAX_BYTES:,}")
+                raise PointsError(f"the record at byte {offset:,} has {length:,} bytes; expected at most {MAX_BYTES:,}")
             yield kind, memoryview(file.read(length))
-        at += 9 + length
+        offset += 9 + length
 
 
 def _split(content: bytes) -> Iterator[tuple[int, memoryview]]:
     """The records of a chunk."""
-    view, at = memoryview(content), 0
-    while at < len(view):
-        kind, length = struct.unpack_from("<BQ", view, at) if at + 9 <= len(view) else (0, len(view))
-        if at + 9 + length > len(view):
+    view, offset = memoryview(content), 0
+    while offset < len(view):
+        kind, length = struct.unpack_from("<BQ", view, offset) if offset + 9 <= len(view) else (0, len(view))
+        if offset + 9 + length > len(view):
             raise PointsError("a chunk is damaged: it ends inside a record")
-        yield kind, view[at + 9 : at + 9 + length]
-        at += 9 + length
+        yield kind, view[offset + 9 : offset + 9 + length]
+        offset += 9 + length
 
 
 def _unpacked(chunk: memoryview) -> bytes:
     """The records of a chunk as bytes, once length and CRC-32 are right."""
     size, crc = struct.unpack_from("<16xQI", chunk)
-    method, at = _text(chunk, 28)
-    (packed_size,) = struct.unpack_from("<Q", chunk, at)
+    method, offset = _text(chunk, 28)
+    (packed_size,) = struct.unpack_from("<Q", chunk, offset)
     if size > MAX_BYTES:
         raise PointsError(f"a chunk claims to unpack to {size:,} bytes; expected at most {MAX_BYTES:,}")
-    if packed_size != len(chunk) - at - 8:
-        raise PointsError(f"a chunk is damaged: it declares {packed_size:,} bytes and holds {len(chunk) - at - 8:,}")
-    content = inflate(bytes(chunk[at + 8 :]), method, size)
+    if packed_size != len(chunk) - offset - 8:
+        raise PointsError(
+            f"a chunk is damaged: it declares {packed_size:,} bytes and holds {len(chunk) - offset - 8:,}"
+        )
+    content = inflate(bytes(chunk[offset + 8 :]), method, size)
     if len(content) != size:
         raise PointsError(f"a chunk is damaged: it unpacks to {len(content):,} bytes and declares {size:,}")
     if crc and zlib.crc32(content) != crc:
@@ -145,10 +141,10 @@ def _unpacked(chunk: memoryview) -> bytes:
     return content
 
 
-def _text(content: memoryview, at: int) -> tuple[str, int]:
+def _text(content: memoryview, offset: int) -> tuple[str, int]:
     """A string with its length in front, and the place behind it."""
-    (length,) = struct.unpack_from("<I", content, at)
-    end = at + 4 + length
+    (length,) = struct.unpack_from("<I", content, offset)
+    end = offset + 4 + length
     if end > len(content):
         raise PointsError("a record is damaged: a text ends past it")
-    return bytes(content[at + 4 : end]).decode(), end
+    return bytes(content[offset + 4 : end]).decode(), end

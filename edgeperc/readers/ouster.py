@@ -36,19 +36,19 @@ def open_capture(path: Path, warn: Callable[[str], None], alive: Callable[[], No
         text = read_metadata(file)
         layout = core.PacketFormat(core.SensorInfo(text))
         sizes |= {int(getattr(layout, f"{kind}_packet_size", 0)) for kind in ("lidar", "imu", "zone")}
-    found = check_datagrams(path, sizes - {0}, alive)
-    if not found.n_good:
+    datagrams = check_datagrams(path, sizes - {0}, alive)
+    if not datagrams.n_good:
         return None
-    if found.n_bad:
+    if datagrams.n_bad:
         warn(
-            f"{path}: dropped {found.n_bad} damaged packets of the capture: empty, incomplete, or of another length "
-            "than the metadata says"
+            f"{path}: dropped {datagrams.n_bad} damaged packets of the capture: empty, incomplete, or of another "
+            "length than the metadata says"
         )
-    if found.bad:
+    if datagrams.bad:
         if shutil.disk_usage(tempfile.gettempdir()).free < path.stat().st_size:
             raise PointsError("the temporary folder has no room for a copy without the damaged packets")
         source = Path(tempfile.mkdtemp()) / "whole.pcap"
-        copy_without(path, found.bad, source, alive)
+        copy_without(path, datagrams.bad, source, alive)
     else:
         source = path
     return pcap.PcapFrameSetSource(str(source), meta=[str(file) for file in metadata])
@@ -69,7 +69,7 @@ def metadata_beside(path: Path) -> list[Path]:
     if not longest:
         raise PointsError(
             "not a Velodyne capture (packets of 1206 bytes), and cannot be read as Ouster's: there is no "
-            "metadata beside it. Expected a .json file whose name has the same beginning"
+            "metadata next to it. Expected a .json file whose name has the same beginning"
         )
     return [file for file, n in alike.items() if n == longest]
 
@@ -82,7 +82,7 @@ def read_metadata(path: Path) -> str:
     try:
         content = json.loads(text)
     except (ValueError, RecursionError) as exc:
-        raise PointsError(f"the metadata {path.name} cannot be read: it is no JSON ({exc})") from exc
+        raise PointsError(f"the metadata {path.name} cannot be read: it is not JSON ({exc})") from exc
     try:
         check_metadata(content)
     except PointsError as exc:
@@ -144,14 +144,14 @@ def _checked_beams(name: str, values: Any, n: int | None) -> int:
 def check_osf(path: Path) -> None:
     """Raise `PointsError` unless every checksum is right."""
     data = np.memmap(path, np.uint8, "r").data
-    kind, at, size = b"", 0, len(data)
-    while at < size:
+    kind, offset, size = b"", 0, len(data)
+    while offset < size:
         # The length of the block, the block, CRC-32 of both.
-        end = at + 4 + struct.unpack_from("<I", data, at)[0] if at + 8 <= size else size
-        if end + 4 > size or zlib.crc32(data[at:end]) != struct.unpack_from("<I", data, end)[0]:
+        end = offset + 4 + struct.unpack_from("<I", data, offset)[0] if offset + 8 <= size else size
+        if end + 4 > size or zlib.crc32(data[offset:end]) != struct.unpack_from("<I", data, end)[0]:
             raise PointsError(
-                f"the .osf file is damaged or cut short: the block at byte {at:,} of {size:,} is not whole"
+                f"the .osf file is damaged or cut short: the block at byte {offset:,} of {size:,} is not whole"
             )
-        kind, at = bytes(data[at + 8 : at + 12]), end + 4
+        kind, offset = bytes(data[offset + 8 : offset + 12]), end + 4
     if kind != b"OSF#":
         raise PointsError("the .osf file is cut short: its last block is not the metadata")

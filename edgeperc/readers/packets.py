@@ -31,7 +31,7 @@ _GPS_BYTES = 600  # what LiDARs send of their GPS is shorter, their points are l
 # Enough to find a LiDAR's packet among those of a GPS, and quick to read.
 _SNIFFED_PACKETS = 2000
 
-# Datagrams of which fragments are awaited; more than a few at once are damage.
+# Datagrams of which fragments are awaited; more than a few at the same time are damage.
 _PENDING = 256
 
 
@@ -47,9 +47,9 @@ def pcap_packets(path: Path, whole: bool = True) -> Iterator[tuple[int, memoryvi
     if bytes(data[:4]) not in PCAP_MAGIC:
         raise PointsError("not a pcap file by its first bytes")
     header = struct.Struct(f"{PCAP_MAGIC[bytes(data[:4])]}8xI4x")
-    at, n_packets = 24, 0
-    while at < size:
-        end = at + 16 + (header.unpack_from(data, at)[0] if at + 16 <= size else size)
+    offset, n_packets = 24, 0
+    while offset < size:
+        end = offset + 16 + (header.unpack_from(data, offset)[0] if offset + 16 <= size else size)
         if end > size and not whole:
             return
         if end > size:
@@ -57,21 +57,16 @@ def pcap_packets(path: Path, whole: bool = True) -> Iterator[tuple[int, memoryvi
                 f"cut short or damaged: the file ends inside packet {n_packets + 1}, at byte {size:,}; all packets "
                 "before it were read"
             )
-        yield at, data[at + 16 : end]
-        at, n_packets = end, n_packets + 1
+        yield offset, data[offset + 16 : end]
+        offset, n_packets = end, n_packets + 1
 
 
 class Checked(NamedTuple):
     """What `check_datagrams` finds.
 
-    Attributes
-    ----------
-    n_good : int
-        Datagrams of an expected size.
-    n_bad : int
-        Datagrams that are empty, incomplete, contradict themselves, or have another size on a port of good ones.
-    bad : array of int
-        Places in the file of the bad records, and of the unfinished one at its end.
+    n_good : datagrams of an expected size.
+    n_bad : datagrams that are empty, incomplete, contradict themselves, or have another size on a port of good ones.
+    bad : places in the file of the bad records, and of the unfinished one at its end.
     """
 
     n_good: int
@@ -102,14 +97,14 @@ def check_datagrams(path: Path, sizes: Collection[int], alive: Callable[[], None
     n_others: Counter[int] = Counter()
     pending: dict[bytes, tuple[list[int], int, int]] = {}  # source: places, bytes so far, port and length of UDP
     link = _link_type(path)
-    for k, (at, packet) in enumerate(pcap_packets(path, whole=False)):
+    for k, (offset, packet) in enumerate(pcap_packets(path, whole=False)):
         if k % 10_000 == 0:
             alive()
-        end = at + 16 + len(packet)
+        end = offset + 16 + len(packet)
         try:
             part = _fragment(packet, link)
         except ValueError:
-            bad.append(at)
+            bad.append(offset)
             n_bad += 1
             continue
         if part is None:
@@ -121,14 +116,14 @@ def check_datagrams(path: Path, sizes: Collection[int], alive: Callable[[], None
                 n_bad += 1
                 places, n_bytes = [], 0
                 if len(part.payload) < 8:
-                    bad.append(at)
+                    bad.append(offset)
                     continue
             udp = struct.unpack_from(">2xI", part.payload)[0]
         elif part.start != n_bytes:
-            bad.extend([*places, at])
+            bad.extend([*places, offset])
             n_bad += 1
             continue
-        places.append(at)
+        places.append(offset)
         n_bytes += len(part.payload)
         if part.more:
             pending[part.source] = places, n_bytes, udp
@@ -213,27 +208,27 @@ def _hesai_name(payload: memoryview) -> str | None:
 def _fragment(packet: memoryview, link: int) -> _Fragment | None:
     """The part of a UDP datagram over IPv4 in a packet, None if it holds none; ValueError if lengths contradict."""
     if link in _LINKS:
-        at, kind = _LINKS[link]
-        if len(packet) < at:
+        offset, kind = _LINKS[link]
+        if len(packet) < offset:
             raise ValueError("cut inside the link's header")
-        while bytes(packet[kind : kind + 2]) in (b"\x81\x00", b"\x88\xa8") and len(packet) >= at + 4:  # a VLAN
-            at, kind = at + 4, kind + 4
+        while bytes(packet[kind : kind + 2]) in (b"\x81\x00", b"\x88\xa8") and len(packet) >= offset + 4:  # a VLAN
+            offset, kind = offset + 4, kind + 4
         if bytes(packet[kind : kind + 2]) != b"\x08\x00":
             return None
     elif link in (0, 12, 14, 101, 108, 228):  # loopback has 4 bytes in front, raw IP none
-        at = 4 if link in (0, 108) else 0
+        offset = 4 if link in (0, 108) else 0
     else:
         return None
-    if len(packet) < at + 20:
+    if len(packet) < offset + 20:
         raise ValueError("cut inside the IP header")
-    if packet[at] >> 4 != 4 or packet[at + 9] != 17:
+    if packet[offset] >> 4 != 4 or packet[offset + 9] != 17:
         return None
-    header = 4 * (packet[at] & 15)
-    total, identification, place = struct.unpack_from(">HHH", packet, at + 2)
-    if not 20 <= header < total <= len(packet) - at:
+    header = 4 * (packet[offset] & 15)
+    total, identification, place = struct.unpack_from(">HHH", packet, offset + 2)
+    if not 20 <= header < total <= len(packet) - offset:
         raise ValueError("the length in the IP header contradicts the record")
-    source = bytes(packet[at + 12 : at + 20]) + identification.to_bytes(2, "big")
-    return _Fragment(source, 8 * (place & 0x1FFF), bool(place & 0x2000), packet[at + header : at + total])
+    source = bytes(packet[offset + 12 : offset + 20]) + identification.to_bytes(2, "big")
+    return _Fragment(source, 8 * (place & 0x1FFF), bool(place & 0x2000), packet[offset + header : offset + total])
 
 
 def copy_without(path: Path, bad: Collection[int], target: Path, alive: Callable[[], None]) -> None:
@@ -241,9 +236,9 @@ def copy_without(path: Path, bad: Collection[int], target: Path, alive: Callable
     left_out = frozenset(bad)
     with path.open("rb") as source, target.open("wb") as out:
         out.write(source.read(24))
-        for k, (at, packet) in enumerate(pcap_packets(path, whole=False)):
+        for k, (offset, packet) in enumerate(pcap_packets(path, whole=False)):
             if k % 10_000 == 0:
                 alive()
-            if at not in left_out:
-                source.seek(at)
+            if offset not in left_out:
+                source.seek(offset)
                 out.write(source.read(16 + len(packet)))

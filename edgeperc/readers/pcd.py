@@ -11,7 +11,16 @@ from numpy.typing import NDArray
 from ..errors import PointsError
 from ..system.kernel_cache import njit
 from ..types.points import plain_name
-from .tables import MAX_HEADER_BYTES, MAX_SCAN_BYTES, Columns, column, cut_short, parse_table, whole_number
+from .tables import (
+    MAX_HEADER_BYTES,
+    MAX_SCAN_BYTES,
+    Columns,
+    column,
+    cut_short,
+    header_lines,
+    parse_table,
+    whole_number,
+)
 
 _PCD_TYPES = {f"{kind}{size}": f"<{kind.lower()}{size}" for kind in "IU" for size in (1, 2, 4, 8)} | {
     "F4": "<f4",
@@ -41,16 +50,8 @@ class _PcdHeader:
 
 
 def _parse_pcd_header(head: bytes) -> _PcdHeader:
-    entries: dict[str, list[str]] = {}
-    at = 0
-    while "DATA" not in entries:
-        end = head.find(b"\n", at)
-        if end < 0:
-            raise PointsError("the PCD header has no DATA line; the file is cut short or not a PCD file")
-        tokens = head[at:end].decode("latin-1").split()
-        at = end + 1
-        if tokens and not tokens[0].startswith("#"):
-            entries[tokens[0]] = tokens[1:]
+    lines, n_bytes = header_lines(head, "DATA", "PCD")
+    entries = {words[0]: words[1:] for words in lines if words and not words[0].startswith("#")}
     names = entries.get("FIELDS", entries.get("COLUMNS", []))
     try:
         sizes = [whole_number(token) for token in entries.get("SIZE", [])]
@@ -75,7 +76,7 @@ def _parse_pcd_header(head: bytes) -> _PcdHeader:
     if n_points is None or n_points < 0 or organized not in (None, n_points):
         raise PointsError(f"the PCD header declares {width} x {height} points and POINTS {n_points}; they must agree")
     encoding = entries["DATA"][0].lower() if entries["DATA"] else ""
-    return _PcdHeader(tuple(names), tuple(types), tuple(counts), n_points, encoding, at)
+    return _PcdHeader(tuple(names), tuple(types), tuple(counts), n_points, encoding, n_bytes)
 
 
 def parse_pcd(data: NDArray[np.uint8], head: bytes, remission_field: str | None) -> Columns:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ..errors import PointsError
 from ..types.points import plain_name
-from .tables import Columns, column, cut_short, parse_table, whole_number
+from .tables import Columns, column, cut_short, header_lines, parse_table, whole_number
 
 _PLY_TYPES = {
     **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"},
@@ -33,17 +33,10 @@ class _PlyElement:
 def _parse_ply_header(head: bytes) -> tuple[str, list[_PlyElement], int]:
     encoding = ""
     elements: list[_PlyElement] = []
-    at = 0
-    while True:
-        end = head.find(b"\n", at)
-        if end < 0:
-            raise PointsError("the PLY header has no end_header line; the file is cut short or not a PLY file")
-        tokens = head[at:end].decode("latin-1").split()
-        at = end + 1
+    lines, n_bytes = header_lines(head, "end_header", "PLY")
+    for tokens in lines:
         try:
             match tokens:
-                case ["end_header"]:
-                    break
                 case ["format", kind, *_]:
                     encoding = kind
                 case ["element", name, count]:
@@ -56,13 +49,13 @@ def _parse_ply_header(head: bytes) -> tuple[str, list[_PlyElement], int]:
                     elements[-1].properties.append((name, _PLY_TYPES[kind], _PLY_TYPES[length_type]))
                 case ["property", kind, name]:
                     elements[-1].properties.append((name, _PLY_TYPES[kind], ""))
-                case ["ply"] | [] | ["comment" | "obj_info", *_]:
+                case ["ply" | "end_header"] | [] | ["comment" | "obj_info", *_]:
                     pass
                 case _:
                     raise ValueError("an unknown line")
         except (ValueError, KeyError, IndexError) as exc:
             raise PointsError(f"the PLY header line {' '.join(tokens)[:80]!r} cannot be read ({exc})") from exc
-    return encoding, elements, at
+    return encoding, elements, n_bytes
 
 
 def parse_ply(data: NDArray[np.uint8], head: bytes, remission_field: str | None) -> Columns:
@@ -94,10 +87,10 @@ def parse_ply(data: NDArray[np.uint8], head: bytes, remission_field: str | None)
     if encoding not in ("binary_little_endian", "binary_big_endian"):
         raise PointsError(f"PLY data is ascii, binary_little_endian or binary_big_endian, got {encoding!r}")
     order = "<" if encoding == "binary_little_endian" else ">"
-    at = 0
+    offset = 0
     for element in before:
-        at = _row_starts(body, at, element, order)[1]
-    starts, _ = _row_starts(body, at, vertex, order)
+        offset = _row_starts(body, offset, element, order)[1]
+    starts, _ = _row_starts(body, offset, vertex, order)
     n = vertex.count
     fields: dict[str, NDArray[Any]] = {}
     if starts is None:
@@ -105,7 +98,7 @@ def parse_ply(data: NDArray[np.uint8], head: bytes, remission_field: str | None)
         record = sum(widths)
         for name, k in places.items():
             kind = order + vertex.properties[k][1]
-            fields[name] = column(body, kind, n, at + sum(widths[:k]), record)
+            fields[name] = column(body, kind, n, offset + sum(widths[:k]), record)
     else:
         for name, k in places.items():
             kind = order + vertex.properties[k][1]
@@ -115,14 +108,14 @@ def parse_ply(data: NDArray[np.uint8], head: bytes, remission_field: str | None)
 
 
 def _row_starts(
-    body: NDArray[np.uint8], at: int, element: _PlyElement, order: str
+    body: NDArray[np.uint8], offset: int, element: _PlyElement, order: str
 ) -> tuple[NDArray[np.int64] | None, int]:
     """Start of each property of each row, None if all rows have one length; and the end of the element."""
     if not element.has_lists:
         record = sum(int(np.dtype(kind).itemsize) for _, kind, _ in element.properties)
-        end = at + element.count * record
+        end = offset + element.count * record
         if end > body.size:
-            raise cut_short(element.count, record, body.size - at)
+            raise cut_short(element.count, record, body.size - offset)
         return None, end
     byte_order: Literal["little", "big"] = "little" if order == "<" else "big"
     steps = [
@@ -130,16 +123,16 @@ def _row_starts(
         for _, kind, length in element.properties
     ]
     least = sum(length_size or size for size, length_size in steps)
-    if at + element.count * least > body.size:
-        raise cut_short(element.count, least, body.size - at)
+    if offset + element.count * least > body.size:
+        raise cut_short(element.count, least, body.size - offset)
     starts = np.empty((element.count, len(steps)), dtype=np.int64)
     for row in range(element.count):
         for k, (size, length_size) in enumerate(steps):
-            starts[row, k] = at
+            starts[row, k] = offset
             if length_size:
-                at += length_size + size * int.from_bytes(body[at : at + length_size].tobytes(), byte_order)
+                offset += length_size + size * int.from_bytes(body[offset : offset + length_size].tobytes(), byte_order)
             else:
-                at += size
-            if at > body.size:
+                offset += size
+            if offset > body.size:
                 raise PointsError(f"cut short: row {row} of {element.count} of {element.name!r} ends past the file")
-    return starts, at
+    return starts, offset

@@ -26,14 +26,9 @@ MAX_SCAN_BYTES = 1 << 28
 class Columns(NamedTuple):
     """The fields of a scan, for `edgeperc.types.points.assemble`.
 
-    Attributes
-    ----------
-    n : int
-        Number of points.
-    fields : mapping of str to (n,) array
-        Columns by `edgeperc.types.points.plain_name`.
-    names : sequence of str
-        All fields of the source.
+    n : number of points.
+    fields : mapping of str to (n,) array; columns by `edgeperc.types.points.plain_name`.
+    names : all fields of the source.
     """
 
     n: int
@@ -47,6 +42,22 @@ def column(data: NDArray[np.uint8], kind: str, n: int, offset: int, stride: int)
         return np.empty(0, dtype=kind)
     column: NDArray[Any] = np.ndarray((n,), kind, data.data, offset, (stride,))
     return column
+
+
+def header_lines(head: bytes, last: str, kind: str) -> tuple[list[list[str]], int]:
+    """Words of each line of a header that ends with the line ``last``, and its length in bytes.
+
+    Raises PointsError.
+    """
+    lines: list[list[str]] = []
+    start = 0
+    while not lines or lines[-1][:1] != [last]:
+        end = head.find(b"\n", start)
+        if end < 0:
+            raise PointsError(f"the {kind} header has no {last} line; the file is cut short or not a {kind} file")
+        lines.append(head[start:end].decode("latin-1").split())
+        start = end + 1
+    return lines, start
 
 
 def whole_number(text: str) -> int:

@@ -14,11 +14,7 @@ from ..errors import OptionError
 class Qos:
     """Quality of service: always volatile, and the last ``depth`` messages are kept.
 
-    Attributes
-    ----------
-    reliable : bool
-        False: best effort.
-    depth : int
+    reliable : false: best effort.
     """
 
     reliable: bool
@@ -45,10 +41,7 @@ class Output(Protocol):
 class Graph(Protocol):
     """A node in a ROS graph; one for each middleware.
 
-    Attributes
-    ----------
-    name : str
-        Fully qualified name of the node.
+    name : fully qualified name of the node.
     """
 
     name: str
@@ -77,7 +70,7 @@ def full_name(name: str, namespace: str = "/") -> str:
     full = full if full.startswith("/") else f"/{full}"
     if not re.fullmatch(r"(/[A-Za-z_][A-Za-z0-9_]*)+", full) or "__" in full:
         raise OptionError(
-            f"{full!r} is no name of ROS 2; expected words of letters, digits and single underscores after slashes, "
+            f"{full!r} is not a name of ROS 2; expected words of letters, digits and single underscores after slashes, "
             "such as /lidar_top/points"
         )
     return full

@@ -144,19 +144,19 @@ class RosMessages:
         Raises
         ------
         PointsError
-            The bytes are no such message.
+            The bytes are not such a message.
         """
         try:
             return self.typestore.deserialize_cdr(data, name)
         except Exception as exc:  # of rosbags, struct, numpy: whatever the bytes lead to
             reason = " ".join(str(exc).split()) or type(exc).__name__
-            raise PointsError(f"got {len(data):,} bytes that are no {name} ({reason}); expected one in CDR") from exc
+            raise PointsError(f"got {len(data):,} bytes that are not a {name} ({reason}); expected one in CDR") from exc
 
     def points(self, scan: PerceivedScan, stamp_ns: int | None = None) -> Any:
         """Every point of the scan with its class: a sensor_msgs/PointCloud2.
 
         Fields are ``x``, ``y``, ``z``, ``intensity`` (the remission as it came; 0 without one), ``label`` (uint8, index
-        into the classes that `diagnostics` lists) and ``in_view`` (uint8, 0 where the label is no prediction).
+        into the classes that `diagnostics` lists) and ``in_view`` (uint8, 0 where the label is not a prediction).
 
         Parameters
         ----------
@@ -283,11 +283,11 @@ class RosMessages:
         message
         """
         header = self._header(scan, stamp_ns)
-        found = [(box, "") for box in scan.perception.boxes]
+        boxes = [(box, "") for box in scan.perception.boxes]
         if scan.tracked is not None:
-            found = [(track.box, str(track.id)) for track in scan.tracked]
+            boxes = [(track.box, str(track.id)) for track in scan.tracked]
         detections = []
-        for box, track_id in found:
+        for box, track_id in boxes:
             pose = self._make("geometry_msgs/msg/PoseWithCovariance", pose=self._pose(box), covariance=np.zeros(36))
             what = self._make("vision_msgs/msg/ObjectHypothesis", class_id=box.label, score=float(box.score))
             result = self._make("vision_msgs/msg/ObjectHypothesisWithPose", hypothesis=what, pose=pose)
@@ -332,23 +332,23 @@ class RosMessages:
         if scan is None:
             level, message = 3 if level is None else level, message or "no scan yet"
         else:
-            found = scan.perception
+            perception = scan.perception
             level = _LEVELS[scan.health] if level is None else level
             message = message or scan.health or "OK"
-            near, ego = found.dropped.too_near, found.dropped.ego
-            listed |= {"points": found.n_points, "points not finite": found.n_dropped - near - ego}
+            near, ego = perception.dropped.too_near, perception.dropped.ego
+            listed |= {"points": perception.n_points, "points not finite": perception.n_dropped - near - ego}
             listed |= {"points too near": near} if near else {}
             listed |= {"points of the own vehicle": ego} if ego else {}
-            listed |= {"boxes": len(found.boxes)}
+            listed |= {"boxes": len(perception.boxes)}
             if scan.tracks is not None:
                 listed["tracks"] = len(scan.tracks)
-            if found.top_view is not None:
-                listed["drivable [m2]"] = f"{found.top_view.drivable_area_m2:.1f}"
-            listed |= {f"{stage} [ms]": f"{ms:.1f}" for stage, ms in found.stage_ms.items()}
-            listed |= {f"provider of {model}": ran for model, ran in found.providers.items()}
-            if found.points is not None:
-                listed["labels"] = ", ".join(f"{k} {label}" for k, label in enumerate(found.points.classes))
-            listed |= {f"unlike the training scans {k}": said for k, said in enumerate(found.fitness, 1)}
+            if perception.top_view is not None:
+                listed["drivable [m2]"] = f"{perception.top_view.drivable_area_m2:.1f}"
+            listed |= {f"{stage} [ms]": f"{ms:.1f}" for stage, ms in perception.stage_ms.items()}
+            listed |= {f"provider of {model}": ran for model, ran in perception.providers.items()}
+            if perception.points is not None:
+                listed["labels"] = ", ".join(f"{k} {label}" for k, label in enumerate(perception.points.classes))
+            listed |= {f"unlike the training scans {k}": sentence for k, sentence in enumerate(perception.fitness, 1)}
         status = self._make(
             "diagnostic_msgs/msg/DiagnosticStatus",
             level=level,
@@ -407,7 +407,7 @@ class RosMessages:
             color=self._make("std_msgs/msg/ColorRGBA", r=red, g=green, b=blue, a=alpha),
             lifetime=self._make("builtin_interfaces/msg/Duration", sec=lasting_ns // 10**9, nanosec=lasting_ns % 10**9),
             frame_locked=False,
-            points=[self._point(each) for each in (() if points is None else points)],
+            points=[self._point(point) for point in (() if points is None else points)],
             colors=[],
             texture_resource="",
             texture=image,
@@ -418,8 +418,8 @@ class RosMessages:
             mesh_use_embedded_materials=False,
         )
 
-    def _point(self, at: Any) -> Any:
-        return self._make("geometry_msgs/msg/Point", x=float(at[0]), y=float(at[1]), z=float(at[2]))
+    def _point(self, place: Any) -> Any:
+        return self._make("geometry_msgs/msg/Point", x=float(place[0]), y=float(place[1]), z=float(place[2]))
 
     def _vector(self, along: Any) -> Any:
         return self._make("geometry_msgs/msg/Vector3", x=float(along[0]), y=float(along[1]), z=float(along[2]))

@@ -54,7 +54,7 @@ def qos_key(qos: Qos) -> str:
 
 
 def attachment(number: int, stamp_ns: int, publisher_id: bytes) -> bytes:
-    """The 33 bytes beside each message: its number from 1, the time of publishing, and the id of its publisher."""
+    """The 33 bytes with each message: its number from 1, the time of publishing, and the id of its publisher."""
     return _ATTACHMENT.pack(number, stamp_ns, len(publisher_id), publisher_id)
 
 
@@ -152,8 +152,8 @@ class ZenohGraph:
     def close(self) -> None:
         """Undeclare everything and close the session; more calls have no effect."""
         with self._closing:
-            kept, self._kept = self._kept, []
-            if not returns(lambda: self._undeclare(kept), _CLOSING_S):
+            entities, self._kept = self._kept, []
+            if not returns(lambda: self._undeclare(entities), _CLOSING_S):
                 warnings.warn(
                     f"the Zenoh session did not close within {_CLOSING_S:.0f} s and was left behind",
                     RuntimeWarning,

@@ -16,7 +16,7 @@ def stem_of(name: str) -> tuple[str, str]:
     The scan of a capture, ``drive.pcap/000003``, has no suffix. Neither has an image, whose scan has the image's name.
     """
     last = Path(name).name
-    suffix = next((each for each in _SUFFIXES if last.lower().endswith(each)), "")
+    suffix = next((ending for ending in _SUFFIXES if last.lower().endswith(ending)), "")
     return (last[: -len(suffix)] if suffix else Path(last).stem), suffix
 
 

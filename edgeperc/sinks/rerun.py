@@ -118,11 +118,11 @@ class RerunSink:
             pose = tracks.T_world_sensor
             log("world/lidar", rr.Transform3D(translation=pose[:3, 3], mat3x3=pose[:3, :3]))
             trails = self._trails.update(tracks)
-            found = [track.world_box for track in tracks]
-            log("world/tracks", self._boxes(found, [track_text(track) for track in tracks], show=True))
+            track_boxes = [track.world_box for track in tracks]
+            log("world/tracks", self._boxes(track_boxes, [track_text(track) for track in tracks], show=True))
             log(
                 "world/trails",
-                rr.LineStrips3D([trails[track.id] for track in tracks], class_ids=self._ids(found)),
+                rr.LineStrips3D([trails[track.id] for track in tracks], class_ids=self._ids(track_boxes)),
             )
         for name, ms in scan.perception.stage_ms.items():
             log(["status", printable(name)], rr.Scalars(ms))
@@ -145,14 +145,14 @@ class RerunSink:
         return np.array([self._classes[box.label] for box in boxes], np.uint16)
 
     def _boxes(self, boxes: Any, texts: list[str], *, show: bool) -> Any:
-        found: list[Box] = list(boxes)
-        yaws = np.array([box.yaw for box in found]) / 2.0
-        turns = np.column_stack([np.zeros((len(found), 2)), np.sin(yaws), np.cos(yaws)])
+        listed: list[Box] = list(boxes)
+        yaws = np.array([box.yaw for box in listed]) / 2.0
+        turns = np.column_stack([np.zeros((len(listed), 2)), np.sin(yaws), np.cos(yaws)])
         return self._rr.Boxes3D(
-            centers=np.array([box.center for box in found]).reshape(-1, 3),
-            sizes=np.array([box.size for box in found]).reshape(-1, 3),
+            centers=np.array([box.center for box in listed]).reshape(-1, 3),
+            sizes=np.array([box.size for box in listed]).reshape(-1, 3),
             quaternions=turns,
-            class_ids=self._ids(found),
+            class_ids=self._ids(listed),
             labels=texts,
             show_labels=show,
         )

@@ -53,9 +53,9 @@ def colored_points(
     """
     points, perception = as_points(scan.points), scan.perception
     check_points(points, perception)
-    found = perception.points
-    classes: tuple[str, ...] = ("background",) if found is None else found.classes
-    labels = np.zeros(len(points), np.uint8) if found is None else found.labels
+    point_labels = perception.points
+    classes: tuple[str, ...] = ("background",) if point_labels is None else point_labels.classes
+    labels = np.zeros(len(points), np.uint8) if point_labels is None else point_labels.labels
     names, painted = paint_points(in_model_frame(perception, points)[1], perception)
     return points, labels, classes, byte_colors(names)[painted]
 

@@ -14,7 +14,8 @@ from typing import IO, Any
 def open_atomic(path: str | Path, mode: str = "wb", permissions: int = 0o666) -> Iterator[IO[Any]]:
     """Open a temporary file in the target's folder; it replaces the target when the block ends without an error.
 
-    A link is followed. A target that is no regular file, such as ``/dev/stdout`` or a named pipe, is written directly.
+    A link is followed. A target that is not a regular file, such as ``/dev/stdout`` or a named pipe, is written
+    directly.
 
     path : the target.
     mode : ``"w"`` writes text as UTF-8.

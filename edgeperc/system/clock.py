@@ -36,16 +36,10 @@ class Clock:
     in a row, one that is earlier than the last tracked scan is a jump, so a clock that steps back by less than `LATE_S`
     stops tracking for a few scans only.
 
-    Attributes
-    ----------
-    last_s : float or None
-        Time of the last scan of the session [s]; None before the first.
-    former_s : float or None
-        The same of the session before the last jump, until the next scan confirms the jump.
-    n_late : int
-        Number of late scans since the last scan of the session.
-    gap_s : float
-        Longest step forward within a session [s].
+    last_s : time of the last scan of the session [s]; None before the first.
+    former_s : the same of the session before the last jump, until the next scan confirms the jump.
+    n_late : number of late scans since the last scan of the session.
+    gap_s : longest step forward within a session [s].
     """
 
     last_s: float | None = None

@@ -66,7 +66,7 @@ SECONDS_EACH = 0.27  # of a kernel on a core at 2.4 GHz, with what numba compile
 UNEVEN = 1.4  # as long as if all processes ended at the same time
 MIN_S = 1.5  # below, nothing is said
 BAR = 10  # characters
-PRIOR = 10  # kernels that the estimate counts for, beside those that are done
+PRIOR = 10  # kernels that the estimate counts for, in addition to those that are done
 
 
 class Compilation:

@@ -5,7 +5,7 @@ raises an unrelated error or crashes the process. Here each file begins with a c
 compiled again and replaced. The checksum protects against damage only. Against other users, a folder or file is used
 only if it belongs to this user or to root and nobody else can write it.
 
-Folders, in this order: ``NUMBA_CACHE_DIR``, if it is set; otherwise ``__pycache__`` beside the source, and ``kernels``
+Folders, in this order: ``NUMBA_CACHE_DIR``, if it is set; otherwise ``__pycache__`` next to the source, and ``kernels``
 in `machine.cache_folder`. If none can be written, every start compiles again, and a warning in the log says so.
 """
 
@@ -56,8 +56,8 @@ watchers: list[Callable[[], None]] = []
 
 def tell_watchers() -> None:
     """Call the `watchers`."""
-    for each in tuple(watchers):
-        each()
+    for watcher in tuple(watchers):
+        watcher()
 
 
 def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
@@ -168,8 +168,8 @@ class KernelCache:
     def cache_path(self) -> str | None:
         """The first folder that can be written, or holds this kernel already; None if there is none."""
         usable = [folder for folder in self._folders() if _unusable(folder) is None]
-        kept = (folder for folder in usable if _can_be_written(folder) or self._is_in(folder))
-        return next(map(str, kept), None)
+        writable = (folder for folder in usable if _can_be_written(folder) or self._is_in(folder))
+        return next(map(str, writable), None)
 
     def is_missing(self) -> bool:
         """Whether no folder holds a compiled form of this kernel, for any types, and one of them can be written."""
@@ -312,7 +312,7 @@ class KernelCache:
 def _rebuilt(target_context: Any, defined: Iterable[str], library: tuple[str, str, Any], *rest: Any) -> Any:
     """A compiled form from what ``CompileResult._reduce`` gave, and the names that its module defines.
 
-    Beside the machine code there is a module for kernels that call this one. It is parsed when such a kernel is
+    In addition to the machine code there is a module for kernels that call this one. It is parsed when such a kernel is
     compiled; at a start that would take as long as everything else here.
     """
     name, kind, content = library
@@ -371,7 +371,7 @@ def _stamp_of(file: Path) -> bytes:
 def _can_be_written(folder: Path) -> bool:
     """Whether files can be put into a folder, which may not exist yet."""
     try:
-        return os.access(next(each for each in (folder, *folder.parents) if each.exists()), os.W_OK)
+        return os.access(next(parent for parent in (folder, *folder.parents) if parent.exists()), os.W_OK)
     except OSError:
         return False
 

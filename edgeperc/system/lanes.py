@@ -17,8 +17,6 @@ _Value = TypeVar("_Value")
 class Stopwatch:
     """Sum of the wall time of each stage [ms] in the thread that made it; other threads take no time of the answer.
 
-    Attributes
-    ----------
     ms : dict of str to float
     """
 

@@ -103,9 +103,25 @@ def usable_cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
+def has_hypervisor() -> bool | None:
+    """Whether this is a virtual machine; None where the processor does not tell, as on ARM."""
+    flags = _cpuinfo("flags")
+    return "hypervisor" in flags.split() if flags else None
+
+
+def board() -> str | None:
+    """The name of the board; None on computers without one."""
+    return read_text(Path("/sys/firmware/devicetree/base/model"))
+
+
+def cpu_quota() -> str | None:
+    """The container's limit of CPU time, as Linux writes it; None without control groups."""
+    return read_text(Path("/sys/fs/cgroup/cpu.max"))
+
+
 def _cpuinfo(*keys: str) -> str:
     """The first value of any of the keys; empty if there is none."""
-    for line in (_text(Path("/proc/cpuinfo")) or "").splitlines():
+    for line in (read_text(Path("/proc/cpuinfo")) or "").splitlines():
         key, _, value = line.partition(":")
         if key.strip() in keys:
             return value.strip()
@@ -114,7 +130,7 @@ def _cpuinfo(*keys: str) -> str:
 
 def _arm_cores() -> str:
     """Numbers of the kinds of cores, which Linux shows on ARM in place of a name; empty on other processors."""
-    lines = [line.partition(":") for line in (_text(Path("/proc/cpuinfo")) or "").splitlines()]
+    lines = [line.partition(":") for line in (read_text(Path("/proc/cpuinfo")) or "").splitlines()]
     makers, parts = ([v.strip() for k, _, v in lines if k.strip() == key] for key in ("CPU implementer", "CPU part"))
     # A processor may have cores of several kinds.
     kinds = sorted({*zip(makers, parts, strict=False)})
@@ -123,13 +139,12 @@ def _arm_cores() -> str:
 
 def fingerprint() -> str:
     """Identify this kind of computer: 16 hexadecimal digits from CPU, board, architecture, cores and CPU quota."""
-    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    board, quota = (_text(Path(p)) for p in ("/sys/firmware/devicetree/base/model", "/sys/fs/cgroup/cpu.max"))
-    properties = [cpu_model(), board, platform.machine(), os.cpu_count(), usable, quota]
+    properties = [cpu_model(), board(), platform.machine(), os.cpu_count(), usable_cores(), cpu_quota()]
     return hashlib.sha256(json.dumps(properties).encode()).hexdigest()[:16]
 
 
-def _text(path: Path) -> str | None:
+def read_text(path: Path) -> str | None:
+    """A file of the system, without blanks at its ends; None if it cannot be read."""
     try:
         return path.read_text(errors="replace").strip()
     except OSError:

@@ -4,11 +4,21 @@ from __future__ import annotations
 
 import re
 import reprlib
+from collections.abc import Iterable
 from pathlib import PureWindowsPath
 
 MAX_NAME = 200
+_MAX_COMPARED = 60
 _NAME = re.compile(r"[A-Za-z0-9_]([A-Za-z0-9._+-]*[A-Za-z0-9_+-])?")
 _DEVICES = re.compile(r"(con|prn|aux|nul|com\d|lpt\d)(\..*)?", re.IGNORECASE)  # Windows opens them, whatever the suffix
+
+
+def nearest(name: str, known: Iterable[str]) -> str:
+    """``" (did you mean hdl-64e?)"`` if a known name is close to a mistyped one, otherwise nothing."""
+    import difflib  # 2 ms, for errors only
+
+    match = difflib.get_close_matches(name[:_MAX_COMPARED], [*known], 1)
+    return f" (did you mean {match[0]}?)" if match else ""
 
 
 def check_text(field: str, text: str, error: type[Exception]) -> None:

@@ -30,10 +30,7 @@ STORE_BYTES = 256 * 2**20
 class Lost:
     """In place of a result.
 
-    Attributes
-    ----------
-    reason : str
-        The traceback of an exception, or that the worker process died.
+    reason : the traceback of an exception, or that the worker process died.
     """
 
     reason: str

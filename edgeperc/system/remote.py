@@ -75,10 +75,10 @@ class Remote:
     def files(self, suffixes: Collection[str]) -> list[Remote]:
         """This file, or the files with these suffixes anywhere below this folder, sorted, without hidden ones."""
         with self._system() as (system, path):
-            found = [each.removeprefix(path) for each in sorted(system.find(path))]
+            names = [file.removeprefix(path) for file in sorted(system.find(path))]
         return [
             Remote(self.url + inside)
-            for inside in found
+            for inside in names
             if not inside or (posixpath.splitext(inside)[1].lower() in suffixes and "/." not in inside)
         ]
 

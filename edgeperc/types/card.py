@@ -14,9 +14,10 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from ..errors import CardError
+from ..system.fields import Fields
 from ..system.names import check_name, check_text
 from .onnx_file import read_metadata
-from .views import CameraGeometry, RangeImageGeometry, TopViewGeometry, check, check_each
+from .views import CameraGeometry, RangeImageGeometry, TopViewGeometry
 
 CARD_KEY = "edgeperc.card"
 Precision = Literal["fp32", "int8"]
@@ -34,6 +35,8 @@ CHANNELS = {
     "range_image": ("x", "y", "z", "remission", "range", "height_above_ground"),
 }
 N_DENSE_CHANNELS, N_FRONT_CHANNELS = 9, 2
+FIELDS = Fields("the card", CardError, "export the model again", optional=("front", "block"))  # earlier cards lack them
+VIEWS = {"top_view": TopViewGeometry, "range_image": RangeImageGeometry, "camera": CameraGeometry}
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,13 +45,8 @@ class InputSpec:
 
     The raw values of a camera are 0..255 in ``"red"``, ``"green"`` and ``"blue"``, in the order that the network takes.
 
-    Attributes
-    ----------
-    name : str
-        Name of the input in the graph.
-    channels : tuple of str
-    mean, std : tuple of float
-        One value per channel, in the channel's unit.
+    name : name of the input in the graph.
+    mean, std : one value per channel, in the channel's unit.
     """
 
     name: str
@@ -67,29 +65,23 @@ class InputSpec:
                 f"input has {len(self.channels)} channels, {len(self.mean)} means and {len(self.std)} standard "
                 "deviations; expected as many of each, at least one"
             )
-        check("the number of input channels", len(self.channels), 1, MAX_CHANNELS)
+        FIELDS.whole("the number of input channels", len(self.channels), 1, MAX_CHANNELS)
         check_text("input.name", self.name, CardError)
-        check_each("input.mean", self.mean, -1e6, 1e6)
-        check_each("input.std", self.std, 1e-6, 1e6)
+        FIELDS.numbers("input.mean", self.mean, None, -1e6, 1e6)
+        FIELDS.numbers("input.std", self.std, None, 1e-6, 1e6)
 
 
 @dataclass(frozen=True, slots=True)
 class OutputSpec:
     """One output of the graph; ``kind`` picks the function in ``decode.py`` that reads it.
 
-    Attributes
-    ----------
-    name : str
-        Name of the output in the graph.
-    kind : str
-        One of ``OUTPUT_KINDS``.
-    front : bool
-        Of kind ``"box_dense"``: it has two more channels, a vector towards the front of a box. Its component along a
-        heading is the logit that the front is there.
-    block : (int, int)
-        Of a class output: rows and columns of the pixels whose values are channels of one position. Value of class c in
-        pixel (row, column): channel ``(c * rows + row % rows) * columns + column % columns``, at position
-        ``(row // rows, column // columns)``.
+    name : name of the output in the graph.
+    kind : one of ``OUTPUT_KINDS``.
+    front : of kind ``"box_dense"``: it has two more channels, a vector towards the front of a box. Its component along
+        a heading is the logit that the front is there.
+    block : (int, int); of a class output: rows and columns of the pixels whose values are channels of one position.
+        Value of class c in pixel (row, column): channel ``(c * rows + row % rows) * columns + column % columns``, at
+        position ``(row // rows, column // columns)``.
     """
 
     name: str
@@ -122,13 +114,8 @@ class Golden:
     positions, so that any runtime can be compared with the exporter's: at 16 or more different positions, or at all
     positions of a smaller output.
 
-    Attributes
-    ----------
-    seed : int
-    input_sha256 : str
-        SHA-256 of the input as float32 bytes in C order.
-    outputs : mapping
-        Output name to ``{"sha256": str, "std": float, "positions": [int], "values": [float]}``.
+    input_sha256 : SHA-256 of the input as float32 bytes in C order.
+    outputs : output name to ``{"sha256": str, "std": float, "positions": [int], "values": [float]}``.
     """
 
     seed: int
@@ -136,10 +123,9 @@ class Golden:
     outputs: Mapping[str, Mapping[str, Any]]
 
     def __post_init__(self) -> None:
-        if not 0 <= self.seed < 2**64:
-            raise CardError(f"golden.seed is {reprlib.repr(self.seed)}; expected a whole number from 0 to 2**64 - 1")
-        check("the length of golden.input_sha256", len(self.input_sha256), 0, 64)
-        check("the number of golden.outputs", len(self.outputs), 1, MAX_CHANNELS)
+        FIELDS.whole("golden.seed", self.seed, 0, 2**64 - 1)
+        FIELDS.whole("the length of golden.input_sha256", len(self.input_sha256), 0, 64)
+        FIELDS.whole("the number of golden.outputs", len(self.outputs), 1, MAX_CHANNELS)
         for name, record in self.outputs.items():
             field = f"golden.outputs[{reprlib.repr(name)}]"
             missing = {"std", "positions", "values"} - record.keys()
@@ -148,11 +134,11 @@ class Golden:
             positions, values = record["positions"], record["values"]
             if not isinstance(positions, list) or not isinstance(values, list) or len(positions) != len(values):
                 raise CardError(f"{field} holds positions and values that are not lists of one length")
-            check(f"the number of {field}.values", len(values), 1, MAX_GOLDEN_VALUES)
-            check(f"{field}.std", _float(f"{field}.std", record["std"]), 0.0, 1e30)
+            FIELDS.whole(f"the number of {field}.values", len(values), 1, MAX_GOLDEN_VALUES)
+            FIELDS.number(f"{field}.std", record["std"], 0.0, 1e30)
             for index, (position, value) in enumerate(zip(positions, values, strict=True)):
-                check(f"{field}.positions[{index}]", _int(f"{field}.positions", position), 0, 2**40)
-                check(f"{field}.values[{index}]", _float(f"{field}.values", value), -1e30, 1e30)
+                FIELDS.whole(f"{field}.positions[{index}]", position, 0, 2**40)
+                FIELDS.number(f"{field}.values[{index}]", value, -1e30, 1e30)
 
     def check_output(self, name: str, size: int) -> None:
         """Check the record of an output against the number of its values.
@@ -180,10 +166,10 @@ class ModelCard:
     view : TopViewGeometry, RangeImageGeometry or CameraGeometry
     input : InputSpec
     outputs : tuple of OutputSpec
-        That of a camera is of kind ``"camera_logits"``, float32 of shape (1, classes, h, w): logits on a grid whose h
-        and w divide the height and the width of the view.
+        A camera model has one output of kind ``"camera_logits"``, float32 of shape (1, classes, h, w): logits on a grid
+        whose h and w divide the height and the width of the view.
     classes : tuple of str
-        Index 0 is the background; those of a camera have none.
+        Index 0 is the background; a camera model has none.
     box_classes : tuple of str
         Classes that boxes may have; a subset of ``classes``.
     box_size_priors : mapping
@@ -239,8 +225,8 @@ class ModelCard:
             raise CardError(
                 f"classes {reprlib.repr(self.classes)}; expected 2 to 255 different names, the background first"
             )
-        for each in self.classes:
-            check_text("class", each, CardError)
+        for name in self.classes:
+            check_text("class", name, CardError)
         unknown = [c for c in self.input.channels if c not in CHANNELS[self.view.kind]]
         if unknown:
             raise CardError(
@@ -276,16 +262,16 @@ class ModelCard:
                 f"box_size_spreads of {[*self.box_size_spreads]}; expected a spread and a prior for each box class"
             )
         for name, sizes in self.box_size_priors.items():
-            check_each(f"box_size_priors.{name}", sizes, 0.01, 100.0)
+            FIELDS.numbers(f"box_size_priors[{reprlib.repr(name)}]", sizes, 3, 0.01, 100.0)
         for name, spreads in self.box_size_spreads.items():
-            check_each(f"box_size_spreads.{reprlib.repr(name)}", spreads, 1e-6, 10.0)
-        check("score_threshold", self.score_threshold, 0.0, 1.0)
-        check("nms_iou", self.nms_iou, 0.0, 1.0)
-        check("mount_height_m", self.mount_height_m, -100.0, 100.0)
+            FIELDS.numbers(f"box_size_spreads[{reprlib.repr(name)}]", spreads, 3, 1e-6, 10.0)
+        FIELDS.number("score_threshold", self.score_threshold, 0.0, 1.0)
+        FIELDS.number("nms_iou", self.nms_iou, 0.0, 1.0)
+        FIELDS.number("mount_height_m", self.mount_height_m, -100.0, 100.0)
         for name, record in self.precisions.items():
             check_text("the precision", name, CardError)
             if "loss" in record:
-                check(f"precisions.{name}.loss", _float(f"precisions.{name}.loss", record["loss"]), 0.0, 100.0)
+                FIELDS.number(f"precisions.{name}.loss", record["loss"], 0.0, 100.0)
         if self.golden is not None:
             for output in self.outputs:
                 shape = self.output_shape(output.kind)
@@ -300,7 +286,7 @@ class ModelCard:
                 f"input channels {self.input.channels} of a camera; expected red, green and blue, each once"
             )
         if self.fitness is not None:
-            raise CardError("a camera with a fitness, which is of scans; expected null")
+            raise CardError("fitness is given for a camera model; expected null")
 
     def output_shape(self, kind: str) -> tuple[int | None, ...]:
         """Shape of the output of a kind, with the batch; None where any length is allowed."""
@@ -356,98 +342,18 @@ class ModelCard:
         Raises
         ------
         CardError
-            Not JSON, no schema number, a newer schema, or a key that is missing, malformed or out of its bounds.
+            Not JSON, another schema, or a key that is missing, of another type or out of its bounds.
             Unknown keys are ignored.
         """
         if len(text) > MAX_CHARACTERS:
             raise CardError(f"the card has {len(text)} characters; expected at most {MAX_CHARACTERS}")
-        try:
-            document = json.loads(text)
-        except (RecursionError, ValueError) as exc:
-            raise CardError(f"the card is not JSON ({exc}); export the model again") from exc
+        document = FIELDS.document(text, SCHEMA)
         _check_tree(document)
-        if not isinstance(document, dict) or not isinstance(document.get("schema"), int):
-            raise CardError("the card has no schema number; export the model again")
-        if document["schema"] not in (2, SCHEMA):
-            raise CardError(
-                f"the card has schema {reprlib.repr(document['schema'])}, this edgeperc reads {SCHEMA}; "
-                + ("upgrade edgeperc" if document["schema"] > SCHEMA else "export the model again")
-            )
-        try:
-            return _card(document)
-        except CardError:
-            raise
-        except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as exc:
-            raise CardError(f"the card is malformed: {type(exc).__name__} {exc}; export the model again") from exc
-
-
-def _card(document: dict[str, Any]) -> ModelCard:
-    view = {**document["view"]}  # dict() would take a list of pairs, too
-    kind = view.pop("kind")
-    geometry: TopViewGeometry | RangeImageGeometry | CameraGeometry
-    if kind == "top_view":
-        geometry = TopViewGeometry(
-            x_range_m=_pair("view.x_range_m", view["x_range_m"]),
-            y_range_m=_pair("view.y_range_m", view["y_range_m"]),
-            z_range_m=_pair("view.z_range_m", view["z_range_m"]),
-            cell_m=_float("view.cell_m", view["cell_m"]),
-        )
-    elif kind == "range_image":
-        geometry = RangeImageGeometry(
-            row_elevations_deg=_floats("view.row_elevations_deg", view["row_elevations_deg"]),
-            width=_int("view.width", view["width"]),
-            azimuth_left_deg=_float("view.azimuth_left_deg", view["azimuth_left_deg"]),
-            azimuth_right_deg=_float("view.azimuth_right_deg", view["azimuth_right_deg"]),
-        )
-    elif kind == "camera":
-        geometry = CameraGeometry(_int("view.width", view["width"]), _int("view.height", view["height"]), view["fit"])
-    else:
-        raise CardError(f"view.kind is {reprlib.repr(kind)}; expected top_view, range_image or camera")
-    fitness, golden = document["fitness"], document["golden"]
-    if document["schema"] == 2:  # schema 2 has the precision in the free-form metadata, and no measured agreement
-        precision, precisions = document["training"].get("precision", "fp32"), {}
-    else:
-        precision, precisions = document["precision"], document["precisions"]
-    return ModelCard(
-        name=_text("name", document["name"]),
-        version=_text("version", document["version"]),
-        precision=precision,
-        view=geometry,
-        input=InputSpec(
-            name=_text("input.name", document["input"]["name"]),
-            channels=_texts("input.channels", document["input"]["channels"]),
-            mean=_floats("input.mean", document["input"]["mean"]),
-            std=_floats("input.std", document["input"]["std"]),
-        ),
-        outputs=tuple(
-            OutputSpec(
-                name=_text("output.name", o["name"]),
-                kind=_text("output.kind", o["kind"]),
-                front=_bool("output.front", o.get("front", False)),  # earlier cards lack it, and the block
-                block=_ints("output.block", o.get("block", [1, 1])),
-            )
-            for o in document["outputs"]
-        ),
-        classes=_texts("classes", document["classes"]),
-        box_classes=_texts("box_classes", document["box_classes"]),
-        box_size_priors=_sizes("box_size_priors", document["box_size_priors"]),
-        box_size_spreads=_sizes("box_size_spreads", document["box_size_spreads"]),
-        score_threshold=_float("score_threshold", document["score_threshold"]),
-        nms_iou=_float("nms_iou", document["nms_iou"]),
-        mount_height_m=_float("mount_height_m", document["mount_height_m"]),
-        fitness=None if fitness is None else {**fitness},
-        training={**document["training"]},
-        metrics={**document["metrics"]},
-        parity={**document["parity"]},
-        golden=None
-        if golden is None
-        else Golden(
-            _int("golden.seed", golden["seed"]),
-            _text("golden.input_sha256", golden["input_sha256"]),
-            {name: {**record} for name, record in golden["outputs"].items()},
-        ),
-        precisions={name: {**entry} for name, entry in precisions.items()},
-    )
+        view = FIELDS.read(Mapping[str, Any], document.get("view"), "view")  # type: ignore[type-abstract]
+        if view.get("kind") not in [*VIEWS]:
+            FIELDS.refuse("view.kind", view.get("kind"), "top_view, range_image or camera")
+        geometry = FIELDS.entry(VIEWS[view["kind"]], view, "view")
+        return FIELDS.read(cls, {**document, "view": geometry})
 
 
 def _check_tree(document: Any) -> None:
@@ -472,59 +378,3 @@ def _check_tree(document: Any) -> None:
         if not level:
             return
     raise CardError(f"the card is nested more than {MAX_DEPTH} deep; export the model again")
-
-
-def _text(field: str, value: Any) -> str:
-    if not isinstance(value, str):
-        raise CardError(f"{field} is {reprlib.repr(value)}; expected a text")
-    return value
-
-
-def _float(field: str, value: Any) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        raise CardError(f"{field} is {reprlib.repr(value)}; expected a number")
-    return float(value)
-
-
-def _int(field: str, value: Any) -> int:
-    if isinstance(value, bool) or not isinstance(value, int):
-        raise CardError(f"{field} is {reprlib.repr(value)}; expected a whole number")
-    return value
-
-
-def _bool(field: str, value: Any) -> bool:
-    if not isinstance(value, bool):
-        raise CardError(f"{field} is {reprlib.repr(value)}; expected true or false")
-    return value
-
-
-def _list(field: str, value: Any) -> list[Any]:
-    if not isinstance(value, list):
-        raise CardError(f"{field} is {reprlib.repr(value)}; expected a list")
-    return value
-
-
-def _texts(field: str, values: Any) -> tuple[str, ...]:
-    return tuple(_text(field, value) for value in _list(field, values))
-
-
-def _floats(field: str, values: Any) -> tuple[float, ...]:
-    return tuple(_float(field, value) for value in _list(field, values))
-
-
-def _ints(field: str, values: Any) -> tuple[int, int]:
-    first, second = (_int(field, value) for value in _list(field, values))
-    return first, second
-
-
-def _sizes(field: str, document: dict[str, Any]) -> dict[str, tuple[float, float, float]]:
-    sizes = {}
-    for name, values in document.items():
-        length, width, height = _floats(f"{field}.{reprlib.repr(name)}", values)
-        sizes[name] = length, width, height
-    return sizes
-
-
-def _pair(field: str, values: Any) -> tuple[float, float]:
-    low, high = _floats(field, values)
-    return low, high

@@ -121,13 +121,13 @@ def _damaged(path: str | os.PathLike[str], exc: ValueError) -> ModelFileError:
 
 def _entry(reader: _Reader, start: int, end: int, wanted: bytes) -> tuple[int, int] | None:
     """Start and end of the value of a metadata entry; None if the entry has another key."""
-    found, value = b"", (0, 0)
+    key, value = b"", (0, 0)
     for number, _, first, last in reader.fields(start, end):
         if number == 1:
-            found = reader.content(first, last) if last - first == len(wanted) else b""
+            key = reader.content(first, last) if last - first == len(wanted) else b""
         elif number == 2:
             value = first, last
-    return value if found == wanted else None
+    return value if key == wanted else None
 
 
 class _Reader:
@@ -240,10 +240,10 @@ class _GraphCheck:
                 self._refuse_unless_trusted("defines functions of its own")
                 for part, _, first, last in self._messages(start, end, 7, 11):
                     (self._node if part == 7 else self._attribute)(first, last, 1)
-        for each in graphs:  # a parser joins them into one; initializers may stand behind the nodes
-            self._initializers(*each, 1)
-        for each in graphs:
-            self._walk_nodes(*each, 1)
+        for graph in graphs:  # a parser joins them into one; initializers may stand behind the nodes
+            self._initializers(*graph, 1)
+        for graph in graphs:
+            self._walk_nodes(*graph, 1)
         if not self._trusted:
             self._follow_constants()
 

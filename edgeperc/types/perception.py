@@ -10,10 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import PointsError
+from ..system.fields import Fields
 from .mounting import MODEL_MOUNTING, Mounting
 from .sensor import RemissionFunction
 from .views import TopViewGeometry
 
+_FIELDS = Fields("box", PointsError, "write it with Box.to_dict", optional=("front",))
 _PART = 2**20
 ROADS = ("drivable", "road")  # names of classes of an image on which a vehicle may drive, in lower case
 
@@ -75,20 +77,7 @@ class Box:
         PointsError
             A key is missing, or its value is of another type or length.
         """
-        try:
-            (x, y, z), (length, width, height) = document["center"], document["size"]
-            numbers = [float(v) for v in (document["score"], x, y, z, length, width, height, document["yaw"])]
-            label, front = document["label"], document.get("front")
-            front = None if front is None else float(front)
-        except (KeyError, OverflowError, TypeError, ValueError) as exc:
-            raise PointsError(
-                f"got a box that cannot be read ({type(exc).__name__}: {exc}); expected label, score, yaw, center "
-                "(x, y, z), size (length, width, height) and front, a number or null"
-            ) from exc
-        if not isinstance(label, str):
-            raise PointsError(f"got a box with label {label!r}; expected a str")
-        score, x, y, z, length, width, height, yaw = numbers
-        return cls(label, score, (x, y, z), (length, width, height), yaw, front)
+        return _FIELDS.read(cls, document, "box")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -197,10 +186,10 @@ class ImageLabels:
     def drivable(self) -> NDArray[np.bool_]:
         """Pixels of the road, (H, W) bool: of a class called road or drivable; all False if there is none."""
         roads = [k for k, name in enumerate(self.classes) if name.casefold() in ROADS]
-        found = np.zeros(self.labels.shape, np.bool_)
+        is_road = np.zeros(self.labels.shape, np.bool_)
         for k in roads:
-            found |= self.labels == k
-        return found
+            is_road |= self.labels == k
+        return is_road
 
     @property
     def drivable_share(self) -> float:

@@ -6,17 +6,17 @@ import json
 import math
 import os
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..errors import SensorError
-from ..system.names import check_text
+from ..system.fields import Fields
+from ..system.names import check_text, nearest
 from .mounting import MODEL_HEIGHT_M, UNKNOWN_MOUNTING, Mounting
 
 __all__ = ["REMISSION_KINDS", "SENSORS", "RemissionFunction", "SensorProfile", "get_sensor"]
@@ -28,6 +28,9 @@ MIN_RANGE_M = 0.5
 MAX_EGO_M = 100.0
 
 EgoBox = tuple[tuple[float, float], tuple[float, float], tuple[float, float]]
+_ADVICE = "write it again with edgeperc fit-sensor or edgeperc info --write"
+# Profiles of earlier versions have no box of the own vehicle.
+FIELDS = Fields("the sensor profile", SensorError, _ADVICE, optional=("ego_box",), exact=True)
 REMISSION_KINDS = {"linear": 2, "polynomial": 3, "logarithm": 2, "power": 2}  # number of coefficients
 
 
@@ -68,27 +71,19 @@ class RemissionFunction:
     source: str
 
     def __post_init__(self) -> None:
-        try:
-            object.__setattr__(self, "coefficients", tuple(float(c) for c in self.coefficients))
-            object.__setattr__(self, "full_scale", float(self.full_scale))
-            object.__setattr__(self, "rmse", float(self.rmse))
-        except (TypeError, ValueError, OverflowError) as exc:
-            raise SensorError(f"remission function: a value is not a number ({exc})") from exc
         if not isinstance(self.kind, str) or self.kind not in REMISSION_KINDS:
-            raise SensorError(f"remission function of kind {self.kind!r}; expected one of {', '.join(REMISSION_KINDS)}")
-        if len(self.coefficients) != REMISSION_KINDS[self.kind] or not all(abs(c) <= 1e9 for c in self.coefficients):
-            raise SensorError(
-                f"a {self.kind} remission function has {REMISSION_KINDS[self.kind]} finite coefficients up to 1e9, "
-                f"got {self.coefficients!r}"
-            )
-        if self.kind == "power" and self.coefficients[1] <= 0.0:
-            raise SensorError(f"a power remission function has an exponent above 0, got {self.coefficients[1]!r}")
-        if not 0.0 < self.full_scale <= 1e9 or not 0.0 <= self.rmse < math.inf:
-            raise SensorError(
-                f"full_scale {self.full_scale!r} must be above 0 and at most 1e9, rmse {self.rmse!r} finite, from 0"
-            )
+            FIELDS.refuse("remission.kind", self.kind, f"one of {', '.join(REMISSION_KINDS)}")
+        n = REMISSION_KINDS[self.kind]
+        coefficients = FIELDS.numbers("remission.coefficients", self.coefficients, n, -1e9, 1e9)
+        if self.kind == "power" and coefficients[1] <= 0.0:
+            FIELDS.refuse("remission.coefficients", coefficients, "an exponent above 0")
+        object.__setattr__(self, "coefficients", coefficients)
+        object.__setattr__(self, "full_scale", FIELDS.number("remission.full_scale", self.full_scale, 0.0, 1e9))
+        if self.full_scale == 0.0:
+            FIELDS.refuse("remission.full_scale", self.full_scale, "a number above 0")
+        object.__setattr__(self, "rmse", FIELDS.number("remission.rmse", self.rmse, 0.0, 1e9))
         if not isinstance(self.to, str) or not self.to or not isinstance(self.source, str):
-            raise SensorError(f"remission function to {self.to!r} from {self.source!r}; expected two str")
+            FIELDS.refuse("remission.to and source", (self.to, self.source), "two texts")
 
 
 @dataclass(frozen=True)
@@ -142,42 +137,32 @@ class SensorProfile:
         if not isinstance(self.name, str) or not self.name:
             raise SensorError(f"a sensor's name is a non-empty str, got {self.name!r}")
         check_text("a sensor's name is", self.name, SensorError)
-        try:
-            object.__setattr__(self, "elevations_deg", tuple(float(e) for e in self.elevations_deg))
-            object.__setattr__(self, "remission_range", tuple(float(v) for v in self.remission_range))
-            for field in ("min_range_m", "max_range_m"):
-                object.__setattr__(self, field, float(getattr(self, field)))
-            columns_are_whole = int(self.columns) == self.columns
-            object.__setattr__(self, "columns", int(self.columns))
-        except (TypeError, ValueError, OverflowError) as exc:
-            raise SensorError(f"sensor {self.name!r}: a value is not a number ({exc})") from exc
+        who = f"sensor {self.name!r}:"
+        columns = FIELDS.number(f"{who} columns", self.columns, 1, 1_000_000)
+        if not columns.is_integer():
+            FIELDS.refuse(f"{who} columns", self.columns, "a whole number")
+        object.__setattr__(self, "columns", int(columns))
+        object.__setattr__(self, "elevations_deg", FIELDS.numbers(f"{who} elevations_deg", self.elevations_deg))
+        bounds = FIELDS.pair(f"{who} remission_range", self.remission_range, -1e9, 1e9)
+        object.__setattr__(self, "remission_range", bounds)
+        for name in ("min_range_m", "max_range_m"):
+            object.__setattr__(self, name, FIELDS.number(f"{who} {name}", getattr(self, name), 0.0))
         if not 1 <= len(self.elevations_deg) <= 4096 or not all(-90.0 < e < 90.0 for e in self.elevations_deg):
-            raise SensorError(
-                f"sensor {self.name!r}: elevations_deg needs one angle a beam, between -90 and 90, of 1 to 4096 beams"
-            )
+            raise SensorError(f"{who} elevations_deg needs one angle a beam, between -90 and 90, of 1 to 4096 beams")
         if any(upper <= lower for upper, lower in pairwise(self.elevations_deg)):
-            raise SensorError(f"sensor {self.name!r}: elevations_deg must strictly decrease, from the top beam down")
-        if not columns_are_whole or not 1 <= self.columns <= 1_000_000:
-            raise SensorError(
-                f"sensor {self.name!r}: columns is a whole number from 1 to 1,000,000, got {self.columns!r}"
-            )
-        bounds = self.remission_range
-        if len(bounds) != 2 or not max(map(abs, bounds)) <= 1e9 or not bounds[1] - bounds[0] >= 1e-9:
-            raise SensorError(
-                f"sensor {self.name!r}: remission_range is (lowest, highest) raw value, such as (0, 255), up to 1e9, "
-                f"got {bounds!r}"
-            )
+            raise SensorError(f"{who} elevations_deg must strictly decrease, from the top beam down")
+        if not bounds[1] - bounds[0] >= 1e-9:
+            FIELDS.refuse(f"{who} remission_range", bounds, "the lowest and the highest raw value, such as (0, 255)")
         if not isinstance(self.mounting, Mounting):
-            raise SensorError(f"sensor {self.name!r}: mounting is a Mounting, got {self.mounting!r:.80}")
-        if not 0.0 <= self.min_range_m < self.max_range_m < math.inf:
+            raise SensorError(f"{who} mounting is a Mounting, got {self.mounting!r:.80}")
+        if not self.min_range_m < self.max_range_m:
             raise SensorError(
-                f"sensor {self.name!r}: 0 <= min_range_m < max_range_m must hold, "
-                f"got {self.min_range_m!r} and {self.max_range_m!r}"
+                f"{who} min_range_m is {self.min_range_m!r}; expected less than max_range_m, {self.max_range_m!r}"
             )
         if self.remission is not None and not isinstance(self.remission, RemissionFunction):
-            raise SensorError(f"sensor {self.name!r}: remission is a RemissionFunction or None, got {self.remission!r}")
+            raise SensorError(f"{who} remission is a RemissionFunction or None, got {self.remission!r}")
         if self.ego_box is not None:
-            object.__setattr__(self, "ego_box", _ego_box(self.name, self.ego_box))
+            object.__setattr__(self, "ego_box", _ego_box(who, self.ego_box))
 
     def to_json(self) -> str:
         """Convert to JSON, which `get_sensor` reads from a file."""
@@ -192,28 +177,7 @@ class SensorProfile:
         SensorError
             Not JSON, another schema, or an entry that is missing, unknown or of another type.
         """
-        try:
-            document = json.loads(text)
-        except (RecursionError, ValueError) as exc:
-            raise SensorError(
-                f"the sensor profile is not JSON ({exc}); write it again with edgeperc fit-sensor"
-            ) from exc
-        if not isinstance(document, dict) or document.get("schema") != SCHEMA:
-            found = document.get("schema") if isinstance(document, dict) else None
-            raise SensorError(
-                f"the sensor profile has schema {found!r}, this edgeperc reads {SCHEMA}; write it again with edgeperc "
-                "fit-sensor or edgeperc info --write"
-            )
-        # Profiles of earlier versions have no box of the own vehicle.
-        box = document.pop("ego_box", None)
-        names = {field.name for field in fields(cls)} - {"ego_box"}
-        _check_entries(document, {"schema", *names}, "sensor profile", optional="ego_box")
-        del document["schema"]
-        if document["remission"] is not None:
-            _check_entries(document["remission"], {field.name for field in fields(RemissionFunction)}, "remission")
-            document["remission"] = RemissionFunction(**document["remission"])
-        document["mounting"] = Mounting.from_dict(document["mounting"])
-        return cls(**document, ego_box=box)
+        return FIELDS.read(cls, FIELDS.document(text, SCHEMA))
 
     @classmethod
     def uniform(
@@ -387,35 +351,17 @@ SENSORS: Mapping[str, SensorProfile] = MappingProxyType({profile.name: profile f
 """The built-in profiles by name."""
 
 
-def _ego_box(name: str, given: object) -> EgoBox:
+def _ego_box(who: str, given: Any) -> EgoBox:
     """The box as numbers; SensorError if it is not one."""
     try:
-        box: NDArray[Any] = np.array(given)
-    except (TypeError, ValueError) as exc:
-        box = np.array(str(exc))
-    if (
-        box.shape != (3, 2)
-        or box.dtype.kind not in "fiu"
-        or not (np.abs(box) <= MAX_EGO_M).all()
-        or not (box[:, 0] < box[:, 1]).all()
-    ):
-        raise SensorError(
-            f"sensor {name!r}: ego_box is {given!r:.200}; expected ((x, x), (y, y), (z, z)), lowest and highest value "
-            f"about the sensor [m], up to {MAX_EGO_M:g} m"
+        x, y, z = (FIELDS.pair(f"{who} ego_box", bounds, -MAX_EGO_M, MAX_EGO_M) for bounds in given)
+    except (TypeError, ValueError):
+        x = y = z = (0.0, 0.0)
+    if not all(low < high for low, high in (x, y, z)):
+        FIELDS.refuse(
+            f"{who} ego_box", given, "((x, x), (y, y), (z, z)), lowest and highest value about the sensor [m]"
         )
-    (x_low, x_high), (y_low, y_high), (z_low, z_high) = box.astype(float).tolist()
-    return (x_low, x_high), (y_low, y_high), (z_low, z_high)
-
-
-def _check_entries(document: object, names: set[str], what: str, optional: str = "") -> None:
-    if not isinstance(document, dict) or set(document) != names:
-        found = ", ".join(sorted(map(str, document))) if isinstance(document, dict) else repr(document)
-        more = f" (and {optional}, or not)" if optional else ""
-        raise SensorError(f"a {what} file holds exactly {', '.join(sorted(names))}{more}; got {found}")
-    numbers = {name: value for name, value in document.items() if name not in ("name", "kind", "to", "source")}
-    listed = [v for value in numbers.values() for v in (value if isinstance(value, list) else [value])]
-    if any(isinstance(v, (str, bool)) for v in listed):
-        raise SensorError(f"a {what} file has a text or truth value where a number belongs: {numbers!r}")
+    return x, y, z
 
 
 def get_sensor(sensor: str | os.PathLike[str] | SensorProfile) -> SensorProfile:
@@ -445,6 +391,6 @@ def get_sensor(sensor: str | os.PathLike[str] | SensorProfile) -> SensorProfile:
         return SENSORS[sensor]
     except (KeyError, TypeError):
         raise SensorError(
-            f"no sensor {sensor!r} is built in; known are {', '.join(SENSORS)}. "
+            f"no sensor {sensor!r} is built in{nearest(str(sensor), SENSORS)}; known are {', '.join(SENSORS)}. "
             "Describe another with SensorProfile(...) or SensorProfile.uniform(...), or name a .json file."
         ) from None

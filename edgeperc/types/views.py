@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import reprlib
-from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -12,21 +11,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import CardError
+from ..system.fields import Fields
 
 MAX_ROWS, MAX_COLUMNS, MAX_PIXELS = 4096, 65_536, 16 * 10**6
 MIN_SECTOR_DEG = 1.0
 
 
-def check(field: str, value: float, low: float, high: float) -> None:
-    """Refuse a number of the card that is out of its bounds, or not finite."""
-    if not low <= value <= high:
-        raise CardError(f"{field} is {reprlib.repr(value)}; expected a number from {low:g} to {high:g}")
-
-
-def check_each(field: str, values: Iterable[float], low: float, high: float) -> None:
-    """`check` for each number of a list."""
-    for index, value in enumerate(values):
-        check(f"{field}[{index}]", value, low, high)
+_FIELDS = Fields("the card", CardError)
 
 
 def check_size(rows: int, columns: int) -> None:
@@ -42,12 +33,8 @@ def check_size(rows: int, columns: int) -> None:
 class TopViewGeometry:
     """The ground ahead as an image (SSADNet 2.1.2). Row 0 is farthest ahead, column 0 leftmost.
 
-    Attributes
-    ----------
-    x_range_m, y_range_m, z_range_m : tuple of 2 float
-        Bounds of the view [m] in the sensor frame, lower first.
-    cell_m : float
-        Edge of a cell [m].
+    x_range_m, y_range_m, z_range_m : bounds of the view [m] in the sensor frame, lower first.
+    cell_m : edge of a cell [m].
     """
 
     x_range_m: tuple[float, float] = (6.0, 46.0)
@@ -57,11 +44,10 @@ class TopViewGeometry:
 
     def __post_init__(self) -> None:
         for name in ("x_range_m", "y_range_m", "z_range_m"):
-            low, high = getattr(self, name)
-            check_each(f"view.{name}", (low, high), -1e4, 1e4)
+            low, high = _FIELDS.pair(f"view.{name}", getattr(self, name), -1e4, 1e4)
             if not high - low >= 1e-3:
                 raise CardError(f"view.{name} is {(low, high)}; expected two finite numbers, the lower first")
-        check("view.cell_m", self.cell_m, 1e-3, 100.0)
+        _FIELDS.number("view.cell_m", self.cell_m, 1e-3, 100.0)
         check_size(self.height, self.width)
 
     @property
@@ -110,14 +96,11 @@ class TopViewGeometry:
 class RangeImageGeometry:
     """The scan as seen from the sensor (PointSeg 3.1). Row 0 is the top beam, column 0 leftmost.
 
-    Attributes
-    ----------
-    row_elevations_deg : tuple of float
-        Elevation of every row [deg], top to bottom, strictly decreasing, not necessarily evenly spaced.
-    width : int
-        Columns, evenly spread over the azimuths.
-    azimuth_left_deg, azimuth_right_deg : float
-        Azimuths of the image's left and right edges [deg], counter-clockwise from +x; 180 and -180 for a full turn.
+    row_elevations_deg : elevation of every row [deg], top to bottom, strictly decreasing, not necessarily evenly
+        spaced.
+    width : columns, evenly spread over the azimuths.
+    azimuth_left_deg, azimuth_right_deg : azimuths of the image's left and right edges [deg], counter-clockwise from +x;
+        180 and -180 for a full turn.
     """
 
     row_elevations_deg: tuple[float, ...]
@@ -156,13 +139,10 @@ class RangeImageGeometry:
 class CameraGeometry:
     """The image of a camera, scaled to the network's input. Row 0 is the top, column 0 leftmost.
 
-    Attributes
-    ----------
-    width, height : int
-        Columns and rows of the input.
-    fit : {"stretch"}
-        How an image of another size gets there: all of it is scaled to ``width`` and ``height``, bilinearly with
-        half-pixel centers (`edgeperc.camera.image.ImageScaler`), whatever its aspect; nothing is cropped or padded.
+    width, height : columns and rows of the input.
+    fit : {"stretch"}; how an image of another size gets there: all of it is scaled to ``width`` and ``height``,
+        bilinearly with half-pixel centers (`edgeperc.camera.image.ImageScaler`), whatever its aspect; nothing is
+        cropped or padded.
     """
 
     width: int

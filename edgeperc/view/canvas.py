@@ -16,23 +16,6 @@ from ..system.atomic import write_atomic
 from ..system.extras import require
 from .colors import FAINT, FRAME, GROUND, INK, PANEL, color_of
 
-__all__ = [
-    "Label",
-    "add_axes",
-    "area_of",
-    "as_png",
-    "draw_legend",
-    "free_place",
-    "height_of_legend",
-    "new_figure",
-    "place_labels",
-    "shorten",
-    "wrap",
-    "write_at",
-    "write_heading",
-    "write_text",
-]
-
 _DPI = 100.0
 _CLASSES_A_ROW, _LEGEND_ROW = 7, 104
 # More labels would cover the picture; the rest is only counted.
@@ -158,11 +141,7 @@ def draw_legend(figure: Any, left: float, top: float, width: float, facts: Mappi
 class Label:
     """A text that names something in a picture.
 
-    Attributes
-    ----------
-    area : tuple of 4 float
-        The named object, in pixels of the figure: left, bottom, right, top.
-    text, color : str
+    area : the named object, in pixels of the figure: left, bottom, right, top.
     """
 
     area: tuple[float, float, float, float]
@@ -196,12 +175,12 @@ def place_labels(
         )
         extent = text.get_window_extent()
         half = np.array([extent.width / 2.0 + gap, extent.height / 2.0 + gap])
-        found = free_place(label.area, half, taken, (panel.x0, panel.y0, panel.x1, panel.y1))
-        if found is None:
+        place = free_place(label.area, half, taken, (panel.x0, panel.y0, panel.x1, panel.y1))
+        if place is None:
             text.remove()
             n_omitted += 1
             continue
-        middle, apart = found
+        middle, apart = place
         text.set(position=tuple(middle), ha="center", va="center")
         text.set_bbox({"facecolor": PANEL, "edgecolor": "none", "alpha": 0.8, "pad": 2.0})
         taken = np.vstack([taken, [*(middle - half), *(middle + half)]])

@@ -7,25 +7,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = [
-    "AMBER",
-    "CAMERA_COLORS",
-    "CLASS_COLORS",
-    "FAINT",
-    "FALSE",
-    "FOUND",
-    "FRAME",
-    "GROUND",
-    "HIGH",
-    "INK",
-    "LOW",
-    "MISSED",
-    "PANEL",
-    "color_of",
-    "ramp",
-    "rgb",
-]
-
 # CIELAB distance of at least 21 for normal, deuteranope, protanope and tritanope vision (Machado et al. 2009). With the
 # palette of Okabe and Ito it is 5: a deuteranope sees pedestrians in the gray of the background.
 CLASS_COLORS = {

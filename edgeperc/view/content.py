@@ -21,23 +21,6 @@ from .colors import CLASS_COLORS
 if TYPE_CHECKING:
     from ..tracking.tracks import Track
 
-__all__ = [
-    "EDGES",
-    "box_corners",
-    "box_text",
-    "check_points",
-    "class_facts",
-    "drawable_boxes",
-    "drawable_points",
-    "fit_ground",
-    "in_model_frame",
-    "paint_points",
-    "perceived_image",
-    "provider_lines",
-    "timing_line",
-    "track_text",
-]
-
 # Limits of what is drawn: no sensor reaches as far, and a drawing library may fail on huge coordinates.
 _REACH_M = 1000.0
 _LARGEST_BOX_M = 100.0
@@ -58,11 +41,11 @@ def check_points(points: NDArray[np.float32], perception: Perception) -> None:
 
 def perceived_image(image: ArrayLike, perception: Perception) -> tuple[NDArray[np.uint8], ImageLabels]:
     """The image that was perceived, checked, and its labels; `ImageError` if it is another."""
-    image, found = as_image(image), perception.image
-    if found is None or found.labels.shape != image.shape[:2]:
-        given = "no image" if found is None else f"an image of shape {found.labels.shape}"
+    image, labels = as_image(image), perception.image
+    if labels is None or labels.labels.shape != image.shape[:2]:
+        given = "no image" if labels is None else f"an image of shape {labels.labels.shape}"
         raise ImageError(f"image has shape {image.shape}, of a perception of {given}; expected what was perceived")
-    return image, found
+    return image, labels
 
 
 def in_model_frame(perception: Perception, points: NDArray[np.float32]) -> tuple[Perception, NDArray[np.float32]]:

@@ -13,8 +13,6 @@ from ..types.perception import Perception
 from .colors import color_of, rgb
 from .content import check_points
 
-__all__ = ["SEMANTICKITTI_IDS", "write_labels", "write_ply"]
-
 # The raw ids of SemanticKITTI's .label files. It counts vans as cars; 99 is its "other-object".
 SEMANTICKITTI_IDS = {
     "background": 0,

@@ -39,8 +39,6 @@ from .content import (
 if TYPE_CHECKING:
     from ..tracking.tracks import Tracks
 
-__all__ = ["DrivePage", "write_html"]
-
 # Of a drive: a step of coordinates, the farthest one, the fewest points of a scan, and the steps in time.
 _STEP_M, _FARTHEST_M = 0.01, 320.0
 _FEWEST_POINTS = 3000

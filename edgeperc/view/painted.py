@@ -18,8 +18,6 @@ from .canvas import add_axes, as_png, draw_legend, height_of_legend, new_figure,
 from .colors import FAINT, INK, color_of, rgb
 from .content import check_points, drawable_boxes, drawable_points, perceived_image, provider_lines, timing_line
 
-__all__ = ["draw_painted"]
-
 # Sizes in pixels.
 _WIDTH, _MARGIN, _TOP, _GAP, _AXIS = 1600, 28, 128, 44, 62
 _WIDEST, _HIGHEST = 888, 560
@@ -69,7 +67,7 @@ def draw_painted(
     OSError
         The file cannot be written.
     """
-    image, found = perceived_image(image, perception)
+    image, labels = perceived_image(image, perception)
     check_points(points, perception)
     painted = paint(perception, points, calibration, sensor=sensor)
     road = camera_road(perception, points, calibration, sensor=sensor)
@@ -80,13 +78,13 @@ def draw_painted(
     bottom = _TOP + max(2.0 * height + _GAP, 740.0)
     counts = np.bincount(painted, minlength=256)
     facts = {
-        name: [f"{100.0 * n / found.labels.size:.1f} %"] + [f"{counts[k]:,} points"] * bool(counts[k])
-        for k, (name, n) in enumerate(found.counts().items())
+        name: [f"{100.0 * n / labels.labels.size:.1f} %"] + [f"{counts[k]:,} points"] * bool(counts[k])
+        for k, (name, n) in enumerate(labels.counts().items())
         if n
     }
     figure = new_figure(_WIDTH, int(bottom) + 40 + height_of_legend(facts) + 68)
-    colors = rgb([color_of(name) for name in found.classes])
-    _draw_image(figure, (_MARGIN, _TOP, width, height), image, colors, found.labels)
+    colors = rgb([color_of(name) for name in labels.classes])
+    _draw_image(figure, (_MARGIN, _TOP, width, height), image, colors, labels.labels)
     place = (_MARGIN, _TOP + height + _GAP, width, height)
     _draw_points(figure, place, image, points, calibration, colors, painted)
     left = _MARGIN + width + 34.0 + _AXIS
@@ -175,7 +173,7 @@ def _draw_from_above(
         outline.set_linewidth(2.0)
         axes.add_patch(outline)
     ahead = np.arange(0.0, high, 10.0)
-    axes.set_yticks(ahead, labels=[f"{at:.0f} m" for at in ahead])
+    axes.set_yticks(ahead, labels=[f"{tick:.0f} m" for tick in ahead])
     axes.grid(color=INK, alpha=0.12, linewidth=0.8)
     axes.set_axisbelow(True)
     axes.add_patch(Polygon([[0.0, 1.2], [0.9, -1.2], [-0.9, -1.2]], closed=True, facecolor=INK, zorder=4))

@@ -42,8 +42,6 @@ from .content import (
     timing_line,
 )
 
-__all__ = ["draw", "draw_image"]
-
 # Sizes in pixels. A page that shows the picture 1000 pixels wide reduces text of 13 points to 8.
 _WIDTH, _MARGIN, _TOP, _BOTTOM = 1600, 28, 128, 868
 _AXIS = 62
@@ -147,16 +145,16 @@ def draw_image(
     OSError
         The file cannot be written.
     """
-    image, found = perceived_image(image, perception)
-    counts = sorted(found.counts().items(), key=lambda item: -item[1])
-    facts = {name: [f"{100.0 * n / found.labels.size:.1f} %"] for name, n in counts if n}
+    image, labels = perceived_image(image, perception)
+    counts = sorted(labels.counts().items(), key=lambda item: -item[1])
+    facts = {name: [f"{100.0 * n / labels.labels.size:.1f} %"] for name, n in counts if n}
     height = min(_WIDTH * image.shape[0] // image.shape[1], _WIDTH) + 1
     legend_top, legend_height = 80 + height + 24, height_of_legend(facts)
     figure = new_figure(_WIDTH, legend_top + legend_height + 68)
     axes = add_axes(figure, _MARGIN, 80, _WIDTH - 2 * _MARGIN, height)
-    colors = rgb([color_of(name) for name in found.classes]).astype(np.float32)[found.labels]
+    colors = rgb([color_of(name) for name in labels.classes]).astype(np.float32)[labels.labels]
     axes.imshow(0.55 * image.astype(np.float32) / 255.0 + 0.45 * colors, aspect="equal", interpolation="antialiased")
-    size = f"{image.shape[1]} x {image.shape[0]} pixels, {100.0 * found.drivable_share:.1f} % road"
+    size = f"{image.shape[1]} x {image.shape[0]} pixels, {100.0 * labels.drivable_share:.1f} % road"
     write_at(figure, _WIDTH - _MARGIN, 46, size, fontsize=18.0, ha="right", color=FAINT)
     style = {"fontsize": 23.0, "fontweight": "bold"}
     write_at(figure, _MARGIN, 46, shorten(figure, title, 1000, **style), **style)
@@ -238,9 +236,9 @@ def _draw_top_view(
     step = 10.0 if high - low > 25.0 else 5.0
     ticks = np.arange(math.ceil(low / step) * step, high, step)[:30]
     beside = np.arange(math.ceil(right / step) * step, left, step)[:30]
-    axes.set_yticks(ticks, labels=[f"{at:.0f} m" for at in ticks])
+    axes.set_yticks(ticks, labels=[f"{tick:.0f} m" for tick in ticks])
     axes.set_xticks(
-        beside, labels=[f"{abs(at):.0f} m{' left' * (at > 0)}{' right' * (at < 0)}" for at in beside.tolist()]
+        beside, labels=[f"{abs(tick):.0f} m{' left' * (tick > 0)}{' right' * (tick < 0)}" for tick in beside.tolist()]
     )
     axes.grid(color=INK, alpha=0.12, linewidth=0.8)
     axes.set_axisbelow(True)
@@ -304,8 +302,8 @@ def _draw_range_image(
     rows = next((n for n in (16, 32, 64) if n >= len(ahead) / columns), 128)
     row = np.floor((high - elevation) / (high - low) * rows).astype(np.intp)
     col = np.floor((45.0 - azimuth[ahead]) / 90.0 * columns).astype(np.intp)
-    kept = (row >= 0) & (row < rows) & (col >= 0) & (col < columns)
-    ahead, row, col = ahead[kept], row[kept], col[kept]
+    in_view = (row >= 0) & (row < rows) & (col >= 0) & (col < columns)
+    ahead, row, col = ahead[in_view], row[in_view], col[in_view]
     nearest_last = np.argsort(-range_m[ahead], kind="stable")
     index = np.full((rows, columns), -1, dtype=np.intp)
     index[row[nearest_last], col[nearest_last]] = ahead[nearest_last]

@@ -26,8 +26,6 @@ from .content import drawable_boxes, drawable_points, fit_ground, paint_points
 if TYPE_CHECKING:
     from ..tracking.tracks import Track, Tracks
 
-__all__ = ["draw_tracks", "flatten_scan"]
-
 # Forward is to the right, left is up. Sizes in pixels, 10 per meter. Frames are drawn twice as large and reduced, which
 # smooths the edges.
 _PX_PER_M, _FINE = 10, 2
@@ -164,7 +162,7 @@ def draw_tracks(
         _write_names(pen, drawn, fonts[14])
         facts = f"{time_s:.1f} s · {len(tracks)} track{'s' * (len(tracks) != 1)}"
         _write_frame(
-            pen, title or "Tracks", facts, sorted({label for of in scans for label in of.labels}), fonts, tail_s
+            pen, title or "Tracks", facts, sorted({label for scan in scans for label in scan.labels}), fonts, tail_s
         )
         pictures.append(picture.reduce(_FINE).quantize(palette=palette, dither=Image.Dither.NONE))
     lasted = [round(1e3 * (after - before)) for before, after in pairwise([*times_s, times_s[-1] + 1.0])]
@@ -219,9 +217,9 @@ def _draw_rings(pen: Any, font: Any) -> None:
         pen.arc(
             [middle[0] - reach, middle[1] - reach, middle[0] + reach, middle[1] + reach], -90, 90, FRAME, width=_FINE
         )
-        y = min(24.0, 0.8 * ring_m)  # beside the road, where there are few labels
-        (at,) = _pixels(np.array([[math.sqrt(ring_m**2 - y**2), y]]))
-        pen.text(at, f" {ring_m} m", fill=FAINT, font=font)
+        y = min(24.0, 0.8 * ring_m)  # next to the road, where there are few labels
+        (place,) = _pixels(np.array([[math.sqrt(ring_m**2 - y**2), y]]))
+        pen.text(place, f" {ring_m} m", fill=FAINT, font=font)
     pen.polygon(_pixels(np.array([[2.2, 0.0], [-1.4, 0.9], [-1.4, -0.9]])), fill=INK)
 
 
@@ -253,9 +251,9 @@ def _write_names(pen: Any, tracks: Sequence[Track], font: Any) -> None:
         text = f"{track.id}" + (f" · {3.6 * speed:.0f} km/h" if speed > 0.5 else "")
         left, top, right, bottom = pen.textbbox((0, 0), text, font=font, anchor="mm")
         half = np.array([(right - left) / 2.0 + 6.0, (bottom - top) / 2.0 + 6.0])
-        found = free_place(area, half, np.array(taken), panel)
-        if found is not None:
-            middle, _ = found
+        place = free_place(area, half, np.array(taken), panel)
+        if place is not None:
+            middle, _ = place
             taken.append((*(middle - half).tolist(), *(middle + half).tolist()))
             pen.rectangle(taken[-1], fill=PANEL)
             pen.text(tuple(middle.tolist()), text, fill=color_of(track.label), font=font, anchor="mm")

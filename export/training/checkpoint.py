@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -12,11 +11,13 @@ import torch
 from torch import nn
 
 from edgeperc.errors import ModelError
+from edgeperc.system.fields import Fields
 
 from ..networks import build
 from ..recipe import Recipe
 
 MAX_WIDTH = 4096
+_FIELDS = Fields("the checkpoint", ValueError, "train again", optional=("*",), exact=True)
 _TEXTS = {"before": list, "curve": list, "frames": dict}  # entries that are JSON
 
 
@@ -65,22 +66,11 @@ def build_network(state: Mapping[str, Any], path: Path) -> nn.Module:
 
 
 def _recipe(text: str) -> Recipe:
-    given = json.loads(text)
-    recipe = Recipe(**{**given, "classes": tuple(given.get("classes", ()))})
-    if not all(isinstance(name, str) for name in recipe.classes):
-        raise ValueError(f"its recipe has classes {str(recipe.classes)[:60]}")
-    for field in fields(Recipe):
-        value, usual = getattr(recipe, field.name), getattr(Recipe, field.name, "")
-        kinds: Any = (int, float) if isinstance(usual, float) else type(usual)
-        if not isinstance(value, kinds) or isinstance(value, bool) != isinstance(usual, bool):
-            raise ValueError(f"its recipe has {field.name} {str(value)[:60]}")
-    if not (
-        1 <= recipe.context_width <= MAX_WIDTH
-        and 0.0 < recipe.width <= 8.0
-        and 0.0 <= recipe.dropout < 1.0
-        and 0 <= recipe.seed < 2**63
-    ):
-        raise ValueError("its recipe has a context_width, a dropout or a seed that is impossible")
+    recipe = _FIELDS.read(Recipe, json.loads(text), "recipe")
+    _FIELDS.whole("recipe.context_width", recipe.context_width, 1, MAX_WIDTH)
+    _FIELDS.whole("recipe.seed", recipe.seed, 0, 2**63 - 1)
+    _FIELDS.number("recipe.width", recipe.width, 1e-3, 8.0)
+    _FIELDS.number("recipe.dropout", recipe.dropout, 0.0, 0.999)
     return recipe
 
 
@@ -91,8 +81,7 @@ def _checked(state: Mapping[str, Any]) -> dict[str, Any]:
         if not isinstance(content, _TEXTS[name]):
             raise TypeError(f"{name} is {str(content)[:60]}; expected a {_TEXTS[name].__name__}")
     for name in ("n_simulated", "step"):
-        if not isinstance(state[name], int) or isinstance(state[name], bool):
-            raise TypeError(f"{name} is {str(state[name])[:60]}; expected a whole number")
+        _FIELDS.read(int, state[name], name)
     for name in ("averaged", "best"):
         weights = state[name]
         if name == "best" and weights is None:

@@ -321,6 +321,22 @@ def test_without_a_command_it_runs_or_measures_a_matrix(
     assert asked == [command]
 
 
+@pytest.mark.parametrize(
+    ("words", "close"),
+    [
+        (["compair", "a.json", "b.json"], "(did you mean compare?)"),
+        (["run", "--min-scan", "2"], "--min-scan 2 (did you mean --min-scans?)"),
+        (["--provider", "openvno"], "got 'openvno' (did you mean openvino?)"),
+        (["--precisions", "int"], "got 'int' (did you mean int8?)"),
+    ],
+)
+def test_mistyped_words_name_the_nearest(words: list[str], close: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as caught:
+        cli.main(words)
+    assert caught.value.code == 2
+    assert close in capsys.readouterr().err
+
+
 def test_without_psutil_only_measuring_fails(tmp_path: Path, reports: Any) -> None:
     """In a process of its own, where psutil cannot be imported."""
     block = """

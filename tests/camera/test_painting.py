@@ -385,7 +385,7 @@ def test_the_demo_with_a_camera(tmp_path: Path, capsys: pytest.CaptureFixture[st
     options = ("--out", str(tmp_path / "out"), "--model", "pointseg")
     assert cli.main(["demo", "--camera", *options]) == 0
     out = capsys.readouterr().out
-    assert "it is no photograph" in out
+    assert "not a photograph" in out
     assert "no model of a camera's images ran" in out
     assert "the scene's true classes, not those of a network" in out
     assert float(re.search(r"([\d.]+) % of them have the class of their surface", out)[1]) > 98.0  # type: ignore[index]
@@ -421,7 +421,7 @@ def test_run_draws_an_image_and_its_scan(tmp_path: Path, capsys: pytest.CaptureF
     for wrong in ([*both, *options], [both[0], "--calib", str(calib), "--png", "--out", str(out)], both[2:]):
         with pytest.raises(SystemExit):
             cli.main(["run", *wrong])
-    assert "--calib is for the picture of images and their scans" in capsys.readouterr().err
+    assert "--calib needs images with --scan and --png" in capsys.readouterr().err
     calib.write_text("P2: 1 2 3\n")
     assert cli.main(["run", *both, *options, "--png", "--out", str(out)]) == 2
     assert "holds no KITTI calibration" in capsys.readouterr().err

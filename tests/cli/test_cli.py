@@ -23,7 +23,7 @@ from test_captures import vlp16_packets, write_pcap
 
 from cli_helpers import POINTSEG, SSADNET, run, write_scan
 from edgeperc import __version__, live, zoo
-from edgeperc.cli.arguments import DEFAULT, PRECISIONS, PROVIDERS
+from edgeperc.cli.arguments import PRECISIONS, PROVIDERS
 from edgeperc.cli.evaluation.scans import _figure_lines
 from edgeperc.cli.main import build_parser, in_options
 from edgeperc.cli.output import print_line, progress
@@ -542,7 +542,7 @@ def test_a_scan_is_never_overwritten(tmp_path: Path, capsys: pytest.CaptureFixtu
 def test_wrong_usage(tmp_path: Path, capsys: pytest.CaptureFixture[str], fake: type[FakePerceiver]) -> None:
     scan = write_scan(tmp_path / "a.bin")
     for arguments, words in [
-        (("--png",), "add --out"),
+        (("--png",), "--png needs --out DIR"),
         (("--out", tmp_path / "out"), "add --png"),
         (("--on-mismatch", "explode"), "invalid choice"),
         (("--rate", "0"), "above 0"),
@@ -550,7 +550,7 @@ def test_wrong_usage(tmp_path: Path, capsys: pytest.CaptureFixture[str], fake: t
         (("--live", "--ply", "--out", tmp_path / "out"), "--live writes no files; leave out --ply"),
         ((scan, "--live"), f"--live replays one path, got 2: {scan}, {scan}"),
         (("--deskew",), "--deskew needs --poses FILE or --track"),
-        (("--poses", scan), "--poses is of --deskew"),
+        (("--poses", scan), "--poses needs --deskew"),
         (("--deskew", "--track", "--live"), "and no --live"),
     ]:
         assert usage_code("run", scan, *arguments) == 2
@@ -816,27 +816,27 @@ def test_the_examples_of_a_help_page_can_be_parsed(name: str) -> None:
 
 
 def test_the_help_page_lists_what_there_is() -> None:
-    assert zoo.DEFAULT == DEFAULT
     assert {*PROVIDERS} == {"auto", *providers.PROVIDERS}
     assert ("auto", *session.PRECISIONS) == PRECISIONS
+
+
+def test_a_mistyped_sensor_names_the_nearest(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("info", "a.bin", "--sensor", "hdl64e") == 2
+    assert "no --sensor 'hdl64e' is built in (did you mean hdl-64e?)" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
     ("words", "new"),
     [
-        (
-            ["eval", "sensors", "os1-64=simulation"],
-            "'eval sensors' is now 'eval-sensors': edgeperc eval-sensors os1-64=",
-        ),
-        (["eval", "tracking", "root", "--iou", "0.5"], "edgeperc eval-tracking root --iou 0.5"),
-        (["adapt", "fit", "a", "--sensor", "x", "--out", "b"], "edgeperc fit-sensor a --sensor x --out b"),
-        (["run", "a.bin", "--all-around"], "--all-around is now --full-turn"),
-        (["demo", "--all-around"], "--all-around is now --full-turn"),
-        (["run", "a.bin", "--adapt", "neither"], "neither is now none"),
-        (["run", "a.bin", "--precis", "int8"], "unrecognized arguments: --precis"),
+        (["evl", "root"], "(did you mean eval?)"),
+        (["fit-sensors", "a"], "(did you mean fit-sensor?)"),
+        (["run", "a.bin", "--full-trun"], "unrecognized arguments: --full-trun (did you mean --full-turn?)"),
+        (["run", "a.bin", "--precis=int8"], "unrecognized arguments: --precis=int8 (did you mean --precision?)"),
+        (["run", "a.bin", "--xyzw"], "unrecognized arguments: --xyzw\n"),
+        (["run", "a.bin", "--adapt", "remision"], "(did you mean remission?)"),
     ],
 )
-def test_old_words_are_refused_with_the_new_one(words: list[str], new: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_mistyped_words_name_the_nearest(words: list[str], new: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert usage_code(*words) == 2
     assert new in capsys.readouterr().err
 

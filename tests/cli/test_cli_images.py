@@ -107,10 +107,10 @@ def test_wrong_usage(tmp_path: Path, model: Path, capsys: pytest.CaptureFixture[
     for arguments, said in (
         ((image, "--scan", scan, scan.with_name("c.bin"), "--model", model), "--scan: 2 scans for 1 image"),
         ((scan, "--scan", scan), "--scan: 1 scan for 0 images"),
-        ((image, "--labels", *out), "--labels is of scans; add --scan"),
-        ((image, "--track"), "--track is of scans; add --scan"),
-        ((image, "--live"), f"--live is of scans, and {image} is an image"),
-        ((image, "--deskew", "--track"), "--deskew is of scans"),
+        ((image, "--labels", *out), "--labels needs --scan for images"),
+        ((image, "--track"), "--track needs --scan for images"),
+        ((image, "--live"), f"--live needs scans, and {image} is an image"),
+        ((image, "--deskew", "--track"), "--deskew needs scans"),
         ((image, "--png", "--out", tmp_path, "--model", model), "is one of the images and would be overwritten"),
     ):
         with pytest.raises(SystemExit, match="2"):

@@ -6,7 +6,7 @@ import json
 import math
 import re
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,7 @@ pytest.importorskip("tqdm")
 from checkout import REPOSITORY
 from edgeperc import Perceiver, cli
 from edgeperc.datasets.kitti import scan_hash
-from edgeperc.datasets.layout import _KEYS, ScanLayout, class_number, known_layouts, read_layout
+from edgeperc.datasets.layout import ScanLayout, class_number, known_layouts, read_layout
 from edgeperc.datasets.scan_folder import ScanFolder
 from edgeperc.errors import MountingError, OptionError, PointsError, SensorError
 from edgeperc.evaluation.evaluate import evaluate
@@ -148,7 +148,7 @@ def test_classes_of_points_that_are_wrong(
 def test_label_files_of_half_a_number_and_names_that_are_none(tmp_path: Path) -> None:
     root = with_classes(tmp_path, [1, 2, 3, 4], np.uint32)
     (root / "semseg/a.label").write_bytes(b"12345")
-    with pytest.raises(PointsError, match="5 bytes are no uint32 labels"):
+    with pytest.raises(PointsError, match="5 bytes are not uint32 labels"):
         ScanFolder(root).frame("a")
     np.array([1, 2, 3, 4], np.uint32).tofile(root / "semseg/a.label")
     for text in ("[1]", "{", '{"-1": "Road"}', '{"1": 2}'):
@@ -317,9 +317,9 @@ def test_polygons_that_are_none(tmp_path: Path, text: str) -> None:
         ({"sensor": "mine.json"}, "cannot be read"),
         ({"sensor": {"columns": 3}}, "sensor: expected 'like'"),
         ({"sensor": {"like": "hdl-64e", "beams": 3}}, "sensor is"),
-        ({"sensor": {"like": "hdl-64e", "columns": "x"}}, "not a number"),
+        ({"sensor": {"like": "hdl-64e", "columns": "x"}}, "columns is 'x'; expected a number"),
         ({"sensor": {"name": "x", "elevations_deg": [0, 1], "columns": 9}}, "must strictly decrease"),
-        ({"mounting": {"height": 2}}, "mounting is"),
+        ({"mounting": {"height": 2}}, "mounting has unknown entries height"),
         ({"mounting": {"height_m": "2"}}, "height_m is '2'"),
         ({"boxes": ["car"]}, "boxes is"),
         ({"boxes": {"Car": 1}}, "boxes is"),
@@ -333,10 +333,10 @@ def test_polygons_that_are_none(tmp_path: Path, text: str) -> None:
         ({"box_format": "coco"}, "box_format is 'coco'"),
         ({"box_format": []}, "box_format is"),
         ({"box_columns": ["class"]}, "expected x, y, z"),
-        ({"box_columns": "class"}, "expected a list of str"),
+        ({"box_columns": "class"}, "expected a list of texts"),
         ({"labeled_deg": [30, -30]}, "labeled_deg is"),
         ({"labeled_deg": [-300, 300]}, "labeled_deg is"),
-        ({"labeled_deg": 30}, "expected two numbers"),
+        ({"labeled_deg": 30}, "expected a list of 2 numbers"),
         ({"labeled_deg": [True, 30]}, "expected a number"),
         ({"labeled_m": 0}, "labeled_m is 0"),
         ({"labeled_m": "far"}, "labeled_m is 'far'"),
@@ -344,7 +344,7 @@ def test_polygons_that_are_none(tmp_path: Path, text: str) -> None:
         ({"min_points": 1.5}, "min_points is 1.5"),
         ({"drives": "all"}, "drives is 'all'"),
         ({"splits": ["x"]}, "splits is"),
-        ({"splits": {"train": "x"}}, "expected a list of str"),
+        ({"splits": {"train": "x"}}, "expected a list of texts"),
         ({"splits": {"training": []}}, "splits is"),
         ({"splits": {"train": ["x"], "test": ["x"]}}, "lists x twice"),
     ],
@@ -383,7 +383,7 @@ def test_the_description_in_the_documentation() -> None:
     table = page.partition("| entry |")[2].partition("\n\n")[0]
     entries = re.findall(r"^\| (`.*?) \|", table, flags=re.MULTILINE)
     named = {name for entry in entries for name in re.findall(r"`(\w+)`", entry)}
-    assert named | {"name", "about"} == _KEYS
+    assert named | {"name", "about"} == {"schema", "about", "mounting", *(field.name for field in fields(ScanLayout))}
 
 
 JSON = st.recursive(

@@ -26,7 +26,7 @@ HEIGHT, WIDTH = 24, 32
 
 def write_set(root: Path, ids: dict[str, NDArray[np.uint8]], names: tuple[str, ...] = tiny_camera.CLASSES) -> Path:
     """Images whose colors are the classes 0, 1 and 2 in stripes of 8 columns, with the given labels."""
-    document = {str(k): name for k, name in enumerate((*names, "Unlabelled"))}
+    document = {str(k): name for k, name in enumerate((*names, "Unlabeled"))}
     root.mkdir(exist_ok=True)
     (root / "classes.json").write_text(json.dumps(document))
     for name, labels in ids.items():
@@ -163,8 +163,8 @@ def test_the_table_of_images(tmp_path: Path, model: Path, capsys: pytest.Capture
     assert document["images"]["classes"]["Road"]["iou"] == 0.5
     for arguments, said in (
         ((root, "simulation:1"), "different figures"),
-        ((root, "--fold", "0"), "--fold is for scans"),
-        ((root, "--worst", tmp_path / "w.png"), "--worst is for scans"),
+        ((root, "--fold", "0"), "--fold needs scans"),
+        ((root, "--worst", tmp_path / "w.png"), "--worst needs scans"),
         ((root, "--model", model, "--model", model), "got 2 models"),
     ):
         with pytest.raises(SystemExit, match="2"):

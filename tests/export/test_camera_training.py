@@ -75,7 +75,7 @@ def drawn(tmp_path_factory: pytest.TempPathFactory) -> Path:
             image = 20 * labels[..., None] + np.array([0, 10, 20]) + rng.integers(0, 12, (72, 96, 3))
             Image.fromarray(image.astype(np.uint8)).save(root / folder / f"{k:03}.png")
             Image.fromarray(labels).save(root / f"{folder}annot" / f"{k:03}.png")
-    names = dict(enumerate((*CAMERA_CLASSES, "Unlabelled")))
+    names = dict(enumerate((*CAMERA_CLASSES, "Unlabeled")))
     (root / "classes.json").write_text(json.dumps(names))
     return root
 

@@ -48,12 +48,19 @@ def test_every_option_has_a_help_text() -> None:
         parser.format_help()  # raises ValueError for a stray % in a help text
 
 
-@pytest.mark.parametrize("command", ["build", "label", "coco", "check"])
-def test_the_old_database_commands_name_the_new_ones(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize(
+    ("words", "close"),
+    [
+        (["database-biuld"], "(did you mean database-build?)"),
+        (["train", "pointsg", "out"], "(did you mean pointseg?)"),
+        (["train", "pointseg", "out", "--kitty", "root"], "--kitty root (did you mean --kitti?)"),
+    ],
+)
+def test_mistyped_words_name_the_nearest(words: list[str], close: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as caught:
-        main(["database", command, "out"])
+        main(words)
     assert caught.value.code == 2
-    assert f'"database {command}" is now written database-{command}' in capsys.readouterr().err
+    assert close in capsys.readouterr().err
 
 
 def test_help_and_recipes_load_no_torch() -> None:

@@ -256,7 +256,7 @@ class Images:
         root = case.folder / "set"
         for folder in ("val", "valannot"):
             (root / folder).mkdir(parents=True)
-        names = mutated_document({"0": "Sky", "1": "Road", "2": "Tree", "3": "Unlabelled"}, case)
+        names = mutated_document({"0": "Sky", "1": "Road", "2": "Tree", "3": "Unlabeled"}, case)
         (root / "classes.json").write_text(json.dumps(names) if case.chance(0.9) else "{")
         content = case.pick(self.files)
         (root / "val" / "a.png").write_bytes(content)

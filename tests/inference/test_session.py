@@ -187,7 +187,7 @@ def test_every_provider_is_available_or_refused() -> None:
 
 @pytest.mark.parametrize("name", ["gpu", "CPUExecutionProvider", ""])
 def test_unknown_providers_are_refused(name: str) -> None:
-    with pytest.raises(ProviderError, match="is unknown; expected auto or one of"):
+    with pytest.raises(ProviderError, match=r"is unknown.*; expected auto or one of"):
         Session(model_path("pointseg"), name)
 
 
@@ -199,7 +199,7 @@ def test_a_precision_in_the_providers_name_is_refused() -> None:
 @pytest.mark.parametrize(
     ("model", "precision", "message"),
     [
-        ("pointseg", "fp16", "precision 'fp16' is unknown; expected auto, fp32, bf16, int8"),
+        ("pointseg", "fp16", "precision 'fp16' is unknown \\(did you mean bf16\\?\\); expected auto, fp32, bf16, int8"),
         ("pointseg", "bf16", "cannot run in precision 'bf16' on provider 'cpu', only in fp32 or int8; bf16 needs"),
         ("pointseg:int8", "fp32", "only in int8; give a model whose weights are stored in fp32"),
         ("pointseg:fp32", "int8", "only in fp32; give a model whose weights are stored in int8"),

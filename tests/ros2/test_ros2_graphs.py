@@ -171,7 +171,7 @@ def _of(watch: Watch, name: str, n: int) -> set[str]:
         ({}, {"ROS_DOMAIN_ID": "seven"}, "ROS_DOMAIN_ID is 'seven'"),
         ({"connect": "nonsense"}, {}, "connect='nonsense'"),
         ({}, {CONFIG_VARIABLE: "/nowhere.json5"}, "nowhere.json5"),
-        ({"name": "two words"}, {}, "no name of ROS 2"),
+        ({"name": "two words"}, {}, "not a name of ROS 2"),
     ],
 )
 def test_what_is_no_graph(
@@ -218,7 +218,7 @@ def test_the_command_of_the_page_answers_another_process(router: str, watch: Wat
         _compare(heard)
         until(lambda: any(_status(raw).level == 2 for raw in heard("diagnostics")))
         status = next(_status(raw) for raw in heard("diagnostics") if _status(raw).level == 2)
-        assert "are no sensor_msgs/msg/PointCloud2" in status.message
+        assert "are not a sensor_msgs/msg/PointCloud2" in status.message
         values = {v.key: v.value for v in status.values}
         assert (values["answers"], values["clouds failed"], values["clouds dropped"]) == ("3", "1", "0")
         node.send_signal(signal.SIGTERM)
@@ -416,8 +416,8 @@ def test_parameters_take_the_place_of_options(bus: Bus, capsys: pytest.CaptureFi
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["--ros-args", "-r", "a:=b"], "add --rclpy"),
-        (["--rclpy", "--connect", "tcp/localhost:1"], "--connect is of Zenoh"),
+        (["--ros-args", "-r", "a:=b"], "--ros-args needs --rclpy"),
+        (["--rclpy", "--connect", "tcp/localhost:1"], "--connect needs Zenoh"),
     ],
 )
 def test_options_that_exclude_one_another(arguments: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:

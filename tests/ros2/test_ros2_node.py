@@ -137,9 +137,9 @@ def test_nothing_is_made_that_nobody_wants() -> None:
 
 
 HOSTILE = {
-    "not CDR": (b"garbage", "no sensor_msgs/msg/PointCloud2"),
-    "nothing": (b"", "no sensor_msgs/msg/PointCloud2"),
-    "half": (cloud(POINTS)[:60], "no sensor_msgs/msg/PointCloud2"),
+    "not CDR": (b"garbage", "not a sensor_msgs/msg/PointCloud2"),
+    "nothing": (b"", "not a sensor_msgs/msg/PointCloud2"),
+    "half": (cloud(POINTS)[:60], "not a sensor_msgs/msg/PointCloud2"),
     "no fields": (cloud(POINTS, fields=[]), "layout is impossible|no numeric field"),
     "steps too small": (cloud(POINTS, point_step=3), "layout is impossible"),
     "step of 0": (cloud(POINTS, point_step=0), "layout is impossible"),
@@ -362,5 +362,5 @@ def test_names_are_resolved(name: str, namespace: str, full: str) -> None:
 
 @pytest.mark.parametrize("name", ["", "/", "/a/", "a b", "/1st", "a__b", "/a//b", "/a/*", "~/points"])
 def test_names_that_ros_does_not_allow(name: str) -> None:
-    with pytest.raises(OptionError, match="no name of ROS 2"):
+    with pytest.raises(OptionError, match="not a name of ROS 2"):
         full_name(name)

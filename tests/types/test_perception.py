@@ -51,14 +51,14 @@ def test_a_box_is_read_back_as_it_was_written() -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"label": None}, "label None"),
+        ({"label": None}, "box.label is None; expected a text"),
         ({"score": "high"}, "high"),
-        ({"center": [1.0, 2.0]}, "not enough values"),
-        ({"center": 3.0}, "TypeError"),
-        ({"size": [1.0, 2.0, 3.0, 4.0]}, "too many values"),
-        ({"yaw": None}, "TypeError"),
+        ({"center": [1.0, 2.0]}, "expected a list of 3 numbers"),
+        ({"center": 3.0}, "center is 3.0"),
+        ({"size": [1.0, 2.0, 3.0, 4.0]}, "expected a list of 3 numbers"),
+        ({"yaw": None}, "yaw is None; expected a number"),
         ({"front": "rear"}, "rear"),
-        ({"front": []}, "TypeError"),
+        ({"front": []}, r"front is \[\]; expected a number"),
     ],
 )
 def test_a_wrong_box_is_refused(change: dict[str, Any], message: str) -> None:

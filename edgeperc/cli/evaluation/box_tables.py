@@ -8,7 +8,7 @@ from typing import Any
 from ..output import FEW, table_lines
 
 CAPPED = " (R40 capped)"
-"""Beside rows with fewer objects than recall positions: KITTI's tool then leaves positions empty."""
+"""Next to rows with fewer objects than recall positions: KITTI's tool then leaves positions empty."""
 
 
 def interval_columns(*rates: tuple[str, str]) -> tuple[tuple[str, str], ...]:

@@ -8,10 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from ...system.extras import require
+from ...types.choices import CAMERA, DEFAULT_MODELS, RULES
 from ..arguments import (
-    CAMERA,
-    DEFAULT,
-    RULES,
     Commands,
     add_agreement,
     add_boxes_from,
@@ -127,7 +125,7 @@ def eval_command(arguments: argparse.Namespace) -> int:
     with progress() as show:
         figures, mistakes = evaluate(
             arguments.datasets,
-            arguments.model or DEFAULT,
+            arguments.model or DEFAULT_MODELS,
             split=arguments.split,
             fold=arguments.fold,
             road_by=arguments.road_by,
@@ -158,11 +156,11 @@ def _eval_images(arguments: argparse.Namespace, roots: Sequence[Path]) -> int:
     if len(roots) < len(arguments.datasets):
         arguments.usage_error("labeled images and labeled scans have different figures; evaluate them one by one")
     if arguments.engine == "ray":
-        arguments.usage_error("--engine ray is for scans; leave it out")
+        arguments.usage_error("--engine ray needs scans, and these are images; leave it out")
     used = {"--fold": arguments.fold, "--mounted": arguments.mounted, "--road-by": arguments.road_by}
     for option, value in (used | {"--worst": arguments.worst}).items():
         if value is not None:
-            arguments.usage_error(f"{option} is for scans")
+            arguments.usage_error(f"{option} needs scans, and these are images; leave it out")
     models = arguments.model or [CAMERA]
     if len(models) > 1:
         arguments.usage_error(f"got {len(models)} models; images are evaluated with one --model")
@@ -324,8 +322,8 @@ def _cell_lines(of_block: Mapping[str, Any]) -> list[str]:
             if row["n_cells"]:
                 rows.append(((band, ""), row | {"iou": None, "iou_interval": None}))
                 for name, n_cells in row["n_cells_of"].items():
-                    own = {key: row[key][name] for key in ("iou", "iou_interval")}
-                    rows.append(((band, name), own | {"n_cells": n_cells}))
+                    of_class = {key: row[key][name] for key in ("iou", "iou_interval")}
+                    rows.append(((band, name), of_class | {"n_cells": n_cells}))
         lines += table_lines(f"top view, {kind}", _CELL_COLUMNS, rows)
     return lines
 

@@ -121,14 +121,14 @@ def eval_tracking_command(arguments: argparse.Namespace) -> int:
     from ...records import read_boxes
 
     names = arguments.sequences or sequence_names(arguments.root)
-    of = "given detections"
+    source = "given detections"
     boxes: dict[str, list[list[Box]]] = {}
     if arguments.boxes is not None:
-        boxes, of = {names[0]: read_boxes(arguments.boxes)}, f"boxes of {arguments.boxes}"
+        boxes, source = {names[0]: read_boxes(arguments.boxes)}, f"boxes of {arguments.boxes}"
     elif arguments.model or not (arguments.root / "detections").is_dir():
-        boxes, of = _perceived(arguments, names)
+        boxes, source = _perceived(arguments, names)
     with progress("sequence") as show:
-        figures = {"of": of} | evaluate_kitti(
+        figures = {"of": source} | evaluate_kitti(
             arguments.root,
             sequences=names,
             classes=arguments.classes,
@@ -164,14 +164,15 @@ def _perceived(arguments: argparse.Namespace, names: Sequence[str]) -> tuple[dic
     from ...evaluation.tracking import perceive_drive, sequence_scans
 
     scans = {name: sequence_scans(arguments.root, name) for name in names}
-    for name, of in scans.items():
-        if not of:
+    for name, sequence in scans.items():
+        if not sequence:
             raise PointsError(f"{arguments.root} has no scans of {name}; expected velodyne/{name}/*.bin, or detections")
     perceive = make_perceiver(arguments, sensor=arguments.sensor, on_mismatch="ignore", adapt=arguments.adapt)
     total, counted = sum(map(len, scans.values())), itertools.count(1)
     with progress() as show:
         boxes = {
-            name: perceive_drive(perceive, of, name, lambda: show(next(counted), total)) for name, of in scans.items()
+            name: perceive_drive(perceive, sequence, name, lambda: show(next(counted), total))
+            for name, sequence in scans.items()
         }
     return boxes, "boxes of " + " and ".join(f"{card.name} {card.version}" for card in perceive.cards)
 

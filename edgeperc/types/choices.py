@@ -1,0 +1,9 @@
+"""Names that options take, and their defaults. This module imports nothing, so that ``--help`` is fast."""
+
+from __future__ import annotations
+
+DEFAULT_MODELS = ("ssadnet", "pointseg")
+CAMERA = "camseg"
+DEFAULT_SENSOR = "hdl-64e"
+PRECISIONS = ("fp32", "bf16", "int8")
+RULES = ("boxes", "cells", "column", "fill", "ground", "height", "person", "road", "share", "stand", "support")
