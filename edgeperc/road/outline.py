@@ -378,6 +378,34 @@ def meet(ar: int, ac: int, br: int, bc: int, cr: int, cc: int, dr: int, dc: int)
 
 
 @njit(cache=True, nogil=True)
+def is_apart(ring: NDArray[np.int64], edges: NDArray[np.int64], k: int, pr: int, pc: int) -> bool:
+    """Whether a ring stays valid with a corner p in place of its corners k and k + 1 (`merge_corners`)."""
+    n = ring.shape[0]
+    before, following, behind = (k - 1) % n, (k + 1) % n, (k + 2) % n
+    ar, ac, dr, dc = ring[before, 0], ring[before, 1], ring[behind, 0], ring[behind, 1]
+    for v in range(n):
+        if v in (before, k, following):
+            continue
+        w = (v + 1) % n
+        vr, vc, wr, wc = ring[v, 0], ring[v, 1], ring[w, 0], ring[w, 1]
+        if w == before:  # has a in common with the edge ap
+            if turn(vr, vc, ar, ac, pr, pc) == 0 and (vr - ar) * (pr - ar) + (vc - ac) * (pc - ac) > 0:
+                return False
+        elif meet(ar, ac, pr, pc, vr, vc, wr, wc):
+            return False
+        if v == behind:  # has d in common with the edge pd
+            if turn(wr, wc, dr, dc, pr, pc) == 0 and (wr - dr) * (pr - dr) + (wc - dc) * (pc - dc) > 0:
+                return False
+        elif meet(pr, pc, dr, dc, vr, vc, wr, wc):
+            return False
+    for e in range(edges.shape[0]):
+        vr, vc, wr, wc = edges[e, 0], edges[e, 1], edges[e, 2], edges[e, 3]
+        if meet(ar, ac, pr, pc, vr, vc, wr, wc) or meet(pr, pc, dr, dc, vr, vc, wr, wc):
+            return False
+    return True
+
+
+@njit(cache=True, nogil=True)
 def merge_corners(
     ring: NDArray[np.int64], edges: NDArray[np.int64], fixed: NDArray[np.int32], around: int, enough: int
 ) -> int:
@@ -446,34 +474,7 @@ def merge_corners(
                         and may_change(pr, pc, cr, cc, dr, dc, fixed)
                     ):
                         continue
-                    apart = True
-                    for v in range(n):
-                        if v in (before, k, following):
-                            continue
-                        w = (v + 1) % n
-                        vr, vc, wr, wc = ring[v, 0], ring[v, 1], ring[w, 0], ring[w, 1]
-                        if w == before:  # has a in common with the edge ap
-                            back = (
-                                turn(vr, vc, ar, ac, pr, pc) == 0 and (vr - ar) * (pr - ar) + (vc - ac) * (pc - ac) > 0
-                            )
-                            apart = not back and not meet(pr, pc, dr, dc, vr, vc, wr, wc)
-                        elif v == behind:  # has d in common with the edge pd
-                            back = (
-                                turn(wr, wc, dr, dc, pr, pc) == 0 and (wr - dr) * (pr - dr) + (wc - dc) * (pc - dc) > 0
-                            )
-                            apart = not back and not meet(ar, ac, pr, pc, vr, vc, wr, wc)
-                        else:
-                            apart = not meet(ar, ac, pr, pc, vr, vc, wr, wc) and not meet(
-                                pr, pc, dr, dc, vr, vc, wr, wc
-                            )
-                        if not apart:
-                            break
-                    for e in range(edges.shape[0]):
-                        if not apart:
-                            break
-                        vr, vc, wr, wc = edges[e, 0], edges[e, 1], edges[e, 2], edges[e, 3]
-                        apart = not meet(ar, ac, pr, pc, vr, vc, wr, wc) and not meet(pr, pc, dr, dc, vr, vc, wr, wc)
-                    if apart:
+                    if is_apart(ring[:n], edges, k, pr, pc):
                         least, best_r, best_c = area, pr, pc
             if best_r < 0:
                 tried[k] = limit

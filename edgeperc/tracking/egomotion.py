@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..system.kernel_cache import njit
+from .ukf import fill_inverse
 
 MAX_ROUNDS = 12
 MAX_PROPOSALS = 256
@@ -174,18 +175,3 @@ def nearest_detection(
         if squared < smallest:
             nearest, smallest = j, squared
     return nearest, smallest
-
-
-# A copy of that in `ukf`: numba would not recompile a cached kernel after a change in another file.
-@njit(cache=True, nogil=True)
-def fill_inverse(matrix: NDArray[np.float64], inverse: NDArray[np.float64]) -> None:
-    """Invert a symmetric positive definite (3, 3) matrix into ``inverse``, by cofactors."""
-    a, b, c = matrix[0, 0], matrix[0, 1], matrix[0, 2]
-    d, e, f = matrix[1, 1], matrix[1, 2], matrix[2, 2]
-    determinant = a * (d * f - e * e) - b * (b * f - c * e) + c * (b * e - c * d)
-    inverse[0, 0] = (d * f - e * e) / determinant
-    inverse[1, 1] = (a * f - c * c) / determinant
-    inverse[2, 2] = (a * d - b * b) / determinant
-    inverse[0, 1] = inverse[1, 0] = (c * e - b * f) / determinant
-    inverse[0, 2] = inverse[2, 0] = (b * e - c * d) / determinant
-    inverse[1, 2] = inverse[2, 1] = (b * c - a * e) / determinant
