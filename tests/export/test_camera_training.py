@@ -17,6 +17,7 @@ Image = pytest.importorskip("PIL.Image")
 
 import torch.nn.functional as F
 from torch import nn
+from training_helpers import train
 
 from edgeperc.errors import ImageError, PointsError, SplitError
 from edgeperc.evaluation.camvid import evaluate_images
@@ -54,7 +55,7 @@ from edgeperc_export.training.images import (
     read_camvid,
 )
 from edgeperc_export.training.losses import _lovasz_at_once, cross_entropy, lovasz_softmax
-from edgeperc_export.training.train import _last, train
+from edgeperc_export.training.train import _last
 
 SMALL: dict[str, Any] = {"image_width": 48, "image_height": 36, "batch": 2, "steps": 4, "dropout": 0.0}
 
