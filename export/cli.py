@@ -368,24 +368,19 @@ def _add_quantize(commands: Commands) -> None:
 
 
 def _quantize(args: argparse.Namespace) -> int:
-    from .release.quantize import calibration_images, calibration_scans, quantize
+    from .release.quantize import LabeledSets, calibration_images, calibration_scans, quantize
 
-    scans: Sequence[Any]
     if args.camvid is not None:
-        scans, hashes = calibration_images(args.camvid)
+        calibration = calibration_images(args.camvid)
     else:
-        scans, hashes = calibration_scans(args.scans, kitti=args.kitti, n_simulated=args.simulated)
+        calibration = calibration_scans(args.scans, kitti=args.kitti, n_simulated=args.simulated)
     card = quantize(
         args.model,
         args.out,
-        scans=scans,
-        hashes=hashes,
-        kitti=args.kitti,
-        semantickitti=args.semantickitti,
-        camvid=args.camvid,
+        calibration,
+        LabeledSets(args.kitti, args.semantickitti, args.camvid, args.evaluate_on),
         exclude=args.exclude,
         seven_bits=args.seven_bits,
-        n_evaluated=args.evaluate_on,
         n_threads=args.threads,
     )
     print_line(

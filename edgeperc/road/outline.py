@@ -26,14 +26,10 @@ FARTHEST = 8
 class Outline:
     """The outline of connected cells. A cell's upper left corner has the cell's row and column.
 
-    Attributes
-    ----------
-    outer : (k, 2) int64
-        Row and column of the corners, with the cells on the left. Shape (0, 2) if there are no cells.
-    holes : tuple of (k, 2) int64
-        Likewise.
-    factor : float
-        No cell that is left out is farther than this many times the tolerance from the edges of the cells.
+    outer : (k, 2) int64; row and column of the corners, with the cells on the left. Shape (0, 2) if there are no
+        cells.
+    holes : tuple of (k, 2) int64; likewise.
+    factor : no cell that is left out is farther than this many times the tolerance from the edges of the cells.
     """
 
     outer: NDArray[np.int64]
@@ -52,34 +48,23 @@ def outline_of(
 ) -> Outline:
     """Outline the connected cells that are nearest to a place.
 
-    Parameters
-    ----------
-    cells : (rows, columns) bool
-    origin : tuple of 2 float
-        Row and column of the place, where a cell's middle has the cell's row and column. It may be outside the grid.
-    obstacles : (rows, columns) bool
-        Cells that are never included.
-    in_holes : (rows, columns) bool
-        A hole without such a cell is filled.
-    tolerance : float
-        Largest distance between the outline and the edges of the cells, in cells. 0 keeps all corners, however many.
-    max_corners : int
-        Largest number of corners of the outer ring, at least 4. If they do not suffice, cells are left out that are
-        farther from the edges; no more are added.
-
-    Returns
-    -------
-    Outline
-        A valid polygon: its rings neither touch nor cross themselves or one another, and the holes are inside.
-
-    Notes
-    -----
     Closing by a disc fills gaps narrower than twice the tolerance, opening removes what is as narrow. So cells that are
     connected only over a narrower passage are left out. Where two cells share only a corner, a cell between them is
     added, or else the one with the smaller row is left out. Corners are removed by growing area of their triangle
     (Visvalingam and Whyatt, 1993), as long as all cells that the triangle touches are within the tolerance. If more
     than ``max_corners`` remain, pairs of neighbors are replaced by one corner that may be anywhere on the grid, by
     growing area between the old edges and the new ones, under the same condition.
+
+    cells : (rows, columns) bool
+    origin : tuple of 2 float; row and column of the place, where a cell's middle has the cell's row and column. It
+        may be outside the grid.
+    obstacles : (rows, columns) bool; cells that are never included.
+    in_holes : (rows, columns) bool; a hole without such a cell is filled.
+    tolerance : largest distance between the outline and the edges of the cells, in cells. 0 keeps all corners,
+        however many.
+    max_corners : largest number of corners of the outer ring, at least 4. If they do not suffice, cells are left out
+        that are farther from the edges; no more are added.
+    Returns: A valid polygon: its rings neither touch nor cross themselves or one another, and the holes are inside.
     """
     # A kernel is compiled for arrays in C order.
     cells, obstacles, in_holes = (np.ascontiguousarray(mask, np.bool_) for mask in (cells, obstacles, in_holes))
@@ -411,29 +396,16 @@ def merge_corners(
 ) -> int:
     """Replace two neighboring corners of a ring by one; smallest changes first.
 
-    Parameters
-    ----------
-    ring : (n, 2) int64, modified
-        Row and column of the corners of a ring that neither touches nor crosses itself.
-    edges : (m, 4) int64
-        Row and column of the two ends of other edges, which the ring may not touch.
-    fixed : (rows, columns + 1) int32
-        Number of cells of each row before each column that may not change sides.
-    around : int
-        How far the new corner may lie from the rectangle around the two [cells].
-    enough : int
-        The ring keeps at least so many corners, and at least 4.
-
-    Returns
-    -------
-    n_corners : int
-        The first so many rows of ``ring`` are the corners.
-
-    Notes
-    -----
     Between the neighbors a and d, the corner p replaces b and c. What changes sides lies in the triangles pab, pbc and
     pcd. No cell that they touch may be fixed, and of all such p, that with the smallest sum of their areas is taken.
     The new edges may meet no other edge, so the ring stays valid. Holes stay inside if none of their cells may change.
+
+    ring : (n, 2) int64, modified; row and column of the corners of a ring that neither touches nor crosses itself.
+    edges : (m, 4) int64; row and column of the two ends of other edges, which the ring may not touch.
+    fixed : (rows, columns + 1) int32; number of cells of each row before each column that may not change sides.
+    around : how far the new corner may lie from the rectangle around the two [cells].
+    enough : the ring keeps at least so many corners, and at least 4.
+    Returns n_corners: The first so many rows of ``ring`` are the corners.
     """
     n, height, width = ring.shape[0], fixed.shape[0], fixed.shape[1] - 1
     tried = np.empty(n, np.int64)  # the limit at which a corner and the next one were tried in vain

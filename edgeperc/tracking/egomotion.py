@@ -29,33 +29,19 @@ def fit_motion(
 ) -> int:
     """Fit the rigid motion that moves detections to the predicted positions of tracks.
 
-    Parameters
-    ----------
-    landmarks : (n, 4) float64
-        Predicted x, y [m] of tracks in the previous sensor frame, the variance of each coordinate [m2], and the group
-        of classes that may be confused.
-    detections : (m, 4) float64
-        The same columns, in the current sensor frame.
-    prior : (3,) float64
-        Expected motion: x, y [m] and turn [rad] of the sensor in its previous frame.
-    prior_variances : (3,) float64
-        [m2, m2, rad2]
-    motion : (3,) float64, overwritten
-        The fitted motion; the prior if no detection fits a track.
-    covariance : (3, 3) float64, overwritten
-        Covariance of ``motion``.
-
-    Returns
-    -------
-    n_pairs : int
-        Tracks that were matched to a detection.
-
-    Notes
-    -----
     Each pair of track and detection proposes a shift and a turn that move the detection to the track. Proposals within
     three standard deviations of the prior are tried, at most 256. A Gauss-Newton iteration starts from the proposal
     with the largest `support`. It matches each track to its nearest detection, with Geman and McClure's weight
     1 / (1 + r2 / 9)^2, where r is the distance in standard deviations.
+
+    landmarks : (n, 4) float64; predicted x, y [m] of tracks in the previous sensor frame, the variance of each
+        coordinate [m2], and the group of classes that may be confused.
+    detections : (m, 4) float64; the same columns, in the current sensor frame.
+    prior : (3,) float64; expected motion: x, y [m] and turn [rad] of the sensor in its previous frame.
+    prior_variances : (3,) float64; [m2, m2, rad2]
+    motion : (3,) float64, overwritten; the fitted motion; the prior if no detection fits a track.
+    covariance : (3, 3) float64, overwritten; covariance of ``motion``.
+    Returns n_pairs: Tracks that were matched to a detection.
     """
     # Element by element: to copy an array, numba compiles a broadcast with its error messages, for 3 s.
     for a in range(3):

@@ -34,13 +34,8 @@ from .files import N_FOLDS
 class DrawnScene:
     """A scene with a drawn road.
 
-    Attributes
-    ----------
-    fold : int
-    road : list
-        COCO segmentations of the drawn road.
-    inputs : str
-        Key of the scene's input files, from `edgeperc_export.database.scenes.inputs_of`.
+    road : COCO segmentations of the drawn road.
+    inputs : key of the scene's input files, from `edgeperc_export.database.scenes.inputs_of`.
     """
 
     fold: int

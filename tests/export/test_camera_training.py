@@ -33,7 +33,7 @@ from edgeperc_export.networks.segnet import VGG_16, SegNet, unpool
 from edgeperc_export.networks.unet import UNet
 from edgeperc_export.recipe import MODELS, PAPER, Recipe
 from edgeperc_export.release.agree import agree
-from edgeperc_export.release.quantize import calibration_images, quantize
+from edgeperc_export.release.quantize import Calibration, LabeledSets, calibration_images, quantize
 from edgeperc_export.release.to_onnx import export, load, to_graph, verify
 from edgeperc_export.training.camera import Camera, class_weights
 from edgeperc_export.training.camvid import (
@@ -500,9 +500,8 @@ def test_int8_of_a_camera(trained: tuple[Path, Path], drawn: Path, tmp_path: Pat
     card = quantize(
         trained[1],
         tmp_path / "int8.onnx",
-        scans=images,
-        hashes=hashes,
-        camvid=drawn,
+        Calibration(images, hashes),
+        LabeledSets(camvid=drawn),
         race=race,
         max_noise=9.0,
     )
