@@ -5,10 +5,10 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import Field, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 from edgeperc import __version__
 from edgeperc.cli.output import print_error, print_line
@@ -18,17 +18,42 @@ from edgeperc.errors import EdgepercError, MissingExtraError, ModelError
 from .database.cli import add_database_commands
 from .recipe import MODELS, NETWORKS, PAPER, TASKS, Recipe
 
+Commands: TypeAlias = "argparse._SubParsersAction[Any]"
 KITTI = "KITTI object set: a folder of training/velodyne, label_2, calib and of frames.csv"
-LAYOUTS = "folder of KITTI's label_2, calib and frames.csv: half of the simulated scenes get their boxes"
-SEMANTICKITTI = "root folder of SemanticKITTI, to evaluate the drivable area"
-FOLD = "fold of the training drives (0, 1 or 2) to validate on instead of training on it"
-THREADS = "number of CPU threads (default: one for each core)"
-COMPILE = "run the network through torch.compile, which needs a C++ compiler and a minute to start"
 CAMVID = "folder of CamVid: train, trainannot, val, valannot and classes.json"
-SCANS = "more real scans: FOLDER with a scans.json, or FOLDER:LAYOUT; may be repeated"
-WORKERS = "number of processes that make the training samples (default 1)"
-VERSION = "version to write into the card (default 1.0.0)"
 PROOF = "scan (or image) files on which torch and onnxruntime must agree, in addition to four simulated ones"
+
+# Options that several commands have.
+SHARED: Mapping[str, Mapping[str, Any]] = {
+    "--kitti": {"type": Path, "help": KITTI},
+    "--layouts": {
+        "type": Path,
+        "help": "folder of KITTI's label_2, calib and frames.csv: half of the simulated scenes get their boxes",
+    },
+    "--semantickitti": {"type": Path, "help": "root folder of SemanticKITTI, to evaluate the drivable area"},
+    "--camvid": {"type": Path, "help": CAMVID},
+    "--fold": {
+        "type": int,
+        "help": "fold of the training drives (0, 1 or 2) to validate on instead of training on it",
+    },
+    "--scans": {
+        "action": "append",
+        "default": [],
+        "metavar": "FOLDER[:LAYOUT]",
+        "help": "more real scans: FOLDER with a scans.json, or FOLDER:LAYOUT; may be repeated",
+    },
+    "--threads": {"type": int, "help": "number of CPU threads (default: one for each core)"},
+    "--workers": {
+        "type": int,
+        "default": 1,
+        "help": "number of processes that make the training samples (default 1)",
+    },
+    "--compile": {
+        "action": "store_true",
+        "help": "run the network through torch.compile, which needs a C++ compiler and a minute to start",
+    },
+    "--model-version": {"default": "1.0.0", "help": "version to write into the card (default 1.0.0)"},
+}
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -59,203 +84,15 @@ def build_parser() -> argparse.ArgumentParser:
     parser.set_defaults(extra="export")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
 
-    simulate = commands.add_parser("simulate", help="write simulated, labeled scans to train on")
-    simulate.add_argument("out", type=Path, help="folder for the scans; existing scans in it are kept")
-    simulate.add_argument("-n", type=int, default=1000, help="number of scans (default 1000)")
-    simulate.add_argument("--first", type=int, default=0, help="number of the first scan, and its seed (default 0)")
-    simulate.add_argument("--layouts", type=Path, help=LAYOUTS)
-    simulate.add_argument("--sensor", default="hdl-64e", help="sensor to simulate (default hdl-64e)")
-    simulate.add_argument(
-        "--workers", type=int, default=0, help="number of processes that simulate (default: this one)"
-    )
-    simulate.set_defaults(run=_simulate)
-
-    train = commands.add_parser("train", help="train a network, or resume a stopped training run")
-    train.add_argument("network", choices=NETWORKS, help="network to train")
-    train.add_argument("out", type=Path, help="folder for checkpoint.pt and log.jsonl; a checkpoint in it is resumed")
-    train.add_argument("--kitti", type=Path, help=KITTI)
-    train.add_argument("--scans", action="append", default=[], metavar="FOLDER[:LAYOUT]", help=SCANS)
-    train.add_argument("--simulated", type=Path, help="folder of scans written by edgeperc-export simulate")
-    train.add_argument("--camvid", type=Path, help=f"{CAMVID}; for networks of a camera")
-    train.add_argument("--fold", type=int, help=FOLD)
-    train.add_argument(
-        "--recipe",
-        choices=("ours", "paper"),
-        default="ours",
-        help=f"source of the options not given below: the defaults shown, or the network's paper ({', '.join(PAPER)})",
-    )
-    train.add_argument(
-        "--start-from", type=Path, help="checkpoint.pt, or fp32 model.onnx, whose weights the run starts from"
-    )
-    train.add_argument(
-        "--teacher",
-        type=Path,
-        help="checkpoint.pt or model.onnx of the network to distil from; with --distil 0, checkpoint.pt of one that "
-        "labels the unlabeled points",
-    )
-    train.add_argument("--threads", type=int, help=THREADS)
-    train.add_argument("--workers", type=int, default=1, help=WORKERS)
-    train.add_argument(
-        "--checkpoint-every",
-        type=int,
-        default=100,
-        metavar="STEPS",
-        help="steps between checkpoints, and between lines of log.jsonl (default 100)",
-    )
-    train.add_argument("--compile", action="store_true", help=COMPILE)
-    _add_recipe_options(train)
-    train.set_defaults(run=_train)
-
-    curve = commands.add_parser("curve", help="show the validation figures of training runs over the samples seen")
-    curve.add_argument("runs", type=Path, nargs="+", metavar="OUT", help="folder of a training run, with its log.jsonl")
-    curve.add_argument("--lines", type=int, default=12, help="at most this many lines for each run (default 12)")
-    curve.set_defaults(run=_curve)
-
-    export = commands.add_parser("export", help="write a checkpoint as an .onnx model with a card")
-    export.add_argument("checkpoint", type=Path, help="checkpoint.pt of a training run")
-    export.add_argument("out", type=Path, help=".onnx file to write; not written if torch and onnxruntime disagree")
-    export.add_argument("--scans", type=Path, nargs="*", default=[], help=PROOF)
-    export.add_argument("--kitti", type=Path, help=f"{KITTI}; the card describes its scans, for the check of inputs")
-    export.add_argument("--metrics", type=Path, help="JSON file of edgeperc eval --json, to write into the card")
-    export.add_argument("--name", help="name of the model (default: the network's)")
-    export.add_argument("--model-version", default="1.0.0", help=VERSION)
-    export.add_argument(
-        "--licence",
-        default="Apache-2.0",
-        help="license of weights trained on simulation alone (default Apache-2.0); KITTI's applies to all others",
-    )
-    export.set_defaults(run=_export)
-
-    verify = commands.add_parser("verify", help="compare an .onnx model with its checkpoint")
-    verify.add_argument("checkpoint", type=Path, help="checkpoint.pt that the model was exported from")
-    verify.add_argument("model", type=Path, help=".onnx file")
-    verify.add_argument("--scans", type=Path, nargs="*", default=[], help=PROOF)
-    verify.set_defaults(run=_verify)
-
-    card = commands.add_parser(
-        "card", help="add a card to an .onnx network made elsewhere, so that edgeperc can run it"
-    )
-    card.add_argument("model", type=Path, help=".onnx file of the network")
-    card.add_argument("card", type=Path, help="JSON file of the card; edgeperc info MODEL --json prints one to edit")
-    card.add_argument("out", type=Path, help=".onnx file to write")
-    card.set_defaults(run=_card)
-
-    quantize = commands.add_parser(
-        "quantize", help="make an int8 model, if it is faster on this computer and as accurate"
-    )
-    quantize.add_argument("model", type=Path, help=".onnx file of the fp32 model")
-    quantize.add_argument("out", type=Path, help=".onnx file to write")
-    quantize.add_argument(
-        "--scans", type=Path, nargs="*", default=[], help="scans, or folders of .bin, to calibrate on"
-    )
-    quantize.add_argument(
-        "--kitti", type=Path, help=f"{KITTI}; calibrates on training drives, compares on validation drives"
-    )
-    quantize.add_argument(
-        "--simulated", type=int, default=64, metavar="N", help="simulated scans to calibrate on (default 64)"
-    )
-    quantize.add_argument("--semantickitti", type=Path, help=SEMANTICKITTI)
-    quantize.add_argument(
-        "--camvid", type=Path, help=f"{CAMVID}; for a camera's model: calibrates on training images, not on scans"
-    )
-    quantize.add_argument(
-        "--seven-bits",
-        action="store_true",
-        default=None,
-        help="use 7-bit weights, which x86 without VNNI needs (default: if this computer needs them)",
-    )
-    quantize.add_argument(
-        "--evaluate-on",
-        type=int,
-        default=48,
-        metavar="N",
-        help="simulated scans to evaluate both models on (default 48)",
-    )
-    quantize.add_argument("--exclude", nargs="*", default=[], metavar="NODE", help="graph nodes to keep in fp32")
-    quantize.add_argument(
-        "--threads", type=int, help="number of CPU threads for timing (default: onnxruntime's choice)"
-    )
-    quantize.set_defaults(run=_quantize)
-
-    agree = commands.add_parser("agree", help="compare bf16 and int8 with fp32, and write the agreement into the cards")
-    agree.add_argument("models", nargs="+", metavar="MODEL", help="a network's name, or its files, one of them in fp32")
-    agree.add_argument("--kitti", type=Path, help="root of a KITTI object set")
-    agree.add_argument("--semantickitti", type=Path, help="root of SemanticKITTI, for the road")
-    agree.add_argument("--camvid", type=Path, help=f"{CAMVID}; for a network of a camera")
-    agree.add_argument("--split", default="validation", help="drives of the KITTI set, or images (default: validation)")
-    agree.add_argument("--scans", type=int, metavar="N", help="at most N scans of each set (default: all)")
-    agree.set_defaults(run=_agree)
-
-    make = commands.add_parser("make", help="make a shipped model from scratch: simulate, train, export, evaluate")
-    shipped = sorted(name for name in MODELS if not name.endswith("-start"))
-    make.add_argument(
-        "name",
-        choices=shipped,
-        help="model to make; the models that it starts from or is distilled from are made first",
-    )
-    make.add_argument("out", type=Path, help="folder for scans, checkpoints and models; finished ones in it are kept")
-    make.add_argument("--kitti", type=Path, help=KITTI)
-    make.add_argument("--layouts", type=Path, help=LAYOUTS)
-    make.add_argument("--semantickitti", type=Path, help=SEMANTICKITTI)
-    make.add_argument("--camvid", type=Path, help=f"{CAMVID}; for camseg")
-    make.add_argument("--fold", type=int, help=FOLD)
-    make.add_argument("--scans", action="append", default=[], metavar="FOLDER[:LAYOUT]", help=SCANS)
-    make.add_argument("--steps", type=int, help="training steps (default: as many as for the shipped model)")
-    make.add_argument("--threads", type=int, help=THREADS)
-    make.add_argument("--workers", type=int, default=1, help=WORKERS)
-    make.add_argument("--compile", action="store_true", help=COMPILE)
-    make.add_argument("--model-version", default="1.0.0", help=VERSION)
-    make.set_defaults(run=_make)
-
-    ablate = commands.add_parser(
-        "ablate", help="measure the effect of each part of the training on a fold, or compare networks on CamVid"
-    )
-    ablate.add_argument(
-        "network",
-        choices=["ssadnet", "pointseg", "lodnn", "camvid"],
-        help="network whose variants are trained, or camvid: eleven networks under one budget",
-    )
-    ablate.add_argument("out", type=Path, help="folder for the runs and their figures; finished runs in it are kept")
-    scans = ablate.add_argument_group("variants of a network")
-    scans.add_argument("--kitti", type=Path, help=KITTI)
-    scans.add_argument("--simulated", type=Path, help="folder of scans from edgeperc-export simulate")
-    scans.add_argument("--start-from", type=Path, help="checkpoint.pt of NETWORK-sim; lodnn starts from random weights")
-    scans.add_argument("--fold", type=int, default=0, help="fold of the training drives to evaluate on (default 0)")
-    scans.add_argument("--steps", type=int, default=150, help="training steps of each run (default 150)")
-    scans.add_argument("--plot", type=Path, metavar="PNG", help="also draw the results (lodnn only)")
-    images = ablate.add_argument_group("networks on CamVid")
-    images.add_argument("--camvid", type=Path, help=CAMVID)
-    images.add_argument(
-        "--size", type=_size, default=(120, 90), metavar="WxH", help="size of the images (default 120x90)"
-    )
-    images.add_argument("--epochs", type=int, default=10, help="how often each image is trained on (default 10)")
-    images.add_argument("--batch", type=int, default=8, help="images in each step (default 8)")
-    images.add_argument("--learning-rate", type=float, help="learning rate (default 3e-4)")
-    images.add_argument("--no-plots", action="store_true", help="write the table alone, without matplotlib")
-    images.add_argument("--compile", action="store_true", help=COMPILE)
-    ablate.add_argument(
-        "--variant", action="append", default=[], help="run this variant, or network, only; may be repeated"
-    )
-    ablate.add_argument("--threads", type=int, help=THREADS)
-    ablate.set_defaults(run=_ablate)
-
-    add_database_commands(commands)
-
-    triton = commands.add_parser("triton", help="write a model repository for NVIDIA's Triton Inference Server")
-    triton.add_argument("out", type=Path, help="folder of the repository; models of the same names are replaced")
-    triton.add_argument(
-        "--model",
-        action="append",
-        metavar="MODEL",
-        help="name or file of a network of scans; may be repeated (default: ssadnet and pointseg)",
-    )
-    triton.add_argument("--sensor", default="hdl-64e", help="sensor of the scans (default hdl-64e)")
-    triton.set_defaults(run=_triton)
-
-    models = commands.add_parser("models", help="write MODELS.md from the cards of a folder's models")
-    models.add_argument("folder", type=Path, help="folder of .onnx models")
-    models.set_defaults(run=_models)
+    before = _add_simulate, _add_train, _add_curve, _add_export, _add_verify, _add_card, _add_quantize, _add_agree
+    for add in (*before, _add_make, _add_ablate, add_database_commands, _add_triton, _add_models):
+        add(commands)
     return parser
+
+
+def _add_shared(parser: argparse._ActionsContainer, *options: str) -> None:
+    for option in options:
+        parser.add_argument(option, **SHARED[option])
 
 
 # --- recipes ----------------------------------------------------------------------------------------------------------
@@ -319,6 +156,19 @@ def _recipe(args: argparse.Namespace) -> Recipe:
 # --- commands ---------------------------------------------------------------------------------------------------------
 
 
+def _add_simulate(commands: Commands) -> None:
+    simulate = commands.add_parser("simulate", help="write simulated, labeled scans to train on")
+    simulate.add_argument("out", type=Path, help="folder for the scans; existing scans in it are kept")
+    simulate.add_argument("-n", type=int, default=1000, help="number of scans (default 1000)")
+    simulate.add_argument("--first", type=int, default=0, help="number of the first scan, and its seed (default 0)")
+    _add_shared(simulate, "--layouts")
+    simulate.add_argument("--sensor", default="hdl-64e", help="sensor to simulate (default hdl-64e)")
+    simulate.add_argument(
+        "--workers", type=int, default=0, help="number of processes that simulate (default: this one)"
+    )
+    simulate.set_defaults(run=_simulate)
+
+
 def _simulate(args: argparse.Namespace) -> int:
     from .data.simulate import simulate
 
@@ -326,29 +176,60 @@ def _simulate(args: argparse.Namespace) -> int:
     return 0
 
 
+def _add_train(commands: Commands) -> None:
+    train = commands.add_parser("train", help="train a network, or resume a stopped training run")
+    train.add_argument("network", choices=NETWORKS, help="network to train")
+    train.add_argument("out", type=Path, help="folder for checkpoint.pt and log.jsonl; a checkpoint in it is resumed")
+    _add_shared(train, "--kitti", "--scans")
+    train.add_argument("--simulated", type=Path, help="folder of scans written by edgeperc-export simulate")
+    train.add_argument("--camvid", type=Path, help=f"{CAMVID}; for networks of a camera")
+    _add_shared(train, "--fold")
+    train.add_argument(
+        "--recipe",
+        choices=("ours", "paper"),
+        default="ours",
+        help=f"source of the options not given below: the defaults shown, or the network's paper ({', '.join(PAPER)})",
+    )
+    train.add_argument(
+        "--start-from", type=Path, help="checkpoint.pt, or fp32 model.onnx, whose weights the run starts from"
+    )
+    train.add_argument(
+        "--teacher",
+        type=Path,
+        help="checkpoint.pt or model.onnx of the network to distil from; with --distil 0, checkpoint.pt of one that "
+        "labels the unlabeled points",
+    )
+    _add_shared(train, "--threads", "--workers")
+    train.add_argument(
+        "--checkpoint-every",
+        type=int,
+        default=100,
+        metavar="STEPS",
+        help="steps between checkpoints, and between lines of log.jsonl (default 100)",
+    )
+    _add_shared(train, "--compile")
+    _add_recipe_options(train)
+    train.set_defaults(run=_train)
+
+
 def _train(args: argparse.Namespace) -> int:
     recipe = _recipe(args)
     from edgeperc.datasets.scan_folder import ScanFolder
 
-    from .training.train import train
+    from .training.train import Data, Run, train
 
-    checkpoint = train(
-        recipe,
-        args.out,
-        kitti=args.kitti,
-        scan_sets=[ScanFolder.parse(text) for text in args.scans],
-        simulated=args.simulated,
-        camvid=args.camvid,
-        fold=args.fold,
-        start_from=args.start_from,
-        teacher=args.teacher,
-        n_threads=args.threads,
-        n_workers=args.workers,
-        compiled=args.compile,
-        checkpoint_every=args.checkpoint_every,
-    )
-    print_line(str(checkpoint))
+    scan_sets = [ScanFolder.parse(text) for text in args.scans]
+    data = Data(args.kitti, args.simulated, args.camvid, scan_sets, fold=args.fold)
+    run = Run(args.start_from, args.teacher, args.threads, args.workers, args.compile, args.checkpoint_every)
+    print_line(str(train(recipe, args.out, data, run)))
     return 0
+
+
+def _add_curve(commands: Commands) -> None:
+    curve = commands.add_parser("curve", help="show the validation figures of training runs over the samples seen")
+    curve.add_argument("runs", type=Path, nargs="+", metavar="OUT", help="folder of a training run, with its log.jsonl")
+    curve.add_argument("--lines", type=int, default=12, help="at most this many lines for each run (default 12)")
+    curve.set_defaults(run=_curve)
 
 
 def _curve(args: argparse.Namespace) -> int:
@@ -358,6 +239,23 @@ def _curve(args: argparse.Namespace) -> int:
         for line in curve_table(run, args.lines):
             print_line(line)
     return 0
+
+
+def _add_export(commands: Commands) -> None:
+    export = commands.add_parser("export", help="write a checkpoint as an .onnx model with a card")
+    export.add_argument("checkpoint", type=Path, help="checkpoint.pt of a training run")
+    export.add_argument("out", type=Path, help=".onnx file to write; not written if torch and onnxruntime disagree")
+    export.add_argument("--scans", type=Path, nargs="*", default=[], help=PROOF)
+    export.add_argument("--kitti", type=Path, help=f"{KITTI}; the card describes its scans, for the check of inputs")
+    export.add_argument("--metrics", type=Path, help="JSON file of edgeperc eval --json, to write into the card")
+    export.add_argument("--name", help="name of the model (default: the network's)")
+    _add_shared(export, "--model-version")
+    export.add_argument(
+        "--licence",
+        default="Apache-2.0",
+        help="license of weights trained on simulation alone (default Apache-2.0); KITTI's applies to all others",
+    )
+    export.set_defaults(run=_export)
 
 
 def _export(args: argparse.Namespace) -> int:
@@ -381,6 +279,14 @@ def _export(args: argparse.Namespace) -> int:
     return 0
 
 
+def _add_verify(commands: Commands) -> None:
+    verify = commands.add_parser("verify", help="compare an .onnx model with its checkpoint")
+    verify.add_argument("checkpoint", type=Path, help="checkpoint.pt that the model was exported from")
+    verify.add_argument("model", type=Path, help=".onnx file")
+    verify.add_argument("--scans", type=Path, nargs="*", default=[], help=PROOF)
+    verify.set_defaults(run=_verify)
+
+
 def _verify(args: argparse.Namespace) -> int:
     from .data.simulate import parity_images, parity_scans
     from .release.to_onnx import load, verify
@@ -389,6 +295,16 @@ def _verify(args: argparse.Namespace) -> int:
     samples = parity_images(args.scans) if recipe.task == "camera" else parity_scans(args.scans)
     print_line(json.dumps(verify(network, args.model, samples)))
     return 0
+
+
+def _add_card(commands: Commands) -> None:
+    card = commands.add_parser(
+        "card", help="add a card to an .onnx network made elsewhere, so that edgeperc can run it"
+    )
+    card.add_argument("model", type=Path, help=".onnx file of the network")
+    card.add_argument("card", type=Path, help="JSON file of the card; edgeperc info MODEL --json prints one to edit")
+    card.add_argument("out", type=Path, help=".onnx file to write")
+    card.set_defaults(run=_card)
 
 
 def _card(args: argparse.Namespace) -> int:
@@ -409,25 +325,59 @@ def _card(args: argparse.Namespace) -> int:
     return 0
 
 
-def _quantize(args: argparse.Namespace) -> int:
-    from .release.quantize import calibration_images, calibration_scans, quantize
+def _add_quantize(commands: Commands) -> None:
+    quantize = commands.add_parser(
+        "quantize", help="make an int8 model, if it is faster on this computer and as accurate"
+    )
+    quantize.add_argument("model", type=Path, help=".onnx file of the fp32 model")
+    quantize.add_argument("out", type=Path, help=".onnx file to write")
+    quantize.add_argument(
+        "--scans", type=Path, nargs="*", default=[], help="scans, or folders of .bin, to calibrate on"
+    )
+    quantize.add_argument(
+        "--kitti", type=Path, help=f"{KITTI}; calibrates on training drives, compares on validation drives"
+    )
+    quantize.add_argument(
+        "--simulated", type=int, default=64, metavar="N", help="simulated scans to calibrate on (default 64)"
+    )
+    _add_shared(quantize, "--semantickitti")
+    quantize.add_argument(
+        "--camvid", type=Path, help=f"{CAMVID}; for a camera's model: calibrates on training images, not on scans"
+    )
+    quantize.add_argument(
+        "--seven-bits",
+        action="store_true",
+        default=None,
+        help="use 7-bit weights, which x86 without VNNI needs (default: if this computer needs them)",
+    )
+    quantize.add_argument(
+        "--evaluate-on",
+        type=int,
+        default=48,
+        metavar="N",
+        help="simulated scans to evaluate both models on (default 48)",
+    )
+    quantize.add_argument("--exclude", nargs="*", default=[], metavar="NODE", help="graph nodes to keep in fp32")
+    quantize.add_argument(
+        "--threads", type=int, help="number of CPU threads for timing (default: onnxruntime's choice)"
+    )
+    quantize.set_defaults(run=_quantize)
 
-    scans: Sequence[Any]
+
+def _quantize(args: argparse.Namespace) -> int:
+    from .release.quantize import LabeledSets, calibration_images, calibration_scans, quantize
+
     if args.camvid is not None:
-        scans, hashes = calibration_images(args.camvid)
+        calibration = calibration_images(args.camvid)
     else:
-        scans, hashes = calibration_scans(args.scans, kitti=args.kitti, n_simulated=args.simulated)
+        calibration = calibration_scans(args.scans, kitti=args.kitti, n_simulated=args.simulated)
     card = quantize(
         args.model,
         args.out,
-        scans=scans,
-        hashes=hashes,
-        kitti=args.kitti,
-        semantickitti=args.semantickitti,
-        camvid=args.camvid,
+        calibration,
+        LabeledSets(args.kitti, args.semantickitti, args.camvid, args.evaluate_on),
         exclude=args.exclude,
         seven_bits=args.seven_bits,
-        n_evaluated=args.evaluate_on,
         n_threads=args.threads,
     )
     print_line(
@@ -438,6 +388,17 @@ def _quantize(args: argparse.Namespace) -> int:
         f"precision auto takes the model only if it agrees with fp32: edgeperc-export agree {args.model} {args.out}"
     )
     return 0
+
+
+def _add_agree(commands: Commands) -> None:
+    agree = commands.add_parser("agree", help="compare bf16 and int8 with fp32, and write the agreement into the cards")
+    agree.add_argument("models", nargs="+", metavar="MODEL", help="a network's name, or its files, one of them in fp32")
+    agree.add_argument("--kitti", type=Path, help="root of a KITTI object set")
+    agree.add_argument("--semantickitti", type=Path, help="root of SemanticKITTI, for the road")
+    agree.add_argument("--camvid", type=Path, help=f"{CAMVID}; for a network of a camera")
+    agree.add_argument("--split", default="validation", help="drives of the KITTI set, or images (default: validation)")
+    agree.add_argument("--scans", type=int, metavar="N", help="at most N scans of each set (default: all)")
+    agree.set_defaults(run=_agree)
 
 
 def _agree(args: argparse.Namespace) -> int:
@@ -458,34 +419,83 @@ def _agree(args: argparse.Namespace) -> int:
     return 0
 
 
+def _add_make(commands: Commands) -> None:
+    make = commands.add_parser("make", help="make a shipped model from scratch: simulate, train, export, evaluate")
+    shipped = sorted(name for name in MODELS if not name.endswith("-start"))
+    make.add_argument(
+        "name",
+        choices=shipped,
+        help="model to make; the models that it starts from or is distilled from are made first",
+    )
+    make.add_argument("out", type=Path, help="folder for scans, checkpoints and models; finished ones in it are kept")
+    _add_shared(make, "--kitti", "--layouts", "--semantickitti")
+    make.add_argument("--camvid", type=Path, help=f"{CAMVID}; for camseg")
+    _add_shared(make, "--fold", "--scans")
+    make.add_argument("--steps", type=int, help="training steps (default: as many as for the shipped model)")
+    _add_shared(make, "--threads", "--workers", "--compile", "--model-version")
+    make.set_defaults(run=_make)
+
+
 def _make(args: argparse.Namespace) -> int:
     from edgeperc.datasets.scan_folder import ScanFolder
 
     from .make import make
+    from .training.train import Data, Run
 
+    scan_sets = [ScanFolder.parse(text) for text in args.scans]
     path = make(
         args.name,
         args.out,
-        kitti=args.kitti,
+        Data(args.kitti, camvid=args.camvid, scan_sets=scan_sets, fold=args.fold),
+        Run(n_threads=args.threads, n_workers=args.workers, compiled=args.compile),
         layouts=args.layouts,
         semantickitti=args.semantickitti,
-        camvid=args.camvid,
-        scan_sets=[ScanFolder.parse(text) for text in args.scans],
-        fold=args.fold,
         steps=args.steps,
-        n_threads=args.threads,
-        n_workers=args.workers,
-        compiled=args.compile,
         version=args.model_version,
     )
     print_line(str(path))
     return 0
 
 
+def _add_ablate(commands: Commands) -> None:
+    ablate = commands.add_parser(
+        "ablate", help="measure the effect of each part of the training on a fold, or compare networks on CamVid"
+    )
+    ablate.add_argument(
+        "network",
+        choices=["ssadnet", "pointseg", "lodnn", "camvid"],
+        help="network whose variants are trained, or camvid: eleven networks under one budget",
+    )
+    ablate.add_argument("out", type=Path, help="folder for the runs and their figures; finished runs in it are kept")
+    scans = ablate.add_argument_group("variants of a network")
+    _add_shared(scans, "--kitti")
+    scans.add_argument("--simulated", type=Path, help="folder of scans from edgeperc-export simulate")
+    scans.add_argument("--start-from", type=Path, help="checkpoint.pt of NETWORK-sim; lodnn starts from random weights")
+    scans.add_argument("--fold", type=int, default=0, help="fold of the training drives to evaluate on (default 0)")
+    scans.add_argument("--steps", type=int, default=150, help="training steps of each run (default 150)")
+    scans.add_argument("--plot", type=Path, metavar="PNG", help="also draw the results (lodnn only)")
+    images = ablate.add_argument_group("networks on CamVid")
+    _add_shared(images, "--camvid")
+    images.add_argument(
+        "--size", type=_size, default=(120, 90), metavar="WxH", help="size of the images (default 120x90)"
+    )
+    images.add_argument("--epochs", type=int, default=10, help="how often each image is trained on (default 10)")
+    images.add_argument("--batch", type=int, default=8, help="images in each step (default 8)")
+    images.add_argument("--learning-rate", type=float, help="learning rate (default 3e-4)")
+    images.add_argument("--no-plots", action="store_true", help="write the table alone, without matplotlib")
+    _add_shared(images, "--compile")
+    ablate.add_argument(
+        "--variant", action="append", default=[], help="run this variant, or network, only; may be repeated"
+    )
+    _add_shared(ablate, "--threads")
+    ablate.set_defaults(run=_ablate)
+
+
 def _ablate(args: argparse.Namespace) -> int:
     if args.network == "camvid":
         return _ablate_camvid(args)
     from .training.ablation import ablate, plot
+    from .training.train import Data, Run
 
     if args.kitti is None or args.simulated is None:
         raise ValueError(f"{args.network} is trained on real and simulated scans; give --kitti and --simulated")
@@ -494,13 +504,10 @@ def _ablate(args: argparse.Namespace) -> int:
     rows = ablate(
         args.network,
         args.out,
-        kitti=args.kitti,
-        simulated=args.simulated,
-        start_from=args.start_from,
-        fold=args.fold,
+        Data(args.kitti, args.simulated, fold=args.fold),
+        Run(args.start_from, n_threads=args.threads),
         steps=args.steps,
         variants=args.variant,
-        n_threads=args.threads,
     )
     for row in rows:
         print_line(f"{row['network']}, fold {row['fold']}, {row['steps']} steps, {row['variant']}: {row['figures']}")
@@ -545,6 +552,19 @@ def _ablate_camvid(args: argparse.Namespace) -> int:
     return 0
 
 
+def _add_triton(commands: Commands) -> None:
+    triton = commands.add_parser("triton", help="write a model repository for NVIDIA's Triton Inference Server")
+    triton.add_argument("out", type=Path, help="folder of the repository; models of the same names are replaced")
+    triton.add_argument(
+        "--model",
+        action="append",
+        metavar="MODEL",
+        help="name or file of a network of scans; may be repeated (default: ssadnet and pointseg)",
+    )
+    triton.add_argument("--sensor", default="hdl-64e", help="sensor of the scans (default hdl-64e)")
+    triton.set_defaults(run=_triton)
+
+
 def _triton(args: argparse.Namespace) -> int:
     from edgeperc.zoo import DEFAULT
 
@@ -553,6 +573,12 @@ def _triton(args: argparse.Namespace) -> int:
     for folder in write_repository(args.out, args.model or DEFAULT, sensor=args.sensor):
         print_line(str(folder))
     return 0
+
+
+def _add_models(commands: Commands) -> None:
+    models = commands.add_parser("models", help="write MODELS.md from the cards of a folder's models")
+    models.add_argument("folder", type=Path, help="folder of .onnx models")
+    models.set_defaults(run=_models)
 
 
 def _models(args: argparse.Namespace) -> int:

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import onnx
 
-from edgeperc.datasets.scan_folder import ScanFolder
 from edgeperc.evaluation.camvid import evaluate_images
 from edgeperc.evaluation.evaluate import evaluate
 from edgeperc.types.card import ModelCard
@@ -18,7 +16,7 @@ from edgeperc.types.card import ModelCard
 from .data.simulate import fitness_of, parity_images, parity_scans, simulate
 from .recipe import MODELS
 from .release.to_onnx import export, write_card
-from .training.train import train
+from .training.train import Data, Run, train
 
 N_SIMULATED = 2400
 SOURCES = {"real", "semantickitti", "simulated"}
@@ -31,83 +29,52 @@ ROAD_TRUTH = "ssadnet-sim"
 def make(
     name: str,
     out: Path,
+    data: Data,
+    run: Run,
     *,
-    kitti: Path | None,
-    layouts: Path | None,
+    layouts: Path | None = None,
     semantickitti: Path | None = None,
-    camvid: Path | None = None,
-    scan_sets: Sequence[ScanFolder] = (),
-    fold: int | None = None,
     steps: int | None = None,
-    n_threads: int | None = None,
-    n_workers: int = 0,
-    compiled: bool = False,
     version: str = "1.0.0",
 ) -> Path:
     """Simulate, train, export and evaluate a model. Finished parts are not made again.
 
     name : a key of `MODELS`. The models that it starts from or is distilled from are made first.
     out : folder for scans, checkpoints and models.
-    kitti, layouts, semantickitti : folders of a KITTI object set, of its labels and calibrations alone, and of
-        SemanticKITTI. Models whose name ends in ``-sim`` need none of them; ``kitti`` then serves for evaluation
-        only.
-    camvid : folder of CamVid, which the network of a camera is trained and evaluated on; it needs nothing else.
-    scan_sets : more real scans to train on.
-    fold : validate on this fold of the training drives, and do not train on it.
+    data : the real scans or images. Models whose name ends in ``-sim`` need none; ``kitti`` then serves for evaluation
+        only. Simulated scans are made.
+    layouts, semantickitti : folders of KITTI's labels and calibrations alone, and of SemanticKITTI.
     steps : number of training steps; by default the shipped model's.
-    compiled : as for `edgeperc_export.training.train.train`.
     version : version to write into the card.
     Returns: ``out/NAME.onnx``, with its figures in its card.
     Raises ValueError.
     """
     stage = MODELS[name]
     recipe = stage.recipe if steps is None else replace(stage.recipe, steps=steps)
+    fold, simulated_only = data.fold, stage.recipe.simulated_share == 1.0
     if recipe.task == "camera":
-        checkpoint = train(
-            recipe, out / name, kitti=None, simulated=None, camvid=camvid, n_threads=n_threads, compiled=compiled
-        )
-        finish(name, checkpoint, out / f"{name}.onnx", kitti=None, semantickitti=None, camvid=camvid, version=version)
-        return out / f"{name}.onnx"
-    simulated_only = stage.recipe.simulated_share == 1.0
-    if not simulated_only and (kitti is None or layouts is None):
-        raise ValueError(f"{name} is trained on real scans too; give --kitti and --layouts")
-    scans = out / ("scans" if simulated_only else "scans-with-layouts")
-    simulate(scans, N_SIMULATED, layouts_root=None if simulated_only else layouts, n_workers=n_workers)
+        data, fold = Data(camvid=data.camvid), None
+    else:
+        if not simulated_only and (data.kitti is None or layouts is None):
+            raise ValueError(f"{name} is trained on real scans too; give --kitti and --layouts")
+        scans = out / ("scans" if simulated_only else "scans-with-layouts")
+        simulate(scans, N_SIMULATED, layouts_root=None if simulated_only else layouts, n_workers=run.n_workers)
+        data = replace(data, simulated=scans)
 
-    def checkpoint_of(other: str) -> Path:
+    def checkpoint_of(other: str | None) -> Path | None:
+        if other is None:
+            return None
         # The models that this one starts from or is distilled from must not be trained on the fold either.
         own_fold = None if MODELS[other].recipe.simulated_share == 1.0 else fold
         base = out / f"{other}{_suffix(own_fold)}"
         if not base.with_suffix(".onnx").exists():
-            make(
-                other,
-                out,
-                kitti=kitti,
-                layouts=layouts,
-                scan_sets=scan_sets,
-                fold=own_fold,
-                n_threads=n_threads,
-                n_workers=n_workers,
-                compiled=compiled,
-                version=version,
-            )
+            make(other, out, replace(data, fold=own_fold), run, layouts=layouts, version=version)
         return base / "checkpoint.pt"
 
-    checkpoint = train(
-        recipe,
-        out / f"{name}{_suffix(fold)}",
-        kitti=kitti,
-        simulated=scans,
-        scan_sets=scan_sets,
-        fold=fold,
-        start_from=None if stage.after is None else checkpoint_of(stage.after),
-        teacher=None if stage.teacher is None else checkpoint_of(stage.teacher),
-        n_threads=n_threads,
-        n_workers=n_workers,
-        compiled=compiled,
-    )
+    run = replace(run, start_from=checkpoint_of(stage.after), teacher=checkpoint_of(stage.teacher))
     path = out / f"{name}{_suffix(fold)}.onnx"
-    finish(name, checkpoint, path, kitti=kitti, semantickitti=semantickitti, fold=fold, version=version)
+    checkpoint = train(recipe, path.with_suffix(""), data, run)
+    finish(name, checkpoint, path, data, semantickitti=semantickitti, version=version)
     return path
 
 
@@ -119,11 +86,9 @@ def finish(
     name: str,
     checkpoint: Path,
     path: Path,
+    data: Data,
     *,
-    kitti: Path | None,
-    semantickitti: Path | None,
-    camvid: Path | None = None,
-    fold: int | None = None,
+    semantickitti: Path | None = None,
     version: str = "1.0.0",
 ) -> None:
     """Export a checkpoint, evaluate the file, and write the figures into its card and a JSON file beside it.
@@ -131,13 +96,13 @@ def finish(
     name : a key of `MODELS`, and the name of the model.
     path : the .onnx file to write. The JSON file has the same name, but ends in .json. If ``ssadnet-sim.onnx`` is in
         the same folder, its road is the ground truth of KITTI's scans.
-    kitti, semantickitti, camvid, fold, version : as for `make`.
+    data, semantickitti, version : as for `make`.
     """
-    stage = MODELS[name]
+    stage, kitti, fold = MODELS[name], data.kitti, data.fold
     if stage.recipe.task == "camera":
-        assert camvid is not None
+        assert data.camvid is not None
         card = export(checkpoint, path, scans=parity_images([]), fitness=None, name=name, version=version)
-        figures = evaluate_images([camvid], path, split="validation")
+        figures = evaluate_images([data.camvid], path, split="validation")
         _write_figures(
             path, card, figures | {"command": f"edgeperc eval CAMVID --split validation --model {name}:fp32"}
         )

@@ -273,14 +273,10 @@ PAPER = {
 class Stage:
     """One training run on the way to a model.
 
-    Attributes
-    ----------
-    recipe : Recipe
-        With a ``simulated_share`` of 1 the run reads no real scan and no real layout, so no data license applies.
-    after : str or None
-        The model whose weights the run starts from.
-    teacher : str or None
-        The model that the run is distilled from.
+    recipe : with a ``simulated_share`` of 1 the run reads no real scan and no real layout, so no data license
+        applies.
+    after : the model whose weights the run starts from.
+    teacher : the model that the run is distilled from.
     """
 
     recipe: Recipe

@@ -43,7 +43,8 @@ FLOORS = {
         preprocess.__init__ preprocess.fitness preprocess.interpolation preprocess.returns
         preprocess.condition preprocess.ego preprocess.findings preprocess.motion preprocess.sensor_fit
         preprocess.remission
-        tracking.egomotion tracking.imm tracking.jpda tracking.lives tracking.ukf
+        tracking.imm tracking.jpda tracking.ukf
+        tracking.egomotion tracking.lives
         tracking.tracks
         tracking.tracker
         tracking.__init__

@@ -7,6 +7,7 @@ per operation and in one thread, so compiled code, interpreted code and any numb
 from __future__ import annotations
 
 import os
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -90,6 +91,21 @@ def _advice(shape: tuple[int, ...]) -> str:
     return ""
 
 
+class Taps(NamedTuple):
+    """The pixels of an image that count for each pixel of the output, along one axis."""
+
+    start: NDArray[np.int32]  # (n_out,), the first; ``start + K`` is at most the image's size
+    weights: NDArray[np.float32]  # (n_out, K), from there; their sum is 1, but for rounding
+
+
+class Channels(NamedTuple):
+    """The channels of a network's input, and what they are normalized by."""
+
+    source: NDArray[np.int32]  # (C,): 0 red, 1 green, 2 blue
+    mean: NDArray[np.float32]  # (C,)
+    std: NDArray[np.float32]  # (C,)
+
+
 class ImageScaler:
     """Scale images of any size to a network's input, and normalize them.
 
@@ -106,8 +122,8 @@ class ImageScaler:
 
     def __init__(self, view: CameraGeometry, input: InputSpec) -> None:
         self.shape = (len(input.channels), view.height, view.width)
-        self._channels = np.array([CHANNELS["camera"].index(name) for name in input.channels], np.int32)
-        self._mean, self._std = np.array(input.mean, np.float32), np.array(input.std, np.float32)
+        source = np.array([CHANNELS["camera"].index(name) for name in input.channels], np.int32)
+        self._channels = Channels(source, np.array(input.mean, np.float32), np.array(input.std, np.float32))
         self._tables_of: tuple[int, int] | None = None
 
     def fill(self, image: NDArray[np.uint8], out: NDArray[np.float32]) -> None:
@@ -122,17 +138,12 @@ class ImageScaler:
             raise ImageError(f"the buffer is {out.shape} {out.dtype}; expected {self.shape} float32, C-contiguous")
         rows, columns, _ = image.shape
         if self._tables_of != (rows, columns):
-            self._tables = (*_taps(rows, self.shape[1]), *_taps(columns, self.shape[2]))
+            self._tables = _taps(rows, self.shape[1]), _taps(columns, self.shape[2])
             self._tables_of = (rows, columns)
-        fill_scaled(image.reshape(rows, -1), *self._tables, self._channels, self._mean, self._std, out)
+        fill_scaled(image.reshape(rows, -1), *self._tables, self._channels, out)
 
 
-def _taps(n_in: int, n_out: int) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
-    """For each pixel of the output along one axis: the first pixel of the image that counts, and K weights from there.
-
-    Returns start ((n_out,) int32): ``start + K`` is at most ``n_in``.
-    Returns weights ((n_out, K) float32): Their sum is 1, but for rounding.
-    """
+def _taps(n_in: int, n_out: int) -> Taps:
     scale = n_in / n_out
     reach = max(scale, 1.0)
     center = (np.arange(n_out) + 0.5) * scale - 0.5
@@ -146,30 +157,20 @@ def _taps(n_in: int, n_out: int) -> tuple[NDArray[np.int32], NDArray[np.float32]
     columns = start[:, None] + np.arange(n_taps) - at[:, :1]
     inside = (columns >= 0) & (columns < at.shape[1])
     kept = np.where(inside, np.take_along_axis(weights, np.where(inside, columns, 0), axis=1), 0.0)
-    return start.astype(np.int32), (kept / kept.sum(axis=1, keepdims=True)).astype(np.float32)
+    return Taps(start.astype(np.int32), (kept / kept.sum(axis=1, keepdims=True)).astype(np.float32))
 
 
 @njit(cache=True, nogil=True)
 def fill_scaled(
-    image: NDArray[np.uint8],
-    row_start: NDArray[np.int32],
-    row_weights: NDArray[np.float32],
-    col_start: NDArray[np.int32],
-    col_weights: NDArray[np.float32],
-    channels: NDArray[np.int32],
-    mean: NDArray[np.float32],
-    std: NDArray[np.float32],
-    out: NDArray[np.float32],
+    image: NDArray[np.uint8], rows: Taps, columns: Taps, channels: Channels, out: NDArray[np.float32]
 ) -> None:
     """Scale and normalize an image: for each row of the output, first along columns, then along rows.
 
     image : (H, 3 * W) uint8, C-contiguous; red, green, blue of each pixel.
-    row_start, col_start : (h,), (w,) int32; first row and column of the image that count for each of the output.
-    row_weights, col_weights : (h, K), (w, L) float32; weights from there.
-    channels : (C,) int32; 0 red, 1 green, 2 blue.
-    mean, std : (C,) float32
     out : (C, h, w) float32, overwritten
     """
+    row_start, row_weights = rows
+    col_start, col_weights = columns
     n_values = image.shape[1]
     n_channels, height, width = out.shape
     n_rows, n_columns = row_weights.shape[1], col_weights.shape[1]
@@ -184,8 +185,8 @@ def fill_scaled(
             for k in range(n_values):
                 mixed[k] += weight * np.float32(image[first + tap, k])
         for c in range(n_channels):
-            channel = channels[c]
-            center, spread = mean[c], std[c]
+            channel = channels.source[c]
+            center, spread = channels.mean[c], channels.std[c]
             for col in range(width):
                 at = 3 * col_start[col] + channel
                 value = col_weights[col, 0] * mixed[at]

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import os
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,6 +39,31 @@ MAX_HALF_RAD = math.radians(1.5)  # 2.5 degrees for a VLP-16 would leave 86 % of
 # Windows are measured in cells of the depth buffer, which are so large that most windows reach 6 cells to each side.
 USUAL_CELLS, MAX_CELLS = 6, 24
 ABOVE_M = 100.0
+
+
+class Pixels(NamedTuple):
+    """Where points fall in an image (`Calibration.project`)."""
+
+    u: NDArray[np.float64]  # (n,) [px]
+    v: NDArray[np.float64]  # (n,) [px]
+    depth: NDArray[np.float64]  # (n,) [m]
+
+
+class Windows(NamedTuple):
+    """Half-sizes of a point's window [px], if the point is as far from the camera as from the sensor."""
+
+    between: NDArray[np.float64]  # (beams - 1,), tangent of the elevation between each two beams, from the top
+    up: NDArray[np.float64]  # (beams,)
+    down: NDArray[np.float64]  # (beams,)
+    side: float
+
+
+class DepthBuffer(NamedTuple):
+    """Depth of the nearest point whose window covers each cell of an image."""
+
+    nearest: NDArray[np.float32]  # (rows, columns) [m]; infinite where no window is
+    cell_h: int  # [px]
+    cell_w: int  # [px]
 
 
 def paint(
@@ -102,7 +127,7 @@ def paint(
     labels = _labels_of(found.labels if isinstance(found, ImageLabels) else found, np.uint8, calibration)
     rows, buffer, _ = _hidden_by(image, points, calibration, get_sensor(sensor), mounting)
     painted = np.empty(len(rows), np.uint8)
-    fill_painted(labels, *calibration.project(rows), *buffer, SLACK_M, SLACK_SHARE, painted)
+    fill_painted(labels, Pixels(*calibration.project(rows)), buffer, SLACK_M, SLACK_SHARE, painted)
     return painted
 
 
@@ -156,7 +181,7 @@ def camera_road(
     x, y = (each.ravel() for each in np.broadcast_arrays(*geometry.cell_centers()))
     _, buffer, cells = _hidden_by(image, points, calibration, get_sensor(sensor), mounting, np.column_stack([x, y]))
     labels = np.empty(x.size, np.uint8)
-    fill_painted(road, *calibration.project(cells), *buffer, SLACK_M, SLACK_SHARE, labels)
+    fill_painted(road, Pixels(*calibration.project(cells)), buffer, SLACK_M, SLACK_SHARE, labels)
     found = labels.reshape(geometry.height, geometry.width)
     observed = found != UNSEEN
     return TopView(
@@ -185,11 +210,11 @@ def _hidden_by(
     sensor: SensorProfile,
     mounting: Mounting | None,
     places: NDArray[np.float64] | None = None,
-) -> tuple[NDArray[np.float32], tuple[NDArray[np.float32], int, int], NDArray[np.float64]]:
+) -> tuple[NDArray[np.float32], DepthBuffer, NDArray[np.float64]]:
     """Find what stands on the ground, and the ground at ``places`` x, y (k, 2) in the frame of the models.
 
-    Returns the points, checked; the depth buffer of those above the ground and the size of its cells; and the places
-    (k, 3) on the ground, in the frame of the sensor, NaN if the scan shows no ground.
+    Returns the points, checked; the depth buffer of those above the ground; and the places (k, 3) on the ground, in the
+    frame of the sensor, NaN if the scan shows no ground.
     """
     if not isinstance(points, np.ndarray) or points.ndim != 2 or points.shape[1] < 3 or points.dtype.kind not in "fiu":
         raise PointsError(f"got {_described(points)} for points; expected an array (n, 3 or more): x, y, z")
@@ -207,7 +232,7 @@ def _hidden_by(
         ground = find_ground(np.concatenate([moved, cells]).astype(np.float32), mount_height_m=MODEL_HEIGHT_M)
     cells[:, 2] -= ground.height_m[len(rows) :] if ground.plane is not None else np.nan
     standing = read_only(rows[~ground.mask[: len(rows)]])
-    return rows, _nearest(standing, *calibration.project(standing), calibration, sensor), (cells - frame.t) @ frame.R
+    return rows, _nearest(standing, calibration, sensor), (cells - frame.t) @ frame.R
 
 
 def _labels_of(image: object, dtype: type, calibration: Calibration) -> NDArray[Any]:
@@ -240,15 +265,8 @@ def _road_of(image: Perception | ImageLabels | NDArray[np.bool_], calibration: C
     return np.where(labels == UNSEEN, np.uint8(UNSEEN), found.drivable.astype(np.uint8))
 
 
-def _nearest(
-    points: NDArray[np.float32],
-    u: NDArray[np.float64],
-    v: NDArray[np.float64],
-    depth: NDArray[np.float64],
-    calibration: Calibration,
-    sensor: SensorProfile,
-) -> tuple[NDArray[np.float32], int, int]:
-    """The depth buffer of a scan, and the size of its cells [px]: height, width."""
+def _nearest(points: NDArray[np.float32], calibration: Calibration, sensor: SensorProfile) -> DepthBuffer:
+    """The depth buffer of a scan."""
     elevations = np.radians(sensor.elevations_deg)
     step = 2.0 * math.pi / sensor.columns
     gaps = -np.diff(elevations) if len(elevations) > 1 else np.array([step])
@@ -259,38 +277,24 @@ def _nearest(
     f_x, f_y = float(calibration.K[0, 0]), float(calibration.K[1, 1])
     cell_h = math.ceil(max(half_up.max(), half_down.max()) * f_y / USUAL_CELLS)
     cell_w = math.ceil(half_side * f_x / USUAL_CELLS)
-    buffer = np.empty((-(-calibration.height // cell_h), -(-calibration.width // cell_w)), np.float32)
-    fill_nearest(points, u, v, depth, between, f_y * half_up, f_y * half_down, f_x * half_side, cell_h, cell_w, buffer)
-    return buffer, cell_h, cell_w
+    nearest = np.empty((-(-calibration.height // cell_h), -(-calibration.width // cell_w)), np.float32)
+    buffer = DepthBuffer(nearest, cell_h, cell_w)
+    windows = Windows(between, f_y * half_up, f_y * half_down, f_x * half_side)
+    fill_nearest(points, Pixels(*calibration.project(points)), windows, buffer)
+    return buffer
 
 
 @njit(cache=True, nogil=True)
-def fill_nearest(
-    points: NDArray[np.float32],
-    u: NDArray[np.float64],
-    v: NDArray[np.float64],
-    depth: NDArray[np.float64],
-    between: NDArray[np.float64],
-    half_up: NDArray[np.float64],
-    half_down: NDArray[np.float64],
-    half_side: float,
-    cell_h: int,
-    cell_w: int,
-    buffer: NDArray[np.float32],
-) -> None:
-    """Write the depth of the nearest point whose window covers each cell of an image.
+def fill_nearest(points: NDArray[np.float32], pixels: Pixels, windows: Windows, buffer: DepthBuffer) -> None:
+    """Write the depth of the nearest point whose window covers each cell into ``buffer.nearest``.
 
     points : (n, 3 or more) float32, C-contiguous
-    u, v, depth : (n,) float64; as `Calibration.project` returns them.
-    between : (beams - 1,) float64; tangent of the elevation between each two beams, from the top.
-    half_up, half_down : (beams,) float64; half-size of a window above and below its point [px], if the point is as
-        far from the camera as from the sensor.
-    half_side : half-size to the left and to the right [px].
-    cell_h, cell_w : size of a cell [px].
-    buffer : (rows, columns) float32, overwritten; [m]; infinite where no window is.
     """
-    buffer[:] = np.float32(math.inf)
-    rows, columns = buffer.shape
+    u, v, depth = pixels
+    between = windows.between
+    nearest, cell_h, cell_w = buffer
+    nearest[:] = np.float32(math.inf)
+    rows, columns = nearest.shape
     for i in range(points.shape[0]):
         d = depth[i]
         if not 0.0 < d < math.inf:
@@ -306,9 +310,9 @@ def fill_nearest(
                 high = middle
         apart = math.sqrt(level * level + z * z) / d
         # Windows of points far beside the image may be huge.
-        up = min(half_up[low] * apart, MAX_CELLS * cell_h)
-        down = min(half_down[low] * apart, MAX_CELLS * cell_h)
-        side = min(half_side * apart * level / d, MAX_CELLS * cell_w)
+        up = min(windows.up[low] * apart, MAX_CELLS * cell_h)
+        down = min(windows.down[low] * apart, MAX_CELLS * cell_h)
+        side = min(windows.side * apart * level / d, MAX_CELLS * cell_w)
         top, bottom = (v[i] + 0.5 - up) / cell_h, (v[i] + 0.5 + down) / cell_h
         left, right = (u[i] + 0.5 - side) / cell_w, (u[i] + 0.5 + side) / cell_w
         if not (top < rows and bottom >= 0.0 and left < columns and right >= 0.0):
@@ -316,19 +320,15 @@ def fill_nearest(
         near = np.float32(d)
         for row in range(int(max(top, 0.0)), min(int(bottom), rows - 1) + 1):
             for column in range(int(max(left, 0.0)), min(int(right), columns - 1) + 1):
-                if near < buffer[row, column]:
-                    buffer[row, column] = near
+                if near < nearest[row, column]:
+                    nearest[row, column] = near
 
 
 @njit(cache=True, nogil=True)
 def fill_painted(
     labels: NDArray[np.uint8],
-    u: NDArray[np.float64],
-    v: NDArray[np.float64],
-    depth: NDArray[np.float64],
-    buffer: NDArray[np.float32],
-    cell_h: int,
-    cell_w: int,
+    pixels: Pixels,
+    buffer: DepthBuffer,
     slack_m: float,
     slack_share: float,
     painted: NDArray[np.uint8],
@@ -336,12 +336,11 @@ def fill_painted(
     """Write the label of the pixel of each point that is not hidden, else `UNSEEN`.
 
     labels : (H, W) uint8, C-contiguous
-    u, v, depth : (n,) float64; as `Calibration.project` returns them.
-    buffer, cell_h, cell_w : from `fill_nearest`.
     slack_m, slack_share : a point is hidden if it is farther behind the nearest one than this [m], plus this share of
         its depth.
     painted : (n,) uint8, overwritten
     """
+    u, v, depth = pixels
     height, width = labels.shape
     for i in range(u.shape[0]):
         painted[i] = UNSEEN
@@ -349,6 +348,6 @@ def fill_painted(
             continue
         # The last float below half a pixel is rounded onto the next pixel.
         row, column = min(int(v[i] + 0.5), height - 1), min(int(u[i] + 0.5), width - 1)
-        near = np.float64(buffer[row // cell_h, column // cell_w])
+        near = np.float64(buffer.nearest[row // buffer.cell_h, column // buffer.cell_w])
         if depth[i] <= near + slack_m + slack_share * near:
             painted[i] = labels[row, column]

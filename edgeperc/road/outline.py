@@ -26,14 +26,10 @@ FARTHEST = 8
 class Outline:
     """The outline of connected cells. A cell's upper left corner has the cell's row and column.
 
-    Attributes
-    ----------
-    outer : (k, 2) int64
-        Row and column of the corners, with the cells on the left. Shape (0, 2) if there are no cells.
-    holes : tuple of (k, 2) int64
-        Likewise.
-    factor : float
-        No cell that is left out is farther than this many times the tolerance from the edges of the cells.
+    outer : (k, 2) int64; row and column of the corners, with the cells on the left. Shape (0, 2) if there are no
+        cells.
+    holes : tuple of (k, 2) int64; likewise.
+    factor : no cell that is left out is farther than this many times the tolerance from the edges of the cells.
     """
 
     outer: NDArray[np.int64]
@@ -52,34 +48,23 @@ def outline_of(
 ) -> Outline:
     """Outline the connected cells that are nearest to a place.
 
-    Parameters
-    ----------
-    cells : (rows, columns) bool
-    origin : tuple of 2 float
-        Row and column of the place, where a cell's middle has the cell's row and column. It may be outside the grid.
-    obstacles : (rows, columns) bool
-        Cells that are never included.
-    in_holes : (rows, columns) bool
-        A hole without such a cell is filled.
-    tolerance : float
-        Largest distance between the outline and the edges of the cells, in cells. 0 keeps all corners, however many.
-    max_corners : int
-        Largest number of corners of the outer ring, at least 4. If they do not suffice, cells are left out that are
-        farther from the edges; no more are added.
-
-    Returns
-    -------
-    Outline
-        A valid polygon: its rings neither touch nor cross themselves or one another, and the holes are inside.
-
-    Notes
-    -----
     Closing by a disc fills gaps narrower than twice the tolerance, opening removes what is as narrow. So cells that are
     connected only over a narrower passage are left out. Where two cells share only a corner, a cell between them is
     added, or else the one with the smaller row is left out. Corners are removed by growing area of their triangle
     (Visvalingam and Whyatt, 1993), as long as all cells that the triangle touches are within the tolerance. If more
     than ``max_corners`` remain, pairs of neighbors are replaced by one corner that may be anywhere on the grid, by
     growing area between the old edges and the new ones, under the same condition.
+
+    cells : (rows, columns) bool
+    origin : tuple of 2 float; row and column of the place, where a cell's middle has the cell's row and column. It
+        may be outside the grid.
+    obstacles : (rows, columns) bool; cells that are never included.
+    in_holes : (rows, columns) bool; a hole without such a cell is filled.
+    tolerance : largest distance between the outline and the edges of the cells, in cells. 0 keeps all corners,
+        however many.
+    max_corners : largest number of corners of the outer ring, at least 4. If they do not suffice, cells are left out
+        that are farther from the edges; no more are added.
+    Returns: A valid polygon: its rings neither touch nor cross themselves or one another, and the holes are inside.
     """
     # A kernel is compiled for arrays in C order.
     cells, obstacles, in_holes = (np.ascontiguousarray(mask, np.bool_) for mask in (cells, obstacles, in_holes))
@@ -378,34 +363,49 @@ def meet(ar: int, ac: int, br: int, bc: int, cr: int, cc: int, dr: int, dc: int)
 
 
 @njit(cache=True, nogil=True)
+def is_apart(ring: NDArray[np.int64], edges: NDArray[np.int64], k: int, pr: int, pc: int) -> bool:
+    """Whether a ring stays valid with a corner p in place of its corners k and k + 1 (`merge_corners`)."""
+    n = ring.shape[0]
+    before, following, behind = (k - 1) % n, (k + 1) % n, (k + 2) % n
+    ar, ac, dr, dc = ring[before, 0], ring[before, 1], ring[behind, 0], ring[behind, 1]
+    for v in range(n):
+        if v in (before, k, following):
+            continue
+        w = (v + 1) % n
+        vr, vc, wr, wc = ring[v, 0], ring[v, 1], ring[w, 0], ring[w, 1]
+        if w == before:  # has a in common with the edge ap
+            if turn(vr, vc, ar, ac, pr, pc) == 0 and (vr - ar) * (pr - ar) + (vc - ac) * (pc - ac) > 0:
+                return False
+        elif meet(ar, ac, pr, pc, vr, vc, wr, wc):
+            return False
+        if v == behind:  # has d in common with the edge pd
+            if turn(wr, wc, dr, dc, pr, pc) == 0 and (wr - dr) * (pr - dr) + (wc - dc) * (pc - dc) > 0:
+                return False
+        elif meet(pr, pc, dr, dc, vr, vc, wr, wc):
+            return False
+    for e in range(edges.shape[0]):
+        vr, vc, wr, wc = edges[e, 0], edges[e, 1], edges[e, 2], edges[e, 3]
+        if meet(ar, ac, pr, pc, vr, vc, wr, wc) or meet(pr, pc, dr, dc, vr, vc, wr, wc):
+            return False
+    return True
+
+
+@njit(cache=True, nogil=True)
 def merge_corners(
     ring: NDArray[np.int64], edges: NDArray[np.int64], fixed: NDArray[np.int32], around: int, enough: int
 ) -> int:
     """Replace two neighboring corners of a ring by one; smallest changes first.
 
-    Parameters
-    ----------
-    ring : (n, 2) int64, modified
-        Row and column of the corners of a ring that neither touches nor crosses itself.
-    edges : (m, 4) int64
-        Row and column of the two ends of other edges, which the ring may not touch.
-    fixed : (rows, columns + 1) int32
-        Number of cells of each row before each column that may not change sides.
-    around : int
-        How far the new corner may lie from the rectangle around the two [cells].
-    enough : int
-        The ring keeps at least so many corners, and at least 4.
-
-    Returns
-    -------
-    n_corners : int
-        The first so many rows of ``ring`` are the corners.
-
-    Notes
-    -----
     Between the neighbors a and d, the corner p replaces b and c. What changes sides lies in the triangles pab, pbc and
     pcd. No cell that they touch may be fixed, and of all such p, that with the smallest sum of their areas is taken.
     The new edges may meet no other edge, so the ring stays valid. Holes stay inside if none of their cells may change.
+
+    ring : (n, 2) int64, modified; row and column of the corners of a ring that neither touches nor crosses itself.
+    edges : (m, 4) int64; row and column of the two ends of other edges, which the ring may not touch.
+    fixed : (rows, columns + 1) int32; number of cells of each row before each column that may not change sides.
+    around : how far the new corner may lie from the rectangle around the two [cells].
+    enough : the ring keeps at least so many corners, and at least 4.
+    Returns n_corners: The first so many rows of ``ring`` are the corners.
     """
     n, height, width = ring.shape[0], fixed.shape[0], fixed.shape[1] - 1
     tried = np.empty(n, np.int64)  # the limit at which a corner and the next one were tried in vain
@@ -446,34 +446,7 @@ def merge_corners(
                         and may_change(pr, pc, cr, cc, dr, dc, fixed)
                     ):
                         continue
-                    apart = True
-                    for v in range(n):
-                        if v in (before, k, following):
-                            continue
-                        w = (v + 1) % n
-                        vr, vc, wr, wc = ring[v, 0], ring[v, 1], ring[w, 0], ring[w, 1]
-                        if w == before:  # has a in common with the edge ap
-                            back = (
-                                turn(vr, vc, ar, ac, pr, pc) == 0 and (vr - ar) * (pr - ar) + (vc - ac) * (pc - ac) > 0
-                            )
-                            apart = not back and not meet(pr, pc, dr, dc, vr, vc, wr, wc)
-                        elif v == behind:  # has d in common with the edge pd
-                            back = (
-                                turn(wr, wc, dr, dc, pr, pc) == 0 and (wr - dr) * (pr - dr) + (wc - dc) * (pc - dc) > 0
-                            )
-                            apart = not back and not meet(ar, ac, pr, pc, vr, vc, wr, wc)
-                        else:
-                            apart = not meet(ar, ac, pr, pc, vr, vc, wr, wc) and not meet(
-                                pr, pc, dr, dc, vr, vc, wr, wc
-                            )
-                        if not apart:
-                            break
-                    for e in range(edges.shape[0]):
-                        if not apart:
-                            break
-                        vr, vc, wr, wc = edges[e, 0], edges[e, 1], edges[e, 2], edges[e, 3]
-                        apart = not meet(ar, ac, pr, pc, vr, vc, wr, wc) and not meet(pr, pc, dr, dc, vr, vc, wr, wc)
-                    if apart:
+                    if is_apart(ring[:n], edges, k, pr, pc):
                         least, best_r, best_c = area, pr, pc
             if best_r < 0:
                 tried[k] = limit

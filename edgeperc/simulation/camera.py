@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..camera.calibration import Calibration
 from ..errors import CalibrationError
-from .raycast import FACADE, GLASS, LEAVES, PAINT, RETRO, fill_cast, fill_ground_kinds
+from .raycast import FACADE, GLASS, LEAVES, PAINT, RETRO, Hits, Rays, fill_cast, fill_ground_kinds
 from .scene import Scene, SimulatedScan, place_shapes
 from .street import CAMERA_CLASSES
 
@@ -113,33 +113,31 @@ def render(
     if not pose[2, 2] >= math.cos(math.radians(MOST_TILT_DEG)):
         raise CalibrationError(f"the camera is tilted by more than {MOST_TILT_DEG:g} degrees, which is not simulated")
     rng = np.random.default_rng((int(seed) & 0x7FFFFFFFFFFFFFFF, 15485863))
-    key = int(rng.integers(0, 2**63))
+    first_key = int(rng.integers(0, 2**63))
     width, height = calibration.width, calibration.height
     (f_x, _, c_x), (_, f_y, c_y), _ = calibration.K.tolist()
     azimuths = np.arctan((c_x - np.arange(width)) / f_x)
     slopes = (c_y - np.arange(height)) / f_y
-    primitives, bounds, starts, rows = place_shapes(scene, pose, _SECTORS, max_range_m)
+    shapes = place_shapes(scene, pose, _SECTORS, max_range_m)
     sectors = np.floor(azimuths / (2.0 * math.pi / _SECTORS)).astype(np.int64) % _SECTORS
 
     # Transposed: a column of the image has one azimuth, and elevations of its own.
     shape = (width, height, 1)
-    ranges, exits, cosines = np.empty(shape), np.empty(shape), np.empty(shape)
-    hits = np.empty(shape, dtype=np.int32)
+    found = Hits(np.empty(shape), np.empty(shape, np.int32), np.empty(shape), np.empty(shape))
     elevations = np.arctan(slopes * np.cos(azimuths)[:, None])
     for column, sector in enumerate(sectors.tolist()):
-        fill_cast(
-            primitives, bounds, starts[sector : sector + 2], rows, scene.strips, scene.terrain, scene.tile, pose,
-            elevations[column], azimuths[column : column + 1], max_range_m, np.uint64(key + column * height),
-            ranges[column], hits[column], exits[column], cosines[column],
-        )  # fmt: skip
-    ranges, cosines, hits = (np.ascontiguousarray(of[:, :, 0].T) for of in (ranges, cosines, hits))
+        key = np.uint64(first_key + column * height)
+        rays = Rays(elevations[column], azimuths[column : column + 1], max_range_m, key)
+        part = shapes._replace(starts=shapes.starts[sector : sector + 2])
+        fill_cast(part, scene.ground, pose, rays, Hits(*(of[column] for of in found)))
+    ranges, hits, _, cosines = (np.ascontiguousarray(of[:, :, 0].T) for of in found)
     elevations = elevations.T
     depth = np.where(hits == -2, np.inf, ranges * np.cos(elevations) * np.cos(azimuths))
 
     labels = np.full(hits.shape, _SKY, dtype=np.uint8)
     solid, ground = hits >= 0, hits == -1
     surfaces = np.full(hits.shape, -1, dtype=np.int64)
-    surfaces[solid] = primitives[hits[solid], 19].astype(np.int64)
+    surfaces[solid] = shapes.primitives[hits[solid], 19].astype(np.int64)
     labels[solid] = surface_classes(scene)[surfaces[solid]]
     row, col = np.nonzero(ground)
     places = np.stack([-np.tan(azimuths[col]), -slopes[row], np.ones(len(row))], axis=1) * depth[ground][:, None]
@@ -174,7 +172,7 @@ def _ground_at(
     """Kind and remission of the ground at places (n, 3) of a frame."""
     world = places.astype(np.float64) @ T_world_frame[:3, :3].T + T_world_frame[:3, 3]
     kinds, remissions = np.empty(len(world), np.uint8), np.empty(len(world))
-    fill_ground_kinds(scene.strips, scene.terrain, scene.tile, world[:, :2].copy(), kinds, remissions)
+    fill_ground_kinds(scene.ground, world[:, :2].copy(), kinds, remissions)
     return kinds, remissions
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,7 +31,59 @@ TILE = 256  # cells along each side of the noise tile; 0.3 m each
 _GROUND, _NOTHING = -1, -2  # hits that are not rows of primitives
 
 
-# --- kernels ----------------------------------------------------------------------------------------------------------
+class Ground(NamedTuple):
+    """The ground of a scene (`Scene`)."""
+
+    strips: NDArray[np.float64]  # (k, 10)
+    terrain: NDArray[np.float64]  # (27,)
+    tile: NDArray[np.float64]  # (256, 256)
+
+
+class Shapes(NamedTuple):
+    """Primitives in the sensor frame, nearest first, and those that the rays of each column may hit."""
+
+    primitives: NDArray[np.float64]  # (n, 20)
+    bounds: NDArray[np.float64]  # (n, 5), from `fill_bounds`
+    starts: NDArray[np.int64]  # (columns + 1,), where each column's list begins in `rows`
+    rows: NDArray[np.int32]  # rows of `primitives`
+
+
+class Rays(NamedTuple):
+    """The rays of a sensor at the origin: one for each beam and column."""
+
+    elevations: NDArray[np.float64]  # (beams,), top to bottom [rad]
+    azimuths: NDArray[np.float64]  # (columns,) [rad]
+    reach: float  # length [m]
+    key: np.uint64  # seed of all draws
+
+
+class Hits(NamedTuple):
+    """The first hit of each ray, (beams, columns)."""
+
+    ranges: NDArray[np.float64]  # [m]; not finite: no return
+    rows: NDArray[np.int32]  # of the primitives, -1 for the ground, -2 for no hit
+    exits: NDArray[np.float64]  # range at which the ray leaves the primitive [m]
+    cosines: NDArray[np.float64]  # of the angle of incidence
+
+
+class Receiver(NamedTuple):
+    """What a sensor makes of hits."""
+
+    range_offsets: NDArray[np.float64]  # (beams,), calibration errors [m]
+    remission_offsets: NDArray[np.float64]  # (beams,), calibration errors
+    min_range: float  # [m]
+    noise: bool  # noise and drop-out
+    ego_shadow: bool  # the ego vehicle hides the directions that KITTI's car hides
+
+
+class Echo(NamedTuple):
+    """What returns along a ray, before noise."""
+
+    range: float  # [m]
+    remission: float
+    lost: float  # probability of no return
+    jitter: float  # factor of the noise
+    least: float  # the remission reads no less
 
 
 @njit(cache=True, nogil=True)
@@ -68,14 +121,13 @@ def _tile_at(tile: NDArray[np.float64], x: float, y: float, cell_m: float) -> fl
 
 
 @njit(cache=True, nogil=True)
-def ground_at(
-    strips: NDArray[np.float64], terrain: NDArray[np.float64], tile: NDArray[np.float64], x: float, y: float
-) -> tuple[float, float, float, float, float]:
+def ground_at(ground: Ground, x: float, y: float) -> tuple[float, float, float, float, float]:
     """Evaluate the ground at x, y [m], world frame.
 
     Returns height, distance outside the roads, distance outside the bays, and u and s in the first road's frame [m].
     Both distances are negative inside; an island is outside. s is along the axis of the road, u to its left.
     """
+    strips, terrain = ground.strips, ground.terrain
     outside, outside_bays, outside_islands, u_first, s_first = 1e9, 1e9, 1e9, 0.0, 0.0
     for k in range(strips.shape[0]):
         dx, dy = x - strips[k, 0], y - strips[k, 1]
@@ -117,15 +169,13 @@ def ground_at(
         z += min(slope * e, rise) if rise > 0.0 else max(-slope * e, rise)
         basin = (e - 1.6) / 1.2
         z -= terrain[DITCH] * max(1.0 - basin * basin, 0.0)
-        z += min(e / 0.3, 1.0) * terrain[ROUGH] * (1.0 + _tile_at(tile, x, y, 0.3))
+        z += min(e / 0.3, 1.0) * terrain[ROUGH] * (1.0 + _tile_at(ground.tile, x, y, 0.3))
     return z, outside, outside_bays, u_first, s_first
 
 
 @njit(cache=True, nogil=True)
 def fill_drivable(
-    strips: NDArray[np.float64],
-    terrain: NDArray[np.float64],
-    tile: NDArray[np.float64],
+    ground: Ground,
     T_world_sensor: NDArray[np.float64],
     x: NDArray[np.float64],
     y: NDArray[np.float64],
@@ -139,7 +189,7 @@ def fill_drivable(
             z = -T[2, 3]
             xw = T[0, 0] * x[i] + T[0, 1] * y[j] + T[0, 2] * z + T[0, 3]
             yw = T[1, 0] * x[i] + T[1, 1] * y[j] + T[1, 2] * z + T[1, 3]
-            labels[i, j] = 1 if ground_at(strips, terrain, tile, xw, yw)[1] < 0.0 else 0
+            labels[i, j] = 1 if ground_at(ground, xw, yw)[1] < 0.0 else 0
 
 
 @njit(cache=True, nogil=True)
@@ -361,150 +411,159 @@ def _cosine(p: NDArray[np.float64], face: int, t: float, dx: float, dy: float, d
     return min(abs(wx * dx + wy * dy + wz * dz) / max(length, 1e-12), 1.0)
 
 
-@njit(cache=True, nogil=True)
-def _height_above(
-    strips: NDArray[np.float64],
-    terrain: NDArray[np.float64],
-    tile: NDArray[np.float64],
-    T: NDArray[np.float64],
-    x: float,
-    y: float,
-    z: float,
-) -> float:
+# Inlined, as calls from the loops of rays take an eighth longer in all.
+@njit(cache=True, nogil=True, inline="always")
+def _height_above(ground: Ground, T: NDArray[np.float64], x: float, y: float, z: float) -> float:
     """Height above the ground [m] of a point in the sensor frame."""
     xw = T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3]
     yw = T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3]
     zw = T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3]
-    return zw - ground_at(strips, terrain, tile, xw, yw)[0]
+    return zw - ground_at(ground, xw, yw)[0]
 
 
 @njit(cache=True, nogil=True)
-def fill_cast(
-    primitives: NDArray[np.float64],
-    bounds: NDArray[np.float64],
-    starts: NDArray[np.int64],
-    rows: NDArray[np.int32],
-    strips: NDArray[np.float64],
-    terrain: NDArray[np.float64],
-    tile: NDArray[np.float64],
-    T_world_sensor: NDArray[np.float64],
-    elevations: NDArray[np.float64],
-    azimuths: NDArray[np.float64],
-    reach: float,
-    key: np.uint64,
-    ranges: NDArray[np.float64],
-    hits: NDArray[np.int32],
-    exits: NDArray[np.float64],
-    cosines: NDArray[np.float64],
-) -> None:
-    """Find the first hit of each ray.
-
-    primitives : (n, 20) float64; in the sensor frame, nearest first.
-    bounds, starts, rows : from `fill_bounds`, `fill_column_counts`, `fill_column_rows`.
-    elevations : (beams,) float64; elevation of each beam, top to bottom [rad].
-    azimuths : (columns,) float64; azimuth of each column [rad].
-    reach : length of the rays [m].
-    key : uint64; seed for leaves and fences.
-    ranges, hits, exits, cosines : (beams, columns), overwritten; range [m]; row of ``primitives``, -1 for the ground,
-        -2 for no hit; range at which the ray leaves the primitive [m]; cosine of the angle of incidence.
-    """
-    n_beams, n_columns = elevations.shape[0], azimuths.shape[0]
-    tangents = np.tan(elevations)
+def fill_cast(shapes: Shapes, ground: Ground, T_world_sensor: NDArray[np.float64], rays: Rays, hits: Hits) -> None:
+    """Find the first hit of each ray; ``hits`` are overwritten."""
     T = T_world_sensor
+    n_beams, n_columns = rays.elevations.shape[0], rays.azimuths.shape[0]
+    tangents = np.tan(rays.elevations)
     # Radii of ground samples start inside the ring of the lowest beam and grow by 3 %: at 30 m, by a third of the
     # distance between two rings.
-    height = _height_above(strips, terrain, tile, T, 0.0, 0.0, 0.0)
+    height = _height_above(ground, T, 0.0, 0.0, 0.0)
     innermost = min(max(0.3, 0.4 * height / max(-tangents[n_beams - 1], 0.05)), 5.0)
-    n_radii = int(math.log(max(reach / innermost, 2.0)) / math.log(1.03)) + 2
+    n_radii = int(math.log(max(rays.reach / innermost, 2.0)) / math.log(1.03)) + 2
     radii, heights = np.empty(n_radii), np.empty(n_radii)
     for i in range(n_radii):
         radii[i] = innermost * 1.03**i
-    straight = abs(T[2, 2]) > 0.999999999
     for column in range(n_columns):
-        ca, sa = math.cos(azimuths[column]), math.sin(azimuths[column])
-        z = -T[2, 3]
-        for i in range(n_radii):
-            r = radii[i]
-            # One Newton step, which is exact for an upright sensor.
-            z -= _height_above(strips, terrain, tile, T, r * ca, r * sa, z) / T[2, 2]
-            if not straight:
-                z -= _height_above(strips, terrain, tile, T, r * ca, r * sa, z) / T[2, 2]
-            heights[i] = z
+        level = math.cos(rays.azimuths[column]), math.sin(rays.azimuths[column])
+        _fill_profile(ground, T, level, radii, heights)
         # Higher beams meet the ground no nearer than lower ones, so one pass over the radii is enough for all beams.
         i = 0
         for b in range(n_beams - 1, -1, -1):
             tan = tangents[b]
             while i < n_radii and heights[i] < radii[i] * tan:
                 i += 1
-            ce = math.cos(elevations[b])
-            dx, dy, dz = ce * ca, ce * sa, math.sin(elevations[b])
-            best, hit, leave_best, face_best = reach, _NOTHING, reach, -1
-            cosine = 0.0
+            ce = math.cos(rays.elevations[b])
+            direction = ce * level[0], ce * level[1], math.sin(rays.elevations[b])
+            best, row, leave, cosine = rays.reach, _NOTHING, rays.reach, 0.0
             if i < n_radii:
-                low = 0.0 if i == 0 else radii[i - 1]
-                high = radii[i]
-                above = 0.1 if i == 0 else low * tan - heights[i - 1]
-                below = high * tan - heights[i]
-                r = high
-                for _ in range(24):
-                    if above - below < 1e-12:
-                        break
-                    # False position; the limits keep it from converging slowly at a kerb, which is a corner.
-                    share = above / (above - below)
-                    share = min(max(share, 0.1), 0.9) if high - low > 0.02 else share
-                    r = low + share * (high - low)
-                    gap = _height_above(strips, terrain, tile, T, r * ca, r * sa, r * tan)
-                    if abs(gap) < 1e-4:
-                        break
-                    if gap > 0.0:
-                        low, above = r, gap
-                    else:
-                        high, below = r, gap
-                    if high - low < 1e-4:
-                        break
-                t = r / ce
-                if t < best:
-                    best, hit, leave_best = t, _GROUND, t
-                    # Slope of the ground along the ray, over 4 cm.
-                    rise = _height_above(strips, terrain, tile, T, (r - 0.02) * ca, (r - 0.02) * sa, r * tan)
-                    rise -= _height_above(strips, terrain, tile, T, (r + 0.02) * ca, (r + 0.02) * sa, r * tan)
-                    rise /= 0.04
-                    cosine = abs(rise * ce - dz) / math.sqrt(1.0 + rise * rise)
-            ray = _mixed(np.uint64(key + np.uint64(b * n_columns + column)))
-            for e in range(starts[column], starts[column + 1]):
-                k = rows[e]
-                if bounds[k, 4] >= best:
-                    break
-                if tan < bounds[k, 2] or tan > bounds[k, 3]:
-                    continue
-                p = primitives[k]
-                enter, leave, face = _crossing(p, dx, dy, dz)
-                if enter > leave or leave <= 0.0:
-                    continue
-                material = int(p[1])
-                if material == LEAVES:
-                    # Random free path through the leaves.
-                    draw = _uniform(_mixed(np.uint64(ray ^ np.uint64(k + 1))))
-                    t = max(enter, 0.0) - math.log(draw) / p[3]
-                    if t < leave and t < best:
-                        best, hit, leave_best, face_best = t, k, leave, -1
-                elif enter > 0.0 and enter < best:
-                    if material == POROUS and _uniform(_mixed(np.uint64(ray ^ np.uint64(k + 1)))) > p[3]:
-                        continue
-                    best, hit, leave_best, face_best = enter, k, leave, face
-            if hit >= 0:
-                cosine = 0.7 if face_best < 0 else _cosine(primitives[hit], face_best, best, dx, dy, dz)
-            ranges[b, column] = best
-            hits[b, column] = hit
-            exits[b, column] = leave_best
-            cosines[b, column] = cosine
+                r = _ground_radius(ground, T, level, tan, radii, heights, i)
+                if r / ce < best:
+                    best = leave = r / ce
+                    rise = _ground_rise(ground, T, level, tan, r)
+                    row, cosine = _GROUND, abs(rise * ce - direction[2]) / math.sqrt(1.0 + rise * rise)
+            ray = _mixed(np.uint64(rays.key + np.uint64(b * n_columns + column)))
+            nearer, k, exit, face = _first_shape(shapes, column, direction, tan, ray, best)
+            if k >= 0:
+                best, row, leave = nearer, k, exit
+                cosine = 0.7 if face < 0 else _cosine(shapes.primitives[k], face, best, *direction)
+            hits.ranges[b, column] = best
+            hits.rows[b, column] = row
+            hits.exits[b, column] = leave
+            hits.cosines[b, column] = cosine
 
 
 @njit(cache=True, nogil=True)
-def _ground_remission(
-    strips: NDArray[np.float64], terrain: NDArray[np.float64], tile: NDArray[np.float64], x: float, y: float
+def _fill_profile(
+    ground: Ground,
+    T: NDArray[np.float64],
+    level: tuple[float, float],
+    radii: NDArray[np.float64],
+    heights: NDArray[np.float64],
+) -> None:
+    """Heights (n,) of the ground in the sensor frame at radii (n,) along an azimuth, overwritten [m].
+
+    level : cosine and sine of the azimuth.
+    """
+    straight = abs(T[2, 2]) > 0.999999999
+    z = -T[2, 3]
+    for i in range(radii.shape[0]):
+        x, y = radii[i] * level[0], radii[i] * level[1]
+        # One Newton step, which is exact for an upright sensor.
+        z -= _height_above(ground, T, x, y, z) / T[2, 2]
+        if not straight:
+            z -= _height_above(ground, T, x, y, z) / T[2, 2]
+        heights[i] = z
+
+
+@njit(cache=True, nogil=True)
+def _ground_radius(
+    ground: Ground,
+    T: NDArray[np.float64],
+    level: tuple[float, float],
+    tan: float,
+    radii: NDArray[np.float64],
+    heights: NDArray[np.float64],
+    i: int,
 ) -> float:
-    _, outside, outside_bays, u, s = ground_at(strips, terrain, tile, x, y)
+    """Horizontal distance [m] at which a ray of slope ``tan`` meets the ground, between samples i - 1 and i."""
+    low = 0.0 if i == 0 else radii[i - 1]
+    high = radii[i]
+    above = 0.1 if i == 0 else low * tan - heights[i - 1]
+    below = high * tan - heights[i]
+    r = high
+    for _ in range(24):
+        if above - below < 1e-12:
+            break
+        # False position; the limits keep it from converging slowly at a kerb, which is a corner.
+        share = above / (above - below)
+        share = min(max(share, 0.1), 0.9) if high - low > 0.02 else share
+        r = low + share * (high - low)
+        gap = _height_above(ground, T, r * level[0], r * level[1], r * tan)
+        if abs(gap) < 1e-4:
+            break
+        if gap > 0.0:
+            low, above = r, gap
+        else:
+            high, below = r, gap
+        if high - low < 1e-4:
+            break
+    return r
+
+
+@njit(cache=True, nogil=True)
+def _ground_rise(ground: Ground, T: NDArray[np.float64], level: tuple[float, float], tan: float, r: float) -> float:
+    """Slope of the ground along a ray of slope ``tan`` that meets it at ``r`` [m], over 4 cm."""
+    rise = _height_above(ground, T, (r - 0.02) * level[0], (r - 0.02) * level[1], r * tan)
+    rise -= _height_above(ground, T, (r + 0.02) * level[0], (r + 0.02) * level[1], r * tan)
+    return rise / 0.04
+
+
+@njit(cache=True, nogil=True)
+def _first_shape(
+    shapes: Shapes, column: int, direction: tuple[float, float, float], tan: float, ray: np.uint64, reach: float
+) -> tuple[float, int, float, int]:
+    """Find the first primitive that a ray hits within ``reach`` [m]: range, row (-2: none), exit [m], face."""
+    best, row, leave_best, face_best = reach, _NOTHING, reach, -1
+    for e in range(shapes.starts[column], shapes.starts[column + 1]):
+        k = shapes.rows[e]
+        if shapes.bounds[k, 4] >= best:
+            break
+        if tan < shapes.bounds[k, 2] or tan > shapes.bounds[k, 3]:
+            continue
+        p = shapes.primitives[k]
+        enter, leave, face = _crossing(p, *direction)
+        if enter > leave or leave <= 0.0:
+            continue
+        material = int(p[1])
+        if material == LEAVES:
+            # Random free path through the leaves.
+            draw = _uniform(_mixed(np.uint64(ray ^ np.uint64(k + 1))))
+            t = max(enter, 0.0) - math.log(draw) / p[3]
+            if t < leave and t < best:
+                best, row, leave_best, face_best = t, k, leave, -1
+        elif enter > 0.0 and enter < best:
+            if material == POROUS and _uniform(_mixed(np.uint64(ray ^ np.uint64(k + 1)))) > p[3]:
+                continue
+            best, row, leave_best, face_best = enter, k, leave, face
+    return best, row, leave_best, face_best
+
+
+@njit(cache=True, nogil=True)
+def _ground_remission(ground: Ground, x: float, y: float) -> float:
+    strips, terrain, tile = ground
+    _, outside, outside_bays, u, s = ground_at(ground, x, y)
     stain = _tile_at(tile, x, y, 0.11)
     patch = _tile_at(tile, x + 31.0, y + 17.0, 1.7)
     if outside < 0.0:
@@ -527,9 +586,7 @@ def _ground_remission(
 
 @njit(cache=True, nogil=True)
 def fill_ground_kinds(
-    strips: NDArray[np.float64],
-    terrain: NDArray[np.float64],
-    tile: NDArray[np.float64],
+    ground: Ground,
     xy: NDArray[np.float64],
     kinds: NDArray[np.uint8],
     remissions: NDArray[np.float64],
@@ -542,9 +599,9 @@ def fill_ground_kinds(
         kinds[i], remissions[i] = 2, math.nan
         if not (abs(xy[i, 0]) < 1e6 and abs(xy[i, 1]) < 1e6):
             continue
-        _, outside, outside_bays, _, _ = ground_at(strips, terrain, tile, xy[i, 0], xy[i, 1])
-        kinds[i] = 0 if outside < 0.0 else 1 if outside_bays < 0.0 or outside < terrain[PAVEMENT] else 2
-        remissions[i] = _ground_remission(strips, terrain, tile, xy[i, 0], xy[i, 1])
+        _, outside, outside_bays, _, _ = ground_at(ground, xy[i, 0], xy[i, 1])
+        kinds[i] = 0 if outside < 0.0 else 1 if outside_bays < 0.0 or outside < ground.terrain[PAVEMENT] else 2
+        remissions[i] = _ground_remission(ground, xy[i, 0], xy[i, 1])
 
 
 @njit(cache=True, nogil=True)
@@ -570,136 +627,130 @@ def _in_ego_shadow(azimuth: float, elevation: float) -> bool:
 @njit(cache=True, nogil=True)
 def fill_points(
     primitives: NDArray[np.float64],
-    strips: NDArray[np.float64],
-    terrain: NDArray[np.float64],
-    tile: NDArray[np.float64],
+    ground: Ground,
     T_world_sensor: NDArray[np.float64],
-    elevations: NDArray[np.float64],
-    azimuths: NDArray[np.float64],
-    range_offsets: NDArray[np.float64],
-    remission_offsets: NDArray[np.float64],
-    ranges: NDArray[np.float64],
-    hits: NDArray[np.int32],
-    exits: NDArray[np.float64],
-    cosines: NDArray[np.float64],
-    min_range: float,
-    reach: float,
-    key: np.uint64,
-    noise: bool,
-    ego_shadow: bool,
+    rays: Rays,
+    hits: Hits,
+    receiver: Receiver,
     points: NDArray[np.float32],
     objects: NDArray[np.int32],
 ) -> int:
     """Convert hits to returns, beam by beam.
 
-    range_offsets, remission_offsets : (beams,) float64; calibration errors of the beams.
-    ranges, hits, exits, cosines : (beams, columns); from `fill_cast`; a range that is not finite gives no return.
-    min_range, reach : shortest and longest range of a return [m].
-    key : uint64; seed for noise and drop-out.
-    noise, ego_shadow : whether to add noise and drop-out, and whether the ego vehicle hides the directions measured
-        on KITTI's car.
     points : (beams * columns, 4) float32, first rows overwritten
     objects : (beams * columns,) int32, first rows overwritten; object of each point, -1 for none.
     Returns n: Number of returns.
     """
-    n_beams, n_columns = hits.shape
-    T = T_world_sensor
+    n_beams, n_columns = hits.rows.shape
     n = 0
     for b in range(n_beams):
-        ce, se = math.cos(elevations[b]), math.sin(elevations[b])
+        ce, se = math.cos(rays.elevations[b]), math.sin(rays.elevations[b])
         for column in range(n_columns):
-            k = hits[b, column]
-            t, cosine = ranges[b, column], cosines[b, column]
+            k, t = hits.rows[b, column], hits.ranges[b, column]
             if k == _NOTHING or not math.isfinite(t):
                 continue
-            ray = _mixed(np.uint64(key ^ np.uint64(0x5DEECE66D) ^ (np.uint64(b * n_columns + column) << np.uint64(20))))
+            number = np.uint64(b * n_columns + column) << np.uint64(20)
+            ray = _mixed(np.uint64(rays.key ^ np.uint64(0x5DEECE66D) ^ number))
             luck = _uniform(ray)
             ray = _mixed(ray)
             spread = _normal(ray)
             ray = _mixed(ray)
             other = _uniform(ray)
-            if ego_shadow and _in_ego_shadow(azimuths[column] + 0.01 * spread, elevations[b] + 0.016 * (other - 0.5)):
+            azimuth, elevation = rays.azimuths[column], rays.elevations[b]
+            if receiver.ego_shadow and _in_ego_shadow(azimuth + 0.01 * spread, elevation + 0.016 * (other - 0.5)):
                 continue
-            ca, sa = math.cos(azimuths[column]), math.sin(azimuths[column])
-            dx, dy, dz = ce * ca, ce * sa, se
-            lost = 0.006
-            o = -1
-            jitter = 1.0
-            floor = 0.0
+            direction = ce * math.cos(azimuth), ce * math.sin(azimuth), se
+            cosine, leave, o = hits.cosines[b, column], hits.exits[b, column], -1
             if k == _GROUND:
-                x, y, z = t * dx, t * dy, t * dz
-                value = _ground_remission(
-                    strips,
-                    terrain,
-                    tile,
-                    T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3],
-                    T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3],
-                )
-                # Measured: road remission is constant up to 20 m, 0.07 at 25..40 m, 0.00 beyond, with fewer returns.
-                value *= min(max((cosine - 0.04) / 0.034, 0.0), 1.0)
-                lost += min(max((0.045 - cosine) / 0.04, 0.0), 0.85)
+                echo = _ground_echo(ground, T_world_sensor, direction, t, cosine)
             else:
-                p = primitives[k]
-                o = int(p[19])
-                material = int(p[1])
-                value = p[2]
-                if material == PAINT:
-                    # Clear coat over a dark or light base; specular, so brightest along the normal.
-                    value *= 0.5 + 0.5 * cosine
-                    value += 0.5 * max((cosine - 0.97) / 0.03, 0.0) * (0.25 + value) - 0.11
-                    # Measured: half of the rays on a near car return, a fifth beyond 45 m.
-                    lost += 0.06 + p[3] * (1.0 - 0.7 * cosine) + min(max((t - 28.0) * 0.02, 0.0), 0.6)
-                elif material == GLASS:
-                    lost += p[3]
-                    if other < 0.6:  # the far side or a seat behind the pane
-                        t += (0.15 + 0.8 * other / 0.6) * max(exits[b, column] - t - 0.05, 0.0)
-                        value = 0.04
-                    else:
-                        value = 0.02
-                elif material == RETRO:
-                    value *= 0.4 + 0.6 * cosine
-                elif material == FACADE:
-                    # Recessed windows on a grid; most of them reflect rays away from the sensor.
-                    qx, qy, qz = t * dx, t * dy, t * dz
-                    wx = T[0, 0] * qx + T[0, 1] * qy + T[0, 2] * qz + T[0, 3]
-                    wy = T[1, 0] * qx + T[1, 1] * qy + T[1, 2] * qz + T[1, 3]
-                    wz = T[2, 0] * qx + T[2, 1] * qy + T[2, 2] * qz + T[2, 3]
-                    across = (abs(p[8]) * wx + abs(p[7]) * wy) / max(math.hypot(p[7], p[8]), 1e-9)
-                    if abs(p[7] * dx + p[8] * dy) < abs(p[10] * dx + p[11] * dy):
-                        across = (p[7] * wx + p[8] * wy) / max(math.hypot(p[7], p[8]), 1e-9)
-                    fraction = across / p[3] - math.floor(across / p[3])
-                    storey = (wz - 0.9) / 2.9 - math.floor((wz - 0.9) / 2.9)
-                    if fraction < 0.42 and storey < 0.5:
-                        lost += 0.35
-                        value *= 0.3
-                        t += 0.12 / max(cosine, 0.2) + (2.5 * (other - 0.75) / 0.25 if other > 0.75 else 0.0)
-                    value *= 0.55 + 0.45 * cosine
-                elif material == LEAVES:
-                    jitter = 1.6
-                    value *= 0.75 + 0.5 * other
-                else:
-                    value *= 0.55 + 0.45 * cosine
-                if material != RETRO:
-                    # Measured: facades 0.43 nearby, 0.31 at 25..40 m, 0.22 beyond; leaves 0.36, 0.23, 0.11.
-                    value *= min(1.0, max(1.0 - 0.022 * (t - 18.0), 0.35))
-                    lost += min(max((t - 35.0) * 0.004, 0.0), 0.3)
-                else:
-                    floor = 0.3
-            if noise:
-                if luck > 1.0 - lost:
+                o = int(primitives[k, 19])
+                echo = _shape_echo(primitives[k], T_world_sensor, direction, t, leave, cosine, other)
+            t, value = echo.range, echo.remission
+            if receiver.noise:
+                if luck > 1.0 - echo.lost:
                     continue
-                t += range_offsets[b] + 0.01 * jitter * spread
+                t += receiver.range_offsets[b] + 0.01 * echo.jitter * spread
                 spread = _normal(_mixed(np.uint64(ray ^ np.uint64(0xABCDEF))))
-                value += remission_offsets[b] * min(1.0, 0.2 + 4.0 * max(value, 0.0)) + 0.05 * jitter * spread
+                gain = min(1.0, 0.2 + 4.0 * max(value, 0.0))
+                value += receiver.remission_offsets[b] * gain + 0.05 * echo.jitter * spread
                 # Measured: few values between 0 and 0.1, and 57 % of a car's returns at 0: weak echoes read 0.
                 if value < 0.01 + 0.1 * luck or other > 0.965:
                     value = 0.0
-            if not min_range <= t < reach:
+            if not receiver.min_range <= t < rays.reach:
                 continue
-            points[n, 0] = t * dx
-            points[n, 1] = t * dy
-            points[n, 2] = t * dz
-            points[n, 3] = math.floor(min(max(value, floor), 0.99) * 100.0 + 0.5) / 100.0
+            for axis in range(3):
+                points[n, axis] = t * direction[axis]
+            points[n, 3] = math.floor(min(max(value, echo.least), 0.99) * 100.0 + 0.5) / 100.0
             objects[n] = o
             n += 1
     return n
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _ground_echo(
+    ground: Ground, T: NDArray[np.float64], direction: tuple[float, float, float], t: float, cosine: float
+) -> Echo:
+    """Echo of the ground at the range ``t`` [m]."""
+    x, y, z = t * direction[0], t * direction[1], t * direction[2]
+    xw = T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3]
+    yw = T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3]
+    # Measured: road remission is constant up to 20 m, 0.07 at 25..40 m, 0.00 beyond, with fewer returns.
+    value = _ground_remission(ground, xw, yw) * min(max((cosine - 0.04) / 0.034, 0.0), 1.0)
+    return Echo(t, value, 0.006 + min(max((0.045 - cosine) / 0.04, 0.0), 0.85), 1.0, 0.0)
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _shape_echo(
+    p: NDArray[np.float64],
+    T: NDArray[np.float64],
+    direction: tuple[float, float, float],
+    t: float,
+    leave: float,
+    cosine: float,
+    draw: float,
+) -> Echo:
+    """Echo of a primitive (20,) between the ranges ``t`` and ``leave`` [m]; ``draw`` is uniform in 0..1."""
+    material, value, lost, jitter = int(p[1]), p[2], 0.006, 1.0
+    if material == PAINT:
+        # Clear coat over a dark or light base; specular, so brightest along the normal.
+        value *= 0.5 + 0.5 * cosine
+        value += 0.5 * max((cosine - 0.97) / 0.03, 0.0) * (0.25 + value) - 0.11
+        # Measured: half of the rays on a near car return, a fifth beyond 45 m.
+        lost += 0.06 + p[3] * (1.0 - 0.7 * cosine) + min(max((t - 28.0) * 0.02, 0.0), 0.6)
+    elif material == GLASS:
+        lost += p[3]
+        value = 0.02
+        if draw < 0.6:  # the far side or a seat behind the pane
+            t += (0.15 + 0.8 * draw / 0.6) * max(leave - t - 0.05, 0.0)
+            value = 0.04
+    elif material == RETRO:
+        return Echo(t, value * (0.4 + 0.6 * cosine), lost, jitter, 0.3)
+    elif material == LEAVES:
+        jitter = 1.6
+        value *= 0.75 + 0.5 * draw
+    else:
+        if material == FACADE and _in_window(p, T, direction, t):
+            lost += 0.35
+            value *= 0.3
+            t += 0.12 / max(cosine, 0.2) + (2.5 * (draw - 0.75) / 0.25 if draw > 0.75 else 0.0)
+        value *= 0.55 + 0.45 * cosine
+    # Measured: facades 0.43 nearby, 0.31 at 25..40 m, 0.22 beyond; leaves 0.36, 0.23, 0.11.
+    value *= min(1.0, max(1.0 - 0.022 * (t - 18.0), 0.35))
+    return Echo(t, value, lost + min(max((t - 35.0) * 0.004, 0.0), 0.3), jitter, 0.0)
+
+
+@njit(cache=True, nogil=True)
+def _in_window(p: NDArray[np.float64], T: NDArray[np.float64], direction: tuple[float, float, float], t: float) -> bool:
+    """Whether a ray meets a facade in one of its recessed windows, most of which reflect it away from the sensor."""
+    dx, dy, dz = direction
+    qx, qy, qz = t * dx, t * dy, t * dz
+    wx = T[0, 0] * qx + T[0, 1] * qy + T[0, 2] * qz + T[0, 3]
+    wy = T[1, 0] * qx + T[1, 1] * qy + T[1, 2] * qz + T[1, 3]
+    wz = T[2, 0] * qx + T[2, 1] * qy + T[2, 2] * qz + T[2, 3]
+    across = (abs(p[8]) * wx + abs(p[7]) * wy) / max(math.hypot(p[7], p[8]), 1e-9)
+    if abs(p[7] * dx + p[8] * dy) < abs(p[10] * dx + p[11] * dy):
+        across = (p[7] * wx + p[8] * wy) / max(math.hypot(p[7], p[8]), 1e-9)
+    fraction = across / p[3] - math.floor(across / p[3])
+    storey = (wz - 0.9) / 2.9 - math.floor((wz - 0.9) / 2.9)
+    return fraction < 0.42 and storey < 0.5

@@ -15,6 +15,11 @@ from ..types.perception import Box
 from ..types.sensor import SensorProfile, get_sensor
 from ..types.views import TopViewGeometry
 from .raycast import (
+    Ground,
+    Hits,
+    Rays,
+    Receiver,
+    Shapes,
     fill_bounds,
     fill_cast,
     fill_column_counts,
@@ -86,6 +91,11 @@ class Scene:
     terrain: NDArray[np.float64]
     tile: NDArray[np.float64]
 
+    @property
+    def ground(self) -> Ground:
+        """The ground, as kernels take it."""
+        return Ground(self.strips, self.terrain, self.tile)
+
     def at(self, t_s: float) -> Scene:
         """Move the objects by ``t_s`` [s] on the ground, with constant speed and turn rate; return the new scene."""
         moved = []
@@ -101,11 +111,11 @@ class Scene:
 
     def ground_height(self, x: float, y: float) -> float:
         """Height of the ground [m] at x, y, world frame."""
-        return float(ground_at(self.strips, self.terrain, self.tile, float(x), float(y))[0])
+        return float(ground_at(self.ground, float(x), float(y))[0])
 
     def on_road(self, x: float, y: float) -> bool:
         """Whether x, y [m], world frame, is on a road surface; parking bays are not."""
-        return bool(ground_at(self.strips, self.terrain, self.tile, float(x), float(y))[1] < 0.0)
+        return bool(ground_at(self.ground, float(x), float(y))[1] < 0.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -159,8 +169,7 @@ class SimulatedScan:
         view = TopViewGeometry() if geometry is None else geometry
         x, y = view.cell_centers()
         labels = np.zeros((view.height, view.width), dtype=np.uint8)
-        strips, terrain, tile = self.scene.strips, self.scene.terrain, self.scene.tile
-        fill_drivable(strips, terrain, tile, self.T_world_sensor, x.ravel(), y.ravel(), labels)
+        fill_drivable(self.scene.ground, self.T_world_sensor, x.ravel(), y.ravel(), labels)
         others = [replace(box, label="background") for box in self.boxes if box.label in ("tram", "misc")]
         draw_footprints(labels, [*others, *self.boxes], view, TOP_VIEW_CLASSES)
         return labels
@@ -249,22 +258,15 @@ def simulate(
     elevations = np.radians(np.asarray(profile.elevations_deg))
     reach = min(float(max_range_m), profile.max_range_m)
 
-    primitives, bounds, starts, rows = place_shapes(scene, pose, n_columns, reach)
+    shapes = place_shapes(scene, pose, n_columns, reach)
     shape = (n_beams, n_columns)
-    ranges, exits, cosines = np.empty(shape), np.empty(shape), np.empty(shape)
-    hits = np.empty(shape, dtype=np.int32)
-    key = np.uint64(rng.integers(0, 2**63))
-    fill_cast(
-        primitives, bounds, starts, rows, scene.strips, scene.terrain, scene.tile, pose,
-        elevations, azimuths, reach, key, ranges, hits, exits, cosines,
-    )  # fmt: skip
+    hits = Hits(np.empty(shape), np.empty(shape, np.int32), np.empty(shape), np.empty(shape))
+    rays = Rays(elevations, azimuths, reach, np.uint64(rng.integers(0, 2**63)))
+    fill_cast(shapes, scene.ground, pose, rays, hits)
+    receiver = Receiver(range_offsets, remission_offsets, profile.min_range_m, noise, noise and ego_shadow)
     points = np.empty((n_beams * n_columns, 4), dtype=np.float32)
     surfaces = np.empty(n_beams * n_columns, dtype=np.int32)
-    n = fill_points(
-        primitives, scene.strips, scene.terrain, scene.tile, pose, elevations, azimuths, range_offsets,
-        remission_offsets, ranges, hits, exits, cosines, profile.min_range_m, reach, key, noise, noise and ego_shadow,
-        points, surfaces,
-    )  # fmt: skip
+    n = fill_points(shapes.primitives, scene.ground, pose, rays, hits, receiver, points, surfaces)
     points, surfaces = points[:n].copy(), surfaces[:n].copy()
     # Shapes that are not part of an object have a negative number; -1 is the last entry, the ground.
     objects = np.maximum([*scene.primitives[:, 19], -1.0], -1.0).astype(np.int32)[surfaces]
@@ -284,16 +286,12 @@ def simulate(
     )
 
 
-def place_shapes(
-    scene: Scene, T_world_sensor: NDArray[np.float64], n_columns: int, reach_m: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64], NDArray[np.int32]]:
+def place_shapes(scene: Scene, T_world_sensor: NDArray[np.float64], n_columns: int, reach_m: float) -> Shapes:
     """Sort the shapes of a scene by the directions in which rays from a sensor may hit them.
 
     T_world_sensor : (4, 4) float64
     n_columns : number of sectors of a turn, counter-clockwise from +x.
-    Returns primitives ((n, 20) float64): In the sensor frame, nearest first; the last column is the row of
-        ``scene.primitives``.
-    Returns bounds, starts, rows: As `fill_cast` needs them.
+    The last column of the returned primitives is their row of ``scene.primitives``.
     """
     primitives = np.empty_like(scene.primitives)
     poses = np.array([(*o.center[:2], o.center[2] - o.size[2] / 2.0, o.yaw) for o in scene.objects]).reshape(-1, 4)
@@ -307,7 +305,7 @@ def place_shapes(
     fill_column_counts(bounds, n_columns, reach_m, starts)
     rows = np.empty(starts[-1], dtype=np.int32)
     fill_column_rows(bounds, n_columns, reach_m, starts, rows)
-    return primitives, bounds, starts, rows
+    return Shapes(primitives, bounds, starts, rows)
 
 
 def simulate_sequence(

@@ -43,6 +43,7 @@ from .raycast import (
     WAVE_Y_0,
     WAVE_Y_K,
     WEAR,
+    Ground,
     ground_at,
 )
 from .scene import Scene, SceneObject
@@ -109,7 +110,7 @@ class Street:
 
     def ground(self, x: float, y: float) -> tuple[float, float]:
         """Height of the ground and distance from the roads (negative on a road) at x, y [m]."""
-        z, outside, _, _, _ = ground_at(self.strips, self.terrain, self.tile, float(x), float(y))
+        z, outside, _, _, _ = ground_at(Ground(self.strips, self.terrain, self.tile), float(x), float(y))
         return z, outside
 
     def edge(self, road: int, side: float) -> float:

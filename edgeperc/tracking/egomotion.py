@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..system.kernel_cache import njit
+from .ukf import fill_inverse
 
 MAX_ROUNDS = 12
 MAX_PROPOSALS = 256
@@ -28,33 +29,19 @@ def fit_motion(
 ) -> int:
     """Fit the rigid motion that moves detections to the predicted positions of tracks.
 
-    Parameters
-    ----------
-    landmarks : (n, 4) float64
-        Predicted x, y [m] of tracks in the previous sensor frame, the variance of each coordinate [m2], and the group
-        of classes that may be confused.
-    detections : (m, 4) float64
-        The same columns, in the current sensor frame.
-    prior : (3,) float64
-        Expected motion: x, y [m] and turn [rad] of the sensor in its previous frame.
-    prior_variances : (3,) float64
-        [m2, m2, rad2]
-    motion : (3,) float64, overwritten
-        The fitted motion; the prior if no detection fits a track.
-    covariance : (3, 3) float64, overwritten
-        Covariance of ``motion``.
-
-    Returns
-    -------
-    n_pairs : int
-        Tracks that were matched to a detection.
-
-    Notes
-    -----
     Each pair of track and detection proposes a shift and a turn that move the detection to the track. Proposals within
     three standard deviations of the prior are tried, at most 256. A Gauss-Newton iteration starts from the proposal
     with the largest `support`. It matches each track to its nearest detection, with Geman and McClure's weight
     1 / (1 + r2 / 9)^2, where r is the distance in standard deviations.
+
+    landmarks : (n, 4) float64; predicted x, y [m] of tracks in the previous sensor frame, the variance of each
+        coordinate [m2], and the group of classes that may be confused.
+    detections : (m, 4) float64; the same columns, in the current sensor frame.
+    prior : (3,) float64; expected motion: x, y [m] and turn [rad] of the sensor in its previous frame.
+    prior_variances : (3,) float64; [m2, m2, rad2]
+    motion : (3,) float64, overwritten; the fitted motion; the prior if no detection fits a track.
+    covariance : (3, 3) float64, overwritten; covariance of ``motion``.
+    Returns n_pairs: Tracks that were matched to a detection.
     """
     # Element by element: to copy an array, numba compiles a broadcast with its error messages, for 3 s.
     for a in range(3):
@@ -174,18 +161,3 @@ def nearest_detection(
         if squared < smallest:
             nearest, smallest = j, squared
     return nearest, smallest
-
-
-# A copy of that in `ukf`: numba would not recompile a cached kernel after a change in another file.
-@njit(cache=True, nogil=True)
-def fill_inverse(matrix: NDArray[np.float64], inverse: NDArray[np.float64]) -> None:
-    """Invert a symmetric positive definite (3, 3) matrix into ``inverse``, by cofactors."""
-    a, b, c = matrix[0, 0], matrix[0, 1], matrix[0, 2]
-    d, e, f = matrix[1, 1], matrix[1, 2], matrix[2, 2]
-    determinant = a * (d * f - e * e) - b * (b * f - c * e) + c * (b * e - c * d)
-    inverse[0, 0] = (d * f - e * e) / determinant
-    inverse[1, 1] = (a * f - c * c) / determinant
-    inverse[2, 2] = (a * d - b * b) / determinant
-    inverse[0, 1] = inverse[1, 0] = (c * e - b * f) / determinant
-    inverse[0, 2] = inverse[2, 0] = (b * e - c * d) / determinant
-    inverse[1, 2] = inverse[2, 1] = (b * c - a * e) / determinant

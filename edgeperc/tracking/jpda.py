@@ -9,6 +9,7 @@ Trans. AES 2014).
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,60 +22,64 @@ TOLERANCE = 1e-6
 LARGEST_WEIGHT = 1e15  # keeps the products of a cluster finite
 
 
+class Predictions(NamedTuple):
+    """Tracks as they are expected at the time of a scan."""
+
+    means: NDArray[np.float64]  # (n, 3, 5); x, y [m], v [m/s], heading [rad], turn rate [rad/s] by motion model
+    covariances: NDArray[np.float64]  # (n, 3, 5, 5)
+    prior: NDArray[np.float64]  # (n, 3), probability of each motion model
+
+
+class Gates(NamedTuple):
+    """Which detections may belong to each track."""
+
+    sigmas: NDArray[np.float64]  # (n, 3), along and across the heading of a detection [m] and of its heading [rad]
+    odds: NDArray[np.float64]  # (n,), P_D / ((1 - P_D) lambda) [m2 rad]: probability of detection, density of clutter
+    groups: NDArray[np.int64]  # (n,), classes that may be confused; detections of other groups are never associated
+    limits: NDArray[np.float64]  # (n,), largest Mahalanobis distance of a position from the nearest motion model
+
+
+class Detections(NamedTuple):
+    """The boxes of one scan."""
+
+    places: NDArray[np.float64]  # (m, 3); x, y [m], heading [rad] in the frame of the tracks
+    shapes: NDArray[np.float64]  # (m, 4); height of the center, length, width, height [m]
+    logits: NDArray[np.float64]  # (m,), log odds of the scores
+    fronts: NDArray[np.float64]  # (m,), log odds that the heading points to the front; 0 if that is unknown
+    kinds: NDArray[np.int64]  # (m,), class
+    groups: NDArray[np.int64]  # (m,), group of classes
+    ranges: NDArray[np.float64]  # (m,), distance from the sensor [m]
+    sources: NDArray[np.int64]  # (m,), index in the scan
+
+
 @njit(cache=True, nogil=True)
 def fill_likelihoods(
-    means: NDArray[np.float64],
-    predicted: NDArray[np.float64],
-    sigmas: NDArray[np.float64],
-    prior: NDArray[np.float64],
-    odds: NDArray[np.float64],
-    groups: NDArray[np.int64],
-    detections: NDArray[np.float64],
-    detection_groups: NDArray[np.int64],
-    gates: NDArray[np.float64],
+    tracks: Predictions,
+    gates: Gates,
+    detections: Detections,
     likelihoods: NDArray[np.float64],
     weights: NDArray[np.float64],
 ) -> None:
     """Compute the likelihood of each detection under each motion model of each track, and the association weights.
 
-    Parameters
-    ----------
-    means : (n, 3, 5) float64
-        Predicted x, y [m], v [m/s], heading [rad], turn rate [rad/s] for each motion model.
-    predicted : (n, 3, 5, 5) float64
-        Their covariances.
-    sigmas : (n, 3) float64
-        Standard deviations of a detection along and across the heading [m] and of the heading [rad].
-    prior : (n, 3) float64
-        Probability of each motion model.
-    odds : (n,) float64
-        P_D / ((1 - P_D) lambda) [m2 rad], from detection probability P_D and clutter density lambda.
-    groups : (n,) int64
-        Group of classes that may be confused. Detections of other groups are never associated.
-    detections : (m, 3) float64
-        x, y [m], heading [rad].
-    detection_groups : (m,) int64
-        Group of each detection.
-    gates : (n,) float64
-        Largest Mahalanobis distance of a detection's position from the nearest motion model.
-    likelihoods : (n, 3, m) float64, overwritten
-        [1/(m2 rad)]; 0 for all motion models if the detection is outside the gate.
-    weights : (n, m) float64, overwritten
-        odds_t sum_k prior_tk L_tkj, the input of `fill_association`.
+    likelihoods : (n, 3, m) float64, overwritten; [1/(m2 rad)]; 0 for all motion models if the detection is outside the
+        gate.
+    weights : (n, m) float64, overwritten; odds_t sum_k prior_tk L_tkj, the input of `fill_association`.
 
-    Notes
-    -----
     Headings are compared modulo pi, because a box looks the same from behind. Detectors are sometimes wrong by 90
     degrees, so deviations are limited to three standard deviations.
     """
-    n, m = len(groups), len(detection_groups)
+    means, predicted, prior = tracks
+    sigmas, odds, groups, limits = gates
+    places = detections.places
+    n, m = len(groups), len(places)
     likelihoods[:] = 0.0
     weights[:] = 0.0
     # For each motion model: covariance of the position, regression of the heading on the position, variance, limit and
     # norm. Computed once: most pairs are outside the gate and need no sine, root or exponential.
     forms = np.empty((3, 9))
     for i in range(n):
-        gate, reach, apart = gates[i], 0.0, 0.0
+        gate, reach, apart = limits[i], 0.0, 0.0
         for mode in range(3):
             mean, cov, form = means[i, mode], predicted[i, mode], forms[mode]
             cos, sin = math.cos(mean[3]), math.sin(mean[3])
@@ -96,25 +101,25 @@ def fill_likelihoods(
             apart = max(apart, math.hypot(mean[0] - means[i, 0, 0], mean[1] - means[i, 0, 1]))
         reach = (gate * math.sqrt(reach) + apart) ** 2
         for j in range(m):
-            dx = detections[j, 0] - means[i, 0, 0]
-            dy = detections[j, 1] - means[i, 0, 1]
-            if groups[i] != detection_groups[j] or dx * dx + dy * dy > reach:
+            dx = places[j, 0] - means[i, 0, 0]
+            dy = places[j, 1] - means[i, 0, 1]
+            if groups[i] != detections.groups[j] or dx * dx + dy * dy > reach:
                 continue
             inside = False
             for mode in range(3):
                 a, b, d, place = forms[mode, 0], forms[mode, 1], forms[mode, 2], forms[mode, 3]
-                dx = detections[j, 0] - means[i, mode, 0]
-                dy = detections[j, 1] - means[i, mode, 1]
+                dx = places[j, 0] - means[i, mode, 0]
+                dy = places[j, 1] - means[i, mode, 1]
                 inside = inside or d * dx * dx - 2.0 * b * dx * dy + a * dy * dy <= gate * gate * place
             if not inside:
                 continue
             for mode in range(3):
                 a, b, d, place = forms[mode, 0], forms[mode, 1], forms[mode, 2], forms[mode, 3]
-                dx = detections[j, 0] - means[i, mode, 0]
-                dy = detections[j, 1] - means[i, mode, 1]
+                dx = places[j, 0] - means[i, mode, 0]
+                dy = places[j, 1] - means[i, mode, 1]
                 squared = (d * dx * dx - 2.0 * b * dx * dy + a * dy * dy) / place
                 limit = forms[mode, 7]
-                turn = detections[j, 2] - means[i, mode, 3]
+                turn = places[j, 2] - means[i, mode, 3]
                 turn -= math.pi * np.floor(turn / math.pi + 0.5)  # math.floor raises on NaN
                 turn = min(max(turn, -limit), limit) - forms[mode, 4] * dx - forms[mode, 5] * dy
                 squared += turn * turn / forms[mode, 6]

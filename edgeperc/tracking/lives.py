@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..system.kernel_cache import njit
+from .jpda import Detections
 
 # Complete state of a track. The tracker replaces it as a whole, so a scan that raises an error changes nothing.
 TRACK = np.dtype(
@@ -82,40 +83,23 @@ MOST_HIDDEN = 0.9
 
 
 @njit(cache=True, nogil=True)
-def fill_newborn(
-    first_id: int,
-    kinds: NDArray[np.int64],
-    classes: NDArray[np.void],
-    detections: NDArray[np.float64],
-    shapes: NDArray[np.float64],
-    logits: NDArray[np.float64],
-    told: NDArray[np.float64],
-    sources: NDArray[np.int64],
-    ranges: NDArray[np.float64],
-    tracks: NDArray[np.void],
-) -> None:
+def fill_newborn(first_id: int, detections: Detections, classes: NDArray[np.void], tracks: NDArray[np.void]) -> None:
     """Begin a track at each detection, with speed 0.
 
     first_id : id of the first new track.
-    kinds : (n,) int64; class of each detection.
     classes : (n,) record; parameters of each detection's class.
-    detections : (n, 3) float64; x, y [m], heading [rad].
-    shapes : (n, 4) float64; height of the center, length, width, height [m].
-    logits : (n,) float64; log odds of the scores.
-    told : (n,) float64; log odds that the heading points to the front.
-    sources : (n,) int64; index of each detection in the scan.
-    ranges : (n,) float64; distances from the sensor [m].
     tracks : (n,) record, overwritten; all fields 0 beforehand.
     """
+    places, shapes, logits, fronts = detections.places, detections.shapes, detections.logits, detections.fronts
     for i in range(len(tracks)):
         track, of = tracks[i], classes[i]
-        farther = 1.0 + ranges[i] / of["range_m"]
-        x, y, heading = detections[i, 0], detections[i, 1], detections[i, 2]
+        farther = 1.0 + detections.ranges[i] / of["range_m"]
+        x, y, heading = places[i, 0], places[i, 1], places[i, 2]
         cos, sin = math.cos(heading), math.sin(heading)
         along, across, turn = of["sigmas"][0] * farther, of["sigmas"][1] * farther, of["sigmas"][2] * farther
-        track["id"], track["label"], track["group"] = first_id + i, kinds[i], of["group"]
-        track["hits"], track["chances"], track["label_weight"], track["source"] = 1, 1.0, 1.0, sources[i]
-        track["fronts"][1], track["fronts"][2] = min(max(told[i], -TOLD), TOLD), 1.0
+        track["id"], track["label"], track["group"] = first_id + i, detections.kinds[i], of["group"]
+        track["hits"], track["chances"], track["label_weight"], track["source"] = 1, 1.0, 1.0, detections.sources[i]
+        track["fronts"][1], track["fronts"][2] = min(max(fronts[i], -TOLD), TOLD), 1.0
         track["logit_sum"] = track["last_logit"] = logits[i]
         track["existence"] = min(logits[i] - of["sure_logit"], MOST_EXISTENCE)
         for a in range(4):

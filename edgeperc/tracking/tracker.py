@@ -19,7 +19,7 @@ from ..system.clock import GAP_S, LATEST_S, Clock, Step
 from ..types.perception import Box, Perception
 from .egomotion import fit_motion
 from .imm import fill_combined, fill_interaction, fill_mode_probabilities
-from .jpda import MAX_EVENTS, fill_association, fill_likelihoods
+from .jpda import MAX_EVENTS, Detections, Gates, Predictions, fill_association, fill_likelihoods
 from .lives import (
     CLASS,
     LEAST_EXISTENCE,
@@ -213,7 +213,7 @@ class Tracker:
                 f"got a scan {'with' if posed else 'without'} T_world_sensor, unlike those before it; pass it with all "
                 "scans or with none, or call reset() before a new recording"
             )
-        given, told, names = _checked_boxes(boxes)
+        given, fronts, names = _checked_boxes(boxes)
         pose = None if T_world_sensor is None else _checked_pose(T_world_sensor)
         self._warn_of(step, stamp_s)
         if step == "late":
@@ -227,104 +227,30 @@ class Tracker:
         tracks = session.tracks
         tracks = tracks[tracks["missed_s"] + dt <= self._classes["memory_s"][tracks["label"]]]
         of = self._classes[tracks["label"]]
-        n, m = len(tracks), len(given)
-
-        # Fields of records go to kernels as copies: of a single record a field is contiguous, of several it is not, and
-        # numba would compile a kernel for each layout in memory.
-
-        # Interaction.
-        mixed, mixed_covariances, prior = np.empty((n, 3, 5)), np.empty((n, 3, 5, 5)), np.empty((n, 3))
-        stay = np.exp(-dt / of["keep_motion_s"])
-        states, covariances, modes = (tracks[field].copy() for field in ("states", "covariances", "modes"))
-        fill_interaction(states, covariances, modes, stay, mixed, mixed_covariances, prior)
-
-        # Prediction.
-        means, predicted = np.empty_like(mixed), np.empty_like(mixed_covariances)
-        fill_predictions(mixed, mixed_covariances, of["noise"].copy(), dt, means, predicted)
-        state, covariance = np.empty((n, 5)), np.empty((n, 5, 5))
-        fill_combined(means, predicted, prior, state, covariance)
+        predictions = _predictions(tracks, of, dt)
+        state, covariance = _combined(*predictions)
         twist, twist_variances = session.twist, session.twist_variances
         if pose is None:
             estimate = self._estimated_pose(session, tracks, state, covariance, given, classes, dt)
             pose, twist, twist_variances = estimate
-
-        # Data association.
-        detections, heights = _in_world(given, pose)
-        shapes = given[:, 2:6].copy()
-        shapes[:, 0] = heights
-        farther = 1.0 + np.hypot(state[:, 0] - pose[0, 3], state[:, 1] - pose[1, 3]) / of["range_m"]
-        sigmas = of["sigmas"] * farther[:, None]
-        likelihoods, weights, beta = np.empty((n, 3, m)), np.empty((n, m)), np.empty((n, m + 1))
-        fill_likelihoods(
-            means,
-            predicted,
-            sigmas,
-            prior,
-            of["odds"].copy(),
-            tracks["group"].copy(),
-            detections,
-            classes["group"].copy(),
-            of["gate"].copy(),
-            likelihoods,
-            weights,
-        )
-        n_approximated = fill_association(weights, MAX_EVENTS, beta)
-
-        # Mode probability update, with the update of each motion.
-        shares = np.empty((n, 3, m + 1))
-        fill_mode_probabilities(prior, likelihoods, beta, shares, modes)
-        fill_updates(means, predicted, detections, sigmas, shares, states, covariances)
-
-        # Combination.
-        fill_combined(states, covariances, modes, state, covariance)
-        shape, shape_variance, fronts = (tracks[field].copy() for field in ("shape", "shape_variance", "fronts"))
-        update_shapes(
-            beta,
-            shapes,
-            of["shape"] * farther[:, None],
-            SHAPE_WALK_M * math.sqrt(dt),
-            shape,
-            shape_variance,
-        )
-        speed_sigma = np.sqrt(np.maximum(covariance[:, 2, 2], 0.0))
-        update_fronts(state, speed_sigma, of["moving_mps"].copy(), beta, detections, told, fronts)
-        hidden = np.zeros(n)
-        fill_hidden(state, shape, beta[:, 0] < 0.5, pose[:2, 3].copy(), hidden)
-        tracks["states"], tracks["covariances"], tracks["modes"] = states, covariances, modes
-        tracks["state"], tracks["covariance"] = state, covariance
-        tracks["shape"], tracks["shape_variance"], tracks["fronts"] = shape, shape_variance, fronts
-        logits = _logit(given[:, 7])
-        update_lives(tracks, of, beta, hidden, logits, kinds, dt)
-
-        # Detections that probably belong to no track begin new tracks.
-        own = np.flatnonzero((beta[:, 1:].sum(axis=0) < 0.5) & (logits >= classes["birth_logit"]))
-        if len(own):
-            ranges = np.hypot(given[own, 0], given[own, 1])
-            joined = np.zeros(n + len(own), TRACK)  # np.concatenate takes ten times as long with named fields
-            joined[:n] = tracks
-            fill_newborn(
-                self._next_id,
-                kinds[own],
-                classes[own],
-                detections[own],
-                shapes[own],
-                logits[own],
-                told[own],
-                own,
-                ranges,
-                joined[n:],
-            )
-            tracks = joined
+        detections = _detections(given, fronts, kinds, classes["group"].copy(), pose)
+        farther = _farther(state, of, pose)
+        gates = Gates(of["sigmas"] * farther[:, None], of["odds"].copy(), tracks["group"].copy(), of["gate"].copy())
+        likelihoods, beta, n_approximated = _associated(predictions, gates, detections)
+        _update_motion(tracks, predictions, gates.sigmas, detections.places, likelihoods, beta)
+        _update_shapes(tracks, detections, beta, of["shape"] * farther[:, None], dt)
+        _update_evidence(tracks, of, detections, beta, pose, dt)
+        n = len(tracks)
+        tracks = self._with_newborn(tracks, detections, classes, beta)
+        n_born = len(tracks) - n
         tracks = self._living(tracks)
-        of, strength = self._classes[tracks["label"]], strength_of(tracks)
-        away = np.hypot(tracks["state"][:, 0] - pose[0, 3], tracks["state"][:, 1] - pose[1, 3]) / of["range_m"]
-        tracks["score"] = strength + of["latest"] * (tracks["last_logit"] - strength)
-        tracks["score"] += of["far_logit"] * away - of["coasting_logit"] * tracks["misses"]
+        strength = strength_of(tracks)
+        tracks["score"] = _scores(tracks, strength, self._classes[tracks["label"]], pose)
 
         self._clock, self._former = clock, former if step == "jump" else None
         self._session = _Session(session.number, stamp_s, posed, tracks, pose, twist, twist_variances)
         self._n_sessions += step == "jump"
-        self._next_id += len(own)
+        self._next_id += n_born
         reported = tracks["existence"] > 0.0
         mark_out_of_view(tracks, pose, self._left, self._right, reported)
         strongest_first = np.argsort(-strength, kind="stable")
@@ -401,6 +327,23 @@ class Tracker:
         step = np.array([[cos, -sin, 0, motion[0]], [sin, cos, 0, motion[1]], [0, 0, 1, 0], [0, 0, 0, 1]])
         return session.T_world_sensor @ step, motion / dt, np.minimum(np.diag(spread) / dt**2, FIRST_TWIST**2)
 
+    def _with_newborn(
+        self,
+        tracks: NDArray[np.void],
+        detections: Detections,
+        classes: NDArray[np.void],
+        beta: NDArray[np.float64],
+    ) -> NDArray[np.void]:
+        """Begin tracks at the detections that probably belong to none; ``classes`` are those of the detections."""
+        own = np.flatnonzero((beta[:, 1:].sum(axis=0) < 0.5) & (detections.logits >= classes["birth_logit"]))
+        if not len(own):
+            return tracks
+        joined = np.zeros(len(tracks) + len(own), TRACK)  # np.concatenate takes ten times as long with named fields
+        joined[: len(tracks)] = tracks
+        born = Detections._make(field[own] for field in detections)
+        fill_newborn(self._next_id, born, classes[own], joined[len(tracks) :])
+        return joined
+
     def _living(self, tracks: NDArray[np.void]) -> NDArray[np.void]:
         """Tracks to keep: above `LEAST_EXISTENCE`, and at most ``max_tracks`` of them."""
         stays = tracks["existence"] > LEAST_EXISTENCE
@@ -410,6 +353,120 @@ class Tracker:
             rank = np.argsort(-tracks["existence"], kind="stable")
             tracks = tracks[np.sort(rank[: self._max_tracks])]
         return tracks
+
+
+# Fields of records go to kernels as copies: of a single record a field is contiguous, of several it is not, and numba
+# would compile a kernel for each layout in memory.
+
+
+def _predictions(tracks: NDArray[np.void], classes: NDArray[np.void], dt: float) -> Predictions:
+    """Interaction and prediction of each motion model."""
+    n = len(tracks)
+    mixed, mixed_covariances, prior = np.empty((n, 3, 5)), np.empty((n, 3, 5, 5)), np.empty((n, 3))
+    stay = np.exp(-dt / classes["keep_motion_s"])
+    states, covariances, modes = (tracks[field].copy() for field in ("states", "covariances", "modes"))
+    fill_interaction(states, covariances, modes, stay, mixed, mixed_covariances, prior)
+    means, predicted = np.empty_like(mixed), np.empty_like(mixed_covariances)
+    fill_predictions(mixed, mixed_covariances, classes["noise"].copy(), dt, means, predicted)
+    return Predictions(means, predicted, prior)
+
+
+def _combined(
+    states: NDArray[np.float64], covariances: NDArray[np.float64], modes: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Combination: state (n, 5) and covariance (n, 5, 5) of tracks over their motion models."""
+    state, covariance = np.empty((len(states), 5)), np.empty((len(states), 5, 5))
+    fill_combined(states, covariances, modes, state, covariance)
+    return state, covariance
+
+
+def _detections(
+    given: NDArray[np.float64],
+    fronts: NDArray[np.float64],
+    kinds: NDArray[np.int64],
+    groups: NDArray[np.int64],
+    pose: NDArray[np.float64],
+) -> Detections:
+    """The checked boxes (m, 8) in the world frame."""
+    places, heights = _in_world(given, pose)
+    shapes = given[:, 2:6].copy()
+    shapes[:, 0] = heights
+    ranges = np.hypot(given[:, 0], given[:, 1])
+    return Detections(places, shapes, _logit(given[:, 7]), fronts, kinds, groups, ranges, np.arange(len(given)))
+
+
+def _farther(state: NDArray[np.float64], classes: NDArray[np.void], pose: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Factor of the standard deviations of detections at the distance of each track, (n,)."""
+    return np.asarray(1.0 + np.hypot(state[:, 0] - pose[0, 3], state[:, 1] - pose[1, 3]) / classes["range_m"])
+
+
+def _associated(
+    predictions: Predictions, gates: Gates, detections: Detections
+) -> tuple[NDArray[np.float64], NDArray[np.float64], int]:
+    """Data association: likelihoods (n, 3, m), probabilities (n, m + 1), number of approximated tracks."""
+    n, m = len(predictions.means), len(detections.places)
+    likelihoods, weights, beta = np.empty((n, 3, m)), np.empty((n, m)), np.empty((n, m + 1))
+    fill_likelihoods(predictions, gates, detections, likelihoods, weights)
+    return likelihoods, beta, fill_association(weights, MAX_EVENTS, beta)
+
+
+def _update_motion(
+    tracks: NDArray[np.void],
+    predictions: Predictions,
+    sigmas: NDArray[np.float64],
+    places: NDArray[np.float64],
+    likelihoods: NDArray[np.float64],
+    beta: NDArray[np.float64],
+) -> None:
+    """Mode probability update with the update of each motion, and combination."""
+    means, predicted, prior = predictions
+    shares, modes = np.empty((len(tracks), 3, beta.shape[1])), np.empty_like(prior)
+    fill_mode_probabilities(prior, likelihoods, beta, shares, modes)
+    states, covariances = np.empty_like(means), np.empty_like(predicted)
+    fill_updates(means, predicted, places, sigmas, shares, states, covariances)
+    tracks["states"], tracks["covariances"], tracks["modes"] = states, covariances, modes
+    tracks["state"], tracks["covariance"] = _combined(states, covariances, modes)
+
+
+def _update_shapes(
+    tracks: NDArray[np.void],
+    detections: Detections,
+    beta: NDArray[np.float64],
+    sigmas: NDArray[np.float64],
+    dt: float,
+) -> None:
+    """Smooth the heights and sizes; ``sigmas`` (n, 4) are those of a detection [m]."""
+    shape, variance = tracks["shape"].copy(), tracks["shape_variance"].copy()
+    update_shapes(beta, detections.shapes, sigmas, SHAPE_WALK_M * math.sqrt(dt), shape, variance)
+    tracks["shape"], tracks["shape_variance"] = shape, variance
+
+
+def _update_evidence(
+    tracks: NDArray[np.void],
+    classes: NDArray[np.void],
+    detections: Detections,
+    beta: NDArray[np.float64],
+    pose: NDArray[np.float64],
+    dt: float,
+) -> None:
+    """Collect what the scan says of fronts, labels and existence."""
+    state, fronts = tracks["state"].copy(), tracks["fronts"].copy()
+    speed_sigma = np.sqrt(np.maximum(tracks["covariance"][:, 2, 2], 0.0))
+    moving_mps = classes["moving_mps"].copy()
+    update_fronts(state, speed_sigma, moving_mps, beta, detections.places, detections.fronts, fronts)
+    tracks["fronts"] = fronts
+    hidden = np.zeros(len(tracks))
+    fill_hidden(state, tracks["shape"].copy(), beta[:, 0] < 0.5, pose[:2, 3].copy(), hidden)
+    update_lives(tracks, classes, beta, hidden, detections.logits, detections.kinds, dt)
+
+
+def _scores(
+    tracks: NDArray[np.void], strength: NDArray[np.float64], classes: NDArray[np.void], pose: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Log odds (n,) of the reported scores."""
+    away = np.hypot(tracks["state"][:, 0] - pose[0, 3], tracks["state"][:, 1] - pose[1, 3]) / classes["range_m"]
+    scores = strength + classes["latest"] * (tracks["last_logit"] - strength)
+    return np.asarray(scores + (classes["far_logit"] * away - classes["coasting_logit"] * tracks["misses"]))
 
 
 def _checked_boxes(boxes: Iterable[Box]) -> tuple[NDArray[np.float64], NDArray[np.float64], list[str]]:

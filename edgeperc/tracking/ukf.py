@@ -33,24 +33,16 @@ def fill_predictions(
 ) -> None:
     """Predict each motion model of each track with sigma points (KUL-Seg's "prediction").
 
-    Parameters
-    ----------
-    states : (n, 3, 5) float64
-        State for each motion model: constant velocity, CTRV, random motion.
-    covariances : (n, 3, 5, 5) float64
-    noise : (n, 5) float64
-        Standard deviations: acceleration [m/s2], turn acceleration [rad/s2], random walk of the place [m/s^0.5], of the
-        heading [rad/s^0.5], and speed of random motion [m/s].
-    dt : float
-        Time step [s], not negative.
-    means : (n, 3, 5) float64, overwritten
-    predicted : (n, 3, 5, 5) float64, overwritten
-        Covariances, with additive process noise.
-
-    Notes
-    -----
     The sigma points are x, and x plus and minus each column of the Cholesky root of (n + kappa) P. Their weights are
     kappa / (n + kappa) and 1 / (2 (n + kappa)), with n = 5 and kappa = 1.
+
+    states : (n, 3, 5) float64; state for each motion model: constant velocity, CTRV, random motion.
+    covariances : (n, 3, 5, 5) float64
+    noise : (n, 5) float64; standard deviations: acceleration [m/s2], turn acceleration [rad/s2], random walk of the
+        place [m/s^0.5], of the heading [rad/s^0.5], and speed of random motion [m/s].
+    dt : time step [s], not negative.
+    means : (n, 3, 5) float64, overwritten
+    predicted : (n, 3, 5, 5) float64, overwritten; covariances, with additive process noise.
     """
     points = np.empty((11, 5))
     root = np.empty((5, 5))
@@ -150,24 +142,17 @@ def fill_updates(
 ) -> None:
     """Update each motion model of each track with all detections, weighted by their association (PDA filter).
 
-    Parameters
-    ----------
-    means, predicted
-        From `fill_predictions`.
-    detections : (m, 3) float64
-        x, y [m], heading [rad], in the frame of the states.
-    sigmas : (n, 3) float64
-        Standard deviations of a detection along and across its heading [m] and of its heading [rad].
-    beta : (n, 3, m + 1) float64
-        For each motion model, as in `edgeperc.tracking.jpda.fill_association`.
-    states : (n, 3, 5) float64, overwritten
-    covariances : (n, 3, 5, 5) float64, overwritten
-
-    Notes
-    -----
     The measurement is part of the state, so the unscented cross-covariance and innovation covariance are exactly
     columns and a block of the predicted covariance. Headings are compared modulo pi, and deviations are
     limited to three standard deviations, as in `edgeperc.tracking.jpda.fill_likelihoods`.
+
+    means, predicted : from `fill_predictions`.
+    detections : (m, 3) float64; x, y [m], heading [rad], in the frame of the states.
+    sigmas : (n, 3) float64; standard deviations of a detection along and across its heading [m] and of its heading
+        [rad].
+    beta : (n, 3, m + 1) float64; for each motion model, as in `edgeperc.tracking.jpda.fill_association`.
+    states : (n, 3, 5) float64, overwritten
+    covariances : (n, 3, 5, 5) float64, overwritten
     """
     innovation = np.empty((3, 3))
     inverse = np.empty((3, 3))

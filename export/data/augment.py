@@ -4,7 +4,7 @@ stay correct."""
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import chain
 
@@ -49,12 +49,8 @@ AHEAD_SLOPE, AHEAD_MARGIN_M = 1.43, 2.0
 class ObjectBank:
     """Objects cut out of labeled scans, to paste into others (ground-truth sampling of SECOND; Yan et al., 2018).
 
-    Attributes
-    ----------
-    objects : dict of str to list of (Box, (n, 4) float32)
-        Label -> boxes and the points in them.
-    classes : tuple of str
-        Classes of points that pasted objects get, the background first.
+    objects : dict of str to list of (Box, (n, 4) float32); label -> boxes and the points in them.
+    classes : classes of points that pasted objects get, the background first.
     """
 
     objects: dict[str, list[tuple[Box, NDArray[np.float32]]]]
@@ -325,44 +321,52 @@ def facing(scan: LabeledScan, rng: np.random.Generator) -> float:
     return float(rng.uniform(-0.6, 0.6) - np.arctan2(box.center[1], box.center[0]))
 
 
+@dataclass(frozen=True, slots=True)
+class Augmentation:
+    """How scans are changed at random.
+
+    n_pasted : mean number of objects to paste.
+    odds : how often each kind is pasted; None: equally often.
+    turn_to_rare : share of the scans labeled on all sides that are turned to a pedestrian or cyclist.
+    turn_anywhere : share of the remaining ones that are turned by any angle.
+    weather : share of scans in bad weather.
+    n_negatives : mean number of pieces of background to paste.
+    negatives : how often each kind is pasted.
+    half_beams : share of scans of which every second beam is left.
+    tilt_deg : standard deviation of the errors of roll and pitch [deg]; the errors are at most twice as large.
+    no_remission : share of scans whose remission is the constant that stands for a missing one.
+    """
+
+    n_pasted: float = 0.0
+    odds: Mapping[str, float] | None = None
+    turn_to_rare: float = 0.0
+    turn_anywhere: float = 0.0
+    weather: float = 0.0
+    n_negatives: float = 0.0
+    negatives: Mapping[str, float] = field(default_factory=lambda: NEGATIVES)
+    half_beams: float = 0.0
+    tilt_deg: float = 0.0
+    no_remission: float = 0.0
+
+
 def augmented(
     scan: LabeledScan,
     rng: np.random.Generator,
-    *,
+    how: Augmentation = Augmentation(),  # it is immutable
     bank: ObjectBank | None = None,
-    n_pasted: float = 0.0,
-    odds: Mapping[str, float] | None = None,
-    turn_to_rare: float = 0.0,
-    turn_anywhere: float = 0.0,
-    weather: float = 0.0,
-    n_negatives: float = 0.0,
-    negatives: Mapping[str, float] = NEGATIVES,
-    half_beams: float = 0.0,
-    tilt_deg: float = 0.0,
-    no_remission: float = 0.0,
 ) -> LabeledScan:
     """The scan turned, mirrored, thinned, shifted in height and scaled in remission, all at random.
 
     A scan that is labeled on all sides (simulation) faces forwards or backwards along the street. Other scans are
     turned by a few degrees only.
 
-    rng : np.random.Generator
-    n_pasted : mean number of objects to paste.
-    odds : mapping of str to float; how often each kind is pasted; by default equally often.
-    turn_to_rare : share of the scans labeled on all sides that are turned to a pedestrian or cyclist instead.
-    turn_anywhere : share of the remaining ones that are turned by any angle.
-    weather : share of scans in bad weather.
-    n_negatives : mean number of pieces of background to paste.
-    negatives : mapping of str to float; how often each kind is pasted.
-    half_beams : share of scans of which every second beam is left.
-    tilt_deg : standard deviation of the errors of roll and pitch [deg]; the errors are at most twice as large.
-    no_remission : share of scans whose remission is the constant that stands for a missing one.
+    bank : objects to paste.
     """
     full = scan.azimuths[1] - scan.azimuths[0] >= 2.0 * np.pi
     angle = rng.normal(0.0, np.radians(5.0))
-    if full and rng.random() < turn_to_rare:
+    if full and rng.random() < how.turn_to_rare:
         angle = facing(scan, rng)
-    elif full and turn_anywhere > 0.0 and rng.random() < turn_anywhere:
+    elif full and how.turn_anywhere > 0.0 and rng.random() < how.turn_anywhere:
         angle = rng.uniform(-np.pi, np.pi)
     elif full and rng.random() < 0.5:
         angle += np.pi
@@ -373,25 +377,25 @@ def augmented(
     x, y = scan.points[:, 0], scan.points[:, 1]
     ahead = np.abs(y) < AHEAD_SLOPE * x + AHEAD_MARGIN_M
     scan = replace(scan, points=scan.points[ahead], labels=scan.labels[ahead])
-    if bank is not None and n_pasted + n_negatives > 0.0:
-        kinds = odds or {name: 1.0 for name in bank.objects if name not in NEGATIVES}
+    if bank is not None and how.n_pasted + how.n_negatives > 0.0:
+        kinds = how.odds or {name: 1.0 for name in bank.objects if name not in NEGATIVES}
         shares: dict[str, float] = {}
-        for n, group in ((n_pasted, kinds), (n_negatives, negatives)):
+        for n, group in ((how.n_pasted, kinds), (how.n_negatives, how.negatives)):
             total = sum(group.values())
             shares |= {name: n * share / total for name, share in group.items()}
-        scan = pasted(scan, bank, rng, int(rng.poisson(n_pasted + n_negatives)), shares)
-    if rng.random() < weather:
+        scan = pasted(scan, bank, rng, int(rng.poisson(how.n_pasted + how.n_negatives)), shares)
+    if rng.random() < how.weather:
         scan = weathered(scan, rng)
-    if rng.random() < half_beams:
+    if rng.random() < how.half_beams:
         scan = halved(scan)
     points, labels = scan.points, scan.labels
     if rng.random() < 0.3:
         kept = rng.random(len(points)) < rng.uniform(0.75, 1.0)
         points, labels = points[kept], labels[kept]
-    roll, pitch = np.radians(tilt_deg) * np.clip(rng.normal(size=2), -MAX_TILT_SIGMAS, MAX_TILT_SIGMAS)
+    roll, pitch = np.radians(how.tilt_deg) * np.clip(rng.normal(size=2), -MAX_TILT_SIGMAS, MAX_TILT_SIGMAS)
     scan = tilted(replace(scan, points=points, labels=labels), roll, pitch, float(rng.normal(0.0, 0.04)))
     gain, offset = np.exp(rng.normal(0.0, 0.15)), rng.normal(0.0, 0.02)
     scan.points[:, 3] = np.clip(scan.points[:, 3] * np.float32(gain) + np.float32(offset), 0.0, 1.0)
-    if rng.random() < no_remission:
+    if rng.random() < how.no_remission:
         scan.points[:, 3] = NO_REMISSION.coefficients[0]
     return scan

@@ -27,27 +27,16 @@ CAMERA_AZIMUTHS = (-0.70, 0.69)  # KITTI's left color camera sees 41.2 degrees t
 class LabeledScan:
     """A scan and its ground truth.
 
-    Attributes
-    ----------
-    points : (n, 4) float32
-        x, y, z [m] in the frame of the models, remission in 0..1.
-    labels : (n,) uint8
-        The network's classes (PointSeg's, unless others are asked for), `IGNORE` where unknown.
-    boxes : tuple of Box
-    counts : tuple of int
-        Number of returns from each box.
-    surface : (500, 500) uint8
-        0 background, 1 drivable, `IGNORE` unknown, over `SURFACE`, as it was before ``turn`` and ``mirrored``.
-    azimuths : tuple of 2 float
-        Smallest and largest azimuth of the labeled sector [rad], counterclockwise from +x.
-    turn : float
-        Angle by which the points were turned about +z [rad].
-    mirrored : bool
-        Whether left and right were swapped after that turn.
-    sensor : SensorProfile or None
-        The sensor of the scan; None: the one that the models are trained for.
-    boxes_known : bool
-        Whether the objects in the labeled sector have boxes; False if only points are labeled.
+    points : (n, 4) float32; x, y, z [m] in the frame of the models, remission in 0..1.
+    labels : (n,) uint8; the network's classes (PointSeg's, unless others are asked for), `IGNORE` where unknown.
+    counts : number of returns from each box.
+    surface : (500, 500) uint8; 0 background, 1 drivable, `IGNORE` unknown, over `SURFACE`, as it was before ``turn``
+        and ``mirrored``.
+    azimuths : tuple of 2 float; smallest and largest azimuth of the labeled sector [rad], counterclockwise from +x.
+    turn : angle by which the points were turned about +z [rad].
+    mirrored : whether left and right were swapped after that turn.
+    sensor : the sensor of the scan; None: the one that the models are trained for.
+    boxes_known : whether the objects in the labeled sector have boxes; False if only points are labeled.
     """
 
     points: NDArray[np.float32]

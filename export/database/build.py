@@ -47,16 +47,10 @@ if TYPE_CHECKING:
 class Report:
     """The result of a build.
 
-    Attributes
-    ----------
-    scenes, made, kept : int
-        Number of scenes in the database; number made by this build; number already finished.
-    skipped : dict of str to str
-        Name of each scene left out -> the reason.
-    scores : dict
-        Scores of the road model on the drawn roads, by split: F1, accuracy, precision, recall.
-    notes : tuple of str
-        Remarks on the inputs, such as drawn scenes that do not exist.
+    scenes, made, kept : number of scenes in the database; number made by this build; number already finished.
+    skipped : dict of str to str; name of each scene left out -> the reason.
+    scores : scores of the road model on the drawn roads, by split: F1, accuracy, precision, recall.
+    notes : remarks on the inputs, such as drawn scenes that do not exist.
     """
 
     scenes: int

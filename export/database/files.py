@@ -94,22 +94,12 @@ def vehicles(boxes: Iterable[Box]) -> tuple[Box, ...]:
 def road_and_vehicles(road: NDArray[Any], boxes: Iterable[Box]) -> NDArray[np.uint8]:
     """The map of a scene (section 3.8): the road, with the vehicles drawn over it.
 
-    Parameters
-    ----------
-    road : (400, 200) bool or integer
-        1 road, 0 other ground.
-    boxes : iterable of Box
-        From `vehicles`.
-
-    Returns
-    -------
-    (400, 200) uint8
-        Index into `CLASSES`.
-
-    Notes
-    -----
     A cell belongs to a vehicle if its center lies in the vehicle's rectangle. This is the paper's rotated box, without
     the holes left by rotating whole pixels. Where two vehicles overlap, the nearer one is drawn.
+
+    road : (400, 200) bool or integer; 1 road, 0 other ground.
+    boxes : from `vehicles`.
+    Returns (400, 200) uint8: Index into `CLASSES`.
     """
     labels = road.astype(np.uint8)
     draw_footprints(labels, boxes, VIEW, CLASSES)
@@ -160,16 +150,10 @@ def read_png(path: Path) -> NDArray[np.uint8]:
 class TopViewScene:
     """One scene of the database.
 
-    Attributes
-    ----------
-    name, drive, split : str
-    fold : int or None
-        None for test scenes.
+    fold : None for test scenes.
     image : (400, 200, 3) uint8
-    boxes : tuple of Box
-        Their z and height are 0.
-    map : (400, 200) uint8
-        Index into `CLASSES`.
+    boxes : their z and height are 0.
+    map : (400, 200) uint8; index into `CLASSES`.
     """
 
     name: str
@@ -189,28 +173,12 @@ class TopViewScene:
 class TopViewDatabase:
     """A finished database: a sequence of `TopViewScene`, read one at a time.
 
-    Parameters
-    ----------
-    root : Path or str
-        Folder written by ``edgeperc-export database-build``.
-    split : str
-        ``"all"``, ``"train"``, ``"validation"`` or ``"test"``.
-    fold : int, optional
-        Validation is this fold, and training the other four. Without it, validation is empty.
-
-    Attributes
-    ----------
-    manifest : dict
-        Content of ``manifest.json``.
-    rows : list of dict of str to str
-        The lines of the index that belong to the split.
-
-    Raises
-    ------
-    DatabaseError
-        ``root`` holds no finished database, one of another format, or an index that does not match the manifest.
-    ValueError
-        The split or the fold is unknown.
+    root : folder written by ``edgeperc-export database-build``.
+    split : ``"all"``, ``"train"``, ``"validation"`` or ``"test"``.
+    fold : validation is this fold, and training the other four. Without it, validation is empty.
+    manifest : content of ``manifest.json``.
+    rows : list of dict of str to str; the lines of the index that belong to the split.
+    Raises DatabaseError, ValueError.
     """
 
     def __init__(self, root: Path | str, split: str = "all", fold: int | None = None) -> None:

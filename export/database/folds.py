@@ -26,7 +26,7 @@ from ..data.scans import LabeledScan
 from ..recipe import Recipe
 from ..release.to_onnx import export, write_card
 from ..training.samples import RealScans
-from ..training.train import train
+from ..training.train import Data, train
 from .files import N_FOLDS
 
 
@@ -34,13 +34,8 @@ from .files import N_FOLDS
 class DrawnScene:
     """A scene with a drawn road.
 
-    Attributes
-    ----------
-    fold : int
-    road : list
-        COCO segmentations of the drawn road.
-    inputs : str
-        Key of the scene's input files, from `edgeperc_export.database.scenes.inputs_of`.
+    road : COCO segmentations of the drawn road.
+    inputs : key of the scene's input files, from `edgeperc_export.database.scenes.inputs_of`.
     """
 
     fold: int
@@ -85,7 +80,7 @@ def train_folds(objects: KittiObjects, drawn: Mapping[str, DrawnScene], recipe: 
         scans, watched = _labeled(objects, trained_on), _labeled(objects, held_out)
         hashes = {name: scan_hash(scan.points) for name, scan in scans.items()}
         given = RealScans([*scans.values()], hashes, [*watched.values()])
-        checkpoint = train(recipe, work / key, kitti=None, simulated=None, given=given)
+        checkpoint = train(recipe, work / key, Data(given=given))
         fitness = FitnessProfile.from_scans(scan.points for scan in scans.values())
         proof = [scan.points for scan in scans.values()][:4]
         export(checkpoint, model, scans=proof, fitness=fitness, name=name)

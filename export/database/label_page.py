@@ -60,34 +60,16 @@ HEADERS = {
 class LabelServer(ThreadingHTTPServer):
     """The server of the page, on 127.0.0.1; ``serve_forever`` runs it.
 
-    Parameters
-    ----------
-    root : Path
-        A finished database.
-    polygons : Path
-        COCO file to write; its polygons are read if it exists.
-    kitti : Path, optional
-        Object set whose ``training/image_2`` holds camera pictures.
-    port : int
-        0 takes any free port.
-
-    Attributes
-    ----------
-    url : str
-        Address of the page.
-    token : str
-        Random; every write has it in the header ``X-Edgeperc-Token``.
-    hosts : set of str
-        The ``Host`` headers that are answered: of 127.0.0.1 and of localhost.
-    roads, drafts : dict of str to list
-        Polygons of the drawn scenes, and of scenes with an unconfirmed draft. A scene is in one of them at most.
-
-    Raises
-    ------
-    DatabaseError
-        ``root`` is not a finished database, or ``polygons`` holds run lengths, which the page cannot draw.
-    OSError
-        The port is taken.
+    root : a finished database.
+    polygons : COCO file to write; its polygons are read if it exists.
+    kitti : object set whose ``training/image_2`` holds camera pictures.
+    port : 0 takes any free port.
+    url : address of the page.
+    token : random; every write has it in the header ``X-Edgeperc-Token``.
+    hosts : the ``Host`` headers that are answered: of 127.0.0.1 and of localhost.
+    roads, drafts : dict of str to list; polygons of the drawn scenes, and of scenes with an unconfirmed draft. A
+        scene is in one of them at most.
+    Raises DatabaseError, OSError.
     """
 
     daemon_threads = True

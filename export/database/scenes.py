@@ -44,19 +44,14 @@ TRAIN, TRAINED = "train", ("road/models", ".build/road")
 class Plan:
     """Settings of a database.
 
-    Attributes
-    ----------
-    kitti, out : Path
-        Folders of the KITTI object set and of the database. All computers of a Ray cluster need them at these paths.
-    road_by : str
-        Source of the roads that are not drawn by hand: the name of a shipped model, the path of an .onnx with a card,
-        or ``"train"``: a model for each fold, trained on the drawn roads of the other folds.
-    sensor : str
-        Sensor of the scans, as `edgeperc.Perceiver` takes it.
-    provider : str
-        As `edgeperc.Perceiver` takes it. With ``"auto"`` the provider, and so the roads, may change between builds.
-    variations : int
-        Number of variations of each drawn training scene (section 3.4).
+    kitti, out : folders of the KITTI object set and of the database. All computers of a Ray cluster need them at
+        these paths.
+    road_by : source of the roads that are not drawn by hand: the name of a shipped model, the path of an .onnx with a
+        card, or ``"train"``: a model for each fold, trained on the drawn roads of the other folds.
+    sensor : sensor of the scans, as `edgeperc.Perceiver` takes it.
+    provider : as `edgeperc.Perceiver` takes it. With ``"auto"`` the provider, and so the roads, may change between
+        builds.
+    variations : number of variations of each drawn training scene (section 3.4).
     """
 
     kitti: Path
@@ -75,14 +70,9 @@ class Plan:
 class Job:
     """One scene to make.
 
-    Attributes
-    ----------
-    name, drive, grade, split : str
-        As in the index.
-    fold : int or None
-        None for test scenes.
-    road : list or None
-        COCO segmentations of the drawn road; None if none is drawn.
+    name, drive, grade, split : as in the index.
+    fold : None for test scenes.
+    road : COCO segmentations of the drawn road; None if none is drawn.
     """
 
     name: str

@@ -46,18 +46,12 @@ class Bottleneck(nn.Module):
 class CamSeg(nn.Module):
     """Labels an image at a quarter of its resolution.
 
-    Parameters
-    ----------
-    n_channels, n_classes : int
-        Channels of the input; classes of the output.
-    dropout : float
-        Probability of dropping a channel before the last convolution.
-    early : bool
-        In training, also return early logits from the encoder, (B, n_classes, H/8, W/8) and (B, n_classes, H/16, W/16).
-
-    Notes
-    -----
     In: (B, n_channels, H, W) float32; H and W divisible by 4. Out: logits (B, n_classes, H/4, W/4) float32.
+
+    n_channels, n_classes : channels of the input; classes of the output.
+    dropout : probability of dropping a channel before the last convolution.
+    early : in training, also return early logits from the encoder, (B, n_classes, H/8, W/8) and (B, n_classes, H/16,
+        W/16).
     """
 
     def __init__(self, *, n_channels: int = 3, n_classes: int = 11, dropout: float = 0.1, early: bool = False) -> None:

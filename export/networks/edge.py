@@ -83,17 +83,11 @@ def spread(x: Tensor, block: tuple[int, int]) -> Tensor:
 class PointSegEdge(nn.Module):
     """Labels every pixel of a range image, like `PointSeg`, with 1.0 instead of 7.2 GMAC.
 
-    Parameters
-    ----------
-    n_channels, n_classes : int
-        Channels of the input; classes of the output.
-    width : float
-        Factor of the numbers of channels in between.
-
-    Notes
-    -----
     In: (B, n_channels, 64, 512) float32; any height divisible by 4 and width divisible by 8.
     Out: logits (B, 4, 64, 512) float32.
+
+    n_channels, n_classes : channels of the input; classes of the output.
+    width : factor of the numbers of channels in between.
     """
 
     block = EDGE_BLOCKS["pointseg"]
@@ -119,19 +113,12 @@ class SSADNetEdge(nn.Module):
 
     It takes 1.4 instead of 8.9 GMAC.
 
-    Parameters
-    ----------
-    n_channels, n_classes : int
-        Channels of the input; classes of the segmentation map.
-    front : bool
-        Also predict which end of a vehicle is its front.
-    width : float
-        Factor of the numbers of channels in between.
-
-    Notes
-    -----
     In: (B, 3, 400, 200) float32; any height and width divisible by 8.
     Out: segmentation logits (B, 5, 400, 200) and boxes (B, 9 or 11, 100, 50), in the format of `DenseHead`, float32.
+
+    n_channels, n_classes : channels of the input; classes of the segmentation map.
+    front : also predict which end of a vehicle is its front.
+    width : factor of the numbers of channels in between.
     """
 
     block = EDGE_BLOCKS["ssadnet"]

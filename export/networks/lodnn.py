@@ -33,23 +33,14 @@ EDGE_DILATIONS = CONTEXT_DILATIONS[:-1]
 class LoDNN(nn.Module):
     """Labels every cell of a top view as road or not.
 
-    Parameters
-    ----------
-    n_channels : int
-        3 for LoDNN-I, 6 for LoDNN.
-    n_classes : int
-        Classes of the output.
-    context_width : int
-        Channels inside the context module; 128 in the papers, where the module takes 18.5 of 20.1 GMAC.
-    dropout : float
-        Probability of the spatial dropout in the context module.
-    batch_norm : bool
-        Add batch norm after every convolution but the last.
-
-    Notes
-    -----
     In: (B, n_channels, 400, 200) float32; any even height and width.
     Out: logits (B, n_classes, 400, 200) float32.
+
+    n_channels : 3 for LoDNN-I, 6 for LoDNN.
+    n_classes : classes of the output.
+    context_width : channels inside the context module; 128 in the papers, where the module takes 18.5 of 20.1 GMAC.
+    dropout : probability of the spatial dropout in the context module.
+    batch_norm : add batch norm after every convolution but the last.
     """
 
     def __init__(
@@ -95,17 +86,11 @@ class LoDNNEdge(nn.Module):
 
     It takes 0.73 instead of 20.1 GMAC.
 
-    Parameters
-    ----------
-    n_channels, n_classes : int
-        Channels of the input; classes of the output.
-    fine, context_width : int
-        Channels at half and at a quarter of the resolution.
-
-    Notes
-    -----
     In: (B, n_channels, 400, 200) float32; any height and width divisible by 4.
     Out: logits (B, n_classes, 400, 200) float32.
+
+    n_channels, n_classes : channels of the input; classes of the output.
+    fine, context_width : channels at half and at a quarter of the resolution.
     """
 
     def __init__(self, *, n_channels: int = 3, n_classes: int = 2, fine: int = 16, context_width: int = 48) -> None:

@@ -110,21 +110,14 @@ class Enlargement(nn.Module):
 class PointSeg(nn.Module):
     """Labels every pixel of a range image.
 
-    Parameters
-    ----------
-    n_channels, n_classes : int
-        Channels of the input; classes of the output.
-    enlargement_width : int
-        Channels of each branch of the enlargement layer.
-    dropout : float
-        Probability of dropping a channel before the last convolution, as in SqueezeSeg.
-    deep_supervision : bool
-        In training, also return early logits (B, n_classes, H, W/4), from the decoder at a quarter of the width.
-
-    Notes
-    -----
     In: (B, 5, 64, 512) float32; any height, and any width divisible by 16 (a full turn: 2048).
     Out: logits (B, 4, 64, 512) float32.
+
+    n_channels, n_classes : channels of the input; classes of the output.
+    enlargement_width : channels of each branch of the enlargement layer.
+    dropout : probability of dropping a channel before the last convolution, as in SqueezeSeg.
+    deep_supervision : in training, also return early logits (B, n_classes, H, W/4), from the decoder at a quarter of
+        the width.
     """
 
     def __init__(

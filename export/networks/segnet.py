@@ -41,16 +41,10 @@ def unpool(x: Tensor, positions: Tensor, size: tuple[int, int]) -> Tensor:
 class SegNet(nn.Module):
     """Labels every pixel of an image.
 
-    Parameters
-    ----------
-    n_channels, n_classes : int
-        Channels of the input; classes of the output.
-    dropout : float
-        Probability of dropping a value.
-
-    Notes
-    -----
     In: (B, n_channels, H, W) float32 of any size. Out: logits (B, n_classes, H, W) float32.
+
+    n_channels, n_classes : channels of the input; classes of the output.
+    dropout : probability of dropping a value.
     """
 
     def __init__(self, *, n_channels: int = 3, n_classes: int = 11, dropout: float = 0.0) -> None:

@@ -47,18 +47,12 @@ class ContextAggregation(nn.Module):
 class SqueezeSegV2(nn.Module):
     """Labels every pixel of a range image.
 
-    Parameters
-    ----------
-    n_channels, n_classes : int
-        Channels of the input; classes of the output.
-    dropout : float
-        Probability of dropping a channel before the last convolution.
-
-    Notes
-    -----
     In: (B, 5, 64, 512) float32; any height, and any width divisible by 16. Pixels without a return are 0 in every
     channel.
     Out: logits (B, 4, 64, 512) float32.
+
+    n_channels, n_classes : channels of the input; classes of the output.
+    dropout : probability of dropping a channel before the last convolution.
     """
 
     def __init__(self, *, n_channels: int = 5, n_classes: int = 4, dropout: float = 0.25) -> None:

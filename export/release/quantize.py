@@ -24,7 +24,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import onnx
@@ -85,16 +85,41 @@ class RefusedError(EdgepercError):
     """The int8 model is not faster on this computer, or less accurate; nothing was written."""
 
 
-def calibration_scans(
-    paths: Sequence[Path] = (), *, kitti: Path | None = None, n_simulated: int = 0
-) -> tuple[list[NDArray[np.float32]], list[str]]:
-    """Scans to calibrate on, and the hashes of the real ones.
+class Calibration(NamedTuple):
+    """What the ranges of tensors are measured on."""
+
+    scans: Sequence[NDArray[Any]]
+    """(n, 4) float32; of a camera's model images (H, W, 3) uint8."""
+    hashes: Sequence[str] = ()
+    """`scan_hash` or `image_hash` of the real ones, for the card: the model is never evaluated on them."""
+
+
+@dataclass(frozen=True, slots=True)
+class LabeledSets:
+    """What two models are compared on.
+
+    kitti : root of a KITTI object set: on its validation drives; the card's figures are of its test drives.
+    semantickitti : root of SemanticKITTI: on its roads.
+    camvid : folder of CamVid: on its validation images.
+    n_simulated : number of simulated scans, other than those of the calibration.
+    """
+
+    kitti: Path | None = None
+    semantickitti: Path | None = None
+    camvid: Path | None = None
+    n_simulated: int = 48
+
+
+Losses = Mapping[str, tuple[float, float, float, float]]
+"""Name of a score -> the score in fp32 and in int8, and the 95 % interval of the loss."""
+
+
+def calibration_scans(paths: Sequence[Path] = (), *, kitti: Path | None = None, n_simulated: int = 0) -> Calibration:
+    """Scans to calibrate on, the real ones first.
 
     paths : scans, or folders of ``.bin`` files.
     kitti : root of a KITTI object set; 64 scans of its training drives are taken, evenly spread.
     n_simulated : number of simulated scans.
-    Returns scans (list of (n, 4) float32): The real scans first.
-    Returns hashes: `edgeperc.datasets.kitti.scan_hash` of each real scan.
     Raises SplitError, PointsError.
     """
     files = [file for path in paths for file in (sorted(path.rglob("*.bin")) if path.is_dir() else [path])]
@@ -111,15 +136,15 @@ def calibration_scans(
     if not scans:
         asked = f"{len(paths)} paths, KITTI root {kitti}, {n_simulated} simulated scans"
         raise PointsError(f"no scan to calibrate on in {asked}; name scans, a root with training drives, or simulate")
-    return scans, [scan_hash(points) for points in real]
+    return Calibration(scans, [scan_hash(points) for points in real])
 
 
-def calibration_images(camvid: Path) -> tuple[list[NDArray[np.uint8]], list[str]]:
-    """64 training images of CamVid, evenly spread, and their `edgeperc.datasets.images.image_hash`."""
+def calibration_images(camvid: Path) -> Calibration:
+    """64 training images of CamVid, evenly spread."""
     data = LabeledImages(camvid)
     files = data.files("train")
     images = [data.read(file)[0] for file in files[:: max(1, len(files) // N_IMAGES)][:N_IMAGES]]
-    return images, [image_hash(image) for image in images]
+    return Calibration(images, [image_hash(image) for image in images])
 
 
 def _drive(file: Path) -> str | None:
@@ -458,21 +483,19 @@ def _scores(figures: Mapping[str, Mapping[str, Any]]) -> dict[str, float]:
     return {name: score for name, score in scores.items() if score is not None and np.isfinite(score)}
 
 
-def _compared(
-    before: Path, after: Path, kitti: Path | None, semantickitti: Path | None, n_simulated: int
-) -> list[dict[str, list[Record]]]:
+def _compared(before: Path, after: Path, labeled: LabeledSets) -> list[dict[str, list[Record]]]:
     """Counts of both models on KITTI's validation drives, on SemanticKITTI's roads and on simulated scans, by set."""
     judges = [Judge([path], boxes_from="network", rules=()) for path in (before, after)]
     read = judges[1]  # it was also calibrated on scans, which must not be among these
     truths: list[tuple[str, Callable[[], Truth]]] = [
-        ("simulated", partial(read.simulated, samples.FIRST_SEED + k)) for k in range(n_simulated)
+        ("simulated", partial(read.simulated, samples.FIRST_SEED + k)) for k in range(labeled.n_simulated)
     ]
-    if kitti is not None:
-        objects = KittiObjects(kitti)
+    if labeled.kitti is not None:
+        objects = KittiObjects(labeled.kitti)
         names = objects.names("validation") or objects.names("test")  # a set of other drives has no validation drives
         truths += [("real", partial(_later, read.kitti, objects.frame, name)) for name in names]
-    if semantickitti is not None and read.from_above is not None:
-        roads = SemanticKitti(semantickitti)
+    if labeled.semantickitti is not None and read.from_above is not None:
+        roads = SemanticKitti(labeled.semantickitti)
         truths += [("road", partial(_later, read.semantickitti, roads.frame, name)) for name in roads.names("all")]
     records: list[dict[str, list[Record]]] = [{}, {}]
     for block, make in tqdm(truths, desc="comparing", unit="scan"):
@@ -486,10 +509,8 @@ def _later(evaluate: Callable[[Any], Truth], read: Callable[[Any], Any], name: A
     return evaluate(read(name))
 
 
-def _losses(
-    before: Mapping[str, Sequence[Record]], after: Mapping[str, Sequence[Record]]
-) -> dict[str, tuple[float, float, float, float]]:
-    """Scores before and after, and the 95 % interval of the loss over resampled drives, by the name of the score.
+def _losses(before: Mapping[str, Sequence[Record]], after: Mapping[str, Sequence[Record]]) -> Losses:
+    """Compare the scores of both models; intervals are over resampled drives.
 
     Both models are resampled alike, because they err on the same scans. With one drive the interval is the loss itself.
     """
@@ -522,15 +543,11 @@ def _by_drive(records: Sequence[Record]) -> list[Record]:
 def quantize(
     path: Path,
     out: Path,
+    calibration: Calibration,
+    labeled: LabeledSets,
     *,
-    scans: Sequence[NDArray[Any]],
-    hashes: Sequence[str] = (),
-    kitti: Path | None = None,
-    semantickitti: Path | None = None,
-    camvid: Path | None = None,
     exclude: Sequence[str] = (),
     seven_bits: bool | None = None,
-    n_evaluated: int = 48,
     n_threads: int | None = None,
     max_noise: float = MAX_NOISE,
     race: Race = race,
@@ -540,88 +557,36 @@ def quantize(
     ``precision="auto"`` takes the variant only after `edgeperc_export.release.agree` has measured it.
 
     path, out : the model in fp32, and the .onnx to write.
-    scans : sequence of (n, 4) float32; to calibrate on, from `calibration_scans`; of a camera's model images (H, W,
-        3) uint8, from `calibration_images`.
-    hashes : hashes of the real scans. The card lists them, so that the model is never evaluated on these scans.
-    kitti : root of a KITTI object set. Both models are compared on its validation drives; the card's figures are of
-        its test drives.
-    semantickitti : root of SemanticKITTI; both models are evaluated on its roads.
-    camvid : folder of CamVid; both models are evaluated on its validation images.
+    calibration : from `calibration_scans` or, for a camera's model, `calibration_images`.
+    labeled : what both models are compared on.
     exclude : nodes to keep in fp32.
     seven_bits : use 7-bit weights. x86 without VNNI needs them, because its sums of 8-bit products saturate; None: if
         this computer needs them.
-    n_evaluated : number of simulated scans, other than those of the calibration, on which both models are evaluated.
     n_threads : for timing; None leaves it to onnxruntime.
     max_noise : largest noise of the outputs, as a share of their variance; above it, convolutions stay in fp32.
     race : two paths and ``n_threads`` -> times of paired runs of both models [ms].
     Raises RefusedError, ModelError, PointsError, OptionError.
     """
-    if not scans:
+    if not calibration.scans:
         raise PointsError("no scan to calibrate on; expected at least one")
-    session = Session(path, "cpu")
-    card = session.card
-    if card.view.kind == "camera" and camvid is None:
+    card = Session(path, "cpu").card
+    if card.view.kind == "camera" and labeled.camvid is None:
         raise OptionError(f"{path} is of a camera; give --camvid to calibrate and evaluate it on")
     if card.precision != "fp32":
         raise ModelError(f"{path} is in {card.precision}; quantize the model in fp32")
     seven_bits = _saturates() if seven_bits is None else seven_bits
-    tried: list[tuple[float, _Calibrated]] = []
-    for strength in STRENGTHS:
-        fp32 = _Calibrated.on(path, card, scans, seven_bits, strength)
-        candidates = _candidates(fp32.model.graph, exclude)
-        tried.append((fp32.noise(candidates), fp32))
-        if tried[-1][0] <= max_noise:
-            break
-    noise, fp32 = min(tried, key=lambda each: each[0])
-    chosen, noise = _choose(fp32, candidates, max_noise, noise)
-    model = fp32.rounded(chosen)
-    model.producer_name, model.producer_version = "edgeperc", ""
-    kept = [n.name for n in fp32.model.graph.node if n.op_type == "Conv" and n.name not in chosen]
-    training = dict(card.training)
-    frames = training.get("frames")
-    training |= {
-        "frames": {**dict(zip(hashes, hashes, strict=True)), **(frames if isinstance(frames, Mapping) else {})},
-        "quantized": {
-            "from": f"{card.name} {card.version}",
-            "graph_sha256": hashlib.sha256(onnx.load(path).graph.SerializeToString(deterministic=True)).hexdigest(),
-            "calibration": f"{len(hashes)} images of CamVid"
-            if card.view.kind == "camera"
-            else f"{len(hashes)} real and {len(scans) - len(hashes)} simulated scans",
-            "left_alone": kept,
-            "noise": noise,
-            "weight_bits": 7 if seven_bits else 8,
-        },
-    }
+    model, chosen, kept, noise = _rounded(path, card, calibration.scans, exclude, seven_bits, max_noise)
+    share = f"{len(chosen)} of {len(chosen) + len(kept)} convolutions in int8"
+    made = {"left_alone": kept, "noise": noise, "weight_bits": 7 if seven_bits else 8}
+    training = _training(path, card, calibration, made)
     card = replace(card, precision="int8", precisions={}, training=training, parity={}, metrics={})
     card = with_golden(model, card)
     trial = out.with_name(f".{out.name}.trial.onnx")
     try:
         write_card(model, card, trial)
-        share = f"{len(chosen)} of {len(chosen) + len(kept)} convolutions in int8"
-        one, other = race(path, trial, n_threads)
-        ratio, least, most = _ratio(one, other)
-        speed = (
-            f"{np.median(one):.1f} ms in fp32, {np.median(other):.1f} in int8, "
-            f"{ratio:.2f} times as long ({least:.2f} to {most:.2f})"
-        )
-        if most >= 1.0:
-            raise RefusedError(f"{path}: not faster here with {share}: {speed}; expected an interval below 1")
-        if card.view.kind == "camera":
-            assert camvid is not None
-            figures, before = (evaluate_images([camvid], each, split="validation") for each in (trial, path))
-            command = f"edgeperc eval CAMVID --split validation --model {out.name}"
-            fp32_scores, int8_scores = (_scores({"images": each["images"]}) for each in (before, figures))
-            lost = {
-                name: (score, own := int8_scores.get(name, 0.0), score - own) for name, score in fp32_scores.items()
-            }
-            losses = {name: (*each, each[2]) for name, each in lost.items()}
-        else:
-            losses = _losses(*_compared(path, trial, kitti, semantickitti, n_evaluated))
-            simulated = f"simulation:{n_evaluated}"
-            given = {"KITTI": kitti, "SEMANTICKITTI": semantickitti, simulated: simulated}
-            datasets = {name: root for name, root in given.items() if root is not None}
-            figures = evaluate([*datasets.values()], [trial], boxes_from="network", rules=())[0]
-            command = " ".join(["edgeperc eval", *datasets, f"--model {out.name}", "--no-agreement"])
+        speed = _speed(path, share, race(path, trial, n_threads))
+        camera = card.view.kind == "camera"
+        figures, losses = (_evaluated_on_images if camera else _evaluated_on_scans)(path, trial, out.name, labeled)
         lines = {
             name: f"{name} {score:.3f} to {own:.3f} (loss {low:.3f} to {high:.3f})"
             for name, (score, own, low, high) in losses.items()
@@ -629,7 +594,6 @@ def quantize(
         worse = [lines[name] for name, (score, own, low, _) in losses.items() if score - own > MAX_LOSS and low > 0.0]
         if worse:
             raise RefusedError(f"{path}: more than {MAX_LOSS} lost with {share}: {'; '.join(worse)} ({speed})")
-        figures["command"] = command
         worst = lines[max(losses, key=lambda name: losses[name][0] - losses[name][1])] if losses else "none"
         parity = {**_parity(path, trial), "speed": speed, "largest_loss": worst}
         card = replace(card, parity=parity, metrics=figures)
@@ -637,6 +601,77 @@ def quantize(
     finally:
         trial.unlink(missing_ok=True)
     return card
+
+
+def _rounded(
+    path: Path, card: ModelCard, scans: Sequence[NDArray[Any]], exclude: Sequence[str], seven_bits: bool, limit: float
+) -> tuple[onnx.ModelProto, list[str], list[str], float]:
+    """The model in int8, its convolutions in int8 and in fp32, and the noise of its outputs."""
+    tried: list[tuple[float, _Calibrated]] = []
+    for strength in STRENGTHS:
+        fp32 = _Calibrated.on(path, card, scans, seven_bits, strength)
+        candidates = _candidates(fp32.model.graph, exclude)
+        tried.append((fp32.noise(candidates), fp32))
+        if tried[-1][0] <= limit:
+            break
+    noise, fp32 = min(tried, key=lambda each: each[0])
+    chosen, noise = _choose(fp32, candidates, limit, noise)
+    model = fp32.rounded(chosen)
+    model.producer_name, model.producer_version = "edgeperc", ""
+    kept = [n.name for n in fp32.model.graph.node if n.op_type == "Conv" and n.name not in chosen]
+    return model, chosen, kept, noise
+
+
+def _training(path: Path, card: ModelCard, calibration: Calibration, made: Mapping[str, Any]) -> dict[str, Any]:
+    """What the card of the int8 model says of its training and of how it was ``made``."""
+    (scans, hashes), frames = calibration, card.training.get("frames")
+    return dict(card.training) | {
+        "frames": {**dict(zip(hashes, hashes, strict=True)), **(frames if isinstance(frames, Mapping) else {})},
+        "quantized": {
+            "from": f"{card.name} {card.version}",
+            "graph_sha256": hashlib.sha256(onnx.load(path).graph.SerializeToString(deterministic=True)).hexdigest(),
+            "calibration": f"{len(hashes)} images of CamVid"
+            if card.view.kind == "camera"
+            else f"{len(hashes)} real and {len(scans) - len(hashes)} simulated scans",
+            **made,
+        },
+    }
+
+
+def _speed(path: Path, share: str, times: tuple[NDArray[np.float64], NDArray[np.float64]]) -> str:
+    """The times of both models in words. Raises RefusedError if int8 is not faster."""
+    one, other = times
+    ratio, least, most = _ratio(one, other)
+    speed = (
+        f"{np.median(one):.1f} ms in fp32, {np.median(other):.1f} in int8, "
+        f"{ratio:.2f} times as long ({least:.2f} to {most:.2f})"
+    )
+    if most >= 1.0:
+        raise RefusedError(f"{path}: not faster here with {share}: {speed}; expected an interval below 1")
+    return speed
+
+
+def _evaluated_on_images(path: Path, trial: Path, name: str, labeled: LabeledSets) -> tuple[dict[str, Any], Losses]:
+    """Figures of the int8 model on CamVid's validation images, and what it loses."""
+    assert labeled.camvid is not None
+    figures, before = (evaluate_images([labeled.camvid], each, split="validation") for each in (trial, path))
+    fp32_scores, int8_scores = (_scores({"images": each["images"]}) for each in (before, figures))
+    losses = {
+        each: (score, own := int8_scores.get(each, 0.0), score - own, score - own)
+        for each, score in fp32_scores.items()
+    }
+    return figures | {"command": f"edgeperc eval CAMVID --split validation --model {name}"}, losses
+
+
+def _evaluated_on_scans(path: Path, trial: Path, name: str, labeled: LabeledSets) -> tuple[dict[str, Any], Losses]:
+    """Figures of the int8 model on the test drives, and what it loses on the validation drives."""
+    losses = _losses(*_compared(path, trial, labeled))
+    simulated = f"simulation:{labeled.n_simulated}"
+    given = {"KITTI": labeled.kitti, "SEMANTICKITTI": labeled.semantickitti, simulated: simulated}
+    datasets = {name: root for name, root in given.items() if root is not None}
+    figures = evaluate([*datasets.values()], [trial], boxes_from="network", rules=())[0]
+    command = " ".join(["edgeperc eval", *datasets, f"--model {name}", "--no-agreement"])
+    return figures | {"command": command}, losses
 
 
 def _parity(path: Path, rounded: Path) -> dict[str, float]:

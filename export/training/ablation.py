@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from ..recipe import MODELS, PAPER, Recipe
-from .train import train
+from .train import Data, Run, train
 
 VARIANTS: Mapping[str, Mapping[str, Mapping[str, Any]]] = {
     "pointseg": {
@@ -69,22 +69,19 @@ SHIPPED = {"pointseg": "pointseg-full", "ssadnet": "ssadnet-full", "lodnn": "lod
 def ablate(
     network: str,
     out: Path,
+    data: Data,
+    run: Run,
     *,
-    kitti: Path,
-    simulated: Path,
-    start_from: Path | None,
-    fold: int,
     steps: int,
     variants: Sequence[str] = (),
-    n_threads: int | None = None,
 ) -> list[dict[str, Any]]:
     """Run variants and add their figures to ``out/ablation.json``; variants with figures there are not run again.
 
     network : ``"pointseg"``, ``"ssadnet"`` or ``"lodnn"``.
     out : folder for the runs and ``ablation.json``.
-    kitti, simulated : as for `edgeperc_export.training.train.train`.
-    start_from : checkpoint of the network's ``-sim`` model; None for ``"lodnn"``, which has none.
-    fold, steps : fold to evaluate on; training steps of each run, for the shipped model's batch size.
+    data : with the fold to evaluate on.
+    run : starts from the checkpoint of the network's ``-sim`` model; ``"lodnn"`` has none.
+    steps : training steps of each run, for the shipped model's batch size.
     variants : names in `VARIANTS`, or `PAPERS`; by default all of them.
     Returns: ``network``, ``variant``, ``fold``, ``steps``, number of ``scans`` drawn, and ``figures`` at the end of
         the run.
@@ -99,27 +96,24 @@ def ablate(
     if unknown := [variant for variant in variants if variant not in known]:
         raise ValueError(f"{network} has no variant {unknown[0]!r}; expected one of: {'; '.join(known)}")
     for variant in variants or known:
-        if (network, variant, fold, steps) in done:
+        if (network, variant, data.fold, steps) in done:
             continue
         changes = dict(VARIANTS[network].get(variant, {}))
-        teacher = start_from if changes.pop("teacher", False) else None
+        teacher = run.start_from if changes.pop("teacher", False) else None
         n_scans = steps * shipped.batch * changes.pop("scans", 1.0)
         recipe: Recipe = replace(shipped, **changes)
-        start: Path | None = start_from
+        start = run.start_from
         if variant == PAPERS:
             recipe, start = replace(PAPER[network], context_width=shipped.context_width), None
         recipe = replace(recipe, steps=max(1, int(n_scans) // recipe.batch))  # the same number of scans
-        folder = out / f"{network}-{fold}-{steps}-{'-'.join(variant.split())}"
-        train(
-            recipe, folder, kitti=kitti, simulated=simulated, fold=fold, start_from=start, teacher=teacher,
-            n_threads=n_threads, checkpoint_every=recipe.steps,
-        )  # fmt: skip
+        folder = out / f"{network}-{data.fold}-{steps}-{'-'.join(variant.split())}"
+        train(recipe, folder, data, replace(run, start_from=start, teacher=teacher, checkpoint_every=recipe.steps))
         last = json.loads((folder / "log.jsonl").read_text().splitlines()[-1])
         rows.append(
             {
                 "network": network,
                 "variant": variant,
-                "fold": fold,
+                "fold": data.fold,
                 "steps": steps,
                 "scans": recipe.steps * recipe.batch,
                 "figures": last["validation"],

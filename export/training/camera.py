@@ -33,11 +33,7 @@ COARSE_STRIDE, LOVASZ_STRIDE, EARLY_STRIDE = 2, 4, 4
 class Camera:
     """A class for every pixel of an image.
 
-    Attributes
-    ----------
-    recipe : Recipe
-    card : ModelCard
-        View, input, classes and outputs, as the exported model has them.
+    card : view, input, classes and outputs, as the exported model has them.
     """
 
     recipe: Recipe

@@ -29,7 +29,7 @@ from ..recipe import PAPER
 from .camera import Camera
 from .checkpoint import build_network, read_checkpoint
 from .images import camvid_samples, confusions, read_camvid
-from .train import train
+from .train import Data, Run, train
 
 ELEVEN: Mapping[str, tuple[str, float]] = {
     "U-Net ReLU": ("unet", 0.0),
@@ -120,7 +120,7 @@ def ablate_camvid(
     width, height : size that images are scaled to for training and inference. Labels are compared at their own size.
     epochs, batch : the budget of each network: this many times all training images, in steps of ``batch`` images.
     learning_rate : by default the recipe's.
-    compiled : as for `edgeperc_export.training.train.train`.
+    compiled : as for `edgeperc_export.training.train.Run`.
     Returns: For each network its name, ``budget``, `FIGURES`, ``miou_interval``, ``iou`` of each class,
         ``parameters``, ``seconds`` and ``curve``.
     Raises ValueError.
@@ -154,18 +154,10 @@ def ablate_camvid(
             raise ValueError(f"{path} has results of the budget {other[0]['budget']}; give it, or an empty folder")
         if any(row["name"] == name for row in rows):
             continue
-        run, began = out / "runs" / "-".join([network, f"{dropout:g}"]), time.monotonic()
-        checkpoint = train(
-            recipe,
-            run,
-            kitti=None,
-            simulated=None,
-            camvid=camvid,
-            n_threads=n_threads,
-            compiled=compiled,
-            checkpoint_every=max(recipe.steps // N_POINTS, n_images // batch, 1),
-            save_every_s=60.0,
-        )
+        folder, began = out / "runs" / "-".join([network, f"{dropout:g}"]), time.monotonic()
+        every = max(recipe.steps // N_POINTS, n_images // batch, 1)
+        run = Run(n_threads=n_threads, compiled=compiled, checkpoint_every=every, save_every_s=60.0)
+        checkpoint = train(recipe, folder, Data(camvid=camvid), run)
         seconds = time.monotonic() - began
         task = Camera.of(recipe)
         state = read_checkpoint(checkpoint, device)

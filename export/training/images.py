@@ -37,14 +37,9 @@ VALIDATION_BATCH = 8
 class ImageSet(NamedTuple):
     """Images and their labels.
 
-    Attributes
-    ----------
-    hashes : dict of str to str
-        Name of each image -> its `edgeperc.datasets.images.image_hash`.
-    images : (n, 3, H, W) uint8
-        Red, green, blue.
-    labels : (n, H, W) uint8
-        Indices into `edgeperc.simulation.street.CAMERA_CLASSES`; `IGNORE` where unlabeled.
+    hashes : dict of str to str; name of each image -> its `edgeperc.datasets.images.image_hash`.
+    images : (n, 3, H, W) uint8; red, green, blue.
+    labels : (n, H, W) uint8; indices into `edgeperc.simulation.street.CAMERA_CLASSES`; `IGNORE` where unlabeled.
     """
 
     hashes: dict[str, str]
@@ -141,19 +136,9 @@ def augmented_images(images: Tensor, labels: Tensor, rng: np.random.Generator) -
 class ImageSamples:
     """Batches of images, each drawn once in an epoch, in random order.
 
-    Parameters
-    ----------
-    task : Camera
-    images : ImageSet
-        To train on, of the size of the task's view, on the device that trains.
-
-    Attributes
-    ----------
-    n_targets : int
-        Number of arrays of a batch that are targets.
-    simulated : tuple
-    odds : dict
-        Always empty: there are no simulated images, and none is drawn more often.
+    images : to train on, of the size of the task's view, on the device that trains.
+    n_targets : number of arrays of a batch that are targets.
+    odds : always empty: there are no simulated images, and none is drawn more often.
     """
 
     n_targets = 1

@@ -30,12 +30,8 @@ class RankError(EdgepercError):
 class Ranks:
     """The processes of a run: one, or those of ``torchrun``, which sets ``RANK``, ``WORLD_SIZE`` and ``LOCAL_RANK``.
 
-    Attributes
-    ----------
-    rank, world : int
-        Number of this process, and of all.
-    device : torch.device
-        The GPU of this process, or the CPU.
+    rank, world : number of this process, and of all.
+    device : torch.device; the GPU of this process, or the CPU.
     """
 
     def __init__(self) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -21,7 +20,7 @@ from edgeperc.inference.projection import make_projector
 from edgeperc.simulation.samples import IGNORE
 from edgeperc.simulation.scene import POINT_CLASSES
 
-from ..data.augment import NEGATIVES, ObjectBank, augmented, swapped, with_ground_ahead
+from ..data.augment import NEGATIVES, Augmentation, ObjectBank, augmented, swapped, with_ground_ahead
 from ..data.processes import CONTEXT
 from ..data.roads import drawn_roads, sure_surface, with_road
 from ..data.scan_sets import seen_by_network
@@ -46,30 +45,15 @@ RECENT_SAMPLES = 2048
 class Samples:
     """Network inputs and targets, from real and simulated scans.
 
-    Parameters
-    ----------
-    recipe : Recipe
-    real : sequence of LabeledScan
-    real_weights : sequence of float
-        How often each real scan is drawn, relative to the others.
-    simulated : sequence of Path
-        Files written by `LabeledScan.save`.
-    teacher : OnnxTeacher, optional
-        Its answers come with the samples.
-    n_workers : int
-        Number of processes that cut out the objects to paste; 0: this one.
-
-    Attributes
-    ----------
-    n_targets : int
-        Number of arrays of a batch that are targets; the first is the input, those after the targets are the teacher's.
-    odds : dict of str to (n,) float64
-        How often each ``"real"`` and each ``"simulated"`` scan is drawn beside its weight (`redraw`).
-
-    Raises
-    ------
-    ValueError
-        There are neither real nor simulated scans.
+    real_weights : how often each real scan is drawn, relative to the others.
+    simulated : files written by `LabeledScan.save`.
+    teacher : its answers come with the samples.
+    n_workers : number of processes that cut out the objects to paste; 0: this one.
+    n_targets : number of arrays of a batch that are targets; the first is the input, those after the targets are the
+        teacher's.
+    odds : dict of str to (n,) float64; how often each ``"real"`` and each ``"simulated"`` scan is drawn beside its
+        weight (`redraw`).
+    Raises ValueError.
     """
 
     def __init__(
@@ -99,6 +83,18 @@ class Samples:
         self.paste_odds |= {name: OWN_ODDS for name in recipe.classes[1:] if name not in POINT_CLASSES}
         # A top view's road goes on under a pole, but not through a wall.
         self.negatives = NEGATIVES if recipe.task == "points" else {"pole": 1.0}
+        self.augmentation = Augmentation(
+            n_pasted=recipe.n_pasted,
+            odds=self.paste_odds,
+            turn_to_rare=recipe.turn_to_rare,
+            turn_anywhere=recipe.turn_anywhere,
+            weather=recipe.weather,
+            n_negatives=recipe.n_negatives,
+            negatives=self.negatives,
+            half_beams=recipe.half_beams,
+            tilt_deg=recipe.tilt_deg,
+            no_remission=recipe.no_remission,
+        )
         self.bank: ObjectBank | None = None
         if max(recipe.n_pasted, recipe.n_negatives) > 0.0:
             stride = max(1, len(simulated) // BANK_SCANS)
@@ -155,24 +151,9 @@ class Samples:
         scan = self._scan(rng)
         if not recipe.augment:
             return scan
-        change = partial(
-            augmented,
-            rng=rng,
-            bank=self.bank,
-            n_pasted=recipe.n_pasted,
-            odds=self.paste_odds,
-            turn_to_rare=recipe.turn_to_rare,
-            turn_anywhere=recipe.turn_anywhere,
-            weather=recipe.weather,
-            n_negatives=recipe.n_negatives,
-            negatives=self.negatives,
-            half_beams=recipe.half_beams,
-            tilt_deg=recipe.tilt_deg,
-            no_remission=recipe.no_remission,
-        )
-        scan = change(scan)
+        scan = augmented(scan, rng, self.augmentation, self.bank)
         if self.task.swaps_sectors and rng.random() < recipe.swap:
-            other = change(self._scan(rng))
+            other = augmented(self._scan(rng), rng, self.augmentation, self.bank)
             scan = swapped(scan, other, rng) if other.sensor == scan.sensor else scan
         return scan
 
@@ -268,14 +249,9 @@ def _numbers(classes: Sequence[str]) -> NDArray[np.uint8]:
 class RealScans(NamedTuple):
     """Real scans with labels that are not in KITTI's files, for instance hand-drawn roads.
 
-    Attributes
-    ----------
-    scans : list of LabeledScan
-        Scans to train on.
-    hashes : dict of str to str
-        Name of each scan -> its `edgeperc.datasets.kitti.scan_hash`, for the card.
-    watched : list of LabeledScan
-        Scans to validate on.
+    scans : scans to train on.
+    hashes : dict of str to str; name of each scan -> its `edgeperc.datasets.kitti.scan_hash`, for the card.
+    watched : scans to validate on.
     """
 
     scans: list[LabeledScan]

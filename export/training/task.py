@@ -51,11 +51,7 @@ N_SLOTS = 16
 class Tally:
     """Counts of a network's labels and boxes compared with the ground truth.
 
-    Attributes
-    ----------
-    pixels : Confusion
-    boxes : BoxEvaluator or None
-        None if the network has no boxes.
+    boxes : None if the network has no boxes.
     """
 
     pixels: Confusion
@@ -78,16 +74,10 @@ class Tally:
 class Task(ABC):
     """The task of a recipe's network: its input, targets, loss and validation.
 
-    Attributes
-    ----------
-    recipe : Recipe
-    card : ModelCard
-        View, input, classes and outputs, as the exported model has them.
-    paste_odds : mapping of str to float
-        How often each kind of object is pasted into a training scan.
-    swaps_sectors : bool
-        Whether a sector of a scan may be replaced by another scan's. This replaces points and their labels, but
-        neither boxes nor the ground.
+    card : view, input, classes and outputs, as the exported model has them.
+    paste_odds : mapping of str to float; how often each kind of object is pasted into a training scan.
+    swaps_sectors : whether a sector of a scan may be replaced by another scan's. This replaces points and their
+        labels, but neither boxes nor the ground.
     """
 
     recipe: Recipe

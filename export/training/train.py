@@ -13,7 +13,7 @@ import os
 import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -50,30 +50,10 @@ VALIDATION_STRIDE = 6
 STATISTICS_BATCHES = 8
 
 
-def train(
-    recipe: Recipe,
-    out: Path,
-    *,
-    kitti: Path | None,
-    simulated: Path | None,
-    camvid: Path | None = None,
-    scan_sets: Sequence[ScanFolder] = (),
-    given: RealScans | None = None,
-    fold: int | None = None,
-    start_from: Path | None = None,
-    teacher: Path | None = None,
-    n_threads: int | None = None,
-    n_workers: int = 0,
-    compiled: bool = False,
-    checkpoint_every: int = 100,
-    save_every_s: float = 0.0,
-) -> Path:
-    """Train the network of a recipe, or resume its training.
+@dataclass(frozen=True, slots=True)
+class Data:
+    """What a network is trained on and watched on.
 
-    Under ``torchrun`` the processes share each batch (`training.ranks`): the samples are the same, and the
-    weights equal those of one process up to rounding. The first process writes the files; all read the checkpoint.
-
-    out : folder for ``checkpoint.pt`` and ``log.jsonl``. A checkpoint of the same recipe in it is resumed.
     kitti : folder of a KITTI object set. Frames of test drives are not used; validation drives are for the curve
         only. With a ``simulated_share`` of 1, all training drives are for validation only.
     simulated : folder of scans written by ``edgeperc-export simulate``.
@@ -82,8 +62,22 @@ def train(
     scan_sets : more real scans, of any sensor; their drives for training are trained on, those for validation are
         watched.
     given : real scans in place of those of ``kitti``.
-    fold : fold of the training drives to validate on instead of training on it. Every ``checkpoint_every`` steps the
-        averaged network is evaluated on it, and the best weights are kept (early stopping).
+    fold : fold of the training drives to validate on instead of training on it. At every checkpoint the averaged
+        network is evaluated on it, and the best weights are kept (early stopping).
+    """
+
+    kitti: Path | None = None
+    simulated: Path | None = None
+    camvid: Path | None = None
+    scan_sets: Sequence[ScanFolder] = ()
+    given: RealScans | None = None
+    fold: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """What a training run starts from, and how it is carried out.
+
     start_from : a checkpoint or an exported model (.onnx) whose weights a new run starts from. Weights that the
         networks do not share are ignored.
     teacher : a checkpoint or an exported model (.onnx) of the network to distil from. If the recipe does not distil:
@@ -96,193 +90,111 @@ def train(
         ``stop_after``.
     save_every_s : seconds between checkpoints, at least; the last one is always written. Large networks take seconds
         to write.
+    """
+
+    start_from: Path | None = None
+    teacher: Path | None = None
+    n_threads: int | None = None
+    n_workers: int = 0
+    compiled: bool = False
+    checkpoint_every: int = 100
+    save_every_s: float = 0.0
+
+
+def train(recipe: Recipe, out: Path, data: Data, run: Run | None = None) -> Path:
+    """Train the network of a recipe, or resume its training.
+
+    Under ``torchrun`` the processes share each batch (`training.ranks`): the samples are the same, and the
+    weights equal those of one process up to rounding. The first process writes the files; all read the checkpoint.
+
+    out : folder for ``checkpoint.pt`` and ``log.jsonl``. A checkpoint of the same recipe in it is resumed.
     Returns: The checkpoint.
     Raises ValueError, FloatingPointError, RankError.
     """
+    run = run or Run()
     ranks = Ranks()
-    ranks.check(recipe.batch, recipe.accumulate, compiled)
+    ranks.check(recipe.batch, recipe.accumulate, run.compiled)
     with ranks.together():
-        return _train(
-            recipe,
-            out,
-            ranks,
-            kitti=kitti,
-            simulated=simulated,
-            camvid=camvid,
-            scan_sets=scan_sets,
-            given=given,
-            fold=fold,
-            start_from=start_from,
-            teacher=teacher,
-            n_threads=n_threads,
-            n_workers=n_workers,
-            compiled=compiled,
-            checkpoint_every=checkpoint_every,
-            save_every_s=save_every_s,
-        )
+        return _train(recipe, out, data, run, ranks)
 
 
-def _train(
-    recipe: Recipe,
-    out: Path,
-    ranks: Ranks,
-    *,
-    kitti: Path | None,
-    simulated: Path | None,
-    camvid: Path | None,
-    scan_sets: Sequence[ScanFolder],
-    given: RealScans | None,
-    fold: int | None,
-    start_from: Path | None,
-    teacher: Path | None,
-    n_threads: int | None,
-    n_workers: int,
-    compiled: bool,
-    checkpoint_every: int,
-    save_every_s: float,
-) -> Path:
+def _train(recipe: Recipe, out: Path, data: Data, run: Run, ranks: Ranks) -> Path:
     """`train` in one of the ranks."""
+    # Settings.
     out.mkdir(parents=True, exist_ok=True)
-    if n_threads is not None:
-        torch.set_num_threads(n_threads)
-    device = ranks.device
+    checkpoint = out / "checkpoint.pt"
+    if run.n_threads is not None:
+        torch.set_num_threads(run.n_threads)
     torch.backends.cudnn.benchmark = True  # inputs have one size
-    if recipe.task == "camera":
-        data = _image_data(recipe, camvid, device)
-    else:
-        data = _scan_data(
-            recipe, device, kitti, simulated, scan_sets, given=given, fold=fold, teacher=teacher, n_workers=n_workers
-        )
-    task, samples, watch, hashes = data.task, data.samples, data.watch, data.hashes
-    teacher_network, n_real = data.teacher, data.n_real
+
+    # Data.
+    source = (_image_source if recipe.task == "camera" else _scan_source)(recipe, data, run, ranks.device)
+    samples, watch = source.samples, source.watch
+    epoch = max(1, source.n_real // recipe.batch)
+    every = epoch if recipe.stop_after else run.checkpoint_every
     # Where no real scan or image is trained on, or other scans are given, the validation decides which step is best.
-    stops = fold is not None or given is not None or recipe.simulated_share == 1.0 or recipe.stop_after > 0
-    epoch = max(1, n_real // recipe.batch)
-    if recipe.stop_after:
-        checkpoint_every = epoch
+    stops = data.fold is not None or data.given is not None or recipe.simulated_share == 1.0 or recipe.stop_after > 0
 
-    network = build(recipe)
-    before: list[dict[str, Any]] = []
-    checkpoint, step = out / "checkpoint.pt", 0
-    if start_from is not None and not checkpoint.exists():
+    # Model.
+    network, state = build(recipe), _State(hashes=source.hashes)
+    if run.start_from is not None and not checkpoint.exists():
         images = [torch.as_tensor(samples.batch(k)[0]).cpu() for k in range(STATISTICS_BATCHES)]
-        before, frames = start(network, recipe, start_from, images)
-        hashes = frames | hashes
-    network = network.to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]  # not in its stubs
+        state.before, frames = start(network, recipe, run.start_from, images)
+        state.hashes = frames | state.hashes
+    network = network.to(ranks.device, memory_format=torch.channels_last)  # type: ignore[call-overload]  # not in its stubs
     ranks.share(network)
-    averaged = copy.deepcopy(network).eval()
-    optimizer = _optimizer(recipe, network)
-    best, since_best, halvings = None, 0, 0
-    best_figure, lowest_loss = -1.0, math.inf
-    curve: list[dict[str, Any]] = []
-    if checkpoint.exists():
-        state = read_checkpoint(checkpoint, device)
-        if state["recipe"] != recipe:
-            raise ValueError(f"{checkpoint} is of another recipe: {state['recipe']}; give an empty folder")
-        before, curve, hashes = state["before"], state["curve"], state["frames"]
-        network.load_state_dict(state["network"])
-        averaged.load_state_dict(state["averaged"])
-        optimizer.load_state_dict(state["optimizer"])
-        step, best = state["step"], state["best"]
-        best_figure, lowest_loss, since_best, halvings = state["watched"]
-        samples.odds = {name: odds.cpu().numpy() for name, odds in state["odds"].items()}
-
-    def save() -> None:
-        with open_atomic(checkpoint) as file:
-            torch.save(
-                {
-                    "recipe": json.dumps(asdict(recipe)),
-                    "before": json.dumps(before),
-                    "step": step,
-                    "network": network.state_dict(),
-                    "averaged": averaged.state_dict(),
-                    "best": best,
-                    "watched": (best_figure, lowest_loss, since_best, halvings),
-                    "optimizer": optimizer.state_dict(),
-                    "curve": json.dumps(curve),
-                    "frames": json.dumps(hashes),
-                    "fold": -1 if fold is None else fold,
-                    "n_simulated": len(samples.simulated),
-                    "odds": {name: torch.from_numpy(odds) for name, odds in samples.odds.items()},
-                },
-                file,
-            )
-
     # The compiled network shares its weights with the original, which is averaged and saved.
-    forward = torch.compile(network) if compiled else network
-    progress = tqdm(total=recipe.steps, initial=step, desc=recipe.network, unit="step", disable=not ranks.is_first)
+    forward = torch.compile(network) if run.compiled else network
+    model = _Model(network, forward, copy.deepcopy(network).eval(), _optimizer(recipe, network))
+    if checkpoint.exists():
+        state = _resumed(checkpoint, recipe, model, samples, ranks.device)
+
+    # Loop.
+    progress = tqdm(
+        total=recipe.steps, initial=state.step, desc=recipe.network, unit="step", disable=not ranks.is_first
+    )
     losses: list[float] = []
     saved_s = time.monotonic()
     with (out / "log.jsonl" if ranks.is_first else Path(os.devnull)).open("a") as log, progress:
-        if isinstance(samples, ImageSamples):
-            batches: Iterator[Sequence[Tensor]] = samples.batches(step, _last(recipe, curve, epoch))
-        else:
-            batches = loaded(samples, step, recipe.steps, n_workers, ranks)
-        for arrays in batches:
-            for group in optimizer.param_groups:
-                group["lr"] = recipe.learning_rate * _schedule(recipe, step) * 0.5**halvings
-            torch.manual_seed((recipe.seed << 32) + step)
-            network.train()
-            if recipe.head_only:
-                network.segmentation.requires_grad_(False).eval()
-            optimizer.zero_grad(set_to_none=True)
-            total = torch.zeros((), device=device)
-            for inputs, *others in zip(*(array.chunk(recipe.accumulate) for array in arrays), strict=True):
-                x = ranks.part(inputs).contiguous(memory_format=torch.channels_last)
-                y = others[: samples.n_targets]
-                taught: tuple[Any, ...] = tuple(others[samples.n_targets :])
-                with torch.autocast(device.type, torch.bfloat16):
-                    outputs = ranks.whole(forward(x))
-                loss = task.loss(outputs, y)
-                if teacher_network is not None and recipe.distil > 0.0:
-                    taught = ranks.whole(teach(teacher_network, x, task.input, mirror=recipe.seen_twice))
-                if taught and isinstance(task, Task):
-                    loss = loss + recipe.distil * task.distillation(outputs, *taught)
-                loss = loss * (len(inputs) / len(arrays[0]))
-                torch.autograd.backward(loss)
-                total += loss.detach()
-            ranks.add_gradients(network)
-            losses.append(total.item())
-            if not math.isfinite(losses[-1]):
-                raise FloatingPointError(f"the loss is {losses[-1]} at step {step}; lower --learning-rate")
-            nn.utils.clip_grad_norm_(network.parameters(), 5.0)
-            optimizer.step()
-            step += 1
-            _average(averaged, network, min(recipe.ema, (1 + step) / (10 + step)))
+        for arrays in _batches(recipe, samples, state, epoch, run.n_workers, ranks):
+            losses.append(_step(recipe, source, model, state, arrays, ranks))
+            state.step += 1
+            _average(model.averaged, network, min(recipe.ema, (1 + state.step) / (10 + state.step)))
             progress.update()
             progress.set_postfix(loss=f"{losses[-1]:.3f}")
-            if isinstance(samples, Samples) and recipe.redraw_every and step % recipe.redraw_every == 0:
+            if isinstance(samples, Samples) and recipe.redraw_every and state.step % recipe.redraw_every == 0:
                 if ranks.is_first:
-                    samples.redraw(averaged, step)
+                    samples.redraw(model.averaged, state.step)
                 samples.odds = ranks.from_first(samples.odds)
-            if step % checkpoint_every == 0 or step == recipe.steps:
-                line: dict[str, Any] = {"step": step, "samples": step * recipe.batch}
-                line["loss"] = round(float(np.mean(losses)), 5)
-                losses.clear()
-                if watch is not None:
-                    validated = watch.validate(averaged) if ranks.is_first else None
-                    figure, watched_loss, figures = ranks.from_first(validated) or (0.0, 0.0, {})
-                    line |= {"validation_loss": round(watched_loss, 5), "validation": figures}
-                    if figure > best_figure and stops:
-                        best_figure, best = figure, copy.deepcopy(averaged.state_dict())
-                    since_best = 0 if watched_loss < lowest_loss else since_best + checkpoint_every
-                    lowest_loss = min(lowest_loss, watched_loss)
-                    if recipe.halve_after and since_best >= recipe.halve_after * epoch:
-                        halvings, since_best = halvings + 1, 0
-                curve.append(line)
-                log.write(json.dumps(line) + "\n")
-                log.flush()
-                over = step >= _last(recipe, curve, epoch)
-                if ranks.is_first and (over or time.monotonic() - saved_s >= save_every_s):
-                    save()
-                    saved_s = time.monotonic()
-                if over:
-                    break
+            if state.step % every and state.step != recipe.steps:
+                continue
+            line: dict[str, Any] = {"step": state.step, "samples": state.step * recipe.batch}
+            line["loss"] = round(float(np.mean(losses)), 5)
+            losses.clear()
+            if watch is not None:
+                validated = watch.validate(model.averaged) if ranks.is_first else None
+                figure, loss, figures = ranks.from_first(validated) or (0.0, 0.0, {})
+                line |= {"validation_loss": round(loss, 5), "validation": figures}
+                if figure > state.best_figure and stops:
+                    state.best_figure, state.best = figure, copy.deepcopy(model.averaged.state_dict())
+                state.since_best = 0 if loss < state.lowest_loss else state.since_best + every
+                state.lowest_loss = min(state.lowest_loss, loss)
+                if recipe.halve_after and state.since_best >= recipe.halve_after * epoch:
+                    state.halvings, state.since_best = state.halvings + 1, 0
+            state.curve.append(line)
+            log.write(json.dumps(line) + "\n")
+            log.flush()
+            over = state.step >= _last(recipe, state.curve, epoch)
+            if ranks.is_first and (over or time.monotonic() - saved_s >= run.save_every_s):
+                _save(checkpoint, recipe, model, state, samples, data.fold)
+                saved_s = time.monotonic()
+            if over:
+                break
     return checkpoint
 
 
-class _Data(NamedTuple):
-    """What a network is trained on and watched on."""
+class _Source(NamedTuple):
+    """What a network is trained on and watched on, read."""
 
     task: Task | Camera
     samples: Samples | ImageSamples
@@ -292,32 +204,133 @@ class _Data(NamedTuple):
     teacher: nn.Module | None = None
 
 
-def _image_data(recipe: Recipe, camvid: Path | None, device: torch.device) -> _Data:
+class _Model(NamedTuple):
+    """A network, what runs it, its averaged weights, and its optimizer."""
+
+    network: Any
+    forward: Any
+    averaged: nn.Module
+    optimizer: torch.optim.Optimizer
+
+
+@dataclass(slots=True)
+class _State:
+    """How far a run is; a checkpoint keeps it."""
+
+    hashes: dict[str, str]
+    before: list[dict[str, Any]] = field(default_factory=list)
+    curve: list[dict[str, Any]] = field(default_factory=list)
+    step: int = 0
+    best: dict[str, Any] | None = None
+    best_figure: float = -1.0
+    lowest_loss: float = math.inf
+    since_best: int = 0
+    halvings: int = 0
+
+
+def _step(
+    recipe: Recipe, source: _Source, model: _Model, state: _State, arrays: Sequence[Tensor], ranks: Ranks
+) -> float:
+    """One step of the optimizer on a batch; returns the loss."""
+    task, network, optimizer = source.task, model.network, model.optimizer
+    for group in optimizer.param_groups:
+        group["lr"] = recipe.learning_rate * _schedule(recipe, state.step) * 0.5**state.halvings
+    torch.manual_seed((recipe.seed << 32) + state.step)
+    network.train()
+    if recipe.head_only:
+        network.segmentation.requires_grad_(False).eval()
+    optimizer.zero_grad(set_to_none=True)
+    total = torch.zeros((), device=ranks.device)
+    for inputs, *others in zip(*(array.chunk(recipe.accumulate) for array in arrays), strict=True):
+        x = ranks.part(inputs).contiguous(memory_format=torch.channels_last)
+        y = others[: source.samples.n_targets]
+        taught: tuple[Any, ...] = tuple(others[source.samples.n_targets :])
+        with torch.autocast(ranks.device.type, torch.bfloat16):
+            outputs = ranks.whole(model.forward(x))
+        loss = task.loss(outputs, y)
+        if source.teacher is not None and recipe.distil > 0.0:
+            taught = ranks.whole(teach(source.teacher, x, task.input, mirror=recipe.seen_twice))
+        if taught and isinstance(task, Task):
+            loss = loss + recipe.distil * task.distillation(outputs, *taught)
+        loss = loss * (len(inputs) / len(arrays[0]))
+        torch.autograd.backward(loss)
+        total += loss.detach()
+    ranks.add_gradients(network)
+    found = float(total.item())
+    if not math.isfinite(found):
+        raise FloatingPointError(f"the loss is {found} at step {state.step}; lower --learning-rate")
+    nn.utils.clip_grad_norm_(network.parameters(), 5.0)
+    optimizer.step()
+    return found
+
+
+def _batches(
+    recipe: Recipe, samples: Samples | ImageSamples, state: _State, epoch: int, n_workers: int, ranks: Ranks
+) -> Iterator[Sequence[Tensor]]:
+    """The batches that are left."""
+    if isinstance(samples, ImageSamples):
+        return samples.batches(state.step, _last(recipe, state.curve, epoch))
+    return loaded(samples, state.step, recipe.steps, n_workers, ranks)
+
+
+def _save(
+    checkpoint: Path,
+    recipe: Recipe,
+    model: _Model,
+    state: _State,
+    samples: Samples | ImageSamples,
+    fold: int | None,
+) -> None:
+    with open_atomic(checkpoint) as file:
+        torch.save(
+            {
+                "recipe": json.dumps(asdict(recipe)),
+                "before": json.dumps(state.before),
+                "step": state.step,
+                "network": model.network.state_dict(),
+                "averaged": model.averaged.state_dict(),
+                "best": state.best,
+                "watched": (state.best_figure, state.lowest_loss, state.since_best, state.halvings),
+                "optimizer": model.optimizer.state_dict(),
+                "curve": json.dumps(state.curve),
+                "frames": json.dumps(state.hashes),
+                "fold": -1 if fold is None else fold,
+                "n_simulated": len(samples.simulated),
+                "odds": {name: torch.from_numpy(odds) for name, odds in samples.odds.items()},
+            },
+            file,
+        )
+
+
+def _resumed(
+    checkpoint: Path, recipe: Recipe, model: _Model, samples: Samples | ImageSamples, device: torch.device
+) -> _State:
+    """Load a checkpoint into the model and the samples."""
+    kept = read_checkpoint(checkpoint, device)
+    if kept["recipe"] != recipe:
+        raise ValueError(f"{checkpoint} is of another recipe: {kept['recipe']}; give an empty folder")
+    model.network.load_state_dict(kept["network"])
+    model.averaged.load_state_dict(kept["averaged"])
+    model.optimizer.load_state_dict(kept["optimizer"])
+    samples.odds = {name: odds.cpu().numpy() for name, odds in kept["odds"].items()}
+    return _State(kept["frames"], kept["before"], kept["curve"], kept["step"], kept["best"], *kept["watched"])
+
+
+def _image_source(recipe: Recipe, data: Data, run: Run, device: torch.device) -> _Source:
     """The training images of CamVid; the validation images are watched."""
-    if camvid is None:
+    if data.camvid is None:
         raise ValueError(f"no images to train {recipe.network} on; give --camvid")
     task = Camera.of(recipe)
-    samples, watch = camvid_samples(task, camvid, device)
-    return _Data(task, samples, watch, samples.images.hashes, len(samples.images.hashes))
+    samples, watch = camvid_samples(task, data.camvid, device)
+    return _Source(task, samples, watch, samples.images.hashes, len(samples.images.hashes))
 
 
-def _scan_data(
-    recipe: Recipe,
-    device: torch.device,
-    kitti: Path | None,
-    simulated: Path | None,
-    scan_sets: Sequence[ScanFolder],
-    *,
-    given: RealScans | None,
-    fold: int | None,
-    teacher: Path | None,
-    n_workers: int,
-) -> _Data:
-    """Real and simulated scans, and the teacher; parameters are those of `train`."""
-    task = task_of(recipe)
-    objects = KittiObjects(kitti) if kitti else None
+def _scan_source(recipe: Recipe, data: Data, run: Run, device: torch.device) -> _Source:
+    """Real and simulated scans, and the teacher."""
+    task, teacher, given = task_of(recipe), run.teacher, data.given
+    objects = KittiObjects(data.kitti) if data.kitti else None
     real, weights, hashes, watched = (
-        _real(recipe, objects, scan_sets, fold)
+        _real(recipe, objects, data.scan_sets, data.fold)
         if given is None
         else (given.scans, [1.0] * len(given.scans), given.hashes, given.watched)
     )
@@ -330,13 +343,13 @@ def _scan_data(
         raise ValueError(f"{teacher}: an exported teacher does not label scans; give its checkpoint.pt, or --distil")
     teacher_network = None if teacher is None or onnx_teacher else _teacher(teacher, task).to(device)
     if teacher_network is not None and objects is not None and recipe.distil == 0.0:
-        extra = unlabeled_scans(objects, fold)
+        extra = unlabeled_scans(objects, data.fold)
         real = pseudo_labeled(teacher_network.cpu(), task, [*real, *extra])
         weights += [len(extra) ** -0.5] * len(extra)
-    paths = sorted(simulated.glob("*.npz")) if simulated else []
-    samples = Samples(recipe, real, weights, paths, onnx_teacher, n_workers)
+    paths = sorted(data.simulated.glob("*.npz")) if data.simulated else []
+    samples = Samples(recipe, real, weights, paths, onnx_teacher, run.n_workers)
     watch = Watch(samples, watched) if watched else None
-    return _Data(task, samples, watch, hashes, len(real), teacher_network)
+    return _Source(task, samples, watch, hashes, len(real), teacher_network)
 
 
 def _real(

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 import twins.image as twins
 from edgeperc.camera.image import (
     MAX_EDGE,
+    Channels,
     ImageScaler,
     _between,
     _taps,
@@ -112,7 +113,7 @@ def test_scaling_matches_its_twins(size: tuple[int, int], channels: tuple[str, .
     out = scaled(image, 32, 24, spec)
     np.testing.assert_allclose(out, twins.scaled(image, view, spec), atol=2e-6 * 255)
     order = np.array([("red", "green", "blue").index(name) for name in channels], np.int32)
-    tables = (*_taps(size[0], 24), *_taps(size[1], 32), order, np.float32(spec.mean), np.float32(spec.std))
+    tables = _taps(size[0], 24), _taps(size[1], 32), Channels(order, np.float32(spec.mean), np.float32(spec.std))
     again, same = np.empty_like(out), np.empty_like(out)
     twins.fill_scaled(image.reshape(size[0], -1), *tables, again)
     fill_scaled(as_image(image).reshape(size[0], -1), *tables, same)

@@ -33,7 +33,15 @@ from edgeperc import (
     paint,
     road_ahead,
 )
-from edgeperc.camera.painting import MAX_CELLS, UNSEEN, fill_nearest, fill_painted
+from edgeperc.camera.painting import (
+    MAX_CELLS,
+    UNSEEN,
+    DepthBuffer,
+    Pixels,
+    Windows,
+    fill_nearest,
+    fill_painted,
+)
 from edgeperc.evaluation.painting import _beside_edges, count_painting
 from edgeperc.simulation.camera import CAMERA_CLASSES, VOID, CameraImage, forward_camera, render
 from edgeperc.simulation.drawn import random_scene
@@ -84,25 +92,24 @@ def test_kernels_equal_twins(seed: int, n: int) -> None:
     rng = np.random.default_rng(seed)
     points, u, v, depth, between, half_up, half_down = a_case(rng, n)
     half_side, cell_h, cell_w = float(rng.uniform(0.1, 5.0)), *rng.integers(1, 4, 2).tolist()
-    shape = (-(-48 // cell_h), -(-64 // cell_w))
-    buffer = np.empty(shape, np.float32)
-    windows = between, half_up, half_down, half_side, cell_h, cell_w
-    fill_nearest(points, u, v, depth, *windows, buffer)
-    slow = twins.painting.nearest(points, u, v, depth, *windows, shape, MAX_CELLS)
-    np.testing.assert_array_equal(buffer, slow)
-    assert np.isfinite(buffer).any() or n < 60
+    buffer = DepthBuffer(np.empty((-(-48 // cell_h), -(-64 // cell_w)), np.float32), cell_h, cell_w)
+    pixels, windows = Pixels(u, v, depth), Windows(between, half_up, half_down, half_side)
+    fill_nearest(points, pixels, windows, buffer)
+    slow = twins.painting.nearest(points, *pixels, *windows, cell_h, cell_w, buffer.nearest.shape, MAX_CELLS)
+    np.testing.assert_array_equal(buffer.nearest, slow)
+    assert np.isfinite(buffer.nearest).any() or n < 60
     labels = rng.integers(0, 256, (48, 64), np.uint8)
     painted = np.empty(n, np.uint8)
     slack = rng.uniform(0.0, 0.5), rng.uniform(0.0, 0.1)
-    fill_painted(labels, u, v, depth, buffer, cell_h, cell_w, *slack, painted)
-    slow = twins.painting.painted(labels, u, v, depth, buffer, cell_h, cell_w, *slack)
+    fill_painted(labels, pixels, buffer, *slack, painted)
+    slow = twins.painting.painted(labels, *pixels, *buffer, *slack)
     np.testing.assert_array_equal(painted, slow)
 
     # In any order, and the nearest point is never hidden.
     order = rng.permutation(n)
-    turned = np.empty_like(buffer)
-    fill_nearest(points[order], u[order], v[order], depth[order], *windows, turned)
-    np.testing.assert_array_equal(turned, buffer)
+    turned = buffer._replace(nearest=np.empty_like(buffer.nearest))
+    fill_nearest(points[order], Pixels(*(each[order] for each in pixels)), windows, turned)
+    np.testing.assert_array_equal(turned.nearest, buffer.nearest)
     first = np.argmin(np.where(np.isfinite(u), depth, np.inf)) if n else 0
     if n and math.isfinite(u[first]) and 0 <= u[first] < 63 and 0 <= v[first] < 47:
         assert painted[first] == labels[round(v[first]), round(u[first])]
@@ -112,9 +119,8 @@ def test_kernels_equal_twins(seed: int, n: int) -> None:
 def test_the_last_float_of_a_pixel() -> None:
     """0.49999999999999994 + 0.5 is 1.0, beside an image of one pixel."""
     last, painted = np.array([np.nextafter(0.5, 0.0)]), np.empty(1, np.uint8)
-    fill_painted(
-        np.array([[3]], np.uint8), last, last, np.ones(1), np.ones((1, 1), np.float32), 1, 1, 0.1, 0.0, painted
-    )
+    pixels, buffer = Pixels(last, last, np.ones(1)), DepthBuffer(np.ones((1, 1), np.float32), 1, 1)
+    fill_painted(np.array([[3]], np.uint8), pixels, buffer, 0.1, 0.0, painted)
     assert painted.tolist() == [3]
 
 
@@ -122,10 +128,10 @@ def test_the_last_float_of_a_pixel() -> None:
 def test_a_window_is_bounded() -> None:
     """A point that nearly touches the camera covers 49 x 49 cells at most."""
     points = np.array([[0.2701, 0.0, -0.08]], np.float32)
-    places = NEAR.project(points)
-    buffer = np.empty((480, 640), np.float32)
-    fill_nearest(points, *places, np.empty(0), np.full(1, 5.0), np.full(1, 5.0), 5.0, 1, 1, buffer)
-    assert 40**2 < np.count_nonzero(np.isfinite(buffer)) <= (2 * MAX_CELLS + 1) ** 2
+    buffer = DepthBuffer(np.empty((480, 640), np.float32), 1, 1)
+    windows = Windows(np.empty(0), np.full(1, 5.0), np.full(1, 5.0), 5.0)
+    fill_nearest(points, Pixels(*NEAR.project(points)), windows, buffer)
+    assert 40**2 < np.count_nonzero(np.isfinite(buffer.nearest)) <= (2 * MAX_CELLS + 1) ** 2
 
 
 # --- painting ---------------------------------------------------------------------------------------------------------

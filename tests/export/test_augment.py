@@ -20,6 +20,7 @@ from edgeperc.types.perception import Box
 from edgeperc_export.data.augment import (
     MAX_PERSON_RANGE_M,
     NEGATIVES,
+    Augmentation,
     ObjectBank,
     augmented,
     background_pieces,
@@ -183,7 +184,9 @@ def test_a_scan_labeled_on_all_sides_turns_anywhere(scan: LabeledScan) -> None:
     middle = np.array([scan.boxes[0].center[:2]])
 
     def turns(**how: float) -> np.ndarray:
-        seen = [augmented(scan, np.random.default_rng(seed), **how).boxes[0].center[:2] for seed in range(60)]
+        seen = [
+            augmented(scan, np.random.default_rng(seed), Augmentation(**how)).boxes[0].center[:2] for seed in range(60)
+        ]
         return np.abs(np.degrees(np.angle(np.array(seen) @ [1, 1j] / (middle @ [1, 1j]))))
 
     # A mirror changes only the sign of an angle, so an object ahead or behind shows how far the scan was turned.
@@ -196,8 +199,8 @@ def test_a_scan_labeled_on_all_sides_turns_anywhere(scan: LabeledScan) -> None:
 
 def test_the_same_draw_gives_the_same_scan(scan: LabeledScan) -> None:
     bank = ObjectBank.of([scan])
-    how = {"bank": bank, "n_pasted": 5.0, "turn_to_rare": 0.5, "weather": 0.5}
-    one, other = (augmented(scan, np.random.default_rng(9), **how) for _ in range(2))  # type: ignore[arg-type]
+    how = Augmentation(n_pasted=5.0, turn_to_rare=0.5, weather=0.5)
+    one, other = (augmented(scan, np.random.default_rng(9), how, bank) for _ in range(2))
     np.testing.assert_array_equal(one.points, other.points)
     np.testing.assert_array_equal(one.labels, other.labels)
     assert one.boxes == other.boxes
@@ -318,6 +321,6 @@ def test_a_tilted_scan_keeps_its_objects(scan: LabeledScan) -> None:
 
 def test_scans_without_remission_have_the_constant_of_the_runtime(scan: LabeledScan) -> None:
     rng = np.random.default_rng(0)
-    missing = augmented(scan, rng, no_remission=1.0)
+    missing = augmented(scan, rng, Augmentation(no_remission=1.0))
     assert (missing.points[:, 3] == np.float32(NO_REMISSION.coefficients[0])).all()
     assert np.ptp(augmented(scan, rng).points[:, 3]) > 0.1

@@ -17,6 +17,7 @@ Image = pytest.importorskip("PIL.Image")
 
 import torch.nn.functional as F
 from torch import nn
+from training_helpers import train
 
 from edgeperc.errors import ImageError, PointsError, SplitError
 from edgeperc.evaluation.camvid import evaluate_images
@@ -32,7 +33,7 @@ from edgeperc_export.networks.segnet import VGG_16, SegNet, unpool
 from edgeperc_export.networks.unet import UNet
 from edgeperc_export.recipe import MODELS, PAPER, Recipe
 from edgeperc_export.release.agree import agree
-from edgeperc_export.release.quantize import calibration_images, quantize
+from edgeperc_export.release.quantize import Calibration, LabeledSets, calibration_images, quantize
 from edgeperc_export.release.to_onnx import export, load, to_graph, verify
 from edgeperc_export.training.camera import Camera, class_weights
 from edgeperc_export.training.camvid import (
@@ -54,7 +55,7 @@ from edgeperc_export.training.images import (
     read_camvid,
 )
 from edgeperc_export.training.losses import _lovasz_at_once, cross_entropy, lovasz_softmax
-from edgeperc_export.training.train import _last, train
+from edgeperc_export.training.train import _last
 
 SMALL: dict[str, Any] = {"image_width": 48, "image_height": 36, "batch": 2, "steps": 4, "dropout": 0.0}
 
@@ -499,9 +500,8 @@ def test_int8_of_a_camera(trained: tuple[Path, Path], drawn: Path, tmp_path: Pat
     card = quantize(
         trained[1],
         tmp_path / "int8.onnx",
-        scans=images,
-        hashes=hashes,
-        camvid=drawn,
+        Calibration(images, hashes),
+        LabeledSets(camvid=drawn),
         race=race,
         max_noise=9.0,
     )

@@ -18,6 +18,7 @@ torch = pytest.importorskip("torch")
 onnx = pytest.importorskip("onnx")
 
 from torch import Tensor, nn
+from training_helpers import ablate, make, train
 
 from checkout import REPOSITORY
 from edgeperc import Perceiver
@@ -45,13 +46,13 @@ from edgeperc_export.recipe import MODELS, PAPER, SCAN_NETWORKS, TASKS, Recipe, 
 from edgeperc_export.release import to_onnx
 from edgeperc_export.release.models_page import models_page
 from edgeperc_export.release.to_onnx import ParityError, export, load, to_graph, verify, write_card
-from edgeperc_export.training.ablation import PAPERS, SHIPPED, VARIANTS, ablate, plot
+from edgeperc_export.training.ablation import PAPERS, SHIPPED, VARIANTS, plot
 from edgeperc_export.training.curve import curve_table
 from edgeperc_export.training.samples import Recent, Samples, loaded, real_scans
 from edgeperc_export.training.start import start
 from edgeperc_export.training.task import Task, task_of
 from edgeperc_export.training.teacher import OnnxTeacher, pseudo_labeled, teach, unlabeled_scans
-from edgeperc_export.training.train import _optimizer, _schedule, train
+from edgeperc_export.training.train import _optimizer, _schedule
 from edgeperc_export.training.watch import Watch
 
 
@@ -682,7 +683,7 @@ def test_make_also_makes_the_models_that_it_starts_from(
     monkeypatch.setattr(to_onnx, "MIN_AGREEMENT", 0.99)  # after so few steps, the logits of many pixels are close
     out = tmp_path / "out"
     arguments = {"kitti": kitti, "layouts": layouts, "n_threads": 1}
-    made = make_module.make("pointseg-full", out, fold=0, steps=1, **arguments)
+    made = make("pointseg-full", out, fold=0, steps=1, **arguments)
     assert made == out / "pointseg-full-fold0.onnx"
     assert evaluated == [[str(kitti), "simulation"]] * 2
     cards = [Session(path, "cpu").card for path in (out / "pointseg-sim.onnx", made)]
@@ -694,11 +695,11 @@ def test_make_also_makes_the_models_that_it_starts_from(
     ]
     assert cards[1].training["started_from"] == [cards[0].training["recipe"]]
     assert json.loads(made.with_suffix(".json").read_text())["real"]["n_frames"] == 1
-    taught = make_module.make("pointseg", out, fold=0, **arguments)
+    taught = make("pointseg", out, fold=0, **arguments)
     assert len(evaluated) == 3  # the teacher of this fold was made already
     assert taught.stat().st_size < 0.6 * made.stat().st_size
     with pytest.raises(ValueError, match="trained on real scans too; give --kitti and --layouts"):
-        make_module.make("pointseg", out, kitti=None, layouts=None)
+        make("pointseg", out, kitti=None, layouts=None)
 
 
 @pytest.mark.usefixtures("small_views")

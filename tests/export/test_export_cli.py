@@ -15,10 +15,11 @@ torch = pytest.importorskip("torch")
 onnx = pytest.importorskip("onnx")
 
 
+from training_helpers import ablate
+
 from edgeperc_export.cli import _recipe, build_parser, main
 from edgeperc_export.networks import build
 from edgeperc_export.recipe import MODELS, NETWORKS, Recipe
-from edgeperc_export.training.ablation import ablate
 
 
 def parsers(parser: argparse.ArgumentParser | None = None, name: str = "") -> Iterator[tuple[str, object]]:

@@ -27,7 +27,7 @@ from edgeperc.types.card import InputSpec, ModelCard, OutputSpec
 from edgeperc.types.views import RangeImageGeometry
 from edgeperc_export import cli
 from edgeperc_export.release import quantize as module
-from edgeperc_export.release.quantize import RefusedError, calibration_scans, quantize
+from edgeperc_export.release.quantize import Calibration, LabeledSets, RefusedError, calibration_scans, quantize
 from edgeperc_export.release.to_onnx import to_graph, with_golden, write_card
 
 
@@ -107,6 +107,7 @@ def timed(fp32_ms: float, int8_ms: float) -> Callable[..., tuple[np.ndarray, np.
     return race
 
 
+ONE = LabeledSets(n_simulated=1)
 FASTER = timed(10.0, 5.0)
 
 
@@ -123,7 +124,7 @@ def convolutions(path: Path) -> dict[str, int]:
 def test_inner_layers_become_int8_and_the_card_says_so(tmp_path: Path, small: Path, scans: list[np.ndarray]) -> None:
     out = tmp_path / "small-int8.onnx"
     before = Session(small).card
-    card = quantize(small, out, scans=scans, hashes=["f" * 16], n_evaluated=1, max_noise=9.0, race=FASTER)
+    card = quantize(small, out, Calibration(scans, ["f" * 16]), ONE, max_noise=9.0, race=FASTER)
     int8, fp32 = onnx.TensorProto.INT8, onnx.TensorProto.FLOAT
     assert convolutions(out) == {"stem": fp32, "down": int8, "context": int8, "merge": int8, "last": fp32}
     nodes = onnx.load(out).graph.node
@@ -141,7 +142,7 @@ def test_inner_layers_become_int8_and_the_card_says_so(tmp_path: Path, small: Pa
     assert set(card.training["frames"].values()) == {"f" * 16, "0123456789abcdef"}
     assert len(card.training["quantized"]["left_alone"]) == 2
     with pytest.raises(ModelError, match="quantize the model in fp32"):
-        quantize(out, out, scans=scans)
+        quantize(out, out, Calibration(scans), LabeledSets())
     assert card.parity["label_agreement"] > 0.9
     assert card.metrics["simulated"]["n_frames"] == 1
     assert [p.name for p in tmp_path.iterdir()] == ["small-int8.onnx"]
@@ -152,7 +153,7 @@ def test_weights_have_seven_bits_on_request(
     tmp_path: Path, small: Path, scans: list[np.ndarray], seven_bits: bool, most: int
 ) -> None:
     out = tmp_path / "int8.onnx"
-    card = quantize(small, out, scans=scans, n_evaluated=1, max_noise=9.0, seven_bits=seven_bits, race=FASTER)
+    card = quantize(small, out, Calibration(scans), ONE, max_noise=9.0, seven_bits=seven_bits, race=FASTER)
     weights = [onnx.numpy_helper.to_array(w) for w in onnx.load(out).graph.initializer]
     assert max(int(abs(w.astype(int)).max()) for w in weights if w.dtype == np.int8) == most
     assert card.training["quantized"]["weight_bits"] == (7 if seven_bits else 8)
@@ -166,7 +167,7 @@ def test_layers_that_rounding_harms_stay_in_fp32(
     if not equalized:
         monkeypatch.setattr(module, "STRENGTHS", (None,))
     path, out = written(Fragile(1e4), tmp_path / "spoilt.onnx"), tmp_path / "int8.onnx"
-    card = quantize(path, out, scans=scans, n_evaluated=1, race=FASTER)
+    card = quantize(path, out, Calibration(scans), ONE, race=FASTER)
     types = convolutions(out)
     assert types["good"] == onnx.TensorProto.INT8
     assert types["spoil"] == (onnx.TensorProto.INT8 if equalized else onnx.TensorProto.FLOAT)
@@ -176,7 +177,7 @@ def test_layers_that_rounding_harms_stay_in_fp32(
 def test_a_less_accurate_model_is_refused(tmp_path: Path, scans: list[np.ndarray]) -> None:
     path = written(Fragile(1e4), tmp_path / "spoilt.onnx")
     with pytest.raises(RefusedError, match=r"simulated car IoU 0\.\d+ to 0\.000"):
-        quantize(path, tmp_path / "int8.onnx", scans=scans, n_evaluated=1, max_noise=9.0, race=FASTER)
+        quantize(path, tmp_path / "int8.onnx", Calibration(scans), ONE, max_noise=9.0, race=FASTER)
     assert [p.name for p in tmp_path.iterdir()] == ["spoilt.onnx"]
 
 
@@ -187,7 +188,7 @@ def test_a_model_that_is_not_faster_is_refused(
     out = tmp_path / "int8.onnx"
     out.write_bytes(b"of another day")
     with pytest.raises(RefusedError, match=rf"not faster here .* 10\.0 ms in fp32, {int8_ms:.1f} in int8"):
-        quantize(small, out, scans=scans, max_noise=9.0, race=timed(10.0, int8_ms))
+        quantize(small, out, Calibration(scans), LabeledSets(), max_noise=9.0, race=timed(10.0, int8_ms))
     assert out.read_bytes() == b"of another day"
     assert [p.name for p in tmp_path.iterdir()] == ["int8.onnx"]
 
@@ -239,10 +240,10 @@ def test_the_race_runs_both_models_equally_often(small: Path) -> None:
 def test_excluded_nodes_stay_in_fp32(tmp_path: Path, small: Path, scans: list[np.ndarray]) -> None:
     out = tmp_path / "int8.onnx"
     name = next(n.name for n in onnx.load(small).graph.node if "down.weight" in n.input)
-    quantize(small, out, scans=scans, exclude=[name], n_evaluated=1, max_noise=9.0, race=FASTER)
+    quantize(small, out, Calibration(scans), ONE, exclude=[name], max_noise=9.0, race=FASTER)
     assert convolutions(out)["down"] == onnx.TensorProto.FLOAT
     with pytest.raises(ValueError, match="no node is called nothing"):
-        quantize(small, out, scans=scans, exclude=["nothing"], race=FASTER)
+        quantize(small, out, Calibration(scans), LabeledSets(), exclude=["nothing"], race=FASTER)
 
 
 def test_unpooling_is_not_rounded_on_one_side(tmp_path: Path, scans: list[np.ndarray]) -> None:
@@ -272,7 +273,7 @@ def test_no_scans_is_an_error(tmp_path: Path, small: Path, capsys: pytest.Captur
     assert cli.main(arguments) == 2
     assert "no scan to calibrate on in 1 paths" in capsys.readouterr().err
     with pytest.raises(PointsError, match="expected at least one"):
-        quantize(small, tmp_path / "o.onnx", scans=[])
+        quantize(small, tmp_path / "o.onnx", Calibration([]), LabeledSets())
 
 
 def test_calibration_never_sees_test_drives(tmp_path: Path, scans: list[np.ndarray]) -> None:
@@ -356,7 +357,7 @@ def test_the_shift_is_corrected_where_the_noise_is_above_the_limit(
     written = []
     for limit in (1.01 * noise, 0.99 * noise):
         quantized = quantize(
-            small, tmp_path / "int8.onnx", scans=scans, n_evaluated=1, max_noise=limit, race=FASTER
+            small, tmp_path / "int8.onnx", Calibration(scans), ONE, max_noise=limit, race=FASTER
         ).training["quantized"]
         written.append(quantized)
     assert written[0]["noise"] == pytest.approx(noise)

@@ -27,9 +27,9 @@ from pathlib import Path
 import torch
 from edgeperc.types.views import TopViewGeometry
 from edgeperc_export import cards
-from edgeperc_export.training import ranks
 from edgeperc_export.recipe import Recipe
-from edgeperc_export.training.train import train
+from edgeperc_export.training import ranks
+from edgeperc_export.training.train import Data, Run, train
 
 cards.RANGE_IMAGE = replace(
     cards.RANGE_IMAGE, row_elevations_deg=cards.RANGE_IMAGE.row_elevations_deg[::4], width=128
@@ -52,7 +52,7 @@ if dies == os.environ.get("RANK"):
     ranks.Ranks.add_gradients = dying
 for out, changes in json.loads(runs).items():
     recipe = Recipe(**{"steps": 6, "batch": 4, "context_width": 8, "redraw_every": 3, **changes})
-    train(recipe, Path(out), kitti=None, simulated=Path(simulated), n_threads=1, checkpoint_every=2)
+    train(recipe, Path(out), Data(simulated=Path(simulated)), Run(n_threads=1, checkpoint_every=2))
 """
 
 RUNS = {

@@ -26,7 +26,7 @@ from edgeperc.simulation.samples import simulated_scan
 from edgeperc.types.mounting import MODEL_MOUNTING
 from edgeperc_export.networks import build
 from edgeperc_export.recipe import Recipe
-from edgeperc_export.release.quantize import quantize
+from edgeperc_export.release.quantize import Calibration, LabeledSets, quantize
 from edgeperc_export.release.to_onnx import export
 from edgeperc_export.training.task import task_of
 
@@ -94,8 +94,8 @@ def test_from_training_to_the_vehicle(tmp_path: Path, scans: Sequence[NDArray[np
             quantize(
                 path,
                 rounded,
-                scans=scans,
-                n_evaluated=2,
+                Calibration(scans),
+                LabeledSets(n_simulated=2),
                 max_noise=9.0,
                 race=lambda *_: (10.0 + NOISE[0], 5.0 + NOISE[1]),
             )

@@ -163,7 +163,7 @@ def test_kinds_of_the_ground_equal_twin(n: int) -> None:
         xy = rng.uniform(-60.0, 60.0, (n, 2))
         xy[rng.random((n, 2)) < 0.02] = rng.choice([np.nan, np.inf, -np.inf, 1e300])
         kinds, remissions = np.empty(n, np.uint8), np.empty(n)
-        raycast.fill_ground_kinds(scene.strips, scene.terrain, scene.tile, xy, kinds, remissions)
+        raycast.fill_ground_kinds(scene.ground, xy, kinds, remissions)
         slow_kinds, slow_remissions = twins.simulation.ground_kinds(scene, xy)
         np.testing.assert_array_equal(kinds, slow_kinds)
         np.testing.assert_allclose(remissions, slow_remissions, rtol=1e-9)

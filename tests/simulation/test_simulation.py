@@ -16,7 +16,21 @@ from edgeperc.errors import PointsError
 from edgeperc.simulation import drawn, raycast
 from edgeperc.simulation.drawn import ENVIRONMENTS, random_scene
 from edgeperc.simulation.layouts import scene_from_boxes
-from edgeperc.simulation.raycast import BANK_SLOPE_LEFT, FACADE, GLASS, LEAVES, MATTE, PAINT, POROUS, ROUGH, ground_at
+from edgeperc.simulation.raycast import (
+    BANK_SLOPE_LEFT,
+    FACADE,
+    GLASS,
+    LEAVES,
+    MATTE,
+    PAINT,
+    POROUS,
+    ROUGH,
+    Hits,
+    Rays,
+    Receiver,
+    Shapes,
+    ground_at,
+)
 from edgeperc.simulation.roadside import add_cafe
 from edgeperc.simulation.samples import IGNORE, labels_by_boxes, simulated_scan
 from edgeperc.simulation.scene import (
@@ -102,19 +116,14 @@ def columns_of(bounds: np.ndarray, n_columns: int, reach: float) -> tuple[np.nda
 KEY = np.uint64(99)
 
 
-def cast(
-    scene: Scene, pose: np.ndarray, elevations: np.ndarray, azimuths: np.ndarray, reach: float
-) -> tuple[np.ndarray, tuple[np.ndarray, ...]]:
-    """Primitives in the sensor frame, nearest first; ranges, hits, exits and cosines of the rays."""
+def cast(scene: Scene, pose: np.ndarray, rays: Rays) -> tuple[np.ndarray, Hits]:
+    """Primitives in the sensor frame, nearest first; what the rays hit."""
     placed, bounds = placed_primitives(scene, pose)
-    starts, rows = columns_of(bounds, len(azimuths), reach)
-    shape = (len(elevations), len(azimuths))
-    ranges, exits, cosines, hits = np.empty(shape), np.empty(shape), np.empty(shape), np.empty(shape, np.int32)
-    raycast.fill_cast(
-        placed, bounds, starts, rows, scene.strips, scene.terrain, scene.tile, pose,
-        elevations, azimuths, reach, KEY, ranges, hits, exits, cosines,
-    )  # fmt: skip
-    return placed, (ranges, hits, exits, cosines)
+    shapes = Shapes(placed, bounds, *columns_of(bounds, len(rays.azimuths), rays.reach))
+    shape = (len(rays.elevations), len(rays.azimuths))
+    hits = Hits(np.empty(shape), np.empty(shape, np.int32), np.empty(shape), np.empty(shape))
+    raycast.fill_cast(shapes, scene.ground, pose, rays, hits)
+    return placed, hits
 
 
 def near_scene(seed: int, environment: str | None = None) -> Scene:
@@ -137,8 +146,9 @@ def test_cast_is_its_twin(seed: int, tilt: float) -> None:
     azimuths = np.arange(20) * 2 * np.pi / 20
     elevations = np.sort(np.radians(rng.uniform(-24, 8, 6)))[::-1].copy()
     pose = sensor_pose(scene, SMALL, 1.0, 0.3, yaw=0.2, pitch=tilt, roll=-tilt)
-    placed, (ranges, hits, exits, cosines) = cast(scene, pose, elevations, azimuths, 40.0)
-    slow_ranges, slow_hits = twins.simulation.cast(placed, scene, pose, elevations, azimuths, 40.0, KEY)
+    rays = Rays(elevations, azimuths, 40.0, KEY)
+    placed, (ranges, hits, exits, cosines) = cast(scene, pose, rays)
+    slow_ranges, slow_hits = twins.simulation.cast(placed, scene, pose, *rays)
     # Where a ray all but grazes the ground, a kerb between two samples may be missed too.
     grazing = ((hits == -1) & (ranges > 18.0)) | ((slow_hits == -1) & (slow_ranges > 18.0))
     close = (hits != slow_hits) & (np.abs(ranges - slow_ranges) < 0.02)  # within a step of the twin's walk
@@ -170,19 +180,18 @@ def test_cast_without_shapes_and_with_shapes_that_are_not_finite() -> None:
     pose = sensor_pose(scene, SMALL)
     for beams, n_columns in (((-0.2,), 1), ((0.1, -0.1, -0.3), 5)):
         azimuths = np.arange(n_columns) * 2 * np.pi / n_columns
-        placed, found = cast(empty, pose, np.array(beams), azimuths, 40.0)
-        slow_ranges, slow_hits = twins.simulation.cast(placed, empty, pose, np.array(beams), azimuths, 40.0, KEY)
+        rays = Rays(np.array(beams), azimuths, 40.0, KEY)
+        placed, found = cast(empty, pose, rays)
+        slow_ranges, slow_hits = twins.simulation.cast(placed, empty, pose, *rays)
         np.testing.assert_array_equal(found[1], slow_hits)
         np.testing.assert_allclose(found[0], slow_ranges, rtol=0, atol=0.02)
         assert set(found[1].ravel()) <= {-1, -2}
     strange = np.stack([plate(8.0, (0.2, 30.0, 20.0), material=material) for material in (0, LEAVES, POROUS)])
     for k, column, value in ((0, 4, np.nan), (1, 5, np.inf), (2, 7, np.nan)):
         strange[k, column] = value
-    elevations, azimuths = np.array([0.0, -0.1]), np.arange(8) * np.pi / 4
-    plain = cast(empty, pose, elevations, azimuths, 40.0)[1]
-    for got, wanted in zip(
-        cast(replace(scene, primitives=strange), pose, elevations, azimuths, 40.0)[1], plain, strict=True
-    ):
+    rays = Rays(np.array([0.0, -0.1]), np.arange(8) * np.pi / 4, 40.0, KEY)
+    plain = cast(empty, pose, rays)[1]
+    for got, wanted in zip(cast(replace(scene, primitives=strange), pose, rays)[1], plain, strict=True):
         np.testing.assert_array_equal(got, wanted)
 
 
@@ -225,7 +234,7 @@ def test_drivable_cells_are_those_of_the_twin() -> None:
             (np.array([5.0, np.nan]), np.array([0.0, np.nan])),
         ):
             labels = np.full((len(x), len(y)), 9, np.uint8)
-            raycast.fill_drivable(scene.strips, scene.terrain, scene.tile, pose, x, y, labels)
+            raycast.fill_drivable(scene.ground, pose, x, y, labels)
             np.testing.assert_array_equal(labels, twins.simulation.drivable(scene, pose, x, y))
 
 
@@ -236,23 +245,20 @@ def test_points_are_those_of_the_twin(seed: int, noise: bool) -> None:
     around = SensorProfile.uniform("around", 32, 15.0, -24.0, columns=120)
     pose = sensor_pose(scene, around, 1.0, 0.2, yaw=0.1, pitch=0.01, roll=-0.01)
     for sensor, reach in ((around, 80.0), (SensorProfile("one", (-10.0,), 1), 80.0), (SMALL, 1.0)):
-        elevations = np.radians(sensor.elevations_deg)
         azimuths = np.arange(0.0, 2 * np.pi, 2 * np.pi / sensor.columns)
-        placed, (ranges, hits, exits, cosines) = cast(scene, pose, elevations, azimuths, reach)
-        ranges[:1, ::7] = np.nan  # no return, whatever it hit
-        offsets = rng.normal(0.0, 0.02, (2, len(elevations)))
-        given = (
-            pose, elevations, azimuths, *offsets, ranges, hits, exits, cosines, 0.9, reach, KEY, noise, noise,
-        )  # fmt: skip
-        points, objects = np.empty((hits.size, 4), np.float32), np.empty(hits.size, np.int32)
-        n = raycast.fill_points(placed, scene.strips, scene.terrain, scene.tile, *given, points, objects)
-        slow_points, slow_objects = twins.simulation.points(placed, scene, *given)
+        rays = Rays(np.radians(sensor.elevations_deg), azimuths, reach, KEY)
+        placed, hits = cast(scene, pose, rays)
+        hits.ranges[:1, ::7] = np.nan  # no return, whatever it hit
+        receiver = Receiver(*rng.normal(0.0, 0.02, (2, sensor.n_beams)), 0.9, noise, noise)
+        points, objects = np.empty((hits.rows.size, 4), np.float32), np.empty(hits.rows.size, np.int32)
+        n = raycast.fill_points(placed, scene.ground, pose, rays, hits, receiver, points, objects)
+        slow_points, slow_objects = twins.simulation.points(placed, scene, pose, rays, hits, receiver)
         assert n == len(slow_points)
         np.testing.assert_array_equal(objects[:n], slow_objects)
         np.testing.assert_allclose(points[:n], slow_points, rtol=0, atol=2e-5)
         assert np.isfinite(points[:n]).all()
         if sensor is around:
-            materials = placed[hits[hits >= 0], 1].astype(int)
+            materials = placed[hits.rows[hits.rows >= 0], 1].astype(int)
             assert {*materials.tolist()} >= {MATTE, PAINT, GLASS, LEAVES, FACADE}
 
 
@@ -285,7 +291,7 @@ def test_ground_equals_twin() -> None:
     for seed in range(6):
         scene = random_scene(seed)
         xy = rng.uniform(-60, 60, (300, 2))
-        fast = np.array([ground_at(scene.strips, scene.terrain, scene.tile, x, y)[:2] for x, y in xy])
+        fast = np.array([ground_at(scene.ground, x, y)[:2] for x, y in xy])
         slow = np.stack(twins.simulation.ground(scene, xy[:, 0], xy[:, 1]), axis=1)
         np.testing.assert_allclose(fast, slow, rtol=0, atol=1e-9)
 

@@ -12,13 +12,21 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import twins.tracking
-from edgeperc.tracking import egomotion, ukf
 from edgeperc.tracking.imm import fill_combined, fill_interaction, fill_mode_probabilities
-from edgeperc.tracking.jpda import MAX_EVENTS, fill_association, fill_by_propagation, fill_likelihoods
+from edgeperc.tracking.jpda import (
+    MAX_EVENTS,
+    Detections,
+    Gates,
+    Predictions,
+    fill_association,
+    fill_by_propagation,
+    fill_likelihoods,
+)
 from edgeperc.tracking.ukf import (
     CONSTANT_VELOCITY,
     CTRV,
     fill_cholesky,
+    fill_inverse,
     fill_predictions,
     fill_updates,
     half_turn,
@@ -164,20 +172,10 @@ def test_all_motions_together_are_filterpys_imm() -> None:
         mixed, mixed_spread = np.empty_like(ours), np.empty_like(spread)
         fill_interaction(ours, spread, modes, np.array([stay]), mixed, mixed_spread, prior)
         means, predicted = predict(mixed, mixed_spread, NOISE[None], dt)
-        gates, likelihoods, weights = np.array([1e3]), np.empty((1, 3, 1)), np.empty((1, 1))
-        group = np.zeros(1, np.int64)
+        likelihoods, weights, group = np.empty((1, 3, 1)), np.empty((1, 1)), np.zeros(1, np.int64)
+        gates = Gates(SIGMAS[None], np.ones(1), group, np.array([1e3]))
         fill_likelihoods(
-            means,
-            predicted,
-            SIGMAS[None],
-            prior,
-            np.ones(1),
-            group,
-            detection[None],
-            group,
-            gates,
-            likelihoods,
-            weights,
+            Predictions(means, predicted, prior), gates, detected(detection[None], group), likelihoods, weights
         )
         shares = np.empty((1, 3, 2))
         fill_mode_probabilities(prior, likelihoods, np.array([[0.0, 1.0]]), shares, modes)
@@ -223,9 +221,8 @@ def test_small_matrices_are_those_of_numpy_the_twins_own() -> None:
         root, inverse = np.empty((5, 5)), np.empty((3, 3))
         fill_cholesky(matrix, root)
         np.testing.assert_allclose(root, np.linalg.cholesky(matrix), atol=1e-12)
-        for invert in (ukf.fill_inverse, egomotion.fill_inverse):
-            invert(matrix[:3, :3].copy(), inverse)
-            np.testing.assert_allclose(inverse, np.linalg.inv(matrix[:3, :3]), rtol=1e-8, atol=1e-9)
+        fill_inverse(matrix[:3, :3].copy(), inverse)
+        np.testing.assert_allclose(inverse, np.linalg.inv(matrix[:3, :3]), rtol=1e-8, atol=1e-9)
     fill_cholesky(np.diag([4.0, 0.0, -1e-18, 9.0, 1.0]), root)  # directions without variance
     np.testing.assert_array_equal(root, np.diag([2.0, 0.0, 0.0, 3.0, 1.0]))
     for angle in (*rng.uniform(-20.0, 20.0, 20), 0.0, math.pi / 2):
@@ -262,6 +259,13 @@ def test_the_imm_is_its_twin(n: int) -> None:
             np.testing.assert_allclose(got, wanted, atol=1e-9)
 
 
+def detected(places: np.ndarray, groups: np.ndarray) -> Detections:
+    """Detections of which only the place and the group matter."""
+    n = len(places)
+    nothing = np.full(n, np.nan)
+    return Detections(places, np.full((n, 4), np.nan), nothing, nothing, groups, groups, nothing, groups)
+
+
 # --- association -----------------------------------------------------------------------------------------------------
 
 
@@ -278,13 +282,14 @@ def test_likelihoods_are_those_of_the_twin(n: int, m: int) -> None:
     detections = rng.normal(0.0, 2.0, (m, 3))
     groups, theirs = rng.integers(0, 2, n), rng.integers(0, 2, m)
     sigmas, prior, odds = np.tile(SIGMAS, (n, 1)), rng.dirichlet(np.ones(3), n), rng.uniform(1.0, 9.0, n)
-    gates, got, weights = np.full(n, 3.0), np.empty((n, 3, m)), np.empty((n, m))
-    fill_likelihoods(means, predicted, sigmas, prior, odds, groups, detections, theirs, gates, got, weights)
-    wanted = twins.tracking.likelihoods(means, predicted, sigmas, groups, detections, theirs, gates)
+    limits, got, weights = np.full(n, 3.0), np.empty((n, 3, m)), np.empty((n, m))
+    tracks, gates = Predictions(means, predicted, prior), Gates(sigmas, odds, groups, limits)
+    fill_likelihoods(tracks, gates, detected(detections, theirs), got, weights)
+    wanted = twins.tracking.likelihoods(means, predicted, sigmas, groups, detections, theirs, limits)
     np.testing.assert_allclose(got, wanted, atol=1e-12)
     np.testing.assert_allclose(weights, odds[:, None] * np.einsum("nk,nkm->nm", prior, wanted), atol=1e-12)
     detections[:1] = np.nan  # the tracker never lets it in; it must not spread either way
-    fill_likelihoods(means, predicted, sigmas, prior, odds, groups, detections, theirs, gates, got, weights)
+    fill_likelihoods(tracks, gates, detected(detections, theirs), got, weights)
     assert not got[:, :, :1].any()
 
 

@@ -15,6 +15,7 @@ import edgeperc
 import twins.tracking
 from edgeperc import Box, StampError, Tracker, TrackingError
 from edgeperc.tracking.egomotion import fit_motion, nearest_detection, support
+from edgeperc.tracking.jpda import Detections
 from edgeperc.tracking.lives import (
     EXPECTED,
     MOST_EXISTENCE,
@@ -545,11 +546,11 @@ def test_births_lives_and_views_are_those_of_the_twins(n: int, m: int) -> None:
     kinds = tracker._kinds(["car", "pedestrian", "cyclist"])[rng.integers(0, 3, n)]
     of = tracker._classes[kinds]
     detections, shapes = rng.normal(0.0, 9.0, (n, 3)), rng.uniform(0.5, 4.0, (n, 4))
-    evidence = rng.normal(0.0, 3.0, n), rng.normal(0.0, 3.0, n), np.arange(n)
-    born = kinds, of, detections, shapes, *evidence, rng.uniform(0.0, 60.0, n)
-    wanted = twins.tracking.newborn(5, *born, MOST_EXISTENCE, TRACK)
+    logits, fronts, ranges = rng.normal(0.0, 3.0, n), rng.normal(0.0, 3.0, n), rng.uniform(0.0, 60.0, n)
+    born = Detections(detections, shapes, logits, fronts, kinds, of["group"].copy(), ranges, np.arange(n))
+    wanted = twins.tracking.newborn(5, born, of, MOST_EXISTENCE, TRACK)
     tracks = np.zeros(n, TRACK)
-    fill_newborn(5, *born, tracks)
+    fill_newborn(5, born, of, tracks)
     assert_same_tracks(tracks, wanted)
 
     for _ in range(4):

@@ -32,8 +32,9 @@ def scaled(image, view, spec):
     return (mixed[order] - mean) / std
 
 
-def fill_scaled(image, row_start, row_weights, col_start, col_weights, channels, mean, std, out):
+def fill_scaled(image, rows, columns, normalized, out):
     """Every operation of the kernel in its order, in float32; bit for bit the same."""
+    (row_start, row_weights), (col_start, col_weights), (channels, mean, std) = rows, columns, normalized
     for row, first in enumerate(row_start):
         mixed = row_weights[row, 0] * image[first].astype(np.float32)
         for tap in range(1, row_weights.shape[1]):

@@ -278,11 +278,11 @@ def in_ego_shadow(azimuth: np.ndarray, elevation: np.ndarray) -> np.ndarray:
     return np.where(np.isnan(roof), mast, elevation < roof)
 
 
-def points(
-    primitives, scene, pose, elevations, azimuths, range_offsets, remission_offsets,
-    ranges, hits, exits, cosines, min_range, reach, key, noise, ego_shadow,
-):  # fmt: skip
+def points(primitives, scene, pose, rays, found, receiver):
     """Twin of `fill_points`: the returns (n, 4) float32 and the object of each, all rays at once."""
+    elevations, azimuths, reach, key = rays
+    ranges, hits, exits, cosines = found
+    range_offsets, remission_offsets, min_range, noise, ego_shadow = receiver
     beam, column = np.nonzero((hits > -2) & np.isfinite(ranges))
     hit, t, leave, cos = (of[beam, column] for of in (hits, ranges, exits, cosines))
     t = t.copy()
@@ -356,5 +356,5 @@ def points(
         value = np.where((value < 0.01 + 0.1 * luck) | (other > 0.965), 0, value)
     kept &= (t >= min_range) & (t < reach)
     value = np.floor(np.clip(value, np.where(retro, 0.3, 0), 0.99) * 100 + 0.5) / 100
-    found = np.column_stack([t[:, None] * direction, value]).astype(np.float32)
-    return found[kept], np.where(hit >= 0, shapes[:, 19], -1)[kept].astype(np.int32)
+    returns = np.column_stack([t[:, None] * direction, value]).astype(np.float32)
+    return returns[kept], np.where(hit >= 0, shapes[:, 19], -1)[kept].astype(np.int32)

@@ -256,11 +256,12 @@ def lives(tracks, classes, beta, hidden, logits, kinds, dt, most_hidden, expecte
     return tracks
 
 
-def newborn(first_id, kinds, classes, detections, shapes, logits, told, sources, ranges, most, dtype):
+def newborn(first_id, detections, classes, most, dtype):
     """Twin of `edgeperc.tracking.lives.fill_newborn`."""
+    places, shapes, logits, told, kinds, _, ranges, sources = detections
     tracks = np.zeros(len(kinds), dtype)
     for track, kind, of, detection, shape, logit, front, distance in zip(
-        tracks, kinds, classes, detections, shapes, logits, told, ranges, strict=True
+        tracks, kinds, classes, places, shapes, logits, told, ranges, strict=True
     ):
         farther = 1 + distance / of["range_m"]
         turned = np.array(

@@ -1,0 +1,36 @@
+"""Training with the fields of `Data` and `Run` by name, for tests."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+from edgeperc_export import make as make_module
+from edgeperc_export.recipe import Recipe
+from edgeperc_export.training import ablation
+from edgeperc_export.training import train as training
+from edgeperc_export.training.train import Data, Run
+
+
+def of_train(settings: dict[str, Any]) -> tuple[Data, Run, dict[str, Any]]:
+    """The records, and the settings of neither."""
+    data, run = ({f.name for f in fields(kind)} & settings.keys() for kind in (Data, Run))
+    others = {name: settings[name] for name in settings.keys() - data - run}
+    return Data(**{name: settings[name] for name in data}), Run(**{name: settings[name] for name in run}), others
+
+
+def train(recipe: Recipe, out: Path, **settings: Any) -> Path:
+    data, run, others = of_train(settings)
+    assert not others
+    return training.train(recipe, out, data, run)
+
+
+def make(name: str, out: Path, **settings: Any) -> Path:
+    data, run, others = of_train(settings)
+    return make_module.make(name, out, data, run, **others)
+
+
+def ablate(network: str, out: Path, **settings: Any) -> list[dict[str, Any]]:
+    data, run, others = of_train(settings)
+    return ablation.ablate(network, out, data, run, **others)
