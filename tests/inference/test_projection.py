@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 import twins.projection
 from edgeperc.errors import CardError, PointsError
 from edgeperc.ground.planes import find_ground
-from edgeperc.inference import network_input, projection
+from edgeperc.inference import projection
 from edgeperc.inference.projection import column_edges, make_projector, row_edges, tabulate
 from edgeperc.types.card import CHANNELS, InputSpec
 from edgeperc.types.sensor import get_sensor
@@ -168,7 +168,7 @@ def test_channels_are_normalized_in_the_order_asked_for(channels):
 @pytest.mark.parametrize("name", [name for name, view in VIEWS.items() if view.kind == "range_image"])
 def test_tables_find_the_interval_of_every_value(name):
     for edges in (row_edges(VIEWS[name]), column_edges(VIEWS[name])):
-        (first, last, cells_per_unit), base, split = tabulate(edges, "edges")
+        first, last, cells_per_unit, base, split = tabulate(edges, "edges")
         rng = np.random.default_rng(2)
         values = np.concatenate(
             [edges, np.nextafter(edges, np.float32(9)), np.nextafter(edges, np.float32(-9)),
@@ -339,16 +339,16 @@ def test_a_scan_is_projected_with_its_ground(n):
     points[::9, 2] += 1.2
     points[3::50] = math.nan
     projector = make_projector(VIEWS["front"], spec_of(VIEWS["front"]))
-    seen = network_input.project(projector, points)
+    seen = projection.project(projector, points)
     height_m = find_ground(points, mount_height_m=1.73).height_m
     assert_same(
         seen, twins.projection.project(points, VIEWS["front"], edges_of("front"), spec_of(VIEWS["front"]), height_m)
     )
     assert n < 4000 or abs(np.nanmedian(height_m)) < 0.05
     plain = make_projector(VIEWS["top view"], spec_of(VIEWS["top view"]))
-    assert network_input.input_heights(plain, points) is None
+    assert projection.input_heights(plain, points) is None
     assert_same(
-        network_input.project(plain, points), [getattr(plain.project(points), k) for k in ("image", "index", "pixel")]
+        projection.project(plain, points), [getattr(plain.project(points), k) for k in ("image", "index", "pixel")]
     )
 
 
