@@ -30,15 +30,16 @@ FLOORS = {
         system.printable
         system.machine system.ray_cluster system.remote
         system.kernel_cache
-        system.compilation
+        system.compilation system.draws
         types.__init__ types.choices types.mounting types.onnx_file types.points types.views
         types.card types.sensor
         types.perception
         types.frame types.geometry
         ground.observed ground.planes
         ground.__init__ ground.leveling ground.scan
-        objects.__init__ objects.linkage objects.persons objects.refine
+        objects.__init__ objects.linkage objects.refine
         objects.cluster
+        objects.persons
         objects.boxes
         preprocess.__init__ preprocess.fitness preprocess.interpolation preprocess.returns
         preprocess.condition preprocess.ego preprocess.findings preprocess.motion preprocess.sensor_fit

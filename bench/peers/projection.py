@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 
 from edgeperc.inference.projection import (
     HEIGHT_RANGE_M,
+    Intervals,
     RangeImageProjector,
     TopViewProjector,
     column_edges,
@@ -151,7 +152,7 @@ class NumpyRangeImage(_NumpyProjector):
         squared_distance = x * x + y * y
         squared_range = squared_distance + z * z
         elevation, azimuth = z / (np.sqrt(squared_distance) + np.abs(z)), y / (x + np.abs(y))
-        (top, bottom, _), (left, right, _) = self.rows[0], self.cols[0]
+        top, bottom, left, right = self.rows.first, self.rows.last, self.cols.first, self.cols.last
         inside = (elevation <= top) & (elevation > bottom) & (azimuth <= left) & (azimuth > right)
         inside &= np.isfinite(squared_range) & np.isfinite(remission)
         flat = look_up(elevation[inside], self.rows) * self.shape[2] + look_up(azimuth[inside], self.cols)
@@ -164,11 +165,9 @@ class NumpyRangeImage(_NumpyProjector):
         return np.stack((x, y, z, remission, np.sqrt(x * x + y * y + z * z)))
 
 
-def look_up(
-    values: NDArray[np.float32], table: tuple[NDArray[np.float32], NDArray[np.int32], NDArray[np.float32]]
-) -> NDArray[np.int32]:
+def look_up(values: NDArray[np.float32], table: Intervals) -> NDArray[np.int32]:
     """Find the intervals of the values with `tabulate`'s table; takes a third of searchsorted's time."""
-    (first, _, cells_per_unit), base, split = table
+    first, _, cells_per_unit, base, split = table
     cells = ((first - values) * cells_per_unit).astype(np.int32)
     return base[cells] + (values <= split[cells])
 

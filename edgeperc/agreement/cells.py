@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 
 from ..ground.scan import Scan
 from ..system.kernel_cache import njit
-from ..types.geometry import draw_footprints
+from ..types.geometry import cell_at, draw_footprints
 from ..types.perception import Box, PointLabels, TopView
-from ..types.points import read_only
+from ..types.points import Cloud, Labeled
 from .rules import RULES, cells_of, roles_of
-from .votes import VEHICLE
+from .votes import VEHICLE, Cells
 
 OBSTACLE_M = (0.3, 2.0)  # heights of returns that block a cell
 _NO_BOX = _NO_CLASS = 255
@@ -54,7 +54,7 @@ def agree_on_cells(
     if not (of_road or of_vehicles):
         return view
     drivable = view.classes.index("drivable") if of_road and "drivable" in view.classes else _NO_CLASS
-    _, is_vehicle, _ = cells_of(view)
+    is_vehicle = cells_of(view).is_vehicle
     cells = view.labels.copy()
     covered = _footprints(view, boxes)
     marked = np.flatnonzero(marks != 0)  # flatnonzero of a bool array is five times as fast as of uint8
@@ -79,23 +79,13 @@ def mark_cells(
     """
     if labels is None:
         nothing = np.zeros(len(scan.points), np.uint8)
-        in_view, object_of, roles = nothing.view(np.bool_), nothing, np.zeros(1, np.uint8)
+        in_view, labeled = nothing.view(np.bool_), Labeled(nothing, np.zeros(1, np.uint8))
     else:
-        in_view, object_of, roles = labels.in_view, labels.labels, roles_of(labels.classes)
-    cells, is_vehicle, grid = cells_of(view)
-    marks = np.zeros(cells.shape, np.uint8)
-    fill_marks(
-        scan.points,
-        scan.ground.height_m,
-        read_only(in_view, np.bool_),
-        read_only(object_of, np.uint8),
-        roles,
-        scan.ground.plane is not None,
-        grid,
-        is_vehicle & ("cells" in rules and labels is not None),
-        cells,
-        marks,
-    )
+        in_view, labeled = labels.in_view, Labeled(labels.labels, roles_of(labels.classes))
+    cells = cells_of(view)
+    marks = np.zeros(cells.labels.shape, np.uint8)
+    counted = cells._replace(is_vehicle=cells.is_vehicle & ("cells" in rules and labels is not None))
+    fill_marks(scan.cloud, in_view, labeled, scan.ground.plane is not None, counted, marks)
     return marks
 
 
@@ -109,43 +99,33 @@ def _footprints(view: TopView, boxes: Sequence[Box]) -> NDArray[np.uint8]:
 
 @njit(cache=True, nogil=True)
 def fill_marks(
-    points: NDArray[np.float32],
-    height: NDArray[np.float32],
+    cloud: Cloud,
     in_view: NDArray[np.bool_],
-    labels: NDArray[np.uint8],
-    roles: NDArray[np.uint8],
+    labeled: Labeled,
     by_height: bool,
-    grid: NDArray[np.float64],
-    is_vehicle: NDArray[np.bool_],
-    cells: NDArray[np.uint8],
+    view: Cells,
     marks: NDArray[np.uint8],
 ) -> None:
     """Write what the points show in each cell; see `mark_cells`.
 
-    points : (n, 3 or more) float32, C-contiguous
-    height : (n,) float32
     in_view : (n,) bool
-    labels : (n,) uint8
-    roles : (classes,) uint8; 1 for vehicles, 2 for persons, 0 for classes that are no objects.
+    labeled : roles are 1 for vehicles, 2 for persons, 0 for classes that are not objects.
     by_height : whether returns above the ground are obstacles, whatever their label.
-    grid : (3,) float64; x of the far edge, y of the left edge, edge of a cell [m].
-    is_vehicle : (256,) bool; labels of cells that the points may contradict.
-    cells : (rows, columns) uint8
     marks : (rows, columns) uint8, modified; zeros before.
     """
+    points, height, labels, roles = cloud.points, cloud.height, labeled.labels, labeled.roles
+    cells, is_vehicle, grid = view.labels, view.is_vehicle, view.grid
     n_rows, n_cols = cells.shape
     lowest, highest = OBSTACLE_M
-    least_x, least_y = grid[0] - (n_rows + 1) * grid[2], grid[1] - (n_cols + 1) * grid[2]
-    most_x, most_y = grid[0] + grid[2], grid[1] + grid[2]
+    least_x, least_y = grid.far - (n_rows + 1) * grid.cell, grid.left - (n_cols + 1) * grid.cell
+    most_x, most_y = grid.far + grid.cell, grid.left + grid.cell
     for i in range(points.shape[0]):
         x, y = points[i, 0], points[i, 1]
         if not ((x >= least_x) & (x <= most_x) & (y >= least_y) & (y <= most_y)):  # saves divisions for most points
             continue
-        row = (grid[0] - np.float64(points[i, 0])) / grid[2]
-        col = (grid[1] - np.float64(points[i, 1])) / grid[2]
-        if not ((row >= 0.0) & (row < n_rows) & (col >= 0.0) & (col < n_cols)):
+        r, c = cell_at(grid, cells.shape, np.float64(x), np.float64(y))
+        if r < 0:
             continue
-        r, c = int(row), int(col)
         role = roles[labels[i]]
         if role != 0:
             marks[r, c] |= 6 if role == VEHICLE else 2

@@ -27,19 +27,25 @@ from ..objects.linkage import Strips
 from ..objects.persons import complete_persons
 from ..system.kernel_cache import njit
 from ..types import choices
+from ..types.geometry import Grid, box_records, is_inside
 from ..types.mounting import MODEL_HEIGHT_M
 from ..types.perception import Box, PointLabels, TopView
-from ..types.points import read_only
+from ..types.points import Cloud, Labeled
 from .votes import (
+    CLUSTER,
     COMPLETING_SCORE,
     MIN_VEHICLE_SHARE,
     PERSON,
     VEHICLE,
+    Applied,
+    Cells,
+    Tallies,
     apply_verdicts,
     fill_tallies,
     fill_verdicts,
     fill_votes,
     find_persons_alone,
+    may_be_persons,
 )
 
 RULES = frozenset(choices.RULES)
@@ -121,8 +127,7 @@ def find_voters(
     """
     roles = roles_of(labels.classes)
     votes = np.empty(len(scan.points), np.uint8)
-    in_view, classes = read_only(labels.in_view, np.bool_), read_only(labels.labels, np.uint8)
-    fill_votes(in_view, classes, roles, support.scores, votes)
+    fill_votes(labels.in_view, Labeled(labels.labels, roles), support.scores, votes)
     # A share of exactly the limit is enough. Labels that are neither vehicles nor persons are never lost.
     is_searched = "share" not in rules or not roles[1:].all()
     shares = (-1.0, -1.0) if is_searched else np.nextafter((MIN_VEHICLE_SHARE, MIN_PERSON_SHARE), 0.0)
@@ -185,32 +190,27 @@ def agree_on_points(
     an object of their kind stands; within 6 m, points lower than 0.06 m lose it.
     """
     rules = _applicable(rules, scan.ground)
-    points, height, on_ground = scan.points, scan.ground.height_m, scan.ground.mask
-    in_view, of = read_only(labels.in_view, np.bool_), read_only(clusters, np.int32)
-    agreed, roles = upright, roles_of(labels.classes)
+    agreed, in_view, roles = upright, labels.in_view, roles_of(labels.classes)
     n = int(clusters.max(initial=-1)) + 1
-    counts = np.empty((n, len(labels.classes) + 1), np.int32)
-    bounds = np.empty((n, 5), np.float32)
-    above = np.empty((n, 3), np.int32)
+    tallies = Tallies(np.empty(n, CLUSTER), np.empty((n, len(labels.classes) + 1), np.int32))
     votes = "cells" in rules and view is not None and not VEHICLES.isdisjoint(view.classes)
-    cells = cells_of(view if votes else None)
-    fill_tallies(points, height, in_view, read_only(agreed, np.uint8), of, *cells, counts, bounds, above)
-    refused = (above[:, 1] == 0) & (above[:, 0] >= MIN_IN_TOP_VIEW * above[:, 2])
-    verdicts = _verdicts(labels.classes, counts, bounds, refused, rules)
+    fill_tallies(scan.cloud, in_view, agreed, clusters, cells_of(view if votes else None), tallies)
+    verdicts = _verdicts(labels.classes, tallies, rules)
     before = agreed.copy()
-    apply_verdicts(in_view, of, verdicts, roles, support.scores, support.names, agreed)
+    apply_verdicts(in_view, clusters, verdicts, roles, support.scores, support.names, agreed)
     if "person" in rules:
-        alone = find_persons_alone(points, height, roles, before, agreed)
+        alone = find_persons_alone(scan.cloud, roles, before, agreed)
         for own in alone:
             agreed[own] = before[own]
         for part, whole in PART_OF.items():
             if part in labels.classes and whole in labels.classes:
                 walks, rides = labels.classes.index(part), labels.classes.index(whole)
-                complete_persons(points, height, in_view, of, counts, bounds, walks, rides, agreed)
+                may_be = may_be_persons(tallies, walks, rides)
+                complete_persons(scan.cloud, in_view, clusters, may_be, walks, rides, agreed)
         for number, own in enumerate(alone, start=n):
             clusters[own] = number
     if "ground" in rules:
-        clear_ground(points, height, on_ground, roles, agreed)
+        clear_ground(scan.points, scan.ground.height_m, scan.ground.mask, roles, agreed)
     return PointLabels(agreed, labels.in_view, labels.classes)
 
 
@@ -236,16 +236,8 @@ def agree_on_boxes(
     if "boxes" not in rules or not doubted or not (roles == VEHICLE).any():
         return tuple(boxes)
     counts = np.empty((len(doubted), 3), np.int64)
-    count_inside(
-        scan.points,
-        scan.ground.height_m,
-        scan.ground.mask,
-        read_only(labels.in_view, np.bool_),
-        read_only(labels.labels, np.uint8),
-        roles,
-        _as_rows([boxes[k] for k in doubted]),
-        counts,
-    )
+    rows = as_rows([boxes[k] for k in doubted])
+    count_inside(scan.cloud, scan.ground.mask, labels.in_view, Labeled(labels.labels, roles), rows, counts)
     held, seen, labeled = counts.T
     wrong = (held == 0) | ((seen > 0) & (labeled < MIN_BOX_SHARE * seen))
     dropped = {k for k, is_wrong in zip(doubted, wrong, strict=True) if is_wrong}
@@ -271,20 +263,14 @@ def stand_boxes(
     vehicles = [k for k, box in enumerate(boxes) if box.label in TALL_M]
     if "stand" not in _applicable(rules, scan.ground) or not vehicles:
         return tuple(boxes)
-    rows = _as_rows([boxes[k] for k in vehicles])
-    rows[:, 6] = [TALL_M[boxes[k].label][1] for k in vehicles]
+    rows = as_rows([boxes[k] for k in vehicles])
+    rows["top"] = [TALL_M[boxes[k].label][1] for k in vehicles]
     sums = np.empty((len(rows), 3))
-    nothing = np.zeros(len(scan.points), np.bool_)
-    sum_inside(
-        scan.points,
-        scan.ground.height_m,
-        scan.ground.mask,
-        read_only(nothing if labels is None else labels.in_view, np.bool_),
-        read_only(nothing.view(np.uint8) if labels is None else labels.labels, np.uint8),
-        roles_of(("background",) if labels is None else labels.classes),
-        rows,
-        sums,
-    )
+    if labels is None:
+        nothing = np.zeros(len(scan.points), np.bool_)
+        labels = PointLabels(nothing.view(np.uint8), nothing, ("background",))
+    labeled = Labeled(labels.labels, roles_of(labels.classes))
+    sum_inside(scan.cloud, scan.ground.mask, labels.in_view, labeled, rows, sums)
     standing = list(boxes)
     for k, (n, level, top) in zip(vehicles, sums.tolist(), strict=True):
         if n >= MIN_STANDING:
@@ -308,34 +294,19 @@ def roles_of(classes: Sequence[str]) -> NDArray[np.uint8]:
     return np.array([VEHICLE if c in VEHICLES else PERSON if c in PERSON_TOP_M else 0 for c in classes], np.uint8)
 
 
-def cells_of(view: TopView | None) -> tuple[NDArray[np.uint8], NDArray[np.bool_], NDArray[np.float64]]:
-    """A top view as the kernels take it; None has no cells.
-
-    Labels of its cells, (rows, columns); which labels are vehicles, (256,); x of its far edge, y of its left edge, and
-    edge of a cell [m].
-    """
+def cells_of(view: TopView | None) -> Cells:
+    """A top view as the kernels take it; None has no cells."""
     classes = () if view is None else view.classes
     is_vehicle = np.array([name in VEHICLES for name in classes] + [False] * (256 - len(classes)), np.bool_)
-    labels = np.empty((0, 0), np.uint8) if view is None else view.labels
-    grid = (1.0, 1.0, 1.0) if view is None else (view.x_range_m[1], view.y_range_m[1], view.cell_m)
-    return read_only(labels, np.uint8), is_vehicle, np.array(grid)
+    if view is None:
+        return Cells(np.empty((0, 0), np.uint8), is_vehicle, Grid(1.0, 1.0, 1.0))
+    grid = Grid(float(view.x_range_m[1]), float(view.y_range_m[1]), float(view.cell_m))
+    return Cells(np.ascontiguousarray(view.labels), is_vehicle, grid)
 
 
-def _as_rows(boxes: Sequence[Box]) -> NDArray[np.float64]:
-    """Boxes as the kernels take them, (m, 8): x, y, half length, half width, cosine, sine, highest point, score."""
-    rows = [
-        (
-            *box.center[:2],
-            0.5 * box.size[0] + MARGIN_M,
-            0.5 * box.size[1] + MARGIN_M,
-            math.cos(box.yaw),
-            math.sin(box.yaw),
-            box.size[2] + ABOVE_BOX_M,
-            box.score,
-        )
-        for box in boxes
-    ]
-    return np.array(rows, np.float64).reshape(-1, 8)
+def as_rows(boxes: Sequence[Box], labels: Sequence[int] | None = None) -> NDArray[np.void]:
+    """Boxes with a margin for points, (m,) `BOX`; ``labels`` are those of their points."""
+    return box_records(boxes, labels or [0] * len(boxes), MARGIN_M, ABOVE_BOX_M)
 
 
 def find_support(scan: Scan, labels: PointLabels, boxes: Sequence[Box], rules: Collection[str] = RULES) -> Support:
@@ -343,40 +314,21 @@ def find_support(scan: Scan, labels: PointLabels, boxes: Sequence[Box], rules: C
     known = {name: labels.classes.index(name) for name in VEHICLES if name in labels.classes}
     usable = [box for box in boxes if box.label in VEHICLES] if "car" in known and "support" in rules else []
     support = Support(np.empty(len(scan.points), np.float32), np.empty(len(scan.points), np.uint8))
-    fill_support(
-        scan.points,
-        scan.ground.height_m,
-        labels.in_view & ~scan.ground.mask,
-        read_only(labels.labels, np.uint8),
-        roles_of(labels.classes),
-        _as_rows(usable),
-        np.array([known.get(box.label, known["car"]) for box in usable], np.uint8),
-        *support,
-    )
+    among, labeled = labels.in_view & ~scan.ground.mask, Labeled(labels.labels, roles_of(labels.classes))
+    rows = as_rows(usable, [known.get(box.label, known["car"]) for box in usable])
+    fill_support(scan.cloud, among, labeled, rows, support)
     return support
 
 
-def _verdicts(
-    classes: Sequence[str],
-    counts: NDArray[np.int32],
-    bounds: NDArray[np.float32],
-    refused: NDArray[np.bool_],
-    rules: Collection[str],
-) -> NDArray[np.uint8]:
+def _verdicts(classes: Sequence[str], tallies: Tallies, rules: Collection[str]) -> NDArray[np.uint8]:
     """What becomes of each label in each cluster, (k, classes)."""
+    clusters = tallies.clusters
+    refused = clusters["n_in_both"] >= MIN_IN_TOP_VIEW * clusters["n_points"]
+    refused &= clusters["n_in_vehicles"] == 0
     parts = [(classes.index(p), classes.index(w)) for p, w in PART_OF.items() if p in classes and w in classes]
-    verdicts = np.empty((len(counts), len(classes)), np.uint8)
-    fill_verdicts(
-        counts,
-        bounds,
-        refused,
-        roles_of(classes),
-        np.array(parts, np.int64).reshape(-1, 2),
-        "share" in rules,
-        "height" in rules,
-        "fill" in rules,
-        verdicts,
-    )
+    verdicts = np.empty((len(clusters), len(classes)), np.uint8)
+    applied = Applied("share" in rules, "height" in rules, "fill" in rules)
+    fill_verdicts(tallies, refused, roles_of(classes), np.array(parts, np.int64).reshape(-1, 2), applied, verdicts)
     return verdicts
 
 
@@ -448,29 +400,16 @@ def clear_columns(
 
 @njit(cache=True, nogil=True)
 def fill_support(
-    points: NDArray[np.float32],
-    height: NDArray[np.float32],
-    among: NDArray[np.bool_],
-    labels: NDArray[np.uint8],
-    roles: NDArray[np.uint8],
-    boxes: NDArray[np.float64],
-    of_box: NDArray[np.uint8],
-    scores: NDArray[np.float32],
-    names: NDArray[np.uint8],
+    cloud: Cloud, among: NDArray[np.bool_], labeled: Labeled, boxes: NDArray[np.void], support: Support
 ) -> None:
     """Find the best box around each point, among the boxes with enough vehicle points (`MIN_BOX_SHARE`).
 
-    points : (n, 3 or more) float32, C-contiguous
-    height : (n,) float32
     among : (n,) bool; points that may be in a box: those in view, above the ground.
-    labels : (n,) uint8
-    roles : (classes,) uint8; 1 for vehicles.
-    boxes : (m, 8) float64; x, y, half length, half width [m], cosine and sine of the yaw, greatest height of a point
-        [m], score.
-    of_box : (m,) uint8; class of each box.
-    scores : (n,) float32, overwritten; 0 in no box.
-    names : (n,) uint8, overwritten; class of the box with that score, the earlier one on ties; 0 in no box.
+    boxes : (m,) `BOX`
+    support : overwritten; the earlier box on ties.
     """
+    points, height, labels, roles = cloud.points, cloud.height, labeled.labels, labeled.roles
+    scores, names = support.scores, support.names
     scores[:] = 0.0
     names[:] = 0
     if boxes.shape[0] == 0:
@@ -478,48 +417,42 @@ def fill_support(
     low_x, high_x, low_y, high_y = bounds_of(boxes)
     near = np.empty(points.shape[0], np.int32)  # points that may be in a box
     n_near = 0
-    held, labeled = np.zeros(boxes.shape[0], np.int64), np.zeros(boxes.shape[0], np.int64)
+    n_inside, n_labeled = np.zeros(boxes.shape[0], np.int64), np.zeros(boxes.shape[0], np.int64)
     for i in range(points.shape[0]):
         if not among[i]:
             continue
         x, y = np.float64(points[i, 0]), np.float64(points[i, 1])
         if not ((x >= low_x) & (x <= high_x) & (y >= low_y) & (y <= high_y)):
             continue
-        is_held = False
+        is_near = False
         for k in range(boxes.shape[0]):
-            if height[i] <= boxes[k, 6] and is_inside(boxes, k, x, y):
-                is_held = True
-                held[k] += 1
-                labeled[k] += 1 if roles[labels[i]] == VEHICLE else 0
+            if height[i] <= boxes[k]["top"] and is_inside(boxes[k], x, y):
+                is_near = True
+                n_inside[k] += 1
+                n_labeled[k] += 1 if roles[labels[i]] == VEHICLE else 0
         near[n_near] = i
-        n_near += 1 if is_held else 0
+        n_near += 1 if is_near else 0
     for i in near[:n_near]:
         x, y = np.float64(points[i, 0]), np.float64(points[i, 1])
         for k in range(boxes.shape[0]):
-            if labeled[k] < MIN_BOX_SHARE * held[k]:
+            box = boxes[k]
+            if n_labeled[k] < MIN_BOX_SHARE * n_inside[k]:
                 continue
-            if boxes[k, 7] > scores[i] and height[i] <= boxes[k, 6] and is_inside(boxes, k, x, y):
-                scores[i] = boxes[k, 7]
-                names[i] = of_box[k]
+            if box["score"] > scores[i] and height[i] <= box["top"] and is_inside(box, x, y):
+                scores[i] = box["score"]
+                names[i] = box["label"]
 
 
 @njit(cache=True, nogil=True)
-def bounds_of(boxes: NDArray[np.float64]) -> tuple[float, float, float, float]:
+def bounds_of(boxes: NDArray[np.void]) -> tuple[float, float, float, float]:
     """Lowest and highest x, lowest and highest y of the circles around boxes; none is inside if there are no boxes."""
     low_x, high_x, low_y, high_y = math.inf, -math.inf, math.inf, -math.inf
     for k in range(boxes.shape[0]):
-        radius = math.hypot(boxes[k, 2], boxes[k, 3])
-        low_x, high_x = min(low_x, boxes[k, 0] - radius), max(high_x, boxes[k, 0] + radius)
-        low_y, high_y = min(low_y, boxes[k, 1] - radius), max(high_y, boxes[k, 1] + radius)
+        box = boxes[k]
+        radius = math.hypot(box["half_length"], box["half_width"])
+        low_x, high_x = min(low_x, box["x"] - radius), max(high_x, box["x"] + radius)
+        low_y, high_y = min(low_y, box["y"] - radius), max(high_y, box["y"] + radius)
     return low_x, high_x, low_y, high_y
-
-
-@njit(cache=True, nogil=True)
-def is_inside(boxes: NDArray[np.float64], k: int, x: float, y: float) -> bool:
-    """Whether a place lies in the footprint of a box."""
-    dx, dy = x - boxes[k, 0], y - boxes[k, 1]
-    along, across = boxes[k, 4] * dx + boxes[k, 5] * dy, boxes[k, 4] * dy - boxes[k, 5] * dx
-    return bool((abs(along) <= boxes[k, 2]) & (abs(across) <= boxes[k, 3]))
 
 
 @njit(cache=True, nogil=True)
@@ -568,25 +501,20 @@ def clear_ground(
 
 @njit(cache=True, nogil=True)
 def count_inside(
-    points: NDArray[np.float32],
-    height: NDArray[np.float32],
+    cloud: Cloud,
     on_ground: NDArray[np.bool_],
     in_view: NDArray[np.bool_],
-    labels: NDArray[np.uint8],
-    roles: NDArray[np.uint8],
-    boxes: NDArray[np.float64],
+    labeled: Labeled,
+    boxes: NDArray[np.void],
     counts: NDArray[np.int64],
 ) -> None:
     """Count the points above the ground in every box.
 
-    points : (n, 3 or more) float32, C-contiguous
-    height : (n,) float32
     on_ground, in_view : (n,) bool
-    labels : (n,) uint8
-    roles : (classes,) uint8; 1 for vehicles.
-    boxes : (m, 8) float64; as in `fill_support`.
+    boxes : (m,) `BOX`
     counts : (m, 3) int64, overwritten; all points, those in view, and vehicle points in view.
     """
+    points, height, labels, roles = cloud.points, cloud.height, labeled.labels, labeled.roles
     counts[:] = 0
     low_x, high_x, low_y, high_y = bounds_of(boxes)
     for i in range(points.shape[0]):
@@ -594,7 +522,7 @@ def count_inside(
         if on_ground[i] or not ((x >= low_x) & (x <= high_x) & (y >= low_y) & (y <= high_y)):
             continue
         for k in range(boxes.shape[0]):
-            if is_inside(boxes, k, x, y) and height[i] <= boxes[k, 6]:
+            if is_inside(boxes[k], x, y) and height[i] <= boxes[k]["top"]:
                 counts[k, 0] += 1
                 if in_view[i]:
                     counts[k, 1] += 1
@@ -603,19 +531,18 @@ def count_inside(
 
 @njit(cache=True, nogil=True)
 def sum_inside(
-    points: NDArray[np.float32],
-    height: NDArray[np.float32],
+    cloud: Cloud,
     on_ground: NDArray[np.bool_],
     in_view: NDArray[np.bool_],
-    labels: NDArray[np.uint8],
-    roles: NDArray[np.uint8],
-    boxes: NDArray[np.float64],
+    labeled: Labeled,
+    boxes: NDArray[np.void],
     sums: NDArray[np.float64],
 ) -> None:
-    """Sum up the points above the ground in every box of (m, 8) as in `fill_support`: vehicles', and those out of view.
+    """Sum up the points above the ground in every box, (m,) `BOX`: vehicles', and those out of view.
 
     ``sums``, (m, 3), is overwritten: number of points, sum of the z of the ground below them, greatest height [m].
     """
+    points, height, labels, roles = cloud.points, cloud.height, labeled.labels, labeled.roles
     sums[:] = 0.0
     low_x, high_x, low_y, high_y = bounds_of(boxes)
     for i in range(points.shape[0]):
@@ -626,7 +553,7 @@ def sum_inside(
             continue
         above = np.float64(height[i])
         for k in range(boxes.shape[0]):
-            if (above >= 0.0) & (above <= boxes[k, 6]) and is_inside(boxes, k, x, y):
+            if (above >= 0.0) & (above <= boxes[k]["top"]) and is_inside(boxes[k], x, y):
                 sums[k, 0] += 1.0
                 sums[k, 1] += np.float64(points[i, 2]) - above
                 sums[k, 2] = max(sums[k, 2], above)

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..objects.cluster import MIN_PERSON_SHARE, find_clusters
+from ..objects.cluster import MIN_OF_WHOLE, MIN_PERSON_SHARE, find_clusters
 from ..objects.persons import MAX_LENGTH_M as MAX_PERSON_M
-from ..objects.persons import MAX_RIDING_WIDTH_M, MIN_OF_WHOLE, measure
+from ..objects.persons import MAX_RIDING_WIDTH_M, measure
 from ..objects.persons import MAX_TOP_M as MAX_PERSON_TOP_M
 from ..system.kernel_cache import njit
+from ..types.geometry import Grid, cell_at
+from ..types.points import Cloud, Labeled
 
 VEHICLE, PERSON = 1, 2  # roles of classes
 NO_CLUSTER = -1
@@ -44,23 +47,77 @@ ALONE_MARGIN_M = 0.1
 BODY_M = 0.3  # lower points may be of grass or pavement
 
 
+# A cluster; bounds are those of all of its points, in view or not.
+CLUSTER = np.dtype(
+    [
+        ("low_x", np.float32),  # [m]
+        ("low_y", np.float32),
+        ("high_x", np.float32),
+        ("high_y", np.float32),
+        ("top", np.float32),  # greatest height above the ground [m]
+        ("n_points", np.int32),
+        ("n_in_both", np.int32),  # points in view of the range image and of the top view
+        ("n_in_vehicles", np.int32),  # those of them in cells of vehicles
+    ],
+    align=True,
+)
+
+
+class Tallies(NamedTuple):
+    """What clusters hold.
+
+    Attributes
+    ----------
+    clusters : (k,) `CLUSTER`
+    counts : (k, classes + 1) int32
+        Points in view of each class; last, of all classes.
+    """
+
+    clusters: NDArray[np.void]
+    counts: NDArray[np.int32]
+
+
+class Cells(NamedTuple):
+    """A top view as kernels take it.
+
+    Attributes
+    ----------
+    labels : (rows, columns) uint8, C-contiguous
+        No cells without a top view.
+    is_vehicle : (256,) bool
+        Which labels are vehicles that count.
+    grid : Grid
+    """
+
+    labels: NDArray[np.uint8]
+    is_vehicle: NDArray[np.bool_]
+    grid: Grid
+
+
+class Applied(NamedTuple):
+    """Which rules on whole clusters apply."""
+
+    share: bool
+    height: bool
+    fill: bool
+
+
 @njit(cache=True, nogil=True)
 def fill_votes(
     in_view: NDArray[np.bool_],
-    labels: NDArray[np.uint8],
-    roles: NDArray[np.uint8],
+    labeled: Labeled,
     scores: NDArray[np.float32],
     votes: NDArray[np.uint8],
 ) -> None:
     """Write what each point may count for in its cluster.
 
     in_view : (n,) bool
-    labels : (n,) uint8
-    roles : (classes,) uint8; 1 for vehicles, 2 for persons, 0 for others.
+    labeled : roles are 1 for vehicles, 2 for persons, 0 for others.
     scores : (n,) float32; from `edgeperc.agreement.rules.fill_support`.
     votes : (n,) uint8, overwritten; bit 0: the point is in view. Bit 1: it may get the label of a vehicle. Bit 2: it
         has the label of a person.
     """
+    labels, roles = labeled.labels, labeled.roles
     of_label = np.empty(len(roles), np.uint8)
     for c in range(len(roles)):
         of_label[c] = 3 if roles[c] == VEHICLE else 5 if roles[c] == PERSON else 1
@@ -72,83 +129,68 @@ def fill_votes(
 
 @njit(cache=True, nogil=True)
 def fill_tallies(
-    points: NDArray[np.float32],
-    height: NDArray[np.float32],
+    cloud: Cloud,
     in_view: NDArray[np.bool_],
     labels: NDArray[np.uint8],
-    clusters: NDArray[np.int32],
-    cells: NDArray[np.uint8],
-    is_vehicle: NDArray[np.bool_],
-    grid: NDArray[np.float64],
-    counts: NDArray[np.int32],
-    bounds: NDArray[np.float32],
-    above: NDArray[np.int32],
+    cluster_of: NDArray[np.int32],
+    view: Cells,
+    tallies: Tallies,
 ) -> None:
     """Count the labels of every cluster, and measure it.
 
-    points : (n, 3 or more) float32, C-contiguous
-    height : (n,) float32
-    in_view : (n,) bool
-    labels : (n,) uint8
-    clusters : (n,) int32
-    cells : (rows, columns) uint8, C-contiguous; labels of the top view; no cells without one.
-    is_vehicle : (256,) bool; which labels of cells are vehicles.
-    grid : (3,) float64; x of the far edge of the top view, y of its left edge, edge of a cell [m].
-    counts : (k, classes + 1) int32, overwritten; points in view of each class; last, of all classes.
-    bounds : (k, 5) float32, overwritten; lowest x and y, highest x and y, highest height [m] of all points.
-    above : (k, 3) int32, overwritten; points in view that are in the top view too; those of them in cells of
-        vehicles; all points, in view or not.
+    in_view, labels, cluster_of : (n,) bool, (n,) uint8, (n,) int32
+    tallies : overwritten
     """
-    n_rows, n_cols = cells.shape
+    points, height, clusters, counts = cloud.points, cloud.height, tallies.clusters, tallies.counts
+    cells, is_vehicle, grid = view.labels, view.is_vehicle, view.grid
     counts[:] = 0
-    above[:] = 0
     last = counts.shape[1] - 1
-    for k in range(bounds.shape[0]):
-        bounds[k, 0], bounds[k, 1] = np.float32(math.inf), np.float32(math.inf)
-        bounds[k, 2], bounds[k, 3] = np.float32(-math.inf), np.float32(-math.inf)
-        bounds[k, 4] = np.float32(-math.inf)
+    for k in range(len(clusters)):
+        cluster = clusters[k]
+        cluster["low_x"], cluster["low_y"] = np.float32(math.inf), np.float32(math.inf)
+        cluster["high_x"], cluster["high_y"] = np.float32(-math.inf), np.float32(-math.inf)
+        cluster["top"] = np.float32(-math.inf)
+        cluster["n_points"], cluster["n_in_both"], cluster["n_in_vehicles"] = 0, 0, 0
     for i in range(points.shape[0]):
-        k = clusters[i]
+        k = cluster_of[i]
         if k < 0:
             continue
-        above[k, 2] += 1
+        cluster = clusters[k]
+        cluster["n_points"] += 1
         if in_view[i]:
             counts[k, labels[i]] += 1
             counts[k, last] += 1
-            row = (grid[0] - np.float64(points[i, 0])) / grid[2]
-            col = (grid[1] - np.float64(points[i, 1])) / grid[2]
-            if (row >= 0.0) & (row < n_rows) & (col >= 0.0) & (col < n_cols):
-                above[k, 0] += 1
-                above[k, 1] += 1 if is_vehicle[cells[int(row), int(col)]] else 0
-        bounds[k, 0], bounds[k, 1] = min(bounds[k, 0], points[i, 0]), min(bounds[k, 1], points[i, 1])
-        bounds[k, 2], bounds[k, 3] = max(bounds[k, 2], points[i, 0]), max(bounds[k, 3], points[i, 1])
-        bounds[k, 4] = max(bounds[k, 4], height[i])
+            row, col = cell_at(grid, cells.shape, np.float64(points[i, 0]), np.float64(points[i, 1]))
+            if row >= 0:
+                cluster["n_in_both"] += 1
+                cluster["n_in_vehicles"] += 1 if is_vehicle[cells[row, col]] else 0
+        cluster["low_x"], cluster["low_y"] = min(cluster["low_x"], points[i, 0]), min(cluster["low_y"], points[i, 1])
+        cluster["high_x"], cluster["high_y"] = (
+            max(cluster["high_x"], points[i, 0]),
+            max(cluster["high_y"], points[i, 1]),
+        )
+        cluster["top"] = max(cluster["top"], height[i])
 
 
 @njit(cache=True, nogil=True)
 def fill_verdicts(
-    counts: NDArray[np.int32],
-    bounds: NDArray[np.float32],
+    tallies: Tallies,
     refused: NDArray[np.bool_],
     roles: NDArray[np.uint8],
     parts: NDArray[np.int64],
-    by_share: bool,
-    by_height: bool,
-    is_filled: bool,
+    applied: Applied,
     verdicts: NDArray[np.uint8],
 ) -> None:
     """Decide what becomes of each label in each cluster.
 
-    counts : (k, classes + 1) int32
-    bounds : (k, 5) float32; from `fill_tallies`.
-    refused : (k,) bool; clusters that are no vehicles for another reason.
+    refused : (k,) bool; clusters that are not vehicles for another reason.
     roles : (classes,) uint8; 1 for vehicles, 2 for persons, 0 for others.
     parts : (p, 2) int64; class, and the class that it may be a part of.
-    by_share, by_height, is_filled : rules that apply.
     verdicts : (k, classes) uint8, overwritten
     """
+    clusters, counts = tallies.clusters, tallies.counts
     n_classes = len(roles)
-    for k in range(counts.shape[0]):
+    for k in range(len(clusters)):
         seen = max(counts[k, n_classes], 1)
         n_of_role = np.zeros(3, np.int64)
         most = np.zeros(3, np.int64)  # the most frequent class of each role, the first one on ties
@@ -158,33 +200,29 @@ def fill_verdicts(
             if role > 0 and (most[role] == 0 or counts[k, c] > counts[k, most[role]]):
                 most[role] = c
         vehicle_share, person_share = n_of_role[VEHICLE] / seen, n_of_role[PERSON] / seen
-        length = math.hypot(
-            np.float64(bounds[k, 2]) - np.float64(bounds[k, 0]), np.float64(bounds[k, 3]) - np.float64(bounds[k, 1])
-        )
-        top = bounds[k, 4]
+        low_x, low_y = np.float64(clusters[k]["low_x"]), np.float64(clusters[k]["low_y"])
+        high_x, high_y = np.float64(clusters[k]["high_x"]), np.float64(clusters[k]["high_y"])
+        length, top = math.hypot(high_x - low_x, high_y - low_y), clusters[k]["top"]
         is_large = length > MAX_LENGTH_M or top > MAX_TOP_M
         no_vehicle = refused[k]
-        no_vehicle |= by_share and vehicle_share < (MIN_LARGE_SHARE if is_large else MIN_VEHICLE_SHARE)
-        no_person = by_share and person_share < MIN_PERSON_SHARE
-        if by_height:
-            ahead = max(np.float64(bounds[k, 0]), -np.float64(bounds[k, 2]), 0.0)
-            aside = max(np.float64(bounds[k, 1]), -np.float64(bounds[k, 3]), 0.0)
-            is_near = math.hypot(ahead, aside) < NEAR_M
-            reach_x = max(abs(np.float64(bounds[k, 0])), abs(np.float64(bounds[k, 2])))
-            reach_y = max(abs(np.float64(bounds[k, 1])), abs(np.float64(bounds[k, 3])))
+        no_vehicle |= applied.share and vehicle_share < (MIN_LARGE_SHARE if is_large else MIN_VEHICLE_SHARE)
+        no_person = applied.share and person_share < MIN_PERSON_SHARE
+        if applied.height:
+            is_near = math.hypot(max(low_x, -high_x, 0.0), max(low_y, -high_y, 0.0)) < NEAR_M
+            reach = math.hypot(max(abs(low_x), abs(high_x)), max(abs(low_y), abs(high_y)))
             no_vehicle |= top < (MIN_NEAR_VEHICLE_TOP_M if is_near else MIN_VEHICLE_TOP_M)
             is_door = length < DOOR_M or top < DOOR_TOP_M
-            no_vehicle |= math.hypot(reach_x, reach_y) < OWN_REACH_M and is_door and person_share < MIN_PERSON_SHARE
+            no_vehicle |= reach < OWN_REACH_M and is_door and person_share < MIN_PERSON_SHARE
             no_person |= top < MIN_PERSON_TOP_M
         for c in range(n_classes):
             is_lost = (roles[c] == VEHICLE and no_vehicle) or (roles[c] == PERSON and no_person)
             verdicts[k, c] = 0 if is_lost else c
-        if is_filled and most[VEHICLE] > 0 and not no_vehicle and vehicle_share >= MIN_FILL_SHARE and not is_large:
+        if applied.fill and most[VEHICLE] > 0 and not no_vehicle and vehicle_share >= MIN_FILL_SHARE and not is_large:
             for c in range(n_classes):
                 if c == 0 or roles[c] > 0:
                     verdicts[k, c] = most[VEHICLE]
         is_group = person_share >= MIN_FILL_SHARE and length < MAX_GROUP_M and top < MAX_GROUP_TOP_M
-        if is_filled and most[PERSON] > 0 and not no_person and is_group:
+        if applied.fill and most[PERSON] > 0 and not no_person and is_group:
             for at in range(parts.shape[0]):
                 part, whole = parts[at]
                 if counts[k, whole] >= MIN_OF_WHOLE * (counts[k, part] + counts[k, whole]):
@@ -227,32 +265,36 @@ def apply_verdicts(
         labels[i] = new
 
 
+def may_be_persons(tallies: Tallies, walks: int, rides: int) -> NDArray[np.bool_]:
+    """The clusters that hold labels of persons and whose bounds are not too large for one, (k,)."""
+    clusters, counts = tallies
+    edge = np.maximum(clusters["high_x"] - clusters["low_x"], clusters["high_y"] - clusters["low_y"])
+    # In float64: numpy would round the limits to float32.
+    is_small = (edge.astype(np.float64) <= 2.0 * MAX_PERSON_M) & (
+        clusters["top"].astype(np.float64) <= MAX_PERSON_TOP_M
+    )
+    return np.asarray(is_small & (counts[:, walks] + counts[:, rides] > 0), np.bool_)
+
+
 def find_persons_alone(
-    points: NDArray[np.float32],
-    height: NDArray[np.float32],
-    roles: NDArray[np.uint8],
-    before: NDArray[np.uint8],
-    labels: NDArray[np.uint8],
+    cloud: Cloud, roles: NDArray[np.uint8], before: NDArray[np.uint8], labels: NDArray[np.uint8]
 ) -> list[NDArray[np.int32]]:
     """Find groups of points that are a person by themselves, though linked with something large.
 
-    points : (n, 4) float32, C-contiguous
-    height : (n,) float32; height above the ground [m].
     roles : (classes,) uint8
     before, labels : (n,) uint8; labels before the clusters voted, and after.
     Returns list of (k,) int32: Rows of each person. Their labels were lost.
     """
+    points, height = cloud
     changed = np.flatnonzero(before != labels)
     lost = changed[(roles[before[changed]] == PERSON) & (labels[changed] == 0)].astype(np.int32)
     if len(lost) < MIN_ALONE:
         return []
     alone = []
     groups = find_clusters(points[lost], min_points=MIN_ALONE)
-    shape = np.empty(7)
     for k in range(int(groups.max()) + 1):
         own = lost[groups == k]
-        measure(points, height, own, BODY_M, shape)
-        cos, sin, u_low, u_high, v_low, v_high, top = shape.tolist()
+        cos, sin, u_low, u_high, v_low, v_high, top = measure(cloud, own, BODY_M)
         if (
             u_high - u_low > MAX_PERSON_M
             or not MIN_ALONE_WIDTH_M <= v_high - v_low <= MAX_RIDING_WIDTH_M

@@ -10,11 +10,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import PointsError
+from ..system.draws import drawn_of, next_draw
 from ..system.kernel_cache import njit
 from ..types.points import read_only
 
@@ -233,6 +235,26 @@ def fill_lowest(points: NDArray[np.float32], cell: NDArray[np.int32], lowest: ND
         flat[at] = np.int32(best[at + 1] & LOW_WORD) if best[at + 1] != EMPTY else np.int32(-1)
 
 
+class Patch(NamedTuple):
+    """A square of cells to which a plane is fitted.
+
+    Attributes
+    ----------
+    row, col : int
+        The first cell.
+    size : int
+        Cells along each side.
+    x, y : float
+        Origin of the plane [m].
+    """
+
+    row: int
+    col: int
+    size: int
+    x: float
+    y: float
+
+
 @njit(cache=True, nogil=True)
 def fit_first_plane(
     points: NDArray[np.float32], lowest: NDArray[np.int32], reach_m: float, plane: NDArray[np.float64]
@@ -242,7 +264,8 @@ def fit_first_plane(
     start = (N_CELLS - size) // 2
     residuals = np.empty((3, size * size))
     fitted = np.empty(3)
-    n = fill_residuals(points, lowest, start, start, size, 0.0, 0.0, plane, MAX_MOUNT_ERROR_M, MAX_SLOPE, residuals)
+    patch = Patch(start, start, size, 0.0, 0.0)
+    n = fill_residuals(points, lowest, patch, plane, MAX_MOUNT_ERROR_M, MAX_SLOPE, residuals)
     step = (n + MAX_TESTED - 1) // MAX_TESTED
     tested = np.empty((3, MAX_TESTED))
     n_tested = np.int64(0)
@@ -304,8 +327,8 @@ def fill_planes(
                     expected[0], expected[1], expected[2] = first[0], first[1], first[2]
                     expected[2] += first[0] * middle_x + first[1] * middle_y
                 row, col = r * CELLS_A_REGION, q * CELLS_A_REGION
-                size = np.int64(CELLS_A_REGION)
-                n = fill_residuals(points, lowest, row, col, size, middle_x, middle_y, expected, BAND_M, 0.0, residuals)
+                patch = Patch(row, col, np.int64(CELLS_A_REGION), middle_x, middle_y)
+                n = fill_residuals(points, lowest, patch, expected, BAND_M, 0.0, residuals)
                 # Element by element: to copy an array, numba compiles a broadcast with its error messages, for 3 s.
                 for k in range(3):
                     planes[r, q, k] = expected[k]
@@ -323,29 +346,25 @@ def fill_planes(
 def fill_residuals(
     points: NDArray[np.float32],
     lowest: NDArray[np.int32],
-    first_row: int,
-    first_col: int,
-    size: int,
-    middle_x: float,
-    middle_y: float,
+    patch: Patch,
     expected: NDArray[np.float64],
     band: float,
     cone: float,
     residuals: NDArray[np.float64],
 ) -> int:
-    """Write x, y from the middle and z above the expected plane of the lowest returns of size x size cells.
+    """Write x, y from the origin and z above the expected plane of the lowest returns of a patch.
 
-    A return is skipped if it is farther from the plane than ``band`` plus ``cone`` times its distance from the middle.
+    A return is skipped if it is farther from the plane than ``band`` plus ``cone`` times its distance from the origin.
     Returns the number of columns written.
     """
     n = 0
-    for row in range(first_row, first_row + size):
-        for col in range(first_col, first_col + size):
+    for row in range(patch.row, patch.row + patch.size):
+        for col in range(patch.col, patch.col + patch.size):
             i = lowest[row, col]
             if i < 0:
                 continue
-            x = np.float64(points[i, 0]) - middle_x
-            y = np.float64(points[i, 1]) - middle_y
+            x = np.float64(points[i, 0]) - patch.x
+            y = np.float64(points[i, 1]) - patch.y
             z = np.float64(points[i, 2]) - (expected[0] * x + expected[1] * y + expected[2])
             if abs(z) <= band + cone * math.sqrt(x * x + y * y):
                 residuals[0, n], residuals[1, n], residuals[2, n] = x, y, z
@@ -371,8 +390,8 @@ def find_plane(
     corners = np.empty(3, np.int64)
     for _ in range(n_hypotheses):
         for corner in range(3):
-            draw = (draw * 1103515245 + 12345) & 0x7FFFFFFF
-            corners[corner] = (draw * n) >> 31
+            draw = next_draw(draw)
+            corners[corner] = drawn_of(draw, n)
         x0, y0, z0 = residuals[0, corners[0]], residuals[1, corners[0]], residuals[2, corners[0]]
         x1, y1, z1 = residuals[0, corners[1]] - x0, residuals[1, corners[1]] - y0, residuals[2, corners[1]] - z0
         x2, y2, z2 = residuals[0, corners[2]] - x0, residuals[1, corners[2]] - y0, residuals[2, corners[2]] - z0

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from ..errors import PointsError
 from ..types.perception import PointLabels
-from ..types.points import read_only
+from ..types.points import Cloud, read_only
 from .planes import Ground
 
 
@@ -27,6 +27,11 @@ class Scan:
 
     points: NDArray[np.float32]
     ground: Ground
+
+    @property
+    def cloud(self) -> Cloud:
+        """The points as kernels take them."""
+        return Cloud(self.points, self.ground.height_m)
 
     @classmethod
     def of(cls, points: NDArray[np.float32], ground: Ground, labels: PointLabels | None = None) -> Scan:

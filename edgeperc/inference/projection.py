@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -64,6 +65,52 @@ class Projection:
     pixel: NDArray[np.int32]
 
 
+class Bounds(NamedTuple):
+    """A top view as its kernel takes it.
+
+    Attributes
+    ----------
+    x_min, x_max, y_min, y_max, z_min, z_max : float32
+        [m]
+    cells_per_m : float32
+    height, width : int32
+        Rows and columns.
+    """
+
+    x_min: np.float32
+    x_max: np.float32
+    y_min: np.float32
+    y_max: np.float32
+    z_min: np.float32
+    z_max: np.float32
+    cells_per_m: np.float32
+    height: np.int32
+    width: np.int32
+
+
+class Intervals(NamedTuple):
+    """Tables that find the interval of a value with one comparison (`tabulate`).
+
+    Interval j holds ``edges[j] >= value > edges[j + 1]``. With ``k = int32((first - value) * cells_per_unit)`` in
+    float32, j is exactly ``base[k] + (value <= split[k])``: the edges are sorted into table cells by the same rounded
+    arithmetic, and no two edges share a cell.
+
+    Attributes
+    ----------
+    first, last : float32
+        First and last edge; the last is lower than any value if it is straight behind the sensor.
+    cells_per_unit : float32
+    base : (cells + 2,) int32
+    split : (cells + 2,) float32
+    """
+
+    first: np.float32
+    last: np.float32
+    cells_per_unit: np.float32
+    base: NDArray[np.int32]
+    split: NDArray[np.float32]
+
+
 # The kernels process points in blocks, in short loops without branches that compile to vector instructions. Only the
 # table look-ups and the choice of a pixel's point are scalar code. Each of these rules makes its loop two to three
 # times as fast:
@@ -75,30 +122,17 @@ class Projection:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def mark_top_view(
-    points: NDArray[np.float32],
-    x_range: NDArray[np.float32],
-    y_range: NDArray[np.float32],
-    z_range: NDArray[np.float32],
-    cells_per_m: np.float32,
-    height: np.int32,
-    width: np.int32,
-    index: NDArray[np.int32],
-    pixel: NDArray[np.int32],
+    points: NDArray[np.float32], view: Bounds, index: NDArray[np.int32], pixel: NDArray[np.int32]
 ) -> None:
     """Mark the highest point of each cell in ``index``, and the cell of each point in ``pixel``.
 
     points : (n, 4) float32, C-contiguous; x, y, z [m] in the sensor frame, remission.
-    x_range, y_range, z_range : (2,) float32; bounds of the view [m], lower first.
-    cells_per_m : float32
-    height, width : int32
     index : (height * width,) int32, overwritten; row of points; -1 without a return.
     pixel : (n,) int32, overwritten; flat pixel of each point; -1 out of view.
     """
     pixel[:] = np.int32(-1)
     index[:] = np.int32(-1)
-    x_min, x_max = x_range[0], x_range[1]
-    y_min, y_max = y_range[0], y_range[1]
-    z_min, z_max = z_range[0], z_range[1]
+    x_min, x_max, y_min, y_max, z_min, z_max, cells_per_m, height, width = view
     last_row = height - np.int32(1)
     last_col = width - np.int32(1)
     values = points.reshape(-1)
@@ -147,12 +181,8 @@ def mark_top_view(
 def mark_range_image(
     points: NDArray[np.float32],
     wedge: NDArray[np.float32],
-    row_scale: NDArray[np.float32],
-    row_base: NDArray[np.int32],
-    row_split: NDArray[np.float32],
-    col_scale: NDArray[np.float32],
-    col_base: NDArray[np.int32],
-    col_split: NDArray[np.float32],
+    row_table: Intervals,
+    col_table: Intervals,
     width: np.int32,
     winner: NDArray[np.int64],
     index: NDArray[np.int32],
@@ -163,10 +193,6 @@ def mark_range_image(
     points : (n, 4) float32, C-contiguous; x, y, z [m] in the sensor frame, remission.
     wedge : (4,) float32; coefficients of x, y, x, y in two sums that are not negative for any point in view: a cheap
         test that saves the divisions for three quarters of a full turn.
-    row_scale, col_scale : (3,) float32
-    row_base, col_base : (cells + 2,) int32
-    row_split, col_split : (cells + 2,) float32; from `tabulate`.
-    width : int32
     winner : (height * width,) int64, overwritten; scratch: ``rank << 32 | row of points``, or ``EMPTY``.
     index : (height * width,) int32, overwritten; row of points; -1 without a return.
     pixel : (n,) int32, overwritten; flat pixel of each point; -1 out of view.
@@ -174,8 +200,8 @@ def mark_range_image(
     pixel[:] = np.int32(-1)
     winner[:] = EMPTY
     left_x, left_y, right_x, right_y = wedge[0], wedge[1], wedge[2], wedge[3]
-    top, bottom, row_cells = row_scale[0], row_scale[1], row_scale[2]
-    left, right, col_cells = col_scale[0], col_scale[1], col_scale[2]
+    top, bottom, row_cells, row_base, row_split = row_table
+    left, right, col_cells, col_base, col_split = col_table
     values = points.reshape(-1)
     seen = np.empty(BLOCK, np.uint32)
     chosen = np.empty(BLOCK, np.uint32)
@@ -321,8 +347,17 @@ class TopViewProjector:
         self.shape = (len(input.channels), view.height, view.width)
         self.needs_ground = input.needs_ground
         self._channels, self._mean, self._std = _channels(input, ("distance", "remission", "height"))
-        self._ranges = tuple(np.array(r, dtype=np.float32) for r in (view.x_range_m, view.y_range_m, view.z_range_m))
-        self._cells_per_m = np.float32(1.0 / view.cell_m)
+        self._bounds = Bounds(
+            np.float32(view.x_range_m[0]),
+            np.float32(view.x_range_m[1]),
+            np.float32(view.y_range_m[0]),
+            np.float32(view.y_range_m[1]),
+            np.float32(view.z_range_m[0]),
+            np.float32(view.z_range_m[1]),
+            np.float32(1.0 / view.cell_m),
+            np.int32(view.height),
+            np.int32(view.width),
+        )
 
     def fill(
         self,
@@ -344,12 +379,8 @@ class TopViewProjector:
         Raises PointsError.
         """
         points = _checked(self.shape, points, image, index, pixel)
-        _, height, width = self.shape
-        x_range, y_range, z_range = self._ranges
         flat_index = index.reshape(-1)
-        mark_top_view(
-            points, x_range, y_range, z_range, self._cells_per_m, np.int32(height), np.int32(width), flat_index, pixel
-        )
+        mark_top_view(points, self._bounds, flat_index, pixel)
         heights = _heights(self.needs_ground, len(points), height_m)
         flat_image = image.reshape(self.shape[0], -1)
         fill_image(points, heights, flat_index, self._channels, self._mean, self._std, flat_image)
@@ -421,9 +452,8 @@ class RangeImageProjector:
         """Project into the caller's buffers; arguments and errors as in `TopViewProjector.fill`."""
         points = _checked(self.shape, points, image, index, pixel)
         flat_index = index.reshape(-1)
-        mark_range_image(
-            points, self._wedge, *self._rows, *self._cols, np.int32(self.shape[2]), self._winner, flat_index, pixel
-        )
+        width = np.int32(self.shape[2])
+        mark_range_image(points, self._wedge, self._rows, self._cols, width, self._winner, flat_index, pixel)
         self.fill_image(points, index, image, height_m)
 
     def fill_image(
@@ -483,21 +513,11 @@ def wedge(view: RangeImageGeometry) -> NDArray[np.float32]:
     return np.array([math.sin(left), -math.cos(left), -math.sin(right), math.cos(right)], dtype=np.float32)
 
 
-def tabulate(
-    edges: NDArray[np.float32], what: str
-) -> tuple[NDArray[np.float32], NDArray[np.int32], NDArray[np.float32]]:
+def tabulate(edges: NDArray[np.float32], what: str) -> Intervals:
     """Build tables that find the interval of a value with one comparison.
-
-    Interval j holds ``edges[j] >= value > edges[j + 1]``. With ``k = int32((first - value) * cells_per_unit)`` in
-    float32, j is exactly ``base[k] + (value <= split[k])``: the edges are sorted into table cells by the same rounded
-    arithmetic, and no two edges share a cell.
 
     edges : (m + 1,) float32; strictly decreasing.
     what : noun for the error message, e.g. ``"rows"``.
-    Returns scale ((3,) float32): First edge, last edge (lower than any value if it is straight behind the sensor),
-        cells_per_unit.
-    Returns base: (cells + 2,) int32.
-    Returns split: (cells + 2,) float32.
     Raises CardError.
     """
     first, last = edges[0], edges[-1]
@@ -512,7 +532,7 @@ def tabulate(
             split[at] = inner
             # -2 is straight behind; azimuths slightly to the left of that are rounded to it.
             open_end = np.float32(-3.0) if last == np.float32(-2.0) else last
-            return np.array([first, open_end, cells_per_unit], dtype=np.float32), base, split
+            return Intervals(first, open_end, cells_per_unit, base, split)
         cells *= 2
     raise CardError(
         f"view has {edges.size - 1} {what}, some closer than float32 angles can separate; expected wider ones"

@@ -13,9 +13,9 @@ from ..errors import PointsError
 from ..system.kernel_cache import njit
 from ..types.geometry import oriented_iou, rectangles, shared_area, suppress_overlaps
 from ..types.perception import Box
-from ..types.points import read_only
-from .cluster import MIN_PERSON_SHARE, PERSONS, find_clusters, group_points, labels_of_groups
-from .persons import UNSEEN, fill_person_groups, fill_persons
+from ..types.points import Cloud, Labeled, read_only
+from .cluster import MIN_PERSON_SHARE, PERSONS, Groups, find_clusters, group_points, labels_of_groups
+from .persons import PERSON, UNSEEN, fill_person_groups, fill_persons
 
 # Mean length, width and height [m] of KITTI's labeled objects.
 OBJECT_SIZE_M: Mapping[str, tuple[float, float, float]] = MappingProxyType(
@@ -173,19 +173,22 @@ def objects_from_points(
         )
     if clusters.shape != labels.shape:
         raise PointsError(f"got clusters of shape {clusters.shape} for {len(points)} points; expected one a point")
-    order, starts = group_points(clusters)
+    labels, clusters = read_only(labels, np.uint8), read_only(clusters, np.int32)
+    cloud = Cloud(read_only(points), read_only(np.zeros(len(points)) if height_m is None else height_m))
+    groups = group_points(clusters)
     numbers = labels
     if in_view is not None and roles.any() and len(classes) < len(roles):
-        numbers = np.where(in_view, labels, len(classes)).astype(np.uint8)
+        numbers = read_only(np.where(in_view, labels, len(classes)), np.uint8)
         roles[len(classes)] = UNSEEN
+    standing = cloud if height_m is not None else _above_lowest(cloud, clusters, groups)
     persons = _persons(
-        points, numbers, classes, roles, clusters, order, starts, height_m, distance_per_m, min_points, size_m
+        standing, Labeled(numbers, roles), classes, clusters, groups, distance_per_m, max(min_points, 1), size_m
     )
-    sizes = np.diff(starts)
-    found, shares = labels_of_groups(order, starts, labels, 0.0, {})
+    sizes = np.diff(groups.starts)
+    found, shares = labels_of_groups(groups, labels, 0.0, {})
     seen = sizes
     if in_view is not None and len(sizes):
-        seen = np.add.reduceat(in_view[order[: starts[-1]]], starts[:-1], dtype=np.int64)
+        seen = np.add.reduceat(in_view[groups.order], groups.starts[:-1], dtype=np.int64)
         shares *= sizes / np.maximum(seen, 1)
     found[(shares <= min_share) | (roles[found] > 0)] = 0
     evidence = seen / (seen + EVIDENCE)
@@ -193,13 +196,11 @@ def objects_from_points(
     kept = np.argsort(-highest, kind="stable")[:MAX_OBJECTS]
     kept = np.sort(kept[(found[kept] > 0) & (highest[kept] >= min_score)])
     named_by_size = {*classes_of_boxes(classes)} - {*classes}
-    rows = read_only(points)
-    above = read_only(np.zeros(len(points)) if height_m is None else height_m)
     boxes, spans = [], []
     for k in kept.tolist():
         name = classes[found[k]]
-        members = order[starts[k] : starts[k + 1]]
-        rectangle, levels, top = _fitted(rows, above, members, name in L_SHAPED)
+        members = groups.order[groups.starts[k] : groups.starts[k + 1]]
+        rectangle, levels, top = _fitted(cloud, members, name in L_SHAPED)
         levels.sort()
         if height_m is None:
             bottom = float(levels[0])
@@ -243,7 +244,7 @@ def _not_inside(boxes: list[Box], spans: Sequence[NDArray[np.float64]], others: 
 
 
 def _fitted(
-    rows: NDArray[np.float32], above: NDArray[np.float32], members: NDArray[np.int32], l_shaped: bool
+    cloud: Cloud, members: NDArray[np.int32], l_shaped: bool
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
     """What `fill_rectangle` finds: the rectangle, the levels and the highest point.
 
@@ -252,11 +253,11 @@ def _fitted(
     """
     for _ in range(MAX_FITS):
         rectangle, levels = np.empty(5), np.empty(len(members))
-        top = fill_rectangle(rows, above, members, l_shaped, rectangle, levels)
+        top = fill_rectangle(cloud, members, l_shaped, rectangle, levels)
         if not l_shaped or min(rectangle[2:4]) <= MAX_WIDTH_M:
             break
         across = rectangle[4] + (math.pi / 2.0 if rectangle[2] >= rectangle[3] else 0.0)
-        side = rows[members, :2] @ np.array([math.cos(across), math.sin(across)])
+        side = cloud.points[members, :2] @ np.array([math.cos(across), math.sin(across)])
         ordered = np.sort(side)
         n_within = np.searchsorted(ordered, ordered + MAX_WIDTH_M, side="right") - np.arange(len(side))
         first = ordered[n_within.argmax()]
@@ -288,44 +289,44 @@ def _roles(classes: Sequence[str]) -> NDArray[np.uint8]:
     return roles
 
 
+def _above_lowest(cloud: Cloud, clusters: NDArray[np.int32], groups: Groups) -> Cloud:
+    """Points with their heights above the lowest point of their cluster, (n,)."""
+    z = cloud.points[:, 2]
+    if not len(groups.order):
+        return cloud
+    lowest = np.minimum.reduceat(z[groups.order], groups.starts[:-1])
+    return Cloud(cloud.points, read_only(z - np.where(clusters >= 0, lowest[clusters], 0.0)))
+
+
 def _persons(
-    points: NDArray[np.float32],
-    labels: NDArray[np.uint8],
+    cloud: Cloud,
+    labeled: Labeled,
     classes: Sequence[str],
-    roles: NDArray[np.uint8],
     clusters: NDArray[np.int32],
-    order: NDArray[np.int32],
-    starts: NDArray[np.int64],
-    height_m: NDArray[np.float32] | None,
+    by_cluster: Groups,
     distance_per_m: float,
     min_points: int,
     size_m: Mapping[str, tuple[float, float, float]],
 ) -> list[Box]:
     """The boxes of persons, of any score; see `objects_from_points`."""
-    order = order[: starts[-1]]
-    if not roles.any() or not len(order):
+    if not labeled.roles.any() or not len(by_cluster.order):
         return []
-    rows, numbers = read_only(points), read_only(labels, np.uint8)
-    if height_m is None:
-        lowest = np.minimum.reduceat(rows[order, 2], starts[:-1])
-        height_m = rows[:, 2] - np.where(clusters >= 0, lowest[clusters], 0.0)
-    height, of = read_only(height_m, np.float32), read_only(clusters, np.int32)
-    groups, group_starts = np.empty_like(order), np.empty_like(starts)
-    loose = np.empty_like(order)
-    n_whole, n_loose = fill_person_groups(rows, height, numbers, roles, order, starts, groups, group_starts, loose)
-    groups, group_starts = groups[: group_starts[n_whole]], group_starts[: n_whole + 1]
+    groups = Groups(np.empty_like(by_cluster.order), np.empty_like(by_cluster.starts))
+    loose = np.empty_like(by_cluster.order)
+    n_whole, n_loose = fill_person_groups(cloud, labeled, by_cluster, groups, loose)
+    groups = Groups(groups.order[: groups.starts[n_whole]], groups.starts[: n_whole + 1])
     if n_loose:
-        linked = find_clusters(rows[loose[:n_loose]], distance_per_m=distance_per_m, min_points=min_points)
-        linked_order, linked_starts = group_points(linked)
-        groups = np.concatenate([groups, loose[linked_order[: linked_starts[-1]]]])
-        group_starts = np.concatenate([group_starts, group_starts[-1] + linked_starts[1:]])
-    found = np.empty((min(len(groups) // max(min_points, 1), MAX_OBJECTS), 11))
-    n = fill_persons(
-        rows, height, numbers, roles, groups, group_starts, n_whole, of, order, starts, max(min_points, 1), found
-    )
+        linked = find_clusters(cloud.points[loose[:n_loose]], distance_per_m=distance_per_m, min_points=min_points)
+        order, starts = group_points(linked)
+        groups = Groups(
+            np.concatenate([groups.order, loose[order]]),
+            np.concatenate([groups.starts, groups.starts[-1] + starts[1:]]),
+        )
+    persons = np.empty(min(len(groups.order) // min_points, MAX_OBJECTS), PERSON)
+    n = fill_persons(cloud, labeled, groups, n_whole, clusters, by_cluster, min_points, persons)
     known = [name for name in PERSONS if name in classes]
     boxes = []
-    for rides, x, y, along, across, yaw, bottom, top, n_points, share, heads in found[:n].tolist():
+    for rides, x, y, along, across, yaw, bottom, top, n_points, share, heads in persons[:n].tolist():
         name = known[-1] if rides else known[0]
         evidence = EVIDENCE
         if distance_per_m > 0.0:
@@ -412,8 +413,7 @@ def _completed(
 
 @njit(cache=True, nogil=True)
 def fill_rectangle(
-    points: NDArray[np.float32],
-    height: NDArray[np.float32],
+    cloud: Cloud,
     members: NDArray[np.int32],
     l_shaped: bool,
     rectangle: NDArray[np.float64],
@@ -421,8 +421,6 @@ def fill_rectangle(
 ) -> float:
     """Write the rectangle around points seen from above, and what they stand on.
 
-    points : (n, 3 or more) float32; x, y, z [m].
-    height : (n,) float32; height of every point above the ground [m].
     members : (m,) int32; rows of the points in the rectangle, at least one.
     l_shaped : true: the heading for which most points lie near a side. False: the heading of the smallest rectangle.
     rectangle : (5,) float64, overwritten; x, y of the middle, extent along and across the heading [m], heading [rad]
@@ -432,6 +430,7 @@ def fill_rectangle(
     """
     # All headings at once for each point: processors compare and divide eight at a time, which takes a third of the
     # time of one heading after the other.
+    points, height = cloud.points, cloud.height
     step = (len(members) + MAX_FITTED - 1) // MAX_FITTED
     cos, sin, merit = np.empty(N_ANGLES), np.empty(N_ANGLES), np.empty(N_ANGLES)
     low_u, high_u = np.empty(N_ANGLES), np.empty(N_ANGLES)

@@ -11,6 +11,7 @@ import math
 import warnings
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,10 +19,11 @@ from numpy.typing import NDArray
 from ..errors import PointsError
 from ..system.kernel_cache import njit
 from ..types.points import read_only
-from .linkage import COLUMN_EDGE, MAX_COLUMNS, TESTS_PER_POINT, Strips, chain_points, fill_clusters, levels_of
-from .persons import MIN_OF_WHOLE, RIDES, WALKS
+from .linkage import COLUMN_EDGE, MAX_COLUMNS, TESTS_PER_POINT, WORK, Strips, chain_points, fill_clusters, levels_of
 
-# Networks label many of a cyclist's points as pedestrian.
+WALKS, RIDES = 1, 2  # roles of labels
+# Networks label many of a cyclist's points as pedestrian: who has this share of them or more rides.
+MIN_OF_WHOLE = 0.25
 PART_OF = MappingProxyType({"pedestrian": "cyclist"})
 MIN_PERSON_SHARE = 0.1  # persons stand near walls and cars: a larger share loses people
 PERSONS = MappingProxyType({"pedestrian": WALKS, "cyclist": RIDES})
@@ -108,23 +110,12 @@ def find_clusters(
         if mask is not None and mask.shape != points.shape[:1]:
             raise PointsError(f"got {name} of shape {mask.shape} for {len(points)} points; expected one value a point")
     seeded = read_only(np.ones(len(points), np.bool_) if seeds is None else seeds, np.bool_)
-    clusters = np.empty(len(points), np.int32)
-    work = np.empty(3, np.int64)
-    fill_clusters(
-        read_only(points),
-        *strips,
-        seeded,
-        read_only(seeded.view(np.uint8) * 2 + 1 if votes is None else votes, np.uint8),
-        np.array(min_share, np.float64).reshape(-1),
-        float(distance_per_m),
-        float(max_range_m),
-        min_points,
-        clusters,
-        work,
-    )
-    if work[2]:
+    counted = read_only(seeded.view(np.uint8) * 2 + 1 if votes is None else votes, np.uint8)
+    clusters, work = np.empty(len(points), np.int32), np.empty(1, WORK)
+    fill_clusters(strips, seeded, counted, np.array(min_share, np.float64).reshape(-1), min_points, clusters, work)
+    if n_incomplete := int(work["n_incomplete"][0]):
         warnings.warn(
-            f"{work[2]} neighboring parts of the scan were not compared completely, because that needs more than "
+            f"{n_incomplete} neighboring parts of the scan were not compared completely, because that needs more than "
             f"{TESTS_PER_POINT} tests a point; a cluster may be split there. Is this the scan of a LiDAR, in meters?",
             stacklevel=2,
         )
@@ -161,12 +152,12 @@ def sort_points(
             f"got min_distance_m={min_distance_m}, distance_per_m={distance_per_m} and max_range_m={max_range_m}; "
             "expected a distance above 0 and at least 1/2000 of the range, and distance_per_m in 0..1"
         )
-    edges, limits = levels_of(float(min_distance_m), float(distance_per_m), float(max_range_m))
+    levels = levels_of(float(min_distance_m), float(distance_per_m), float(max_range_m))
     rows, chain = np.empty((2, n), np.int32)
-    grids, shapes = np.empty((len(edges) - 1, 3)), np.empty((len(edges) - 1, 3), np.int64)
     used = read_only(np.ones(n, np.bool_) if among is None else among, np.bool_)
-    m, heads = chain_points(read_only(points), used, edges, limits, float(max_range_m), rows, chain, grids, shapes)
-    return Strips(rows[:m], heads, chain, edges, limits, grids, shapes)
+    scan = read_only(points)
+    m, heads = chain_points(scan, used, float(max_range_m), levels, rows, chain)
+    return Strips(scan, rows[:m], heads, chain, levels, float(distance_per_m), float(max_range_m))
 
 
 def cluster_labels(
@@ -191,41 +182,46 @@ def cluster_labels(
         raise PointsError(
             f"got labels of shape {labels.shape} for clusters of shape {clusters.shape}; expected the same"
         )
-    return labels_of_groups(*group_points(clusters), labels, min_share, part_of)
+    return labels_of_groups(group_points(clusters), labels, min_share, part_of)
+
+
+class Groups(NamedTuple):
+    """Points by the groups that they belong to.
+
+    Attributes
+    ----------
+    order : (m,) int32
+        Rows of the points of group 0, in input order unless stated otherwise, then of group 1, and so on.
+    starts : (k + 1,) int64
+        Where each of the k groups begins in ``order``; last, where they end.
+    """
+
+    order: NDArray[np.int32]
+    starts: NDArray[np.int64]
 
 
 def labels_of_groups(
-    order: NDArray[np.int32],
-    starts: NDArray[np.int64],
-    labels: NDArray[np.uint8],
-    min_share: float,
-    part_of: Mapping[int, int],
+    groups: Groups, labels: NDArray[np.uint8], min_share: float, part_of: Mapping[int, int]
 ) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
-    """`cluster_labels` of points that are sorted by `group_points`."""
-    classes = np.empty(len(starts) - 1, np.uint8)
-    shares = np.empty(len(starts) - 1)
+    """`cluster_labels` of groups."""
+    classes = np.empty(len(groups.starts) - 1, np.uint8)
+    shares = np.empty(len(groups.starts) - 1)
     parts = np.array([*part_of.items()], np.int64).reshape(-1, 2)
-    fill_cluster_labels(read_only(labels, np.uint8), order, starts, parts, float(min_share), classes, shares)
+    fill_cluster_labels(labels, groups, parts, float(min_share), classes, shares)
     return classes, shares
 
 
-def group_points(clusters: NDArray[np.int32]) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
-    """Points of cluster 0 in input order, then those of cluster 1, and so on; and where each starts, (k + 1,)."""
-    starts = np.empty(int(clusters.max(initial=-1)) + 2, np.int64)
-    order = np.empty(len(clusters), np.int32)
-    fill_groups(read_only(clusters, np.int32), starts, order)
-    return order, starts
+def group_points(clusters: NDArray[np.int32]) -> Groups:
+    """Points by cluster, (n,); -1 for none."""
+    groups = Groups(np.empty(len(clusters), np.int32), np.empty(int(clusters.max(initial=-1)) + 2, np.int64))
+    fill_groups(read_only(clusters, np.int32), groups)
+    return Groups(groups.order[: groups.starts[-1]], groups.starts)
 
 
 @njit(cache=True, nogil=True)
-def fill_groups(clusters: NDArray[np.int32], starts: NDArray[np.int64], order: NDArray[np.int32]) -> None:
-    """Sort points by their clusters.
-
-    clusters : (n,) int32; negative for none.
-    starts : (k + 1,) int64, overwritten; where each of the k clusters starts in ``order``; last, their number of
-        points.
-    order : (n,) int32, overwritten; rows of the points, in input order within a cluster.
-    """
+def fill_groups(clusters: NDArray[np.int32], groups: Groups) -> None:
+    """Sort points by their clusters, (n,); negative for none. ``groups`` is overwritten."""
+    order, starts = groups.order, groups.starts
     starts[:] = 0
     for i in range(len(clusters)):
         if clusters[i] >= 0:
@@ -244,8 +240,7 @@ def fill_groups(clusters: NDArray[np.int32], starts: NDArray[np.int64], order: N
 @njit(cache=True, nogil=True)
 def fill_cluster_labels(
     labels: NDArray[np.uint8],
-    order: NDArray[np.int32],
-    starts: NDArray[np.int64],
+    groups: Groups,
     parts: NDArray[np.int64],
     min_share: float,
     classes: NDArray[np.uint8],
@@ -254,11 +249,11 @@ def fill_cluster_labels(
     """Write the class of every cluster; see `cluster_labels`.
 
     labels : (n,) uint8
-    order, starts : from `fill_groups`.
     parts : (p, 2) int64; class, and the class that it may be a part of; below 256.
     classes : (k,) uint8, overwritten
     shares : (k,) float64, overwritten
     """
+    order, starts = groups.order, groups.starts
     counts = np.zeros(256, np.int64)
     for k in range(len(classes)):
         for place in range(starts[k], starts[k + 1]):

@@ -25,73 +25,153 @@ MAX_PAIRS = 2048  # bounds of float32 coordinates can be halved 831 times
 TESTS_PER_POINT = 64  # 570 real scans of 10 sensors need at most 6
 FREE, DROPPED = -1, -2  # runs in no cluster; runs of clusters without a sufficient share
 
+# Points of similar reach, the distance up to which a point is linked, and a grid of columns in proportion to it: a
+# point has few columns within its reach at any range.
+LEVEL = np.dtype(
+    [
+        ("reach", np.float64),  # of its points [m]: from this one up to that of the next level
+        ("limit", np.float64),  # squared range with this reach [m2]
+        ("x", np.float64),  # lowest of the columns [m]
+        ("y", np.float64),
+        ("columns_per_m", np.float64),
+        ("n_rows", np.int64),  # columns along x
+        ("n_columns", np.int64),  # columns along y
+        ("first_strip", np.int64),
+    ],
+    align=True,
+)
+
+# A run or a part of one: points that follow one another in `Search.order`.
+PART = np.dtype(
+    [
+        ("first", np.int32),
+        ("stop", np.int32),
+        ("child", np.int32),  # number of the first of its two halves; 0 without any
+        ("level", np.int32),
+        *((f"{end}_{axis}", np.float64) for end in ("low", "high") for axis in "xyz"),  # of its points [m]
+        ("longest", np.float64),  # reach of its points [m]
+        ("shortest", np.float64),
+    ],
+    align=True,
+)
+
+# What `fill_clusters` did, and may still do.
+WORK = np.dtype(
+    [
+        ("n_strips", np.int64),  # that were opened, and what they hold
+        ("n_points", np.int64),
+        ("n_runs", np.int64),
+        ("first_half", np.int64),  # lowest number of a part that is no run
+        ("n_compared", np.int64),  # pairs of runs
+        ("n_incomplete", np.int64),  # pairs of runs whose points were not tested completely
+        ("n_tests", np.int64),  # of points and bounds
+        ("tests_left", np.int64),
+        ("reserve", np.int64),  # the last of the tests
+    ]
+)
+
 
 class Strips(NamedTuple):
     """The points of a scan by strips: `STRIP` columns of one row of a grid; no labels are needed for it.
 
     Attributes
     ----------
+    points : (n, 3 or more) float32
     rows : (m,) int32
         Of the points that take part, in input order.
     heads : (strips,) int32
-        A point of each strip, -1 without one. `fill_clusters` overwrites them.
+        A point of each strip, -1 without one. `fill_clusters` overwrites them: -2 - k for the k-th opened strip.
     chain : (n,) int32
         After each of the m points, the next one of its strip, or -1.
-    edges : (levels + 1,) float64
-        The reach of a point is the distance up to which it is linked. Points of a level have a reach from its edge up
-        to the next one [m], and columns in proportion: a point has few columns within its reach at any range.
-    limits : (levels + 1,) float64
-        Squared ranges with these reaches [m2].
-    grids : (levels, 3) float64
-        Lowest x and y of the columns, columns per meter.
-    shapes : (levels, 3) int64
-        Rows and columns, and the first strip.
+    levels : (levels + 1,) `LEVEL`
+        The last one only ends the one before it.
+    distance_per_m, max_range_m : float
+        As in `edgeperc.objects.cluster.find_clusters`.
     """
 
+    points: NDArray[np.float32]
     rows: NDArray[np.int32]
     heads: NDArray[np.int32]
     chain: NDArray[np.int32]
-    edges: NDArray[np.float64]
-    limits: NDArray[np.float64]
-    grids: NDArray[np.float64]
-    shapes: NDArray[np.int64]
+    levels: NDArray[np.void]
+    distance_per_m: float
+    max_range_m: float
 
 
-def levels_of(
-    min_distance: float, distance_per_m: float, max_range: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """``edges`` and ``limits`` of `Strips`."""
-    edges = [min_distance]
+class Search(NamedTuple):
+    """The points of opened strips, by column and height, and the clusters that grow from them.
+
+    A run holds points of one column, each linked with the one before. It is the root of a tree of smaller parts, which
+    are made when they are needed (`halves_are_linked`). Runs are numbered from 0, smaller parts from the end down.
+
+    Attributes
+    ----------
+    order, xyz, reach, keys : (m,) int32, (m, 3) float32, (m,) float64, (m,) float64
+        Of each point: row, coordinates [m], reach [m], and scratch.
+    parts : (parts,) `PART`
+    run_votes : (runs, shares + 1) int32
+    owner : (runs,) int32
+        Cluster of each run, `FREE` or `DROPPED`.
+    run_of : (n,) int32
+        Run of each point of the scan.
+    firsts : (strips, STRIP + 1) int32
+        First run of each column of the opened strips, and the end.
+    queue : (runs,) int32
+        Runs of the cluster that grows.
+    near, pairs : (runs,) int32, (MAX_PAIRS, 2) int32
+        Scratch.
+    votes, votes_left : (shares + 1,) int64
+        Of the cluster that grows, and of the points in no cluster yet.
+    min_shares : (shares,) float64
+    work : (1,) `WORK`
+    """
+
+    order: NDArray[np.int32]
+    xyz: NDArray[np.float32]
+    reach: NDArray[np.float64]
+    keys: NDArray[np.float64]
+    parts: NDArray[np.void]
+    run_votes: NDArray[np.int32]
+    owner: NDArray[np.int32]
+    run_of: NDArray[np.int32]
+    firsts: NDArray[np.int32]
+    queue: NDArray[np.int32]
+    near: NDArray[np.int32]
+    pairs: NDArray[np.int32]
+    votes: NDArray[np.int64]
+    votes_left: NDArray[np.int64]
+    min_shares: NDArray[np.float64]
+    work: NDArray[np.void]
+
+
+def levels_of(min_distance: float, distance_per_m: float, max_range: float) -> NDArray[np.void]:
+    """The levels of `Strips` without their grids."""
+    reaches = [min_distance]
     power = LEVEL_STEP  # exact: there are fewer than 33 levels
     while min_distance * power <= 2.0 * distance_per_m * max_range:
-        edges.append(min_distance * power)
+        reaches.append(min_distance * power)
         power *= LEVEL_STEP
-    edges.append(min_distance * power)
-    ranges = [edge / distance_per_m if distance_per_m > 0.0 else math.inf for edge in edges]
-    return np.array(edges), np.array([each * each for each in ranges])
+    reaches.append(min_distance * power)
+    ranges = [reach / distance_per_m if distance_per_m > 0.0 else math.inf for reach in reaches]
+    levels = np.zeros(len(reaches), LEVEL)
+    levels["reach"], levels["limit"] = reaches, [each * each for each in ranges]
+    return levels
 
 
 @njit(cache=True, nogil=True)
 def chain_points(
     points: NDArray[np.float32],
     among: NDArray[np.bool_],
-    edges: NDArray[np.float64],
-    limits: NDArray[np.float64],
     max_range: float,
+    levels: NDArray[np.void],
     rows: NDArray[np.int32],
     chain: NDArray[np.int32],
-    grids: NDArray[np.float64],
-    shapes: NDArray[np.int64],
 ) -> tuple[int, NDArray[np.int32]]:
-    """Write the points of every strip; see `Strips`.
+    """Write the grids of the levels, and the points of every strip; see `Strips`.
 
-    points : (n, 3 or more) float32, C-contiguous
     among : (n,) bool
-    edges, limits : (levels + 1,) float64
     max_range : points with a larger x, y or z do not take part [m].
     rows, chain : (n,) int32, overwritten
-    grids : (levels, 3) float64, overwritten
-    shapes : (levels, 3) int64, overwritten
     Returns m: Number of points that take part.
     Returns heads: (strips,) int32.
     """
@@ -105,206 +185,275 @@ def chain_points(
             low_x, high_x = min(low_x, x), max(high_x, x)
             low_y, high_y = min(low_y, y), max(high_y, y)
     n_strips = 0
-    for at in range(shapes.shape[0] if m > 0 else 0):
-        farthest = math.sqrt(limits[at + 1])
-        grids[at, 0], grids[at, 1] = max(low_x, -farthest), max(low_y, -farthest)
-        grids[at, 2] = 1.0 / (COLUMN_EDGE * edges[at])
-        shapes[at, 0] = max(int((min(high_x, farthest) - grids[at, 0]) * grids[at, 2]) + 1, 0)
-        shapes[at, 1] = max(int((min(high_y, farthest) - grids[at, 1]) * grids[at, 2]) + 1, 0)
-        shapes[at, 2] = n_strips
-        n_strips += shapes[at, 0] * ((shapes[at, 1] + STRIP - 1) // STRIP)
+    for at in range(levels.shape[0] - 1 if m > 0 else 0):
+        level, farthest = levels[at], math.sqrt(levels[at + 1]["limit"])
+        level["x"], level["y"] = max(low_x, -farthest), max(low_y, -farthest)
+        level["columns_per_m"] = 1.0 / (COLUMN_EDGE * level["reach"])
+        level["n_rows"] = max(int((min(high_x, farthest) - level["x"]) * level["columns_per_m"]) + 1, 0)
+        level["n_columns"] = max(int((min(high_y, farthest) - level["y"]) * level["columns_per_m"]) + 1, 0)
+        level["first_strip"] = n_strips
+        n_strips += level["n_rows"] * strips_a_row(level)
     heads = np.empty(n_strips, np.int32)
     heads[:] = -1
     for k in range(m):
         i = rows[k]
-        strip = strip_of(points, i, limits, grids, shapes)
+        strip = strip_of(points, i, levels)
         chain[i] = heads[strip]
         heads[strip] = i
     return m, heads
 
 
 @njit(cache=True, nogil=True)
+def strips_a_row(level: np.void) -> int:
+    return int((level["n_columns"] + STRIP - 1) // STRIP)
+
+
+@njit(cache=True, nogil=True)
+def strip_of(points: NDArray[np.float32], i: int, levels: NDArray[np.void]) -> int:
+    """The strip of columns that holds a point."""
+    level = levels[level_of(points, i, levels)]
+    row = int((np.float64(points[i, 0]) - level["x"]) * level["columns_per_m"])
+    col = int((np.float64(points[i, 1]) - level["y"]) * level["columns_per_m"])
+    return int(level["first_strip"] + row * strips_a_row(level) + col // STRIP)
+
+
+@njit(cache=True, nogil=True)
+def level_of(points: NDArray[np.float32], i: int, levels: NDArray[np.void]) -> int:
+    """The level whose squared ranges hold a point."""
+    x, y, z = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
+    squared_range = x * x + y * y + z * z
+    level = 0
+    while squared_range >= levels[level + 1]["limit"]:
+        level += 1
+    return level
+
+
+@njit(cache=True, nogil=True)
 def fill_clusters(
-    points: NDArray[np.float32],
-    rows: NDArray[np.int32],
-    heads: NDArray[np.int32],
-    chain: NDArray[np.int32],
-    edges: NDArray[np.float64],
-    limits: NDArray[np.float64],
-    grids: NDArray[np.float64],
-    shapes: NDArray[np.int64],
+    strips: Strips,
     seeds: NDArray[np.bool_],
     votes: NDArray[np.uint8],
     min_shares: NDArray[np.float64],
-    distance_per_m: float,
-    max_range: float,
     min_points: int,
     clusters: NDArray[np.int32],
-    work: NDArray[np.int64],
+    work: NDArray[np.void],
 ) -> None:
     """Compute every point's cluster; see `find_clusters`.
 
-    Only strips within reach of a growing cluster are opened: sorted, and divided into runs.
+    Clusters grow from seeds, run by run. Only strips within reach of a growing cluster are opened: sorted, and divided
+    into runs. A run of another cluster is not linked with this one, which was complete.
 
-    points : (n, 3 or more) float32, C-contiguous
-    rows, heads, chain, edges, limits, grids, shapes : of `Strips`; ``heads`` is overwritten.
     seeds : (n,) bool
     votes : (n,) uint8; bit 0: the point counts. Bit k + 1: it may count for share k.
     min_shares : (k,) float64, at most 7
     clusters : (n,) int32, overwritten; -1 without a cluster; -2 for points of clusters without a sufficient share, as
         far as they were looked at.
-    work : (3,) int64, overwritten; number of pairs of runs looked at; of tests of their points and bounds; of pairs
-        of runs whose tests were not completed.
+    work : (1,) `WORK`, overwritten
     """
     clusters[:] = FREE
-    work[:] = 0
-    n_shares, n_levels, m = len(min_shares), len(shapes), len(rows)
-    n_left = np.empty(n_shares + 1, np.int64)  # votes of points in no cluster yet
-    n_left[:] = 0
+    points, rows, levels, heads = strips.points, strips.rows, strips.levels, strips.heads
+    search = new_search(len(points), len(rows), min_shares, work)
     n_seeds = 0
-    for k in range(m):  # compiles faster than `for i in rows`
-        i = rows[k]
-        n_seeds += 1 if seeds[i] else 0
-        if votes[i] > 1:
-            add_votes(votes[i], n_left)
-    if n_seeds == 0:
-        return
-
-    # Runs: points of one column, each linked with the one before. Every run is the root of a tree of smaller parts,
-    # which are made when they are needed (are_linked). Runs are numbered from 0, smaller parts from the end down.
-    keys = np.empty(m)
-    order = np.empty(m, np.int32)
-    xyz = np.empty((m, 3), np.float32)
-    reach = np.empty(m)
-    n_parts = m + m // 2 + 64
-    parts = np.empty((n_parts, 3), np.int32)  # first point, end, first child or 0
-    bounds = np.empty((n_parts, 8))
-    run_level = np.empty(m, np.int32)
-    run_votes = np.empty((m, n_shares + 1), np.int32)
-    run_of = np.empty(points.shape[0], np.int32)
-    firsts = np.empty((m, STRIP + 1), np.int32)  # of opened strips: the first run of every column, and the end
-    owner = np.empty(m, np.int32)
-    # First of the smaller parts, tests left, the reserve of tests, points in opened strips, runs, opened strips.
-    state = np.empty(6, np.int64)
-    state[0], state[1], state[2] = n_parts, 2 * TESTS_PER_POINT * m, TESTS_PER_POINT * m
-    state[3], state[4], state[5] = 0, 0, 0
-
-    # Clusters grow from seeds, run by run. A run of another cluster is not linked with this one, which was complete.
-    is_kept = np.empty(n_seeds, np.int32)  # 0 or 1, of every cluster that was not dropped
-    queue = np.empty(m, np.int32)
-    pairs = np.empty((MAX_PAIRS, 2), np.int32)
-    n_votes, n_none = np.empty(n_shares + 1, np.int64), np.empty(n_shares + 1, np.int64)
-    n_none[:] = 0
+    for k in range(len(rows)):  # compiles faster than `for i in rows`
+        n_seeds += 1 if seeds[rows[k]] else 0
+        if votes[rows[k]] > 1:
+            add_votes(votes[rows[k]], search.votes_left)
+    is_kept = np.empty(n_seeds, np.bool_)  # of every cluster that was not dropped
     n_clusters = 0
-    for nth in range(m):
-        seed = rows[nth]
+    for k in range(len(rows) if n_seeds > 0 else 0):
+        seed = rows[k]
         if not seeds[seed]:
             continue
-        strip = strip_of(points, seed, limits, grids, shapes)
+        strip = strip_of(points, seed, levels)
         if heads[strip] >= 0:
-            open_strip(
-                points, votes, heads, chain, strip, limits, grids, edges, max_range, distance_per_m, keys, order, xyz,
-                reach, parts, bounds, run_level, run_votes, run_of, firsts, owner, state,
-            )  # fmt: skip
-        if owner[run_of[seed]] != FREE:
+            open_strip(strips, votes, search, strip)
+        if search.owner[search.run_of[seed]] != FREE:
             continue
-        n_votes[:] = 0
-        queue[0], n_queued, n_done, size = run_of[seed], 1, 0, 0
-        owner[queue[0]] = n_clusters
-        is_dropped = False
-        while n_done < n_queued and not is_dropped:
-            run = np.int64(queue[n_done])
-            n_done += 1
-            size += parts[run, 1] - parts[run, 0]
-            for k in range(n_shares + 1):
-                n_votes[k] += run_votes[run, k]
-                n_left[k] -= run_votes[run, k]
-            is_dropped = not may_reach(n_votes, n_left, min_shares)
-            # The reaches of linked points differ by at most distance_per_m times the shorter one.
-            differ = SAFE * (1.0 + distance_per_m)
-            lowest, highest = run_level[run], run_level[run]
-            while lowest > 0 and bounds[run, 7] <= differ * edges[lowest]:
-                lowest -= 1
-            while highest < n_levels - 1 and differ * bounds[run, 6] >= edges[highest + 1]:
-                highest += 1
-            far = SAFE * bounds[run, 6]
-            for at in range(lowest, highest + 1):
-                scale = grids[at, 2]
-                first_row = int(max((bounds[run, 0] - far - grids[at, 0]) * scale, 0.0))
-                last_row = int(min((bounds[run, 3] + far - grids[at, 0]) * scale, shapes[at, 0] - 1.0))
-                first_col = int(max((bounds[run, 1] - far - grids[at, 1]) * scale, 0.0))
-                last_col = int(min((bounds[run, 4] + far - grids[at, 1]) * scale, shapes[at, 1] - 1.0))
-                n_strips = (shapes[at, 1] + STRIP - 1) // STRIP
-                for row in range(first_row, last_row + 1):
-                    for number in range(first_col // STRIP, last_col // STRIP + 1):
-                        strip = shapes[at, 2] + row * n_strips + number
-                        if heads[strip] == -1:
-                            continue
-                        if heads[strip] >= 0:
-                            open_strip(
-                                points, votes, heads, chain, strip, limits, grids, edges, max_range, distance_per_m,
-                                keys, order, xyz, reach, parts, bounds, run_level, run_votes, run_of, firsts, owner,
-                                state,
-                            )  # fmt: skip
-                        opened = -2 - heads[strip]
-                        col = max(first_col - number * STRIP, 0)
-                        last_here = min(last_col - number * STRIP, STRIP - 1)
-                        # If the columns hold many runs, they are searched one by one, by height.
-                        one_by_one = firsts[opened, last_here + 1] - firsts[opened, col] > MAX_SCANNED
-                        while col <= last_here and not is_dropped:
-                            end = col if one_by_one else last_here
-                            first, last = firsts[opened, col], firsts[opened, end + 1]
-                            col = end + 1
-                            if one_by_one:
-                                first = first_above(bounds, first, last, bounds[run, 2] - far)
-                            for other in range(first, last):
-                                if one_by_one and bounds[other, 2] > bounds[run, 5] + far:
-                                    break
-                                work[0] += 1
-                                if owner[other] >= 0:
-                                    continue
-                                longest = min(bounds[run, 6], bounds[other, 6])
-                                if squared_gap(bounds, run, other) > longest * longest:
-                                    continue
-                                n_points = max(parts[run, 1] - parts[run, 0], parts[other, 1] - parts[other, 0])
-                                if n_points <= MAX_TESTED:
-                                    n_tests = test_points(xyz, reach, parts, bounds, state, run, other)
-                                    state[1] -= abs(n_tests)
-                                    linked = n_tests > 0
-                                else:
-                                    linked = are_linked(
-                                        xyz, reach, order, parts, bounds, pairs, state, work, run, other
-                                    )
-                                if linked and owner[other] == DROPPED:
-                                    is_dropped = True
-                                elif linked:
-                                    owner[other] = n_clusters
-                                    queue[n_queued] = other
-                                    n_queued += 1
-        for k in range(n_done, n_queued):  # of a cluster that was dropped before it was complete
-            for share in range(n_shares + 1):
-                n_left[share] -= run_votes[queue[k], share]
-        is_dropped = is_dropped or not may_reach(n_votes, n_none, min_shares)
-        for k in range(n_queued):
-            owner[queue[k]] = DROPPED if is_dropped else n_clusters
-            for place in range(parts[queue[k], 0], parts[queue[k], 1]):
-                clusters[order[place]] = owner[queue[k]]
+        n_queued, is_dropped = grow(strips, votes, search, np.int64(search.run_of[seed]), n_clusters)
+        size = assign(search, n_queued, DROPPED if is_dropped else n_clusters, clusters)
         if not is_dropped:
-            is_kept[n_clusters] = 1 if size >= min_points else 0
+            is_kept[n_clusters] = size >= min_points
             n_clusters += 1
-    work[1] = 2 * TESTS_PER_POINT * m - state[1]
+    renumber(is_kept[:n_clusters], clusters)
+    work[0]["n_tests"] = 2 * TESTS_PER_POINT * len(rows) - work[0]["tests_left"]
 
-    renumbered = np.empty(n_clusters, np.int32)
-    renumbered[:] = FREE
-    n_kept = 0
-    for i in range(points.shape[0]):
-        found = clusters[i]
-        if found < 0:
+
+@njit(cache=True, nogil=True)
+def new_search(n: int, m: int, min_shares: NDArray[np.float64], work: NDArray[np.void]) -> Search:
+    """A search in which no strip is open; for n points, of which m take part."""
+    n_parts, n_votes = m + m // 2 + 64, len(min_shares) + 1
+    done = work[0]
+    done["n_strips"], done["n_points"], done["n_runs"], done["first_half"] = 0, 0, 0, n_parts
+    done["n_compared"], done["n_incomplete"], done["n_tests"] = 0, 0, 0
+    done["tests_left"], done["reserve"] = 2 * TESTS_PER_POINT * m, TESTS_PER_POINT * m
+    votes_left = np.empty(n_votes, np.int64)
+    votes_left[:] = 0
+    return Search(
+        np.empty(m, np.int32),
+        np.empty((m, 3), np.float32),
+        np.empty(m),
+        np.empty(m),
+        np.empty(n_parts, PART),
+        np.empty((m, n_votes), np.int32),
+        np.empty(m, np.int32),
+        np.empty(n, np.int32),
+        np.empty((m, STRIP + 1), np.int32),
+        np.empty(m, np.int32),
+        np.empty(m, np.int32),
+        np.empty((MAX_PAIRS, 2), np.int32),
+        np.empty(n_votes, np.int64),
+        votes_left,
+        min_shares,
+        work,
+    )
+
+
+@njit(cache=True, nogil=True)
+def grow(strips: Strips, votes: NDArray[np.uint8], search: Search, first: int, cluster: int) -> tuple[int, bool]:
+    """Collect the runs of a cluster in the queue; their number, and whether the cluster has no sufficient share."""
+    # Fields are taken out once, before the loops: each time counts references, which made this four times as slow.
+    levels, heads, firsts, parts, owner = strips.levels, strips.heads, search.firsts, search.parts, search.owner
+    xyz, reach, near, queue, work = search.xyz, search.reach, search.near, search.queue, search.work
+    counts, left, run_votes, min_shares = search.votes, search.votes_left, search.run_votes, search.min_shares
+    distance_per_m = strips.distance_per_m
+    counts[:] = 0
+    queue[0] = first
+    owner[first] = cluster
+    n_queued, n_done, is_dropped = 1, 0, False
+    while n_done < n_queued and not is_dropped:
+        run = np.int64(queue[n_done])
+        n_done += 1
+        for k in range(len(counts)):
+            counts[k] += run_votes[run, k]
+            left[k] -= run_votes[run, k]
+        is_dropped = not may_reach(counts, left, min_shares)
+        part = parts[run]
+        lowest, highest = levels_within(levels, part, distance_per_m)
+        for at in range(lowest, highest + 1):
+            level = levels[at]
+            first_row, last_row, first_col, last_col = columns_within(level, part)
+            for row in range(first_row, last_row + 1):
+                for number in range(first_col // STRIP, last_col // STRIP + 1):
+                    strip = level["first_strip"] + row * strips_a_row(level) + number
+                    if is_dropped or heads[strip] == -1:
+                        continue
+                    if heads[strip] >= 0:
+                        open_strip(strips, votes, search, strip)
+                    begin, end = max(first_col - number * STRIP, 0), min(last_col - number * STRIP, STRIP - 1) + 1
+                    n_near = find_near(parts, owner, firsts[-2 - heads[strip]], begin, end, part, near, work)
+                    for k in range(n_near):
+                        other = np.int64(near[k])
+                        if max(n_points(part), n_points(parts[other])) <= MAX_TESTED:
+                            linked = test_points(xyz, reach, part, parts[other], work)
+                        else:
+                            linked = halves_are_linked(search, run, other)
+                        if linked and owner[other] == DROPPED:
+                            is_dropped = True
+                        elif linked:
+                            owner[other] = cluster
+                            queue[n_queued] = other
+                            n_queued += 1
+    for place in range(n_done, n_queued):  # of a cluster that was dropped before it was complete
+        for k in range(len(counts)):
+            left[k] -= run_votes[queue[place], k]
+    nothing = np.empty(len(counts), np.int64)
+    nothing[:] = 0
+    return n_queued, is_dropped or not may_reach(counts, nothing, min_shares)
+
+
+@njit(cache=True, nogil=True)
+def n_points(part: np.void) -> int:
+    return part["stop"] - part["first"]
+
+
+@njit(cache=True, nogil=True)
+def levels_within(levels: NDArray[np.void], part: np.void, distance_per_m: float) -> tuple[int, int]:
+    """The lowest and the highest level that may hold points linked with those of a part."""
+    # The reaches of linked points differ by at most distance_per_m times the shorter one.
+    differ = SAFE * (1.0 + distance_per_m)
+    lowest, highest = np.int64(part["level"]), np.int64(part["level"])
+    while lowest > 0 and part["shortest"] <= differ * levels[lowest]["reach"]:
+        lowest -= 1
+    while highest < len(levels) - 2 and differ * part["longest"] >= levels[highest + 1]["reach"]:
+        highest += 1
+    return lowest, highest
+
+
+@njit(cache=True, nogil=True)
+def columns_within(level: np.void, part: np.void) -> tuple[int, int, int, int]:
+    """First and last row, first and last column of a level within reach of a part."""
+    far, scale = SAFE * part["longest"], level["columns_per_m"]
+    return (
+        int(max((part["low_x"] - far - level["x"]) * scale, 0.0)),
+        int(min((part["high_x"] + far - level["x"]) * scale, level["n_rows"] - 1.0)),
+        int(max((part["low_y"] - far - level["y"]) * scale, 0.0)),
+        int(min((part["high_y"] + far - level["y"]) * scale, level["n_columns"] - 1.0)),
+    )
+
+
+@njit(cache=True, nogil=True, forceinline=True)
+def find_near(
+    parts: NDArray[np.void],
+    owner: NDArray[np.int32],
+    firsts: NDArray[np.int32],
+    col: int,
+    end: int,
+    part: np.void,
+    near: NDArray[np.int32],
+    work: NDArray[np.void],
+) -> int:
+    """List the runs of no cluster in columns of a strip that may be linked with a part.
+
+    firsts : (STRIP + 1,) int32; of the strip, as in `Search`.
+    col, end : first column, and the one after the last.
+    near : (runs,) int32, overwritten
+    """
+    n_near, far = 0, SAFE * part["longest"]
+    # If the columns hold many runs, they are searched one by one, by height.
+    one_by_one = end > col and firsts[end] - firsts[col] > MAX_SCANNED
+    while col < end:
+        following = col + 1 if one_by_one else end
+        first, last = np.int64(firsts[col]), np.int64(firsts[following])
+        col = following
+        if one_by_one:
+            first = first_above(parts, first, last, part["low_z"] - far)
+        for other in range(first, last):
+            if one_by_one and parts[other]["low_z"] > part["high_z"] + far:
+                break
+            work[0]["n_compared"] += 1
+            if owner[other] < 0 and are_near(part, parts[other]):
+                near[n_near] = other
+                n_near += 1
+    return n_near
+
+
+@njit(cache=True, nogil=True)
+def assign(search: Search, n_queued: int, cluster: int, clusters: NDArray[np.int32]) -> int:
+    """Write the cluster of the runs in the queue, and of their points; the number of points."""
+    parts, order, owner, queue, size = search.parts, search.order, search.owner, search.queue, 0
+    for k in range(n_queued):
+        part = parts[queue[k]]
+        owner[queue[k]] = cluster
+        size += part["stop"] - part["first"]
+        for place in range(part["first"], part["stop"]):
+            clusters[order[place]] = cluster
+    return size
+
+
+@njit(cache=True, nogil=True)
+def renumber(is_kept: NDArray[np.bool_], clusters: NDArray[np.int32]) -> None:
+    """Number the clusters that are kept by their first points; points of others become `FREE`."""
+    numbers = np.empty(len(is_kept), np.int32)
+    numbers[:] = FREE
+    n = 0
+    for i in range(len(clusters)):
+        cluster = clusters[i]
+        if cluster < 0:
             continue
-        if is_kept[found] != 0 and renumbered[found] < 0:
-            renumbered[found] = n_kept
-            n_kept += 1
-        clusters[i] = renumbered[found]
+        if is_kept[cluster] and numbers[cluster] < 0:
+            numbers[cluster] = n
+            n += 1
+        clusters[i] = numbers[cluster]
 
 
 @njit(cache=True, nogil=True)
@@ -324,62 +473,57 @@ def may_reach(counts: NDArray[np.int64], left: NDArray[np.int64], min_shares: ND
 
 
 @njit(cache=True, nogil=True)
-def strip_of(
-    points: NDArray[np.float32],
-    i: int,
-    limits: NDArray[np.float64],
-    grids: NDArray[np.float64],
-    shapes: NDArray[np.int64],
-) -> int:
-    """The strip of columns that holds a point."""
-    x, y, z = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
-    at = level_of(limits, x, y, z)
-    row, col = int((x - grids[at, 0]) * grids[at, 2]), int((y - grids[at, 1]) * grids[at, 2])
-    return int(shapes[at, 2] + row * ((shapes[at, 1] + STRIP - 1) // STRIP) + col // STRIP)
+def open_strip(strips: Strips, votes: NDArray[np.uint8], search: Search, strip: int) -> None:
+    """Sort the points of a strip by column and height, and divide them into runs."""
+    points, parts, order, work = strips.points, search.parts, search.order, search.work[0]
+    xyz, reach, owner, run_votes, run_of = search.xyz, search.reach, search.owner, search.run_votes, search.run_of
+    firsts, opened = search.firsts, work["n_strips"]
+    number = level_of(points, np.int64(strips.heads[strip]), strips.levels)
+    level, shortest, distance_per_m = strips.levels[number], strips.levels[0]["reach"], strips.distance_per_m
+    start, first = work["n_points"], work["n_runs"]
+    stop = sort_strip(strips, search, strip, level)
+    column, run = -1, first - 1
+    for k in range(start, stop):
+        i = order[k]
+        x, y, z = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
+        xyz[k, 0], xyz[k, 1], xyz[k, 2] = points[i, 0], points[i, 1], points[i, 2]
+        reach[k] = max(shortest, distance_per_m * math.sqrt(x * x + y * y + z * z))
+        own = column_of(y, level)
+        if own != column or z - np.float64(xyz[k - 1, 2]) > RUN_GAP * level["reach"]:
+            run += 1
+            parts[run]["first"], parts[run]["child"], parts[run]["level"] = k, 0, number
+            owner[run] = FREE
+            for share in range(run_votes.shape[1]):
+                run_votes[run, share] = 0
+        for empty in range(column + 1, own + 1):
+            firsts[opened, empty] = run
+        column = own
+        parts[run]["stop"] = k + 1
+        run_of[i] = run
+        for share in range(run_votes.shape[1]):
+            run_votes[run, share] += (votes[i] >> share) & 1
+    for empty in range(column + 1, STRIP + 1):
+        firsts[opened, empty] = run + 1
+    for k in range(first, run + 1):
+        set_bounds(xyz, reach, parts[k])
+    strips.heads[strip] = -2 - opened
+    work["n_points"], work["n_runs"], work["n_strips"] = stop, run + 1, opened + 1
 
 
 @njit(cache=True, nogil=True)
-def level_of(limits: NDArray[np.float64], x: float, y: float, z: float) -> int:
-    """The level whose squared ranges hold a point."""
-    squared_range = x * x + y * y + z * z
-    level = 0
-    while squared_range >= limits[level + 1]:
-        level += 1
-    return level
+def column_of(y: float, level: np.void) -> int:
+    """Column of a point within its strip."""
+    return int((y - level["y"]) * level["columns_per_m"]) % STRIP
 
 
 @njit(cache=True, nogil=True)
-def open_strip(
-    points: NDArray[np.float32],
-    votes: NDArray[np.uint8],
-    heads: NDArray[np.int32],
-    chain: NDArray[np.int32],
-    strip: int,
-    limits: NDArray[np.float64],
-    grids: NDArray[np.float64],
-    edges: NDArray[np.float64],
-    max_range: float,
-    distance_per_m: float,
-    keys: NDArray[np.float64],
-    order: NDArray[np.int32],
-    xyz: NDArray[np.float32],
-    reach: NDArray[np.float64],
-    parts: NDArray[np.int32],
-    bounds: NDArray[np.float64],
-    run_level: NDArray[np.int32],
-    run_votes: NDArray[np.int32],
-    run_of: NDArray[np.int32],
-    firsts: NDArray[np.int32],
-    owner: NDArray[np.int32],
-    state: NDArray[np.int64],
-) -> None:
-    """Sort the points of a strip by column and height, and divide them into runs; its head becomes -2 - its number."""
-    start = stop = state[3]
-    i = heads[strip]
-    level = level_of(limits, np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2]))
+def sort_strip(strips: Strips, search: Search, strip: int, level: np.void) -> int:
+    """Append the points of a strip to the order, by column and height; the end of the order."""
+    points, chain, farthest = strips.points, strips.chain, strips.max_range_m
+    keys, order, start = search.keys, search.order, search.work[0]["n_points"]
+    stop, i = start, strips.heads[strip]
     while i >= 0:
-        column = int((np.float64(points[i, 1]) - grids[level, 1]) * grids[level, 2]) % STRIP
-        keys[stop] = column * 4.0 * max_range + np.float64(points[i, 2])
+        keys[stop] = column_of(np.float64(points[i, 1]), level) * 4.0 * farthest + np.float64(points[i, 2])
         order[stop] = i
         stop += 1
         i = chain[i]
@@ -394,44 +538,15 @@ def open_strip(
                 place -= gap
             keys[place], order[place] = key, i
         gap //= 3
-    opened, first = state[5], state[4]
-    column, run = -1, first - 1
-    for k in range(start, stop):
-        i = order[k]
-        x, y, z = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
-        xyz[k, 0], xyz[k, 1], xyz[k, 2] = points[i, 0], points[i, 1], points[i, 2]
-        reach[k] = max(edges[0], distance_per_m * math.sqrt(x * x + y * y + z * z))
-        is_new = int((y - grids[level, 1]) * grids[level, 2]) % STRIP != column
-        if is_new or z - np.float64(xyz[k - 1, 2]) > RUN_GAP * edges[level]:
-            run += 1
-            parts[run, 0], parts[run, 2] = k, 0
-            run_level[run] = level
-            owner[run] = FREE
-            for share in range(run_votes.shape[1]):
-                run_votes[run, share] = 0
-        if is_new:
-            before = column
-            column = int((y - grids[level, 1]) * grids[level, 2]) % STRIP
-            for empty in range(before + 1, column + 1):
-                firsts[opened, empty] = run
-        parts[run, 1] = k + 1
-        run_of[i] = run
-        for share in range(run_votes.shape[1]):
-            run_votes[run, share] += (votes[i] >> share) & 1
-    for empty in range(column + 1, STRIP + 1):
-        firsts[opened, empty] = run + 1
-    for k in range(first, run + 1):
-        set_bounds(xyz, reach, parts, bounds, k)
-    heads[strip] = -2 - opened
-    state[3], state[4], state[5] = stop, run + 1, opened + 1
+    return int(stop)
 
 
 @njit(cache=True, nogil=True)
-def first_above(bounds: NDArray[np.float64], first: int, last: int, z: float) -> int:
+def first_above(parts: NDArray[np.void], first: int, last: int, z: float) -> int:
     """The first of a column's runs whose top is not below z; ``last`` if there is none."""
     while first < last:
         middle = (first + last) // 2
-        if bounds[middle, 5] < z:
+        if parts[middle]["high_z"] < z:
             first = middle + 1
         else:
             last = middle
@@ -439,147 +554,121 @@ def first_above(bounds: NDArray[np.float64], first: int, last: int, z: float) ->
 
 
 @njit(cache=True, nogil=True)
-def set_bounds(
-    xyz: NDArray[np.float32],
-    reach: NDArray[np.float64],
-    parts: NDArray[np.int32],
-    bounds: NDArray[np.float64],
-    part: int,
-) -> None:
-    """Write lowest x, y, z, highest x, y, z, longest and shortest reach of a part's points."""
+def set_bounds(xyz: NDArray[np.float32], reach: NDArray[np.float64], part: np.void) -> None:
+    """Write the bounds of a part's points, and of their reaches."""
     low_x, low_y, low_z, shortest = math.inf, math.inf, math.inf, math.inf
     high_x, high_y, high_z, longest = -math.inf, -math.inf, -math.inf, 0.0
-    for k in range(parts[part, 0], parts[part, 1]):
+    for k in range(part["first"], part["stop"]):
         x, y, z = np.float64(xyz[k, 0]), np.float64(xyz[k, 1]), np.float64(xyz[k, 2])
         low_x, high_x = min(low_x, x), max(high_x, x)
         low_y, high_y = min(low_y, y), max(high_y, y)
         low_z, high_z = min(low_z, z), max(high_z, z)
         shortest, longest = min(shortest, reach[k]), max(longest, reach[k])
-    bounds[part, 0], bounds[part, 1], bounds[part, 2] = low_x, low_y, low_z
-    bounds[part, 3], bounds[part, 4], bounds[part, 5] = high_x, high_y, high_z
-    bounds[part, 6], bounds[part, 7] = longest, shortest
+    part["low_x"], part["low_y"], part["low_z"] = low_x, low_y, low_z
+    part["high_x"], part["high_y"], part["high_z"] = high_x, high_y, high_z
+    part["longest"], part["shortest"] = longest, shortest
 
 
 @njit(cache=True, nogil=True)
-def squared_gap(bounds: NDArray[np.float64], a: int, b: int) -> float:
-    """Squared distance between two axis-aligned bounds (lowest x, y, z, highest x, y, z); 0 if they overlap."""
-    gap_x = max(bounds[a, 0] - bounds[b, 3], bounds[b, 0] - bounds[a, 3], 0.0)
-    gap_y = max(bounds[a, 1] - bounds[b, 4], bounds[b, 1] - bounds[a, 4], 0.0)
-    gap_z = max(bounds[a, 2] - bounds[b, 5], bounds[b, 2] - bounds[a, 5], 0.0)
-    return gap_x * gap_x + gap_y * gap_y + gap_z * gap_z
+def are_near(a: np.void, b: np.void) -> bool:
+    """Whether the bounds of two parts allow a link."""
+    longest = min(a["longest"], b["longest"])
+    return bool(squared_gap(a, b) <= longest * longest)
 
 
 @njit(cache=True, nogil=True)
-def are_linked(
-    xyz: NDArray[np.float32],
-    reach: NDArray[np.float64],
-    order: NDArray[np.int32],
-    parts: NDArray[np.int32],
-    bounds: NDArray[np.float64],
-    pairs: NDArray[np.int32],
-    state: NDArray[np.int64],
-    work: NDArray[np.int64],
-    run: int,
-    other: int,
-) -> bool:
-    """Whether a point of one run is near enough to a point of another; their bounds are.
+def squared_gap(a: np.void, b: np.void) -> float:
+    """Squared distance between the bounds of two parts; 0 if they overlap."""
+    gap_x = max(a["low_x"] - b["high_x"], b["low_x"] - a["high_x"], 0.0)
+    gap_y = max(a["low_y"] - b["high_y"], b["low_y"] - a["high_y"], 0.0)
+    gap_z = max(a["low_z"] - b["high_z"], b["low_z"] - a["high_z"], 0.0)
+    return float(gap_x * gap_x + gap_y * gap_y + gap_z * gap_z)
 
-    Parts with many points are halved until their bounds are too far apart, or all their pairs of points are tested.
+
+@njit(cache=True, nogil=True)
+def halves_are_linked(search: Search, run: int, other: int) -> bool:
+    """Whether a point of one run is near enough to a point of another; for runs with many points.
+
+    Parts are halved until their bounds are too far apart, or all their pairs of points are tested.
     """
+    parts, pairs, work = search.parts, search.pairs, search.work
     pairs[0, 0], pairs[0, 1] = run, other
     n_pairs = 1
     while n_pairs > 0:
         n_pairs -= 1
         a, b = np.int64(pairs[n_pairs, 0]), np.int64(pairs[n_pairs, 1])
-        if parts[a, 1] - parts[a, 0] < parts[b, 1] - parts[b, 0]:
+        if parts[a]["stop"] - parts[a]["first"] < parts[b]["stop"] - parts[b]["first"]:
             a, b = b, a
-        if not split(xyz, reach, order, parts, bounds, state, a):
+        if not split(search, a):
             a, b = b, a
-            if not split(xyz, reach, order, parts, bounds, state, a):
-                n_tests = test_points(xyz, reach, parts, bounds, state, a, b)
-                state[1] -= abs(n_tests)
-                if n_tests > 0:
+            if not split(search, a):
+                if test_points(search.xyz, search.reach, parts[a], parts[b], work):
                     return True
                 continue
-        if state[1] <= state[2]:
+        if work[0]["tests_left"] <= work[0]["reserve"]:
             n_pairs = 0  # only the reserve is left: only the nearest parts are halved further
-        left, right = np.int64(parts[a, 2]), np.int64(parts[a, 2]) + 1
-        gap_left, gap_right = squared_gap(bounds, left, b), squared_gap(bounds, right, b)
-        if gap_left < gap_right:
-            left, right = right, left
-            gap_left, gap_right = gap_right, gap_left
-        state[1] -= 2
-        longest = min(bounds[left, 6], bounds[b, 6])
-        if state[1] > state[2] and gap_left <= longest * longest:
-            pairs[n_pairs, 0], pairs[n_pairs, 1] = left, b
+        far, near = np.int64(parts[a]["child"]), np.int64(parts[a]["child"]) + 1
+        if squared_gap(parts[far], parts[b]) < squared_gap(parts[near], parts[b]):
+            far, near = near, far
+        work[0]["tests_left"] -= 2
+        if work[0]["tests_left"] > work[0]["reserve"] and are_near(parts[far], parts[b]):
+            pairs[n_pairs, 0], pairs[n_pairs, 1] = far, b
             n_pairs += 1
-        longest = min(bounds[right, 6], bounds[b, 6])
-        if gap_right <= longest * longest:  # the nearer half comes next
-            pairs[n_pairs, 0], pairs[n_pairs, 1] = right, b
+        if are_near(parts[near], parts[b]):  # the nearer half comes next
+            pairs[n_pairs, 0], pairs[n_pairs, 1] = near, b
             n_pairs += 1
-    work[2] += 1 if state[1] <= state[2] else 0
+    work[0]["n_incomplete"] += 1 if work[0]["tests_left"] <= work[0]["reserve"] else 0
     return False
 
 
 @njit(cache=True, nogil=True)
 def test_points(
-    xyz: NDArray[np.float32],
-    reach: NDArray[np.float64],
-    parts: NDArray[np.int32],
-    bounds: NDArray[np.float64],
-    state: NDArray[np.int64],
-    a: int,
-    b: int,
-) -> int:
-    """Number of tests until a point of one part was near enough to a point of another; negative if none was."""
-    most = MAX_TESTED if state[1] > 0 else MAX_LAST_TESTED
-    stop_a, stop_b = min(parts[a, 1], parts[a, 0] + most), min(parts[b, 1], parts[b, 0] + most)
-    low_x, low_y, low_z = bounds[b, 0], bounds[b, 1], bounds[b, 2]
-    high_x, high_y, high_z = bounds[b, 3], bounds[b, 4], bounds[b, 5]
+    xyz: NDArray[np.float32], reach: NDArray[np.float64], a: np.void, b: np.void, work: NDArray[np.void]
+) -> bool:
+    """Whether a point of one part is near enough to a point of another, by pairs of points."""
+    most = MAX_TESTED if work[0]["tests_left"] > 0 else MAX_LAST_TESTED
+    stop_a, stop_b = min(a["stop"], a["first"] + most), min(b["stop"], b["first"] + most)
+    low_x, low_y, low_z = b["low_x"], b["low_y"], b["low_z"]
+    high_x, high_y, high_z = b["high_x"], b["high_y"], b["high_z"]
     n_tests = 0
-    for k in range(parts[a, 0], stop_a):
+    for k in range(a["first"], stop_a):
         n_tests += 1
         x, y, z = np.float64(xyz[k, 0]), np.float64(xyz[k, 1]), np.float64(xyz[k, 2])
         dx, dy, dz = max(low_x - x, x - high_x, 0.0), max(low_y - y, y - high_y, 0.0), max(low_z - z, z - high_z, 0.0)
         if dx * dx + dy * dy + dz * dz > reach[k] * reach[k]:
             continue
-        for j in range(parts[b, 0], stop_b):
+        for j in range(b["first"], stop_b):
             n_tests += 1
             dx, dy, dz = xyz[j, 0] - x, xyz[j, 1] - y, xyz[j, 2] - z
             shorter = min(reach[k], reach[j])
             if dx * dx + dy * dy + dz * dz <= shorter * shorter:
-                return n_tests
-    return -n_tests
+                work[0]["tests_left"] -= n_tests
+                return True
+    work[0]["tests_left"] -= n_tests
+    return False
 
 
 @njit(cache=True, nogil=True)
-def split(
-    xyz: NDArray[np.float32],
-    reach: NDArray[np.float64],
-    order: NDArray[np.int32],
-    parts: NDArray[np.int32],
-    bounds: NDArray[np.float64],
-    state: NDArray[np.int64],
-    part: int,
-) -> bool:
+def split(search: Search, number: int) -> bool:
     """Halve a part along the longest side of its bounds, unless that was done before; False if it stays whole."""
-    if parts[part, 2] > 0:
+    parts, xyz, reach, order, work = search.parts, search.xyz, search.reach, search.order, search.work[0]
+    part = parts[number]
+    if part["child"] > 0:
         return True
-    if state[0] - 2 < len(order):
-        state[1] = min(state[1], 0)  # no room for more parts
-    if parts[part, 1] - parts[part, 0] <= MAX_TESTED or state[1] <= 0:
+    if work["first_half"] - 2 < len(order):
+        work["tests_left"] = min(work["tests_left"], 0)  # no room for more parts
+    if part["stop"] - part["first"] <= MAX_TESTED or work["tests_left"] <= 0:
         return False
-    axis = 0
-    for other in range(1, 3):
-        if bounds[part, 3 + other] - bounds[part, other] > bounds[part, 3 + axis] - bounds[part, axis]:
-            axis = other
-    low, high = bounds[part, axis], bounds[part, 3 + axis]
+    low, high, axis = part["low_x"], part["high_x"], 0
+    if part["high_y"] - part["low_y"] > high - low:
+        low, high, axis = part["low_y"], part["high_y"], 1
+    if part["high_z"] - part["low_z"] > high - low:
+        low, high, axis = part["low_z"], part["high_z"], 2
     if low == high:  # one point many times
         return False
     middle = low + 0.5 * (high - low)
-    start, stop = parts[part, 0], parts[part, 1]
-    state[1] -= stop - start
-    first, last = start, stop - 1
+    work["tests_left"] -= part["stop"] - part["first"]
+    first, last = part["first"], part["stop"] - 1
     while first <= last:
         if xyz[first, axis] <= middle:
             first += 1
@@ -589,11 +678,11 @@ def split(
         reach[first], reach[last] = reach[last], reach[first]
         order[first], order[last] = order[last], order[first]
         last -= 1
-    state[0] -= 2
-    child = state[0]
-    parts[part, 2] = child
-    parts[child, 0], parts[child, 1], parts[child, 2] = start, first, 0
-    parts[child + 1, 0], parts[child + 1, 1], parts[child + 1, 2] = first, stop, 0
-    set_bounds(xyz, reach, parts, bounds, child)
-    set_bounds(xyz, reach, parts, bounds, child + 1)
+    work["first_half"] -= 2
+    part["child"] = work["first_half"]
+    left, right = parts[part["child"]], parts[part["child"] + 1]
+    left["first"], left["stop"], left["child"] = part["first"], first, 0
+    right["first"], right["stop"], right["child"] = first, part["stop"], 0
+    set_bounds(xyz, reach, left)
+    set_bounds(xyz, reach, right)
     return True

@@ -7,15 +7,16 @@ walk side by side, or a person beside a wall. Groups of points are measured alon
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..system.kernel_cache import njit
+from ..types.points import Cloud, Labeled
+from .cluster import MIN_OF_WHOLE, RIDES, Groups, fill_groups
 
-WALKS, RIDES = 1, 2  # roles of labels
-UNSEEN = 3  # role of points out of view: they belong to a person, but say nothing about the class
-MIN_OF_WHOLE = 0.25  # a person rides if at least this share of the persons' points says so: many say "pedestrian"
+UNSEEN = 3  # role of points out of view, beside `WALKS` and `RIDES`: they say nothing about the class
 
 # A cluster with this share of persons' points is one group if it is not larger than a cyclist. Of larger clusters, only
 # the labeled points are grouped. With 0.3 and 0.5, 1 and 3 % fewer of the cyclists on the validation drives are found.
@@ -47,23 +48,53 @@ MAX_FLAT_M = 0.35  # heads of several rows of people have no gaps; a board is fl
 NEAR_M = 0.2  # around a person's points
 
 
-@njit(cache=True, nogil=True)
-def measure(
-    points: NDArray[np.float32],
-    height: NDArray[np.float32],
-    members: NDArray[np.int32],
-    above: float,
-    found: NDArray[np.float64],
-) -> None:
-    """Measure the points of a group that are higher than a limit, along their principal axis.
+PERSON = np.dtype(
+    [
+        ("rides", np.bool_),
+        ("x", np.float64),  # of the middle [m]
+        ("y", np.float64),
+        ("length", np.float64),  # along and across the principal axis [m]
+        ("width", np.float64),
+        ("yaw", np.float64),  # of the axis [rad]
+        ("bottom", np.float64),  # mean z of the ground below, and highest z [m]
+        ("top", np.float64),
+        ("n_seen", np.int64),  # points in view
+        ("share", np.float64),  # of labeled ones among the points in view; of larger clusters, among those around
+        ("heads", np.float64),  # `head_width` of the group [m]
+    ],
+    align=True,
+)
 
-    points : (n, 3 or more) float32, C-contiguous
-    height : (n,) float32
-    members : (k,) int32; rows of the group.
-    above : [m] above the ground.
-    found : (7,) float64, overwritten; cosine and sine of the axis, lowest and highest coordinate along and across it
-        [m], greatest height of all members [m]. Zeros before the height without a point above the limit.
+
+class Extent(NamedTuple):
+    """A group of points along its principal axis, seen from above.
+
+    Attributes
+    ----------
+    cos, sin : float
+        Of the axis.
+    low_u, high_u, low_v, high_v : float
+        Lowest and highest coordinate along and across the axis [m].
+    top : float
+        Greatest height above the ground [m].
     """
+
+    cos: float
+    sin: float
+    low_u: float
+    high_u: float
+    low_v: float
+    high_v: float
+    top: float
+
+
+@njit(cache=True, nogil=True)
+def measure(cloud: Cloud, members: NDArray[np.int32], above: float) -> Extent:
+    """Measure the members of a group that are higher than a limit [m], and the top of all; zeros if none is higher.
+
+    members : (k,) int32; rows of the points.
+    """
+    points, height = cloud.points, cloud.height
     n, x, y, top = 0, 0.0, 0.0, -math.inf
     for i in members:
         top = max(top, np.float64(height[i]))
@@ -71,10 +102,8 @@ def measure(
             n += 1
             x += np.float64(points[i, 0])
             y += np.float64(points[i, 1])
-    found[:] = 0.0
-    found[6] = top
     if n == 0:
-        return
+        return Extent(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, top)
     x, y = x / n, y / n
     xx, xy, yy = 0.0, 0.0, 0.0
     for i in members:
@@ -89,37 +118,27 @@ def measure(
             u = cos * np.float64(points[i, 0]) + sin * np.float64(points[i, 1])
             v = cos * np.float64(points[i, 1]) - sin * np.float64(points[i, 0])
             low_u, high_u, low_v, high_v = min(low_u, u), max(high_u, u), min(low_v, v), max(high_v, v)
-    found[0], found[1], found[2], found[3], found[4], found[5] = cos, sin, low_u, high_u, low_v, high_v
+    return Extent(cos, sin, low_u, high_u, low_v, high_v, top)
 
 
 @njit(cache=True, nogil=True)
 def fill_person_groups(
-    points: NDArray[np.float32],
-    height: NDArray[np.float32],
-    labels: NDArray[np.uint8],
-    roles: NDArray[np.uint8],
-    order: NDArray[np.int32],
-    starts: NDArray[np.int64],
-    groups: NDArray[np.int32],
-    group_starts: NDArray[np.int64],
-    loose: NDArray[np.int32],
+    cloud: Cloud, labeled: Labeled, clusters: Groups, groups: Groups, loose: NDArray[np.int32]
 ) -> tuple[int, int]:
     """List the clusters that may be one or a few persons, and the persons' points of the others.
 
-    points : (n, 3 or more) float32, C-contiguous
-    height : (n,) float32; [m] above the ground.
-    labels : (n,) uint8
-    roles : (256,) uint8; 0 for labels that are no persons', `UNSEEN` for points out of view.
-    order, starts : (m,) int32, (k + 1,) int64; points by cluster, from `edgeperc.objects.cluster.fill_groups`.
-    groups, group_starts : (m,) int32, (k + 1,) int64, overwritten; points by group.
+    labeled : roles are 0 for labels that are not persons', `UNSEEN` for points out of view.
+    groups : with room for all points of ``clusters``, overwritten
     loose : (m,) int32, overwritten; persons' points of clusters that are larger than a person or hold too few
         persons' points.
+    Returns the numbers of groups and of loose points.
     """
-    found = np.empty(7)
+    labels, roles, order, starts = labeled.labels, labeled.roles, groups.order, groups.starts
+    cluster_order, cluster_starts = clusters.order, clusters.starts
     n_groups, n_loose, n = 0, 0, 0
-    group_starts[0] = 0
-    for k in range(len(starts) - 1):
-        members = order[starts[k] : starts[k + 1]]
+    starts[0] = 0
+    for k in range(len(cluster_starts) - 1):
+        members = cluster_order[cluster_starts[k] : cluster_starts[k + 1]]
         n_labeled, n_seen = 0, 0
         for i in members:
             n_labeled += 1 if 0 < roles[labels[i]] < UNSEEN else 0
@@ -128,41 +147,35 @@ def fill_person_groups(
             continue
         is_group = n_labeled >= MIN_GROUP_SHARE * n_seen
         if is_group:
-            measure(points, height, members, -math.inf, found)
-            is_group = found[3] - found[2] <= MAX_LENGTH_M and found[6] <= MAX_TOP_M
+            extent = measure(cloud, members, -math.inf)
+            is_group = extent.high_u - extent.low_u <= MAX_LENGTH_M and extent.top <= MAX_TOP_M
         for i in members:
             if is_group:
-                groups[n] = i
+                order[n] = i
                 n += 1
             elif 0 < roles[labels[i]] < UNSEEN:
                 loose[n_loose] = i
                 n_loose += 1
         if is_group:
             n_groups += 1
-            group_starts[n_groups] = n
+            starts[n_groups] = n
     return n_groups, n_loose
 
 
 @njit(cache=True, nogil=True)
 def complete_persons(
-    points: NDArray[np.float32],
-    height: NDArray[np.float32],
+    cloud: Cloud,
     in_view: NDArray[np.bool_],
     clusters: NDArray[np.int32],
-    counts: NDArray[np.int32],
-    bounds: NDArray[np.float32],
+    may_be: NDArray[np.bool_],
     walks: int,
     rides: int,
     labels: NDArray[np.uint8],
 ) -> None:
     """Give the points of a cluster that has a person's size and shape one label.
 
-    points : (n, 3 or more) float32, C-contiguous
-    height : (n,) float32; [m] above the ground.
-    in_view : (n,) bool
     clusters : (n,) int32; negative for none.
-    counts, bounds : (k, classes + 1) int32, (k, 5) float32; of each cluster, from
-        `edgeperc.agreement.votes.fill_tallies`.
+    may_be : (k,) bool; clusters whose bounds are not too large for a person, and that hold labeled points.
     walks, rides : the labels of persons on foot and of those who ride.
     labels : (n,) uint8, modified; a cluster up to 2.3 m long and 0.7 m wide (0.8 m if the person rides), whose upper
         quarter is at most 0.8 m wide, and of which a fifth in view is labeled as persons, is one person, who rides if
@@ -170,31 +183,19 @@ def complete_persons(
         than a stride, or all points of one who is 1.3 to 2.0 m high and of whom at least 0.3 is labeled, get the
         label.
     """
-    slots = np.full(bounds.shape[0], -1, np.int64)  # of clusters whose size may be a person's
-    n_slots = 0
-    for k in range(bounds.shape[0]):
-        edge = max(bounds[k, 2] - bounds[k, 0], bounds[k, 3] - bounds[k, 1])
-        is_small = edge <= 2.0 * MAX_LENGTH_M and bounds[k, 4] <= MAX_TOP_M
-        if is_small and counts[k, walks] + counts[k, rides] > 0:
-            slots[k] = n_slots
-            n_slots += 1
-    if n_slots == 0:
+    numbers, n = np.empty(len(may_be), np.int32), 0
+    for k in range(len(may_be)):
+        numbers[k] = n if may_be[k] else -1
+        n += 1 if may_be[k] else 0
+    if n == 0:
         return
-    ends = np.zeros(n_slots + 1, np.int64)
+    own = np.empty(len(clusters), np.int32)
     for i in range(len(clusters)):
-        if clusters[i] >= 0 and slots[clusters[i]] >= 0:
-            ends[slots[clusters[i]] + 1] += 1
-    for slot in range(n_slots):
-        ends[slot + 1] += ends[slot]
-    starts = ends.copy()
-    order = np.empty(ends[n_slots], np.int32)
-    for i in range(len(clusters)):
-        if clusters[i] >= 0 and slots[clusters[i]] >= 0:
-            order[ends[slots[clusters[i]]]] = i
-            ends[slots[clusters[i]]] += 1
-    found = np.empty(7)
-    for slot in range(n_slots):
-        members = order[starts[slot] : starts[slot + 1]]
+        own[i] = numbers[clusters[i]] if clusters[i] >= 0 else -1
+    order, starts = np.empty(len(clusters), np.int32), np.empty(n + 1, np.int64)
+    fill_groups(own, Groups(order, starts))
+    for k in range(n):
+        members = order[starts[k] : starts[k + 1]]
         n_walking, n_riding, n_seen = 0, 0, 0
         for i in members:
             n_seen += 1 if in_view[i] else 0
@@ -203,12 +204,12 @@ def complete_persons(
         n_labeled = n_walking + n_riding
         if n_labeled < max(MIN_GROUP_SHARE * n_seen, MIN_LABELED):
             continue
-        measure(points, height, members, -math.inf, found)
-        length, width, top = found[3] - found[2], found[5] - found[4], found[6]
-        measure(points, height, members, UPPER * top, found)
+        extent = measure(cloud, members, -math.inf)
+        length, width, top = extent.high_u - extent.low_u, extent.high_v - extent.low_v, extent.top
+        upper = measure(cloud, members, UPPER * top)
         is_riding = length > MAX_STRIDE_M or (n_riding > 0 and n_riding >= MIN_OF_WHOLE * n_labeled)
         max_width = MAX_RIDING_WIDTH_M if is_riding else MAX_WALKING_WIDTH_M
-        if not (length <= MAX_LENGTH_M and width <= max_width and found[3] - found[2] <= MAX_UPPER_M):
+        if not (length <= MAX_LENGTH_M and width <= max_width and upper.high_u - upper.low_u <= MAX_UPPER_M):
             continue
         is_whole = n_labeled >= MIN_WHOLE_SHARE * n_seen and WHOLE_TOP_M[0] <= top <= WHOLE_TOP_M[1]
         if not is_whole and length <= MAX_STRIDE_M:
@@ -219,21 +220,16 @@ def complete_persons(
 
 
 @njit(cache=True, nogil=True)
-def border_of(
-    points: NDArray[np.float32],
-    height: NDArray[np.float32],
-    members: NDArray[np.int32],
-    above: float,
-    found: NDArray[np.float64],
-) -> float:
-    """Where two persons meet along the axis of `measure`: at the fewest points, as near to the middle as possible."""
-    low, length = found[2], found[3] - found[2]
+def border_of(cloud: Cloud, members: NDArray[np.int32], above: float, extent: Extent) -> float:
+    """Where two persons meet along the axis of a group: at the fewest points, as near to the middle as possible."""
+    points, height, cos, sin = cloud.points, cloud.height, extent.cos, extent.sin
+    low, length = extent.low_u, extent.high_u - extent.low_u
     n_bins = int(min(length / BIN_M, MAX_BINS - 1.0)) + 1
     edge = max(BIN_M, length / n_bins)
     counts = np.zeros(n_bins + 2, np.int64)  # one more at each end
     for i in members:
         if height[i] > above:
-            u = found[0] * np.float64(points[i, 0]) + found[1] * np.float64(points[i, 1])
+            u = cos * np.float64(points[i, 0]) + sin * np.float64(points[i, 1])
             counts[min(max(int((u - low) / edge), 0), n_bins - 1) + 1] += 1
     border, fewest, nearest = low + 0.5 * length, -1, math.inf
     for b in range(n_bins):
@@ -248,19 +244,18 @@ def border_of(
 
 
 @njit(cache=True, nogil=True)
-def head_width(
-    points: NDArray[np.float32], height: NDArray[np.float32], members: NDArray[np.int32], found: NDArray[np.float64]
-) -> float:
-    """Width of the widest part without a gap at the height of heads [m], along the axis of `measure`; 0 if not flat."""
-    low, length = found[2], found[3] - found[2]
+def head_width(cloud: Cloud, members: NDArray[np.int32], extent: Extent) -> float:
+    """Width of the widest part without a gap at the height of heads [m], along the axis of a group; 0 if not flat."""
+    points, height, cos, sin = cloud.points, cloud.height, extent.cos, extent.sin
+    low, length = extent.low_u, extent.high_u - extent.low_u
     n_bins = int(min(length / BIN_M, MAX_BINS - 1.0)) + 1
     edge = max(BIN_M, length / n_bins)
     firsts, lasts = np.full(n_bins, math.inf), np.full(n_bins, -math.inf)
     away, low_v, high_v = math.inf, math.inf, -math.inf
     for i in members:
-        if height[i] > found[6] - HEAD_M:
+        if height[i] > extent.top - HEAD_M:
             x, y = np.float64(points[i, 0]), np.float64(points[i, 1])
-            u, v = found[0] * x + found[1] * y, found[0] * y - found[1] * x
+            u, v = cos * x + sin * y, cos * y - sin * x
             b = min(max(int((u - low) / edge), 0), n_bins - 1)
             firsts[b], lasts[b] = min(firsts[b], u), max(lasts[b], u)
             low_v, high_v = min(low_v, v), max(high_v, v)
@@ -281,101 +276,108 @@ def head_width(
 
 @njit(cache=True, nogil=True)
 def fill_persons(
-    points: NDArray[np.float32],
-    height: NDArray[np.float32],
-    labels: NDArray[np.uint8],
-    roles: NDArray[np.uint8],
-    order: NDArray[np.int32],
-    starts: NDArray[np.int64],
+    cloud: Cloud,
+    labeled: Labeled,
+    groups: Groups,
     n_whole: int,
-    clusters: NDArray[np.int32],
-    cluster_order: NDArray[np.int32],
-    cluster_starts: NDArray[np.int64],
+    cluster_of: NDArray[np.int32],
+    clusters: Groups,
     min_points: int,
-    persons: NDArray[np.float64],
+    persons: NDArray[np.void],
 ) -> int:
     """Divide groups into persons, and measure them.
 
-    A group whose upper quarter is wider than 0.8 m is cut where the fewest points are, and its parts again. A person
-    rides if a quarter of the persons' points says so.
+    A group whose upper quarter is wider than 0.8 m is cut where the fewest points are, and its parts again.
 
-    points : (n, 3 or more) float32, C-contiguous
-    height : (n,) float32; [m] above the ground.
-    labels : (n,) uint8
-    roles : (256,) uint8; 0 for labels that are no persons', `UNSEEN` for points out of view, `WALKS` or `RIDES` for
+    labeled : roles are 0 for labels that are not persons', `UNSEEN` for points out of view, `WALKS` or `RIDES` for
         others.
-    order : (m,) int32, modified
-    starts : (k + 1,) int64; points by group. Those of a group are put in the order of its persons.
-    n_whole : groups from this number on are labeled points of larger clusters. The share of the labels is counted
-        among the points of the cluster within 0.2 m of the person.
-    clusters, cluster_order, cluster_starts : cluster of every point, and points by cluster.
+    groups : the points of a group are put in the order of its persons.
+    n_whole : groups from this number on are labeled points of larger clusters.
+    cluster_of, clusters : cluster of every point, (n,) int32, and points by cluster.
     min_points : smaller parts are dropped.
-    persons : (p, 11) float64, overwritten; for each person: 1 if he or she rides, else 0; x, y of the middle, extent
-        along and across the principal axis [m], its angle [rad]; lowest and highest z [m], from the ground on; number
-        of points in view; share of labeled ones among them; `head_width` of the group [m].
+    persons : (p,) `PERSON`, overwritten
     Returns: Number of persons. Those beyond p are left out, and groups with points that are not finite.
     """
-    found, upper = np.empty(7), np.empty(7)
+    order, starts, others, other_starts = groups.order, groups.starts, clusters.order, clusters.starts
     left = np.empty((MAX_CUTS + 1, 3), np.int64)  # parts: first and last place in `order`, number of cuts before
-    n_found = 0
+    n = 0
     for k in range(len(starts) - 1):
         group = order[starts[k] : starts[k + 1]]
-        measure(points, height, group, -math.inf, found)
-        if not math.isfinite(found[2] + found[3] + found[4] + found[5] + found[6]):
+        extent = measure(cloud, group, -math.inf)
+        if not math.isfinite(extent.low_u + extent.high_u + extent.low_v + extent.high_v + extent.top):
             continue
-        heads = head_width(points, height, group, found)
+        heads = head_width(cloud, group, extent)
         left[0, 0], left[0, 1], left[0, 2] = starts[k], starts[k + 1], 0
         n_left = 1
-        while n_left > 0 and n_found < persons.shape[0]:
+        while n_left > 0 and n < persons.shape[0]:
             n_left -= 1
             first, end, n_cuts = left[n_left]
             members = order[first:end]
             if len(members) < min_points:
                 continue
-            measure(points, height, members, -math.inf, found)
-            limit = UPPER * found[6]
-            measure(points, height, members, limit, upper)
-            if upper[3] - upper[2] > MAX_UPPER_M and n_cuts < MAX_CUTS:
-                border = border_of(points, height, members, limit, upper)
-                middle = first
-                for at in range(first, end):
-                    i = order[at]
-                    if upper[0] * np.float64(points[i, 0]) + upper[1] * np.float64(points[i, 1]) <= border:
-                        order[at], order[middle] = order[middle], i
-                        middle += 1
-                left[n_left, 0], left[n_left, 1], left[n_left, 2] = middle, end, n_cuts + 1
-                left[n_left + 1, 0], left[n_left + 1, 1], left[n_left + 1, 2] = first, middle, n_cuts + 1
+            extent = measure(cloud, members, -math.inf)
+            n_first = cut(cloud, members, UPPER * extent.top) if n_cuts < MAX_CUTS else -1
+            if n_first >= 0:
+                left[n_left, 0], left[n_left, 1], left[n_left, 2] = first + n_first, end, n_cuts + 1
+                left[n_left + 1, 0], left[n_left + 1, 1], left[n_left + 1, 2] = first, first + n_first, n_cuts + 1
                 n_left += 2
                 continue
-            n_labeled, n_riding, n_seen, ground, highest = 0, 0, 0, 0.0, -math.inf
-            for i in members:
-                role = roles[labels[i]]
-                n_labeled += 1 if 0 < role < UNSEEN else 0
-                n_seen += 1 if role != UNSEEN else 0
-                n_riding += 1 if role == RIDES else 0
-                ground += np.float64(points[i, 2]) - np.float64(height[i])
-                highest = max(highest, np.float64(points[i, 2]))
-            n_near = n_seen
-            if k >= n_whole:
-                n_near = 0
-                own = clusters[members[0]]
-                for i in cluster_order[cluster_starts[own] : cluster_starts[own + 1]]:
-                    u = found[0] * np.float64(points[i, 0]) + found[1] * np.float64(points[i, 1])
-                    v = found[0] * np.float64(points[i, 1]) - found[1] * np.float64(points[i, 0])
-                    along = found[2] - NEAR_M <= u <= found[3] + NEAR_M
-                    across = found[4] - NEAR_M <= v <= found[5] + NEAR_M
-                    is_near = along and across and height[i] <= MAX_TOP_M
-                    n_near += 1 if is_near and roles[labels[i]] != UNSEEN else 0
-            length, u, v = found[3] - found[2], 0.5 * (found[2] + found[3]), 0.5 * (found[4] + found[5])
-            rides = n_riding > 0 and n_riding >= MIN_OF_WHOLE * n_labeled
-            persons[n_found, 0] = 1.0 if rides else 0.0
-            persons[n_found, 1] = u * found[0] - v * found[1]
-            persons[n_found, 2] = u * found[1] + v * found[0]
-            persons[n_found, 3], persons[n_found, 4] = length, found[5] - found[4]
-            persons[n_found, 5] = math.atan2(found[1], found[0])
-            persons[n_found, 6], persons[n_found, 7] = ground / len(members), highest
-            persons[n_found, 8] = n_seen
-            persons[n_found, 9] = n_labeled / max(n_near, n_seen, 1)
-            persons[n_found, 10] = heads
-            n_found += 1
-    return n_found
+            own = cluster_of[members[0]] if k >= n_whole else 0
+            around = others[other_starts[own] : other_starts[own + 1] if k >= n_whole else other_starts[own]]
+            fill_person(cloud, labeled, members, extent, around, persons[n])
+            persons[n]["heads"] = heads
+            n += 1
+    return n
+
+
+@njit(cache=True, nogil=True)
+def cut(cloud: Cloud, members: NDArray[np.int32], above: float) -> int:
+    """Put the points of the first of two persons first; their number, or -1 if a group is one person."""
+    points, upper = cloud.points, measure(cloud, members, above)
+    if not upper.high_u - upper.low_u > MAX_UPPER_M:
+        return -1
+    border = border_of(cloud, members, above, upper)
+    n = 0
+    for at in range(len(members)):
+        i = members[at]
+        if upper.cos * np.float64(points[i, 0]) + upper.sin * np.float64(points[i, 1]) <= border:
+            members[at], members[n] = members[n], i
+            n += 1
+    return n
+
+
+@njit(cache=True, nogil=True)
+def fill_person(
+    cloud: Cloud,
+    labeled: Labeled,
+    members: NDArray[np.int32],
+    extent: Extent,
+    around: NDArray[np.int32],
+    person: np.void,
+) -> None:
+    """Write the record of a person.
+
+    around : (m,) int32; of the larger cluster, of which the points within 0.2 m of the person count for the share.
+    """
+    points, height, labels, roles = cloud.points, cloud.height, labeled.labels, labeled.roles
+    cos, sin, low_u, high_u, low_v, high_v, _ = extent
+    n_labeled, n_riding, n_seen, ground, highest = 0, 0, 0, 0.0, -math.inf
+    for i in members:
+        role = roles[labels[i]]
+        n_labeled += 1 if 0 < role < UNSEEN else 0
+        n_seen += 1 if role != UNSEEN else 0
+        n_riding += 1 if role == RIDES else 0
+        ground += np.float64(points[i, 2]) - np.float64(height[i])
+        highest = max(highest, np.float64(points[i, 2]))
+    n_near = 0
+    for i in around:
+        u = cos * np.float64(points[i, 0]) + sin * np.float64(points[i, 1])
+        v = cos * np.float64(points[i, 1]) - sin * np.float64(points[i, 0])
+        is_near = low_u - NEAR_M <= u <= high_u + NEAR_M and low_v - NEAR_M <= v <= high_v + NEAR_M
+        n_near += 1 if is_near and height[i] <= MAX_TOP_M and roles[labels[i]] != UNSEEN else 0
+    u, v = 0.5 * (low_u + high_u), 0.5 * (low_v + high_v)
+    person["rides"] = n_riding > 0 and n_riding >= MIN_OF_WHOLE * n_labeled
+    person["x"], person["y"] = u * cos - v * sin, u * sin + v * cos
+    person["length"], person["width"], person["yaw"] = high_u - low_u, high_v - low_v, math.atan2(sin, cos)
+    person["bottom"], person["top"] = ground / len(members), highest
+    person["n_seen"], person["share"] = n_seen, n_labeled / max(n_near, n_seen, 1)

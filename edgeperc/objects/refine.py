@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import PointsError
+from ..system.draws import drawn_of, next_draw
 from ..system.kernel_cache import njit
 from ..types.points import read_only
 
@@ -293,8 +294,8 @@ def find_consensus(
     most = 0
     center[:] = math.nan
     for _ in range(N_HYPOTHESES):
-        draw = (draw * 1103515245 + 12345) & 0x7FFFFFFF
-        sample = step * ((draw * n_tested) >> 31)
+        draw = next_draw(draw)
+        sample = step * drawn_of(draw, n_tested)
         x, y = ground[sample, 0], ground[sample, 1]
         count = 0
         for again in range(2):

@@ -148,130 +148,157 @@ _FEWEST_ROWS = 8.0
 
 
 def _geometry_findings(scan: Measures, profile: FitnessProfile, sensor: SensorProfile) -> list[Finding]:
+    """What differs in the coordinates; a mistake in their frame or unit alone, because it explains the rest."""
+    mistake = _other_unit(scan, profile) or _other_axes(scan) or _other_origin(scan) or _upside_down(scan, profile)
+    if mistake is not None:
+        return [mistake]
+    other_height = _other_height(scan, profile)
+    has_ground = scan.ground_m is not None and profile.ground_m is not None and other_height is None
+    found = (
+        other_height,
+        _other_field_of_view(scan, profile, sensor),
+        _cropped(scan, profile) or _turned(scan, profile),
+        _room(scan, profile),
+        _few_rows(scan, profile, sensor, has_ground),
+        _other_number(scan, profile),
+    )
+    return [finding for finding in found if finding is not None]
+
+
+def _other_unit(scan: Measures, profile: FitnessProfile) -> Finding | None:
     near, far = profile.range_median_m
-    if not near / 20.0 <= scan.range_median_m <= far * 20.0:
-        factor = scan.range_median_m / math.sqrt(near * far)
-        unit = next((name for name, size in _UNITS if 0.2 * size < factor < 5.0 * size), "another unit")
-        return [
-            Finding(
-                f"The median distance is {scan.range_median_m:.3g}, in training it was {near:.0f} to {far:.0f} m: "
-                f"the coordinates seem to be in {unit}; convert them to meters.",
-                True,
-            )
-        ]
-    if scan.flat_axis is not None:
-        towards = ("+" if scan.flat_m > 0.0 else "-") + "xyz"[scan.flat_axis]
-        advice = "" if towards != "+y" else " They may be a camera's (x right, y down, z forward): pass z, -x, -y."
-        return [
-            Finding(
-                f"The ground seems to lie towards {towards}, where the model expects it towards -z: the axes are not "
-                f"x forward, y left, z up.{advice}",
-                True,
-            )
-        ]
+    if near / 20.0 <= scan.range_median_m <= far * 20.0:
+        return None
+    factor = scan.range_median_m / math.sqrt(near * far)
+    unit = next((name for name, size in _UNITS if 0.2 * size < factor < 5.0 * size), "another unit")
+    return Finding(
+        f"The median distance is {scan.range_median_m:.3g}, in training it was {near:.0f} to {far:.0f} m: "
+        f"the coordinates seem to be in {unit}; convert them to meters.",
+        True,
+    )
 
-    if scan.unevenness > _MOST_UNEVEN or scan.nearest_m > _NEAREST_M:
-        return [
-            Finding(
-                f"One direction holds {scan.unevenness:.1f} times as many points as the mean one, and the nearest "
-                f"points are {scan.nearest_m:.0f} m away: the sensor is not at the origin, as in the frame of a map; "
-                "subtract the sensor's position from the points.",
-                True,
-            )
-        ]
 
-    findings: list[Finding] = []
-    has_ground = scan.ground_m is not None and profile.ground_m is not None
-    if scan.ground_m is not None and profile.ground_m is not None:
-        low, high = profile.ground_m
-        if scan.ground_m > 0.5 and high < 0.0:
-            return [
-                Finding(
-                    f"The ground lies {scan.ground_m:.1f} m above the sensor: it is mounted upside down, or z points "
-                    "down; turn the points by 180 degrees about x (negate y and z).",
-                    True,
-                )
-            ]
-        if not low - 0.6 <= scan.ground_m <= high + 0.6:
-            has_ground = False
-            findings.append(
-                Finding(
-                    f"The ground lies at z = {scan.ground_m:.1f} m, in training it lay at {low:.1f} to {high:.1f} m: "
-                    "the sensor is mounted at another height: pass the right mounting (--mount-height), or none, "
-                    "so that it is found.",
-                    not low - _GROUND_OFF_M <= scan.ground_m <= high + _GROUND_OFF_M,
-                )
-            )
+def _other_axes(scan: Measures) -> Finding | None:
+    if scan.flat_axis is None:
+        return None
+    towards = ("+" if scan.flat_m > 0.0 else "-") + "xyz"[scan.flat_axis]
+    advice = "" if towards != "+y" else " They may be a camera's (x right, y down, z forward): pass z, -x, -y."
+    return Finding(
+        f"The ground seems to lie towards {towards}, where the model expects it towards -z: the axes are not "
+        f"x forward, y left, z up.{advice}",
+        True,
+    )
 
+
+def _other_origin(scan: Measures) -> Finding | None:
+    if scan.unevenness <= _MOST_UNEVEN and scan.nearest_m <= _NEAREST_M:
+        return None
+    return Finding(
+        f"One direction holds {scan.unevenness:.1f} times as many points as the mean one, and the nearest "
+        f"points are {scan.nearest_m:.0f} m away: the sensor is not at the origin, as in the frame of a map; "
+        "subtract the sensor's position from the points.",
+        True,
+    )
+
+
+def _upside_down(scan: Measures, profile: FitnessProfile) -> Finding | None:
+    if scan.ground_m is None or profile.ground_m is None or scan.ground_m <= 0.5 or profile.ground_m[1] >= 0.0:
+        return None
+    return Finding(
+        f"The ground lies {scan.ground_m:.1f} m above the sensor: it is mounted upside down, or z points "
+        "down; turn the points by 180 degrees about x (negate y and z).",
+        True,
+    )
+
+
+def _other_height(scan: Measures, profile: FitnessProfile) -> Finding | None:
+    if scan.ground_m is None or profile.ground_m is None:
+        return None
+    low, high = profile.ground_m
+    if low - 0.6 <= scan.ground_m <= high + 0.6:
+        return None
+    return Finding(
+        f"The ground lies at z = {scan.ground_m:.1f} m, in training it lay at {low:.1f} to {high:.1f} m: "
+        "the sensor is mounted at another height: pass the right mounting (--mount-height), or none, "
+        "so that it is found.",
+        not low - _GROUND_OFF_M <= scan.ground_m <= high + _GROUND_OFF_M,
+    )
+
+
+def _other_field_of_view(scan: Measures, profile: FitnessProfile, sensor: SensorProfile) -> Finding | None:
     low, high = profile.elevation_p01_deg[1], profile.elevation_p99_deg[1]
     # The lowest beams are missing from a crop to a camera's view (9 deg) and from a scan cut short (up to 13).
     unlike = scan.elevation_p01_deg > low + 13.0 or scan.elevation_p99_deg > high + 8.0
-    if unlike and scan.elevation_p01_deg < scan.elevation_p99_deg:  # both are 0 if no point is far
-        findings.append(
-            Finding(
-                f"The points lie between {scan.elevation_p01_deg:.0f} and {scan.elevation_p99_deg:.0f} deg of "
-                f"elevation, in training between {low:.0f} and {high:.0f}: this is a sensor of another field of view, "
-                "or the origin is not the sensor, or it is not level.",
-                scan.elevation_p01_deg > 0.0 or scan.elevation_p99_deg > max(high, sensor.fov_up_deg) + _TOO_HIGH_DEG,
-            )
-        )
+    if not (unlike and scan.elevation_p01_deg < scan.elevation_p99_deg):  # both are 0 if no point is far
+        return None
+    return Finding(
+        f"The points lie between {scan.elevation_p01_deg:.0f} and {scan.elevation_p99_deg:.0f} deg of "
+        f"elevation, in training between {low:.0f} and {high:.0f}: this is a sensor of another field of view, "
+        "or the origin is not the sensor, or it is not level.",
+        scan.elevation_p01_deg > 0.0 or scan.elevation_p99_deg > max(high, sensor.fov_up_deg) + _TOO_HIGH_DEG,
+    )
 
+
+def _cropped(scan: Measures, profile: FitnessProfile) -> Finding | None:
+    if scan.view_covered >= 0.6 * profile.view_covered[0]:
+        return None
     left, right = profile.azimuth_deg
-    if scan.view_covered < 0.6 * profile.view_covered[0]:
-        findings.append(
-            Finding(
-                f"Only {scan.view_covered:.0%} of the model's view ({left:.0f} to {right:.0f} deg of azimuth) holds "
-                "points: the scan is cropped, or x does not point forward.",
-                scan.view_covered < 0.25 * profile.view_covered[0],
-            )
-        )
-    elif (
-        scan.road_ahead is not None
-        and profile.road_ahead is not None
-        and scan.road_ahead < min(-0.5, profile.road_ahead[0] - 0.3)
-    ):
-        findings.append(
-            Finding(
-                "There are more obstacles ahead and behind than to the sides, as if the road ran along y: if x does "
-                "not point forward, pass its direction: Mounting(yaw_deg=-90), --turn -90, for x right, y forward. "
-                "If the vehicle stands across the road, ignore this."
-            )
-        )
+    return Finding(
+        f"Only {scan.view_covered:.0%} of the model's view ({left:.0f} to {right:.0f} deg of azimuth) holds "
+        "points: the scan is cropped, or x does not point forward.",
+        scan.view_covered < 0.25 * profile.view_covered[0],
+    )
 
+
+def _turned(scan: Measures, profile: FitnessProfile) -> Finding | None:
+    if scan.road_ahead is None or profile.road_ahead is None:
+        return None
+    if scan.road_ahead >= min(-0.5, profile.road_ahead[0] - 0.3):
+        return None
+    return Finding(
+        "There are more obstacles ahead and behind than to the sides, as if the road ran along y: if x does "
+        "not point forward, pass its direction: Mounting(yaw_deg=-90), --turn -90, for x right, y forward. "
+        "If the vehicle stands across the road, ignore this."
+    )
+
+
+def _room(scan: Measures, profile: FitnessProfile) -> Finding | None:
+    near, far = profile.range_median_m
     # The smallest median in 481 KITTI scans is 3.8 m, above half of `near`; in two captures of a room 1.3 and 2.1 m.
-    if scan.ground_m is None and scan.range_median_m < near / 2.0:
-        findings.append(
-            Finding(
-                f"Half of the points are nearer than {scan.range_median_m:.1f} m, in training {near:.0f} to "
-                f"{far:.0f} m, and no ground was found: this seems to be a room, or the sensor is covered; the models "
-                "know roads.",
-                True,
-            )
-        )
+    if scan.ground_m is not None or scan.range_median_m >= near / 2.0:
+        return None
+    return Finding(
+        f"Half of the points are nearer than {scan.range_median_m:.1f} m, in training {near:.0f} to "
+        f"{far:.0f} m, and no ground was found: this seems to be a room, or the sensor is covered; the models "
+        "know roads.",
+        True,
+    )
 
+
+def _few_rows(scan: Measures, profile: FitnessProfile, sensor: SensorProfile, has_ground: bool) -> Finding | None:
     few_rows = scan.beams < 0.75 * profile.beams[0] and scan.beams_per_deg < 0.65 * profile.beams_per_deg[0]
     too_few_rows = scan.beams < min(_FEWEST_ROWS, sensor.n_beams)
-    if (few_rows and has_ground) or too_few_rows:  # rows cannot be separated if the origin is wrong
-        findings.append(
-            Finding(
-                f"The scan has about {scan.beams:.0f} rows of points (sensor {sensor.name}: {sensor.n_beams}), in "
-                f"training it had at least {profile.beams[0]:.0f}: expect to lose far and small objects, or use a "
-                "model trained for it.",
-                too_few_rows,
-            )
-        )
+    if not ((few_rows and has_ground) or too_few_rows):  # rows cannot be separated if the origin is wrong
+        return None
+    return Finding(
+        f"The scan has about {scan.beams:.0f} rows of points (sensor {sensor.name}: {sensor.n_beams}), in "
+        f"training it had at least {profile.beams[0]:.0f}: expect to lose far and small objects, or use a "
+        "model trained for it.",
+        too_few_rows,
+    )
 
-    if scan.points_in_view < 0.2 * profile.points_in_view[0]:
-        findings.append(_too_few(scan, profile))
-    elif scan.points_in_view > 5.0 * profile.points_in_view[1]:
-        findings.append(
-            Finding(
-                f"The model's view holds about {scan.points_in_view:.0f} points, in training it held at most "
-                f"{profile.points_in_view[1]:.0f}: pass one turn of the sensor at a time.",
-                scan.points_in_view > 20.0 * profile.points_in_view[1],
-            )
-        )
-    return findings
+
+def _other_number(scan: Measures, profile: FitnessProfile) -> Finding | None:
+    fewest, most = profile.points_in_view
+    if scan.points_in_view < 0.2 * fewest:
+        return _too_few(scan, profile)
+    if scan.points_in_view <= 5.0 * most:
+        return None
+    return Finding(
+        f"The model's view holds about {scan.points_in_view:.0f} points, in training it held at most "
+        f"{most:.0f}: pass one turn of the sensor at a time.",
+        scan.points_in_view > 20.0 * most,
+    )
 
 
 def _remission_findings(scan: Measures, profile: FitnessProfile, sensor: SensorProfile) -> list[Finding]:

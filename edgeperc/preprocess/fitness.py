@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, fields
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,62 +24,126 @@ _SAMPLE, _BEAM_SAMPLE = 6000, 130_000
 _GROUND_SHARE = 0.15
 
 
+N_SECTORS = 64  # of a turn, by pseudo-azimuth: y / (|x| + |y|), unfolded to -2..2
+# The points between these ranges show where the ground is. Nearer, the elevation of a point depends on where in its
+# housing a laser sits, and on how far the origin is from the sensor.
+NEAR_M, FAR_M = 3.0, 25.0
+LEAST_HEIGHT_M = -10.0
+OBSTACLE_M = (0.5, 6.0)  # heights above the ground
+ALONG_M, HALF_LANE_M = 30.0, 2.0  # reach of the corridors to the four sides, and half their width
+# A quarter of a degree to either side: tangents for the axes, and twice that for the diagonals.
+BESIDE_AXIS, BESIDE_DIAGONAL = 0.0044, 0.0087
+
+# Sums over a scan.
+SUMS = np.dtype(
+    [
+        ("n_finite", np.float64),  # points
+        ("n_in_view", np.float64),
+        ("n_sectors", np.float64),  # with points
+        ("view_covered", np.float64),  # share of the sectors in the view that have points
+        ("road_ahead", np.float64),  # logarithm of the ratio of obstacles at the sides to those ahead and behind
+        ("remission_low", np.float64),
+        ("remission_high", np.float64),
+        ("n_near", np.float64),  # points 3 to 25 m away
+        ("unevenness", np.float64),  # points of the fullest sector over the mean of those with points, beyond 3 m
+    ]
+)
+
+
+class Histograms(NamedTuple):
+    """Numbers of points.
+
+    Attributes
+    ----------
+    remissions : (258,) int64
+        Remission <= 0, 256 even bins in 0..1, above 1.
+    elevations : (360,) int64
+        Bins of half a degree from -90, of the points farther than 3 m.
+    ranges : (200,) int64
+        Horizontal distance, 20 bins a decade from 1 mm.
+    heights : (3, 100) int64
+        x, y and z of the points 3 to 25 m away, bins of 0.2 m from -10 m.
+    """
+
+    remissions: NDArray[np.int64]
+    elevations: NDArray[np.int64]
+    ranges: NDArray[np.int64]
+    heights: NDArray[np.int64]
+
+
+class Rows(NamedTuple):
+    """Elevations in the eight directions ahead, left, behind, right and halfway between.
+
+    Attributes
+    ----------
+    elevations : (8, 1024) float64
+        [deg]
+    counts : (8,) int64
+        How many of them each direction has.
+    """
+
+    elevations: NDArray[np.float64]
+    counts: NDArray[np.int64]
+
+
 @njit(cache=True, nogil=True)
 def fill_scan_sums(
     points: NDArray[np.float32],
     step: int,
     beam_step: int,
-    view_right: float,
-    view_left: float,
-    remissions: NDArray[np.int64],
-    elevations: NDArray[np.int64],
-    ranges: NDArray[np.int64],
-    heights: NDArray[np.int64],
-    rows: NDArray[np.float64],
-    n_rows: NDArray[np.int64],
-    sums: NDArray[np.float64],
+    view: tuple[float, float],
+    histograms: Histograms,
+    rows: Rows,
+    sums: NDArray[np.void],
 ) -> None:
-    """Histograms of every ``step``-th point, for `check_fitness`. Points that are not finite are skipped.
+    """Measure every ``step``-th point, for `check_fitness`. Points that are not finite are skipped.
 
     points : (n, 4) float32; x, y, z [m], remission.
-    step, beam_step : every ``step``-th point is used; for the elevations in eight directions, every ``beam_step``-th.
-    view_right, view_left : edges of the model's view as pseudo-azimuth, y / (|x| + |y|) unfolded to -2..2.
-    remissions : (258,) int64, overwritten; points of remission <= 0, 256 even bins in 0..1, points above 1.
-    elevations : (360,) int64, overwritten; bins of half a degree from -90, of the points farther than 3 m: nearer, it
-        depends on where in its housing a laser sits, and on how far the origin is from the sensor.
-    ranges : (200,) int64, overwritten; horizontal distance, 20 bins a decade from 1 mm.
-    heights : (3, 100) int64, overwritten; x, y and z of the points 3 to 25 m away, bins of 0.2 m from -10 m.
-    rows : (8, 1024) float64, overwritten; elevation [deg] of the points in the eight directions ahead, left, behind,
-        right and halfway between.
-    n_rows : (8,) int64, overwritten
-    sums : (9,) float64, overwritten; 0: finite points; 1: finite points in the view; 2: sectors of 1/64 turn with
-        points; 3: share of the sectors in the view that have points; 4: logarithm of the ratio of obstacles at the
-        sides to those ahead and behind; 5, 6: lowest and highest remission; 7: points 3 to 25 m away; 8: points of
-        the fullest sector over the mean of the sectors that have points, of the points farther than 3 m.
+    beam_step : for ``rows``, every ``beam_step``-th point is used.
+    view : right and left edge of the model's view as pseudo-azimuth.
+    histograms, rows : overwritten
+    sums : (1,) `SUMS`, overwritten
     """
-    n = points.shape[0]
+    seen, far = np.zeros(N_SECTORS), np.zeros(N_SECTORS)  # 1 with points; points farther than 3 m
+    fill_histograms(points, step, view, histograms, seen, far, sums)
+    measure_sectors(view, seen, far, sums)
+    # A loop in place of argmax: the compiled form of that imports scipy, which takes 0.2 s a start.
+    heights, highest_bin = histograms.heights, 0
+    for k in range(1, heights.shape[1]):
+        highest_bin = k if heights[2, k] > heights[2, highest_bin] else highest_bin
+    ground = highest_bin * 0.2 - 9.9
+    sums[0]["road_ahead"] = road_ahead(points, step, ground, max(sums[0]["n_finite"], 1.0))
+    fill_rows(points, beam_step, rows)
+
+
+@njit(cache=True, nogil=True)
+def fill_histograms(
+    points: NDArray[np.float32],
+    step: int,
+    view: tuple[float, float],
+    histograms: Histograms,
+    seen: NDArray[np.float64],
+    far: NDArray[np.float64],
+    sums: NDArray[np.void],
+) -> None:
+    """Count the points; see `Histograms`.
+
+    seen, far : (N_SECTORS,) float64, modified; 1 for sectors with points; number of points farther than 3 m.
+    """
+    remissions, elevations, ranges, heights = histograms
     remissions[:] = 0
     elevations[:] = 0
     ranges[:] = 0
     heights[:] = 0
-    n_rows[:] = 0
-    sums[:] = 0.0
-    seen = np.empty(64)  # 1 in sectors with points
-    far = np.empty(64)
-    seen[:] = 0.0
-    far[:] = 0.0
-    lowest = math.inf
-    highest = -math.inf
-    for i in range(0, n, step):
-        x = np.float64(points[i, 0])
-        y = np.float64(points[i, 1])
-        z = np.float64(points[i, 2])
+    right, left = view
+    n_finite, n_in_view, n_near, lowest, highest = 0.0, 0.0, 0.0, math.inf, -math.inf
+    for i in range(0, points.shape[0], step):
+        x, y, z = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
         remission = np.float64(points[i, 3])
         if not math.isfinite(x + y + z + remission):
             continue
-        sums[0] += 1.0
-        lowest = min(lowest, remission)
-        highest = max(highest, remission)
+        n_finite += 1.0
+        lowest, highest = min(lowest, remission), max(highest, remission)
         if remission <= 0.0:
             remissions[0] += 1
         elif remission > 1.0:
@@ -92,93 +156,97 @@ def fill_scan_sums(
         azimuth = y / across
         if x < 0.0:
             azimuth = 2.0 - azimuth if y >= 0.0 else -2.0 - azimuth
-        sector = min(int((azimuth + 2.0) * 16.0), 63)
+        sector = min(int((azimuth + 2.0) * (N_SECTORS / 4.0)), N_SECTORS - 1)
         seen[sector] = 1.0
-        if view_right <= azimuth <= view_left:
-            sums[1] += 1.0
+        n_in_view += 1.0 if right <= azimuth <= left else 0.0
         horizontal = math.sqrt(x * x + y * y)
         ranges[min(max(int((math.log10(horizontal) + 3.0) * 20.0), 0), 199)] += 1
         square = x * x + y * y + z * z
-        if square > 9.0:
-            far[sector] += 1.0
-            elevations[min(int((math.atan(z / horizontal) * (180.0 / math.pi) + 90.0) * 2.0), 359)] += 1
-        if 9.0 < square < 625.0:
-            sums[7] += 1.0
+        if square <= NEAR_M * NEAR_M:
+            continue
+        far[sector] += 1.0
+        elevations[min(int((math.atan(z / horizontal) * (180.0 / math.pi) + 90.0) * 2.0), 359)] += 1
+        if square < FAR_M * FAR_M:
+            n_near += 1.0
             for axis in range(3):
-                value = x if axis == 0 else y if axis == 1 else z
-                if -10.0 <= value < 10.0:
-                    heights[axis, min(int((value + 10.0) * 5.0), 99)] += 1
-    sums[5] = lowest
-    sums[6] = highest
+                above = (x if axis == 0 else y if axis == 1 else z) - LEAST_HEIGHT_M
+                if 0.0 <= above < 20.0:
+                    heights[axis, min(int(above * 5.0), 99)] += 1
+    sums[0]["n_finite"], sums[0]["n_in_view"], sums[0]["n_near"] = n_finite, n_in_view, n_near
+    sums[0]["remission_low"], sums[0]["remission_high"] = lowest, highest
 
-    in_view = 0
-    in_view_seen = 0.0
-    for sector in range(64):
-        sums[2] += seen[sector]
-        middle = (sector + 0.5) / 16.0 - 2.0
-        if view_right <= middle <= view_left:
-            in_view += 1
-            in_view_seen += seen[sector]
-    sums[3] = in_view_seen / max(in_view, 1)
-    n_far = 0.0
-    n_sectors = 0.0
-    fullest = 0.0
-    for sector in range(64):
+
+@njit(cache=True, nogil=True)
+def measure_sectors(
+    view: tuple[float, float], seen: NDArray[np.float64], far: NDArray[np.float64], sums: NDArray[np.void]
+) -> None:
+    """Write how many sectors have points, the share of the view that has, and how uneven they are."""
+    right, left = view
+    n_seen, n_view, n_view_seen, n_far, n_sectors, fullest = 0.0, 0, 0.0, 0.0, 0.0, 0.0
+    for sector in range(N_SECTORS):
+        n_seen += seen[sector]
+        middle = (sector + 0.5) / (N_SECTORS / 4.0) - 2.0
+        if right <= middle <= left:
+            n_view += 1
+            n_view_seen += seen[sector]
         n_far += far[sector]
         n_sectors += far[sector] > 0.0
         fullest = max(fullest, far[sector])
-    sums[8] = fullest * n_sectors / max(n_far, 1.0)
+    sums[0]["n_sectors"], sums[0]["view_covered"] = n_seen, n_view_seen / max(n_view, 1)
+    sums[0]["unevenness"] = fullest * n_sectors / max(n_far, 1.0)
 
-    # Points above the ground in corridors 4 m wide to the four sides, and how well they align with the axes.
-    # Loops in place of argmax and sum: the compiled form of those imports scipy, which takes 0.2 s a start.
-    highest_bin = 0
-    for k in range(1, heights.shape[1]):
-        highest_bin = k if heights[2, k] > heights[2, highest_bin] else highest_bin
-    ground = highest_bin * 0.2 - 9.9
-    ways = np.empty(4)
-    along_x = np.empty(120)
-    along_y = np.empty(120)
-    ways[:] = 0.0
-    along_x[:] = 0.0
-    along_y[:] = 0.0
-    for i in range(0, n, step):
-        x = np.float64(points[i, 0])
-        y = np.float64(points[i, 1])
-        z = np.float64(points[i, 2])
-        if not ground + 0.5 < z < ground + 6.0 or not abs(x) < 30.0 or not abs(y) < 30.0:
+
+@njit(cache=True, nogil=True)
+def road_ahead(points: NDArray[np.float32], step: int, ground: float, n: float) -> float:
+    """Logarithm of the ratio of obstacles at the sides to those ahead and behind, and how well they align with x.
+
+    ground : its z [m].
+    n : finite points among every ``step``-th.
+    """
+    ahead, behind, left, right = 0.0, 0.0, 0.0, 0.0  # obstacles in corridors 4 m wide
+    along_x, along_y = np.zeros(120), np.zeros(120)
+    low, high = OBSTACLE_M
+    for i in range(0, points.shape[0], step):
+        x, y, z = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
+        if not ground + low < z < ground + high or not abs(x) < ALONG_M or not abs(y) < ALONG_M:
             continue
         if not math.isfinite(points[i, 3]):
             continue
-        along_x[int((x + 30.0) * 2.0)] += 1.0
-        along_y[int((y + 30.0) * 2.0)] += 1.0
-        if abs(y) < 2.0 and abs(x) > 3.0:
-            ways[0 if x > 0.0 else 1] += 1.0
-        if abs(x) < 2.0 and abs(y) > 3.0:
-            ways[2 if y > 0.0 else 3] += 1.0
-    few = 0.002 * max(sums[0], 1.0)
-    sums[4] = math.log((max(ways[2], ways[3]) + few) / (max(ways[0], ways[1]) + few))
+        along_x[int((x + ALONG_M) * 2.0)] += 1.0
+        along_y[int((y + ALONG_M) * 2.0)] += 1.0
+        if abs(y) < HALF_LANE_M and abs(x) > NEAR_M:
+            ahead += x > 0.0
+            behind += x <= 0.0
+        if abs(x) < HALF_LANE_M and abs(y) > NEAR_M:
+            left += y > 0.0
+            right += y <= 0.0
+    few = 0.002 * n
     square_x, square_y = 0.0, 0.0
     for k in range(along_x.shape[0]):
         square_x += along_x[k] * along_x[k]
         square_y += along_y[k] * along_y[k]
-    sums[4] += 0.5 * math.log((square_y + 1.0) / (square_x + 1.0))
+    aligned = 0.5 * math.log((square_y + 1.0) / (square_x + 1.0))
+    return math.log((max(left, right) + few) / (max(ahead, behind) + few)) + aligned
 
-    for i in range(0, n, beam_step):
-        x = np.float64(points[i, 0])
-        y = np.float64(points[i, 1])
-        more = max(abs(x), abs(y))
-        less = min(abs(x), abs(y))
-        # A quarter of a degree to either side of each direction.
-        if less < 0.0044 * more:
+
+@njit(cache=True, nogil=True)
+def fill_rows(points: NDArray[np.float32], step: int, rows: Rows) -> None:
+    """Write the elevations in eight directions; see `Rows`."""
+    elevations, counts = rows
+    counts[:] = 0
+    for i in range(0, points.shape[0], step):
+        x, y = np.float64(points[i, 0]), np.float64(points[i, 1])
+        more, less = max(abs(x), abs(y)), min(abs(x), abs(y))
+        if less < BESIDE_AXIS * more:
             direction = (0 if x > 0.0 else 4) if abs(x) > abs(y) else (2 if y > 0.0 else 6)
-        elif more - less < 0.0087 * more:
+        elif more - less < BESIDE_DIAGONAL * more:
             direction = (1 if y > 0.0 else 7) if x > 0.0 else (3 if y > 0.0 else 5)
         else:
             continue
-        z = np.float64(points[i, 2])
-        if more > 1.0 and n_rows[direction] < rows.shape[1] and math.isfinite(x + y + z + np.float64(points[i, 3])):
-            rows[direction, n_rows[direction]] = math.atan(z / math.sqrt(x * x + y * y)) * (180.0 / math.pi)
-            n_rows[direction] += 1
+        z, n = np.float64(points[i, 2]), counts[direction]
+        if more > 1.0 and n < elevations.shape[1] and math.isfinite(x + y + z + np.float64(points[i, 3])):
+            elevations[direction, n] = math.atan(z / math.sqrt(x * x + y * y)) * (180.0 / math.pi)
+            counts[direction] += 1
 
 
 @dataclass(frozen=True)
@@ -225,33 +293,28 @@ def measure(points: NDArray[np.float32], azimuth_deg: tuple[float, float]) -> Me
     """Statistics of one scan; None if no point is finite."""
     if points.ndim != 2 or points.shape[1] != 4:
         raise PointsError(f"got an array of shape {points.shape}; expected (n, 4): x, y, z, remission")
-    points = read_only(points)
-    remissions, elevations, ranges = (np.empty(size, np.int64) for size in (258, 360, 200))
-    heights = np.empty((3, 100), np.int64)
-    rows, n_rows, sums = np.empty((8, 1024)), np.empty(8, np.int64), np.empty(9)
+    histograms = Histograms(*(np.empty(size, np.int64) for size in (258, 360, 200, (3, 100))))
+    rows, filled = Rows(np.empty((8, 1024)), np.empty(8, np.int64)), np.empty(1, SUMS)
     step = int(_STEPS[np.searchsorted(_STEPS[:-1], len(points) // _SAMPLE)])
     left, right = (_pseudo_azimuth(angle) for angle in azimuth_deg)
-    fill_scan_sums(
-        points, step, len(points) // _BEAM_SAMPLE + 1, right, left,
-        remissions, elevations, ranges, heights, rows, n_rows, sums,
-    )  # fmt: skip
-    n_finite = sums[0]
+    fill_scan_sums(read_only(points), step, len(points) // _BEAM_SAMPLE + 1, (right, left), histograms, rows, filled)
+    remissions, elevations, ranges, heights = histograms
+    sums = {name: float(filled[name][0]) for name in SUMS.names or ()}
+    n_finite = sums["n_finite"]
     if n_finite == 0.0:
         return None
     # In one direction, returns of one beam are less than 0.1 deg apart, returns of two beams more.
     beams = [
-        np.count_nonzero(np.diff(np.sort(row[:count])) > 0.1) + 1
-        for row, count in zip(rows, n_rows, strict=True)
-        if count
+        np.count_nonzero(np.diff(np.sort(row[:count])) > 0.1) + 1 for row, count in zip(*rows, strict=True) if count
     ]
     n_beams = float(np.percentile(beams, 75)) if beams else 0.0
     low, high = (_quantile(elevations, share) / 2.0 - 90.0 if elevations.any() else 0.0 for share in (0.01, 0.99))
-    peaks = heights.max(axis=1) / max(1.0, sums[7])
+    peaks = heights.max(axis=1) / max(1.0, sums["n_near"])
     flattest = int(peaks.argmax())
     has_ground = bool(peaks[2] >= _GROUND_SHARE)
     return Measures(
-        points_in_view=float(sums[1]) * step,
-        view_covered=float(sums[3]),
+        points_in_view=sums["n_in_view"] * step,
+        view_covered=sums["view_covered"],
         remission_median=min(max((_quantile(remissions, 0.5) - 1.0) / 256.0, 0.0), 1.0),
         remission_p99=min(max((_quantile(remissions, 0.99) - 1.0) / 256.0, 0.0), 1.0),
         remission_zeros=float(remissions[0] / n_finite),
@@ -262,16 +325,16 @@ def measure(points: NDArray[np.float32], azimuth_deg: tuple[float, float]) -> Me
         range_median_m=10.0 ** (_quantile(ranges, 0.5) / 20.0 - 3.0),
         ground_m=round(int(heights[2].argmax()) * 0.2 - 9.9, 1) if has_ground else None,
         # 58 of 64 sectors: a full turn, parts of which may be hidden by the vehicle.
-        road_ahead=float(sums[4]) if has_ground and sums[2] >= 58 else None,
-        n_sampled=float(n_finite),
-        remission_low=float(sums[5]),
-        remission_high=float(sums[6]),
+        road_ahead=sums["road_ahead"] if has_ground and sums["n_sectors"] >= 58 else None,
+        n_sampled=n_finite,
+        remission_low=sums["remission_low"],
+        remission_high=sums["remission_high"],
         remission_beyond=float(remissions[257] / n_finite),
         remission_alike=float(remissions.max() / n_finite),
         # Facades are flat along y too, but only ground along a camera's axis gives such a wide range of elevations.
         flat_axis=flattest if peaks[flattest] >= max(_GROUND_SHARE, 1.5 * peaks[2]) and high - low > 60.0 else None,
         flat_m=round(int(heights[flattest].argmax()) * 0.2 - 9.9, 1),
-        unevenness=float(sums[8]),
+        unevenness=sums["unevenness"],
         nearest_m=10.0 ** (_quantile(ranges, 0.01) / 20.0 - 3.0),
     )
 

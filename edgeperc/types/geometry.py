@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -18,6 +18,38 @@ from ..system.kernel_cache import njit
 from .perception import Box
 from .points import read_only
 from .views import TopViewGeometry
+
+# A box as kernels take it.
+BOX = np.dtype(
+    [
+        ("x", np.float64),  # of the middle [m]
+        ("y", np.float64),
+        ("half_length", np.float64),  # [m]
+        ("half_width", np.float64),
+        ("cos", np.float64),  # of the yaw
+        ("sin", np.float64),
+        ("top", np.float64),  # greatest height of its points above the ground [m]
+        ("score", np.float64),
+        ("label", np.int64),  # of its cells or points
+    ]
+)
+
+
+class Grid(NamedTuple):
+    """The cells of a top view as kernels take them.
+
+    Attributes
+    ----------
+    far, left : float
+        x of the far edge and y of the left edge [m].
+    cell : float
+        Edge of a cell [m].
+    """
+
+    far: float
+    left: float
+    cell: float
+
 
 Angle = TypeVar("Angle", float, NDArray[np.float64])
 
@@ -41,18 +73,34 @@ def draw_footprints(
     number = {name: k for k, name in enumerate(classes)}
     known = [box for box in boxes if box.label in number]
     known.sort(key=lambda box: -math.hypot(box.center[0], box.center[1]))
-    rows = [
-        (*box.center[:2], box.size[0] / 2.0, box.size[1] / 2.0, math.cos(box.yaw), math.sin(box.yaw)) for box in known
-    ]
     drawn = np.require(labels, np.uint8, ["C", "W"])
-    fill_footprints(
-        np.array(rows, np.float64).reshape(-1, 6),
-        np.array([number[box.label] for box in known], np.uint8),
-        np.array([view.x_range_m[1], view.y_range_m[1], view.cell_m], np.float64),
-        drawn,
-    )
+    grid = Grid(float(view.x_range_m[1]), float(view.y_range_m[1]), float(view.cell_m))
+    fill_footprints(box_records(known, [number[box.label] for box in known]), grid, drawn)
     if drawn is not labels:
         labels[:] = drawn
+
+
+def box_records(
+    boxes: Sequence[Box], labels: Sequence[int], margin_m: float = 0.0, above_m: float = 0.0
+) -> NDArray[np.void]:
+    """Boxes as kernels take them, (m,) `BOX`.
+
+    margin_m, above_m : by which footprints grow on every side, and tops upwards [m].
+    """
+    rows = [
+        (
+            *box.center[:2],
+            0.5 * box.size[0] + margin_m,
+            0.5 * box.size[1] + margin_m,
+            math.cos(box.yaw),
+            math.sin(box.yaw),
+            box.size[2] + above_m,
+            box.score,
+            label,
+        )
+        for box, label in zip(boxes, labels, strict=True)
+    ]
+    return np.array(rows, BOX)
 
 
 def rectangles(boxes: Iterable[Box]) -> NDArray[np.float64]:
@@ -142,34 +190,44 @@ def _as_rectangles(given: ArrayLike) -> NDArray[np.float64]:
 
 
 @njit(cache=True, nogil=True)
-def fill_footprints(
-    boxes: NDArray[np.float64], of_box: NDArray[np.uint8], grid: NDArray[np.float64], labels: NDArray[np.uint8]
-) -> None:
-    """Write the class of each box into the cells whose centers lie in its footprint, one box after the other.
+def fill_footprints(boxes: NDArray[np.void], grid: Grid, labels: NDArray[np.uint8]) -> None:
+    """Write the label of each `BOX`, (m,), into the cells whose centers lie in its footprint, one after the other.
 
-    boxes : (m, 6) float64; x, y, half length, half width [m], cosine and sine of the yaw.
-    of_box : (m,) uint8
-    grid : (3,) float64; x of the far edge, y of the left edge, edge of a cell [m].
     labels : (rows, columns) uint8, modified
     """
-    x_far, y_left, cell_m = grid[0], grid[1], grid[2]
+    x_far, y_left, cell_m = grid
     n_rows, n_cols = labels.shape
     for k in range(boxes.shape[0]):
-        x, y, half_length, half_width = boxes[k, 0], boxes[k, 1], boxes[k, 2], boxes[k, 3]
-        cos, sin = boxes[k, 4], boxes[k, 5]
-        reach_x = abs(cos) * half_length + abs(sin) * half_width
-        reach_y = abs(sin) * half_length + abs(cos) * half_width
+        box = boxes[k]
+        x, y, cos, sin = box["x"], box["y"], abs(box["cos"]), abs(box["sin"])
+        reach_x = cos * box["half_length"] + sin * box["half_width"]
+        reach_y = sin * box["half_length"] + cos * box["half_width"]
         # A cell more on each side; the view's size bounds them before they become whole numbers.
         first_row = int(min(max((x_far - x - reach_x) / cell_m - 1.0, 0.0), n_rows))
         last_row = int(min(max((x_far - x + reach_x) / cell_m + 1.0, -1.0), n_rows - 1.0))
         first_col = int(min(max((y_left - y - reach_y) / cell_m - 1.0, 0.0), n_cols))
         last_col = int(min(max((y_left - y + reach_y) / cell_m + 1.0, -1.0), n_cols - 1.0))
         for row in range(first_row, last_row + 1):
-            dx = x_far - (row + 0.5) * cell_m - x
             for col in range(first_col, last_col + 1):
-                dy = y_left - (col + 0.5) * cell_m - y
-                if abs(cos * dx + sin * dy) <= half_length and abs(cos * dy - sin * dx) <= half_width:
-                    labels[row, col] = of_box[k]
+                if is_inside(box, x_far - (row + 0.5) * cell_m, y_left - (col + 0.5) * cell_m):
+                    labels[row, col] = box["label"]
+
+
+@njit(cache=True, nogil=True)
+def is_inside(box: np.void, x: float, y: float) -> bool:
+    """Whether a place [m] lies in the footprint of a `BOX`."""
+    dx, dy = x - box["x"], y - box["y"]
+    along, across = box["cos"] * dx + box["sin"] * dy, box["cos"] * dy - box["sin"] * dx
+    return bool((abs(along) <= box["half_length"]) & (abs(across) <= box["half_width"]))
+
+
+@njit(cache=True, nogil=True)
+def cell_at(grid: Grid, shape: tuple[int, int], x: float, y: float) -> tuple[int, int]:
+    """Row and column of the cell that holds a place [m]; -1, -1 out of view."""
+    row, col = (grid.far - x) / grid.cell, (grid.left - y) / grid.cell
+    if not ((row >= 0.0) & (row < shape[0]) & (col >= 0.0) & (col < shape[1])):
+        return -1, -1
+    return int(row), int(col)
 
 
 @njit(cache=True, nogil=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
@@ -12,6 +12,35 @@ from ..errors import PointsError
 
 # Best first; of an Ouster's fields, "intensity" is the raw signal and "reflectivity" the calibrated byte.
 _REMISSION_NAMES = ("remission", "intensity", "i", "reflectivity", "reflectance")
+
+
+class Cloud(NamedTuple):
+    """Points as kernels take them.
+
+    Attributes
+    ----------
+    points : (n, 3 or more) float32, C-contiguous, read-only
+        x, y, z [m].
+    height : (n,) float32, read-only
+        Above the ground [m].
+    """
+
+    points: NDArray[np.float32]
+    height: NDArray[np.float32]
+
+
+class Labeled(NamedTuple):
+    """Labels of points as kernels take them.
+
+    Attributes
+    ----------
+    labels : (n,) uint8
+    roles : (classes,) uint8
+        What each label is for the kernel; 0 for what it does not treat.
+    """
+
+    labels: NDArray[np.uint8]
+    roles: NDArray[np.uint8]
 
 
 def as_points(array: ArrayLike, *, remission_field: str | None = None) -> NDArray[np.float32]:

@@ -10,6 +10,7 @@ import pytest
 from agreeing import agreed_cells, agreed_points, voters_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.lib.recfunctions import structured_to_unstructured
 from numpy.typing import NDArray
 
 import twins.rules
@@ -17,8 +18,9 @@ from edgeperc import Box, Perceiver, PointLabels, PointsError, TopView
 from edgeperc.agreement.cells import clear_cells, fill_marks
 from edgeperc.agreement.rules import (
     RULES,
-    _as_rows,
+    Support,
     agree_on_boxes,
+    as_rows,
     clear_columns,
     clear_ground,
     count_inside,
@@ -29,10 +31,14 @@ from edgeperc.agreement.rules import (
     sum_inside,
 )
 from edgeperc.agreement.votes import (
+    CLUSTER,
     MAX_LENGTH_M,
     MAX_TOP_M,
     MIN_LARGE_SHARE,
     MIN_VEHICLE_SHARE,
+    Applied,
+    Cells,
+    Tallies,
     apply_verdicts,
     fill_tallies,
     fill_verdicts,
@@ -46,14 +52,15 @@ from edgeperc.objects.boxes import objects_from_points
 from edgeperc.objects.cluster import find_clusters, sort_points
 from edgeperc.simulation.drawn import random_scene
 from edgeperc.simulation.scene import simulate
-from edgeperc.types.geometry import inside
-from edgeperc.types.points import read_only
+from edgeperc.types.geometry import Grid, inside
+from edgeperc.types.points import Cloud, Labeled, read_only
 from edgeperc.types.views import TopViewGeometry
 
 CLASSES = ("background", "car", "pedestrian", "cyclist")
 ROLES = np.array([0, 1, 2, 2], np.uint8)
 VIEW = TopViewGeometry((0.0, 20.0), (-8.0, 8.0), cell_m=0.5)
 GROUND_Z = -1.73
+BOUNDS = ["low_x", "low_y", "high_x", "high_y", "top"]  # of clusters
 patient = settings(deadline=None, max_examples=60)  # the first example compiles a kernel
 
 coordinates = st.floats(-9.0, 19.0, width=32) | st.sampled_from([0.0, -0.0, 60.0, 3e38, math.nan, math.inf, -math.inf])
@@ -88,6 +95,10 @@ class Scene:
             np.int32
         )
         self.points.flags.writeable = False
+
+    @property
+    def cloud(self) -> Cloud:
+        return Cloud(self.points, read_only(self.height))
 
     @property
     def ground(self) -> Ground:
@@ -138,13 +149,16 @@ def test_dense_columns_match_the_twin(seed: int) -> None:
 @given(scenes, st.sampled_from([(0, 0), (40, 40)]))
 def test_tallies_match_the_twin(given: list, shape: tuple[int, int]) -> None:
     scene = Scene(given)
-    found = np.empty((6, 5), np.int32), np.empty((6, 5), np.float32), np.empty((6, 3), np.int32)
+    found = Tallies(np.empty(6, CLUSTER), np.empty((6, 5), np.int32))
     cells = np.random.default_rng(len(given)).integers(0, 5, shape).astype(np.uint8)
     args = scene.points, scene.height, scene.in_view, scene.labels, scene.clusters, cells, np.arange(256) % 5 > 1
-    grid = np.array([16.0, 8.0, 0.4])
-    fill_tallies(*map_read_only(args), grid, *found)
-    for own, right in zip(found, twins.rules.tallies(*args, grid, 6, 4), strict=True):
-        np.testing.assert_array_equal(own, right)
+    grid = Grid(16.0, 8.0, 0.4)
+    fill_tallies(scene.cloud, *args[2:5], Cells(*args[5:], grid), found)
+    counts, bounds, above = twins.rules.tallies(*args, grid, 6, 4)
+    np.testing.assert_array_equal(found.counts, counts)
+    np.testing.assert_array_equal(structured_to_unstructured(found.clusters[BOUNDS]), bounds)
+    held = found.clusters[["n_in_both", "n_in_vehicles", "n_points"]]
+    np.testing.assert_array_equal(structured_to_unstructured(held), above)
 
 
 def map_read_only(arrays: tuple[NDArray, ...]) -> list[NDArray]:
@@ -154,23 +168,18 @@ def map_read_only(arrays: tuple[NDArray, ...]) -> list[NDArray]:
 @patient
 @given(scenes, boxes_of)
 def test_boxes_around_points_match_the_twin(given: list, boxes: list[Box]) -> None:
-    scene, as_rows = Scene(given), _as_rows(boxes)
-    of_box = (np.arange(len(boxes)) % 3 + 1).astype(np.uint8)
-    scores, names = np.empty(len(scene.points), np.float32), np.empty(len(scene.points), np.uint8)
-    arrays = map_read_only((scene.points, scene.height, scene.on_ground))
-    among = read_only(scene.in_view & ~scene.on_ground, np.bool_)
-    labels = read_only(scene.labels, np.uint8)
-    fill_support(*arrays[:2], among, labels, ROLES, as_rows, of_box, scores, names)
-    right_scores, right_names = twins.rules.support(*arrays[:2], ~among, labels, ROLES, as_rows, of_box)
-    np.testing.assert_array_equal(scores, right_scores)
-    np.testing.assert_array_equal(names, right_names)
-    counts = np.empty((len(boxes), 3), np.int64)
-    more = *arrays, *map_read_only((scene.in_view, scene.labels))
-    count_inside(*more, ROLES, as_rows, counts)
-    np.testing.assert_array_equal(counts, twins.rules.inside_counts(*more, ROLES, as_rows))
-    sums = np.empty((len(boxes), 3))
-    sum_inside(*more, ROLES, as_rows, sums)
-    np.testing.assert_array_equal(sums, twins.rules.inside_sums(*more, ROLES, as_rows))
+    scene, records = Scene(given), as_rows(boxes, [k % 3 + 1 for k in range(len(boxes))])
+    support = Support(np.empty(len(scene.points), np.float32), np.empty(len(scene.points), np.uint8))
+    among, labeled = scene.in_view & ~scene.on_ground, Labeled(scene.labels, ROLES)
+    fill_support(scene.cloud, among, labeled, records, support)
+    for own, right in zip(support, twins.rules.support(*scene.cloud, ~among, *labeled, records), strict=True):
+        np.testing.assert_array_equal(own, right)
+    counts, sums = np.empty((len(boxes), 3), np.int64), np.empty((len(boxes), 3))
+    masks = scene.on_ground, scene.in_view
+    count_inside(scene.cloud, *masks, labeled, records, counts)
+    np.testing.assert_array_equal(counts, twins.rules.inside_counts(*scene.cloud, *masks, *labeled, records))
+    sum_inside(scene.cloud, *masks, labeled, records, sums)
+    np.testing.assert_array_equal(sums, twins.rules.inside_sums(*scene.cloud, *masks, *labeled, records))
 
 
 @patient
@@ -180,13 +189,13 @@ def test_verdicts_match_the_twin(given: list, seed: int) -> None:
     n = len(scene.points)
     table = rng.integers(0, 4, (6, 4)).astype(np.uint8)
     scores, names = rng.random(n).astype(np.float32), rng.integers(0, 4, n).astype(np.uint8)
-    in_view, clusters = map_read_only((scene.in_view, scene.clusters))
+    in_view, clusters = scene.in_view, scene.clusters
     found = scene.labels.copy()
     apply_verdicts(in_view, clusters, table, ROLES, scores, names, found)
     right = twins.rules.verdicts(in_view, clusters, table, ROLES, scores, names, scene.labels)
     np.testing.assert_array_equal(found, right)
     votes = np.empty(n, np.uint8)
-    fill_votes(in_view, read_only(scene.labels, np.uint8), ROLES, scores, votes)
+    fill_votes(scene.in_view, Labeled(scene.labels, ROLES), scores, votes)
     np.testing.assert_array_equal(votes, twins.rules.votes(scene.in_view, scene.labels, ROLES, scores))
 
 
@@ -203,7 +212,10 @@ def test_what_becomes_of_clusters_matches_the_twin(
     bounds = np.column_stack([-sides / 2, sides / 2, rng.choice([-np.inf, 0.4, 0.9, 1.5, 2.2, 4.5], n)])
     bounds = bounds.astype(np.float32)
     parts, refused, found = np.array([[2, 3]]), rng.random(n) < 0.2, np.empty((n, 4), np.uint8)
-    fill_verdicts(counts, bounds, refused, ROLES, parts, *rules, found)
+    clusters = np.zeros(n, CLUSTER)
+    for name, column in zip(BOUNDS, bounds.T, strict=True):
+        clusters[name] = column
+    fill_verdicts(Tallies(clusters, counts), refused, ROLES, parts, Applied(*rules), found)
     np.testing.assert_array_equal(found, twins.rules.verdict_table(counts, bounds, refused, ROLES, parts, *rules))
 
 
@@ -279,14 +291,14 @@ def test_cleared_ground_matches_the_twin(given: list) -> None:
 @given(scenes, st.booleans(), st.booleans(), st.booleans())
 def test_cleared_cells_match_the_twin(given: list, by_height: bool, of_road: bool, of_vehicles: bool) -> None:
     scene, cells = Scene(given), top_view().labels
-    found, grid = cells.copy(), np.array([VIEW.x_range_m[1], VIEW.y_range_m[1], VIEW.cell_m])
+    found, grid = cells.copy(), Grid(VIEW.x_range_m[1], VIEW.y_range_m[1], VIEW.cell_m)
     is_vehicle = (np.arange(256) > 1) & of_vehicles
     in_box = np.random.default_rng(len(given)).random(cells.shape) < 0.3
-    arrays = map_read_only((scene.points, scene.height, scene.in_view, scene.labels))
     drivable, marks = 1 if of_road else 255, np.zeros(cells.shape, np.uint8)
-    fill_marks(*arrays, ROLES, by_height, grid, is_vehicle, read_only(cells, np.uint8), marks)
+    labeled = Labeled(scene.labels, ROLES)
+    fill_marks(scene.cloud, scene.in_view, labeled, by_height, Cells(cells, is_vehicle, grid), marks)
     clear_cells(marks, np.flatnonzero(marks), drivable, is_vehicle, in_box, found)
-    args = *arrays, ROLES, by_height, grid, drivable, is_vehicle, in_box, cells
+    args = *scene.cloud, scene.in_view, *labeled, by_height, grid, drivable, is_vehicle, in_box, cells
     np.testing.assert_array_equal(found, twins.rules.cells(*args))
 
 
@@ -305,7 +317,7 @@ def test_points_keep_their_view_and_meet_the_rules(given: list, boxes: list[Box]
     assert not agreed.labels[~scene.in_view].any()
     boxed = np.zeros(len(scene.points), np.bool_)
     for box in boxes:
-        own = twins.rules.inside(scene.points, scene.height, scene.on_ground, _as_rows([box])[0])
+        own = twins.rules.inside(scene.points, scene.height, scene.on_ground, as_rows([box])[0])
         boxed |= own & (box.score >= 0.3)
     for k in range(6):
         own = scene.clusters == k
@@ -350,7 +362,7 @@ def test_only_uncertain_boxes_without_labels_are_dropped(given: list, boxes: lis
     kept = agree_on_boxes(boxes, Scan.of(scene.points, scene.ground), scene.found)
     assert [box for box in boxes if box in kept] == [*kept]
     for box in boxes:
-        own = twins.rules.inside(scene.points, scene.height, scene.on_ground, _as_rows([box])[0])
+        own = twins.rules.inside(scene.points, scene.height, scene.on_ground, as_rows([box])[0])
         is_right = np.count_nonzero(own & (scene.labels == 1)) >= 0.1 * np.count_nonzero(own & scene.in_view)
         assert (box in kept) == (box.score >= 0.5 or (own.any() and (is_right or not (own & scene.in_view).any())))
 
@@ -514,10 +526,11 @@ def test_points_far_out_do_not_matter_to_a_person_at_a_hedge() -> None:
     for yaw in (0.0, 0.7, 2.4):
         points[: len(person), :2] = person[:, :2] @ [[math.cos(yaw), math.sin(yaw)], [-math.sin(yaw), math.cos(yaw)]]
         before, after = rows[:, 3].astype(np.uint8), np.zeros(len(rows), np.uint8)
-        (own,) = find_persons_alone(points, height, ROLES, before, after)
+        (own,) = find_persons_alone(Cloud(points, height), ROLES, before, after)
         np.testing.assert_array_equal(own, np.arange(len(person)))
         for n in (0, 1, 29):
-            assert find_persons_alone(points[:n], height[:n], ROLES, before[:n], after[:n]) == []
+            few = Cloud(points[:n], height[:n])
+            assert find_persons_alone(few, ROLES, before[:n], after[:n]) == []
 
 
 def test_parts_of_a_hedge_are_no_persons() -> None:

@@ -168,7 +168,7 @@ def test_channels_are_normalized_in_the_order_asked_for(channels):
 @pytest.mark.parametrize("name", [name for name, view in VIEWS.items() if view.kind == "range_image"])
 def test_tables_find_the_interval_of_every_value(name):
     for edges in (row_edges(VIEWS[name]), column_edges(VIEWS[name])):
-        (first, last, cells_per_unit), base, split = tabulate(edges, "edges")
+        first, last, cells_per_unit, base, split = tabulate(edges, "edges")
         rng = np.random.default_rng(2)
         values = np.concatenate(
             [edges, np.nextafter(edges, np.float32(9)), np.nextafter(edges, np.float32(-9)),

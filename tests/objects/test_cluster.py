@@ -15,7 +15,7 @@ from edgeperc.objects import linkage
 from edgeperc.objects.boxes import OBJECT_SIZE_M, classes_of_boxes, join_boxes, objects_from_points
 from edgeperc.objects.cluster import cluster_labels, find_clusters, sort_points
 from edgeperc.types.geometry import oriented_iou, rectangles
-from edgeperc.types.points import read_only
+from edgeperc.types.points import Cloud, read_only
 
 CLASSES = ("background", "car", "pedestrian", "cyclist")
 
@@ -139,13 +139,13 @@ def test_hostile_scans_match_the_twin(kind, seed, per_m):
 def test_the_work_on_hostile_scans_is_bounded(kind, seed, per_m):
     points = read_only(as_points(hostile(kind, np.random.default_rng(seed), 20_000)))
     every = read_only(np.ones(len(points)), np.bool_)
-    clusters, work = np.empty(len(points), np.int32), np.empty(3, np.int64)
-    options = every, read_only(np.full(len(points), 3), np.uint8), np.zeros(1), per_m, 100.0, 1
-    linkage.fill_clusters(points, *sort_points(points, distance_per_m=per_m), *options, clusters, work)
-    assert work[0] <= 100 * len(points)
-    assert work[1] <= 2 * linkage.TESTS_PER_POINT * len(points)
+    clusters, work = np.empty(len(points), np.int32), np.empty(1, linkage.WORK)
+    options = every, read_only(np.full(len(points), 3), np.uint8), np.zeros(1), 1
+    linkage.fill_clusters(sort_points(points, distance_per_m=per_m), *options, clusters, work)
+    assert work["n_compared"] <= 100 * len(points)
+    assert work["n_tests"] <= 2 * linkage.TESTS_PER_POINT * len(points)
     again = np.empty_like(clusters)
-    linkage.fill_clusters(points, *sort_points(points, distance_per_m=per_m), *options, again, work)
+    linkage.fill_clusters(sort_points(points, distance_per_m=per_m), *options, again, work)
     np.testing.assert_array_equal(again, clusters)
 
 
@@ -335,7 +335,7 @@ def test_rectangles_agree_with_the_twin(n, seed, l_shaped):
     points = np.c_[members + rng.uniform(-30, 30, 2), rng.uniform(-2, 1, n)].astype(np.float32)
     height, rows = rng.uniform(-1, 2, n).astype(np.float32), rng.permutation(n)[: rng.integers(1, n + 1)]
     rectangle, levels = np.empty(5), np.empty(len(rows))
-    args = read_only(points), read_only(height), rows.astype(np.int32), l_shaped
+    args = Cloud(read_only(points), read_only(height)), rows.astype(np.int32), l_shaped
     assert object_boxes.fill_rectangle(*args, rectangle, levels) == points[rows, 2].max()
     expected = twins.cluster.rectangle(points[rows, :2].astype(np.float64), l_shaped)
     np.testing.assert_allclose(rectangle, expected, atol=1e-8)

@@ -9,22 +9,24 @@ import pytest
 from agreeing import agreed_points, voters_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.lib.recfunctions import structured_to_unstructured
 
 import twins.persons
-from edgeperc.agreement.rules import RULES
-from edgeperc.agreement.votes import fill_tallies
+from edgeperc.agreement.rules import RULES, cells_of
+from edgeperc.agreement.votes import CLUSTER, Tallies, fill_tallies, may_be_persons
 from edgeperc.ground.planes import Ground
 from edgeperc.objects import persons
 from edgeperc.objects.boxes import OBJECT_SIZE_M, join_boxes, objects_from_points
-from edgeperc.objects.cluster import fill_groups, find_clusters
+from edgeperc.objects.cluster import RIDES, WALKS, Groups, fill_groups, find_clusters
 from edgeperc.types.geometry import oriented_iou
 from edgeperc.types.perception import Box, PointLabels
+from edgeperc.types.points import Cloud, Labeled
 
 CLASSES = ("background", "car", "pedestrian", "cyclist")
 GROUND_Z = -1.73
 BY_ANGLE = 0.014  # of an HDL-64E
 ROLES = np.zeros(256, np.uint8)
-ROLES[[2, 3, 4]] = persons.WALKS, persons.RIDES, persons.UNSEEN
+ROLES[[2, 3, 4]] = WALKS, RIDES, persons.UNSEEN
 
 
 def person(x, y, height=1.75):
@@ -233,9 +235,9 @@ def crowd(seed, n_people, per_cluster=3, depth=0.15):
 
 
 def grouped(clusters):
-    starts, order = np.empty(clusters.max(initial=-1) + 2, np.int64), np.empty(len(clusters), np.int32)
-    fill_groups(clusters, starts, order)
-    return order[: starts[-1]], starts
+    groups = Groups(np.empty(len(clusters), np.int32), np.empty(clusters.max(initial=-1) + 2, np.int64))
+    fill_groups(clusters, groups)
+    return Groups(groups.order[: groups.starts[-1]], groups.starts)
 
 
 @settings(max_examples=60, deadline=None)
@@ -244,10 +246,12 @@ def test_groups_agree_with_the_twin(seed, n_people):
     points, height, labels, clusters = crowd(seed, n_people)
     labels[np.random.default_rng(seed).random(len(labels)) < 0.05] = 4  # out of view
     order, starts = grouped(clusters)
-    groups, group_starts, loose = np.empty_like(order), np.empty_like(starts), np.empty_like(order)
-    n, n_loose = persons.fill_person_groups(points, height, labels, ROLES, order, starts, groups, group_starts, loose)
+    groups, loose = Groups(np.empty_like(order), np.empty_like(starts)), np.empty_like(order)
+    labeled = Labeled(labels, ROLES)
+    n, n_loose = persons.fill_person_groups(Cloud(points, height), labeled, Groups(order, starts), groups, loose)
     whole, others = twins.persons.groups(points, height, labels, ROLES, clusters)
-    assert [groups[group_starts[k] : group_starts[k + 1]].tolist() for k in range(n)] == [g.tolist() for g in whole]
+    found = [groups.order[groups.starts[k] : groups.starts[k + 1]].tolist() for k in range(n)]
+    assert found == [members.tolist() for members in whole]
     assert loose[:n_loose].tolist() == others
 
 
@@ -260,11 +264,10 @@ def test_persons_agree_with_the_twin(seed, n_people, min_points):
     groups = [order[starts[k] : starts[k + 1]].copy() for k in range(len(starts) - 1) if starts[k] < starts[k + 1]]
     n_whole = len(groups) // 2
     given_order = np.concatenate([np.zeros(0, np.int32), *groups]).astype(np.int32)
-    given_starts = np.cumsum([0, *map(len, groups)])
-    found = np.empty((len(points), 11))
-    n = persons.fill_persons(
-        points, height, labels, ROLES, given_order, given_starts, n_whole, clusters, order, starts, min_points, found
-    )
+    whole = Groups(given_order, np.cumsum([0, *map(len, groups)]))
+    records, scan = np.empty(len(points), persons.PERSON), (Cloud(points, height), Labeled(labels, ROLES))
+    n = persons.fill_persons(*scan, whole, n_whole, clusters, Groups(order, starts), min_points, records)
+    found = structured_to_unstructured(records)
     expected = twins.persons.rows(points, height, labels, ROLES, groups, n_whole, clusters, min_points)
     assert n == len(expected)
     assert sorted(given_order.tolist()) == sorted(order.tolist())
@@ -280,11 +283,10 @@ def test_completed_persons_agree_with_the_twin(seed, n_people):
     points, height, labels, clusters = crowd(seed, n_people, per_cluster=1, depth=0.4)
     in_view = np.random.default_rng(seed).random(len(points)) < 0.9
     n = clusters.max(initial=-1) + 1
-    counts, bounds = np.empty((n, 5), np.int32), np.empty((n, 5), np.float32)
-    no_view = np.empty((0, 0), np.uint8), np.zeros(256, np.bool_), np.ones(3)
-    fill_tallies(points, height, in_view, labels, clusters, *no_view, counts, bounds, np.empty((n, 3), np.int32))
+    tallies, cloud = Tallies(np.empty(n, CLUSTER), np.empty((n, 5), np.int32)), Cloud(points, height)
+    fill_tallies(cloud, in_view, labels, clusters, cells_of(None), tallies)
     expected = twins.persons.completed(points, height, in_view, clusters, 2, 3, labels)
-    persons.complete_persons(points, height, in_view, clusters, counts, bounds, 2, 3, labels)
+    persons.complete_persons(cloud, in_view, clusters, may_be_persons(tallies, 2, 3), 2, 3, labels)
     np.testing.assert_array_equal(labels, expected)
 
 
@@ -295,13 +297,13 @@ def test_the_parts_of_the_kernel_agree_with_their_twins(n):
     height = points[:, 2].copy()
     members = rng.permutation(n).astype(np.int32)
     for above in (-math.inf, 1.0, 99.0):
-        found = np.empty(7)
-        persons.measure(points, height, members, above, found)
+        cloud = Cloud(points, height)
+        found = persons.measure(cloud, members, above)
         np.testing.assert_allclose(found, twins.persons.measured(points, height, members, above), atol=1e-6)
         if n:
-            own = persons.border_of(points, height, members, above, found)
+            own = persons.border_of(cloud, members, above, found)
             assert own == pytest.approx(twins.persons.border(points, height, members, above, found))
-            own = persons.head_width(points, height, members, found)
+            own = persons.head_width(cloud, members, found)
             assert own == pytest.approx(twins.persons.heads(points, height, members, found))
 
 
@@ -310,15 +312,14 @@ def test_hostile_groups_are_bounded():
     points = (rng.uniform(-1, 1, (3000, 4)) * 1e30).astype(np.float32)
     height = np.ones(3000, np.float32)
     members = np.arange(3000, dtype=np.int32)
-    found = np.empty((100, 11))
-    groups = np.array([0, 3000])
-    n = persons.fill_persons(
-        points, height, np.full(3000, 2, np.uint8), ROLES, members.copy(), groups, 1,
-        np.zeros(3000, np.int32), members, groups, 1, found,
-    )  # fmt: skip
-    assert 0 < n <= 100
+    found, of = np.empty(100, persons.PERSON), np.zeros(3000, np.int32)
+    labeled = Labeled(np.full(3000, 2, np.uint8), ROLES)
+    clusters = Groups(members, np.array([0, 3000]))
+
+    def n_found():
+        groups = Groups(members.copy(), clusters.starts)
+        return persons.fill_persons(Cloud(points, height), labeled, groups, 1, of, clusters, 1, found)
+
+    assert 0 < n_found() <= 100
     points[7, 0] = np.nan
-    assert persons.fill_persons(
-        points, height, np.full(3000, 2, np.uint8), ROLES, members.copy(), groups, 1,
-        np.zeros(3000, np.int32), members, groups, 1, found,
-    ) == 0  # fmt: skip
+    assert n_found() == 0

@@ -55,7 +55,7 @@ def tallies(points, height, in_view, labels, clusters, cells, is_vehicle, grid, 
 
 def inside(points, height, on_ground, box):
     """Points above the ground in a box of `edgeperc.agreement.rules.fill_support`, (n,) bool."""
-    x, y, half_l, half_w, cos, sin, highest, _ = box
+    x, y, half_l, half_w, cos, sin, highest, *_ = box.tolist()
     dx, dy = points[:, 0].astype(np.float64) - x, points[:, 1].astype(np.float64) - y
     with np.errstate(invalid="ignore"):
         return (
@@ -66,15 +66,15 @@ def inside(points, height, on_ground, box):
         )
 
 
-def support(points, height, on_ground, labels, roles, boxes, of_box):
+def support(points, height, on_ground, labels, roles, boxes):
     """Twin of `edgeperc.agreement.rules.fill_support`."""
     scores, names = np.zeros(len(points), np.float32), np.zeros(len(points), np.uint8)
-    for box, name in zip(boxes, of_box, strict=True):
+    for box in boxes:
         own = inside(points, height, on_ground, box)
         if np.count_nonzero(roles[labels[own]] == 1) < 0.1 * np.count_nonzero(own):
             continue
-        better = own & (box[7] > scores)
-        scores[better], names[better] = box[7], name
+        better = own & (box["score"] > scores)
+        scores[better], names[better] = box["score"], box["label"]
     return scores, names
 
 

@@ -16,7 +16,7 @@ from hypothesis.extra import numpy as hnp
 import twins.fitness
 from edgeperc.errors import CardError, PointsError, SensorError
 from edgeperc.preprocess.findings import check_fitness
-from edgeperc.preprocess.fitness import FitnessProfile, fill_scan_sums
+from edgeperc.preprocess.fitness import SUMS, FitnessProfile, Histograms, Rows, fill_scan_sums
 from edgeperc.readers.files import read_points
 from edgeperc.types.sensor import SENSORS, SensorProfile, get_sensor
 
@@ -263,15 +263,15 @@ def test_the_view_holds_its_share_of_the_points(azimuth_deg):
 
 
 def check_against_twin(points, step, beam_step, view):
-    out = [np.full(size, 99, np.int64) for size in (258, 360, 200, (3, 100))]
-    rows, n_rows, sums = np.full((8, 1024), 99.0), np.full(8, 99, np.int64), np.full(9, 99.0)
-    fill_scan_sums(points, step, beam_step, *view, *out, rows, n_rows, sums)
+    histograms = Histograms(*(np.full(size, 99, np.int64) for size in (258, 360, 200, (3, 100))))
+    rows, sums = Rows(np.full((8, 1024), 99.0), np.full(8, 99, np.int64)), np.empty(1, SUMS)
+    fill_scan_sums(points, step, beam_step, view, histograms, rows, sums)
     *expected, expected_rows, expected_sums = twins.fitness.scan_sums(points, step, beam_step, *view)
-    for got, wanted in zip(out, expected, strict=True):
+    for got, wanted in zip(histograms, expected, strict=True):
         np.testing.assert_array_equal(got, wanted)
-    for row, count, wanted in zip(rows, n_rows, expected_rows, strict=True):
+    for row, count, wanted in zip(*rows, expected_rows, strict=True):
         np.testing.assert_allclose(row[:count], wanted, atol=1e-9)
-    np.testing.assert_allclose(sums, expected_sums, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(sums[0].tolist(), expected_sums, rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.parametrize(("step", "beam_step"), [(1, 1), (7, 2)])
