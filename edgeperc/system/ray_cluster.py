@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import os
 import pickle
+import signal
+import threading
 import traceback
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
@@ -67,7 +70,8 @@ def map_on_ray(
         local: dict[str, Any] = {}
         if "RAY_ADDRESS" not in os.environ:
             local = {"num_cpus": (workers or os.cpu_count() or 1) * n_threads, "object_store_memory": STORE_BYTES}
-        ray.init(**local, include_dashboard=False, log_to_driver=False, configure_logging=False)
+        with signals_kept():
+            ray.init(**local, include_dashboard=False, log_to_driver=False, configure_logging=False)
     try:
         context = data.DataContext.get_current()
         context.enable_progress_bars = False
@@ -87,6 +91,16 @@ def map_on_ray(
     finally:
         if started:
             ray.shutdown()
+
+
+@contextlib.contextmanager
+def signals_kept() -> Iterator[None]:
+    """SIGTERM has its handler again at the end: `ray.init` replaces it for the rest of the process."""
+    handler = signal.getsignal(signal.SIGTERM)
+    yield
+    # Python sets handlers in its main thread alone, and has no name for one of native code.
+    if handler is not None and threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, handler)
 
 
 class _Deaths:

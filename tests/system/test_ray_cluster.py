@@ -22,7 +22,7 @@ from edgeperc.errors import MissingExtraError, OptionError, PointsError
 from edgeperc.perceiver import Perceiver
 from edgeperc.simulation.drawn import random_scene
 from edgeperc.simulation.scene import simulate
-from edgeperc.system.ray_cluster import Lost, map_on_ray
+from edgeperc.system.ray_cluster import Lost, map_on_ray, signals_kept
 from edgeperc.system.remote import Remote, location
 
 pytestmark = pytest.mark.filterwarnings("ignore")  # of Ray, boto and aiohttp
@@ -49,7 +49,8 @@ def cluster() -> Iterator[None]:
     ray = pytest.importorskip("ray")
     pytest.importorskip("pyarrow")
     os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
-    ray.init(num_cpus=2, include_dashboard=False, log_to_driver=False, object_store_memory=2**28)
+    with signals_kept():
+        ray.init(num_cpus=2, include_dashboard=False, log_to_driver=False, object_store_memory=2**28)
     yield
     ray.shutdown()
 
