@@ -413,10 +413,7 @@ def block(
 
 
 def agreed_scene(
-    *parts: NDArray[np.float64],
-    boxes: tuple[Box, ...] = (),
-    view: TopView | None = None,
-    rules: frozenset[str] = RULES,
+    *parts: NDArray[np.float64], boxes: tuple[Box, ...] = (), view: TopView | None = None, rules: frozenset[str] = RULES
 ) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
     """Rows x, y, height, label of parts on a floor, and their labels after the agreement."""
     x, y = (v.ravel() for v in np.meshgrid(np.arange(0.0, 30.0, 0.35), np.arange(-15.0, 15.0, 0.35)))

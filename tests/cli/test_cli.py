@@ -10,10 +10,10 @@ import shlex
 import subprocess
 import sys
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from types import SimpleNamespace
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -40,7 +40,14 @@ class FakePerceiver:
     made: ClassVar[list[FakePerceiver]] = []
 
     def __init__(
-        self, models, *, sensor="hdl-64e", provider="auto", n_threads=None, on_mismatch="warn", **more
+        self,
+        models: Sequence[str | Path],
+        *,
+        sensor: str | None = "hdl-64e",
+        provider: str = "auto",
+        n_threads: int | None = None,
+        on_mismatch: str = "warn",
+        **more: Any,
     ) -> None:
         self.given = (list(models), sensor, provider, n_threads, on_mismatch)
         self.sensor = sensor
@@ -54,7 +61,9 @@ class FakePerceiver:
         self.cards = tuple(known[name] for name in models)
         FakePerceiver.made.append(self)
 
-    def __call__(self, points, stamp_s=None, *, image=None) -> Perception:
+    def __call__(
+        self, points: np.ndarray, stamp_s: float | None = None, *, image: np.ndarray | None = None
+    ) -> Perception:
         if len(points) and points[0, 3] == 1.0:
             raise InferenceError("pointseg answered\nwith NaN")
         if len(points) and points[0, 3] == 2.0:
@@ -420,7 +429,9 @@ def test_every_scan_is_answered_whatever_the_clock_does(
         assert answers[-2 if said.startswith("late") else -1].endswith("tracks: 1 object")
 
 
-def test_a_missing_reader_is_said_at_once(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch) -> None:
+def test_a_missing_reader_is_said_at_once(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     (tmp_path / "drive.bag").write_bytes(b"#ROSBAG V2.0\n")
     (tmp_path / "absent").mkdir()
     (tmp_path / "absent" / "rosbags.py").write_text("raise ImportError('not installed')\n")
@@ -758,7 +769,9 @@ def test_live_replays_the_one_folder_of_a_data_set(tmp_path: Path, capsys: pytes
     assert "--live replays one folder of scans" in capsys.readouterr().err
 
 
-def test_live_names_the_scans_of_a_capture(capture: Path, capsys: pytest.CaptureFixture[str], monkeypatch) -> None:
+def test_live_names_the_scans_of_a_capture(
+    capture: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(live, "read_scans", captures.read_scans)
     assert run("run", capture, "--live", "--json") == 1
     answers = [json.loads(line) for line in capsys.readouterr().out.splitlines()]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -196,7 +197,7 @@ def test_changes_keep_labels_true(scan: LabeledScan) -> None:
 
 
 @pytest.mark.parametrize("change", [lambda s: s, mirrored, lambda s: turned(s, 0.4), lambda s: mirrored(turned(s, -2))])
-def test_the_surface_follows_the_points(scan: LabeledScan, change) -> None:  # type: ignore[no-untyped-def]
+def test_the_surface_follows_the_points(scan: LabeledScan, change: Callable[[LabeledScan], LabeledScan]) -> None:  # type: ignore[no-untyped-def]
     marked = np.zeros_like(scan.surface)
     marked[150:200, 220:300] = 1  # x 10..20 m, y -10..6 m
     scan = replace(scan, surface=marked, boxes=(), counts=())
@@ -307,7 +308,7 @@ def test_drives_are_never_shared(kitti_root: Path) -> None:
         assert fold not in {fold_of(drive[n]) for n in left}
 
 
-def test_layouts_of_test_drives_are_left_out(data_root) -> None:  # type: ignore[no-untyped-def]
+def test_layouts_of_test_drives_are_left_out(data_root: Callable[[str], Path]) -> None:  # type: ignore[no-untyped-def]
     root = data_root("kitti_labels_7481")
     assert any(d in (root / "frames.csv").read_text() for d in TEST_DRIVES)
     rows = (root / "frames.csv").read_text().splitlines()[1:]

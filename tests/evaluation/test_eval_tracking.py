@@ -6,6 +6,7 @@ import json
 import math
 import subprocess
 import sys
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -366,7 +367,7 @@ def test_a_coarser_sensors_drive_has_every_second_beam(drive_root: Path, tmp_pat
     assert (len(sensor.elevations_deg), sensor.remission_range) == (32, (0.0, 255.0))
 
 
-def test_real_sequences_are_tracked_well(data_root) -> None:
+def test_real_sequences_are_tracked_well(data_root: Callable[[str], Path]) -> None:
     """Sequence 0004 with PointRCNN's detections; the figures of the whole set are in the documents."""
     figures = evaluate_kitti(data_root("tracking"), sequences=["0004"])["classes"]["car"]
     assert figures["best"]["mota"] > 0.85
@@ -374,7 +375,7 @@ def test_real_sequences_are_tracked_well(data_root) -> None:
     assert figures["hota"]["hota"] > 0.6
 
 
-def test_real_vehicles_that_move_point_to_where_they_drive(data_root) -> None:
+def test_real_vehicles_that_move_point_to_where_they_drive(data_root: Callable[[str], Path]) -> None:
     """Motion alone: PointRCNN's boxes do not say that they know the front."""
     figures = evaluate_kitti(data_root("tracking"), sequences=["0011"], classes=["car"])["headings"]["car"]
     moving = figures["moving"]

@@ -366,9 +366,7 @@ def test_answers_do_not_depend_on_the_mounting(scans: list[NDArray[np.float32]],
         assert (near < 0.5).mean() >= 0.75
 
 
-def test_the_mounting_is_settled_over_scans_and_refused_scans_teach_nothing(
-    scans: list[NDArray[np.float32]],
-) -> None:
+def test_the_mounting_is_settled_over_scans_and_refused_scans_teach_nothing(scans: list[NDArray[np.float32]]) -> None:
     perceive = Perceiver("pointseg", provider="cpu")
     raised = seen_by(Mounting(2.6, 0.0, 0.66, 0.0), scans[0])
     for _ in range(FROZEN_AFTER):

@@ -6,6 +6,7 @@ import json
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -316,7 +317,9 @@ def project(points: np.ndarray, view: RangeImageGeometry = VIEW) -> np.ndarray:
     return RangeImageProjector(view, SPEC).project(points).index
 
 
-def twin(points: np.ndarray, index: np.ndarray, view: RangeImageGeometry, sensor: SensorProfile):
+def twin(
+    points: np.ndarray, index: np.ndarray, view: RangeImageGeometry, sensor: SensorProfile
+) -> tuple[np.ndarray, ...]:
     """Reaches are computed here anew, beam by beam, from the rule as it is written."""
     rows = np.array(view.row_elevations_deg)
     place = np.interp(-np.array(sensor.elevations_deg), -rows, np.arange(len(rows)), left=-1, right=len(rows))
@@ -607,7 +610,7 @@ def test_a_model_without_points_is_refused() -> None:
 RAW = replace(get_sensor("hdl-64e"), remission_range=(-3.0, 252.0))
 
 
-def some_scan(n=300):
+def some_scan(n: int = 300) -> np.ndarray:
     rng = np.random.default_rng(n)
     points = rng.normal((0.0, 0.0, 0.0, 100.0), 10.0, (n, 4)).astype(np.float32)
     points[:: max(1, n // 20), rng.integers(0, 4)] = rng.choice([np.nan, np.inf, -np.inf])
@@ -617,7 +620,7 @@ def some_scan(n=300):
 @pytest.mark.parametrize("sensor", [get_sensor("hdl-64e"), RAW, get_sensor("vlp-16")], ids=lambda s: s.name)
 @pytest.mark.parametrize("rendered", [True, False])
 @pytest.mark.parametrize("n", [0, 1, 300])
-def test_conditioned_scan_is_finite_or_nan_and_read_only(sensor, rendered, n):
+def test_conditioned_scan_is_finite_or_nan_and_read_only(sensor: SensorProfile, rendered: bool, n: int) -> None:
     points = some_scan(n)
     before = points.copy()
     scan, n_dropped = condition(points, sensor, rendered=rendered)
@@ -637,7 +640,7 @@ def test_conditioned_scan_is_finite_or_nan_and_read_only(sensor, rendered, n):
     np.testing.assert_array_equal(scan[~dropped, 3], expected[~dropped])
 
 
-def test_a_scan_that_is_ready_is_not_copied():
+def test_a_scan_that_is_ready_is_not_copied() -> None:
     points = some_scan()[1:2].copy()
     scan, _ = condition(points, get_sensor("hdl-64e"))
     assert np.shares_memory(scan, points)
@@ -646,7 +649,7 @@ def test_a_scan_that_is_ready_is_not_copied():
     assert np.shares_memory(again, points)
 
 
-def test_a_remission_that_overflows_is_not_finite():
+def test_a_remission_that_overflows_is_not_finite() -> None:
     points = np.array([[1, 2, 3, 3e38], [1, 2, 3, 0.5]], np.float32)
     scan, n_dropped = condition(points, replace(RAW, remission_range=(0.0, 0.5)))
     assert n_dropped == 1
@@ -655,6 +658,6 @@ def test_a_remission_that_overflows_is_not_finite():
 
 
 @pytest.mark.parametrize("bad", [np.zeros((5, 2)), "scan", None, np.zeros((2, 5, 4))])
-def test_arrays_that_are_not_scans_are_refused(bad):
+def test_arrays_that_are_not_scans_are_refused(bad: Any) -> None:
     with pytest.raises(PointsError):
         condition(bad, RAW)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from typing import Any
 
 import numba
 import numpy as np
@@ -55,7 +56,9 @@ def predict(states: np.ndarray, covariance: np.ndarray, noise: np.ndarray, dt: f
     return means, predicted
 
 
-def update(means, predicted, detections, sigmas, beta) -> tuple[np.ndarray, np.ndarray]:
+def update(
+    means: np.ndarray, predicted: np.ndarray, detections: np.ndarray, sigmas: Any, beta: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     states, covariance = np.empty_like(means), np.empty_like(predicted)
     fill_updates(means, predicted, detections, sigmas, beta, states, covariance)
     return states, covariance
@@ -91,7 +94,7 @@ def test_updates_are_those_of_the_twin(n: int, m: int) -> None:
         np.testing.assert_allclose(covariance[i, mode], cov, atol=1e-9)
 
 
-def filterpy_filter(mode: int, state: np.ndarray, covariance: np.ndarray, dt: float):
+def filterpy_filter(mode: int, state: np.ndarray, covariance: np.ndarray, dt: float) -> Any:
     """filterpy's unscented filter of one motion; a straight line's is a plain Kalman filter where it is linear."""
     kalman = pytest.importorskip("filterpy.kalman")
     filtered = kalman.UnscentedKalmanFilter(

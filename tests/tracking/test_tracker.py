@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import tracemalloc
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -96,7 +97,7 @@ def test_one_far_landmark_that_moves_aside_speaks_for_a_turn() -> None:
     assert (np.abs(motion[:2]) < 0.3).all()
 
 
-def drive(n_scans: int, seed: int = 0):
+def drive(n_scans: int, seed: int = 0) -> Iterator[tuple[list[Box], np.ndarray]]:
     """A street of parked cars and an oncoming one, seen from a car that pulls off and turns: boxes and poses."""
     rng = np.random.default_rng(seed)
     parked = np.column_stack([rng.uniform(5.0, 90.0, 24), rng.choice([-6.0, 6.0, 9.0], 24)])
