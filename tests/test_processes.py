@@ -65,7 +65,7 @@ scan[:, 2] = -1.7
 right = perceive(scan).points.labels
 session = perceive.sessions[0]
 begun, finish = threading.Event(), threading.Event()
-real = session._session
+real = session.inference
 
 class Slow:
     def run_with_iobinding(self, binding):
@@ -74,7 +74,7 @@ class Slow:
         real.run_with_iobinding(binding)
 
 if when == "in a call":
-    session._session = Slow()
+    session.inference = Slow()
     thread = threading.Thread(target=perceive, args=(scan,))
     thread.start()
     begun.wait()
@@ -82,7 +82,7 @@ elif when == "under the lock":
     next(iter(perceive._locks.values())).acquire()
 child = os.fork()
 if child == 0:
-    session._session = real
+    session.inference = real
     try:
         print("equal" if (perceive(scan).points.labels == right).all() else "different")
     except edgeperc.InferenceError as error:
@@ -170,16 +170,16 @@ def test_spawned_processes_construct_their_own(tmp_path: Path) -> None:
 
 def test_a_failed_run_is_not_a_running_one(monkeypatch: pytest.MonkeyPatch) -> None:
     session = Session("pointseg", "cpu", n_threads=1)
-    real = session._session
+    real = session.inference
 
     class Broken:
         def run_with_iobinding(self, _: object) -> None:
             raise RuntimeError("no memory")
 
-    session._session = Broken()
+    session.inference = Broken()
     with pytest.raises(EdgepercError, match="no memory"):
         session.run()
-    session._session = real
+    session.inference = real
     monkeypatch.setattr(os, "getpid", lambda: 1)  # as in a child
     session.run()
 

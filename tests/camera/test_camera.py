@@ -208,10 +208,10 @@ def test_logits_that_are_not_finite_are_an_error(model: Path, image: NDArray[np.
     perceive = Perceiver(model, provider="cpu", n_threads=1)
     session = perceive.sessions[0]
     session.outputs["camera_logits"][:] = np.nan
-    real, session._session = session._session, type("Idle", (), {"run_with_iobinding": lambda *_: None})()
+    real, session.inference = session.inference, type("Idle", (), {"run_with_iobinding": lambda *_: None})()
     with pytest.raises(InferenceError, match=r"tinycam: .* of camera_logits are not finite"):
         perceive(image=image)
-    session._session = real
+    session.inference = real
     assert perceive(image=image).image is not None
 
 

@@ -42,7 +42,7 @@ from edgeperc.camera.painting import (
     fill_nearest,
     fill_painted,
 )
-from edgeperc.evaluation.painting import _beside_edges, count_painting
+from edgeperc.evaluation.painting import beside_edges, count_painting
 from edgeperc.simulation.camera import CAMERA_CLASSES, VOID, CameraImage, forward_camera, render
 from edgeperc.simulation.drawn import random_scene
 from edgeperc.simulation.scene import SimulatedScan, simulate
@@ -151,7 +151,7 @@ def test_points_beside_edges_are_not_judged() -> None:
     labels[4, 10] = 1
     wanted = np.zeros(labels.shape, bool)
     wanted[1:8, 7:14] = True
-    np.testing.assert_array_equal(_beside_edges(labels), wanted)
+    np.testing.assert_array_equal(beside_edges(labels), wanted)
 
 
 def test_evaluate_painting(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -24,11 +24,12 @@ from test_captures import vlp16_packets, write_pcap
 from cli_helpers import POINTSEG, SSADNET, run, write_scan
 from edgeperc import __version__, live, zoo
 from edgeperc.cli.arguments import PRECISIONS, PROVIDERS
-from edgeperc.cli.evaluation.scans import _figure_lines
+from edgeperc.cli.evaluation.scans import figure_lines
 from edgeperc.cli.main import build_parser, in_options
 from edgeperc.cli.output import print_line, progress
 from edgeperc.cli.scans import find_scans, output_names
 from edgeperc.errors import InferenceError, ModelFileError, OptionError, PointsError
+from edgeperc.evaluation.judge import Perceiving
 from edgeperc.inference import providers, session
 from edgeperc.readers import captures
 from edgeperc.types.perception import Box, Perception, PointLabels, TopView
@@ -148,8 +149,8 @@ def test_eval_needs_matplotlib_for_a_picture_before_any_work(
 def test_eval_passes_its_options_on(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     asked = []
 
-    def evaluate(datasets: list[str], models: tuple[str, ...], **options: object) -> tuple[dict, list]:
-        asked.append((datasets, models, options))
+    def evaluate(datasets: list[str], models: tuple[str, ...], how: Perceiving, **_: object) -> tuple[dict, list]:
+        asked.append((datasets, models, how))
         return {"models": {"x": "1"}, "providers": {"x": "x fp32, cpu"}, "split": "test", "fold": None}, []
 
     monkeypatch.setitem(sys.modules, "edgeperc.evaluation.evaluate", SimpleNamespace(evaluate=evaluate))
@@ -160,8 +161,8 @@ def test_eval_passes_its_options_on(monkeypatch: pytest.MonkeyPatch, capsys: pyt
     )
     (datasets, models, first), (_, own, second) = asked
     assert (datasets, models, own) == (["KITTI", "simulation:2"], zoo.DEFAULT, ["a"])
-    assert [first[key] for key in ("provider", "precision", "boxes_from")] == ["cpu", "auto", "both"]
-    assert [second[key] for key in ("provider", "precision", "boxes_from")] == ["openvino", "bf16", "network"]
+    assert (first.provider, first.precision, first.boxes_from) == ("cpu", "auto", "both")
+    assert (second.provider, second.precision, second.boxes_from) == ("openvino", "bf16", "network")
     assert capsys.readouterr().out.splitlines()[1] == "ran as x fp32, cpu"
 
 
@@ -189,7 +190,7 @@ def test_tables_of_figures() -> None:
             "boxes": {"upright": {"all": {"mean_ap": 1.0, "car": boxes, "vehicle": boxes}}},
         },
     }
-    lines = _figure_lines(figures)
+    lines = figure_lines(figures)
     assert lines[0].startswith("pointseg 1.2.3; validation drives, fold 1")
     assert lines[1] == "ran as pointseg int8, CPUExecutionProvider"
     assert lines[3] == "== SemanticKITTI: 1 scan, 1 drive =="

@@ -35,7 +35,7 @@ from edgeperc.datasets.kitti import (
 from edgeperc.errors import ModelError, PointsError, SplitError
 from edgeperc.evaluation import evaluate
 from edgeperc.evaluation.causes import count_causes
-from edgeperc.evaluation.judge import Judge, training_scans_of
+from edgeperc.evaluation.judge import Judge, Perceiving, training_scans_of
 from edgeperc.evaluation.metrics import BoxEvaluator, Confusion
 from edgeperc.evaluation.tables import BANDS, FEWEST_OBJECTS, Record, banded, figures
 from edgeperc.simulation.samples import FIRST_SEED, IGNORE
@@ -117,7 +117,7 @@ class World:
 def world(monkeypatch: pytest.MonkeyPatch) -> World:
     made = World()
     monkeypatch.setattr("edgeperc.evaluation.judge.Perceiver", made.perceiver)
-    monkeypatch.setattr("edgeperc.evaluation.judge._Network", made.network)
+    monkeypatch.setattr("edgeperc.evaluation.judge.Network", made.network)
     return made
 
 
@@ -235,7 +235,7 @@ def test_boxes_of_clusters_by_hand(world: World) -> None:
         box(20, 4, score=0.6),
     )
     # Boxes around clusters are named by their size: a van that is called a car is a false car and a missed van.
-    table = evaluated(Judge(["pointseg"], boxes_from="clusters"), frame_of_all)["boxes"]["oriented"]["all"]
+    table = evaluated(Judge(["pointseg"], Perceiving(boxes_from="clusters")), frame_of_all)["boxes"]["oriented"]["all"]
     counts = {
         name: [table[name][k] for k in ("n_truth", "n_predicted", "n_hits")] for name in ("car", "van", "pedestrian")
     }
@@ -250,7 +250,7 @@ def test_boxes_of_clusters_by_hand(world: World) -> None:
     assert counts == {"car": [1, 2, 1], "van": [1, 0, 0], "vehicle": [2, 2, 2]}
     assert "pedestrian" not in table
     assert [result["all_round"]["all"][name]["n_hits"] for name in ("vehicle", "pedestrian")] == [3, 1]
-    assert "boxes" not in evaluated(Judge(["pointseg"], boxes_from="network"), frame_of_all)
+    assert "boxes" not in evaluated(Judge(["pointseg"], Perceiving(boxes_from="network")), frame_of_all)
 
 
 def test_boxes_all_round_by_hand(world: World) -> None:
@@ -298,7 +298,7 @@ def test_boxes_all_round_by_hand(world: World) -> None:
         # Labels are counted with those of other classes.
         assert result["labeled"]["car"] == {"n_boxes": 2, "n_objects": 1, "n_drives": 1, "few": True}
         assert set(result["labeled"]) == {"car", "van", "pedestrian", "cyclist", "person_sitting"}
-    assert not {"all_round", "heading"} & {*evaluated(Judge(["pointseg"], boxes_from="network"), one)}
+    assert not {"all_round", "heading"} & {*evaluated(Judge(["pointseg"], Perceiving(boxes_from="network")), one)}
 
 
 def test_the_ground_in_boxes_and_people_who_sit_are_left_out_of_a_second_figure(world: World) -> None:
@@ -340,7 +340,7 @@ def test_few_objects_are_marked() -> None:
         rows = figures([Record("", "a", {("all_round", "vehicle"): evaluator})])
         assert rows["all_round"]["all"]["vehicle"].get("few", False) is (n < FEWEST_OBJECTS)
         assert rows["heading"]["all_round"]["all"]["vehicle"].get("few", False) is (n < FEWEST_OBJECTS)
-        lines = [line for line in eval_scans._box_lines(rows) if line.startswith("  all")]  # car, before vehicle
+        lines = [line for line in eval_scans.box_lines(rows) if line.startswith("  all")]  # car, before vehicle
         assert [f"car{output.FEW}" in line for line in lines] == [n < FEWEST_OBJECTS] * (2 if n else 0)
     assert f"n<{FEWEST_OBJECTS}" in output.FEW
 
@@ -440,7 +440,7 @@ def test_bumper_has_an_interval_of_points(world: World) -> None:
     assert result["bumper"]["all"] == {"n_points": 4, "n_scans": 1, "n_drives": 1, "n_points_interval": [0, 8]}
     assert set(result["bumper"]) == {"all", "on the ground"}
     assert ["car", "at", "the", "own", "bumper", "all", "-", "-", "4", "0-8", "-", "1", "-", "1"] in [
-        line.split() for line in eval_scans._error_lines(result)
+        line.split() for line in eval_scans.error_lines(result)
     ]
 
 
@@ -777,7 +777,9 @@ def test_the_worst_come_first(world: World, tmp_path: Path, monkeypatch: pytest.
 
 
 def test_a_network_agrees_with_the_perceiver() -> None:
-    judge = Judge(["ssadnet", "pointseg"], rules=())  # the agreement removes cells that the network calls drivable
+    judge = Judge(
+        ["ssadnet", "pointseg"], Perceiving(rules=())
+    )  # the agreement removes cells that the network calls drivable
     truth = judge.simulated(FIRST_SEED)
     found = judge.perceive(truth.points)
     assert judge.from_above is not None

@@ -54,8 +54,8 @@ from edgeperc_export.training.images import (
     normalized,
     read_camvid,
 )
-from edgeperc_export.training.losses import _lovasz_at_once, cross_entropy, lovasz_softmax
-from edgeperc_export.training.train import _last
+from edgeperc_export.training.losses import cross_entropy, lovasz_at_once, lovasz_softmax
+from edgeperc_export.training.train import last_step
 
 SMALL: dict[str, Any] = {"image_width": 48, "image_height": 36, "batch": 2, "steps": 4, "dropout": 0.0}
 
@@ -288,7 +288,7 @@ def test_lovasz_of_all_classes_at_once_is_the_same() -> None:
         logits = torch.randn(2, 5, 9, 11, requires_grad=True)
         labels = torch.randint(0, max(n_known, 1), (2, 9, 11)).byte()
         labels[:, : 9 if n_known == 0 else 2] = IGNORE
-        one, other = lovasz_softmax(logits, labels), _lovasz_at_once(logits, labels)
+        one, other = lovasz_softmax(logits, labels), lovasz_at_once(logits, labels)
         assert torch.allclose(one, other, atol=1e-6)
         slopes = [torch.autograd.grad(each, logits)[0] for each in (one, other)]
         assert torch.allclose(*slopes, atol=1e-4)
@@ -386,10 +386,10 @@ def test_training_stops_without_a_better_validation() -> None:
     def curve(*figures: float) -> list[dict[str, Any]]:
         return [{"step": 11 * (k + 1), "validation": {"mean": figure}} for k, figure in enumerate(figures)]
 
-    assert _last(recipe, [], 11) == recipe.steps
-    assert _last(recipe, curve(0.1, 0.3, 0.2, 0.3), 11) == recipe.steps
-    assert _last(recipe, curve(0.1, 0.3, 0.2, 0.3, 0.1), 11) == 55
-    assert _last(replace(recipe, stop_after=0), curve(0.3, 0.1, 0.1, 0.1, 0.1), 11) == recipe.steps
+    assert last_step(recipe, [], 11) == recipe.steps
+    assert last_step(recipe, curve(0.1, 0.3, 0.2, 0.3), 11) == recipe.steps
+    assert last_step(recipe, curve(0.1, 0.3, 0.2, 0.3, 0.1), 11) == 55
+    assert last_step(replace(recipe, stop_after=0), curve(0.3, 0.1, 0.1, 0.1, 0.1), 11) == recipe.steps
 
 
 def test_the_papers_protocol_keeps_the_best_epoch(drawn: Path, tmp_path: Path) -> None:

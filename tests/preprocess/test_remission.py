@@ -228,7 +228,7 @@ def test_a_function_is_dropped_only_well_below_the_limit(
         ([0.09, 0.05, 0.07, 0.079, 0.081], [True, False, False, False, True]),
     ):
         now = iter(off)
-        monkeypatch.setattr(remission, "_difference", lambda raw, t, s: next(now) if s is BYTE else 0.0)  # noqa: B023
+        monkeypatch.setattr(remission, "quantile_difference", lambda raw, t, s: next(now) if s is BYTE else 0.0)  # noqa: B023
         matcher, found = RemissionMatcher(BYTE), []
         for scan in streets[: len(off)]:
             matcher, used, _ = matcher.add(as_bytes(scan, 1 / 8))

@@ -67,7 +67,7 @@ class FakeGraph:
 @pytest.fixture
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """Diagnostics come often, so that no test waits a second."""
-    monkeypatch.setattr(node_module, "_REPORT_EVERY_S", 0.02)
+    monkeypatch.setattr(node_module, "REPORT_EVERY_S", 0.02)
 
 
 @pytest.fixture(autouse=True)

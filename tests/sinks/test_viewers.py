@@ -593,7 +593,7 @@ def test_a_long_drive_stays_within_its_limit(tmp_path: Path) -> None:
     for k in range(40):
         page.add(perception, points, 0.1 * k, name=str(k))
         states.append((page.n_points, page.every))
-        assert page._n_bytes <= limit
+        assert page.n_bytes <= limit
     assert [*dict.fromkeys(states)] == [(12_000, 1), (6000, 1), (3000, 1), (3000, 2), (3000, 4)]
     page.write(tmp_path / "drive.html")
     assert (tmp_path / "drive.html").stat().st_size <= limit + 40_000  # and the page itself

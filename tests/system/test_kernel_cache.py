@@ -67,7 +67,7 @@ class Place:
 
     def start(self) -> tuple[list[str], int]:
         """Load the kernels and call one; return the warnings and the number of compilations."""
-        self._monkeypatch.setattr(kernel_cache, "_reported", set())
+        self._monkeypatch.setattr(kernel_cache, "reported", set())
         self._caplog.clear()
         spec = importlib.util.spec_from_file_location("some_kernels", self.source)
         assert spec is not None
@@ -601,7 +601,7 @@ def test_a_constant_set_after_the_import_is_not_kept_for_others(place: Place) ->
 
 def test_a_value_without_a_digest_is_named(place: Place) -> None:
     place.source.write_text(SOURCE.replace("x * x", "x * x if x in WHAT else x * x") + "\nWHAT = iter([1.0])\n")
-    kernel_cache._reported.clear()
+    kernel_cache.reported.clear()
     spec = importlib.util.spec_from_file_location("some_kernels", place.source)
     assert spec is not None
     assert spec.loader is not None
@@ -621,7 +621,7 @@ names = [m.name for m in pkgutil.walk_packages(edgeperc.__path__, "edgeperc.") i
 for name in names:
     for key, thing in sorted(vars(import_module(name)).items()):
         if isinstance(thing, Dispatcher) and thing.py_func.__module__ == name:
-            print(name, key, thing._cache._stamp().hex())
+            print(name, key, thing._cache.stamp().hex())
 """
 
 

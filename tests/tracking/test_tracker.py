@@ -544,8 +544,8 @@ def test_shapes_hiding_and_rivals_are_those_of_the_twins(n: int, m: int) -> None
 def test_births_lives_and_views_are_those_of_the_twins(n: int, m: int) -> None:
     rng = np.random.default_rng(7 * n + m)
     tracker = Tracker()
-    kinds = tracker._kinds(["car", "pedestrian", "cyclist"])[rng.integers(0, 3, n)]
-    of = tracker._classes[kinds]
+    kinds = tracker.kinds_of(["car", "pedestrian", "cyclist"])[rng.integers(0, 3, n)]
+    of = tracker.class_table[kinds]
     detections, shapes = rng.normal(0.0, 9.0, (n, 3)), rng.uniform(0.5, 4.0, (n, 4))
     logits, fronts, ranges = rng.normal(0.0, 3.0, n), rng.normal(0.0, 3.0, n), rng.uniform(0.0, 60.0, n)
     born = Detections(detections, shapes, logits, fronts, kinds, of["group"].copy(), ranges, np.arange(n))

@@ -279,24 +279,24 @@ def test_a_graph_of_another_shape_than_the_cards(tmp_path: Path) -> None:
 def test_a_first_run_without_end_is_given_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     onnxruntime = pytest.importorskip("onnxruntime")
     path = write(tmp_path, TINY)
-    enter = session_module._terminated
+    enter = session_module.terminated
 
     def late(ort: Any, after_s: float | None) -> Any:
         assert after_s == session_module.MAX_FIRST_RUN_S
         return enter(ort, 1e-9)
 
-    with session_module._terminated(onnxruntime, 1e-9) as options:
+    with session_module.terminated(onnxruntime, 1e-9) as options:
         while not options.terminate:  # the timer's thread sets it
             time.sleep(0.001)
     for after_s in (None, 60.0):
-        with session_module._terminated(onnxruntime, after_s) as options:
+        with session_module.terminated(onnxruntime, after_s) as options:
             assert not options.terminate
     session = Session(path, "cpu")
     options.terminate = True
     with pytest.raises(InferenceError, match=r"(?i)terminat"):
-        session._run(options)
+        session.run_bound(options)
     session.run()
-    monkeypatch.setattr(session_module, "_terminated", late)
+    monkeypatch.setattr(session_module, "terminated", late)
     with contextlib.suppress(InferenceError):  # the timer may come too late for so small a network
         Session(path, "cpu")
 
