@@ -339,9 +339,6 @@ def test_a_generator_is_left_where_it_stands() -> None:
     assert closed.wait(TIMEOUT_S)
 
 
-# --- replay ----------------------------------------------------------------------------------------------------------
-
-
 class Waits:
     """Stands in for the event that stops a replay: notes how long it would wait, and turns the clock."""
 

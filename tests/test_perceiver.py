@@ -642,9 +642,6 @@ def test_real_scans_are_perceived_without_warnings(kitti_root: Path) -> None:
         assert answer.top_view.drivable_area_m2 > 50.0
 
 
-# --- boxes of networks and of clusters -------------------------------------------------------------------------------
-
-
 def overlaps(first: tuple[Box, ...], second: tuple[Box, ...]) -> NDArray[np.float64]:
     rows = [[(*box.center[:2], *box.size[:2], box.yaw) for box in boxes] for boxes in (first, second)]
     return oriented_iou(*rows)

@@ -50,8 +50,6 @@ def python(code: str, *arguments: str, timeout_s: float = 120.0, **options: Any)
     return subprocess.run(command, capture_output=True, text=True, timeout=timeout_s, **options)
 
 
-# --- fork and spawn --------------------------------------------------------------------------------------------------
-
 FORK = """
 import json, os, sys, threading, warnings
 import numpy as np
@@ -184,9 +182,6 @@ def test_a_failed_run_is_not_a_running_one(monkeypatch: pytest.MonkeyPatch) -> N
     session.run()
 
 
-# --- signals ---------------------------------------------------------------------------------------------------------
-
-
 def edgeperc_run(*arguments: object, **options: Any) -> subprocess.Popen[str]:
     def with_signals() -> None:  # a shell starts programs in the background with SIGINT ignored
         signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -249,9 +244,6 @@ def test_a_signal_ends_the_process_that_decodes_a_capture(tmp_path: Path, number
         time.sleep(0.05)
 
 
-# --- full disks ------------------------------------------------------------------------------------------------------
-
-
 def check_failed(process: subprocess.Popen[str], out: Path, reason: str) -> None:
     """Each scan has its error, on one line, and no part of a file is left."""
     records, errors = process.communicate(timeout=120)
@@ -284,8 +276,6 @@ def test_full_disk_fails_its_scan(folder: Path, small_disk: Callable[[int], Path
     process = edgeperc_run(folder, "--json", "--model", "pointseg", "--labels", "--out", out)
     check_failed(process, out, "No space left on device")
 
-
-# --- homes -----------------------------------------------------------------------------------------------------------
 
 HOMES = ("HOME", "USERPROFILE", "LOCALAPPDATA", "XDG_CACHE_HOME", "XDG_CONFIG_HOME", "XDG_DATA_HOME")
 WITHOUT_PASSWD = """

@@ -149,9 +149,6 @@ def test_one_perceiver_in_threads_gives_the_same_result(perceive: Perceiver, ima
         assert [*pool.map(labels, range(40))] == known * 10
 
 
-# --- beside LiDAR models -----------------------------------------------------------------------------------------
-
-
 def test_scan_and_image_in_one_call(model: Path, perceive: Perceiver, image: NDArray[np.uint8]) -> None:
     """Each part is what it is without the other."""
     options: dict[str, Any] = {"provider": "cpu", "n_threads": 1, "on_mismatch": "ignore"}
@@ -254,9 +251,6 @@ os.waitpid(child, 0)
     for n_threads, said in ((1, "equal"), (2, "construct the Perceiver in the process that calls it")):
         done = subprocess.run([sys.executable, "-c", code, model, str(n_threads)], capture_output=True, text=True)
         assert said in done.stdout, done.stderr
-
-
-# --- files -------------------------------------------------------------------------------------------------------
 
 
 def saved(image: Any, kind: str, **options: Any) -> bytes:

@@ -44,9 +44,6 @@ def scaled(image: NDArray[np.uint8], width: int, height: int, spec: InputSpec = 
     return out
 
 
-# --- arrays ------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("array", "message"),
     [
@@ -100,8 +97,6 @@ def test_any_array_is_an_image_or_refused(content: bytes, shape: list[int], dtyp
     except ImageError:
         assert array.ndim != 3 or array.shape[2] != 3 or dtype != "u1" or not array.size
 
-
-# --- scaling -----------------------------------------------------------------------------------------------------
 
 SIZES = [(1, 1), (1, 7), (9, 1), (24, 32), (25, 33), (48, 64), (12, 16), (100, 30), (7, 301), (61, 47)]
 
@@ -192,9 +187,6 @@ def test_a_scaler_follows_the_size_of_its_images() -> None:
 def test_another_buffer_is_refused(out: NDArray[Any]) -> None:
     with pytest.raises(ImageError, match="the buffer is"):
         ImageScaler(CameraGeometry(32, 24), SPEC).fill(noise(4, 4), out)
-
-
-# --- labels ------------------------------------------------------------------------------------------------------
 
 
 def logits_of(n_classes: int, height: int, width: int, kind: str) -> NDArray[np.float32]:

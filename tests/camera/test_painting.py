@@ -73,9 +73,6 @@ def perceived(scan: SimulatedScan, image: CameraImage, mounting: Mounting = MODE
     return Perception(len(scan.points), 0, None, None, (), {}, {}, (), None, mounting, image=labels)
 
 
-# --- kernels ----------------------------------------------------------------------------------------------------------
-
-
 def a_case(rng: np.random.Generator, n: int) -> tuple[np.ndarray, ...]:
     """Points, their projection and windows; some points are not finite, behind the camera or far beside the image."""
     points = rng.uniform([-5.0, -10.0, -2.0, 0.0], [30.0, 10.0, 2.0, 1.0], (n, 4)).astype(np.float32)
@@ -132,9 +129,6 @@ def test_a_window_is_bounded() -> None:
     windows = Windows(np.empty(0), np.full(1, 5.0), np.full(1, 5.0), 5.0)
     fill_nearest(points, Pixels(*NEAR.project(points)), windows, buffer)
     assert 40**2 < np.count_nonzero(np.isfinite(buffer.nearest)) <= (2 * MAX_CELLS + 1) ** 2
-
-
-# --- painting ---------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("sensor", "calibration"), [("hdl-64e", NEAR), ("hdl-64e", FAR), ("os1-64", NEAR)])
@@ -275,9 +269,6 @@ def test_a_sensor_that_is_mounted_otherwise() -> None:
         paint(image.labels, points, other, mounting=Mounting())
 
 
-# --- the road ---------------------------------------------------------------------------------------------------------
-
-
 def test_the_road_of_an_image_lies_on_the_roads_of_the_scene() -> None:
     n = sum((count_painting(*seen(k, "hdl-64e", NEAR), NEAR, "hdl-64e") for k in range(3)), Counter[str]())
     assert n["cells_right"] / n["cells"] >= 0.96
@@ -315,9 +306,6 @@ def test_without_ground_no_cell_is_seen() -> None:
         assert found.drivable_area_m2 == 0.0
 
 
-# --- errors -----------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     "image",
     [None, "labels", np.zeros((480, 640)), np.zeros((480, 640, 3), np.uint8), np.zeros((480, 640), bool)],
@@ -347,9 +335,6 @@ def test_what_does_not_fit_is_refused() -> None:
         paint(labels, points, NEAR, sensor="hdl-65e")
     with pytest.raises(OptionError, match="mounting"):
         paint(labels, points, NEAR, mounting="roof")  # type: ignore[arg-type]
-
-
-# --- picture and demo -------------------------------------------------------------------------------------------------
 
 
 def test_draw_painted(tmp_path: Path) -> None:

@@ -733,9 +733,6 @@ def test_demo_without_matplotlib(
     assert [file.name for file in (tmp_path / "demo").iterdir()] == ["scene.html"]
 
 
-# --- data sets -------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("files", "names"),
     [
@@ -780,8 +777,6 @@ def test_live_names_the_scans_of_a_capture(
     assert named
     assert {*named} <= {str(capture / f"{k:06d}") for k in range(3)}
 
-
-# --- help and renamed words ------------------------------------------------------------------------------------------
 
 COMMANDS = (
     *("demo", "run", "ros2", "info", "doctor", "models", "sensors", "providers", "eval", "eval-sensors"),

@@ -162,9 +162,6 @@ def test_info_and_lists_need_no_onnxruntime(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
 
 
-# --- models, sensors, providers, completion --------------------------------------------------------------------------
-
-
 @pytest.mark.usefixtures("fake_models")
 def test_models_are_listed_with_what_was_measured_here(capsys: pytest.CaptureFixture[str]) -> None:
     entry = {"provider": "cpu", "precision": "int8", "n_threads": 2, "p50_ms": 7.25}
@@ -246,9 +243,6 @@ def test_completion_names_its_extra(capsys: pytest.CaptureFixture[str], monkeypa
     monkeypatch.setitem(sys.modules, "shtab", None)
     assert run("completion", "bash") == 2
     assert "pip install 'edgeperc[completion]'" in capsys.readouterr().err
-
-
-# --- how a sensor is mounted -----------------------------------------------------------------------------------------
 
 
 @pytest.fixture

@@ -144,9 +144,6 @@ def test_a_plugin_that_does_not_load(capsys: pytest.CaptureFixture[str], monkeyp
     assert "does not load" in found["providers"]["found"]
 
 
-# --- caches ----------------------------------------------------------------------------------------------------------
-
-
 def test_kernels_that_are_not_kept(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(KernelCache, "cache_path", None)
     _, found = report(capsys)
@@ -185,9 +182,6 @@ def test_settings_that_cannot_be_read(tmp_path: Path, capsys: pytest.CaptureFixt
     assert "cannot be read as settings" in found["settings"]["found"]
 
 
-# --- models ----------------------------------------------------------------------------------------------------------
-
-
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A copy of the folder of the models, in its place."""
@@ -222,8 +216,6 @@ def test_without_the_page_hashes_are_not_compared(folder: Path, capsys: pytest.C
     assert found["MODELS.md"]["state"] == "note"
     assert found["model lodnn.onnx"]["found"].endswith("not compared")
 
-
-# --- extras ----------------------------------------------------------------------------------------------------------
 
 REQUIRES = (
     "numpy>=1.24",

@@ -173,9 +173,6 @@ def test_semantickitti_files(tmp_path: Path) -> None:
         sequences.frame("77/000000")
 
 
-# --- scans and their changes -----------------------------------------------------------------------------------------
-
-
 @pytest.fixture(scope="module")
 def scan() -> LabeledScan:
     return LabeledScan.from_simulation(simulated_scan(3))
@@ -253,9 +250,6 @@ def test_the_sure_road_is_road() -> None:
 def test_no_ground_no_claim() -> None:
     assert ground_plane(np.zeros((0, 4), np.float32)) is None
     assert (sure_surface(np.zeros((0, 4), np.float32)) == IGNORE).all()
-
-
-# --- real data -------------------------------------------------------------------------------------------------------
 
 
 def test_every_table_of_frames_is_read_and_unknown_drives_are_left_out(tmp_path: Path) -> None:

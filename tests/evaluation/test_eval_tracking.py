@@ -28,8 +28,6 @@ from edgeperc.evaluation.tracking import (
 from edgeperc.types.sensor import get_sensor
 from edgeperc_bench.peers.tracking import every_second_beam
 
-# --- KITTI -----------------------------------------------------------------------------------------------------------
-
 CALIBRATION = """P2: 700.0 0.0 600.0 0.0 0.0 700.0 180.0 0.0 0.0 0.0 1.0 0.0
 R0_rect: 1.0 0.0 0.0 0.0 1.0 0.0 0.0 0.0 1.0
 Tr_velo_to_cam: 0.0 -1.0 0.0 0.0 0.0 0.0 -1.0 0.0 1.0 0.0 0.0 0.0
@@ -382,9 +380,6 @@ def test_real_vehicles_that_move_point_to_where_they_drive(data_root: Callable[[
     assert moving["n_boxes"] > 500
     assert moving["n_resolved"] > 0.9 * moving["n_boxes"]
     assert moving["n_right"] > 0.95 * moving["n_resolved"]
-
-
-# --- pictures and the command line -----------------------------------------------------------------------------------
 
 
 def test_tracks_are_animated(kitti: Path, tmp_path: Path) -> None:

@@ -135,9 +135,6 @@ def evaluated(judge: Judge, *frames: Frame, n_resamples: int = 50) -> dict[str, 
     return figures([judge.record(judge.kitti(each))[0] for each in frames], n_resamples)
 
 
-# --- tables made by hand ---------------------------------------------------------------------------------------------
-
-
 def test_points_by_hand(world: World) -> None:
     near, far, rider, van = box(10, 0), box(40, 4), box(20, -3, "cyclist"), box(60, 0, "van")
     points = [
@@ -343,9 +340,6 @@ def test_few_objects_are_marked() -> None:
         lines = [line for line in eval_scans.box_lines(rows) if line.startswith("  all")]  # car, before vehicle
         assert [f"car{output.FEW}" in line for line in lines] == [n < FEWEST_OBJECTS] * (2 if n else 0)
     assert f"n<{FEWEST_OBJECTS}" in output.FEW
-
-
-# --- causes of errors ------------------------------------------------------------------------------------------------
 
 
 def street() -> np.ndarray:
@@ -585,9 +579,6 @@ def test_a_model_without_vehicles_is_evaluated_on_road_only(world: World) -> Non
     assert [*figures([record])["segmentation"]["every cell"]["all"]["iou"]] == ["background", "drivable"]
 
 
-# --- drives ----------------------------------------------------------------------------------------------------------
-
-
 def test_intervals_are_over_drives(world: World) -> None:
     right = frame(box(10, 0), box(20, 3, "cyclist"), points=hits(box(10, 0), 10) + hits(box(20, 3), 3, 3), drive="b")
     half = frame(box(10, 0), points=hits(box(10, 0), 5) + hits(box(10, 0), 5, label=0))
@@ -735,9 +726,6 @@ def test_what_is_no_dataset(world: World, dataset: str) -> None:
         evaluate.evaluate([dataset], ["pointseg"])
 
 
-# --- mistakes --------------------------------------------------------------------------------------------------------
-
-
 def test_mistakes_are_named(world: World) -> None:
     car, van, rider, walker = box(10, 0), box(20, 3, "van"), box(15, -3, "cyclist"), box(12, 3, "pedestrian")
     beside, beyond = box(20, 14), box(50, 0)
@@ -771,9 +759,6 @@ def test_the_worst_come_first(world: World, tmp_path: Path, monkeypatch: pytest.
     _, worst = evaluate.evaluate([root], ["pointseg"])
     assert [each.name for each in worst[:2]] == ["000023", "000007"]
     assert len(worst) == 20
-
-
-# --- the shipped models ----------------------------------------------------------------------------------------------
 
 
 def test_a_network_agrees_with_the_perceiver() -> None:
@@ -865,9 +850,6 @@ def test_the_command_on_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[st
     assert "expected the root of a KITTI object set" in capsys.readouterr().err
     with pytest.raises(SystemExit):
         cli.main(["eval", "simulation:1", "--fold", "3"])
-
-
-# --- real scans ------------------------------------------------------------------------------------------------------
 
 
 def test_no_shipped_model_was_trained_on_a_test_scan(kitti_root: Path, semantickitti_root: Path) -> None:

@@ -27,9 +27,6 @@ def box(
     return Box(label, score, (x, y, -1.0), (*size, 1.5), yaw)
 
 
-# --- labels
-
-
 def test_scores_of_a_table_made_by_hand() -> None:
     confusion = Confusion(("background", "car", "pedestrian", "cyclist"))
     # truth:      0  0  0  0  1  1  1  2  2  ignored
@@ -111,9 +108,6 @@ def test_coarser_classes() -> None:
         confusion + coarse
 
 
-# --- average precision
-
-
 def eleven_points(scores: Sequence[float], hits: Sequence[bool], n_truth: int) -> float:
     """As SSADNet's appendix has it, word for word."""
     order = np.argsort(-np.array(scores), kind="stable")
@@ -154,9 +148,6 @@ def test_average_precision_at_its_ends() -> None:
         average_precision([0.5, 0.4], [True], 1)
 
 
-# --- thresholds
-
-
 def test_sweep_by_hand() -> None:
     sweep = ProbabilitySweep()
     assert math.isnan(sweep.max_f1())
@@ -190,9 +181,6 @@ def test_probabilities_that_are_none_raise() -> None:
     for values, truth in (([0.5, 1.5], [True, False]), ([math.nan], [True]), ([0.5], [True, False])):
         with pytest.raises(PointsError, match=r"expected one shape, and all in 0\.\.1"):
             ProbabilitySweep().update(values, truth)
-
-
-# --- boxes
 
 
 def test_boxes_by_hand() -> None:
@@ -341,9 +329,6 @@ def test_axis_aligned_bounds_are_what_the_paper_compares() -> None:
 def test_thresholds_out_of_range_raise(threshold: float) -> None:
     with pytest.raises(PointsError, match="iou_threshold"):
         BoxEvaluator(threshold)
-
-
-# --- headings and distinct objects
 
 
 def test_headings_by_hand() -> None:

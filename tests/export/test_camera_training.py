@@ -89,9 +89,6 @@ def weights(network: nn.Module) -> int:
     return sum(weight.numel() for weight in network.parameters())
 
 
-# --- structure --------------------------------------------------------------------------------------------------------
-
-
 def unet_weights(widths: list[int], n_channels: int, n_classes: int) -> int:
     """By the description: two 3 x 3 a level and path, a 2 x 2 between levels, one 1 x 1."""
     down = sum(9 * a * b + b + 9 * b * b + b for a, b in pairwise([n_channels, *widths]))
@@ -202,9 +199,6 @@ def test_early_logits_are_of_training_alone() -> None:
     assert network.eval()(torch.zeros(1, 3, 32, 48)).shape == (1, 11, 8, 12)
 
 
-# --- samples ----------------------------------------------------------------------------------------------------------
-
-
 def test_unlabeled_pixels_are_ignored(drawn: Path) -> None:
     images = read_camvid(drawn, "train")
     assert images.images.shape == (6, 3, 72, 96)
@@ -254,9 +248,6 @@ def test_each_epoch_draws_each_image_once(drawn: Path) -> None:
     assert sorted(drawn_images[:6]) == sorted(drawn_images[6:]) == [*range(6)]
     assert drawn_images[:6] != drawn_images[6:]
     assert [torch.equal(a, b) for a, b in zip(samples.batch(5), samples.batch(5), strict=True)] == [True, True]
-
-
-# --- losses and figures -----------------------------------------------------------------------------------------------
 
 
 def test_loss_is_categorical_cross_entropy_by_the_papers_recipe() -> None:
@@ -325,9 +316,6 @@ def test_confusions_count_each_image(drawn: Path) -> None:
     assert counts.sum(0).trace() == counts.sum()
     assert loss < 1e-6
     assert torch.equal(labels[known], images.labels[known])
-
-
-# --- training ---------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("network", ["camseg", "segnet", "unet-small", "unet-small-leaky"])
@@ -405,9 +393,6 @@ def test_images_are_needed(tmp_path: Path) -> None:
         train(Recipe("camseg"), tmp_path, kitti=None, simulated=None)
 
 
-# --- the comparison ---------------------------------------------------------------------------------------------------
-
-
 def test_comparison_resumes_network_by_network(drawn: Path, tmp_path: Path) -> None:
     assert len(ELEVEN) == 11
     assert ELEVEN.keys() == PAPER_ROWS.keys()
@@ -436,9 +421,6 @@ def test_comparison_resumes_network_by_network(drawn: Path, tmp_path: Path) -> N
     show_camvid(tmp_path / "camvid.npz", tmp_path / "all.png", drawn)
     assert read_image(tmp_path / "own.png").shape[1] == read_image(tmp_path / "all.png").shape[1]
     assert np.load(tmp_path / "camvid.npz")[names[0]].shape == (3, 72, 96)
-
-
-# --- export -----------------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")

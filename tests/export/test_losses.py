@@ -55,9 +55,6 @@ def random_maps(
     return logits, labels
 
 
-# --- paper_slot_targets ---------------------------------------------------------------------------------------------
-
-
 def test_slot_of_a_box_ahead() -> None:
     (slot,) = paper_slot_targets([CAR], VIEW, 1)
     # Row (46 - 26) / 0.1 = 200 of 400, column (10 - 2) / 0.1 = 80 of 200; 16 columns across, 40 rows along.
@@ -91,9 +88,6 @@ def test_empty_slots_are_zero() -> None:
     assert paper_slot_targets([CAR], VIEW, 4)[1:].tolist() == [[0.0] * 4] * 3
     assert paper_slot_targets([], VIEW, 2).tolist() == [[0.0] * 4] * 2
     assert paper_slot_targets(np.empty((0, 7)), VIEW, 2).dtype == np.float32
-
-
-# --- slot_targets ---------------------------------------------------------------------------------------------------
 
 
 def test_a_slot_has_the_box_centered_in_its_square() -> None:
@@ -143,9 +137,6 @@ def test_boxes_centered_outside_the_view_are_left_out(center: tuple[float, float
 def test_boxes_without_extent_are_refused(targets: Callable[..., Any]) -> None:
     with pytest.raises(ValueError, match="has no extent"):
         targets([(20.0, 0.0, 0.0, 4.0, 0.0, 1.5, 0.0)])
-
-
-# --- dense_targets --------------------------------------------------------------------------------------------------
 
 
 def test_dense_target_of_one_box() -> None:
@@ -239,8 +230,6 @@ def test_unsure_boxes_are_not_learned() -> None:
     assert (dense_targets([], VIEW, unsure=np.empty((0, 7))) == 0.0).all()
 
 
-# --- The runtime decodes the training targets -------------------------------------------------------------------------
-
 CLASSES = ("background", "drivable", "car", "van", "truck")
 ROUND_TRIP = {  # nearest first, as slots are
     "car": (9.37, -4.21, -0.91, 3.9, 1.6, 1.5, np.pi / 2),
@@ -300,9 +289,6 @@ def test_dense_boxes_survive_the_round_trip(turn: float) -> None:
     found = decode_dense(dense, probabilities, "class_probabilities", VIEW, CLASSES, CLASSES[2:])
     same_boxes(found, boxes, atol=1e-4)
     assert all(box.score > 0.999 for box in found)
-
-
-# --- Cross-entropy (equation 4), focal, Lovász ----------------------------------------------------------------------
 
 
 def test_segmentation_loss_is_equation_4(rng: np.random.Generator) -> None:
@@ -432,9 +418,6 @@ def test_pointseg_loss_is_the_sum_of_its_parts(rng: np.random.Generator) -> None
     parts = cross_entropy(logits, labels, weights, focal_gamma=1.5) + 0.7 * lovasz_softmax(logits, labels)
     torch.testing.assert_close(total, parts)
     torch.testing.assert_close(pointseg_loss(logits, labels), cross_entropy(logits, labels))
-
-
-# --- Boxes ----------------------------------------------------------------------------------------------------------
 
 
 def test_paper_slots_loss_is_equations_5_and_6(rng: np.random.Generator) -> None:

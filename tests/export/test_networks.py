@@ -86,9 +86,6 @@ def agree(actual: torch.Tensor, expected: torch.Tensor) -> None:
     torch.testing.assert_close(actual, expected, rtol=1e-5, atol=1e-6)
 
 
-# --- SSADNet: context module
-
-
 def test_receptive_fields_follow_from_the_dilations() -> None:
     assert list(CONTEXT_DILATIONS) == [dilation for dilation, _ in TABLE_1]
     assert receptive_fields() == [field for _, field in TABLE_1]
@@ -134,9 +131,6 @@ def test_spatial_dropout_drops_whole_channels() -> None:
     assert 0.15 * 448 < dropped < 0.35 * 448  # 7 x 2 x 32 channels: within five standard deviations
 
 
-# --- SSADNet: pooling and its inverse
-
-
 @pytest.mark.parametrize("shape", [(1, 1, 2, 2), (2, 3, 8, 6), (1, 4, 10, 14)])
 @pytest.mark.parametrize("ties", [False, True])
 @pytest.mark.parametrize("memory_format", [torch.contiguous_format, torch.channels_last])
@@ -166,9 +160,6 @@ def test_of_equal_values_the_first_is_the_maximum(value: float) -> None:
     expected = torch.zeros(4, 6, dtype=torch.bool)
     expected[::2, ::2] = True
     assert torch.equal(mask, expected.expand(1, 2, 4, 6))
-
-
-# --- SSADNet: the whole network
 
 
 @pytest.mark.parametrize("head", ["slots", "slots-paper", "dense"])
@@ -309,9 +300,6 @@ def test_initial_weights_of_ssadnet_have_the_variance_that_elu_needs() -> None:
     assert boxes[:, 0].sigmoid().mean().item() == pytest.approx(HEAT_PRIOR, abs=0.03)
 
 
-# --- PointSeg
-
-
 @pytest.mark.parametrize("width", [512, 2048])
 def test_pointseg_halves_only_the_width(width: int) -> None:
     network = on_meta(PointSeg)
@@ -409,9 +397,6 @@ def test_pointseg_adds_skips_and_concatenates_only_the_enlarged() -> None:
     agree(got["deconv4"], gave["deconv3"] + gave["fire1"])
     agree(got["classifier"], gave["deconv4"] + gave["skip1"])
     assert torch.equal(gave["classifier"], logits)
-
-
-# --- SqueezeSegV2, KUL-Seg
 
 
 @pytest.mark.parametrize("width", [512, 2048])
@@ -553,9 +538,6 @@ def test_squeezesegv2_aggregates_context_three_times_and_adds_its_skips() -> Non
     assert torch.equal(gave["classifier"], logits)
 
 
-# --- Networks for small computers
-
-
 @pytest.mark.parametrize(
     ("network", "channels", "sizes"),
     [(PointSegEdge, 5, [(64, 512), (32, 256), (4, 8)]), (SSADNetEdge, 3, [(400, 200), (8, 16)])],
@@ -592,9 +574,6 @@ def test_spreading_moves_channels_to_pixels(block: tuple[int, int]) -> None:
     for row in range(rows):
         for col in range(cols):
             assert torch.equal(out[:, :, row::rows, col::cols], x[:, row * cols + col :: rows * cols])
-
-
-# --- LoDNN
 
 
 @pytest.mark.parametrize(("n_channels", "n_expected"), [(6, 947_458), (3, 946_594)])

@@ -54,9 +54,6 @@ def seen_by(mounting: Mounting, points: NDArray[np.float32]) -> NDArray[np.float
     return moved
 
 
-# --- what is given ---------------------------------------------------------------------------------------------------
-
-
 @given(mountings)
 def test_matrix_and_dict_give_the_mounting_back(mounting: Mounting) -> None:
     assert mounting.height_m is not None
@@ -156,9 +153,6 @@ def test_profiles_keep_their_mounting() -> None:
         SensorProfile.from_json(json.dumps(broken))
 
 
-# --- the frame of the models -----------------------------------------------------------------------------------------
-
-
 def test_scans_of_the_training_vehicle_are_not_moved(scans: list[NDArray[np.float32]]) -> None:
     frame = ModelFrame(MODEL_MOUNTING)
     assert frame.is_identity
@@ -204,9 +198,6 @@ def test_boxes_come_back(mounting: Mounting, yaw: float) -> None:
     np.testing.assert_allclose(back.center, box.center, atol=1e-6)
     assert math.remainder(back.yaw - box.yaw, 2 * math.pi) == pytest.approx(0.0, abs=0.02)
     assert (back.label, back.score, back.size) == (box.label, box.score, box.size)
-
-
-# --- what scans show -------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -328,9 +319,6 @@ def test_what_streets_differ_by_is_not_corrected(scans: list[NDArray[np.float32]
     )
     assert nearly == MODEL_MOUNTING
     assert clearly.pitch_deg == pytest.approx(2.5, abs=0.5)
-
-
-# --- through the perceiver -------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(

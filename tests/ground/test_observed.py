@@ -81,9 +81,6 @@ def at(mask: NDArray[np.bool_], x: tuple[float, float], y: tuple[float, float]) 
     return mask[row:last_row, first:last]
 
 
-# --- kernels against their twins -------------------------------------------------------------------------------------
-
-
 @patient
 @given(clouds, st.sampled_from([SMALL, AROUND, TopViewGeometry((0.0, 4.0), (-3.0, 3.0), cell_m=1.0)]))
 def test_the_kernels_agree_with_their_twins(points: NDArray[np.float32], view: TopViewGeometry) -> None:
@@ -135,9 +132,6 @@ def test_cells_of_any_states_agree_with_the_twin(seed: int) -> None:
     np.testing.assert_array_equal([observed, between], right)
 
 
-# --- properties ------------------------------------------------------------------------------------------------------
-
-
 @patient
 @given(clouds)
 def test_low_returns_observe_their_cells_and_order_does_not_matter(points: NDArray[np.float32]) -> None:
@@ -160,9 +154,6 @@ def test_drivable_cells_are_road_and_observed(points: NDArray[np.float32], seed:
     np.testing.assert_array_equal(view.drivable, (labels == 1) & observed)
     np.testing.assert_array_equal(view.road, labels == 1)
     assert view.drivable_area_m2 == 0.25 * np.count_nonzero(view.drivable)
-
-
-# --- scenes ----------------------------------------------------------------------------------------------------------
 
 
 def test_an_empty_scan_observes_nothing() -> None:
@@ -334,9 +325,6 @@ def test_large_views_have_bounded_tables() -> None:
     no_ground = SensorProfile("up", (5.0, 3.0), 1800)
     index = np.full((16, 12), -1, np.int32)
     assert not np.any(Observer(SMALL, no_ground).observe(np.empty((0, 4), np.float32), index))
-
-
-# --- for a planner ---------------------------------------------------------------------------------------------------
 
 
 def test_an_unobserved_cell_is_not_free() -> None:

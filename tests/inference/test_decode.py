@@ -30,9 +30,6 @@ def pixel_of(x: float, y: float) -> tuple[int, int]:
     return int((VIEW.x_range_m[1] - x) / VIEW.cell_m), int((VIEW.y_range_m[1] - y) / VIEW.cell_m)
 
 
-# --- classes
-
-
 @pytest.mark.parametrize("shape", [(1, 4, 64, 512), (1, 5, 7, 3), (2, 1, 1), (1, 1, 4, 5), (3, 0, 4)])
 def test_classes_agree_with_the_twin(shape: tuple[int, ...]) -> None:
     logits = np.random.default_rng(1).normal(0.0, 5.0, shape).astype(np.float32)
@@ -93,9 +90,6 @@ def test_classes_of_another_shape_or_kind_raise() -> None:
         decode_classes(np.zeros((2, 3, 4, 5), dtype=np.float32), "class_logits")
     with pytest.raises(CardMismatchError, match="box_dense"):
         decode_classes(np.zeros((1, 3, 4, 5), dtype=np.float32), "box_dense")
-
-
-# --- slots
 
 
 def slots_for(slots: Any, labels: np.ndarray | None = None, scores: np.ndarray | None = None) -> list[Any]:
@@ -164,9 +158,6 @@ def test_malformed_slots_are_refused() -> None:
             1.73,
         )
     assert slots_for(np.zeros((0, 4))) == []
-
-
-# --- slots with scores
 
 
 def scored_slots_for(slots: Any, class_output: np.ndarray | None = None, **options: Any) -> list[Any]:
@@ -249,9 +240,6 @@ def test_a_top_view_decodes_slots_with_and_without_scores() -> None:
         _, (box,) = decode_top_view(card, np.zeros(SHAPE, np.bool_), outputs, 0.3)
         assert box.label == "van"
         assert box.score == pytest.approx(score, abs=2e-3)
-
-
-# --- dense
 
 
 def dense_of(*boxes: Sequence[float]) -> np.ndarray:

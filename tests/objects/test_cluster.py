@@ -55,9 +55,6 @@ def car_points(
     return np.concatenate(seen)
 
 
-# --- clusters
-
-
 @pytest.mark.parametrize("seed", range(6))
 @pytest.mark.parametrize("per_m", [0.0, 0.02, 0.1])
 def test_clusters_match_a_test_of_every_pair(seed: int, per_m: float) -> None:
@@ -292,9 +289,6 @@ def test_a_wrong_shape_is_refused() -> None:
         find_clusters(np.zeros((2, 2), np.float32))
 
 
-# --- the class of a cluster
-
-
 def test_cluster_is_kept_if_more_than_min_share_has_one_class() -> None:
     clusters = np.repeat(np.array([0, 1, 2, 3, -1], np.int32), 10)
     labels = np.array([1] * 8 + [0] * 2 + [1] * 7 + [0] * 3 + [2] * 5 + [3] * 5 + [0] * 10 + [1] * 10, np.uint8)
@@ -326,9 +320,6 @@ def test_no_cluster_has_no_class() -> None:
 def test_labels_of_another_scan_are_refused() -> None:
     with pytest.raises(PointsError, match="expected the same"):
         cluster_labels(np.zeros(3, np.int32), np.zeros(4, np.uint8))
-
-
-# --- boxes
 
 
 @settings(max_examples=60, deadline=None)

@@ -216,9 +216,6 @@ def test_without_clusters_and_heights_the_boxes_are_the_same() -> None:
     np.testing.assert_allclose(on_ground.center, known.center, atol=1e-5)
 
 
-# --- the kernels
-
-
 def crowd(
     seed: int, n_people: int, per_cluster: int = 3, depth: float = 0.15
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:

@@ -48,9 +48,6 @@ def random_scene(rng: np.random.Generator, shape: tuple[int, int], n_classes: in
     return points, pixel, index, np.ascontiguousarray(labels[: shape[0], : shape[1]], dtype=np.uint8)
 
 
-# --- outliers
-
-
 def test_bleeding_onto_a_wall_is_removed_and_the_car_stays() -> None:
     ranges = np.full((20, 60), 22.0)
     car = (slice(6, 14), slice(20, 40))
@@ -161,9 +158,6 @@ def test_one_point_no_point_and_points_that_are_not_finite() -> None:
     assert remove_outliers(one * np.nan, index, labels, CLASSES)[1, 1] == 0
     empty = remove_outliers(none, index[:0], labels[:0], CLASSES)
     assert empty.shape == (0, 4)
-
-
-# --- points
 
 
 def test_points_behind_a_car_s_edge_are_not_car() -> None:

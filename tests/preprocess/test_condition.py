@@ -54,8 +54,6 @@ POWER = replace(LOGARITHM, kind="power", coefficients=(0.06, 0.4))
 # KUL-Seg, Table 4: Ouster's and Velodyne's intensity of vehicle, truck, ground and pillar.
 OUSTER, VELODYNE = np.array([45.91, 714.50, 113.28, 376.01]), np.array([3.78, 123.38, 5.60, 108.64])
 
-# --- remission -------------------------------------------------------------------------------------------------------
-
 
 def test_ranking_of_functions_matches_the_papers_table() -> None:
     """The ranking of the paper's Table 5: logarithm 58.26, line 72.12, parabola 132.87."""
@@ -233,9 +231,6 @@ def test_rendering_uses_the_profiles_range() -> None:
         render(raw.astype(np.float64), byte)
 
 
-# --- profiles in files -----------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("name", SENSORS)
 def test_profile_is_read_back_from_its_file(name: str, tmp_path: Path) -> None:
     file = tmp_path / "sensor.json"
@@ -299,9 +294,6 @@ def test_file_that_is_not_a_profile_is_refused(text: str, tmp_path: Path) -> Non
         get_sensor(tmp_path / "none.json")
     with pytest.raises(SensorError, match="RemissionFunction or None"):
         replace(HDL, remission=0.5)
-
-
-# --- interpolation ---------------------------------------------------------------------------------------------------
 
 
 def test_only_scans_of_a_coarser_sensor_are_interpolated() -> None:
@@ -442,9 +434,6 @@ def test_wrong_arrays() -> None:
         fill(column(10.0).astype(np.float64), np.full((14, 24), -1, np.int32))
 
 
-# --- the whole runtime -----------------------------------------------------------------------------------------------
-
-
 # Nothing but the sensor adapts the scan; a tilted street does not move it.
 ALONE = {"provider": "cpu", "n_threads": 1, "on_mismatch": "ignore", "mounting": MODEL_MOUNTING}
 
@@ -490,9 +479,6 @@ def test_rendered_scan_gives_the_reference_result() -> None:
     changed, changed_plain = (np.count_nonzero(each.points.labels != given.labels) for each in (rendered, plain))
     assert changed < 0.001 * len(points)
     assert changed * 10 < changed_plain
-
-
-# --- the command line ------------------------------------------------------------------------------------------------
 
 
 def test_adapt_fit_writes_what_run_takes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -604,8 +590,6 @@ def test_a_model_without_points_is_refused() -> None:
     with pytest.raises(ModelError, match="labels no points"):
         compare(["hdl-32e=simulation:1"], "ssadnet")
 
-
-# --- the door ---------------------------------------------------------------------------------------------------------
 
 RAW = replace(get_sensor("hdl-64e"), remission_range=(-3.0, 252.0))
 

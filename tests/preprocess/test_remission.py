@@ -59,9 +59,6 @@ def after(scans: Sequence[np.ndarray], sensor: SensorProfile) -> tuple[Remission
     return matcher, used
 
 
-# --- strata of some of the points ------------------------------------------------------------------------------------
-
-
 def test_some_points_are_whole_cells(streets: list[np.ndarray]) -> None:
     """Surfaces are fitted to all returns of a cell, so incidences of a part are those of the whole."""
     scan = streets[0]
@@ -87,9 +84,6 @@ def test_strata_of_no_points() -> None:
         assert len(strata) == len(rows) == len(incidences(empty[:0])) == 0
     with pytest.raises(PointsError, match=r"\(5, 3\)"):
         stratify(np.zeros((5, 3), np.float32))
-
-
-# --- matching --------------------------------------------------------------------------------------------------------
 
 
 def test_a_profile_that_fits_is_kept(streets: list[np.ndarray]) -> None:
@@ -243,9 +237,6 @@ def test_few_points_are_not_used(streets: list[np.ndarray]) -> None:
         assert matcher.n_scans == len(findings) == 0
 
 
-# --- no remission ----------------------------------------------------------------------------------------------------
-
-
 def test_missing() -> None:
     assert is_missing(np.zeros((300, 4), np.float32))
     assert not is_missing(np.zeros((299, 4), np.float32))
@@ -276,8 +267,6 @@ def test_a_scan_without_remission_gets_a_constant(streets: list[np.ndarray]) -> 
         later = streets[1] if sensor is HDL else as_bytes(streets[1])
         assert matcher.add(later)[1].remission != NO_REMISSION
 
-
-# --- hostile values --------------------------------------------------------------------------------------------------
 
 STRANGE = [0.0, 1.0, -1.0, 0.5, 255.0, 65535.0, 1e-40, 1e38, -1e38, np.inf, -np.inf, np.nan]
 
@@ -319,9 +308,6 @@ def test_any_points_are_survived(points: np.ndarray) -> None:
     assert len(strata) == len(rows)
     assert ((strata >= 0) & (strata < N_STRATA)).all()
     assert used is BYTE or matcher.matched is not None or used.remission == NO_REMISSION
-
-
-# --- the whole runtime -----------------------------------------------------------------------------------------------
 
 
 def perceiver(sensor: SensorProfile | str = "hdl-64e", **options: object) -> Perceiver:
@@ -397,9 +383,6 @@ def test_reset_and_options(streets: list[np.ndarray]) -> None:
     for adapt in ("none", "interpolation"):
         assert perceiver(BYTE, on_mismatch="ignore", adapt=adapt)(dark).remission is None
     assert perceiver(BYTE, on_mismatch="ignore", adapt="remission")(dark).remission == found.remission
-
-
-# --- real scans ------------------------------------------------------------------------------------------------------
 
 
 def test_kitti_scans_are_not_converted(kitti_root: Path) -> None:

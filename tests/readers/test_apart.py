@@ -61,9 +61,6 @@ def started(monkeypatch: pytest.MonkeyPatch) -> list[subprocess.Popen[bytes]]:
     return processes
 
 
-# --- the process -----------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="no such signal")
 def test_a_process_that_is_killed(ouster: Path, started: list[subprocess.Popen[bytes]]) -> None:
     scans = read_scans(ouster / "sphere.pcap")
@@ -141,9 +138,6 @@ def test_a_program_without_a_guard(ouster: Path, tmp_path: Path) -> None:
         [sys.executable, tmp_path / "program.py", ouster / "sphere.pcap"], cwd=elsewhere, capture_output=True, text=True
     )
     assert (done.returncode, done.stdout) == (0, "3\n"), done.stderr
-
-
-# --- packets and metadata --------------------------------------------------------------------------------------------
 
 
 def records_of(content: bytes) -> list[bytes]:
@@ -286,9 +280,6 @@ def test_metadata_that_would_end_the_process(ouster: Path, tmp_path: Path) -> No
     assert "columns_per_packet" in error
 
 
-# --- random damage ---------------------------------------------------------------------------------------------------
-
-
 def read_whole(path: Path) -> None:
     """Every scan and perhaps a `PointsError`; another error fails the test."""
     with suppress(PointsError):
@@ -373,9 +364,6 @@ def test_osf_files_with_damage_and_right_checksums(ouster: Path, tmp_path: Path)
         damaged[end : end + 4] = struct.pack("<I", zlib.crc32(damaged[at:end]))
         (tmp_path / "damaged.osf").write_bytes(damaged)
         read_whole(tmp_path / "damaged.osf")
-
-
-# --- compressed files ------------------------------------------------------------------------------------------------
 
 
 def pack(content: bytes, method: str) -> bytes:

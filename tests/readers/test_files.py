@@ -324,9 +324,6 @@ def test_pickles_do_not_run(tmp_path: Path) -> None:
         read_points(save(tmp_path, "bad.npy", npy(np.array([Bad()], dtype=object))))
 
 
-# --- arrays ----------------------------------------------------------------------------------------------------------
-
-
 def test_points_pass_uncopied() -> None:
     assert as_points(POINTS) is POINTS
     assert read_points(POINTS) is POINTS
@@ -413,8 +410,6 @@ def test_ten_million_points(tmp_path: Path) -> None:
     assert points.shape == many.shape
     assert points[-1, 0] == many[-1, 0]
 
-
-# --- anything at all -------------------------------------------------------------------------------------------------
 
 PREFIXES = [
     b"",

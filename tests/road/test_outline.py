@@ -51,9 +51,6 @@ def traced(cells: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], list[NDArray[np
     return part, rings_of(part)
 
 
-# --- kernels against their twins -------------------------------------------------------------------------------------
-
-
 @given(MASKS, st.floats(0.0, 12.0))
 def test_cells_grow_by_a_disc(cells: NDArray[np.bool_], radius: float) -> None:
     grown = ~cells
@@ -161,9 +158,6 @@ def test_corners_are_merged_as_by_the_twin(cells: NDArray[np.bool_], data: st.Da
     assert list(map(tuple, few.tolist())) == expected
     assert Polygon(few, holes).is_valid
     assert Polygon(few).symmetric_difference(Polygon(outer)).intersection(shape_of(~changeable)).area < 1e-9
-
-
-# --- the polygon -----------------------------------------------------------------------------------------------------
 
 
 def polygon_of(outline: Outline) -> Polygon:

@@ -84,9 +84,6 @@ def last_status(graph: FakeGraph) -> Any:
     return MESSAGES.decode(graph.published["/diagnostics"][-1], DIAGNOSTICS).status[0]
 
 
-# --- the node --------------------------------------------------------------------------------------------------------
-
-
 def test_a_cloud_is_answered_with_its_stamp_and_frame() -> None:
     graph, perceive, described = FakeGraph(), Perceive(), []
 

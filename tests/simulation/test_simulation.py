@@ -136,9 +136,6 @@ def near_scene(seed: int, environment: str | None = None) -> Scene:
     return scene
 
 
-# --- kernels and their twins -----------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(("seed", "tilt"), [(0, 0.0), (1, 0.03), (2, 0.03)])
 def test_cast_is_its_twin(seed: int, tilt: float) -> None:
     scene = near_scene(seed)

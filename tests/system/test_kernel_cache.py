@@ -251,9 +251,6 @@ def test_functions_of_one_name_are_not_confused(place: Place) -> None:
         assert (module.up(1.0), module.shifted(1.0), module.up(1.0)) == (2.0, 0.0, 2.0)
 
 
-# --- folders ---------------------------------------------------------------------------------------------------------
-
-
 def status(**changed: int) -> Any:
     return SimpleNamespace(**{"st_uid": 1000, "st_mode": 0o40755, **changed})
 
@@ -462,8 +459,6 @@ def test_a_file_that_numba_cannot_load_is_compiled_again(
     assert place.start() == ([], 0)
 
 
-# --- what the machine code depends on --------------------------------------------------------------------------------
-
 CALLER = """
 import numpy as np
 from edgeperc.system.kernel_cache import njit
@@ -667,9 +662,6 @@ def test_the_internals_of_numba_that_are_used_exist() -> None:
     assert hasattr(result.library, "_shared_module")
 
 
-# --- the kernels of edgeperc -----------------------------------------------------------------------------------------
-
-
 def test_every_kernel_of_edgeperc_is_kept_here() -> None:
     n_kernels = 0
     for found in pkgutil.walk_packages(edgeperc.__path__, "edgeperc."):
@@ -776,8 +768,6 @@ print(sorted({"scipy.linalg", "numba.np.arraymath", "numba.np.linalg"} & set(sys
         answer = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     assert answer.strip() == "[]"
 
-
-# --- what is compiled when -------------------------------------------------------------------------------------------
 
 CALLS = """
 import itertools, json, pkgutil, sys, warnings

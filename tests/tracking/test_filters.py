@@ -64,9 +64,6 @@ def update(
     return states, covariance
 
 
-# --- filters ---------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("n", [0, 1, 6])
 def test_predictions_are_those_of_the_twin(n: int) -> None:
     rng = np.random.default_rng(n)
@@ -267,9 +264,6 @@ def detected(places: np.ndarray, groups: np.ndarray) -> Detections:
     n = len(places)
     nothing = np.full(n, np.nan)
     return Detections(places, np.full((n, 4), np.nan), nothing, nothing, groups, groups, nothing, groups)
-
-
-# --- association -----------------------------------------------------------------------------------------------------
 
 
 def associate(weights: np.ndarray, max_events: int = MAX_EVENTS) -> tuple[np.ndarray, int]:

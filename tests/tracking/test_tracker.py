@@ -37,9 +37,6 @@ from edgeperc_bench.peers.tracking import crossing
 STANDING = np.eye(4)  # without poses, the motion of a single object cannot be separated from the sensor's
 
 
-# --- the sensor's own motion -----------------------------------------------------------------------------------------
-
-
 def some_places(rng: np.random.Generator, n: int) -> np.ndarray:
     return np.column_stack([rng.uniform(-20.0, 20.0, (n, 2)), rng.uniform(0.05, 1.0, n), rng.integers(0, 2, n)])
 
@@ -146,9 +143,6 @@ def test_with_poses_what_stands_still_stands_still_in_the_world() -> None:
     assert sorted(moved.values())[-2] < 0.4  # all but the oncoming car
     (oncoming,) = [name for name, distance in moved.items() if distance > 5.0]
     assert abs(speeds[oncoming]) == pytest.approx(12.0, abs=0.5)
-
-
-# --- the life of a track ---------------------------------------------------------------------------------------------
 
 
 def test_birth_confirmation_coasting_memory_and_death() -> None:
@@ -409,8 +403,6 @@ def test_memory_stays_flat() -> None:
         tracemalloc.stop()
     assert sizes[1] - sizes[0] < 20_000
 
-
-# --- errors ----------------------------------------------------------------------------------------------------------
 
 BAD_BOXES = [
     replace(box("car", 10.0, 0.0), center=(math.nan, 0.0, 0.0)),

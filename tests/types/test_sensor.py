@@ -23,8 +23,6 @@ from edgeperc.preprocess.fitness import SUMS, FitnessProfile, Histograms, Rows, 
 from edgeperc.readers.files import read_points
 from edgeperc.types.sensor import SENSORS, SensorProfile, get_sensor
 
-# --- profiles --------------------------------------------------------------------------------------------------------
-
 
 def test_built_in_profiles() -> None:
     beams = {name: profile.n_beams for name, profile in SENSORS.items()}
@@ -97,8 +95,6 @@ def test_impossible_numbers_of_beams_are_refused(beams: Any) -> None:
     with pytest.raises(SensorError, match="finite"):
         SensorProfile.uniform("mine", 3, float("nan"), -1)
 
-
-# --- a street --------------------------------------------------------------------------------------------------------
 
 SENSOR = get_sensor("hdl-64e")
 
@@ -262,9 +258,6 @@ def test_the_view_holds_its_share_of_the_points(azimuth_deg: tuple[float, float]
     assert measured.beams[0] == pytest.approx(64, abs=6)
 
 
-# --- the kernel ------------------------------------------------------------------------------------------------------
-
-
 def check_against_twin(points: np.ndarray, step: int, beam_step: int, view: Any) -> None:
     histograms = Histograms(*(np.full(size, 99, np.int64) for size in (258, 360, 200, (3, 100))))
     rows, sums = Rows(np.full((8, 1024), 99.0), np.full(8, 99, np.int64)), np.empty(1, SUMS)
@@ -298,9 +291,6 @@ def test_scan_sums_agree_with_the_twin_on_a_street(step: int, beam_step: int) ->
 def test_scan_sums_agree_with_the_twin_on_random_scans(points: np.ndarray, step: int) -> None:
     with np.errstate(invalid="ignore", over="ignore"):
         check_against_twin(points, step, 1, (-0.5, 0.5))
-
-
-# --- real scans ------------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")

@@ -60,9 +60,6 @@ def test_a_plain_model_is_opened(tmp_path: Path) -> None:
     assert Perceiver(session.path, provider="cpu").cards == (tiny_card(),)
 
 
-# --- the file ---------------------------------------------------------------------------------------------------------
-
-
 def test_what_is_no_regular_file_is_refused_at_once(tmp_path: Path) -> None:
     pipe, folder = tmp_path / "pipe.onnx", tmp_path / "folder.onnx"
     folder.mkdir()
@@ -94,8 +91,6 @@ def test_a_huge_file_is_refused_unread(tmp_path: Path) -> None:
     with pytest.raises(ModelFileError, match="has 2000000001 bytes; expected at most 2000000000"):
         Session(path)
 
-
-# --- the graph --------------------------------------------------------------------------------------------------------
 
 LOCATION = field(1, b"location") + field(2, b"/etc/passwd")
 REVERSED = field(2, b"/etc/passwd") + field(1, b"location")
@@ -301,9 +296,6 @@ def test_a_first_run_without_end_is_given_up(tmp_path: Path, monkeypatch: pytest
         Session(path, "cpu")
 
 
-# --- the card ---------------------------------------------------------------------------------------------------------
-
-
 def test_a_model_without_a_golden_record_is_reported(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     path = write(tmp_path, model(graph(CONVOLUTION, INITIALIZER), card=replace(tiny_card(), golden=None)))
     with caplog.at_level(logging.WARNING):
@@ -427,9 +419,6 @@ def test_a_fitness_profile_out_of_its_bounds_is_named(name: str, value: object) 
     assert FitnessProfile.from_dict(profile).to_dict() == profile
     with pytest.raises(CardError, match=rf"fitness\.{name}(\[.\])? is .*expected"):
         FitnessProfile.from_dict(profile | {name: value})
-
-
-# --- anything at all --------------------------------------------------------------------------------------------------
 
 
 def opened_or_refused(blob: bytes) -> None:

@@ -366,8 +366,6 @@ def test_mistakes_need_matplotlib(monkeypatch: pytest.MonkeyPatch, scan: np.ndar
         draw_mistakes([some_mistakes(scan)])
 
 
-# --- anything may be drawn -------------------------------------------------------------------------------------------
-
 wild = st.floats(allow_nan=True, allow_infinity=True) | st.sampled_from([0.0, -0.0, 1e30, -1e308, 1e-300, 5.0, 20.0])
 wild_boxes = st.builds(
     Box,
@@ -403,9 +401,6 @@ def test_boxes_reach_behind_the_camera(scan: np.ndarray, perception: Perception)
     long = Box("truck", 0.5, (0.0, 0.0, 0.0), (60.0, 3.0, 3.0), 0.0)
     picture = pixels(view.draw(replace(perception, boxes=(long,)), scan))
     assert near(picture[128:648, 560:], "truck").sum() > 200
-
-
-# --- text ------------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.usefixtures("matplotlib")
@@ -499,9 +494,6 @@ def test_ground_is_a_plane_through_the_road() -> None:
     assert fit_ground(points[:0], names, painted[:0]) == (-1.73, 0.0, 0.0)
 
 
-# --- the page in a browser -------------------------------------------------------------------------------------------
-
-
 def test_page_shows_and_hides(scan: np.ndarray, perception: Perception, browser: Any, tmp_path: Path) -> None:
     write_html(perception, scan, tmp_path / "page.html", title="a <b>scan</b>")
     wrong: list[str] = []
@@ -531,9 +523,6 @@ def test_page_shows_and_hides(scan: np.ndarray, perception: Perception, browser:
     assert shown("drivable") == 0
     page.close()
     assert not wrong
-
-
-# --- tracks ----------------------------------------------------------------------------------------------------------
 
 
 def test_tracks_lie_on_the_scan(scan: np.ndarray, perception: Perception, tmp_path: Path) -> None:
