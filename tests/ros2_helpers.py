@@ -5,7 +5,6 @@ from __future__ import annotations
 import sys
 import threading
 import time
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -17,10 +16,10 @@ from edgeperc.ros2.zenoh_graph import ZenohGraph
 from edgeperc.simulation.drawn import random_scene
 from edgeperc.simulation.scene import simulate
 from edgeperc.types.sensor import get_sensor
+from waiting import TIMEOUT_S, until
 
-__all__ = ["FIELDS", "MESSAGES", "TIMEOUT_S", "Perceive", "cloud", "publish", "scans", "until"]
+__all__ = ["FIELDS", "MESSAGES", "Perceive", "cloud", "publish", "scans"]
 
-TIMEOUT_S = 120.0  # nothing here takes long; a test that waits this long has failed
 MESSAGES = RosMessages()
 FIELDS = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", "<f4")]
 
@@ -49,14 +48,6 @@ def cloud(points: np.ndarray, stamp_ns: int = 10**9, frame_id: str = "velodyne",
         "is_dense": True,
     }
     return MESSAGES.encode(make[CLOUD](**{**usual, **changes}))
-
-
-def until(condition: Callable[[], Any]) -> None:
-    """Wait for what another thread or process brings about."""
-    end = time.monotonic() + TIMEOUT_S
-    while not condition():
-        assert time.monotonic() < end, "it never came about"
-        time.sleep(0.01)
 
 
 class Perceive:

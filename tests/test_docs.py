@@ -17,8 +17,7 @@ from checkout import REPOSITORY, files
 from edgeperc import cli
 from edgeperc.cli.main import build_parser
 from edgeperc.simulation.camera import forward_camera, render
-from edgeperc.simulation.drawn import random_scene
-from edgeperc.simulation.scene import simulate
+from scenes import urban
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -70,7 +69,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for name in ("scan.bin", "drive/0.bin", "drive/1.bin", "velodyne/0.bin", "velodyne/1.bin"):
         seed = 4 + len(name)
         (folder / name).parent.mkdir(exist_ok=True)
-        simulate(random_scene(seed, "urban"), "hdl-64e", seed=seed).points.tofile(folder / name)
+        urban(seed).points.tofile(folder / name)
     (folder / "calib.txt").write_text(
         "P2: 831 0 480 0 0 831 360 0 0 0 1 0\nR0_rect: 1 0 0 0 1 0 0 0 1\n"
         "Tr_velo_to_cam: 0 -1 0 0 0 0 -1 -0.08 1 0 0 -0.27\n"
@@ -79,7 +78,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
         from PIL import Image
 
         camera = forward_camera()
-        scan = simulate(random_scene(12, "urban"), "hdl-64e", seed=12)
+        scan = urban(12)
         Image.fromarray(render(scan.scene, camera, scan.T_world_sensor, 12).rgb).save(folder / "image.png")
     (folder / "T_vehicle_sensor.json").write_text("[[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 1.7], [0, 0, 0, 1]]")
     if sys.platform != "win32":

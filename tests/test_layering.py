@@ -317,8 +317,11 @@ def test_tests_use_public_names() -> None:
                 names = [alias.name for alias in node.names]
             elif isinstance(node, ast.Attribute) and ast.unparse(node.value) not in others:
                 names = [node.attr]
-            elif isinstance(node, ast.Call) and ast.unparse(node.func).endswith("setattr"):
+            elif isinstance(node, ast.Call) and ast.unparse(node.func).endswith(
+                ("setattr", "patch.object", "multiple")
+            ):
                 names = [str(a.value).rpartition(".")[2] for a in node.args[:2] if isinstance(a, ast.Constant)]
+                names += [str(keyword.arg) for keyword in node.keywords]
             private = {each for each in names if each.startswith("_") and each[1:2] != "_"} - OF_OTHERS
             reached += [f"{path.name}:{node.lineno} {each}" for each in private]
     assert not reached

@@ -5,7 +5,6 @@ from __future__ import annotations
 import gc
 import math
 import threading
-import time
 import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -19,9 +18,9 @@ import edgeperc
 from edgeperc import live
 from edgeperc.errors import InferenceError, PointsError
 from edgeperc.live import stream
+from waiting import TIMEOUT_S, until
 
 # Nothing here takes long; a test that waits this long has failed.
-TIMEOUT_S = 30.0
 
 
 def scan(k: int) -> np.ndarray:
@@ -34,14 +33,6 @@ def perceive(points: Any, stamp_s: float | None = None) -> Any:
 
 def readers() -> list[threading.Thread]:
     return [thread for thread in threading.enumerate() if thread.name == "edgeperc-source"]
-
-
-def until(condition: Callable[[], Any]) -> None:
-    """Wait for what another thread brings about."""
-    end = time.monotonic() + TIMEOUT_S
-    while not condition():
-        assert time.monotonic() < end, "it never came about"
-        time.sleep(0.001)
 
 
 @pytest.fixture(autouse=True)

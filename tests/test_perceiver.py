@@ -50,11 +50,12 @@ from edgeperc.types.perception import PointLabels
 from edgeperc.types.sensor import get_sensor
 from edgeperc.types.views import RangeImageGeometry, TopViewGeometry
 from edgeperc.zoo import model_path, shipped_models
+from scenes import urban
 
 
 @pytest.fixture(scope="module")
 def scan() -> SimulatedScan:
-    return simulate(random_scene(8, "urban"), "hdl-64e", seed=8)
+    return urban(8)
 
 
 @pytest.fixture(scope="module")
@@ -288,7 +289,7 @@ def test_two_threads_share_the_sectors_of_a_full_turn(
 
 def test_result_does_not_depend_on_earlier_scans(perceive: Perceiver, perception: Perception) -> None:
     other = simulate(random_scene(9), "hdl-64e", seed=9).points
-    again = simulate(random_scene(8, "urban"), "hdl-64e", seed=8).points
+    again = urban(8).points.copy()
     perceive(other)
     assert_same(perception, perceive(again))
 

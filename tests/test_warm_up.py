@@ -11,6 +11,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -166,19 +167,13 @@ def test_what_cannot_start_is_reported(
     assert "no helper process" in caplog.text
 
 
-@pytest.mark.parametrize("executable", ["/usr/bin/robot", "/opt/uwsgi", "", None])
-def test_an_application_that_embeds_python_is_not_started_again(
-    helpers: Callable[[str], Helpers], monkeypatch: pytest.MonkeyPatch, executable: str | None
+@pytest.mark.parametrize(
+    ("name", "value"), [*product(["executable"], ["/usr/bin/robot", "/opt/uwsgi", "", None]), ("frozen", True)]
+)
+def test_an_application_that_embeds_python_or_is_frozen_is_not_started_again(
+    helpers: Callable[[str], Helpers], monkeypatch: pytest.MonkeyPatch, name: str, value: object
 ) -> None:
-    monkeypatch.setattr(sys, "executable", executable)
-    with helpers(HANGS) as running:
-        assert not running.running
-
-
-def test_a_frozen_application_is_not_started_again(
-    helpers: Callable[[str], Helpers], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(sys, "frozen", True, raising=False)
+    monkeypatch.setattr(sys, name, value, raising=name != "frozen")
     with helpers(HANGS) as running:
         assert not running.running
 

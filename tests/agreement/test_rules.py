@@ -45,16 +45,15 @@ from edgeperc.agreement.votes import (
     fill_votes,
     find_persons_alone,
 )
-from edgeperc.cli import arguments
 from edgeperc.ground.planes import Ground, find_ground
 from edgeperc.ground.scan import Scan
 from edgeperc.objects.boxes import objects_from_points
 from edgeperc.objects.cluster import find_clusters, sort_points
-from edgeperc.simulation.drawn import random_scene
-from edgeperc.simulation.scene import simulate
+from edgeperc.types import choices
 from edgeperc.types.geometry import Grid, inside
 from edgeperc.types.points import Cloud, Labeled, read_only
 from edgeperc.types.views import TopViewGeometry
+from scenes import urban
 
 CLASSES = ("background", "car", "pedestrian", "cyclist")
 ROLES = np.array([0, 1, 2, 2], np.uint8)
@@ -386,7 +385,7 @@ def test_arrays_of_a_scan_must_agree() -> None:
 
 
 def test_rules_are_those_of_the_command_line() -> None:
-    assert tuple(sorted(RULES)) == arguments.RULES
+    assert tuple(sorted(RULES)) == choices.RULES
 
 
 def block(
@@ -653,7 +652,7 @@ def test_cells_of_dropped_boxes_are_no_vehicles() -> None:
 
 @pytest.mark.parametrize("models", ["pointseg", "lodnn", ["ssadnet", "pointseg"]])
 def test_perceivers_of_one_view_agree_too(models: str | list[str]) -> None:
-    scan = simulate(random_scene(6, "urban"), "hdl-64e", seed=6).points
+    scan = urban(6).points
     options = {"provider": "cpu", "n_threads": 1, "on_mismatch": "ignore"}
     alone, agreed = Perceiver(models, agree=False, **options), Perceiver(models, **options)
     found = agreed(scan)

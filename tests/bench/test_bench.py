@@ -538,11 +538,10 @@ def no_wait(psutil: None, monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_a_full_turn_is_a_setting_of_its_own(no_wait: None, tmp_path: Path) -> None:
     simulated_scan(5).points[::10].tofile(tmp_path / "own.bin")
-    command = ["run", *FEW, "--scenario", "single-stream", "--min-scans", "2", "--input", str(tmp_path / "own.bin")]
-    for name, extra in (("ahead", []), ("around", ["--full-turn"])):
-        assert cli.main([*command, *extra, "--json", str(tmp_path / f"{name}.json")]) == 0
-    (ahead,), (around,) = (read_report(tmp_path / f"{name}.json")["settings"] for name in ("ahead", "around"))
-    assert setting_label(around) == f"{setting_label(ahead)}, full turn"
+    command = ["run", *FEW, "--scenario", "single-stream", "--min-scans", "2", "--full-turn"]
+    assert cli.main([*command, "--input", str(tmp_path / "own.bin"), "--json", str(tmp_path / "a.json")]) == 0
+    (around,) = read_report(tmp_path / "a.json")["settings"]
+    assert setting_label(around) == f"{setting_label(around | {'full_turn': False})}, full turn"
     assert worker.make_perceiver(worker.Job(("pointseg",), "cpu", full_turn=around["full_turn"])).full_turn
 
 
@@ -554,6 +553,7 @@ def test_a_run_from_scans_to_files(no_wait: None, tmp_path: Path, capsys: pytest
     measured = read_report(tmp_path / "a.json")
     assert measured["complete"]
     (setting,) = measured["settings"]
+    assert "full turn" not in setting_label(setting)
     (only,) = setting["repeats"]
     assert [len(each["ms"]) for each in only["scenarios"].values()] == [3, 3]
     (engine,) = only["engines"]

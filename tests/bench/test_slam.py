@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from edgeperc import Box, MissingExtraError, Perception
+from edgeperc import MissingExtraError, Perception
 from edgeperc_bench.peers import slam
 from edgeperc_bench.peers.slam import (
     CELL_M,
@@ -23,6 +23,7 @@ from edgeperc_bench.peers.slam import (
     step_errors,
     trajectory_error,
 )
+from scenes import box
 
 
 def turned(degrees: float, *place: float) -> NDArray[np.float64]:
@@ -83,17 +84,13 @@ def test_cells_of_a_map_with_a_moving_point_are_counted_once() -> None:
     assert ghost_share([scan], [~whole], [moving], poses[:1]) == 0.0
 
 
-def car(x: float, y: float) -> Box:
-    return Box("car", 1.0, (x, y, -0.9), (4.0, 1.8, 1.5), 0.0)
-
-
 def test_labels_move_by_their_motion_over_ground() -> None:
     """From a vehicle at 8 m/s: one car ahead that is as fast, one parked; one that sets off after two seconds."""
     labels, poses = [], []
     for k in range(40):
         way = 0.8 * k
         later = 60.0 + 0.5 * max(0, k - 20) - way
-        labels.append([car(12.0, 0.0), car(45.0 - way, 6.0), car(later, -4.0)])
+        labels.append([box(12.0, 0.0), box(45.0 - way, 6.0), box(later, -4.0)])
         poses.append(turned(0.0, way, 0.0, 0.0))
     found = moving_boxes(labels, np.array(poses))
     assert all(labels[k][0] in boxes for k, boxes in enumerate(found))  # from the first scan on
@@ -115,11 +112,11 @@ def drive_with_a_car(n: int = 16) -> tuple[Drive, Any]:
         poses.append(pose)
         moving.append(np.arange(len(points)) >= 400)
     every = [np.ones(500, np.bool_)] * n
-    parked = [[car(25.0 + 7.0 * i - 0.8 * k, -6.0 if i % 2 else 6.0) for i in range(4)] for k in range(n)]
-    drive = Drive("d", scans, np.array(poses), moving, every, every, [[car(12.0, 0.0), *parked[k]] for k in range(n)])
+    parked = [[box(25.0 + 7.0 * i - 0.8 * k, -6.0 if i % 2 else 6.0) for i in range(4)] for k in range(n)]
+    drive = Drive("d", scans, np.array(poses), moving, every, every, [[box(12.0, 0.0), *parked[k]] for k in range(n)])
 
     def perceive(points: NDArray[np.float32], stamp_s: float) -> Perception:
-        boxes = (car(12.0, 0.0), *parked[round(10.0 * stamp_s)])
+        boxes = (box(12.0, 0.0), *parked[round(10.0 * stamp_s)])
         return Perception(len(points), 0, None, None, boxes, {}, {}, (), stamp_s)
 
     return drive, perceive

@@ -32,8 +32,7 @@ from edgeperc import (
     PointsError,
 )
 from edgeperc.camera.image import MAX_EDGE
-from edgeperc.simulation.drawn import random_scene
-from edgeperc.simulation.scene import simulate
+from scenes import urban
 
 RED, GREEN, BLUE = (200, 10, 20), (10, 200, 20), (20, 10, 200)
 
@@ -152,7 +151,7 @@ def test_one_perceiver_in_threads_gives_the_same_result(perceive: Perceiver, ima
 def test_scan_and_image_in_one_call(model: Path, perceive: Perceiver, image: NDArray[np.uint8]) -> None:
     """Each part is what it is without the other."""
     options: dict[str, Any] = {"provider": "cpu", "n_threads": 1, "on_mismatch": "ignore"}
-    scan = simulate(random_scene(8, "urban"), "hdl-64e", seed=8).points
+    scan = urban(8).points
     alone = Perceiver(["pointseg"], **options)(scan)
     both = Perceiver(["pointseg", model], **options)
     assert [card.name for card in both.cards] == ["pointseg", "tinycam"]

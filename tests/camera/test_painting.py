@@ -33,15 +33,7 @@ from edgeperc import (
     paint,
     road_ahead,
 )
-from edgeperc.camera.painting import (
-    MAX_CELLS,
-    UNSEEN,
-    DepthBuffer,
-    Pixels,
-    Windows,
-    fill_nearest,
-    fill_painted,
-)
+from edgeperc.camera import painting
 from edgeperc.evaluation.painting import beside_edges, count_painting
 from edgeperc.simulation.camera import CAMERA_CLASSES, VOID, CameraImage, forward_camera, render
 from edgeperc.simulation.drawn import random_scene
@@ -89,23 +81,23 @@ def test_kernels_equal_twins(seed: int, n: int) -> None:
     rng = np.random.default_rng(seed)
     points, u, v, depth, between, half_up, half_down = a_case(rng, n)
     half_side, cell_h, cell_w = float(rng.uniform(0.1, 5.0)), *rng.integers(1, 4, 2).tolist()
-    buffer = DepthBuffer(np.empty((-(-48 // cell_h), -(-64 // cell_w)), np.float32), cell_h, cell_w)
-    pixels, windows = Pixels(u, v, depth), Windows(between, half_up, half_down, half_side)
-    fill_nearest(points, pixels, windows, buffer)
-    slow = twins.painting.nearest(points, *pixels, *windows, cell_h, cell_w, buffer.nearest.shape, MAX_CELLS)
+    buffer = painting.DepthBuffer(np.empty((-(-48 // cell_h), -(-64 // cell_w)), np.float32), cell_h, cell_w)
+    pixels, windows = painting.Pixels(u, v, depth), painting.Windows(between, half_up, half_down, half_side)
+    painting.fill_nearest(points, pixels, windows, buffer)
+    slow = twins.painting.nearest(points, *pixels, *windows, cell_h, cell_w, buffer.nearest.shape, painting.MAX_CELLS)
     np.testing.assert_array_equal(buffer.nearest, slow)
     assert np.isfinite(buffer.nearest).any() or n < 60
     labels = rng.integers(0, 256, (48, 64), np.uint8)
     painted = np.empty(n, np.uint8)
     slack = rng.uniform(0.0, 0.5), rng.uniform(0.0, 0.1)
-    fill_painted(labels, pixels, buffer, *slack, painted)
+    painting.fill_painted(labels, pixels, buffer, *slack, painted)
     slow = twins.painting.painted(labels, *pixels, *buffer, *slack)
     np.testing.assert_array_equal(painted, slow)
 
     # In any order, and the nearest point is never hidden.
     order = rng.permutation(n)
     turned = buffer._replace(nearest=np.empty_like(buffer.nearest))
-    fill_nearest(points[order], Pixels(*(each[order] for each in pixels)), windows, turned)
+    painting.fill_nearest(points[order], painting.Pixels(*(each[order] for each in pixels)), windows, turned)
     np.testing.assert_array_equal(turned.nearest, buffer.nearest)
     first = np.argmin(np.where(np.isfinite(u), depth, np.inf)) if n else 0
     if n and math.isfinite(u[first]) and 0 <= u[first] < 63 and 0 <= v[first] < 47:
@@ -116,8 +108,8 @@ def test_kernels_equal_twins(seed: int, n: int) -> None:
 def test_the_last_float_of_a_pixel() -> None:
     """0.49999999999999994 + 0.5 is 1.0, beside an image of one pixel."""
     last, painted = np.array([np.nextafter(0.5, 0.0)]), np.empty(1, np.uint8)
-    pixels, buffer = Pixels(last, last, np.ones(1)), DepthBuffer(np.ones((1, 1), np.float32), 1, 1)
-    fill_painted(np.array([[3]], np.uint8), pixels, buffer, 0.1, 0.0, painted)
+    pixels, buffer = painting.Pixels(last, last, np.ones(1)), painting.DepthBuffer(np.ones((1, 1), np.float32), 1, 1)
+    painting.fill_painted(np.array([[3]], np.uint8), pixels, buffer, 0.1, 0.0, painted)
     assert painted.tolist() == [3]
 
 
@@ -125,10 +117,10 @@ def test_the_last_float_of_a_pixel() -> None:
 def test_a_window_is_bounded() -> None:
     """A point that nearly touches the camera covers 49 x 49 cells at most."""
     points = np.array([[0.2701, 0.0, -0.08]], np.float32)
-    buffer = DepthBuffer(np.empty((480, 640), np.float32), 1, 1)
-    windows = Windows(np.empty(0), np.full(1, 5.0), np.full(1, 5.0), 5.0)
-    fill_nearest(points, Pixels(*NEAR.project(points)), windows, buffer)
-    assert 40**2 < np.count_nonzero(np.isfinite(buffer.nearest)) <= (2 * MAX_CELLS + 1) ** 2
+    buffer = painting.DepthBuffer(np.empty((480, 640), np.float32), 1, 1)
+    windows = painting.Windows(np.empty(0), np.full(1, 5.0), np.full(1, 5.0), 5.0)
+    painting.fill_nearest(points, painting.Pixels(*NEAR.project(points)), windows, buffer)
+    assert 40**2 < np.count_nonzero(np.isfinite(buffer.nearest)) <= (2 * painting.MAX_CELLS + 1) ** 2
 
 
 @pytest.mark.parametrize(("sensor", "calibration"), [("hdl-64e", NEAR), ("hdl-64e", FAR), ("os1-64", NEAR)])
@@ -180,7 +172,7 @@ def test_a_hidden_point_is_not_painted() -> None:
     assert behind.sum() > 1000
     assert above.sum() > 1000
     assert (painted[above] == 7).all()
-    assert (painted[behind] == UNSEEN).all()
+    assert (painted[behind] == painting.UNSEEN).all()
     assert (painted[inside & (np.arange(len(points)) < len(screen))] == 7).all()
 
 
@@ -210,8 +202,8 @@ def test_any_points_are_painted_or_unseen(seed: int, n: int, columns: int) -> No
     scan[:, :3] = points[:, :3]
     kept, _ = twins.returns.returns(scan, get_sensor("vlp-16").min_range_m)  # what is nearer is not a return
     inside &= np.isfinite(kept).all(axis=1)
-    assert (painted[~inside] == UNSEEN).all()
-    took = painted != UNSEEN
+    assert (painted[~inside] == painting.UNSEEN).all()
+    took = painted != painting.UNSEEN
     row, col = np.floor(v[took] + 0.5).astype(int), np.floor(u[took] + 0.5).astype(int)
     np.testing.assert_array_equal(painted[took], labels[row, col])
     assert took.any() == inside.any()  # the nearest point in the image is seen
@@ -223,11 +215,13 @@ def test_points_that_a_camera_cannot_see() -> None:
     labels = np.zeros((NEAR.height, NEAR.width), np.uint8)
     assert paint(labels, np.empty((0, 4), np.float32), NEAR).shape == (0,)
     behind = np.array([[-10.0, 0.0, 0.0, 0.0], [-5.0, 1.0, -1.0, 0.0]], np.float32)
-    assert paint(labels, behind, NEAR).tolist() == [UNSEEN, UNSEEN]
-    assert paint(labels, np.full((3, 4), np.nan, np.float32), NEAR).tolist() == [UNSEEN] * 3
+    assert paint(labels, behind, NEAR).tolist() == [painting.UNSEEN, painting.UNSEEN]
+    assert paint(labels, np.full((3, 4), np.nan, np.float32), NEAR).tolist() == [painting.UNSEEN] * 3
     assert paint(labels, np.array([[10.0, 0.0, 0.0, 0.0]], np.float32), NEAR).tolist() == [0]
     assert paint(labels, np.array([[10, 0, 0]]), NEAR).tolist() == [0]
-    assert paint(np.full_like(labels, 255), np.array([[10.0, 0.0, 0.0]]), NEAR).tolist() == [UNSEEN]  # no class
+    assert paint(np.full_like(labels, 255), np.array([[10.0, 0.0, 0.0]]), NEAR).tolist() == [
+        painting.UNSEEN
+    ]  # no class
 
 
 def test_a_perception_and_its_labels_paint_alike() -> None:

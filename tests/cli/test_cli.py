@@ -33,6 +33,7 @@ from edgeperc.evaluation.judge import Perceiving
 from edgeperc.inference import providers, session
 from edgeperc.readers import captures
 from edgeperc.types.perception import Box, Perception, PointLabels, TopView
+from scenes import Terminal
 
 
 class FakePerceiver:
@@ -649,13 +650,6 @@ def test_names_that_are_no_text(tmp_path: Path, capsys: pytest.CaptureFixture[st
     assert "\\udce9.bin" in capsys.readouterr().out
     assert run("run", scan, "--html", "--out", tmp_path / "out") == 0
     assert len(list((tmp_path / "out").iterdir())) == 1
-
-
-class Terminal(io.StringIO):
-    """Text that a terminal would show."""
-
-    def isatty(self) -> bool:
-        return True
 
 
 def test_a_progress_bar_is_drawn_on_a_terminal_below_the_lines(

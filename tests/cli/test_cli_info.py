@@ -19,12 +19,11 @@ from edgeperc import zoo
 from edgeperc.errors import ModelFileError
 from edgeperc.inference import listing, providers
 from edgeperc.preprocess.fitness import FitnessProfile
-from edgeperc.simulation.drawn import random_scene
-from edgeperc.simulation.scene import simulate
 from edgeperc.system import machine
 from edgeperc.types.card import ModelCard
 from edgeperc.types.sensor import SENSORS, SensorProfile, get_sensor
 from edgeperc.zoo import Variant
+from scenes import urban
 
 
 @pytest.fixture
@@ -251,7 +250,7 @@ def drive(tmp_path: Path) -> Path:
     folder = tmp_path / "drive"
     folder.mkdir()
     for k in range(3):
-        scan = simulate(random_scene(k, "urban"), "hdl-64e", seed=k).points - np.float32([0.0, 0.0, 0.67, 0.0])
+        scan = urban(k).points - np.float32([0.0, 0.0, 0.67, 0.0])
         kept = np.hypot(scan[:, 0], scan[:, 1]) > (13.0 if k == 1 else 0.0)
         scan[kept].tofile(folder / f"{k}.bin")
     return folder

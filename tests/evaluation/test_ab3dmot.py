@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import scenes
 from edgeperc import Box
 from edgeperc.evaluation.ab3dmot import Ab3dmot, Settings, generalized_iou
 
@@ -19,8 +21,7 @@ def row(x: float, z: float = 0.0, yaw: float = 0.0) -> list[float]:
     return [x, 0.0, z, *CAR, yaw]
 
 
-def box(x: float, y: float = 0.0, yaw: float = 0.0) -> Box:
-    return Box("car", 0.9, (x, y, 0.0), CAR, yaw)
+box = partial(scenes.box, score=0.9, size=CAR, z=0.0)
 
 
 def follow(tracker: Ab3dmot, *frames: list[Box]) -> list[list[int]]:

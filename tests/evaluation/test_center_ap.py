@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from functools import partial
 
 import pytest
 from hypothesis import given, settings
@@ -11,11 +12,10 @@ from hypothesis import strategies as st
 
 from edgeperc.evaluation.center_ap import CLASSES, CenterTable, center_scores, count_centers
 from edgeperc.types.perception import Box
+from scenes import box
 from twins import center_ap as twin
 
-
-def car(x: float, y: float = 0.0, score: float = 1.0, yaw: float = 0.0, label: str = "car") -> Box:
-    return Box(label, score, (x, y, -1.0), (4.0, 2.0, 1.5), yaw)
+car = partial(box, size=(4.0, 2.0, 1.5))
 
 
 def table_of(*scans: tuple[list[Box], list[Box]], ignored: tuple[Box, ...] = ()) -> CenterTable:

@@ -17,14 +17,7 @@ import pytest
 
 from edgeperc import TrackingError, cli
 from edgeperc.datasets.kitti import scan_hash
-from edgeperc.evaluation.tracking import (
-    RULES,
-    evaluate_kitti,
-    read_sequence,
-    sequence_names,
-    sequence_scans,
-    track_sequence,
-)
+from edgeperc.evaluation import tracking
 from edgeperc.types.sensor import get_sensor
 from edgeperc_bench.peers.tracking import every_second_beam
 
@@ -59,7 +52,7 @@ def kitti(tmp_path: Path) -> Path:
 
 
 def test_kitti_sequences_are_read_into_the_sensors_frame(kitti: Path) -> None:
-    sequence = read_sequence(kitti, "0000")
+    sequence = tracking.read_sequence(kitti, "0000")
     assert len(sequence.detections) == 20
     first = sequence.detections[0][0]
     assert first.center == pytest.approx((15.0, 0.0, -0.95))
@@ -74,7 +67,7 @@ def test_kitti_sequences_are_read_into_the_sensors_frame(kitti: Path) -> None:
 
 def test_kitti_is_evaluated_by_its_rules(kitti: Path) -> None:
     seen = []
-    figures = evaluate_kitti(kitti, on_sequence=lambda done, total: seen.append((done, total)))
+    figures = tracking.evaluate_kitti(kitti, on_sequence=lambda done, total: seen.append((done, total)))
     car, pedestrian = figures["classes"]["car"], figures["classes"]["pedestrian"]
     assert (car["best"]["n_truth"], car["best"]["n_false"], car["best"]["n_switches"]) == (20, 0, 0)
     assert car["best"]["mota"] == 1.0
@@ -95,8 +88,8 @@ def test_the_rules_decide_which_box_is_small_and_who_sits(kitti: Path) -> None:
     pedestrians = kitti / "detections/pointrcnn_Pedestrian/0000.txt"
     pedestrians.write_text(pedestrians.read_text() + "\n" + "\n".join(person))
     n_false = {}
-    for rules in RULES:
-        figures = evaluate_kitti(kitti, rules=rules, rival=True)
+    for rules in tracking.RULES:
+        figures = tracking.evaluate_kitti(kitti, rules=rules, rival=True)
         assert figures["rules"] == rules
         n_false[rules] = [
             figures[method][of]["all_tracks"]["n_false"]
@@ -108,7 +101,7 @@ def test_the_rules_decide_which_box_is_small_and_who_sits(kitti: Path) -> None:
     assert n_false["edgeperc"] == [20, 0, 20, 0]
     assert n_false["ab3dmot"] == [0, 40, 0, 40]
     with pytest.raises(TrackingError, match="rules 'kitti'"):
-        evaluate_kitti(kitti, rules="kitti")
+        tracking.evaluate_kitti(kitti, rules="kitti")
 
 
 TILTED = """P2: 700.0 0.0 600.0 0.0 0.0 700.0 180.0 0.0 0.0 0.0 1.0 0.0
@@ -157,7 +150,7 @@ def test_a_made_up_street_has_the_figures_of_ab3dmots_program(tmp_path: Path) ->
     method in its result format, at 3-D IoU 0.25.
     """
     made_up_street(tmp_path)
-    figures = evaluate_kitti(tmp_path, rules="ab3dmot", rival=True)["rival"]
+    figures = tracking.evaluate_kitti(tmp_path, rules="ab3dmot", rival=True)["rival"]
     # sAMOTA, AMOTA, AMOTP, MOTA, MOTP; ID switches, fragments, false, missed, found.
     program = {
         "car": ([0.812742, 0.408179, 0.566171, 0.709877, 0.642380], [0, 3, 9, 38, 137]),
@@ -222,13 +215,13 @@ def test_nothing_is_compiled_while_the_clock_runs(kitti: Path, what: str) -> Non
 
 def test_kitti_errors(kitti: Path, tmp_path: Path) -> None:
     with pytest.raises(TrackingError, match="no label_02"):
-        evaluate_kitti(tmp_path / "elsewhere")
+        tracking.evaluate_kitti(tmp_path / "elsewhere")
     (kitti / "detections/pointrcnn_Car/0000.txt").write_text("0,2,100\n")
     with pytest.raises(TrackingError, match="15 comma-separated"):
-        read_sequence(kitti, "0000")
+        tracking.read_sequence(kitti, "0000")
     (kitti / "label_02/0000.txt").write_text("0 1 Car\n")
     with pytest.raises(TrackingError, match="17 columns"):
-        read_sequence(kitti, "0000")
+        tracking.read_sequence(kitti, "0000")
 
 
 def test_eval_tracking_prints_the_tables(kitti: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -248,7 +241,7 @@ def test_eval_tracking_prints_the_tables(kitti: Path, capsys: pytest.CaptureFixt
 
 def test_a_models_boxes_are_evaluated(kitti: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """What run --json prints takes the place of the detections, which need not be there."""
-    detections = read_sequence(kitti, "0000").detections
+    detections = tracking.read_sequence(kitti, "0000").detections
     lines = [{"scan": "x", "boxes": [replace(one, label="van").to_dict() for one in of]} for of in detections]
     for of in ("Car", "Pedestrian", "Cyclist"):
         (kitti / f"detections/pointrcnn_{of}/0000.txt").unlink()
@@ -303,11 +296,11 @@ def drive_root(kitti: Path, tmp_path: Path) -> Path:
 
 
 def test_an_object_set_with_track_ids_is_the_same_sequence(kitti: Path, drive_root: Path) -> None:
-    assert sequence_names(drive_root) == ["my_drive"]
-    scans = sequence_scans(drive_root, "my_drive")
+    assert tracking.sequence_names(drive_root) == ["my_drive"]
+    scans = tracking.sequence_scans(drive_root, "my_drive")
     assert [path.stem for path in scans.values()] == [f"{100 + k:06}" for k in range(20)]
-    given = read_sequence(kitti, "0000")
-    same = read_sequence(drive_root, "my_drive", boxes=given.detections)
+    given = tracking.read_sequence(kitti, "0000")
+    same = tracking.read_sequence(drive_root, "my_drive", boxes=given.detections)
     for of in ("car", "pedestrian"):
         for a, b in zip(given.truth[of], same.truth[of], strict=True):
             np.testing.assert_array_equal(a.ids, b.ids)
@@ -315,14 +308,14 @@ def test_an_object_set_with_track_ids_is_the_same_sequence(kitti: Path, drive_ro
             np.testing.assert_array_equal(a.ignored, b.ignored)
     (drive_root / "training/track_id/000103.txt").write_text("1\n")
     with pytest.raises(TrackingError, match="3 labels, and 1 track ids"):
-        read_sequence(drive_root, "my_drive", boxes=given.detections)
+        tracking.read_sequence(drive_root, "my_drive", boxes=given.detections)
 
 
 def test_a_drive_is_perceived_and_tracked(
     kitti: Path, drive_root: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """From scans to the table in one command; a scan that a model was trained on is refused."""
-    found = read_sequence(kitti, "0000").detections
+    found = tracking.read_sequence(kitti, "0000").detections
     card = SimpleNamespace(name="seer", version="1.0", training={})
 
     def perceive(points: np.ndarray) -> SimpleNamespace:
@@ -340,7 +333,7 @@ def test_a_drive_is_perceived_and_tracked(
     assert cli.main(["eval-tracking", str(kitti), "--model", "seer"]) == 2
     assert "no scans of 0000" in capsys.readouterr().err
     (kitti / "velodyne/0000").mkdir(parents=True)
-    for k, path in sequence_scans(drive_root, "my_drive").items():
+    for k, path in tracking.sequence_scans(drive_root, "my_drive").items():
         (kitti / f"velodyne/0000/{k:06}.bin").write_bytes(path.read_bytes())
     (kitti / "velodyne/0000/000003.bin").unlink()  # as in KITTI's sequence 0001
     assert cli.main(["eval-tracking", str(kitti), "--model", "seer", "--classes", "car"]) == 0
@@ -353,10 +346,10 @@ def test_a_drive_is_perceived_and_tracked(
 def test_a_coarser_sensors_drive_has_every_second_beam(drive_root: Path, tmp_path: Path) -> None:
     turn = np.radians(np.arange(0.5, 360.0, 30.0))
     beams = [np.column_stack([9.0 * np.cos(turn), 9.0 * np.sin(turn), 0 * turn - k, 0 * turn + 0.5]) for k in range(5)]
-    for path in sequence_scans(drive_root, "my_drive").values():
+    for path in tracking.sequence_scans(drive_root, "my_drive").values():
         np.concatenate(beams).astype(np.float32).tofile(path)
     every_second_beam(drive_root, tmp_path / "coarse")
-    scans = sequence_scans(tmp_path / "coarse", "my_drive")
+    scans = tracking.sequence_scans(tmp_path / "coarse", "my_drive")
     assert len(scans) == 20
     points = np.fromfile(scans[7], np.float32).reshape(-1, 4)
     assert points[:, 2].tolist() == [0.0] * 12 + [-2.0] * 12 + [-4.0] * 12
@@ -367,7 +360,7 @@ def test_a_coarser_sensors_drive_has_every_second_beam(drive_root: Path, tmp_pat
 
 def test_real_sequences_are_tracked_well(data_root: Callable[[str], Path]) -> None:
     """Sequence 0004 with PointRCNN's detections; the figures of the whole set are in the documents."""
-    figures = evaluate_kitti(data_root("tracking"), sequences=["0004"])["classes"]["car"]
+    figures = tracking.evaluate_kitti(data_root("tracking"), sequences=["0004"])["classes"]["car"]
     assert figures["best"]["mota"] > 0.85
     assert figures["best"]["n_switches"] == 0
     assert figures["hota"]["hota"] > 0.6
@@ -375,7 +368,7 @@ def test_real_sequences_are_tracked_well(data_root: Callable[[str], Path]) -> No
 
 def test_real_vehicles_that_move_point_to_where_they_drive(data_root: Callable[[str], Path]) -> None:
     """Motion alone: PointRCNN's boxes do not say that they know the front."""
-    figures = evaluate_kitti(data_root("tracking"), sequences=["0011"], classes=["car"])["headings"]["car"]
+    figures = tracking.evaluate_kitti(data_root("tracking"), sequences=["0011"], classes=["car"])["headings"]["car"]
     moving = figures["moving"]
     assert moving["n_boxes"] > 500
     assert moving["n_resolved"] > 0.9 * moving["n_boxes"]
@@ -386,7 +379,7 @@ def test_tracks_are_animated(kitti: Path, tmp_path: Path) -> None:
     image = pytest.importorskip("PIL.Image")
     from edgeperc.view.tracks import draw_tracks
 
-    tracks, _ = track_sequence(read_sequence(kitti, "0000"))
+    tracks, _ = tracking.track_sequence(tracking.read_sequence(kitti, "0000"))
     content = draw_tracks(tracks, tmp_path / "tracks.gif", title="a drive")
     assert (tmp_path / "tracks.gif").read_bytes() == content
     with image.open(tmp_path / "tracks.gif") as animation:

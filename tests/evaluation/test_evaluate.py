@@ -8,6 +8,7 @@ import json
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -18,20 +19,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import scenes
 from checkout import files
 from edgeperc import cli
 from edgeperc.cli import output
 from edgeperc.cli.evaluation import scans as eval_scans
 from edgeperc.cli.output import print_line
-from edgeperc.datasets.kitti import (
-    Frame,
-    KittiCalibration,
-    KittiLabels,
-    KittiObjects,
-    RoadFrame,
-    SemanticKitti,
-    scan_hash,
-)
+from edgeperc.datasets import kitti
 from edgeperc.errors import ModelError, PointsError, SplitError
 from edgeperc.evaluation import evaluate
 from edgeperc.evaluation.causes import count_causes
@@ -49,7 +43,7 @@ POINTS = ("background", "car", "pedestrian", "cyclist")
 CELLS = ("background", "drivable", "car", "van", "truck")
 # The camera stands at the sensor and looks along x; a quarter turn of the scan is in its image.
 T_CAM_VELO = np.array([[0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]], np.float64)
-CAMERA = KittiCalibration(T_CAM_VELO, np.array([[621.0, 0, 621.0, 0], [0, 621.0, 187.0, 0], [0, 0, 1, 0]]))
+CAMERA = kitti.KittiCalibration(T_CAM_VELO, np.array([[621.0, 0, 621.0, 0], [0, 621.0, 187.0, 0], [0, 0, 1, 0]]))
 
 
 def card(name: str, **given: Any) -> ModelCard:
@@ -68,8 +62,7 @@ def card(name: str, **given: Any) -> ModelCard:
     )
 
 
-def box(x: float, y: float, label: str = "car", score: float = 1.0) -> Box:
-    return Box(label, score, (x, y, -1.0), (4.0, 2.0, 1.6), 0.0)
+box = partial(scenes.box, size=(4.0, 2.0, 1.6), z=-1.0)
 
 
 class World:
@@ -121,9 +114,9 @@ def world(monkeypatch: pytest.MonkeyPatch) -> World:
     return made
 
 
-def frame(*boxes: Box, points: list[list[float]] | None = None, drive: str = "a", unlabeled: Any = ()) -> Frame:
+def frame(*boxes: Box, points: list[list[float]] | None = None, drive: str = "a", unlabeled: Any = ()) -> kitti.Frame:
     scan = np.array(points or [[0.0, 0.0, 0.0, 0.0]], np.float32)
-    return Frame("000000", drive, "A", scan, boxes, np.array(unlabeled, np.float64).reshape(-1, 4), CAMERA)
+    return kitti.Frame("000000", drive, "A", scan, boxes, np.array(unlabeled, np.float64).reshape(-1, 4), CAMERA)
 
 
 def hits(at: Box, n: int, label: int = 1) -> list[list[float]]:
@@ -131,7 +124,7 @@ def hits(at: Box, n: int, label: int = 1) -> list[list[float]]:
     return [[at.center[0] + 0.1 * k, at.center[1], at.center[2], label] for k in range(n)]
 
 
-def evaluated(judge: Judge, *frames: Frame, n_resamples: int = 50) -> dict[str, Any]:
+def evaluated(judge: Judge, *frames: kitti.Frame, n_resamples: int = 50) -> dict[str, Any]:
     return figures([judge.record(judge.kitti(each))[0] for each in frames], n_resamples)
 
 
@@ -210,7 +203,7 @@ def test_labels_of_kitti_are_measured_by_levels_and_other_boxes_all_round(world:
     world.boxes = (car, box(-15, 0))
     seen = frame(car, points=hits(car, 3))
     row = [0.0, 0.0, 0.0, 500.0, 150.0, 600.0, 250.0, 1.6, 2.0, 4.0, 0.0, 1.8, 15.0, -math.pi / 2]
-    labeled = replace(seen, labels=KittiLabels(("car",), np.array([row])), drive="2011_09_28_drive_0001")
+    labeled = replace(seen, labels=kitti.KittiLabels(("car",), np.array([row])), drive="2011_09_28_drive_0001")
     all_round = evaluated(Judge(["ssadnet"]), seen)
     levels = evaluated(Judge(["ssadnet"]), labeled)
     assert set(all_round["kitti"]["car"]["3-D 0.7"]) == {"all round"}
@@ -527,7 +520,7 @@ def test_road_by_hand(world: World) -> None:
     # A row of cells 20 m ahead: four of road, a car, three of something else, and one that nobody labeled.
     y = 5.05 - np.arange(9)
     points = np.stack([np.full(9, 20.05), y, np.full(9, -1.7), np.zeros(9)], axis=1).astype(np.float32)
-    scan = RoadFrame("00/000000", "b", points, np.array([1, 1, 1, 1, 2, 0, 0, 0, IGNORE], np.uint8))
+    scan = kitti.RoadFrame("00/000000", "b", points, np.array([1, 1, 1, 1, 2, 0, 0, 0, IGNORE], np.uint8))
     cols = np.floor((10.0 - y) / 0.1).astype(int)
     said = np.zeros((400, 200), np.uint8)
     said[259, cols[[0, 1, 5, 8]]] = 1
@@ -562,7 +555,7 @@ def test_road_by_hand(world: World) -> None:
 def test_a_model_without_vehicles_is_evaluated_on_road_only(world: World) -> None:
     y = 5.05 - np.arange(5)
     points = np.stack([np.full(5, 20.05), y, np.full(5, -1.7), np.zeros(5)], axis=1).astype(np.float32)
-    scan = RoadFrame("00/000000", "b", points, np.array([1, 1, 2, 0, IGNORE], np.uint8))
+    scan = kitti.RoadFrame("00/000000", "b", points, np.array([1, 1, 2, 0, IGNORE], np.uint8))
     world.cards["lodnn"] = card("lodnn", classes=CELLS[:2], box_classes=(), outputs=card("pointseg").outputs)
     cols = np.floor((10.0 - y) / 0.1).astype(int)
     world.cells["lodnn"][259, cols[[0, 2]]] = 1
@@ -706,7 +699,7 @@ def test_scans_of_drives_listed_nowhere_are_evaluated(world: World, tmp_path: Pa
 @pytest.mark.parametrize("guilty", ["pointseg", "lodnn"])
 def test_training_scans_are_refused_unless_asked_for(world: World, tmp_path: Path, guilty: str) -> None:
     root = kitti_set(tmp_path, {"000000": "2011_09_26_drive_0011", "000001": "2011_09_26_drive_0005"})
-    seen = hashlib.sha256(KittiObjects(root).frame("000001").points.tobytes()).hexdigest()[:16]
+    seen = hashlib.sha256(kitti.KittiObjects(root).frame("000001").points.tobytes()).hexdigest()[:16]
     models = ["pointseg", "ssadnet"]
     # Whatever the scan was called when it was trained on.
     world.cards[guilty] = card(guilty, training={"frames": {"renamed": seen}})
@@ -748,14 +741,14 @@ def test_the_worst_come_first(world: World, tmp_path: Path, monkeypatch: pytest.
     names = [f"{k:06d}" for k in range(30)]
     root = kitti_set(tmp_path, dict.fromkeys(names, "2011_09_26_drive_0011"))
     wrong = {"000007": 2, "000023": 3}
-    read = KittiObjects.frame
+    read = kitti.KittiObjects.frame
 
-    def spoilt(objects: KittiObjects, name: str) -> Frame:
+    def spoilt(objects: kitti.KittiObjects, name: str) -> kitti.Frame:
         one = read(objects, name)
         extra = tuple(box(15.0 + 5 * k, 0) for k in range(wrong.get(name, 0)))
         return replace(one, boxes=extra, points=np.array([p for b in extra for p in hits(b, 3, 0)] or one.points))
 
-    monkeypatch.setattr(KittiObjects, "frame", spoilt)
+    monkeypatch.setattr(kitti.KittiObjects, "frame", spoilt)
     _, worst = evaluate.evaluate([root], ["pointseg"])
     assert [each.name for each in worst[:2]] == ["000023", "000007"]
     assert len(worst) == 20
@@ -825,22 +818,17 @@ def test_the_command_on_simulated_scans(tmp_path: Path, capsys: pytest.CaptureFi
     assert f"{100 * simulated['road']['all']['ap']:.1f}" in printed.out
 
 
-class Terminal(io.StringIO):
-    def isatty(self) -> bool:
-        return True
-
-
 def test_figures_of_few_objects_are_gray_on_a_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("NO_COLOR", raising=False)
     for stream, gray, expected in (
-        (Terminal(), True, "\x1b[90mcar \\u001b[0m\x1b[0m\n"),  # what the text holds itself is shown, not obeyed
-        (Terminal(), False, "car \\u001b[0m\n"),
+        (scenes.Terminal(), True, "\x1b[90mcar \\u001b[0m\x1b[0m\n"),  # what the text holds itself is shown, not obeyed
+        (scenes.Terminal(), False, "car \\u001b[0m\n"),
         (io.StringIO(), True, "car \\u001b[0m\n"),
     ):
         print_line("car \x1b[0m", stream, gray=gray)
         assert stream.getvalue() == expected
     monkeypatch.setenv("NO_COLOR", "1")
-    plain = Terminal()
+    plain = scenes.Terminal()
     print_line("car", plain, gray=True)
     assert plain.getvalue() == "car\n"
 
@@ -853,13 +841,13 @@ def test_the_command_on_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[st
 
 
 def test_no_shipped_model_was_trained_on_a_test_scan(kitti_root: Path, semantickitti_root: Path) -> None:
-    objects, sequences = KittiObjects(kitti_root), SemanticKitti(semantickitti_root)
+    objects, sequences = kitti.KittiObjects(kitti_root), kitti.SemanticKitti(semantickitti_root)
     held_back = [*objects.names("test", grades="AB"), *objects.names("validation", grades="AB")]
     scans = [kitti_root / f"training/velodyne/{name}.bin" for name in held_back]
     scans += [semantickitti_root / f"sequences/00/velodyne/{name[3:]}.bin" for name in sequences.names("test")]
     assert len(scans) > 35 + 100
-    hashes = {scan_hash(np.fromfile(scan, np.float32)) for scan in scans}
-    assert scan_hash(objects.frame(held_back[0]).points) in hashes
+    hashes = {kitti.scan_hash(np.fromfile(scan, np.float32)) for scan in scans}
+    assert kitti.scan_hash(objects.frame(held_back[0]).points) in hashes
     models = files(".onnx", "models")
     assert len(models) >= len(shipped_models())
     for path in models:
@@ -878,7 +866,7 @@ def test_shipped_models_refuse_their_training_scans(kitti_root: Path) -> None:
 
 def test_real_scans(kitti_root: Path, semantickitti_root: Path) -> None:
     judge = Judge(["ssadnet", "pointseg"])
-    objects, sequences = KittiObjects(kitti_root), SemanticKitti(semantickitti_root)
+    objects, sequences = kitti.KittiObjects(kitti_root), kitti.SemanticKitti(semantickitti_root)
     result = figures([judge.record(judge.kitti(objects.frame(name)))[0] for name in objects.names("test")[::7]], 100)
     assert result["points"]["all"]["car"]["iou"] > 0.5
     low, high = result["points"]["all"]["car"]["iou_interval"]

@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 
 import numpy as np
 import pytest
 
-from edgeperc import Box, Tracker
+from edgeperc import Tracker
 from edgeperc.evaluation.headings import Headings, Standing, count_headings, speeds
 from edgeperc.evaluation.tracking_metrics import FrameTruth
+from scenes import box
 
 SIZE = (4.0, 2.0, 1.5)
 SCANS = 30
 
 
-def car(x: float, y: float, yaw: float) -> Box:
-    return Box("car", 0.99, (x, y, -0.9), SIZE, yaw)
+car = partial(box, score=0.99, size=SIZE)
 
 
 def truth_of(places: list[tuple[float, float]], ignored: bool = False) -> FrameTruth:
@@ -34,7 +35,7 @@ def test_headings_by_hand() -> None:
     tracker, truth, tracks = Tracker(), [], []
     for k in range(SCANS):
         truth.append(truth_of([(driven(k), 0.0), (10.0, 6.0)]))
-        tracks.append(tracker.update([car(driven(k), 0.0, math.pi), car(10.0, 6.0, math.pi)], 0.1 * k, np.eye(4)))
+        tracks.append(tracker.update([car(driven(k), yaw=math.pi), car(10.0, 6.0, yaw=math.pi)], 0.1 * k, np.eye(4)))
     np.testing.assert_allclose([speed[0] for speed in speeds(truth, tracks)[:15]], 8.0)
     assert speeds(truth, tracks)[-1] == pytest.approx([0.0, 0.0])
     found = count_headings(truth, tracks, ("car",), 0.25)
@@ -50,7 +51,7 @@ def test_headings_by_hand() -> None:
 
 def test_ignored_lonely_and_missed_objects_do_not_count() -> None:
     tracker = Tracker()
-    tracks = [tracker.update([car(10.0, 0.0, 0.0)], 0.1 * k, np.eye(4)) for k in range(3)]
+    tracks = [tracker.update([car(10.0)], 0.1 * k, np.eye(4)) for k in range(3)]
     assert count_headings([truth_of([(10.0, 0.0)], ignored=True)] * 3, tracks, ("car",), 0.25) == Headings()
     once = [truth_of([(10.0, 0.0)]), truth_of([]), truth_of([])]
     assert np.isnan(speeds(once, tracks)[0]).all()

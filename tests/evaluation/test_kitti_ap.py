@@ -12,18 +12,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from edgeperc.datasets.kitti import KittiCalibration, KittiLabels
-from edgeperc.evaluation.kitti_ap import (
-    CLASSES,
-    LEVELS,
-    ApTable,
-    FrontTruth,
-    average_precisions,
-    best_candidates,
-    candidate_recall,
-    count_all_round,
-    count_in_image,
-    image_size_of,
-)
+from edgeperc.evaluation import kitti_ap
 from edgeperc.types.perception import Box
 from twins import kitti_ap as twin
 
@@ -58,15 +47,15 @@ def labels(*rows: tuple[str, list[float]]) -> KittiLabels:
     return KittiLabels(tuple(kind for kind, _ in rows), np.array([n for _, n in rows], np.float64).reshape(-1, 14))
 
 
-def table_of(*scans: Scan) -> ApTable:
-    table = ApTable()
+def table_of(*scans: Scan) -> kitti_ap.ApTable:
+    table = kitti_ap.ApTable()
     for k, (of_scan, boxes) in enumerate(scans):
-        table += count_in_image(FrontTruth(of_scan, CAMERA), boxes, f"drive {k}")
+        table += kitti_ap.count_in_image(kitti_ap.FrontTruth(of_scan, CAMERA), boxes, f"drive {k}")
     return table
 
 
-def scores(table: ApTable, label: str, overlap: str, level: str) -> tuple[float, float, float]:
-    return average_precisions(table.counts[label, overlap, level])
+def scores(table: kitti_ap.ApTable, label: str, overlap: str, level: str) -> tuple[float, float, float]:
+    return kitti_ap.average_precisions(table.counts[label, overlap, level])
 
 
 def street(n: int) -> list[Box]:
@@ -105,7 +94,7 @@ def test_neighbors_hidden_and_small_objects_count_neither_way() -> None:
     rows += [("car", label_row(hidden, occlusion=2)), ("car", label_row(cut, truncation=0.4)), ("car", label_row(far))]
     guesses = [replace(each, label="car", score=0.5) for each in (car, van, truck, hidden, cut, far)]
     table = table_of((labels(*rows), guesses))
-    counts = {level: table.counts["car", "3-D 0.7", level][0] for level in LEVELS}
+    counts = {level: table.counts["car", "3-D 0.7", level][0] for level in kitti_ap.LEVELS}
     assert {level: len(each.objects) for level, each in counts.items()} == {"easy": 1, "moderate": 1, "hard": 3}
     # The truck's detection is the only false positive; the far car is 18 px high.
     assert {level: each.steps for level, each in counts.items()} == {
@@ -140,15 +129,15 @@ def test_ranges_count_objects_and_false_positives_in_them_alone() -> None:
 
 
 def test_the_size_of_the_image_follows_from_the_day_of_the_drive() -> None:
-    assert image_size_of("2011_09_28_drive_0016") == (1224, 370)
-    assert image_size_of("mine") == (1242, 375)
+    assert kitti_ap.image_size_of("2011_09_28_drive_0016") == (1224, 370)
+    assert kitti_ap.image_size_of("mine") == (1242, 375)
 
 
 def test_all_round_boxes_of_unknown_objects_may_be_found_and_others_may_not() -> None:
     car, few, truck = box("car", -15, 0), box("car", -30, 0), box("truck", 15, 0)
     unknown = Box("ignore", 1.0, (0.0, 20.0, -1.0), SIZES["car"], 0.0)
     guesses = [replace(each, label="car", score=0.5) for each in (car, few, truck, unknown)]
-    table = count_all_round(guesses, [car, truck], [few, unknown], "a")
+    table = kitti_ap.count_all_round(guesses, [car, truck], [few, unknown], "a")
     (counts,) = table.counts["car", "3-D 0.7", "all round"]
     assert (len(counts.objects), counts.steps) == (1, ((0.5, 1, 1),))
 
@@ -165,14 +154,14 @@ def test_candidates_of_any_class_cover_objects_of_a_level() -> None:
     car, person, far, van = box("car", 15, 0), box("pedestrian", 15, 5), box("car", 80, 0), box("van", 20, -5)
     scan = labels(*((each.label, label_row(each)) for each in (car, person, far, van)))
     rough = Box("cluster", 0.05, (15.8, 0.2, -1.0), (3.0, 1.6, 1.4), 0.1)
-    found = best_candidates(FrontTruth(scan, CAMERA), [rough, box("truck", 40, 8)], "a")
+    found = kitti_ap.best_candidates(kitti_ap.FrontTruth(scan, CAMERA), [rough, box("truck", 40, 8)], "a")
     assert [each.label for each in found] == ["car", "pedestrian"]
     assert found[0].range_m == pytest.approx(15.0)
     assert 0.3 < found[0].iou < 0.8
-    recall = candidate_recall(found)
+    recall = kitti_ap.candidate_recall(found)
     assert (recall["car"], recall["pedestrian"]) == ((1.0, 1), (0.0, 1))
     assert math.isnan(recall["cyclist"][0])
-    assert [each.iou for each in best_candidates(FrontTruth(scan, CAMERA), [], "a")] == [0.0, 0.0]
+    assert [each.iou for each in kitti_ap.best_candidates(kitti_ap.FrontTruth(scan, CAMERA), [], "a")] == [0.0, 0.0]
 
 
 @st.composite
@@ -214,10 +203,10 @@ def test_the_development_kit_step_by_step_gives_the_same_numbers(given_scans: li
         ([twin.read_row(kind, row) for kind, row in zip(of.kinds, of.numbers, strict=True)], submitted(boxes))
         for of, boxes in given_scans
     ]
-    for label, (least_ious, _) in CLASSES.items():
+    for label, (least_ious, _) in kitti_ap.CLASSES.items():
         for metric in ("bird's eye", "3-D"):
             for least_iou in least_ious:
-                for level in LEVELS:
+                for level in kitti_ap.LEVELS:
                     counts = table.counts[label, f"{metric} {least_iou:g}", level]
                     n_truth, r40, r11 = (
                         twin.eval_class(read, label, level, metric, least_iou)
@@ -225,7 +214,7 @@ def test_the_development_kit_step_by_step_gives_the_same_numbers(given_scans: li
                         else (0, math.nan, math.nan)
                     )
                     assert sum(len(each.objects) for each in counts) == n_truth
-                    assert average_precisions(counts)[:2] == pytest.approx((r40, r11), abs=1e-12, nan_ok=True)
+                    assert kitti_ap.average_precisions(counts)[:2] == pytest.approx((r40, r11), abs=1e-12, nan_ok=True)
 
 
 @settings(deadline=None, max_examples=100)

@@ -3,32 +3,23 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import scenes
 from edgeperc.errors import PointsError
-from edgeperc.evaluation.metrics import (
-    BoxEvaluator,
-    Confusion,
-    ProbabilitySweep,
-    average_precision,
-    mean,
-    object_key,
-)
+from edgeperc.evaluation import metrics
 from edgeperc.types.perception import Box
 
-
-def box(
-    x: float, y: float, label: str = "car", score: float = 1.0, size: tuple[float, float] = (4.0, 2.0), yaw: float = 0.0
-) -> Box:
-    return Box(label, score, (x, y, -1.0), (*size, 1.5), yaw)
+box = partial(scenes.box, size=(4.0, 2.0, 1.5), z=-1.0)
 
 
 def test_scores_of_a_table_made_by_hand() -> None:
-    confusion = Confusion(("background", "car", "pedestrian", "cyclist"))
+    confusion = metrics.Confusion(("background", "car", "pedestrian", "cyclist"))
     # truth:      0  0  0  0  1  1  1  2  2  ignored
     # predicted:  0  0  0  1  1  1  0  2  1  3
     confusion.update([[0, 0, 0, 1, 1], [1, 0, 2, 1, 3]], [[0, 0, 0, 0, 1], [1, 1, 2, 2, 255]])
@@ -42,7 +33,7 @@ def test_scores_of_a_table_made_by_hand() -> None:
 
 
 def test_updates_add_up_and_nothing_has_no_score() -> None:
-    confusion = Confusion(("a", "b"), ignore=7)
+    confusion = metrics.Confusion(("a", "b"), ignore=7)
     assert math.isnan(confusion.accuracy())
     assert np.isnan(confusion.iou()).all()
     assert math.isnan(confusion.mean_iou())
@@ -59,7 +50,7 @@ def test_updates_add_up_and_nothing_has_no_score() -> None:
 
 @given(st.lists(st.tuples(st.integers(0, 3), st.sampled_from([0, 1, 2, 3, 255])), max_size=40))
 def test_scores_are_those_of_sets(pairs: list[tuple[int, int]]) -> None:
-    confusion = Confusion("abcd")
+    confusion = metrics.Confusion("abcd")
     predicted, truth = np.array(pairs, dtype=np.uint8).reshape(-1, 2).T
     confusion.update(predicted, truth)
     for k in range(4):
@@ -70,7 +61,7 @@ def test_scores_are_those_of_sets(pairs: list[tuple[int, int]]) -> None:
 
 
 def test_labels_that_cannot_be_counted_raise() -> None:
-    confusion = Confusion(("a", "b"))
+    confusion = metrics.Confusion(("a", "b"))
     with pytest.raises(PointsError, match=r"\(2,\) and truth \(3,\)"):
         confusion.update([0, 0], [0, 0, 0])
     with pytest.raises(PointsError, match=r"predicted labels from 0 to 2; expected 0\.\.1"):
@@ -85,12 +76,12 @@ PAIRS = st.lists(st.tuples(st.integers(0, 3), st.sampled_from([0, 1, 2, 3, 255])
 
 @given(PAIRS, PAIRS)
 def test_counts_of_two_are_counts_of_both(one: list[tuple[int, int]], other: list[tuple[int, int]]) -> None:
-    together = Confusion("abcd")
+    together = metrics.Confusion("abcd")
     apart = []
     for pairs in (one, other):
         predicted, truth = np.array(pairs, dtype=np.uint8).reshape(-1, 2).T
         together.update(predicted, truth)
-        apart.append(Confusion("abcd"))
+        apart.append(metrics.Confusion("abcd"))
         apart[-1].update(predicted, truth)
     before = apart[0].counts.copy()
     np.testing.assert_array_equal((apart[0] + apart[1]).counts, together.counts)
@@ -98,7 +89,7 @@ def test_counts_of_two_are_counts_of_both(one: list[tuple[int, int]], other: lis
 
 
 def test_coarser_classes() -> None:
-    confusion = Confusion(("other", "road", "car", "van"))
+    confusion = metrics.Confusion(("other", "road", "car", "van"))
     confusion.update([0, 1, 2, 3, 2, 3, 1], [0, 0, 2, 2, 3, 1, 1])
     coarse = confusion.merged({"ground": ["other", "road"], "vehicle": ["car", "van"]})
     assert coarse.classes == ("ground", "vehicle")
@@ -121,42 +112,42 @@ def test_average_precision_is_what_its_definition_says(predictions: list[tuple[f
     scores, hits = zip(*predictions, strict=True)
     n_truth = sum(hits) + n_missed
     if n_truth:
-        assert average_precision(scores, hits, n_truth) == pytest.approx(eleven_points(scores, hits, n_truth))
+        assert metrics.average_precision(scores, hits, n_truth) == pytest.approx(eleven_points(scores, hits, n_truth))
 
 
 def test_average_precision_by_hand() -> None:
     # Precision after each: 1, 1/2, 2/3, 3/4, 3/5; recall 1/4, 1/4, 1/2, 3/4, 3/4.
     scores, hits = [0.9, 0.8, 0.7, 0.6, 0.5], [True, False, True, True, False]
     expected = (3 * 1.0 + 5 * 0.75) / 11  # recalls 0, .1, .2 reach 1; .3 to .7 reach 3/4; .8 to 1 nothing
-    assert average_precision(scores, hits, 4) == pytest.approx(expected)
+    assert metrics.average_precision(scores, hits, 4) == pytest.approx(expected)
     shuffled = [3, 0, 4, 2, 1]
-    again = average_precision([scores[k] for k in shuffled], [hits[k] for k in shuffled], 4)
+    again = metrics.average_precision([scores[k] for k in shuffled], [hits[k] for k in shuffled], 4)
     assert again == pytest.approx(expected)
 
 
 def test_average_precision_at_its_ends() -> None:
-    assert average_precision([0.5, 0.4], [True, True], 2) == 1.0
-    assert average_precision([0.5, 0.4], [False, False], 2) == 0.0
-    assert average_precision([], [], 3) == 0.0
-    assert math.isnan(average_precision([0.5], [False], 0))
+    assert metrics.average_precision([0.5, 0.4], [True, True], 2) == 1.0
+    assert metrics.average_precision([0.5, 0.4], [False, False], 2) == 0.0
+    assert metrics.average_precision([], [], 3) == 0.0
+    assert math.isnan(metrics.average_precision([0.5], [False], 0))
     # A recall of exactly 0.3 counts for the four levels 0 to 0.3, whatever 0.1 * 3 rounds to.
-    assert average_precision([0.9, 0.8, 0.7], [True] * 3, 10) == pytest.approx(4 / 11)
+    assert metrics.average_precision([0.9, 0.8, 0.7], [True] * 3, 10) == pytest.approx(4 / 11)
     # Of equal scores the earlier counts as the better.
-    assert average_precision([0.5, 0.5], [True, False], 1) == 1.0
-    assert average_precision([0.5, 0.5], [False, True], 1) == 0.5
+    assert metrics.average_precision([0.5, 0.5], [True, False], 1) == 1.0
+    assert metrics.average_precision([0.5, 0.5], [False, True], 1) == 0.5
     with pytest.raises(PointsError, match=r"\(2,\) and hits \(1,\)"):
-        average_precision([0.5, 0.4], [True], 1)
+        metrics.average_precision([0.5, 0.4], [True], 1)
 
 
 def test_sweep_by_hand() -> None:
-    sweep = ProbabilitySweep()
+    sweep = metrics.ProbabilitySweep()
     assert math.isnan(sweep.max_f1())
     assert math.isnan(sweep.average_precision())
     sweep.update([0.9, 0.8, 0.7, 0.6], [True, False, True, False])
     # Taken from above: 1 of 1, 1 of 2, 2 of 3, 2 of 4; there are 2.
     assert sweep.max_f1() == pytest.approx(2 * 2 / (3 + 2))
     assert sweep.average_precision() == pytest.approx((6 * 1.0 + 5 * 2 / 3) / 11)
-    other = ProbabilitySweep()
+    other = metrics.ProbabilitySweep()
     other.update([[1.0, 0.0]], [[False, True]])
     both = sweep + other
     assert both.counts.sum() == 6
@@ -170,7 +161,7 @@ def test_sweep_by_hand() -> None:
 def test_sweep_takes_the_best_threshold(cells: list[tuple[int, bool]]) -> None:
     level, truth = np.array(cells).T
     truth = truth.astype(bool)
-    sweep = ProbabilitySweep()
+    sweep = metrics.ProbabilitySweep()
     sweep.update(level / 255, truth)
     if truth.any():
         f1 = [2 * (truth & (level >= t)).sum() / ((level >= t).sum() + truth.sum()) for t in range(256)]
@@ -180,11 +171,11 @@ def test_sweep_takes_the_best_threshold(cells: list[tuple[int, bool]]) -> None:
 def test_probabilities_that_are_none_raise() -> None:
     for values, truth in (([0.5, 1.5], [True, False]), ([math.nan], [True]), ([0.5], [True, False])):
         with pytest.raises(PointsError, match=r"expected one shape, and all in 0\.\.1"):
-            ProbabilitySweep().update(values, truth)
+            metrics.ProbabilitySweep().update(values, truth)
 
 
 def test_boxes_by_hand() -> None:
-    evaluator = BoxEvaluator(0.5)
+    evaluator = metrics.BoxEvaluator(0.5)
     truth = [box(10.0, 0.0), box(20.0, 0.0), box(30.0, 5.0, "van")]
     predicted = [
         box(10.5, 0.0, score=0.9),  # 3.5 of 4.5 m: IoU 7/9
@@ -214,14 +205,14 @@ def test_boxes_by_hand() -> None:
 
 
 def test_scans_add_up_and_do_not_mix() -> None:
-    evaluator = BoxEvaluator()
+    evaluator = metrics.BoxEvaluator()
     evaluator.update([box(10.0, 0.0, score=0.3)], [])
     evaluator.update([], [box(10.0, 0.0)])
     scores = evaluator.overall()
     assert (scores.n_truth, scores.n_predicted, scores.n_hits) == (1, 1, 0)
     assert scores.ap == scores.precision == scores.recall == 0.0
     assert math.isnan(scores.mean_iou_50)
-    empty = BoxEvaluator()
+    empty = metrics.BoxEvaluator()
     empty.update([], [])
     assert empty.per_class() == {}
     assert math.isnan(empty.overall().ap)
@@ -229,7 +220,7 @@ def test_scans_add_up_and_do_not_mix() -> None:
 
 
 def test_boxes_by_range() -> None:
-    evaluator = BoxEvaluator()
+    evaluator = metrics.BoxEvaluator()
     truth = [box(10.0, 0.0), box(28.0, 0.0), box(40.0, 0.0)]
     predicted = [box(10.0, 0.0, score=0.9), box(28.5, 0.0, score=0.8), box(12.0, 5.0, score=0.7)]
     pairs = evaluator.update(predicted, truth)
@@ -244,7 +235,7 @@ def test_boxes_by_range() -> None:
 
 
 def test_what_is_excused_is_in_no_pair() -> None:
-    evaluator = BoxEvaluator()
+    evaluator = metrics.BoxEvaluator()
     assert evaluator.update([box(20.0, 0.0)], [], ignored=[box(20.0, 0.0)]) == []
 
 
@@ -259,7 +250,7 @@ SOME_BOXES = st.lists(
 def test_evaluators_put_together_say_what_one_says(
     scans: list[tuple[list[Box], list[Box]]], split: int, oriented: bool
 ) -> None:
-    whole, first, second = (BoxEvaluator(oriented=oriented) for _ in range(3))
+    whole, first, second = (metrics.BoxEvaluator(oriented=oriented) for _ in range(3))
     for k, (predicted, truth) in enumerate(scans):
         scan = [box(*each) for each in predicted], [box(*each) for each in truth]
         whole.update(*scan)
@@ -269,21 +260,21 @@ def test_evaluators_put_together_say_what_one_says(
         assert repr(both.per_class(within_m)) == repr(whole.per_class(within_m))  # NaN is not equal to itself
         assert repr(both.overall(within_m)) == repr(whole.overall(within_m))
     with pytest.raises(PointsError, match="expected the same"):
-        both + BoxEvaluator(0.7, oriented=oriented)
+        both + metrics.BoxEvaluator(0.7, oriented=oriented)
 
 
 def test_overall_puts_together_what_it_is_told_to() -> None:
     truth = [box(10.0, 0.0, "van"), box(20.0, 0.0, "pedestrian"), box(30.0, 0.0, "car")]
-    evaluator = BoxEvaluator(0.5, together=("car", "van"))
+    evaluator = metrics.BoxEvaluator(0.5, together=("car", "van"))
     pairs = evaluator.update([box(10.0, 0.0), box(20.0, 0.0), box(30.0, 0.0, "pedestrian")], truth)
     assert [(guess is not None, right is not None) for guess, right in pairs] == [(True, True)] * 3
-    for scores in (evaluator.overall(), (evaluator + BoxEvaluator(0.5, together=("car", "van"))).overall()):
+    for scores in (evaluator.overall(), (evaluator + metrics.BoxEvaluator(0.5, together=("car", "van"))).overall()):
         assert (scores.n_truth, scores.n_predicted, scores.n_hits) == (2, 2, 1)
 
 
 def test_better_scores_choose_first_and_take_what_fits_best() -> None:
     truth = [box(10.0, 0.0), box(11.0, 0.0)]
-    evaluator = BoxEvaluator(0.5)
+    evaluator = metrics.BoxEvaluator(0.5)
     # Listed worst first. The better prediction overlaps both; it takes the nearer, and leaves the other.
     evaluator.update([box(10.1, 0.0, score=0.2), box(10.8, 0.0, score=0.9)], truth)
     assert evaluator.overall().n_hits == 2
@@ -291,7 +282,7 @@ def test_better_scores_choose_first_and_take_what_fits_best() -> None:
 
 
 def test_ignored_boxes_and_regions_make_neither_right_nor_wrong() -> None:
-    evaluator = BoxEvaluator(0.5)
+    evaluator = metrics.BoxEvaluator(0.5)
     evaluator.update(
         [
             box(10.0, 0.0, score=0.9),
@@ -307,7 +298,7 @@ def test_ignored_boxes_and_regions_make_neither_right_nor_wrong() -> None:
     scores = evaluator.overall()
     assert (scores.n_truth, scores.n_predicted, scores.n_hits) == (1, 2, 1)
     # A truth is taken before an ignored box is thought of.
-    close = BoxEvaluator(0.5)
+    close = metrics.BoxEvaluator(0.5)
     close.update([box(10.0, 0.0)], [box(10.5, 0.0)], ignored=[box(10.0, 0.0)])
     assert close.overall().n_hits == 1
 
@@ -315,7 +306,7 @@ def test_ignored_boxes_and_regions_make_neither_right_nor_wrong() -> None:
 def test_axis_aligned_bounds_are_what_the_paper_compares() -> None:
     turned = [box(10.0, 0.0, yaw=math.pi / 4.0)]
     other = [box(10.0, 0.0, yaw=-math.pi / 4.0)]
-    oriented, aligned = BoxEvaluator(0.5), BoxEvaluator(0.5, oriented=False)
+    oriented, aligned = metrics.BoxEvaluator(0.5), metrics.BoxEvaluator(0.5, oriented=False)
     oriented.update(other, turned)
     aligned.update(other, turned)
     assert oriented.overall().n_hits == 0  # two bars that cross: 4 of 12 m2
@@ -328,11 +319,11 @@ def test_axis_aligned_bounds_are_what_the_paper_compares() -> None:
 @pytest.mark.parametrize("threshold", [0.0, -0.5, 1.1, math.nan])
 def test_thresholds_out_of_range_raise(threshold: float) -> None:
     with pytest.raises(PointsError, match="iou_threshold"):
-        BoxEvaluator(threshold)
+        metrics.BoxEvaluator(threshold)
 
 
 def test_headings_by_hand() -> None:
-    square = {"size": (2.0, 2.0)}
+    square = {"size": (2.0, 2.0, 1.5)}
     truth = [box(10.0 * k, 0.0, yaw=yaw, **square) for k, yaw in enumerate((0.0, 0.0, 0.0, 3.1, 0.0))]
     predicted = [
         box(0.0, 0.0, yaw=0.7, **square),  # 40 degrees
@@ -342,11 +333,11 @@ def test_headings_by_hand() -> None:
         box(99.0, 0.0, **square),  # no match
         box(40.0, 0.0, yaw=math.nan, **square),  # overlaps nothing
     ]
-    evaluator = BoxEvaluator()
+    evaluator = metrics.BoxEvaluator()
     evaluator.update(predicted, truth)
     scores = evaluator.overall()
     assert (scores.n_hits, scores.heading, scores.axis, scores.front_known) == (4, 2 / 4, 3 / 4, 0.0)
-    known = BoxEvaluator()
+    known = metrics.BoxEvaluator()
     known.update([replace(predicted[0], front=0.9), predicted[1], replace(predicted[4], front=0.9)], truth)
     assert known.overall().front_known == 1 / 2
     near = evaluator.per_class((0.0, 15.0))["car"]
@@ -360,10 +351,10 @@ def test_headings_by_hand() -> None:
 @settings(deadline=None)
 @given(st.lists(st.tuples(st.integers(-700, 700), st.integers(-700, 700)), max_size=5))
 def test_headings_are_those_of_unit_vectors(degrees: list[tuple[int, int]]) -> None:
-    side = {"size": (2.0, 2.0)}
+    side = {"size": (2.0, 2.0, 1.5)}
     degrees = [(a, b) for a, b in degrees if (a - b) % 90 != 45]  # exactly 45 degrees depends on rounding
     truth = [box(10.0 * k, 0.0, yaw=math.radians(b), **side) for k, (_, b) in enumerate(degrees)]
-    evaluator = BoxEvaluator()
+    evaluator = metrics.BoxEvaluator()
     evaluator.update([box(10.0 * k, 0.0, yaw=math.radians(a), **side) for k, (a, _) in enumerate(degrees)], truth)
     cosines = np.cos(np.radians([a - b for a, b in degrees]))
     scores = evaluator.overall()
@@ -374,12 +365,12 @@ def test_headings_are_those_of_unit_vectors(degrees: list[tuple[int, int]]) -> N
 
 
 def test_an_object_counts_once_a_drive() -> None:
-    evaluator = BoxEvaluator()
-    one, other = box(10.0, 0.0, size=(4.123, 2.0)), box(30.0, 0.0, size=(4.13, 2.0))
-    moved = box(14.0, 3.0, size=(4.1249, 2.0), yaw=0.4)
-    assert object_key("a", one) == object_key("a", moved) == ("a", "car", 4.12, 2.0, 1.5)
-    assert object_key("a", one) != object_key("a", other)
-    assert object_key("a", one) != object_key("b", one)
+    evaluator = metrics.BoxEvaluator()
+    one, other = box(10.0, 0.0, size=(4.123, 2.0, 1.5)), box(30.0, 0.0, size=(4.13, 2.0, 1.5))
+    moved = box(14.0, 3.0, size=(4.1249, 2.0, 1.5), yaw=0.4)
+    assert metrics.object_key("a", one) == metrics.object_key("a", moved) == ("a", "car", 4.12, 2.0, 1.5)
+    assert metrics.object_key("a", one) != metrics.object_key("a", other)
+    assert metrics.object_key("a", one) != metrics.object_key("b", one)
     evaluator.update([one], [one, other], drive="a")
     evaluator.update([moved], [moved], drive="a")
     evaluator.update([], [one], drive="b")
@@ -393,6 +384,6 @@ def test_an_object_counts_once_a_drive() -> None:
 
 
 def test_a_mean_leaves_nan_out() -> None:
-    assert mean([0.5, math.nan, 1.0]) == 0.75
-    assert math.isnan(mean([]))
-    assert math.isnan(mean([math.nan]))
+    assert metrics.mean([0.5, math.nan, 1.0]) == 0.75
+    assert math.isnan(metrics.mean([]))
+    assert math.isnan(metrics.mean([math.nan]))

@@ -17,22 +17,7 @@ from edgeperc.simulation.samples import IGNORE, simulated_scan
 from edgeperc.simulation.scene import POINT_CLASS_OF
 from edgeperc.types.geometry import inside
 from edgeperc.types.perception import Box
-from edgeperc_export.data.augment import (
-    MAX_PERSON_RANGE_M,
-    NEGATIVES,
-    Augmentation,
-    ObjectBank,
-    augmented,
-    background_pieces,
-    facing,
-    halved,
-    pasted,
-    resized,
-    swapped,
-    tilted,
-    weathered,
-    with_ground_ahead,
-)
+from edgeperc_export.data import augment
 from edgeperc_export.data.scans import SURFACE, LabeledScan, turned
 
 GROUND_M = -1.73
@@ -76,7 +61,7 @@ def test_a_bank_holds_each_object_with_its_points() -> None:
         boxes=(box, replace(box, center=(20.0, 5.0, -0.88)), replace(box, label="tram")),
         counts=(len(points), 3, 50),  # enough returns, too few returns, an unknown class
     )
-    bank = ObjectBank.of([held])
+    bank = augment.ObjectBank.of([held])
     ((kept, cut),) = bank.objects.pop("pedestrian")
     assert not bank.objects
     assert kept == box
@@ -87,8 +72,8 @@ def test_a_bank_holds_each_object_with_its_points() -> None:
 def test_a_pasted_object_hides_only_what_is_behind_it() -> None:
     box, points = post(10.0, 0.0, "car")
     street = flat_street()
-    bank = ObjectBank({"car": [(box, points)]})
-    out = pasted(street, bank, np.random.default_rng(0), 1, {"car": 1.0})
+    bank = augment.ObjectBank({"car": [(box, points)]})
+    out = augment.pasted(street, bank, np.random.default_rng(0), 1, {"car": 1.0})
     (there,) = out.boxes
     (count,) = out.counts
     assert count == np.count_nonzero(out.labels == 1) == len(points)
@@ -111,14 +96,14 @@ def test_an_object_behind_a_wall_is_not_pasted() -> None:
     hidden = replace(
         street, points=np.concatenate([street.points, wall]), labels=np.zeros(len(street.points) + len(wall), np.uint8)
     )
-    bank = ObjectBank({"pedestrian": [post(10.0, 0.0)]})
+    bank = augment.ObjectBank({"pedestrian": [post(10.0, 0.0)]})
     for seed in range(5):
-        assert pasted(hidden, bank, np.random.default_rng(seed), 1, {"pedestrian": 1.0}) is hidden
+        assert augment.pasted(hidden, bank, np.random.default_rng(seed), 1, {"pedestrian": 1.0}) is hidden
 
 
 def test_objects_are_not_pasted_into_one_another() -> None:
-    bank = ObjectBank({"pedestrian": [post(10.0, 0.0)], "cyclist": [post(10.0, 0.0, "cyclist")]})
-    out = pasted(flat_street(), bank, np.random.default_rng(3), 60, {"pedestrian": 1.0, "cyclist": 1.0})
+    bank = augment.ObjectBank({"pedestrian": [post(10.0, 0.0)], "cyclist": [post(10.0, 0.0, "cyclist")]})
+    out = augment.pasted(flat_street(), bank, np.random.default_rng(3), 60, {"pedestrian": 1.0, "cyclist": 1.0})
     centers = np.array([b.center[:2] for b in out.boxes])
     apart = np.hypot(*(centers[:, None] - centers[None]).transpose(2, 0, 1)) + 9 * np.eye(len(centers))
     assert len(centers) > 5
@@ -128,18 +113,20 @@ def test_objects_are_not_pasted_into_one_another() -> None:
 
 def test_nothing_to_paste_is_no_change(scan: LabeledScan) -> None:
     rng = np.random.default_rng(0)
-    assert pasted(scan, ObjectBank({}), rng, 5, {"pedestrian": 1.0}) is scan
-    assert pasted(scan, ObjectBank({"pedestrian": [post(10, 0)]}), rng, 0, {"pedestrian": 1.0}) is scan
+    assert augment.pasted(scan, augment.ObjectBank({}), rng, 5, {"pedestrian": 1.0}) is scan
+    assert augment.pasted(scan, augment.ObjectBank({"pedestrian": [post(10, 0)]}), rng, 0, {"pedestrian": 1.0}) is scan
     empty = replace(flat_street(), points=np.zeros((0, 4), np.float32), labels=np.zeros(0, np.uint8))
-    assert pasted(empty, ObjectBank({"pedestrian": [post(10, 0)]}), rng, 5, {"pedestrian": 1.0}) is empty
+    assert (
+        augment.pasted(empty, augment.ObjectBank({"pedestrian": [post(10, 0)]}), rng, 5, {"pedestrian": 1.0}) is empty
+    )
 
 
 @settings(max_examples=15, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_pasted_labels_are_those_of_the_boxes(scan: LabeledScan, seed: int) -> None:
     rng = np.random.default_rng(seed)
-    bank = ObjectBank.of([scan])
-    out = pasted(scan, bank, rng, 6, dict.fromkeys(bank.objects, 1.0))
+    bank = augment.ObjectBank.of([scan])
+    out = augment.pasted(scan, bank, rng, 6, dict.fromkeys(bank.objects, 1.0))
     assert len(out.points) == len(out.labels)
     assert len(out.boxes) == len(out.counts)
     for box, count in zip(out.boxes[len(scan.boxes) :], out.counts[len(scan.boxes) :], strict=True):
@@ -150,7 +137,7 @@ def test_pasted_labels_are_those_of_the_boxes(scan: LabeledScan, seed: int) -> N
 def test_a_swapped_sector_keeps_its_labels(scan: LabeledScan) -> None:
     other = replace(scan, points=scan.points + np.float32([0, 0, 0.5, 0]), labels=np.full_like(scan.labels, 3))
     scan = replace(scan, labels=np.zeros_like(scan.labels))
-    out = swapped(scan, other, np.random.default_rng(1))
+    out = augment.swapped(scan, other, np.random.default_rng(1))
     azimuth = np.arctan2(out.points[:, 1], out.points[:, 0])
     low, high = azimuth[out.labels == 3].min(), azimuth[out.labels == 3].max()
     assert np.radians(20) < high - low <= np.pi / 4
@@ -160,13 +147,13 @@ def test_a_swapped_sector_keeps_its_labels(scan: LabeledScan) -> None:
 
 
 def test_weather_loses_returns_and_labels_drops_background(scan: LabeledScan) -> None:
-    out = weathered(replace(scan, labels=np.ones_like(scan.labels)), np.random.default_rng(4))
+    out = augment.weathered(replace(scan, labels=np.ones_like(scan.labels)), np.random.default_rng(4))
     far = [np.mean(np.linalg.norm(s.points[:, :3], axis=1) > 30) for s in (scan, out)]
     assert far[1] < far[0]
     assert len(out.points) == len(out.labels) < len(scan.points)
     drops = out.labels == 0
     assert 0 < drops.mean() < 0.02
-    unknown = weathered(replace(scan, labels=np.full_like(scan.labels, IGNORE)), np.random.default_rng(4))
+    unknown = augment.weathered(replace(scan, labels=np.full_like(scan.labels, IGNORE)), np.random.default_rng(4))
     assert (unknown.labels == IGNORE).all()
 
 
@@ -174,10 +161,10 @@ def test_facing_turns_a_rare_object_to_the_front(scan: LabeledScan) -> None:
     rare = [b for b, n in zip(scan.boxes, scan.counts, strict=True) if b.label in ("pedestrian", "cyclist") and n >= 5]
     assert rare, "the scene has no pedestrian or cyclist"
     for seed in range(5):
-        angle = facing(scan, np.random.default_rng(seed))
+        angle = augment.facing(scan, np.random.default_rng(seed))
         ahead = [b for b in turned(scan, angle).boxes if b.label in ("pedestrian", "cyclist")]
         assert min(abs(np.arctan2(b.center[1], b.center[0])) for b in ahead) <= 0.6
-    assert facing(flat_street(), np.random.default_rng(0)) == 0.0
+    assert augment.facing(flat_street(), np.random.default_rng(0)) == 0.0
 
 
 def test_a_scan_labeled_on_all_sides_turns_anywhere(scan: LabeledScan) -> None:
@@ -185,7 +172,8 @@ def test_a_scan_labeled_on_all_sides_turns_anywhere(scan: LabeledScan) -> None:
 
     def turns(**how: float) -> np.ndarray:
         seen = [
-            augmented(scan, np.random.default_rng(seed), Augmentation(**how)).boxes[0].center[:2] for seed in range(60)
+            augment.augmented(scan, np.random.default_rng(seed), augment.Augmentation(**how)).boxes[0].center[:2]
+            for seed in range(60)
         ]
         return np.abs(np.degrees(np.angle(np.array(seen) @ [1, 1j] / (middle @ [1, 1j]))))
 
@@ -198,9 +186,9 @@ def test_a_scan_labeled_on_all_sides_turns_anywhere(scan: LabeledScan) -> None:
 
 
 def test_the_same_draw_gives_the_same_scan(scan: LabeledScan) -> None:
-    bank = ObjectBank.of([scan])
-    how = Augmentation(n_pasted=5.0, turn_to_rare=0.5, weather=0.5)
-    one, other = (augmented(scan, np.random.default_rng(9), how, bank) for _ in range(2))
+    bank = augment.ObjectBank.of([scan])
+    how = augment.Augmentation(n_pasted=5.0, turn_to_rare=0.5, weather=0.5)
+    one, other = (augment.augmented(scan, np.random.default_rng(9), how, bank) for _ in range(2))
     np.testing.assert_array_equal(one.points, other.points)
     np.testing.assert_array_equal(one.labels, other.labels)
     assert one.boxes == other.boxes
@@ -233,7 +221,7 @@ def pole_and_wall() -> LabeledScan:
 
 def test_poles_and_walls_are_cut_out_of_the_background() -> None:
     scan = pole_and_wall()
-    pieces = list(background_pieces(scan))
+    pieces = list(augment.background_pieces(scan))
     assert sorted({box.label for box, _ in pieces}) == ["pole", "wall"]
     for box, points in pieces:
         assert inside(box, points, 0.05).all()
@@ -244,16 +232,16 @@ def test_poles_and_walls_are_cut_out_of_the_background() -> None:
     ((pole, _),) = [piece for piece in pieces if piece[0].label == "pole"]
     assert pole.center[:2] == pytest.approx((12.0, 4.0), abs=0.1)
     # A pole of unknown class, or beside a labeled object, is not known to be background.
-    assert not list(background_pieces(replace(scan, labels=np.full_like(scan.labels, IGNORE))))
+    assert not list(augment.background_pieces(replace(scan, labels=np.full_like(scan.labels, IGNORE))))
     nothing = replace(scan, points=scan.points[:0], labels=scan.labels[:0])
-    assert not list(background_pieces(nothing))
+    assert not list(augment.background_pieces(nothing))
 
 
 def test_pasted_background_is_background() -> None:
-    bank = ObjectBank.of([pole_and_wall()])
+    bank = augment.ObjectBank.of([pole_and_wall()])
     assert set(bank.objects) == {"pedestrian", "pole", "wall"}
     street = flat_street()
-    out = pasted(street, bank, np.random.default_rng(0), 8, NEGATIVES)
+    out = augment.pasted(street, bank, np.random.default_rng(0), 8, augment.NEGATIVES)
     assert not out.boxes
     assert not out.counts
     assert not out.labels.any()
@@ -261,8 +249,8 @@ def test_pasted_background_is_background() -> None:
 
 
 def test_pasted_objects_get_the_number_of_their_class() -> None:
-    bank = ObjectBank({"cone": [post(10.0, 0.0, "cone")]}, ("background", "car", "cone"))
-    out = pasted(flat_street(), bank, np.random.default_rng(0), 1, {"cone": 1.0})
+    bank = augment.ObjectBank({"cone": [post(10.0, 0.0, "cone")]}, ("background", "car", "cone"))
+    out = augment.pasted(flat_street(), bank, np.random.default_rng(0), 1, {"cone": 1.0})
     assert set(np.unique(out.labels)) == {0, 2}
 
 
@@ -270,8 +258,8 @@ def test_pasted_objects_get_the_number_of_their_class() -> None:
 @given(seed=st.integers(0, 2**32 - 1), distance=st.floats(4.0, 44.0))
 def test_a_resized_person_stands_on_the_same_ground(seed: int, distance: float) -> None:
     box, points = post(distance, 0.0)
-    other, moved = resized(box, points, np.random.default_rng(seed))
-    assert distance - 1e-6 <= np.hypot(*other.center[:2]) <= min(1.6 * distance, MAX_PERSON_RANGE_M) + 1e-6
+    other, moved = augment.resized(box, points, np.random.default_rng(seed))
+    assert distance - 1e-6 <= np.hypot(*other.center[:2]) <= min(1.6 * distance, augment.MAX_PERSON_RANGE_M) + 1e-6
     assert other.center[2] - other.size[2] / 2 == pytest.approx(GROUND_M, abs=1e-6)
     assert 0.87 <= other.size[2] / box.size[2] <= 1.15
     assert inside(other, moved, 0.01).all()
@@ -283,17 +271,17 @@ def test_the_ground_at_the_bumper_is_background() -> None:
     street = flat_street((box,))
     unknown = np.full(len(street.points) + len(points), IGNORE, np.uint8)
     scan = replace(street, points=np.concatenate([street.points, points]), labels=unknown, counts=(len(points),))
-    out = with_ground_ahead(scan)
+    out = augment.with_ground_ahead(scan)
     known = out.labels == 0
     near = (scan.points[:, 0] < 6.0) & (np.abs(scan.points[:, 1]) < 3.0) & (scan.points[:, 2] < GROUND_M + 0.2)
     assert (near | ~known).all()
     assert np.count_nonzero(known) > 500
     assert not (known & inside(box, scan.points)).any()
-    assert with_ground_ahead(street) is street
+    assert augment.with_ground_ahead(street) is street
 
 
 def test_every_second_beam_is_dropped(scan: LabeledScan) -> None:
-    out = halved(scan)
+    out = augment.halved(scan)
     assert out.sensor is not None
     assert len(out.sensor.elevations_deg) == 32
     assert 0.4 < len(out.points) / len(scan.points) < 0.6
@@ -301,11 +289,11 @@ def test_every_second_beam_is_dropped(scan: LabeledScan) -> None:
     elevations = np.degrees(np.arctan2(out.points[:, 2], flat))
     apart = np.abs(elevations[:, None] - np.array(out.sensor.elevations_deg)).min(1)
     assert np.quantile(apart, 0.99) < 0.3
-    assert halved(out) is out
+    assert augment.halved(out) is out
 
 
 def test_a_tilted_scan_keeps_its_objects(scan: LabeledScan) -> None:
-    out = tilted(scan, np.radians(0.5), np.radians(-0.5), 0.05)
+    out = augment.tilted(scan, np.radians(0.5), np.radians(-0.5), 0.05)
     for box, other in zip(scan.boxes, out.boxes, strict=True):
         shift = np.subtract(other.center, box.center)
         assert abs(shift[2]) < 0.05 + np.radians(0.75) * np.hypot(*box.center[:2])
@@ -321,6 +309,6 @@ def test_a_tilted_scan_keeps_its_objects(scan: LabeledScan) -> None:
 
 def test_scans_without_remission_have_the_constant_of_the_runtime(scan: LabeledScan) -> None:
     rng = np.random.default_rng(0)
-    missing = augmented(scan, rng, Augmentation(no_remission=1.0))
+    missing = augment.augmented(scan, rng, augment.Augmentation(no_remission=1.0))
     assert (missing.points[:, 3] == np.float32(NO_REMISSION.coefficients[0])).all()
-    assert np.ptp(augmented(scan, rng).points[:, 3]) > 0.1
+    assert np.ptp(augment.augmented(scan, rng).points[:, 3]) > 0.1

@@ -27,7 +27,7 @@ for package in ("filelock", "tqdm", "onnx", "onnxruntime"):
     pytest.importorskip(package)
 shapely = pytest.importorskip("shapely")
 
-from database_helpers import INPUT, TRAPEZIUM, drawn, plan_of, road_network, simulated_kitti
+from database_helpers import INPUT, TRAPEZIUM, drawn, plan_of, road_network
 from shapely import Polygon
 
 import twins.database
@@ -53,11 +53,6 @@ from edgeperc_export.database.files import (
     vehicles,
     write_labels,
 )
-
-
-@pytest.fixture(scope="module")
-def kitti(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return simulated_kitti(tmp_path_factory.mktemp("kitti"))
 
 
 @pytest.fixture(scope="module")

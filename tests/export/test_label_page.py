@@ -28,7 +28,7 @@ pytest.importorskip("PIL.Image")
 for package in ("faster_coco_eval", "filelock", "tqdm", "onnx", "onnxruntime"):
     pytest.importorskip(package)
 
-from database_helpers import TRAPEZIUM, drawn, plan_of, road_network, simulated_kitti
+from database_helpers import TRAPEZIUM, drawn, plan_of, road_network
 
 from edgeperc.system.printable import printable
 from edgeperc.types.views import TopViewGeometry
@@ -39,11 +39,6 @@ from edgeperc_export.database.files import TopViewDatabase
 from edgeperc_export.database.label_page import LARGEST_BODY, LARGEST_HEAD, TOKEN, LabelServer
 
 ROAD = json.dumps([TRAPEZIUM])
-
-
-@pytest.fixture(scope="module")
-def kitti(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return simulated_kitti(tmp_path_factory.mktemp("kitti"))
 
 
 @pytest.fixture(scope="module")

@@ -18,19 +18,7 @@ from edgeperc.types.perception import Box
 from edgeperc.types.views import TopViewGeometry
 from edgeperc_export.data.scans import LabeledScan, mirrored, turned
 from edgeperc_export.data.targets import REGRESSED_FROM, dense_targets, paper_slot_targets, slot_targets
-from edgeperc_export.training.losses import (
-    FRONT_WEIGHT,
-    GEOMETRY_WEIGHTS,
-    box_distillation_loss,
-    cross_entropy,
-    dense_loss,
-    distillation_loss,
-    lovasz_softmax,
-    paper_slots_loss,
-    pointseg_loss,
-    slots_loss,
-    ssadnet_loss,
-)
+from edgeperc_export.training import losses
 
 VIEW = TopViewGeometry()  # x 6..46 m, y -10..10 m, 0.1 m cells
 CAR = (26.0, 2.0, -1.0, 4.0, 1.6, 1.5, 0.0)
@@ -296,7 +284,7 @@ def test_segmentation_loss_is_equation_4(rng: np.random.Generator) -> None:
     n, height, width = labels.shape
     y_true = np.eye(5)[labels].transpose(0, 3, 1, 2)
     expected = -(y_true * log_softmax(logits)).sum() / (n * width * height)
-    assert cross_entropy(torch.tensor(logits), torch.tensor(labels)).item() == pytest.approx(expected, rel=1e-5)
+    assert losses.cross_entropy(torch.tensor(logits), torch.tensor(labels)).item() == pytest.approx(expected, rel=1e-5)
 
 
 @pytest.mark.parametrize("gamma", [0.0, 2.0])
@@ -314,7 +302,7 @@ def test_weighted_cross_entropy_with_ignored_pixels(
             total -= weight * (1 - p) ** gamma * log_p[n, label, r, c]
             share += weight
     tensor = None if weights is None else torch.tensor(weights)
-    loss = cross_entropy(torch.tensor(logits), torch.tensor(labels), tensor, focal_gamma=gamma)
+    loss = losses.cross_entropy(torch.tensor(logits), torch.tensor(labels), tensor, focal_gamma=gamma)
     assert loss.item() == pytest.approx(total / share, rel=1e-4)
 
 
@@ -324,11 +312,13 @@ def test_weighted_cross_entropy_with_ignored_pixels(
 )
 def test_the_focal_loss_of_a_pixel_is_its_formula(p: float, gamma: float, expected: float) -> None:
     logits = torch.tensor([np.log(p), np.log(1.0 - p)], dtype=torch.float32).view(1, 2, 1, 1)
-    loss = cross_entropy(logits, torch.zeros((1, 1, 1), dtype=torch.uint8), focal_gamma=gamma)
+    loss = losses.cross_entropy(logits, torch.zeros((1, 1, 1), dtype=torch.uint8), focal_gamma=gamma)
     assert loss.item() == pytest.approx(expected, rel=1e-5)
 
 
-@pytest.mark.parametrize("loss", [cross_entropy, lovasz_softmax, lambda x, y: pointseg_loss(x, y, lovasz_weight=1.0)])
+@pytest.mark.parametrize(
+    "loss", [losses.cross_entropy, losses.lovasz_softmax, lambda x, y: losses.pointseg_loss(x, y, lovasz_weight=1.0)]
+)
 def test_the_loss_without_labels_is_0(loss: Callable[..., torch.Tensor]) -> None:
     logits = torch.randn(2, 4, 3, 3, requires_grad=True)
     value = loss(logits, torch.full((2, 3, 3), IGNORE, dtype=torch.uint8))
@@ -337,7 +327,7 @@ def test_the_loss_without_labels_is_0(loss: Callable[..., torch.Tensor]) -> None
     assert not logits.grad.any()
 
 
-@pytest.mark.parametrize("loss", [cross_entropy, lovasz_softmax])
+@pytest.mark.parametrize("loss", [losses.cross_entropy, losses.lovasz_softmax])
 def test_ignored_pixels_get_no_gradient(rng: np.random.Generator, loss: Callable[..., torch.Tensor]) -> None:
     logits, labels = random_maps(rng)
     tensor = torch.tensor(logits, requires_grad=True)
@@ -351,9 +341,9 @@ def test_distillation_is_lowest_at_the_teachers_probabilities(rng: np.random.Gen
     logits, _ = random_maps(rng)
     teacher = np.exp(log_softmax(rng.normal(size=logits.shape)))
     expected = -(teacher * log_softmax(logits.astype(np.float64))).sum(1).mean()
-    loss = distillation_loss(torch.from_numpy(logits), torch.from_numpy(teacher))
+    loss = losses.distillation_loss(torch.from_numpy(logits), torch.from_numpy(teacher))
     assert float(loss) == pytest.approx(expected, rel=1e-5)
-    assert distillation_loss(torch.from_numpy(np.log(teacher)), torch.from_numpy(teacher)) < loss
+    assert losses.distillation_loss(torch.from_numpy(np.log(teacher)), torch.from_numpy(teacher)) < loss
 
 
 @pytest.mark.parametrize(("n_taught", "n_own"), [(9, 9), (9, 11), (11, 9), (11, 11)])
@@ -367,17 +357,17 @@ def test_distillation_of_boxes_is_weighted_by_the_teachers_heat(
     share = heat * (heat >= REGRESSED_FROM)
     assert share.sum() > 1.0
     cross = -(heat * np.log(p) + (1.0 - heat) * np.log(1.0 - p)).sum()
-    apart = (np.abs(own[:, :9] - taught[:, :9])[:, 1:] * np.array(GEOMETRY_WEIGHTS).reshape(1, -1, 1, 1)).sum(1)
+    apart = (np.abs(own[:, :9] - taught[:, :9])[:, 1:] * np.array(losses.GEOMETRY_WEIGHTS).reshape(1, -1, 1, 1)).sum(1)
     if n_taught == n_own == 11:
         yaw = 0.5 * np.arctan2(taught[:, 5], taught[:, 6])
         theirs, ours = (front[:, 9] * np.cos(yaw) + front[:, 10] * np.sin(yaw) for front in (taught, own))
-        apart += FRONT_WEIGHT * cross_of_logits(ours, 1.0 / (1.0 + np.exp(-theirs.astype(np.float64))))
+        apart += losses.FRONT_WEIGHT * cross_of_logits(ours, 1.0 / (1.0 + np.exp(-theirs.astype(np.float64))))
     expected = (cross + (apart * share).sum()) / share.sum()
-    loss = box_distillation_loss(torch.from_numpy(own), torch.from_numpy(taught))
+    loss = losses.box_distillation_loss(torch.from_numpy(own), torch.from_numpy(taught))
     assert loss.item() == pytest.approx(expected, rel=1e-5)
     nothing = torch.from_numpy(taught).clone()
     nothing[:, 0] = -50.0
-    assert torch.isfinite(box_distillation_loss(torch.from_numpy(own), nothing))
+    assert torch.isfinite(losses.box_distillation_loss(torch.from_numpy(own), nothing))
 
 
 def test_lovasz_of_hard_predictions_is_one_minus_mean_iou(rng: np.random.Generator) -> None:
@@ -389,7 +379,7 @@ def test_lovasz_of_hard_predictions_is_one_minus_mean_iou(rng: np.random.Generat
         for c in range(3)
     ]
     logits = 1e4 * np.eye(3, dtype=np.float32)[predicted].transpose(0, 3, 1, 2)
-    loss = lovasz_softmax(torch.tensor(logits), torch.tensor(labels))
+    loss = losses.lovasz_softmax(torch.tensor(logits), torch.tensor(labels))
     assert loss.item() == pytest.approx(1.0 - np.mean(ious), abs=1e-5)
 
 
@@ -407,31 +397,35 @@ def test_lovasz_is_the_extension_of_the_jaccard_loss(rng: np.random.Generator) -
             wrong = (errors >= higher).reshape(truth.shape)
             value += (higher - lower) * wrong.sum() / (truth | wrong).sum()
         expected.append(value)
-    loss = lovasz_softmax(torch.tensor(logits), torch.tensor(labels))
+    loss = losses.lovasz_softmax(torch.tensor(logits), torch.tensor(labels))
     assert loss.item() == pytest.approx(np.mean(expected), rel=1e-5)
 
 
 def test_pointseg_loss_is_the_sum_of_its_parts(rng: np.random.Generator) -> None:
     logits, labels = (torch.tensor(a) for a in random_maps(rng, n_classes=4))
     weights = torch.tensor([0.1, 1.0, 2.0, 3.0])
-    total = pointseg_loss(logits, labels, weights, focal_gamma=1.5, lovasz_weight=0.7)
-    parts = cross_entropy(logits, labels, weights, focal_gamma=1.5) + 0.7 * lovasz_softmax(logits, labels)
+    total = losses.pointseg_loss(logits, labels, weights, focal_gamma=1.5, lovasz_weight=0.7)
+    parts = losses.cross_entropy(logits, labels, weights, focal_gamma=1.5) + 0.7 * losses.lovasz_softmax(logits, labels)
     torch.testing.assert_close(total, parts)
-    torch.testing.assert_close(pointseg_loss(logits, labels), cross_entropy(logits, labels))
+    torch.testing.assert_close(losses.pointseg_loss(logits, labels), losses.cross_entropy(logits, labels))
 
 
 def test_paper_slots_loss_is_equations_5_and_6(rng: np.random.Generator) -> None:
     predicted, target = rng.random((2, 3, 6, 4)).astype(np.float32)
     n, k, _ = target.shape
     mean_squared = [((target[..., i] - predicted[..., i]) ** 2).sum() / (n * k) for i in range(4)]
-    assert paper_slots_loss(torch.tensor(predicted), torch.tensor(target)).item() == pytest.approx(sum(mean_squared))
+    assert losses.paper_slots_loss(torch.tensor(predicted), torch.tensor(target)).item() == pytest.approx(
+        sum(mean_squared)
+    )
 
 
 def test_negative_slots_are_not_learned(rng: np.random.Generator) -> None:
     predicted, target = (torch.tensor(a.astype(np.float32)) for a in rng.random((2, 2, 6, 4)))
     target[1] = -1.0
-    torch.testing.assert_close(paper_slots_loss(predicted, target), paper_slots_loss(predicted[:1], target[:1]))
-    assert paper_slots_loss(predicted[1:], target[1:]).item() == 0.0
+    torch.testing.assert_close(
+        losses.paper_slots_loss(predicted, target), losses.paper_slots_loss(predicted[:1], target[:1])
+    )
+    assert losses.paper_slots_loss(predicted[1:], target[1:]).item() == 0.0
 
 
 def slots_case(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
@@ -445,7 +439,7 @@ def slots_case(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
 
 def test_slots_loss_is_the_presence_and_the_error_of_each_box(rng: np.random.Generator) -> None:
     predicted, target = slots_case(rng)
-    presence, boxes = slots_loss(torch.tensor(predicted), torch.tensor(target))
+    presence, boxes = losses.slots_loss(torch.tensor(predicted), torch.tensor(target))
     learned = target[..., 4] >= 0.0
     cross = cross_of_logits(predicted[..., 4], target[..., 4] == 1.0)
     assert presence.item() == pytest.approx(cross[learned].sum() / 2, rel=1e-5)
@@ -463,7 +457,7 @@ def test_slots_loss_is_the_presence_and_the_error_of_each_box(rng: np.random.Gen
 def test_slots_loss_ignores_unlearned_slots_and_boxes_of_empty_ones(rng: np.random.Generator) -> None:
     predicted, target = slots_case(rng)
     tensor = torch.tensor(predicted, requires_grad=True)
-    sum(slots_loss(tensor, torch.tensor(target))).backward()
+    sum(losses.slots_loss(tensor, torch.tensor(target))).backward()
     gradient = tensor.grad.numpy()
     assert (gradient[..., 4].astype(bool) == (target[..., 4] >= 0.0)).all()
     assert (gradient[..., :4].any(-1) == (target[..., 4] == 1.0)).all()
@@ -473,12 +467,12 @@ def test_slots_loss_of_the_truth_is_small_and_of_no_objects_is_finite(rng: np.ra
     _, target = slots_case(rng)
     perfect = torch.tensor(target)
     perfect[..., 4] = torch.where(perfect[..., 4] == 1.0, 30.0, -30.0)
-    presence, boxes = slots_loss(perfect, torch.tensor(target))
+    presence, boxes = losses.slots_loss(perfect, torch.tensor(target))
     assert presence.item() < 1e-6
     assert boxes.item() < 1e-5
     for value in (0.0, -1e30, 1e30):
         extreme = torch.full((1, 72, 5), value, requires_grad=True)
-        loss = sum(slots_loss(extreme, torch.tensor(target[1:])))
+        loss = sum(losses.slots_loss(extreme, torch.tensor(target[1:])))
         loss.backward()
         assert extreme.grad.isfinite().all()
         assert loss.isfinite()
@@ -502,12 +496,12 @@ def test_dense_loss(rng: np.random.Generator) -> None:
     miss = (1 - heat) ** 4 * p**2 * np.log(1 - p)
     expected_heat = -(hit[heat == 1].sum() + miss[(heat >= 0) & (heat < 1)].sum()) / 2
     share = np.where(heat >= REGRESSED_FROM, heat, 0.0)
-    error = (np.abs(predicted - target)[:, 1:9] * np.reshape(GEOMETRY_WEIGHTS, (1, 8, 1, 1))).sum(1)
-    heat_loss, geometry_loss = dense_loss(torch.tensor(predicted[:, :9]), torch.tensor(target))
+    error = (np.abs(predicted - target)[:, 1:9] * np.reshape(losses.GEOMETRY_WEIGHTS, (1, 8, 1, 1))).sum(1)
+    heat_loss, geometry_loss = losses.dense_loss(torch.tensor(predicted[:, :9]), torch.tensor(target))
     assert heat_loss.item() == pytest.approx(expected_heat, rel=1e-4)
     assert geometry_loss.item() == pytest.approx((error * share).sum() / share.sum(), rel=1e-4)
-    error += FRONT_WEIGHT * cross_of_logits((predicted * target)[:, 9:].sum(1), 1.0)
-    with_front = dense_loss(torch.tensor(predicted), torch.tensor(target))
+    error += losses.FRONT_WEIGHT * cross_of_logits((predicted * target)[:, 9:].sum(1), 1.0)
+    with_front = losses.dense_loss(torch.tensor(predicted), torch.tensor(target))
     assert with_front[0].item() == heat_loss.item()
     assert with_front[1].item() == pytest.approx((error * share).sum() / share.sum(), rel=1e-4)
 
@@ -515,7 +509,7 @@ def test_dense_loss(rng: np.random.Generator) -> None:
 def test_dense_loss_ignores_unlearned_cells(rng: np.random.Generator) -> None:
     predicted, target = dense_case(rng)
     tensor = torch.tensor(predicted, requires_grad=True)
-    sum(dense_loss(tensor, torch.tensor(target))).backward()
+    sum(losses.dense_loss(tensor, torch.tensor(target))).backward()
     gradient = tensor.grad.numpy()
     assert not gradient[:, 0][target[:, 0] == -1.0].any()
     assert not gradient[:, 1:].any(1)[target[:, 0] < REGRESSED_FROM].any()
@@ -527,11 +521,11 @@ def test_dense_loss_of_the_truth_is_small_and_of_no_boxes_is_finite() -> None:
     perfect = target.clone()
     perfect[:, 0] = torch.where(target[:, 0] == 1.0, 30.0, -30.0)
     perfect[:, 9] = torch.where(target[:, 9] == 1.0, 30.0, -30.0)
-    heat_loss, geometry_loss = dense_loss(perfect, target)
+    heat_loss, geometry_loss = losses.dense_loss(perfect, target)
     assert heat_loss.item() < 1e-6
     assert geometry_loss.item() < 1e-6
     extreme = torch.full((1, 10, 100, 50), 200.0, requires_grad=True)
-    heat_loss, geometry_loss = dense_loss(extreme, torch.zeros(1, 10, 100, 50))
+    heat_loss, geometry_loss = losses.dense_loss(extreme, torch.zeros(1, 10, 100, 50))
     (heat_loss + geometry_loss).backward()
     assert torch.isfinite(heat_loss)
     assert geometry_loss.item() == 0.0
@@ -543,19 +537,19 @@ def test_ssadnet_loss_is_equation_3(rng: np.random.Generator, head: str) -> None
     logits, labels = (torch.tensor(a) for a in random_maps(rng))
     if head == "slots":
         boxes, targets = (torch.tensor(a) for a in slots_case(rng))
-        detection = sum(slots_loss(boxes, targets))
+        detection = sum(losses.slots_loss(boxes, targets))
     elif head == "slots-paper":
         boxes, targets = (torch.tensor(a.astype(np.float32)) for a in rng.random((2, 2, 6, 4)))
-        detection = paper_slots_loss(boxes, targets)
+        detection = losses.paper_slots_loss(boxes, targets)
     else:
         boxes, targets = (torch.tensor(a) for a in dense_case(rng))
-        detection = sum(dense_loss(boxes, targets))
-    segmentation = cross_entropy(logits, labels)
-    total, parts = ssadnet_loss(logits, boxes, labels, targets)
+        detection = sum(losses.dense_loss(boxes, targets))
+    segmentation = losses.cross_entropy(logits, labels)
+    total, parts = losses.ssadnet_loss(logits, boxes, labels, targets)
     torch.testing.assert_close(total, 1.0 * segmentation + 0.1 * detection)
     own = {"slots-paper": {"det"}, "slots": {"presence", "geometry"}, "dense": {"heat", "geometry"}}
     assert set(parts) == {"seg", *own[head]}
-    total, _ = ssadnet_loss(logits, boxes, labels, targets, lw_seg=2.0, lw_det=0.5)
+    total, _ = losses.ssadnet_loss(logits, boxes, labels, targets, lw_seg=2.0, lw_det=0.5)
     torch.testing.assert_close(total, 2.0 * segmentation + 0.5 * detection)
 
 
@@ -563,7 +557,7 @@ def test_ssadnet_loss_is_equation_3(rng: np.random.Generator, head: str) -> None
 def test_a_batch_without_ground_truth_is_not_learned(shape: tuple[int, ...]) -> None:
     logits, boxes = torch.randn(2, 5, 16, 12, requires_grad=True), torch.randn(shape, requires_grad=True)
     labels = torch.full((2, 16, 12), IGNORE, dtype=torch.uint8)
-    total, _ = ssadnet_loss(logits, boxes, labels, torch.full(shape, -1.0), class_weights=torch.rand(5))
+    total, _ = losses.ssadnet_loss(logits, boxes, labels, torch.full(shape, -1.0), class_weights=torch.rand(5))
     total.backward()
     assert total.item() == 0.0
     assert not logits.grad.any()
@@ -572,14 +566,14 @@ def test_a_batch_without_ground_truth_is_not_learned(shape: tuple[int, ...]) -> 
 
 def test_losses_take_bfloat16(rng: np.random.Generator) -> None:
     logits, labels = (torch.tensor(a) for a in random_maps(rng))
-    assert cross_entropy(logits.bfloat16(), labels).dtype == torch.float32
-    assert cross_entropy(logits.bfloat16(), labels).item() == pytest.approx(
-        cross_entropy(logits, labels).item(), rel=0.02
+    assert losses.cross_entropy(logits.bfloat16(), labels).dtype == torch.float32
+    assert losses.cross_entropy(logits.bfloat16(), labels).item() == pytest.approx(
+        losses.cross_entropy(logits, labels).item(), rel=0.02
     )
 
 
 @pytest.mark.parametrize("gamma", [0.5, 1.0, 2.0])
 def test_a_certain_pixel_has_a_finite_gradient(gamma: float) -> None:
     logits = torch.tensor([[[[30.0]], [[0.0]]]], requires_grad=True)
-    cross_entropy(logits, torch.zeros((1, 1, 1), dtype=torch.uint8), focal_gamma=gamma).backward()
+    losses.cross_entropy(logits, torch.zeros((1, 1, 1), dtype=torch.uint8), focal_gamma=gamma).backward()
     assert torch.isfinite(logits.grad).all()

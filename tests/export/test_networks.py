@@ -14,23 +14,12 @@ torch = pytest.importorskip("torch")
 from torch import nn
 from torch.utils.flop_counter import FlopCounterMode
 
+from edgeperc_export.networks import ssadnet
 from edgeperc_export.networks.edge import PointSegEdge, SSADNetEdge, spread
 from edgeperc_export.networks.kulseg import KULSeg
 from edgeperc_export.networks.lodnn import EDGE_DILATIONS, LoDNN, LoDNNEdge
 from edgeperc_export.networks.pointseg import ENLARGEMENT_RATES, Fire, FireDeconv, PointSeg, SqueezeReweight
 from edgeperc_export.networks.squeezesegv2 import ContextAggregation, SqueezeSegV2
-from edgeperc_export.networks.ssadnet import (
-    CONTEXT_DILATIONS,
-    ELU_GAIN,
-    HEAT_PRIOR,
-    BoxRegressor,
-    ContextModule,
-    FeatureBlock,
-    SSADNet,
-    max_pool_with_mask,
-    max_unpool,
-    receptive_fields,
-)
 
 # SSADNet, Table 1: dilation (width, height) and receptive field (width, height) of the context module's layers.
 TABLE_1 = [
@@ -87,15 +76,15 @@ def agree(actual: torch.Tensor, expected: torch.Tensor) -> None:
 
 
 def test_receptive_fields_follow_from_the_dilations() -> None:
-    assert list(CONTEXT_DILATIONS) == [dilation for dilation, _ in TABLE_1]
-    assert receptive_fields() == [field for _, field in TABLE_1]
-    assert receptive_fields(((1, 1), (1, 1), (3, 2))) == [(3, 3), (5, 5), (11, 9)]
-    assert receptive_fields(()) == []
+    assert list(ssadnet.CONTEXT_DILATIONS) == [dilation for dilation, _ in TABLE_1]
+    assert ssadnet.receptive_fields() == [field for _, field in TABLE_1]
+    assert ssadnet.receptive_fields(((1, 1), (1, 1), (3, 2))) == [(3, 3), (5, 5), (11, 9)]
+    assert ssadnet.receptive_fields(()) == []
 
 
 @pytest.mark.parametrize("k", range(1, 8))
 def test_the_first_k_context_layers_have_the_receptive_field_of_table_1(k: int) -> None:
-    module = ContextModule(channels=1, width=1).eval()
+    module = ssadnet.ContextModule(channels=1, width=1).eval()
     for layer in module.dilated:
         if isinstance(layer, nn.Conv2d):
             nn.init.ones_(layer.weight)
@@ -112,7 +101,7 @@ def test_the_first_k_context_layers_have_the_receptive_field_of_table_1(k: int) 
 
 
 def test_context_layers_are_dilated_farther_along_the_road() -> None:
-    module = ContextModule()
+    module = ssadnet.ContextModule()
     convolutions = [layer for layer in module.dilated if isinstance(layer, nn.Conv2d)]
     assert [conv.kernel_size for conv in convolutions] == [(3, 3)] * 7
     assert [conv.dilation for conv in convolutions] == [(height, width) for (width, height), _ in TABLE_1]
@@ -122,7 +111,7 @@ def test_context_layers_are_dilated_farther_along_the_road() -> None:
 
 def test_spatial_dropout_drops_whole_channels() -> None:
     names = [f"dilated.{3 * k + 1}" for k in range(7)]
-    _, recorded = run_and_record(ContextModule(4, 32, dropout=0.25).train(), torch.randn(2, 4, 9, 5), *names)
+    _, recorded = run_and_record(ssadnet.ContextModule(4, 32, dropout=0.25).train(), torch.randn(2, 4, 9, 5), *names)
     dropped = 0
     for before, after in recorded.values():
         gone = (after == 0).all((2, 3))
@@ -139,8 +128,8 @@ def test_unpooling_equals_torchs(shape: tuple[int, ...], ties: bool, memory_form
     x = x.to(memory_format=memory_format).requires_grad_()
     weights, scale = torch.randn(shape), torch.rand(shape[0], shape[1], shape[2] // 2, shape[3] // 2)
 
-    pooled, mask = max_pool_with_mask(x)
-    restored = max_unpool(pooled * scale, mask)
+    pooled, mask = ssadnet.max_pool_with_mask(x)
+    restored = ssadnet.max_unpool(pooled * scale, mask)
     (gradient,) = torch.autograd.grad((restored * weights).sum(), x)
 
     expected, indices = nn.MaxPool2d(2, return_indices=True)(x)
@@ -155,7 +144,7 @@ def test_unpooling_equals_torchs(shape: tuple[int, ...], ties: bool, memory_form
 
 @pytest.mark.parametrize("value", [0.0, -2.5, float("inf")])
 def test_of_equal_values_the_first_is_the_maximum(value: float) -> None:
-    pooled, mask = max_pool_with_mask(torch.full((1, 2, 4, 6), value))
+    pooled, mask = ssadnet.max_pool_with_mask(torch.full((1, 2, 4, 6), value))
     assert (pooled == value).all()
     expected = torch.zeros(4, 6, dtype=torch.bool)
     expected[::2, ::2] = True
@@ -164,7 +153,7 @@ def test_of_equal_values_the_first_is_the_maximum(value: float) -> None:
 
 @pytest.mark.parametrize("head", ["slots", "slots-paper", "dense"])
 def test_ssadnet_shapes_at_each_stage(head: str) -> None:
-    network = on_meta(lambda: SSADNet(head))
+    network = on_meta(lambda: ssadnet.SSADNet(head))
     names = [f"segmentation.{name}" for name in ("encoder", "context.dilated", "context", "decoder")]
     five = {
         "features.0": (16, 200, 100),
@@ -192,7 +181,7 @@ def test_ssadnet_shapes_at_each_stage(head: str) -> None:
     ("head", "height", "width"), [("slots", 72, 40), ("slots-paper", 32, 40), ("dense", 8, 24), ("dense", 72, 40)]
 )
 def test_ssadnet_accepts_other_sizes(head: str, height: int, width: int) -> None:
-    network = SSADNet(head, n_channels=2, n_classes=3, n_slots=7, context_width=4).eval()
+    network = ssadnet.SSADNet(head, n_channels=2, n_classes=3, n_slots=7, context_width=4).eval()
     with torch.no_grad():
         logits, boxes = network(torch.randn(3, 2, height, width))
     assert logits.shape == (3, 3, height, width)
@@ -204,12 +193,12 @@ def test_ssadnet_accepts_other_sizes(head: str, height: int, width: int) -> None
 
 def test_ssadnet_refuses_other_heads() -> None:
     with pytest.raises(ValueError, match="'anchors'"):
-        SSADNet("anchors")
+        ssadnet.SSADNet("anchors")
 
 
 @pytest.mark.parametrize(("head", "detection"), [("slots", 1_036_341), ("slots-paper", 994_416), ("dense", 290_169)])
 def test_parameters_and_arithmetic_of_ssadnet(head: str, detection: int) -> None:
-    network = on_meta(lambda: SSADNet(head))
+    network = on_meta(lambda: ssadnet.SSADNet(head))
     assert n_parameters(network.segmentation) == 955_429
     assert n_parameters(network.detection) == detection
     assert n_parameters(network) == 955_429 + detection
@@ -220,7 +209,7 @@ def test_parameters_and_arithmetic_of_ssadnet(head: str, detection: int) -> None
 def test_the_bridge_is_the_input_and_the_decoders_features(head: str) -> None:
     x = torch.randn(2, 3, 32, 32)
     (logits, _), recorded = run_and_record(
-        SSADNet(head, context_width=4).eval(), x, "segmentation.decoder", "segmentation.classifier", "detection"
+        ssadnet.SSADNet(head, context_width=4).eval(), x, "segmentation.decoder", "segmentation.classifier", "detection"
     )
     decoded = recorded["segmentation.decoder"][1]
     assert torch.equal(recorded["detection"][0], torch.cat([x, decoded], dim=1))
@@ -230,13 +219,15 @@ def test_the_bridge_is_the_input_and_the_decoders_features(head: str) -> None:
 
 def test_the_bridge_is_bfloat16_under_autocast() -> None:
     with torch.autocast("cpu", torch.bfloat16):
-        _, recorded = run_and_record(SSADNet("dense", context_width=4).eval(), torch.randn(1, 3, 16, 16), "detection")
+        _, recorded = run_and_record(
+            ssadnet.SSADNet("dense", context_width=4).eval(), torch.randn(1, 3, 16, 16), "detection"
+        )
     assert recorded["detection"][0].dtype == torch.bfloat16
 
 
 def test_slots_by_place() -> None:
     """A slot's box starts in the middle of its square, and an object that moves by a square moves to the next slot."""
-    network = SSADNet("slots", context_width=4, batch_norm=True).eval()
+    network = ssadnet.SSADNet("slots", context_width=4, batch_norm=True).eval()
     with torch.no_grad():
         _, boxes = network(torch.zeros(1, 3, 400, 200))
     boxes = boxes[0].reshape(12, 6, 5).numpy()
@@ -260,9 +251,9 @@ def test_slots_by_place() -> None:
 
 
 def test_slots_head_has_five_feature_blocks_and_four_regressors() -> None:
-    network = SSADNet("slots-paper", n_slots=6, context_width=4).eval()
-    blocks = [module for module in network.modules() if isinstance(module, FeatureBlock)]
-    regressors = [module for module in network.modules() if isinstance(module, BoxRegressor)]
+    network = ssadnet.SSADNet("slots-paper", n_slots=6, context_width=4).eval()
+    blocks = [module for module in network.modules() if isinstance(module, ssadnet.FeatureBlock)]
+    regressors = [module for module in network.modules() if isinstance(module, ssadnet.BoxRegressor)]
     assert len(regressors) == 4
 
     # Two 3x3 convolutions for each block, and one more in all blocks but the first and the last.
@@ -288,16 +279,18 @@ def test_initial_weights_of_ssadnet_have_the_variance_that_elu_needs() -> None:
     z = np.linspace(-12.0, 12.0, 240_001)
     density = np.exp(-0.5 * z**2) / np.sqrt(2.0 * np.pi)
     elu = np.where(z > 0.0, z, np.expm1(np.minimum(z, 0.0)))
-    assert 1.0 / np.sum(elu**2 * density * (z[1] - z[0])) == pytest.approx(ELU_GAIN, rel=1e-3)
+    assert 1.0 / np.sum(elu**2 * density * (z[1] - z[0])) == pytest.approx(ssadnet.ELU_GAIN, rel=1e-3)
 
-    network = SSADNet("dense", dropout=0.4).train()
+    network = ssadnet.SSADNet("dense", dropout=0.4).train()
     for conv in (network.segmentation.encoder[1][0], network.detection.merge[0][0]):
-        assert conv.weight.var().item() * conv.weight[0].numel() == pytest.approx(ELU_GAIN, rel=0.1)
+        assert conv.weight.var().item() * conv.weight[0].numel() == pytest.approx(ssadnet.ELU_GAIN, rel=0.1)
     for conv in list(network.segmentation.context.dilated)[::3]:
-        assert conv.weight.var().item() * conv.weight[0].numel() == pytest.approx(ELU_GAIN * (1.0 - 0.4), rel=0.05)
+        assert conv.weight.var().item() * conv.weight[0].numel() == pytest.approx(
+            ssadnet.ELU_GAIN * (1.0 - 0.4), rel=0.05
+        )
     with torch.no_grad():
         _, boxes = network(torch.randn(2, 3, 64, 64))
-    assert boxes[:, 0].sigmoid().mean().item() == pytest.approx(HEAT_PRIOR, abs=0.03)
+    assert boxes[:, 0].sigmoid().mean().item() == pytest.approx(ssadnet.HEAT_PRIOR, abs=0.03)
 
 
 @pytest.mark.parametrize("width", [512, 2048])
@@ -546,7 +539,7 @@ def test_edge_networks_have_the_outputs_of_the_full_ones(
     network: Callable[..., torch.nn.Module], channels: int, sizes: list[tuple[int, int]]
 ) -> None:
     edge = network().eval()
-    full = PointSeg().eval() if network is PointSegEdge else SSADNet("dense", context_width=64).eval()
+    full = PointSeg().eval() if network is PointSegEdge else ssadnet.SSADNet("dense", context_width=64).eval()
     for height, width in sizes:
         x = torch.rand(1, channels, height, width)
         with torch.no_grad():
@@ -616,8 +609,8 @@ def test_lodnn_keeps_the_signal_and_learns_from_random_weights() -> None:
 
 def test_lodnn_edge_has_the_receptive_field_of_lodnn_at_a_27th_of_the_arithmetic() -> None:
     network = on_meta(LoDNNEdge)
-    cells = receptive_fields(EDGE_DILATIONS)[-1]
-    whole = receptive_fields()[-1]
+    cells = ssadnet.receptive_fields(EDGE_DILATIONS)[-1]
+    whole = ssadnet.receptive_fields()[-1]
     assert [0.4 * n for n in cells] == pytest.approx([0.2 * n for n in whole], abs=0.3)  # meters
     shape = (1, 3, 400, 200)
     assert network(torch.empty(shape, device="meta")).shape == (1, 2, 400, 200)

@@ -15,12 +15,11 @@ import pytest
 from edgeperc import Perceiver
 from edgeperc.errors import ModelError, SensorError
 from edgeperc.records import scan_record
-from edgeperc.simulation.drawn import random_scene
-from edgeperc.simulation.scene import simulate
 from edgeperc.types.card import ModelCard
 from edgeperc.zoo import DEFAULT, model_path
 from edgeperc_export import cli
 from edgeperc_export.release.triton import write_repository
+from scenes import urban
 
 
 @pytest.fixture(scope="module")
@@ -101,7 +100,7 @@ def test_the_python_model_answers_as_a_perceiver(repository: Path, monkeypatch: 
     monkeypatch.setitem(sys.modules, "triton_python_backend_utils", triton)
     model = loaded(repository)
     perceive = Perceiver([model_path(name) for name in DEFAULT], provider="cpu", n_threads=1)
-    scans = [simulate(random_scene(k, "urban"), "hdl-64e", seed=k).points for k in range(2)]
+    scans = [urban(k).points for k in range(2)]
     requests = [
         SimpleNamespace(tensors=[triton.Tensor("points", scans[0])]),
         SimpleNamespace(

@@ -209,7 +209,7 @@ class Captures:
         if end_to_end:
             return f"{seed.kind}, end to end: {self.read(case, case.folder / seed.entry)}"
         limit_s = OSF_LIMIT_S if seed.kind == "osf" else FORKED_LIMIT_S
-        with mock.patch.multiple(apart, _start=self.start, SCAN_LIMIT_S=limit_s):
+        with mock.patch.multiple(apart, start_process=self.start, SCAN_LIMIT_S=limit_s):
             answer = self.read(case, case.folder / seed.entry)
         if self.process is not None:
             check(self.process.returncode is not None, "the process that decodes is left behind")

@@ -251,5 +251,5 @@ def make(seed: int) -> Commands:
     main_module = import_module("edgeperc.cli.main")  # the package's name `main` is the function
     mock.patch.object(main_module, "build_parser", functools.cache(main_module.build_parser)).start()
     mock.patch.object(perceiver_module, "Session", session).start()
-    mock.patch.object(apart, "_start", Forked).start()
+    mock.patch.object(apart, "start_process", Forked).start()
     return Commands()

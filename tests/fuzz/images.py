@@ -21,12 +21,11 @@ import edgeperc.perceiver as perceiver_module
 from edgeperc import Perceiver, Perception
 from edgeperc.camera.image import MAX_EDGE, MAX_PIXELS
 from edgeperc.datasets.images import LabeledImages
-from edgeperc.errors import EdgepercError
 from edgeperc.readers.images import read_image
 from edgeperc.types.views import CameraGeometry
 
 from .mutate import mutated_bytes, mutated_document
-from .running import Case, check
+from .running import Case, check, one_of
 from .scans import MadeUp
 
 __all__ = ["LIMIT_MB", "LIMIT_S", "Images", "make"]
@@ -190,12 +189,7 @@ class Images:
         yield b"P3 1 1 255\n1 2 3\n"
 
     def run(self, case: Case) -> str:
-        way = case.pick(self.ways)
-        try:
-            return f"{way.__name__}: {way(case)}"
-        except EdgepercError as exc:
-            check(len(str(exc)) < 20_000, f"a message of {len(str(exc))} characters")
-            return f"{way.__name__}: {type(exc).__name__}"
+        return one_of(self.ways, case)
 
     def array(self, case: Case) -> str:
         perceive, session = case.pick(self.perceivers)

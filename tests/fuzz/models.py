@@ -15,7 +15,6 @@ from tiny_model import field, node, number, tensor
 
 import edgeperc.perceiver as perceiver_module
 from edgeperc import Perceiver, SensorProfile
-from edgeperc.errors import EdgepercError
 from edgeperc.inference.session import Session
 from edgeperc.records import read_boxes
 from edgeperc.system.machine import fingerprint, read_setting, write_settings
@@ -25,7 +24,7 @@ from edgeperc.types.sensor import SENSORS, get_sensor
 from edgeperc.zoo import digest, model_path, resolve
 
 from .mutate import mutated_bytes, mutated_document, mutated_json, mutated_message, noise, parse
-from .running import Case, check
+from .running import Case, check, one_of
 from .scans import MadeUp, check_perception
 from .tiny import CARD, GRAPH, boxed_card, image_card, model
 
@@ -87,12 +86,7 @@ class Models:
         self.ways = [way for weight, way in ways for _ in range(weight)]
 
     def run(self, case: Case) -> str:
-        way = case.pick(self.ways)
-        try:
-            return f"{way.__name__}: {way(case)}"
-        except EdgepercError as exc:
-            check(len(str(exc)) < 20_000, f"a message of {len(str(exc))} characters")
-            return f"{way.__name__}: {type(exc).__name__}"
+        return one_of(self.ways, case)
 
     def opened(self, case: Case, blob: bytes) -> str:
         """Open a model file, run it, perceive with it."""

@@ -73,6 +73,16 @@ class Case:
         return values[int(self.rng.integers(len(values)))]
 
 
+def one_of(ways: list[Callable[[Case], str]], case: Case) -> str:
+    """Go one of the ways; an error of the library with a short message is an answer."""
+    way = case.pick(ways)
+    try:
+        return f"{way.__name__}: {way(case)}"
+    except EdgepercError as exc:
+        check(len(str(exc)) < 20_000, f"a message of {len(str(exc))} characters")
+        return f"{way.__name__}: {type(exc).__name__}"
+
+
 class Kind(Protocol):
     """What a module of this package provides: made once for a process, then run for each case."""
 

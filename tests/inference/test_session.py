@@ -15,15 +15,7 @@ import numpy as np
 import pytest
 
 import edgeperc.inference.session as session_module
-from edgeperc.errors import (
-    CardError,
-    CardMismatchError,
-    InferenceError,
-    ModelError,
-    ModelFileError,
-    OptionError,
-    ProviderError,
-)
+from edgeperc import errors
 from edgeperc.inference import providers
 from edgeperc.inference.providers import PROVIDERS, available_providers
 from edgeperc.inference.session import Session, golden_input
@@ -91,15 +83,28 @@ def test_the_golden_input_never_changes() -> None:
     np.testing.assert_array_equal(x.ravel(), raw.astype(np.float32) / np.float32(2**23) - np.float32(1))
 
 
-def test_no_card(tmp_path: Path) -> None:
-    path = edited(tmp_path, "pointseg", (CARD_KEY.encode(), b"someone.cards"))
-    with pytest.raises(CardError, match=r"has no card.*edgeperc-export card"):
-        Session(path, "cpu")
-
-
-def test_a_newer_card(tmp_path: Path) -> None:
-    path = edited(tmp_path, "pointseg", (b'"schema":3', b'"schema":9'))
-    with pytest.raises(CardError, match=r"edited\.onnx: the card has schema 9.*upgrade edgeperc"):
+@pytest.mark.parametrize(
+    ("old", "new", "error", "message"),
+    [
+        (CARD_KEY.encode(), b"someone.cards", errors.CardError, r"has no card.*edgeperc-export card"),
+        (b'"schema":3', b'"schema":9', errors.CardError, r"edited\.onnx: the card has schema 9.*upgrade edgeperc"),
+        (
+            b'"positions":',
+            b'"positionz":',
+            errors.CardError,
+            r"edited\.onnx: golden.outputs\['logits'\] lacks positions",
+        ),
+        (
+            b'"name":"range_image"',
+            b'"name":"range_imagE"',
+            errors.CardMismatchError,
+            r"card names input 'range_imagE', the graph has \['range_image'\]",
+        ),
+    ],
+)
+def test_wrong_cards(tmp_path: Path, old: bytes, new: bytes, error: type[Exception], message: str) -> None:
+    path = edited(tmp_path, "pointseg", (old, new))
+    with pytest.raises(error, match=message):
         Session(path, "cpu")
 
 
@@ -109,19 +114,9 @@ def test_swapped_outputs(tmp_path: Path) -> None:
     names = [o.name for o in card.outputs]
     swapped = f"{first},{second}".replace(names[0], "@").replace(names[1], names[0]).replace("@", names[1])
     path = edited(tmp_path, "ssadnet", (f"{first},{second}".encode(), swapped.encode()))
-    with pytest.raises(CardError, match=r"golden.outputs\['segmentation'\] has position 398883; the output has 55000"):
-        Session(path, "cpu")
-
-
-def test_malformed_golden_record(tmp_path: Path) -> None:
-    path = edited(tmp_path, "pointseg", (b'"positions":', b'"positionz":'))
-    with pytest.raises(CardError, match=r"edited\.onnx: golden.outputs\['logits'\] lacks positions"):
-        Session(path, "cpu")
-
-
-def test_another_name_than_the_graphs(tmp_path: Path) -> None:
-    path = edited(tmp_path, "pointseg", (b'"name":"range_image"', b'"name":"range_imagE"'))
-    with pytest.raises(CardMismatchError, match=r"card names input 'range_imagE', the graph has \['range_image'\]"):
+    with pytest.raises(
+        errors.CardError, match=r"golden.outputs\['segmentation'\] has position 398883; the output has 55000"
+    ):
         Session(path, "cpu")
 
 
@@ -132,7 +127,7 @@ def test_weights_that_changed_are_noticed(tmp_path: Path) -> None:
     weights = np.frombuffer(largest.raw_data, np.float32) * np.float32(3)
     largest.raw_data = weights.tobytes()
     onnx.save(model, tmp_path / "changed.onnx")
-    with pytest.raises(CardMismatchError, match="standard deviations away from the exporter's"):
+    with pytest.raises(errors.CardMismatchError, match="standard deviations away from the exporter's"):
         Session(tmp_path / "changed.onnx", "cpu")
 
 
@@ -151,7 +146,7 @@ def test_external_weights_are_refused_wherever_they_lie(tmp_path: Path) -> None:
         tensor.external_data.add(key="location", value=location)
         path = inside / "model.onnx"
         path.write_bytes(model.SerializeToString())
-        with pytest.raises(ModelFileError, match="weights in other files"):
+        with pytest.raises(errors.ModelFileError, match="weights in other files"):
             Session(path, "cpu")
 
 
@@ -159,7 +154,7 @@ def test_external_weights_are_refused_wherever_they_lie(tmp_path: Path) -> None:
 def test_file_that_is_not_a_model(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "model.onnx"
     path.write_bytes(content)
-    with pytest.raises(ModelError, match=r"model\.onnx"):
+    with pytest.raises(errors.ModelError, match=r"model\.onnx"):
         Session(path, "cpu")
 
 
@@ -167,12 +162,12 @@ def test_a_truncated_model(tmp_path: Path) -> None:
     blob = model_path("pointseg").read_bytes()
     path = tmp_path / "model.onnx"
     path.write_bytes(blob[: len(blob) // 2])
-    with pytest.raises(ModelError, match=r"model\.onnx"):
+    with pytest.raises(errors.ModelError, match=r"model\.onnx"):
         Session(path, "cpu")
 
 
 def test_a_missing_file(tmp_path: Path) -> None:
-    with pytest.raises(ModelFileError, match="cannot be read"):
+    with pytest.raises(errors.ModelFileError, match="cannot be read"):
         Session(tmp_path / "model.onnx", "cpu")
 
 
@@ -181,18 +176,18 @@ def test_every_provider_is_available_or_refused() -> None:
     assert "cpu" in present
     for name in PROVIDERS:
         if name not in present:
-            with pytest.raises(ProviderError, match=f"{name!r} is not available.*present: .*cpu"):
+            with pytest.raises(errors.ProviderError, match=f"{name!r} is not available.*present: .*cpu"):
                 Session(model_path("pointseg"), name)
 
 
 @pytest.mark.parametrize("name", ["gpu", "CPUExecutionProvider", ""])
 def test_unknown_providers_are_refused(name: str) -> None:
-    with pytest.raises(ProviderError, match=r"is unknown.*; expected auto or one of"):
+    with pytest.raises(errors.ProviderError, match=r"is unknown.*; expected auto or one of"):
         Session(model_path("pointseg"), name)
 
 
 def test_a_precision_in_the_providers_name_is_refused() -> None:
-    with pytest.raises(ProviderError, match="ask for provider 'openvino' and precision 'bf16'"):
+    with pytest.raises(errors.ProviderError, match="ask for provider 'openvino' and precision 'bf16'"):
         Session("pointseg", "openvino:bf16")
 
 
@@ -206,7 +201,7 @@ def test_a_precision_in_the_providers_name_is_refused() -> None:
     ],
 )
 def test_unavailable_precision_is_refused(model: str, precision: str, message: str) -> None:
-    with pytest.raises(ProviderError, match=message):
+    with pytest.raises(errors.ProviderError, match=message):
         Session(model, "cpu", precision=precision)
 
 
@@ -240,7 +235,7 @@ def test_auto_skips_a_provider_that_cannot_run_the_model(
     monkeypatch.setattr(session_module, "available_providers", lambda: ("mirage", "cpu"))
     assert Session(model_path("pointseg"), "auto").provider == "CPUExecutionProvider"
     assert "auto skips pointseg on mirage in fp32" in caplog.text
-    with pytest.raises(ProviderError):
+    with pytest.raises(errors.ProviderError):
         Session(model_path("pointseg"), "mirage")
 
 
@@ -331,7 +326,7 @@ def test_the_webgpu_plugin_runs_fp32(monkeypatch: pytest.MonkeyPatch) -> None:
     assert available_providers() == ("webgpu", "cpu")
     assert Session("pointseg", "webgpu").description == f"pointseg fp32, {PROVIDERS['webgpu']}"
     assert fake.chosen == [("GPU", {})]
-    with pytest.raises(ProviderError, match="provider 'qnn' is not available"):
+    with pytest.raises(errors.ProviderError, match="provider 'qnn' is not available"):
         Session("pointseg", "qnn")
 
 
@@ -343,7 +338,7 @@ def test_a_failing_run_is_an_inference_error() -> None:
             raise RuntimeError("no memory")
 
     session.inference = Broken()
-    with pytest.raises(InferenceError, match="no memory"):
+    with pytest.raises(errors.InferenceError, match="no memory"):
         session.run()
 
 
@@ -374,14 +369,14 @@ def test_auto_skips_a_provider_that_gives_other_outputs(
 
     def wrong(self: Session, limit: float, run_options: object) -> float:
         if self.precision == "int8":
-            raise CardMismatchError("off by far")
+            raise errors.CardMismatchError("off by far")
         return warm_up(self, limit, run_options)
 
     monkeypatch.setattr(Session, "warm_up", wrong)
     monkeypatch.setattr(session_module, "cpu_features", lambda: frozenset({"avx512_vnni"}))
     assert Session("pointseg", "cpu").description == "pointseg fp32, CPUExecutionProvider"
     assert "auto skips pointseg on cpu in int8: off by far" in caplog.text
-    with pytest.raises(CardMismatchError, match="off by far"):
+    with pytest.raises(errors.CardMismatchError, match="off by far"):
         Session("pointseg", "cpu", precision="int8")
 
 
@@ -410,5 +405,5 @@ def test_auto_takes_the_setting_that_was_measured_here(
 
 @pytest.mark.parametrize("n_threads", [0, -1, 4097, 10**400])
 def test_the_number_of_threads_is_bounded(n_threads: int) -> None:
-    with pytest.raises(OptionError, match=f"n_threads is {n_threads!r:.20}; expected 1 to 4096"):
+    with pytest.raises(errors.OptionError, match=f"n_threads is {n_threads!r:.20}; expected 1 to 4096"):
         Session(model_path("pointseg"), "cpu", n_threads=n_threads)

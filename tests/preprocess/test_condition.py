@@ -20,25 +20,14 @@ from edgeperc.datasets.kitti import scan_hash
 from edgeperc.errors import PointsError, SensorError, SplitError
 from edgeperc.evaluation.transfer import compare
 from edgeperc.inference.projection import RangeImageProjector
+from edgeperc.preprocess import sensor_fit
 from edgeperc.preprocess.condition import condition, render
 from edgeperc.preprocess.interpolation import Interpolator
-from edgeperc.preprocess.sensor_fit import (
-    N_SHARES,
-    N_STRATA,
-    REFERENCES,
-    fit_functions,
-    fit_sensor,
-    incidences,
-    increasing,
-    match_quantiles,
-    remission_strata,
-)
-from edgeperc.simulation.drawn import random_scene
-from edgeperc.simulation.scene import simulate
 from edgeperc.types.card import InputSpec
 from edgeperc.types.mounting import MODEL_MOUNTING
 from edgeperc.types.sensor import SENSORS, RemissionFunction, SensorProfile, get_sensor
 from edgeperc.types.views import RangeImageGeometry
+from scenes import urban
 
 HDL = get_sensor("hdl-64e")
 VIEW = RangeImageGeometry(HDL.elevations_deg)
@@ -57,7 +46,9 @@ OUSTER, VELODYNE = np.array([45.91, 714.50, 113.28, 376.01]), np.array([3.78, 12
 
 def test_ranking_of_functions_matches_the_papers_table() -> None:
     """The ranking of the paper's Table 5: logarithm 58.26, line 72.12, parabola 132.87."""
-    best, *others = fit_functions(OUSTER, VELODYNE / 255.0, full_scale=9000.0, to="hdl-64e", source="KUL-Seg")
+    best, *others = sensor_fit.fit_functions(
+        OUSTER, VELODYNE / 255.0, full_scale=9000.0, to="hdl-64e", source="KUL-Seg"
+    )
     assert [f.kind for f in (best, *others)] == ["logarithm", "linear", "polynomial", "power"]
     assert [round(255.0 * f.rmse, 1) for f in (best, *others)] == [35.1, 56.1, 177.0, 199.5]
     np.testing.assert_allclose(np.multiply(best.coefficients, 255.0), np.polyfit(np.log1p(OUSTER), VELODYNE, 1)[::-1])
@@ -80,7 +71,7 @@ def test_ranking_of_functions_matches_the_papers_table() -> None:
 def test_exact_pairs_recover_the_function(shape: RemissionFunction, offset: float, size: float, seed: int) -> None:
     x = np.random.default_rng(seed).uniform(0.0, 255.0, 60)
     wanted = offset + size * _value(shape, x)
-    best = fit_functions(x, wanted, full_scale=255.0, to="hdl-64e", source="")[0]
+    best = sensor_fit.fit_functions(x, wanted, full_scale=255.0, to="hdl-64e", source="")[0]
     assert best.rmse < 1e-9 * (1.0 + np.abs(wanted).max())
     np.testing.assert_allclose(_value(best, x), wanted, atol=1e-7)
 
@@ -90,7 +81,7 @@ def test_exact_pairs_recover_the_function(shape: RemissionFunction, offset: floa
 def test_powers_are_recovered(exponent: float, top: float, seed: int) -> None:
     """Exponents are tried in steps of 6 %."""
     x = np.random.default_rng(seed).uniform(0.0, 255.0, 60)
-    functions = fit_functions(x, top * (x / 255.0) ** exponent, full_scale=255.0, to="hdl-64e", source="")
+    functions = sensor_fit.fit_functions(x, top * (x / 255.0) ** exponent, full_scale=255.0, to="hdl-64e", source="")
     found = next(function for function in functions if function.kind == "power")
     assert found.coefficients[1] == pytest.approx(exponent, rel=0.07)
     np.testing.assert_allclose(_value(found, x), top * (x / 255.0) ** exponent, atol=0.03 * top)
@@ -116,7 +107,7 @@ def _value(function: RemissionFunction, x: np.ndarray) -> np.ndarray:
 )
 def test_too_few_pairs_are_refused(raw: list[float], wanted: list[float], message: str) -> None:
     with pytest.raises(SensorError, match=message):
-        fit_functions(raw, wanted, full_scale=255.0, to="hdl-64e", source="")
+        sensor_fit.fit_functions(raw, wanted, full_scale=255.0, to="hdl-64e", source="")
 
 
 def plane(n: int, normal: np.ndarray, at: np.ndarray, seed: int) -> np.ndarray:
@@ -138,7 +129,7 @@ def test_incidence_on_a_plane(normal: np.ndarray, seed: int) -> None:
     if len(points) < 50:
         return
     wanted = np.abs(points @ normal) / np.linalg.norm(points, axis=1)
-    found = incidences(np.column_stack([points, np.zeros(len(points))]).astype(np.float32))
+    found = sensor_fit.incidences(np.column_stack([points, np.zeros(len(points))]).astype(np.float32))
     np.testing.assert_allclose(found, wanted, atol=0.02)
 
 
@@ -148,13 +139,13 @@ def test_incidence_without_a_surface_is_nan() -> None:
     beam = np.column_stack([np.full(50, 20.1), np.linspace(0.01, 0.79, 50), np.full(50, 0.1)])
     strange = np.array([[np.nan, 0, 0], [np.inf, 1, 1], [1e30, 0, 0], [0, 0, 0]])
     points = np.column_stack([np.vstack([leaves, beam, strange]), np.zeros(554)]).astype(np.float32)
-    assert np.isnan(incidences(points)).all()
-    assert incidences(points[:0]).shape == (0,)
-    assert np.isnan(incidences(points[:1])).all()
+    assert np.isnan(sensor_fit.incidences(points)).all()
+    assert sensor_fit.incidences(points[:0]).shape == (0,)
+    assert np.isnan(sensor_fit.incidences(points[:1])).all()
 
 
 def street(seed: int) -> np.ndarray:
-    return simulate(random_scene(seed, "urban"), "hdl-64e", seed).points
+    return urban(seed).points.copy()
 
 
 def test_function_is_recovered_from_other_streets() -> None:
@@ -162,19 +153,19 @@ def test_function_is_recovered_from_other_streets() -> None:
     scans = [street(k) for k in (11, 12, 13)]
     for scan in scans:
         scan[:, 3] = np.rint(np.expm1((scan[:, 3] + 0.1) / 0.15))
-    found = fit_sensor(scans, SensorProfile("mine", HDL.elevations_deg, 2083, (0.0, 255.0)))
+    found = sensor_fit.fit_sensor(scans, SensorProfile("mine", HDL.elevations_deg, 2083, (0.0, 255.0)))
     best = found[1][0]
     assert best.kind == "logarithm"
     assert found[0].remission is best
     x = np.expm1((np.array([0.1, 0.2, 0.3, 0.4, 0.5]) + 0.1) / 0.15)
     # Simulated streets are not KITTI's; the same streets through `match_quantiles` below give 0.01.
     np.testing.assert_allclose(_value(best, x), [0.1, 0.2, 0.3, 0.4, 0.5], atol=0.08)
-    own = remission_strata([street(k) for k in (14, 15, 16)])
-    raw, wanted = match_quantiles(remission_strata(scans), own)
-    assert len(raw) == N_SHARES
+    own = sensor_fit.remission_strata([street(k) for k in (14, 15, 16)])
+    raw, wanted = sensor_fit.match_quantiles(sensor_fit.remission_strata(scans), own)
+    assert len(raw) == sensor_fit.N_SHARES
     assert (np.diff(raw) >= 0.0).all()
     assert (np.diff(wanted) >= 0.0).all()
-    again = fit_functions(raw, wanted, full_scale=255.0, to="hdl-64e", source="")[0]
+    again = sensor_fit.fit_functions(raw, wanted, full_scale=255.0, to="hdl-64e", source="")[0]
     np.testing.assert_allclose(_value(again, x), [0.1, 0.2, 0.3, 0.4, 0.5], atol=0.05)
 
 
@@ -183,23 +174,23 @@ def test_parabola_that_turns_down_is_not_used() -> None:
     x = np.linspace(0.0, 100.0, 60)
     wanted = 0.9 * x / 100.0 - 0.4 * (x / 100.0) ** 2
     for full_scale, used in ((100.0, 0), (4000.0, 1)):
-        functions = fit_functions(x, wanted, full_scale=full_scale, to="hdl-64e", source="")
+        functions = sensor_fit.fit_functions(x, wanted, full_scale=full_scale, to="hdl-64e", source="")
         assert functions[0].kind == "polynomial"
-        assert increasing(functions) is functions[used]
+        assert sensor_fit.increasing(functions) is functions[used]
 
 
 def test_strata_with_few_points_are_empty() -> None:
-    nothing = [(0.0, ())] * N_STRATA
+    nothing = [(0.0, ())] * sensor_fit.N_STRATA
     few = np.tile(np.array([[5.0, 0.0, 0.0, 9.0]], np.float32), (199, 1))
-    assert remission_strata([]) == remission_strata([few]) == nothing
-    assert remission_strata([np.full((500, 4), np.nan, np.float32)]) == nothing
-    assert [len(a) for a in match_quantiles(nothing, REFERENCES["hdl-64e"])] == [0, 0]
+    assert sensor_fit.remission_strata([]) == sensor_fit.remission_strata([few]) == nothing
+    assert sensor_fit.remission_strata([np.full((500, 4), np.nan, np.float32)]) == nothing
+    assert [len(a) for a in sensor_fit.match_quantiles(nothing, sensor_fit.REFERENCES["hdl-64e"])] == [0, 0]
     with pytest.raises(SensorError, match="0 finite pairs"):
-        fit_sensor([few], get_sensor("vlp-16"))
+        sensor_fit.fit_sensor([few], get_sensor("vlp-16"))
     with pytest.raises(SensorError, match="no reference remissions of 'vlp-16'; known are hdl-64e"):
-        fit_sensor([few], get_sensor("vlp-16"), "vlp-16")
+        sensor_fit.fit_sensor([few], get_sensor("vlp-16"), "vlp-16")
     with pytest.raises(PointsError, match=r"shape \(3, 3\)"):
-        remission_strata([np.zeros((3, 3), np.float32)])
+        sensor_fit.remission_strata([np.zeros((3, 3), np.float32)])
 
 
 @pytest.mark.parametrize("function", [*FUNCTIONS, POWER], ids=lambda f: f.kind)
@@ -440,7 +431,7 @@ ALONE = {"provider": "cpu", "n_threads": 1, "on_mismatch": "ignore", "mounting":
 
 @pytest.mark.parametrize("name", ["vlp-16", "os1-64"])
 def test_labels_are_only_of_input_points(name: str) -> None:
-    points = simulate(random_scene(4, "urban"), name, seed=4).points
+    points = urban(4, name).points.copy()
     points[::97] = np.nan
     before = points.copy()
     own = replace(get_sensor(name), remission_range=(0.0, 1.0), remission=None)  # the simulator's is the HDL-64E's
@@ -458,7 +449,7 @@ def test_labels_are_only_of_input_points(name: str) -> None:
 
 
 def test_scans_of_the_training_sensor_are_not_adapted() -> None:
-    points = simulate(random_scene(4, "urban"), "hdl-64e", seed=4).points
+    points = urban(4).points
     answers = [Perceiver("pointseg", adapt=adapt, **ALONE)(points) for adapt in ("both", "none")]
     np.testing.assert_array_equal(answers[0].points.labels, answers[1].points.labels)
     assert all("adapt" not in answer.stage_ms for answer in answers)
@@ -468,7 +459,7 @@ def test_scans_of_the_training_sensor_are_not_adapted() -> None:
 
 def test_rendered_scan_gives_the_reference_result() -> None:
     """Remission taken through a function's inverse and rendered back: the same result as without both."""
-    points = simulate(random_scene(4, "urban"), "hdl-64e", seed=4).points
+    points = urban(4).points
     distorted = points.copy()
     distorted[:, 3] = np.expm1((points[:, 3].astype(np.float64) + 0.1) / 0.15)
     sensor = replace(HDL, remission_range=(0.0, 255.0), remission=LOGARITHM)
@@ -485,7 +476,7 @@ def test_adapt_fit_writes_what_run_takes(tmp_path: Path, capsys: pytest.CaptureF
     scans, out = tmp_path / "scans", tmp_path / "profiles" / "mine.json"
     scans.mkdir()
     for k in range(2):
-        scan = simulate(random_scene(k, "urban"), "vlp-16", k).points
+        scan = urban(k, "vlp-16").points.copy()
         scan[:, 3] = np.rint(np.expm1((scan[:, 3] + 0.1) / 0.15))
         scan.tofile(scans / f"{k}.bin")
     fit = ["fit-sensor", str(scans), "--sensor", "vlp-16", "--to", "hdl-64e", "--out", str(out)]
@@ -515,7 +506,7 @@ def test_adapt_fit_writes_what_run_takes(tmp_path: Path, capsys: pytest.CaptureF
 def test_eval_sensors_counts_test_drives_only(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "velodyne").mkdir()
     (tmp_path / "label").mkdir()
-    scan = simulate(random_scene(4, "urban"), "hdl-64e", seed=4)
+    scan = urban(4)
     for name in ("a", "b"):
         scan.points.tofile(tmp_path / "velodyne" / f"{name}.bin")
         (tmp_path / "label" / f"{name}.txt").write_text("")
@@ -531,7 +522,7 @@ def test_eval_sensors_counts_test_drives_only(tmp_path: Path, monkeypatch: pytes
 
 def test_eval_sensors(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Two simulated scans, and the same street as boxes and as range images."""
-    scan = simulate(random_scene(4, "urban"), "hdl-64e", seed=4)
+    scan = urban(4)
     boxes, images = tmp_path / "boxes", tmp_path / "images"
     for folder in (boxes / "velodyne", boxes / "label", images):
         folder.mkdir(parents=True)

@@ -24,10 +24,9 @@ from edgeperc.preprocess.condition import condition
 from edgeperc.preprocess.remission import FROZEN_AFTER, NO_REMISSION, RemissionMatcher, is_missing
 from edgeperc.preprocess.sensor_fit import N_STRATA, incidences, quantiles_by_stratum, remission_strata, stratify
 from edgeperc.readers.files import read_points
-from edgeperc.simulation.drawn import random_scene
 from edgeperc.simulation.samples import IGNORE
-from edgeperc.simulation.scene import simulate
 from edgeperc.types.sensor import SENSORS, SensorProfile, get_sensor
+from scenes import urban
 
 HDL = get_sensor("hdl-64e")
 BYTE = get_sensor("hdl-32e")
@@ -36,7 +35,7 @@ BYTE = get_sensor("hdl-32e")
 @pytest.fixture(scope="module")
 def streets() -> list[np.ndarray]:
     """Six streets as the training sensor sees them; remission 0..1."""
-    return [simulate(random_scene(seed, "urban"), "hdl-64e", seed).points for seed in range(6)]
+    return [urban(seed).points for seed in range(6)]
 
 
 def with_remission(scan: np.ndarray, values: np.ndarray | float) -> np.ndarray:

@@ -24,12 +24,11 @@ from edgeperc.preprocess.motion import Motion
 from edgeperc.preprocess.remission import RemissionMatcher
 from edgeperc.preprocess.returns import returns
 from edgeperc.preprocess.sensor_fit import fit_sensor
-from edgeperc.simulation.drawn import random_scene
 from edgeperc.simulation.samples import simulated_scan
-from edgeperc.simulation.scene import simulate
 from edgeperc.types.mounting import MODEL_MOUNTING
 from edgeperc.types.perception import DroppedPoints, Perception
 from edgeperc.types.sensor import SENSORS, SensorProfile, get_sensor
+from scenes import urban
 
 Points = NDArray[np.float32]
 VLP = get_sensor("vlp-16")
@@ -292,7 +291,7 @@ def beside(seed: int) -> Points:
 @pytest.fixture(scope="module")
 def drive() -> list[Points]:
     """Twelve places."""
-    return [simulate(random_scene(seed, "urban"), "hdl-64e", seed=seed).points for seed in range(12)]
+    return [urban(seed).points for seed in range(12)]
 
 
 def test_the_own_roof_is_suggested_and_nothing_else(drive: list[Points]) -> None:

@@ -22,7 +22,7 @@ import pytest
 
 pytest.importorskip("rosbags")
 
-from ros2_helpers import MESSAGES, TIMEOUT_S, Perceive, cloud, scans, until
+from ros2_helpers import MESSAGES, Perceive, cloud, scans
 
 from edgeperc import MissingExtraError, OptionError, Perceiver, Tracker
 from edgeperc.cli.main import main
@@ -33,6 +33,7 @@ from edgeperc.ros2.node import PerceptionNode
 from edgeperc.ros2.rclpy_graph import RclpyGraph
 from edgeperc.ros2.zenoh_graph import CONFIG_VARIABLE, ZenohGraph, attachment, qos_key, type_key
 from edgeperc.types.sensor import get_sensor
+from waiting import TIMEOUT_S, until
 
 TESTS = Path(__file__).resolve().parent.parent
 PAGE = TESTS.parent / "docs" / "howto" / "ros2.md"

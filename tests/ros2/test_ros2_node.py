@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 pytest.importorskip("rosbags")
 
-from ros2_helpers import FIELDS, MESSAGES, TIMEOUT_S, Perceive, cloud, until
+from ros2_helpers import FIELDS, MESSAGES, Perceive, cloud
 
 from edgeperc import Box, ModelFileError, OptionError, Perception, PointsError, Tracker
 from edgeperc.readers.decoders import cloud_points
@@ -25,6 +25,7 @@ from edgeperc.ros2 import node as node_module
 from edgeperc.ros2.graph import RELIABLE, Qos, full_name
 from edgeperc.ros2.messages import CLOUD, DIAGNOSTICS, OUTPUTS
 from edgeperc.ros2.node import PerceptionNode
+from waiting import TIMEOUT_S, until
 
 SLOW_HZ = 0.01  # no answer is late
 

@@ -24,6 +24,7 @@ from edgeperc.datasets.scan_folder import ScanFolder
 from edgeperc.records import PerceivedScan
 from edgeperc.sinks.prelabels import KINDS, PrelabelSink
 from edgeperc.types.sensor import get_sensor
+from scenes import urban
 
 Row = tuple[str, list[float]]
 """A class, and x, y, z, length, width, height [m], yaw [rad]."""
@@ -405,15 +406,13 @@ def test_the_commands_choices_are_the_kinds() -> None:
 def test_corrected_labels_train_a_network(tmp_path: Path) -> None:
     """From the scans of a drive: pre-labels, one correction, the description, and two steps of a training."""
     pytest.importorskip("torch")
-    from edgeperc.simulation.drawn import random_scene
-    from edgeperc.simulation.scene import simulate
     from edgeperc_export import cli as export
 
     mine = tmp_path / "mine"
     (mine / "velodyne").mkdir(parents=True)
     scans = []
     for seed in (3, 4):
-        scan = simulate(random_scene(seed, "urban"), "hdl-64e", seed=seed)
+        scan = urban(seed)
         path = mine / f"velodyne/{seed}.bin"
         scan.points.tofile(path)
         cars = tuple(box for box, n in zip(scan.boxes, scan.box_points, strict=True) if box.label == "car" and n > 50)

@@ -20,13 +20,9 @@ import pytest
 from edgeperc.system import compilation, kernel_cache
 from edgeperc.system.compilation import KERNELS, Compilation, kernels_of
 from edgeperc.system.kernel_cache import KernelCache, missing, tell_watchers
+from scenes import Terminal
 
 pytestmark = pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason="nothing is compiled with the JIT off")
-
-
-class Terminal(io.StringIO):
-    def isatty(self) -> bool:
-        return True
 
 
 class Closed(Terminal):

@@ -14,16 +14,8 @@ from hypothesis import strategies as st
 
 from edgeperc import SettingsError
 from edgeperc.inference.session import Session
+from edgeperc.system import machine
 from edgeperc.system import machine as settings
-from edgeperc.system.machine import (
-    cache_folder,
-    compiled_folder,
-    cpu_model,
-    fingerprint,
-    read_setting,
-    settings_path,
-    write_settings,
-)
 from edgeperc.zoo import digest, resolve
 
 CPU_2 = {"provider": "cpu", "precision": "int8", "n_threads": 2}
@@ -34,14 +26,14 @@ CUDA = {"provider": "cuda", "precision": "fp32", "n_threads": 1}
 
 def test_file_holds_settings_of_several_computers_and_models(tmp_path: Path) -> None:
     path = tmp_path / "deep" / "settings.json"
-    assert read_setting(path, "m", "s") is None
-    write_settings(path, "m", {"s": CPU_2})
-    write_settings(path, "m", {"t": OPENVINO})
-    write_settings(path, "n", {"s": CUDA})
-    write_settings(path, "m", {"s": CPU_4})
-    assert read_setting(path, "m", "s") == CPU_4
-    assert read_setting(path, "m", "t") == OPENVINO
-    assert read_setting(path, "n", "t") is None
+    assert machine.read_setting(path, "m", "s") is None
+    machine.write_settings(path, "m", {"s": CPU_2})
+    machine.write_settings(path, "m", {"t": OPENVINO})
+    machine.write_settings(path, "n", {"s": CUDA})
+    machine.write_settings(path, "m", {"s": CPU_4})
+    assert machine.read_setting(path, "m", "s") == CPU_4
+    assert machine.read_setting(path, "m", "t") == OPENVINO
+    assert machine.read_setting(path, "n", "t") is None
     assert [*path.parent.iterdir()] == [path]
 
 
@@ -60,7 +52,7 @@ def test_malformed_settings_are_named(tmp_path: Path, text: str) -> None:
     path = tmp_path / "settings.json"
     path.write_text(text)
     with pytest.raises(SettingsError, match=r"settings\.json.*delete it"):
-        read_setting(path, "m", "s")
+        machine.read_setting(path, "m", "s")
 
 
 NESTED = st.recursive(
@@ -76,7 +68,7 @@ def check_settings(path: Path, content: bytes) -> None:
     path.write_bytes(content)
     entry, message = None, "delete it"
     try:
-        entry = read_setting(path, "m", "s")
+        entry = machine.read_setting(path, "m", "s")
     except SettingsError as exc:
         message = str(exc)
     else:
@@ -85,11 +77,11 @@ def check_settings(path: Path, content: bytes) -> None:
     assert "delete it" in message
     assert len(message) < 1000
     try:
-        write_settings(path, "m", {"s": CPU_2})
+        machine.write_settings(path, "m", {"s": CPU_2})
     except SettingsError:
         assert path.read_bytes() == content
     else:
-        assert read_setting(path, "m", "s") == CPU_2
+        assert machine.read_setting(path, "m", "s") == CPU_2
 
 
 @given(EDITS)
@@ -153,7 +145,7 @@ def test_settings_that_are_no_file_are_named(tmp_path: Path, kind: str, message:
     else:
         pytest.skip("no named pipes")
     with pytest.raises(SettingsError, match=rf"settings\.json.*{message}.*delete it"):
-        read_setting(path, "m", "s")
+        machine.read_setting(path, "m", "s")
 
 
 @pytest.mark.parametrize("provider", ["\ud800", "\x1b[31m", "n" * 100_000])
@@ -164,7 +156,7 @@ def test_a_start_survives_strange_settings(
     pytest.importorskip("onnxruntime")
     monkeypatch.setenv("EDGEPERC_CACHE_DIR", str(tmp_path))
     entry = {"provider": provider, "precision": "fp32", "n_threads": 1}
-    write_settings(settings_path(), fingerprint(), {digest(resolve("pointseg")): entry})
+    machine.write_settings(machine.settings_path(), machine.fingerprint(), {digest(resolve("pointseg")): entry})
     assert Session("pointseg").card.name == "pointseg"
     assert "\x1b" not in capsys.readouterr().err
 
@@ -178,8 +170,8 @@ def test_no_home_is_a_typed_error(monkeypatch: pytest.MonkeyPatch, caplog: pytes
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setattr(Path, "home", missing)
     with pytest.raises(SettingsError, match="no home folder; set EDGEPERC_CACHE_DIR"):
-        settings_path()
-    assert compiled_folder("a", "f" * 64, "fp32") is None
+        machine.settings_path()
+    assert machine.compiled_folder("a", "f" * 64, "fp32") is None
     assert "the compiled model is not kept" in caplog.text
 
 
@@ -189,52 +181,52 @@ def test_compiled_models_that_others_can_write_are_not_used(
 ) -> None:
     monkeypatch.setenv("EDGEPERC_CACHE_DIR", str(tmp_path))
     umask = os.umask(0o022)
-    folder = compiled_folder("a", "f" * 64, "fp32")
+    folder = machine.compiled_folder("a", "f" * 64, "fp32")
     os.umask(umask)
     assert folder is not None
     for each in (folder, folder.parent):
         each.chmod(0o777)
-        assert compiled_folder("a", "f" * 64, "fp32") is None
+        assert machine.compiled_folder("a", "f" * 64, "fp32") is None
         assert "other users can write it (mode 777)" in caplog.messages[-1]
         each.chmod(0o755)
-    assert compiled_folder("a", "f" * 64, "fp32") == folder
+    assert machine.compiled_folder("a", "f" * 64, "fp32") == folder
 
 
 def test_cache_folder_follows_the_environment(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("EDGEPERC_CACHE_DIR", str(tmp_path / "here"))
-    assert cache_folder() == tmp_path / "here"
-    assert settings_path() == tmp_path / "here" / "settings.json"
+    assert machine.cache_folder() == tmp_path / "here"
+    assert machine.settings_path() == tmp_path / "here" / "settings.json"
     assert not (tmp_path / "here").exists()
     monkeypatch.delenv("EDGEPERC_CACHE_DIR")
     if sys.platform.startswith("linux"):
         monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-        assert cache_folder() == tmp_path / "edgeperc"
+        assert machine.cache_folder() == tmp_path / "edgeperc"
 
 
 def test_compiled_folder_depends_on_engine_model_and_precision(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("EDGEPERC_CACHE_DIR", str(tmp_path))
     asked = [("a 1", "f" * 64, "fp32"), ("a 2", "f" * 64, "fp32"), ("a 1", "e" * 64, "fp32"), ("a 1", "f" * 64, "bf16")]
-    folders = [compiled_folder(*each) for each in asked]
+    folders = [machine.compiled_folder(*each) for each in asked]
     assert len(set(folders)) == len(asked)
     assert all(folder is not None and folder.is_dir() for folder in folders)
-    assert compiled_folder(*asked[0]) == folders[0]
+    assert machine.compiled_folder(*asked[0]) == folders[0]
     monkeypatch.setattr(settings, "fingerprint", lambda: "another computer")
-    assert compiled_folder(*asked[0]) not in folders
+    assert machine.compiled_folder(*asked[0]) not in folders
 
 
 def test_read_only_cache_is_not_used(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("EDGEPERC_CACHE_DIR", str(tmp_path / "file" / "below"))
-    assert compiled_folder("a", "f" * 64, "fp32") is None
+    assert machine.compiled_folder("a", "f" * 64, "fp32") is None
     monkeypatch.setenv("EDGEPERC_CACHE_DIR", str(tmp_path))
     monkeypatch.setattr(os, "access", lambda *_: False)
-    assert compiled_folder("a", "f" * 64, "fp32") is None
+    assert machine.compiled_folder("a", "f" * 64, "fp32") is None
 
 
 def test_equal_computers_have_one_fingerprint(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert cpu_model()
-    assert len(fingerprint()) == 16
-    assert fingerprint() == fingerprint()
-    before = fingerprint()
+    assert machine.cpu_model()
+    assert len(machine.fingerprint()) == 16
+    assert machine.fingerprint() == machine.fingerprint()
+    before = machine.fingerprint()
     monkeypatch.setattr(settings, "cpu_model", lambda: "another")
-    assert fingerprint() != before
+    assert machine.fingerprint() != before

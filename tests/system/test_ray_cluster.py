@@ -20,10 +20,9 @@ import pytest
 from edgeperc import cli
 from edgeperc.errors import MissingExtraError, OptionError, PointsError
 from edgeperc.perceiver import Perceiver
-from edgeperc.simulation.drawn import random_scene
-from edgeperc.simulation.scene import simulate
 from edgeperc.system.ray_cluster import Lost, map_on_ray, signals_kept
 from edgeperc.system.remote import Remote, location
+from scenes import urban
 
 pytestmark = pytest.mark.filterwarnings("ignore")  # of Ray, boto and aiohttp
 
@@ -35,7 +34,7 @@ def scans(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Nine scans; the eighth is damaged, and the last two have no remission."""
     folder = tmp_path_factory.mktemp("scans")
     for k in range(N_SCANS):
-        points = simulate(random_scene(k, "urban"), "hdl-64e", seed=k).points[::3].copy()
+        points = urban(k).points[::3].copy()
         if k >= 7:
             points[:, 3] = 0.0
         points.tofile(folder / f"{k}.bin")

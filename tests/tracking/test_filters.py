@@ -13,25 +13,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import twins.tracking
+from edgeperc.tracking import jpda, ukf
 from edgeperc.tracking.imm import fill_combined, fill_interaction, fill_mode_probabilities
-from edgeperc.tracking.jpda import (
-    MAX_EVENTS,
-    Detections,
-    Gates,
-    Predictions,
-    fill_association,
-    fill_by_propagation,
-    fill_likelihoods,
-)
-from edgeperc.tracking.ukf import (
-    CONSTANT_VELOCITY,
-    CTRV,
-    fill_cholesky,
-    fill_inverse,
-    fill_predictions,
-    fill_updates,
-    half_turn,
-)
 
 NOISE = np.array([2.0, 0.4, 0.3, 0.1, 0.2])
 
@@ -52,7 +35,7 @@ def some_tracks(rng: np.random.Generator, n: int) -> tuple[np.ndarray, np.ndarra
 
 def predict(states: np.ndarray, covariance: np.ndarray, noise: np.ndarray, dt: float) -> tuple[np.ndarray, np.ndarray]:
     means, predicted = np.empty_like(states), np.empty_like(covariance)
-    fill_predictions(states, covariance, noise, dt, means, predicted)
+    ukf.fill_predictions(states, covariance, noise, dt, means, predicted)
     return means, predicted
 
 
@@ -60,7 +43,7 @@ def update(
     means: np.ndarray, predicted: np.ndarray, detections: np.ndarray, sigmas: Any, beta: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     states, covariance = np.empty_like(means), np.empty_like(predicted)
-    fill_updates(means, predicted, detections, sigmas, beta, states, covariance)
+    ukf.fill_updates(means, predicted, detections, sigmas, beta, states, covariance)
     return states, covariance
 
 
@@ -115,7 +98,7 @@ def test_each_motion_filters_as_filterpys(mode: int) -> None:
     ours, spread = np.tile(state, (1, 3, 1)), np.tile(covariance, (1, 3, 1, 1))
     truth = state.copy()
     for _ in range(10 if numba.config.DISABLE_JIT else 50):
-        truth = twins.tracking.moved(CTRV, truth, dt)
+        truth = twins.tracking.moved(ukf.CTRV, truth, dt)
         detection = truth[[0, 1, 3]] + rng.normal(0.0, 1.0, 3) * [0.1, 0.1, 0.02]
         theirs.Q = twins.tracking.process_noise(mode, theirs.x[3], NOISE, dt)
         theirs.predict()
@@ -140,7 +123,7 @@ def test_a_straight_line_is_filtered_as_by_filterpys_linear_filter() -> None:
     theirs.R = np.diag(SIGMAS**2)
     noise = NOISE * [1, 0, 1, 0, 1]  # a heading that is known and stays makes the motion linear
     theirs.x, theirs.P = np.array([0.0, 1.0, 6.0, 0.0, 0.0]), np.diag([1.0, 1.0, 9.0, 0.0, 0.0])
-    theirs.Q = twins.tracking.process_noise(CONSTANT_VELOCITY, 0.0, noise, dt)
+    theirs.Q = twins.tracking.process_noise(ukf.CONSTANT_VELOCITY, 0.0, noise, dt)
     ours, spread = np.tile(theirs.x, (1, 3, 1)), np.tile(theirs.P, (1, 3, 1, 1))
     for k in range(60):
         detection = np.array([0.65 * k + 0.1 * math.sin(k), 1.0 + 0.1 * math.cos(k), 0.0])
@@ -148,8 +131,8 @@ def test_a_straight_line_is_filtered_as_by_filterpys_linear_filter() -> None:
         theirs.update(detection)
         means, predicted = predict(ours, spread, noise[None], dt)
         ours, spread = update(means, predicted, detection[None], SIGMAS[None], np.tile([0.0, 1.0], (1, 3, 1)))
-        np.testing.assert_allclose(ours[0, CONSTANT_VELOCITY], theirs.x, atol=1e-6)
-        np.testing.assert_allclose(spread[0, CONSTANT_VELOCITY], theirs.P, atol=1e-6)
+        np.testing.assert_allclose(ours[0, ukf.CONSTANT_VELOCITY], theirs.x, atol=1e-6)
+        np.testing.assert_allclose(spread[0, ukf.CONSTANT_VELOCITY], theirs.P, atol=1e-6)
 
 
 def test_all_motions_together_are_filterpys_imm() -> None:
@@ -166,16 +149,16 @@ def test_all_motions_together_are_filterpys_imm() -> None:
     for k in range(60):
         truth[4] = 0.4 if 20 <= k < 40 else 0.0
         truth[2] = 5.0 if k < 40 else 0.0
-        truth = twins.tracking.moved(CTRV, truth, dt)
+        truth = twins.tracking.moved(ukf.CTRV, truth, dt)
         detection = truth[[0, 1, 3]] + rng.normal(0.0, 1.0, 3) * [0.05, 0.05, 0.02]
 
         mixed, mixed_spread = np.empty_like(ours), np.empty_like(spread)
         fill_interaction(ours, spread, modes, np.array([stay]), mixed, mixed_spread, prior)
         means, predicted = predict(mixed, mixed_spread, NOISE[None], dt)
         likelihoods, weights, group = np.empty((1, 3, 1)), np.empty((1, 1)), np.zeros(1, np.int64)
-        gates = Gates(SIGMAS[None], np.ones(1), group, np.array([1e3]))
-        fill_likelihoods(
-            Predictions(means, predicted, prior), gates, detected(detection[None], group), likelihoods, weights
+        gates = jpda.Gates(SIGMAS[None], np.ones(1), group, np.array([1e3]))
+        jpda.fill_likelihoods(
+            jpda.Predictions(means, predicted, prior), gates, detected(detection[None], group), likelihoods, weights
         )
         shares = np.empty((1, 3, 2))
         fill_mode_probabilities(prior, likelihoods, np.array([[0.0, 1.0]]), shares, modes)
@@ -219,15 +202,15 @@ def test_small_matrices_are_those_of_numpy_the_twins_own() -> None:
     rng = np.random.default_rng(2)
     for matrix in covariances(rng, 6):
         root, inverse = np.empty((5, 5)), np.empty((3, 3))
-        fill_cholesky(matrix, root)
+        ukf.fill_cholesky(matrix, root)
         np.testing.assert_allclose(root, np.linalg.cholesky(matrix), atol=1e-12)
-        fill_inverse(matrix[:3, :3].copy(), inverse)
+        ukf.fill_inverse(matrix[:3, :3].copy(), inverse)
         np.testing.assert_allclose(inverse, np.linalg.inv(matrix[:3, :3]), rtol=1e-8, atol=1e-9)
-    fill_cholesky(np.diag([4.0, 0.0, -1e-18, 9.0, 1.0]), root)  # directions without variance
+    ukf.fill_cholesky(np.diag([4.0, 0.0, -1e-18, 9.0, 1.0]), root)  # directions without variance
     np.testing.assert_array_equal(root, np.diag([2.0, 0.0, 0.0, 3.0, 1.0]))
     for angle in (*rng.uniform(-20.0, 20.0, 20), 0.0, math.pi / 2):
-        assert half_turn(angle) == pytest.approx((angle + math.pi / 2) % math.pi - math.pi / 2, abs=1e-12)
-    assert math.isnan(half_turn(math.nan))
+        assert ukf.half_turn(angle) == pytest.approx((angle + math.pi / 2) % math.pi - math.pi / 2, abs=1e-12)
+    assert math.isnan(ukf.half_turn(math.nan))
 
 
 @pytest.mark.parametrize("n", [0, 1, 5])
@@ -259,16 +242,16 @@ def test_the_imm_is_its_twin(n: int) -> None:
             np.testing.assert_allclose(got, wanted, atol=1e-9)
 
 
-def detected(places: np.ndarray, groups: np.ndarray) -> Detections:
+def detected(places: np.ndarray, groups: np.ndarray) -> jpda.Detections:
     """Detections of which only the place and the group matter."""
     n = len(places)
     nothing = np.full(n, np.nan)
-    return Detections(places, np.full((n, 4), np.nan), nothing, nothing, groups, groups, nothing, groups)
+    return jpda.Detections(places, np.full((n, 4), np.nan), nothing, nothing, groups, groups, nothing, groups)
 
 
-def associate(weights: np.ndarray, max_events: int = MAX_EVENTS) -> tuple[np.ndarray, int]:
+def associate(weights: np.ndarray, max_events: int = jpda.MAX_EVENTS) -> tuple[np.ndarray, int]:
     beta = np.empty((weights.shape[0], weights.shape[1] + 1))
-    return beta, fill_association(weights, max_events, beta)
+    return beta, jpda.fill_association(weights, max_events, beta)
 
 
 @pytest.mark.parametrize(("n", "m"), [(0, 0), (0, 3), (3, 0), (1, 1), (5, 6)])
@@ -280,13 +263,13 @@ def test_likelihoods_are_those_of_the_twin(n: int, m: int) -> None:
     groups, theirs = rng.integers(0, 2, n), rng.integers(0, 2, m)
     sigmas, prior, odds = np.tile(SIGMAS, (n, 1)), rng.dirichlet(np.ones(3), n), rng.uniform(1.0, 9.0, n)
     limits, got, weights = np.full(n, 3.0), np.empty((n, 3, m)), np.empty((n, m))
-    tracks, gates = Predictions(means, predicted, prior), Gates(sigmas, odds, groups, limits)
-    fill_likelihoods(tracks, gates, detected(detections, theirs), got, weights)
+    tracks, gates = jpda.Predictions(means, predicted, prior), jpda.Gates(sigmas, odds, groups, limits)
+    jpda.fill_likelihoods(tracks, gates, detected(detections, theirs), got, weights)
     wanted = twins.tracking.likelihoods(means, predicted, sigmas, groups, detections, theirs, limits)
     np.testing.assert_allclose(got, wanted, atol=1e-12)
     np.testing.assert_allclose(weights, odds[:, None] * np.einsum("nk,nkm->nm", prior, wanted), atol=1e-12)
     detections[:1] = np.nan  # the tracker never lets it in; it must not spread either way
-    fill_likelihoods(tracks, gates, detected(detections, theirs), got, weights)
+    jpda.fill_likelihoods(tracks, gates, detected(detections, theirs), got, weights)
     assert not got[:, :, :1].any()
 
 
@@ -354,5 +337,5 @@ def test_two_certain_pairs_do_not_mix() -> None:
     beta, _ = associate(np.array([[1e15, 1.0], [1.0, 1e15]]))
     np.testing.assert_allclose(beta[:, 1:], np.eye(2), atol=1e-9)
     scratch = np.zeros((2, 3))
-    fill_by_propagation(np.array([[1e15, 1.0], [1.0, 1e15]]), np.arange(2), np.arange(2), scratch)
+    jpda.fill_by_propagation(np.array([[1e15, 1.0], [1.0, 1e15]]), np.arange(2), np.arange(2), scratch)
     np.testing.assert_allclose(scratch[:, 1:], np.eye(2), atol=1e-6)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,7 @@ import twins.moving
 from edgeperc import Box, OptionError, Perception, PointLabels, PointsError, Tracker, Tracks
 from edgeperc.tracking.moving import mark_in_boxes, movable_points, moving_points, moving_tracks
 from edgeperc.types.geometry import inside
+from scenes import box
 
 PLACES = st.one_of(st.integers(-12, 12).map(lambda n: n / 2.0), st.sampled_from([math.nan, math.inf, -math.inf]))
 
@@ -54,8 +56,7 @@ def perceived(n: int, boxes: Any = (), labels: PointLabels | None = None) -> Per
     return Perception(n, 0, labels, None, tuple(boxes), {}, {}, (), None)
 
 
-def car(x: float, y: float, label: str = "car") -> Box:
-    return Box(label, 0.99, (x, y, -0.9), (4.0, 1.8, 1.5), 0.0)
+car = partial(box, score=0.99)
 
 
 def followed(*ways: Any, n: int = 20, ego_mps: float = 0.0, poses: bool = True, label: str = "car") -> Tracks:

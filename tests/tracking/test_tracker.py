@@ -15,21 +15,9 @@ from hypothesis import strategies as st
 import edgeperc
 import twins.tracking
 from edgeperc import Box, StampError, Tracker, TrackingError
+from edgeperc.tracking import lives
 from edgeperc.tracking.egomotion import fit_motion, nearest_detection, support
 from edgeperc.tracking.jpda import Detections
-from edgeperc.tracking.lives import (
-    EXPECTED,
-    MOST_EXISTENCE,
-    MOST_HIDDEN,
-    TRACK,
-    fill_hidden,
-    fill_newborn,
-    mark_out_of_view,
-    mark_rivals,
-    update_fronts,
-    update_lives,
-    update_shapes,
-)
 from edgeperc.tracking.tracks import PARAMETERS
 from edgeperc.types.perception import Perception
 from edgeperc_bench.peers.tracking import crossing
@@ -286,13 +274,13 @@ def test_fronts_are_those_of_the_twin(n: int, m: int) -> None:
     fronts = rng.uniform([-4, -8, -10], [4, 8, 10], (n, 3))
     sigma, limit = rng.uniform(0.1, 2.0, n), rng.uniform(0.5, 2.0, n)
     wanted = twins.tracking.updated_fronts(state, sigma, limit, beta, detections, told, fronts)
-    update_fronts(state, sigma, limit, beta, detections, told, fronts)
+    lives.update_fronts(state, sigma, limit, beta, detections, told, fronts)
     np.testing.assert_allclose(fronts, wanted)
     if n > 1:  # a track that is not finite leaves the others unchanged
         state[0] = np.nan
         before = fronts.copy()
-        update_fronts(state, sigma, limit, beta, detections, told, fronts)
-        update_fronts(state[1:], sigma[1:], limit[1:], beta[1:], detections, told, before[1:])
+        lives.update_fronts(state, sigma, limit, beta, detections, told, fronts)
+        lives.update_fronts(state[1:], sigma[1:], limit[1:], beta[1:], detections, told, before[1:])
         np.testing.assert_array_equal(fronts[1:], before[1:])
 
 
@@ -520,15 +508,15 @@ def test_shapes_hiding_and_rivals_are_those_of_the_twins(n: int, m: int) -> None
     shape, variance = rng.uniform(1, 3, (n, 4)), rng.uniform(0.1, 1, (n, 4))
     walk = np.array([0.1, 0.2, 0.3, 0.4])
     wanted = twins.tracking.updated_shapes(beta, shapes, sigmas, walk, shape, variance)
-    update_shapes(beta, shapes, sigmas, walk, shape, variance)
+    lives.update_shapes(beta, shapes, sigmas, walk, shape, variance)
     for got, want in zip((shape, variance), wanted, strict=True):
         np.testing.assert_allclose(got, want)
     seen, sensor, shares = rng.random(n) < 0.7, np.array([3.0, -8.0]), np.empty(n)
-    fill_hidden(10.0 * state, shape, seen, sensor, shares)
+    lives.fill_hidden(10.0 * state, shape, seen, sensor, shares)
     np.testing.assert_allclose(shares, twins.tracking.hidden(10.0 * state, shape, seen, sensor))
     strength, reported = rng.permutation(n).astype(float), rng.random(n) < 0.8
     wanted_rows = twins.tracking.rivals(state, shape, strength, reported)
-    mark_rivals(state, shape, np.argsort(-strength, kind="stable"), reported)
+    lives.mark_rivals(state, shape, np.argsort(-strength, kind="stable"), reported)
     assert np.flatnonzero(reported).tolist() == wanted_rows
 
 
@@ -541,22 +529,22 @@ def test_births_lives_and_views_are_those_of_the_twins(n: int, m: int) -> None:
     detections, shapes = rng.normal(0.0, 9.0, (n, 3)), rng.uniform(0.5, 4.0, (n, 4))
     logits, fronts, ranges = rng.normal(0.0, 3.0, n), rng.normal(0.0, 3.0, n), rng.uniform(0.0, 60.0, n)
     born = Detections(detections, shapes, logits, fronts, kinds, of["group"].copy(), ranges, np.arange(n))
-    wanted = twins.tracking.newborn(5, born, of, MOST_EXISTENCE, TRACK)
-    tracks = np.zeros(n, TRACK)
-    fill_newborn(5, born, of, tracks)
+    wanted = twins.tracking.newborn(5, born, of, lives.MOST_EXISTENCE, lives.TRACK)
+    tracks = np.zeros(n, lives.TRACK)
+    lives.fill_newborn(5, born, of, tracks)
     assert_same_tracks(tracks, wanted)
 
     for _ in range(4):
         beta = rng.dirichlet(np.full(m + 1, 0.2), n)
         seen = beta, rng.random(n), rng.normal(0.0, 3.0, m), rng.integers(0, 3, m), 0.1
-        wanted = twins.tracking.lives(tracks, of, *seen, MOST_HIDDEN, EXPECTED, MOST_EXISTENCE)
-        update_lives(tracks, of, *seen)
+        wanted = twins.tracking.lives(tracks, of, *seen, lives.MOST_HIDDEN, lives.EXPECTED, lives.MOST_EXISTENCE)
+        lives.update_lives(tracks, of, *seen)
         assert_same_tracks(tracks, wanted)
 
     pose = np.array([[0.8, -0.6, 0, 3.0], [0.6, 0.8, 0, -4.0], [0, 0, 1, 0], [0, 0, 0, 1]])
     reported = rng.random(n) < 0.8
     stays = reported & ((tracks["misses"] == 0) | twins.tracking.in_view(tracks, pose, 0.9, -0.7))
-    mark_out_of_view(tracks, pose, 0.9, -0.7, reported)
+    lives.mark_out_of_view(tracks, pose, 0.9, -0.7, reported)
     assert reported.tolist() == stays.tolist()
 
 

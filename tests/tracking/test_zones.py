@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -15,8 +16,9 @@ from shapely import MultiPoint, Point, Polygon
 
 import edgeperc
 import twins.motion
-from edgeperc import Box, Line, OptionError, PointsError, Tracker, Tracks, Zone
+from edgeperc import Line, OptionError, PointsError, Tracker, Tracks, Zone
 from edgeperc.tracking.zones import mark_inside
+from scenes import box
 
 WHOLE = st.integers(-6, 6).map(float)
 QUARTERS = st.integers(-24, 24).map(lambda n: n / 4.0)
@@ -62,14 +64,18 @@ def test_a_convex_zone_holds_what_shapely_says() -> None:
     assert 100 < found.sum() < 500
 
 
-def car(x: float, y: float) -> Box:
-    return Box("car", 0.99, (x, y, -0.9), (4.0, 1.8, 1.5), 0.0)
+car = partial(box, score=0.99)
 
 
 def drive(*ways: Any, n: int = 30, pose: Any = lambda t: np.eye(4)) -> list[Tracks]:
     """Tracks of cars, each way a function from the time to x, y; without ``pose`` the sensor stands."""
     tracker = Tracker()
     return [tracker.update([car(*way(0.1 * k)) for way in ways], 0.1 * k, pose(0.1 * k)) for k in range(n)]
+
+
+def forward(t: float) -> NDArray[np.float64]:
+    """Of a vehicle that drives 10 m/s."""
+    return np.array([[1, 0, 0, 10.0 * t], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
 
 
 def test_boxes_and_tracks_in_a_zone() -> None:
@@ -84,12 +90,7 @@ def test_boxes_and_tracks_in_a_zone() -> None:
 
 
 def test_a_zone_in_the_world_stays_where_it_is() -> None:
-    def pose(t: float) -> NDArray[np.float64]:
-        T = np.eye(4)
-        T[0, 3] = 10.0 * t
-        return T
-
-    last = drive(lambda t: (40.0 - 10.0 * t, 0.0), pose=pose)[-1]  # stands in the world, 11 m ahead at the end
+    last = drive(lambda t: (40.0 - 10.0 * t, 0.0), pose=forward)[-1]  # stands in the world, 11 m ahead at the end
     (track,) = last
     assert [t.id for t in Zone([(8, -3), (14, -3), (14, 3), (8, 3)]).tracks(last)] == [track.id]
     assert [t.id for t in Zone([(37, -3), (43, -3), (43, 3), (37, 3)]).tracks(last, world=True)] == [track.id]
@@ -153,12 +154,7 @@ def test_a_line_remembers_tracks_by_the_time_that_passed() -> None:
 
 
 def test_a_line_of_the_vehicle_counts_what_it_passes() -> None:
-    def pose(t: float) -> NDArray[np.float64]:
-        T = np.eye(4)
-        T[0, 3] = 10.0 * t
-        return T
-
-    seen = drive(lambda t: (20.0 - 10.0 * t, 4.0), pose=pose)
+    seen = drive(lambda t: (20.0 - 10.0 * t, 4.0), pose=forward)
     ahead, fixed = Line((8, -10), (8, 10), world=False), Line((8, -10), (8, 10))
     assert sum(len(ahead.count(tracks)) for tracks in seen) == 1
     assert sum(len(fixed.count(tracks)) for tracks in seen) == 0

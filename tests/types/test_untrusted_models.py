@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from test_card import TOP_VIEW_CARD
+from test_card import TOP_VIEW_CARD, write
 from tiny_model import (
     CONVOLUTION,
     INITIALIZER,
@@ -46,12 +46,6 @@ from edgeperc.types.onnx_file import check_graph, read_model
 from edgeperc.zoo import digest, model_path, resolve
 
 TINY = model(graph(CONVOLUTION, INITIALIZER))
-
-
-def write(folder: Path, content: bytes) -> Path:
-    path = folder / "model.onnx"
-    path.write_bytes(content)
-    return path
 
 
 def test_a_plain_model_is_opened(tmp_path: Path) -> None:
