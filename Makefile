@@ -77,7 +77,7 @@ test-wheel: .venv-test/installed
 # The tests of kernels import no extra, nor do those of the cache, the first start and the source files.
 test-minimal: .venv-minimal/installed
 	$(MINIMAL)/python -c "import importlib.util as u; assert not any(map(u.find_spec, ['torch', 'onnx', 'matplotlib']))"
-	$(MINIMAL)/pytest -n $(JOBS) --dist worksteal -m 'not kernel' --ignore tests/system/test_kernel_cache.py --ignore tests/test_warm_up.py --ignore tests/test_layering.py
+	$(MINIMAL)/pytest -n $(JOBS) --dist worksteal -m 'not kernel and not compiled' --ignore tests/system/test_kernel_cache.py --ignore tests/test_warm_up.py --ignore tests/test_layering.py
 
 # An old matplotlib uses what newer packages below it deprecate.
 test-lowest: .venv-lowest/installed

@@ -41,6 +41,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 def pytest_configure(config: pytest.Config) -> None:
     config.addinivalue_line("markers", "kernel: holds a kernel against its slow twin")
+    config.addinivalue_line("markers", "compiled: takes a twin for the truth of more than a kernel")
     if "PYTEST_XDIST_WORKER" in os.environ:  # the processes share the cores; torch's threads would wait for one another
         os.environ.setdefault("OMP_NUM_THREADS", "1")
     if numba.config.DISABLE_JIT:
@@ -67,11 +68,12 @@ def pytest_configure(config: pytest.Config) -> None:
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """A test that calls a twin, itself or through a function of its file, holds a kernel against it.
 
-    Such a test runs interpreted and bounds-checked, too; ``@pytest.mark.kernel`` marks one that knows another truth.
+    Such a test runs interpreted and bounds-checked, too; ``@pytest.mark.kernel`` marks one that knows another truth,
+    ``@pytest.mark.compiled`` one that runs compiled alone, for its kernels are held against their twins elsewhere.
     """
     for item in items:
         function, module = getattr(item, "function", None), getattr(item, "module", None)
-        if function is not None and module is not None:
+        if function is not None and module is not None and item.get_closest_marker("compiled") is None:
             if hasattr(function, "hypothesis"):
                 function = function.hypothesis.inner_test
             names = {*function.__code__.co_names}

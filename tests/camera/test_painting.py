@@ -185,6 +185,7 @@ def test_the_order_of_points_does_not_matter(seed: int) -> None:
     np.testing.assert_array_equal(paint(image.labels, scan.points[order], NEAR, sensor="os1-64"), painted[order])
 
 
+@pytest.mark.compiled
 @settings(max_examples=25)
 @given(st.integers(0, 2**32 - 1), st.sampled_from([0, 1, 2, 500]), st.sampled_from([3, 4]))
 def test_any_points_are_painted_or_unseen(seed: int, n: int, columns: int) -> None:

@@ -297,6 +297,7 @@ def with_front(dense: np.ndarray, x: float, y: float) -> np.ndarray:
     return np.concatenate([dense, *(np.broadcast_to(np.float32(v), dense[:, :1].shape) for v in (x, y))], axis=1)
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize("yaw", [0.0, 0.4, -1.2, 1.57, -1.57])
 @pytest.mark.parametrize("front", [(0, 0), (3, 0), (-3, 0), (0, 3), (0.1, -0.2), (-0.1, -0.1), (800, 1), (3e38, -3e38)])
 def test_boxes_turn_to_their_fronts(yaw: float, front: tuple[float, float]) -> None:

@@ -272,6 +272,7 @@ def test_a_velodyne_that_moves(tmp_path: Path) -> None:
     check_straight(first, at_s, 0.1)  # the lasers sit some centimeters off the origin
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize("name", ["room.pcap", "room.osf"])
 def test_an_ouster_that_moves(tmp_path: Path, name: str) -> None:
     core, pcap = pytest.importorskip("ouster.sdk.core"), pytest.importorskip("ouster.sdk.pcap")
@@ -345,6 +346,7 @@ def test_scans_are_straightened_by_poses(tmp_path: Path) -> None:
         Straightener(poses).straighten(*scan)
 
 
+@pytest.mark.compiled
 def test_scans_are_straightened_by_the_tracks_before(tmp_path: Path) -> None:
     """The tracker knows the motion from the second scan on."""
     straightener, straight = Straightener(None), []
@@ -363,6 +365,7 @@ def tracks_at(stamp_s: float | None, pose: NDArray[np.float64], session: int = 0
     return SimpleNamespace(T_world_sensor=pose, stamp_s=stamp_s, session=session, is_late=is_late)
 
 
+@pytest.mark.compiled
 @pytest.mark.filterwarnings("ignore:--deskew")
 def test_late_scans_and_those_of_another_session_give_no_motion(tmp_path: Path) -> None:
     (scan,) = read_timed_scans(drive(tmp_path / "drive.bag", [1700.2]))

@@ -56,6 +56,7 @@ def test_the_corridor_follows_the_largest_overlap(cells: NDArray[np.bool_], firs
     np.testing.assert_array_equal(bounds, twins.ahead.corridor(cells, first, first + width))
 
 
+@pytest.mark.compiled
 @patient
 @given(npst.arrays(np.bool_, npst.array_shapes(min_dims=2, max_dims=2, min_side=1, max_side=12)))
 def test_the_polygon_is_the_part_nearest_to_the_sensor(cells: NDArray[np.bool_]) -> None:

@@ -468,6 +468,7 @@ def test_unknown_environment_is_refused() -> None:
         random_scene(0, "moon")
 
 
+@pytest.mark.compiled
 def test_top_view_labels() -> None:
     car, truck = box("car", 20, 0.5, 0.3), box("truck", 35, -3.0, 0.0)
     scan = simulate(flat(street(car, truck, box("pedestrian", 10, 6))), SMALL, 0)
@@ -517,6 +518,7 @@ def test_islands_are_raised_and_not_drivable() -> None:
     assert (labels[(y > -3.9) & (y < 0.9)] == 1).all()
 
 
+@pytest.mark.compiled
 def test_islands_have_poles_and_no_traffic() -> None:
     scenes = [scene for scene in map(random_scene, range(40)) if (scene.strips[:, 9] < 0.0).any()]
     assert len(scenes) > 4
@@ -542,6 +544,7 @@ def test_trams_and_trailers_belong_to_no_class() -> None:
     assert (view[(np.abs(x - 20.0) < 6.5) & (np.abs(y - 4.0) < 1.0)] == 0).all()
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize(("height_m", "pitch_deg", "roll_deg"), [(1.4, 3.0, 0.0), (2.2, -3.0, 2.0)])
 def test_scans_of_other_mountings(height_m: float, pitch_deg: float, roll_deg: float) -> None:
     mounting = Mounting(height_m=height_m, pitch_deg=pitch_deg, roll_deg=roll_deg)
