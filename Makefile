@@ -5,7 +5,10 @@ JOBS ?= 2
 SHELL := /bin/bash
 .SHELLFLAGS := -euo pipefail -c
 .DELETE_ON_ERROR:
+# Each pytest takes all cores. What takes one runs beside others of its kind: ALONGSIDE=1 is for `make test` itself.
+ifndef ALONGSIDE
 .NOTPARALLEL:
+endif
 # Without .pyc files, each of the tests' processes would compile what it imports.
 unexport PYTHONDONTWRITEBYTECODE
 .DEFAULT_GOAL := help
@@ -48,7 +51,9 @@ help:
 demo: .venv/installed
 	$(BIN)/edgeperc demo --out demo
 
-test: check docs test-full test-kernels test-wheel test-minimal
+test: .venv-test/installed
+	$(MAKE) --no-print-directory --jobs $(JOBS) ALONGSIDE=1 check docs test-wheel .venv-minimal/installed
+	$(MAKE) --no-print-directory test-full test-kernels test-minimal
 
 check: .venv-test/installed
 	$(TEST)/ruff check .
@@ -58,10 +63,11 @@ check: .venv-test/installed
 test-full: .venv-test/installed
 	$(TEST)/pytest -n $(JOBS) --dist worksteal
 
-# Interpreted, a kernel answers as it does compiled; compiled, it stays inside its arrays.
+# Interpreted, a kernel answers as it does compiled; compiled, it stays inside its arrays. To import the other tests took 11 s.
+test-kernels: KERNEL = -m kernel $$(grep --recursive --files-with-matches --include='test_*.py' -E 'twins|mark\.kernel' tests)
 test-kernels: .venv-test/installed
-	NUMBA_DISABLE_JIT=1 $(TEST)/pytest -q -n $(JOBS) --dist worksteal -m kernel --every-kernel
-	NUMBA_BOUNDSCHECK=1 NUMBA_CACHE_DIR=$(CURDIR)/.venv-test/bounds-checked $(TEST)/pytest -q -n $(JOBS) --dist worksteal -m kernel
+	NUMBA_DISABLE_JIT=1 $(TEST)/pytest -q -n $(JOBS) --dist worksteal --every-kernel $(KERNEL)
+	NUMBA_BOUNDSCHECK=1 NUMBA_CACHE_DIR=$(CURDIR)/.venv-test/bounds-checked $(TEST)/pytest -q -n $(JOBS) --dist worksteal $(KERNEL)
 
 docs: .venv-test/installed
 	$(TEST)/python -m sphinx -W --keep-going -q -b html docs docs/_build/html

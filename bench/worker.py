@@ -113,14 +113,15 @@ def serve(connection: Any, job: Job) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent gets it too, and asks for the results so far
     try:
         try:
-            connection.send(("done", _work(connection, job)))
+            connection.send(("done", work(connection, job)))
         except EdgepercError as exc:
             connection.send(("failed", (type(exc).__name__, str(exc))))
     except (BrokenPipeError, ConnectionResetError, EOFError):
         return  # the parent has ended
 
 
-def _work(connection: Any, job: Job) -> dict[str, Any]:
+def work(connection: Any, job: Job) -> dict[str, Any]:
+    """Do one job and return what it measured."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         began = time.perf_counter()
@@ -131,7 +132,7 @@ def _work(connection: Any, job: Job) -> dict[str, Any]:
             began = time.perf_counter()
             perceive(next(iter(scans.values())))
             result["first_call_ms"] = 1e3 * (time.perf_counter() - began)
-        result |= {"engines": _engines(perceive), "scenarios": {}, "interrupted": False, "predictions": []}
+        result |= {"engines": active_engines(perceive), "scenarios": {}, "interrupted": False, "predictions": []}
         result["scans_mb"] = sum(scan.nbytes for scan in scans.values()) / 1e6
         connection.send(("ready", None))
         stopped = connection.recv() == "stop"
@@ -165,7 +166,7 @@ def _predict(perceive: Perceive, scan: NDArray[np.float32]) -> Prediction:
     return Prediction(perception.points, perception.top_view, perception.boxes)
 
 
-def _engines(perceive: Perceiver) -> list[dict[str, Any]]:
+def active_engines(perceive: Perceiver) -> list[dict[str, Any]]:
     """The active engines, one record per network."""
     return [
         {
@@ -289,7 +290,7 @@ def measure(jobs: Sequence[Job], on_tick: OnTick = lambda name, ms: None) -> lis
                 pending: dict[Any, int] = {here: k for k, (_, here) in enumerate(workers) if k not in results}
                 for ready in wait(list(pending), timeout=TICK_S):
                     k = pending[ready]
-                    kind, content = _receive(workers[k][1], workers[k][0])
+                    kind, content = receive(workers[k][1], workers[k][0])
                     if kind == "ready":
                         n_ready += 1
                         if n_ready == len(jobs):
@@ -317,7 +318,8 @@ def measure(jobs: Sequence[Job], on_tick: OnTick = lambda name, ms: None) -> lis
     return [results[k] for k in range(len(jobs))]
 
 
-def _receive(connection: Any, process: Any) -> tuple[str, Any]:
+def receive(connection: Any, process: Any) -> tuple[str, Any]:
+    """The next message of a worker, or the error of one that ended."""
     try:
         kind, content = connection.recv()
     except EOFError as exc:

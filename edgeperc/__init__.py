@@ -141,7 +141,7 @@ __all__ = [
 
 __version__ = "0.1.0"
 
-_MODULES = {
+MODULES = {
     "Answer": "live",
     "Box": "types.perception",
     "Crossing": "tracking.zones",
@@ -194,9 +194,9 @@ _MODULES = {
 
 
 def __getattr__(name: str) -> object:
-    if name not in _MODULES:
+    if name not in MODULES:
         raise AttributeError(f"module 'edgeperc' has no attribute {name!r}")
-    found: object = getattr(import_module(f"edgeperc.{_MODULES[name]}"), name)
+    found: object = getattr(import_module(f"edgeperc.{MODULES[name]}"), name)
     globals()[name] = found  # the next use finds it without this function
     return found
 

@@ -23,7 +23,7 @@ from .types.sensor import SensorProfile
 Health = Literal["OK", "LATE", "STALE"]
 
 # Longest time that `Stream.close` waits for the reading thread.
-_PATIENCE_S = 1.0
+PATIENCE_S = 1.0
 
 # Longest pause of a recording that is replayed as it is [s], or 5 periods of the sensor if these are longer.
 _PAUSE_S = 2.0
@@ -126,7 +126,7 @@ def stream(
     inbox = _Inbox()
     if isinstance(source, str | os.PathLike):
         _warn_of_another_sensor(source, perceiver, topic)
-        scans: Iterator[Any] = _paced(read_scans(Path(source), topic=topic), rate_hz, inbox.stopped)
+        scans: Iterator[Any] = paced(read_scans(Path(source), topic=topic), rate_hz, inbox.stopped)
     else:
         try:
             scans = iter(source)
@@ -182,7 +182,7 @@ class Stream:
         stale_after_s: float,
     ) -> None:
         self.late_after_s, self.stale_after_s = late_after_s, stale_after_s
-        self._inbox, self._perceiver, self._tracker = inbox, perceiver, tracker
+        self.inbox, self._perceiver, self._tracker = inbox, perceiver, tracker
         self._newest_s = -math.inf
         self._is_untimed_reported = False
         self._thread = threading.Thread(target=_read, args=(scans, inbox), name="edgeperc-source", daemon=True)
@@ -217,7 +217,7 @@ class Stream:
         Exception
             Any error of the source, the perceiver or the tracker.
         """
-        taken = self._inbox.take(timeout_s)
+        taken = self.inbox.take(timeout_s)
         if taken is None:
             return None
         (points, stamp_s, arrived_s), n_scans, n_dropped = taken
@@ -257,17 +257,17 @@ class Stream:
     @property
     def n_scans(self) -> int:
         """Number of scans that have arrived."""
-        return self._inbox.n_scans
+        return self.inbox.n_scans
 
     @property
     def n_dropped(self) -> int:
         """Number of scans that were dropped because a newer scan had arrived."""
-        return self._inbox.n_dropped
+        return self.inbox.n_dropped
 
     def close(self) -> None:
         """Stop reading. Wait up to 1 s for the reading thread. Waiting calls of `take` raise StopIteration."""
-        self._inbox.stop()
-        self._thread.join(_PATIENCE_S)
+        self.inbox.stop()
+        self._thread.join(PATIENCE_S)
 
     def __enter__(self) -> Stream:
         return self
@@ -343,7 +343,7 @@ def _stamped(scan: Any) -> tuple[Any, float | None]:
         raise PointsError(f"got a tuple that is not a scan ({exc}); expected points or (stamp_s, points)") from exc
 
 
-def _paced(
+def paced(
     scans: Iterator[tuple[float | None, Any]], rate_hz: float, stopped: threading.Event
 ) -> Iterator[tuple[float, Any]]:
     """Yield recorded scans in real time, by their stamps or at the sensor's rate. Late scans come immediately.

@@ -387,6 +387,11 @@ class Perceiver:
         """That of this process: after a fork, the one that held the parent's lock may be missing."""
         return self._locks.setdefault(os.getpid(), threading.Lock())
 
+    @property
+    def pipeline(self) -> Pipeline | None:
+        """What computes a perception of a scan; None without a LiDAR model."""
+        return self._pipeline
+
     def reset_mounting(self) -> None:
         """Estimate mounting and remission anew, for scans of another vehicle; the next five scans settle both."""
         with self._lock:

@@ -262,14 +262,14 @@ class Helpers:
 
     def __init__(self, parts: Collection[str]) -> None:
         self._began_s = time.monotonic()
-        self._running: list[subprocess.Popen[bytes]] = []
-        parts = [part for part in PARTS if part in parts and _is_cold(PARTS[part].largest)]
-        self._own, *self._shares = _shares(parts)
+        self.running: list[subprocess.Popen[bytes]] = []
+        parts = [part for part in PARTS if part in parts and is_cold(PARTS[part].largest)]
+        self.own_parts, *self.shares = _shares(parts)
 
     def __enter__(self) -> Helpers:
-        for share in self._shares:
+        for share in self.shares:
             try:
-                self._running.append(_start(share))
+                self.running.append(_start(share))
             except (OSError, ValueError) as exc:  # such as no memory, no permission, or a path with a null character
                 logger.info("no helper process compiles kernels at this first start: %s", exc)
                 break
@@ -277,10 +277,10 @@ class Helpers:
 
     def wait(self) -> None:
         """Compile the caller's share and wait for the others, but not longer than that took (at least 5 s)."""
-        if self._running:
-            compile_parts(self._own)
+        if self.running:
+            compile_parts(self.own_parts)
         until_s = time.monotonic() + max(MIN_WAIT_S, time.monotonic() - self._began_s)
-        for helper in self._running:
+        for helper in self.running:
             while (code := helper.poll()) is None and (left_s := until_s - time.monotonic()) > 0.0:
                 tell_watchers()
                 with suppress(subprocess.TimeoutExpired):
@@ -295,8 +295,8 @@ class Helpers:
         self._end()
 
     def _end(self) -> None:
-        while self._running:
-            helper = self._running.pop()
+        while self.running:
+            helper = self.running.pop()
             helper.kill()
             helper.wait()
             assert helper.stdin is not None
@@ -355,7 +355,7 @@ def _shares(parts: Sequence[str]) -> list[list[str]]:
     return [shares[0], *(sorted(share, key=lambda part: part != "ground") for share in shares[1:] if share)]
 
 
-def _is_cold(kernel: Any) -> bool:
+def is_cold(kernel: Any) -> bool:
     """Whether compiling this kernel is of use: it is not in the cache, which can be written."""
     cache = getattr(kernel, "_cache", None)
     return isinstance(cache, KernelCache) and cache.is_missing()

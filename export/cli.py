@@ -131,7 +131,7 @@ def _title(networks: tuple[str, ...]) -> str:
     return f"{' and '.join(tasks)} ({', '.join(networks)})"
 
 
-def _recipe(args: argparse.Namespace) -> Recipe:
+def recipe_of(args: argparse.Namespace) -> Recipe:
     """The recipe of a ``train`` command.
 
     Raises ValueError.
@@ -213,7 +213,7 @@ def _add_train(commands: Commands) -> None:
 
 
 def _train(args: argparse.Namespace) -> int:
-    recipe = _recipe(args)
+    recipe = recipe_of(args)
     from edgeperc.datasets.scan_folder import ScanFolder
 
     from .training.train import Data, Run, train

@@ -10,7 +10,7 @@ from typing import Any
 import onnx
 
 from edgeperc.evaluation.camvid import evaluate_images
-from edgeperc.evaluation.evaluate import evaluate
+from edgeperc.evaluation.evaluate import NETWORK_ALONE, evaluate
 from edgeperc.types.card import ModelCard
 
 from .data.simulate import fitness_of, parity_images, parity_scans, simulate
@@ -119,7 +119,7 @@ def finish(
     learned_road = "drivable" in card.classes and kitti is not None and path != truth and truth.exists()
     road_by = truth if learned_road else None
     # The figures of a card are of its network alone.
-    figures, _ = evaluate([*datasets.values()], [path], fold=fold, road_by=road_by, boxes_from="network", rules=())
+    figures, _ = evaluate([*datasets.values()], [path], NETWORK_ALONE, fold=fold, road_by=road_by)
     command = ["edgeperc eval", *datasets, f"--model {name}"]
     command += [f"--road-by {ROAD_TRUTH}"] if road_by else []
     command += [f"--fold {fold}"] if fold is not None else []

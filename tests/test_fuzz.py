@@ -68,9 +68,6 @@ def test_a_round_of_forked_processes(kind: str, cases: int, tmp_path: Path) -> N
     assert f"{kind} seed 7: {cases} cases, 0 failures" in done.stdout
 
 
-# --- the fuzzer itself ------------------------------------------------------------------------------------------------
-
-
 class Broken:
     """A kind whose every third case fails, in another way each time."""
 
@@ -126,9 +123,6 @@ def test_a_process_that_dies_or_hangs_is_a_failure(tmp_path: Path) -> None:
     )  # fmt: skip
     assert (state.cases, state.n_failures) == (7, 2)
     assert [f["error"] for f in state.failures] == ["the process died (-11)", "hangs"]
-
-
-# --- faults that were found -------------------------------------------------------------------------------------------
 
 
 def read_card(path: Path, folder: Path) -> object:

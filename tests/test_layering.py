@@ -162,6 +162,33 @@ NEVER = {"edgeperc_bench", "edgeperc_export", "onnx", "pydantic", "scipy", "torc
 ONLY_IN_FUNCTIONS = {"PIL", "matplotlib", "onnxruntime"}
 RIVALS = "edgeperc_bench.peers."
 TALK_TO_ONNXRUNTIME = {"edgeperc.inference.providers", "edgeperc.inference.session"}
+# Names with an underscore of argparse, named tuples, numba and ouster-sdk that tests use.
+OF_OTHERS = {"_512x10", "_actions", "_choices_actions", "_replace", "_cache", "_defined_symbols", "_engine"}
+# Functions that are lists of options.
+LONG_BODIES = {"add_parser"}
+MANY_PARAMETERS = {("edgeperc.perceiver", "__init__")}
+# File names that occur more than once: how often, and why.
+SAME_NAME = {
+    "camera": (3, "the camera's networks measured, simulated, trained"),
+    "camvid": (2, "the data set evaluated, trained on"),
+    "cli": (3, "one a program"),
+    "files": (3, "the files of readers, of pictures, of the database"),
+    "images": (3, "images read, labeled, trained on"),
+    "names": (2, "names in messages, names in what viewers show"),
+    "page": (2, "the page, and the sink that writes it"),
+    "painting": (3, "painting, its evaluation, the command of that"),
+    "projection": (2, "the projection, and its rivals"),
+    "report": (2, "of a scan, of a benchmark"),
+    "run": (2, "a command of two programs"),
+    "samples": (3, "of the simulation, of the training, of times"),
+    "scans": (3, "scans of a command, of its evaluation, of the training"),
+    "scene": (2, "simulated, shown by viewers"),
+    "start": (2, "of a benchmark, of the training"),
+    "tables": (3, "of figures, of rivals, of capture files"),
+    "tracking": (3, "its evaluation, the command of that, its rivals"),
+    "tracks": (2, "tracks, and how they are drawn"),
+    "worker": (2, "a process that decodes, one that measures"),
+}
 # Packages of the runtime that only tools import.
 WINGS = {"edgeperc.datasets", "edgeperc.evaluation", "edgeperc.simulation"}
 
@@ -174,6 +201,11 @@ def modules() -> dict[str, Path]:
         for path in files(".py", str(folder.relative_to(REPOSITORY))):
             found[".".join([package, *path.relative_to(folder).with_suffix("").parts])] = path
     return found
+
+
+@functools.cache
+def tree_of(name: str) -> ast.Module:
+    return ast.parse(modules()[name].read_text("utf-8"))
 
 
 RUNTIME = sorted(name for name in modules() if name.startswith("edgeperc."))
@@ -198,10 +230,11 @@ def packages_imported(name: str, tree: ast.AST) -> set[str]:
     return {dotted.partition(".")[0] for dotted in imported(name, tree)}
 
 
+@functools.cache
 def own_imports(name: str) -> set[str]:
     """Modules of the three packages that a module imports."""
     known, found = modules(), set()
-    for dotted in imported(name, ast.parse(known[name].read_text("utf-8"))):
+    for dotted in imported(name, tree_of(name)):
         parent = dotted.rpartition(".")[0]
         candidates = (dotted, f"{dotted}.__init__", parent, f"{parent}.__init__")
         found |= {next((each for each in candidates if each in known), name)}
@@ -267,10 +300,28 @@ def test_only_tools_import_the_wings(name: str) -> None:
 
 @pytest.mark.parametrize("name", sorted(modules()))
 def test_private_names_stay_in_their_module(name: str) -> None:
-    for node in ast.walk(ast.parse(modules()[name].read_text("utf-8"))):
+    for node in ast.walk(tree_of(name)):
         if isinstance(node, ast.ImportFrom) and (node.level or str(node.module).startswith("edgeperc")):
             private = [alias.name for alias in node.names if alias.name.startswith("_") and alias.name[1] != "_"]
             assert not private, f"{name} imports {private} of {node.module}"
+
+
+def test_tests_use_public_names() -> None:
+    """What a test needs of a module has a name without an underscore."""
+    others = {"argparse", "core", "os", "sys", "self", "cls"}
+    reached = []
+    for path in files(".py", "tests"):
+        for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+            names: list[str] = []
+            if isinstance(node, ast.ImportFrom) and str(node.module).startswith("edgeperc"):
+                names = [alias.name for alias in node.names]
+            elif isinstance(node, ast.Attribute) and ast.unparse(node.value) not in others:
+                names = [node.attr]
+            elif isinstance(node, ast.Call) and ast.unparse(node.func).endswith("setattr"):
+                names = [str(a.value).rpartition(".")[2] for a in node.args[:2] if isinstance(a, ast.Constant)]
+            private = {each for each in names if each.startswith("_") and each[1:2] != "_"} - OF_OTHERS
+            reached += [f"{path.name}:{node.lineno} {each}" for each in private]
+    assert not reached
 
 
 def test_the_listing_explains_the_system() -> None:
@@ -289,9 +340,47 @@ def test_files_have_at_most_800_lines(name: str) -> None:
     assert modules()[name].read_text("utf-8").count("\n") <= 800
 
 
+def functions(tree: ast.AST) -> Iterator[ast.FunctionDef | ast.AsyncFunctionDef]:
+    for node in ast.walk(tree):
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+            yield node
+
+
+def n_parameters(function: ast.FunctionDef | ast.AsyncFunctionDef) -> int:
+    """Without `self` and `cls`."""
+    of = function.args
+    names = [each.arg for each in (*of.posonlyargs, *of.args, *of.kwonlyargs, *filter(None, (of.vararg, of.kwarg)))]
+    return len(names) - (names[:1] in (["self"], ["cls"]))
+
+
+@pytest.mark.parametrize("name", sorted(modules()))
+def test_functions_are_small(name: str) -> None:
+    """Bodies of at most 80 lines without the docstring, at most 12 parameters; kernels have at most 8."""
+    tree = tree_of(name)
+    compiled = {kernel.name for kernel, _ in kernels(tree)}
+    for function in functions(tree):
+        body = function.body[ast.get_docstring(function) is not None :]
+        n_lines = int(body[-1].end_lineno or 0) - body[0].lineno + 1 if body else 0
+        assert n_lines <= 80 or function.name in LONG_BODIES, f"{function.name} has a body of {n_lines} lines"
+        n = n_parameters(function)
+        assert n <= (8 if function.name in compiled else 12) or (name, function.name) in MANY_PARAMETERS, (
+            f"{function.name} has {n} parameters"
+        )
+
+
+def test_a_file_name_occurs_once() -> None:
+    """A name says which module is meant; two of one name are two sides of one thing, or stand here with the reason."""
+    folders: dict[str, list[str]] = {}
+    for name in modules():
+        folder, _, file = name.rpartition(".")
+        folders.setdefault(file, []).append(folder)
+    twice = {file: names for file, names in folders.items() if len(names) > 1 and file != "__init__"}
+    assert {file: len(names) for file, names in twice.items()} == {file: n for file, (n, _) in SAME_NAME.items()}
+
+
 @pytest.mark.parametrize("name", RUNTIME)
 def test_the_runtime_is_light(name: str) -> None:
-    tree = ast.parse(modules()[name].read_text("utf-8"))
+    tree = tree_of(name)
     packages = packages_imported(name, tree)
     assert not packages & NEVER
     assert name in TALK_TO_ONNXRUNTIME or "onnxruntime" not in packages, f"only {TALK_TO_ONNXRUNTIME} talk to it"
@@ -306,14 +395,10 @@ def test_library_code_leaves_the_process_alone(name: str) -> None:
     """No exit, no print and no logging set-up outside the command line."""
     if name.startswith("edgeperc.cli.") or name == "edgeperc.__main__":
         return
-    calls = [
-        ast.unparse(node.func)
-        for node in ast.walk(ast.parse(modules()[name].read_text("utf-8")))
-        if isinstance(node, ast.Call)
-    ]
-    mine = {"signal.signal"} if name == "edgeperc.system.ray_cluster" else set()  # it gives back the handler Ray took
-    every = {"print", "exit", "quit", "sys.exit", "os._exit", "logging.basicConfig", "signal.signal"}
-    assert not (every - mine) & {*calls}
+    calls = [ast.unparse(node.func) for node in ast.walk(tree_of(name)) if isinstance(node, ast.Call)]
+    if name != "edgeperc.system.ray_cluster":  # it puts back the handler that ray.init replaces
+        assert "signal.signal" not in calls
+    assert not {"print", "exit", "quit", "sys.exit", "os._exit", "logging.basicConfig"} & {*calls}
 
 
 @pytest.mark.parametrize("name", sorted(name for name in modules() if name.startswith("edgeperc_bench.")))
@@ -323,7 +408,7 @@ def test_bench_imports_only_the_runtime(name: str) -> None:
     Rivals stand on what they stand on, but only when they are asked for too.
     """
     rivals = {"edgeperc_export", "onnx", "onnxruntime", "openvino", "scipy", "torch"}
-    tree = ast.parse(modules()[name].read_text("utf-8"))
+    tree = tree_of(name)
     assert name.startswith(RIVALS) or not packages_imported(name, tree) & rivals
     for statement in at_import(tree):
         if isinstance(statement, ast.Import | ast.ImportFrom):
@@ -343,7 +428,7 @@ def kernels(tree: ast.Module) -> Iterator[tuple[ast.FunctionDef, ast.expr]]:
 @pytest.mark.parametrize("name", RUNTIME)
 def test_kernels_follow_the_conventions(name: str) -> None:
     """Cached, without the GIL; never parallel (aborts the process when two threads call) or fastmath (drops guards)."""
-    tree = ast.parse(modules()[name].read_text("utf-8"))
+    tree = tree_of(name)
     for kernel, decorator in kernels(tree):
         assert isinstance(decorator, ast.Call), f"{kernel.name}: write @njit(cache=True, nogil=True)"
         options = {keyword.arg: ast.unparse(keyword.value) for keyword in decorator.keywords}

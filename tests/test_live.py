@@ -278,13 +278,13 @@ def test_no_scans_no_answers() -> None:
 
 
 def test_leaving_stops_reading(source: Source, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(live, "_PATIENCE_S", TIMEOUT_S)
+    monkeypatch.setattr(live, "PATIENCE_S", TIMEOUT_S)
     with stream(source, perceive) as answers:
         source.give(scan(1))
         next(answers)
         monotone = answers.n_scans
         # The thread waits inside the source, and sees the end with the scan that comes next.
-        threading.Thread(target=lambda: (until(answers._inbox.stopped.is_set), source.give(scan(2), last=True))).start()
+        threading.Thread(target=lambda: (until(answers.inbox.stopped.is_set), source.give(scan(2), last=True))).start()
     assert not readers()
     assert answers.n_scans == monotone
     with pytest.raises(StopIteration):
@@ -292,7 +292,7 @@ def test_leaving_stops_reading(source: Source, monkeypatch: pytest.MonkeyPatch) 
 
 
 def test_a_source_that_blocks_for_ever_holds_nobody_up(source: Source, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(live, "_PATIENCE_S", 0.01)
+    monkeypatch.setattr(live, "PATIENCE_S", 0.01)
     answers = stream(source, perceive)
     assert answers.take(timeout_s=0.0) is None
     assert answers.health == "STALE"
@@ -314,7 +314,7 @@ def test_a_stream_that_is_forgotten_stops(source: Source) -> None:
     answers: live.Stream | None = stream(source, lambda points, stamp_s: held[0](points, stamp_s))
     assert answers is not None
     source.give(scan(1))
-    stopped = answers._inbox.stopped
+    stopped = answers.inbox.stopped
     for _ in answers:
         break
     answers = None
@@ -339,9 +339,6 @@ def test_a_generator_is_left_where_it_stands() -> None:
     assert closed.wait(TIMEOUT_S)
 
 
-# --- replay ----------------------------------------------------------------------------------------------------------
-
-
 class Waits:
     """Stands in for the event that stops a replay: notes how long it would wait, and turns the clock."""
 
@@ -358,7 +355,7 @@ class Waits:
 def test_a_folder_is_replayed_at_the_sensors_rate(monkeypatch: pytest.MonkeyPatch) -> None:
     clock = Waits(monkeypatch)
     scans = [(None, scan(k)) for k in range(4)]
-    stamps = [stamp for stamp, _ in live._paced(iter(scans), 20.0, clock)]
+    stamps = [stamp for stamp, _ in live.paced(iter(scans), 20.0, clock)]
     assert stamps == pytest.approx([0.0, 0.05, 0.1, 0.15])
     assert clock.waits == [0.0, 0.05, 0.05, 0.05]
 
@@ -372,7 +369,7 @@ def test_a_capture_is_replayed_by_its_stamps(monkeypatch: pytest.MonkeyPatch) ->
             clock.now += reading_s
             yield stamp_s, scan(1)
 
-    assert [stamp for stamp, _ in live._paced(read(), 10.0, clock)] == [7.0, 7.1, 7.3, 7.4, 7.35, 9.0]
+    assert [stamp for stamp, _ in live.paced(read(), 10.0, clock)] == [7.0, 7.1, 7.3, 7.4, 7.35, 9.0]
     assert clock.waits == pytest.approx([0.0, 0.1, 0.0, 0.05, 0.0, 1.6])
 
 
@@ -392,7 +389,7 @@ def test_no_jump_of_the_clock_is_waited_for(
     monkeypatch: pytest.MonkeyPatch, stamps_s: list[float | None], waits_s: list[float]
 ) -> None:
     clock = Waits(monkeypatch)
-    stamps = [stamp for stamp, _ in live._paced(((stamp, scan(1)) for stamp in stamps_s), 10.0, clock)]
+    stamps = [stamp for stamp, _ in live.paced(((stamp, scan(1)) for stamp in stamps_s), 10.0, clock)]
     np.testing.assert_equal(stamps, [0.1 * k if stamp is None else stamp for k, stamp in enumerate(stamps_s)])
     assert clock.waits == pytest.approx([0.0, *waits_s], abs=1e-5)
 
@@ -423,7 +420,7 @@ def test_scans_without_a_usable_time_are_answered_without_tracks() -> None:
 
 def test_a_replay_stops_while_it_waits(monkeypatch: pytest.MonkeyPatch) -> None:
     clock = Waits(monkeypatch, stop_after=2)
-    assert len(list(live._paced(iter([(None, scan(1))] * 9), 10.0, clock))) == 2
+    assert len(list(live.paced(iter([(None, scan(1))] * 9), 10.0, clock))) == 2
 
 
 def save(folder: Path, n: int) -> Path:
@@ -446,7 +443,7 @@ def test_a_folder_is_a_source(tmp_path: Path) -> None:
 def test_a_long_wait_for_the_next_scan_is_no_hindrance_to_leaving(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(live, "_PATIENCE_S", TIMEOUT_S)
+    monkeypatch.setattr(live, "PATIENCE_S", TIMEOUT_S)
     with stream(str(save(tmp_path / "drive", 2)), perceive, rate_hz=1e-6) as answers:
         assert next(answers).perception.n_points == 1
     assert not readers()

@@ -42,9 +42,6 @@ def conda(texts: list[str]) -> dict[str, Any]:
     return requirements([f"{name} {version}" for name, _, version in pairs if name not in ("pip", "python")])
 
 
-# --- extras ----------------------------------------------------------------------------------------------------------
-
-
 def wanted_extras() -> Iterator[tuple[str, str]]:
     """File and extra of each call of `edgeperc.system.extras.require`."""
     for file in files(".py", "edgeperc", "bench", "export"):
@@ -94,8 +91,6 @@ def test_versions_that_leak_on_arm_are_excluded_there(machine: str) -> None:
     assert allowed == {"1.18.0", "1.22.1", "1.27.0"} | (leaking if machine == "x86_64" else set())
 
 
-# --- conda-forge -----------------------------------------------------------------------------------------------------
-
 RECIPE = yaml.safe_load((REPOSITORY / "recipe" / "recipe.yaml").read_text("utf-8"))
 
 
@@ -118,9 +113,6 @@ def test_the_recipe_requires_what_the_wheel_does() -> None:
     assert conda(RECIPE["requirements"]["run"]) == needed
     constrained = conda([text.replace("-base", "") for text in RECIPE["requirements"]["run_constraints"]])
     assert constrained == requirements(PROJECT["optional-dependencies"]["view"])
-
-
-# --- the container ---------------------------------------------------------------------------------------------------
 
 
 def test_the_containerfile_passes_hadolint() -> None:
@@ -152,9 +144,6 @@ def test_the_container_gets_all_that_the_wheel_is_built_from() -> None:
     files = {"pyproject.toml", "MANIFEST.in", PROJECT["readme"], *PROJECT["license-files"]}
     assert kept == folders | files
     assert (REPOSITORY / ".dockerignore").read_text("utf-8") == "\n".join(lines) + "\n"
-
-
-# --- the checkout ----------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("is_repository", [True, False])

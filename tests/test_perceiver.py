@@ -37,7 +37,7 @@ from edgeperc import (
 from edgeperc.ground import planes
 from edgeperc.inference import decode, projection, providers, session
 from edgeperc.objects import cluster, refine
-from edgeperc.pipeline import weigh
+from edgeperc.pipeline import Pipeline, weigh
 from edgeperc.preprocess import condition, fitness
 from edgeperc.road import ahead
 from edgeperc.simulation.drawn import random_scene
@@ -254,10 +254,10 @@ def test_two_threads_share_the_sectors_of_a_full_turn(
     alone = Perceiver(["ssadnet", "pointseg"], n_threads=1, **options)
     monkeypatch.setattr(session, "usable_cores", lambda: 2)
     both = Perceiver(["ssadnet", "pointseg"], **options)
-    assert alone._pipeline is not None
-    assert both._pipeline is not None
-    assert len(alone._pipeline.ranged) == 1
-    top, (ranged, aside) = both.sessions[0], (network.session for network in both._pipeline.ranged)
+    assert alone.pipeline is not None
+    assert both.pipeline is not None
+    assert len(alone.pipeline.ranged) == 1
+    top, (ranged, aside) = both.sessions[0], (network.session for network in both.pipeline.ranged)
     of = {"aside": aside, "top view": top, "sectors": ranged}
     runs = dict.fromkeys(of, 0)
 
@@ -486,7 +486,7 @@ def test_gross_differences_are_refused_before_a_network_runs(
     """As often as such a scan comes; good scans are perceived."""
     perceive = Perceiver("pointseg", provider="cpu")
     with monkeypatch.context() as patch:
-        patch.setattr(perceive, "_pipeline", pytest.fail)
+        patch.setattr(Pipeline, "__call__", pytest.fail)
         for _ in range(7):
             with pytest.raises(FitnessError, match=rf"(?s){FAULTS[fault]}.*on_mismatch=\"warn\".*--anyway"):
                 perceive(faulty(scan.points, fault))
@@ -642,9 +642,6 @@ def test_real_scans_are_perceived_without_warnings(kitti_root: Path) -> None:
         assert answer.top_view.drivable_area_m2 > 50.0
 
 
-# --- boxes of networks and of clusters -------------------------------------------------------------------------------
-
-
 def overlaps(first: tuple[Box, ...], second: tuple[Box, ...]) -> NDArray[np.float64]:
     rows = [[(*box.center[:2], *box.size[:2], box.yaw) for box in boxes] for boxes in (first, second)]
     return oriented_iou(*rows)
@@ -727,9 +724,9 @@ def test_car_cut_by_the_views_edge_gets_a_full_box_if_it_is_seen_at_all(
         labels = points[:, 3].astype(np.uint8)
         return PointLabels(labels, labels > 0, ("background", "car", "pedestrian", "cyclist"))
 
-    assert perceive._pipeline is not None
-    monkeypatch.setattr(perceive._pipeline.ranged[0], "label", label)
-    boxes = perceive._pipeline(scan, MODEL_MOUNTING, Stopwatch()).boxes
+    assert perceive.pipeline is not None
+    monkeypatch.setattr(perceive.pipeline.ranged[0], "label", label)
+    boxes = perceive.pipeline(scan, MODEL_MOUNTING, Stopwatch()).boxes
     assert len(boxes) == n_boxes
     for box in boxes:
         np.testing.assert_allclose(box.center[0], 6.0, atol=0.05)

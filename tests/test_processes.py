@@ -50,8 +50,6 @@ def python(code: str, *arguments: str, timeout_s: float = 120.0, **options: Any)
     return subprocess.run(command, capture_output=True, text=True, timeout=timeout_s, **options)
 
 
-# --- fork and spawn --------------------------------------------------------------------------------------------------
-
 FORK = """
 import json, os, sys, threading, warnings
 import numpy as np
@@ -65,7 +63,7 @@ scan[:, 2] = -1.7
 right = perceive(scan).points.labels
 session = perceive.sessions[0]
 begun, finish = threading.Event(), threading.Event()
-real = session._session
+real = session.inference
 
 class Slow:
     def run_with_iobinding(self, binding):
@@ -74,7 +72,7 @@ class Slow:
         real.run_with_iobinding(binding)
 
 if when == "in a call":
-    session._session = Slow()
+    session.inference = Slow()
     thread = threading.Thread(target=perceive, args=(scan,))
     thread.start()
     begun.wait()
@@ -82,7 +80,7 @@ elif when == "under the lock":
     next(iter(perceive._locks.values())).acquire()
 child = os.fork()
 if child == 0:
-    session._session = real
+    session.inference = real
     try:
         print("equal" if (perceive(scan).points.labels == right).all() else "different")
     except edgeperc.InferenceError as error:
@@ -170,21 +168,18 @@ def test_spawned_processes_construct_their_own(tmp_path: Path) -> None:
 
 def test_a_failed_run_is_not_a_running_one(monkeypatch: pytest.MonkeyPatch) -> None:
     session = Session("pointseg", "cpu", n_threads=1)
-    real = session._session
+    real = session.inference
 
     class Broken:
         def run_with_iobinding(self, _: object) -> None:
             raise RuntimeError("no memory")
 
-    session._session = Broken()
+    session.inference = Broken()
     with pytest.raises(EdgepercError, match="no memory"):
         session.run()
-    session._session = real
+    session.inference = real
     monkeypatch.setattr(os, "getpid", lambda: 1)  # as in a child
     session.run()
-
-
-# --- signals ---------------------------------------------------------------------------------------------------------
 
 
 def edgeperc_run(*arguments: object, **options: Any) -> subprocess.Popen[str]:
@@ -249,9 +244,6 @@ def test_a_signal_ends_the_process_that_decodes_a_capture(tmp_path: Path, number
         time.sleep(0.05)
 
 
-# --- full disks ------------------------------------------------------------------------------------------------------
-
-
 def check_failed(process: subprocess.Popen[str], out: Path, reason: str) -> None:
     """Each scan has its error, on one line, and no part of a file is left."""
     records, errors = process.communicate(timeout=120)
@@ -284,8 +276,6 @@ def test_full_disk_fails_its_scan(folder: Path, small_disk: Callable[[int], Path
     process = edgeperc_run(folder, "--json", "--model", "pointseg", "--labels", "--out", out)
     check_failed(process, out, "No space left on device")
 
-
-# --- homes -----------------------------------------------------------------------------------------------------------
 
 HOMES = ("HOME", "USERPROFILE", "LOCALAPPDATA", "XDG_CACHE_HOME", "XDG_CONFIG_HOME", "XDG_DATA_HOME")
 WITHOUT_PASSWD = """

@@ -90,7 +90,7 @@ def test_helpers_fill_the_same_cache_and_change_no_result(cold: None, tmp_path: 
     assert len(kernels(tmp_path / "alone")) == len(own)
     own = {f"{part.largest.py_func.__module__}.{part.largest.py_func.__name__}": name for name, part in PARTS.items()}
     # Both may begin with the ground at once.
-    assert {own[name] for name in helped if name in own} - {"ground"} == set(Helpers([*PARTS])._own) - {"ground"}
+    assert {own[name] for name in helped if name in own} - {"ground"} == set(Helpers([*PARTS]).own_parts) - {"ground"}
     assert (tmp_path / "helped" / "begun").read_text().count("\n") == 1, "a helper ran the caller's main module"
     assert not [*tmp_path.rglob("*.part")]
     assert start(tmp_path / "helped", 2) == ([], [], answer)
@@ -99,7 +99,7 @@ def test_helpers_fill_the_same_cache_and_change_no_result(cold: None, tmp_path: 
 @pytest.fixture
 def cold(monkeypatch: pytest.MonkeyPatch) -> None:
     """Two cores, and nothing in the cache."""
-    monkeypatch.setattr(warm_up, "_is_cold", lambda _: True)
+    monkeypatch.setattr(warm_up, "is_cold", lambda _: True)
     monkeypatch.setattr(warm_up, "usable_cores", lambda: 2)
 
 
@@ -114,7 +114,7 @@ def helpers(cold: None, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[s
         return made[-1]
 
     yield make
-    assert all(not each._running for each in made)
+    assert all(not each.running for each in made)
 
 
 HANGS = "import time; time.sleep(600)"
@@ -123,7 +123,7 @@ HANGS = "import time; time.sleep(600)"
 def test_a_helper_that_hangs_is_killed(helpers: Callable[[str], Helpers], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(warm_up, "MIN_WAIT_S", 0.1)
     with helpers(HANGS) as running:
-        (process,) = running._running
+        (process,) = running.running
         running.wait()
         assert process.returncode is not None
         assert process.returncode != 0
@@ -144,7 +144,7 @@ def test_no_helper_is_left_where_construction_is_interrupted(
 
     def interrupted() -> None:
         with helpers(HANGS) as running:
-            processes.extend(running._running)
+            processes.extend(running.running)
             raise raised
 
     with pytest.raises(raised):
@@ -161,7 +161,7 @@ def test_what_cannot_start_is_reported(
     caplog.set_level("INFO", logger="edgeperc.warm_up")
     monkeypatch.setattr(sys, "executable", str(tmp_path / "python3"))
     with helpers(HANGS) as running:
-        assert not running._running
+        assert not running.running
         running.wait()
     assert "no helper process" in caplog.text
 
@@ -172,7 +172,7 @@ def test_an_application_that_embeds_python_is_not_started_again(
 ) -> None:
     monkeypatch.setattr(sys, "executable", executable)
     with helpers(HANGS) as running:
-        assert not running._running
+        assert not running.running
 
 
 def test_a_frozen_application_is_not_started_again(
@@ -180,17 +180,17 @@ def test_a_frozen_application_is_not_started_again(
 ) -> None:
     monkeypatch.setattr(sys, "frozen", True, raising=False)
     with helpers(HANGS) as running:
-        assert not running._running
+        assert not running.running
 
 
 @pytest.mark.parametrize("n_cores", range(1, 7))
 def test_helpers_share_the_work(cold: None, monkeypatch: pytest.MonkeyPatch, n_cores: int) -> None:
     monkeypatch.setattr(warm_up, "usable_cores", lambda: n_cores)
     helpers = Helpers([*PARTS])
-    assert len(helpers._shares) == min(n_cores - 1, 3)
-    parts = [*helpers._own, *(part for share in helpers._shares for part in share)]
+    assert len(helpers.shares) == min(n_cores - 1, 3)
+    parts = [*helpers.own_parts, *(part for share in helpers.shares for part in share)]
     assert sorted(parts) == sorted(PARTS)
-    seconds = [sum(PARTS[part].seconds for part in share) for share in (helpers._own, *helpers._shares)]
+    seconds = [sum(PARTS[part].seconds for part in share) for share in (helpers.own_parts, *helpers.shares)]
     seconds[0] += warm_up.OTHERS_S
     assert max(seconds) <= {1: 23.0, 2: 12.0}.get(n_cores, 8.5)
 
@@ -201,17 +201,17 @@ def test_no_helper_where_the_cache_cannot_be_written_or_holds_the_kernels(
     monkeypatch.setattr(warm_up, "usable_cores", lambda: 2)
     monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path / "new" / "cache"))
     cache = PARTS["road"].largest._cache
-    assert Helpers(["road"])._shares == [["road"]]
+    assert Helpers(["road"]).shares == [["road"]]
     (tmp_path / "file").write_bytes(b"")
     monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path / "file"))
-    assert Helpers(["road"])._shares == []
+    assert Helpers(["road"]).shares == []
     monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path / "cache"))
-    folder = next(cache._folders())
+    folder = next(cache.folders())
     folder.mkdir(0o755, parents=True)
-    file = folder / f"{cache._name}-0123456789abcdef.kernel"
-    for content, is_cold in ((b"", True), (bytes(64), True), (bytes(32) + cache._stamp(), False)):
+    file = folder / f"{cache.name}-0123456789abcdef.kernel"
+    for content, is_cold in ((b"", True), (bytes(64), True), (bytes(32) + cache.stamp(), False)):
         file.write_bytes(content)
-        assert bool(Helpers(["road"])._shares) is is_cold
+        assert bool(Helpers(["road"]).shares) is is_cold
 
 
 @pytest.mark.skipif(not Path("/proc/self/fd").is_dir(), reason="/proc shows which files a process has open")
@@ -219,18 +219,18 @@ def test_a_helper_inherits_no_files(helpers: Callable[[str], Helpers], tmp_path:
     with (tmp_path / "mine").open("wb") as mine:
         os.set_inheritable(mine.fileno(), True)
         with helpers(HANGS) as running:
-            (process,) = running._running
+            (process,) = running.running
             opened = [each.readlink() for each in Path(f"/proc/{process.pid}/fd").iterdir()]
     assert len(opened) >= 3
     assert not [path for path in opened if path.is_relative_to(tmp_path)]
 
 
 def _help_once() -> None:
-    warm_up._is_cold = lambda _: True  # type: ignore[assignment]
+    warm_up.is_cold = lambda _: True  # type: ignore[assignment]
     warm_up.usable_cores = lambda: 2
     warm_up.START = "raise SystemExit(0)"
     with Helpers(["road"]) as running:
-        assert running._running
+        assert running.running
         running.wait()
 
 
@@ -245,7 +245,7 @@ PARENT = """
 import signal, time
 from edgeperc import warm_up
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore it
-warm_up._is_cold = lambda _: True
+warm_up.is_cold = lambda _: True
 warm_up.usable_cores = lambda: 2
 warm_up.START = '''
 import sys, time
@@ -255,7 +255,7 @@ warm_up.PARTS = {"road": warm_up.Part(lambda: time.sleep(600), None, 1.0)}
 warm_up.main(sys.argv[1])
 '''
 with warm_up.Helpers(["road"]) as running:
-    print(running._running[0].pid, flush=True)
+    print(running.running[0].pid, flush=True)
     while True:
         time.sleep(0.1)  # a signal that arrives just before a sleep does not end it
 """

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from edgeperc.evaluation.evaluate import evaluate
+from edgeperc.evaluation.evaluate import NETWORK_ALONE, evaluate
 from edgeperc.inference.projection import make_projector, project
 from edgeperc.simulation.samples import simulated_scan
 from edgeperc.types.card import ModelCard
@@ -32,7 +32,7 @@ ENGINES = {"onnxruntime": "fp32", "openvino": "bf16"}
 
 def accuracy(kitti: Path, path: Path) -> float:
     """Mean IoU of the points' classes without background, or AP50 of oriented vehicle boxes."""
-    figures = evaluate([kitti], [path], split="validation", boxes_from="network", rules=(), n_resamples=1)[0]["real"]
+    figures = evaluate([kitti], [path], NETWORK_ALONE, split="validation", n_resamples=1)[0]["real"]
     if ModelCard.read(path).view.kind == "range_image":
         return float(np.mean([row["iou"] for name, row in figures["points"]["all"].items() if name != "background"]))
     return float(figures["boxes"]["oriented"]["all"]["vehicle"]["ap"])

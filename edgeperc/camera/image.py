@@ -138,12 +138,13 @@ class ImageScaler:
             raise ImageError(f"the buffer is {out.shape} {out.dtype}; expected {self.shape} float32, C-contiguous")
         rows, columns, _ = image.shape
         if self._tables_of != (rows, columns):
-            self._tables = _taps(rows, self.shape[1]), _taps(columns, self.shape[2])
+            self._tables = taps(rows, self.shape[1]), taps(columns, self.shape[2])
             self._tables_of = (rows, columns)
         fill_scaled(image.reshape(rows, -1), *self._tables, self._channels, out)
 
 
-def _taps(n_in: int, n_out: int) -> Taps:
+def taps(n_in: int, n_out: int) -> Taps:
+    """The pixels of a line of the image that make each pixel of the input, and their weights."""
     scale = n_in / n_out
     reach = max(scale, 1.0)
     center = (np.arange(n_out) + 0.5) * scale - 0.5
@@ -214,7 +215,7 @@ def label_pixels(
         raise CardMismatchError(f"{model}: camera_logits have shape {logits.shape}; expected (C, h, w), C up to 255")
     values = read_only(logits)
     labels = np.empty((height, width), np.uint8)
-    n_bad = fill_image_labels(values, *_between(values.shape[1], height), *_between(values.shape[2], width), labels)
+    n_bad = fill_image_labels(values, *between(values.shape[1], height), *between(values.shape[2], width), labels)
     if n_bad:
         raise InferenceError(
             f"{model}: {n_bad} of {values.size} values of camera_logits are not finite; run another provider or "
@@ -223,7 +224,7 @@ def label_pixels(
     return labels
 
 
-def _between(n_in: int, n_out: int) -> tuple[NDArray[np.int32], NDArray[np.float32], NDArray[np.int32]]:
+def between(n_in: int, n_out: int) -> tuple[NDArray[np.int32], NDArray[np.float32], NDArray[np.int32]]:
     """Interpolation along one axis.
 
     Returns sides ((2, n_out) int32): The centers of the grid on the two sides of each pixel: one and the same where a
@@ -254,7 +255,7 @@ def fill_image_labels(
     """Write every pixel's best class (`label_pixels`).
 
     logits : (C, h, w) float32, C-contiguous
-    row_sides, row_weight, row_runs, col_sides, col_weight, col_runs : from `_between`.
+    row_sides, row_weight, row_runs, col_sides, col_weight, col_runs : from `between`.
     labels : (H, W) uint8, overwritten
     Returns n_bad: Number of logits that are not finite; if there are any, the labels are undefined.
     """

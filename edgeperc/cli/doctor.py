@@ -88,12 +88,12 @@ def examine() -> Iterator[Finding]:
     checks: dict[str, Callable[[], Iterator[Finding]]] = {
         "edgeperc": _program,
         "processor": _processor,
-        "packages": _packages,
+        "packages": find_packages,
         "kernels": _kernels,
         "providers": _providers,
         "caches": _caches,
         "models": _models,
-        "extras": _extras,
+        "extras": find_extras,
     }
     for name, check in checks.items():
         try:
@@ -129,7 +129,7 @@ def _processor() -> Iterator[Finding]:
         )
 
 
-def _installed(prefix: str = "") -> dict[str, str]:
+def installed(prefix: str = "") -> dict[str, str]:
     """Version of each installed distribution whose name has this beginning."""
     versions: dict[str, str] = {}
     for distribution in importlib.metadata.distributions():
@@ -139,7 +139,8 @@ def _installed(prefix: str = "") -> dict[str, str]:
     return versions
 
 
-def _packages() -> Iterator[Finding]:
+def find_packages() -> Iterator[Finding]:
+    """Python, numpy, numba and the one build of onnxruntime."""
     for name in ("numpy", "numba", "llvmlite"):
         try:
             yield Finding(name, "ok", str(import_module(name).__version__))
@@ -147,7 +148,7 @@ def _packages() -> Iterator[Finding]:
             yield _broken(name, exc, f"pip install --force-reinstall {name}")
     from ..inference.providers import runtime_version
 
-    versions = _installed("onnxruntime")
+    versions = installed("onnxruntime")
     builds = [name for name in _BUILDS if name in versions]
     try:
         version = runtime_version()
@@ -161,7 +162,7 @@ def _packages() -> Iterator[Finding]:
     if len(builds) > 1:
         both = f"{shown}: they overwrite one another"
         yield Finding("onnxruntime", "broken", both, f"pip uninstall {' '.join(builds)}, then install one")
-    elif version.startswith(_LEAKING) and _has_sme():
+    elif version.startswith(_LEAKING) and has_sme():
         leaks = f"{shown}: leaks memory at each convolution on this processor"
         yield Finding("onnxruntime", "note", leaks, "pip install 'onnxruntime>=1.27'")
     else:
@@ -171,7 +172,8 @@ def _packages() -> Iterator[Finding]:
     yield Finding("telemetry", "ok", "off") if setting == "1" else Finding("telemetry", "note", on)
 
 
-def _has_sme() -> bool:
+def has_sme() -> bool:
+    """Whether the processor has the instructions with which some versions of onnxruntime leak."""
     from ..system.machine import cpu_features
 
     return "sme" in cpu_features() or (sys.platform == "darwin" and platform.machine() == "arm64")
@@ -205,7 +207,7 @@ def _providers() -> Iterator[Finding]:
 
     present = [provider.name for provider in providers() if provider.available]
     if not present:
-        return  # without onnxruntime, which `_packages` reports
+        return  # without onnxruntime, which `find_packages` reports
     from ..inference.providers import PLUGINS, devices
 
     for short, package in PLUGINS.items():
@@ -293,10 +295,10 @@ def _models() -> Iterator[Finding]:
     for name in DEFAULT_MODELS:
         if name not in names:
             yield Finding(f"model {name}", "broken", "missing", _REINSTALL)
-    yield from _runs(names)
+    yield from find_runs(names)
 
 
-def _runs(names: set[str]) -> Iterator[Finding]:
+def find_runs(names: set[str]) -> Iterator[Finding]:
     """Whether the default models open and answer their golden inputs, with the provider that is chosen here."""
     from ..inference.session import Session
 
@@ -304,13 +306,14 @@ def _runs(names: set[str]) -> Iterator[Finding]:
         if name in names:
             try:
                 yield Finding(f"runs {name}", "ok", Session(name).description)
-            except MissingExtraError:  # `_packages` reports it
+            except MissingExtraError:  # `find_packages` reports it
                 return
             except EdgepercError as exc:
                 yield _broken(f"runs {name}", exc)
 
 
-def _extras() -> Iterator[Finding]:
+def find_extras() -> Iterator[Finding]:
+    """What is installed of each extra."""
     try:
         metadata = importlib.metadata.metadata("edgeperc")
         requirement: Any = import_module("packaging.requirements").Requirement
@@ -321,7 +324,7 @@ def _extras() -> Iterator[Finding]:
         yield Finding("extras", "note", "not examined: that needs packaging, which comes with onnxruntime")
         return
     needed = [requirement(text) for text in metadata.get_all("Requires-Dist") or ()]
-    versions = _installed()
+    versions = installed()
     for package, fault in _faults(needed, "", versions):
         yield Finding(package, "broken", fault, f"pip install '{package}'")
     present = []

@@ -7,28 +7,27 @@ over resampled drives.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import groupby
 from pathlib import Path
 from typing import Any, Literal
 
-from ..agreement.rules import RULES
 from ..datasets.kitti import KittiObjects, SemanticKitti
 from ..datasets.layout import known_layouts
 from ..datasets.scan_folder import ScanFolder
 from ..errors import EdgepercError, OptionError, PointsError
 from ..perceiver import Learned, Perceiver
-from ..pipeline import BoxesFrom
 from ..simulation.samples import FIRST_SEED
 from ..system.ray_cluster import MOST_FIRST, Lost, map_on_ray
 from ..types.mounting import Mounting
 from ..zoo import DEFAULT
-from .judge import Judge
+from .judge import BY_DEFAULT, NETWORK_ALONE, Judge, Perceiving
 from .mistakes import Mistakes
 from .tables import Record, figures
 
-__all__ = ["evaluate"]
+__all__ = ["NETWORK_ALONE", "Perceiving", "evaluate"]
 
 N_WORST = 20
 KINDS, OF_FOLDER = ("real", "semantickitti", "simulated"), "folder "
@@ -41,14 +40,11 @@ _Scan = tuple[str, str | None, Callable[[], _Figures]]
 def evaluate(
     datasets: Sequence[str | Path],
     models: Sequence[str | Path] = DEFAULT,
+    perceiving: Perceiving = BY_DEFAULT,
     *,
     split: str | None = None,
     fold: int | None = None,
     road_by: str | Path | None = None,
-    provider: str = "cpu",
-    precision: str = "auto",
-    boxes_from: BoxesFrom = "both",
-    rules: Collection[str] = RULES,
     mounted: Mounting | None = None,
     n_resamples: int = 1000,
     engine: Literal["local", "ray"] = "local",
@@ -64,8 +60,10 @@ def evaluate(
         labeled scans of any sensor: a folder with ``scans.json``, or ``"FOLDER:LAYOUT"``
         (`scan_folder.ScanFolder.parse`). Those are perceived with the profile of their sensor, all round; the mounting
         is found from the scans.
-    models, road_by, provider, precision, boxes_from, rules, mounted
+    models, road_by, mounted
         As in `Judge`.
+    perceiving : Perceiving
+        How the scans are perceived.
     split : str or None
         Drives of the real scans: ``"test"``, ``"train"``, ``"validation"`` or ``"all"`` (`splits.in_split`), or
         ``"held-back"``: validation and test drives. None: the validation drives if there is a ``fold``, else the test
@@ -101,9 +99,7 @@ def evaluate(
         A model was trained on a scan, and ``split`` is not ``"train"``.
     """
     split = split or ("test" if fold is None else "validation")
-    options: dict[str, Any] = {"provider": provider, "precision": precision, "boxes_from": boxes_from}
-    options |= {"rules": rules, "training_scans": split == "train"}
-    job = _Job(tuple(datasets), tuple(models), split, fold, road_by, mounted, options)
+    job = _Job(tuple(datasets), tuple(models), perceiving, split, fold, road_by, mounted)
     perceive, scans = job.scans()
     records: dict[str, list[Record]] = {}
     worst: dict[str, list[Mistakes]] = {}
@@ -130,25 +126,26 @@ class _Job:
 
     datasets: tuple[str | Path, ...]
     models: tuple[str | Path, ...]
+    perceiving: Perceiving
     split: str
     fold: int | None
     road_by: str | Path | None
     mounted: Mounting | None
-    options: dict[str, Any]
 
     def scans(self, n_threads: int | None = None) -> tuple[Perceiver, list[_Scan]]:
         """The perceiver of the last data set, and the scans of all."""
-        options, split, fold = self.options | {"n_threads": n_threads}, self.split, self.fold
+        split, fold = self.split, self.fold
+        judge_of = partial(Judge, self.models, self.perceiving, training_scans=split == "train", n_threads=n_threads)
         folders = {str(dataset): folder for dataset in self.datasets if (folder := _folder(dataset)) is not None}
         if folders and (self.mounted is not None or self.road_by is not None):
             raise OptionError(f"{next(iter(folders))} is of another sensor; mounted and road_by are for KITTI's scans")
         judges: list[Judge] = []
         scans: list[_Scan] = []
         for folder in folders.values():
-            judges.append(Judge(self.models, sensor=folder.layout.sensor, **options))
+            judges.append(judge_of(sensor=folder.layout.sensor))
             scans += _folder_scans(judges[-1], folder, split, fold)
         if len(folders) < len(self.datasets):
-            judges.append(Judge(self.models, road_by=self.road_by, mounted=self.mounted, **options))
+            judges.append(judge_of(road_by=self.road_by, mounted=self.mounted))
             scans += [s for d in self.datasets if str(d) not in folders for s in _scans(judges[-1], d, split, fold)]
         return judges[-1].perceive, scans
 

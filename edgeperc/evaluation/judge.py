@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -44,19 +44,41 @@ from .truth import Truth, folder_truth, kitti_truth, semantickitti_truth, simula
 FARTHEST_M = 46.0  # farther objects are evaluated by their points, but never listed as mistakes
 
 
+@dataclass(frozen=True)
+class Perceiving:
+    """How the scans are perceived.
+
+    Attributes
+    ----------
+    provider, precision : str
+        As in `edgeperc.Perceiver`.
+    boxes_from : {"both", "clusters", "network"}
+        As in `edgeperc.Perceiver`. The figures ``"boxes"`` are of the boxes that a top-view model detects, in its
+        view; without such a model, or with "clusters", of the boxes around clusters, wherever the truth is known.
+    rules : collection of str
+        Rules of the agreement of labels, boxes and cells; a part of `edgeperc.agreement.rules.RULES` for an ablation.
+    """
+
+    provider: str = "cpu"
+    precision: str = "auto"
+    boxes_from: BoxesFrom = "both"
+    rules: Collection[str] = RULES
+
+
+BY_DEFAULT = Perceiving()
+NETWORK_ALONE = Perceiving(boxes_from="network", rules=())
+"""The answers of the networks, without clusters and agreement: what the figures of a card are of."""
+
+
 class Judge:
     """Perceives scans and compares the results with their truth.
 
     models : names of shipped models, or paths. Range-image models are evaluated by points, top-view models by boxes
         and cells.
-    provider, precision, n_threads : as in `Perceiver`.
+    n_threads : as in `Perceiver`.
     road_by : a top-view model that supplies the true road of KITTI frames, because KITTI's labels have no road.
         SSADNet (3.1.2) uses LoDNN in this way.
     training_scans : also evaluate scans that a model was trained on.
-    boxes_from : as in `Perceiver`. The figures ``"boxes"`` are of the boxes that a top-view model detects, in its
-        view; without such a model, or with "clusters", of the boxes around clusters, wherever the truth is known.
-    rules : collection of str; rules of the agreement of labels, boxes and cells; a part of
-        `edgeperc.agreement.rules.RULES` for an ablation.
     mounted : perceive each scan as a sensor mounted so would have recorded it, with the mounting to be estimated from
         this scan alone. Points (not pixels) and boxes are evaluated. None: as recorded, on the training vehicle.
     sensor : the sensor of the scans for `record_scan`, with what is known of its mounting; their points are evaluated
@@ -67,29 +89,24 @@ class Judge:
     def __init__(
         self,
         models: Sequence[str | Path],
+        perceiving: Perceiving = BY_DEFAULT,
         *,
-        provider: str = "cpu",
-        precision: str = "auto",
         road_by: str | Path | None = None,
         training_scans: bool = False,
-        boxes_from: BoxesFrom = "both",
-        rules: Collection[str] = RULES,
         mounted: Mounting | None = None,
         sensor: SensorProfile | None = None,
         n_threads: int | None = None,
     ) -> None:
         mounting = MODEL_MOUNTING if mounted is None else Mounting()
         if sensor is None:
-            self.perceive = _perceiver(models, provider, precision, n_threads, boxes_from, rules, mounting)
+            self.perceive = _perceiver(models, perceiving, n_threads, mounting)
         else:
-            self.perceive = _perceiver(
-                models, provider, precision, n_threads, boxes_from, rules, sensor.mounting, sensor
-            )
+            self.perceive = _perceiver(models, perceiving, n_threads, sensor.mounting, sensor)
         self.mounted = None if mounted is None else ModelFrame(mounted)
         self.as_recorded = mounted is None and sensor is None
         self.point_classes: tuple[str, ...] = POINT_CLASSES
         self.drive: str | None = None
-        networks = [_Network(session) for session in self.perceive.sessions]
+        networks = [Network(session) for session in self.perceive.sessions]
         self.from_sensor = next((n for n in networks if n.card.view.kind == "range_image"), None)
         self.from_above = next((n for n in networks if n.card.view.kind == "top_view"), None)
         if sensor is not None and self.from_sensor is not None:
@@ -99,11 +116,14 @@ class Judge:
             assert isinstance(self.from_above.card.view, TopViewGeometry)
             self.view = self.from_above.card.view
             self.cell_range_m = np.hypot(*np.broadcast_arrays(*self.view.cell_centers()))
-        self.box_classes = self.from_above.card.box_classes if self.from_above and boxes_from != "clusters" else ()
+        self.box_classes = (
+            self.from_above.card.box_classes if self.from_above and perceiving.boxes_from != "clusters" else ()
+        )
         self.detected_in = self.view if self.box_classes else None  # None: anywhere
-        if not self.box_classes and self.from_sensor is not None and boxes_from != "network":
+        if not self.box_classes and self.from_sensor is not None and perceiving.boxes_from != "network":
             self.box_classes = classes_of_boxes(self.from_sensor.card.classes)
-        self.draw_road = None if road_by is None else _perceiver([road_by], provider, precision, n_threads)
+        drawing = replace(perceiving, boxes_from="network", rules=())
+        self.draw_road = None if road_by is None else _perceiver([road_by], drawing, n_threads)
         cards = [*self.perceive.cards]
         if self.draw_road is not None:
             (card,) = self.draw_road.cards
@@ -337,7 +357,7 @@ class Judge:
             tallies["road", band].update(probability[counted], road[counted])
 
 
-class _Network:
+class Network:
     """Raw outputs of the perceiver's last run, for figures that need more than a perception."""
 
     def __init__(self, session: Session) -> None:
@@ -361,11 +381,8 @@ class _Network:
 
 def _perceiver(
     models: Sequence[str | Path],
-    provider: str,
-    precision: str,
+    perceiving: Perceiving,
     n_threads: int | None,
-    boxes_from: BoxesFrom = "network",
-    rules: Collection[str] = (),
     mounting: Mounting = MODEL_MOUNTING,  # the truth of cells is in the frame of the scan
     sensor: SensorProfile | None = None,
 ) -> Perceiver:
@@ -374,12 +391,12 @@ def _perceiver(
         sensor=sensor or "hdl-64e",
         full_turn=sensor is not None,
         mounting=mounting,
-        provider=provider,
-        precision=precision,
+        provider=perceiving.provider,
+        precision=perceiving.precision,
         n_threads=n_threads,
         on_mismatch="ignore",
-        boxes_from=boxes_from,
-        agree=rules,
+        boxes_from=perceiving.boxes_from,
+        agree=perceiving.rules,
     )
 
 

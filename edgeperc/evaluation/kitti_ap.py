@@ -292,7 +292,7 @@ def average_precisions(counts: Sequence[Counts]) -> tuple[float, float, float]:
     steps = steps[np.argsort(-steps[:, 0], kind="stable")]
     n_hits, n_false = np.cumsum(steps[:, 1:], axis=0).astype(np.int64).T
     curve = np.zeros(N_POSITIONS + 1)
-    thresholds = hits[[*_positions(len(hits), n_truth)]]
+    thresholds = hits[[*recall_positions(len(hits), n_truth)]]
     last = np.searchsorted(-steps[:, 0], -thresholds, side="right") - 1
     curve[: len(last)] = n_hits[last] / np.maximum(n_hits[last] + n_false[last], 1)
     curve = np.maximum.accumulate(curve[::-1])[::-1]
@@ -303,7 +303,7 @@ def average_precisions(counts: Sequence[Counts]) -> tuple[float, float, float]:
     return float(curve[1:].mean()), float(curve[::4].mean()), ap
 
 
-def _positions(n_hits: int, n_truth: int) -> Iterator[int]:
+def recall_positions(n_hits: int, n_truth: int) -> Iterator[int]:
     """Which hits, best first, give the thresholds of the recall positions (``getThresholds``)."""
     recall, k = 0.0, 0
     while k < n_hits:

@@ -88,7 +88,7 @@ def count_painting(
         inside = (u >= -0.5) & (u < calibration.width - 0.5) & (v >= -0.5) & (v < calibration.height - 0.5)
     row, col = (np.floor(each[inside] + 0.5).astype(np.int64) for each in (v, u))
     pixel, painted, true, depth = image.labels[row, col], painted[inside], true[inside], depth[inside]
-    away = ~_beside_edges(image.labels)[row, col] & (true != VOID) & (pixel != VOID)
+    away = ~beside_edges(image.labels)[row, col] & (true != VOID) & (pixel != VOID)
     took = away & (painted != UNSEEN)
     visible = away & (depth <= 1.02 * image.depth_m[row, col] + 0.5)
 
@@ -116,7 +116,7 @@ def count_painting(
     return Counter({name: int(np.count_nonzero(mask)) for name, mask in masks.items()})
 
 
-def _beside_edges(labels: NDArray[np.uint8]) -> NDArray[np.bool_]:
+def beside_edges(labels: NDArray[np.uint8]) -> NDArray[np.bool_]:
     """Pixels with another class within `EDGE_PX` rows and columns."""
     least, most = labels.copy(), labels.copy()
     for axis in (0, 1):

@@ -20,7 +20,7 @@ from ..simulation.scene import POINT_CLASSES
 from ..types.perception import Box
 from ..types.sensor import SensorProfile, get_sensor
 from ..zoo import DEFAULT
-from .judge import Judge, check_unseen, training_scans_of
+from .judge import Judge, Perceiving, check_unseen, training_scans_of
 from .metrics import FEWEST_RETURNS, Confusion, ObjectKey, object_key
 from .tables import FEWEST_OBJECTS, figures
 
@@ -121,7 +121,7 @@ def compare(
             **{adaptation: _row(confusion) for adaptation, confusion in counts.items()},
         }
         if folder is not None:
-            judge = Judge([*DEFAULT[:1], model], provider=provider, precision=precision, sensor=sensor)
+            judge = Judge([*DEFAULT[:1], model], Perceiving(provider, precision), sensor=sensor)
             records = []
             for frame in _frames(folder):
                 records.append(judge.record_boxes(frame))

@@ -106,9 +106,9 @@ class Observer:
         first = float(azimuth.min())
         sector, ring = ((azimuth - first) / width).astype(np.int64), (distance_m / ring_m).astype(np.int64)
         shape = (int(sector.max()) + 1, int(FARTHER * ring.max()) + 2)
-        self._bin_of_cell = (sector * shape[1] + ring).astype(np.int32).reshape(-1)
-        self._grid = np.array([first, 1.0 / width, ring_m])
-        self._bounds = FARTHER * np.array(
+        self.bin_of_cell = (sector * shape[1] + ring).astype(np.int32).reshape(-1)
+        self.grid = np.array([first, 1.0 / width, ring_m])
+        self.bounds = FARTHER * np.array(
             [(min(low, 0.0), max(high, 0.0)) for low, high in (view.x_range_m, view.y_range_m)]
         )
         # Gradients dz / dx of the beams that meet level ground. A sensor without such beams connects no returns.
@@ -116,25 +116,25 @@ class Observer:
         gradients = np.tan(np.deg2rad(np.clip(sensor.elevations_deg, -STEEPEST_DEG, STEEPEST_DEG)))
         downward = gradients[gradients < 0.0]
         widest_step = float(np.abs(np.diff(downward)).max(initial=0.0))
-        self._beams = float(downward.min(initial=0.0)), MAX_BEAMS * widest_step
+        self.beams = float(downward.min(initial=0.0)), MAX_BEAMS * widest_step
         # Step of the beams around each bin of -gradient, the widest within the tolerance.
-        self._steps = np.zeros(int(steepest / GRADIENT_BIN) + 1)
-        middles = -(np.arange(len(self._steps)) + 0.5) * GRADIENT_BIN
+        self.steps = np.zeros(int(steepest / GRADIENT_BIN) + 1)
+        middles = -(np.arange(len(self.steps)) + 0.5) * GRADIENT_BIN
         for upper, lower in pairwise(gradients.tolist()):
             near = (middles <= upper + BEAM_TOLERANCE) & (middles >= lower - BEAM_TOLERANCE)
-            self._steps[near] = np.maximum(self._steps[near], BEAM_STEPS * (upper - lower))
+            self.steps[near] = np.maximum(self.steps[near], BEAM_STEPS * (upper - lower))
         # Directions of the sectors: x, y from the pseudo-azimuth.
         turn = first + (np.arange(shape[0]) + 0.5) * width
         ahead = np.stack([1.0 - np.abs(turn), np.where(np.abs(turn) <= 1.0, turn, np.copysign(2.0, turn) - turn)])
-        self._ahead = ahead / np.maximum(np.hypot(*ahead), 1e-9)
-        self._lowest, self._level = np.empty((2, *shape), np.float32)
-        self._state = np.empty(shape, np.uint8)
+        self.ahead = ahead / np.maximum(np.hypot(*ahead), 1e-9)
+        self.lowest, self._level = np.empty((2, *shape), np.float32)
+        self.state = np.empty(shape, np.uint8)
         self._set_mounting(MODEL_MOUNTING)
 
     def _set_mounting(self, mounting: Mounting) -> None:
         self._mounting = mounting
         # A direction of the models' frame has this much more gradient in the frame of the sensor.
-        self._tilt = ModelFrame(mounting).R[:2, 2] @ self._ahead
+        self._tilt = ModelFrame(mounting).R[:2, 2] @ self.ahead
 
     def observe(
         self, points: NDArray[np.float32], index: NDArray[np.int32], mounting: Mounting = MODEL_MOUNTING
@@ -181,12 +181,12 @@ class Observer:
             raise PointsError(f"index is {index.shape} {index.dtype}; expected {self.shape} int32")
         rows, cells = read_only(points), read_only(index, np.int32)
         observed, between = np.empty((2, *self.shape), np.bool_)
-        fill_lowest_returns(rows, self._bounds, self._grid, self._lowest)
-        rays = np.array([float(self._grid[2]), beams_above_m(mounting) + ROAD_Z_M, *self._beams])
+        fill_lowest_returns(rows, self.bounds, self.grid, self.lowest)
+        rays = np.array([float(self.grid[2]), beams_above_m(mounting) + ROAD_Z_M, *self.beams])
         if mounting != self._mounting:
             self._set_mounting(mounting)
-        follow_rays(self._lowest, rays, self._steps, self._tilt, self._level, self._state)
-        mark_cells(rows, cells, self._bin_of_cell, self._level, self._state, observed, between)
+        follow_rays(self.lowest, rays, self.steps, self._tilt, self._level, self.state)
+        mark_cells(rows, cells, self.bin_of_cell, self._level, self.state, observed, between)
         return Observation(observed, between)
 
 

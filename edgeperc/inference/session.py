@@ -236,11 +236,11 @@ class Session:
         if self.shares_cores:
             n_threads = cores // self._at_once
         self._has_threads = short != "cpu" or n_threads != 1
-        self._session = self._open(ort, blob, short, precision, n_threads)
+        self.inference = self._open(ort, blob, short, precision, n_threads)
         self._check_graph()
-        with _terminated(ort, None if self._trusted else MAX_FIRST_RUN_S) as run_options:
+        with terminated(ort, None if self._trusted else MAX_FIRST_RUN_S) as run_options:
             self._bind(run_options)
-            self.golden_deviation = self._warm_up(MAX_GOLDEN_DEVIATION[precision], run_options)
+            self.golden_deviation = self.warm_up(MAX_GOLDEN_DEVIATION[precision], run_options)
 
     @property
     def description(self) -> str:
@@ -304,8 +304,8 @@ class Session:
 
     def _check_graph(self) -> None:
         card, height, width = self.card, self.card.view.height, self.card.view.width
-        inputs = {i.name: i for i in self._session.get_inputs()}
-        outputs = {o.name: o for o in self._session.get_outputs()}
+        inputs = {i.name: i for i in self.inference.get_inputs()}
+        outputs = {o.name: o for o in self.inference.get_outputs()}
         expected_shape = (1, len(card.input.channels), height, width)
         if list(inputs) != [card.input.name]:
             raise CardMismatchError(f"{self.path}: card names input {card.input.name!r}, the graph has {list(inputs)}")
@@ -333,7 +333,7 @@ class Session:
         card = self.card
         batch = np.zeros((1, len(card.input.channels), card.view.height, card.view.width), np.float32)
         self.input: NDArray[np.float32] = batch[0]
-        self._binding = self._session.io_binding()
+        self.binding = self.inference.io_binding()
         self.raw: dict[str, NDArray[np.float32]] = {}
         self.outputs: dict[str, NDArray[np.float32]] = {}
         for output, shape in zip(card.outputs, self._shapes(batch, run_options), strict=True):
@@ -343,7 +343,7 @@ class Session:
                     f"{card.view.height} and {card.view.width}"
                 )
             buffer = np.zeros(shape, np.float32)
-            self._binding.bind_output(output.name, "cpu", 0, np.float32, buffer.shape, buffer.ctypes.data)
+            self.binding.bind_output(output.name, "cpu", 0, np.float32, buffer.shape, buffer.ctypes.data)
             self.raw[output.kind] = self.outputs[output.kind] = buffer[0]
             if output.block != (1, 1):
                 pixels = (len(card.classes), card.view.height, card.view.width)
@@ -353,12 +353,14 @@ class Session:
 
     def _shapes(self, batch: NDArray[np.float32], run_options: Any) -> list[tuple[int, ...]]:
         """Shapes of the outputs, from the graph, or from a run if the graph leaves dimensions open."""
-        declared = {o.name: tuple(o.shape) for o in self._session.get_outputs()}
+        declared = {o.name: tuple(o.shape) for o in self.inference.get_outputs()}
         shapes = [declared[o.name] for o in self.card.outputs]
         if all(isinstance(n, int) for shape in shapes for n in shape):
             return shapes
         try:
-            answers = self._session.run([o.name for o in self.card.outputs], {self.card.input.name: batch}, run_options)
+            answers = self.inference.run(
+                [o.name for o in self.card.outputs], {self.card.input.name: batch}, run_options
+            )
         except Exception as exc:  # onnxruntime's errors share no base but Exception
             raise InferenceError(f"{self.path}: the first run on {self.provider} failed: {exc}") from exc
         for output, answer in zip(self.card.outputs, answers, strict=True):
@@ -371,21 +373,22 @@ class Session:
                 )
         return [answer.shape for answer in answers]
 
-    def _warm_up(self, limit: float, run_options: Any) -> float:
+    def warm_up(self, limit: float, run_options: Any) -> float:
+        """Run the golden input; return the largest deviation from the recorded answers."""
         golden = self.card.golden
         if golden is None:
             logger.warning(
                 "the card of %s has no golden record: the outputs on %s are not compared with the exporter's",
                 *(self.path, self.provider),
             )
-            self._run(run_options)
+            self.run_bound(run_options)
             return float("nan")
         self.input[:] = golden_input(golden.seed, self._batch.shape)[0]
         if hashlib.sha256(self._batch.tobytes()).hexdigest() != golden.input_sha256:
             raise CardMismatchError(
                 f"{self.path}: the golden input does not have the card's SHA-256; export the model again"
             )
-        self._run(run_options)
+        self.run_bound(run_options)
         self.input[:] = 0.0
         deviation = 0.0
         for output in self.card.outputs:
@@ -422,7 +425,7 @@ class Session:
             )
         self._running_in = here
         try:
-            self._run()
+            self.run_bound()
         finally:
             self._running_in = 0
         return self.outputs
@@ -434,7 +437,7 @@ class Session:
             return Session(self.path, self.short, precision=self.precision, at_once=at_once, trusted=trusted)
         twin = object.__new__(Session)
         vars(twin).update(vars(self))
-        with _terminated(load_onnxruntime(), None) as run_options:
+        with terminated(load_onnxruntime(), None) as run_options:
             twin._bind(run_options)
         return twin
 
@@ -449,18 +452,19 @@ class Session:
             f"a session of {self.path} cannot be pickled or copied; construct a Perceiver or Session in each process"
         )
 
-    def _run(self, *run_options: Any) -> None:
+    def run_bound(self, *run_options: Any) -> None:
+        """One run on the bound buffers."""
         try:
             # Bind before every run: a provider with its own memory copies the input only when it is bound.
-            self._binding.bind_input(*self._bound_input)
-            self._session.run_with_iobinding(self._binding, *run_options)
+            self.binding.bind_input(*self._bound_input)
+            self.inference.run_with_iobinding(self.binding, *run_options)
         except Exception as exc:  # onnxruntime's errors share no base but Exception
             raise InferenceError(f"{self.path}: a run on {self.provider} failed: {exc}") from exc
         self.spread()
 
 
 @contextmanager
-def _terminated(ort: Any, after_s: float | None) -> Iterator[Any]:
+def terminated(ort: Any, after_s: float | None) -> Iterator[Any]:
     """Run options with which onnxruntime stops between two operators after ``after_s`` seconds; None: never."""
     options = ort.RunOptions()
     options.log_severity_level = 4

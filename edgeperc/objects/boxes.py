@@ -65,11 +65,9 @@ def objects_from_points(
     in_view: NDArray[np.bool_] | None = None,
     others: Sequence[Box] = (),
     min_share: float = 0.7,
-    min_distance_m: float = 0.5,
     distance_per_m: float = 0.015,
     min_points: int = 5,
     min_score: float = MIN_SCORE,
-    size_m: Mapping[str, tuple[float, float, float]] = OBJECT_SIZE_M,
 ) -> tuple[Box, ...]:
     """Fit boxes to the clusters that have one dominant class (KUL-Seg 5.2).
 
@@ -95,12 +93,10 @@ def objects_from_points(
     min_share : float
         A cluster is kept if more than this share of its points in view has one class (KUL-Seg 5.2), however many are
         out of view. Persons need no share.
-    min_distance_m, distance_per_m, min_points
+    distance_per_m, min_points
         As in `find_clusters`.
     min_score : float
         Boxes with a lower score are dropped.
-    size_m : mapping
-        Class to usual length, width, height [m]. Boxes of other classes have the size of their points.
 
     Returns
     -------
@@ -167,7 +163,6 @@ def objects_from_points(
             seeds=labels > 0,
             votes=np.where(labels > 0, np.where(roles > 0, 7, 3)[labels], in_view is None or in_view).astype(np.uint8),
             min_share=(min_share, min(min_share, MIN_PERSON_SHARE)),
-            min_distance_m=min_distance_m,
             distance_per_m=distance_per_m,
             min_points=min_points,
         )
@@ -181,9 +176,7 @@ def objects_from_points(
         numbers = read_only(np.where(in_view, labels, len(classes)), np.uint8)
         roles[len(classes)] = UNSEEN
     standing = cloud if height_m is not None else _above_lowest(cloud, clusters, groups)
-    persons = _persons(
-        standing, Labeled(numbers, roles), classes, clusters, groups, distance_per_m, max(min_points, 1), size_m
-    )
+    persons = _persons(standing, Labeled(numbers, roles), classes, clusters, groups, distance_per_m, max(min_points, 1))
     sizes = np.diff(groups.starts)
     found, shares = labels_of_groups(groups, labels, 0.0, {})
     seen = sizes
@@ -208,8 +201,8 @@ def objects_from_points(
             bottom = 0.5 * float(levels[(len(levels) - 1) // 2] + levels[len(levels) // 2])  # the median
         side = float(max(rectangle[2:4]))
         score = float(highest[k])
-        if name in size_m:
-            _, width, height = size_m[name]
+        if name in OBJECT_SIZE_M:
+            _, width, height = OBJECT_SIZE_M[name]
             # Points below the ground are reflections. What is too tall for a car may be a van.
             unseen = distance_per_m * math.hypot(rectangle[0], rectangle[1])  # between the last return and the edge
             score *= min(max(top - bottom + unseen, 0.0) / height, 1.0) ** 2
@@ -219,7 +212,7 @@ def objects_from_points(
             if named_by_size and name == "car":
                 name = _vehicle_of_size(side, top - bottom)
                 usual = "car" if name == "car" else "van"  # trucks differ too much in length
-            boxes.append(_completed(name, score, rectangle, bottom, top, size_m.get(usual, (0.0, 0.0, 0.0))))
+            boxes.append(_completed(name, score, rectangle, bottom, top, OBJECT_SIZE_M.get(usual, (0.0, 0.0, 0.0))))
             spans.append(rectangle)
     boxes = _not_inside(boxes, spans, others)
     persons = [box for box in persons if box.score >= min_score]
@@ -306,7 +299,6 @@ def _persons(
     by_cluster: Groups,
     distance_per_m: float,
     min_points: int,
-    size_m: Mapping[str, tuple[float, float, float]],
 ) -> list[Box]:
     """The boxes of persons, of any score; see `objects_from_points`."""
     if not labeled.roles.any() or not len(by_cluster.order):
@@ -333,8 +325,8 @@ def _persons(
             expected = (PERSON_POINTS / max(distance_per_m * math.hypot(x, y), MIN_SIDE_M)) ** 2
             evidence = min(max(expected, EVIDENCE), MAX_EVIDENCE)
         score = share * n_points / (n_points + evidence)
-        usual = size_m.get(name, (0.0, 0.0, 0.0))
-        if name in size_m:
+        usual = OBJECT_SIZE_M.get(name, (0.0, 0.0, 0.0))
+        if name in OBJECT_SIZE_M:
             seen = max(top - bottom, 0.0) / usual[2]
             score *= min(seen, 1.0 / max(seen, 1.0)) ** 2  # too tall: probably a pole
             score *= min(1.0, MAX_HEADS_M[name] / max(heads, MIN_SIDE_M)) ** 2

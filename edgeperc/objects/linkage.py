@@ -205,6 +205,7 @@ def chain_points(
 
 @njit(cache=True, nogil=True)
 def strips_a_row(level: np.void) -> int:
+    """Strips along one row of the grid."""
     return int((level["n_columns"] + STRIP - 1) // STRIP)
 
 

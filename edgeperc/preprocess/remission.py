@@ -183,7 +183,7 @@ class RemissionMatcher:
         if not len(raw):
             return None
         limit = _LIMIT_OF_TRAINING_SENSOR if self._is_training_sensor else _LIMIT
-        off = _difference(raw, wanted, self.sensor)
+        off = quantile_difference(raw, wanted, self.sensor)
         if off <= limit * (1.0 if self.matched is None else _HYSTERESIS):
             return None
         low, high = self.sensor.remission_range
@@ -192,10 +192,10 @@ class RemissionMatcher:
             best = increasing(fit_functions(raw - low, wanted, full_scale=high - low, to=self._to, source=source))
         except SensorError:  # nearly all points have one remission
             return None
-        return best if _difference(raw, wanted, replace(self.sensor, remission=best)) < off else None
+        return best if quantile_difference(raw, wanted, replace(self.sensor, remission=best)) < off else None
 
 
-def _difference(raw: NDArray[np.float64], wanted: NDArray[np.float64], sensor: SensorProfile) -> float:
+def quantile_difference(raw: NDArray[np.float64], wanted: NDArray[np.float64], sensor: SensorProfile) -> float:
     """Mean difference between converted quantiles and the training sensor's."""
     points = np.zeros((len(raw), 4), np.float32)
     points[:, 3] = raw

@@ -31,7 +31,7 @@ SCAN_LIMIT_S = 60.0
 _MOST_TEXT_BYTES = 1 << 24
 
 # The module path is that of this process; the current folder, which may hold foreign files, is not added to it.
-_START = "import sys; sys.path[:] = sys.argv[1:]; from edgeperc.readers.worker import main; main()"
+START = "import sys; sys.path[:] = sys.argv[1:]; from edgeperc.readers.worker import main; main()"
 
 
 def decode_apart(
@@ -66,7 +66,7 @@ def _serve(request: dict[str, Any], path: Path, found: list[Any]) -> Iterator[Ti
     request_line = json.dumps(request).encode() + b"\n"
     with (
         tempfile.TemporaryDirectory(prefix="edgeperc-", ignore_cleanup_errors=True) as folder,
-        _start(folder) as process,
+        start_process(folder) as process,
         _Watch(process) as watch,
     ):
         assert process.stdin is not None
@@ -79,14 +79,15 @@ def _serve(request: dict[str, Any], path: Path, found: list[Any]) -> Iterator[Ti
             process.kill()
 
 
-def _start(folder: str) -> subprocess.Popen[bytes]:
+def start_process(folder: str) -> subprocess.Popen[bytes]:
+    """Start the process that decodes captures."""
     # Threads of these libraries would each take part of the memory limit.
     one_thread = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
     # Here lies what libraries unpack, and it is deleted even if the process is killed.
     temporary = dict.fromkeys(("TMPDIR", "TEMP", "TMP"), folder)
     flags = getattr(subprocess, "CREATE_NO_WINDOW", 0) | getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0)
     return subprocess.Popen(
-        [sys.executable, "-W", "ignore", "-c", _START, *sys.path],
+        [sys.executable, "-W", "ignore", "-c", START, *sys.path],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         env={**os.environ, **one_thread, **temporary},

@@ -290,7 +290,7 @@ def _clouds(path: Path, kind: str, topic: str | None, alive: Callable[[], None])
     opened = _McapBag(files, humble) if files else highlevel.AnyReader([path], default_typestore=humble)
     with opened as bag:
         for reader in getattr(bag, "readers", []):
-            _limit_chunks(reader)
+            limit_chunks(reader)
         clouds = [c for c in bag.connections if c.msgtype == _CLOUD]
         others = sorted({f"{c.topic} ({c.msgtype})" for c in bag.connections if c.msgtype != _CLOUD})
         names = sorted({c.topic for c in clouds})
@@ -338,7 +338,7 @@ def _plain_bag(folder: Path, alive: Callable[[], None]) -> tuple[Path, bool, lis
     return target, mode == "message", []
 
 
-def _limit_chunks(reader: Any) -> None:
+def limit_chunks(reader: Any) -> None:
     """Give the chunks of a ROS 1 bag a decompressor that stops at the limit."""
     by_magic = {b"BZh": "bz2", b"\x04\x22\x4d": "lz4"}
     for place, chunk in getattr(reader, "chunks", {}).items():

@@ -73,31 +73,31 @@ def outline_of(
     place = (origin[0] + 1.0, origin[1] + 1.0)
     near = _grown(grid, tolerance)
     addable = near & free
-    closed = _without_gaps(grid | (addable & ~_opened(~grid, near, tolerance)), addable, place, wanted)
+    closed = without_gaps(grid | (addable & ~_opened(~grid, near, tolerance)), addable, place, wanted)
     beside = _grown(~closed, tolerance)
     opened = _opened(closed, beside, tolerance)
-    smooth = _without_gaps(opened if opened.any() else closed, closed, place, wanted)
-    rings = _rings(smooth)
+    smooth = without_gaps(opened if opened.any() else closed, closed, place, wanted)
+    rings = rings_of(smooth)
     if not rings:
         return Outline(np.empty((0, 2), np.int64), (), 1.0)
 
     outer = int(np.argmax([_area(ring) for ring in rings]))  # the only ring with a positive area
     added = addable | closed
-    found = _needed(rings, _sums(added), _sums(beside), outer, 3)
+    found = _needed(rings, row_sums(added), row_sums(beside), outer, 3)
     factor = 1.0
     if tolerance > 0.0 and len(found[outer]) > max_corners:
         holes = [np.hstack([ring, np.roll(ring, -1, axis=0)]) for k, ring in enumerate(found) if k != outer]
         edges, around = np.concatenate([*holes, np.empty((0, 4), np.int64)]), min(math.ceil(2.0 * tolerance), FARTHEST)
         for factor in REACHES:
             # Holes are not marked, as no cell of them may come outside.
-            band = np.where(smooth, _grown(~closed, factor * tolerance), added & ~_filled(smooth))
-            n = merge_corners(found[outer], edges, _sums(band), around, max_corners)
+            band = np.where(smooth, _grown(~closed, factor * tolerance), added & ~filled(smooth))
+            n = merge_corners(found[outer], edges, row_sums(band), around, max_corners)
             found[outer] = found[outer][:n]
             if n <= max_corners:
                 break
         else:
             factor = math.inf
-            found = _needed(found, _sums(added), _sums(np.ones_like(closed)), outer, max_corners)
+            found = _needed(found, row_sums(added), row_sums(np.ones_like(closed)), outer, max_corners)
     found = [ring - 1 for ring in found]
     return Outline(found[outer], tuple(ring for k, ring in enumerate(found) if k != outer), factor)
 
@@ -112,14 +112,14 @@ def nearest_part(cells: NDArray[np.bool_], origin: tuple[float, float]) -> NDArr
     return part
 
 
-def _without_gaps(
+def without_gaps(
     cells: NDArray[np.bool_], addable: NDArray[np.bool_], origin: tuple[float, float], wanted: NDArray[np.bool_]
 ) -> NDArray[np.bool_]:
     """The nearest part, without cells that touch only at a corner, and without holes that contain no wanted cell."""
     part = cells.copy()
     resolve_contacts(part, addable.copy())
     part = nearest_part(part, origin)
-    holes = _filled(part) & ~part
+    holes = filled(part) & ~part
     pending, hole = holes & wanted, np.empty_like(part)
     while pending.any():
         row, col = divmod(int(np.argmax(pending)), pending.shape[1])
@@ -129,7 +129,7 @@ def _without_gaps(
     return part | holes
 
 
-def _filled(cells: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def filled(cells: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """The cells and their holes, in a grid whose border is not marked."""
     outside = np.empty_like(cells)
     mark_connected(~cells, 0, 0, outside)
@@ -150,7 +150,7 @@ def _opened(cells: NDArray[np.bool_], beside: NDArray[np.bool_], radius: float) 
     return cells & _grown(_grown(~beside, radius), radius)
 
 
-def _rings(cells: NDArray[np.bool_]) -> list[NDArray[np.int64]]:
+def rings_of(cells: NDArray[np.bool_]) -> list[NDArray[np.int64]]:
     """Rings of corners (row, column) around cells of a grid whose border is not marked."""
     n_sides = sum(int(np.count_nonzero(cells & ~np.roll(cells, shift, axis))) for axis in (0, 1) for shift in (1, -1))
     corners, ends = np.empty((n_sides, 2), np.int64), np.empty(n_sides // 4 + 1, np.int64)
@@ -177,7 +177,7 @@ def _area(ring: NDArray[np.int64]) -> int:
     return int(row @ np.roll(col, -1) - col @ np.roll(row, -1))
 
 
-def _sums(cells: NDArray[np.bool_]) -> NDArray[np.int32]:
+def row_sums(cells: NDArray[np.bool_]) -> NDArray[np.int32]:
     """Number of cells of each row before each column that are not marked, (rows, columns + 1)."""
     sums = np.zeros((cells.shape[0], cells.shape[1] + 1), np.int32)
     np.cumsum(~cells, axis=1, out=sums[:, 1:])

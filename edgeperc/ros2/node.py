@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 __all__ = ["PerceptionNode"]
 
-_REPORT_EVERY_S = 1.0
+REPORT_EVERY_S = 1.0
 # No scan heals what is wrong with the installation or the options.
 _FATAL = (MissingExtraError, ModelError, OptionError, ProviderError)
 
@@ -218,7 +218,7 @@ class PerceptionNode:
 
     def _report_always(self) -> None:
         """Body of the thread that publishes the diagnostics, also while a scan is perceived."""
-        while not self._closed.wait(_REPORT_EVERY_S) and self._diagnostics is not None:
+        while not self._closed.wait(REPORT_EVERY_S) and self._diagnostics is not None:
             self._diagnostics.publish(self._messages.encode(self._report()))
 
     def _report(self) -> Any:
@@ -237,7 +237,7 @@ class PerceptionNode:
             "clouds dropped": self.n_dropped,
             "clouds failed": n_failed,
             "answers": n_answers,
-            "answers [Hz]": f"{(n_answers - self._n_reported) / _REPORT_EVERY_S:.0f}",
+            "answers [Hz]": f"{(n_answers - self._n_reported) / REPORT_EVERY_S:.0f}",
         }
         if newest is not None:
             values["age of the newest answer [ms]"] = f"{1e3 * self._stream.age_s:.0f}"

@@ -87,8 +87,8 @@ class Echo(NamedTuple):
 
 
 @njit(cache=True, nogil=True)
-def _mixed(value: np.uint64) -> np.uint64:
-    # splitmix64: a draw depends on its ray and purpose only, not on the order of the rays.
+def mixed_bits(value: np.uint64) -> np.uint64:
+    """SplitMix64: a draw depends on its ray and purpose only, not on the order of the rays."""
     value = np.uint64(value + np.uint64(0x9E3779B97F4A7C15))
     value = np.uint64((value ^ (value >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9))
     value = np.uint64((value ^ (value >> np.uint64(27))) * np.uint64(0x94D049BB133111EB))
@@ -96,13 +96,14 @@ def _mixed(value: np.uint64) -> np.uint64:
 
 
 @njit(cache=True, nogil=True)
-def _uniform(bits: np.uint64) -> float:
+def uniform_draw(bits: np.uint64) -> float:
     """Convert random bits to a uniform number in (0, 1)."""
     return (float(bits >> np.uint64(11)) + 0.5) * (1.0 / 9007199254740992.0)
 
 
 @njit(cache=True, nogil=True)
-def _normal(bits: np.uint64) -> float:
+def normal_draw(bits: np.uint64) -> float:
+    """Convert random bits to a number of the normal distribution."""
     # Sum of four 16-bit uniforms, scaled to variance 1: within 3.5 sigma, from one hash.
     total = 0.0
     for k in range(4):
@@ -321,7 +322,7 @@ def fill_column_rows(
 
 
 @njit(cache=True, nogil=True)
-def _crossing(p: NDArray[np.float64], dx: float, dy: float, dz: float) -> tuple[float, float, int]:
+def crossing(p: NDArray[np.float64], dx: float, dy: float, dz: float) -> tuple[float, float, int]:
     """Intersect a ray from the origin with a primitive: ranges of entry and exit [m], and face. entry > exit: miss."""
     ox = -(p[7] * p[4] + p[8] * p[5] + p[9] * p[6])
     oy = -(p[10] * p[4] + p[11] * p[5] + p[12] * p[6])
@@ -453,7 +454,7 @@ def fill_cast(shapes: Shapes, ground: Ground, T_world_sensor: NDArray[np.float64
                     best = leave = r / ce
                     rise = _ground_rise(ground, T, level, tan, r)
                     row, cosine = _GROUND, abs(rise * ce - direction[2]) / math.sqrt(1.0 + rise * rise)
-            ray = _mixed(np.uint64(rays.key + np.uint64(b * n_columns + column)))
+            ray = mixed_bits(np.uint64(rays.key + np.uint64(b * n_columns + column)))
             nearer, k, exit, face = _first_shape(shapes, column, direction, tan, ray, best)
             if k >= 0:
                 best, row, leave = nearer, k, exit
@@ -543,18 +544,18 @@ def _first_shape(
         if tan < shapes.bounds[k, 2] or tan > shapes.bounds[k, 3]:
             continue
         p = shapes.primitives[k]
-        enter, leave, face = _crossing(p, *direction)
+        enter, leave, face = crossing(p, *direction)
         if enter > leave or leave <= 0.0:
             continue
         material = int(p[1])
         if material == LEAVES:
             # Random free path through the leaves.
-            draw = _uniform(_mixed(np.uint64(ray ^ np.uint64(k + 1))))
+            draw = uniform_draw(mixed_bits(np.uint64(ray ^ np.uint64(k + 1))))
             t = max(enter, 0.0) - math.log(draw) / p[3]
             if t < leave and t < best:
                 best, row, leave_best, face_best = t, k, leave, -1
         elif enter > 0.0 and enter < best:
-            if material == POROUS and _uniform(_mixed(np.uint64(ray ^ np.uint64(k + 1)))) > p[3]:
+            if material == POROUS and uniform_draw(mixed_bits(np.uint64(ray ^ np.uint64(k + 1)))) > p[3]:
                 continue
             best, row, leave_best, face_best = enter, k, leave, face
     return best, row, leave_best, face_best
@@ -650,12 +651,12 @@ def fill_points(
             if k == _NOTHING or not math.isfinite(t):
                 continue
             number = np.uint64(b * n_columns + column) << np.uint64(20)
-            ray = _mixed(np.uint64(rays.key ^ np.uint64(0x5DEECE66D) ^ number))
-            luck = _uniform(ray)
-            ray = _mixed(ray)
-            spread = _normal(ray)
-            ray = _mixed(ray)
-            other = _uniform(ray)
+            ray = mixed_bits(np.uint64(rays.key ^ np.uint64(0x5DEECE66D) ^ number))
+            luck = uniform_draw(ray)
+            ray = mixed_bits(ray)
+            spread = normal_draw(ray)
+            ray = mixed_bits(ray)
+            other = uniform_draw(ray)
             azimuth, elevation = rays.azimuths[column], rays.elevations[b]
             if receiver.ego_shadow and _in_ego_shadow(azimuth + 0.01 * spread, elevation + 0.016 * (other - 0.5)):
                 continue
@@ -671,7 +672,7 @@ def fill_points(
                 if luck > 1.0 - echo.lost:
                     continue
                 t += receiver.range_offsets[b] + 0.01 * echo.jitter * spread
-                spread = _normal(_mixed(np.uint64(ray ^ np.uint64(0xABCDEF))))
+                spread = normal_draw(mixed_bits(np.uint64(ray ^ np.uint64(0xABCDEF))))
                 gain = min(1.0, 0.2 + 4.0 * max(value, 0.0))
                 value += receiver.remission_offsets[b] * gain + 0.05 * echo.jitter * spread
                 # Measured: few values between 0 and 0.1, and 57 % of a car's returns at 0: weak echoes read 0.

@@ -12,10 +12,10 @@ from dataclasses import dataclass, field
 MAX_VIEWERS = 8
 _CHUNK = 2**18
 _BUFFER = 2**20  # of the kernel, for each socket
-_MAX_RECEIVED = 4 * 2**20  # a viewer sends names of topics and answers to pings
-_GREETING_S = 10.0  # until the server has answered the handshake
-_STALLED_S = 30.0  # without reading what waits
-_TICK_S = 0.5
+MAX_RECEIVED = 4 * 2**20  # a viewer sends names of topics and answers to pings
+GREETING_S = 10.0  # until the server has answered the handshake
+STALLED_S = 30.0  # without reading what waits
+TICK_S = 0.5
 _FULL = (
     b"HTTP/1.1 503 Service Unavailable\r\nContent-Type: text/plain\r\nConnection: close\r\n\r\n"
     b"as many viewers as edgeperc serves are connected\n"
@@ -50,7 +50,7 @@ class Relay:
     def __init__(self, listener: socket.socket, port: int) -> None:
         self.n_refused = 0
         self._listener, self._port = listener, port
-        self._viewers: list[_Viewer] = []
+        self.viewers: list[_Viewer] = []
         self._wake, self._woken = socket.socketpair()
         self._ending_s: float | None = None
         self._selector = selectors.DefaultSelector()
@@ -73,18 +73,18 @@ class Relay:
 
     def _run(self) -> None:
         try:
-            while self._ending_s is None or (self._viewers and time.monotonic() < self._ending_s):
-                for key, events in self._selector.select(_TICK_S if self._ending_s is None else 0.05):
+            while self._ending_s is None or (self.viewers and time.monotonic() < self._ending_s):
+                for key, events in self._selector.select(TICK_S if self._ending_s is None else 0.05):
                     if key.fileobj is self._listener:
                         self._accept()
                     elif key.fileobj is self._woken:
                         self._woken.recv(16)
                         self._stop_listening()
-                    elif key.data in self._viewers:
+                    elif key.data in self.viewers:
                         self._pass(key.data, key.fileobj, events)
                 self._drop_silent()
         finally:
-            for viewer in [*self._viewers]:
+            for viewer in [*self.viewers]:
                 self._drop(viewer)
             self._stop_listening()
             self._selector.close()
@@ -95,7 +95,7 @@ class Relay:
         if self._listener.fileno() >= 0:
             self._selector.unregister(self._listener)
             self._listener.close()
-        for viewer in [viewer for viewer in self._viewers if not viewer.is_greeted]:
+        for viewer in [viewer for viewer in self.viewers if not viewer.is_greeted]:
             self._drop(viewer)
 
     def _accept(self) -> None:
@@ -106,7 +106,7 @@ class Relay:
             return
         client.setblocking(False)
         try:
-            if len(self._viewers) >= MAX_VIEWERS:
+            if len(self.viewers) >= MAX_VIEWERS:
                 self.n_refused += 1
                 client.send(_FULL)
                 client.shutdown(socket.SHUT_WR)
@@ -122,7 +122,7 @@ class Relay:
         except OSError:
             client.close()
             return
-        self._viewers.append(viewer := _Viewer(client, server))
+        self.viewers.append(viewer := _Viewer(client, server))
         self._watch(viewer)
 
     def _watch(self, viewer: _Viewer) -> None:
@@ -153,7 +153,7 @@ class Relay:
             if events & selectors.EVENT_READ and is_client:
                 viewer.to_server = memoryview(viewer.client.recv(_CHUNK))
                 viewer.n_received += len(viewer.to_server)
-                if not viewer.to_server or viewer.n_received > _MAX_RECEIVED:
+                if not viewer.to_server or viewer.n_received > MAX_RECEIVED:
                     self._drop(viewer)
                     return
             elif events & selectors.EVENT_READ:
@@ -173,13 +173,13 @@ class Relay:
 
     def _drop_silent(self) -> None:
         now = time.monotonic()
-        for viewer in [*self._viewers]:
-            limit_s = _STALLED_S if viewer.is_greeted else _GREETING_S
+        for viewer in [*self.viewers]:
+            limit_s = STALLED_S if viewer.is_greeted else GREETING_S
             if now - viewer.since_s > limit_s and (viewer.to_client or not viewer.is_greeted):
                 self._drop(viewer)
 
     def _drop(self, viewer: _Viewer) -> None:
-        self._viewers.remove(viewer)
+        self.viewers.remove(viewer)
         for side in (viewer.client, viewer.server):
             if side in self._selector.get_map():
                 self._selector.unregister(side)

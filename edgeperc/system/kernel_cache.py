@@ -44,7 +44,7 @@ logger = logging.getLogger(__name__)
 _numba: Any = numba.core  # internals, which have no types
 FORMAT = 3  # of the files
 _DIGEST_BYTES = hashlib.sha256().digest_size
-_reported: set[str] = set()
+reported: set[str] = set()
 _collecting = threading.Lock()
 _rarely: list[tuple[int, int, int]] = []  # the thresholds before, once for each `fewer_collections` that is active
 RARE = 50_000  # objects; a collection takes 0.2 s once numba has built its tables
@@ -100,19 +100,19 @@ class _Compiler(numba.core.compiler.CompilerBase):
 
 def missing(kernels: Iterable[Any]) -> list[Any]:
     """Those of some kernels that no folder and no memory holds in compiled form, for any types."""
-    left = {kernel._cache._name: kernel for kernel in kernels if _is_cached(kernel) and not kernel.signatures}
-    for folder in dict.fromkeys(folder for kernel in left.values() for folder in kernel._cache._folders()):
+    left = {kernel._cache.name: kernel for kernel in kernels if _is_cached(kernel) and not kernel.signatures}
+    for folder in dict.fromkeys(folder for kernel in left.values() for folder in kernel._cache.folders()):
         for file in folder.glob("*.kernel") if left and _unusable(folder) is None else ():
             kernel = left.get(file.name.rpartition("-")[0])
-            if kernel is not None and _stamp_of(file) == kernel._cache._stamp():
-                del left[kernel._cache._name]
+            if kernel is not None and _stamp_of(file) == kernel._cache.stamp():
+                del left[kernel._cache.name]
     return [*left.values()]
 
 
 def are_kept(kernels: Iterable[Any]) -> bool:
     """Whether compiled kernels are put into a cache, from which the next start loads them."""
     caches = [kernel._cache for kernel in kernels if _is_cached(kernel)]
-    return bool(caches) and any(_can_be_written(each) and not _unusable(each) for each in caches[0]._folders())
+    return bool(caches) and any(_can_be_written(each) and not _unusable(each) for each in caches[0].folders())
 
 
 def _is_cached(kernel: Any) -> bool:
@@ -155,26 +155,26 @@ class KernelCache:
         self._source = Path(sys.executable if is_frozen else self._function.__code__.co_filename).absolute()
         self._enabled = True
 
-    def _stamp(self, *, anew: bool = False) -> bytes | None:
+    def stamp(self, *, anew: bool = False) -> bytes | None:
         """Changes with everything that the machine code depends on; None, after a report, if that is not known."""
         try:
             stamp = stamp_of(self._kernel, _Compiler.define_pipelines, anew=anew)
         except Exception as exc:  # a value of a kind that is not known
-            _report("unknown", "the compiled kernel %s is not kept: %s", self._name, exc)
+            _report("unknown", "the compiled kernel %s is not kept: %s", self.name, exc)
             return None
         return hashlib.sha256(b"%d %s" % (FORMAT, stamp)).digest()
 
     @property
     def cache_path(self) -> str | None:
         """The first folder that can be written, or holds this kernel already; None if there is none."""
-        usable = [folder for folder in self._folders() if _unusable(folder) is None]
+        usable = [folder for folder in self.folders() if _unusable(folder) is None]
         writable = (folder for folder in usable if _can_be_written(folder) or self._is_in(folder))
         return next(map(str, writable), None)
 
     def is_missing(self) -> bool:
         """Whether no folder holds a compiled form of this kernel, for any types, and one of them can be written."""
         can_write = False
-        for folder in self._folders() if self._enabled and self._stamp() is not None else ():
+        for folder in self.folders() if self._enabled and self.stamp() is not None else ():
             if _unusable(folder) is not None:
                 continue
             if self._is_in(folder):
@@ -184,8 +184,8 @@ class KernelCache:
 
     def _is_in(self, folder: Path) -> bool:
         """Whether a folder holds a compiled form of this kernel, for any types."""
-        stamp = self._stamp()
-        return any(_stamp_of(file) == stamp for file in folder.glob(f"{self._name}-*.kernel"))
+        stamp = self.stamp()
+        return any(_stamp_of(file) == stamp for file in folder.glob(f"{self.name}-*.kernel"))
 
     def enable(self) -> None:
         """Load and save from now on."""
@@ -211,7 +211,7 @@ class KernelCache:
         return result
 
     def _load(self, sig: Any, target_context: Any) -> Any:
-        if not self._enabled or (stamp := self._stamp()) is None:
+        if not self._enabled or (stamp := self.stamp()) is None:
             return None
         try:
             # Machine code needs numba's memory allocator, but neither its compiler's tables of types and functions nor
@@ -221,7 +221,7 @@ class KernelCache:
         except Exception as exc:  # another numba
             _report("unknown", "compiled kernels cannot be loaded with numba %s: %s", numba.__version__, _text(exc))
             return None
-        for folder in self._folders():
+        for folder in self.folders():
             file = folder / name
             try:
                 if _unusable(folder) is None and (content := _read(file)) is not None and content[0] == stamp:
@@ -242,10 +242,10 @@ class KernelCache:
         tell_watchers()
 
     def _save(self, sig: Any, result: Any) -> None:
-        if not self._enabled or (stamp := self._stamp()) is None:
+        if not self._enabled or (stamp := self.stamp()) is None:
             return
-        if self._stamp(anew=True) != stamp:
-            _report("unknown", "the compiled kernel %s is not kept: a value that it reads was set anew", self._name)
+        if self.stamp(anew=True) != stamp:
+            _report("unknown", "the compiled kernel %s is not kept: a value that it reads was set anew", self.name)
             return
         try:
             if result.library.has_dynamic_globals:  # addresses in this process
@@ -267,7 +267,7 @@ class KernelCache:
     def _write(self, name: str, content: bytes) -> str | None:
         """Write a file into the first folder that takes it; the reasons if none does."""
         reasons = []
-        for folder in self._folders():
+        for folder in self.folders():
             try:
                 # mkdir's mode, lessened by the umask, is that of the last folder only.
                 folder.parent.mkdir(0o755, parents=True, exist_ok=True)
@@ -287,15 +287,15 @@ class KernelCache:
         known = _numba.sigutils.normalize_signature(sig)
         processor = codegen.magic_tuple()
         what = repr((function.__qualname__, *map(str, known), processor, tag, settings())).encode()
-        return f"{self._name}-{hashlib.sha256(what).hexdigest()[:16]}.kernel", known
+        return f"{self.name}-{hashlib.sha256(what).hexdigest()[:16]}.kernel", known
 
     @property
-    def _name(self) -> str:
+    def name(self) -> str:
         """What the names of the files of this kernel begin with."""
         name = f"{self._source.stem}.{self._function.__qualname__}"
         return name.translate({ord("<"): None, ord(">"): None})[:80]
 
-    def _folders(self) -> Iterator[Path]:
+    def folders(self) -> Iterator[Path]:
         """Where compiled forms may lie, best first."""
         place = f"{self._source.parent.name}-{hashlib.sha256(bytes(self._source.parent)).hexdigest()[:16]}"
         if _numba.config.CACHE_DIR:
@@ -395,6 +395,6 @@ def _text(exc: Exception) -> str:
 
 def _report(kind: str, message: str, *values: object) -> None:
     """Log a warning the first time in this process; further ones of its kind are logged as information."""
-    level = logging.INFO if kind in _reported else logging.WARNING
-    _reported.add(kind)
+    level = logging.INFO if kind in reported else logging.WARNING
+    reported.add(kind)
     logger.log(level, message, *values)

@@ -134,7 +134,7 @@ class Tracker:
         """Delete all tracks, and reset the time, the pose and the ids."""
         self._labels: list[str] = []
         self._groups: list[str] = []
-        self._classes = np.zeros(0, CLASS)
+        self.class_table = np.zeros(0, CLASS)
         self._next_id, self._n_sessions = 1, 1
         self._session = _Session()
         self._former: _Session | None = None  # that before a jump, until the next scan confirms the jump
@@ -220,13 +220,13 @@ class Tracker:
             self._clock = clock
             nothing, pose = np.zeros(0, TRACK), session.T_world_sensor.copy()
             return Tracks(nothing, self._labels, stamp_s, pose, len(session.tracks), 0, session.number, is_late=True)
-        kinds = self._kinds(names)
-        classes = self._classes[kinds]
+        kinds = self.kinds_of(names)
+        classes = self.class_table[kinds]
 
         dt = stamp_s - session.stamp_s if session.posed is not None else 0.0
         tracks = session.tracks
-        tracks = tracks[tracks["missed_s"] + dt <= self._classes["memory_s"][tracks["label"]]]
-        of = self._classes[tracks["label"]]
+        tracks = tracks[tracks["missed_s"] + dt <= self.class_table["memory_s"][tracks["label"]]]
+        of = self.class_table[tracks["label"]]
         predictions = _predictions(tracks, of, dt)
         state, covariance = _combined(*predictions)
         twist, twist_variances = session.twist, session.twist_variances
@@ -245,7 +245,7 @@ class Tracker:
         n_born = len(tracks) - n
         tracks = self._living(tracks)
         strength = strength_of(tracks)
-        tracks["score"] = _scores(tracks, strength, self._classes[tracks["label"]], pose)
+        tracks["score"] = _scores(tracks, strength, self.class_table[tracks["label"]], pose)
 
         self._clock, self._former = clock, former if step == "jump" else None
         self._session = _Session(session.number, stamp_s, posed, tracks, pose, twist, twist_variances)
@@ -271,7 +271,7 @@ class Tracker:
         last_s = self._clock.last_s
         warnings.warn(f"got a scan at {stamp_s} s after one at {last_s} s: {meaning} (said once)", stacklevel=3)
 
-    def _kinds(self, names: Sequence[str]) -> NDArray[np.int64]:
+    def kinds_of(self, names: Sequence[str]) -> NDArray[np.int64]:
         """Row in the table of classes for each label; new classes are added."""
         for name in names:
             if name in self._labels:
@@ -290,7 +290,7 @@ class Tracker:
             row["odds"] = of.detection / ((1.0 - of.detection) * of.clutter)
             row["birth_logit"], row["sure_logit"] = _logit(of.birth_score), _logit(of.sure_score)
             self._labels.append(name)
-            self._classes = np.concatenate([self._classes, row])
+            self.class_table = np.concatenate([self.class_table, row])
         return np.array([self._labels.index(name) for name in names], np.int64)
 
     def _estimated_pose(

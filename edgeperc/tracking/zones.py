@@ -167,7 +167,7 @@ class Line:
         # The time that has passed so far without jumps of the clock, and the stamp of the last scan.
         self._now_s, self._stamp_s = 0.0, math.inf
         # Of each track: the last place beyond the margin, the directions counted so far, and the time it was seen.
-        self._known: dict[int, tuple[NDArray[np.float64], frozenset[bool], float]] = {}
+        self.known: dict[int, tuple[NDArray[np.float64], frozenset[bool], float]] = {}
 
     def count(self, tracks: Tracks) -> tuple[Crossing, ...]:
         """Count the tracks that crossed the line since the last scan.
@@ -190,18 +190,18 @@ class Line:
         found = []
         for track in tracks:
             place = np.array((track.world_box if self.world else track.box).center[:2])
-            last, counted, _ = self._known.get(track.id, (place, frozenset[bool](), 0.0))
+            last, counted, _ = self.known.get(track.id, (place, frozenset[bool](), 0.0))
             side = self._left_of(place)
             if abs(side) < self.margin_m:
                 # Near the line it keeps its last place, if it had one on a side.
-                if track.id in self._known:
-                    self._known[track.id] = last, counted, self._now_s
+                if track.id in self.known:
+                    self.known[track.id] = last, counted, self._now_s
                 continue
             if side * self._left_of(last) < 0.0 and (side > 0.0) not in counted and self._between(last, place):
                 counted |= {side > 0.0}
                 found.append(Crossing(track.id, track.label, side > 0.0, tracks.stamp_s))
-            self._known[track.id] = place, counted, self._now_s
-        self._known = {k: known for k, known in self._known.items() if self._now_s - known[2] <= FORGET_S}
+            self.known[track.id] = place, counted, self._now_s
+        self.known = {k: known for k, known in self.known.items() if self._now_s - known[2] <= FORGET_S}
         n_left = sum(crossing.to_left for crossing in found)
         self.to_left += n_left
         self.to_right += len(found) - n_left

@@ -109,7 +109,7 @@ class DrivePage:
     def __init__(self, *, title: str = "", max_bytes: int = 48 * 2**20) -> None:
         self.n_points, self.every = 12_000, 1
         self._title, self._max_bytes = title, max_bytes
-        self._n = self._n_bytes = 0
+        self._n = self.n_bytes = 0
         self._classes: dict[str, int] = {}
         self._scans: list[_Thin] = []
         self._fitness: dict[str, None] = {}
@@ -162,15 +162,15 @@ class DrivePage:
         text = _in_script(json.dumps(scan, allow_nan=False))
         cells = np.round(xyz[chosen] / _STEP_M).astype("<i2")
         self._scans.append(_Thin(text, stamp_s, cells, remission[chosen], label[chosen]))
-        self._n_bytes += self._scans[-1].n_bytes
-        while self._n_bytes > self._max_bytes and (self.n_points > _FEWEST_POINTS or len(self._scans) > 1):
+        self.n_bytes += self._scans[-1].n_bytes
+        while self.n_bytes > self._max_bytes and (self.n_points > _FEWEST_POINTS or len(self._scans) > 1):
             if self.n_points > _FEWEST_POINTS:
                 self.n_points //= 2
                 self._scans = [each.reduced(self.n_points) for each in self._scans]
             else:
                 self.every *= 2
                 self._scans = self._scans[::2]
-            self._n_bytes = sum(each.n_bytes for each in self._scans)
+            self.n_bytes = sum(each.n_bytes for each in self._scans)
 
     def write(self, path: str | Path) -> None:
         """Write the page.

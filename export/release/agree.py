@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from edgeperc.datasets.images import LabeledImages
 from edgeperc.datasets.kitti import KittiObjects, SemanticKitti
 from edgeperc.errors import ModelError, PointsError
-from edgeperc.evaluation.judge import Judge
+from edgeperc.evaluation.judge import Judge, Perceiving
 from edgeperc.evaluation.metrics import Confusion
 from edgeperc.evaluation.tables import Record, figures
 from edgeperc.evaluation.truth import Truth
@@ -36,7 +36,7 @@ T = TypeVar("T")
 
 
 @dataclass(frozen=True)
-class _Measured:
+class Measured:
     """Labels and accuracy of one precision over all scans; ``by`` is the engine, provider and processor."""
 
     labels: list[NDArray[np.uint8]]
@@ -99,7 +99,7 @@ def agree(
     options += [f"--camvid CAMVID --split {split}"] * (camvid is not None)
     options += ["--semantickitti SEMANTICKITTI"] * (semantickitti is not None) + [f"--scans {n_scans}"] * bool(n_scans)
     command = " ".join(["edgeperc-export agree", variants["fp32"].name, *options])
-    records = {precision: _record(each, measured["fp32"], command) for precision, each in measured.items()}
+    records = {precision: record_of(each, measured["fp32"], command) for precision, each in measured.items()}
     for variant in variants.values():
         own = {precision: records[precision] for precision, each in runs.items() if each is variant}
         write_card(onnx.load(variant.path), replace(variant.card, precisions=own), variant.path)
@@ -117,7 +117,8 @@ def summary(precisions: Mapping[str, Mapping[str, Any]]) -> list[str]:
     ]
 
 
-def _record(own: _Measured, fp32: _Measured, command: str) -> dict[str, Any]:
+def record_of(own: Measured, fp32: Measured, command: str) -> dict[str, Any]:
+    """What the card says of a precision, compared with fp32."""
     same = sum(int(np.count_nonzero(a == b)) for a, b in zip(own.labels, fp32.labels, strict=True))
     losses = [fp32.mean_iou - own.mean_iou, 0.0]
     if own.ap is not None and fp32.ap is not None:
@@ -143,8 +144,8 @@ def _measure(
     split: str,
     n_scans: int | None,
     on_scan: Callable[[str], None],
-) -> _Measured:
-    judge = Judge([variant.path], boxes_from="network")
+) -> Measured:
+    judge = Judge([variant.path], Perceiving(boxes_from="network"))
     (session,) = judge.perceive.sessions
     by = f"onnxruntime {onnxruntime.__version__}, {session.provider}"
     if precision == "bf16":
@@ -170,7 +171,7 @@ def _measure(
     blocks = [figures(of_block, 0) for of_block in records.values()]
     ious = [iou for block in blocks for iou in _ious(block)]
     ap = [block["boxes"]["oriented"]["all"]["vehicle"]["ap"] for block in blocks if "boxes" in block]
-    return _Measured(labels, float(np.nanmean(ious)), ap[0] if ap else None, f"{by}, {cpu_model()}")
+    return Measured(labels, float(np.nanmean(ious)), ap[0] if ap else None, f"{by}, {cpu_model()}")
 
 
 def _measure_images(
@@ -180,7 +181,7 @@ def _measure_images(
     split: str,
     n_images: int | None,
     on_image: Callable[[str], None],
-) -> _Measured:
+) -> Measured:
     perceive = Perceiver([variant.path])
     (session,) = perceive.sessions
     by = f"onnxruntime {onnxruntime.__version__}, {session.provider}"
@@ -194,7 +195,7 @@ def _measure_images(
         labels.append(found.labels.ravel())
         confusion.update(found.labels, truth)
         on_image(precision)
-    return _Measured(labels, confusion.mean_iou(), None, f"{by}, {cpu_model()}")
+    return Measured(labels, confusion.mean_iou(), None, f"{by}, {cpu_model()}")
 
 
 def _kitti(judge: Judge, objects: KittiObjects, name: str) -> Truth:

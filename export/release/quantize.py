@@ -40,7 +40,7 @@ from edgeperc.datasets.splits import in_split
 from edgeperc.errors import EdgepercError, ModelError, OptionError, PointsError, SplitError
 from edgeperc.evaluation.camvid import evaluate_images
 from edgeperc.evaluation.evaluate import evaluate
-from edgeperc.evaluation.judge import Judge
+from edgeperc.evaluation.judge import NETWORK_ALONE, Judge
 from edgeperc.evaluation.tables import Record
 from edgeperc.evaluation.tables import figures as figures_of
 from edgeperc.evaluation.truth import Truth
@@ -182,7 +182,7 @@ def _folded(path: Path) -> onnx.ModelProto:
 
 
 @dataclass(frozen=True)
-class _Calibrated:
+class Calibrated:
     """A network in fp32, the range of each of its tensors, and its outputs for some images.
 
     ``means`` are those of the convolutions whose shift is corrected.
@@ -205,7 +205,7 @@ class _Calibrated:
         scans: Sequence[NDArray[Any]],
         seven_bits: bool = False,
         strength: float | None = None,
-    ) -> _Calibrated:
+    ) -> Calibrated:
         """Calibrate the model of a file on scans, or images, with one of `STRENGTHS`."""
         model, images = _folded(path), [image[None] for image, _ in views(card, scans)]
         probes = images[:: max(1, len(images) // N_PROBES)][:N_PROBES]
@@ -217,7 +217,7 @@ class _Calibrated:
                 sizes |= {name: np.maximum(sizes[name], _by_channel(abs(v)).max(1)) for name, v in tensors.items()}
             equalize(model, {name: size**strength for name, size in sizes.items()})
         made = [node.output[0] for node in model.graph.node if node.op_type == "Conv"]
-        means = {} if strength is None else _means(model, card, images, made)
+        means = {} if strength is None else channel_means(model, card, images, made)
         return cls(card, model, _ranges(model, card, images), images, means, probes, outputs, seven_bits)
 
     def rounded(self, convolutions: Collection[str]) -> onnx.ModelProto:
@@ -229,7 +229,7 @@ class _Calibrated:
         for node in [node for node in corrected if len(node.input) > 2]:
             rounded = self._rounded(model, convolutions)
             (made,) = (each.output[0] for each in rounded.graph.node if each.name == node.name)
-            shift = _means(rounded, self.card, self.images, [made])[made] - self.means[node.output[0]]
+            shift = channel_means(rounded, self.card, self.images, [made])[made] - self.means[node.output[0]]
             bias = biases[node.input[2]]
             values = onnx.numpy_helper.to_array(bias)
             bias.CopyFrom(onnx.numpy_helper.from_array((values - shift).astype(values.dtype), bias.name))
@@ -274,7 +274,7 @@ def _ranges(model: onnx.ModelProto, card: ModelCard, images: Sequence[NDArray[np
             if values.dtype == np.float32:
                 bins = np.ascontiguousarray(values).view(np.uint32).ravel() >> (32 - BIN_BITS)
                 counts[name] += np.bincount(bins, minlength=1 << BIN_BITS)
-    ranges = {name: _range(count) for name, count in counts.items()}
+    ranges = {name: range_of(count) for name, count in counts.items()}
     data = {name: tuple(np.array(bound, np.float32) for bound in bounds) for name, bounds in ranges.items()}
     return TensorsData(CalibrationMethod.MinMax, data)
 
@@ -299,7 +299,7 @@ def _by_channel(values: NDArray[Any]) -> NDArray[Any]:
     return values.reshape(values.shape[1], -1) if values.ndim > 1 else values.reshape(1, -1)
 
 
-def _means(
+def channel_means(
     model: onnx.ModelProto, card: ModelCard, images: Sequence[NDArray[np.float32]], names: Sequence[str]
 ) -> dict[str, NDArray[np.float64]]:
     """Mean of each channel of some tensors (1, C, ...) over all images."""
@@ -310,7 +310,7 @@ def _means(
     return sums
 
 
-def _range(counts: NDArray[np.int64]) -> tuple[float, float]:
+def range_of(counts: NDArray[np.int64]) -> tuple[float, float]:
     """The range that makes least noise in 8 bits: squares of what is clipped, and of what is rounded inside."""
     taken = np.flatnonzero(counts)
     middle = (taken.astype(np.uint32) << np.uint32(32 - BIN_BITS)) + np.uint32(1 << (31 - BIN_BITS))
@@ -390,7 +390,7 @@ def _noise(
     return max(shares)
 
 
-def _candidates(graph: onnx.GraphProto, exclude: Collection[str]) -> list[str]:
+def find_candidates(graph: onnx.GraphProto, exclude: Collection[str]) -> list[str]:
     """Convolutions that may be rounded: not excluded, not the first after an input or the last before an output."""
     unknown = set(exclude) - {node.name for node in graph.node}
     if unknown:
@@ -416,7 +416,7 @@ def _multiplications(model: onnx.ModelProto) -> dict[str, int]:
     return {node.name: int(np.prod(sizes[node.input[1]]) * np.prod(sizes[node.output[0]][2:])) for node in convolutions}
 
 
-def _choose(fp32: _Calibrated, candidates: Sequence[str], limit: float, noise: float) -> tuple[list[str], float]:
+def _choose(fp32: Calibrated, candidates: Sequence[str], limit: float, noise: float) -> tuple[list[str], float]:
     """The convolutions to round, and their noise: all of them, which make ``noise``, or as many as the limit allows.
 
     Those that make most noise for the time that they take, alone, are left out first. Takes at most n + log2(n) trials
@@ -485,7 +485,7 @@ def _scores(figures: Mapping[str, Mapping[str, Any]]) -> dict[str, float]:
 
 def _compared(before: Path, after: Path, labeled: LabeledSets) -> list[dict[str, list[Record]]]:
     """Counts of both models on KITTI's validation drives, on SemanticKITTI's roads and on simulated scans, by set."""
-    judges = [Judge([path], boxes_from="network", rules=()) for path in (before, after)]
+    judges = [Judge([path], NETWORK_ALONE) for path in (before, after)]
     read = judges[1]  # it was also calibrated on scans, which must not be among these
     truths: list[tuple[str, Callable[[], Truth]]] = [
         ("simulated", partial(read.simulated, samples.FIRST_SEED + k)) for k in range(labeled.n_simulated)
@@ -509,7 +509,7 @@ def _later(evaluate: Callable[[Any], Truth], read: Callable[[Any], Any], name: A
     return evaluate(read(name))
 
 
-def _losses(before: Mapping[str, Sequence[Record]], after: Mapping[str, Sequence[Record]]) -> Losses:
+def losses_of(before: Mapping[str, Sequence[Record]], after: Mapping[str, Sequence[Record]]) -> Losses:
     """Compare the scores of both models; intervals are over resampled drives.
 
     Both models are resampled alike, because they err on the same scans. With one drive the interval is the loss itself.
@@ -607,10 +607,10 @@ def _rounded(
     path: Path, card: ModelCard, scans: Sequence[NDArray[Any]], exclude: Sequence[str], seven_bits: bool, limit: float
 ) -> tuple[onnx.ModelProto, list[str], list[str], float]:
     """The model in int8, its convolutions in int8 and in fp32, and the noise of its outputs."""
-    tried: list[tuple[float, _Calibrated]] = []
+    tried: list[tuple[float, Calibrated]] = []
     for strength in STRENGTHS:
-        fp32 = _Calibrated.on(path, card, scans, seven_bits, strength)
-        candidates = _candidates(fp32.model.graph, exclude)
+        fp32 = Calibrated.on(path, card, scans, seven_bits, strength)
+        candidates = find_candidates(fp32.model.graph, exclude)
         tried.append((fp32.noise(candidates), fp32))
         if tried[-1][0] <= limit:
             break
@@ -665,11 +665,11 @@ def _evaluated_on_images(path: Path, trial: Path, name: str, labeled: LabeledSet
 
 def _evaluated_on_scans(path: Path, trial: Path, name: str, labeled: LabeledSets) -> tuple[dict[str, Any], Losses]:
     """Figures of the int8 model on the test drives, and what it loses on the validation drives."""
-    losses = _losses(*_compared(path, trial, labeled))
+    losses = losses_of(*_compared(path, trial, labeled))
     simulated = f"simulation:{labeled.n_simulated}"
     given = {"KITTI": labeled.kitti, "SEMANTICKITTI": labeled.semantickitti, simulated: simulated}
     datasets = {name: root for name, root in given.items() if root is not None}
-    figures = evaluate([*datasets.values()], [trial], boxes_from="network", rules=())[0]
+    figures = evaluate([*datasets.values()], [trial], NETWORK_ALONE)[0]
     command = " ".join(["edgeperc eval", *datasets, f"--model {name}", "--no-agreement"])
     return figures | {"command": command}, losses
 

@@ -86,19 +86,19 @@ def _config(
     parameters: Mapping[str, str] = {},
 ) -> str:
     """``config.pbtxt``, a ModelConfig in protobuf's text format."""
-    lines = [f"name: {_quoted(name)}", f"backend: {_quoted(backend)}", "max_batch_size: 0"]
+    lines = [f"name: {quoted(name)}", f"backend: {quoted(backend)}", "max_batch_size: 0"]
     for field, tensors in (("input", inputs), ("output", outputs)):
         for tensor, kind, shape, optional in tensors:
             more = " optional: true" if optional else ""
             dims = f"dims: {[*shape]}"
-            lines.append(f"{field} {{ name: {_quoted(tensor)} data_type: TYPE_{kind} {dims}{more} }}")
+            lines.append(f"{field} {{ name: {quoted(tensor)} data_type: TYPE_{kind} {dims}{more} }}")
     lines += [
-        f"parameters {{ key: {_quoted(key)} value {{ string_value: {_quoted(value)} }} }}"
+        f"parameters {{ key: {quoted(key)} value {{ string_value: {quoted(value)} }} }}"
         for key, value in parameters.items()
     ]
     return "\n".join(lines) + "\n"
 
 
-def _quoted(text: str) -> str:
+def quoted(text: str) -> str:
     """A string of protobuf's text format: bytes of UTF-8, escaped in octal where they are not plain."""
     return '"' + "".join(chr(b) if 32 <= b < 127 and b not in b'"\\' else f"\\{b:03o}" for b in text.encode()) + '"'

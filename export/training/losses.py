@@ -48,7 +48,7 @@ def lovasz_softmax(logits: Tensor, labels: Tensor) -> Tensor:
     Shapes as for `cross_entropy`; the batch counts as one image.
     """
     if logits.is_cuda:
-        return _lovasz_at_once(logits, labels)
+        return lovasz_at_once(logits, labels)
     known = labels != IGNORE
     probabilities = logits.float().softmax(1).movedim(1, -1)[known]  # (n, C)
     labels = labels[known].long()
@@ -72,7 +72,7 @@ def lovasz_softmax(logits: Tensor, labels: Tensor) -> Tensor:
     return torch.stack(losses).mean() if losses else logits.float().sum() * 0.0
 
 
-def _lovasz_at_once(logits: Tensor, labels: Tensor) -> Tensor:
+def lovasz_at_once(logits: Tensor, labels: Tensor) -> Tensor:
     """`lovasz_softmax` of all classes and all errors at once: it sorts more, but never waits for the GPU."""
     known, n_classes = (labels != IGNORE).flatten(), logits.shape[1]
     probabilities = logits.float().softmax(1).movedim(1, 0).flatten(1)  # (C, n)

@@ -98,7 +98,7 @@ class Samples:
         self.bank: ObjectBank | None = None
         if max(recipe.n_pasted, recipe.n_negatives) > 0.0:
             stride = max(1, len(simulated) // BANK_SCANS)
-            scans = [*self.real, *(self._load(k) for k in range(0, len(simulated), stride))]
+            scans = [*self.real, *(self.load(k) for k in range(0, len(simulated), stride))]
             scans = tqdm(scans, desc="cutting out objects", leave=False)
             self.bank = ObjectBank.of(scans, classes=recipe.classes or POINT_CLASSES, n_workers=n_workers)
 
@@ -137,7 +137,7 @@ class Samples:
             chosen = rng.permutation(len(odds))[:REDRAWN_SCANS]
             false = np.zeros(len(chosen))
             for k, number in enumerate(chosen):
-                image, truth, *_ = self.sample(self.real[number] if name == "real" else self._load(number))
+                image, truth, *_ = self.sample(self.real[number] if name == "real" else self.load(number))
                 outputs = network(torch.from_numpy(image[None]).to(device))
                 logits: Tensor = outputs[0] if isinstance(outputs, tuple) else outputs
                 labels = logits[0].argmax(0).cpu().numpy()
@@ -161,9 +161,10 @@ class Samples:
         name = "simulated" if rng.random() < self.simulated_share else "real"
         odds = self.weights[name] * self.odds[name]
         number = int(rng.choice(len(odds), p=odds / odds.sum()))
-        return self._load(number) if name == "simulated" else self.real[number]
+        return self.load(number) if name == "simulated" else self.real[number]
 
-    def _load(self, number: int) -> LabeledScan:
+    def load(self, number: int) -> LabeledScan:
+        """A simulated scan, labeled with the classes of the training."""
         scan = LabeledScan.load(self.simulated[number])
         return replace(scan, labels=self._numbers[scan.labels])
 

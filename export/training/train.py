@@ -145,7 +145,7 @@ def _train(recipe: Recipe, out: Path, data: Data, run: Run, ranks: Ranks) -> Pat
     ranks.share(network)
     # The compiled network shares its weights with the original, which is averaged and saved.
     forward = torch.compile(network) if run.compiled else network
-    model = _Model(network, forward, copy.deepcopy(network).eval(), _optimizer(recipe, network))
+    model = _Model(network, forward, copy.deepcopy(network).eval(), make_optimizer(recipe, network))
     if checkpoint.exists():
         state = _resumed(checkpoint, recipe, model, samples, ranks.device)
 
@@ -184,7 +184,7 @@ def _train(recipe: Recipe, out: Path, data: Data, run: Run, ranks: Ranks) -> Pat
             state.curve.append(line)
             log.write(json.dumps(line) + "\n")
             log.flush()
-            over = state.step >= _last(recipe, state.curve, epoch)
+            over = state.step >= last_step(recipe, state.curve, epoch)
             if ranks.is_first and (over or time.monotonic() - saved_s >= run.save_every_s):
                 _save(checkpoint, recipe, model, state, samples, data.fold)
                 saved_s = time.monotonic()
@@ -234,7 +234,7 @@ def _step(
     """One step of the optimizer on a batch; returns the loss."""
     task, network, optimizer = source.task, model.network, model.optimizer
     for group in optimizer.param_groups:
-        group["lr"] = recipe.learning_rate * _schedule(recipe, state.step) * 0.5**state.halvings
+        group["lr"] = recipe.learning_rate * make_schedule(recipe, state.step) * 0.5**state.halvings
     torch.manual_seed((recipe.seed << 32) + state.step)
     network.train()
     if recipe.head_only:
@@ -269,7 +269,7 @@ def _batches(
 ) -> Iterator[Sequence[Tensor]]:
     """The batches that are left."""
     if isinstance(samples, ImageSamples):
-        return samples.batches(state.step, _last(recipe, state.curve, epoch))
+        return samples.batches(state.step, last_step(recipe, state.curve, epoch))
     return loaded(samples, state.step, recipe.steps, n_workers, ranks)
 
 
@@ -388,7 +388,7 @@ def _few_of_each_drive(names: Sequence[str], drives: Sequence[str]) -> list[str]
     return chosen
 
 
-def _last(recipe: Recipe, curve: Sequence[dict[str, Any]], epoch: int) -> int:
+def last_step(recipe: Recipe, curve: Sequence[dict[str, Any]], epoch: int) -> int:
     """The last step: that of the recipe, or where the validation figure has not improved for ``stop_after`` epochs."""
     figures = [row["validation"]["mean"] or 0.0 for row in curve] if recipe.stop_after else []
     if figures:
@@ -398,7 +398,7 @@ def _last(recipe: Recipe, curve: Sequence[dict[str, Any]], epoch: int) -> int:
     return recipe.steps
 
 
-def _schedule(recipe: Recipe, step: int) -> float:
+def make_schedule(recipe: Recipe, step: int) -> float:
     """Factor of the learning rate: warm-up, constant, cosine."""
     begin = round(recipe.steps * (1.0 - recipe.cooldown))
     if step >= begin:
@@ -406,7 +406,8 @@ def _schedule(recipe: Recipe, step: int) -> float:
     return min(1.0, (step + 1) / WARM_UP_STEPS) if recipe.cooldown else 1.0
 
 
-def _optimizer(recipe: Recipe, network: nn.Module) -> torch.optim.Optimizer:
+def make_optimizer(recipe: Recipe, network: nn.Module) -> torch.optim.Optimizer:
+    """The optimizer that the recipe names."""
     if recipe.optimizer == "adagrad":
         return torch.optim.Adagrad(network.parameters(), lr=recipe.learning_rate)
     if recipe.optimizer == "adam":

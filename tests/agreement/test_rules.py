@@ -116,9 +116,6 @@ def top_view(seed: int = 0, view: TopViewGeometry = VIEW) -> TopView:
     return TopView(labels, names, view.cell_m, view.x_range_m, view.y_range_m, np.ones(labels.shape, np.bool_))
 
 
-# --- kernels
-
-
 @patient
 @given(scenes)
 def test_columns_match_the_twin(given: list) -> None:
@@ -302,9 +299,6 @@ def test_cleared_cells_match_the_twin(given: list, by_height: bool, of_road: boo
     np.testing.assert_array_equal(found, twins.rules.cells(*args))
 
 
-# --- what always holds
-
-
 @patient
 @given(scenes, boxes_of)
 def test_points_keep_their_view_and_meet_the_rules(given: list, boxes: list[Box]) -> None:
@@ -395,9 +389,6 @@ def test_rules_are_those_of_the_command_line() -> None:
     assert tuple(sorted(RULES)) == arguments.RULES
 
 
-# --- scenes with known answers
-
-
 def block(
     x: float, y: float, size: tuple[float, float, float], label: int, spacing: float = 0.15
 ) -> NDArray[np.float64]:
@@ -413,10 +404,7 @@ def block(
 
 
 def agreed_scene(
-    *parts: NDArray[np.float64],
-    boxes: tuple[Box, ...] = (),
-    view: TopView | None = None,
-    rules: frozenset[str] = RULES,
+    *parts: NDArray[np.float64], boxes: tuple[Box, ...] = (), view: TopView | None = None, rules: frozenset[str] = RULES
 ) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
     """Rows x, y, height, label of parts on a floor, and their labels after the agreement."""
     x, y = (v.ravel() for v in np.meshgrid(np.arange(0.0, 30.0, 0.35), np.arange(-15.0, 15.0, 0.35)))

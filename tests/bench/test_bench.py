@@ -428,7 +428,7 @@ def in_process(no_wait: None, monkeypatch: pytest.MonkeyPatch) -> list[worker.Jo
         jobs.extend(asked)
         if any((job.provider, job.precision) == ("openvino", "bf16") for job in asked):
             raise ProviderError("cannot run this model")
-        return [worker._work(connection, job) for job in asked]
+        return [worker.work(connection, job) for job in asked]
 
     def engines(perceive: Street) -> list[dict[str, Any]]:
         engine = {"name": "n", "variant": "fp32", "version": "1", "sha256": "b" * 64, "digest": "a" * 64}
@@ -436,7 +436,7 @@ def in_process(no_wait: None, monkeypatch: pytest.MonkeyPatch) -> list[worker.Jo
         return [engine | {"options": {"threads": "1"}}]
 
     monkeypatch.setattr(worker, "make_perceiver", lambda job: Street())
-    monkeypatch.setattr(worker, "_engines", engines)
+    monkeypatch.setattr(worker, "active_engines", engines)
     monkeypatch.setattr(measure, "measure", measured)
     return jobs
 
@@ -616,7 +616,7 @@ def test_a_dead_process_is_an_error() -> None:
             raise EOFError
 
     with pytest.raises(worker.WorkerError, match="exit code -9"):
-        worker._receive(Silent(), Dead())
+        worker.receive(Silent(), Dead())
 
 
 def test_a_cold_start_is_measured_step_by_step(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

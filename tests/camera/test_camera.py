@@ -149,9 +149,6 @@ def test_one_perceiver_in_threads_gives_the_same_result(perceive: Perceiver, ima
         assert [*pool.map(labels, range(40))] == known * 10
 
 
-# --- beside LiDAR models -----------------------------------------------------------------------------------------
-
-
 def test_scan_and_image_in_one_call(model: Path, perceive: Perceiver, image: NDArray[np.uint8]) -> None:
     """Each part is what it is without the other."""
     options: dict[str, Any] = {"provider": "cpu", "n_threads": 1, "on_mismatch": "ignore"}
@@ -208,10 +205,10 @@ def test_logits_that_are_not_finite_are_an_error(model: Path, image: NDArray[np.
     perceive = Perceiver(model, provider="cpu", n_threads=1)
     session = perceive.sessions[0]
     session.outputs["camera_logits"][:] = np.nan
-    real, session._session = session._session, type("Idle", (), {"run_with_iobinding": lambda *_: None})()
+    real, session.inference = session.inference, type("Idle", (), {"run_with_iobinding": lambda *_: None})()
     with pytest.raises(InferenceError, match=r"tinycam: .* of camera_logits are not finite"):
         perceive(image=image)
-    session._session = real
+    session.inference = real
     assert perceive(image=image).image is not None
 
 
@@ -254,9 +251,6 @@ os.waitpid(child, 0)
     for n_threads, said in ((1, "equal"), (2, "construct the Perceiver in the process that calls it")):
         done = subprocess.run([sys.executable, "-c", code, model, str(n_threads)], capture_output=True, text=True)
         assert said in done.stdout, done.stderr
-
-
-# --- files -------------------------------------------------------------------------------------------------------
 
 
 def saved(image: Any, kind: str, **options: Any) -> bytes:

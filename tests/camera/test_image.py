@@ -17,12 +17,12 @@ from edgeperc.camera.image import (
     MAX_EDGE,
     Channels,
     ImageScaler,
-    _between,
-    _taps,
     as_image,
+    between,
     fill_image_labels,
     fill_scaled,
     label_pixels,
+    taps,
 )
 from edgeperc.errors import CardMismatchError, ImageError, InferenceError
 from edgeperc.types.card import InputSpec
@@ -42,9 +42,6 @@ def scaled(image: NDArray[np.uint8], width: int, height: int, spec: InputSpec = 
     out = np.full((len(spec.channels), height, width), np.nan, np.float32)
     ImageScaler(view, spec).fill(as_image(image), out)
     return out
-
-
-# --- arrays ------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -101,8 +98,6 @@ def test_any_array_is_an_image_or_refused(content: bytes, shape: list[int], dtyp
         assert array.ndim != 3 or array.shape[2] != 3 or dtype != "u1" or not array.size
 
 
-# --- scaling -----------------------------------------------------------------------------------------------------
-
 SIZES = [(1, 1), (1, 7), (9, 1), (24, 32), (25, 33), (48, 64), (12, 16), (100, 30), (7, 301), (61, 47)]
 
 
@@ -113,7 +108,7 @@ def test_scaling_matches_its_twins(size: tuple[int, int], channels: tuple[str, .
     out = scaled(image, 32, 24, spec)
     np.testing.assert_allclose(out, twins.scaled(image, view, spec), atol=2e-6 * 255)
     order = np.array([("red", "green", "blue").index(name) for name in channels], np.int32)
-    tables = _taps(size[0], 24), _taps(size[1], 32), Channels(order, np.float32(spec.mean), np.float32(spec.std))
+    tables = taps(size[0], 24), taps(size[1], 32), Channels(order, np.float32(spec.mean), np.float32(spec.std))
     again, same = np.empty_like(out), np.empty_like(out)
     twins.fill_scaled(image.reshape(size[0], -1), *tables, again)
     fill_scaled(as_image(image).reshape(size[0], -1), *tables, same)
@@ -122,7 +117,7 @@ def test_scaling_matches_its_twins(size: tuple[int, int], channels: tuple[str, .
 
 @given(st.integers(1, 200), st.integers(1, 200))
 def test_weights_are_a_triangle_around_each_center(n_in: int, n_out: int) -> None:
-    start, weights = _taps(n_in, n_out)
+    start, weights = taps(n_in, n_out)
     assert start.min() >= 0
     assert start.max() + weights.shape[1] <= n_in
     for k in range(n_out):
@@ -137,7 +132,7 @@ def test_weights_are_a_triangle_around_each_center(n_in: int, n_out: int) -> Non
 def test_an_image_of_the_inputs_size_stays_as_it_is() -> None:
     image = noise(24, 32)
     np.testing.assert_array_equal(scaled(image, 32, 24), image.transpose(2, 0, 1))
-    start, weights = _taps(24, 24)
+    start, weights = taps(24, 24)
     np.testing.assert_array_equal(start, np.arange(24))
     np.testing.assert_array_equal(weights, np.ones((24, 1)))
 
@@ -194,9 +189,6 @@ def test_another_buffer_is_refused(out: NDArray[Any]) -> None:
         ImageScaler(CameraGeometry(32, 24), SPEC).fill(noise(4, 4), out)
 
 
-# --- labels ------------------------------------------------------------------------------------------------------
-
-
 def logits_of(n_classes: int, height: int, width: int, kind: str) -> NDArray[np.float32]:
     rng = np.random.default_rng(n_classes)
     if kind == "noise":
@@ -234,7 +226,7 @@ def test_logits_at_the_images_size_are_their_own_best_class() -> None:
 
 def test_every_pixel_is_written_once() -> None:
     for n_in, n_out in ((1, 1), (1, 9), (7, 3), (12, 48), (5, 301)):
-        sides, weight, runs = _between(n_in, n_out)
+        sides, weight, runs = between(n_in, n_out)
         assert runs[0] == 0
         assert runs[-1] == n_out
         assert (np.diff(runs) > 0).all()
@@ -247,7 +239,7 @@ def test_every_pixel_is_written_once() -> None:
 def test_logits_that_are_not_finite_are_an_error(value: float) -> None:
     logits = logits_of(3, 4, 5, "noise")
     logits[1, 2, 3] = logits[2, 0, 0] = value
-    tables = (*_between(4, 8), *_between(5, 10))
+    tables = (*between(4, 8), *between(5, 10))
     assert fill_image_labels(as_read_only(logits), *tables, np.empty((8, 10), np.uint8)) == 2
     with pytest.raises(InferenceError, match="m: 2 of 60 values of camera_logits are not finite"):
         label_pixels(logits, 8, 10, model="m")

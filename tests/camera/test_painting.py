@@ -42,7 +42,7 @@ from edgeperc.camera.painting import (
     fill_nearest,
     fill_painted,
 )
-from edgeperc.evaluation.painting import _beside_edges, count_painting
+from edgeperc.evaluation.painting import beside_edges, count_painting
 from edgeperc.simulation.camera import CAMERA_CLASSES, VOID, CameraImage, forward_camera, render
 from edgeperc.simulation.drawn import random_scene
 from edgeperc.simulation.scene import SimulatedScan, simulate
@@ -71,9 +71,6 @@ def seen(scene: int, sensor: str, calibration: Calibration) -> tuple[SimulatedSc
 def perceived(scan: SimulatedScan, image: CameraImage, mounting: Mounting = MODEL_MOUNTING) -> Perception:
     labels = ImageLabels(image.labels, CAMERA_CLASSES)
     return Perception(len(scan.points), 0, None, None, (), {}, {}, (), None, mounting, image=labels)
-
-
-# --- kernels ----------------------------------------------------------------------------------------------------------
 
 
 def a_case(rng: np.random.Generator, n: int) -> tuple[np.ndarray, ...]:
@@ -134,9 +131,6 @@ def test_a_window_is_bounded() -> None:
     assert 40**2 < np.count_nonzero(np.isfinite(buffer.nearest)) <= (2 * MAX_CELLS + 1) ** 2
 
 
-# --- painting ---------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(("sensor", "calibration"), [("hdl-64e", NEAR), ("hdl-64e", FAR), ("os1-64", NEAR)])
 def test_points_get_the_class_of_their_surface(sensor: str, calibration: Calibration) -> None:
     n = sum((count_painting(*seen(k, sensor, calibration), calibration, sensor) for k in range(3)), Counter[str]())
@@ -151,7 +145,7 @@ def test_points_beside_edges_are_not_judged() -> None:
     labels[4, 10] = 1
     wanted = np.zeros(labels.shape, bool)
     wanted[1:8, 7:14] = True
-    np.testing.assert_array_equal(_beside_edges(labels), wanted)
+    np.testing.assert_array_equal(beside_edges(labels), wanted)
 
 
 def test_evaluate_painting(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -275,9 +269,6 @@ def test_a_sensor_that_is_mounted_otherwise() -> None:
         paint(image.labels, points, other, mounting=Mounting())
 
 
-# --- the road ---------------------------------------------------------------------------------------------------------
-
-
 def test_the_road_of_an_image_lies_on_the_roads_of_the_scene() -> None:
     n = sum((count_painting(*seen(k, "hdl-64e", NEAR), NEAR, "hdl-64e") for k in range(3)), Counter[str]())
     assert n["cells_right"] / n["cells"] >= 0.96
@@ -315,9 +306,6 @@ def test_without_ground_no_cell_is_seen() -> None:
         assert found.drivable_area_m2 == 0.0
 
 
-# --- errors -----------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     "image",
     [None, "labels", np.zeros((480, 640)), np.zeros((480, 640, 3), np.uint8), np.zeros((480, 640), bool)],
@@ -347,9 +335,6 @@ def test_what_does_not_fit_is_refused() -> None:
         paint(labels, points, NEAR, sensor="hdl-65e")
     with pytest.raises(OptionError, match="mounting"):
         paint(labels, points, NEAR, mounting="roof")  # type: ignore[arg-type]
-
-
-# --- picture and demo -------------------------------------------------------------------------------------------------
 
 
 def test_draw_painted(tmp_path: Path) -> None:

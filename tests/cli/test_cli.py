@@ -10,10 +10,10 @@ import shlex
 import subprocess
 import sys
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from types import SimpleNamespace
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -24,11 +24,12 @@ from test_captures import vlp16_packets, write_pcap
 from cli_helpers import POINTSEG, SSADNET, run, write_scan
 from edgeperc import __version__, live, zoo
 from edgeperc.cli.arguments import PRECISIONS, PROVIDERS
-from edgeperc.cli.evaluation.scans import _figure_lines
+from edgeperc.cli.evaluation.scans import figure_lines
 from edgeperc.cli.main import build_parser, in_options
 from edgeperc.cli.output import print_line, progress
 from edgeperc.cli.scans import find_scans, output_names
 from edgeperc.errors import InferenceError, ModelFileError, OptionError, PointsError
+from edgeperc.evaluation.judge import Perceiving
 from edgeperc.inference import providers, session
 from edgeperc.readers import captures
 from edgeperc.types.perception import Box, Perception, PointLabels, TopView
@@ -40,7 +41,14 @@ class FakePerceiver:
     made: ClassVar[list[FakePerceiver]] = []
 
     def __init__(
-        self, models, *, sensor="hdl-64e", provider="auto", n_threads=None, on_mismatch="warn", **more
+        self,
+        models: Sequence[str | Path],
+        *,
+        sensor: str | None = "hdl-64e",
+        provider: str = "auto",
+        n_threads: int | None = None,
+        on_mismatch: str = "warn",
+        **more: Any,
     ) -> None:
         self.given = (list(models), sensor, provider, n_threads, on_mismatch)
         self.sensor = sensor
@@ -54,7 +62,9 @@ class FakePerceiver:
         self.cards = tuple(known[name] for name in models)
         FakePerceiver.made.append(self)
 
-    def __call__(self, points, stamp_s=None, *, image=None) -> Perception:
+    def __call__(
+        self, points: np.ndarray, stamp_s: float | None = None, *, image: np.ndarray | None = None
+    ) -> Perception:
         if len(points) and points[0, 3] == 1.0:
             raise InferenceError("pointseg answered\nwith NaN")
         if len(points) and points[0, 3] == 2.0:
@@ -139,8 +149,8 @@ def test_eval_needs_matplotlib_for_a_picture_before_any_work(
 def test_eval_passes_its_options_on(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     asked = []
 
-    def evaluate(datasets: list[str], models: tuple[str, ...], **options: object) -> tuple[dict, list]:
-        asked.append((datasets, models, options))
+    def evaluate(datasets: list[str], models: tuple[str, ...], how: Perceiving, **_: object) -> tuple[dict, list]:
+        asked.append((datasets, models, how))
         return {"models": {"x": "1"}, "providers": {"x": "x fp32, cpu"}, "split": "test", "fold": None}, []
 
     monkeypatch.setitem(sys.modules, "edgeperc.evaluation.evaluate", SimpleNamespace(evaluate=evaluate))
@@ -151,8 +161,8 @@ def test_eval_passes_its_options_on(monkeypatch: pytest.MonkeyPatch, capsys: pyt
     )
     (datasets, models, first), (_, own, second) = asked
     assert (datasets, models, own) == (["KITTI", "simulation:2"], zoo.DEFAULT, ["a"])
-    assert [first[key] for key in ("provider", "precision", "boxes_from")] == ["cpu", "auto", "both"]
-    assert [second[key] for key in ("provider", "precision", "boxes_from")] == ["openvino", "bf16", "network"]
+    assert (first.provider, first.precision, first.boxes_from) == ("cpu", "auto", "both")
+    assert (second.provider, second.precision, second.boxes_from) == ("openvino", "bf16", "network")
     assert capsys.readouterr().out.splitlines()[1] == "ran as x fp32, cpu"
 
 
@@ -180,7 +190,7 @@ def test_tables_of_figures() -> None:
             "boxes": {"upright": {"all": {"mean_ap": 1.0, "car": boxes, "vehicle": boxes}}},
         },
     }
-    lines = _figure_lines(figures)
+    lines = figure_lines(figures)
     assert lines[0].startswith("pointseg 1.2.3; validation drives, fold 1")
     assert lines[1] == "ran as pointseg int8, CPUExecutionProvider"
     assert lines[3] == "== SemanticKITTI: 1 scan, 1 drive =="
@@ -420,7 +430,9 @@ def test_every_scan_is_answered_whatever_the_clock_does(
         assert answers[-2 if said.startswith("late") else -1].endswith("tracks: 1 object")
 
 
-def test_a_missing_reader_is_said_at_once(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch) -> None:
+def test_a_missing_reader_is_said_at_once(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     (tmp_path / "drive.bag").write_bytes(b"#ROSBAG V2.0\n")
     (tmp_path / "absent").mkdir()
     (tmp_path / "absent" / "rosbags.py").write_text("raise ImportError('not installed')\n")
@@ -721,9 +733,6 @@ def test_demo_without_matplotlib(
     assert [file.name for file in (tmp_path / "demo").iterdir()] == ["scene.html"]
 
 
-# --- data sets -------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("files", "names"),
     [
@@ -758,7 +767,9 @@ def test_live_replays_the_one_folder_of_a_data_set(tmp_path: Path, capsys: pytes
     assert "--live replays one folder of scans" in capsys.readouterr().err
 
 
-def test_live_names_the_scans_of_a_capture(capture: Path, capsys: pytest.CaptureFixture[str], monkeypatch) -> None:
+def test_live_names_the_scans_of_a_capture(
+    capture: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(live, "read_scans", captures.read_scans)
     assert run("run", capture, "--live", "--json") == 1
     answers = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
@@ -766,8 +777,6 @@ def test_live_names_the_scans_of_a_capture(capture: Path, capsys: pytest.Capture
     assert named
     assert {*named} <= {str(capture / f"{k:06d}") for k in range(3)}
 
-
-# --- help and renamed words ------------------------------------------------------------------------------------------
 
 COMMANDS = (
     *("demo", "run", "ros2", "info", "doctor", "models", "sensors", "providers", "eval", "eval-sensors"),

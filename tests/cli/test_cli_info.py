@@ -23,7 +23,7 @@ from edgeperc.simulation.drawn import random_scene
 from edgeperc.simulation.scene import simulate
 from edgeperc.system import machine
 from edgeperc.types.card import ModelCard
-from edgeperc.types.sensor import SENSORS, get_sensor
+from edgeperc.types.sensor import SENSORS, SensorProfile, get_sensor
 from edgeperc.zoo import Variant
 
 
@@ -85,7 +85,9 @@ def test_info_of_a_shipped_model_fits_a_screen(name: str, capsys: pytest.Capture
     assert max(map(len, lines)) <= 100
 
 
-def test_info_folds_what_is_long(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch) -> None:
+def test_info_folds_what_is_long(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     card = replace(POINTSEG, training={"data": "street " * 100}, classes=tuple(f"class {k}" for k in range(250)))
     monkeypatch.setattr(zoo, "resolve", lambda model: (Variant(Path(__file__), card),))
     assert run("info", "pointseg") == 0
@@ -100,7 +102,9 @@ def test_info_of_a_scan(tmp_path: Path, capsys: pytest.CaptureFixture[str], monk
 
     checked = []
 
-    def check_fitness(points, profile, sensor) -> tuple[str, ...]:
+    def check_fitness(
+        points: np.ndarray, profile: FitnessProfile | None, sensor: SensorProfile | None
+    ) -> tuple[str, ...]:
         checked.append((points, profile, sensor.name))
         return ("it has 32 beams",)
 
@@ -156,9 +160,6 @@ def test_info_and_lists_need_no_onnxruntime(tmp_path: Path) -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-
-
-# --- models, sensors, providers, completion --------------------------------------------------------------------------
 
 
 @pytest.mark.usefixtures("fake_models")
@@ -242,9 +243,6 @@ def test_completion_names_its_extra(capsys: pytest.CaptureFixture[str], monkeypa
     monkeypatch.setitem(sys.modules, "shtab", None)
     assert run("completion", "bash") == 2
     assert "pip install 'edgeperc[completion]'" in capsys.readouterr().err
-
-
-# --- how a sensor is mounted -----------------------------------------------------------------------------------------
 
 
 @pytest.fixture

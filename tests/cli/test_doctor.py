@@ -24,14 +24,14 @@ from edgeperc.system.kernel_cache import KernelCache
 posix = pytest.mark.skipif(os.name != "posix", reason="Windows' folders have access lists")
 
 
-RUNS = doctor._runs
+RUNS = doctor.find_runs
 
 
 @pytest.fixture(autouse=True)
 def quick(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """A cache of its own; only the tests of the models open them."""
     monkeypatch.setenv("EDGEPERC_CACHE_DIR", str(tmp_path / "cache"))
-    monkeypatch.setattr(doctor, "_runs", lambda found: iter(()))
+    monkeypatch.setattr(doctor, "find_runs", lambda found: iter(()))
 
 
 def report(capsys: pytest.CaptureFixture[str]) -> tuple[int, dict[str, dict[str, str]]]:
@@ -48,7 +48,7 @@ def broken(found: dict[str, dict[str, str]]) -> set[str]:
 
 def test_an_installation_that_works(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("onnxruntime")
-    monkeypatch.setattr(doctor, "_runs", RUNS)
+    monkeypatch.setattr(doctor, "find_runs", RUNS)
     monkeypatch.setenv("ORT_DISABLE_TELEMETRY", "1")
     code, found = report(capsys)
     assert (code, broken(found)) == (0, set())
@@ -88,7 +88,7 @@ def test_a_package_that_cannot_be_imported(package: str, tmp_path: Path) -> None
 
 def test_no_onnxruntime(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
-    monkeypatch.setattr(doctor, "_installed", lambda prefix="": {})
+    monkeypatch.setattr(doctor, "installed", lambda prefix="": {})
     code, found = report(capsys)
     assert code == 1
     assert found["onnxruntime"] == {
@@ -114,9 +114,9 @@ def test_builds_of_onnxruntime(
     versions: dict[str, str], features: tuple[str, ...], state: str, text: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(providers, "runtime_version", lambda: versions["onnxruntime"])
-    monkeypatch.setattr(doctor, "_installed", lambda prefix="": versions)
-    monkeypatch.setattr(doctor, "_has_sme", lambda: "sme" in features)
-    found = {finding.name: finding for finding in doctor._packages()}
+    monkeypatch.setattr(doctor, "installed", lambda prefix="": versions)
+    monkeypatch.setattr(doctor, "has_sme", lambda: "sme" in features)
+    found = {finding.name: finding for finding in doctor.find_packages()}
     assert found["onnxruntime"].state == state
     assert text in found["onnxruntime"].found
 
@@ -129,7 +129,7 @@ def test_telemetry(value: str, state: str, text: str, monkeypatch: pytest.Monkey
     monkeypatch.setenv("ORT_DISABLE_TELEMETRY", value)
     if not value:
         monkeypatch.delenv("ORT_DISABLE_TELEMETRY")
-    found = {finding.name: finding for finding in doctor._packages()}["telemetry"]
+    found = {finding.name: finding for finding in doctor.find_packages()}["telemetry"]
     assert found.state == state
     assert text in found.found
 
@@ -142,9 +142,6 @@ def test_a_plugin_that_does_not_load(capsys: pytest.CaptureFixture[str], monkeyp
     code, found = report(capsys)
     assert code == 1
     assert "does not load" in found["providers"]["found"]
-
-
-# --- caches ----------------------------------------------------------------------------------------------------------
 
 
 def test_kernels_that_are_not_kept(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
@@ -185,9 +182,6 @@ def test_settings_that_cannot_be_read(tmp_path: Path, capsys: pytest.CaptureFixt
     assert "cannot be read as settings" in found["settings"]["found"]
 
 
-# --- models ----------------------------------------------------------------------------------------------------------
-
-
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A copy of the folder of the models, in its place."""
@@ -223,8 +217,6 @@ def test_without_the_page_hashes_are_not_compared(folder: Path, capsys: pytest.C
     assert found["model lodnn.onnx"]["found"].endswith("not compared")
 
 
-# --- extras ----------------------------------------------------------------------------------------------------------
-
 REQUIRES = (
     "numpy>=1.24",
     'onnxruntime>=1.18; extra == "cpu"',
@@ -245,8 +237,8 @@ def extras(monkeypatch: pytest.MonkeyPatch, versions: dict[str, str]) -> dict[st
     for extra in ("both", "cpu", "docs", "gpu", "ros", "view"):
         metadata["Provides-Extra"] = extra
     monkeypatch.setattr(importlib.metadata, "metadata", lambda name: metadata)
-    monkeypatch.setattr(doctor, "_installed", lambda prefix="": versions)
-    return {finding.name: finding for finding in doctor._extras()}
+    monkeypatch.setattr(doctor, "installed", lambda prefix="": versions)
+    return {finding.name: finding for finding in doctor.find_extras()}
 
 
 def test_missing_extras_come_with_the_line_that_installs_them(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -275,5 +267,5 @@ def test_a_package_that_pip_did_not_install(monkeypatch: pytest.MonkeyPatch) -> 
         raise importlib.metadata.PackageNotFoundError(name)
 
     monkeypatch.setattr(importlib.metadata, "metadata", metadata)
-    (found,) = doctor._extras()
+    (found,) = doctor.find_extras()
     assert (found.name, found.state) == ("extras", "note")

@@ -35,9 +35,6 @@ def is_safe(out: str) -> bool:
     return all(line.isprintable() for line in out.split("\n"))
 
 
-# --- printing --------------------------------------------------------------------------------------------------------
-
-
 @given(ANY)
 def test_any_text_becomes_printable(text: str) -> None:
     shown = printable(text)
@@ -107,9 +104,6 @@ def test_a_parser_quotes_safely(capsys: pytest.CaptureFixture[str]) -> None:
         assert caught.value.code == 2
         assert is_safe(capsys.readouterr().err)
     assert isinstance(parser, argparse.ArgumentParser)
-
-
-# --- how a program ends ----------------------------------------------------------------------------------------------
 
 
 def test_errors_and_warnings_are_one_line(capsys: pytest.CaptureFixture[str]) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -172,9 +173,6 @@ def test_semantickitti_files(tmp_path: Path) -> None:
         sequences.frame("77/000000")
 
 
-# --- scans and their changes -----------------------------------------------------------------------------------------
-
-
 @pytest.fixture(scope="module")
 def scan() -> LabeledScan:
     return LabeledScan.from_simulation(simulated_scan(3))
@@ -196,7 +194,7 @@ def test_changes_keep_labels_true(scan: LabeledScan) -> None:
 
 
 @pytest.mark.parametrize("change", [lambda s: s, mirrored, lambda s: turned(s, 0.4), lambda s: mirrored(turned(s, -2))])
-def test_the_surface_follows_the_points(scan: LabeledScan, change) -> None:  # type: ignore[no-untyped-def]
+def test_the_surface_follows_the_points(scan: LabeledScan, change: Callable[[LabeledScan], LabeledScan]) -> None:  # type: ignore[no-untyped-def]
     marked = np.zeros_like(scan.surface)
     marked[150:200, 220:300] = 1  # x 10..20 m, y -10..6 m
     scan = replace(scan, surface=marked, boxes=(), counts=())
@@ -254,9 +252,6 @@ def test_no_ground_no_claim() -> None:
     assert (sure_surface(np.zeros((0, 4), np.float32)) == IGNORE).all()
 
 
-# --- real data -------------------------------------------------------------------------------------------------------
-
-
 def test_every_table_of_frames_is_read_and_unknown_drives_are_left_out(tmp_path: Path) -> None:
     (tmp_path / "training/label_2").mkdir(parents=True)
     for name in ("000000", "000001", "000002"):
@@ -307,7 +302,7 @@ def test_drives_are_never_shared(kitti_root: Path) -> None:
         assert fold not in {fold_of(drive[n]) for n in left}
 
 
-def test_layouts_of_test_drives_are_left_out(data_root) -> None:  # type: ignore[no-untyped-def]
+def test_layouts_of_test_drives_are_left_out(data_root: Callable[[str], Path]) -> None:  # type: ignore[no-untyped-def]
     root = data_root("kitti_labels_7481")
     assert any(d in (root / "frames.csv").read_text() for d in TEST_DRIVES)
     rows = (root / "frames.csv").read_text().splitlines()[1:]

@@ -198,9 +198,6 @@ def test_kittis_own_labels(tmp_path: Path) -> None:
     assert ScanFolder(root).frame("a").boxes is not None
 
 
-# --- files of a folder ------------------------------------------------------------------------------------------------
-
-
 def test_scans_of_any_format(tmp_path: Path) -> None:
     root = folder_of(tmp_path, label__a_dot_txt="", label__b_dot_txt="")
     np.save(root / "velodyne/b.npy", PLACES)
@@ -300,9 +297,6 @@ def test_polygons_that_are_none(tmp_path: Path, text: str) -> None:
     folder = ScanFolder(folder_of(tmp_path, drivable__a_dot_json=text))
     with pytest.raises(PointsError, match="polygon"):
         folder.frame("a")
-
-
-# --- descriptions -----------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -443,8 +437,6 @@ def test_descriptions_of_public_sets() -> None:
     assert read_layout("vod").labeled_deg == (-30.0, 30.0)
 
 
-# --- truth ------------------------------------------------------------------------------------------------------------
-
 VIEW = TopViewGeometry()
 SMALL = TopViewGeometry(x_range_m=(0.0, 4.0), y_range_m=(-2.0, 2.0), cell_m=0.5)
 CORNER = st.tuples(st.floats(-1.0, 5.0), st.floats(-3.0, 3.0))
@@ -546,9 +538,6 @@ def test_polygons_are_the_road_where_the_scan_sees_it(tmp_path: Path) -> None:
     np.testing.assert_array_equal(cells[empty] == 1, np.abs(y[empty]) < 3.0)
 
 
-# --- training ---------------------------------------------------------------------------------------------------------
-
-
 def test_scans_to_train_on(tmp_path: Path) -> None:
     root, _ = street(tmp_path, seeds=(3, 4), min_points=3)
     folder = ScanFolder(root)
@@ -631,9 +620,6 @@ def test_the_sensor_of_a_scan_is_stored(tmp_path: Path) -> None:
         assert LabeledScan.load(tmp_path / "scan.npz").sensor == sensor
 
 
-# --- evaluation -------------------------------------------------------------------------------------------------------
-
-
 def test_folders_are_evaluated(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     root, _ = street(tmp_path / "set", "hdl-64e", (3, 4))
     for name in ("ssadnet-sim", "pointseg-sim"):
@@ -667,9 +653,6 @@ def test_other_sensors_are_compared_by_the_same_reader(tmp_path: Path, capsys: p
     for source in (str(tmp_path / "set/velodyne"), f"{root}:pandar"):
         assert cli.main(["eval-sensors", source]) == 2
         assert "SENSOR=simulation:N" in capsys.readouterr().err
-
-
-# --- real data --------------------------------------------------------------------------------------------------------
 
 
 def test_public_sets(data_root: Callable[[str], Path]) -> None:

@@ -6,6 +6,7 @@ import json
 import math
 import subprocess
 import sys
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -26,8 +27,6 @@ from edgeperc.evaluation.tracking import (
 )
 from edgeperc.types.sensor import get_sensor
 from edgeperc_bench.peers.tracking import every_second_beam
-
-# --- KITTI -----------------------------------------------------------------------------------------------------------
 
 CALIBRATION = """P2: 700.0 0.0 600.0 0.0 0.0 700.0 180.0 0.0 0.0 0.0 1.0 0.0
 R0_rect: 1.0 0.0 0.0 0.0 1.0 0.0 0.0 0.0 1.0
@@ -366,7 +365,7 @@ def test_a_coarser_sensors_drive_has_every_second_beam(drive_root: Path, tmp_pat
     assert (len(sensor.elevations_deg), sensor.remission_range) == (32, (0.0, 255.0))
 
 
-def test_real_sequences_are_tracked_well(data_root) -> None:
+def test_real_sequences_are_tracked_well(data_root: Callable[[str], Path]) -> None:
     """Sequence 0004 with PointRCNN's detections; the figures of the whole set are in the documents."""
     figures = evaluate_kitti(data_root("tracking"), sequences=["0004"])["classes"]["car"]
     assert figures["best"]["mota"] > 0.85
@@ -374,16 +373,13 @@ def test_real_sequences_are_tracked_well(data_root) -> None:
     assert figures["hota"]["hota"] > 0.6
 
 
-def test_real_vehicles_that_move_point_to_where_they_drive(data_root) -> None:
+def test_real_vehicles_that_move_point_to_where_they_drive(data_root: Callable[[str], Path]) -> None:
     """Motion alone: PointRCNN's boxes do not say that they know the front."""
     figures = evaluate_kitti(data_root("tracking"), sequences=["0011"], classes=["car"])["headings"]["car"]
     moving = figures["moving"]
     assert moving["n_boxes"] > 500
     assert moving["n_resolved"] > 0.9 * moving["n_boxes"]
     assert moving["n_right"] > 0.95 * moving["n_resolved"]
-
-
-# --- pictures and the command line -----------------------------------------------------------------------------------
 
 
 def test_tracks_are_animated(kitti: Path, tmp_path: Path) -> None:

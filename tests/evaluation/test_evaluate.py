@@ -35,7 +35,7 @@ from edgeperc.datasets.kitti import (
 from edgeperc.errors import ModelError, PointsError, SplitError
 from edgeperc.evaluation import evaluate
 from edgeperc.evaluation.causes import count_causes
-from edgeperc.evaluation.judge import Judge, training_scans_of
+from edgeperc.evaluation.judge import Judge, Perceiving, training_scans_of
 from edgeperc.evaluation.metrics import BoxEvaluator, Confusion
 from edgeperc.evaluation.tables import BANDS, FEWEST_OBJECTS, Record, banded, figures
 from edgeperc.simulation.samples import FIRST_SEED, IGNORE
@@ -117,7 +117,7 @@ class World:
 def world(monkeypatch: pytest.MonkeyPatch) -> World:
     made = World()
     monkeypatch.setattr("edgeperc.evaluation.judge.Perceiver", made.perceiver)
-    monkeypatch.setattr("edgeperc.evaluation.judge._Network", made.network)
+    monkeypatch.setattr("edgeperc.evaluation.judge.Network", made.network)
     return made
 
 
@@ -133,9 +133,6 @@ def hits(at: Box, n: int, label: int = 1) -> list[list[float]]:
 
 def evaluated(judge: Judge, *frames: Frame, n_resamples: int = 50) -> dict[str, Any]:
     return figures([judge.record(judge.kitti(each))[0] for each in frames], n_resamples)
-
-
-# --- tables made by hand ---------------------------------------------------------------------------------------------
 
 
 def test_points_by_hand(world: World) -> None:
@@ -235,7 +232,7 @@ def test_boxes_of_clusters_by_hand(world: World) -> None:
         box(20, 4, score=0.6),
     )
     # Boxes around clusters are named by their size: a van that is called a car is a false car and a missed van.
-    table = evaluated(Judge(["pointseg"], boxes_from="clusters"), frame_of_all)["boxes"]["oriented"]["all"]
+    table = evaluated(Judge(["pointseg"], Perceiving(boxes_from="clusters")), frame_of_all)["boxes"]["oriented"]["all"]
     counts = {
         name: [table[name][k] for k in ("n_truth", "n_predicted", "n_hits")] for name in ("car", "van", "pedestrian")
     }
@@ -250,7 +247,7 @@ def test_boxes_of_clusters_by_hand(world: World) -> None:
     assert counts == {"car": [1, 2, 1], "van": [1, 0, 0], "vehicle": [2, 2, 2]}
     assert "pedestrian" not in table
     assert [result["all_round"]["all"][name]["n_hits"] for name in ("vehicle", "pedestrian")] == [3, 1]
-    assert "boxes" not in evaluated(Judge(["pointseg"], boxes_from="network"), frame_of_all)
+    assert "boxes" not in evaluated(Judge(["pointseg"], Perceiving(boxes_from="network")), frame_of_all)
 
 
 def test_boxes_all_round_by_hand(world: World) -> None:
@@ -298,7 +295,7 @@ def test_boxes_all_round_by_hand(world: World) -> None:
         # Labels are counted with those of other classes.
         assert result["labeled"]["car"] == {"n_boxes": 2, "n_objects": 1, "n_drives": 1, "few": True}
         assert set(result["labeled"]) == {"car", "van", "pedestrian", "cyclist", "person_sitting"}
-    assert not {"all_round", "heading"} & {*evaluated(Judge(["pointseg"], boxes_from="network"), one)}
+    assert not {"all_round", "heading"} & {*evaluated(Judge(["pointseg"], Perceiving(boxes_from="network")), one)}
 
 
 def test_the_ground_in_boxes_and_people_who_sit_are_left_out_of_a_second_figure(world: World) -> None:
@@ -340,12 +337,9 @@ def test_few_objects_are_marked() -> None:
         rows = figures([Record("", "a", {("all_round", "vehicle"): evaluator})])
         assert rows["all_round"]["all"]["vehicle"].get("few", False) is (n < FEWEST_OBJECTS)
         assert rows["heading"]["all_round"]["all"]["vehicle"].get("few", False) is (n < FEWEST_OBJECTS)
-        lines = [line for line in eval_scans._box_lines(rows) if line.startswith("  all")]  # car, before vehicle
+        lines = [line for line in eval_scans.box_lines(rows) if line.startswith("  all")]  # car, before vehicle
         assert [f"car{output.FEW}" in line for line in lines] == [n < FEWEST_OBJECTS] * (2 if n else 0)
     assert f"n<{FEWEST_OBJECTS}" in output.FEW
-
-
-# --- causes of errors ------------------------------------------------------------------------------------------------
 
 
 def street() -> np.ndarray:
@@ -440,7 +434,7 @@ def test_bumper_has_an_interval_of_points(world: World) -> None:
     assert result["bumper"]["all"] == {"n_points": 4, "n_scans": 1, "n_drives": 1, "n_points_interval": [0, 8]}
     assert set(result["bumper"]) == {"all", "on the ground"}
     assert ["car", "at", "the", "own", "bumper", "all", "-", "-", "4", "0-8", "-", "1", "-", "1"] in [
-        line.split() for line in eval_scans._error_lines(result)
+        line.split() for line in eval_scans.error_lines(result)
     ]
 
 
@@ -583,9 +577,6 @@ def test_a_model_without_vehicles_is_evaluated_on_road_only(world: World) -> Non
     assert mistakes is not None
     record, _ = judge.record(judge.simulated(FIRST_SEED))
     assert [*figures([record])["segmentation"]["every cell"]["all"]["iou"]] == ["background", "drivable"]
-
-
-# --- drives ----------------------------------------------------------------------------------------------------------
 
 
 def test_intervals_are_over_drives(world: World) -> None:
@@ -735,9 +726,6 @@ def test_what_is_no_dataset(world: World, dataset: str) -> None:
         evaluate.evaluate([dataset], ["pointseg"])
 
 
-# --- mistakes --------------------------------------------------------------------------------------------------------
-
-
 def test_mistakes_are_named(world: World) -> None:
     car, van, rider, walker = box(10, 0), box(20, 3, "van"), box(15, -3, "cyclist"), box(12, 3, "pedestrian")
     beside, beyond = box(20, 14), box(50, 0)
@@ -773,11 +761,10 @@ def test_the_worst_come_first(world: World, tmp_path: Path, monkeypatch: pytest.
     assert len(worst) == 20
 
 
-# --- the shipped models ----------------------------------------------------------------------------------------------
-
-
 def test_a_network_agrees_with_the_perceiver() -> None:
-    judge = Judge(["ssadnet", "pointseg"], rules=())  # the agreement removes cells that the network calls drivable
+    judge = Judge(
+        ["ssadnet", "pointseg"], Perceiving(rules=())
+    )  # the agreement removes cells that the network calls drivable
     truth = judge.simulated(FIRST_SEED)
     found = judge.perceive(truth.points)
     assert judge.from_above is not None
@@ -863,9 +850,6 @@ def test_the_command_on_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[st
     assert "expected the root of a KITTI object set" in capsys.readouterr().err
     with pytest.raises(SystemExit):
         cli.main(["eval", "simulation:1", "--fold", "3"])
-
-
-# --- real scans ------------------------------------------------------------------------------------------------------
 
 
 def test_no_shipped_model_was_trained_on_a_test_scan(kitti_root: Path, semantickitti_root: Path) -> None:

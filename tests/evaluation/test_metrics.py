@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -20,14 +21,13 @@ from edgeperc.evaluation.metrics import (
 from edgeperc.types.perception import Box
 
 
-def box(x, y, label="car", score=1.0, size=(4.0, 2.0), yaw=0.0):
+def box(
+    x: float, y: float, label: str = "car", score: float = 1.0, size: tuple[float, float] = (4.0, 2.0), yaw: float = 0.0
+) -> Box:
     return Box(label, score, (x, y, -1.0), (*size, 1.5), yaw)
 
 
-# --- labels
-
-
-def test_scores_of_a_table_made_by_hand():
+def test_scores_of_a_table_made_by_hand() -> None:
     confusion = Confusion(("background", "car", "pedestrian", "cyclist"))
     # truth:      0  0  0  0  1  1  1  2  2  ignored
     # predicted:  0  0  0  1  1  1  0  2  1  3
@@ -41,7 +41,7 @@ def test_scores_of_a_table_made_by_hand():
     assert confusion.weighted_precision() == pytest.approx((4 * 0.75 + 3 * 0.5 + 2 * 1.0) / 9)
 
 
-def test_updates_add_up_and_nothing_has_no_score():
+def test_updates_add_up_and_nothing_has_no_score() -> None:
     confusion = Confusion(("a", "b"), ignore=7)
     assert math.isnan(confusion.accuracy())
     assert np.isnan(confusion.iou()).all()
@@ -58,7 +58,7 @@ def test_updates_add_up_and_nothing_has_no_score():
 
 
 @given(st.lists(st.tuples(st.integers(0, 3), st.sampled_from([0, 1, 2, 3, 255])), max_size=40))
-def test_scores_are_those_of_sets(pairs):
+def test_scores_are_those_of_sets(pairs: list[tuple[int, int]]) -> None:
     confusion = Confusion("abcd")
     predicted, truth = np.array(pairs, dtype=np.uint8).reshape(-1, 2).T
     confusion.update(predicted, truth)
@@ -69,7 +69,7 @@ def test_scores_are_those_of_sets(pairs):
         np.testing.assert_allclose(confusion.iou()[k], expected)
 
 
-def test_labels_that_cannot_be_counted_raise():
+def test_labels_that_cannot_be_counted_raise() -> None:
     confusion = Confusion(("a", "b"))
     with pytest.raises(PointsError, match=r"\(2,\) and truth \(3,\)"):
         confusion.update([0, 0], [0, 0, 0])
@@ -84,7 +84,7 @@ PAIRS = st.lists(st.tuples(st.integers(0, 3), st.sampled_from([0, 1, 2, 3, 255])
 
 
 @given(PAIRS, PAIRS)
-def test_counts_of_two_are_counts_of_both(one, other):
+def test_counts_of_two_are_counts_of_both(one: list[tuple[int, int]], other: list[tuple[int, int]]) -> None:
     together = Confusion("abcd")
     apart = []
     for pairs in (one, other):
@@ -97,7 +97,7 @@ def test_counts_of_two_are_counts_of_both(one, other):
     np.testing.assert_array_equal(apart[0].counts, before)
 
 
-def test_coarser_classes():
+def test_coarser_classes() -> None:
     confusion = Confusion(("other", "road", "car", "van"))
     confusion.update([0, 1, 2, 3, 2, 3, 1], [0, 0, 2, 2, 3, 1, 1])
     coarse = confusion.merged({"ground": ["other", "road"], "vehicle": ["car", "van"]})
@@ -108,10 +108,7 @@ def test_coarser_classes():
         confusion + coarse
 
 
-# --- average precision
-
-
-def eleven_points(scores, hits, n_truth):
+def eleven_points(scores: Sequence[float], hits: Sequence[bool], n_truth: int) -> float:
     """As SSADNet's appendix has it, word for word."""
     order = np.argsort(-np.array(scores), kind="stable")
     found = np.cumsum(np.array(hits)[order])
@@ -120,14 +117,14 @@ def eleven_points(scores, hits, n_truth):
 
 
 @given(st.lists(st.tuples(st.sampled_from([0.2, 0.5, 0.9]), st.booleans()), min_size=1), st.integers(0, 5))
-def test_average_precision_is_what_its_definition_says(predictions, n_missed):
+def test_average_precision_is_what_its_definition_says(predictions: list[tuple[float, bool]], n_missed: int) -> None:
     scores, hits = zip(*predictions, strict=True)
     n_truth = sum(hits) + n_missed
     if n_truth:
         assert average_precision(scores, hits, n_truth) == pytest.approx(eleven_points(scores, hits, n_truth))
 
 
-def test_average_precision_by_hand():
+def test_average_precision_by_hand() -> None:
     # Precision after each: 1, 1/2, 2/3, 3/4, 3/5; recall 1/4, 1/4, 1/2, 3/4, 3/4.
     scores, hits = [0.9, 0.8, 0.7, 0.6, 0.5], [True, False, True, True, False]
     expected = (3 * 1.0 + 5 * 0.75) / 11  # recalls 0, .1, .2 reach 1; .3 to .7 reach 3/4; .8 to 1 nothing
@@ -137,7 +134,7 @@ def test_average_precision_by_hand():
     assert again == pytest.approx(expected)
 
 
-def test_average_precision_at_its_ends():
+def test_average_precision_at_its_ends() -> None:
     assert average_precision([0.5, 0.4], [True, True], 2) == 1.0
     assert average_precision([0.5, 0.4], [False, False], 2) == 0.0
     assert average_precision([], [], 3) == 0.0
@@ -151,10 +148,7 @@ def test_average_precision_at_its_ends():
         average_precision([0.5, 0.4], [True], 1)
 
 
-# --- thresholds
-
-
-def test_sweep_by_hand():
+def test_sweep_by_hand() -> None:
     sweep = ProbabilitySweep()
     assert math.isnan(sweep.max_f1())
     assert math.isnan(sweep.average_precision())
@@ -173,7 +167,7 @@ def test_sweep_by_hand():
 
 
 @given(st.lists(st.tuples(st.integers(0, 255), st.booleans()), min_size=1, max_size=30))
-def test_sweep_takes_the_best_threshold(cells):
+def test_sweep_takes_the_best_threshold(cells: list[tuple[int, bool]]) -> None:
     level, truth = np.array(cells).T
     truth = truth.astype(bool)
     sweep = ProbabilitySweep()
@@ -183,16 +177,13 @@ def test_sweep_takes_the_best_threshold(cells):
         assert sweep.max_f1() == pytest.approx(max(f1))
 
 
-def test_probabilities_that_are_none_raise():
+def test_probabilities_that_are_none_raise() -> None:
     for values, truth in (([0.5, 1.5], [True, False]), ([math.nan], [True]), ([0.5], [True, False])):
         with pytest.raises(PointsError, match=r"expected one shape, and all in 0\.\.1"):
             ProbabilitySweep().update(values, truth)
 
 
-# --- boxes
-
-
-def test_boxes_by_hand():
+def test_boxes_by_hand() -> None:
     evaluator = BoxEvaluator(0.5)
     truth = [box(10.0, 0.0), box(20.0, 0.0), box(30.0, 5.0, "van")]
     predicted = [
@@ -222,7 +213,7 @@ def test_boxes_by_hand():
     assert evaluator.mean_ap() == pytest.approx(0.5)
 
 
-def test_scans_add_up_and_do_not_mix():
+def test_scans_add_up_and_do_not_mix() -> None:
     evaluator = BoxEvaluator()
     evaluator.update([box(10.0, 0.0, score=0.3)], [])
     evaluator.update([], [box(10.0, 0.0)])
@@ -237,7 +228,7 @@ def test_scans_add_up_and_do_not_mix():
     assert math.isnan(empty.mean_ap())
 
 
-def test_boxes_by_range():
+def test_boxes_by_range() -> None:
     evaluator = BoxEvaluator()
     truth = [box(10.0, 0.0), box(28.0, 0.0), box(40.0, 0.0)]
     predicted = [box(10.0, 0.0, score=0.9), box(28.5, 0.0, score=0.8), box(12.0, 5.0, score=0.7)]
@@ -252,7 +243,7 @@ def test_boxes_by_range():
     assert evaluator.overall((28.2, 28.6)).n_predicted == 0
 
 
-def test_what_is_excused_is_in_no_pair():
+def test_what_is_excused_is_in_no_pair() -> None:
     evaluator = BoxEvaluator()
     assert evaluator.update([box(20.0, 0.0)], [], ignored=[box(20.0, 0.0)]) == []
 
@@ -265,7 +256,9 @@ SOME_BOXES = st.lists(
 
 @settings(deadline=None)
 @given(st.lists(st.tuples(SOME_BOXES, SOME_BOXES), min_size=2, max_size=4), st.integers(1, 3), st.booleans())
-def test_evaluators_put_together_say_what_one_says(scans, split, oriented):
+def test_evaluators_put_together_say_what_one_says(
+    scans: list[tuple[list[Box], list[Box]]], split: int, oriented: bool
+) -> None:
     whole, first, second = (BoxEvaluator(oriented=oriented) for _ in range(3))
     for k, (predicted, truth) in enumerate(scans):
         scan = [box(*each) for each in predicted], [box(*each) for each in truth]
@@ -279,7 +272,7 @@ def test_evaluators_put_together_say_what_one_says(scans, split, oriented):
         both + BoxEvaluator(0.7, oriented=oriented)
 
 
-def test_overall_puts_together_what_it_is_told_to():
+def test_overall_puts_together_what_it_is_told_to() -> None:
     truth = [box(10.0, 0.0, "van"), box(20.0, 0.0, "pedestrian"), box(30.0, 0.0, "car")]
     evaluator = BoxEvaluator(0.5, together=("car", "van"))
     pairs = evaluator.update([box(10.0, 0.0), box(20.0, 0.0), box(30.0, 0.0, "pedestrian")], truth)
@@ -288,7 +281,7 @@ def test_overall_puts_together_what_it_is_told_to():
         assert (scores.n_truth, scores.n_predicted, scores.n_hits) == (2, 2, 1)
 
 
-def test_better_scores_choose_first_and_take_what_fits_best():
+def test_better_scores_choose_first_and_take_what_fits_best() -> None:
     truth = [box(10.0, 0.0), box(11.0, 0.0)]
     evaluator = BoxEvaluator(0.5)
     # Listed worst first. The better prediction overlaps both; it takes the nearer, and leaves the other.
@@ -297,7 +290,7 @@ def test_better_scores_choose_first_and_take_what_fits_best():
     assert evaluator.overall().mean_iou_50 == pytest.approx((3.8 / 4.2 + 3.9 / 4.1) / 2)
 
 
-def test_ignored_boxes_and_regions_make_neither_right_nor_wrong():
+def test_ignored_boxes_and_regions_make_neither_right_nor_wrong() -> None:
     evaluator = BoxEvaluator(0.5)
     evaluator.update(
         [
@@ -319,7 +312,7 @@ def test_ignored_boxes_and_regions_make_neither_right_nor_wrong():
     assert close.overall().n_hits == 1
 
 
-def test_axis_aligned_bounds_are_what_the_paper_compares():
+def test_axis_aligned_bounds_are_what_the_paper_compares() -> None:
     turned = [box(10.0, 0.0, yaw=math.pi / 4.0)]
     other = [box(10.0, 0.0, yaw=-math.pi / 4.0)]
     oriented, aligned = BoxEvaluator(0.5), BoxEvaluator(0.5, oriented=False)
@@ -333,15 +326,12 @@ def test_axis_aligned_bounds_are_what_the_paper_compares():
 
 
 @pytest.mark.parametrize("threshold", [0.0, -0.5, 1.1, math.nan])
-def test_thresholds_out_of_range_raise(threshold):
+def test_thresholds_out_of_range_raise(threshold: float) -> None:
     with pytest.raises(PointsError, match="iou_threshold"):
         BoxEvaluator(threshold)
 
 
-# --- headings and distinct objects
-
-
-def test_headings_by_hand():
+def test_headings_by_hand() -> None:
     square = {"size": (2.0, 2.0)}
     truth = [box(10.0 * k, 0.0, yaw=yaw, **square) for k, yaw in enumerate((0.0, 0.0, 0.0, 3.1, 0.0))]
     predicted = [
@@ -369,7 +359,7 @@ def test_headings_by_hand():
 
 @settings(deadline=None)
 @given(st.lists(st.tuples(st.integers(-700, 700), st.integers(-700, 700)), max_size=5))
-def test_headings_are_those_of_unit_vectors(degrees):
+def test_headings_are_those_of_unit_vectors(degrees: list[tuple[int, int]]) -> None:
     side = {"size": (2.0, 2.0)}
     degrees = [(a, b) for a, b in degrees if (a - b) % 90 != 45]  # exactly 45 degrees depends on rounding
     truth = [box(10.0 * k, 0.0, yaw=math.radians(b), **side) for k, (_, b) in enumerate(degrees)]
@@ -383,7 +373,7 @@ def test_headings_are_those_of_unit_vectors(degrees):
         assert scores.axis == pytest.approx(np.mean(np.abs(cosines) > math.sqrt(0.5)))
 
 
-def test_an_object_counts_once_a_drive():
+def test_an_object_counts_once_a_drive() -> None:
     evaluator = BoxEvaluator()
     one, other = box(10.0, 0.0, size=(4.123, 2.0)), box(30.0, 0.0, size=(4.13, 2.0))
     moved = box(14.0, 3.0, size=(4.1249, 2.0), yaw=0.4)
@@ -402,7 +392,7 @@ def test_an_object_counts_once_a_drive():
     assert (far.n_truth, far.n_objects, far.n_drives, far.n_found) == (1, 1, 1, 0)
 
 
-def test_a_mean_leaves_nan_out():
+def test_a_mean_leaves_nan_out() -> None:
     assert mean([0.5, math.nan, 1.0]) == 0.75
     assert math.isnan(mean([]))
     assert math.isnan(mean([math.nan]))

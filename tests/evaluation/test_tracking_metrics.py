@@ -25,8 +25,6 @@ from edgeperc.evaluation.tracking_metrics import (
     recall_thresholds,
 )
 
-# --- the figures -----------------------------------------------------------------------------------------------------
-
 
 def row(x: float, y: float = 0.0) -> list[float]:
     return [x, y, 0.0, 4.0, 2.0, 1.5, 0.0]

@@ -20,8 +20,8 @@ from edgeperc_export.release import agree as module
 from edgeperc_export.release.agree import agree, summary
 
 
-def measured(labels: list[int], mean_iou: float, ap: float | None) -> module._Measured:
-    return module._Measured([np.array(labels, np.uint8)], mean_iou, ap, "an engine")
+def measured(labels: list[int], mean_iou: float, ap: float | None) -> module.Measured:
+    return module.Measured([np.array(labels, np.uint8)], mean_iou, ap, "an engine")
 
 
 @pytest.mark.parametrize(
@@ -29,7 +29,7 @@ def measured(labels: list[int], mean_iou: float, ap: float | None) -> module._Me
     [(0.8, 0.6, 0.0), (0.79, 0.6, 1.0), (0.9, 0.58, 2.0), (0.79, 0.58, 2.0), (0.9, 0.7, 0.0)],
 )
 def test_the_loss_is_the_larger_one_of_iou_and_ap_in_points(mean_iou: float, ap: float, loss: float) -> None:
-    record = module._record(measured([0, 1, 2, 3], mean_iou, ap), measured([0, 1, 2, 2], 0.8, 0.6), "a command")
+    record = module.record_of(measured([0, 1, 2, 3], mean_iou, ap), measured([0, 1, 2, 2], 0.8, 0.6), "a command")
     assert record["loss"] == pytest.approx(loss)
     assert (record["label_agreement"], record["n_scans"]) == (0.75, 1)
     assert (record["mean_iou"], record["fp32_mean_iou"], record["ap"], record["fp32_ap"]) == (mean_iou, 0.8, ap, 0.6)
@@ -38,7 +38,7 @@ def test_the_loss_is_the_larger_one_of_iou_and_ap_in_points(mean_iou: float, ap:
 
 
 def test_a_network_without_boxes_has_no_ap() -> None:
-    record = module._record(measured([0], 0.5, None), measured([0], 0.6, None), "a command")
+    record = module.record_of(measured([0], 0.5, None), measured([0], 0.6, None), "a command")
     assert (record["loss"], record["ap"], record["fp32_ap"]) == (10.0, None, None)
     assert "AP" not in summary({"int8": record})[0]
 

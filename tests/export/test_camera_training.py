@@ -54,8 +54,8 @@ from edgeperc_export.training.images import (
     normalized,
     read_camvid,
 )
-from edgeperc_export.training.losses import _lovasz_at_once, cross_entropy, lovasz_softmax
-from edgeperc_export.training.train import _last
+from edgeperc_export.training.losses import cross_entropy, lovasz_at_once, lovasz_softmax
+from edgeperc_export.training.train import last_step
 
 SMALL: dict[str, Any] = {"image_width": 48, "image_height": 36, "batch": 2, "steps": 4, "dropout": 0.0}
 
@@ -87,9 +87,6 @@ def convolutions(network: nn.Module) -> int:
 
 def weights(network: nn.Module) -> int:
     return sum(weight.numel() for weight in network.parameters())
-
-
-# --- structure --------------------------------------------------------------------------------------------------------
 
 
 def unet_weights(widths: list[int], n_channels: int, n_classes: int) -> int:
@@ -202,9 +199,6 @@ def test_early_logits_are_of_training_alone() -> None:
     assert network.eval()(torch.zeros(1, 3, 32, 48)).shape == (1, 11, 8, 12)
 
 
-# --- samples ----------------------------------------------------------------------------------------------------------
-
-
 def test_unlabeled_pixels_are_ignored(drawn: Path) -> None:
     images = read_camvid(drawn, "train")
     assert images.images.shape == (6, 3, 72, 96)
@@ -256,9 +250,6 @@ def test_each_epoch_draws_each_image_once(drawn: Path) -> None:
     assert [torch.equal(a, b) for a, b in zip(samples.batch(5), samples.batch(5), strict=True)] == [True, True]
 
 
-# --- losses and figures -----------------------------------------------------------------------------------------------
-
-
 def test_loss_is_categorical_cross_entropy_by_the_papers_recipe() -> None:
     task = Camera.of(PAPER["unet"])
     logits = torch.randn(2, 11, 6, 8, requires_grad=True)
@@ -288,7 +279,7 @@ def test_lovasz_of_all_classes_at_once_is_the_same() -> None:
         logits = torch.randn(2, 5, 9, 11, requires_grad=True)
         labels = torch.randint(0, max(n_known, 1), (2, 9, 11)).byte()
         labels[:, : 9 if n_known == 0 else 2] = IGNORE
-        one, other = lovasz_softmax(logits, labels), _lovasz_at_once(logits, labels)
+        one, other = lovasz_softmax(logits, labels), lovasz_at_once(logits, labels)
         assert torch.allclose(one, other, atol=1e-6)
         slopes = [torch.autograd.grad(each, logits)[0] for each in (one, other)]
         assert torch.allclose(*slopes, atol=1e-4)
@@ -325,9 +316,6 @@ def test_confusions_count_each_image(drawn: Path) -> None:
     assert counts.sum(0).trace() == counts.sum()
     assert loss < 1e-6
     assert torch.equal(labels[known], images.labels[known])
-
-
-# --- training ---------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("network", ["camseg", "segnet", "unet-small", "unet-small-leaky"])
@@ -386,10 +374,10 @@ def test_training_stops_without_a_better_validation() -> None:
     def curve(*figures: float) -> list[dict[str, Any]]:
         return [{"step": 11 * (k + 1), "validation": {"mean": figure}} for k, figure in enumerate(figures)]
 
-    assert _last(recipe, [], 11) == recipe.steps
-    assert _last(recipe, curve(0.1, 0.3, 0.2, 0.3), 11) == recipe.steps
-    assert _last(recipe, curve(0.1, 0.3, 0.2, 0.3, 0.1), 11) == 55
-    assert _last(replace(recipe, stop_after=0), curve(0.3, 0.1, 0.1, 0.1, 0.1), 11) == recipe.steps
+    assert last_step(recipe, [], 11) == recipe.steps
+    assert last_step(recipe, curve(0.1, 0.3, 0.2, 0.3), 11) == recipe.steps
+    assert last_step(recipe, curve(0.1, 0.3, 0.2, 0.3, 0.1), 11) == 55
+    assert last_step(replace(recipe, stop_after=0), curve(0.3, 0.1, 0.1, 0.1, 0.1), 11) == recipe.steps
 
 
 def test_the_papers_protocol_keeps_the_best_epoch(drawn: Path, tmp_path: Path) -> None:
@@ -403,9 +391,6 @@ def test_the_papers_protocol_keeps_the_best_epoch(drawn: Path, tmp_path: Path) -
 def test_images_are_needed(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="give --camvid"):
         train(Recipe("camseg"), tmp_path, kitti=None, simulated=None)
-
-
-# --- the comparison ---------------------------------------------------------------------------------------------------
 
 
 def test_comparison_resumes_network_by_network(drawn: Path, tmp_path: Path) -> None:
@@ -436,9 +421,6 @@ def test_comparison_resumes_network_by_network(drawn: Path, tmp_path: Path) -> N
     show_camvid(tmp_path / "camvid.npz", tmp_path / "all.png", drawn)
     assert read_image(tmp_path / "own.png").shape[1] == read_image(tmp_path / "all.png").shape[1]
     assert np.load(tmp_path / "camvid.npz")[names[0]].shape == (3, 72, 96)
-
-
-# --- export -----------------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")

@@ -94,9 +94,6 @@ def with_edges(rng: np.random.Generator, n: int) -> np.ndarray:
     return points
 
 
-# --- images ----------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("n", [0, 1, 5000])
 def test_a_picture_equals_its_twin(n: int) -> None:
     points = with_edges(np.random.default_rng(n), n)
@@ -137,9 +134,6 @@ def test_a_card_with_the_databases_view_has_its_cells() -> None:
     image = picture(points)
     np.testing.assert_array_equal(image[..., 0] > 0, seen.index >= 0)
     np.testing.assert_allclose(image[..., 0] / 255, seen.image[0], atol=0.6 / 255)
-
-
-# --- labels and maps -------------------------------------------------------------------------------------------------
 
 
 def footprints(kitti: Path, name: str) -> list[tuple[str, Polygon]]:
@@ -226,9 +220,6 @@ def test_pedestrians_and_vehicles_out_of_view_are_left_out() -> None:
     seen = Box("car", 1.0, (20.0, 0.0, -1.0), (4.0, 1.8, 1.5), 0.3)
     boxes = [seen, replace(seen, label="pedestrian"), replace(seen, center=(80.0, 0.0, 0.0))]
     assert [b.label for b in vehicles(boxes)] == ["car"]
-
-
-# --- the database ----------------------------------------------------------------------------------------------------
 
 
 def test_three_folders_with_equal_names_and_an_index(out: Path, kitti: Path) -> None:
@@ -377,9 +368,6 @@ def test_wrong_usage_of_the_reader_is_explained(out: Path, tmp_path: Path) -> No
         (tmp_path / "copy/manifest.json").write_text(text)
         with pytest.raises(DatabaseError, match=message):
             TopViewDatabase(tmp_path / "copy")
-
-
-# --- equal results of all builds -------------------------------------------------------------------------------------
 
 
 def test_processes_make_the_same_files(out: Path, kitti: Path, model: str, polygons: Path, tmp_path: Path) -> None:
@@ -649,9 +637,6 @@ def test_notes_report_what_a_data_set_lacks(kitti: Path, model: str, polygons: P
     assert "000007" in report.notes[0]
     assert "frames.csv" in report.notes[1]
     assert TopViewDatabase(tmp_path / "out", "test").names == ["000002"]
-
-
-# --- polygons --------------------------------------------------------------------------------------------------------
 
 
 def test_polygons_and_run_lengths_become_masks(tmp_path: Path) -> None:

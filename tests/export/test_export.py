@@ -52,7 +52,7 @@ from edgeperc_export.training.samples import Recent, Samples, loaded, real_scans
 from edgeperc_export.training.start import start
 from edgeperc_export.training.task import Task, task_of
 from edgeperc_export.training.teacher import OnnxTeacher, pseudo_labeled, teach, unlabeled_scans
-from edgeperc_export.training.train import _optimizer, _schedule
+from edgeperc_export.training.train import make_optimizer, make_schedule
 from edgeperc_export.training.watch import Watch
 
 
@@ -217,12 +217,12 @@ def test_a_longer_run_starts_like_a_shorter_one(tmp_path: Path, simulated: Path)
 
 def test_the_learning_rate_rises_stays_and_falls() -> None:
     recipe = Recipe("pointseg", steps=1000, cooldown=0.4)
-    rates = [_schedule(recipe, step) for step in range(1000)]
+    rates = [make_schedule(recipe, step) for step in range(1000)]
     assert rates[0] == 0.01
     assert set(rates[99:600]) == {1.0}
     assert all(a > b for a, b in itertools.pairwise(rates[600:]))
     assert rates[-1] < 1e-4
-    assert {_schedule(PAPER["ssadnet"], step) for step in (0, 30_000, 64_999)} == {1.0}
+    assert {make_schedule(PAPER["ssadnet"], step) for step in (0, 30_000, 64_999)} == {1.0}
 
 
 def test_a_run_starts_from_the_weights_it_shares_with_a_checkpoint(tmp_path: Path, simulated: Path) -> None:
@@ -334,7 +334,7 @@ def test_the_papers_recipes_match_the_papers() -> None:
     assert lodnn.n_pasted == lodnn.ema == lodnn.lovasz_weight == lodnn.simulated_share == lodnn.distil == 0.0
     assert not any(isinstance(m, nn.BatchNorm2d) for m in build(lodnn).modules())
     assert not any(isinstance(m, nn.BatchNorm2d) for m in build(ssadnet).segmentation.modules())  # type: ignore[union-attr, operator]
-    optimizer = _optimizer(pointseg, build(pointseg))
+    optimizer = make_optimizer(pointseg, build(pointseg))
     assert type(optimizer) is torch.optim.Adagrad
 
 
@@ -607,7 +607,7 @@ def test_scans_with_false_objects_are_drawn_more_often(kitti: Path, simulated: P
     samples.redraw(Blind(), 1000)
     for name in ("real", "simulated"):
         odds = samples.odds[name]
-        loads = [samples.real[k] if name == "real" else samples._load(k) for k in range(2)]
+        loads = [samples.real[k] if name == "real" else samples.load(k) for k in range(2)]
         false = [int(((far := samples.sample(s))[0][4] > 1.0)[far[1] == 0].sum()) for s in loads]
         assert odds[int(np.argmax(false))] > odds[int(np.argmin(false))]
     again = Samples(small("pointseg", n_pasted=0.0), scans, scan_weights, sorted(simulated.glob("*.npz")))

@@ -17,7 +17,7 @@ onnx = pytest.importorskip("onnx")
 
 from training_helpers import ablate
 
-from edgeperc_export.cli import _recipe, build_parser, main
+from edgeperc_export.cli import build_parser, main, recipe_of
 from edgeperc_export.networks import build
 from edgeperc_export.recipe import MODELS, NETWORKS, Recipe
 
@@ -99,7 +99,7 @@ def test_every_field_of_a_recipe_is_an_option() -> None:
                     arguments += [option if field.default else option.replace("--", "--no-", 1)]
                 else:
                     arguments += [option, "" if field.default == () else str(field.default)]
-        assert _recipe(build_parser().parse_args(arguments)) == Recipe(network)
+        assert recipe_of(build_parser().parse_args(arguments)) == Recipe(network)
 
 
 @pytest.mark.parametrize(

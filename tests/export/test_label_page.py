@@ -124,9 +124,6 @@ def states(server: LabelServer) -> dict[str, str]:
     return {scene["name"]: scene["state"] for scene in ask(server, "scenes").json if scene["state"]}
 
 
-# --- what it saves ---------------------------------------------------------------------------------------------------
-
-
 def test_the_page_saves_drawn_polygons(server: LabelServer, out: Path) -> None:
     scenes = ask(server, "scenes").json
     assert [scene["name"] for scene in scenes] == TopViewDatabase(out).names
@@ -197,9 +194,6 @@ def test_a_file_that_cannot_be_written_is_reported(server: LabelServer, capsys: 
     server.polygons.rmdir()
     assert ask(server, "road/000001", ROAD).status == 200
     assert roads(server, "000001") == [TRAPEZIUM]
-
-
-# --- what it refuses -------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -422,9 +416,6 @@ def test_a_scenes_name_cannot_leave_its_folder(out: Path, tmp_path: Path) -> Non
             LabelServer(tmp_path / "out", tmp_path / "road.json")
 
 
-# --- limits ----------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("head", "status"),
     [
@@ -525,9 +516,6 @@ def status_of_scenes(server: LabelServer) -> int | None:
         return ask(server, "scenes").status
     except (OSError, http.client.HTTPException):
         return None
-
-
-# --- in a browser ----------------------------------------------------------------------------------------------------
 
 
 def test_drawing_undoing_saving_and_reloading_in_a_browser(server: LabelServer, browser: Any) -> None:

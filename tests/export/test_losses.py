@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 import pytest
@@ -35,32 +37,31 @@ CAR = (26.0, 2.0, -1.0, 4.0, 1.6, 1.5, 0.0)
 
 
 @pytest.fixture
-def rng():
+def rng() -> np.random.Generator:
     return np.random.default_rng(0)
 
 
-def log_softmax(logits):
+def log_softmax(logits: np.ndarray) -> np.ndarray:
     shifted = logits - logits.max(1, keepdims=True)
     return shifted - np.log(np.exp(shifted).sum(1, keepdims=True))
 
 
-def random_maps(rng, n_classes=5, shape=(2, 6, 7), ignored=0.2):
+def random_maps(
+    rng: np.random.Generator, n_classes: int = 5, shape: tuple[int, int, int] = (2, 6, 7), ignored: float = 0.2
+) -> tuple[np.ndarray, np.ndarray]:
     logits = rng.normal(size=(shape[0], n_classes, *shape[1:])).astype(np.float32)
     labels = rng.integers(n_classes, size=shape).astype(np.uint8)
     labels[rng.random(shape) < ignored] = IGNORE
     return logits, labels
 
 
-# --- paper_slot_targets ---------------------------------------------------------------------------------------------
-
-
-def test_slot_of_a_box_ahead():
+def test_slot_of_a_box_ahead() -> None:
     (slot,) = paper_slot_targets([CAR], VIEW, 1)
     # Row (46 - 26) / 0.1 = 200 of 400, column (10 - 2) / 0.1 = 80 of 200; 16 columns across, 40 rows along.
     np.testing.assert_allclose(slot, [80 / 200, 200 / 400, 16 / 200, 40 / 400], rtol=1e-6)
 
 
-def test_slots_of_rotated_boxes_contain_the_footprint(rng):
+def test_slots_of_rotated_boxes_contain_the_footprint(rng: np.random.Generator) -> None:
     for _ in range(20):
         yaw = rng.uniform(-np.pi, np.pi)
         box = np.array([rng.uniform(12, 40), rng.uniform(-5, 5), 0.0, rng.uniform(1, 9), rng.uniform(1, 3), 1.5, yaw])
@@ -77,41 +78,38 @@ def test_slots_of_rotated_boxes_contain_the_footprint(rng):
         np.testing.assert_allclose(paper_slot_targets([box], VIEW, 1)[0], expected, rtol=1e-5)
 
 
-def test_slots_are_nearest_first_and_the_farthest_are_dropped():
+def test_slots_are_nearest_first_and_the_farthest_are_dropped() -> None:
     boxes = [(x, 0.0, 0.0, 4.0, 2.0, 1.5, 0.0) for x in (30.0, 10.0, 40.0, 20.0)]
     target = paper_slot_targets(boxes, VIEW, 3)
     np.testing.assert_allclose(target[:, 1], [0.9, 0.65, 0.4], rtol=1e-6)
 
 
-def test_empty_slots_are_zero():
+def test_empty_slots_are_zero() -> None:
     assert paper_slot_targets([CAR], VIEW, 4)[1:].tolist() == [[0.0] * 4] * 3
     assert paper_slot_targets([], VIEW, 2).tolist() == [[0.0] * 4] * 2
     assert paper_slot_targets(np.empty((0, 7)), VIEW, 2).dtype == np.float32
 
 
-# --- slot_targets ---------------------------------------------------------------------------------------------------
-
-
-def test_a_slot_has_the_box_centered_in_its_square():
+def test_a_slot_has_the_box_centered_in_its_square() -> None:
     target = slot_targets([CAR], VIEW).reshape(12, 6, 5)
     # Row 200 is in the square of rows 192 to 223, column 80 in that of columns 64 to 95.
     np.testing.assert_allclose(target[6, 2], [80 / 200, 200 / 400, 16 / 200, 40 / 400, 1.0], rtol=1e-6)
     assert np.count_nonzero(target) == 5
 
 
-def test_the_last_squares_get_the_cells_left_over():
+def test_the_last_squares_get_the_cells_left_over() -> None:
     target = slot_targets([(6.05, -9.95, 0.0, 4.0, 2.0, 1.5, 0.0)], VIEW).reshape(12, 6, 5)
     np.testing.assert_allclose(target[11, 5, :2], [199.5 / 200, 399.5 / 400], rtol=1e-6)
     assert np.count_nonzero(target[..., 4]) == 1
 
 
-def test_of_two_objects_in_a_square_the_slot_gets_the_nearer():
+def test_of_two_objects_in_a_square_the_slot_gets_the_nearer() -> None:
     near, far = (26.0, 1.0, 0.0, 2.0, 1.0, 1.5, 0.0), (26.5, 3.0, 0.0, 3.0, 1.0, 1.5, 0.0)
     for boxes in ([near, far], [far, near]):
         np.testing.assert_array_equal(slot_targets(boxes, VIEW), slot_targets([near], VIEW))
 
 
-def test_squares_with_unlabeled_cells_or_unsure_objects_are_not_learned():
+def test_squares_with_unlabeled_cells_or_unsure_objects_are_not_learned() -> None:
     labeled = np.ones((400, 200), bool)
     labeled[399, 0] = False  # beyond the last whole square
     labeled[200, 80] = False  # in the square of the car, which is learned anyway
@@ -125,7 +123,7 @@ def test_squares_with_unlabeled_cells_or_unsure_objects_are_not_learned():
 
 
 @pytest.mark.parametrize("center", [(5.9, 0.0), (46.1, 0.0), (20.0, 10.1), (20.0, -10.1), (6.0, 0.0), (np.nan, 0.0)])
-def test_boxes_centered_outside_the_view_are_left_out(center):
+def test_boxes_centered_outside_the_view_are_left_out(center: tuple[float, float]) -> None:
     box = [(*center, *CAR[2:])]
     assert not paper_slot_targets(box, VIEW, 2).any()
     assert not slot_targets(box, VIEW).any()
@@ -136,15 +134,12 @@ def test_boxes_centered_outside_the_view_are_left_out(center):
     "targets",
     [lambda b: paper_slot_targets(b, VIEW, 1), lambda b: slot_targets(b, VIEW), lambda b: dense_targets(b, VIEW)],
 )
-def test_boxes_without_extent_are_refused(targets):
+def test_boxes_without_extent_are_refused(targets: Callable[..., Any]) -> None:
     with pytest.raises(ValueError, match="has no extent"):
         targets([(20.0, 0.0, 0.0, 4.0, 0.0, 1.5, 0.0)])
 
 
-# --- dense_targets --------------------------------------------------------------------------------------------------
-
-
-def test_dense_target_of_one_box():
+def test_dense_target_of_one_box() -> None:
     yaw = 0.3
     target = dense_targets([(26.13, 2.27, -0.8, 4.1, 1.7, 1.5, yaw)], VIEW)
     assert target.shape == (11, 100, 50)
@@ -156,7 +151,7 @@ def test_dense_target_of_one_box():
 
 
 @pytest.mark.parametrize("degrees", [0, 89, -89, 90, 91, -91, 179, -179, 180, 271, 361, -541])
-def test_the_front_that_is_learned_is_decoded(degrees):
+def test_the_front_that_is_learned_is_decoded(degrees: float) -> None:
     target = dense_targets([(26.13, 2.27, -0.8, 4.1, 1.7, 1.5, np.radians(degrees))], VIEW)
     learned = target[0] >= REGRESSED_FROM
     assert learned.sum() > 1
@@ -171,7 +166,7 @@ def test_the_front_that_is_learned_is_decoded(degrees):
 @pytest.mark.parametrize(
     "change", [lambda scan: turned(scan, 2.5), mirrored, lambda scan: mirrored(turned(scan, -1.0))]
 )
-def test_the_front_stays_right_when_a_scan_is_turned_or_mirrored(change):
+def test_the_front_stays_right_when_a_scan_is_turned_or_mirrored(change: Callable[[LabeledScan], LabeledScan]) -> None:
     """A car's nose, a point 2 m ahead of its center, stays ahead of its yaw."""
     box = Box("car", 1.0, (10.0, 3.0, -1.0), (4.0, 1.7, 1.5), 2.0)
     nose = np.float32([[10.0 + 2.0 * np.cos(2.0), 3.0 + 2.0 * np.sin(2.0), -1.0, 0.0]])
@@ -181,7 +176,7 @@ def test_the_front_stays_right_when_a_scan_is_turned_or_mirrored(change):
     assert np.cos(moved.yaw - np.arctan2(y, x)) == pytest.approx(1.0, abs=1e-5)
 
 
-def test_every_learned_cell_points_to_the_same_center():
+def test_every_learned_cell_points_to_the_same_center() -> None:
     target = dense_targets([(26.13, 2.27, -0.8, 9.0, 3.0, 1.5, 0.3)], VIEW)
     rows, cols = np.nonzero(target[0] >= REGRESSED_FROM)
     assert len(rows) > 5
@@ -190,7 +185,7 @@ def test_every_learned_cell_points_to_the_same_center():
     assert not target[1:, target[0] < REGRESSED_FROM].any()
 
 
-def test_heat_lies_along_the_box():
+def test_heat_lies_along_the_box() -> None:
     # 45 degrees to the left: ahead (up a row) goes with left (down a column).
     heat = dense_targets([(26.0, 0.0, 0.0, 8.0, 2.0, 1.5, np.pi / 4)], VIEW)[0]
     ((row, col),) = np.argwhere(heat == 1.0)
@@ -202,7 +197,7 @@ def test_heat_lies_along_the_box():
     assert ahead[row - 10, col] == pytest.approx(np.exp(-4.5), rel=1e-5)
 
 
-def test_neighbors_keep_their_own_geometry():
+def test_neighbors_keep_their_own_geometry() -> None:
     near, far = (20.0, 0.1, -1.0, 4.0, 1.6, 1.5, 0.0), (21.7, 0.1, -0.5, 8.0, 2.4, 3.0, 0.0)
     for boxes in ([near, far], [far, near]):
         target = dense_targets(boxes, VIEW)
@@ -215,7 +210,7 @@ def test_neighbors_keep_their_own_geometry():
         np.testing.assert_array_equal(target[0], alone)
 
 
-def test_unlabeled_cells_learn_nothing():
+def test_unlabeled_cells_learn_nothing() -> None:
     labeled = np.ones((400, 200), bool)
     labeled[:101] = False  # the 26th output row is only partly labeled
     heat = dense_targets([CAR, (44.0, 0.0, *CAR[2:])], VIEW, labeled=labeled)[0]
@@ -224,7 +219,7 @@ def test_unlabeled_cells_learn_nothing():
     assert (heat == 1.0).sum() == 2  # a labeled box counts in any cell
 
 
-def test_unsure_boxes_are_not_learned():
+def test_unsure_boxes_are_not_learned() -> None:
     unsure = (26.0, -4.0, *CAR[2:])
     target = dense_targets([CAR], VIEW, unsure=[unsure])
     np.testing.assert_array_equal(target[0] == -1.0, dense_targets([unsure], VIEW)[0] > 0.1)
@@ -235,8 +230,6 @@ def test_unsure_boxes_are_not_learned():
     assert (dense_targets([], VIEW, unsure=np.empty((0, 7))) == 0.0).all()
 
 
-# --- The runtime decodes the training targets -------------------------------------------------------------------------
-
 CLASSES = ("background", "drivable", "car", "van", "truck")
 ROUND_TRIP = {  # nearest first, as slots are
     "car": (9.37, -4.21, -0.91, 3.9, 1.6, 1.5, np.pi / 2),
@@ -245,7 +238,7 @@ ROUND_TRIP = {  # nearest first, as slots are
 }
 
 
-def painted(boxes):
+def painted(boxes: dict[str, tuple[float, ...]]) -> np.ndarray:
     """Labels (400, 200) of upright boxes, by class."""
     labels = np.zeros((400, 200), np.uint8)
     for label, box in boxes.items():
@@ -256,7 +249,7 @@ def painted(boxes):
     return labels
 
 
-def same_boxes(found, boxes, *, atol):
+def same_boxes(found: Sequence[Any], boxes: dict[str, tuple[float, ...]], *, atol: float) -> None:
     assert sorted(box.label for box in found) == sorted(boxes)
     for box in found:
         x, y, z, length, width, height, yaw = boxes[box.label]
@@ -265,7 +258,7 @@ def same_boxes(found, boxes, *, atol):
         assert abs(np.sin(box.yaw - yaw)) < 1e-4  # front and rear look alike
 
 
-def test_slots_survive_the_round_trip():
+def test_slots_survive_the_round_trip() -> None:
     priors = {label: box[3:6] for label, box in ROUND_TRIP.items()}
     slots = paper_slot_targets(list(ROUND_TRIP.values()), VIEW, 8)[None]
     scores = np.full((400, 200), 0.5, np.float32)
@@ -274,7 +267,7 @@ def test_slots_survive_the_round_trip():
     same_boxes(found, standing, atol=1e-4)
 
 
-def test_scored_slots_survive_the_round_trip():
+def test_scored_slots_survive_the_round_trip() -> None:
     priors = {label: box[3:6] for label, box in ROUND_TRIP.items()}
     slots = slot_targets(list(ROUND_TRIP.values()), VIEW)
     slots[:, 4] = 8.0 * slots[:, 4] - 4.0  # logits
@@ -287,7 +280,7 @@ def test_scored_slots_survive_the_round_trip():
 
 
 @pytest.mark.parametrize("turn", [0.0, 0.3, 1.0, 2.2, -0.8, -2.9])
-def test_dense_boxes_survive_the_round_trip(turn):
+def test_dense_boxes_survive_the_round_trip(turn: float) -> None:
     boxes = {label: (*box[:6], box[6] + turn) for label, box in ROUND_TRIP.items()}
     dense = dense_targets(list(boxes.values()), VIEW)
     heat = dense[0].clip(1e-6, 1.0 - 1e-6)
@@ -298,10 +291,7 @@ def test_dense_boxes_survive_the_round_trip(turn):
     assert all(box.score > 0.999 for box in found)
 
 
-# --- Cross-entropy (equation 4), focal, Lovász ----------------------------------------------------------------------
-
-
-def test_segmentation_loss_is_equation_4(rng):
+def test_segmentation_loss_is_equation_4(rng: np.random.Generator) -> None:
     logits, labels = random_maps(rng, ignored=0.0)
     n, height, width = labels.shape
     y_true = np.eye(5)[labels].transpose(0, 3, 1, 2)
@@ -311,7 +301,9 @@ def test_segmentation_loss_is_equation_4(rng):
 
 @pytest.mark.parametrize("gamma", [0.0, 2.0])
 @pytest.mark.parametrize("weights", [None, [0.1, 1.0, 2.0, 0.0, 5.0]])
-def test_weighted_cross_entropy_with_ignored_pixels(rng, weights, gamma):
+def test_weighted_cross_entropy_with_ignored_pixels(
+    rng: np.random.Generator, weights: list[float] | None, gamma: float
+) -> None:
     logits, labels = random_maps(rng)
     total = share = 0.0
     log_p = log_softmax(logits)
@@ -330,14 +322,14 @@ def test_weighted_cross_entropy_with_ignored_pixels(rng, weights, gamma):
     ("p", "gamma", "expected"),
     [(0.5, 2.0, 0.25 * np.log(2.0)), (0.9, 2.0, -0.01 * np.log(0.9)), (0.1, 0.5, -(0.9**0.5) * np.log(0.1))],
 )
-def test_the_focal_loss_of_a_pixel_is_its_formula(p, gamma, expected):
+def test_the_focal_loss_of_a_pixel_is_its_formula(p: float, gamma: float, expected: float) -> None:
     logits = torch.tensor([np.log(p), np.log(1.0 - p)], dtype=torch.float32).view(1, 2, 1, 1)
     loss = cross_entropy(logits, torch.zeros((1, 1, 1), dtype=torch.uint8), focal_gamma=gamma)
     assert loss.item() == pytest.approx(expected, rel=1e-5)
 
 
 @pytest.mark.parametrize("loss", [cross_entropy, lovasz_softmax, lambda x, y: pointseg_loss(x, y, lovasz_weight=1.0)])
-def test_the_loss_without_labels_is_0(loss):
+def test_the_loss_without_labels_is_0(loss: Callable[..., torch.Tensor]) -> None:
     logits = torch.randn(2, 4, 3, 3, requires_grad=True)
     value = loss(logits, torch.full((2, 3, 3), IGNORE, dtype=torch.uint8))
     value.backward()
@@ -346,7 +338,7 @@ def test_the_loss_without_labels_is_0(loss):
 
 
 @pytest.mark.parametrize("loss", [cross_entropy, lovasz_softmax])
-def test_ignored_pixels_get_no_gradient(rng, loss):
+def test_ignored_pixels_get_no_gradient(rng: np.random.Generator, loss: Callable[..., torch.Tensor]) -> None:
     logits, labels = random_maps(rng)
     tensor = torch.tensor(logits, requires_grad=True)
     loss(tensor, torch.tensor(labels)).backward()
@@ -355,7 +347,7 @@ def test_ignored_pixels_get_no_gradient(rng, loss):
     assert gradient[labels != IGNORE].any()
 
 
-def test_distillation_is_lowest_at_the_teachers_probabilities(rng):
+def test_distillation_is_lowest_at_the_teachers_probabilities(rng: np.random.Generator) -> None:
     logits, _ = random_maps(rng)
     teacher = np.exp(log_softmax(rng.normal(size=logits.shape)))
     expected = -(teacher * log_softmax(logits.astype(np.float64))).sum(1).mean()
@@ -365,7 +357,9 @@ def test_distillation_is_lowest_at_the_teachers_probabilities(rng):
 
 
 @pytest.mark.parametrize(("n_taught", "n_own"), [(9, 9), (9, 11), (11, 9), (11, 11)])
-def test_distillation_of_boxes_is_weighted_by_the_teachers_heat(rng, n_taught, n_own):
+def test_distillation_of_boxes_is_weighted_by_the_teachers_heat(
+    rng: np.random.Generator, n_taught: int, n_own: int
+) -> None:
     taught = rng.normal(size=(2, n_taught, 3, 4)).astype(np.float32)
     own = rng.normal(size=(2, n_own, 3, 4)).astype(np.float32)
     heat = 1.0 / (1.0 + np.exp(-taught[:, 0].astype(np.float64)))
@@ -386,7 +380,7 @@ def test_distillation_of_boxes_is_weighted_by_the_teachers_heat(rng, n_taught, n
     assert torch.isfinite(box_distillation_loss(torch.from_numpy(own), nothing))
 
 
-def test_lovasz_of_hard_predictions_is_one_minus_mean_iou(rng):
+def test_lovasz_of_hard_predictions_is_one_minus_mean_iou(rng: np.random.Generator) -> None:
     _, labels = random_maps(rng, n_classes=3)
     predicted = rng.integers(3, size=labels.shape)
     known = labels != IGNORE
@@ -399,7 +393,7 @@ def test_lovasz_of_hard_predictions_is_one_minus_mean_iou(rng):
     assert loss.item() == pytest.approx(1.0 - np.mean(ious), abs=1e-5)
 
 
-def test_lovasz_is_the_extension_of_the_jaccard_loss(rng):
+def test_lovasz_is_the_extension_of_the_jaccard_loss(rng: np.random.Generator) -> None:
     """Its definition: the Jaccard loss of each set of largest errors, weighted by the steps between the errors."""
     logits, labels = random_maps(rng, n_classes=2, shape=(1, 3, 4), ignored=0.0)
     p = np.exp(log_softmax(logits))[0]
@@ -417,7 +411,7 @@ def test_lovasz_is_the_extension_of_the_jaccard_loss(rng):
     assert loss.item() == pytest.approx(np.mean(expected), rel=1e-5)
 
 
-def test_pointseg_loss_is_the_sum_of_its_parts(rng):
+def test_pointseg_loss_is_the_sum_of_its_parts(rng: np.random.Generator) -> None:
     logits, labels = (torch.tensor(a) for a in random_maps(rng, n_classes=4))
     weights = torch.tensor([0.1, 1.0, 2.0, 3.0])
     total = pointseg_loss(logits, labels, weights, focal_gamma=1.5, lovasz_weight=0.7)
@@ -426,24 +420,21 @@ def test_pointseg_loss_is_the_sum_of_its_parts(rng):
     torch.testing.assert_close(pointseg_loss(logits, labels), cross_entropy(logits, labels))
 
 
-# --- Boxes ----------------------------------------------------------------------------------------------------------
-
-
-def test_paper_slots_loss_is_equations_5_and_6(rng):
+def test_paper_slots_loss_is_equations_5_and_6(rng: np.random.Generator) -> None:
     predicted, target = rng.random((2, 3, 6, 4)).astype(np.float32)
     n, k, _ = target.shape
     mean_squared = [((target[..., i] - predicted[..., i]) ** 2).sum() / (n * k) for i in range(4)]
     assert paper_slots_loss(torch.tensor(predicted), torch.tensor(target)).item() == pytest.approx(sum(mean_squared))
 
 
-def test_negative_slots_are_not_learned(rng):
+def test_negative_slots_are_not_learned(rng: np.random.Generator) -> None:
     predicted, target = (torch.tensor(a.astype(np.float32)) for a in rng.random((2, 2, 6, 4)))
     target[1] = -1.0
     torch.testing.assert_close(paper_slots_loss(predicted, target), paper_slots_loss(predicted[:1], target[:1]))
     assert paper_slots_loss(predicted[1:], target[1:]).item() == 0.0
 
 
-def slots_case(rng):
+def slots_case(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     target = np.stack([slot_targets([CAR, (15.0, -3.0, 0.0, 6.0, 2.0, 2.0, 0.7)], VIEW), slot_targets([], VIEW)])
     target[:, :9, 4] = -1.0
     predicted = rng.uniform(0.02, 0.3, target.shape)
@@ -452,7 +443,7 @@ def slots_case(rng):
     return predicted.astype(np.float32), target
 
 
-def test_slots_loss_is_the_presence_and_the_error_of_each_box(rng):
+def test_slots_loss_is_the_presence_and_the_error_of_each_box(rng: np.random.Generator) -> None:
     predicted, target = slots_case(rng)
     presence, boxes = slots_loss(torch.tensor(predicted), torch.tensor(target))
     learned = target[..., 4] >= 0.0
@@ -469,7 +460,7 @@ def test_slots_loss_is_the_presence_and_the_error_of_each_box(rng):
     assert boxes.item() == pytest.approx(expected / 2, rel=1e-4)
 
 
-def test_slots_loss_ignores_unlearned_slots_and_boxes_of_empty_ones(rng):
+def test_slots_loss_ignores_unlearned_slots_and_boxes_of_empty_ones(rng: np.random.Generator) -> None:
     predicted, target = slots_case(rng)
     tensor = torch.tensor(predicted, requires_grad=True)
     sum(slots_loss(tensor, torch.tensor(target))).backward()
@@ -478,7 +469,7 @@ def test_slots_loss_ignores_unlearned_slots_and_boxes_of_empty_ones(rng):
     assert (gradient[..., :4].any(-1) == (target[..., 4] == 1.0)).all()
 
 
-def test_slots_loss_of_the_truth_is_small_and_of_no_objects_is_finite(rng):
+def test_slots_loss_of_the_truth_is_small_and_of_no_objects_is_finite(rng: np.random.Generator) -> None:
     _, target = slots_case(rng)
     perfect = torch.tensor(target)
     perfect[..., 4] = torch.where(perfect[..., 4] == 1.0, 30.0, -30.0)
@@ -493,18 +484,18 @@ def test_slots_loss_of_the_truth_is_small_and_of_no_objects_is_finite(rng):
         assert loss.isfinite()
 
 
-def cross_of_logits(logits, truth):
+def cross_of_logits(logits: np.ndarray, truth: np.ndarray | float) -> np.ndarray:
     p = 1.0 / (1.0 + np.exp(-logits.astype(np.float64)))
     return -(truth * np.log(p) + (1.0 - truth) * np.log(1.0 - p))
 
 
-def dense_case(rng):
+def dense_case(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     target = np.stack([dense_targets([CAR, (15.0, -3.0, 0.0, 6.0, 2.0, 2.0, 0.7)], VIEW), dense_targets([], VIEW)])
     target[:, 0, :20] = -1.0
     return rng.normal(size=target.shape).astype(np.float32), target
 
 
-def test_dense_loss(rng):
+def test_dense_loss(rng: np.random.Generator) -> None:
     predicted, target = dense_case(rng)
     heat, p = target[:, 0], 1.0 / (1.0 + np.exp(-predicted[:, 0].astype(np.float64)))
     hit = (1 - p) ** 2 * np.log(p)
@@ -521,7 +512,7 @@ def test_dense_loss(rng):
     assert with_front[1].item() == pytest.approx((error * share).sum() / share.sum(), rel=1e-4)
 
 
-def test_dense_loss_ignores_unlearned_cells(rng):
+def test_dense_loss_ignores_unlearned_cells(rng: np.random.Generator) -> None:
     predicted, target = dense_case(rng)
     tensor = torch.tensor(predicted, requires_grad=True)
     sum(dense_loss(tensor, torch.tensor(target))).backward()
@@ -531,7 +522,7 @@ def test_dense_loss_ignores_unlearned_cells(rng):
     assert gradient[:, 1:].any(1)[target[:, 0] >= REGRESSED_FROM].all()
 
 
-def test_dense_loss_of_the_truth_is_small_and_of_no_boxes_is_finite():
+def test_dense_loss_of_the_truth_is_small_and_of_no_boxes_is_finite() -> None:
     target = torch.tensor(dense_targets([CAR], VIEW))[None]
     perfect = target.clone()
     perfect[:, 0] = torch.where(target[:, 0] == 1.0, 30.0, -30.0)
@@ -548,7 +539,7 @@ def test_dense_loss_of_the_truth_is_small_and_of_no_boxes_is_finite():
 
 
 @pytest.mark.parametrize("head", ["slots-paper", "slots", "dense"])
-def test_ssadnet_loss_is_equation_3(rng, head):
+def test_ssadnet_loss_is_equation_3(rng: np.random.Generator, head: str) -> None:
     logits, labels = (torch.tensor(a) for a in random_maps(rng))
     if head == "slots":
         boxes, targets = (torch.tensor(a) for a in slots_case(rng))
@@ -569,7 +560,7 @@ def test_ssadnet_loss_is_equation_3(rng, head):
 
 
 @pytest.mark.parametrize("shape", [(2, 6, 4), (2, 6, 5), (2, 9, 4, 3), (2, 10, 4, 3)])
-def test_a_batch_without_ground_truth_is_not_learned(shape):
+def test_a_batch_without_ground_truth_is_not_learned(shape: tuple[int, ...]) -> None:
     logits, boxes = torch.randn(2, 5, 16, 12, requires_grad=True), torch.randn(shape, requires_grad=True)
     labels = torch.full((2, 16, 12), IGNORE, dtype=torch.uint8)
     total, _ = ssadnet_loss(logits, boxes, labels, torch.full(shape, -1.0), class_weights=torch.rand(5))
@@ -579,7 +570,7 @@ def test_a_batch_without_ground_truth_is_not_learned(shape):
     assert not boxes.grad.any()
 
 
-def test_losses_take_bfloat16(rng):
+def test_losses_take_bfloat16(rng: np.random.Generator) -> None:
     logits, labels = (torch.tensor(a) for a in random_maps(rng))
     assert cross_entropy(logits.bfloat16(), labels).dtype == torch.float32
     assert cross_entropy(logits.bfloat16(), labels).item() == pytest.approx(
@@ -588,7 +579,7 @@ def test_losses_take_bfloat16(rng):
 
 
 @pytest.mark.parametrize("gamma", [0.5, 1.0, 2.0])
-def test_a_certain_pixel_has_a_finite_gradient(gamma):
+def test_a_certain_pixel_has_a_finite_gradient(gamma: float) -> None:
     logits = torch.tensor([[[[30.0]], [[0.0]]]], requires_grad=True)
     cross_entropy(logits, torch.zeros((1, 1, 1), dtype=torch.uint8), focal_gamma=gamma).backward()
     assert torch.isfinite(logits.grad).all()

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import pytest
@@ -43,17 +45,17 @@ TABLE_1 = [
 
 
 @pytest.fixture(autouse=True)
-def _seed():
+def _seed() -> Iterator[None]:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
         yield
 
 
-def run_and_record(network, x, *names):
+def run_and_record(network: torch.nn.Module, x: torch.Tensor, *names: str) -> Any:
     """The network's outputs, and by name the inputs and outputs of some of its modules."""
     recorded = {}
 
-    def watch(name):
+    def watch(name: str) -> Callable[..., None]:
         return lambda module, inputs, output: recorded.__setitem__(name, (inputs[0], output))
 
     handles = [network.get_submodule(name).register_forward_hook(watch(name)) for name in names]
@@ -64,30 +66,27 @@ def run_and_record(network, x, *names):
     return output, recorded
 
 
-def on_meta(make):
+def on_meta(make: Callable[[], torch.nn.Module]) -> torch.nn.Module:
     """The network in inference mode, with shapes but without values (device "meta")."""
     with torch.device("meta"):
         return make().eval()
 
 
-def n_parameters(module):
+def n_parameters(module: torch.nn.Module) -> int:
     return sum(parameter.numel() for parameter in module.parameters())
 
 
-def giga_macs(network, *shape):
+def giga_macs(network: torch.nn.Module, *shape: int) -> float:
     with FlopCounterMode(display=False) as counter, torch.no_grad():
         network(torch.empty(shape, device="meta"))
     return counter.get_total_flops() / 2e9
 
 
-def agree(actual, expected):
+def agree(actual: torch.Tensor, expected: torch.Tensor) -> None:
     torch.testing.assert_close(actual, expected, rtol=1e-5, atol=1e-6)
 
 
-# --- SSADNet: context module
-
-
-def test_receptive_fields_follow_from_the_dilations():
+def test_receptive_fields_follow_from_the_dilations() -> None:
     assert list(CONTEXT_DILATIONS) == [dilation for dilation, _ in TABLE_1]
     assert receptive_fields() == [field for _, field in TABLE_1]
     assert receptive_fields(((1, 1), (1, 1), (3, 2))) == [(3, 3), (5, 5), (11, 9)]
@@ -95,7 +94,7 @@ def test_receptive_fields_follow_from_the_dilations():
 
 
 @pytest.mark.parametrize("k", range(1, 8))
-def test_the_first_k_context_layers_have_the_receptive_field_of_table_1(k):
+def test_the_first_k_context_layers_have_the_receptive_field_of_table_1(k: int) -> None:
     module = ContextModule(channels=1, width=1).eval()
     for layer in module.dilated:
         if isinstance(layer, nn.Conv2d):
@@ -112,7 +111,7 @@ def test_the_first_k_context_layers_have_the_receptive_field_of_table_1(k):
     assert len(rows) == width * height  # every cell of the field has an effect
 
 
-def test_context_layers_are_dilated_farther_along_the_road():
+def test_context_layers_are_dilated_farther_along_the_road() -> None:
     module = ContextModule()
     convolutions = [layer for layer in module.dilated if isinstance(layer, nn.Conv2d)]
     assert [conv.kernel_size for conv in convolutions] == [(3, 3)] * 7
@@ -121,7 +120,7 @@ def test_context_layers_are_dilated_farther_along_the_road():
     assert module.project[0].kernel_size == (1, 1)  # layer 8
 
 
-def test_spatial_dropout_drops_whole_channels():
+def test_spatial_dropout_drops_whole_channels() -> None:
     names = [f"dilated.{3 * k + 1}" for k in range(7)]
     _, recorded = run_and_record(ContextModule(4, 32, dropout=0.25).train(), torch.randn(2, 4, 9, 5), *names)
     dropped = 0
@@ -132,13 +131,10 @@ def test_spatial_dropout_drops_whole_channels():
     assert 0.15 * 448 < dropped < 0.35 * 448  # 7 x 2 x 32 channels: within five standard deviations
 
 
-# --- SSADNet: pooling and its inverse
-
-
 @pytest.mark.parametrize("shape", [(1, 1, 2, 2), (2, 3, 8, 6), (1, 4, 10, 14)])
 @pytest.mark.parametrize("ties", [False, True])
 @pytest.mark.parametrize("memory_format", [torch.contiguous_format, torch.channels_last])
-def test_unpooling_equals_torchs(shape, ties, memory_format):
+def test_unpooling_equals_torchs(shape: tuple[int, ...], ties: bool, memory_format: torch.memory_format) -> None:
     x = torch.randint(-1, 2, shape).float() if ties else torch.randn(shape)
     x = x.to(memory_format=memory_format).requires_grad_()
     weights, scale = torch.randn(shape), torch.rand(shape[0], shape[1], shape[2] // 2, shape[3] // 2)
@@ -158,7 +154,7 @@ def test_unpooling_equals_torchs(shape, ties, memory_format):
 
 
 @pytest.mark.parametrize("value", [0.0, -2.5, float("inf")])
-def test_of_equal_values_the_first_is_the_maximum(value):
+def test_of_equal_values_the_first_is_the_maximum(value: float) -> None:
     pooled, mask = max_pool_with_mask(torch.full((1, 2, 4, 6), value))
     assert (pooled == value).all()
     expected = torch.zeros(4, 6, dtype=torch.bool)
@@ -166,11 +162,8 @@ def test_of_equal_values_the_first_is_the_maximum(value):
     assert torch.equal(mask, expected.expand(1, 2, 4, 6))
 
 
-# --- SSADNet: the whole network
-
-
 @pytest.mark.parametrize("head", ["slots", "slots-paper", "dense"])
-def test_ssadnet_shapes_at_each_stage(head):
+def test_ssadnet_shapes_at_each_stage(head: str) -> None:
     network = on_meta(lambda: SSADNet(head))
     names = [f"segmentation.{name}" for name in ("encoder", "context.dilated", "context", "decoder")]
     five = {
@@ -198,7 +191,7 @@ def test_ssadnet_shapes_at_each_stage(head):
 @pytest.mark.parametrize(
     ("head", "height", "width"), [("slots", 72, 40), ("slots-paper", 32, 40), ("dense", 8, 24), ("dense", 72, 40)]
 )
-def test_ssadnet_accepts_other_sizes(head, height, width):
+def test_ssadnet_accepts_other_sizes(head: str, height: int, width: int) -> None:
     network = SSADNet(head, n_channels=2, n_classes=3, n_slots=7, context_width=4).eval()
     with torch.no_grad():
         logits, boxes = network(torch.randn(3, 2, height, width))
@@ -209,13 +202,13 @@ def test_ssadnet_accepts_other_sizes(head, height, width):
     assert boxes.isfinite().all()
 
 
-def test_ssadnet_refuses_other_heads():
+def test_ssadnet_refuses_other_heads() -> None:
     with pytest.raises(ValueError, match="'anchors'"):
         SSADNet("anchors")
 
 
 @pytest.mark.parametrize(("head", "detection"), [("slots", 1_036_341), ("slots-paper", 994_416), ("dense", 290_169)])
-def test_parameters_and_arithmetic_of_ssadnet(head, detection):
+def test_parameters_and_arithmetic_of_ssadnet(head: str, detection: int) -> None:
     network = on_meta(lambda: SSADNet(head))
     assert n_parameters(network.segmentation) == 955_429
     assert n_parameters(network.detection) == detection
@@ -224,7 +217,7 @@ def test_parameters_and_arithmetic_of_ssadnet(head, detection):
 
 
 @pytest.mark.parametrize("head", ["slots", "slots-paper", "dense"])
-def test_the_bridge_is_the_input_and_the_decoders_features(head):
+def test_the_bridge_is_the_input_and_the_decoders_features(head: str) -> None:
     x = torch.randn(2, 3, 32, 32)
     (logits, _), recorded = run_and_record(
         SSADNet(head, context_width=4).eval(), x, "segmentation.decoder", "segmentation.classifier", "detection"
@@ -235,13 +228,13 @@ def test_the_bridge_is_the_input_and_the_decoders_features(head):
     assert torch.equal(recorded["segmentation.classifier"][1], logits)
 
 
-def test_the_bridge_is_bfloat16_under_autocast():
+def test_the_bridge_is_bfloat16_under_autocast() -> None:
     with torch.autocast("cpu", torch.bfloat16):
         _, recorded = run_and_record(SSADNet("dense", context_width=4).eval(), torch.randn(1, 3, 16, 16), "detection")
     assert recorded["detection"][0].dtype == torch.bfloat16
 
 
-def test_slots_by_place():
+def test_slots_by_place() -> None:
     """A slot's box starts in the middle of its square, and an object that moves by a square moves to the next slot."""
     network = SSADNet("slots", context_width=4, batch_norm=True).eval()
     with torch.no_grad():
@@ -266,7 +259,7 @@ def test_slots_by_place():
     torch.testing.assert_close(moved, torch.full_like(moved, 32 / 640))
 
 
-def test_slots_head_has_five_feature_blocks_and_four_regressors():
+def test_slots_head_has_five_feature_blocks_and_four_regressors() -> None:
     network = SSADNet("slots-paper", n_slots=6, context_width=4).eval()
     blocks = [module for module in network.modules() if isinstance(module, FeatureBlock)]
     regressors = [module for module in network.modules() if isinstance(module, BoxRegressor)]
@@ -291,7 +284,7 @@ def test_slots_head_has_five_feature_blocks_and_four_regressors():
         agree(boxes[:, :, i], regressor.layers(features).sum((2, 3)) / 6)
 
 
-def test_initial_weights_of_ssadnet_have_the_variance_that_elu_needs():
+def test_initial_weights_of_ssadnet_have_the_variance_that_elu_needs() -> None:
     z = np.linspace(-12.0, 12.0, 240_001)
     density = np.exp(-0.5 * z**2) / np.sqrt(2.0 * np.pi)
     elu = np.where(z > 0.0, z, np.expm1(np.minimum(z, 0.0)))
@@ -307,11 +300,8 @@ def test_initial_weights_of_ssadnet_have_the_variance_that_elu_needs():
     assert boxes[:, 0].sigmoid().mean().item() == pytest.approx(HEAT_PRIOR, abs=0.03)
 
 
-# --- PointSeg
-
-
 @pytest.mark.parametrize("width", [512, 2048])
-def test_pointseg_halves_only_the_width(width):
+def test_pointseg_halves_only_the_width(width: int) -> None:
     network = on_meta(PointSeg)
     stages = {
         "fire1": (64, 2),
@@ -337,21 +327,21 @@ def test_pointseg_halves_only_the_width(width):
 
 
 @pytest.mark.parametrize(("height", "width"), [(32, 256), (5, 16)])
-def test_pointseg_accepts_other_sizes(height, width):
+def test_pointseg_accepts_other_sizes(height: int, width: int) -> None:
     with torch.inference_mode():
         logits = PointSeg().eval()(torch.randn(1, 5, height, width))
     assert logits.shape == (1, 4, height, width)
     assert logits.isfinite().all()
 
 
-def test_parameters_and_arithmetic_of_pointseg():
+def test_parameters_and_arithmetic_of_pointseg() -> None:
     network = on_meta(PointSeg)
     assert n_parameters(network) == 2_983_700
     assert n_parameters(network.enlarge) == 1_240_016
     assert giga_macs(network, 1, 5, 64, 512) == pytest.approx(7.3, rel=0.05)
 
 
-def test_fire_layers_squeeze_to_a_quarter():
+def test_fire_layers_squeeze_to_a_quarter() -> None:
     layers = {name: m for name, m in PointSeg().named_modules() if isinstance(m, (Fire, FireDeconv))}
     assert [name for name, m in layers.items() if isinstance(m, Fire)] == [f"fire{i}" for i in range(2, 10)]
     assert sum(isinstance(m, FireDeconv) for m in layers.values()) == 5
@@ -362,7 +352,7 @@ def test_fire_layers_squeeze_to_a_quarter():
         assert expand1.out_channels == expand3.out_channels
 
 
-def test_squeeze_reweighting_is_equations_3_and_4():
+def test_squeeze_reweighting_is_equations_3_and_4() -> None:
     layer = SqueezeReweight(8)
     x = torch.randn(3, 8, 5, 7)
     with torch.no_grad():
@@ -376,7 +366,7 @@ def test_squeeze_reweighting_is_equations_3_and_4():
         np.testing.assert_allclose(y, sample * scale[:, None, None], rtol=1e-5)  # equation 4
 
 
-def test_enlargement_has_five_scales():
+def test_enlargement_has_five_scales() -> None:
     network = PointSeg().eval()
     nn.init.ones_(network.enlarge.average[0].bias)
     names = ["point", "dilated.0", "dilated.1", "dilated.2", "average"]
@@ -394,7 +384,7 @@ def test_enlargement_has_five_scales():
     assert recorded["compress"][1].shape == (2, 512 // 4, 8, 6)
 
 
-def test_pointseg_adds_skips_and_concatenates_only_the_enlarged():
+def test_pointseg_adds_skips_and_concatenates_only_the_enlarged() -> None:
     names = ["fire1", "skip1", "sr1", "sr2", "sr3", "enlarge", "deconv1", "deconv1_enlarged"]
     names += ["deconv2", "deconv3", "deconv4", "classifier"]
     logits, recorded = run_and_record(PointSeg().eval(), torch.randn(1, 5, 4, 64), *names)
@@ -409,12 +399,9 @@ def test_pointseg_adds_skips_and_concatenates_only_the_enlarged():
     assert torch.equal(gave["classifier"], logits)
 
 
-# --- SqueezeSegV2, KUL-Seg
-
-
 @pytest.mark.parametrize("width", [512, 2048])
 @pytest.mark.parametrize("make", [SqueezeSegV2, KULSeg])
-def test_squeezesegv2_halves_only_the_width(make, width):
+def test_squeezesegv2_halves_only_the_width(make: Callable[[], torch.nn.Module], width: int) -> None:
     stages = {
         "fire1": (64, 2),
         "context1": (64, 2),
@@ -438,7 +425,7 @@ def test_squeezesegv2_halves_only_the_width(make, width):
 
 
 @pytest.mark.parametrize(("height", "width"), [(32, 128), (5, 16)])
-def test_kulseg_accepts_other_sizes(height, width):
+def test_kulseg_accepts_other_sizes(height: int, width: int) -> None:
     with torch.inference_mode():
         logits = KULSeg(n_classes=3).eval()(torch.randn(2, 5, height, width))
     assert logits.shape == (2, 3, height, width)
@@ -446,14 +433,14 @@ def test_kulseg_accepts_other_sizes(height, width):
 
 
 @pytest.mark.parametrize(("make", "parameters", "gmac"), [(SqueezeSegV2, 915_672, 2.959), (KULSeg, 1_027_128, 3.186)])
-def test_parameters_and_arithmetic_of_kulseg(make, parameters, gmac):
+def test_parameters_and_arithmetic_of_kulseg(make: Callable[[], torch.nn.Module], parameters: int, gmac: float) -> None:
     network = on_meta(make)
     assert n_parameters(network) == parameters
     assert giga_macs(network, 1, 5, 64, 512) == pytest.approx(gmac, abs=0.001)
     assert gmac < 0.45 * giga_macs(on_meta(PointSeg), 1, 5, 64, 512)
 
 
-def test_kulseg_is_squeezesegv2_with_a_fire_7b():
+def test_kulseg_is_squeezesegv2_with_a_fire_7b() -> None:
     kulseg, plain = on_meta(KULSeg).state_dict(), on_meta(SqueezeSegV2).state_dict()
     shape_of = {name: value.shape for name, value in kulseg.items()}
     added = {name: shape for name, shape in shape_of.items() if name.startswith("fire7b.")}
@@ -470,7 +457,7 @@ def test_kulseg_is_squeezesegv2_with_a_fire_7b():
     assert recorded["fire8"][0] is recorded["fire7"][1]
 
 
-def test_squeezesegv2_squeezes_as_squeezeseg_does():
+def test_squeezesegv2_squeezes_as_squeezeseg_does() -> None:
     layers = {name: m for name, m in KULSeg().named_modules() if isinstance(m, (Fire, FireDeconv))}
     widths = {
         "fire2": (64, 16, 128),
@@ -493,7 +480,7 @@ def test_squeezesegv2_squeezes_as_squeezeseg_does():
     } == widths
 
 
-def test_context_aggregation_scales_by_the_maximum_around():
+def test_context_aggregation_scales_by_the_maximum_around() -> None:
     layer = ContextAggregation(32)
     x = torch.randn(2, 32, 9, 11)
     with torch.no_grad():
@@ -507,7 +494,7 @@ def test_context_aggregation_scales_by_the_maximum_around():
             np.testing.assert_allclose(y[:, row, col], sample[:, row, col] * scale, rtol=1e-4, atol=1e-6)
 
 
-def test_context_aggregation_sees_7_by_7():
+def test_context_aggregation_sees_7_by_7() -> None:
     layer = ContextAggregation(16)
     for parameter in layer.parameters():
         nn.init.constant_(parameter, 0.1)
@@ -520,7 +507,7 @@ def test_context_aggregation_sees_7_by_7():
     assert len(rows) == 49
 
 
-def test_squeezesegv2_gets_the_mask_of_returns():
+def test_squeezesegv2_gets_the_mask_of_returns() -> None:
     x = torch.randn(2, 5, 4, 32)
     x[0, :, 1, 3:9] = 0.0
     x[1, 1:, 2, 5] = 0.0  # also a return: its x is not 0
@@ -532,7 +519,7 @@ def test_squeezesegv2_gets_the_mask_of_returns():
         assert torch.equal(recorded[name][0][:, 5], expected)
 
 
-def test_squeezesegv2_aggregates_context_three_times_and_adds_its_skips():
+def test_squeezesegv2_aggregates_context_three_times_and_adds_its_skips() -> None:
     names = [f"context{i}" for i in (1, 2, 3)] + [f"deconv{i}" for i in (10, 11, 12, 13)]
     names += ["skip1", "fire1", "fire2", "fire3", "fire4", "fire5", "fire9", "classifier"]
     logits, recorded = run_and_record(KULSeg().eval(), torch.randn(1, 5, 4, 64), *names)
@@ -551,14 +538,13 @@ def test_squeezesegv2_aggregates_context_three_times_and_adds_its_skips():
     assert torch.equal(gave["classifier"], logits)
 
 
-# --- Networks for small computers
-
-
 @pytest.mark.parametrize(
     ("network", "channels", "sizes"),
     [(PointSegEdge, 5, [(64, 512), (32, 256), (4, 8)]), (SSADNetEdge, 3, [(400, 200), (8, 16)])],
 )
-def test_edge_networks_have_the_outputs_of_the_full_ones(network, channels, sizes):
+def test_edge_networks_have_the_outputs_of_the_full_ones(
+    network: Callable[..., torch.nn.Module], channels: int, sizes: list[tuple[int, int]]
+) -> None:
     edge = network().eval()
     full = PointSeg().eval() if network is PointSegEdge else SSADNet("dense", context_width=64).eval()
     for height, width in sizes:
@@ -580,7 +566,7 @@ def test_edge_networks_have_the_outputs_of_the_full_ones(network, channels, size
 
 
 @pytest.mark.parametrize("block", [(1, 2), (2, 2), (2, 3)])
-def test_spreading_moves_channels_to_pixels(block):
+def test_spreading_moves_channels_to_pixels(block: tuple[int, int]) -> None:
     rows, cols = block
     x = torch.rand(2, 3 * rows * cols, 4, 5)
     out = spread(x, block)
@@ -590,11 +576,8 @@ def test_spreading_moves_channels_to_pixels(block):
             assert torch.equal(out[:, :, row::rows, col::cols], x[:, row * cols + col :: rows * cols])
 
 
-# --- LoDNN
-
-
 @pytest.mark.parametrize(("n_channels", "n_expected"), [(6, 947_458), (3, 946_594)])
-def test_lodnn_has_the_papers_layers(n_channels, n_expected):
+def test_lodnn_has_the_papers_layers(n_channels: int, n_expected: int) -> None:
     """LoDNN, Table 1. SSADNet has the same context module: 128 channels, 32 in its 1x1; 32 before and after it."""
     network = on_meta(lambda: LoDNN(n_channels=n_channels))
     convolutions = [m for m in network.modules() if isinstance(m, nn.Conv2d)]
@@ -608,7 +591,7 @@ def test_lodnn_has_the_papers_layers(n_channels, n_expected):
     assert n_parameters(network) == by_hand == n_expected
 
 
-def test_lodnn_halves_the_resolution_once():
+def test_lodnn_halves_the_resolution_once() -> None:
     names = ["encoder", "context.dilated", "context", "decoder"]
     logits, recorded = run_and_record(LoDNN(context_width=8).eval(), torch.randn(1, 3, 400, 200), *names)
     assert logits.shape == (1, 2, 400, 200)
@@ -622,7 +605,7 @@ def test_lodnn_halves_the_resolution_once():
     assert (recorded["decoder"][0] != 0).float().mean() <= 0.25  # unpooled: a cell of four
 
 
-def test_lodnn_keeps_the_signal_and_learns_from_random_weights():
+def test_lodnn_keeps_the_signal_and_learns_from_random_weights() -> None:
     network = LoDNN(context_width=32).eval()
     _, recorded = run_and_record(
         network, torch.randn(1, 3, 200, 100), *(f"context.dilated.{k}" for k in range(2, 21, 3))
@@ -631,7 +614,7 @@ def test_lodnn_keeps_the_signal_and_learns_from_random_weights():
     assert all(0.2 < size < 3.0 for size in sizes)
 
 
-def test_lodnn_edge_has_the_receptive_field_of_lodnn_at_a_27th_of_the_arithmetic():
+def test_lodnn_edge_has_the_receptive_field_of_lodnn_at_a_27th_of_the_arithmetic() -> None:
     network = on_meta(LoDNNEdge)
     cells = receptive_fields(EDGE_DILATIONS)[-1]
     whole = receptive_fields()[-1]
@@ -645,7 +628,7 @@ def test_lodnn_edge_has_the_receptive_field_of_lodnn_at_a_27th_of_the_arithmetic
     assert dilations == [(height, width) for width, height in EDGE_DILATIONS]
 
 
-def test_lodnn_edge_is_a_shortcut_before_training():
+def test_lodnn_edge_is_a_shortcut_before_training() -> None:
     network = LoDNNEdge().eval()
     x = torch.rand(1, 48, 20, 10)
     agree(network.context(x), x)

@@ -205,12 +205,12 @@ def test_the_interval_of_a_loss_is_over_drives() -> None:
         return {"real": records}
 
     right = of(*[1.0] * 12)
-    one_drive = module._losses(right, of(*[1.0] * 11, 0.4))["real car IoU"]
+    one_drive = module.losses_of(right, of(*[1.0] * 11, 0.4))["real car IoU"]
     assert one_drive[:2] == pytest.approx((1.0, 0.95))
     assert one_drive[2] == 0.0 < one_drive[3]
-    every_drive = module._losses(right, of(*[0.8] * 12))["real car IoU"]
+    every_drive = module.losses_of(right, of(*[0.8] * 12))["real car IoU"]
     assert every_drive == pytest.approx((1.0, 0.8, 0.2, 0.2))
-    alone = module._losses(of(1.0, 1.0), of(0.9, 0.9))["real car IoU"]
+    alone = module.losses_of(of(1.0, 1.0), of(0.9, 0.9))["real car IoU"]
     assert alone == pytest.approx((1.0, 0.9, 0.1, 0.1))
 
 
@@ -220,7 +220,7 @@ def test_a_range_clips_what_costs_less_than_it_saves() -> None:
 
     def range_of(values: np.ndarray) -> tuple[float, float]:
         bins = values.view(np.uint32) >> (32 - module.BIN_BITS)
-        return module._range(np.bincount(bins, minlength=1 << module.BIN_BITS))
+        return module.range_of(np.bincount(bins, minlength=1 << module.BIN_BITS))
 
     low, high = range_of(values[1:])
     assert low == 0.0
@@ -261,7 +261,7 @@ def test_unpooling_is_not_rounded_on_one_side(tmp_path: Path, scans: list[np.nda
 
     torch.manual_seed(0)
     path = written(Unpooling(), tmp_path / "unpooling.onnx")
-    fp32 = module._Calibrated.on(path, Session(path).card, scans)
+    fp32 = module.Calibrated.on(path, Session(path).card, scans)
     assert fp32.noise([n.name for n in fp32.model.graph.node if "inner.weight" in n.input]) < 0.1
 
 
@@ -335,13 +335,13 @@ def test_the_mean_of_every_channel_is_that_of_fp32(small: Path, scans: list[np.n
     card = Session(small).card
     shifts = {}
     for strength in (None, 0.0, 1.0):
-        fp32 = module._Calibrated.on(small, card, scans, strength=strength)
-        candidates = module._candidates(fp32.model.graph, ())
+        fp32 = module.Calibrated.on(small, card, scans, strength=strength)
+        candidates = module.find_candidates(fp32.model.graph, ())
         rounded = fp32.rounded(candidates)
         made = {n.name: n.output[0] for n in rounded.graph.node if n.name in candidates}
-        means = module._means(rounded, card, fp32.images, [*made.values()])
+        means = module.channel_means(rounded, card, fp32.images, [*made.values()])
         right = {n.name: n.output[0] for n in fp32.model.graph.node if n.name in candidates}
-        expected = module._means(fp32.model, card, fp32.images, [*right.values()])
+        expected = module.channel_means(fp32.model, card, fp32.images, [*right.values()])
         own = {name: expected[output] for name, output in right.items()}
         shifts[strength] = max(abs(means[made[name]] - own[name]).max() / own[name].std() for name in candidates)
     assert shifts[0.0] < 0.2 * shifts[None]
@@ -352,8 +352,8 @@ def test_the_shift_is_corrected_where_the_noise_is_above_the_limit(
     tmp_path: Path, small: Path, scans: list[np.ndarray]
 ) -> None:
     card = Session(small).card
-    fp32 = module._Calibrated.on(small, card, scans)
-    noise = fp32.noise(module._candidates(fp32.model.graph, ()))
+    fp32 = module.Calibrated.on(small, card, scans)
+    noise = fp32.noise(module.find_candidates(fp32.model.graph, ()))
     written = []
     for limit in (1.01 * noise, 0.99 * noise):
         quantized = quantize(

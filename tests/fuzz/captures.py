@@ -266,8 +266,6 @@ def check_scan(stamp_s: Any, points: Any) -> None:
     check(points.ndim == 2 and points.shape[1] == 4, f"points of shape {points.shape}")
 
 
-# --- damage -----------------------------------------------------------------------------------------------------------
-
 Files = dict[str, bytes]
 
 

@@ -57,8 +57,6 @@ def mutated_bytes(content: bytes, case: Case, most: int = 8, near: int = 0) -> b
     return bytes(damaged)
 
 
-# --- protobuf ---------------------------------------------------------------------------------------------------------
-
 Field = list[Any]
 """Number, wire type, value: an int, bytes, or a list of fields of the message that the bytes are."""
 
@@ -155,8 +153,6 @@ def mutated_message(fields: list[Field], case: Case, pieces: list[Field], most: 
             rng.shuffle(field[2])
     return unparse(fields)
 
-
-# --- JSON -------------------------------------------------------------------------------------------------------------
 
 VALUES: list[Any] = [
     None, True, False, 0, 1, -1, 2, 0.5, 1e-9, 5e-324, -5e-324, 1e308, -1e308, 1.7976931348623157e308, 1e300, 1e30, 1e9,

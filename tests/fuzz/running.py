@@ -294,7 +294,7 @@ def supervise(
 
 def _tend(
     worker: dict[str, Any], command: list[str], limit_s: float, cases: int, jobs: int, end: float, kind: str, seed: int,
-    out: Path,
+    out: Path
 ) -> None:  # fmt: skip
     process = worker["process"]
     left = end - time.monotonic()

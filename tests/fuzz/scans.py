@@ -225,7 +225,7 @@ class Scans:
         # The first scans are checked and show the mounting. The state of a perceiver is not part of a case, so every
         # scan is checked, or none, and every scan is the first to show the mounting.
         if perceive.on_mismatch != "ignore":
-            perceive._to_check = int(case.index % 3 == 0)
+            perceive.start_from(replace(perceive.learned, to_check=int(case.index % 3 == 0)))
         perceive.reset_mounting()
         # The padding of a longdouble is not copied reliably.
         is_plain = isinstance(scan, np.ndarray) and not isinstance(scan, np.ma.MaskedArray) and scan.dtype.char != "g"
@@ -242,7 +242,7 @@ class Scans:
         try:
             perception = perceive(scan, stamp_s)
         except FitnessError:
-            perceive._to_check = 0
+            perceive.start_from(replace(perceive.learned, to_check=0))
             perception = perceive(scan, stamp_s)
         check_perception(perception, points)
         if perceive.agree:

@@ -54,9 +54,6 @@ def seen_by(mounting: Mounting, points: NDArray[np.float32]) -> NDArray[np.float
     return moved
 
 
-# --- what is given ---------------------------------------------------------------------------------------------------
-
-
 @given(mountings)
 def test_matrix_and_dict_give_the_mounting_back(mounting: Mounting) -> None:
     assert mounting.height_m is not None
@@ -156,9 +153,6 @@ def test_profiles_keep_their_mounting() -> None:
         SensorProfile.from_json(json.dumps(broken))
 
 
-# --- the frame of the models -----------------------------------------------------------------------------------------
-
-
 def test_scans_of_the_training_vehicle_are_not_moved(scans: list[NDArray[np.float32]]) -> None:
     frame = ModelFrame(MODEL_MOUNTING)
     assert frame.is_identity
@@ -204,9 +198,6 @@ def test_boxes_come_back(mounting: Mounting, yaw: float) -> None:
     np.testing.assert_allclose(back.center, box.center, atol=1e-6)
     assert math.remainder(back.yaw - box.yaw, 2 * math.pi) == pytest.approx(0.0, abs=0.02)
     assert (back.label, back.score, back.size) == (box.label, box.score, box.size)
-
-
-# --- what scans show -------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -330,9 +321,6 @@ def test_what_streets_differ_by_is_not_corrected(scans: list[NDArray[np.float32]
     assert clearly.pitch_deg == pytest.approx(2.5, abs=0.5)
 
 
-# --- through the perceiver -------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     "mounting",
     [Mounting(2.5, 0.0, 0.0, 0.0), Mounting(1.73, 5.0, -4.0, 0.0), Mounting(-0.2, -3.0, 2.0, -90.0)],
@@ -366,9 +354,7 @@ def test_answers_do_not_depend_on_the_mounting(scans: list[NDArray[np.float32]],
         assert (near < 0.5).mean() >= 0.75
 
 
-def test_the_mounting_is_settled_over_scans_and_refused_scans_teach_nothing(
-    scans: list[NDArray[np.float32]],
-) -> None:
+def test_the_mounting_is_settled_over_scans_and_refused_scans_teach_nothing(scans: list[NDArray[np.float32]]) -> None:
     perceive = Perceiver("pointseg", provider="cpu")
     raised = seen_by(Mounting(2.6, 0.0, 0.66, 0.0), scans[0])
     for _ in range(FROZEN_AFTER):

@@ -81,31 +81,26 @@ def at(mask: NDArray[np.bool_], x: tuple[float, float], y: tuple[float, float]) 
     return mask[row:last_row, first:last]
 
 
-# --- kernels against their twins -------------------------------------------------------------------------------------
-
-
 @patient
 @given(clouds, st.sampled_from([SMALL, AROUND, TopViewGeometry((0.0, 4.0), (-3.0, 3.0), cell_m=1.0)]))
 def test_the_kernels_agree_with_their_twins(points: NDArray[np.float32], view: TopViewGeometry) -> None:
     observer = Observer(view, get_sensor("vlp-16"))
-    shape = observer._lowest.shape
+    shape = observer.lowest.shape
     lowest = np.full(shape, 7.0, np.float32)
-    fill_lowest_returns(points, observer._bounds, observer._grid, lowest)
-    np.testing.assert_array_equal(
-        lowest, twins.observed.lowest_returns(points, observer._bounds, observer._grid, shape)
-    )
+    fill_lowest_returns(points, observer.bounds, observer.grid, lowest)
+    np.testing.assert_array_equal(lowest, twins.observed.lowest_returns(points, observer.bounds, observer.grid, shape))
     for z_beams in (0.0, 0.4, -1.2):
         level, state = np.full(shape, 7.0, np.float32), np.ones(shape, np.uint8)
-        rays, tilt = np.array([1.0, z_beams, *observer._beams]), 0.03 * observer._ahead[1]
-        follow_rays(lowest, rays, observer._steps, tilt, level, state)
-        right_level, right_state = twins.observed.rays(lowest, rays, observer._steps, tilt)
+        rays, tilt = np.array([1.0, z_beams, *observer.beams]), 0.03 * observer.ahead[1]
+        follow_rays(lowest, rays, observer.steps, tilt, level, state)
+        right_level, right_state = twins.observed.rays(lowest, rays, observer.steps, tilt)
         np.testing.assert_array_equal(state, right_state)
         np.testing.assert_array_equal(level, right_level)
     projector = TopViewProjector(view, InputSpec("image", ("height",), (0.0,), (1.0,)))
     index = projector.project(points).index
     observed, between = np.ones((2, *index.shape), np.bool_)
-    mark_cells(points, index, observer._bin_of_cell, level, state, observed, between)
-    right = twins.observed.cells(points, index, observer._bin_of_cell, level, state)
+    mark_cells(points, index, observer.bin_of_cell, level, state, observed, between)
+    right = twins.observed.cells(points, index, observer.bin_of_cell, level, state)
     np.testing.assert_array_equal([observed, between], right)
 
 
@@ -129,15 +124,12 @@ def test_rays_over_uneven_ground_agree_with_the_twin(seed: int, missing: float) 
 def test_cells_of_any_states_agree_with_the_twin(seed: int) -> None:
     rng = np.random.default_rng(seed)
     observer, index = Observer(SMALL, get_sensor("vlp-16")), np.full((16, 12), -1, np.int32)
-    state = rng.integers(0, 4, observer._state.shape).astype(np.uint8)
+    state = rng.integers(0, 4, observer.state.shape).astype(np.uint8)
     level, points = np.zeros(state.shape, np.float32), np.empty((0, 4), np.float32)
     observed, between = np.ones((2, *index.shape), np.bool_)
-    mark_cells(points, index, observer._bin_of_cell, level, state, observed, between)
-    right = twins.observed.cells(points, index, observer._bin_of_cell, level, state)
+    mark_cells(points, index, observer.bin_of_cell, level, state, observed, between)
+    right = twins.observed.cells(points, index, observer.bin_of_cell, level, state)
     np.testing.assert_array_equal([observed, between], right)
-
-
-# --- properties ------------------------------------------------------------------------------------------------------
 
 
 @patient
@@ -162,9 +154,6 @@ def test_drivable_cells_are_road_and_observed(points: NDArray[np.float32], seed:
     np.testing.assert_array_equal(view.drivable, (labels == 1) & observed)
     np.testing.assert_array_equal(view.road, labels == 1)
     assert view.drivable_area_m2 == 0.25 * np.count_nonzero(view.drivable)
-
-
-# --- scenes ----------------------------------------------------------------------------------------------------------
 
 
 def test_an_empty_scan_observes_nothing() -> None:
@@ -329,16 +318,13 @@ def test_arrays_of_a_wrong_shape_are_refused() -> None:
 
 def test_large_views_have_bounded_tables() -> None:
     far = TopViewGeometry((9000.0, 9040.0), (-10.0, 10.0), cell_m=0.1)
-    assert Observer(far, get_sensor("hdl-64e"))._lowest.size < 100_000
+    assert Observer(far, get_sensor("hdl-64e")).lowest.size < 100_000
     wide = TopViewGeometry((-1000.0, 1000.0), (-1000.0, 1000.0), cell_m=5.0)
     observer = Observer(wide, get_sensor("hdl-64e"))
-    assert observer._lowest.size < 600 * 4200
+    assert observer.lowest.size < 600 * 4200
     no_ground = SensorProfile("up", (5.0, 3.0), 1800)
     index = np.full((16, 12), -1, np.int32)
     assert not np.any(Observer(SMALL, no_ground).observe(np.empty((0, 4), np.float32), index))
-
-
-# --- for a planner ---------------------------------------------------------------------------------------------------
 
 
 def test_an_unobserved_cell_is_not_free() -> None:

@@ -13,7 +13,15 @@ from edgeperc.simulation.samples import simulated_scan
 from edgeperc.simulation.scene import simulate
 
 
-def street(rng, n=4000, slope_x=0.0, slope_y=0.0, kerb=0.0, reach=30.0, mount=1.73):
+def street(
+    rng: np.random.Generator,
+    n: int = 4000,
+    slope_x: float = 0.0,
+    slope_y: float = 0.0,
+    kerb: float = 0.0,
+    reach: float = 30.0,
+    mount: float = 1.73,
+) -> tuple[np.ndarray, np.ndarray]:
     """Points of a street with a pavement left of y = 4 m, and whether they are ground; a third stand on boxes."""
     x, y = rng.uniform(-reach, reach, (2, n))
     z = slope_x * x + slope_y * y - mount + kerb * (y > 4.0) + rng.normal(0.0, 0.01, n)
@@ -24,7 +32,7 @@ def street(rng, n=4000, slope_x=0.0, slope_y=0.0, kerb=0.0, reach=30.0, mount=1.
 
 
 @pytest.mark.parametrize("columns", [3, 5])
-def test_other_columns_do_not_matter(columns):
+def test_other_columns_do_not_matter(columns: int) -> None:
     points, _ = street(np.random.default_rng(0))
     other = np.full((len(points), columns), np.nan, np.float32)
     other[:, :3] = points[:, :3]
@@ -35,7 +43,7 @@ def test_other_columns_do_not_matter(columns):
 
 @pytest.mark.parametrize("regions", [True, False])
 @pytest.mark.parametrize(("slope_x", "slope_y"), [(0.0, 0.0), (0.08, -0.05), (-0.2, 0.1)])
-def test_a_slope_is_ground_and_what_stands_on_it_is_not(slope_x, slope_y, regions):
+def test_a_slope_is_ground_and_what_stands_on_it_is_not(slope_x: float, slope_y: float, regions: bool) -> None:
     points, on = street(np.random.default_rng(0), slope_x=slope_x, slope_y=slope_y)
     ground = find_ground(points, regions=regions)
     np.testing.assert_allclose(ground.plane, (slope_x, slope_y, -1.73), atol=0.01)
@@ -45,7 +53,7 @@ def test_a_slope_is_ground_and_what_stands_on_it_is_not(slope_x, slope_y, region
     assert abs(ground.height_m[on]).max() < 0.1
 
 
-def test_the_ground_steps_onto_the_pavement():
+def test_the_ground_steps_onto_the_pavement() -> None:
     points, on = street(np.random.default_rng(1), n=20000, kerb=0.2)
     stepped, plane = find_ground(points), find_ground(points, regions=False)
     assert stepped.mask[on].mean() > 0.999
@@ -53,14 +61,14 @@ def test_the_ground_steps_onto_the_pavement():
     assert np.abs(plane.height_m[on]).mean() > 0.04
 
 
-def test_the_ground_follows_a_hill_that_no_plane_fits():
+def test_the_ground_follows_a_hill_that_no_plane_fits() -> None:
     points, on = street(np.random.default_rng(2), n=20000)
     points[:, 2] += 0.002 * points[:, 0] ** 2  # 1.8 m up at 30 m
     assert (find_ground(points).mask == on).mean() > 0.999
     assert find_ground(points, regions=False).mask[on].mean() < 0.7
 
 
-def test_street_between_roofs_is_the_ground():
+def test_street_between_roofs_is_the_ground() -> None:
     """Roofs on both sides have three fifths of the cells around the vehicle; the street between lies lower."""
     rng = np.random.default_rng(3)
     points, _ = street(rng, n=12000)
@@ -74,7 +82,7 @@ def test_street_between_roofs_is_the_ground():
 
 
 @pytest.mark.parametrize("mount", [0.5, 1.73, 3.2])
-def test_any_mounting_height_works_if_given(mount):
+def test_any_mounting_height_works_if_given(mount: float) -> None:
     points, on = street(np.random.default_rng(4), mount=mount)
     np.testing.assert_array_equal(find_ground(points, mount_height_m=mount + 0.3).mask, on)
     assert find_ground(points, mount_height_m=mount + 2.0).plane is None
@@ -92,7 +100,7 @@ def test_any_mounting_height_works_if_given(mount):
     ],
     ids=["empty", "one", "nan", "not finite", "a wall"],
 )
-def test_scan_without_ground_has_no_ground_points(points, regions):
+def test_scan_without_ground_has_no_ground_points(points: np.ndarray, regions: bool) -> None:
     ground = find_ground(points.astype(np.float32), regions=regions)
     assert ground.plane is None
     assert not ground.mask.any()
@@ -101,7 +109,7 @@ def test_scan_without_ground_has_no_ground_points(points, regions):
     np.testing.assert_allclose(ground.height_m[finite], points[finite, 2] + 1.73, atol=1e-6)
 
 
-def test_points_that_are_not_finite_change_nothing():
+def test_points_that_are_not_finite_change_nothing() -> None:
     points, _ = street(np.random.default_rng(6))
     broken = np.insert(points, [0, 100, 4000], [np.nan, np.inf, -np.inf, 0.0], axis=0)
     kept = np.delete(np.arange(len(broken)), [0, 101, 4002])
@@ -111,7 +119,7 @@ def test_points_that_are_not_finite_change_nothing():
     assert not np.delete(ground.mask, kept).any()
 
 
-def test_points_far_below_are_not_ground():
+def test_points_far_below_are_not_ground() -> None:
     points, _ = street(np.random.default_rng(7))
     points[:3, 2] -= 3.0
     assert not find_ground(points).mask[:3].any()
@@ -119,7 +127,7 @@ def test_points_far_below_are_not_ground():
 
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("regions", [True, False])
-def test_heights_agree_with_the_twin(seed, regions):
+def test_heights_agree_with_the_twin(seed: int, regions: bool) -> None:
     rng = np.random.default_rng(seed)
     points, _ = street(rng, n=1500, slope_x=0.05, kerb=0.12 * seed, reach=[20.0, 45.0, 70.0, 90.0][seed])
     points[rng.random(len(points)) < 0.02] *= np.float32(3.0)
@@ -136,7 +144,7 @@ numbers = st.sampled_from([0.0, 1.0, -1.7, -1.73, -2.0, 3.0, 63.99999, 64.0, -64
 
 @settings(max_examples=30, deadline=None)
 @given(st.lists(st.tuples(numbers, numbers, numbers), max_size=40), st.booleans())
-def test_random_scans_match_the_twin(rows, regions):
+def test_random_scans_match_the_twin(rows: list[tuple[float, float, float]], regions: bool) -> None:
     # The floor makes sure that there is something to find.
     x, y = np.meshgrid(np.arange(-10.0, 10.0, 2.5), np.arange(-10.0, 10.0, 2.5))
     floor = np.column_stack([x.ravel(), y.ravel(), 0.03 * x.ravel() - 1.7])
@@ -147,7 +155,7 @@ def test_random_scans_match_the_twin(rows, regions):
     np.testing.assert_allclose(ground.height_m, heights, atol=1e-4, rtol=1e-6)
 
 
-def test_ground_is_deterministic():
+def test_ground_is_deterministic() -> None:
     points, _ = street(np.random.default_rng(8))
     first, second = find_ground(points), find_ground(points.copy())
     np.testing.assert_array_equal(first.height_m, second.height_m)
@@ -155,7 +163,7 @@ def test_ground_is_deterministic():
 
 
 @pytest.mark.parametrize("regions", [False, True])
-def test_heights_of_some_points_are_those_of_all(regions):
+def test_heights_of_some_points_are_those_of_all(regions: bool) -> None:
     points, _ = street(np.random.default_rng(8))
     every = find_ground(points, regions=regions)
     x, y = points[:, 0], points[:, 1]
@@ -198,7 +206,7 @@ def test_other_points_are_as_high_as_in_the_scan(seed: int, n: int, n_scan: int)
     np.testing.assert_allclose(heights_above(surface, lower).height_m, expected - 201.5, atol=1e-4)
 
 
-def test_ground_of_a_simulated_street():
+def test_ground_of_a_simulated_street() -> None:
     scan = simulate(random_scene(3), "hdl-64e", 0)
     world = scan.points[:, :3] @ scan.T_world_sensor[:3, :3].T + scan.T_world_sensor[:3, 3]
     some = np.arange(0, len(world), 97)
@@ -208,7 +216,7 @@ def test_ground_of_a_simulated_street():
     assert not mask[above > 0.5].any()
 
 
-def test_the_ground_of_a_road_above_lower_land_is_the_road():
+def test_the_ground_of_a_road_above_lower_land_is_the_road() -> None:
     """The land on the right is 0.4 m lower, and as large."""
     scan = simulated_scan(2_000_000_002, "os1-64")
     near = np.hypot(*scan.points[:, :2].T) < 20.0
@@ -218,12 +226,12 @@ def test_the_ground_of_a_road_above_lower_land_is_the_road():
 
 
 @pytest.mark.parametrize("points", [np.zeros((3, 2), np.float32), np.zeros(4, np.float32)])
-def test_a_wrong_shape_is_refused(points):
+def test_a_wrong_shape_is_refused(points: np.ndarray) -> None:
     with pytest.raises(PointsError, match="expected"):
         find_ground(points)
 
 
 @pytest.mark.parametrize("option", [{"mount_height_m": 0.0}, {"mount_height_m": np.nan}, {"max_height_m": -1.0}])
-def test_an_impossible_height_is_refused(option):
+def test_an_impossible_height_is_refused(option: dict[str, float]) -> None:
     with pytest.raises(PointsError, match="meters above 0"):
         find_ground(np.zeros((3, 4), np.float32), **option)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -21,7 +22,7 @@ from edgeperc.zoo import model_path
 @pytest.mark.parametrize("block", [(1, 1), (1, 2), (2, 4), (4, 4), (3, 2)])
 @pytest.mark.parametrize("size", [(0, 0), (1, 1), (1, 7), (5, 3)])
 @pytest.mark.parametrize("n_classes", [1, 4])
-def test_pixels_of_blocks_match_the_twin(block, size, n_classes):
+def test_pixels_of_blocks_match_the_twin(block: tuple[int, int], size: tuple[int, int], n_classes: int) -> None:
     rows, cols = block
     blocks = np.random.default_rng(1).normal(size=(n_classes * rows * cols, *size)).astype(np.float32)
     blocks.ravel()[::3] = np.nan
@@ -31,7 +32,7 @@ def test_pixels_of_blocks_match_the_twin(block, size, n_classes):
 
 
 @pytest.mark.parametrize("name", ["pointseg", "ssadnet"])
-def test_a_session_gives_an_image_of_every_class(name):
+def test_a_session_gives_an_image_of_every_class(name: str) -> None:
     session = Session(model_path(f"{name}:fp32"), "cpu", n_threads=1)
     card = session.card
     rows, cols = next(output.block for output in card.outputs if output.kind == "class_logits")
@@ -44,7 +45,7 @@ def test_a_session_gives_an_image_of_every_class(name):
     np.testing.assert_array_equal(outputs["class_logits"], wanted)
 
 
-def test_cards_hold_blocks_and_earlier_ones_have_none():
+def test_cards_hold_blocks_and_earlier_ones_have_none() -> None:
     blocked = replace(POINTSEG, outputs=(OutputSpec("logits", "class_logits", block=(3, 4)),))
     assert ModelCard.from_json(blocked.to_json()) == blocked
     height, width, n = blocked.view.height, blocked.view.width, len(blocked.classes)
@@ -64,7 +65,7 @@ def test_cards_hold_blocks_and_earlier_ones_have_none():
         ("12", "expected a list"),
     ],
 )
-def test_blocks_that_cannot_be(block, message):
+def test_blocks_that_cannot_be(block: list[Any], message: str) -> None:
     document = json.loads(POINTSEG.to_json())
     document["outputs"][0]["block"] = block
     with pytest.raises(CardError, match=message):
@@ -72,19 +73,19 @@ def test_blocks_that_cannot_be(block, message):
 
 
 @pytest.mark.parametrize("block", [[2, 4, 1], [2]])
-def test_blocks_have_two_sides(block):
+def test_blocks_have_two_sides(block: list[Any]) -> None:
     document = json.loads(POINTSEG.to_json())
     document["outputs"][0]["block"] = block
     with pytest.raises(CardError, match="expected"):
         ModelCard.from_json(json.dumps(document))
 
 
-def test_boxes_have_no_blocks():
+def test_boxes_have_no_blocks() -> None:
     with pytest.raises(CardError, match="has blocks; only outputs of classes may"):
         OutputSpec("boxes", "box_dense", block=(2, 2))
 
 
-def test_a_graph_without_the_blocks_of_its_card_is_refused(tmp_path: Path):
+def test_a_graph_without_the_blocks_of_its_card_is_refused(tmp_path: Path) -> None:
     blob, old = model_path("pointseg:fp32").read_bytes(), b'"block":[2,4]'
     assert blob.count(old) == 1
     (tmp_path / "other.onnx").write_bytes(blob.replace(old, b'"block":[2,2]'))

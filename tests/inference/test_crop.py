@@ -141,8 +141,8 @@ def test_buffers_grow_and_empty_scans_stay_empty() -> None:
 
 
 def pipeline_of(perceive: Perceiver) -> Pipeline:
-    assert perceive._pipeline is not None
-    return perceive._pipeline
+    assert perceive.pipeline is not None
+    return perceive.pipeline
 
 
 @pytest.mark.parametrize("models", [["ssadnet", "pointseg"], ["pointseg"], ["ssadnet"]])

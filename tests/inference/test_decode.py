@@ -1,7 +1,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -24,15 +26,12 @@ VIEW = TopViewGeometry()
 SHAPE = (VIEW.height, VIEW.width)
 
 
-def pixel_of(x, y):
+def pixel_of(x: float, y: float) -> tuple[int, int]:
     return int((VIEW.x_range_m[1] - x) / VIEW.cell_m), int((VIEW.y_range_m[1] - y) / VIEW.cell_m)
 
 
-# --- classes
-
-
 @pytest.mark.parametrize("shape", [(1, 4, 64, 512), (1, 5, 7, 3), (2, 1, 1), (1, 1, 4, 5), (3, 0, 4)])
-def test_classes_agree_with_the_twin(shape):
+def test_classes_agree_with_the_twin(shape: tuple[int, ...]) -> None:
     logits = np.random.default_rng(1).normal(0.0, 5.0, shape).astype(np.float32)
     values = logits[0] if logits.ndim == 4 else logits
     labels, scores = decode_classes(logits, "class_logits")
@@ -48,7 +47,7 @@ def test_classes_agree_with_the_twin(shape):
     np.testing.assert_array_equal(scores, probabilities.max(axis=0))
 
 
-def test_lower_class_wins_a_tie_and_scores_stay_probabilities():
+def test_lower_class_wins_a_tie_and_scores_stay_probabilities() -> None:
     logits = np.zeros((1, 5, 2, 2), dtype=np.float32)
     logits[0, 3:, 0, 0] = 7.0
     logits[0, 4, 1, 1] = 1e30
@@ -61,7 +60,7 @@ def test_lower_class_wins_a_tie_and_scores_stay_probabilities():
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 @pytest.mark.parametrize("kind", ["class_logits", "class_probabilities"])
-def test_classes_that_are_not_finite_raise(value, kind):
+def test_classes_that_are_not_finite_raise(value: float, kind: str) -> None:
     output = np.full((1, 3, 4, 5), 0.25, dtype=np.float32)
     output[0, 1, 2, 3] = output[0, 2, 0, 0] = value
     with pytest.raises(InferenceError, match=r"pointseg: 2 of 60 values of class_"):
@@ -70,7 +69,7 @@ def test_classes_that_are_not_finite_raise(value, kind):
 
 @pytest.mark.kernel
 @pytest.mark.parametrize("shape", [(0, 4), (1, 1), (7, 33)])
-def test_cells_without_a_return_lose_a_class_of_boxes(shape):
+def test_cells_without_a_return_lose_a_class_of_boxes(shape: tuple[int, ...]) -> None:
     rng = np.random.default_rng(3)
     labels, returned = rng.integers(0, 4, shape).astype(np.uint8), rng.random(shape) < 0.5
     is_box = np.array([False, False, True, True])
@@ -79,24 +78,21 @@ def test_cells_without_a_return_lose_a_class_of_boxes(shape):
     np.testing.assert_array_equal(found, np.where(is_box[labels] & ~returned, 0, labels))
 
 
-def test_values_that_are_not_finite_are_counted():
+def test_values_that_are_not_finite_are_counted() -> None:
     values = np.linspace(-3e38, 3e38, 1000, dtype=np.float32)
     assert box_heads.count_not_finite(values) == box_heads.count_not_finite(values[:0]) == 0
     values[::7], values[1::70], values[-1] = np.nan, np.inf, -np.inf
     assert box_heads.count_not_finite(values) == np.count_nonzero(~np.isfinite(values))
 
 
-def test_classes_of_another_shape_or_kind_raise():
+def test_classes_of_another_shape_or_kind_raise() -> None:
     with pytest.raises(CardMismatchError, match=r"\(2, 3, 4, 5\)"):
         decode_classes(np.zeros((2, 3, 4, 5), dtype=np.float32), "class_logits")
     with pytest.raises(CardMismatchError, match="box_dense"):
         decode_classes(np.zeros((1, 3, 4, 5), dtype=np.float32), "box_dense")
 
 
-# --- slots
-
-
-def slots_for(slots, labels=None, scores=None):
+def slots_for(slots: Any, labels: np.ndarray | None = None, scores: np.ndarray | None = None) -> list[Any]:
     labels = np.zeros(SHAPE, dtype=np.uint8) if labels is None else labels
     scores = np.ones(SHAPE, dtype=np.float32) if scores is None else scores
     return decode_slots(
@@ -104,7 +100,7 @@ def slots_for(slots, labels=None, scores=None):
     )
 
 
-def test_slots_become_boxes_in_meters():
+def test_slots_become_boxes_in_meters() -> None:
     labels, scores = np.zeros(SHAPE, dtype=np.uint8), np.zeros(SHAPE, dtype=np.float32)
     # A car 26 m ahead, 5 m to the left, 4 m along x; a truck 16 m ahead, 5 m right, lying across.
     labels[200, 50], scores[200, 50] = 2, 0.75
@@ -133,17 +129,17 @@ def test_slots_become_boxes_in_meters():
         [0.5, 1.2, 0.1, 0.1],
     ],
 )
-def test_empty_slots(slot):
+def test_empty_slots(slot: list[float]) -> None:
     assert slots_for([slot], np.full(SHAPE, 2, dtype=np.uint8)) == []
     assert len(slots_for([[0.5, 0.5, 0.1, 0.1]], np.full(SHAPE, 2, dtype=np.uint8))) == 1
 
 
 @pytest.mark.parametrize("label", [0, 1])
-def test_slot_outside_a_vehicle_is_empty(label):
+def test_slot_outside_a_vehicle_is_empty(label: int) -> None:
     assert slots_for([[0.5, 0.5, 0.1, 0.1]], np.full(SHAPE, label, dtype=np.uint8)) == []
 
 
-def test_malformed_slots_are_refused():
+def test_malformed_slots_are_refused() -> None:
     with pytest.raises(InferenceError, match="ssadnet: 1 of 4 values of box_slots"):
         slots_for([[0.5, np.nan, 0.1, 0.1]])
     with pytest.raises(CardMismatchError, match=r"\(1, 5\)"):
@@ -164,17 +160,16 @@ def test_malformed_slots_are_refused():
     assert slots_for(np.zeros((0, 4))) == []
 
 
-# --- slots with scores
-
-
-def scored_slots_for(slots, class_output=None, **options):
+def scored_slots_for(slots: Any, class_output: np.ndarray | None = None, **options: Any) -> list[Any]:
     class_output = np.zeros((len(CLASSES), *SHAPE), np.float32) if class_output is None else class_output
     return decode_scored_slots(
         np.asarray(slots, np.float32), class_output, "class_logits", VIEW, CLASSES, VEHICLES, PRIORS, 1.73, **options
     )
 
 
-def twin_of_scored_slots(slots, logits, score_threshold, iou_threshold, max_boxes):
+def twin_of_scored_slots(
+    slots: Any, logits: np.ndarray, score_threshold: float, iou_threshold: float, max_boxes: int
+) -> list[Any]:
     """One slot after the other."""
     found = []
     for col, row, across, along, logit in np.asarray(slots, np.float64):
@@ -196,7 +191,7 @@ def twin_of_scored_slots(slots, logits, score_threshold, iou_threshold, max_boxe
 
 
 @pytest.mark.parametrize("n", [0, 1, 72, 400])
-def test_scored_slots_equal_their_twin(n):
+def test_scored_slots_equal_their_twin(n: int) -> None:
     rng = np.random.default_rng(n)
     slots = np.column_stack([rng.uniform(-0.1, 1.1, (n, 2)), rng.uniform(-0.02, 0.2, (n, 2)), rng.normal(size=n)])
     slots = slots.astype(np.float32)
@@ -213,7 +208,7 @@ def test_scored_slots_equal_their_twin(n):
         assert box.yaw == yaw
 
 
-def test_of_two_slots_with_one_object_the_surer_remains():
+def test_of_two_slots_with_one_object_the_surer_remains() -> None:
     car, same = [0.5, 0.5, 0.08, 0.1, 1.0], [0.5, 0.505, 0.08, 0.1, 2.0]
     (box,) = scored_slots_for([car, same, [0.5, 0.9, 0.08, 0.1, -4.0]])
     assert box.score == pytest.approx(1.0 / (1.0 + math.exp(-2.0)))
@@ -224,7 +219,7 @@ def test_of_two_slots_with_one_object_the_surer_remains():
     assert len(scored_slots_for([[0.5, 0.5, 0.1, 0.1, -1e4]], score_threshold=0.0)) == 1
 
 
-def test_malformed_scored_slots_are_refused():
+def test_malformed_scored_slots_are_refused() -> None:
     with pytest.raises(InferenceError, match="1 of 5 values of box_slots"):
         scored_slots_for([[0.5, 0.5, np.inf, 0.1, 1.0]])
     with pytest.raises(CardMismatchError, match=r"\(1, 4\)"):
@@ -237,7 +232,7 @@ def test_malformed_scored_slots_are_refused():
         scored_slots_for([[0.5, 0.5, 0.1, 0.1, 1.0]], broken)
 
 
-def test_a_top_view_decodes_slots_with_and_without_scores():
+def test_a_top_view_decodes_slots_with_and_without_scores() -> None:
     card = card_of(Recipe("ssadnet", head="slots"), version="1")
     outputs = {"class_logits": class_logits((slice(100, 140), slice(50, 66), CLASSES.index("van"), 9.0))[0]}
     for slot, score in (([0.29, 0.3, 0.08, 0.1], 1.0), ([0.29, 0.3, 0.08, 0.1, 0.0], 0.5)):
@@ -247,10 +242,7 @@ def test_a_top_view_decodes_slots_with_and_without_scores():
         assert box.score == pytest.approx(score, abs=2e-3)
 
 
-# --- dense
-
-
-def dense_of(*boxes):
+def dense_of(*boxes: Sequence[float]) -> np.ndarray:
     """What a perfect network says of (x, y, z, length, width, height, yaw, logit)."""
     dense = np.zeros((1, 9, SHAPE[0] // 4, SHAPE[1] // 4), dtype=np.float32)
     dense[0, 0] = -10.0
@@ -271,7 +263,7 @@ def dense_of(*boxes):
     return dense
 
 
-def class_logits(*patches):
+def class_logits(*patches: Any) -> np.ndarray:
     """Background, with (row slice, column slice, class, logit) on top."""
     logits = np.zeros((1, 5, *SHAPE), dtype=np.float32)
     logits[0, 0] = 2.0
@@ -280,7 +272,7 @@ def class_logits(*patches):
     return logits
 
 
-def test_dense_boxes_are_decoded_exactly():
+def test_dense_boxes_are_decoded_exactly() -> None:
     a = (20.13, 3.37, -0.9, 4.2, 1.7, 1.5, 0.4, 3.0)
     b = (38.8, -6.1, -0.5, 9.5, 2.5, 3.1, -1.2, 1.0)
     rows_a, cols_a = pixel_of(a[0], a[1])
@@ -300,14 +292,14 @@ def test_dense_boxes_are_decoded_exactly():
     assert decode_dense(dense_of(b, a), probabilities, "class_probabilities", VIEW, CLASSES, VEHICLES) == boxes
 
 
-def with_front(dense, x, y):
+def with_front(dense: np.ndarray, x: float, y: float) -> np.ndarray:
     """The dense maps with a vector towards the front."""
     return np.concatenate([dense, *(np.broadcast_to(np.float32(v), dense[:, :1].shape) for v in (x, y))], axis=1)
 
 
 @pytest.mark.parametrize("yaw", [0.0, 0.4, -1.2, 1.57, -1.57])
 @pytest.mark.parametrize("front", [(0, 0), (3, 0), (-3, 0), (0, 3), (0.1, -0.2), (-0.1, -0.1), (800, 1), (3e38, -3e38)])
-def test_boxes_turn_to_their_fronts(yaw, front):
+def test_boxes_turn_to_their_fronts(yaw: float, front: tuple[float, float]) -> None:
     dense = dense_of((20.13, 3.37, -0.9, 4.2, 1.7, 1.5, yaw, 3.0), (38.8, -6.1, -0.5, 9.5, 2.5, 3.1, 0.7, 1.0))
     plain = decode_dense(dense, class_logits(), "class_logits", VIEW, CLASSES, VEHICLES)
     boxes = decode_dense(with_front(dense, *front), class_logits(), "class_logits", VIEW, CLASSES, VEHICLES)
@@ -321,7 +313,7 @@ def test_boxes_turn_to_their_fronts(yaw, front):
         assert -math.pi <= box.yaw <= math.pi
 
 
-def test_each_box_has_its_own_front():
+def test_each_box_has_its_own_front() -> None:
     ahead, away = (20.13, 3.37, -0.9, 4.2, 1.7, 1.5, 0.4, 3.0), (38.8, -6.1, -0.5, 9.5, 2.5, 3.1, 0.7, 1.0)
     dense = with_front(dense_of(ahead, away), 2.0, 0.0)
     row, col = int((VIEW.x_range_m[1] - away[0]) / 0.4), int((VIEW.y_range_m[1] - away[1]) / 0.4)
@@ -336,7 +328,7 @@ def test_each_box_has_its_own_front():
         decode_dense(dense, class_logits(), "class_logits", VIEW, CLASSES, VEHICLES)
 
 
-def test_one_pixel_at_the_center_does_not_decide_the_class():
+def test_one_pixel_at_the_center_does_not_decide_the_class() -> None:
     x, y = 26.05, 0.05
     row, col = pixel_of(x, y)
     logits = class_logits(
@@ -349,7 +341,7 @@ def test_one_pixel_at_the_center_does_not_decide_the_class():
     assert box.label == "car"
 
 
-def test_background_under_the_box_still_leaves_a_vehicle():
+def test_background_under_the_box_still_leaves_a_vehicle() -> None:
     logits = class_logits()
     logits[0, 3] = 0.1
     (box,) = decode_dense(
@@ -358,7 +350,7 @@ def test_background_under_the_box_still_leaves_a_vehicle():
     assert box.label == "van"
 
 
-def test_sizes_decide_between_equally_likely_classes():
+def test_sizes_decide_between_equally_likely_classes() -> None:
     priors = {"car": (3.9, 1.6, 1.5), "van": (5.0, 1.9, 2.2), "truck": (10.0, 2.6, 3.2)}
     spreads = dict.fromkeys(priors, (0.1, 0.1, 0.1))
     sizes = {"box_size_priors": priors, "box_size_spreads": spreads}
@@ -376,7 +368,7 @@ def test_sizes_decide_between_equally_likely_classes():
     assert box.label == "car"
 
 
-def test_overlapping_boxes_of_the_dense_head():
+def test_overlapping_boxes_of_the_dense_head() -> None:
     first = (20.2, 3.4, -0.9, 4.2, 1.7, 1.5, 0.0, 1.0)
     second = (21.4, 3.4, -0.9, 4.2, 1.7, 1.5, 0.0, 2.0)
     beside = (20.2, 0.6, -0.9, 4.2, 1.7, 1.5, 0.0, 0.5)
@@ -392,7 +384,7 @@ def test_overlapping_boxes_of_the_dense_head():
     assert sure == boxes[:1]
 
 
-def test_score_thresholds_0_and_1():
+def test_score_thresholds_0_and_1() -> None:
     dense = dense_of((26.0, 0.0, -1.0, 4.0, 1.6, 1.5, 0.0, 2.0))
     assert decode_dense(dense, class_logits(), "class_logits", VIEW, CLASSES, VEHICLES, score_threshold=1.0) == []
     # A flat heat map has one peak a plateau, and the plateau of -10 touches the real one.
@@ -402,7 +394,7 @@ def test_score_thresholds_0_and_1():
     assert decode_dense(dense, class_logits(), "class_logits", VIEW, CLASSES, VEHICLES, max_boxes=0) == []
 
 
-def test_dense_clips_extreme_sizes_and_refuses_non_finite_values():
+def test_dense_clips_extreme_sizes_and_refuses_non_finite_values() -> None:
     dense = dense_of((26.0, 0.0, -1.0, 4.0, 1.6, 1.5, 0.0, 2.0))
     dense[0, [3, 4, 8], 50, 25] = 200.0, -200.0, 90.0
     (box,) = decode_dense(dense, class_logits(), "class_logits", VIEW, CLASSES, VEHICLES)
@@ -423,7 +415,7 @@ def test_dense_clips_extreme_sizes_and_refuses_non_finite_values():
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 7), (20, 30)])
-def test_peaks_agree_with_the_twin(shape):
+def test_peaks_agree_with_the_twin(shape: tuple[int, ...]) -> None:
     rng = np.random.default_rng(5)
     for heat in (rng.normal(size=shape), rng.integers(0, 3, shape), np.zeros(shape)):
         heat = heat.astype(np.float32)
@@ -434,7 +426,7 @@ def test_peaks_agree_with_the_twin(shape):
 
 
 @pytest.mark.parametrize("are_logits", [True, False])
-def test_footprint_sums_agree_with_the_twin(are_logits):
+def test_footprint_sums_agree_with_the_twin(are_logits: bool) -> None:
     rng = np.random.default_rng(6)
     values = rng.normal(0.0, 3.0, (5, 40, 30)).astype(np.float32)
     rectangles = np.column_stack(
@@ -448,7 +440,7 @@ def test_footprint_sums_agree_with_the_twin(are_logits):
     )
 
 
-def test_huge_footprints_are_sampled():
+def test_huge_footprints_are_sampled() -> None:
     values = np.random.default_rng(7).normal(0.0, 3.0, (20, 150, 150)).astype(np.float32)
     rectangles = np.array([[7.5, 0.0, 15.0, 14.0, 0.3], [7.5, 0.0, 4.0, 2.0, 0.3]])
     sums = np.empty((2, 20))
@@ -459,7 +451,7 @@ def test_huge_footprints_are_sampled():
     assert sums[1].sum() == pytest.approx(40 * 20, rel=0.05)
 
 
-def test_only_the_best_slots_become_boxes():
+def test_only_the_best_slots_become_boxes() -> None:
     scores = np.random.default_rng(8).random(SHAPE).astype(np.float32)
     labels = np.full(SHAPE, 2, np.uint8)
     slots = np.column_stack([np.random.default_rng(9).uniform(0, 1, (5000, 2)), np.full((5000, 2), 0.1)])
@@ -469,7 +461,7 @@ def test_only_the_best_slots_become_boxes():
     np.testing.assert_array_equal([box.score for box in boxes], best)
 
 
-def test_boxes_are_drawn_into_the_map():
+def test_boxes_are_drawn_into_the_map() -> None:
     card = card_of(Recipe("ssadnet"), version="1")
     drivable, stray = CLASSES.index("drivable"), CLASSES.index("van")
     logits = class_logits((slice(0, 10), slice(None), drivable, 9.0), (slice(350, 360), slice(0, 20), stray, 9.0))[0]
@@ -486,7 +478,7 @@ def test_boxes_are_drawn_into_the_map():
     assert abs(np.count_nonzero(labels == 4) - 100 * 26) < 60
 
 
-def test_slot_boxes_do_not_change_the_map():
+def test_slot_boxes_do_not_change_the_map() -> None:
     card = card_of(Recipe("ssadnet", head="slots-paper"), version="1")
     logits = class_logits((slice(100, 140), slice(50, 66), CLASSES.index("van"), 9.0))[0]
     slots = np.zeros((2, 4), np.float32)

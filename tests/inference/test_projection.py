@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ import twins.projection
 from edgeperc.errors import CardError, PointsError
 from edgeperc.ground.planes import find_ground
 from edgeperc.inference import projection
-from edgeperc.inference.projection import column_edges, make_projector, row_edges, tabulate
+from edgeperc.inference.projection import Projection, column_edges, make_projector, row_edges, tabulate
 from edgeperc.types.card import CHANNELS, InputSpec
 from edgeperc.types.sensor import get_sensor
 from edgeperc.types.views import RangeImageGeometry, TopViewGeometry
@@ -36,14 +37,14 @@ VIEWS = {
 SMALL = [name for name, view in VIEWS.items() if view.height * view.width < 2000]
 
 
-def spec_of(view, order=1):
+def spec_of(view: Any, order: int = 1) -> InputSpec:
     names = CHANNELS[view.kind][::order]
     return InputSpec(
         "input", names, tuple(0.5 * k for k in range(len(names))), tuple(1.0 + k for k in range(len(names)))
     )
 
 
-def random_points(rng, n):
+def random_points(rng: np.random.Generator, n: int) -> np.ndarray:
     """Points in every direction, near and far, on and off the grid, some not finite, some twice."""
     points = rng.normal(0.0, 1.0, (n, 4)) * 10.0 ** rng.uniform(-1.0, 1.7, (n, 1)) * (1.0, 1.0, 0.2, 1.0)
     points[: n // 4] = np.round(points[: n // 4], 1)
@@ -53,16 +54,16 @@ def random_points(rng, n):
     return points.astype(np.float32)
 
 
-def edges_of(name):
+def edges_of(name: str) -> tuple[np.ndarray, np.ndarray]:
     return row_edges(VIEWS[name]), column_edges(VIEWS[name])
 
 
-def assert_same(got, expected):
+def assert_same(got: Any, expected: Any) -> None:
     for name, expected_array in zip(("image", "index", "pixel"), expected, strict=True):
         np.testing.assert_array_equal(getattr(got, name), expected_array, err_msg=name)
 
 
-def heights_of(points):
+def heights_of(points: np.ndarray) -> np.ndarray:
     """Heights above an uneven ground, some beyond the limits, some not finite."""
     rng = np.random.default_rng(len(points))
     height_m = (points[:, 2] + rng.normal(1.7, 0.1, len(points))).astype(np.float32)
@@ -70,7 +71,7 @@ def heights_of(points):
     return height_m
 
 
-def check(points, view, spec=None):
+def check(points: np.ndarray, view: Any, spec: InputSpec | None = None) -> Projection:
     """Compiled, interpreted and slow runs agree to the last bit; returns the projection."""
     spec = spec or spec_of(view)
     projector = make_projector(view, spec)
@@ -92,14 +93,14 @@ def check(points, view, spec=None):
 
 @pytest.mark.parametrize("name", VIEWS)
 @pytest.mark.parametrize("n", [1, 255, 256, 257, 3000])
-def test_random_points(name, n):
+def test_random_points(name: str, n: int) -> None:
     rng = np.random.default_rng(n)
     seen = check(random_points(rng, n), VIEWS[name], spec_of(VIEWS[name], (-1) ** n))
     assert n < 3000 or (seen.index >= 0).any()
 
 
 @pytest.mark.parametrize("name", VIEWS)
-def test_no_points(name):
+def test_no_points(name: str) -> None:
     seen = check(np.empty((0, 4), np.float32), VIEWS[name])
     assert (seen.index == -1).all()
     assert (seen.image == 0.0).all()
@@ -114,12 +115,12 @@ numbers = st.one_of(
 
 @settings(max_examples=60, deadline=None)
 @given(st.lists(st.tuples(numbers, numbers, numbers, numbers), max_size=12), st.sampled_from(SMALL))
-def test_any_numbers(rows, name):
+def test_any_numbers(rows: list[tuple[float, float, float, float]], name: str) -> None:
     check(np.array(rows, np.float32).reshape(-1, 4), VIEWS[name])
 
 
 @pytest.mark.parametrize("name", [name for name, view in VIEWS.items() if view.kind == "range_image"])
-def test_pixels_are_those_of_true_angles(name):
+def test_pixels_are_those_of_true_angles(name: str) -> None:
     view = VIEWS[name]
     points = random_points(np.random.default_rng(5), 20000)
     seen = make_projector(view, spec_of(view)).project(points, heights_of(points))
@@ -141,7 +142,7 @@ def test_pixels_are_those_of_true_angles(name):
     assert inside.sum() > 200
 
 
-def test_point_lands_in_the_pixel_of_the_equations():
+def test_point_lands_in_the_pixel_of_the_equations() -> None:
     point = np.float32([[10.0, 0.0, -1.0, 0.25]])
     above = check(point, VIEWS["top view"], InputSpec("input", ("distance", "remission", "height"), (0,) * 3, (1,) * 3))
     assert above.pixel[0] == 359 * 200 + 99  # (46 - 10) / 0.1 cells from the far edge; half-way across, on the edge
@@ -154,7 +155,7 @@ def test_point_lands_in_the_pixel_of_the_equations():
 
 
 @pytest.mark.parametrize("channels", [("height",), ("remission", "distance"), ("height", "distance", "remission")])
-def test_channels_are_normalized_in_the_order_asked_for(channels):
+def test_channels_are_normalized_in_the_order_asked_for(channels: tuple[str, ...]) -> None:
     mean, std = (10.0, 0.5, -1.0)[: len(channels)], (2.0, 0.25, 4.0)[: len(channels)]
     points = np.float32([[3.0, 4.0, 1.0, 0.5], [1.0, 1.0, 0.5, 1.5]])
     seen = check(points, VIEWS["coarse top view"], InputSpec("input", channels, mean, std))
@@ -166,7 +167,7 @@ def test_channels_are_normalized_in_the_order_asked_for(channels):
 
 
 @pytest.mark.parametrize("name", [name for name, view in VIEWS.items() if view.kind == "range_image"])
-def test_tables_find_the_interval_of_every_value(name):
+def test_tables_find_the_interval_of_every_value(name: str) -> None:
     for edges in (row_edges(VIEWS[name]), column_edges(VIEWS[name])):
         first, last, cells_per_unit, base, split = tabulate(edges, "edges")
         rng = np.random.default_rng(2)
@@ -180,7 +181,7 @@ def test_tables_find_the_interval_of_every_value(name):
         np.testing.assert_array_equal(found, (values[:, None] <= edges[1:-1]).sum(axis=1))
 
 
-def test_edges_of_the_top_view():
+def test_edges_of_the_top_view() -> None:
     points = np.float32([
         [6.0, -10.0, -2.5, 0.0], [46.0, 0.0, 0.0, 0.0], [6.0, 10.0, 0.0, 0.0],
         [np.nextafter(np.float32(46), np.float32(0)), np.nextafter(np.float32(10), np.float32(0)), 2.5, 0.0],
@@ -191,20 +192,20 @@ def test_edges_of_the_top_view():
     assert seen.pixel.tolist() == [399 * 200 + 199, -1, -1, 0, -1, 199 * 200 + 99, -1]
 
 
-def test_edges_of_the_range_image():
+def test_edges_of_the_range_image() -> None:
     view = RangeImageGeometry((45.0, 0.0, -45.0), 2)  # edges at 67.5, 22.5, -22.5, -67.5 degrees
     points = np.float32([[5, 5, 0, 0], [5, -5, 0, 0], [5, 0, 0, 0], [5, -0.001, 0, 0], [5, 0, 5, 0], [-5, 0, 0, 0]])
     assert check(points, view).pixel.tolist() == [2, -1, 3, 3, 1, -1]
 
 
-def test_straight_behind_is_in_a_full_turn():
+def test_straight_behind_is_in_a_full_turn() -> None:
     points = np.float32([[-5, 0.0, 0, 0], [-5, -0.0, 0, 0], [-5, -1e-20, 0, 0], [-5, 1e-20, 0, 0]])
     view = VIEWS["full turn, uneven"]
     seen = check(points, view)
     assert (seen.pixel % view.width).tolist() == [0, 0, view.width - 1, 0]
 
 
-def test_axis_and_origin_are_out_of_view():
+def test_axis_and_origin_are_out_of_view() -> None:
     # The squares of 1e-30 are 0 in float32.
     points = np.float32([[0, 0, 0, 0], [-0.0, 0, 0, 0.5], [0, 0, 1, 0], [0, 0, -1, 0], [1e-30, 1e-30, 1, 0]])
     points = np.concatenate([points, points * np.float32([-1, 1, 1, 1])])
@@ -215,7 +216,7 @@ def test_axis_and_origin_are_out_of_view():
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
 @pytest.mark.parametrize("column", range(4))
-def test_points_not_finite_are_out_of_view(bad, column):
+def test_points_not_finite_are_out_of_view(bad: float, column: int) -> None:
     points = np.float32([[10.0, 1.0, -1.0, 0.5]] * 2)
     points[0, column] = bad
     for view in VIEWS.values():
@@ -224,7 +225,7 @@ def test_points_not_finite_are_out_of_view(bad, column):
         assert not (seen.index == 0).any()
 
 
-def test_the_best_point_wins_and_the_earlier_of_two():
+def test_the_best_point_wins_and_the_earlier_of_two() -> None:
     points = np.full((1000, 4), (10.02, 0.03, 0.0, 0.5), np.float32)
     for view in (VIEWS["top view"], VIEWS["front"]):
         seen = check(points, view)
@@ -239,7 +240,7 @@ def test_the_best_point_wins_and_the_earlier_of_two():
     assert check(points, VIEWS["front"]).index.max() == 300
 
 
-def test_points_may_be_read_only():
+def test_points_may_be_read_only() -> None:
     points = random_points(np.random.default_rng(0), 500)
     before = points.copy()
     points.flags.writeable = False
@@ -248,7 +249,7 @@ def test_points_may_be_read_only():
     np.testing.assert_array_equal(points, before)
 
 
-def test_every_pixel_leads_back_to_its_point():
+def test_every_pixel_leads_back_to_its_point() -> None:
     points = random_points(np.random.default_rng(1), 5000)
     for view in VIEWS.values():
         seen = make_projector(view, spec_of(view)).project(points, heights_of(points))
@@ -257,13 +258,13 @@ def test_every_pixel_leads_back_to_its_point():
         np.testing.assert_array_equal(np.unique(seen.pixel[seen.pixel >= 0]), flat)
 
 
-def test_error_of_the_papers_azimuth():
+def test_error_of_the_papers_azimuth() -> None:
     paper_deg = math.degrees(math.asin(math.sin(math.radians(45.0)) * math.cos(math.radians(-24.8))))
     assert paper_deg == pytest.approx(39.9, abs=0.05)
     assert round((45.0 - paper_deg) / 90.0 * 512) == 29
 
 
-def test_wrong_arrays_are_refused():
+def test_wrong_arrays_are_refused() -> None:
     view = VIEWS["coarse top view"]
     projector = make_projector(view, spec_of(view))
     good = np.zeros((5, 4), np.float32)
@@ -294,7 +295,7 @@ def test_wrong_arrays_are_refused():
             projector.fill(good, **(buffers | {name: bad}))
 
 
-def test_heights_above_the_ground_are_clipped_and_normalized():
+def test_heights_above_the_ground_are_clipped_and_normalized() -> None:
     spec = InputSpec("input", ("height_above_ground", "z"), (1.0, 0.0), (2.0, 1.0))
     points = np.zeros((7, 4), np.float32)
     points[:, 0], points[:, 1] = 10.0, np.linspace(-9.0, 9.0, 7)  # seven columns of one row
@@ -308,7 +309,7 @@ def test_heights_above_the_ground_are_clipped_and_normalized():
     assert not seen.image[:, seen.index < 0].any()
 
 
-def test_missing_or_wrong_heights_are_refused():
+def test_missing_or_wrong_heights_are_refused() -> None:
     projector = make_projector(VIEWS["front"], spec_of(VIEWS["front"]))
     points = np.ones((5, 4), np.float32)
     with pytest.raises(PointsError, match=r"height_m is missing.*find_ground"):
@@ -321,7 +322,7 @@ def test_missing_or_wrong_heights_are_refused():
     assert (projector.project(points, strided).pixel >= -1).all()
 
 
-def test_five_channels_do_not_depend_on_heights():
+def test_five_channels_do_not_depend_on_heights() -> None:
     points = random_points(np.random.default_rng(4), 3000)
     names = CHANNELS["range_image"][:5]
     without = make_projector(VIEWS["front"], InputSpec("input", names, (0.5,) * 5, (2.0,) * 5)).project(points)
@@ -331,7 +332,7 @@ def test_five_channels_do_not_depend_on_heights():
 
 
 @pytest.mark.parametrize("n", [0, 1, 4000])
-def test_a_scan_is_projected_with_its_ground(n):
+def test_a_scan_is_projected_with_its_ground(n: int) -> None:
     rng = np.random.default_rng(n)
     points = np.zeros((n, 4), np.float32)
     points[:, :2] = rng.uniform(-30.0, 30.0, (n, 2))
@@ -352,13 +353,13 @@ def test_a_scan_is_projected_with_its_ground(n):
     )
 
 
-def test_the_benchmark_compares_equal_answers():
+def test_the_benchmark_compares_equal_answers() -> None:
     points = random_points(np.random.default_rng(3), 20000)
     calls = contenders(points[(np.abs(points) < 1e9).all(axis=1)])  # raises where numpy and the kernels differ
     assert set(calls) >= {"copy loop", "top view", "top view, numpy", "range image", "range image, numpy"}
 
 
-def test_wrong_cards_are_refused():
+def test_wrong_cards_are_refused() -> None:
     with pytest.raises(CardError, match="range"):
         make_projector(VIEWS["top view"], InputSpec("input", ("range",), (0.0,), (1.0,)))
     with pytest.raises(CardError, match="height"):
@@ -376,7 +377,7 @@ def test_wrong_cards_are_refused():
 
 @pytest.mark.kernel
 @pytest.mark.parametrize("n", [0, 1, 500])
-def test_copy_loop_copies(n):
+def test_copy_loop_copies(n: int) -> None:
     points = random_points(np.random.default_rng(n), n)
     copy = np.empty_like(points)
     fill_copy(points, copy)

@@ -342,7 +342,7 @@ def test_a_failing_run_is_an_inference_error() -> None:
         def run_with_iobinding(self, _: object) -> None:
             raise RuntimeError("no memory")
 
-    session._session = Broken()
+    session.inference = Broken()
     with pytest.raises(InferenceError, match="no memory"):
         session.run()
 
@@ -360,7 +360,7 @@ def test_the_input_is_bound_for_every_run(monkeypatch: pytest.MonkeyPatch) -> No
         def run_with_iobinding(self, binding: Device) -> None:
             seen.append(binding.copied)
 
-    session._session = session._binding = Device()
+    session.inference = session.binding = Device()
     for value in (1.0, 2.0):
         session.input[:] = value
         session.run()
@@ -370,14 +370,14 @@ def test_the_input_is_bound_for_every_run(monkeypatch: pytest.MonkeyPatch) -> No
 def test_auto_skips_a_provider_that_gives_other_outputs(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    warm_up = Session._warm_up
+    warm_up = Session.warm_up
 
     def wrong(self: Session, limit: float, run_options: object) -> float:
         if self.precision == "int8":
             raise CardMismatchError("off by far")
         return warm_up(self, limit, run_options)
 
-    monkeypatch.setattr(Session, "_warm_up", wrong)
+    monkeypatch.setattr(Session, "warm_up", wrong)
     monkeypatch.setattr(session_module, "cpu_features", lambda: frozenset({"avx512_vnni"}))
     assert Session("pointseg", "cpu").description == "pointseg fp32, CPUExecutionProvider"
     assert "auto skips pointseg on cpu in int8: off by far" in caplog.text

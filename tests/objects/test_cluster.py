@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,23 +16,31 @@ from edgeperc.objects import linkage
 from edgeperc.objects.boxes import OBJECT_SIZE_M, classes_of_boxes, join_boxes, objects_from_points
 from edgeperc.objects.cluster import cluster_labels, find_clusters, sort_points
 from edgeperc.types.geometry import oriented_iou, rectangles
+from edgeperc.types.perception import Box
 from edgeperc.types.points import Cloud, read_only
 
 CLASSES = ("background", "car", "pedestrian", "cyclist")
 
 
-def as_points(xyz):
+def as_points(xyz: Any) -> np.ndarray:
     return np.column_stack([xyz, np.zeros(len(xyz))]).astype(np.float32)
 
 
-def side(start, end, z=(-1.5, -0.3), spacing=0.1):
+def side(
+    start: tuple[float, float] | np.ndarray,
+    end: tuple[float, float] | np.ndarray,
+    z: tuple[float, float] = (-1.5, -0.3),
+    spacing: float = 0.1,
+) -> np.ndarray:
     """Points on an upright rectangle between two places, as a spinning sensor leaves them."""
     n = max(round(math.dist(start, end) / spacing), 1) + 1
     line = np.linspace(start, end, n)
     return np.array([[x, y, height] for height in np.linspace(z[1], z[0], 6) for x, y in line])
 
 
-def car_points(x, y, yaw, *, front=True, flank=True, size=(3.89, 1.63)):
+def car_points(
+    x: float, y: float, yaw: float, *, front: bool = True, flank: bool = True, size: tuple[float, float] = (3.89, 1.63)
+) -> np.ndarray:
     """The sides of a car that are turned to the sensor at the origin, and the place of its middle."""
     along, across = size[0] / 2, size[1] / 2
     cos, sin = math.cos(yaw), math.sin(yaw)
@@ -46,12 +55,9 @@ def car_points(x, y, yaw, *, front=True, flank=True, size=(3.89, 1.63)):
     return np.concatenate(seen)
 
 
-# --- clusters
-
-
 @pytest.mark.parametrize("seed", range(6))
 @pytest.mark.parametrize("per_m", [0.0, 0.02, 0.1])
-def test_clusters_match_a_test_of_every_pair(seed, per_m):
+def test_clusters_match_a_test_of_every_pair(seed: int, per_m: float) -> None:
     rng = np.random.default_rng(seed)
     centers = rng.uniform(-30, 30, (25, 3)) * [1, 1, 0.1]
     points = as_points(centers[rng.integers(0, 25, 700)] + rng.normal(0, 0.1 * (seed + 1), (700, 3)))
@@ -70,14 +76,14 @@ places = st.sampled_from([0.0, 0.25, 0.5, 0.75, 1.0, 0.3, -0.2, 0.35, 5.0, -7.5,
 
 @settings(max_examples=300, deadline=None)
 @given(st.lists(st.tuples(places, places, places), max_size=30), st.sampled_from([0.0, 0.05]), st.integers(1, 3))
-def test_random_scans_match_the_twin(rows, per_m, min_points):
+def test_random_scans_match_the_twin(rows: list[tuple[float, float, float]], per_m: float, min_points: int) -> None:
     points = as_points(np.array(rows).reshape(-1, 3))
     among = np.ones(len(points), bool)
     found = find_clusters(points, min_distance_m=0.5, distance_per_m=per_m, min_points=min_points)
     np.testing.assert_array_equal(found, twins.cluster.clusters(points, among, 0.5, per_m, 100.0, min_points))
 
 
-def hostile(kind, rng, n):
+def hostile(kind: str, rng: np.random.Generator, n: int) -> np.ndarray:
     """Points that make a clustering by distances up to 0.5 m slow, or lie just inside or outside of it."""
     k = np.arange(n)
     edge = math.ceil(n ** (1 / 3))
@@ -126,7 +132,7 @@ KINDS = (
 @pytest.mark.parametrize("kind", KINDS)
 @settings(max_examples=5, deadline=None)
 @given(st.integers(0, 2**31), st.sampled_from([0.0, 0.014, 0.1, 1.0]))
-def test_hostile_scans_match_the_twin(kind, seed, per_m):
+def test_hostile_scans_match_the_twin(kind: str, seed: int, per_m: float) -> None:
     points = as_points(hostile(kind, np.random.default_rng(seed), 160))
     found = find_clusters(points, distance_per_m=per_m, min_points=1)
     every = np.ones(len(points), bool)
@@ -136,7 +142,7 @@ def test_hostile_scans_match_the_twin(kind, seed, per_m):
 @pytest.mark.parametrize("kind", KINDS)
 @settings(max_examples=3, deadline=None)
 @given(st.integers(0, 2**31), st.sampled_from([0.014, 0.1]))
-def test_the_work_on_hostile_scans_is_bounded(kind, seed, per_m):
+def test_the_work_on_hostile_scans_is_bounded(kind: str, seed: int, per_m: float) -> None:
     points = read_only(as_points(hostile(kind, np.random.default_rng(seed), 20_000)))
     every = read_only(np.ones(len(points)), np.bool_)
     clusters, work = np.empty(len(points), np.int32), np.empty(1, linkage.WORK)
@@ -149,7 +155,7 @@ def test_the_work_on_hostile_scans_is_bounded(kind, seed, per_m):
     np.testing.assert_array_equal(again, clusters)
 
 
-def test_a_scan_that_needs_too_many_tests_is_split_where_no_link_was_found_and_warns():
+def test_a_scan_that_needs_too_many_tests_is_split_where_no_link_was_found_and_warns() -> None:
     rng = np.random.default_rng(0)
     shell = hostile("far shell", rng, 20_000)
     shell *= (0.5 + 2e-4) / np.linalg.norm(shell, axis=1)[:, None]
@@ -163,7 +169,7 @@ def test_a_scan_that_needs_too_many_tests_is_split_where_no_link_was_found_and_w
 
 @settings(max_examples=60, deadline=None)
 @given(st.integers(0, 2**31), st.floats(0.0, 1.0), st.sampled_from([0.0, 0.1]), st.sampled_from([0.0, 0.3, 0.7, 1.0]))
-def test_clusters_with_enough_seeds_are_kept(seed, share, per_m, min_share):
+def test_clusters_with_enough_seeds_are_kept(seed: int, share: float, per_m: float, min_share: float) -> None:
     rng = np.random.default_rng(seed)
     centers = rng.uniform(-12, 12, (12, 3)) * [1, 1, 0.1]
     of = rng.integers(0, 12, 200)
@@ -183,7 +189,7 @@ def test_clusters_with_enough_seeds_are_kept(seed, share, per_m, min_share):
 
 @settings(max_examples=60, deadline=None)
 @given(st.integers(0, 2**31), st.sampled_from([(-1.0, -1.0), (0.3, 0.6), (0.6, 0.1), (1.0, 1.0)]))
-def test_clusters_with_enough_votes_are_kept(seed, min_share):
+def test_clusters_with_enough_votes_are_kept(seed: int, min_share: tuple[float, float]) -> None:
     rng = np.random.default_rng(seed)
     centers = rng.uniform(-12, 12, (12, 3)) * [1, 1, 0.1]
     of = rng.integers(0, 12, 200)
@@ -208,7 +214,7 @@ def test_clusters_with_enough_votes_are_kept(seed, min_share):
 
 
 @pytest.mark.parametrize("spread", [0.02, 0.5, 20.0])
-def test_tall_column_in_any_order_matches_the_twin(spread):
+def test_tall_column_in_any_order_matches_the_twin(spread: np.ndarray) -> None:
     rng = np.random.default_rng(0)
     points = as_points(np.column_stack([rng.uniform(0, 0.6, (300, 2)), rng.uniform(0, spread * 10, 300)]))
     np.testing.assert_array_equal(
@@ -217,7 +223,7 @@ def test_tall_column_in_any_order_matches_the_twin(spread):
     )
 
 
-def test_clusters_are_those_of_dbscan_with_one_sample():
+def test_clusters_are_those_of_dbscan_with_one_sample() -> None:
     csgraph, spatial = pytest.importorskip("scipy.sparse.csgraph"), pytest.importorskip("scipy.spatial")
     rng = np.random.default_rng(1)
     points = as_points(rng.uniform(-6, 6, (800, 3)) * [1, 1, 0.3])
@@ -229,13 +235,13 @@ def test_clusters_are_those_of_dbscan_with_one_sample():
     np.testing.assert_array_equal([np.flatnonzero(found == number)[0] for number in found], first)
 
 
-def test_far_points_may_be_farther_apart():
+def test_far_points_may_be_farther_apart() -> None:
     pairs = as_points([[5, 0, 0], [5, 0.8, 0], [60, 0, 0], [60, 0.8, 0]])
     assert find_clusters(pairs, min_points=1).tolist() == [0, 1, 2, 2]
     assert find_clusters(pairs, min_points=1, distance_per_m=0.0).tolist() == [0, 1, 2, 3]
 
 
-def test_clusters_are_numbered_by_their_first_points():
+def test_clusters_are_numbered_by_their_first_points() -> None:
     rng = np.random.default_rng(2)
     points = as_points(np.repeat(rng.uniform(-50, 50, (40, 3)), 6, axis=0))
     order = rng.permutation(len(points))
@@ -249,12 +255,12 @@ def test_clusters_are_numbered_by_their_first_points():
 
 
 @pytest.mark.parametrize("points", [np.zeros((0, 4)), np.full((7, 4), np.nan), np.full((3, 4), np.inf)])
-def test_scan_without_finite_points_has_no_clusters(points):
+def test_scan_without_finite_points_has_no_clusters(points: np.ndarray) -> None:
     assert (find_clusters(points.astype(np.float32), min_points=1) == -1).all()
     assert objects_from_points(points.astype(np.float32), np.zeros(len(points), np.uint8), CLASSES) == ()
 
 
-def test_one_point_is_a_cluster_if_min_points_is_1():
+def test_one_point_is_a_cluster_if_min_points_is_1() -> None:
     point = as_points([[3.0, 1.0, 0.0]])
     assert find_clusters(point, min_points=1).tolist() == [0]
     assert find_clusters(point).tolist() == [-1]
@@ -273,20 +279,17 @@ def test_one_point_is_a_cluster_if_min_points_is_1():
         {"seeds": np.ones(3, bool)},
     ],
 )
-def test_impossible_options_are_refused(options):
+def test_impossible_options_are_refused(options: dict[str, float]) -> None:
     with pytest.raises(PointsError, match="expected"):
         find_clusters(np.zeros((2, 4), np.float32), **options)
 
 
-def test_a_wrong_shape_is_refused():
+def test_a_wrong_shape_is_refused() -> None:
     with pytest.raises(PointsError, match="expected"):
         find_clusters(np.zeros((2, 2), np.float32))
 
 
-# --- the class of a cluster
-
-
-def test_cluster_is_kept_if_more_than_min_share_has_one_class():
+def test_cluster_is_kept_if_more_than_min_share_has_one_class() -> None:
     clusters = np.repeat(np.array([0, 1, 2, 3, -1], np.int32), 10)
     labels = np.array([1] * 8 + [0] * 2 + [1] * 7 + [0] * 3 + [2] * 5 + [3] * 5 + [0] * 10 + [1] * 10, np.uint8)
     classes, shares = cluster_labels(clusters, labels)
@@ -297,7 +300,7 @@ def test_cluster_is_kept_if_more_than_min_share_has_one_class():
 
 @settings(max_examples=60, deadline=None)
 @given(st.integers(0, 2**31), st.integers(1, 400), st.sampled_from([2, 4, 256]), st.floats(0.0, 1.0))
-def test_votes_agree_with_the_twin(seed, n, n_labels, min_share):
+def test_votes_agree_with_the_twin(seed: int, n: int, n_labels: int, min_share: float) -> None:
     rng = np.random.default_rng(seed)
     clusters = rng.integers(-1, max(n // 10, 1), n).astype(np.int32)
     labels = rng.integers(0, n_labels, n).astype(np.uint8)
@@ -308,23 +311,20 @@ def test_votes_agree_with_the_twin(seed, n, n_labels, min_share):
     np.testing.assert_array_equal(shares, expected_shares)
 
 
-def test_no_cluster_has_no_class():
+def test_no_cluster_has_no_class() -> None:
     for clusters in (np.zeros(0, np.int32), np.full(4, -1, np.int32)):
         classes, shares = cluster_labels(clusters, np.zeros(len(clusters), np.uint8))
         assert classes.shape == shares.shape == (0,)
 
 
-def test_labels_of_another_scan_are_refused():
+def test_labels_of_another_scan_are_refused() -> None:
     with pytest.raises(PointsError, match="expected the same"):
         cluster_labels(np.zeros(3, np.int32), np.zeros(4, np.uint8))
 
 
-# --- boxes
-
-
 @settings(max_examples=60, deadline=None)
 @given(st.integers(1, 700), st.integers(0, 2**31), st.booleans())
-def test_rectangles_agree_with_the_twin(n, seed, l_shaped):
+def test_rectangles_agree_with_the_twin(n: int, seed: int, l_shaped: bool) -> None:
     rng = np.random.default_rng(seed)
     turn = rng.uniform(0, np.pi)
     members = (
@@ -344,7 +344,7 @@ def test_rectangles_agree_with_the_twin(n, seed, l_shaped):
 
 @pytest.mark.parametrize("where", [(12.0, 5.0), (-9.0, 7.0), (-15.0, -4.0), (8.0, -20.0)])
 @pytest.mark.parametrize("yaw", [0.0, 0.5, 1.2, -0.9])
-def test_a_car_gets_its_box_all_around_the_vehicle(where, yaw):
+def test_a_car_gets_its_box_all_around_the_vehicle(where: tuple[float, float], yaw: float) -> None:
     points = as_points(car_points(*where, yaw))
     (box,) = objects_from_points(points, np.ones(len(points), np.uint8), CLASSES)
     assert box.label == "car"
@@ -355,7 +355,7 @@ def test_a_car_gets_its_box_all_around_the_vehicle(where, yaw):
 
 @pytest.mark.parametrize("part", [{"flank": False}, {"front": False}])
 @pytest.mark.parametrize("x", [15.0, -15.0])
-def test_hidden_side_is_extended_to_the_usual_length(part, x):
+def test_hidden_side_is_extended_to_the_usual_length(part: dict[str, bool], x: float) -> None:
     points = as_points(car_points(x, 6.0, 0.0, **part))
     (box,) = objects_from_points(points, np.ones(len(points), np.uint8), CLASSES)
     np.testing.assert_allclose(box.size[:2], OBJECT_SIZE_M["car"][:2], atol=0.06)
@@ -365,7 +365,7 @@ def test_hidden_side_is_extended_to_the_usual_length(part, x):
 
 @pytest.mark.parametrize("where", [(15.0, 2.0), (-40.0, -3.5), (1.0, 18.0)])
 @pytest.mark.parametrize(("width", "depth"), [(1.6, 1.4), (1.9, 1.75), (2.2, 1.5), (1.5, 2.0)])
-def test_what_is_seen_of_a_car_from_behind_is_its_width(where, width, depth):
+def test_what_is_seen_of_a_car_from_behind_is_its_width(where: tuple[float, float], width: float, depth: float) -> None:
     """A broad rear and a part of a flank: the flank continues away from the sensor."""
     x, y = where
     heading = 0.0 if abs(x) > abs(y) else math.pi / 2
@@ -387,7 +387,9 @@ def test_what_is_seen_of_a_car_from_behind_is_its_width(where, width, depth):
         ((11.0, 2.5), 1.7, "truck", (11.0, 2.5, 2.2)),
     ],
 )
-def test_vans_and_trucks_are_known_by_their_size(size, height_m, label, completed):
+def test_vans_and_trucks_are_known_by_their_size(
+    size: tuple[float, float], height_m: float, label: str, completed: tuple[float, ...]
+) -> None:
     x, y, _ = car_points(12.0, 6.0, 0.0, size=size).T
     z = np.linspace(-1.73, height_m - 1.73, 40)
     points = as_points(np.column_stack([np.repeat(x, 40), np.repeat(y, 40), np.tile(z, len(x))]))
@@ -399,14 +401,14 @@ def test_vans_and_trucks_are_known_by_their_size(size, height_m, label, complete
             np.testing.assert_allclose(box.size, completed, atol=0.1)
 
 
-def test_sides_longer_than_usual_are_kept():
+def test_sides_longer_than_usual_are_kept() -> None:
     points = as_points(car_points(12.0, 6.0, 0.0, size=(11.0, 2.5)))
     (box,) = objects_from_points(points, np.ones(len(points), np.uint8), CLASSES)
     np.testing.assert_allclose(box.size[:2], (11.0, 2.5), atol=0.05)
 
 
 @pytest.mark.parametrize(("x", "y", "yaw"), [(14.0, 9.0, 0.4), (20.0, -6.0, 0.0), (5.0, 18.0, 1.2)])
-def test_what_stands_beside_a_vehicle_does_not_widen_its_box(x, y, yaw):
+def test_what_stands_beside_a_vehicle_does_not_widen_its_box(x: float, y: float, yaw: float) -> None:
     beside = np.array([-math.sin(yaw), math.cos(yaw)])
     beside *= math.copysign(1.0, beside @ (x, y))  # away from the sensor
     car = car_points(x, y, yaw, size=(5.07, 1.91))
@@ -423,14 +425,14 @@ def test_what_stands_beside_a_vehicle_does_not_widen_its_box(x, y, yaw):
     assert min(wide.size[:2]) > object_boxes.MAX_WIDTH_M
 
 
-def cluster_extents(points, yaw):
+def cluster_extents(points: np.ndarray, yaw: float) -> np.ndarray:
     """How far points reach along and across a heading [m]."""
     cos, sin = math.cos(yaw), math.sin(yaw)
     return np.ptp(points[:, :2] @ np.array([[cos, -sin], [sin, cos]]), axis=0)
 
 
 @pytest.mark.parametrize("n", [2, 3, 500])
-def test_a_cluster_as_wide_as_a_street_gets_a_finite_box(n):
+def test_a_cluster_as_wide_as_a_street_gets_a_finite_box(n: int) -> None:
     rng = np.random.default_rng(n)
     points = as_points(rng.uniform([10.0, -20.0, -1.5], [50.0, 20.0, 0.0], (n, 3)))
     clusters, labels = np.zeros(n, np.int32), np.ones(n, np.uint8)
@@ -438,7 +440,7 @@ def test_a_cluster_as_wide_as_a_street_gets_a_finite_box(n):
         assert np.isfinite([box.score, *box.center, *box.size, box.yaw]).all()
 
 
-def test_boxes_stand_on_the_ground():
+def test_boxes_stand_on_the_ground() -> None:
     points = as_points(car_points(12.0, 6.0, 0.0))
     height = points[:, 2] + np.float32(1.73)
     (box,) = objects_from_points(points, np.ones(len(points), np.uint8), CLASSES, height_m=height)
@@ -446,7 +448,7 @@ def test_boxes_stand_on_the_ground():
     assert box.size[2] == pytest.approx(OBJECT_SIZE_M["car"][2])
 
 
-def test_ground_points_do_not_join_objects():
+def test_ground_points_do_not_join_objects() -> None:
     cars = [car_points(12.0, y, 0.0) for y in (5.0, 9.0)]
     x, y = np.meshgrid(np.arange(5.0, 20.0, 0.3), np.arange(0.0, 15.0, 0.3))
     floor = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, -1.73)])
@@ -457,11 +459,11 @@ def test_ground_points_do_not_join_objects():
     assert objects_from_points(points, labels, CLASSES) == ()
 
 
-def test_a_cluster_is_judged_by_its_points_in_view():
+def test_a_cluster_is_judged_by_its_points_in_view() -> None:
     points = as_points(car_points(12.0, 6.0, 0.0))
     rank = np.argsort(np.argsort(points[:, 0], kind="stable"))
 
-    def boxes(seen, labeled=1.0):
+    def boxes(seen: float, labeled: float = 1.0) -> tuple[Box, ...]:
         in_view = rank < seen * len(points)
         labels = (rank < seen * labeled * len(points)).astype(np.uint8)
         return objects_from_points(points, labels, CLASSES, in_view=in_view)
@@ -482,7 +484,7 @@ def test_a_cluster_is_judged_by_its_points_in_view():
 
 
 @pytest.mark.parametrize("x", [12.0, 40.0])
-def test_what_lies_between_returns_does_not_lower_the_score(x):
+def test_what_lies_between_returns_does_not_lower_the_score(x: float) -> None:
     """Of a car 40 m away, two beams may meet 0.6 m of its height."""
     points = car_points(x, 6.0, 0.0)
     points = as_points(points[np.isin(points[:, 2].round(2), (-1.02, -0.78, -0.54))])
@@ -496,14 +498,14 @@ def test_what_lies_between_returns_does_not_lower_the_score(x):
     assert closer[0].score == pytest.approx(n * (top / 1.53) ** 2, rel=0.02)
 
 
-def test_pieces_of_one_object_are_one_box():
+def test_pieces_of_one_object_are_one_box() -> None:
     points = car_points(20.0, 6.0, 0.0)
     points = as_points(points[(points[:, 0] < 19.6) | (points[:, 0] > 20.4)])  # a pole in front
     assert find_clusters(points).max() == 1
     assert len(objects_from_points(points, np.ones(len(points), np.uint8), CLASSES)) == 1
 
 
-def test_what_lies_inside_a_better_box_is_no_further_object():
+def test_what_lies_inside_a_better_box_is_no_further_object() -> None:
     """Returns from inside a car, seen through its windows: completed away from the sensor, they would reach beyond."""
     shell = car_points(20.0, 6.0, 0.0)
     inside = side((20.3, 6.2), (21.3, 6.2), z=(-1.4, -0.4))
@@ -523,7 +525,7 @@ def test_what_lies_inside_a_better_box_is_no_further_object():
     assert objects_from_points(*alone, clusters=one, others=[away]) == (ghost,)
 
 
-def test_every_class_has_boxes_and_better_ones_come_first():
+def test_every_class_has_boxes_and_better_ones_come_first() -> None:
     person = side((8.0, -6.0), (8.0, -5.5), z=(-1.7, 0.0))
     points = as_points(np.concatenate([person, car_points(12.0, 6.0, 0.0)]))
     labels = np.array([2] * len(person) + [1] * (len(points) - len(person)), np.uint8)
@@ -534,7 +536,7 @@ def test_every_class_has_boxes_and_better_ones_come_first():
     assert objects_from_points(points, labels, CLASSES) == boxes
 
 
-def test_at_most_1000_clusters_get_a_box():
+def test_at_most_1000_clusters_get_a_box() -> None:
     person = side((0.0, -0.3), (0.0, 0.3), z=(-1.7, 0.0), spacing=0.2)
     x, y = np.meshgrid(np.arange(-60.0, 60.0, 3.0), np.arange(-60.0, 60.0, 3.0))
     places = np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)])
@@ -543,15 +545,15 @@ def test_at_most_1000_clusters_get_a_box():
     assert find_clusters(points).max() + 1 == x.size > len(boxes) == object_boxes.MAX_OBJECTS == 1000
 
 
-def test_objects_below_the_ground_are_dropped():
+def test_objects_below_the_ground_are_dropped() -> None:
     points = as_points(side((8.0, -6.0), (8.0, -5.5), z=(-3.5, -2.5)))
     height = points[:, 2] + np.float32(1.73)
     for label in (1, 2):
         assert objects_from_points(points, np.full(len(points), label, np.uint8), CLASSES, height_m=height) == ()
 
 
-def test_pole_scores_lower_than_a_person():
-    def score(top, label):
+def test_pole_scores_lower_than_a_person() -> None:
+    def score(top: float, label: int) -> float:
         points = as_points(side((8.0, -6.0), (8.0, -5.3), z=(-1.7, top)))
         boxes = objects_from_points(points, np.full(len(points), label, np.uint8), CLASSES, min_score=0.0)
         return boxes[0].score
@@ -561,7 +563,7 @@ def test_pole_scores_lower_than_a_person():
     assert score(0.0, 1) == score(0.7, 1)  # as tall as a van
 
 
-def test_class_without_usual_size_has_the_size_of_its_points():
+def test_class_without_usual_size_has_the_size_of_its_points() -> None:
     points = as_points(side((8.0, -6.0), (8.0, -4.0), z=(-1.7, 0.0)))
     (box,) = objects_from_points(points, np.ones(len(points), np.uint8), ("background", "sign"))
     np.testing.assert_allclose(box.size, (2.0, object_boxes.MIN_SIDE_M, 1.7), atol=1e-5)
@@ -578,6 +580,6 @@ def test_class_without_usual_size_has_the_size_of_its_points():
         (np.zeros(4, np.uint8), {"height_m": np.zeros(5, np.float32)}, "height_m"),
     ],
 )
-def test_arrays_of_another_scan_are_refused(labels, options, message):
+def test_arrays_of_another_scan_are_refused(labels: np.ndarray, options: dict[str, np.ndarray], message: str) -> None:
     with pytest.raises(PointsError, match=message):
         objects_from_points(np.zeros((4, 4), np.float32), labels, CLASSES, **options)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import pytest
@@ -29,7 +31,7 @@ ROLES = np.zeros(256, np.uint8)
 ROLES[[2, 3, 4]] = WALKS, RIDES, persons.UNSEEN
 
 
-def person(x, y, height=1.75):
+def person(x: float, y: float, height: float = 1.75) -> np.ndarray:
     """What a sensor at the origin sees of a person: legs, a torso 0.5 m wide, and a head, as upright arcs."""
     away = math.hypot(x, y)
     heights = np.arange(0.15, height, max(0.007 * away, 0.02))
@@ -46,14 +48,16 @@ def person(x, y, height=1.75):
     return xyz
 
 
-def upright(x, y, width, depth, z=(0.2, 1.75), spacing=0.06):
+def upright(
+    x: float, y: float, width: float, depth: float, z: tuple[float, float] = (0.2, 1.75), spacing: float = 0.06
+) -> np.ndarray:
     """Points in an upright block, all around the place."""
     u, v = np.arange(-width / 2, width / 2 + 0.01, spacing), np.arange(-depth / 2, depth / 2 + 0.01, spacing)
     h = np.arange(*z, 0.07)
     return np.stack(np.meshgrid(v + x, u + y, h + GROUND_Z), -1).reshape(-1, 3)
 
 
-def boxes_of(*parts, labels=None, **options):
+def boxes_of(*parts: np.ndarray, labels: Sequence[int] | None = None, **options: Any) -> tuple[Box, ...]:
     """Boxes of parts whose points are all labeled; of pedestrians by default."""
     xyz = np.concatenate(parts)
     points = np.column_stack([xyz, np.zeros(len(xyz))]).astype(np.float32)
@@ -63,16 +67,18 @@ def boxes_of(*parts, labels=None, **options):
     return objects_from_points(points, own, CLASSES, **options)
 
 
-def one_cluster(*parts):
+def one_cluster(*parts: np.ndarray) -> np.ndarray:
     return np.zeros(sum(map(len, parts)), np.int32)
 
 
-def iou(box, x, y, size=OBJECT_SIZE_M["pedestrian"][:2], yaw=0.0):
+def iou(
+    box: Box, x: float, y: float, size: tuple[float, float] = OBJECT_SIZE_M["pedestrian"][:2], yaw: float = 0.0
+) -> float:
     return oriented_iou([(*box.center[:2], *box.size[:2], box.yaw)], [(x, y, *size, yaw)])[0, 0]
 
 
 @pytest.mark.parametrize("where", [(8.0, 0.0), (12.0, -9.0), (-14.0, 3.0), (0.0, 25.0)])
-def test_a_person_seen_from_one_side_gets_a_box_of_a_persons_size_around_the_points(where):
+def test_a_person_seen_from_one_side_gets_a_box_of_a_persons_size_around_the_points(where: np.ndarray) -> None:
     xyz = person(*where)
     (box,) = boxes_of(xyz)
     assert box.label == "pedestrian"
@@ -88,7 +94,7 @@ def test_a_person_seen_from_one_side_gets_a_box_of_a_persons_size_around_the_poi
 @pytest.mark.parametrize("away", [8.0, 15.0, 22.0])
 @pytest.mark.parametrize("apart", [0.55, 0.7, 0.9])
 @pytest.mark.parametrize("n", [2, 3, 5])
-def test_people_side_by_side_have_a_box_each(away, apart, n):
+def test_people_side_by_side_have_a_box_each(away: float, apart: float, n: int) -> None:
     places = [(away, (k - (n - 1) / 2) * apart) for k in range(n)]
     boxes = boxes_of(*(person(*place) for place in places))
     assert [box.label for box in boxes] == ["pedestrian"] * n
@@ -97,27 +103,27 @@ def test_people_side_by_side_have_a_box_each(away, apart, n):
 
 
 @pytest.mark.parametrize(("apart", "n"), [(1.2, 1), (1.9, 2)])
-def test_boxes_of_cyclists_do_not_overlap(apart, n):
+def test_boxes_of_cyclists_do_not_overlap(apart: float, n: int) -> None:
     parts = [person(15.0, 0.0), person(15.0, apart)]
     clusters = np.repeat(np.array([0, 1], np.int32), [len(part) for part in parts])
     assert [box.label for box in boxes_of(*parts, labels=[3, 3], clusters=clusters)] == ["cyclist"] * n
     assert [box.label for box in boxes_of(*parts, labels=[2, 2], clusters=clusters)] == ["pedestrian"] * 2
 
 
-def test_a_person_in_a_stride_is_one_person():
+def test_a_person_in_a_stride_is_one_person() -> None:
     foot = upright(10.0, 0.0, 1.0, 0.1, z=(0.15, 0.3))
     (box,) = boxes_of(np.concatenate([person(10.0, 0.0), foot]))
     assert box.label == "pedestrian"
 
 
-def test_a_person_beside_a_wall_gets_a_box():
+def test_a_person_beside_a_wall_gets_a_box() -> None:
     wall = upright(12.4, 0.0, 8.0, 0.1, z=(0.2, 3.0))
     (box,) = boxes_of(wall, person(12.0, 1.0), labels=[0, 2], clusters=one_cluster(wall, person(12.0, 1.0)))
     assert box.label == "pedestrian"
     assert math.dist(box.center[:2], (12.0, 1.0)) < 0.2
 
 
-def test_the_labeled_part_of_a_wall_scores_low():
+def test_the_labeled_part_of_a_wall_scores_low() -> None:
     wall, part = upright(12.0, 0.0, 8.0, 0.1, z=(0.2, 3.0)), person(12.0, 1.0)
     (alone,) = boxes_of(part)
     together = one_cluster(wall, part[::4])
@@ -125,7 +131,7 @@ def test_the_labeled_part_of_a_wall_scores_low():
     assert max(box.score for box in sparse) < 0.5 * alone.score
 
 
-def test_a_person_of_whom_a_part_is_labeled_gets_a_whole_box():
+def test_a_person_of_whom_a_part_is_labeled_gets_a_whole_box() -> None:
     xyz = person(9.0, 2.0)
     low = xyz[:, 2] < GROUND_Z + 0.9
     (box,) = boxes_of(xyz[low], xyz[~low], labels=[0, 2])
@@ -134,7 +140,7 @@ def test_a_person_of_whom_a_part_is_labeled_gets_a_whole_box():
 
 @pytest.mark.parametrize("away", [10.0, 20.0])
 @pytest.mark.parametrize("alike", [True, False])
-def test_a_pedestrian_longer_than_a_stride_is_a_cyclist(away, alike):
+def test_a_pedestrian_longer_than_a_stride_is_a_cyclist(away: float, alike: bool) -> None:
     bicycle = upright(away, 0.0, 1.7, 0.1, z=(0.15, 0.9))
     rider = upright(away, 0.1, 0.45, 0.2, z=(0.9, 1.65))
     walking, pair = person(away, -8.0), [person(away, 8.0), person(away, 8.6)]
@@ -155,28 +161,28 @@ def test_a_pedestrian_longer_than_a_stride_is_a_cyclist(away, alike):
     assert len(boxes) == 4
 
 
-def test_a_board_is_no_row_of_people():
+def test_a_board_is_no_row_of_people() -> None:
     board = upright(15.0, 0.0, 1.6, 0.05)
     assert boxes_of(board) == ()
     people = boxes_of(*(person(15.0, y) for y in (-0.8, 0.0, 0.8)))
     assert len(people) == 3
 
 
-def test_near_fragments_score_lower_than_persons():
+def test_near_fragments_score_lower_than_persons() -> None:
     fragment = person(8.0, 0.0)[::15]
     scores = [boxes_of(fragment, min_score=0.0, distance_per_m=per_m)[0].score for per_m in (0.0, BY_ANGLE)]
     assert scores[1] < 0.6 * scores[0]
     assert boxes_of(person(8.0, 0.0))[0].score > 0.7
 
 
-def test_a_person_is_kept_beside_a_vehicle_of_lower_score():
+def test_a_person_is_kept_beside_a_vehicle_of_lower_score() -> None:
     standing = Box("pedestrian", 0.8, (10.0, 0.9, -0.8), (0.85, 0.66, 1.76), 0.0)
     for score, expected in ((0.6, ["pedestrian", "car"]), (0.9, ["car"])):
         car = Box("car", score, (10.0, 0.0, -1.0), (4.0, 1.8, 1.5), 0.0)
         assert [box.label for box in join_boxes([car], [standing])] == expected
 
 
-def test_models_with_one_class_of_persons_use_it():
+def test_models_with_one_class_of_persons_use_it() -> None:
     xyz = upright(10.0, 0.0, 1.7, 0.1, z=(0.15, 1.6))[:, :3]
     points = np.column_stack([xyz, np.zeros(len(xyz))]).astype(np.float32)
     for name in ("pedestrian", "cyclist"):
@@ -185,12 +191,12 @@ def test_models_with_one_class_of_persons_use_it():
 
 
 @pytest.mark.parametrize("n", [0, 1, 4])
-def test_too_few_points_have_no_box(n):
+def test_too_few_points_have_no_box(n: int) -> None:
     points = np.tile(np.array([[8.0, 1.0, -1.0, 0.0]], np.float32), (n, 1))
     assert objects_from_points(points, np.full(n, 2, np.uint8), CLASSES, min_score=0.0) == ()
 
 
-def test_points_that_are_not_finite_are_in_no_box():
+def test_points_that_are_not_finite_are_in_no_box() -> None:
     xyz = np.concatenate([person(8.0, 0.0), np.full((4, 3), np.nan), [[np.inf, 0, 0], [0, -np.inf, 0]]])
     (box,) = boxes_of(xyz)
     assert np.isfinite([*box.center, *box.size, box.yaw, box.score]).all()
@@ -199,7 +205,7 @@ def test_points_that_are_not_finite_are_in_no_box():
     assert objects_from_points(points, np.full(len(points), 2, np.uint8), CLASSES, clusters=together) == ()
 
 
-def test_without_clusters_and_heights_the_boxes_are_the_same():
+def test_without_clusters_and_heights_the_boxes_are_the_same() -> None:
     xyz = person(8.0, 0.0)
     xyz[0, 2] = GROUND_Z
     points = np.column_stack([xyz, np.zeros(len(xyz))]).astype(np.float32)
@@ -210,10 +216,9 @@ def test_without_clusters_and_heights_the_boxes_are_the_same():
     np.testing.assert_allclose(on_ground.center, known.center, atol=1e-5)
 
 
-# --- the kernels
-
-
-def crowd(seed, n_people, per_cluster=3, depth=0.15):
+def crowd(
+    seed: int, n_people: int, per_cluster: int = 3, depth: float = 0.15
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """People at random places, with labels, heights and clusters; the rows are shuffled."""
     rng = np.random.default_rng(seed)
     middles = rng.uniform(-20, 20, (max(n_people // per_cluster, 1), 2))
@@ -234,7 +239,7 @@ def crowd(seed, n_people, per_cluster=3, depth=0.15):
     return points, height, labels, clusters
 
 
-def grouped(clusters):
+def grouped(clusters: np.ndarray) -> Groups:
     groups = Groups(np.empty(len(clusters), np.int32), np.empty(clusters.max(initial=-1) + 2, np.int64))
     fill_groups(clusters, groups)
     return Groups(groups.order[: groups.starts[-1]], groups.starts)
@@ -242,7 +247,7 @@ def grouped(clusters):
 
 @settings(max_examples=60, deadline=None)
 @given(st.integers(0, 2**31), st.integers(0, 14))
-def test_groups_agree_with_the_twin(seed, n_people):
+def test_groups_agree_with_the_twin(seed: int, n_people: int) -> None:
     points, height, labels, clusters = crowd(seed, n_people)
     labels[np.random.default_rng(seed).random(len(labels)) < 0.05] = 4  # out of view
     order, starts = grouped(clusters)
@@ -257,7 +262,7 @@ def test_groups_agree_with_the_twin(seed, n_people):
 
 @settings(max_examples=80, deadline=None)
 @given(st.integers(0, 2**31), st.integers(0, 14), st.integers(1, 6))
-def test_persons_agree_with_the_twin(seed, n_people, min_points):
+def test_persons_agree_with_the_twin(seed: int, n_people: int, min_points: int) -> None:
     points, height, labels, clusters = crowd(seed, n_people)
     labels[np.random.default_rng(seed).random(len(labels)) < 0.05] = 4  # out of view
     order, starts = grouped(clusters)
@@ -279,7 +284,7 @@ def test_persons_agree_with_the_twin(seed, n_people, min_points):
 
 @settings(max_examples=80, deadline=None)
 @given(st.integers(0, 2**31), st.integers(0, 14))
-def test_completed_persons_agree_with_the_twin(seed, n_people):
+def test_completed_persons_agree_with_the_twin(seed: int, n_people: int) -> None:
     points, height, labels, clusters = crowd(seed, n_people, per_cluster=1, depth=0.4)
     in_view = np.random.default_rng(seed).random(len(points)) < 0.9
     n = clusters.max(initial=-1) + 1
@@ -291,7 +296,7 @@ def test_completed_persons_agree_with_the_twin(seed, n_people):
 
 
 @pytest.mark.parametrize("n", [0, 1, 3, 200])
-def test_the_parts_of_the_kernel_agree_with_their_twins(n):
+def test_the_parts_of_the_kernel_agree_with_their_twins(n: int) -> None:
     rng = np.random.default_rng(n)
     points = (rng.normal(0, 1, (n, 4)) * [0.9, 0.2, 0.5, 0] + [7, 3, 1, 0]).astype(np.float32)
     height = points[:, 2].copy()
@@ -307,7 +312,7 @@ def test_the_parts_of_the_kernel_agree_with_their_twins(n):
             assert own == pytest.approx(twins.persons.heads(points, height, members, found))
 
 
-def test_hostile_groups_are_bounded():
+def test_hostile_groups_are_bounded() -> None:
     rng = np.random.default_rng(0)
     points = (rng.uniform(-1, 1, (3000, 4)) * 1e30).astype(np.float32)
     height = np.ones(3000, np.float32)
@@ -316,7 +321,7 @@ def test_hostile_groups_are_bounded():
     labeled = Labeled(np.full(3000, 2, np.uint8), ROLES)
     clusters = Groups(members, np.array([0, 3000]))
 
-    def n_found():
+    def n_found() -> int:
         groups = Groups(members.copy(), clusters.starts)
         return persons.fill_persons(Cloud(points, height), labeled, groups, 1, of, clusters, 1, found)
 

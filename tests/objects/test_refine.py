@@ -14,7 +14,7 @@ CLASSES = ("background", "car", "pedestrian", "cyclist")
 RADII = np.array([0.0, *refine.OBJECT_RADIUS_M.values()])
 
 
-def scene(ranges, azimuth_step_deg=0.5, elevation_step_deg=0.4):
+def scene(ranges: np.ndarray, azimuth_step_deg: float = 0.5, elevation_step_deg: float = 0.4) -> tuple[np.ndarray, ...]:
     """Points behind every pixel of an (H, W) image of ranges [m], 0 for none: points, index, pixel."""
     height, width = ranges.shape
     azimuth = np.radians((np.arange(width)[None, :] - width / 2) * -azimuth_step_deg)
@@ -34,7 +34,7 @@ def scene(ranges, azimuth_step_deg=0.5, elevation_step_deg=0.4):
     return np.ascontiguousarray(image.reshape(-1, 4)[pixel], dtype=np.float32), index, pixel
 
 
-def random_scene(rng, shape, n_classes=4):
+def random_scene(rng: np.random.Generator, shape: tuple[int, int], n_classes: int = 4) -> tuple[np.ndarray, ...]:
     """Blocks at different ranges, some pixels empty, some points hidden behind others."""
     ranges = np.kron(rng.uniform(3.0, 40.0, (-(-shape[0] // 4), -(-shape[1] // 5))), np.ones((4, 5)))
     ranges = ranges[: shape[0], : shape[1]] + rng.normal(0.0, 0.3, shape)
@@ -48,10 +48,7 @@ def random_scene(rng, shape, n_classes=4):
     return points, pixel, index, np.ascontiguousarray(labels[: shape[0], : shape[1]], dtype=np.uint8)
 
 
-# --- outliers
-
-
-def test_bleeding_onto_a_wall_is_removed_and_the_car_stays():
+def test_bleeding_onto_a_wall_is_removed_and_the_car_stays() -> None:
     ranges = np.full((20, 60), 22.0)
     car = (slice(6, 14), slice(20, 40))
     ranges[car] = 12.0
@@ -66,7 +63,7 @@ def test_bleeding_onto_a_wall_is_removed_and_the_car_stays():
 
 
 @pytest.mark.parametrize("farther", [0.0, 6.0])
-def test_two_cars_in_one_component_both_stay(farther):
+def test_two_cars_in_one_component_both_stay(farther: float) -> None:
     ranges = np.full((20, 80), 40.0)
     ranges[6:14, 10:40] = 15.0
     ranges[7:13, 40:70] = 15.0 + farther
@@ -75,7 +72,7 @@ def test_two_cars_in_one_component_both_stay(farther):
     np.testing.assert_array_equal(remove_outliers(points, index, labels, CLASSES), labels)
 
 
-def test_pedestrian_in_front_of_a_car_loses_the_cars_points():
+def test_pedestrian_in_front_of_a_car_loses_the_cars_points() -> None:
     ranges = np.full((20, 40), 9.0)
     ranges[3:17, 18:22] = 6.0
     points, index, _ = scene(ranges)
@@ -90,7 +87,7 @@ def test_pedestrian_in_front_of_a_car_loses_the_cars_points():
     assert (cleaned[labels == 1] == 1).all()
 
 
-def test_classes_without_a_radius_and_pixels_without_a_point_stay():
+def test_classes_without_a_radius_and_pixels_without_a_point_stay() -> None:
     ranges = np.full((6, 30), 10.0)
     ranges[:, 15:] = 40.0
     ranges[2, 3] = 0.0
@@ -103,7 +100,7 @@ def test_classes_without_a_radius_and_pixels_without_a_point_stay():
     assert not remove_outliers(points, index, 0 * labels, CLASSES).any()
 
 
-def test_an_object_across_the_seam_is_one_object():
+def test_an_object_across_the_seam_is_one_object() -> None:
     ranges = np.full((12, 90), 30.0)
     ranges[4:8, [0, 1, 2, 87, 88, 89]] = 8.0
     labels = np.zeros(ranges.shape, dtype=np.uint8)
@@ -119,7 +116,7 @@ def test_an_object_across_the_seam_is_one_object():
     np.testing.assert_array_equal(np.concatenate([cleaned[:, 45:], cleaned[:, :45]], axis=1), expected)
 
 
-def test_a_rim_reaches_across_the_seam():
+def test_a_rim_reaches_across_the_seam() -> None:
     ranges = np.full((12, 90), 30.0)
     ranges[2:10, :6] = 8.0
     labels = np.zeros(ranges.shape, dtype=np.uint8)
@@ -132,7 +129,7 @@ def test_a_rim_reaches_across_the_seam():
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 9), (7, 1), (16, 40), (32, 64)])
 @pytest.mark.parametrize("full_turn", [False, True])
-def test_outliers_agree_with_the_twin(shape, full_turn):
+def test_outliers_agree_with_the_twin(shape: tuple[int, int], full_turn: bool) -> None:
     rng = np.random.default_rng(shape[1])
     for n_classes in (2, 4):
         points, _, index, labels = random_scene(rng, shape, n_classes)
@@ -143,14 +140,14 @@ def test_outliers_agree_with_the_twin(shape, full_turn):
         np.testing.assert_array_equal(again, cleaned)
 
 
-def test_a_component_larger_than_what_is_tested_agrees_with_the_twin():
+def test_a_component_larger_than_what_is_tested_agrees_with_the_twin() -> None:
     points, _, index, _ = random_scene(np.random.default_rng(8), (24, 64))
     labels = np.full(index.shape, 1, dtype=np.uint8)
     cleaned = remove_outliers(points, index, labels, CLASSES)
     np.testing.assert_array_equal(cleaned, twins.refine.without_outliers(points, index, labels, RADII, False))
 
 
-def test_one_point_no_point_and_points_that_are_not_finite():
+def test_one_point_no_point_and_points_that_are_not_finite() -> None:
     one = np.array([[5.0, 0.0, 0.0, 0.1]], dtype=np.float32)
     index = np.full((3, 4), -1, dtype=np.int32)
     labels = np.full((3, 4), 2, dtype=np.uint8)
@@ -163,10 +160,7 @@ def test_one_point_no_point_and_points_that_are_not_finite():
     assert empty.shape == (0, 4)
 
 
-# --- points
-
-
-def test_points_behind_a_car_s_edge_are_not_car():
+def test_points_behind_a_car_s_edge_are_not_car() -> None:
     ranges = np.full((9, 30), 20.0)
     ranges[3:6, 10:20] = 10.0
     points, index, pixel = scene(ranges)
@@ -181,7 +175,7 @@ def test_points_behind_a_car_s_edge_are_not_car():
     assert found[-3:].tolist() == [0, 1, 0]
 
 
-def test_the_majority_of_the_nearest_five_wins_and_the_nearest_breaks_ties():
+def test_the_majority_of_the_nearest_five_wins_and_the_nearest_breaks_ties() -> None:
     ranges = np.zeros((1, 5))
     ranges[0] = [10.0, 10.2, 10.3, 10.4, 12.0]
     points, index, pixel = scene(ranges)
@@ -193,7 +187,7 @@ def test_the_majority_of_the_nearest_five_wins_and_the_nearest_breaks_ties():
     assert label_points(points, pixel, index, labels)[-1] == 3
 
 
-def test_equal_ranges_vote_in_order_above_then_left():
+def test_equal_ranges_vote_in_order_above_then_left() -> None:
     points = np.tile(np.float32([5.0, 0.0, 0.0, 0.1]), (10, 1))
     index = np.arange(9, dtype=np.int32).reshape(3, 3)
     pixel = np.array([*range(9), 4], dtype=np.int32)
@@ -204,7 +198,7 @@ def test_equal_ranges_vote_in_order_above_then_left():
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 9), (7, 1), (16, 40)])
 @pytest.mark.parametrize("full_turn", [False, True])
-def test_point_labels_agree_with_the_twin(shape, full_turn):
+def test_point_labels_agree_with_the_twin(shape: tuple[int, int], full_turn: bool) -> None:
     points, pixel, index, labels = random_scene(np.random.default_rng(shape[0]), shape)
     found = label_points(points, pixel, index, labels, full_turn=full_turn)
     assert found.dtype == np.uint8
@@ -214,7 +208,7 @@ def test_point_labels_agree_with_the_twin(shape, full_turn):
 
 @settings(deadline=None, max_examples=60)
 @given(st.data())
-def test_any_scan_gets_labels_that_were_there(data):
+def test_any_scan_gets_labels_that_were_there(data: st.DataObject) -> None:
     height, width = data.draw(st.integers(0, 4)), data.draw(st.integers(1, 5))
     n = data.draw(st.integers(0, 12))
     number = st.floats(width=32) | st.integers(-9, 9)
@@ -234,7 +228,7 @@ def test_any_scan_gets_labels_that_were_there(data):
     assert set(found.tolist()) <= {0, *cleaned.reshape(-1).tolist()}
 
 
-def test_arrays_that_disagree_raise():
+def test_arrays_that_disagree_raise() -> None:
     points, index, pixel = scene(np.full((3, 4), 5.0))
     labels = np.zeros((3, 4), dtype=np.uint8)
     with pytest.raises(PointsError, match=r"\(3, 3\).*\(3, 4\)"):

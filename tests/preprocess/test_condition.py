@@ -6,6 +6,7 @@ import json
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -52,8 +53,6 @@ POWER = replace(LOGARITHM, kind="power", coefficients=(0.06, 0.4))
 
 # KUL-Seg, Table 4: Ouster's and Velodyne's intensity of vehicle, truck, ground and pillar.
 OUSTER, VELODYNE = np.array([45.91, 714.50, 113.28, 376.01]), np.array([3.78, 123.38, 5.60, 108.64])
-
-# --- remission -------------------------------------------------------------------------------------------------------
 
 
 def test_ranking_of_functions_matches_the_papers_table() -> None:
@@ -232,9 +231,6 @@ def test_rendering_uses_the_profiles_range() -> None:
         render(raw.astype(np.float64), byte)
 
 
-# --- profiles in files -----------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("name", SENSORS)
 def test_profile_is_read_back_from_its_file(name: str, tmp_path: Path) -> None:
     file = tmp_path / "sensor.json"
@@ -300,9 +296,6 @@ def test_file_that_is_not_a_profile_is_refused(text: str, tmp_path: Path) -> Non
         replace(HDL, remission=0.5)
 
 
-# --- interpolation ---------------------------------------------------------------------------------------------------
-
-
 def test_only_scans_of_a_coarser_sensor_are_interpolated() -> None:
     assert not Interpolator(VIEW, HDL).needed
     for name in ("hdl-32e", "vlp-16", "vlp-32c", "os1-64", "os0-32", "pandar64"):
@@ -316,7 +309,9 @@ def project(points: np.ndarray, view: RangeImageGeometry = VIEW) -> np.ndarray:
     return RangeImageProjector(view, SPEC).project(points).index
 
 
-def twin(points: np.ndarray, index: np.ndarray, view: RangeImageGeometry, sensor: SensorProfile):
+def twin(
+    points: np.ndarray, index: np.ndarray, view: RangeImageGeometry, sensor: SensorProfile
+) -> tuple[np.ndarray, ...]:
     """Reaches are computed here anew, beam by beam, from the rule as it is written."""
     rows = np.array(view.row_elevations_deg)
     place = np.interp(-np.array(sensor.elevations_deg), -rows, np.arange(len(rows)), left=-1, right=len(rows))
@@ -439,9 +434,6 @@ def test_wrong_arrays() -> None:
         fill(column(10.0).astype(np.float64), np.full((14, 24), -1, np.int32))
 
 
-# --- the whole runtime -----------------------------------------------------------------------------------------------
-
-
 # Nothing but the sensor adapts the scan; a tilted street does not move it.
 ALONE = {"provider": "cpu", "n_threads": 1, "on_mismatch": "ignore", "mounting": MODEL_MOUNTING}
 
@@ -487,9 +479,6 @@ def test_rendered_scan_gives_the_reference_result() -> None:
     changed, changed_plain = (np.count_nonzero(each.points.labels != given.labels) for each in (rendered, plain))
     assert changed < 0.001 * len(points)
     assert changed * 10 < changed_plain
-
-
-# --- the command line ------------------------------------------------------------------------------------------------
 
 
 def test_adapt_fit_writes_what_run_takes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -602,12 +591,10 @@ def test_a_model_without_points_is_refused() -> None:
         compare(["hdl-32e=simulation:1"], "ssadnet")
 
 
-# --- the door ---------------------------------------------------------------------------------------------------------
-
 RAW = replace(get_sensor("hdl-64e"), remission_range=(-3.0, 252.0))
 
 
-def some_scan(n=300):
+def some_scan(n: int = 300) -> np.ndarray:
     rng = np.random.default_rng(n)
     points = rng.normal((0.0, 0.0, 0.0, 100.0), 10.0, (n, 4)).astype(np.float32)
     points[:: max(1, n // 20), rng.integers(0, 4)] = rng.choice([np.nan, np.inf, -np.inf])
@@ -617,7 +604,7 @@ def some_scan(n=300):
 @pytest.mark.parametrize("sensor", [get_sensor("hdl-64e"), RAW, get_sensor("vlp-16")], ids=lambda s: s.name)
 @pytest.mark.parametrize("rendered", [True, False])
 @pytest.mark.parametrize("n", [0, 1, 300])
-def test_conditioned_scan_is_finite_or_nan_and_read_only(sensor, rendered, n):
+def test_conditioned_scan_is_finite_or_nan_and_read_only(sensor: SensorProfile, rendered: bool, n: int) -> None:
     points = some_scan(n)
     before = points.copy()
     scan, n_dropped = condition(points, sensor, rendered=rendered)
@@ -637,7 +624,7 @@ def test_conditioned_scan_is_finite_or_nan_and_read_only(sensor, rendered, n):
     np.testing.assert_array_equal(scan[~dropped, 3], expected[~dropped])
 
 
-def test_a_scan_that_is_ready_is_not_copied():
+def test_a_scan_that_is_ready_is_not_copied() -> None:
     points = some_scan()[1:2].copy()
     scan, _ = condition(points, get_sensor("hdl-64e"))
     assert np.shares_memory(scan, points)
@@ -646,7 +633,7 @@ def test_a_scan_that_is_ready_is_not_copied():
     assert np.shares_memory(again, points)
 
 
-def test_a_remission_that_overflows_is_not_finite():
+def test_a_remission_that_overflows_is_not_finite() -> None:
     points = np.array([[1, 2, 3, 3e38], [1, 2, 3, 0.5]], np.float32)
     scan, n_dropped = condition(points, replace(RAW, remission_range=(0.0, 0.5)))
     assert n_dropped == 1
@@ -655,6 +642,6 @@ def test_a_remission_that_overflows_is_not_finite():
 
 
 @pytest.mark.parametrize("bad", [np.zeros((5, 2)), "scan", None, np.zeros((2, 5, 4))])
-def test_arrays_that_are_not_scans_are_refused(bad):
+def test_arrays_that_are_not_scans_are_refused(bad: Any) -> None:
     with pytest.raises(PointsError):
         condition(bad, RAW)

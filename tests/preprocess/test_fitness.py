@@ -172,8 +172,6 @@ def test_crops_and_thinned_scans_are_accepted(seed: int, half_deg: float, every:
     assert gross(points[ahead][::every]) == []
 
 
-# --- real scans ------------------------------------------------------------------------------------------------------
-
 FAULTS: dict[str, Callable[[Points], Points]] = {
     "millimeters": lambda p: p * np.float32([1e3, 1e3, 1e3, 1]),
     "upside down": lambda p: p * np.float32([1, -1, -1, 1]),

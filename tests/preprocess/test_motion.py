@@ -130,9 +130,6 @@ def test_errors_name_the_reason() -> None:
     assert edgeperc.deskew is deskew
 
 
-# --- poses -----------------------------------------------------------------------------------------------------------
-
-
 def quaternion(R: NDArray[np.float64]) -> tuple[float, ...]:
     """x, y, z, w of a rotation by less than half a turn."""
     w = math.sqrt(1.0 + np.trace(R)) / 2.0

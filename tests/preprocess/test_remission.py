@@ -59,9 +59,6 @@ def after(scans: Sequence[np.ndarray], sensor: SensorProfile) -> tuple[Remission
     return matcher, used
 
 
-# --- strata of some of the points ------------------------------------------------------------------------------------
-
-
 def test_some_points_are_whole_cells(streets: list[np.ndarray]) -> None:
     """Surfaces are fitted to all returns of a cell, so incidences of a part are those of the whole."""
     scan = streets[0]
@@ -87,9 +84,6 @@ def test_strata_of_no_points() -> None:
         assert len(strata) == len(rows) == len(incidences(empty[:0])) == 0
     with pytest.raises(PointsError, match=r"\(5, 3\)"):
         stratify(np.zeros((5, 3), np.float32))
-
-
-# --- matching --------------------------------------------------------------------------------------------------------
 
 
 def test_a_profile_that_fits_is_kept(streets: list[np.ndarray]) -> None:
@@ -228,7 +222,7 @@ def test_a_function_is_dropped_only_well_below_the_limit(
         ([0.09, 0.05, 0.07, 0.079, 0.081], [True, False, False, False, True]),
     ):
         now = iter(off)
-        monkeypatch.setattr(remission, "_difference", lambda raw, t, s: next(now) if s is BYTE else 0.0)  # noqa: B023
+        monkeypatch.setattr(remission, "quantile_difference", lambda raw, t, s: next(now) if s is BYTE else 0.0)  # noqa: B023
         matcher, found = RemissionMatcher(BYTE), []
         for scan in streets[: len(off)]:
             matcher, used, _ = matcher.add(as_bytes(scan, 1 / 8))
@@ -241,9 +235,6 @@ def test_few_points_are_not_used(streets: list[np.ndarray]) -> None:
         matcher, used, findings = RemissionMatcher(BYTE).add(as_bytes(few, 1 / 8))
         assert used is BYTE
         assert matcher.n_scans == len(findings) == 0
-
-
-# --- no remission ----------------------------------------------------------------------------------------------------
 
 
 def test_missing() -> None:
@@ -276,8 +267,6 @@ def test_a_scan_without_remission_gets_a_constant(streets: list[np.ndarray]) -> 
         later = streets[1] if sensor is HDL else as_bytes(streets[1])
         assert matcher.add(later)[1].remission != NO_REMISSION
 
-
-# --- hostile values --------------------------------------------------------------------------------------------------
 
 STRANGE = [0.0, 1.0, -1.0, 0.5, 255.0, 65535.0, 1e-40, 1e38, -1e38, np.inf, -np.inf, np.nan]
 
@@ -319,9 +308,6 @@ def test_any_points_are_survived(points: np.ndarray) -> None:
     assert len(strata) == len(rows)
     assert ((strata >= 0) & (strata < N_STRATA)).all()
     assert used is BYTE or matcher.matched is not None or used.remission == NO_REMISSION
-
-
-# --- the whole runtime -----------------------------------------------------------------------------------------------
 
 
 def perceiver(sensor: SensorProfile | str = "hdl-64e", **options: object) -> Perceiver:
@@ -397,9 +383,6 @@ def test_reset_and_options(streets: list[np.ndarray]) -> None:
     for adapt in ("none", "interpolation"):
         assert perceiver(BYTE, on_mismatch="ignore", adapt=adapt)(dark).remission is None
     assert perceiver(BYTE, on_mismatch="ignore", adapt="remission")(dark).remission == found.remission
-
-
-# --- real scans ------------------------------------------------------------------------------------------------------
 
 
 def test_kitti_scans_are_not_converted(kitti_root: Path) -> None:

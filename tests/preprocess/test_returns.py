@@ -48,9 +48,6 @@ def on_a_ray(n: int, nearest_m: float, farthest_m: float, seed: int = 0, remissi
     return np.column_stack([ranges[:, None] * ray, np.full(n, remission)]).astype(np.float32)
 
 
-# --- which rows ------------------------------------------------------------------------------------------------------
-
-
 @settings(max_examples=150, deadline=None)
 @given(
     scans,
@@ -107,9 +104,6 @@ def test_simulated_scans_of_every_sensor_have_returns_only(sensor: SensorProfile
     assert np.shares_memory(scan, points)
 
 
-# --- the box of the own vehicle --------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     "box", [(1, 2, 3), "box", ((0, 1), (0, 1)), ((1, 0), (0, 1), (0, 1)), ((0, np.nan), (0, 1), (0, 1)),
             ((0, 101), (0, 1), (0, 1)), (("0", "1"), ("0", "1"), ("0", "1")), ((0, 1), (0,), (0, 1))]
@@ -125,9 +119,6 @@ def test_a_profile_keeps_its_box_in_a_file_and_reads_files_without_one() -> None
     document = json.loads(VLP.to_json())
     del document["ego_box"]
     assert SensorProfile.from_json(json.dumps(document)) == VLP
-
-
-# --- the pipeline ----------------------------------------------------------------------------------------------------
 
 
 def perceived(points: Points, sensor: SensorProfile | str = "vlp-16", **options: object) -> Perception:
@@ -246,9 +237,6 @@ def test_remission_is_matched_and_fitted_without_what_is_dropped(street: Points)
     assert RemissionMatcher(sensor).add(returns(np.vstack([constant, zeros]), sensor)[0])[2]
 
 
-# --- before the pipeline ---------------------------------------------------------------------------------------------
-
-
 def test_motion_does_not_move_beams_without_a_return(street: Points) -> None:
     near = on_a_ray(50, 0.001, 0.45)
     points = np.vstack([street, np.zeros((50, 4), np.float32), near])
@@ -270,9 +258,6 @@ def test_merged_scans_have_no_beams_without_a_return(street: Points) -> None:
         merge([points, points], poses, min_range_m=(0.5,))
 
 
-# --- the command line ------------------------------------------------------------------------------------------------
-
-
 def test_info_counts_and_takes_a_box(street: Points, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file, profile = tmp_path / "scan.npy", tmp_path / "mine.json"
     np.save(file, np.vstack([street, on_a_ray(4400, 0.001, 0.45), np.float32([[1, 0, -1, 9]])]))
@@ -285,9 +270,6 @@ def test_info_counts_and_takes_a_box(street: Points, tmp_path: Path, capsys: pyt
     assert cli.main(["info", str(file), "--sensor", str(profile)]) == 0
     printed = " ".join(capsys.readouterr().out.split())
     assert "4,400 at most 0.5 m from the sensor, not returns, 1 inside the box" in printed
-
-
-# --- the suggestion of a box -----------------------------------------------------------------------------------------
 
 
 def roof(seed: int) -> Points:

@@ -51,17 +51,14 @@ READY = "import sys; sys.path[:] = sys.argv[1:]\n" + READY + "out.write(HEADER.p
 def started(monkeypatch: pytest.MonkeyPatch) -> list[subprocess.Popen[bytes]]:
     """The processes that decode captures, as they are started."""
     processes: list[subprocess.Popen[bytes]] = []
-    real = apart._start
+    real = apart.start_process
 
     def start(folder: str) -> subprocess.Popen[bytes]:
         processes.append(real(folder))
         return processes[-1]
 
-    monkeypatch.setattr(apart, "_start", start)
+    monkeypatch.setattr(apart, "start_process", start)
     return processes
-
-
-# --- the process -----------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="no such signal")
@@ -89,14 +86,14 @@ def test_a_process_that_is_killed(ouster: Path, started: list[subprocess.Popen[b
 def test_a_process_that_ends_or_replies_nonsense(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, started: list[subprocess.Popen[bytes]], end: str, error: str
 ) -> None:
-    monkeypatch.setattr(apart, "_START", READY + end)
+    monkeypatch.setattr(apart, "START", READY + end)
     with pytest.raises(PointsError, match=error):
         next(read_scans(write_pcap(tmp_path / "any.pcap", [])))
     assert started[0].returncode is not None
 
 
 def test_a_process_that_does_not_start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(apart, "_START", "import sys; sys.exit(7)")
+    monkeypatch.setattr(apart, "START", "import sys; sys.exit(7)")
     with pytest.raises(PointsError, match=r"did not start \(exit code 7\)"):
         next(read_scans(write_pcap(tmp_path / "any.pcap", [])))
 
@@ -141,9 +138,6 @@ def test_a_program_without_a_guard(ouster: Path, tmp_path: Path) -> None:
         [sys.executable, tmp_path / "program.py", ouster / "sphere.pcap"], cwd=elsewhere, capture_output=True, text=True
     )
     assert (done.returncode, done.stdout) == (0, "3\n"), done.stderr
-
-
-# --- packets and metadata --------------------------------------------------------------------------------------------
 
 
 def records_of(content: bytes) -> list[bytes]:
@@ -286,9 +280,6 @@ def test_metadata_that_would_end_the_process(ouster: Path, tmp_path: Path) -> No
     assert "columns_per_packet" in error
 
 
-# --- random damage ---------------------------------------------------------------------------------------------------
-
-
 def read_whole(path: Path) -> None:
     """Every scan and perhaps a `PointsError`; another error fails the test."""
     with suppress(PointsError):
@@ -373,9 +364,6 @@ def test_osf_files_with_damage_and_right_checksums(ouster: Path, tmp_path: Path)
         damaged[end : end + 4] = struct.pack("<I", zlib.crc32(damaged[at:end]))
         (tmp_path / "damaged.osf").write_bytes(damaged)
         read_whole(tmp_path / "damaged.osf")
-
-
-# --- compressed files ------------------------------------------------------------------------------------------------
 
 
 def pack(content: bytes, method: str) -> bytes:
@@ -530,7 +518,7 @@ def test_chunks_of_a_bag_stop_at_the_limit(monkeypatch: pytest.MonkeyPatch) -> N
 
     monkeypatch.setattr(decoders, "inflate", lambda packed, method: inflate(packed, method, 1000))
     reader = SimpleNamespace(chunks={9: Chunk(lambda packed: packed + b" as it is")})
-    decoders._limit_chunks(reader)
+    decoders.limit_chunks(reader)
     unpack = reader.chunks[9].decompressor
     assert unpack(b"plain") == b"plain as it is"
     for method in ("bz2", "lz4"):
@@ -635,7 +623,7 @@ worker.main()
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="only Linux limits the memory of a process")
 def test_decoding_that_takes_more_memory_than_the_limit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(apart, "_START", "import sys; sys.path[:] = sys.argv[1:]" + ALLOCATES)
+    monkeypatch.setattr(apart, "START", "import sys; sys.path[:] = sys.argv[1:]" + ALLOCATES)
     scans, error = read_until_error(write_pcap(tmp_path / "any.pcap", []))
     assert len(scans) == 1
     assert "after 1 scans decoding the capture takes more than 2,147,483,648 bytes of memory" in error
@@ -643,7 +631,7 @@ def test_decoding_that_takes_more_memory_than_the_limit(tmp_path: Path, monkeypa
 
 def test_a_scan_that_is_too_large(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     program = ALLOCATES.replace("1 << 28", "(1 << 24) + 1")
-    monkeypatch.setattr(apart, "_START", "import sys; sys.path[:] = sys.argv[1:]" + program)
+    monkeypatch.setattr(apart, "START", "import sys; sys.path[:] = sys.argv[1:]" + program)
     scans, error = read_until_error(write_pcap(tmp_path / "any.pcap", []))
     assert len(scans) == 1
     assert "a scan of 16,777,217 points is too large; expected at most 16,777,216" in error

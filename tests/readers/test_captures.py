@@ -43,8 +43,6 @@ def read_until_error(path: Path) -> tuple[list[Any], str]:
     return scans, str(caught.value)
 
 
-# --- point clouds of ROS ---------------------------------------------------------------------------------------------
-
 FLOATS = (("x", "f4"), ("y", "f4"), ("z", "f4"), ("intensity", "f4"))
 TYPES = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
 
@@ -173,8 +171,6 @@ def test_malformed_clouds_are_refused(changes: dict[str, Any], error: str) -> No
     with pytest.raises(PointsError, match="layout is impossible"):
         cloud_points(object())
 
-
-# --- bags ------------------------------------------------------------------------------------------------------------
 
 LIDAR, OTHER = "/lidar/points", "/imu/text"
 
@@ -358,9 +354,6 @@ def test_a_database_that_is_cut_short(tmp_path: Path) -> None:
 
 def test_an_mcap_of_another_profile(tmp_path: Path) -> None:
     assert "cannot be read" in error_of(write_mcap(tmp_path / "other.mcap", profile=b"protobuf"))
-
-
-# --- packets ---------------------------------------------------------------------------------------------------------
 
 
 def write_pcap(path: Path, payloads: Sequence[bytes], endian: str = "<") -> Path:
@@ -591,9 +584,6 @@ def test_missing_extra_names_the_install_command(
         next(decode_here(path))
 
 
-# --- folders and files -----------------------------------------------------------------------------------------------
-
-
 def test_a_scan_file_is_one_scan(tmp_path: Path) -> None:
     POINTS.tofile(tmp_path / "a.bin")
     ((stamp, points),) = list(read_scans(tmp_path / "a.bin"))
@@ -626,9 +616,6 @@ def test_first_bytes_decide_the_format(tmp_path: Path) -> None:
     path = write_bag1(tmp_path / "drive.bag").rename(tmp_path / "drive.bag.1")
     assert is_capture(path)
     assert "there is none" not in error_of(path, topic="/nowhere")
-
-
-# --- real captures ---------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(

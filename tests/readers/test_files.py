@@ -5,6 +5,8 @@ from __future__ import annotations
 import io
 import struct
 import zipfile
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -24,13 +26,15 @@ POINTS = np.array(
 FORMATS = (".bin", ".pcd.bin", ".npy", ".npz", ".pcd", ".ply", ".unknown")
 
 
-def save(folder, name, content):
+def save(folder: Path, name: str, content: bytes) -> Path:
     path = folder / name
     path.write_bytes(content)
     return path
 
 
-def pcd(fields, types, sizes, counts, n, encoding, body, width=None):
+def pcd(
+    fields: str, types: str, sizes: str, counts: str, n: int, encoding: str, body: bytes, width: int | None = None
+) -> bytes:
     header = (
         "# .PCD v0.7 - Point Cloud Data file format\nVERSION 0.7\n"
         f"FIELDS {fields}\nSIZE {sizes}\nTYPE {types}\nCOUNT {counts}\nWIDTH {n if width is None else width}\n"
@@ -39,35 +43,35 @@ def pcd(fields, types, sizes, counts, n, encoding, body, width=None):
     return header.encode() + body
 
 
-def lzf_literals(data):
+def lzf_literals(data: bytes) -> bytes:
     return b"".join(bytes([len(data[i : i + 32]) - 1]) + data[i : i + 32] for i in range(0, len(data), 32))
 
 
-def packed_pcd(points, packed=None, size=None):
+def packed_pcd(points: np.ndarray, packed: bytes | None = None, size: tuple[int, int] | None = None) -> bytes:
     plain = points.T.astype("<f4").tobytes()
     packed = lzf_literals(plain) if packed is None else packed
     sizes = struct.pack("<II", len(packed), len(plain) if size is None else size)
     return pcd("x y z intensity", "F F F F", "4 4 4 4", "1 1 1 1", len(points), "binary_compressed", sizes + packed)
 
 
-def ply(encoding, body, n=4, before="", properties=None):
+def ply(encoding: str, body: bytes, n: int = 4, before: str = "", properties: str | None = None) -> bytes:
     properties = properties or "".join(f"property float {name}\n" for name in ("x", "y", "z", "intensity"))
     return (
         f"ply\nformat {encoding} 1.0\ncomment c\n{before}element vertex {n}\n{properties}end_header\n".encode() + body
     )
 
 
-def text_rows(points):
+def text_rows(points: np.ndarray) -> bytes:
     return "".join(" ".join(f"{float(v)!r}" for v in row) + "\n" for row in points).encode()
 
 
-def npy(array):
+def npy(array: np.ndarray) -> bytes:
     stream = io.BytesIO()
     np.save(stream, array)
     return stream.getvalue()
 
 
-def npz(compressed=True, **arrays):
+def npz(compressed: bool = True, **arrays: Any) -> bytes:
     stream = io.BytesIO()
     (np.savez_compressed if compressed else np.savez)(stream, **arrays)
     return stream.getvalue()
@@ -135,7 +139,7 @@ FILES = {
 
 
 @pytest.mark.parametrize("name", FILES)
-def test_every_format_gives_the_same_points_in_the_same_order(tmp_path, name):
+def test_every_format_gives_the_same_points_in_the_same_order(tmp_path: Path, name: str) -> None:
     points = read_points(save(tmp_path, name, FILES[name]))
     assert points.dtype == np.float32
     assert points.flags.c_contiguous
@@ -143,7 +147,7 @@ def test_every_format_gives_the_same_points_in_the_same_order(tmp_path, name):
 
 
 @pytest.mark.parametrize("name", FILES)
-def test_a_file_cut_anywhere_is_an_error_or_at_most_fewer_points(tmp_path, name):
+def test_a_file_cut_anywhere_is_an_error_or_at_most_fewer_points(tmp_path: Path, name: str) -> None:
     content = FILES[name]
     for end in range(0, len(content), 7):
         try:
@@ -155,7 +159,7 @@ def test_a_file_cut_anywhere_is_an_error_or_at_most_fewer_points(tmp_path, name)
             assert name.endswith(".bin") or len(points) == len(POINTS) or end == len(content)
 
 
-def test_str_path_and_columns(tmp_path):
+def test_str_path_and_columns(tmp_path: Path) -> None:
     path = save(tmp_path, "six.raw", np.arange(24, dtype="<f4").tobytes())
     np.testing.assert_array_equal(read_points(str(path), columns=6)[1], [6, 7, 8, 9])
     np.testing.assert_array_equal(read_points(path, columns=3)[1], [3, 4, 5, 0])
@@ -166,7 +170,7 @@ def test_str_path_and_columns(tmp_path):
             read_points(path, columns=columns)
 
 
-def test_remission_is_not_scaled_and_missing_remission_is_zero(tmp_path):
+def test_remission_is_not_scaled_and_missing_remission_is_zero(tmp_path: Path) -> None:
     raw = np.array([[1, 2, 3, 255], [4, 5, 6, 0]], np.uint16)
     np.testing.assert_array_equal(read_points(raw)[:, 3], [255, 0])
     body = POINTS[:, :3].tobytes()
@@ -180,7 +184,7 @@ def test_remission_is_not_scaled_and_missing_remission_is_zero(tmp_path):
         assert (points[:, 3] == 0).all()
 
 
-def test_remission_field_chooses(tmp_path):
+def test_remission_field_chooses(tmp_path: Path) -> None:
     content = pcd("x y z reflectivity intensity", "F F F F F", "4 4 4 4 4", "1 1 1 1 1", 1, "ascii", b"1 2 3 4 5\n")
     path = save(tmp_path, "ouster.pcd", content)
     assert read_points(path)[0, 3] == 5
@@ -189,7 +193,7 @@ def test_remission_field_chooses(tmp_path):
         read_points(path, remission_field="signal")
 
 
-def test_scan_without_points_is_valid_if_its_header_says_so(tmp_path):
+def test_scan_without_points_is_valid_if_its_header_says_so(tmp_path: Path) -> None:
     fields = ("x y z intensity", "F F F F", "4 4 4 4", "1 1 1 1", 0)
     for name, content in {
         "a.npy": npy(POINTS[:0]),
@@ -205,12 +209,12 @@ def test_scan_without_points_is_valid_if_its_header_says_so(tmp_path):
 
 
 @pytest.mark.parametrize("suffix", FORMATS)
-def test_empty_file_is_an_error(tmp_path, suffix):
+def test_empty_file_is_an_error(tmp_path: Path, suffix: str) -> None:
     with pytest.raises(PointsError, match="empty"):
         read_points(save(tmp_path, f"scan{suffix}", b""))
 
 
-def test_unreadable_paths(tmp_path):
+def test_unreadable_paths(tmp_path: Path) -> None:
     with pytest.raises(PointsError, match="no such file"):
         read_points(tmp_path / "absent.bin")
     with pytest.raises(PointsError, match="no such file"):
@@ -294,7 +298,7 @@ BAD_FILES = {
 
 
 @pytest.mark.parametrize("name", BAD_FILES)
-def test_bad_file_names_the_fault(tmp_path, name):
+def test_bad_file_names_the_fault(tmp_path: Path, name: str) -> None:
     content, match = BAD_FILES[name]
     if not isinstance(content, bytes):
         content = content.astype("<f4").tobytes()
@@ -303,7 +307,7 @@ def test_bad_file_names_the_fault(tmp_path, name):
     assert name in str(caught.value)
 
 
-def test_a_zip_bomb_is_not_unpacked(tmp_path):
+def test_a_zip_bomb_is_not_unpacked(tmp_path: Path) -> None:
     stream = io.BytesIO()
     with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("points.npy", npy(np.zeros((5_000_000, 4), np.float32)))
@@ -311,19 +315,16 @@ def test_a_zip_bomb_is_not_unpacked(tmp_path):
         read_points(save(tmp_path, "bomb.npz", stream.getvalue()))
 
 
-def test_pickles_do_not_run(tmp_path):
+def test_pickles_do_not_run(tmp_path: Path) -> None:
     class Bad:
-        def __reduce__(self):
+        def __reduce__(self) -> tuple[Any, ...]:
             return (pytest.fail, ("a pickle was loaded",))
 
     with pytest.raises(PointsError, match="never unpickled"):
         read_points(save(tmp_path, "bad.npy", npy(np.array([Bad()], dtype=object))))
 
 
-# --- arrays ----------------------------------------------------------------------------------------------------------
-
-
-def test_points_pass_uncopied():
+def test_points_pass_uncopied() -> None:
     assert as_points(POINTS) is POINTS
     assert read_points(POINTS) is POINTS
 
@@ -341,7 +342,7 @@ def test_points_pass_uncopied():
         POINTS.tolist(),
     ],
 )
-def test_any_layout_and_dtype(array):
+def test_any_layout_and_dtype(array: np.ndarray) -> None:
     if isinstance(array, np.ndarray):
         array.flags.writeable = False
     points = as_points(array)
@@ -352,12 +353,12 @@ def test_any_layout_and_dtype(array):
     np.testing.assert_array_equal(points, POINTS)
 
 
-def test_values_beyond_float32_become_infinite():
+def test_values_beyond_float32_become_infinite() -> None:
     assert np.isinf(as_points([[1e300, 0.0, 0.0, 0.0]])[0, 0])
     assert np.isinf(as_points([[1e300, 0.0, 0.0]])[0, 0])
 
 
-def test_structured_arrays_with_padding_and_rows_of_an_organized_cloud():
+def test_structured_arrays_with_padding_and_rows_of_an_organized_cloud() -> None:
     layout = np.dtype(
         {
             "names": ["x", "y", "z", "intensity", "ring", "rgb"],
@@ -395,12 +396,12 @@ def test_structured_arrays_with_padding_and_rows_of_an_organized_cloud():
         object(),
     ],
 )
-def test_arrays_that_are_not_scans_are_refused(array):
+def test_arrays_that_are_not_scans_are_refused(array: Any) -> None:
     with pytest.raises(PointsError):
         as_points(array)
 
 
-def test_ten_million_points(tmp_path):
+def test_ten_million_points(tmp_path: Path) -> None:
     many = np.zeros((10_000_000, 4), np.float32)
     many[:, 0] = np.arange(len(many)) % 100 + 1
     path = tmp_path / "many.bin"
@@ -409,8 +410,6 @@ def test_ten_million_points(tmp_path):
     assert points.shape == many.shape
     assert points[-1, 0] == many[-1, 0]
 
-
-# --- anything at all -------------------------------------------------------------------------------------------------
 
 PREFIXES = [
     b"",
@@ -426,7 +425,7 @@ PREFIXES = [
 ]
 
 
-def check_points_or_error(path):
+def check_points_or_error(path: Path) -> None:
     try:
         points = read_points(path)
     except PointsError:
@@ -440,13 +439,13 @@ def check_points_or_error(path):
 @settings(deadline=None, max_examples=400, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.sampled_from(FORMATS), st.sampled_from(PREFIXES), st.binary(max_size=300))
 @example(".npy", b"\x93NUMPY\1\0", b"\x10\0" + b"(" * 16)
-def test_any_bytes_give_points_or_points_error(tmp_path, suffix, prefix, tail):
+def test_any_bytes_give_points_or_points_error(tmp_path: Path, suffix: str, prefix: bytes, tail: bytes) -> None:
     check_points_or_error(save(tmp_path, f"scan{suffix}", prefix + tail))
 
 
 @settings(deadline=None, max_examples=400, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.sampled_from(sorted(FILES)), st.data())
-def test_damaged_files_give_points_or_points_error(tmp_path, name, data):
+def test_damaged_files_give_points_or_points_error(tmp_path: Path, name: str, data: st.DataObject) -> None:
     content = bytearray(FILES[name])
     for _ in range(data.draw(st.integers(1, 4))):
         at = data.draw(st.integers(0, len(content) - 1))
@@ -461,7 +460,7 @@ def test_damaged_files_give_points_or_points_error(tmp_path, name, data):
         hnp.array_shapes(min_dims=0, max_dims=3, min_side=0, max_side=5),
     )
 )
-def test_any_array_gives_points_or_points_error(array):
+def test_any_array_gives_points_or_points_error(array: np.ndarray) -> None:
     try:
         points = as_points(array)
     except PointsError:
@@ -476,7 +475,7 @@ def test_any_array_gives_points_or_points_error(array):
 @given(st.binary(max_size=60), st.integers(0, 200))
 @example(b"\0a\xe0\xff\0", 300)
 @example(b"\0a\x20\0", 4)
-def test_lzf_agrees_with_the_twin(packed, size):
+def test_lzf_agrees_with_the_twin(packed: bytes, size: int) -> None:
     unpacked = np.zeros(size, np.uint8)
     written = fill_unpacked_lzf(np.frombuffer(packed, np.uint8), unpacked)
     expected = twins.points.unpack_lzf(packed, size)

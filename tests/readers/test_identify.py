@@ -25,8 +25,6 @@ from edgeperc.readers.decoders import cloud_points
 from edgeperc.readers.identify import KnownSensor, of_cloud, of_metadata
 from edgeperc.types.sensor import SENSORS, SensorProfile, get_sensor
 
-# --- packets ---------------------------------------------------------------------------------------------------------
-
 
 def velodyne(product: int, mode: int = 0x37, flags: Sequence[bytes] = (b"\xff\xee",)) -> list[bytes]:
     """Packets of a Velodyne whose blocks have these flags in turn."""
@@ -108,9 +106,6 @@ def test_packets_that_begin_like_a_hesais_by_chance(ouster: Path, tmp_path: Path
 def test_a_capture_of_no_lidar(tmp_path: Path) -> None:
     with pytest.raises(PointsError, match=r"other\.pcap: not a Velodyne capture"):
         sensor_of(write_pcap(tmp_path / "other.pcap", [b"name server" * 9] * 7))
-
-
-# --- metadata --------------------------------------------------------------------------------------------------------
 
 
 def metadata(line: str | None, angles: Any, columns: int = 2048) -> dict[str, Any]:
@@ -216,8 +211,6 @@ def test_packets_are_read_without_native_libraries(ouster: Path, tmp_path: Path)
     done = subprocess.run([sys.executable, "-c", code, *files], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout.split()) == (0, ["vlp-16", "os1-64", "os1-64"]), done.stderr
 
-
-# --- point clouds ----------------------------------------------------------------------------------------------------
 
 OUSTER_FIELDS = ["x", "y", "z", "intensity", "t", "reflectivity", "ring", "ambient", "range"]
 VELODYNE_FIELDS = ["x", "y", "z", "intensity", "ring", "time"]
@@ -348,9 +341,6 @@ def test_bags_that_do_not_name_their_sensor(tmp_path: Path, write: Callable[[Pat
         sensor_of(path)
 
 
-# --- files, folders, commands ----------------------------------------------------------------------------------------
-
-
 def test_scan_files_do_not_name_their_sensor(tmp_path: Path) -> None:
     POINTS.tofile(tmp_path / "a.bin")
     assert sensor_of(tmp_path / "a.bin") is None
@@ -438,9 +428,6 @@ def test_a_stream_warns_of_another_sensor(tmp_path: Path) -> None:
     path = write_pcap(tmp_path / "a.pcap", velodyne(0x22))
     with pytest.warns(UserWarning, match="the perceiver's sensor is hdl-64e, the capture names vlp-16"):
         stream(path, Perceiver()).close()
-
-
-# --- real captures ---------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(

@@ -65,9 +65,6 @@ def check_straight(found: edgeperc.TimedScan, at_s: float, tolerance_m: float) -
     assert off_the_walls(deskew(found.points, found.times_s, MOTION, at_s=at_s)) < tolerance_m
 
 
-# --- fields ----------------------------------------------------------------------------------------------------------
-
-
 @given(
     st.sampled_from([1.0, 1e-3, 1e-6, 1e-9]),
     st.floats(0.0021, 1.9),
@@ -110,8 +107,6 @@ def test_the_best_known_field_counts() -> None:
     assert time_name(["x", "time_offset", "timestamp", "t"]) == "t"
     assert time_name(["x", "ring"]) is None
 
-
-# --- scan files ------------------------------------------------------------------------------------------------------
 
 TABLE = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", "<f4")]
 
@@ -178,9 +173,6 @@ def test_files_without_times(tmp_path: Path) -> None:
         np.testing.assert_array_equal(scan.points, points)
 
 
-# --- bags ------------------------------------------------------------------------------------------------------------
-
-
 def write_bag(path: Path, scans: Sequence[tuple[float, NDArray[Any]]]) -> Path:
     """A ROS 1 bag of clouds with these stamps."""
     typesys, rosbag1 = pytest.importorskip("rosbags.typesys"), pytest.importorskip("rosbags.rosbag1")
@@ -241,8 +233,6 @@ def test_bags(tmp_path: Path, name: str, kind: str, stored: Callable[[Any, float
         assert stamp_s == timed.stamp_s
         np.testing.assert_array_equal(points, timed.points)
 
-
-# --- packets ---------------------------------------------------------------------------------------------------------
 
 VLP16_FIRING_S, VLP16_LASER_S, VLP16_START_S = 55.296e-6, 2.304e-6, 1.0
 VLP16_DEG = np.array([-15, 1, -13, 3, -11, 5, -9, 7, -7, 9, -5, 11, -3, 13, -1, 15])
@@ -328,9 +318,6 @@ def test_real_captures(data_root: Callable[[str], Path], name: str) -> None:
     assert scan.stamp_s is not None
     assert 0.01 < np.ptp(scan.times_s) < 0.12
     assert scan.times_s.max() == pytest.approx(scan.stamp_s, abs=0.001)
-
-
-# --- edgeperc run --deskew -------------------------------------------------------------------------------------------
 
 
 def drive(path: Path, ends: Sequence[float], name: str = "time") -> Path:

@@ -39,9 +39,6 @@ def blank() -> NDArray[np.bool_]:
     return np.zeros((400, 200), np.bool_)
 
 
-# --- kernels against their twins -------------------------------------------------------------------------------------
-
-
 @patient
 @given(MASKS)
 def test_cells_are_counted_from_the_near_edge_to_the_first_of_each_kind(cells: NDArray[np.bool_]) -> None:
@@ -57,9 +54,6 @@ def test_the_corridor_follows_the_largest_overlap(cells: NDArray[np.bool_], firs
     bounds = np.full((len(cells), 2), 99)
     fill_corridor(cells, first, first + width, bounds)
     np.testing.assert_array_equal(bounds, twins.ahead.corridor(cells, first, first + width))
-
-
-# --- the polygon -----------------------------------------------------------------------------------------------------
 
 
 @patient
@@ -168,9 +162,6 @@ def test_polygons_of_real_scans_are_valid(data_root: Callable[[str], Path]) -> N
             tolerances.append(check_real(found.top_view, found.boxes))
         assert np.median(tolerances) <= 0.4
         assert max(tolerances) <= 0.8
-
-
-# --- what a planner asks ---------------------------------------------------------------------------------------------
 
 
 def test_road_computed_by_hand() -> None:

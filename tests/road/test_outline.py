@@ -13,12 +13,9 @@ from shapely import LineString, Polygon, box, union_all
 import twins.outline
 from edgeperc.road.outline import (
     Outline,
-    _filled,
-    _rings,
-    _sums,
-    _without_gaps,
     fill_grown,
     fill_rings,
+    filled,
     mark_connected,
     mark_needed,
     may_change,
@@ -27,7 +24,10 @@ from edgeperc.road.outline import (
     nearest_part,
     outline_of,
     resolve_contacts,
+    rings_of,
+    row_sums,
     turn,
+    without_gaps,
 )
 
 MASKS = npst.arrays(np.bool_, npst.array_shapes(min_dims=2, max_dims=2, min_side=1, max_side=9))
@@ -47,11 +47,8 @@ def streets(draw: st.DrawFn, most: int = 40) -> NDArray[np.bool_]:
 def traced(cells: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], list[NDArray[np.int64]]]:
     """The nearest part of padded cells, and its rings."""
     grid = np.pad(cells, 1)
-    part = _without_gaps(grid, np.zeros_like(grid), (0.0, 0.0), ~np.zeros_like(grid))
-    return part, _rings(part)
-
-
-# --- kernels against their twins -------------------------------------------------------------------------------------
+    part = without_gaps(grid, np.zeros_like(grid), (0.0, 0.0), ~np.zeros_like(grid))
+    return part, rings_of(part)
 
 
 @given(MASKS, st.floats(0.0, 12.0))
@@ -117,7 +114,7 @@ def test_corners_are_removed_as_by_the_twin(cells: NDArray[np.bool_], data: st.D
     outer, enough = data.draw(st.integers(0, len(rings) - 1)), data.draw(st.integers(3, 12))
     corners, ends = np.concatenate(rings), np.cumsum([len(ring) for ring in rings])
     kept = np.ones(len(corners), np.bool_)
-    mark_needed(corners, ends, _sums(addable), _sums(removable), outer, enough, kept)
+    mark_needed(corners, ends, row_sums(addable), row_sums(removable), outer, enough, kept)
     found = [ring[few].tolist() for ring, few in zip(rings, np.split(kept, ends[:-1]), strict=True)]
     expected = twins.outline.needed([map(tuple, ring.tolist()) for ring in rings], addable, removable, outer, enough)
     assert found == [[list(corner) for corner in ring] for ring in expected]
@@ -131,7 +128,7 @@ CORNERS = st.tuples(st.integers(0, 9), st.integers(0, 9))
 def test_cells_that_a_triangle_touches(triangle: tuple[tuple[int, int], ...], fixed: NDArray[np.bool_]) -> None:
     touched = Polygon(triangle).intersection(shape_of(fixed)).area > 1e-9
     if Polygon(triangle).area > 0.0:
-        assert may_change(*np.ravel(triangle).tolist(), _sums(~fixed)) == (not touched)
+        assert may_change(*np.ravel(triangle).tolist(), row_sums(~fixed)) == (not touched)
     assert abs(turn(*np.ravel(triangle).tolist())) == pytest.approx(2.0 * Polygon(triangle).area)
 
 
@@ -151,19 +148,16 @@ def test_corners_are_merged_as_by_the_twin(cells: NDArray[np.bool_], data: st.Da
         return
     random = np.random.default_rng(data.draw(st.integers(0, 99)))
     changeable = random.random(part.shape) < data.draw(st.sampled_from([0.0, 0.7, 0.9, 1.0]))
-    changeable &= part | ~_filled(part)  # otherwise a hole may come outside
+    changeable &= part | ~filled(part)  # otherwise a hole may come outside
     around, enough = data.draw(st.integers(0, 4)), data.draw(st.integers(0, 12))
     outer, *holes = sorted(rings, key=lambda ring: -Polygon(ring).area)
     edges = np.concatenate([*(np.hstack([hole, np.roll(hole, -1, 0)]) for hole in holes), np.empty((0, 4), np.int64)])
     ring = outer.copy()
-    few = ring[: merge_corners(ring, edges, _sums(changeable), around, enough)]
+    few = ring[: merge_corners(ring, edges, row_sums(changeable), around, enough)]
     expected = twins.outline.merged(list(map(tuple, outer.tolist())), edges.tolist(), changeable, around, enough)
     assert list(map(tuple, few.tolist())) == expected
     assert Polygon(few, holes).is_valid
     assert Polygon(few).symmetric_difference(Polygon(outer)).intersection(shape_of(~changeable)).area < 1e-9
-
-
-# --- the polygon -----------------------------------------------------------------------------------------------------
 
 
 def polygon_of(outline: Outline) -> Polygon:
@@ -249,7 +243,7 @@ def test_results_by_hand() -> None:
 
 
 def test_a_ring_of_one_cell_stays_a_ring() -> None:
-    (ring,) = _rings(np.pad([[True]], 1))
+    (ring,) = rings_of(np.pad([[True]], 1))
     assert ring.tolist() == [[2, 2], [1, 2], [1, 1], [2, 1]]
     cell = np.ones((1, 1), np.bool_)
     found = outline_of(cell, (0.0, 0.0), ~cell, ~cell, tolerance=5.0, max_corners=4)

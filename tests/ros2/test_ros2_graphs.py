@@ -42,9 +42,6 @@ POINT_CLOUD = (
 POINTS = np.array([[10.0, 1.0, -1.0, 0.5], [5.0, -2.0, 0.25, 1.0]], np.float32)
 
 
-# --- Zenoh -----------------------------------------------------------------------------------------------------------
-
-
 def test_types_and_qualities_in_keys() -> None:
     """As in the examples of rmw_zenoh's design: an empty part is a default."""
     assert type_key("std_msgs/msg/String") == "std_msgs::msg::dds_::String_"
@@ -254,9 +251,6 @@ def _compare(heard: Callable[[str], list[bytes]]) -> None:
         assert len(scan.perception.boxes) > 2
         for name in names:
             assert heard(name)[k] == MESSAGES.encode(getattr(MESSAGES, name)(scan, stamp_ns)), name
-
-
-# --- rclpy -----------------------------------------------------------------------------------------------------------
 
 
 class Bus:

@@ -294,9 +294,6 @@ def test_bytes_that_are_no_message(data: bytes) -> None:
         MESSAGES.decode(data, CLOUD)
 
 
-# --- bags ------------------------------------------------------------------------------------------------------------
-
-
 def read_bag(folder: Path) -> list[tuple[str, str, int, bytes]]:
     """Topic, type, time [ns] and bytes of each message, by rosbags' reader."""
     from rosbags.rosbag2 import Reader

@@ -67,7 +67,7 @@ class FakeGraph:
 @pytest.fixture
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """Diagnostics come often, so that no test waits a second."""
-    monkeypatch.setattr(node_module, "_REPORT_EVERY_S", 0.02)
+    monkeypatch.setattr(node_module, "REPORT_EVERY_S", 0.02)
 
 
 @pytest.fixture(autouse=True)
@@ -82,9 +82,6 @@ POINTS = np.array([[10.0, 1.0, -1.0, 0.5], [np.nan, 0.0, 0.0, 0.1], [5.0, -2.0, 
 
 def last_status(graph: FakeGraph) -> Any:
     return MESSAGES.decode(graph.published["/diagnostics"][-1], DIAGNOSTICS).status[0]
-
-
-# --- the node --------------------------------------------------------------------------------------------------------
 
 
 def test_a_cloud_is_answered_with_its_stamp_and_frame() -> None:

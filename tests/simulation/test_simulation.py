@@ -136,9 +136,6 @@ def near_scene(seed: int, environment: str | None = None) -> Scene:
     return scene
 
 
-# --- kernels and their twins -----------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(("seed", "tilt"), [(0, 0.0), (1, 0.03), (2, 0.03)])
 def test_cast_is_its_twin(seed: int, tilt: float) -> None:
     scene = near_scene(seed)
@@ -276,7 +273,7 @@ def test_bounds_hold_every_ray_that_hits(seed: int, kind: int) -> None:
         target = center + rng.normal(0, 0.3, 3) * size
         direction = target / np.linalg.norm(target)
         found = twins.simulation.crossing(row[0], direction)
-        enter, leave, _ = raycast._crossing(row[0], *direction)
+        enter, leave, _ = raycast.crossing(row[0], *direction)
         assert (found is None) == (enter > leave)
         if found is None or found[0] <= 0:
             continue
@@ -298,11 +295,11 @@ def test_ground_equals_twin() -> None:
 
 def test_draws_equal_twin() -> None:
     for value in (0, 1, 2**63, 2**64 - 1):
-        bits = np.uint64(raycast._mixed(np.uint64(value)))
+        bits = np.uint64(raycast.mixed_bits(np.uint64(value)))
         assert int(bits) == twins.simulation.mixed(value)
-        assert raycast._uniform(bits) == pytest.approx(twins.simulation.uniform_draw(int(bits)), abs=1e-15)
-        assert raycast._normal(bits) == pytest.approx(twins.simulation.normal_draw(int(bits)), abs=1e-12)
-    normals = [raycast._normal(np.uint64(raycast._mixed(np.uint64(k)))) for k in range(4000)]
+        assert raycast.uniform_draw(bits) == pytest.approx(twins.simulation.uniform_draw(int(bits)), abs=1e-15)
+        assert raycast.normal_draw(bits) == pytest.approx(twins.simulation.normal_draw(int(bits)), abs=1e-12)
+    normals = [raycast.normal_draw(np.uint64(raycast.mixed_bits(np.uint64(k)))) for k in range(4000)]
     assert abs(np.mean(normals)) < 0.06
     assert abs(np.std(normals) - 1.0) < 0.05
 

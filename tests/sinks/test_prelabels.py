@@ -70,9 +70,6 @@ def written(folder: Path, kind: str, *scans: PerceivedScan, calib: Path | None =
     return folder
 
 
-# --- the tools' own rules, written again ------------------------------------------------------------------------------
-
-
 def read_as_labelcloud(folder: Path, name: str) -> list[Row]:
     """labelCloud's ``centroid_rel``: its file of classes must know every class."""
     classes = json.loads((folder / "labels/_classes.json").read_text())
@@ -298,9 +295,6 @@ def test_errors_name_the_reason(tmp_path: Path) -> None:
         assert len(READERS[kind](written(tmp_path / kind, kind, perceived("x.bin")), "x")) == len(BOXES)
 
 
-# --- what the tools save ----------------------------------------------------------------------------------------------
-
-
 def test_degrees_of_labelcloud_are_read_by_its_file_of_classes(tmp_path: Path) -> None:
     folder = written(tmp_path, "labelcloud", perceived("x.bin"))
     path, settings_of = folder / "labels/x.json", folder / "labels/_classes.json"
@@ -369,9 +363,6 @@ def test_a_tilted_box_is_an_error(tmp_path: Path) -> None:
         else:
             with pytest.raises(PointsError, match="tilted by 29 degrees"):
                 read_sustechpoints(path)
-
-
-# --- the command ------------------------------------------------------------------------------------------------------
 
 
 class Seeing:

@@ -70,9 +70,6 @@ def write(sink: Sink, scans: list[PerceivedScan]) -> None:
     sink.close()
 
 
-# --- MCAP ------------------------------------------------------------------------------------------------------------
-
-
 def decoded(schema: Any, data: bytes) -> Any:
     """A message, by the schema that the file or the server names."""
     if schema.encoding == "jsonschema":
@@ -336,9 +333,6 @@ def test_a_full_disk_is_an_error(small_disk: Any) -> None:
     assert (folder / "run.mcap").read_bytes() == b"old"
 
 
-# --- WebSocket -------------------------------------------------------------------------------------------------------
-
-
 class Viewer:
     """A client of Foxglove's WebSocket protocol, from a socket (RFC 6455)."""
 
@@ -459,9 +453,6 @@ def test_serving_is_local_and_a_taken_port_is_an_error(served: Any) -> None:
         other.close()
 
 
-# --- Rerun -----------------------------------------------------------------------------------------------------------
-
-
 def read_rrd(path: Path) -> dict[str, dict[str, list[Any]]]:
     """Components of each entity of a recording, a list of one entry a log time."""
     chunk = pytest.importorskip("rerun.chunk")
@@ -541,9 +532,6 @@ def test_rrd_without_room_is_an_error(small_disk: Any) -> None:
     assert not [*folder.iterdir()]
 
 
-# --- the page of a drive ---------------------------------------------------------------------------------------------
-
-
 def scene_of(path: Path) -> dict[str, Any]:
     (data,) = [part.split("</script>")[0] for part in path.read_text().split('type="application/json">')[1:]]
     scene: dict[str, Any] = json.loads(data)
@@ -593,7 +581,7 @@ def test_a_long_drive_stays_within_its_limit(tmp_path: Path) -> None:
     for k in range(40):
         page.add(perception, points, 0.1 * k, name=str(k))
         states.append((page.n_points, page.every))
-        assert page._n_bytes <= limit
+        assert page.n_bytes <= limit
     assert [*dict.fromkeys(states)] == [(12_000, 1), (6000, 1), (3000, 1), (3000, 2), (3000, 4)]
     page.write(tmp_path / "drive.html")
     assert (tmp_path / "drive.html").stat().st_size <= limit + 40_000  # and the page itself
@@ -716,9 +704,6 @@ def test_a_page_of_one_scan_has_no_play_bar(browser: Any, tmp_path: Path) -> Non
     page.goto((tmp_path / "drive.html").as_uri())
     assert not page.is_visible("#play")
     page.close()
-
-
-# --- the command line ------------------------------------------------------------------------------------------------
 
 
 def test_a_drive_on_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -53,9 +53,6 @@ def tracked(times_s: Sequence[float]) -> list[Tracks]:
         return [tracker.update(cars(k), time_s) for k, time_s in enumerate(times_s)]
 
 
-# --- the rule --------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("times_s", "expected"),
     [
@@ -104,9 +101,6 @@ def test_a_step_is_of_one_kind(last_s: float, stamp_s: float) -> None:
 def test_no_time_at_all_is_a_jump() -> None:
     assert {step_between(*pair) for pair in ((math.nan, 1.0), (1.0, math.nan), (1.0, math.inf))} == {"jump"}
     assert elapsed_s(math.inf, 1.0) == 0.0
-
-
-# --- the tracker by it -----------------------------------------------------------------------------------------------
 
 
 @settings(max_examples=60, deadline=None)

@@ -176,10 +176,10 @@ def test_kernels_that_are_needed_exist_and_are_missing_from_an_empty_cache(
     monkeypatch.setattr(type(kernels[0]), "signatures", ())
     assert missing(kernels) == kernels
     cache = kernels[3]._cache
-    folder = next(cache._folders())
+    folder = next(cache.folders())
     folder.mkdir(0o755)
-    (folder / f"{cache._name}-0123456789abcdef.kernel").write_bytes(bytes(32) + cache._stamp())
-    (folder / f"{kernels[5]._cache._name}-0123456789abcdef.kernel").write_bytes(bytes(64))
+    (folder / f"{cache.name}-0123456789abcdef.kernel").write_bytes(bytes(32) + cache.stamp())
+    (folder / f"{kernels[5]._cache.name}-0123456789abcdef.kernel").write_bytes(bytes(64))
     assert missing(kernels) == [*kernels[:3], *kernels[4:]]
 
 

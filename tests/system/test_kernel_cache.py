@@ -68,7 +68,7 @@ class Place:
 
     def start(self) -> tuple[list[str], int]:
         """Load the kernels and call one; return the warnings and the number of compilations."""
-        self._monkeypatch.setattr(kernel_cache, "_reported", set())
+        self._monkeypatch.setattr(kernel_cache, "reported", set())
         self._caplog.clear()
         spec = importlib.util.spec_from_file_location("some_kernels", self.source)
         assert spec is not None
@@ -250,9 +250,6 @@ def test_functions_of_one_name_are_not_confused(place: Place) -> None:
         module = sys.modules["some_kernels"]
         assert [module.times(factor)(5.0) for factor in (2.0, 3.0, 2.0)] == [10.0, 15.0, 10.0]
         assert (module.up(1.0), module.shifted(1.0), module.up(1.0)) == (2.0, 0.0, 2.0)
-
-
-# --- folders ---------------------------------------------------------------------------------------------------------
 
 
 def status(**changed: int) -> Any:
@@ -463,8 +460,6 @@ def test_a_file_that_numba_cannot_load_is_compiled_again(
     assert place.start() == ([], 0)
 
 
-# --- what the machine code depends on --------------------------------------------------------------------------------
-
 CALLER = """
 import numpy as np
 from edgeperc.system.kernel_cache import njit
@@ -602,7 +597,7 @@ def test_a_constant_set_after_the_import_is_not_kept_for_others(place: Place) ->
 
 def test_a_value_without_a_digest_is_named(place: Place) -> None:
     place.source.write_text(SOURCE.replace("x * x", "x * x if x in WHAT else x * x") + "\nWHAT = iter([1.0])\n")
-    kernel_cache._reported.clear()
+    kernel_cache.reported.clear()
     spec = importlib.util.spec_from_file_location("some_kernels", place.source)
     assert spec is not None
     assert spec.loader is not None
@@ -622,7 +617,7 @@ names = [m.name for m in pkgutil.walk_packages(edgeperc.__path__, "edgeperc.") i
 for name in names:
     for key, thing in sorted(vars(import_module(name)).items()):
         if isinstance(thing, Dispatcher) and thing.py_func.__module__ == name:
-            print(name, key, thing._cache._stamp().hex())
+            print(name, key, thing._cache.stamp().hex())
 """
 
 
@@ -674,9 +669,6 @@ def test_the_bound_of_numba_is_stated_once_and_holds() -> None:
     assert f",<{bound}\n" in (REPOSITORY / "recipe" / "recipe.yaml").read_text("utf-8")
     version = [int(part) for part in numba.__version__.split(".")[:2]]
     assert version < [int(part) for part in bound.split(".")]
-
-
-# --- the kernels of edgeperc -----------------------------------------------------------------------------------------
 
 
 def test_every_kernel_of_edgeperc_is_kept_here() -> None:
@@ -785,8 +777,6 @@ print(sorted({"scipy.linalg", "numba.np.arraymath", "numba.np.linalg"} & set(sys
         answer = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     assert answer.strip() == "[]"
 
-
-# --- what is compiled when -------------------------------------------------------------------------------------------
 
 CALLS = """
 import itertools, json, pkgutil, sys, warnings

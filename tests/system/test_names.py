@@ -129,7 +129,7 @@ def test_a_repository_for_triton_stays_in_its_folder(name: str) -> None:
 )
 def test_strings_of_configurations_are_one_string(text: str) -> None:
     triton = pytest.importorskip("edgeperc_export.release.triton")
-    quoted = triton._quoted(text)
+    quoted = triton.quoted(text)
     assert quoted.isascii()
     assert quoted.isprintable()
     # Octal escapes are those of Python's bytes.

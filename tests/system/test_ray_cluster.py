@@ -170,9 +170,6 @@ def test_without_ray_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None
         list(map_on_ray(int, (), [1]))
 
 
-# --- URLs ------------------------------------------------------------------------------------------------------------
-
-
 def test_paths_stay_paths(tmp_path: Path) -> None:
     assert location("a/b.bin") == Path("a/b.bin")
     assert location(tmp_path.as_uri()) == tmp_path

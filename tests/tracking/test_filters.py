@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from typing import Any
 
 import numba
 import numpy as np
@@ -55,13 +56,12 @@ def predict(states: np.ndarray, covariance: np.ndarray, noise: np.ndarray, dt: f
     return means, predicted
 
 
-def update(means, predicted, detections, sigmas, beta) -> tuple[np.ndarray, np.ndarray]:
+def update(
+    means: np.ndarray, predicted: np.ndarray, detections: np.ndarray, sigmas: Any, beta: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     states, covariance = np.empty_like(means), np.empty_like(predicted)
     fill_updates(means, predicted, detections, sigmas, beta, states, covariance)
     return states, covariance
-
-
-# --- filters ---------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("n", [0, 1, 6])
@@ -91,7 +91,7 @@ def test_updates_are_those_of_the_twin(n: int, m: int) -> None:
         np.testing.assert_allclose(covariance[i, mode], cov, atol=1e-9)
 
 
-def filterpy_filter(mode: int, state: np.ndarray, covariance: np.ndarray, dt: float):
+def filterpy_filter(mode: int, state: np.ndarray, covariance: np.ndarray, dt: float) -> Any:
     """filterpy's unscented filter of one motion; a straight line's is a plain Kalman filter where it is linear."""
     kalman = pytest.importorskip("filterpy.kalman")
     filtered = kalman.UnscentedKalmanFilter(
@@ -264,9 +264,6 @@ def detected(places: np.ndarray, groups: np.ndarray) -> Detections:
     n = len(places)
     nothing = np.full(n, np.nan)
     return Detections(places, np.full((n, 4), np.nan), nothing, nothing, groups, groups, nothing, groups)
-
-
-# --- association -----------------------------------------------------------------------------------------------------
 
 
 def associate(weights: np.ndarray, max_events: int = MAX_EVENTS) -> tuple[np.ndarray, int]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import tracemalloc
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -34,9 +35,6 @@ from edgeperc.types.perception import Perception
 from edgeperc_bench.peers.tracking import crossing
 
 STANDING = np.eye(4)  # without poses, the motion of a single object cannot be separated from the sensor's
-
-
-# --- the sensor's own motion -----------------------------------------------------------------------------------------
 
 
 def some_places(rng: np.random.Generator, n: int) -> np.ndarray:
@@ -96,7 +94,7 @@ def test_one_far_landmark_that_moves_aside_speaks_for_a_turn() -> None:
     assert (np.abs(motion[:2]) < 0.3).all()
 
 
-def drive(n_scans: int, seed: int = 0):
+def drive(n_scans: int, seed: int = 0) -> Iterator[tuple[list[Box], np.ndarray]]:
     """A street of parked cars and an oncoming one, seen from a car that pulls off and turns: boxes and poses."""
     rng = np.random.default_rng(seed)
     parked = np.column_stack([rng.uniform(5.0, 90.0, 24), rng.choice([-6.0, 6.0, 9.0], 24)])
@@ -145,9 +143,6 @@ def test_with_poses_what_stands_still_stands_still_in_the_world() -> None:
     assert sorted(moved.values())[-2] < 0.4  # all but the oncoming car
     (oncoming,) = [name for name, distance in moved.items() if distance > 5.0]
     assert abs(speeds[oncoming]) == pytest.approx(12.0, abs=0.5)
-
-
-# --- the life of a track ---------------------------------------------------------------------------------------------
 
 
 def test_birth_confirmation_coasting_memory_and_death() -> None:
@@ -409,8 +404,6 @@ def test_memory_stays_flat() -> None:
     assert sizes[1] - sizes[0] < 20_000
 
 
-# --- errors ----------------------------------------------------------------------------------------------------------
-
 BAD_BOXES = [
     replace(box("car", 10.0, 0.0), center=(math.nan, 0.0, 0.0)),
     replace(box("car", 10.0, 0.0), size=(4.0, math.inf, 1.5)),
@@ -543,8 +536,8 @@ def test_shapes_hiding_and_rivals_are_those_of_the_twins(n: int, m: int) -> None
 def test_births_lives_and_views_are_those_of_the_twins(n: int, m: int) -> None:
     rng = np.random.default_rng(7 * n + m)
     tracker = Tracker()
-    kinds = tracker._kinds(["car", "pedestrian", "cyclist"])[rng.integers(0, 3, n)]
-    of = tracker._classes[kinds]
+    kinds = tracker.kinds_of(["car", "pedestrian", "cyclist"])[rng.integers(0, 3, n)]
+    of = tracker.class_table[kinds]
     detections, shapes = rng.normal(0.0, 9.0, (n, 3)), rng.uniform(0.5, 4.0, (n, 4))
     logits, fronts, ranges = rng.normal(0.0, 3.0, n), rng.normal(0.0, 3.0, n), rng.uniform(0.0, 60.0, n)
     born = Detections(detections, shapes, logits, fronts, kinds, of["group"].copy(), ranges, np.arange(n))

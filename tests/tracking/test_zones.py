@@ -119,7 +119,7 @@ def test_a_track_counts_once_for_each_direction() -> None:
     ]
     assert [crossing.to_left for crossing in crossings] == [False, True]
     assert line.count(drive(lambda t: (50.0, 0.0), n=200)[-1]) == ()
-    assert len(line._known) <= 1  # the others were not seen for 10 s
+    assert len(line.known) <= 1  # the others were not seen for 10 s
 
 
 @pytest.mark.filterwarnings("ignore:got a scan at")
@@ -149,7 +149,7 @@ def test_a_line_remembers_tracks_by_the_time_that_passed() -> None:
     for k in range(400):  # a recording of 2 s that plays again and again
         line.count(tracker.update([car(30.0 - 0.8 * (k % 20), 0.0)], 0.1 * (k % 20), np.eye(4)))
     assert line.to_left == 20
-    assert len(line._known) <= 7
+    assert len(line.known) <= 7
 
 
 def test_a_line_of_the_vehicle_counts_what_it_passes() -> None:

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 
 
-def clusters(points, among, min_distance, distance_per_m, max_range, min_points):
+def clusters(
+    points: np.ndarray, among: np.ndarray, min_distance: float, distance_per_m: float, max_range: float, min_points: int
+) -> np.ndarray:
     """Twin of `edgeperc.objects.linkage.fill_clusters` with every point as a seed: every pair is looked at."""
     xyz = points[:, :3].astype(np.float64)
     used = np.flatnonzero(among & np.isfinite(xyz).all(axis=1) & (abs(xyz) <= max_range).all(axis=1))
@@ -29,7 +33,9 @@ def clusters(points, among, min_distance, distance_per_m, max_range, min_points)
     return found
 
 
-def votes(clusters, labels, min_share, part_of):
+def votes(
+    clusters: np.ndarray, labels: np.ndarray, min_share: float, part_of: Mapping[int, int]
+) -> tuple[np.ndarray, np.ndarray]:
     """Twin of `edgeperc.objects.cluster.cluster_labels`: a table of all clusters and labels."""
     counts = np.zeros((clusters.max(initial=-1) + 1, 256), int)
     np.add.at(counts, (clusters[clusters >= 0], labels[clusters >= 0]), 1)
@@ -41,15 +47,15 @@ def votes(clusters, labels, min_share, part_of):
     return np.where(shares > min_share, counts[:, 1:].argmax(axis=1) + 1, 0), shares
 
 
-def rectangle(members, l_shaped):
+def rectangle(members: np.ndarray, l_shaped: bool) -> np.ndarray:
     """Twin of `edgeperc.objects.boxes.fill_rectangle`: x, y, extent along, across, heading."""
     voting = members[:: -(-len(members) // 256)]
 
-    def turned(points, angle):
+    def turned(points: np.ndarray, angle: float) -> np.ndarray:
         cos, sin = np.cos(angle), np.sin(angle)
         return np.c_[cos * points[:, 0] + sin * points[:, 1], cos * points[:, 1] - sin * points[:, 0]]
 
-    def merit(angle):
+    def merit(angle: float) -> float:
         p = turned(voting, angle)
         low, high = p.min(axis=0), p.max(axis=0)
         if l_shaped:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 
 
-def rendered(points, function, remission_range):
+def rendered(points: np.ndarray, function: Any, remission_range: tuple[float, float]) -> np.ndarray:
     """Twin of `edgeperc.preprocess.condition.render`."""
     low, high = remission_range
     out = points.copy()
@@ -26,7 +28,7 @@ def rendered(points, function, remission_range):
     return out
 
 
-def one_surface(p, q, ground_z):
+def one_surface(p: np.ndarray, q: np.ndarray, ground_z: float) -> bool:
     """Whether a point may be put between two: KUL-Seg 5, never across a depth edge."""
     far, near = max(np.linalg.norm(p[:3]), np.linalg.norm(q[:3])), min(np.linalg.norm(p[:3]), np.linalg.norm(q[:3]))
     apart = np.linalg.norm(q[:3] - p[:3])
@@ -36,12 +38,20 @@ def one_surface(p, q, ground_z):
     return at_ground and abs(q[2] - p[2]) <= 0.1 * apart
 
 
-def between(points, index, elevations, azimuths, row_reach, col_reach, ground_z):
+def between(
+    points: np.ndarray,
+    index: np.ndarray,
+    elevations: np.ndarray,
+    azimuths: np.ndarray,
+    row_reach: Callable[..., Any],
+    col_reach: Callable[..., Any],
+    ground_z: float,
+) -> tuple[np.ndarray, np.ndarray, list[tuple[Any, Any]]]:
     """Twin of `Interpolator.fill`: points, index, and the two neighbors of every new point."""
     points, index, parents = [p.astype(np.float64) for p in points], index.copy(), []
     height, width = index.shape
 
-    def fill(line, reach, offset):
+    def fill(line: list[tuple[int, int]], reach: Callable[[tuple[int, int]], int], offset: Callable[..., Any]) -> None:
         """Along one line of pixels (row, col); ``offset`` is how far a point lies from the middle of a pixel."""
         full = [k for k, at in enumerate(line) if index[at] >= 0]
         for start, stop in pairwise(full):

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 
-def picture(points):
+def picture(points: np.ndarray) -> np.ndarray:
     """Twin of `edgeperc_export.database.files.picture`, point by point: round, clamp, keep the highest."""
     image, highest = np.zeros((400, 200, 3), np.uint8), {}
     for x, y, z, remission in points.astype(np.float64):

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import Any
+
 import numpy as np
 
 
-def rectangle_corners(rectangle):
+def rectangle_corners(rectangle: Any) -> np.ndarray:
     """Corners of x, y, length, width, yaw, counter-clockwise, (4, 2)."""
     x, y, length, width, yaw = rectangle
     local = 0.5 * np.array([[length, width], [-length, width], [-length, -width], [length, -width]])
@@ -13,7 +16,7 @@ def rectangle_corners(rectangle):
     return local @ turn.T + [x, y]
 
 
-def polygon_area(corners):
+def polygon_area(corners: Any) -> float:
     """Shoelace formula; 0 for fewer than three corners."""
     if len(corners) < 3:
         return 0.0
@@ -21,12 +24,12 @@ def polygon_area(corners):
     return 0.5 * float(np.dot(x, np.roll(y, -1)) - np.dot(y, np.roll(x, -1)))
 
 
-def clip_polygon(subject, clip):
+def clip_polygon(subject: Any, clip: Any) -> list[Any]:
     """Sutherland and Hodgman: the part of polygon ``subject`` inside the convex, counter-clockwise ``clip``."""
     for start, end in zip(clip, np.roll(clip, -1, axis=0), strict=True):
         edge = end - start
 
-        def side(p, start=start, edge=edge):
+        def side(p: np.ndarray, start: tuple[float, float] | np.ndarray = start, edge: np.ndarray = edge) -> float:
             return edge[0] * (p[1] - start[1]) - edge[1] * (p[0] - start[0])
 
         inside = []
@@ -41,7 +44,7 @@ def clip_polygon(subject, clip):
     return subject
 
 
-def oriented_iou(a, b):
+def oriented_iou(a: Any, b: Any) -> np.ndarray:
     """Twin of `edgeperc.types.geometry.fill_oriented_iou`."""
     iou = np.zeros((len(a), len(b)))
     for i, first in enumerate(np.asarray(a, dtype=np.float64)):
@@ -54,7 +57,7 @@ def oriented_iou(a, b):
     return iou
 
 
-def nms(rectangles, iou_threshold, max_inside=np.inf):
+def nms(rectangles: np.ndarray, iou_threshold: float | np.ndarray, max_inside: float = np.inf) -> np.ndarray:
     """Twin of `edgeperc.types.geometry.mark_nms`."""
     iou = oriented_iou(rectangles, rectangles)
     limits = np.broadcast_to(iou_threshold, len(rectangles))
@@ -67,21 +70,21 @@ def nms(rectangles, iou_threshold, max_inside=np.inf):
     return keep
 
 
-def softmax(logits):
+def softmax(logits: np.ndarray) -> np.ndarray:
     """Probabilities along axis 0, in float64."""
     logits = np.asarray(logits, dtype=np.float64)
     e = np.exp(logits - logits.max(axis=0, keepdims=True))
     return e / e.sum(axis=0, keepdims=True)
 
 
-def classes(values, are_logits):
+def classes(values: np.ndarray, are_logits: bool) -> tuple[np.ndarray, np.ndarray, int]:
     """Twin of `decode.fill_labels` and `fill_scores`: labels, scores, number of values that are not finite."""
     labels = np.argmax(values, axis=0).astype(np.uint8)
     probabilities = softmax(values) if are_logits else values
     return labels, probabilities.max(axis=0), int((~np.isfinite(values)).sum())
 
 
-def peaks(heat, threshold):
+def peaks(heat: np.ndarray, threshold: float) -> np.ndarray:
     """Twin of `edgeperc.inference.box_heads.mark_peaks`."""
     padded = np.pad(heat.astype(np.float64), 1, constant_values=-np.inf)
     height, width = heat.shape
@@ -96,7 +99,7 @@ def peaks(heat, threshold):
     return peak
 
 
-def facing(yaw, x, y):
+def facing(yaw: float, x: float, y: float) -> tuple[float, bool]:
     """Twin of `box_heads._facing` for one box: the yaw of the likelier front, and its probability."""
     logit = np.dot([np.cos(yaw), np.sin(yaw)], [x, y])
     with np.errstate(over="ignore"):
@@ -106,7 +109,15 @@ def facing(yaw, x, y):
     return (yaw - np.pi if yaw > 0.0 else yaw + np.pi), 1.0 - front
 
 
-def footprint_sums(values, are_logits, rectangles, x_far, y_left, cell, max_summed=2**18):
+def footprint_sums(
+    values: np.ndarray,
+    are_logits: bool,
+    rectangles: np.ndarray,
+    x_far: float,
+    y_left: float,
+    cell: float,
+    max_summed: int = 2**18,
+) -> Any:
     """Twin of `edgeperc.inference.box_heads.fill_footprint_sums`."""
     probabilities = softmax(values) if are_logits else values.astype(np.float64)
     _, height, width = values.shape
@@ -137,7 +148,7 @@ def footprint_sums(values, are_logits, rectangles, x_far, y_left, cell, max_summ
     return sums
 
 
-def footprints(labels, boxes, view, classes):
+def footprints(labels: np.ndarray, boxes: Sequence[Any], view: Any, classes: Sequence[str]) -> None:
     """Twin of `edgeperc.types.geometry.draw_footprints`: every cell of the view for every box."""
     x, y = view.cell_centers()
     for box in sorted(boxes, key=lambda box: -np.hypot(*box.center[:2])):

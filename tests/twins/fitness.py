@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 
 
-def scan_sums(points, step, beam_step, view_right, view_left):
+def scan_sums(points: np.ndarray, step: int, beam_step: int, view_right: float, view_left: float) -> tuple[Any, ...]:
     """Twin of `edgeperc.preprocess.fitness.fill_scan_sums`: its outputs in their order, but ``rows`` as eight lists."""
 
-    def finite(rows):
+    def finite(rows: np.ndarray) -> np.ndarray:
         return rows[np.isfinite(rows).all(axis=1)].astype(np.float64)
 
     remissions, elevations, ranges = np.zeros(258, int), np.zeros(360, int), np.zeros(200, int)

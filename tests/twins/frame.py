@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 
-def moved(points, R, t):
+def moved(points: np.ndarray, R: np.ndarray, t: np.ndarray) -> np.ndarray:
     """Points moved by a rotation and a translation, one after another."""
     rows = []
     for x, y, z, remission in np.asarray(points, np.float64):
@@ -15,7 +15,7 @@ def moved(points, R, t):
         return np.array(rows, np.float64).reshape(-1, 4).astype(np.float32)
 
 
-def turned(points, angle_rad):
+def turned(points: np.ndarray, angle_rad: float) -> np.ndarray:
     """Twin of `edgeperc.types.frame.turned`, one operation of numpy after another."""
     found = points.copy()
     cos, sin = np.float32(np.cos(angle_rad)), np.float32(np.sin(angle_rad))

@@ -7,7 +7,14 @@ import math
 import numpy as np
 
 
-def standing(points, height_m, corner, lowest, overhead, shape):
+def standing(
+    points: np.ndarray,
+    height_m: np.ndarray,
+    corner: tuple[float, float, float],
+    lowest: np.ndarray,
+    overhead: float,
+    shape: tuple[int, int],
+) -> tuple[np.ndarray, np.ndarray]:
     """Twin of `edgeperc.road.grid.fill_standing`."""
     highest, tallest = np.full(shape, -1, np.int32), np.full(shape, np.nan, np.float32)
     for row, col in np.ndindex(shape):

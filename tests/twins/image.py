@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 
+from edgeperc.types.card import InputSpec
 
-def taps(n_in, n_out, k):
+
+def taps(n_in: int, n_out: int, k: int) -> dict[int, float]:
     """The pixels of the image that count for pixel k of the output, and their weights, which sum to 1."""
     scale = n_in / n_out
     reach = max(scale, 1.0)
@@ -18,7 +21,7 @@ def taps(n_in, n_out, k):
     return {j: weight / total for j, weight in weights.items()}
 
 
-def scaled(image, view, spec):
+def scaled(image: np.ndarray, view: Any, spec: InputSpec) -> np.ndarray:
     """The network's input in float64, pixel by pixel; (C, height, width)."""
     rows = np.zeros((view.height, image.shape[0]))
     columns = np.zeros((view.width, image.shape[1]))
@@ -32,7 +35,13 @@ def scaled(image, view, spec):
     return (mixed[order] - mean) / std
 
 
-def fill_scaled(image, rows, columns, normalized, out):
+def fill_scaled(
+    image: np.ndarray,
+    rows: tuple[np.ndarray, np.ndarray],
+    columns: tuple[np.ndarray, np.ndarray],
+    normalized: tuple[np.ndarray, ...],
+    out: np.ndarray,
+) -> None:
     """Every operation of the kernel in its order, in float32; bit for bit the same."""
     (row_start, row_weights), (col_start, col_weights), (channels, mean, std) = rows, columns, normalized
     for row, first in enumerate(row_start):
@@ -47,7 +56,7 @@ def fill_scaled(image, rows, columns, normalized, out):
             out[c, row] = (value - mean[c]) / std[c]
 
 
-def side(n_in, n_out, k):
+def side(n_in: int, n_out: int, k: int) -> tuple[int, int, float]:
     """The two centers of the grid around pixel k, and the weight of the second in float32."""
     at = min(max((k + 0.5) * (n_in / n_out) - 0.5, 0.0), n_in - 1.0)
     first = math.floor(at)
@@ -55,7 +64,7 @@ def side(n_in, n_out, k):
     return first, min(first + 1, n_in - 1) if weight > 0 else first, weight
 
 
-def pixel_labels(logits, height, width):
+def pixel_labels(logits: np.ndarray, height: int, width: int) -> np.ndarray:
     """Pixel by pixel: bilinear logits in float32, the lower class on ties; the class of four centers that share one."""
     labels = np.empty((height, width), np.uint8)
     coarse = logits.argmax(axis=0)

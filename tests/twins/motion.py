@@ -7,7 +7,7 @@ from fractions import Fraction
 import numpy as np
 
 
-def exponential(matrix):
+def exponential(matrix: np.ndarray) -> np.ndarray:
     """The matrix exponential, by its series of a small part of the matrix, squared as often as needed."""
     n = max(0, int(np.ceil(np.log2(np.abs(matrix).max() + 1e-300)))) + 4
     term = total = np.eye(len(matrix))
@@ -19,13 +19,13 @@ def exponential(matrix):
     return total
 
 
-def screw(velocity, rate):
+def screw(velocity: np.ndarray, rate: np.ndarray) -> np.ndarray:
     """The (4, 4) matrix whose exponential is the pose after one second."""
     x, y, z = rate
     return np.array([[0, -z, y, velocity[0]], [z, 0, -x, velocity[1]], [-y, x, 0, velocity[2]], [0, 0, 0, 0]], float)
 
 
-def deskewed(points, after_s, velocity, rate):
+def deskewed(points: np.ndarray, after_s: np.ndarray, velocity: np.ndarray, rate: np.ndarray) -> np.ndarray:
     """Twin of `edgeperc.preprocess.motion.fill_deskewed`."""
     moved = points.copy()
     for i, seconds in enumerate(after_s):
@@ -36,7 +36,7 @@ def deskewed(points, after_s, velocity, rate):
     return moved
 
 
-def inside(polygon, points):
+def inside(polygon: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Twin of `edgeperc.tracking.zones.mark_inside`: how often each point sees an edge above it, in fractions."""
     found = []
     for point in points.tolist():

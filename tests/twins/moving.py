@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import Any
+
 import numpy as np
 
 
-def in_boxes(boxes, points):
+def in_boxes(boxes: Sequence[Any], points: np.ndarray) -> np.ndarray:
     """Twin of `edgeperc.tracking.moving.mark_in_boxes`: each point is turned into the frame of each box."""
     found = []
     for point in points[:, :3].astype(float):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 
-def lowest_returns(points, bounds, grid, shape):
+def lowest_returns(points: np.ndarray, bounds: np.ndarray, grid: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     """Twin of `edgeperc.ground.observed.fill_lowest_returns`."""
     first, per_unit, ring_m = grid
     x, y = points[:, :2].T.astype(np.float64)
@@ -23,7 +23,7 @@ def lowest_returns(points, bounds, grid, shape):
     return lowest
 
 
-def rays(lowest, rays, steps, tilt):
+def rays(lowest: np.ndarray, rays: np.ndarray, steps: np.ndarray, tilt: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Twin of `observed.follow_rays`: the returns on the ground, what lies between two of them, bridges."""
     ring_m, z_beams, first_gradient, max_apart = rays
     middles = (np.arange(lowest.shape[1]) + 0.5) * ring_m
@@ -74,14 +74,16 @@ def rays(lowest, rays, steps, tilt):
     return level, state
 
 
-def sectors(state):
+def sectors(state: np.ndarray) -> np.ndarray:
     """States with `PASSED` bins `BETWEEN` where both neighboring sectors are known."""
     known = (state == 1) | (state == 2)
     bridged = (state == 3) & np.pad(known, ((1, 0), (0, 0)))[:-1] & np.pad(known, ((0, 1), (0, 0)))[1:]
     return np.where(bridged, np.uint8(2), state)
 
 
-def cells(points, index, bin_of_cell, level, state):
+def cells(
+    points: np.ndarray, index: np.ndarray, bin_of_cell: np.ndarray, level: np.ndarray, state: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Twin of `edgeperc.ground.observed.mark_cells`."""
     flat = index.reshape(-1)
     top = np.full(flat.shape, np.inf)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from shapely import LinearRing, LineString, Point, Polygon, box, union_all
 
 
-def grown(cells, radius):
+def grown(cells: np.ndarray, radius: float) -> np.ndarray:
     """Twin of `edgeperc.road.outline.fill_grown`: distances to all marked cells."""
     rows, cols = np.nonzero(cells)
     row, col = np.indices(cells.shape)
@@ -14,7 +16,7 @@ def grown(cells, radius):
     return (squares <= radius**2).any(axis=-1)
 
 
-def without_contacts(cells, addable):
+def without_contacts(cells: np.ndarray, addable: np.ndarray) -> np.ndarray:
     """Twin of `edgeperc.road.outline.resolve_contacts`, in the same order."""
     cells, addable, changed = cells.copy(), addable.copy(), True
     while changed:  # a cell may be added and removed again in one pass
@@ -32,7 +34,7 @@ def without_contacts(cells, addable):
     return cells
 
 
-def connected(cells, row, col):
+def connected(cells: np.ndarray, row: int, col: int) -> Any:
     """Twin of `edgeperc.road.outline.mark_connected`: the part grows until it no longer does."""
     part = np.zeros_like(cells)
     part[row, col] = True
@@ -45,7 +47,7 @@ def connected(cells, row, col):
         part = grown
 
 
-def sides(cells):
+def sides(cells: np.ndarray) -> Any:
     """What the rings of `outline.fill_rings` consist of: sides from corner to corner, cells to the left."""
     found = set()
     for row, col in np.argwhere(cells).tolist():
@@ -56,7 +58,7 @@ def sides(cells):
     return found
 
 
-def needed(rings, addable, removable, outer, enough):
+def needed(rings: list[Any], addable: np.ndarray, removable: np.ndarray, outer: int, enough: int) -> list[Any]:
     """Twin of `edgeperc.road.outline.mark_needed`: the same order, shapely's geometry; rings of tuples."""
     rings = [list(ring) for ring in rings]
     places = [(number, corner) for number, ring in enumerate(rings) for corner in ring]
@@ -92,7 +94,7 @@ def needed(rings, addable, removable, outer, enough):
     return rings
 
 
-def merged(ring, edges, changeable, around, enough):
+def merged(ring: Any, edges: np.ndarray, changeable: np.ndarray, around: np.ndarray, enough: int) -> list[Any]:
     """Twin of `edgeperc.road.outline.merge_corners`: the same order, shapely's geometry; a ring of tuples."""
     ring, limit, tried = list(ring), 8, {}
     (height, width), others = changeable.shape, [LineString([edge[:2], edge[2:]]) for edge in edges]

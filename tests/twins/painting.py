@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 
@@ -19,7 +20,18 @@ def projected(points: np.ndarray, P: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 
 def nearest(
-    points, u, v, depth, between, half_up, half_down, half_side, cell_h, cell_w, shape, max_cells
+    points: np.ndarray,
+    u: np.ndarray,
+    v: np.ndarray,
+    depth: np.ndarray,
+    between: np.ndarray,
+    half_up: np.ndarray,
+    half_down: np.ndarray,
+    half_side: np.ndarray,
+    cell_h: int,
+    cell_w: int,
+    shape: tuple[int, ...],
+    max_cells: int,
 ) -> np.ndarray:
     """Twin of `fill_nearest`: the window of each point as a slice of the buffer."""
     buffer = np.full(shape, np.inf, np.float32)
@@ -39,7 +51,17 @@ def nearest(
     return buffer
 
 
-def painted(labels, u, v, depth, buffer, cell_h, cell_w, slack_m, slack_share) -> np.ndarray:
+def painted(
+    labels: np.ndarray,
+    u: np.ndarray,
+    v: np.ndarray,
+    depth: float,
+    buffer: Any,
+    cell_h: int,
+    cell_w: int,
+    slack_m: float,
+    slack_share: float,
+) -> np.ndarray:
     """Twin of `fill_painted`, all points at once."""
     with np.errstate(invalid="ignore"):
         row, column = np.floor(v + 0.5), np.floor(u + 0.5)

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from edgeperc.objects import persons
 
 
-def measured(points, height, members, above):
+def measured(points: np.ndarray, height: np.ndarray, members: np.ndarray, above: float) -> np.ndarray:
     """Twin of `persons.measure`: the axis is the mean direction of squared offsets, as complex numbers."""
     tall = height[members].astype(np.float64)
     top = tall.max(initial=-np.inf)
@@ -21,12 +23,14 @@ def measured(points, height, members, above):
     return np.array([axis.real, axis.imag, u.min(), u.max(), v.min(), v.max(), top])
 
 
-def along(points, members, cos, sin):
+def along(points: np.ndarray, members: np.ndarray, cos: float, sin: float) -> tuple[np.ndarray, np.ndarray]:
     x, y = points[members, :2].astype(np.float64).T
     return cos * x + sin * y, cos * y - sin * x
 
 
-def groups(points, height, labels, roles, clusters):
+def groups(
+    points: np.ndarray, height: np.ndarray, labels: np.ndarray, roles: np.ndarray, clusters: np.ndarray
+) -> tuple[list[Any], Any]:
     """Twin of `edgeperc.objects.persons.fill_person_groups`: the groups, and the points outside of them."""
     whole, loose = [], []
     for k in range(clusters.max(initial=-1) + 1):
@@ -44,7 +48,7 @@ def groups(points, height, labels, roles, clusters):
     return whole, loose
 
 
-def border(points, height, members, above, found):
+def border(points: np.ndarray, height: np.ndarray, members: np.ndarray, above: float, found: np.ndarray) -> float:
     """Twin of `edgeperc.objects.persons.border_of`: a smoothed histogram."""
     length = found[3] - found[2]
     n = int(min(length / persons.BIN_M, persons.MAX_BINS - 1)) + 1
@@ -59,7 +63,7 @@ def border(points, height, members, above, found):
     return found[2] + (length / 2 if best is None else places[best])
 
 
-def heads(points, height, members, found):
+def heads(points: np.ndarray, height: np.ndarray, members: np.ndarray, found: np.ndarray) -> float:
     """Twin of `edgeperc.objects.persons.head_width`: sorted places, cut at gaps."""
     upper = members[height[members].astype(np.float64) > found[6] - persons.HEAD_M]
     u, v = along(points, upper, found[0], found[1])
@@ -71,7 +75,7 @@ def heads(points, height, members, found):
     return max(np.ptp(part) for part in parts)
 
 
-def divided(points, height, members, n_cuts=0):
+def divided(points: np.ndarray, height: np.ndarray, members: np.ndarray, n_cuts: int = 0) -> list[Any]:
     """The parts of a group, each one person."""
     found = measured(points, height, members, -np.inf)
     limit = persons.UPPER * found[6]
@@ -84,7 +88,16 @@ def divided(points, height, members, n_cuts=0):
     return [own for part in parts for own in divided(points, height, part, n_cuts + 1)]
 
 
-def rows(points, height, labels, roles, groups, n_whole, clusters, min_points):
+def rows(
+    points: np.ndarray,
+    height: np.ndarray,
+    labels: np.ndarray,
+    roles: np.ndarray,
+    groups: np.ndarray,
+    n_whole: int,
+    clusters: np.ndarray,
+    min_points: int,
+) -> np.ndarray:
     """Twin of `edgeperc.objects.persons.fill_persons`: a row for each part that is large enough."""
     found = []
     for k, group in enumerate(groups):
@@ -116,7 +129,15 @@ def rows(points, height, labels, roles, groups, n_whole, clusters, min_points):
     return np.array(found).reshape(-1, 11)
 
 
-def completed(points, height, in_view, clusters, walks, rides, labels):
+def completed(
+    points: np.ndarray,
+    height: np.ndarray,
+    in_view: np.ndarray,
+    clusters: np.ndarray,
+    walks: int,
+    rides: int,
+    labels: np.ndarray,
+) -> np.ndarray:
     """Twin of `edgeperc.objects.persons.complete_persons`."""
     labels = labels.copy()
     for k in range(clusters.max(initial=-1) + 1):

@@ -3,22 +3,25 @@
 from __future__ import annotations
 
 import itertools
+from typing import Any
 
 import numpy as np
 
 
-def draws(draw):
+def draws(draw: int) -> Any:
     """Twin of the draws in `edgeperc.ground.planes.find_plane`: numbers in 0..1 without end."""
     while True:
         draw = (draw * 1103515245 + 12345) & 0x7FFFFFFF
         yield draw / 2**31
 
 
-def consensus_plane(residuals, max_slope, max_shift, n_hypotheses, seed):
+def consensus_plane(
+    residuals: np.ndarray, max_slope: float, max_shift: float, n_hypotheses: int, seed: int
+) -> np.ndarray:
     """Twin of `edgeperc.ground.planes.find_plane`."""
     tested = residuals[:: -(-len(residuals) // 1024) or 1]
 
-    def support(plane):
+    def support(plane: np.ndarray) -> int:
         gap = tested[:, 2] - plane[0] * tested[:, 0] - plane[1] * tested[:, 1] - plane[2]
         return (abs(gap) <= 0.1).sum() - (gap < -0.1).sum()
 
@@ -37,7 +40,9 @@ def consensus_plane(residuals, max_slope, max_shift, n_hypotheses, seed):
     return best
 
 
-def refined_plane(residuals, prior, max_slope, max_shift, plane):
+def refined_plane(
+    residuals: np.ndarray, prior: float, max_slope: float, max_shift: float, plane: np.ndarray
+) -> tuple[int, np.ndarray]:
     """Twin of `planes.refine_plane`: support and plane, by two more rows that say what no slope weighs."""
     on = abs(residuals[:, 2] - residuals[:, :2] @ plane[:2] - plane[2]) <= 0.1
     if not on.any():
@@ -53,7 +58,9 @@ def refined_plane(residuals, prior, max_slope, max_shift, plane):
     return on.sum(), refined if (abs(refined) <= [max_slope, max_slope, max_shift]).all() else plane
 
 
-def ground_heights(points, mount_height_m, regions=True):
+def ground_heights(
+    points: np.ndarray, mount_height_m: float, regions: bool = True
+) -> tuple[np.ndarray, np.ndarray | None]:
     """Twin of `edgeperc.ground.planes.find_ground`: heights (n,), and the first plane or None."""
     xyz = points[:, :3].astype(np.float64)
     finite = np.isfinite(xyz).all(axis=1)
@@ -66,7 +73,9 @@ def ground_heights(points, mount_height_m, regions=True):
         if at not in lowest or points[i, 2] < points[lowest[at], 2]:
             lowest[at] = i
 
-    def residuals(first_row, first_col, size, middle, expected, band, cone):
+    def residuals(
+        first_row: int, first_col: int, size: int, middle: Any, expected: np.ndarray, band: float, cone: float
+    ) -> np.ndarray:
         area = [(r, c) for r in range(first_row, first_row + size) for c in range(first_col, first_col + size)]
         rows = xyz[[lowest[at] for at in area if at in lowest]].reshape(-1, 3)
         rows[:, :2] -= middle

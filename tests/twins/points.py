@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 
-def unpack_lzf(packed, size):
+def unpack_lzf(packed: bytes, size: int) -> bytes | None:
     """Twin of `edgeperc.readers.pcd.fill_unpacked_lzf`: the bytes, or None where the data is damaged."""
     packed, out = list(packed), []
     try:

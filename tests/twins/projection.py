@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
+from edgeperc.types.card import InputSpec
 
-def top_view_pixel(point, view):
+
+def top_view_pixel(point: np.ndarray, view: Any) -> tuple[int, Any]:
     """Flat pixel of one point and its rank, the smaller the better; (-1, None) out of view."""
     x, y, z, remission = point
     (x_min, x_max), (y_min, y_max), (z_min, z_max) = np.float32([view.x_range_m, view.y_range_m, view.z_range_m])
@@ -17,7 +21,7 @@ def top_view_pixel(point, view):
     return (view.height - 1 - ahead) * view.width + view.width - 1 - left, -z
 
 
-def range_image_pixel(point, view, row_edges, col_edges):
+def range_image_pixel(point: np.ndarray, view: Any, row_edges: np.ndarray, col_edges: np.ndarray) -> tuple[int, Any]:
     """Flat pixel of one point and its rank, the smaller the better; (-1, None) out of view."""
     if not np.isfinite(point).all():
         return -1, None
@@ -39,7 +43,9 @@ def range_image_pixel(point, view, row_edges, col_edges):
     return row * view.width + col, squared_range
 
 
-def project(points, view, edges, spec, height_m=None):
+def project(
+    points: np.ndarray, view: Any, edges: Any, spec: InputSpec, height_m: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Twin of the kernels: image, index, pixel. ``edges``: a range image's, of rows and columns."""
     image = np.zeros((len(spec.channels), view.height * view.width), np.float32)
     index = np.full(view.height * view.width, -1, np.int32)

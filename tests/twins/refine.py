@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from typing import Any
+
 import numpy as np
 
 
-def neighbors(row, col, reach, shape, full_turn):
+def neighbors(row: int, col: int, reach: int, shape: tuple[int, int], full_turn: bool) -> Iterator[tuple[int, int]]:
     """Pixels at most ``reach`` rows and columns away, row by row."""
     for r in range(max(row - reach, 0), min(row + reach + 1, shape[0])):
         for c in range(col - reach, col + reach + 1):
@@ -13,7 +16,9 @@ def neighbors(row, col, reach, shape, full_turn):
                 yield r, c % shape[1]
 
 
-def without_outliers(points, index, labels, radii, full_turn):
+def without_outliers(
+    points: np.ndarray, index: np.ndarray, labels: np.ndarray, radii: Any, full_turn: bool
+) -> np.ndarray:
     """Twin of `edgeperc.objects.refine.fill_without_outliers`."""
     cleaned = labels.copy()
     seen = np.zeros(labels.shape, dtype=bool)
@@ -63,7 +68,9 @@ def without_outliers(points, index, labels, radii, full_turn):
     return cleaned
 
 
-def point_labels(points, pixel, index, labels, full_turn):
+def point_labels(
+    points: np.ndarray, pixel: np.ndarray, index: np.ndarray, labels: np.ndarray, full_turn: bool
+) -> np.ndarray:
     """Twin of `edgeperc.objects.refine.fill_point_labels`."""
     ranges = np.sqrt((points[:, :3].astype(np.float64) ** 2).sum(axis=1))
     out = np.zeros(len(points), dtype=np.uint8)

@@ -5,7 +5,12 @@ from __future__ import annotations
 import numpy as np
 
 
-def returns(points, min_range_m, origin=(0.0, 0.0), ego_box=None):
+def returns(
+    points: np.ndarray,
+    min_range_m: float,
+    origin: tuple[float, float] = (0.0, 0.0),
+    ego_box: tuple[float, ...] | None = None,
+) -> tuple[np.ndarray, tuple[int, ...]]:
     """Twin of `returns.returns`: the points, and the number that are not finite, too near and of the ego."""
     out = points.copy()
     counts = [0, 0, 0]

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 
-def cells_of(points, cell_m, n):
+def cells_of(points: np.ndarray, cell_m: float, n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Row and column of each point in a square grid around the sensor, and whether it is in the grid."""
     x, y = (points[:, k].astype(np.float64) + 0.5 * n * cell_m for k in range(2))
     known = (x >= 0.0) & (x < n * cell_m) & (y >= 0.0) & (y < n * cell_m)
@@ -13,7 +15,7 @@ def cells_of(points, cell_m, n):
     return row, col, known
 
 
-def columns(points, height, limits, labels):
+def columns(points: np.ndarray, height: np.ndarray, limits: Any, labels: np.ndarray) -> np.ndarray:
     """Twin of `edgeperc.agreement.rules.clear_columns`."""
     row, col, known = cells_of(points, 0.2, 512)
     h = height.astype(np.float64)
@@ -31,7 +33,18 @@ def columns(points, height, limits, labels):
     return cleared
 
 
-def tallies(points, height, in_view, labels, clusters, cells, is_vehicle, grid, n, n_classes):
+def tallies(
+    points: np.ndarray,
+    height: np.ndarray,
+    in_view: np.ndarray,
+    labels: np.ndarray,
+    clusters: np.ndarray,
+    cells: Any,
+    is_vehicle: np.ndarray,
+    grid: Any,
+    n: int,
+    n_classes: int,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Twin of `edgeperc.agreement.votes.fill_tallies`."""
     counts = np.zeros((n, n_classes + 1), np.int32)
     bounds = np.empty((n, 5), np.float32)
@@ -53,7 +66,7 @@ def tallies(points, height, in_view, labels, clusters, cells, is_vehicle, grid, 
     return counts, bounds, above
 
 
-def inside(points, height, on_ground, box):
+def inside(points: np.ndarray, height: np.ndarray, on_ground: np.ndarray, box: Any) -> np.ndarray:
     """Points above the ground in a box of `edgeperc.agreement.rules.fill_support`, (n,) bool."""
     x, y, half_l, half_w, cos, sin, highest, *_ = box.tolist()
     dx, dy = points[:, 0].astype(np.float64) - x, points[:, 1].astype(np.float64) - y
@@ -66,7 +79,9 @@ def inside(points, height, on_ground, box):
         )
 
 
-def support(points, height, on_ground, labels, roles, boxes):
+def support(
+    points: np.ndarray, height: np.ndarray, on_ground: np.ndarray, labels: np.ndarray, roles: np.ndarray, boxes: Any
+) -> tuple[np.ndarray, Any]:
     """Twin of `edgeperc.agreement.rules.fill_support`."""
     scores, names = np.zeros(len(points), np.float32), np.zeros(len(points), np.uint8)
     for box in boxes:
@@ -78,7 +93,15 @@ def support(points, height, on_ground, labels, roles, boxes):
     return scores, names
 
 
-def inside_counts(points, height, on_ground, in_view, labels, roles, boxes):
+def inside_counts(
+    points: np.ndarray,
+    height: np.ndarray,
+    on_ground: np.ndarray,
+    in_view: np.ndarray,
+    labels: np.ndarray,
+    roles: np.ndarray,
+    boxes: Any,
+) -> np.ndarray:
     """Twin of `edgeperc.agreement.rules.count_inside`."""
     own = [inside(points, height, on_ground, box) for box in boxes]
     is_vehicle = roles[labels] == 1
@@ -88,7 +111,15 @@ def inside_counts(points, height, on_ground, in_view, labels, roles, boxes):
     return np.array(rows, np.int64).reshape(-1, 3)
 
 
-def inside_sums(points, height, on_ground, in_view, labels, roles, boxes):
+def inside_sums(
+    points: np.ndarray,
+    height: np.ndarray,
+    on_ground: np.ndarray,
+    in_view: np.ndarray,
+    labels: np.ndarray,
+    roles: np.ndarray,
+    boxes: Any,
+) -> np.ndarray:
     """Twin of `edgeperc.agreement.rules.sum_inside`."""
     sums = np.zeros((len(boxes), 3))
     for row, box in zip(sums, boxes, strict=True):
@@ -98,7 +129,15 @@ def inside_sums(points, height, on_ground, in_view, labels, roles, boxes):
     return sums
 
 
-def verdicts(in_view, clusters, table, roles, scores, names, labels):
+def verdicts(
+    in_view: np.ndarray,
+    clusters: np.ndarray,
+    table: np.ndarray,
+    roles: np.ndarray,
+    scores: np.ndarray,
+    names: np.ndarray,
+    labels: np.ndarray,
+) -> np.ndarray:
     """Twin of `edgeperc.agreement.votes.apply_verdicts`."""
     agreed = labels.copy()
     for i in np.flatnonzero(in_view):
@@ -112,13 +151,22 @@ def verdicts(in_view, clusters, table, roles, scores, names, labels):
     return agreed
 
 
-def votes(in_view, labels, roles, scores):
+def votes(in_view: np.ndarray, labels: np.ndarray, roles: np.ndarray, scores: np.ndarray) -> np.ndarray:
     """Twin of `edgeperc.agreement.votes.fill_votes`."""
     role = roles[labels]
     return np.where(in_view, 1 + 2 * ((role == 1) | (scores >= 0.5)) + 4 * (role == 2), 0)
 
 
-def verdict_table(counts, bounds, refused, roles, parts, by_share, by_height, is_filled):
+def verdict_table(
+    counts: np.ndarray,
+    bounds: np.ndarray,
+    refused: np.ndarray,
+    roles: np.ndarray,
+    parts: Any,
+    by_share: bool,
+    by_height: bool,
+    is_filled: Any,
+) -> np.ndarray:
     """Twin of `edgeperc.agreement.votes.fill_verdicts`: all clusters at once."""
     vehicles, persons = np.flatnonzero(roles == 1), np.flatnonzero(roles == 2)
     seen = np.maximum(counts[:, -1], 1)
@@ -147,7 +195,9 @@ def verdict_table(counts, bounds, refused, roles, parts, by_share, by_height, is
     return table
 
 
-def ground(points, height, on_ground, roles, labels):
+def ground(
+    points: np.ndarray, height: np.ndarray, on_ground: np.ndarray, roles: np.ndarray, labels: np.ndarray
+) -> np.ndarray:
     """Twin of `edgeperc.agreement.rules.clear_ground`."""
     row, col, known = cells_of(points, 0.2, 1024)
     cleared = labels.copy()
@@ -161,7 +211,19 @@ def ground(points, height, on_ground, roles, labels):
     return cleared
 
 
-def cells(points, height, in_view, labels, roles, by_height, grid, drivable, is_vehicle, in_box, cells):
+def cells(
+    points: np.ndarray,
+    height: np.ndarray,
+    in_view: np.ndarray,
+    labels: np.ndarray,
+    roles: np.ndarray,
+    by_height: Any,
+    grid: Any,
+    drivable: np.ndarray,
+    is_vehicle: Any,
+    in_box: np.ndarray,
+    cells: Any,
+) -> np.ndarray:
     """Twin of `edgeperc.agreement.cells.fill_marks` and `clear_cells`."""
     far, left, cell_m = grid
     returns, vehicles, others = np.zeros(cells.shape, int), np.zeros(cells.shape, bool), np.zeros(cells.shape, bool)

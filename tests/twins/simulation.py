@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Iterable
+from typing import Any
 
 import numpy as np
 
@@ -128,7 +130,7 @@ def columns(bounds: np.ndarray, n_columns: int, reach: float) -> list[list[int]]
     return lists
 
 
-def drivable(scene, pose: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+def drivable(scene: Any, pose: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Twin of `fill_drivable`; a place that is not finite is no road."""
     with np.errstate(invalid="ignore"):
         places = np.stack(np.broadcast_arrays(x[:, None], y[None, :], -pose[2, 3]), axis=-1) @ pose[:3, :3].T
@@ -148,7 +150,7 @@ def tile_at(tile: np.ndarray, x: np.ndarray, y: np.ndarray, cell_m: float) -> np
     )
 
 
-def road_places(scene, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, ...]:
+def road_places(scene: Any, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, ...]:
     """Distance outside roads, bays and islands, and u, s along the first road, for arrays of x and y."""
     rounding = scene.terrain[15]
     outside, bays, islands = (np.full(np.shape(x), 1e9) for _ in range(3))
@@ -167,7 +169,7 @@ def road_places(scene, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, ...]:
     return outside, bays, islands, u_first, s_first
 
 
-def ground(scene, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def ground(scene: Any, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Twin of `ground_at`, its height and its distance outside the roads, for arrays of x and y."""
     slope_x, slope_y, ax, kx, px, ay, ky, py = scene.terrain[:8]
     kerb, pavement, crown, bank, rise, rough, ditch, _ = scene.terrain[8:16]
@@ -192,7 +194,9 @@ def ground(scene, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]
     )
 
 
-def cast(primitives, scene, pose, elevations, azimuths, reach, key):
+def cast(
+    primitives: np.ndarray, scene: Any, pose: Any, elevations: np.ndarray, azimuths: np.ndarray, reach: float, key: int
+) -> tuple[np.ndarray, np.ndarray]:
     """Twin of `fill_cast`: tries every primitive near the ray, and walks over the ground in steps of 5 mm."""
     shape = (len(elevations), len(azimuths))
     centers = primitives[:, 4:7]
@@ -230,7 +234,7 @@ def normal_draw(bits: int) -> float:
     return (sum((bits >> shift) & 0xFFFF for shift in (0, 16, 32, 48)) / 65536.0 - 2.0) * math.sqrt(3.0)
 
 
-def ground_remission(scene, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+def ground_remission(scene: Any, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Twin of `_ground_remission`."""
     terrain = scene.terrain
     pavement, asphalt, paving, grass, marking, lane = terrain[[9, 16, 17, 18, 19, 20]]
@@ -252,7 +256,7 @@ def ground_remission(scene, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     )
 
 
-def ground_kinds(scene, xy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def ground_kinds(scene: Any, xy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Twin of `fill_ground_kinds`."""
     kinds, remissions = np.full(len(xy), 2, np.uint8), np.full(len(xy), np.nan)
     with np.errstate(invalid="ignore"):
@@ -278,7 +282,9 @@ def in_ego_shadow(azimuth: np.ndarray, elevation: np.ndarray) -> np.ndarray:
     return np.where(np.isnan(roof), mast, elevation < roof)
 
 
-def points(primitives, scene, pose, rays, found, receiver):
+def points(
+    primitives: np.ndarray, scene: Any, pose: Any, rays: np.ndarray, found: np.ndarray, receiver: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Twin of `fill_points`: the returns (n, 4) float32 and the object of each, all rays at once."""
     elevations, azimuths, reach, key = rays
     ranges, hits, exits, cosines = found
@@ -287,7 +293,7 @@ def points(primitives, scene, pose, rays, found, receiver):
     hit, t, leave, cos = (of[beam, column] for of in (hits, ranges, exits, cosines))
     t = t.copy()
 
-    def draws(seeds) -> np.ndarray:
+    def draws(seeds: Iterable[int]) -> np.ndarray:
         return np.array([mixed(int(seed)) for seed in seeds], dtype=object)
 
     first = draws(

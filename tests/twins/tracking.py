@@ -5,11 +5,12 @@ from __future__ import annotations
 import itertools
 import math
 from fractions import Fraction
+from typing import Any
 
 import numpy as np
 
 
-def moved(mode, state, dt):
+def moved(mode: Any, state: np.ndarray, dt: float) -> np.ndarray:
     """Twin of `edgeperc.tracking.ukf.move`."""
     x, y, v, heading, turn = state
     if mode == 0:
@@ -25,7 +26,7 @@ def moved(mode, state, dt):
     return np.array([x, y, v, heading + turn * dt, turn])
 
 
-def process_noise(mode, heading, noise, dt):
+def process_noise(mode: Any, heading: float, noise: Any, dt: float) -> np.ndarray:
     """Twin of `edgeperc.tracking.ukf.fill_process_noise`."""
     acceleration, turn, walk, wander, speed = noise
     if mode == 2:
@@ -36,7 +37,9 @@ def process_noise(mode, heading, noise, dt):
     return Q + turn**2 * (np.outer(swing, swing) if mode == 1 else np.diag([0, 0, 0, 0, 0.01]))
 
 
-def unscented_prediction(mode, state, covariance, noise, dt):
+def unscented_prediction(
+    mode: Any, state: np.ndarray, covariance: np.ndarray, noise: Any, dt: float
+) -> tuple[np.ndarray, np.ndarray]:
     """Twin of `edgeperc.tracking.ukf.fill_predictions`, for one motion of one track."""
     root = np.linalg.cholesky(6.0 * covariance)
     points = [state, *(state + root.T), *(state - root.T)]
@@ -46,7 +49,9 @@ def unscented_prediction(mode, state, covariance, noise, dt):
     return mean, (points - mean).T @ np.diag(weights) @ (points - mean) + process_noise(mode, state[3], noise, dt)
 
 
-def innovation(mean, covariance, sigmas, detection):
+def innovation(
+    mean: np.ndarray, covariance: np.ndarray, sigmas: np.ndarray, detection: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """A detection's deviation from a prediction, and its covariance: heading modulo pi, three deviations at most."""
     H = np.eye(5)[[0, 1, 3]]
     cos, sin = math.cos(mean[3]), math.sin(mean[3])
@@ -58,7 +63,9 @@ def innovation(mean, covariance, sigmas, detection):
     return off, S
 
 
-def pda_update(mean, covariance, sigmas, detections, beta):
+def pda_update(
+    mean: np.ndarray, covariance: np.ndarray, sigmas: np.ndarray, detections: np.ndarray, beta: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Twin of `edgeperc.tracking.ukf.fill_updates`, for one motion of one track: the books' PDA filter."""
     _, S = innovation(mean, covariance, sigmas, np.zeros(3))
     offs = [innovation(mean, covariance, sigmas, detection)[0] for detection in detections]
@@ -70,7 +77,15 @@ def pda_update(mean, covariance, sigmas, detections, beta):
     return mean + K @ off, total
 
 
-def likelihoods(means, predicted, sigmas, groups, detections, detection_groups, gates):
+def likelihoods(
+    means: np.ndarray,
+    predicted: np.ndarray,
+    sigmas: np.ndarray,
+    groups: np.ndarray,
+    detections: np.ndarray,
+    detection_groups: np.ndarray,
+    gates: np.ndarray,
+) -> np.ndarray:
     """Twin of `edgeperc.tracking.jpda.fill_likelihoods`, without the weights."""
     out = np.zeros((len(groups), 3, len(detections)))
     for i, j in np.ndindex(len(groups), len(detections)):
@@ -86,7 +101,7 @@ def likelihoods(means, predicted, sigmas, groups, detections, detection_groups, 
     return out
 
 
-def association(weights):
+def association(weights: np.ndarray) -> np.ndarray:
     """Twin of `edgeperc.tracking.jpda.fill_association`: every joint event written out."""
     n, m = weights.shape
     beta = np.zeros((n, m + 1))
@@ -99,7 +114,7 @@ def association(weights):
     return beta / beta.sum(axis=1, keepdims=True)
 
 
-def propagation(weights, rounds=2000):
+def propagation(weights: np.ndarray, rounds: int = 2000) -> np.ndarray:
     """Twin of `edgeperc.tracking.jpda.fill_by_propagation`."""
     to_track = np.ones(weights.shape)
     for _ in range(rounds):
@@ -111,7 +126,9 @@ def propagation(weights, rounds=2000):
     return np.hstack([1 / total, sent / total])
 
 
-def interaction(states, covariances, probabilities, stay):
+def interaction(
+    states: np.ndarray, covariances: np.ndarray, probabilities: np.ndarray, stay: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Twin of `edgeperc.tracking.imm.fill_interaction`, for one track."""
     k = len(states)
     chain = np.where(np.eye(k, dtype=bool), stay, (1 - stay) / (k - 1))
@@ -120,14 +137,16 @@ def interaction(states, covariances, probabilities, stay):
     return np.array([pair[0] for pair in pairs]), np.array([pair[1] for pair in pairs]), prior
 
 
-def combination(states, covariances, probabilities):
+def combination(
+    states: np.ndarray, covariances: np.ndarray, probabilities: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Twin of `edgeperc.tracking.imm.fill_combined`, for one track."""
     mean = probabilities @ states
     off = states - mean
     return mean, np.einsum("k,kab->ab", probabilities, covariances + off[:, :, None] * off[:, None, :])
 
 
-def mode_probabilities(prior, likelihoods, beta):
+def mode_probabilities(prior: np.ndarray, likelihoods: np.ndarray, beta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Twin of `edgeperc.tracking.imm.fill_mode_probabilities`, for one track: shares and probabilities."""
     mixture = prior @ likelihoods
     joint = np.hstack(
@@ -139,7 +158,9 @@ def mode_probabilities(prior, likelihoods, beta):
     return joint / joint.sum(axis=1, keepdims=True), joint.sum(axis=1) / joint.sum()
 
 
-def motion_support(landmarks, detections, prior, spread, motion):
+def motion_support(
+    landmarks: np.ndarray, detections: np.ndarray, prior: np.ndarray, spread: np.ndarray, motion: np.ndarray
+) -> float:
     """Twin of `edgeperc.tracking.egomotion.support`."""
     cos, sin = math.cos(motion[2]), math.sin(motion[2])
     turned = detections[:, :2] @ np.array([[cos, sin], [-sin, cos]]) + motion[:2]
@@ -151,7 +172,7 @@ def motion_support(landmarks, detections, prior, spread, motion):
     return total
 
 
-def nearest(landmarks, detections, motion):
+def nearest(landmarks: np.ndarray, detections: np.ndarray, motion: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Twin of `edgeperc.tracking.egomotion.nearest_detection`, for all landmarks: indices and squared distances."""
     cos, sin = math.cos(motion[2]), math.sin(motion[2])
     turned = detections[:, :2] @ np.array([[cos, sin], [-sin, cos]]) + motion[:2]
@@ -163,7 +184,9 @@ def nearest(landmarks, detections, motion):
     return np.where(np.isinf(smallest), -1, squared.argmin(axis=1)), smallest
 
 
-def fitted_motion(landmarks, detections, prior, variances):
+def fitted_motion(
+    landmarks: np.ndarray, detections: np.ndarray, prior: np.ndarray, variances: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, int]:
     """Twin of `edgeperc.tracking.egomotion.fit_motion`: motion, covariance and pairs."""
     proposals = [prior]
     cos, sin = math.cos(prior[2]), math.sin(prior[2])
@@ -199,7 +222,7 @@ def fitted_motion(landmarks, detections, prior, variances):
     return motion, covariance, int(paired.sum())
 
 
-def hidden(state, shape, seen, sensor):
+def hidden(state: np.ndarray, shape: np.ndarray, seen: np.ndarray, sensor: tuple[float, float]) -> np.ndarray:
     """Twin of `edgeperc.tracking.lives.fill_hidden`."""
     off = state[:, :2] - sensor
     azimuth, distance = np.arctan2(off[:, 1], off[:, 0]), np.hypot(off[:, 0], off[:, 1])
@@ -214,7 +237,9 @@ def hidden(state, shape, seen, sensor):
     return shares
 
 
-def updated_shapes(beta, shapes, sigmas, walk, shape, variance):
+def updated_shapes(
+    beta: np.ndarray, shapes: np.ndarray, sigmas: Any, walk: np.ndarray, shape: np.ndarray, variance: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Twin of `edgeperc.tracking.lives.update_shapes`: the new shape and variance."""
     variance = variance + walk**2
     detected = 1 - beta[:, :1]
@@ -222,7 +247,15 @@ def updated_shapes(beta, shapes, sigmas, walk, shape, variance):
     return shape + gain * (beta[:, 1:] @ shapes - detected * shape), variance * (1 - gain * detected)
 
 
-def updated_fronts(state, speed_sigma, moving_mps, beta, detections, told, fronts):
+def updated_fronts(
+    state: np.ndarray,
+    speed_sigma: np.ndarray,
+    moving_mps: float,
+    beta: np.ndarray,
+    detections: np.ndarray,
+    told: np.ndarray,
+    fronts: np.ndarray,
+) -> np.ndarray:
     """Twin of `edgeperc.tracking.lives.update_fronts`: the new evidence."""
     speed = np.abs(state[:, 2])
     step = 0.5 * np.sign(state[:, 2]) * ((speed > moving_mps) & (speed > 3 * speed_sigma))
@@ -232,7 +265,18 @@ def updated_fronts(state, speed_sigma, moving_mps, beta, detections, told, front
     return np.clip(fronts + np.stack([step, knew, headings], axis=1), [-4, -8, -10], [4, 8, 10])
 
 
-def lives(tracks, classes, beta, hidden, logits, kinds, dt, most_hidden, expected, most):
+def lives(
+    tracks: np.ndarray,
+    classes: np.ndarray,
+    beta: np.ndarray,
+    hidden: np.ndarray,
+    logits: np.ndarray,
+    kinds: np.ndarray,
+    dt: float,
+    most_hidden: float,
+    expected: np.ndarray,
+    most: int,
+) -> np.ndarray:
     """Twin of `edgeperc.tracking.lives.update_lives`: the tracks as they are then."""
     tracks = tracks.copy()
     hit = beta[:, 0] < 0.5
@@ -256,7 +300,7 @@ def lives(tracks, classes, beta, hidden, logits, kinds, dt, most_hidden, expecte
     return tracks
 
 
-def newborn(first_id, detections, classes, most, dtype):
+def newborn(first_id: int, detections: np.ndarray, classes: np.ndarray, most: int, dtype: np.dtype) -> np.ndarray:
     """Twin of `edgeperc.tracking.lives.fill_newborn`."""
     places, shapes, logits, told, kinds, _, ranges, sources = detections
     tracks = np.zeros(len(kinds), dtype)
@@ -284,7 +328,7 @@ def newborn(first_id, detections, classes, most, dtype):
     return tracks
 
 
-def in_view(tracks, pose, left, right):
+def in_view(tracks: np.ndarray, pose: np.ndarray, left: float, right: float) -> np.ndarray:
     """Twin of `edgeperc.tracking.lives.mark_out_of_view`, of tracks that were not detected."""
     along = 0.5 * tracks["shape"][:, 1:2] * [1, -1, -1, 1]
     across = 0.5 * tracks["shape"][:, 2:3] * [1, 1, -1, -1]
@@ -294,7 +338,7 @@ def in_view(tracks, pose, left, right):
     return ((azimuth <= left) & (azimuth >= right)).all(axis=1)
 
 
-def rivals(state, shape, strength, reported):
+def rivals(state: np.ndarray, shape: np.ndarray, strength: np.ndarray, reported: np.ndarray) -> list[int]:
     """Twin of `edgeperc.tracking.lives.mark_rivals`: rows of the tracks that stay."""
     kept = []
     for i in sorted(np.flatnonzero(reported), key=lambda i: -strength[i]):
@@ -313,7 +357,7 @@ def rivals(state, shape, strength, reported):
     return sorted(kept)
 
 
-def breaks(truth, ids, ignored, late):
+def breaks(truth: np.ndarray, ids: np.ndarray, ignored: np.ndarray, late: np.ndarray) -> tuple[int, Any]:
     """Twin of `edgeperc.evaluation.tracking_metrics.count_breaks`: ID switches and fragments, as KITTI counts them."""
     switches = fragments = 0
     for one in {*truth.tolist()}:
@@ -333,7 +377,7 @@ def breaks(truth, ids, ignored, late):
     return switches, fragments
 
 
-def best_gain(gain):
+def best_gain(gain: np.ndarray) -> float:
     """Twin of `edgeperc.evaluation.tracking_metrics.fill_assignment`: the largest sum, over all assignments."""
     n, m = gain.shape
     padded = np.hstack([gain, np.zeros((n, n))])
@@ -343,7 +387,7 @@ def best_gain(gain):
     )
 
 
-def thresholds_by_walking(scores, n_truth):
+def thresholds_by_walking(scores: np.ndarray, n_truth: int) -> tuple[list[float], list[float]]:
     """Twin of `tracking_metrics.recall_thresholds`: KITTI's walk down the scores, in fractions for ties."""
     found, wanted = [], Fraction(0)
     scores = sorted(scores, reverse=True)

@@ -238,9 +238,6 @@ def test_positions_and_cells_agree() -> None:
     assert (rows[0], cols[0]) == (0, 0)  # a cell holds its far and left edges
 
 
-# --- a card in its file ----------------------------------------------------------------------------------------------
-
-
 CARD = entry(CARD_KEY, TOP_VIEW_CARD.to_json().encode())
 GRAPH = varint(1 << 3) + varint(8) + field(2, b"pytorch") + field(7, bytes(range(256)) * 40)
 

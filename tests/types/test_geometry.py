@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from typing import Literal
+
 import numpy as np
 import pytest
 import shapely
@@ -21,7 +23,7 @@ from edgeperc.types.perception import Box
 from edgeperc.types.views import TopViewGeometry
 
 
-def some_rectangles(rng, n):
+def some_rectangles(rng: np.random.Generator, n: int) -> np.ndarray:
     rows = np.empty((n, 5))
     rows[:, :2] = rng.uniform(-4.0, 4.0, (n, 2))
     rows[:, 2:4] = rng.uniform(0.2, 6.0, (n, 2))
@@ -29,13 +31,13 @@ def some_rectangles(rng, n):
     return rows
 
 
-def shapely_iou(a, b):
+def shapely_iou(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     first = np.array([shapely.Polygon(twins.decode.rectangle_corners(r)) for r in a])[:, None]
     second = np.array([shapely.Polygon(twins.decode.rectangle_corners(r)) for r in b])[None, :]
     return shapely.area(shapely.intersection(first, second)) / shapely.area(shapely.union(first, second))
 
 
-def test_iou_agrees_with_shapely_and_with_the_twin():
+def test_iou_agrees_with_shapely_and_with_the_twin() -> None:
     rng = np.random.default_rng(1)
     a, b = some_rectangles(rng, 40), some_rectangles(rng, 50)
     iou = oriented_iou(a, b)
@@ -52,7 +54,7 @@ def test_iou_agrees_with_shapely_and_with_the_twin():
         max_size=6,
     )
 )
-def test_iou_of_aligned_touching_and_equal_rectangles(rows):
+def test_iou_of_aligned_touching_and_equal_rectangles(rows: list[tuple[int, ...]]) -> None:
     rectangles = np.array(rows, dtype=np.float64).reshape(-1, 5) * [1.0, 1.0, 1.0, 1.0, np.pi / 4.0]
     iou = oriented_iou(rectangles, rectangles)
     assert ((iou >= 0.0) & (iou <= 1.0)).all()
@@ -60,7 +62,7 @@ def test_iou_of_aligned_touching_and_equal_rectangles(rows):
     np.testing.assert_allclose(iou, twins.decode.oriented_iou(rectangles, rectangles), atol=1e-12)
 
 
-def test_iou_by_hand():
+def test_iou_by_hand() -> None:
     square = [0.0, 0.0, 2.0, 2.0, 0.0]
     others = [
         [1.0, 0.0, 2.0, 2.0, 0.0],  # half: 2 / 6
@@ -77,7 +79,7 @@ def test_iou_by_hand():
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, -1.0, 1e200])
 @pytest.mark.parametrize("column", range(5))
-def test_impossible_rectangles_overlap_nothing(value, column):
+def test_impossible_rectangles_overlap_nothing(value: float, column: int) -> None:
     strange = np.array([0.0, 0.0, 2.0, 2.0, 0.0])
     strange[column] = value
     iou = oriented_iou([strange], [strange, [0.5, 0.5, 2.0, 2.0, 0.1]])
@@ -87,7 +89,7 @@ def test_impossible_rectangles_overlap_nothing(value, column):
     assert suppress_overlaps([strange, strange], [0.5, 0.5], 0.5)[0] == 0
 
 
-def test_empty_and_misshapen():
+def test_empty_and_misshapen() -> None:
     assert oriented_iou([], np.zeros((3, 5))).shape == (0, 3)
     assert suppress_overlaps([], [], 0.5).shape == (0,)
     assert bounding_rectangles([]).shape == (0, 5)
@@ -99,7 +101,7 @@ def test_empty_and_misshapen():
         suppress_overlaps(np.zeros((3, 5)), [0.1, 0.2, 0.3], [0.5, 0.5])
 
 
-def test_suppression_agrees_with_the_twin():
+def test_suppression_agrees_with_the_twin() -> None:
     rng = np.random.default_rng(2)
     for n in (1, 2, 30):
         rectangles, scores = some_rectangles(rng, n), rng.integers(0, 5, n) / 5.0
@@ -112,7 +114,7 @@ def test_suppression_agrees_with_the_twin():
             np.testing.assert_array_equal(suppress_overlaps(rectangles, scores, threshold, max_inside=0.5), expected)
 
 
-def test_suppression_keeps_the_earlier_of_equals_and_chains_greedily():
+def test_suppression_keeps_the_earlier_of_equals_and_chains_greedily() -> None:
     row = [[0.0, 0.0, 4.0, 2.0, 0.0], [2.0, 0.0, 4.0, 2.0, 0.0], [4.0, 0.0, 4.0, 2.0, 0.0]]
     # The middle one overlaps both others by a third; beaten by the first, it does not beat the last.
     assert suppress_overlaps(row, [0.9, 0.8, 0.7], 0.3).tolist() == [0, 2]
@@ -125,13 +127,13 @@ def test_suppression_keeps_the_earlier_of_equals_and_chains_greedily():
     assert suppress_overlaps(row, [0.9, 0.8, 0.7], [0.3, 0.5, 0.5]).tolist() == [0, 2]
 
 
-def test_suppression_of_small_rectangles_in_large_ones():
+def test_suppression_of_small_rectangles_in_large_ones() -> None:
     rows = [[0.0, 0.0, 10.0, 10.0, 0.0], [1.0, 1.0, 1.0, 1.0, 0.3], [5.1, 0.0, 1.0, 1.0, 0.0]]
     assert suppress_overlaps(rows, [0.9, 0.8, 0.7], 0.1).tolist() == [0, 1, 2]
     assert suppress_overlaps(rows, [0.9, 0.8, 0.7], 0.1, max_inside=0.5).tolist() == [0, 2]
 
 
-def test_bounds_hold_the_corners_tightly():
+def test_bounds_hold_the_corners_tightly() -> None:
     rng = np.random.default_rng(3)
     rectangles = some_rectangles(rng, 20)
     for bounds, rectangle in zip(bounding_rectangles(rectangles), rectangles, strict=True):
@@ -141,7 +143,7 @@ def test_bounds_hold_the_corners_tightly():
         assert bounds[4] == 0.0
 
 
-def test_interpreted_and_compiled_kernels_agree():
+def test_interpreted_and_compiled_kernels_agree() -> None:
     rng = np.random.default_rng(4)
     a = some_rectangles(rng, 6)
     compiled, interpreted = np.empty((6, 6)), np.empty((6, 6))
@@ -150,14 +152,14 @@ def test_interpreted_and_compiled_kernels_agree():
     np.testing.assert_allclose(compiled, interpreted, atol=1e-13)
 
 
-def test_rectangles_are_the_boxes_footprints():
+def test_rectangles_are_the_boxes_footprints() -> None:
     boxes = [Box("car", 1.0, (10.0, -2.0, -1.0), (4.0, 1.7, 1.5), 0.3), Box("van", 0.5, (7, 3, 0), (5, 2, 2), -1)]
     np.testing.assert_array_equal(rectangles(boxes), [[10.0, -2.0, 4.0, 1.7, 0.3], [7, 3, 5, 2, -1]])
     assert rectangles([]).shape == (0, 5)
     assert rectangles(iter(boxes)).dtype == np.float64
 
 
-def test_shared_area_follows_from_iou():
+def test_shared_area_follows_from_iou() -> None:
     a = np.array([[0.0, 0.0, 4.0, 2.0, 0.0]])
     b = np.array([[1.0, 0.0, 4.0, 2.0, 0.0], [0.0, 0.0, 2.0, 1.0, 0.0], [9.0, 9.0, 4.0, 2.0, 0.0]])
     np.testing.assert_allclose(shared_area(oriented_iou(a, b), a, b), [[6.0, 2.0, 0.0]], rtol=1e-12)
@@ -169,7 +171,7 @@ def test_shared_area_follows_from_iou():
 
 @pytest.mark.parametrize("seed", range(8))
 @pytest.mark.parametrize("layout", ["C", "F"])
-def test_footprints_agree_with_the_twin(seed, layout):
+def test_footprints_agree_with_the_twin(seed: int, layout: Literal["C", "F"]) -> None:
     rng = np.random.default_rng(seed)
     view = TopViewGeometry((2.0, 22.0), (-7.0, 9.0), cell_m=0.5)
     boxes = [

@@ -5,7 +5,10 @@ from __future__ import annotations
 import csv
 import json
 import re
+from collections.abc import Callable, Sequence
 from dataclasses import FrozenInstanceError, replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,10 +23,8 @@ from edgeperc.preprocess.fitness import SUMS, FitnessProfile, Histograms, Rows, 
 from edgeperc.readers.files import read_points
 from edgeperc.types.sensor import SENSORS, SensorProfile, get_sensor
 
-# --- profiles --------------------------------------------------------------------------------------------------------
 
-
-def test_built_in_profiles():
+def test_built_in_profiles() -> None:
     beams = {name: profile.n_beams for name, profile in SENSORS.items()}
     assert beams == {
         **{"hdl-64e": 64, "hdl-32e": 32, "vlp-16": 16, "vlp-32c": 32, "pandar64": 64, "pandarxt-32": 32},
@@ -38,11 +39,11 @@ def test_built_in_profiles():
         np.testing.assert_allclose((raw + profile.remission_offset) * profile.remission_scale, [0, 1])
 
 
-def test_vlp_16_is_evenly_spaced():
+def test_vlp_16_is_evenly_spaced() -> None:
     np.testing.assert_allclose(get_sensor("vlp-16").elevations_deg, np.arange(15, -16, -2))
 
 
-def test_own_and_changed_profiles():
+def test_own_and_changed_profiles() -> None:
     own = SensorProfile.uniform("mine", 40, 7.0, -16.0, columns=1800, remission_range=(10, 110))
     assert get_sensor(own) is own
     assert (own.n_beams, own.fov_up_deg, own.fov_down_deg) == (40, 7.0, -16.0)
@@ -54,7 +55,7 @@ def test_own_and_changed_profiles():
 
 
 @pytest.mark.parametrize("name", ["hdl64", "HDL-64E", "", None, ["vlp-16"]])
-def test_an_unknown_sensor_lists_the_known(name):
+def test_an_unknown_sensor_lists_the_known(name: Any) -> None:
     with pytest.raises(SensorError, match=r"hdl-64e.*pandarxt-32"):
         get_sensor(name)
 
@@ -82,25 +83,23 @@ def test_an_unknown_sensor_lists_the_known(name):
         {"max_range_m": None},
     ],
 )
-def test_impossible_sensors_are_refused(change):
+def test_impossible_sensors_are_refused(change: dict[str, Any]) -> None:
     with pytest.raises(SensorError):
         replace(get_sensor("vlp-16"), **change)
 
 
 @pytest.mark.parametrize("beams", [0, -1, 2.0, True, 5000])
-def test_impossible_numbers_of_beams_are_refused(beams):
+def test_impossible_numbers_of_beams_are_refused(beams: Any) -> None:
     with pytest.raises(SensorError, match=r"1\.\.4096"):
         SensorProfile.uniform("mine", beams, 1, -1)
     with pytest.raises(SensorError, match="finite"):
         SensorProfile.uniform("mine", 3, float("nan"), -1)
 
 
-# --- a street --------------------------------------------------------------------------------------------------------
-
 SENSOR = get_sensor("hdl-64e")
 
 
-def street(seed, sensor=SENSOR, columns=1000):
+def street(seed: int, sensor: SensorProfile = SENSOR, columns: int = 1000) -> np.ndarray:
     """A road along x between facades, with a crossing road and parked cars, as the sensor sees it."""
     rng = np.random.default_rng(seed)
     elevation, azimuth = np.meshgrid(
@@ -137,32 +136,32 @@ def street(seed, sensor=SENSOR, columns=1000):
 
 
 @pytest.fixture(scope="module")
-def streets():
+def streets() -> list[np.ndarray]:
     return [street(seed) for seed in range(6)]
 
 
 @pytest.fixture(scope="module")
-def profile(streets):
+def profile(streets: list[np.ndarray]) -> FitnessProfile:
     return FitnessProfile.from_scans(streets[:3])
 
 
-def columns(*parts):
+def columns(*parts: np.ndarray) -> np.ndarray:
     return np.column_stack(parts).astype(np.float32)
 
 
-def in_camera_axes(p):
+def in_camera_axes(p: np.ndarray) -> np.ndarray:
     return columns(-p[:, 1], -p[:, 2], p[:, 0], p[:, 3])
 
 
-def in_nuscenes_axes(p):
+def in_nuscenes_axes(p: np.ndarray) -> np.ndarray:
     return columns(-p[:, 1], p[:, 0], p[:, 2:])
 
 
-def cropped(p):
+def cropped(p: np.ndarray) -> np.ndarray:
     return p[(p[:, 0] > 0) & (np.abs(p[:, 1]) < 0.8 * p[:, 0]) & (p[:, 2] > -0.26 * p[:, 0])]
 
 
-def rescaled(factors):
+def rescaled(factors: Sequence[float]) -> Callable[[np.ndarray], np.ndarray]:
     return lambda p: p * np.float32(factors)
 
 
@@ -189,7 +188,7 @@ FAULTS = {
 
 
 @pytest.mark.parametrize("fault", FAULTS)
-def test_faults_are_reported(streets, profile, fault):
+def test_faults_are_reported(streets: list[np.ndarray], profile: FitnessProfile, fault: str) -> None:
     spoil, expected_text = FAULTS[fault]
     for scan in streets[3:]:
         findings = check_fitness(np.ascontiguousarray(spoil(scan)), profile, SENSOR)
@@ -200,14 +199,14 @@ def test_faults_are_reported(streets, profile, fault):
 @pytest.mark.parametrize(
     ("name", "expected_text"), [("vlp-16", "about 1[4-7] rows"), ("hdl-32e", "about (2[89]|3[0-3]) rows")]
 )
-def test_fewer_beams_are_reported(profile, name, expected_text):
+def test_fewer_beams_are_reported(profile: FitnessProfile, name: str, expected_text: str) -> None:
     sensor = get_sensor(name)
     findings = " ".join(check_fitness(street(9, sensor), profile, sensor))
     assert re.search(expected_text, findings), findings
     assert f"{name}: {sensor.n_beams}" in findings
 
 
-def test_ordinary_scans_pass(streets, profile):
+def test_ordinary_scans_pass(streets: list[np.ndarray], profile: FitnessProfile) -> None:
     rng = np.random.default_rng(0)
     for scan in streets:
         assert check_fitness(scan, profile, SENSOR) == ()
@@ -217,7 +216,7 @@ def test_ordinary_scans_pass(streets, profile):
         assert check_fitness(spoilt, profile, SENSOR) == ()
 
 
-def test_scan_without_finite_points_is_reported(profile):
+def test_scan_without_finite_points_is_reported(profile: FitnessProfile) -> None:
     for scan in (np.empty((0, 4), np.float32), np.full((9, 4), np.nan, np.float32)):
         assert "no finite point" in check_fitness(scan, profile, SENSOR)[0]
     assert check_fitness(np.zeros((1, 4), np.float32), profile, SENSOR)
@@ -225,7 +224,7 @@ def test_scan_without_finite_points_is_reported(profile):
         check_fitness(np.zeros((5, 3), np.float32), profile, SENSOR)
 
 
-def test_profile_is_read_back_from_json(profile):
+def test_profile_is_read_back_from_json(profile: FitnessProfile) -> None:
     assert FitnessProfile.from_dict(json.loads(json.dumps(profile.to_dict(), allow_nan=False))) == profile
     crops_only = FitnessProfile.from_scans([cropped(street(1))])
     assert crops_only.road_ahead is None
@@ -236,20 +235,20 @@ def test_profile_is_read_back_from_json(profile):
 @pytest.mark.parametrize(
     "change", [{"beams": None}, {"beams": 3}, {"beams": [1, "x"]}, {"beams": [1, float("nan")]}, {"more": [0, 1]}]
 )
-def test_a_damaged_profile_is_refused(profile, change):
+def test_a_damaged_profile_is_refused(profile: FitnessProfile, change: dict[str, Any]) -> None:
     with pytest.raises(CardError):
         FitnessProfile.from_dict(profile.to_dict() | change)
     with pytest.raises(CardError):
         FitnessProfile.from_dict({})
 
 
-def test_a_profile_needs_scans():
+def test_a_profile_needs_scans() -> None:
     with pytest.raises(PointsError, match="training scans"):
         FitnessProfile.from_scans([np.empty((0, 4), np.float32)])
 
 
 @pytest.mark.parametrize("azimuth_deg", [(45.0, -45.0), (180.0, -180.0), (120.0, -30.0)])
-def test_the_view_holds_its_share_of_the_points(azimuth_deg):
+def test_the_view_holds_its_share_of_the_points(azimuth_deg: tuple[float, float]) -> None:
     scan = street(4)
     measured = FitnessProfile.from_scans([scan], azimuth_deg)
     azimuth = np.degrees(np.arctan2(scan[:, 1], scan[:, 0]))
@@ -259,10 +258,7 @@ def test_the_view_holds_its_share_of_the_points(azimuth_deg):
     assert measured.beams[0] == pytest.approx(64, abs=6)
 
 
-# --- the kernel ------------------------------------------------------------------------------------------------------
-
-
-def check_against_twin(points, step, beam_step, view):
+def check_against_twin(points: np.ndarray, step: int, beam_step: int, view: Any) -> None:
     histograms = Histograms(*(np.full(size, 99, np.int64) for size in (258, 360, 200, (3, 100))))
     rows, sums = Rows(np.full((8, 1024), 99.0), np.full(8, 99, np.int64)), np.empty(1, SUMS)
     fill_scan_sums(points, step, beam_step, view, histograms, rows, sums)
@@ -275,7 +271,7 @@ def check_against_twin(points, step, beam_step, view):
 
 
 @pytest.mark.parametrize(("step", "beam_step"), [(1, 1), (7, 2)])
-def test_scan_sums_agree_with_the_twin_on_a_street(step, beam_step):
+def test_scan_sums_agree_with_the_twin_on_a_street(step: int, beam_step: int) -> None:
     check_against_twin(street(5, columns=200), step, beam_step, (-0.5, 0.5))
 
 
@@ -292,27 +288,26 @@ def test_scan_sums_agree_with_the_twin_on_a_street(step, beam_step):
     ),
     st.integers(1, 3),
 )
-def test_scan_sums_agree_with_the_twin_on_random_scans(points, step):
+def test_scan_sums_agree_with_the_twin_on_random_scans(points: np.ndarray, step: int) -> None:
     with np.errstate(invalid="ignore", over="ignore"):
         check_against_twin(points, step, 1, (-0.5, 0.5))
 
 
-# --- real scans ------------------------------------------------------------------------------------------------------
-
-
 @pytest.fixture(scope="module")
-def kitti_scans(kitti_root):
+def kitti_scans(kitti_root: Path) -> tuple[list[dict[str, Any]], list[np.ndarray]]:
     with (kitti_root / "frames.csv").open() as file:
         frames = list(csv.DictReader(file))
     return frames, [read_points(kitti_root / "training" / "velodyne" / f"{frame['name']}.bin") for frame in frames]
 
 
 @pytest.fixture(scope="module")
-def kitti_profile(kitti_scans):
+def kitti_profile(kitti_scans: tuple[list[dict[str, Any]], list[np.ndarray]]) -> FitnessProfile:
     return FitnessProfile.from_scans(kitti_scans[1][:154:10] + kitti_scans[1][254:307:8])
 
 
-def test_every_kitti_scan_passes(kitti_scans, kitti_profile, semantickitti_root):
+def test_every_kitti_scan_passes(
+    kitti_scans: tuple[list[dict[str, Any]], list[np.ndarray]], kitti_profile: FitnessProfile, semantickitti_root: Path
+) -> None:
     frames, scans = kitti_scans
     assert len(scans) == 314
     found = {
@@ -328,7 +323,9 @@ def test_every_kitti_scan_passes(kitti_scans, kitti_profile, semantickitti_root)
     assert found == {}
 
 
-def test_kitti_scans_turned_by_90_degrees_are_mostly_reported(kitti_scans, kitti_profile):
+def test_kitti_scans_turned_by_90_degrees_are_mostly_reported(
+    kitti_scans: tuple[list[dict[str, Any]], list[np.ndarray]], kitti_profile: FitnessProfile
+) -> None:
     full = [scan for frame, scan in zip(*kitti_scans, strict=True) if frame["crop"] == "0"]
     found = sum(bool(check_fitness(in_nuscenes_axes(scan), kitti_profile, SENSOR)) for scan in full)
     assert found / len(full) > 0.85
@@ -346,7 +343,9 @@ def test_kitti_scans_turned_by_90_degrees_are_mostly_reported(kitti_scans, kitti
         "almost empty",
     ],
 )
-def test_corrupted_kitti_scans_are_reported(kitti_scans, kitti_profile, fault):
+def test_corrupted_kitti_scans_are_reported(
+    kitti_scans: tuple[list[dict[str, Any]], list[np.ndarray]], kitti_profile: FitnessProfile, fault: str
+) -> None:
     spoil, expected_text = FAULTS[fault]
     for frame, scan in list(zip(*kitti_scans, strict=True))[:307:9]:
         findings = check_fitness(np.ascontiguousarray(spoil(scan)), kitti_profile, SENSOR)
@@ -354,7 +353,7 @@ def test_corrupted_kitti_scans_are_reported(kitti_scans, kitti_profile, fault):
         assert re.search(expected, " ".join(findings)), (frame["name"], findings)
 
 
-def test_nuscenes_sweep_is_reported(data_root, kitti_profile):
+def test_nuscenes_sweep_is_reported(data_root: Callable[[str], Path], kitti_profile: FitnessProfile) -> None:
     (path,) = (data_root("other_sensors") / "nuscenes_sweep").glob("*.bin")
     findings = " ".join(check_fitness(read_points(path), kitti_profile, SENSOR))
     for expected_text in ("--turn -90", "(0, 255)", "rows of points"):

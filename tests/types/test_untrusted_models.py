@@ -60,9 +60,6 @@ def test_a_plain_model_is_opened(tmp_path: Path) -> None:
     assert Perceiver(session.path, provider="cpu").cards == (tiny_card(),)
 
 
-# --- the file ---------------------------------------------------------------------------------------------------------
-
-
 def test_what_is_no_regular_file_is_refused_at_once(tmp_path: Path) -> None:
     pipe, folder = tmp_path / "pipe.onnx", tmp_path / "folder.onnx"
     folder.mkdir()
@@ -94,8 +91,6 @@ def test_a_huge_file_is_refused_unread(tmp_path: Path) -> None:
     with pytest.raises(ModelFileError, match="has 2000000001 bytes; expected at most 2000000000"):
         Session(path)
 
-
-# --- the graph --------------------------------------------------------------------------------------------------------
 
 LOCATION = field(1, b"location") + field(2, b"/etc/passwd")
 REVERSED = field(2, b"/etc/passwd") + field(1, b"location")
@@ -279,29 +274,26 @@ def test_a_graph_of_another_shape_than_the_cards(tmp_path: Path) -> None:
 def test_a_first_run_without_end_is_given_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     onnxruntime = pytest.importorskip("onnxruntime")
     path = write(tmp_path, TINY)
-    enter = session_module._terminated
+    enter = session_module.terminated
 
     def late(ort: Any, after_s: float | None) -> Any:
         assert after_s == session_module.MAX_FIRST_RUN_S
         return enter(ort, 1e-9)
 
-    with session_module._terminated(onnxruntime, 1e-9) as options:
+    with session_module.terminated(onnxruntime, 1e-9) as options:
         while not options.terminate:  # the timer's thread sets it
             time.sleep(0.001)
     for after_s in (None, 60.0):
-        with session_module._terminated(onnxruntime, after_s) as options:
+        with session_module.terminated(onnxruntime, after_s) as options:
             assert not options.terminate
     session = Session(path, "cpu")
     options.terminate = True
     with pytest.raises(InferenceError, match=r"(?i)terminat"):
-        session._run(options)
+        session.run_bound(options)
     session.run()
-    monkeypatch.setattr(session_module, "_terminated", late)
+    monkeypatch.setattr(session_module, "terminated", late)
     with contextlib.suppress(InferenceError):  # the timer may come too late for so small a network
         Session(path, "cpu")
-
-
-# --- the card ---------------------------------------------------------------------------------------------------------
 
 
 def test_a_model_without_a_golden_record_is_reported(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -427,9 +419,6 @@ def test_a_fitness_profile_out_of_its_bounds_is_named(name: str, value: object) 
     assert FitnessProfile.from_dict(profile).to_dict() == profile
     with pytest.raises(CardError, match=rf"fitness\.{name}(\[.\])? is .*expected"):
         FitnessProfile.from_dict(profile | {name: value})
-
-
-# --- anything at all --------------------------------------------------------------------------------------------------
 
 
 def opened_or_refused(blob: bytes) -> None:

@@ -86,9 +86,6 @@ class Elements(HTMLParser):
         return [tag for tag, _ in self.found]
 
 
-# --- the 3-D page ----------------------------------------------------------------------------------------------------
-
-
 def test_names_are_only_text_on_the_page(tmp_path: Path) -> None:
     scan = a_scan()[:7000]
     for k, names in enumerate((("plain", *HOSTILE), tuple(f"name {k}" for k in range(len(HOSTILE) + 1)))):
@@ -179,9 +176,6 @@ def test_no_other_script_runs_on_the_page(browser: Any, tmp_path: Path) -> None:
         shown.close()
 
 
-# --- reports of edgeperc-bench ---------------------------------------------------------------------------------------
-
-
 def parts_of(names: tuple[str, ...]) -> list[Section]:
     rows = [("name", "ms"), *((name, name) for name in names)]
     return [Section(name, (name, name), rows) for name in names]
@@ -206,9 +200,6 @@ def test_names_are_only_text_in_reports(browser: Any, tmp_path: Path) -> None:
     path.write_text(page.replace("</body>", f"<script>{RUN}</script><img src=x onerror='{RUN}'></body>"))
     shown, _ = opened(browser, path)
     assert shown.evaluate("window.stolen") is None
-
-
-# --- pictures --------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.usefixtures("matplotlib")

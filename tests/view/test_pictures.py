@@ -162,7 +162,7 @@ def test_picture_is_the_same_again_and_in_other_threads(scan: np.ndarray, percep
 
 @pytest.mark.parametrize("n", [0, 1])
 @pytest.mark.usefixtures("matplotlib")
-def test_tiny_scans(n: int, tmp_path, scan: np.ndarray) -> None:
+def test_tiny_scans(n: int, tmp_path: Path, scan: np.ndarray) -> None:
     whole = a_perception(scan)
     for points in (scan[:n], np.full((n, 4), np.nan, dtype=np.float32)):
         labels = PointLabels(np.zeros(n, np.uint8), np.zeros(n, bool), POINT_CLASSES)
@@ -175,7 +175,7 @@ def test_tiny_scans(n: int, tmp_path, scan: np.ndarray) -> None:
 
 
 @pytest.mark.usefixtures("matplotlib")
-def test_strange_titles_and_classes(scan: np.ndarray, perception: Perception, tmp_path) -> None:
+def test_strange_titles_and_classes(scan: np.ndarray, perception: Perception, tmp_path: Path) -> None:
     strange = "$\\frac{ <script>alert(1)</script> 走 \n \udcff @@SCENE@@" + "x" * 200
     classes = (*POINT_CLASSES[:3], "</script> & tram\nelement vertex 3")
     perception = replace(perception, points=replace(perception.points, classes=classes))
@@ -191,7 +191,7 @@ def test_strange_titles_and_classes(scan: np.ndarray, perception: Perception, tm
 
 
 @pytest.mark.usefixtures("matplotlib")
-def test_file_is_replaced_whole(scan: np.ndarray, perception: Perception, tmp_path) -> None:
+def test_file_is_replaced_whole(scan: np.ndarray, perception: Perception, tmp_path: Path) -> None:
     target = tmp_path / "scan.png"
     target.write_bytes(b"old")
     png = view.draw(perception, scan, target)
@@ -205,7 +205,7 @@ def test_file_is_replaced_whole(scan: np.ndarray, perception: Perception, tmp_pa
     assert sorted(entry.name for entry in tmp_path.iterdir()) == ["scan.label", "scan.png"]
 
 
-def test_html_holds_every_finite_point_and_no_address(scan: np.ndarray, perception: Perception, tmp_path) -> None:
+def test_html_holds_every_finite_point_and_no_address(scan: np.ndarray, perception: Perception, tmp_path: Path) -> None:
     bright = scan * np.array([1, 1, 1, 200], dtype=np.float32)
     write_html(perception, bright, tmp_path / "page.html", title="a scan")
     text = (tmp_path / "page.html").read_text(encoding="utf-8")
@@ -246,7 +246,7 @@ def test_leaves_above_the_road_are_not_road(perception: Perception) -> None:
     assert painted[60] == 0
 
 
-def test_ply_reads_back(scan: np.ndarray, perception: Perception, tmp_path) -> None:
+def test_ply_reads_back(scan: np.ndarray, perception: Perception, tmp_path: Path) -> None:
     write_ply(perception, scan, tmp_path / "points.ply")
     header, body = (tmp_path / "points.ply").read_bytes().split(b"end_header\n", 1)
     kinds = {"float": "<f4", "uchar": "u1"}
@@ -261,7 +261,7 @@ def test_ply_reads_back(scan: np.ndarray, perception: Perception, tmp_path) -> N
     assert "#{:02x}{:02x}{:02x}".format(*(car[c] for c in ("red", "green", "blue"))) == CLASS_COLORS["car"]
 
 
-def test_labels_are_semantickitti_ids(scan: np.ndarray, perception: Perception, tmp_path) -> None:
+def test_labels_are_semantickitti_ids(scan: np.ndarray, perception: Perception, tmp_path: Path) -> None:
     labels = np.arange(len(scan), dtype=np.uint8) % 4
     named = replace(perception.points, labels=labels, classes=("background", "car", "cyclist", "tram"))
     write_labels(replace(perception, points=named), tmp_path / "scan.label")
@@ -269,7 +269,7 @@ def test_labels_are_semantickitti_ids(scan: np.ndarray, perception: Perception, 
     np.testing.assert_array_equal(raw, np.array([0, 10, 31, 99])[labels])
 
 
-def test_refusals(scan: np.ndarray, perception: Perception, tmp_path) -> None:
+def test_refusals(scan: np.ndarray, perception: Perception, tmp_path: Path) -> None:
     top_alone = replace(perception, points=None)
     with pytest.raises(PointsError, match="pointseg"):
         write_labels(top_alone, tmp_path / "a.label")
@@ -283,7 +283,9 @@ def test_refusals(scan: np.ndarray, perception: Perception, tmp_path) -> None:
     assert not list(tmp_path.iterdir())
 
 
-def test_missing_matplotlib_names_the_line(scan: np.ndarray, perception: Perception, monkeypatch) -> None:
+def test_missing_matplotlib_names_the_line(
+    scan: np.ndarray, perception: Perception, monkeypatch: pytest.MonkeyPatch
+) -> None:
     for name in ("matplotlib", "matplotlib.figure", "matplotlib.backends.backend_agg"):
         monkeypatch.setitem(sys.modules, name, None)
     with pytest.raises(MissingExtraError, match=r"pip install 'edgeperc\[view\]'"):
@@ -302,7 +304,7 @@ def test_drawing_uses_no_pyplot(scan: np.ndarray, perception: Perception) -> Non
     assert ("matplotlib.pyplot" in sys.modules) == before
 
 
-def some_mistakes(points: np.ndarray, **given) -> Mistakes:
+def some_mistakes(points: np.ndarray, **given: Any) -> Mistakes:
     return Mistakes("000123", "drive_0011", points, np.zeros(len(points), np.uint8), **given)
 
 
@@ -322,7 +324,7 @@ def test_mistakes_are_summed_up(scan: np.ndarray) -> None:
 
 
 @pytest.mark.usefixtures("matplotlib")
-def test_mistakes_alone_are_drawn(scan: np.ndarray, tmp_path) -> None:
+def test_mistakes_alone_are_drawn(scan: np.ndarray, tmp_path: Path) -> None:
     right = some_mistakes(scan, found=(CAR, VAN))
     missed = some_mistakes(scan, found=(CAR,), missed=((VAN, 300),))
     false = some_mistakes(scan, found=(CAR, VAN), false=(replace(CAR, center=(40.0, -12.0, -1.0)),))
@@ -365,8 +367,6 @@ def test_mistakes_need_matplotlib(monkeypatch: pytest.MonkeyPatch, scan: np.ndar
         draw_mistakes([some_mistakes(scan)])
 
 
-# --- anything may be drawn -------------------------------------------------------------------------------------------
-
 wild = st.floats(allow_nan=True, allow_infinity=True) | st.sampled_from([0.0, -0.0, 1e30, -1e308, 1e-300, 5.0, 20.0])
 wild_boxes = st.builds(
     Box,
@@ -384,7 +384,7 @@ wild_points = st.lists(
 @pytest.mark.usefixtures("matplotlib")
 @settings(deadline=None, max_examples=10)
 @given(wild_points, st.lists(wild_boxes, max_size=8))
-def test_anything_is_drawn(tmp_path_factory, points: np.ndarray, boxes: list[Box]) -> None:
+def test_anything_is_drawn(tmp_path_factory: pytest.TempPathFactory, points: np.ndarray, boxes: list[Box]) -> None:
     folder = tmp_path_factory.mktemp("drawn")
     n = len(points)
     labels = PointLabels((np.arange(n) % 4).astype(np.uint8), np.ones(n, bool), POINT_CLASSES)
@@ -402,9 +402,6 @@ def test_boxes_reach_behind_the_camera(scan: np.ndarray, perception: Perception)
     long = Box("truck", 0.5, (0.0, 0.0, 0.0), (60.0, 3.0, 3.0), 0.0)
     picture = pixels(view.draw(replace(perception, boxes=(long,)), scan))
     assert near(picture[128:648, 560:], "truck").sum() > 200
-
-
-# --- text ------------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.usefixtures("matplotlib")
@@ -427,7 +424,7 @@ rectangles = st.tuples(st.floats(0, 950), st.floats(0, 550), st.floats(0.5, 300)
 
 @settings(deadline=None)
 @given(rectangles, st.lists(rectangles, max_size=12), st.floats(5, 120), st.floats(5, 20))
-def test_free_place_is_free(area, others, width: float, height: float) -> None:
+def test_free_place_is_free(area: Any, others: Any, width: float, height: float) -> None:
     half, taken = np.array([width, height]), np.array([area, *others])
     found = free_place(area, half, taken, (0.0, 0.0, 1000.0, 600.0))
     if found is None:
@@ -496,9 +493,6 @@ def test_pictures_are_drawn_on_the_ground_of_the_perception() -> None:
     assert ground_plane(unknown, points[:0]) == (-1.73, 0.0, 0.0)
 
 
-# --- the page in a browser -------------------------------------------------------------------------------------------
-
-
 def test_page_shows_and_hides(scan: np.ndarray, perception: Perception, browser: Any, tmp_path: Path) -> None:
     write_html(perception, scan, tmp_path / "page.html", title="a <b>scan</b>")
     wrong: list[str] = []
@@ -530,10 +524,7 @@ def test_page_shows_and_hides(scan: np.ndarray, perception: Perception, browser:
     assert not wrong
 
 
-# --- tracks ----------------------------------------------------------------------------------------------------------
-
-
-def test_tracks_lie_on_the_scan(scan: np.ndarray, perception: Perception, tmp_path) -> None:
+def test_tracks_lie_on_the_scan(scan: np.ndarray, perception: Perception, tmp_path: Path) -> None:
     image = pytest.importorskip("PIL.Image")
     tracker = Tracker()
     cars = [replace(CAR, center=(20.0 + 0.8 * k, 3.0, -0.9), yaw=0.0) for k in range(6)]

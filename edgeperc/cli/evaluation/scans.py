@@ -120,25 +120,24 @@ def eval_command(arguments: argparse.Namespace) -> int:
     if of_images:
         return _eval_images(arguments, of_images)
     from ...evaluation.evaluate import evaluate
+    from ...evaluation.judge import Perceiving
     from ...types.mounting import Mounting
 
+    rules = () if arguments.no_agreement else {*RULES} - {*arguments.without_rule}
     with progress() as show:
         figures, mistakes = evaluate(
             arguments.datasets,
             arguments.model or DEFAULT_MODELS,
+            Perceiving(arguments.provider, arguments.precision, arguments.boxes_from, frozenset(rules)),
             split=arguments.split,
             fold=arguments.fold,
             road_by=arguments.road_by,
-            boxes_from=arguments.boxes_from,
-            rules=() if arguments.no_agreement else {*RULES} - {*arguments.without_rule},
             mounted=None if arguments.mounted is None else Mounting(*arguments.mounted),
-            provider=arguments.provider,
-            precision=arguments.precision,
             engine=arguments.engine,
             workers=arguments.workers,
             on_scan=show,
         )
-    for line in _figure_lines(figures):
+    for line in figure_lines(figures):
         print_line(line, gray=FEW in line)
     write_figures(arguments, figures)
     if arguments.worst is not None:
@@ -223,7 +222,8 @@ _IMAGE_COLUMNS = (
 _BLOCKS = {"real": "real scans with boxes", "semantickitti": "SemanticKITTI", "simulated": "simulated scans"}
 
 
-def _figure_lines(figures: Mapping[str, Any]) -> list[str]:
+def figure_lines(figures: Mapping[str, Any]) -> list[str]:
+    """The tables of all blocks of figures."""
     models = ", ".join(f"{name} {version}" for name, version in figures["models"].items())
     fold = "" if figures["fold"] is None else f", fold {figures['fold']}"
     lines = [
@@ -237,10 +237,10 @@ def _figure_lines(figures: Mapping[str, Any]) -> list[str]:
             lines += [
                 *_labeled_lines(of_block),
                 *_point_lines(of_block),
-                *_box_lines(of_block),
+                *box_lines(of_block),
                 *box_table_lines(of_block),
             ]
-            lines += [*_error_lines(of_block), *_cell_lines(of_block), *_road_lines(of_block)]
+            lines += [*error_lines(of_block), *_cell_lines(of_block), *_road_lines(of_block)]
     return lines
 
 
@@ -277,7 +277,8 @@ def _point_lines(of_block: Mapping[str, Any]) -> list[str]:
     return lines
 
 
-def _box_lines(of_block: Mapping[str, Any]) -> list[str]:
+def box_lines(of_block: Mapping[str, Any]) -> list[str]:
+    """The tables of boxes."""
     lines = []
     for kind, of_kind in of_block.get("boxes", {}).items():
         means = {
@@ -299,7 +300,8 @@ def _box_lines(of_block: Mapping[str, Any]) -> list[str]:
     return lines
 
 
-def _error_lines(of_block: Mapping[str, Any]) -> list[str]:
+def error_lines(of_block: Mapping[str, Any]) -> list[str]:
+    """The table of the causes of errors."""
     rows = [
         ((error, _marked(cause, row)), row)
         for error, causes in of_block.get("errors", {}).items()
