@@ -17,6 +17,7 @@ BIN := .venv/bin
 TEST := .venv-test/bin
 MINIMAL := .venv-minimal/bin
 LOWEST := .venv-lowest/bin
+NEWEST := .venv-newest/bin
 ALONE := .venv-extra/bin
 
 # Of make fuzz: time for all kinds together, the kinds (all), the seed (the time; it is printed). Of make soak: scans.
@@ -27,7 +28,7 @@ SCANS ?= 20000
 # Of make test-extra.
 EXTRA ?= ros
 
-.PHONY: help demo test check test-full test-kernels test-wheel test-minimal test-lowest test-extra test-arm docs fuzz soak release sbom clean
+.PHONY: help demo test check test-full test-kernels test-wheel test-minimal test-lowest test-newest test-extra test-arm docs fuzz soak release sbom clean
 
 help:
 	@echo "make demo          perceive the bundled scene: a table, and a picture in demo/"
@@ -38,6 +39,7 @@ help:
 	@echo "make test-wheel    build the wheel, run the demo from it outside the checkout"
 	@echo "make test-minimal  pytest with nothing but the runtime: no torch, no onnx, no matplotlib"
 	@echo "make test-lowest   pytest with the lowest versions that pyproject.toml allows"
+	@echo "make test-newest  kernels and their cache with the newest numba and numpy, above the bound in pyproject.toml"
 	@echo "make test-extra    pytest with EXTRA=ros alone, or another extra"
 	@echo "make test-arm      edgeperc on aarch64 under qemu, compared with x86; skipped without qemu"
 	@echo "make docs          build the documentation into docs/_build/html; warnings are errors"
@@ -82,6 +84,14 @@ test-minimal: .venv-minimal/installed
 # An old matplotlib uses what newer packages below it deprecate.
 test-lowest: .venv-lowest/installed
 	$(LOWEST)/pytest -W ignore::DeprecationWarning -n $(JOBS) --dist worksteal
+
+# Green with a new numba: raise the bound.
+test-newest: pyproject.toml
+	$(call environment,.venv-newest)
+	$(NEWEST)/pip install --quiet --editable '.[cpu]' filelock hypothesis pytest pytest-xdist
+	$(NEWEST)/pip install --quiet --upgrade numba numpy
+	$(NEWEST)/pytest -n $(JOBS) --dist worksteal -m kernel
+	$(NEWEST)/pytest -n $(JOBS) --dist worksteal tests/system/test_kernel_cache.py tests/test_warm_up.py
 
 test-extra: pyproject.toml
 	$(call environment,.venv-extra)
@@ -140,5 +150,5 @@ define environment
 endef
 
 clean:
-	rm -rf .venv .venv-test .venv-minimal .venv-lowest .venv-extra build dist demo docs/_build docs/reference/generated *.egg-info .hypothesis .mypy_cache .pytest_cache .ruff_cache
+	rm -rf .venv .venv-test .venv-minimal .venv-lowest .venv-newest .venv-extra build dist demo docs/_build docs/reference/generated *.egg-info .hypothesis .mypy_cache .pytest_cache .ruff_cache
 	find bench edgeperc export models tests -name __pycache__ -type d -exec rm -rf {} +

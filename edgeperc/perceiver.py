@@ -535,6 +535,7 @@ class Perceiver:
             mounting=self._mounting,
             remission=profile.remission if self._renders else None,
             dropped=dropped,
+            ground=parts.ground,
         )
 
     def _without_ground(self, reason: MountingError) -> tuple[Finding, ...]:

@@ -28,7 +28,7 @@ from .system.lanes import Lanes, Once, Stopwatch
 from .types.frame import turned
 from .types.geometry import oriented_iou, rectangles, shared_area
 from .types.mounting import MODEL_HEIGHT_M, Mounting
-from .types.perception import Box, PointLabels, TopView
+from .types.perception import Box, GroundSurface, PointLabels, TopView
 from .types.sensor import SensorProfile
 from .types.views import RangeImageGeometry, TopViewGeometry
 
@@ -36,11 +36,12 @@ BoxesFrom = Literal["both", "network", "clusters"]
 
 
 class Parts(NamedTuple):
-    """The answer to a scan, in the frame of the models; None without such a network."""
+    """The answer to a scan, in the frame of the models; None without such a network, or where no ground is needed."""
 
     points: PointLabels | None
     top_view: TopView | None
     boxes: Sequence[Box]
+    ground: GroundSurface | None
 
 
 @dataclass(frozen=True)
@@ -173,10 +174,11 @@ class Pipeline:
 
         absent = value("check", _absent)
         near = value("project", self._select, points)
-        planes = scan = absent
+        planes = scan = surface = absent
         if self.needs_ground:
             planes = value("cluster", fit_ground, points, mount_height_m=MODEL_HEIGHT_M)
             scan = value("cluster", _on_ground, near, planes)
+            surface = value("cluster", GroundFit.surface, planes)
 
         # The top view (SSADNet)
         projected, boxes, cells = absent, value("check", tuple), absent
@@ -239,11 +241,11 @@ class Pipeline:
                 joined,
                 view,
             ],
-            [planes, boxes, *reversed(sectors), *aside, upright, marks, standing],
+            [planes, boxes, *reversed(sectors), *aside, surface, upright, marks, standing],
         )
         labeled = agreed()
         whole = None if labeled is None else spread([(labeled, near().rows)], len(points))
-        return Parts(whole, view(), standing())
+        return Parts(whole, view(), standing(), surface())
 
     def _select(self, points: NDArray[np.float32]) -> View:
         return View(*self.crop.select(points))

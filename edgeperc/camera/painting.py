@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import CalibrationError, ImageError, OptionError, PointsError
-from ..ground.planes import find_ground
+from ..ground.planes import fit_ground, heights_above
 from ..preprocess.returns import returns
 from ..system.kernel_cache import njit
 from ..types.frame import ModelFrame
@@ -38,7 +38,6 @@ SLACK_M, SLACK_SHARE = 0.5, 0.05  # a point up to this far behind may be of the 
 MAX_HALF_RAD = math.radians(1.5)  # 2.5 degrees for a VLP-16 would leave 86 % of what its camera sees, not 99 %
 # Windows are measured in cells of the depth buffer, which are so large that most windows reach 6 cells to each side.
 USUAL_CELLS, MAX_CELLS = 6, 24
-ABOVE_M = 100.0
 
 
 class Pixels(NamedTuple):
@@ -142,7 +141,8 @@ def camera_road(
 ) -> TopView:
     """Carry the road of an image to the top view, over the ground that the scan shows.
 
-    The center of each cell is projected into the image, at the height of the ground that `find_ground` finds there.
+    The center of each cell is projected into the image, at the height of the ground there: that of the perception, or
+    the one that `find_ground` finds.
 
     Parameters
     ----------
@@ -225,14 +225,18 @@ def _hidden_by(
         rows, _ = returns(scan, sensor, known.origin_m)
         frame = ModelFrame(known)
         moved = rows[:, :3].astype(np.float64) @ frame.R.T + frame.t
-        cells = np.empty((0 if places is None else len(places), 3))
+        above = moved.astype(np.float32)
+        is_its_scan = isinstance(image, Perception) and (image.n_points, image.mounting) == (len(points), known)
+        surface = image.ground if isinstance(image, Perception) and is_its_scan else None
+        if surface is None:
+            surface = fit_ground(above, mount_height_m=MODEL_HEIGHT_M).surface()
+        is_ground = heights_above(surface, above).mask
+        cells = np.zeros((0 if places is None else len(places), 3))
         if places is not None:
-            # They join the scan as points high above the ground, where they change nothing but get a height.
-            cells[:, :2], cells[:, 2] = places, ABOVE_M
-        ground = find_ground(np.concatenate([moved, cells]).astype(np.float32), mount_height_m=MODEL_HEIGHT_M)
-    cells[:, 2] -= ground.height_m[len(rows) :] if ground.plane is not None else np.nan
-    standing = read_only(rows[~ground.mask[: len(rows)]])
-    return rows, _nearest(standing, calibration, sensor), (cells - frame.t) @ frame.R
+            cells[:, :2] = places
+            is_known = surface.plane is not None
+            cells[:, 2] -= heights_above(surface, cells.astype(np.float32)).height_m if is_known else np.nan
+    return rows, _nearest(read_only(rows[~is_ground]), calibration, sensor), (cells - frame.t) @ frame.R
 
 
 def _labels_of(image: object, dtype: type, calibration: Calibration) -> NDArray[Any]:

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from ..errors import PointsError
 from ..system.draws import drawn_of, next_draw
 from ..system.kernel_cache import njit
+from ..types.perception import GroundSurface
 from ..types.points import read_only
 
 # 256 x 256 cells of half a meter, in 16 x 16 regions of 16 x 16 cells. Farther out, few rays meet the ground.
@@ -52,6 +53,8 @@ MAX_TESTED = 1024  # cells a hypothesis is tested on
 WINDOW = 2
 MAX_STEP_M = 0.3
 MAX_DEPTH_M = 0.5  # deeper points are reflections
+
+FAR_ABOVE_M = 1e6  # a return so far above the ground says nothing of it
 
 BLOCK = 256  # points: their intermediate values fit into the first-level cache
 EMPTY = np.int64(0x7FFF_FFFF << 32)
@@ -172,20 +175,60 @@ class GroundFit:
         else:
             fill_heights_above_plane(self.points, wanted, self.plane, max_height_m, height, mask)
             mask &= self.found
+        return Ground(mask, height, self._plane if self.found else None)
+
+    @property
+    def _plane(self) -> tuple[float, float, float]:
         a, b, c = self.plane.tolist()
-        return Ground(mask, height, (a, b, c) if self.found else None)
+        return a, b, c
+
+    def surface(self) -> GroundSurface:
+        """The ground without the scan: 0.2 MB in place of 3 MB."""
+        cells = np.flatnonzero(self.lowest.reshape(-1) >= 0).astype(np.int32)
+        lowest = self.points[self.lowest.reshape(-1)[cells]]
+        return GroundSurface(self._plane if self.found else None, self._plane, self.planes, cells, lowest)
+
+
+def heights_above(ground: GroundSurface, points: NDArray[np.float32], *, max_height_m: float = 0.125) -> Ground:
+    """Heights of any points above the ground that a scan showed.
+
+    Parameters
+    ----------
+    ground : GroundSurface
+        `edgeperc.Perception.ground`.
+    points : (n, 3 or more) float32
+        x, y, z [m] in the frame of the models (`edgeperc.ModelFrame`). For the scan's own points, the heights are those
+        of `find_ground`.
+    max_height_m : float
+        As in `find_ground`.
+
+    Returns
+    -------
+    Ground
+
+    Raises
+    ------
+    PointsError
+        As `find_ground`.
+    """
+    fit = _sorted_into_cells(points)
+    n, k = len(fit.points), len(ground.lowest)
+    # In a cell that only these points are in, the ground follows the planes, as below a return far above it.
+    far_above = np.array([[0.0, 0.0, FAR_ABOVE_M, 0.0]], np.float32)
+    lowest = np.where(fit.lowest.reshape(-1) >= 0, np.int32(n + k), np.int32(-1))
+    lowest[ground.cells] = np.arange(n, n + k, dtype=np.int32)
+    rows = np.arange(n, dtype=np.int32)
+    scan = np.concatenate([fit.points, ground.lowest, far_above])
+    plane, found = np.array(ground.expected), ground.plane is not None
+    whole = GroundFit(scan, fit.cell, lowest.reshape(N_CELLS, N_CELLS), plane, ground.planes, found)
+    return whole.heights(rows, max_height_m=max_height_m)
 
 
 def fit_ground(points: NDArray[np.float32], *, mount_height_m: float = 1.73, regions: bool = True) -> GroundFit:
     """Fit the planes of the ground; parameters and errors as in `find_ground`."""
-    if points.ndim != 2 or points.shape[1] < 3:
-        raise PointsError(f"got points of shape {points.shape}; expected (n, 4): x, y, z, remission")
     if not 0.0 < mount_height_m < math.inf:
         raise PointsError(f"got mount_height_m={mount_height_m}; expected meters above 0")
-    scan = read_only(points if points.shape[1] == 4 else np.pad(points[:, :3], ((0, 0), (0, 1))))
-    cell = np.empty(len(scan), np.int32)
-    lowest = np.empty((N_CELLS, N_CELLS), np.int32)
-    fill_lowest(scan, cell, lowest)
+    scan, cell, lowest = _sorted_into_cells(points)
     plane = np.array([0.0, 0.0, -mount_height_m])
     found = fit_first_plane(scan, lowest, FIRST_REACH_M, plane)
     planes = None
@@ -193,6 +236,23 @@ def fit_ground(points: NDArray[np.float32], *, mount_height_m: float = 1.73, reg
         planes = np.empty((N_REGIONS, N_REGIONS, 3))
         fill_planes(scan, lowest, plane, planes)
     return GroundFit(scan, cell, lowest, plane, planes, found)
+
+
+class Sorted(NamedTuple):
+    """A scan, the cell of each of its points, and the row of the lowest point in each cell."""
+
+    points: NDArray[np.float32]
+    cell: NDArray[np.int32]
+    lowest: NDArray[np.int32]
+
+
+def _sorted_into_cells(points: NDArray[np.float32]) -> Sorted:
+    if points.ndim != 2 or points.shape[1] < 3:
+        raise PointsError(f"got points of shape {points.shape}; expected (n, 4): x, y, z, remission")
+    scan = read_only(points if points.shape[1] == 4 else np.pad(points[:, :3], ((0, 0), (0, 1))))
+    found = Sorted(scan, np.empty(len(scan), np.int32), np.empty((N_CELLS, N_CELLS), np.int32))
+    fill_lowest(*found)
+    return found
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

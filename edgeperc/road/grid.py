@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..errors import CardError, OptionError, PointsError
 from ..ground.observed import OVERHEAD_M, Observer
-from ..ground.planes import find_ground
+from ..ground.planes import find_ground, heights_above
 from ..preprocess.returns import returns
 from ..system.atomic import write_atomic
 from ..system.kernel_cache import njit
@@ -217,7 +217,7 @@ def occupancy_grid(
 
     Notes
     -----
-    The heights are above the ground that `find_ground` finds. Returns more than 2 m above it, such as those of a tree's
+    The heights are above the ground that was perceived. Returns more than 2 m above it, such as those of a tree's
     crown, are no obstacles. Returns and rays decide what is unknown, not the network's labels.
 
     Its kernel is compiled in the first call, not when a `Perceiver` is made; later processes load it from the cache.
@@ -246,7 +246,10 @@ def occupancy_grid(
     profile = get_sensor(sensor)
     frame = ModelFrame(perception.mounting)
     moved = read_only(frame.move(returns(rows, profile, perception.mounting.origin_m)[0]))
-    ground = find_ground(moved, mount_height_m=MODEL_HEIGHT_M)
+    if perception.ground is None:
+        ground = find_ground(moved, mount_height_m=MODEL_HEIGHT_M)
+    else:
+        ground = heights_above(perception.ground, moved)
 
     shape = (view.height, view.width)
     highest, tallest = np.empty(shape, np.int32), np.empty(shape, np.float32)

@@ -215,6 +215,33 @@ class ImageLabels:
         }
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class GroundSurface:
+    """The ground that a scan showed, in the frame of the models (KUL-Seg 5.2).
+
+    `edgeperc.ground.planes.heights_above` gives the height of any points above it.
+
+    Attributes
+    ----------
+    plane : tuple of 3 float, or None
+        a, b, c of z = a x + b y + c [m] around the vehicle. None if the scan showed no ground.
+    expected : tuple of 3 float
+        The same, or the level plane at the mounting height.
+    planes : (16, 16, 3) float64, or None
+        Slopes along x and y, and height in the middle [m], of each region of 8 m; None without ground.
+    cells : (k,) int32
+        Cells of 0.5 m with a return: row of x times 256 plus row of y.
+    lowest : (k, 4) float32
+        The lowest return of each: x, y, z [m], remission.
+    """
+
+    plane: tuple[float, float, float] | None
+    expected: tuple[float, float, float]
+    planes: NDArray[np.float64] | None
+    cells: NDArray[np.int32]
+    lowest: NDArray[np.float32]
+
+
 @dataclass(frozen=True, slots=True)
 class DroppedPoints:
     """Number of input points that are not returns of the world, by kind. Each counts once, as the first of its kinds.
@@ -275,6 +302,8 @@ class Perception:
         From a camera model; None without one.
     dropped : DroppedPoints
         ``n_dropped`` by kind.
+    ground : GroundSurface or None
+        The ground under the scan; None if no stage needed it, or without a scan.
     """
 
     n_points: int
@@ -290,6 +319,7 @@ class Perception:
     remission: RemissionFunction | None = None
     image: ImageLabels | None = None
     dropped: DroppedPoints = DroppedPoints()
+    ground: GroundSurface | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """Convert to a dict for JSON, with the number of points of each class in place of their labels.

@@ -12,9 +12,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..camera.image import as_image
 from ..errors import ImageError, PointsError
+from ..ground.planes import fit_ground
 from ..system.printable import printable
 from ..types.frame import ModelFrame
-from ..types.mounting import MODEL_MOUNTING
+from ..types.mounting import MODEL_HEIGHT_M, MODEL_MOUNTING
 from ..types.perception import Box, ImageLabels, Perception
 from .colors import CLASS_COLORS
 
@@ -109,27 +110,14 @@ def paint_points(points: NDArray[np.float32], perception: Perception) -> tuple[l
     return names, painted
 
 
-def fit_ground(points: NDArray[np.float32], names: list[str], painted: NDArray[np.uint8]) -> tuple[float, float, float]:
-    """Fit the ground plane that a picture is drawn on: z = a + b x + c y [m].
+def ground_plane(perception: Perception, points: NDArray[np.float32]) -> tuple[float, float, float]:
+    """The plane that a picture is drawn on: z = a + b x + c y [m], in the frame of the models.
 
-    points : (n, 4) float32; only those of `drawable_points`.
-    painted : (n,) uint8; as in `paint_points`.
-    Returns a, b, c: A plane through the drivable points; a level plane if there are fewer than 50 of them.
+    points : (n, 4) float32; the scan, in that frame, for a perception without ground.
     """
-    if "drivable" in names:
-        road = points[painted == names.index("drivable"), :3].astype(np.float64)
-        if len(road) >= 50:
-            level = float(np.median(road[:, 2])), 0.0, 0.0
-            # The second fit leaves out the outliers of the first.
-            for _ in range(2):
-                if len(road) < 50 or road[:, :2].std(axis=0).min() < 1.0:
-                    return level
-                known = np.column_stack([np.ones(len(road)), road[:, :2]])
-                plane = np.linalg.lstsq(known, road[:, 2], rcond=None)[0]
-                road = road[np.abs(known @ plane - road[:, 2]) < 0.3]
-            return (float(plane[0]), float(plane[1]), float(plane[2])) if np.abs(plane[1:]).max() < 0.2 else level
-    near = np.hypot(points[:, 0], points[:, 1]) < 30.0
-    return (float(np.percentile(points[near, 2], 15.0)) if near.any() else -1.73), 0.0, 0.0
+    ground = perception.ground or fit_ground(points, mount_height_m=MODEL_HEIGHT_M).surface()
+    slope_x, slope_y, level = ground.expected
+    return level, slope_x, slope_y
 
 
 def box_corners(box: Box) -> NDArray[np.float64]:

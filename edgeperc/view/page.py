@@ -28,7 +28,7 @@ from .content import (
     class_facts,
     drawable_boxes,
     drawable_points,
-    fit_ground,
+    ground_plane,
     in_model_frame,
     paint_points,
     provider_lines,
@@ -245,7 +245,7 @@ def _scan(
     # Some sensors give remission up to 255 or 65535.
     remission = np.maximum(points[:, 3], 0.0) / max(1.0, float(points[:, 3].max(initial=0.0)))
     scan: dict[str, Any] = {
-        "ground": [round(value, 5) for value in fit_ground(points, names, painted)],
+        "ground": [round(value, 5) for value in ground_plane(perception, points)],
         "road": None if perception.top_view is None else _road(perception.top_view),
         "boxes": [
             {

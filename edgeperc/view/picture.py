@@ -34,7 +34,7 @@ from .content import (
     class_facts,
     drawable_boxes,
     drawable_points,
-    fit_ground,
+    ground_plane,
     in_model_frame,
     paint_points,
     perceived_image,
@@ -85,7 +85,7 @@ def draw(
     names, painted = paint_points(points, perception)
     seen = drawable_points(points)
     points, painted = points[seen], painted[seen]
-    ground = fit_ground(points, names, painted)
+    ground = ground_plane(perception, points)
     boxes = drawable_boxes(perception.boxes)
     top_view = perception.top_view
     road = None if top_view is None else road_ahead(top_view, boxes)

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import TrackingError
+from ..ground.planes import find_ground, heights_above
 from ..system.atomic import write_atomic
 from ..system.clock import elapsed_s
 from ..system.extras import require
@@ -21,7 +22,7 @@ from ..types.frame import ModelFrame
 from ..types.perception import Perception
 from .canvas import free_place
 from .colors import CLASS_COLORS, FAINT, FRAME, GROUND, HIGH, INK, LOW, PANEL, color_of, rgb
-from .content import drawable_boxes, drawable_points, fit_ground, paint_points
+from .content import drawable_boxes, drawable_points, paint_points
 
 if TYPE_CHECKING:
     from ..tracking.tracks import Track, Tracks
@@ -70,9 +71,8 @@ def flatten_scan(points: NDArray[np.float32], perception: Perception | None = No
             image[inside] = _ROAD * view.drivable[row[inside].astype(np.intp), col[inside].astype(np.intp)]
     seen = drawable_points(points)
     points, painted = points[seen], painted[seen]
-    a, b, c = fit_ground(points, names, painted)
-    x, y, z = points[:, :3].astype(np.float64).T
-    level = np.clip(np.floor((z - a - b * x - c * y) / 1.2 + 0.75), 0, 2)
+    x, y = points[:, :2].astype(np.float64).T
+    level = np.clip(np.floor(_heights(points, perception) / 1.2 + 0.75), 0, 2)
     order = [*CLASS_COLORS]
     as_pixel = np.array([_CLASS + order.index(name) if name in order else _OTHER for name in names], np.uint8)
     value = np.where(painted == 0, _POINT + level.astype(np.uint8), as_pixel[painted])
@@ -83,6 +83,14 @@ def flatten_scan(points: NDArray[np.float32], perception: Perception | None = No
     shown = shown[np.argsort(value[shown], kind="stable")]  # classes over the background
     image[row[shown].astype(np.intp), col[shown].astype(np.intp)] = value[shown]
     return zlib.compress(image.tobytes(), 1)
+
+
+def _heights(points: NDArray[np.float32], perception: Perception | None) -> NDArray[np.float32]:
+    """Heights above the ground [m]."""
+    if perception is None:
+        return find_ground(points).height_m
+    moved = ModelFrame(perception.mounting).move(points)
+    return (find_ground(moved) if perception.ground is None else heights_above(perception.ground, moved)).height_m
 
 
 def draw_tracks(

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 import twins.planes
 from edgeperc.errors import PointsError
-from edgeperc.ground.planes import find_ground
+from edgeperc.ground.planes import find_ground, fit_ground, heights_above
 from edgeperc.simulation.drawn import random_scene
 from edgeperc.simulation.samples import simulated_scan
 from edgeperc.simulation.scene import simulate
@@ -177,6 +177,33 @@ def test_heights_of_some_points_are_those_of_all(regions: bool) -> None:
     none = find_ground(points, regions=regions, rows=rows[:0])
     assert none.plane == every.plane
     assert none.mask.shape == none.height_m.shape == (0,)
+
+
+@pytest.mark.parametrize("mount", [1.73, 4.0])  # the second is so wrong that no ground is found
+@pytest.mark.parametrize("regions", [True, False])
+def test_the_surface_gives_the_heights_of_the_scan(mount: float, regions: bool) -> None:
+    points, _ = street(np.random.default_rng(7), n=3000, kerb=0.15, reach=80.0)
+    points[:5, 2] = np.nan
+    fit = fit_ground(points, mount_height_m=mount, regions=regions)
+    found, whole = heights_above(fit.surface(), points), fit.heights()
+    np.testing.assert_array_equal(found.height_m, whole.height_m)
+    np.testing.assert_array_equal(found.mask, whole.mask)
+    assert found.plane == whole.plane
+
+
+@settings(max_examples=30)
+@given(st.integers(0, 2**32 - 1), st.integers(0, 40), st.integers(0, 300))
+def test_other_points_are_as_high_as_in_the_scan(seed: int, n: int, n_scan: int) -> None:
+    """Far above the ground, they would change nothing in the scan; any z only shifts their height."""
+    rng = np.random.default_rng(seed)
+    points, _ = street(rng, n=n_scan)
+    others = np.concatenate([rng.uniform(-90.0, 90.0, (n, 2)), np.full((n, 1), 200.0)], axis=1).astype(np.float32)
+    both = np.concatenate([points[:, :3], others])
+    expected = find_ground(both).height_m[n_scan:]
+    surface = fit_ground(points).surface()
+    np.testing.assert_array_equal(heights_above(surface, others).height_m, expected)
+    lower = others - np.float32([0.0, 0.0, 201.5])
+    np.testing.assert_allclose(heights_above(surface, lower).height_m, expected - 201.5, atol=1e-4)
 
 
 def test_ground_of_a_simulated_street() -> None:

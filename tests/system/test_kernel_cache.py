@@ -32,6 +32,7 @@ from numba.core.compiler import CompileResult
 from numba.core.dispatcher import Dispatcher
 
 import edgeperc
+from checkout import REPOSITORY
 from edgeperc.system import kernel_cache, kernel_stamp, machine
 from edgeperc.system.kernel_cache import KernelCache
 from edgeperc.system.machine import unsafe_because
@@ -660,6 +661,14 @@ def test_the_internals_of_numba_that_are_used_exist() -> None:
     (result,) = kernel.overloads.values()
     assert isinstance(result.codegen._engine._defined_symbols, set)
     assert hasattr(result.library, "_shared_module")
+
+
+def test_the_bound_of_numba_is_stated_once_and_holds() -> None:
+    """`make test-newest` tests the versions above it."""
+    (bound,) = re.findall(r'"numba>=[\d.]+,<(\d+\.\d+)"', (REPOSITORY / "pyproject.toml").read_text("utf-8"))
+    assert f",<{bound}\n" in (REPOSITORY / "recipe" / "recipe.yaml").read_text("utf-8")
+    version = [int(part) for part in numba.__version__.split(".")[:2]]
+    assert version < [int(part) for part in bound.split(".")]
 
 
 def test_every_kernel_of_edgeperc_is_kept_here() -> None:

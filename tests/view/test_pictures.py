@@ -20,11 +20,12 @@ from hypothesis import strategies as st
 from edgeperc import Tracker, view
 from edgeperc.errors import MissingExtraError, PointsError, TrackingError
 from edgeperc.evaluation.mistakes import Mistakes, draw_mistakes
+from edgeperc.ground.planes import fit_ground
 from edgeperc.types.perception import Box, Perception, PointLabels, TopView
 from edgeperc.view import draw_tracks, flatten_scan, write_html, write_labels, write_ply
 from edgeperc.view.canvas import Label, add_axes, free_place, new_figure, place_labels, shorten, wrap
 from edgeperc.view.colors import CLASS_COLORS, FALSE, FOUND, MISSED
-from edgeperc.view.content import fit_ground, paint_points
+from edgeperc.view.content import ground_plane, paint_points
 
 POINT_CLASSES = ("background", "car", "pedestrian", "cyclist")
 TOP_CLASSES = ("background", "drivable", "car", "van", "truck")
@@ -481,17 +482,15 @@ def test_classes_differ_for_color_blind_readers() -> None:
             assert np.linalg.norm(one - other) > 20.0, (who, a, b)
 
 
-def test_ground_is_a_plane_through_the_road() -> None:
+def test_pictures_are_drawn_on_the_ground_of_the_perception() -> None:
     rng = np.random.default_rng(0)
-    xy = rng.uniform((5.0, -8.0), (45.0, 8.0), (500, 2))
-    z = -1.7 + 0.03 * xy[:, 0] - 0.01 * xy[:, 1]
-    z[:40] += 1.5  # what stands on it
-    points = np.column_stack([xy, z, np.zeros(500)]).astype(np.float32)
-    names, painted = ["background", "drivable"], np.ones(500, np.uint8)
-    assert fit_ground(points, names, painted) == pytest.approx((-1.7, 0.03, -0.01), abs=0.01)
-    same = np.repeat(points[100:101], 60, axis=0)
-    assert fit_ground(same, names, painted[:60]) == pytest.approx((float(z[100]), 0.0, 0.0), abs=1e-5)
-    assert fit_ground(points[:0], names, painted[:0]) == (-1.73, 0.0, 0.0)
+    xy = rng.uniform((-15.0, -15.0), (15.0, 15.0), (3000, 2))
+    points = np.column_stack([xy, -1.7 + 0.03 * xy[:, 0] - 0.01 * xy[:, 1], np.zeros(3000)]).astype(np.float32)
+    seen = Perception(3000, 0, None, None, (), {}, {}, (), None, ground=fit_ground(points).surface())
+    assert ground_plane(seen, points[:0]) == pytest.approx((-1.7, 0.03, -0.01), abs=0.01)
+    unknown = replace(seen, ground=None)
+    assert ground_plane(unknown, points) == ground_plane(seen, points)
+    assert ground_plane(unknown, points[:0]) == (-1.73, 0.0, 0.0)
 
 
 def test_page_shows_and_hides(scan: np.ndarray, perception: Perception, browser: Any, tmp_path: Path) -> None:
