@@ -6,6 +6,7 @@ import gc
 import json
 import multiprocessing
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -26,30 +27,45 @@ MOST_COMPILATIONS = 150
 
 pytestmark = pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason="nothing is compiled with the JIT off")
 
-FIRST = """
+# What is compiled, and what is counted for the line on the terminal.
+NOTED = """
+from numba.core import event
+from edgeperc import Perceiver, perceiver, warm_up
+from edgeperc.system import compilation
+
+def name_of(kernel):
+    return f"{kernel.py_func.__module__}.{kernel.py_func.__name__}"
+
+class Compilations(event.Listener):
+    def __init__(self):
+        self.names = []
+    def on_start(self, found):
+        self.names.append(name_of(found.data["dispatcher"]))
+    def on_end(self, found):
+        pass
+
+def noted(needs, of=compilation.kernels_of):
+    needs = [*needs]
+    called.update(f"edgeperc.{name}" for need in needs for name in compilation.KERNELS[need].split())
+    counted.update(name_of(kernel) for kernel in of(needs))
+    return of(needs)
+
+called, counted, compilations = set(), set(), Compilations()
+perceiver.kernels_of = noted
+event.register("numba:compile", compilations)
+"""
+
+FIRST = f"""
 import sys
 with open(sys.argv[1] + "/begun", "a") as begun:
     begun.write("this module was run\\n")
 
 import hashlib, json
 import numpy as np
-from numba.core import event
-from edgeperc import Perceiver, warm_up
-
+{NOTED}
 warm_up.usable_cores = lambda: int(sys.argv[2])
 warm_up.MIN_WAIT_S = 600.0  # however busy this computer is
 
-class Compilations(event.Listener):
-    def __init__(self):
-        self.names = []
-    def on_start(self, found):
-        function = found.data["dispatcher"].py_func
-        self.names.append(f"{function.__module__}.{function.__name__}")
-    def on_end(self, found):
-        pass
-
-compilations = Compilations()
-event.register("numba:compile", compilations)
 perceive = Perceiver(provider="cpu", n_threads=1, on_mismatch="warn")
 constructed = list(compilations.names)
 turn, down = np.meshgrid(np.linspace(-np.pi, np.pi, 600, endpoint=False), np.radians(np.linspace(1.2, 24.9, 40)))
@@ -57,12 +73,21 @@ radius = 1.73 / np.tan(down)
 columns = radius * np.cos(turn), radius * np.sin(turn), np.full_like(turn, -1.73), 0.3 + 0.1 * np.sin(turn)
 found = perceive(np.stack(columns, -1).reshape(-1, 4))
 answer = hashlib.sha256(found.points.labels.tobytes() + found.top_view.labels.tobytes() + repr(found.boxes).encode())
-print(json.dumps([constructed, compilations.names[len(constructed):], answer.hexdigest()]))
+print(json.dumps([constructed, compilations.names[len(constructed):], answer.hexdigest(), sorted(counted)]))
+"""
+LATER = f"""
+import json, sys
+{NOTED}
+warm_up.usable_cores = lambda: 1
+Perceiver(provider="cpu", n_threads=1, **json.loads(sys.argv[1]))
+used = {{name_of(kernel) for kernel in compilation.kernels_of(compilation.KERNELS) if kernel.signatures}}
+used |= {{name for name in compilations.names if name.startswith("edgeperc.")}}
+print(json.dumps([sorted(called), sorted(used), sorted(counted)]))
 """
 
 
-def start(folder: Path, n_cores: int) -> tuple[list[str], list[str], str]:
-    """What a process compiled when it constructed a perceiver, what it compiled in a call, and the call's result."""
+def start(folder: Path, n_cores: int) -> tuple[list[str], list[str], str, list[str]]:
+    """What a process compiled for a perceiver, what for a call, the call's result, and which kernels it counted."""
     folder.mkdir(exist_ok=True)
     (folder / "main.py").write_text(FIRST)
     environment = os.environ | {"NUMBA_CACHE_DIR": str(folder / "cache"), "EDGEPERC_CACHE_DIR": str(folder / "user")}
@@ -70,31 +95,63 @@ def start(folder: Path, n_cores: int) -> tuple[list[str], list[str], str]:
     done = subprocess.run(command, capture_output=True, text=True, env=environment)
     assert done.returncode == 0, done.stderr
     assert not done.stderr
-    constructed, called, answer = json.loads(done.stdout)
-    return constructed, called, answer
+    return tuple(json.loads(done.stdout))
 
 
 def kernels(folder: Path) -> set[str]:
     return {file.name for file in (folder / "cache").rglob("*.kernel")}
 
 
-def test_helpers_fill_the_same_cache_and_change_no_result(cold: None, tmp_path: Path) -> None:
-    alone, called, answer = start(tmp_path / "alone", 1)
+@pytest.fixture(scope="module")
+def first(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, tuple[list[str], list[str], str, list[str]]]:
+    """The folder of a first start without helpers, which takes long, and what it said."""
+    folder = tmp_path_factory.mktemp("first") / "alone"
+    return folder, start(folder, 1)
+
+
+def test_what_is_counted_is_what_is_compiled(first: tuple[Path, Any]) -> None:
+    compiled, _, _, counted = first[1]
+    assert sorted({name for name in compiled if name.startswith("edgeperc.")}) == counted
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        pytest.param({"models": "lodnn", "on_mismatch": "ignore"}, id="road"),
+        pytest.param({"boxes_from": "network", "full_turn": True}, id="full turn"),
+        pytest.param({"models": "pointseg", "sensor": "vlp-16", "agree": False}, id="coarse sensor"),
+    ],
+)
+def test_what_is_counted_is_what_is_used(first: tuple[Path, Any], options: dict[str, Any], tmp_path: Path) -> None:
+    """Every kernel that Python is said to call is called, and no other; what is loaded hides the kernels it calls."""
+    shutil.copytree(first[0] / "cache", tmp_path / "cache")
+    for file in (tmp_path / "cache").rglob("*.fill_returns-*"):
+        file.unlink()  # nothing is counted as long as nothing is missing
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "cache")}
+    command = [sys.executable, "-W", "ignore", "-c", LATER, json.dumps(options)]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (0, "")
+    called, used, counted = map(set, json.loads(done.stdout))
+    assert called <= used <= counted
+
+
+def test_helpers_fill_the_same_cache_and_change_no_result(cold: None, first: tuple[Path, Any], tmp_path: Path) -> None:
+    folder, (alone, called, answer, _) = first
     assert called == []
     # Each takes 0.03 s at least. More than these are a sign of kernels that are compiled for several types.
     assert len(alone) <= MOST_COMPILATIONS
     own = [name for name in alone if name.startswith("edgeperc.")]
     assert len(own) == len(set(own)), "a kernel is compiled for more than one set of types"
-    helped, called, same_answer = start(tmp_path / "helped", 2)
+    helped, called, same_answer, _ = start(tmp_path / "helped", 2)
     assert (called, same_answer) == ([], answer)
-    assert kernels(tmp_path / "helped") == kernels(tmp_path / "alone")
-    assert len(kernels(tmp_path / "alone")) == len(own)
+    assert kernels(tmp_path / "helped") == kernels(folder)
+    assert len(kernels(folder)) == len(own)
     own = {f"{part.largest.py_func.__module__}.{part.largest.py_func.__name__}": name for name, part in PARTS.items()}
     # Both may begin with the ground at once.
     assert {own[name] for name in helped if name in own} - {"ground"} == set(Helpers([*PARTS]).own_parts) - {"ground"}
     assert (tmp_path / "helped" / "begun").read_text().count("\n") == 1, "a helper ran the caller's main module"
     assert not [*tmp_path.rglob("*.part")]
-    assert start(tmp_path / "helped", 2) == ([], [], answer)
+    assert start(tmp_path / "helped", 2)[:3] == ([], [], answer)
 
 
 @pytest.fixture

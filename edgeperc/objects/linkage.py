@@ -364,6 +364,7 @@ def grow(strips: Strips, votes: NDArray[np.uint8], search: Search, first: int, c
 
 @njit(cache=True, nogil=True)
 def n_points(part: np.void) -> int:
+    """Number of points of a part."""
     return part["stop"] - part["first"]
 
 

@@ -3,12 +3,8 @@
 from __future__ import annotations
 
 import io
-import json
 import logging
-import os
 import re
-import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -177,49 +173,3 @@ def test_kernels_that_are_needed_exist_and_are_missing_from_an_empty_cache(
     (folder / f"{cache.name}-0123456789abcdef.kernel").write_bytes(bytes(32) + cache.stamp())
     (folder / f"{kernels[5]._cache.name}-0123456789abcdef.kernel").write_bytes(bytes(64))
     assert missing(kernels) == [*kernels[:3], *kernels[4:]]
-
-
-COUNT = """
-import json, sys
-from numba.core import event
-from edgeperc import Perceiver, perceiver, warm_up
-from edgeperc.system import compilation
-
-warm_up.usable_cores = lambda: 1
-names, needed = set(), []
-
-class Compilations(event.Listener):
-    def on_start(self, found):
-        function = found.data["dispatcher"].py_func
-        names.add(f"{function.__module__}.{function.__name__}")
-    def on_end(self, found):
-        pass
-
-def noted(needs, of=compilation.kernels_of):
-    found = of(needs)
-    needed[:] = [f"{each.py_func.__module__}.{each.py_func.__name__}" for each in found]
-    return found
-
-perceiver.kernels_of = noted
-event.register("numba:compile", Compilations())
-Perceiver(provider="cpu", n_threads=1, **json.loads(sys.argv[1]))
-print(json.dumps([sorted(name for name in names if name.startswith("edgeperc.")), sorted(needed)]))
-"""
-
-
-@pytest.mark.parametrize(
-    "options",
-    [
-        pytest.param({}, id="both"),
-        pytest.param({"models": "lodnn", "on_mismatch": "ignore"}, id="road"),
-        pytest.param({"boxes_from": "network", "full_turn": True}, id="full turn"),
-        pytest.param({"models": "pointseg", "sensor": "vlp-16", "agree": False}, id="coarse sensor"),
-    ],
-)
-def test_what_is_counted_is_what_is_compiled(options: dict[str, Any], tmp_path: Path) -> None:
-    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
-    command = [sys.executable, "-W", "ignore", "-c", COUNT, json.dumps(options)]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True)
-    assert (done.returncode, done.stderr) == (0, "")
-    compiled, needed = json.loads(done.stdout)
-    assert compiled == needed
