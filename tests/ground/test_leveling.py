@@ -149,7 +149,7 @@ def test_profiles_keep_their_mounting() -> None:
     with pytest.raises(SensorError, match="height_m"):
         SensorProfile.from_json(json.dumps(broken))
     broken["mounting"] = {"height_m": 1.0}
-    with pytest.raises(SensorError, match="exactly"):
+    with pytest.raises(SensorError, match="mounting lacks origin_m"):
         SensorProfile.from_json(json.dumps(broken))
 
 
