@@ -365,8 +365,17 @@ def _add_quantize(commands: Commands) -> None:
 
 
 def _quantize(args: argparse.Namespace) -> int:
+    from edgeperc.types.card import ModelCard
+
     from .release.quantize import LabeledSets, calibration_images, calibration_scans, quantize
 
+    if ModelCard.read(args.model).view.kind == "objects":
+        from .release.object_int8 import quantize_objects
+
+        calibration = calibration_scans(args.scans, kitti=args.kitti, n_simulated=args.simulated)
+        card = quantize_objects(args.model, args.out, calibration, seven_bits=args.seven_bits, n_threads=args.threads)
+        print_line(f"{args.out}: {card.name} {card.version}: {card.parity['speed']}")
+        return 0
     if args.camvid is not None:
         calibration = calibration_images(args.camvid)
     else:
