@@ -568,7 +568,7 @@ def _add_triton(commands: Commands) -> None:
         "--model",
         action="append",
         metavar="MODEL",
-        help="name or file of a network of scans; may be repeated (default: ssadnet and pointseg)",
+        help="name or file of a network of scans; may be repeated (default: ssadnet, pointseg and objects)",
     )
     triton.add_argument("--sensor", default="hdl-64e", help="sensor of the scans (default hdl-64e)")
     triton.set_defaults(run=_triton)

@@ -21,7 +21,7 @@ from edgeperc import warm_up
 from edgeperc.system.kernel_cache import RARE, fewer_collections
 from edgeperc.warm_up import PARTS, Helpers
 
-MOST_COMPILATIONS = 190
+MOST_COMPILATIONS = 150
 
 pytestmark = pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason="nothing is compiled with the JIT off")
 

@@ -121,8 +121,8 @@ def compare(
             **{adaptation: _row(confusion) for adaptation, confusion in counts.items()},
         }
         if folder is not None:
-            top_view, _, objects = DEFAULT
-            judge = Judge([top_view, model, objects], provider=provider, precision=precision, sensor=sensor)
+            top_view, _, of_objects = DEFAULT
+            judge = Judge([top_view, model, of_objects], provider=provider, precision=precision, sensor=sensor)
             records = []
             for frame in _frames(folder):
                 records.append(judge.record_boxes(frame))

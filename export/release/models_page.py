@@ -94,7 +94,7 @@ def _size(variant: Variant) -> str:
 def _shipped(variants: Sequence[Variant]) -> Iterable[str]:
     yield from _prose(
         "A name stands for one network and its variants. `Perceiver()` and `edgeperc run PATH` take "
-        f"{' and '.join(f'`{name}`' for name in DEFAULT)}. `NAME:fp32` and `NAME:int8` ask for one variant."
+        f"{', '.join(f'`{name}`' for name in DEFAULT)}. `NAME:fp32` and `NAME:int8` ask for one variant."
     )
     yield from _head("name", ["task", "classes", "view", "files", "terms of the weights"])
     for name in dict.fromkeys(variant.name for variant in variants):

@@ -65,11 +65,28 @@ def quantize_objects(
         write_card(model, card, trial)
         share = f"{len(ROUNDED)} products in int8, {len(batches[0])} candidates"
         speed = speed_of(path, share, _race(path, trial, batches, n_threads))
-        card = replace(card, parity={"speed": f"{speed}, {len(batches[0])} candidates"})
+        parity = {
+            "n_scans": len(calibration.scans),
+            "label_agreement": _agreement(path, trial, batches, len(card.classes)),
+            "speed": f"{speed}, {len(batches[0])} candidates",
+        }
+        card = replace(card, parity=parity)
         write_card(model, card, out)
     finally:
         trial.unlink(missing_ok=True)
     return card
+
+
+def _agreement(one: Path, other: Path, batches: Sequence[NDArray[np.float32]], n_classes: int) -> float:
+    """Share of the candidates to which two networks give the same class."""
+    classes = []
+    for session in (Session(path, "cpu") for path in (one, other)):
+        found = []
+        for batch in batches:
+            session.input[: len(batch)] = batch
+            found.append(session.run(len(batch))["objects"][: len(batch), :n_classes].argmax(axis=1))
+        classes.append(np.concatenate(found))
+    return float((classes[0] == classes[1]).mean())
 
 
 def _race(

@@ -23,7 +23,7 @@ from .object_task import VEHICLE, Objects
 # Shares of the classes in a batch.
 SHARES = {BACKGROUND: 0.45, 1: 0.26, 2: 0.08, 3: 0.04, 4: 0.09, 5: 0.07, VEHICLE: 0.01}
 SIMULATED = "simulated"
-SOURCE_WEIGHTS: Mapping[str, float] = {SIMULATED: 0.02, "pandaset": 0.2}
+SOURCE_WEIGHTS: Mapping[str, float] = {SIMULATED: 0.02, "pandaset": 1.0}
 """How often an object of a source counts, for one of KITTI; others: `OTHER_WEIGHT`."""
 OTHER_WEIGHT, PASTED_WEIGHT = 0.1, 0.3
 ALIKE = 0.5  # samples of one object count as this power of their number

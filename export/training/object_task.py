@@ -28,7 +28,7 @@ VEHICLE = -1
 PLACE, BOTTOM, SIZE, AXIS, FRONT, IOU, LOOK = 0.25, 0.15, 0.12, 0.2, 0.2, 0.7, 1.0
 PLACE_M = {"car": 0.4, "van": 0.4, "truck": 0.4, "pedestrian": 0.2, "cyclist": 0.2}
 BOTTOM_M, SIZE_LOG, AXIS_SCALE = 0.2, 0.1, 0.25
-PERSON_AXIS = 0.3  # of a vehicle's weight: people turn on the spot
+PEDESTRIAN_AXIS = 0.3  # of a vehicle's weight: pedestrians turn on the spot
 BACKGROUND_IOU = 0.3
 SMOOTHING = 0.02
 VAN = 2  # a vehicle of unknown kind has the sizes of a van
@@ -82,7 +82,7 @@ class Objects:
         kinds = torch.where(is_vehicle, VAN, labels)[is_object]
         own, right = Parts(*(part[is_object] for part in parts)), boxes[is_object]
         priors = self._priors(values)[kinds - 1]
-        is_person = kinds > 3
+        walks = kinds == self.classes.index("pedestrian")
         place_m = torch.tensor([PLACE_M[name] for name in self.classes[1:]], device=labels.device)[kinds - 1]
         place = _huber(own.place[:, :2], right[:, :2], place_m[:, None], 0.25)
         bottom = _huber(own.place[:, 2:], right[:, 2:3], BOTTOM_M, 0.5)
@@ -92,7 +92,7 @@ class Objects:
         axis = _huber(own.axis, torch.stack([(2 * yaw).cos(), (2 * yaw).sin()], dim=1), AXIS_SCALE, 0.5)
         towards = (own.front * torch.stack([yaw.cos(), yaw.sin()], dim=1)).sum(1)
         front = binary_cross_entropy_with_logits(towards, torch.ones_like(towards), reduction="none")
-        turning = (AXIS * axis + FRONT * front) * torch.where(is_person, PERSON_AXIS, 1.0)
+        turning = (AXIS * axis + FRONT * front) * torch.where(walks, PEDESTRIAN_AXIS, 1.0)
         iou = torch.zeros_like(parts.iou)
         iou[is_object] = self._overlaps(own, kinds, right)
         overlap = binary_cross_entropy_with_logits(parts.iou, iou, reduction="none")
