@@ -66,7 +66,8 @@ def card_of(recipe: Recipe, **facts: Any) -> ModelCard:
             classes=OBJECT_CLASSES,
             box_classes=OBJECT_CLASSES[1:],
             box_size_priors=box_sizes(),
-            **facts,
+            # On the folds, the F1 of cars is 0.79 with 0.5 and 0.65 with 0.3; AP is the same.
+            **{"score_threshold": 0.5, **facts},
         )
     if task == "camera":
         return ModelCard(

@@ -13,6 +13,7 @@ import pytest
 torch = pytest.importorskip("torch")
 pytest.importorskip("onnx")
 
+from edgeperc.errors import ModelError, PointsError
 from edgeperc.ground.planes import find_ground
 from edgeperc.ground.scan import Scan
 from edgeperc.inference.session import MAX_ROWS, Session
@@ -24,11 +25,14 @@ from edgeperc.simulation.samples import simulated_scan
 from edgeperc.types.mounting import MODEL_MOUNTING
 from edgeperc.types.points import read_only
 from edgeperc.types.sensor import get_sensor
+from edgeperc.zoo import model_path
 from edgeperc_export.cards import OBJECT_CLASSES, OBJECT_VIEW
 from edgeperc_export.data.scans import LabeledScan
 from edgeperc_export.networks import build
 from edgeperc_export.networks.objects import ObjectNet, parts_of, rejected
 from edgeperc_export.recipe import MODELS
+from edgeperc_export.release.object_int8 import candidate_batches, quantize_objects, rounded
+from edgeperc_export.release.quantize import Calibration, folded
 from edgeperc_export.release.to_onnx import load, to_graph, verify, with_golden, write_card
 from edgeperc_export.training.object_batches import ObjectBatches, ObjectWatch, tensors
 from edgeperc_export.training.object_batches import _Drawn as Drawn
@@ -226,3 +230,26 @@ def test_a_missing_source_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="no scans to train objects on"):
         train(RECIPE, tmp_path / "run", Data())
     build_samples(tmp_path, "nothing", [], real=True)
+
+
+def test_int8_agrees_with_fp32(tmp_path: Path) -> None:
+    """The shipped network, rounded on one scan: the classes of the candidates of another."""
+    path, rounded_path = model_path("objects:fp32"), tmp_path / "int8.onnx"
+    card = Session(path, "cpu").card
+    (batch,) = candidate_batches(card, [simulated_scan(SEED).points])
+    model = rounded(folded(path), [batch], card.input.name)
+    write_card(model, with_golden(model, replace(card, precision="int8", precisions={})), rounded_path)
+    (other,) = candidate_batches(card, [simulated_scan(SEED + 1).points])
+    classes = []
+    for session in (Session(path, "cpu"), Session(rounded_path, "cpu")):
+        session.input[: len(other)] = other
+        classes.append(session.run(len(other))["objects"][: len(other), : len(card.classes)].argmax(axis=1))
+    assert (classes[0] == classes[1]).mean() > 0.95
+
+
+def test_only_fp32_and_scans_with_clusters_are_quantized(tmp_path: Path) -> None:
+    nothing = Calibration([np.zeros((0, 4), np.float32)], [])
+    with pytest.raises(PointsError, match="no candidate in 1 scans"):
+        quantize_objects(model_path("objects:fp32"), tmp_path / "int8.onnx", nothing)
+    with pytest.raises(ModelError, match="quantize the model in fp32"):
+        quantize_objects(model_path("objects:int8"), tmp_path / "int8.onnx", nothing)
