@@ -12,7 +12,8 @@ from torch.nn.functional import relu
 from edgeperc.objects.crops import N_POINT_FEATURES
 
 LOOK_STRIDE = 4
-LEAST = math.log(0.15 / 0.85)
+# With 0.15 in place of 0.4, 1.7 times as many candidates get a close look, and AP on the folds is the same.
+LEAST = math.log(0.4 / 0.6)
 """Logit of the least probability for a close look."""
 SURE = 12.0
 
