@@ -223,8 +223,8 @@ class Pipeline:
             scan = value("cluster", _on_ground, near, planes)
 
         # The top view (SSADNet)
-        projected, boxes, cells = absent, value("check", tuple), absent
-        detected = boxes
+        projected = cells = absent
+        boxes = detected = value("check", tuple)
         if top is not None:
             projected = value("project", top.project, near)
             least = options.network_score if self.objects is None else min(options.network_score, MIN_DETECTOR_SCORE)
@@ -253,24 +253,16 @@ class Pipeline:
             strips = value("cluster", _sorted, scan, options.distance_per_m)
             upright = value("agree", without_poles, scan, labels, rules)
             support = value("cluster", find_support, scan, labels, boxes, rules)
-            clusters = value(
-                "cluster",
-                find_voters,
-                scan,
-                labels,
-                support,
-                strips,
-                distance_per_m=options.distance_per_m,
-                rules=rules,
-            )
+            per_m = options.distance_per_m
+            clusters = value("cluster", find_voters, scan, labels, support, strips, distance_per_m=per_m, rules=rules)
             agreed = value("agree", agree_on_points, scan, labels, clusters, support, upright, view=cells, rules=rules)
             trusted = value("agree", agree_on_boxes, boxes, scan, agreed, rules)
             joined = trusted
-        if self.objects is not None:
+        if self.objects is not None and self.ranged and options.boxes_from != "network":
+            people = value("cluster", _people, scan, agreed, clusters, options)
+            joined = value("cluster", _with_people, objects, people)
+        elif self.objects is not None:
             joined = objects
-            if self.ranged and options.boxes_from != "network":
-                people = value("cluster", _people, scan, agreed, clusters, options)
-                joined = value("cluster", _with_people, objects, people)
         elif self.ranged and options.boxes_from != "network":
             around = value("cluster", _objects, scan, agreed, clusters, trusted, options)
             joined = value("cluster", self._join, trusted, around)
@@ -283,20 +275,9 @@ class Pipeline:
 
         # The second lane has time for what needs no labels. In a turn, the lane that finds no sector left takes it.
         aside = [strips, cells]
+        first = [near, projected, scan, *sectors, *(aside if sectors else ())]
         self._lanes.run(
-            [
-                near,
-                projected,
-                scan,
-                *sectors,
-                *(aside if sectors else ()),
-                labels,
-                clusters,
-                agreed,
-                trusted,
-                joined,
-                view,
-            ],
+            [*first, labels, clusters, agreed, trusted, joined, view],
             [planes, boxes, objects, *reversed(sectors), *aside, upright, marks, standing],
         )
         labeled = agreed()
