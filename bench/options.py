@@ -28,7 +28,7 @@ def model_options() -> argparse.ArgumentParser:
         action="append",
         metavar="NAME",
         help="a shipped model (ssadnet), one variant of it (ssadnet:int8) or the path of an .onnx file; may be "
-        f"repeated (default: {' and '.join(DEFAULT)})",
+        f"repeated (default: {', '.join(DEFAULT)})",
     )
     parser.add_argument(
         "--sensor",

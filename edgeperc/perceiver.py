@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import math
 import os
 import threading
 import warnings
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from numbers import Integral, Real
 from types import MappingProxyType
 from typing import Literal, NamedTuple, NoReturn
@@ -22,7 +20,7 @@ from .errors import EdgepercError, FitnessError, ImageError, MountingError, Opti
 from .ground.leveling import MountingEstimate, MountingEstimator
 from .inference.session import Session
 from .objects.boxes import MIN_SCORE
-from .pipeline import BoxesFrom, Options, Pipeline, RangeImageNetwork, TopViewNetwork
+from .pipeline import BoxesFrom, ObjectNetwork, Options, Pipeline, RangeImageNetwork, TopViewNetwork
 from .preprocess.condition import scale
 from .preprocess.findings import Finding, check_dropped, check_profiles
 from .preprocess.fitness import FitnessProfile
@@ -38,7 +36,7 @@ from .types.mounting import Mounting
 from .types.perception import ImageLabels, Perception
 from .types.points import as_points
 from .types.sensor import SensorProfile, get_sensor
-from .types.views import CameraGeometry, RangeImageGeometry, TopViewGeometry
+from .types.views import CameraGeometry, ObjectGeometry, RangeImageGeometry, TopViewGeometry
 from .warm_up import Rehearsed, n_processes, warm_up
 from .zoo import CAMERA, DEFAULT, resolve
 
@@ -124,7 +122,7 @@ class Perceiver:
     ----------
     models : str, Path, sequence of these, or None
         Names of shipped models (``"ssadnet"``, ``"pointseg:int8"``) or paths of .onnx files with a card; at most one
-        model per view: top view, range image and camera. None takes the best pair of LiDAR models,
+        model per view: top view, range image, objects and camera. None takes the best LiDAR models together,
         `edgeperc.zoo.DEFAULT`. The options of scans have no effect on a camera.
     sensor : str, Path or SensorProfile
         The sensor that takes the scans: a built-in name (`edgeperc.sensors`), a file written by ``edgeperc
@@ -149,7 +147,7 @@ class Perceiver:
         of others. ``"warn"``: warn of all. ``"raise"``: raise FitnessError for any. ``"ignore"``: skip the check.
     score_threshold : float or None
         Lowest score of a box, in 0..1. None takes the card's threshold for boxes of a network, and 0.3 for boxes of
-        clusters.
+        clusters. That of a model of objects is the one of its boxes.
     adapt : {"both", "remission", "interpolation", "none"}
         How to adapt scans of a sensor that the models were not trained on. ``"remission"``: convert its remission to
         that of the training sensor, by the function of its profile or one that is matched to the first five scans
@@ -162,6 +160,8 @@ class Perceiver:
         a network's box, unless it is a person's with the better score. Otherwise it stays wherever it is: a network
         that detects its class, and sees it, but has not found it, halves its score, in part if it sees the object in
         part.
+        A model of objects replaces both, at candidates from the top view, from clusters of points of any class, or from
+        both; boxes of people are still those around labeled points, if points are labeled.
     full_turn : bool
         Run a range-image model once for each sector, four times for the shipped models. Every point then has a class,
         and there are boxes next to and behind the vehicle.
@@ -266,8 +266,9 @@ class Perceiver:
     def _kernel_needs(self, cards: Sequence[ModelCard]) -> list[str]:
         """Which kernels are needed: keys of `edgeperc.system.compilation.KERNELS`."""
         kinds, scans = {card.view.kind for card in cards}, [c for c in cards if not isinstance(c.view, CameraGeometry)]
-        points, top_view = "range_image" in kinds, "top_view" in kinds
-        boxes, agreement = points and self.boxes_from != "network", points and bool(self.agree)
+        points, top_view, objects = "range_image" in kinds, "top_view" in kinds, "objects" in kinds
+        boxes = points and self.boxes_from != "network"
+        agreement = points and bool(self.agree)
         gaps = self._interpolates and any(
             isinstance(card.view, RangeImageGeometry) and Interpolator(card.view, self.sensor).needed for card in scans
         )
@@ -277,16 +278,18 @@ class Perceiver:
             "crop": bool(scans) and not gaps,
             "gaps": gaps,
             "turn": points and self.full_turn,
-            "ground": bool(scans) and (bool(self.agree) or boxes or any(card.input.needs_ground for card in scans)),
+            "ground": bool(scans)
+            and (bool(self.agree) or boxes or objects or any(card.input.needs_ground for card in scans)),
             "points": points,
             "points outside": points and not gaps,
             "clusters": boxes or agreement,
             "boxes": boxes,
             "agreement": agreement,
-            "standing": bool(self.agree) and (boxes or any(card.box_classes for card in scans)),
+            "objects": objects,
+            "standing": bool(self.agree) and not objects and (boxes or any(card.box_classes for card in scans)),
             "road": top_view,
             "cells": top_view and bool(self.agree),
-            "detections": any(card.box_classes for card in scans),
+            "detections": any(card.box_classes for card in scans if card.view.kind == "top_view"),
             "blocks": any(output.block != (1, 1) for card in scans for output in card.outputs),
             "image": "camera" in kinds,
         }
@@ -319,8 +322,11 @@ class Perceiver:
             ),
             None,
         )
-        if self.boxes_from == "clusters" and "range_image" not in views:
-            raise OptionError("boxes_from is 'clusters', which needs a class for every point; add a range-image model")
+        if self.boxes_from == "clusters" and not {"range_image", "objects"} & {*views}:
+            raise OptionError(
+                "boxes_from is 'clusters', which needs a class for every point or for every cluster; add a range-image "
+                "model or one of objects"
+            )
         self.providers = MappingProxyType({s.card.name: s.description for s in self.sessions})
         self._fitness = [FitnessProfile.from_dict(card.fitness) for card in self.cards if card.fitness is not None]
         self._to_check = 0 if self.on_mismatch == "ignore" else CHECKED_SCANS
@@ -340,6 +346,7 @@ class Perceiver:
         """The pipeline of the LiDAR networks; None without any."""
         top: TopViewNetwork | None = None
         ranged: list[RangeImageNetwork] = []
+        objects: ObjectNetwork | None = None
         for session in self.sessions:
             if isinstance(session.card.view, TopViewGeometry):
                 top = TopViewNetwork(session, self.sensor)
@@ -347,24 +354,28 @@ class Perceiver:
                 interpolator = Interpolator(session.card.view, self.sensor) if self._interpolates else None
                 needed = interpolator if interpolator is not None and interpolator.needed else None
                 ranged = [RangeImageNetwork(session, needed)]
-        if top is None and not ranged:
+            elif isinstance(session.card.view, ObjectGeometry):
+                objects = ObjectNetwork(session)
+        if top is None and not ranged and objects is None:
             return None
         if self.full_turn and self._lanes.n == 2 and ranged:  # either lane may take a sector
             ranged.append(ranged[0].second())
         network_score = self.score_threshold
         if network_score is None:
             network_score = MIN_SCORE if top is None else top.card.score_threshold
-        gaps_deg = [upper - lower for upper, lower in pairwise(self.sensor.elevations_deg)]
+        object_score = self.score_threshold
+        if object_score is None:
+            object_score = MIN_SCORE if objects is None else objects.card.score_threshold
         options = Options(
             rules=frozenset(RULES if self.agree is True else self.agree or ()),
             boxes_from=self.boxes_from,
             network_score=network_score,
             cluster_score=MIN_SCORE if self.score_threshold is None else self.score_threshold,
-            # Twice the spacing of beams or columns: an object whose return between is missing stays linked.
-            distance_per_m=2.0 * math.radians(max(np.median(gaps_deg or [0.0]), 360.0 / self.sensor.columns)),
+            object_score=object_score,
+            distance_per_m=self.sensor.link_per_m,
             full_turn=self.full_turn,
         )
-        return Pipeline(top, ranged, options, self._lanes)
+        return Pipeline(top, ranged, options, self._lanes, objects)
 
     def __setattr__(self, name: str, value: object) -> None:
         if not name.startswith("_") and "_locks" in vars(self):  # the last attribute of construction

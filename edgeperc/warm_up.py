@@ -101,7 +101,7 @@ class Rehearsed(Session):
     def __init__(self, session: Session) -> None:
         vars(self).update(vars(session))
 
-    def run(self) -> Mapping[str, NDArray[np.float32]]:
+    def run(self, n_rows: int = 1) -> Mapping[str, NDArray[np.float32]]:
         """`Session.outputs`, without running the network."""
         return self.outputs
 
@@ -135,6 +135,7 @@ def warm_up(
     """Compile what a scan needs, and `edgeperc.road_ahead`."""
     few_points = np.array([[10, 0, -1, 0], [20, 1, -1, 0], [0, 0, 0, 0]], np.float32)
     options, top, ranged = pipeline.options, pipeline.top, pipeline.ranged
+    objects = copy(pipeline.objects)
     boxes_points = bool(ranged) and options.boxes_from != "network"
     needed = {
         "ground": pipeline.needs_ground,
@@ -165,17 +166,20 @@ def warm_up(
         helpers.wait()  # for what follows
         # Objects and agreement
         floor[:, 3] = labels.labels
+        if objects is not None:
+            objects.session = Rehearsed(objects.session)
         rehearsed_top = None if top is None else _RehearsedTop(top)
         rehearsed = Pipeline(
             rehearsed_top,
             [_RehearsedRange(network) for network in ranged[:1]],
             replace(options, full_turn=False),
             alone,
+            objects,
         )
         rehearsed(read_only(floor), MODEL_MOUNTING, Stopwatch())
         if boxes_points:
             compile_parts(["boxes"])  # some only several boxes need
-        if options.rules and (boxes_points or (top is not None and top.card.box_classes)):
+        if options.rules and objects is None and (boxes_points or (top is not None and top.card.box_classes)):
             stand_boxes([UNCERTAIN], *_made_up())
         if top is not None:
             compile_kernels()

@@ -365,8 +365,17 @@ def _add_quantize(commands: Commands) -> None:
 
 
 def _quantize(args: argparse.Namespace) -> int:
+    from edgeperc.types.card import ModelCard
+
     from .release.quantize import LabeledSets, calibration_images, calibration_scans, quantize
 
+    if ModelCard.read(args.model).view.kind == "objects":
+        from .release.object_int8 import quantize_objects
+
+        calibration = calibration_scans(args.scans, kitti=args.kitti, n_simulated=args.simulated)
+        card = quantize_objects(args.model, args.out, calibration, seven_bits=args.seven_bits, n_threads=args.threads)
+        print_line(f"{args.out}: {card.name} {card.version}: {card.parity['speed']}")
+        return 0
     if args.camvid is not None:
         calibration = calibration_images(args.camvid)
     else:
@@ -559,7 +568,7 @@ def _add_triton(commands: Commands) -> None:
         "--model",
         action="append",
         metavar="MODEL",
-        help="name or file of a network of scans; may be repeated (default: ssadnet and pointseg)",
+        help="name or file of a network of scans; may be repeated (default: ssadnet, pointseg and objects)",
     )
     triton.add_argument("--sensor", default="hdl-64e", help="sensor of the scans (default hdl-64e)")
     triton.set_defaults(run=_triton)

@@ -10,17 +10,21 @@ from typing import Any
 import onnx
 
 from edgeperc.evaluation.camvid import evaluate_images
-from edgeperc.evaluation.evaluate import NETWORK_ALONE, evaluate
+from edgeperc.evaluation.evaluate import NETWORK_ALONE, Perceiving, evaluate
 from edgeperc.types.card import ModelCard
 
 from .data.simulate import fitness_of, parity_images, parity_scans, simulate
 from .recipe import MODELS
+from .release.object_parity import TOP_VIEW
 from .release.to_onnx import export, write_card
 from .training.train import Data, Run, train
 
 N_SIMULATED = 2400
+# The object network sees points, not beams: with scans of other sensors it learns how sparse an object may be.
+OTHER_SENSORS, N_OF_OTHERS = ("pandar64", "vlp-32c", "vlp-16"), 200
 SOURCES = {"real", "semantickitti", "simulated"}
 # What a card holds of the figures of a source; `edgeperc eval` prints the rest, which is four times as long.
+OBJECT_FIGURES = ("n_frames", "n_drives", "kitti")
 CARD_FIGURES = ("n_frames", "n_drives", "points", "boxes", "segmentation", "road")
 ROAD_TRUTH = "ssadnet-sim"
 """Model whose road is the ground truth of KITTI's scans, which have no road labels."""
@@ -59,6 +63,8 @@ def make(
             raise ValueError(f"{name} is trained on real scans too; give --kitti and --layouts")
         scans = out / ("scans" if simulated_only else "scans-with-layouts")
         simulate(scans, N_SIMULATED, layouts_root=None if simulated_only else layouts, n_workers=run.n_workers)
+        if recipe.task == "objects":
+            scans = _more_sensors(out, scans, layouts, run.n_workers)
         data = replace(data, simulated=scans)
 
     def checkpoint_of(other: str | None) -> Path | None:
@@ -76,6 +82,17 @@ def make(
     checkpoint = train(recipe, path.with_suffix(""), data, run)
     finish(name, checkpoint, path, data, semantickitti=semantickitti, version=version)
     return path
+
+
+def _more_sensors(out: Path, scans: Path, layouts: Path | None, n_workers: int) -> Path:
+    """A folder of the simulated scans and others of `OTHER_SENSORS`."""
+    every = out / "scans-of-sensors"
+    for k, sensor in enumerate(OTHER_SENSORS, start=1):
+        simulate(every, N_OF_OTHERS, first=10_000 * k, layouts_root=layouts, sensor=sensor, n_workers=n_workers)
+    for file in scans.glob("*.npz"):
+        if not (every / file.name).exists():
+            (every / file.name).symlink_to(file.resolve())
+    return every
 
 
 def _suffix(fold: int | None) -> str:
@@ -106,6 +123,14 @@ def finish(
         _write_figures(
             path, card, figures | {"command": f"edgeperc eval CAMVID --split validation --model {name}:fp32"}
         )
+        return
+    if stage.recipe.task == "objects":
+        card = export(checkpoint, path, scans=parity_scans([]), fitness=None, name=name, version=version)
+        if kitti is not None:
+            figures, _ = evaluate([kitti], [TOP_VIEW, path], Perceiving(rules=()), fold=fold)
+            figures["real"] = {name: of for name, of in figures["real"].items() if name in OBJECT_FIGURES}
+            printed = f"edgeperc eval KITTI --model {TOP_VIEW} --model {name}:fp32 --no-agreement"
+            _write_figures(path, card, figures | {"command": printed + (f" --fold {fold}" if fold is not None else "")})
         return
     fitness = fitness_of(None if stage.recipe.simulated_share == 1.0 else kitti)
     card = export(checkpoint, path, scans=parity_scans([]), fitness=fitness, name=name, version=version)

@@ -10,14 +10,16 @@ TASKS: Mapping[str, tuple[str, ...]] = {
     "points": ("kulseg", "pointseg", "squeezesegv2"),
     "vehicles": ("ssadnet",),
     "road": ("lodnn",),
+    "objects": ("objects",),
     "camera": ("camseg", "fcn16", "fcn8", "segnet", "unet", "unet-long", "unet-small", "unet-small-leaky"),
 }
 """Task -> its networks. Points: a class for every point of a range image. Vehicles: vehicles and drivable area in a
-top view. Road: drivable area alone. Camera: a class for every pixel of a camera's image."""
+top view. Road: drivable area alone. Objects: class and box of each candidate. Camera: a class for every pixel of a
+camera's image."""
 
 NETWORKS = tuple(sorted(network for networks in TASKS.values() for network in networks))
-SCAN_NETWORKS = tuple(network for network in NETWORKS if network not in TASKS["camera"])
-"""Networks of LiDAR scans."""
+SCAN_NETWORKS = tuple(network for task in ("points", "vehicles", "road") for network in TASKS[task])
+"""Networks of whole LiDAR scans."""
 EDGE_NETWORKS = ("lodnn", "pointseg", "ssadnet")
 """Networks with a version for small computers (`edgeperc_export.networks.edge`)."""
 EDGE_BLOCKS: Mapping[str, tuple[int, int]] = {"pointseg": (2, 4), "ssadnet": (4, 4)}
@@ -345,6 +347,18 @@ CAMSEG = Recipe(
     deep_supervision=0.4,
 )
 
+OBJECTS = Recipe(
+    "objects",
+    steps=40_000,
+    batch=128,
+    learning_rate=2e-3,
+    weight_decay=0.02,
+    cooldown=0.95,
+    ema=0.999,
+    dropout=0.1,
+    redraw_every=0,
+)
+
 MODELS = {
     "pointseg-sim": Stage(Recipe("pointseg", simulated_share=1.0, steps=1000, learning_rate=2e-3, cooldown=0.3)),
     "pointseg-full": Stage(Recipe("pointseg", steps=3600, batch=4, learning_rate=1e-3), after="pointseg-sim"),
@@ -386,5 +400,6 @@ MODELS = {
         )
     ),
     "camseg": Stage(CAMSEG),
+    "objects": Stage(OBJECTS),
 }
 """The training run of every model, by name; names that end in ``-start`` are intermediate results."""

@@ -36,7 +36,7 @@ __all__ = [
 ]
 
 DEFAULT = choices.DEFAULT_MODELS
-"""The best pair: drivable area and vehicles ahead, and a class for every point."""
+"""The best ones together: drivable area and vehicles ahead, a class for every point, and boxes all around."""
 
 CAMERA = choices.CAMERA
 """The model of a camera's images."""

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from edgeperc import cli
-from edgeperc.types.card import InputSpec, ModelCard, OutputSpec
-from edgeperc.types.views import RangeImageGeometry, TopViewGeometry
+from edgeperc.types.card import CHANNELS, InputSpec, ModelCard, OutputSpec
+from edgeperc.types.views import ObjectGeometry, RangeImageGeometry, TopViewGeometry
 
 POINTSEG = ModelCard(
     name="pointseg",
@@ -38,6 +38,17 @@ SSADNET = ModelCard(
     outputs=(OutputSpec("map", "class_probabilities"), OutputSpec("boxes", "box_dense")),
     classes=("background", "drivable", "car", "van", "truck"),
     box_classes=("car", "van"),
+)
+
+OBJECTS = ModelCard(
+    name="objects",
+    version="1.0.0",
+    view=ObjectGeometry(),
+    input=InputSpec("candidates", CHANNELS["objects"], (0.0,) * 13, (1.0,) * 13),
+    outputs=(OutputSpec("objects", "objects"),),
+    classes=("background", "car"),
+    box_classes=("car",),
+    box_size_priors={"car": (3.9, 1.6, 1.5)},
 )
 
 

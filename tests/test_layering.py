@@ -37,8 +37,8 @@ FLOORS = {
         types.frame types.geometry
         ground.observed ground.planes
         ground.__init__ ground.leveling ground.scan
-        objects.__init__ objects.linkage objects.refine
-        objects.cluster
+        objects.__init__ objects.candidate_boxes objects.candidates objects.linkage objects.refine
+        objects.cluster objects.crops
         objects.persons
         objects.boxes
         preprocess.__init__ preprocess.fitness preprocess.interpolation preprocess.returns
@@ -116,19 +116,22 @@ FLOORS = {
         data.scan_sets
         recipe
         cards
-        networks.pointseg networks.ssadnet
+        networks.objects networks.pointseg networks.ssadnet
         networks.camseg networks.edge networks.lodnn networks.segnet networks.squeezesegv2 networks.unet
         networks.fcn networks.kulseg
         networks.__init__
-        training.__init__ training.checkpoint training.curve training.losses training.ranks
-        training.camera training.start training.task
-        training.images training.teacher
-        training.samples
+        training.__init__ training.checkpoint training.curve training.losses training.object_task training.ranks
+        training.camera training.object_samples training.start training.task
+        training.images training.object_sets training.teacher
+        training.object_batches training.samples
         training.watch
         training.train
         training.ablation training.camvid
-        release.__init__ release.int8_graph release.models_page release.to_onnx release.triton_model
-        release.agree release.quantize release.triton
+        release.__init__ release.int8_graph release.models_page release.object_graph release.object_parity
+        release.triton_model
+        release.to_onnx release.triton
+        release.agree release.quantize
+        release.object_int8
         database.__init__ database.files
         database.coco database.folds database.torch
         database.label_page database.scenes

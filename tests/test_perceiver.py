@@ -626,7 +626,7 @@ def test_shipped_views_match_the_papers() -> None:
     assert isinstance(seen, RangeImageGeometry)
     assert (seen.height, seen.width, seen.azimuth_left_deg, seen.azimuth_right_deg) == (64, 512, 45.0, -45.0)
     for card in cards.values():
-        assert (card.fitness is None) == (card.view.kind == "camera")
+        assert (card.fitness is None) == (card.view.kind in ("camera", "objects"))
         assert card.golden is not None
         assert card.training["licence"]
         assert card.parity["n_scans"] >= 4

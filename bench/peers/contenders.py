@@ -102,7 +102,7 @@ def why_missing(contender: Contender) -> str:
 
 
 def default_models() -> list[str]:
-    """The shipped models that are measured by default: every variant of the default pair."""
+    """The shipped models that are measured by default: every variant of the default models."""
     return [str(variant) for variant in listed() if variant.name in DEFAULT]
 
 
@@ -118,7 +118,7 @@ def groups(
     scan : the scan that is the input of networks alone.
     """
     points, _ = condition(np.load(scan), get_sensor(sensor), rendered=False)
-    views: dict[str, list[Variant]] = {"range_image": [], "top_view": [], "camera": []}
+    views: dict[str, list[Variant]] = {"range_image": [], "top_view": [], "camera": [], "objects": []}
     for name in models:
         variant = resolve(name)[0]
         views[variant.card.view.kind].append(variant)

@@ -214,7 +214,7 @@ def _folded(rows: Sequence[tuple[str, str]]) -> list[tuple[str, str]]:
 def _model_rows(variants: Sequence[Variant]) -> list[tuple[str, str]]:
     """Rows that describe a model; accuracy and geometry come from the card of its first variant."""
     from ..inference.listing import purpose
-    from ..types.views import CameraGeometry, TopViewGeometry
+    from ..types.views import CameraGeometry, ObjectGeometry, TopViewGeometry
 
     path, card = variants[0].path, variants[0].card
     size = ", ".join(f"{variant.precision} {_megabytes(variant.path)}" for variant in variants)
@@ -229,6 +229,9 @@ def _model_rows(variants: Sequence[Variant]) -> list[tuple[str, str]]:
         seen = f"x {x_near:g}..{x_far:g} m, y {y_right:g}..{y_left:g} m, cells of {card.view.cell_m:g} m"
     elif isinstance(card.view, CameraGeometry):
         seen = f"{card.view.width} x {card.view.height} pixels, images are {card.view.fit}ed to it"
+    elif isinstance(card.view, ObjectGeometry):
+        low, high = card.view.height_range_m
+        seen = f"{card.view.n_points} points within {card.view.margin_m:g} m, {low:g} to {high:g} m above the ground"
     else:
         up, down = card.view.row_elevations_deg[0], card.view.row_elevations_deg[-1]
         left, right = card.view.azimuth_left_deg, card.view.azimuth_right_deg
@@ -236,7 +239,7 @@ def _model_rows(variants: Sequence[Variant]) -> list[tuple[str, str]]:
     channels = card.input.channels
     rows += [
         ("view", f"{card.view.kind}: {seen}"),
-        ("input", f"{len(channels)} x {card.view.height} x {card.view.width}: {', '.join(channels)}"),
+        ("input", f"{_shape(card)}: {', '.join(channels)}"),
         ("outputs", ", ".join(f"{output.name} ({output.kind})" for output in card.outputs)),
         ("classes", ", ".join(card.classes)),
     ]
@@ -319,7 +322,15 @@ def _image_rows(path: Path) -> tuple[list[tuple[str, str]], dict[str, Any]]:
 
 
 def _size(card: ModelCard) -> tuple[int, int]:
-    return card.view.width, card.view.height
+    _, _, height, width = card.input_shape
+    assert height is not None
+    assert width is not None
+    return width, height
+
+
+def _shape(card: ModelCard) -> str:
+    """Shape of the input without the batch."""
+    return " x ".join(map(str, card.input_shape[1:]))
 
 
 def _dropped_text(dropped: DroppedPoints, sensor: SensorProfile) -> str:
@@ -464,7 +475,7 @@ def _suiting_models(
     rows: list[tuple[str, str]] = []
     findings: dict[str, list[str] | None] = {}
     for card in {variant.name: variant.card for variant in listed()}.values():
-        if card.view.kind == "camera":
+        if card.view.kind in ("camera", "objects"):  # objects are of any scan
             continue
         if card.fitness is None:
             findings[card.name] = None

@@ -80,8 +80,8 @@ def compare(
         that does not occur), ``"mean_iou"`` over the classes except the background, ``"n_points"`` (class -> count).
         In ``"n_objects"`` distinct objects by class, or None if only points are labeled, and in ``"few"`` the classes
         with fewer than `tables.FEWEST_OBJECTS`: their figures say little. In ``"boxes"`` the figures ``"kitti"`` and
-        ``"centers"`` of `tables.figures` for labeled scans with boxes: those of the default pair, all round, with
-        ``model`` for the points.
+        ``"centers"`` of `tables.figures` for labeled scans with boxes: those of the default models, all round,
+        with ``model`` for the points.
     Raises PointsError, ModelError, SplitError.
     """
     result: dict[str, Any] = {}
@@ -121,7 +121,8 @@ def compare(
             **{adaptation: _row(confusion) for adaptation, confusion in counts.items()},
         }
         if folder is not None:
-            judge = Judge([*DEFAULT[:1], model], Perceiving(provider, precision), sensor=sensor)
+            top_view, _, of_objects = DEFAULT
+            judge = Judge([top_view, model, of_objects], Perceiving(provider, precision), sensor=sensor)
             records = []
             for frame in _frames(folder):
                 records.append(judge.record_boxes(frame))

@@ -40,7 +40,7 @@ class ModelInfo:
     purpose : str
         What it detects, e.g. ``"drivable area and boxes of car, van, truck"``.
     default : bool
-        Whether it is one of the pair that ``models=None`` selects.
+        Whether it is one of those that ``models=None`` selects.
     path : Path
         File of its first variant: fp32, if there is an fp32 variant.
     variants : mapping of str to float
@@ -145,6 +145,8 @@ def purpose(card: ModelCard) -> str:
         return f"a class for every point ({', '.join(card.classes[1:])})"
     if card.view.kind == "camera":
         return f"a class for every pixel of a camera's image ({len(card.classes)} classes)"
+    if card.view.kind == "objects":
+        return f"boxes all around, by their points ({', '.join(card.box_classes)})"
     found = ["drivable area"] if "drivable" in card.classes else []
     found += [f"boxes of {', '.join(card.box_classes)}"] if card.box_classes else []
     return " and ".join(found) or "classes of a top view"

@@ -41,8 +41,10 @@ from ..system.machine import (
 )
 from ..system.names import nearest
 from ..system.printable import printable
+from ..types.card import ModelCard
 from ..types.choices import PRECISIONS
 from ..types.onnx_file import check_graph, read_model
+from ..types.views import CameraGeometry, ObjectGeometry
 from ..zoo import Variant, choose, digest, resolve
 from .decode import fill_pixels
 from .providers import AUTO, PLUGINS, PROVIDERS, SHARING, available_providers, load_onnxruntime, plugin_devices, version
@@ -55,6 +57,8 @@ MAX_GOLDEN_DEVIATION = {"fp32": 0.02, "bf16": 0.5, "int8": 0.5}
 # Share of the golden values that must be within that deviation. If two maxima in max-pooling differ only by rounding,
 # engines may unpool to either one, and a few pixels differ from there on.
 GOLDEN_SHARE = 0.9
+# Candidates of one run of an object network, and of its golden input.
+MAX_ROWS, GOLDEN_ROWS = 256, 16
 # The largest network of this project takes 0.2 s on one core of a server.
 MAX_FIRST_RUN_S = 30.0
 
@@ -117,7 +121,8 @@ class Session:
     options : dict of str to str
         Settings of onnxruntime's session and of the provider, for reports.
     input : (C, H, W) float32
-        Write the network's input here, then `run`.
+        Write the network's input here, then `run`. Of an object network: (`MAX_ROWS`, points, channels), a row for
+        each candidate.
     outputs : mapping of str to ndarray
         Outputs by output *kind*, without the batch axis; overwritten by every `run`. Values of blocks are written to
         their pixels (`edgeperc.card.OutputSpec`).
@@ -303,13 +308,12 @@ class Session:
         return session
 
     def _check_graph(self) -> None:
-        card, height, width = self.card, self.card.view.height, self.card.view.width
+        card = self.card
         inputs = {i.name: i for i in self.inference.get_inputs()}
         outputs = {o.name: o for o in self.inference.get_outputs()}
-        expected_shape = (1, len(card.input.channels), height, width)
         if list(inputs) != [card.input.name]:
             raise CardMismatchError(f"{self.path}: card names input {card.input.name!r}, the graph has {list(inputs)}")
-        self._match(card.input.name, inputs[card.input.name], expected_shape)
+        self._match(card.input.name, inputs[card.input.name], card.input_shape)
         for output in card.outputs:
             if output.name not in outputs:
                 raise CardMismatchError(
@@ -331,13 +335,21 @@ class Session:
 
     def _bind(self, run_options: Any) -> None:
         card = self.card
-        batch = np.zeros((1, len(card.input.channels), card.view.height, card.view.width), np.float32)
-        self.input: NDArray[np.float32] = batch[0]
+        batch = np.zeros([MAX_ROWS if n is None else n for n in card.input_shape], np.float32)
         self.binding = self.inference.io_binding()
         self.raw: dict[str, NDArray[np.float32]] = {}
         self.outputs: dict[str, NDArray[np.float32]] = {}
+        self._batch = batch  # the binding holds a bare pointer
+        self._has_rows = card.input_shape[0] is None
+        if self._has_rows:
+            self.input: NDArray[np.float32] = batch
+            for output in card.outputs:
+                shape = card.output_shape(output.kind)
+                self.raw[output.kind] = self.outputs[output.kind] = np.zeros((MAX_ROWS, *shape[1:]), np.float32)
+            return
+        self.input = batch[0]
         for output, shape in zip(card.outputs, self._shapes(batch, run_options), strict=True):
-            if output.kind == "camera_logits" and (card.view.height % shape[2] or card.view.width % shape[3]):
+            if isinstance(card.view, CameraGeometry) and (card.view.height % shape[2] or card.view.width % shape[3]):
                 raise CardMismatchError(
                     f"{self.path}: {output.name!r} has shape {shape}; expected rows and columns that divide the view's "
                     f"{card.view.height} and {card.view.width}"
@@ -346,9 +358,9 @@ class Session:
             self.binding.bind_output(output.name, "cpu", 0, np.float32, buffer.shape, buffer.ctypes.data)
             self.raw[output.kind] = self.outputs[output.kind] = buffer[0]
             if output.block != (1, 1):
+                assert not isinstance(card.view, ObjectGeometry)  # whose outputs have no blocks
                 pixels = (len(card.classes), card.view.height, card.view.width)
                 self.outputs[output.kind] = np.zeros(pixels, np.float32)
-        self._batch = batch  # the binding holds a bare pointer
         self._bound_input = (card.input.name, "cpu", 0, np.float32, batch.shape, batch.ctypes.data)
 
     def _shapes(self, batch: NDArray[np.float32], run_options: Any) -> list[tuple[int, ...]]:
@@ -374,25 +386,25 @@ class Session:
         return [answer.shape for answer in answers]
 
     def warm_up(self, limit: float, run_options: Any) -> float:
-        """Run the golden input; return the largest deviation from the recorded answers."""
-        golden = self.card.golden
+        golden, n_rows = self.card.golden, GOLDEN_ROWS if self._has_rows else 1
         if golden is None:
             logger.warning(
                 "the card of %s has no golden record: the outputs on %s are not compared with the exporter's",
                 *(self.path, self.provider),
             )
-            self.run_bound(run_options)
+            self.run_bound(n_rows, run_options)
             return float("nan")
-        self.input[:] = golden_input(golden.seed, self._batch.shape)[0]
-        if hashlib.sha256(self._batch.tobytes()).hexdigest() != golden.input_sha256:
+        self._batch[:n_rows] = golden_input(golden.seed, golden_shape(self.card))
+        if hashlib.sha256(self._batch[:n_rows].tobytes()).hexdigest() != golden.input_sha256:
             raise CardMismatchError(
                 f"{self.path}: the golden input does not have the card's SHA-256; export the model again"
             )
-        self.run_bound(run_options)
+        self.run_bound(n_rows, run_options)
         self.input[:] = 0.0
         deviation = 0.0
         for output in self.card.outputs:
-            known, here = golden.outputs.get(output.name), self.raw[output.kind].reshape(-1)
+            known, here = golden.outputs.get(output.name), self.raw[output.kind]
+            here = (here[:n_rows] if self._has_rows else here).reshape(-1)
             if known is None:
                 raise CardMismatchError(f"{self.path}: the card's golden record lacks output {output.name!r}")
             try:
@@ -410,10 +422,13 @@ class Session:
             )
         return deviation
 
-    def run(self) -> Mapping[str, NDArray[np.float32]]:
+    def run(self, n_rows: int = 1) -> Mapping[str, NDArray[np.float32]]:
         """Run the network on `input`.
 
-        Returns mapping of str to ndarray: `outputs`, which the next run overwrites.
+        ``n_rows``: of an object network, how many rows of `input`, from the first one on, hold candidates; 1 to
+        `MAX_ROWS`.
+        Returns mapping of str to ndarray: `outputs`, which the next run overwrites; of an object network, its first
+        ``n_rows`` rows are new.
         Raises InferenceError.
         """
         here = os.getpid()
@@ -425,7 +440,7 @@ class Session:
             )
         self._running_in = here
         try:
-            self.run_bound()
+            self.run_bound(n_rows)
         finally:
             self._running_in = 0
         return self.outputs
@@ -452,11 +467,17 @@ class Session:
             f"a session of {self.path} cannot be pickled or copied; construct a Perceiver or Session in each process"
         )
 
-    def run_bound(self, *run_options: Any) -> None:
-        """One run on the bound buffers."""
+    def run_bound(self, n_rows: int, *run_options: Any) -> None:
         try:
             # Bind before every run: a provider with its own memory copies the input only when it is bound.
-            self.binding.bind_input(*self._bound_input)
+            if self._has_rows:
+                array = self._batch[:n_rows]
+                self.binding.bind_input(self.card.input.name, "cpu", 0, np.float32, array.shape, array.ctypes.data)
+                for output in self.card.outputs:
+                    array = self.raw[output.kind][:n_rows]
+                    self.binding.bind_output(output.name, "cpu", 0, np.float32, array.shape, array.ctypes.data)
+            else:
+                self.binding.bind_input(*self._bound_input)
             self.inference.run_with_iobinding(self.binding, *run_options)
         except Exception as exc:  # onnxruntime's errors share no base but Exception
             raise InferenceError(f"{self.path}: a run on {self.provider} failed: {exc}") from exc
@@ -482,6 +503,11 @@ def terminated(ort: Any, after_s: float | None) -> Iterator[Any]:
         yield options
     finally:
         timer.cancel()
+
+
+def golden_shape(card: ModelCard) -> tuple[int, ...]:
+    """Shape of the input of a card's golden record; `GOLDEN_ROWS` candidates."""
+    return tuple(GOLDEN_ROWS if n is None else n for n in card.input_shape)
 
 
 def golden_input(seed: int, shape: tuple[int, ...]) -> NDArray[np.float32]:

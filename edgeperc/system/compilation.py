@@ -45,6 +45,9 @@ KERNELS: Mapping[str, str] = MappingProxyType(
         "boxes": "objects.boxes.fill_rectangle objects.cluster.fill_cluster_labels objects.cluster.fill_groups "
         "objects.persons.fill_person_groups objects.persons.fill_persons types.geometry.fill_oriented_iou "
         "types.geometry.mark_nms",
+        "objects": "objects.candidate_boxes.fill_boxes objects.candidate_boxes.fill_merged "
+        "objects.candidates.fill_cells objects.candidates.fill_groups_of_cells objects.candidates.fit_groups "
+        "objects.crops.fill_crops objects.crops.fill_features types.geometry.fill_oriented_iou types.geometry.mark_nms",
         "agreement": "agreement.rules.clear_columns agreement.rules.clear_ground agreement.rules.count_inside "
         "agreement.rules.fill_support agreement.votes.apply_verdicts agreement.votes.fill_tallies "
         "agreement.votes.fill_verdicts agreement.votes.fill_votes objects.persons.complete_persons",

@@ -17,7 +17,7 @@ from ..errors import CardError
 from ..system.fields import Fields
 from ..system.names import check_name, check_text
 from .onnx_file import read_metadata
-from .views import CameraGeometry, RangeImageGeometry, TopViewGeometry
+from .views import CameraGeometry, ObjectGeometry, RangeImageGeometry, TopViewGeometry
 
 CARD_KEY = "edgeperc.card"
 Precision = Literal["fp32", "int8"]
@@ -28,15 +28,25 @@ MAX_TEXT = 100_000  # characters of one text of the free-form metadata
 MAX_CHANNELS = 16
 MAX_BLOCK = 16
 MIN_GOLDEN_VALUES, MAX_GOLDEN_VALUES = 16, 100_000
-OUTPUT_KINDS = ("class_logits", "class_probabilities", "box_slots", "box_dense", "camera_logits")
+OUTPUT_KINDS = ("class_logits", "class_probabilities", "box_slots", "box_dense", "camera_logits", "objects")
 CHANNELS = {
     "camera": ("red", "green", "blue"),
     "top_view": ("distance", "remission", "height"),
     "range_image": ("x", "y", "z", "remission", "range", "height_above_ground"),
+    "objects": (
+        *("x", "y", "height_above_ground", "remission", "beyond_length", "beyond_width"),
+        *("length", "width", "top", "sensor_ahead", "sensor_left", "range", "n_points"),
+    ),
 }
 N_DENSE_CHANNELS, N_FRONT_CHANNELS = 9, 2
+N_OBJECT_VALUES = 8  # in addition to the classes and the sizes: place, axis, front, overlap
 FIELDS = Fields("the card", CardError, "export the model again", optional=("front", "block"))  # earlier cards lack them
-VIEWS = {"top_view": TopViewGeometry, "range_image": RangeImageGeometry, "camera": CameraGeometry}
+VIEWS = {
+    "top_view": TopViewGeometry,
+    "range_image": RangeImageGeometry,
+    "camera": CameraGeometry,
+    "objects": ObjectGeometry,
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -163,7 +173,7 @@ class ModelCard:
         The name may become that of files and of models on a server: see `edgeperc.system.names.check_name`.
     precision : {"fp32", "int8"}
         Precision of the stored weights. ``"int8"``: weights and activations are 8-bit integers.
-    view : TopViewGeometry, RangeImageGeometry or CameraGeometry
+    view : TopViewGeometry, RangeImageGeometry, CameraGeometry or ObjectGeometry
     input : InputSpec
     outputs : tuple of OutputSpec
         A camera model has one output of kind ``"camera_logits"``, float32 of shape (1, classes, h, w): logits on a grid
@@ -198,7 +208,7 @@ class ModelCard:
 
     name: str
     version: str
-    view: TopViewGeometry | RangeImageGeometry | CameraGeometry
+    view: TopViewGeometry | RangeImageGeometry | CameraGeometry | ObjectGeometry
     input: InputSpec
     outputs: tuple[OutputSpec, ...]
     classes: tuple[str, ...]
@@ -236,11 +246,16 @@ class ModelCard:
         kinds = [o.kind for o in self.outputs]
         if self.view.kind == "camera":
             self._check_camera(kinds)
+        elif self.view.kind == "objects":
+            self._check_objects(kinds)
         elif (
-            sum(k.startswith("class_") for k in kinds) != 1 or len(kinds) != len(set(kinds)) or "camera_logits" in kinds
+            sum(k.startswith("class_") for k in kinds) != 1
+            or len(kinds) != len(set(kinds))
+            or {"camera_logits", "objects"} & {*kinds}
         ):
             raise CardError(f"output kinds {kinds}; expected one class output and at most one of each box kind")
-        for rows, cols in (output.block for output in self.outputs):
+        for rows, cols in (output.block for output in self.outputs if output.block != (1, 1)):
+            assert not isinstance(self.view, ObjectGeometry)  # only outputs of classes have blocks
             if self.view.height % rows or self.view.width % cols:
                 raise CardError(
                     f"output.block is {(rows, cols)}; expected divisors of the view's {self.view.height} rows and "
@@ -288,8 +303,35 @@ class ModelCard:
         if self.fitness is not None:
             raise CardError("fitness is given for a camera model; expected null")
 
+    def _check_objects(self, kinds: list[str]) -> None:
+        if kinds != ["objects"]:
+            raise CardError(f"output kinds {kinds} of candidates; expected one, objects")
+        if self.input.channels != CHANNELS["objects"]:
+            raise CardError(
+                f"input channels {self.input.channels} of candidates; expected {', '.join(CHANNELS['objects'])}"
+            )
+        if self.box_classes != self.classes[1:] or not set(self.box_classes) <= self.box_size_priors.keys():
+            raise CardError(
+                f"box_classes {self.box_classes} of candidates; expected all classes but the background, each with a "
+                "box_size_prior"
+            )
+        if self.fitness is not None:
+            raise CardError("candidates with a fitness, which is of scans; expected null")
+
+    @property
+    def input_shape(self) -> tuple[int | None, ...]:
+        """Shape of the input, with the batch: (1, channels, rows, columns); of candidates (any, points, channels)."""
+        if isinstance(self.view, ObjectGeometry):
+            return (None, self.view.n_points, len(self.input.channels))
+        return (1, len(self.input.channels), self.view.height, self.view.width)
+
     def output_shape(self, kind: str) -> tuple[int | None, ...]:
         """Shape of the output of a kind, with the batch; None where any length is allowed."""
+        if kind == "objects":
+            n_classes = len(self.classes)
+            return (None, n_classes + 3 * (n_classes - 1) + N_OBJECT_VALUES)
+        if isinstance(self.view, ObjectGeometry):
+            raise CardError(f"a {self.view.kind} has no output of kind {kind}; expected objects")
         if kind == "box_slots":
             return (1, None, None)
         if kind == "camera_logits":
@@ -351,7 +393,7 @@ class ModelCard:
         _check_tree(document)
         view = FIELDS.read(Mapping[str, Any], document.get("view"), "view")  # type: ignore[type-abstract]
         if view.get("kind") not in [*VIEWS]:
-            FIELDS.refuse("view.kind", view.get("kind"), "top_view, range_image or camera")
+            FIELDS.refuse("view.kind", view.get("kind"), "top_view, range_image, camera or objects")
         geometry = FIELDS.entry(VIEWS[view["kind"]], view, "view")
         return FIELDS.read(cls, {**document, "view": geometry})
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-DEFAULT_MODELS = ("ssadnet", "pointseg")
+DEFAULT_MODELS = ("ssadnet", "pointseg", "objects")
 CAMERA = "camseg"
 DEFAULT_SENSOR = "hdl-64e"
 PRECISIONS = ("fp32", "bf16", "int8")

@@ -249,6 +249,16 @@ class SensorProfile:
         return 360.0 / self.columns
 
     @property
+    def link_per_m(self) -> float:
+        """Twice the angle between neighboring beams or columns [rad], whichever is larger.
+
+        An object whose return between two others is missing stays linked at any range
+        (`edgeperc.objects.cluster.find_clusters`).
+        """
+        gaps_deg = [upper - lower for upper, lower in pairwise(self.elevations_deg)]
+        return 2.0 * math.radians(max(float(np.median(gaps_deg or [0.0])), self.azimuth_resolution_deg))
+
+    @property
     def mount_height_m(self) -> float:
         """Height above the road [m] in simulated scans: that of the mounting, or else of the training vehicle."""
         return MODEL_HEIGHT_M if self.mounting.height_m is None else self.mounting.height_m

@@ -1,4 +1,4 @@
-"""How a network sees its input: top view, range image, camera image."""
+"""How a network sees its input: top view, range image, camera image, points of candidates."""
 
 from __future__ import annotations
 
@@ -157,3 +157,28 @@ class CameraGeometry:
     @property
     def kind(self) -> str:
         return "camera"
+
+
+@dataclass(frozen=True, slots=True)
+class ObjectGeometry:
+    """The points of each place where an object may be, one row of the batch each (`edgeperc.objects.crops`).
+
+    n_points : points of a candidate that the network sees.
+    margin_m : they lie in the candidate's rectangle, grown by this on every side [m].
+    height_range_m : lowest and greatest height above the ground of these points [m].
+    """
+
+    n_points: int = 64
+    margin_m: float = 0.8
+    height_range_m: tuple[float, float] = (0.1, 4.2)
+
+    def __post_init__(self) -> None:
+        _FIELDS.whole("view.n_points", self.n_points, 1, MAX_COLUMNS)
+        _FIELDS.number("view.margin_m", self.margin_m, 0.0, 10.0)
+        low, high = _FIELDS.pair("view.height_range_m", self.height_range_m, -100.0, 100.0)
+        if not low < high:
+            raise CardError(f"view.height_range_m is {(low, high)}; expected two numbers, the lower first")
+
+    @property
+    def kind(self) -> str:
+        return "objects"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -17,9 +18,12 @@ from edgeperc.readers.images import read_image
 from edgeperc.simulation.camera import forward_camera, render
 from edgeperc.simulation.samples import simulated_scan
 from edgeperc.types.perception import Box
+from edgeperc.types.sensor import get_sensor
 
 from .processes import mapped
 from .scans import LabeledScan
+
+TRAINING_SENSOR = "hdl-64e"
 
 
 def simulate(
@@ -53,7 +57,10 @@ def _path(out: Path, seed: int) -> Path:
 def _simulate(seed: int, *, out: Path, layouts: Sequence[Sequence[Box]], sensor: str) -> None:
     # 4,973 is prime: neighboring seeds take layouts of different drives.
     boxes = layouts[seed * 4973 % len(layouts)] if layouts and seed % 2 else None
-    LabeledScan.from_simulation(simulated_scan(seed, sensor, boxes)).save(_path(out, seed))
+    scan = LabeledScan.from_simulation(simulated_scan(seed, sensor, boxes))
+    if sensor != TRAINING_SENSOR:
+        scan = replace(scan, sensor=get_sensor(sensor))
+    scan.save(_path(out, seed))
 
 
 def parity_scans(paths: Sequence[Path]) -> list[NDArray[np.float32]]:

@@ -14,6 +14,7 @@ from .edge import PointSegEdge, SSADNetEdge
 from .fcn import FCN
 from .kulseg import KULSeg
 from .lodnn import LoDNN, LoDNNEdge
+from .objects import ObjectNet
 from .pointseg import PointSeg
 from .segnet import SegNet
 from .squeezesegv2 import SqueezeSegV2
@@ -52,6 +53,8 @@ def build(recipe: Recipe) -> nn.Module:
     if recipe.width != 1.0:
         raise ValueError(f"width is {recipe.width:g}; only networks for small computers (--edge) have one")
     sizes["dropout"] = recipe.dropout
+    if recipe.network == "objects":
+        return ObjectNet(**sizes)
     if recipe.network == "camseg":
         return CamSeg(**sizes, early=recipe.deep_supervision > 0.0)
     if recipe.network == "segnet":

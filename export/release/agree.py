@@ -18,21 +18,33 @@ import onnxruntime
 from numpy.typing import NDArray
 
 from edgeperc.datasets.images import LabeledImages
-from edgeperc.datasets.kitti import KittiObjects, SemanticKitti
+from edgeperc.datasets.kitti import KittiLabels, KittiObjects, SemanticKitti
 from edgeperc.errors import ModelError, PointsError
 from edgeperc.evaluation.judge import Judge, Perceiving
+from edgeperc.evaluation.kitti_ap import (
+    ApTable,
+    FrontTruth,
+    average_precisions,
+    best_candidates,
+    count_in_image,
+    image_size_of,
+)
 from edgeperc.evaluation.metrics import Confusion
 from edgeperc.evaluation.tables import Record, figures
 from edgeperc.evaluation.truth import Truth
-from edgeperc.inference.session import Session
+from edgeperc.inference.session import MAX_ROWS, Session
+from edgeperc.objects.candidate_boxes import LEAST_SCORE
 from edgeperc.perceiver import Perceiver
 from edgeperc.system.machine import cpu_features, cpu_model
+from edgeperc.types.mounting import MODEL_MOUNTING
 from edgeperc.types.perception import Perception
 from edgeperc.zoo import BF16_FEATURES, Variant, resolve
 
+from .object_parity import TOP_VIEW, candidate_inputs
 from .to_onnx import write_card
 
 T = TypeVar("T")
+NO_LABELS = KittiLabels((), np.empty((0, 14)))
 
 
 @dataclass(frozen=True)
@@ -80,7 +92,12 @@ def agree(
             "expected files of one network, one of them in fp32"
         )
     runs: dict[str, Variant] = {"fp32": variants["fp32"]}
-    if importlib.util.find_spec("openvino") is not None and not BF16_FEATURES.isdisjoint(cpu_features()):
+    of_objects = variants["fp32"].card.view.kind == "objects"
+    if (
+        not of_objects
+        and importlib.util.find_spec("openvino") is not None
+        and not BF16_FEATURES.isdisjoint(cpu_features())
+    ):
         runs["bf16"] = variants["fp32"]
     runs |= variants
     if variants["fp32"].card.view.kind == "camera":
@@ -88,6 +105,13 @@ def agree(
             raise PointsError(f"{variants['fp32'].name} is of a camera, and there is no labeled image; name CamVid")
         measured = {
             precision: _measure_images(variant, precision, LabeledImages(camvid), split, n_scans, on_scan)
+            for precision, variant in runs.items()
+        }
+    elif of_objects:
+        if kitti is None:
+            raise PointsError("objects are compared on KITTI's boxes; name a KITTI object set")
+        measured = {
+            precision: _measure_objects(variant, KittiObjects(kitti), split, n_scans, on_scan)
             for precision, variant in runs.items()
         }
     else:
@@ -174,6 +198,39 @@ def _measure(
     return Measured(labels, float(np.nanmean(ious)), ap[0] if ap else None, f"{by}, {cpu_model()}")
 
 
+def _measure_objects(
+    variant: Variant, objects: KittiObjects, split: str, n_scans: int | None, on_scan: Callable[[str], None]
+) -> Measured:
+    """Class of each cluster; overlap from above of each object to find with the best box; mean AP of cars.
+
+    AP is the mean of bird's eye and 3-D at 0.7, moderate, with the boxes of the top view as candidates, too.
+    """
+    perceive = Perceiver(
+        [TOP_VIEW, variant.path],
+        mounting=MODEL_MOUNTING,
+        provider="cpu",
+        agree=False,
+        score_threshold=LEAST_SCORE,
+        on_mismatch="ignore",
+    )
+    session = next(session for session in perceive.sessions if session.card.view.kind == "objects")
+    labels, overlaps, table = [], [], ApTable()
+    for name in _spread(objects.names(split), n_scans):
+        frame = objects.frame(name)
+        truth = FrontTruth(frame.labels or NO_LABELS, frame.calibration, image_size_of(frame.drive))
+        boxes = perceive(frame.points).boxes
+        table += count_in_image(truth, boxes, frame.drive)
+        overlaps += [each.iou for each in best_candidates(truth, boxes, frame.drive)]
+        inputs, _, _ = candidate_inputs(session.card, frame.points)
+        session.input[: len(inputs[:MAX_ROWS])] = inputs[:MAX_ROWS]
+        outputs = session.run(min(len(inputs), MAX_ROWS))["objects"][: len(inputs)] if len(inputs) else inputs[:, 0]
+        labels.append(outputs[:, : len(session.card.classes)].argmax(axis=1).astype(np.uint8))
+        on_scan(session.precision)
+    aps = [average_precisions(table.counts["car", overlap, "moderate"])[2] for overlap in ("bird's eye 0.7", "3-D 0.7")]
+    by = f"onnxruntime {onnxruntime.__version__}, {session.provider}, {cpu_model()}"
+    return Measured(labels, float(np.mean(overlaps)), float(np.mean(aps)), by)
+
+
 def _measure_images(
     variant: Variant,
     precision: str,
@@ -240,7 +297,7 @@ def _run_in_openvino(session: Session) -> str:
     request = compiled.create_infer_request()
     request.set_input_tensor(openvino.Tensor(session.input[None], shared_memory=True))
 
-    def run() -> Mapping[str, NDArray[np.float32]]:
+    def run(n_rows: int = 1) -> Mapping[str, NDArray[np.float32]]:
         request.infer()
         for output in session.card.outputs:
             session.raw[output.kind][...] = request.get_tensor(output.name).data[0]

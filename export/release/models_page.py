@@ -12,7 +12,7 @@ from typing import Any
 from edgeperc.datasets.splits import FOLDS, TEST_DRIVES, VALIDATION_DRIVES
 from edgeperc.evaluation.tables import BANDS
 from edgeperc.types.card import ModelCard
-from edgeperc.types.views import CameraGeometry, TopViewGeometry
+from edgeperc.types.views import CameraGeometry, ObjectGeometry, TopViewGeometry
 from edgeperc.zoo import DEFAULT, MAX_LOSS, Variant, digest, resolve
 
 from ..recipe import Recipe
@@ -21,6 +21,7 @@ NO_AGREEMENT = "--no-agreement"
 
 TASKS = {
     "camera": "a class for every pixel of an image",
+    "objects": "boxes all around, of places where an object may be",
     "range_image": "a class for every point",
     "top_view": "drivable area and vehicles ahead",
 }
@@ -93,7 +94,7 @@ def _size(variant: Variant) -> str:
 def _shipped(variants: Sequence[Variant]) -> Iterable[str]:
     yield from _prose(
         "A name stands for one network and its variants. `Perceiver()` and `edgeperc run PATH` take "
-        f"{' and '.join(f'`{name}`' for name in DEFAULT)}. `NAME:fp32` and `NAME:int8` ask for one variant."
+        f"{', '.join(f'`{name}`' for name in DEFAULT)}. `NAME:fp32` and `NAME:int8` ask for one variant."
     )
     yield from _head("name", ["task", "classes", "view", "files", "terms of the weights"])
     for name in dict.fromkeys(variant.name for variant in variants):
@@ -112,6 +113,8 @@ def _view(card: ModelCard) -> str:
         return f"{view.height} x {view.width} cells of {view.cell_m:g} m, {ranges}"
     if isinstance(view, CameraGeometry):
         return f"{view.height} x {view.width} pixels, images are {view.fit}ed to it"
+    if isinstance(view, ObjectGeometry):
+        return f"{view.n_points} points within {view.margin_m:g} m of each candidate"
     return (
         f"{view.height} x {view.width} pixels, azimuth {view.azimuth_left_deg:g} to {view.azimuth_right_deg:g} degrees"
     )

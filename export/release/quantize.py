@@ -158,12 +158,12 @@ def _drive(file: Path) -> str | None:
     return KittiObjects(root).drives.get(file.stem) if (root / "frames.csv").exists() else None
 
 
-def _saturates() -> bool:
+def saturates() -> bool:
     """Whether this computer adds pairs of 8-bit products in 16 bits, which may saturate: x86 without VNNI."""
     return platform.machine() in ("x86_64", "AMD64") and INT8_FEATURES.isdisjoint(cpu_features())
 
 
-def _folded(path: Path) -> onnx.ModelProto:
+def folded(path: Path) -> onnx.ModelProto:
     """The graph with folded constants (half-precision weights become fp32), and a name for every node."""
     with tempfile.TemporaryDirectory() as folder:
         options = onnxruntime.SessionOptions()
@@ -207,7 +207,7 @@ class Calibrated:
         strength: float | None = None,
     ) -> Calibrated:
         """Calibrate the model of a file on scans, or images, with one of `STRENGTHS`."""
-        model, images = _folded(path), [image[None] for image, _ in views(card, scans)]
+        model, images = folded(path), [image[None] for image, _ in views(card, scans)]
         probes = images[:: max(1, len(images) // N_PROBES)][:N_PROBES]
         outputs = _outputs(model, card, probes)
         names = [name for node in model.graph.node for name in node.output if name]
@@ -455,7 +455,7 @@ def race(
     return times[0], times[1]
 
 
-def _ratio(one: NDArray[np.float64], other: NDArray[np.float64]) -> tuple[float, float, float]:
+def paired_ratio(one: NDArray[np.float64], other: NDArray[np.float64]) -> tuple[float, float, float]:
     """The median of paired ratios, and its 95 % interval by order statistics."""
     ratios = np.sort(other / one)
     half = int(np.ceil(0.98 * np.sqrt(len(ratios))))
@@ -574,17 +574,17 @@ def quantize(
         raise OptionError(f"{path} is of a camera; give --camvid to calibrate and evaluate it on")
     if card.precision != "fp32":
         raise ModelError(f"{path} is in {card.precision}; quantize the model in fp32")
-    seven_bits = _saturates() if seven_bits is None else seven_bits
+    seven_bits = saturates() if seven_bits is None else seven_bits
     model, chosen, kept, noise = _rounded(path, card, calibration.scans, exclude, seven_bits, max_noise)
     share = f"{len(chosen)} of {len(chosen) + len(kept)} convolutions in int8"
     made = {"left_alone": kept, "noise": noise, "weight_bits": 7 if seven_bits else 8}
-    training = _training(path, card, calibration, made)
+    training = training_of(path, card, calibration, made)
     card = replace(card, precision="int8", precisions={}, training=training, parity={}, metrics={})
     card = with_golden(model, card)
     trial = out.with_name(f".{out.name}.trial.onnx")
     try:
         write_card(model, card, trial)
-        speed = _speed(path, share, race(path, trial, n_threads))
+        speed = speed_of(path, share, race(path, trial, n_threads))
         camera = card.view.kind == "camera"
         figures, losses = (_evaluated_on_images if camera else _evaluated_on_scans)(path, trial, out.name, labeled)
         lines = {
@@ -622,7 +622,7 @@ def _rounded(
     return model, chosen, kept, noise
 
 
-def _training(path: Path, card: ModelCard, calibration: Calibration, made: Mapping[str, Any]) -> dict[str, Any]:
+def training_of(path: Path, card: ModelCard, calibration: Calibration, made: Mapping[str, Any]) -> dict[str, Any]:
     """What the card of the int8 model says of its training and of how it was ``made``."""
     (scans, hashes), frames = calibration, card.training.get("frames")
     return dict(card.training) | {
@@ -638,10 +638,10 @@ def _training(path: Path, card: ModelCard, calibration: Calibration, made: Mappi
     }
 
 
-def _speed(path: Path, share: str, times: tuple[NDArray[np.float64], NDArray[np.float64]]) -> str:
+def speed_of(path: Path, share: str, times: tuple[NDArray[np.float64], NDArray[np.float64]]) -> str:
     """The times of both models in words. Raises RefusedError if int8 is not faster."""
     one, other = times
-    ratio, least, most = _ratio(one, other)
+    ratio, least, most = paired_ratio(one, other)
     speed = (
         f"{np.median(one):.1f} ms in fp32, {np.median(other):.1f} in int8, "
         f"{ratio:.2f} times as long ({least:.2f} to {most:.2f})"

@@ -19,25 +19,28 @@ import numpy as np
 import onnx
 import torch
 from numpy.typing import NDArray
-from torch import nn
+from torch import Tensor, nn
 
 from edgeperc.camera.image import ImageScaler
 from edgeperc.errors import EdgepercError
 from edgeperc.inference.decode import decode_classes, decode_top_view
 from edgeperc.inference.projection import make_projector, project
-from edgeperc.inference.session import Session, golden_input
+from edgeperc.inference.session import Session, golden_input, golden_shape
 from edgeperc.preprocess.fitness import FitnessProfile
 from edgeperc.system.atomic import open_atomic
 from edgeperc.types.card import CARD_KEY, Golden, ModelCard
 from edgeperc.types.perception import Box
-from edgeperc.types.views import CameraGeometry
+from edgeperc.types.views import CameraGeometry, ObjectGeometry
 
 from ..cards import card_of
 from ..networks.lodnn import LoDNN
+from ..networks.objects import ObjectNet
 from ..networks.segnet import SegNet
 from ..networks.ssadnet import SSADNet
 from ..recipe import Recipe
 from ..training.checkpoint import build_network, read_checkpoint
+from .object_graph import with_first_look
+from .object_parity import compare_objects
 
 OPSET = 18
 # In standard deviations of the output. Measured: 1e-4 for fp32 convolutions summed in another order, and 0.1 or more
@@ -96,19 +99,36 @@ def to_graph(network: nn.Module, card: ModelCard) -> onnx.ModelProto:
 
     If the card's outputs have blocks, the graph ends where the network's ``blocks`` do.
     """
+    example = torch.from_numpy(golden_input(0, golden_shape(card)))
+    names = [o.name for o in card.outputs]
+    if isinstance(network, ObjectNet):
+        look = _traced(network.look, "forward", example, card.input.name, names)
+        model = with_first_look(look, _traced(network, "closely", example, card.input.name, names))
+        _halve(model.graph)
+        return model
+    has_blocks = any(output.block != (1, 1) for output in card.outputs)
+    model = _traced(network, "blocks" if has_blocks else "forward", example, card.input.name, names)
+    if not isinstance(network, UNPOOLING):
+        _halve(model.graph)
+    return model
+
+
+def _traced(network: nn.Module, method: str, example: Tensor, input_name: str, names: Sequence[str]) -> onnx.ModelProto:
+    """A method of a network as a graph; of an input with three axes, for any length of the first two."""
     exported = network
-    if any(output.block != (1, 1) for output in card.outputs):
+    if method != "forward":
         exported = copy.copy(network)
-        exported.forward = network.blocks  # type: ignore[assignment]  # a method of the networks in edge.py
-    example = torch.from_numpy(golden_input(0, (1, len(card.input.channels), card.view.height, card.view.width)))
+        exported.forward = getattr(network, method)
+    rows: tuple[Any, ...] = ({0: torch.export.Dim("candidates"), 1: torch.export.Dim("points")},)
     with warnings.catch_warnings():  # the exporter warns about its own future changes
         warnings.simplefilter("ignore")
         program = torch.onnx.export(
             exported.eval(),
             (example,),
-            input_names=[card.input.name],
-            output_names=[o.name for o in card.outputs],
+            input_names=[input_name],
+            output_names=[*names],
             opset_version=OPSET,
+            dynamic_shapes=rows if example.ndim == 3 else None,
             dynamo=True,
             external_data=False,
             verbose=False,
@@ -123,8 +143,6 @@ def to_graph(network: nn.Module, card: ModelCard) -> onnx.ModelProto:
         if hasattr(holder, "doc_string"):
             holder.doc_string = ""
     model.producer_name, model.producer_version = "edgeperc", ""
-    if not isinstance(network, UNPOOLING):
-        _halve(model.graph)
     return model
 
 
@@ -168,7 +186,7 @@ def with_golden(model: onnx.ModelProto, card: ModelCard) -> ModelCard:
     import onnxruntime
 
     session = onnxruntime.InferenceSession(model.SerializeToString(), providers=["CPUExecutionProvider"])
-    x = golden_input(0, (1, len(card.input.channels), card.view.height, card.view.width))
+    x = golden_input(0, golden_shape(card))
     outputs = session.run([o.name for o in card.outputs], {card.input.name: x})
     records = {}
     for spec, output in zip(card.outputs, outputs, strict=True):
@@ -192,6 +210,7 @@ def views(card: ModelCard, samples: Sequence[NDArray[Any]]) -> Iterator[tuple[ND
             scaler.fill(sample, image)
             yield image, np.ones(image.shape[1:], np.bool_)
         return
+    assert not isinstance(card.view, ObjectGeometry)  # `compare_objects` makes their input
     projector = make_projector(card.view, card.input)
     for sample in samples:
         projected = project(projector, np.ascontiguousarray(sample, np.float32))
@@ -217,6 +236,10 @@ def verify(network: nn.Module, path: Path, scans: Sequence[NDArray[Any]]) -> dic
     """
     session = Session(path, "cpu")
     card = session.card
+    if isinstance(network, ObjectNet):
+        parity = compare_objects(network, session, scans)
+        _check_parity(path, parity)
+        return parity
     worst, agreement, box_deviation = 0.0, 1.0, 0.0
     for image, returned in views(card, scans):
         with torch.no_grad():
@@ -240,18 +263,25 @@ def verify(network: nn.Module, path: Path, scans: Sequence[NDArray[Any]]) -> dic
             ((kind, logits),) = expected.items()
             labels, expected_labels = (pixel_labels(raw, kind) for raw in (actual[kind], logits))
         agreement = min(agreement, float((labels == expected_labels).mean()))
-    if worst > MAX_DEVIATION or agreement < MIN_AGREEMENT or box_deviation > 0.05:
-        raise ParityError(
-            f"{path}: raw outputs differ by {worst:.3g} standard deviations (at most {MAX_DEVIATION}), labels "
-            f"agree on {agreement:.4%} of the pixels (at least {MIN_AGREEMENT:.2%}), boxes differ by up to "
-            f"{box_deviation:.3g} m (at most 0.05)"
-        )
-    return {
+    parity = {
         "n_scans": len(scans),
         "max_deviation": worst,
         "label_agreement": agreement,
         "box_deviation": box_deviation,
     }
+    _check_parity(path, parity)
+    return parity
+
+
+def _check_parity(path: Path, parity: Mapping[str, float]) -> None:
+    """Raise `ParityError` if a difference exceeds its limit."""
+    worst, agreement, box_deviation = (parity[n] for n in ("max_deviation", "label_agreement", "box_deviation"))
+    if worst > MAX_DEVIATION or agreement < MIN_AGREEMENT or box_deviation > 0.05:
+        raise ParityError(
+            f"{path}: raw outputs differ by {worst:.3g} standard deviations (at most {MAX_DEVIATION}), labels "
+            f"agree on {agreement:.4%} of the pixels or candidates (at least {MIN_AGREEMENT:.2%}), boxes differ by up "
+            f"to {box_deviation:.3g} m (at most 0.05)"
+        )
 
 
 def _deviation(boxes: Sequence[Box], expected: Sequence[Box]) -> float:

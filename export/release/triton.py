@@ -54,7 +54,7 @@ def write_repository(out: Path, models: Sequence[str | Path] = DEFAULT, *, senso
 
 
 def _network_config(card: ModelCard) -> str:
-    shape = (1, len(card.input.channels), card.view.height, card.view.width)
+    shape = [-1 if n is None else n for n in card.input_shape]
     outputs = [
         (o.name, "FP32", [-1 if n is None else n for n in card.output_shape(o.kind)], False) for o in card.outputs
     ]

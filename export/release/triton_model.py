@@ -35,19 +35,24 @@ class TritonPythonModel:
         for session in self._perceive.sessions:
             session.run = partial(self._run, session)  # type: ignore[method-assign]
 
-    def _run(self, session: Session) -> Mapping[str, NDArray[np.float32]]:
+    def _run(self, session: Session, n_rows: int = 1) -> Mapping[str, NDArray[np.float32]]:
         """`Session.run`, by Triton."""
         triton, card = self._triton, session.card
+        of_rows = card.input_shape[0] is None
         response = triton.InferenceRequest(
             model_name=card.name,
             requested_output_names=[output.name for output in card.outputs],
-            inputs=[triton.Tensor(card.input.name, session.input[None])],
+            inputs=[triton.Tensor(card.input.name, session.input[:n_rows] if of_rows else session.input[None])],
             preferred_memory=triton.PreferredMemory(triton.TRITONSERVER_MEMORY_CPU, 0),
         ).exec()
         if response.has_error():
             raise InferenceError(f"{card.name}: {response.error().message()}")
         for output in card.outputs:
-            session.raw[output.kind][:] = triton.get_output_tensor_by_name(response, output.name).as_numpy()[0]
+            answer = triton.get_output_tensor_by_name(response, output.name).as_numpy()
+            if of_rows:
+                session.raw[output.kind][:n_rows] = answer
+            else:
+                session.raw[output.kind][:] = answer[0]
         session.spread()
         return session.outputs
 

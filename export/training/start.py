@@ -17,7 +17,7 @@ import onnx
 import torch
 from torch import Tensor, nn
 
-from edgeperc.inference.session import golden_input
+from edgeperc.inference.session import golden_input, golden_shape
 from edgeperc.types.card import ModelCard
 
 from ..cards import card_of
@@ -50,8 +50,7 @@ def start(
         card, folded = card_of(state["recipe"], version="0"), False
         given = state["best"] or state["averaged"]
         before, frames = [*state["before"], asdict(state["recipe"])], dict(state["frames"])
-    shape = (1, len(own_card.input.channels), own_card.view.height, own_card.view.width)
-    pairs, first = _layers(network, torch.from_numpy(golden_input(0, shape)))
+    pairs, first = _layers(network, torch.from_numpy(golden_input(0, golden_shape(own_card))))
     own = network.state_dict()
     common = {}
     for name, weight in given.items():

@@ -23,7 +23,7 @@ from edgeperc.inference.projection import Projection
 from edgeperc.simulation.samples import IGNORE
 from edgeperc.types.card import InputSpec, ModelCard
 from edgeperc.types.perception import Box
-from edgeperc.types.views import CameraGeometry, RangeImageGeometry, TopViewGeometry
+from edgeperc.types.views import CameraGeometry, ObjectGeometry, RangeImageGeometry, TopViewGeometry
 
 from ..cards import card_of
 from ..data.scans import LabeledScan
@@ -88,7 +88,7 @@ class Task(ABC):
     @property
     def view(self) -> RangeImageGeometry | TopViewGeometry:
         """The grid of the network's input."""
-        assert not isinstance(self.card.view, CameraGeometry)
+        assert not isinstance(self.card.view, CameraGeometry | ObjectGeometry)
         return self.card.view
 
     @property

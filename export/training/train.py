@@ -34,6 +34,10 @@ from ..recipe import Recipe
 from .camera import Camera
 from .checkpoint import build_network, read_checkpoint
 from .images import ImageSamples, ImageWatch, camvid_samples
+from .object_batches import ObjectBatches, ObjectWatch
+from .object_samples import load_samples
+from .object_sets import PASTED, VALIDATION, write_samples
+from .object_task import Objects
 from .ranks import Ranks
 from .samples import RealScans, Samples, loaded, real_scans
 from .start import start
@@ -42,6 +46,8 @@ from .teacher import OnnxTeacher, pseudo_labeled, teach, unlabeled_scans
 from .watch import Watch
 
 WARM_UP_STEPS = 100
+OBJECT_SAMPLES = "object-samples"
+"""Folder beside those of the runs, with the samples of the object network."""
 
 # Of a drive with more frames than this, every sixth is enough to validate on, because neighboring frames look alike.
 FEW_FRAMES = 6
@@ -128,7 +134,12 @@ def _train(recipe: Recipe, out: Path, data: Data, run: Run, ranks: Ranks) -> Pat
     torch.backends.cudnn.benchmark = True  # inputs have one size
 
     # Data.
-    source = (_image_source if recipe.task == "camera" else _scan_source)(recipe, data, run, ranks.device)
+    if recipe.task == "camera":
+        source = _image_source(recipe, data, run, ranks.device)
+    elif recipe.task == "objects":
+        source = _object_source(recipe, out.parent / OBJECT_SAMPLES, data, run)
+    else:
+        source = _scan_source(recipe, data, run, ranks.device)
     samples, watch = source.samples, source.watch
     epoch = max(1, source.n_real // recipe.batch)
     every = epoch if recipe.stop_after else run.checkpoint_every
@@ -196,9 +207,9 @@ def _train(recipe: Recipe, out: Path, data: Data, run: Run, ranks: Ranks) -> Pat
 class _Source(NamedTuple):
     """What a network is trained on and watched on, read."""
 
-    task: Task | Camera
-    samples: Samples | ImageSamples
-    watch: Watch | ImageWatch | None
+    task: Task | Camera | Objects
+    samples: Samples | ImageSamples | ObjectBatches | ObjectBatches
+    watch: Watch | ImageWatch | ObjectWatch | None
     hashes: dict[str, str]
     n_real: int
     teacher: nn.Module | None = None
@@ -242,7 +253,8 @@ def _step(
     optimizer.zero_grad(set_to_none=True)
     total = torch.zeros((), device=ranks.device)
     for inputs, *others in zip(*(array.chunk(recipe.accumulate) for array in arrays), strict=True):
-        x = ranks.part(inputs).contiguous(memory_format=torch.channels_last)
+        x = ranks.part(inputs)
+        x = x.contiguous(memory_format=torch.channels_last if x.ndim == 4 else torch.contiguous_format)
         y = others[: source.samples.n_targets]
         taught: tuple[Any, ...] = tuple(others[source.samples.n_targets :])
         with torch.autocast(ranks.device.type, torch.bfloat16):
@@ -265,10 +277,15 @@ def _step(
 
 
 def _batches(
-    recipe: Recipe, samples: Samples | ImageSamples, state: _State, epoch: int, n_workers: int, ranks: Ranks
+    recipe: Recipe,
+    samples: Samples | ImageSamples | ObjectBatches,
+    state: _State,
+    epoch: int,
+    n_workers: int,
+    ranks: Ranks,
 ) -> Iterator[Sequence[Tensor]]:
     """The batches that are left."""
-    if isinstance(samples, ImageSamples):
+    if not isinstance(samples, Samples):
         return samples.batches(state.step, last_step(recipe, state.curve, epoch))
     return loaded(samples, state.step, recipe.steps, n_workers, ranks)
 
@@ -278,7 +295,7 @@ def _save(
     recipe: Recipe,
     model: _Model,
     state: _State,
-    samples: Samples | ImageSamples,
+    samples: Samples | ImageSamples | ObjectBatches,
     fold: int | None,
 ) -> None:
     with open_atomic(checkpoint) as file:
@@ -303,7 +320,11 @@ def _save(
 
 
 def _resumed(
-    checkpoint: Path, recipe: Recipe, model: _Model, samples: Samples | ImageSamples, device: torch.device
+    checkpoint: Path,
+    recipe: Recipe,
+    model: _Model,
+    samples: Samples | ImageSamples | ObjectBatches,
+    device: torch.device,
 ) -> _State:
     """Load a checkpoint into the model and the samples."""
     kept = read_checkpoint(checkpoint, device)
@@ -323,6 +344,19 @@ def _image_source(recipe: Recipe, data: Data, run: Run, device: torch.device) ->
     task = Camera.of(recipe)
     samples, watch = camvid_samples(task, data.camvid, device)
     return _Source(task, samples, watch, samples.images.hashes, len(samples.images.hashes))
+
+
+def _object_source(recipe: Recipe, folder: Path, data: Data, run: Run) -> _Source:
+    """Candidates of real and simulated scans, whose samples are kept in a folder; those of the fold are watched."""
+    task = Objects.of(recipe)
+    names, hashes = write_samples(folder, data.kitti, data.simulated, data.scan_sets, run.n_workers)
+    watched = [VALIDATION if data.fold is None else f"kitti-{data.fold}"]
+    trained = [name for name in names if name != VALIDATION and name.removesuffix(f"-{PASTED}") not in watched]
+    if not trained:
+        raise ValueError("no scans to train objects on; give --kitti, --scans, --simulated or several of them")
+    seen = {name: of for source in trained for name, of in hashes[source].items()}
+    watch = ObjectWatch(task, load_samples(folder, watched)) if watched[0] in names else None
+    return _Source(task, ObjectBatches(task, load_samples(folder, trained), trained), watch, seen, len(seen))
 
 
 def _scan_source(recipe: Recipe, data: Data, run: Run, device: torch.device) -> _Source:

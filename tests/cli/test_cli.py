@@ -21,7 +21,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from test_captures import vlp16_packets, write_pcap
 
-from cli_helpers import POINTSEG, SSADNET, run, write_scan
+from cli_helpers import OBJECTS, POINTSEG, SSADNET, run, write_scan
 from edgeperc import __version__, live, zoo
 from edgeperc.cli.arguments import PRECISIONS, PROVIDERS
 from edgeperc.cli.evaluation.scans import figure_lines
@@ -54,10 +54,10 @@ class FakePerceiver:
         self.given = (list(models), sensor, provider, n_threads, on_mismatch)
         self.sensor = sensor
         self.more = more
-        known = {"pointseg": POINTSEG, "ssadnet": SSADNET}
+        known = {"objects": OBJECTS, "pointseg": POINTSEG, "ssadnet": SSADNET}
         for name in models:
             if name not in known:
-                raise ModelFileError(f"no model is called {name!r}.\nShipped: pointseg, ssadnet.")
+                raise ModelFileError(f"no model is called {name!r}.\nShipped: objects, pointseg, ssadnet.")
         if len(set(models)) < len(self.given[0]):
             raise OptionError(f"models {self.given[0]} have one view; n_threads is {n_threads}")
         self.cards = tuple(known[name] for name in models)
@@ -215,7 +215,7 @@ def test_run_prints_a_line_a_scan(
     assert "drivable 100.0 m2" in lines[1]
     assert "boxes: 1 car" in lines[1]
     assert "car 600, pedestrian 0, cyclist 0" in lines[1]
-    assert fake.made[0].given == (["ssadnet", "pointseg"], "os1-64", "cpu", 2, "ignore")
+    assert fake.made[0].given == ([*zoo.DEFAULT], "os1-64", "cpu", 2, "ignore")
     options = ("--boxes-from", "clusters", "--full-turn", "--precision", "bf16", "--adapt", "none", "--trusted")
     assert run("run", scans[0], *options, "--no-agreement") == 0
     usual = {"precision": "auto", "adapt": "both", "boxes_from": "both", "full_turn": False, "agree": True}
@@ -243,7 +243,7 @@ def test_json_is_one_object_a_scan_and_nothing_else(tmp_path: Path, capsys: pyte
         "n_dropped": 0,
         "dropped": {"not_finite": 0, "too_near": 0, "ego": 0},
         "stage_ms": {"project": 1.0, "infer": 20.25},
-        "providers": {"ssadnet": "CPUExecutionProvider (fp32)", "pointseg": "CPUExecutionProvider (fp32)"},
+        "providers": dict.fromkeys(zoo.DEFAULT, "CPUExecutionProvider (fp32)"),
         "boxes": [
             {
                 "label": "car",
@@ -569,7 +569,7 @@ def test_wrong_usage(tmp_path: Path, capsys: pytest.CaptureFixture[str], fake: t
         assert usage_code("run", scan, *arguments) == 2
         assert words in capsys.readouterr().err
     for arguments, words in [
-        (("--model", "nonesuch"), "no model is called 'nonesuch'. Shipped: pointseg, ssadnet."),
+        (("--model", "nonesuch"), "no model is called 'nonesuch'. Shipped: objects, pointseg, ssadnet."),
         (
             ("--model", "pointseg", "--model", "pointseg"),
             "--model ['pointseg', 'pointseg'] have one view; --threads is",

@@ -36,7 +36,7 @@ from edgeperc.simulation.samples import FIRST_SEED, IGNORE
 from edgeperc.types.card import InputSpec, ModelCard, OutputSpec
 from edgeperc.types.perception import Box, Perception, PointLabels, TopView
 from edgeperc.types.views import RangeImageGeometry, TopViewGeometry
-from edgeperc.zoo import shipped_models
+from edgeperc.zoo import DEFAULT, shipped_models
 
 VIEW = TopViewGeometry()
 POINTS = ("background", "car", "pedestrian", "cyclist")
@@ -789,7 +789,7 @@ def test_the_command_on_simulated_scans(tmp_path: Path, capsys: pytest.CaptureFi
         assert words in printed.out
     result = json.loads(out.read_text())
     assert result["command"].startswith("edgeperc eval simulation:2 --json ")
-    assert set(result["models"]) == {"ssadnet", "pointseg"}
+    assert set(result["models"]) == {*DEFAULT}
     assert (result["split"], result["fold"]) == ("test", None)
     simulated = result["simulated"]
     groups = {

@@ -129,7 +129,7 @@ def test_wrong_usage_is_reported_in_one_line(tmp_path: Path, capsys: pytest.Capt
         ValueError, match="kulseg has no network for small computers; expected lodnn or pointseg or ssadnet"
     ):
         build(Recipe("kulseg", edge=True))
-    with pytest.raises(ValueError, match="network is 'yolo'; expected camseg, fcn16, fcn8, kulseg, lodnn, pointseg"):
+    with pytest.raises(ValueError, match="network is 'yolo'; expected camseg, fcn16, fcn8, kulseg, lodnn, objects"):
         build(Recipe("yolo"))
     assert main(["verify", str(tmp_path / "no.pt"), str(tmp_path / "no.onnx")]) == 2
     assert "no.pt" in capsys.readouterr().err

@@ -1,0 +1,310 @@
+"""Places where an object may be: rectangles around groups of points above the ground, of no class.
+
+Points are sorted into small cells once, for the groups here and for the crops (`objects.crops`). Groups are found at
+three scales, because an object next to a wall is linked with it at a large distance, and a far one falls apart at a
+small distance. A detector of the top view adds its boxes.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import PointsError
+from ..ground.scan import Scan
+from ..system.kernel_cache import njit
+from ..types.points import read_only
+
+CELL_M = 0.2
+REACH_M = 80.0
+N_SIDE = round(2.0 * REACH_M / CELL_M)
+N_ANGLES = 30
+MAX_FITTED = 64  # points that a heading is fitted to
+MIN_POINTS = 4
+MAX_LENGTH_M = 14.0
+MIN_TOP_M = 0.45  # lower groups are kerbs and grass
+MIN_DETECTOR_SCORE = 0.05  # of a box of a detector that is a candidate
+SAME = 0.8  # a group with this share of the cells of the group around it is the same candidate
+
+
+class Scale(NamedTuple):
+    """Which points are linked: those of heights above the ground [m], at a distance; the longest group [m].
+
+    Beyond ``far_m``, the distance grows in proportion to the range.
+    """
+
+    low_m: float
+    high_m: float
+    link_m: float
+    longest_m: float
+
+
+# The first one holds the others. The last one is for people beside walls or each other: only their upper bodies are
+# apart.
+SCALES = (Scale(0.2, 2.6, 0.5, MAX_LENGTH_M), Scale(0.3, 2.2, 0.3, MAX_LENGTH_M), Scale(0.9, 2.2, 0.3, 2.5))
+
+
+class Cells(NamedTuple):
+    """Points above the ground by the square cells that they lie in.
+
+    number : (N_SIDE, N_SIDE) int32, of each cell, x by y; -1 without a point.
+    flat : (k,) int32, flat index of each numbered cell.
+    starts : (k + 1,) int32, where the points of a cell start in ``rows``.
+    rows : (m,) int32, rows of the points, cell by cell.
+    """
+
+    number: NDArray[np.int32]
+    flat: NDArray[np.int32]
+    starts: NDArray[np.int32]
+    rows: NDArray[np.int32]
+
+
+class Candidates(NamedTuple):
+    """Rectangles x, y, length, width [m], yaw [rad], (m, 5) float64, and the cells that they were found in."""
+
+    rectangles: NDArray[np.float64]
+    cells: Cells
+
+
+def cell_buffer() -> NDArray[np.int32]:
+    """Memory for `Cells.number`, which a caller may use for one scan after the other."""
+    return np.empty((N_SIDE, N_SIDE), np.int32)
+
+
+def sort_into_cells(scan: Scan, height_range_m: tuple[float, float], number: NDArray[np.int32] | None = None) -> Cells:
+    """Sort the points of a scan whose height above the ground is in a range [m]; ``number`` is overwritten."""
+    n = len(scan.points)
+    number = cell_buffer() if number is None else number
+    flat, rows, of_point = np.empty((3, n), np.int32)
+    starts = np.empty(n + 1, np.int32)
+    low, high = height_range_m
+    n_cells, n_rows = fill_cells(
+        scan.points, scan.ground.height_m, low, high, Cells(number, flat, starts, rows), of_point
+    )
+    return Cells(number, flat[:n_cells], starts[: n_cells + 1], rows[:n_rows])
+
+
+def find_candidates(scan: Scan, cells: Cells, boxes: NDArray[np.float64], distance_per_m: float = 0.015) -> Candidates:
+    """Find where an object may be.
+
+    boxes : (k, 5) float64, rectangles of other origin, such as a detector's: x, y, length, width [m], yaw [rad].
+    distance_per_m : as in `objects.cluster.find_clusters`: twice the angle between neighboring beams [rad].
+    Returns: the groups at each of the `SCALES`, then ``boxes``.
+    Raises PointsError.
+    """
+    if boxes.ndim != 2 or boxes.shape[1] != 5:
+        raise PointsError(f"got boxes of shape {boxes.shape}; expected (k, 5): x, y, length, width, yaw")
+    if not 0.0 <= distance_per_m <= 1.0:
+        raise PointsError(f"got distance_per_m={distance_per_m}; expected radians in 0..1")
+    n_cells = len(cells.flat)
+    around, sizes = np.full(n_cells, -1, np.int32), np.empty(n_cells, np.int32)
+    found = []
+    for k, scale in enumerate(SCALES):
+        group, order = np.empty((2, n_cells), np.int32)
+        first = np.empty(n_cells + 1, np.int32)
+        n_groups = fill_groups_of_cells(
+            scan.ground.height_m, cells, scale, distance_per_m * scale.link_m / SCALES[0].link_m, group, order, first
+        )
+        fits = np.empty((n_groups, 5))
+        n = fit_groups(
+            scan.points, scan.ground.height_m, cells, scale, Groups(order, first[: n_groups + 1], around, sizes), fits
+        )
+        found.append(fits[:n])
+        if k == 0:
+            around = group
+            sizes = np.diff(first[: n_groups + 1])
+    return Candidates(np.concatenate([*found, read_only(boxes, np.float64)]), cells)
+
+
+class Groups(NamedTuple):
+    """Groups of cells, and the larger groups that they are parts of.
+
+    order : (k,) int32, numbers of cells, group by group.
+    first : (groups + 1,) int32, where the cells of a group start in ``order``.
+    around : (cells,) int32, of each cell, its group at the first scale; -1: there is none.
+    sizes : (groups of the first scale,) int32, numbers of their cells.
+    """
+
+    order: NDArray[np.int32]
+    first: NDArray[np.int32]
+    around: NDArray[np.int32]
+    sizes: NDArray[np.int32]
+
+
+@njit(cache=True, nogil=True)
+def fill_cells(
+    points: NDArray[np.float32],
+    height: NDArray[np.float32],
+    low: float,
+    high: float,
+    cells: Cells,
+    of_point: NDArray[np.int32],
+) -> tuple[int, int]:
+    """Write `Cells` with arrays as long as the scan (``starts``: one more); return how many cells and rows there are.
+
+    ``of_point`` (n,) is overwritten with the number of each point's cell, -1 for none.
+    """
+    number, flat, starts, rows = cells.number.reshape(-1), cells.flat, cells.starts, cells.rows
+    for c in range(number.shape[0]):
+        number[c] = -1
+    n_cells, n_rows = 0, 0
+    for i in range(points.shape[0]):
+        of_point[i] = -1
+        x, y = points[i, 0], points[i, 1]
+        if low < height[i] < high and abs(x) < REACH_M and abs(y) < REACH_M:
+            row = min(int((x + REACH_M) / CELL_M), N_SIDE - 1)
+            col = min(int((y + REACH_M) / CELL_M), N_SIDE - 1)
+            c = row * N_SIDE + col
+            if number[c] < 0:
+                number[c] = n_cells
+                flat[n_cells] = c
+                starts[n_cells] = 0
+                n_cells += 1
+            of_point[i] = number[c]
+            starts[number[c]] += 1
+            n_rows += 1
+    total = 0
+    for k in range(n_cells):
+        total += starts[k]
+        starts[k] = total
+    starts[n_cells] = total
+    for i in range(points.shape[0] - 1, -1, -1):
+        if of_point[i] >= 0:
+            starts[of_point[i]] -= 1
+            rows[starts[of_point[i]]] = i
+    return n_cells, n_rows
+
+
+@njit(cache=True, nogil=True)
+def fill_groups_of_cells(
+    height: NDArray[np.float32],
+    cells: Cells,
+    scale: Scale,
+    per_m: float,
+    group: NDArray[np.int32],
+    order: NDArray[np.int32],
+    first: NDArray[np.int32],
+) -> int:
+    """Link cells with a point in the scale's heights whose middles are near enough; return the number of groups.
+
+    ``group`` (k,) gets the group of each cell, -1 for none; ``order`` and ``first`` are those of `Groups`.
+    """
+    number, flat, starts, rows = cells.number, cells.flat, cells.starts, cells.rows
+    for k in range(flat.shape[0]):
+        group[k] = -1
+        for at in range(starts[k], starts[k + 1]):
+            if scale.low_m < height[rows[at]] < scale.high_m:
+                group[k] = -2  # takes part, and is in no group yet
+                break
+    n_groups, end = 0, 0
+    first[0] = 0
+    for seed in range(flat.shape[0]):
+        if group[seed] != -2:
+            continue
+        group[seed] = n_groups
+        order[end] = seed
+        at = end
+        end += 1
+        while at < end:
+            row, col = flat[order[at]] // N_SIDE, flat[order[at]] % N_SIDE
+            at += 1
+            x, y = (row + 0.5) * CELL_M - REACH_M, (col + 0.5) * CELL_M - REACH_M
+            reach = max(scale.link_m, per_m * math.sqrt(x * x + y * y)) / CELL_M
+            far = int(reach)
+            for r in range(max(row - far, 0), min(row + far, N_SIDE - 1) + 1):
+                for c in range(max(col - far, 0), min(col + far, N_SIDE - 1) + 1):
+                    k = number[r, c]
+                    if k >= 0 and group[k] == -2 and (r - row) * (r - row) + (c - col) * (c - col) <= reach * reach:
+                        group[k] = n_groups
+                        order[end] = k
+                        end += 1
+        n_groups += 1
+        first[n_groups] = end
+    return n_groups
+
+
+@njit(cache=True, nogil=True)
+def fit_groups(
+    points: NDArray[np.float32],
+    height: NDArray[np.float32],
+    cells: Cells,
+    scale: Scale,
+    groups: Groups,
+    fits: NDArray[np.float64],
+) -> int:
+    """Write the rectangles of the groups that may be an object into ``fits`` (groups, 5); return their number.
+
+    Left out are groups of few points, those that are low or long, and those that are about the group around them.
+    """
+    starts, of_cells = cells.starts, cells.rows
+    order, bounds, around, sizes = groups.order, groups.first, groups.around, groups.sizes
+    rows = np.empty(of_cells.shape[0], np.int32)
+    n_fits = 0
+    for g in range(bounds.shape[0] - 1):
+        start, end = bounds[g], bounds[g + 1]
+        outer = around[order[start]]
+        if outer >= 0 and end - start >= SAME * sizes[outer]:
+            continue
+        n, top = 0, 0.0
+        low_x, low_y, high_x, high_y = math.inf, math.inf, -math.inf, -math.inf
+        for k in order[start:end]:
+            for at in range(starts[k], starts[k + 1]):
+                i = of_cells[at]
+                if scale.low_m < height[i] < scale.high_m:
+                    rows[n] = i
+                    n += 1
+                    top = max(top, height[i])
+                    low_x, high_x = min(low_x, points[i, 0]), max(high_x, points[i, 0])
+                    low_y, high_y = min(low_y, points[i, 1]), max(high_y, points[i, 1])
+        if n < MIN_POINTS or top < MIN_TOP_M or math.hypot(high_x - low_x, high_y - low_y) > scale.longest_m:
+            continue
+        fit_rectangle(points, rows[:n], fits[n_fits])
+        n_fits += 1
+    return n_fits
+
+
+@njit(cache=True, nogil=True)
+def fit_rectangle(points: NDArray[np.float32], rows: NDArray[np.int32], rectangle: NDArray[np.float64]) -> None:
+    """Write the rectangle around points seen from above whose sides most of them are near; its length is not shorter.
+
+    As `objects.boxes.fill_rectangle`, with fewer headings and fewer points.
+    """
+    step = (len(rows) + MAX_FITTED - 1) // MAX_FITTED
+    cos, sin, merit = np.empty(N_ANGLES), np.empty(N_ANGLES), np.empty(N_ANGLES)
+    low_u, high_u = np.empty(N_ANGLES), np.empty(N_ANGLES)
+    low_v, high_v = np.empty(N_ANGLES), np.empty(N_ANGLES)
+    for k in range(N_ANGLES):
+        angle = 0.5 * math.pi * k / N_ANGLES
+        cos[k], sin[k], merit[k] = math.cos(angle), math.sin(angle), 0.0
+        low_u[k], high_u[k], low_v[k], high_v[k] = math.inf, -math.inf, math.inf, -math.inf
+    for at in range(0, len(rows), step):
+        x, y = np.float64(points[rows[at], 0]), np.float64(points[rows[at], 1])
+        for k in range(N_ANGLES):
+            u, v = cos[k] * x + sin[k] * y, cos[k] * y - sin[k] * x
+            low_u[k], high_u[k] = min(low_u[k], u), max(high_u[k], u)
+            low_v[k], high_v[k] = min(low_v[k], v), max(high_v[k], v)
+    for at in range(0, len(rows), step):
+        x, y = np.float64(points[rows[at], 0]), np.float64(points[rows[at], 1])
+        for k in range(N_ANGLES):
+            u, v = cos[k] * x + sin[k] * y, cos[k] * y - sin[k] * x
+            gap = min(min(u - low_u[k], high_u[k] - u), min(v - low_v[k], high_v[k] - v))
+            merit[k] += 1.0 / max(gap, 0.05)
+    best = 0
+    for k in range(N_ANGLES):
+        best = k if merit[k] > merit[best] else best
+    least_u, most_u, least_v, most_v = math.inf, -math.inf, math.inf, -math.inf
+    for i in rows:
+        x, y = np.float64(points[i, 0]), np.float64(points[i, 1])
+        u, v = cos[best] * x + sin[best] * y, cos[best] * y - sin[best] * x
+        least_u, most_u, least_v, most_v = min(least_u, u), max(most_u, u), min(least_v, v), max(most_v, v)
+    u, v = 0.5 * (least_u + most_u), 0.5 * (least_v + most_v)
+    rectangle[0] = u * cos[best] - v * sin[best]
+    rectangle[1] = u * sin[best] + v * cos[best]
+    rectangle[2], rectangle[3] = most_u - least_u, most_v - least_v
+    rectangle[4] = 0.5 * math.pi * best / N_ANGLES
+    if rectangle[3] > rectangle[2]:
+        rectangle[2], rectangle[3] = rectangle[3], rectangle[2]
+        rectangle[4] += 0.5 * math.pi

@@ -1,0 +1,260 @@
+"""Training samples of the object network: candidates of labeled scans, as the runtime finds and crops them.
+
+A sample is a crop with more points than the network takes, and the object that its candidate covers. No score and no
+label of another network is in it: those are overfitted on the training drives.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+from edgeperc.ground.planes import find_ground
+from edgeperc.ground.scan import Scan
+from edgeperc.objects.candidates import MIN_DETECTOR_SCORE, Candidates, find_candidates, sort_into_cells
+from edgeperc.objects.crops import crop_candidates
+from edgeperc.perceiver import Perceiver
+from edgeperc.simulation.samples import BOX_ABOVE_GROUND_M, IGNORE
+from edgeperc.system.atomic import open_atomic
+from edgeperc.types.geometry import oriented_iou, rectangles
+from edgeperc.types.mounting import MODEL_HEIGHT_M, MODEL_MOUNTING
+from edgeperc.types.perception import Box
+from edgeperc.types.points import read_only
+from edgeperc.types.sensor import get_sensor
+
+from ..cards import OBJECT_CLASSES, OBJECT_VIEW, box_sizes
+from ..data.processes import mapped
+from ..data.scans import LabeledScan
+from ..data.simulate import TRAINING_SENSOR
+from .object_task import VEHICLE
+
+N_STORED = 192  # points of a crop; training draws from them
+STORED_MARGIN_M = 1.5
+MAX_NEGATIVES = {"real": 120, "simulated": 48}  # groups without an object, of each scan
+PSEUDO_BOXES = 0.3  # share of the groups that also become a box of a vehicle's or a person's size
+PSEUDO_ODDS = {"car": 0.6, "van": 0.15, "truck": 0.05, "pedestrian": 0.1, "cyclist": 0.1}
+MIN_RETURNS = 3  # of an object that is a sample
+PART = 100  # scans
+
+GROUP, DETECTED, TRUE = 0, 1, 2  # origins of candidates
+BACKGROUND = 0
+UNKNOWN = -2  # nothing is known of what is there
+NAMES = {name: k for k, name in enumerate(OBJECT_CLASSES)} | {
+    "person_sitting": OBJECT_CLASSES.index("pedestrian"),
+    "background": BACKGROUND,
+    "construction vehicle": VEHICLE,
+}
+
+
+class ObjectSamples(NamedTuple):
+    """Samples; all in the frame of the models.
+
+    points : (m, N_STORED, 4) float16, as in `objects.crops.Crops`.
+    counts : (m,) int32.
+    rectangles : (m, 5) float32, of the candidates.
+    level : (m,) float32.
+    origin : (m,) int8, `GROUP`, `DETECTED` or `TRUE`.
+    classes : (m,) int8, index into the classes of objects, or `VEHICLE`.
+    truth : (m, 7) float32, x, y, z of the middle, length, width, height [m], yaw [rad]; 0 for background.
+    objects : (m,) int64, the same for all samples of one object; for background, of one scan.
+    sources : (m,) int8, numbers of the sources; `load_samples` knows them.
+    """
+
+    points: NDArray[np.float16]
+    counts: NDArray[np.int32]
+    rectangles: NDArray[np.float32]
+    level: NDArray[np.float32]
+    origin: NDArray[np.int8]
+    classes: NDArray[np.int8]
+    truth: NDArray[np.float32]
+    objects: NDArray[np.int64]
+    sources: NDArray[np.int8]
+
+
+def build_samples(
+    folder: Path,
+    name: str,
+    scans: Sequence[tuple[str, LabeledScan | Path | Callable[[], LabeledScan]]],
+    *,
+    real: bool,
+    n_workers: int = 0,
+) -> None:
+    """Write the samples of scans into ``folder``, in parts; finished parts are kept.
+
+    name : of the source.
+    scans : the drive, and the scan, the file of one, or what makes it.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    parts = [scans[first : first + PART] for first in range(0, len(scans), PART)]
+    missing = [k for k in range(len(parts)) if not (folder / f"{name}-{k:03d}.npz").exists()]
+    write = partial(_write_part, folder=folder, name=name, parts=parts, real=real)
+    with mapped(write, missing, n_workers) as done:
+        for _ in tqdm(done, desc=f"candidates of {name}", unit="part", total=len(missing)):
+            pass
+
+
+def _write_part(
+    part: int,
+    *,
+    folder: Path,
+    name: str,
+    parts: Sequence[Sequence[tuple[str, LabeledScan | Path | Callable[[], LabeledScan]]]],
+    real: bool,
+) -> None:
+    perceive = Perceiver(
+        "ssadnet",
+        mounting=MODEL_MOUNTING,
+        n_threads=1,
+        precision="fp32",
+        score_threshold=MIN_DETECTOR_SCORE,
+        boxes_from="network",
+        agree=False,
+        on_mismatch="ignore",
+        adapt="none",
+    )
+    samples = []
+    for k, (drive, given) in enumerate(parts[part]):
+        if isinstance(given, LabeledScan):
+            scan = given
+        else:
+            scan = LabeledScan.load(given) if isinstance(given, Path) else given()
+        rng = np.random.default_rng((part, k, len(name)))
+        samples.append(samples_of(scan, f"{name}/{drive}", perceive, rng, real=real))
+    joined = ObjectSamples(*(np.concatenate(arrays) for arrays in zip(*samples, strict=True)))
+    with open_atomic(folder / f"{name}-{part:03d}.npz") as file:
+        np.savez(file, **joined._asdict())
+
+
+def load_samples(folder: Path, names: Sequence[str]) -> ObjectSamples:
+    """Read the samples of sources; their numbers are the places of their names. Raises ValueError."""
+    read = []
+    for source, name in enumerate(names):
+        files = sorted(folder.glob(f"{name}-[0-9][0-9][0-9].npz"))
+        if not files:
+            raise ValueError(f"{folder} has no samples of {name}; write them first")
+        for file in files:
+            with np.load(file, allow_pickle=False) as data:
+                part = ObjectSamples(**{field: data[field] for field in ObjectSamples._fields})
+            read.append(part._replace(sources=np.full(len(part.counts), source, np.int8)))
+    return ObjectSamples(*(np.concatenate(arrays) for arrays in zip(*read, strict=True)))
+
+
+def samples_of(
+    labeled: LabeledScan, drive: str, perceive: Perceiver, rng: np.random.Generator, *, real: bool
+) -> ObjectSamples:
+    """The samples of one scan; ``perceive`` finds boxes in the top view."""
+    points = read_only(labeled.points)
+    scan = Scan.of(points, find_ground(points, mount_height_m=MODEL_HEIGHT_M))
+    cells = sort_into_cells(scan, OBJECT_VIEW.height_range_m)
+    detected = rectangles(perceive(points).boxes)
+    sensor = labeled.sensor or get_sensor(TRAINING_SENSOR)
+    found = find_candidates(scan, cells, detected, sensor.link_per_m)
+    truths = [(box, n) for box, n in zip(labeled.boxes, labeled.counts, strict=True)]
+    boxes = [box for box, _ in truths]
+    known = np.array([n >= MIN_RETURNS and box.label in NAMES for box, n in truths], np.bool_)
+    n_groups = len(found.rectangles) - len(detected)
+    pseudo = _pseudo_boxes(found.rectangles[rng.permutation(n_groups)[: int(PSEUDO_BOXES * n_groups)]], rng)
+    true = rectangles(box for box, use in zip(boxes, known, strict=True) if use and NAMES[box.label] != BACKGROUND)
+    places = np.concatenate([found.rectangles, pseudo, true])
+    origin = np.repeat(
+        np.array([GROUP, DETECTED, DETECTED, TRUE], np.int8), [n_groups, len(detected), len(pseudo), len(true)]
+    )
+    of_box = _assigned(scan, labeled.labels, places, boxes)
+    crops = crop_candidates(scan, found._replace(rectangles=places), N_STORED, STORED_MARGIN_M)
+    labels = np.array([NAMES.get(box.label, UNKNOWN) if n >= MIN_RETURNS else UNKNOWN for box, n in truths], np.int8)
+    classes = np.where(of_box >= 0, np.append(labels, np.int8(0))[of_box], np.where(of_box == -1, BACKGROUND, UNKNOWN))
+    keep = (classes != UNKNOWN) & (crops.counts >= MIN_RETURNS)
+    negatives = np.flatnonzero(keep & (classes == BACKGROUND) & (origin == GROUP))
+    keep[rng.permutation(negatives)[MAX_NEGATIVES["real" if real else "simulated"] :]] = False
+    at = np.flatnonzero(keep)
+    truth = np.array([[*box.center, *box.size, box.yaw] for box in boxes], np.float32).reshape(-1, 7)
+    if not real:
+        truth[:, 2] += BOX_ABOVE_GROUND_M  # as KITTI's boxes are
+    truth = np.where((classes == BACKGROUND)[:, None], 0.0, np.concatenate([truth, np.zeros((1, 7))])[of_box])
+    keys = np.array([hash_of(drive, box) for box in boxes] + [hash_of(drive, None)], np.int64)
+    return ObjectSamples(
+        crops.points[at].astype(np.float16),
+        crops.counts[at],
+        places[at].astype(np.float32),
+        crops.level[at].astype(np.float32),
+        origin[at],
+        classes[at].astype(np.int8),
+        truth[at].astype(np.float32),
+        np.where(classes == BACKGROUND, keys[-1], keys[of_box])[at],
+        np.zeros(len(at), np.int8),
+    )
+
+
+def hash_of(drive: str, box: Box | None) -> int:
+    """A number of an object in all scans of a drive, by its class and its size, or of the drive's background."""
+    key = (drive, "", 0.0) if box is None else (drive, box.label, *(round(side, 2) for side in box.size))
+    return int.from_bytes(hashlib.sha256(repr(key).encode()).digest()[:8], "little", signed=True)
+
+
+def _pseudo_boxes(groups: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.float64]:
+    """Rectangles of usual sizes whose near corner is that of a group: what a detector that errs would find there."""
+    sizes = box_sizes()
+    places = groups[np.max(groups[:, 2:4], axis=1, initial=0.0) < 8.0].copy() if len(groups) else groups
+    names = rng.choice([*PSEUDO_ODDS], len(places), p=[*PSEUDO_ODDS.values()])
+    for place, name in zip(places, names, strict=True):
+        length, width, _ = np.array(sizes[str(name)]) * np.exp(rng.normal(0.0, 0.08, 3))
+        place[4] += rng.normal(0.0, 0.1) + (math.pi / 2.0 if rng.random() < 0.3 else 0.0)
+        cos, sin = math.cos(place[4]), math.sin(place[4])
+        ahead, left = cos * place[0] + sin * place[1], cos * place[1] - sin * place[0]
+        grown = [max(length - place[2], 0.0), max(width - place[3], 0.0)]
+        along, across = 0.5 * math.copysign(grown[0], ahead), 0.5 * math.copysign(grown[1], left)
+        place[0] += cos * along - sin * across + rng.normal(0.0, 0.2)
+        place[1] += sin * along + cos * across + rng.normal(0.0, 0.2)
+        place[2:4] = length, width
+    return places
+
+
+def _assigned(
+    scan: Scan, labels: NDArray[np.uint8], places: NDArray[np.float64], boxes: Sequence[Box]
+) -> NDArray[np.int64]:
+    """The row of the object that each candidate covers, (m,); -1: none, -2: unknown or a part of one.
+
+    A candidate covers an object if they overlap by more than 0.4 (IoU), or if more than 0.6 of its points are the
+    object's and more than 0.3 of the object's are its own. What shares less than that, but more than a tenth or a
+    quarter, is neither an object nor background.
+    """
+    unknown = read_only(np.column_stack([scan.points[:, :3], labels == IGNORE]))
+    marked = Scan.of(unknown, scan.ground)
+    cells = sort_into_cells(scan, (0.15, 4.0))
+    crops = crop_candidates(marked, Candidates(places, cells), 64, 0.05)
+    of_box = np.where(crops.points[:, :, 3].mean(axis=1) > 0.5, -2, -1)
+    if not boxes or not len(places):
+        return of_box
+    true = rectangles(boxes)
+    iou = oriented_iou(places, true)
+    above = scan.points[cells.rows, :2].astype(np.float64)
+    shared = np.zeros(iou.shape)
+    n_true = np.zeros(len(true))
+    for k, box in enumerate(true):
+        inside = _within(above, box, 0.1)
+        n_true[k] = np.count_nonzero(inside)
+        own = above[inside]
+        for row in np.flatnonzero(np.hypot(*(places[:, :2] - box[:2]).T) < 10.0).tolist() if len(own) else ():
+            shared[row, k] = np.count_nonzero(_within(own, places[row], 0.05))
+    of_place, of_true = shared / np.maximum(crops.counts, 1)[:, None], shared / np.maximum(n_true, 1.0)
+    covers = (iou > 0.4) | ((of_place > 0.6) & (of_true > 0.3))
+    some = (iou > 0.1) | (of_place > 0.25) | (of_true > 0.25)
+    best = np.where(covers, iou + of_place + of_true, -1.0).argmax(axis=1)
+    return np.where(covers.any(axis=1), best, np.where(some.any(axis=1), -2, of_box))
+
+
+def _within(xy: NDArray[np.float64], rectangle: NDArray[np.float64], margin_m: float) -> NDArray[np.bool_]:
+    """Which points (n, 2) are in a rectangle grown by a margin."""
+    x, y, length, width, yaw = rectangle.tolist()
+    dx, dy, cos, sin = xy[:, 0] - x, xy[:, 1] - y, math.cos(yaw), math.sin(yaw)
+    along, across = np.abs(cos * dx + sin * dy), np.abs(cos * dy - sin * dx)
+    found: NDArray[np.bool_] = (along < 0.5 * length + margin_m) & (across < 0.5 * width + margin_m)
+    return found

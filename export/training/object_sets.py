@@ -1,0 +1,93 @@
+"""The sources of the object network's training samples: KITTI by folds, simulated scans, and sets of other sensors."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cache, partial
+from pathlib import Path
+
+import numpy as np
+
+from edgeperc.datasets.kitti import KittiObjects, scan_hash
+from edgeperc.datasets.scan_folder import ScanFolder
+from edgeperc.datasets.splits import FOLDS, fold_of
+
+from ..data.augment import Augmentation, ObjectBank, augmented
+from ..data.scan_sets import read_scan_set
+from ..data.scans import LabeledScan
+from .object_samples import build_samples
+
+VALIDATION = "validation"
+PASTED = "pasted"
+"""Suffix of a source: the scans of another one with objects of its scans pasted in."""
+N_VARIANTS = 4  # of each scan
+ODDS = {"car": 0.35, "van": 0.15, "truck": 0.05, "pedestrian": 0.25, "cyclist": 0.2}
+PASTING = Augmentation(n_pasted=6.0, odds=ODDS, n_negatives=2.0, half_beams=0.1, weather=0.05, tilt_deg=0.25)
+
+
+def write_samples(
+    out: Path,
+    kitti: Path | None = None,
+    simulated: Path | None = None,
+    scan_sets: Sequence[ScanFolder] = (),
+    n_workers: int = 0,
+) -> tuple[list[str], dict[str, dict[str, str]]]:
+    """Write the samples of all scans; those in ``out`` are kept.
+
+    Each fold of KITTI's training drives is a source of its own, so that a run can leave it out. So are the validation
+    drives, which are watched only. Test drives are not read.
+
+    Returns names: of the sources, `VALIDATION` among them if there is KITTI.
+    Returns hashes: of each source, name of each real scan -> its `datasets.kitti.scan_hash`.
+    """
+    names: list[str] = []
+    hashes: dict[str, dict[str, str]] = {}
+    if kitti is not None:
+        objects = KittiObjects(kitti)
+        train = objects.names("train")
+        groups = {f"kitti-{k}": [n for n in train if fold_of(objects.drives[n]) == k] for k in range(len(FOLDS))}
+        groups |= {"kitti-other": [n for n in train if fold_of(objects.drives[n]) is None]}
+        groups |= {VALIDATION: objects.names("validation")}
+        for name, scans in groups.items():
+            if scans:
+                frames = [objects.frame(scan) for scan in scans]
+                labeled = [(frame.drive, partial(LabeledScan.from_frame, frame)) for frame in frames]
+                hashes[name] = {frame.name: scan_hash(frame.points) for frame in frames}
+                build_samples(out, name, labeled, real=True, n_workers=n_workers)
+                names.append(name)
+                if name != VALIDATION:
+                    # Objects of this source alone, so that leaving it out leaves them out.
+                    bank = cache(partial(_bank, tuple(scan for _, scan in labeled)))
+                    changed = [(drive, _Pasted(scan, bank, k)) for drive, scan in labeled for k in range(N_VARIANTS)]
+                    build_samples(out, f"{name}-{PASTED}", changed, real=True, n_workers=n_workers)
+                    names.append(f"{name}-{PASTED}")
+                    hashes[names[-1]] = {}
+    for folder in scan_sets:
+        of_set, _, hashes[folder.layout.name] = read_scan_set(folder, "train")
+        drives = [folder.drives[name.partition("/")[2]] for name in hashes[folder.layout.name]]
+        build_samples(out, folder.layout.name, list(zip(drives, of_set, strict=True)), real=True, n_workers=n_workers)
+        names.append(folder.layout.name)
+    if simulated is not None:
+        files = sorted(simulated.glob("*.npz"))
+        build_samples(out, "simulated", [(file.stem, file) for file in files], real=False, n_workers=n_workers)
+        names.append("simulated")
+        hashes["simulated"] = {}
+    return names, hashes
+
+
+def _bank(scans: Sequence[Callable[[], LabeledScan]]) -> ObjectBank:
+    return ObjectBank.of(scan() for scan in scans)
+
+
+@dataclass(frozen=True)
+class _Pasted:
+    """A scan that is made when it is needed, with objects of a bank among its own."""
+
+    scan: Callable[[], LabeledScan]
+    bank: Callable[[], ObjectBank]
+    seed: int
+
+    def __call__(self) -> LabeledScan:
+        scan = self.scan()
+        return augmented(scan, np.random.default_rng((self.seed, len(scan.points))), PASTING, self.bank())

@@ -1,0 +1,255 @@
+"""Training of the object network: samples are what the runtime sees, and the exported graph is the network."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch")
+pytest.importorskip("onnx")
+
+from edgeperc.errors import ModelError, PointsError
+from edgeperc.ground.planes import find_ground
+from edgeperc.ground.scan import Scan
+from edgeperc.inference.session import MAX_ROWS, Session
+from edgeperc.objects.candidate_boxes import decode_objects
+from edgeperc.objects.candidates import find_candidates, sort_into_cells
+from edgeperc.objects.crops import crop_candidates, fill_features
+from edgeperc.perceiver import Perceiver
+from edgeperc.simulation.samples import simulated_scan
+from edgeperc.types.mounting import MODEL_MOUNTING
+from edgeperc.types.points import read_only
+from edgeperc.types.sensor import get_sensor
+from edgeperc.zoo import model_path
+from edgeperc_export.cards import OBJECT_CLASSES, OBJECT_VIEW
+from edgeperc_export.data.scans import LabeledScan
+from edgeperc_export.networks import build
+from edgeperc_export.networks.objects import ObjectNet, parts_of, rejected
+from edgeperc_export.recipe import MODELS
+from edgeperc_export.release.object_int8 import candidate_batches, quantize_objects, rounded
+from edgeperc_export.release.quantize import Calibration, folded
+from edgeperc_export.release.to_onnx import load, to_graph, verify, with_golden, write_card
+from edgeperc_export.training.object_batches import ObjectBatches, ObjectWatch, tensors
+from edgeperc_export.training.object_batches import _Drawn as Drawn
+from edgeperc_export.training.object_samples import (
+    GROUP,
+    N_STORED,
+    TRUE,
+    ObjectSamples,
+    build_samples,
+    load_samples,
+    samples_of,
+)
+from edgeperc_export.training.object_task import Objects, fill_box_ious
+from edgeperc_export.training.train import Data, Run, train
+
+SEED = 4 * 10**9
+RECIPE = replace(MODELS["objects"].recipe, steps=4, batch=16)
+
+
+@pytest.fixture(scope="module")
+def labeled() -> LabeledScan:
+    return LabeledScan.from_simulation(simulated_scan(SEED))
+
+
+@pytest.fixture(scope="module")
+def samples(labeled: LabeledScan) -> ObjectSamples:
+    perceive = Perceiver(
+        "ssadnet:fp32", mounting=MODEL_MOUNTING, boxes_from="network", agree=False, on_mismatch="ignore"
+    )
+    return samples_of(labeled, "simulated/0", perceive, np.random.default_rng(0), real=False)
+
+
+def test_samples_are_what_the_runtime_sees(labeled: LabeledScan, samples: ObjectSamples) -> None:
+    """Of a candidate with few points, the input in training and at run time differ by the rounding of the store."""
+    task = Objects.of(RECIPE)
+    points = read_only(labeled.points)
+    scan = Scan.of(points, find_ground(points))
+    cells = sort_into_cells(scan, OBJECT_VIEW.height_range_m)
+    own = find_candidates(scan, cells, np.empty((0, 5)), get_sensor("hdl-64e").link_per_m)
+    groups = np.flatnonzero(samples.origin == GROUP)
+    assert len(groups) > 20
+    for k in groups:
+        assert np.abs(own.rectangles - samples.rectangles[k]).max(axis=1).min() < 1e-3
+    places = samples.rectangles[groups].astype(np.float64)
+    crops = crop_candidates(scan, own._replace(rectangles=places), OBJECT_VIEW.n_points, OBJECT_VIEW.margin_m)
+    right = np.empty((len(groups), OBJECT_VIEW.n_points, len(task.input.channels)), np.float32)
+    spec = task.input
+    fill_features(crops.points, crops.counts, places, np.array([spec.mean, spec.std], np.float32), right)
+    found, labels, _ = tensors(task, Drawn.of(samples, groups))
+    few = np.flatnonzero(
+        (samples.counts[groups] <= N_STORED) & (crops.counts >= 3) & (crops.counts <= OBJECT_VIEW.n_points)
+    )
+    assert len(few) > 5
+    for k in few:
+        seen, shown = (np.unique(np.round(array[k].astype(np.float64), 1), axis=0) for array in (found.numpy(), right))
+        np.testing.assert_allclose(seen.max(axis=0), shown.max(axis=0), atol=0.21)
+        np.testing.assert_allclose(seen.min(axis=0), shown.min(axis=0), atol=0.21)
+        np.testing.assert_allclose(found[k, 0, -1], right[k, 0, -1], atol=1e-5)  # the number of points
+    assert (labels.numpy() == samples.classes[groups]).all()
+
+
+def test_candidates_of_objects_have_their_truth(labeled: LabeledScan, samples: ObjectSamples) -> None:
+    objects = samples.classes > 0
+    assert 0 < objects.sum() < len(objects)
+    for k in np.flatnonzero(objects & (samples.origin == TRUE)):
+        np.testing.assert_allclose(samples.rectangles[k, :2], samples.truth[k, :2], atol=1e-3)
+    names = {OBJECT_CLASSES[k] for k in samples.classes[objects]}
+    assert names <= {box.label.replace("person_sitting", "pedestrian") for box in labeled.boxes}
+    assert not samples.truth[samples.classes == 0].any()
+
+
+def test_batches_are_the_same_for_the_same_step(samples: ObjectSamples) -> None:
+    batches = ObjectBatches(Objects.of(RECIPE), samples, ["simulated"])
+    first, again, other = batches.batch(3), batches.batch(3), batches.batch(4)
+    for a, b in zip(first, again, strict=True):
+        assert torch.equal(a, b)
+    assert not torch.equal(first[0], other[0])
+    assert len(batches.simulated) == 1
+    x, labels, boxes = first
+    assert x.shape == (16, OBJECT_VIEW.n_points, len(Objects.of(RECIPE).input.channels))
+    assert torch.isfinite(x).all()
+    assert torch.isfinite(boxes).all()
+    assert (boxes[labels > 0][:, 3:6] > 0.0).all()
+
+
+def test_boxes_of_the_training_are_those_of_the_runtime() -> None:
+    task = Objects.of(RECIPE)
+    rng = np.random.default_rng(1)
+    outputs = torch.from_numpy(rng.normal(0.0, 1.0, (40, 29)).astype(np.float32))
+    parts = parts_of(outputs, len(OBJECT_CLASSES))
+    kinds = 1 + parts.classes[:, 1:].argmax(1)
+    boxes = task.boxes(parts, kinds).numpy()
+    found = decode_objects(task.card, outputs.numpy(), np.zeros((40, 5)), np.zeros(40))
+    boxes[:, 2] += 0.5 * boxes[:, 5]  # the middle, not the bottom
+    np.testing.assert_allclose(found[:, :6], boxes[:, :6], atol=1e-5)
+    np.testing.assert_allclose(np.cos(found[:, 6] - boxes[:, 6]), 1.0, atol=1e-5)
+    np.testing.assert_array_equal(found[:, 8], kinds.numpy())
+
+
+def test_overlap_in_space() -> None:
+    box = np.array([[1.0, 2.0, 0.0, 4.0, 2.0, 1.5, 0.3]])
+    for change, right in (
+        ({}, 1.0),
+        ({2: 0.75}, 1.0 / 3.0),
+        ({2: 1.5}, 0.0),
+        ({0: 9.0}, 0.0),
+        ({6: 0.3 + math.pi}, 1.0),
+        ({3: 2.0}, 0.5),
+    ):
+        other = box.copy()
+        for column, value in change.items():
+            other[0, column] = value
+        iou = np.empty(1)
+        fill_box_ious(box, other, iou)
+        np.testing.assert_allclose(iou, right, atol=1e-9)
+
+
+def test_a_step_lowers_the_loss(samples: ObjectSamples) -> None:
+    task = Objects.of(RECIPE)
+    batches, network = ObjectBatches(task, samples, ["simulated"]), build(RECIPE)
+    x, *targets = batches.batch(0)
+    optimizer = torch.optim.AdamW(network.parameters(), lr=2e-3)
+    losses = []
+    for _ in range(12):
+        loss = task.loss(network(x), targets)
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        losses.append(loss.item())
+    assert losses[-1] < 0.8 * losses[0]
+    figure, loss, figures = ObjectWatch(task, samples).validate(network.eval())
+    assert 0.0 <= figure <= 1.0
+    assert math.isfinite(loss)
+    assert "precision" in figures
+
+
+def test_the_graph_looks_closely_where_the_first_look_says_so(tmp_path: Path) -> None:
+    """None, some and all of the candidates: torch and onnxruntime agree."""
+    network = build(RECIPE).eval()
+    assert isinstance(network, ObjectNet)
+    card = Objects.of(RECIPE).card
+    for bias in (-100.0, -3.5, 100.0):
+        with torch.no_grad():
+            network.look.head2.bias.fill_(bias)
+        model = to_graph(network, card)
+        path = tmp_path / "objects.onnx"
+        write_card(model, with_golden(model, card), path)
+        session = Session(path, "cpu")
+        for n in (1, 2, 50, MAX_ROWS):
+            x = torch.randn(
+                n, OBJECT_VIEW.n_points, len(card.input.channels), generator=torch.Generator().manual_seed(n)
+            )
+            session.input[:n] = x.numpy()
+            found = session.run(n)["objects"][:n]
+            with torch.no_grad():
+                right = network.detect(x).numpy()
+            np.testing.assert_allclose(found, right, atol=2e-3)
+            kept = ~np.isclose(right, rejected(29).numpy()).all(axis=1)
+            assert kept.all() if bias > 0.0 else True
+            assert not kept.any() if bias < -10.0 else True
+    assert verify(network, path, [simulated_scan(SEED).points])["label_agreement"] >= 0.999
+
+
+def test_training_resumes_bit_for_bit(labeled: LabeledScan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    scans = tmp_path / "scans"
+    scans.mkdir()
+    labeled.save(scans / "000000.npz")
+
+    def run(name: str) -> dict[str, torch.Tensor]:
+        checkpoint = train(RECIPE, tmp_path / name, Data(simulated=scans), Run(n_threads=1, checkpoint_every=2))
+        weights: dict[str, torch.Tensor] = load(checkpoint)[0].state_dict()
+        return weights
+
+    whole = run("whole")
+    loss, calls = Objects.loss, 0
+
+    def dying(task: Objects, *given: Any) -> torch.Tensor:
+        nonlocal calls
+        calls += 1
+        if calls == 3:  # there is a checkpoint of the second step
+            raise KeyboardInterrupt
+        return loss(task, *given)
+
+    monkeypatch.setattr(Objects, "loss", dying)
+    with pytest.raises(KeyboardInterrupt):
+        run("cut")
+    monkeypatch.setattr(Objects, "loss", loss)
+    for name, weight in run("cut").items():
+        assert torch.equal(weight, whole[name]), name
+
+
+def test_a_missing_source_is_an_error(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="no samples of kitti-0"):
+        load_samples(tmp_path, ["kitti-0"])
+    with pytest.raises(ValueError, match="no scans to train objects on"):
+        train(RECIPE, tmp_path / "run", Data())
+    build_samples(tmp_path, "nothing", [], real=True)
+
+
+def test_int8_agrees_with_fp32(tmp_path: Path) -> None:
+    """The shipped network, rounded on one scan: the classes of the candidates of another."""
+    path, rounded_path = model_path("objects:fp32"), tmp_path / "int8.onnx"
+    card = Session(path, "cpu").card
+    (batch,) = candidate_batches(card, [simulated_scan(SEED).points])
+    model = rounded(folded(path), [batch], card.input.name)
+    write_card(model, with_golden(model, replace(card, precision="int8", precisions={})), rounded_path)
+    (other,) = candidate_batches(card, [simulated_scan(SEED + 1).points])
+    classes = []
+    for session in (Session(path, "cpu"), Session(rounded_path, "cpu")):
+        session.input[: len(other)] = other
+        classes.append(session.run(len(other))["objects"][: len(other), : len(card.classes)].argmax(axis=1))
+    assert (classes[0] == classes[1]).mean() > 0.95
+
+
+def test_only_fp32_and_scans_with_clusters_are_quantized(tmp_path: Path) -> None:
+    nothing = Calibration([np.zeros((0, 4), np.float32)], [])
+    with pytest.raises(PointsError, match="no candidate in 1 scans"):
+        quantize_objects(model_path("objects:fp32"), tmp_path / "int8.onnx", nothing)
+    with pytest.raises(ModelError, match="quantize the model in fp32"):
+        quantize_objects(model_path("objects:int8"), tmp_path / "int8.onnx", nothing)

@@ -1,0 +1,96 @@
+"""The shipped object network in the pipeline."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from edgeperc import Perceiver
+from edgeperc.errors import OptionError
+from edgeperc.simulation.samples import FIRST_SEED, simulated_scan
+from edgeperc.simulation.scene import SimulatedScan
+from edgeperc.types.perception import Perception
+
+SEED = FIRST_SEED + 3
+
+
+@pytest.fixture(scope="module")
+def scan() -> SimulatedScan:
+    return simulated_scan(SEED)
+
+
+def near_true(perception: Perception, scan: SimulatedScan, least_returns: int = 100) -> float:
+    """Share of the true cars with so many returns that have a vehicle's box within 1 m."""
+    cars = [
+        box for box, n in zip(scan.boxes, scan.box_points, strict=True) if n >= least_returns and box.label == "car"
+    ]
+    found = np.array([box.center[:2] for box in perception.boxes if box.label in ("car", "van", "truck")])
+    hits = [len(found) and np.hypot(*(found - box.center[:2]).T).min() < 1.0 for box in cars]
+    return float(np.mean(hits))
+
+
+def test_objects_are_found_all_around(scan: SimulatedScan) -> None:
+    perceive = Perceiver(["pointseg", "objects"], full_turn=True, n_threads=1)
+    perception = perceive(scan.points)
+    assert near_true(perception, scan) > 0.6
+    assert any(box.center[0] < 0.0 for box in perception.boxes)
+    vehicles = [box for box in perception.boxes if box.label in ("car", "van", "truck")]
+    assert all(box.front is not None and 0.5 <= box.front <= 1.0 for box in vehicles)
+    scores = [box.score for box in perception.boxes]
+    assert scores == sorted(scores, reverse=True)
+    assert {box.label for box in perception.boxes} <= {"car", "van", "truck", "pedestrian", "cyclist"}
+
+
+def test_the_network_of_objects_needs_no_other_one(scan: SimulatedScan) -> None:
+    perception = Perceiver("objects", n_threads=1)(scan.points)
+    assert perception.points is None
+    assert perception.top_view is None
+    assert near_true(perception, scan) > 0.6
+
+
+def test_people_are_boxed_by_their_labels(scan: SimulatedScan) -> None:
+    people = [
+        [box for box in Perceiver(models, n_threads=1)(scan.points).boxes if box.label in ("pedestrian", "cyclist")]
+        for models in ("pointseg", ["pointseg", "objects"])
+    ]
+    assert {box.center for box in people[1]} >= {box.center for box in people[0]}
+
+
+def test_the_answer_does_not_depend_on_the_threads(scan: SimulatedScan) -> None:
+    models = ["ssadnet", "pointseg", "objects"]
+    one, two = (Perceiver(models, provider="cpu", **given)(scan.points) for given in ({"n_threads": 1}, {}))
+    assert one.boxes == two.boxes
+    again = Perceiver(models, provider="cpu", n_threads=1)
+    again(simulated_scan(SEED + 1).points)  # buffers hold another scan
+    assert again(scan.points).boxes == one.boxes
+
+
+def test_candidates_may_come_from_one_source_alone(scan: SimulatedScan) -> None:
+    both, ahead, clusters = (
+        Perceiver(["ssadnet", "objects"], boxes_from=source, n_threads=1)(scan.points)
+        for source in ("both", "network", "clusters")
+    )
+    assert len(ahead.boxes) <= len(both.boxes)
+    assert all(box.center[0] > 0.0 for box in ahead.boxes)
+    assert near_true(clusters, scan) <= near_true(Perceiver("objects", n_threads=1)(scan.points), scan)
+    assert clusters.boxes
+    with pytest.raises(OptionError, match="add a range-image model or one of objects"):
+        Perceiver("ssadnet", boxes_from="clusters")
+
+
+def test_labels_do_not_depend_on_the_objects(scan: SimulatedScan) -> None:
+    """The network replaces boxes; labels of points are those without it."""
+    without, with_objects = (
+        Perceiver(models, n_threads=1)(scan.points)
+        for models in (["ssadnet", "pointseg"], ["ssadnet", "pointseg", "objects"])
+    )
+    assert without.points is not None
+    assert with_objects.points is not None
+    np.testing.assert_array_equal(without.points.labels, with_objects.points.labels)
+
+
+@pytest.mark.parametrize("n", [0, 1, 7])
+def test_scans_without_objects_have_no_boxes(n: int) -> None:
+    points = np.zeros((n, 4), np.float32)
+    points[:, 0] = np.linspace(5.0, 30.0, n)
+    assert Perceiver(["ssadnet", "pointseg", "objects"], on_mismatch="ignore")(points).boxes == ()
