@@ -63,9 +63,10 @@ FLOORS = {
         road.ahead
         pipeline
         readers.__init__ readers.images readers.packets readers.times
-        readers.ouster readers.tables
+        readers.clouds readers.ouster readers.tables
         readers.inflate readers.pcd readers.ply
         readers.files readers.mcap
+        readers.bags
         readers.decoders
         readers.identify readers.worker
         readers.apart

@@ -109,8 +109,8 @@ def add_topic(group: Any) -> None:
     group.add_argument(
         "--topic",
         metavar="NAME",
-        help="the topic of a bag with several point clouds, or the serial number of a sensor in an Ouster capture "
-        "(default: the only one)",
+        help="what to read of several sensors: the topic of a bag, TOPIC@FRAME, the serial number of an Ouster, the "
+        "address of a Velodyne (default: the only one)",
     )
 
 

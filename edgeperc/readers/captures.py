@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from ..errors import PointsError, SensorError
 from ..types.sensor import SensorProfile
 from .apart import decode_apart, describe_apart
+from .bags import bag_files
 from .files import read_points, read_timed_file
 from .identify import KnownSensor, of_cloud, of_metadata, of_packets
 from .packets import PCAP_MAGIC
@@ -45,11 +46,12 @@ def read_scans(
     source : str or path
         A scan file (`edgeperc.read_points`); a folder of scan files and captures, read in the order of their names; a
         Velodyne ``.pcap``; an Ouster ``.osf``, or ``.pcap`` with its metadata next to it in a ``.json`` file whose name
-        has the same beginning; a ROS 1 ``.bag``, a ROS 2 bag's folder or one ``.mcap`` file. Bags are read for
-        messages of type ``sensor_msgs/PointCloud2``. The first bytes of a file decide its format, not its name.
+        has the same beginning; a ROS 1 ``.bag``, a ROS 2 bag's folder or one file of it, or an ``.mcap`` file. Bags
+        are read for messages of type ``sensor_msgs/PointCloud2``, MCAP files for ``foxglove.PointCloud`` (protobuf),
+        too. The first bytes of a file decide its format, not its name.
     topic : str, optional
-        The topic to read if a bag has several with point clouds; the serial number of the sensor if an Ouster capture
-        has several.
+        What to read if there are several sensors: the topic of point clouds; ``TOPIC@FRAME`` for those of one frame;
+        the serial number of an Ouster; the IPv4 address of a Velodyne.
     remission_field : str, optional
         Name of the remission field, as in `edgeperc.read_points`; ``reflectivity`` by default for an Ouster capture.
 
@@ -67,8 +69,7 @@ def read_scans(
     ------
     PointsError
         The source does not exist, is damaged, holds no scan of a LiDAR, or takes more memory or time than the limits.
-        The scans before the damage come first, where the format allows: a bag whose index is damaged is refused as a
-        whole.
+        The scans before the damage come first, and those of the other files of a bag.
     MissingExtraError
         The library that reads this kind of capture is not installed.
 
@@ -199,15 +200,14 @@ def _readable_kind(path: Path) -> str:
     kind = _kind(path)
     if kind == ".pcapng":
         raise PointsError(f"{path}: a pcapng file; expected pcap. Run: editcap -F pcap {path.name} {path.stem}.pcap")
-    if kind == ".db3":
-        raise PointsError(f"{path}: a .db3 is read with the folder it lies in; expected metadata.yaml next to it")
     return kind
 
 
 def _kind(path: Path) -> str:
     """``"scan"``, ``"folder"``, ``"ros2"`` or one of `CAPTURE_SUFFIXES`, by content or else by name."""
     if path.is_dir():
-        return "ros2" if (path / "metadata.yaml").is_file() else "folder"
+        is_bag = (path / "metadata.yaml").is_file() or any(path.glob("*.db3"))
+        return "ros2" if is_bag and bag_files(path) else "folder"
     if not path.is_file():  # opening a pipe would block
         return "scan"
     try:
