@@ -99,12 +99,14 @@ def read_timed_scans(
         Time of each point [s]. An Ouster's packets have one for each column, a Velodyne's for each firing. Of point
         clouds, ``.pcd``, ``.ply`` and structured ``.npy`` files, it is the field t, time, timestamp, time_stamp,
         offset_time or time_offset, whose unit shows in the duration of the scan: 2 ms to 2 s. Values below 2 s count
-        from ``stamp_s``. None without such a field, or if no unit gives such a duration.
+        from ``stamp_s``. NaN where a time is damaged and lies far from all others. None without such a field, or if no
+        unit gives such a duration.
 
     Raises
     ------
     PointsError, MissingExtraError
-        As `read_scans`.
+        As `read_scans`. PointsError also if the times contradict the stamps of the scans, or if the azimuths turn once
+        in a time that no LiDAR takes for a turn: below 33 ms, or above 350 ms.
     """
     return _scans(Path(source), topic, remission_field, times=True)
 

@@ -19,7 +19,7 @@ from .mcap import Channel
 from .ouster import check_osf, open_capture
 from .packets import copy_as_ethernet, is_ethernet, pcap_packets, refuse_others, velodyne_packets, velodyne_senders
 from .tables import MAX_BYTES
-from .times import TimedScan, point_times
+from .times import TimedScan, of_plausible_duration, point_times
 
 _Item = TypeVar("_Item")
 
@@ -45,7 +45,7 @@ def decode(
     scans = (
         _packet_scans(path, kind, topic, remission_field, warn, alive)
         if kind in (".pcap", ".osf")
-        else _bag_scans(path, topic, remission_field, alive, times)
+        else of_plausible_duration(_bag_scans(path, topic, remission_field, alive, times))
     )
     for stamp_s, points, times_s in _with_typed_errors(path, scans):
         yield TimedScan(stamp_s, points, times_s if times else None)
