@@ -121,6 +121,11 @@ def add_parser(commands: Commands) -> None:
         "quaternion x, y, z, w, TUM's format (default: the tracker's estimate)",
     )
     reading.add_argument(
+        "--quaternion",
+        choices=("xyzw", "wxyz"),
+        help="order of the quaternions in --poses (default: xyzw, unless the poses contradict it)",
+    )
+    reading.add_argument(
         "--on-mismatch",
         choices=("refuse", "warn", "raise", "ignore"),
         default="refuse",
@@ -299,6 +304,8 @@ def _check_usage(arguments: argparse.Namespace, kinds: Sequence[str]) -> None:
         arguments.usage_error("--deskew needs --poses FILE or --track, and no --live")
     if arguments.poses is not None and not arguments.deskew:
         arguments.usage_error("--poses needs --deskew")
+    if arguments.quaternion is not None and arguments.poses is None:
+        arguments.usage_error("--quaternion needs --poses FILE")
     if arguments.png:
         require("matplotlib", "view", "Drawing a picture")
     if arguments.gif:
@@ -419,7 +426,7 @@ class _Run:
         if arguments.deskew:
             from .straighten import Straightener
 
-            self._straightener = Straightener(arguments.poses)
+            self._straightener = Straightener(arguments.poses, arguments.quaternion)
         self._n = 0
 
     def scans(self, path: Path, target: Path, shown: Path | None = None) -> Iterator[Outcome]:

@@ -503,7 +503,7 @@ def _checked_pose(given: ArrayLike) -> NDArray[np.float64]:
             f"got a T_world_sensor of shape {pose.shape}; expected (4, 4) finite numbers, up to {FARTHEST_M:g}"
         )
     off = np.abs(pose[:3, :3] @ pose[:3, :3].T - np.eye(3)).max()
-    if off > 1e-3 or np.linalg.det(pose[:3, :3]) < 0.0 or (pose[3] != [0.0, 0.0, 0.0, 1.0]).any():
+    if off > 1e-3 or np.linalg.det(pose[:3, :3]) < 0.0 or (np.abs(pose[3] - [0, 0, 0, 1]) > 1e-9).any():
         raise TrackingError("got a T_world_sensor that is not rigid; expected a rotation and a translation")
     return pose
 
