@@ -64,7 +64,7 @@ FLOORS = {
         pipeline
         readers.__init__ readers.images readers.packets readers.times
         readers.clouds readers.ouster readers.tables
-        readers.inflate readers.pcd readers.ply
+        readers.inflate readers.pcd readers.ply readers.raw
         readers.files readers.mcap
         readers.bags
         readers.decoders

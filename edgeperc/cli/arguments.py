@@ -114,6 +114,28 @@ def add_topic(group: Any) -> None:
     )
 
 
+def add_fields(group: Any) -> None:
+    """Add ``--columns`` and ``--remission-field``."""
+    group.add_argument(
+        "--columns",
+        nargs="+",
+        metavar="NAME",
+        help="what .bin files hold for each point, in order; after the paths: --columns x y z intensity ring (default: "
+        "x y z remission, unless the values show that there are more or fewer)",
+    )
+    group.add_argument(
+        "--remission-field",
+        metavar="NAME",
+        help="the field to take the remission from (default: the first of remission, intensity, i, reflectivity, "
+        "reflectance; reflectivity for an Ouster)",
+    )
+
+
+def reading_options(arguments: argparse.Namespace) -> dict[str, Any]:
+    """Options of `edgeperc.read_scans` from ``--topic``, ``--columns`` and ``--remission-field``."""
+    return {name: getattr(arguments, name) for name in ("topic", "columns", "remission_field")}
+
+
 def add_model(group: Any, default: Sequence[str] = DEFAULT_MODELS) -> None:
     """Add ``--model``, which may be repeated."""
     group.add_argument(

@@ -20,12 +20,14 @@ from .arguments import (
     Commands,
     add_adapt,
     add_command,
+    add_fields,
     add_model,
     add_mounting,
     add_network,
     add_sensor,
     add_topic,
     positive_number,
+    reading_options,
 )
 from .output import many, print_line, progress
 from .ray import add_engine, check_engine, perceive_on_ray, through_temporary
@@ -107,6 +109,7 @@ def add_parser(commands: Commands) -> None:
     add_sensor(reading, of_capture=True)
     add_mounting(reading)
     add_topic(reading)
+    add_fields(reading)
     reading.add_argument(
         "--deskew",
         action="store_true",
@@ -304,6 +307,8 @@ def _check_usage(arguments: argparse.Namespace, kinds: Sequence[str]) -> None:
         arguments.usage_error("--deskew needs --poses FILE or --track, and no --live")
     if arguments.poses is not None and not arguments.deskew:
         arguments.usage_error("--poses needs --deskew")
+    if arguments.live and (arguments.columns or arguments.remission_field):
+        arguments.usage_error("--columns and --remission-field need no --live")
     if arguments.quaternion is not None and arguments.poses is None:
         arguments.usage_error("--quaternion needs --poses FILE")
     if arguments.png:
@@ -441,7 +446,7 @@ class _Run:
             perceive = self._perceivers.of(self._perceivers.sensor_of(path))
             numbered = is_capture(path)
             read: Callable[..., Iterator[tuple[Any, ...]]] = read_timed_scans if self._straightener else read_scans
-            for k, (stamp_s, points, *times_s) in enumerate(read(path, topic=self._arguments.topic)):
+            for k, (stamp_s, points, *times_s) in enumerate(read(path, **reading_options(self._arguments))):
                 name, file = (shown / f"{k:06d}", target / f"{k:06d}") if numbered else (shown, target)
                 try:
                     if self._straightener is not None:
@@ -469,7 +474,8 @@ class _Run:
         try:
             image = read_image(path)
             perceive = perceivers.of(perceivers.sensor_of(scan) if scan else arguments.sensor or DEFAULT_SENSOR)
-            points = None if scan is None else read_points(scan)
+            fields = {"columns": arguments.columns, "remission_field": arguments.remission_field}
+            points = None if scan is None else read_points(scan, **fields)
             perception = perceive(points, image=image)
             wanted = _files_of(target, self._kinds, **_pictures_of(arguments, [path]))
             if "image" in wanted:

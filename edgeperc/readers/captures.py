@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,7 +34,11 @@ _MAGIC = {
 
 
 def read_scans(
-    source: str | os.PathLike[str], *, topic: str | None = None, remission_field: str | None = None
+    source: str | os.PathLike[str],
+    *,
+    topic: str | None = None,
+    remission_field: str | None = None,
+    columns: int | Sequence[str] | None = None,
 ) -> Iterator[tuple[float | None, NDArray[np.float32]]]:
     """Read the scans of a recording, one after another; `read_timed_scans` gives the times of their points too.
 
@@ -54,6 +59,8 @@ def read_scans(
         the serial number of an Ouster; the IPv4 address of a Velodyne.
     remission_field : str, optional
         Name of the remission field, as in `edgeperc.read_points`; ``reflectivity`` by default for an Ouster capture.
+    columns : int or sequence of str, optional
+        What scan files without a header hold, as in `edgeperc.read_points`.
 
     Yields
     ------
@@ -78,17 +85,24 @@ def read_scans(
     UserWarning
         Damaged packets of an Ouster capture were dropped; the message has their number.
     """
-    return ((stamp_s, points) for stamp_s, points, _ in _scans(Path(source), topic, remission_field, times=False))
+    return (
+        (stamp_s, points)
+        for stamp_s, points, _ in _scans(Path(source), _Options(topic, remission_field, columns, False))
+    )
 
 
 def read_timed_scans(
-    source: str | os.PathLike[str], *, topic: str | None = None, remission_field: str | None = None
+    source: str | os.PathLike[str],
+    *,
+    topic: str | None = None,
+    remission_field: str | None = None,
+    columns: int | Sequence[str] | None = None,
 ) -> Iterator[TimedScan]:
     """Like `read_scans`, with the time of each point, where the source holds it, for `edgeperc.deskew`.
 
     Parameters
     ----------
-    source, topic, remission_field
+    source, topic, remission_field, columns
         As in `read_scans`.
 
     Yields
@@ -108,17 +122,25 @@ def read_timed_scans(
         As `read_scans`. PointsError also if the times contradict the stamps of the scans, or if the azimuths turn once
         in a time that no LiDAR takes for a turn: below 33 ms, or above 350 ms.
     """
-    return _scans(Path(source), topic, remission_field, times=True)
+    return _scans(Path(source), _Options(topic, remission_field, columns, times=True))
 
 
-def _scans(path: Path, topic: str | None, remission_field: str | None, times: bool) -> Iterator[TimedScan]:
+class _Options(NamedTuple):
+    topic: str | None
+    remission_field: str | None
+    columns: int | Sequence[str] | None
+    times: bool
+
+
+def _scans(path: Path, options: _Options) -> Iterator[TimedScan]:
+    topic, remission_field, columns, times = options
     kind = _readable_kind(path)
     if kind == "folder":
-        return _folder(path, topic, remission_field, times)
+        return _folder(path, options)
     if kind == "scan":
         if times:
-            return iter([read_timed_file(path, remission_field)])
-        return iter([TimedScan(None, read_points(path, remission_field=remission_field), None)])
+            return iter([read_timed_file(path, remission_field, columns)])
+        return iter([TimedScan(None, read_points(path, remission_field=remission_field, columns=columns), None)])
     return decode_apart(path, kind, topic, remission_field, times)
 
 
@@ -223,7 +245,7 @@ def _kind(path: Path) -> str:
     return next((kind for magic, kind in _MAGIC.items() if head.startswith(magic)), by_name)
 
 
-def _folder(folder: Path, topic: str | None, remission_field: str | None, times: bool) -> Iterator[TimedScan]:
+def _folder(folder: Path, options: _Options) -> Iterator[TimedScan]:
     files = scan_files(folder)
     if not files:
         raise PointsError(
@@ -231,4 +253,4 @@ def _folder(folder: Path, topic: str | None, remission_field: str | None, times:
             "bag's metadata.yaml"
         )
     for file in files:
-        yield from _scans(file, topic, remission_field, times)
+        yield from _scans(file, options)

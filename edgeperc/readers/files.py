@@ -7,7 +7,7 @@ import math
 import os
 import zipfile
 import zlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,24 +19,23 @@ from ..types.points import as_points, assemble, table_columns
 from .inflate import inflate, most_bytes
 from .pcd import begins_like_pcd, parse_pcd
 from .ply import parse_ply
+from .raw import parse_raw
 from .tables import MAX_HEADER_BYTES, MAX_SCAN_BYTES, Columns
 from .times import TimedScan, point_times
-
-_TEXT_BYTES = np.zeros(256, dtype=np.bool_)
-_TEXT_BYTES[[9, 10, 13, *range(32, 127)]] = True
 
 
 def read_points(
     source: str | os.PathLike[str] | ArrayLike,
     *,
-    columns: int | None = None,
+    columns: int | Sequence[str] | None = None,
     remission_field: str | None = None,
 ) -> NDArray[np.float32]:
     """Read the points of one scan from a file or an array.
 
     The first bytes of a file decide its format: a PCD header, ``ply``, NumPy's or zip's magic. Raw float32 files have
-    no header, so their name must end in ``.bin`` (KITTI, SemanticKITTI: x, y, z, remission) or ``.pcd.bin`` (nuScenes:
-    the same and the ring), or ``columns`` gives the number of values of a point.
+    no header, so their name must end in ``.bin``, or ``columns`` says what they hold. A ``.bin`` has 4 values a point
+    (KITTI, SemanticKITTI: x, y, z, remission) and a ``.pcd.bin`` 5 (nuScenes: the same and the ring), unless the values
+    themselves show that it has another number, 3 to 12: those of one column are alike.
 
     Remission is not scaled here: the `Perceiver` does that, by its sensor's ``remission_range``. It is 0 if the file
     holds none. Rows that are not finite stay in place, so that labels have the file's order.
@@ -46,8 +45,10 @@ def read_points(
     source : str, path or array
         ``.bin``, ``.pcd.bin``, ``.npy``, ``.npz`` (its only array, or the one called ``points``), ``.pcd`` (ascii,
         binary, binary_compressed), ``.ply`` (ascii, binary), or an array for `as_points`.
-    columns : int, optional
-        Number of float32 values of a point in a file without a header, at least 3; ignored for other files.
+    columns : int or sequence of str, optional
+        What a file without a header holds for each point: the number of float32 values, at least 3, of which the first
+        are x, y, z and remission; or their names in order, such as ``("x", "y", "z", "intensity", "ring")``. Ignored
+        for other files.
     remission_field : str, optional
         Name of the remission field, for formats with named fields. By default the first existing one of remission,
         intensity, i, reflectivity, reflectance.
@@ -68,9 +69,9 @@ def read_points(
     return _read(Path(source), columns, remission_field)[0]
 
 
-def read_timed_file(path: Path, remission_field: str | None) -> TimedScan:
+def read_timed_file(path: Path, remission_field: str | None, columns: int | Sequence[str] | None = None) -> TimedScan:
     """Read a scan file with the times of its points; options and errors as `read_points`."""
-    points, fields = _read(path, None, remission_field)
+    points, fields = _read(path, columns, remission_field)
     return TimedScan(None, points, point_times(fields, points, None))
 
 
@@ -78,7 +79,7 @@ _Read = tuple[NDArray[np.float32], Mapping[str, NDArray[Any]]]
 """Points, and the fields of the file if they have names."""
 
 
-def _read(path: Path, columns: int | None, remission_field: str | None) -> _Read:
+def _read(path: Path, columns: int | Sequence[str] | None, remission_field: str | None) -> _Read:
     try:
         size = path.stat().st_size if path.is_file() else 0
         if size > MAX_SCAN_BYTES:
@@ -98,7 +99,9 @@ def _read(path: Path, columns: int | None, remission_field: str | None) -> _Read
         raise PointsError(f"{path}: reading {data.size:,} bytes takes more memory than there is") from exc
 
 
-def _parse(data: NDArray[np.uint8], name: str, columns: int | None, remission_field: str | None) -> _Read:
+def _parse(
+    data: NDArray[np.uint8], name: str, columns: int | Sequence[str] | None, remission_field: str | None
+) -> _Read:
     if data.size == 0:
         raise PointsError(
             "the file is empty (0 bytes), as an interrupted recording leaves it; "
@@ -113,14 +116,18 @@ def _parse(data: NDArray[np.uint8], name: str, columns: int | None, remission_fi
         return _of_columns(parse_ply(data, head, remission_field), remission_field)
     if begins_like_pcd(head):
         return _of_columns(parse_pcd(data, head, remission_field), remission_field)
-    if columns is None:
-        if not name.endswith(".bin"):
-            raise PointsError(
-                "neither PCD, PLY, .npy nor .npz by its first bytes; for raw float32 values name it .bin or pass "
-                "columns=4 (x, y, z, remission)"
-            )
-        return _parse_raw(data, 5 if name.endswith(".pcd.bin") else 4, by_name=True), {}
-    return _parse_raw(data, columns, by_name=False), {}
+    if columns is None and not name.endswith(".bin"):
+        raise PointsError(
+            "neither PCD, PLY, .npy nor .npz by its first bytes; for raw float32 values name it .bin or pass "
+            "columns=4 (x, y, z, remission)"
+        )
+    return _of_raw(parse_raw(data, columns, 5 if name.endswith(".pcd.bin") else 4), columns, remission_field)
+
+
+def _of_raw(raw: Columns, columns: int | Sequence[str] | None, remission_field: str | None) -> _Read:
+    if columns is None or isinstance(columns, int | np.integer):  # fields without names
+        return assemble(*raw, None), {}
+    return assemble(*raw, remission_field), raw.fields
 
 
 def _of_array(array: NDArray[Any], remission_field: str | None) -> _Read:
@@ -129,40 +136,6 @@ def _of_array(array: NDArray[Any], remission_field: str | None) -> _Read:
 
 def _of_columns(columns: Columns, remission_field: str | None) -> _Read:
     return assemble(*columns, remission_field), columns.fields
-
-
-def _parse_raw(data: NDArray[np.uint8], columns: int, by_name: bool) -> NDArray[np.float32]:
-    if isinstance(columns, bool) or not isinstance(columns, int | np.integer) or not 3 <= columns <= 64:
-        raise PointsError(f"columns is the number of float32 values a point, 3 to 64, got {columns!r}")
-    if _TEXT_BYTES[data[:4096]].all():
-        raise PointsError("the file holds text, not float32 values; expected x, y, z, remission as raw float32")
-    record = 4 * int(columns)
-    if data.size % record:
-        raise PointsError(
-            f"{data.size} bytes are not a whole number of points of {columns} float32 values ({record} bytes): the "
-            "file is cut short, or pass columns= with the right number of values a point"
-        )
-    values = data.view("<f4").reshape(-1, columns)
-    xyz = np.abs(values[:: max(1, len(values) // 4096), :3])
-    # Coordinates do not have such values. Most rows do if float64, big-endian or other bytes are read as float32.
-    with np.errstate(invalid="ignore"):  # comparing signalling NaN
-        absurd = ((xyz > 1e7) & (xyz < np.inf)) | ((xyz > 0.0) & (xyz < 1e-30))
-    if absurd.any(axis=1).mean() > 0.2:
-        raise PointsError(
-            "the values are not coordinates; expected little-endian float32 x, y, z, remission, not float64 or "
-            "another format"
-        )
-    if by_name and columns == 4 and data.size % 20 == 0:
-        rows = data.view("<f4").reshape(-1, 5)[:1024]
-        with np.errstate(invalid="ignore"):
-            whole = rows == np.floor(rows)
-            rings = whole[:, 4] & (rows[:, 4] >= 0.0) & (rows[:, 4] < 256.0)
-        if rings.all() and not whole[:, :3].all():
-            raise PointsError(
-                "every fifth value is a small whole number, so these seem to be points of 5 values (x, y, z, "
-                "intensity, ring); pass columns=5 or name the file .pcd.bin"
-            )
-    return as_points(values[:, :4])
 
 
 def _parse_npy(data: NDArray[np.uint8]) -> NDArray[Any]:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import io
 import struct
+import tempfile
 import zipfile
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,6 +14,7 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
+import edgeperc
 import twins.points
 from edgeperc.errors import PointsError
 from edgeperc.readers.files import read_points
@@ -224,10 +227,6 @@ BAD_FILES = {
     "text.bin": (b"12.0 3.0 1.0 0.5\n" * 16, "text"),
     "double.bin": (np.random.default_rng(0).normal(0, 20, (500, 4)).tobytes(), "not coordinates"),
     "big_endian.bin": (np.random.default_rng(0).normal(0, 20, (500, 4)).astype(">f4").tobytes(), "not coordinates"),
-    "five.bin": (
-        np.random.default_rng(0).normal(0, 20, (500, 5)).astype("<f4") * [1, 1, 1, 1, 0] + [0, 0, 0, 0, 3],
-        "columns=5",
-    ),
     "four.pcd.bin": (POINTS[:3].tobytes(), "columns="),
     "objects.npy": (npy(np.array([{}, []], dtype=object)), "never unpickled"),
     "strings.npy": (npy(np.array([["1", "2", "3", "4"]])), "<U1"),
@@ -484,3 +483,88 @@ def test_lzf_agrees_with_the_twin(packed, size):
         assert written == -1
     else:
         assert unpacked[:written].tobytes() == expected
+
+
+# --- raw files of other columns --------------------------------------------------------------------------------------
+
+
+def street(seed: int, n: int = 6000) -> np.ndarray:
+    """Points along the rings of a sensor: ground, and walls beside it."""
+    rng = np.random.default_rng(seed)
+    azimuth = np.tile(np.linspace(-np.pi, np.pi, n // 20, endpoint=False), 20)
+    elevation = np.repeat(np.radians(np.linspace(-25.0, 3.0, 20)), n // 20)
+    reach = np.minimum(8.0 / np.maximum(np.abs(np.sin(azimuth)), 0.1), 1.7 / np.maximum(-np.sin(elevation), 0.02))
+    reach += rng.normal(0.0, 0.02, len(reach))
+    across = reach * np.cos(elevation)
+    xyz = [across * np.cos(azimuth), across * np.sin(azimuth), reach * np.sin(elevation)]
+    return np.column_stack([*xyz, rng.uniform(0.0, 0.6, len(reach))]).astype("<f4")
+
+
+OTHERS = {
+    "time": lambda n, rng: np.linspace(0.0, 0.1, n),
+    "ring": lambda n, rng: np.repeat(np.arange(20), n // 20)[:n],
+    "unknown": lambda n, rng: np.full(n, -1.0),
+    "elongation": lambda n, rng: rng.uniform(0.0, 1.0, n),
+    "noise": lambda n, rng: rng.normal(size=n),
+    "large": lambda n, rng: rng.integers(0, 2**24, n),
+}
+
+
+@given(
+    seed=st.integers(0, 9),
+    others=st.lists(st.sampled_from([*OTHERS]), max_size=5),
+    remission=st.sampled_from([None, 0.0, 1.0, 255.0]),
+    shuffled=st.booleans(),
+)
+@settings(max_examples=60, deadline=None)
+def test_raw_files_show_how_many_values_a_point_has(seed, others, remission, shuffled):
+    rng = np.random.default_rng(seed)
+    points = street(seed)
+    points[:, 3] *= remission or 0.0
+    if remission is None and not others:
+        points = points[:, :3]
+    if shuffled:
+        points = rng.permutation(points)
+    rows = np.column_stack([points, *(OTHERS[name](len(points), rng) for name in others)]).astype("<f4")
+    with tempfile.TemporaryDirectory() as folder:
+        for name in ("scan.bin", "scan.pcd.bin"):
+            path = save(Path(folder), name, rows.tobytes())
+            np.testing.assert_array_equal(read_points(path)[:, : points.shape[1]], points)
+            np.testing.assert_array_equal(read_points(path, columns=rows.shape[1])[:, : points.shape[1]], points)
+
+
+@pytest.mark.parametrize("n", [1, 3, 40, 249])
+def test_few_points_have_the_usual_columns(tmp_path, n):
+    points = street(1)[:: 6000 // n][:n]
+    np.testing.assert_array_equal(read_points(save(tmp_path, "scan.bin", points.tobytes())), points)
+
+
+def test_columns_have_names(tmp_path):
+    rows = np.arange(30, dtype="<f4").reshape(5, 6)
+    path = save(tmp_path, "scan.bin", rows.tobytes())
+    names = ("ring", "X", "intensity", "z", "y", "time")
+    np.testing.assert_array_equal(read_points(path, columns=names), rows[:, [1, 4, 3, 2]])
+    np.testing.assert_array_equal(read_points(path, columns=names, remission_field="ring"), rows[:, [1, 4, 3, 0]])
+    ((_, points),) = edgeperc.read_scans(path, columns=names, remission_field="time")
+    np.testing.assert_array_equal(points, rows[:, [1, 4, 3, 5]])
+    with pytest.raises(PointsError, match="'signal'"):
+        read_points(path, columns=names, remission_field="signal")
+    with pytest.raises(PointsError, match="no numeric field y, z"):
+        read_points(path, columns=("x", "a", "b", "c", "d", "e"))
+    for columns in (("x", "y"), ("x", "y", "z", "z", "a", "b"), ["x"] * 65):
+        with pytest.raises(PointsError, match="3 to 64 different names"):
+            read_points(path, columns=columns)
+    with pytest.raises(PointsError, match="whole number of points of 4 float32"):
+        read_points(path, columns=("x", "y", "z", "i"))
+
+
+def test_named_columns_have_times(tmp_path):
+    points = street(2)
+    rows = np.column_stack([points, np.linspace(0.0, 0.1, len(points))]).astype("<f4")
+    path = save(tmp_path, "scan.bin", rows.tobytes())
+    (scan,) = edgeperc.read_timed_scans(path, columns=("x", "y", "z", "intensity", "time"))
+    np.testing.assert_allclose(scan.times_s, rows[:, 4])
+    np.testing.assert_array_equal(scan.points, points)
+    (scan,) = edgeperc.read_timed_scans(path)
+    assert scan.times_s is None
+    np.testing.assert_array_equal(scan.points, points)
