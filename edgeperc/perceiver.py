@@ -418,9 +418,10 @@ class Perceiver:
         Parameters
         ----------
         points : (n, 4) or (n, 3) array_like, or a structured array; None without a LiDAR model
-            x, y, z [m] about the sensor, z up; remission in the sensor's raw unit. Not modified. Rows that are not
-            finite, nearer than the sensor measures, or inside its ``ego_box`` are counted (`Perception.dropped`),
-            labeled 0 and otherwise ignored; an empty scan gives an empty perception.
+            x, y, z [m] about the sensor, z up; remission in the sensor's raw unit. Not modified. Rows whose x, y or z
+            is not finite, nearer than the sensor measures, or inside its ``ego_box`` are counted
+            (`Perception.dropped`), labeled 0 and otherwise ignored; an empty scan gives an empty perception. A
+            remission that is not finite is taken as the median of the others.
         stamp_s : float or None
             Time of the scan [s], for the tracker; returned in the perception.
         image : (H, W, 3) uint8 array_like; None without a camera model
