@@ -115,7 +115,7 @@ def add_topic(group: Any) -> None:
 
 
 def add_fields(group: Any) -> None:
-    """Add ``--columns`` and ``--remission-field``."""
+    """Add ``--columns``, ``--remission-field`` and ``--origin``."""
     group.add_argument(
         "--columns",
         nargs="+",
@@ -129,11 +129,23 @@ def add_fields(group: Any) -> None:
         help="the field to take the remission from (default: the first of remission, intensity, i, reflectivity, "
         "reflectance; reflectivity for an Ouster)",
     )
+    group.add_argument(
+        "--origin",
+        nargs=3,
+        type=finite_number,
+        metavar=("X", "Y", "Z"),
+        help="place of the sensor in the map [m], for scan files with coordinates of a map (default: 0 0 0)",
+    )
 
 
 def reading_options(arguments: argparse.Namespace) -> dict[str, Any]:
-    """Options of `edgeperc.read_scans` from ``--topic``, ``--columns`` and ``--remission-field``."""
-    return {name: getattr(arguments, name) for name in ("topic", "columns", "remission_field")}
+    """Options of `edgeperc.read_scans` from ``--topic`` and those of `add_fields`."""
+    return {"topic": arguments.topic, **file_options(arguments)}
+
+
+def file_options(arguments: argparse.Namespace) -> dict[str, Any]:
+    """Options of `edgeperc.read_points` from those of `add_fields`."""
+    return {"columns": arguments.columns, "remission_field": arguments.remission_field, "origin_m": arguments.origin}
 
 
 def add_model(group: Any, default: Sequence[str] = DEFAULT_MODELS) -> None:

@@ -26,6 +26,7 @@ from .arguments import (
     add_network,
     add_sensor,
     add_topic,
+    file_options,
     positive_number,
     reading_options,
 )
@@ -307,8 +308,8 @@ def _check_usage(arguments: argparse.Namespace, kinds: Sequence[str]) -> None:
         arguments.usage_error("--deskew needs --poses FILE or --track, and no --live")
     if arguments.poses is not None and not arguments.deskew:
         arguments.usage_error("--poses needs --deskew")
-    if arguments.live and (arguments.columns or arguments.remission_field):
-        arguments.usage_error("--columns and --remission-field need no --live")
+    if arguments.live and any(value is not None for value in file_options(arguments).values()):
+        arguments.usage_error("--columns, --remission-field and --origin need no --live")
     if arguments.quaternion is not None and arguments.poses is None:
         arguments.usage_error("--quaternion needs --poses FILE")
     if arguments.png:
@@ -474,8 +475,7 @@ class _Run:
         try:
             image = read_image(path)
             perceive = perceivers.of(perceivers.sensor_of(scan) if scan else arguments.sensor or DEFAULT_SENSOR)
-            fields = {"columns": arguments.columns, "remission_field": arguments.remission_field}
-            points = None if scan is None else read_points(scan, **fields)
+            points = None if scan is None else read_points(scan, **file_options(arguments))
             perception = perceive(points, image=image)
             wanted = _files_of(target, self._kinds, **_pictures_of(arguments, [path]))
             if "image" in wanted:

@@ -15,7 +15,7 @@ from ..errors import PointsError, SensorError
 from ..types.sensor import SensorProfile
 from .apart import decode_apart, describe_apart
 from .bags import bag_files
-from .files import read_points, read_timed_file
+from .files import FileOptions, read_points, read_timed_file
 from .identify import KnownSensor, of_cloud, of_metadata, of_packets
 from .packets import PCAP_MAGIC
 from .times import TimedScan
@@ -39,6 +39,7 @@ def read_scans(
     topic: str | None = None,
     remission_field: str | None = None,
     columns: int | Sequence[str] | None = None,
+    origin_m: Sequence[float] | None = None,
 ) -> Iterator[tuple[float | None, NDArray[np.float32]]]:
     """Read the scans of a recording, one after another; `read_timed_scans` gives the times of their points too.
 
@@ -61,6 +62,8 @@ def read_scans(
         Name of the remission field, as in `edgeperc.read_points`; ``reflectivity`` by default for an Ouster capture.
     columns : int or sequence of str, optional
         What scan files without a header hold, as in `edgeperc.read_points`.
+    origin_m : sequence of 3 float, optional
+        Place of the sensor in the map of scan files, as in `edgeperc.read_points`.
 
     Yields
     ------
@@ -85,10 +88,8 @@ def read_scans(
     UserWarning
         Damaged packets of an Ouster capture were dropped; the message has their number.
     """
-    return (
-        (stamp_s, points)
-        for stamp_s, points, _ in _scans(Path(source), _Options(topic, remission_field, columns, False))
-    )
+    options = _Options(topic, FileOptions(columns, remission_field, origin_m), times=False)
+    return ((stamp_s, points) for stamp_s, points, _ in _scans(Path(source), options))
 
 
 def read_timed_scans(
@@ -97,12 +98,13 @@ def read_timed_scans(
     topic: str | None = None,
     remission_field: str | None = None,
     columns: int | Sequence[str] | None = None,
+    origin_m: Sequence[float] | None = None,
 ) -> Iterator[TimedScan]:
     """Like `read_scans`, with the time of each point, where the source holds it, for `edgeperc.deskew`.
 
     Parameters
     ----------
-    source, topic, remission_field, columns
+    source, topic, remission_field, columns, origin_m
         As in `read_scans`.
 
     Yields
@@ -122,26 +124,24 @@ def read_timed_scans(
         As `read_scans`. PointsError also if the times contradict the stamps of the scans, or if the azimuths turn once
         in a time that no LiDAR takes for a turn: below 33 ms, or above 350 ms.
     """
-    return _scans(Path(source), _Options(topic, remission_field, columns, times=True))
+    return _scans(Path(source), _Options(topic, FileOptions(columns, remission_field, origin_m), times=True))
 
 
 class _Options(NamedTuple):
     topic: str | None
-    remission_field: str | None
-    columns: int | Sequence[str] | None
+    of_files: FileOptions
     times: bool
 
 
 def _scans(path: Path, options: _Options) -> Iterator[TimedScan]:
-    topic, remission_field, columns, times = options
     kind = _readable_kind(path)
     if kind == "folder":
         return _folder(path, options)
     if kind == "scan":
-        if times:
-            return iter([read_timed_file(path, remission_field, columns)])
-        return iter([TimedScan(None, read_points(path, remission_field=remission_field, columns=columns), None)])
-    return decode_apart(path, kind, topic, remission_field, times)
+        if options.times:
+            return iter([read_timed_file(path, options.of_files)])
+        return iter([TimedScan(None, read_points(path, **options.of_files._asdict()), None)])
+    return decode_apart(path, kind, options.topic, options.of_files.remission_field, options.times)
 
 
 def is_capture(path: Path) -> bool:

@@ -9,7 +9,7 @@ import zipfile
 import zlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -29,6 +29,7 @@ def read_points(
     *,
     columns: int | Sequence[str] | None = None,
     remission_field: str | None = None,
+    origin_m: Sequence[float] | None = None,
 ) -> NDArray[np.float32]:
     """Read the points of one scan from a file or an array.
 
@@ -52,6 +53,9 @@ def read_points(
     remission_field : str, optional
         Name of the remission field, for formats with named fields. By default the first existing one of remission,
         intensity, i, reflectivity, reflectance.
+    origin_m : sequence of 3 float, optional
+        Place of the sensor in a map [m], subtracted from the coordinates before they become float32, which rounds UTM
+        northings to 0.5 m.
 
     Returns
     -------
@@ -62,16 +66,26 @@ def read_points(
     ------
     PointsError
         The file cannot be read, is empty, larger than 256 MiB, cut short or not a scan. A scan of no points is valid
-        if a header says so; a file of 0 bytes is an error.
+        if a header says so; a file of 0 bytes is an error. Coordinates of a map need ``origin_m``.
+    OptionError
+        ``origin_m`` is not three finite numbers.
     """
     if not isinstance(source, str | os.PathLike):
-        return as_points(source, remission_field=remission_field)
-    return _read(Path(source), columns, remission_field)[0]
+        return as_points(source, remission_field=remission_field, origin_m=origin_m)
+    return _read(Path(source), FileOptions(columns, remission_field, origin_m))[0]
 
 
-def read_timed_file(path: Path, remission_field: str | None, columns: int | Sequence[str] | None = None) -> TimedScan:
-    """Read a scan file with the times of its points; options and errors as `read_points`."""
-    points, fields = _read(path, columns, remission_field)
+class FileOptions(NamedTuple):
+    """Options of `read_points`."""
+
+    columns: int | Sequence[str] | None
+    remission_field: str | None
+    origin_m: Sequence[float] | None
+
+
+def read_timed_file(path: Path, options: FileOptions) -> TimedScan:
+    """Read a scan file with the times of its points; errors as `read_points`."""
+    points, fields = _read(path, options)
     return TimedScan(None, points, point_times(fields, points, None))
 
 
@@ -79,7 +93,7 @@ _Read = tuple[NDArray[np.float32], Mapping[str, NDArray[Any]]]
 """Points, and the fields of the file if they have names."""
 
 
-def _read(path: Path, columns: int | Sequence[str] | None, remission_field: str | None) -> _Read:
+def _read(path: Path, options: FileOptions) -> _Read:
     try:
         size = path.stat().st_size if path.is_file() else 0
         if size > MAX_SCAN_BYTES:
@@ -92,16 +106,14 @@ def _read(path: Path, columns: int | Sequence[str] | None, remission_field: str 
     if data is None:
         raise PointsError(f"{path}: there is no such file; expected a scan as .bin, .npy, .npz, .pcd or .ply")
     try:
-        return _parse(data, path.name.lower(), columns, remission_field)
+        return _parse(data, path.name.lower(), options)
     except PointsError as exc:
         raise PointsError(f"{path}: {exc}") from exc
     except MemoryError as exc:
         raise PointsError(f"{path}: reading {data.size:,} bytes takes more memory than there is") from exc
 
 
-def _parse(
-    data: NDArray[np.uint8], name: str, columns: int | Sequence[str] | None, remission_field: str | None
-) -> _Read:
+def _parse(data: NDArray[np.uint8], name: str, options: FileOptions) -> _Read:
     if data.size == 0:
         raise PointsError(
             "the file is empty (0 bytes), as an interrupted recording leaves it; "
@@ -109,33 +121,31 @@ def _parse(
         )
     head = data[:MAX_HEADER_BYTES].tobytes()
     if head.startswith(b"\x93NUMPY"):
-        return _of_array(_parse_npy(data), remission_field)
+        return _of_array(_parse_npy(data), options)
     if head.startswith(b"PK\x03\x04"):
-        return _of_array(_parse_npz(data), remission_field)
+        return _of_array(_parse_npz(data), options)
     if head.startswith((b"ply\n", b"ply\r")):
-        return _of_columns(parse_ply(data, head, remission_field), remission_field)
+        return _of_columns(parse_ply(data, head, options.remission_field), options)
     if begins_like_pcd(head):
-        return _of_columns(parse_pcd(data, head, remission_field), remission_field)
-    if columns is None and not name.endswith(".bin"):
+        return _of_columns(parse_pcd(data, head, options.remission_field), options)
+    if options.columns is None and not name.endswith(".bin"):
         raise PointsError(
             "neither PCD, PLY, .npy nor .npz by its first bytes; for raw float32 values name it .bin or pass "
             "columns=4 (x, y, z, remission)"
         )
-    return _of_raw(parse_raw(data, columns, 5 if name.endswith(".pcd.bin") else 4), columns, remission_field)
+    raw = parse_raw(data, options.columns, 5 if name.endswith(".pcd.bin") else 4)
+    if options.columns is None or isinstance(options.columns, int | np.integer):  # fields without names
+        return assemble(*raw, None, options.origin_m), {}
+    return _of_columns(raw, options)
 
 
-def _of_raw(raw: Columns, columns: int | Sequence[str] | None, remission_field: str | None) -> _Read:
-    if columns is None or isinstance(columns, int | np.integer):  # fields without names
-        return assemble(*raw, None), {}
-    return assemble(*raw, remission_field), raw.fields
+def _of_array(array: NDArray[Any], options: FileOptions) -> _Read:
+    points = as_points(array, remission_field=options.remission_field, origin_m=options.origin_m)
+    return points, table_columns(array)
 
 
-def _of_array(array: NDArray[Any], remission_field: str | None) -> _Read:
-    return as_points(array, remission_field=remission_field), table_columns(array)
-
-
-def _of_columns(columns: Columns, remission_field: str | None) -> _Read:
-    return assemble(*columns, remission_field), columns.fields
+def _of_columns(columns: Columns, options: FileOptions) -> _Read:
+    return assemble(*columns, options.remission_field, options.origin_m), columns.fields
 
 
 def _parse_npy(data: NDArray[np.uint8]) -> NDArray[Any]:

@@ -16,7 +16,7 @@ from hypothesis.extra import numpy as hnp
 
 import edgeperc
 import twins.points
-from edgeperc.errors import PointsError
+from edgeperc.errors import OptionError, PointsError
 from edgeperc.readers.files import read_points
 from edgeperc.readers.pcd import fill_unpacked_lzf
 from edgeperc.types.points import as_points
@@ -568,3 +568,58 @@ def test_named_columns_have_times(tmp_path):
     (scan,) = edgeperc.read_timed_scans(path)
     assert scan.times_s is None
     np.testing.assert_array_equal(scan.points, points)
+
+
+# --- coordinates of a map --------------------------------------------------------------------------------------------
+
+MAPS = {
+    "UTM": (512_345.25, 5_412_345.5, 113.0),
+    "Gauss-Krüger": (3_500_000.5, 5_800_000.0, 40.0),
+    "south": (-9e4, 0, 0),
+}
+
+
+@pytest.mark.parametrize("place", MAPS)
+@pytest.mark.parametrize("kind", ["pcd", "ply", "array", "named", "npy"])
+def test_coordinates_of_a_map_are_not_rounded(tmp_path, kind, place):
+    """A scan whose coordinates float32 would round is refused, and exact if the place of the sensor is subtracted."""
+    points, origin = street(4), np.array(MAPS[place])
+    placed = np.column_stack([points[:, :3].astype("f8") + origin, points[:, 3]])
+    named = np.rec.fromarrays(placed.T, names="x,y,z,intensity")
+    n = len(points)
+    source = {
+        "pcd": lambda: save(
+            tmp_path, "a.pcd", pcd("x y z intensity", "F F F F", "8 8 8 8", "1 1 1 1", n, "binary", placed.tobytes())
+        ),
+        "ply": lambda: save(
+            tmp_path,
+            "a.ply",
+            ply(
+                "binary_little_endian",
+                placed.tobytes(),
+                n=n,
+                properties="".join(f"property double {name}\n" for name in ("x", "y", "z", "intensity")),
+            ),
+        ),
+        "array": lambda: placed,
+        "named": lambda: named,
+        "npy": lambda: save(tmp_path, "a.npy", npy(placed)),
+    }[kind]()
+    with pytest.raises(PointsError, match=r"those of a map, about \(.*--origin X Y Z"):
+        read_points(source)
+    read = read_points(source, origin_m=origin)
+    np.testing.assert_allclose(read, points, atol=1e-5)
+    if kind != "array" and kind != "named":
+        ((_, read),) = edgeperc.read_scans(source, origin_m=origin.tolist())
+        np.testing.assert_allclose(read, points, atol=1e-5)
+
+
+@pytest.mark.parametrize("origin", [(0, 0), ("a", 0, 0), (0, np.nan, 0), 5.0])
+def test_an_origin_is_three_numbers(origin):
+    with pytest.raises(OptionError, match="origin_m is"):
+        read_points(POINTS, origin_m=origin)
+
+
+def test_an_origin_may_be_subtracted_from_float32():
+    moved = read_points(POINTS, origin_m=(1.0, -2.0, 0.5))
+    np.testing.assert_allclose(moved, POINTS - np.float32([1.0, -2.0, 0.5, 0.0]))
