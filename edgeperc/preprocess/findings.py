@@ -206,7 +206,8 @@ def _upside_down(scan: Measures, profile: FitnessProfile) -> Finding | None:
         return None
     return Finding(
         f"The ground lies {scan.ground_m:.1f} m above the sensor: it is mounted upside down, or z points "
-        "down; turn the points by 180 degrees about x (negate y and z).",
+        "down: pass the mounting of a sensor that hangs, Mounting(roll_deg=180) or --extrinsic, or turn the points by "
+        "180 degrees about x (negate y and z).",
         True,
     )
 
