@@ -166,7 +166,7 @@ def _geometry_findings(scan: Measures, profile: FitnessProfile, sensor: SensorPr
         other_height,
         _other_field_of_view(scan, profile, sensor),
         _cropped(scan, profile) or _turned(scan, profile),
-        walls or _room(scan, profile),
+        _room(scan, profile) or walls,
         _few_rows(scan, profile, sensor, has_ground),
         _other_number(scan, profile),
     )
@@ -224,13 +224,14 @@ _ASYMMETRIC_DEG = 8.0  # of beams that tell up from down
 
 
 def check_beams(points: NDArray[np.float32], sensor: SensorProfile) -> tuple[Finding, ...]:
-    """Describe a scan whose elevations are those of the sensor's beams with the opposite sign.
+    """Describe a scan with its ground above, whose elevations are those of the sensor's beams with the opposite sign.
 
     points : (n, 4) float32; returns in the frame of the scan, before a mounting moves them.
     """
     up, down = max(sensor.elevations_deg), min(sensor.elevations_deg)
     scan = measure(points, (180.0, -180.0)) if abs(up + down) > _ASYMMETRIC_DEG else None
-    if scan is None:
+    # Elevations about an origin on the road, as in the frame of a vehicle, are as high; its ground is not above it.
+    if scan is None or scan.ground_m is None or scan.ground_m <= 0.5:
         return ()
     highest, lowest = scan.elevation_p99_deg, scan.elevation_p01_deg
     as_is = abs(highest - up) + abs(lowest - down)

@@ -21,7 +21,9 @@ from .pcd import begins_like_pcd, parse_pcd
 from .ply import parse_ply
 from .raw import parse_raw
 from .tables import MAX_HEADER_BYTES, MAX_SCAN_BYTES, Columns
+from .text import begins_like_text, parse_text
 from .times import TimedScan, point_times
+from .unknown import advice_for
 
 
 def read_points(
@@ -45,11 +47,12 @@ def read_points(
     ----------
     source : str, path or array
         ``.bin``, ``.pcd.bin``, ``.npy``, ``.npz`` (its only array, or the one called ``points``), ``.pcd`` (ascii,
-        binary, binary_compressed), ``.ply`` (ascii, binary), or an array for `as_points`.
+        binary, binary_compressed), ``.ply`` (ascii, binary), a table of text (``.csv``, ``.xyz``, ``.txt``, ``.pts``),
+        or an array for `as_points`.
     columns : int or sequence of str, optional
-        What a file without a header holds for each point: the number of float32 values, at least 3, of which the first
-        are x, y, z and remission; or their names in order, such as ``("x", "y", "z", "intensity", "ring")``. Ignored
-        for other files.
+        What a raw file or a text without names holds for each point: the names of the values in order, such as
+        ``("x", "y", "z", "intensity", "ring")``; or, of a raw file, the number of float32 values, at least 3, of which
+        the first are x, y, z and remission. Ignored for other files.
     remission_field : str, optional
         Name of the remission field, for formats with named fields. By default the first existing one of remission,
         intensity, i, reflectivity, reflectance.
@@ -128,10 +131,17 @@ def _parse(data: NDArray[np.uint8], name: str, options: FileOptions) -> _Read:
         return _of_columns(parse_ply(data, head, options.remission_field), options)
     if begins_like_pcd(head):
         return _of_columns(parse_pcd(data, head, options.remission_field), options)
+    # The first bytes of float32 values may be any, but thousands of them are no text.
+    may_be_raw = options.columns is not None or (name.endswith(".bin") and not begins_like_text(head))
+    advice = None if may_be_raw else advice_for(head)
+    if advice is not None:
+        raise PointsError(f"this is {advice}")
+    if begins_like_text(head) and not name.endswith(".bin"):
+        return _of_columns(parse_text(data, options.columns), options)
     if options.columns is None and not name.endswith(".bin"):
         raise PointsError(
-            "neither PCD, PLY, .npy nor .npz by its first bytes; for raw float32 values name it .bin or pass "
-            "columns=4 (x, y, z, remission)"
+            f"neither PCD, PLY, .npy, .npz nor text by its first bytes, {head[:8]!r}; if they are raw float32 values, "
+            "name it .bin or pass columns=4 (x, y, z, remission)"
         )
     raw = parse_raw(data, options.columns, 5 if name.endswith(".pcd.bin") else 4)
     if options.columns is None or isinstance(options.columns, int | np.integer):  # fields without names

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from ..errors import PointsError
 from .tables import Columns
 
-_TEXT_BYTES = np.zeros(256, dtype=np.bool_)
-_TEXT_BYTES[[9, 10, 13, *range(32, 127)]] = True
+TEXT_BYTES = np.zeros(256, dtype=np.bool_)
+TEXT_BYTES[[9, 10, 13, *range(32, 127)]] = True
 
 _KNOWN = ("x", "y", "z", "remission")
 _WIDTHS = range(3, 13)  # values a point that are told apart
@@ -30,7 +30,7 @@ def parse_raw(data: NDArray[np.uint8], columns: int | Sequence[str] | None, usua
     Raises PointsError.
     """
     names = _names(columns)
-    if _TEXT_BYTES[data[:4096]].all():
+    if TEXT_BYTES[data[:4096]].all():
         raise PointsError("the file holds text, not float32 values; expected x, y, z, remission as raw float32")
     if columns is None:
         width = _width(data[: data.size // 4 * 4].view("<f4"), usual)

@@ -288,7 +288,7 @@ BAD_FILES = {
         ),
         "save it as binary",
     ),
-    "picture.pcd": (b"\x89PNG\r\n\x1a\n" + b"\0" * 64, "first bytes"),
+    "picture.pcd": (b"\x89PNG\r\n\x1a\n" + b"\0" * 64, "this is an image"),
 }
 
 
@@ -623,3 +623,89 @@ def test_an_origin_is_three_numbers(origin):
 def test_an_origin_may_be_subtracted_from_float32():
     moved = read_points(POINTS, origin_m=(1.0, -2.0, 0.5))
     np.testing.assert_allclose(moved, POINTS - np.float32([1.0, -2.0, 0.5, 0.0]))
+
+
+# --- text, and formats that are not read -----------------------------------------------------------------------------
+
+
+@given(
+    separator=st.sampled_from([" ", ",", ";", "\t", ", ", "  "]),
+    names=st.permutations(["x", "Y", "z", "Intensity", "ring", "time"]),
+    end=st.sampled_from(["\n", "\r\n"]),
+    comment=st.sampled_from(["", "# made by a tool\n", "// made by a tool\n", "\ufeff"]),
+    mark=st.sampled_from(["", "#", "//", "# "]),
+)
+@settings(max_examples=60, deadline=None)
+def test_tables_of_text_with_names(separator, names, end, comment, mark):
+    values = np.round(np.random.default_rng(1).normal(0.0, 20.0, (7, 6)), 3)
+    rows = [mark + separator.join(names), *(separator.join(str(v) for v in row) for row in values)]
+    places = [[name.lower() for name in names].index(name) for name in ("x", "y", "z", "intensity")]
+    with tempfile.TemporaryDirectory() as folder:
+        path = save(Path(folder), "scan.csv", (comment + end.join(rows) + end).encode())
+        np.testing.assert_array_equal(read_points(path), values[:, places].astype("f4"))
+        ((_, points),) = edgeperc.read_scans(path, remission_field="ring")
+        np.testing.assert_array_equal(points[:, 3], values[:, [*names].index("ring")].astype("f4"))
+
+
+@pytest.mark.parametrize(
+    ("name", "head", "n"), [("a.xyz", "", 3), ("b.xyz", "", 4), ("a.txt", "", 4), ("a.pts", "5\n", 4)]
+)
+def test_tables_of_text_without_names(tmp_path, name, head, n):
+    values = np.arange(5.0 * n).reshape(5, n) * 1.25
+    path = save(tmp_path, name, (head + "\n".join(" ".join(map(str, row)) for row in values)).encode())
+    points = read_points(path)
+    np.testing.assert_array_equal(points[:, :n], values)
+    assert points.shape == (5, 4)
+    named = read_points(path, columns=("z", "y", "x", "i")[:n])
+    np.testing.assert_array_equal(named[:, :3], values[:, [2, 1, 0]])
+
+
+@pytest.mark.parametrize(
+    ("content", "error"),
+    [
+        (b"1 2 3 4 5 6\n" * 9, "a row has 6 numbers, and there are no line of names: pass columns="),
+        (b"x y z i\n1 2 3 4 5\n", "a row has 5 numbers, and there are 4 names"),
+        (b"1 2 3 4\n1 2 3\n", "does not hold 4 numbers"),
+        (b"1 2 3 4\nfar 2 3 1\n", "does not hold 4 numbers"),
+        (b"Dear reader,\nno points here\n", "no table of points: it has a line 'Dear reader'"),
+        (b"# x y z\n", "no row of three numbers"),
+        (b"300\n200\n0 0 0\n1 0 0\n0 1 0\n0 0 1\n1 0 0 0\n", "does not hold 3 numbers"),  # PTX
+    ],
+)
+def test_text_that_is_no_table(tmp_path, content, error):
+    with pytest.raises(PointsError, match=error):
+        read_points(save(tmp_path, "scan.txt", content))
+
+
+@pytest.mark.parametrize(
+    ("content", "error"),
+    [
+        (b"LASF" + bytes(400), "a LAS or LAZ file; convert it"),
+        (b"ARROW1\0\0" + bytes(400), "a Feather .* pandas"),
+        (b"PAR1" + bytes(99), "a Parquet table"),
+        (b"version https://git-lfs.github.com/spec/v1\noid sha256:00\n", "Run: git lfs pull"),
+        (b"\0\0\0\x20ftypisom" + bytes(400), "a film"),
+        (b"II*\0" + bytes(40), "a TIFF image"),
+        (b"\x89PNG\r\n" + bytes(40), "an image; pass it with a camera model"),
+        (b"\x1f\x8b\x08" + bytes(40), "an archive; unpack it"),
+        (bytes(257) + b"ustar" + bytes(99), "an archive; unpack it"),
+        (b"ASTM-E57" + bytes(40), "an E57 file"),
+        (b"\x80\x04\x95" + bytes(40), "a pickle, which is never unpickled"),
+        (b"<!DOCTYPE html><html>not found</html>", "a download may have failed"),
+        (b'{"points": []}', "JSON"),
+        (b"\x01\x02\x03\x04\x05\x06\x07\x08", r"by its first bytes, b'\\x01\\x02"),
+    ],
+)
+@pytest.mark.parametrize("suffix", ["", ".pcd", ".bin"])
+def test_other_formats_are_named(tmp_path, content, error, suffix):
+    if suffix == ".bin" and min(content) < 9:
+        return  # may be float32 values
+    with pytest.raises(PointsError, match=rf"scan{suffix}: .*{error}"):
+        read_points(save(tmp_path, f"scan{suffix}", content))
+
+
+@pytest.mark.parametrize("first", [b"{\0\x90A", b"[ab@", b"RIFF", b"BZh@", b"\xff\xd8\xff@"])
+def test_raw_values_may_begin_like_another_format(tmp_path, first):
+    content = first + street(1).tobytes()[4:]
+    assert len(read_points(save(tmp_path, "scan.bin", content))) == 6000
+    assert len(read_points(save(tmp_path, "scan.raw", content), columns=4)) == 6000
