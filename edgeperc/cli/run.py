@@ -312,6 +312,10 @@ def _check_usage(arguments: argparse.Namespace, kinds: Sequence[str]) -> None:
         arguments.usage_error("--columns, --remission-field and --origin need no --live")
     if arguments.quaternion is not None and arguments.poses is None:
         arguments.usage_error("--quaternion needs --poses FILE")
+    if arguments.sensor is not None or arguments.extrinsic is not None:
+        from ..types.sensor import get_sensor
+
+        get_sensor(with_mounting(arguments.sensor or DEFAULT_SENSOR, arguments))  # one error, before the first scan
     if arguments.png:
         require("matplotlib", "view", "Drawing a picture")
     if arguments.gif:
