@@ -111,9 +111,11 @@ class Unreadable:
         self._error = error
 
     def topics(self) -> set[Channel]:
+        """As `BagFile.topics`."""
         raise self._error
 
     def messages_of(self, channel: Channel) -> Iterator[tuple[int, memoryview]]:
+        """As `BagFile.messages_of`."""
         raise self._error
 
 
@@ -124,9 +126,11 @@ class McapBag:
         self._file = McapFile(path)
 
     def topics(self) -> set[Channel]:
+        """As `BagFile.topics`."""
         return set(self._file.channels.values())
 
     def messages_of(self, channel: Channel) -> Iterator[tuple[int, memoryview]]:
+        """As `BagFile.messages_of`."""
         for number, stamp_ns, data in self._file.messages():
             if self._file.channels.get(number) == channel:
                 yield stamp_ns, _plain(data)
@@ -139,11 +143,13 @@ class SqliteBag:
         self._path = path
 
     def topics(self) -> set[Channel]:
+        """As `BagFile.topics`."""
         with closing(self._open()) as database:
             rows = self._rows(database, "SELECT name, type, serialization_format FROM topics")
             return {Channel(str(name), str(kind), str(encoding)) for name, kind, encoding in rows}
 
     def messages_of(self, channel: Channel) -> Iterator[tuple[int, memoryview]]:
+        """As `BagFile.messages_of`."""
         of_topic = "FROM messages WHERE topic_id IN (SELECT id FROM topics WHERE name = ?) ORDER BY"
         with closing(self._open()) as database:
             try:
@@ -186,6 +192,7 @@ class Ros1Bag:
         self._whole = False
 
     def topics(self) -> set[Channel]:
+        """As `BagFile.topics`."""
         if not self._whole:
             try:
                 with self._path.open("rb") as file:
@@ -203,6 +210,7 @@ class Ros1Bag:
         return set(self._connections.values())
 
     def messages_of(self, channel: Channel) -> Iterator[tuple[int, memoryview]]:
+        """As `BagFile.messages_of`."""
         for number, stamp_ns, data in self._messages():
             if self._connections.get(number) == channel:
                 yield stamp_ns, data
