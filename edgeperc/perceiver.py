@@ -22,7 +22,7 @@ from .inference.session import Session
 from .objects.boxes import MIN_SCORE
 from .pipeline import BoxesFrom, ObjectNetwork, Options, Pipeline, RangeImageNetwork, TopViewNetwork
 from .preprocess.condition import scale
-from .preprocess.findings import Finding, check_dropped, check_profiles
+from .preprocess.findings import Finding, check_beams, check_dropped, check_profiles
 from .preprocess.fitness import FitnessProfile
 from .preprocess.interpolation import Interpolator
 from .preprocess.remission import RemissionMatcher
@@ -434,9 +434,10 @@ class Perceiver:
         Parameters
         ----------
         points : (n, 4) or (n, 3) array_like, or a structured array; None without a LiDAR model
-            x, y, z [m] about the sensor, z up; remission in the sensor's raw unit. Not modified. Rows that are not
-            finite, nearer than the sensor measures, or inside its ``ego_box`` are counted (`Perception.dropped`),
-            labeled 0 and otherwise ignored; an empty scan gives an empty perception.
+            x, y, z [m] about the sensor, z up; remission in the sensor's raw unit. Not modified. Rows whose x, y or z
+            is not finite, nearer than the sensor measures, or inside its ``ego_box`` are counted
+            (`Perception.dropped`), labeled 0 and otherwise ignored; an empty scan gives an empty perception. A
+            remission that is not finite is taken as the median of the others.
         stamp_s : float or None
             Time of the scan [s], for the tracker; returned in the perception.
         image : (H, W, 3) uint8 array_like; None without a camera model
@@ -500,6 +501,7 @@ class Perceiver:
     def _perceive(self, scan: NDArray[np.float32], stamp_s: float | None, watch: Stopwatch, check: bool) -> Perception:
         given, before, matcher, profile = scan, self._estimator, self._remission, self.sensor
         hidden: tuple[Finding, ...] = ()
+        turned: tuple[Finding, ...] = ()
         matched: tuple[Finding, ...] = ()
         scan, dropped = returns(given, profile, before.known.origin_m)
         if self._renders:
@@ -508,6 +510,7 @@ class Perceiver:
         dropped = replace(dropped, not_finite=dropped.not_finite + n_overflowed)
         watch.lap("adapt" if self._renders and profile.remission is not None else "check")
         if not before.is_complete and len(scan):
+            turned = check_beams(scan, profile) if check and before.known.roll_deg is None else ()
             try:
                 self._set_mounting(before.add(scan))
             except MountingError as exc:
@@ -518,7 +521,7 @@ class Perceiver:
             watch.lap("adapt")
         fitness = check_dropped(given, dropped, profile) if check else ()
         if check and not fitness:
-            fitness = check_profiles(scan, self._fitness, profile)
+            fitness = turned or check_profiles(scan, self._fitness, profile)
         if check and not any(finding.gross for finding in fitness):
             fitness = (*fitness, *hidden)
         if self.on_mismatch != "ignore":

@@ -15,6 +15,7 @@ from pathlib import Path
 # Modules that an extra brings, and arguments of pytest: tests that use them. The extras docs and test are whole jobs.
 # BESIDE has what these tests want, too.
 SMOKE: dict[str, tuple[list[str], list[str]]] = {
+    "bags": (["lz4", "zstandard"], ["tests/readers/test_bags.py", "tests/readers/test_clouds.py"]),
     "bench": (["psutil"], ["tests/bench/test_bench_measure.py"]),
     "camera": (["PIL"], ["tests/camera/test_camera.py"]),
     "completion": (["shtab"], ["tests/cli/test_cli_info.py", "-k", "complet"]),
@@ -28,7 +29,7 @@ SMOKE: dict[str, tuple[list[str], list[str]]] = {
     "geometry": (["open3d", "pypatchworkpp", "sklearn"], ["tests/bench/test_peers.py", "-k", "ground"]),
     "gpu": (["onnxruntime"], ["tests/inference/test_session.py"]),
     "io": (
-        ["ouster.sdk", "rosbags", "velodyne_decoder"],
+        ["lz4", "ouster.sdk", "velodyne_decoder", "zstandard"],
         ["tests/readers/test_captures.py", "tests/readers/test_times.py"],
     ),
     "loadgen": (["mlperf_loadgen"], ["tests/bench/test_bench_measure.py", "-k", "loadgen"]),
@@ -44,7 +45,7 @@ SMOKE: dict[str, tuple[list[str], list[str]]] = {
     "rerun": (["rerun"], ["tests/sinks/test_viewers.py", "-k", "rerun or rrd"]),
     "ros": (
         ["lz4", "rosbags", "zstandard"],
-        ["tests/readers/test_captures.py", "tests/readers/test_times.py", "-k", "bag or mcap"],
+        ["tests/readers/test_bags.py", "tests/readers/test_times.py", "-k", "bag or mcap"],
     ),
     "ros2": (["rosbags", "zenoh"], ["tests/ros2/test_ros2_messages.py", "tests/ros2/test_ros2_node.py"]),
     "slam": (["kiss_icp"], ["tests/bench/test_slam.py"]),

@@ -62,10 +62,11 @@ FLOORS = {
         road.__init__ road.grid road.outline
         road.ahead
         pipeline
-        readers.__init__ readers.images readers.packets readers.times
-        readers.ouster readers.tables
-        readers.inflate readers.pcd readers.ply
-        readers.files readers.mcap
+        readers.__init__ readers.images readers.packets readers.times readers.unknown
+        readers.clouds readers.ouster readers.tables
+        readers.inflate readers.pcd readers.ply readers.raw
+        readers.mcap readers.text
+        readers.bags readers.files
         readers.decoders
         readers.identify readers.worker
         readers.apart

@@ -84,7 +84,8 @@ class Calibration:
         Parameters
         ----------
         path : str or Path
-            A ``calib`` file of the object, tracking or odometry data, as in `read_kitti_calibration`.
+            A ``calib`` file of the object, tracking or odometry data; of raw data, the folder of the day, or its
+            ``calib_velo_to_cam.txt`` or ``calib_cam_to_cam.txt``.
         width, height : int
             Size of the image [px]. The file does not hold it; KITTI's images are 1224 to 1242 wide and 370 to 376 high.
 
@@ -148,31 +149,58 @@ class Calibration:
 
 
 def read_kitti_calibration(path: str | os.PathLike[str]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Read a calibration file of KITTI's object, tracking or odometry data.
+    """Read a calibration of KITTI's object, tracking, odometry or raw data.
 
-    path : a text file with P2, R0_rect (or R_rect) and Tr_velo_to_cam (or Tr_velo_cam); in odometry data P2 and Tr,
-        which includes the rectification.
+    path : of raw data the folder of a day, or either of its files calib_velo_to_cam.txt and calib_cam_to_cam.txt; a
+        text file with P2, R0_rect (or R_rect) and Tr_velo_to_cam (or Tr_velo_cam); in odometry data P2 and Tr, which
+        includes the rectification.
     Returns T_rectified_sensor ((4, 4) float64): From the Velodyne's frame to the rectified frame of camera 0.
     Returns P2 ((3, 4) float64): From there to the image of the left color camera.
     Raises CalibrationError, OSError.
     """
-    values = {}
+    folder = Path(path) if Path(path).is_dir() else Path(path).parent
+    is_raw = Path(path).is_dir() or Path(path).name in _RAW_FILES
+    values: dict[str, NDArray[np.float64]] = {}
     try:
-        for line in Path(path).read_text("utf-8").splitlines():
-            key, _, numbers = line.replace(":", " ", 1).partition(" ")
-            if numbers.strip():
-                values[key] = np.array([float(v) for v in numbers.split()])
+        for file in [folder / name for name in _RAW_FILES] if is_raw else [Path(path)]:
+            for line in file.read_text("utf-8").splitlines():
+                key, _, numbers = line.replace(":", " ", 1).partition(" ")
+                if numbers.strip() and key not in _NO_NUMBERS:
+                    values[key] = np.array([float(v) for v in numbers.split()])
         rectify, from_velo = np.eye(4), np.eye(4)
+        if is_raw:
+            rectify[:3, :3] = values["R_rect_00"].reshape(3, 3)
+            from_velo[:3] = np.column_stack([values["R"].reshape(3, 3), values["T"].reshape(3)])
+            return rectify @ from_velo, values["P_rect_02"].reshape(3, 4)
         if "Tr" in values:
             from_velo[:3] = values["Tr"].reshape(3, 4)
+        elif {"P0", "P2"} <= values.keys() and not any(key.startswith(("R0", "R_", "Tr_")) for key in values):
+            raise CalibrationError(
+                f"{path} lacks Tr, the place of the Velodyne: KITTI's odometry calibration comes in two downloads. "
+                "Take calib.txt of data_odometry_calib.zip"
+            )
         else:
             rectify[:3, :3] = values["R0_rect" if "R0_rect" in values else "R_rect"].reshape(3, 3)
             from_velo[:3] = values["Tr_velo_to_cam" if "Tr_velo_to_cam" in values else "Tr_velo_cam"].reshape(3, 4)
         return rectify @ from_velo, values["P2"].reshape(3, 4)
-    except (KeyError, ValueError) as exc:
+    except FileNotFoundError as exc:
+        if not is_raw:
+            raise
         raise CalibrationError(
-            f"{path} holds no KITTI calibration ({type(exc).__name__}: {exc}); expected P2, R0_rect and Tr_velo_to_cam"
+            f"{exc.filename} is missing; the calibration of a KITTI raw drive is the folder of its day, with "
+            f"{' and '.join(_RAW_FILES)}"
         ) from exc
+    except CalibrationError:
+        raise
+    except (KeyError, ValueError) as exc:
+        expected = "R, T, R_rect_00 and P_rect_02" if is_raw else "P2, R0_rect and Tr_velo_to_cam"
+        raise CalibrationError(
+            f"{path} holds no KITTI calibration ({type(exc).__name__}: {exc}); expected {expected}"
+        ) from exc
+
+
+_RAW_FILES = ("calib_velo_to_cam.txt", "calib_cam_to_cam.txt")  # of a day's drives
+_NO_NUMBERS = ("calib_time",)
 
 
 def _pixels(name: str, given: object) -> int:

@@ -109,9 +109,43 @@ def add_topic(group: Any) -> None:
     group.add_argument(
         "--topic",
         metavar="NAME",
-        help="the topic of a bag with several point clouds, or the serial number of a sensor in an Ouster capture "
-        "(default: the only one)",
+        help="what to read of several sensors: the topic of a bag, TOPIC@FRAME, the serial number of an Ouster, the "
+        "address of a Velodyne (default: the only one)",
     )
+
+
+def add_fields(group: Any) -> None:
+    """Add ``--columns``, ``--remission-field`` and ``--origin``."""
+    group.add_argument(
+        "--columns",
+        nargs="+",
+        metavar="NAME",
+        help="what .bin files hold for each point, in order; after the paths: --columns x y z intensity ring (default: "
+        "x y z remission, unless the values show that there are more or fewer)",
+    )
+    group.add_argument(
+        "--remission-field",
+        metavar="NAME",
+        help="the field to take the remission from (default: the first of remission, intensity, i, reflectivity, "
+        "reflectance; reflectivity for an Ouster)",
+    )
+    group.add_argument(
+        "--origin",
+        nargs=3,
+        type=finite_number,
+        metavar=("X", "Y", "Z"),
+        help="place of the sensor in the map [m], for scan files with coordinates of a map (default: 0 0 0)",
+    )
+
+
+def reading_options(arguments: argparse.Namespace) -> dict[str, Any]:
+    """Options of `edgeperc.read_scans` from ``--topic`` and those of `add_fields`."""
+    return {"topic": arguments.topic, **file_options(arguments)}
+
+
+def file_options(arguments: argparse.Namespace) -> dict[str, Any]:
+    """Options of `edgeperc.read_points` from those of `add_fields`."""
+    return {"columns": arguments.columns, "remission_field": arguments.remission_field, "origin_m": arguments.origin}
 
 
 def add_model(group: Any, default: Sequence[str] = DEFAULT_MODELS) -> None:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from ..errors import EdgepercError, MissingExtraError, MountingError, PointsError
 from ..system.atomic import write_atomic
-from .arguments import Commands, add_command, add_mounting, add_sensor, add_topic
+from .arguments import Commands, add_command, add_fields, add_mounting, add_sensor, add_topic, reading_options
 from .output import print_error, print_line, print_rows
 from .scans import scan_sensor
 
@@ -66,6 +66,7 @@ def add_parser(commands: Commands) -> None:
     add_sensor(reading, of_capture=True)
     add_mounting(reading)
     add_topic(reading)
+    add_fields(reading)
     reading.add_argument(
         "--suggest-ego-box",
         action="store_true",
@@ -163,7 +164,7 @@ def _suggest_ego_box(
         print_error(f"--suggest-ego-box: the scans are of {len(estimators)} sensors; expected scans of one")
         return True
     ((sensor, estimator),) = estimators.items()
-    scans = (points for path in paths for _, points in read_scans(path, topic=arguments.topic))
+    scans = (points for path in paths for _, points in read_scans(path, **reading_options(arguments)))
     try:
         suggestion = suggest_ego_box(islice(scans, _MOST_SCANS), sensor, estimator.mounting())
     except EdgepercError as exc:
@@ -355,7 +356,7 @@ def _scan_rows(
 
     named, because = scan_sensor(path, arguments)
     sensor = get_sensor(named)
-    scans, damage = _first_scans(path, arguments.topic)
+    scans, damage = _first_scans(path, reading_options(arguments))
     cleaned, (dropped, *_) = zip(*(returns(scan, sensor) for scan in scans), strict=True)
     document: dict[str, Any] = {
         "scan": str(path),
@@ -388,14 +389,14 @@ def _scan_rows(
     return [*rows, *extent_rows, *remission_rows, *mounting_rows, beams, *model_rows], document
 
 
-def _first_scans(path: Path, topic: str | None) -> tuple[list[NDArray[np.float32]], str]:
+def _first_scans(path: Path, options: Mapping[str, Any]) -> tuple[list[NDArray[np.float32]], str]:
     """The scans that decide a mounting, and what damage comes after them."""
     from ..ground.leveling import FROZEN_AFTER
     from ..readers.captures import read_scans
 
     scans: list[NDArray[np.float32]] = []
     try:
-        scans.extend(points for _, points in islice(read_scans(path, topic=topic), FROZEN_AFTER))
+        scans.extend(points for _, points in islice(read_scans(path, **options), FROZEN_AFTER))
     except PointsError as exc:
         if not scans:
             raise

@@ -20,12 +20,15 @@ from .arguments import (
     Commands,
     add_adapt,
     add_command,
+    add_fields,
     add_model,
     add_mounting,
     add_network,
     add_sensor,
     add_topic,
+    file_options,
     positive_number,
+    reading_options,
 )
 from .output import many, print_line, progress
 from .ray import add_engine, check_engine, perceive_on_ray, through_temporary
@@ -86,7 +89,7 @@ def add_parser(commands: Commands) -> None:
         metavar="PATH",
         help="scan files (.bin, .pcd, .ply, .npy, .npz); folders of them; the root of a KITTI object set, of "
         "SemanticKITTI or of a KITTI raw drive; captures: .pcap, .osf, .bag, .mcap, a ROS 2 bag's folder "
-        "(extras 'velodyne', 'ouster', 'ros'); or images (.jpg, .png, .webp, .bmp, .ppm) and folders of them (extra "
+        "(extras 'velodyne', 'ouster', 'bags'); or images (.jpg, .png, .webp, .bmp, .ppm) and folders of them (extra "
         "'camera')",
     )
     reading.add_argument(
@@ -107,6 +110,7 @@ def add_parser(commands: Commands) -> None:
     add_sensor(reading, of_capture=True)
     add_mounting(reading)
     add_topic(reading)
+    add_fields(reading)
     reading.add_argument(
         "--deskew",
         action="store_true",
@@ -119,6 +123,11 @@ def add_parser(commands: Commands) -> None:
         metavar="FILE",
         help="poses of the sensor on the clock of the scans, for --deskew: lines of time [s], x, y, z [m] and the "
         "quaternion x, y, z, w, TUM's format (default: the tracker's estimate)",
+    )
+    reading.add_argument(
+        "--quaternion",
+        choices=("xyzw", "wxyz"),
+        help="order of the quaternions in --poses (default: xyzw, unless the poses contradict it)",
     )
     reading.add_argument(
         "--on-mismatch",
@@ -299,6 +308,14 @@ def _check_usage(arguments: argparse.Namespace, kinds: Sequence[str]) -> None:
         arguments.usage_error("--deskew needs --poses FILE or --track, and no --live")
     if arguments.poses is not None and not arguments.deskew:
         arguments.usage_error("--poses needs --deskew")
+    if arguments.live and any(value is not None for value in file_options(arguments).values()):
+        arguments.usage_error("--columns, --remission-field and --origin need no --live")
+    if arguments.quaternion is not None and arguments.poses is None:
+        arguments.usage_error("--quaternion needs --poses FILE")
+    if arguments.sensor is not None or arguments.extrinsic is not None:
+        from ..types.sensor import get_sensor
+
+        get_sensor(with_mounting(arguments.sensor or DEFAULT_SENSOR, arguments))  # one error, before the first scan
     if arguments.png:
         require("matplotlib", "view", "Drawing a picture")
     if arguments.gif:
@@ -419,7 +436,7 @@ class _Run:
         if arguments.deskew:
             from .straighten import Straightener
 
-            self._straightener = Straightener(arguments.poses)
+            self._straightener = Straightener(arguments.poses, arguments.quaternion)
         self._n = 0
 
     def scans(self, path: Path, target: Path, shown: Path | None = None) -> Iterator[Outcome]:
@@ -434,7 +451,7 @@ class _Run:
             perceive = self._perceivers.of(self._perceivers.sensor_of(path))
             numbered = is_capture(path)
             read: Callable[..., Iterator[tuple[Any, ...]]] = read_timed_scans if self._straightener else read_scans
-            for k, (stamp_s, points, *times_s) in enumerate(read(path, topic=self._arguments.topic)):
+            for k, (stamp_s, points, *times_s) in enumerate(read(path, **reading_options(self._arguments))):
                 name, file = (shown / f"{k:06d}", target / f"{k:06d}") if numbered else (shown, target)
                 try:
                     if self._straightener is not None:
@@ -462,7 +479,7 @@ class _Run:
         try:
             image = read_image(path)
             perceive = perceivers.of(perceivers.sensor_of(scan) if scan else arguments.sensor or DEFAULT_SENSOR)
-            points = None if scan is None else read_points(scan)
+            points = None if scan is None else read_points(scan, **file_options(arguments))
             perception = perceive(points, image=image)
             wanted = _files_of(target, self._kinds, **_pictures_of(arguments, [path]))
             if "image" in wanted:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,11 +23,12 @@ class Straightener:
 
     poses : a file for `edgeperc.Trajectory.from_tum`; by default the motion is that between the last two scans that
         were tracked.
+    quaternion : as for `edgeperc.Trajectory.from_tum`.
     Raises TrackingError.
     """
 
-    def __init__(self, poses: Path | None) -> None:
-        self._trajectory = None if poses is None else Trajectory.from_tum(poses)
+    def __init__(self, poses: Path | None, quaternion: Literal["xyzw", "wxyz"] | None = None) -> None:
+        self._trajectory = None if poses is None else Trajectory.from_tum(poses, quaternion=quaternion)
         self._tracked: list[Tracks] = []
 
     def straighten(

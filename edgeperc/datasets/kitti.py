@@ -181,10 +181,26 @@ class Frame:
 
 
 def read_labels(path: Path) -> KittiLabels:
-    """Read the rows of a KITTI label file."""
-    rows = [line.split() for line in path.read_text().splitlines() if line.strip()]
-    numbers = np.array([[float(value) for value in row[1:15]] for row in rows], np.float64).reshape(-1, 14)
-    return KittiLabels(tuple(row[0].lower() for row in rows), numbers)
+    """Read the rows of a KITTI label file. Raises PointsError, which names the line."""
+    try:
+        text = path.read_bytes().decode("utf-8-sig")
+    except (OSError, UnicodeDecodeError) as exc:
+        raise PointsError(f"{path}: the labels cannot be read ({exc})") from exc
+    rows = []
+    for number, line in enumerate(text.splitlines(), start=1):
+        words = line.split()
+        if not words:
+            continue
+        try:
+            values = [float(word) for word in words[1:15]]
+        except ValueError as exc:
+            raise PointsError(f"{path}, line {number}: {exc}; expected a class and 14 numbers") from exc
+        if len(values) < 14 or not np.isfinite(values).all():
+            got = "one that is not finite" if len(values) == 14 else f"{len(values)}, as labels of images have"
+            raise PointsError(f"{path}, line {number}: expected a class and 14 finite numbers, got {got}")
+        rows.append((words[0].lower(), values))
+    numbers = np.array([values for _, values in rows], np.float64).reshape(-1, 14)
+    return KittiLabels(tuple(kind for kind, _ in rows), numbers)
 
 
 def read_objects(label_path: Path, calibration: KittiCalibration) -> tuple[tuple[Box, ...], NDArray[np.float64]]:

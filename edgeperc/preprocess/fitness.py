@@ -275,6 +275,12 @@ class Measures:
     flat_m: float
     unevenness: float
     nearest_m: float
+    far_m: float
+    enclosed: float
+
+
+_WALL_DEPTH, _WALL_HEIGHT_M = 0.9, 0.3  # where a direction's end begins, as a share of it; how high it is
+_STREET_M = 30.0  # 99 % of the points of 561 real streets reach farther
 
 
 def _pseudo_azimuth(azimuth_deg: float) -> float:
@@ -311,6 +317,7 @@ def measure(points: NDArray[np.float32], azimuth_deg: tuple[float, float]) -> Me
     low, high = (_quantile(elevations, share) / 2.0 - 90.0 if elevations.any() else 0.0 for share in (0.01, 0.99))
     peaks = heights.max(axis=1) / max(1.0, sums["n_near"])
     flattest = int(peaks.argmax())
+    far_m = 10.0 ** (_quantile(ranges, 0.99) / 20.0 - 3.0)
     has_ground = bool(peaks[2] >= _GROUND_SHARE)
     return Measures(
         points_in_view=sums["n_in_view"] * step,
@@ -336,7 +343,22 @@ def measure(points: NDArray[np.float32], azimuth_deg: tuple[float, float]) -> Me
         flat_m=round(int(heights[flattest].argmax()) * 0.2 - 9.9, 1),
         unevenness=sums["unevenness"],
         nearest_m=10.0 ** (_quantile(ranges, 0.01) / 20.0 - 3.0),
+        far_m=far_m,
+        enclosed=_enclosed(points[::step]) if far_m < _STREET_M else 0.0,
     )
+
+
+def _enclosed(points: NDArray[np.float32]) -> float:
+    """Share of the directions with points that end at a wall: the farthest points lie above one another."""
+    x, y, z = points[np.isfinite(points).all(axis=1), :3].astype(np.float64).T
+    sector = (np.floor((np.arctan2(y, x) / (2.0 * np.pi) + 0.5) * N_SECTORS)).astype(np.int64) % N_SECTORS
+    across = np.hypot(x, y)
+    farthest, top, bottom = np.zeros(N_SECTORS), np.full(N_SECTORS, -np.inf), np.full(N_SECTORS, np.inf)
+    np.maximum.at(farthest, sector, across)
+    at_end = across > _WALL_DEPTH * farthest[sector]
+    np.maximum.at(top, sector[at_end], z[at_end])
+    np.minimum.at(bottom, sector[at_end], z[at_end])
+    return float((top - bottom >= _WALL_HEIGHT_M).sum() / max(1, np.count_nonzero(farthest)))
 
 
 Range = tuple[float, float]

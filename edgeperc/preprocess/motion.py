@@ -8,6 +8,7 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -21,6 +22,8 @@ from .returns import blank_too_near
 MAX_RATE = 1e4  # of m/s and rad/s
 MAX_TURN = 3.1  # rad; the axis of half a turn has no sign
 MAX_BYTES = 1 << 28  # of a file of poses; a line has about 100
+MIN_STEP_M, MIN_WAY_M = 1.0, 5.0  # of a trajectory, until its directions of travel count
+UPRIGHT, FORWARD, SAME_WAY = 0.7, 0.7, 0.95  # cosines: z is up, x is ahead; the way keeps its direction in the sensor
 OUTSIDE_S = 0.2  # the motion at the ends of a trajectory holds for two scans of 10 Hz
 
 
@@ -134,21 +137,29 @@ class Trajectory:
         )
 
     @classmethod
-    def from_tum(cls, path: str | os.PathLike[str]) -> Trajectory:
+    def from_tum(cls, path: str | os.PathLike[str], *, quaternion: Literal["xyzw", "wxyz"] | None = None) -> Trajectory:
         """Read a file in TUM's format, as kiss-icp, evo and others write it.
 
         Parameters
         ----------
         path : str or path
-            Lines of time [s], x, y, z [m] and the quaternion x, y, z, w of T_world_sensor; ``#`` begins a comment.
+            Lines of time [s], x, y, z [m] and the quaternion of T_world_sensor; ``#`` begins a comment.
+        quaternion : str, optional
+            Order of the quaternion: ``"xyzw"`` (TUM) or ``"wxyz"`` (EuRoC, nuScenes, COLMAP). By default it is
+            ``"xyzw"``, unless the poses contradict that.
 
         Raises
         ------
         TrackingError
-            The file cannot be read, or a line is not such eight numbers.
+            The file cannot be read, or a line is not such eight numbers. Or the order is not given, and only as
+            ``"wxyz"`` does the z axis of the sensor point up and its x axis along its way.
         StampError
             Fewer than two lines, or their times do not rise.
+        OptionError
+            ``quaternion`` is neither.
         """
+        if quaternion not in (None, "xyzw", "wxyz"):
+            raise OptionError(f"quaternion is {quaternion!r}; expected 'xyzw' or 'wxyz'")
         try:
             with Path(path).open("rb") as file:
                 content = file.read(MAX_BYTES + 1)
@@ -161,16 +172,27 @@ class Trajectory:
             ) from exc
         norm = np.linalg.norm(rows[:, 4:], axis=1)
         if not (np.abs(norm - 1.0) < 1e-2).all():
+            line = _line(content, int(np.argmax(~(np.abs(norm - 1.0) < 1e-2))))
+            raise TrackingError(f"{path}: the quaternion of line {line} has not length 1")
+        rises = np.diff(rows[:, 0]) > 0.0
+        if not rises.all():
+            line = _line(content, int(np.argmin(rises)) + 1)
+            raise StampError(f"{path}: the time of line {line} is not later than that before; expected times that rise")
+        units = rows[:, 4:] / norm[:, None]
+        poses = _poses(rows[:, 1:4], units)
+        other = _poses(rows[:, 1:4], np.roll(units, -1, axis=1))
+        if quaternion == "wxyz":
+            poses = other
+        elif quaternion is None and np.isfinite(rows).all() and _fits_better(other, poses):
             raise TrackingError(
-                f"{path}: the quaternion of line {int(np.argmax(~(np.abs(norm - 1.0) < 1e-2))) + 1} has not length 1"
+                f"{path}: read as x, y, z, w, the quaternions are those of a sensor whose z axis points "
+                f"{_directions(poses)}; read as w, x, y, z, {_directions(other)}. Say which is right: quaternion= or "
+                "--quaternion, xyzw or wxyz"
             )
-        x, y, z, w = (rows[:, 4:] / norm[:, None]).T
-        poses = np.zeros((len(rows), 4, 4))
-        poses[:, 0, :3] = np.column_stack([1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)])
-        poses[:, 1, :3] = np.column_stack([2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)])
-        poses[:, 2, :3] = np.column_stack([2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)])
-        poses[:, :3, 3], poses[:, 3, 3] = rows[:, 1:4], 1.0
-        return cls(rows[:, 0], poses)
+        try:
+            return cls(rows[:, 0], poses)
+        except EdgepercError as exc:
+            raise type(exc)(f"{path}: {exc}") from exc
 
     def motion(self, first_s: float, last_s: float) -> Motion:
         """The motion during a scan, between the poses around it.
@@ -327,6 +349,58 @@ def _meters(min_range_m: float) -> float:
     return meters
 
 
+def _line(content: bytes, k: int) -> int:
+    """The number of the line of a text with the k-th row of numbers, from 1."""
+    rows = [n for n, line in enumerate(content.splitlines(), start=1) if line.partition(b"#")[0].strip()]
+    return rows[k] if k < len(rows) else k + 1
+
+
+def _poses(positions: NDArray[np.float64], quaternions: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Matrices (n, 4, 4) of positions and unit quaternions x, y, z, w."""
+    x, y, z, w = quaternions.T
+    poses = np.zeros((len(positions), 4, 4))
+    poses[:, 0, :3] = np.column_stack([1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)])
+    poses[:, 1, :3] = np.column_stack([2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)])
+    poses[:, 2, :3] = np.column_stack([2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)])
+    poses[:, :3, 3], poses[:, 3, 3] = positions, 1.0
+    return poses
+
+
+def _fits_better(other: NDArray[np.float64], poses: NDArray[np.float64]) -> bool:
+    """Whether one reading of the same quaternions is that of a vehicle, and the second is not.
+
+    Where neither is, as for a camera's axes, a way that keeps its direction in the sensor decides.
+    """
+    (other_up, other_way), (up, way) = _up_and_way(other), _up_and_way(poses)
+    is_other = other_up > UPRIGHT and (other_way is None or other_way[0] > FORWARD)
+    is_vehicle = up > UPRIGHT and (way is None or way[0] > FORWARD)
+    if is_other or is_vehicle or other_way is None or way is None:
+        return is_other and not is_vehicle
+    return bool(np.linalg.norm(other_way) > SAME_WAY > np.linalg.norm(way))
+
+
+def _up_and_way(poses: NDArray[np.float64]) -> tuple[float, NDArray[np.float64] | None]:
+    """The mean of the z axes along z of the world, and of the directions of travel in the sensor; None if it stands."""
+    up = float(poses[:, 2, 2].mean())
+    kept = [0]
+    for k, position in enumerate(poses[:, :3, 3]):
+        if math.dist(position, poses[kept[-1], :3, 3]) >= MIN_STEP_M:
+            kept.append(k)
+    steps = np.diff(poses[kept, :3, 3], axis=0)
+    lengths = np.linalg.norm(steps, axis=1)
+    if lengths.sum() < MIN_WAY_M:
+        return up, None
+    middle = poses[kept[:-1], :3, :3] + poses[kept[1:], :3, :3]  # the way between two poses is a chord
+    ways = np.einsum("kji,kj->ki", middle, steps)
+    return up, (ways / np.linalg.norm(ways, axis=1, keepdims=True).clip(1e-9)).mean(axis=0)
+
+
+def _directions(poses: NDArray[np.float64]) -> str:
+    up, way = _up_and_way(poses)
+    tilt = f"{math.degrees(math.acos(min(1.0, max(-1.0, up)))):.0f} deg from up"
+    return tilt if way is None else f"{tilt} and that travels along {np.round(way, 1).tolist()}"
+
+
 def _rigid(name: str, given: ArrayLike, error: type[EdgepercError]) -> NDArray[np.float64]:
     try:
         pose: NDArray[np.float64] = np.array(given, np.float64)
@@ -335,7 +409,11 @@ def _rigid(name: str, given: ArrayLike, error: type[EdgepercError]) -> NDArray[n
     if pose.shape != (4, 4) or not np.isfinite(pose).all():
         raise error(f"{name} has shape {pose.shape}; expected (4, 4) finite numbers")
     R = pose[:3, :3]
-    if np.abs(R @ R.T - np.eye(3)).max() > 1e-3 or np.linalg.det(R) < 0.0 or (pose[3] != [0.0, 0.0, 0.0, 1.0]).any():
+    if (
+        np.abs(R @ R.T - np.eye(3)).max() > 1e-3
+        or np.linalg.det(R) < 0.0
+        or (np.abs(pose[3] - [0, 0, 0, 1]) > 1e-9).any()
+    ):
         raise error(f"{name} is not rigid; expected a rotation and a translation")
     return pose
 

@@ -31,13 +31,15 @@ def returns(
         own place. Rows inside ``ego_box`` are of the own vehicle.
     origin_m : tuple of 2 float; x, y of the sensor in the frame of the scan [m]; by default as the profile's mounting
         says.
-    Returns scan ((n, 4) float32, C-contiguous, read-only): In input order. Blanked rows are NaN in all four columns.
-        A view of ``points`` if there are none.
+    Returns scan ((n, 4) float32, C-contiguous, read-only): In input order. Blanked rows are NaN in all four columns. A
+        remission that is not finite is missing: it becomes the median of the others, 0 if there are none. A view of
+        ``points`` if nothing changes.
     Returns dropped: A row of several kinds counts once, as the first of them.
     """
     x, y = sensor.mounting.origin_m if origin_m is None else origin_m
     box = None if sensor.ego_box is None else np.array(sensor.ego_box)
-    return _blanked(points, np.array([x, y, 0.0]), sensor.min_range_m, box)
+    scan, dropped, n_unknown = _blanked(points, np.array([x, y, 0.0]), sensor.min_range_m, box)
+    return _with_remission(scan) if n_unknown else scan, dropped
 
 
 def blank_too_near(points: NDArray[np.float32], min_range_m: float) -> NDArray[np.float32]:
@@ -56,20 +58,30 @@ def about_too_near(dropped: DroppedPoints, n_points: int, sensor: SensorProfile)
     )
 
 
+def _with_remission(scan: NDArray[np.float32]) -> NDArray[np.float32]:
+    """A copy whose rows with coordinates have a remission."""
+    filled, known = scan.copy(), np.isfinite(scan[:, 3])
+    median = np.median(scan[known, 3]) if known.any() else 0.0
+    filled[~known & np.isfinite(scan[:, 0]), 3] = median
+    return read_only(filled)
+
+
 def _blanked(
     points: NDArray[np.float32], origin: NDArray[np.float64], min_range_m: float, box: NDArray[np.float64] | None
-) -> tuple[NDArray[np.float32], DroppedPoints]:
+) -> tuple[NDArray[np.float32], DroppedPoints, int]:
+    """The scan, what was dropped, and the number of other rows whose remission is not finite."""
     points = read_only(points)
     limit = min_range_m * (1.0 + ROUNDING)
     # Nearly every scan of a good driver has returns only, and finding that out takes a fifth of the time.
     if box is None and not origin.any():
         surely_far = np.float32(limit * limit * (1.0 + 1e-5) + 1e-30)  # beyond the rounding of float32
         if has_returns_only(points.reshape(-1), surely_far):
-            return points, DroppedPoints()
+            return points, DroppedPoints(), 0
     cleaned = np.empty(points.shape, np.float32)
     sides = np.array([(np.inf, -np.inf)] * 3) if box is None else box
-    dropped = DroppedPoints(*fill_returns(points, origin, limit * limit, sides, cleaned))
-    return (read_only(cleaned), dropped) if dropped.total else (points, dropped)
+    *counts, n_unknown = fill_returns(points, origin, limit * limit, sides, cleaned)
+    dropped = DroppedPoints(*counts)
+    return read_only(cleaned) if dropped.total else points, dropped, n_unknown
 
 
 @njit(cache=True, nogil=True)
@@ -95,28 +107,31 @@ def fill_returns(
     square: float,
     box: NDArray[np.float64],
     cleaned: NDArray[np.float32],
-) -> tuple[int, int, int]:
-    """Copy the points (n, 4) that are returns, NaN in place of others; count the not finite, the too near and the ego.
+) -> tuple[int, int, int, int]:
+    """Copy the points (n, 4) that are returns, NaN in place of others.
+
+    Returns the numbers of rows that are not finite, too near and of the ego, and of others without remission.
 
     ``square`` is that of the nearest range [m2] about ``origin`` (3,); ``box`` (3, 2) has lowest and highest x, y, z
     about it.
     """
-    n_not_finite, n_too_near, n_ego = 0, 0, 0
+    n_not_finite, n_too_near, n_ego, n_unknown = 0, 0, 0, 0
     for i in range(points.shape[0]):
         x = np.float64(points[i, 0]) - origin[0]
         y = np.float64(points[i, 1]) - origin[1]
         z = np.float64(points[i, 2]) - origin[2]
-        # No sum of four float32 overflows in float64.
-        if not math.isfinite(x + y + z + np.float64(points[i, 3])):
+        # No sum of three float32 overflows in float64.
+        if not math.isfinite(x + y + z):
             n_not_finite += 1
         elif x * x + y * y + z * z <= square:
             n_too_near += 1
         elif box[0, 0] <= x <= box[0, 1] and box[1, 0] <= y <= box[1, 1] and box[2, 0] <= z <= box[2, 1]:
             n_ego += 1
         else:
+            n_unknown += 0 if math.isfinite(points[i, 3]) else 1
             for column in range(4):
                 cleaned[i, column] = points[i, column]
             continue
         for column in range(4):
             cleaned[i, column] = np.nan
-    return n_not_finite, n_too_near, n_ego
+    return n_not_finite, n_too_near, n_ego, n_unknown

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +14,8 @@ from numpy.typing import NDArray
 from ..errors import PointsError, SensorError
 from ..types.sensor import SensorProfile
 from .apart import decode_apart, describe_apart
-from .files import read_points, read_timed_file
+from .bags import bag_files
+from .files import FileOptions, read_points, read_timed_file
 from .identify import KnownSensor, of_cloud, of_metadata, of_packets
 from .packets import PCAP_MAGIC
 from .times import TimedScan
@@ -32,7 +34,12 @@ _MAGIC = {
 
 
 def read_scans(
-    source: str | os.PathLike[str], *, topic: str | None = None, remission_field: str | None = None
+    source: str | os.PathLike[str],
+    *,
+    topic: str | None = None,
+    remission_field: str | None = None,
+    columns: int | Sequence[str] | None = None,
+    origin_m: Sequence[float] | None = None,
 ) -> Iterator[tuple[float | None, NDArray[np.float32]]]:
     """Read the scans of a recording, one after another; `read_timed_scans` gives the times of their points too.
 
@@ -45,13 +52,18 @@ def read_scans(
     source : str or path
         A scan file (`edgeperc.read_points`); a folder of scan files and captures, read in the order of their names; a
         Velodyne ``.pcap``; an Ouster ``.osf``, or ``.pcap`` with its metadata next to it in a ``.json`` file whose name
-        has the same beginning; a ROS 1 ``.bag``, a ROS 2 bag's folder or one ``.mcap`` file. Bags are read for
-        messages of type ``sensor_msgs/PointCloud2``. The first bytes of a file decide its format, not its name.
+        has the same beginning; a ROS 1 ``.bag``, a ROS 2 bag's folder or one file of it, or an ``.mcap`` file. Bags
+        are read for messages of type ``sensor_msgs/PointCloud2``, MCAP files for ``foxglove.PointCloud`` (protobuf),
+        too. The first bytes of a file decide its format, not its name.
     topic : str, optional
-        The topic to read if a bag has several with point clouds; the serial number of the sensor if an Ouster capture
-        has several.
+        What to read if there are several sensors: the topic of point clouds; ``TOPIC@FRAME`` for those of one frame;
+        the serial number of an Ouster; the IPv4 address of a Velodyne.
     remission_field : str, optional
         Name of the remission field, as in `edgeperc.read_points`; ``reflectivity`` by default for an Ouster capture.
+    columns : int or sequence of str, optional
+        What scan files without a header hold, as in `edgeperc.read_points`.
+    origin_m : sequence of 3 float, optional
+        Place of the sensor in the map of scan files, as in `edgeperc.read_points`.
 
     Yields
     ------
@@ -67,8 +79,7 @@ def read_scans(
     ------
     PointsError
         The source does not exist, is damaged, holds no scan of a LiDAR, or takes more memory or time than the limits.
-        The scans before the damage come first, where the format allows: a bag whose index is damaged is refused as a
-        whole.
+        The scans before the damage come first, and those of the other files of a bag.
     MissingExtraError
         The library that reads this kind of capture is not installed.
 
@@ -77,17 +88,23 @@ def read_scans(
     UserWarning
         Damaged packets of an Ouster capture were dropped; the message has their number.
     """
-    return ((stamp_s, points) for stamp_s, points, _ in _scans(Path(source), topic, remission_field, times=False))
+    options = _Options(topic, FileOptions(columns, remission_field, origin_m), times=False)
+    return ((stamp_s, points) for stamp_s, points, _ in _scans(Path(source), options))
 
 
 def read_timed_scans(
-    source: str | os.PathLike[str], *, topic: str | None = None, remission_field: str | None = None
+    source: str | os.PathLike[str],
+    *,
+    topic: str | None = None,
+    remission_field: str | None = None,
+    columns: int | Sequence[str] | None = None,
+    origin_m: Sequence[float] | None = None,
 ) -> Iterator[TimedScan]:
     """Like `read_scans`, with the time of each point, where the source holds it, for `edgeperc.deskew`.
 
     Parameters
     ----------
-    source, topic, remission_field
+    source, topic, remission_field, columns, origin_m
         As in `read_scans`.
 
     Yields
@@ -98,25 +115,33 @@ def read_timed_scans(
         Time of each point [s]. An Ouster's packets have one for each column, a Velodyne's for each firing. Of point
         clouds, ``.pcd``, ``.ply`` and structured ``.npy`` files, it is the field t, time, timestamp, time_stamp,
         offset_time or time_offset, whose unit shows in the duration of the scan: 2 ms to 2 s. Values below 2 s count
-        from ``stamp_s``. None without such a field, or if no unit gives such a duration.
+        from ``stamp_s``. NaN where a time is damaged and lies far from all others. None without such a field, or if no
+        unit gives such a duration.
 
     Raises
     ------
     PointsError, MissingExtraError
-        As `read_scans`.
+        As `read_scans`. PointsError also if the times contradict the stamps of the scans, or if the azimuths turn once
+        in a time that no LiDAR takes for a turn: below 33 ms, or above 350 ms.
     """
-    return _scans(Path(source), topic, remission_field, times=True)
+    return _scans(Path(source), _Options(topic, FileOptions(columns, remission_field, origin_m), times=True))
 
 
-def _scans(path: Path, topic: str | None, remission_field: str | None, times: bool) -> Iterator[TimedScan]:
+class _Options(NamedTuple):
+    topic: str | None
+    of_files: FileOptions
+    times: bool
+
+
+def _scans(path: Path, options: _Options) -> Iterator[TimedScan]:
     kind = _readable_kind(path)
     if kind == "folder":
-        return _folder(path, topic, remission_field, times)
+        return _folder(path, options)
     if kind == "scan":
-        if times:
-            return iter([read_timed_file(path, remission_field)])
-        return iter([TimedScan(None, read_points(path, remission_field=remission_field), None)])
-    return decode_apart(path, kind, topic, remission_field, times)
+        if options.times:
+            return iter([read_timed_file(path, options.of_files)])
+        return iter([TimedScan(None, read_points(path, **options.of_files._asdict()), None)])
+    return decode_apart(path, kind, options.topic, options.of_files.remission_field, options.times)
 
 
 def is_capture(path: Path) -> bool:
@@ -199,15 +224,14 @@ def _readable_kind(path: Path) -> str:
     kind = _kind(path)
     if kind == ".pcapng":
         raise PointsError(f"{path}: a pcapng file; expected pcap. Run: editcap -F pcap {path.name} {path.stem}.pcap")
-    if kind == ".db3":
-        raise PointsError(f"{path}: a .db3 is read with the folder it lies in; expected metadata.yaml next to it")
     return kind
 
 
 def _kind(path: Path) -> str:
     """``"scan"``, ``"folder"``, ``"ros2"`` or one of `CAPTURE_SUFFIXES`, by content or else by name."""
     if path.is_dir():
-        return "ros2" if (path / "metadata.yaml").is_file() else "folder"
+        is_bag = (path / "metadata.yaml").is_file() or any(path.glob("*.db3"))
+        return "ros2" if is_bag and bag_files(path) else "folder"
     if not path.is_file():  # opening a pipe would block
         return "scan"
     try:
@@ -221,7 +245,7 @@ def _kind(path: Path) -> str:
     return next((kind for magic, kind in _MAGIC.items() if head.startswith(magic)), by_name)
 
 
-def _folder(folder: Path, topic: str | None, remission_field: str | None, times: bool) -> Iterator[TimedScan]:
+def _folder(folder: Path, options: _Options) -> Iterator[TimedScan]:
     files = scan_files(folder)
     if not files:
         raise PointsError(
@@ -229,4 +253,4 @@ def _folder(folder: Path, topic: str | None, remission_field: str | None, times:
             "bag's metadata.yaml"
         )
     for file in files:
-        yield from _scans(file, topic, remission_field, times)
+        yield from _scans(file, options)

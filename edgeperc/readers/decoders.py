@@ -2,36 +2,26 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
-from pathlib import Path, PurePath
+from collections.abc import Callable, Iterator, Sequence, Set
+from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..errors import MissingExtraError, PointsError
 from ..system.extras import require
 from ..types.points import as_points, table_columns
-from .inflate import inflate, inflate_file, most_bytes
-from .mcap import McapFile
+from .bags import BagFile, open_bag
+from .clouds import CLOUD_READERS, Cloud, cloud_points, cloud_table, describe_cloud
+from .mcap import Channel
 from .ouster import check_osf, open_capture
-from .packets import pcap_packets, refuse_hesai, velodyne_packets
+from .packets import copy_as_ethernet, is_ethernet, pcap_packets, refuse_others, velodyne_packets, velodyne_senders
 from .tables import MAX_BYTES
-from .times import TimedScan, point_times
+from .times import TimedScan, of_plausible_duration, point_times
 
 _Item = TypeVar("_Item")
-
-_CLOUD = "sensor_msgs/msg/PointCloud2"
-
-# PointField.datatype, from 1.
-_CLOUD_TYPES = ("i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8")
-_MOST_RINGS = 256
-
-# Nearer, a laser's own place in the housing shows in its elevation.
-_ELEVATION_FROM_M = 3.0
 
 
 def decode(
@@ -55,7 +45,7 @@ def decode(
     scans = (
         _packet_scans(path, kind, topic, remission_field, warn, alive)
         if kind in (".pcap", ".osf")
-        else _bag_scans(path, kind, topic, remission_field, alive, times)
+        else of_plausible_duration(_bag_scans(path, topic, remission_field, alive, times))
     )
     for stamp_s, points, times_s in _with_typed_errors(path, scans):
         yield TimedScan(stamp_s, points, times_s if times else None)
@@ -78,23 +68,10 @@ def describe(path: Path, kind: str, topic: str | None, alive: Callable[[], None]
             chosen = frames.sensor_info[_choose("sensor", [str(info.sn) for info in frames.sensor_info], topic)]
             yield {"metadata": chosen.to_json_string()}
         else:
-            for name, message, _ in _clouds(path, kind, topic, alive):
+            for name, message, _ in _clouds(path, topic, alive):
                 yield describe_cloud(name, message)
 
     return next(_with_typed_errors(path, found()))
-
-
-def describe_cloud(topic: str, message: Any) -> dict[str, Any]:
-    """What a ROS ``sensor_msgs/PointCloud2`` message says about its sensor; see `describe`.
-
-    Raises PointsError.
-    """
-    return {
-        "topic": topic,
-        "frame": str(message.header.frame_id),
-        "fields": [str(f.name) for f in message.fields],
-        "elevations_deg": _ring_elevations(message),
-    }
 
 
 def _with_typed_errors(path: Path, items: Iterator[_Item]) -> Iterator[_Item]:
@@ -116,76 +93,6 @@ def _with_typed_errors(path: Path, items: Iterator[_Item]) -> Iterator[_Item]:
         raise PointsError(f"{path}: {after}the capture cannot be read ({reason}); it is damaged or cut short") from exc
 
 
-def cloud_points(message: Any, *, remission_field: str | None = None) -> NDArray[np.float32]:
-    """Convert a ROS ``sensor_msgs/PointCloud2`` message, from any library, to points.
-
-    message : object; with the message's attributes: height, width, fields, is_bigendian, point_step, row_step, data.
-        Organized or not; fields in any order, of any type, padded or not.
-    remission_field : as in `edgeperc.read_points`; by default ``reflectivity`` if the fields are those of Ouster's
-        driver.
-    Returns (n, 4) float32, C-contiguous: Row by row. Points that are not finite stay in place.
-    Raises PointsError.
-    """
-    cloud = _as_table(message)
-    if remission_field is None and is_ouster_cloud(cloud.dtype.names or ()):
-        remission_field = "reflectivity"
-    return as_points(cloud, remission_field=remission_field)
-
-
-def _as_table(message: Any) -> NDArray[Any]:
-    """The points of a cloud as a structured array, (height, width)."""
-    try:
-        height, width, step = int(message.height), int(message.width), int(message.point_step)
-        row_step = int(message.row_step) if height > 1 else width * step
-        data = np.frombuffer(message.data, np.uint8)
-        # A field with several values per point, such as a descriptor, is not a coordinate.
-        fields = {f.name: f for f in message.fields if f.count in (0, 1) and 1 <= f.datatype <= len(_CLOUD_TYPES)}
-        order = ">" if message.is_bigendian else "<"
-        dtype = np.dtype(
-            {
-                "names": [*fields],
-                "formats": [order + _CLOUD_TYPES[f.datatype - 1] for f in fields.values()],
-                "offsets": [f.offset for f in fields.values()],
-                "itemsize": step,
-            }
-        )
-    except (AttributeError, TypeError, ValueError, OverflowError) as exc:
-        raise PointsError(f"the point cloud's layout is impossible: {exc}") from exc
-    n_bytes = (height - 1) * row_step + width * step if height > 0 and width > 0 else 0
-    if min(height, width) < 0 or row_step < width * step or data.size < n_bytes:
-        raise PointsError(
-            f"the point cloud declares {height} x {width} points of {step} bytes in rows of {row_step}, and holds "
-            f"{data.size} bytes; expected {n_bytes}"
-        )
-    shape = (height, width) if n_bytes else (0, 0)
-    cloud: NDArray[Any] = np.ndarray(shape, dtype, data, strides=(row_step, step) if n_bytes else None)
-    return cloud
-
-
-def is_ouster_cloud(names: Sequence[str]) -> bool:
-    """Whether these are the fields of Ouster's driver; its ``intensity`` is a count of photons."""
-    return "reflectivity" in names and not {"range", "ambient", "noise", "near_ir", "signal"}.isdisjoint(names)
-
-
-def _ring_elevations(message: Any) -> list[float | None]:
-    """See `describe`."""
-    cloud = _as_table(message)
-    names = cloud.dtype.names or ()
-    if "ring" in names:
-        ring = cloud["ring"].ravel().astype(np.float64)
-    elif cloud.ndim == 2 and 1 < len(cloud) <= _MOST_RINGS:
-        ring = np.repeat(np.arange(len(cloud), dtype=np.float64), cloud.shape[1])
-    else:
-        return []
-    points = as_points(cloud).astype(np.float64)
-    across = np.hypot(points[:, 0], points[:, 1])
-    with np.errstate(invalid="ignore"):
-        far = np.isfinite(points).all(axis=1) & (across > _ELEVATION_FROM_M)
-        n_rings = int(ring[(ring >= 0.0) & (ring < _MOST_RINGS)].max(initial=-1.0)) + 1
-    elevation, ring = np.degrees(np.arctan2(points[far, 2], across[far])), ring[far]
-    return [round(float(np.median(elevation[ring == k])), 3) if np.any(ring == k) else None for k in range(n_rings)]
-
-
 def _choose(what: str, names: Sequence[str], wanted: str | None, others: str = "") -> int:
     """Index of the wanted name, or of the only name; otherwise a `PointsError` lists the names."""
     if wanted in names:
@@ -194,7 +101,7 @@ def _choose(what: str, names: Sequence[str], wanted: str | None, others: str = "
     if wanted is not None:
         raise PointsError(f"no {what} {wanted!r}; {there}{others}")
     if len(names) != 1:
-        raise PointsError(f"expected one {what}, {there}{others}{'; say which by topic=' if names else ''}")
+        raise PointsError(f"expected one {what}, {there}{others}{'; choose one by topic (--topic)' if names else ''}")
     return 0
 
 
@@ -213,10 +120,12 @@ def _packet_scans(
     if kind == ".osf":
         scans = _ouster_scans(_open_osf(path), topic, remission_field)
     elif next(velodyne_packets(path), None) is not None:
-        scans = _velodyne_scans(path)
+        senders = velodyne_senders(path)
+        sender = senders[_choose("Velodyne", senders, topic)] if len(senders) > 1 else None
+        scans = _velodyne_scans(_decodable(path, alive, sender))
     else:
-        refuse_hesai(path)
-        frames = open_capture(path, warn, alive)
+        refuse_others(path)
+        frames = open_capture(_decodable(path, alive, None), warn, alive, beside=path)
         if frames is not None:
             scans = _ouster_scans(frames, topic, remission_field)
     n_scans = 0
@@ -228,6 +137,17 @@ def _packet_scans(
     if not n_scans:
         content = "holds no scan" if kind == ".osf" else f"has {n_packets} packets, none from a supported LiDAR"
         raise PointsError(f"the capture {content}; expected a Velodyne capture, or an Ouster capture with its metadata")
+
+
+def _decodable(path: Path, alive: Callable[[], None], sender: str | None) -> Path:
+    """The capture, or a copy of one sender's packets behind Ethernet's header."""
+    if sender is None and is_ethernet(path):
+        return path
+    if shutil.disk_usage(tempfile.gettempdir()).free < path.stat().st_size:
+        raise PointsError("the temporary folder has no room for a copy whose packets begin with Ethernet's header")
+    target = Path(tempfile.mkdtemp()) / path.name
+    copy_as_ethernet(path, target, alive, sender)
+    return target
 
 
 def _open_osf(path: Path) -> Any:
@@ -271,104 +191,71 @@ def _ouster_scans(frames: Any, topic: str | None, remission_field: str | None) -
 
 
 def _bag_scans(
-    path: Path, kind: str, topic: str | None, remission_field: str | None, alive: Callable[[], None], times: bool
+    path: Path, topic: str | None, remission_field: str | None, alive: Callable[[], None], times: bool
 ) -> Iterator[TimedScan]:
-    for _, message, stamp_s in _clouds(path, kind, topic, alive):
+    for _, message, stamp_s in _clouds(path, topic, alive):
         points = cloud_points(message, remission_field=remission_field)
-        times_s = point_times(table_columns(_as_table(message)), points, stamp_s) if times else None
+        times_s = point_times(table_columns(cloud_table(message)), points, stamp_s) if times else None
         yield TimedScan(stamp_s, points, times_s)
 
 
-def _clouds(path: Path, kind: str, topic: str | None, alive: Callable[[], None]) -> Iterator[tuple[str, Any, float]]:
-    """Topic, message and stamp [s] of each point cloud."""
-    highlevel = require("rosbags.highlevel", "ros", "Reading a bag")
-    typesys = require("rosbags.typesys", "ros", "Reading a bag")
-    humble = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
-    packed, files = False, [path] if kind == ".mcap" else []
-    if kind == "ros2":
-        path, packed, files = _plain_bag(path, alive)
-    opened = _McapBag(files, humble) if files else highlevel.AnyReader([path], default_typestore=humble)
-    with opened as bag:
-        for reader in getattr(bag, "readers", []):
-            limit_chunks(reader)
-        clouds = [c for c in bag.connections if c.msgtype == _CLOUD]
-        others = sorted({f"{c.topic} ({c.msgtype})" for c in bag.connections if c.msgtype != _CLOUD})
-        names = sorted({c.topic for c in clouds})
-        beside = f"; of other types {', '.join(others)}" if others else ""
-        chosen = names[_choose("topic of type sensor_msgs/PointCloud2", names, topic, beside)]
-        n_scans = 0
-        for connection, stamp_ns, raw in bag.messages([c for c in clouds if c.topic == chosen]):
-            message = bag.deserialize(inflate(bytes(raw), "zstd") if packed else raw, connection.msgtype)
-            stamp = message.header.stamp
-            stamp_s = stamp.sec + 1e-9 * stamp.nanosec
-            n_scans += 1
-            yield chosen, message, stamp_s or 1e-9 * stamp_ns
-        if not n_scans:
-            raise PointsError(f"topic {chosen} has no message; expected point clouds")
+def _clouds(path: Path, topic: str | None, alive: Callable[[], None]) -> Iterator[tuple[str, Cloud, float]]:
+    """Topic, message and stamp [s] of each point cloud.
 
-
-def _plain_bag(folder: Path, alive: Callable[[], None]) -> tuple[Path, bool, list[Path]]:
-    """A ROS 2 bag without compression, for readers that would unpack without limits.
-
-    Returns folder: The bag's own; or a temporary one, whose files are unpacked, or links to those with compressed
-        messages.
-    Returns packed: Whether its messages are compressed all the same.
-    Returns files: Its MCAP files, if nothing in it is compressed; empty if it has files of another format.
+    What is damaged in one file of a bag is reported after the clouds of all.
     """
-    yaml = require("ruamel.yaml", "ros", "Reading a bag", package="ruamel.yaml")
-    information = yaml.YAML(typ="safe").load(folder / "metadata.yaml")["rosbag2_bagfile_information"]
-    files = [folder / PurePath(name).name for name in information["relative_file_paths"]]
-    mode = str(information.get("compression_mode") or "none").lower()
-    if mode not in ("file", "message"):
-        return folder, False, files if information["storage_identifier"] == "mcap" else []
-    target = Path(tempfile.mkdtemp())
-    names = [file.stem if mode == "file" else file.name for file in files]
-    left = min(most_bytes(sum(file.stat().st_size for file in files)), shutil.disk_usage(target).free // 2)
-    for file, name in zip(files, names, strict=True):
-        if mode == "file":
-            left -= inflate_file(file, target / name, left, alive)
-            continue
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
+        files = open_bag(path, Path(folder), alive)
+        topics, damage = _topics(files)
+        clouds = {channel for channel in topics if channel[1:] in CLOUD_READERS}
+        if damage is not None and not clouds:
+            raise damage
+        others = sorted({f"{channel.topic} ({channel.msgtype})" for channel in topics - clouds})
+        names = sorted({channel.topic for channel in clouds})
+        more = f"; of other types {', '.join(others)}" if others else ""
+        name, _, frame = (topic, "", "") if topic in names else (topic or "").partition("@")
+        chosen = names[_choose("topic of type sensor_msgs/PointCloud2", names, name or None, more)]
+        n_scans, frames = 0, dict[str, None]()
+        for message, recorded_ns in _messages(files, clouds, chosen):
+            frames.setdefault(message.header.frame_id)
+            if frame and message.header.frame_id != frame:
+                continue
+            if len(frames) > 1 and not frame:
+                raise PointsError(
+                    f"after {n_scans} scans: the clouds of topic {chosen} are of several sensors, with the frames "
+                    f"{', '.join(frames)}; choose one, e.g. topic '{chosen}@{next(iter(frames))}' (--topic), or read "
+                    "each and put them together with edgeperc.merge"
+                )
+            n_scans += 1
+            stamp = message.header.stamp
+            yield chosen, message, (stamp.sec + 1e-9 * stamp.nanosec) or 1e-9 * recorded_ns
+        if not n_scans:
+            seen = f" with frame {frame!r}, only {', '.join(frames)}" if frames else ""
+            raise PointsError(f"topic {chosen} has no message{seen}; expected point clouds")
+
+
+def _topics(files: Sequence[BagFile]) -> tuple[set[Channel], PointsError | None]:
+    """The topics of all files, and the damage of the first that has none for it."""
+    topics, damage = set[Channel](), None
+    for file in files:
         try:
-            (target / name).symlink_to(file.absolute())
-        except OSError:  # Windows allows links to few users
-            shutil.copy(file, target / name)
-    plain = {**information, "compression_mode": "", "compression_format": "", "relative_file_paths": names}
-    text = json.dumps({"rosbag2_bagfile_information": plain}, default=str)  # JSON is YAML
-    (target / "metadata.yaml").write_text(text, encoding="utf-8")
-    return target, mode == "message", []
+            topics |= file.topics()
+        except PointsError as exc:
+            damage = damage or exc
+    return topics, damage
 
 
-def limit_chunks(reader: Any) -> None:
-    """Give the chunks of a ROS 1 bag a decompressor that stops at the limit."""
-    by_magic = {b"BZh": "bz2", b"\x04\x22\x4d": "lz4"}
-    for place, chunk in getattr(reader, "chunks", {}).items():
-        usual = chunk.decompressor
-
-        def unpack(packed: bytes, usual: Callable[[bytes], bytes] = usual) -> bytes:
-            # A chunk that is not packed begins with the length of a record's header, never these numbers.
-            return inflate(packed, by_magic[packed[:3]]) if packed[:3] in by_magic else usual(packed)
-
-        reader.chunks[place] = chunk._replace(decompressor=unpack)
-
-
-class _McapBag:
-    """MCAP files as `AnyReader` shows a bag."""
-
-    def __init__(self, paths: Sequence[Path], typestore: Any) -> None:
-        self._files, self._typestore = [McapFile(path) for path in paths], typestore
-        self.connections = sorted({c for file in self._files for c in file.channels.values()})
-
-    def __enter__(self) -> _McapBag:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        pass
-
-    def messages(self, connections: Sequence[Any]) -> Iterator[tuple[Any, int, Any]]:
-        for file in self._files:
-            for channel, stamp_ns, data in file.messages():
-                if file.channels.get(channel) in connections:
-                    yield file.channels[channel], stamp_ns, data
-
-    def deserialize(self, raw: Any, msgtype: str) -> Any:
-        return self._typestore.deserialize_cdr(bytes(raw), msgtype)
+def _messages(files: Sequence[BagFile], clouds: Set[Channel], topic: str) -> Iterator[tuple[Cloud, int]]:
+    """Clouds of a topic and when they were recorded [ns]; damage in one file is raised after those of all files."""
+    n, damage = 0, None
+    for file in files:
+        try:
+            for channel in sorted(channel for channel in file.topics() & clouds if channel.topic == topic):
+                for recorded_ns, raw in file.messages_of(channel):
+                    message = CLOUD_READERS[channel.msgtype, channel.encoding](raw)
+                    n += 1
+                    yield message, recorded_ns
+        except PointsError as exc:
+            damage = damage or exc
+    if damage is not None:
+        raise PointsError(f"after {n} scans {damage}" if n else str(damage)) from damage

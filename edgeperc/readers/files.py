@@ -7,9 +7,9 @@ import math
 import os
 import zipfile
 import zlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -19,24 +19,26 @@ from ..types.points import as_points, assemble, table_columns
 from .inflate import inflate, most_bytes
 from .pcd import begins_like_pcd, parse_pcd
 from .ply import parse_ply
+from .raw import parse_raw
 from .tables import MAX_HEADER_BYTES, MAX_SCAN_BYTES, Columns
+from .text import begins_like_text, parse_text
 from .times import TimedScan, point_times
-
-_TEXT_BYTES = np.zeros(256, dtype=np.bool_)
-_TEXT_BYTES[[9, 10, 13, *range(32, 127)]] = True
+from .unknown import advice_for
 
 
 def read_points(
     source: str | os.PathLike[str] | ArrayLike,
     *,
-    columns: int | None = None,
+    columns: int | Sequence[str] | None = None,
     remission_field: str | None = None,
+    origin_m: Sequence[float] | None = None,
 ) -> NDArray[np.float32]:
     """Read the points of one scan from a file or an array.
 
     The first bytes of a file decide its format: a PCD header, ``ply``, NumPy's or zip's magic. Raw float32 files have
-    no header, so their name must end in ``.bin`` (KITTI, SemanticKITTI: x, y, z, remission) or ``.pcd.bin`` (nuScenes:
-    the same and the ring), or ``columns`` gives the number of values of a point.
+    no header, so their name must end in ``.bin``, or ``columns`` says what they hold. A ``.bin`` has 4 values a point
+    (KITTI, SemanticKITTI: x, y, z, remission) and a ``.pcd.bin`` 5 (nuScenes: the same and the ring), unless the values
+    themselves show that it has another number, 3 to 12: those of one column are alike.
 
     Remission is not scaled here: the `Perceiver` does that, by its sensor's ``remission_range``. It is 0 if the file
     holds none. Rows that are not finite stay in place, so that labels have the file's order.
@@ -45,12 +47,18 @@ def read_points(
     ----------
     source : str, path or array
         ``.bin``, ``.pcd.bin``, ``.npy``, ``.npz`` (its only array, or the one called ``points``), ``.pcd`` (ascii,
-        binary, binary_compressed), ``.ply`` (ascii, binary), or an array for `as_points`.
-    columns : int, optional
-        Number of float32 values of a point in a file without a header, at least 3; ignored for other files.
+        binary, binary_compressed), ``.ply`` (ascii, binary), a table of text (``.csv``, ``.xyz``, ``.txt``, ``.pts``),
+        or an array for `as_points`.
+    columns : int or sequence of str, optional
+        What a raw file or a text without names holds for each point: the names of the values in order, such as
+        ``("x", "y", "z", "intensity", "ring")``; or, of a raw file, the number of float32 values, at least 3, of which
+        the first are x, y, z and remission. Ignored for other files.
     remission_field : str, optional
         Name of the remission field, for formats with named fields. By default the first existing one of remission,
         intensity, i, reflectivity, reflectance.
+    origin_m : sequence of 3 float, optional
+        Place of the sensor in a map [m], subtracted from the coordinates before they become float32, which rounds UTM
+        northings to 0.5 m.
 
     Returns
     -------
@@ -61,16 +69,26 @@ def read_points(
     ------
     PointsError
         The file cannot be read, is empty, larger than 256 MiB, cut short or not a scan. A scan of no points is valid
-        if a header says so; a file of 0 bytes is an error.
+        if a header says so; a file of 0 bytes is an error. Coordinates of a map need ``origin_m``.
+    OptionError
+        ``origin_m`` is not three finite numbers.
     """
     if not isinstance(source, str | os.PathLike):
-        return as_points(source, remission_field=remission_field)
-    return _read(Path(source), columns, remission_field)[0]
+        return as_points(source, remission_field=remission_field, origin_m=origin_m)
+    return _read(Path(source), FileOptions(columns, remission_field, origin_m))[0]
 
 
-def read_timed_file(path: Path, remission_field: str | None) -> TimedScan:
-    """Read a scan file with the times of its points; options and errors as `read_points`."""
-    points, fields = _read(path, None, remission_field)
+class FileOptions(NamedTuple):
+    """Options of `read_points`."""
+
+    columns: int | Sequence[str] | None
+    remission_field: str | None
+    origin_m: Sequence[float] | None
+
+
+def read_timed_file(path: Path, options: FileOptions) -> TimedScan:
+    """Read a scan file with the times of its points; errors as `read_points`."""
+    points, fields = _read(path, options)
     return TimedScan(None, points, point_times(fields, points, None))
 
 
@@ -78,7 +96,7 @@ _Read = tuple[NDArray[np.float32], Mapping[str, NDArray[Any]]]
 """Points, and the fields of the file if they have names."""
 
 
-def _read(path: Path, columns: int | None, remission_field: str | None) -> _Read:
+def _read(path: Path, options: FileOptions) -> _Read:
     try:
         size = path.stat().st_size if path.is_file() else 0
         if size > MAX_SCAN_BYTES:
@@ -91,14 +109,14 @@ def _read(path: Path, columns: int | None, remission_field: str | None) -> _Read
     if data is None:
         raise PointsError(f"{path}: there is no such file; expected a scan as .bin, .npy, .npz, .pcd or .ply")
     try:
-        return _parse(data, path.name.lower(), columns, remission_field)
+        return _parse(data, path.name.lower(), options)
     except PointsError as exc:
         raise PointsError(f"{path}: {exc}") from exc
     except MemoryError as exc:
         raise PointsError(f"{path}: reading {data.size:,} bytes takes more memory than there is") from exc
 
 
-def _parse(data: NDArray[np.uint8], name: str, columns: int | None, remission_field: str | None) -> _Read:
+def _parse(data: NDArray[np.uint8], name: str, options: FileOptions) -> _Read:
     if data.size == 0:
         raise PointsError(
             "the file is empty (0 bytes), as an interrupted recording leaves it; "
@@ -106,63 +124,38 @@ def _parse(data: NDArray[np.uint8], name: str, columns: int | None, remission_fi
         )
     head = data[:MAX_HEADER_BYTES].tobytes()
     if head.startswith(b"\x93NUMPY"):
-        return _of_array(_parse_npy(data), remission_field)
+        return _of_array(_parse_npy(data), options)
     if head.startswith(b"PK\x03\x04"):
-        return _of_array(_parse_npz(data), remission_field)
+        return _of_array(_parse_npz(data), options)
     if head.startswith((b"ply\n", b"ply\r")):
-        return _of_columns(parse_ply(data, head, remission_field), remission_field)
+        return _of_columns(parse_ply(data, head, options.remission_field), options)
     if begins_like_pcd(head):
-        return _of_columns(parse_pcd(data, head, remission_field), remission_field)
-    if columns is None:
-        if not name.endswith(".bin"):
-            raise PointsError(
-                "neither PCD, PLY, .npy nor .npz by its first bytes; for raw float32 values name it .bin or pass "
-                "columns=4 (x, y, z, remission)"
-            )
-        return _parse_raw(data, 5 if name.endswith(".pcd.bin") else 4, by_name=True), {}
-    return _parse_raw(data, columns, by_name=False), {}
-
-
-def _of_array(array: NDArray[Any], remission_field: str | None) -> _Read:
-    return as_points(array, remission_field=remission_field), table_columns(array)
-
-
-def _of_columns(columns: Columns, remission_field: str | None) -> _Read:
-    return assemble(*columns, remission_field), columns.fields
-
-
-def _parse_raw(data: NDArray[np.uint8], columns: int, by_name: bool) -> NDArray[np.float32]:
-    if isinstance(columns, bool) or not isinstance(columns, int | np.integer) or not 3 <= columns <= 64:
-        raise PointsError(f"columns is the number of float32 values a point, 3 to 64, got {columns!r}")
-    if _TEXT_BYTES[data[:4096]].all():
-        raise PointsError("the file holds text, not float32 values; expected x, y, z, remission as raw float32")
-    record = 4 * int(columns)
-    if data.size % record:
+        return _of_columns(parse_pcd(data, head, options.remission_field), options)
+    # The first bytes of float32 values may be any, but thousands of them are no text.
+    may_be_raw = options.columns is not None or (name.endswith(".bin") and not begins_like_text(head))
+    advice = None if may_be_raw else advice_for(head)
+    if advice is not None:
+        raise PointsError(f"this is {advice}")
+    if begins_like_text(head) and not name.endswith(".bin"):
+        return _of_columns(parse_text(data, options.columns), options)
+    if options.columns is None and not name.endswith(".bin"):
         raise PointsError(
-            f"{data.size} bytes are not a whole number of points of {columns} float32 values ({record} bytes): the "
-            "file is cut short, or pass columns= with the right number of values a point"
+            f"neither PCD, PLY, .npy, .npz nor text by its first bytes, {head[:8]!r}; if they are raw float32 values, "
+            "name it .bin or pass columns=4 (x, y, z, remission)"
         )
-    values = data.view("<f4").reshape(-1, columns)
-    xyz = np.abs(values[:: max(1, len(values) // 4096), :3])
-    # Coordinates do not have such values. Most rows do if float64, big-endian or other bytes are read as float32.
-    with np.errstate(invalid="ignore"):  # comparing signalling NaN
-        absurd = ((xyz > 1e7) & (xyz < np.inf)) | ((xyz > 0.0) & (xyz < 1e-30))
-    if absurd.any(axis=1).mean() > 0.2:
-        raise PointsError(
-            "the values are not coordinates; expected little-endian float32 x, y, z, remission, not float64 or "
-            "another format"
-        )
-    if by_name and columns == 4 and data.size % 20 == 0:
-        rows = data.view("<f4").reshape(-1, 5)[:1024]
-        with np.errstate(invalid="ignore"):
-            whole = rows == np.floor(rows)
-            rings = whole[:, 4] & (rows[:, 4] >= 0.0) & (rows[:, 4] < 256.0)
-        if rings.all() and not whole[:, :3].all():
-            raise PointsError(
-                "every fifth value is a small whole number, so these seem to be points of 5 values (x, y, z, "
-                "intensity, ring); pass columns=5 or name the file .pcd.bin"
-            )
-    return as_points(values[:, :4])
+    raw = parse_raw(data, options.columns, 5 if name.endswith(".pcd.bin") else 4)
+    if options.columns is None or isinstance(options.columns, int | np.integer):  # fields without names
+        return assemble(*raw, None, options.origin_m), {}
+    return _of_columns(raw, options)
+
+
+def _of_array(array: NDArray[Any], options: FileOptions) -> _Read:
+    points = as_points(array, remission_field=options.remission_field, origin_m=options.origin_m)
+    return points, table_columns(array)
+
+
+def _of_columns(columns: Columns, options: FileOptions) -> _Read:
+    return assemble(*columns, options.remission_field, options.origin_m), columns.fields
 
 
 def _parse_npy(data: NDArray[np.uint8]) -> NDArray[Any]:

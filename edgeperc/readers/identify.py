@@ -13,9 +13,9 @@ import numpy as np
 
 from ..errors import PointsError, SensorError
 from ..types.sensor import SENSORS, SensorProfile
-from .decoders import is_ouster_cloud
+from .clouds import is_ouster_cloud
 from .ouster import check_metadata, metadata_beside, read_metadata
-from .packets import refuse_hesai, velodyne_packets
+from .packets import refuse_others, velodyne_packets
 
 _CHOICES = f"Pass its name, sensor= or --sensor: {', '.join(SENSORS)}; or a profile of your own, a .json file."
 
@@ -63,10 +63,10 @@ def contradicts(given: SensorProfile, recorded_by: SensorProfile) -> bool:
 def of_packets(path: Path, topic: str | None = None) -> KnownSensor:
     """The sensor of a pcap file.
 
-    topic : the serial number, if there is metadata of several Ouster sensors.
+    topic : the serial number, if there is metadata of several Ouster sensors; the address of a Velodyne.
     Raises PointsError, SensorError.
     """
-    names = {_velodyne_name(packet) for packet in velodyne_packets(path)}
+    names = {_velodyne_name(packet) for packet in velodyne_packets(path, topic)}
     if names:
         name = ", ".join(sorted(map(str, names)))
         if name in SENSORS:
@@ -74,14 +74,15 @@ def of_packets(path: Path, topic: str | None = None) -> KnownSensor:
         if names == {None}:
             raise SensorError(f"the packets are a Velodyne's but do not name the model. {_CHOICES}")
         raise SensorError(f"the packets are of a Velodyne {name}, of which no profile is built in. {_CHOICES}")
-    refuse_hesai(path)
+    refuse_others(path)
     files = metadata_beside(path)
     contents = [(file.name, json.loads(read_metadata(file))) for file in files]
     chosen = [entry for entry in contents if topic is None or _serial(entry[1]) == topic] or contents
     known = [of_metadata(content, f"the metadata {name}") for name, content in chosen]
     if len({entry.profile for entry in known}) > 1:
         raise SensorError(
-            f"there is metadata of several sensors: {', '.join(name for name, _ in contents)}; say which by topic="
+            f"there is metadata of several sensors: {', '.join(name for name, _ in contents)}; choose one by topic "
+            "(--topic)"
         )
     return known[0]
 

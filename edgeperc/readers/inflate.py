@@ -51,7 +51,7 @@ def inflate_file(packed: Path, target: Path, limit: int, alive: Callable[[], Non
 
     Raises PointsError.
     """
-    zstd = require("zstandard", "ros", "Reading zstd data")
+    zstd = require("zstandard", "bags", "Reading zstd data")
     n = 0
     with packed.open("rb") as source, target.open("wb") as out:
         reader = zstd.ZstdDecompressor().stream_reader(source, read_across_frames=True)
@@ -76,9 +76,9 @@ def _decompressor(method: str) -> Any:
     if method == "bz2":
         return _each_bz2
     if method == "lz4":
-        lz4 = require("lz4.frame", "ros", "Reading lz4 data")
+        lz4 = require("lz4.frame", "bags", "Reading lz4 data")
         return lambda packed, most: _in_pieces(lz4.LZ4FrameFile(io.BytesIO(packed)).read, most)
-    zstd = require("zstandard", "ros", "Reading zstd data")
+    zstd = require("zstandard", "bags", "Reading zstd data")
     return lambda packed, most: _in_pieces(zstd.ZstdDecompressor().stream_reader(packed).read, most)
 
 

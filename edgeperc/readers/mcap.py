@@ -5,15 +5,14 @@ from __future__ import annotations
 import struct
 import zlib
 from collections.abc import Iterator
-from contextlib import suppress
 from pathlib import Path
-from typing import BinaryIO, NamedTuple
+from typing import Any, BinaryIO, NamedTuple
 
 from ..errors import PointsError
 from .inflate import inflate
 from .tables import MAX_BYTES
 
-_MAGIC = b"\x89MCAP0\r\n"
+MCAP_MAGIC = b"\x89MCAP0\r\n"
 _HEADER, _FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _DATA_END = 1, 2, 3, 4, 5, 6, 15
 
 
@@ -37,7 +36,9 @@ class McapFile:
     """One .mcap file, read from front to back; an index is not needed.
 
     path : Path
-    channels : dict of int to Channel; those of the summary, or those met so far.
+    channels : dict of int to Channel; those of the summary, or those among the messages.
+
+    Raises PointsError: it does not begin as an MCAP file, or is damaged before its first channel.
     """
 
     def __init__(self, path: Path) -> None:
@@ -46,29 +47,34 @@ class McapFile:
         self.channels: dict[int, Channel] = {}
         with path.open("rb") as file:
             size = path.stat().st_size
-            if size < 45 or file.read(8) != _MAGIC:
+            if size < 45 or file.read(8) != MCAP_MAGIC:
                 raise PointsError("the file is damaged or cut short: it does not begin as an MCAP file")
-            kind, content = next(_records(file, 8, size))
-            if kind != _HEADER or (profile := _text(content, 0)[0]) != "ros2":
-                raise PointsError(f"the MCAP file cannot be read: its profile is {profile!r}; expected 'ros2'")
+            kind, _ = next(_records(file, 8, size), (0, None))
+            if kind != _HEADER:
+                raise PointsError("the file is damaged: it does not begin with the header of an MCAP file")
             file.seek(-37, 2)
             footer = file.read()
-            if footer[:9] != struct.pack("<BQ", _FOOTER, 20) or footer[29:] != _MAGIC:
-                raise PointsError("the file is damaged or cut short: it does not end as an MCAP file")
-            (summary,) = struct.unpack_from("<Q", footer, 9)
-            self._end = size - 37
+            self._is_whole = footer[:9] == struct.pack("<BQ", _FOOTER, 20) and footer[29:] == MCAP_MAGIC
+            self._end = size - 37 if self._is_whole else size
+            (summary,) = unpack("<Q", footer, 9) if self._is_whole else (0,)
             if summary > self._end:
                 raise PointsError(f"the file is damaged: its summary is said to begin at byte {summary:,} of {size:,}")
             if summary:
                 for kind, content in _records(file, summary, self._end):
                     self._learn(kind, content)
         if not self.channels:  # no summary: the channels stand among the messages
-            with suppress(PointsError):  # raised when the messages are read
+            try:
                 for _ in self.messages():
                     pass
+            except PointsError:  # raised again when the messages are read
+                if not self.channels:
+                    raise
 
     def messages(self) -> Iterator[Message]:
-        """Every message: chunk by chunk, within a chunk in the order of time."""
+        """Every message: chunk by chunk, within a chunk in the order of time.
+
+        Raises PointsError at the damage; what stands before it came. A recorder that lost power wrote no end.
+        """
         with self._path.open("rb") as file:
             for kind, content in _records(file, 8, self._end):
                 if kind == _CHUNK:
@@ -78,20 +84,22 @@ class McapFile:
                     return
                 else:
                     yield from self._of_records(iter([(kind, content)]))
+        if not self._is_whole:
+            raise PointsError("the file is damaged or cut short: it does not end as an MCAP file")
 
     def _of_records(self, records: Iterator[tuple[int, memoryview]]) -> Iterator[Message]:
         for kind, content in records:
             if kind == _MESSAGE:
-                channel, _, stamp_ns, _ = struct.unpack_from("<HIQQ", content)
+                channel, _, stamp_ns, _ = unpack("<HIQQ", content)
                 yield Message(channel, stamp_ns, content[22:])
             else:
                 self._learn(kind, content)
 
     def _learn(self, kind: int, content: memoryview) -> None:
         if kind == _SCHEMA:
-            self._schemas[struct.unpack_from("<H", content)[0]] = _text(content, 2)[0]
+            self._schemas[unpack("<H", content)[0]] = _text(content, 2)[0]
         elif kind == _CHANNEL:
-            number, schema = struct.unpack_from("<HH", content)
+            number, schema = unpack("<HH", content)
             topic, offset = _text(content, 4)
             self.channels[number] = Channel(topic, self._schemas.get(schema, ""), _text(content, offset)[0])
 
@@ -124,9 +132,9 @@ def _split(content: bytes) -> Iterator[tuple[int, memoryview]]:
 
 def _unpacked(chunk: memoryview) -> bytes:
     """The records of a chunk as bytes, once length and CRC-32 are right."""
-    size, crc = struct.unpack_from("<16xQI", chunk)
+    size, crc = unpack("<16xQI", chunk)
     method, offset = _text(chunk, 28)
-    (packed_size,) = struct.unpack_from("<Q", chunk, offset)
+    (packed_size,) = unpack("<Q", chunk, offset)
     if size > MAX_BYTES:
         raise PointsError(f"a chunk claims to unpack to {size:,} bytes; expected at most {MAX_BYTES:,}")
     if packed_size != len(chunk) - offset - 8:
@@ -141,10 +149,18 @@ def _unpacked(chunk: memoryview) -> bytes:
     return content
 
 
+def unpack(code: str, content: memoryview | bytes, offset: int = 0) -> tuple[Any, ...]:
+    """Numbers at a place of a record; PointsError if it ends before."""
+    try:
+        return struct.unpack_from(code, content, offset)
+    except struct.error as exc:
+        raise PointsError(f"a record is damaged: {exc}") from exc
+
+
 def _text(content: memoryview, offset: int) -> tuple[str, int]:
     """A string with its length in front, and the place behind it."""
-    (length,) = struct.unpack_from("<I", content, offset)
+    (length,) = unpack("<I", content, offset)
     end = offset + 4 + length
     if end > len(content):
         raise PointsError("a record is damaged: a text ends past it")
-    return bytes(content[offset + 4 : end]).decode(), end
+    return bytes(content[offset + 4 : end]).decode("utf-8", "replace"), end

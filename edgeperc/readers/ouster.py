@@ -23,14 +23,15 @@ _MOST_BEAMS, _MOST_COLUMNS = 1024, 65536
 _MOST_JSON_BYTES = 1 << 24
 
 
-def open_capture(path: Path, warn: Callable[[str], None], alive: Callable[[], None]) -> Any:
+def open_capture(path: Path, warn: Callable[[str], None], alive: Callable[[], None], beside: Path) -> Any:
     """The turns of an Ouster packet capture as ouster-sdk reads them, without packets that could end the process.
 
+    beside : the metadata lies beside this file, of which ``path`` may be a copy.
     Returns ouster.sdk.pcap.PcapFrameSetSource or None: None if no packet has the size that the metadata says.
     """
     pcap = require("ouster.sdk.pcap", "ouster", "Reading a capture that is not Velodyne's", package="ouster-sdk")
     core = require("ouster.sdk.core", "ouster", "Reading an Ouster capture", package="ouster-sdk")
-    metadata = metadata_beside(path)
+    metadata = metadata_beside(beside)
     sizes = set()
     for file in metadata:
         text = read_metadata(file)
@@ -41,7 +42,7 @@ def open_capture(path: Path, warn: Callable[[str], None], alive: Callable[[], No
         return None
     if datagrams.n_bad:
         warn(
-            f"{path}: dropped {datagrams.n_bad} damaged packets of the capture: empty, incomplete, or of another "
+            f"{beside}: dropped {datagrams.n_bad} damaged packets of the capture: empty, incomplete, or of another "
             "length than the metadata says"
         )
     if datagrams.bad:

@@ -24,6 +24,7 @@ PCAP_MAGIC = {
 
 # Bytes in front of the IP header and the place of the EtherType, by the link type: Ethernet, Linux cooked 1 and 2.
 _LINKS = {1: (14, 12), 113: (16, 14), 276: (20, 0)}
+_LOOPBACK_LINKS, _RAW_LINKS = (0, 108), (12, 14, 101, 228)  # four bytes in front of the IP header, none
 
 _VELODYNE_BYTES = 1206
 _GPS_BYTES = 600  # what LiDARs send of their GPS is shorter, their points are longer
@@ -159,24 +160,57 @@ def _link_type(path: Path) -> int:
     return int(struct.unpack(f"{order}I", head[20:24])[0]) & 0xFFFF if len(head) == 24 else 1
 
 
-def velodyne_packets(path: Path) -> Iterator[memoryview]:
-    """A Velodyne's packets among the first of a pcap file, of 1206 bytes each."""
+def velodyne_packets(path: Path, sender: str | None = None) -> Iterator[memoryview]:
+    """A Velodyne's packets among the first of a pcap file, of 1206 bytes each.
+
+    sender : one of `velodyne_senders`; None: all.
+    """
+    for address, packet in _velodyne_packets(path):
+        if sender is None or address in (sender, ""):
+            yield packet
+
+
+def velodyne_senders(path: Path) -> list[str]:
+    """IPv4 addresses that a Velodyne's packets come from, among the first of a pcap file; sorted."""
+    return sorted({address for address, _ in _velodyne_packets(path)} - {""})
+
+
+def _velodyne_packets(path: Path) -> Iterator[tuple[str, memoryview]]:
+    link = _link_type(path)
     for _, packet in islice(pcap_packets(path, whole=False), _SNIFFED_PACKETS):
-        # The first of twelve blocks begins with the flag 0xEEFF, behind the headers of Ethernet, IP and UDP.
+        # The first of twelve blocks begins with the flag 0xEEFF, behind the headers of the link, IP and UDP.
         if len(packet) > _VELODYNE_BYTES and bytes(packet[-_VELODYNE_BYTES : 2 - _VELODYNE_BYTES]) == b"\xff\xee":
-            yield packet[-_VELODYNE_BYTES:]
+            try:
+                at = _ip_at(packet, link)
+            except ValueError:
+                at = None
+            is_ip = at is not None and len(packet) >= at + 28 + _VELODYNE_BYTES
+            yield _address(packet[at + 12 : at + 16]) if at is not None and is_ip else "", packet[-_VELODYNE_BYTES:]
 
 
-def refuse_hesai(path: Path) -> None:
-    """Raise `PointsError` if most of the first packets of a pcap file are a Hesai's."""
+def refuse_others(path: Path) -> None:
+    """Raise `PointsError` if most of the first packets of a pcap file are those of a LiDAR that is not decoded."""
     # One of 65,536 packets of other sensors begins like them by chance.
-    names = Counter(_hesai_name(payload) for payload in _first_payloads(path) if len(payload) > _GPS_BYTES)
+    names = Counter(_maker(payload) for payload in _first_payloads(path) if len(payload) > _GPS_BYTES)
     name, n = max(names.items(), key=lambda item: item[1], default=(None, 0))
     if name is not None and 2 * n > names.total():
         raise PointsError(
             f"a capture of a {name}, which cannot be decoded; expected a Velodyne or an Ouster. Convert it with "
-            "Hesai's driver, to a ROS bag or to .pcd files"
+            f"{name.split()[0]}'s driver, to a ROS bag or to .pcd files"
         )
+
+
+def _maker(payload: memoryview) -> str | None:
+    """The LiDAR that sends such a packet, e.g. ``"Hesai Pandar64"``; None of Velodyne, Ouster and unknown ones."""
+    head = bytes(payload[:4])
+    if head in (b"\x55\xaa\x05\x0a", b"\x55\xaa\x05\x5a", b"\xaa\x55\x05\xa5"):
+        return "RoboSense sensor"
+    # Livox: version 0, length of the packet; 96 points and more of 14 bytes (or 8), behind 36 bytes.
+    if len(payload) in (1380, 804, 996) and (
+        head[0] == 0 and int.from_bytes(payload[1:3], "little") in (0, len(payload))
+    ):
+        return "Livox sensor"
+    return _hesai_name(payload)
 
 
 def _first_payloads(path: Path) -> Iterator[memoryview]:
@@ -205,19 +239,24 @@ def _hesai_name(payload: memoryview) -> str | None:
     return f"Hesai sensor of {payload[6]} lasers (version {payload[2]}.{payload[3]} of the packets)"
 
 
-def _fragment(packet: memoryview, link: int) -> _Fragment | None:
-    """The part of a UDP datagram over IPv4 in a packet, None if it holds none; ValueError if lengths contradict."""
+def _ip_at(packet: memoryview, link: int) -> int | None:
+    """Where the IPv4 header begins in a packet, None if there is none; ValueError if it is cut inside the link's."""
     if link in _LINKS:
         offset, kind = _LINKS[link]
         if len(packet) < offset:
             raise ValueError("cut inside the link's header")
         while bytes(packet[kind : kind + 2]) in (b"\x81\x00", b"\x88\xa8") and len(packet) >= offset + 4:  # a VLAN
             offset, kind = offset + 4, kind + 4
-        if bytes(packet[kind : kind + 2]) != b"\x08\x00":
-            return None
-    elif link in (0, 12, 14, 101, 108, 228):  # loopback has 4 bytes in front, raw IP none
-        offset = 4 if link in (0, 108) else 0
-    else:
+        return offset if bytes(packet[kind : kind + 2]) == b"\x08\x00" else None
+    if link in _LOOPBACK_LINKS:
+        return 4
+    return 0 if link in _RAW_LINKS else None
+
+
+def _fragment(packet: memoryview, link: int) -> _Fragment | None:
+    """The part of a UDP datagram over IPv4 in a packet, None if it holds none; ValueError if lengths contradict."""
+    offset = _ip_at(packet, link)
+    if offset is None:
         return None
     if len(packet) < offset + 20:
         raise ValueError("cut inside the IP header")
@@ -229,6 +268,47 @@ def _fragment(packet: memoryview, link: int) -> _Fragment | None:
         raise ValueError("the length in the IP header contradicts the record")
     source = bytes(packet[offset + 12 : offset + 20]) + identification.to_bytes(2, "big")
     return _Fragment(source, 8 * (place & 0x1FFF), bool(place & 0x2000), packet[offset + header : offset + total])
+
+
+def is_ethernet(path: Path) -> bool:
+    """Whether a pcap file's packets begin with Ethernet's header, as the libraries that decode them expect."""
+    return _link_type(path) == 1
+
+
+def copy_as_ethernet(path: Path, target: Path, alive: Callable[[], None], sender: str | None = None) -> None:
+    """Copy the IPv4 packets of a pcap file, of one sender or all, behind Ethernet's header.
+
+    ``tcpdump -i any`` writes Linux's cooked headers; tunnels and phones write raw IP.
+    """
+    link = _link_type(path)
+    order = PCAP_MAGIC[_magic(path)]
+    record = struct.Struct(f"{order}IIII")
+    with path.open("rb") as source, target.open("wb") as out:
+        out.write(source.read(20) + struct.pack(f"{order}I", 1))
+        for k, (at, packet) in enumerate(pcap_packets(path, whole=False)):
+            if k % 10_000 == 0:
+                alive()
+            try:
+                ip_at = _ip_at(packet, link)
+            except ValueError:
+                continue
+            if ip_at is None or len(packet) < ip_at + 20:
+                continue
+            if sender is not None and _address(packet[ip_at + 12 : ip_at + 16]) != sender:
+                continue
+            source.seek(at)
+            seconds, fraction, _, _ = record.unpack(source.read(16))
+            content = bytes(12) + b"\x08\x00" + bytes(packet[ip_at:])
+            out.write(record.pack(seconds, fraction, len(content), len(content)) + content)
+
+
+def _address(four: memoryview) -> str:
+    return ".".join(map(str, four))
+
+
+def _magic(path: Path) -> bytes:
+    with path.open("rb") as file:
+        return file.read(4)
 
 
 def copy_without(path: Path, bad: Collection[int], target: Path, alive: Callable[[], None]) -> None:

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+import statistics
+from collections import deque
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+
+from ..errors import PointsError
 
 # Best first: of Ouster's and Velodyne's drivers, of Hesai's, RoboSense's and Livox', of others.
 _NAMES = ("t", "time", "timestamp", "timestamps", "time_stamp", "offset_time", "time_offset", "time_offset_ns")
@@ -15,6 +19,17 @@ _NAMES = ("t", "time", "timestamp", "timestamps", "time_stamp", "offset_time", "
 # gives a duration between them.
 _SHORTEST_S, _LONGEST_S = 2e-3, 2.0
 _UNITS_S = (1.0, 1e-3, 1e-6, 1e-9)
+
+# How long a LiDAR takes for a turn [s]: 5 to 20 turns a second, with a margin.
+_FASTEST_TURN_S, _SLOWEST_TURN_S = 1 / 30, 0.35
+_SECTORS, _TURN_SECTORS = 36, 27  # sectors of azimuth, and how many of them a turn has points in
+_TURN_FIT = 0.9  # length of the mean of directions that turn with time; 1 where azimuth and time agree
+
+# Share of times on either side that may be damaged, and how far outside of the others they then lie [their duration].
+_DAMAGED_SHARE, _DAMAGED_DISTANCE = 0.01, 1.0
+
+# A scan lasts no longer than it takes to the next one; stamps jitter.
+_LONGEST_OF_INTERVAL, _INTERVALS = 1.5, 9
 
 
 class TimedScan(NamedTuple):
@@ -54,8 +69,10 @@ def point_times(
     points : (n, 4) float32; times of points without a return, which are not finite or lie in the origin, do not show
         the unit.
     stamp_s : None counts from 0.
-    Returns (n,) float64 or None: [s]; None without such a field, or if no unit gives a duration of 2 ms to 2 s, as
-        where all times are 0.
+    Returns (n,) float64 or None: [s]; NaN where a time is damaged and lies far from all others; None without such a
+        field, or if no unit gives a duration of 2 ms to 2 s, as where all times are 0.
+    Raises PointsError: By these times and the azimuths, the sensor takes less than 33 or more than 350 ms for
+        a turn.
     """
     name = time_name(fields)
     if name is None:
@@ -63,13 +80,70 @@ def point_times(
     with np.errstate(over="ignore", invalid="ignore"):
         moments = fields[name].astype(np.float64)
     xyz = points[:, :3]
-    known = moments[np.isfinite(moments) & np.isfinite(xyz).all(axis=1) & (xyz != 0.0).any(axis=1)]
-    if not len(known):
+    shows = np.isfinite(moments) & np.isfinite(xyz).all(axis=1) & (xyz != 0.0).any(axis=1)
+    if not shows.any():
         return None
-    first, last = float(known.min()), float(known.max())
+    first, last = _range(moments[shows])
     for unit in _UNITS_S:
         if _SHORTEST_S <= (last - first) * unit < _LONGEST_S:
             counted = max(abs(first), abs(last)) * unit < _LONGEST_S
+            moments[shows & ((moments < first) | (moments > last))] = np.nan
+            shows &= ~np.isnan(moments)
+            _check_turn(xyz[shows], (moments[shows] - first) / (last - first), (last - first) * unit, name)
             with np.errstate(over="ignore", invalid="ignore"):
                 return moments * unit + (stamp_s or 0.0 if counted else 0.0)
     return None
+
+
+def _range(moments: NDArray[np.float64]) -> tuple[float, float]:
+    """First and last of the times, without damaged ones far outside of the others."""
+    n_damaged = int(_DAMAGED_SHARE * len(moments))
+    ends = [0, n_damaged, len(moments) - 1 - n_damaged, len(moments) - 1]
+    first, low, high, last = np.partition(moments, sorted({*ends}))[ends]
+    reach = _DAMAGED_DISTANCE * (high - low)
+    if reach > 0.0 and (first < low - reach or last > high + reach):
+        kept = moments[(moments >= low - reach) & (moments <= high + reach)]
+        first, last = kept.min(), kept.max()
+    return float(first), float(last)
+
+
+def _check_turn(xyz: NDArray[np.float32], shares: NDArray[np.float64], duration_s: float, name: str) -> None:
+    """Raise PointsError if the azimuth turns once in these times, in a time that no LiDAR takes for a turn.
+
+    shares : (n,); of the duration, 0 to 1.
+    """
+    azimuth = np.arctan2(xyz[:, 1], xyz[:, 0]).astype(np.float64)
+    sectors = np.unique(np.floor((azimuth / (2 * np.pi) + 0.5) * _SECTORS).astype(np.int64) % _SECTORS)
+    if len(sectors) < _TURN_SECTORS or _FASTEST_TURN_S <= duration_s <= _SLOWEST_TURN_S:
+        return
+    turned = 2j * np.pi * shares
+    fit = max(abs(np.exp(1j * azimuth - turned).mean()), abs(np.exp(1j * azimuth + turned).mean()))
+    if fit > _TURN_FIT:
+        raise PointsError(
+            f"by the field {name!r}, a turn of the sensor takes {duration_s:.3g} s; LiDARs take 0.05 to 0.2 s. The "
+            "times are in another unit, or shares of a turn. Leave out --deskew, or pass the times in seconds to "
+            "edgeperc.deskew"
+        )
+
+
+def of_plausible_duration(scans: Iterable[TimedScan]) -> Iterator[TimedScan]:
+    """The scans of a stream. Raises PointsError if the times of points contradict the stamps of scans.
+
+    That is where a scan lasts longer than it takes to the next one.
+    """
+    stamp_s: float | None = None
+    intervals_s = deque[float](maxlen=_INTERVALS)
+    for scan in scans:
+        if stamp_s is not None and scan.stamp_s is not None and scan.stamp_s > stamp_s:
+            intervals_s.append(scan.stamp_s - stamp_s)
+        stamp_s = scan.stamp_s
+        if scan.times_s is not None and len(intervals_s) > 1:
+            duration_s = float(np.nanmax(scan.times_s) - np.nanmin(scan.times_s))
+            interval_s = statistics.median(intervals_s)
+            if duration_s > _LONGEST_OF_INTERVAL * interval_s:
+                raise PointsError(
+                    f"the times of the points of a scan span {duration_s:.3g} s, and a scan comes every "
+                    f"{interval_s:.3g} s: the times are in another unit, or several sensors share the topic. Leave out "
+                    "--deskew, or pass the times in seconds to edgeperc.deskew"
+                )
+        yield scan

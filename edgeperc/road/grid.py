@@ -17,7 +17,7 @@ from ..ground.planes import find_ground, heights_above
 from ..preprocess.returns import returns
 from ..system.atomic import write_atomic
 from ..system.kernel_cache import njit
-from ..types.frame import ModelFrame
+from ..types.frame import ModelFrame, quaternion
 from ..types.geometry import draw_footprints
 from ..types.mounting import MODEL_HEIGHT_M, MODEL_MOUNTING, Mounting
 from ..types.perception import Perception, TopView
@@ -103,7 +103,7 @@ class OccupancyGrid:
         Parameters
         ----------
         frame_id : str
-            Name of the frame of the cells.
+            Name of the frame of the scan: the message's origin turns and moves the cells there.
         off_road : int
             As in `values`.
 
@@ -121,6 +121,9 @@ class OccupancyGrid:
         values = self.values(off_road)
         nanoseconds = round((self.stamp_s or 0.0) * 1e9)
         stamp = {"sec": nanoseconds // 10**9, "nanosec": nanoseconds % 10**9}
+        frame = ModelFrame(self.mounting)
+        R, t = (np.eye(3), np.zeros(3)) if frame.is_identity else (frame.R, frame.t)
+        corner = R.T @ (np.array([self.x_range_m[0], self.y_range_m[0], -MODEL_HEIGHT_M]) - t)
         return {
             "header": {"stamp": stamp, "frame_id": frame_id},
             "info": {
@@ -129,8 +132,8 @@ class OccupancyGrid:
                 "width": values.shape[1],
                 "height": values.shape[0],
                 "origin": {
-                    "position": {"x": self.x_range_m[0], "y": self.y_range_m[0], "z": -MODEL_HEIGHT_M},
-                    "orientation": {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0},
+                    "position": dict(zip("xyz", corner.tolist(), strict=True)),
+                    "orientation": dict(zip("xyzw", quaternion(R.T), strict=True)),
                 },
             },
             "data": values.reshape(-1),

@@ -18,8 +18,6 @@ from ..errors import OptionError, PointsError
 from ..road.grid import OCCUPIED, occupancy_grid
 from ..system.extras import require
 from ..system.names import check_text
-from ..types.frame import ModelFrame, quaternion
-from ..types.mounting import MODEL_HEIGHT_M
 from ..types.points import as_points
 from ..view.colors import color_of, rgb
 from ..view.content import EDGES, box_corners
@@ -252,12 +250,11 @@ class RosMessages:
         grid = occupancy_grid(scan.perception, scan.points, cell_m=self._cell_m, sensor=scan.sensor)
         fields = grid.to_occupancy_grid(off_road=self._off_road)
         header = self._header(scan, stamp_ns, self.grid_frame_id)
-        corner = np.array([grid.x_range_m[0], grid.y_range_m[0], -MODEL_HEIGHT_M])
         if self.grid_frame_id is None:
-            frame = ModelFrame(grid.mounting)
-            pose = self._pose(center=frame.R.T @ (corner - frame.t), turned=quaternion(frame.R.T))
+            placed = fields["info"]["origin"]
+            pose = self._pose(center=[*placed["position"].values()], turned=tuple(placed["orientation"].values()))
         else:
-            pose = self._pose(center=(corner[0], corner[1], 0.0))
+            pose = self._pose(center=(grid.x_range_m[0], grid.y_range_m[0], 0.0))
         info = self._make(
             "nav_msgs/msg/MapMetaData",
             map_load_time=header.stamp,

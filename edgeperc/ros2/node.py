@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from ..errors import MissingExtraError, ModelError, OptionError, PointsError, ProviderError
 from ..live import stream
-from ..readers.decoders import cloud_points, describe_cloud
+from ..readers.clouds import cloud_points, describe_cloud
 from ..readers.tables import MAX_SCAN_BYTES
 from ..records import PerceivedScan
 from ..system.names import check_text
@@ -51,7 +51,7 @@ class PerceptionNode:
     graph : Graph
         Closed by the node.
     perceiver_for : callable
-        Called once, with the description of the first cloud (`edgeperc.readers.decoders.describe_cloud`); returns the
+        Called once, with the description of the first cloud (`edgeperc.readers.clouds.describe_cloud`); returns the
         `edgeperc.Perceiver`. An error of a kind that another cloud may not have, such as `SensorError`, is an item of
         the iteration, and the next cloud is tried.
     topic : str

@@ -188,7 +188,7 @@ class Tracker:
         Raises
         ------
         StampError
-            ``stamp_s`` is not finite, or beyond 1e12 s.
+            ``stamp_s`` is no finite number, or beyond 1e12 s.
         TrackingError
             A box or the pose is malformed, not finite or farther than 1e8 m, or only some scans have poses.
 
@@ -197,7 +197,10 @@ class Tracker:
         UserWarning
             A scan was late or doubled, or the clock jumped; once each.
         """
-        stamp_s = float(stamp_s)
+        try:
+            stamp_s = float(stamp_s)
+        except (OverflowError, TypeError, ValueError) as exc:
+            raise StampError(f"got a stamp_s that is no number ({exc}); expected the time of the scan [s]") from exc
         if not abs(stamp_s) <= LATEST_S:
             raise StampError(f"got a scan at {stamp_s} s; expected a finite time in seconds, up to {LATEST_S:g}")
         step, clock = self._clock.after(stamp_s)
@@ -503,7 +506,7 @@ def _checked_pose(given: ArrayLike) -> NDArray[np.float64]:
             f"got a T_world_sensor of shape {pose.shape}; expected (4, 4) finite numbers, up to {FARTHEST_M:g}"
         )
     off = np.abs(pose[:3, :3] @ pose[:3, :3].T - np.eye(3)).max()
-    if off > 1e-3 or np.linalg.det(pose[:3, :3]) < 0.0 or (pose[3] != [0.0, 0.0, 0.0, 1.0]).any():
+    if off > 1e-3 or np.linalg.det(pose[:3, :3]) < 0.0 or (np.abs(pose[3] - [0, 0, 0, 1]) > 1e-9).any():
         raise TrackingError("got a T_world_sensor that is not rigid; expected a rotation and a translation")
     return pose
 

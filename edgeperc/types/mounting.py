@@ -30,7 +30,8 @@ class Mounting:
     height_m : float or None
         Height of the scan's origin above the road [m]. Negative if the origin is below the road.
     roll_deg, pitch_deg : float or None
-        Tilt [deg]: roll is positive if the left side is up, pitch if x points down.
+        Tilt [deg]: roll is positive if the left side is up, pitch if x points down. A sensor that hangs upside down has
+        a roll of 180.
     yaw_deg : float or None
         Direction of the scan's x axis, counter-clockwise from the vehicle's x axis [deg]: -90 for x right, y forward.
         None: estimated from the street, which has two ends: the yaw is then in -90..90.
@@ -50,7 +51,7 @@ class Mounting:
     origin_m: tuple[float, float] = (0.0, 0.0)
 
     def __post_init__(self) -> None:
-        limits = {"height_m": 20.0, "roll_deg": 90.0, "pitch_deg": 90.0, "yaw_deg": 360.0}
+        limits = {"height_m": 20.0, "roll_deg": 180.0, "pitch_deg": 90.0, "yaw_deg": 360.0}
         for name, limit in limits.items():
             value = getattr(self, name)
             if value is not None:

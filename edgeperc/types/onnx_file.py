@@ -78,7 +78,8 @@ def read_model(path: str | os.PathLike[str]) -> bytes:
     """
     with open_model(path) as file:
         try:
-            return file.read(MAX_BYTES)
+            # A read of a size allocates it, however small the file is; one that grows meanwhile is no model.
+            return file.read(min(MAX_BYTES, os.fstat(file.fileno()).st_size))
         except OSError as exc:
             raise ModelFileError(f"{os.fspath(path)} cannot be read: {exc.strerror or exc}") from exc
 

@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
-from ..errors import PointsError
+from ..errors import OptionError, PointsError
 
 # Best first; of an Ouster's fields, "intensity" is the raw signal and "reflectivity" the calibrated byte.
 _REMISSION_NAMES = ("remission", "intensity", "i", "reflectivity", "reflectance")
+
+
+MAX_ROUNDING_M = 5e-3  # of coordinates; a LiDAR measures to 1 to 3 cm
+MAX_MAP_M = 1e8  # of a map's coordinates; projected ones are up to 1e7
 
 
 class Cloud(NamedTuple):
@@ -43,7 +48,9 @@ class Labeled(NamedTuple):
     roles: NDArray[np.uint8]
 
 
-def as_points(array: ArrayLike, *, remission_field: str | None = None) -> NDArray[np.float32]:
+def as_points(
+    array: ArrayLike, *, remission_field: str | None = None, origin_m: Sequence[float] | None = None
+) -> NDArray[np.float32]:
     """Convert an array to points.
 
     array : (n, 4) or (n, 3) array of numbers, or a structured array; any float or integer dtype, byte order and
@@ -51,9 +58,10 @@ def as_points(array: ArrayLike, *, remission_field: str | None = None) -> NDArra
         (any shape, e.g. that of a PointCloud2 message) needs the fields x, y and z; other fields and padding are
         skipped.
     remission_field : as in `read_points`; structured arrays only.
+    origin_m : subtracted from x, y, z [m] before they become float32.
     Returns (n, 4) float32, C-contiguous: The given array itself if it already has this form. Values beyond the range
         of float32 become infinite.
-    Raises PointsError.
+    Raises PointsError: Also for coordinates of a map, which float32 would round by more than 5 mm.
     """
     if isinstance(array, np.ma.MaskedArray):
         raise PointsError("got a masked array; fill it first, e.g. with array.filled(np.nan)")
@@ -63,7 +71,7 @@ def as_points(array: ArrayLike, *, remission_field: str | None = None) -> NDArra
     except Exception as exc:
         raise PointsError(f"got an object that is not an array: {exc}; expected (n, 4) x, y, z, remission") from exc
     if values.dtype.names is not None:
-        return assemble(values.size, table_columns(values), values.dtype.names, remission_field)
+        return assemble(values.size, table_columns(values), values.dtype.names, remission_field, origin_m)
     if values.dtype.kind not in "fiu":
         raise PointsError(f"got an array of {values.dtype}; expected (n, 4) numbers: x, y, z, remission")
     if values.ndim != 2 or values.shape[1] not in (3, 4):
@@ -74,7 +82,10 @@ def as_points(array: ArrayLike, *, remission_field: str | None = None) -> NDArra
                 advice = "; pass points.T"
         raise PointsError(f"got an array of shape {values.shape}; expected (n, 4): x, y, z, remission{advice}")
     if values.shape[1] == 3:
-        return assemble(values.shape[0], dict(zip("xyz", values.T, strict=True)), "xyz", None)
+        return assemble(values.shape[0], dict(zip("xyz", values.T, strict=True)), "xyz", None, origin_m)
+    if origin_m is not None or (values.dtype.itemsize > 4 and _is_rounded(values[:, :3])):
+        columns = dict(zip(("x", "y", "z", "remission"), values.T, strict=True))
+        return assemble(values.shape[0], columns, [*columns], None, origin_m)
     with np.errstate(over="ignore", invalid="ignore"):
         return np.require(values, dtype=np.float32, requirements=["C", "A"])
 
@@ -120,14 +131,18 @@ def remission_name(names: Iterable[str], wanted: str | None) -> str | None:
 
 
 def assemble(
-    n: int, fields: Mapping[str, NDArray[Any]], names: Sequence[str], remission_field: str | None
+    n: int,
+    fields: Mapping[str, NDArray[Any]],
+    names: Sequence[str],
+    remission_field: str | None,
+    origin_m: Sequence[float] | None = None,
 ) -> NDArray[np.float32]:
     """Build points from named columns.
 
     n : number of points.
     fields : mapping of str to (n,) array; columns by `plain_name`.
     names : all fields of the source, for the error message.
-    remission_field : as in `as_points`.
+    remission_field, origin_m : as in `as_points`.
     Returns (n, 4) float32: x, y, z [m], remission; 0 without a remission field.
     Raises PointsError.
     """
@@ -138,9 +153,41 @@ def assemble(
             "expected x, y, z and a remission or intensity"
         )
     remission = remission_name(fields, remission_field)
+    xyz = [fields[axis] for axis in "xyz"]
+    if origin_m is not None:
+        xyz = [values.astype(np.float64) - origin for values, origin in zip(xyz, _origin(origin_m), strict=True)]
+    if any(_is_rounded(values) for values in xyz):
+        middle = ", ".join(f"{np.median(values.astype(np.float64)[np.isfinite(values)]):,.1f}" for values in xyz)
+        raise PointsError(
+            f"the coordinates are those of a map, about ({middle}) m, and would be rounded by more than "
+            f"{1e3 * MAX_ROUNDING_M:g} mm as float32; pass the place of the sensor, which is subtracted first: "
+            "origin_m= or --origin X Y Z"
+        )
     points = np.zeros((n, 4), dtype=np.float32)
     with np.errstate(over="ignore", invalid="ignore"):
-        for column, name in enumerate(("x", "y", "z", remission)):
-            if name is not None:
-                points[:, column] = fields[name]
+        for column, values in enumerate(xyz):
+            points[:, column] = values
+        if remission is not None:
+            points[:, 3] = fields[remission]
     return points
+
+
+def _origin(given: Sequence[float]) -> tuple[float, float, float]:
+    try:
+        x, y, z = (float(value) for value in given)
+    except (OverflowError, TypeError, ValueError) as exc:
+        raise OptionError(f"origin_m is {given!r:.200}; expected x, y, z [m]") from exc
+    if not all(math.isfinite(value) for value in (x, y, z)):
+        raise OptionError(f"origin_m is {(x, y, z)}; expected three finite numbers [m]")
+    return x, y, z
+
+
+def _is_rounded(values: NDArray[Any]) -> bool:
+    """Whether float32 rounds most of the coordinates of an axis by more than they are measured to."""
+    if values.dtype.itemsize <= 4 or not values.size:
+        return False
+    exact = values[:: max(1, len(values) // 4096)].astype(np.float64)
+    with np.errstate(over="ignore", invalid="ignore"):
+        # Half the distance of float32 numbers there; larger ones are no map's.
+        off = (np.abs(exact) >= MAX_ROUNDING_M * 2**24) & (np.abs(exact) < MAX_MAP_M)
+    return bool((off.mean(axis=0) > 0.5).any())

@@ -161,6 +161,41 @@ def test_a_file_of_kitti(tmp_path: Path) -> None:
     )
 
 
+@pytest.mark.parametrize("name", ["", "calib_velo_to_cam.txt", "calib_cam_to_cam.txt"])
+def test_the_calibration_of_a_raw_drive(tmp_path: Path, name: str) -> None:
+    """The same camera as in the object data, by the two files of a day."""
+    path = tmp_path / "000000.txt"
+    path.write_text(KITTI)
+    made = Calibration.from_kitti(path, 1242, 375)
+    values = {key: numbers.split() for key, numbers in (line.split(":") for line in KITTI.splitlines() if line.strip())}
+    T = [values["Tr_velo_to_cam"][k : k + 4] for k in (0, 4, 8)]
+    folder = tmp_path / "2011_09_26"
+    folder.mkdir()
+    (folder / "calib_velo_to_cam.txt").write_text(
+        "calib_time: 15-Mar-2012 11:37:16\n"
+        f"R: {' '.join(' '.join(row[:3]) for row in T)}\nT: {' '.join(row[3] for row in T)}\n"
+        "delta_f: 0 0\ndelta_c: 0 0\n"
+    )
+    with pytest.raises(CalibrationError, match=r"calib_cam_to_cam\.txt is missing"):
+        Calibration.from_kitti(folder / name if name.startswith("calib_velo") else folder, 1242, 375)
+    (folder / "calib_cam_to_cam.txt").write_text(
+        "calib_time: 09-Jan-2012 13:57:47\ncorner_dist: 9.95e-02\n"
+        f"R_rect_00: {' '.join(values['R0_rect'])}\nP_rect_02: {' '.join(values['P2'])}\n"
+    )
+    found = Calibration.from_kitti(folder / name if name else folder, 1242, 375)
+    np.testing.assert_allclose(found.T_camera_sensor, made.T_camera_sensor)
+    np.testing.assert_array_equal(found.K, made.K)
+    (folder / "calib_cam_to_cam.txt").write_text("R_rect_00: 1 0 0 0 1 0 0 0 1\n")
+    with pytest.raises(CalibrationError, match="expected R, T, R_rect_00 and P_rect_02"):
+        Calibration.from_kitti(folder, 1242, 375)
+
+
+def test_an_odometry_calibration_without_the_velodyne(tmp_path: Path) -> None:
+    (tmp_path / "calib.txt").write_text("".join(f"P{k}: 720 0 610 45 0 720 173 0.2 0 0 1 0.003\n" for k in range(4)))
+    with pytest.raises(CalibrationError, match="lacks Tr, the place of the Velodyne"):
+        Calibration.from_kitti(tmp_path / "calib.txt", 1242, 375)
+
+
 @pytest.mark.parametrize(
     "text",
     ["", "nonsense", KITTI.replace("P2", "P9"), KITTI.replace("44.86 ", ""), KITTI.replace("721.5", "many"),

@@ -20,6 +20,7 @@ from edgeperc.datasets.kitti import (
     RoadFrame,
     SemanticKitti,
     layouts,
+    read_labels,
     read_objects,
 )
 from edgeperc.datasets.splits import FOLDS, TEST_DRIVES, VALIDATION_DRIVES, fold_of, in_split
@@ -337,3 +338,35 @@ def test_road_truth_of_observed_cells(semantickitti_root: Path) -> None:
     assert 3000 < (truth != IGNORE).sum() < 12_000
     assert 0.2 < (truth[truth != IGNORE] == 1).mean() < 0.9
     assert set(np.unique(truth)) <= {0, 1, 2, IGNORE}
+
+
+CAR_LINE = "Car 0 0 0 500 150 700 300 1.5 1.6 3.9 1.0 1.7 12.0 1.57"
+
+
+@pytest.mark.parametrize(
+    ("text", "error"),
+    [
+        (CAR_LINE + "\nCar 0 0 0 415 34 876 356", r"line 2: expected a class and 14 finite numbers, got 7"),
+        (CAR_LINE.replace("12.0", "far"), r"line 1: could not convert string to float: 'far'"),
+        ("\n\n" + CAR_LINE.replace("12.0", "nan"), r"line 3: .* one that is not finite"),
+        (CAR_LINE.replace("12.0", "1e999"), r"line 1: .* one that is not finite"),
+        ("Car", r"line 1: .* got 0"),
+        (CAR_LINE.replace(" ", ","), r"line 1: .* got 0"),
+        ("\ufeff" + CAR_LINE + "\n\x00", r"line 2: "),
+        (CAR_LINE.encode("utf-16"), "the labels cannot be read"),
+    ],
+)
+def test_malformed_labels_name_the_line(text: str | bytes, error: str, tmp_path: Path) -> None:
+    path = tmp_path / "000001.txt"
+    path.write_bytes(text if isinstance(text, bytes) else text.encode())
+    with pytest.raises(PointsError, match=rf"000001\.txt(, |: ){error}"):
+        read_labels(path)
+
+
+@pytest.mark.parametrize("end", ["\n", "\r\n", "", " 0.97\n"])
+@pytest.mark.parametrize("mark", ["", "\ufeff"])
+def test_labels_as_other_tools_write_them(mark: str, end: str, tmp_path: Path) -> None:
+    (tmp_path / "a.txt").write_bytes((mark + CAR_LINE + end).encode())
+    labels = read_labels(tmp_path / "a.txt")
+    assert labels.kinds == ("car",)
+    np.testing.assert_array_equal(labels.numbers, [[float(word) for word in CAR_LINE.split()[1:]]])

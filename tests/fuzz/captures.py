@@ -8,7 +8,6 @@ allowed; such deaths are counted by signal.
 
 from __future__ import annotations
 
-import functools
 import gc
 import json
 import os
@@ -52,8 +51,8 @@ CAPTURES_OF_A_FORK = 50
 REAL_SHARE, FILE_SHARE = 0.1, 0.2
 
 LIBRARIES = (
-    "ouster.sdk.core", "ouster.sdk.osf", "ouster.sdk.pcap", "velodyne_decoder", "rosbags.highlevel", "rosbags.typesys",
-    "rosbags.rosbag1", "rosbags.rosbag2", "lz4.frame", "zstandard", "sqlite3", "multiprocessing.pool",
+    "ouster.sdk.core", "ouster.sdk.osf", "ouster.sdk.pcap", "velodyne_decoder", "lz4.frame", "zstandard", "sqlite3",
+    "multiprocessing.pool",
 )  # fmt: skip
 
 
@@ -177,10 +176,6 @@ class Captures:
     def __init__(self) -> None:
         for library in LIBRARIES:
             import_module(library)
-        typesys = import_module("rosbags.typesys")
-        made = functools.lru_cache(typesys.get_typestore)
-        made(typesys.Stores.ROS2_HUMBLE)  # 0.1 s, which every process would spend
-        typesys.get_typestore = made
         with tempfile.TemporaryDirectory() as folder:
             self.seeds = synthetic_seeds(Path(folder))
         root = data_root()

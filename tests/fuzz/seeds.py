@@ -13,6 +13,8 @@ from typing import Any
 import numpy as np
 import test_apart as apart_tests
 import test_captures as capture_tests
+import test_clouds as cloud_tests
+import test_packets as packet_tests
 
 __all__ = ["Seed", "pcap_records", "real_seeds", "synthetic_seeds"]
 
@@ -41,12 +43,19 @@ def synthetic_seeds(folder: Path) -> list[Seed]:
     seeds = [_ouster(folder / "ouster"), _osf(folder / "ouster")]
     path = capture_tests.write_pcap(folder / "vlp16.pcap", capture_tests.vlp16_packets(0.12))
     seeds.append(Seed("velodyne", {"cap.pcap": path.read_bytes()}, "cap.pcap"))
+    for link in (113, 276, 101):
+        path = packet_tests.write_link(folder / "link.pcap", link, capture_tests.vlp16_packets(0.02))
+        seeds.append(Seed("velodyne", {"cap.pcap": path.read_bytes()}, "cap.pcap"))
     seeds += [Seed("bag1", {"cap.bag": capture_tests.write_bag1(folder / "one.bag").read_bytes()}, "cap.bag")]
-    seeds += [Seed("bag1", {"cap.bag": _packed_bag(folder / f"{m}.bag", m)}, "cap.bag") for m in ("BZ2", "LZ4")]
+    seeds += [Seed("bag1", {"cap.bag": _packed_bag(folder, m)}, "cap.bag") for m in ("BZ2", "LZ4")]
     bag2 = capture_tests.write_bag2(folder / "bag2")
     seeds.append(Seed("bag2", {f"cap/{f.name}": f.read_bytes() for f in sorted(bag2.iterdir())}, "cap"))
     mcap = capture_tests.write_mcap_folder(folder / "mcap")
     seeds.append(Seed("bag2", {f"cap/{f.name}": f.read_bytes() for f in sorted(mcap.iterdir())}, "cap"))
+    alone = {f"cap/{f.name}": f.read_bytes() for f in bag2.glob("*.db3")}
+    seeds.append(Seed("bag2", alone, "cap"))
+    foxglove = cloud_tests.write_foxglove(folder / "foxglove.mcap").read_bytes()
+    seeds += [Seed("mcap", {"cap.mcap": foxglove}, "cap.mcap")] * 3
     plain = capture_tests.write_mcap(folder / "plain.mcap").read_bytes()
     seeds += [Seed("mcap", {"cap.mcap": plain}, "cap.mcap")] * 3
     for method in ("", "lz4", "zstd"):
@@ -109,18 +118,8 @@ def _osf(folder: Path) -> Seed:
     return Seed("osf", {"cap.osf": (folder / "cap.osf").read_bytes()}, "cap.osf")
 
 
-def _packed_bag(path: Path, compression: str) -> bytes:
-    from rosbags import rosbag1, typesys
-
-    store, sent = capture_tests.messages(typesys, 1)
-    bag = rosbag1.Writer(path)
-    bag.set_compression(rosbag1.Writer.CompressionFormat[compression])
-    with bag:
-        connection = bag.add_connection(capture_tests.LIDAR, sent[0][1], typestore=store)
-        for topic, kind, stamp_ns, message in sent:
-            if topic == capture_tests.LIDAR:
-                bag.write(connection, stamp_ns, store.serialize_ros1(message, kind))
-    return path.read_bytes()
+def _packed_bag(folder: Path, method: str) -> bytes:
+    return capture_tests.write_bag1(folder / f"{method}.bag", compression=method).read_bytes()
 
 
 def scan_files() -> dict[str, bytes]:

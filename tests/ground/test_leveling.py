@@ -122,7 +122,7 @@ def test_any_text_is_a_mounting_or_an_error(tmp_path_factory: pytest.TempPathFac
     [
         {"height_m": math.nan},
         {"height_m": 1e6},
-        {"roll_deg": 91.0},
+        {"roll_deg": 181.0},
         {"pitch_deg": "3"},
         {"yaw_deg": 361.0},
         {"yaw_deg": True},
@@ -378,3 +378,17 @@ def test_a_scan_without_ground_is_told_of(scans: list[NDArray[np.float32]]) -> N
     assert found.mounting == MODEL_MOUNTING
     with pytest.raises(OptionError, match="expected a Mounting"):
         Perceiver("pointseg", mounting=1.7, provider="cpu")  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("yaw_deg", [0.0, 90.0, -135.0])
+def test_a_sensor_that_hangs_is_described(yaw_deg: float) -> None:
+    """The scan of a sensor turned by 180 degrees about x lies where that of a level one does."""
+    points = np.random.default_rng(3).normal(0.0, 9.0, (200, 4)).astype(np.float32)
+    level = Mounting(2.1, 0.0, 0.0, yaw_deg)
+    hanging = points * np.float32([1, -1, -1, 1])
+    T_vehicle_sensor = np.eye(4)
+    T_vehicle_sensor[:3, :3], T_vehicle_sensor[2, 3] = level.rotation() @ np.diag([1.0, -1.0, -1.0]), 2.1
+    for mounting in (Mounting(2.1, 180.0, 0.0, yaw_deg), Mounting.from_matrix(T_vehicle_sensor)):
+        np.testing.assert_allclose(ModelFrame(mounting).move(hanging), ModelFrame(level).move(points), atol=1e-4)
+    with pytest.raises(SensorError, match="-180 to 180"):
+        Mounting(2.1, 181.0, 0.0)

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from edgeperc.preprocess.condition import condition
-from edgeperc.preprocess.findings import Finding, check_fitness
+from edgeperc.preprocess.findings import Finding, check_beams, check_fitness
 from edgeperc.preprocess.fitness import FitnessProfile
 from edgeperc.readers.files import read_points
 from edgeperc.simulation.samples import simulated_scan
@@ -126,6 +126,68 @@ def room(half_m: float, height_m: float) -> Points:
 
 def test_a_room() -> None:
     assert any("a room" in sentence for sentence in gross(room(2.0, 2.4), "vlp-16"))
+
+
+def enclosed(size: tuple[float, float, float], height_m: float, sensor: str, shift: float = 0.1) -> Points:
+    """The walls, floor and ceiling of a box, as a sensor above its floor sees them; also a floor that is ground."""
+    elevation, azimuth = np.meshgrid(
+        np.radians(get_sensor(sensor).elevations_deg), np.radians(np.arange(-180.0, 180.0, 0.3)), indexing="ij"
+    )
+    way = np.column_stack(
+        [
+            (np.cos(elevation) * np.cos(azimuth)).ravel(),
+            (np.cos(elevation) * np.sin(azimuth)).ravel(),
+            np.sin(elevation).ravel(),
+        ]
+    )
+    high = np.array([(0.5 + shift) * size[0], (0.5 - shift) * size[1], size[2] - height_m])
+    low = high - size
+    with np.errstate(divide="ignore"):
+        distance = np.where(way > 0.0, high / way, np.where(way < 0.0, low / way, np.inf)).min(axis=1)
+    rng = np.random.default_rng(7)
+    points = way * (distance + rng.normal(0.0, 0.01, len(way)))[:, None]
+    remission = rng.uniform(0.1, 0.6, len(way)) * get_sensor(sensor).remission_range[1]
+    return np.column_stack([points, remission]).astype(np.float32)[distance < 100.0]
+
+
+@pytest.mark.parametrize("sensor", ["hdl-64e", "vlp-16", "os1-64", "pandar64"])
+@pytest.mark.parametrize("size", [(9.0, 7.0, 2.6), (14.0, 10.0, 3.2), (5.0, 4.0, 2.4)])
+@pytest.mark.parametrize("height_m", [0.4, 1.0, 1.7])
+def test_rooms_whose_floor_is_ground(sensor: str, size: tuple[float, float, float], height_m: float) -> None:
+    assert any("a room" in sentence for sentence in gross(enclosed(size, height_m, sensor), sensor))
+
+
+@pytest.mark.parametrize(
+    ("size", "what"),
+    [
+        ((400.0, 4.0, 6.0), "alley"),
+        ((300.0, 8.0, 5.0), "tunnel"),
+        ((60.0, 20.0, 4.5), "underpass"),
+        ((26.0, 24.0, 3.0), "garage"),
+    ],
+)
+@pytest.mark.parametrize("sensor", ["hdl-64e", "vlp-16", "os1-64"])
+def test_narrow_and_covered_roads_are_no_rooms(sensor: str, size: tuple[float, float, float], what: str) -> None:
+    assert not any("a room" in sentence for sentence in gross(enclosed(size, 1.73, sensor), sensor)), what
+
+
+@pytest.mark.parametrize("crop_m", [8.0, 12.0, 20.0])
+def test_a_street_that_is_cropped_is_no_room(crop_m: float) -> None:
+    for seed in SEEDS:
+        points = street(seed)
+        assert not any("a room" in sentence for sentence in gross(points[np.hypot(*points[:, :2].T) < crop_m]))
+
+
+@pytest.mark.parametrize("sensor", ["hdl-64e", "pandar64", "vlp-32c"])
+def test_elevations_tell_up_from_down(sensor: str) -> None:
+    points = enclosed((80.0, 30.0, 9.0), 1.73, sensor)
+    assert not check_beams(points, get_sensor(sensor))
+    for turned in (points * np.float32([1, -1, -1, 1]), points * np.float32([1, 1, -1, 1])):
+        (finding,) = check_beams(turned, get_sensor(sensor))
+        assert finding.gross
+        assert "mounted upside down, or z points down" in finding
+    symmetric = get_sensor("vlp-16")
+    assert not check_beams(enclosed((80.0, 30.0, 9.0), 1.73, "vlp-16") * np.float32([1, -1, -1, 1]), symmetric)
 
 
 @pytest.mark.parametrize(

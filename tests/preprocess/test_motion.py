@@ -150,7 +150,8 @@ def test_poses_are_read_as_they_were_written(rate: Any, velocity: Any) -> None:
     screw = twins.motion.screw(velocity, np.array(rate) / 3.0)
     poses = [twins.motion.exponential(screw * t) for t in (0.0, 0.5, 1.0)]
     with tempfile.TemporaryDirectory() as folder:
-        found = Trajectory.from_tum(write_tum(Path(folder) / "poses.txt", (10.0, 10.5, 11.0), poses))
+        path = write_tum(Path(folder) / "poses.txt", (10.0, 10.5, 11.0), poses)
+        found = Trajectory.from_tum(path, quaternion="xyzw")
     np.testing.assert_allclose(found.T_world_sensor, poses, atol=1e-12)
     for first_s, last_s in ((10.1, 10.2), (10.4, 10.6), (9.9, 10.0), (11.0, 11.2), (10.5, 10.5)):
         motion = found.motion(first_s, last_s)
@@ -198,6 +199,86 @@ def test_files_that_are_no_poses_are_refused(text: str, error: str, tmp_path: Pa
         Trajectory.from_tum(tmp_path / "poses.txt")
     with pytest.raises(TrackingError, match="cannot be read"):
         Trajectory.from_tum(tmp_path / "absent.txt")
+
+
+def drive(turn_radps: float, speed_mps: float = 10.0, heading: float = 0.0, T_vehicle_sensor: Any = None) -> Any:
+    """Times and poses of a sensor on a vehicle that drives an arc for 3 s; by default x is ahead and z is up."""
+    times, poses = 0.1 * np.arange(30), []
+    for t in times:
+        yaw = heading + turn_radps * t
+        step = speed_mps * t * np.sinc(0.5 * turn_radps * t / np.pi)  # the chord of the arc
+        T = np.eye(4)
+        T[:2, :2] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
+        T[:2, 3] = step * np.cos(0.5 * (heading + yaw)), step * np.sin(0.5 * (heading + yaw))
+        poses.append(T @ (np.eye(4) if T_vehicle_sensor is None else T_vehicle_sensor))
+    return times, poses
+
+
+def write_w_first(path: Path, times: Any, poses: Any) -> Path:
+    lines = write_tum(path, times, poses).read_text().splitlines()[1:]
+    rows = [line.split() for line in lines]
+    path.write_text("\n".join(" ".join([*row[:4], row[7], *row[4:7]]) for row in rows))
+    return path
+
+
+HANGING = np.diag([1.0, -1.0, -1.0, 1.0])
+CAMERA = np.array([[0, 0, 1.0, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+
+
+@pytest.mark.parametrize("heading", [0.0, 1.5, 3.1, -2.0])
+@pytest.mark.parametrize("turn", [0.0, 0.4, -1.0])
+@pytest.mark.parametrize("speed", [10.0, 0.0])
+def test_quaternions_with_w_first_are_not_read_as_w_last(
+    turn: float, heading: float, speed: float, tmp_path: Path
+) -> None:
+    times, poses = drive(turn, speed, heading)
+    last = Trajectory.from_tum(write_tum(tmp_path / "last.txt", times, poses))
+    np.testing.assert_allclose(last.T_world_sensor, poses, atol=1e-12)
+    path = write_w_first(tmp_path / "first.txt", times, poses)
+    found = Trajectory.from_tum(path, quaternion="wxyz")
+    np.testing.assert_allclose(found.T_world_sensor, poses, atol=1e-12)
+    if speed == 0.0 and abs(heading) > 3.0:
+        return  # both readings are upright
+    with pytest.raises(TrackingError, match=r"first\.txt: read as x, y, z, w, .* read as w, x, y, z, .*--quaternion"):
+        Trajectory.from_tum(path)
+
+
+@pytest.mark.parametrize("T_vehicle_sensor", [CAMERA, HANGING @ CAMERA], ids=["camera", "camera upside down"])
+def test_cameras_may_look_along_z(T_vehicle_sensor: Any, tmp_path: Path) -> None:
+    times, poses = drive(0.4, 10.0, 0.7, T_vehicle_sensor)
+    found = Trajectory.from_tum(write_tum(tmp_path / "last.txt", times, poses))
+    np.testing.assert_allclose(found.T_world_sensor, poses, atol=1e-12)
+    if T_vehicle_sensor is CAMERA:
+        path = write_w_first(tmp_path / "first.txt", times, poses)
+        with pytest.raises(TrackingError, match="read as w, x, y, z"):
+            Trajectory.from_tum(path)
+
+
+def test_a_sensor_that_hangs_is_read_when_the_order_is_said(tmp_path: Path) -> None:
+    times, poses = drive(0.0, 10.0, 0.0, HANGING)
+    path = tmp_path / "last.txt"
+    path.write_text("\n".join(f"{t} {T[0, 3]} 0 0 1 0 0 0" for t, T in zip(times, poses, strict=True)))
+    with pytest.raises(TrackingError, match="180 deg from up"):
+        Trajectory.from_tum(path)
+    np.testing.assert_allclose(Trajectory.from_tum(path, quaternion="xyzw").T_world_sensor, poses, atol=1e-12)
+    with pytest.raises(OptionError, match="expected 'xyzw' or 'wxyz'"):
+        Trajectory.from_tum(path, quaternion="wzyx")  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("text", "line"), [("# t\n1 {0}\n\n2 {0}\n2 {0}", 5), ("1 {0}\n0 {0}", 2), ("0 {0}\n#\nnan {0}", 3)]
+)
+def test_times_that_do_not_rise_name_the_line(text: str, line: int, tmp_path: Path) -> None:
+    (tmp_path / "poses.txt").write_text(text.format("0 0 0 0 0 0 1"))
+    with pytest.raises(StampError, match=rf"poses\.txt: the time of line {line} is not later"):
+        Trajectory.from_tum(tmp_path / "poses.txt")
+
+
+def test_the_last_row_of_a_pose_may_be_rounded() -> None:
+    pose = np.eye(4)
+    pose[3] = [1e-16, 0.0, -1e-17, 1.0 + 1e-15]
+    assert Trajectory(np.arange(2.0), np.stack([pose] * 2)).motion(0.0, 1.0).velocity_mps == (0.0, 0.0, 0.0)
+    assert Motion.between(pose, 0.0, pose, 1.0).rate_radps == (0.0, 0.0, 0.0)
 
 
 def test_impossible_trajectories_are_refused() -> None:

@@ -18,8 +18,7 @@ import zlib
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pytest
@@ -37,7 +36,7 @@ from test_captures import (
 from test_captures import ouster as ouster
 
 from edgeperc.errors import PointsError
-from edgeperc.readers import apart, decoders, files
+from edgeperc.readers import apart, files
 from edgeperc.readers.captures import read_scans
 from edgeperc.readers.files import read_points
 from edgeperc.readers.inflate import inflate
@@ -477,7 +476,7 @@ def test_mcap_chunks(tmp_path: Path, method: str, summary: bool) -> None:
             np.testing.assert_array_equal(points, POINTS + np.float32(k))
     scans, error = read_until_error(chunked_mcap(tmp_path / "bad.mcap", method, damaged=2, summary=summary))
     assert len(scans) == 2
-    assert "bad.mcap: a chunk is damaged: its CRC-32 is wrong" in error
+    assert "bad.mcap: after 2 scans a chunk is damaged: its CRC-32 is wrong" in error
 
 
 @pytest.mark.parametrize("method", ["lz4", "zstd"])
@@ -494,37 +493,6 @@ def test_an_mcap_chunk_that_holds_more_than_it_says(tmp_path: Path, method: str,
     scans, error = read_until_error(path)
     assert len(scans) == 3
     assert "unpack to" in error
-
-
-@pytest.mark.parametrize("compression", ["BZ2", "LZ4"])
-def test_a_bag_with_compressed_chunks(tmp_path: Path, compression: str) -> None:
-    rosbag1, typesys = pytest.importorskip("rosbags.rosbag1"), pytest.importorskip("rosbags.typesys")
-    store, sent = messages(typesys, 1)
-    bag = rosbag1.Writer(tmp_path / "packed.bag")
-    bag.set_compression(rosbag1.Writer.CompressionFormat[compression])
-    with bag:
-        connection = bag.add_connection(LIDAR, sent[0][1], typestore=store)
-        for topic, kind, stamp_ns, message in sent:
-            if topic == LIDAR:
-                bag.write(connection, stamp_ns, store.serialize_ros1(message, kind))
-    scans = list(read_scans(tmp_path / "packed.bag"))
-    assert len(scans) == 3
-    np.testing.assert_array_equal(scans[0][1], POINTS)
-
-
-def test_chunks_of_a_bag_stop_at_the_limit(monkeypatch: pytest.MonkeyPatch) -> None:
-    class Chunk(NamedTuple):
-        decompressor: Callable[[bytes], bytes]
-
-    monkeypatch.setattr(decoders, "inflate", lambda packed, method: inflate(packed, method, 1000))
-    reader = SimpleNamespace(chunks={9: Chunk(lambda packed: packed + b" as it is")})
-    decoders.limit_chunks(reader)
-    unpack = reader.chunks[9].decompressor
-    assert unpack(b"plain") == b"plain as it is"
-    for method in ("bz2", "lz4"):
-        assert unpack(pack(bytes(1000), method)) == bytes(1000)
-        with pytest.raises(PointsError, match="more than 1,000"):
-            unpack(pack(bytes(1001), method))
 
 
 def compressed_bag(folder: Path, mode: str) -> Path:

@@ -16,7 +16,8 @@ import pytest
 import edgeperc
 from edgeperc.errors import MissingExtraError, PointsError
 from edgeperc.readers.captures import is_capture, read_scans, scan_files
-from edgeperc.readers.decoders import cloud_points, decode
+from edgeperc.readers.clouds import cloud_points
+from edgeperc.readers.decoders import decode
 
 POINTS = np.array(
     [[12.5, -3.25, -1.75, 0.25], [40.0, 8.5, 2.0, 99.0], [np.nan, 1.0, 1.0, 0.5], [5.0, np.inf, 0.0, 255.0]], np.float32
@@ -205,10 +206,15 @@ def messages(typesys: Any, ros: int) -> tuple[Any, list[tuple[str, str, int, Any
     return store, sent
 
 
-def write_bag1(path: Path, renamed: Callable[[int, str], str] = lambda k, topic: topic) -> Path:
+def write_bag1(
+    path: Path, renamed: Callable[[int, str], str] = lambda k, topic: topic, compression: str | None = None
+) -> Path:
     typesys, rosbag1 = pytest.importorskip("rosbags.typesys"), pytest.importorskip("rosbags.rosbag1")
     store, sent = messages(typesys, 1)
-    with rosbag1.Writer(path) as bag:
+    bag = rosbag1.Writer(path)
+    if compression is not None:
+        bag.set_compression(rosbag1.Writer.CompressionFormat[compression])
+    with bag:
         connections: dict[str, Any] = {}
         for k, (name, kind, stamp_ns, message) in enumerate(sent):
             topic = renamed(k, name)
@@ -301,14 +307,14 @@ def test_bags(tmp_path: Path, name: str) -> None:
             np.testing.assert_array_equal(points, POINTS + np.float32(k))
     error = error_of(path, topic="/camera/points")
     assert f"no topic of type sensor_msgs/PointCloud2 '/camera/points'; there are {LIDAR}" in error
-    assert f"of other types {OTHER} (std_msgs/msg/String)" in error
+    assert f"of other types {OTHER} (std_msgs/{'' if name == 'ros1.bag' else 'msg/'}String)" in error
 
 
 def test_a_bag_with_several_lidars_asks_which(tmp_path: Path) -> None:
     path = write_bag1(tmp_path / "two.bag", lambda k, topic: "/rear/points" if k == 2 else topic)
     error = error_of(path)
     assert f"expected one topic of type sensor_msgs/PointCloud2, there are {LIDAR}, /rear/points" in error
-    assert "topic=" in error
+    assert "choose one by topic (--topic)" in error
     assert [stamp for stamp, _ in read_scans(path, topic="/rear/points")] == pytest.approx([101.5])
     assert len(list(read_scans(path, topic=LIDAR))) == 2
 
@@ -322,38 +328,11 @@ def test_bag_without_lidar_lists_its_topics(tmp_path: Path) -> None:
         bag.write(connection, 1, store.serialize_ros1(sent[1][3], "std_msgs/msg/String"))
     error = error_of(path)
     assert "expected one topic of type sensor_msgs/PointCloud2, there is none" in error
-    assert f"{OTHER} (std_msgs/msg/String)" in error
+    assert f"{OTHER} (std_msgs/String)" in error
     empty = tmp_path / "empty.bag"
     with rosbag1.Writer(empty) as bag:
         bag.add_connection(LIDAR, "sensor_msgs/msg/PointCloud2", typestore=store)
     assert "damaged" in (error := error_of(empty)) or "no message" in error
-
-
-@pytest.mark.parametrize("name", ["ros1.bag", "one.mcap"])
-@pytest.mark.parametrize("share", [0.0, 0.01, 0.3, 0.7, 0.99])
-def test_bags_that_are_cut_short(tmp_path: Path, name: str, share: float) -> None:
-    path = BAGS[name](tmp_path / name)
-    content = path.read_bytes()
-    path.write_bytes(content[: int(share * len(content))])
-    assert "damaged or cut short" in error_of(path)
-
-
-def test_a_database_that_is_cut_short(tmp_path: Path) -> None:
-    folder = write_bag2(tmp_path / "bag")
-    (database,) = folder.glob("*.db3")
-    assert "read with the folder it lies in" in error_of(database)
-    content = database.read_bytes()
-    for share in (0.0, 0.2, 0.8):
-        database.write_bytes(content[: int(share * len(content))])
-        scans, error = read_until_error(folder)
-        assert len(scans) < 3
-        assert str(folder) in error
-    (folder / "metadata.yaml").write_text("rosbag2_bagfile_information: [")
-    error_of(folder)
-
-
-def test_an_mcap_of_another_profile(tmp_path: Path) -> None:
-    assert "cannot be read" in error_of(write_mcap(tmp_path / "other.mcap", profile=b"protobuf"))
 
 
 def write_pcap(path: Path, payloads: Sequence[bytes], endian: str = "<") -> Path:
@@ -547,11 +526,11 @@ def test_packets_without_a_lidar_are_refused(tmp_path: Path, ouster: Path) -> No
         ("text.mcap", b"no capture at all", "damaged"),
         ("text.osf", b"no capture at all", "damaged"),
         ("empty.osf", b"", "damaged"),
-        ("text.db3", b"no database", "folder it lies in"),
+        ("text.db3", b"no database", "damaged or cut short: it begins with b'no database'"),
     ],
 )
 def test_files_that_are_not_captures_are_refused(tmp_path: Path, name: str, content: bytes, error: str) -> None:
-    for module in ("rosbags.highlevel", "ouster.sdk.pcap", "velodyne_decoder"):
+    for module in ("ouster.sdk.pcap", "velodyne_decoder"):
         pytest.importorskip(module)
     path = tmp_path / name
     path.write_bytes(content)
@@ -565,21 +544,17 @@ def test_files_that_are_not_captures_are_refused(tmp_path: Path, name: str, cont
         ("vlp16.pcap", "velodyne", ("velodyne_decoder",)),
         ("other.pcap", "ouster", ("ouster", "ouster.sdk", "ouster.sdk.pcap")),
         ("frames.osf", "ouster", ("ouster", "ouster.sdk", "ouster.sdk.osf")),
-        ("drive.bag", "ros", ("rosbags", "rosbags.highlevel")),
-        ("drive.mcap", "ros", ("rosbags", "rosbags.highlevel")),
     ],
 )
 def test_missing_extra_names_the_install_command(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, extra: str, modules: Sequence[str]
 ) -> None:
     path = tmp_path / name
-    path.write_bytes(b"#ROSBAG V2.0\n")
+    path.write_bytes(b"")
     if path.suffix == ".pcap":
         write_pcap(path, vlp16_packets(0.1) if name == "vlp16.pcap" else [b"other"])
     for module in modules:
         monkeypatch.setitem(sys.modules, module, None)
-    if name == "frames.osf":
-        path.write_bytes(b"")
     with pytest.raises(MissingExtraError, match=rf"pip install 'edgeperc\[{extra}\]'"):
         next(decode_here(path))
 

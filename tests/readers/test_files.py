@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import struct
+import tempfile
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -14,8 +15,9 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
+import edgeperc
 import twins.points
-from edgeperc.errors import PointsError
+from edgeperc.errors import OptionError, PointsError
 from edgeperc.readers.files import read_points
 from edgeperc.readers.pcd import fill_unpacked_lzf
 from edgeperc.types.points import as_points
@@ -228,10 +230,6 @@ BAD_FILES = {
     "text.bin": (b"12.0 3.0 1.0 0.5\n" * 16, "text"),
     "double.bin": (np.random.default_rng(0).normal(0, 20, (500, 4)).tobytes(), "not coordinates"),
     "big_endian.bin": (np.random.default_rng(0).normal(0, 20, (500, 4)).astype(">f4").tobytes(), "not coordinates"),
-    "five.bin": (
-        np.random.default_rng(0).normal(0, 20, (500, 5)).astype("<f4") * [1, 1, 1, 1, 0] + [0, 0, 0, 0, 3],
-        "columns=5",
-    ),
     "four.pcd.bin": (POINTS[:3].tobytes(), "columns="),
     "objects.npy": (npy(np.array([{}, []], dtype=object)), "never unpickled"),
     "strings.npy": (npy(np.array([["1", "2", "3", "4"]])), "<U1"),
@@ -293,7 +291,7 @@ BAD_FILES = {
         ),
         "save it as binary",
     ),
-    "picture.pcd": (b"\x89PNG\r\n\x1a\n" + b"\0" * 64, "first bytes"),
+    "picture.pcd": (b"\x89PNG\r\n\x1a\n" + b"\0" * 64, "this is an image"),
 }
 
 
@@ -483,3 +481,229 @@ def test_lzf_agrees_with_the_twin(packed: bytes, size: int) -> None:
         assert written == -1
     else:
         assert unpacked[:written].tobytes() == expected
+
+
+# --- raw files of other columns --------------------------------------------------------------------------------------
+
+
+def street(seed: int, n: int = 6000) -> np.ndarray:
+    """Points along the rings of a sensor: ground, and walls beside it."""
+    rng = np.random.default_rng(seed)
+    azimuth = np.tile(np.linspace(-np.pi, np.pi, n // 20, endpoint=False), 20)
+    elevation = np.repeat(np.radians(np.linspace(-25.0, 3.0, 20)), n // 20)
+    reach = np.minimum(8.0 / np.maximum(np.abs(np.sin(azimuth)), 0.1), 1.7 / np.maximum(-np.sin(elevation), 0.02))
+    reach += rng.normal(0.0, 0.02, len(reach))
+    across = reach * np.cos(elevation)
+    xyz = [across * np.cos(azimuth), across * np.sin(azimuth), reach * np.sin(elevation)]
+    return np.column_stack([*xyz, rng.uniform(0.0, 0.6, len(reach))]).astype("<f4")
+
+
+OTHERS = {
+    "time": lambda n, rng: np.linspace(0.0, 0.1, n),
+    "ring": lambda n, rng: np.repeat(np.arange(20), n // 20)[:n],
+    "unknown": lambda n, rng: np.full(n, -1.0),
+    "elongation": lambda n, rng: rng.uniform(0.0, 1.0, n),
+    "noise": lambda n, rng: rng.normal(size=n),
+    "large": lambda n, rng: rng.integers(0, 2**24, n),
+}
+
+
+@given(
+    seed=st.integers(0, 9),
+    others=st.lists(st.sampled_from([*OTHERS]), max_size=5),
+    remission=st.sampled_from([None, 0.0, 1.0, 255.0]),
+    shuffled=st.booleans(),
+)
+@settings(max_examples=60, deadline=None)
+def test_raw_files_show_how_many_values_a_point_has(seed: int, others: Any, remission: Any, shuffled: Any) -> None:
+    rng = np.random.default_rng(seed)
+    points = street(seed)
+    points[:, 3] *= remission or 0.0
+    if remission is None and not others:
+        points = points[:, :3]
+    if shuffled:
+        points = rng.permutation(points)
+    rows = np.column_stack([points, *(OTHERS[name](len(points), rng) for name in others)]).astype("<f4")
+    with tempfile.TemporaryDirectory() as folder:
+        for name in ("scan.bin", "scan.pcd.bin"):
+            path = save(Path(folder), name, rows.tobytes())
+            np.testing.assert_array_equal(read_points(path)[:, : points.shape[1]], points)
+            np.testing.assert_array_equal(read_points(path, columns=rows.shape[1])[:, : points.shape[1]], points)
+
+
+@pytest.mark.parametrize("n", [1, 3, 40, 249])
+def test_few_points_have_the_usual_columns(tmp_path: Path, n: int) -> None:
+    points = street(1)[:: 6000 // n][:n]
+    np.testing.assert_array_equal(read_points(save(tmp_path, "scan.bin", points.tobytes())), points)
+
+
+def test_columns_have_names(tmp_path: Path) -> None:
+    rows = np.arange(30, dtype="<f4").reshape(5, 6)
+    path = save(tmp_path, "scan.bin", rows.tobytes())
+    names = ("ring", "X", "intensity", "z", "y", "time")
+    np.testing.assert_array_equal(read_points(path, columns=names), rows[:, [1, 4, 3, 2]])
+    np.testing.assert_array_equal(read_points(path, columns=names, remission_field="ring"), rows[:, [1, 4, 3, 0]])
+    ((_, points),) = edgeperc.read_scans(path, columns=names, remission_field="time")
+    np.testing.assert_array_equal(points, rows[:, [1, 4, 3, 5]])
+    with pytest.raises(PointsError, match="'signal'"):
+        read_points(path, columns=names, remission_field="signal")
+    with pytest.raises(PointsError, match="no numeric field y, z"):
+        read_points(path, columns=("x", "a", "b", "c", "d", "e"))
+    for columns in (("x", "y"), ("x", "y", "z", "z", "a", "b"), ["x"] * 65):
+        with pytest.raises(PointsError, match="3 to 64 different names"):
+            read_points(path, columns=columns)
+    with pytest.raises(PointsError, match="whole number of points of 4 float32"):
+        read_points(path, columns=("x", "y", "z", "i"))
+
+
+def test_named_columns_have_times(tmp_path: Path) -> None:
+    points = street(2)
+    rows = np.column_stack([points, np.linspace(0.0, 0.1, len(points))]).astype("<f4")
+    path = save(tmp_path, "scan.bin", rows.tobytes())
+    (scan,) = edgeperc.read_timed_scans(path, columns=("x", "y", "z", "intensity", "time"))
+    np.testing.assert_allclose(scan.times_s, rows[:, 4])
+    np.testing.assert_array_equal(scan.points, points)
+    (scan,) = edgeperc.read_timed_scans(path)
+    assert scan.times_s is None
+    np.testing.assert_array_equal(scan.points, points)
+
+
+# --- coordinates of a map --------------------------------------------------------------------------------------------
+
+MAPS = {
+    "UTM": (512_345.25, 5_412_345.5, 113.0),
+    "Gauss-Krüger": (3_500_000.5, 5_800_000.0, 40.0),
+    "south": (-9e4, 0, 0),
+}
+
+
+@pytest.mark.parametrize("place", MAPS)
+@pytest.mark.parametrize("kind", ["pcd", "ply", "array", "named", "npy"])
+def test_coordinates_of_a_map_are_not_rounded(tmp_path: Path, kind: str, place: Any) -> None:
+    """A scan whose coordinates float32 would round is refused, and exact if the place of the sensor is subtracted."""
+    points, origin = street(4), np.array(MAPS[place])
+    placed = np.column_stack([points[:, :3].astype("f8") + origin, points[:, 3]])
+    named = np.rec.fromarrays(placed.T, names="x,y,z,intensity")
+    n = len(points)
+    source = {
+        "pcd": lambda: save(
+            tmp_path, "a.pcd", pcd("x y z intensity", "F F F F", "8 8 8 8", "1 1 1 1", n, "binary", placed.tobytes())
+        ),
+        "ply": lambda: save(
+            tmp_path,
+            "a.ply",
+            ply(
+                "binary_little_endian",
+                placed.tobytes(),
+                n=n,
+                properties="".join(f"property double {name}\n" for name in ("x", "y", "z", "intensity")),
+            ),
+        ),
+        "array": lambda: placed,
+        "named": lambda: named,
+        "npy": lambda: save(tmp_path, "a.npy", npy(placed)),
+    }[kind]()
+    with pytest.raises(PointsError, match=r"those of a map, about \(.*--origin X Y Z"):
+        read_points(source)
+    read = read_points(source, origin_m=origin)
+    np.testing.assert_allclose(read, points, atol=1e-5)
+    if kind != "array" and kind != "named":
+        ((_, read),) = edgeperc.read_scans(source, origin_m=origin.tolist())
+        np.testing.assert_allclose(read, points, atol=1e-5)
+
+
+@pytest.mark.parametrize("origin", [(0, 0), ("a", 0, 0), (0, np.nan, 0), 5.0])
+def test_an_origin_is_three_numbers(origin: Any) -> None:
+    with pytest.raises(OptionError, match="origin_m is"):
+        read_points(POINTS, origin_m=origin)
+
+
+def test_an_origin_may_be_subtracted_from_float32() -> None:
+    moved = read_points(POINTS, origin_m=(1.0, -2.0, 0.5))
+    np.testing.assert_allclose(moved, POINTS - np.float32([1.0, -2.0, 0.5, 0.0]))
+
+
+# --- text, and formats that are not read -----------------------------------------------------------------------------
+
+
+@given(
+    separator=st.sampled_from([" ", ",", ";", "\t", ", ", "  "]),
+    names=st.permutations(["x", "Y", "z", "Intensity", "ring", "time"]),
+    end=st.sampled_from(["\n", "\r\n"]),
+    comment=st.sampled_from(["", "# made by a tool\n", "// made by a tool\n", "\ufeff"]),
+    mark=st.sampled_from(["", "#", "//", "# "]),
+)
+@settings(max_examples=60, deadline=None)
+def test_tables_of_text_with_names(separator: Any, names: Any, end: Any, comment: Any, mark: Any) -> None:
+    values = np.round(np.random.default_rng(1).normal(0.0, 20.0, (7, 6)), 3)
+    rows = [mark + separator.join(names), *(separator.join(str(v) for v in row) for row in values)]
+    places = [[name.lower() for name in names].index(name) for name in ("x", "y", "z", "intensity")]
+    with tempfile.TemporaryDirectory() as folder:
+        path = save(Path(folder), "scan.csv", (comment + end.join(rows) + end).encode())
+        np.testing.assert_array_equal(read_points(path), values[:, places].astype("f4"))
+        ((_, points),) = edgeperc.read_scans(path, remission_field="ring")
+        np.testing.assert_array_equal(points[:, 3], values[:, [*names].index("ring")].astype("f4"))
+
+
+@pytest.mark.parametrize(
+    ("name", "head", "n"), [("a.xyz", "", 3), ("b.xyz", "", 4), ("a.txt", "", 4), ("a.pts", "5\n", 4)]
+)
+def test_tables_of_text_without_names(tmp_path: Path, name: str, head: Any, n: int) -> None:
+    values = np.arange(5.0 * n).reshape(5, n) * 1.25
+    path = save(tmp_path, name, (head + "\n".join(" ".join(map(str, row)) for row in values)).encode())
+    points = read_points(path)
+    np.testing.assert_array_equal(points[:, :n], values)
+    assert points.shape == (5, 4)
+    named = read_points(path, columns=("z", "y", "x", "i")[:n])
+    np.testing.assert_array_equal(named[:, :3], values[:, [2, 1, 0]])
+
+
+@pytest.mark.parametrize(
+    ("content", "error"),
+    [
+        (b"1 2 3 4 5 6\n" * 9, "a row has 6 numbers, and there are no line of names: pass columns="),
+        (b"x y z i\n1 2 3 4 5\n", "a row has 5 numbers, and there are 4 names"),
+        (b"1 2 3 4\n1 2 3\n", "does not hold 4 numbers"),
+        (b"1 2 3 4\nfar 2 3 1\n", "does not hold 4 numbers"),
+        (b"Dear reader,\nno points here\n", "no table of points: it has a line 'Dear reader'"),
+        (b"# x y z\n", "no row of three numbers"),
+        (b"300\n200\n0 0 0\n1 0 0\n0 1 0\n0 0 1\n1 0 0 0\n", "does not hold 3 numbers"),  # PTX
+    ],
+)
+def test_text_that_is_no_table(tmp_path: Path, content: bytes, error: str) -> None:
+    with pytest.raises(PointsError, match=error):
+        read_points(save(tmp_path, "scan.txt", content))
+
+
+@pytest.mark.parametrize(
+    ("content", "error"),
+    [
+        (b"LASF" + bytes(400), "a LAS or LAZ file; convert it"),
+        (b"ARROW1\0\0" + bytes(400), "a Feather .* pandas"),
+        (b"PAR1" + bytes(99), "a Parquet table"),
+        (b"version https://git-lfs.github.com/spec/v1\noid sha256:00\n", "Run: git lfs pull"),
+        (b"\0\0\0\x20ftypisom" + bytes(400), "a film"),
+        (b"II*\0" + bytes(40), "a TIFF image"),
+        (b"\x89PNG\r\n" + bytes(40), "an image; pass it with a camera model"),
+        (b"\x1f\x8b\x08" + bytes(40), "an archive; unpack it"),
+        (bytes(257) + b"ustar" + bytes(99), "an archive; unpack it"),
+        (b"ASTM-E57" + bytes(40), "an E57 file"),
+        (b"\x80\x04\x95" + bytes(40), "a pickle, which is never unpickled"),
+        (b"<!DOCTYPE html><html>not found</html>", "a download may have failed"),
+        (b'{"points": []}', "JSON"),
+        (b"\x01\x02\x03\x04\x05\x06\x07\x08", r"by its first bytes, b'\\x01\\x02"),
+    ],
+)
+@pytest.mark.parametrize("suffix", ["", ".pcd", ".bin"])
+def test_other_formats_are_named(tmp_path: Path, content: bytes, error: str, suffix: str) -> None:
+    if suffix == ".bin" and min(content) < 9:
+        return  # may be float32 values
+    with pytest.raises(PointsError, match=rf"scan{suffix}: .*{error}"):
+        read_points(save(tmp_path, f"scan{suffix}", content))
+
+
+@pytest.mark.parametrize("first", [b"{\0\x90A", b"[ab@", b"RIFF", b"BZh@", b"\xff\xd8\xff@"])
+def test_raw_values_may_begin_like_another_format(tmp_path: Path, first: Any) -> None:
+    content = first + street(1).tobytes()[4:]
+    assert len(read_points(save(tmp_path, "scan.bin", content))) == 6000
+    assert len(read_points(save(tmp_path, "scan.raw", content), columns=4)) == 6000

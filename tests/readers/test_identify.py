@@ -21,7 +21,7 @@ from cli_helpers import run
 from edgeperc.errors import EdgepercError, PointsError, SensorError
 from edgeperc.live import stream
 from edgeperc.readers.captures import known_sensor, read_scans, sensor_of
-from edgeperc.readers.decoders import cloud_points
+from edgeperc.readers.clouds import cloud_points
 from edgeperc.readers.identify import KnownSensor, of_cloud, of_metadata
 from edgeperc.types.sensor import SENSORS, SensorProfile, get_sensor
 

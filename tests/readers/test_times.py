@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import struct
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -23,7 +23,8 @@ import twins.motion
 from cli_helpers import run
 from edgeperc import Motion, deskew, read_timed_scans
 from edgeperc.cli.straighten import Straightener
-from edgeperc.readers.times import point_times, time_name
+from edgeperc.errors import PointsError
+from edgeperc.readers.times import of_plausible_duration, point_times, time_name
 
 MOTION = Motion((18.0, 0.5, 0.0), (0.02, -0.03, 0.6))
 HALF_X_M, HALF_Y_M = 20.0, 15.0
@@ -101,6 +102,52 @@ def test_points_without_return_do_not_hide_the_unit() -> None:
 def test_fields_that_are_no_times_give_none(fields: dict[str, NDArray[Any]]) -> None:
     assert point_times(fields, np.ones((5, 4), np.float32), 1.0) is None
     assert point_times({name: values[:0] for name, values in fields.items()}, np.ones((0, 4), np.float32), 1.0) is None
+
+
+@pytest.mark.parametrize(
+    ("damage", "places"),
+    [(3_604_361_924, [17]), (1_904_361_924, [0]), (4_294_967_295, [5, 99, 1999]), (2**32 - 7, [*range(19)])],
+)
+@pytest.mark.parametrize("start", [0, 1_700_000_000])
+def test_a_damaged_time_costs_its_point_alone(damage: int, places: list[int], start: int) -> None:
+    nanoseconds = np.linspace(start, start + 1e8, 2000).astype("u4")
+    nanoseconds[places] = damage
+    times = point_times({"t": nanoseconds}, np.ones((2000, 4), np.float32), 50.0)
+    assert times is not None
+    assert np.nonzero(np.isnan(times))[0].tolist() == places
+    rest = ~np.isnan(times)
+    expected = np.linspace(start, start + 1e8, 2000) * 1e-9 + 50.0
+    np.testing.assert_allclose(times[rest], expected[rest], atol=1e-6)
+
+
+@pytest.mark.parametrize("count", [10.0, 0.1, 4e3, 1.5e4])
+@pytest.mark.parametrize("direction", [1.0, -1.0])
+def test_times_that_contradict_the_turn_are_refused(count: float, direction: float) -> None:
+    """Shares of a turn and odd units: the azimuth turns once in 1 s, 10 ms, 0.4 s and 1.5 s."""
+    angle = direction * np.linspace(0.0, 2 * np.pi, 5000)
+    points = np.column_stack([9 * np.cos(angle), 9 * np.sin(angle), 0 * angle, 0 * angle]).astype(np.float32)
+    turn_s = np.linspace(0.0, 0.1, 5000)
+    assert point_times({"t": turn_s}, points, None) is not None
+    with pytest.raises(PointsError, match=r"by the field 't', a turn of the sensor takes .* in another unit"):
+        point_times({"t": turn_s * count}, points, None)
+    # A sensor that does not turn may take any time.
+    still = np.random.default_rng(3).permutation(points)
+    assert point_times({"t": turn_s * 10.0}, still, None) is not None
+
+
+@pytest.mark.parametrize(("duration_s", "interval_s"), [(1.0, 0.1), (0.2, 0.1), (0.19, 0.05), (1.9, 1.0)])
+def test_scans_that_last_longer_than_their_interval_are_refused(duration_s: float, interval_s: float) -> None:
+    def scans(duration_s: float, stamps_s: Iterable[float]) -> Iterator[edgeperc.TimedScan]:
+        for stamp_s in stamps_s:
+            times = stamp_s + np.array([0.0, np.nan, duration_s])
+            yield edgeperc.TimedScan(stamp_s, np.ones((3, 4), np.float32), times)
+
+    stamps_s = [50.0 + interval_s * k for k in range(6)]
+    with pytest.raises(PointsError, match=r"span .* s, and a scan comes every .* s: the times are in another unit"):
+        list(of_plausible_duration(scans(duration_s, stamps_s)))
+    assert len(list(of_plausible_duration(scans(interval_s, stamps_s)))) == 6
+    late = [*stamps_s[:3], stamps_s[3] - 0.9 * interval_s, *stamps_s[4:], 49.0]  # one message early, a clock set back
+    assert len(list(of_plausible_duration(scans(interval_s, late)))) == 7
 
 
 def test_the_best_known_field_counts() -> None:

@@ -18,6 +18,7 @@ import edgeperc
 import twins.grid
 from edgeperc import Box, Mounting, OccupancyGrid, OptionError, Perception, PointsError, TopView, occupancy_grid
 from edgeperc.road.grid import fill_standing
+from edgeperc.types.frame import ModelFrame
 from edgeperc.types.mounting import MODEL_MOUNTING
 
 NUMBERS = st.one_of(st.floats(-3, 3, width=32), st.sampled_from([math.nan, math.inf, -math.inf]))
@@ -162,3 +163,33 @@ def test_results_are_immutable_and_errors_name_the_reason() -> None:
         with pytest.raises(OptionError, match="min_height_m is"):
             occupancy_grid(found, points, min_height_m=height)
     assert edgeperc.occupancy_grid is occupancy_grid
+
+
+@pytest.mark.parametrize(
+    "mounting",
+    [
+        Mounting(1.73, 0.0, 0.0, 0.0),
+        Mounting(2.1, 0.0, 0.66, -90.0),
+        Mounting(1.5, 3.0, -2.0, 135.0),
+        Mounting(3.0, 0.0, 0.0, 180.0, origin_m=(1.0, -2.0)),
+    ],
+)
+def test_the_message_lies_in_the_frame_of_the_scan(mounting: Mounting) -> None:
+    """A post that the sensor sees lies in an occupied cell, however the sensor is turned."""
+    frame = ModelFrame(mounting)
+    post = np.array([20.05, 6.05, -1.0])  # in the frame of the models
+    place = frame.R.T @ (post - frame.t)
+    empty = np.zeros((60, 40), np.bool_)
+    height_m = np.zeros((60, 40), np.float32)
+    grid = OccupancyGrid(empty, empty, height_m, ~empty, 0.5, (0.0, 30.0), (-10.0, 10.0), mounting=mounting)
+    origin = grid.to_occupancy_grid("lidar")["info"]["origin"]
+    x, y, z, w = (origin["orientation"][axis] for axis in "xyzw")
+    R = np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+    corner = np.array([origin["position"][axis] for axis in "xyz"])
+    np.testing.assert_allclose(R.T @ (place - corner), [20.05, 16.05, 0.73], atol=1e-9)  # column, row and height

@@ -32,7 +32,7 @@ from edgeperc import (
     occupancy_grid,
     read_scans,
 )
-from edgeperc.readers.decoders import cloud_points
+from edgeperc.readers.clouds import cloud_points
 from edgeperc.records import PerceivedScan
 from edgeperc.ros2.messages import CLOUD, OUTPUTS, RosMessages, nanoseconds
 from edgeperc.sinks.rosbag import TOPICS, BagSink

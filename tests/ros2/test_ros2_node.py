@@ -19,7 +19,7 @@ pytest.importorskip("rosbags")
 from ros2_helpers import FIELDS, MESSAGES, Perceive, cloud
 
 from edgeperc import Box, ModelFileError, OptionError, Perception, PointsError, Tracker
-from edgeperc.readers.decoders import cloud_points
+from edgeperc.readers.clouds import cloud_points
 from edgeperc.records import PerceivedScan
 from edgeperc.ros2 import node as node_module
 from edgeperc.ros2.graph import RELIABLE, Qos, full_name

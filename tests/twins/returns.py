@@ -14,9 +14,9 @@ def returns(
     """Twin of `returns.returns`: the points, and the number that are not finite, too near and of the ego."""
     out = points.copy()
     counts = [0, 0, 0]
-    for i, (x, y, z, remission) in enumerate(points.astype(np.float64)):
+    for i, (x, y, z, _) in enumerate(points.astype(np.float64)):
         place = np.array([x - origin[0], y - origin[1], z])
-        if not np.isfinite([x, y, z, remission]).all():
+        if not np.isfinite([x, y, z]).all():
             kind = 0
         elif (place**2).sum() <= (min_range_m * (1.0 + 1e-6)) ** 2:
             kind = 1
@@ -26,4 +26,8 @@ def returns(
             continue
         counts[kind] += 1
         out[i] = np.nan
+    known = np.sort([r for *_, r in out if np.isfinite(r)])
+    for row in out:
+        if np.isfinite(row[:3]).all() and not np.isfinite(row[3]):
+            row[3] = np.median(known) if len(known) else 0.0
     return out, tuple(counts)

@@ -10,6 +10,7 @@ import os
 import struct
 import tempfile
 import time
+import tracemalloc
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -514,3 +515,15 @@ def test_a_shape_is_read_packed_or_not() -> None:
     packed = field(1, varint(2) + varint(2) + varint(1) + varint(1))
     content = packed + number(2, 1) + field(8, b"w") + field(4, struct.pack("<4f", *WEIGHTS.ravel()))
     check_graph(model(graph(CONVOLUTION, field(5, content))), "model.onnx")
+
+
+def test_reading_a_model_asks_for_its_size_alone(tmp_path: Path) -> None:
+    """A buffer of the largest size would be asked for otherwise, which a limit of the memory refuses."""
+    path = tmp_path / "small.onnx"
+    path.write_bytes(b"x" * 1000)
+    tracemalloc.start()
+    try:
+        assert onnx_file.read_model(path) == b"x" * 1000
+        assert tracemalloc.get_traced_memory()[1] < 1_000_000
+    finally:
+        tracemalloc.stop()

@@ -1,0 +1,95 @@
+"""Raw float32 files, which have no header: their values a point show in the values themselves."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import PointsError
+from .tables import Columns
+
+TEXT_BYTES = np.zeros(256, dtype=np.bool_)
+TEXT_BYTES[[9, 10, 13, *range(32, 127)]] = True
+
+_KNOWN = ("x", "y", "z", "remission")
+_WIDTHS = range(3, 13)  # values a point that are told apart
+_FEWEST_POINTS = 250  # fewer do not show it
+_BLOCKS, _BLOCK = 4, 6000  # what is looked at: so many pieces of so many values
+
+# Values of one column are alike. Of 561 real scans of 4 values, the difference at the right width is at most 1.05 times
+# the smallest one; wrong widths have 1.2 times and more, even where the points are shuffled.
+_ALIKE, _UNLIKE = 1.15, 1.2
+
+
+def parse_raw(data: NDArray[np.uint8], columns: int | Sequence[str] | None, usual: int) -> Columns:
+    """The columns of a raw float32 file.
+
+    columns : number of values of a point, or their names; None: ``usual``, unless the values show another number.
+    Raises PointsError.
+    """
+    names = _names(columns)
+    if TEXT_BYTES[data[:4096]].all():
+        raise PointsError("the file holds text, not float32 values; expected x, y, z, remission as raw float32")
+    if columns is None:
+        width = _width(data[: data.size // 4 * 4].view("<f4"), usual)
+        names = (*_KNOWN[:width], *(f"column {k}" for k in range(5, width + 1)))
+    record = 4 * len(names)
+    if data.size % record:
+        raise PointsError(
+            f"{data.size} bytes are not a whole number of points of {len(names)} float32 values ({record} bytes): the "
+            "file is cut short, or pass columns= (--columns) with the right number of values a point"
+        )
+    values = data.view("<f4").reshape(-1, len(names))
+    xyz = np.abs(values[:: max(1, len(values) // 4096), :3])
+    # Coordinates do not have such values. Most rows do if float64, big-endian or other bytes are read as float32.
+    with np.errstate(invalid="ignore"):  # comparing signalling NaN
+        absurd = ((xyz > 1e7) & (xyz < np.inf)) | ((xyz > 0.0) & (xyz < 1e-30))
+    if absurd.any(axis=1).mean() > 0.2:
+        raise PointsError(
+            "the values are not coordinates; expected little-endian float32 x, y, z, remission, not float64 or "
+            "another format"
+        )
+    return Columns(len(values), dict(zip(names, values.T, strict=True)), names)
+
+
+def _names(columns: int | Sequence[str] | None) -> tuple[str, ...]:
+    """The names of the columns; the first four of a number of them are x, y, z and remission."""
+    if columns is None:
+        return ()
+    if isinstance(columns, Sequence) and not isinstance(columns, str):
+        names = tuple(str(name).lower() for name in columns)
+        if not 3 <= len(names) <= 64 or len({*names}) < len(names):
+            raise PointsError(f"columns are 3 to 64 different names, among them x, y and z, got {list(columns)!r:.200}")
+        return names
+    if isinstance(columns, bool) or not isinstance(columns, int | np.integer) or not 3 <= columns <= 64:
+        raise PointsError(f"columns is the number of float32 values a point, 3 to 64, or their names, got {columns!r}")
+    return (*_KNOWN[: int(columns)], *(f"column {k}" for k in range(5, int(columns) + 1)))
+
+
+def _width(values: NDArray[np.float32], usual: int) -> int:
+    """How many values a point has: those at this distance are most alike, for they are of the same column.
+
+    usual : stays, where the values do not clearly say otherwise.
+    """
+    if len(values) < _FEWEST_POINTS * usual:
+        return usual
+    with np.errstate(all="ignore"):
+        differences = np.array([_difference(values, width) for width in _WIDTHS])
+    best = float(differences.min())
+    width = _WIDTHS[int(np.argmax(differences <= _ALIKE * best))]
+    return width if differences[usual - _WIDTHS[0]] > _UNLIKE * best else usual
+
+
+def _difference(values: NDArray[np.float32], distance: int) -> float:
+    """The mean relative difference, 0 to 1, between values at a distance."""
+    starts = np.linspace(0, max(0, len(values) - _BLOCK - distance), _BLOCKS).astype(np.int64)
+    total = n = 0.0
+    for start in np.unique(starts):
+        block = values[start : start + _BLOCK + distance].astype(np.float64)
+        one, other = block[:-distance], block[distance:]
+        difference = np.abs(one - other) / (np.abs(one) + np.abs(other) + 0.01)
+        known = np.isfinite(difference)
+        total, n = total + float(difference[known].sum()), n + np.count_nonzero(known)
+    return total / n if n else 1.0

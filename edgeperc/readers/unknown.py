@@ -1,0 +1,51 @@
+"""Formats that are not read: what a file is, and what to do with it."""
+
+from __future__ import annotations
+
+_ARCHIVE = "an archive; unpack it first"
+_FILM = "a film; edgeperc reads images (.jpg, .png), for a camera model"
+_IMAGE = "an image; pass it with a camera model: --model camseg"
+_TABLE = "read it with pandas, and pass the columns x, y, z and intensity as an array of shape (n, 4)"
+
+# First bytes, and what to say of them.
+_KNOWN = {
+    b"version https://git-lfs": "a pointer of Git LFS; the file itself is not there yet. Run: git lfs pull",
+    b"LASF": "a LAS or LAZ file; convert it, e.g.: pdal translate FILE scan.pcd, or read it with laspy",
+    b"ARROW1": f"a Feather (Arrow) table, as of Argoverse 2; {_TABLE}",
+    b"PAR1": f"a Parquet table; {_TABLE}",
+    b"ASTM-E57": "an E57 file; convert it with CloudCompare or pdal, to .pcd or .ply",
+    b"\x89HDF": f"an HDF5 file; {_TABLE.replace('pandas', 'h5py')}",
+    b"MATLAB": "a MATLAB file; save the points as .npy or .pcd",
+    b"\x80\x02": "a pickle, which is never unpickled; save the points as .npy",
+    b"\x80\x03": "a pickle, which is never unpickled; save the points as .npy",
+    b"\x80\x04": "a pickle, which is never unpickled; save the points as .npy",
+    b"\x80\x05": "a pickle, which is never unpickled; save the points as .npy",
+    b"DRACO": "a Draco file; decode it to .ply",
+    b"\x1f\x8b": _ARCHIVE,
+    b"BZh": _ARCHIVE,
+    b"\xfd7zXZ": _ARCHIVE,
+    b"7z\xbc\xaf": _ARCHIVE,
+    b"\x28\xb5\x2f\xfd": _ARCHIVE,
+    b"Rar!": _ARCHIVE,
+    b"\x1a\x45\xdf\xa3": _FILM,
+    b"RIFF": "a film or an image (RIFF); edgeperc reads .jpg and .png, for a camera model",
+    b"\x89PNG": _IMAGE,
+    b"\xff\xd8\xff": _IMAGE,
+    b"II*\0": "a TIFF image; convert it to .png, for a camera model",
+    b"MM\0*": "a TIFF image; convert it to .png, for a camera model",
+    b"%PDF": "a PDF document",
+    b"\x7fELF": "a program",
+}
+
+
+def advice_for(head: bytes) -> str | None:
+    """What a file of another format is, and what to do; None if its first bytes are not known."""
+    if head[4:8] == b"ftyp":
+        return _FILM
+    if head[257:262] == b"ustar":
+        return _ARCHIVE
+    if head[:256].lstrip().lower().startswith((b"<!doctype", b"<html", b"<?xml")):
+        return "a web page or XML; a download may have failed"
+    if head.lstrip()[:1] in (b"{", b"["):
+        return "JSON; save the points as .npy or .pcd"
+    return next((advice for first, advice in _KNOWN.items() if head.startswith(first)), None)

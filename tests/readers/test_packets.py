@@ -1,0 +1,105 @@
+"""Packet captures: where the network's headers end, and who sent what."""
+
+from __future__ import annotations
+
+import socket
+import struct
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+from test_captures import error_of, vlp16_packets, write_pcap
+from test_captures import ouster as ouster
+
+from edgeperc.readers.captures import read_scans, sensor_of
+from edgeperc.readers.packets import velodyne_senders
+
+# Headers in front of the IP header, by the link type.
+LINKS = {
+    1: bytes(12) + b"\x08\x00",
+    113: bytes(14) + b"\x08\x00",
+    276: b"\x08\x00" + bytes(18),
+    0: struct.pack("<I", 2),
+    108: struct.pack(">I", 2),
+    12: b"", 14: b"", 101: b"", 228: b"",
+}  # fmt: skip
+VLAN = bytes(12) + b"\x81\x00\x00\x05\x08\x00"
+
+
+def write_link(path: Path, link: int, payloads: Sequence[bytes], head: bytes | None = None, **sent: str) -> Path:
+    """UDP in IPv4 behind a link's header, 1 ms apart; by turns from each of several addresses."""
+    senders = [*sent.values()] or ["192.168.1.201"]
+    content = struct.pack("<IHHIIII", 0xA1B2C3D4, 2, 4, 0, 0, 65535, link)
+    for k, payload in enumerate(payloads):
+        for sender in senders:
+            udp = struct.pack(">HHHH", 2368, 2368, 8 + len(payload), 0) + payload
+            addresses = socket.inet_aton(sender) + b"\xff" * 4
+            ip = struct.pack(">BBHHHBBH", 0x45, 0, 20 + len(udp), k % 65536, 0, 64, 17, 0) + addresses + udp
+            frame = (LINKS[link] if head is None else head) + ip
+            content += struct.pack("<IIII", 1000 + k // 1000, 1000 * (k % 1000), len(frame), len(frame)) + frame
+    path.write_bytes(content)
+    return path
+
+
+@pytest.mark.parametrize(("link", "head"), [*LINKS.items(), (1, VLAN)])
+def test_a_velodyne_behind_any_link(tmp_path: Path, link: int, head: bytes) -> None:
+    pytest.importorskip("velodyne_decoder")
+    expected = list(read_scans(write_pcap(tmp_path / "ethernet.pcap", vlp16_packets(1.2))))
+    path = write_link(tmp_path / "link.pcap", link, vlp16_packets(1.2), head)
+    scans = list(read_scans(path))
+    assert len(scans) == len(expected) == 2
+    for (stamp, points), (other_stamp, other_points) in zip(scans, expected, strict=True):
+        assert stamp == other_stamp
+        np.testing.assert_array_equal(points, other_points)
+    sensor = sensor_of(path)
+    assert sensor is not None
+    assert sensor.name == "vlp-16"
+
+
+@pytest.mark.parametrize("link", [113, 276, 101])
+def test_an_ouster_behind_any_link(ouster: Path, tmp_path: Path, link: int) -> None:
+    content, at, records = (ouster / "sphere.pcap").read_bytes(), 24, b""
+    while at < len(content):
+        (length,) = struct.unpack_from("<I", content, at + 8)
+        packet = LINKS[link] + content[at + 30 : at + 16 + length]
+        records += content[at : at + 8] + struct.pack("<II", len(packet), len(packet)) + packet
+        at += 16 + length
+    path = tmp_path / "link.pcap"
+    path.write_bytes(content[:20] + struct.pack("<I", link) + records)
+    path.with_suffix(".json").write_text((ouster / "sphere.json").read_text())
+    scans, expected = list(read_scans(path)), list(read_scans(ouster / "sphere.pcap"))
+    assert len(scans) == len(expected)
+    for (_, points), (_, other_points) in zip(scans, expected, strict=True):
+        np.testing.assert_array_equal(points, other_points)
+
+
+@pytest.mark.parametrize("senders", [("10.0.0.1", "10.0.0.2"), ("10.0.0.9", "10.0.0.10", "192.168.1.201")])
+@pytest.mark.parametrize("link", [1, 113])
+def test_several_velodynes_are_told_apart(tmp_path: Path, link: int, senders: tuple[str, ...]) -> None:
+    pytest.importorskip("velodyne_decoder")
+    packets = vlp16_packets(1.2)
+    path = write_link(tmp_path / "two.pcap", link, packets, **{f"sender_{k}": s for k, s in enumerate(senders)})
+    assert velodyne_senders(path) == sorted(senders)
+    expected = [len(points) for _, points in read_scans(write_pcap(tmp_path / "one.pcap", packets))]
+    error = error_of(path)
+    assert f"expected one Velodyne, there are {', '.join(sorted(senders))}; choose one" in error
+    for sender in senders:
+        assert [len(points) for _, points in read_scans(path, topic=sender)] == expected
+    assert "no Velodyne '10.1.1.1'" in error_of(path, topic="10.1.1.1")
+
+
+@pytest.mark.parametrize(
+    ("payload", "name"),
+    [
+        (bytes.fromhex("55aa050a5aa550a0") + bytes(1240), "RoboSense"),  # MSOP of the RS-16 and RS-32
+        (bytes.fromhex("55aa055a") + bytes(1206), "RoboSense"),  # of the M1
+        (bytes(1380), "Livox"),
+        (b"\0" + struct.pack("<H", 1380) + bytes(1377), "Livox"),  # 96 points of 14 bytes behind 36
+        (b"\0" + struct.pack("<H", 804) + bytes(801), "Livox"),  # 96 points of 8 bytes
+    ],
+)
+def test_lidars_that_are_not_decoded_are_named(tmp_path: Path, payload: bytes, name: str) -> None:
+    error = error_of(write_pcap(tmp_path / "other.pcap", [payload] * 20))
+    assert f"a capture of a {name} sensor, which cannot be decoded" in error
+    assert f"Convert it with {name}'s driver" in error
