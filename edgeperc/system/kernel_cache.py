@@ -11,16 +11,13 @@ in `machine.cache_folder`. If none can be written, every start compiles again, a
 
 from __future__ import annotations
 
-import gc
 import hashlib
 import logging
 import os
 import pickle
 import stat
 import sys
-import threading
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -37,6 +34,7 @@ import numba.core.sigutils
 from ..errors import SettingsError
 from .atomic import write_atomic
 from .kernel_stamp import settings, stamp_of
+from .kernels import tell_watchers
 from .machine import cache_folder, unsafe_because
 
 logger = logging.getLogger(__name__)
@@ -45,19 +43,6 @@ _numba: Any = numba.core  # internals, which have no types
 FORMAT = 3  # of the files
 _DIGEST_BYTES = hashlib.sha256().digest_size
 _reported: set[str] = set()
-_collecting = threading.Lock()
-_rarely: list[tuple[int, int, int]] = []  # the thresholds before, once for each `fewer_collections` that is active
-RARE = 50_000  # objects; a collection takes 0.2 s once numba has built its tables
-
-
-watchers: list[Callable[[], None]] = []
-"""Called before a kernel is compiled, and when it was."""
-
-
-def tell_watchers() -> None:
-    """Call the `watchers`."""
-    for watcher in tuple(watchers):
-        watcher()
 
 
 def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
@@ -117,25 +102,6 @@ def are_kept(kernels: Iterable[Any]) -> bool:
 
 def _is_cached(kernel: Any) -> bool:
     return isinstance(getattr(kernel, "_cache", None), KernelCache)
-
-
-@contextmanager
-def fewer_collections() -> Iterator[None]:
-    """Let garbage be collected more rarely while kernels are compiled, which takes a seventh less time.
-
-    Afterwards the thresholds are those from before. Where collection is off, it stays off.
-    """
-    with _collecting:
-        _rarely.append(_rarely[0] if _rarely else gc.get_threshold())
-        if len(_rarely) == 1 and 0 < _rarely[0][0] < RARE:
-            gc.set_threshold(RARE, *_rarely[0][1:])
-    try:
-        yield
-    finally:
-        with _collecting:
-            before = _rarely.pop()
-            if not _rarely:
-                gc.set_threshold(*before)
 
 
 class KernelCache:

@@ -122,6 +122,9 @@ def _fields(code: CodeType) -> tuple[Any, ...]:
 def _value(value: Any, reader: FunctionType | None = None, called: list[Any] | None = None) -> Any:
     """A value as texts. A kernel joins those that are ``called``. Raises TypeError for what has no digest."""
     kind = type(value)
+    if called is not None and hasattr(value, "py_func"):  # by numba, or of a library
+        called.append(value)
+        return len(called)
     return repr(value) if kind in _PLAIN else (kind.__module__, kind.__qualname__, _content(value, reader, called))
 
 
@@ -153,7 +156,7 @@ def _content(value: Any, reader: FunctionType | None, called: list[Any] | None) 
         return str(value)
     module = str(getattr(value, "__module__", None))
     is_called = isinstance(value, FunctionType) and module.partition(".")[0] not in VERSIONED
-    if called is not None and (is_called or hasattr(value, "py_func")):
+    if called is not None and is_called:
         called.append(value)
         return len(called)
     if not (name := getattr(value, "__qualname__", getattr(value, "__name__", None))):

@@ -8,10 +8,13 @@ past its end. For everything else there is numba. A source checkout has no libra
 
 from __future__ import annotations
 
+import gc
 import json
 import logging
 import os
-from collections.abc import Callable, Mapping
+import threading
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from functools import cache, partial, update_wrapper
 from importlib import import_module
 from pathlib import Path
@@ -33,7 +36,20 @@ LEVELS: Mapping[str, tuple[str, ...]] = {
     "x86_64_v2": ("SSE42", "SSSE3", "POPCNT"),
     "aarch64": ("NEON", "ASIMD"),
 }
+_collecting = threading.Lock()
+_rarely: list[tuple[int, int, int]] = []  # the thresholds before, once for each `fewer_collections` that is active
+RARE = 50_000  # objects; a collection takes 0.2 s once numba has built its tables
 ALIGNED, WRITEABLE, BY_ROWS, BY_COLUMNS = 0x100, 0x400, 0x1, 0x2  # of ndarray.flags.num
+
+
+watchers: list[Callable[[], None]] = []
+"""Called before a kernel is compiled, and when it was."""
+
+
+def tell_watchers() -> None:
+    """Call the `watchers`."""
+    for watcher in tuple(watchers):
+        watcher()
 
 
 def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
@@ -65,6 +81,25 @@ def kind_of(value: object) -> object:
 def is_ahead() -> bool:
     """Whether kernels were compiled when the package was built."""
     return _library() is not None
+
+
+@contextmanager
+def fewer_collections() -> Iterator[None]:
+    """Let garbage be collected more rarely while kernels are compiled, which takes a seventh less time.
+
+    Afterwards the thresholds are those from before. Where collection is off, it stays off.
+    """
+    with _collecting:
+        _rarely.append(_rarely[0] if _rarely else gc.get_threshold())
+        if len(_rarely) == 1 and 0 < _rarely[0][0] < RARE:
+            gc.set_threshold(RARE, *_rarely[0][1:])
+    try:
+        yield
+    finally:
+        with _collecting:
+            before = _rarely.pop()
+            if not _rarely:
+                gc.set_threshold(*before)
 
 
 class Kernel:
@@ -134,11 +169,20 @@ def written(kind: Any) -> Any:
         return f"{kind.__module__}.{kind.__qualname__}"
     first, *rest = kind
     if isinstance(first, np.dtype):
-        return ["array", first.str if first.names is None else np.lib.format.dtype_to_descr(first), *rest]
+        return ["array", _written_dtype(first), *rest]
     (last,) = rest
     if isinstance(last, np.dtype):
-        return ["record", np.lib.format.dtype_to_descr(last)]
+        return ["record", _written_dtype(last)]
     return ["tuple", written(first), *map(written, last)]
+
+
+def _written_dtype(dtype: np.dtype[Any]) -> Any:
+    if dtype.names is None:
+        return dtype.str
+    fields = [dtype.fields[name] for name in dtype.names] if dtype.fields else []
+    formats, offsets = [_written_dtype(field[0]) for field in fields], [field[1] for field in fields]
+    layout = {"names": [*dtype.names], "formats": formats, "offsets": offsets, "itemsize": dtype.itemsize}
+    return layout | {"aligned": dtype.isalignedstruct}
 
 
 def _kind(document: Any) -> Any:
@@ -149,7 +193,7 @@ def _kind(document: Any) -> Any:
     what, first, *rest = document
     if what == "tuple":
         return _kind(first), tuple(map(_kind, rest))
-    dtype = np.dtype([tuple(field) for field in first] if isinstance(first, list) else first)
+    dtype = np.dtype(first)
     return (dtype, *rest) if what == "array" else (np.void, dtype)
 
 
