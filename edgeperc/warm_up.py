@@ -60,7 +60,8 @@ from .preprocess.remission import NO_REMISSION
 from .preprocess.returns import returns
 from .road.ahead import compile_kernels
 from .road.outline import merge_corners
-from .system.kernels import fewer_collections, is_ahead, tell_watchers
+from .system.compiling import fewer_collections, tell_watchers
+from .system.kernels import is_ahead
 from .system.lanes import Lanes, Stopwatch
 from .system.machine import usable_cores
 from .types.frame import ModelFrame

@@ -19,8 +19,8 @@ from importlib import import_module
 from types import MappingProxyType, TracebackType
 from typing import Any, TextIO
 
+from .compiling import watchers
 from .kernel_stamp import called_by
-from .kernels import watchers
 
 logger = logging.getLogger(__name__)
 

@@ -33,8 +33,8 @@ import numba.core.sigutils
 
 from ..errors import SettingsError
 from .atomic import write_atomic
+from .compiling import tell_watchers
 from .kernel_stamp import settings, stamp_of
-from .kernels import tell_watchers
 from .machine import cache_folder, unsafe_because
 
 logger = logging.getLogger(__name__)
@@ -57,7 +57,7 @@ def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
 
     def decorate(function: Callable[..., Any]) -> Any:
         # Kernels are never called from C: without that wrapper, they compile faster.
-        kernel = numba.njit(**{"no_cfunc_wrapper": True, "pipeline_class": _Compiler, **options})(function)
+        kernel = numba.njit(**{"no_cfunc_wrapper": True, "pipeline_class": Compiler, **options})(function)
         if (
             kept and function.__closure__ is None and hasattr(kernel, "_cache")
         ):  # with NUMBA_DISABLE_JIT, the kernel is the function itself
@@ -67,7 +67,7 @@ def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     return decorate
 
 
-class _Compiler(numba.core.compiler.CompilerBase):
+class Compiler(numba.core.compiler.CompilerBase):
     """numba's passes without those for what kernels do not have, which take a twentieth of the time.
 
     These are closures and comprehensions, and arithmetic with whole arrays.
@@ -124,7 +124,7 @@ class KernelCache:
     def _stamp(self, *, anew: bool = False) -> bytes | None:
         """Changes with everything that the machine code depends on; None, after a report, if that is not known."""
         try:
-            stamp = stamp_of(self._kernel, _Compiler.define_pipelines, anew=anew)
+            stamp = stamp_of(self._kernel, Compiler.define_pipelines, anew=anew)
         except Exception as exc:  # a value of a kind that is not known
             _report("unknown", "the compiled kernel %s is not kept: %s", self._name, exc)
             return None

@@ -8,13 +8,11 @@ past its end. For everything else there is numba. A source checkout has no libra
 
 from __future__ import annotations
 
-import gc
 import json
 import logging
 import os
-import threading
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
+from contextlib import suppress
 from functools import cache, partial, update_wrapper
 from importlib import import_module
 from pathlib import Path
@@ -36,20 +34,7 @@ LEVELS: Mapping[str, tuple[str, ...]] = {
     "x86_64_v2": ("SSE42", "SSSE3", "POPCNT"),
     "aarch64": ("NEON", "ASIMD"),
 }
-_collecting = threading.Lock()
-_rarely: list[tuple[int, int, int]] = []  # the thresholds before, once for each `fewer_collections` that is active
-RARE = 50_000  # objects; a collection takes 0.2 s once numba has built its tables
 ALIGNED, WRITEABLE, BY_ROWS, BY_COLUMNS = 0x100, 0x400, 0x1, 0x2  # of ndarray.flags.num
-
-
-watchers: list[Callable[[], None]] = []
-"""Called before a kernel is compiled, and when it was."""
-
-
-def tell_watchers() -> None:
-    """Call the `watchers`."""
-    for watcher in tuple(watchers):
-        watcher()
 
 
 def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
@@ -83,31 +68,16 @@ def is_ahead() -> bool:
     return _library() is not None
 
 
-@contextmanager
-def fewer_collections() -> Iterator[None]:
-    """Let garbage be collected more rarely while kernels are compiled, which takes a seventh less time.
-
-    Afterwards the thresholds are those from before. Where collection is off, it stays off.
-    """
-    with _collecting:
-        _rarely.append(_rarely[0] if _rarely else gc.get_threshold())
-        if len(_rarely) == 1 and 0 < _rarely[0][0] < RARE:
-            gc.set_threshold(RARE, *_rarely[0][1:])
-    try:
-        yield
-    finally:
-        with _collecting:
-            before = _rarely.pop()
-            if not _rarely:
-                gc.set_threshold(*before)
-
-
 class Kernel:
     """A kernel in a library, with what the package uses of numba's dispatchers.
 
     library : its functions by name, and what they were compiled from.
     options : of `njit`.
     """
+
+    __name__: str
+    __qualname__: str
+    __module__: str
 
     def __init__(self, library: Library, options: Mapping[str, Any], function: Callable[..., Any]) -> None:
         self.py_func, self.options = function, options
@@ -122,7 +92,8 @@ class Kernel:
         functions = self._functions
         if functions is None:
             functions = self._functions = self._library.functions_of(self)
-        return functions.get(tuple(map(kind_of, args)), self._compile)(*args)
+        form: Callable[..., Any] = functions.get(tuple(map(kind_of, args)), self._compile)
+        return form(*args)
 
     def __reduce__(self) -> Any:
         return getattr, (import_module(self.__module__), self.__name__)
@@ -160,7 +131,7 @@ class Library:
         entry = self._index.get(f"{kernel.__module__}.{kernel.__name__}")
         if entry is None or entry["code"] != code_of(kernel).hex():
             return {}
-        return {tuple(map(_kind, kinds)): getattr(self._module, name) for name, kinds in entry["forms"].items()}
+        return {tuple(map(read_kind, kinds)): getattr(self._module, name) for name, kinds in entry["forms"].items()}
 
 
 def written(kind: Any) -> Any:
@@ -177,6 +148,8 @@ def written(kind: Any) -> Any:
 
 
 def _written_dtype(dtype: np.dtype[Any]) -> Any:
+    if dtype.subdtype is not None:
+        return [_written_dtype(dtype.subdtype[0]), dtype.shape]
     if dtype.names is None:
         return dtype.str
     fields = [dtype.fields[name] for name in dtype.names] if dtype.fields else []
@@ -185,15 +158,25 @@ def _written_dtype(dtype: np.dtype[Any]) -> Any:
     return layout | {"aligned": dtype.isalignedstruct}
 
 
-def _kind(document: Any) -> Any:
+def _read_dtype(document: Any) -> np.dtype[Any]:
+    if isinstance(document, list):
+        base, shape = document
+        document = _read_dtype(base), tuple(shape)
+    elif isinstance(document, dict):
+        document = {**document, "formats": [*map(_read_dtype, document["formats"])]}
+    dtype: Any = np.dtype
+    return dtype(document)
+
+
+def read_kind(document: Any) -> Any:
     """What `written` wrote."""
     if isinstance(document, str):
         module, _, name = document.rpartition(".")
-        return getattr(import_module(module), name)
+        return type(None) if name == "NoneType" else getattr(import_module(module), name)
     what, first, *rest = document
     if what == "tuple":
-        return _kind(first), tuple(map(_kind, rest))
-    dtype = np.dtype(first)
+        return read_kind(first), tuple(map(read_kind, rest))
+    dtype = _read_dtype(first)
     return (dtype, *rest) if what == "array" else (np.void, dtype)
 
 
@@ -202,10 +185,11 @@ def _library() -> Library | None:
     """The library for this processor and Python; None if there is none."""
     if os.environ.get(SETTING) == "jit" or not FOLDER.is_dir():
         return None
-    try:
-        from numpy._core._multiarray_umath import __cpu_features__ as features
-    except ImportError:  # numpy 1
-        from numpy.core._multiarray_umath import __cpu_features__ as features
+    features: Mapping[str, bool] = {}
+    for umath in ("numpy._core._multiarray_umath", "numpy.core._multiarray_umath"):  # of numpy 2 and 1
+        with suppress(ImportError):
+            features = import_module(umath).__cpu_features__
+            break
     for level, needed in LEVELS.items():
         if all(features.get(name, False) for name in needed):
             try:
