@@ -17,7 +17,7 @@ from typing import Any
 import numba
 import pytest
 
-from edgeperc.system import compilation
+from edgeperc.system import compilation, compiling, kernel_cache
 from edgeperc.system.compilation import KERNELS, Compilation, kernels_of
 from edgeperc.system.compiling import tell_watchers
 from edgeperc.system.kernel_cache import KernelCache, missing
@@ -188,7 +188,7 @@ COUNT = """
 import json, sys
 from numba.core import event
 from edgeperc import Perceiver, perceiver, warm_up
-from edgeperc.system import compilation
+from edgeperc.system import compilation, compiling, kernel_cache
 
 warm_up.usable_cores = lambda: 1
 names, needed = set(), []
