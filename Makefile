@@ -28,7 +28,7 @@ SCANS ?= 20000
 # Of make test-extra.
 EXTRA ?= ros
 
-.PHONY: help demo test check test-full test-kernels test-wheel test-minimal test-lowest test-newest test-extra test-arm docs fuzz soak release sbom clean
+.PHONY: help demo test check test-full test-kernels test-wheel test-minimal test-lowest test-ahead test-newest test-extra test-arm docs fuzz soak release sbom clean
 
 help:
 	@echo "make demo          perceive the bundled scene: a table, and a picture in demo/"
@@ -39,6 +39,7 @@ help:
 	@echo "make test-wheel    build the wheel, run the demo from it outside the checkout"
 	@echo "make test-minimal  pytest with nothing but the runtime: no torch, no onnx, no matplotlib"
 	@echo "make test-lowest   pytest with the lowest versions that pyproject.toml allows"
+	@echo "make test-ahead    a wheel with compiled kernels, without numba; needs a C compiler"
 	@echo "make test-newest  kernels and their cache with the newest numba and numpy, above the bound in pyproject.toml"
 	@echo "make test-extra    pytest with EXTRA=ros alone, or another extra"
 	@echo "make test-arm      edgeperc on aarch64 under qemu, compared with x86; skipped without qemu"
@@ -84,6 +85,13 @@ test-minimal: .venv-minimal/installed
 # An old matplotlib uses what newer packages below it deprecate.
 test-lowest: .venv-lowest/installed
 	$(LOWEST)/pytest -W ignore::DeprecationWarning -n $(JOBS) --dist worksteal
+
+# A wheel with compiled kernels, in an environment without numba; and the tests of the kernels and of perceivers with them.
+test-ahead: .venv-test/installed
+	$(TEST)/python .ci/kernels
+	PYTHON=$(TEST)/python KERNELS=ahead tests/wheel_demo.sh
+	EDGEPERC_KERNELS=ahead $(TEST)/pytest -q -n $(JOBS) --dist worksteal -m kernel
+	EDGEPERC_KERNELS=ahead $(TEST)/pytest -q -n $(JOBS) --dist worksteal tests/test_perceiver.py tests/tracking tests/road
 
 # Green with a new numba: raise the bound.
 test-newest: pyproject.toml
@@ -150,5 +158,5 @@ define environment
 endef
 
 clean:
-	rm -rf .venv .venv-test .venv-minimal .venv-lowest .venv-newest .venv-extra build dist demo docs/_build docs/reference/generated *.egg-info .hypothesis .mypy_cache .pytest_cache .ruff_cache
+	rm -rf edgeperc/system/compiled .venv .venv-test .venv-minimal .venv-lowest .venv-newest .venv-extra build dist demo docs/_build docs/reference/generated *.egg-info .hypothesis .mypy_cache .pytest_cache .ruff_cache
 	find bench edgeperc export models tests -name __pycache__ -type d -exec rm -rf {} +

@@ -31,7 +31,6 @@ from pathlib import Path
 from types import MappingProxyType, TracebackType
 from typing import Any, NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -61,7 +60,8 @@ from .preprocess.remission import NO_REMISSION
 from .preprocess.returns import returns
 from .road.ahead import compile_kernels
 from .road.outline import merge_corners
-from .system.kernel_cache import KernelCache, fewer_collections, tell_watchers
+from .system.compiling import fewer_collections, tell_watchers
+from .system.kernels import is_ahead
 from .system.lanes import Lanes, Stopwatch
 from .system.machine import usable_cores
 from .types.frame import ModelFrame
@@ -132,7 +132,9 @@ class _RehearsedRange(RangeImageNetwork):
 def warm_up(
     pipeline: Pipeline, sensor: SensorProfile, fitness: Sequence[FitnessProfile], estimator: MountingEstimator
 ) -> None:
-    """Compile what a scan needs, and `edgeperc.road_ahead`."""
+    """Compile what a scan needs, and `edgeperc.road_ahead`, unless that was done when the package was built."""
+    if is_ahead():
+        return
     few_points = np.array([[10, 0, -1, 0], [20, 1, -1, 0], [0, 0, 0, 0]], np.float32)
     options, top, ranged = pipeline.options, pipeline.top, pipeline.ranged
     objects = copy(pipeline.objects)
@@ -361,8 +363,8 @@ def _shares(parts: Sequence[str]) -> list[list[str]]:
 
 def is_cold(kernel: Any) -> bool:
     """Whether compiling this kernel is of use: it is not in the cache, which can be written."""
-    cache = getattr(kernel, "_cache", None)
-    return isinstance(cache, KernelCache) and cache.is_missing()
+    is_missing = getattr(getattr(kernel, "_cache", None), "is_missing", None)
+    return is_missing is not None and bool(is_missing())
 
 
 def _interpreter() -> str | None:
@@ -380,6 +382,8 @@ def _start(parts: Sequence[str]) -> subprocess.Popen[bytes]:
     flags += [*(["-B"] if sys.dont_write_bytecode else []), *(["-E"] if sys.flags.ignore_environment else [])]
     paths = [path for path in sys.path if isinstance(path, str)]
     environment = dict(os.environ)
+    import numba
+
     config: Any = numba.config  # may have been set without the environment
     if config.CACHE_DIR:
         environment["NUMBA_CACHE_DIR"] = str(config.CACHE_DIR)

@@ -16,6 +16,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+os.environ.setdefault("EDGEPERC_KERNELS", "jit")  # the kernels of the sources, whatever was built of them
+
 import numba
 import pytest
 from hypothesis import HealthCheck, settings

@@ -25,11 +25,13 @@ PACKAGES = {
 FLOORS = {
     "edgeperc": """
         errors
-        system.__init__ system.atomic system.clock system.extras system.fields system.kernel_stamp system.lanes
+        system.__init__ system.atomic system.clock system.extras system.fields system.lanes
         system.names
         system.printable
         system.machine system.ray_cluster system.remote
+        system.compiling system.kernel_stamp
         system.kernel_cache
+        system.kernels
         system.compilation system.draws
         types.__init__ types.choices types.mounting types.onnx_file types.points types.views
         types.card types.sensor

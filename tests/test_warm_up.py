@@ -20,7 +20,7 @@ import numba
 import pytest
 
 from edgeperc import warm_up
-from edgeperc.system.kernel_cache import RARE, fewer_collections
+from edgeperc.system.compiling import RARE, fewer_collections
 from edgeperc.warm_up import PARTS, Helpers
 
 MOST_COMPILATIONS = 150

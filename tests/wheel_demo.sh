@@ -1,6 +1,7 @@
 #!/usr/bin/env bash
 # Build the wheel (through the sdist), look at what is in it, install it into an empty environment outside the
-# checkout and run the demo there. PYTHON is an interpreter that has `build`.
+# checkout and run the demo there. PYTHON is an interpreter that has `build`. With KERNELS=ahead the checkout has compiled
+# kernels (.ci/kernels), and the environment must have no numba.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 checkout=$PWD
@@ -9,7 +10,7 @@ python=$(command -v "${PYTHON:-python3}")
 away=$(cd "$(mktemp -d)" && pwd -P)
 trap 'rm -rf "$away"' EXIT
 
-"$python" -m build --outdir "$away/dist" . >"$away/build.log" 2>&1 || { cat "$away/build.log"; exit 1; }
+"$python" -m build ${KERNELS:+--wheel} --outdir "$away/dist" . >"$away/build.log" 2>&1 || { cat "$away/build.log"; exit 1; }
 "$python" - "$away"/dist/*.whl <<'END'
 import pathlib, sys, zipfile
 
@@ -28,6 +29,7 @@ END
 wheel=$(echo "$away"/dist/*.whl)
 "$away/venv/bin/pip" install --quiet "${wheel}[cpu,view]"
 "$away/venv/bin/pip" check
+if [[ ${KERNELS:-} ]] && "$away/venv/bin/pip" show --quiet numba; then echo "numba is installed"; exit 1; fi
 cd "$away"
 "$away/venv/bin/python" -c "import edgeperc; assert edgeperc.__file__.startswith('$away'), edgeperc.__file__"
 "$away/venv/bin/edgeperc" demo --out demo

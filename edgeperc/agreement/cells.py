@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..ground.scan import Scan
-from ..system.kernel_cache import njit
+from ..system.kernels import njit
 from ..types.geometry import cell_at, draw_footprints
 from ..types.perception import Box, PointLabels, TopView
 from ..types.points import Cloud, Labeled

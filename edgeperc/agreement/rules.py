@@ -25,7 +25,7 @@ from ..ground.scan import Scan
 from ..objects.cluster import MIN_PERSON_SHARE, PART_OF, find_clusters
 from ..objects.linkage import Strips
 from ..objects.persons import complete_persons
-from ..system.kernel_cache import njit
+from ..system.kernels import njit
 from ..types import choices
 from ..types.geometry import Grid, box_records, is_inside
 from ..types.mounting import MODEL_HEIGHT_M

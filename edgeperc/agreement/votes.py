@@ -12,7 +12,7 @@ from ..objects.cluster import MIN_OF_WHOLE, MIN_PERSON_SHARE, find_clusters
 from ..objects.persons import MAX_LENGTH_M as MAX_PERSON_M
 from ..objects.persons import MAX_RIDING_WIDTH_M, measure
 from ..objects.persons import MAX_TOP_M as MAX_PERSON_TOP_M
-from ..system.kernel_cache import njit
+from ..system.kernels import njit
 from ..types.geometry import Grid, cell_at
 from ..types.points import Cloud, Labeled
 

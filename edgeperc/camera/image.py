@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import CardMismatchError, ImageError, InferenceError
-from ..system.kernel_cache import njit
+from ..system.kernels import njit
 from ..types.card import CHANNELS, InputSpec
 from ..types.points import read_only
 from ..types.views import CameraGeometry

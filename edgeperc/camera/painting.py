@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from ..errors import CalibrationError, ImageError, OptionError, PointsError
 from ..ground.planes import fit_ground, heights_above
 from ..preprocess.returns import returns
-from ..system.kernel_cache import njit
+from ..system.kernels import njit
 from ..types.frame import ModelFrame
 from ..types.mounting import MODEL_HEIGHT_M, MODEL_MOUNTING, Mounting
 from ..types.perception import ImageLabels, Perception, TopView

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import TrackingError
-from ..system.kernel_cache import njit
+from ..system.kernels import njit
 from ..types.geometry import oriented_iou, shared_area
 
 N_RECALLS = 40

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import PointsError
-from ..system.kernel_cache import njit
+from ..system.kernels import njit
 from ..types.frame import ModelFrame
 from ..types.mounting import MODEL_MOUNTING, Mounting
 from ..types.points import read_only

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from ..errors import PointsError
 from ..system.draws import drawn_of, next_draw
-from ..system.kernel_cache import njit
+from ..system.kernels import njit
 from ..types.perception import GroundSurface
 from ..types.points import read_only
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import CardMismatchError, InferenceError
-from ..system.kernel_cache import njit
+from ..system.kernels import njit
 from ..types.card import N_DENSE_CHANNELS, N_FRONT_CHANNELS
 from ..types.geometry import suppress_overlaps
 from ..types.perception import Box

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..ground.observed import FARTHER
-from ..system.kernel_cache import njit
+from ..system.kernels import njit
 from ..types.perception import PointLabels
 from ..types.points import read_only
 from ..types.views import RangeImageGeometry, TopViewGeometry

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InferenceError
-from ..system.kernel_cache import njit
+from ..system.kernels import njit
 from ..types.card import ModelCard
 from ..types.geometry import draw_footprints
 from ..types.perception import Box

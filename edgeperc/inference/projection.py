@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from ..errors import CardError, PointsError
 from ..ground.planes import find_ground
-from ..system.kernel_cache import njit
+from ..system.kernels import njit
 from ..types.card import InputSpec
 from ..types.mounting import MODEL_HEIGHT_M
 from ..types.points import read_only

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import PointsError
-from ..system.kernel_cache import njit
+from ..system.kernels import njit
 from ..types.geometry import oriented_iou, rectangles, shared_area, suppress_overlaps
 from ..types.perception import Box
 from ..types.points import Cloud, Labeled, read_only

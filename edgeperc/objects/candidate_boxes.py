@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InferenceError
-from ..system.kernel_cache import njit
+from ..system.kernels import njit
 from ..types.card import ModelCard
 from ..types.geometry import oriented_iou, suppress_overlaps
 from ..types.perception import Box

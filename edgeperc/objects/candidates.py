@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ..errors import PointsError
 from ..ground.scan import Scan
-from ..system.kernel_cache import njit
+from ..system.kernels import njit
 from ..types.points import read_only
 
 CELL_M = 0.2

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..ground.scan import Scan
-from ..system.kernel_cache import njit
+from ..system.kernels import njit
 from .candidates import CELL_M, N_SIDE, REACH_M, Candidates, Cells
 
 FEATURES = (

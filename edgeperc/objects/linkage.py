@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..system.kernel_cache import njit
+from ..system.kernels import njit
 
 # A column's edge is slightly more than half the reach of its points. Points of one column are linked if their heights
 # differ by at most 0.7 of the reach: 2 * 0.50005^2 + 0.7^2 < 1.

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..system.kernel_cache import njit
+from ..system.kernels import njit
 from ..types.points import Cloud, Labeled
 from .cluster import MIN_OF_WHOLE, RIDES, Groups, fill_groups
 

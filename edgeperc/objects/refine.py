@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from ..errors import PointsError
 from ..system.draws import drawn_of, next_draw
-from ..system.kernel_cache import njit
+from ..system.kernels import njit
 from ..types.points import read_only
 
 # Half of an object's diagonal seen from above, and a margin because the mean of the visible side is not its middle. On

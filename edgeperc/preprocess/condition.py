@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import PointsError, SensorError
-from ..system.kernel_cache import njit
+from ..system.kernels import njit
 from ..types.points import as_points, read_only
 from ..types.sensor import SensorProfile
 from .returns import returns

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ..errors import CardError, PointsError
 from ..system.fields import Fields
-from ..system.kernel_cache import njit
+from ..system.kernels import njit
 from ..types.points import read_only
 
 # About 6,000 points are enough. Steps are prime, so that they do not align with the rows of an organized scan.

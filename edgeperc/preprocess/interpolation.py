@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import PointsError
-from ..system.kernel_cache import njit
+from ..system.kernels import njit
 from ..types.mounting import MODEL_HEIGHT_M
 from ..types.sensor import SensorProfile
 from ..types.views import RangeImageGeometry

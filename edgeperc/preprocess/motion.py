@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import EdgepercError, OptionError, PointsError, SensorError, StampError, TrackingError
-from ..system.kernel_cache import njit
+from ..system.kernels import njit
 from ..types.frame import fill_moved
 from ..types.points import as_points, read_only
 from .returns import blank_too_near

@@ -11,7 +11,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from ..system.kernel_cache import njit
+from ..system.kernels import njit
 from ..types.perception import DroppedPoints
 from ..types.points import read_only
 from ..types.sensor import SensorProfile

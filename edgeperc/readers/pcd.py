@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import PointsError
-from ..system.kernel_cache import njit
+from ..system.kernels import njit
 from ..types.points import plain_name
 from .tables import (
     MAX_HEADER_BYTES,

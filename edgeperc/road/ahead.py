@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import OptionError, PointsError
-from ..system.kernel_cache import njit
+from ..system.kernels import njit
 from ..types.frame import ModelFrame
 from ..types.geometry import draw_footprints
 from ..types.perception import Box, TopView

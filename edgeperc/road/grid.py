@@ -16,7 +16,7 @@ from ..ground.observed import OVERHEAD_M, Observer
 from ..ground.planes import find_ground, heights_above
 from ..preprocess.returns import returns
 from ..system.atomic import write_atomic
-from ..system.kernel_cache import njit
+from ..system.kernels import njit
 from ..types.frame import ModelFrame, quaternion
 from ..types.geometry import draw_footprints
 from ..types.mounting import MODEL_HEIGHT_M, MODEL_MOUNTING, Mounting

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..system.kernel_cache import njit
+from ..system.kernels import njit
 
 # A primitive is a row of float64: kind, material, remission, density, center (3), rows of the matrix that maps an
 # offset from the center into the unit shape (9), taper of the front, rear and sides (3), object. Below 0, the last is a

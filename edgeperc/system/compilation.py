@@ -19,7 +19,7 @@ from importlib import import_module
 from types import MappingProxyType, TracebackType
 from typing import Any, TextIO
 
-from .kernel_cache import are_kept, missing, watchers
+from .compiling import watchers
 from .kernel_stamp import called_by
 
 logger = logging.getLogger(__name__)
@@ -92,6 +92,8 @@ class Compilation:
     def __exit__(self, kind: type[BaseException] | None, exc: BaseException | None, at: TracebackType | None) -> None:
         watchers.remove(self.update)
         if kind is None and self._width:
+            from .kernel_cache import are_kept
+
             later = "; later starts load them" if are_kept(self._kernels()) else ""
             self._write(f"compiled {self._n} functions in {math.ceil(time.monotonic() - self._began_s)} s{later}")
         if self._width and self._terminal is not None:
@@ -103,6 +105,8 @@ class Compilation:
         if self._left is None:
             self._begin()
         elif self._terminal is not None:
+            from .kernel_cache import missing
+
             self._left = missing(self._left)
             done, passed_s = self._n - len(self._left), time.monotonic() - self._began_s
             left_s = len(self._left) * (PRIOR * self._each_s + passed_s) / (PRIOR + done)
@@ -110,6 +114,8 @@ class Compilation:
             self._write(f"{self._what} [{'#' * filled:-<{BAR}}] {math.ceil(left_s)} s left")
 
     def _begin(self) -> None:
+        from .kernel_cache import are_kept, missing
+
         kernels = [*self._kernels()]
         self._left, self._began_s = missing(kernels), time.monotonic()
         self._n = len(self._left)

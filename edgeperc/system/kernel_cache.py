@@ -11,16 +11,13 @@ in `machine.cache_folder`. If none can be written, every start compiles again, a
 
 from __future__ import annotations
 
-import gc
 import hashlib
 import logging
 import os
 import pickle
 import stat
 import sys
-import threading
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -36,6 +33,7 @@ import numba.core.sigutils
 
 from ..errors import SettingsError
 from .atomic import write_atomic
+from .compiling import tell_watchers
 from .kernel_stamp import settings, stamp_of
 from .machine import cache_folder, unsafe_because
 
@@ -45,19 +43,6 @@ _numba: Any = numba.core  # internals, which have no types
 FORMAT = 3  # of the files
 _DIGEST_BYTES = hashlib.sha256().digest_size
 reported: set[str] = set()
-_collecting = threading.Lock()
-_rarely: list[tuple[int, int, int]] = []  # the thresholds before, once for each `fewer_collections` that is active
-RARE = 50_000  # objects; a collection takes 0.2 s once numba has built its tables
-
-
-watchers: list[Callable[[], None]] = []
-"""Called before a kernel is compiled, and when it was."""
-
-
-def tell_watchers() -> None:
-    """Call the `watchers`."""
-    for watcher in tuple(watchers):
-        watcher()
 
 
 def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
@@ -72,7 +57,7 @@ def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
 
     def decorate(function: Callable[..., Any]) -> Any:
         # Kernels are never called from C: without that wrapper, they compile faster.
-        kernel = numba.njit(**{"no_cfunc_wrapper": True, "pipeline_class": _Compiler, **options})(function)
+        kernel = numba.njit(**{"no_cfunc_wrapper": True, "pipeline_class": Compiler, **options})(function)
         if (
             kept and function.__closure__ is None and hasattr(kernel, "_cache")
         ):  # with NUMBA_DISABLE_JIT, the kernel is the function itself
@@ -82,7 +67,7 @@ def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     return decorate
 
 
-class _Compiler(numba.core.compiler.CompilerBase):
+class Compiler(numba.core.compiler.CompilerBase):
     """numba's passes without those for what kernels do not have, which take a twentieth of the time.
 
     These are closures and comprehensions, and arithmetic with whole arrays.
@@ -119,25 +104,6 @@ def _is_cached(kernel: Any) -> bool:
     return isinstance(getattr(kernel, "_cache", None), KernelCache)
 
 
-@contextmanager
-def fewer_collections() -> Iterator[None]:
-    """Let garbage be collected more rarely while kernels are compiled, which takes a seventh less time.
-
-    Afterwards the thresholds are those from before. Where collection is off, it stays off.
-    """
-    with _collecting:
-        _rarely.append(_rarely[0] if _rarely else gc.get_threshold())
-        if len(_rarely) == 1 and 0 < _rarely[0][0] < RARE:
-            gc.set_threshold(RARE, *_rarely[0][1:])
-    try:
-        yield
-    finally:
-        with _collecting:
-            before = _rarely.pop()
-            if not _rarely:
-                gc.set_threshold(*before)
-
-
 class KernelCache:
     """The compiled forms of one kernel on disk, in place of `numba.core.caching.FunctionCache`.
 
@@ -158,7 +124,7 @@ class KernelCache:
     def stamp(self, *, anew: bool = False) -> bytes | None:
         """Changes with everything that the machine code depends on; None, after a report, if that is not known."""
         try:
-            stamp = stamp_of(self._kernel, _Compiler.define_pipelines, anew=anew)
+            stamp = stamp_of(self._kernel, Compiler.define_pipelines, anew=anew)
         except Exception as exc:  # a value of a kind that is not known
             _report("unknown", "the compiled kernel %s is not kept: %s", self.name, exc)
             return None

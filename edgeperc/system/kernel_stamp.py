@@ -12,18 +12,17 @@ import enum
 import hashlib
 import sys
 from collections.abc import Iterable, Iterator, Mapping
+from functools import cache
+from importlib.metadata import version
 from types import CodeType, FunctionType, ModuleType
 from typing import Any, NamedTuple
 
-import llvmlite
-import numba
-import numba.core.config
 import numpy as np
 
-VERSIONS = f"{numba.__version__} {llvmlite.__version__} {np.__version__} {sys.version}"
 # Of numba, which the environment sets, for example NUMBA_BOUNDSCHECK.
 SETTINGS = ("BOUNDSCHECK", "DEBUGINFO_DEFAULT", "LOOP_VECTORIZE", "OPT", "SLP_VECTORIZE", "USING_SVML")
 VERSIONED = {*sys.stdlib_module_names, "llvmlite", "numba", "numpy"}
+_WITHOUT_EFFECT = ("nopython", "no_cfunc_wrapper", "pipeline_class")  # on the machine code
 _PLAIN = {bool, int, float, complex, str, bytes, type(None), type(...)}
 
 
@@ -37,6 +36,17 @@ class _Described(NamedTuple):
 _described: dict[Any, _Described] = {}
 
 
+@cache
+def versions() -> str:
+    """What compiles."""
+    return f"{version('numba')} {version('llvmlite')} {np.__version__} {sys.version}"
+
+
+def code_of(kernel: Any) -> bytes:
+    """Digest of the code of a kernel, of those that it calls, and of the values that they read; 32 bytes."""
+    return _digest(kernel, [], anew=False)
+
+
 def stamp_of(kernel: Any, passes: Any = None, *, anew: bool = False) -> bytes:
     """Digest of all that the machine code of a kernel depends on, except types, processor and `settings`.
 
@@ -46,8 +56,11 @@ def stamp_of(kernel: Any, passes: Any = None, *, anew: bool = False) -> bytes:
     Returns: 32 bytes, the same in every process.
     Raises TypeError.
     """
+    return _digest(kernel, [versions(), "" if passes is None else repr(_fields(passes.__code__))], anew)
+
+
+def _digest(kernel: Any, texts: list[str], anew: bool) -> bytes:
     kernels = [kernel]  # and those that are called, in the order in which they are met
-    texts = [VERSIONS, "" if passes is None else repr(_fields(passes.__code__))]
     for each in kernels:
         digest, called = (
             _describe(each) if anew else _described.get(each) or _described.setdefault(each, _describe(each))
@@ -64,6 +77,8 @@ def called_by(kernel: Any) -> tuple[Any, ...]:
 
 def settings() -> tuple[str, ...]:
     """The settings of numba that change the machine code of every kernel."""
+    import numba.core.config
+
     config: Any = numba.core.config
     return tuple(f"{name}={getattr(config, name, None) or 0}" for name in SETTINGS)
 
@@ -77,8 +92,10 @@ def _describe(kernel: Any) -> _Described:
             values.append((name, _value(value, function, called)))
         except TypeError as exc:
             raise TypeError(f"{function.__qualname__} reads {name}, {exc}") from None
-    options = getattr(kernel, "targetoptions", None), function.__defaults__, function.__kwdefaults__
-    text = repr((_fields(function.__code__), options, values)).encode("utf-8", "surrogatepass")
+    given = getattr(kernel, "targetoptions", {}).items()
+    options = sorted((name, value) for name, value in given if value is not None and name not in _WITHOUT_EFFECT)
+    defaults = function.__defaults__, function.__kwdefaults__
+    text = repr((_fields(function.__code__), options, defaults, values)).encode("utf-8", "surrogatepass")
     return _Described(hashlib.sha256(text).hexdigest(), tuple(called))
 
 
@@ -105,13 +122,21 @@ def _fields(code: CodeType) -> tuple[Any, ...]:
 def _value(value: Any, reader: FunctionType | None = None, called: list[Any] | None = None) -> Any:
     """A value as texts. A kernel joins those that are ``called``. Raises TypeError for what has no digest."""
     kind = type(value)
+    if called is not None and hasattr(value, "py_func"):  # by numba, or of a library
+        called.append(value)
+        return len(called)
     return repr(value) if kind in _PLAIN else (kind.__module__, kind.__qualname__, _content(value, reader, called))
+
+
+def _is_type_of_numba(kind: type) -> bool:
+    return any((base.__module__, base.__name__) == ("numba.core.types.abstract", "Type") for base in kind.__mro__)
 
 
 def _content(value: Any, reader: FunctionType | None, called: list[Any] | None) -> Any:
     def each_of(values: Iterable[Any]) -> list[Any]:
         return [_value(each, reader, called) for each in values]
 
+    kind = type(value)
     if isinstance(value, ModuleType):  # whose attributes may be read
         if reader is None or value.__name__.partition(".")[0] in VERSIONED:
             return value.__name__
@@ -127,11 +152,11 @@ def _content(value: Any, reader: FunctionType | None, called: list[Any] | None) 
         return each_of(value.items())
     if isinstance(value, enum.EnumMeta):
         return each_of((name, member.value) for name, member in dict[str, Any](value.__members__).items())
-    if isinstance(value, enum.Enum | np.dtype | numba.types.Type):
+    if isinstance(value, enum.Enum | np.dtype) or _is_type_of_numba(kind):
         return str(value)
     module = str(getattr(value, "__module__", None))
     is_called = isinstance(value, FunctionType) and module.partition(".")[0] not in VERSIONED
-    if called is not None and (is_called or hasattr(value, "py_func")):
+    if called is not None and is_called:
         called.append(value)
         return len(called)
     if not (name := getattr(value, "__qualname__", getattr(value, "__name__", None))):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ..system.kernel_cache import njit
+from ..system.kernels import njit
 
 
 @njit(cache=True, nogil=True)

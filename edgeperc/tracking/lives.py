@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from ..system.kernel_cache import njit
+from ..system.kernels import njit
 from .jpda import Detections
 
 # Complete state of a track. The tracker replaces it as a whole, so a scan that raises an error changes nothing.

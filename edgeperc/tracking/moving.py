@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import OptionError, PointsError
-from ..system.kernel_cache import njit
+from ..system.kernels import njit
 from ..types.perception import Box, Perception
 from ..types.points import as_points, read_only
 from . import Track

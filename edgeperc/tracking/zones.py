@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..errors import OptionError, PointsError
 from ..system.clock import elapsed_s
-from ..system.kernel_cache import njit
+from ..system.kernels import njit
 from ..types.perception import Box
 from ..types.points import read_only
 from . import Track, Tracks

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import PointsError
-from ..system.kernel_cache import njit
+from ..system.kernels import njit
 from .perception import Box
 from .points import read_only
 from .views import TopViewGeometry

@@ -13,9 +13,10 @@ from typing import Any
 import numba
 import pytest
 
-from edgeperc.system import compilation, kernel_cache
+from edgeperc.system import compilation, compiling, kernel_cache
 from edgeperc.system.compilation import KERNELS, Compilation, kernels_of
-from edgeperc.system.kernel_cache import KernelCache, missing, tell_watchers
+from edgeperc.system.compiling import tell_watchers
+from edgeperc.system.kernel_cache import KernelCache, missing
 from scenes import Terminal
 
 pytestmark = pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason="nothing is compiled with the JIT off")
@@ -44,13 +45,13 @@ class Kernel:
 def kernels(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[Any]]:
     """Eighty that are missing; remove one, and it is compiled."""
     left: list[Any] = [Kernel(k) for k in range(80)]
-    monkeypatch.setattr(compilation, "missing", lambda wanted: [each for each in wanted if each in left])
-    monkeypatch.setattr(compilation, "are_kept", lambda _: True)
+    monkeypatch.setattr(kernel_cache, "missing", lambda wanted: [each for each in wanted if each in left])
+    monkeypatch.setattr(kernel_cache, "are_kept", lambda _: True)
     monkeypatch.setattr(compilation.logger, "hasHandlers", lambda: False)  # but those of pytest
     # The module's own, because pytest puts its capture into sys.stderr before each test.
     monkeypatch.setattr(compilation, "sys", SimpleNamespace(stderr=Terminal()))
     yield left
-    assert kernel_cache.watchers == []
+    assert compiling.watchers == []
 
 
 def lines() -> list[str]:
@@ -93,7 +94,7 @@ def test_nothing_is_counted_while_nothing_is_compiled(kernels: list[Any]) -> Non
 
 
 def test_what_is_not_kept_is_not_compiled_once(kernels: list[Any], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(compilation, "are_kept", lambda _: False)
+    monkeypatch.setattr(kernel_cache, "are_kept", lambda _: False)
     every = list(kernels)
     with Compilation(lambda: every):
         tell_watchers()

@@ -1,0 +1,30 @@
+"""What users do, so that `.ci/kernels` knows which kernels Python calls and for which types."""
+
+from __future__ import annotations
+
+import itertools
+import tempfile
+
+import numpy as np
+
+import edgeperc
+from edgeperc.cli import main
+from edgeperc.simulation.samples import simulated_scan
+
+SET_UPS = ({}, {"full_turn": True}, {"models": "lodnn"}, {"boxes_from": "clusters"}, {"agree": False, "precision": "fp32"})
+
+
+def run() -> None:
+    """Perceive, track and map simulated scans in every usual set-up, and run the demo."""
+    with tempfile.TemporaryDirectory() as folder:
+        main(["demo", "--out", folder])
+    for name, set_up in itertools.product(("hdl-64e", "vlp-16"), SET_UPS):
+        perceive, tracker = edgeperc.Perceiver(sensor=name, on_mismatch="ignore", **set_up), edgeperc.Tracker()
+        scans = [simulated_scan(seed, name).points for seed in (1, 2)]
+        for k, points in enumerate((*scans, *scans, np.zeros((0, 4), np.float32))):
+            given = points * np.float32([1, 1, 1, 255]) if name == "vlp-16" else points
+            perception = perceive(given)
+            tracker.update(perception.boxes, 0.1 * k)
+            edgeperc.occupancy_grid(perception, given, sensor=name)
+            if perception.top_view is not None:
+                edgeperc.road_ahead(perception.top_view, perception.boxes)

@@ -1,0 +1,1 @@
+"""Kernels that were compiled when this package was built."""
