@@ -249,14 +249,14 @@ class Part(NamedTuple):
 
 PARTS: Mapping[str, Part] = MappingProxyType(
     {
-        "clusters": Part(_compile_clusters, fill_clusters, 3.0),
-        "boxes": Part(_compile_boxes, fill_rectangle, 3.1),
+        "clusters": Part(_compile_clusters, fill_clusters, 3.7),
+        "boxes": Part(_compile_boxes, fill_rectangle, 2.7),
         "agreement": Part(_compile_agreement, clear_columns, 2.9),
-        "road": Part(compile_kernels, merge_corners, 2.2),
-        "ground": Part(_compile_ground, fill_planes, 2.0),
+        "road": Part(compile_kernels, merge_corners, 2.0),
+        "ground": Part(_compile_ground, fill_planes, 2.2),
     }
 )
-OTHERS_S = 8.3  # what the other kernels of a perceiver take
+OTHERS_S = 6.5  # what the other kernels of a perceiver take
 MAX_HELPERS = 3
 
 

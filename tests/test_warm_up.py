@@ -23,7 +23,7 @@ from edgeperc import warm_up
 from edgeperc.system.compiling import RARE, fewer_collections
 from edgeperc.warm_up import PARTS, Helpers
 
-MOST_COMPILATIONS = 150
+MOST_COMPILATIONS = 185
 
 pytestmark = pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason="nothing is compiled with the JIT off")
 

@@ -214,7 +214,7 @@ def labels_of_groups(
 def group_points(clusters: NDArray[np.int32]) -> Groups:
     """Points by cluster, (n,); -1 for none."""
     groups = Groups(np.empty(len(clusters), np.int32), np.empty(int(clusters.max(initial=-1)) + 2, np.int64))
-    fill_groups(read_only(clusters, np.int32), groups)
+    fill_groups(np.require(clusters, np.int32, ["C", "W"]), groups)  # writable, as where kernels call it
     return Groups(groups.order[: groups.starts[-1]], groups.starts)
 
 

@@ -212,7 +212,7 @@ def strips_a_row(level: np.void) -> int:
 @njit(cache=True, nogil=True)
 def strip_of(points: NDArray[np.float32], i: int, levels: NDArray[np.void]) -> int:
     """The strip of columns that holds a point."""
-    level = levels[level_of(points, i, levels)]
+    level = levels[level_of(points, np.int64(i), levels)]
     row = int((np.float64(points[i, 0]) - level["x"]) * level["columns_per_m"])
     col = int((np.float64(points[i, 1]) - level["y"]) * level["columns_per_m"])
     return int(level["first_strip"] + row * strips_a_row(level) + col // STRIP)
@@ -270,7 +270,7 @@ def fill_clusters(
             open_strip(strips, votes, search, strip)
         if search.owner[search.run_of[seed]] != FREE:
             continue
-        n_queued, is_dropped = grow(strips, votes, search, np.int64(search.run_of[seed]), n_clusters)
+        n_queued, is_dropped = grow(strips, votes, search, np.int64(search.run_of[seed]), np.int64(n_clusters))
         size = assign(search, n_queued, DROPPED if is_dropped else n_clusters, clusters)
         if not is_dropped:
             is_kept[n_clusters] = size >= min_points

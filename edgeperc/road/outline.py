@@ -446,7 +446,7 @@ def merge_corners(
                         and may_change(pr, pc, cr, cc, dr, dc, fixed)
                     ):
                         continue
-                    if is_apart(ring[:n], edges, k, pr, pc):
+                    if is_apart(ring[:n], edges, np.int64(k), pr, pc):
                         least, best_r, best_c = area, pr, pc
             if best_r < 0:
                 tried[k] = limit
