@@ -34,7 +34,7 @@ from .types.card import ModelCard
 from .types.frame import ModelFrame
 from .types.mounting import Mounting
 from .types.perception import ImageLabels, Perception
-from .types.points import as_points
+from .types.points import Points, as_points
 from .types.sensor import SensorProfile, get_sensor
 from .types.views import CameraGeometry, ObjectGeometry, RangeImageGeometry, TopViewGeometry
 from .warm_up import Rehearsed, n_processes, warm_up
@@ -498,7 +498,7 @@ class Perceiver:
         """The perception of no scan."""
         return Perception(0, 0, None, None, (), MappingProxyType(watch.ms), self.providers, (), stamp_s)
 
-    def _perceive(self, scan: NDArray[np.float32], stamp_s: float | None, watch: Stopwatch, check: bool) -> Perception:
+    def _perceive(self, scan: Points, stamp_s: float | None, watch: Stopwatch, check: bool) -> Perception:
         given, before, matcher, profile = scan, self._estimator, self._remission, self.sensor
         hidden: tuple[Finding, ...] = ()
         turned: tuple[Finding, ...] = ()

@@ -32,6 +32,7 @@ from .types.frame import turned
 from .types.geometry import oriented_iou, rectangles, shared_area
 from .types.mounting import MODEL_HEIGHT_M, Mounting
 from .types.perception import Box, GroundSurface, PointLabels, TopView
+from .types.points import Heights, Ids, Points, Rows
 from .types.sensor import SensorProfile
 from .types.views import ObjectGeometry, RangeImageGeometry, TopViewGeometry
 
@@ -67,8 +68,8 @@ class Options:
 class View(NamedTuple):
     """The points of a scan that a view needs, (n, 4), and their rows in the scan; None for all."""
 
-    points: NDArray[np.float32]
-    rows: NDArray[np.int32] | None
+    points: Points
+    rows: Rows | None
 
 
 class TopViewNetwork:
@@ -123,7 +124,7 @@ class RangeImageNetwork:
         """The same with buffers of its own, for another thread."""
         return RangeImageNetwork(self.session.second(), self.interpolator)
 
-    def label(self, points: NDArray[np.float32], height_m: NDArray[np.float32] | None, watch: Stopwatch) -> PointLabels:
+    def label(self, points: Points, height_m: Heights | None, watch: Stopwatch) -> PointLabels:
         """Project points, run the network, decode pixels, remove outliers and label the points (PointSeg 3.1, 3.4)."""
         pixel = np.empty(len(points), np.int32)
         self.projector.fill(points, self.session.input, self.index, pixel, height_m)
@@ -209,7 +210,7 @@ class Pipeline:
         views = [network.view for network in (top, *ranged[:1]) if network is not None]
         self.crop = Crop([] if options.full_turn or interpolates else views)
 
-    def __call__(self, points: NDArray[np.float32], mounting: Mounting, watch: Stopwatch) -> Parts:
+    def __call__(self, points: Points, mounting: Mounting, watch: Stopwatch) -> Parts:
         """Perceive points in the frame of the models, (n, 4) float32, read-only, finite or NaN."""
         top, options, rules = self.top, self.options, self.options.rules
 
@@ -286,7 +287,7 @@ class Pipeline:
         whole = None if labeled is None else spread([(labeled, near().rows)], len(points))
         return Parts(whole, view(), standing(), surface())
 
-    def _select(self, points: NDArray[np.float32]) -> View:
+    def _select(self, points: Points) -> View:
         return View(*self.crop.select(points))
 
     def _label_ahead(self, near: View, scan: Scan | None, watch: Stopwatch) -> PointLabels:
@@ -359,7 +360,7 @@ def _joined(near: View, *sectors: tuple[PointLabels, NDArray[np.int32] | None]) 
 
 
 def _objects(
-    scan: Scan, labels: PointLabels, clusters: NDArray[np.int32] | None, boxes: Sequence[Box], options: Options
+    scan: Scan, labels: PointLabels, clusters: Ids | None, boxes: Sequence[Box], options: Options
 ) -> tuple[Box, ...]:
     """Boxes around clusters of points above the ground.
 
@@ -379,7 +380,7 @@ def _objects(
     )
 
 
-def _people(scan: Scan, labels: PointLabels, clusters: NDArray[np.int32] | None, options: Options) -> tuple[Box, ...]:
+def _people(scan: Scan, labels: PointLabels, clusters: Ids | None, options: Options) -> tuple[Box, ...]:
     """Boxes around points that are labeled as people."""
     is_person = np.array([name in PERSONS for name in labels.classes], np.bool_)
     people = replace(labels, labels=np.where(is_person[labels.labels], labels.labels, np.uint8(0)))

@@ -68,7 +68,7 @@ from .types.frame import ModelFrame
 from .types.geometry import suppress_overlaps
 from .types.mounting import MODEL_HEIGHT_M, MODEL_MOUNTING, Mounting
 from .types.perception import Box, PointLabels, TopView
-from .types.points import read_only
+from .types.points import Heights, Points, read_only
 from .types.sensor import SensorProfile
 
 logger = logging.getLogger(__name__)
@@ -125,7 +125,7 @@ class _RehearsedRange(RangeImageNetwork):
     def __init__(self, network: RangeImageNetwork) -> None:
         vars(self).update(vars(network))
 
-    def label(self, points: NDArray[np.float32], height_m: NDArray[np.float32] | None, watch: Stopwatch) -> PointLabels:
+    def label(self, points: Points, height_m: Heights | None, watch: Stopwatch) -> PointLabels:
         return PointLabels(points[:, 3].astype(np.uint8), np.ones(len(points), np.bool_), self.card.classes)
 
 

@@ -12,7 +12,7 @@ from ..ground.scan import Scan
 from ..system.kernels import njit
 from ..types.geometry import cell_at, draw_footprints
 from ..types.perception import Box, PointLabels, TopView
-from ..types.points import Cloud, Labeled
+from ..types.points import Cloud, Labeled, Mask
 from .rules import RULES, cells_of, roles_of
 from .votes import VEHICLE, Cells
 
@@ -100,7 +100,7 @@ def _footprints(view: TopView, boxes: Sequence[Box]) -> NDArray[np.uint8]:
 @njit(cache=True, nogil=True)
 def fill_marks(
     cloud: Cloud,
-    in_view: NDArray[np.bool_],
+    in_view: Mask,
     labeled: Labeled,
     by_height: bool,
     view: Cells,

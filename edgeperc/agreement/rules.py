@@ -30,7 +30,7 @@ from ..types import choices
 from ..types.geometry import Grid, box_records, is_inside
 from ..types.mounting import MODEL_HEIGHT_M
 from ..types.perception import Box, PointLabels, TopView
-from ..types.points import Cloud, Labeled
+from ..types.points import Cloud, Heights, Ids, Labeled, Labels, Mask, Points
 from .votes import (
     CLUSTER,
     COMPLETING_SCORE,
@@ -146,7 +146,7 @@ def find_voters(
 def agree_on_points(
     scan: Scan,
     labels: PointLabels,
-    clusters: NDArray[np.int32],
+    clusters: Ids,
     support: Support,
     upright: NDArray[np.uint8],
     *,
@@ -333,7 +333,7 @@ def _verdicts(classes: Sequence[str], tallies: Tallies, rules: Collection[str]) 
 
 
 @njit(cache=True, nogil=True)
-def cell_of(points: NDArray[np.float32], i: int, n: int) -> tuple[int, int]:
+def cell_of(points: Points, i: int, n: int) -> tuple[int, int]:
     """Row and column of a point in a grid of n x n cells of `CELL_M` around the sensor; -1, -1 outside of it."""
     half = 0.5 * n * CELL_M
     x, y = np.float64(points[i, 0]) + half, np.float64(points[i, 1]) + half
@@ -343,9 +343,7 @@ def cell_of(points: NDArray[np.float32], i: int, n: int) -> tuple[int, int]:
 
 
 @njit(cache=True, nogil=True)
-def clear_columns(
-    points: NDArray[np.float32], height: NDArray[np.float32], limits: NDArray[np.float64], labels: NDArray[np.uint8]
-) -> None:
+def clear_columns(points: Points, height: Heights, limits: NDArray[np.float64], labels: Labels) -> None:
     """Make persons background whose column of points goes on above a limit.
 
     points : (n, 3 or more) float32, C-contiguous
@@ -399,9 +397,7 @@ def clear_columns(
 
 
 @njit(cache=True, nogil=True)
-def fill_support(
-    cloud: Cloud, among: NDArray[np.bool_], labeled: Labeled, boxes: NDArray[np.void], support: Support
-) -> None:
+def fill_support(cloud: Cloud, among: Mask, labeled: Labeled, boxes: NDArray[np.void], support: Support) -> None:
     """Find the best box around each point, among the boxes with enough vehicle points (`MIN_BOX_SHARE`).
 
     among : (n,) bool; points that may be in a box: those in view, above the ground.
@@ -457,11 +453,11 @@ def bounds_of(boxes: NDArray[np.void]) -> tuple[float, float, float, float]:
 
 @njit(cache=True, nogil=True)
 def clear_ground(
-    points: NDArray[np.float32],
-    height: NDArray[np.float32],
+    points: Points,
+    height: Heights,
     on_ground: NDArray[np.bool_],
     roles: NDArray[np.uint8],
-    labels: NDArray[np.uint8],
+    labels: Labels,
 ) -> None:
     """Make points on the ground background, except in cells in which an object of their kind stands.
 
@@ -503,7 +499,7 @@ def clear_ground(
 def count_inside(
     cloud: Cloud,
     on_ground: NDArray[np.bool_],
-    in_view: NDArray[np.bool_],
+    in_view: Mask,
     labeled: Labeled,
     boxes: NDArray[np.void],
     counts: NDArray[np.int64],
@@ -533,7 +529,7 @@ def count_inside(
 def sum_inside(
     cloud: Cloud,
     on_ground: NDArray[np.bool_],
-    in_view: NDArray[np.bool_],
+    in_view: Mask,
     labeled: Labeled,
     boxes: NDArray[np.void],
     sums: NDArray[np.float64],

@@ -14,7 +14,7 @@ from ..objects.persons import MAX_RIDING_WIDTH_M, measure
 from ..objects.persons import MAX_TOP_M as MAX_PERSON_TOP_M
 from ..system.kernels import njit
 from ..types.geometry import Grid, cell_at
-from ..types.points import Cloud, Labeled
+from ..types.points import Cloud, Ids, Labeled, Labels, Mask
 
 VEHICLE, PERSON = 1, 2  # roles of classes
 NO_CLUSTER = -1
@@ -89,7 +89,7 @@ class Cells(NamedTuple):
     grid : Grid
     """
 
-    labels: NDArray[np.uint8]
+    labels: Labels
     is_vehicle: NDArray[np.bool_]
     grid: Grid
 
@@ -104,7 +104,7 @@ class Applied(NamedTuple):
 
 @njit(cache=True, nogil=True)
 def fill_votes(
-    in_view: NDArray[np.bool_],
+    in_view: Mask,
     labeled: Labeled,
     scores: NDArray[np.float32],
     votes: NDArray[np.uint8],
@@ -130,9 +130,9 @@ def fill_votes(
 @njit(cache=True, nogil=True)
 def fill_tallies(
     cloud: Cloud,
-    in_view: NDArray[np.bool_],
-    labels: NDArray[np.uint8],
-    cluster_of: NDArray[np.int32],
+    in_view: Mask,
+    labels: Labels,
+    cluster_of: Ids,
     view: Cells,
     tallies: Tallies,
 ) -> None:
@@ -234,13 +234,13 @@ def fill_verdicts(
 
 @njit(cache=True, nogil=True)
 def apply_verdicts(
-    in_view: NDArray[np.bool_],
-    clusters: NDArray[np.int32],
+    in_view: Mask,
+    clusters: Ids,
     verdicts: NDArray[np.uint8],
     roles: NDArray[np.uint8],
     scores: NDArray[np.float32],
     names: NDArray[np.uint8],
-    labels: NDArray[np.uint8],
+    labels: Labels,
 ) -> None:
     """Replace each label in view by what its cluster and the box around it say.
 
@@ -277,7 +277,7 @@ def may_be_persons(tallies: Tallies, walks: int, rides: int) -> NDArray[np.bool_
 
 
 def find_persons_alone(
-    cloud: Cloud, roles: NDArray[np.uint8], before: NDArray[np.uint8], labels: NDArray[np.uint8]
+    cloud: Cloud, roles: NDArray[np.uint8], before: NDArray[np.uint8], labels: Labels
 ) -> list[NDArray[np.int32]]:
     """Find groups of points that are a person by themselves, though linked with something large.
 

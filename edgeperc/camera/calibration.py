@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..errors import CalibrationError, PointsError
 from ..system.kernels import njit
-from ..types.points import read_only
+from ..types.points import Points, read_only
 
 MAX_EDGE, MAX_PIXELS = 2**15, 2**26  # of an image, as in `edgeperc.camera.image`
 MAX_DISTANCE_M = 100.0  # between the sensors; more is probably a translation in millimeters
@@ -223,7 +223,7 @@ def _matrix(name: str, given: ArrayLike, n: int) -> NDArray[np.float64]:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def fill_projected(
-    points: NDArray[np.float32],
+    points: Points,
     P: NDArray[np.float64],
     u: NDArray[np.float64],
     v: NDArray[np.float64],

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..errors import CardMismatchError, ImageError, InferenceError
 from ..system.kernels import njit
 from ..types.card import CHANNELS, InputSpec
-from ..types.points import read_only
+from ..types.points import Labels, read_only
 from ..types.views import CameraGeometry
 
 MAX_PIXELS = 2**26  # 8192 x 8192: three times a photograph of 24 megapixels, 200 MB
@@ -250,7 +250,7 @@ def fill_image_labels(
     col_sides: NDArray[np.int32],
     col_weight: NDArray[np.float32],
     col_runs: NDArray[np.int32],
-    labels: NDArray[np.uint8],
+    labels: Labels,
 ) -> int:
     """Write every pixel's best class (`label_pixels`).
 

@@ -21,7 +21,7 @@ from ..system.kernels import njit
 from ..types.frame import ModelFrame
 from ..types.mounting import MODEL_HEIGHT_M, MODEL_MOUNTING, Mounting
 from ..types.perception import ImageLabels, Perception, TopView
-from ..types.points import read_only
+from ..types.points import Labels, Points, read_only
 from ..types.sensor import SensorProfile, get_sensor
 from ..types.views import TopViewGeometry
 from .calibration import Calibration
@@ -67,7 +67,7 @@ class DepthBuffer(NamedTuple):
 
 def paint(
     image: Perception | ImageLabels | NDArray[np.uint8],
-    points: NDArray[np.float32],
+    points: Points,
     calibration: Calibration,
     *,
     sensor: str | os.PathLike[str] | SensorProfile = "hdl-64e",
@@ -132,7 +132,7 @@ def paint(
 
 def camera_road(
     image: Perception | ImageLabels | NDArray[np.bool_],
-    points: NDArray[np.float32],
+    points: Points,
     calibration: Calibration,
     *,
     sensor: str | os.PathLike[str] | SensorProfile = "hdl-64e",
@@ -205,7 +205,7 @@ def _mounting_of(image: object, mounting: Mounting | None) -> Mounting:
 
 def _hidden_by(
     image: object,
-    points: NDArray[np.float32],
+    points: Points,
     calibration: Calibration,
     sensor: SensorProfile,
     mounting: Mounting | None,
@@ -269,7 +269,7 @@ def _road_of(image: Perception | ImageLabels | NDArray[np.bool_], calibration: C
     return np.where(labels == UNSEEN, np.uint8(UNSEEN), found.drivable.astype(np.uint8))
 
 
-def _nearest(points: NDArray[np.float32], calibration: Calibration, sensor: SensorProfile) -> DepthBuffer:
+def _nearest(points: Points, calibration: Calibration, sensor: SensorProfile) -> DepthBuffer:
     """The depth buffer of a scan."""
     elevations = np.radians(sensor.elevations_deg)
     step = 2.0 * math.pi / sensor.columns
@@ -289,7 +289,7 @@ def _nearest(points: NDArray[np.float32], calibration: Calibration, sensor: Sens
 
 
 @njit(cache=True, nogil=True)
-def fill_nearest(points: NDArray[np.float32], pixels: Pixels, windows: Windows, buffer: DepthBuffer) -> None:
+def fill_nearest(points: Points, pixels: Pixels, windows: Windows, buffer: DepthBuffer) -> None:
     """Write the depth of the nearest point whose window covers each cell into ``buffer.nearest``.
 
     points : (n, 3 or more) float32, C-contiguous
@@ -330,12 +330,12 @@ def fill_nearest(points: NDArray[np.float32], pixels: Pixels, windows: Windows, 
 
 @njit(cache=True, nogil=True)
 def fill_painted(
-    labels: NDArray[np.uint8],
+    labels: Labels,
     pixels: Pixels,
     buffer: DepthBuffer,
     slack_m: float,
     slack_share: float,
-    painted: NDArray[np.uint8],
+    painted: Labels,
 ) -> None:
     """Write the label of the pixel of each point that is not hidden, else `UNSEEN`.
 

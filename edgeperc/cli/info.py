@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from ..errors import EdgepercError, MissingExtraError, MountingError, PointsError
 from ..system.atomic import write_atomic
+from ..types.points import Points
 from .arguments import Commands, add_command, add_fields, add_mounting, add_sensor, add_topic, reading_options
 from .output import print_error, print_line, print_rows
 from .scans import scan_sensor
@@ -404,7 +405,7 @@ def _first_scans(path: Path, options: Mapping[str, Any]) -> tuple[list[NDArray[n
     return scans, ""
 
 
-def _extent_rows(points: NDArray[np.float32]) -> tuple[list[tuple[str, str]], dict[str, list[float]]]:
+def _extent_rows(points: Points) -> tuple[list[tuple[str, str]], dict[str, list[float]]]:
     """Extent, range, elevation and remission of the finite points; empty without any."""
     import numpy as np
 
@@ -466,7 +467,7 @@ def _mounting_rows(
 
 
 def _suiting_models(
-    scan: NDArray[np.float32], sensor: SensorProfile, unit: Sequence[str], reported: Sequence[str]
+    scan: Points, sensor: SensorProfile, unit: Sequence[str], reported: Sequence[str]
 ) -> tuple[list[tuple[str, str]], dict[str, list[str] | None]]:
     """For each model of scans, what speaks against it; None without a description of its training scans."""
     from ..preprocess.findings import check_fitness

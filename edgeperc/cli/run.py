@@ -16,6 +16,7 @@ from ..records import PerceivedScan, Sink
 from ..system.extras import require
 from ..system.remote import Remote, location
 from ..types.choices import CAMERA, DEFAULT_MODELS, DEFAULT_SENSOR
+from ..types.points import Points
 from .arguments import (
     Commands,
     add_adapt,
@@ -46,9 +47,6 @@ from .scans import (
 from .sinks import add_sinks, open_sinks, wanted_sinks
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
     from ..live import Answer
     from ..perceiver import Perceiver
     from ..tracking.tracks import Tracks
@@ -537,7 +535,7 @@ class _Run:
     def _answered(
         self,
         name: Path,
-        points: NDArray[np.float32],
+        points: Points,
         perception: Perception,
         sensor: SensorProfile,
         wanted: Mapping[str, Path],
@@ -604,7 +602,7 @@ def _files_of(target: Path, kinds: Sequence[str], *, of_image: bool, of_scan: bo
     return files
 
 
-def _write(points: NDArray[np.float32], perception: Perception, wanted: Mapping[str, Path], title: str) -> None:
+def _write(points: Points, perception: Perception, wanted: Mapping[str, Path], title: str) -> None:
     from .. import view
 
     if "png" in wanted:
@@ -617,7 +615,7 @@ def _write(points: NDArray[np.float32], perception: Perception, wanted: Mapping[
         view.write_ply(perception, points, wanted["ply"])
 
 
-def _under(points: NDArray[np.float32], perception: Perception) -> bytes:
+def _under(points: Points, perception: Perception) -> bytes:
     from ..view import flatten_scan
 
     return flatten_scan(points, perception)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from ..errors import PointsError
 from ..preprocess.motion import Motion, Trajectory, deskew
 from ..preprocess.returns import returns
+from ..types.points import Points
 
 if TYPE_CHECKING:
     from ..tracking.tracks import Tracks
@@ -34,7 +35,7 @@ class Straightener:
     def straighten(
         self,
         stamp_s: float | None,
-        points: NDArray[np.float32],
+        points: Points,
         times_s: NDArray[np.float64] | None,
         sensor: SensorProfile | None = None,
     ) -> NDArray[np.float32]:

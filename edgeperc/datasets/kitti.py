@@ -24,6 +24,7 @@ from ..simulation.scene import POINT_CLASS_OF
 from ..system.names import check_file
 from ..types.geometry import inside
 from ..types.perception import Box
+from ..types.points import Labels, Points
 from ..types.views import TopViewGeometry
 from .splits import TEST_DRIVES, in_split
 
@@ -157,7 +158,7 @@ class Frame:
     name: str
     drive: str
     grade: str
-    points: NDArray[np.float32]
+    points: Points
     boxes: tuple[Box, ...]
     unlabeled: NDArray[np.float64]
     calibration: KittiCalibration
@@ -220,7 +221,7 @@ def label_objects(labels: KittiLabels, calibration: KittiCalibration) -> tuple[t
     return boxes, labels.numbers[~is_object, 3:7]
 
 
-def scan_hash(points: NDArray[np.float32]) -> str:
+def scan_hash(points: Points) -> str:
     """Identify a scan in a model's card: the first 16 hexadecimal digits of the SHA-256 of its points."""
     return hashlib.sha256(points.tobytes()).hexdigest()[:16]
 
@@ -336,8 +337,8 @@ class RoadFrame:
 
     name: str
     drive: str
-    points: NDArray[np.float32]
-    labels: NDArray[np.uint8]
+    points: Points
+    labels: Labels
 
     def top_view(self, geometry: TopViewGeometry) -> NDArray[np.uint8]:
         """True class of each cell, (rows, columns) uint8: index into `ROAD_CLASSES`.

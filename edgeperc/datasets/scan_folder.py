@@ -35,6 +35,7 @@ from ..simulation.samples import IGNORE
 from ..simulation.scene import POINT_CLASSES
 from ..types.geometry import inside
 from ..types.perception import Box
+from ..types.points import Points
 from .annotations import read_datumaro, read_labelcloud, read_sustechpoints
 from .kitti import IMAGE_SIZE, SEQUENCE_DRIVES, KittiCalibration, KittiLabels, label_objects, read_labels
 from .layout import (
@@ -86,7 +87,7 @@ class ScanFrame:
     name: str
     drive: str
     layout: ScanLayout
-    points: NDArray[np.float32]
+    points: Points
     boxes: tuple[Box, ...] | None
     point_classes: NDArray[np.uint8] | None
     drivable: tuple[NDArray[np.float64], ...] | None

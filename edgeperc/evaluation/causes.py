@@ -15,6 +15,7 @@ from ..objects.cluster import find_clusters
 from ..simulation.scene import POINT_CLASS_OF, POINT_CLASSES
 from ..types.geometry import inside
 from ..types.perception import Box
+from ..types.points import Labels, Mask, Points
 from .metrics import object_key
 
 BUMPER = "car at the own bumper"
@@ -41,11 +42,11 @@ Counts = dict[tuple[str, ...], "Counter[Any]"]
 
 
 def count_causes(
-    points: NDArray[np.float32],
-    labels: NDArray[np.uint8],
+    points: Points,
+    labels: Labels,
     right: NDArray[np.uint8],
     known: NDArray[np.bool_],
-    in_view: NDArray[np.bool_],
+    in_view: Mask,
     boxes: Sequence[Box],
     drive: str,
 ) -> Counts:
@@ -98,7 +99,7 @@ def count_causes(
 class _Scan:
     """Where points lie: each method takes and returns a mask (n,) bool."""
 
-    def __init__(self, points: NDArray[np.float32], boxes: Sequence[Box]) -> None:
+    def __init__(self, points: Points, boxes: Sequence[Box]) -> None:
         self.points, self.boxes = points, boxes
 
     @cached_property
@@ -111,18 +112,18 @@ class _Scan:
         is_near: NDArray[np.bool_] = (x < BUMPER_X_M) & (np.abs(y) < BUMPER_Y_M) & (z < BUMPER_Z_M)
         return is_near
 
-    def within(self, mask: NDArray[np.bool_], boxes: Sequence[Box], margin_m: float = 0.0) -> NDArray[np.bool_]:
+    def within(self, mask: Mask, boxes: Sequence[Box], margin_m: float = 0.0) -> NDArray[np.bool_]:
         """Points in one of the boxes."""
         rows, is_near = np.flatnonzero(mask), np.zeros(len(mask), np.bool_)
         for box in boxes:
             is_near[rows] |= inside(box, self.points[rows], margin_m)
         return is_near
 
-    def near_objects(self, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    def near_objects(self, mask: Mask) -> NDArray[np.bool_]:
         """Points in a true box, or next to one."""
         return self.within(mask, self.boxes, NEAR_M)
 
-    def on_large_structures(self, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    def on_large_structures(self, mask: Mask) -> NDArray[np.bool_]:
         """Points above the ground, in a cluster that is too large for a car."""
         above = ~self.ground.mask & np.isfinite(self.points).all(axis=1)
         clusters = find_clusters(self.points, among=above, seeds=mask & above, min_points=1)
@@ -137,7 +138,7 @@ class _Scan:
             large[rows] = is_large[clusters[rows]]
         return mask & large
 
-    def on_poles(self, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    def on_poles(self, mask: Mask) -> NDArray[np.bool_]:
         """Points with a point higher than people above or below them, at most 0.3 m aside."""
         is_pole = np.zeros(len(mask), np.bool_)
         tall = self.points[self.ground.height_m > POLE_HEIGHT_M, :2]

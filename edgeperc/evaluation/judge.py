@@ -31,6 +31,7 @@ from ..types.frame import ModelFrame
 from ..types.geometry import inside
 from ..types.mounting import MODEL_MOUNTING, Mounting
 from ..types.perception import Box, Perception, PointLabels, TopView
+from ..types.points import Labels, Points
 from ..types.sensor import SensorProfile
 from ..types.views import TopViewGeometry
 from .causes import count_causes
@@ -221,7 +222,7 @@ class Judge:
             self._count_cells(tallies, truth, perception.top_view)
         return Record(truth.name, truth.drive, tallies), mistakes
 
-    def _perceive(self, points: NDArray[np.float32]) -> Perception:
+    def _perceive(self, points: Points) -> Perception:
         if self.mounted is None:
             return self.perceive(points)
         seen = points.copy()
@@ -376,7 +377,7 @@ class Network:
             values = np.exp(values - values.max(axis=0))
         return values[self.card.classes.index(name)] / values.sum(axis=0)
 
-    def point_labels(self, points: NDArray[np.float32]) -> NDArray[np.uint8]:
+    def point_labels(self, points: Points) -> NDArray[np.uint8]:
         """Label of the pixel of each point before PointSeg's refinement, (n,) uint8; 0 out of view."""
         labels, _ = decode_classes(self.session.outputs[self.kind], self.kind, model=self.card.name)
         pixel = project(self.projector, points).pixel
@@ -412,7 +413,7 @@ def _without_vehicles(classes: tuple[str, ...], right: NDArray[np.uint8]) -> tup
     return others, number[right]
 
 
-def _renamed(labels: NDArray[np.uint8], names: Sequence[str], classes: Sequence[str]) -> NDArray[np.uint8]:
+def _renamed(labels: Labels, names: Sequence[str], classes: Sequence[str]) -> NDArray[np.uint8]:
     """Convert a model's labels to those of a table; classes that the table lacks become its first class."""
     coarse = {"drivable": "road", **dict.fromkeys(VEHICLES, "vehicle")}
     renamed = [name if name in classes else coarse.get(name, "") for name in names]
@@ -425,7 +426,7 @@ def training_scans_of(cards: Sequence[ModelCard]) -> dict[str, set[str]]:
     return {name: set(hashes.values()) if isinstance(hashes, Mapping) else set() for name, hashes in frames.items()}
 
 
-def check_unseen(trained_on: Mapping[str, set[str]], name: str, drive: str, points: NDArray[np.float32]) -> None:
+def check_unseen(trained_on: Mapping[str, set[str]], name: str, drive: str, points: Points) -> None:
     """Raise `SplitError` if one of the models was trained on this scan (see `training_scans_of`)."""
     digest = scan_hash(points)
     for model, hashes in trained_on.items():

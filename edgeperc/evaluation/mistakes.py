@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..types.perception import Box
+from ..types.points import Points
 from ..view.canvas import (
     Label,
     add_axes,
@@ -44,7 +45,7 @@ class Mistakes:
 
     name: str
     drive: str
-    points: NDArray[np.float32]
+    points: Points
     wrong: NDArray[np.uint8]
     found: tuple[Box, ...] = ()
     missed: tuple[tuple[Box, int], ...] = ()

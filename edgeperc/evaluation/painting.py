@@ -20,6 +20,7 @@ from ..simulation.drawn import random_scene
 from ..simulation.samples import FIRST_SEED
 from ..simulation.scene import SimulatedScan, simulate
 from ..types.perception import ImageLabels
+from ..types.points import Labels
 from ..types.sensor import SensorProfile, get_sensor
 
 EDGE_PX = 3
@@ -116,7 +117,7 @@ def count_painting(
     return Counter({name: int(np.count_nonzero(mask)) for name, mask in masks.items()})
 
 
-def beside_edges(labels: NDArray[np.uint8]) -> NDArray[np.bool_]:
+def beside_edges(labels: Labels) -> NDArray[np.bool_]:
     """Pixels with another class within `EDGE_PX` rows and columns."""
     least, most = labels.copy(), labels.copy()
     for axis in (0, 1):

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..types.points import Labels
 from .causes import BUMPER, CAUSES, FLOOR
 from .center_ap import CLASSES, CenterTable, center_scores
 from .kitti_ap import ApTable, average_precisions
@@ -62,7 +63,7 @@ def within(range_m: Any, within_m: tuple[float, float]) -> Any:
 def banded(
     table: tuple[str, ...],
     classes: tuple[str, ...],
-    labels: NDArray[np.uint8],
+    labels: Labels,
     right: NDArray[np.uint8],
     range_m: NDArray[Any],
 ) -> dict[tuple[str, ...], Confusion]:

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..datasets.layout import class_number
 from ..datasets.scan_folder import ScanFolder, ScanFrame
@@ -18,6 +17,7 @@ from ..preprocess.sensor_fit import fit_sensor
 from ..simulation.samples import FIRST_SEED, IGNORE, labels_by_boxes, simulated_scan
 from ..simulation.scene import POINT_CLASSES
 from ..types.perception import Box
+from ..types.points import Labels, Points
 from ..types.sensor import SensorProfile, get_sensor
 from ..zoo import DEFAULT
 from .judge import Judge, Perceiving, check_unseen, training_scans_of
@@ -52,8 +52,8 @@ class Scan:
     """
 
     name: str
-    points: NDArray[np.float32]
-    labels: NDArray[np.uint8]
+    points: Points
+    labels: Labels
     objects: frozenset[tuple[str, ObjectKey]] | None
 
 

@@ -17,7 +17,7 @@ from ..types.frame import ModelFrame
 from ..types.geometry import draw_footprints, inside
 from ..types.mounting import Mounting
 from ..types.perception import Box
-from ..types.points import read_only
+from ..types.points import Labels, Points, read_only
 from ..types.views import TopViewGeometry
 from .kitti_ap import FrontTruth, image_size_of
 from .tables import VEHICLES
@@ -48,8 +48,8 @@ class Truth:
 
     name: str
     drive: str
-    points: NDArray[np.float32]
-    labels: NDArray[np.uint8] | None
+    points: Points
+    labels: Labels | None
     boxes: tuple[Box, ...]
     returns: tuple[int, ...]
     known: Callable[[NDArray[np.float64]], NDArray[np.bool_]]

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ..errors import MountingError
 from ..types.frame import ModelFrame
 from ..types.mounting import MODEL_HEIGHT_M, MODEL_MOUNTING, Mounting
-from ..types.points import read_only
+from ..types.points import Points, read_only
 from .planes import N_CELLS, TOLERANCE_M, fill_lowest, fit_first_plane
 
 __all__ = ["FROZEN_AFTER", "MountingEstimate", "MountingEstimator"]
@@ -118,7 +118,7 @@ class MountingEstimator:
         """Whether more scans change nothing: all is known, or five scans were used."""
         return self.known.is_known or len(self._found) >= FROZEN_AFTER
 
-    def add(self, points: NDArray[np.float32]) -> MountingEstimator:
+    def add(self, points: Points) -> MountingEstimator:
         """An estimator that has used one more scan; this one does not change.
 
         Parameters
@@ -194,7 +194,7 @@ def _filled(mounting: Mounting, values: NDArray[np.float64]) -> Mounting:
     return Mounting(height_m, roll_deg, pitch_deg, yaw_deg, mounting.origin_m)
 
 
-def _leveled(scan: NDArray[np.float32], guess: Mounting) -> tuple[Mounting, float]:
+def _leveled(scan: Points, guess: Mounting) -> tuple[Mounting, float]:
     """The mounting by the ground in a scan, from a first guess, and its support."""
     frame = ModelFrame(guess)
     (a, b, c), support = _ground_plane(read_only(frame.move(scan)))
@@ -206,7 +206,7 @@ def _leveled(scan: NDArray[np.float32], guess: Mounting) -> tuple[Mounting, floa
     return replace(Mounting.from_matrix(T_vehicle_sensor), yaw_deg=guess.yaw_deg), support
 
 
-def _ground_plane(scan: NDArray[np.float32]) -> tuple[tuple[float, float, float], float]:
+def _ground_plane(scan: Points) -> tuple[tuple[float, float, float], float]:
     """a, b, c of the ground z = a x + b y + c [m] around the vehicle, and how many more cells lie on it than below."""
     cell = np.empty(len(scan), np.int32)
     lowest = np.empty((N_CELLS, N_CELLS), np.int32)
@@ -247,7 +247,7 @@ def _ground_plane(scan: NDArray[np.float32]) -> tuple[tuple[float, float, float]
     return (a, b, c), float(best)
 
 
-def _street_axis(scan: NDArray[np.float32]) -> float:
+def _street_axis(scan: Points) -> float:
     """Yaw [deg] of a scan whose z axis is upright: minus the direction of the street, in -90..90."""
     low, high, far = _STREET_M
     height = scan[:, 2] + np.float32(MODEL_HEIGHT_M)

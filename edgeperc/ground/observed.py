@@ -20,7 +20,7 @@ from ..errors import PointsError
 from ..system.kernels import njit
 from ..types.frame import ModelFrame
 from ..types.mounting import MODEL_MOUNTING, Mounting
-from ..types.points import read_only
+from ..types.points import Points, read_only
 from ..types.sensor import SensorProfile
 from ..types.views import TopViewGeometry
 
@@ -136,9 +136,7 @@ class Observer:
         # A direction of the models' frame has this much more gradient in the frame of the sensor.
         self._tilt = ModelFrame(mounting).R[:2, 2] @ self.ahead
 
-    def observe(
-        self, points: NDArray[np.float32], index: NDArray[np.int32], mounting: Mounting = MODEL_MOUNTING
-    ) -> Observation:
+    def observe(self, points: Points, index: NDArray[np.int32], mounting: Mounting = MODEL_MOUNTING) -> Observation:
         """Find the observed cells, and those between two beams.
 
         Parameters
@@ -198,7 +196,7 @@ def beams_above_m(mounting: Mounting) -> float:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def fill_lowest_returns(
-    points: NDArray[np.float32],
+    points: Points,
     bounds: NDArray[np.float64],
     grid: NDArray[np.float64],
     lowest: NDArray[np.float32],
@@ -304,7 +302,7 @@ def follow_rays(
 
 @njit(cache=True, nogil=True)
 def mark_cells(
-    points: NDArray[np.float32],
+    points: Points,
     index: NDArray[np.int32],
     bin_of_cell: NDArray[np.int32],
     level: NDArray[np.float32],

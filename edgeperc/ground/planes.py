@@ -19,7 +19,7 @@ from ..errors import PointsError
 from ..system.draws import drawn_of, next_draw
 from ..system.kernels import njit
 from ..types.perception import GroundSurface
-from ..types.points import read_only
+from ..types.points import Heights, Mask, Points, Rows, read_only
 
 # 256 x 256 cells of half a meter, in 16 x 16 regions of 16 x 16 cells. Farther out, few rays meet the ground.
 CELL_M = 0.5
@@ -76,18 +76,18 @@ class Ground:
         heights are above a level plane at the mounting height.
     """
 
-    mask: NDArray[np.bool_]
-    height_m: NDArray[np.float32]
+    mask: Mask
+    height_m: Heights
     plane: tuple[float, float, float] | None
 
 
 def find_ground(
-    points: NDArray[np.float32],
+    points: Points,
     *,
     mount_height_m: float = 1.73,
     max_height_m: float = 0.125,
     regions: bool = True,
-    rows: NDArray[np.int32] | None = None,
+    rows: Rows | None = None,
 ) -> Ground:
     """Separate the ground from what stands on it (KUL-Seg 5.2).
 
@@ -154,14 +154,14 @@ class GroundFit:
         Whether there is ground.
     """
 
-    points: NDArray[np.float32]
+    points: Points
     cell: NDArray[np.int32]
     lowest: NDArray[np.int32]
     plane: NDArray[np.float64]
     planes: NDArray[np.float64] | None
     found: bool
 
-    def heights(self, rows: NDArray[np.int32] | None = None, *, max_height_m: float = 0.125) -> Ground:
+    def heights(self, rows: Rows | None = None, *, max_height_m: float = 0.125) -> Ground:
         """The ground of the points in some rows, or of all; parameters and errors as in `find_ground`."""
         if not 0.0 < max_height_m < math.inf:
             raise PointsError(f"got max_height_m={max_height_m}; expected meters above 0")
@@ -189,7 +189,7 @@ class GroundFit:
         return GroundSurface(self._plane if self.found else None, self._plane, self.planes, cells, lowest)
 
 
-def heights_above(ground: GroundSurface, points: NDArray[np.float32], *, max_height_m: float = 0.125) -> Ground:
+def heights_above(ground: GroundSurface, points: Points, *, max_height_m: float = 0.125) -> Ground:
     """Heights of any points above the ground that a scan showed.
 
     Parameters
@@ -224,7 +224,7 @@ def heights_above(ground: GroundSurface, points: NDArray[np.float32], *, max_hei
     return whole.heights(rows, max_height_m=max_height_m)
 
 
-def fit_ground(points: NDArray[np.float32], *, mount_height_m: float = 1.73, regions: bool = True) -> GroundFit:
+def fit_ground(points: Points, *, mount_height_m: float = 1.73, regions: bool = True) -> GroundFit:
     """Fit the planes of the ground; parameters and errors as in `find_ground`."""
     if not 0.0 < mount_height_m < math.inf:
         raise PointsError(f"got mount_height_m={mount_height_m}; expected meters above 0")
@@ -241,12 +241,12 @@ def fit_ground(points: NDArray[np.float32], *, mount_height_m: float = 1.73, reg
 class Sorted(NamedTuple):
     """A scan, the cell of each of its points, and the row of the lowest point in each cell."""
 
-    points: NDArray[np.float32]
+    points: Points
     cell: NDArray[np.int32]
     lowest: NDArray[np.int32]
 
 
-def _sorted_into_cells(points: NDArray[np.float32]) -> Sorted:
+def _sorted_into_cells(points: Points) -> Sorted:
     if points.ndim != 2 or points.shape[1] < 3:
         raise PointsError(f"got points of shape {points.shape}; expected (n, 4): x, y, z, remission")
     scan = read_only(points if points.shape[1] == 4 else np.pad(points[:, :3], ((0, 0), (0, 1))))
@@ -256,7 +256,7 @@ def _sorted_into_cells(points: NDArray[np.float32]) -> Sorted:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def fill_lowest(points: NDArray[np.float32], cell: NDArray[np.int32], lowest: NDArray[np.int32]) -> None:
+def fill_lowest(points: Points, cell: NDArray[np.int32], lowest: NDArray[np.int32]) -> None:
     """Write every point's cell and every cell's lowest point.
 
     points : (n, 4) float32, C-contiguous
@@ -316,9 +316,7 @@ class Patch(NamedTuple):
 
 
 @njit(cache=True, nogil=True)
-def fit_first_plane(
-    points: NDArray[np.float32], lowest: NDArray[np.int32], reach_m: float, plane: NDArray[np.float64]
-) -> bool:
+def fit_first_plane(points: Points, lowest: NDArray[np.int32], reach_m: float, plane: NDArray[np.float64]) -> bool:
     """Replace ``plane`` (3,), the expected a, b, c, by the plane within ``reach_m``; False if there is none."""
     size = 2 * int(reach_m / CELL_M)
     start = (N_CELLS - size) // 2
@@ -342,7 +340,7 @@ def fit_first_plane(
 
 @njit(cache=True, nogil=True)
 def fill_planes(
-    points: NDArray[np.float32],
+    points: Points,
     lowest: NDArray[np.int32],
     first: NDArray[np.float64],
     planes: NDArray[np.float64],
@@ -404,7 +402,7 @@ def fill_planes(
 
 @njit(cache=True, nogil=True)
 def fill_residuals(
-    points: NDArray[np.float32],
+    points: Points,
     lowest: NDArray[np.int32],
     patch: Patch,
     expected: NDArray[np.float64],
@@ -523,10 +521,10 @@ def refine_plane(
 
 @njit(cache=True, nogil=True)
 def fill_levels(
-    points: NDArray[np.float32],
+    points: Points,
     lowest: NDArray[np.int32],
     planes: NDArray[np.float64],
-    rows: NDArray[np.int32],
+    rows: Rows,
     cell: NDArray[np.int32],
     level: NDArray[np.float32],
 ) -> None:
@@ -599,14 +597,14 @@ def fill_levels(
 
 @njit(cache=True, nogil=True)
 def fill_heights(
-    points: NDArray[np.float32],
-    rows: NDArray[np.int32],
+    points: Points,
+    rows: Rows,
     cell: NDArray[np.int32],
     level: NDArray[np.float32],
     planes: NDArray[np.float64],
     max_height: float,
-    height: NDArray[np.float32],
-    mask: NDArray[np.bool_],
+    height: Heights,
+    mask: Mask,
 ) -> None:
     """Write the heights of some points above the ground, and whether they are on the ground.
 
@@ -645,12 +643,12 @@ def fill_heights(
 
 @njit(cache=True, nogil=True)
 def fill_heights_above_plane(
-    points: NDArray[np.float32],
-    rows: NDArray[np.int32],
+    points: Points,
+    rows: Rows,
     plane: NDArray[np.float64],
     max_height: float,
-    height: NDArray[np.float32],
-    mask: NDArray[np.bool_],
+    height: Heights,
+    mask: Mask,
 ) -> None:
     """Write the heights of some points above z = a x + b y + c (NaN if not finite), and whether they are on it."""
     for k in range(rows.shape[0]):

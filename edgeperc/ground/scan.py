@@ -5,11 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..errors import PointsError
 from ..types.perception import PointLabels
-from ..types.points import Cloud, read_only
+from ..types.points import Cloud, Points, read_only
 from .planes import Ground
 
 
@@ -25,7 +24,7 @@ class Scan:
         Of these points; its arrays are read-only.
     """
 
-    points: NDArray[np.float32]
+    points: Points
     ground: Ground
 
     @property
@@ -34,7 +33,7 @@ class Scan:
         return Cloud(self.points, self.ground.height_m)
 
     @classmethod
-    def of(cls, points: NDArray[np.float32], ground: Ground, labels: PointLabels | None = None) -> Scan:
+    def of(cls, points: Points, ground: Ground, labels: PointLabels | None = None) -> Scan:
         """A scan of given arrays, which are checked and not copied.
 
         Raises PointsError.

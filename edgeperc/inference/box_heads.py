@@ -13,6 +13,7 @@ from ..system.kernels import njit
 from ..types.card import N_DENSE_CHANNELS, N_FRONT_CHANNELS
 from ..types.geometry import suppress_overlaps
 from ..types.perception import Box
+from ..types.points import Labels
 from ..types.views import TopViewGeometry
 
 STRIDE = 4  # cells of the top view behind one cell of a box_dense output, along each axis
@@ -24,7 +25,7 @@ MAX_PROBABILITY = 1.02  # rounded to bfloat16, probabilities add up to a little 
 
 def decode_slots(
     slots: NDArray[np.float32],
-    labels: NDArray[np.uint8],
+    labels: Labels,
     scores: NDArray[np.float32],
     geometry: TopViewGeometry,
     classes: Sequence[str],

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from ..ground.observed import FARTHER
 from ..system.kernels import njit
 from ..types.perception import PointLabels
-from ..types.points import read_only
+from ..types.points import Labels, Mask, Points, Rows, read_only
 from ..types.views import RangeImageGeometry, TopViewGeometry
 
 MARGIN_M = 5.0
@@ -61,7 +61,7 @@ class Crop:
             cos, sin = math.cos(turn_rad), math.sin(turn_rad)
             self._lines = np.column_stack([inward @ np.array([(cos, sin), (-sin, cos)]), np.min(nearest, axis=0)])
 
-    def select(self, points: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.int32] | None]:
+    def select(self, points: Points) -> tuple[NDArray[np.float32], NDArray[np.int32] | None]:
         """The points that matter, in their order.
 
         points : (n, 4) float32; x, y, z [m] in the frame of the models, remission. Rows that are not finite are left
@@ -138,9 +138,7 @@ def _hull(
 
 
 @njit(cache=True, nogil=True)
-def fill_rows(
-    points: NDArray[np.float32], lines: NDArray[np.float64], rows: NDArray[np.int32], kept: NDArray[np.float32]
-) -> int:
+def fill_rows(points: Points, lines: NDArray[np.float64], rows: Rows, kept: NDArray[np.float32]) -> int:
     """Copy the points between two lines.
 
     points : (n, 4) float32, C-contiguous
@@ -162,9 +160,9 @@ def fill_rows(
 
 @njit(cache=True, nogil=True)
 def fill_spread(
-    rows: NDArray[np.int32],
-    labels: NDArray[np.uint8],
-    in_view: NDArray[np.bool_],
+    rows: Rows,
+    labels: Labels,
+    in_view: Mask,
     all_labels: NDArray[np.uint8],
     all_in_view: NDArray[np.bool_],
 ) -> None:

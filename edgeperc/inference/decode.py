@@ -13,7 +13,7 @@ from ..system.kernels import njit
 from ..types.card import ModelCard
 from ..types.geometry import draw_footprints
 from ..types.perception import Box
-from ..types.points import read_only
+from ..types.points import Labels, read_only
 from ..types.views import TopViewGeometry
 from .box_heads import (
     MAX_PROBABILITY,
@@ -66,7 +66,7 @@ def decode_classes(
 
 
 @njit(cache=True, nogil=True)
-def fill_labels(values: NDArray[np.float32], labels: NDArray[np.uint8]) -> tuple[int, float, float]:
+def fill_labels(values: NDArray[np.float32], labels: Labels) -> tuple[int, float, float]:
     """Write every pixel's best class.
 
     values : (C, H, W) float32, C-contiguous; logits or probabilities.
@@ -106,7 +106,7 @@ def fill_labels(values: NDArray[np.float32], labels: NDArray[np.uint8]) -> tuple
 
 
 @njit(cache=True, nogil=True)
-def clear_empty(returned: NDArray[np.bool_], is_box: NDArray[np.bool_], labels: NDArray[np.uint8]) -> None:
+def clear_empty(returned: NDArray[np.bool_], is_box: NDArray[np.bool_], labels: Labels) -> None:
     """Make cells of box classes without a return background.
 
     returned : (H, W) bool

@@ -21,7 +21,7 @@ from ..ground.planes import find_ground
 from ..system.kernels import njit
 from ..types.card import InputSpec
 from ..types.mounting import MODEL_HEIGHT_M
-from ..types.points import read_only
+from ..types.points import Heights, Points, read_only
 from ..types.views import RangeImageGeometry, TopViewGeometry
 
 # Number of each channel in the kernels. "height" is z; "distance" is the range in the x-y plane.
@@ -121,9 +121,7 @@ class Intervals(NamedTuple):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def mark_top_view(
-    points: NDArray[np.float32], view: Bounds, index: NDArray[np.int32], pixel: NDArray[np.int32]
-) -> None:
+def mark_top_view(points: Points, view: Bounds, index: NDArray[np.int32], pixel: NDArray[np.int32]) -> None:
     """Mark the highest point of each cell in ``index``, and the cell of each point in ``pixel``.
 
     points : (n, 4) float32, C-contiguous; x, y, z [m] in the sensor frame, remission.
@@ -179,7 +177,7 @@ def mark_top_view(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def mark_range_image(
-    points: NDArray[np.float32],
+    points: Points,
     wedge: NDArray[np.float32],
     row_table: Intervals,
     col_table: Intervals,
@@ -271,8 +269,8 @@ def mark_range_image(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def fill_image(
-    points: NDArray[np.float32],
-    heights: NDArray[np.float32],
+    points: Points,
+    heights: Heights,
     index: NDArray[np.int32],
     channels: NDArray[np.int32],
     mean: NDArray[np.float32],
@@ -361,11 +359,11 @@ class TopViewProjector:
 
     def fill(
         self,
-        points: NDArray[np.float32],
+        points: Points,
         image: NDArray[np.float32],
         index: NDArray[np.int32],
         pixel: NDArray[np.int32],
-        height_m: NDArray[np.float32] | None = None,
+        height_m: Heights | None = None,
     ) -> None:
         """Project into the caller's buffers.
 
@@ -385,7 +383,7 @@ class TopViewProjector:
         flat_image = image.reshape(self.shape[0], -1)
         fill_image(points, heights, flat_index, self._channels, self._mean, self._std, flat_image)
 
-    def project(self, points: NDArray[np.float32], height_m: NDArray[np.float32] | None = None) -> Projection:
+    def project(self, points: Points, height_m: Heights | None = None) -> Projection:
         """Project into fresh buffers; arguments and errors as in `fill`."""
         return _project(self, points, height_m)
 
@@ -443,11 +441,11 @@ class RangeImageProjector:
 
     def fill(
         self,
-        points: NDArray[np.float32],
+        points: Points,
         image: NDArray[np.float32],
         index: NDArray[np.int32],
         pixel: NDArray[np.int32],
-        height_m: NDArray[np.float32] | None = None,
+        height_m: Heights | None = None,
     ) -> None:
         """Project into the caller's buffers; arguments and errors as in `TopViewProjector.fill`."""
         points = _checked(self.shape, points, image, index, pixel)
@@ -458,10 +456,10 @@ class RangeImageProjector:
 
     def fill_image(
         self,
-        points: NDArray[np.float32],
+        points: Points,
         index: NDArray[np.int32],
         image: NDArray[np.float32],
-        height_m: NDArray[np.float32] | None = None,
+        height_m: Heights | None = None,
     ) -> None:
         """Write the image for a given ``index``; arguments and errors as in `TopViewProjector.fill`."""
         points = _checked(self.shape, points, image, index)
@@ -469,7 +467,7 @@ class RangeImageProjector:
         flat_image = image.reshape(self.shape[0], -1)
         fill_image(points, heights, index.reshape(-1), self._channels, self._mean, self._std, flat_image)
 
-    def project(self, points: NDArray[np.float32], height_m: NDArray[np.float32] | None = None) -> Projection:
+    def project(self, points: Points, height_m: Heights | None = None) -> Projection:
         """Project into fresh buffers; arguments and errors as in `TopViewProjector.fill`."""
         return _project(self, points, height_m)
 
@@ -552,7 +550,7 @@ def _channels(
 
 def _checked(
     shape: tuple[int, int, int],
-    points: NDArray[np.float32],
+    points: Points,
     image: NDArray[np.float32],
     index: NDArray[np.int32],
     pixel: NDArray[np.int32] | None = None,
@@ -574,7 +572,7 @@ def _checked(
     return read_only(points)
 
 
-def _heights(needed: bool, n: int, height_m: NDArray[np.float32] | None) -> NDArray[np.float32]:
+def _heights(needed: bool, n: int, height_m: Heights | None) -> NDArray[np.float32]:
     """The heights as the kernel takes them; raises PointsError."""
     if not needed:
         return read_only(np.empty(0, np.float32))
@@ -588,7 +586,7 @@ def _heights(needed: bool, n: int, height_m: NDArray[np.float32] | None) -> NDAr
     return read_only(np.ascontiguousarray(height_m))
 
 
-def _check_points(points: NDArray[np.float32]) -> None:
+def _check_points(points: Points) -> None:
     if not isinstance(points, np.ndarray):
         raise PointsError(f"points are a {type(points).__name__}; expected a numpy array (n, 4) float32")
     if points.ndim != 2 or points.shape[1] != 4 or points.dtype != np.float32 or not points.flags.c_contiguous:
@@ -600,8 +598,8 @@ def _check_points(points: NDArray[np.float32]) -> None:
 
 def _project(
     projector: TopViewProjector | RangeImageProjector,
-    points: NDArray[np.float32],
-    height_m: NDArray[np.float32] | None,
+    points: Points,
+    height_m: Heights | None,
 ) -> Projection:
     _check_points(points)
     projection = Projection(
@@ -613,14 +611,12 @@ def _project(
     return projection
 
 
-def input_heights(
-    projector: TopViewProjector | RangeImageProjector, points: NDArray[np.float32]
-) -> NDArray[np.float32] | None:
+def input_heights(projector: TopViewProjector | RangeImageProjector, points: Points) -> NDArray[np.float32] | None:
     """Heights of points of the models' frame above the ground, (n,) float32 [m]; None if the projector needs none."""
     return find_ground(points, mount_height_m=MODEL_HEIGHT_M).height_m if projector.needs_ground else None
 
 
-def project(projector: TopViewProjector | RangeImageProjector, points: NDArray[np.float32]) -> Projection:
+def project(projector: TopViewProjector | RangeImageProjector, points: Points) -> Projection:
     """Project a scan and, if the projector needs it, find the ground first, as a `Perceiver` does.
 
     points : (n, 4) float32, C-contiguous; x, y, z [m] in the frame of the models, remission in 0..1.

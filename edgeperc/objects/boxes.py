@@ -13,7 +13,7 @@ from ..errors import PointsError
 from ..system.kernels import njit
 from ..types.geometry import oriented_iou, rectangles, shared_area, suppress_overlaps
 from ..types.perception import Box
-from ..types.points import Cloud, Labeled, read_only
+from ..types.points import Cloud, Heights, Ids, Labeled, Labels, Mask, Points, read_only
 from .cluster import MIN_PERSON_SHARE, PERSONS, Groups, find_clusters, group_points, labels_of_groups
 from .persons import PERSON, UNSEEN, fill_person_groups, fill_persons
 
@@ -55,14 +55,14 @@ MIN_SCORE = 0.3  # precision of cars on KITTI's drive 0005 rose from 0.24 to 0.5
 
 
 def objects_from_points(
-    points: NDArray[np.float32],
-    labels: NDArray[np.uint8],
+    points: Points,
+    labels: Labels,
     classes: Sequence[str],
     *,
-    among: NDArray[np.bool_] | None = None,
-    height_m: NDArray[np.float32] | None = None,
-    clusters: NDArray[np.int32] | None = None,
-    in_view: NDArray[np.bool_] | None = None,
+    among: Mask | None = None,
+    height_m: Heights | None = None,
+    clusters: Ids | None = None,
+    in_view: Mask | None = None,
     others: Sequence[Box] = (),
     min_share: float = 0.7,
     distance_per_m: float = 0.015,
@@ -282,7 +282,7 @@ def _roles(classes: Sequence[str]) -> NDArray[np.uint8]:
     return roles
 
 
-def _above_lowest(cloud: Cloud, clusters: NDArray[np.int32], groups: Groups) -> Cloud:
+def _above_lowest(cloud: Cloud, clusters: Ids, groups: Groups) -> Cloud:
     """Points with their heights above the lowest point of their cluster, (n,)."""
     z = cloud.points[:, 2]
     if not len(groups.order):
@@ -295,7 +295,7 @@ def _persons(
     cloud: Cloud,
     labeled: Labeled,
     classes: Sequence[str],
-    clusters: NDArray[np.int32],
+    clusters: Ids,
     by_cluster: Groups,
     distance_per_m: float,
     min_points: int,

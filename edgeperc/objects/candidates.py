@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from ..errors import PointsError
 from ..ground.scan import Scan
 from ..system.kernels import njit
-from ..types.points import read_only
+from ..types.points import Heights, Points, Rows, read_only
 
 CELL_M = 0.2
 REACH_M = 80.0
@@ -59,7 +59,7 @@ class Cells(NamedTuple):
     number: NDArray[np.int32]
     flat: NDArray[np.int32]
     starts: NDArray[np.int32]
-    rows: NDArray[np.int32]
+    rows: Rows
 
 
 class Candidates(NamedTuple):
@@ -136,8 +136,8 @@ class Groups(NamedTuple):
 
 @njit(cache=True, nogil=True)
 def fill_cells(
-    points: NDArray[np.float32],
-    height: NDArray[np.float32],
+    points: Points,
+    height: Heights,
     low: float,
     high: float,
     cells: Cells,
@@ -180,7 +180,7 @@ def fill_cells(
 
 @njit(cache=True, nogil=True)
 def fill_groups_of_cells(
-    height: NDArray[np.float32],
+    height: Heights,
     cells: Cells,
     scale: Scale,
     per_m: float,
@@ -228,8 +228,8 @@ def fill_groups_of_cells(
 
 @njit(cache=True, nogil=True)
 def fit_groups(
-    points: NDArray[np.float32],
-    height: NDArray[np.float32],
+    points: Points,
+    height: Heights,
     cells: Cells,
     scale: Scale,
     groups: Groups,
@@ -267,7 +267,7 @@ def fit_groups(
 
 
 @njit(cache=True, nogil=True)
-def fit_rectangle(points: NDArray[np.float32], rows: NDArray[np.int32], rectangle: NDArray[np.float64]) -> None:
+def fit_rectangle(points: Points, rows: Rows, rectangle: NDArray[np.float64]) -> None:
     """Write the rectangle around points seen from above whose sides most of them are near; its length is not shorter.
 
     As `objects.boxes.fill_rectangle`, with fewer headings and fewer points.

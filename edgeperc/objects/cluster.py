@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from ..errors import PointsError
 from ..system.kernels import njit
-from ..types.points import read_only
+from ..types.points import Ids, Labels, Mask, Points, read_only
 from .linkage import COLUMN_EDGE, MAX_COLUMNS, TESTS_PER_POINT, WORK, Strips, chain_points, fill_clusters, levels_of
 
 WALKS, RIDES = 1, 2  # roles of labels
@@ -30,9 +30,9 @@ PERSONS = MappingProxyType({"pedestrian": WALKS, "cyclist": RIDES})
 
 
 def find_clusters(
-    points: NDArray[np.float32],
+    points: Points,
     *,
-    among: NDArray[np.bool_] | None = None,
+    among: Mask | None = None,
     seeds: NDArray[np.bool_] | None = None,
     votes: NDArray[np.uint8] | None = None,
     min_share: float | Sequence[float] | NDArray[np.float64] = 0.0,
@@ -125,8 +125,8 @@ def find_clusters(
 
 
 def sort_points(
-    points: NDArray[np.float32],
-    among: NDArray[np.bool_] | None = None,
+    points: Points,
+    among: Mask | None = None,
     *,
     min_distance_m: float = 0.5,
     distance_per_m: float = 0.015,
@@ -161,8 +161,8 @@ def sort_points(
 
 
 def cluster_labels(
-    clusters: NDArray[np.int32],
-    labels: NDArray[np.uint8],
+    clusters: Ids,
+    labels: Labels,
     *,
     min_share: float = 0.7,
     part_of: Mapping[int, int] = MappingProxyType({}),
@@ -201,7 +201,7 @@ class Groups(NamedTuple):
 
 
 def labels_of_groups(
-    groups: Groups, labels: NDArray[np.uint8], min_share: float, part_of: Mapping[int, int]
+    groups: Groups, labels: Labels, min_share: float, part_of: Mapping[int, int]
 ) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
     """`cluster_labels` of groups."""
     classes = np.empty(len(groups.starts) - 1, np.uint8)
@@ -211,7 +211,7 @@ def labels_of_groups(
     return classes, shares
 
 
-def group_points(clusters: NDArray[np.int32]) -> Groups:
+def group_points(clusters: Ids) -> Groups:
     """Points by cluster, (n,); -1 for none."""
     groups = Groups(np.empty(len(clusters), np.int32), np.empty(int(clusters.max(initial=-1)) + 2, np.int64))
     fill_groups(np.require(clusters, np.int32, ["C", "W"]), groups)  # writable, as where kernels call it
@@ -219,7 +219,7 @@ def group_points(clusters: NDArray[np.int32]) -> Groups:
 
 
 @njit(cache=True, nogil=True)
-def fill_groups(clusters: NDArray[np.int32], groups: Groups) -> None:
+def fill_groups(clusters: Ids, groups: Groups) -> None:
     """Sort points by their clusters, (n,); negative for none. ``groups`` is overwritten."""
     order, starts = groups.order, groups.starts
     starts[:] = 0
@@ -239,7 +239,7 @@ def fill_groups(clusters: NDArray[np.int32], groups: Groups) -> None:
 
 @njit(cache=True, nogil=True)
 def fill_cluster_labels(
-    labels: NDArray[np.uint8],
+    labels: Labels,
     groups: Groups,
     parts: NDArray[np.int64],
     min_share: float,

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from ..ground.scan import Scan
 from ..system.kernels import njit
+from ..types.points import Heights, Points
 from .candidates import CELL_M, N_SIDE, REACH_M, Candidates, Cells
 
 FEATURES = (
@@ -43,7 +44,7 @@ class Crops(NamedTuple):
     level : (m,) float64, z of the ground below [m].
     """
 
-    points: NDArray[np.float32]
+    points: Points
     counts: NDArray[np.int32]
     level: NDArray[np.float64]
 
@@ -67,8 +68,8 @@ def with_points(candidates: Candidates, crops: Crops) -> tuple[Candidates, Crops
 
 @njit(cache=True, nogil=True)
 def fill_crops(
-    points: NDArray[np.float32],
-    height: NDArray[np.float32],
+    points: Points,
+    height: Heights,
     cells: Cells,
     rectangles: NDArray[np.float64],
     margin_m: float,
@@ -124,7 +125,7 @@ def fill_crops(
 
 @njit(cache=True, nogil=True)
 def fill_features(
-    points: NDArray[np.float32],
+    points: Points,
     counts: NDArray[np.int32],
     rectangles: NDArray[np.float64],
     scale: NDArray[np.float32],

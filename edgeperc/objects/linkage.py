@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..system.kernels import njit
+from ..types.points import Ids, Mask, Points, Rows
 
 # A column's edge is slightly more than half the reach of its points. Points of one column are linked if their heights
 # differ by at most 0.7 of the reach: 2 * 0.50005^2 + 0.7^2 < 1.
@@ -89,8 +90,8 @@ class Strips(NamedTuple):
         As in `edgeperc.objects.cluster.find_clusters`.
     """
 
-    points: NDArray[np.float32]
-    rows: NDArray[np.int32]
+    points: Points
+    rows: Rows
     heads: NDArray[np.int32]
     chain: NDArray[np.int32]
     levels: NDArray[np.void]
@@ -127,7 +128,7 @@ class Search(NamedTuple):
     """
 
     order: NDArray[np.int32]
-    xyz: NDArray[np.float32]
+    xyz: Points
     reach: NDArray[np.float64]
     keys: NDArray[np.float64]
     parts: NDArray[np.void]
@@ -160,11 +161,11 @@ def levels_of(min_distance: float, distance_per_m: float, max_range: float) -> N
 
 @njit(cache=True, nogil=True)
 def chain_points(
-    points: NDArray[np.float32],
-    among: NDArray[np.bool_],
+    points: Points,
+    among: Mask,
     max_range: float,
     levels: NDArray[np.void],
-    rows: NDArray[np.int32],
+    rows: Rows,
     chain: NDArray[np.int32],
 ) -> tuple[int, NDArray[np.int32]]:
     """Write the grids of the levels, and the points of every strip; see `Strips`.
@@ -210,7 +211,7 @@ def strips_a_row(level: np.void) -> int:
 
 
 @njit(cache=True, nogil=True)
-def strip_of(points: NDArray[np.float32], i: int, levels: NDArray[np.void]) -> int:
+def strip_of(points: Points, i: int, levels: NDArray[np.void]) -> int:
     """The strip of columns that holds a point."""
     level = levels[level_of(points, np.int64(i), levels)]
     row = int((np.float64(points[i, 0]) - level["x"]) * level["columns_per_m"])
@@ -219,7 +220,7 @@ def strip_of(points: NDArray[np.float32], i: int, levels: NDArray[np.void]) -> i
 
 
 @njit(cache=True, nogil=True)
-def level_of(points: NDArray[np.float32], i: int, levels: NDArray[np.void]) -> int:
+def level_of(points: Points, i: int, levels: NDArray[np.void]) -> int:
     """The level whose squared ranges hold a point."""
     x, y, z = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
     squared_range = x * x + y * y + z * z
@@ -236,7 +237,7 @@ def fill_clusters(
     votes: NDArray[np.uint8],
     min_shares: NDArray[np.float64],
     min_points: int,
-    clusters: NDArray[np.int32],
+    clusters: Ids,
     work: NDArray[np.void],
 ) -> None:
     """Compute every point's cluster; see `find_clusters`.
@@ -430,7 +431,7 @@ def find_near(
 
 
 @njit(cache=True, nogil=True)
-def assign(search: Search, n_queued: int, cluster: int, clusters: NDArray[np.int32]) -> int:
+def assign(search: Search, n_queued: int, cluster: int, clusters: Ids) -> int:
     """Write the cluster of the runs in the queue, and of their points; the number of points."""
     parts, order, owner, queue, size = search.parts, search.order, search.owner, search.queue, 0
     for k in range(n_queued):
@@ -443,7 +444,7 @@ def assign(search: Search, n_queued: int, cluster: int, clusters: NDArray[np.int
 
 
 @njit(cache=True, nogil=True)
-def renumber(is_kept: NDArray[np.bool_], clusters: NDArray[np.int32]) -> None:
+def renumber(is_kept: NDArray[np.bool_], clusters: Ids) -> None:
     """Number the clusters that are kept by their first points; points of others become `FREE`."""
     numbers = np.empty(len(is_kept), np.int32)
     numbers[:] = FREE
@@ -556,7 +557,7 @@ def first_above(parts: NDArray[np.void], first: int, last: int, z: float) -> int
 
 
 @njit(cache=True, nogil=True)
-def set_bounds(xyz: NDArray[np.float32], reach: NDArray[np.float64], part: np.void) -> None:
+def set_bounds(xyz: Points, reach: NDArray[np.float64], part: np.void) -> None:
     """Write the bounds of a part's points, and of their reaches."""
     low_x, low_y, low_z, shortest = math.inf, math.inf, math.inf, math.inf
     high_x, high_y, high_z, longest = -math.inf, -math.inf, -math.inf, 0.0
@@ -624,9 +625,7 @@ def halves_are_linked(search: Search, run: int, other: int) -> bool:
 
 
 @njit(cache=True, nogil=True)
-def test_points(
-    xyz: NDArray[np.float32], reach: NDArray[np.float64], a: np.void, b: np.void, work: NDArray[np.void]
-) -> bool:
+def test_points(xyz: Points, reach: NDArray[np.float64], a: np.void, b: np.void, work: NDArray[np.void]) -> bool:
     """Whether a point of one part is near enough to a point of another, by pairs of points."""
     most = MAX_TESTED if work[0]["tests_left"] > 0 else MAX_LAST_TESTED
     stop_a, stop_b = min(a["stop"], a["first"] + most), min(b["stop"], b["first"] + most)

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..system.kernels import njit
-from ..types.points import Cloud, Labeled
+from ..types.points import Cloud, Ids, Labeled, Labels, Mask
 from .cluster import MIN_OF_WHOLE, RIDES, Groups, fill_groups
 
 UNSEEN = 3  # role of points out of view, beside `WALKS` and `RIDES`: they say nothing about the class
@@ -165,12 +165,12 @@ def fill_person_groups(
 @njit(cache=True, nogil=True)
 def complete_persons(
     cloud: Cloud,
-    in_view: NDArray[np.bool_],
-    clusters: NDArray[np.int32],
+    in_view: Mask,
+    clusters: Ids,
     may_be: NDArray[np.bool_],
     walks: int,
     rides: int,
-    labels: NDArray[np.uint8],
+    labels: Labels,
 ) -> None:
     """Give the points of a cluster that has a person's size and shape one label.
 
@@ -280,7 +280,7 @@ def fill_persons(
     labeled: Labeled,
     groups: Groups,
     n_whole: int,
-    cluster_of: NDArray[np.int32],
+    cluster_of: Ids,
     clusters: Groups,
     min_points: int,
     persons: NDArray[np.void],

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from ..errors import PointsError
 from ..system.draws import drawn_of, next_draw
 from ..system.kernels import njit
-from ..types.points import read_only
+from ..types.points import Labels, Mask, Points, Rows, read_only
 
 # Half of an object's diagonal seen from above, and a margin because the mean of the visible side is not its middle. On
 # 90 labeled KITTI frames, car IoU was 0.888, 0.884, 0.878 and 0.872 for 2.5, 3, 3.5 and 4.5 m for masks
@@ -38,9 +38,9 @@ MAX_RANGE_GAP_M = 1.0
 
 
 def remove_outliers(
-    points: NDArray[np.float32],
+    points: Points,
     index: NDArray[np.int32],
-    labels: NDArray[np.uint8],
+    labels: Labels,
     classes: Sequence[str],
     *,
     radius_m: Mapping[str, float] = OBJECT_RADIUS_M,
@@ -98,10 +98,10 @@ def remove_outliers(
 
 
 def label_points(
-    points: NDArray[np.float32],
+    points: Points,
     pixel: NDArray[np.int32],
     index: NDArray[np.int32],
-    labels: NDArray[np.uint8],
+    labels: Labels,
     *,
     full_turn: bool = False,
 ) -> NDArray[np.uint8]:
@@ -151,7 +151,7 @@ def label_points(
 
 
 def _check(
-    points: NDArray[np.float32], index: NDArray[np.int32], labels: NDArray[np.uint8]
+    points: Points, index: NDArray[np.int32], labels: Labels
 ) -> tuple[NDArray[np.float32], NDArray[np.int32], NDArray[np.uint8]]:
     if points.ndim != 2 or points.shape[1] < 3:
         raise PointsError(f"got points of shape {points.shape}; expected (n, 4): x, y, z, remission")
@@ -170,9 +170,9 @@ def _check(
 
 @njit(cache=True, nogil=True)
 def fill_without_outliers(
-    points: NDArray[np.float32],
+    points: Points,
     index: NDArray[np.int32],
-    labels: NDArray[np.uint8],
+    labels: Labels,
     radii: NDArray[np.float64],
     full_turn: bool,
     cleaned: NDArray[np.uint8],
@@ -246,13 +246,13 @@ def fill_without_outliers(
 
 @njit(cache=True, nogil=True)
 def collect_component(
-    labels: NDArray[np.uint8],
+    labels: Labels,
     index: NDArray[np.int32],
     first_row: int,
     first_col: int,
     full_turn: bool,
-    seen: NDArray[np.bool_],
-    rows: NDArray[np.int32],
+    seen: Mask,
+    rows: Rows,
     cols: NDArray[np.int32],
 ) -> int:
     """Write the pixels of a component that hold a point into ``rows`` and ``cols``, and return how many there are."""
@@ -327,10 +327,10 @@ def is_near(ground: NDArray[np.float64], k: int, x: float, y: float, squared_rad
 
 @njit(cache=True, nogil=True)
 def fill_point_labels(
-    points: NDArray[np.float32],
+    points: Points,
     pixel: NDArray[np.int32],
     index: NDArray[np.int32],
-    labels: NDArray[np.uint8],
+    labels: Labels,
     full_turn: bool,
     point_labels: NDArray[np.uint8],
 ) -> None:
@@ -408,7 +408,7 @@ def fill_point_labels(
 
 
 @njit(cache=True, nogil=True)
-def distance_to(points: NDArray[np.float32], i: int) -> float:
+def distance_to(points: Points, i: int) -> float:
     """Range of a point [m]."""
     x, y, z = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
     return math.sqrt(x * x + y * y + z * z)

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..errors import PointsError, SensorError
 from ..system.kernels import njit
-from ..types.points import as_points, read_only
+from ..types.points import Points, as_points, read_only
 from ..types.sensor import SensorProfile
 from .returns import returns
 
@@ -40,9 +40,7 @@ def condition(points: ArrayLike, sensor: SensorProfile, *, rendered: bool = True
     return scan, dropped.total + n_overflowed
 
 
-def scale(
-    points: NDArray[np.float32], sensor: SensorProfile, *, rendered: bool = True
-) -> tuple[NDArray[np.float32], int]:
+def scale(points: Points, sensor: SensorProfile, *, rendered: bool = True) -> tuple[NDArray[np.float32], int]:
     """Scale the remission of a scan, whose rows are finite or NaN, to 0..1.
 
     points : (n, 4) float32; from `edgeperc.preprocess.returns.returns`. Not modified.
@@ -65,7 +63,7 @@ def scale(
     return read_only(scan), n_overflowed
 
 
-def render(points: NDArray[np.float32], sensor: SensorProfile) -> NDArray[np.float32]:
+def render(points: Points, sensor: SensorProfile) -> NDArray[np.float32]:
     """Convert the remission to that of the sensor that the models were trained on, 0..1 (KUL-Seg 5).
 
     points : (n, 4) float32; x, y, z [m], remission in the sensor's raw unit. Not modified. Non-finite values stay
@@ -95,7 +93,7 @@ def render(points: NDArray[np.float32], sensor: SensorProfile) -> NDArray[np.flo
 
 @njit(cache=True, nogil=True)
 def fill_rendered(
-    points: NDArray[np.float32],
+    points: Points,
     kind: int,
     coefficients: NDArray[np.float64],
     offset: float,

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from ..errors import SensorError
 from ..types.frame import ModelFrame
 from ..types.mounting import MODEL_HEIGHT_M, Mounting
+from ..types.points import Points
 from ..types.sensor import EgoBox, SensorProfile
 from .returns import returns
 
@@ -100,7 +101,7 @@ def suggest_ego_box(scans: Iterable[NDArray[np.float32]], sensor: SensorProfile,
     return EgoSuggestion(((x0, x1), (y0, y1), (z0, z1)), len(places), int(np.count_nonzero(still)))
 
 
-def _place(moved: NDArray[np.float32], above_m: NDArray[np.float32]) -> frozenset[tuple[int, int]]:
+def _place(moved: Points, above_m: NDArray[np.float32]) -> frozenset[tuple[int, int]]:
     """Square meters around the vehicle on which something stands."""
     flat_m = np.hypot(moved[:, 0], moved[:, 1])
     standing = (flat_m > _AROUND_M[0]) & (flat_m < _AROUND_M[1])

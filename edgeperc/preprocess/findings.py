@@ -6,9 +6,9 @@ import math
 from collections.abc import Iterable
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..types.perception import DroppedPoints
+from ..types.points import Points
 from ..types.sensor import SensorProfile
 from .fitness import FitnessProfile, Measures, Range, measure
 
@@ -31,7 +31,7 @@ class Finding(str):
         return finding
 
 
-def check_fitness(points: NDArray[np.float32], profile: FitnessProfile, sensor: SensorProfile) -> tuple[Finding, ...]:
+def check_fitness(points: Points, profile: FitnessProfile, sensor: SensorProfile) -> tuple[Finding, ...]:
     """Describe how a scan differs from the scans that a model was trained on, and what to do about it.
 
     Margins are wide: the check finds gross mistakes (axes, units, remission scale, another sensor) and accepts ordinary
@@ -52,9 +52,7 @@ def check_fitness(points: NDArray[np.float32], profile: FitnessProfile, sensor: 
     return check_profiles(points, [profile], sensor)
 
 
-def check_profiles(
-    points: NDArray[np.float32], profiles: Iterable[FitnessProfile], sensor: SensorProfile
-) -> tuple[Finding, ...]:
+def check_profiles(points: Points, profiles: Iterable[FitnessProfile], sensor: SensorProfile) -> tuple[Finding, ...]:
     """Describe how a scan differs from the training scans of several models, each difference once.
 
     points, sensor : as in `check_fitness`.
@@ -94,7 +92,7 @@ _NEARLY_ALL = 10  # near points for each that is left; also empty beams may be m
 _USUAL_M = 9.0  # median distance in a street
 
 
-def check_dropped(points: NDArray[np.float32], dropped: DroppedPoints, sensor: SensorProfile) -> tuple[Finding, ...]:
+def check_dropped(points: Points, dropped: DroppedPoints, sensor: SensorProfile) -> tuple[Finding, ...]:
     """Describe a scan of which nearly all is nearer than the sensor measures: a street in another unit, or no returns.
 
     points : (n, 4) float32; the scan before anything was dropped.
@@ -223,7 +221,7 @@ def _upside_down(scan: Measures, profile: FitnessProfile) -> Finding | None:
 _ASYMMETRIC_DEG = 8.0  # of beams that tell up from down
 
 
-def check_beams(points: NDArray[np.float32], sensor: SensorProfile) -> tuple[Finding, ...]:
+def check_beams(points: Points, sensor: SensorProfile) -> tuple[Finding, ...]:
     """Describe a scan with its ground above, whose elevations are those of the sensor's beams with the opposite sign.
 
     points : (n, 4) float32; returns in the frame of the scan, before a mounting moves them.

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ..errors import CardError, PointsError
 from ..system.fields import Fields
 from ..system.kernels import njit
-from ..types.points import read_only
+from ..types.points import Points, read_only
 
 # About 6,000 points are enough. Steps are prime, so that they do not align with the rows of an organized scan.
 _STEPS = np.array([1, 2, 3, 5, 7, 11, 13, 17, 19, 23, 29, 31, 37, 41, 43, 53, 61, 71, 83, 97, 127, 167, 223, 307, 401])
@@ -88,7 +88,7 @@ class Rows(NamedTuple):
 
 @njit(cache=True, nogil=True)
 def fill_scan_sums(
-    points: NDArray[np.float32],
+    points: Points,
     step: int,
     beam_step: int,
     view: tuple[float, float],
@@ -118,7 +118,7 @@ def fill_scan_sums(
 
 @njit(cache=True, nogil=True)
 def fill_histograms(
-    points: NDArray[np.float32],
+    points: Points,
     step: int,
     view: tuple[float, float],
     histograms: Histograms,
@@ -197,7 +197,7 @@ def measure_sectors(
 
 
 @njit(cache=True, nogil=True)
-def road_ahead(points: NDArray[np.float32], step: int, ground: float, n: float) -> float:
+def road_ahead(points: Points, step: int, ground: float, n: float) -> float:
     """Logarithm of the ratio of obstacles at the sides to those ahead and behind, and how well they align with x.
 
     ground : its z [m].
@@ -230,7 +230,7 @@ def road_ahead(points: NDArray[np.float32], step: int, ground: float, n: float) 
 
 
 @njit(cache=True, nogil=True)
-def fill_rows(points: NDArray[np.float32], step: int, rows: Rows) -> None:
+def fill_rows(points: Points, step: int, rows: Rows) -> None:
     """Write the elevations in eight directions; see `Rows`."""
     elevations, counts = rows
     counts[:] = 0
@@ -295,7 +295,7 @@ def _quantile(histogram: NDArray[np.int64], share: float) -> float:
     return float(np.searchsorted(total, share * total[-1], side="right")) + 0.5
 
 
-def measure(points: NDArray[np.float32], azimuth_deg: tuple[float, float]) -> Measures | None:
+def measure(points: Points, azimuth_deg: tuple[float, float]) -> Measures | None:
     """Statistics of one scan; None if no point is finite."""
     if points.ndim != 2 or points.shape[1] != 4:
         raise PointsError(f"got an array of shape {points.shape}; expected (n, 4): x, y, z, remission")
@@ -348,7 +348,7 @@ def measure(points: NDArray[np.float32], azimuth_deg: tuple[float, float]) -> Me
     )
 
 
-def _enclosed(points: NDArray[np.float32]) -> float:
+def _enclosed(points: Points) -> float:
     """Share of the directions with points that end at a wall: the farthest points lie above one another."""
     x, y, z = points[np.isfinite(points).all(axis=1), :3].astype(np.float64).T
     sector = (np.floor((np.arctan2(y, x) / (2.0 * np.pi) + 0.5) * N_SECTORS)).astype(np.int64) % N_SECTORS

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from ..errors import PointsError
 from ..system.kernels import njit
 from ..types.mounting import MODEL_HEIGHT_M
+from ..types.points import Points
 from ..types.sensor import SensorProfile
 from ..types.views import RangeImageGeometry
 
@@ -65,9 +66,7 @@ class Interpolator:
         self.shape = (view.height, view.width)
         self.needed = bool(self._row_reach.any() or self._col_reach)
 
-    def fill(
-        self, points: NDArray[np.float32], index: NDArray[np.int32]
-    ) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
+    def fill(self, points: Points, index: NDArray[np.int32]) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
         """Interpolate points in the gaps of a range image.
 
         points : (n, 4) float32
@@ -96,7 +95,7 @@ class Interpolator:
 
 
 @njit(cache=True, nogil=True)
-def on_one_surface(points: NDArray[np.float32], i: int, j: int, ground_z: float) -> bool:
+def on_one_surface(points: Points, i: int, j: int, ground_z: float) -> bool:
     """Whether two neighboring returns lie on one surface, or both on the ground."""
     xi, yi, zi = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
     xj, yj, zj = np.float64(points[j, 0]), np.float64(points[j, 1]), np.float64(points[j, 2])
@@ -116,7 +115,7 @@ def on_one_surface(points: NDArray[np.float32], i: int, j: int, ground_z: float)
 
 @njit(cache=True, nogil=True)
 def fill_between(
-    points: NDArray[np.float32],
+    points: Points,
     n: int,
     index: NDArray[np.int32],
     row_slopes: NDArray[np.float64],

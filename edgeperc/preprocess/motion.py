@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..errors import EdgepercError, OptionError, PointsError, SensorError, StampError, TrackingError
 from ..system.kernels import njit
 from ..types.frame import fill_moved
-from ..types.points import as_points, read_only
+from ..types.points import Points, as_points, read_only
 from .returns import blank_too_near
 
 MAX_RATE = 1e4  # of m/s and rad/s
@@ -420,11 +420,11 @@ def _rigid(name: str, given: ArrayLike, error: type[EdgepercError]) -> NDArray[n
 
 @njit(cache=True, nogil=True)
 def fill_deskewed(
-    points: NDArray[np.float32],
+    points: Points,
     after_s: NDArray[np.float64],
     velocity: NDArray[np.float64],
     rate: NDArray[np.float64],
-    moved: NDArray[np.float32],
+    moved: Points,
 ) -> None:
     """Move points by the motion of the sensor (Rodrigues' formula for the turn and for its integral).
 

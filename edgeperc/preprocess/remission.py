@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import SensorError
+from ..types.points import Points
 from ..types.sensor import RemissionFunction, SensorProfile
 from .condition import scale
 from .findings import Finding
@@ -96,7 +97,7 @@ class RemissionMatcher:
         """Whether more scans do not change the function: five were used."""
         return self.n_scans >= FROZEN_AFTER
 
-    def add(self, points: NDArray[np.float32]) -> tuple[RemissionMatcher, SensorProfile, tuple[Finding, ...]]:
+    def add(self, points: Points) -> tuple[RemissionMatcher, SensorProfile, tuple[Finding, ...]]:
         """Use one more scan; this matcher does not change.
 
         Parameters
@@ -145,7 +146,7 @@ class RemissionMatcher:
         """The sensor that the models were trained on."""
         return NO_REMISSION.to if self.sensor.remission is None else self.sensor.remission.to
 
-    def _is_in_range(self, points: NDArray[np.float32]) -> bool:
+    def _is_in_range(self, points: Points) -> bool:
         """Whether the remission is in the profile's unit; `check_fitness` reports it if not."""
         with np.errstate(invalid="ignore"):  # a signaling NaN
             raw = points[:: max(1, len(points) // _SAMPLE), 3].astype(np.float64)
@@ -162,7 +163,7 @@ class RemissionMatcher:
     def _is_training_sensor(self) -> bool:
         return self.sensor.remission is None and self.sensor.name == self._to
 
-    def _is_usual(self, points: NDArray[np.float32]) -> bool:
+    def _is_usual(self, points: Points) -> bool:
         """Whether the sensor is the training sensor, and the remission of the scan distributed as in its scans."""
         if not self._is_training_sensor:
             return False
@@ -202,7 +203,7 @@ def quantile_difference(raw: NDArray[np.float64], wanted: NDArray[np.float64], s
     return float(np.abs(scale(points, sensor)[0][:, 3] - wanted).mean())
 
 
-def is_missing(points: NDArray[np.float32]) -> bool:
+def is_missing(points: Points) -> bool:
     """Whether all points, at least 300, have one remission: a constant, or 0 because there is no such field.
 
     Parameters

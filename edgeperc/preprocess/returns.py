@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ..system.kernels import njit
 from ..types.perception import DroppedPoints
-from ..types.points import read_only
+from ..types.points import Points, read_only
 from ..types.sensor import SensorProfile
 
 # A coordinate of float32 is off by at most 6e-8 of its size: a point at exactly the nearest range counts as near.
@@ -21,7 +21,7 @@ ROUNDING = 1e-6
 
 
 def returns(
-    points: NDArray[np.float32], sensor: SensorProfile, origin_m: tuple[float, float] | None = None
+    points: Points, sensor: SensorProfile, origin_m: tuple[float, float] | None = None
 ) -> tuple[NDArray[np.float32], DroppedPoints]:
     """Blank the rows of a scan that are not returns of the world.
 
@@ -42,7 +42,7 @@ def returns(
     return _with_remission(scan) if n_unknown else scan, dropped
 
 
-def blank_too_near(points: NDArray[np.float32], min_range_m: float) -> NDArray[np.float32]:
+def blank_too_near(points: Points, min_range_m: float) -> NDArray[np.float32]:
     """A scan (n, 4) in which rows at most ``min_range_m`` from its origin are NaN, read-only; see `returns`."""
     return _blanked(points, np.zeros(3), min_range_m, None)[0]
 
@@ -58,7 +58,7 @@ def about_too_near(dropped: DroppedPoints, n_points: int, sensor: SensorProfile)
     )
 
 
-def _with_remission(scan: NDArray[np.float32]) -> NDArray[np.float32]:
+def _with_remission(scan: Points) -> NDArray[np.float32]:
     """A copy whose rows with coordinates have a remission."""
     filled, known = scan.copy(), np.isfinite(scan[:, 3])
     median = np.median(scan[known, 3]) if known.any() else 0.0
@@ -67,7 +67,7 @@ def _with_remission(scan: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def _blanked(
-    points: NDArray[np.float32], origin: NDArray[np.float64], min_range_m: float, box: NDArray[np.float64] | None
+    points: Points, origin: NDArray[np.float64], min_range_m: float, box: NDArray[np.float64] | None
 ) -> tuple[NDArray[np.float32], DroppedPoints, int]:
     """The scan, what was dropped, and the number of other rows whose remission is not finite."""
     points = read_only(points)
@@ -102,7 +102,7 @@ def has_returns_only(values: NDArray[np.float32], square: np.float32) -> bool:
 
 @njit(cache=True, nogil=True)
 def fill_returns(
-    points: NDArray[np.float32],
+    points: Points,
     origin: NDArray[np.float64],
     square: float,
     box: NDArray[np.float64],

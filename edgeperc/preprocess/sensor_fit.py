@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import PointsError, SensorError
+from ..types.points import Points
 from ..types.sensor import REMISSION_KINDS, RemissionFunction, SensorProfile
 from .returns import returns
 
@@ -128,7 +129,7 @@ def fit_functions(
     return tuple(sorted(found, key=lambda function: function.rmse))
 
 
-def incidences(points: NDArray[np.float32], cell_m: float = 0.8) -> NDArray[np.float64]:
+def incidences(points: Points, cell_m: float = 0.8) -> NDArray[np.float64]:
     """Compute the cosine of the incidence, between each ray and the normal of the surface around its point.
 
     points : (n, 3 or more) float32; x, y, z [m] in the sensor frame.
@@ -165,7 +166,7 @@ def incidences(points: NDArray[np.float32], cell_m: float = 0.8) -> NDArray[np.f
 
 
 def stratify(
-    scan: NDArray[np.float32], n_points: int | None = None, cell_m: float = 0.8
+    scan: Points, n_points: int | None = None, cell_m: float = 0.8
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Find the stratum of each point, by range and incidence.
 

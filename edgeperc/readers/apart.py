@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import MissingExtraError, PointsError
+from ..types.points import Points
 from .tables import MAX_BYTES, MAX_SCAN_BYTES
 from .times import TimedScan
 from .worker import ALIVE, END, ERROR, FOUND, HEADER, MISSING, READY, SCAN, TIMES, WARNING
@@ -147,7 +148,7 @@ def _replies(
                 break
             continue
         if kind == SCAN and n_bytes % 16 == 0:
-            points: NDArray[np.float32] = np.empty((n_bytes // 16, 4), "<f4")
+            points: Points = np.empty((n_bytes // 16, 4), "<f4")
             if n_bytes and _fill(replies, points) < n_bytes:
                 break
             if times_s is not None and len(times_s) != len(points):

@@ -15,7 +15,7 @@ from ..errors import PointsError, SensorError
 from ..types.sensor import SENSORS, SensorProfile
 from .clouds import is_ouster_cloud
 from .ouster import check_metadata, metadata_beside, read_metadata
-from .packets import refuse_others, velodyne_packets
+from .packets import refuse_others, velodyne_packets, velodyne_senders
 
 _CHOICES = f"Pass its name, sensor= or --sensor: {', '.join(SENSORS)}; or a profile of your own, a .json file."
 
@@ -66,7 +66,8 @@ def of_packets(path: Path, topic: str | None = None) -> KnownSensor:
     topic : the serial number, if there is metadata of several Ouster sensors; the address of a Velodyne.
     Raises PointsError, SensorError.
     """
-    names = {_velodyne_name(packet) for packet in velodyne_packets(path, topic)}
+    sender = topic if topic in velodyne_senders(path) else None
+    names = {_velodyne_name(packet) for packet in velodyne_packets(path, sender)}
     if names:
         name = ", ".join(sorted(map(str, names)))
         if name in SENSORS:

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import PointsError
+from ..types.points import Points
 
 # Best first: of Ouster's and Velodyne's drivers, of Hesai's, RoboSense's and Livox', of others.
 _NAMES = ("t", "time", "timestamp", "timestamps", "time_stamp", "offset_time", "time_offset", "time_offset_ns")
@@ -47,7 +48,7 @@ class TimedScan(NamedTuple):
     """
 
     stamp_s: float | None
-    points: NDArray[np.float32]
+    points: Points
     times_s: NDArray[np.float64] | None
 
 
@@ -58,7 +59,7 @@ def time_name(names: Iterable[str]) -> str | None:
 
 
 def point_times(
-    fields: Mapping[str, NDArray[Any]], points: NDArray[np.float32], stamp_s: float | None
+    fields: Mapping[str, NDArray[Any]], points: Points, stamp_s: float | None
 ) -> NDArray[np.float64] | None:
     """Find the times of points in a scan's fields.
 
@@ -107,7 +108,7 @@ def _range(moments: NDArray[np.float64]) -> tuple[float, float]:
     return float(first), float(last)
 
 
-def _check_turn(xyz: NDArray[np.float32], shares: NDArray[np.float64], duration_s: float, name: str) -> None:
+def _check_turn(xyz: Points, shares: NDArray[np.float64], duration_s: float, name: str) -> None:
     """Raise PointsError if the azimuth turns once in these times, in a time that no LiDAR takes for a turn.
 
     shares : (n,); of the duration, 0 to 1.

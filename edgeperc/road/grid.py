@@ -21,7 +21,7 @@ from ..types.frame import ModelFrame, quaternion
 from ..types.geometry import draw_footprints
 from ..types.mounting import MODEL_HEIGHT_M, MODEL_MOUNTING, Mounting
 from ..types.perception import Perception, TopView
-from ..types.points import as_points, read_only
+from ..types.points import Heights, Points, as_points, read_only
 from ..types.sensor import SensorProfile, get_sensor
 from ..types.views import TopViewGeometry
 
@@ -58,7 +58,7 @@ class OccupancyGrid:
 
     drivable: NDArray[np.bool_]
     obstacle: NDArray[np.bool_]
-    height_m: NDArray[np.float32]
+    height_m: Heights
     observed: NDArray[np.bool_]
     cell_m: float
     x_range_m: tuple[float, float]
@@ -295,8 +295,8 @@ def _drivable(top_view: TopView | None, view: TopViewGeometry) -> NDArray[np.boo
 
 @njit(cache=True, nogil=True)
 def fill_standing(
-    points: NDArray[np.float32],
-    height_m: NDArray[np.float32],
+    points: Points,
+    height_m: Heights,
     corner: NDArray[np.float64],
     lowest: float,
     overhead: float,

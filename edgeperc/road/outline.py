@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..system.kernels import njit
+from ..types.points import Mask
 
 REACHES = (1.0, 1.25, 1.5, 2.0, 4.0, 8.0)
 """Factors of the tolerance that are tried in turn if the outline has too many corners."""
@@ -472,7 +473,7 @@ def mark_needed(
     not_removable: NDArray[np.int32],
     outer: int,
     enough: int,
-    kept: NDArray[np.bool_],
+    kept: Mask,
 ) -> None:
     """Remove corners of rings that neither touch nor cross; smallest triangles first.
 

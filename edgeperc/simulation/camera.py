@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..camera.calibration import Calibration
 from ..errors import CalibrationError
+from ..types.points import Labels
 from .raycast import FACADE, GLASS, LEAVES, PAINT, RETRO, Hits, Rays, fill_cast, fill_ground_kinds
 from .scene import Scene, SimulatedScan, place_shapes
 from .street import CAMERA_CLASSES
@@ -48,7 +49,7 @@ class CameraImage:
     """
 
     rgb: NDArray[np.uint8]
-    labels: NDArray[np.uint8]
+    labels: Labels
     depth_m: NDArray[np.float32]
 
 

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..system.kernels import njit
+from ..types.points import Labels, Points, Rows
 
 # A primitive is a row of float64: kind, material, remission, density, center (3), rows of the matrix that maps an
 # offset from the center into the unit shape (9), taper of the front, rear and sides (3), object. Below 0, the last is a
@@ -45,7 +46,7 @@ class Shapes(NamedTuple):
     primitives: NDArray[np.float64]  # (n, 20)
     bounds: NDArray[np.float64]  # (n, 5), from `fill_bounds`
     starts: NDArray[np.int64]  # (columns + 1,), where each column's list begins in `rows`
-    rows: NDArray[np.int32]  # rows of `primitives`
+    rows: Rows  # rows of `primitives`
 
 
 class Rays(NamedTuple):
@@ -61,7 +62,7 @@ class Hits(NamedTuple):
     """The first hit of each ray, (beams, columns)."""
 
     ranges: NDArray[np.float64]  # [m]; not finite: no return
-    rows: NDArray[np.int32]  # of the primitives, -1 for the ground, -2 for no hit
+    rows: Rows  # of the primitives, -1 for the ground, -2 for no hit
     exits: NDArray[np.float64]  # range at which the ray leaves the primitive [m]
     cosines: NDArray[np.float64]  # of the angle of incidence
 
@@ -180,7 +181,7 @@ def fill_drivable(
     T_world_sensor: NDArray[np.float64],
     x: NDArray[np.float64],
     y: NDArray[np.float64],
-    labels: NDArray[np.uint8],
+    labels: Labels,
 ) -> None:
     """Write 1 into ``labels`` (rows, columns) uint8 if a road surface is below the center of a cell, else 0."""
     T = T_world_sensor
@@ -308,7 +309,7 @@ def fill_column_counts(bounds: NDArray[np.float64], n_columns: int, reach: float
 
 @njit(cache=True, nogil=True)
 def fill_column_rows(
-    bounds: NDArray[np.float64], n_columns: int, reach: float, starts: NDArray[np.int64], rows: NDArray[np.int32]
+    bounds: NDArray[np.float64], n_columns: int, reach: float, starts: NDArray[np.int64], rows: Rows
 ) -> None:
     """Write the primitives of each column, in the order of ``bounds``, into ``rows`` (starts[-1],)."""
     ends = starts.copy()
@@ -633,7 +634,7 @@ def fill_points(
     rays: Rays,
     hits: Hits,
     receiver: Receiver,
-    points: NDArray[np.float32],
+    points: Points,
     objects: NDArray[np.int32],
 ) -> int:
     """Convert hits to returns, beam by beam.

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..errors import PointsError
 from ..types.geometry import draw_footprints, wrapped
 from ..types.perception import Box
+from ..types.points import Labels, Points
 from ..types.sensor import SensorProfile, get_sensor
 from ..types.views import TopViewGeometry
 from .raycast import (
@@ -143,8 +144,8 @@ class SimulatedScan:
     scene : Scene
     """
 
-    points: NDArray[np.float32]
-    labels: NDArray[np.uint8]
+    points: Points
+    labels: Labels
     objects: NDArray[np.int32]
     surfaces: NDArray[np.int32]
     boxes: tuple[Box, ...]

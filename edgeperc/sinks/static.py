@@ -7,13 +7,12 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..errors import OptionError, PointsError
 from ..records import PerceivedScan
 from ..system.atomic import write_atomic
 from ..tracking.moving import movable_points, moving_points
-from ..types.points import as_points
+from ..types.points import Mask, Points, as_points
 from .names import ScanFiles, stem_of
 
 __all__ = ["StaticSink"]
@@ -89,7 +88,7 @@ class StaticSink:
         """Do nothing; every file is complete."""
 
 
-def _content(points: NDArray[np.float32], kept: NDArray[np.bool_], suffix: str, source: str) -> bytes:
+def _content(points: Points, kept: Mask, suffix: str, source: str) -> bytes:
     rows = np.ascontiguousarray(points[kept], "<f4")
     if suffix == ".pcd.bin":
         whole = np.fromfile(source, "<f4")

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..system.kernels import njit
+from ..types.points import Mask
 from .jpda import Detections
 
 # Complete state of a track. The tracker replaces it as a whole, so a scan that raises an error changes nothing.
@@ -151,7 +152,7 @@ def mark_out_of_view(
 def fill_hidden(
     state: NDArray[np.float64],
     shape: NDArray[np.float64],
-    seen: NDArray[np.bool_],
+    seen: Mask,
     sensor: NDArray[np.float64],
     hidden: NDArray[np.float64],
 ) -> None:

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..errors import OptionError, PointsError
 from ..system.kernels import njit
 from ..types.perception import Box, Perception
-from ..types.points import as_points, read_only
+from ..types.points import Mask, Points, as_points, read_only
 from . import Track
 from .tracks import PARAMETERS
 
@@ -130,7 +130,7 @@ def movable_points(
     return found
 
 
-def _inside_any(boxes: list[Box], points: NDArray[np.float32], margin_m: float) -> NDArray[np.bool_]:
+def _inside_any(boxes: list[Box], points: Points, margin_m: float) -> NDArray[np.bool_]:
     if not 0.0 <= margin_m < math.inf:
         raise OptionError(f"margin_m is {margin_m}; expected 0 or more meters")
     rows = [
@@ -143,7 +143,7 @@ def _inside_any(boxes: list[Box], points: NDArray[np.float32], margin_m: float) 
 
 
 @njit(cache=True, nogil=True)
-def mark_in_boxes(boxes: NDArray[np.float64], points: NDArray[np.float32], inside: NDArray[np.bool_]) -> None:
+def mark_in_boxes(boxes: NDArray[np.float64], points: Points, inside: Mask) -> None:
     """Mark the points inside at least one box.
 
     boxes : (m, 8) float64, C-contiguous, read-only; x, y, z of the center, half length, half width, half height [m],

@@ -14,7 +14,7 @@ from ..errors import OptionError, PointsError
 from ..system.clock import elapsed_s
 from ..system.kernels import njit
 from ..types.perception import Box
-from ..types.points import read_only
+from ..types.points import Mask, read_only
 from . import Track, Tracks
 
 FARTHEST_M = 1e8
@@ -232,7 +232,7 @@ def _places(name: str, given: Any) -> NDArray[np.float64]:
 
 
 @njit(cache=True, nogil=True)
-def mark_inside(polygon: NDArray[np.float64], points: NDArray[np.float64], inside: NDArray[np.bool_]) -> None:
+def mark_inside(polygon: NDArray[np.float64], points: NDArray[np.float64], inside: Mask) -> None:
     """Mark the points from which a ray along y crosses the polygon an odd number of times.
 
     polygon : (k, 2) float64, C-contiguous, read-only

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from ..system.kernels import njit
 from .mounting import MODEL_HEIGHT_M, MODEL_MOUNTING, Mounting
 from .perception import Box
-from .points import read_only
+from .points import Points, read_only
 
 
 class ModelFrame:
@@ -44,7 +44,7 @@ class ModelFrame:
         self.t: NDArray[np.float64] = raised - self.R @ np.array([*mounting.origin_m, 0.0])
         self.is_identity = bool(np.allclose(self.R, np.eye(3), atol=1e-9) and np.allclose(self.t, 0.0, atol=1e-6))
 
-    def move(self, points: NDArray[np.float32]) -> NDArray[np.float32]:
+    def move(self, points: Points) -> NDArray[np.float32]:
         """Scan (n, 4) float32 in the models' frame, read-only; the same array if nothing moves."""
         if self.is_identity:
             return points
@@ -61,7 +61,7 @@ class ModelFrame:
         return tuple(boxes) if self.is_identity else _moved(boxes, self.R.T, -self.R.T @ self.t)
 
 
-def turned(points: NDArray[np.float32], angle_rad: float) -> NDArray[np.float32]:
+def turned(points: Points, angle_rad: float) -> NDArray[np.float32]:
     """Scan (n, 4) float32 as a sensor that is turned to the left by an angle sees it, read-only."""
     result = np.empty(points.shape, np.float32)
     fill_turned(read_only(points), np.float32(math.cos(angle_rad)), np.float32(math.sin(angle_rad)), result)
@@ -94,9 +94,7 @@ def _moved(boxes: Iterable[Box], R: NDArray[np.float64], t: NDArray[np.float64])
 
 
 @njit(cache=True, nogil=True)
-def fill_moved(
-    points: NDArray[np.float32], R: NDArray[np.float64], t: NDArray[np.float64], moved: NDArray[np.float32]
-) -> None:
+def fill_moved(points: Points, R: NDArray[np.float64], t: NDArray[np.float64], moved: Points) -> None:
     """Write ``R p + t`` of every point into ``moved`` (n, 4) float32, with its remission.
 
     points : (n, 4) float32, C-contiguous
@@ -112,7 +110,7 @@ def fill_moved(
 
 
 @njit(cache=True, nogil=True)
-def fill_turned(points: NDArray[np.float32], cos: np.float32, sin: np.float32, turned: NDArray[np.float32]) -> None:
+def fill_turned(points: Points, cos: np.float32, sin: np.float32, turned: NDArray[np.float32]) -> None:
     """Write the points, turned about the z axis in float32.
 
     points : (n, 4) float32, C-contiguous

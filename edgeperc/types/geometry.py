@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..errors import PointsError
 from ..system.kernels import njit
 from .perception import Box
-from .points import read_only
+from .points import Labels, Mask, read_only
 from .views import TopViewGeometry
 
 # A box as kernels take it.
@@ -59,9 +59,7 @@ def wrapped(angle: Angle) -> Angle:
     return (angle + math.pi) % (2.0 * math.pi) - math.pi
 
 
-def draw_footprints(
-    labels: NDArray[np.uint8], boxes: Iterable[Box], view: TopViewGeometry, classes: Sequence[str]
-) -> None:
+def draw_footprints(labels: Labels, boxes: Iterable[Box], view: TopViewGeometry, classes: Sequence[str]) -> None:
     """Draw the footprints of boxes over top-view labels, in place (SSADNet 3.1.2).
 
     A cell belongs to a box if its center lies in the footprint; the nearer of two boxes wins. Boxes of other classes
@@ -190,7 +188,7 @@ def _as_rectangles(given: ArrayLike) -> NDArray[np.float64]:
 
 
 @njit(cache=True, nogil=True)
-def fill_footprints(boxes: NDArray[np.void], grid: Grid, labels: NDArray[np.uint8]) -> None:
+def fill_footprints(boxes: NDArray[np.void], grid: Grid, labels: Labels) -> None:
     """Write the label of each `BOX`, (m,), into the cells whose centers lie in its footprint, one after the other.
 
     labels : (rows, columns) uint8, modified
@@ -244,9 +242,7 @@ def fill_oriented_iou(a: NDArray[np.float64], b: NDArray[np.float64], iou: NDArr
 
 
 @njit(cache=True, nogil=True)
-def mark_nms(
-    rectangles: NDArray[np.float64], limits: NDArray[np.float64], max_inside: float, keep: NDArray[np.bool_]
-) -> None:
+def mark_nms(rectangles: NDArray[np.float64], limits: NDArray[np.float64], max_inside: float, keep: Mask) -> None:
     """Mark the rectangles that overlap no better kept rectangle too much.
 
     rectangles : (n, 5) float64, C-contiguous; best first.

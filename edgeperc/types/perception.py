@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from ..errors import PointsError
 from ..system.fields import Fields
 from .mounting import MODEL_MOUNTING, Mounting
+from .points import Labels, Mask
 from .sensor import RemissionFunction
 from .views import TopViewGeometry
 
@@ -108,7 +109,7 @@ class TopView:
         (`edgeperc.ground.observed.Observation`). A `Perceiver` knows them. None: no cell is known to be one.
     """
 
-    labels: NDArray[np.uint8]
+    labels: Labels
     classes: tuple[str, ...]
     cell_m: float
     x_range_m: tuple[float, float]
@@ -157,8 +158,8 @@ class PointLabels:
     classes : tuple of str
     """
 
-    labels: NDArray[np.uint8]
-    in_view: NDArray[np.bool_]
+    labels: Labels
+    in_view: Mask
     classes: tuple[str, ...]
 
     def counts(self) -> dict[str, int]:
@@ -179,7 +180,7 @@ class ImageLabels:
     classes : tuple of str
     """
 
-    labels: NDArray[np.uint8]
+    labels: Labels
     classes: tuple[str, ...]
 
     @property

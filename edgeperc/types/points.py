@@ -11,6 +11,14 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from ..errors import OptionError, PointsError
 
+# Arrays by what they hold; n points.
+Points = NDArray[np.float32]  # (n, 4): x, y, z [m], remission
+Heights = NDArray[np.float32]  # (n,): above the ground below [m]; NaN for points that are not finite
+Labels = NDArray[np.uint8]  # (n,) or (rows, columns): index of a class
+Mask = NDArray[np.bool_]  # (n,)
+Rows = NDArray[np.int32]  # (m,): of some points in a scan
+Ids = NDArray[np.int32]  # (n,): cluster of each point; -1 for none
+
 # Best first; of an Ouster's fields, "intensity" is the raw signal and "reflectivity" the calibrated byte.
 _REMISSION_NAMES = ("remission", "intensity", "i", "reflectivity", "reflectance")
 

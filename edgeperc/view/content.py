@@ -17,6 +17,7 @@ from ..system.printable import printable
 from ..types.frame import ModelFrame
 from ..types.mounting import MODEL_HEIGHT_M, MODEL_MOUNTING
 from ..types.perception import Box, ImageLabels, Perception
+from ..types.points import Points
 from .colors import CLASS_COLORS
 
 if TYPE_CHECKING:
@@ -30,7 +31,7 @@ EDGES = ((0, 1), (1, 2), (2, 3), (3, 0), (4, 5), (5, 6), (6, 7), (7, 4), (0, 4),
 """Pairs of `box_corners`: the edges of a box."""
 
 
-def check_points(points: NDArray[np.float32], perception: Perception) -> None:
+def check_points(points: Points, perception: Perception) -> None:
     """Raise `PointsError` if ``points`` has a wrong shape or another number of points than the perceived scan."""
     if points.ndim != 2 or points.shape[1] != 4:
         raise PointsError(f"points have shape {points.shape}; expected (n, 4): x, y, z, remission")
@@ -49,7 +50,7 @@ def perceived_image(image: ArrayLike, perception: Perception) -> tuple[NDArray[n
     return image, labels
 
 
-def in_model_frame(perception: Perception, points: NDArray[np.float32]) -> tuple[Perception, NDArray[np.float32]]:
+def in_model_frame(perception: Perception, points: Points) -> tuple[Perception, NDArray[np.float32]]:
     """The perception with its boxes, and its scan, in the frame of the models, where the top view lies."""
     frame = ModelFrame(perception.mounting)
     if frame.is_identity:
@@ -61,7 +62,7 @@ def in_model_frame(perception: Perception, points: NDArray[np.float32]) -> tuple
     return replace(perception, boxes=boxes, top_view=top_view, mounting=MODEL_MOUNTING), frame.move(points)
 
 
-def drawable_points(points: NDArray[np.float32]) -> NDArray[np.bool_]:
+def drawable_points(points: Points) -> NDArray[np.bool_]:
     """Which points are finite and within 1 km, (n,) bool."""
     return np.asarray(np.isfinite(points).all(axis=1) & (np.abs(points[:, :3]) < _REACH_M).all(axis=1))
 
@@ -77,7 +78,7 @@ def drawable_boxes(boxes: Iterable[Box]) -> list[Box]:
     ]
 
 
-def paint_points(points: NDArray[np.float32], perception: Perception) -> tuple[list[str], NDArray[np.uint8]]:
+def paint_points(points: Points, perception: Perception) -> tuple[list[str], NDArray[np.uint8]]:
     """Choose the class to show for every point.
 
     points : (n, 4) float32
@@ -110,7 +111,7 @@ def paint_points(points: NDArray[np.float32], perception: Perception) -> tuple[l
     return names, painted
 
 
-def ground_plane(perception: Perception, points: NDArray[np.float32]) -> tuple[float, float, float]:
+def ground_plane(perception: Perception, points: Points) -> tuple[float, float, float]:
     """The plane that a picture is drawn on: z = a + b x + c y [m], in the frame of the models.
 
     points : (n, 4) float32; the scan, in that frame, for a perception without ground.

@@ -5,11 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..errors import PointsError
 from ..system.atomic import write_atomic
 from ..types.perception import Perception
+from ..types.points import Points
 from .colors import color_of, rgb
 from .content import check_points
 
@@ -26,7 +26,7 @@ SEMANTICKITTI_IDS = {
 _OTHER_ID = 99
 
 
-def write_ply(perception: Perception, points: NDArray[np.float32], path: str | Path) -> None:
+def write_ply(perception: Perception, points: Points, path: str | Path) -> None:
     """Write the labeled scan as a binary PLY file.
 
     One row per input point, in input order: x, y, z, remission (float), label, red, green, blue (uchar). Comments in

@@ -20,6 +20,7 @@ from ..system.atomic import open_atomic
 from ..system.printable import printable
 from ..types.frame import ModelFrame
 from ..types.perception import Box, Perception, TopView
+from ..types.points import Points
 from .colors import HIGH, LOW, color_of
 from .content import (
     box_corners,
@@ -46,7 +47,7 @@ _SHORTEST_S, _LONGEST_S = 0.001, 1.0
 _MOST_WARNINGS = 5
 
 
-def write_html(perception: Perception, points: NDArray[np.float32], path: str | Path, *, title: str = "") -> None:
+def write_html(perception: Perception, points: Points, path: str | Path, *, title: str = "") -> None:
     """Write an interactive 3-D page for a browser. It needs no network.
 
     Parameters
@@ -121,7 +122,7 @@ class DrivePage:
     def add(
         self,
         perception: Perception,
-        points: NDArray[np.float32],
+        points: Points,
         stamp_s: float,
         tracks: Tracks | None = None,
         *,
@@ -218,7 +219,7 @@ class _Thin:
         return self.text[:-1] + "".join(f', "{key}": "{_base64(part)}"' for key, part in parts.items()) + "}"
 
 
-def _sample(xyz: NDArray[np.float32], label: NDArray[np.uint8], names: list[str], n: int) -> NDArray[np.intp]:
+def _sample(xyz: Points, label: NDArray[np.uint8], names: list[str], n: int) -> NDArray[np.intp]:
     """Indices of at most ``n`` points, drawn without replacement; the first k of them are such a sample of k points."""
     objects = np.array([name not in ("background", "drivable") for name in names])
     # A scan is denser near the sensor, by about the square of the distance.
@@ -230,7 +231,7 @@ def _sample(xyz: NDArray[np.float32], label: NDArray[np.uint8], names: list[str]
 
 
 def _scan(
-    perception: Perception, points: NDArray[np.float32], classes: dict[str, int], tracks: Tracks | None = None
+    perception: Perception, points: Points, classes: dict[str, int], tracks: Tracks | None = None
 ) -> tuple[dict[str, Any], NDArray[np.float32], NDArray[np.uint8], NDArray[np.uint8]]:
     """What the page shows of a scan, and its points: x, y, z, remission and class; new classes get the next numbers."""
     facts = class_facts(perception)

@@ -13,6 +13,7 @@ from ..camera.calibration import Calibration
 from ..camera.painting import UNSEEN, camera_road, paint
 from ..types.frame import ModelFrame
 from ..types.perception import Box, Perception, TopView
+from ..types.points import Labels, Points
 from ..types.sensor import SensorProfile
 from .canvas import add_axes, as_png, draw_legend, height_of_legend, new_figure, shorten, write_at, write_heading
 from .colors import FAINT, INK, color_of, rgb
@@ -27,7 +28,7 @@ _BESIDE_M, _BEHIND_M, _BEYOND_M = 4.0, 8.0, 2.0  # of the panel from above, outs
 def draw_painted(
     perception: Perception,
     image: NDArray[np.uint8],
-    points: NDArray[np.float32],
+    points: Points,
     calibration: Calibration,
     path: str | Path | None = None,
     *,
@@ -107,7 +108,7 @@ def _draw_image(
     place: tuple[float, float, float, float],
     image: NDArray[np.uint8],
     colors: NDArray[np.float64],
-    labels: NDArray[np.uint8],
+    labels: Labels,
 ) -> None:
     write_heading(figure, place[0], place[1] - 20, "the camera", "a class for every pixel")
     known = labels < len(colors)
@@ -120,10 +121,10 @@ def _draw_points(
     figure: Any,
     place: tuple[float, float, float, float],
     image: NDArray[np.uint8],
-    points: NDArray[np.float32],
+    points: Points,
     calibration: Calibration,
     colors: NDArray[np.float64],
-    painted: NDArray[np.uint8],
+    painted: Labels,
 ) -> None:
     more = "in the colors of their pixels; black: hidden or no class"
     write_heading(figure, place[0], place[1] - 20, "the points in the image", more)
@@ -143,11 +144,11 @@ def _draw_points(
 def _draw_from_above(
     figure: Any,
     room: tuple[float, float, float, float],
-    points: NDArray[np.float32],
+    points: Points,
     road: TopView,
     boxes: tuple[Box, ...],
     colors: NDArray[np.float64],
-    painted: NDArray[np.uint8],
+    painted: Labels,
 ) -> None:
     from matplotlib.patches import Polygon
 

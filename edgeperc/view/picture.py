@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from ..road.ahead import FreeAhead, RoadAhead, road_ahead
 from ..types.perception import Box, Perception, TopView
+from ..types.points import Labels, Points
 from .canvas import (
     Label,
     add_axes,
@@ -49,9 +50,7 @@ _NEAR_M = 1.0
 _HALF_STRIP_M = 1.0
 
 
-def draw(
-    perception: Perception, points: NDArray[np.float32], path: str | Path | None = None, *, title: str = ""
-) -> bytes:
+def draw(perception: Perception, points: Points, path: str | Path | None = None, *, title: str = "") -> bytes:
     """Draw a scan and what was perceived in it.
 
     Parameters
@@ -196,7 +195,7 @@ def _strip(ahead: FreeAhead, x_near: float) -> tuple[str, NDArray[np.float64] | 
 
 def _draw_top_view(
     figure: Any,
-    points: NDArray[np.float32],
+    points: Points,
     top_view: TopView,
     road: RoadAhead,
     boxes: Sequence[Box],
@@ -283,9 +282,9 @@ def _omitted(text: str, n_omitted: int) -> str:
 def _draw_range_image(
     figure: Any,
     place: tuple[float, float, float, float],
-    points: NDArray[np.float32],
+    points: Points,
     names: list[str],
-    painted: NDArray[np.uint8],
+    painted: Labels,
 ) -> None:
     """Draw the quarter turn ahead as a range image. It is only a picture, not the projection of a network."""
     axes = add_axes(figure, *place)
@@ -328,9 +327,9 @@ def _draw_range_image(
 def _draw_from_behind(
     figure: Any,
     place: tuple[float, float, float, float],
-    points: NDArray[np.float32],
+    points: Points,
     names: list[str],
-    painted: NDArray[np.uint8],
+    painted: Labels,
     top_view: TopView | None,
     road: RoadAhead | None,
     boxes: Sequence[Box],

@@ -20,6 +20,7 @@ from ..system.clock import elapsed_s
 from ..system.extras import require
 from ..types.frame import ModelFrame
 from ..types.perception import Perception
+from ..types.points import Points
 from .canvas import free_place
 from .colors import CLASS_COLORS, FAINT, FRAME, GROUND, HIGH, INK, LOW, PANEL, color_of, rgb
 from .content import drawable_boxes, drawable_points, paint_points
@@ -37,7 +38,7 @@ _ROAD, _POINT, _CLASS = 1, 2, 5
 _OTHER = _CLASS + len(CLASS_COLORS)
 
 
-def flatten_scan(points: NDArray[np.float32], perception: Perception | None = None) -> bytes:
+def flatten_scan(points: Points, perception: Perception | None = None) -> bytes:
     """Reduce a scan to the image that `draw_tracks` shows under the tracks, about 20 kB.
 
     Parameters
@@ -85,7 +86,7 @@ def flatten_scan(points: NDArray[np.float32], perception: Perception | None = No
     return zlib.compress(image.tobytes(), 1)
 
 
-def _heights(points: NDArray[np.float32], perception: Perception | None) -> NDArray[np.float32]:
+def _heights(points: Points, perception: Perception | None) -> NDArray[np.float32]:
     """Heights above the ground [m]."""
     if perception is None:
         return find_ground(points).height_m

@@ -357,7 +357,7 @@ def capture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A capture of three scans, cut short; the second of them makes the perceiver choke."""
     path = write_pcap(tmp_path / "drive.pcap", vlp16_packets(0.1))
 
-    def read_scans(source: Path, topic: str | None = None) -> Iterator[tuple[float, np.ndarray]]:
+    def read_scans(source: Path, topic: str | None = None, **_: object) -> Iterator[tuple[float, np.ndarray]]:
         if source != path:
             yield from real(source, topic=topic)
             return
@@ -414,7 +414,7 @@ def test_every_scan_is_answered_whatever_the_clock_does(
 ) -> None:
     path = write_pcap(tmp_path / "drive.pcap", vlp16_packets(0.1))
 
-    def read(source: Path, topic: str | None = None) -> Iterator[tuple[float, np.ndarray]]:
+    def read(source: Path, topic: str | None = None, **_: object) -> Iterator[tuple[float, np.ndarray]]:
         return ((wrong(k), np.full((10, 4), 0.5, np.float32)) for k in range(10))
 
     for module in ("edgeperc.readers.captures", "edgeperc.live"):
@@ -434,12 +434,12 @@ def test_every_scan_is_answered_whatever_the_clock_does(
 def test_a_missing_reader_is_said_at_once(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    (tmp_path / "drive.bag").write_bytes(b"#ROSBAG V2.0\n")
+    (tmp_path / "frames.osf").write_bytes(bytes(8) + b"OSF#" + bytes(8))
     (tmp_path / "absent").mkdir()
-    (tmp_path / "absent" / "rosbags.py").write_text("raise ImportError('not installed')\n")
+    (tmp_path / "absent" / "ouster.py").write_text("raise ImportError('not installed')\n")
     monkeypatch.syspath_prepend(tmp_path / "absent")  # the process that decodes captures has this process's path
-    assert run("run", tmp_path / "drive.bag") == 2
-    assert "pip install 'edgeperc[ros]'" in capsys.readouterr().err
+    assert run("run", tmp_path / "frames.osf") == 2
+    assert "pip install 'edgeperc[ouster]'" in capsys.readouterr().err
 
 
 def test_live(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

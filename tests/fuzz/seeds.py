@@ -146,6 +146,7 @@ def scan_files() -> dict[str, bytes]:
         "a.pcd": (pcd + "ascii\n" + text).encode(), "b.pcd": (pcd + "binary\n").encode() + points.tobytes(),
         "c.pcd": (pcd + "binary_compressed\n").encode() + compressed,
         "a.ply": (ply.format("ascii") + text).encode(),
+        "a.xyz": text.encode(), "a.csv": b"x,y,z,intensity\n" + text.replace(" ", ",").encode(),
         "b.ply": ply.format("binary_little_endian").encode() + points.tobytes(),
         "c.ply": ply.format("binary_big_endian").encode() + points.astype(">f4").tobytes(),
     }  # fmt: skip

@@ -1,1 +1,0 @@
-"""Kernels that were compiled when this package was built."""
