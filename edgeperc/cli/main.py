@@ -8,7 +8,6 @@ terminated.
 from __future__ import annotations
 
 import argparse
-import re
 import shlex
 import sys
 from collections.abc import Sequence
@@ -18,26 +17,8 @@ from .. import __version__
 from ..errors import EdgepercError
 from . import completion, demo, doctor, fit_sensor, info, lists, ros2, run
 from .evaluation import painting, scans, sensors, tracking
+from .output import in_options
 from .program import Parser, run_program
-
-# Arguments of the library and the options that set them.
-_OPTIONS = {
-    "agree": "--no-agreement",
-    "adapt": "--adapt",
-    "boxes_from": "--boxes-from",
-    "fold": "--fold",
-    "full_turn": "--full-turn",
-    "models": "--model",
-    "n_threads": "--threads",
-    "on_mismatch": "--on-mismatch",
-    "precision": "--precision",
-    "provider": "--provider",
-    "rate_hz": "--rate",
-    "road_by": "--road-by",
-    "sensor": "--sensor",
-    "split": "--split",
-    "topic": "--topic",
-}
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -81,14 +62,3 @@ def build_parser() -> argparse.ArgumentParser:
     for module in (demo, run, ros2, info, doctor, lists, *evaluations, fit_sensor, completion):
         module.add_parser(commands)
     return parser
-
-
-def in_options(message: str) -> str:
-    """Replace the library's argument names in a message by command-line options.
-
-    ``provider 'cuda' is ...``, ``n_threads is 0`` and ``precision="bf16"`` become ``--provider 'cuda' is ...``,
-    ``--threads is 0`` and ``--precision bf16``. The same word elsewhere in a sentence is not changed.
-    """
-    names = "|".join(_OPTIONS)
-    message = re.sub(rf"(?<![\w-])({names})=(['\"]?)([\w.:-]+)\2", lambda m: f"{_OPTIONS[m[1]]} {m[3]}", message)
-    return re.sub(rf"(?<![\w-])({names})(?= is | are | '| \[)", lambda m: _OPTIONS[m[1]], message)

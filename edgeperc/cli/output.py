@@ -7,6 +7,7 @@ import contextlib
 import json
 import math
 import os
+import re
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from importlib import import_module
@@ -36,6 +37,40 @@ def print_line(text: str, file: TextIO | None = None, *, gray: bool = False) -> 
         shown = f"\x1b[90m{shown}\x1b[0m"
     with contextlib.nullcontext() if tqdm is None else tqdm.external_write_mode(sys.stdout):
         print(shown, file=file, flush=True)
+
+
+# Arguments of the library and the options that set them.
+_OPTIONS = {
+    "agree": "--no-agreement",
+    "adapt": "--adapt",
+    "boxes_from": "--boxes-from",
+    "fold": "--fold",
+    "full_turn": "--full-turn",
+    "models": "--model",
+    "n_threads": "--threads",
+    "on_mismatch": "--on-mismatch",
+    "precision": "--precision",
+    "provider": "--provider",
+    "rate_hz": "--rate",
+    "road_by": "--road-by",
+    "sensor": "--sensor",
+    "split": "--split",
+    "topic": "--topic",
+}
+
+
+def in_options(message: str) -> str:
+    """Replace the library's argument names in a message by command-line options.
+
+    ``provider 'cuda' is ...``, ``n_threads is 0`` and ``precision="bf16"`` become ``--provider 'cuda' is ...``,
+    ``--threads is 0`` and ``--precision bf16``; an option that a message has in parentheses stands alone. The same word
+    elsewhere in a sentence is not changed.
+    """
+    names = "|".join(_OPTIONS)
+    message = re.sub(r"pass \w+=\S* \(on the command line ([^)]*)\)", r"pass \1", message)
+    message = re.sub(rf"(?<![\w-])({names})= ", lambda m: f"{_OPTIONS[m[1]]} ", message)
+    message = re.sub(rf"(?<![\w-])({names})=(['\"]?)([\w.:-]+)\2", lambda m: f"{_OPTIONS[m[1]]} {m[3]}", message)
+    return re.sub(rf"(?<![\w-])({names})(?= is | are | '| \[)", lambda m: _OPTIONS[m[1]], message)
 
 
 def print_error(text: object, program: str = "edgeperc") -> None:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import argparse
 import json
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import MissingExtraError
 from ..system.remote import Remote
-from .output import many, one_line, print_error, print_line
+from .output import in_options, many, one_line, print_error, print_line
 
 if TYPE_CHECKING:
     from ..live import Answer
@@ -32,6 +33,7 @@ class Report:
         self.tracks: list[Tracks] = []
         self.under: list[bytes] = []
         self._json = arguments.json
+        self._reported: dict[str, Path | Remote] = {}
 
     def add(
         self,
@@ -54,7 +56,9 @@ class Report:
         self.n += 1
         if error is not None:
             self.n_failed += 1
-            print_error(f"{source}: {error}")
+            said = in_options(error)
+            first = self._reported.setdefault(re.sub(r"[-+\d.]+", "", said), source)  # whatever the numbers
+            print_error(f"{source}: {said}" if first is source else f"{source}: the same as {first}")
         if text:
             print_line(text)
 

@@ -32,6 +32,7 @@ from edgeperc.errors import InferenceError, ModelFileError, OptionError, PointsE
 from edgeperc.evaluation.judge import Perceiving
 from edgeperc.inference import providers, session
 from edgeperc.readers import captures
+from edgeperc.simulation.samples import simulated_scan
 from edgeperc.types.perception import Box, Perception, PointLabels, TopView
 from scenes import Terminal
 
@@ -856,11 +857,27 @@ def test_mistyped_words_name_the_nearest(words: list[str], new: str, capsys: pyt
             "the sensor gives no remission; the provider's choice",
             "the sensor gives no remission; the provider's choice",
         ),
+        ("pass sensor= a profile whose range is (0, 255)", "pass --sensor a profile whose range is (0, 255)"),
+        ('pass on_mismatch="warn" (on the command line --anyway).', "pass --anyway."),
+        ("pass mounting= (on the command line --mount-height or --extrinsic).", "pass --mount-height or --extrinsic."),
         ("--provider 'x' is given; no sensor 'y' is built in", "--provider 'x' is given; no --sensor 'y' is built in"),
     ],
 )
 def test_messages_name_options(message: str, expected: str) -> None:
     assert in_options(message) == expected
+
+
+def test_one_reason_is_written_out_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    points = simulated_scan(1, "hdl-64e").points
+    for k in range(3):
+        (points * np.float32([1, 1, 1, 200 + k])).tofile(tmp_path / f"{k}.bin")
+    assert run("run", tmp_path, "--model", "pointseg") == 1
+    lines = capsys.readouterr().err.splitlines()
+    assert "pass --sensor" in lines[0]
+    assert "sensor=" not in lines[0]
+    assert [line.partition(": ")[2] for line in lines[1:3]] == [
+        f"{tmp_path / f'{k}.bin'}: the same as {tmp_path / '0.bin'}" for k in (1, 2)
+    ]
 
 
 def test_python_m_edgeperc() -> None:
