@@ -870,11 +870,11 @@ def test_messages_name_options(message: str, expected: str) -> None:
 def test_one_reason_is_written_out_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     points = simulated_scan(1, "hdl-64e").points
     for k in range(3):
-        (points * np.float32([1, 1, 1, 200 + k])).tofile(tmp_path / f"{k}.bin")
+        (points * np.float32([1000 + k, 1000, 1000, 1])).tofile(tmp_path / f"{k}.bin")  # millimeters
     assert run("run", tmp_path, "--model", "pointseg") == 1
     lines = capsys.readouterr().err.splitlines()
-    assert "pass --sensor" in lines[0]
-    assert "sensor=" not in lines[0]
+    assert "--anyway" in lines[0]
+    assert "on_mismatch=" not in lines[0]
     assert [line.partition(": ")[2] for line in lines[1:3]] == [
         f"{tmp_path / f'{k}.bin'}: the same as {tmp_path / '0.bin'}" for k in (1, 2)
     ]
