@@ -27,12 +27,12 @@ from edgeperc.cli.arguments import PRECISIONS, PROVIDERS
 from edgeperc.cli.evaluation.scans import figure_lines
 from edgeperc.cli.main import build_parser, in_options
 from edgeperc.cli.output import print_line, progress
+from edgeperc.cli.report import Report
 from edgeperc.cli.scans import find_scans, output_names
 from edgeperc.errors import InferenceError, ModelFileError, OptionError, PointsError
 from edgeperc.evaluation.judge import Perceiving
 from edgeperc.inference import providers, session
 from edgeperc.readers import captures
-from edgeperc.simulation.samples import simulated_scan
 from edgeperc.types.perception import Box, Perception, PointLabels, TopView
 from scenes import Terminal
 
@@ -867,17 +867,18 @@ def test_messages_name_options(message: str, expected: str) -> None:
     assert in_options(message) == expected
 
 
-def test_one_reason_is_written_out_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    points = simulated_scan(1, "hdl-64e").points
-    for k in range(3):
-        (points * np.float32([1000 + k, 1000, 1000, 1])).tofile(tmp_path / f"{k}.bin")  # millimeters
-    assert run("run", tmp_path, "--model", "pointseg") == 1
-    lines = capsys.readouterr().err.splitlines()
-    assert "--anyway" in lines[0]
-    assert "on_mismatch=" not in lines[0]
-    assert [line.partition(": ")[2] for line in lines[1:3]] == [
-        f"{tmp_path / f'{k}.bin'}: the same as {tmp_path / '0.bin'}" for k in (1, 2)
+def test_one_reason_is_written_out_once(capsys: pytest.CaptureFixture[str]) -> None:
+    report = Report(argparse.Namespace(json=False), {})
+    for k, error in enumerate(
+        ("farther than 12.5 m: pass sensor= a profile", "farther than 9 m: pass sensor= a profile", "x")
+    ):
+        report.add(Path(f"{k}.bin"), PointsError(error))
+    assert capsys.readouterr().err.splitlines() == [
+        "edgeperc: 0.bin: farther than 12.5 m: pass --sensor a profile",
+        "edgeperc: 1.bin: the same as 0.bin",
+        "edgeperc: 2.bin: x",
     ]
+    assert report.n_failed == 3
 
 
 def test_python_m_edgeperc() -> None:
