@@ -338,7 +338,7 @@ def _stamped(scan: Any) -> tuple[Any, float | None]:
         return scan, None
     try:
         stamp_s, points = scan
-        return points, None if stamp_s is None else float(stamp_s)
+        return points, stamp_s if stamp_s is None or isinstance(stamp_s, float) else float(stamp_s)
     except (TypeError, ValueError) as exc:
         raise PointsError(f"got a tuple that is not a scan ({exc}); expected points or (stamp_s, points)") from exc
 

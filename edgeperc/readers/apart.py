@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import MissingExtraError, PointsError
+from ..system.clock import Stamp
 from ..types.points import Points
 from .tables import MAX_BYTES, MAX_SCAN_BYTES
 from .times import TimedScan
@@ -138,7 +139,7 @@ def _replies(
         header = replies.read(HEADER.size)
         if len(header) < HEADER.size:
             break
-        kind, stamp, n_bytes = HEADER.unpack(header)
+        kind, stamp, stamp_ns, n_bytes = HEADER.unpack(header)
         known = kind in (ALIVE, END, ERROR, FOUND, MISSING, READY, SCAN, TIMES, WARNING)
         if not known or not 0 <= n_bytes <= (MAX_SCAN_BYTES if kind in (SCAN, TIMES) else _MOST_TEXT_BYTES):
             break
@@ -155,7 +156,8 @@ def _replies(
                 break
             n_scans += 1
             watch.since_s = None
-            yield TimedScan(None if np.isnan(stamp) else stamp, points, times_s)
+            stamp_s = stamp if stamp_ns < 0 else Stamp(stamp, stamp_ns)
+            yield TimedScan(None if np.isnan(stamp) else stamp_s, points, times_s)
             times_s = None
             continue
         text = replies.read(n_bytes)

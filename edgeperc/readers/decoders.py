@@ -11,6 +11,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from ..errors import MissingExtraError, PointsError
+from ..system.clock import Stamp
 from ..system.extras import require
 from ..types.points import as_points, table_columns
 from .bags import BagFile, open_bag
@@ -228,7 +229,8 @@ def _clouds(path: Path, topic: str | None, alive: Callable[[], None]) -> Iterato
                 )
             n_scans += 1
             stamp = message.header.stamp
-            yield chosen, message, (stamp.sec + 1e-9 * stamp.nanosec) or 1e-9 * recorded_ns
+            stamp_s, stamp_ns = stamp.sec + 1e-9 * stamp.nanosec, 10**9 * stamp.sec + stamp.nanosec
+            yield chosen, message, Stamp(stamp_s, stamp_ns) if stamp_ns else Stamp(1e-9 * recorded_ns, recorded_ns)
         if not n_scans:
             seen = f" with frame {frame!r}, only {', '.join(frames)}" if frames else ""
             raise PointsError(f"topic {chosen} has no message{seen}; expected point clouds")

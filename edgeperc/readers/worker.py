@@ -19,7 +19,7 @@ from ..errors import MissingExtraError, PointsError
 from .decoders import decode, describe
 from .tables import MAX_BYTES, MAX_SCAN_BYTES
 
-HEADER = struct.Struct("<cdq")
+HEADER = struct.Struct("<cdqq")  # kind, stamp [s], the same [ns] or -1, bytes
 ALIVE, END, ERROR, FOUND, MISSING, READY, SCAN, TIMES, WARNING = b"A", b"Z", b"E", b"F", b"M", b"R", b"S", b"T", b"W"
 
 
@@ -36,7 +36,7 @@ def main() -> None:
     with suppress(BrokenPipeError):  # the reader has gone
 
         def reply(kind: bytes, content: memoryview | bytes = b"", stamp: float = np.nan) -> None:
-            for part in (HEADER.pack(kind, stamp, len(content)), content):
+            for part in (HEADER.pack(kind, stamp, getattr(stamp, "ns", -1), len(content)), content):
                 view = memoryview(part)
                 while len(view):
                     view = view[replies.write(view) :]

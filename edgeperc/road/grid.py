@@ -16,6 +16,7 @@ from ..ground.observed import OVERHEAD_M, Observer
 from ..ground.planes import find_ground, heights_above
 from ..preprocess.returns import returns
 from ..system.atomic import write_atomic
+from ..system.clock import nanoseconds_of
 from ..system.kernels import njit
 from ..types.frame import ModelFrame, quaternion
 from ..types.geometry import draw_footprints
@@ -119,7 +120,7 @@ class OccupancyGrid:
             ``off_road`` is out of its range.
         """
         values = self.values(off_road)
-        nanoseconds = round((self.stamp_s or 0.0) * 1e9)
+        nanoseconds = nanoseconds_of(self.stamp_s or 0.0)
         stamp = {"sec": nanoseconds // 10**9, "nanosec": nanoseconds % 10**9}
         frame = ModelFrame(self.mounting)
         R, t = (np.eye(3), np.zeros(3)) if frame.is_identity else (frame.R, frame.t)

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from ..errors import OptionError, PointsError
 from ..road.grid import OCCUPIED, occupancy_grid
+from ..system.clock import nanoseconds_of
 from ..system.extras import require
 from ..system.names import check_text
 from ..types.points import as_points
@@ -65,7 +66,7 @@ _MOVING_MPS = 0.5  # slower tracks get no arrow
 
 
 def nanoseconds(stamp_s: float) -> int:
-    """A time [s] in whole nanoseconds; times of today are exact to 0.2 us in a float.
+    """A time [s] in whole nanoseconds: those of the recording, or from a float, which holds times of today to 0.2 us.
 
     Raises
     ------
@@ -74,7 +75,7 @@ def nanoseconds(stamp_s: float) -> int:
     """
     if not math.isfinite(stamp_s):
         raise PointsError(f"the scan's time is {stamp_s} s; expected a finite number")
-    return round(stamp_s * 1e9)
+    return nanoseconds_of(stamp_s)
 
 
 class RosMessages:

@@ -14,6 +14,7 @@ from ..live import stream
 from ..readers.clouds import cloud_points, describe_cloud
 from ..readers.tables import MAX_SCAN_BYTES
 from ..records import PerceivedScan
+from ..system.clock import Stamp
 from ..system.names import check_text
 from .graph import RELIABLE, Graph, Output
 from .messages import CLOUD, DIAGNOSTICS, OUTPUTS, RosMessages
@@ -194,7 +195,7 @@ class PerceptionNode:
             self._perceiver = self._perceiver_for(describe_cloud(self._topic, cloud))
         stamp_ns = cloud.header.stamp.sec * 10**9 + cloud.header.stamp.nanosec or time.time_ns()
         self._messages.frame_id = self._frame_id or cloud.header.frame_id or "lidar"
-        perception = self._perceiver(points, stamp_s=stamp_ns * 1e-9)
+        perception = self._perceiver(points, stamp_s=Stamp(stamp_ns * 1e-9, stamp_ns))
         self._points, self._stamp_ns = points, stamp_ns
         return perception
 

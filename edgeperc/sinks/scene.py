@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from ..errors import PointsError
 from ..records import PerceivedScan
+from ..system.clock import nanoseconds_of
 from ..tracking.tracks import Tracks
 from ..types.frame import ModelFrame
 from ..types.points import as_points
@@ -90,4 +91,4 @@ def nanoseconds(scan: PerceivedScan) -> int:
     """
     if not 0.0 <= scan.stamp_s < 2.0**32:
         raise PointsError(f"the scan's time is {scan.stamp_s} s; a viewer needs one from 0 to 2^32 s")
-    return round(scan.stamp_s * 1e9)
+    return nanoseconds_of(scan.stamp_s)

@@ -15,6 +15,28 @@ LATEST_S = 1e12  # a clock that counts nanoseconds since 1970 is at 1.7e18
 Step = Literal["next", "late", "jump", "return"]
 
 
+class Stamp(float):
+    """A time [s] that knows the whole nanoseconds it was recorded with; a float holds times of today to 0.2 us.
+
+    ns : int
+    """
+
+    ns: int
+
+    def __new__(cls, seconds: float, ns: int) -> Stamp:
+        stamp = super().__new__(cls, seconds)
+        stamp.ns = ns
+        return stamp
+
+    def __reduce__(self) -> tuple[type[Stamp], tuple[float, int]]:
+        return Stamp, (float(self), self.ns)
+
+
+def nanoseconds_of(stamp_s: float) -> int:
+    """A time [s] in whole nanoseconds."""
+    return stamp_s.ns if isinstance(stamp_s, Stamp) else round(stamp_s * 1e9)
+
+
 def step_between(last_s: float, stamp_s: float, gap_s: float = GAP_S) -> Literal["next", "late", "jump"]:
     """What a scan at ``stamp_s`` is after one at ``last_s``: the next one, a late or doubled one, or after a jump."""
     if last_s - LATE_S <= stamp_s <= last_s or last_s < stamp_s < last_s + SHORTEST_STEP_S:

@@ -43,7 +43,7 @@ from edgeperc.readers.inflate import inflate
 from edgeperc.readers.ouster import check_metadata
 
 READY = "import os, signal, sys, time; from edgeperc.readers.worker import *\nout = sys.stdout.buffer\n"
-READY = "import sys; sys.path[:] = sys.argv[1:]\n" + READY + "out.write(HEADER.pack(READY, 0, 0)); out.flush()\n"
+READY = "import sys; sys.path[:] = sys.argv[1:]\n" + READY + "out.write(HEADER.pack(READY, 0, -1, 0)); out.flush()\n"
 
 
 @pytest.fixture
@@ -76,8 +76,8 @@ def test_a_process_that_is_killed(ouster: Path, started: list[subprocess.Popen[b
     [
         ("os.kill(os.getpid(), signal.SIGSEGV)", "failed" if os.name == "nt" else r"failed \(SIGSEGV\)"),
         ("out.write(b'x' * 100)", "failed"),
-        ("out.write(HEADER.pack(SCAN, 0, 1 << 40))", "failed"),
-        ("out.write(HEADER.pack(SCAN, 0, 64) + bytes(10))", "failed"),
+        ("out.write(HEADER.pack(SCAN, 0, -1, 1 << 40))", "failed"),
+        ("out.write(HEADER.pack(SCAN, 0, -1, 64) + bytes(10))", "failed"),
         ("os._exit(3)", r"failed \(exit code 3\)"),
         ("out.write(b'x' * 100); out.flush(); time.sleep(60)", "failed"),
     ],

@@ -18,6 +18,7 @@ from edgeperc.errors import MissingExtraError, PointsError
 from edgeperc.readers.captures import is_capture, read_scans, scan_files
 from edgeperc.readers.clouds import cloud_points
 from edgeperc.readers.decoders import decode
+from edgeperc.system.clock import nanoseconds_of
 
 POINTS = np.array(
     [[12.5, -3.25, -1.75, 0.25], [40.0, 8.5, 2.0, 99.0], [np.nan, 1.0, 1.0, 0.5], [5.0, np.inf, 0.0, 255.0]], np.float32
@@ -303,6 +304,7 @@ def test_bags(tmp_path: Path, name: str) -> None:
     for topic in (None, LIDAR):
         scans = list(edgeperc.read_scans(str(path), topic=topic))
         assert [stamp for stamp, _ in scans] == pytest.approx([100.5, 101.5, 202.0])
+        assert [nanoseconds_of(stamp) for stamp, _ in scans] == [100_500_000_000, 101_500_000_000, 202_000_000_000]
         for k, (_, points) in enumerate(scans):
             np.testing.assert_array_equal(points, POINTS + np.float32(k))
     error = error_of(path, topic="/camera/points")

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 import math
+import pickle
 import warnings
 from collections.abc import Sequence
 from itertools import pairwise
@@ -13,7 +15,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from edgeperc import Box, Tracker, Tracks
-from edgeperc.system.clock import GAP_S, LATE_S, LATEST_S, MOST_LATE, Clock, elapsed_s, step_between
+from edgeperc.system.clock import (
+    GAP_S,
+    LATE_S,
+    LATEST_S,
+    MOST_LATE,
+    Clock,
+    Stamp,
+    elapsed_s,
+    nanoseconds_of,
+    step_between,
+)
 
 POISON_S = 2147483651.0  # the year 2038: 2**31 - 1 s and 4e9 ns
 STEPS_S = st.one_of(
@@ -173,3 +185,14 @@ def test_poses_may_begin_or_end_with_a_session() -> None:
     tracker.update(cars(0), 5.0, np.eye(4))
     with pytest.warns(UserWarning, match="jumped"):
         assert len(tracker.update(cars(0), 1.0)) == 2
+
+
+@given(st.integers(0, 2**62))
+def test_a_stamp_keeps_its_nanoseconds(ns: int) -> None:
+    """A float of today's seconds is off by up to 0.2 us; what is computed with a stamp is a plain float again."""
+    stamp = Stamp(ns * 1e-9, ns)
+    for same in (stamp, copy.deepcopy(stamp), pickle.loads(pickle.dumps(stamp))):
+        assert same == ns * 1e-9
+        assert nanoseconds_of(same) == ns
+    assert type(stamp + 0.0) is float
+    assert nanoseconds_of(float(stamp)) == round(ns * 1e-9 * 1e9)
