@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import ast
+import copy
 import functools
+import graphlib
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -236,11 +238,19 @@ def packages_imported(name: str, tree: ast.AST) -> set[str]:
     return {dotted.partition(".")[0] for dotted in imported(name, tree)}
 
 
+class Running(ast.NodeTransformer):
+    """A module without what only type checkers read."""
+
+    def visit_If(self, node: ast.If) -> ast.AST | None:
+        return None if ast.unparse(node.test) == "TYPE_CHECKING" else self.generic_visit(node)
+
+
 @functools.cache
-def own_imports(name: str) -> set[str]:
-    """Modules of the three packages that a module imports."""
+def own_imports(name: str, running: bool = False) -> set[str]:
+    """Modules of the three packages that a module imports, for its types, too, unless ``running``."""
     known, found = modules(), set()
-    for dotted in imported(name, tree_of(name)):
+    tree = tree_of(name)
+    for dotted in imported(name, Running().visit(copy.deepcopy(tree)) if running else tree):
         parent = dotted.rpartition(".")[0]
         candidates = (dotted, f"{dotted}.__init__", parent, f"{parent}.__init__")
         found |= {next((each for each in candidates if each in known), name)}
@@ -342,6 +352,13 @@ def test_the_listing_explains_the_system() -> None:
     edges = {(one, other) for one, other in edges if one != other}
     assert len(units) <= 27
     assert len(edges) <= 165
+    below: dict[str, set[str]] = {unit: set() for unit in units}
+    for name in RUNTIME:
+        below[unit_of(name)] |= {unit_of(other) for other in own_imports(name, running=True)} - {unit_of(name)}
+    layers: dict[str, int] = {}
+    for unit in graphlib.TopologicalSorter(below).static_order():
+        layers[unit] = 1 + max((layers[other] for other in below[unit]), default=0)
+    assert max(layers.values()) <= 11, sorted((n, u) for u, n in layers.items())
 
 
 @pytest.mark.parametrize("name", sorted(modules()))

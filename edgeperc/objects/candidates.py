@@ -8,15 +8,17 @@ small distance. A detector of the top view adds its boxes.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import PointsError
-from ..ground.scan import Scan
 from ..system.kernels import njit
 from ..types.points import Heights, Points, Rows, read_only
+
+if TYPE_CHECKING:
+    from ..ground.scan import Scan
 
 CELL_M = 0.2
 REACH_M = 80.0

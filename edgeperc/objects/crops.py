@@ -7,15 +7,17 @@ above the ground below it. `fill_features` makes the network's input of crops, a
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..ground.scan import Scan
 from ..system.kernels import njit
 from ..types.points import Heights, Points
 from .candidates import CELL_M, N_SIDE, REACH_M, Candidates, Cells
+
+if TYPE_CHECKING:
+    from ..ground.scan import Scan
 
 FEATURES = (
     *("x", "y", "height_above_ground", "remission", "beyond_length", "beyond_width"),
