@@ -19,6 +19,7 @@ SMOKE: dict[str, tuple[list[str], list[str]]] = {
     "bench": (["psutil"], ["tests/bench/test_bench_measure.py"]),
     "camera": (["PIL"], ["tests/camera/test_camera.py"]),
     "completion": (["shtab"], ["tests/cli/test_cli_info.py", "-k", "complet"]),
+    "jit": (["numba"], ["tests/system/test_kernels.py"]),
     "cpu": (["onnxruntime"], ["tests/inference/test_session.py", "tests/cli/test_doctor.py"]),
     "database": (
         ["faster_coco_eval", "filelock", "PIL", "shapely", "tqdm"],

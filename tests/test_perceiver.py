@@ -343,8 +343,8 @@ def test_non_finite_points_are_counted_and_ignored(
     rows = np.sort(rng.choice(len(scan.points), size=500, replace=False))
     dirty = np.insert(scan.points, rows, scan.points[rows], axis=0)
     at = rows + np.arange(500)
-    dirty[at[:300], rng.integers(4, size=300)] = np.nan
-    dirty[at[300:], rng.integers(4, size=200)] = np.inf
+    dirty[at[:300], rng.integers(3, size=300)] = np.nan
+    dirty[at[300:], rng.integers(3, size=200)] = np.inf
     answer = perceive(dirty)
     assert answer.n_dropped == 500
     assert answer.points is not None

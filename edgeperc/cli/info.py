@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any
 
 from ..errors import EdgepercError, MissingExtraError, MountingError, PointsError
 from ..system.atomic import write_atomic
-from ..types.points import Points
 from .arguments import Commands, add_command, add_fields, add_mounting, add_sensor, add_topic, reading_options
 from .output import print_error, print_line, print_rows
 from .scans import scan_sensor
@@ -26,6 +25,7 @@ if TYPE_CHECKING:
     from ..ground.leveling import MountingEstimator
     from ..types.card import ModelCard
     from ..types.perception import DroppedPoints
+    from ..types.points import Points
     from ..types.sensor import SensorProfile
     from ..zoo import Variant
 

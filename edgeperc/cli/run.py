@@ -16,7 +16,6 @@ from ..records import PerceivedScan, Sink
 from ..system.extras import require
 from ..system.remote import Remote, location
 from ..types.choices import CAMERA, DEFAULT_MODELS, DEFAULT_SENSOR
-from ..types.points import Points
 from .arguments import (
     Commands,
     add_adapt,
@@ -51,6 +50,7 @@ if TYPE_CHECKING:
     from ..perceiver import Perceiver
     from ..tracking.tracks import Tracks
     from ..types.perception import Perception
+    from ..types.points import Points
     from ..types.sensor import SensorProfile
 
 

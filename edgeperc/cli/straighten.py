@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from ..errors import PointsError
 from ..preprocess.motion import Motion, Trajectory, deskew
 from ..preprocess.returns import returns
-from ..types.points import Points
 
 if TYPE_CHECKING:
     from ..tracking.tracks import Tracks
+    from ..types.points import Points
     from ..types.sensor import SensorProfile
 
 

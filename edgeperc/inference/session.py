@@ -386,6 +386,7 @@ class Session:
         return [answer.shape for answer in answers]
 
     def warm_up(self, limit: float, run_options: Any) -> float:
+        """Run the golden input; return the largest deviation from the recorded answers."""
         golden, n_rows = self.card.golden, GOLDEN_ROWS if self._has_rows else 1
         if golden is None:
             logger.warning(

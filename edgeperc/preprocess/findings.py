@@ -154,7 +154,8 @@ def _geometry_findings(scan: Measures, profile: FitnessProfile, sensor: SensorPr
     """What differs in the coordinates; a mistake in their frame or unit alone, because it explains the rest."""
     walls = _walls(scan)
     room = walls if walls is not None and walls.gross else None  # its ceiling may count as ground
-    mistake = _other_unit(scan, profile) or room or _other_axes(scan) or _other_origin(scan)
+    axes = _other_axes(scan)
+    mistake = _other_unit(scan, profile) or (axes if scan.flat_axis in (0, 1) else room or axes) or _other_origin(scan)
     mistake = mistake or _upside_down(scan, profile)
     if mistake is not None:
         return [mistake]

@@ -83,7 +83,7 @@ class Kernel:
         self.py_func, self.options = function, options
         self.targetoptions = {name: value for name, value in options.items() if name != "cache"}
         update_wrapper(self, function)
-        self._library = library
+        self.library = library
         self._functions: dict[object, Callable[..., Any]] | None = None
         self._dispatcher: Any = None
 
@@ -91,7 +91,7 @@ class Kernel:
         """Call the compiled form for these types."""
         functions = self._functions
         if functions is None:
-            functions = self._functions = self._library.functions_of(self)
+            functions = self._functions = self.library.functions_of(self)
         form: Callable[..., Any] = functions.get(tuple(map(kind_of, args)), self._compile)
         return form(*args)
 

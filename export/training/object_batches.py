@@ -41,7 +41,7 @@ WATCHED_BATCH = 512
 
 
 @dataclass
-class _Drawn:
+class Drawn:
     """Samples of a batch; fields as in `ObjectSamples`, with ``valid`` points (B, N_STORED)."""
 
     points: NDArray[np.float32]
@@ -54,7 +54,7 @@ class _Drawn:
     truth: NDArray[np.float64]
 
     @classmethod
-    def of(cls, samples: ObjectSamples, chosen: NDArray[np.int64]) -> _Drawn:
+    def of(cls, samples: ObjectSamples, chosen: NDArray[np.int64]) -> Drawn:
         counts = samples.counts[chosen]
         return cls(
             samples.points[chosen].astype(np.float32),
@@ -99,7 +99,7 @@ class ObjectBatches:
         """Input (B, n_points, channels), classes (B,) and boxes (B, 7) of one step, the same for the same step."""
         rng = np.random.default_rng((self.recipe.seed, step))
         chosen = np.searchsorted(self._sums, rng.random(self.recipe.batch) * self._sums[-1], side="right")
-        drawn = _Drawn.of(self.samples, np.minimum(chosen, len(self._sums) - 1))
+        drawn = Drawn.of(self.samples, np.minimum(chosen, len(self._sums) - 1))
         if self.recipe.augment:
             _augment(drawn, rng)
         return tensors(self.task, drawn, rng)
@@ -133,7 +133,7 @@ def _weights(samples: ObjectSamples, names: Sequence[str]) -> NDArray[np.float64
     return total
 
 
-def _augment(drawn: _Drawn, rng: np.random.Generator) -> None:
+def _augment(drawn: Drawn, rng: np.random.Generator) -> None:
     """Mirror, scale and thin the scan; move, turn and scale the candidate; change the remission."""
     n = len(drawn.counts)
     side = np.where(rng.random(n) < 0.5, -1.0, 1.0)
@@ -176,7 +176,7 @@ def _augment(drawn: _Drawn, rng: np.random.Generator) -> None:
     points[rng.random(n) < 0.1, :, 3] = NO_REMISSION.coefficients[0]
 
 
-def tensors(task: Objects, drawn: _Drawn, rng: np.random.Generator | None = None) -> tuple[Tensor, Tensor, Tensor]:
+def tensors(task: Objects, drawn: Drawn, rng: np.random.Generator | None = None) -> tuple[Tensor, Tensor, Tensor]:
     """The network's input and targets of samples; the points are drawn at random, without ``rng`` evenly."""
     view, n_slots = task.view, task.view.n_points
     along, across = 0.5 * drawn.rectangles[:, 2:4].T + view.margin_m
@@ -214,7 +214,7 @@ class ObjectWatch:
         kept = np.flatnonzero((samples.origin == GROUP) | ((samples.origin == DETECTED) & (samples.classes > 0)))
         self.task = task
         self._batches = [
-            tensors(task, _Drawn.of(samples, kept[first : first + WATCHED_BATCH]))
+            tensors(task, Drawn.of(samples, kept[first : first + WATCHED_BATCH]))
             for first in range(0, len(kept), WATCHED_BATCH)
         ]
 

@@ -34,8 +34,8 @@ from edgeperc_export.recipe import MODELS
 from edgeperc_export.release.object_int8 import candidate_batches, quantize_objects, rounded
 from edgeperc_export.release.quantize import Calibration, folded
 from edgeperc_export.release.to_onnx import load, to_graph, verify, with_golden, write_card
+from edgeperc_export.training.object_batches import Drawn as Drawn
 from edgeperc_export.training.object_batches import ObjectBatches, ObjectWatch, tensors
-from edgeperc_export.training.object_batches import _Drawn as Drawn
 from edgeperc_export.training.object_samples import (
     GROUP,
     N_STORED,

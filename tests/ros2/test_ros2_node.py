@@ -141,7 +141,7 @@ HOSTILE = {
     "no fields": (cloud(POINTS, fields=[]), "layout is impossible|no numeric field"),
     "steps too small": (cloud(POINTS, point_step=3), "layout is impossible"),
     "step of 0": (cloud(POINTS, point_step=0), "layout is impossible"),
-    "rows that overlap": (cloud(POINTS, height=3, width=1, row_step=4), "declares 3 x 1 points"),
+    "rows that overlap": (cloud(POINTS, height=3, width=2, row_step=4), "declares 3 x 2 points"),
     "more points than bytes": (cloud(POINTS, width=1000), "declares 1 x 1000 points"),
     "huge": (cloud(POINTS, width=2**32 - 1, height=2**32 - 1), "declares 4,294,967,295 x 4,294,967,295 points"),
     "a huge step": (cloud(POINTS, point_step=2**32 - 1), "layout is impossible"),

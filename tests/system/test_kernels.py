@@ -123,7 +123,7 @@ def test_a_compiled_form_is_called_for_its_types_only() -> None:
 def test_an_edited_kernel_is_not_the_compiled_one() -> None:
     values = np.arange(4, dtype=np.float32)
     kernel, module = library_of(total, values, 2.0)
-    other = Kernel(kernel._library, {"nogil": True, "error_model": "numpy"}, total)
+    other = Kernel(kernel.library, {"nogil": True, "error_model": "numpy"}, total)
     assert other(values, 2.0) == 12.0
     assert not module.called
 

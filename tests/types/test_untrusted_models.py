@@ -284,7 +284,7 @@ def test_a_first_run_without_end_is_given_up(tmp_path: Path, monkeypatch: pytest
     session = Session(path, "cpu")
     options.terminate = True
     with pytest.raises(InferenceError, match=r"(?i)terminat"):
-        session.run_bound(options)
+        session.run_bound(1, options)
     session.run()
     monkeypatch.setattr(session_module, "terminated", late)
     with contextlib.suppress(InferenceError):  # the timer may come too late for so small a network
