@@ -286,6 +286,7 @@ class Perceiver:
             "boxes": boxes,
             "agreement": agreement,
             "objects": objects,
+            "candidates": objects and self.boxes_from != "network",
             "standing": bool(self.agree) and (boxes or any(card.box_classes for card in scans)),
             "road": top_view,
             "cells": top_view and bool(self.agree),

@@ -469,6 +469,7 @@ class Session:
         )
 
     def run_bound(self, n_rows: int, *run_options: Any) -> None:
+        """One run on the bound buffers, of so many rows where the batch has rows."""
         try:
             # Bind before every run: a provider with its own memory copies the input only when it is bound.
             if self._has_rows:

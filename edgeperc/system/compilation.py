@@ -46,8 +46,9 @@ KERNELS: Mapping[str, str] = MappingProxyType(
         "objects.persons.fill_person_groups objects.persons.fill_persons types.geometry.fill_oriented_iou "
         "types.geometry.mark_nms",
         "objects": "objects.candidate_boxes.fill_boxes objects.candidate_boxes.fill_merged "
-        "objects.candidates.fill_cells objects.candidates.fill_groups_of_cells objects.candidates.fit_groups "
-        "objects.crops.fill_crops objects.crops.fill_features types.geometry.fill_oriented_iou types.geometry.mark_nms",
+        "objects.candidates.fill_cells objects.crops.fill_crops objects.crops.fill_features "
+        "types.geometry.fill_oriented_iou types.geometry.mark_nms",
+        "candidates": "objects.candidates.fill_groups_of_cells objects.candidates.fit_groups",
         "agreement": "agreement.rules.clear_columns agreement.rules.clear_ground agreement.rules.count_inside "
         "agreement.rules.fill_support agreement.votes.apply_verdicts agreement.votes.fill_tallies "
         "agreement.votes.fill_verdicts agreement.votes.fill_votes objects.persons.complete_persons",
