@@ -22,7 +22,8 @@ models = {name for name in names if name.endswith(".onnx")}
 assert {"edgeperc/zoo/ssadnet.onnx", "edgeperc/zoo/pointseg.onnx"} <= models, f"the wheel has the models {sorted(models)}"
 assert not [name for name in names if "research" in name], "a research model is in the wheel"
 megabytes = pathlib.Path(sys.argv[1]).stat().st_size / 1e6
-assert megabytes <= 8.0, f"the wheel has {megabytes:.1f} MB, more than 8"
+most = 9.0 if any(name.endswith((".so", ".pyd")) for name in names) else 8.0  # compiled kernels: 0.35 MB a level
+assert megabytes <= most, f"the wheel has {megabytes:.1f} MB, more than {most:g}"
 END
 
 "$python" -m venv "$away/venv"
