@@ -245,12 +245,14 @@ def test_a_signal_ends_the_process_that_decodes_a_capture(tmp_path: Path, number
 
 
 def check_failed(process: subprocess.Popen[str], out: Path, reason: str) -> None:
-    """Each scan has its error, on one line, and no part of a file is left."""
+    """Each scan has its error, on one line, the same reason once, and no part of a file is left."""
     records, errors = process.communicate(timeout=120)
     assert process.returncode == 1, errors
     assert "Traceback" not in errors
     assert [reason in json.loads(line)["error"] for line in records.splitlines()] == [True, True]
-    assert len([line for line in errors.splitlines() if reason in line and ".bin" in line]) == 2
+    first, second = (line for line in errors.splitlines() if ".bin" in line)
+    assert reason in first
+    assert f": the same as {first.split(': ')[1]}" in second
     assert not [file for file in out.rglob("*") if file.is_file() and file.name != "filler"]
 
 
