@@ -132,6 +132,7 @@ def test_boxes_of_the_training_are_those_of_the_runtime() -> None:
     np.testing.assert_array_equal(found[:, 8], kinds.numpy())
 
 
+@pytest.mark.kernel
 def test_overlap_in_space() -> None:
     box = np.array([[1.0, 2.0, 0.0, 4.0, 2.0, 1.5, 0.3]])
     for change, right in (
