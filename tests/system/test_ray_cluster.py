@@ -107,7 +107,9 @@ def test_ray_gives_the_same_figures(tmp_path: Path) -> None:
             assert cli.main(["eval", "simulation:3", "--engine", engine, "--json", str(file)]) == 0
         figures = json.loads(file.read_text())
         del figures["command"]
-        found[engine] = figures, out.getvalue()
+        # Ray itself prints that a process of its died, which a busy computer may bring about; the block is done again.
+        printed = [line for line in out.getvalue().splitlines() if "(raylet)" not in line]
+        found[engine] = figures, printed
     assert found["ray"] == found["local"]
 
 
