@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from ..errors import PointsError
 from ..system.kernels import njit
 from ..types.points import Heights, Points, Rows, read_only
+from .rectangles import fit_rectangle
 
 if TYPE_CHECKING:
     from ..ground.scan import Scan
@@ -263,50 +264,10 @@ def fit_groups(
                     low_y, high_y = min(low_y, points[i, 1]), max(high_y, points[i, 1])
         if n < MIN_POINTS or top < MIN_TOP_M or math.hypot(high_x - low_x, high_y - low_y) > scale.longest_m:
             continue
-        fit_rectangle(points, rows[:n], fits[n_fits])
+        rectangle = fits[n_fits]
+        fit_rectangle(points, rows[:n], np.int64(N_ANGLES), np.int64(MAX_FITTED), np.bool_(True), rectangle)
+        if rectangle[3] > rectangle[2]:
+            rectangle[2], rectangle[3] = rectangle[3], rectangle[2]
+            rectangle[4] += 0.5 * math.pi
         n_fits += 1
     return n_fits
-
-
-@njit(cache=True, nogil=True)
-def fit_rectangle(points: Points, rows: Rows, rectangle: NDArray[np.float64]) -> None:
-    """Write the rectangle around points seen from above whose sides most of them are near; its length is not shorter.
-
-    As `objects.boxes.fill_rectangle`, with fewer headings and fewer points.
-    """
-    step = (len(rows) + MAX_FITTED - 1) // MAX_FITTED
-    cos, sin, merit = np.empty(N_ANGLES), np.empty(N_ANGLES), np.empty(N_ANGLES)
-    low_u, high_u = np.empty(N_ANGLES), np.empty(N_ANGLES)
-    low_v, high_v = np.empty(N_ANGLES), np.empty(N_ANGLES)
-    for k in range(N_ANGLES):
-        angle = 0.5 * math.pi * k / N_ANGLES
-        cos[k], sin[k], merit[k] = math.cos(angle), math.sin(angle), 0.0
-        low_u[k], high_u[k], low_v[k], high_v[k] = math.inf, -math.inf, math.inf, -math.inf
-    for at in range(0, len(rows), step):
-        x, y = np.float64(points[rows[at], 0]), np.float64(points[rows[at], 1])
-        for k in range(N_ANGLES):
-            u, v = cos[k] * x + sin[k] * y, cos[k] * y - sin[k] * x
-            low_u[k], high_u[k] = min(low_u[k], u), max(high_u[k], u)
-            low_v[k], high_v[k] = min(low_v[k], v), max(high_v[k], v)
-    for at in range(0, len(rows), step):
-        x, y = np.float64(points[rows[at], 0]), np.float64(points[rows[at], 1])
-        for k in range(N_ANGLES):
-            u, v = cos[k] * x + sin[k] * y, cos[k] * y - sin[k] * x
-            gap = min(min(u - low_u[k], high_u[k] - u), min(v - low_v[k], high_v[k] - v))
-            merit[k] += 1.0 / max(gap, 0.05)
-    best = 0
-    for k in range(N_ANGLES):
-        best = k if merit[k] > merit[best] else best
-    least_u, most_u, least_v, most_v = math.inf, -math.inf, math.inf, -math.inf
-    for i in rows:
-        x, y = np.float64(points[i, 0]), np.float64(points[i, 1])
-        u, v = cos[best] * x + sin[best] * y, cos[best] * y - sin[best] * x
-        least_u, most_u, least_v, most_v = min(least_u, u), max(most_u, u), min(least_v, v), max(most_v, v)
-    u, v = 0.5 * (least_u + most_u), 0.5 * (least_v + most_v)
-    rectangle[0] = u * cos[best] - v * sin[best]
-    rectangle[1] = u * sin[best] + v * cos[best]
-    rectangle[2], rectangle[3] = most_u - least_u, most_v - least_v
-    rectangle[4] = 0.5 * math.pi * best / N_ANGLES
-    if rectangle[3] > rectangle[2]:
-        rectangle[2], rectangle[3] = rectangle[3], rectangle[2]
-        rectangle[4] += 0.5 * math.pi
