@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, TypeVar
 
 from edgeperc.objects.boxes import OBJECT_SIZE_M
 from edgeperc.objects.crops import FEATURES
@@ -106,3 +107,32 @@ def card_of(recipe: Recipe, **facts: Any) -> ModelCard:
 def box_sizes() -> dict[str, tuple[float, float, float]]:
     """Usual length, width and height [m] of the classes of objects, from which the object network's sizes start."""
     return {name: OBJECT_SIZE_M[name] for name in OBJECT_CLASSES[1:]}
+
+
+_T = TypeVar("_T", bound="Carded")
+
+
+@dataclass(frozen=True)
+class Carded:
+    """What the task of every network has.
+
+    card : view, input, classes and outputs, as the exported model has them.
+    """
+
+    recipe: Recipe
+    card: ModelCard
+
+    @classmethod
+    def of(cls: type[_T], recipe: Recipe) -> _T:
+        """The task of a recipe."""
+        return cls(recipe, card_of(recipe, version="0"))
+
+    @property
+    def input(self) -> InputSpec:
+        """The channels of the network's input."""
+        return self.card.input
+
+    @property
+    def classes(self) -> tuple[str, ...]:
+        """Classes of the network's output; of objects, the background first."""
+        return self.card.classes

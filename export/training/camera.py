@@ -11,11 +11,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from edgeperc.types.card import InputSpec, ModelCard
 from edgeperc.types.views import CameraGeometry
 
-from ..cards import card_of
-from ..recipe import Recipe
+from ..cards import Carded
 from .losses import cross_entropy, lovasz_softmax
 
 ImageOutputs: TypeAlias = "Tensor | tuple[Tensor, ...]"
@@ -30,35 +28,14 @@ COARSE_STRIDE, LOVASZ_STRIDE, EARLY_STRIDE = 2, 4, 4
 
 
 @dataclass(frozen=True)
-class Camera:
-    """A class for every pixel of an image.
-
-    card : view, input, classes and outputs, as the exported model has them.
-    """
-
-    recipe: Recipe
-    card: ModelCard
-
-    @classmethod
-    def of(cls, recipe: Recipe) -> Camera:
-        """The task of a recipe."""
-        return cls(recipe, card_of(recipe, version="0"))
+class Camera(Carded):
+    """A class for every pixel of an image."""
 
     @property
     def view(self) -> CameraGeometry:
         """The size of the network's input."""
         assert isinstance(self.card.view, CameraGeometry)
         return self.card.view
-
-    @property
-    def input(self) -> InputSpec:
-        """The channels of the network's input."""
-        return self.card.input
-
-    @property
-    def classes(self) -> tuple[str, ...]:
-        """Classes of the network's pixels."""
-        return self.card.classes
 
     def loss(self, outputs: ImageOutputs, targets: tuple[Tensor, ...] | list[Tensor]) -> Tensor:
         """Cross-entropy (categorical, as in the comparison) and, by the recipe, `lovasz_softmax` and early logits.

@@ -13,13 +13,11 @@ from torch import Tensor
 from torch.nn.functional import binary_cross_entropy_with_logits, cross_entropy, smooth_l1_loss
 
 from edgeperc.system.kernel_cache import njit
-from edgeperc.types.card import InputSpec, ModelCard
 from edgeperc.types.geometry import pair_iou
 from edgeperc.types.views import ObjectGeometry
 
-from ..cards import card_of
+from ..cards import Carded
 from ..networks.objects import Parts, parts_of
-from ..recipe import Recipe
 
 VEHICLE = -1
 """Class of a vehicle of unknown kind."""
@@ -35,35 +33,14 @@ VAN = 2  # a vehicle of unknown kind has the sizes of a van
 
 
 @dataclass(frozen=True)
-class Objects:
-    """Class, box and overlap of candidates.
-
-    card : view, input, classes and outputs, as the exported model has them.
-    """
-
-    recipe: Recipe
-    card: ModelCard
-
-    @classmethod
-    def of(cls, recipe: Recipe) -> Objects:
-        """The task of a recipe."""
-        return cls(recipe, card_of(recipe, version="0"))
+class Objects(Carded):
+    """Class, box and overlap of candidates."""
 
     @property
     def view(self) -> ObjectGeometry:
         """Which points of a candidate the network sees."""
         assert isinstance(self.card.view, ObjectGeometry)
         return self.card.view
-
-    @property
-    def input(self) -> InputSpec:
-        """The channels of the network's input."""
-        return self.card.input
-
-    @property
-    def classes(self) -> tuple[str, ...]:
-        """Classes of objects, the background first."""
-        return self.card.classes
 
     def loss(self, outputs: tuple[Tensor, Tensor], targets: Sequence[Tensor]) -> Tensor:
         """The loss of a batch.

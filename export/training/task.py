@@ -21,11 +21,11 @@ from edgeperc.evaluation.metrics import FEWEST_RETURNS, BoxEvaluator, Confusion,
 from edgeperc.inference.decode import decode_top_view
 from edgeperc.inference.projection import Projection
 from edgeperc.simulation.samples import IGNORE
-from edgeperc.types.card import InputSpec, ModelCard
+from edgeperc.types.card import ModelCard
 from edgeperc.types.perception import Box
 from edgeperc.types.views import CameraGeometry, ObjectGeometry, RangeImageGeometry, TopViewGeometry
 
-from ..cards import card_of
+from ..cards import Carded, card_of
 from ..data.scans import LabeledScan
 from ..data.targets import dense_targets, paper_slot_targets, slot_targets
 from ..recipe import Recipe
@@ -71,17 +71,14 @@ class Tally:
 
 
 @dataclass(frozen=True)
-class Task(ABC):
+class Task(Carded, ABC):
     """The task of a recipe's network: its input, targets, loss and validation.
 
-    card : view, input, classes and outputs, as the exported model has them.
     paste_odds : mapping of str to float; how often each kind of object is pasted into a training scan.
     swaps_sectors : whether a sector of a scan may be replaced by another scan's. This replaces points and their
         labels, but neither boxes nor the ground.
     """
 
-    recipe: Recipe
-    card: ModelCard
     paste_odds: ClassVar[Mapping[str, float]]
     swaps_sectors: ClassVar[bool] = False
 
@@ -90,16 +87,6 @@ class Task(ABC):
         """The grid of the network's input."""
         assert not isinstance(self.card.view, CameraGeometry | ObjectGeometry)
         return self.card.view
-
-    @property
-    def input(self) -> InputSpec:
-        """The channels of the network's input."""
-        return self.card.input
-
-    @property
-    def classes(self) -> tuple[str, ...]:
-        """Classes of the network's pixels."""
-        return self.card.classes
 
     @abstractmethod
     def target(self, scan: LabeledScan, projected: Projection) -> Targets:
