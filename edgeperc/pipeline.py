@@ -268,7 +268,8 @@ class Pipeline:
         if rules:
             standing = value("agree", stand_boxes, joined, scan, agreed, rules, options.distance_per_m)
         if self.objects is not None:
-            standing = joined = value("cluster", _completed, objects, standing, options.cluster_score)
+            by_labels = bool(self.ranged) and options.boxes_from != "network"
+            standing = joined = value("cluster", _completed, objects, standing, by_labels, options.cluster_score)
         if top is not None and rules:
             marks = value("agree", mark_cells, cells, scan, agreed, rules)
             view = value("agree", _agreed_cells, cells, agreed, joined, boxes, trusted, marks, rules)
@@ -377,15 +378,15 @@ def _objects(
     )
 
 
-def _completed(objects: Sequence[Box], others: Sequence[Box], min_score: float) -> tuple[Box, ...]:
-    """Vehicles of the object network and people by the labels of their points; and vehicles that it has not found.
+def _completed(objects: Sequence[Box], others: Sequence[Box], by_labels: bool, min_score: float) -> tuple[Box, ...]:
+    """Boxes of the object network, and vehicles that it has not found; people by the labels of their points, if any.
 
     Of 31 pedestrians on the validation and test drives, labels find more than the network (AP25 57 and 52), and there
     are too few on the folds to decide. A vehicle that the other networks have found and this one has not keeps half of
     its score: points that show an object are not left without a box.
     """
     kept = [box if box.label in PERSONS else replace(box, score=0.5 * box.score) for box in others]
-    found = [box for box in objects if box.label not in PERSONS]
+    found = [box for box in objects if not by_labels or box.label not in PERSONS]
     return join_boxes(found, [box for box in kept if box.score >= min_score])
 
 

@@ -51,6 +51,15 @@ def test_the_network_of_objects_needs_no_other_one(scan: SimulatedScan) -> None:
     assert near_true(perception, scan) > 0.6
 
 
+def test_people_are_the_networks_where_no_labels_box_them() -> None:
+    scan = simulated_scan(1)
+    people = [b.center for b, n in zip(scan.boxes, scan.box_points, strict=True) if b.label == "pedestrian" and n > 60]
+    boxes = Perceiver("objects", n_threads=1)(scan.points).boxes
+    found = [box.center for box in boxes if box.label == "pedestrian"]
+    assert people
+    assert any(np.hypot(x - u, y - v) < 1.0 for x, y, _ in people for u, v, _ in found)
+
+
 def test_people_are_boxed_by_their_labels(scan: SimulatedScan) -> None:
     people = [
         [box for box in Perceiver(models, n_threads=1)(scan.points).boxes if box.label in ("pedestrian", "cyclist")]
