@@ -196,6 +196,6 @@ def _is_rounded(values: NDArray[Any]) -> bool:
         return False
     exact = values[:: max(1, len(values) // 4096)].astype(np.float64)
     with np.errstate(over="ignore", invalid="ignore"):
-        # Half the distance of float32 numbers there; larger ones are no map's.
-        off = (np.abs(exact) >= MAX_ROUNDING_M * 2**24) & (np.abs(exact) < MAX_MAP_M)
+        # Half the distance of float32 numbers there; larger ones are no map's. What float32 holds is not rounded.
+        off = (np.abs(exact) >= MAX_ROUNDING_M * 2**24) & (np.abs(exact) < MAX_MAP_M) & (exact != exact.astype("f4"))
     return bool((off.mean(axis=0) > 0.5).any())
