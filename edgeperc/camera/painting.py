@@ -226,10 +226,10 @@ def _hidden_by(
         frame = ModelFrame(known)
         moved = rows[:, :3].astype(np.float64) @ frame.R.T + frame.t
         above = moved.astype(np.float32)
-        is_its_scan = isinstance(image, Perception) and (image.n_points, image.mounting) == (len(points), known)
-        surface = image.ground if isinstance(image, Perception) and is_its_scan else None
-        if surface is None:
-            surface = fit_ground(above, mount_height_m=MODEL_HEIGHT_M).surface()
+        surface = None
+        if isinstance(image, Perception) and (image.n_points, image.mounting) == (len(points), known):
+            surface = image.ground
+        surface = surface or fit_ground(above, mount_height_m=MODEL_HEIGHT_M).surface()
         is_ground = heights_above(surface, above).mask
         cells = np.zeros((0 if places is None else len(places), 3))
         if places is not None:

@@ -189,13 +189,13 @@ class GroundFit:
         return GroundSurface(self._plane if self.found else None, self._plane, self.planes, cells, lowest)
 
 
-def heights_above(ground: GroundSurface, points: Points, *, max_height_m: float = 0.125) -> Ground:
+def heights_above(ground: GroundSurface | None, points: Points, *, max_height_m: float = 0.125) -> Ground:
     """Heights of any points above the ground that a scan showed.
 
     Parameters
     ----------
-    ground : GroundSurface
-        `edgeperc.Perception.ground`.
+    ground : GroundSurface or None
+        `edgeperc.Perception.ground`. None: the points are a scan, and show the ground themselves.
     points : (n, 3 or more) float32
         x, y, z [m] in the frame of the models (`edgeperc.ModelFrame`). For the scan's own points, the heights are those
         of `find_ground`.
@@ -211,6 +211,8 @@ def heights_above(ground: GroundSurface, points: Points, *, max_height_m: float 
     PointsError
         As `find_ground`.
     """
+    if ground is None:
+        return find_ground(points, max_height_m=max_height_m)
     fit = _sorted_into_cells(points)
     n, k = len(fit.points), len(ground.lowest)
     # In a cell that only these points are in, the ground follows the planes, as below a return far above it.

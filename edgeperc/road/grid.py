@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..errors import CardError, OptionError, PointsError
 from ..ground.observed import OVERHEAD_M, Observer
-from ..ground.planes import find_ground, heights_above
+from ..ground.planes import heights_above
 from ..preprocess.returns import returns
 from ..system.atomic import write_atomic
 from ..system.clock import nanoseconds_of
@@ -250,10 +250,7 @@ def occupancy_grid(
     profile = get_sensor(sensor)
     frame = ModelFrame(perception.mounting)
     moved = read_only(frame.move(returns(rows, profile, perception.mounting.origin_m)[0]))
-    if perception.ground is None:
-        ground = find_ground(moved, mount_height_m=MODEL_HEIGHT_M)
-    else:
-        ground = heights_above(perception.ground, moved)
+    ground = heights_above(perception.ground, moved)
 
     shape = (view.height, view.width)
     highest, tallest = np.empty(shape, np.int32), np.empty(shape, np.float32)

@@ -90,8 +90,7 @@ def _heights(points: Points, perception: Perception | None) -> NDArray[np.float3
     """Heights above the ground [m]."""
     if perception is None:
         return find_ground(points).height_m
-    moved = ModelFrame(perception.mounting).move(points)
-    return (find_ground(moved) if perception.ground is None else heights_above(perception.ground, moved)).height_m
+    return heights_above(perception.ground, ModelFrame(perception.mounting).move(points)).height_m
 
 
 def draw_tracks(
