@@ -14,7 +14,7 @@ from ..readers.images import IMAGE_SUFFIXES, read_image
 from ..system.extras import require
 
 FOLDERS = {"train": "train", "validation": "val", "test": "test"}
-UNLABELED = ("unlabeled", "unlabeled", "void")
+UNLABELED = ("unlabeled", "unlabelled", "void")  # both spellings are in data sets
 IGNORE = 255
 LEVEL = 0.95
 

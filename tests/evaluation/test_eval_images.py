@@ -172,6 +172,14 @@ def test_the_table_of_images(tmp_path: Path, model: Path, capsys: pytest.Capture
         assert said in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("name", ["unlabeled", "Unlabelled", "VOID"])
+def test_a_class_of_unlabeled_pixels_is_not_a_class(tmp_path: Path, name: str) -> None:
+    root = write_set(tmp_path / "set", {"val/a": labels(0, 1, 2, 0)}, ("Sky", "Road", name))
+    data = LabeledImages(root)
+    assert data.classes == ("Sky", "Road")
+    assert {*np.unique(data.read(root / "val" / "a.webp")[1]).tolist()} == {0, 1, 255}
+
+
 def test_camvid_is_read(data_root: Callable[[str], Path]) -> None:
     data = LabeledImages(data_root("camvid"))
     assert len(data.classes) == 11
