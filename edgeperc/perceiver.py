@@ -31,6 +31,7 @@ from .system.compilation import Compilation, kernels_of
 from .system.lanes import Lanes, Stopwatch
 from .system.names import nearest
 from .types.card import ModelCard
+from .types.choices import WEIGHTS
 from .types.frame import ModelFrame
 from .types.mounting import Mounting
 from .types.perception import ImageLabels, Perception
@@ -99,10 +100,13 @@ def _check_choice(option: str, value: object, choices: Sequence[object]) -> None
         raise OptionError(f"{option} is {value!r}{nearest(str(value), known)}; expected {', '.join(others)} or {last}")
 
 
-def _listed(models: object) -> list[str | os.PathLike[str]]:
+def _listed(models: object, weights: str) -> list[str | os.PathLike[str]]:
     """The models as a list; one name or path becomes a list of one."""
+    _check_choice("weights", weights, (*WEIGHTS,))
     if models is None:
-        return list(DEFAULT)
+        return list(WEIGHTS[weights])
+    if weights != "default":
+        raise OptionError(f"weights is {weights!r}, and models={models!r}; pass one of the two")
     given = models if isinstance(models, Sequence) and not isinstance(models, str) else [models]
     listed = [model for model in given if isinstance(model, str | os.PathLike)]
     if not listed or len(listed) < len(given):
@@ -122,8 +126,8 @@ class Perceiver:
     ----------
     models : str, Path, sequence of these, or None
         Names of shipped models (``"ssadnet"``, ``"pointseg:int8"``) or paths of .onnx files with a card; at most one
-        model per view: top view, range image, objects and camera. None takes the best LiDAR models together,
-        `edgeperc.zoo.DEFAULT`. The options of scans have no effect on a camera.
+        model per view: top view, range image, objects and camera. None takes the LiDAR models together that ``weights``
+        names, by default the best ones, `edgeperc.zoo.DEFAULT`. The options of scans have no effect on a camera.
     sensor : str, Path or SensorProfile
         The sensor that takes the scans: a built-in name (`edgeperc.sensors`), a file written by ``edgeperc
         fit-sensor``, or a profile.
@@ -173,6 +177,9 @@ class Perceiver:
     trusted : bool
         Open model files whose graphs are otherwise refused: with unusual operators, functions, subgraphs or sizes
         (`edgeperc.inference.session.Session`). Only for files whose origin you know.
+    weights : {"default", "open"}
+        The models of None: the most accurate ones, whose weights have the terms of KITTI, or `edgeperc.zoo.OPEN`, whose
+        weights anyone may use, commercially too.
 
     Attributes
     ----------
@@ -231,6 +238,7 @@ class Perceiver:
         full_turn: bool = False,
         agree: bool | Collection[str] = True,
         trusted: bool = False,
+        weights: str = "default",
     ) -> None:
         _check_choice("adapt", adapt, ADAPTATIONS)
         _check_choice("on_mismatch", on_mismatch, ("refuse", "warn", "raise", "ignore"))
@@ -245,7 +253,7 @@ class Perceiver:
         for option, given in (("provider", provider), ("precision", precision)):
             if not isinstance(given, str):
                 raise OptionError(f"{option} is {given!r}; expected a str")
-        wanted = _listed(models)
+        wanted = _listed(models, weights)
         if mounting is not None and not isinstance(mounting, Mounting):
             raise OptionError(f"mounting is {mounting!r:.80}; expected a Mounting, or None")
         self.sensor = get_sensor(sensor)

@@ -55,17 +55,20 @@ def make(
     """
     stage = MODELS[name]
     recipe = stage.recipe if steps is None else replace(stage.recipe, steps=steps)
-    fold, simulated_only = data.fold, stage.recipe.simulated_share == 1.0
+    fold, without_kitti = data.fold, stage.is_open or stage.recipe.simulated_share == 1.0
+    evaluated = data
     if recipe.task == "camera":
         data, fold = Data(camvid=data.camvid), None
     else:
-        if not simulated_only and (data.kitti is None or layouts is None):
+        if not without_kitti and (data.kitti is None or layouts is None):
             raise ValueError(f"{name} is trained on real scans too; give --kitti and --layouts")
-        scans = out / ("scans" if simulated_only else "scans-with-layouts")
-        simulate(scans, N_SIMULATED, layouts_root=None if simulated_only else layouts, n_workers=run.n_workers)
-        if recipe.task == "objects":
+        if without_kitti:
+            layouts = None
+        scans = out / ("scans" if without_kitti else "scans-with-layouts")
+        simulate(scans, N_SIMULATED, layouts_root=layouts, n_workers=run.n_workers)
+        if recipe.task == "objects" or stage.is_open:
             scans = _more_sensors(out, scans, layouts, run.n_workers)
-        data = replace(data, simulated=scans)
+        data = replace(data, simulated=scans, kitti=None if stage.is_open else data.kitti)
 
     def checkpoint_of(other: str | None) -> Path | None:
         if other is None:
@@ -80,13 +83,13 @@ def make(
     run = replace(run, start_from=checkpoint_of(stage.after), teacher=checkpoint_of(stage.teacher))
     path = out / f"{name}{_suffix(fold)}.onnx"
     checkpoint = train(recipe, path.with_suffix(""), data, run)
-    finish(name, checkpoint, path, data, semantickitti=semantickitti, version=version)
+    finish(name, checkpoint, path, replace(data, kitti=evaluated.kitti), semantickitti=semantickitti, version=version)
     return path
 
 
 def _more_sensors(out: Path, scans: Path, layouts: Path | None, n_workers: int) -> Path:
     """A folder of the simulated scans and others of `OTHER_SENSORS`."""
-    every = out / "scans-of-sensors"
+    every = out / f"{scans.name}-of-sensors"
     for k, sensor in enumerate(OTHER_SENSORS, start=1):
         simulate(every, N_OF_OTHERS, first=10_000 * k, layouts_root=layouts, sensor=sensor, n_workers=n_workers)
     for file in scans.glob("*.npz"):
@@ -132,7 +135,7 @@ def finish(
             printed = f"edgeperc eval KITTI --model {TOP_VIEW} --model {name}:fp32 --no-agreement"
             _write_figures(path, card, figures | {"command": printed + (f" --fold {fold}" if fold is not None else "")})
         return
-    fitness = fitness_of(None if stage.recipe.simulated_share == 1.0 else kitti)
+    fitness = fitness_of(None if stage.is_open or stage.recipe.simulated_share == 1.0 else kitti)
     card = export(checkpoint, path, scans=parity_scans([]), fitness=fitness, name=name, version=version)
     datasets: dict[str, str | Path] = {"simulation": "simulation"}
     if semantickitti is not None and fold is None:

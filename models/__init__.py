@@ -26,6 +26,7 @@ __all__ = [
     "DEFAULT",
     "INT8_FEATURES",
     "MAX_LOSS",
+    "OPEN",
     "Variant",
     "choose",
     "digest",
@@ -37,6 +38,9 @@ __all__ = [
 
 DEFAULT = choices.DEFAULT_MODELS
 """The best ones together: drivable area and vehicles ahead, a class for every point, and boxes all around."""
+
+OPEN = choices.OPEN_MODELS
+"""The same of weights that anyone may use, commercially too: trained on simulated streets and PandaSet (CC BY 4.0)."""
 
 CAMERA = choices.CAMERA
 """The model of a camera's images."""

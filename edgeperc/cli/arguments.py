@@ -11,7 +11,7 @@ from typing import Any
 
 from ..inference import providers
 from ..types import choices
-from ..types.choices import DEFAULT_MODELS, DEFAULT_SENSOR
+from ..types.choices import DEFAULT_MODELS, DEFAULT_SENSOR, WEIGHTS
 
 Commands = Any  # what ArgumentParser.add_subparsers returns; argparse keeps its class private
 _WIDTH = 78
@@ -157,6 +157,20 @@ def add_model(group: Any, default: Sequence[str] = DEFAULT_MODELS) -> None:
         help="a name from 'edgeperc models', one of its variants such as pointseg:int8, or the path of an .onnx file "
         f"with a card; repeat the option to run one model of each kind (default: {' and '.join(default)})",
     )
+    group.add_argument(
+        "--weights",
+        choices=(*WEIGHTS,),
+        default="default",
+        help=f"open: {', '.join(WEIGHTS['open'])}, which anyone may use commercially, in place of the most accurate "
+        "models, whose weights have the terms of KITTI (default: %(default)s)",
+    )
+
+
+def chosen_models(arguments: argparse.Namespace) -> Sequence[str]:
+    """The models of ``--model`` or of ``--weights``."""
+    if arguments.model and arguments.weights != "default":
+        arguments.usage_error(f"--model and --weights {arguments.weights} both name models; leave out one")
+    return arguments.model or WEIGHTS[arguments.weights]
 
 
 def add_provider(group: Any, *, provider: str = "auto", precision: str = "auto") -> None:

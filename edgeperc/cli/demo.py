@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..errors import MissingExtraError
-from ..types.choices import CAMERA, DEFAULT_MODELS
-from .arguments import Commands, add_command, add_model, add_network
+from ..types.choices import CAMERA
+from .arguments import Commands, add_command, add_model, add_network, chosen_models
 from .output import one_line, print_rows
 from .run import make_perceiver
 
@@ -73,7 +73,7 @@ def demo_command(arguments: argparse.Namespace) -> int:
     from ..zoo import shipped_models
 
     if arguments.camera and not arguments.model and CAMERA in shipped_models():
-        arguments.model = [*DEFAULT_MODELS, CAMERA]
+        arguments.model, arguments.weights = [*chosen_models(arguments), CAMERA], "default"
     perceive = make_perceiver(arguments, sensor="hdl-64e", on_mismatch="ignore")
     scan = simulate(random_scene(*DEMO_SCENE), "hdl-64e", DEMO_SCENE[0])
     image = None

@@ -15,7 +15,7 @@ from ..errors import EdgepercError, ImageError, ModelError, PointsError
 from ..records import PerceivedScan, Sink
 from ..system.extras import require
 from ..system.remote import Remote, location
-from ..types.choices import CAMERA, DEFAULT_MODELS, DEFAULT_SENSOR
+from ..types.choices import CAMERA, DEFAULT_SENSOR
 from .arguments import (
     Commands,
     add_adapt,
@@ -26,6 +26,7 @@ from .arguments import (
     add_network,
     add_sensor,
     add_topic,
+    chosen_models,
     file_options,
     positive_number,
     reading_options,
@@ -206,7 +207,7 @@ def make_perceiver(
     from ..perceiver import Perceiver
 
     return Perceiver(
-        arguments.model or DEFAULT_MODELS,
+        chosen_models(arguments),
         sensor=sensor,
         provider=arguments.provider,
         precision=arguments.precision,
@@ -343,7 +344,9 @@ def _images(arguments: argparse.Namespace, kinds: Sequence[str]) -> dict[Path, P
         arguments.usage_error(f"--{of_scans[0]} needs --scan for images; add it, or leave --{of_scans[0]} out")
     require("PIL.Image", "camera", "Reading an image", package="pillow")
     if arguments.model is None:
-        arguments.model = [*DEFAULT_MODELS, CAMERA] if scans else [CAMERA]
+        if arguments.weights == "open":
+            arguments.usage_error(f"--weights open has no model of images; leave it out for the terms of {CAMERA}")
+        arguments.model = [*chosen_models(arguments), CAMERA] if scans else [CAMERA]
     return {image: scans[k] if scans else None for k, image in enumerate(images)}
 
 

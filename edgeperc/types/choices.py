@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 DEFAULT_MODELS = ("ssadnet", "pointseg", "objects")
+OPEN_MODELS = ("ssadnet-open", "pointseg-open", "objects-open")
+WEIGHTS = {"default": DEFAULT_MODELS, "open": OPEN_MODELS}
 CAMERA = "camseg"
 DEFAULT_SENSOR = "hdl-64e"
 PRECISIONS = ("fp32", "bf16", "int8")

@@ -13,7 +13,7 @@ from edgeperc.datasets.splits import FOLDS, TEST_DRIVES, VALIDATION_DRIVES
 from edgeperc.evaluation.tables import BANDS
 from edgeperc.types.card import ModelCard
 from edgeperc.types.views import CameraGeometry, ObjectGeometry, TopViewGeometry
-from edgeperc.zoo import DEFAULT, MAX_LOSS, Variant, digest, resolve
+from edgeperc.zoo import DEFAULT, MAX_LOSS, OPEN, Variant, digest, resolve
 
 from ..recipe import Recipe
 
@@ -45,7 +45,7 @@ def models_page(folder: Path) -> str:
         "",
         *_shipped(shipped),
         *_precisions(shipped),
-        *_free(research),
+        *_open(shipped),
         *_validation(folder / "validation.json"),
         "",
         "## Figures of the shipped models",
@@ -147,21 +147,21 @@ def _precisions(variants: Sequence[Variant]) -> Iterable[str]:
     )
 
 
-def _free(research: Sequence[Variant]) -> Iterable[str]:
-    free = [variant for variant in research if "KITTI" not in variant.card.training.get("licence", "")]
+def _open(variants: Sequence[Variant]) -> Iterable[str]:
+    free = [variant for variant in variants if variant.name in OPEN]
     if not free:
         return
-    options = " ".join(f"--model models/research/{variant.path.name}" for variant in reversed(free))
-    yield from ("", "## Weights free of KITTI's terms", "")
+    yield from ("", "## Weights that anyone may use", "")
     yield from _prose(
-        "The shipped models were trained on KITTI's scans, whose terms exclude commercial use. For commercial use "
-        "take the models that were trained on simulation alone, from the repository or the source distribution:"
+        "The default models were trained on KITTI's scans, whose terms exclude commercial use. "
+        f"{', '.join(f'`{name}`' for name in OPEN)} were trained without any scan, box or network of KITTI: on drawn "
+        "streets and 28 scans of PandaSet. Their terms are in the table above. They take the same time, and are less "
+        "accurate where KITTI's sensor drives:"
     )
-    yield from ("", f"    edgeperc run PATH {options}", "")
-    size = sum(variant.path.stat().st_size for variant in free) / 1e6
+    yield from ("", '    edgeperc run PATH --weights open', "    edgeperc.Perceiver(weights=\"open\")", "")
     yield from _prose(
-        f"They are less accurate ({', '.join(variant.name for variant in free)} below). The wheel "
-        f"leaves out their {size:.1f} MB."
+        "In the wheel they are in int8. Their fp32 files, to train further or for other providers, are among the "
+        "research models, as are the larger `pointseg-sim` and `ssadnet-sim`, trained on drawn streets alone."
     )
 
 

@@ -59,6 +59,9 @@ FEWEST_HALVED = 1024
 # 0.12 standard deviations.
 UNPOOLING = (LoDNN, SegNet, SSADNet)
 N_GOLDEN_VALUES = 64
+# Terms of weights by the data sets of the real frames; a frame of a set is called SET/NAME.
+TERMS = {"pandaset": "CC BY 4.0, as PandaSet's (Hesai and Scale AI), with its terms of use"}
+OTHER_TERMS = "terms of the data sets of the real frames; KITTI: CC BY-NC-SA 3.0"
 CAMVID_LICENCE = (
     "terms of CamVid: free for research; cite Brostow, Fauqueur and Cipolla (2009), and Brostow et al. (2008)"
 )
@@ -80,7 +83,10 @@ def _training(recipe: Recipe, notes: Mapping[str, Any]) -> dict[str, Any]:
     frames = notes["frames"]
     simulated = f"{notes['n_simulated']} simulated scans"
     data = f"{len(frames)} real frames, {simulated}" if frames else f"{simulated}, no real frame"
-    licence = "terms of the data sets of the real frames; KITTI: CC BY-NC-SA 3.0" if frames else notes["licence"]
+    sets = {name.partition("/")[0] if "/" in name else "KITTI" for name in frames}
+    licence = notes["licence"]
+    if sets:
+        licence = "; ".join(TERMS[name] for name in sorted(sets)) if sets <= TERMS.keys() else OTHER_TERMS
     if recipe.task == "camera":
         data, licence = f"{len(frames)} images of CamVid", CAMVID_LICENCE
     return {
@@ -317,7 +323,7 @@ def export(
     fitness : profile of the training scans, for the check of inputs at runtime; None for a camera's network.
     name : name of the model; by default the network's.
     metrics : figures to write into the card.
-    licence : license of weights trained on simulation alone; KITTI's applies to all others.
+    licence : license of weights trained on simulation alone; others have the terms of their real frames (`TERMS`).
     Raises ParityError.
     """
     network, recipe, notes = load(checkpoint)

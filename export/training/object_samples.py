@@ -36,6 +36,9 @@ from ..data.scans import LabeledScan
 from ..data.simulate import TRAINING_SENSOR
 from .object_task import VEHICLE
 
+DETECTOR = "ssadnet"
+"""The model whose boxes are candidates."""
+
 N_STORED = 192  # points of a crop; training draws from them
 STORED_MARGIN_M = 1.5
 MAX_NEGATIVES = {"real": 120, "simulated": 48}  # groups without an object, of each scan
@@ -85,17 +88,19 @@ def build_samples(
     scans: Sequence[tuple[str, LabeledScan | Path | Callable[[], LabeledScan]]],
     *,
     real: bool,
+    detector: bool = True,
     n_workers: int = 0,
 ) -> None:
     """Write the samples of scans into ``folder``, in parts; finished parts are kept.
 
     name : of the source.
     scans : the drive, and the scan, the file of one, or what makes it.
+    detector : boxes of `DETECTOR` are candidates too.
     """
     folder.mkdir(parents=True, exist_ok=True)
     parts = [scans[first : first + PART] for first in range(0, len(scans), PART)]
     missing = [k for k in range(len(parts)) if not (folder / f"{name}-{k:03d}.npz").exists()]
-    write = partial(_write_part, folder=folder, name=name, parts=parts, real=real)
+    write = partial(_write_part, folder=folder, name=name, parts=parts, real=real, detector=detector)
     with mapped(write, missing, n_workers) as done:
         for _ in tqdm(done, desc=f"candidates of {name}", unit="part", total=len(missing)):
             pass
@@ -108,9 +113,10 @@ def _write_part(
     name: str,
     parts: Sequence[Sequence[tuple[str, LabeledScan | Path | Callable[[], LabeledScan]]]],
     real: bool,
+    detector: bool,
 ) -> None:
-    perceive = Perceiver(
-        "ssadnet",
+    perceive = detector and Perceiver(
+        DETECTOR,
         mounting=MODEL_MOUNTING,
         n_threads=1,
         precision="fp32",
@@ -127,7 +133,7 @@ def _write_part(
         else:
             scan = LabeledScan.load(given) if isinstance(given, Path) else given()
         rng = np.random.default_rng((part, k, len(name)))
-        samples.append(samples_of(scan, f"{name}/{drive}", perceive, rng, real=real))
+        samples.append(samples_of(scan, f"{name}/{drive}", perceive or None, rng, real=real))
     joined = ObjectSamples(*(np.concatenate(arrays) for arrays in zip(*samples, strict=True)))
     with open_atomic(folder / f"{name}-{part:03d}.npz") as file:
         np.savez(file, **joined._asdict())
@@ -148,13 +154,18 @@ def load_samples(folder: Path, names: Sequence[str]) -> ObjectSamples:
 
 
 def samples_of(
-    labeled: LabeledScan, drive: str, perceive: Perceiver, rng: np.random.Generator, *, real: bool
+    labeled: LabeledScan,
+    drive: str,
+    perceive: Perceiver | None,
+    rng: np.random.Generator,
+    *,
+    real: bool,
 ) -> ObjectSamples:
     """The samples of one scan; ``perceive`` finds boxes in the top view."""
     points = read_only(labeled.points)
     scan = Scan.of(points, find_ground(points, mount_height_m=MODEL_HEIGHT_M))
     cells = sort_into_cells(scan, OBJECT_VIEW.height_range_m)
-    detected = rectangles(perceive(points).boxes)
+    detected = rectangles(perceive(points).boxes if perceive is not None else ())
     sensor = labeled.sensor or get_sensor(TRAINING_SENSOR)
     found = find_candidates(scan, cells, detected, sensor.link_per_m)
     truths = [(box, n) for box, n in zip(labeled.boxes, labeled.counts, strict=True)]

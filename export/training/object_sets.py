@@ -32,6 +32,8 @@ def write_samples(
     simulated: Path | None = None,
     scan_sets: Sequence[ScanFolder] = (),
     n_workers: int = 0,
+    *,
+    detector: bool = True,
 ) -> tuple[list[str], dict[str, dict[str, str]]]:
     """Write the samples of all scans; those in ``out`` are kept.
 
@@ -43,6 +45,7 @@ def write_samples(
     """
     names: list[str] = []
     hashes: dict[str, dict[str, str]] = {}
+    build = partial(build_samples, out, detector=detector, n_workers=n_workers)
     if kitti is not None:
         objects = KittiObjects(kitti)
         train = objects.names("train")
@@ -54,23 +57,23 @@ def write_samples(
                 frames = [objects.frame(scan) for scan in scans]
                 labeled = [(frame.drive, partial(LabeledScan.from_frame, frame)) for frame in frames]
                 hashes[name] = {frame.name: scan_hash(frame.points) for frame in frames}
-                build_samples(out, name, labeled, real=True, n_workers=n_workers)
+                build(name, labeled, real=True)
                 names.append(name)
                 if name != VALIDATION:
                     # Objects of this source alone, so that leaving it out leaves them out.
                     bank = cache(partial(_bank, tuple(scan for _, scan in labeled)))
                     changed = [(drive, _Pasted(scan, bank, k)) for drive, scan in labeled for k in range(N_VARIANTS)]
-                    build_samples(out, f"{name}-{PASTED}", changed, real=True, n_workers=n_workers)
+                    build(f"{name}-{PASTED}", changed, real=True)
                     names.append(f"{name}-{PASTED}")
                     hashes[names[-1]] = {}
     for folder in scan_sets:
         of_set, _, hashes[folder.layout.name] = read_scan_set(folder, "train")
         drives = [folder.drives[name.partition("/")[2]] for name in hashes[folder.layout.name]]
-        build_samples(out, folder.layout.name, list(zip(drives, of_set, strict=True)), real=True, n_workers=n_workers)
+        build(folder.layout.name, list(zip(drives, of_set, strict=True)), real=True)
         names.append(folder.layout.name)
     if simulated is not None:
         files = sorted(simulated.glob("*.npz"))
-        build_samples(out, "simulated", [(file.stem, file) for file in files], real=False, n_workers=n_workers)
+        build("simulated", [(file.stem, file) for file in files], real=False)
         names.append("simulated")
         hashes["simulated"] = {}
     return names, hashes

@@ -349,7 +349,11 @@ def _image_source(recipe: Recipe, data: Data, run: Run, device: torch.device) ->
 def _object_source(recipe: Recipe, folder: Path, data: Data, run: Run) -> _Source:
     """Candidates of real and simulated scans, whose samples are kept in a folder; those of the fold are watched."""
     task = Objects.of(recipe)
-    names, hashes = write_samples(folder, data.kitti, data.simulated, data.scan_sets, run.n_workers)
+    if not recipe.detector:
+        folder = folder.with_name(f"{folder.name}-of-groups")
+    names, hashes = write_samples(
+        folder, data.kitti, data.simulated, data.scan_sets, run.n_workers, detector=recipe.detector
+    )
     watched = [VALIDATION if data.fold is None else f"kitti-{data.fold}"]
     trained = [name for name in names if name != VALIDATION and name.removesuffix(f"-{PASTED}") not in watched]
     if not trained:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from ...system.extras import require
-from ...types.choices import CAMERA, DEFAULT_MODELS, RULES
+from ...types.choices import CAMERA, RULES
 from ..arguments import (
     Commands,
     add_agreement,
@@ -17,6 +17,7 @@ from ..arguments import (
     add_figures_file,
     add_model,
     add_provider,
+    chosen_models,
     finite_number,
 )
 from ..output import FEW, many, print_line, progress, table_lines, write_figures
@@ -127,7 +128,7 @@ def eval_command(arguments: argparse.Namespace) -> int:
     with progress() as show:
         figures, mistakes = evaluate(
             arguments.datasets,
-            arguments.model or DEFAULT_MODELS,
+            chosen_models(arguments),
             Perceiving(arguments.provider, arguments.precision, arguments.boxes_from, frozenset(rules)),
             split=arguments.split,
             fold=arguments.fold,

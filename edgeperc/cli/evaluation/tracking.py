@@ -125,7 +125,7 @@ def eval_tracking_command(arguments: argparse.Namespace) -> int:
     boxes: dict[str, list[list[Box]]] = {}
     if arguments.boxes is not None:
         boxes, source = {names[0]: read_boxes(arguments.boxes)}, f"boxes of {arguments.boxes}"
-    elif arguments.model or not (arguments.root / "detections").is_dir():
+    elif arguments.model or arguments.weights != "default" or not (arguments.root / "detections").is_dir():
         boxes, source = _perceived(arguments, names)
     with progress("sequence") as show:
         figures = {"of": source} | evaluate_kitti(
