@@ -104,7 +104,7 @@ def evaluate(
     perceive, scans = job.scans()
     records: dict[str, list[Record]] = {}
     worst: dict[str, list[Mistakes]] = {}
-    evaluated = (evaluate() for _, _, evaluate in scans)
+    evaluated: Iterator[_Figures] = (evaluate() for _, _, evaluate in scans)
     if engine == "ray" or (workers or 1) > 1:
         evaluated = _side_by_side(job, perceive, scans, engine, workers)
     for done, ((block, _, _), (record, mistakes)) in enumerate(zip(scans, evaluated, strict=True), start=1):

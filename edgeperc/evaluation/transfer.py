@@ -58,6 +58,10 @@ class Scan:
     objects: frozenset[tuple[str, ObjectKey]] | None
 
 
+_DataSet = tuple[SensorProfile, int, Callable[[], Iterator[Scan]], "ScanFolder | None"]
+"""Sensor, number of scans, a function that reads them, and their folder if they have boxes."""
+
+
 def compare(
     datasets: Sequence[str],
     model: str | Path = "pointseg",
@@ -88,8 +92,8 @@ def compare(
         with ``model`` for the points.
     Raises PointsError, ModelError, SplitError.
     """
-    sets = [(name, *_dataset(name)) for name in datasets]
-    sizes = {name: (len(ADAPTATIONS) + (folder is not None)) * n for name, _, n, _, folder in sets}
+    sets = {name: _dataset(name) for name in datasets}
+    sizes = {name: (len(ADAPTATIONS) + (folder is not None)) * n for name, (_, n, _, folder) in sets.items()}
     total, done = sum(sizes.values()), 0
     result: dict[str, Any] = {}
     if (workers or 1) > 1:
@@ -109,20 +113,20 @@ def compare(
         done += 1
         on_scan(done, total)
 
-    for name, *dataset in sets:
-        result[name] = _compare_one(model, provider, precision, *dataset, count)
+    for name, dataset in sets.items():
+        result[name] = _compare_one(model, provider, precision, dataset, count)
     return result
 
 
 class _OfOne:
     """Compares a data set in a worker process."""
 
-    def __init__(self, *arguments: Any) -> None:
-        self._arguments = arguments
+    def __init__(self, model: str | Path, provider: str, precision: str) -> None:
+        self._arguments = model, provider, precision
 
     def __call__(self, name: str) -> dict[str, Any] | EdgepercError:
         try:
-            return _compare_one(*self._arguments, *_dataset(name), lambda: None)
+            return _compare_one(*self._arguments, _dataset(name), lambda: None)
         except EdgepercError as exc:
             return exc
 
@@ -131,13 +135,11 @@ def _compare_one(
     model: str | Path,
     provider: str,
     precision: str,
-    sensor: SensorProfile,
-    n_scans: int,
-    read: Callable[[], Iterator[Scan]],
-    folder: ScanFolder | None,
+    dataset: _DataSet,
     count: Callable[[], None],
 ) -> dict[str, Any]:
     """The figures of a data set; ``count`` is called after each scan."""
+    sensor, n_scans, read, folder = dataset
     perceivers = {
         adaptation: Perceiver(
             model,
@@ -161,7 +163,7 @@ def _compare_one(
             count()
         objects = None if objects is None or scan.objects is None else objects | scan.objects
     function = sensor.remission
-    result = {
+    result: dict[str, Any] = {
         "n_scans": n_scans,
         "function": None
         if function is None
@@ -206,8 +208,7 @@ def _row(confusion: Confusion) -> dict[str, Any]:
     return {"iou": known, "mean_iou": sum(objects) / len(objects) if objects else None, "n_points": n_points}
 
 
-def _dataset(name: str) -> tuple[SensorProfile, int, Callable[[], Iterator[Scan]], ScanFolder | None]:
-    """Sensor and number of scans of a dataset, a function that reads them, and their folder if they have boxes."""
+def _dataset(name: str) -> _DataSet:
     sensor_name, equals, source = name.partition("=")
     if not equals:
         return _of_folder(_folder(name))
@@ -226,9 +227,7 @@ def _dataset(name: str) -> tuple[SensorProfile, int, Callable[[], Iterator[Scan]
     return _of_folder(_folder(source), sensor)
 
 
-def _of_folder(
-    folder: ScanFolder, sensor: SensorProfile | None = None
-) -> tuple[SensorProfile, int, Callable[[], Iterator[Scan]], ScanFolder | None]:
+def _of_folder(folder: ScanFolder, sensor: SensorProfile | None = None) -> _DataSet:
     n_scans = len(folder.names("test"))
     return (
         sensor or folder.layout.sensor,
