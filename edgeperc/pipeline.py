@@ -295,7 +295,7 @@ class Pipeline:
             marks = value("agree", mark_cells, cells, scan, agreed, rules)
             view = value("agree", _agreed_cells, cells, agreed, joined, boxes, trusted, marks, rules)
 
-        # What needs no objects is for the lane that would wait for them; what needs no labels, for the one that finds no
+        # What needs no objects is for the lane that waits for them; what needs no labels, for the one that finds no
         # sector of a turn left.
         aside = [strips, cells]
         first = [near, projected, scan, *sectors, *(aside if sectors else ())]
