@@ -11,7 +11,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .agreement.cells import agree_on_cells, mark_cells
-from .agreement.rules import agree_on_boxes, agree_on_points, find_support, find_voters, stand_boxes, without_poles
+from .agreement.rules import (
+    Support,
+    agree_on_boxes,
+    agree_on_points,
+    find_support,
+    find_voters,
+    roles_of,
+    stand_boxes,
+    without_poles,
+)
+from .agreement.votes import VEHICLE
 from .ground.observed import Observer
 from .ground.planes import GroundFit, fit_ground
 from .ground.scan import Scan
@@ -21,7 +31,7 @@ from .inference.projection import RangeImageProjector, input_heights, make_proje
 from .inference.session import MAX_ROWS, Session
 from .objects.boxes import join_boxes, objects_from_points
 from .objects.candidate_boxes import boxes_of_objects, decode_objects, merge_boxes
-from .objects.candidates import MIN_DETECTOR_SCORE, Candidates, cell_buffer, find_candidates, sort_into_cells
+from .objects.candidates import MIN_DETECTOR_SCORE, Candidates, CellBuffer, find_candidates
 from .objects.cluster import PERSONS, sort_points
 from .objects.crops import Crops, crop_candidates, fill_features, with_points
 from .objects.linkage import Strips
@@ -35,6 +45,11 @@ from .types.perception import Box, GroundSurface, PointLabels, TopView
 from .types.points import Heights, Ids, Points, Rows
 from .types.sensor import SensorProfile
 from .types.views import ObjectGeometry, RangeImageGeometry, TopViewGeometry
+
+# What is taken from the scores of the object network, so that points are completed from 0.7 and supported from 0.5 on.
+# All round on PandaSet, Lyft, Argoverse 2 and DDAD, 191 of 191 vehicles' boxes from 0.7 on are at a vehicle, and 236 of
+# 304 from 0.5 to 0.7.
+LESS_SURE = 0.2
 
 BoxesFrom = Literal["both", "network", "clusters"]
 
@@ -152,12 +167,12 @@ class ObjectNetwork:
         view = session.card.view
         assert isinstance(view, ObjectGeometry)
         self.session, self.card, self.view = session, session.card, view
-        self._number = cell_buffer()
+        self._cells = CellBuffer()
         self._scale = np.array([session.card.input.mean, session.card.input.std], np.float32)
 
     def crop(self, scan: Scan, boxes: Sequence[Box], options: Options) -> tuple[Candidates, Crops]:
         """Where objects may be, with the points there: clusters, and boxes of the top view."""
-        cells = sort_into_cells(scan, self.view.height_range_m, self._number)
+        cells = self._cells.sort(scan, self.view.height_range_m)
         detected = rectangles(boxes if options.boxes_from != "clusters" else ())
         candidates = Candidates(detected, cells)
         if options.boxes_from != "network":
@@ -258,14 +273,20 @@ class Pipeline:
             support = value("cluster", find_support, scan, labels, boxes, rules)
             per_m = options.distance_per_m
             clusters = value("cluster", find_voters, scan, labels, support, strips, distance_per_m=per_m, rules=rules)
+            if (
+                self.objects is not None
+            ):  # the clusters vote without them: a box keeps and adds labels whatever they say
+                supporting = value("agree", _supporting, boxes, objects)
+                support = value("cluster", find_support, scan, labels, supporting, rules)
             agreed = value("agree", agree_on_points, scan, labels, clusters, support, upright, view=cells, rules=rules)
             trusted = value("agree", agree_on_boxes, boxes, scan, agreed, rules)
             joined = trusted
         if self.ranged and options.boxes_from != "network":
-            around = value("cluster", _objects, scan, agreed, clusters, trusted, options)
+            left = agreed if self.objects is None or not rules else value("cluster", _unboxed, agreed, support)
+            around = value("cluster", _objects, scan, left, clusters, trusted, options)
             joined = value("cluster", self._join, trusted, around)
         standing = joined
-        if rules:
+        if rules and self.objects is None:
             standing = value("agree", stand_boxes, joined, scan, agreed, rules, options.distance_per_m)
         if self.objects is not None:
             by_labels = bool(self.ranged) and options.boxes_from != "network"
@@ -274,11 +295,12 @@ class Pipeline:
             marks = value("agree", mark_cells, cells, scan, agreed, rules)
             view = value("agree", _agreed_cells, cells, agreed, joined, boxes, trusted, marks, rules)
 
-        # The second lane has time for what needs no labels. In a turn, the lane that finds no sector left takes it.
+        # What needs no objects is for the lane that waits for them; what needs no labels, for the one that finds no
+        # sector of a turn left.
         aside = [strips, cells]
         first = [near, projected, scan, *sectors, *(aside if sectors else ())]
         self._lanes.run(
-            [*first, labels, clusters, agreed, trusted, joined, view],
+            [*first, labels, upright, strips, clusters, cells, surface, agreed, trusted, joined, view],
             [planes, boxes, objects, *reversed(sectors), *aside, surface, upright, marks, standing],
         )
         labeled = agreed()
@@ -338,6 +360,17 @@ def weigh(boxes: Sequence[Box], view: TopViewGeometry, classes: Sequence[str], m
 
 def _absent() -> None:
     """The value of a part without a network, or that no option asks for."""
+
+
+def _supporting(boxes: Sequence[Box], objects: Sequence[Box]) -> list[Box]:
+    """Boxes that keep and add labels of points: those of the top view, and of the object network."""
+    return [*boxes, *(replace(box, score=box.score - LESS_SURE) for box in objects)]
+
+
+def _unboxed(labels: PointLabels, support: Support) -> PointLabels:
+    """Labels without those of vehicles that have a box: what has one needs no other."""
+    vehicles = roles_of(labels.classes)[labels.labels] == VEHICLE
+    return replace(labels, labels=np.where(vehicles & (support.scores > 0.0), np.uint8(0), labels.labels))
 
 
 def _at_least(boxes: Sequence[Box], min_score: float) -> list[Box]:

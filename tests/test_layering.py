@@ -30,7 +30,9 @@ FLOORS = {
         system.__init__ system.atomic system.clock system.extras system.fields system.lanes
         system.names
         system.printable
-        system.machine system.ray_cluster system.remote
+        system.machine system.remote
+        system.workers
+        system.ray_cluster
         system.compiling system.kernel_stamp
         system.kernel_cache
         system.kernels
@@ -108,7 +110,7 @@ FLOORS = {
         cli.arguments cli.evaluation.__init__ cli.output cli.straighten
         cli.completion cli.doctor cli.evaluation.box_tables cli.evaluation.painting cli.lists cli.program
         cli.report cli.scans cli.sinks
-        cli.evaluation.sensors cli.fit_sensor cli.info cli.ray
+        cli.evaluation.sensors cli.fit_sensor cli.info cli.side_by_side
         cli.evaluation.scans cli.run
         cli.demo cli.evaluation.tracking cli.ros2
         cli.main

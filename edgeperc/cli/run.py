@@ -32,7 +32,6 @@ from .arguments import (
     reading_options,
 )
 from .output import many, print_line, progress
-from .ray import add_engine, check_engine, perceive_on_ray, through_temporary
 from .report import Report
 from .scans import (
     Scans,
@@ -44,6 +43,7 @@ from .scans import (
     scan_sensor,
     with_mounting,
 )
+from .side_by_side import add_engine, check_engine, has_workers, perceive_side_by_side, through_temporary
 from .sinks import add_sinks, open_sinks, wanted_sinks
 
 if TYPE_CHECKING:
@@ -256,9 +256,9 @@ def run_command(arguments: argparse.Namespace) -> int:
     started = time.perf_counter()
     with progress("file") as show, ExitStack() as stack:
         run = _Run(arguments, perceivers, kinds, open_sinks(arguments, stack))
-        if arguments.engine == "ray":
-            perceive_on_ray(arguments, _alone, perceivers, scans, targets, report, show)
-        for done, (scan, target) in enumerate(zip(scans, targets, strict=True) if arguments.engine == "local" else ()):
+        if has_workers(arguments):
+            perceive_side_by_side(arguments, _alone, perceivers, scans, targets, report, show)
+        for done, (scan, target) in enumerate(() if has_workers(arguments) else zip(scans, targets, strict=True)):
             show(done, len(scans))
             if images:
                 outcomes = run.image(scan, images[scan], target)
@@ -570,7 +570,7 @@ class _Run:
 def _alone(
     arguments: argparse.Namespace, perceivers: _Perceivers | None = None
 ) -> tuple[Perceiver, Callable[..., Iterator[Outcome]], Callable[[Path], list[Path]]]:
-    """For `perceive_on_ray`: a perceiver of scan files, what perceives one and writes its files, and these files."""
+    """For `perceive_side_by_side`: a perceiver, what perceives a scan file and writes its files, and these files."""
     kinds = [kind for kind in _KINDS if getattr(arguments, kind)]
     perceivers = perceivers or _Perceivers(arguments)
     perceive = perceivers.of(with_mounting(arguments.sensor or DEFAULT_SENSOR, arguments))

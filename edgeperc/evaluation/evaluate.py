@@ -20,7 +20,8 @@ from ..datasets.scan_folder import ScanFolder
 from ..errors import EdgepercError, OptionError, PointsError
 from ..perceiver import Learned, Perceiver
 from ..simulation.samples import FIRST_SEED
-from ..system.ray_cluster import MOST_FIRST, Lost, map_on_ray
+from ..system.ray_cluster import map_in_workers
+from ..system.workers import MOST_FIRST, Lost
 from ..types.mounting import Mounting
 from ..zoo import DEFAULT
 from .judge import BY_DEFAULT, NETWORK_ALONE, Judge, Perceiving
@@ -73,10 +74,10 @@ def evaluate(
     n_resamples : int
         Number of resamples of the drives for the intervals.
     engine : {"local", "ray"}
-        This process, or processes with one thread each on a Ray cluster (`ray_cluster.map_on_ray`); the figures are
+        This computer, or processes with one thread each on a Ray cluster (`ray_cluster.map_on_ray`); the figures are
         the same.
     workers : int or None
-        Number of processes of ``"ray"``.
+        Number of worker processes. None: this process alone; of ``"ray"``, one for each CPU.
     on_scan : callable
         Called after each scan with the number of scans done and the number of all scans.
 
@@ -103,7 +104,9 @@ def evaluate(
     perceive, scans = job.scans()
     records: dict[str, list[Record]] = {}
     worst: dict[str, list[Mistakes]] = {}
-    evaluated = _on_ray(job, perceive, scans, workers) if engine == "ray" else (evaluate() for _, _, evaluate in scans)
+    evaluated: Iterator[_Figures] = (evaluate() for _, _, evaluate in scans)
+    if engine == "ray" or (workers or 1) > 1:
+        evaluated = _side_by_side(job, perceive, scans, engine, workers)
     for done, ((block, _, _), (record, mistakes)) in enumerate(zip(scans, evaluated, strict=True), start=1):
         records.setdefault(block, []).append(record)
         if mistakes is not None:
@@ -169,7 +172,9 @@ class _Evaluator:
         return results
 
 
-def _on_ray(job: _Job, perceive: Perceiver, scans: Sequence[_Scan], workers: int | None) -> Iterator[_Figures]:
+def _side_by_side(
+    job: _Job, perceive: Perceiver, scans: Sequence[_Scan], engine: str, workers: int | None
+) -> Iterator[_Figures]:
     """Evaluate each scan, or each drive whose scans need their order, in a worker process."""
     # The perceiver learns from the first scans, so they are evaluated here.
     first: dict[int, _Figures] = {}
@@ -180,7 +185,7 @@ def _on_ray(job: _Job, perceive: Perceiver, scans: Sequence[_Scan], workers: int
     # Consecutive scans of one drive stay together; the others are apart.
     rest = (k for k in range(len(scans)) if k not in first)
     groups = [[*group] for _, group in groupby(rest, lambda k: (scans[k][0], scans[k][1] or k))]
-    results = map_on_ray(_Evaluator, (job, perceive.learned), groups, workers=workers) if groups else iter(())
+    results = map_in_workers(engine, _Evaluator, (job, perceive.learned), groups, workers=workers)
     done = 0
     for numbers, answer in zip(groups, results, strict=True):
         if isinstance(answer, EdgepercError):

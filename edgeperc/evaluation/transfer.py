@@ -11,11 +11,12 @@ import numpy as np
 
 from ..datasets.layout import class_number
 from ..datasets.scan_folder import ScanFolder, ScanFrame
-from ..errors import ModelError, PointsError
+from ..errors import EdgepercError, ModelError, PointsError
 from ..perceiver import ADAPTATIONS, Perceiver
 from ..preprocess.sensor_fit import fit_sensor
 from ..simulation.samples import FIRST_SEED, IGNORE, labels_by_boxes, simulated_scan
 from ..simulation.scene import POINT_CLASSES
+from ..system.workers import Lost, map_in_processes
 from ..types.perception import Box
 from ..types.points import Labels, Points
 from ..types.sensor import SensorProfile, get_sensor
@@ -57,12 +58,17 @@ class Scan:
     objects: frozenset[tuple[str, ObjectKey]] | None
 
 
+_DataSet = tuple[SensorProfile, int, Callable[[], Iterator[Scan]], "ScanFolder | None"]
+"""Sensor, number of scans, a function that reads them, and their folder if they have boxes."""
+
+
 def compare(
     datasets: Sequence[str],
     model: str | Path = "pointseg",
     *,
     provider: str = "cpu",
     precision: str = "auto",
+    workers: int | None = None,
     on_scan: Callable[[int, int], None] = lambda done, total: None,
 ) -> dict[str, Any]:
     """Compute the IoU of points by class, for each dataset and each of `edgeperc.perceiver.ADAPTATIONS`.
@@ -75,7 +81,9 @@ def compare(
         function of a simulated sensor is fitted to eight other scenes. That of a real sensor comes from its profile.
     model : a range-image model.
     provider, precision : as in `Perceiver`.
-    on_scan : called after each scan with the number of scans done and the number of all scans, over all adaptations.
+    workers : number of worker processes, each with one data set at a time; None: this process alone.
+    on_scan : called after each scan, or data set of a worker, with the number of scans done and that of all scans, over
+        all adaptations.
     Returns: By dataset: ``"n_scans"``, ``"function"``, and by adaptation ``"iou"`` (class -> IoU, None for a class
         that does not occur), ``"mean_iou"`` over the classes except the background, ``"n_points"`` (class -> count).
         In ``"n_objects"`` distinct objects by class, or None if only points are labeled, and in ``"few"`` the classes
@@ -84,52 +92,94 @@ def compare(
         with ``model`` for the points.
     Raises PointsError, ModelError, SplitError.
     """
+    sets = {name: _dataset(name) for name in datasets}
+    sizes = {name: (len(ADAPTATIONS) + (folder is not None)) * n for name, (_, n, _, folder) in sets.items()}
+    total, done = sum(sizes.values()), 0
     result: dict[str, Any] = {}
-    sets = [(name, *_dataset(name)) for name in datasets]
-    total, done = sum((len(ADAPTATIONS) + (folder is not None)) * n for _, _, n, _, folder in sets), 0
-    for name, sensor, n_scans, read, folder in sets:
-        perceivers = {
-            adaptation: Perceiver(
-                model,
-                sensor=sensor,
-                provider=provider,
-                precision=precision,
-                on_mismatch="ignore",
-                adapt=adaptation,
-                boxes_from="network",  # only points are evaluated
-                full_turn=True,
-            )
-            for adaptation in ADAPTATIONS
-        }
-        counts = {adaptation: Confusion(POINT_CLASSES) for adaptation in ADAPTATIONS}
-        trained_on = training_scans_of(perceivers["none"].cards)
-        objects: set[tuple[str, ObjectKey]] | None = set()
-        for scan in read():
-            check_unseen(trained_on, scan.name, scan.name, scan.points)
-            for adaptation, perceive in perceivers.items():
-                _count(counts[adaptation], perceive, scan)
-                done += 1
-                on_scan(done, total)
-            objects = None if objects is None or scan.objects is None else objects | scan.objects
-        function = sensor.remission
-        result[name] = {
-            "n_scans": n_scans,
-            "function": None
-            if function is None
-            else f"{function.kind} {', '.join(f'{c:.4g}' for c in function.coefficients)}",
-            **_distinct(objects),
-            **{adaptation: _row(confusion) for adaptation, confusion in counts.items()},
-        }
-        if folder is not None:
-            top_view, _, of_objects = DEFAULT
-            judge = Judge([top_view, model, of_objects], Perceiving(provider, precision), sensor=sensor)
-            records = []
-            for frame in _frames(folder):
-                records.append(judge.record_boxes(frame))
-                done += 1
-                on_scan(done, total)
-            measured = figures(records)
-            result[name]["boxes"] = {key: measured[key] for key in ("kitti", "centers") if key in measured}
+    if (workers or 1) > 1:
+        answers = map_in_processes(_OfOne, (model, provider, precision), [*sizes], workers=workers)
+        for name, answer in zip(sizes, answers, strict=True):
+            if isinstance(answer, EdgepercError):
+                raise answer
+            if isinstance(answer, Lost):
+                raise EdgepercError(f"{name} was not evaluated: {answer.reason}")
+            result[name] = answer
+            done += sizes[name]
+            on_scan(done, total)
+        return result
+
+    def count() -> None:
+        nonlocal done
+        done += 1
+        on_scan(done, total)
+
+    for name, dataset in sets.items():
+        result[name] = _compare_one(model, provider, precision, dataset, count)
+    return result
+
+
+class _OfOne:
+    """Compares a data set in a worker process."""
+
+    def __init__(self, model: str | Path, provider: str, precision: str) -> None:
+        self._arguments = model, provider, precision
+
+    def __call__(self, name: str) -> dict[str, Any] | EdgepercError:
+        try:
+            return _compare_one(*self._arguments, _dataset(name), lambda: None)
+        except EdgepercError as exc:
+            return exc
+
+
+def _compare_one(
+    model: str | Path,
+    provider: str,
+    precision: str,
+    dataset: _DataSet,
+    count: Callable[[], None],
+) -> dict[str, Any]:
+    """The figures of a data set; ``count`` is called after each scan."""
+    sensor, n_scans, read, folder = dataset
+    perceivers = {
+        adaptation: Perceiver(
+            model,
+            sensor=sensor,
+            provider=provider,
+            precision=precision,
+            on_mismatch="ignore",
+            adapt=adaptation,
+            boxes_from="network",  # only points are evaluated
+            full_turn=True,
+        )
+        for adaptation in ADAPTATIONS
+    }
+    counts = {adaptation: Confusion(POINT_CLASSES) for adaptation in ADAPTATIONS}
+    trained_on = training_scans_of(perceivers["none"].cards)
+    objects: set[tuple[str, ObjectKey]] | None = set()
+    for scan in read():
+        check_unseen(trained_on, scan.name, scan.name, scan.points)
+        for adaptation, perceive in perceivers.items():
+            _count(counts[adaptation], perceive, scan)
+            count()
+        objects = None if objects is None or scan.objects is None else objects | scan.objects
+    function = sensor.remission
+    result: dict[str, Any] = {
+        "n_scans": n_scans,
+        "function": None
+        if function is None
+        else f"{function.kind} {', '.join(f'{c:.4g}' for c in function.coefficients)}",
+        **_distinct(objects),
+        **{adaptation: _row(confusion) for adaptation, confusion in counts.items()},
+    }
+    if folder is not None:
+        top_view, _, of_objects = DEFAULT
+        judge = Judge([top_view, model, of_objects], Perceiving(provider, precision), sensor=sensor)
+        records = []
+        for frame in _frames(folder):
+            records.append(judge.record_boxes(frame))
+            count()
+        measured = figures(records)
+        result["boxes"] = {key: measured[key] for key in ("kitti", "centers") if key in measured}
     return result
 
 
@@ -158,8 +208,7 @@ def _row(confusion: Confusion) -> dict[str, Any]:
     return {"iou": known, "mean_iou": sum(objects) / len(objects) if objects else None, "n_points": n_points}
 
 
-def _dataset(name: str) -> tuple[SensorProfile, int, Callable[[], Iterator[Scan]], ScanFolder | None]:
-    """Sensor and number of scans of a dataset, a function that reads them, and their folder if they have boxes."""
+def _dataset(name: str) -> _DataSet:
     sensor_name, equals, source = name.partition("=")
     if not equals:
         return _of_folder(_folder(name))
@@ -178,9 +227,7 @@ def _dataset(name: str) -> tuple[SensorProfile, int, Callable[[], Iterator[Scan]
     return _of_folder(_folder(source), sensor)
 
 
-def _of_folder(
-    folder: ScanFolder, sensor: SensorProfile | None = None
-) -> tuple[SensorProfile, int, Callable[[], Iterator[Scan]], ScanFolder | None]:
+def _of_folder(folder: ScanFolder, sensor: SensorProfile | None = None) -> _DataSet:
     n_scans = len(folder.names("test"))
     return (
         sensor or folder.layout.sensor,

@@ -72,15 +72,29 @@ class Candidates(NamedTuple):
     cells: Cells
 
 
-def cell_buffer() -> NDArray[np.int32]:
-    """Memory for `Cells.number`, which a caller may use for one scan after the other."""
-    return np.empty((N_SIDE, N_SIDE), np.int32)
+class CellBuffer:
+    """Memory for `Cells.number`, for one scan after the other: only the cells of the last scan are emptied."""
+
+    def __init__(self) -> None:
+        self._number = np.empty((N_SIDE, N_SIDE), np.int32)
+        self._taken: NDArray[np.int32] | None = None
+
+    def sort(self, scan: Scan, height_range_m: tuple[float, float]) -> Cells:
+        """`sort_into_cells`; the next call overwrites the numbers of the cells."""
+        taken, self._taken = self._taken, None
+        if taken is None:
+            self._number.fill(-1)
+        else:
+            self._number.reshape(-1)[taken] = -1
+        cells = sort_into_cells(scan, height_range_m, self._number)
+        self._taken = cells.flat
+        return cells
 
 
 def sort_into_cells(scan: Scan, height_range_m: tuple[float, float], number: NDArray[np.int32] | None = None) -> Cells:
-    """Sort the points of a scan whose height above the ground is in a range [m]; ``number`` is overwritten."""
+    """Sort the points of a scan whose height above the ground is in a range [m]; ``number`` is -1 everywhere."""
     n = len(scan.points)
-    number = cell_buffer() if number is None else number
+    number = np.full((N_SIDE, N_SIDE), -1, np.int32) if number is None else number
     flat, rows, of_point = np.empty((3, n), np.int32)
     starts = np.empty(n + 1, np.int32)
     low, high = height_range_m
@@ -148,11 +162,9 @@ def fill_cells(
 ) -> tuple[int, int]:
     """Write `Cells` with arrays as long as the scan (``starts``: one more); return how many cells and rows there are.
 
-    ``of_point`` (n,) is overwritten with the number of each point's cell, -1 for none.
+    ``cells.number`` is -1 everywhere. ``of_point`` (n,) is overwritten with the number of each point's cell, or -1.
     """
     number, flat, starts, rows = cells.number.reshape(-1), cells.flat, cells.starts, cells.rows
-    for c in range(number.shape[0]):
-        number[c] = -1
     n_cells, n_rows = 0, 0
     for i in range(points.shape[0]):
         of_point[i] = -1

@@ -1,4 +1,4 @@
-"""Map items to results in worker processes of a Ray cluster, for ``--engine ray``."""
+"""Map items to results in worker processes, on this computer or on a Ray cluster (``--engine``, ``--workers``)."""
 
 from __future__ import annotations
 
@@ -11,32 +11,33 @@ import threading
 import traceback
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 from .extras import require
-
-MOST_FIRST = 20
-"""Scans that the driver perceives at most, until its perceiver has learned what workers start from. Usually five are
-enough; a scan that shows no ground does not count."""
+from .workers import DIED, MOST_DEATHS, Lost, map_in_processes
 
 # Items of a block, the unit that a worker is given. Few, because all are done again if its process dies. Many, because
 # the driver keeps some kilobytes for each block.
 MOST_IN_BLOCK = 16
-# How often the process of an item may die, before the item is given up.
-MOST_DEATHS = 2
 # A local cluster's memory for items and results in transit; Ray's own default is 30 % of the computer's.
 STORE_BYTES = 256 * 2**20
 
 
-@dataclass(frozen=True)
-class Lost:
-    """In place of a result.
-
-    reason : the traceback of an exception, or that the worker process died.
-    """
-
-    reason: str
+def map_in_workers(
+    engine: str,
+    make: Callable[..., Callable[[Any], Any]],
+    arguments: tuple[Any, ...],
+    items: Sequence[Any],
+    *,
+    workers: int | None = None,
+    n_threads: int = 1,
+) -> Iterator[Any]:
+    """`map_on_ray` for the engine ``"ray"``, else `workers.map_in_processes`."""
+    if not items:
+        return iter(())
+    if engine == "ray":
+        return map_on_ray(make, arguments, items, workers=workers, n_threads=n_threads)
+    return map_in_processes(make, arguments, items, workers=workers)
 
 
 def map_on_ray(
@@ -129,7 +130,7 @@ class _Worker:
     def __call__(self, batch: dict[str, Any]) -> Iterator[dict[str, list[Any]]]:
         """Map a block, item by item."""
         for number, item in zip(batch["number"].tolist(), batch["item"], strict=True):
-            result: Any = Lost(f"its worker process died {MOST_DEATHS} times, perhaps for lack of memory")
+            result: Any = Lost(DIED)
             if self._ray.get(self._deaths.begin.remote(number)) < MOST_DEATHS:
                 try:
                     result = self._function(pickle.loads(item))

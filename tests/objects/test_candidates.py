@@ -16,9 +16,9 @@ from edgeperc.ground.scan import Scan
 from edgeperc.objects.candidate_boxes import SCORE, boxes_of_objects, decode_objects, fill_merged, merge_boxes
 from edgeperc.objects.candidates import (
     MAX_LENGTH_M,
-    N_SIDE,
     SCALES,
     Candidates,
+    CellBuffer,
     Cells,
     fill_groups_of_cells,
     find_candidates,
@@ -156,11 +156,10 @@ def test_boxes_of_a_detector_are_the_last_candidates() -> None:
 
 
 def test_one_buffer_serves_one_scan_after_the_other() -> None:
-    number = np.empty((N_SIDE, N_SIDE), np.int32)
-    for scan in scans():
-        reused = sort_into_cells(scan, RANGE_M, number)
+    buffer = CellBuffer()
+    for scan in [*scans(), *reversed(scans())]:
+        reused = buffer.sort(scan, RANGE_M)
         fresh = sort_into_cells(scan, RANGE_M)
-        assert reused.number is number
         for a, b in zip(reused, fresh, strict=True):
             np.testing.assert_array_equal(a, b)
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -9,6 +12,7 @@ from edgeperc import Perceiver
 from edgeperc.errors import OptionError
 from edgeperc.simulation.samples import FIRST_SEED, simulated_scan
 from edgeperc.simulation.scene import SimulatedScan
+from edgeperc.types.geometry import inside
 from edgeperc.types.perception import Perception
 
 SEED = FIRST_SEED + 3
@@ -90,15 +94,27 @@ def test_candidates_may_come_from_one_source_alone(scan: SimulatedScan) -> None:
         Perceiver("ssadnet", boxes_from="clusters")
 
 
-def test_labels_do_not_depend_on_the_objects(scan: SimulatedScan) -> None:
-    """The network replaces boxes; labels of points are those without it."""
-    without, with_objects = (
-        Perceiver(models, n_threads=1)(scan.points)
-        for models in (["ssadnet", "pointseg"], ["ssadnet", "pointseg", "objects"])
-    )
-    assert without.points is not None
-    assert with_objects.points is not None
-    np.testing.assert_array_equal(without.points.labels, with_objects.points.labels)
+def test_boxes_of_objects_keep_and_add_labels(scan: SimulatedScan) -> None:
+    """In a box that is sure, and of which points are labeled, all above the ground are a vehicle's or a person's."""
+    options: dict[str, Any] = {"full_turn": True, "n_threads": 1}
+    without = Perceiver(["ssadnet", "pointseg"], **options)(scan.points).points
+    perception = Perceiver(["ssadnet", "pointseg", "objects"], **options)(scan.points)
+    labeled = perception.points
+    assert without is not None
+    assert labeled is not None
+    boxed, shares = np.zeros(len(scan.points), np.bool_), []
+    for box in perception.boxes:
+        if box.label in ("car", "van", "truck") and box.front is not None:
+            boxed |= inside(replace(box, size=(box.size[0], box.size[1], 20.0)), scan.points, 0.2)
+            stands = scan.points[:, 2] > box.center[2] - 0.5 * box.size[2] + 0.4
+            held = inside(box, scan.points, -0.1) & stands & without.in_view
+            if box.score >= 0.75 and held.any():
+                shares.append(float((labeled.labels[held] > 0).mean()))
+    assert len(shares) >= 3
+    assert np.mean(np.array(shares) == 1.0) > 0.7
+    changed = labeled.labels != without.labels
+    assert changed.any()
+    assert boxed[changed].all()
 
 
 @pytest.mark.parametrize("n", [0, 1, 7])

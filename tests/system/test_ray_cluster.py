@@ -1,4 +1,4 @@
-"""``--engine ray`` gives what ``--engine local`` gives; scans and results at URLs."""
+"""Worker processes, of this computer or of Ray, give what one process gives; scans and results at URLs."""
 
 from __future__ import annotations
 
@@ -20,8 +20,9 @@ import pytest
 from edgeperc import cli
 from edgeperc.errors import MissingExtraError, OptionError, PointsError
 from edgeperc.perceiver import Perceiver
-from edgeperc.system.ray_cluster import Lost, map_on_ray, signals_kept
+from edgeperc.system.ray_cluster import map_on_ray, signals_kept
 from edgeperc.system.remote import Remote, location
+from edgeperc.system.workers import Lost
 from scenes import urban
 
 pytestmark = pytest.mark.filterwarnings("ignore")  # of Ray, boto and aiohttp
@@ -72,16 +73,23 @@ def contents(folder: Path) -> dict[str, bytes]:
     }
 
 
-@pytest.mark.usefixtures("cluster")
-def test_ray_gives_the_same_bytes_and_resumes(scans: Path, tmp_path: Path) -> None:
+@pytest.fixture(params=["local", "ray"])
+def workers(request: pytest.FixtureRequest) -> tuple[str, ...]:
+    """Options of two worker processes."""
+    if request.param == "ray":
+        request.getfixturevalue("cluster")
+    return ("--engine", request.param, "--workers", "2")
+
+
+def test_workers_give_the_same_bytes_and_resume(scans: Path, tmp_path: Path, workers: tuple[str, ...]) -> None:
     files = ("--labels", "--ply")  # a page and a picture show times
     code, records, said = run(scans, "--out", tmp_path / "local", *files)
     assert code == 1
     assert [bool(record.get("error")) for record in records] == [k == 6 for k in range(N_SCANS)]
     assert "no remission" in " ".join(records[7]["fitness"])
     assert not records[8]["fitness"]  # said once
-    there = tmp_path / "ray"
-    assert run(scans, "--out", there, *files, "--engine", "ray", "--workers", "2")[:2] == (code, records)
+    there = tmp_path / "workers"
+    assert run(scans, "--out", there, *files, *workers)[:2] == (code, records)
     assert contents(there) == contents(tmp_path / "local")
     assert len(contents(there)) == 2 * (N_SCANS - 1)
     assert "6.bin" in said
@@ -89,28 +97,27 @@ def test_ray_gives_the_same_bytes_and_resumes(scans: Path, tmp_path: Path) -> No
     # What is complete is kept; what is missing, cut short, or of a scan that changed since is made again.
     (there / "5.ply").unlink()
     (there / "7.label").write_bytes(b"cut")
-    again = run(scans, "--out", there, *files, "--engine", "ray", "--workers", "2")
+    again = run(scans, "--out", there, *files, *workers)
     assert again[:2] == (code, records)
     assert "1 scan of an earlier run kept" in again[2]
     assert contents(there) == contents(tmp_path / "local")
-    other = run(scans, "--out", there, *files, "--engine", "ray", "--workers", "2", "--boxes-from", "network")
+    other = run(scans, "--out", there, *files, *workers, "--boxes-from", "network")
     assert "kept" not in other[2]
     assert other[1] != records
 
 
-@pytest.mark.usefixtures("cluster")
-def test_ray_gives_the_same_figures(tmp_path: Path) -> None:
+def test_workers_give_the_same_figures(tmp_path: Path, workers: tuple[str, ...]) -> None:
     found = {}
-    for engine in ("local", "ray"):
-        file = tmp_path / f"{engine}.json"
+    for name, options in (("one", ()), ("workers", workers)):
+        file = tmp_path / f"{name}.json"
         with contextlib.redirect_stdout(io.StringIO()) as out:
-            assert cli.main(["eval", "simulation:3", "--engine", engine, "--json", str(file)]) == 0
+            assert cli.main(["eval", "simulation:8", *options, "--json", str(file)]) == 0
         figures = json.loads(file.read_text())
         del figures["command"]
         # Ray itself prints that a process of its died, which a busy computer may bring about; the block is done again.
         printed = [line for line in out.getvalue().splitlines() if "(raylet)" not in line]
-        found[engine] = figures, printed
-    assert found["ray"] == found["local"]
+        found[name] = figures, printed
+    assert found["workers"] == found["one"]
 
 
 @pytest.mark.usefixtures("cluster")
@@ -149,20 +156,17 @@ def test_a_perceiver_starts_from_what_another_learned(scans: Path) -> None:
 
 
 @pytest.mark.parametrize("option", ["--track", "--live", "--static=out"])
-def test_what_needs_an_order_is_refused(scans: Path, option: str, capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize("asked", ["--engine ray", "--workers 2"])
+def test_what_needs_an_order_is_refused(
+    scans: Path, tmp_path: Path, option: str, asked: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     with pytest.raises(SystemExit):
-        cli.main(["run", str(scans), "--engine", "ray", option])
-    assert "in their order" in capsys.readouterr().err
-
-
-def test_captures_and_lone_workers_are_refused(scans: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit):
-        cli.main(["run", str(scans), "--workers", "2"])
-    assert "--engine ray" in capsys.readouterr().err
+        cli.main(["run", str(scans), *asked.split(), option])
+    assert f"in their order, and {asked} perceives" in capsys.readouterr().err
     (tmp_path / "drive.pcap").write_bytes(b"\xd4\xc3\xb2\xa1" + bytes(20))
     with pytest.raises(SystemExit):
-        cli.main(["run", str(tmp_path / "drive.pcap"), "--engine", "ray", "--model", "pointseg"])
-    assert "capture" in capsys.readouterr().err
+        cli.main(["run", str(tmp_path / "drive.pcap"), *asked.split(), "--model", "pointseg"])
+    assert f"{asked} takes scan files" in capsys.readouterr().err
 
 
 def test_without_ray_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:

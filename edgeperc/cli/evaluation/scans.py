@@ -21,7 +21,7 @@ from ..arguments import (
     finite_number,
 )
 from ..output import FEW, many, print_line, progress, table_lines, write_figures
-from ..ray import add_engine
+from ..side_by_side import add_engine, has_workers
 from .box_tables import box_table_lines, interval_columns
 
 
@@ -155,8 +155,8 @@ def _eval_images(arguments: argparse.Namespace, roots: Sequence[Path]) -> int:
 
     if len(roots) < len(arguments.datasets):
         arguments.usage_error("labeled images and labeled scans have different figures; evaluate them one by one")
-    if arguments.engine == "ray":
-        arguments.usage_error("--engine ray needs scans, and these are images; leave it out")
+    if has_workers(arguments):
+        arguments.usage_error("--workers and --engine ray need scans, and these are images; leave them out")
     used = {"--fold": arguments.fold, "--mounted": arguments.mounted, "--road-by": arguments.road_by}
     for option, value in (used | {"--worst": arguments.worst}).items():
         if value is not None:

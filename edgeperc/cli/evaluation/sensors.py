@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from ..arguments import Commands, add_command, add_figures_file, add_provider
+from ..arguments import Commands, add_command, add_figures_file, add_provider, positive
 from ..output import FEW, many, print_line, progress, table_lines, write_figures
 from .box_tables import box_table_lines
 
@@ -40,6 +40,13 @@ def add_parser(commands: Commands) -> None:
         help="a range-image model: a name from 'edgeperc models' or an .onnx file with a card (default: %(default)s)",
     )
     add_provider(models, provider="cpu")
+    models.add_argument(
+        "--workers",
+        type=positive,
+        metavar="N",
+        help="number of worker processes, each with one data set at a time; the results are the same (default: this "
+        "process alone)",
+    )
     output = parser.add_argument_group("output")
     add_figures_file(output)
 
@@ -55,6 +62,7 @@ def eval_sensors_command(arguments: argparse.Namespace) -> int:
             arguments.model,
             provider=arguments.provider,
             precision=arguments.precision,
+            workers=arguments.workers,
             on_scan=show,
         )
     lines = [f"{arguments.model}; IoU of points in per cent, mIoU over the classes shown"]

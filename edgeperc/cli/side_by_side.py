@@ -1,8 +1,8 @@
-"""``--engine ray`` of ``edgeperc run``, and scans and results at URLs.
+"""``--workers`` and ``--engine ray`` of ``edgeperc run``, and scans and results at URLs.
 
 A perceiver learns from its first scans how the sensor is mounted and how strong its remission is. The driver therefore
 perceives these itself, until more scans change nothing. All other scans are perceived by workers, each scan from this
-same state. So the results do not depend on the number of workers, and they equal those of ``--engine local``.
+same state. So the results do not depend on the number of workers, and they equal those of a single process.
 """
 
 from __future__ import annotations
@@ -22,8 +22,9 @@ from typing import TYPE_CHECKING, Any
 from .. import __version__
 from ..errors import EdgepercError
 from ..system.atomic import write_atomic
-from ..system.ray_cluster import MOST_FIRST, Lost, map_on_ray
+from ..system.ray_cluster import map_in_workers
 from ..system.remote import Remote
+from ..system.workers import MOST_FIRST, Lost
 from .arguments import positive
 from .output import many, one_line, print_line
 from .report import Report
@@ -50,40 +51,50 @@ def add_engine(parser: argparse.ArgumentParser) -> None:
         "--engine",
         choices=("local", "ray"),
         default="local",
-        help="local: this process; ray: worker processes with one thread each, on the cluster that the environment "
+        help="local: this computer; ray: worker processes with one thread each, on the cluster that the environment "
         "variable RAY_ADDRESS names, else on this computer (extra 'ray'). The results are the same (default: local)",
     )
     group.add_argument(
         "--workers",
         type=positive,
         metavar="N",
-        help="number of workers of --engine ray (default: one for each CPU of the cluster)",
+        help="number of worker processes with one thread each, among which the scans are divided; the results are the "
+        "same (default: this process alone; with --engine ray, one for each CPU of the cluster)",
     )
 
 
+def has_workers(arguments: argparse.Namespace) -> bool:
+    """Whether scans are divided among worker processes."""
+    return arguments.engine == "ray" or (arguments.workers or 1) > 1
+
+
+def _asked_by(arguments: argparse.Namespace) -> str:
+    """The option that asks for worker processes."""
+    return "--engine ray" if arguments.engine == "ray" else f"--workers {arguments.workers}"
+
+
 def check_engine(arguments: argparse.Namespace, sinks: Sequence[str]) -> None:
-    """Check for options that do not go with ``--engine ray`` or with URLs."""
-    if arguments.workers is not None and arguments.engine != "ray":
-        arguments.usage_error("--workers needs --engine ray")
+    """Check for options that do not go with worker processes or with URLs."""
     in_order = [name for name in ("live", "track", "gif", "scan") if getattr(arguments, name)]
     in_order = [f"--{name.replace('_', '-')}" for name in (*in_order, *sinks)]
-    if arguments.engine == "ray" and in_order:
+    if has_workers(arguments) and arguments.deskew:
+        in_order.append("--deskew")
+    if has_workers(arguments) and in_order:
         arguments.usage_error(
-            f"{in_order[0]} needs the scans in their order, and --engine ray perceives them side by side; leave out one"
+            f"{in_order[0]} needs the scans in their order, and {_asked_by(arguments)} perceives them side by side; "
+            "leave out one"
         )
-    if arguments.engine == "ray" and arguments.deskew:
-        arguments.usage_error("--deskew needs --engine local")
     local = [name for name in in_order if name in ("--live", "--gif", "--labels-for")]
     urls = [path for path in (*arguments.paths, arguments.out) if isinstance(path, Remote)]
     if urls and local:
         arguments.usage_error(f"{local[0]} takes no URL such as {urls[0]}; copy the files to this computer")
-    if arguments.engine == "ray" and any(url.url.startswith("memory:") for url in urls):
+    if has_workers(arguments) and any(url.url.startswith("memory:") for url in urls):
         arguments.usage_error(
-            "memory:// belongs to one process, and --engine ray has several; pass another URL or a path"
+            f"memory:// belongs to one process, and {_asked_by(arguments)} has several; pass another URL or a path"
         )
 
 
-def perceive_on_ray(
+def perceive_side_by_side(
     arguments: argparse.Namespace,
     alone: Alone,
     perceivers: Any,
@@ -92,7 +103,7 @@ def perceive_on_ray(
     report: Report,
     show: Callable[[int, int], None],
 ) -> None:
-    """Perceive scan files on a Ray cluster, and report them in their order.
+    """Perceive scan files in worker processes, and report them in their order.
 
     Next to the files of a scan, ``.run/NAME.json`` records what they were made of: the scan, the options, the models,
     and what was learned from the first scans. A scan is not perceived again if its record says the same and its files
@@ -102,7 +113,9 @@ def perceive_on_ray(
 
     for scan in scans:
         if scan.suffix.lower() in CAPTURE_SUFFIXES or (isinstance(scan, Path) and scan.is_dir()):
-            arguments.usage_error(f"--engine ray takes scan files; {scan} is a capture, which is decoded in its order")
+            arguments.usage_error(
+                f"{_asked_by(arguments)} takes scan files; {scan} is a capture, which is decoded in its order"
+            )
     perceive, run, _ = alone(arguments, perceivers)
     n_first = 0
     while n_first < min(len(scans), MOST_FIRST) and not perceive.learned.is_settled:
@@ -116,7 +129,7 @@ def perceive_on_ray(
     if not learned.is_settled:
         warnings.warn(
             f"the first {n_first} scans do not settle mounting and remission (no ground, no remission, or refused): "
-            "--engine local would go on learning, and may give other results; pass --mount-height or --extrinsic",
+            "a single process would go on learning, and may give other results; pass --mount-height or --extrinsic",
             stacklevel=2,
         )
     options = {name: value for name, value in vars(arguments).items() if name not in _OF_PARSER}
@@ -127,7 +140,8 @@ def perceive_on_ray(
         (scan, _absolute(scan), _absolute(target))
         for scan, target in zip(scans[n_first:], targets[n_first:], strict=True)
     ]
-    answers = map_on_ray(
+    answers = map_in_workers(
+        arguments.engine,
         _ScanWorker,
         (alone, argparse.Namespace(**options), learned),
         items,
@@ -193,7 +207,7 @@ class _ScanWorker:
             warnings.simplefilter("always")
             outcomes = list(self._run(path, target, name))
         if len(outcomes) != 1:
-            raise EdgepercError(f"{name} holds {many(len(outcomes), 'scan')}; --engine ray takes files of one")
+            raise EdgepercError(f"{name} holds {many(len(outcomes), 'scan')}; worker processes take files of one")
         ((_, outcome, _, _),) = outcomes
         if isinstance(outcome, EdgepercError):  # it names the absolute path
             outcome.args = (str(outcome).replace(str(path), str(name)),)

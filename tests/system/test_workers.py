@@ -1,0 +1,141 @@
+"""Worker processes of this computer."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import textwrap
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from edgeperc.errors import EdgepercError
+from edgeperc.evaluation.transfer import compare
+from edgeperc.system.workers import MOST_KEPT, Lost, map_in_processes
+
+
+def scaled(factor: int, deadly: tuple[int, ...] = ()) -> Callable[[int], int]:
+    """What processes make: items times a factor; of some items a process dies, and seven cannot be scaled."""
+
+    def function(item: int) -> int:
+        if item in deadly:
+            os._exit(3)
+        if item == 7:
+            raise ValueError("seven")
+        return factor * item
+
+    return function
+
+
+def slowest_first(seconds: float) -> Callable[[int], tuple[int, float]]:
+    def function(item: int) -> tuple[int, float]:
+        time.sleep(seconds if item == 0 else 0.0)
+        return item, time.monotonic()
+
+    return function
+
+
+def without_pickle() -> Callable[[int], object]:
+    return lambda item: (lambda: item) if item == 1 else item
+
+
+def failing() -> Callable[[int], int]:
+    raise ValueError("no such model")
+
+
+def dying() -> Callable[[int], int]:
+    os._exit(4)
+
+
+@pytest.mark.parametrize(("workers", "n"), [(1, 0), (1, 1), (2, 1), (2, 100), (3, 8), (None, 9)])
+def test_results_come_in_order(workers: int | None, n: int) -> None:
+    found = list(map_in_processes(scaled, (10,), range(n), workers=workers))
+    assert [each for each in found if not isinstance(each, Lost)] == [10 * k for k in range(n) if k != 7]
+    assert len(found) == n
+    for lost in found[7:8]:
+        assert "ValueError: seven" in lost.reason
+
+
+def test_an_item_that_kills_its_process_is_lost_alone() -> None:
+    found = list(map_in_processes(scaled, (10, (5, 6, 20)), range(30), workers=2))
+    assert [k for k, each in enumerate(found) if isinstance(each, Lost)] == [5, 6, 7, 20]
+    assert all("died 2 times" in found[k].reason for k in (5, 6, 20))
+    assert [found[k] for k in (4, 8, 19, 21, 29)] == [40, 80, 190, 210, 290]
+
+
+def test_few_results_wait_for_a_slow_one() -> None:
+    n = 3 * MOST_KEPT
+    found = list(map_in_processes(slowest_first, (1.0,), range(n), workers=2))
+    assert [item for item, _ in found] == [*range(n)]
+    first = found[0][1]
+    assert sum(end < first for _, end in found) < MOST_KEPT
+
+
+def test_a_result_that_cannot_be_sent_is_lost() -> None:
+    found = list(map_in_processes(without_pickle, (), range(3), workers=1))
+    assert (found[0], found[2]) == (0, 2)
+    assert "pickle" in found[1].reason
+
+
+@pytest.mark.parametrize(("make", "message"), [(failing, "no such model"), (dying, "exit code 4")])
+def test_what_cannot_start_is_an_error(make: Callable[[], Callable[[int], int]], message: str) -> None:
+    with pytest.raises(EdgepercError, match=message):
+        list(map_in_processes(make, (), range(4), workers=2))
+
+
+@pytest.mark.parametrize("is_killed", [True, False])
+def test_processes_end_with_their_driver(tmp_path: Path, is_killed: bool) -> None:
+    """Killed, the driver leaves no process that goes on; left early, it waits for none."""
+    if not Path("/proc/self/stat").exists():
+        pytest.skip("needs /proc to see processes")
+    program = tmp_path / "driver.py"
+    program.write_text(
+        textwrap.dedent(
+            """
+            import os, time
+            from edgeperc.system.workers import map_in_processes
+
+            def make():
+                return slow
+
+            def slow(item):
+                time.sleep(30.0 if item else 0.0)
+                return os.getpid()
+
+            if __name__ == "__main__":
+                results = map_in_processes(make, (), range(8), workers=2)
+                print(next(results), flush=True)
+                input()
+                results.close()
+            """
+        )
+    )
+    with subprocess.Popen(
+        [sys.executable, program], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as driver:
+        assert driver.stdout is not None
+        assert driver.stdin is not None
+        pid = int(driver.stdout.readline())
+        if is_killed:
+            driver.kill()
+        else:
+            driver.stdin.write("\n")
+            driver.stdin.close()
+            assert driver.wait(timeout=20.0) == 0
+    deadline = time.monotonic() + 20.0
+    while Path(f"/proc/{pid}").exists() and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert not Path(f"/proc/{pid}").exists()
+
+
+def test_workers_give_the_same_figures_of_other_sensors() -> None:
+    sets = ["vlp-16=simulation:2", "os1-64=simulation:1"]
+    seen: list[tuple[int, int]] = []
+    one = compare(sets)
+    two = compare(sets, workers=2, on_scan=lambda done, total: seen.append((done, total)))
+    np.testing.assert_equal(two, one)
+    assert seen == [(8, 12), (12, 12)]
