@@ -264,12 +264,12 @@ def _export(args: argparse.Namespace) -> int:
     from .training.checkpoint import read_checkpoint
 
     metrics = json.loads(args.metrics.read_text()) if args.metrics else None
-    camera = read_checkpoint(args.checkpoint)["recipe"].task == "camera"
+    task = read_checkpoint(args.checkpoint)["recipe"].task
     card = export(
         args.checkpoint,
         args.out,
-        scans=parity_images(args.scans) if camera else parity_scans(args.scans),
-        fitness=None if camera else fitness_of(args.kitti),
+        scans=parity_images(args.scans) if task == "camera" else parity_scans(args.scans),
+        fitness=None if task in ("camera", "objects") else fitness_of(args.kitti),
         name=args.name,
         version=args.model_version,
         metrics=metrics,

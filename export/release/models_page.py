@@ -158,7 +158,7 @@ def _open(variants: Sequence[Variant]) -> Iterable[str]:
         "streets and 28 scans of PandaSet. Their terms are in the table above. They take the same time, and are less "
         "accurate where KITTI's sensor drives:"
     )
-    yield from ("", '    edgeperc run PATH --weights open', "    edgeperc.Perceiver(weights=\"open\")", "")
+    yield from ("", "    edgeperc run PATH --weights open", '    edgeperc.Perceiver(weights="open")', "")
     yield from _prose(
         "In the wheel they are in int8. Their fp32 files, to train further or for other providers, are among the "
         "research models, as are the larger `pointseg-sim` and `ssadnet-sim`, trained on drawn streets alone."

@@ -10,7 +10,7 @@ import copy
 import hashlib
 import json
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -78,15 +78,18 @@ def load(checkpoint: Path) -> tuple[nn.Module, Recipe, dict[str, Any]]:
     return build_network(state, checkpoint).eval(), state["recipe"], notes
 
 
+def terms_of(frames: Iterable[str]) -> str:
+    """Terms of weights that were trained on real scans of these names; empty without one."""
+    sets = {name.partition("/")[0] if "/" in name else "KITTI" for name in frames}
+    return "; ".join(TERMS[name] for name in sorted(sets)) if sets <= TERMS.keys() else OTHER_TERMS
+
+
 def _training(recipe: Recipe, notes: Mapping[str, Any]) -> dict[str, Any]:
     """The card's record of the training."""
     frames = notes["frames"]
     simulated = f"{notes['n_simulated']} simulated scans"
     data = f"{len(frames)} real frames, {simulated}" if frames else f"{simulated}, no real frame"
-    sets = {name.partition("/")[0] if "/" in name else "KITTI" for name in frames}
-    licence = notes["licence"]
-    if sets:
-        licence = "; ".join(TERMS[name] for name in sorted(sets)) if sets <= TERMS.keys() else OTHER_TERMS
+    licence = terms_of(frames) or notes["licence"]
     if recipe.task == "camera":
         data, licence = f"{len(frames)} images of CamVid", CAMVID_LICENCE
     return {

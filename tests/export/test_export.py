@@ -45,7 +45,7 @@ from edgeperc_export.networks import build
 from edgeperc_export.recipe import MODELS, PAPER, SCAN_NETWORKS, TASKS, Recipe, Stage
 from edgeperc_export.release import to_onnx
 from edgeperc_export.release.models_page import models_page
-from edgeperc_export.release.to_onnx import ParityError, export, load, to_graph, verify, write_card
+from edgeperc_export.release.to_onnx import ParityError, export, load, terms_of, to_graph, verify, write_card
 from edgeperc_export.training.ablation import PAPERS, SHIPPED, VARIANTS, plot
 from edgeperc_export.training.curve import curve_table
 from edgeperc_export.training.samples import Recent, Samples, loaded, real_scans
@@ -668,6 +668,7 @@ def test_make_also_makes_the_models_that_it_starts_from(
         "pointseg-sim": base,
         "pointseg-full": Stage(full, after="pointseg-sim"),
         "pointseg": Stage(replace(full, edge=True, distil=1.0, steps=1), teacher="pointseg-full"),
+        "pointseg-open": Stage(replace(full, edge=True, steps=1), is_open=True),
     }
     evaluated = []
 
@@ -679,6 +680,7 @@ def test_make_also_makes_the_models_that_it_starts_from(
 
     monkeypatch.setattr(make_module, "MODELS", stages)
     monkeypatch.setattr(make_module, "N_SIMULATED", 2)
+    monkeypatch.setattr(make_module, "OTHER_SENSORS", ())
     monkeypatch.setattr(make_module, "evaluate", recorded_evaluate)
     monkeypatch.setattr(to_onnx, "MIN_AGREEMENT", 0.99)  # after so few steps, the logits of many pixels are close
     out = tmp_path / "out"
@@ -698,6 +700,10 @@ def test_make_also_makes_the_models_that_it_starts_from(
     taught = make("pointseg", out, fold=0, **arguments)
     assert len(evaluated) == 3  # the teacher of this fold was made already
     assert taught.stat().st_size < 0.6 * made.stat().st_size
+    # An open one reads KITTI for its figures alone.
+    training = Session(make("pointseg-open", out, **arguments), "cpu").card.training
+    assert (training["frames"], training["licence"], training["started_from"]) == ({}, "Apache-2.0", [])
+    assert len(evaluated) == 4
     with pytest.raises(ValueError, match="trained on real scans too; give --kitti and --layouts"):
         make("pointseg", out, kitti=None, layouts=None)
 
@@ -900,6 +906,13 @@ def test_a_card_that_does_not_fit_writes_nothing(tmp_path: Path, third_party: tu
     assert not (tmp_path / "out.onnx").exists()
     (tmp_path / "card.json").write_text(wrong.to_json())
     assert main(["card", str(path), str(tmp_path / "card.json"), str(tmp_path / "out.onnx")]) == 2
+
+
+def test_weights_have_the_terms_of_their_scans() -> None:
+    assert terms_of([]) == ""
+    assert terms_of(["pandaset/002_00", "pandaset/002_01"]).startswith("CC BY 4.0")
+    for frames in (["pandaset/002_00", "000001"], ["lyft/7"], ["000001"]):
+        assert "KITTI: CC BY-NC-SA 3.0" in terms_of(frames)
 
 
 def test_a_card_replaces_an_existing_one(tmp_path: Path, third_party: tuple[Path, ModelCard]) -> None:

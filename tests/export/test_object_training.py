@@ -22,11 +22,13 @@ from edgeperc.objects.candidates import find_candidates, sort_into_cells
 from edgeperc.objects.crops import crop_candidates, fill_features
 from edgeperc.perceiver import Perceiver
 from edgeperc.simulation.samples import simulated_scan
+from edgeperc.types.card import ModelCard
 from edgeperc.types.mounting import MODEL_MOUNTING
 from edgeperc.types.points import read_only
 from edgeperc.types.sensor import get_sensor
 from edgeperc.zoo import model_path
 from edgeperc_export.cards import OBJECT_CLASSES, OBJECT_VIEW
+from edgeperc_export.cli import main
 from edgeperc_export.data.scans import LabeledScan
 from edgeperc_export.networks import build
 from edgeperc_export.networks.objects import ObjectNet, parts_of, rejected
@@ -223,6 +225,25 @@ def test_training_resumes_bit_for_bit(labeled: LabeledScan, tmp_path: Path, monk
     monkeypatch.setattr(Objects, "loss", loss)
     for name, weight in run("cut").items():
         assert torch.equal(weight, whole[name]), name
+
+
+def test_without_a_detector_candidates_are_groups(
+    labeled: LabeledScan, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The network is exported by the command line, too; what the networks of others found is no part of it."""
+    scans = tmp_path / "scans"
+    scans.mkdir()
+    labeled.save(scans / "000000.npz")
+    recipe = replace(RECIPE, steps=1, detector=False)
+    checkpoint = train(recipe, tmp_path / "run", Data(simulated=scans), Run(n_threads=1))
+    found = load_samples(tmp_path / "object-samples-of-groups", ["simulated"])
+    alone = samples_of(labeled, "simulated/000000", None, np.random.default_rng((0, 0, len("simulated"))), real=False)
+    np.testing.assert_array_equal(found.places, alone.places)
+    assert not (tmp_path / "object-samples").exists()
+    path = tmp_path / "objects.onnx"
+    assert main(["export", str(checkpoint), str(path), "--name", "mine"]) == 0
+    assert "mine 1.0.0, parity" in capsys.readouterr().out
+    assert ModelCard.read(path).fitness is None
 
 
 def test_a_missing_source_is_an_error(tmp_path: Path) -> None:

@@ -1,0 +1,64 @@
+"""Weights that anyone may use."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from edgeperc import Perceiver, cli
+from edgeperc.errors import OptionError
+from edgeperc.simulation.samples import FIRST_SEED, simulated_scan
+from edgeperc.types.card import ModelCard
+from edgeperc.zoo import DEFAULT, OPEN, resolve
+from edgeperc_export.recipe import MODELS
+
+
+@pytest.mark.parametrize("name", OPEN)
+def test_no_frame_of_kitti_was_trained_on(name: str) -> None:
+    for variant in resolve(name):
+        training = variant.card.training
+        assert training["frames"]
+        assert all(frame.startswith("pandaset/") for frame in training["frames"])
+        assert "CC BY 4.0" in training["licence"]
+        assert "KITTI" not in training["licence"]
+        assert not training["started_from"]
+    assert MODELS[name].is_open
+
+
+def test_they_see_what_the_default_models_see() -> None:
+    for name, other in zip(OPEN, DEFAULT, strict=True):
+        open_card, card = (resolve(each)[0].card for each in (name, other))
+        assert open_card.view == card.view
+        assert open_card.classes == card.classes
+        assert open_card.input == card.input
+
+
+def test_a_perceiver_takes_them() -> None:
+    scan = simulated_scan(FIRST_SEED + 3)
+    perceive = Perceiver(weights="open", n_threads=1)
+    assert [card.name for card in perceive.cards] == [*OPEN]
+    perception = perceive(scan.points)
+    assert perception.points is not None
+    vehicles = scan.labels == perception.points.classes.index("car")
+    known = perception.points.in_view & vehicles
+    assert (perception.points.labels[known] > 0).mean() > 0.5
+    assert any(box.label == "car" for box in perception.boxes)
+
+
+def test_weights_and_models_exclude_each_other(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(OptionError, match="weights is 'open', and models="):
+        Perceiver("pointseg", weights="open")
+    with pytest.raises(OptionError, match="weights is 'opne'; did you mean"):
+        Perceiver(weights="opne")
+    (tmp_path / "scan.bin").write_bytes(bytes(16 * 100))
+    with pytest.raises(SystemExit):
+        cli.main(["run", str(tmp_path / "scan.bin"), "--model", "pointseg", "--weights", "open"])
+    assert "both name models" in capsys.readouterr().err
+
+
+def test_the_program_takes_them(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    simulated_scan(FIRST_SEED).points.tofile(tmp_path / "scan.bin")
+    assert cli.main(["run", str(tmp_path / "scan.bin"), "--weights", "open", "--json", "--threads", "1"]) == 0
+    said = capsys.readouterr().out
+    assert all(ModelCard.read(resolve(name)[0].path).name in said for name in OPEN)
