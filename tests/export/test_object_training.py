@@ -238,7 +238,7 @@ def test_without_a_detector_candidates_are_groups(
     checkpoint = train(recipe, tmp_path / "run", Data(simulated=scans), Run(n_threads=1))
     found = load_samples(tmp_path / "object-samples-of-groups", ["simulated"])
     alone = samples_of(labeled, "simulated/000000", None, np.random.default_rng((0, 0, len("simulated"))), real=False)
-    np.testing.assert_array_equal(found.places, alone.places)
+    np.testing.assert_array_equal(found.rectangles, alone.rectangles)
     assert not (tmp_path / "object-samples").exists()
     path = tmp_path / "objects.onnx"
     assert main(["export", str(checkpoint), str(path), "--name", "mine"]) == 0
