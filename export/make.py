@@ -90,6 +90,7 @@ def make(
 def _more_sensors(out: Path, scans: Path, layouts: Path | None, n_workers: int) -> Path:
     """A folder of the simulated scans and others of `OTHER_SENSORS`."""
     every = out / f"{scans.name}-of-sensors"
+    every.mkdir(parents=True, exist_ok=True)
     for k, sensor in enumerate(OTHER_SENSORS, start=1):
         simulate(every, N_OF_OTHERS, first=10_000 * k, layouts_root=layouts, sensor=sensor, n_workers=n_workers)
     for file in scans.glob("*.npz"):
