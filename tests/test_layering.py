@@ -103,8 +103,8 @@ FLOORS = {
         evaluation.camvid evaluation.evaluate evaluation.tracking evaluation.transfer
         ros2.__init__ ros2.graph ros2.messages
         ros2.node ros2.rclpy_graph ros2.zenoh_graph
-        sinks.__init__ sinks.kept_file sinks.names sinks.relay sinks.rosbag sinks.scene
-        sinks.foxglove sinks.page sinks.prelabels sinks.rerun sinks.static
+        sinks.__init__ sinks.names sinks.relay sinks.run_file sinks.scene
+        sinks.foxglove sinks.page sinks.prelabels sinks.rerun sinks.rosbag sinks.static
         cli.arguments cli.evaluation.__init__ cli.output cli.straighten
         cli.completion cli.doctor cli.evaluation.box_tables cli.evaluation.painting cli.lists cli.program
         cli.report cli.scans cli.sinks

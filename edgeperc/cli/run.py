@@ -7,12 +7,11 @@ import os
 import sys
 import time
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from ..errors import EdgepercError, ImageError, ModelError, PointsError
-from ..records import PerceivedScan, Sink
+from ..records import PerceivedScan
 from ..system.extras import require
 from ..system.remote import Remote, location
 from ..types.choices import CAMERA, DEFAULT_MODELS, DEFAULT_SENSOR
@@ -30,7 +29,7 @@ from .arguments import (
     positive_number,
     reading_options,
 )
-from .output import many, print_line, progress
+from .output import many, print_error, print_line, progress
 from .ray import add_engine, check_engine, perceive_on_ray, through_temporary
 from .report import Report
 from .scans import (
@@ -43,7 +42,7 @@ from .scans import (
     scan_sensor,
     with_mounting,
 )
-from .sinks import add_sinks, open_sinks, wanted_sinks
+from .sinks import Sinks, add_sinks, wanted_sinks
 
 if TYPE_CHECKING:
     from ..live import Answer
@@ -253,8 +252,8 @@ def run_command(arguments: argparse.Namespace) -> int:
     for folder in found.empty:
         report.add(folder, PointsError("no scan in this folder; expected scans, captures or a ROS 2 bag's folder"))
     started = time.perf_counter()
-    with progress("file") as show, ExitStack() as stack:
-        run = _Run(arguments, perceivers, kinds, open_sinks(arguments, stack))
+    with progress("file") as show, Sinks(arguments) as sinks:
+        run = _Run(arguments, perceivers, kinds, sinks)
         if arguments.engine == "ray":
             perceive_on_ray(arguments, _alone, perceivers, scans, targets, report, show)
         for done, (scan, target) in enumerate(zip(scans, targets, strict=True) if arguments.engine == "local" else ()):
@@ -265,17 +264,22 @@ def run_command(arguments: argparse.Namespace) -> int:
                 outcomes = run.live(scan) if arguments.live else run.scans(scan, target)
             for outcome in outcomes:
                 report.add(*outcome)
+    n_failed = report.n_failed + sinks.n_failed
     if report.tracks:
         from ..view.tracks import draw_tracks
 
-        arguments.out.mkdir(parents=True, exist_ok=True)
-        draw_tracks(report.tracks, arguments.out / "tracks.gif", under=report.under)
+        try:
+            arguments.out.mkdir(parents=True, exist_ok=True)
+            draw_tracks(report.tracks, arguments.out / "tracks.gif", under=report.under)
+        except OSError as exc:
+            n_failed += 1
+            print_error(f"{arguments.out / 'tracks.gif'}: {exc}")
     n_perceived = report.n - len(found.empty)
     if n_perceived > 1:
         each_ms = 1e3 * (time.perf_counter() - started) / n_perceived
         things = "answers" if arguments.live else "images" if images else "scans"
         print_line(f"{report.n} {things}, {report.n_failed} failed, {each_ms:.0f} ms each with files", sys.stderr)
-    return 1 if report.n_failed else 0
+    return 1 if n_failed else 0
 
 
 def _check_usage(arguments: argparse.Namespace, kinds: Sequence[str]) -> None:
@@ -421,7 +425,7 @@ class _Run:
     """What a run does with every scan: perceive it, track its boxes, write its files and its part of the run's."""
 
     def __init__(
-        self, arguments: argparse.Namespace, perceivers: _Perceivers, kinds: Sequence[str], sinks: Sequence[Sink]
+        self, arguments: argparse.Namespace, perceivers: _Perceivers, kinds: Sequence[str], sinks: Sinks | None = None
     ) -> None:
         from ..tracking.tracker import Tracker
 
@@ -546,8 +550,10 @@ class _Run:
         tracks = None if self._tracker is None else self._tracker.update(perception.boxes, stamp_s)
         if self._straightener is not None and tracks is not None:
             self._straightener.follow(tracks)
-        _write(points, perception, wanted, title=title or str(name))
-        self._sink(PerceivedScan(str(name), stamp_s, points, perception, tracks, sensor))
+        try:
+            _write(points, perception, wanted, title=title or str(name))
+        finally:  # a picture that cannot be written costs no sink its scan
+            self._sink(PerceivedScan(str(name), stamp_s, points, perception, tracks, sensor))
         return name, perception, tracks, _under(points, perception) if self._arguments.gif else None
 
     def _track(self, perception: Perception) -> Tracks:
@@ -560,8 +566,8 @@ class _Run:
         return self._n / self._arguments.rate if perception.stamp_s is None else perception.stamp_s
 
     def _sink(self, scan: PerceivedScan) -> None:
-        for sink in self._sinks:
-            sink.write(scan)
+        if self._sinks is not None:
+            self._sinks.write(scan)
 
 
 def _alone(
@@ -571,7 +577,7 @@ def _alone(
     kinds = [kind for kind in _KINDS if getattr(arguments, kind)]
     perceivers = perceivers or _Perceivers(arguments)
     perceive = perceivers.of(with_mounting(arguments.sensor or DEFAULT_SENSOR, arguments))
-    run = _Run(arguments, perceivers, kinds, [])
+    run = _Run(arguments, perceivers, kinds)
     return perceive, run.scans, lambda target: [_file_of(target, kind) for kind in kinds]
 
 
