@@ -127,6 +127,56 @@ def test_a_fork_that_cannot_work_is_refused_at_once(when: str, options: dict[str
     assert "construct the Perceiver in the process that calls it" in forked(when, **options)
 
 
+END = """
+import gc, multiprocessing, os, sys, warnings
+import numpy as np
+import edgeperc
+
+warnings.simplefilter("ignore")
+scan = np.random.default_rng(0).normal(0.0, 10.0, (2000, 4)).astype(np.float32)
+
+def make():
+    perceive = edgeperc.Perceiver("pointseg", provider="cpu", n_threads=2, on_mismatch="ignore")
+    perceive(scan)
+    return perceive
+
+perceive = make()
+how, child = sys.argv[1], 0
+if how == "multiprocessing":
+    process = multiprocessing.get_context("fork").Process(target=print, args=("ended",))
+    process.start()
+    process.join()
+    sys.exit(process.exitcode)
+child = os.fork()
+if child == 0:
+    if how == "dropped":
+        del perceive
+        gc.collect()
+    elif how == "forked again" and os.fork():
+        os.wait()
+    elif how == "with its own":
+        perceive = make()
+    elif how == "cyclic":
+        cycle = [perceive]
+        cycle.append(cycle)
+        del perceive, cycle
+        gc.collect()
+    print("ended", flush=True)
+    sys.exit(0)
+_, status = os.waitpid(child, 0)
+sys.exit(os.waitstatus_to_exitcode(status))
+"""
+
+
+@posix
+@pytest.mark.parametrize("how", ["exit", "dropped", "forked again", "with its own", "cyclic", "multiprocessing"])
+def test_a_fork_ends(how: str) -> None:
+    """Its copies of threads, of which there are none, are not waited for."""
+    done = python(END, how)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.split() == ["ended"] * (2 if how == "forked again" else 1)
+
+
 def test_perceivers_are_not_pickled_or_copied() -> None:
     perceive = Perceiver("pointseg", provider="cpu", n_threads=1)
     for thing in (perceive, perceive.sessions[0]):

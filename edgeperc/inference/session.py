@@ -30,6 +30,7 @@ from ..errors import (
     ProviderError,
     SettingsError,
 )
+from ..system.forks import kept_in_forks
 from ..system.machine import (
     MAX_THREADS,
     compiled_folder,
@@ -149,8 +150,9 @@ class Session:
 
     Notes
     -----
-    A session belongs to its process. In a forked child it runs only with ``provider="cpu"`` and ``n_threads=1``: the
-    threads of a provider do not exist there, and waiting for them would never end. It cannot be pickled.
+    A session belongs to its process. A forked child may drop it and end. It runs there only with ``provider="cpu"`` and
+    ``n_threads=1``: the threads of a provider do not exist there, and waiting for them would never end. It cannot be
+    pickled.
     """
 
     def __init__(
@@ -241,7 +243,7 @@ class Session:
         if self.shares_cores:
             n_threads = cores // self._at_once
         self._has_threads = short != "cpu" or n_threads != 1
-        self.inference = self._open(ort, blob, short, precision, n_threads)
+        self.inference = kept_in_forks(self._open(ort, blob, short, precision, n_threads))
         self._check_graph()
         with terminated(ort, None if self._trusted else MAX_FIRST_RUN_S) as run_options:
             self._bind(run_options)
