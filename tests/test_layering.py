@@ -35,6 +35,7 @@ FLOORS = {
         system.kernel_cache
         system.kernels
         system.compilation system.draws
+        types.rigid
         types.__init__ types.choices types.mounting types.onnx_file types.points types.views
         types.card types.sensor
         types.perception

@@ -231,18 +231,7 @@ def run_command(arguments: argparse.Namespace) -> int:
     scans = found.paths
     names = output_names(scans, keep_folder=found.of_data_set) if kinds else []
     targets = [arguments.out / name for name in names] if kinds else [Path()] * len(scans)
-    sources = {_real(source) for source in (*scans, *images.values()) if source is not None}
-    pictures = _pictures_of(arguments, images)
-    whole = [getattr(arguments, name) for name in wanted_sinks(arguments)]
-    for file in (
-        *(file for target in targets for file in _files_of(target, kinds, **pictures).values()),
-        *(value for value in whole if isinstance(value, Path)),
-    ):
-        if _real(file) in sources:
-            arguments.usage_error(
-                f"{file} is one of the {'images' if images else 'scans'} and would be overwritten; choose another --out"
-            )
-
+    _check_outputs(arguments, kinds, images, scans, targets)
     perceivers = _Perceivers(arguments)
     local = [scan for scan in scans if isinstance(scan, Path)]
     perceivers.check([*filter(None, images.values())] if images else local, of_images=bool(images))
@@ -322,6 +311,39 @@ def _check_usage(arguments: argparse.Namespace, kinds: Sequence[str]) -> None:
         require("matplotlib", "view", "Drawing a picture")
     if arguments.gif:
         require("PIL", "view", "Drawing an animation", package="pillow")
+
+
+def _check_outputs(
+    arguments: argparse.Namespace,
+    kinds: Sequence[str],
+    images: Mapping[Path, Path | None],
+    scans: Sequence[Path],
+    targets: Sequence[Path],
+) -> None:
+    """Check that no file is a scan, and none is written twice."""
+    from ..readers.captures import is_capture
+
+    sources = {_real(source) for source in (*scans, *images.values()) if source is not None}
+    pictures = _pictures_of(arguments, images)
+    outputs = [("--out", file) for target in targets for file in _files_of(target, kinds, **pictures).values()]
+    outputs += [("--gif", arguments.out / "tracks.gif")] if arguments.gif else []
+    for name in wanted_sinks(arguments):
+        value = getattr(arguments, name)
+        outputs += [(f"--{name}", value)] if isinstance(value, Path) else []
+    if arguments.static is not None:  # scans of a capture get numbers
+        named = [scan for scan in (images.values() if images else scans) if scan is not None and not is_capture(scan)]
+        outputs += [("--static", arguments.static / scan.name) for scan in named]
+    if arguments.labels_for == "cvat":
+        outputs.append(("--labels-for", arguments.out / "annotations.zip"))
+    written: dict[str, str] = {}
+    for option, file in outputs:
+        if _real(file) in sources and option != "--static":  # which refuses it scan by scan
+            arguments.usage_error(
+                f"{file} is one of the {'images' if images else 'scans'} and would be overwritten; choose another --out"
+            )
+        other = written.setdefault(_real(file), option)
+        if other != option:
+            arguments.usage_error(f"{other} and {option} both write {file}; choose another name for one of them")
 
 
 def _images(arguments: argparse.Namespace, kinds: Sequence[str]) -> dict[Path, Path | None]:
