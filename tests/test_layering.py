@@ -27,7 +27,7 @@ PACKAGES = {
 FLOORS = {
     "edgeperc": """
         errors
-        system.__init__ system.atomic system.clock system.extras system.fields system.forks system.lanes
+        system.__init__ system.atomic system.clock system.extras system.fields system.interpreter system.lanes
         system.names
         system.printable
         system.machine system.ray_cluster system.remote

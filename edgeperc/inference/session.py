@@ -30,7 +30,7 @@ from ..errors import (
     ProviderError,
     SettingsError,
 )
-from ..system.forks import kept_in_forks
+from ..system.interpreter import kept_in_forks
 from ..system.machine import (
     MAX_THREADS,
     compiled_folder,
