@@ -177,6 +177,72 @@ def test_a_fork_ends(how: str) -> None:
     assert done.stdout.split() == ["ended"] * (2 if how == "forked again" else 1)
 
 
+DAEMON = """
+import os, sys, threading, time, warnings
+import numpy as np
+import edgeperc
+
+warnings.simplefilter("ignore")
+scan = np.random.default_rng(0).normal(0.0, 10.0, (20_000, 4)).astype(np.float32)
+perceive = edgeperc.Perceiver("pointseg", provider="cpu", n_threads=1, on_mismatch="ignore")
+perceive(scan)
+begun = threading.Event()
+
+def work():
+    while True:
+        begun.set()
+        perceive(scan)
+
+threading.Thread(target=work, daemon=True).start()
+begun.wait()
+time.sleep(float(sys.argv[1]))
+"""
+
+IN_A_CALL = """
+import atexit, os, sys, threading, time
+from edgeperc.system.interpreter import native_call
+
+begun = threading.Event()
+
+def work():
+    with native_call():
+        begun.set()
+        time.sleep(0.5)
+        os.write(1, b"call ended\\n")
+    with native_call():
+        os.write(1, b"never\\n")
+
+def at_the_end():
+    with native_call():
+        os.write(1, b"at the end\\n")
+
+if sys.argv[1] == "fork" and os.fork():
+    os.wait()
+else:
+    atexit.register(at_the_end)  # runs after what edgeperc does at the end
+    threading.Thread(target=work, daemon=True).start()
+    begun.wait()
+    if sys.argv[1] == "fork, in the call" and os.fork():
+        os.wait()
+"""
+
+
+@pytest.mark.parametrize("how", ["plain", "fork", "fork, in the call"] if os.name == "posix" else ["plain"])
+def test_the_interpreter_ends_after_a_call(how: str) -> None:
+    """That of a daemon thread; another one never begins, but in the main thread. A fork waits for no call of others."""
+    done = python(IN_A_CALL, how)
+    assert done.returncode == 0, done.stderr
+    assert "Traceback" not in done.stderr
+    lines = ["call ended", "at the end"]
+    assert done.stdout.splitlines() == (["at the end", *lines] if how == "fork, in the call" else lines)
+
+
+@pytest.mark.parametrize("wait_s", [0.0, 0.003, 0.007, 0.011, 0.017, 0.023])
+def test_a_daemon_thread_in_a_call_ends_with_the_interpreter(wait_s: float) -> None:
+    done = python(DAEMON, str(wait_s))
+    assert done.returncode == 0, done.stderr
+
+
 def test_perceivers_are_not_pickled_or_copied() -> None:
     perceive = Perceiver("pointseg", provider="cpu", n_threads=1)
     for thing in (perceive, perceive.sessions[0]):
