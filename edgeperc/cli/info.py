@@ -389,7 +389,7 @@ def _scan_rows(
     (n_beams, _) = FitnessProfile.from_scans([scan]).beams
     beams = ("beams", f"about {n_beams:.0f} rows of points ({sensor.name}: {sensor.n_beams})")
     turned = check_beams(conditioned[0], used) if sensor.mounting.roll_deg is None else ()
-    model_rows, findings = _suiting_models(scan, used, [*unit, *turned], reported)
+    model_rows, findings = _suiting_models(scan, scans[0][:, 3], used, [*unit, *turned], reported)
     document["refused"] |= any(_is_refused(findings.get(name) or ()) for name in DEFAULT_MODELS)
     document |= {**extents, "mounting": mounting, "beams": round(float(n_beams)), "models": findings}
     refusal = _refusal(document["refused"])
@@ -482,10 +482,10 @@ def _mounting_rows(
 
 
 def _suiting_models(
-    scan: Points, sensor: SensorProfile, unit: Sequence[str], reported: Sequence[str]
+    scan: Points, remission: NDArray[np.float32], sensor: SensorProfile, unit: Sequence[str], reported: Sequence[str]
 ) -> tuple[list[tuple[str, str]], dict[str, list[str] | None]]:
     """For each model of scans, what speaks against it; None without a description of its training scans."""
-    from ..preprocess.findings import check_fitness
+    from ..preprocess.findings import check_fitness, with_raw_remission
     from ..preprocess.fitness import FitnessProfile
     from ..zoo import listed
 
@@ -498,7 +498,8 @@ def _suiting_models(
             findings[card.name] = None
             rows.append((card.name, "its card does not describe its training scans"))
             continue
-        sentences = [*unit, *check_fitness(scan, FitnessProfile.from_dict(card.fitness), sensor), *reported]
+        fitness = check_fitness(scan, FitnessProfile.from_dict(card.fitness), sensor)
+        sentences = [*unit, *with_raw_remission(fitness, remission, sensor), *reported]
         findings[card.name] = sentences
         rows += [(card.name, f"as a scan of {sensor.name}: {sentence}") for sentence in sentences]
         if not sentences:
