@@ -72,7 +72,7 @@ FLOORS = {
         readers.clouds readers.ouster readers.tables
         readers.inflate readers.pcd readers.ply readers.raw
         readers.mcap readers.text
-        readers.bags readers.files
+        readers.bags readers.files readers.packet_messages
         readers.decoders
         readers.identify readers.worker
         readers.apart
