@@ -22,7 +22,7 @@ from .inference.session import Session
 from .objects.boxes import MIN_SCORE
 from .pipeline import BoxesFrom, ObjectNetwork, Options, Pipeline, RangeImageNetwork, TopViewNetwork
 from .preprocess.condition import scale
-from .preprocess.findings import Finding, check_beams, check_dropped, check_profiles
+from .preprocess.findings import Finding, check_beams, check_dropped, check_profiles, with_raw_remission
 from .preprocess.fitness import FitnessProfile
 from .preprocess.interpolation import Interpolator
 from .preprocess.remission import RemissionMatcher
@@ -523,6 +523,7 @@ class Perceiver:
         fitness = check_dropped(given, dropped, profile) if check else ()
         if check and not fitness:
             fitness = turned or check_profiles(scan, self._fitness, profile)
+            fitness = with_raw_remission(fitness, given[:, 3], profile)
         if check and not any(finding.gross for finding in fitness):
             fitness = (*fitness, *hidden)
         if self.on_mismatch != "ignore":

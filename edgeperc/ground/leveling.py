@@ -51,8 +51,10 @@ class MountingEstimate:
 
     def __str__(self) -> str:
         m = self.mounting
+        # x ahead is the default, so nobody need have said it.
+        kept = {"yaw": " (not estimated)" if m.yaw_deg == 0.0 else " (given)"}
         parts = [
-            f"{name} {value:.{digits}f}{unit}" + (f" +- {sd:.{digits}f}" if sd else " (given)")
+            f"{name} {value:.{digits}f}{unit}" + (f" +- {sd:.{digits}f}" if sd else kept.get(name, " (given)"))
             for name, value, sd, unit, digits in (
                 ("height", m.height_m, self.height_sd_m, " m", 2),
                 ("roll", m.roll_deg, self.roll_sd_deg, " deg", 1),

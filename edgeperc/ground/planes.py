@@ -226,11 +226,19 @@ def heights_above(ground: GroundSurface | None, points: Points, *, max_height_m:
     return whole.heights(rows, max_height_m=max_height_m)
 
 
-def fit_ground(points: Points, *, mount_height_m: float = 1.73, regions: bool = True) -> GroundFit:
-    """Fit the planes of the ground; parameters and errors as in `find_ground`."""
+def fit_ground(
+    points: Points, *, mount_height_m: float = 1.73, regions: bool = True, any_order: bool = False
+) -> GroundFit:
+    """Fit the planes of the ground; parameters and errors as in `find_ground`.
+
+    any_order : whether the ground is the same for any order of the points, which takes 2 ms more. Otherwise, the
+        earlier of a cell's equally low points stands for it.
+    """
     if not 0.0 < mount_height_m < math.inf:
         raise PointsError(f"got mount_height_m={mount_height_m}; expected meters above 0")
     scan, cell, lowest = _sorted_into_cells(points)
+    if any_order:
+        _settle_ties(scan, cell, lowest)
     plane = np.array([0.0, 0.0, -mount_height_m])
     found = fit_first_plane(scan, lowest, FIRST_REACH_M, plane)
     planes = None
@@ -246,6 +254,16 @@ class Sorted(NamedTuple):
     points: Points
     cell: NDArray[np.int32]
     lowest: NDArray[np.int32]
+
+
+def _settle_ties(points: Points, cell: NDArray[np.int32], lowest: NDArray[np.int32]) -> None:
+    """Of a cell's equally low points, take the one with the smallest x, then y."""
+    flat = lowest.reshape(-1)
+    inside = np.flatnonzero(cell >= 0)
+    tied = inside[points[inside, 2] == points[flat[cell[inside]], 2]]
+    # Of several points of a cell, the last one that is written stays.
+    tied = tied[np.lexsort((points[tied, 1], points[tied, 0]))[::-1]]
+    flat[cell[tied]] = tied
 
 
 def _sorted_into_cells(points: Points) -> Sorted:

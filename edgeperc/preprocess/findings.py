@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterable
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..types.perception import DroppedPoints
 from ..types.points import Points
@@ -350,6 +351,37 @@ def _other_number(scan: Measures, profile: FitnessProfile) -> Finding | None:
     )
 
 
+_ALL_ZERO = "Remission is 0 for"
+
+
+def with_raw_remission(
+    findings: Iterable[Finding], remission: NDArray[np.floating], sensor: SensorProfile
+) -> tuple[Finding, ...]:
+    """The findings, but of a remission that is there in another unit, that, in place of one that is missing.
+
+    The function of a profile, such as a logarithm, maps all values of 0..1 to 0 where 0..255 is expected.
+
+    remission : (n,) as recorded.
+    """
+    found = tuple(findings)
+    known = remission[np.isfinite(remission)]
+    if not any(finding.startswith(_ALL_ZERO) for finding in found) or not (known > 0.0).any() or np.ptp(known) == 0.0:
+        return found
+    low, high = sensor.remission_range
+    brightest = float(np.percentile(known, 99))
+    likely, own = _likely_range(float(known.min()), float(known.max())), f"({low:g}, {high:g})"
+    there = Finding(
+        f"Remission hardly exceeds {brightest:.2g}, but the profile {sensor.name} has {low:g} to {high:g}: pass "
+        f"sensor= a profile with the remission_range of this data{'' if likely == own else f', {likely}'}.",
+        True,
+    )
+    return tuple(there if finding.startswith(_ALL_ZERO) else finding for finding in found)
+
+
+def _likely_range(low: float, high: float) -> str:
+    return next((f"(0, {top})" for top in (1, 255, 65535) if low >= 0.0 and high <= top), f"({low:g}, {high:g})")
+
+
 def _remission_findings(scan: Measures, profile: FitnessProfile, sensor: SensorProfile) -> list[Finding]:
     # Without remission, 36 % of the car points and 74 % of the road cells remain (intersection over union with the
     # results with remission, 20 KITTI scans, default models); with a constant one, 15 % and 32 %.
@@ -360,18 +392,17 @@ def _remission_findings(scan: Measures, profile: FitnessProfile, sensor: SensorP
     stated = f"the profile {sensor.name} has {low:g} to {high:g}"
     useless = max(0.9, profile.remission_zeros[1] + 0.05)
     if scan.remission_beyond > 0.01 or scan.remission_low < -0.05:
-        likely = next((f"(0, {top})" for top in (1, 255, 65535) if raw_low >= 0.0 and raw_high <= top), "that")
         return [
             Finding(
                 f"Remission runs from {raw_low:g} to {raw_high:g}, but {stated}: pass sensor= a profile whose "
-                f"remission_range is {likely}.",
+                f"remission_range is {_likely_range(raw_low, raw_high)}.",
                 True,
             )
         ]
     if scan.remission_zeros > useless:
         return [
             Finding(
-                f"Remission is 0 for {scan.remission_zeros:.0%} of the points: the field is missing or was not read; "
+                f"{_ALL_ZERO} {scan.remission_zeros:.0%} of the points: the field is missing or was not read; "
                 "the model needs it.",
                 True,
             )

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from edgeperc.preprocess.condition import condition
-from edgeperc.preprocess.findings import Finding, check_beams, check_fitness
+from edgeperc.preprocess.findings import Finding, check_beams, check_fitness, with_raw_remission
 from edgeperc.preprocess.fitness import FitnessProfile
 from edgeperc.readers.files import read_points
 from edgeperc.simulation.samples import simulated_scan
@@ -106,6 +106,33 @@ def test_constant_remission(seed: int, value: float) -> None:
 def test_another_scale_of_remission(factor: float) -> None:
     for seed in SEEDS:
         assert any("emission" in sentence for sentence in gross(street(seed) * np.float32([1, 1, 1, factor])))
+
+
+@pytest.mark.parametrize("sensor", [name for name in SENSORS if get_sensor(name).remission is not None])
+@pytest.mark.parametrize("brightest", [1.0, 0.3])
+def test_a_remission_of_another_unit_is_not_called_missing(sensor: str, brightest: float) -> None:
+    """A profile's logarithm maps 0..1 to nothing where it expects 0..255."""
+    profile = get_sensor(sensor)
+    raw = simulated_scan(1, sensor).points.copy()
+    raw[:, 3] *= brightest / raw[:, 3].max()
+    scan = condition(raw, profile)[0]
+    for fitness in PROFILES:
+        found = with_raw_remission(check_fitness(scan, fitness, profile), raw[:, 3], profile)
+        about = [finding for finding in found if "emission" in finding]
+        assert any(finding.gross for finding in about) or sensor == "pandar64"  # whose function is weaker
+        assert not any("missing" in finding for finding in found)
+        raw_range = f"{profile.remission_range[0]:g} to {profile.remission_range[1]:g}"
+        assert any(raw_range in finding and "(0, 1)" in finding for finding in about)
+
+
+@pytest.mark.parametrize("value", [0.0, np.nan, 7.0])
+def test_a_missing_remission_is_called_so(value: float) -> None:
+    profile = get_sensor("hdl-32e")
+    raw = simulated_scan(1, "hdl-32e").points.copy()
+    raw[:, 3] = value
+    zeros = (Finding("Remission is 0 for 100% of the points: the field is missing", True), Finding("another"))
+    assert with_raw_remission(zeros, raw[:, 3], profile) == zeros
+    assert with_raw_remission((), raw[:, 3] + 1.0, profile) == ()
 
 
 def room(half_m: float, height_m: float) -> Points:
