@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from .agreement.cells import agree_on_cells, mark_cells
 from .agreement.rules import agree_on_boxes, agree_on_points, find_support, find_voters, stand_boxes, without_poles
 from .ground.observed import Observer
-from .ground.planes import GroundFit, fit_ground
+from .ground.planes import FIRST_REACH_HEIGHTS, FIRST_REACH_M, GroundFit, fit_ground
 from .ground.scan import Scan
 from .inference.crop import Crop, sectors_of_turn, spread
 from .inference.decode import decode_boxes, decode_cells, decode_labels
@@ -221,7 +221,8 @@ class Pipeline:
         near = value("project", self._select, points)
         planes = scan = surface = absent
         if self.needs_ground:
-            planes = value("cluster", fit_ground, points, mount_height_m=MODEL_HEIGHT_M)
+            reach_m = max(FIRST_REACH_M, FIRST_REACH_HEIGHTS * (mounting.height_m or 0.0))
+            planes = value("cluster", fit_ground, points, mount_height_m=MODEL_HEIGHT_M, reach_m=reach_m)
             scan = value("cluster", _on_ground, near, planes)
             surface = value("cluster", GroundFit.surface, planes)
 

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
     from ..ground.leveling import MountingEstimator
     from ..types.card import ModelCard
+    from ..types.frame import ModelFrame
     from ..types.perception import DroppedPoints
     from ..types.points import Points
     from ..types.sensor import SensorProfile
@@ -136,7 +137,7 @@ def _mounting_of_all(arguments: argparse.Namespace, estimators: Mapping[SensorPr
     for sensor, estimator in estimators.items():
         if estimator.n_scans > 1 and not arguments.json:
             print_line("")
-            print_rows([("mounting", f"{estimator.estimate()}; {sensor.name}, by {estimator.n_scans} scans")])
+            print_rows([("mounting", f"{_mounting_text(estimator)}; {sensor.name}, by {estimator.n_scans} scans")])
     if arguments.write is None:
         return False
     if len(estimators) != 1:
@@ -144,7 +145,8 @@ def _mounting_of_all(arguments: argparse.Namespace, estimators: Mapping[SensorPr
         return True
     ((sensor, estimator),) = estimators.items()
     try:
-        profile = replace(sensor, mounting=estimator.estimate().mounting)
+        unsure = dict.fromkeys(estimator.doubtful())  # is found from later scans
+        profile = replace(sensor, mounting=replace(estimator.estimate().mounting, **unsure))
     except MountingError as exc:
         print_error(f"--write: {exc}")
         return True
@@ -382,10 +384,11 @@ def _scan_rows(
         return rows, document
     used, reported, remission_rows = _matched_remission(cleaned, sensor)
     conditioned, estimator, mounting_rows, mounting = _mounting_rows(cleaned, sensor, used, estimators)
-    scan = ModelFrame(estimator.mounting()).move(conditioned[0])
+    frame = ModelFrame(estimator.mounting())
+    scan = frame.move(conditioned[0])
     (n_beams, _) = FitnessProfile.from_scans([scan]).beams
     beams = ("beams", f"about {n_beams:.0f} rows of points ({sensor.name}: {sensor.n_beams})")
-    model_rows, findings = _suiting_models(scan, used, unit, reported)
+    model_rows, findings = _suiting_models(scan, used, frame, unit, reported)
     document |= {**extents, "mounting": mounting, "beams": round(float(n_beams)), "models": findings}
     return [*rows, *extent_rows, *remission_rows, *mounting_rows, beams, *model_rows], document
 
@@ -463,11 +466,18 @@ def _mounting_rows(
         estimate = estimator.estimate()
     except MountingError:
         return conditioned, estimator, [("mounting", f"cannot be estimated: {reason}")], None
-    return conditioned, estimator, [("mounting", str(estimate))], estimate.to_dict()
+    return conditioned, estimator, [("mounting", _mounting_text(estimator))], estimate.to_dict()
+
+
+def _mounting_text(estimator: MountingEstimator) -> str:
+    """The estimate, and what of it is not used."""
+    unsure = [name.removesuffix("_deg") for name in estimator.doubtful()]
+    level = f"; the ground is too uneven to be sure of {' and '.join(unsure)}: taken as level" if unsure else ""
+    return f"{estimator.estimate()}{level}"
 
 
 def _suiting_models(
-    scan: Points, sensor: SensorProfile, unit: Sequence[str], reported: Sequence[str]
+    scan: Points, sensor: SensorProfile, frame: ModelFrame, unit: Sequence[str], reported: Sequence[str]
 ) -> tuple[list[tuple[str, str]], dict[str, list[str] | None]]:
     """For each model of scans, what speaks against it; None without a description of its training scans."""
     from ..preprocess.findings import check_fitness
@@ -483,7 +493,8 @@ def _suiting_models(
             findings[card.name] = None
             rows.append((card.name, "its card does not describe its training scans"))
             continue
-        sentences = [*unit, *check_fitness(scan, FitnessProfile.from_dict(card.fitness), sensor), *reported]
+        profile = FitnessProfile.from_dict(card.fitness)
+        sentences = [*unit, *check_fitness(scan, profile, sensor, frame), *reported]
         findings[card.name] = sentences
         rows += [(card.name, f"as a scan of {sensor.name}: {sentence}") for sentence in sentences]
         if not sentences:

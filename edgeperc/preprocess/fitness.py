@@ -277,6 +277,7 @@ class Measures:
     nearest_m: float
     far_m: float
     enclosed: float
+    raised_m: float = 0.0  # the sensor, above that of the models
 
 
 _WALL_DEPTH, _WALL_HEIGHT_M = 0.9, 0.3  # where a direction's end begins, as a share of it; how high it is

@@ -16,10 +16,12 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from edgeperc.preprocess.condition import condition
-from edgeperc.preprocess.findings import Finding, check_beams, check_fitness
+from edgeperc.preprocess.findings import Finding, check_beams, check_fitness, check_profiles
 from edgeperc.preprocess.fitness import FitnessProfile
 from edgeperc.readers.files import read_points
 from edgeperc.simulation.samples import simulated_scan
+from edgeperc.types.frame import ModelFrame
+from edgeperc.types.mounting import Mounting
 from edgeperc.types.sensor import SENSORS, get_sensor
 from edgeperc.zoo import listed
 
@@ -261,3 +263,27 @@ def test_spoilt_real_scans_are_refused(kitti_root: Path, fault: str) -> None:
 def test_the_frame_of_a_map(seed: int, direction_deg: float, distance_m: float) -> None:
     away = distance_m * np.array([np.cos(np.radians(direction_deg)), np.sin(np.radians(direction_deg)), 0.0, 0.0])
     assert any("is not at the" in sentence for sentence in gross(street(seed) + away))
+
+
+@pytest.mark.parametrize("height_m", [3.0, 5.0, 6.5, 8.0])
+@pytest.mark.parametrize("sensor", ["os1-64", "hdl-64e", "vlp-16", "pandar64"])
+def test_high_sensors_are_accepted_with_their_height(sensor: str, height_m: float) -> None:
+    """They see little of the ground near by, and objects from above: as high as their beams, in their own frame."""
+    profile = replace(get_sensor(sensor), remission_range=(0.0, 1.0), remission=None)
+    for seed in SEEDS:
+        points = condition(simulated_scan(seed, sensor, mounting=Mounting(height_m, 0.0, 0.0, 0.0)).points, profile)[0]
+        frame = ModelFrame(Mounting(height_m, 0.0, 0.0, 0.0))
+        assert not any(finding.gross for finding in check_profiles(frame.move(points), PROFILES, profile, frame))
+        wrong = ModelFrame(Mounting(height_m + 3.0, 0.0, 0.0, 0.0))
+        found = [finding for finding in check_profiles(wrong.move(points), PROFILES, profile, wrong) if finding.gross]
+        assert any("another height" in finding or "above the sensor" in finding for finding in found)
+
+
+@pytest.mark.parametrize(("roll_deg", "pitch_deg"), [(0.0, 15.0), (0.0, 30.0), (-20.0, 5.0)])
+def test_sensors_that_lean_are_accepted_with_their_tilt(roll_deg: float, pitch_deg: float) -> None:
+    """A part of the beams points higher than that of a level sensor."""
+    mounting = Mounting(6.0, roll_deg, pitch_deg, 0.0)
+    profile, frame = replace(get_sensor("os1-64"), remission_range=(0.0, 1.0), remission=None), ModelFrame(mounting)
+    for seed in SEEDS:
+        points = condition(simulated_scan(seed, "os1-64", mounting=mounting).points, profile)[0]
+        assert not any(finding.gross for finding in check_profiles(frame.move(points), PROFILES, profile, frame))
