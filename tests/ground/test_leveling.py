@@ -7,6 +7,7 @@ import json
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,7 @@ import twins.frame
 from edgeperc import Box, FitnessError, ModelFrame, Mounting, MountingError, OptionError, Perceiver, SensorError
 from edgeperc.ground.leveling import FROZEN_AFTER, MountingEstimator
 from edgeperc.simulation.drawn import random_scene
+from edgeperc.simulation.samples import simulated_scan
 from edgeperc.simulation.scene import Scene, simulate
 from edgeperc.types.frame import fill_moved, turned
 from edgeperc.types.mounting import MODEL_MOUNTING
@@ -413,6 +415,16 @@ def test_high_sensors_are_found_from_the_ground(sensor: str, height_m: float) ->
         assert given.roll_deg == pytest.approx(0.0, abs=1.0)
     assert np.median(errors) < 0.1
     assert max(errors) < 0.6
+
+
+def test_heights_above_uneven_land_are_nearly_found() -> None:
+    errors = []
+    for sensor, height_m, seed in product(("os1-64", "hdl-64e", "pandar64", "vlp-16"), (3.0, 5.0, 6.5), range(40, 45)):
+        points = simulated_scan(seed, sensor, mounting=Mounting(height_m, 0.0, 0.0, 0.0)).points
+        found = MountingEstimator(Mounting()).add(points).mounting().height_m
+        errors.append(abs((found or 0.0) - height_m))
+    assert np.quantile(errors, 0.9) < 0.5
+    assert np.median(errors) < 0.2
 
 
 @pytest.mark.parametrize(("roll_deg", "pitch_deg"), [(4.0, -3.0), (0.0, 8.0), (-5.0, 5.0)])
