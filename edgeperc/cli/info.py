@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 
     from ..ground.leveling import MountingEstimator
     from ..types.card import ModelCard
+    from ..types.frame import ModelFrame
     from ..types.perception import DroppedPoints
     from ..types.points import Points
     from ..types.sensor import SensorProfile
@@ -138,7 +139,7 @@ def _mounting_of_all(arguments: argparse.Namespace, estimators: Mapping[SensorPr
     for sensor, estimator in estimators.items():
         if estimator.n_scans > 1 and not arguments.json:
             print_line("")
-            print_rows([("mounting", f"{estimator.estimate()}; {sensor.name}, by {estimator.n_scans} scans")])
+            print_rows([("mounting", f"{_mounting_text(estimator)}; {sensor.name}, by {estimator.n_scans} scans")])
     if arguments.write is None:
         return False
     if len(estimators) != 1:
@@ -146,7 +147,8 @@ def _mounting_of_all(arguments: argparse.Namespace, estimators: Mapping[SensorPr
         return True
     ((sensor, estimator),) = estimators.items()
     try:
-        profile = replace(sensor, mounting=estimator.estimate().mounting)
+        unsure = dict.fromkeys(estimator.doubtful())  # is found from later scans
+        profile = replace(sensor, mounting=replace(estimator.estimate().mounting, **unsure))
     except MountingError as exc:
         print_error(f"--write: {exc}")
         return True
@@ -385,11 +387,12 @@ def _scan_rows(
         return [*rows, *_refusal(document["refused"])], document
     used, reported, remission_rows = _matched_remission(cleaned, sensor)
     conditioned, estimator, mounting_rows, mounting = _mounting_rows(cleaned, sensor, used, estimators)
-    scan = ModelFrame(estimator.mounting()).move(conditioned[0])
+    frame = ModelFrame(estimator.mounting())
+    scan = frame.move(conditioned[0])
     (n_beams, _) = FitnessProfile.from_scans([scan]).beams
     beams = ("beams", f"about {n_beams:.0f} rows of points ({sensor.name}: {sensor.n_beams})")
     turned = check_beams(conditioned[0], used) if sensor.mounting.roll_deg is None else ()
-    model_rows, findings = _suiting_models(scan, scans[0][:, 3], used, [*unit, *turned], reported)
+    model_rows, findings = _suiting_models(scan, scans[0][:, 3], used, frame, [*unit, *turned], reported)
     document["refused"] |= any(_is_refused(findings.get(name) or ()) for name in DEFAULT_MODELS)
     document |= {**extents, "mounting": mounting, "beams": round(float(n_beams)), "models": findings}
     refusal = _refusal(document["refused"])
@@ -478,11 +481,23 @@ def _mounting_rows(
         estimate = estimator.estimate()
     except MountingError:
         return conditioned, estimator, [("mounting", f"cannot be estimated: {reason}")], None
-    return conditioned, estimator, [("mounting", str(estimate))], estimate.to_dict()
+    return conditioned, estimator, [("mounting", _mounting_text(estimator))], estimate.to_dict()
+
+
+def _mounting_text(estimator: MountingEstimator) -> str:
+    """The estimate, and what of it is not used."""
+    unsure = [name.removesuffix("_deg") for name in estimator.doubtful()]
+    level = f"; the ground is too uneven to be sure of {' and '.join(unsure)}: taken as level" if unsure else ""
+    return f"{estimator.estimate()}{level}"
 
 
 def _suiting_models(
-    scan: Points, remission: NDArray[np.float32], sensor: SensorProfile, unit: Sequence[str], reported: Sequence[str]
+    scan: Points,
+    remission: NDArray[np.float32],
+    sensor: SensorProfile,
+    frame: ModelFrame,
+    unit: Sequence[str],
+    reported: Sequence[str],
 ) -> tuple[list[tuple[str, str]], dict[str, list[str] | None]]:
     """For each model of scans, what speaks against it; None without a description of its training scans."""
     from ..preprocess.findings import check_fitness, with_raw_remission
@@ -498,7 +513,7 @@ def _suiting_models(
             findings[card.name] = None
             rows.append((card.name, "its card does not describe its training scans"))
             continue
-        fitness = check_fitness(scan, FitnessProfile.from_dict(card.fitness), sensor)
+        fitness = check_fitness(scan, FitnessProfile.from_dict(card.fitness), sensor, frame)
         sentences = [*unit, *with_raw_remission(fitness, remission, sensor), *reported]
         findings[card.name] = sentences
         rows += [(card.name, f"as a scan of {sensor.name}: {sentence}") for sentence in sentences]

@@ -22,6 +22,7 @@ from edgeperc.inference import listing, providers
 from edgeperc.preprocess.fitness import FitnessProfile
 from edgeperc.system import machine
 from edgeperc.types.card import ModelCard
+from edgeperc.types.frame import ModelFrame
 from edgeperc.types.sensor import SENSORS, SensorProfile, get_sensor
 from edgeperc.zoo import Variant
 from scenes import urban
@@ -103,7 +104,7 @@ def test_info_of_a_scan(tmp_path: Path, capsys: pytest.CaptureFixture[str], monk
     checked = []
 
     def check_fitness(
-        points: np.ndarray, profile: FitnessProfile | None, sensor: SensorProfile | None
+        points: np.ndarray, profile: FitnessProfile | None, sensor: SensorProfile | None, frame: ModelFrame
     ) -> tuple[str, ...]:
         checked.append((points, profile, sensor.name))
         return ("it has 32 beams",)
@@ -322,7 +323,7 @@ def drive(tmp_path: Path) -> Path:
     folder.mkdir()
     for k in range(3):
         scan = urban(k).points - np.float32([0.0, 0.0, 0.67, 0.0])
-        kept = np.hypot(scan[:, 0], scan[:, 1]) > (13.0 if k == 1 else 0.0)
+        kept = np.hypot(scan[:, 0], scan[:, 1]) > (60.0 if k == 1 else 0.0)
         scan[kept].tofile(folder / f"{k}.bin")
     return folder
 
@@ -372,6 +373,12 @@ def test_no_profile_is_written_without_ground_or_of_two_sensors(
     [
         (["--mount-height", "2.1"], {"height_m": 2.1}),
         (["--turn", "-90"], {"yaw_deg": -90.0}),
+        (["--roll", "-2.5"], {"roll_deg": -2.5}),
+        (
+            ["--pitch", "3", "--roll", "180", "--mount-height", "6"],
+            {"roll_deg": 180.0, "pitch_deg": 3.0, "height_m": 6.0},
+        ),
+        (["--extrinsic", "T.json", "--pitch", "4"], {"height_m": 1.9, "pitch_deg": 4.0, "yaw_deg": -90.0}),
         (["--extrinsic", "T.json"], {"height_m": 1.9, "roll_deg": 0.0, "pitch_deg": 0.0, "yaw_deg": -90.0}),
         (["--extrinsic", "T.json", "--mount-height", "3"], {"height_m": 3.0, "yaw_deg": -90.0}),
     ],
@@ -392,7 +399,15 @@ def test_run_uses_the_given_mounting(
 
 
 @pytest.mark.parametrize(
-    "options", [["--mount-height", "nan"], ["--turn", "left"], ["--mount-height", "1e9"], ["--extrinsic", "absent"]]
+    "options",
+    [
+        ["--mount-height", "nan"],
+        ["--turn", "left"],
+        ["--mount-height", "1e9"],
+        ["--extrinsic", "absent"],
+        ["--roll", "181"],
+        ["--pitch", "steep"],
+    ],
 )
 def test_impossible_mountings_are_refused(options: list[str], drive: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with contextlib.suppress(SystemExit):  # argparse
