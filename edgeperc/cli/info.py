@@ -147,7 +147,7 @@ def _mounting_of_all(arguments: argparse.Namespace, estimators: Mapping[SensorPr
         return True
     ((sensor, estimator),) = estimators.items()
     try:
-        unsure = dict.fromkeys(estimator.doubtful())  # is found from later scans
+        unsure: dict[str, Any] = dict.fromkeys(estimator.doubtful())  # is found from later scans
         profile = replace(sensor, mounting=replace(estimator.estimate().mounting, **unsure))
     except MountingError as exc:
         print_error(f"--write: {exc}")

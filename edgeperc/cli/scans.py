@@ -160,7 +160,9 @@ def with_mounting(sensor: str | SensorProfile, arguments: argparse.Namespace) ->
 
     options = {"height_m": "mount_height", "roll_deg": "roll", "pitch_deg": "pitch", "yaw_deg": "turn"}
     given = {name: getattr(arguments, option, None) for name, option in options.items()}
-    values = {name: None if value == "street" else value for name, value in given.items() if value is not None}
+    values: dict[str, Any] = {
+        name: None if value == "street" else value for name, value in given.items() if value is not None
+    }
     file, ego = getattr(arguments, "extrinsic", None), getattr(arguments, "ego_box", None)
     if not values and file is None and ego is None:
         return sensor
