@@ -22,7 +22,7 @@ from .inference.session import Session
 from .objects.boxes import MIN_SCORE
 from .pipeline import BoxesFrom, ObjectNetwork, Options, Pipeline, RangeImageNetwork, TopViewNetwork
 from .preprocess.condition import scale
-from .preprocess.findings import Finding, check_beams, check_dropped, check_profiles
+from .preprocess.findings import Finding, check_beams, check_dropped, check_profiles, with_raw_remission
 from .preprocess.fitness import FitnessProfile
 from .preprocess.interpolation import Interpolator
 from .preprocess.remission import RemissionMatcher
@@ -522,6 +522,7 @@ class Perceiver:
             turned = check_beams(scan, profile) if check and before.known.roll_deg is None else ()
             try:
                 self._set_mounting(before.add(scan))
+                hidden = self._about_tilt()
             except MountingError as exc:
                 hidden = self._without_ground(exc)
             watch.lap("check")
@@ -530,7 +531,8 @@ class Perceiver:
             watch.lap("adapt")
         fitness = check_dropped(given, dropped, profile) if check else ()
         if check and not fitness:
-            fitness = turned or check_profiles(scan, self._fitness, profile)
+            fitness = turned or check_profiles(scan, self._fitness, profile, self._frame)
+            fitness = with_raw_remission(fitness, given[:, 3], profile)
         if check and not any(finding.gross for finding in fitness):
             fitness = (*fitness, *hidden)
         if self.on_mismatch != "ignore":
@@ -570,6 +572,24 @@ class Perceiver:
                 f"The mounting of the sensor cannot be estimated ({reason}); it is taken as "
                 f"{self._mounting.height_m:g} m above the road and level: pass mounting= (on the command line "
                 "--mount-height or --extrinsic)."
+            ),
+        )
+
+    def _about_tilt(self) -> tuple[Finding, ...]:
+        """What to say if the scans suggest a tilt, and their ground is too uneven to be sure."""
+        doubtful = self._estimator.doubtful()
+        if not doubtful:
+            return ()
+        found = self._estimator.estimate()
+        shown = " and ".join(
+            f"{name} of {getattr(found.mounting, f'{name}_deg'):.1f} +- {getattr(found, f'{name}_sd_deg'):.1f} deg"
+            for name in (name.removesuffix("_deg") for name in doubtful)
+        )
+        return (
+            Finding(
+                f"The ground suggests a {shown}, but it is too uneven to tell a tilt of the sensor from its own slope: "
+                "the sensor is taken as level until scans of other places agree. If you know its tilt, pass mounting= "
+                "(on the command line --roll, --pitch or --extrinsic)."
             ),
         )
 

@@ -23,7 +23,7 @@ from .agreement.rules import (
 )
 from .agreement.votes import VEHICLE
 from .ground.observed import Observer
-from .ground.planes import GroundFit, fit_ground
+from .ground.planes import FIRST_REACH_HEIGHTS, FIRST_REACH_M, GroundFit, fit_ground
 from .ground.scan import Scan
 from .inference.crop import Crop, sectors_of_turn, spread
 from .inference.decode import decode_boxes, decode_cells, decode_labels
@@ -236,7 +236,8 @@ class Pipeline:
         near = value("project", self._select, points)
         planes = scan = surface = absent
         if self.needs_ground:
-            planes = value("cluster", fit_ground, points, mount_height_m=MODEL_HEIGHT_M)
+            reach_m = max(FIRST_REACH_M, FIRST_REACH_HEIGHTS * (mounting.height_m or 0.0))
+            planes = value("cluster", fit_ground, points, mount_height_m=MODEL_HEIGHT_M, reach_m=reach_m)
             scan = value("cluster", _on_ground, near, planes)
             surface = value("cluster", GroundFit.surface, planes)
 

@@ -137,5 +137,19 @@ class Sink(Protocol):
             The scan could not be written; the next one may be.
         """
 
-    def close(self) -> None:
-        """Finish the file; nothing is written afterwards. Called after an error, too."""
+    def close(self, whole: bool = True) -> None:
+        """Finish the file; nothing is written afterwards. Called after an error, too.
+
+        A file that is not whole, because an error kept a scan from it or the run ended early, is called ``NAME.part``.
+        A `RuntimeWarning` says so, and an existing file of its name stays.
+
+        Parameters
+        ----------
+        whole : bool
+            False if the run ended before its last scan.
+
+        Raises
+        ------
+        EdgepercError or OSError
+            The file could not be finished.
+        """

@@ -61,6 +61,7 @@ from .preprocess.returns import returns
 from .road.ahead import compile_kernels
 from .road.outline import merge_corners
 from .system.compiling import fewer_collections, tell_watchers
+from .system.interpreter import interpreter_flags
 from .system.kernels import is_ahead
 from .system.lanes import Lanes, Stopwatch
 from .system.machine import usable_cores
@@ -377,9 +378,6 @@ def _interpreter() -> str | None:
 
 def _start(parts: Sequence[str]) -> subprocess.Popen[bytes]:
     """Start a helper. It inherits no files; its standard input is open until it is closed or this process ends."""
-    # What is compiled depends on the bytecode, and that on -O.
-    flags = ["-O"] * sys.flags.optimize
-    flags += [*(["-B"] if sys.dont_write_bytecode else []), *(["-E"] if sys.flags.ignore_environment else [])]
     paths = [path for path in sys.path if isinstance(path, str)]
     environment = dict(os.environ)
     import numba
@@ -388,7 +386,7 @@ def _start(parts: Sequence[str]) -> subprocess.Popen[bytes]:
     if config.CACHE_DIR:
         environment["NUMBA_CACHE_DIR"] = str(config.CACHE_DIR)
     return subprocess.Popen(
-        [str(_interpreter()), *flags, "-c", START, ",".join(parts), *paths],
+        [str(_interpreter()), *interpreter_flags(), "-c", START, ",".join(parts), *paths],
         stdin=subprocess.PIPE,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,

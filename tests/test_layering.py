@@ -27,7 +27,7 @@ PACKAGES = {
 FLOORS = {
     "edgeperc": """
         errors
-        system.__init__ system.atomic system.clock system.extras system.fields system.lanes
+        system.__init__ system.atomic system.clock system.extras system.fields system.interpreter system.lanes
         system.names
         system.printable
         system.machine system.remote
@@ -37,6 +37,7 @@ FLOORS = {
         system.kernel_cache
         system.kernels
         system.compilation system.draws
+        types.rigid
         types.__init__ types.choices types.mounting types.onnx_file types.points types.views
         types.card types.sensor
         types.perception
@@ -73,7 +74,7 @@ FLOORS = {
         readers.clouds readers.ouster readers.tables
         readers.inflate readers.pcd readers.ply readers.raw
         readers.mcap readers.text
-        readers.bags readers.files
+        readers.bags readers.files readers.packet_messages
         readers.decoders
         readers.identify readers.worker
         readers.apart
@@ -105,8 +106,8 @@ FLOORS = {
         evaluation.camvid evaluation.evaluate evaluation.tracking evaluation.transfer
         ros2.__init__ ros2.graph ros2.messages
         ros2.node ros2.rclpy_graph ros2.zenoh_graph
-        sinks.__init__ sinks.kept_file sinks.names sinks.relay sinks.rosbag sinks.scene
-        sinks.foxglove sinks.page sinks.prelabels sinks.rerun sinks.static
+        sinks.__init__ sinks.names sinks.relay sinks.run_file sinks.scene
+        sinks.foxglove sinks.page sinks.prelabels sinks.rerun sinks.rosbag sinks.static
         cli.arguments cli.evaluation.__init__ cli.output cli.straighten
         cli.completion cli.doctor cli.evaluation.box_tables cli.evaluation.painting cli.lists cli.program
         cli.report cli.scans cli.sinks

@@ -14,6 +14,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -126,6 +127,122 @@ def test_a_fork_that_cannot_work_is_refused_at_once(when: str, options: dict[str
     assert "construct the Perceiver in the process that calls it" in forked(when, **options)
 
 
+END = """
+import gc, multiprocessing, os, sys, warnings
+import numpy as np
+import edgeperc
+
+warnings.simplefilter("ignore")
+scan = np.random.default_rng(0).normal(0.0, 10.0, (2000, 4)).astype(np.float32)
+
+def make():
+    perceive = edgeperc.Perceiver("pointseg", provider="cpu", n_threads=2, on_mismatch="ignore")
+    perceive(scan)
+    return perceive
+
+perceive = make()
+how, child = sys.argv[1], 0
+if how == "multiprocessing":
+    process = multiprocessing.get_context("fork").Process(target=print, args=("ended",))
+    process.start()
+    process.join()
+    sys.exit(process.exitcode)
+child = os.fork()
+if child == 0:
+    if how == "dropped":
+        del perceive
+        gc.collect()
+    elif how == "forked again" and os.fork():
+        os.wait()
+    elif how == "with its own":
+        perceive = make()
+    elif how == "cyclic":
+        cycle = [perceive]
+        cycle.append(cycle)
+        del perceive, cycle
+        gc.collect()
+    print("ended", flush=True)
+    sys.exit(0)
+_, status = os.waitpid(child, 0)
+sys.exit(os.waitstatus_to_exitcode(status))
+"""
+
+
+@posix
+@pytest.mark.parametrize("how", ["exit", "dropped", "forked again", "with its own", "cyclic", "multiprocessing"])
+def test_a_fork_ends(how: str) -> None:
+    """Its copies of threads, of which there are none, are not waited for."""
+    done = python(END, how)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.split() == ["ended"] * (2 if how == "forked again" else 1)
+
+
+DAEMON = """
+import os, sys, threading, time, warnings
+import numpy as np
+import edgeperc
+
+warnings.simplefilter("ignore")
+scan = np.random.default_rng(0).normal(0.0, 10.0, (20_000, 4)).astype(np.float32)
+perceive = edgeperc.Perceiver("pointseg", provider="cpu", n_threads=1, on_mismatch="ignore")
+perceive(scan)
+begun = threading.Event()
+
+def work():
+    while True:
+        begun.set()
+        perceive(scan)
+
+threading.Thread(target=work, daemon=True).start()
+begun.wait()
+time.sleep(float(sys.argv[1]))
+"""
+
+IN_A_CALL = """
+import atexit, os, sys, threading, time
+from edgeperc.system.interpreter import native_call
+
+begun = threading.Event()
+
+def work():
+    with native_call():
+        begun.set()
+        time.sleep(0.5)
+        os.write(1, b"call ended\\n")
+    with native_call():
+        os.write(1, b"never\\n")
+
+def at_the_end():
+    with native_call():
+        os.write(1, b"at the end\\n")
+
+if sys.argv[1] == "fork" and os.fork():
+    os.wait()
+else:
+    atexit.register(at_the_end)  # runs after what edgeperc does at the end
+    threading.Thread(target=work, daemon=True).start()
+    begun.wait()
+    if sys.argv[1] == "fork, in the call" and os.fork():
+        os.wait()
+"""
+
+
+@pytest.mark.parametrize("how", ["plain", "fork", "fork, in the call"] if os.name == "posix" else ["plain"])
+def test_the_interpreter_ends_after_a_call(how: str) -> None:
+    """That of a daemon thread; another one never begins, but in the main thread. A fork waits for no call of others."""
+    done = python(IN_A_CALL, how)
+    assert done.returncode == 0, done.stderr
+    assert "Traceback" not in done.stderr
+    lines = ["call ended", "at the end"]
+    assert done.stdout.splitlines() == (["at the end", *lines] if how == "fork, in the call" else lines)
+
+
+@pytest.mark.parametrize("wait_s", [0.0, 0.003, 0.007, 0.011, 0.017, 0.023])
+def test_a_daemon_thread_in_a_call_ends_with_the_interpreter(wait_s: float) -> None:
+    done = python(DAEMON, str(wait_s))
+    assert done.returncode == 0, done.stderr
+
+
 def test_perceivers_are_not_pickled_or_copied() -> None:
     perceive = Perceiver("pointseg", provider="cpu", n_threads=1)
     for thing in (perceive, perceive.sessions[0]):
@@ -182,14 +299,15 @@ def test_a_failed_run_is_not_a_running_one(monkeypatch: pytest.MonkeyPatch) -> N
     session.run()
 
 
-def edgeperc_run(*arguments: object, **options: Any) -> subprocess.Popen[str]:
+def edgeperc_run(*arguments: object, limit: Callable[[], None] = lambda: None, **options: Any) -> subprocess.Popen[str]:
     def with_signals() -> None:  # a shell starts programs in the background with SIGINT ignored
         signal.signal(signal.SIGINT, signal.default_int_handler)
+        limit()
 
     command = [sys.executable, "-m", "edgeperc", "run", *map(str, arguments)]
     command += ["--provider", "cpu", "--threads", "1", "--on-mismatch", "ignore"]
-    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-    return subprocess.Popen(command, preexec_fn=with_signals, **pipes, **options)
+    options = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True} | options
+    return subprocess.Popen(command, preexec_fn=with_signals, **options)
 
 
 @posix
@@ -277,6 +395,103 @@ def test_full_disk_fails_its_scan(folder: Path, small_disk: Callable[[int], Path
     (out / "filler").write_bytes(bytes(40 << 10))
     process = edgeperc_run(folder, "--json", "--model", "pointseg", "--labels", "--out", out)
     check_failed(process, out, "No space left on device")
+
+
+WHOLE_RUN = {
+    "bag": ("--bag bag", "rosbags"),
+    "mcap": ("--mcap run.mcap", "foxglove"),
+    "rrd": ("--rrd run.rrd", "rerun"),
+    "page": ("--play run.html", None),
+    "cvat": ("--labels-for cvat --out labels", None),
+    "static": ("--static static --movable", None),
+    "labelcloud": ("--labels-for labelcloud --out labels", None),
+    "kitti": ("--labels-for kitti --out labels", None),
+    "gif": ("--track --gif --out pictures", "matplotlib"),
+}
+"""Options of what is written of a whole run, and what each needs."""
+
+
+@posix
+@pytest.mark.parametrize("sink", WHOLE_RUN)
+@pytest.mark.parametrize("limit", [0, 1500])
+def test_what_cannot_be_written_is_said_and_is_no_result(folder: Path, tmp_path: Path, sink: str, limit: int) -> None:
+    """Of any error of writing: here files have a greatest size, as with a quota."""
+    resource = pytest.importorskip("resource")
+    options, package = WHOLE_RUN[sink]
+    if package is not None:
+        pytest.importorskip(package)
+    if limit and sink in ("kitti", "labelcloud", "cvat"):
+        pytest.skip("these files are smaller")
+    out = tmp_path / "out"
+    out.mkdir()
+    process = edgeperc_run(
+        folder,
+        "--json",
+        *options.split(),
+        cwd=out,
+        limit=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (limit,) * 2),
+    )
+    records, errors = process.communicate(timeout=120)
+    assert process.returncode in (1, 2), errors  # 2: before the first scan
+    assert "Traceback" not in errors
+    assert "Errno" in errors
+    assert len(records.splitlines()) == (2 if process.returncode == 1 else 0)
+    left = [file.relative_to(out) for file in out.rglob("*") if file.is_file()]
+    assert all(".part" in str(file) and not str(file).startswith(".") for file in left)
+
+
+@pytest.mark.parametrize("append", [False, True])
+def test_lines_that_do_not_fit_leave_no_half(folder: Path, small_disk: Callable[[int], Path], append: bool) -> None:
+    """A result that cannot be printed is an error of its scan; what is printed has whole lines."""
+    disk = small_disk(64)
+    lines = disk / "lines.jsonl"
+    with lines.open("ab" if append else "wb", buffering=0) as stdout:
+        if append:
+            stdout.write(b"{}\n")
+        (disk / "filler").write_bytes(bytes(56 << 10))
+        scans = [folder / f"copy{k}.bin" for k in range(12)]
+        for copy in scans:
+            copy.hardlink_to(folder / "000000.bin")
+        process = edgeperc_run(*scans, "--json", "--model", "pointseg", stdout=stdout)
+        _, errors = process.communicate(timeout=120)
+    assert "Traceback" not in errors
+    assert process.returncode == 1
+    assert "cannot be printed: [Errno 28] No space left on device" in errors
+    held = lines.read_bytes()
+    assert held.endswith(b"\n")
+    records = [json.loads(line) for line in held.splitlines()]
+    assert records[0] == {} or not append
+    assert 2 <= len(records) < 12
+
+
+@posix
+@pytest.mark.parametrize("number", [2, 15])  # SIGINT, SIGTERM
+def test_a_signal_leaves_an_older_run_as_it_is(folder: Path, tmp_path: Path, number: int) -> None:
+    out = tmp_path / "out"
+    out.mkdir()
+    options = ["--play run.html", "--labels-for cvat --out ."]
+    targets = {"run.html", "annotations.zip"}
+    for name in ("mcap", "rrd"):
+        if find_spec(str(WHOLE_RUN[name][1])):
+            options.append(WHOLE_RUN[name][0])
+            targets.add(f"run.{name}")
+    for name in targets:
+        (out / name).write_bytes(b"of an older run")
+    scans = [folder / "000000.bin"]
+    for k in range(300):
+        scans.append(folder / f"copy{k}.bin")
+        scans[-1].hardlink_to(scans[0])
+    process = edgeperc_run(*scans, "--model", "pointseg", *" ".join(options).split(), cwd=out)
+    assert process.stdout is not None
+    for _ in range(3):
+        assert process.stdout.readline()
+    process.send_signal(number)
+    _, errors = process.communicate(timeout=120)
+    assert process.returncode == {2: 130, 15: 143}[number]
+    assert "Traceback" not in errors
+    assert errors.count(" was not written to its end; ") == len(targets)
+    assert {file.name for file in out.iterdir()} == targets | {f"{name}.part" for name in targets}
+    assert all((out / name).read_bytes() == b"of an older run" for name in targets)
 
 
 HOMES = ("HOME", "USERPROFILE", "LOCALAPPDATA", "XDG_CACHE_HOME", "XDG_CONFIG_HOME", "XDG_DATA_HOME")

@@ -13,11 +13,11 @@ from numpy.typing import ArrayLike, NDArray
 from ..errors import CalibrationError, PointsError
 from ..system.kernels import njit
 from ..types.points import Points, read_only
+from ..types.rigid import ROW_TOLERANCE, rigid
 
 MAX_EDGE, MAX_PIXELS = 2**15, 2**26  # of an image, as in `edgeperc.camera.image`
 MAX_DISTANCE_M = 100.0  # between the sensors; more is probably a translation in millimeters
 # KITTI's rotations have seven digits; a product of two of them is off by some 1e-6.
-ROTATION_TOLERANCE = 1e-3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -39,8 +39,8 @@ class Calibration:
     Raises
     ------
     CalibrationError
-        A value is not finite or out of its bounds, ``K`` has another form, or ``T_camera_sensor`` is not a rotation
-        and a translation.
+        A value is not finite or out of its bounds, ``K`` has another form or its center outside the image, or
+        ``T_camera_sensor`` is not a rotation and a translation.
     """
 
     K: NDArray[np.float64]
@@ -49,8 +49,8 @@ class Calibration:
     height: int
 
     def __post_init__(self) -> None:
-        K, T = _matrix("K", self.K, 3), _matrix("T_camera_sensor", self.T_camera_sensor, 4)
-        if K[0, 1] != 0.0 or K[1, 0] != 0.0 or K[2].tolist() != [0.0, 0.0, 1.0]:
+        K, T = _matrix("K", self.K, 3), rigid("T_camera_sensor", self.T_camera_sensor, CalibrationError)
+        if max(abs(K[0, 1]), abs(K[1, 0]), *np.abs(K[2] - [0.0, 0.0, 1.0])) > ROW_TOLERANCE:
             raise CalibrationError(
                 f"K is {K.tolist()}; expected [[f_x, 0, c_x], [0, f_y, c_y], [0, 0, 1]], without skew. "
                 "Rectify the images first"
@@ -60,22 +60,25 @@ class Calibration:
                 f"K has focal lengths {K[0, 0]:g}, {K[1, 1]:g} and center {K[0, 2]:g}, {K[1, 2]:g}; expected focal "
                 "lengths above 0 and values up to 1e6 pixels"
             )
-        R, t = T[:3, :3], T[:3, 3]
-        if np.abs(R @ R.T - np.eye(3)).max() > ROTATION_TOLERANCE or np.linalg.det(R) < 0.0:
+        if np.abs(T[:3, 3]).max() > MAX_DISTANCE_M:
             raise CalibrationError(
-                f"T_camera_sensor has {R.tolist()} at its upper left; expected a rotation (orthonormal, determinant 1)"
+                f"T_camera_sensor has translation {T[:3, 3].tolist()}; expected at most {MAX_DISTANCE_M:g} m between "
+                "camera and LiDAR (not millimeters)"
             )
-        if T[3].tolist() != [0.0, 0.0, 0.0, 1.0] or np.abs(t).max() > MAX_DISTANCE_M:
-            raise CalibrationError(
-                f"T_camera_sensor has translation {t.tolist()} and last row {T[3].tolist()}; expected at most "
-                f"{MAX_DISTANCE_M:g} m between camera and LiDAR (not millimeters), and 0, 0, 0, 1"
-            )
-        object.__setattr__(self, "K", K)
-        object.__setattr__(self, "T_camera_sensor", T)
+        K[0, 1] = K[1, 0] = 0.0
+        K[2] = 0.0, 0.0, 1.0
+        object.__setattr__(self, "K", read_only(K, np.float64))
+        object.__setattr__(self, "T_camera_sensor", read_only(T, np.float64))
         object.__setattr__(self, "width", _pixels("width", self.width))
         object.__setattr__(self, "height", _pixels("height", self.height))
         if self.width * self.height > MAX_PIXELS:
             raise CalibrationError(f"width x height is {self.width} x {self.height}; expected at most {MAX_PIXELS:,}")
+        c_x, c_y = K[:2, 2].tolist()
+        if not (-0.5 <= c_x <= self.width - 0.5 and -0.5 <= c_y <= self.height - 0.5):
+            raise CalibrationError(
+                f"K has its center at {c_x:g}, {c_y:g}, outside the image of {self.width} x {self.height} pixels; "
+                "expected the size of the image that K is of. For a resized image, use calibration.resized(...)"
+            )
 
     @classmethod
     def from_kitti(cls, path: str | os.PathLike[str], width: int, height: int) -> Calibration:
@@ -211,8 +214,8 @@ def _pixels(name: str, given: object) -> int:
 
 def _matrix(name: str, given: ArrayLike, n: int) -> NDArray[np.float64]:
     try:
-        matrix: NDArray[np.float64] = read_only(np.array(given, dtype=np.float64), np.float64)
-    except (TypeError, ValueError) as exc:
+        matrix: NDArray[np.float64] = np.array(given, dtype=np.float64)
+    except (OverflowError, TypeError, ValueError) as exc:
         raise CalibrationError(f"{name} is not an array of numbers ({exc}); expected ({n}, {n})") from exc
     if matrix.shape != (n, n) or not np.isfinite(matrix).all():
         raise CalibrationError(

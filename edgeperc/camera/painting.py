@@ -229,7 +229,7 @@ def _hidden_by(
         surface = None
         if isinstance(image, Perception) and (image.n_points, image.mounting) == (len(points), known):
             surface = image.ground
-        surface = surface or fit_ground(above, mount_height_m=MODEL_HEIGHT_M).surface()
+        surface = surface or fit_ground(above, mount_height_m=MODEL_HEIGHT_M, any_order=True).surface()
         is_ground = heights_above(surface, above).mask
         cells = np.zeros((0 if places is None else len(places), 3))
         if places is not None:

@@ -71,6 +71,19 @@ def add_mounting(group: Any) -> None:
         help="height of the scan's origin above the road [m] (default: found from the ground in the scans)",
     )
     group.add_argument(
+        "--roll",
+        type=finite_number,
+        metavar="DEG",
+        help="tilt of the sensor to the right, its left side up [deg]; 180: it hangs upside down (default: found from "
+        "the ground in the scans)",
+    )
+    group.add_argument(
+        "--pitch",
+        type=finite_number,
+        metavar="DEG",
+        help="tilt of the sensor, positive if it looks down ahead [deg] (default: found from the ground in the scans)",
+    )
+    group.add_argument(
         "--turn",
         type=_yaw,
         metavar="DEG",

@@ -14,9 +14,10 @@ from typing import TYPE_CHECKING, Any
 
 from ..errors import EdgepercError, MissingExtraError, MountingError, PointsError
 from ..system.atomic import write_atomic
+from ..types.choices import DEFAULT_MODELS, DEFAULT_SENSOR
 from .arguments import Commands, add_command, add_fields, add_mounting, add_sensor, add_topic, reading_options
 from .output import print_error, print_line, print_rows
-from .scans import scan_sensor
+from .scans import scan_sensor, with_mounting
 
 if TYPE_CHECKING:
     import numpy as np
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
 
     from ..ground.leveling import MountingEstimator
     from ..types.card import ModelCard
+    from ..types.frame import ModelFrame
     from ..types.perception import DroppedPoints
     from ..types.points import Points
     from ..types.sensor import SensorProfile
@@ -32,7 +34,7 @@ if TYPE_CHECKING:
 
 _WIDTH = 100  # characters of a line, with its name
 _MOST_SCANS = 300  # to look for the own vehicle in
-_LINES = 2  # lines of a row; --json prints everything
+_LINES = 2  # lines of a row about a model; --json prints everything
 
 
 def add_parser(commands: Commands) -> None:
@@ -90,13 +92,13 @@ def add_parser(commands: Commands) -> None:
 
 
 def info_command(arguments: argparse.Namespace) -> int:
-    """Describe models, scans and images; 1 if some failed."""
+    """Describe models, scans and images; 1 if some failed, or ``edgeperc run`` refuses a scan."""
     from ..readers.images import IMAGE_SUFFIXES
 
-    if arguments.sensor is not None:
+    if arguments.sensor is not None or arguments.extrinsic is not None:
         from ..types.sensor import get_sensor
 
-        get_sensor(arguments.sensor)
+        get_sensor(with_mounting(arguments.sensor or DEFAULT_SENSOR, arguments))  # one error, before the first thing
     if arguments.write is not None and arguments.write.suffix != ".json":
         arguments.usage_error(f"--write {arguments.write}: expected a name that ends in .json")
     estimators: dict[SensorProfile, MountingEstimator] = {}
@@ -112,6 +114,7 @@ def info_command(arguments: argparse.Namespace) -> int:
             else:
                 rows, document = _scan_rows(Path(thing), arguments, estimators)
                 scans.append(Path(thing))
+                n_failed += document["refused"]
         except MissingExtraError:
             raise
         except EdgepercError as exc:
@@ -123,7 +126,7 @@ def info_command(arguments: argparse.Namespace) -> int:
         else:
             if n_printed:
                 print_line("")
-            print_rows(_folded(rows))
+            print_rows(_folded(rows, _LINES if _is_model(thing) else None))
         n_printed += 1
     n_failed += _mounting_of_all(arguments, estimators)
     if arguments.suggest_ego_box:
@@ -136,7 +139,7 @@ def _mounting_of_all(arguments: argparse.Namespace, estimators: Mapping[SensorPr
     for sensor, estimator in estimators.items():
         if estimator.n_scans > 1 and not arguments.json:
             print_line("")
-            print_rows([("mounting", f"{estimator.estimate()}; {sensor.name}, by {estimator.n_scans} scans")])
+            print_rows([("mounting", f"{_mounting_text(estimator)}; {sensor.name}, by {estimator.n_scans} scans")])
     if arguments.write is None:
         return False
     if len(estimators) != 1:
@@ -144,7 +147,8 @@ def _mounting_of_all(arguments: argparse.Namespace, estimators: Mapping[SensorPr
         return True
     ((sensor, estimator),) = estimators.items()
     try:
-        profile = replace(sensor, mounting=estimator.estimate().mounting)
+        unsure: dict[str, Any] = dict.fromkeys(estimator.doubtful())  # is found from later scans
+        profile = replace(sensor, mounting=replace(estimator.estimate().mounting, **unsure))
     except MountingError as exc:
         print_error(f"--write: {exc}")
         return True
@@ -203,12 +207,12 @@ def _variants(thing: str) -> Sequence[Variant]:
     return resolve(thing)
 
 
-def _folded(rows: Sequence[tuple[str, str]]) -> list[tuple[str, str]]:
-    """Rows with long values wrapped to `_WIDTH`, or cut off after `_LINES`."""
+def _folded(rows: Sequence[tuple[str, str]], max_lines: int | None) -> list[tuple[str, str]]:
+    """Rows with long values wrapped to `_WIDTH`, or cut off after so many lines."""
     width = _WIDTH - max(len(name) for name, _ in rows) - 2
     folded = []
     for name, value in rows:
-        lines = textwrap.wrap(value, width, max_lines=_LINES, placeholder=" ...") or [""]
+        lines = textwrap.wrap(value, width, max_lines=max_lines, placeholder=" ...") or [""]
         folded += [(name if k == 0 else "", line) for k, line in enumerate(lines)]
     return folded
 
@@ -349,7 +353,7 @@ def _scan_rows(
     path: Path, arguments: argparse.Namespace, estimators: dict[SensorProfile, MountingEstimator]
 ) -> tuple[list[tuple[str, str]], dict[str, Any]]:
     """Measure a scan and check which models suit it: rows to print, and the same measurements for JSON."""
-    from ..preprocess.findings import check_dropped
+    from ..preprocess.findings import check_beams, check_dropped
     from ..preprocess.fitness import FitnessProfile
     from ..preprocess.returns import returns
     from ..types.frame import ModelFrame
@@ -378,16 +382,30 @@ def _scan_rows(
     unit = check_dropped(scans[0], dropped, sensor)
     rows += [("unit", sentence) for sentence in unit]
     extent_rows, extents = _extent_rows(cleaned[0])
+    document["refused"] = _is_refused(unit) or (len(scans[0]) > 0 and not extents)
     if not extents:
-        return rows, document
+        return [*rows, *_refusal(document["refused"])], document
     used, reported, remission_rows = _matched_remission(cleaned, sensor)
     conditioned, estimator, mounting_rows, mounting = _mounting_rows(cleaned, sensor, used, estimators)
-    scan = ModelFrame(estimator.mounting()).move(conditioned[0])
+    frame = ModelFrame(estimator.mounting())
+    scan = frame.move(conditioned[0])
     (n_beams, _) = FitnessProfile.from_scans([scan]).beams
     beams = ("beams", f"about {n_beams:.0f} rows of points ({sensor.name}: {sensor.n_beams})")
-    model_rows, findings = _suiting_models(scan, used, unit, reported)
+    turned = check_beams(conditioned[0], used) if sensor.mounting.roll_deg is None else ()
+    model_rows, findings = _suiting_models(scan, scans[0][:, 3], used, frame, [*unit, *turned], reported)
+    document["refused"] |= any(_is_refused(findings.get(name) or ()) for name in DEFAULT_MODELS)
     document |= {**extents, "mounting": mounting, "beams": round(float(n_beams)), "models": findings}
-    return [*rows, *extent_rows, *remission_rows, *mounting_rows, beams, *model_rows], document
+    refusal = _refusal(document["refused"])
+    return [*rows, *extent_rows, *remission_rows, *mounting_rows, beams, *model_rows, *refusal], document
+
+
+def _is_refused(sentences: Sequence[str]) -> bool:
+    """Whether `edgeperc run` refuses a scan of which these are said."""
+    return any(getattr(sentence, "gross", False) for sentence in sentences)
+
+
+def _refusal(is_refused: bool) -> list[tuple[str, str]]:
+    return [("refused", "edgeperc run refuses this scan; with --anyway it warns")] if is_refused else []
 
 
 def _first_scans(path: Path, options: Mapping[str, Any]) -> tuple[list[NDArray[np.float32]], str]:
@@ -463,14 +481,26 @@ def _mounting_rows(
         estimate = estimator.estimate()
     except MountingError:
         return conditioned, estimator, [("mounting", f"cannot be estimated: {reason}")], None
-    return conditioned, estimator, [("mounting", str(estimate))], estimate.to_dict()
+    return conditioned, estimator, [("mounting", _mounting_text(estimator))], estimate.to_dict()
+
+
+def _mounting_text(estimator: MountingEstimator) -> str:
+    """The estimate, and what of it is not used."""
+    unsure = [name.removesuffix("_deg") for name in estimator.doubtful()]
+    level = f"; the ground is too uneven to be sure of {' and '.join(unsure)}: taken as level" if unsure else ""
+    return f"{estimator.estimate()}{level}"
 
 
 def _suiting_models(
-    scan: Points, sensor: SensorProfile, unit: Sequence[str], reported: Sequence[str]
+    scan: Points,
+    remission: NDArray[np.float32],
+    sensor: SensorProfile,
+    frame: ModelFrame,
+    unit: Sequence[str],
+    reported: Sequence[str],
 ) -> tuple[list[tuple[str, str]], dict[str, list[str] | None]]:
     """For each model of scans, what speaks against it; None without a description of its training scans."""
-    from ..preprocess.findings import check_fitness
+    from ..preprocess.findings import check_fitness, with_raw_remission
     from ..preprocess.fitness import FitnessProfile
     from ..zoo import listed
 
@@ -483,7 +513,8 @@ def _suiting_models(
             findings[card.name] = None
             rows.append((card.name, "its card does not describe its training scans"))
             continue
-        sentences = [*unit, *check_fitness(scan, FitnessProfile.from_dict(card.fitness), sensor), *reported]
+        fitness = check_fitness(scan, FitnessProfile.from_dict(card.fitness), sensor, frame)
+        sentences = [*unit, *with_raw_remission(fitness, remission, sensor), *reported]
         findings[card.name] = sentences
         rows += [(card.name, f"as a scan of {sensor.name}: {sentence}") for sentence in sentences]
         if not sentences:

@@ -36,7 +36,37 @@ def print_line(text: str, file: TextIO | None = None, *, gray: bool = False) -> 
     if gray and (file or sys.stdout).isatty() and not os.environ.get("NO_COLOR"):
         shown = f"\x1b[90m{shown}\x1b[0m"
     with contextlib.nullcontext() if tqdm is None else tqdm.external_write_mode(sys.stdout):
-        print(shown, file=file, flush=True)
+        try:
+            print(shown, file=file, flush=True)
+        except OSError as exc:
+            # Where errors cannot be written, nobody can be told, and the work goes on.
+            if file is None or file is not sys.stderr or isinstance(exc, BrokenPipeError):
+                raise
+
+
+def print_result(text: str) -> None:
+    """Print a line on stdout; of a line that does not fit on a full disk, nothing stays, nor waits in a buffer.
+
+    Raises OSError.
+    """
+    try:
+        number = sys.stdout.fileno()
+    except (AttributeError, OSError, ValueError):  # no stream, or one without a file
+        number = -1
+    if number < 0 or os.isatty(number):
+        print_line(text)
+        return
+    sys.stdout.flush()
+    data = f"{printable(text)}{os.linesep}".encode(sys.stdout.encoding or "utf-8", sys.stdout.errors or "strict")
+    size, n = os.fstat(number).st_size, 0
+    try:
+        while n < len(data):
+            n += os.write(number, data[n:])
+    except OSError:
+        if n and os.fstat(number).st_size == size + n:  # a file, and nobody else has written to it
+            os.ftruncate(number, size)
+            os.lseek(number, -n, os.SEEK_CUR)
+        raise
 
 
 # Arguments of the library and the options that set them.

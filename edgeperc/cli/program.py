@@ -22,7 +22,7 @@ from ..system.names import nearest
 from ..system.printable import printable
 from .output import print_error, show_warning
 
-_DELICATE = ("llvmlite.", "importlib._bootstrap", "edgeperc.sinks.kept_file", "logging")
+_DELICATE = ("llvmlite.", "importlib._bootstrap", "edgeperc.sinks.run_file", "logging")
 
 
 class Parser(argparse.ArgumentParser):
@@ -73,7 +73,8 @@ def run_program(program: str, command: Callable[[], int], message: Callable[[Exc
                 try:
                     return command()
                 finally:
-                    print(end="", flush=True)
+                    if sys.stdout is not None:
+                        sys.stdout.flush()
         except (EdgepercError, OSError) as exc:
             if isinstance(exc, BrokenPipeError) and _unread():
                 return 141

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from ..errors import MissingExtraError
 from ..system.remote import Remote
-from .output import in_options, many, one_line, print_error, print_line
+from .output import in_options, many, one_line, print_error, print_result
 
 if TYPE_CHECKING:
     from ..live import Answer
@@ -54,13 +54,18 @@ class Report:
     def show(self, source: Path | Remote, text: str, error: str | None) -> None:
         """Count a scan, and print its `text` and its error."""
         self.n += 1
+        if text:
+            try:
+                print_result(text)
+            except BrokenPipeError:  # nobody reads any more
+                raise
+            except OSError as exc:
+                error = error or f"its result cannot be printed: {exc}"
         if error is not None:
             self.n_failed += 1
             said = in_options(error)
             first = self._reported.setdefault(re.sub(r"[-+\d.]+", "", said), source)  # whatever the numbers
             print_error(f"{source}: {said}" if first is source else f"{source}: the same as {first}")
-        if text:
-            print_line(text)
 
     def text(
         self, source: Path | Remote, outcome: Perception | Answer | Exception, tracks: Tracks | None = None

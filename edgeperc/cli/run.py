@@ -7,12 +7,11 @@ import os
 import sys
 import time
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from ..errors import EdgepercError, ImageError, ModelError, PointsError
-from ..records import PerceivedScan, Sink
+from ..records import PerceivedScan
 from ..system.extras import require
 from ..system.remote import Remote, location
 from ..types.choices import CAMERA, DEFAULT_SENSOR
@@ -31,7 +30,7 @@ from .arguments import (
     positive_number,
     reading_options,
 )
-from .output import many, print_line, progress
+from .output import many, print_error, print_line, progress
 from .report import Report
 from .scans import (
     Scans,
@@ -44,7 +43,7 @@ from .scans import (
     with_mounting,
 )
 from .side_by_side import add_engine, check_engine, has_workers, perceive_side_by_side, through_temporary
-from .sinks import add_sinks, open_sinks, wanted_sinks
+from .sinks import Sinks, add_sinks, wanted_sinks
 
 if TYPE_CHECKING:
     from ..live import Answer
@@ -233,18 +232,7 @@ def run_command(arguments: argparse.Namespace) -> int:
     scans = found.paths
     names = output_names(scans, keep_folder=found.of_data_set) if kinds else []
     targets = [arguments.out / name for name in names] if kinds else [Path()] * len(scans)
-    sources = {_real(source) for source in (*scans, *images.values()) if source is not None}
-    pictures = _pictures_of(arguments, images)
-    whole = [getattr(arguments, name) for name in wanted_sinks(arguments)]
-    for file in (
-        *(file for target in targets for file in _files_of(target, kinds, **pictures).values()),
-        *(value for value in whole if isinstance(value, Path)),
-    ):
-        if _real(file) in sources:
-            arguments.usage_error(
-                f"{file} is one of the {'images' if images else 'scans'} and would be overwritten; choose another --out"
-            )
-
+    _check_outputs(arguments, kinds, images, scans, targets)
     perceivers = _Perceivers(arguments)
     local = [scan for scan in scans if isinstance(scan, Path)]
     perceivers.check([*filter(None, images.values())] if images else local, of_images=bool(images))
@@ -254,8 +242,8 @@ def run_command(arguments: argparse.Namespace) -> int:
     for folder in found.empty:
         report.add(folder, PointsError("no scan in this folder; expected scans, captures or a ROS 2 bag's folder"))
     started = time.perf_counter()
-    with progress("file") as show, ExitStack() as stack:
-        run = _Run(arguments, perceivers, kinds, open_sinks(arguments, stack))
+    with progress("file") as show, Sinks(arguments) as sinks:
+        run = _Run(arguments, perceivers, kinds, sinks)
         if has_workers(arguments):
             perceive_side_by_side(arguments, _alone, perceivers, scans, targets, report, show)
         for done, (scan, target) in enumerate(() if has_workers(arguments) else zip(scans, targets, strict=True)):
@@ -266,17 +254,22 @@ def run_command(arguments: argparse.Namespace) -> int:
                 outcomes = run.live(scan) if arguments.live else run.scans(scan, target)
             for outcome in outcomes:
                 report.add(*outcome)
+    n_failed = report.n_failed + sinks.n_failed
     if report.tracks:
         from ..view.tracks import draw_tracks
 
-        arguments.out.mkdir(parents=True, exist_ok=True)
-        draw_tracks(report.tracks, arguments.out / "tracks.gif", under=report.under)
+        try:
+            arguments.out.mkdir(parents=True, exist_ok=True)
+            draw_tracks(report.tracks, arguments.out / "tracks.gif", under=report.under)
+        except OSError as exc:
+            n_failed += 1
+            print_error(f"{arguments.out / 'tracks.gif'}: {exc}")
     n_perceived = report.n - len(found.empty)
     if n_perceived > 1:
         each_ms = 1e3 * (time.perf_counter() - started) / n_perceived
         things = "answers" if arguments.live else "images" if images else "scans"
         print_line(f"{report.n} {things}, {report.n_failed} failed, {each_ms:.0f} ms each with files", sys.stderr)
-    return 1 if report.n_failed else 0
+    return 1 if n_failed else 0
 
 
 def _check_usage(arguments: argparse.Namespace, kinds: Sequence[str]) -> None:
@@ -319,6 +312,39 @@ def _check_usage(arguments: argparse.Namespace, kinds: Sequence[str]) -> None:
         require("matplotlib", "view", "Drawing a picture")
     if arguments.gif:
         require("PIL", "view", "Drawing an animation", package="pillow")
+
+
+def _check_outputs(
+    arguments: argparse.Namespace,
+    kinds: Sequence[str],
+    images: Mapping[Path, Path | None],
+    scans: Sequence[Path],
+    targets: Sequence[Path],
+) -> None:
+    """Check that no file is a scan, and none is written twice."""
+    from ..readers.captures import is_capture
+
+    sources = {_real(source) for source in (*scans, *images.values()) if source is not None}
+    pictures = _pictures_of(arguments, images)
+    outputs = [("--out", file) for target in targets for file in _files_of(target, kinds, **pictures).values()]
+    outputs += [("--gif", arguments.out / "tracks.gif")] if arguments.gif else []
+    for name in wanted_sinks(arguments):
+        value = getattr(arguments, name)
+        outputs += [(f"--{name}", value)] if isinstance(value, Path) else []
+    if arguments.static is not None:  # scans of a capture get numbers
+        named = [scan for scan in (images.values() if images else scans) if scan is not None and not is_capture(scan)]
+        outputs += [("--static", arguments.static / scan.name) for scan in named]
+    if arguments.labels_for == "cvat":
+        outputs.append(("--labels-for", arguments.out / "annotations.zip"))
+    written: dict[str, str] = {}
+    for option, file in outputs:
+        if _real(file) in sources and option != "--static":  # which refuses it scan by scan
+            arguments.usage_error(
+                f"{file} is one of the {'images' if images else 'scans'} and would be overwritten; choose another --out"
+            )
+        other = written.setdefault(_real(file), option)
+        if other != option:
+            arguments.usage_error(f"{other} and {option} both write {file}; choose another name for one of them")
 
 
 def _images(arguments: argparse.Namespace, kinds: Sequence[str]) -> dict[Path, Path | None]:
@@ -424,7 +450,7 @@ class _Run:
     """What a run does with every scan: perceive it, track its boxes, write its files and its part of the run's."""
 
     def __init__(
-        self, arguments: argparse.Namespace, perceivers: _Perceivers, kinds: Sequence[str], sinks: Sequence[Sink]
+        self, arguments: argparse.Namespace, perceivers: _Perceivers, kinds: Sequence[str], sinks: Sinks | None = None
     ) -> None:
         from ..tracking.tracker import Tracker
 
@@ -549,8 +575,10 @@ class _Run:
         tracks = None if self._tracker is None else self._tracker.update(perception.boxes, stamp_s)
         if self._straightener is not None and tracks is not None:
             self._straightener.follow(tracks)
-        _write(points, perception, wanted, title=title or str(name))
-        self._sink(PerceivedScan(str(name), stamp_s, points, perception, tracks, sensor))
+        try:
+            _write(points, perception, wanted, title=title or str(name))
+        finally:  # a picture that cannot be written costs no sink its scan
+            self._sink(PerceivedScan(str(name), stamp_s, points, perception, tracks, sensor))
         return name, perception, tracks, _under(points, perception) if self._arguments.gif else None
 
     def _track(self, perception: Perception) -> Tracks:
@@ -563,8 +591,8 @@ class _Run:
         return self._n / self._arguments.rate if perception.stamp_s is None else perception.stamp_s
 
     def _sink(self, scan: PerceivedScan) -> None:
-        for sink in self._sinks:
-            sink.write(scan)
+        if self._sinks is not None:
+            self._sinks.write(scan)
 
 
 def _alone(
@@ -574,7 +602,7 @@ def _alone(
     kinds = [kind for kind in _KINDS if getattr(arguments, kind)]
     perceivers = perceivers or _Perceivers(arguments)
     perceive = perceivers.of(with_mounting(arguments.sensor or DEFAULT_SENSOR, arguments))
-    run = _Run(arguments, perceivers, kinds, [])
+    run = _Run(arguments, perceivers, kinds)
     return perceive, run.scans, lambda target: [_file_of(target, kind) for kind in kinds]
 
 

@@ -151,26 +151,25 @@ def scan_sensor(path: Path, arguments: argparse.Namespace) -> tuple[str | Sensor
 
 
 def with_mounting(sensor: str | SensorProfile, arguments: argparse.Namespace) -> str | SensorProfile:
-    """The sensor with what ``--extrinsic``, ``--mount-height``, ``--turn`` and ``--ego-box`` give.
+    """The sensor with what ``--extrinsic``, the options of single values and ``--ego-box`` give.
 
     Raises SensorError.
     """
     from ..types.mounting import Mounting
     from ..types.sensor import get_sensor
 
-    height_m, turn, file = (getattr(arguments, name, None) for name in ("mount_height", "turn", "extrinsic"))
-    ego = getattr(arguments, "ego_box", None)
-    if height_m is None and turn is None and file is None and ego is None:
+    options = {"height_m": "mount_height", "roll_deg": "roll", "pitch_deg": "pitch", "yaw_deg": "turn"}
+    given = {name: getattr(arguments, option, None) for name, option in options.items()}
+    values: dict[str, Any] = {
+        name: None if value == "street" else value for name, value in given.items() if value is not None
+    }
+    file, ego = getattr(arguments, "extrinsic", None), getattr(arguments, "ego_box", None)
+    if not values and file is None and ego is None:
         return sensor
     profile = get_sensor(sensor)
     if ego is not None:
         profile = replace(profile, ego_box=((ego[0], ego[1]), (ego[2], ego[3]), (ego[4], ego[5])))
-    mounting = profile.mounting if file is None else Mounting.from_file(file)
-    if height_m is not None:
-        mounting = replace(mounting, height_m=height_m)
-    if turn is not None:
-        mounting = replace(mounting, yaw_deg=None if turn == "street" else turn)
-    return replace(profile, mounting=mounting)
+    return replace(profile, mounting=replace(profile.mounting if file is None else Mounting.from_file(file), **values))
 
 
 def output_names(scans: Sequence[Path], *, keep_folder: bool = False) -> list[Path]:

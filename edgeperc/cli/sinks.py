@@ -5,13 +5,15 @@ from __future__ import annotations
 import argparse
 import sys
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from .output import print_line
+from ..errors import EdgepercError
+from .output import print_error, print_line
 
 if TYPE_CHECKING:
-    from ..records import Sink
+    from ..records import PerceivedScan, Sink
 
 
 SINKS: tuple[str, ...] = (
@@ -108,48 +110,88 @@ def wanted_sinks(arguments: argparse.Namespace) -> list[str]:
     return [name for name in SINKS if getattr(arguments, name) is not None]
 
 
-def open_sinks(arguments: argparse.Namespace, stack: ExitStack) -> list[Sink]:
-    """Make the sinks of the passed options; errors of options and missing extras come here, before the first scan.
+class Sinks:
+    """The sinks of the passed options: each gets every scan and is closed, whatever becomes of the others.
 
-    The stack closes them, also those that were made before one that cannot be. What is served is closed last: the files
-    are finished, whatever viewers do.
+    Errors of options and missing extras come from the constructor, before the first scan.
+
+    n_failed : int; files that could not be finished.
     """
-    sinks: list[Sink] = []
-    if arguments.serve is not None:
-        from ..sinks.foxglove import ServeSink
 
-        served = ServeSink(*arguments.serve)
-        stack.callback(served.close)
-        print_line(f"open {served.url} in Foxglove", sys.stderr)
+    def __init__(self, arguments: argparse.Namespace) -> None:
+        self.n_failed = 0
+        self._is_live: bool = arguments.live
+        self._is_whole = True
+        self._sinks: list[Sink] = []
+        self._stack = ExitStack()
+        try:
+            self._open(arguments)
+        except BaseException:
+            self._stack.close()
+            raise
 
-    def add(sink: Sink) -> None:
-        stack.callback(sink.close)
-        sinks.append(sink)
+    def __enter__(self) -> Sinks:
+        return self
 
-    if arguments.mcap is not None:
-        from ..sinks.foxglove import McapSink
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        # A live source has no end of its own: Ctrl-C is how it ends.
+        self._is_whole = kind is None or (self._is_live and not issubclass(kind, Exception))
+        self._stack.close()
 
-        add(McapSink(arguments.mcap))
-    if arguments.rrd is not None:
-        from ..sinks.rerun import RerunSink
+    def write(self, scan: PerceivedScan) -> None:
+        """Write one scan.
 
-        add(RerunSink(arguments.rrd))
-    if arguments.play is not None:
-        from ..sinks.page import PageSink
+        Raises EdgepercError, OSError: A sink could not; the first error.
+        """
+        errors: list[Exception] = []
+        for sink in self._sinks:
+            try:
+                sink.write(scan)
+            except (EdgepercError, OSError) as exc:
+                errors.append(exc)
+        if errors:
+            raise errors[0]
 
-        add(PageSink(arguments.play))
-    if arguments.static is not None:
-        from ..sinks.static import StaticSink
+    def _open(self, arguments: argparse.Namespace) -> None:
+        if arguments.serve is not None:
+            from ..sinks.foxglove import ServeSink
 
-        add(StaticSink(arguments.static, without="movable" if arguments.movable else "moving"))
-    if arguments.labels_for is not None:
-        from ..sinks.prelabels import PrelabelSink
+            served = ServeSink(*arguments.serve)
+            self._add(served)
+            print_line(f"open {served.url} in Foxglove", sys.stderr)
+        if arguments.mcap is not None:
+            from ..sinks.foxglove import McapSink
 
-        add(PrelabelSink(arguments.out, arguments.labels_for, calib=arguments.calib))
-    if arguments.bag is not None:
-        from ..sinks.rosbag import BagSink
+            self._add(McapSink(arguments.mcap))
+        if arguments.rrd is not None:
+            from ..sinks.rerun import RerunSink
 
-        add(BagSink(arguments.bag, storage=arguments.bag_storage, frame_id=arguments.bag_frame))
-    if arguments.serve is not None:
-        sinks.append(served)
-    return sinks
+            self._add(RerunSink(arguments.rrd))
+        if arguments.play is not None:
+            from ..sinks.page import PageSink
+
+            self._add(PageSink(arguments.play))
+        if arguments.static is not None:
+            from ..sinks.static import StaticSink
+
+            self._add(StaticSink(arguments.static, without="movable" if arguments.movable else "moving"))
+        if arguments.labels_for is not None:
+            from ..sinks.prelabels import PrelabelSink
+
+            self._add(PrelabelSink(arguments.out, arguments.labels_for, calib=arguments.calib))
+        if arguments.bag is not None:
+            from ..sinks.rosbag import BagSink
+
+            self._add(BagSink(arguments.bag, storage=arguments.bag_storage, frame_id=arguments.bag_frame))
+
+    def _add(self, sink: Sink) -> None:
+        """The first is closed last: files are finished before what is served ends, whatever viewers do."""
+        self._sinks.append(sink)
+        self._stack.callback(partial(self._close, sink))
+
+    def _close(self, sink: Sink) -> None:
+        try:
+            sink.close(self._is_whole)
+        except (EdgepercError, OSError) as exc:
+            self.n_failed += 1
+            print_error(str(exc))

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +22,10 @@ __all__ = ["FROZEN_AFTER", "MountingEstimate", "MountingEstimator"]
 # slope and camber: scans stay as they are. An error of 0.2 m, 2 deg of roll or 0.75 deg of pitch costs about one, one
 # and three points of IoU of cars.
 SAME_HEIGHT_M, SAME_ROLL_DEG, SAME_PITCH_DEG = 0.15, 2.5, 0.75
+# A larger tilt is doubted if it is less than two standard deviations, and the quarters of the ground differ by more
+# than those of streets: 95 % of 481 KITTI scans have standard errors of roll below 1.8 and of pitch below 0.6 deg.
+DOUBTED_DEG, EVEN_ROLL_DEG, EVEN_PITCH_DEG = 2.0, 2.0, 0.75
+OTHER_HEIGHT_M = 0.5  # a height that differs by more is another one, however uncertain it is
 
 
 @dataclass(frozen=True)
@@ -33,7 +38,7 @@ class MountingEstimate:
         A known one: what was given, and the medians over the scans of the rest.
     height_sd_m, roll_sd_deg, pitch_sd_deg, yaw_sd_deg : float
         Standard deviation of each value; 0 for one that was given. It includes what streets differ in slope and
-        camber, which more scans of one street do not reduce.
+        camber, and what the parts of the ground in a scan differ by, which more scans of one street do not reduce.
     n_scans : int
         Scans that showed enough ground.
     """
@@ -51,8 +56,10 @@ class MountingEstimate:
 
     def __str__(self) -> str:
         m = self.mounting
+        # x ahead is the default, so nobody need have said it.
+        kept = {"yaw": " (not estimated)" if m.yaw_deg == 0.0 else " (given)"}
         parts = [
-            f"{name} {value:.{digits}f}{unit}" + (f" +- {sd:.{digits}f}" if sd else " (given)")
+            f"{name} {value:.{digits}f}{unit}" + (f" +- {sd:.{digits}f}" if sd else kept.get(name, " (given)"))
             for name, value, sd, unit, digits in (
                 ("height", m.height_m, self.height_sd_m, " m", 2),
                 ("roll", m.roll_deg, self.roll_sd_deg, " deg", 1),
@@ -74,6 +81,15 @@ _PITCH_SD_DEG = (1.0, 0.35, 0.3)
 # Heights of the origin above the road to start from [m]; the ground is found within 0.5 m of each.
 _STARTS_M = (1.7, 0.9, 2.5, 0.1, 3.3, 4.1, -0.7)
 _VOTING_M = 12.0  # farther out, the land beside a road is often lower
+# A sensor on a truck, a pole or a crane may see no ground so near: the least reach counts in which its plane is seen.
+_FAR_STARTS_M = (1.7, 2.5, 3.3, 4.1, 4.9, 5.7, 6.5, 7.3, 8.1, 8.9)
+_HIGH_M = 2.8  # a lower sensor would see ground within 12 m: something hides it
+_FAR_REACHES_M = (24.0, 28.0, 32.0, 40.0, 48.0, 60.0)
+_FEW_BELOW = 0.25  # cells below such a plane, as a share of the cells on it; if there is none, `_MAX_BELOW`
+_LEVEL_DEG = 3.0  # embankments and rows of roofs are steeper
+# What lies high within 12 m, such as roofs of cars, is not the ground if a lower plane has so many times its support,
+# and most lies below it. Such roofs had a support of at most 106 in 400 simulated scans; streets have more.
+_OUTVOTED, _SURE_SUPPORT = 3.0, 150
 _MIN_CELLS = 60  # of half a meter, on the plane
 _MAX_BELOW = 0.8  # cells below the plane, as a share of the cells on it
 _CORRIDOR_M = (3.0, 15.0)  # half its width, and its length ahead and behind: the road that the vehicle stands on
@@ -106,7 +122,8 @@ class MountingEstimator:
 
     def __init__(self, known: Mounting) -> None:
         self.known = known
-        self._found: tuple[tuple[float, ...], ...] = ()  # height, roll, pitch, yaw and support by each scan
+        # By each scan: height, roll, pitch, yaw, support, and the uncertainty of the plane in height, roll and pitch.
+        self._found: tuple[tuple[float, ...], ...] = ()
 
     @property
     def n_scans(self) -> int:
@@ -137,10 +154,11 @@ class MountingEstimator:
         if self.known.origin_m != (0.0, 0.0):
             scan = points - np.array([*self.known.origin_m, 0.0, 0.0], np.float32)
         found = replace(MODEL_MOUNTING, yaw_deg=self.known.yaw_deg or 0.0)
-        found, support = _leveled(scan, found)
+        found, support, uncertainty = _leveled(scan, found, self.known.height_m)
         yaw_deg = _street_axis(ModelFrame(found).move(scan)) if self.known.yaw_deg is None else self.known.yaw_deg
         more = MountingEstimator(self.known)
-        more._found = (*self._found, (*_values(replace(found, yaw_deg=yaw_deg)).tolist(), support))
+        values = _values(replace(found, yaw_deg=yaw_deg))
+        more._found = (*self._found, (*values.tolist(), support, *uncertainty.tolist()))
         return more
 
     def estimate(self) -> MountingEstimate:
@@ -156,12 +174,14 @@ class MountingEstimator:
             return MountingEstimate(known, 0.0, 0.0, 0.0, 0.0, 0)
         if not self._found:
             raise MountingError("no scan shows the ground around the vehicle")
-        found = np.array(self._found)
-        support = found[:, 4].max()
-        found = found[found[:, 4] >= 0.5 * support, :4]
+        scans = np.array(self._found)
+        support = scans[:, 4].max()
+        scans = scans[scans[:, 4] >= 0.5 * support]
+        found, uncertainty = scans[:, :4], np.median(scans[:, 5:], axis=0)
         spread = found.std(axis=0, ddof=1) if len(found) > 1 else np.zeros(4)
         of_one = [np.interp(support, _SUPPORT, sd) for sd in (_HEIGHT_SD_M, _ROLL_SD_DEG, _PITCH_SD_DEG)]
-        sd = np.hypot([*of_one, _STREET_YAW_SD], spread / math.sqrt(len(found)))
+        of_plane = np.hypot(of_one, uncertainty)
+        sd = np.hypot([*of_plane, _STREET_YAW_SD], spread / math.sqrt(len(found)))
         height, roll, pitch, yaw = np.where(np.isnan(_values(known)), sd, 0.0).tolist()
         middle = _filled(known, np.median(found, axis=0))
         return MountingEstimate(middle, height, roll, pitch, yaw, len(self._found))
@@ -169,16 +189,40 @@ class MountingEstimator:
     def mounting(self) -> Mounting:
         """The mounting to use: the estimate, or the training vehicle's where that differs by no more than streets do.
 
-        It is the training vehicle's as well if no scan showed the ground. Given values are kept.
+        It is the training vehicle's as well if no scan showed the ground. Given values are kept. A roll or pitch that
+        differs by more, but by less than two standard deviations, is not used (`doubtful`).
         """
         usual = _filled(self.known, _values(MODEL_MOUNTING))
         if self.known.is_known or not self._found:
             return usual
+        found = self.estimate().mounting
+        off, same, sure = self._compared()
+        if (off <= np.maximum(same, sure)).all():
+            return usual
+        return replace(found, **{name: getattr(usual, name) for name in self.doubtful()})
+
+    def doubtful(self) -> tuple[str, ...]:
+        """Which of ``roll_deg`` and ``pitch_deg`` the scans suggest, but do not show surely: they are not used."""
+        if self.known.is_known or not self._found:
+            return ()
+        off, same, sure = self._compared()
+        doubtful = ((off > same) & (off <= sure))[1:3]
+        _, roll_deg, pitch_deg = np.median(np.array(self._found)[:, 5:], axis=0)
+        is_uneven = roll_deg > EVEN_ROLL_DEG or pitch_deg > EVEN_PITCH_DEG
+        if not is_uneven or not (doubtful & (off[1:3] > DOUBTED_DEG)).any():
+            return ()
+        return tuple(name for name, is_so in zip(("roll_deg", "pitch_deg"), doubtful.tolist(), strict=True) if is_so)
+
+    def _compared(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """How far height, roll, pitch and yaw are from the usual ones, and by how much they may be: as streets differ,
+        and twice the standard deviation.
+        """
         found = self.estimate()
-        uncertain = 2.0 * np.array([found.height_sd_m, found.roll_sd_deg, found.pitch_sd_deg, 0.0])
-        least = np.maximum([SAME_HEIGHT_M, SAME_ROLL_DEG, SAME_PITCH_DEG, 0.0], uncertain)
-        same = np.abs(_values(found.mounting) - _values(usual)) <= least
-        return usual if same.all() else found.mounting
+        off = np.abs(_values(found.mounting) - _values(_filled(self.known, _values(MODEL_MOUNTING))))
+        sure = 2.0 * np.array(
+            [min(found.height_sd_m, 0.5 * OTHER_HEIGHT_M), found.roll_sd_deg, found.pitch_sd_deg, 0.0]
+        )
+        return off, np.array([SAME_HEIGHT_M, SAME_ROLL_DEG, SAME_PITCH_DEG, 0.0]), sure
 
 
 def _values(mounting: Mounting) -> NDArray[np.float64]:
@@ -194,39 +238,122 @@ def _filled(mounting: Mounting, values: NDArray[np.float64]) -> Mounting:
     return Mounting(height_m, roll_deg, pitch_deg, yaw_deg, mounting.origin_m)
 
 
-def _leveled(scan: Points, guess: Mounting) -> tuple[Mounting, float]:
-    """The mounting by the ground in a scan, from a first guess, and its support."""
+def _leveled(scan: Points, guess: Mounting, height_m: float | None) -> tuple[Mounting, float, NDArray[np.float64]]:
+    """The mounting by the ground in a scan, from a first guess and a height; its support; its `_uncertainty`."""
     frame = ModelFrame(guess)
-    (a, b, c), support = _ground_plane(read_only(frame.move(scan)))
+    (a, b, c), support, uncertainty = _ground_plane(read_only(frame.move(scan)), height_m)
     norm = math.sqrt(1.0 + a * a + b * b)
     rest = Mounting(-c / norm, math.degrees(math.atan(-b)), math.degrees(math.asin(a / norm)), 0.0)
     T_vehicle_sensor = np.eye(4)
     T_vehicle_sensor[:3, :3] = rest.rotation() @ frame.R
     T_vehicle_sensor[:3, 3] = rest.rotation() @ frame.t + [0.0, 0.0, -c / norm]
-    return replace(Mounting.from_matrix(T_vehicle_sensor), yaw_deg=guess.yaw_deg), support
+    return replace(Mounting.from_matrix(T_vehicle_sensor), yaw_deg=guess.yaw_deg), support, uncertainty
 
 
-def _ground_plane(scan: Points) -> tuple[tuple[float, float, float], float]:
-    """a, b, c of the ground z = a x + b y + c [m] around the vehicle, and how many more cells lie on it than below."""
+class _Plane(NamedTuple):
+    """A plane z = a x + b y + c [m]: ``abc``, and how many cells of half a meter within a reach lie on and below it."""
+
+    abc: NDArray[np.float64]
+    reach_m: float
+    on: int
+    below: int
+
+    @property
+    def support(self) -> int:
+        return self.on - self.below
+
+    @property
+    def level_support(self) -> float:
+        """The support, less for a plane that is steeper than streets."""
+        tilt_deg = math.degrees(math.hypot(self.abc[0], self.abc[1]))
+        return self.support / (1.0 + (tilt_deg / _LEVEL_DEG) ** 2)
+
+    def is_lowest(self, share: float = _MAX_BELOW) -> bool:
+        """Whether little lies below it, as below the ground."""
+        return self.below <= share * self.on
+
+
+def _ground_plane(
+    scan: Points, height_m: float | None
+) -> tuple[tuple[float, float, float], float, NDArray[np.float64]]:
+    """a, b, c of the ground z = a x + b y + c [m] around the sensor, near a given height below it or at any; how many
+    more cells lie on it than below; the `_uncertainty`.
+    """
     cell = np.empty(len(scan), np.int32)
     lowest = np.empty((N_CELLS, N_CELLS), np.int32)
     fill_lowest(scan, cell, lowest)
     low = scan[lowest[lowest >= 0], :3].astype(np.float64)
-    low = low[np.hypot(low[:, 0], low[:, 1]) < _VOTING_M]
-    best, most, plane = 0, 0, np.zeros(3)
-    for start in _STARTS_M:
-        trial = np.array([0.0, 0.0, -start])
-        if not fit_first_plane(scan, lowest, _VOTING_M, trial):
-            continue
-        above = low[:, 2] - low[:, :2] @ trial[:2] - trial[2]
-        on, below = int((np.abs(above) <= TOLERANCE_M).sum()), int((above < -TOLERANCE_M).sum())
-        if below <= _MAX_BELOW * on and on - below > best:
-            best, most, plane = on - below, on, trial
-    if most < _MIN_CELLS:
+    plane = None if height_m is None else _lowest_plane(scan, lowest, low, [height_m], [height_m])
+    plane = plane or _lowest_plane(scan, lowest, low, _STARTS_M, _FAR_STARTS_M)
+    if plane is None:
         raise MountingError(
-            f"the scan shows no ground: {most} cells of half a meter within {_VOTING_M:.0f} m lie on one plane, "
-            f"expected at least {_MIN_CELLS}"
+            f"the scan shows no ground: fewer than {_MIN_CELLS} cells of half a meter lie on one plane within "
+            f"{_VOTING_M:.0f} m, or farther away below a high sensor"
         )
+    if plane.reach_m == _VOTING_M:
+        plane = plane._replace(abc=_refined(scan, cell, plane.abc))
+    a, b, c = plane.abc.tolist()
+    return (a, b, c), float(plane.support), _uncertainty(scan, lowest, low, plane)
+
+
+def _lowest_plane(
+    scan: Points,
+    lowest: NDArray[np.int32],
+    low: NDArray[np.float64],
+    starts_m: Sequence[float],
+    far_starts_m: Sequence[float],
+) -> _Plane | None:
+    """The ground within 12 m or, below a high sensor, farther away; from several heights above it."""
+    planes = [plane for plane in _planes(scan, lowest, low, starts_m, _VOTING_M) if plane.is_lowest()]
+    near = max(planes, key=lambda plane: plane.support, default=None)
+    if near is not None and near.on < _MIN_CELLS:
+        near = None
+    if near is not None and (near.support >= _SURE_SUPPORT or _counted(near.abc, low, _FAR_REACHES_M[-1]).is_lowest()):
+        return near
+    far = _far_plane(scan, lowest, low, far_starts_m)
+    if far is not None and far.abc[2] > -_HIGH_M:
+        far = None
+    if near is None or far is None:
+        return near or far
+    is_outvoted = far.support >= _OUTVOTED * near.support and not _counted(near.abc, low, far.reach_m).is_lowest()
+    return far if is_outvoted else near
+
+
+def _far_plane(
+    scan: Points, lowest: NDArray[np.int32], low: NDArray[np.float64], starts_m: Sequence[float]
+) -> _Plane | None:
+    """The ground in the least reach that shows it."""
+    seen = []
+    for reach_m in _FAR_REACHES_M:
+        planes = [plane for plane in _planes(scan, lowest, low, starts_m, reach_m) if plane.support >= _MIN_CELLS]
+        few_below = [plane for plane in planes if plane.is_lowest(_FEW_BELOW) and plane.level_support >= _MIN_CELLS]
+        if few_below:
+            return max(few_below, key=lambda plane: plane.level_support)
+        seen += [plane for plane in planes if plane.is_lowest()]
+    return max(seen, key=lambda plane: plane.level_support, default=None)
+
+
+def _planes(
+    scan: Points, lowest: NDArray[np.int32], low: NDArray[np.float64], starts_m: Sequence[float], reach_m: float
+) -> Iterator[_Plane]:
+    """The plane near each of several heights below the origin, if there is one with support."""
+    for start in starts_m:
+        abc = np.array([0.0, 0.0, -start])
+        if fit_first_plane(scan, lowest, reach_m, abc):
+            plane = _counted(abc, low, reach_m)
+            if plane.support > 0:
+                yield plane
+
+
+def _counted(abc: NDArray[np.float64], low: NDArray[np.float64], reach_m: float) -> _Plane:
+    """The plane with the lowest returns (n, 3) that are on and below it."""
+    within = low[np.hypot(low[:, 0], low[:, 1]) < reach_m]
+    above = within[:, 2] - within[:, :2] @ abc[:2] - abc[2]
+    return _Plane(abc, reach_m, int((np.abs(above) <= TOLERANCE_M).sum()), int((above < -TOLERANCE_M).sum()))
+
+
+def _refined(scan: Points, cell: NDArray[np.int32], plane: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The plane by least squares in the corridor that the vehicle stands on."""
     across, along = _CORRIDOR_M
     # Half the time of taking the columns row by row.
     x, y, z = np.ascontiguousarray(scan[:, :3].T)
@@ -243,8 +370,33 @@ def _ground_plane(scan: Points) -> tuple[tuple[float, float, float], float]:
         if np.count_nonzero(on_plane) < _MIN_CELLS // 2:
             break
         plane = np.linalg.lstsq(design[on_plane], xyz[on_plane, 2], rcond=None)[0]
-    a, b, c = plane.tolist()
-    return (a, b, c), float(best)
+    return plane
+
+
+def _uncertainty(
+    scan: Points, lowest: NDArray[np.int32], low: NDArray[np.float64], plane: _Plane
+) -> NDArray[np.float64]:
+    """Standard errors of height [m], roll and pitch [deg], (3,), by how the quarters of the ground differ in slope.
+
+    Left and right show one pitch, ahead and behind one roll: of the quarters, two are independent.
+    """
+    half = N_CELLS // 2
+    slopes = []
+    for row in (slice(None, half), slice(half, None)):
+        for col in (slice(None, half), slice(half, None)):
+            quarter, part = np.full_like(lowest, -1), plane.abc.copy()
+            quarter[row, col] = lowest[row, col]
+            if fit_first_plane(scan, quarter, plane.reach_m, part):
+                slopes.append(np.degrees(part[:2] - plane.abc[:2]))
+    pitch, roll = (
+        np.sqrt(np.mean(np.square(slopes), axis=0) / 2.0) if len(slopes) > 1 else (_PITCH_SD_DEG[0], _ROLL_SD_DEG[0])
+    )
+    if plane.reach_m == _VOTING_M:
+        return np.array([0.0, roll, pitch])
+    range_m = np.hypot(low[:, 0], low[:, 1])
+    on_plane = np.abs(low[:, 2] - low[:, :2] @ plane.abc[:2] - plane.abc[2]) <= TOLERANCE_M
+    nearest_m = float(np.percentile(range_m[on_plane & (range_m < plane.reach_m)], 5.0))
+    return np.array([nearest_m * math.tan(math.radians(math.hypot(pitch, roll))), roll, pitch])
 
 
 def _street_axis(scan: Points) -> float:

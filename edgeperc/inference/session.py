@@ -30,6 +30,7 @@ from ..errors import (
     ProviderError,
     SettingsError,
 )
+from ..system.interpreter import kept_in_forks, native_call
 from ..system.machine import (
     MAX_THREADS,
     compiled_folder,
@@ -149,8 +150,9 @@ class Session:
 
     Notes
     -----
-    A session belongs to its process. In a forked child it runs only with ``provider="cpu"`` and ``n_threads=1``: the
-    threads of a provider do not exist there, and waiting for them would never end. It cannot be pickled.
+    A session belongs to its process. A forked child may drop it and end. It runs there only with ``provider="cpu"`` and
+    ``n_threads=1``: the threads of a provider do not exist there, and waiting for them would never end. It cannot be
+    pickled.
     """
 
     def __init__(
@@ -241,7 +243,8 @@ class Session:
         if self.shares_cores:
             n_threads = cores // self._at_once
         self._has_threads = short != "cpu" or n_threads != 1
-        self.inference = self._open(ort, blob, short, precision, n_threads)
+        with native_call():
+            self.inference = kept_in_forks(self._open(ort, blob, short, precision, n_threads))
         self._check_graph()
         with terminated(ort, None if self._trusted else MAX_FIRST_RUN_S) as run_options:
             self._bind(run_options)
@@ -370,9 +373,10 @@ class Session:
         if all(isinstance(n, int) for shape in shapes for n in shape):
             return shapes
         try:
-            answers = self.inference.run(
-                [o.name for o in self.card.outputs], {self.card.input.name: batch}, run_options
-            )
+            with native_call():
+                answers = self.inference.run(
+                    [o.name for o in self.card.outputs], {self.card.input.name: batch}, run_options
+                )
         except Exception as exc:  # onnxruntime's errors share no base but Exception
             raise InferenceError(f"{self.path}: the first run on {self.provider} failed: {exc}") from exc
         for output, answer in zip(self.card.outputs, answers, strict=True):
@@ -480,7 +484,8 @@ class Session:
                     self.binding.bind_output(output.name, "cpu", 0, np.float32, array.shape, array.ctypes.data)
             else:
                 self.binding.bind_input(*self._bound_input)
-            self.inference.run_with_iobinding(self.binding, *run_options)
+            with native_call():
+                self.inference.run_with_iobinding(self.binding, *run_options)
         except Exception as exc:  # onnxruntime's errors share no base but Exception
             raise InferenceError(f"{self.path}: a run on {self.provider} failed: {exc}") from exc
         self.spread()

@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
+from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
+from ..types.frame import ModelFrame
+from ..types.mounting import MODEL_HEIGHT_M
 from ..types.perception import DroppedPoints
 from ..types.points import Points
 from ..types.sensor import SensorProfile
@@ -31,7 +35,9 @@ class Finding(str):
         return finding
 
 
-def check_fitness(points: Points, profile: FitnessProfile, sensor: SensorProfile) -> tuple[Finding, ...]:
+def check_fitness(
+    points: Points, profile: FitnessProfile, sensor: SensorProfile, frame: ModelFrame | None = None
+) -> tuple[Finding, ...]:
     """Describe how a scan differs from the scans that a model was trained on, and what to do about it.
 
     Margins are wide: the check finds gross mistakes (axes, units, remission scale, another sensor) and accepts ordinary
@@ -42,6 +48,8 @@ def check_fitness(points: Points, profile: FitnessProfile, sensor: SensorProfile
         skipped.
     sensor : the sensor that the caller says recorded the scan. If its remission function is constant, because the
         scan has no remission, remission is not checked.
+    frame : what moved the scan into the frame of the models. A sensor that is high, or leans, sees points that are
+        higher there than its beams.
     Returns: One sentence for each difference; empty if there is none. Gross are: another unit; a vertical axis that
         is not z, or points down; ground more than 1.3 m from where it lay in training; no points below the horizon;
         points far above the sensor's field of view; points in less than a quarter of the model's view; half of the
@@ -49,13 +57,15 @@ def check_fitness(points: Points, profile: FitnessProfile, sensor: SensorProfile
         fewer than eight rows of points; remission that is constant, missing or off the sensor's range.
     Raises PointsError.
     """
-    return check_profiles(points, [profile], sensor)
+    return check_profiles(points, [profile], sensor, frame)
 
 
-def check_profiles(points: Points, profiles: Iterable[FitnessProfile], sensor: SensorProfile) -> tuple[Finding, ...]:
+def check_profiles(
+    points: Points, profiles: Iterable[FitnessProfile], sensor: SensorProfile, frame: ModelFrame | None = None
+) -> tuple[Finding, ...]:
     """Describe how a scan differs from the training scans of several models, each difference once.
 
-    points, sensor : as in `check_fitness`.
+    points, sensor, frame : as in `check_fitness`.
     profiles : the scan is measured once for all profiles of the same view.
     Raises PointsError.
     """
@@ -63,9 +73,60 @@ def check_profiles(points: Points, profiles: Iterable[FitnessProfile], sensor: S
     found: dict[Finding, None] = {}
     for profile in profiles:
         if profile.azimuth_deg not in measured:
-            measured[profile.azimuth_deg] = measure(points, profile.azimuth_deg)
+            scan = measure(points, profile.azimuth_deg)
+            measured[profile.azimuth_deg] = None if scan is None else _seen_again(scan, points, sensor, frame)
         found |= dict.fromkeys(_findings(measured[profile.azimuth_deg], profile, sensor))
     return tuple(found)
+
+
+def _seen_again(scan: Measures, points: Points, sensor: SensorProfile, frame: ModelFrame | None) -> Measures:
+    """The measures with the ground as the lowest points show it, if it is not where most points are, and with
+    elevations as the sensor sees them, if these are lower.
+
+    Most points may be on a ceiling or on walls; and a high sensor sees little of the ground near by.
+    """
+    raised_m = 0.0 if frame is None else float(frame.eye[2])
+    sample = points[:: len(points) // _SAMPLE + 1, :3].astype(np.float64)
+    sample = sample[np.isfinite(sample).all(axis=1)]
+    off_m = 0.0 if scan.ground_m is None else abs(scan.ground_m + MODEL_HEIGHT_M)
+    is_elsewhere, is_near = off_m > _LEVEL_OFF_M or scan.flat_axis is not None, scan.most_m < _MOST_OF_HALL_M
+    is_road_below = (is_elsewhere or is_near) and _is_road_below(sample)
+    scan = replace(scan, raised_m=raised_m, is_on_car=not is_near or (is_road_below and raised_m >= _LOWER_M))
+    if raised_m > _HIGH_M and len(sample):
+        scan = replace(scan, ground_m=_ground_far_around(sample), road_ahead=None)
+    elif is_elsewhere and is_road_below:
+        scan = replace(scan, ground_m=-MODEL_HEIGHT_M, flat_axis=None, road_ahead=None)
+    if frame is not None and scan.elevation_p99_deg > sensor.fov_up_deg + _TOO_HIGH_DEG:
+        x, y, z = ((sample - frame.eye) @ frame.R).T
+        highest_deg = float(np.percentile(np.degrees(np.arctan2(z, np.hypot(x, y))), 99.0))
+        scan = replace(scan, elevation_p99_deg=min(scan.elevation_p99_deg, highest_deg))
+    return scan
+
+
+def _is_road_below(sample: NDArray[np.float64]) -> bool:
+    """Whether the lowest points of many cells near by are as high as the road, and those of few are lower."""
+    lowest = _lowest_in_cells(sample, *_NEAR_AROUND_M)
+    on_road = np.abs(lowest + MODEL_HEIGHT_M) <= _LEVEL_OFF_M
+    return bool(len(lowest) and on_road.mean() >= _MANY and (lowest < -MODEL_HEIGHT_M - _LEVEL_OFF_M).mean() < _SOME)
+
+
+def _lowest_in_cells(sample: NDArray[np.float64], reach_m: float, cell_m: float) -> NDArray[np.float64]:
+    """The lowest z in each square of ``cell_m`` with points up to ``reach_m`` away."""
+    x, y, z = sample[np.hypot(sample[:, 0], sample[:, 1]) < reach_m].T
+    _, cell = np.unique(np.floor([x / cell_m, y / cell_m]).astype(np.int64), axis=1, return_inverse=True)
+    lowest = np.full(int(cell.max(initial=-1)) + 1, np.inf)
+    np.minimum.at(lowest, cell.ravel(), z)
+    return lowest
+
+
+def _ground_far_around(sample: NDArray[np.float64]) -> float | None:
+    """The height that many of the lowest points in cells up to 60 m away have [m]: that nearest to the road's.
+
+    None if no height has many. Land beside a road may be higher or lower, and wider.
+    """
+    steps, counts = np.unique(np.floor(_lowest_in_cells(sample, *_FAR_AROUND_M) / _STEP_M), return_counts=True)
+    levels_m = (steps[counts >= _MANY * counts.sum()] + 0.5) * _STEP_M
+    return round(float(levels_m[np.abs(levels_m + MODEL_HEIGHT_M).argmin()]), 1) if len(levels_m) else None
 
 
 def _findings(scan: Measures | None, profile: FitnessProfile, sensor: SensorProfile) -> tuple[Finding, ...]:
@@ -141,13 +202,29 @@ _TOO_HIGH_DEG = 12.0
 # KITTI, PandaSet, Argoverse 2, Lyft, DDAD, nuScenes and View of Delft; 6 and more if the origin is 45 m off.
 _MOST_UNEVEN = 4.0
 _NEAREST_M = 25.0  # of 99 % of the points; at most 10 m in these data
-# 99 % of the points of a room of 14 x 10 m are nearer than 10 m; of the most enclosed of 561 real streets, 33 m.
-_ROOM_M, _HALL_M, _COVERED_M = 12.0, 25.0, 1.5
-# Share of directions that end at a wall: 0.72 and more in 64 drawn rooms of four sensors, at most 0.70 in real streets
-# that were cropped to 8 and 12 m.
+_NEAREST_HEIGHTS = 4.0  # the lowest beam of a vlp-16 meets the ground at 3.7 times its height
+_SAMPLE = 6000  # points
+_HIGH_M = 1.0  # above the sensor of the models
+# How far the lowest points are looked at, and the squares in which they are the lowest. In drawn tunnels, alleys and
+# garages, 16 % and more of the squares near by have theirs on the road, if it lies where it should; in scans of KITTI
+# and of simulated streets that are upside down, shifted or have other axes, at most 12 %.
+_FAR_AROUND_M, _NEAR_AROUND_M = (60.0, 3.0), (15.0, 1.0)
+_STEP_M, _LEVEL_OFF_M, _MANY, _SOME = 0.6, 0.5, 0.15, 0.4
+# 99 % of the points of a room of 14 x 10 m are nearer than 10 m; of the most enclosed of 561 real streets, 33 m. Half
+# of the points of a street that was cropped to 12 m are mostly farther than 5 m.
+_ROOM_M, _HALL_M, _COVERED_M, _HALF_OF_SMALL_M = 12.0, 25.0, 1.5, 5.0
+# Share of directions that end at a wall: 0.72 and more in 64 drawn rooms of four sensors, at most 0.70 in nearly all
+# real streets that were cropped to 8 and 12 m.
 _ENCLOSED = 0.71
+# With windows and doors, some points are far: 90 % are nearer than 9 m in rooms and 11 m in garages, and farther than
+# 11.6 m in real streets. Half of the points are nearer than in streets (3.6 m) and in garages, where the sensor is on a
+# car. Two opposite directions of an alley are both seen farther than 17 m. Of streets that were cropped to 8 and 12 m,
+# at most 0.88 of the directions end at a wall.
+_OF_ROOM_M, _BESIDE_CAR_M = (4.5, 9.0), (2.6, 9.0)  # the ranges below which half and 90 % of the points are
+_MOST_OF_HALL_M, _THROUGH_M, _ENCLOSED_HALL = 11.0, 12.0, 0.9
+_LOWER_M = -0.3  # than the sensor of the models, on a car
 # Fewer rows than a sensor of 16 beams has (12 to 13 are counted).
-_FEWEST_ROWS = 8.0
+_FEWEST_ROWS, _FEWEST_FROM_ABOVE = 8.0, 4.0  # half of the beams of a high sensor may meet nothing
 
 
 def _geometry_findings(scan: Measures, profile: FitnessProfile, sensor: SensorProfile) -> list[Finding]:
@@ -198,7 +275,7 @@ def _other_axes(scan: Measures) -> Finding | None:
 
 
 def _other_origin(scan: Measures) -> Finding | None:
-    if scan.unevenness <= _MOST_UNEVEN and scan.nearest_m <= _NEAREST_M:
+    if scan.unevenness <= _MOST_UNEVEN and scan.nearest_m <= _NEAREST_M + _NEAREST_HEIGHTS * max(0.0, scan.raised_m):
         return None
     return Finding(
         f"One direction holds {scan.unevenness:.1f} times as many points as the mean one, and the nearest "
@@ -255,8 +332,8 @@ def _other_height(scan: Measures, profile: FitnessProfile) -> Finding | None:
         return None
     return Finding(
         f"The ground lies at z = {scan.ground_m:.1f} m, in training it lay at {low:.1f} to {high:.1f} m: "
-        "the sensor is mounted at another height: pass the right mounting (--mount-height), or none, "
-        "so that it is found.",
+        "the sensor is mounted at another height than was given, or was found from the ground: pass its height above "
+        "the road (--mount-height).",
         not low - _GROUND_OFF_M <= scan.ground_m <= high + _GROUND_OFF_M,
     )
 
@@ -299,12 +376,20 @@ def _turned(scan: Measures, profile: FitnessProfile) -> Finding | None:
 
 
 def _walls(scan: Measures) -> Finding | None:
-    if scan.far_m >= _HALL_M or scan.enclosed < _ENCLOSED:
+    half_m, most_m = _BESIDE_CAR_M if scan.is_on_car else _OF_ROOM_M
+    is_closed = scan.walls.through_m < _THROUGH_M and scan.walls.mostly_enclosed >= _ENCLOSED
+    is_small = scan.far_m < _ROOM_M and scan.walls.enclosed >= _ENCLOSED
+    is_small = is_small and (scan.range_median_m < _HALF_OF_SMALL_M or scan.walls.mostly_enclosed >= _ENCLOSED_HALL)
+    is_room = is_small or (is_closed and scan.most_m < most_m and scan.range_median_m < half_m)
+    is_hall = (scan.far_m < _HALL_M and scan.walls.enclosed >= _ENCLOSED) or (
+        is_closed and scan.most_m < _MOST_OF_HALL_M and scan.walls.mostly_enclosed >= _ENCLOSED_HALL
+    )
+    if not (is_room or is_hall):
         return None
-    is_room = scan.far_m < _ROOM_M
     return Finding(
-        f"Nothing is farther than {scan.far_m:.0f} m, and there are walls on all sides: this seems to be a "
-        f"{'room' if is_room else 'garage or a hall'}; the models know roads.",
+        f"Half of the points are nearer than {scan.range_median_m:.1f} m, nine tenths nearer than {scan.most_m:.0f} m, "
+        f"and there are walls on all sides: this seems to be a {'room' if is_room else 'garage or a hall'}; the models "
+        "know roads.",
         is_room,
     )
 
@@ -326,7 +411,8 @@ def _room(scan: Measures, profile: FitnessProfile) -> Finding | None:
 
 def _few_rows(scan: Measures, profile: FitnessProfile, sensor: SensorProfile, has_ground: bool) -> Finding | None:
     few_rows = scan.beams < 0.75 * profile.beams[0] and scan.beams_per_deg < 0.65 * profile.beams_per_deg[0]
-    too_few_rows = scan.beams < min(_FEWEST_ROWS, sensor.n_beams)
+    fewest = _FEWEST_FROM_ABOVE if scan.raised_m > _HIGH_M else _FEWEST_ROWS
+    too_few_rows = scan.beams < min(fewest, sensor.n_beams)
     if not ((few_rows and has_ground) or too_few_rows):  # rows cannot be separated if the origin is wrong
         return None
     return Finding(
@@ -350,6 +436,37 @@ def _other_number(scan: Measures, profile: FitnessProfile) -> Finding | None:
     )
 
 
+_ALL_ZERO = "Remission is 0 for"
+
+
+def with_raw_remission(
+    findings: Iterable[Finding], remission: NDArray[np.floating], sensor: SensorProfile
+) -> tuple[Finding, ...]:
+    """The findings, but of a remission that is there in another unit, that, in place of one that is missing.
+
+    The function of a profile, such as a logarithm, maps all values of 0..1 to 0 where 0..255 is expected.
+
+    remission : (n,) as recorded.
+    """
+    found = tuple(findings)
+    known = remission[np.isfinite(remission)]
+    if not any(finding.startswith(_ALL_ZERO) for finding in found) or not (known > 0.0).any() or np.ptp(known) == 0.0:
+        return found
+    low, high = sensor.remission_range
+    brightest = float(np.percentile(known, 99))
+    likely, own = _likely_range(float(known.min()), float(known.max())), f"({low:g}, {high:g})"
+    there = Finding(
+        f"Remission hardly exceeds {brightest:.2g}, but the profile {sensor.name} has {low:g} to {high:g}: pass "
+        f"sensor= a profile with the remission_range of this data{'' if likely == own else f', {likely}'}.",
+        True,
+    )
+    return tuple(there if finding.startswith(_ALL_ZERO) else finding for finding in found)
+
+
+def _likely_range(low: float, high: float) -> str:
+    return next((f"(0, {top})" for top in (1, 255, 65535) if low >= 0.0 and high <= top), f"({low:g}, {high:g})")
+
+
 def _remission_findings(scan: Measures, profile: FitnessProfile, sensor: SensorProfile) -> list[Finding]:
     # Without remission, 36 % of the car points and 74 % of the road cells remain (intersection over union with the
     # results with remission, 20 KITTI scans, default models); with a constant one, 15 % and 32 %.
@@ -360,18 +477,17 @@ def _remission_findings(scan: Measures, profile: FitnessProfile, sensor: SensorP
     stated = f"the profile {sensor.name} has {low:g} to {high:g}"
     useless = max(0.9, profile.remission_zeros[1] + 0.05)
     if scan.remission_beyond > 0.01 or scan.remission_low < -0.05:
-        likely = next((f"(0, {top})" for top in (1, 255, 65535) if raw_low >= 0.0 and raw_high <= top), "that")
         return [
             Finding(
                 f"Remission runs from {raw_low:g} to {raw_high:g}, but {stated}: pass sensor= a profile whose "
-                f"remission_range is {likely}.",
+                f"remission_range is {_likely_range(raw_low, raw_high)}.",
                 True,
             )
         ]
     if scan.remission_zeros > useless:
         return [
             Finding(
-                f"Remission is 0 for {scan.remission_zeros:.0%} of the points: the field is missing or was not read; "
+                f"{_ALL_ZERO} {scan.remission_zeros:.0%} of the points: the field is missing or was not read; "
                 "the model needs it.",
                 True,
             )

@@ -249,6 +249,24 @@ def fill_rows(points: Points, step: int, rows: Rows) -> None:
             counts[direction] += 1
 
 
+class Walls(NamedTuple):
+    """Where a scan ends, in `N_SECTORS` directions.
+
+    Attributes
+    ----------
+    enclosed : float
+        Share of the directions with points that end at a wall: the farthest points lie above one another.
+    mostly_enclosed : float
+        The same for the nearest three quarters of the points of each: the others may be seen through windows.
+    through_m : float
+        How far two opposite directions are seen [m], each by a tenth of its points.
+    """
+
+    enclosed: float = 0.0
+    mostly_enclosed: float = 0.0
+    through_m: float = math.inf
+
+
 @dataclass(frozen=True)
 class Measures:
     """Statistics of one scan; None where the scan does not determine a value."""
@@ -276,11 +294,10 @@ class Measures:
     unevenness: float
     nearest_m: float
     far_m: float
-    enclosed: float
-
-
-_WALL_DEPTH, _WALL_HEIGHT_M = 0.9, 0.3  # where a direction's end begins, as a share of it; how high it is
-_STREET_M = 30.0  # 99 % of the points of 561 real streets reach farther
+    most_m: float
+    walls: Walls
+    raised_m: float = 0.0  # the sensor, above that of the models
+    is_on_car: bool = True  # it is as high above the ground as on a car
 
 
 def _pseudo_azimuth(azimuth_deg: float) -> float:
@@ -317,7 +334,7 @@ def measure(points: Points, azimuth_deg: tuple[float, float]) -> Measures | None
     low, high = (_quantile(elevations, share) / 2.0 - 90.0 if elevations.any() else 0.0 for share in (0.01, 0.99))
     peaks = heights.max(axis=1) / max(1.0, sums["n_near"])
     flattest = int(peaks.argmax())
-    far_m = 10.0 ** (_quantile(ranges, 0.99) / 20.0 - 3.0)
+    most_m, far_m = (10.0 ** (_quantile(ranges, share) / 20.0 - 3.0) for share in (0.9, 0.99))
     has_ground = bool(peaks[2] >= _GROUND_SHARE)
     return Measures(
         points_in_view=sums["n_in_view"] * step,
@@ -344,21 +361,42 @@ def measure(points: Points, azimuth_deg: tuple[float, float]) -> Measures | None
         unevenness=sums["unevenness"],
         nearest_m=10.0 ** (_quantile(ranges, 0.01) / 20.0 - 3.0),
         far_m=far_m,
-        enclosed=_enclosed(points[::step]) if far_m < _STREET_M else 0.0,
+        most_m=most_m,
+        walls=_walls(points[::step]) if far_m < _STREET_M or most_m < _MOST_OF_STREET_M else Walls(),
     )
 
 
-def _enclosed(points: Points) -> float:
-    """Share of the directions with points that end at a wall: the farthest points lie above one another."""
+_WALL_DEPTH, _WALL_HEIGHT_M = 0.9, 0.3  # where a direction's end begins, as a share of it; how high it is
+_FEWEST_OF_SECTOR = 5  # points
+# 99 and 90 % of the points of 561 real streets reach farther than 33 and 11.6 m.
+_STREET_M, _MOST_OF_STREET_M = 30.0, 11.0
+
+
+def _walls(points: Points) -> Walls:
     x, y, z = points[np.isfinite(points).all(axis=1), :3].astype(np.float64).T
-    sector = (np.floor((np.arctan2(y, x) / (2.0 * np.pi) + 0.5) * N_SECTORS)).astype(np.int64) % N_SECTORS
     across = np.hypot(x, y)
-    farthest, top, bottom = np.zeros(N_SECTORS), np.full(N_SECTORS, -np.inf), np.full(N_SECTORS, np.inf)
-    np.maximum.at(farthest, sector, across)
-    at_end = across > _WALL_DEPTH * farthest[sector]
-    np.maximum.at(top, sector[at_end], z[at_end])
-    np.minimum.at(bottom, sector[at_end], z[at_end])
-    return float((top - bottom >= _WALL_HEIGHT_M).sum() / max(1, np.count_nonzero(farthest)))
+    sector = (np.floor((np.arctan2(y, x) / (2.0 * np.pi) + 0.5) * N_SECTORS)).astype(np.int64) % N_SECTORS
+    order = np.lexsort((across, sector))
+    across, sector, z = across[order], sector[order], z[order]
+    count = np.bincount(sector, minlength=N_SECTORS)
+    first = np.cumsum(count) - count
+
+    def ends(share: float) -> NDArray[np.float64]:
+        """The range below which this share of a direction's points lies; 0 if it has too few."""
+        row = np.minimum(first + np.floor(share * (count - 1.0)).astype(np.int64), len(across) - 1)
+        return np.where(count > 0, across[row], 0.0)
+
+    def enclosed(share: float, fewest: int) -> float:
+        end, top, bottom = ends(share), np.full(N_SECTORS, -np.inf), np.full(N_SECTORS, np.inf)
+        at_end = (across > _WALL_DEPTH * end[sector]) & (across * _WALL_DEPTH <= end[sector])
+        np.maximum.at(top, sector[at_end], z[at_end])
+        np.minimum.at(bottom, sector[at_end], z[at_end])
+        used = count >= fewest
+        return float((used & (top - bottom >= _WALL_HEIGHT_M)).sum() / max(1, np.count_nonzero(used)))
+
+    most = ends(0.9)
+    through_m = float(np.minimum(most, np.roll(most, N_SECTORS // 2)).max())
+    return Walls(enclosed(1.0, 1), enclosed(0.75, _FEWEST_OF_SECTOR), through_m)
 
 
 Range = tuple[float, float]

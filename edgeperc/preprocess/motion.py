@@ -17,6 +17,7 @@ from ..errors import EdgepercError, OptionError, PointsError, SensorError, Stamp
 from ..system.kernels import njit
 from ..types.frame import fill_moved
 from ..types.points import Points, as_points, read_only
+from ..types.rigid import rigid
 from .returns import blank_too_near
 
 MAX_RATE = 1e4  # of m/s and rad/s
@@ -80,8 +81,8 @@ class Motion:
         StampError
             A time is not finite, or the second is not later.
         """
-        first = _rigid("T_world_first", T_world_first, TrackingError)
-        second = _rigid("T_world_second", T_world_second, TrackingError)
+        first = rigid("T_world_first", T_world_first, TrackingError)
+        second = rigid("T_world_second", T_world_second, TrackingError)
         if not 0.0 < second_s - first_s < math.inf:
             raise StampError(f"got poses at {first_s} s and {second_s} s; expected a second one that is later")
         R = first[:3, :3].T @ second[:3, :3]
@@ -124,7 +125,14 @@ class Trajectory:
     T_world_sensor: NDArray[np.float64]
 
     def __post_init__(self) -> None:
-        times, poses = np.array(self.times_s, np.float64), np.array(self.T_world_sensor, np.float64)
+        try:
+            times = np.array(self.times_s, np.float64)
+        except (OverflowError, TypeError, ValueError) as exc:
+            raise StampError(f"got times of poses that are not numbers ({exc}); expected seconds") from exc
+        try:
+            poses = np.array(self.T_world_sensor, np.float64)
+        except (OverflowError, TypeError, ValueError) as exc:
+            raise TrackingError(f"got poses that are not matrices ({exc}); expected (n, 4, 4) numbers") from exc
         if times.ndim != 1 or len(times) < 2 or not np.isfinite(times).all() or (np.diff(times) <= 0.0).any():
             raise StampError(f"got {times.size} times of poses; expected two or more finite ones that rise")
         if poses.shape != (len(times), 4, 4):
@@ -133,7 +141,7 @@ class Trajectory:
             )
         object.__setattr__(self, "times_s", times)
         object.__setattr__(
-            self, "T_world_sensor", np.array([_rigid(f"pose {k}", pose, TrackingError) for k, pose in enumerate(poses)])
+            self, "T_world_sensor", np.array([rigid(f"pose {k}", pose, TrackingError) for k, pose in enumerate(poses)])
         )
 
     @classmethod
@@ -332,7 +340,7 @@ def merge(
     merged = np.empty((sum(map(len, rows)), 4), np.float32)
     begin = 0
     for k, (scan, given, range_m) in enumerate(zip(rows, T_vehicle_sensor, ranges_m, strict=True)):
-        pose = _rigid(f"T_vehicle_sensor[{k}]", given, SensorError)
+        pose = rigid(f"T_vehicle_sensor[{k}]", given, SensorError)
         R, t = np.ascontiguousarray(pose[:3, :3]), pose[:3, 3].copy()
         fill_moved(blank_too_near(scan, _meters(range_m)), R, t, merged[begin : begin + len(scan)])
         begin += len(scan)
@@ -399,23 +407,6 @@ def _directions(poses: NDArray[np.float64]) -> str:
     up, way = _up_and_way(poses)
     tilt = f"{math.degrees(math.acos(min(1.0, max(-1.0, up)))):.0f} deg from up"
     return tilt if way is None else f"{tilt} and that travels along {np.round(way, 1).tolist()}"
-
-
-def _rigid(name: str, given: ArrayLike, error: type[EdgepercError]) -> NDArray[np.float64]:
-    try:
-        pose: NDArray[np.float64] = np.array(given, np.float64)
-    except (OverflowError, TypeError, ValueError) as exc:
-        raise error(f"{name} is not a matrix ({exc}); expected (4, 4) numbers") from exc
-    if pose.shape != (4, 4) or not np.isfinite(pose).all():
-        raise error(f"{name} has shape {pose.shape}; expected (4, 4) finite numbers")
-    R = pose[:3, :3]
-    if (
-        np.abs(R @ R.T - np.eye(3)).max() > 1e-3
-        or np.linalg.det(R) < 0.0
-        or (np.abs(pose[3] - [0, 0, 0, 1]) > 1e-9).any()
-    ):
-        raise error(f"{name} is not rigid; expected a rotation and a translation")
-    return pose
 
 
 @njit(cache=True, nogil=True)

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from ..errors import MissingExtraError, PointsError
 from ..system.clock import Stamp
+from ..system.interpreter import interpreter_flags
 from ..types.points import Points
 from .tables import MAX_BYTES, MAX_SCAN_BYTES
 from .times import TimedScan
@@ -89,7 +90,7 @@ def start_process(folder: str) -> subprocess.Popen[bytes]:
     temporary = dict.fromkeys(("TMPDIR", "TEMP", "TMP"), folder)
     flags = getattr(subprocess, "CREATE_NO_WINDOW", 0) | getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0)
     return subprocess.Popen(
-        [sys.executable, "-W", "ignore", "-c", START, *sys.path],
+        [sys.executable, *interpreter_flags(), "-W", "ignore", "-c", START, *sys.path],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         env={**os.environ, **one_thread, **temporary},

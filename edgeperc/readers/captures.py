@@ -16,7 +16,7 @@ from ..types.sensor import SensorProfile
 from .apart import decode_apart, describe_apart
 from .bags import bag_files
 from .files import FileOptions, read_points, read_timed_file
-from .identify import KnownSensor, of_cloud, of_metadata, of_packets
+from .identify import KnownSensor, of_cloud, of_metadata, of_packets, of_velodyne
 from .packets import PCAP_MAGIC
 from .times import TimedScan
 
@@ -54,7 +54,8 @@ def read_scans(
         Velodyne ``.pcap``; an Ouster ``.osf``, or ``.pcap`` with its metadata next to it in a ``.json`` file whose name
         has the same beginning; a ROS 1 ``.bag``, a ROS 2 bag's folder or one file of it, or an ``.mcap`` file. Bags
         are read for messages of type ``sensor_msgs/PointCloud2``, MCAP files for ``foxglove.PointCloud`` (protobuf),
-        too. The first bytes of a file decide its format, not its name.
+        too; without such, for packets of a Velodyne, ``velodyne_msgs/VelodyneScan``. The first bytes of a file decide
+        its format, not its name.
     topic : str, optional
         What to read if there are several sensors: the topic of point clouds; ``TOPIC@FRAME`` for those of one frame;
         the serial number of an Ouster; the IPv4 address of a Velodyne.
@@ -69,7 +70,7 @@ def read_scans(
     ------
     stamp_s : float or None
         Time of the scan on the sensor's clock [s]: the end of the scan for a Velodyne and an Ouster, the header's stamp
-        for a message. None for scan files.
+        for a message; when the last packet came for a Velodyne's packets in messages. None for scan files.
     points : (n, 4) float32, C-contiguous
         x, y, z [m] in the sensor's frame, and the raw remission, which the `Perceiver` scales by its sensor's
         ``remission_range``: 0..255 for a Velodyne and an Ouster's reflectivity, but 0..1 for an HDL-64E, as in KITTI's
@@ -199,6 +200,8 @@ def known_sensor(path: Path, topic: str | None = None) -> KnownSensor | None:
         description = describe_apart(path, kind, topic)
         if "metadata" in description:
             return of_metadata(json.loads(description["metadata"]), "the metadata")
+        if "velodyne" in description:
+            return of_velodyne(description["velodyne"])
         return of_cloud(description)
     except SensorError as exc:
         raise SensorError(f"{path}: {exc}") from exc

@@ -62,13 +62,19 @@ class Cloud(NamedTuple):
     data: memoryview
 
 
-class _Reader:
-    """Values one after another; those of CDR are aligned to their size."""
+class MessageReader:
+    """Values of a message of ROS, one after another; those of CDR (ROS 2) are aligned to their size."""
 
     def __init__(self, content: memoryview, order: str, *, aligned: bool) -> None:
         self._content, self._order, self._aligned, self._at = content, order, aligned, 0
 
+    @property
+    def left(self) -> int:
+        """Bytes that are not read yet."""
+        return len(self._content) - self._at
+
     def value(self, code: str) -> int:
+        """A number, by its code in `struct`."""
         size = struct.calcsize(code)
         if self._aligned:
             self._at += -self._at % size
@@ -76,6 +82,7 @@ class _Reader:
         return int(value)
 
     def take(self, n_bytes: int) -> memoryview:
+        """So many bytes."""
         end = self._at + n_bytes
         if end > len(self._content):
             raise PointsError(f"a message is damaged: it ends at byte {len(self._content):,} of {end:,} or more")
@@ -83,14 +90,34 @@ class _Reader:
         return taken
 
     def text(self) -> str:
+        """A ``string``."""
         return bytes(self.take(self.value("I"))).rstrip(b"\0").decode("utf-8", "replace")
 
+    def stamp(self) -> Stamp:
+        """A ``time``."""
+        return Stamp(self.value("i" if self._aligned else "I"), self.value("I"))
 
-def _ros_cloud(content: memoryview, order: str, *, aligned: bool) -> Cloud:
-    read = _Reader(content, order, aligned=aligned)
-    if not aligned:
-        read.value("I")  # ROS 1 counts messages
-    header = Header(Stamp(read.value("i" if aligned else "I"), read.value("I")), read.text())
+    def header(self) -> Header:
+        """A ``std_msgs/Header``."""
+        if not self._aligned:
+            self.value("I")  # ROS 1 counts messages
+        return Header(self.stamp(), self.text())
+
+
+def cdr_reader(content: memoryview) -> MessageReader:
+    """Of a message in CDR, behind its header. Raises PointsError."""
+    if len(content) < 4 or bytes(content[:2]) not in (b"\0\0", b"\0\1"):
+        raise PointsError(f"a message is damaged: it begins with {bytes(content[:4])!r}; expected the header of CDR")
+    return MessageReader(content[4:], "<" if content[1] else ">", aligned=True)
+
+
+def ros1_reader(content: memoryview) -> MessageReader:
+    """Of a message of ROS 1."""
+    return MessageReader(content, "<", aligned=False)
+
+
+def _ros_cloud(read: MessageReader) -> Cloud:
+    header = read.header()
     height, width, n_fields = (read.value("I") for _ in range(3))
     if n_fields > _MOST_FIELDS:
         raise PointsError(f"a message is damaged: it declares {n_fields:,} fields")
@@ -98,16 +125,6 @@ def _ros_cloud(content: memoryview, order: str, *, aligned: bool) -> Cloud:
     is_bigendian, point_step, row_step = bool(read.value("B")), read.value("I"), read.value("I")
     data = read.take(read.value("I"))
     return Cloud(header, height, width, fields, is_bigendian, point_step, row_step, data)
-
-
-def _cdr_cloud(content: memoryview) -> Cloud:
-    if len(content) < 4 or bytes(content[:2]) not in (b"\0\0", b"\0\1"):
-        raise PointsError(f"a message is damaged: it begins with {bytes(content[:4])!r}; expected the header of CDR")
-    return _ros_cloud(content[4:], "<" if content[1] else ">", aligned=True)
-
-
-def _ros1_cloud(content: memoryview) -> Cloud:
-    return _ros_cloud(content, "<", aligned=False)
 
 
 def _protobuf(content: memoryview) -> Iterator[tuple[int, Any]]:
@@ -166,8 +183,8 @@ def _foxglove_cloud(content: memoryview) -> Cloud:
 
 CLOUD_READERS: MappingProxyType[tuple[str, str], Callable[[memoryview], Cloud]] = MappingProxyType(
     {
-        ("sensor_msgs/msg/PointCloud2", "cdr"): _cdr_cloud,
-        ("sensor_msgs/PointCloud2", "ros1"): _ros1_cloud,
+        ("sensor_msgs/msg/PointCloud2", "cdr"): lambda content: _ros_cloud(cdr_reader(content)),
+        ("sensor_msgs/PointCloud2", "ros1"): lambda content: _ros_cloud(ros1_reader(content)),
         ("foxglove.PointCloud", "protobuf"): _foxglove_cloud,
     }
 )

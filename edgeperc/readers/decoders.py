@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 import tempfile
-from collections.abc import Callable, Iterator, Sequence, Set
+from collections.abc import Callable, Iterator, Mapping, Sequence, Set
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -18,11 +18,21 @@ from .bags import BagFile, open_bag
 from .clouds import CLOUD_READERS, Cloud, cloud_points, cloud_table, describe_cloud
 from .mcap import Channel
 from .ouster import check_osf, open_capture
-from .packets import copy_as_ethernet, is_ethernet, pcap_packets, refuse_others, velodyne_packets, velodyne_senders
+from .packet_messages import PACKET_READERS, VelodyneScan, VelodyneStream, packets_of_others
+from .packets import (
+    copy_as_ethernet,
+    is_ethernet,
+    pcap_packets,
+    refuse_others,
+    velodyne_name,
+    velodyne_packets,
+    velodyne_senders,
+)
 from .tables import MAX_BYTES
 from .times import TimedScan, of_plausible_duration, point_times
 
 _Item = TypeVar("_Item")
+_READERS: Mapping[tuple[str, str], Callable[[memoryview], Cloud | VelodyneScan]] = {**CLOUD_READERS, **PACKET_READERS}
 
 
 def decode(
@@ -57,9 +67,9 @@ def describe(path: Path, kind: str, topic: str | None, alive: Callable[[], None]
 
     topic : as in `edgeperc.read_scans`.
     alive : as in `decode`.
-    Returns: ``metadata`` of an Ouster, as text; or ``topic``, ``frame``, ``fields`` and ``elevations_deg`` of a point
-        cloud: the median elevation of each ring or, without rings, of each row of an organized cloud [deg], None
-        where a ring has no return; empty without both.
+    Returns: ``metadata`` of an Ouster, as text; ``velodyne``, the names in its packets; or ``topic``, ``frame``,
+        ``fields`` and ``elevations_deg`` of a point cloud: the median elevation of each ring or, without rings, of each
+        row of an organized cloud [deg], None where a ring has no return; empty without both.
     Raises PointsError, MissingExtraError.
     """
 
@@ -70,7 +80,11 @@ def describe(path: Path, kind: str, topic: str | None, alive: Callable[[], None]
             yield {"metadata": chosen.to_json_string()}
         else:
             for name, message, _ in _clouds(path, topic, alive):
-                yield describe_cloud(name, message)
+                if isinstance(message, VelodyneScan):
+                    names = {velodyne_name(packet) for _, packet in message.packets}
+                    yield {"velodyne": sorted(names, key=str)}
+                else:
+                    yield describe_cloud(name, message)
 
     return next(_with_typed_errors(path, found()))
 
@@ -194,14 +208,28 @@ def _ouster_scans(frames: Any, topic: str | None, remission_field: str | None) -
 def _bag_scans(
     path: Path, topic: str | None, remission_field: str | None, alive: Callable[[], None], times: bool
 ) -> Iterator[TimedScan]:
-    for _, message, stamp_s in _clouds(path, topic, alive):
-        points = cloud_points(message, remission_field=remission_field)
-        times_s = point_times(table_columns(cloud_table(message)), points, stamp_s) if times else None
-        yield TimedScan(stamp_s, points, times_s)
+    turns: VelodyneStream | None = None
+    try:
+        for _, message, stamp_s in _clouds(path, topic, alive):
+            if isinstance(message, VelodyneScan):
+                turns = turns or VelodyneStream()
+                yield from turns.add(message)
+                continue
+            points = cloud_points(message, remission_field=remission_field)
+            times_s = point_times(table_columns(cloud_table(message)), points, stamp_s) if times else None
+            yield TimedScan(stamp_s, points, times_s)
+    except PointsError:  # the end of the file, which is damaged
+        if turns is not None:
+            yield from turns.end()
+        raise
+    if turns is not None:
+        yield from turns.end()
 
 
-def _clouds(path: Path, topic: str | None, alive: Callable[[], None]) -> Iterator[tuple[str, Cloud, float]]:
-    """Topic, message and stamp [s] of each point cloud.
+def _clouds(
+    path: Path, topic: str | None, alive: Callable[[], None]
+) -> Iterator[tuple[str, Cloud | VelodyneScan, float]]:
+    """Topic, message and stamp [s] of each point cloud, or of each message of packets in a bag without clouds.
 
     What is damaged in one file of a bag is reported after the clouds of all.
     """
@@ -209,11 +237,17 @@ def _clouds(path: Path, topic: str | None, alive: Callable[[], None]) -> Iterato
         files = open_bag(path, Path(folder), alive)
         topics, damage = _topics(files)
         clouds = {channel for channel in topics if channel[1:] in CLOUD_READERS}
+        packets = {channel for channel in topics if channel[1:] in PACKET_READERS}
+        if not clouds or (topic or "").partition("@")[0] in {channel.topic for channel in packets}:
+            clouds = packets or clouds
         if damage is not None and not clouds:
             raise damage
         others = sorted({f"{channel.topic} ({channel.msgtype})" for channel in topics - clouds})
         names = sorted({channel.topic for channel in clouds})
         more = f"; of other types {', '.join(others)}" if others else ""
+        wanted = {channel for channel in topics if channel.topic == topic} if clouds else topics
+        if said := packets_of_others(wanted):
+            raise PointsError("; ".join(said))
         name, _, frame = (topic, "", "") if topic in names else (topic or "").partition("@")
         chosen = names[_choose("topic of type sensor_msgs/PointCloud2", names, name or None, more)]
         n_scans, frames = 0, dict[str, None]()
@@ -247,14 +281,14 @@ def _topics(files: Sequence[BagFile]) -> tuple[set[Channel], PointsError | None]
     return topics, damage
 
 
-def _messages(files: Sequence[BagFile], clouds: Set[Channel], topic: str) -> Iterator[tuple[Cloud, int]]:
+def _messages(files: Sequence[BagFile], clouds: Set[Channel], topic: str) -> Iterator[tuple[Cloud | VelodyneScan, int]]:
     """Clouds of a topic and when they were recorded [ns]; damage in one file is raised after those of all files."""
     n, damage = 0, None
     for file in files:
         try:
             for channel in sorted(channel for channel in file.topics() & clouds if channel.topic == topic):
                 for recorded_ns, raw in file.messages_of(channel):
-                    message = CLOUD_READERS[channel.msgtype, channel.encoding](raw)
+                    message = _READERS[channel.msgtype, channel.encoding](raw)
                     n += 1
                     yield message, recorded_ns
         except PointsError as exc:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -15,21 +15,9 @@ from ..errors import PointsError, SensorError
 from ..types.sensor import SENSORS, SensorProfile
 from .clouds import is_ouster_cloud
 from .ouster import check_metadata, metadata_beside, read_metadata
-from .packets import refuse_others, velodyne_packets, velodyne_senders
+from .packets import refuse_others, velodyne_name, velodyne_packets, velodyne_senders
 
 _CHOICES = f"Pass its name, sensor= or --sensor: {', '.join(SENSORS)}; or a profile of your own, a .json file."
-
-# The last byte of a Velodyne's packet, behind the return mode: the model's beam angles. VLS-128 has two by firmware.
-_PRODUCTS = {
-    0x21: "hdl-32e",
-    0x22: "vlp-16",
-    0x23: "VLP-32A or VLP-32B",
-    0x24: "Puck Hi-Res",
-    0x28: "vlp-32c",
-    0x63: "VLS-128",
-    0xA1: "VLS-128",
-}
-_RETURN_MODES = (0x37, 0x38, 0x39, 0x3A, 0x3B)
 
 # Vertical field of view [deg] of Ouster's families: lowest and highest of their units; a first-generation OS1 has 33.
 _OUSTER_SPANS = {"os2": (18.0, 27.0), "os1": (30.0, 48.0), "os0": (75.0, 100.0)}
@@ -67,14 +55,9 @@ def of_packets(path: Path, topic: str | None = None) -> KnownSensor:
     Raises PointsError, SensorError.
     """
     sender = topic if topic in velodyne_senders(path) else None
-    names = {_velodyne_name(packet) for packet in velodyne_packets(path, sender)}
+    names = {velodyne_name(packet) for packet in velodyne_packets(path, sender)}
     if names:
-        name = ", ".join(sorted(map(str, names)))
-        if name in SENSORS:
-            return KnownSensor(SENSORS[name], "named by the packets")
-        if names == {None}:
-            raise SensorError(f"the packets are a Velodyne's but do not name the model. {_CHOICES}")
-        raise SensorError(f"the packets are of a Velodyne {name}, of which no profile is built in. {_CHOICES}")
+        return of_velodyne(names)
     refuse_others(path)
     files = metadata_beside(path)
     contents = [(file.name, json.loads(read_metadata(file))) for file in files]
@@ -88,14 +71,17 @@ def of_packets(path: Path, topic: str | None = None) -> KnownSensor:
     return known[0]
 
 
-def _velodyne_name(packet: memoryview) -> str | None:
-    """The model, None if the packet does not name it."""
-    blocks = {bytes(packet[k : k + 2]) for k in range(0, 1200, 100)}
-    if blocks & {b"\xff\xcc", b"\xff\xbb"}:
-        return "VLS-128"
-    if b"\xff\xdd" in blocks:  # the second half of the lasers; the last bytes hold its status instead
-        return "hdl-64e"
-    return _PRODUCTS.get(packet[-1]) if packet[-2] in _RETURN_MODES else None
+def of_velodyne(names: Collection[str | None]) -> KnownSensor:
+    """The sensor of a Velodyne's packets, by the names in them (`packets.velodyne_name`).
+
+    Raises SensorError.
+    """
+    name = ", ".join(sorted(map(str, names)))
+    if name in SENSORS:
+        return KnownSensor(SENSORS[name], "named by the packets")
+    if {*names} == {None}:
+        raise SensorError(f"the packets are a Velodyne's but do not name the model. {_CHOICES}")
+    raise SensorError(f"the packets are of a Velodyne {name}, of which no profile is built in. {_CHOICES}")
 
 
 def of_metadata(content: Any, source: str) -> KnownSensor:

@@ -26,8 +26,20 @@ PCAP_MAGIC = {
 _LINKS = {1: (14, 12), 113: (16, 14), 276: (20, 0)}
 _LOOPBACK_LINKS, _RAW_LINKS = (0, 108), (12, 14, 101, 228)  # four bytes in front of the IP header, none
 
-_VELODYNE_BYTES = 1206
+VELODYNE_BYTES = 1206
 _GPS_BYTES = 600  # what LiDARs send of their GPS is shorter, their points are longer
+
+# The last byte of a Velodyne's packet, behind the return mode: the model's beam angles. VLS-128 has two by firmware.
+_PRODUCTS = {
+    0x21: "hdl-32e",
+    0x22: "vlp-16",
+    0x23: "VLP-32A or VLP-32B",
+    0x24: "Puck Hi-Res",
+    0x28: "vlp-32c",
+    0x63: "VLS-128",
+    0xA1: "VLS-128",
+}
+_RETURN_MODES = (0x37, 0x38, 0x39, 0x3A, 0x3B)
 
 # Enough to find a LiDAR's packet among those of a GPS, and quick to read.
 _SNIFFED_PACKETS = 2000
@@ -170,6 +182,16 @@ def velodyne_packets(path: Path, sender: str | None = None) -> Iterator[memoryvi
             yield packet
 
 
+def velodyne_name(packet: memoryview) -> str | None:
+    """The model of a Velodyne, None if the packet does not name it."""
+    blocks = {bytes(packet[k : k + 2]) for k in range(0, 1200, 100)}
+    if blocks & {b"\xff\xcc", b"\xff\xbb"}:
+        return "VLS-128"
+    if b"\xff\xdd" in blocks:  # the second half of the lasers; the last bytes hold its status instead
+        return "hdl-64e"
+    return _PRODUCTS.get(packet[-1]) if packet[-2] in _RETURN_MODES else None
+
+
 def velodyne_senders(path: Path) -> list[str]:
     """IPv4 addresses that a Velodyne's packets come from, among the first of a pcap file; sorted."""
     return sorted({address for address, _ in _velodyne_packets(path)} - {""})
@@ -179,13 +201,13 @@ def _velodyne_packets(path: Path) -> Iterator[tuple[str, memoryview]]:
     link = _link_type(path)
     for _, packet in islice(pcap_packets(path, whole=False), _SNIFFED_PACKETS):
         # The first of twelve blocks begins with the flag 0xEEFF, behind the headers of the link, IP and UDP.
-        if len(packet) > _VELODYNE_BYTES and bytes(packet[-_VELODYNE_BYTES : 2 - _VELODYNE_BYTES]) == b"\xff\xee":
+        if len(packet) > VELODYNE_BYTES and bytes(packet[-VELODYNE_BYTES : 2 - VELODYNE_BYTES]) == b"\xff\xee":
             try:
                 at = _ip_at(packet, link)
             except ValueError:
                 at = None
-            is_ip = at is not None and len(packet) >= at + 28 + _VELODYNE_BYTES
-            yield _address(packet[at + 12 : at + 16]) if at is not None and is_ip else "", packet[-_VELODYNE_BYTES:]
+            is_ip = at is not None and len(packet) >= at + 28 + VELODYNE_BYTES
+            yield _address(packet[at + 12 : at + 16]) if at is not None and is_ip else "", packet[-VELODYNE_BYTES:]
 
 
 def refuse_others(path: Path) -> None:

@@ -162,7 +162,8 @@ def road_ahead(
     max_corners : int
         Largest number of corners of the outline. Corners of cells are used if so few suffice, otherwise some that lie
         anywhere within the tolerance. Where these are too many, more road is left out, up to 1.25, 1.5, 2, 4 or 8 times
-        the tolerance from its edges or, at last, any distance (`RoadAhead.tolerance_m`). No more is added.
+        the tolerance from its edges or, at last, any distance (`RoadAhead.tolerance_m`), with all behind the holes
+        where these are in the way. No more is added. With a tolerance of 0, there is no limit.
 
     Returns
     -------

@@ -64,7 +64,7 @@ def outline_of(
     tolerance : largest distance between the outline and the edges of the cells, in cells. 0 keeps all corners,
         however many.
     max_corners : largest number of corners of the outer ring, at least 4. If they do not suffice, cells are left out
-        that are farther from the edges; no more are added.
+        that are farther from the edges, at last all between holes and the first row; no more are added.
     Returns: A valid polygon: its rings neither touch nor cross themselves or one another, and the holes are inside.
     """
     # A kernel is compiled for arrays in C order.
@@ -98,7 +98,13 @@ def outline_of(
                 break
         else:
             factor = math.inf
-            found = _needed(found, row_sums(added), row_sums(np.ones_like(closed)), outer, max_corners)
+            anywhere = row_sums(np.ones_like(closed))
+            found = _needed(found, row_sums(added), anywhere, outer, max_corners)
+            if len(found[outer]) > max_corners:  # a ring without holes loses any corners; these are in the way
+                behind = np.logical_or.accumulate((filled(smooth) & ~smooth)[::-1])[::-1]
+                rings = rings_of(without_gaps(smooth & ~behind, np.zeros_like(smooth), place, ~smooth))
+                outer = int(np.argmax([_area(ring) for ring in rings]))
+                found = _needed(rings, row_sums(added), anywhere, outer, max_corners)
     found = [ring - 1 for ring in found]
     return Outline(found[outer], tuple(ring for k, ring in enumerate(found) if k != outer), factor)
 

@@ -21,7 +21,6 @@ import json
 import math
 import socket
 import warnings
-from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +29,6 @@ from numpy.typing import NDArray
 
 from ..errors import OptionError
 from ..records import PerceivedScan
-from ..system.atomic import open_atomic
 from ..system.extras import require
 from ..system.lanes import returns
 from ..system.printable import printable
@@ -38,8 +36,8 @@ from ..types.frame import quaternion
 from ..types.mounting import MODEL_HEIGHT_M
 from ..types.perception import Box, TopView
 from ..view.content import EDGES, box_corners, box_text, track_text
-from .kept_file import KeptFile
 from .relay import MAX_VIEWERS, Relay
+from .run_file import RunFile
 from .scene import (
     BASE,
     LIDAR,
@@ -302,7 +300,7 @@ class McapSink:
     Parameters
     ----------
     path : str or Path
-        The file; it replaces an existing one when the sink is closed.
+        The file; it replaces an existing one when the sink is closed, unless it is not whole (`Sink.close`).
 
     Raises
     ------
@@ -315,14 +313,13 @@ class McapSink:
     def __init__(self, path: str | Path) -> None:
         require("foxglove.mcap", "foxglove", "Writing an MCAP file", package="foxglove-sdk")
         self._path = checked_target(path)
-        self._open = ExitStack()
         self._channels: _Channels | None = None
 
     def _start(self) -> _Channels:
         """Open the file: with the first scan, so that a run without answers replaces no file."""
         sdk = require("foxglove", "foxglove", "Writing an MCAP file", package="foxglove-sdk")
         mcap = require("foxglove.mcap", "foxglove", "Writing an MCAP file", package="foxglove-sdk")
-        self._file = KeptFile(self._open.enter_context(open_atomic(self._path)))
+        self._file = RunFile(self._path)
         # Of a scan of 113,000 points, zstd's level 1 takes 10 ms and its default 30 ms for the same size.
         options = mcap.MCAPWriteOptions(compression_level=1, compression_threads=0)
         context = sdk.Context()
@@ -345,18 +342,12 @@ class McapSink:
         self._channels.write(scan)
         self._file.check()
 
-    def close(self) -> None:
-        """Finish the file. A file that could not be written whole is removed, and the existing one stays.
-
-        Raises
-        ------
-        OSError
-            The file cannot be written.
-        """
-        with self._open:
-            if self._channels is not None:
-                self._writer.close()
-                self._file.check()
+    def close(self, whole: bool = True) -> None:
+        """Finish the file; see `Sink.close`."""
+        if self._channels is not None:
+            self._channels = None
+            self._writer.close()
+            self._file.close(whole)
 
 
 class ServeSink:
@@ -426,7 +417,7 @@ class ServeSink:
                 stacklevel=2,
             )
 
-    def close(self) -> None:
+    def close(self, whole: bool = True) -> None:
         """Close all connections, within a few seconds whatever viewers do."""
         try:
             self._relay.end(_GRACE_S)

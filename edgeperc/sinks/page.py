@@ -5,8 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 from ..records import PerceivedScan
+from ..system.atomic import part_of
 from ..types.points import as_points
 from ..view.page import DrivePage
+from .run_file import warn_of
 from .scene import checked_target
 
 __all__ = ["PageSink"]
@@ -18,7 +20,7 @@ class PageSink:
     Parameters
     ----------
     path : str or Path
-        The file; it is written, or replaced, when the sink is closed.
+        The file; it is written, or replaced, when the sink is closed, unless it is not whole (`Sink.close`).
 
     Raises
     ------
@@ -40,13 +42,18 @@ class PageSink:
         """
         self._page.add(scan.perception, as_points(scan.points), scan.stamp_s, scan.tracks, name=scan.name)
 
-    def close(self) -> None:
-        """Write the page; without scans, none is written.
+    def close(self, whole: bool = True) -> None:
+        """Write the page; without scans, none is written. See `Sink.close`.
 
         Raises
         ------
         OSError
-            The file cannot be written.
+            The file cannot be written; nothing of it is left.
         """
         if len(self._page):
-            self._page.write(self._path)
+            try:
+                self._page.write(self._path if whole else part_of(self._path))
+            except OSError as exc:
+                raise OSError(exc.errno, exc.strerror, str(self._path)) from exc
+            if not whole:
+                warn_of(part_of(self._path), self._path)

@@ -16,10 +16,11 @@ from numpy.typing import NDArray
 from ..camera.calibration import read_kitti_calibration
 from ..errors import OptionError
 from ..records import PerceivedScan
-from ..system.atomic import open_atomic, write_atomic
+from ..system.atomic import part_of, write_atomic
 from ..types.geometry import wrapped
 from ..types.perception import Box
 from .names import ScanFiles, stem_of
+from .run_file import RunFile, warn_of
 
 __all__ = ["KINDS", "PrelabelSink"]
 
@@ -92,8 +93,8 @@ class PrelabelSink:
         if kind == "cvat":
             self._before: Mapping[int, Box] = {}
             self._n_items = 0
-            file = self._stack.enter_context(open_atomic(self._folder / "annotations.zip"))
-            archive = self._stack.enter_context(zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED))
+            self._file = RunFile(self._folder / "annotations.zip")
+            archive = self._stack.enter_context(zipfile.ZipFile(self._file, "w", zipfile.ZIP_DEFLATED))
             self._document = self._stack.enter_context(archive.open("annotations/default.json", "w", force_zip64=True))
             self._document.write(b'{"info": {}, "items": [')
 
@@ -117,19 +118,23 @@ class PrelabelSink:
                 self._classes.append(box.label)
         self._writer(stem_of(scan.name)[0], scan, boxes)
 
-    def close(self) -> None:
-        """Finish the files that are of all scans."""
+    def close(self, whole: bool = True) -> None:
+        """Finish the files that are of all scans; see `Sink.close`."""
         if self._kind == "labelcloud":
             classes = [
                 {"name": name, "id": k, "color": _COLORS[k % len(_COLORS)]} for k, name in enumerate(self._classes)
             ]
             document = {"classes": classes, "default": 0, "type": "object_detection", "format": "centroid_rel"}
-            self._write_json("labels/_classes.json", "", document)
+            name = Path("labels/_classes.json")
+            self._write_json(str(name if whole else part_of(name)), "", document)
+            if not whole:
+                warn_of(self._folder / part_of(name), self._folder / name)
         elif self._kind == "cvat" and not self._document.closed:
             labels = [{"name": name, "parent": "", "attributes": []} for name in self._classes]
             categories = {"label": {"labels": labels, "attributes": ["occluded"]}}
             self._document.write(f'], "categories": {json.dumps(categories)}}}'.encode())
             self._stack.close()
+            self._file.close(whole)
 
     def _labelcloud(self, name: str, scan: PerceivedScan, boxes: Sequence[Named]) -> None:
         source = Path(scan.name)
@@ -186,6 +191,7 @@ class PrelabelSink:
         self._document.write((", " if self._n_items else "").encode() + json.dumps(item).encode())
         self._n_items += 1
         self._before = now
+        self._file.check()
 
     def _kitti(self, name: str, scan: PerceivedScan, boxes: Sequence[Named]) -> None:
         T_cam_sensor, P2, text = _NOMINAL_TR, _NOMINAL_P2, None

@@ -5,7 +5,6 @@ from __future__ import annotations
 import errno
 import os
 import shutil
-from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -13,18 +12,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..records import PerceivedScan
-from ..system.atomic import open_atomic
 from ..system.extras import require
 from ..system.printable import printable
 from ..types.mounting import MODEL_HEIGHT_M
 from ..types.perception import Box, TopView
 from ..view.content import box_text, track_text
+from .run_file import Pipe, RunFile
 from .scene import Trails, base_pose, byte_colors, checked_target, colored_points, nanoseconds
 
 __all__ = ["RerunSink"]
 
-# The SDK writes in a thread of its own and waits for ever if that has failed, so space is checked beforehand. A point
-# takes 20 bytes; the rest of a scan less than 8 MB.
+# The SDK writes in a thread of its own and waits for ever if that has failed, so it writes to a pipe. Where there is
+# none, space is checked beforehand: a point takes 20 bytes; the rest of a scan less than 8 MB.
+_HAS_PIPES = hasattr(os, "mkfifo")
 _POINT_BYTES, _ROOM_BYTES = 20, 8 * 2**20
 _PATIENCE_S = 60.0
 _RADIUS = -1.2  # a negative one is in points of the screen
@@ -50,7 +50,7 @@ class RerunSink:
     Parameters
     ----------
     path : str or Path
-        The file; it replaces an existing one when the sink is closed.
+        The file; it replaces an existing one when the sink is closed, unless it is not whole (`Sink.close`).
 
     Raises
     ------
@@ -64,17 +64,16 @@ class RerunSink:
         self._rr: Any = require("rerun", "rerun", "Writing a recording for Rerun", package="rerun-sdk")
         require("rerun.blueprint", "rerun", "Writing a recording for Rerun", package="rerun-sdk")
         self._path = checked_target(path)
-        self._open = ExitStack()
         self._recording: Any = None
         self._trails = Trails()
         self._classes: dict[str, int] = {}
-        self._failed = False
+        self._pipe: Pipe | None = None
 
     def _start(self) -> None:
         """Open the file: with the first scan, so that a run without answers replaces no file."""
-        file = self._open.enter_context(open_atomic(self._path))
+        self._file = RunFile(self._path)
         rr, views = self._rr, self._rr.blueprint
-        self._recording = rr.RecordingStream("edgeperc")
+        recording = rr.RecordingStream("edgeperc")
         # The view moves with the sensor and looks ahead from behind and above it.
         eye = views.EyeControls3D(position=(-14.0, 0.0, 9.0), look_target=(12.0, 0.0, -1.7), eye_up=(0.0, 0.0, 1.0))
         seen = views.Spatial3DView(
@@ -82,8 +81,15 @@ class RerunSink:
         )
         times = views.TimeSeriesView(origin="/status", name="stages [ms]")
         layout = views.Blueprint(views.Vertical(seen, times, row_shares=[4, 1]), collapse_panels=True)
-        self._recording.save(file.name, default_blueprint=layout)
-        self._recording.set_log_time_enabled(False)
+        recording.set_log_time_enabled(False)
+        self._recording = recording
+        try:
+            self._pipe = Pipe(self._file) if _HAS_PIPES else None
+            recording.save(self._file.place if self._pipe is None else self._pipe.path, default_blueprint=layout)
+        except (OSError, RuntimeError) as exc:
+            self._file.fail(OSError(errno.EIO, f"the recording could not be begun ({exc})"))
+        if self._pipe is not None:
+            self._pipe.start()
         self._recording.log("world", self._rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
 
     def write(self, scan: PerceivedScan) -> None:
@@ -129,7 +135,8 @@ class RerunSink:
         if scan.health is not None:
             level = {"OK": "INFO", "LATE": "WARN"}.get(scan.health, "ERROR")
             log("status/health", rr.TextLog(scan.health, level=level))
-        self._flush()
+        self._flush(self._recording)
+        self._file.check()
 
     def _annotate(self, names: list[str]) -> None:
         """Number the classes in the order in which they come; static, so a new class is shown in earlier scans, too."""
@@ -175,28 +182,23 @@ class RerunSink:
         )
 
     def _check_room(self, n_bytes: int) -> None:
-        if self._failed:
-            raise OSError(errno.EIO, "an earlier scan could not be written to the recording")
-        if shutil.disk_usage(os.path.realpath(self._path.parent)).free < n_bytes + _ROOM_BYTES:
-            raise OSError(errno.ENOSPC, "the recording does not fit on the disk", str(self._path))
+        self._file.check()
+        if not _HAS_PIPES and shutil.disk_usage(os.path.realpath(self._path.parent)).free < n_bytes + _ROOM_BYTES:
+            self._file.fail(OSError(errno.ENOSPC, "the recording does not fit on the disk"))
+            self._file.check()
 
-    def _flush(self) -> None:
+    def _flush(self, recording: Any) -> None:
         try:
-            self._recording.flush(timeout_sec=_PATIENCE_S)
+            recording.flush(timeout_sec=_PATIENCE_S)
         except RuntimeError as exc:
-            self._failed = True
-            raise OSError(errno.EIO, f"the recording could not be written ({exc})") from exc
+            self._file.fail(OSError(errno.EIO, f"the recording could not be written ({exc})"))
 
-    def close(self) -> None:
-        """Finish the file. A file that could not be written whole is removed, and the existing one stays.
-
-        Raises
-        ------
-        OSError
-            The file cannot be written.
-        """
-        with self._open:
-            if self._recording is not None:
-                self._check_room(0)
-                self._flush()
-                self._recording.disconnect()
+    def close(self, whole: bool = True) -> None:
+        """Finish the file; see `Sink.close`."""
+        if self._recording is not None:
+            recording, self._recording = self._recording, None
+            self._flush(recording)
+            recording.disconnect()
+            if self._pipe is not None and not self._pipe.ends(_PATIENCE_S):
+                self._file.fail(OSError(errno.EIO, "the recording could not be written in time"))
+            self._file.close(whole)

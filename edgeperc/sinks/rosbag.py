@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import errno
 import inspect
 import os
+import sqlite3
+from contextlib import closing, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from ..errors import OptionError
 from ..ros2.messages import OUTPUTS, RosMessages, nanoseconds
+from ..system.atomic import beside
 from ..system.extras import require
+from .run_file import settle
 
 if TYPE_CHECKING:
     from ..records import PerceivedScan
@@ -23,8 +28,8 @@ TOPICS = {name: "/diagnostics" if name == "diagnostics" else f"/edgeperc/{name}"
 class BagSink:
     """Writes a ROS 2 bag: points with their classes, markers, the grid, detections and diagnostics of every scan.
 
-    The folder is made with the first scan, so a run in which every scan fails leaves none behind. It is complete after
-    `close`. Times of messages are those of the scans.
+    The folder is made with the first scan, so a run in which every scan fails leaves none behind. It has its name after
+    `close`, unless it is not whole (`Sink.close`). Times of messages are those of the scans.
 
     Parameters
     ----------
@@ -65,22 +70,72 @@ class BagSink:
                     "0.9.23), or choose the storage sqlite3"
                 )
             how["storage_plugin"] = rosbag2.StoragePlugin.MCAP
-        self._writer = rosbag2.Writer(self._folder, **how)
+        self._beside = beside(self._folder)
+        # A bag's files have the name of its folder.
+        self._writer = rosbag2.Writer(self._beside / self._folder.name, **how)
         self._connections: dict[str, Any] = {}
+        self._error: OSError | None = None
 
     def write(self, scan: PerceivedScan) -> None:
         """Write one scan; see `Sink.write`."""
+        if self._error is not None:
+            raise self._error
         encoded = {name: self._messages.encode(getattr(self._messages, name)(scan)) for name in OUTPUTS}
-        if not self._connections:
-            self._writer.open()
-            typestore = self._messages.typestore
-            for name, kind in OUTPUTS.items():
-                self._connections[name] = self._writer.add_connection(TOPICS[name], kind, typestore=typestore)
-        for name, data in encoded.items():
-            self._writer.write(self._connections[name], nanoseconds(scan.stamp_s), data)
+        try:
+            if not self._connections:
+                self._open()
+            for name, data in encoded.items():
+                self._writer.write(self._connections[name], nanoseconds(scan.stamp_s), data)
+            if (database := self._database) is not None:
+                database.commit()  # a full disk or a process that is killed costs no earlier scan
+        except (OSError, sqlite3.Error) as exc:
+            self._error = self._typed(exc)
+            raise self._error from exc
 
-    def close(self) -> None:
-        """Finish the bag; see `Sink.close`."""
-        if self._connections:
-            self._connections = {}
-            self._writer.close()
+    def _open(self) -> None:
+        self._writer.open()
+        typestore = self._messages.typestore
+        for name, kind in OUTPUTS.items():
+            self._connections[name] = self._writer.add_connection(TOPICS[name], kind, typestore=typestore)
+
+    @property
+    def _database(self) -> sqlite3.Connection | None:
+        storage = getattr(self._writer, "storage", self._writer)  # at first, rosbags' writer itself
+        found: sqlite3.Connection | None = getattr(storage, "conn", None)
+        return found
+
+    def _typed(self, error: OSError | sqlite3.Error) -> OSError:
+        number = error.errno if isinstance(error, OSError) else errno.ENOSPC if "full" in str(error) else errno.EIO
+        return OSError(number or errno.EIO, getattr(error, "strerror", str(error)), str(self._folder))
+
+    def close(self, whole: bool = True) -> None:
+        """Finish the bag; see `Sink.close`. One that could not be written has no ``metadata.yaml``."""
+        if not self._beside.exists():
+            return
+        told = self._error
+        try:
+            if told is None:
+                self._writer.close()
+        except (OSError, sqlite3.Error) as exc:
+            self._error = self._typed(exc)
+        if self._error is not None:
+            self._abandon()
+        try:
+            settle(self._beside / self._folder.name, self._folder, whole and self._error is None)
+        finally:
+            self._beside.rmdir()
+        if self._error is not None and told is None:
+            raise self._error
+
+    def _abandon(self) -> None:
+        """Keep what is on the disk, without metadata that promise more."""
+        folder = self._beside / self._folder.name
+        with suppress(OSError, sqlite3.Error):
+            if hasattr(self._writer, "abort"):  # since rosbags 0.11
+                self._writer.abort()
+            elif (database := self._database) is not None:
+                database.close()
+            for file in folder.glob("*.db3"):  # opened again, sqlite takes back what it could not on a full disk
+                with closing(sqlite3.connect(file)) as again:
+                    again.execute("SELECT count(*) FROM messages")
+        (folder / "metadata.yaml").unlink(missing_ok=True)

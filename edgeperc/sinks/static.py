@@ -84,7 +84,7 @@ class StaticSink:
         self.n_points += len(points)
         self.n_removed += int(np.count_nonzero(gone))
 
-    def close(self) -> None:
+    def close(self, whole: bool = True) -> None:
         """Do nothing; every file is complete."""
 
 

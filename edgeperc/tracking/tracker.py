@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..errors import StampError, TrackingError
 from ..system.clock import GAP_S, LATEST_S, Clock, Step
 from ..types.perception import Box, Perception
+from ..types.rigid import rigid
 from .egomotion import fit_motion
 from .imm import fill_combined, fill_interaction, fill_mode_probabilities
 from .jpda import MAX_EVENTS, Detections, Gates, Predictions, fill_association, fill_likelihoods
@@ -474,8 +475,8 @@ def _scores(
 
 def _checked_boxes(boxes: Iterable[Box]) -> tuple[NDArray[np.float64], NDArray[np.float64], list[str]]:
     """Check boxes; return rows (m, 8) of x, y, z, length, width, height, yaw, score, log odds of fronts, and labels."""
-    given = list(boxes)
     try:
+        given = list(boxes)
         rows = np.array([(*box.center, *box.size, box.yaw, box.score) for box in given], np.float64).reshape(-1, 8)
         fronts = np.array([0.5 if box.front is None else box.front for box in given], np.float64)
         names = [box.label for box in given]
@@ -497,17 +498,9 @@ def _checked_boxes(boxes: Iterable[Box]) -> tuple[NDArray[np.float64], NDArray[n
 
 
 def _checked_pose(given: ArrayLike) -> NDArray[np.float64]:
-    try:
-        pose = np.array(given, np.float64, order="C")
-    except (OverflowError, TypeError, ValueError) as exc:
-        raise TrackingError(f"got a T_world_sensor that is not a matrix ({exc}); expected (4, 4) numbers") from exc
-    if pose.shape != (4, 4) or not (np.abs(pose) <= FARTHEST_M).all():
-        raise TrackingError(
-            f"got a T_world_sensor of shape {pose.shape}; expected (4, 4) finite numbers, up to {FARTHEST_M:g}"
-        )
-    off = np.abs(pose[:3, :3] @ pose[:3, :3].T - np.eye(3)).max()
-    if off > 1e-3 or np.linalg.det(pose[:3, :3]) < 0.0 or (np.abs(pose[3] - [0, 0, 0, 1]) > 1e-9).any():
-        raise TrackingError("got a T_world_sensor that is not rigid; expected a rotation and a translation")
+    pose = rigid("T_world_sensor", given, TrackingError)
+    if np.abs(pose).max() > FARTHEST_M:
+        raise TrackingError(f"T_world_sensor has {np.abs(pose).max():g}; expected at most {FARTHEST_M:g} m")
     return pose
 
 

@@ -34,6 +34,8 @@ class ModelFrame:
     R : (3, 3) float64
     t : (3,) float64
         A point p of the scan lies at ``R p + t`` [m] in the models' frame.
+    eye : (3,) float64
+        Where the sensor is in the models' frame [m].
     """
 
     def __init__(self, mounting: Mounting) -> None:
@@ -41,6 +43,7 @@ class ModelFrame:
         from_vehicle = MODEL_MOUNTING.rotation().T
         self.R: NDArray[np.float64] = from_vehicle @ mounting.rotation()
         raised = from_vehicle @ np.array([0.0, 0.0, mounting.height_m - MODEL_HEIGHT_M])
+        self.eye: NDArray[np.float64] = raised
         self.t: NDArray[np.float64] = raised - self.R @ np.array([*mounting.origin_m, 0.0])
         self.is_identity = bool(np.allclose(self.R, np.eye(3), atol=1e-9) and np.allclose(self.t, 0.0, atol=1e-6))
 

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..errors import SensorError
 from ..system.fields import Fields
+from .rigid import rigid
 
 FIELDS = Fields("mounting", SensorError, exact=True)
 
@@ -84,21 +85,8 @@ class Mounting:
         SensorError
             Not a rotation and a translation.
         """
-        try:
-            matrix = np.array(T_vehicle_sensor, np.float64)
-        except (TypeError, ValueError) as exc:
-            raise SensorError(f"the extrinsic matrix is not 4 x 4 numbers ({exc})") from exc
-        if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
-            raise SensorError(f"the extrinsic matrix has shape {matrix.shape}; expected 4 x 4 finite numbers")
+        matrix = rigid("the extrinsic matrix", T_vehicle_sensor, SensorError)
         R = matrix[:3, :3]
-        if (
-            not np.allclose(R @ R.T, np.eye(3), atol=1e-3)
-            or np.linalg.det(R) < 0.0
-            or not np.allclose(matrix[3], [0, 0, 0, 1])
-        ):
-            raise SensorError(
-                "the extrinsic matrix is not a rotation and a translation; expected R R^T = 1, det R = 1, last row 0001"
-            )
         pitch = math.asin(min(1.0, max(-1.0, -float(R[2, 0]))))
         return cls(
             height_m=float(matrix[2, 3]),

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -348,3 +349,15 @@ class Perception:
             "remission": None if self.remission is None else asdict(self.remission),
             "image": None if self.image is None else self.image.to_dict(),
         }
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """For pickles and copies: a read-only view of a mapping has neither."""
+        values = {field.name: getattr(self, field.name) for field in fields(self)}
+        return _with_views, (values | {name: dict(values[name]) for name in _VIEWS},)
+
+
+_VIEWS = ("stage_ms", "providers")
+
+
+def _with_views(values: dict[str, Any]) -> Perception:
+    return Perception(**values | {name: MappingProxyType(values[name]) for name in _VIEWS})

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+import os
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -73,6 +74,8 @@ def as_points(
     """
     if isinstance(array, np.ma.MaskedArray):
         raise PointsError("got a masked array; fill it first, e.g. with array.filled(np.nan)")
+    if not isinstance(array, np.ndarray) and (what := _to_convert(array)):
+        raise PointsError(f"got {what[0]}; expected (n, 4) x, y, z, remission: pass {what[1]}")
     try:
         # Ragged sequences raise ValueError; the __array__ of an object may raise anything.
         values = np.asarray(array)
@@ -96,6 +99,40 @@ def as_points(
         return assemble(values.shape[0], columns, [*columns], None, origin_m)
     with np.errstate(over="ignore", invalid="ignore"):
         return np.require(values, dtype=np.float32, requirements=["C", "A"])
+
+
+def _to_convert(thing: Any) -> tuple[str, str] | None:
+    """What something is that people have in place of an array, and what to pass; None if it may be an array."""
+    first = next(iter(thing), None) if isinstance(thing, list | tuple) else None
+    kind = f"{type(thing).__module__}.{type(thing).__qualname__}"
+    if isinstance(thing, str | os.PathLike):
+        return (
+            f"the path {os.fspath(thing)!r:.80}",
+            "edgeperc.read_points(path), or each scan of edgeperc.read_scans(path)",
+        )
+    if isinstance(first, str | os.PathLike):
+        return "paths", "one scan a call, edgeperc.read_points(path)"
+    if isinstance(thing, bytes | bytearray):
+        return f"{len(thing):,} bytes", "np.frombuffer(data, np.float32).reshape(-1, 4), if these are float32"
+    if hasattr(thing, "__array__"):
+        return None
+    if all(hasattr(thing, name) for name in ("point_step", "fields", "data")):
+        return f"a PointCloud2 message ({kind})", "edgeperc.readers.clouds.cloud_points(message)"
+    if kind.startswith("open3d.") and hasattr(thing, "point"):
+        remission = "its intensity, if it has one, as the fourth column"
+        return f"a point cloud of Open3D ({kind})", f"cloud.point.positions.numpy(), with {remission}"
+    if kind.startswith("open3d.") and hasattr(thing, "points"):
+        return f"a point cloud of Open3D ({kind})", "np.asarray(cloud.points), which has no remission"
+    if isinstance(thing, tuple) and len(thing) in (2, 3) and isinstance(thing[1], np.ndarray) and thing[1].ndim == 2:
+        return (
+            "a scan with its stamp",
+            "its points alone, perceive(points, stamp_s), as in: for stamp_s, points in read_scans(...)",
+        )
+    if isinstance(thing, Iterator):
+        return f"an iterator ({kind})", "one scan a call, as in: for stamp_s, points in read_scans(...)"
+    if all(hasattr(thing, axis) for axis in "xyz"):
+        return f"an object with x, y and z ({kind})", "np.column_stack([cloud.x, cloud.y, cloud.z, remission])"
+    return None
 
 
 def table_columns(table: NDArray[Any]) -> dict[str, NDArray[Any]]:

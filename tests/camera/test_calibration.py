@@ -52,9 +52,12 @@ def test_matrices_are_kept_and_cannot_be_changed() -> None:
         (lambda K, T: K.__setitem__((1, 1), -700.0), "focal lengths above 0"),
         (lambda K, T: K.__setitem__((0, 2), 1e7), "up to 1e6 pixels"),
         (lambda K, T: K.__setitem__((0, 1), 2.0), "without skew"),
+        (lambda K, T: K.__setitem__((0, 2), 640.0), "center at 640, 239.5, outside the image of 640 x 480"),
+        (lambda K, T: K.__setitem__((0, 2), -20.0), "outside the image"),
+        (lambda K, T: K.__setitem__((1, 2), 600.0), r"outside the image.*calibration\.resized"),
         (lambda K, T: K.__setitem__((2, 2), 2.0), "without skew"),
         (lambda K, T: K.__setitem__((0, 0), np.nan), r"K has shape \(3, 3\); expected a finite"),
-        (lambda K, T: T.__setitem__((0, 3), np.inf), r"T_camera_sensor has shape \(4, 4\); expected a finite"),
+        (lambda K, T: T.__setitem__((0, 3), np.inf), r"T_camera_sensor has shape \(4, 4\); expected \(4, 4\) finite"),
         (lambda K, T: T.__setitem__((0, 1), -0.9), "expected a rotation"),
         (lambda K, T: T.__setitem__((slice(0, 2), slice(0, 3)), T[[1, 0], :3]), "expected a rotation"),  # mirrored
         (lambda K, T: T.__setitem__((0, 3), 270.0), "not millimeters"),

@@ -388,7 +388,7 @@ def test_the_scans_of_a_capture_are_numbered(capture: Path, tmp_path: Path, caps
     assert "5 scans, 2 failed" in captured.err
     written = {file.relative_to(out).as_posix(): file.stat().st_size // 4 for file in out.rglob("*.label")}
     assert written == {"drive/000000.label": 10, "drive/000002.label": 12, "a.label": 40}
-    assert run("info", capture) == 0
+    assert run("info", capture) == 1  # run refuses its ten points
     assert "10, of which 0 are not finite" in capsys.readouterr().out
 
 
@@ -551,6 +551,31 @@ def test_a_scan_is_never_overwritten(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert usage_code("run", ply, "--ply", "--out", tmp_path) == 2
     assert "would be overwritten" in capsys.readouterr().err
     assert ply.read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    ("options", "both"),
+    [
+        ("--mcap out/a --play out/a", "--mcap and --play"),
+        ("--rrd a --bag out/../a", "--rrd and --bag"),
+        ("--ply --out out --play out/0.ply", "--out and --play"),
+        ("--labels-for cvat --out out --mcap out/annotations.zip", "--mcap and --labels-for"),
+        ("--track --gif --out out --play out/tracks.gif", "--gif and --play"),
+        ("--static out --movable --play out/0.bin", "--play and --static"),
+        ("--mcap link/a --play out/a", "--mcap and --play"),
+    ],
+)
+def test_no_file_is_written_twice(
+    options: str, both: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "out").mkdir()
+    (tmp_path / "link").symlink_to(tmp_path / "out")
+    write_scan(tmp_path / "0.bin")
+    with pytest.raises(SystemExit):
+        run("run", "0.bin", *options.split())
+    assert f"{both} both write" in capsys.readouterr().err
+    assert not [*(tmp_path / "out").iterdir()]
 
 
 def test_wrong_usage(tmp_path: Path, capsys: pytest.CaptureFixture[str], fake: type[FakePerceiver]) -> None:

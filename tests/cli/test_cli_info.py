@@ -8,6 +8,7 @@ import json
 import shutil
 import subprocess
 import sys
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,6 +22,7 @@ from edgeperc.inference import listing, providers
 from edgeperc.preprocess.fitness import FitnessProfile
 from edgeperc.system import machine
 from edgeperc.types.card import ModelCard
+from edgeperc.types.frame import ModelFrame
 from edgeperc.types.sensor import SENSORS, SensorProfile, get_sensor
 from edgeperc.zoo import Variant
 from scenes import urban
@@ -102,7 +104,7 @@ def test_info_of_a_scan(tmp_path: Path, capsys: pytest.CaptureFixture[str], monk
     checked = []
 
     def check_fitness(
-        points: np.ndarray, profile: FitnessProfile | None, sensor: SensorProfile | None
+        points: np.ndarray, profile: FitnessProfile | None, sensor: SensorProfile | None, frame: ModelFrame
     ) -> tuple[str, ...]:
         checked.append((points, profile, sensor.name))
         return ("it has 32 beams",)
@@ -131,6 +133,76 @@ def test_info_of_a_scan(tmp_path: Path, capsys: pytest.CaptureFixture[str], monk
     assert document["models"] == {"pointseg": ["it has 32 beams"], "ssadnet": None}
 
 
+REFUSED: dict[str, Callable[[np.ndarray], np.ndarray]] = {
+    "millimeters": lambda scan: scan * np.float32([1e3, 1e3, 1e3, 1.0]),
+    "kilometers": lambda scan: scan * np.float32([1e-3, 1e-3, 1e-3, 1.0]),
+    "upside down": lambda scan: scan * np.float32([1.0, -1.0, -1.0, 1.0]),
+    "y up": lambda scan: scan[:, [0, 2, 1, 3]],
+    "raw remission": lambda scan: scan * np.float32([1.0, 1.0, 1.0, 255.0]),
+    "few points": lambda scan: scan[::2000],
+    "not finite": lambda scan: scan * np.float32(np.nan),
+    "empty beams": lambda scan: scan * np.float32(0.0),
+}
+
+
+@pytest.mark.parametrize("change", ["none", *REFUSED])
+def test_info_says_what_run_does(change: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The same exit code, and the whole advice."""
+    pytest.importorskip("onnxruntime")
+    scan = urban(3).points
+    file = tmp_path / "scan.bin"
+    np.ascontiguousarray(REFUSED.get(change, lambda scan: scan)(scan), np.float32).tofile(file)
+    refused = run("run", file, "--json")
+    assert refused == (change != "none")
+    error = json.loads(capsys.readouterr().out).get("error", "")
+    assert run("info", file) == refused
+    printed = capsys.readouterr()
+    shown = " ".join(line.partition(" ")[2].strip() for line in printed.out.splitlines())
+    assert ("edgeperc run refuses this scan" in shown) == refused
+    said = error.partition(" Results would be")[0]
+    if change not in ("none", "not finite", "few points", "empty beams"):
+        assert said in shown
+    assert " ..." not in printed.out
+    assert run("info", file, "--json") == refused
+    assert json.loads(capsys.readouterr().out)["refused"] is bool(refused)
+
+
+@pytest.mark.parametrize("command", ["run", "info"])
+@pytest.mark.parametrize(
+    ("option", "said"),
+    [
+        ("--sensor hdl64e", "did you mean hdl-64e?"),
+        ("--sensor absent.json", "absent.json"),
+        ("--extrinsic absent.json", "absent.json"),
+        ("--extrinsic 0.bin", "0.bin"),
+    ],
+)
+def test_a_wrong_sensor_is_one_error_before_the_first_scan(
+    command: str,
+    option: str,
+    said: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for k in range(4):
+        write_scan(tmp_path / f"{k}.bin")
+    assert run(command, *sorted(tmp_path.iterdir()), *option.split()) == 2
+    printed = capsys.readouterr()
+    assert len(printed.err.splitlines()) == 1
+    assert said in printed.err
+    assert not printed.out
+
+
+def test_only_what_is_given_is_called_so(drive: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for options, given in (("", 0), ("--mount-height 2.4", 1), ("--turn -90", 1), ("--mount-height 2.4 --turn -90", 2)):
+        run("info", drive / "0.bin", *options.split())
+        mounting = " ".join(capsys.readouterr().out.partition("\nmounting")[2].partition("\nbeams")[0].split())
+        assert mounting.count("(given)") == given
+        assert ("yaw 0.0 deg (not estimated)" in mounting) == ("--turn" not in options)
+
+
 def test_info_prints_a_card_as_it_is(capsys: pytest.CaptureFixture[str]) -> None:
     assert run("info", "ssadnet", "--json") == 0
     assert ModelCard.from_json(capsys.readouterr().out).to_json() == zoo.resolve("ssadnet")[0].card.to_json()
@@ -154,7 +226,7 @@ def test_info_and_lists_need_no_onnxruntime(tmp_path: Path) -> None:
     scan = write_scan(tmp_path / "a.bin", 40)
     code = (
         "import sys; from edgeperc.cli import main\n"
-        f"for words in (['info', 'pointseg', {str(scan)!r}], ['models'], ['sensors']): assert main(words) == 0\n"
+        f"for words in (['info', 'pointseg', {str(scan)!r}], ['models'], ['sensors']): assert main(words) in (0, 1)\n"
         "sys.exit('opened' if 'onnxruntime' in sys.modules else 0)\n"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
@@ -251,7 +323,7 @@ def drive(tmp_path: Path) -> Path:
     folder.mkdir()
     for k in range(3):
         scan = urban(k).points - np.float32([0.0, 0.0, 0.67, 0.0])
-        kept = np.hypot(scan[:, 0], scan[:, 1]) > (13.0 if k == 1 else 0.0)
+        kept = np.hypot(scan[:, 0], scan[:, 1]) > (60.0 if k == 1 else 0.0)
         scan[kept].tofile(folder / f"{k}.bin")
     return folder
 
@@ -301,6 +373,12 @@ def test_no_profile_is_written_without_ground_or_of_two_sensors(
     [
         (["--mount-height", "2.1"], {"height_m": 2.1}),
         (["--turn", "-90"], {"yaw_deg": -90.0}),
+        (["--roll", "-2.5"], {"roll_deg": -2.5}),
+        (
+            ["--pitch", "3", "--roll", "180", "--mount-height", "6"],
+            {"roll_deg": 180.0, "pitch_deg": 3.0, "height_m": 6.0},
+        ),
+        (["--extrinsic", "T.json", "--pitch", "4"], {"height_m": 1.9, "pitch_deg": 4.0, "yaw_deg": -90.0}),
         (["--extrinsic", "T.json"], {"height_m": 1.9, "roll_deg": 0.0, "pitch_deg": 0.0, "yaw_deg": -90.0}),
         (["--extrinsic", "T.json", "--mount-height", "3"], {"height_m": 3.0, "yaw_deg": -90.0}),
     ],
@@ -321,7 +399,15 @@ def test_run_uses_the_given_mounting(
 
 
 @pytest.mark.parametrize(
-    "options", [["--mount-height", "nan"], ["--turn", "left"], ["--mount-height", "1e9"], ["--extrinsic", "absent"]]
+    "options",
+    [
+        ["--mount-height", "nan"],
+        ["--turn", "left"],
+        ["--mount-height", "1e9"],
+        ["--extrinsic", "absent"],
+        ["--roll", "181"],
+        ["--pitch", "steep"],
+    ],
 )
 def test_impossible_mountings_are_refused(options: list[str], drive: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with contextlib.suppress(SystemExit):  # argparse

@@ -66,12 +66,12 @@ STRANGE = [
 OPTIONS = [
     "--json", "--out", "--png", "--html", "--labels", "--ply", "--track", "--sensor", "--model", "--provider",
     "--precision", "--threads", "--topic", "--on-mismatch", "--adapt", "--boxes-from", "--full-turn", "--rate",
-    "--trusted", "--anyway", "--mount-height", "--turn",
+    "--trusted", "--anyway", "--mount-height", "--roll", "--pitch", "--turn",
 ]  # fmt: skip
 USUAL = {
     "--sensor": [*SENSORS], "--model": ["lodnn"], "--on-mismatch": ["warn", "ignore"], "--provider": ["cpu", "auto"],
     "--precision": ["auto", "fp32"], "--threads": ["1"], "--adapt": ["none", "both"], "--boxes-from": ["network"],
-    "--rate": ["10"], "--mount-height": ["1.5"], "--turn": ["90"],
+    "--rate": ["10"], "--mount-height": ["1.5"], "--roll": ["-2"], "--pitch": ["3"], "--turn": ["90"],
 }  # fmt: skip
 TAKE_NONE = {"--json", "--png", "--html", "--labels", "--ply", "--track", "--full-turn", "--trusted", "--anyway"}
 

@@ -14,6 +14,7 @@ import numpy as np
 import test_apart as apart_tests
 import test_captures as capture_tests
 import test_clouds as cloud_tests
+import test_packet_messages as message_tests
 import test_packets as packet_tests
 
 __all__ = ["Seed", "pcap_records", "real_seeds", "synthetic_seeds"]
@@ -58,6 +59,9 @@ def synthetic_seeds(folder: Path) -> list[Seed]:
     seeds += [Seed("mcap", {"cap.mcap": foxglove}, "cap.mcap")] * 3
     plain = capture_tests.write_mcap(folder / "plain.mcap").read_bytes()
     seeds += [Seed("mcap", {"cap.mcap": plain}, "cap.mcap")] * 3
+    for kind, writer in (("bag1", "ROS 1"), ("mcap", "ROS 2"), ("mcap", "big-endian")):
+        path = message_tests.WRITERS[writer](folder, capture_tests.vlp16_packets(0.12), 4)
+        seeds.append(Seed(kind, {f"cap{path.suffix}": path.read_bytes()}, f"cap{path.suffix}"))
     for method in ("", "lz4", "zstd"):
         for summary in (True, False):
             packed = apart_tests.chunked_mcap(folder / "packed.mcap", method, summary=summary)

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
+from collections.abc import Callable
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +20,7 @@ import twins.frame
 from edgeperc import Box, FitnessError, ModelFrame, Mounting, MountingError, OptionError, Perceiver, SensorError
 from edgeperc.ground.leveling import FROZEN_AFTER, MountingEstimator
 from edgeperc.simulation.drawn import random_scene
+from edgeperc.simulation.samples import simulated_scan
 from edgeperc.simulation.scene import Scene, simulate
 from edgeperc.types.frame import fill_moved, turned
 from edgeperc.types.mounting import MODEL_MOUNTING
@@ -392,3 +396,108 @@ def test_a_sensor_that_hangs_is_described(yaw_deg: float) -> None:
         np.testing.assert_allclose(ModelFrame(mounting).move(hanging), ModelFrame(level).move(points), atol=1e-4)
     with pytest.raises(SensorError, match="-180 to 180"):
         Mounting(2.1, 181.0, 0.0)
+
+
+@pytest.mark.parametrize("height_m", [3.5, 5.0, 6.5, 8.0])
+@pytest.mark.parametrize("sensor", ["os1-64", "hdl-64e", "pandar64", "vlp-16", "os0-64"])
+def test_high_sensors_are_found_from_the_ground(sensor: str, height_m: float) -> None:
+    """On a truck, a pole or a crane: no ground may be seen within 12 m."""
+    high = replace(get_sensor(sensor), mounting=Mounting(height_m, 0.0, 0.0, 0.0))
+    errors = []
+    for seed in (1, 2, 3):  # in the second, the land is half a meter lower than the road
+        points = simulate(flat(random_scene(seed, "urban")), high, seed=seed).points
+        found = MountingEstimator(Mounting()).add(points)
+        assert not found.doubtful()
+        assert found.mounting().height_m == found.estimate().mounting.height_m
+        errors.append(abs((found.mounting().height_m or 0.0) - height_m))
+        given = MountingEstimator(Mounting(height_m)).add(points).mounting()
+        assert given.height_m == height_m
+        assert given.roll_deg == pytest.approx(0.0, abs=1.0)
+    assert np.median(errors) < 0.1
+    assert max(errors) < 0.6
+
+
+def test_heights_above_uneven_land_are_nearly_found() -> None:
+    errors = []
+    for sensor, height_m, seed in product(("os1-64", "hdl-64e", "pandar64", "vlp-16"), (3.0, 5.0, 6.5), range(40, 45)):
+        points = simulated_scan(seed, sensor, mounting=Mounting(height_m, 0.0, 0.0, 0.0)).points
+        found = MountingEstimator(Mounting()).add(points).mounting().height_m
+        errors.append(abs((found or 0.0) - height_m))
+    assert np.quantile(errors, 0.9) < 0.5
+    assert np.median(errors) < 0.2
+
+
+@pytest.mark.parametrize(("roll_deg", "pitch_deg"), [(4.0, -3.0), (0.0, 8.0), (-5.0, 5.0)])
+def test_high_sensors_that_lean_are_found(roll_deg: float, pitch_deg: float) -> None:
+    high = replace(get_sensor("os1-64"), mounting=Mounting(6.0, 0.0, 0.0, 0.0))
+    level = simulate(flat(random_scene(3, "urban")), high, seed=3).points
+    level[:, 2] += 6.0 - 1.73
+    found = MountingEstimator(Mounting()).add(seen_by(Mounting(6.0, roll_deg, pitch_deg, 0.0), level)).mounting()
+    assert found.height_m == pytest.approx(6.0, abs=0.2)
+    assert found.roll_deg == pytest.approx(roll_deg, abs=1.0)
+    assert found.pitch_deg == pytest.approx(pitch_deg, abs=1.0)
+
+
+@pytest.mark.parametrize("seed", range(1, 7))
+def test_land_below_a_bridge_is_not_its_road(seed: int) -> None:
+    """A road 8 m wide, and land 6 m lower; the deck hides what is near."""
+    points = simulate(flat(random_scene(seed, "urban")), "hdl-64e", seed=seed).points
+    beside = np.abs(points[:, 1]) > 4.0
+    points[beside, 2] -= 6.0
+    seen = points[~beside | (np.abs(points[:, 1]) > 17.0)]
+    assert MountingEstimator(Mounting()).add(seen).mounting().height_m == pytest.approx(1.73, abs=0.1)
+
+
+Surface = Callable[[NDArray[np.float32], NDArray[np.float32]], NDArray[np.float32]]
+UNEVEN: dict[str, Surface] = {
+    "a ramp ahead": lambda x, y: 0.06 * np.maximum(x, 0.0),
+    "a ridge": lambda x, y: -0.06 * np.abs(x - 5.0),
+    "a bank": lambda x, y: 0.1 * np.maximum(y - 1.0, 0.0) + 0.05 * y,
+    "a twisted street": lambda x, y: 0.006 * x * y + 0.05 * x,
+}
+
+
+@pytest.mark.parametrize("surface", UNEVEN)
+def test_one_scan_of_uneven_ground_does_not_level_the_sensor(scans: list[NDArray[np.float32]], surface: str) -> None:
+    scan = scans[0].copy()
+    scan[:, 2] += UNEVEN[surface](scan[:, 0], scan[:, 1])
+    found = MountingEstimator(Mounting()).add(scan)
+    assert found.doubtful()
+    for name in found.doubtful():
+        assert abs(getattr(found.estimate().mounting, name)) > 1.5
+        assert getattr(found.mounting(), name) == getattr(MODEL_MOUNTING, name)
+    # Even ground of the same slope is a tilt as far as the models are concerned, and so is one that several scans show.
+    scan = scans[0].copy()
+    scan[:, 2] += 0.05 * scan[:, 1] - 0.06 * scan[:, 0]
+    even = MountingEstimator(Mounting()).add(scan)
+    assert not even.doubtful()
+    assert even.mounting().roll_deg == pytest.approx(-2.9, abs=0.5)
+    assert even.mounting().pitch_deg == pytest.approx(-3.4, abs=0.5)
+    for _ in range(4):
+        found = found.add(seen_by(Mounting(1.73, 5.0, -4.0, 0.0), scans[1]))
+    assert not found.doubtful()
+    assert found.mounting().roll_deg == pytest.approx(5.0, abs=0.7)
+    assert found.mounting().pitch_deg == pytest.approx(-4.0, abs=0.7)
+
+
+@pytest.mark.parametrize(
+    ("known", "doubtful"),
+    [(Mounting(), True), (Mounting(1.73), True), (Mounting(pitch_deg=0.5), False), (Mounting(1.73, 0.0, 0.5), False)],
+)
+def test_a_doubtful_tilt_is_told_of(scans: list[NDArray[np.float32]], known: Mounting, doubtful: bool) -> None:
+    scan = scans[0].copy()
+    scan[:, 2] += UNEVEN["a ramp ahead"](scan[:, 0], scan[:, 1])
+    perceive = Perceiver("pointseg", mounting=known, provider="cpu")
+    with pytest.warns(UserWarning, match="--pitch") if doubtful else contextlib.nullcontext():
+        found = perceive(scan)
+    told = [sentence for sentence in found.fitness if "--pitch" in sentence]
+    assert len(told) == doubtful
+    assert found.mounting.pitch_deg == (0.66 if doubtful else 0.5)
+
+
+def test_the_ground_around_a_bridge_is_no_tilt(data_root: Callable[[str], Path]) -> None:
+    """A crowd on a bridge over a canal; the sensor is level."""
+    scan = np.fromfile(data_root("other_roads") / "vod" / "velodyne" / "01201.bin", np.float32).reshape(-1, 4)
+    found = MountingEstimator(Mounting()).add(scan)
+    assert set(found.doubtful()) == {"roll_deg", "pitch_deg"}
+    assert found.mounting() == MODEL_MOUNTING

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import pickle
 from collections.abc import Callable
 from dataclasses import replace
@@ -15,11 +16,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from edgeperc.errors import MountingError
+from edgeperc.ground.leveling import MountingEstimator
 from edgeperc.preprocess.condition import condition
-from edgeperc.preprocess.findings import Finding, check_beams, check_fitness
+from edgeperc.preprocess.findings import Finding, check_beams, check_fitness, check_profiles, with_raw_remission
 from edgeperc.preprocess.fitness import FitnessProfile
 from edgeperc.readers.files import read_points
 from edgeperc.simulation.samples import simulated_scan
+from edgeperc.types.frame import ModelFrame
+from edgeperc.types.mounting import Mounting
 from edgeperc.types.sensor import SENSORS, get_sensor
 from edgeperc.zoo import listed
 
@@ -108,6 +113,33 @@ def test_another_scale_of_remission(factor: float) -> None:
         assert any("emission" in sentence for sentence in gross(street(seed) * np.float32([1, 1, 1, factor])))
 
 
+@pytest.mark.parametrize("sensor", [name for name in SENSORS if get_sensor(name).remission is not None])
+@pytest.mark.parametrize("brightest", [1.0, 0.3])
+def test_a_remission_of_another_unit_is_not_called_missing(sensor: str, brightest: float) -> None:
+    """A profile's logarithm maps 0..1 to nothing where it expects 0..255."""
+    profile = get_sensor(sensor)
+    raw = simulated_scan(1, sensor).points.copy()
+    raw[:, 3] *= brightest / raw[:, 3].max()
+    scan = condition(raw, profile)[0]
+    for fitness in PROFILES:
+        found = with_raw_remission(check_fitness(scan, fitness, profile), raw[:, 3], profile)
+        about = [finding for finding in found if "emission" in finding]
+        assert any(finding.gross for finding in about) or sensor == "pandar64"  # whose function is weaker
+        assert not any("missing" in finding for finding in found)
+        raw_range = f"{profile.remission_range[0]:g} to {profile.remission_range[1]:g}"
+        assert any(raw_range in finding and "(0, 1)" in finding for finding in about)
+
+
+@pytest.mark.parametrize("value", [0.0, np.nan, 7.0])
+def test_a_missing_remission_is_called_so(value: float) -> None:
+    profile = get_sensor("hdl-32e")
+    raw = simulated_scan(1, "hdl-32e").points.copy()
+    raw[:, 3] = value
+    zeros = (Finding("Remission is 0 for 100% of the points: the field is missing", True), Finding("another"))
+    assert with_raw_remission(zeros, raw[:, 3], profile) == zeros
+    assert with_raw_remission((), raw[:, 3] + 1.0, profile) == ()
+
+
 def room(half_m: float, height_m: float) -> Points:
     """The walls, floor and ceiling of a room, as a VLP-16 in its middle sees them."""
     elevation, azimuth = np.meshgrid(np.radians(np.arange(-15.0, 16.0, 2.0)), np.radians(np.arange(0.0, 360.0, 0.2)))
@@ -169,6 +201,76 @@ def test_rooms_whose_floor_is_ground(sensor: str, size: tuple[float, float, floa
 @pytest.mark.parametrize("sensor", ["hdl-64e", "vlp-16", "os1-64"])
 def test_narrow_and_covered_roads_are_no_rooms(sensor: str, size: tuple[float, float, float], what: str) -> None:
     assert not any("a room" in sentence for sentence in gross(enclosed(size, 1.73, sensor), sensor)), what
+
+
+def leveled(points: Points, sensor: str) -> list[Finding]:
+    """What differs if the mounting is found from the ground, as a Perceiver does it; remission is in 0..1."""
+    profile = replace(get_sensor(sensor), remission_range=(0.0, 1.0), remission=None)
+    estimator = MountingEstimator(Mounting())
+    with contextlib.suppress(MountingError):
+        estimator = estimator.add(points)
+    frame = ModelFrame(estimator.mounting())
+    return [*check_beams(points, profile), *check_profiles(frame.move(points), PROFILES, profile, frame)]
+
+
+def office(sensor: str, seed: int, window: float) -> Points:
+    """A room with furniture, as a sensor 1 m above its floor sees it: a share of the rays that meet the upper half of
+    one wall goes on through windows, and those that meet a door go on into a corridor.
+    """
+    rng = np.random.default_rng(seed)
+    elevation, azimuth = np.meshgrid(
+        np.radians(get_sensor(sensor).elevations_deg), np.radians(np.arange(-180.0, 180.0, 0.3)), indexing="ij"
+    )
+    level = np.cos(elevation).ravel()
+    way = np.column_stack([level * np.cos(azimuth).ravel(), level * np.sin(azimuth).ravel(), np.sin(elevation).ravel()])
+    size = np.array([8.5, 6.5, 2.6])
+    high = np.array([*(rng.uniform(0.3, 0.7, 2) * size[:2]), 1.6])
+    low = high - size
+    with np.errstate(divide="ignore", invalid="ignore"):
+        walls = np.where(way > 0.0, high / way, np.where(way < 0.0, low / way, np.inf))
+        distance, wall = walls.min(axis=1), walls.argmin(axis=1)
+        x, y, z = (way * distance[:, None]).T
+        goes_on = (wall == 0) & (z > 0.0) & (z < 1.2) & (rng.random(len(x)) < window) & (x > 0.0)
+        goes_on |= (wall == 1) & (y > 0.0) & (np.abs(x) < 0.5) & (z < 1.0)
+        distance = np.where(goes_on, distance + rng.uniform(3.0, 30.0, len(x)), distance)
+        for _ in range(15):
+            corner, extent = rng.uniform(low, high), rng.uniform([0.3, 0.3, 0.4], [1.5, 1.2, 1.8])
+            if np.hypot(*corner[:2]) > 2.0:
+                corner[2] = low[2]
+                sides = np.stack([corner / way, (corner + extent) / way])
+                near, far = sides.min(axis=0).max(axis=1), sides.max(axis=0).min(axis=1)
+                distance = np.where((near < far) & (near > 0.0), np.minimum(distance, near), distance)
+    remission = rng.uniform(0.1, 0.6, len(way))
+    return np.column_stack([way * distance[:, None], remission]).astype(np.float32)
+
+
+@pytest.mark.parametrize("sensor", ["hdl-64e", "vlp-16", "os1-64", "pandar64", "os0-64", "hdl-32e"])
+@pytest.mark.parametrize("window", [0.0, 0.2, 0.4])
+def test_rooms_with_furniture_windows_and_doors(sensor: str, window: float) -> None:
+    for seed in SEEDS:
+        assert any("a room" in finding for finding in leveled(office(sensor, seed, window), sensor) if finding.gross)
+
+
+@pytest.mark.parametrize(
+    ("size", "is_hall"),
+    [
+        ((400.0, 4.0, 6.0), False),
+        ((300.0, 8.0, 5.0), False),
+        ((200.0, 3.0, 7.0), False),
+        ((60.0, 20.0, 4.5), False),
+        ((26.0, 24.0, 3.0), True),
+        ((20.0, 18.0, 4.0), True),
+    ],
+    ids=["alley", "tunnel", "narrow alley", "underpass", "garage", "hall"],
+)
+@pytest.mark.parametrize("sensor", ["hdl-64e", "vlp-16", "os1-64", "pandar64", "os0-64", "vlp-32c"])
+def test_ceilings_and_walls_are_not_taken_for_the_ground(
+    sensor: str, size: tuple[float, float, float], is_hall: bool
+) -> None:
+    """Most points may be on them; the road is below all the same."""
+    found = leveled(enclosed(size, 1.73, sensor) / np.float32([1, 1, 1, get_sensor(sensor).remission_range[1]]), sensor)
+    assert [finding for finding in found if finding.gross] == []
+    assert any("a garage or a hall" in finding for finding in found) or not is_hall
 
 
 @pytest.mark.parametrize("crop_m", [8.0, 12.0, 20.0])
@@ -261,3 +363,27 @@ def test_spoilt_real_scans_are_refused(kitti_root: Path, fault: str) -> None:
 def test_the_frame_of_a_map(seed: int, direction_deg: float, distance_m: float) -> None:
     away = distance_m * np.array([np.cos(np.radians(direction_deg)), np.sin(np.radians(direction_deg)), 0.0, 0.0])
     assert any("is not at the" in sentence for sentence in gross(street(seed) + away))
+
+
+@pytest.mark.parametrize("height_m", [3.0, 5.0, 6.5, 8.0])
+@pytest.mark.parametrize("sensor", ["os1-64", "hdl-64e", "vlp-16", "pandar64"])
+def test_high_sensors_are_accepted_with_their_height(sensor: str, height_m: float) -> None:
+    """They see little of the ground near by, and objects from above: as high as their beams, in their own frame."""
+    profile = replace(get_sensor(sensor), remission_range=(0.0, 1.0), remission=None)
+    for seed in SEEDS:
+        points = condition(simulated_scan(seed, sensor, mounting=Mounting(height_m, 0.0, 0.0, 0.0)).points, profile)[0]
+        frame = ModelFrame(Mounting(height_m, 0.0, 0.0, 0.0))
+        assert not any(finding.gross for finding in check_profiles(frame.move(points), PROFILES, profile, frame))
+        wrong = ModelFrame(Mounting(height_m + 3.0, 0.0, 0.0, 0.0))
+        found = [finding for finding in check_profiles(wrong.move(points), PROFILES, profile, wrong) if finding.gross]
+        assert any("another height" in finding or "above the sensor" in finding for finding in found)
+
+
+@pytest.mark.parametrize(("roll_deg", "pitch_deg"), [(0.0, 15.0), (0.0, 30.0), (-20.0, 5.0)])
+def test_sensors_that_lean_are_accepted_with_their_tilt(roll_deg: float, pitch_deg: float) -> None:
+    """A part of the beams points higher than that of a level sensor."""
+    mounting = Mounting(6.0, roll_deg, pitch_deg, 0.0)
+    profile, frame = replace(get_sensor("os1-64"), remission_range=(0.0, 1.0), remission=None), ModelFrame(mounting)
+    for seed in SEEDS:
+        points = condition(simulated_scan(seed, "os1-64", mounting=mounting).points, profile)[0]
+        assert not any(finding.gross for finding in check_profiles(frame.move(points), PROFILES, profile, frame))

@@ -186,6 +186,7 @@ def test_polygons_are_valid(
     assert polygon.exterior.is_ccw
     assert polygon.area > 0.0
     assert found.factor == 1.0 or tolerance > 0.0
+    assert len(found.outer) <= max_corners or tolerance == 0.0
     standing = shape_of(objects)
     assert polygon.intersection(standing).area < 1e-9
     for hole in found.holes:
@@ -214,6 +215,22 @@ def test_the_outline_has_few_corners(cells: NDArray[np.bool_], max_corners: int)
     found = outline_of(cells, (0.0, 0.0), nothing, nothing, tolerance=2.0, max_corners=max_corners)
     assert len(found.outer) <= max_corners
     assert found.holes == ()
+
+
+@settings(max_examples=200)
+@given(st.integers(0, 2**32), st.integers(4, 60), st.floats(0.5, 4.0), st.sampled_from([0.002, 0.01, 0.05, 0.3]))
+def test_holes_do_not_cost_corners(seed: int, max_corners: int, tolerance: float, density: float) -> None:
+    """A road full of obstacles, and of any shape, has few corners, too; it covers none of them."""
+    random = np.random.default_rng(seed)
+    cells = np.kron(random.random((6, 5)) < 0.8, np.ones((8, 8), np.bool_))
+    objects = random.random(cells.shape) < density
+    cells &= ~objects
+    found = outline_of(cells, (48.0, 20.0), objects, objects, tolerance=tolerance, max_corners=max_corners)
+    assert len(found.outer) <= max_corners
+    polygon = polygon_of(found)
+    assert polygon.is_valid
+    assert polygon.area > 0.0 or not cells.any()
+    assert polygon.intersection(shape_of(objects)).area < 1e-9
 
 
 @given(streets(12))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -353,6 +354,27 @@ def test_a_scan_that_cannot_be_written_leaves_the_bag_whole(tmp_path: Path) -> N
     sink.write(perceived(2.0))
     sink.close()
     assert len(read_bag(tmp_path / "bag")) == 2 * len(OUTPUTS)
+
+
+@pytest.mark.parametrize("storage", storages())
+@pytest.mark.parametrize("size_kib", [64, 400])
+def test_a_full_disk_leaves_a_part_with_the_scans_before(
+    tmp_path: Path, small_disk: Callable[[int], Path], storage: Any, size_kib: int
+) -> None:
+    sink, n = BagSink(small_disk(size_kib) / "bag", storage=storage), 0
+    scan = perceived(1.0)
+    with pytest.raises(OSError, match=r"full|No space"):  # noqa: PT012
+        for n in range(1000):
+            sink.write(replace(scan, stamp_s=float(n)))
+    with pytest.raises(OSError, match=r"full|No space"):
+        sink.write(scan)
+    with pytest.warns(RuntimeWarning, match=r"bag\.part"):
+        sink.close()
+    (part,) = (tmp_path / "disk").iterdir()
+    assert part.name == "bag.part"
+    assert not (part / "metadata.yaml").exists()  # they would promise what is not there
+    if storage == "sqlite3" and n:
+        assert [stamp_s for stamp_s, _ in read_scans(part)] == [*map(float, range(n))]
 
 
 def test_an_old_rosbags_writes_no_mcap(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

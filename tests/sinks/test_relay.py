@@ -17,10 +17,10 @@ from typing import Any
 import pytest
 
 from edgeperc.cli.program import run_program
-from edgeperc.cli.sinks import SINKS, open_sinks
+from edgeperc.cli.sinks import SINKS, Sinks
 from edgeperc.sinks import relay as relay_module
-from edgeperc.sinks.kept_file import KeptFile
 from edgeperc.sinks.relay import MAX_VIEWERS, Relay
+from edgeperc.sinks.run_file import RunFile
 from edgeperc.system.lanes import returns
 
 PATIENCE_S = 60.0  # of a test whose fault would be to wait for ever
@@ -184,22 +184,22 @@ def test_files_are_finished_before_what_is_served(tmp_path: Path, monkeypatch: p
     closed: list[str] = []
     ended = ServeSink.close
 
-    def close(sink: Any) -> None:
-        closed.append(type(sink).__name__)
+    def close(sink: Any, whole: bool) -> None:
+        closed.append(f"{type(sink).__name__} {whole}")
         if isinstance(sink, ServeSink):
             ended(sink)
 
     monkeypatch.setattr(McapSink, "close", close)
     monkeypatch.setattr(ServeSink, "close", close)
-    arguments = argparse.Namespace(**dict.fromkeys(SINKS))
+    arguments = argparse.Namespace(**dict.fromkeys(SINKS), live=False)
     arguments.mcap, arguments.serve = tmp_path / "run.mcap", ("127.0.0.1", 0)
-    with ExitStack() as stack:
-        assert len(open_sinks(arguments, stack)) == 2
-    assert closed == ["McapSink", "ServeSink"]
+    with Sinks(arguments):
+        assert not closed
+    assert closed == ["McapSink True", "ServeSink True"]
 
 
 @pytest.mark.skipif(os.name != "posix", reason="signals differ elsewhere")
-def test_a_signal_acts_after_what_a_library_called() -> None:
+def test_a_signal_acts_after_what_a_library_called(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Native code loses an exception of the file that it writes to."""
     whole: list[bool] = []
 
@@ -208,8 +208,11 @@ def test_a_signal_acts_after_what_a_library_called() -> None:
             signal.raise_signal(signal.SIGTERM)
             whole.append(True)
 
+    monkeypatch.setattr(Path, "open", lambda *_: File())
+    file = RunFile(tmp_path / "file")
+
     def command() -> int:
-        assert KeptFile(File()).write(b"12") == 2
+        assert file.write(b"12") == 2
         time.sleep(PATIENCE_S)
         return 0
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
-from contextlib import ExitStack
+from contextlib import suppress
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from cli_helpers import POINTSEG, run
 from edgeperc import Box, OptionError, Perception, PointLabels, PointsError, Tracker, Tracks, read_points
 from edgeperc.cli.main import build_parser
-from edgeperc.cli.sinks import open_sinks
+from edgeperc.cli.sinks import Sinks
 from edgeperc.records import PerceivedScan
 from edgeperc.sinks.static import StaticSink
 from edgeperc.types.sensor import get_sensor
@@ -167,12 +167,57 @@ def test_the_command_writes_every_scan(tmp_path: Path, monkeypatch: pytest.Monke
 
 def test_a_sink_made_before_one_that_cannot_be_is_closed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     closed = []
-    monkeypatch.setattr("edgeperc.sinks.page.PageSink.close", lambda self: closed.append(self))
+    monkeypatch.setattr("edgeperc.sinks.page.PageSink.close", lambda self, whole: closed.append(self))
     (tmp_path / "file").write_bytes(b"")
     options = ["--play", str(tmp_path / "play.html"), "--static", str(tmp_path / "file"), "--movable"]
     arguments = build_parser().parse_args(["run", str(tmp_path), *options])
-    with ExitStack() as stack:
-        with pytest.raises(OSError, match="file"):
-            open_sinks(arguments, stack)
-        assert not closed
+    with pytest.raises(OSError, match="file"):
+        Sinks(arguments)
     assert len(closed) == 1
+
+
+def test_a_sink_that_fails_costs_the_others_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Each gets every scan and is closed; the run is told the first error of a scan, and how many files failed."""
+    options = ["--play", str(tmp_path / "play.html"), "--static", str(tmp_path / "static"), "--movable"]
+    arguments = build_parser().parse_args(["run", str(tmp_path), *options])
+    perception = Perception(2, 0, None, None, (AHEAD,), {}, {}, (), None)
+    points = np.zeros((2, 4), np.float32)
+    with Sinks(arguments) as sinks:
+        for k in range(3):
+            scan = PerceivedScan(f"{k}.bin", float(k), points, perception, None, get_sensor("hdl-64e"))
+            if k == 1:
+                (tmp_path / "static").rename(tmp_path / "away")
+                with pytest.raises(FileNotFoundError, match="static"):
+                    sinks.write(scan)
+                (tmp_path / "away").rename(tmp_path / "static")
+            else:
+                sinks.write(scan)
+        (tmp_path / "play.html").mkdir()  # a page cannot replace a folder
+    assert {file.name for file in (tmp_path / "static").iterdir()} == {"0.bin", "2.bin"}
+    assert sinks.n_failed == 1
+    assert "play.html" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("live", "error", "names"),
+    [
+        (False, None, {"play.html"}),
+        (False, KeyboardInterrupt, {"play.html.part"}),
+        (False, PointsError, {"play.html.part"}),
+        (True, KeyboardInterrupt, {"play.html"}),
+        (True, SystemExit, {"play.html"}),
+        (True, OSError, {"play.html.part"}),
+    ],
+)
+@pytest.mark.filterwarnings("ignore:.*was not written to its end:RuntimeWarning")
+def test_only_a_live_source_is_whole_when_it_is_interrupted(
+    tmp_path: Path, live: bool, error: type[BaseException] | None, names: set[str]
+) -> None:
+    options = ["--play", str(tmp_path / "play.html"), *(["--live"] if live else [])]
+    arguments = build_parser().parse_args(["run", str(tmp_path), *options])
+    perception = Perception(2, 0, None, None, (AHEAD,), {}, {}, (), None)
+    with suppress(*(() if error is None else (error,))), Sinks(arguments) as sinks:
+        sinks.write(PerceivedScan("0.bin", 0.0, np.zeros((2, 4), np.float32), perception, None, get_sensor("hdl-64e")))
+        if error is not None:
+            raise error
+    assert {file.name for file in tmp_path.iterdir()} == names

@@ -10,8 +10,11 @@ import socket
 import struct
 import threading
 import time
+import zipfile
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from dataclasses import replace
+from importlib.util import find_spec
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -23,12 +26,13 @@ from hypothesis import strategies as st
 from test_pages import HOSTILE, perceived
 from test_pictures import CAR, VAN, a_perception, a_scan
 
-from edgeperc import Mounting, Tracker, cli
+from edgeperc import Mounting, Tracker, cli, read_scans
 from edgeperc.errors import MissingExtraError, OptionError, PointsError
 from edgeperc.records import PerceivedScan, Sink
 from edgeperc.simulation.drawn import random_scene
 from edgeperc.simulation.scene import simulate_sequence
 from edgeperc.sinks.page import PageSink
+from edgeperc.sinks.prelabels import PrelabelSink
 from edgeperc.sinks.scene import colored_points, nanoseconds
 from edgeperc.types.frame import ModelFrame, quaternion
 from edgeperc.types.perception import Box
@@ -327,10 +331,13 @@ def test_a_full_disk_is_an_error(small_disk: Any) -> None:
             sink.write(replace(scans[k % 8], stamp_s=float(k)))
     with pytest.raises(OSError, match="No space"):
         sink.write(scans[0])
-    with pytest.raises(OSError, match="No space"):
+    with pytest.warns(RuntimeWarning, match=r"run\.mcap\.part"):
         sink.close()
-    assert [p.name for p in folder.iterdir()] == ["run.mcap"]
+    assert {p.name for p in folder.iterdir()} == {"run.mcap", "run.mcap.part"}
     assert (folder / "run.mcap").read_bytes() == b"old"
+    reading: Any = read_scans(folder / "run.mcap.part")
+    with closing(reading):
+        np.testing.assert_array_equal(next(reading)[1][:, :3], scans[0].points[:, :3])  # what there is of it
 
 
 class Viewer:
@@ -524,12 +531,71 @@ def test_rrd_without_room_is_an_error(small_disk: Any) -> None:
     from edgeperc.sinks.rerun import RerunSink
 
     folder = small_disk(1024)
-    sink = RerunSink(folder / "run.rrd")
-    with pytest.raises(OSError, match="does not fit"):
-        sink.write(a_run(8)[-1])
-    with pytest.raises(OSError, match="does not fit"):
+    sink, scans = RerunSink(folder / "run.rrd"), a_run()
+    with pytest.raises(OSError, match="No space"):  # noqa: PT012
+        for k in range(100):
+            sink.write(replace(scans[k % 8], stamp_s=float(k)))
+    with pytest.raises(OSError, match="No space"):
+        sink.write(scans[0])
+    with pytest.warns(RuntimeWarning, match=r"run\.rrd\.part"):
         sink.close()
-    assert not [*folder.iterdir()]
+    assert [p.name for p in folder.iterdir()] == ["run.rrd.part"]
+
+
+def read_page(path: Path) -> list[Any]:
+    scans: list[Any] = scene_of(path)["scans"]
+    return scans
+
+
+def read_cvat(path: Path) -> list[Any]:
+    with zipfile.ZipFile(path) as archive:
+        items: list[Any] = json.loads(archive.read("annotations/default.json"))["items"]
+    return items
+
+
+def sinks_of_a_run(folder: Path) -> Iterator[tuple[Sink, str, Callable[[Path], list[Any]]]]:
+    """Each sink that writes one file of a run; the file's name, and a list of its scans."""
+    yield PageSink(folder / "run.html"), "run.html", read_page
+    yield PrelabelSink(folder, "cvat"), "annotations.zip", read_cvat
+    if find_spec("foxglove"):
+        from edgeperc.sinks.foxglove import McapSink
+
+        yield McapSink(folder / "run.mcap"), "run.mcap", lambda path: read_mcap(path)["/points"]
+    if find_spec("rerun"):
+        from edgeperc.sinks.rerun import RerunSink
+
+        yield RerunSink(folder / "run.rrd"), "run.rrd", lambda path: read_rrd(path)["/world/lidar/points"]["stamp"]
+    if find_spec("rosbags"):
+        from edgeperc.sinks.rosbag import BagSink
+
+        yield BagSink(folder / "bag"), "bag", lambda path: [*read_scans(path)]
+
+
+@pytest.mark.parametrize("before", [b"of an older run", None])
+def test_a_run_that_ends_early_replaces_nothing(tmp_path: Path, before: bytes | None) -> None:
+    scans = a_run(3)
+    for sink, name, read in sinks_of_a_run(tmp_path):
+        target = tmp_path / name
+        if before is not None and name != "bag":
+            target.write_bytes(before)
+        for scan in scans:
+            sink.write(scan)
+        with pytest.warns(RuntimeWarning, match=f"{name}.part"):
+            sink.close(whole=False)
+        assert len({str(each) for each in read(tmp_path / f"{name}.part")}) == 3  # and the part can be read
+        assert (target.read_bytes() if target.exists() else None) == (None if name == "bag" else before)
+        sink.close()
+    assert not [file for file in tmp_path.iterdir() if file.name.startswith(".")]
+
+
+def test_classes_of_a_run_that_ends_early_replace_no_list(tmp_path: Path) -> None:
+    sink = PrelabelSink(tmp_path, "labelcloud")
+    sink.write(a_run()[0])
+    (tmp_path / "labels/_classes.json").write_text("of an older run")
+    with pytest.warns(RuntimeWarning, match=r"_classes\.json\.part"):
+        sink.close(whole=False)
+    assert (tmp_path / "labels/_classes.json").read_text() == "of an older run"
+    assert json.loads((tmp_path / "labels/_classes.json.part").read_text())["classes"]
 
 
 def scene_of(path: Path) -> dict[str, Any]:

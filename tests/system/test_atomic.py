@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from edgeperc.system.atomic import open_atomic, write_atomic
+from edgeperc.system.atomic import name_whole, open_atomic, write_atomic
 
 
 def test_a_written_file_replaces_the_old_one(tmp_path: Path) -> None:
@@ -27,6 +27,29 @@ def test_readers_see_the_old_file_until_the_new_one_is_complete(tmp_path: Path) 
         file.flush()
         assert path.read_bytes() == b"old"
     assert path.read_bytes() == "Straße".encode()
+
+
+@pytest.mark.parametrize("content", [b"", b"few", bytes(100_000)])
+def test_what_has_its_name_is_on_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, content: bytes) -> None:
+    """After a loss of power a file is whole, too: its content is there before its name."""
+    path, synced = tmp_path / "file.bin", []
+    sync = os.fsync
+
+    def noted(number: int) -> None:
+        synced.append((os.fstat(number).st_ino, os.fstat(number).st_size, path.exists()))
+        sync(number)
+
+    monkeypatch.setattr(os, "fsync", noted)
+    write_atomic(path, content)
+    assert synced == [(path.stat().st_ino, len(content), False)]
+    folder, files = tmp_path / "beside", {"a": b"1", "b/c": content}
+    for name, inside in files.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_bytes(inside)
+    synced.clear()
+    name_whole(folder, tmp_path / "folder")
+    assert sorted(size for _, size, _ in synced) == sorted(map(len, files.values()))
+    assert {name: (tmp_path / "folder" / name).read_bytes() for name in files} == files
 
 
 def write_half(path: Path) -> None:

@@ -428,6 +428,12 @@ def test_errors_leave_the_tracker_as_it_was(posed: bool) -> None:
     for wrong in (np.eye(3), 2.0 * np.eye(4), MIRRORED, np.full((4, 4), np.nan), "pose"):
         with pytest.raises(TrackingError, match="T_world_sensor"):
             Tracker().update([], 0.0, wrong)
+    for no_boxes in (None, 1, [None], "box"):
+        with pytest.raises(TrackingError, match=r"pass edgeperc\.Box objects"):
+            Tracker().update(no_boxes, 0.0)  # type: ignore[arg-type]
+    for no_time in (None, "now", [], 10**400):
+        with pytest.raises(StampError, match="expected the time of the scan"):
+            Tracker().update([], no_time)  # type: ignore[arg-type]
 
 
 def test_what_comes_out_is_the_callers() -> None:

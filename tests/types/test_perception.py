@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import copy
 import json
 import math
+import pickle
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -98,6 +102,30 @@ def test_perception_as_json_counts_points_by_class() -> None:
     empty = perception_of(labels=False).to_dict()
     assert empty.keys() == document.keys()
     assert empty["point_counts"] is empty["drivable_area_m2"] is empty["stamp_s"] is None
+
+
+COPIES: dict[str, Callable[[Any], Any]] = {
+    "pickle": lambda thing: pickle.loads(pickle.dumps(thing)),
+    "old pickle": lambda thing: pickle.loads(pickle.dumps(thing, 0)),
+    "copy": copy.copy,
+    "deepcopy": copy.deepcopy,
+    "replace": replace,
+}
+
+
+@pytest.mark.parametrize("how", COPIES)
+@pytest.mark.parametrize("made", [perception_of(CAR, stamp_s=12.5), perception_of(), perception_of(labels=False)])
+def test_a_perception_is_pickled_and_copied(how: str, made: Perception) -> None:
+    made = replace(made, stage_ms=MappingProxyType({"infer": 1.5}), providers=MappingProxyType({"a": "b"}))
+    copied = COPIES[how](made)
+    assert copied.to_dict() == made.to_dict()
+    assert (copied.stage_ms, copied.boxes, copied.fitness) == (made.stage_ms, made.boxes, made.fitness)
+    if made.points is not None:
+        np.testing.assert_array_equal(copied.points.labels, made.points.labels)
+    if made.top_view is not None:
+        np.testing.assert_array_equal(copied.top_view.observed, made.top_view.observed)
+    with pytest.raises(TypeError):  # as before
+        copied.stage_ms["infer"] = 0.0
 
 
 def test_only_observed_road_is_in_the_json() -> None:

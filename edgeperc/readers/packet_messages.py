@@ -1,0 +1,104 @@
+"""Messages of drivers that hold a LiDAR's packets: a Velodyne's, which are decoded, and others, which are named."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable, Iterator
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ..errors import PointsError
+from ..system.extras import require
+from ..types.points import as_points
+from .clouds import Header, MessageReader, cdr_reader, ros1_reader
+from .mcap import Channel
+from .packets import VELODYNE_BYTES, velodyne_name
+from .times import TimedScan
+
+
+class VelodyneScan(NamedTuple):
+    """``velodyne_msgs/VelodyneScan``: about a turn; when each packet came [ns], and its bytes."""
+
+    header: Header
+    packets: tuple[tuple[int, memoryview], ...]
+
+
+def _velodyne_scan(read: MessageReader) -> VelodyneScan:
+    header, n_packets = read.header(), read.value("I")
+    if n_packets > read.left // VELODYNE_BYTES:
+        raise PointsError(f"a message is damaged: it declares {n_packets:,} packets")
+    packets = []
+    for _ in range(n_packets):
+        stamp = read.stamp()
+        packets.append((10**9 * stamp.sec + stamp.nanosec, read.take(VELODYNE_BYTES)))
+    return VelodyneScan(header, tuple(packets))
+
+
+PACKET_READERS: MappingProxyType[tuple[str, str], Callable[[memoryview], VelodyneScan]] = MappingProxyType(
+    {
+        ("velodyne_msgs/msg/VelodyneScan", "cdr"): lambda content: _velodyne_scan(cdr_reader(content)),
+        ("velodyne_msgs/VelodyneScan", "ros1"): lambda content: _velodyne_scan(ros1_reader(content)),
+    }
+)
+"""What reads a message of packets of a type in an encoding."""
+
+# Types of messages that are not decoded, by their packages, and what makes clouds of them.
+_OTHERS = (
+    (r"(pandar_msgs|hesai\w*)/", "packets of a Hesai sensor", "Hesai's driver (HesaiLidar_ROS_2.0)"),
+    (r"nebula_msgs/", "packets for Nebula", "Nebula's ROS nodes"),
+    (r"(rslidar\w*|robosense\w*)/", "packets of a RoboSense sensor", "RoboSense's driver (rslidar_sdk)"),
+    (r"livox_\w+/", "points in Livox' own type", "Livox' driver with xfer_format 0"),
+    (r"ouster_\w+/(msg/)?PacketMsg", "packets of an Ouster", "Ouster's driver (ouster-ros)"),
+)
+
+
+def packets_of_others(channels: Iterable[Channel]) -> list[str]:
+    """For each topic with such messages a sentence: whose they are, and what makes point clouds of them."""
+    said = []
+    for channel in sorted(channels):
+        for pattern, what, driver in _OTHERS:
+            if re.match(pattern, channel.msgtype):
+                said.append(
+                    f"topic {channel.topic} holds {what} ({channel.msgtype}), which cannot be decoded: play the bag "
+                    f"through {driver}, and record its sensor_msgs/PointCloud2"
+                )
+    return said
+
+
+class VelodyneStream:
+    """Turns of a Velodyne from messages, which need not begin and end where a turn does.
+
+    Raises MissingExtraError.
+    """
+
+    def __init__(self) -> None:
+        self._velodyne = require(
+            "velodyne_decoder", "velodyne", "Reading a Velodyne's packets", package="velodyne-decoder"
+        )
+        self._decoder = self._velodyne.StreamDecoder(self._velodyne.Config())
+
+    def add(self, message: VelodyneScan) -> Iterator[TimedScan]:
+        """The turns that end in a message.
+
+        Raises PointsError.
+        """
+        if any(velodyne_name(packet) == "hdl-64e" for _, packet in message.packets[:1]):
+            raise PointsError(
+                "the packets are of an HDL-64E, and each has a calibration of its own: play the bag through "
+                "velodyne_pointcloud, and record its sensor_msgs/PointCloud2"
+            )
+        for stamp_ns, packet in message.packets:
+            yield from self._turn(self._decoder.decode(1e-9 * stamp_ns, packet))
+
+    def end(self) -> Iterator[TimedScan]:
+        """The last turn, which may be a part."""
+        yield from self._turn(self._decoder.finish())
+
+    @staticmethod
+    def _turn(decoded: Any) -> Iterator[TimedScan]:
+        if decoded is not None:
+            stamp, points = decoded
+            # On the clock of the computer that recorded the bag, as all its messages.
+            yield TimedScan(stamp.host, as_points(points[:, :4]), stamp.host + points[:, 4].astype(np.float64))

@@ -1,0 +1,141 @@
+"""A file of a whole run, which has its name only if it is whole."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from threading import Thread
+
+from ..system.atomic import beside, name_part, name_whole
+
+
+class RunFile:
+    """A file for a library that writes it from native code, where an exception would be lost; a panic follows some.
+
+    It keeps its first error, which `check` raises. It is written beside its place and has its name after `close`; a
+    file that is not whole is called ``NAME.part``, and the existing one stays. A target that is not a regular file is
+    written directly.
+
+    path : the target; its folder exists.
+    Raises OSError.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = Path(os.path.realpath(path))
+        self._is_special = self._path.exists() and not self._path.is_file()
+        self.place = self._path if self._is_special else beside(self._path)
+        self._file = self.place.open("wb" if self._is_special else "xb")
+        self._error: OSError | None = None
+        self._is_told = False
+        self._at = self._end = 0
+
+    def check(self) -> None:
+        """Raise the error, if there was one."""
+        if self._error is not None:
+            self._is_told = True
+            raise OSError(self._error.errno, self._error.strerror, str(self._path))
+
+    def fail(self, error: OSError) -> None:
+        """Count as failed, unless an earlier error is known."""
+        self._error = self._error or error
+
+    def write(self, data: bytes) -> int:
+        """Write, unless there was an error; the number of bytes given."""
+        self._unless_failed(self._file.write, data)
+        self._at += len(data)
+        self._end = max(self._end, self._at) if data else self._end
+        return len(data)
+
+    def seek(self, offset: int, whence: int = 0) -> int:
+        """Move to where a file without an error would be."""
+        self._at = offset + (0, self._at, self._end)[whence]
+        self._unless_failed(self._file.seek, self._at)
+        return self._at
+
+    def tell(self) -> int:
+        """Where a file without an error would be."""
+        return self._at
+
+    def flush(self) -> None:
+        """As of a file, unless there was an error."""
+        self._unless_failed(self._file.flush)
+
+    def _unless_failed(self, act: Callable[..., object], *given: object) -> None:
+        if self._error is None:
+            try:
+                act(*given)
+            except OSError as exc:
+                self.fail(exc)
+
+    def close(self, whole: bool = True) -> None:
+        """Give the file its name, or that of a part, with a warning.
+
+        whole : False if the run ended before its last scan.
+        Raises OSError: The file could not be written, and `check` has not said so yet.
+        """
+        try:
+            self.flush()
+            self._file.close()
+        except OSError as exc:  # of what is still in its buffer; the file is closed nevertheless
+            self.fail(exc)
+        if not self._is_special:
+            try:
+                settle(self.place, self._path, whole and self._error is None)
+            except OSError as exc:
+                self.fail(exc)
+        if not self._is_told:
+            self.check()
+
+
+def settle(temporary: Path, path: Path, whole: bool) -> None:
+    """Give what a run has written its name, or leave it as a part and warn.
+
+    Raises OSError: It could not be written whole; it is a part.
+    """
+    try:
+        if whole:
+            name_whole(temporary, path)
+    finally:
+        if temporary.exists():
+            warn_of(name_part(temporary, path), path)
+
+
+def warn_of(part: Path, path: Path) -> None:
+    """Warn that a part was left."""
+    warnings.warn(f"{path} was not written to its end; what there is of it is {part}", RuntimeWarning, stacklevel=2)
+
+
+class Pipe:
+    """A named pipe that a thread empties into a file, for a library that waits for ever if it cannot write its own.
+
+    file : what is written.
+    """
+
+    def __init__(self, file: RunFile) -> None:
+        self._file = file
+        self._folder = tempfile.TemporaryDirectory(prefix="edgeperc-")
+        self.path = Path(self._folder.name) / "pipe"
+        os.mkfifo(self.path, 0o600)
+        self._reader = os.open(self.path, os.O_RDONLY | os.O_NONBLOCK)  # so that who opens it to write need not wait
+        os.set_blocking(self._reader, True)
+        self._thread = Thread(target=self._empty, name="edgeperc-pipe", daemon=True)
+
+    def start(self) -> None:
+        """Begin, as soon as the library has opened the path."""
+        self._folder.cleanup()
+        self._thread.start()
+
+    def ends(self, patience_s: float) -> bool:
+        """Wait until the library has closed the pipe, and all is in the file; False if it takes longer."""
+        self._thread.join(patience_s)
+        return not self._thread.is_alive()
+
+    def _empty(self) -> None:
+        try:
+            while data := os.read(self._reader, 1 << 20):
+                self._file.write(data)
+        finally:
+            os.close(self._reader)

@@ -1,0 +1,32 @@
+"""Rigid transforms that callers pass: a rotation and a translation, up to rounding."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..errors import EdgepercError
+
+ROTATION_TOLERANCE = 1e-3  # of R R^T
+ROW_TOLERANCE = 1e-6  # of the last row: what is multiplied or inverted in float32 is as far off
+
+
+def rigid(name: str, given: ArrayLike, error: type[EdgepercError]) -> NDArray[np.float64]:
+    """A copy of a rigid transform, (4, 4), with an exact last row; otherwise an error of this type, with this name."""
+    try:
+        pose: NDArray[np.float64] = np.array(given, np.float64, order="C")
+    except (OverflowError, TypeError, ValueError) as exc:
+        raise error(f"{name} is not a matrix ({exc}); expected (4, 4) numbers") from exc
+    if pose.shape != (4, 4) or not np.isfinite(pose).all():
+        raise error(f"{name} has shape {pose.shape}; expected (4, 4) finite numbers")
+    R, row = pose[:3, :3], pose[3] - [0.0, 0.0, 0.0, 1.0]
+    with np.errstate(over="ignore", invalid="ignore"):
+        off = np.abs(R @ R.T - np.eye(3)).max()
+        is_rotation = off <= ROTATION_TOLERANCE and np.linalg.det(R) > 0.0
+    if not is_rotation or np.abs(row).max() > ROW_TOLERANCE:
+        raise error(
+            f"{name} is not rigid; expected a rotation R (R R^T = 1, det R = 1) and a translation, and the last row "
+            "0, 0, 0, 1"
+        )
+    pose[3] = 0.0, 0.0, 0.0, 1.0
+    return pose

@@ -1,0 +1,236 @@
+"""Bags of drivers that recorded packets: a Velodyne's are decoded as from a capture, others are named."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from test_captures import LIDAR, messages, record, sized, vlp16_packets, write_pcap
+from test_identify import velodyne
+
+from cli_helpers import run
+from edgeperc import MissingExtraError, PointsError, SensorError, read_scans, read_timed_scans, sensor_of
+from edgeperc.readers.packet_messages import PACKET_READERS, VelodyneStream
+from edgeperc.types.sensor import SENSORS
+
+SCAN = "velodyne_msgs/msg/VelodyneScan"
+PACKETS = "/velodyne_packets"
+
+
+def ros2_message(packets: Sequence[bytes], first: int, order: str = "<") -> bytes:
+    """CDR by its specification: numbers at multiples of their size, a fixed array without its length."""
+    content = struct.pack(order + "iI", 1000, 10**6 * first) + struct.pack(order + "I", 9) + b"velodyne\0"
+    content += bytes(-len(content) % 4) + struct.pack(order + "I", len(packets))
+    for k, packet in enumerate(packets, start=first):
+        content += bytes(-len(content) % 4) + struct.pack(order + "iI", 1000, 10**6 * k) + packet
+    return (b"\0\1\0\0" if order == "<" else b"\0\0\0\0") + content
+
+
+def ros1_message(packets: Sequence[bytes], first: int) -> bytes:
+    content = struct.pack("<IIII", 7, 1000, 10**6 * first, 8) + b"velodyne" + struct.pack("<I", len(packets))
+    return content + b"".join(
+        struct.pack("<II", 1000, 10**6 * k) + packet for k, packet in enumerate(packets, start=first)
+    )
+
+
+def mcap_of(path: Path, topics: Sequence[tuple[str, str, str, Sequence[bytes]]]) -> Path:
+    """MCAP without an index: topic, type, encoding and messages."""
+    magic = b"\x89MCAP0\r\n"
+    content = magic + record(1, sized(b"") + sized(b"test"))
+    for k, (topic, kind, encoding, sent) in enumerate(topics, start=1):
+        content += record(3, struct.pack("<H", k) + sized(kind.encode()) + sized(b"") + sized(b""))
+        content += record(4, struct.pack("<HH", k, k) + sized(topic.encode()) + sized(encoding.encode()) + sized(b""))
+        for n, message in enumerate(sent):
+            content += record(5, struct.pack("<HIQQ", k, n, 10**12 + n, 10**12 + n) + message)
+    path.write_bytes(content + record(15, bytes(4)) + record(2, bytes(20)) + magic)
+    return path
+
+
+def ros1_bag(path: Path, topics: Sequence[tuple[str, str, str, Sequence[bytes]]]) -> Path:
+    def fields(**values: bytes) -> bytes:
+        return sized(b"".join(sized(name.encode() + b"=" + value) for name, value in values.items()))
+
+    content = (
+        b"#ROSBAG V2.0\n" + fields(op=b"\3", index_pos=bytes(8), conn_count=bytes(4), chunk_count=bytes(4)) + sized(b"")
+    )
+    for k, (topic, kind, _, sent) in enumerate(topics):
+        number = struct.pack("<I", k)
+        content += fields(op=b"\7", conn=number, topic=topic.encode()) + fields(
+            topic=topic.encode(), type=kind.encode()
+        )
+        for n, message in enumerate(sent):
+            content += fields(op=b"\2", conn=number, time=struct.pack("<II", 1000, n)) + sized(message)
+    path.write_bytes(content)
+    return path
+
+
+def split(packets: Sequence[bytes], size: int, message: Callable[[Sequence[bytes], int], bytes]) -> list[bytes]:
+    return [message(packets[k : k + size], k) for k in range(0, len(packets), size)]
+
+
+WRITERS: dict[str, Callable[[Path, Sequence[bytes], int], Path]] = {
+    "ROS 2": lambda folder, packets, size: mcap_of(
+        folder / "a.mcap", [(PACKETS, SCAN, "cdr", split(packets, size, ros2_message))]
+    ),
+    "big-endian": lambda folder, packets, size: mcap_of(
+        folder / "b.mcap", [(PACKETS, SCAN, "cdr", split(packets, size, lambda some, k: ros2_message(some, k, ">")))]
+    ),
+    "ROS 1": lambda folder, packets, size: ros1_bag(
+        folder / "c.bag", [(PACKETS, "velodyne_msgs/VelodyneScan", "ros1", split(packets, size, ros1_message))]
+    ),
+    "ROS 1 in MCAP": lambda folder, packets, size: mcap_of(
+        folder / "d.mcap", [(PACKETS, "velodyne_msgs/VelodyneScan", "ros1", split(packets, size, ros1_message))]
+    ),
+}
+
+
+@pytest.mark.parametrize("size", [1, 76, 1000])
+@pytest.mark.parametrize("writer", WRITERS)
+def test_packets_give_the_turns_of_a_capture(tmp_path: Path, writer: str, size: int) -> None:
+    """However many of them the driver put into a message; with the clock of the messages."""
+    pytest.importorskip("velodyne_decoder")
+    packets = vlp16_packets(2.5)
+    of_capture = [*read_timed_scans(write_pcap(tmp_path / "a.pcap", packets))]
+    path = WRITERS[writer](tmp_path, packets, size)
+    of_bag = [*read_timed_scans(path)]
+    assert len(of_bag) == len(of_capture) == 3
+    for one, other in zip(of_bag, of_capture, strict=True):
+        np.testing.assert_array_equal(one.points, other.points)
+        assert one.times_s is not None
+        assert other.times_s is not None
+        assert one.stamp_s is not None
+        assert 1000.0 <= one.stamp_s < 1001.0
+        np.testing.assert_allclose(one.times_s - one.stamp_s, other.times_s - other.stamp_s, atol=1e-6)
+    assert [scan.stamp_s for scan in of_bag] == sorted(scan.stamp_s for scan in of_bag)  # type: ignore[type-var]
+    assert sensor_of(path) is SENSORS["vlp-16"]
+
+
+def test_the_driver_of_ros_writes_what_is_read(tmp_path: Path) -> None:
+    """The layout by rosbags, from the definitions of the messages."""
+    typesys = pytest.importorskip("rosbags.typesys")
+    packets = vlp16_packets(0.1)
+    for version, make, empty in ((1, ros1_message, "ROS1_NOETIC"), (2, ros2_message, "ROS2_HUMBLE")):
+        store = typesys.get_typestore(typesys.Stores[empty])
+        time = "time" if version == 1 else "builtin_interfaces/Time"
+        store.register(
+            typesys.get_types_from_msg(f"{time} stamp\nuint8[1206] data\n", "velodyne_msgs/msg/VelodynePacket")
+        )
+        store.register(
+            typesys.get_types_from_msg("std_msgs/Header header\nvelodyne_msgs/VelodynePacket[] packets\n", SCAN)
+        )
+        types = store.types
+
+        def stamp(k: int, types: Any = types) -> Any:
+            return types["builtin_interfaces/msg/Time"](sec=1000, nanosec=10**6 * k)
+
+        packed = [
+            types["velodyne_msgs/msg/VelodynePacket"](stamp=stamp(k), data=np.frombuffer(packet, np.uint8))
+            for k, packet in enumerate(packets, start=3)
+        ]
+        counter = {"seq": 7} if version == 1 else {}
+        header = types["std_msgs/msg/Header"](stamp=stamp(3), frame_id="velodyne", **counter)
+        message = types[SCAN](header=header, packets=packed)
+        written = store.serialize_ros1(message, SCAN) if version == 1 else store.serialize_cdr(message, SCAN)
+        assert bytes(written) == make(packets, 3)
+
+
+@pytest.mark.parametrize("key", PACKET_READERS)
+@given(data=st.data())
+def test_damaged_messages(key: tuple[str, str], data: st.DataObject) -> None:
+    make = ros1_message if key[1] == "ros1" else ros2_message
+    content = bytearray(make(vlp16_packets(0.05), 0))
+    whole = PACKET_READERS[key](memoryview(bytes(content)))
+    assert whole.header.frame_id == "velodyne"
+    assert [bytes(packet) for _, packet in whole.packets] == vlp16_packets(0.05)
+    for at in data.draw(st.lists(st.integers(0, 60), max_size=4)):
+        content[at] = data.draw(st.integers(0, 255))
+    cut = bytes(content[: data.draw(st.integers(0, len(content)))])
+    with suppress(PointsError):
+        found = PACKET_READERS[key](memoryview(cut))
+        assert all(len(packet) == 1206 for _, packet in found.packets)
+        assert 1206 * len(found.packets) <= len(cut)
+
+
+def test_clouds_come_first_and_a_topic_chooses(tmp_path: Path) -> None:
+    pytest.importorskip("velodyne_decoder")
+    typesys = pytest.importorskip("rosbags.typesys")
+    store, sent = messages(typesys, 2)
+    clouds = [bytes(store.serialize_cdr(m, kind)) for _, kind, _, m in sent if kind.endswith("PointCloud2")]
+    packets = split(vlp16_packets(1.2), 75, ros2_message)
+    both = [(LIDAR, "sensor_msgs/msg/PointCloud2", "cdr", clouds), (PACKETS, SCAN, "cdr", packets)]
+    path = mcap_of(tmp_path / "both.mcap", both)
+    assert len([*read_scans(path)]) == len(clouds)
+    assert sum(len(points) for _, points in read_scans(path, topic=PACKETS)) == len(vlp16_packets(1.2)) * 12 * 32
+    two = mcap_of(tmp_path / "two.mcap", [("/left", SCAN, "cdr", packets), ("/right", SCAN, "cdr", packets[:1])])
+    with pytest.raises(PointsError, match="there are /left, /right; choose one by topic"):
+        next(iter(read_scans(two)))
+    assert sum(len(points) for _, points in read_scans(two, topic="/right")) == 75 * 12 * 32
+
+
+OTHERS = {
+    "pandar_msgs/PandarScan": "Hesai",
+    "pandar_msgs/msg/PandarScan": "Hesai",
+    "hesai_lidar/PandarScan": "Hesai",
+    "hesai_ros_driver/msg/UdpFrame": "Hesai",
+    "nebula_msgs/msg/NebulaPackets": "Nebula",
+    "rslidar_msg/msg/RslidarPacket": "RoboSense",
+    "rslidar_msgs/rslidarScan": "RoboSense",
+    "livox_ros_driver2/msg/CustomMsg": "Livox",
+    "ouster_sensor_msgs/msg/PacketMsg": "Ouster",
+    "ouster_ros/PacketMsg": "Ouster",
+}
+
+
+@pytest.mark.parametrize("kind", OTHERS)
+def test_other_packets_are_named_with_what_to_do(kind: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = mcap_of(
+        tmp_path / "a.mcap", [("/packets", kind, "cdr", [bytes(9)]), ("/imu", "sensor_msgs/msg/Imu", "cdr", [])]
+    )
+    text = rf"topic /packets holds .*{OTHERS[kind]}.*\({kind}\).*record its sensor_msgs/PointCloud2"
+    for call in (lambda: next(iter(read_scans(path))), lambda: sensor_of(path)):
+        with pytest.raises(PointsError, match=text):
+            call()
+    assert run("run", path, "--sensor", "pandar64", "--model", "pointseg") == 1
+    assert OTHERS[kind] in capsys.readouterr().err
+    clouds = [("/points", "sensor_msgs/msg/PointCloud2", "cdr", []), ("/packets", kind, "cdr", [])]
+    with pytest.raises(PointsError, match=text):
+        next(iter(read_scans(mcap_of(tmp_path / "b.mcap", clouds), topic="/packets")))
+
+
+def test_an_hdl64_in_a_bag_says_what_to_do(tmp_path: Path) -> None:
+    pytest.importorskip("velodyne_decoder")
+    packets = velodyne(0x05, 0x48, [b"\xff\xee", b"\xff\xdd"])
+    path = WRITERS["ROS 2"](tmp_path, packets, 75)
+    with pytest.raises(PointsError, match=r"HDL-64E.*velodyne_pointcloud"):
+        next(iter(read_scans(path)))
+    assert sensor_of(path) is SENSORS["hdl-64e"]
+
+
+def test_packets_that_do_not_name_their_model(tmp_path: Path) -> None:
+    with pytest.raises(SensorError, match="do not name the model"):
+        sensor_of(WRITERS["ROS 1"](tmp_path, velodyne(0), 75))
+
+
+def test_the_scans_before_the_damage_come(tmp_path: Path) -> None:
+    pytest.importorskip("velodyne_decoder")
+    packets = vlp16_packets(2.5)
+    path = WRITERS["ROS 2"](tmp_path, packets, 75)
+    path.write_bytes(path.read_bytes()[:-2000])
+    scans = []
+    with pytest.raises(PointsError, match="cut short"):  # noqa: PT012
+        for _, points in read_scans(path):
+            scans.append(points)
+    assert sum(map(len, scans)) == 75 * (len(packets) // 75) * 12 * 32
+
+
+def test_without_the_library_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(__import__("sys").modules, "velodyne_decoder", None)
+    with pytest.raises(MissingExtraError, match=r"edgeperc\[velodyne\]"):
+        VelodyneStream()
