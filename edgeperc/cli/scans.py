@@ -9,7 +9,7 @@ import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from ..errors import EdgepercError, ImageError
 from ..system.remote import Remote
@@ -160,9 +160,9 @@ def with_mounting(sensor: str | SensorProfile, arguments: argparse.Namespace) ->
 
     options = {"height_m": "mount_height", "roll_deg": "roll", "pitch_deg": "pitch", "yaw_deg": "turn"}
     given = {name: getattr(arguments, option, None) for name, option in options.items()}
-    values: dict[str, Any] = {
-        name: None if value == "street" else value for name, value in given.items() if value is not None
-    }
+    values: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
+    if values.get("yaw_deg") == "street":
+        values["yaw_deg"] = None
     file, ego = getattr(arguments, "extrinsic", None), getattr(arguments, "ego_box", None)
     if not values and file is None and ego is None:
         return sensor
