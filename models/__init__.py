@@ -98,7 +98,8 @@ def listed(network: str = "") -> tuple[Variant, ...]:
     """
     names = (str(entry) for entry in resources.files(__name__).iterdir() if entry.name.endswith(".onnx"))
     paths = [path for path in map(Path, names) if path.name.startswith(network)]
-    return tuple(sorted((Variant(path, _card(path, path.stat().st_mtime_ns)) for path in paths), key=str))
+    variants = (Variant(path, _card(path, path.stat().st_mtime_ns)) for path in paths)
+    return tuple(sorted(variants, key=lambda variant: (variant.name, variant.precision)))
 
 
 @functools.cache

@@ -156,12 +156,13 @@ def _open(variants: Sequence[Variant]) -> Iterable[str]:
         "The default models were trained on KITTI's scans, whose terms exclude commercial use. "
         f"{', '.join(f'`{name}`' for name in OPEN)} were trained without any scan, box or network of KITTI: on drawn "
         "streets and 28 scans of PandaSet. Their terms are in the table above. They take the same time, and are less "
-        "accurate where KITTI's sensor drives:"
+        "accurate on KITTI's roads:"
     )
     yield from ("", "    edgeperc run PATH --weights open", '    edgeperc.Perceiver(weights="open")', "")
     yield from _prose(
-        "In the wheel they are in int8. Their fp32 files, to train further or for other providers, are among the "
-        "research models, as are the larger `pointseg-sim` and `ssadnet-sim`, trained on drawn streets alone."
+        "They are in int8, with weights of 7 bits, so that every processor computes them without overflow. Their fp32 "
+        "files, to train further or for other providers, are among the research models, as are the larger "
+        "`pointseg-sim` and `ssadnet-sim`, trained on drawn streets alone."
     )
 
 

@@ -290,7 +290,7 @@ def test_completion_knows_commands_options_and_names(shell: str, capsys: pytest.
         (["mod"], {"models"}),
         (["run", "--full"], {"--full-turn"}),
         (["run", "--precision", "b"], {"bf16"}),
-        (["run", "--model", "ssad"], {"ssadnet"}),
+        (["run", "--model", "ssad"], {"ssadnet", "ssadnet-open"}),
         (["run", "--sensor", "pandarx"], {"pandarxt-32"}),
         (["run", "--model", "ssadnet", "sca"], {"scan.bin"}),
         (["info", "sca"], {"scan.bin"}),
@@ -332,8 +332,9 @@ def test_info_prints_the_mounting_and_writes_a_profile(
     drive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     written = tmp_path / "mine.json"
-    assert run("info", *sorted(drive.iterdir()), "--write", written) == 0
+    assert run("info", *sorted(drive.iterdir()), "--write", written) == 1  # of a scan that run refuses
     printed = capsys.readouterr().out
+    assert printed.count("edgeperc run refuses this scan") == 1
     assert printed.count("cannot be estimated: the scan shows no ground") == 1
     assert "hdl-64e, by 2 scans" in printed
     mounting = get_sensor(written).mounting
