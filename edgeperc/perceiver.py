@@ -34,7 +34,7 @@ from .types.card import ModelCard
 from .types.frame import ModelFrame
 from .types.mounting import Mounting
 from .types.perception import ImageLabels, Perception
-from .types.points import Points, as_points
+from .types.points import Points, as_origin, as_points
 from .types.sensor import SensorProfile, get_sensor
 from .types.views import CameraGeometry, ObjectGeometry, RangeImageGeometry, TopViewGeometry
 from .warm_up import Rehearsed, n_processes, warm_up
@@ -192,7 +192,7 @@ class Perceiver:
     OptionError
         An option is unknown or out of range, or the models cannot be combined.
     ModelError, ProviderError, SensorError, MissingExtraError
-        A model, a provider or a sensor is missing or does not fit. Only construction raises these and OptionError.
+        A model, a provider or a sensor is missing or does not fit. Only construction raises these.
     PointsError, ImageError, InferenceError, FitnessError
         Only a call raises these.
 
@@ -428,7 +428,12 @@ class Perceiver:
         self._frame = ModelFrame(self._mounting)
 
     def __call__(
-        self, points: ArrayLike | None = None, stamp_s: float | None = None, *, image: ArrayLike | None = None
+        self,
+        points: ArrayLike | None = None,
+        stamp_s: float | None = None,
+        *,
+        image: ArrayLike | None = None,
+        origin_m: Sequence[float] | None = None,
     ) -> Perception:
         """Perceive one scan, one image, or a scan and an image of the same moment.
 
@@ -443,6 +448,9 @@ class Perceiver:
             Time of the scan [s], for the tracker; returned in the perception.
         image : (H, W, 3) uint8 array_like; None without a camera model
             Red, green and blue, row 0 at the top (`edgeperc.read_image`), of any size up to 2**26 pixels. Not modified.
+        origin_m : sequence of 3 float or None
+            Place of the points' frame in a map [m]: what `edgeperc.read_points` subtracted. It is not subtracted here,
+            but returned in the perception, which places its boxes in the map (`Perception.map_boxes`).
 
         Raises
         ------
@@ -454,8 +462,11 @@ class Perceiver:
             A network failed, or its output has values that are not finite.
         FitnessError
             The scan differs from the training scans, grossly if ``on_mismatch`` is ``"refuse"``.
+        OptionError
+            ``origin_m`` is not three finite numbers.
         """
         self._check_given(points, image)
+        place = None if origin_m is None else as_origin(origin_m)
         scan = None if points is None else as_points(points)
         pixels = None if image is None else as_image(image)
         with self._lock:
@@ -468,6 +479,8 @@ class Perceiver:
                 self._to_check -= check
             if pixels is not None and self._camera is not None:
                 perception = replace(perception, image=self._camera.label(pixels, watch))
+            if place is not None:
+                perception = replace(perception, origin_m=place)
             sentences = perception.fitness
             if perception.dropped.too_near and not self._told_of_near:
                 self._told_of_near = True
