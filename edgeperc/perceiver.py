@@ -22,7 +22,7 @@ from .inference.session import Session
 from .objects.boxes import MIN_SCORE
 from .pipeline import BoxesFrom, ObjectNetwork, Options, Pipeline, RangeImageNetwork, TopViewNetwork
 from .preprocess.condition import scale
-from .preprocess.findings import Finding, check_beams, check_dropped, check_profiles
+from .preprocess.findings import Finding, check_beams, check_dropped, check_ground, check_profiles
 from .preprocess.fitness import FitnessProfile
 from .preprocess.interpolation import Interpolator
 from .preprocess.remission import RemissionMatcher
@@ -524,7 +524,8 @@ class Perceiver:
         dropped = replace(dropped, not_finite=dropped.not_finite + n_overflowed)
         watch.lap("adapt" if self._renders and profile.remission is not None else "check")
         if not before.is_complete and len(scan):
-            turned = check_beams(scan, profile) if check and before.known.roll_deg is None else ()
+            if check and before.known.roll_deg is None:
+                turned = check_beams(scan, profile) or check_ground(scan)
             try:
                 self._set_mounting(before.add(scan))
                 hidden = self._about_tilt()
