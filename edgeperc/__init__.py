@@ -53,7 +53,7 @@ if TYPE_CHECKING:
     from .perceiver import Perceiver
     from .preprocess.motion import Motion, Trajectory, deskew, merge
     from .readers.captures import read_scans, read_timed_scans, sensor_of
-    from .readers.files import read_points
+    from .readers.files import find_origin, read_points
     from .readers.images import read_image
     from .readers.times import TimedScan
     from .road.ahead import FreeAhead, RoadAhead, free_ahead, road_ahead
@@ -121,6 +121,7 @@ __all__ = [
     "camera_road",
     "deskew",
     "draw",
+    "find_origin",
     "free_ahead",
     "merge",
     "models",
@@ -174,6 +175,7 @@ MODULES = {
     "camera_road": "camera.painting",
     "deskew": "preprocess.motion",
     "draw": "view",
+    "find_origin": "readers.files",
     "free_ahead": "road.ahead",
     "merge": "preprocess.motion",
     "models": "inference.listing",

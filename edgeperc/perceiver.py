@@ -22,7 +22,7 @@ from .inference.session import Session
 from .objects.boxes import MIN_SCORE
 from .pipeline import BoxesFrom, ObjectNetwork, Options, Pipeline, RangeImageNetwork, TopViewNetwork
 from .preprocess.condition import scale
-from .preprocess.findings import Finding, check_beams, check_dropped, check_profiles, with_raw_remission
+from .preprocess.findings import Finding, check_beams, check_dropped, check_ground, check_profiles, with_raw_remission
 from .preprocess.fitness import FitnessProfile
 from .preprocess.interpolation import Interpolator
 from .preprocess.remission import RemissionMatcher
@@ -35,7 +35,7 @@ from .types.choices import WEIGHTS
 from .types.frame import ModelFrame
 from .types.mounting import Mounting
 from .types.perception import ImageLabels, Perception
-from .types.points import Points, as_points
+from .types.points import Points, as_origin, as_points
 from .types.sensor import SensorProfile, get_sensor
 from .types.views import CameraGeometry, ObjectGeometry, RangeImageGeometry, TopViewGeometry
 from .warm_up import Rehearsed, n_processes, warm_up
@@ -199,7 +199,7 @@ class Perceiver:
     OptionError
         An option is unknown or out of range, or the models cannot be combined.
     ModelError, ProviderError, SensorError, MissingExtraError
-        A model, a provider or a sensor is missing or does not fit. Only construction raises these and OptionError.
+        A model, a provider or a sensor is missing or does not fit. Only construction raises these.
     PointsError, ImageError, InferenceError, FitnessError
         Only a call raises these.
 
@@ -436,7 +436,12 @@ class Perceiver:
         self._frame = ModelFrame(self._mounting)
 
     def __call__(
-        self, points: ArrayLike | None = None, stamp_s: float | None = None, *, image: ArrayLike | None = None
+        self,
+        points: ArrayLike | None = None,
+        stamp_s: float | None = None,
+        *,
+        image: ArrayLike | None = None,
+        origin_m: Sequence[float] | None = None,
     ) -> Perception:
         """Perceive one scan, one image, or a scan and an image of the same moment.
 
@@ -451,6 +456,9 @@ class Perceiver:
             Time of the scan [s], for the tracker; returned in the perception.
         image : (H, W, 3) uint8 array_like; None without a camera model
             Red, green and blue, row 0 at the top (`edgeperc.read_image`), of any size up to 2**26 pixels. Not modified.
+        origin_m : sequence of 3 float or None
+            Place of the points' frame in a map [m]: what `edgeperc.read_points` subtracted. It is not subtracted here,
+            but returned in the perception, which places its boxes in the map (`Perception.map_boxes`).
 
         Raises
         ------
@@ -462,8 +470,11 @@ class Perceiver:
             A network failed, or its output has values that are not finite.
         FitnessError
             The scan differs from the training scans, grossly if ``on_mismatch`` is ``"refuse"``.
+        OptionError
+            ``origin_m`` is not three finite numbers.
         """
         self._check_given(points, image)
+        place = None if origin_m is None else as_origin(origin_m)
         scan = None if points is None else as_points(points)
         pixels = None if image is None else as_image(image)
         with self._lock:
@@ -476,6 +487,8 @@ class Perceiver:
                 self._to_check -= check
             if pixels is not None and self._camera is not None:
                 perception = replace(perception, image=self._camera.label(pixels, watch))
+            if place is not None:
+                perception = replace(perception, origin_m=place)
             sentences = perception.fitness
             if perception.dropped.too_near and not self._told_of_near:
                 self._told_of_near = True
@@ -519,7 +532,8 @@ class Perceiver:
         dropped = replace(dropped, not_finite=dropped.not_finite + n_overflowed)
         watch.lap("adapt" if self._renders and profile.remission is not None else "check")
         if not before.is_complete and len(scan):
-            turned = check_beams(scan, profile) if check and before.known.roll_deg is None else ()
+            if check and before.known.roll_deg is None:
+                turned = check_beams(scan, profile) or check_ground(scan)
             try:
                 self._set_mounting(before.add(scan))
                 hidden = self._about_tilt()

@@ -37,6 +37,8 @@ SCAN_KEYS = (
     "mounting",
     "remission",
     "image",
+    "origin_m",
+    "map_boxes",
 )
 """Keys of a record, in their written order; every record has all of them."""
 

@@ -49,7 +49,7 @@ FLOORS = {
         objects.cluster objects.crops
         objects.persons
         objects.boxes
-        preprocess.__init__ preprocess.fitness preprocess.interpolation preprocess.returns
+        preprocess.__init__ preprocess.fitness preprocess.interpolation preprocess.origin preprocess.returns
         preprocess.condition preprocess.ego preprocess.findings preprocess.motion preprocess.sensor_fit
         preprocess.remission
         tracking.imm tracking.jpda tracking.ukf

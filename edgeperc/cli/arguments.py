@@ -117,6 +117,19 @@ def _yaw(text: str) -> float | str:
     return text if text == "street" else finite_number(text)
 
 
+def _place(text: str) -> float | str:
+    return text if text == "auto" else finite_number(text)
+
+
+def with_whole_options(given: Sequence[str]) -> list[str]:
+    """Arguments in which ``--origin auto`` has the three values that argparse expects."""
+    whole: list[str] = []
+    for argument in given:
+        is_auto = argument == "auto" and whole[-1:] == ["--origin"]
+        whole += ["auto"] * 3 if is_auto else [argument]
+    return whole
+
+
 def add_topic(group: Any) -> None:
     """Add ``--topic``."""
     group.add_argument(
@@ -145,9 +158,11 @@ def add_fields(group: Any) -> None:
     group.add_argument(
         "--origin",
         nargs=3,
-        type=finite_number,
+        type=_place,
         metavar=("X", "Y", "Z"),
-        help="place of the sensor in the map [m], for scan files with coordinates of a map (default: 0 0 0)",
+        help="place of the sensor in the map [m], for scan files with coordinates of a map: it is subtracted, and "
+        "--json and --ply give boxes and points in the map; or 'auto', for a level sensor: where its beams meet "
+        "(default: 0 0 0)",
     )
 
 
@@ -158,7 +173,12 @@ def reading_options(arguments: argparse.Namespace) -> dict[str, Any]:
 
 def file_options(arguments: argparse.Namespace) -> dict[str, Any]:
     """Options of `edgeperc.read_points` from those of `add_fields`."""
-    return {"columns": arguments.columns, "remission_field": arguments.remission_field, "origin_m": arguments.origin}
+    origin = arguments.origin
+    if origin is not None and "auto" in origin:
+        if set(origin) != {"auto"}:
+            arguments.usage_error(f"--origin {' '.join(map(str, origin))}: expected X Y Z, or auto")
+        origin = "auto"
+    return {"columns": arguments.columns, "remission_field": arguments.remission_field, "origin_m": origin}
 
 
 def add_model(group: Any, default: Sequence[str] = DEFAULT_MODELS) -> None:

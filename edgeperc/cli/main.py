@@ -16,6 +16,7 @@ from collections.abc import Sequence
 from .. import __version__
 from ..errors import EdgepercError
 from . import completion, demo, doctor, fit_sensor, info, lists, ros2, run
+from .arguments import with_whole_options
 from .evaluation import painting, scans, sensors, tracking
 from .output import in_options
 from .program import Parser, run_program
@@ -41,7 +42,7 @@ def _run(given: list[str]) -> int:
     if any("\0" in argument for argument in given):  # from Python; no shell passes it on
         parser.error("an argument has a null character, which no file name and no value can have")
     known = argparse.Namespace(typed=shlex.join(["edgeperc", *given]), parser=parser)
-    arguments = parser.parse_args(given, known)
+    arguments = parser.parse_args(with_whole_options(given), known)
     code: int = arguments.command(arguments)
     return code
 

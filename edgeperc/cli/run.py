@@ -478,12 +478,14 @@ class _Run:
             perceive = self._perceivers.of(self._perceivers.sensor_of(path))
             numbered = is_capture(path)
             read: Callable[..., Iterator[tuple[Any, ...]]] = read_timed_scans if self._straightener else read_scans
-            for k, (stamp_s, points, *times_s) in enumerate(read(path, **reading_options(self._arguments))):
+            options = reading_options(self._arguments)
+            options["origin_m"] = origin = None if numbered else self._origin(path)
+            for k, (stamp_s, points, *times_s) in enumerate(read(path, **options)):
                 name, file = (shown / f"{k:06d}", target / f"{k:06d}") if numbered else (shown, target)
                 try:
                     if self._straightener is not None:
                         points = self._straightener.straighten(stamp_s, points, times_s[0], perceive.sensor)
-                    perception = perceive(points, stamp_s)
+                    perception = perceive(points, stamp_s, origin_m=origin)
                     if self._kinds and numbered:
                         target.mkdir(exist_ok=True)
                     wanted = {kind: _file_of(file, kind) for kind in self._kinds}
@@ -494,6 +496,13 @@ class _Run:
                     yield name, PointsError(f"{len(points):,} points take more memory than there is"), None, None
         except (EdgepercError, OSError) as exc:
             yield shown, exc, None, None
+
+    def _origin(self, scan: Path) -> Sequence[float] | None:
+        """Place of the sensor in the map of a scan file, as ``--origin`` says."""
+        from ..readers.files import find_origin
+
+        origin: Sequence[float] | str | None = file_options(self._arguments)["origin_m"]
+        return find_origin(scan, columns=self._arguments.columns) if isinstance(origin, str) else origin
 
     def image(self, path: Path, scan: Path | None, target: Path) -> Iterator[Outcome]:
         """Perceive an image and its scan, if it has one."""
@@ -506,8 +515,10 @@ class _Run:
         try:
             image = read_image(path)
             perceive = perceivers.of(perceivers.sensor_of(scan) if scan else arguments.sensor or DEFAULT_SENSOR)
-            points = None if scan is None else read_points(scan, **file_options(arguments))
-            perception = perceive(points, image=image)
+            origin = None if scan is None else self._origin(scan)
+            options = file_options(arguments) | {"origin_m": origin}
+            points = None if scan is None else read_points(scan, **options)
+            perception = perceive(points, image=image, origin_m=origin)
             wanted = _files_of(target, self._kinds, **_pictures_of(arguments, [path]))
             if "image" in wanted:
                 view.draw_image(perception, image, wanted.pop("image"), title=path.name)

@@ -250,6 +250,14 @@ def _leveled(scan: Points, guess: Mounting, height_m: float | None) -> tuple[Mou
     return replace(Mounting.from_matrix(T_vehicle_sensor), yaw_deg=guess.yaw_deg), support, uncertainty
 
 
+def near_support(points: Points) -> int:
+    """How many more cells of half a meter within 12 m lie on the ground than below it; 0 without ground."""
+    scan = read_only(points)
+    _, lowest, low = _lowest_returns(scan)
+    near = _near_plane(scan, lowest, low, _STARTS_M)
+    return 0 if near is None else near.support
+
+
 class _Plane(NamedTuple):
     """A plane z = a x + b y + c [m]: ``abc``, and how many cells of half a meter within a reach lie on and below it."""
 
@@ -279,10 +287,7 @@ def _ground_plane(
     """a, b, c of the ground z = a x + b y + c [m] around the sensor, near a given height below it or at any; how many
     more cells lie on it than below; the `_uncertainty`.
     """
-    cell = np.empty(len(scan), np.int32)
-    lowest = np.empty((N_CELLS, N_CELLS), np.int32)
-    fill_lowest(scan, cell, lowest)
-    low = scan[lowest[lowest >= 0], :3].astype(np.float64)
+    cell, lowest, low = _lowest_returns(scan)
     plane = None if height_m is None else _lowest_plane(scan, lowest, low, [height_m], [height_m])
     plane = plane or _lowest_plane(scan, lowest, low, _STARTS_M, _FAR_STARTS_M)
     if plane is None:
@@ -296,6 +301,23 @@ def _ground_plane(
     return (a, b, c), float(plane.support), _uncertainty(scan, lowest, low, plane)
 
 
+def _lowest_returns(scan: Points) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.float64]]:
+    """The cell of each point, the row of the lowest point in each cell, and these points (n, 3)."""
+    cell = np.empty(len(scan), np.int32)
+    lowest = np.empty((N_CELLS, N_CELLS), np.int32)
+    fill_lowest(scan, cell, lowest)
+    return cell, lowest, scan[lowest[lowest >= 0], :3].astype(np.float64)
+
+
+def _near_plane(
+    scan: Points, lowest: NDArray[np.int32], low: NDArray[np.float64], starts_m: Sequence[float]
+) -> _Plane | None:
+    """The ground within 12 m, from several heights above it."""
+    planes = [plane for plane in _planes(scan, lowest, low, starts_m, _VOTING_M) if plane.is_lowest()]
+    near = max(planes, key=lambda plane: plane.support, default=None)
+    return None if near is None or near.on < _MIN_CELLS else near
+
+
 def _lowest_plane(
     scan: Points,
     lowest: NDArray[np.int32],
@@ -304,10 +326,7 @@ def _lowest_plane(
     far_starts_m: Sequence[float],
 ) -> _Plane | None:
     """The ground within 12 m or, below a high sensor, farther away; from several heights above it."""
-    planes = [plane for plane in _planes(scan, lowest, low, starts_m, _VOTING_M) if plane.is_lowest()]
-    near = max(planes, key=lambda plane: plane.support, default=None)
-    if near is not None and near.on < _MIN_CELLS:
-        near = None
+    near = _near_plane(scan, lowest, low, starts_m)
     if near is not None and (near.support >= _SURE_SUPPORT or _counted(near.abc, low, _FAR_REACHES_M[-1]).is_lowest()):
         return near
     far = _far_plane(scan, lowest, low, far_starts_m)

@@ -6,7 +6,7 @@ import json
 import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,7 +39,7 @@ def read_scans(
     topic: str | None = None,
     remission_field: str | None = None,
     columns: int | Sequence[str] | None = None,
-    origin_m: Sequence[float] | None = None,
+    origin_m: Sequence[float] | Literal["auto"] | None = None,
 ) -> Iterator[tuple[float | None, NDArray[np.float32]]]:
     """Read the scans of a recording, one after another; `read_timed_scans` gives the times of their points too.
 
@@ -63,7 +63,7 @@ def read_scans(
         Name of the remission field, as in `edgeperc.read_points`; ``reflectivity`` by default for an Ouster capture.
     columns : int or sequence of str, optional
         What scan files without a header hold, as in `edgeperc.read_points`.
-    origin_m : sequence of 3 float, optional
+    origin_m : sequence of 3 float or "auto", optional
         Place of the sensor in the map of scan files, as in `edgeperc.read_points`.
 
     Yields
@@ -99,7 +99,7 @@ def read_timed_scans(
     topic: str | None = None,
     remission_field: str | None = None,
     columns: int | Sequence[str] | None = None,
-    origin_m: Sequence[float] | None = None,
+    origin_m: Sequence[float] | Literal["auto"] | None = None,
 ) -> Iterator[TimedScan]:
     """Like `read_scans`, with the time of each point, where the source holds it, for `edgeperc.deskew`.
 

@@ -9,12 +9,13 @@ import zipfile
 import zlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import PointsError
+from ..preprocess.origin import find_place
 from ..types.points import as_points, assemble, table_columns
 from .inflate import inflate, most_bytes
 from .pcd import begins_like_pcd, parse_pcd
@@ -31,7 +32,7 @@ def read_points(
     *,
     columns: int | Sequence[str] | None = None,
     remission_field: str | None = None,
-    origin_m: Sequence[float] | None = None,
+    origin_m: Sequence[float] | Literal["auto"] | None = None,
 ) -> NDArray[np.float32]:
     """Read the points of one scan from a file or an array.
 
@@ -56,9 +57,9 @@ def read_points(
     remission_field : str, optional
         Name of the remission field, for formats with named fields. By default the first existing one of remission,
         intensity, i, reflectivity, reflectance.
-    origin_m : sequence of 3 float, optional
+    origin_m : sequence of 3 float or "auto", optional
         Place of the sensor in a map [m], subtracted from the coordinates before they become float32, which rounds UTM
-        northings to 0.5 m.
+        northings to 0.5 m. ``"auto"``: that of `find_origin`.
 
     Returns
     -------
@@ -73,9 +74,43 @@ def read_points(
     OptionError
         ``origin_m`` is not three finite numbers.
     """
-    if not isinstance(source, str | os.PathLike):
-        return as_points(source, remission_field=remission_field, origin_m=origin_m)
-    return _read(Path(source), FileOptions(columns, remission_field, origin_m))[0]
+    options = FileOptions(columns, remission_field, origin_m)
+    if isinstance(source, str | os.PathLike):
+        return _read(Path(source), options).points
+    if isinstance(origin_m, str):
+        return _of_array(np.asarray(source), options).points
+    return as_points(source, remission_field=remission_field, origin_m=origin_m)
+
+
+def find_origin(
+    source: str | os.PathLike[str] | ArrayLike, *, columns: int | Sequence[str] | None = None
+) -> tuple[float, float, float]:
+    """Find the place of the sensor in a scan whose coordinates are those of a map.
+
+    From there, the points of each beam have one elevation. The axes may be turned about z, but a sensor that leans, a
+    scan whose points were moved one by one, or a sensor without rows of beams is refused.
+
+    Parameters
+    ----------
+    source, columns
+        As in `read_points`.
+
+    Returns
+    -------
+    tuple of 3 float
+        x, y, z [m], for ``origin_m`` of `read_points` and of a `Perceiver`'s call.
+
+    Raises
+    ------
+    PointsError
+        As `read_points`, or the place cannot be told.
+    """
+    options = FileOptions(columns, None, "auto")
+    is_file = isinstance(source, str | os.PathLike)
+    read = _read(Path(source), options) if is_file else _of_array(np.asarray(source), options)  # type: ignore[arg-type]
+    assert read.origin_m is not None
+    x, y, z = read.origin_m
+    return x, y, z
 
 
 class FileOptions(NamedTuple):
@@ -83,17 +118,21 @@ class FileOptions(NamedTuple):
 
     columns: int | Sequence[str] | None
     remission_field: str | None
-    origin_m: Sequence[float] | None
+    origin_m: Sequence[float] | Literal["auto"] | None
 
 
 def read_timed_file(path: Path, options: FileOptions) -> TimedScan:
     """Read a scan file with the times of its points; errors as `read_points`."""
-    points, fields = _read(path, options)
+    points, fields, _ = _read(path, options)
     return TimedScan(None, points, point_times(fields, points, None))
 
 
-_Read = tuple[NDArray[np.float32], Mapping[str, NDArray[Any]]]
-"""Points, and the fields of the file if they have names."""
+class _Read(NamedTuple):
+    """Points, the fields of the file if they have names, and the place in a map that was subtracted."""
+
+    points: NDArray[np.float32]
+    fields: Mapping[str, NDArray[Any]]
+    origin_m: Sequence[float] | None
 
 
 def _read(path: Path, options: FileOptions) -> _Read:
@@ -145,17 +184,28 @@ def _parse(data: NDArray[np.uint8], name: str, options: FileOptions) -> _Read:
         )
     raw = parse_raw(data, options.columns, 5 if name.endswith(".pcd.bin") else 4)
     if options.columns is None or isinstance(options.columns, int | np.integer):  # fields without names
-        return assemble(*raw, None, options.origin_m), {}
+        return _of_columns(raw, options._replace(remission_field=None))._replace(fields={})
     return _of_columns(raw, options)
 
 
 def _of_array(array: NDArray[Any], options: FileOptions) -> _Read:
-    points = as_points(array, remission_field=options.remission_field, origin_m=options.origin_m)
-    return points, table_columns(array)
+    fields = table_columns(array)
+    xyz = fields if fields or array.ndim != 2 else dict(zip("xyz", array.T, strict=False))
+    origin = _origin(xyz, options)
+    return _Read(as_points(array, remission_field=options.remission_field, origin_m=origin), fields, origin)
 
 
 def _of_columns(columns: Columns, options: FileOptions) -> _Read:
-    return assemble(*columns, options.remission_field, options.origin_m), columns.fields
+    origin = _origin(columns.fields, options)
+    return _Read(assemble(*columns, options.remission_field, origin), columns.fields, origin)
+
+
+def _origin(fields: Mapping[str, NDArray[Any]], options: FileOptions) -> Sequence[float] | None:
+    """The given place of the sensor, or the one that is found; fields without coordinates are refused afterwards."""
+    if not isinstance(options.origin_m, str) or options.origin_m != "auto":
+        return options.origin_m
+    has_coordinates = all(axis in fields for axis in "xyz")
+    return find_place(np.column_stack([fields[axis].astype(np.float64) for axis in "xyz"])) if has_coordinates else None
 
 
 def _parse_npy(data: NDArray[np.uint8]) -> NDArray[Any]:

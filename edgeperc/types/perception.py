@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from types import MappingProxyType
 from typing import Any
 
@@ -306,6 +306,9 @@ class Perception:
         ``n_dropped`` by kind.
     ground : GroundSurface or None
         The ground under the scan; None if no stage needed it, or without a scan.
+    origin_m : tuple of 3 float, or None
+        Place of the frame of the scan in a map [m], as given with the scan: what was subtracted from the coordinates
+        (`edgeperc.read_points`). The axes are the map's.
     """
 
     n_points: int
@@ -322,6 +325,36 @@ class Perception:
     image: ImageLabels | None = None
     dropped: DroppedPoints = DroppedPoints()
     ground: GroundSurface | None = None
+    origin_m: tuple[float, float, float] | None = None
+
+    def to_map(self, points: NDArray[Any]) -> NDArray[np.float64]:
+        """Coordinates of points of the scan in the map, x, y, z [m], (n, 3) float64; exact, unlike float32.
+
+        Parameters
+        ----------
+        points : (n, 3 or more) array
+            x, y, z [m] in the frame of the scan, such as the scan itself.
+
+        Raises
+        ------
+        PointsError
+            The place of the scan in a map was not given.
+        """
+        return np.asarray(points)[:, :3].astype(np.float64) + np.array(self._origin())
+
+    @property
+    def map_boxes(self) -> tuple[Box, ...]:
+        """The boxes with their centers in the map; PointsError if the place of the scan in a map was not given."""
+        ox, oy, oz = self._origin()
+        placed = [(box, *box.center) for box in self.boxes]
+        return tuple(replace(box, center=(x + ox, y + oy, z + oz)) for box, x, y, z in placed)
+
+    def _origin(self) -> tuple[float, float, float]:
+        if self.origin_m is None:
+            raise PointsError(
+                "the place of the scan in a map is not known; pass it with the points: origin_m=(x, y, z)"
+            )
+        return self.origin_m
 
     def to_dict(self) -> dict[str, Any]:
         """Convert to a dict for JSON, with the number of points of each class in place of their labels.
@@ -330,9 +363,9 @@ class Perception:
         -------
         dict
             ``stamp_s``, ``n_points``, ``n_dropped``, ``dropped`` (by kind), ``stage_ms``, ``providers``, ``boxes``
-            (`Box.to_dict`), ``drivable_area_m2``, ``point_counts``, ``fitness``, ``mounting``, ``remission`` and
-            ``image`` (`ImageLabels.to_dict`). Every key is always present; its value is None if no model of that kind
-            ran, or if remission was only scaled.
+            (`Box.to_dict`), ``drivable_area_m2``, ``point_counts``, ``fitness``, ``mounting``, ``remission``,
+            ``image`` (`ImageLabels.to_dict`), ``origin_m`` and ``map_boxes``. Every key is always present; its value is
+            None if no model of that kind ran, if remission was only scaled, or if the place in a map was not given.
         """
         return {
             "stamp_s": self.stamp_s,
@@ -348,6 +381,8 @@ class Perception:
             "mounting": self.mounting.to_dict(),
             "remission": None if self.remission is None else asdict(self.remission),
             "image": None if self.image is None else self.image.to_dict(),
+            "origin_m": None if self.origin_m is None else list(self.origin_m),
+            "map_boxes": None if self.origin_m is None else [box.to_dict() for box in self.map_boxes],
         }
 
     def __reduce__(self) -> tuple[Any, ...]:

@@ -200,13 +200,13 @@ def assemble(
     remission = remission_name(fields, remission_field)
     xyz = [fields[axis] for axis in "xyz"]
     if origin_m is not None:
-        xyz = [values.astype(np.float64) - origin for values, origin in zip(xyz, _origin(origin_m), strict=True)]
+        xyz = [values.astype(np.float64) - origin for values, origin in zip(xyz, as_origin(origin_m), strict=True)]
     if any(_is_rounded(values) for values in xyz):
         middle = ", ".join(f"{np.median(values.astype(np.float64)[np.isfinite(values)]):,.1f}" for values in xyz)
         raise PointsError(
             f"the coordinates are those of a map, about ({middle}) m, and would be rounded by more than "
             f"{1e3 * MAX_ROUNDING_M:g} mm as float32; pass the place of the sensor, which is subtracted first: "
-            "origin_m= or --origin X Y Z"
+            'origin_m= or --origin X Y Z; "auto" finds that of a level sensor'
         )
     points = np.zeros((n, 4), dtype=np.float32)
     with np.errstate(over="ignore", invalid="ignore"):
@@ -217,7 +217,11 @@ def assemble(
     return points
 
 
-def _origin(given: Sequence[float]) -> tuple[float, float, float]:
+def as_origin(given: Sequence[float]) -> tuple[float, float, float]:
+    """A place in a map, x, y, z [m].
+
+    Raises OptionError.
+    """
     try:
         x, y, z = (float(value) for value in given)
     except (OverflowError, TypeError, ValueError) as exc:

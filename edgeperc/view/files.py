@@ -30,7 +30,8 @@ def write_ply(perception: Perception, points: Points, path: str | Path) -> None:
     """Write the labeled scan as a binary PLY file.
 
     One row per input point, in input order: x, y, z, remission (float), label, red, green, blue (uchar). Comments in
-    the header name the labels.
+    the header name the labels. If the perception has its place in a map (``origin_m``), x, y, z are in the map, as
+    doubles.
 
     Parameters
     ----------
@@ -50,16 +51,19 @@ def write_ply(perception: Perception, points: Points, path: str | Path) -> None:
     check_points(points, perception)
     if perception.points is None:
         raise _no_labels("PLY file")
-    fields = [(name, "<f4") for name in ("x", "y", "z", "remission")]
+    in_map = perception.origin_m is not None
+    fields = [*((name, "<f8" if in_map else "<f4") for name in "xyz"), ("remission", "<f4")]
     fields += [(name, "|u1") for name in ("label", "red", "green", "blue")]
     rows = np.empty(len(points), dtype=fields)
     colors = (rgb([color_of(name) for name in perception.points.classes]) * 255.0).round().astype(np.uint8)
-    for k in range(4):
-        rows[fields[k][0]] = points[:, k]
+    xyz = perception.to_map(points) if in_map else points
+    for k, name in enumerate("xyz"):
+        rows[name] = xyz[:, k]
+    rows["remission"] = points[:, 3]
     rows["label"] = perception.points.labels
     for k, name in enumerate(("red", "green", "blue")):
         rows[name] = colors[perception.points.labels, k]
-    kinds = {"<f4": "float", "|u1": "uchar"}
+    kinds = {"<f4": "float", "<f8": "double", "|u1": "uchar"}
     header = ["ply", "format binary_little_endian 1.0"]
     header += [f"comment label {k} {' '.join(name.split())}" for k, name in enumerate(perception.points.classes)]
     header += [f"element vertex {len(points)}", *(f"property {kinds[t]} {name}" for name, t in fields), "end_header\n"]

@@ -33,6 +33,7 @@ from edgeperc.errors import InferenceError, ModelFileError, OptionError, PointsE
 from edgeperc.evaluation.judge import Perceiving
 from edgeperc.inference import providers, session
 from edgeperc.readers import captures
+from edgeperc.simulation.samples import simulated_scan
 from edgeperc.types.perception import Box, Perception, PointLabels, TopView
 from scenes import Terminal
 
@@ -65,7 +66,12 @@ class FakePerceiver:
         FakePerceiver.made.append(self)
 
     def __call__(
-        self, points: np.ndarray, stamp_s: float | None = None, *, image: np.ndarray | None = None
+        self,
+        points: np.ndarray,
+        stamp_s: float | None = None,
+        *,
+        image: np.ndarray | None = None,
+        origin_m: tuple[float, float, float] | None = None,
     ) -> Perception:
         if len(points) and points[0, 3] == 1.0:
             raise InferenceError("pointseg answered\nwith NaN")
@@ -91,6 +97,7 @@ class FakePerceiver:
             providers={card.name: "CPUExecutionProvider (fp32)" for card in self.cards},
             fitness=("the scan has 32 beams",) if len(points) == 5 else (),
             stamp_s=stamp_s,
+            origin_m=origin_m,
         )
 
 
@@ -273,12 +280,51 @@ def test_json_is_one_object_a_scan_and_nothing_else(tmp_path: Path, capsys: pyte
         "mounting": {"height_m": 1.73, "roll_deg": 0.0, "pitch_deg": 0.66, "yaw_deg": 0.0, "origin_m": [0.0, 0.0]},
         "remission": None,
         "image": None,
+        "origin_m": None,
+        "map_boxes": None,
     }
     complaints = captured.err.splitlines()
     assert [line.startswith("edgeperc: ") for line in complaints] == [True, True, True, False]
     assert complaints[3].startswith("4 scans, 3 failed")
     assert captured.err.count(str(short)) == 1
     assert "Traceback" not in captured.err
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["--origin", "512345.25", "5412345.5", "113", "scan.npy"],
+        ["scan.npy", "--origin", "auto"],
+        ["--origin", "auto", "scan.npy"],
+    ],
+)
+def test_boxes_come_back_in_the_map(
+    words: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    points, origin = simulated_scan(3, "os1-64").points, np.array([512345.25, 5412345.5, 113.0])
+    np.save("scan.npy", np.column_stack([points[:, :3].astype(np.float64) + origin, points[:, 3]]))
+    assert run("run", *words, "--json", "--model", "ssadnet", "--model", "pointseg") == 0
+    answer = json.loads(capsys.readouterr().out)
+    np.testing.assert_allclose(answer["origin_m"], origin, atol=0.05)
+    (box,), (placed,) = answer["boxes"], answer["map_boxes"]
+    np.testing.assert_allclose(np.subtract(placed["center"], answer["origin_m"]), box["center"], atol=1e-3)
+    assert placed["yaw"] == box["yaw"]
+
+
+@pytest.mark.parametrize(
+    "words", [["1", "2"], ["auto", "1", "2"], ["1", "auto", "2"], ["a", "b", "c"], ["nan", "0", "0"]]
+)
+def test_an_origin_is_three_numbers_or_auto(
+    words: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert usage_code("run", write_scan(tmp_path / "a.bin"), "--origin", *words) == 2
+    assert "Traceback" not in capsys.readouterr().err
+
+
+def test_an_origin_that_cannot_be_found_fails_the_scan(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("run", write_scan(tmp_path / "a.bin"), "--origin", "auto") == 1
+    assert "place of the sensor cannot be told" in capsys.readouterr().err
 
 
 def test_json_of_one_model_says_null_for_the_other(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -314,10 +360,10 @@ def test_folders_are_opened_and_sorted(tmp_path: Path, capsys: pytest.CaptureFix
 def test_huge_scans_fail_and_the_others_go_on(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def perceive(self: FakePerceiver, points: np.ndarray, stamp_s: float | None = None) -> Perception:
+    def perceive(self: FakePerceiver, points: np.ndarray, stamp_s: float | None = None, **more: Any) -> Perception:
         if len(points) == 41:
             raise MemoryError
-        return real(self, points, stamp_s)
+        return real(self, points, stamp_s, **more)
 
     real = FakePerceiver.__call__
     monkeypatch.setattr(FakePerceiver, "__call__", perceive)

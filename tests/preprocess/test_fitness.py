@@ -19,7 +19,14 @@ from numpy.typing import NDArray
 from edgeperc.errors import MountingError
 from edgeperc.ground.leveling import MountingEstimator
 from edgeperc.preprocess.condition import condition
-from edgeperc.preprocess.findings import Finding, check_beams, check_fitness, check_profiles, with_raw_remission
+from edgeperc.preprocess.findings import (
+    Finding,
+    check_beams,
+    check_fitness,
+    check_ground,
+    check_profiles,
+    with_raw_remission,
+)
 from edgeperc.preprocess.fitness import FitnessProfile
 from edgeperc.readers.files import read_points
 from edgeperc.simulation.samples import simulated_scan
@@ -210,7 +217,8 @@ def leveled(points: Points, sensor: str) -> list[Finding]:
     with contextlib.suppress(MountingError):
         estimator = estimator.add(points)
     frame = ModelFrame(estimator.mounting())
-    return [*check_beams(points, profile), *check_profiles(frame.move(points), PROFILES, profile, frame)]
+    turned = check_beams(points, profile) or check_ground(points)
+    return [*turned, *check_profiles(frame.move(points), PROFILES, profile, frame)]
 
 
 def office(sensor: str, seed: int, window: float) -> Points:
@@ -387,3 +395,42 @@ def test_sensors_that_lean_are_accepted_with_their_tilt(roll_deg: float, pitch_d
     for seed in SEEDS:
         points = condition(simulated_scan(seed, "os1-64", mounting=mounting).points, profile)[0]
         assert not any(finding.gross for finding in check_profiles(frame.move(points), PROFILES, profile, frame))
+
+
+TURNED = {
+    "about x": np.float32([1, -1, -1, 1]),
+    "about y": np.float32([-1, 1, -1, 1]),
+    "z alone": np.float32([1, 1, -1, 1]),
+}
+
+
+@pytest.mark.parametrize("turn", TURNED)
+@pytest.mark.parametrize("sensor", ["vlp-16", "os1-64", "os0-64", "os2-64", "pandarxt-32", "vlp-32c", "pandar64"])
+def test_the_ground_tells_up_from_down(sensor: str, turn: str) -> None:
+    """Beams that are as high as low do not."""
+    for seed in SEEDS:
+        points = street(seed, sensor)
+        assert not check_ground(points)
+        assert any("upside down" in finding for finding in leveled(points * TURNED[turn], sensor) if finding.gross)
+
+
+@pytest.mark.parametrize("turn", TURNED)
+def test_real_scans_that_are_upside_down_are_refused(kitti_root: Path, turn: str) -> None:
+    files = sorted(kitti_root.glob("training/velodyne/*.bin"))[::12]
+    assert len(files) == 41
+    scans = {file.name: read_points(file) for file in files}
+    assert [name for name, scan in scans.items() if check_ground(scan)] == []
+    assert [
+        name for name, scan in scans.items() if not any(f.gross for f in leveled(scan * TURNED[turn], "hdl-64e"))
+    ] == []
+
+
+@pytest.mark.parametrize("size", [(300.0, 8.0, 5.0), (60.0, 20.0, 4.5), (26.0, 24.0, 3.0), (400.0, 4.0, 6.0)])
+def test_a_ceiling_is_not_the_ground_above(size: tuple[float, float, float]) -> None:
+    for sensor in ("os0-64", "os1-64", "vlp-16", "hdl-32e"):
+        assert not check_ground(enclosed(size, 1.73, sensor))
+
+
+@pytest.mark.parametrize("points", [np.zeros((0, 4)), np.full((9, 4), np.nan), np.zeros((50, 4)), np.eye(4)])
+def test_nothing_is_upside_down_in_a_scan_of_nothing(points: NDArray[np.float64]) -> None:
+    assert check_ground(points.astype(np.float32)) == ()

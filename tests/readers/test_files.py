@@ -20,6 +20,7 @@ import twins.points
 from edgeperc.errors import OptionError, PointsError
 from edgeperc.readers.files import read_points
 from edgeperc.readers.pcd import fill_unpacked_lzf
+from edgeperc.simulation.samples import simulated_scan
 from edgeperc.types.points import as_points
 
 POINTS = np.array(
@@ -626,6 +627,36 @@ def test_coordinates_of_a_map_are_not_rounded(tmp_path: Path, kind: str, place: 
 def test_an_origin_is_three_numbers(origin: Any) -> None:
     with pytest.raises(OptionError, match="origin_m is"):
         read_points(POINTS, origin_m=origin)
+
+
+@pytest.mark.parametrize("kind", ["pcd", "npy", "array", "named"])
+def test_the_origin_of_a_level_sensor_is_found(tmp_path: Path, kind: str) -> None:
+    points, origin = simulated_scan(3, "os1-64").points, np.array(MAPS["UTM"])
+    placed = np.column_stack([points[:, :3].astype("f8") + origin, points[:, 3]])
+    source = {
+        "pcd": lambda: save(
+            tmp_path,
+            "a.pcd",
+            pcd("x y z intensity", "F F F F", "8 8 8 8", "1 1 1 1", len(placed), "binary", placed.tobytes()),
+        ),
+        "npy": lambda: save(tmp_path, "a.npy", npy(placed)),
+        "array": lambda: placed,
+        "named": lambda: np.rec.fromarrays(placed.T, names="x,y,z,intensity"),
+    }[kind]()
+    found = edgeperc.find_origin(source)
+    np.testing.assert_allclose(found, origin, atol=0.05)
+    read = read_points(source, origin_m="auto")
+    np.testing.assert_array_equal(read, read_points(source, origin_m=found))
+    np.testing.assert_allclose(read, points, atol=0.05)
+
+
+@pytest.mark.parametrize("source", [POINTS, np.zeros((5, 2)), np.zeros(3), np.zeros((9, 4))])
+def test_an_origin_that_cannot_be_found_is_an_error(source: Any) -> None:
+    for read in (edgeperc.find_origin, lambda given: read_points(given, origin_m="auto")):
+        with pytest.raises(PointsError):
+            read(source)
+    with pytest.raises(OptionError, match="origin_m is 'atuo'"):
+        read_points(POINTS, origin_m="atuo")  # type: ignore[arg-type]
 
 
 def test_an_origin_may_be_subtracted_from_float32() -> None:

@@ -193,3 +193,30 @@ def test_cell_centers_of_a_top_view() -> None:
     for cell in ((0, 0), (399, 199), (17, 101)):
         row, col, in_view = view.geometry.cells(*view.to_meters(*cell))
         assert ((int(row), int(col)), bool(in_view)) == (cell, True)
+
+
+@pytest.mark.parametrize("origin", [(512345.25, 5412345.5, 113.0), (-1e7 + 0.1, 1e-3, -4000.0), (0.0, 0.0, 0.0)])
+def test_boxes_and_points_are_placed_in_the_map(origin: tuple[float, float, float]) -> None:
+    perception = replace(perception_of(CAR, replace(CAR, score=0.5)), origin_m=origin)
+    for box, placed in zip(perception.boxes, perception.map_boxes, strict=True):
+        assert placed == replace(box, center=tuple(c + o for c, o in zip(box.center, origin, strict=True)))
+    points = np.random.default_rng(0).normal(0.0, 30.0, (50, 4)).astype(np.float32)
+    in_map = perception.to_map(points)
+    assert in_map.dtype == np.float64
+    np.testing.assert_array_equal(in_map, points[:, :3].astype(np.float64) + np.array(origin))
+    np.testing.assert_array_equal((in_map - np.array(origin)).astype(np.float32)[:, 1:2], points[:, 1:2])
+    record = json.loads(json.dumps(scan_record(perception)))
+    assert record["origin_m"] == list(origin)
+    assert [Box.from_dict(box) for box in record["map_boxes"]] == [
+        Box.from_dict(box.to_dict()) for box in perception.map_boxes
+    ]
+
+
+def test_without_an_origin_nothing_is_in_a_map() -> None:
+    perception = perception_of(CAR)
+    record = perception.to_dict()
+    assert (record["origin_m"], record["map_boxes"]) == (None, None)
+    with pytest.raises(PointsError, match="origin_m="):
+        _ = perception.map_boxes
+    with pytest.raises(PointsError, match="place of the scan in a map is not known"):
+        perception.to_map(np.zeros((3, 4), np.float32))

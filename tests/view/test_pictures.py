@@ -21,6 +21,7 @@ from edgeperc import Tracker, view
 from edgeperc.errors import MissingExtraError, PointsError, TrackingError
 from edgeperc.evaluation.mistakes import Mistakes, draw_mistakes
 from edgeperc.ground.planes import fit_ground
+from edgeperc.readers.files import read_points
 from edgeperc.types.perception import Box, Perception, PointLabels, TopView
 from edgeperc.view import draw_tracks, flatten_scan, write_html, write_labels, write_ply
 from edgeperc.view.canvas import Label, add_axes, free_place, new_figure, place_labels, shorten, wrap
@@ -244,6 +245,17 @@ def test_leaves_above_the_road_are_not_road(perception: Perception) -> None:
     names, painted = paint_points(points, replace(perception, n_points=61, points=bare))
     assert (painted[:60] == names.index("drivable")).all()
     assert painted[60] == 0
+
+
+def test_ply_of_a_map_has_its_coordinates(scan: np.ndarray, perception: Perception, tmp_path: Path) -> None:
+    origin = (512345.25, 5412345.5, 113.0)
+    write_ply(replace(perception, origin_m=origin), scan, tmp_path / "points.ply")
+    _, body = (tmp_path / "points.ply").read_bytes().split(b"end_header\n", 1)
+    kinds = [("x", "<f8"), ("y", "<f8"), ("z", "<f8"), ("remission", "<f4"), ("colors", "u1", 4)]
+    rows = np.frombuffer(body, dtype=kinds)
+    for k, name in enumerate("xyz"):
+        np.testing.assert_array_equal(rows[name], scan[:, k].astype(np.float64) + origin[k])
+    np.testing.assert_allclose(read_points(tmp_path / "points.ply", origin_m=origin), scan, atol=1e-8)
 
 
 def test_ply_reads_back(scan: np.ndarray, perception: Perception, tmp_path: Path) -> None:
