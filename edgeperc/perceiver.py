@@ -295,7 +295,7 @@ class Perceiver:
             "agreement": agreement,
             "objects": objects,
             "candidates": objects and self.boxes_from != "network",
-            "standing": bool(self.agree) and (boxes or any(card.box_classes for card in scans)),
+            "standing": bool(self.agree) and not objects and (boxes or any(card.box_classes for card in scans)),
             "road": top_view,
             "cells": top_view and bool(self.agree),
             "detections": any(card.box_classes for card in scans if card.view.kind == "top_view"),

@@ -220,7 +220,6 @@ def _compile_agreement() -> None:
     clusters = np.where(scan.ground.mask, -1, 0).astype(np.int32)
     agreed = agree_on_points(scan, labels, clusters, support, without_poles(scan, labels))
     agree_on_boxes([UNCERTAIN], scan, agreed)
-    stand_boxes([UNCERTAIN], scan, agreed)
     cells = np.zeros((400, 200), np.uint8)
     view = TopView(cells, ("background", "drivable"), 0.1, (6.0, 46.0), (-10.0, 10.0), np.ones(cells.shape, np.bool_))
     agree_on_cells(view, agreed, [UNCERTAIN], [UNCERTAIN], mark_cells(view, scan, agreed))

@@ -188,7 +188,7 @@ def test_stamps_beyond_the_limits(stamp_s: float) -> None:
         tracker.update([NEAR], stamp_s)
     far = np.eye(4)
     far[0, 3] = 1e200
-    with pytest.raises(TrackingError, match="up to 1e"):
+    with pytest.raises(TrackingError, match="at most 1e"):
         Tracker().update([NEAR], 0.0, far)
 
 

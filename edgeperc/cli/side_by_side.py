@@ -22,9 +22,9 @@ from typing import TYPE_CHECKING, Any
 from .. import __version__
 from ..errors import EdgepercError
 from ..system.atomic import write_atomic
+from ..system.pool import MOST_FIRST, Lost
 from ..system.ray_cluster import map_in_workers
 from ..system.remote import Remote
-from ..system.workers import MOST_FIRST, Lost
 from .arguments import positive
 from .output import many, one_line, print_line
 from .report import Report

@@ -20,8 +20,8 @@ from ..datasets.scan_folder import ScanFolder
 from ..errors import EdgepercError, OptionError, PointsError
 from ..perceiver import Learned, Perceiver
 from ..simulation.samples import FIRST_SEED
+from ..system.pool import MOST_FIRST, Lost
 from ..system.ray_cluster import map_in_workers
-from ..system.workers import MOST_FIRST, Lost
 from ..types.mounting import Mounting
 from ..zoo import DEFAULT
 from .judge import BY_DEFAULT, NETWORK_ALONE, Judge, Perceiving

@@ -16,7 +16,7 @@ from ..perceiver import ADAPTATIONS, Perceiver
 from ..preprocess.sensor_fit import fit_sensor
 from ..simulation.samples import FIRST_SEED, IGNORE, labels_by_boxes, simulated_scan
 from ..simulation.scene import POINT_CLASSES
-from ..system.workers import Lost, map_in_processes
+from ..system.pool import Lost, map_in_processes
 from ..types.perception import Box
 from ..types.points import Labels, Points
 from ..types.sensor import SensorProfile, get_sensor

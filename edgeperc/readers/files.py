@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import PointsError
-from ..preprocess.origin import find_place
 from ..types.points import as_points, assemble, table_columns
 from .inflate import inflate, most_bytes
+from .origin import find_place
 from .pcd import begins_like_pcd, parse_pcd
 from .ply import parse_ply
 from .raw import parse_raw

@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 from .extras import require
-from .workers import DIED, MOST_DEATHS, Lost, map_in_processes
+from .pool import DIED, MOST_DEATHS, Lost, map_in_processes
 
 # Items of a block, the unit that a worker is given. Few, because all are done again if its process dies. Many, because
 # the driver keeps some kilobytes for each block.
@@ -32,7 +32,7 @@ def map_in_workers(
     workers: int | None = None,
     n_threads: int = 1,
 ) -> Iterator[Any]:
-    """`map_on_ray` for the engine ``"ray"``, else `workers.map_in_processes`."""
+    """`map_on_ray` for the engine ``"ray"``, else `pool.map_in_processes`."""
     if not items:
         return iter(())
     if engine == "ray":

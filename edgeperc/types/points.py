@@ -107,7 +107,7 @@ def _to_convert(thing: Any) -> tuple[str, str] | None:
     kind = f"{type(thing).__module__}.{type(thing).__qualname__}"
     if isinstance(thing, str | os.PathLike):
         return (
-            f"the path {os.fspath(thing)!r:.80}",
+            f"the path {os.fspath(thing)[-200:]!r}",
             "edgeperc.read_points(path), or each scan of edgeperc.read_scans(path)",
         )
     if isinstance(first, str | os.PathLike):

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+from edgeperc.system.pool import Lost
 from edgeperc.system.ray_cluster import map_in_workers
-from edgeperc.system.workers import Lost
 
 from ..data.roads import DatabaseError
 from .scenes import Job, SceneBuilder

@@ -854,7 +854,8 @@ def test_no_shipped_model_was_trained_on_a_test_scan(kitti_root: Path, semantick
         card = ModelCard.read(path)
         (trained_on,) = training_scans_of([card]).values()
         only_simulated = card.training["recipe"]["simulated_share"] == 1.0
-        assert len(trained_on) > 100 or only_simulated, f"{path} does not say what it was trained on"
+        least = 27 if path.stem.removesuffix("-int8").endswith("-open") else 100
+        assert len(trained_on) > least or only_simulated, f"{path} does not say what it was trained on"
         assert path.stem.endswith("-sim") == only_simulated == (not trained_on)
         assert not hashes & trained_on
 

@@ -20,9 +20,9 @@ import pytest
 from edgeperc import cli
 from edgeperc.errors import MissingExtraError, OptionError, PointsError
 from edgeperc.perceiver import Perceiver
+from edgeperc.system.pool import Lost
 from edgeperc.system.ray_cluster import map_on_ray, signals_kept
 from edgeperc.system.remote import Remote, location
-from edgeperc.system.workers import Lost
 from scenes import urban
 
 pytestmark = pytest.mark.filterwarnings("ignore")  # of Ray, boto and aiohttp

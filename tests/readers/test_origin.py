@@ -10,8 +10,8 @@ import pytest
 from numpy.typing import NDArray
 
 from edgeperc.errors import PointsError
-from edgeperc.preprocess.origin import find_place
 from edgeperc.readers.files import read_points
+from edgeperc.readers.origin import find_place
 from edgeperc.simulation.samples import simulated_scan
 from edgeperc.types.mounting import Mounting
 

@@ -76,7 +76,7 @@ def map_in_processes(
             for end in wait([process.end for process in pool]):
                 process = next(each for each in pool if each.end is end)
                 try:
-                    number, result = process.receive()
+                    answer = process.receive()
                 except (EOFError, OSError):
                     pool.remove(process)
                     todo.extendleft(reversed(process.numbers))
@@ -84,7 +84,8 @@ def map_in_processes(
                         number = todo.popleft()
                         results[number] = Lost(DIED)
                     continue
-                results[number] = result
+                if answer is not None:
+                    results[answer[0]] = answer[1]
             while due in results:
                 yield results.pop(due)
                 due += 1
@@ -100,6 +101,7 @@ class _Process:
     process: Any
     end: Connection
     numbers: deque[int] = field(default_factory=deque)
+    has_begun: bool = False
 
     @classmethod
     def start(cls, start: bytes) -> _Process:
@@ -115,19 +117,22 @@ class _Process:
         with contextlib.suppress(OSError):  # of a process that died: the driver learns of it when it reads
             self.end.send_bytes(pickle.dumps(item))
 
-    def receive(self) -> tuple[int, Any]:
-        """The number and the result of its first item. Raises EOFError, OSError, EdgepercError."""
+    def receive(self) -> tuple[int, Any] | None:
+        """The number and the result of its first item; None: it has begun. Raises EOFError, OSError, EdgepercError."""
         kind, result = pickle.loads(self.end.recv_bytes())
         if kind == "failed":
             raise EdgepercError(f"a worker process could not start: {result}")
+        if kind == "begun":
+            self.has_begun = True
+            return None
         return self.numbers.popleft(), result
 
     def died_of(self, deaths: Counter[int]) -> int:
         """How often a process died of its first item, with this one. Raises EdgepercError."""
         self.process.join(LAST_S)
         ended = f"exit code {self.process.exitcode}"
-        if not self.numbers:
-            raise EdgepercError(f"a worker process ended without work ({ended})")
+        if not self.has_begun or not self.numbers:
+            raise EdgepercError(f"a worker process ended before its work ({ended})")
         deaths[self.numbers[0]] += 1
         return deaths[self.numbers[0]]
 
@@ -150,6 +155,7 @@ def _work(end: Connection, start: bytes) -> None:
         except Exception:
             end.send_bytes(pickle.dumps(("failed", traceback.format_exc())))
             return
+        end.send_bytes(pickle.dumps(("begun", None)))
         while True:
             item = end.recv_bytes()
             try:

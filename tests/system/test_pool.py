@@ -15,7 +15,7 @@ import pytest
 
 from edgeperc.errors import EdgepercError
 from edgeperc.evaluation.transfer import compare
-from edgeperc.system.workers import MOST_KEPT, Lost, map_in_processes
+from edgeperc.system.pool import MOST_KEPT, Lost, map_in_processes
 
 
 def scaled(factor: int, deadly: tuple[int, ...] = ()) -> Callable[[int], int]:
@@ -97,7 +97,7 @@ def test_processes_end_with_their_driver(tmp_path: Path, is_killed: bool) -> Non
         textwrap.dedent(
             """
             import os, time
-            from edgeperc.system.workers import map_in_processes
+            from edgeperc.system.pool import map_in_processes
 
             def make():
                 return slow
