@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from .agreement.rules import RULES
 from .camera.image import ImageScaler, as_image, label_pixels
 from .errors import EdgepercError, FitnessError, ImageError, MountingError, OptionError, PointsError
-from .ground.leveling import MountingEstimate, MountingEstimator
+from .ground.leveling import MountingEstimate, MountingEstimator, near_support
 from .inference.session import Session
 from .objects.boxes import MIN_SCORE
 from .pipeline import BoxesFrom, ObjectNetwork, Options, Pipeline, RangeImageNetwork, TopViewNetwork
@@ -533,7 +533,7 @@ class Perceiver:
         watch.lap("adapt" if self._renders and profile.remission is not None else "check")
         if not before.is_complete and len(scan):
             if check and before.known.roll_deg is None:
-                turned = check_beams(scan, profile) or check_ground(scan)
+                turned = check_beams(scan, profile) or check_ground(scan, near_support)
             try:
                 self._set_mounting(before.add(scan))
                 hidden = self._about_tilt()

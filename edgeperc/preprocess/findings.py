@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..ground.leveling import near_support
 from ..types.frame import ModelFrame
 from ..types.mounting import MODEL_HEIGHT_M
 from ..types.perception import DroppedPoints
@@ -331,13 +330,14 @@ def check_beams(points: Points, sensor: SensorProfile) -> tuple[Finding, ...]:
 _ABOVE, _FEWEST_ABOVE = 1.5, 120  # times the cells below, and cells of half a meter
 
 
-def check_ground(points: Points) -> tuple[Finding, ...]:
+def check_ground(points: Points, support_of: Callable[[Points], float]) -> tuple[Finding, ...]:
     """Describe a scan that shows a plane above, as it should show the ground below, and little of a plane below.
 
     points : (n, 4) float32; returns in the frame of the scan, before a mounting moves them.
+    support_of : `ground.leveling.near_support`.
     """
-    above = near_support(points * np.array([1.0, -1.0, -1.0, 1.0], np.float32))
-    if above < _FEWEST_ABOVE or above <= _ABOVE * near_support(points):
+    above = support_of(points * np.array([1.0, -1.0, -1.0, 1.0], np.float32))
+    if above < _FEWEST_ABOVE or above <= _ABOVE * support_of(points):
         return ()
     scan = measure(points, (180.0, -180.0))
     if scan is None or scan.far_m < _HALL_M or scan.most_m < _MOST_OF_HALL_M:
