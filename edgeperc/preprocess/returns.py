@@ -61,7 +61,7 @@ def about_too_near(dropped: DroppedPoints, n_points: int, sensor: SensorProfile)
 def _with_remission(scan: Points) -> NDArray[np.float32]:
     """A copy whose rows with coordinates have a remission."""
     filled, known = scan.copy(), np.isfinite(scan[:, 3])
-    median = np.median(scan[known, 3]) if known.any() else 0.0
+    median = np.median(scan[known, 3].astype(np.float64)) if known.any() else 0.0  # a mean of two may overflow
     filled[~known & np.isfinite(scan[:, 0]), 3] = median
     return read_only(filled)
 
