@@ -476,8 +476,10 @@ def with_raw_remission(
     remission : (n,) as recorded.
     """
     found = tuple(findings)
+    if not any(finding.startswith(_ALL_ZERO) for finding in found):
+        return found
     known = remission[np.isfinite(remission)].astype(np.float64)  # float32 may overflow in a difference
-    if not any(finding.startswith(_ALL_ZERO) for finding in found) or not (known > 0.0).any() or np.ptp(known) == 0.0:
+    if not (known > 0.0).any() or np.ptp(known) == 0.0:
         return found
     low, high = sensor.remission_range
     brightest = float(np.percentile(known, 99))
