@@ -274,9 +274,7 @@ class Pipeline:
             support = value("cluster", find_support, scan, labels, boxes, rules)
             per_m = options.distance_per_m
             clusters = value("cluster", find_voters, scan, labels, support, strips, distance_per_m=per_m, rules=rules)
-            if (
-                self.objects is not None
-            ):  # the clusters vote without them: a box keeps and adds labels whatever they say
+            if self.objects is not None:  # whatever the clusters say, a box keeps and adds labels
                 supporting = value("agree", _supporting, boxes, objects)
                 support = value("cluster", find_support, scan, labels, supporting, rules)
             agreed = value("agree", agree_on_points, scan, labels, clusters, support, upright, view=cells, rules=rules)
