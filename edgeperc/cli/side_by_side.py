@@ -23,7 +23,7 @@ from .. import __version__
 from ..errors import EdgepercError
 from ..system.atomic import write_atomic
 from ..system.pool import MOST_FIRST, Lost
-from ..system.ray_cluster import map_in_workers
+from ..system.ray_cluster import ENGINES
 from ..system.remote import Remote
 from .arguments import positive
 from .output import many, one_line, print_line
@@ -140,8 +140,7 @@ def perceive_side_by_side(
         (scan, _absolute(scan), _absolute(target))
         for scan, target in zip(scans[n_first:], targets[n_first:], strict=True)
     ]
-    answers = map_in_workers(
-        arguments.engine,
+    answers = ENGINES[arguments.engine](
         _ScanWorker,
         (alone, argparse.Namespace(**options), learned),
         items,

@@ -17,11 +17,11 @@ from typing import Any, Literal
 from ..datasets.kitti import KittiObjects, SemanticKitti
 from ..datasets.layout import known_layouts
 from ..datasets.scan_folder import ScanFolder
-from ..errors import EdgepercError, OptionError, PointsError
+from ..errors import OptionError, PointsError
 from ..perceiver import Learned, Perceiver
 from ..simulation.samples import FIRST_SEED
-from ..system.pool import MOST_FIRST, Lost
-from ..system.ray_cluster import map_in_workers
+from ..system.pool import MOST_FIRST, taken
+from ..system.ray_cluster import ENGINES
 from ..types.mounting import Mounting
 from ..zoo import DEFAULT
 from .judge import BY_DEFAULT, NETWORK_ALONE, Judge, Perceiving
@@ -160,15 +160,12 @@ class _Evaluator:
         self._perceive, self._scans = job.scans(n_threads=1)
         self._learned = learned
 
-    def __call__(self, numbers: Sequence[int]) -> list[_Figures] | EdgepercError:
+    def __call__(self, numbers: Sequence[int]) -> list[_Figures]:
         results = []
-        try:
-            for _, drive, evaluate in (self._scans[number] for number in numbers):
-                if drive is None:
-                    self._perceive.start_from(self._learned)
-                results.append(evaluate())
-        except EdgepercError as exc:
-            return exc
+        for _, drive, evaluate in (self._scans[number] for number in numbers):
+            if drive is None:
+                self._perceive.start_from(self._learned)
+            results.append(evaluate())
         return results
 
 
@@ -185,17 +182,14 @@ def _side_by_side(
     # Consecutive scans of one drive stay together; the others are apart.
     rest = (k for k in range(len(scans)) if k not in first)
     groups = [[*group] for _, group in groupby(rest, lambda k: (scans[k][0], scans[k][1] or k))]
-    results = map_in_workers(engine, _Evaluator, (job, perceive.learned), groups, workers=workers)
+    answers = ENGINES[engine](_Evaluator, (job, perceive.learned), groups, workers=workers)
     done = 0
-    for numbers, answer in zip(groups, results, strict=True):
-        if isinstance(answer, EdgepercError):
-            raise answer
-        if isinstance(answer, Lost):
-            raise EdgepercError(f"scan {numbers[0] + 1} of {len(scans)} was not evaluated: {answer.reason}")
+    for numbers, answer in zip(groups, answers, strict=True):
+        results = taken(answer, f"scan {numbers[0] + 1} of {len(scans)}")
         while done < numbers[0]:
             yield first[done]
             done += 1
-        yield from answer
+        yield from results
         done += len(numbers)
     yield from (first[k] for k in range(done, len(scans)))
 

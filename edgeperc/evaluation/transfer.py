@@ -11,12 +11,12 @@ import numpy as np
 
 from ..datasets.layout import class_number
 from ..datasets.scan_folder import ScanFolder, ScanFrame
-from ..errors import EdgepercError, ModelError, PointsError
+from ..errors import ModelError, PointsError
 from ..perceiver import ADAPTATIONS, Perceiver
 from ..preprocess.sensor_fit import fit_sensor
 from ..simulation.samples import FIRST_SEED, IGNORE, labels_by_boxes, simulated_scan
 from ..simulation.scene import POINT_CLASSES
-from ..system.pool import Lost, map_in_processes
+from ..system.pool import map_in_processes, taken
 from ..types.perception import Box
 from ..types.points import Labels, Points
 from ..types.sensor import SensorProfile, get_sensor
@@ -99,11 +99,7 @@ def compare(
     if (workers or 1) > 1:
         answers = map_in_processes(_OfOne, (model, provider, precision), [*sizes], workers=workers)
         for name, answer in zip(sizes, answers, strict=True):
-            if isinstance(answer, EdgepercError):
-                raise answer
-            if isinstance(answer, Lost):
-                raise EdgepercError(f"{name} was not evaluated: {answer.reason}")
-            result[name] = answer
+            result[name] = taken(answer, name)
             done += sizes[name]
             on_scan(done, total)
         return result
@@ -124,11 +120,8 @@ class _OfOne:
     def __init__(self, model: str | Path, provider: str, precision: str) -> None:
         self._arguments = model, provider, precision
 
-    def __call__(self, name: str) -> dict[str, Any] | EdgepercError:
-        try:
-            return _compare_one(*self._arguments, _dataset(name), lambda: None)
-        except EdgepercError as exc:
-            return exc
+    def __call__(self, name: str) -> dict[str, Any]:
+        return _compare_one(*self._arguments, _dataset(name), lambda: None)
 
 
 def _compare_one(

@@ -13,6 +13,7 @@ from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection, wait
+from queue import SimpleQueue
 from typing import Any
 
 from ..errors import EdgepercError
@@ -38,9 +39,28 @@ class Lost:
     """In place of a result.
 
     reason : the traceback of an exception, or that the worker process died.
+    error : the exception, if it is one of edgeperc's.
     """
 
     reason: str
+    error: EdgepercError | None = None
+
+
+def taken(answer: Any, what: str) -> Any:
+    """A result; of one that is lost its error, or one about ``what``."""
+    if not isinstance(answer, Lost):
+        return answer
+    raise answer.error or EdgepercError(f"{what} was not evaluated: {answer.reason}")
+
+
+def attempt(function: Callable[[Any], Any], item: bytes) -> bytes:
+    """The pickled result, or `Lost`, of a pickled item."""
+    try:
+        return pickle.dumps(function(pickle.loads(item)))
+    except EdgepercError as exc:
+        return pickle.dumps(Lost(traceback.format_exc(), exc))
+    except Exception:
+        return pickle.dumps(Lost(traceback.format_exc()))
 
 
 def map_in_processes(
@@ -49,6 +69,7 @@ def map_in_processes(
     items: Sequence[Any],
     *,
     workers: int | None = None,
+    n_threads: int = 1,
 ) -> Iterator[Any]:
     """Map items to results in processes of this computer, which share nothing.
 
@@ -56,13 +77,14 @@ def map_in_processes(
 
     make : called with ``arguments`` once in each process; returns a function from an item to its result.
     items : anything that can be pickled, as ``make``, ``arguments`` and the results.
-    workers : number of processes; None: one for each usable core.
+    workers : number of processes; None: the number of usable cores divided by ``n_threads``.
+    n_threads : that each process uses.
     Yields result (object or Lost): In the order of the items. `Lost` if the function raised an exception, or if its
         process died twice; other items of a process that dies are done in the next one.
     Raises EdgepercError: ``make`` failed, or processes die at their start.
     """
     start = pickle.dumps((make, arguments))
-    n = min(workers or usable_cores(), len(items))
+    n = min(workers or max(1, usable_cores() // n_threads), len(items))
     pool: list[_Process] = []
     todo, results, deaths = deque(range(len(items))), {}, Counter[int]()
     due = 0
@@ -119,13 +141,13 @@ class _Process:
 
     def receive(self) -> tuple[int, Any] | None:
         """The number and the result of its first item; None: it has begun. Raises EOFError, OSError, EdgepercError."""
-        kind, result = pickle.loads(self.end.recv_bytes())
-        if kind == "failed":
-            raise EdgepercError(f"a worker process could not start: {result}")
-        if kind == "begun":
-            self.has_begun = True
-            return None
-        return self.numbers.popleft(), result
+        answer = pickle.loads(self.end.recv_bytes())
+        if self.has_begun:
+            return self.numbers.popleft(), answer
+        if answer is not None:
+            raise EdgepercError(f"a worker process could not start: {answer}")
+        self.has_begun = True
+        return None
 
     def died_of(self, deaths: Counter[int]) -> int:
         """How often a process died of its first item, with this one. Raises EdgepercError."""
@@ -147,27 +169,25 @@ class _Process:
 def _work(end: Connection, start: bytes) -> None:
     """What a worker process does: results for items, until its driver closes the pipe or is gone."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the driver is interrupted too, and stops its processes
-    threading.Thread(target=_end_with_driver, daemon=True).start()
+    items: SimpleQueue[bytes] = SimpleQueue()
+    threading.Thread(target=_take, args=(end, items), daemon=True).start()
+    try:
+        make, arguments = pickle.loads(start)
+        function = make(*arguments)
+    except Exception:
+        end.send_bytes(pickle.dumps(traceback.format_exc()))
+        return
+    end.send_bytes(pickle.dumps(None))
+    while True:
+        end.send_bytes(attempt(function, items.get()))
+
+
+def _take(end: Connection, items: SimpleQueue[bytes]) -> None:
+    """Take items as they come, so that neither end waits for the other to read; without a driver, end the process.
+
+    It does not finish its item: another run may write the same files.
+    """
     with contextlib.suppress(EOFError, OSError):
-        try:
-            make, arguments = pickle.loads(start)
-            function = make(*arguments)
-        except Exception:
-            end.send_bytes(pickle.dumps(("failed", traceback.format_exc())))
-            return
-        end.send_bytes(pickle.dumps(("begun", None)))
         while True:
-            item = end.recv_bytes()
-            try:
-                answer = pickle.dumps(("done", function(pickle.loads(item))))
-            except Exception:
-                answer = pickle.dumps(("done", Lost(traceback.format_exc())))
-            end.send_bytes(answer)
-
-
-def _end_with_driver() -> None:
-    """A process does not finish its item after its driver was killed: another run may write the same files."""
-    driver = multiprocessing.parent_process()
-    assert driver is not None
-    driver.join()
+            items.put(end.recv_bytes())
     os._exit(1)

@@ -8,36 +8,19 @@ import os
 import pickle
 import signal
 import threading
-import traceback
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from types import MappingProxyType
 from typing import Any
 
 from .extras import require
-from .pool import DIED, MOST_DEATHS, Lost, map_in_processes
+from .pool import DIED, MOST_DEATHS, Lost, attempt, map_in_processes
 
 # Items of a block, the unit that a worker is given. Few, because all are done again if its process dies. Many, because
 # the driver keeps some kilobytes for each block.
 MOST_IN_BLOCK = 16
 # A local cluster's memory for items and results in transit; Ray's own default is 30 % of the computer's.
 STORE_BYTES = 256 * 2**20
-
-
-def map_in_workers(
-    engine: str,
-    make: Callable[..., Callable[[Any], Any]],
-    arguments: tuple[Any, ...],
-    items: Sequence[Any],
-    *,
-    workers: int | None = None,
-    n_threads: int = 1,
-) -> Iterator[Any]:
-    """`map_on_ray` for the engine ``"ray"``, else `pool.map_in_processes`."""
-    if not items:
-        return iter(())
-    if engine == "ray":
-        return map_on_ray(make, arguments, items, workers=workers, n_threads=n_threads)
-    return map_in_processes(make, arguments, items, workers=workers)
 
 
 def map_on_ray(
@@ -61,6 +44,8 @@ def map_on_ray(
         process died twice.
     Raises MissingExtraError.
     """
+    if not items:
+        return
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")  # else Ray warns about a future default
     ray = require("ray", "ray", "--engine ray")
@@ -130,11 +115,11 @@ class _Worker:
     def __call__(self, batch: dict[str, Any]) -> Iterator[dict[str, list[Any]]]:
         """Map a block, item by item."""
         for number, item in zip(batch["number"].tolist(), batch["item"], strict=True):
-            result: Any = Lost(DIED)
-            if self._ray.get(self._deaths.begin.remote(number)) < MOST_DEATHS:
-                try:
-                    result = self._function(pickle.loads(item))
-                except Exception:
-                    result = Lost(traceback.format_exc())
+            may_run = self._ray.get(self._deaths.begin.remote(number)) < MOST_DEATHS
+            result = attempt(self._function, item) if may_run else pickle.dumps(Lost(DIED))
             self._deaths.end.remote(number)
-            yield {"result": [pickle.dumps(result)]}
+            yield {"result": [result]}
+
+
+ENGINES: Mapping[str, Callable[..., Iterator[Any]]] = MappingProxyType({"local": map_in_processes, "ray": map_on_ray})
+"""What maps items to results, by the value of ``--engine``."""

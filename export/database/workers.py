@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from edgeperc.system.pool import Lost
-from edgeperc.system.ray_cluster import map_in_workers
+from edgeperc.system.ray_cluster import ENGINES
 
 from ..data.roads import DatabaseError
 from .scenes import Job, SceneBuilder
@@ -18,7 +18,7 @@ def run_jobs(builder: SceneBuilder, jobs: list[Job], engine: str, workers: int) 
     for job in jobs[:n_here]:
         yield job.name, builder(job)
     rest = jobs[n_here:]
-    reasons = map_in_workers(engine, SceneBuilder, (builder.plan,), rest, workers=workers)
+    reasons = ENGINES[engine](SceneBuilder, (builder.plan,), rest, workers=workers)
     for job, reason in zip(rest, reasons, strict=True):
         if isinstance(reason, Lost):
             raise DatabaseError(f"scene {job.name}: {reason.reason}")
