@@ -17,7 +17,6 @@ from ..types.rigid import ROW_TOLERANCE, rigid
 
 MAX_EDGE, MAX_PIXELS = 2**15, 2**26  # of an image, as in `edgeperc.camera.image`
 MAX_DISTANCE_M = 100.0  # between the sensors; more is probably a translation in millimeters
-# KITTI's rotations have seven digits; a product of two of them is off by some 1e-6.
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -7,7 +7,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..errors import EdgepercError
 
-ROTATION_TOLERANCE = 1e-3  # of R R^T
+# Of R R^T. KITTI's rotations have seven digits; a product of two of them is off by some 1e-6.
+ROTATION_TOLERANCE = 1e-3
 ROW_TOLERANCE = 1e-6  # of the last row: what is multiplied or inverted in float32 is as far off
 
 
