@@ -371,7 +371,7 @@ def made(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
         def __init__(self, *_: Any, sensor: Any, **__: Any) -> None:
             sensors.append(sensor)
 
-        def __call__(self, points: Any, stamp_s: Any = None) -> Any:
+        def __call__(self, points: Any, stamp_s: Any = None, **_: Any) -> Any:
             raise PointsError("not perceived")
 
     monkeypatch.setattr("edgeperc.perceiver.Perceiver", Perceiver)
@@ -422,7 +422,7 @@ def test_a_stream_warns_of_another_sensor(tmp_path: Path) -> None:
     class Perceiver:
         sensor = get_sensor("hdl-64e")
 
-        def __call__(self, points: Any, stamp_s: Any = None) -> Any:
+        def __call__(self, points: Any, stamp_s: Any = None, **_: Any) -> Any:
             raise AssertionError
 
     path = write_pcap(tmp_path / "a.pcap", velodyne(0x22))
