@@ -29,5 +29,5 @@ def returns(
     known = np.sort([r for *_, r in out if np.isfinite(r)])
     for row in out:
         if np.isfinite(row[:3]).all() and not np.isfinite(row[3]):
-            row[3] = np.median(known) if len(known) else 0.0
+            row[3] = np.median(np.asarray(known, np.float64)) if len(known) else 0.0
     return out, tuple(counts)
