@@ -614,6 +614,8 @@ def test_a_scan_is_never_overwritten(tmp_path: Path, capsys: pytest.CaptureFixtu
 def test_no_file_is_written_twice(
     options: str, both: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    if "--gif" in options:  # an extra is missed before what is written is compared
+        pytest.importorskip("PIL")
     monkeypatch.chdir(tmp_path)
     (tmp_path / "out").mkdir()
     (tmp_path / "link").symlink_to(tmp_path / "out")
