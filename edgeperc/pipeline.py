@@ -103,9 +103,9 @@ class TopViewNetwork:
         pixel = np.empty(len(near.points), np.int32)
         self.projector.fill(near.points, self.session.input, self.index, pixel, None)
 
-    def find_boxes(self, projected: None, score_threshold: float) -> list[Box]:
-        """Run the network on what was projected, and decode its boxes (SSADNet 3.1)."""
-        return decode_boxes(self.card, self.session.run(), score_threshold)
+    def find_boxes(self, projected: None, score_threshold: float, named_from: float) -> list[Box]:
+        """Run the network on what was projected, and decode its boxes (SSADNet 3.1); weak ones without a class."""
+        return decode_boxes(self.card, self.session.run(), score_threshold, named_from)
 
     def label_cells(self, near: View, boxes: Sequence[Box], mounting: Mounting) -> TopView:
         """Class of every cell, and which cells the scan observed; after `find_boxes`."""
@@ -247,7 +247,7 @@ class Pipeline:
         if top is not None:
             projected = value("project", top.project, near)
             least = options.network_score if self.objects is None else min(options.network_score, MIN_DETECTOR_SCORE)
-            detected = value("infer", top.find_boxes, projected, least)
+            detected = value("infer", top.find_boxes, projected, least, options.network_score)
             boxes = value("decode", _at_least, detected, options.network_score)
             cells = value("decode", top.label_cells, near, boxes, mounting)
 
@@ -260,13 +260,13 @@ class Pipeline:
             labels = value("refine", self._label_ahead, near, scan, watch)
 
         # Objects by the points of their candidates
-        objects = absent
+        objects = candidates = absent
         if self.objects is not None:
             candidates = value("cluster", self.objects.crop, scan, detected, options)
             objects = value("infer", self.objects.find_boxes, candidates, options.object_score)
 
         # Objects, and what the parts say of one another (KUL-Seg 5.2)
-        strips = clusters = upright = marks = absent
+        strips = clusters = upright = support = marks = absent
         agreed, trusted, joined, view = labels, boxes, boxes, cells
         if self.ranged and rules:
             strips = value("cluster", _sorted, scan, options.distance_per_m)
@@ -294,13 +294,13 @@ class Pipeline:
             marks = value("agree", mark_cells, cells, scan, agreed, rules)
             view = value("agree", _agreed_cells, cells, agreed, joined, boxes, trusted, marks, rules)
 
-        # What needs no objects is for the lane that waits for them; what needs no labels, for the one that finds no
-        # sector of a turn left.
-        aside = [strips, cells]
-        first = [near, projected, scan, *sectors, *(aside if sectors else ())]
+        # The second lane ends with the objects, and what needs them; the first one has what needs labels. The lane that
+        # finds no sector of a turn left makes the candidates, while the other one labels the last.
+        spare = [candidates, strips] if sectors else []
+        first = [near, projected, scan, *sectors, *spare, labels, upright, strips, clusters]
         self._lanes.run(
-            [*first, labels, upright, strips, clusters, cells, surface, agreed, trusted, joined, view],
-            [planes, boxes, objects, *reversed(sectors), *aside, surface, upright, marks, standing],
+            [*first, cells, surface, agreed, trusted, joined, view],
+            [planes, boxes, *reversed(sectors), objects, support, cells, surface, marks, standing],
         )
         labeled = agreed()
         whole = None if labeled is None else spread([(labeled, near().rows)], len(points))
@@ -368,8 +368,10 @@ def _supporting(boxes: Sequence[Box], objects: Sequence[Box]) -> list[Box]:
 
 def _unboxed(labels: PointLabels, support: Support) -> PointLabels:
     """Labels without those of vehicles that have a box: what has one needs no other."""
-    vehicles = roles_of(labels.classes)[labels.labels] == VEHICLE
-    return replace(labels, labels=np.where(vehicles & (support.scores > 0.0), np.uint8(0), labels.labels))
+    boxed = np.flatnonzero(support.scores > 0.0)
+    left = labels.labels.copy()
+    left[boxed[roles_of(labels.classes)[left[boxed]] == VEHICLE]] = 0
+    return replace(labels, labels=left)
 
 
 def _at_least(boxes: Sequence[Box], min_score: float) -> list[Box]:

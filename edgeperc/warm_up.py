@@ -113,7 +113,7 @@ class _RehearsedTop(TopViewNetwork):
     def __init__(self, network: TopViewNetwork) -> None:
         vars(self).update(vars(network))
 
-    def find_boxes(self, projected: None, score_threshold: float) -> list[Box]:
+    def find_boxes(self, projected: None, score_threshold: float, named_from: float) -> list[Box]:
         return [UNCERTAIN] if self.card.box_classes else []
 
     def project(self, near: View) -> None:

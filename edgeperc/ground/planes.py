@@ -185,8 +185,7 @@ class GroundFit:
 
     def surface(self) -> GroundSurface:
         """The ground without the scan: 0.2 MB in place of 3 MB."""
-        cells = np.flatnonzero(self.lowest.reshape(-1) >= 0).astype(np.int32)
-        lowest = self.points[self.lowest.reshape(-1)[cells]]
+        cells, lowest = taken_cells(self.points, self.lowest)
         return GroundSurface(self._plane if self.found else None, self._plane, self.planes, cells, lowest)
 
 
@@ -320,6 +319,22 @@ def fill_lowest(points: Points, cell: NDArray[np.int32], lowest: NDArray[np.int3
             best[at] = min(best[at], np.int64(ordered[j]) << 32 | np.int64(start + j))
     for at in range(N_CELLS * N_CELLS):
         flat[at] = np.int32(best[at + 1] & LOW_WORD) if best[at + 1] != EMPTY else np.int32(-1)
+
+
+@njit(cache=True, nogil=True)
+def taken_cells(points: Points, lowest: NDArray[np.int32]) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
+    """The flat numbers of the cells with a point, (k,), and the lowest point of each, (k, 4)."""
+    flat, n = lowest.reshape(-1), 0
+    taken = np.empty(len(flat) + 1, np.int32)
+    for at in range(len(flat)):  # no branches: a third of the time
+        taken[n] = at
+        n += flat[at] >= 0
+    cells, rows = np.empty(n, np.int32), np.empty((n, 4), np.float32)
+    for k in range(n):
+        cells[k] = taken[k]
+        for axis in range(4):
+            rows[k, axis] = points[flat[taken[k]], axis]
+    return cells, rows
 
 
 class Patch(NamedTuple):

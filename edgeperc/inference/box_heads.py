@@ -188,6 +188,7 @@ def decode_dense(
     box_size_priors: Mapping[str, tuple[float, float, float]] | None = None,
     box_size_spreads: Mapping[str, tuple[float, float, float]] | None = None,
     score_threshold: float = 0.3,
+    named_from: float = 0.0,
     iou_threshold: float = 0.2,
     max_boxes: int = 100,
     model: str = "the model",
@@ -213,6 +214,8 @@ def decode_dense(
         spreads only the segmentation decides the class.
     score_threshold : float
         Lowest score of a box, in 0..1.
+    named_from : float
+        Boxes with a lower score are places only: their label is empty, which saves most of the time.
     iou_threshold : float
         If two boxes overlap by more, the one with the lower score is dropped, even if their classes differ.
     max_boxes : int
@@ -280,25 +283,27 @@ def decode_dense(
     tall = np.exp(np.clip(log_h, low, high))
     yaws, fronts = _facing(rectangles[:, 4], *front) if front else (rectangles[:, 4], None)
     keep = suppress_overlaps(rectangles, scores, iou_threshold)
-    evidence = _footprint_evidence(values, class_kind, rectangles[keep], geometry, classes, box_classes)
+    named = keep[: int(np.count_nonzero(scores[keep] >= named_from))]  # the best scores come first
+    evidence = _footprint_evidence(values, class_kind, rectangles[named], geometry, classes, box_classes)
     if box_size_spreads:
         assert box_size_priors is not None
-        sizes = np.log(np.stack([rectangles[keep, 2], rectangles[keep, 3], tall[keep]], axis=1))
+        sizes = np.log(np.stack([rectangles[named, 2], rectangles[named, 3], tall[named]], axis=1))
         usual = np.log([box_size_priors[name] for name in box_classes])
         spread = np.array([box_size_spreads[name] for name in box_classes])
         off = (sizes[:, None] - usual) / spread
         likelihood = -0.5 * (off**2).sum(axis=2) - np.log(spread).sum(axis=1)
         evidence = np.log(np.maximum(evidence, np.finfo(np.float64).tiny)) + likelihood
+    labels = [box_classes[k] for k in evidence.argmax(axis=1).tolist()] + [""] * (len(keep) - len(named))
     return [
         Box(
-            label=box_classes[int(np.argmax(evidence[k]))],
+            label=label,
             score=float(scores[i]),
             center=(float(rectangles[i, 0]), float(rectangles[i, 1]), float(z[i])),
             size=(float(rectangles[i, 2]), float(rectangles[i, 3]), float(tall[i])),
             yaw=float(yaws[i]),
             front=None if fronts is None else float(fronts[i]),
         )
-        for k, i in enumerate(keep)
+        for label, i in zip(labels, keep, strict=True)
     ]
 
 
@@ -483,7 +488,7 @@ def add_probabilities(
     total = 0.0
     for c in range(n_classes):
         value = np.float64(values[c, row, col])
-        pixel[c] = math.exp(value - best) if are_logits else value
+        pixel[c] = (math.exp(value - best) if value < best else 1.0) if are_logits else value
         total += pixel[c]
     for c in range(n_classes):
         sums[c] += pixel[c] / total if are_logits else pixel[c]

@@ -127,12 +127,15 @@ def decode_top_view(
     return decode_cells(card, returned, outputs, found), found
 
 
-def decode_boxes(card: ModelCard, outputs: Mapping[str, NDArray[np.float32]], score_threshold: float) -> list[Box]:
+def decode_boxes(
+    card: ModelCard, outputs: Mapping[str, NDArray[np.float32]], score_threshold: float, named_from: float = 0.0
+) -> list[Box]:
     """Decode the boxes of a top-view network (SSADNet 2.2.1 B, 3.1.2).
 
     card : with a top view.
     outputs : mapping of str to ndarray; raw outputs by kind, e.g. ``"class_logits"``.
     score_threshold : lowest score of a box, in 0..1.
+    named_from : of a dense head, boxes with a lower score have an empty label.
     Returns: Best score first; empty if the network has no boxes.
     Raises InferenceError, CardMismatchError.
     """
@@ -149,6 +152,7 @@ def decode_boxes(card: ModelCard, outputs: Mapping[str, NDArray[np.float32]], sc
             box_size_priors=card.box_size_priors,
             box_size_spreads=card.box_size_spreads,
             score_threshold=score_threshold,
+            named_from=named_from,
             iou_threshold=card.nms_iou,
             model=card.name,
         )

@@ -37,7 +37,7 @@ KERNELS: Mapping[str, str] = MappingProxyType(
         "gaps": "preprocess.interpolation.fill_between",
         "turn": "types.frame.fill_turned",
         "ground": "ground.planes.fill_heights ground.planes.fill_heights_above_plane ground.planes.fill_levels "
-        "ground.planes.fill_planes",
+        "ground.planes.fill_planes ground.planes.taken_cells",
         "points": "inference.projection.mark_range_image objects.refine.fill_point_labels "
         "objects.refine.fill_without_outliers",
         "points outside": "inference.crop.fill_spread",

@@ -152,7 +152,12 @@ def read_only(array: ArrayLike, dtype: DTypeLike = np.float32) -> NDArray[Any]:
     numba compiles a kernel separately for writable and read-only arrays. Kernels get their input through this function,
     so that a memory map or ``np.frombuffer`` needs no second compilation.
     """
-    view = np.require(array, dtype=dtype, requirements=["C", "A"]).view()
+    if type(array) is np.ndarray and array.dtype == dtype and array.flags.num & 0x101 == 0x101:
+        if not array.flags.writeable:
+            return array
+        view = array.view()
+    else:
+        view = np.require(array, dtype=dtype, requirements=["C", "A"]).view()
     view.flags.writeable = False
     return view
 
