@@ -297,14 +297,12 @@ class Pipeline:
         # The second lane ends with the objects, and what needs them; the first one has what needs labels. The lane that
         # finds no sector of a turn left makes the candidates, while the other one labels the last.
         spare = [candidates, strips] if sectors else []
-        first = [near, projected, scan, *sectors, *spare, labels, upright, strips, clusters]
+        whole = value("refine", _whole, agreed, near, len(points))
         self._lanes.run(
-            [*first, cells, surface, agreed, trusted, joined, view],
-            [planes, boxes, *reversed(sectors), objects, support, cells, surface, marks, standing],
+            [near, projected, scan, *sectors, *spare, labels, upright, strips, clusters, cells, surface, joined, view],
+            [planes, boxes, *reversed(sectors), objects, strips, cells, support, surface, marks, whole, standing],
         )
-        labeled = agreed()
-        whole = None if labeled is None else spread([(labeled, near().rows)], len(points))
-        return Parts(whole, view(), standing(), surface())
+        return Parts(whole(), view(), standing(), surface())
 
     def _select(self, points: Points) -> View:
         return View(*self.crop.select(points))
@@ -384,6 +382,11 @@ def _on_ground(near: View, planes: GroundFit) -> Scan:
 
 def _sorted(scan: Scan, distance_per_m: float) -> Strips:
     return sort_points(scan.points, ~scan.ground.mask, distance_per_m=distance_per_m)
+
+
+def _whole(labels: PointLabels | None, near: View, n: int) -> PointLabels | None:
+    """Labels of all n points of a scan."""
+    return None if labels is None else spread([(labels, near.rows)], n)
 
 
 def _joined(near: View, *sectors: tuple[PointLabels, NDArray[np.int32] | None]) -> PointLabels:

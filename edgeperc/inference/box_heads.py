@@ -17,6 +17,7 @@ from ..types.points import Labels
 from ..types.views import TopViewGeometry
 
 STRIDE = 4  # cells of the top view behind one cell of a box_dense output, along each axis
+MAX_BOXES = 100  # the best ones are decoded
 MIN_EXTENT_M = 0.5  # smaller slots are empty
 MAX_SUMMED = 2**18  # values under a box: 23 x 23 m of a map of 5 classes in cells of 0.1 m
 SIZE_RANGE_M = (0.2, 40.0)  # boxes are clipped to these sizes
@@ -33,7 +34,6 @@ def decode_slots(
     box_size_priors: Mapping[str, tuple[float, float, float]],
     mount_height_m: float,
     *,
-    max_boxes: int = 100,
     model: str = "the model",
 ) -> list[Box]:
     """Decode axis-aligned boxes; each gets the class of the segmentation at its center (SSADNet 2.2.1 B).
@@ -45,7 +45,6 @@ def decode_slots(
     box_classes : classes that boxes may have.
     box_size_priors : class to (length, width, height) [m]; only the height is used, because the top view has none.
     mount_height_m : height of the sensor above the road [m]; boxes stand on the road.
-    max_boxes : only this many boxes with the best scores are returned.
     model : name for messages.
     Returns: Best score first, the earlier slot on ties. The score is the probability of the class at the center
         pixel. A slot is empty if an extent is below 0.5 m, if its center is out of view, or if the class there is not
@@ -63,7 +62,7 @@ def decode_slots(
     at_row, at_col = (values[:, 1] * height).astype(np.int64), (values[:, 0] * width).astype(np.int64)
     is_box = np.array([name in box_classes for name in classes])[labels[at_row, at_col]]
     values, score = values[is_box], np.minimum(scores[at_row, at_col][is_box], 1.0)
-    best = np.argsort(-score, kind="stable")[:max_boxes]
+    best = np.argsort(-score, kind="stable")[:MAX_BOXES]
     names = [classes[k] for k in labels[at_row[is_box], at_col[is_box]][best]]
     return _standing(_slot_rectangles(values[best], geometry), score[best], names, box_size_priors, mount_height_m)
 
@@ -80,7 +79,6 @@ def decode_scored_slots(
     *,
     score_threshold: float = 0.3,
     iou_threshold: float = 0.2,
-    max_boxes: int = 100,
     model: str = "the model",
 ) -> list[Box]:
     """Decode axis-aligned boxes with scores of their own.
@@ -90,7 +88,7 @@ def decode_scored_slots(
     class_output, class_kind, classes, box_classes : as for `decode_dense`; the class of a box is the one with the
         largest sum of probabilities in its footprint.
     geometry, box_size_priors, mount_height_m : as for `decode_slots`.
-    score_threshold, iou_threshold, max_boxes, model : as for `decode_dense`: of the best slots, those that overlap a
+    score_threshold, iou_threshold, model : as for `decode_dense`: of the best slots, those that overlap a
         better one are dropped.
     Returns: Best score first, the earlier slot on ties. The yaw is 0 if the longer side points ahead, else pi/2.
         Extents are clipped to 0.2 to 40 m.
@@ -99,11 +97,11 @@ def decode_scored_slots(
     rows = _slot_rows(slots, 5, box_classes, box_size_priors, model)
     values = _cell_values(class_output, class_kind, geometry, classes, model)
     _check_finite(values, class_kind, model)
-    if max_boxes < 1 or not box_classes:
+    if not box_classes:
         return []
     inside = ((rows[:, :2] >= 0.0) & (rows[:, :2] < 1.0)).all(axis=1)
     rows = rows[inside & (rows[:, 4] >= _logit(score_threshold))]
-    rows = rows[np.argsort(-rows[:, 4], kind="stable")[:max_boxes]]
+    rows = rows[np.argsort(-rows[:, 4], kind="stable")[:MAX_BOXES]]
     rectangles = _slot_rectangles(rows, geometry)
     rectangles[:, 2:4] = np.clip(rectangles[:, 2:4], *SIZE_RANGE_M)
     with np.errstate(over="ignore"):  # a score of 0
@@ -190,7 +188,6 @@ def decode_dense(
     score_threshold: float = 0.3,
     named_from: float = 0.0,
     iou_threshold: float = 0.2,
-    max_boxes: int = 100,
     model: str = "the model",
 ) -> list[Box]:
     """Decode oriented boxes from a heat map of centers and a box regressed at every cell.
@@ -218,8 +215,6 @@ def decode_dense(
         Boxes with a lower score are places only: their label is empty, which saves most of the time.
     iou_threshold : float
         If two boxes overlap by more, the one with the lower score is dropped, even if their classes differ.
-    max_boxes : int
-        Only this many of the highest peaks of the heat map are decoded.
     model : str
         Name for messages.
 
@@ -257,13 +252,13 @@ def decode_dense(
     maps = np.ascontiguousarray(maps, dtype=np.float32)
     _check_finite(maps, "box_dense", model)
     _check_finite(values, class_kind, model)
-    if max_boxes < 1 or not box_classes:
+    if not box_classes:
         return []
 
     peak = np.empty(maps.shape[1:], np.bool_)
     mark_peaks(maps[0], _logit(score_threshold), peak)
     rows, cols = np.nonzero(peak)
-    best = np.argsort(-maps[0, rows, cols], kind="stable")[:max_boxes]
+    best = np.argsort(-maps[0, rows, cols], kind="stable")[:MAX_BOXES]
     rows, cols = rows[best], cols[best]
     heat, d_row, d_col, log_l, log_w, sin, cos, z, log_h, *front = maps[:, rows, cols].astype(np.float64)
     with np.errstate(over="ignore"):  # a score of 0

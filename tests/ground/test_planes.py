@@ -191,6 +191,18 @@ def test_the_surface_gives_the_heights_of_the_scan(mount: float, regions: bool) 
     assert found.plane == whole.plane
 
 
+@pytest.mark.kernel
+@pytest.mark.parametrize("n", [0, 1, 50, 3000])
+def test_the_surface_holds_the_lowest_point_of_each_cell(n: int) -> None:
+    points, _ = street(np.random.default_rng(n), n=n, kerb=0.15, reach=80.0)
+    points[::7, 0] = np.inf
+    fit = fit_ground(points)
+    surface, rows = fit.surface(), fit.lowest.reshape(-1)
+    np.testing.assert_array_equal(surface.cells, [cell for cell in range(len(rows)) if rows[cell] >= 0])
+    assert surface.cells.dtype == np.int32
+    np.testing.assert_array_equal(surface.lowest, points[rows[rows >= 0]])
+
+
 @settings(max_examples=30)
 @given(st.integers(0, 2**32 - 1), st.integers(0, 40), st.integers(0, 300))
 def test_other_points_are_as_high_as_in_the_scan(seed: int, n: int, n_scan: int) -> None:

@@ -167,9 +167,7 @@ def scored_slots_for(slots: Any, class_output: np.ndarray | None = None, **optio
     )
 
 
-def twin_of_scored_slots(
-    slots: Any, logits: np.ndarray, score_threshold: float, iou_threshold: float, max_boxes: int
-) -> list[Any]:
+def twin_of_scored_slots(slots: Any, logits: np.ndarray, score_threshold: float, iou_threshold: float) -> list[Any]:
     """One slot after the other."""
     found = []
     for col, row, across, along, logit in np.asarray(slots, np.float64):
@@ -180,7 +178,7 @@ def twin_of_scored_slots(
         sides = np.clip([max(along, across), min(along, across)], 0.2, 40.0)
         yaw = 0.0 if along >= across else math.pi / 2.0
         found.append((score, np.array([46.0 - row * 40.0, 10.0 - col * 20.0, *sides, yaw])))
-    found = sorted(found, key=lambda each: -each[0])[:max_boxes]
+    found = sorted(found, key=lambda each: -each[0])[: box_heads.MAX_BOXES]
     rectangles = np.array([rectangle for _, rectangle in found]).reshape(-1, 5)
     kept = twins.decode.nms(rectangles, iou_threshold)
     sums = twins.decode.footprint_sums(logits, True, rectangles[kept], 46.0, 10.0, 0.1)
@@ -196,7 +194,7 @@ def test_scored_slots_equal_their_twin(n: int) -> None:
     slots = np.column_stack([rng.uniform(-0.1, 1.1, (n, 2)), rng.uniform(-0.02, 0.2, (n, 2)), rng.normal(size=n)])
     slots = slots.astype(np.float32)
     logits = rng.normal(size=(len(CLASSES), *SHAPE)).astype(np.float32)
-    limits = {"score_threshold": 0.4, "iou_threshold": 0.2, "max_boxes": 50}
+    limits = {"score_threshold": 0.4, "iou_threshold": 0.2}
     found = scored_slots_for(slots, logits, **limits)
     expected = twin_of_scored_slots(slots, logits, **limits)
     assert [box.label for box in found] == [name for name, *_ in expected]
@@ -208,14 +206,15 @@ def test_scored_slots_equal_their_twin(n: int) -> None:
         assert box.yaw == yaw
 
 
-def test_of_two_slots_with_one_object_the_surer_remains() -> None:
+def test_of_two_slots_with_one_object_the_surer_remains(monkeypatch: pytest.MonkeyPatch) -> None:
     car, same = [0.5, 0.5, 0.08, 0.1, 1.0], [0.5, 0.505, 0.08, 0.1, 2.0]
     (box,) = scored_slots_for([car, same, [0.5, 0.9, 0.08, 0.1, -4.0]])
     assert box.score == pytest.approx(1.0 / (1.0 + math.exp(-2.0)))
     assert box.center[0] == pytest.approx(46.0 - 0.505 * 40.0)
     assert len(scored_slots_for([car, same], iou_threshold=1.0)) == 2
-    assert len(scored_slots_for([car, same], iou_threshold=1.0, max_boxes=1)) == 1
-    assert scored_slots_for([car], max_boxes=0) == []
+    with monkeypatch.context() as few:
+        few.setattr(box_heads, "MAX_BOXES", 1)
+        assert len(scored_slots_for([car, same], iou_threshold=1.0)) == 1
     assert len(scored_slots_for([[0.5, 0.5, 0.1, 0.1, -1e4]], score_threshold=0.0)) == 1
 
 
@@ -379,10 +378,12 @@ def test_overlapping_boxes_of_the_dense_head() -> None:
     assert [round(box.center[1], 3) for box in boxes] == [3.4, 0.6]
     everything = decode_dense(dense, class_logits(), "class_logits", VIEW, CLASSES, VEHICLES, iou_threshold=1.0)
     assert len(everything) == 3
-    best = decode_dense(dense, class_logits(), "class_logits", VIEW, CLASSES, VEHICLES, max_boxes=1)
-    assert best == boxes[:1]
     sure = decode_dense(dense, class_logits(), "class_logits", VIEW, CLASSES, VEHICLES, score_threshold=0.7)
     assert sure == boxes[:1]
+    weak_unnamed = decode_dense(dense, class_logits(), "class_logits", VIEW, CLASSES, VEHICLES, named_from=0.7)
+    assert weak_unnamed == [boxes[0], *(replace(box, label="") for box in boxes[1:])]
+    unnamed = decode_dense(dense, class_logits(), "class_logits", VIEW, CLASSES, VEHICLES, named_from=1.0)
+    assert unnamed == [replace(box, label="") for box in boxes]
 
 
 def test_score_thresholds_0_and_1() -> None:
@@ -392,7 +393,6 @@ def test_score_thresholds_0_and_1() -> None:
     everything = decode_dense(dense, class_logits(), "class_logits", VIEW, CLASSES, VEHICLES, score_threshold=0.0)
     assert 1 <= len(everything) <= 2
     assert decode_dense(dense, class_logits(), "class_logits", VIEW, CLASSES, ()) == []
-    assert decode_dense(dense, class_logits(), "class_logits", VIEW, CLASSES, VEHICLES, max_boxes=0) == []
 
 
 def test_dense_clips_extreme_sizes_and_refuses_non_finite_values() -> None:

@@ -82,8 +82,9 @@ def scans() -> list[Scan]:
 
 
 @pytest.mark.kernel
+@pytest.mark.parametrize("distance_per_m", [0.015, 0.9], ids=["near", "far"])  # far: more than 64 cells to each side
 @pytest.mark.parametrize("scan", scans(), ids=lambda scan: f"{len(scan.points)} points")
-def test_cells_and_groups_agree_with_their_twins(scan: Scan) -> None:
+def test_cells_and_groups_agree_with_their_twins(scan: Scan, distance_per_m: float) -> None:
     cells = sort_into_cells(scan, RANGE_M)
     right = twins.objects.cells(scan.points, scan.ground.height_m, *RANGE_M)
     assert by_cell(cells) == right
@@ -96,8 +97,8 @@ def test_cells_and_groups_agree_with_their_twins(scan: Scan) -> None:
     for k, scale in enumerate(SCALES):
         group, order = np.empty((2, len(right)), np.int32)
         first = np.empty(len(right) + 1, np.int32)
-        per_m = 0.015 * scale.link_m / SCALES[0].link_m
-        n = fill_groups_of_cells(scan.ground.height_m, cells, scale, per_m, group, order, first)
+        per_m = distance_per_m * scale.link_m / SCALES[0].link_m
+        n = fill_groups_of_cells(cells, k, scale.link_m, per_m, group, order, first)
         found = [{*cells.flat[order[first[g] : first[g + 1]]].tolist()} for g in range(n)]
         expected = twins.objects.groups(right, scan.ground.height_m, scale, per_m)
         assert found == expected
@@ -108,7 +109,7 @@ def test_cells_and_groups_agree_with_their_twins(scan: Scan) -> None:
                 scan.points, scan.ground.height_m, rows, scale, len(own), outer if k else None
             )
         around = around if k else expected
-    assert len(find_candidates(scan, cells, np.empty((0, 5))).rectangles) == n_found
+    assert len(find_candidates(scan, cells, np.empty((0, 5)), distance_per_m).rectangles) == n_found
 
 
 @pytest.mark.kernel
