@@ -479,13 +479,14 @@ class _Run:
             numbered = is_capture(path)
             read: Callable[..., Iterator[tuple[Any, ...]]] = read_timed_scans if self._straightener else read_scans
             options = reading_options(self._arguments)
-            options["origin_m"] = origin = None if numbered else self._origin(path)
+            if not numbered:
+                options["origin_m"] = self._origin(path)
             for k, (stamp_s, points, *times_s) in enumerate(read(path, **options)):
                 name, file = (shown / f"{k:06d}", target / f"{k:06d}") if numbered else (shown, target)
                 try:
                     if self._straightener is not None:
                         points = self._straightener.straighten(stamp_s, points, times_s[0], perceive.sensor)
-                    perception = perceive(points, stamp_s, origin_m=origin)
+                    perception = perceive(points, stamp_s, origin_m=options["origin_m"])
                     if self._kinds and numbered:
                         target.mkdir(exist_ok=True)
                     wanted = {kind: _file_of(file, kind) for kind in self._kinds}

@@ -142,6 +142,10 @@ def _scans(path: Path, options: _Options) -> Iterator[TimedScan]:
         if options.times:
             return iter([read_timed_file(path, options.of_files)])
         return iter([TimedScan(None, read_points(path, **options.of_files._asdict()), None)])
+    if options.of_files.origin_m is not None:
+        raise PointsError(
+            f"{path}: a recording, whose scans are in the sensor's frame; the origin is that of scan files"
+        )
     return decode_apart(path, kind, options.topic, options.of_files.remission_field, options.times)
 
 

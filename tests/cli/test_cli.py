@@ -322,6 +322,16 @@ def test_an_origin_is_three_numbers_or_auto(
     assert "Traceback" not in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("origin", [["auto"], ["1", "2", "3"]], ids=" ".join)
+def test_an_origin_is_not_for_recordings(tmp_path: Path, capsys: pytest.CaptureFixture[str], origin: list[str]) -> None:
+    pytest.importorskip("velodyne_decoder")
+    path = write_pcap(tmp_path / "a.pcap", vlp16_packets(1.5))
+    assert run("run", path, "--origin", *origin) == 1
+    assert "a recording, whose scans are in the sensor's frame" in capsys.readouterr().err
+    with pytest.raises(PointsError, match="the origin is that of scan files"):
+        next(captures.read_scans(path, origin_m=(1.0, 2.0, 3.0)))
+
+
 def test_an_origin_that_cannot_be_found_fails_the_scan(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run("run", write_scan(tmp_path / "a.bin"), "--origin", "auto") == 1
     assert "place of the sensor cannot be told" in capsys.readouterr().err
