@@ -251,7 +251,14 @@ def add_network(group: Any) -> None:
 
 
 def add_boxes_from(group: Any) -> None:
-    """Add ``--boxes-from``."""
+    """Add ``--score-threshold`` and ``--boxes-from``."""
+    group.add_argument(
+        "--score-threshold",
+        type=share,
+        metavar="S",
+        help="return boxes from this score on, 0 to 1; published figures of detectors are mostly from 0.1 on "
+        "(default: each model's)",
+    )
     group.add_argument(
         "--boxes-from",
         choices=("both", "network", "clusters"),
@@ -305,6 +312,14 @@ def finite_number(text: str) -> float:
     value = float(text)
     if not math.isfinite(value):
         raise argparse.ArgumentTypeError(f"{value} is not finite; expected a number")
+    return value
+
+
+def share(text: str) -> float:
+    """Parse a number in 0..1."""
+    value = finite_number(text)
+    if not 0.0 <= value <= 1.0:
+        raise argparse.ArgumentTypeError(f"{value:g} is not in 0..1")
     return value
 
 

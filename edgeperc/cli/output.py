@@ -82,6 +82,7 @@ _OPTIONS = {
     "precision": "--precision",
     "provider": "--provider",
     "rate_hz": "--rate",
+    "score_threshold": "--score-threshold",
     "road_by": "--road-by",
     "sensor": "--sensor",
     "split": "--split",

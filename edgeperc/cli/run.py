@@ -212,6 +212,7 @@ def make_perceiver(
         precision=arguments.precision,
         n_threads=arguments.threads,
         on_mismatch=on_mismatch,
+        score_threshold=arguments.score_threshold,
         adapt=adapt,
         boxes_from=arguments.boxes_from,
         full_turn=arguments.full_turn,

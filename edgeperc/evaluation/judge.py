@@ -58,12 +58,15 @@ class Perceiving:
         view; without such a model, or with "clusters", of the boxes around clusters, wherever the truth is known.
     rules : collection of str
         Rules of the agreement of labels, boxes and cells; a part of `edgeperc.agreement.rules.RULES` for an ablation.
+    score_threshold : float or None
+        As in `edgeperc.Perceiver`.
     """
 
     provider: str = "cpu"
     precision: str = "auto"
     boxes_from: BoxesFrom = "both"
     rules: Collection[str] = RULES
+    score_threshold: float | None = None
 
 
 BY_DEFAULT = Perceiving()
@@ -400,6 +403,7 @@ def _perceiver(
         precision=perceiving.precision,
         n_threads=n_threads,
         on_mismatch="ignore",
+        score_threshold=perceiving.score_threshold,
         boxes_from=perceiving.boxes_from,
         agree=perceiving.rules,
     )

@@ -164,14 +164,13 @@ def test_eval_passes_its_options_on(monkeypatch: pytest.MonkeyPatch, capsys: pyt
 
     monkeypatch.setitem(sys.modules, "edgeperc.evaluation.evaluate", SimpleNamespace(evaluate=evaluate))
     assert run("eval", "KITTI", "simulation:2") == 0
-    assert (
-        run("eval", "x", "--model", "a", "--provider", "openvino", "--precision", "bf16", "--boxes-from", "network")
-        == 0
-    )
+    options = ("--provider", "openvino", "--precision", "bf16", "--boxes-from", "network", "--score-threshold", "0.1")
+    assert run("eval", "x", "--model", "a", *options) == 0
     (datasets, models, first), (_, own, second) = asked
     assert (datasets, models, own) == (["KITTI", "simulation:2"], zoo.DEFAULT, ["a"])
-    assert (first.provider, first.precision, first.boxes_from) == ("cpu", "auto", "both")
+    assert (first.provider, first.precision, first.boxes_from, first.score_threshold) == ("cpu", "auto", "both", None)
     assert (second.provider, second.precision, second.boxes_from) == ("openvino", "bf16", "network")
+    assert second.score_threshold == 0.1
     assert capsys.readouterr().out.splitlines()[1] == "ran as x fp32, cpu"
 
 
@@ -225,10 +224,19 @@ def test_run_prints_a_line_a_scan(
     assert "car 600, pedestrian 0, cyclist 0" in lines[1]
     assert fake.made[0].given == ([*zoo.DEFAULT], "os1-64", "cpu", 2, "ignore")
     options = ("--boxes-from", "clusters", "--full-turn", "--precision", "bf16", "--adapt", "none", "--trusted")
-    assert run("run", scans[0], *options, "--no-agreement") == 0
+    assert run("run", scans[0], *options, "--no-agreement", "--score-threshold", "0.4") == 0
     usual = {"precision": "auto", "adapt": "both", "boxes_from": "both", "full_turn": False, "agree": True}
     other = {"precision": "bf16", "adapt": "none", "boxes_from": "clusters", "full_turn": True, "agree": False}
-    assert [one.more for one in fake.made] == [{**usual, "trusted": False}, {**other, "trusted": True}]
+    assert [one.more for one in fake.made] == [
+        {**usual, "trusted": False, "score_threshold": None},
+        {**other, "trusted": True, "score_threshold": 0.4},
+    ]
+
+
+@pytest.mark.parametrize("threshold", ["1.5", "-0.1", "nan"])
+def test_a_score_threshold_is_a_share(tmp_path: Path, capsys: pytest.CaptureFixture[str], threshold: str) -> None:
+    assert usage_code("run", write_scan(tmp_path / "a.bin"), "--score-threshold", threshold) == 2
+    assert "--score-threshold" in capsys.readouterr().err
 
 
 def test_json_is_one_object_a_scan_and_nothing_else(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -129,7 +129,13 @@ def eval_command(arguments: argparse.Namespace) -> int:
         figures, mistakes = evaluate(
             arguments.datasets,
             chosen_models(arguments),
-            Perceiving(arguments.provider, arguments.precision, arguments.boxes_from, frozenset(rules)),
+            Perceiving(
+                arguments.provider,
+                arguments.precision,
+                arguments.boxes_from,
+                frozenset(rules),
+                arguments.score_threshold,
+            ),
             split=arguments.split,
             fold=arguments.fold,
             road_by=arguments.road_by,
