@@ -20,7 +20,7 @@ from ..system.kernels import njit
 from ..types.points import Points
 from ..types.sensor import SENSORS, SensorProfile
 
-__all__ = ["MOST_SCANS", "SensorEstimate", "estimate_sensor"]
+__all__ = ["MOST_SCANS", "SensorEstimate", "compile_votes", "estimate_sensor", "fill_votes"]
 
 MOST_SCANS = 3  # that an estimate uses
 
@@ -44,10 +44,11 @@ _TWO_BLOCKS = 1.08  # how much more two heights must explain than one
 _VALLEY = 0.5  # of a peak: lower ones part two beams
 _FEWEST_OF_BEAM = 5  # votes
 _SHARED = 0.5  # of the directions in which one of two beams has points; parts of one beam share fewer
-# Place, way and tilt: steps [m] with the nearest points [m] and the bins of elevation [deg] that are used.
-_STEPS = ((0.2, 8.0, 0.1), (0.1, 6.0, 0.06), (0.05, 4.0, 0.04), (0.025, 3.0, 0.02), (0.0125, 2.0, 0.02))
-_STEP_OF = (1.0, 1.0, 2.0, 2.0, 0.01, 0.01)  # of place, way [m] and tilt [rad]
-_STRAIGHT_SAMPLE, _ROUNDS = 12_000, 3
+# Place, way and tilt of the sensor: nearest points [m] that are used, and how often their votes are smoothed; how far
+# points may be from a peak of votes, and from their beam [deg], and from where on they count little.
+_STAGES = ((12.0, 8), (8.0, 8), (6.0, 6), (4.5, 6), (3.5, 4), (2.5, 4), (2.0, 3), (1.5, 2), (1.5, 1))
+_REACH_DEG, _OFF_DEG = (0.25, 1.0), 0.05
+_DAMPING = (1e-3, 1e-3, 1e-3, 1e-3, 0.1, 0.1)
 
 # Points on beams: how near [deg], which share of them beyond that of random points.
 _ON_BEAM_DEG, _ON_BEAM = 0.06, 0.95
@@ -409,53 +410,80 @@ def _straightened(polar: Polar) -> Polar:
     """The points as seen from where the sensor was, about its axis.
 
     Data sets move points to one time, and turn them level. The place, the way of the sensor during the scan and its
-    tilt are those from which elevations stand out most.
+    tilt are fitted so that the points of each beam have one elevation: first of far points, which hardly depend on it,
+    and then of nearer ones.
     """
     flat, z, azimuth, time, rows = polar
     ahead, left = np.cos(np.radians(azimuth)), np.sin(np.radians(azimuth))
     moves = np.stack([ahead, left, time * ahead, time * left])
     offsets_m, split = _blocks(*_far(flat, z, _SAMPLE))
     level = z - np.where(np.degrees(np.arctan2(z, flat)) < split * _BIN_DEG - _UP_DEG, *offsets_m)
-    best = np.zeros(6)
-    for step, near_m, width_deg in _STEPS:
-        chosen = np.random.default_rng(1).permutation(np.flatnonzero(flat > near_m))[:_STRAIGHT_SAMPLE]
-        some = Polar(flat[chosen], level[chosen], azimuth[chosen], time[chosen], ())
-        seen = np.ascontiguousarray(moves[:, chosen])
-        most = _sharpness(*_moved(some, seen, best), width_deg)
-        for _ in range(_ROUNDS):
-            before = most
-            for k in range(6):
-                for way in (step, -step):
-                    tried = best.copy()
-                    tried[k] += way * _STEP_OF[k]
-                    if (gain := _sharpness(*_moved(some, seen, tried), width_deg)) > most:
-                        best, most = tried, gain
-                        break
-            if most == before:
-                break
-    flat, z = _moved(polar, moves, best)
+    numbers = np.full(len(flat), -1)
+    for k, row in enumerate(rows):
+        numbers[row] = k
+    values = np.zeros(6)
+    for near_m, n_smooth in _STAGES:
+        chosen = np.random.default_rng(0).permutation(np.flatnonzero(flat > near_m))[:_SAMPLE]
+        seen = moves[:, chosen]
+        some = _moved(flat[chosen], level[chosen], seen, values)
+        values = values + _step(*some, seen, numbers[chosen] if rows else None, n_smooth)
+    flat, z = _moved(flat, z, moves, values)
     return Polar(np.maximum(flat, 0.1), z, azimuth, time, rows)
 
 
 def _moved(
-    polar: Polar, moves: NDArray[np.float64], values: NDArray[np.float64]
+    flat: NDArray[np.float64], z: NDArray[np.float64], moves: NDArray[np.float64], values: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Distances and heights after a move [m] and a small tilt [rad]."""
     lean = values[4:] @ moves[:2]
-    return polar.flat - values[:4] @ moves + lean * polar.z, polar.z - lean * polar.flat
+    return flat - values[:4] @ moves + lean * z, z - lean * flat
 
 
-def _sharpness(flat: NDArray[np.float64], z: NDArray[np.float64], width_deg: float) -> float:
-    """How much the elevations stand out."""
-    n = round(width_deg / _BIN_DEG)
-    votes = _votes(flat, z, np.zeros(1))
-    return float(_contrast(votes.reshape(1, -1, n).sum(axis=2), n).sum())
+def _step(
+    flat: NDArray[np.float64],
+    z: NDArray[np.float64],
+    moves: NDArray[np.float64],
+    numbers: NDArray[np.int64] | None,
+    n_smooth: int,
+) -> NDArray[np.float64]:
+    """A Gauss-Newton step of the move and the tilt towards one elevation for each beam, or for each peak of votes."""
+    elevation = np.degrees(np.arctan2(z, flat))
+    if numbers is None:
+        votes = _votes(flat, z, np.zeros(1))[0]
+        for _ in range(n_smooth):
+            votes = np.convolve(votes, [0.25, 0.5, 0.25], "same")
+        peaks_deg = np.array([peak_deg for peak_deg, _ in _peaks(votes)])
+        numbers = np.searchsorted((peaks_deg[1:] + peaks_deg[:-1]) / 2.0, elevation)
+        reach_deg = _REACH_DEG[0]
+    else:
+        rows = [np.flatnonzero(numbers == k) for k in range(int(numbers.max(initial=-1)) + 1)]
+        peaks_deg = np.array([np.median(elevation[row]) if len(row) else 0.0 for row in rows])
+        reach_deg = _REACH_DEG[1]
+    if len(peaks_deg) < _FEWEST_LINES:
+        return np.zeros(6)
+    off_deg = elevation - peaks_deg[numbers]
+    used = (np.abs(off_deg) < reach_deg) & (numbers >= 0)
+    numbers, off_deg = numbers[used], off_deg[used]
+    slopes = np.degrees(np.concatenate([z * moves / (flat * flat + z * z), -moves[:2]]))[:, used]
+    # What all points of a beam share moves the beam, and is no error.
+    counts = np.maximum(np.bincount(numbers, minlength=len(peaks_deg)), 1)
+    off_deg, *rows_of = (
+        each - (np.bincount(numbers, each, minlength=len(peaks_deg)) / counts)[numbers] for each in (off_deg, *slopes)
+    )
+    slopes = np.array(rows_of)
+    weights = 1.0 / (1.0 + (off_deg / _OFF_DEG) ** 2)
+    return np.asarray(-np.linalg.solve((slopes * weights) @ slopes.T + np.diag(_DAMPING), slopes * weights @ off_deg))
 
 
 def _votes(flat: NDArray[np.float64], z: NDArray[np.float64], offsets_m: NDArray[np.float64]) -> NDArray[np.float64]:
     votes = np.empty((len(offsets_m), round(2.0 * _UP_DEG / _BIN_DEG)))
     fill_votes(flat, z, offsets_m, math.radians(_UP_DEG), votes)
     return votes
+
+
+def compile_votes() -> None:
+    """Compile the kernel before the first scan."""
+    _votes(np.ones(1), np.ones(1), np.zeros(1))
 
 
 @njit(cache=True, nogil=True)
@@ -479,9 +507,9 @@ def fill_votes(
                 votes[k, int(place)] += 1.0
 
 
-def _contrast(votes: NDArray[np.float64], width: int = 1) -> NDArray[np.float64]:
-    """How much each bin, of so many, stands out from the band around it; random counts do by their own number."""
-    half = round(_BAND_DEG / _BIN_DEG / width / 2.0)
+def _contrast(votes: NDArray[np.float64]) -> NDArray[np.float64]:
+    """How much each bin stands out from the band around it; random counts do by their own number."""
+    half = round(_BAND_DEG / _BIN_DEG / 2.0)
     total = np.cumsum(np.pad(votes, ((0, 0), (half + 1, half))), axis=1)
     band = (total[:, 2 * half + 1 :] - total[:, : -2 * half - 1]) / (2 * half + 1)
     return np.asarray(votes * (votes - 1.0) / (band + 1.0))
