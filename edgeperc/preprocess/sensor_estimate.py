@@ -20,11 +20,11 @@ from ..system.kernels import njit
 from ..types.points import Points
 from ..types.sensor import SENSORS, SensorProfile
 
-__all__ = ["MOST_SCANS", "SensorEstimate", "compile_votes", "estimate_sensor", "fill_votes"]
+__all__ = ["FEWEST_POINTS", "MOST_SCANS", "SensorEstimate", "compile_votes", "estimate_sensor", "fill_votes"]
 
 MOST_SCANS = 3  # that an estimate uses
 
-_FEWEST = 2000  # points
+FEWEST_POINTS = 2000
 _NEAREST_M = (3.0, 1.0, 0.5)  # of the points that are used: the first of which enough are left
 _ENOUGH = 4000
 _SAMPLE, _CHECKED = 20_000, 6000  # points that vote, and that are compared with the beams of each scan
@@ -189,9 +189,9 @@ def estimate_sensor(scans: Sequence[Points]) -> SensorEstimate:
     clean = [scan[np.isfinite(scan).all(axis=1)] for scan in scans[:MOST_SCANS]]
     polar = [_polar(scan) for scan in clean]
     n_points = max((len(each.flat) for each in polar), default=0)
-    if n_points < _FEWEST:
-        raise _unknown(f"the scan has {n_points:,} points; expected at least {_FEWEST:,}")
-    polar = [each for each in polar if len(each.flat) >= _FEWEST // 2]
+    if n_points < FEWEST_POINTS:
+        raise _unknown(f"the scan has {n_points:,} points; expected at least {FEWEST_POINTS:,}")
+    polar = [each for each in polar if len(each.flat) >= FEWEST_POINTS // 2]
     beams, match, on_beams = _beams_of(polar)
     if on_beams < _ON_BEAM and not match.name:
         polar = [_straightened(each) for each in polar]
@@ -213,13 +213,14 @@ def estimate_sensor(scans: Sequence[Points]) -> SensorEstimate:
     covered = 360.0 - sum(end - start for start, end in blind)
     if not match.name and covered < _FEWEST_SECTORS * _SECTOR_DEG:
         raise _unknown(
-            f"its points cover {covered:.0f} deg of azimuth, and its {len(beams.slopes)} beams are of no built-in sensor: "
-            "a part of a turn, or a sensor that does not turn"
+            f"its points cover {covered:.0f} deg of azimuth, and its {len(beams.slopes)} beams are of no built-in "
+            "sensor: a part of a turn, or a sensor that does not turn"
         )
     columns = _columns(max(polar, key=lambda each: len(each.flat)), beams)
+    remission_range = _remission_range(np.concatenate([scan[:, 3] for scan in clean]))
     ranges = np.concatenate([np.hypot(each.flat, each.z) for each in polar])
     return SensorEstimate(
-        profile=_profile(match.name, beams, columns, _remission_range(np.concatenate([scan[:, 3] for scan in clean]))),
+        profile=_profile(match.name, beams, columns, remission_range),
         is_built_in=bool(match.name),
         offsets_m=tuple(round(float(offset), 3) for offset in beams.offsets_m),
         n_beams=len(beams.slopes),
