@@ -52,6 +52,7 @@ _DAMPING = (1e-3, 1e-3, 1e-3, 1e-3, 0.1, 0.1)
 
 # Points on beams: how near [deg], which share of them beyond that of random points.
 _ON_BEAM_DEG, _ON_BEAM = 0.06, 0.95
+_NEAR_M, _NEAR_ALL_M = 1.0, 3.0  # median distances of the points of a beam, and of most beams, that show no elevation
 _LINE, _PURE = math.radians(_ON_BEAM_DEG), 0.6  # share of the points of a beam
 # The same of a built-in profile's beams, and of those of the HDL-64E, which motion during the scan moves.
 _ON_KNOWN, _ON_MOVED = 0.6, 0.3
@@ -59,7 +60,7 @@ _ON_KNOWN, _ON_MOVED = 0.6, 0.3
 # Differences from a built-in profile [deg], of units of one model. Those of the HDL-64E are of KITTI's unit about the
 # middle of lasers 0.2 m above.
 _UNIT_DEG = 0.1
-_UNIT_OF_BLOCKS_DEG, _MEDIAN_OF_BLOCKS_DEG = 0.5, 0.2
+_UNIT_OF_BLOCKS_DEG, _MEDIAN_OF_BLOCKS_DEG = 0.6, 0.25
 _SEEN, _MOST_MISSED = 0.6, 1.25  # share of a profile's beams; beams from the top to the bottom one for each one seen
 _FEW = 0.2  # points of a beam, as a share of the fewer of its neighbors'
 # Other units of the HDL-64E: heights of its two blocks, where they part, and its outer lasers.
@@ -111,6 +112,8 @@ class Beams(NamedTuple):
         Its points.
     pure : (n,) float64
         Share of these on its line.
+    flat_m : (n,) float64
+        Their median distance.
     """
 
     elevations_deg: NDArray[np.float64]
@@ -119,6 +122,7 @@ class Beams(NamedTuple):
     seen_deg: NDArray[np.float64]
     counts: NDArray[np.int64]
     pure: NDArray[np.float64]
+    flat_m: NDArray[np.float64]
 
 
 class Match(NamedTuple):
@@ -209,6 +213,11 @@ def estimate_sensor(scans: Sequence[Points]) -> SensorEstimate:
             f"it has {len(beams.slopes)} of the {SENSORS[match.part_of].n_beams} beams of the {match.part_of}: a part "
             "of a scan, if it is of that sensor"
         )
+    if not match.name and np.median(beams.flat_m) < _NEAR_ALL_M:
+        raise _unknown(
+            f"half of its points are nearer than {np.median(beams.flat_m):.1f} m, which shows the beams of no built-in "
+            "sensor to 0.1 degrees"
+        )
     blind = _blind(np.concatenate([each.azimuth for each in polar]))
     covered = 360.0 - sum(end - start for start, end in blind)
     if not match.name and covered < _FEWEST_SECTORS * _SECTOR_DEG:
@@ -236,7 +245,7 @@ def _unknown(reason: str) -> SensorError:
     return SensorError(f"the sensor cannot be told from the scan: {reason}; {_ADVICE}")
 
 
-_NO_BEAMS = Beams(np.empty(0), np.empty(0), np.empty(0), np.empty(0), np.empty(0, np.int64), np.empty(0))
+_NO_BEAMS = Beams(np.empty(0), np.empty(0), np.empty(0), np.empty(0), np.empty(0, np.int64), np.empty(0), np.empty(0))
 
 
 def _polar(scan: Points) -> Polar:
@@ -277,13 +286,13 @@ def _beams_of(polar: Sequence[Polar]) -> tuple[Beams, Match, float]:
             votes[:, slice(0, split) if is_upper else slice(split, None)] = 0.0
             offset_m += float(_FINE_M[_contrast(votes).sum(axis=1).argmax()])
             blocks.append(_voted(polar, offset_m, split, is_upper))
-    beams = _distinct(Beams(*(np.concatenate([block[k] for block in reversed(blocks)]) for k in range(6))))
+    beams = _distinct(Beams(*(np.concatenate([block[k] for block in reversed(blocks)]) for k in range(7))))
     match = _match(beams)
     if not match.name and _is_hdl_64e(beams, offsets_m, split):
         known = np.array(SENSORS["hdl-64e"].elevations_deg)
         match = Match("hdl-64e", round(float(np.abs(beams.seen_deg[:, None] - known).min(axis=1).max()), 3))
-    if not match.name:  # points of several beams, which no turn parts, lie on none
-        beams = Beams(*(values[beams.pure >= _PURE] for values in beams))
+    if not match.name:  # points of several beams, which no turn parts, lie on none; near ones show where beams start
+        beams = Beams(*(values[(beams.pure >= _PURE) & (beams.flat_m >= _NEAR_M)] for values in beams))
         match = _match(beams)
     return beams, match, min(_on_beams(each, beams) for each in polar)
 
@@ -332,7 +341,8 @@ def _fitted(flat: NDArray[np.float64], z: NDArray[np.float64], rows: Sequence[ND
     elevations, seen = np.degrees(np.arctan([slopes, middles]))
     lines = zip(rows, offsets, slopes, strict=True)
     pure = [np.mean(np.abs((z[row] - h) / flat[row] - t) < _LINE * (1.0 + t * t)) for row, h, t in lines]
-    return Beams(elevations, slopes, offsets, seen, np.array([*map(len, rows)]), np.array(pure))
+    distances = np.array([np.median(flat[row]) for row in rows])
+    return Beams(elevations, slopes, offsets, seen, np.array([*map(len, rows)]), np.array(pure), distances)
 
 
 def _offset(flat: NDArray[np.float64], z: NDArray[np.float64], slope: float) -> float:
