@@ -288,7 +288,7 @@ def _beams_of(polar: Sequence[Polar]) -> tuple[Beams, Match, float]:
             blocks.append(_voted(polar, offset_m, split, is_upper))
     beams = _distinct(Beams(*(np.concatenate([block[k] for block in reversed(blocks)]) for k in range(7))))
     match = _match(beams)
-    if not match.name and _is_hdl_64e(beams, offsets_m, split):
+    if not match.name and _is_hdl_64e(beams, split):
         known = np.array(SENSORS["hdl-64e"].elevations_deg)
         match = Match("hdl-64e", round(float(np.abs(beams.seen_deg[:, None] - known).min(axis=1).max()), 3))
     if not match.name:  # points of several beams, which no turn parts, lie on none; near ones show where beams start
@@ -306,16 +306,12 @@ def _distinct(beams: Beams) -> Beams:
     return Beams(*(values[apart[: len(full)] & full] for values in beams))
 
 
-def _is_hdl_64e(beams: Beams, offsets_m: tuple[float, float], split: int) -> bool:
-    """Whether lasers start at the heights of the two blocks of an HDL-64E and look where its units do."""
-    lower_m, upper_m = offsets_m
-    parted_deg = split * _BIN_DEG - _UP_DEG
-    n, angles = len(beams.slopes), beams.elevations_deg
+def _is_hdl_64e(beams: Beams, split: int) -> bool:
+    """Whether the beams start at the two heights of an HDL-64E, and look where its units do."""
+    angles, (fewest, most) = beams.elevations_deg, _HDL_64E_BEAMS
     return (
-        _HDL_64E_BEAMS[0] <= n <= _HDL_64E_BEAMS[1]
-        and abs(upper_m - _HDL_64E_M[1]) < _HDL_64E_OFF_M
-        and abs(lower_m - _HDL_64E_M[0]) < _HDL_64E_OFF_M
-        and abs(parted_deg - _HDL_64E_PARTED_DEG) < _HDL_64E_OFF_DEG
+        split > 0
+        and fewest <= len(angles) <= most
         and bool(np.abs(angles[[0, -1]] - _HDL_64E_DEG).max() < _HDL_64E_OFF_DEG)
     )
 
@@ -406,15 +402,21 @@ def _far(flat: NDArray[np.float64], z: NDArray[np.float64], n: int) -> tuple[NDA
 
 
 def _blocks(flat: NDArray[np.float64], z: NDArray[np.float64]) -> tuple[tuple[float, float], int]:
-    """Heights of the origin of the lower and the upper beams [m], and the bin of elevation that parts them; 0: none."""
+    """Heights of the origin of the lower and the upper beams [m], and the bin of elevation that parts them; 0: none.
+
+    Rings on the road show no height, so that two are sought only where the lasers of an HDL-64E are.
+    """
     gains = np.cumsum(_contrast(_votes(flat, z, _OFFSETS_M)), axis=1)
     above = gains[:, -1:] - gains
-    split = int((gains.max(axis=0) + above.max(axis=0)).argmax())
-    lower, upper = int(gains[:, split].argmax()), int(above[:, split].argmax())
-    if gains[lower, split] + above[upper, split] < _TWO_BLOCKS * gains[:, -1].max():
-        lower = upper = int(gains[:, -1].argmax())
-        split = -1
-    return (float(_OFFSETS_M[lower]), float(_OFFSETS_M[upper])), split + 1
+    lower, upper = (np.flatnonzero(np.abs(_OFFSETS_M - height) < _HDL_64E_OFF_M) for height in _HDL_64E_M)
+    first, last = (round((_HDL_64E_PARTED_DEG + off + _UP_DEG) / _BIN_DEG) for off in (-_HDL_64E_OFF_DEG, 1.0))
+    both = gains[lower, first:last].max(axis=0) + above[upper, first:last].max(axis=0)
+    split = first + int(both.argmax())
+    if both.max() < _TWO_BLOCKS * gains[:, -1].max():
+        best = float(_OFFSETS_M[gains[:, -1].argmax()])
+        return (best, best), 0
+    heights_m = _OFFSETS_M[lower[gains[lower, split].argmax()]], _OFFSETS_M[upper[above[upper, split].argmax()]]
+    return (float(heights_m[0]), float(heights_m[1])), split + 1
 
 
 def _straightened(polar: Polar) -> Polar:
