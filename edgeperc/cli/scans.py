@@ -143,7 +143,7 @@ def find_sensor(paths: Sequence[Path], options: Mapping[str, Any]) -> SensorEsti
     options : of `edgeperc.read_scans`.
     Raises SensorError.
     """
-    from ..preprocess.sensor_estimate import FEWEST_POINTS, MOST_SCANS, estimate_sensor
+    from ..preprocess.sensor_estimate import MOST_SCANS, estimate_sensor, has_enough_points
     from ..readers.captures import is_capture, read_scans
 
     scans: list[NDArray[np.float32]] = []
@@ -151,10 +151,21 @@ def find_sensor(paths: Sequence[Path], options: Mapping[str, Any]) -> SensorEsti
         of_file = {} if is_capture(path) else {"origin_m": options.get("origin_m")}
         with suppress(EdgepercError, OSError):  # reported when the scan's turn comes
             read = islice(read_scans(path, **{**options, "origin_m": None, **of_file}), MOST_SCANS)
-            scans.extend(points for _, points in read if len(points) >= FEWEST_POINTS)
+            scans.extend(points for _, points in read if has_enough_points(points))
         if len(scans) >= MOST_SCANS:
             break
-    return estimate_sensor(scans[:MOST_SCANS]) if scans else None
+    if not scans:
+        return None
+    try:
+        return estimate_sensor(scans[:MOST_SCANS])
+    except SensorError:  # one of them may not tell
+        found = []
+        for scan in scans[:MOST_SCANS]:
+            with suppress(SensorError):
+                found.append(estimate_sensor([scan]))
+        if len({each.profile.name for each in found}) != 1:
+            raise
+        return found[0]
 
 
 def scan_sensor(

@@ -20,7 +20,7 @@ from ..system.kernels import njit
 from ..types.points import Points
 from ..types.sensor import SENSORS, SensorProfile
 
-__all__ = ["FEWEST_POINTS", "MOST_SCANS", "SensorEstimate", "compile_votes", "estimate_sensor", "fill_votes"]
+__all__ = ["MOST_SCANS", "SensorEstimate", "compile_votes", "estimate_sensor", "fill_votes", "has_enough_points"]
 
 MOST_SCANS = 3  # that an estimate uses
 
@@ -34,7 +34,8 @@ _STEP_DEG, _BACK_DEG = 2.0, 20.0  # between neighbors in a beam, and back to the
 _IN_STEP, _ONE_WAY = 0.96, 0.97  # share of the neighbors that are so near, and that go one way around
 _FEWEST_OF_RING = 12
 _FEWEST_OF_LINE, _SPREAD = 30, 0.2  # points, and the spread of their inverse distances, that show where a beam starts
-_FEWEST_LINES, _RADIUS_M = 4, 0.1  # beams that show the circle from which all start, and its largest radius
+# Beams that show the circle from which all start, its largest radius, and the weight of none: (3 mm / 3 cm) squared.
+_FEWEST_LINES, _RADIUS_M, _RIDGE = 4, 0.05, 0.01
 
 # Votes: heights of the origin about that of the scan [m], bins of elevations [deg].
 _OFFSETS_M = np.arange(-20, 21) * 0.02
@@ -205,8 +206,8 @@ def estimate_sensor(scans: Sequence[Points]) -> SensorEstimate:
     if on_beams < least:
         raise _unknown(
             f"no beams stand out in its {n_points:,} points: {len(beams.slopes)} explain {max(on_beams, 0.0):.0%} of "
-            "them. Points of a solid-state or non-repeating sensor, of several sensors, or about another place than "
-            "the sensor, and thinned ones have no beams"
+            "them. Points of a solid-state or non-repeating sensor, of several sensors, about another place than the "
+            "sensor or along other axes, and thinned ones have no beams"
         )
     if match.part_of:
         raise _unknown(
@@ -239,6 +240,13 @@ def estimate_sensor(scans: Sequence[Points]) -> SensorEstimate:
         nearest_m=round(float(np.quantile(ranges, 0.001)), 2),
         blind_deg=blind,
     )
+
+
+def has_enough_points(scan: Points) -> bool:
+    """Whether a scan has so many points that it may tell; empty beams are none."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        flat = np.hypot(scan[:, 0], scan[:, 1])
+    return int(np.count_nonzero((flat > _NEAREST_M[-1]) & np.isfinite(scan).all(axis=1))) >= FEWEST_POINTS
 
 
 def _unknown(reason: str) -> SensorError:
@@ -331,7 +339,7 @@ def _fitted(flat: NDArray[np.float64], z: NDArray[np.float64], rows: Sequence[ND
         if np.count_nonzero(used) < _FEWEST_LINES:
             break
         lean, mean = middles[used] - middles[used].mean(), own[used].mean()
-        radius = np.clip(lean @ own[used] / max(lean @ lean, 1e-9), -_RADIUS_M, _RADIUS_M)
+        radius = np.clip(lean @ own[used] / (lean @ lean + _RIDGE), -_RADIUS_M, _RADIUS_M)
         offsets = mean + radius * (middles - middles[used].mean())
     slopes = np.array([np.median((z[row] - h) / flat[row]) for row, h in zip(rows, offsets, strict=True)])
     elevations, seen = np.degrees(np.arctan([slopes, middles]))
@@ -575,20 +583,26 @@ def _match(beams: Beams) -> Match:
         if not 0 < n <= len(known):
             continue
         for way in (1.0, -1.0):
-            if name == "hdl-64e":  # as its profile has them, the elevations depend on the distances
+            off = np.abs(way * beams.elevations_deg[:, None] - known)
+            nearest, off_deg = off.argmin(axis=1), off.min(axis=1)
+            is_run = np.ptp(nearest) < _MOST_MISSED * n and len(np.unique(nearest)) == n
+            fits = is_run and off_deg.max() <= _UNIT_DEG
+            if name == "hdl-64e" and not fits and _is_above(beams, way):
+                # As the profile has them, seen from the origin, the elevations depend on the distances.
                 seen = np.sort(way * beams.seen_deg)[::-1]
                 off_deg = min((np.abs(seen - known[k : k + n]) for k in range(len(known) - n + 1)), key=np.median)
                 fits = off_deg.max() <= _UNIT_OF_BLOCKS_DEG and np.median(off_deg) <= _MEDIAN_OF_BLOCKS_DEG
-            else:
-                off = np.abs(way * beams.elevations_deg[:, None] - known)
-                nearest, off_deg = off.argmin(axis=1), off.min(axis=1)
-                is_run = np.ptp(nearest) < _MOST_MISSED * n and len(np.unique(nearest)) == n
-                fits = is_run and off_deg.max() <= _UNIT_DEG
             if fits:
+                error_deg = round(float(off_deg.max()), 3)
                 is_whole = n >= _SEEN * len(known)
-                off = round(float(off_deg.max()), 3)
-                found.append(Match(name, off) if is_whole else Match(part_of=name, off_deg=off))
+                found.append(Match(name, error_deg) if is_whole else Match(part_of=name, off_deg=error_deg))
     return min(found[1:] or found, key=lambda each: (not each.name, each.off_deg))
+
+
+def _is_above(beams: Beams, way: float) -> bool:
+    """Whether the upper beams start where the upper lasers of an HDL-64E are."""
+    upper_m = way * beams.offsets_m[way * beams.elevations_deg > _HDL_64E_PARTED_DEG]
+    return len(upper_m) > 0 and bool(abs(np.median(upper_m) - _HDL_64E_M[1]) < _HDL_64E_OFF_M)
 
 
 def _columns(polar: Polar, beams: Beams) -> int:
