@@ -38,8 +38,8 @@ _FEWEST_OF_LINE, _SPREAD = 30, 0.2  # points, and the spread of their inverse di
 _FEWEST_LINES, _RADIUS_M, _RIDGE = 4, 0.05, 0.01
 
 # Votes: heights of the origin about that of the scan [m], bins of elevations [deg].
-_OFFSETS_M = np.arange(-20, 21) * 0.02
-_FINE_M = np.arange(-5, 6) * 0.004
+_OFFSETS_M: NDArray[np.float64] = np.arange(-20, 21) * np.float64(0.02)
+_FINE_M: NDArray[np.float64] = np.arange(-5, 6) * np.float64(0.004)
 _BIN_DEG, _UP_DEG, _BAND_DEG = 0.02, 60.0, 1.0
 _TWO_BLOCKS = 1.08  # how much more two heights must explain than one
 _VALLEY = 0.5  # of a peak: lower ones part two beams
@@ -109,8 +109,8 @@ class Beams(NamedTuple):
         A beam's points have z = offset + slope * horizontal distance; the elevation is the angle of that slope.
     seen_deg : (n,) float64
         Median elevation of its points as seen from the origin of the scan.
-    counts : (n,) int64
-        Its points.
+    counts : (n,) float64
+        The number of its points.
     pure : (n,) float64
         Share of these on its line.
     flat_m : (n,) float64
@@ -121,7 +121,7 @@ class Beams(NamedTuple):
     slopes: NDArray[np.float64]
     offsets_m: NDArray[np.float64]
     seen_deg: NDArray[np.float64]
-    counts: NDArray[np.int64]
+    counts: NDArray[np.float64]
     pure: NDArray[np.float64]
     flat_m: NDArray[np.float64]
 
@@ -253,7 +253,7 @@ def _unknown(reason: str) -> SensorError:
     return SensorError(f"the sensor cannot be told from the scan: {reason}; {_ADVICE}")
 
 
-_NO_BEAMS = Beams(np.empty(0), np.empty(0), np.empty(0), np.empty(0), np.empty(0, np.int64), np.empty(0), np.empty(0))
+_NO_BEAMS = Beams(np.empty(0), np.empty(0), np.empty(0), np.empty(0), np.empty(0), np.empty(0), np.empty(0))
 
 
 def _polar(scan: Points) -> Polar:
@@ -262,7 +262,8 @@ def _polar(scan: Points) -> Polar:
     flat = np.hypot(x, y)
     used = flat > _NEAREST_M[-1]
     azimuth = np.degrees(np.arctan2(y[used], x[used]))
-    rows, time = (), np.linspace(-0.5, 0.5, len(azimuth))
+    rows: tuple[NDArray[np.int64], ...] = ()
+    time = np.linspace(-0.5, 0.5, len(azimuth))
     steps = (np.diff(azimuth) + 180.0) % 360.0 - 180.0
     near = np.abs(steps) < _STEP_DEG
     way = math.copysign(1.0, float(np.median(steps[near]))) if near.any() else 1.0
@@ -346,7 +347,7 @@ def _fitted(flat: NDArray[np.float64], z: NDArray[np.float64], rows: Sequence[ND
     lines = zip(rows, offsets, slopes, strict=True)
     pure = [np.mean(np.abs((z[row] - h) / flat[row] - t) < _LINE * (1.0 + t * t)) for row, h, t in lines]
     distances = np.array([np.median(flat[row]) for row in rows])
-    return Beams(elevations, slopes, offsets, seen, np.array([*map(len, rows)]), np.array(pure), distances)
+    return Beams(elevations, slopes, offsets, seen, np.array([*map(len, rows)], np.float64), np.array(pure), distances)
 
 
 def _offset(flat: NDArray[np.float64], z: NDArray[np.float64], slope: float) -> float:
