@@ -30,8 +30,9 @@ VLP = SENSORS["vlp-16"]
 def test_beams_are_compared_with_those_next_to_them(
     elevations_deg: tuple[float, ...], off_deg: float, is_whole: bool
 ) -> None:
-    found = compare_beams(replace(VLP, elevations_deg=elevations_deg), VLP)
-    assert found == (pytest.approx(off_deg), is_whole)
+    error_deg, whole = compare_beams(replace(VLP, elevations_deg=elevations_deg), VLP)
+    assert error_deg == pytest.approx(off_deg)
+    assert whole == is_whole
 
 
 def test_right_wrong_and_cannot_tell(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
