@@ -27,11 +27,12 @@ from .preprocess.fitness import FitnessProfile
 from .preprocess.interpolation import Interpolator
 from .preprocess.remission import RemissionMatcher
 from .preprocess.returns import about_too_near, returns
+from .preprocess.sensor_estimate import SensorEstimate, compile_votes, estimate_sensor
 from .system.compilation import Compilation, kernels_of
 from .system.lanes import Lanes, Stopwatch
 from .system.names import nearest
 from .types.card import ModelCard
-from .types.choices import WEIGHTS
+from .types.choices import AUTO_SENSOR, DEFAULT_SENSOR, WEIGHTS
 from .types.frame import ModelFrame
 from .types.mounting import Mounting
 from .types.perception import ImageLabels, Perception
@@ -48,6 +49,8 @@ ADAPTATIONS: tuple[Adaptation, ...] = ("none", "remission", "interpolation", "bo
 # A wrong set-up shows in any scan. Several are checked, because one may have been taken in a tunnel or a depot.
 # A refused scan does not count.
 CHECKED_SCANS = 5
+
+COARSE_SENSOR = "vlp-16"  # with gaps between its beams
 
 
 @dataclass(frozen=True)
@@ -78,12 +81,15 @@ class Learned(NamedTuple):
         Number of scans that are still compared with the training scans.
     is_settled : bool
         Whether further scans change nothing: the answer to a scan then depends on this scan alone.
+    sensor_estimate : SensorEstimate or None
+        What ``sensor="auto"`` found.
     """
 
     mounting: MountingEstimator
     remission: RemissionMatcher
     to_check: int
     is_settled: bool
+    sensor_estimate: SensorEstimate | None = None
 
 
 def _card_of(model: str | os.PathLike[str]) -> ModelCard | None:
@@ -130,7 +136,8 @@ class Perceiver:
         names, by default the best ones, `edgeperc.zoo.DEFAULT`. The options of scans have no effect on a camera.
     sensor : str, Path or SensorProfile
         The sensor that takes the scans: a built-in name (`edgeperc.sensors`), a file written by ``edgeperc
-        fit-sensor``, or a profile.
+        fit-sensor``, or a profile. ``"auto"``: the one whose beams the first scan has, or a profile of its beams
+        (`preprocess.sensor_estimate`); a scan that does not tell is refused.
     mounting : Mounting or None
         How the sensor is mounted. What is None in it is estimated from the ground in the first five scans that show
         it (`leveling.MountingEstimator`). None: as the sensor's profile says, which for the built-in ones is
@@ -184,6 +191,9 @@ class Perceiver:
     Attributes
     ----------
     sensor : SensorProfile
+        With ``"auto"``, that of the training scans until the first scan has told.
+    sensor_estimate : SensorEstimate or None
+        What ``"auto"`` found, and how sure it is.
     mounting : MountingEstimate or None
         The mounting by the scans so far; None if it is to be estimated and no scan has shown the ground.
     on_mismatch, score_threshold, adapt, boxes_from, full_turn, agree
@@ -201,7 +211,7 @@ class Perceiver:
     ModelError, ProviderError, SensorError, MissingExtraError
         A model, a provider or a sensor is missing or does not fit. Only construction raises these.
     PointsError, ImageError, InferenceError, FitnessError
-        Only a call raises these.
+        Only a call raises these. With ``sensor="auto"``, it raises SensorError, too.
 
     Examples
     --------
@@ -256,7 +266,9 @@ class Perceiver:
         wanted = _listed(models, weights)
         if mounting is not None and not isinstance(mounting, Mounting):
             raise OptionError(f"mounting is {mounting!r:.80}; expected a Mounting, or None")
-        self.sensor = get_sensor(sensor)
+        self._finds_sensor = isinstance(sensor, str) and sensor == AUTO_SENSOR
+        self._sensor_estimate: SensorEstimate | None = None
+        self.sensor = get_sensor(DEFAULT_SENSOR if self._finds_sensor else sensor)
         self._set_mounting(MountingEstimator(self.sensor.mounting if mounting is None else mounting))
         self._remission = RemissionMatcher(self.sensor)
         self.on_mismatch = on_mismatch
@@ -278,18 +290,21 @@ class Perceiver:
         boxes = points and self.boxes_from != "network"
         agreement = points and bool(self.agree)
         gaps = self._interpolates and any(
-            isinstance(card.view, RangeImageGeometry) and Interpolator(card.view, self.sensor).needed for card in scans
+            self._finds_sensor or Interpolator(card.view, self.sensor).needed
+            for card in scans
+            if isinstance(card.view, RangeImageGeometry)
         )
         needs = {
             "scans": bool(scans),
             "fitness": self.on_mismatch != "ignore" and any(card.fitness is not None for card in scans),
-            "crop": bool(scans) and not gaps,
+            "crop": bool(scans) and (self._finds_sensor or not gaps),
             "gaps": gaps,
             "turn": points and self.full_turn,
             "ground": bool(scans)
             and (bool(self.agree) or boxes or objects or any(card.input.needs_ground for card in scans)),
             "points": points,
-            "points outside": points and not gaps,
+            "points outside": points and (self._finds_sensor or not gaps),
+            "sensor": self._finds_sensor and bool(scans),
             "clusters": boxes or agreement,
             "boxes": boxes,
             "agreement": agreement,
@@ -342,7 +357,7 @@ class Perceiver:
         self._told_of_near = False
         self._locks = {os.getpid(): threading.Lock()}
         self._lanes = Lanes(2 if at_once == 2 and all(session.shares_cores for session in self.sessions) else 1)
-        self._pipeline = self._assemble()
+        self._pipeline = self._assemble(self.sensor)
         # Compile every kernel here, not in the first call. The networks have already run on their golden inputs.
         if self._camera is not None:
             _Camera(Rehearsed(self._camera.session), self._camera.scaler).label(
@@ -350,17 +365,21 @@ class Perceiver:
             )
         if self._pipeline is not None:
             warm_up(self._pipeline, self.sensor, self._fitness if self._to_check else [], self._estimator)
+            if self._finds_sensor:
+                compile_votes()
+                coarse = get_sensor(COARSE_SENSOR)  # fills the gaps between its beams
+                warm_up(self._assemble(coarse) or self._pipeline, coarse, [], self._estimator)
 
-    def _assemble(self) -> Pipeline | None:
+    def _assemble(self, sensor: SensorProfile) -> Pipeline | None:
         """The pipeline of the LiDAR networks; None without any."""
         top: TopViewNetwork | None = None
         ranged: list[RangeImageNetwork] = []
         objects: ObjectNetwork | None = None
         for session in self.sessions:
             if isinstance(session.card.view, TopViewGeometry):
-                top = TopViewNetwork(session, self.sensor)
+                top = TopViewNetwork(session, sensor)
             elif isinstance(session.card.view, RangeImageGeometry):
-                interpolator = Interpolator(session.card.view, self.sensor) if self._interpolates else None
+                interpolator = Interpolator(session.card.view, sensor) if self._interpolates else None
                 needed = interpolator if interpolator is not None and interpolator.needed else None
                 ranged = [RangeImageNetwork(session, needed)]
             elif isinstance(session.card.view, ObjectGeometry):
@@ -381,7 +400,7 @@ class Perceiver:
             network_score=network_score,
             cluster_score=MIN_SCORE if self.score_threshold is None else self.score_threshold,
             object_score=object_score,
-            distance_per_m=self.sensor.link_per_m,
+            distance_per_m=sensor.link_per_m,
             full_turn=self.full_turn,
         )
         return Pipeline(top, ranged, options, self._lanes, objects)
@@ -403,6 +422,11 @@ class Perceiver:
             return None
 
     @property
+    def sensor_estimate(self) -> SensorEstimate | None:
+        """See the class."""
+        return self._sensor_estimate
+
+    @property
     def _lock(self) -> threading.Lock:
         """That of this process: after a fork, the one that held the parent's lock may be missing."""
         return self._locks.setdefault(os.getpid(), threading.Lock())
@@ -413,22 +437,49 @@ class Perceiver:
         return self._pipeline
 
     def reset_mounting(self) -> None:
-        """Estimate mounting and remission anew, for scans of another vehicle; the next five scans settle both."""
+        """Estimate mounting and remission anew, for scans of another vehicle; the next five scans settle both.
+
+        With ``sensor="auto"``, the next scan tells the sensor.
+        """
         with self._lock:
+            self._sensor_estimate = None
             self._remission = RemissionMatcher(self.sensor)
             self._set_mounting(MountingEstimator(self._estimator.known))
 
     @property
     def learned(self) -> Learned:
         """What the scans so far have shown, for a perceiver of the same options elsewhere (`start_from`)."""
-        is_settled = self._estimator.is_complete and (self._remission.is_complete or not self._renders)
-        return Learned(self._estimator, self._remission, self._to_check, is_settled and self._to_check == 0)
+        is_settled = (
+            self._is_sensor_known and self._estimator.is_complete and (self._remission.is_complete or not self._renders)
+        )
+        is_settled = is_settled and self._to_check == 0
+        return Learned(self._estimator, self._remission, self._to_check, is_settled, self._sensor_estimate)
 
     def start_from(self, learned: Learned) -> None:
         """Forget the scans so far, and continue from what another perceiver has learned."""
         with self._lock:
+            if self._finds_sensor:
+                self._sensor_estimate = learned.sensor_estimate
+                self._use(learned.remission.sensor)
             self._remission, self._to_check = learned.remission, learned.to_check
             self._set_mounting(learned.mounting)
+
+    @property
+    def _is_sensor_known(self) -> bool:
+        return not self._finds_sensor or self._sensor_estimate is not None
+
+    def _find_sensor(self, scan: Points) -> None:
+        """Use the sensor whose beams the scan has; SensorError if it does not tell."""
+        self._sensor_estimate = estimate_sensor([scan])
+        self._use(self._sensor_estimate.profile)
+
+    def _use(self, sensor: SensorProfile) -> None:
+        """Take further scans as this sensor's."""
+        if sensor == self.sensor:
+            return
+        vars(self)["sensor"] = sensor
+        self._remission = RemissionMatcher(sensor)
+        self._pipeline = self._assemble(sensor)
 
     def _set_mounting(self, estimator: MountingEstimator) -> None:
         self._estimator = estimator
@@ -482,6 +533,9 @@ class Perceiver:
             if scan is None:
                 perception = self._nothing(stamp_s, watch)
             else:
+                if not self._is_sensor_known and len(scan):
+                    self._find_sensor(scan)
+                    watch.lap("check")
                 check = self._to_check > 0 and len(scan) > 0
                 perception = self._perceive(scan, stamp_s, watch, check)
                 self._to_check -= check
@@ -557,6 +611,7 @@ class Perceiver:
             except FitnessError:
                 self._set_mounting(before)  # nothing is learnt from a refused scan
                 self._remission = matcher
+                self._sensor_estimate = None
                 raise
         watch.lap("check")
         assert self._pipeline is not None

@@ -8,6 +8,7 @@ import io
 from edgeperc.simulation import random_scene, simulate
 from edgeperc.simulation.scene import SimulatedScan
 from edgeperc.types.perception import Box
+from edgeperc.types.sensor import SensorProfile
 
 
 def box(
@@ -24,7 +25,7 @@ def box(
 
 
 @functools.cache
-def urban(seed: int, sensor: str = "hdl-64e") -> SimulatedScan:
+def urban(seed: int, sensor: str | SensorProfile = "hdl-64e") -> SimulatedScan:
     """A street of a town."""
     scan = simulate(random_scene(seed, "urban"), sensor, seed=seed)
     scan.points.flags.writeable = False

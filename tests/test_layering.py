@@ -50,7 +50,8 @@ FLOORS = {
         objects.persons
         objects.boxes
         preprocess.__init__ preprocess.fitness preprocess.interpolation preprocess.returns
-        preprocess.condition preprocess.ego preprocess.findings preprocess.motion preprocess.sensor_fit
+        preprocess.condition preprocess.ego preprocess.findings preprocess.motion preprocess.sensor_estimate
+        preprocess.sensor_fit
         preprocess.remission
         tracking.imm tracking.jpda tracking.ukf
         tracking.egomotion tracking.lives
@@ -103,7 +104,7 @@ FLOORS = {
         evaluation.tables
         evaluation.truth
         evaluation.judge
-        evaluation.camvid evaluation.evaluate evaluation.tracking evaluation.transfer
+        evaluation.camvid evaluation.evaluate evaluation.found evaluation.tracking evaluation.transfer
         ros2.__init__ ros2.graph ros2.messages
         ros2.node ros2.rclpy_graph ros2.zenoh_graph
         sinks.__init__ sinks.names sinks.relay sinks.run_file sinks.scene

@@ -799,3 +799,54 @@ def test_the_first_call_compiles_nothing(scan: SimulatedScan, options: dict[str,
 def test_boxes_from_clusters_need_a_range_image_model() -> None:
     with pytest.raises(OptionError, match="range-image model"):
         Perceiver("ssadnet", provider="cpu", boxes_from="clusters")
+
+
+@pytest.mark.parametrize("name", ["hdl-64e", "vlp-16", "os1-64"])
+def test_a_sensor_that_is_found_gives_the_answers_of_the_named_one(name: str) -> None:
+    """Also for a perceiver elsewhere that starts from what this one has learned, and after a reset."""
+    sensor = replace(get_sensor(name), remission_range=(0.0, 1.0))
+    options: dict[str, Any] = {"provider": "cpu", "n_threads": 1, "on_mismatch": "ignore"}
+    scan = urban(8, name).points
+    finds = Perceiver(["ssadnet", "pointseg"], sensor="auto", **options)
+    assert finds.sensor_estimate is None
+    assert not finds.learned.is_settled
+    assert finds(np.empty((0, 4), np.float32)).n_points == 0  # tells nothing
+    assert finds.sensor_estimate is None
+    answer = finds(scan)
+    assert_same(answer, Perceiver(["ssadnet", "pointseg"], sensor=sensor, **options)(scan))
+    assert finds.sensor == sensor
+    assert (finds.sensor is get_sensor("hdl-64e")) == (name == "hdl-64e")
+    assert finds.sensor_estimate is not None
+    elsewhere = Perceiver(["ssadnet", "pointseg"], sensor="auto", **options)
+    elsewhere.start_from(finds.learned)
+    assert elsewhere.sensor == sensor
+    assert_same(elsewhere(scan), finds(scan))
+    finds.reset_mounting()
+    assert finds.sensor_estimate is None
+    other = "os1-64" if name == "vlp-16" else "vlp-16"
+    finds(urban(8, other).points)
+    assert finds.sensor.name == other
+
+
+def test_a_scan_that_does_not_tell_the_sensor_is_refused_and_the_next_one_may() -> None:
+    finds = Perceiver("pointseg", sensor="auto", provider="cpu", on_mismatch="ignore")
+    for few in (urban(8).points[:500], np.random.default_rng(0).uniform(-30.0, 30.0, (9000, 4)), np.ones((1, 4))):
+        with pytest.raises(SensorError, match="the sensor cannot be told"):
+            finds(few)
+    finds(urban(8).points)
+    assert finds.sensor is get_sensor("hdl-64e")
+
+
+def test_a_refused_scan_does_not_settle_the_sensor() -> None:
+    finds = Perceiver("pointseg", sensor="auto", provider="cpu")
+    scan = urban(8, "vlp-16").points
+    with pytest.raises(FitnessError):
+        finds(scan * np.array([1000.0, 1000.0, 1000.0, 1.0], np.float32))  # millimeters
+    assert finds.sensor_estimate is None
+    finds(urban(8).points)
+    assert finds.sensor is get_sensor("hdl-64e")
+
+
+def test_auto_is_of_a_perceiver() -> None:
+    with pytest.raises(SensorError, match="found in the first scan by a Perceiver"):
+        get_sensor("auto")

@@ -51,14 +51,15 @@ def add_command(
 
 def add_sensor(group: Any, *, required: bool = False, of_capture: bool = False) -> None:
     """Add ``--sensor``; with ``of_capture``, it is None by default, for the sensor that a capture names."""
-    default = f"the one that a capture names; {DEFAULT_SENSOR} for scan files" if of_capture else DEFAULT_SENSOR
+    default = "auto" if of_capture else DEFAULT_SENSOR
     group.add_argument(
         "--sensor",
         required=required,
         default=None if required or of_capture else DEFAULT_SENSOR,
         metavar="SENSOR",
-        help="the LiDAR that recorded the scans: a name from 'edgeperc sensors', or a .json file written by "
-        "'edgeperc fit-sensor'" + (" (required)" if required else f" (default: {default})"),
+        help="the LiDAR that recorded the scans: a name from 'edgeperc sensors', a .json file written by 'edgeperc "
+        "fit-sensor' or 'edgeperc info --write', or auto: the one that a capture names, otherwise the one whose beams "
+        "are found in the points of the first scans" + (" (required)" if required else f" (default: {default})"),
     )
 
 

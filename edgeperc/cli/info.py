@@ -14,10 +14,10 @@ from typing import TYPE_CHECKING, Any
 
 from ..errors import EdgepercError, MissingExtraError, MountingError, PointsError
 from ..system.atomic import write_atomic
-from ..types.choices import DEFAULT_MODELS, DEFAULT_SENSOR
+from ..types.choices import DEFAULT_MODELS
 from .arguments import Commands, add_command, add_fields, add_mounting, add_sensor, add_topic, reading_options
 from .output import print_error, print_line, print_rows
-from .scans import scan_sensor, with_mounting
+from .scans import Sensors, stated_sensor, with_mounting
 
 if TYPE_CHECKING:
     import numpy as np
@@ -98,10 +98,11 @@ def info_command(arguments: argparse.Namespace) -> int:
     if arguments.sensor is not None or arguments.extrinsic is not None:
         from ..types.sensor import get_sensor
 
-        get_sensor(with_mounting(arguments.sensor or DEFAULT_SENSOR, arguments))  # one error, before the first thing
+        get_sensor(with_mounting(stated_sensor(arguments), arguments))  # one error, before the first thing
     if arguments.write is not None and arguments.write.suffix != ".json":
         arguments.usage_error(f"--write {arguments.write}: expected a name that ends in .json")
     estimators: dict[SensorProfile, MountingEstimator] = {}
+    sensors = Sensors(arguments, [Path(thing) for thing in arguments.things])
     scans: list[Path] = []
     n_failed = n_printed = 0
     for thing in arguments.things:
@@ -112,7 +113,7 @@ def info_command(arguments: argparse.Namespace) -> int:
             elif Path(thing).suffix.lower() in IMAGE_SUFFIXES:
                 rows, document = _image_rows(Path(thing))
             else:
-                rows, document = _scan_rows(Path(thing), arguments, estimators)
+                rows, document = _scan_rows(Path(thing), arguments, sensors, estimators)
                 scans.append(Path(thing))
                 n_failed += document["refused"]
         except MissingExtraError:
@@ -350,7 +351,7 @@ def _dropped_text(dropped: DroppedPoints, sensor: SensorProfile) -> str:
 
 
 def _scan_rows(
-    path: Path, arguments: argparse.Namespace, estimators: dict[SensorProfile, MountingEstimator]
+    path: Path, arguments: argparse.Namespace, sensors: Sensors, estimators: dict[SensorProfile, MountingEstimator]
 ) -> tuple[list[tuple[str, str]], dict[str, Any]]:
     """Measure a scan and check which models suit it: rows to print, and the same measurements for JSON."""
     from ..preprocess.findings import check_beams, check_dropped
@@ -359,7 +360,7 @@ def _scan_rows(
     from ..types.frame import ModelFrame
     from ..types.sensor import get_sensor
 
-    named, because = scan_sensor(path, arguments)
+    named, because = sensors.of(path)
     sensor = get_sensor(named)
     scans, damage = _first_scans(path, reading_options(arguments))
     cleaned, (dropped, *_) = zip(*(returns(scan, sensor) for scan in scans), strict=True)

@@ -14,7 +14,7 @@ from ..errors import EdgepercError, ImageError, ModelError, PointsError
 from ..records import PerceivedScan
 from ..system.extras import require
 from ..system.remote import Remote, location
-from ..types.choices import CAMERA, DEFAULT_SENSOR
+from ..types.choices import AUTO_SENSOR, CAMERA
 from .arguments import (
     Commands,
     add_adapt,
@@ -34,12 +34,13 @@ from .output import many, print_error, print_line, progress
 from .report import Report
 from .scans import (
     Scans,
+    Sensors,
     find_images,
     find_scans,
     output_names,
     scan_folders,
     scan_namer,
-    scan_sensor,
+    stated_sensor,
     with_mounting,
 )
 from .side_by_side import add_engine, check_engine, has_workers, perceive_side_by_side, through_temporary
@@ -246,6 +247,8 @@ def run_command(arguments: argparse.Namespace) -> int:
     with progress("file") as show, Sinks(arguments) as sinks:
         run = _Run(arguments, perceivers, kinds, sinks)
         if has_workers(arguments):
+            if arguments.sensor in (None, AUTO_SENSOR):  # of the first scans, for all workers
+                arguments.sensor = perceivers.sensor_of(local[0]) if local else stated_sensor(arguments)
             perceive_side_by_side(arguments, _alone, perceivers, scans, targets, report, show)
         for done, (scan, target) in enumerate(() if has_workers(arguments) else zip(scans, targets, strict=True)):
             show(done, len(scans))
@@ -308,7 +311,7 @@ def _check_usage(arguments: argparse.Namespace, kinds: Sequence[str]) -> None:
     if arguments.sensor is not None or arguments.extrinsic is not None:
         from ..types.sensor import get_sensor
 
-        get_sensor(with_mounting(arguments.sensor or DEFAULT_SENSOR, arguments))  # one error, before the first scan
+        get_sensor(with_mounting(stated_sensor(arguments), arguments))  # one error, before the first scan
     if arguments.png:
         require("matplotlib", "view", "Drawing a picture")
     if arguments.gif:
@@ -398,10 +401,11 @@ class _Perceivers:
     def __init__(self, arguments: argparse.Namespace) -> None:
         self._arguments = arguments
         self._made: dict[str | SensorProfile, Perceiver] = {}
-        self._sensors: dict[Path, str | SensorProfile] = {}
+        self._sensors = Sensors(arguments)
 
     def check(self, scans: Sequence[Path], of_images: bool) -> None:
         """Make the first perceiver, so that errors of options and models come before any file is written."""
+        self._sensors = Sensors(self._arguments, scans)
         for scan in scans:
             try:
                 self.sensor_of(scan)
@@ -411,7 +415,7 @@ class _Perceivers:
         else:
             if scans:
                 return
-        cards = self.of(self.sensor_of(scan) if scans else self._arguments.sensor or DEFAULT_SENSOR).cards
+        cards = self.of(self.sensor_of(scan) if scans else stated_sensor(self._arguments)).cards
         if (self._arguments.labels or self._arguments.ply) and not any(c.view.kind == "range_image" for c in cards):
             raise ModelError(
                 "--labels and --ply need a class for every point; add a range-image model: --model pointseg"
@@ -427,10 +431,8 @@ class _Perceivers:
             raise ModelError("images alone need a camera model alone; leave out the others, or add --scan")
 
     def sensor_of(self, path: Path) -> str | SensorProfile:
-        """The sensor of ``--sensor``, of the capture, or the default."""
-        if path not in self._sensors:
-            self._sensors[path], _ = scan_sensor(path, self._arguments)
-        return self._sensors[path]
+        """The sensor of ``--sensor``, of the capture, or the one that is found in the points."""
+        return self._sensors.of(path)[0]
 
     def of(self, sensor: str | SensorProfile) -> Perceiver:
         """The perceiver of a sensor."""
@@ -516,7 +518,7 @@ class _Run:
         arguments, perceivers = self._arguments, self._perceivers
         try:
             image = read_image(path)
-            perceive = perceivers.of(perceivers.sensor_of(scan) if scan else arguments.sensor or DEFAULT_SENSOR)
+            perceive = perceivers.of(perceivers.sensor_of(scan) if scan else stated_sensor(arguments))
             origin = None if scan is None else self._origin(scan)
             options = file_options(arguments) | {"origin_m": origin}
             points = None if scan is None else read_points(scan, **options)
@@ -614,7 +616,7 @@ def _alone(
     """For `perceive_side_by_side`: a perceiver, what perceives a scan file and writes its files, and these files."""
     kinds = [kind for kind in _KINDS if getattr(arguments, kind)]
     perceivers = perceivers or _Perceivers(arguments)
-    perceive = perceivers.of(with_mounting(arguments.sensor or DEFAULT_SENSOR, arguments))
+    perceive = perceivers.of(with_mounting(stated_sensor(arguments), arguments))
     run = _Run(arguments, perceivers, kinds)
     return perceive, run.scans, lambda target: [_file_of(target, kind) for kind in kinds]
 

@@ -6,16 +6,23 @@ import argparse
 import os
 import re
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from ..errors import EdgepercError, ImageError
+from ..errors import EdgepercError, ImageError, SensorError
 from ..system.remote import Remote
-from ..types.choices import DEFAULT_SENSOR
+from ..types.choices import AUTO_SENSOR, DEFAULT_SENSOR
+from .arguments import reading_options
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from ..preprocess.sensor_estimate import SensorEstimate
     from ..readers.identify import KnownSensor
     from ..types.sensor import SensorProfile
 
@@ -120,22 +127,80 @@ def scan_namer(path: Path) -> Callable[[int], Path]:
     return lambda k: path / f"{k:06d}"
 
 
-def scan_sensor(path: Path, arguments: argparse.Namespace) -> tuple[str | SensorProfile, str]:
-    """The sensor of a scan or capture, and how it is known: by ``--sensor``, by the capture, or as the default.
+# Files that are read for three scans with points.
+_LOOKED_AT = 10
 
-    arguments : argparse.Namespace; with ``sensor`` and ``topic``.
+
+def stated_sensor(arguments: argparse.Namespace) -> str:
+    """``--sensor``, or the default where it is to be found."""
+    return DEFAULT_SENSOR if arguments.sensor in (None, AUTO_SENSOR) else arguments.sensor
+
+
+def find_sensor(paths: Sequence[Path], options: Mapping[str, Any]) -> SensorEstimate | None:
+    """The sensor that the points of the first scans show; None if no scan that can be read has enough points.
+
+    paths : scan files or captures of one sensor.
+    options : of `edgeperc.read_scans`.
+    Raises SensorError.
+    """
+    from ..preprocess.sensor_estimate import MOST_SCANS, estimate_sensor, has_enough_points
+    from ..readers.captures import is_capture, read_scans
+
+    scans: list[NDArray[np.float32]] = []
+    for path in paths[:_LOOKED_AT]:
+        of_file = {} if is_capture(path) else {"origin_m": options.get("origin_m")}
+        with suppress(EdgepercError, OSError):  # reported when the scan's turn comes
+            read = islice(read_scans(path, **{**options, "origin_m": None, **of_file}), MOST_SCANS)
+            scans.extend(points for _, points in read if has_enough_points(points))
+        if len(scans) >= MOST_SCANS:
+            break
+    if not scans:
+        return None
+    try:
+        return estimate_sensor(scans[:MOST_SCANS])
+    except SensorError:  # one of them may not tell
+        found = []
+        for scan in scans[:MOST_SCANS]:
+            with suppress(SensorError):
+                found.append(estimate_sensor([scan]))
+        if len({each.profile.name for each in found}) != 1:
+            raise
+        return found[0]
+
+
+def scan_sensor(
+    path: Path, arguments: argparse.Namespace, beside: Sequence[Path] = ()
+) -> tuple[str | SensorProfile, str]:
+    """The sensor of a scan or capture, and how it is known: by ``--sensor``, by the capture, or by the points.
+
+    arguments : argparse.Namespace; with ``sensor``, ``topic`` and the options of files.
+    beside : scan files of the same sensor, with ``path``; those of its folder if it is one.
     Raises SensorError, PointsError, MissingExtraError.
     Warns UserWarning: ``--sensor`` contradicts the capture.
     """
-    from ..readers.captures import known_sensor
+    from ..readers.captures import is_capture, known_sensor, scan_files
     from ..readers.identify import contradicts
     from ..types.sensor import get_sensor
 
     known: KnownSensor | None
-    if arguments.sensor is None:
-        known = known_sensor(path, arguments.topic)
-        sensor, because = (DEFAULT_SENSOR, "the default for scan files") if known is None else known
-        return with_mounting(sensor, arguments), because
+    if arguments.sensor in (None, AUTO_SENSOR):
+        unnamed: EdgepercError | None = None
+        try:
+            known = known_sensor(path, arguments.topic)
+        except SensorError as exc:
+            unnamed, known = exc, None
+        if known is not None:
+            return with_mounting(known.profile, arguments), known.because
+        files = scan_files(path) if path.is_dir() and not is_capture(path) else beside or [path]
+        try:
+            found = find_sensor(files, reading_options(arguments))
+        except SensorError as exc:
+            raise exc if unnamed is None else unnamed from exc
+        if found is None and (unnamed is not None or arguments.sensor == AUTO_SENSOR):
+            raise unnamed or SensorError("the sensor cannot be told: no scan has enough points; pass --sensor NAME")
+        if found is None:  # so few points are refused, or warned of, when they are perceived
+            return with_mounting(DEFAULT_SENSOR, arguments), "the default: too few points to tell"
+        return with_mounting(found.profile, arguments), str(found)
     given = get_sensor(arguments.sensor)
     try:
         known = known_sensor(path, arguments.topic)
@@ -148,6 +213,39 @@ def scan_sensor(path: Path, arguments: argparse.Namespace) -> tuple[str | Sensor
             stacklevel=2,
         )
     return with_mounting(arguments.sensor, arguments), "as --sensor says"
+
+
+class Sensors:
+    """The sensors of the scans of a command line: that of scan files is found once for each folder.
+
+    arguments : as in `scan_sensor`.
+    scans : the scans and captures.
+    """
+
+    def __init__(self, arguments: argparse.Namespace, scans: Sequence[Path] = ()) -> None:
+        self._arguments, self._scans = arguments, scans
+        self._found: dict[Path, tuple[str | SensorProfile, str] | SensorError] = {}
+
+    def of(self, path: Path) -> tuple[str | SensorProfile, str]:
+        """See `scan_sensor`; a file that was fetched from a URL is the default's, unless ``--sensor`` names another."""
+        from ..readers.captures import is_capture
+
+        arguments = self._arguments
+        is_file = not (is_capture(path) or path.is_dir())
+        if is_file and self._scans and path not in self._scans and arguments.sensor in (None, AUTO_SENSOR):
+            return with_mounting(DEFAULT_SENSOR, arguments), "the default for scans at a URL"
+        key = path.parent if is_file else path
+        if key not in self._found:
+            beside = [scan for scan in self._scans if is_file and scan.parent == key and not is_capture(scan)]
+            try:
+                self._found[key] = scan_sensor(path, arguments, beside)
+            except SensorError as exc:
+                self._found[key] = exc
+        found = self._found[key]
+        if isinstance(found, SensorError):
+            reason = str(found).removeprefix(f"{path}: ")
+            raise SensorError(f"{path}: {reason}")
+        return found
 
 
 def with_mounting(sensor: str | SensorProfile, arguments: argparse.Namespace) -> str | SensorProfile:
@@ -166,6 +264,11 @@ def with_mounting(sensor: str | SensorProfile, arguments: argparse.Namespace) ->
     file, ego = getattr(arguments, "extrinsic", None), getattr(arguments, "ego_box", None)
     if not values and file is None and ego is None:
         return sensor
+    if sensor == AUTO_SENSOR:
+        raise SensorError(
+            "--sensor auto and a mounting or --ego-box: write the sensor that is found, edgeperc info SCAN --write "
+            "FILE, and pass --sensor FILE"
+        )
     profile = get_sensor(sensor)
     if ego is not None:
         profile = replace(profile, ego_box=((ego[0], ego[1]), (ego[2], ego[3]), (ego[4], ego[5])))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +14,12 @@ from ..datasets.layout import class_number
 from ..datasets.scan_folder import ScanFolder, ScanFrame
 from ..errors import ModelError, PointsError
 from ..perceiver import ADAPTATIONS, Perceiver
+from ..preprocess.sensor_estimate import MOST_SCANS, estimate_sensor
 from ..preprocess.sensor_fit import fit_sensor
 from ..simulation.samples import FIRST_SEED, IGNORE, labels_by_boxes, simulated_scan
 from ..simulation.scene import POINT_CLASSES
 from ..system.pool import map_in_processes, taken
+from ..types.choices import AUTO_SENSOR
 from ..types.perception import Box
 from ..types.points import Labels, Points
 from ..types.sensor import SensorProfile, get_sensor
@@ -73,7 +76,8 @@ def compare(
 ) -> dict[str, Any]:
     """Compute the IoU of points by class, for each dataset and each of `edgeperc.perceiver.ADAPTATIONS`.
 
-    datasets : ``SENSOR=SOURCE``. The sensor is a built-in name or the file of a profile. The source is
+    datasets : ``SENSOR=SOURCE``. The sensor is a built-in name or the file of a profile; "auto" finds that of labeled
+        scans in the first three. The source is
         ``simulation:N``, a folder of labeled scans (`scan_folder.ScanFolder.parse`), or one with range images
         ``NAME.npy`` (H, W, 6). Labeled scans need no ``SENSOR=``, because their description names it; those of test
         drives count. Their points are labeled by boxes, as KITTI's are. Scans go through a `Perceiver` as a user's
@@ -205,6 +209,10 @@ def _dataset(name: str) -> _DataSet:
     sensor_name, equals, source = name.partition("=")
     if not equals:
         return _of_folder(_folder(name))
+    if sensor_name == AUTO_SENSOR:
+        folder = _folder(source)
+        first = [frame.points for frame in islice(_frames(folder), MOST_SCANS)]
+        return _of_folder(folder, replace(estimate_sensor(first).profile, mounting=folder.layout.sensor.mounting))
     sensor = get_sensor(sensor_name)
     kind, _, number = source.partition(":")
     if kind == "simulation":

@@ -35,6 +35,7 @@ KERNELS: Mapping[str, str] = MappingProxyType(
         "fitness": "preprocess.fitness.fill_scan_sums",
         "crop": "inference.crop.fill_rows",
         "gaps": "preprocess.interpolation.fill_between",
+        "sensor": "preprocess.sensor_estimate.fill_votes",
         "turn": "types.frame.fill_turned",
         "ground": "ground.planes.fill_heights ground.planes.fill_heights_above_plane ground.planes.fill_levels "
         "ground.planes.fill_planes ground.planes.taken_cells",

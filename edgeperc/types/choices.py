@@ -7,5 +7,6 @@ OPEN_MODELS = ("ssadnet-open", "pointseg-open", "objects-open")
 WEIGHTS = {"default": DEFAULT_MODELS, "open": OPEN_MODELS}
 CAMERA = "camseg"
 DEFAULT_SENSOR = "hdl-64e"
+AUTO_SENSOR = "auto"  # found in the points
 PRECISIONS = ("fp32", "bf16", "int8")
 RULES = ("boxes", "cells", "column", "fill", "ground", "height", "person", "road", "share", "stand", "support")

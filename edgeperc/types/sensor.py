@@ -17,6 +17,7 @@ import numpy as np
 from ..errors import SensorError
 from ..system.fields import Fields
 from ..system.names import check_text, nearest
+from .choices import AUTO_SENSOR
 from .mounting import MODEL_HEIGHT_M, UNKNOWN_MOUNTING, Mounting
 
 __all__ = ["REMISSION_KINDS", "SENSORS", "RemissionFunction", "SensorProfile", "get_sensor"]
@@ -401,6 +402,8 @@ def get_sensor(sensor: str | os.PathLike[str] | SensorProfile) -> SensorProfile:
         return SENSORS[sensor]
     except (KeyError, TypeError):
         raise SensorError(
-            f"no sensor {sensor!r} is built in{nearest(str(sensor), SENSORS)}; known are {', '.join(SENSORS)}. "
+            "sensor 'auto' is found in the first scan by a Perceiver, and nothing is found here: pass Perceiver.sensor"
+            if sensor == AUTO_SENSOR
+            else f"no sensor {sensor!r} is built in{nearest(str(sensor), SENSORS)}; known are {', '.join(SENSORS)}. "
             "Describe another with SensorProfile(...) or SensorProfile.uniform(...), or name a .json file."
         ) from None

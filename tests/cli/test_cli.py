@@ -35,7 +35,7 @@ from edgeperc.inference import providers, session
 from edgeperc.readers import captures
 from edgeperc.simulation.samples import simulated_scan
 from edgeperc.types.perception import Box, Perception, PointLabels, TopView
-from scenes import Terminal
+from scenes import Terminal, urban
 
 
 class FakePerceiver:
@@ -975,3 +975,33 @@ def test_one_reason_is_written_out_once(capsys: pytest.CaptureFixture[str]) -> N
 def test_python_m_edgeperc() -> None:
     done = subprocess.run([sys.executable, "-m", "edgeperc", "--version"], capture_output=True, text=True, check=False)
     assert done.stdout == f"edgeperc {__version__}\n"
+
+
+def test_the_sensor_of_scan_files_is_found_once_a_folder(
+    tmp_path: Path, fake: type[FakePerceiver], capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Also of scans that do not tell it themselves; a folder whose scans do not tell fails alone."""
+    for name in ("vlp-16", "os1-64"):
+        (tmp_path / name).mkdir()
+        urban(3, name).points.tofile(tmp_path / name / "0.bin")
+        write_scan(tmp_path / name / "1.bin")
+    unknown = write_scan(tmp_path / "unknown" / "0.bin", 5000)
+    assert run("run", tmp_path / "vlp-16", tmp_path / "os1-64", unknown) == 1
+    assert [made.sensor.name for made in fake.made] == ["vlp-16", "os1-64"]
+    out, err = capsys.readouterr()
+    assert len(out.splitlines()) == 4
+    assert f"{unknown}: the sensor cannot be told" in err
+
+
+@pytest.mark.parametrize("option", [[], ["--sensor", "auto"]])
+def test_files_with_few_points_are_the_defaults_unless_auto_asks(
+    option: list[str], tmp_path: Path, fake: type[FakePerceiver], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run("run", write_scan(tmp_path / "0.bin"), *option) == len(option) / 2
+    assert [made.sensor for made in fake.made] == ["hdl-64e"][: 1 - len(option) // 2]
+    assert ("no scan has enough points" in capsys.readouterr().err) == bool(option)
+
+
+def test_auto_and_a_mounting_where_no_scan_is_read_first(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("ros2", "--sensor", "auto", "--mount-height", 2) == 2
+    assert "edgeperc info SCAN --write" in capsys.readouterr().err

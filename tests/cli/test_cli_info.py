@@ -152,10 +152,11 @@ def test_info_says_what_run_does(change: str, tmp_path: Path, capsys: pytest.Cap
     scan = urban(3).points
     file = tmp_path / "scan.bin"
     np.ascontiguousarray(REFUSED.get(change, lambda scan: scan)(scan), np.float32).tofile(file)
-    refused = run("run", file, "--json")
+    sensor = "--sensor", "hdl-64e"
+    refused = run("run", file, *sensor, "--json")
     assert refused == (change != "none")
     error = json.loads(capsys.readouterr().out).get("error", "")
-    assert run("info", file) == refused
+    assert run("info", file, *sensor) == refused
     printed = capsys.readouterr()
     shown = " ".join(line.partition(" ")[2].strip() for line in printed.out.splitlines())
     assert ("edgeperc run refuses this scan" in shown) == refused
@@ -163,7 +164,7 @@ def test_info_says_what_run_does(change: str, tmp_path: Path, capsys: pytest.Cap
     if change not in ("none", "not finite", "few points", "empty beams"):
         assert said in shown
     assert " ..." not in printed.out
-    assert run("info", file, "--json") == refused
+    assert run("info", file, *sensor, "--json") == refused
     assert json.loads(capsys.readouterr().out)["refused"] is bool(refused)
 
 
@@ -359,7 +360,7 @@ def test_no_profile_is_written_without_ground_or_of_two_sensors(
     drive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     written = tmp_path / "mine.json"
-    assert run("info", drive / "1.bin", "--write", written) == 1
+    assert run("info", drive / "1.bin", "--sensor", "hdl-64e", "--write", written) == 1
     assert "no scan shows the ground" in capsys.readouterr().err
     assert run("info", "pointseg", "--write", written) == 1
     assert "the scans are of 0 sensors" in capsys.readouterr().err
@@ -416,3 +417,45 @@ def test_impossible_mountings_are_refused(options: list[str], drive: Path, capsy
     error = capsys.readouterr().err
     assert options[0] in error or "mounting" in error or "extrinsic" in error
     assert "Traceback" not in error
+
+
+def test_info_finds_the_sensor_and_writes_it(
+    fake_models: None, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    sensor = SensorProfile.uniform("mine", 40, 8.0, -20.0, columns=1500)
+    scans = [tmp_path / f"{k}.bin" for k in range(2)]
+    for k, scan in enumerate(scans):
+        urban(k, sensor).points.tofile(scan)
+    profile = tmp_path / "found.json"
+    assert run("info", *scans, "--write", profile) == 0
+    shown = " ".join(capsys.readouterr().out.split())
+    assert shown.count("40-beam: 40 beams from 8.0 to -20.0 deg, 1500 columns, found in the points") == 2
+    found = get_sensor(profile)
+    assert found.name == "40-beam"
+    np.testing.assert_allclose(found.elevations_deg, sensor.elevations_deg, atol=0.02)
+    assert run("info", scans[0], "--sensor", profile, "--json") == 0
+    assert json.loads(capsys.readouterr().out)["sensor"] == "40-beam"
+
+
+@pytest.mark.parametrize("name", ["vlp-16", "os1-64", "hdl-64e"])
+@pytest.mark.parametrize("option", [[], ["--sensor", "auto"]])
+def test_info_names_the_sensor_of_scan_files(
+    fake_models: None, name: str, option: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    urban(3, name).points.tofile(tmp_path / "0.bin")
+    assert run("info", tmp_path / "0.bin", *option, "--json") == 0
+    shown = json.loads(capsys.readouterr().out)
+    assert shown["sensor"] == name
+    assert "beams found" in shown["sensor_from"]
+
+
+def test_info_says_that_a_sensor_cannot_be_told(
+    fake_models: None, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scan = write_scan(tmp_path / "0.bin", 5000)
+    assert run("info", scan) == 1
+    assert f"{scan}: the sensor cannot be told from the scan" in capsys.readouterr().err
+    assert run("info", write_scan(tmp_path / "few" / "0.bin"), "--sensor", "auto") == 1
+    assert "pass --sensor" in capsys.readouterr().err
+    assert run("info", scan, "--sensor", "hdl-64e") in (0, 1)
+    assert "cannot be told" not in capsys.readouterr().err

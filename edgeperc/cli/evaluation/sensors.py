@@ -22,6 +22,8 @@ def add_parser(commands: Commands) -> None:
         examples=[
             "edgeperc eval-sensors os1-64=simulation:24",
             "edgeperc eval-sensors PandaSet/:pandaset vlp-16=simulation:8 --json out.json",
+            "edgeperc eval-sensors VoD/:vod auto=VoD/:vod",
+            "edgeperc eval-sensors --find vlp-16=simulation KITTI/ drive.pcap",
         ],
     )
     reading = parser.add_argument_group("input")
@@ -30,7 +32,14 @@ def add_parser(commands: Commands) -> None:
         nargs="+",
         metavar="SENSOR=SOURCE",
         help="a sensor's name or .json profile, and simulation:N or a folder of labeled range images NAME.npy; or "
-        "labeled scans, without SENSOR=: a folder with scans.json, or FOLDER:LAYOUT with the name of a public set",
+        "labeled scans, without SENSOR=: a folder with scans.json, or FOLDER:LAYOUT with the name of a public set. "
+        "auto=SOURCE finds the sensor of labeled scans in their points",
+    )
+    reading.add_argument(
+        "--find",
+        action="store_true",
+        help="only print which sensors are found in the points of the first three scans of each set, and whether that "
+        "is right; a set may then also be a capture, SENSOR=PATH of scans, or SENSOR=simulation (default: no)",
     )
     models = parser.add_argument_group("models")
     models.add_argument(
@@ -52,7 +61,9 @@ def add_parser(commands: Commands) -> None:
 
 
 def eval_sensors_command(arguments: argparse.Namespace) -> int:
-    """Print IoU of points on other sensors."""
+    """Print IoU of points on other sensors, or which sensors are found."""
+    if arguments.find:
+        return _find(arguments)
     from ...evaluation.transfer import compare
     from ...perceiver import ADAPTATIONS
 
@@ -81,3 +92,18 @@ def eval_sensors_command(arguments: argparse.Namespace) -> int:
         print_line(line)
     write_figures(arguments, figures)
     return 0
+
+
+def _find(arguments: argparse.Namespace) -> int:
+    """Print which sensors are found in the points."""
+    from ...evaluation.found import find_sensors
+
+    figures = find_sensors(arguments.datasets)
+    for name, result in figures.items():
+        off = "" if result["off_deg"] is None else f", off by at most {result['off_deg']:.2f} deg"
+        print_line(
+            f"{name} ({result['sensor']}): found {', '.join(result['found']) or 'none'}; {result['right']} right, "
+            f"{result['cannot_tell']} cannot tell, {result['wrong']} wrong{off}"
+        )
+    write_figures(arguments, figures)
+    return 1 if any(result["wrong"] for result in figures.values()) else 0
