@@ -72,7 +72,7 @@ FLOORS = {
         pipeline
         readers.__init__ readers.images readers.origin readers.packets readers.times readers.unknown
         readers.clouds readers.ouster readers.tables
-        readers.inflate readers.pcd readers.ply readers.raw
+        readers.inflate readers.ouster_packets readers.pcd readers.ply readers.raw
         readers.mcap readers.text
         readers.bags readers.files readers.packet_messages
         readers.decoders

@@ -1,9 +1,11 @@
-"""Decoding of captures by native libraries; `worker` runs it in a process of its own."""
+"""Decoding of captures, some by native libraries; `worker` runs it in a process of its own."""
 
 from __future__ import annotations
 
+import json
 import shutil
 import tempfile
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence, Set
 from pathlib import Path
 from typing import Any, TypeVar
@@ -17,9 +19,11 @@ from ..types.points import as_points, table_columns
 from .bags import BagFile, open_bag
 from .clouds import CLOUD_READERS, Cloud, cloud_points, cloud_table, describe_cloud
 from .mcap import Channel
-from .ouster import check_osf, open_capture
+from .ouster import check_osf, metadata_beside, read_metadata
+from .ouster_packets import Layout, OusterStream, layout_of
 from .packet_messages import PACKET_READERS, VelodyneScan, VelodyneStream, packets_of_others
 from .packets import (
+    Datagrams,
     copy_as_ethernet,
     is_ethernet,
     pcap_packets,
@@ -102,7 +106,7 @@ def _with_typed_errors(path: Path, items: Iterator[_Item]) -> Iterator[_Item]:
     except MemoryError as exc:
         after = f"after {n_scans} scans " if n_scans else ""
         raise PointsError(f"{path}: {after}decoding the capture takes more than {MAX_BYTES:,} bytes of memory") from exc
-    except Exception as exc:  # of three libraries, and of numpy, struct and sqlite on damaged files
+    except Exception as exc:  # of libraries, and of numpy, struct and sqlite on damaged files
         after = f"after {n_scans} scans " if n_scans else ""
         reason = " ".join(str(exc).split()) or type(exc).__name__
         raise PointsError(f"{path}: {after}the capture cannot be read ({reason}); it is damaged or cut short") from exc
@@ -140,14 +144,12 @@ def _packet_scans(
         scans = _velodyne_scans(_decodable(path, alive, sender))
     else:
         refuse_others(path)
-        frames = open_capture(_decodable(path, alive, None), warn, alive, beside=path)
-        if frames is not None:
-            scans = _ouster_scans(frames, topic, remission_field)
+        scans = _ouster_turns(path, topic, remission_field, warn, alive)
     n_scans = 0
     for scan in scans:
         n_scans += 1
         yield scan
-    # Both libraries stop without an error if the file ends inside a packet, or has no packets of their sensors.
+    # So far, there was no error if the file ends inside a packet, or has no packets of such a sensor.
     n_packets = 0 if kind == ".osf" else sum(1 for _ in pcap_packets(path))
     if not n_scans:
         content = "holds no scan" if kind == ".osf" else f"has {n_packets} packets, none from a supported LiDAR"
@@ -180,6 +182,50 @@ def _velodyne_scans(path: Path) -> Iterator[TimedScan]:
         if config.model is not None and config.model.name.startswith("HDL64E"):
             scan[:, 3] /= 255.0
         yield TimedScan(stamp.device, scan, stamp.device + points[:, 4].astype(np.float64))
+
+
+def _ouster_turns(
+    path: Path, topic: str | None, remission_field: str | None, warn: Callable[[str], None], alive: Callable[[], None]
+) -> Iterator[TimedScan]:
+    """The turns of an Ouster; damaged packets are left out, and at the end said."""
+    layouts = [_layout(file) for file in metadata_beside(path)]
+    chosen = layouts[_choose("sensor", [layout.name for layout in layouts], topic)]
+    stream = OusterStream(chosen, remission_field)
+    sizes = {size for layout in layouts for size in (layout.packet_bytes, *layout.other_bytes)}
+    ports, n_other_sizes, n_others, n_used = set[int](), Counter[int](), 0, 0
+    datagrams = Datagrams(path, alive)
+    for datagram in datagrams:
+        size = len(datagram.payload)
+        if size not in sizes:
+            n_other_sizes[datagram.port] += 1
+            continue
+        ports.add(datagram.port)
+        if size != chosen.packet_bytes:
+            continue
+        if not stream.is_of_sensor(datagram.payload) or (len(layouts) > 1 and chosen.port not in (0, datagram.port)):
+            n_others += 1
+            continue
+        n_used += 1
+        yield from stream.add(bytes(datagram.payload))
+    yield from stream.end()
+    if n_others and not n_used:
+        raise PointsError(
+            f"the metadata is of the sensor {chosen.name} (initialization_id {chosen.init_id}), and none of the "
+            f"{n_others:,} packets is; expected the metadata that was saved with the capture"
+        )
+    n_bad = datagrams.n_bad + sum(n_other_sizes[port] for port in ports)
+    if n_bad and n_used:
+        warn(
+            f"{path}: dropped {n_bad} damaged packets of the capture: empty, incomplete, or of another length than "
+            "the metadata says"
+        )
+
+
+def _layout(file: Path) -> Layout:
+    try:
+        return layout_of(json.loads(read_metadata(file)))
+    except PointsError as exc:
+        raise PointsError(f"the metadata {file.name} cannot be read: {exc}") from exc
 
 
 def _ouster_scans(frames: Any, topic: str | None, remission_field: str | None) -> Iterator[TimedScan]:
