@@ -16,12 +16,13 @@ from ..types.sensor import SensorProfile
 from .apart import decode_apart, describe_apart
 from .bags import bag_files
 from .files import FileOptions, read_points, read_timed_file
-from .identify import KnownSensor, of_cloud, of_metadata, of_packets, of_velodyne
+from .identify import KnownSensor, of_cloud, of_livox, of_metadata, of_packets, of_velodyne
+from .livox_packets import LVX_MAGIC
 from .packets import PCAP_MAGIC
 from .times import TimedScan
 
 SCAN_SUFFIXES = (".bin", ".npy", ".npz", ".pcd", ".ply")
-CAPTURE_SUFFIXES = (".bag", ".db3", ".mcap", ".osf", ".pcap", ".pcapng")
+CAPTURE_SUFFIXES = (".bag", ".db3", ".lvx2", ".mcap", ".osf", ".pcap", ".pcapng")
 
 # First bytes of captures.
 _MAGIC = {
@@ -30,6 +31,7 @@ _MAGIC = {
     b"#ROSBAG V": ".bag",
     b"\x89MCAP0\r\n": ".mcap",
     b"SQLite format 3\0": ".db3",
+    LVX_MAGIC: ".lvx2",
 }
 
 
@@ -197,6 +199,8 @@ def known_sensor(path: Path, topic: str | None = None) -> KnownSensor | None:
     try:
         if kind == ".pcap":
             return of_packets(path, topic)
+        if kind == ".lvx2":
+            raise of_livox()
         description = describe_apart(path, kind, topic)
         if "metadata" in description:
             return of_metadata(json.loads(description["metadata"]), "the metadata")

@@ -18,6 +18,8 @@ from ..system.extras import require
 from ..types.points import as_points, table_columns
 from .bags import BagFile, open_bag
 from .clouds import CLOUD_READERS, Cloud, cloud_points, cloud_table, describe_cloud
+from .lidars import lidar_of, turns_of
+from .livox_packets import lvx2_scans, lvx2_sensors
 from .mcap import Channel
 from .ouster import check_osf, metadata_beside, read_metadata
 from .ouster_packets import Layout, OusterStream, layout_of
@@ -27,7 +29,6 @@ from .packets import (
     copy_as_ethernet,
     is_ethernet,
     pcap_packets,
-    refuse_others,
     velodyne_name,
     velodyne_packets,
     velodyne_senders,
@@ -59,7 +60,7 @@ def decode(
     """
     scans = (
         _packet_scans(path, kind, topic, remission_field, warn, alive)
-        if kind in (".pcap", ".osf")
+        if kind in (".lvx2", ".osf", ".pcap")
         else of_plausible_duration(_bag_scans(path, topic, remission_field, alive, times))
     )
     for stamp_s, points, times_s in _with_typed_errors(path, scans):
@@ -138,22 +139,26 @@ def _packet_scans(
     scans: Iterator[TimedScan] = iter(())
     if kind == ".osf":
         scans = _ouster_scans(_open_osf(path), topic, remission_field)
+    elif kind == ".lvx2":
+        scans = lvx2_scans(path, _choose("sensor", lvx2_sensors(path), topic), alive)
     elif next(velodyne_packets(path), None) is not None:
         senders = velodyne_senders(path)
         sender = senders[_choose("Velodyne", senders, topic)] if len(senders) > 1 else None
         scans = _velodyne_scans(_decodable(path, alive, sender))
+    elif (lidar := lidar_of(path)) is not None:
+        known = lidar.senders
+        scans = turns_of(path, lidar, known[_choose(lidar.title, known, topic)] if len(known) > 1 else None, alive)
     else:
-        refuse_others(path)
         scans = _ouster_turns(path, topic, remission_field, warn, alive)
     n_scans = 0
     for scan in scans:
         n_scans += 1
         yield scan
     # So far, there was no error if the file ends inside a packet, or has no packets of such a sensor.
-    n_packets = 0 if kind == ".osf" else sum(1 for _ in pcap_packets(path))
+    n_packets = sum(1 for _ in pcap_packets(path)) if kind == ".pcap" else 0
     if not n_scans:
-        content = "holds no scan" if kind == ".osf" else f"has {n_packets} packets, none from a supported LiDAR"
-        raise PointsError(f"the capture {content}; expected a Velodyne capture, or an Ouster capture with its metadata")
+        content = f"has {n_packets} packets, none from a supported LiDAR" if kind == ".pcap" else "holds no scan"
+        raise PointsError(f"the capture {content}; expected a capture of a LiDAR, an Ouster's with its metadata")
 
 
 def _decodable(path: Path, alive: Callable[[], None], sender: str | None) -> Path:

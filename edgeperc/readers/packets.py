@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import struct
-from collections import Counter
 from collections.abc import Callable, Iterator
 from itertools import islice
 from pathlib import Path
@@ -26,7 +25,6 @@ _LINKS = {1: (14, 12), 113: (16, 14), 276: (20, 0)}
 _LOOPBACK_LINKS, _RAW_LINKS = (0, 108), (12, 14, 101, 228)  # four bytes in front of the IP header, none
 
 VELODYNE_BYTES = 1206
-_GPS_BYTES = 600  # what LiDARs send of their GPS is shorter, their points are longer
 
 # The last byte of a Velodyne's packet, behind the return mode: the model's beam angles. VLS-128 has two by firmware.
 _PRODUCTS = {
@@ -189,59 +187,12 @@ def _velodyne_packets(path: Path) -> Iterator[tuple[str, memoryview]]:
                 at = _ip_at(packet, link)
             except ValueError:
                 at = None
-            is_ip = at is not None and len(packet) >= at + 28 + VELODYNE_BYTES
-            yield _address(packet[at + 12 : at + 16]) if at is not None and is_ip else "", packet[-VELODYNE_BYTES:]
-
-
-def refuse_others(path: Path) -> None:
-    """Raise `PointsError` if most of the first packets of a pcap file are those of a LiDAR that is not decoded."""
-    # One of 65,536 packets of other sensors begins like them by chance.
-    names = Counter(_maker(payload) for payload in _first_payloads(path) if len(payload) > _GPS_BYTES)
-    name, n = max(names.items(), key=lambda item: item[1], default=(None, 0))
-    if name is not None and 2 * n > names.total():
-        raise PointsError(
-            f"a capture of a {name}, which cannot be decoded; expected a Velodyne or an Ouster. Convert it with "
-            f"{name.split()[0]}'s driver, to a ROS bag or to .pcd files"
-        )
-
-
-def _maker(payload: memoryview) -> str | None:
-    """The LiDAR that sends such a packet, e.g. ``"Hesai Pandar64"``; None of Velodyne, Ouster and unknown ones."""
-    head = bytes(payload[:4])
-    if head in (b"\x55\xaa\x05\x0a", b"\x55\xaa\x05\x5a", b"\xaa\x55\x05\xa5"):
-        return "RoboSense sensor"
-    # Livox: version 0, length of the packet; 96 points and more of 14 bytes (or 8), behind 36 bytes.
-    if len(payload) in (1380, 804, 996) and (
-        head[0] == 0 and int.from_bytes(payload[1:3], "little") in (0, len(payload))
-    ):
-        return "Livox sensor"
-    return _hesai_name(payload)
-
-
-def _first_payloads(path: Path) -> Iterator[memoryview]:
-    """What the first UDP datagrams of a pcap file carry; fragments and damaged packets are left out."""
-    link = _link_type(path)
-    for _, packet in islice(pcap_packets(path, whole=False), _SNIFFED_PACKETS):
-        try:
-            part = _fragment(packet, link)
-        except ValueError:
-            continue
-        if part is not None and part.start == 0 and not part.more:
-            yield part.payload[8:]
-
-
-def _hesai_name(payload: memoryview) -> str | None:
-    """The Hesai sensor that sends such a packet, e.g. ``"Hesai Pandar64"``; None if it is not one of Hesai's."""
-    # Pandar40P: ten blocks of 124 bytes, each with the same flag, and a tail.
-    if len(payload) in (1262, 1266) and all(bytes(payload[k : k + 2]) == b"\xff\xee" for k in range(0, 1240, 124)):
-        return "Hesai Pandar40P"
-    if len(payload) < 12 or bytes(payload[:2]) != b"\xee\xff":
-        return None
-    # Pandar20 and Pandar64 have the numbers of lasers and blocks here, later sensors the version of the protocol.
-    lasers, blocks = payload[2], payload[3]
-    if (lasers, blocks) in ((20, 20), (64, 6)):
-        return f"Hesai Pandar{lasers}"
-    return f"Hesai sensor of {payload[6]} lasers (version {payload[2]}.{payload[3]} of the packets)"
+            if at is None or len(packet) < at + 28 + VELODYNE_BYTES:
+                yield "", packet[-VELODYNE_BYTES:]
+                continue
+            udp = at + 4 * (packet[at] & 15)
+            if int.from_bytes(packet[udp + 4 : udp + 6], "big") == 8 + VELODYNE_BYTES:  # RoboSense's end like these
+                yield _address(packet[at + 12 : at + 16]), packet[-VELODYNE_BYTES:]
 
 
 def _ip_at(packet: memoryview, link: int) -> int | None:

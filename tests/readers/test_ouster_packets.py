@@ -203,7 +203,10 @@ def test_real_captures_and_metadata(data_root: Callable[[str], Path], tmp_path: 
         (changed(lidar_data_format__udp_profile_lidar="RNG99"), "'RNG99' is not decoded; known are LEGACY"),
         (changed(lidar_data_format__udp_profile_lidar=["LEGACY"]), "is not decoded"),
         (changed(lidar_data_format__columns_per_frame=None, config_params__lidar_mode=None), "one is needed"),
-        (changed(lidar_data_format__columns_per_packet=512, lidar_data_format__udp_profile_lidar=WIDEST), "at most 65,507"),
+        (
+            changed(lidar_data_format__columns_per_packet=512, lidar_data_format__udp_profile_lidar=WIDEST),
+            "at most 65,507",
+        ),
         (changed(beam_intrinsics__beam_altitude_angles=[0.0] * 8), "several beams have the same angle"),
         (changed(beam_intrinsics__beam_altitude_angles=[[0.0]] * 8), "one for each beam"),
         (changed(beam_intrinsics__beam_to_lidar_transform=[1, 2, 3]), "expected 16 numbers"),
