@@ -98,11 +98,9 @@ def open_spinning(path: Path, row: Format, sender: str | None, alive: Callable[[
     sender : None: any.
     Raises PointsError: Neither the capture nor a file beside it has the angles.
     """
-    if row.elevations_deg:
-        return row, Angles(np.array([[elevation, 0.0] for elevation in row.elevations_deg]))
     files = sorted(path.absolute().parent.glob("*.csv"))
     file = next((each for each in files if each.stem.startswith(path.stem)), None)
-    said: Angles | None = None
+    said = Angles(np.array([[each, 0.0] for each in row.elevations_deg])) if row.elevations_deg else None
     for datagram in () if row.is_hesai else Datagrams(path, alive):
         if sender not in (None, datagram.sender):
             continue
@@ -113,7 +111,7 @@ def open_spinning(path: Path, row: Format, sender: str | None, alive: Callable[[
             break
     if file is not None:
         given = read_angles(file, row)
-        return row, given if said is None else said._replace(lasers_deg=given.lasers_deg)
+        return row, given if said is None else said._replace(lasers_deg=given.lasers_deg)  # the speed, and returns
     if said is None:
         there = "" if row.is_hesai else "The capture has no packet with the angles (DIFOP, port 7788). "
         whose = "Hesai's calibration of the unit" if row.is_hesai else "a row 'elevation,azimuth' for each laser [deg]"

@@ -321,4 +321,4 @@ def _scan_of(
     scan = np.empty((len(returned), 4), np.float32)
     scan[:, :3] = _METER * (xyz_mm @ layout.to_sensor[:3, :3].T + layout.to_sensor[:3, 3])
     scan[:, 3] = remission[returned]
-    return TimedScan(float(stamps_ns.max()) * 1e-9, scan, stamps_ns[column] * 1e-9)
+    return TimedScan(float(stamps_ns.max()) * 1e-9, scan, stamps_ns[column].astype(np.float64) * 1e-9)

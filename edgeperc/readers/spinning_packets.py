@@ -22,6 +22,15 @@ from .times import TimedScan
 Bytes = NDArray[np.uint8]
 
 
+class Clock(NamedTuple):
+    """Where a packet has its time: the date, or the seconds; Hesai's the microseconds and the speed, too."""
+
+    kind: Literal["hesai", "date", "seconds"]
+    at: int
+    micros_at: int = 0
+    speed_at: int = 0
+
+
 class Format(NamedTuple):
     """One row of the table.
 
@@ -32,9 +41,7 @@ class Format(NamedTuple):
     flag : the bytes that a block begins with.
     first : from there to the first channel; the azimuth is in the two bytes in front of it.
     fires_us : when each channel fires, after its block.
-    clock : how the time is written: Hesai's way, as a date, or in seconds.
-    clock_at : where; of Hesai's, the date.
-    micros_at, speed_at : where the microseconds and the speed are; RoboSense's speed is in the DIFOP.
+    clock : how and where the time is written.
     reference : the block that the time is of, 0 or -1.
     late_us : how much later the block fires.
     unit_m, mask : of a distance; Hesai's packets say how many mm.
@@ -53,10 +60,7 @@ class Format(NamedTuple):
     flag: bytes
     first: int
     fires_us: tuple[float, ...]
-    clock: Literal["hesai", "date", "seconds"]
-    clock_at: int
-    micros_at: int = 0
-    speed_at: int = 0
+    clock: Clock
     reference: int = 0
     late_us: float = 0.0
     unit_m: float = 0.004
@@ -68,7 +72,7 @@ class Format(NamedTuple):
     @property
     def is_hesai(self) -> bool:
         """Whether the maker is Hesai: numbers are little-endian, and azimuth 0 is along y, as its driver has it."""
-        return self.clock == "hesai"
+        return self.clock.kind == "hesai"
 
     @property
     def block_bytes(self) -> int:
@@ -84,9 +88,9 @@ class Angles(NamedTuple):
     is_dual: bool = False
 
 
-def _tail(body: int, date: int, micros: int, speed: int) -> dict[str, int]:
-    """Where Hesai's tail, which begins behind the body, has its numbers."""
-    return {"clock_at": body + date, "micros_at": body + micros, "speed_at": body + speed}
+def _tail(body: int, date: int, micros: int, speed: int) -> Clock:
+    """Hesai's, which is behind the body."""
+    return Clock("hesai", body + date, body + micros, body + speed)
 
 
 def _xt(name: str, n: int, elevations: Sequence[float]) -> Format:
@@ -94,61 +98,49 @@ def _xt(name: str, n: int, elevations: Sequence[float]) -> Format:
     fires_us = tuple(6.0 + 1.512 * (32 // n) * k for k in range(n))
     return Format(
         name, f"Hesai {name.replace('p', 'P', 1).replace('xt', 'XT')}", 12, 8, n, 4, (body + 28,), b"", 2, fires_us,
-        "hesai", **_tail(body, 13, 19, 11), reference=-1, elevations_deg=tuple(elevations),
+        _tail(body, 13, 19, 11), reference=-1, elevations_deg=tuple(elevations),
     )  # fmt: skip
 
 
 _NO_FIRES = (0.0,) * 128
-_OLD, _DATE, _SECONDS = b"\xff\xee", ("date", 20), ("seconds", 20)
+_OLD, _DATE, _SECONDS = b"\xff\xee", Clock("date", 20), Clock("seconds", 20)
 _RUBY = "000112222333444555666778899aabbccddeefff000111222334444556667778899aabbbccdeefff"  # firings of 80 channels
-_AIRY_US = (
-    0.0,
-    7.616,
-    16.184,
-    24.752,
-    33.32,
-    42.84,
-    52.36,
-    61.88,
-    71.4,
-    79.968,
-    88.536,
-    97.104,
-)  # of eight channels each
+# Of eight channels each.
+_AIRY_US = (0.0, 7.616, 16.184, 24.752, 33.32, 42.84, 52.36, 61.88, 71.4, 79.968, 88.536, 97.104)
 _FORMATS = (
-    Format("pandar40p", "Hesai Pandar40P", 0, 10, 40, 3, (1262, 1266), _OLD, 4, _NO_FIRES[:40], "hesai",
-           **_tail(1240, 16, 10, 8), reference=-1, late_us=-28.58),
-    Format("pandar64", "Hesai Pandar64", 8, 6, 64, 3, (1194, 1198), b"", 2, _NO_FIRES[:64], "hesai",
-           **_tail(1172, 16, 10, 8), reference=-1, late_us=-42.58),
+    Format("pandar40p", "Hesai Pandar40P", 0, 10, 40, 3, (1262, 1266), _OLD, 4, _NO_FIRES[:40],
+           _tail(1240, 16, 10, 8), reference=-1, late_us=-28.58),
+    Format("pandar64", "Hesai Pandar64", 8, 6, 64, 3, (1194, 1198), b"", 2, _NO_FIRES[:64],
+           _tail(1172, 16, 10, 8), reference=-1, late_us=-42.58),
     _xt("pandarxt-32", 32, range(15, -17, -1)),
     _xt("pandarxt-16", 16, range(15, -17, -2)),
-    Format("pandarqt-64", "Hesai PandarQT-64", 12, 4, 64, 4, (1068, 1072), b"", 2, _NO_FIRES[:64], "hesai",
-           **_tail(1044, 18, 12, 10), late_us=25.71),
+    Format("pandarqt-64", "Hesai PandarQT-64", 12, 4, 64, 4, (1068, 1072), b"", 2, _NO_FIRES[:64],
+           _tail(1044, 18, 12, 10), late_us=25.71),
     # Whether there are bytes of confidence and of functional safety is in the packet.
-    Format("ot128", "Hesai OT128", 12, 2, 128, 3, (), b"", 2, _NO_FIRES, "hesai",
-           **_tail(788, 15, 21, 13), reference=-1),
+    Format("ot128", "Hesai OT128", 12, 2, 128, 3, (), b"", 2, _NO_FIRES,
+           _tail(788, 15, 21, 13), reference=-1),
     Format("rs-16", "RoboSense RS-LiDAR-16", 42, 12, 32, 3, (1248,), _OLD, 4,
-           tuple(2.8 * (k % 16) + 55.5 * (k // 16) for k in range(32)), *_DATE, unit_m=0.005, lens_m=(0.03977, 0.0),
+           tuple(2.8 * (k % 16) + 55.5 * (k // 16) for k in range(32)), _DATE, unit_m=0.005, lens_m=(0.03977, 0.0),
            lasers=16),
     Format("rs-32", "RoboSense RS-LiDAR-32", 42, 12, 32, 3, (1248,), _OLD, 4,
-           tuple(2.88 * (k % 16) + 1.44 * (k // 16 + k % 16 // 15) for k in range(32)), *_DATE, unit_m=0.005,
+           tuple(2.88 * (k % 16) + 1.44 * (k // 16 + k % 16 // 15) for k in range(32)), _DATE, unit_m=0.005,
            lens_m=(0.04142, 0.0)),
     Format("rs-bpearl", "RoboSense RS-Bpearl", 42, 12, 32, 3, (1248,), _OLD, 4,
-           tuple(2.56 * (k % 8) + 25.68 * (k // 8 % 2) + 1.28 * (k // 16) for k in range(32)), *_DATE, unit_m=0.005,
+           tuple(2.56 * (k % 8) + 25.68 * (k // 8 % 2) + 1.28 * (k // 16) for k in range(32)), _DATE, unit_m=0.005,
            lens_m=(0.01701, 0.09427)),
     Format("rs-bpearl-4", "RoboSense RS-Bpearl", 42, 12, 32, 3, (1248,), _OLD, 4,
-           tuple(1.668 * k for k in range(32)), *_SECONDS, unit_m=0.0025, lens_m=(0.01829, 0.09571)),
+           tuple(1.668 * k for k in range(32)), _SECONDS, unit_m=0.0025, lens_m=(0.01829, 0.09571)),
     Format("helios-32", "RoboSense RS-Helios", 42, 12, 32, 3, (1248,), _OLD, 4, tuple(1.73 * k for k in range(32)),
-           *_SECONDS, unit_m=0.0025, lens_m=(0.03806, 0.0)),
+           _SECONDS, unit_m=0.0025, lens_m=(0.03806, 0.0)),
     Format("helios-16", "RoboSense RS-Helios-16P", 42, 12, 32, 3, (1248,), _OLD, 4,
-           tuple(1.73 * (k % 16) + 55.56 * (k // 16) for k in range(32)), *_SECONDS, unit_m=0.0025,
+           tuple(1.73 * (k % 16) + 55.56 * (k // 16) for k in range(32)), _SECONDS, unit_m=0.0025,
            lens_m=(0.03806, 0.0), lasers=16),
     Format("rs-airy", "RoboSense Airy", 42, 8, 48, 3, (1248,), _OLD, 4, tuple(_AIRY_US[k // 8] for k in range(96)),
-           *_SECONDS, unit_m=0.005, mask=0x3FFF, lens_m=(0.01143, 0.06056), lasers=96),
+           _SECONDS, unit_m=0.005, mask=0x3FFF, lens_m=(0.01143, 0.06056), lasers=96),
     Format("rs-ruby-80", "RoboSense RS-Ruby Lite", 80, 4, 80, 3, (1248,), b"\xfe", 4,
-           tuple(3.236 * int(firing, 16) for firing in _RUBY), "seconds", 10, unit_m=0.005, lens_m=(0.03995, 0.0)),
+           tuple(3.236 * int(firing, 16) for firing in _RUBY), Clock("seconds", 10), unit_m=0.005, lens_m=(0.03995, 0.0)),
     Format("rs-ruby-128", "RoboSense RS-Ruby", 80, 3, 128, 3, (1248,), b"\xfe", 4,
-           tuple(3.236 * (k // 4 % 16) for k in range(128)), "seconds", 10, unit_m=0.005, lens_m=(0.03995, 0.0)),
+           tuple(3.236 * (k // 4 % 16) for k in range(128)), Clock("seconds", 10), unit_m=0.005, lens_m=(0.03995, 0.0)),
 )  # fmt: skip
 FORMATS = {row.name: row for row in _FORMATS}
 """The formats that are decoded, by name."""
@@ -229,10 +221,9 @@ def _with_options(row: Format, options: int, size: int) -> Format:
     """A row for packets with these bytes of confidence and functional safety."""
     wide, safe = options >> 4 & 1, options >> 2 & 1
     moved = 256 * wide + 17 * safe
-    return row._replace(
-        channel_bytes=row.channel_bytes + wide, clock_at=row.clock_at + moved, micros_at=row.micros_at + moved,
-        speed_at=row.speed_at + moved, sizes=(max(size, row.clock_at + moved + 11),),
-    )  # fmt: skip
+    clock = Clock("hesai", *(at + moved for at in row.clock[1:]))
+    sizes = (max(size, clock.micros_at + 5),)
+    return row._replace(channel_bytes=row.channel_bytes + wide, clock=clock, sizes=sizes)
 
 
 def _has_flags(payload: memoryview, row: Format) -> bool:
@@ -259,7 +250,9 @@ def angles_of_difop(row: Format, payload: memoryview) -> Angles | None:
         is_set = not (triples[0, :, 0] == 255).any() and len(np.unique(lasers[:, 0])) == n
     if not is_set or not (np.abs(lasers) <= 90.0).all():
         return None
-    return Angles(np.round(lasers, 4), float(int.from_bytes(payload[8:10], "big")), payload[300] == 0)
+    return Angles(
+        np.round(lasers, 4).astype(np.float64), float(int.from_bytes(payload[8:10], "big")), payload[300] == 0
+    )
 
 
 def has_16_lasers(payload: memoryview) -> bool:
@@ -398,7 +391,8 @@ class SpinningStream:
     def _packet(self, payload: memoryview) -> _Packet:
         row = self._row
         azimuths = np.array(self.azimuths_of(payload))
-        rpm = float(struct.unpack_from("<H", payload, row.speed_at)[0]) if row.speed_at else self._angles.rpm
+        speed_at = row.clock.speed_at
+        rpm = float(struct.unpack_from("<H", payload, speed_at)[0]) if speed_at else self._angles.rpm
         is_likely = _SPEEDS[0] <= rpm <= _SPEEDS[1]
         return _Packet(bytes(payload), _time_of(row, payload), rpm if is_likely else 600.0, azimuths)
 
@@ -460,13 +454,13 @@ def _beams(row: Format, angles: Angles, is_dual: bool) -> NDArray[np.float64]:
 
 def _time_of(row: Format, payload: memoryview) -> float:
     """The time that a packet states [s]."""
-    at = row.clock_at
-    if row.clock == "seconds":
+    kind, at, micros_at, _ = row.clock
+    if kind == "seconds":
         high, low, micros = struct.unpack_from(">HII", payload, at)
         return float((high << 32 | low) + 1e-6 * micros)
     date = bytes(payload[at : at + 6])
-    if row.clock == "hesai":
-        micros = int.from_bytes(payload[row.micros_at : row.micros_at + 4], "little")
+    if kind == "hesai":
+        micros = int.from_bytes(payload[micros_at : micros_at + 4], "little")
         seconds = int.from_bytes(date[2:], "big") if date[0] == 0 else _seconds(date[0] % 100, date)
         return seconds + 1e-6 * micros
     millis, micros = struct.unpack_from(">HH", payload, at + 6)
