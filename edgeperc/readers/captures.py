@@ -57,7 +57,8 @@ def read_scans(
         has the same beginning; a ``.pcap`` of Hesai's, RoboSense's or Livox' sensors, or an ``.lvx2``; a ROS 1
         ``.bag``, a ROS 2 bag's folder or one file of it, or an ``.mcap`` file. Bags are read for messages of type
         ``sensor_msgs/PointCloud2``, MCAP files for ``foxglove.PointCloud`` (protobuf), too; without such, for packets
-        of a Velodyne, ``velodyne_msgs/VelodyneScan``. The first bytes of a file decide its format, not its name.
+        of a Velodyne, ``velodyne_msgs/VelodyneScan``, or an Ouster, ``PacketMsg``. The first bytes of a file decide its
+        format, not its name.
     topic : str, optional
         What to read if there are several sensors: the topic of point clouds; ``TOPIC@FRAME`` for those of one frame;
         the serial number of an Ouster or in an ``.lvx2``; the IPv4 address of another sensor.

@@ -23,7 +23,18 @@ from .livox_packets import lvx2_scans, lvx2_sensors
 from .mcap import Channel
 from .ouster import check_osf, metadata_beside, read_metadata
 from .ouster_packets import Layout, OusterStream, layout_of
-from .packet_messages import PACKET_READERS, VelodyneScan, VelodyneStream, packets_of_others
+from .packet_messages import (
+    PACKET_READERS,
+    OusterMessages,
+    OusterPacket,
+    Packets,
+    VelodyneScan,
+    VelodyneStream,
+    has_points,
+    is_metadata_of,
+    packets_of_others,
+    read_text,
+)
 from .packets import (
     Datagrams,
     copy_as_ethernet,
@@ -37,7 +48,7 @@ from .tables import MAX_BYTES
 from .times import TimedScan, of_plausible_duration, point_times
 
 _Item = TypeVar("_Item")
-_READERS: Mapping[tuple[str, str], Callable[[memoryview], Cloud | VelodyneScan]] = {**CLOUD_READERS, **PACKET_READERS}
+_READERS: Mapping[tuple[str, str], Callable[[memoryview], Cloud | Packets]] = {**CLOUD_READERS, **PACKET_READERS}
 
 
 def decode(
@@ -88,6 +99,8 @@ def describe(path: Path, kind: str, topic: str | None, alive: Callable[[], None]
                 if isinstance(message, VelodyneScan):
                     names = {velodyne_name(packet) for _, packet in message.packets}
                     yield {"velodyne": sorted(names, key=str)}
+                elif isinstance(message, OusterPacket):
+                    yield {"metadata": message.metadata}
                 else:
                     yield describe_cloud(name, message)
 
@@ -259,12 +272,18 @@ def _ouster_scans(frames: Any, topic: str | None, remission_field: str | None) -
 def _bag_scans(
     path: Path, topic: str | None, remission_field: str | None, alive: Callable[[], None], times: bool
 ) -> Iterator[TimedScan]:
-    turns: VelodyneStream | None = None
+    turns: VelodyneStream | OusterMessages | None = None
     try:
         for _, message, stamp_s in _clouds(path, topic, alive):
             if isinstance(message, VelodyneScan):
-                turns = turns or VelodyneStream()
+                turns = turns if isinstance(turns, VelodyneStream) else VelodyneStream()
                 yield from turns.add(message)
+                continue
+            if isinstance(message, OusterPacket):
+                turns = (
+                    turns if isinstance(turns, OusterMessages) else OusterMessages(message.metadata, remission_field)
+                )
+                yield from turns.add(message, stamp_s)
                 continue
             points = cloud_points(message, remission_field=remission_field)
             times_s = point_times(table_columns(cloud_table(message)), points, stamp_s) if times else None
@@ -277,9 +296,7 @@ def _bag_scans(
         yield from turns.end()
 
 
-def _clouds(
-    path: Path, topic: str | None, alive: Callable[[], None]
-) -> Iterator[tuple[str, Cloud | VelodyneScan, float]]:
+def _clouds(path: Path, topic: str | None, alive: Callable[[], None]) -> Iterator[tuple[str, Cloud | Packets, float]]:
     """Topic, message and stamp [s] of each point cloud, or of each message of packets in a bag without clouds.
 
     What is damaged in one file of a bag is reported after the clouds of all.
@@ -288,7 +305,7 @@ def _clouds(
         files = open_bag(path, Path(folder), alive)
         topics, damage = _topics(files)
         clouds = {channel for channel in topics if channel[1:] in CLOUD_READERS}
-        packets = {channel for channel in topics if channel[1:] in PACKET_READERS}
+        packets = {channel for channel in topics if has_points(channel)}
         if not clouds or (topic or "").partition("@")[0] in {channel.topic for channel in packets}:
             clouds = packets or clouds
         if damage is not None and not clouds:
@@ -302,6 +319,7 @@ def _clouds(
         name, _, frame = (topic, "", "") if topic in names else (topic or "").partition("@")
         chosen = names[_choose("topic of type sensor_msgs/PointCloud2", names, name or None, more)]
         n_scans, frames = 0, dict[str, None]()
+        metadata: str | None = None
         for message, recorded_ns in _messages(files, clouds, chosen):
             frames.setdefault(message.header.frame_id)
             if frame and message.header.frame_id != frame:
@@ -313,12 +331,28 @@ def _clouds(
                     "each and put them together with edgeperc.merge"
                 )
             n_scans += 1
+            if isinstance(message, OusterPacket):
+                metadata = _ouster_metadata(files, topics, chosen) if metadata is None else metadata
+                message = message._replace(metadata=metadata)
             stamp = message.header.stamp
             stamp_s, stamp_ns = stamp.sec + 1e-9 * stamp.nanosec, 10**9 * stamp.sec + stamp.nanosec
             yield chosen, message, Stamp(stamp_s, stamp_ns) if stamp_ns else Stamp(1e-9 * recorded_ns, recorded_ns)
         if not n_scans:
             seen = f" with frame {frame!r}, only {', '.join(frames)}" if frames else ""
             raise PointsError(f"topic {chosen} has no message{seen}; expected point clouds")
+
+
+def _ouster_metadata(files: Sequence[BagFile], topics: Set[Channel], topic: str) -> str:
+    """The text that an Ouster's driver wrote about the sensor."""
+    for channel in sorted(channel for channel in topics if is_metadata_of(channel, topic)):
+        for file in files:
+            for _, raw in file.messages_of(channel) if channel in file.topics() else ():
+                return read_text(channel, raw)
+    raise PointsError(
+        f"topic {topic} holds packets of an Ouster, and the bag has no metadata of the sensor; expected it as a text, "
+        f"topic {topic.rpartition('/')[0]}/metadata. Play the bag through Ouster's driver (ouster-ros) with its "
+        "metadata, and record its sensor_msgs/PointCloud2"
+    )
 
 
 def _topics(files: Sequence[BagFile]) -> tuple[set[Channel], PointsError | None]:
@@ -332,7 +366,7 @@ def _topics(files: Sequence[BagFile]) -> tuple[set[Channel], PointsError | None]
     return topics, damage
 
 
-def _messages(files: Sequence[BagFile], clouds: Set[Channel], topic: str) -> Iterator[tuple[Cloud | VelodyneScan, int]]:
+def _messages(files: Sequence[BagFile], clouds: Set[Channel], topic: str) -> Iterator[tuple[Cloud | Packets, int]]:
     """Clouds of a topic and when they were recorded [ns]; damage in one file is raised after those of all files."""
     n, damage = 0, None
     for file in files:
