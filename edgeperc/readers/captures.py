@@ -17,8 +17,7 @@ from .apart import decode_apart, describe_apart
 from .bags import bag_files
 from .files import FileOptions, read_points, read_timed_file
 from .identify import KnownSensor, of_cloud, of_livox, of_metadata, of_packets, of_velodyne
-from .livox_packets import LVX_MAGIC
-from .packets import PCAP_MAGIC
+from .packets import LVX_MAGIC, PCAP_MAGIC
 from .times import TimedScan
 
 SCAN_SUFFIXES = (".bin", ".npy", ".npz", ".pcd", ".ply")

@@ -18,11 +18,8 @@ from ..system.extras import require
 from ..types.points import as_points, table_columns
 from .bags import BagFile, open_bag
 from .clouds import CLOUD_READERS, Cloud, cloud_points, cloud_table, describe_cloud
-from .lidars import lidar_of, turns_of
-from .livox_packets import lvx2_scans, lvx2_sensors
 from .mcap import Channel
 from .ouster import check_osf, metadata_beside, read_metadata
-from .ouster_packets import Layout, OusterStream, layout_of
 from .packet_messages import (
     PACKET_READERS,
     OusterMessages,
@@ -153,16 +150,22 @@ def _packet_scans(
     if kind == ".osf":
         scans = _ouster_scans(_open_osf(path), topic, remission_field)
     elif kind == ".lvx2":
+        from .livox_packets import lvx2_scans, lvx2_sensors  # numba, which bags do without
+
         scans = lvx2_scans(path, _choose("sensor", lvx2_sensors(path), topic), alive)
     elif next(velodyne_packets(path), None) is not None:
         senders = velodyne_senders(path)
         sender = senders[_choose("Velodyne", senders, topic)] if len(senders) > 1 else None
         scans = _velodyne_scans(_decodable(path, alive, sender))
-    elif (lidar := lidar_of(path)) is not None:
-        known = lidar.senders
-        scans = turns_of(path, lidar, known[_choose(lidar.title, known, topic)] if len(known) > 1 else None, alive)
     else:
-        scans = _ouster_turns(path, topic, remission_field, warn, alive)
+        from .lidars import lidar_of, turns_of
+
+        lidar = lidar_of(path)
+        if lidar is None:
+            scans = _ouster_turns(path, topic, remission_field, warn, alive)
+        else:
+            known = lidar.senders
+            scans = turns_of(path, lidar, known[_choose(lidar.title, known, topic)] if len(known) > 1 else None, alive)
     n_scans = 0
     for scan in scans:
         n_scans += 1
@@ -206,7 +209,14 @@ def _ouster_turns(
     path: Path, topic: str | None, remission_field: str | None, warn: Callable[[str], None], alive: Callable[[], None]
 ) -> Iterator[TimedScan]:
     """The turns of an Ouster; damaged packets are left out, and at the end said."""
-    layouts = [_layout(file) for file in metadata_beside(path)]
+    from .ouster_packets import OusterStream, layout_of
+
+    layouts = []
+    for file in metadata_beside(path):
+        try:
+            layouts.append(layout_of(json.loads(read_metadata(file))))
+        except PointsError as exc:
+            raise PointsError(f"the metadata {file.name} cannot be read: {exc}") from exc
     chosen = layouts[_choose("sensor", [layout.name for layout in layouts], topic)]
     stream = OusterStream(chosen, remission_field)
     sizes = {size for layout in layouts for size in (layout.packet_bytes, *layout.other_bytes)}
@@ -237,13 +247,6 @@ def _ouster_turns(
             f"{path}: dropped {n_bad} damaged packets of the capture: empty, incomplete, or of another length than "
             "the metadata says"
         )
-
-
-def _layout(file: Path) -> Layout:
-    try:
-        return layout_of(json.loads(read_metadata(file)))
-    except PointsError as exc:
-        raise PointsError(f"the metadata {file.name} cannot be read: {exc}") from exc
 
 
 def _ouster_scans(frames: Any, topic: str | None, remission_field: str | None) -> Iterator[TimedScan]:

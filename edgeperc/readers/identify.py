@@ -14,7 +14,6 @@ import numpy as np
 from ..errors import PointsError, SensorError
 from ..types.sensor import SENSORS, SensorProfile
 from .clouds import is_ouster_cloud
-from .lidars import Lidar, columns_of, lidar_of, open_spinning
 from .ouster import check_metadata, metadata_beside, read_metadata
 from .packets import velodyne_name, velodyne_packets, velodyne_senders
 
@@ -59,19 +58,19 @@ def of_packets(path: Path, topic: str | None = None) -> KnownSensor:
     names = {velodyne_name(packet) for packet in velodyne_packets(path, sender)}
     if names:
         return of_velodyne(names)
-    lidar = lidar_of(path)
-    if lidar is not None:
-        return _of_lidar(path, lidar, topic)
+    known = _of_lidar(path, topic)
+    if known is not None:
+        return known
     files = metadata_beside(path)
     contents = [(file.name, json.loads(read_metadata(file))) for file in files]
     chosen = [entry for entry in contents if topic is None or _serial(entry[1]) == topic] or contents
-    known = [of_metadata(content, f"the metadata {name}") for name, content in chosen]
-    if len({entry.profile for entry in known}) > 1:
+    sensors = [of_metadata(content, f"the metadata {name}") for name, content in chosen]
+    if len({entry.profile for entry in sensors}) > 1:
         raise SensorError(
             f"there is metadata of several sensors: {', '.join(name for name, _ in contents)}; choose one by topic "
             "(--topic)"
         )
-    return known[0]
+    return sensors[0]
 
 
 def of_livox() -> SensorError:
@@ -82,8 +81,13 @@ def of_livox() -> SensorError:
     )
 
 
-def _of_lidar(path: Path, lidar: Lidar, topic: str | None) -> KnownSensor:
-    """The sensor of Hesai's or RoboSense's packets, with the angles of the unit."""
+def _of_lidar(path: Path, topic: str | None) -> KnownSensor | None:
+    """The sensor of Hesai's or RoboSense's packets, with the angles of the unit; None if they are not theirs."""
+    from .lidars import columns_of, lidar_of, open_spinning  # numba
+
+    lidar = lidar_of(path)
+    if lidar is None:
+        return None
     if lidar.row is None:
         raise of_livox()
     sender = topic if topic in lidar.senders and len(lidar.senders) > 1 else None

@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 
 from ..errors import PointsError
 from ..system.kernels import njit
+from .packets import LVX_MAGIC
 from .times import TimedScan
 
 SCAN_S = 0.1  # the sensors turn or sweep ten times a second
-LVX_MAGIC = b"livox_tech"
 
 
 class _Kind(NamedTuple):

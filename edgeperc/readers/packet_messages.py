@@ -15,7 +15,6 @@ from ..system.extras import require
 from ..types.points import as_points
 from .clouds import Header, MessageReader, Stamp, cdr_reader, ros1_reader
 from .mcap import Channel
-from .ouster_packets import OusterStream, layout_of
 from .packets import VELODYNE_BYTES, velodyne_name
 from .times import TimedScan
 
@@ -112,6 +111,8 @@ class OusterMessages:
     """
 
     def __init__(self, metadata: str, remission_field: str | None) -> None:
+        from .ouster_packets import OusterStream, layout_of  # numba, which other messages do without
+
         try:
             self._layout = layout_of(json.loads(metadata))
         except (ValueError, RecursionError) as exc:

@@ -20,6 +20,9 @@ PCAP_MAGIC = {
     b"\xa1\xb2\x3c\x4d": ">",
 }
 
+LVX_MAGIC = b"livox_tech"
+"""First bytes of Livox' own files."""
+
 # Bytes in front of the IP header and the place of the EtherType, by the link type: Ethernet, Linux cooked 1 and 2.
 _LINKS = {1: (14, 12), 113: (16, 14), 276: (20, 0)}
 _LOOPBACK_LINKS, _RAW_LINKS = (0, 108), (12, 14, 101, 228)  # four bytes in front of the IP header, none
