@@ -109,9 +109,8 @@ def open_spinning(path: Path, row: Format, sender: str | None, alive: Callable[[
         said = angles_of_difop(row, datagram.payload)
         if said is not None:
             break
-    if file is not None:
-        given = read_angles(file, row)
-        return row, given if said is None else said._replace(lasers_deg=given.lasers_deg)  # the speed, and returns
+    if file is not None and (said is None or row.elevations_deg):
+        return row, read_angles(file, row)
     if said is None:
         there = "" if row.is_hesai else "The capture has no packet with the angles (DIFOP, port 7788). "
         whose = "Hesai's calibration of the unit" if row.is_hesai else "a row 'elevation,azimuth' for each laser [deg]"

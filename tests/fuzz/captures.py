@@ -181,9 +181,10 @@ class Captures:
             self.seeds = synthetic_seeds(Path(folder))
             for seed in self.seeds:  # compiles the kernels, which no case should count
                 if seed.kind in ("lidar", "lvx2", "ouster"):
+                    alone = Path(tempfile.mkdtemp(dir=folder))
                     for name, content in seed.files.items():
-                        Path(folder, name).write_bytes(content)
-                    entry = Path(folder, seed.entry)
+                        (alone / name).write_bytes(content)
+                    entry = alone / seed.entry
                     list(decode(entry, entry.suffix, None, None, lambda text: None, lambda: None))
         root = data_root()
         self.real = [] if root is None else real_seeds(root)

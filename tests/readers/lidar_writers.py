@@ -22,7 +22,7 @@ T0_S = 1_750_000_000
 class Model:
     """A format in the writer's own words: the sizes and offsets are the manuals', not those of the reader.
 
-    body : of a packet with blocks in order; ``tail`` writes what comes behind them.
+    lasers, blocks, channels : of the sensor, of a packet, of a block.
     second : what a block's channels from the 17th or 49th on are: the lasers' second firing, or others.
     """
 
@@ -202,7 +202,7 @@ def expected(
 
 def livox_packets(kind: int, xyz_m: NDArray[np.float64], remission: NDArray[np.int64], is_old: bool) -> list[bytes]:
     """Packets of the new or the old protocol, 96 or 100 points each, one every 0.48 ms."""
-    stride, returns = ({0: 13, 1: 9, 2: 14, 3: 10, 4: 14} if is_old else {1: 14, 2: 8, 3: 10, 0x11: 14})[kind], 1
+    stride = ({0: 13, 1: 9, 2: 14, 3: 10, 4: 14} if is_old else {1: 14, 2: 8, 3: 10, 0x11: 14})[kind]
     returns = 2 if kind == (4 if is_old else 0x11) else 1
     n = 100 if is_old and kind < 2 else 96
     packets = []

@@ -175,6 +175,21 @@ def test_without_angles_it_says_what_is_missing(tmp_path: Path, name: str) -> No
     assert f"has {model.lasers - 1} rows" in error_of(path)
 
 
+def test_which_angles_are_used(tmp_path: Path) -> None:
+    """RoboSense's own, whatever lies beside; of a PandarXT those of the file, if there is one."""
+    path, _ = capture(tmp_path, MODELS["rs-32"], 24)
+    expected_scans = [scan.points for scan in read_timed_scans(path)]
+    path.with_suffix(".csv").write_text("x,y,z\n1,2,3\n")
+    for scan, points in zip(read_timed_scans(path), expected_scans, strict=True):
+        np.testing.assert_array_equal(scan.points, points)
+    model = MODELS["pandarxt-16"]
+    path, _ = capture(tmp_path, model, 24)
+    (tmp_path / "drive.csv").write_text(calibration(unit_angles(model) + np.array([0.25, 1.0])))
+    sensor = sensor_of(path)
+    assert sensor is not None
+    assert sensor.elevations_deg[0] == 15.25
+
+
 @pytest.mark.parametrize(
     ("text", "n"),
     [("", 0), ("a,b\n", 0), ("Channel,Elevation,Azimuth\n1,2\n", 1), ("1,nan,0\n" * 40, 40), ("\0\xff" * 99, 0)],
