@@ -9,15 +9,30 @@ import numpy as np
 
 import edgeperc
 from edgeperc.cli import main
+from edgeperc.readers.livox_packets import NEW_KINDS, LivoxStream, Points
+from edgeperc.readers.ouster_packets import OusterStream, layout_of
+from edgeperc.readers.spinning_packets import FORMATS, Angles, SpinningStream
 from edgeperc.simulation.samples import simulated_scan
 
 SET_UPS = ({}, {"full_turn": True}, {"models": "lodnn"}, {"boxes_from": "clusters"}, {"agree": False, "precision": "fp32"})
+
+
+def decode_packets() -> None:
+    """A packet of each kind of sensor, without a return."""
+    metadata = {"beam_altitude_angles": [1.0, 0.0], "beam_azimuth_angles": [0.0, 0.0], "lidar_mode": "512x10"}
+    layout = layout_of(metadata)
+    ouster, hesai, livox = OusterStream(layout, None), FORMATS["pandarxt-16"], LivoxStream()
+    list(ouster.add(bytes(layout.packet_bytes))) + list(ouster.end())
+    spinning = SpinningStream(hesai, Angles(np.zeros((16, 2))))
+    list(spinning.add(memoryview(bytes(hesai.sizes[0])))) + list(spinning.end())
+    list(livox.add(Points(0.0, 0.0, NEW_KINDS[1], bytes(14)))) + list(livox.end())
 
 
 def run() -> None:
     """Perceive, track and map simulated scans in every usual set-up, and run the demo."""
     with tempfile.TemporaryDirectory() as folder:
         main(["demo", "--out", folder])
+    decode_packets()
     for name, set_up in itertools.product(("hdl-64e", "vlp-16"), SET_UPS):
         perceive, tracker = edgeperc.Perceiver(sensor=name, on_mismatch="ignore", **set_up), edgeperc.Tracker()
         scans = [simulated_scan(seed, name).points for seed in (1, 2)]

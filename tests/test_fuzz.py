@@ -47,7 +47,9 @@ def _round(kind: str, cases: int) -> State:
     return run_job(lambda: module.make(7), State(kind, 7), cases=cases)
 
 
-@pytest.mark.parametrize(("kind", "cases"), [("scans", 600), ("trackers", 250), ("models", 250), ("images", 400)])
+@pytest.mark.parametrize(
+    ("kind", "cases"), [("scans", 600), ("packets", 150), ("trackers", 250), ("models", 250), ("images", 400)]
+)
 def test_a_round(kind: str, cases: int) -> None:
     # In a process of its own: other tests may have left this one with more memory than a case may take.
     with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:

@@ -73,8 +73,9 @@ FLOORS = {
         pipeline
         readers.__init__ readers.images readers.origin readers.packets readers.times readers.unknown
         readers.clouds readers.ouster readers.tables
+        readers.livox_packets readers.ouster_packets readers.spinning_packets
         readers.inflate readers.pcd readers.ply readers.raw
-        readers.mcap readers.text
+        readers.lidars readers.mcap readers.text
         readers.bags readers.files readers.packet_messages
         readers.decoders
         readers.identify readers.worker

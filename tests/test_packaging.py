@@ -72,10 +72,12 @@ def test_smoke_tests_exist() -> None:
 
 
 def test_no_library_that_excludes_another_is_in_two_extras() -> None:
-    """ouster-sdk pins rosbags, so only the extras for Ouster's captures may bring it."""
+    """ouster-sdk pins rosbags, so only the extra for Ouster's files may bring it, and no other brings that extra."""
     of = {extra: {*requirements(texts)} for extra, texts in PROJECT["optional-dependencies"].items()}
     assert [extra for extra, names in of.items() if "ouster-sdk" in names] == ["ouster"]
-    assert "ouster" in str(PROJECT["optional-dependencies"]["io"])
+    assert not any(
+        "ouster" in str(texts) for extra, texts in PROJECT["optional-dependencies"].items() if extra != "ouster"
+    )
 
 
 @pytest.mark.parametrize("machine", ["x86_64", "aarch64", "arm64", "ARM64"])

@@ -88,8 +88,8 @@ def add_parser(commands: Commands) -> None:
         metavar="PATH",
         help="scan files (.bin, .pcd, .ply, .npy, .npz); folders of them; the root of a KITTI object set, of "
         "SemanticKITTI or of a KITTI raw drive; captures: .pcap, .osf, .bag, .mcap, a ROS 2 bag's folder "
-        "(extras 'velodyne', 'ouster', 'bags'); or images (.jpg, .png, .webp, .bmp, .ppm) and folders of them (extra "
-        "'camera')",
+        "(extras 'velodyne', 'bags', and 'ouster' for .osf); or images (.jpg, .png, .webp, .bmp, .ppm) and folders of "
+        "them (extra 'camera')",
     )
     reading.add_argument(
         "--scan",

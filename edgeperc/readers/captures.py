@@ -1,4 +1,4 @@
-"""Read the scans of recordings: folders of scan files, Velodyne and Ouster captures, ROS 1 and 2 bags, MCAP."""
+"""Read the scans of recordings: folders of scan files, captures of LiDARs' packets, ROS 1 and 2 bags, MCAP."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from ..types.sensor import SensorProfile
 from .apart import decode_apart, describe_apart
 from .bags import bag_files
 from .files import FileOptions, read_points, read_timed_file
-from .identify import KnownSensor, of_cloud, of_metadata, of_packets, of_velodyne
-from .packets import PCAP_MAGIC
+from .identify import KnownSensor, of_cloud, of_livox, of_metadata, of_packets, of_velodyne
+from .packets import LVX_MAGIC, PCAP_MAGIC
 from .times import TimedScan
 
 SCAN_SUFFIXES = (".bin", ".npy", ".npz", ".pcd", ".ply")
-CAPTURE_SUFFIXES = (".bag", ".db3", ".mcap", ".osf", ".pcap", ".pcapng")
+CAPTURE_SUFFIXES = (".bag", ".db3", ".lvx2", ".mcap", ".osf", ".pcap", ".pcapng")
 
 # First bytes of captures.
 _MAGIC = {
@@ -30,6 +30,7 @@ _MAGIC = {
     b"#ROSBAG V": ".bag",
     b"\x89MCAP0\r\n": ".mcap",
     b"SQLite format 3\0": ".db3",
+    LVX_MAGIC: ".lvx2",
 }
 
 
@@ -52,13 +53,14 @@ def read_scans(
     source : str or path
         A scan file (`edgeperc.read_points`); a folder of scan files and captures, read in the order of their names; a
         Velodyne ``.pcap``; an Ouster ``.osf``, or ``.pcap`` with its metadata next to it in a ``.json`` file whose name
-        has the same beginning; a ROS 1 ``.bag``, a ROS 2 bag's folder or one file of it, or an ``.mcap`` file. Bags
-        are read for messages of type ``sensor_msgs/PointCloud2``, MCAP files for ``foxglove.PointCloud`` (protobuf),
-        too; without such, for packets of a Velodyne, ``velodyne_msgs/VelodyneScan``. The first bytes of a file decide
-        its format, not its name.
+        has the same beginning; a ``.pcap`` of Hesai's, RoboSense's or Livox' sensors, or an ``.lvx2``; a ROS 1
+        ``.bag``, a ROS 2 bag's folder or one file of it, or an ``.mcap`` file. Bags are read for messages of type
+        ``sensor_msgs/PointCloud2``, MCAP files for ``foxglove.PointCloud`` (protobuf), too; without such, for packets
+        of a Velodyne, ``velodyne_msgs/VelodyneScan``, or an Ouster, ``PacketMsg``. The first bytes of a file decide its
+        format, not its name.
     topic : str, optional
         What to read if there are several sensors: the topic of point clouds; ``TOPIC@FRAME`` for those of one frame;
-        the serial number of an Ouster; the IPv4 address of a Velodyne.
+        the serial number of an Ouster or in an ``.lvx2``; the IPv4 address of another sensor.
     remission_field : str, optional
         Name of the remission field, as in `edgeperc.read_points`; ``reflectivity`` by default for an Ouster capture.
     columns : int or sequence of str, optional
@@ -69,11 +71,11 @@ def read_scans(
     Yields
     ------
     stamp_s : float or None
-        Time of the scan on the sensor's clock [s]: the end of the scan for a Velodyne and an Ouster, the header's stamp
-        for a message; when the last packet came for a Velodyne's packets in messages. None for scan files.
+        Time of the scan on the sensor's clock [s]: the end of the scan for packets, the header's stamp for a message;
+        when the last packet came for a Velodyne's packets in messages. None for scan files.
     points : (n, 4) float32, C-contiguous
         x, y, z [m] in the sensor's frame, and the raw remission, which the `Perceiver` scales by its sensor's
-        ``remission_range``: 0..255 for a Velodyne and an Ouster's reflectivity, but 0..1 for an HDL-64E, as in KITTI's
+        ``remission_range``: 0..255 for packets, with an Ouster's reflectivity, but 0..1 for an HDL-64E, as in KITTI's
         files. The first and the last turn of a packet capture may be incomplete.
 
     Raises
@@ -113,7 +115,7 @@ def read_timed_scans(
     stamp_s : float or None
     points : (n, 4) float32
     times_s : (n,) float64 or None
-        Time of each point [s]. An Ouster's packets have one for each column, a Velodyne's for each firing. Of point
+        Time of each point [s]. An Ouster's packets have one for each column, others for each firing. Of point
         clouds, ``.pcd``, ``.ply`` and structured ``.npy`` files, it is the field t, time, timestamp, time_stamp,
         offset_time or time_offset, whose unit shows in the duration of the scan: 2 ms to 2 s. Values below 2 s count
         from ``stamp_s``. NaN where a time is damaged and lies far from all others. None without such a field, or if no
@@ -157,7 +159,7 @@ def is_capture(path: Path) -> bool:
 def sensor_of(source: str | os.PathLike[str], *, topic: str | None = None) -> SensorProfile | None:
     """Find out which sensor recorded a capture; pass the result to the `Perceiver`.
 
-    An Ouster's metadata names it and has the beam angles of the unit. The packets of a Velodyne name the model. The
+    An Ouster's metadata names it and has the beam angles of the unit. The packets of other makers name the model. The
     clouds of a bag name the maker by their fields, topic or frame, and the model by the elevations of their rings.
 
     Parameters
@@ -201,6 +203,8 @@ def known_sensor(path: Path, topic: str | None = None) -> KnownSensor | None:
     try:
         if kind == ".pcap":
             return of_packets(path, topic)
+        if kind == ".lvx2":
+            raise of_livox()
         description = describe_apart(path, kind, topic)
         if "metadata" in description:
             return of_metadata(json.loads(description["metadata"]), "the metadata")

@@ -1,9 +1,11 @@
-"""Decoding of captures by native libraries; `worker` runs it in a process of its own."""
+"""Decoding of captures, some by native libraries; `worker` runs it in a process of its own."""
 
 from __future__ import annotations
 
+import json
 import shutil
 import tempfile
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence, Set
 from pathlib import Path
 from typing import Any, TypeVar
@@ -17,13 +19,24 @@ from ..types.points import as_points, table_columns
 from .bags import BagFile, open_bag
 from .clouds import CLOUD_READERS, Cloud, cloud_points, cloud_table, describe_cloud
 from .mcap import Channel
-from .ouster import check_osf, open_capture
-from .packet_messages import PACKET_READERS, VelodyneScan, VelodyneStream, packets_of_others
+from .ouster import check_osf, metadata_beside, read_metadata
+from .packet_messages import (
+    PACKET_READERS,
+    OusterMessages,
+    OusterPacket,
+    Packets,
+    VelodyneScan,
+    VelodyneStream,
+    has_points,
+    is_metadata_of,
+    packets_of_others,
+    read_text,
+)
 from .packets import (
+    Datagrams,
     copy_as_ethernet,
     is_ethernet,
     pcap_packets,
-    refuse_others,
     velodyne_name,
     velodyne_packets,
     velodyne_senders,
@@ -32,7 +45,7 @@ from .tables import MAX_BYTES
 from .times import TimedScan, of_plausible_duration, point_times
 
 _Item = TypeVar("_Item")
-_READERS: Mapping[tuple[str, str], Callable[[memoryview], Cloud | VelodyneScan]] = {**CLOUD_READERS, **PACKET_READERS}
+_READERS: Mapping[tuple[str, str], Callable[[memoryview], Cloud | Packets]] = {**CLOUD_READERS, **PACKET_READERS}
 
 
 def decode(
@@ -55,7 +68,7 @@ def decode(
     """
     scans = (
         _packet_scans(path, kind, topic, remission_field, warn, alive)
-        if kind in (".pcap", ".osf")
+        if kind in (".lvx2", ".osf", ".pcap")
         else of_plausible_duration(_bag_scans(path, topic, remission_field, alive, times))
     )
     for stamp_s, points, times_s in _with_typed_errors(path, scans):
@@ -83,6 +96,8 @@ def describe(path: Path, kind: str, topic: str | None, alive: Callable[[], None]
                 if isinstance(message, VelodyneScan):
                     names = {velodyne_name(packet) for _, packet in message.packets}
                     yield {"velodyne": sorted(names, key=str)}
+                elif isinstance(message, OusterPacket):
+                    yield {"metadata": message.metadata}
                 else:
                     yield describe_cloud(name, message)
 
@@ -102,7 +117,7 @@ def _with_typed_errors(path: Path, items: Iterator[_Item]) -> Iterator[_Item]:
     except MemoryError as exc:
         after = f"after {n_scans} scans " if n_scans else ""
         raise PointsError(f"{path}: {after}decoding the capture takes more than {MAX_BYTES:,} bytes of memory") from exc
-    except Exception as exc:  # of three libraries, and of numpy, struct and sqlite on damaged files
+    except Exception as exc:  # of libraries, and of numpy, struct and sqlite on damaged files
         after = f"after {n_scans} scans " if n_scans else ""
         reason = " ".join(str(exc).split()) or type(exc).__name__
         raise PointsError(f"{path}: {after}the capture cannot be read ({reason}); it is damaged or cut short") from exc
@@ -134,24 +149,32 @@ def _packet_scans(
     scans: Iterator[TimedScan] = iter(())
     if kind == ".osf":
         scans = _ouster_scans(_open_osf(path), topic, remission_field)
+    elif kind == ".lvx2":
+        from .livox_packets import lvx2_scans, lvx2_sensors  # numba, which bags do without
+
+        scans = lvx2_scans(path, _choose("sensor", lvx2_sensors(path), topic), alive)
     elif next(velodyne_packets(path), None) is not None:
         senders = velodyne_senders(path)
         sender = senders[_choose("Velodyne", senders, topic)] if len(senders) > 1 else None
         scans = _velodyne_scans(_decodable(path, alive, sender))
     else:
-        refuse_others(path)
-        frames = open_capture(_decodable(path, alive, None), warn, alive, beside=path)
-        if frames is not None:
-            scans = _ouster_scans(frames, topic, remission_field)
+        from .lidars import lidar_of, turns_of
+
+        lidar = lidar_of(path)
+        if lidar is None:
+            scans = _ouster_turns(path, topic, remission_field, warn, alive)
+        else:
+            known = lidar.senders
+            scans = turns_of(path, lidar, known[_choose(lidar.title, known, topic)] if len(known) > 1 else None, alive)
     n_scans = 0
     for scan in scans:
         n_scans += 1
         yield scan
-    # Both libraries stop without an error if the file ends inside a packet, or has no packets of their sensors.
-    n_packets = 0 if kind == ".osf" else sum(1 for _ in pcap_packets(path))
+    # So far, there was no error if the file ends inside a packet, or has no packets of such a sensor.
+    n_packets = sum(1 for _ in pcap_packets(path)) if kind == ".pcap" else 0
     if not n_scans:
-        content = "holds no scan" if kind == ".osf" else f"has {n_packets} packets, none from a supported LiDAR"
-        raise PointsError(f"the capture {content}; expected a Velodyne capture, or an Ouster capture with its metadata")
+        content = f"has {n_packets} packets, none from a supported LiDAR" if kind == ".pcap" else "holds no scan"
+        raise PointsError(f"the capture {content}; expected a capture of a LiDAR, an Ouster's with its metadata")
 
 
 def _decodable(path: Path, alive: Callable[[], None], sender: str | None) -> Path:
@@ -182,6 +205,50 @@ def _velodyne_scans(path: Path) -> Iterator[TimedScan]:
         yield TimedScan(stamp.device, scan, stamp.device + points[:, 4].astype(np.float64))
 
 
+def _ouster_turns(
+    path: Path, topic: str | None, remission_field: str | None, warn: Callable[[str], None], alive: Callable[[], None]
+) -> Iterator[TimedScan]:
+    """The turns of an Ouster; damaged packets are left out, and at the end said."""
+    from .ouster_packets import OusterStream, layout_of
+
+    layouts = []
+    for file in metadata_beside(path):
+        try:
+            layouts.append(layout_of(json.loads(read_metadata(file))))
+        except PointsError as exc:
+            raise PointsError(f"the metadata {file.name} cannot be read: {exc}") from exc
+    chosen = layouts[_choose("sensor", [layout.name for layout in layouts], topic)]
+    stream = OusterStream(chosen, remission_field)
+    sizes = {size for layout in layouts for size in (layout.packet_bytes, *layout.other_bytes)}
+    ports, n_other_sizes, n_others, n_used = set[int](), Counter[int](), 0, 0
+    datagrams = Datagrams(path, alive)
+    for datagram in datagrams:
+        size = len(datagram.payload)
+        if size not in sizes:
+            n_other_sizes[datagram.port] += 1
+            continue
+        ports.add(datagram.port)
+        if size != chosen.packet_bytes:
+            continue
+        if not stream.is_of_sensor(datagram.payload) or (len(layouts) > 1 and chosen.port not in (0, datagram.port)):
+            n_others += 1
+            continue
+        n_used += 1
+        yield from stream.add(bytes(datagram.payload))
+    yield from stream.end()
+    if n_others and not n_used:
+        raise PointsError(
+            f"the metadata is of the sensor {chosen.name} (initialization_id {chosen.init_id}), and none of the "
+            f"{n_others:,} packets is; expected the metadata that was saved with the capture"
+        )
+    n_bad = datagrams.n_bad + sum(n_other_sizes[port] for port in ports)
+    if n_bad and n_used:
+        warn(
+            f"{path}: dropped {n_bad} damaged packets of the capture: empty, incomplete, or of another length than "
+            "the metadata says"
+        )
+
+
 def _ouster_scans(frames: Any, topic: str | None, remission_field: str | None) -> Iterator[TimedScan]:
     core = require("ouster.sdk.core", "ouster", "Reading an Ouster capture", package="ouster-sdk")
     serials = [str(info.sn) for info in frames.sensor_info]
@@ -208,12 +275,18 @@ def _ouster_scans(frames: Any, topic: str | None, remission_field: str | None) -
 def _bag_scans(
     path: Path, topic: str | None, remission_field: str | None, alive: Callable[[], None], times: bool
 ) -> Iterator[TimedScan]:
-    turns: VelodyneStream | None = None
+    turns: VelodyneStream | OusterMessages | None = None
     try:
         for _, message, stamp_s in _clouds(path, topic, alive):
             if isinstance(message, VelodyneScan):
-                turns = turns or VelodyneStream()
+                turns = turns if isinstance(turns, VelodyneStream) else VelodyneStream()
                 yield from turns.add(message)
+                continue
+            if isinstance(message, OusterPacket):
+                turns = (
+                    turns if isinstance(turns, OusterMessages) else OusterMessages(message.metadata, remission_field)
+                )
+                yield from turns.add(message, stamp_s)
                 continue
             points = cloud_points(message, remission_field=remission_field)
             times_s = point_times(table_columns(cloud_table(message)), points, stamp_s) if times else None
@@ -226,9 +299,7 @@ def _bag_scans(
         yield from turns.end()
 
 
-def _clouds(
-    path: Path, topic: str | None, alive: Callable[[], None]
-) -> Iterator[tuple[str, Cloud | VelodyneScan, float]]:
+def _clouds(path: Path, topic: str | None, alive: Callable[[], None]) -> Iterator[tuple[str, Cloud | Packets, float]]:
     """Topic, message and stamp [s] of each point cloud, or of each message of packets in a bag without clouds.
 
     What is damaged in one file of a bag is reported after the clouds of all.
@@ -237,7 +308,7 @@ def _clouds(
         files = open_bag(path, Path(folder), alive)
         topics, damage = _topics(files)
         clouds = {channel for channel in topics if channel[1:] in CLOUD_READERS}
-        packets = {channel for channel in topics if channel[1:] in PACKET_READERS}
+        packets = {channel for channel in topics if has_points(channel)}
         if not clouds or (topic or "").partition("@")[0] in {channel.topic for channel in packets}:
             clouds = packets or clouds
         if damage is not None and not clouds:
@@ -251,6 +322,7 @@ def _clouds(
         name, _, frame = (topic, "", "") if topic in names else (topic or "").partition("@")
         chosen = names[_choose("topic of type sensor_msgs/PointCloud2", names, name or None, more)]
         n_scans, frames = 0, dict[str, None]()
+        metadata: str | None = None
         for message, recorded_ns in _messages(files, clouds, chosen):
             frames.setdefault(message.header.frame_id)
             if frame and message.header.frame_id != frame:
@@ -262,12 +334,28 @@ def _clouds(
                     "each and put them together with edgeperc.merge"
                 )
             n_scans += 1
+            if isinstance(message, OusterPacket):
+                metadata = _ouster_metadata(files, topics, chosen) if metadata is None else metadata
+                message = message._replace(metadata=metadata)
             stamp = message.header.stamp
             stamp_s, stamp_ns = stamp.sec + 1e-9 * stamp.nanosec, 10**9 * stamp.sec + stamp.nanosec
             yield chosen, message, Stamp(stamp_s, stamp_ns) if stamp_ns else Stamp(1e-9 * recorded_ns, recorded_ns)
         if not n_scans:
             seen = f" with frame {frame!r}, only {', '.join(frames)}" if frames else ""
             raise PointsError(f"topic {chosen} has no message{seen}; expected point clouds")
+
+
+def _ouster_metadata(files: Sequence[BagFile], topics: Set[Channel], topic: str) -> str:
+    """The text that an Ouster's driver wrote about the sensor."""
+    for channel in sorted(channel for channel in topics if is_metadata_of(channel, topic)):
+        for file in files:
+            for _, raw in file.messages_of(channel) if channel in file.topics() else ():
+                return read_text(channel, raw)
+    raise PointsError(
+        f"topic {topic} holds packets of an Ouster, and the bag has no metadata of the sensor; expected it as a text, "
+        f"topic {topic.rpartition('/')[0]}/metadata. Play the bag through Ouster's driver (ouster-ros) with its "
+        "metadata, and record its sensor_msgs/PointCloud2"
+    )
 
 
 def _topics(files: Sequence[BagFile]) -> tuple[set[Channel], PointsError | None]:
@@ -281,7 +369,7 @@ def _topics(files: Sequence[BagFile]) -> tuple[set[Channel], PointsError | None]
     return topics, damage
 
 
-def _messages(files: Sequence[BagFile], clouds: Set[Channel], topic: str) -> Iterator[tuple[Cloud | VelodyneScan, int]]:
+def _messages(files: Sequence[BagFile], clouds: Set[Channel], topic: str) -> Iterator[tuple[Cloud | Packets, int]]:
     """Clouds of a topic and when they were recorded [ns]; damage in one file is raised after those of all files."""
     n, damage = 0, None
     for file in files:

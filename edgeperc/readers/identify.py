@@ -15,7 +15,7 @@ from ..errors import PointsError, SensorError
 from ..types.sensor import SENSORS, SensorProfile
 from .clouds import is_ouster_cloud
 from .ouster import check_metadata, metadata_beside, read_metadata
-from .packets import refuse_others, velodyne_name, velodyne_packets, velodyne_senders
+from .packets import velodyne_name, velodyne_packets, velodyne_senders
 
 _CHOICES = f"Pass its name, sensor= or --sensor: {', '.join(SENSORS)}; or a profile of your own, a .json file."
 
@@ -58,17 +58,49 @@ def of_packets(path: Path, topic: str | None = None) -> KnownSensor:
     names = {velodyne_name(packet) for packet in velodyne_packets(path, sender)}
     if names:
         return of_velodyne(names)
-    refuse_others(path)
+    known = _of_lidar(path, topic)
+    if known is not None:
+        return known
     files = metadata_beside(path)
     contents = [(file.name, json.loads(read_metadata(file))) for file in files]
     chosen = [entry for entry in contents if topic is None or _serial(entry[1]) == topic] or contents
-    known = [of_metadata(content, f"the metadata {name}") for name, content in chosen]
-    if len({entry.profile for entry in known}) > 1:
+    sensors = [of_metadata(content, f"the metadata {name}") for name, content in chosen]
+    if len({entry.profile for entry in sensors}) > 1:
         raise SensorError(
             f"there is metadata of several sensors: {', '.join(name for name, _ in contents)}; choose one by topic "
             "(--topic)"
         )
-    return known[0]
+    return sensors[0]
+
+
+def of_livox() -> SensorError:
+    """What to say of Livox' sensors."""
+    return SensorError(
+        "the points are of a Livox sensor, which does not spin. edgeperc.read_scans reads them, but the models know "
+        f"turns of spinning sensors alone, and no profile is built in. {_CHOICES}"
+    )
+
+
+def _of_lidar(path: Path, topic: str | None) -> KnownSensor | None:
+    """The sensor of Hesai's or RoboSense's packets, with the angles of the unit; None if they are not theirs."""
+    from .lidars import columns_of, lidar_of, open_spinning  # numba
+
+    lidar = lidar_of(path)
+    if lidar is None:
+        return None
+    if lidar.row is None:
+        raise of_livox()
+    sender = topic if topic in lidar.senders and len(lidar.senders) > 1 else None
+    row, angles = open_spinning(path, lidar.row, sender, lambda: None)
+    elevations = _distinct(angles.lasers_deg[:, 0].tolist())
+    if not elevations:
+        raise SensorError(
+            f"the packets are of a {row.title}, whose lasers have several times the same angle. {_CHOICES}"
+        )
+    profile = SENSORS.get(row.name, SensorProfile(row.name, elevations, 1800, (0.0, 255.0)))
+    columns = columns_of(path, row, sender) or profile.columns
+    because = f"the packets are a {row.title}'s, with the angles of the unit"
+    return KnownSensor(replace(profile, elevations_deg=elevations, columns=columns), because)
 
 
 def of_velodyne(names: Collection[str | None]) -> KnownSensor:

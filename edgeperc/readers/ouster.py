@@ -1,58 +1,21 @@
-"""Ouster captures: the sensor's metadata and packets, checked before ouster-sdk reads them."""
+"""Ouster captures: the sensor's metadata, and the checksums of .osf files, which ouster-sdk reads."""
 
 from __future__ import annotations
 
 import json
 import os
-import shutil
 import struct
-import tempfile
 import zlib
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ..errors import PointsError
-from ..system.extras import require
-from .packets import check_datagrams, copy_without
 
 # Sensors have up to 128 beams, 4,096 columns in a turn and 32 columns in a packet.
 _MOST_BEAMS, _MOST_COLUMNS = 1024, 65536
 _MOST_JSON_BYTES = 1 << 24
-
-
-def open_capture(path: Path, warn: Callable[[str], None], alive: Callable[[], None], beside: Path) -> Any:
-    """The turns of an Ouster packet capture as ouster-sdk reads them, without packets that could end the process.
-
-    beside : the metadata lies beside this file, of which ``path`` may be a copy.
-    Returns ouster.sdk.pcap.PcapFrameSetSource or None: None if no packet has the size that the metadata says.
-    """
-    pcap = require("ouster.sdk.pcap", "ouster", "Reading a capture that is not Velodyne's", package="ouster-sdk")
-    core = require("ouster.sdk.core", "ouster", "Reading an Ouster capture", package="ouster-sdk")
-    metadata = metadata_beside(beside)
-    sizes = set()
-    for file in metadata:
-        text = read_metadata(file)
-        layout = core.PacketFormat(core.SensorInfo(text))
-        sizes |= {int(getattr(layout, f"{kind}_packet_size", 0)) for kind in ("lidar", "imu", "zone")}
-    datagrams = check_datagrams(path, sizes - {0}, alive)
-    if not datagrams.n_good:
-        return None
-    if datagrams.n_bad:
-        warn(
-            f"{beside}: dropped {datagrams.n_bad} damaged packets of the capture: empty, incomplete, or of another "
-            "length than the metadata says"
-        )
-    if datagrams.bad:
-        if shutil.disk_usage(tempfile.gettempdir()).free < path.stat().st_size:
-            raise PointsError("the temporary folder has no room for a copy without the damaged packets")
-        source = Path(tempfile.mkdtemp()) / "whole.pcap"
-        copy_without(path, datagrams.bad, source, alive)
-    else:
-        source = path
-    return pcap.PcapFrameSetSource(str(source), meta=[str(file) for file in metadata])
 
 
 def metadata_beside(path: Path) -> list[Path]:
@@ -92,7 +55,7 @@ def read_metadata(path: Path) -> str:
 
 
 def check_metadata(content: Any) -> None:
-    """Raise `PointsError` unless the numbers that ouster-sdk divides and allocates by are possible and agree.
+    """Raise `PointsError` unless the numbers that arrays are made by are possible and agree.
 
     content : object; the sensor's metadata as `json.loads` returns it, of any firmware. Fields that are absent are
         not checked.

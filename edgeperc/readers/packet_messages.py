@@ -1,7 +1,8 @@
-"""Messages of drivers that hold a LiDAR's packets: a Velodyne's, which are decoded, and others, which are named."""
+"""Messages of drivers that hold a LiDAR's packets: Velodyne's and Ouster's, which are decoded; others are named."""
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Callable, Iterable, Iterator
 from types import MappingProxyType
@@ -12,7 +13,7 @@ import numpy as np
 from ..errors import PointsError
 from ..system.extras import require
 from ..types.points import as_points
-from .clouds import Header, MessageReader, cdr_reader, ros1_reader
+from .clouds import Header, MessageReader, Stamp, cdr_reader, ros1_reader
 from .mcap import Channel
 from .packets import VELODYNE_BYTES, velodyne_name
 from .times import TimedScan
@@ -23,6 +24,21 @@ class VelodyneScan(NamedTuple):
 
     header: Header
     packets: tuple[tuple[int, memoryview], ...]
+
+
+class OusterPacket(NamedTuple):
+    """``ouster_sensor_msgs/PacketMsg``: one packet. It has no header."""
+
+    header: Header
+    content: memoryview
+    metadata: str = ""
+
+
+Packets = VelodyneScan | OusterPacket
+
+
+def _ouster_packet(read: MessageReader) -> OusterPacket:
+    return OusterPacket(Header(Stamp(0, 0), ""), read.take(read.value("I")))
 
 
 def _velodyne_scan(read: MessageReader) -> VelodyneScan:
@@ -36,8 +52,11 @@ def _velodyne_scan(read: MessageReader) -> VelodyneScan:
     return VelodyneScan(header, tuple(packets))
 
 
-PACKET_READERS: MappingProxyType[tuple[str, str], Callable[[memoryview], VelodyneScan]] = MappingProxyType(
+PACKET_READERS: MappingProxyType[tuple[str, str], Callable[[memoryview], Packets]] = MappingProxyType(
     {
+        ("ouster_sensor_msgs/msg/PacketMsg", "cdr"): lambda content: _ouster_packet(cdr_reader(content)),
+        ("ouster_ros/msg/PacketMsg", "cdr"): lambda content: _ouster_packet(cdr_reader(content)),
+        ("ouster_ros/PacketMsg", "ros1"): lambda content: _ouster_packet(ros1_reader(content)),
         ("velodyne_msgs/msg/VelodyneScan", "cdr"): lambda content: _velodyne_scan(cdr_reader(content)),
         ("velodyne_msgs/VelodyneScan", "ros1"): lambda content: _velodyne_scan(ros1_reader(content)),
     }
@@ -50,7 +69,6 @@ _OTHERS = (
     (r"nebula_msgs/", "packets for Nebula", "Nebula's ROS nodes"),
     (r"(rslidar\w*|robosense\w*)/", "packets of a RoboSense sensor", "RoboSense's driver (rslidar_sdk)"),
     (r"livox_\w+/", "points in Livox' own type", "Livox' driver with xfer_format 0"),
-    (r"ouster_\w+/(msg/)?PacketMsg", "packets of an Ouster", "Ouster's driver (ouster-ros)"),
 )
 
 
@@ -65,6 +83,56 @@ def packets_of_others(channels: Iterable[Channel]) -> list[str]:
                     f"through {driver}, and record its sensor_msgs/PointCloud2"
                 )
     return said
+
+
+def has_points(channel: Channel) -> bool:
+    """Whether messages hold packets with points: an Ouster's with motion have the same type, and imu in their topic."""
+    is_decoded = channel[1:] in PACKET_READERS
+    return is_decoded and not (channel.msgtype.endswith("PacketMsg") and "imu" in channel.topic.rpartition("/")[2])
+
+
+def is_metadata_of(channel: Channel, topic: str) -> bool:
+    """Whether an Ouster's driver writes the metadata of a topic's packets into a channel, as a text."""
+    is_text = channel[1:] in (("std_msgs/msg/String", "cdr"), ("std_msgs/String", "ros1"))
+    return is_text and channel.topic == f"{topic.rpartition('/')[0]}/metadata"
+
+
+def read_text(channel: Channel, content: memoryview) -> str:
+    """A message ``std_msgs/String``. Raises PointsError."""
+    return (cdr_reader(content) if channel.encoding == "cdr" else ros1_reader(content)).text()
+
+
+class OusterMessages:
+    """Turns of an Ouster from messages, on the clock of the computer that recorded the bag.
+
+    metadata : of the sensor.
+    remission_field : None: the reflectivity.
+    Raises PointsError: The metadata is not one, or there is no such field.
+    """
+
+    def __init__(self, metadata: str, remission_field: str | None) -> None:
+        from .ouster_packets import OusterStream, layout_of  # numba, which other messages do without
+
+        try:
+            self._layout = layout_of(json.loads(metadata))
+        except (ValueError, RecursionError) as exc:
+            raise PointsError(f"the Ouster's metadata in the bag cannot be read: {exc}") from exc
+        self._stream, self._last_s = OusterStream(self._layout, remission_field), 0.0
+
+    def add(self, message: OusterPacket, stamp_s: float) -> Iterator[TimedScan]:
+        """The turns that end in a message."""
+        self._last_s = stamp_s
+        if len(message.content) == self._layout.packet_bytes and self._stream.is_of_sensor(message.content):
+            yield from map(self._of_computer, self._stream.add(bytes(message.content)))
+
+    def end(self) -> Iterator[TimedScan]:
+        """The last turn, which may be a part."""
+        yield from map(self._of_computer, self._stream.end())
+
+    def _of_computer(self, scan: TimedScan) -> TimedScan:
+        assert scan.times_s is not None
+        assert scan.stamp_s is not None
+        return TimedScan(self._last_s, scan.points, scan.times_s - scan.stamp_s + self._last_s)
 
 
 class VelodyneStream:

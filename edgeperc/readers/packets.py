@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import struct
-from array import array
-from collections import Counter
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Iterator
 from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
@@ -22,12 +20,14 @@ PCAP_MAGIC = {
     b"\xa1\xb2\x3c\x4d": ">",
 }
 
+LVX_MAGIC = b"livox_tech"
+"""First bytes of Livox' own files."""
+
 # Bytes in front of the IP header and the place of the EtherType, by the link type: Ethernet, Linux cooked 1 and 2.
 _LINKS = {1: (14, 12), 113: (16, 14), 276: (20, 0)}
 _LOOPBACK_LINKS, _RAW_LINKS = (0, 108), (12, 14, 101, 228)  # four bytes in front of the IP header, none
 
 VELODYNE_BYTES = 1206
-_GPS_BYTES = 600  # what LiDARs send of their GPS is shorter, their points are longer
 
 # The last byte of a Velodyne's packet, behind the return mode: the model's beam angles. VLS-128 has two by firmware.
 _PRODUCTS = {
@@ -74,95 +74,79 @@ def pcap_packets(path: Path, whole: bool = True) -> Iterator[tuple[int, memoryvi
         offset, n_packets = end, n_packets + 1
 
 
-class Checked(NamedTuple):
-    """What `check_datagrams` finds.
+class Datagram(NamedTuple):
+    """What a UDP datagram over IPv4 carries.
 
-    n_good : datagrams of an expected size.
-    n_bad : datagrams that are empty, incomplete, contradict themselves, or have another size on a port of good ones.
-    bad : places in the file of the bad records, and of the unfinished one at its end.
+    sender : the IPv4 address.
+    port : that it was sent to.
+    stamp_s : when its last part was captured.
     """
 
-    n_good: int
-    n_bad: int
-    bad: array[int]
+    sender: str
+    port: int
+    stamp_s: float
+    payload: memoryview
 
 
 class _Fragment(NamedTuple):
     source: bytes  # addresses and identification: the same for all fragments of a datagram
+    sender: memoryview
     start: int
     more: bool
     payload: memoryview
 
 
-def check_datagrams(path: Path, sizes: Collection[int], alive: Callable[[], None]) -> Checked:
-    """Compare the lengths in the headers of every UDP datagram over IPv4 with its record and with expected sizes.
+class Datagrams:
+    """The whole UDP datagrams over IPv4 of a pcap file, put together from fragments; packets of others are left out.
 
-    Packets of other protocols, and whole datagrams on other ports, are neither good nor bad.
-
-    path : a pcap file; one that is cut short is checked up to the cut.
-    sizes : collection of int; bytes of payload that the sensor's packets have.
+    path : a pcap file; one that is cut short is read up to the cut.
     alive : called now and then, for large files.
+    n_bad : so far, those that are empty, incomplete, or contradict themselves.
     """
-    size = path.stat().st_size
-    bad, n_good, n_bad, end = array("q"), 0, 0, 24
-    good_ports: set[int] = set()
-    other_sizes: dict[int, array[int]] = {}  # port: places of the records of whole datagrams of another size
-    n_others: Counter[int] = Counter()
-    pending: dict[bytes, tuple[list[int], int, int]] = {}  # source: places, bytes so far, port and length of UDP
-    link = _link_type(path)
-    for k, (offset, packet) in enumerate(pcap_packets(path, whole=False)):
-        if k % 10_000 == 0:
-            alive()
-        end = offset + 16 + len(packet)
-        try:
-            part = _fragment(packet, link)
-        except ValueError:
-            bad.append(offset)
-            n_bad += 1
-            continue
-        if part is None:
-            continue
-        places, n_bytes, udp = pending.pop(part.source, ([], 0, -1))
-        if part.start == 0:
-            if places or len(part.payload) < 8:  # a second beginning: the first datagram lacks its end
-                bad.extend(places)
-                n_bad += 1
-                places, n_bytes = [], 0
-                if len(part.payload) < 8:
-                    bad.append(offset)
+
+    def __init__(self, path: Path, alive: Callable[[], None]) -> None:
+        self._path, self._alive, self.n_bad = path, alive, 0
+        self._pending: dict[bytes, list[memoryview]] = {}  # by source: fragments so far
+
+    def __iter__(self) -> Iterator[Datagram]:
+        end, link, order = 24, _link_type(self._path), PCAP_MAGIC.get(_magic(self._path), "<")
+        fraction_s = 1e-9 if b"\x4d" in _magic(self._path) else 1e-6
+        for k, (offset, packet) in enumerate(pcap_packets(self._path, whole=False)):
+            if k % 10_000 == 0:
+                self._alive()
+            end = offset + 16 + len(packet)
+            try:
+                part = _fragment(packet, link)
+                payload = None if part is None else self._whole(part)
+            except ValueError:
+                self.n_bad += 1
+                continue
+            if part is not None and payload is not None:
+                port, length = struct.unpack_from(">2xHH", payload)
+                if length != len(payload) or length == 8:
+                    self.n_bad += 1
                     continue
-            udp = struct.unpack_from(">2xI", part.payload)[0]
-        elif part.start != n_bytes:
-            bad.extend([*places, offset])
-            n_bad += 1
-            continue
-        places.append(offset)
-        n_bytes += len(part.payload)
-        if part.more:
-            pending[part.source] = places, n_bytes, udp
-            if len(pending) > _PENDING:
-                bad.extend(pending.pop(next(iter(pending)))[0])
-                n_bad += 1
-            continue
-        port, length = udp >> 16, udp & 0xFFFF
-        if length != n_bytes or length == 8:
-            bad.extend(places)
-            n_bad += 1
-        elif length - 8 in sizes:
-            good_ports.add(port)
-            n_good += 1
-        else:
-            other_sizes.setdefault(port, array("q")).extend(places)
-            n_others[port] += 1
-    for places, _, _ in pending.values():
-        bad.extend(places)
-        n_bad += end == size  # a cut file says so itself
-    for port in good_ports & other_sizes.keys():
-        bad.extend(other_sizes[port])
-        n_bad += n_others[port]
-    if end < size:
-        bad.append(end)
-    return Checked(n_good, n_bad, bad)
+                seconds, fraction = struct.unpack_from(f"{order}II", packet.obj, offset)
+                yield Datagram(_address(part.sender), port, seconds + fraction_s * fraction, payload[8:])
+        if end == self._path.stat().st_size:  # a cut file says so itself
+            self.n_bad += len(self._pending)
+
+    def _whole(self, part: _Fragment) -> memoryview | None:
+        """The datagram that ends with a fragment, None if it is not there yet; ValueError if a part is missing."""
+        parts = self._pending.pop(part.source, [])
+        if part.start == 0 and parts:  # a second beginning: the first datagram lacks its end
+            self.n_bad += 1
+            parts = []
+        if part.start != sum(map(len, parts)) or (not parts and len(part.payload) < 8):
+            raise ValueError
+        parts.append(part.payload)
+        if not part.more:
+            return parts[0] if len(parts) == 1 else memoryview(b"".join(parts))
+        self._pending[part.source] = parts
+        if len(self._pending) > _PENDING:
+            del self._pending[next(iter(self._pending))]
+            self.n_bad += 1
+        return None
 
 
 def _link_type(path: Path) -> int:
@@ -206,59 +190,12 @@ def _velodyne_packets(path: Path) -> Iterator[tuple[str, memoryview]]:
                 at = _ip_at(packet, link)
             except ValueError:
                 at = None
-            is_ip = at is not None and len(packet) >= at + 28 + VELODYNE_BYTES
-            yield _address(packet[at + 12 : at + 16]) if at is not None and is_ip else "", packet[-VELODYNE_BYTES:]
-
-
-def refuse_others(path: Path) -> None:
-    """Raise `PointsError` if most of the first packets of a pcap file are those of a LiDAR that is not decoded."""
-    # One of 65,536 packets of other sensors begins like them by chance.
-    names = Counter(_maker(payload) for payload in _first_payloads(path) if len(payload) > _GPS_BYTES)
-    name, n = max(names.items(), key=lambda item: item[1], default=(None, 0))
-    if name is not None and 2 * n > names.total():
-        raise PointsError(
-            f"a capture of a {name}, which cannot be decoded; expected a Velodyne or an Ouster. Convert it with "
-            f"{name.split()[0]}'s driver, to a ROS bag or to .pcd files"
-        )
-
-
-def _maker(payload: memoryview) -> str | None:
-    """The LiDAR that sends such a packet, e.g. ``"Hesai Pandar64"``; None of Velodyne, Ouster and unknown ones."""
-    head = bytes(payload[:4])
-    if head in (b"\x55\xaa\x05\x0a", b"\x55\xaa\x05\x5a", b"\xaa\x55\x05\xa5"):
-        return "RoboSense sensor"
-    # Livox: version 0, length of the packet; 96 points and more of 14 bytes (or 8), behind 36 bytes.
-    if len(payload) in (1380, 804, 996) and (
-        head[0] == 0 and int.from_bytes(payload[1:3], "little") in (0, len(payload))
-    ):
-        return "Livox sensor"
-    return _hesai_name(payload)
-
-
-def _first_payloads(path: Path) -> Iterator[memoryview]:
-    """What the first UDP datagrams of a pcap file carry; fragments and damaged packets are left out."""
-    link = _link_type(path)
-    for _, packet in islice(pcap_packets(path, whole=False), _SNIFFED_PACKETS):
-        try:
-            part = _fragment(packet, link)
-        except ValueError:
-            continue
-        if part is not None and part.start == 0 and not part.more:
-            yield part.payload[8:]
-
-
-def _hesai_name(payload: memoryview) -> str | None:
-    """The Hesai sensor that sends such a packet, e.g. ``"Hesai Pandar64"``; None if it is not one of Hesai's."""
-    # Pandar40P: ten blocks of 124 bytes, each with the same flag, and a tail.
-    if len(payload) in (1262, 1266) and all(bytes(payload[k : k + 2]) == b"\xff\xee" for k in range(0, 1240, 124)):
-        return "Hesai Pandar40P"
-    if len(payload) < 12 or bytes(payload[:2]) != b"\xee\xff":
-        return None
-    # Pandar20 and Pandar64 have the numbers of lasers and blocks here, later sensors the version of the protocol.
-    lasers, blocks = payload[2], payload[3]
-    if (lasers, blocks) in ((20, 20), (64, 6)):
-        return f"Hesai Pandar{lasers}"
-    return f"Hesai sensor of {payload[6]} lasers (version {payload[2]}.{payload[3]} of the packets)"
+            if at is None or len(packet) < at + 28 + VELODYNE_BYTES:
+                yield "", packet[-VELODYNE_BYTES:]
+                continue
+            udp = at + 4 * (packet[at] & 15)
+            if int.from_bytes(packet[udp + 4 : udp + 6], "big") == 8 + VELODYNE_BYTES:  # RoboSense's end like these
+                yield _address(packet[at + 12 : at + 16]), packet[-VELODYNE_BYTES:]
 
 
 def _ip_at(packet: memoryview, link: int) -> int | None:
@@ -289,7 +226,8 @@ def _fragment(packet: memoryview, link: int) -> _Fragment | None:
     if not 20 <= header < total <= len(packet) - offset:
         raise ValueError("the length in the IP header contradicts the record")
     source = bytes(packet[offset + 12 : offset + 20]) + identification.to_bytes(2, "big")
-    return _Fragment(source, 8 * (place & 0x1FFF), bool(place & 0x2000), packet[offset + header : offset + total])
+    payload = packet[offset + header : offset + total]
+    return _Fragment(source, packet[offset + 12 : offset + 16], 8 * (place & 0x1FFF), bool(place & 0x2000), payload)
 
 
 def is_ethernet(path: Path) -> bool:
@@ -331,16 +269,3 @@ def _address(four: memoryview) -> str:
 def _magic(path: Path) -> bytes:
     with path.open("rb") as file:
         return file.read(4)
-
-
-def copy_without(path: Path, bad: Collection[int], target: Path, alive: Callable[[], None]) -> None:
-    """Copy a pcap file without some of its records."""
-    left_out = frozenset(bad)
-    with path.open("rb") as source, target.open("wb") as out:
-        out.write(source.read(24))
-        for k, (offset, packet) in enumerate(pcap_packets(path, whole=False)):
-            if k % 10_000 == 0:
-                alive()
-            if offset not in left_out:
-                source.seek(offset)
-                out.write(source.read(16 + len(packet)))

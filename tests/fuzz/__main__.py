@@ -23,7 +23,7 @@ from edgeperc.system.atomic import write_atomic
 
 from .running import Kind, State, attempt, new_case, run_job, summary_of, supervise
 
-KINDS = ("scans", "captures", "images", "models", "trackers", "commands")
+KINDS = ("scans", "captures", "packets", "images", "models", "trackers", "commands")
 
 
 def kind_of(name: str, seed: int) -> Kind:

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import lidar_writers
 import numpy as np
 import test_apart as apart_tests
 import test_captures as capture_tests
@@ -47,6 +48,7 @@ def synthetic_seeds(folder: Path) -> list[Seed]:
     for link in (113, 276, 101):
         path = packet_tests.write_link(folder / "link.pcap", link, capture_tests.vlp16_packets(0.02))
         seeds.append(Seed("velodyne", {"cap.pcap": path.read_bytes()}, "cap.pcap"))
+    seeds += _lidars(folder)
     seeds += [Seed("bag1", {"cap.bag": capture_tests.write_bag1(folder / "one.bag").read_bytes()}, "cap.bag")]
     seeds += [Seed("bag1", {"cap.bag": _packed_bag(folder, m)}, "cap.bag") for m in ("BZ2", "LZ4")]
     bag2 = capture_tests.write_bag2(folder / "bag2")
@@ -79,6 +81,29 @@ def real_seeds(root: Path, n_packets: int = 40) -> list[Seed]:
         metadata = file.with_suffix(".json")
         files = {"cap.pcap": content} | ({"cap.json": metadata.read_bytes()} if metadata.is_file() else {})
         seeds.append(Seed("ouster" if metadata.is_file() else "velodyne", files, "cap.pcap"))
+    return seeds
+
+
+def _lidars(folder: Path) -> list[Seed]:
+    seeds = []
+    for name, model in lidar_writers.MODELS.items():
+        angles = lidar_writers.unit_angles(model)
+        packets = lidar_writers.packets_of(
+            model, lidar_writers.blocks_of(model, *lidar_writers.ranges(model, 4 * model.blocks), first_deg=359.5)
+        )
+        says = [lidar_writers.difop(model, angles)] if model.layout == ">" else []
+        path = capture_tests.write_pcap(folder / f"{name}.pcap", [*packets[:1], *says, *packets[1:6]])
+        files = {"cap.pcap": path.read_bytes()}
+        if model.layout == "<":
+            files["cap.csv"] = lidar_writers.calibration(angles).encode()
+        seeds.append(Seed("lidar", files, "cap.pcap"))
+    points = np.tile([[10.0, -3.0, 1.0], [0.0, 0.0, 0.0]], (300, 1))
+    for kind, is_old in ((1, False), (2, False), (3, False), (0x11, False), (1, True), (4, True)):
+        packets = lidar_writers.livox_packets(kind, points, np.arange(600) % 256, is_old)
+        path = capture_tests.write_pcap(folder / "livox.pcap", packets)
+        seeds.append(Seed("lidar", {"cap.pcap": path.read_bytes()}, "cap.pcap"))
+        if not is_old:
+            seeds.append(Seed("lvx2", {"cap.lvx2": lidar_writers.lvx2_file(packets, ("one",))}, "cap.lvx2"))
     return seeds
 
 

@@ -81,9 +81,9 @@ def hesai(head: bytes, size: int) -> bytes:
 @pytest.mark.parametrize(
     ("packet", "name"),
     [
-        (hesai(b"\xee\xff\x40\x06\0\x04", 1194), "Hesai Pandar64"),
-        (hesai(b"\xee\xff\x06\x01\0\0\x20\x08", 1080), r"Hesai sensor of 32 lasers \(version 6\.1 "),
-        (b"".join(hesai(b"\xff\xee", 124) for _ in range(10)) + bytes(22), "Hesai Pandar40P"),
+        (hesai(b"\xee\xff\x14\x14\0\x04", 1270), "Hesai Pandar20"),
+        (hesai(b"\xee\xff\x09\x01\0\0\x20\x08", 1080), r"Hesai sensor of 32 lasers \(version 9\.1 "),
+        (hesai(b"\xee\xff\x04\x03\0\0\x80\x02", 1118), "Hesai AT128"),
     ],
 )
 def test_a_hesai_is_named_though_it_cannot_be_decoded(tmp_path: Path, packet: bytes, name: str) -> None:

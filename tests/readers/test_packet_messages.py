@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import struct
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -14,10 +15,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from test_captures import LIDAR, messages, record, sized, vlp16_packets, write_pcap
 from test_identify import velodyne
+from test_ouster_packets import METADATA, random_packets
+from test_ouster_packets import record as write_capture
 
 from cli_helpers import run
 from edgeperc import MissingExtraError, PointsError, SensorError, read_scans, read_timed_scans, sensor_of
-from edgeperc.readers.packet_messages import PACKET_READERS, VelodyneStream
+from edgeperc.readers.packet_messages import PACKET_READERS, VelodyneScan, VelodyneStream
 from edgeperc.types.sensor import SENSORS
 
 SCAN = "velodyne_msgs/msg/VelodyneScan"
@@ -40,7 +43,7 @@ def ros1_message(packets: Sequence[bytes], first: int) -> bytes:
     )
 
 
-def mcap_of(path: Path, topics: Sequence[tuple[str, str, str, Sequence[bytes]]]) -> Path:
+def mcap_of(path: Path, topics: Sequence[tuple[str, str, str, Sequence[bytes]]], step_ns: int = 1) -> Path:
     """MCAP without an index: topic, type, encoding and messages."""
     magic = b"\x89MCAP0\r\n"
     content = magic + record(1, sized(b"") + sized(b"test"))
@@ -48,12 +51,12 @@ def mcap_of(path: Path, topics: Sequence[tuple[str, str, str, Sequence[bytes]]])
         content += record(3, struct.pack("<H", k) + sized(kind.encode()) + sized(b"") + sized(b""))
         content += record(4, struct.pack("<HH", k, k) + sized(topic.encode()) + sized(encoding.encode()) + sized(b""))
         for n, message in enumerate(sent):
-            content += record(5, struct.pack("<HIQQ", k, n, 10**12 + n, 10**12 + n) + message)
+            content += record(5, struct.pack("<HIQQ", k, n, 10**12 + step_ns * n, 10**12 + step_ns * n) + message)
     path.write_bytes(content + record(15, bytes(4)) + record(2, bytes(20)) + magic)
     return path
 
 
-def ros1_bag(path: Path, topics: Sequence[tuple[str, str, str, Sequence[bytes]]]) -> Path:
+def ros1_bag(path: Path, topics: Sequence[tuple[str, str, str, Sequence[bytes]]], step_ns: int = 1) -> Path:
     def fields(**values: bytes) -> bytes:
         return sized(b"".join(sized(name.encode() + b"=" + value) for name, value in values.items()))
 
@@ -66,7 +69,7 @@ def ros1_bag(path: Path, topics: Sequence[tuple[str, str, str, Sequence[bytes]]]
             topic=topic.encode(), type=kind.encode()
         )
         for n, message in enumerate(sent):
-            content += fields(op=b"\2", conn=number, time=struct.pack("<II", 1000, n)) + sized(message)
+            content += fields(op=b"\2", conn=number, time=struct.pack("<II", 1000, step_ns * n)) + sized(message)
     path.write_bytes(content)
     return path
 
@@ -141,12 +144,13 @@ def test_the_driver_of_ros_writes_what_is_read(tmp_path: Path) -> None:
         assert bytes(written) == make(packets, 3)
 
 
-@pytest.mark.parametrize("key", PACKET_READERS)
+@pytest.mark.parametrize("key", [key for key in PACKET_READERS if key[0].endswith("VelodyneScan")])
 @given(data=st.data())
 def test_damaged_messages(key: tuple[str, str], data: st.DataObject) -> None:
     make = ros1_message if key[1] == "ros1" else ros2_message
     content = bytearray(make(vlp16_packets(0.05), 0))
     whole = PACKET_READERS[key](memoryview(bytes(content)))
+    assert isinstance(whole, VelodyneScan)
     assert whole.header.frame_id == "velodyne"
     assert [bytes(packet) for _, packet in whole.packets] == vlp16_packets(0.05)
     for at in data.draw(st.lists(st.integers(0, 60), max_size=4)):
@@ -154,6 +158,7 @@ def test_damaged_messages(key: tuple[str, str], data: st.DataObject) -> None:
     cut = bytes(content[: data.draw(st.integers(0, len(content)))])
     with suppress(PointsError):
         found = PACKET_READERS[key](memoryview(cut))
+        assert isinstance(found, VelodyneScan)
         assert all(len(packet) == 1206 for _, packet in found.packets)
         assert 1206 * len(found.packets) <= len(cut)
 
@@ -183,8 +188,6 @@ OTHERS = {
     "rslidar_msg/msg/RslidarPacket": "RoboSense",
     "rslidar_msgs/rslidarScan": "RoboSense",
     "livox_ros_driver2/msg/CustomMsg": "Livox",
-    "ouster_sensor_msgs/msg/PacketMsg": "Ouster",
-    "ouster_ros/PacketMsg": "Ouster",
 }
 
 
@@ -234,3 +237,69 @@ def test_without_the_library_the_extra_is_named(monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setitem(__import__("sys").modules, "velodyne_decoder", None)
     with pytest.raises(MissingExtraError, match=r"edgeperc\[velodyne\]"):
         VelodyneStream()
+
+
+def ouster_bag(folder: Path, version: str, packets: Sequence[bytes], metadata: str) -> Path:
+    """Packets of the LiDAR and of its motion, and the metadata, as ouster-ros writes them."""
+    kind = {
+        "1": "ouster_ros/PacketMsg",
+        "2": "ouster_sensor_msgs/msg/PacketMsg",
+        "2, older": "ouster_ros/msg/PacketMsg",
+    }[version]
+    head = b"" if version == "1" else b"\0\1\0\0"
+    text = metadata.encode() + (b"" if version == "1" else b"\0")
+    encoding, of_text = ("ros1", "std_msgs/String") if version == "1" else ("cdr", "std_msgs/msg/String")
+    topics = [
+        ("/ouster/imu_packets", kind, encoding, [head + sized(bytes(48))]),
+        ("/ouster/lidar_packets", kind, encoding, [head + sized(packet) for packet in packets]),
+        *([("/ouster/metadata", of_text, encoding, [head + sized(text)])] if metadata else []),
+    ]
+    step_ns = 10**8 // 32  # a turn has 32 packets
+    write, name = (ros1_bag, "a.bag") if version == "1" else (mcap_of, "a.mcap")
+    return write(folder / name, topics, step_ns)
+
+
+@pytest.mark.parametrize("version", ["1", "2", "2, older"])
+def test_an_ousters_packets_give_the_turns_of_a_capture(tmp_path: Path, version: str) -> None:
+    """With the clock of the messages."""
+    packets = [packet for turn in random_packets(METADATA, 3, 4) for packet in turn]
+    of_capture = [*read_timed_scans(write_capture(tmp_path, METADATA, packets))]
+    path = ouster_bag(tmp_path, version, [bytes(packet.buf) for packet in packets], json.dumps(METADATA))
+    of_bag = [*read_timed_scans(path)]
+    assert len(of_bag) == len(of_capture) == 3
+    for one, other in zip(of_bag, of_capture, strict=True):
+        np.testing.assert_array_equal(one.points, other.points)
+        assert one.stamp_s is not None
+        assert other.stamp_s is not None
+        assert 1000.0 <= one.stamp_s < 1001.0
+        np.testing.assert_allclose(one.times_s - one.stamp_s, other.times_s - other.stamp_s, atol=1e-6)
+    assert [len(points) for _, points in read_scans(path, remission_field="signal")] == [len(s.points) for s in of_bag]
+    sensor = sensor_of(path)
+    assert sensor is not None
+    assert sensor.name == "os1-8"
+
+
+@pytest.mark.parametrize(
+    ("metadata", "error"),
+    [
+        ("", "has no metadata of the sensor; expected it as a text, topic /ouster/metadata"),
+        ("{", "the Ouster's metadata in the bag cannot be read"),
+        ("{}", "beam_altitude_angles: expected a list"),
+    ],
+)
+def test_an_ousters_packets_without_metadata(tmp_path: Path, metadata: str, error: str) -> None:
+    with pytest.raises(PointsError, match=error):
+        next(iter(read_scans(ouster_bag(tmp_path, "2", [bytes(1000)], metadata))))
+
+
+@pytest.mark.parametrize("key", [key for key in PACKET_READERS if key[0].endswith("PacketMsg")])
+@given(content=st.binary(max_size=40), cut=st.integers(0, 8))
+def test_damaged_packets_of_an_ouster(key: tuple[str, str], content: bytes, cut: int) -> None:
+    head = b"" if key[1] == "ros1" else b"\0\1\0\0"
+    whole = PACKET_READERS[key](memoryview(head + sized(content)))
+    assert not isinstance(whole, VelodyneScan)
+    assert bytes(whole.content) == content
+    with suppress(PointsError):
+        PACKET_READERS[key](memoryview((head + sized(content))[: len(head) + cut]))
+    with pytest.raises(PointsError, match="damaged"):
+        PACKET_READERS[key](memoryview(head + sized(content)[:-1] if content else head + b"\1"))

@@ -1,0 +1,473 @@
+"""Packets of Hesai's and RoboSense's spinning sensors become turns, by one table of their formats.
+
+A packet has blocks, each with an azimuth, and a distance and a reflectivity of each channel. The angles of the channels
+are those of the unit: in a calibration file beside the capture, or in RoboSense's other packets (DIFOP).
+"""
+
+from __future__ import annotations
+
+import calendar
+import struct
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import PointsError
+from ..system.kernels import njit
+from .times import TimedScan
+
+Bytes = NDArray[np.uint8]
+
+
+class Clock(NamedTuple):
+    """Where a packet has its time: the date, or the seconds; Hesai's the microseconds and the speed, too."""
+
+    kind: Literal["hesai", "date", "seconds"]
+    at: int
+    micros_at: int = 0
+    speed_at: int = 0
+
+
+class Format(NamedTuple):
+    """One row of the table.
+
+    name : the model, as its profile is called.
+    title : the model, as its maker calls it.
+    header, n_blocks, n_channels, channel_bytes : of a packet.
+    sizes : bytes that a packet may have.
+    flag : the bytes that a block begins with.
+    first : from there to the first channel; the azimuth is in the two bytes in front of it.
+    fires_us : when each channel fires, after its block.
+    clock : how and where the time is written.
+    reference : the block that the time is of, 0 or -1.
+    late_us : how much later the block fires.
+    unit_m, mask : of a distance; Hesai's packets say how many mm.
+    lens_m : distance of the lasers from the axis, and height.
+    lasers : 16: channels beyond are a second firing or return; 96: every second block has those beyond 48.
+    elevations_deg : of every unit; empty: each unit has its own angles.
+    """
+
+    name: str
+    title: str
+    header: int
+    n_blocks: int
+    n_channels: int
+    channel_bytes: int
+    sizes: tuple[int, ...]
+    flag: bytes
+    first: int
+    fires_us: tuple[float, ...]
+    clock: Clock
+    reference: int = 0
+    late_us: float = 0.0
+    unit_m: float = 0.004
+    mask: int = 0xFFFF
+    lens_m: tuple[float, float] = (0.0, 0.0)
+    lasers: int = 0
+    elevations_deg: tuple[float, ...] = ()
+
+    @property
+    def is_hesai(self) -> bool:
+        """Whether the maker is Hesai: numbers are little-endian, and azimuth 0 is along y, as its driver has it."""
+        return self.clock.kind == "hesai"
+
+    @property
+    def block_bytes(self) -> int:
+        """From one block to the next."""
+        return self.first + self.n_channels * self.channel_bytes
+
+
+class Angles(NamedTuple):
+    """What is known of a unit: (lasers, 2) elevation and azimuth of each laser [deg], its speed, and returns."""
+
+    lasers_deg: NDArray[np.float64]
+    rpm: float = 600.0
+    is_dual: bool = False
+
+
+def _tail(body: int, date: int, micros: int, speed: int) -> Clock:
+    """Hesai's, which is behind the body."""
+    return Clock("hesai", body + date, body + micros, body + speed)
+
+
+def _xt(name: str, n: int, elevations: Sequence[float]) -> Format:
+    body = 12 + 8 * (2 + 4 * n)
+    fires_us = tuple(6.0 + 1.512 * (32 // n) * k for k in range(n))
+    return Format(
+        name, f"Hesai {name.replace('p', 'P', 1).replace('xt', 'XT')}", 12, 8, n, 4, (body + 28,), b"", 2, fires_us,
+        _tail(body, 13, 19, 11), reference=-1, elevations_deg=tuple(elevations),
+    )  # fmt: skip
+
+
+_NO_FIRES = (0.0,) * 128
+_OLD, _DATE, _SECONDS = b"\xff\xee", Clock("date", 20), Clock("seconds", 20)
+_RUBY = "000112222333444555666778899aabbccddeefff000111222334444556667778899aabbbccdeefff"  # firings of 80 channels
+# Of eight channels each.
+_AIRY_US = (0.0, 7.616, 16.184, 24.752, 33.32, 42.84, 52.36, 61.88, 71.4, 79.968, 88.536, 97.104)
+_FORMATS = (
+    Format("pandar40p", "Hesai Pandar40P", 0, 10, 40, 3, (1262, 1266), _OLD, 4, _NO_FIRES[:40],
+           _tail(1240, 16, 10, 8), reference=-1, late_us=-28.58),
+    Format("pandar64", "Hesai Pandar64", 8, 6, 64, 3, (1194, 1198), b"", 2, _NO_FIRES[:64],
+           _tail(1172, 16, 10, 8), reference=-1, late_us=-42.58),
+    _xt("pandarxt-32", 32, range(15, -17, -1)),
+    _xt("pandarxt-16", 16, range(15, -17, -2)),
+    Format("pandarqt-64", "Hesai PandarQT-64", 12, 4, 64, 4, (1068, 1072), b"", 2, _NO_FIRES[:64],
+           _tail(1044, 18, 12, 10), late_us=25.71),
+    # Whether there are bytes of confidence and of functional safety is in the packet.
+    Format("ot128", "Hesai OT128", 12, 2, 128, 3, (), b"", 2, _NO_FIRES,
+           _tail(788, 15, 21, 13), reference=-1),
+    Format("rs-16", "RoboSense RS-LiDAR-16", 42, 12, 32, 3, (1248,), _OLD, 4,
+           tuple(2.8 * (k % 16) + 55.5 * (k // 16) for k in range(32)), _DATE, unit_m=0.005, lens_m=(0.03977, 0.0),
+           lasers=16),
+    Format("rs-32", "RoboSense RS-LiDAR-32", 42, 12, 32, 3, (1248,), _OLD, 4,
+           tuple(2.88 * (k % 16) + 1.44 * (k // 16 + k % 16 // 15) for k in range(32)), _DATE, unit_m=0.005,
+           lens_m=(0.04142, 0.0)),
+    Format("rs-bpearl", "RoboSense RS-Bpearl", 42, 12, 32, 3, (1248,), _OLD, 4,
+           tuple(2.56 * (k % 8) + 25.68 * (k // 8 % 2) + 1.28 * (k // 16) for k in range(32)), _DATE, unit_m=0.005,
+           lens_m=(0.01701, 0.09427)),
+    Format("rs-bpearl-4", "RoboSense RS-Bpearl", 42, 12, 32, 3, (1248,), _OLD, 4,
+           tuple(1.668 * k for k in range(32)), _SECONDS, unit_m=0.0025, lens_m=(0.01829, 0.09571)),
+    Format("helios-32", "RoboSense RS-Helios", 42, 12, 32, 3, (1248,), _OLD, 4,
+           tuple(1.73 * k for k in range(32)), _SECONDS, unit_m=0.0025, lens_m=(0.03806, 0.0)),
+    Format("helios-16", "RoboSense RS-Helios-16P", 42, 12, 32, 3, (1248,), _OLD, 4,
+           tuple(1.73 * (k % 16) + 55.56 * (k // 16) for k in range(32)), _SECONDS, unit_m=0.0025,
+           lens_m=(0.03806, 0.0), lasers=16),
+    Format("rs-airy", "RoboSense Airy", 42, 8, 48, 3, (1248,), _OLD, 4, tuple(_AIRY_US[k // 8] for k in range(96)),
+           _SECONDS, unit_m=0.005, mask=0x3FFF, lens_m=(0.01143, 0.06056), lasers=96),
+    Format("rs-ruby-80", "RoboSense RS-Ruby Lite", 80, 4, 80, 3, (1248,), b"\xfe", 4,
+           tuple(3.236 * int(firing, 16) for firing in _RUBY), Clock("seconds", 10),
+           unit_m=0.005, lens_m=(0.03995, 0.0)),
+    Format("rs-ruby-128", "RoboSense RS-Ruby", 80, 3, 128, 3, (1248,), b"\xfe", 4,
+           tuple(3.236 * (k // 4 % 16) for k in range(128)), Clock("seconds", 10), unit_m=0.005, lens_m=(0.03995, 0.0)),
+)  # fmt: skip
+FORMATS = {row.name: row for row in _FORMATS}
+"""The formats that are decoded, by name."""
+
+_MSOP, _MSOP_NEW = bytes.fromhex("55aa050a5aa550a0"), bytes.fromhex("55aa055a")
+DIFOP = bytes.fromhex("a5ff005a11115555")
+"""The first bytes of what RoboSense's sensors say of themselves."""
+
+_OLD_MODELS = {1: "rs-16", 2: "rs-32", 3: "rs-bpearl"}
+_OTHER_MODELS = {4: "RS-Ruby", 5: "RS-Ruby Lite"}
+# Of Hesai's later sensors: version of the packets, channels and blocks.
+_HESAI = {
+    (6, 1, 32, 8): "pandarxt-32",
+    (6, 1, 16, 8): "pandarxt-16",
+    (3, 1, 64, 4): "pandarqt-64",
+    (1, 4, 128, 2): "ot128",
+}
+_HESAI_NAMES = {
+    (4, 3): "AT128",
+    (3, 2): "QT128",
+    (6, 1): "XT32M",
+    (1, 8): "JT",
+    (2, 5): "ET25",
+    (4, 7): "ATX",
+    (7, 2): "FT120",
+}
+
+# A turn of the fastest settings has a twentieth of it.
+_MOST_PACKETS = 20_000
+_HALF_TURN_DEG, _SPEEDS = 180.0, (60.0, 3000.0)
+
+
+def format_of(payload: memoryview) -> Format | None:
+    """The format of a packet with points; None if it has none, or is not decoded."""
+    size, head = len(payload), bytes(payload[:12])
+    row = None
+    if size in FORMATS["pandar40p"].sizes and head[:2] == _OLD:
+        row = FORMATS["pandar40p"]
+    elif head[:2] == b"\xee\xff" and size > 12:
+        name = "pandar64" if head[2:4] == b"\x40\x06" else _HESAI.get((head[2], head[3], head[6], head[7]), "")
+        row = FORMATS.get(name)
+        if name == "ot128":
+            row = _with_options(FORMATS[name], head[11], size)
+    elif head[:8] == _MSOP and size > 32:
+        is_new = bytes(payload[31:33]) == b"\x03\x04"
+        row = FORMATS.get("rs-bpearl-4" if is_new else _OLD_MODELS.get(payload[30], ""))
+    elif head[:4] == _MSOP_NEW and size == 1248:
+        named = (FORMATS[name] for name in ("helios-32", "rs-airy", "rs-ruby-128", "rs-ruby-80"))
+        row = next((each for each in named if _has_flags(payload, each)), None)
+        if row is not None and ((row.header == 80 and payload[31] == 5) or (row.lasers == 96 and payload[32] != 2)):
+            row = None
+    return row if row is not None and size in row.sizes and _has_flags(payload, row) else None
+
+
+def name_of(payload: memoryview) -> str | None:
+    """What sends such a packet, e.g. ``"Hesai AT128"``; None if it is neither Hesai's nor RoboSense's."""
+    row, head = format_of(payload), bytes(payload[:8])
+    if row is not None:
+        return row.title
+    if head[:8] == _MSOP and len(payload) > 30:
+        return f"RoboSense {_OTHER_MODELS.get(payload[30], 'sensor')}"
+    if head[:4] == _MSOP_NEW and len(payload) > 32:
+        is_plus = len(payload) == 1248 and _has_flags(payload, FORMATS["rs-ruby-128"]) and payload[31] == 5
+        return "RoboSense RS-Ruby Plus" if is_plus else "RoboSense sensor"
+    if head[:3] == b"\xaa\x55\x05":
+        return "RoboSense sensor"
+    if head[:2] != b"\xee\xff" or len(payload) < 12:
+        return None
+    if head[2:4] == b"\x14\x14":
+        return "Hesai Pandar20"
+    model = _HESAI_NAMES.get((head[2], head[3]))
+    return (
+        f"Hesai {model}" if model else f"Hesai sensor of {head[6]} lasers (version {head[2]}.{head[3]} of the packets)"
+    )
+
+
+def _with_options(row: Format, options: int, size: int) -> Format:
+    """A row for packets with these bytes of confidence and functional safety."""
+    wide, safe = options >> 4 & 1, options >> 2 & 1
+    moved = 256 * wide + 17 * safe
+    clock = Clock("hesai", *(at + moved for at in row.clock[1:]))
+    sizes = (max(size, clock.micros_at + 5),)
+    return row._replace(channel_bytes=row.channel_bytes + wide, clock=clock, sizes=sizes)
+
+
+def _has_flags(payload: memoryview, row: Format) -> bool:
+    places = range(row.header, row.header + row.n_blocks * row.block_bytes, row.block_bytes)
+    return all(bytes(payload[at : at + len(row.flag)]) == row.flag for at in places)
+
+
+def angles_of_difop(row: Format, payload: memoryview) -> Angles | None:
+    """What a RoboSense's other packet says of the unit; None if it is none, or says nothing."""
+    if row.is_hesai or len(payload) != 1248 or bytes(payload[:8]) != DIFOP:
+        return None
+    content = np.frombuffer(payload, np.uint8)
+    if row.name == "rs-16":
+        triples = content[1165:1213].reshape(16, 3).astype(np.float64)
+        elevation = 1e-4 * (triples @ [65536.0, 256.0, 1.0])
+        elevation[:8] *= -1.0
+        lasers = np.stack([elevation, np.zeros(16)], axis=1)
+        is_set = not np.isin(content[1165:1169], (0, 255)).all()
+    else:
+        n = row.lasers or row.n_channels
+        per_list = 128 if row.header == 80 else max(n, 32)
+        triples = content[468 : 468 + 6 * per_list].reshape(2, per_list, 3)[:, :n].astype(np.float64)
+        lasers = (0.01 * (triples[..., 1:] @ [256.0, 1.0]) * np.where(triples[..., 0] > 0, -1.0, 1.0)).T
+        is_set = not (triples[0, :, 0] == 255).any() and len(np.unique(lasers[:, 0])) == n
+    if not is_set or not (np.abs(lasers) <= 90.0).all():
+        return None
+    return Angles(
+        np.round(lasers, 4).astype(np.float64), float(int.from_bytes(payload[8:10], "big")), payload[300] == 0
+    )
+
+
+def has_16_lasers(payload: memoryview) -> bool:
+    """Whether a DIFOP of a Helios has the angles of 16 lasers alone."""
+    others = np.frombuffer(payload, np.uint8)[468 + 48 : 468 + 96].reshape(16, 3)
+    return bool((others[:, 0] == 255).all() or not others.any())
+
+
+def read_angles(path: Path, row: Format) -> Angles:
+    """The angles of a calibration file: ``channel,elevation,azimuth`` as Hesai's, or without channel, as RoboSense's.
+
+    Raises PointsError.
+    """
+    n = row.lasers or row.n_channels
+    rows = []
+    for line in path.read_bytes()[: 1 << 20].decode("utf-8", "replace").splitlines():
+        try:
+            rows.append([float(value) for value in line.split(",")])
+        except ValueError:
+            continue  # a heading
+    lasers = np.array([each[-2:] for each in rows if len(each) in (2, 3)]).reshape(-1, 2)
+    if len(lasers) != n or not (np.abs(lasers) <= (90.0, 360.0)).all():
+        raise PointsError(
+            f"the calibration {path.name} has {len(lasers)} rows of an elevation and an azimuth [deg]; expected {n}, "
+            f"one for each laser of a {row.title}"
+        )
+    return Angles(lasers)
+
+
+@njit(cache=True, nogil=True)
+def fill_returns(
+    packets: Bytes,
+    places: NDArray[np.int64],
+    blocks: NDArray[np.float64],
+    beams: NDArray[np.float64],
+    lens: NDArray[np.float64],
+    points: NDArray[np.float32],
+    times_s: NDArray[np.float64],
+) -> int:
+    """Put the returns of packets into points; a second return at the distance of the first is left out.
+
+    packets : (n, bytes of a packet) uint8.
+    places : header, bytes of a block, its first channel, bytes of a channel, whether numbers are big-endian, mask of a
+        distance, and from a second return back to the first: blocks (of the same azimuth) or channels.
+    blocks : (n, blocks, 3) float64; azimuth [deg], time [s] and speed [deg/s]; not finite: left out.
+    beams : (blocks, channels, 3) float64; elevation [rad], azimuth [deg] and time [us] of each channel.
+    lens : unit [m], direction of azimuth 0 [deg], distance of the lasers from the axis, height [m].
+    points : (>= n * blocks * channels, 4) float32; filled.
+    times_s : likewise.
+    Returns int: how many.
+    """
+    header, block_bytes, first, channel_bytes, is_big, mask, back_blocks, back_channels = places
+    n = 0
+    for p in range(blocks.shape[0]):
+        for b in range(blocks.shape[1]):
+            azimuth, time_s, speed = blocks[p, b]
+            if not np.isfinite(azimuth + time_s + speed):
+                continue
+            is_pair = back_channels == 0 and b >= back_blocks and blocks[p, b - back_blocks, 0] == azimuth
+            for c in range(beams.shape[1]):
+                at = header + b * block_bytes + first + c * channel_bytes
+                high, low = (at, at + 1) if is_big else (at + 1, at)
+                distance = (np.int64(packets[p, high]) << 8 | np.int64(packets[p, low])) & mask
+                if distance == 0:
+                    continue
+                back = 0
+                if is_pair:
+                    back = back_blocks * block_bytes
+                elif 0 < back_channels <= c:
+                    back = back_channels * channel_bytes
+                if back > 0:
+                    other = np.int64(packets[p, high - back]) << 8 | np.int64(packets[p, low - back])
+                    if other & mask == distance:
+                        continue
+                fired = 1e-6 * beams[b, c, 2]
+                turned = lens[1] - azimuth - speed * fired
+                axis, heading = np.radians(turned), np.radians(turned - beams[b, c, 1])
+                range_m = lens[0] * distance
+                flat = range_m * np.cos(beams[b, c, 0])
+                points[n, 0] = flat * np.cos(heading) + lens[2] * np.cos(axis)
+                points[n, 1] = flat * np.sin(heading) + lens[2] * np.sin(axis)
+                points[n, 2] = range_m * np.sin(beams[b, c, 0]) + lens[3]
+                points[n, 3] = packets[p, at + 2]
+                times_s[n] = time_s + fired
+                n += 1
+    return n
+
+
+class _Packet(NamedTuple):
+    content: bytes
+    time_s: float
+    rpm: float
+    azimuths: NDArray[np.float64]  # of the blocks; NaN where one is left out
+
+
+class SpinningStream:
+    """Turns from the packets of a sensor.
+
+    row : the format of the packets.
+    angles : of the unit.
+    """
+
+    def __init__(self, row: Format, angles: Angles) -> None:
+        self._row, self._angles = row, angles
+        self._order: Literal["<", ">"] = "<" if row.is_hesai else ">"
+        self._packets: list[_Packet] = []
+        self._last_deg = np.nan
+
+    def add(self, payload: memoryview) -> Iterator[TimedScan]:
+        """The turns that end in a packet of the format: where the azimuth begins anew."""
+        packet = self._packet(payload)
+        begin = 0
+        for k, azimuth in enumerate(packet.azimuths.tolist()):
+            if azimuth != azimuth:
+                continue
+            if abs(azimuth - self._last_deg) > _HALF_TURN_DEG:
+                yield from self._turn(packet, begin, k)
+                begin = k
+            self._last_deg = azimuth
+        self._packets.append(_part(packet, begin, len(packet.azimuths)))
+        if len(self._packets) > _MOST_PACKETS:
+            yield from self.end()
+
+    def end(self) -> Iterator[TimedScan]:
+        """The last turn, which may be a part."""
+        if self._packets:
+            yield from self._turn(self._packets[-1], 0, 0)
+
+    def azimuths_of(self, payload: memoryview) -> list[float]:
+        """The azimuths of a packet's blocks [deg]; NaN where one is impossible."""
+        row = self._row
+        places = range(row.header, row.header + row.n_blocks * row.block_bytes, row.block_bytes)
+        hundredths = [struct.unpack_from(f"{self._order}H", payload, at + row.first - 2)[0] for at in places]
+        return [0.01 * each if each < 36_000 else np.nan for each in hundredths]
+
+    def _packet(self, payload: memoryview) -> _Packet:
+        row = self._row
+        azimuths = np.array(self.azimuths_of(payload))
+        speed_at = row.clock.speed_at
+        rpm = float(struct.unpack_from("<H", payload, speed_at)[0]) if speed_at else self._angles.rpm
+        is_likely = _SPEEDS[0] <= rpm <= _SPEEDS[1]
+        return _Packet(bytes(payload), _time_of(row, payload), rpm if is_likely else 600.0, azimuths)
+
+    def _turn(self, packet: _Packet, begin: int, end: int) -> Iterator[TimedScan]:
+        """The packets so far and some blocks of another one; nothing, if there is no block among them."""
+        packets = [*self._packets, _part(packet, begin, end)]
+        self._packets = []
+        azimuths = np.array([each.azimuths for each in packets])
+        if np.isnan(azimuths).all():
+            return
+        row = self._row
+        unit_m = (
+            1e-3 * packets[0].content[5 if row.name == "pandar64" else 9] if row.is_hesai and row.header else row.unit_m
+        )
+        content = np.frombuffer(b"".join(each.content for each in packets), np.uint8).reshape(len(packets), -1)
+        is_dual = row.lasers == 16 and self._angles.is_dual
+        places = (
+            row.header, row.block_bytes, row.first, row.channel_bytes, not row.is_hesai, row.mask,
+            2 if row.lasers == 96 else 1, 16 if is_dual else 0,
+        )  # fmt: skip
+        beams = _beams(row, self._angles, is_dual)
+        points = np.empty((azimuths.size * row.n_channels, 4), np.float32)
+        times_s = np.empty(len(points))
+        lens = np.array([unit_m, 90.0 if row.is_hesai else 0.0, *row.lens_m])
+        n = fill_returns(content, np.array(places, np.int64), _blocks(row, packets), beams, lens, points, times_s)
+        last_s = float(times_s[:n].max()) if n else packets[0].time_s
+        yield TimedScan(last_s, points[:n].copy(), times_s[:n].copy())
+
+
+def _part(packet: _Packet, begin: int, end: int) -> _Packet:
+    """A packet with some of its blocks."""
+    azimuths = np.full(len(packet.azimuths), np.nan)
+    azimuths[begin:end] = packet.azimuths[begin:end]
+    return packet._replace(azimuths=azimuths)
+
+
+def _blocks(row: Format, packets: Sequence[_Packet]) -> NDArray[np.float64]:
+    """Azimuth, time and speed of each block: the blocks of a packet are as far apart in time as the sensor turns."""
+    azimuths = np.array([packet.azimuths for packet in packets])
+    speeds = 6.0 * np.array([packet.rpm for packet in packets])
+    order = "<" if row.is_hesai else ">"
+    at = row.header + row.reference % row.n_blocks * row.block_bytes + row.first - 2
+    references = 0.01 * np.array([struct.unpack_from(f"{order}H", packet.content, at)[0] for packet in packets])
+    ahead_deg = (azimuths - references[:, None] + _HALF_TURN_DEG) % 360.0 - _HALF_TURN_DEG
+    times_s = np.array([packet.time_s for packet in packets])[:, None] + 1e-6 * row.late_us
+    return np.stack(
+        [azimuths, times_s + ahead_deg / speeds[:, None], np.broadcast_to(speeds[:, None], azimuths.shape)], -1
+    )
+
+
+def _beams(row: Format, angles: Angles, is_dual: bool) -> NDArray[np.float64]:
+    """Elevation [rad], azimuth [deg] and time [us] of each channel of each block."""
+    block, channel = np.mgrid[: row.n_blocks, : row.n_channels]
+    laser = channel % 16 if row.lasers == 16 else channel + 48 * (block % 2) if row.lasers == 96 else channel
+    elevation, azimuth = np.moveaxis(angles.lasers_deg[laser], -1, 0)
+    fires_us = np.array(row.fires_us)[laser if is_dual or row.lasers == 96 else channel]
+    return np.stack([np.radians(elevation), azimuth, fires_us], axis=-1)
+
+
+def _time_of(row: Format, payload: memoryview) -> float:
+    """The time that a packet states [s]."""
+    kind, at, micros_at, _ = row.clock
+    if kind == "seconds":
+        high, low, micros = struct.unpack_from(">HII", payload, at)
+        return float((high << 32 | low) + 1e-6 * micros)
+    date = bytes(payload[at : at + 6])
+    if kind == "hesai":
+        micros = int.from_bytes(payload[micros_at : micros_at + 4], "little")
+        seconds = int.from_bytes(date[2:], "big") if date[0] == 0 else _seconds(date[0] % 100, date)
+        return seconds + 1e-6 * micros
+    millis, micros = struct.unpack_from(">HH", payload, at + 6)
+    return _seconds(date[0], date) + 1e-3 * millis + 1e-6 * micros
+
+
+def _seconds(year: int, date: bytes) -> int:
+    """Of a date since 2000; a month that a clock was not set to is the first."""
+    return calendar.timegm((2000 + year, date[1] if 1 <= date[1] <= 12 else 1, *date[2:]))

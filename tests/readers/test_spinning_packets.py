@@ -1,0 +1,317 @@
+"""Hesai's and RoboSense's packets: what is written is read, from captures of simulated ranges."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from lidar_writers import (
+    MODELS,
+    T0_S,
+    Model,
+    blocks_of,
+    calibration,
+    difop,
+    expected,
+    packets_of,
+    ranges,
+    unit_angles,
+)
+from numpy.typing import NDArray
+from test_captures import error_of, write_pcap
+from test_packets import write_link
+
+import twins.packets
+from edgeperc import PointsError, read_timed_scans, sensor_of
+from edgeperc.readers.spinning_packets import (
+    FORMATS,
+    Angles,
+    SpinningStream,
+    angles_of_difop,
+    fill_returns,
+    format_of,
+    name_of,
+    read_angles,
+)
+
+# When the channels of a block fire [us], by the makers' manuals; others are not stated, and count as one moment.
+FIRES_US: dict[str, Any] = {
+    "pandarxt-32": 6 + 1.512 * np.arange(32),
+    "pandarxt-16": 6 + 3.024 * np.arange(16),
+    "rs-16": np.concatenate([2.8 * np.arange(16), 55.5 + 2.8 * np.arange(16)]),
+    "helios-16": np.concatenate([1.73 * np.arange(16), 55.56 + 1.73 * np.arange(16)]),
+    "rs-bpearl-4": 1.668 * np.arange(32),
+    "helios-32": 1.73 * np.arange(32),
+    "rs-ruby-128": 3.236 * (np.arange(128) // 4 % 16),
+}
+LENS_M = {
+    "rs-16": (0.03977, 0.0), "rs-32": (0.04142, 0.0), "rs-bpearl": (0.01701, 0.09427),
+    "rs-bpearl-4": (0.01829, 0.09571), "helios-32": (0.03806, 0.0), "helios-16": (0.03806, 0.0),
+    "rs-airy": (0.01143, 0.06056), "rs-ruby-80": (0.03995, 0.0), "rs-ruby-128": (0.03995, 0.0),
+}  # fmt: skip
+
+
+def fires_of(model: Model) -> NDArray[np.float64]:
+    """(blocks, channels); of the models without a formula above, as the table has them."""
+    given_us = np.asarray(FIRES_US.get(model.name, FORMATS[model.name].fires_us))
+    if model.second == "lasers":
+        return np.stack([given_us[48 * (k % 2) :][:48] for k in range(model.blocks)])
+    return np.broadcast_to(given_us, (model.blocks, model.channels))
+
+
+def capture(folder: Path, model: Model, n_columns: int, **options: Any) -> tuple[Path, list[tuple[int, Any, Any]]]:
+    """A capture with what says its angles, and the blocks in it."""
+    angles = unit_angles(model)
+    blocks = blocks_of(model, *ranges(model, n_columns), **options)
+    packets = packets_of(model, blocks)
+    path = folder / "drive.pcap"
+    if model.layout == ">":
+        packets.insert(len(packets) // 2, difop(model, angles))
+    elif not model.name.startswith("pandarxt"):
+        path.with_suffix(".csv").write_text(calibration(angles))
+    return write_pcap(path, packets), blocks[: len(blocks) // model.blocks * model.blocks]
+
+
+@pytest.mark.parametrize("model", MODELS.values(), ids=[*MODELS])
+def test_what_is_written_is_read(tmp_path: Path, model: Model) -> None:
+    """A quarter of a turn: each return, in order, with its range and reflectivity to the bit."""
+    n = round(90 / model.step_deg) * (2 if model.second == "firing" else 1)
+    path, blocks = capture(tmp_path, model, n)
+    (scan,) = list(read_timed_scans(path))
+    wanted = expected(model, blocks, unit_angles(model), fires_of(model), LENS_M.get(model.name, (0.0, 0.0)))
+    assert scan.points.shape == wanted.shape
+    np.testing.assert_array_equal(scan.points[:, 3], wanted[:, 3])
+    np.testing.assert_allclose(scan.points, wanted, atol=2e-5)
+    if model.name not in LENS_M:  # the range in units is a whole number again
+        units = np.concatenate([units[units > 0] for _, units, _ in blocks])
+        read = np.linalg.norm(scan.points[:, :3].astype(np.float64), axis=1) / model.unit_m
+        np.testing.assert_array_equal(np.round(read).astype(np.int64), units)
+    assert scan.times_s is not None
+    assert scan.stamp_s == scan.times_s.max()
+    assert T0_S - 0.001 < scan.times_s.min() < scan.times_s.max() < T0_S + 1.0
+    sensor = sensor_of(path)
+    assert sensor is not None
+    assert sensor.name == model.name
+    assert sensor.elevations_deg == tuple(sorted(unit_angles(model)[:, 0].tolist(), reverse=True))
+    assert sensor.columns == round(360 / model.step_deg) * (2 if model.second == "firing" else 1)
+
+
+@pytest.mark.parametrize("name", ["pandarxt-16", "pandar64", "rs-16", "rs-airy", "helios-32"])
+def test_turns_begin_where_the_azimuth_does(tmp_path: Path, name: str) -> None:
+    model = MODELS[name]
+    per_turn = round(360 / model.step_deg) * (2 if model.second == "firing" else 1)
+    path, blocks = capture(tmp_path, model, int(2.5 * per_turn), first_deg=90.0)
+    scans = list(read_timed_scans(path))
+    azimuths = np.array([azimuth for azimuth, _, _ in blocks])
+    ends = [0, *(np.flatnonzero(np.diff(azimuths) < 0) + 1), len(blocks)]
+    assert len(scans) == len(ends) - 1 == 3
+    for scan, begin, end in zip(scans, ends[:-1], ends[1:], strict=True):
+        assert len(scan.points) == sum(int((units > 0).sum()) for _, units, _ in blocks[begin:end])
+    assert [scan.stamp_s for scan in scans] == sorted(scan.stamp_s for scan in scans)  # type: ignore[type-var]
+
+
+def test_times_go_on_within_a_packet(tmp_path: Path) -> None:
+    """0.18 degrees at 10 turns a second are 50 us; the XT states the time of its last block, others of the first."""
+    for name, index, late_us in (("pandarxt-32", -1, 6.0), ("helios-32", 0, 0.0)):
+        model = MODELS[name]
+        units = np.full((model.blocks, model.lasers), 1000)
+        folder = tmp_path / name
+        folder.mkdir()
+        said = [difop(model, unit_angles(model))] if model.layout == ">" else []
+        path = write_pcap(folder / "a.pcap", said + packets_of(model, blocks_of(model, units, units % 256)))
+        (scan,) = list(read_timed_scans(path))
+        assert scan.times_s is not None
+        firsts = scan.times_s.reshape(model.blocks, model.lasers)[:, 0]
+        np.testing.assert_allclose(np.diff(firsts), model.step_deg / 3600, atol=1e-6)
+        assert firsts[index] == pytest.approx(T0_S + 1e-6 * late_us, abs=1e-6)
+
+
+@pytest.mark.parametrize("name", ["pandar64", "pandarxt-32", "rs-32", "helios-32"])
+def test_a_second_return_is_left_out_where_it_is_the_first(tmp_path: Path, name: str) -> None:
+    """As of a Velodyne: both returns, and one of two equal ones."""
+    model = MODELS[name]
+    units, remission = ranges(model, 60)
+    other = np.where(np.arange(model.lasers) % 3 == 0, units, units // 2)
+    single = blocks_of(model, units, remission)
+    second = blocks_of(model, other, remission)
+    blocks = [block for pair in zip(single, second, strict=True) for block in pair]
+    path, _ = capture(tmp_path, model, model.blocks)
+    packets = packets_of(model, blocks)
+    write_pcap(path, [*packets, difop(model, unit_angles(model))] if model.layout == ">" else packets)
+    (scan,) = list(read_timed_scans(path))
+    used = len(packets) * model.blocks // 2
+    wanted = (units[:used] > 0).sum() + ((other[:used] != units[:used]) & (other[:used] > 0)).sum()
+    assert len(scan.points) == wanted
+
+
+def test_the_returns_of_an_rs_16_are_in_one_block(tmp_path: Path) -> None:
+    model = MODELS["rs-16"]
+    units, remission = ranges(model, 240)
+    units[1::2] = np.where(np.arange(16) % 2 == 0, units[::2], units[::2] // 2)
+    blocks = blocks_of(model, units, remission)
+    path = write_pcap(tmp_path / "a.pcap", [difop(model, unit_angles(model), is_dual=True), *packets_of(model, blocks)])
+    (scan,) = list(read_timed_scans(path))
+    firsts, seconds = units[::2], units[1::2]
+    assert len(scan.points) == (firsts > 0).sum() + ((seconds != firsts) & (seconds > 0)).sum()
+
+
+@pytest.mark.parametrize("name", ["pandar40p", "pandarqt-64", "ot128", "rs-16", "helios-32", "rs-airy"])
+def test_without_angles_it_says_what_is_missing(tmp_path: Path, name: str) -> None:
+    model = MODELS[name]
+    blocks = blocks_of(model, *ranges(model, 2 * model.blocks))
+    path = write_pcap(tmp_path / "drive.pcap", packets_of(model, blocks))
+    error = error_of(path)
+    assert f"the angles of the lasers of this {FORMATS[name].title} are not known" in error
+    assert "drive.csv" in error
+    assert ("DIFOP" in error) == (model.layout == ">")
+    (tmp_path / "drive_angles.csv").write_text(calibration(unit_angles(model)))
+    assert len(list(read_timed_scans(path))) == 1
+    (tmp_path / "drive_angles.csv").write_text(calibration(unit_angles(model)[1:]))
+    assert f"has {model.lasers - 1} rows" in error_of(path)
+
+
+def test_which_angles_are_used(tmp_path: Path) -> None:
+    """RoboSense's own, whatever lies beside; of a PandarXT those of the file, if there is one."""
+    path, _ = capture(tmp_path, MODELS["rs-32"], 24)
+    expected_scans = [scan.points for scan in read_timed_scans(path)]
+    path.with_suffix(".csv").write_text("x,y,z\n1,2,3\n")
+    for scan, points in zip(read_timed_scans(path), expected_scans, strict=True):
+        np.testing.assert_array_equal(scan.points, points)
+    model = MODELS["pandarxt-16"]
+    path, _ = capture(tmp_path, model, 24)
+    (tmp_path / "drive.csv").write_text(calibration(unit_angles(model) + np.array([0.25, 1.0])))
+    sensor = sensor_of(path)
+    assert sensor is not None
+    assert sensor.elevations_deg[0] == 15.25
+
+
+@pytest.mark.parametrize(
+    ("text", "n"),
+    [("", 0), ("a,b\n", 0), ("Channel,Elevation,Azimuth\n1,2\n", 1), ("1,nan,0\n" * 40, 40), ("\0\xff" * 99, 0)],
+)
+def test_calibrations_that_are_none(tmp_path: Path, text: str, n: int) -> None:
+    path = tmp_path / "a.csv"
+    path.write_text(text, encoding="latin-1")
+    with pytest.raises(PointsError, match=rf"a\.csv has {n} rows .*expected 40"):
+        read_angles(path, FORMATS["pandar40p"])
+
+
+def test_several_sensors_are_told_apart(tmp_path: Path) -> None:
+    model = MODELS["pandarxt-16"]
+    packets = packets_of(model, blocks_of(model, *ranges(model, 64)))
+    path = write_link(tmp_path / "two.pcap", 1, packets, one="10.0.0.1", two="10.0.0.2")
+    assert "expected one Hesai PandarXT-16, there are 10.0.0.1, 10.0.0.2; choose one" in error_of(path)
+    (scan,) = list(read_timed_scans(path, topic="10.0.0.2"))
+    (alone,) = list(read_timed_scans(write_link(tmp_path / "one.pcap", 113, packets)))
+    np.testing.assert_array_equal(scan.points, alone.points)
+
+
+OTHERS = {
+    "Hesai AT128": bytes.fromhex("eeff0403000080020004017f") + bytes(1106),
+    "Hesai QT128": bytes.fromhex("eeff03020000800200040107") + bytes(1115),
+    "Hesai XT32M": bytes.fromhex("eeff06010000200600040101") + bytes(808),
+    "Hesai sensor of 99 lasers (version 9.9": bytes.fromhex("eeff09090000630200040101") + bytes(808),
+    "RoboSense RS-Ruby": bytes.fromhex("55aa050a5aa550a0") + bytes(22) + b"\x04" + bytes(1217),
+    "RoboSense RS-Ruby Plus": bytes.fromhex("55aa055a") + bytes(27) + b"\x05" + bytes(48)
+    + b"\xfe".ljust(388, b"\0") * 3 + bytes(4),
+    "RoboSense sensor": bytes.fromhex("55aa055a") + bytes(1206),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", OTHERS)
+def test_models_that_are_not_decoded_are_named(tmp_path: Path, name: str) -> None:
+    path = write_pcap(tmp_path / "other.pcap", [OTHERS[name]] * 20)
+    assert f"a capture of a {name}" in (error := error_of(path))
+    assert "which cannot be decoded" in error
+    with pytest.raises(PointsError, match="which cannot be decoded"):
+        sensor_of(path)
+
+
+@pytest.mark.parametrize("model", MODELS.values(), ids=[*MODELS])
+def test_formats_are_told_apart(model: Model) -> None:
+    (packet, *_) = packets_of(model, blocks_of(model, *ranges(model, 2 * model.blocks)))
+    row = format_of(memoryview(packet))
+    assert row is not None
+    same = "helios-32" if model.name == "helios-16" else model.name  # which the DIFOP tells apart
+    assert row.name == same
+    assert name_of(memoryview(packet)) == FORMATS[same].title
+    for cut in (0, 5, 30, len(packet) // 2, len(packet) - 30):
+        assert format_of(memoryview(packet[:cut])) is None
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.sampled_from([*MODELS]), st.integers(0, 4), st.integers(0, 2**31))
+def test_the_kernel_as_its_slow_twin(name: str, n_packets: int, seed: int) -> None:
+    """On any bytes, and blocks that are not finite."""
+    row, rng = FORMATS[name], np.random.default_rng(seed)
+    size = row.header + row.n_blocks * row.block_bytes
+    packets = rng.integers(0, 4, (n_packets, size)).astype(np.uint8)
+    blocks = rng.choice([0.0, 10.0, 10.2, 359.0, np.nan, np.inf, 1e9], (n_packets, row.n_blocks, 3))
+    beams = rng.normal(size=(row.n_blocks, row.n_channels, 3))
+    lens = np.array([0.004, rng.choice([0.0, 90.0]), 0.04, 0.09])
+    back = [(1, 0), (2, 0), (1, row.n_channels // 2)][int(rng.integers(3))]
+    places = (row.header, row.block_bytes, row.first, row.channel_bytes, int(rng.integers(2)), row.mask, *back)
+    points = np.full((n_packets * row.n_blocks * row.n_channels, 4), 7.0, np.float32)
+    times_s = np.full(len(points), 7.0)
+    n = fill_returns(packets, np.array(places), blocks, beams, lens, points, times_s)
+    wanted, wanted_s = twins.packets.spinning_returns(packets, places, blocks, beams, lens)
+    assert n == len(wanted)
+    np.testing.assert_allclose(points[:n], wanted, rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(times_s[:n], wanted_s, rtol=1e-12, atol=1e-9)
+    assert (points[n:] == 7.0).all()
+
+
+@settings(max_examples=80, deadline=None)
+@given(st.sampled_from([*MODELS]), st.integers(0, 2**31), st.lists(st.integers(0, 1247), max_size=30))
+def test_damaged_packets_give_finite_points(name: str, seed: int, places: list[int]) -> None:
+    model, rng = MODELS[name], np.random.default_rng(seed)
+    stream = SpinningStream(FORMATS[name], Angles(unit_angles(model)))
+    packets = packets_of(model, blocks_of(model, *ranges(model, 6 * model.blocks)))
+    scans = []
+    for packet in packets:
+        damaged = bytearray(packet)
+        for at in places:
+            damaged[at % len(damaged)] = int(rng.integers(256))
+        row = format_of(memoryview(damaged))
+        if row is not None and len(damaged) == len(packet) and (name != "ot128" or row.channel_bytes == 4):
+            if name == "ot128" and not scans:
+                stream = SpinningStream(row, Angles(unit_angles(model)))
+            scans += stream.add(memoryview(damaged))
+    scans += stream.end()
+    for scan in scans:
+        assert np.isfinite(scan.points).all()
+        assert scan.times_s is not None
+        assert np.isfinite(scan.times_s).all()
+
+
+@given(st.sampled_from([name for name, model in MODELS.items() if model.layout == ">"]), st.binary(max_size=300))
+def test_difop_of_any_bytes(name: str, content: bytes) -> None:
+    model = MODELS[name]
+    whole = difop(model, unit_angles(model))
+    angles = angles_of_difop(FORMATS[name], memoryview(whole))
+    assert angles is not None
+    np.testing.assert_allclose(angles.lasers_deg, unit_angles(model), atol=1e-9)
+    assert angles_of_difop(FORMATS[name], memoryview(whole[:8] + bytes(1240))) is None
+    assert angles_of_difop(FORMATS[name], memoryview(whole[:8] + b"\xff" * 1240)) is None
+    damaged = whole[:465] + content + whole[465 + len(content) :]
+    found = angles_of_difop(FORMATS[name], memoryview(damaged))
+    assert found is None or (np.abs(found.lasers_deg) <= 90.0).all()
+
+
+def test_clocks_that_were_not_set(tmp_path: Path) -> None:
+    """Hesai's date may be all zeros, or seconds by PTP; a month may be 0."""
+    model = MODELS["pandarxt-16"]
+    (packet, *_) = packets_of(model, blocks_of(model, np.full((8, 16), 500), np.zeros((8, 16), np.int64)))
+    for date, seconds in (
+        (bytes(6), 0),
+        (b"\0\0" + struct.pack(">I", 1234567), 1234567),
+        (b"\x19\0\1\0\0\0", 1735689600),
+    ):
+        path = write_pcap(tmp_path / "a.pcap", [packet[:553] + date + packet[559:]])
+        (scan,) = list(read_timed_scans(path))
+        assert scan.stamp_s == pytest.approx(seconds, abs=1e-3)
