@@ -179,7 +179,7 @@ def scan_sensor(
     Warns UserWarning: ``--sensor`` contradicts the capture.
     """
     from ..readers.captures import is_capture, known_sensor, scan_files
-    from ..readers.identify import contradicts
+    from ..readers.identify import NotSpinningError, contradicts
     from ..types.sensor import get_sensor
 
     known: KnownSensor | None
@@ -187,6 +187,8 @@ def scan_sensor(
         unnamed: EdgepercError | None = None
         try:
             known = known_sensor(path, arguments.topic)
+        except NotSpinningError:
+            raise
         except SensorError as exc:
             unnamed, known = exc, None
         if known is not None:

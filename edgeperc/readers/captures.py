@@ -212,7 +212,7 @@ def known_sensor(path: Path, topic: str | None = None) -> KnownSensor | None:
             return of_velodyne(description["velodyne"])
         return of_cloud(description)
     except SensorError as exc:
-        raise SensorError(f"{path}: {exc}") from exc
+        raise type(exc)(f"{path}: {exc}") from exc
     except PointsError as exc:
         raise PointsError(f"{path}: {str(exc).removeprefix(f'{path}: ')}") from exc
 

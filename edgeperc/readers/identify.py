@@ -73,9 +73,13 @@ def of_packets(path: Path, topic: str | None = None) -> KnownSensor:
     return sensors[0]
 
 
-def of_livox() -> SensorError:
+class NotSpinningError(SensorError):
+    """The sensor is known, and makes no turns that could be perceived."""
+
+
+def of_livox() -> NotSpinningError:
     """What to say of Livox' sensors."""
-    return SensorError(
+    return NotSpinningError(
         "the points are of a Livox sensor, which does not spin. edgeperc.read_scans reads them, but the models know "
         f"turns of spinning sensors alone, and no profile is built in. {_CHOICES}"
     )

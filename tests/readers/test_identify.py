@@ -415,7 +415,7 @@ def test_info_tells_how_the_sensor_is_known(tmp_path: Path, capsys: pytest.Captu
     assert "do not name the model" in capsys.readouterr().err
     POINTS.tofile(tmp_path / "c.bin")
     assert run("info", tmp_path / "c.bin") == 1  # run refuses it
-    assert "hdl-64e: the default for scan files" in capsys.readouterr().out
+    assert "hdl-64e: the default: too few points to tell" in capsys.readouterr().out
 
 
 def test_a_stream_warns_of_another_sensor(tmp_path: Path) -> None:
