@@ -35,6 +35,7 @@ from edgeperc_export.recipe import MODELS, PAPER, Recipe
 from edgeperc_export.release.agree import agree
 from edgeperc_export.release.quantize import Calibration, LabeledSets, calibration_images, quantize
 from edgeperc_export.release.to_onnx import export, load, to_graph, verify
+from edgeperc_export.training import images as camvid_images
 from edgeperc_export.training.camera import Camera, class_weights
 from edgeperc_export.training.camvid import (
     ELEVEN,
@@ -215,11 +216,20 @@ def test_other_classes_are_refused(drawn: Path, tmp_path: Path) -> None:
         read_camvid(tmp_path, "train")
 
 
-def test_augmented_labels_follow_their_pixels() -> None:
-    """Each class has its own gray, so the label of an augmented pixel can be read off its unchanged color order."""
+@pytest.fixture
+def squares() -> tuple[torch.Tensor, torch.Tensor]:
+    """Images of squares with a gray for each class, and their labels."""
     rng = np.random.default_rng(0)
     labels = torch.from_numpy(np.kron(rng.integers(0, 11, (8, 6, 8)), np.ones((12, 12))).astype(np.uint8))
-    images = (labels[:, None] * 10 + 60).expand(-1, 3, -1, -1).contiguous()
+    return (labels[:, None] * 10 + 60).expand(-1, 3, -1, -1).contiguous(), labels
+
+
+def test_augmented_labels_follow_their_pixels(
+    monkeypatch: pytest.MonkeyPatch, squares: tuple[torch.Tensor, torch.Tensor]
+) -> None:
+    """Each class has its own gray, so the label of an augmented pixel can be read off its unchanged color order."""
+    monkeypatch.setattr(camvid_images, "FLAWED", 0.0)
+    images, labels = squares
     moved, truth = augmented_images(images, labels, np.random.default_rng(1))
     assert moved.shape == images.shape
     assert moved.min() >= 0.0
@@ -236,6 +246,26 @@ def test_augmented_labels_follow_their_pixels() -> None:
         assert means == sorted(means)
     again, _ = augmented_images(images, labels, np.random.default_rng(1))
     assert torch.equal(moved, again)
+
+
+def test_images_are_blurred_and_get_noise(
+    monkeypatch: pytest.MonkeyPatch, squares: tuple[torch.Tensor, torch.Tensor]
+) -> None:
+    images, labels = squares
+    drawn = {}
+    for share in (0.0, 0.5, 1.0):
+        monkeypatch.setattr(camvid_images, "FLAWED", share)
+        drawn[share], truth = augmented_images(images, labels, np.random.default_rng(3))
+        assert drawn[share].min() >= 0.0
+        assert drawn[share].max() <= 255.0
+        again, same = augmented_images(images, labels, np.random.default_rng(3))
+        assert torch.equal(drawn[share], again)
+        assert torch.equal(truth, same)
+    apart = [(drawn[share] - drawn[0.0]).abs().amax((1, 2, 3)) for share in (0.5, 1.0)]
+    assert 0 < int((apart[0] == 0.0).sum()) < len(images)  # some images are not disturbed
+    assert (apart[1] > 1.0).all()
+    means = [drawn[share].mean((1, 2, 3)) for share in (0.0, 1.0)]
+    assert (means[0] - means[1]).abs().max() < 3.0  # noise and blur change no image as a whole
 
 
 def test_each_epoch_draws_each_image_once(drawn: Path) -> None:
