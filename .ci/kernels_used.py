@@ -29,10 +29,13 @@ def decode_packets() -> None:
 
 
 def run() -> None:
-    """Perceive, track and map simulated scans in every usual set-up, and run the demo."""
+    """Perceive, track and map simulated scans in every usual set-up, run the demo, and find a sensor."""
     with tempfile.TemporaryDirectory() as folder:
         main(["demo", "--out", folder])
     decode_packets()
+    with tempfile.TemporaryDirectory() as folder:  # a sensor that is found
+        simulated_scan(1, "hdl-64e").points.tofile(f"{folder}/scan.bin")
+        main(["run", f"{folder}/scan.bin"])
     for name, set_up in itertools.product(("hdl-64e", "vlp-16"), SET_UPS):
         perceive, tracker = edgeperc.Perceiver(sensor=name, on_mismatch="ignore", **set_up), edgeperc.Tracker()
         scans = [simulated_scan(seed, name).points for seed in (1, 2)]
