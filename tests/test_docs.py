@@ -214,3 +214,23 @@ def test_pages_of_the_documentation_are_reachable() -> None:
             }
     pages = {page for page in PAGES if page.is_relative_to(REPOSITORY / "docs")} - {REPOSITORY / "docs" / "index.md"}
     assert pages == listed
+
+
+def test_programs_pass_strict_typing(tmp_path: Path) -> None:
+    """The blocks of a page, one below the other, as a program of a stranger who checks types strictly."""
+    mypy = pytest.importorskip("mypy.api")
+    for page in PYTHON_PAGES:
+        name = "_".join(page.relative_to(REPOSITORY).with_suffix("").parts).replace("-", "_")
+        (tmp_path / f"{name}.py").write_text("\n".join(block.text for block in blocks_of(page, "python")), "utf-8")
+    (tmp_path / "wrong.py").write_text("import edgeperc\n\nedgeperc.Perceiver()(image=None).points.counts()\n", "utf-8")
+    (tmp_path / "mypy.ini").write_text(
+        f"[mypy]\nstrict = True\nmypy_path = {REPOSITORY.as_posix()}\nfollow_imports = silent\n"
+        "ignore_missing_imports = True\n"  # edgeperc.zoo and edgeperc_export lie elsewhere in a checkout
+    )
+    said, faults, code = mypy.run(["--config-file", str(tmp_path / "mypy.ini"), *map(str, tmp_path.glob("*.py"))])
+    assert not faults
+    errors = [line for line in said.splitlines() if ": error:" in line]
+    assert code == 1
+    assert len(errors) == 1, said
+    assert "wrong.py" in errors[0]
+    assert "union-attr" in errors[0]

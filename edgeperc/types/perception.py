@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields, replace
 from types import MappingProxyType
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import PointsError
+from ..errors import ModelError, PointsError
 from ..system.fields import Fields
 from .mounting import MODEL_MOUNTING, Mounting
 from .points import Labels, Mask
@@ -19,6 +19,7 @@ from .views import TopViewGeometry
 
 _FIELDS = Fields("box", PointsError, "write it with Box.to_dict", optional=("front",))
 _PART = 2**20
+_Part = TypeVar("_Part")
 ROADS = ("drivable", "road")  # names of classes of an image on which a vehicle may drive, in lower case
 
 
@@ -327,6 +328,22 @@ class Perception:
     ground: GroundSurface | None = None
     origin_m: tuple[float, float, float] | None = None
 
+    def require_points(self) -> PointLabels:
+        """``points``; `ModelError`, which names the model to add, if it is None."""
+        return _required(self.points, "no class for every point", "pointseg")
+
+    def require_top_view(self) -> TopView:
+        """``top_view``; `ModelError`, which names the model to add, if it is None."""
+        return _required(self.top_view, "no top view", "ssadnet")
+
+    def require_image(self) -> ImageLabels:
+        """``image``; `ModelError`, which names the model to add, if it is None."""
+        return _required(self.image, "no labels of an image", "camseg", "and pass image=")
+
+    def require_ground(self) -> GroundSurface:
+        """``ground``; `ModelError`, which names the model to add, if it is None."""
+        return _required(self.ground, "no ground", "pointseg", "and leave agree=True")
+
     def to_map(self, points: NDArray[Any]) -> NDArray[np.float64]:
         """Coordinates of points of the scan in the map, x, y, z [m], (n, 3) float64; exact, unlike float32.
 
@@ -392,6 +409,16 @@ class Perception:
 
 
 _VIEWS = ("stage_ms", "providers")
+
+
+def _required(part: _Part | None, lacks: str, model: str, also: str = "") -> _Part:
+    """A part of a perception that its models need not give."""
+    if part is None:
+        raise ModelError(
+            f"the perception has {lacks}: no model that ran on this scan gives it; add {model!r} to the models of the "
+            f"Perceiver {also}".rstrip()
+        )
+    return part
 
 
 def _with_views(values: dict[str, Any]) -> Perception:
