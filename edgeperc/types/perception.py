@@ -164,8 +164,13 @@ class PointLabels:
     in_view: Mask
     classes: tuple[str, ...]
 
+    @property
+    def n_in_view(self) -> int:
+        """Number of points in view, which `counts` counts; by default the network sees the quarter turn ahead."""
+        return int(np.count_nonzero(self.in_view))
+
     def counts(self) -> dict[str, int]:
-        """Number of points in view, by class."""
+        """Number of points by class, of the `n_in_view` points in view."""
         counted = np.bincount(self.labels[self.in_view], minlength=len(self.classes))
         return {name: int(counted[k]) for k, name in enumerate(self.classes)}
 
@@ -380,8 +385,8 @@ class Perception:
         -------
         dict
             ``stamp_s``, ``n_points``, ``n_dropped``, ``dropped`` (by kind), ``stage_ms``, ``providers``, ``boxes``
-            (`Box.to_dict`), ``drivable_area_m2``, ``point_counts``, ``fitness``, ``mounting``, ``remission``,
-            ``image`` (`ImageLabels.to_dict`), ``origin_m`` and ``map_boxes``. Every key is always present; its value is
+            (`Box.to_dict`), ``drivable_area_m2``, ``point_counts``, ``n_in_view`` (their sum),
+            ``fitness``, ``mounting``, ``remission``, ``image`` (`ImageLabels.to_dict`), ``origin_m`` and ``map_boxes``. Every key is always present; its value is
             None if no model of that kind ran, if remission was only scaled, or if the place in a map was not given.
         """
         return {
@@ -394,6 +399,7 @@ class Perception:
             "boxes": [box.to_dict() for box in self.boxes],
             "drivable_area_m2": None if self.top_view is None else round(self.top_view.drivable_area_m2, 2),
             "point_counts": None if self.points is None else self.points.counts(),
+            "n_in_view": None if self.points is None else self.points.n_in_view,
             "fitness": list(self.fitness),
             "mounting": self.mounting.to_dict(),
             "remission": None if self.remission is None else asdict(self.remission),

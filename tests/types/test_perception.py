@@ -96,12 +96,13 @@ def test_perception_as_json_counts_points_by_class() -> None:
     assert json.loads(json.dumps(document, allow_nan=False)) == document
     assert document["stamp_s"] == 12.5
     assert document["point_counts"] == {"background": 1, "car": 2}
+    assert document["n_in_view"] == sum(document["point_counts"].values()) == 3
     assert document["drivable_area_m2"] == 320.0
     assert document["boxes"] == [CAR.to_dict()]
     assert document["stage_ms"] == {"infer": 1.235}
     empty = perception_of(labels=False).to_dict()
     assert empty.keys() == document.keys()
-    assert empty["point_counts"] is empty["drivable_area_m2"] is empty["stamp_s"] is None
+    assert empty["point_counts"] is empty["n_in_view"] is empty["drivable_area_m2"] is empty["stamp_s"] is None
 
 
 COPIES: dict[str, Callable[[Any], Any]] = {
