@@ -261,7 +261,12 @@ def _add_export(commands: Commands) -> None:
     export.add_argument("checkpoint", type=Path, help="checkpoint.pt of a training run")
     export.add_argument("out", type=Path, help=".onnx file to write; not written if torch and onnxruntime disagree")
     export.add_argument("--scans", type=Path, nargs="*", default=[], help=PROOF)
-    export.add_argument("--kitti", type=Path, help=f"{KITTI}; the card describes its scans, for the check of inputs")
+    export.add_argument(
+        "--kitti",
+        type=Path,
+        help=f"{KITTI}; of a checkpoint that does not describe its real scans, the card describes these, for the check "
+        "of inputs",
+    )
     export.add_argument("--metrics", type=Path, help="JSON file of edgeperc eval --json, to write into the card")
     export.add_argument("--name", help="name of the model (default: the network's)")
     _add_shared(export, "--model-version")
@@ -279,12 +284,13 @@ def _export(args: argparse.Namespace) -> int:
     from .training.checkpoint import read_checkpoint
 
     metrics = json.loads(args.metrics.read_text()) if args.metrics else None
-    task = read_checkpoint(args.checkpoint)["recipe"].task
+    trained = read_checkpoint(args.checkpoint)
+    task = trained["recipe"].task
     card = export(
         args.checkpoint,
         args.out,
         scans=parity_images(args.scans) if task == "camera" else parity_scans(args.scans),
-        fitness=None if task in ("camera", "objects") else fitness_of(args.kitti),
+        fitness=None if task in ("camera", "objects") else trained["fitness"] or fitness_of(args.kitti),
         name=args.name,
         version=args.model_version,
         metrics=metrics,
