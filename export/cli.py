@@ -96,7 +96,7 @@ def _add_shared(parser: argparse._ActionsContainer, *options: str) -> None:
 
 
 def _model_file(text: str) -> Path:
-    """The file of a model, by its path or by a name from 'edgeperc models'; of a network with variants, that in fp32."""
+    """The file of a model, by its path or by a name from 'edgeperc models', whose fp32 file is taken."""
     path = Path(text)
     if path.suffix or len(path.parts) > 1 or path.exists():
         return path
@@ -211,8 +211,8 @@ def _add_train(commands: Commands) -> None:
     train.add_argument(
         "--teacher",
         type=_model_file,
-        help="checkpoint.pt, model.onnx or name of the network to distil from; with --distil 0, checkpoint.pt of one that "
-        "labels the unlabeled points",
+        help="checkpoint.pt, model.onnx or name of the network to distil from; with --distil 0, checkpoint.pt of one "
+        "that labels the unlabeled points",
     )
     _add_shared(train, "--threads", "--workers")
     train.add_argument(

@@ -66,7 +66,7 @@ PYTHON_PAGES = [page for page in PAGES if blocks_of(page, "python")]
 def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with what the pages speak of: a scan, a drive, a stream, the research models."""
     folder = tmp_path_factory.mktemp("docs")
-    for name in ("scan.bin", "drive/0.bin", "drive/1.bin", "velodyne/0.bin", "velodyne/1.bin"):
+    for name in ("scan.bin", "demo/scan.bin", "drive/0.bin", "drive/1.bin", "velodyne/0.bin", "velodyne/1.bin"):
         seed = 4 + len(name)
         (folder / name).parent.mkdir(exist_ok=True)
         urban(seed).points.tofile(folder / name)
@@ -80,6 +80,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
         camera = forward_camera()
         scan = urban(12)
         Image.fromarray(render(scan.scene, camera, scan.T_world_sensor, 12).rgb).save(folder / "image.png")
+        (folder / "demo/image.png").write_bytes((folder / "image.png").read_bytes())
     (folder / "T_vehicle_sensor.json").write_text("[[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 1.7], [0, 0, 0, 1]]")
     if sys.platform != "win32":
         (folder / "models").symlink_to(REPOSITORY / "models")
@@ -195,6 +196,19 @@ def test_the_readme_is_read_in_a_minute() -> None:
     assert readme.count("\n") <= 130
     (example,) = re.findall(r"```python\n(.*?)```", readme, flags=re.DOTALL)
     assert len([line for line in example.splitlines() if line.strip()]) <= 10
+
+
+def test_what_the_readme_installs_runs_what_it_shows() -> None:
+    """Each extra that an option or an image in its commands needs is in its own line of installation."""
+    commands = [line for block, line in COMMANDS if block.page.name == "README.md"]
+    (install,) = [line for line in commands if line.startswith("pip")]
+    needs = {"--png": "view", "--gif": "view", "--mcap": "foxglove", "--rrd": "rerun", "--bag": "ros", ".png": "view"}
+    wanted = {extra for line in commands for word, extra in needs.items() if word in line}
+    assert wanted == {"view", "foxglove"}
+    assert wanted <= wanted_extras(install)
+    for line in commands:
+        if line.startswith(("edgeperc run", "edgeperc info")):
+            assert " demo/" in line, f"{line}: what edgeperc demo leaves is there to try it on"
 
 
 def test_files_named_in_contributing_are_there() -> None:

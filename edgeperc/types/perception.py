@@ -386,8 +386,9 @@ class Perception:
         dict
             ``stamp_s``, ``n_points``, ``n_dropped``, ``dropped`` (by kind), ``stage_ms``, ``providers``, ``boxes``
             (`Box.to_dict`), ``drivable_area_m2``, ``point_counts``, ``n_in_view`` (their sum),
-            ``fitness``, ``mounting``, ``remission``, ``image`` (`ImageLabels.to_dict`), ``origin_m`` and ``map_boxes``. Every key is always present; its value is
-            None if no model of that kind ran, if remission was only scaled, or if the place in a map was not given.
+            ``fitness``, ``mounting``, ``remission``, ``image`` (`ImageLabels.to_dict`), ``origin_m`` and
+            ``map_boxes``. Every key is always present; its value is None if no model of that kind ran, if
+            remission was only scaled, or if the place in a map was not given.
         """
         return {
             "stamp_s": self.stamp_s,

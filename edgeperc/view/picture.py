@@ -304,7 +304,9 @@ def _draw_range_image(
 ) -> None:
     """Draw a part of the turn as a range image. It is only a picture, not the projection of a network."""
     axes = add_axes(figure, *place)
-    write_heading(figure, place[0], place[1] - 20, "as the sensor sees it", f"{_PARTS[turn_deg]}, a class for every point")
+    write_heading(
+        figure, place[0], place[1] - 20, "as the sensor sees it", f"{_PARTS[turn_deg]}, a class for every point"
+    )
     x, y, z = points[:, :3].astype(np.float64).T
     range_m = np.sqrt(x * x + y * y + z * z)
     azimuth = np.degrees(np.arctan2(y, x))

@@ -30,9 +30,9 @@ def read_checkpoint(path: Path, device: str | torch.device = "cpu") -> dict[str,
     """Read a checkpoint. Only tensors and plain values are unpickled.
 
     device : str or torch.device; where its tensors go.
-    Returns: ``recipe`` (a Recipe), ``before`` and ``curve`` (lists), ``frames`` (dict), ``fitness`` (a FitnessProfile of
-        the real scans; None without one, or of an earlier version), ``n_simulated`` and ``step`` (int), ``averaged`` and ``best`` (weights by name; None if there was no best step), ``network`` and
-        ``optimizer``.
+    Returns: ``recipe`` (a Recipe), ``before`` and ``curve`` (lists), ``frames`` (dict), ``fitness`` (a FitnessProfile
+        of the real scans; None without one, or of an earlier version), ``n_simulated`` and ``step`` (int), ``averaged``
+        and ``best`` (weights by name; None if there was no best step), ``network`` and ``optimizer``.
     Raises CheckpointError, OSError.
     """
     try:

@@ -247,10 +247,10 @@ def test_excluded_nodes_stay_in_fp32(tmp_path: Path, small: Path, scans: list[np
 
 
 @pytest.mark.parametrize("limit", [1e-30, 0.0, -1.0])
-def test_no_layer_below_the_limit_is_said(
-    tmp_path: Path, small: Path, scans: list[np.ndarray], limit: float
-) -> None:
-    with pytest.raises(RefusedError, match=r"no layer became int8: .* of 3 layers alone, \S+, makes noise of \d.*limit"):
+def test_no_layer_below_the_limit_is_said(tmp_path: Path, small: Path, scans: list[np.ndarray], limit: float) -> None:
+    with pytest.raises(
+        RefusedError, match=r"no layer became int8: .* of 3 layers alone, \S+, makes noise of \d.*limit"
+    ):
         quantize(small, tmp_path / "int8.onnx", Calibration(scans), ONE, max_noise=limit, race=FASTER)
 
 
