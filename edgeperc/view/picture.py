@@ -218,8 +218,8 @@ def _draw_top_view(
     (x_near, x_far), (y_right, y_left) = top_view.x_range_m, top_view.y_range_m
     low, high, right, left = min(-2.5, x_near - 2.5), x_far + 2.0, y_right - 4.0, y_left + 4.0
     if any(box.center[0] < low for box in boxes):
-        reach, beside = _AROUND_M
-        low, high, right, left = min(low, -reach), max(high, reach), min(right, -beside), max(left, beside)
+        along, across = _AROUND_M
+        low, high, right, left = min(low, -along), max(high, along), min(right, -across), max(left, across)
     px_per_m = min((_BOTTOM - _TOP) / (high - low), 560.0 / (left - right))
     width = px_per_m * (left - right)
     axes = add_axes(figure, _MARGIN + _AXIS, _TOP, width, px_per_m * (high - low))
