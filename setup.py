@@ -1,11 +1,19 @@
-"""What pyproject.toml cannot say: a wheel with compiled kernels is for one platform, and needs no numba."""
+"""What pyproject.toml cannot say.
 
+A wheel with compiled kernels is for one platform, and needs no numba. A release names its repository; package indexes
+then show the readme with links into it.
+"""
+
+import os
+import re
 from pathlib import Path
 
 from setuptools import Distribution, setup
 
 NUMBA = "numba>=0.59,<0.69"
 HAS_KERNELS = any(file.suffix in (".so", ".pyd") for file in Path("edgeperc/system/compiled").glob("*"))
+# Such as https://github.com/OWNER/NAME, without a slash at its end; empty: no addresses, and links as in the checkout.
+REPOSITORY = os.environ.get("EDGEPERC_REPOSITORY", "")
 
 
 class Package(Distribution):
@@ -16,4 +24,22 @@ class Package(Distribution):
         return HAS_KERNELS
 
 
-setup(distclass=Package, install_requires=["numpy>=1.24", *([] if HAS_KERNELS else [NUMBA])])
+def readme() -> str:
+    """The readme; its links lead to the files of this version in the repository."""
+    text = Path("README.md").read_text("utf-8")
+    if not REPOSITORY:
+        return text
+    (version,) = re.findall(r'^__version__ = "(.+)"$', Path("edgeperc/__init__.py").read_text("utf-8"), re.MULTILINE)
+    text = re.sub(r"(!\[[^\]]*\]\()(?!\w+:)", rf"\1{REPOSITORY}/raw/v{version}/", text)
+    return re.sub(r"((?<!!)\[[^\]]*\]\()(?!\w+:|#)", rf"\1{REPOSITORY}/blob/v{version}/", text)
+
+
+PAGES = {"Source": "", "Issues": "/issues", "Changes": "/blob/main/CHANGELOG.md"}
+
+setup(
+    distclass=Package,
+    install_requires=["numpy>=1.24", *([] if HAS_KERNELS else [NUMBA])],
+    long_description=readme(),
+    long_description_content_type="text/markdown",
+    project_urls={name: f"{REPOSITORY}{page}" for name, page in PAGES.items()} if REPOSITORY else {},
+)

@@ -22,7 +22,34 @@ def sections(document: Mapping[str, Any]) -> list[Section]:
         parts.append(Section(table["title"], table["sentences"], [table["head"], *table["rows"]]))
     if document.get("soak"):
         parts.append(Section("Memory over a long run", document["soak"]["sentences"]))
-    return [*parts, *_context(document)]
+    verdicts = [verdict(setting) for setting in document.get("settings", ()) if document["kind"] == "run"]
+    return [*parts, *_context(document), *(Section("Verdict", [sentence]) for sentence in verdicts if sentence)]
+
+
+def verdict(setting: Mapping[str, Any]) -> str:
+    """One sentence: which rates of a sensor a setting keeps, and with how much to spare; empty without any sample.
+
+    A rate is kept if every result was complete before the next scan arrived; what is spare, is spare of 99 % of the
+    results, or of all if they are too few for that percentile. Without a paced scenario, 10 Hz is judged by scans
+    back to back.
+    """
+    figures = {name: latency(setting, name) for name in scenario_names(setting)}
+    judged = [t for t in figures.values() if t["rate_hz"]] or [*figures.values()][:1]
+    parts = []
+    for t in judged:
+        rate_hz, n = t["rate_hz"] or 10.0, t["n"] + t["skipped"]
+        slow_ms = t["age"]["max"] if t["age"]["p99"] is None else t["age"]["p99"]
+        if slow_ms is None:
+            continue
+        spare, late = 1.0 - slow_ms * rate_hz / 1e3, t["missed"] + t["skipped"]
+        if late == 0 and spare >= 0.0:
+            parts.append(f"keeps {rate_hz:g} Hz with {100.0 * spare:.0f} % to spare")
+        elif late:
+            parts.append(f"does not keep {rate_hz:g} Hz: {late:,} of {n:,} scans were answered late or skipped")
+        else:
+            parts.append(f"does not keep {rate_hz:g} Hz: a scan takes {slow_ms:.0f} ms of {1e3 / rate_hz:.0f}")
+    back_to_back = " (judged by scans back to back)" if parts and not judged[0]["rate_hz"] else ""
+    return f"{setting_label(setting)}: {'; '.join(parts)}{back_to_back}" if parts else ""
 
 
 def _reliability(document: Mapping[str, Any]) -> Section:

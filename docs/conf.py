@@ -17,6 +17,7 @@ extensions = [
     "sphinxarg.ext",
 ]
 exclude_patterns = ["_build"]
+templates_path = ["_templates"]
 html_theme = "furo"
 html_title = f"edgeperc {version}"
 

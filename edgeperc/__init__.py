@@ -64,7 +64,7 @@ if TYPE_CHECKING:
     from .types.card import ModelCard
     from .types.frame import ModelFrame
     from .types.mounting import Mounting
-    from .types.perception import Box, DroppedPoints, ImageLabels, Perception, PointLabels, TopView
+    from .types.perception import Box, DroppedPoints, GroundSurface, ImageLabels, Perception, PointLabels, TopView
     from .types.sensor import SensorProfile
     from .view import draw
 
@@ -80,6 +80,7 @@ __all__ = [
     "EdgepercError",
     "FitnessError",
     "FreeAhead",
+    "GroundSurface",
     "ImageError",
     "ImageLabels",
     "InferenceError",
@@ -150,6 +151,7 @@ MODULES = {
     "Line": "tracking.zones",
     "Calibration": "camera.calibration",
     "FreeAhead": "road.ahead",
+    "GroundSurface": "types.perception",
     "ModelCard": "types.card",
     "ModelFrame": "types.frame",
     "ModelInfo": "inference.listing",

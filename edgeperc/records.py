@@ -32,6 +32,7 @@ SCAN_KEYS = (
     "drivable_area_m2",
     "road",
     "point_counts",
+    "n_in_view",
     "tracks",
     "fitness",
     "mounting",

@@ -95,6 +95,19 @@ def _add_shared(parser: argparse._ActionsContainer, *options: str) -> None:
         parser.add_argument(option, **SHARED[option])
 
 
+def _model_file(text: str) -> Path:
+    """The file of a model, by its path or by a name from 'edgeperc models', whose fp32 file is taken."""
+    path = Path(text)
+    if path.suffix or len(path.parts) > 1 or path.exists():
+        return path
+    from edgeperc.zoo import model_path
+
+    try:
+        return model_path(text)
+    except EdgepercError as exc:
+        raise argparse.ArgumentTypeError(str(exc)) from exc
+
+
 # --- recipes ----------------------------------------------------------------------------------------------------------
 
 
@@ -191,13 +204,15 @@ def _add_train(commands: Commands) -> None:
         help=f"source of the options not given below: the defaults shown, or the network's paper ({', '.join(PAPER)})",
     )
     train.add_argument(
-        "--start-from", type=Path, help="checkpoint.pt, or fp32 model.onnx, whose weights the run starts from"
+        "--start-from",
+        type=_model_file,
+        help="checkpoint.pt, fp32 model.onnx, or name of a model such as pointseg, whose weights the run starts from",
     )
     train.add_argument(
         "--teacher",
-        type=Path,
-        help="checkpoint.pt or model.onnx of the network to distil from; with --distil 0, checkpoint.pt of one that "
-        "labels the unlabeled points",
+        type=_model_file,
+        help="checkpoint.pt, model.onnx or name of the network to distil from; with --distil 0, checkpoint.pt of one "
+        "that labels the unlabeled points",
     )
     _add_shared(train, "--threads", "--workers")
     train.add_argument(
@@ -246,7 +261,12 @@ def _add_export(commands: Commands) -> None:
     export.add_argument("checkpoint", type=Path, help="checkpoint.pt of a training run")
     export.add_argument("out", type=Path, help=".onnx file to write; not written if torch and onnxruntime disagree")
     export.add_argument("--scans", type=Path, nargs="*", default=[], help=PROOF)
-    export.add_argument("--kitti", type=Path, help=f"{KITTI}; the card describes its scans, for the check of inputs")
+    export.add_argument(
+        "--kitti",
+        type=Path,
+        help=f"{KITTI}; of a checkpoint that does not describe its real scans, the card describes these, for the check "
+        "of inputs",
+    )
     export.add_argument("--metrics", type=Path, help="JSON file of edgeperc eval --json, to write into the card")
     export.add_argument("--name", help="name of the model (default: the network's)")
     _add_shared(export, "--model-version")
@@ -264,12 +284,13 @@ def _export(args: argparse.Namespace) -> int:
     from .training.checkpoint import read_checkpoint
 
     metrics = json.loads(args.metrics.read_text()) if args.metrics else None
-    task = read_checkpoint(args.checkpoint)["recipe"].task
+    trained = read_checkpoint(args.checkpoint)
+    task = trained["recipe"].task
     card = export(
         args.checkpoint,
         args.out,
         scans=parity_images(args.scans) if task == "camera" else parity_scans(args.scans),
-        fitness=None if task in ("camera", "objects") else fitness_of(args.kitti),
+        fitness=None if task in ("camera", "objects") else trained["fitness"] or fitness_of(args.kitti),
         name=args.name,
         version=args.model_version,
         metrics=metrics,
@@ -282,7 +303,7 @@ def _export(args: argparse.Namespace) -> int:
 def _add_verify(commands: Commands) -> None:
     verify = commands.add_parser("verify", help="compare an .onnx model with its checkpoint")
     verify.add_argument("checkpoint", type=Path, help="checkpoint.pt that the model was exported from")
-    verify.add_argument("model", type=Path, help=".onnx file")
+    verify.add_argument("model", type=_model_file, help=".onnx file, or name of a model")
     verify.add_argument("--scans", type=Path, nargs="*", default=[], help=PROOF)
     verify.set_defaults(run=_verify)
 
@@ -329,7 +350,7 @@ def _add_quantize(commands: Commands) -> None:
     quantize = commands.add_parser(
         "quantize", help="make an int8 model, if it is faster on this computer and as accurate"
     )
-    quantize.add_argument("model", type=Path, help=".onnx file of the fp32 model")
+    quantize.add_argument("model", type=_model_file, help=".onnx file, or name, of the fp32 model")
     quantize.add_argument("out", type=Path, help=".onnx file to write")
     quantize.add_argument(
         "--scans", type=Path, nargs="*", default=[], help="scans, or folders of .bin, to calibrate on"
@@ -479,7 +500,11 @@ def _add_ablate(commands: Commands) -> None:
     scans = ablate.add_argument_group("variants of a network")
     _add_shared(scans, "--kitti")
     scans.add_argument("--simulated", type=Path, help="folder of scans from edgeperc-export simulate")
-    scans.add_argument("--start-from", type=Path, help="checkpoint.pt of NETWORK-sim; lodnn starts from random weights")
+    scans.add_argument(
+        "--start-from",
+        type=_model_file,
+        help="checkpoint.pt, .onnx file or name of NETWORK-sim; lodnn starts from random weights",
+    )
     scans.add_argument("--fold", type=int, default=0, help="fold of the training drives to evaluate on (default 0)")
     scans.add_argument("--steps", type=int, default=150, help="training steps of each run (default 150)")
     scans.add_argument("--plot", type=Path, metavar="PNG", help="also draw the results (lodnn only)")

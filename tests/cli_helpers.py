@@ -24,7 +24,10 @@ POINTSEG = ModelCard(
         "drives": ["a", "b"],
         "seen": dict.fromkeys("abcdefghijklmnopqrstuvwxyz", 0),
     },
-    metrics={"real": {"n_frames": 21, "points": {"all": {"car": {"iou": 0.65123, "n_objects": 3}}}}},
+    metrics={
+        "split": "test",
+        "real": {"n_frames": 21, "n_drives": 3, "points": {"all": {"car": {"iou": 0.65123, "n_objects": 3}}}},
+    },
     parity={"max_abs_diff": 1.5e-5},
     precisions={"int8": {"label_agreement": 0.99953, "loss": 0.1}},
 )

@@ -66,7 +66,7 @@ PYTHON_PAGES = [page for page in PAGES if blocks_of(page, "python")]
 def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with what the pages speak of: a scan, a drive, a stream, the research models."""
     folder = tmp_path_factory.mktemp("docs")
-    for name in ("scan.bin", "drive/0.bin", "drive/1.bin", "velodyne/0.bin", "velodyne/1.bin"):
+    for name in ("scan.bin", "demo/scan.bin", "drive/0.bin", "drive/1.bin", "velodyne/0.bin", "velodyne/1.bin"):
         seed = 4 + len(name)
         (folder / name).parent.mkdir(exist_ok=True)
         urban(seed).points.tofile(folder / name)
@@ -80,6 +80,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
         camera = forward_camera()
         scan = urban(12)
         Image.fromarray(render(scan.scene, camera, scan.T_world_sensor, 12).rgb).save(folder / "image.png")
+        (folder / "demo/image.png").write_bytes((folder / "image.png").read_bytes())
     (folder / "T_vehicle_sensor.json").write_text("[[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 1.7], [0, 0, 0, 1]]")
     if sys.platform != "win32":
         (folder / "models").symlink_to(REPOSITORY / "models")
@@ -197,6 +198,19 @@ def test_the_readme_is_read_in_a_minute() -> None:
     assert len([line for line in example.splitlines() if line.strip()]) <= 10
 
 
+def test_what_the_readme_installs_runs_what_it_shows() -> None:
+    """Each extra that an option or an image in its commands needs is in its own line of installation."""
+    commands = [line for block, line in COMMANDS if block.page.name == "README.md"]
+    (install,) = [line for line in commands if line.startswith("pip")]
+    needs = {"--png": "view", "--gif": "view", "--mcap": "foxglove", "--rrd": "rerun", "--bag": "ros", ".png": "view"}
+    wanted = {extra for line in commands for word, extra in needs.items() if word in line}
+    assert wanted == {"view", "foxglove"}
+    assert wanted <= wanted_extras(install)
+    for line in commands:
+        if line.startswith(("edgeperc run", "edgeperc info")):
+            assert " demo/" in line, f"{line}: what edgeperc demo leaves is there to try it on"
+
+
 def test_files_named_in_contributing_are_there() -> None:
     """The table "to change X, open Y"."""
     text = (REPOSITORY / "CONTRIBUTING.md").read_text("utf-8")
@@ -214,3 +228,23 @@ def test_pages_of_the_documentation_are_reachable() -> None:
             }
     pages = {page for page in PAGES if page.is_relative_to(REPOSITORY / "docs")} - {REPOSITORY / "docs" / "index.md"}
     assert pages == listed
+
+
+def test_programs_pass_strict_typing(tmp_path: Path) -> None:
+    """The blocks of a page, one below the other, as a program of a stranger who checks types strictly."""
+    mypy = pytest.importorskip("mypy.api")
+    for page in PYTHON_PAGES:
+        name = "_".join(page.relative_to(REPOSITORY).with_suffix("").parts).replace("-", "_")
+        (tmp_path / f"{name}.py").write_text("\n".join(block.text for block in blocks_of(page, "python")), "utf-8")
+    (tmp_path / "wrong.py").write_text("import edgeperc\n\nedgeperc.Perceiver()(image=None).points.counts()\n", "utf-8")
+    (tmp_path / "mypy.ini").write_text(
+        f"[mypy]\nstrict = True\nmypy_path = {REPOSITORY.as_posix()}\nfollow_imports = silent\n"
+        "ignore_missing_imports = True\n"  # edgeperc.zoo and edgeperc_export lie elsewhere in a checkout
+    )
+    said, faults, code = mypy.run(["--config-file", str(tmp_path / "mypy.ini"), *map(str, tmp_path.glob("*.py"))])
+    assert not faults
+    errors = [line for line in said.splitlines() if ": error:" in line]
+    assert code == 1
+    assert len(errors) == 1, said
+    assert "wrong.py" in errors[0]
+    assert "union-attr" in errors[0]

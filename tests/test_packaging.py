@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import ast
+import email
+import os
 import re
 import shutil
 import subprocess
@@ -148,7 +150,7 @@ def test_the_container_gets_all_that_the_wheel_is_built_from() -> None:
     kept = {line[1:] for line in lines if line.startswith("!")}
     assert lines[1] == "*"
     folders = {path.partition("/")[0] for path in SETUPTOOLS["package-dir"].values()}
-    files = {"pyproject.toml", "MANIFEST.in", PROJECT["readme"], *PROJECT["license-files"]}
+    files = {"pyproject.toml", "MANIFEST.in", "README.md", *PROJECT["license-files"]}
     assert kept == folders | files
     assert (REPOSITORY / ".dockerignore").read_text("utf-8") == "\n".join(lines) + "\n"
 
@@ -169,3 +171,101 @@ def test_the_tools_read_the_same_folders_as_the_tests() -> None:
     text = (REPOSITORY / "pyproject.toml").read_text("utf-8")
     assert f'include = ["pyproject.toml", "{{{",".join(sorted(FOLDERS))}}}/**/*.py"]' in text
     assert {path.partition("/")[0] for path in SETUPTOOLS["package-dir"].values()} <= {*FOLDERS}
+
+
+REPOSITORIES = ["https://example.org/some/one", "https://git.example.org/lidar/edgeperc", ""]
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no symbolic links")
+@pytest.mark.parametrize("repository", REPOSITORIES)
+def test_a_release_names_its_repository(repository: str, tmp_path: Path) -> None:
+    """All addresses, and the links of the readme, come from one variable; without it there are none."""
+    for name in ("pyproject.toml", "setup.py", "README.md", "LICENSE", "edgeperc", "models", "bench", "export"):
+        (tmp_path / name).symlink_to(REPOSITORY / name)
+    code = "from setuptools.build_meta import prepare_metadata_for_build_wheel as made; made('.')"
+    environment = {**os.environ, "EDGEPERC_REPOSITORY": repository}
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr[-2000:]
+    (file,) = tmp_path.glob("*.dist-info/METADATA")
+    metadata = email.message_from_string(file.read_text("utf-8"))
+    readme = str(metadata.get_payload())
+    assert metadata["Author"] == "The edgeperc developers"
+    assert metadata["Description-Content-Type"] == "text/markdown"
+    links = [link for link in re.findall(r"\]\(([^)#]+)\)", readme) if not link.startswith(("http", "mailto:"))]
+    urls = metadata.get_all("Project-URL") or []
+    if not repository:
+        assert readme.strip() == (REPOSITORY / "README.md").read_text("utf-8").strip()
+        assert (links != [], urls) == (True, [])
+        return
+    assert not links
+    assert len(urls) == 3
+    assert all(f", {repository}" in url for url in urls)
+    version = edgeperc.__version__
+    assert (
+        f"![A simulated street: drivable area, boxes of every class, labeled points]({repository}/raw/v{version}/"
+        in readme
+    )
+    assert f"[Quick start]({repository}/blob/v{version}/docs/quickstart.md)" in readme
+
+
+def test_the_workflow_names_its_repository() -> None:
+    workflow = yaml.safe_load((REPOSITORY / ".github/workflows/release.yml").read_text("utf-8"))
+    assert workflow["env"]["EDGEPERC_REPOSITORY"] == "${{ github.server_url }}/${{ github.repository }}"
+    named = {"pyproject.toml", "setup.py", "CITATION.cff", "README.md"}
+    addresses = {name: re.findall(r"https://github\.com/\S+", (REPOSITORY / name).read_text("utf-8")) for name in named}
+    assert {name: found for name, found in addresses.items() if found} == {
+        "setup.py": ["https://github.com/OWNER/NAME,"]
+    }
+
+
+def test_every_python_of_the_classifiers_is_tried() -> None:
+    stated = {c.rpartition(" ")[2] for c in PROJECT["classifiers"] if re.search(r"Python :: 3\.\d+$", c)}
+    assert stated == {f"3.{k}" for k in range(10, 15)}
+    release = yaml.safe_load((REPOSITORY / ".github/workflows/release.yml").read_text("utf-8"))["jobs"]["wheels"]
+    wheels = {tag.partition("-")[0] for tag in release["strategy"]["matrix"]["python"]}
+    assert wheels == {f"cp{version.replace('.', '')}" for version in stated}
+    ci = (REPOSITORY / ".github/workflows/ci.yml").read_text("utf-8")
+    assert {f"3.{k}" for k in (10, 14)} <= {*re.findall(r'"(3\.\d+)"', ci)}
+
+
+def test_the_citation_is_of_this_release() -> None:
+    citation = yaml.safe_load((REPOSITORY / "CITATION.cff").read_text("utf-8"))
+    assert citation["version"] == edgeperc.__version__
+    assert citation["title"] == PROJECT["name"]
+    assert citation["license"] == PROJECT["license"]
+    assert citation["authors"] == PROJECT["authors"]
+    assert citation["keywords"] == PROJECT["keywords"]
+    assert {"cff-version", "message", "type"} <= {*citation}
+
+
+@pytest.mark.parametrize(
+    "form", sorted((REPOSITORY / ".github/ISSUE_TEMPLATE").glob("[!c]*.yml")), ids=lambda f: f.stem
+)
+def test_forms_of_issues_are_whole(form: Path) -> None:
+    """As GitHub's schema of issue forms wants them: fields with an id of their own and a label."""
+    document = yaml.safe_load(form.read_text("utf-8"))
+    assert {"name", "description", "body"} <= {*document}
+    fields = [field for field in document["body"] if field["type"] != "markdown"]
+    assert all(field["attributes"]["label"] for field in fields)
+    assert len({field["id"] for field in fields}) == len(fields)
+    assert any(field.get("validations", {}).get("required") for field in fields)
+
+
+def test_what_the_templates_name_is_there() -> None:
+    template = (REPOSITORY / ".github/PULL_REQUEST_TEMPLATE.md").read_text("utf-8")
+    for name in re.findall(r"\b[A-Z]+\.md\b", template):
+        assert (REPOSITORY / name).is_file(), name
+    makefile = (REPOSITORY / "Makefile").read_text("utf-8")
+    assert all(f"\n{target}:" in makefile for target in re.findall(r"`make (\w+)`", template))
+    assert "Report a vulnerability" in (REPOSITORY / "CODE_OF_CONDUCT.md").read_text("utf-8")
+    assert "Report a vulnerability" in (REPOSITORY / "SECURITY.md").read_text("utf-8")
+
+
+def test_read_the_docs_builds_what_make_does() -> None:
+    settings = yaml.safe_load((REPOSITORY / ".readthedocs.yaml").read_text("utf-8"))
+    assert (REPOSITORY / settings["sphinx"]["configuration"]).is_file()
+    assert settings["sphinx"]["fail_on_warning"]
+    (install,) = settings["python"]["install"]
+    assert {"docs"} < {*install["extra_requirements"]} <= EXTRAS

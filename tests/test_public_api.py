@@ -33,6 +33,14 @@ def test_all_is_sorted_and_complete() -> None:
     assert lazy | {*edgeperc.errors.__all__} | {"__version__"} == {*edgeperc.__all__}
 
 
+def test_every_name_has_a_page() -> None:
+    """Each stands once in a table of the reference, which makes a page of it; errors stand on one page."""
+    page = (REPOSITORY / "docs/reference/api.md").read_text("utf-8")
+    listed = re.findall(r"^   (\w+)$", page, flags=re.MULTILINE)
+    assert sorted(listed) == sorted({*edgeperc.__all__} - {*edgeperc.errors.__all__, "__version__"})
+    assert "automodule:: edgeperc.errors" in page
+
+
 @pytest.mark.parametrize("name", edgeperc.__all__)
 def test_every_name_is_importable(name: str) -> None:
     thing = getattr(edgeperc, name)

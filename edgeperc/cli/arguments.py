@@ -57,7 +57,8 @@ def add_sensor(group: Any, *, required: bool = False, of_capture: bool = False) 
         required=required,
         default=None if required or of_capture else DEFAULT_SENSOR,
         metavar="SENSOR",
-        help="the LiDAR that recorded the scans: a name from 'edgeperc sensors', a .json file written by 'edgeperc "
+        help="the LiDAR that recorded the scans: a name from 'edgeperc sensors', a public set (av2, ddad, lyft, "
+        "pandaset, semantickitti, vod), a .json file written by 'edgeperc "
         "fit-sensor' or 'edgeperc info --write', or auto: the one that a capture names, otherwise the one whose beams "
         "are found in the points of the first scans" + (" (required)" if required else f" (default: {default})"),
     )
@@ -142,7 +143,7 @@ def add_topic(group: Any) -> None:
 
 
 def add_fields(group: Any) -> None:
-    """Add ``--columns``, ``--remission-field`` and ``--origin``."""
+    """Add ``--columns``, ``--remission-field``, ``--remission-range`` and ``--origin``."""
     group.add_argument(
         "--columns",
         nargs="+",
@@ -155,6 +156,13 @@ def add_fields(group: Any) -> None:
         metavar="NAME",
         help="the field to take the remission from (default: the first of remission, intensity, i, reflectivity, "
         "reflectance; reflectivity for an Ouster)",
+    )
+    group.add_argument(
+        "--remission-range",
+        nargs=2,
+        type=finite_number,
+        metavar=("LOW", "HIGH"),
+        help="lowest and highest raw value of the remission, such as 0 65535 (default: the sensor's)",
     )
     group.add_argument(
         "--origin",

@@ -9,6 +9,8 @@ from typing import Any
 from ..system.extras import require
 from .arguments import PROVIDERS, Commands, add_command
 
+SHELLS = ("bash", "zsh", "fish", "tcsh")
+
 
 def add_parser(commands: Commands) -> None:
     """Add ``completion``."""
@@ -22,30 +24,33 @@ def add_parser(commands: Commands) -> None:
         examples=[
             "edgeperc completion bash > ~/.local/share/bash-completion/completions/edgeperc",
             "edgeperc completion zsh > ~/.zfunc/_edgeperc    # with fpath+=~/.zfunc",
+            "edgeperc completion fish > ~/.config/fish/completions/edgeperc.fish",
             "edgeperc completion tcsh > ~/.edgeperc.tcsh     # with source ~/.edgeperc.tcsh",
         ],
     )
-    parser.add_argument("shell", choices=("bash", "zsh", "tcsh"), metavar="SHELL", help="bash, zsh or tcsh")
+    parser.add_argument("shell", choices=SHELLS, metavar="SHELL", help="bash, zsh, fish or tcsh")
 
 
 def completion_command(arguments: argparse.Namespace) -> int:
     """Print the script."""
     shtab = require("shtab", "completion", "Completing a command line")
-    from ..types.sensor import SENSORS
+    from ..types.sensor import PUBLIC_SENSORS, SENSORS
     from ..zoo import shipped_models
 
-    names = {"model": shipped_models(), "sensor": tuple(SENSORS), "provider": PROVIDERS}
-    functions: dict[str, list[str]] = {"bash": [], "zsh": []}
+    names = {"model": shipped_models(), "sensor": (*SENSORS, *PUBLIC_SENSORS), "provider": PROVIDERS}
+    functions: dict[str, list[str]] = {"bash": [], "zsh": [], "fish": []}
     completed = {
         **dict.fromkeys(("FILE", "PATH", "SCAN", "DATASET", "SENSOR=SOURCE", "ROOT"), shtab.FILE),
         "DIR": shtab.DIRECTORY,
     }
     for kind, values in names.items():
         function, choices = f"_edgeperc_{kind}_or_file", " ".join(values)
-        completed[kind.upper()] = {"bash": function, "zsh": function, "tcsh": f"({choices})"}
+        completed[kind.upper()] = {"bash": function, "zsh": function, "fish": f"({function})", "tcsh": f"({choices})"}
         # For a function with "file" in its name, shtab adds no space after a completed folder.
         functions["bash"].append(f'{function}() {{ compgen -W \'{choices}\' -- "$1"; compgen -f -- "$1"; }}')
         functions["zsh"].append(f"{function}() {{ compadd {choices}; _files; }}")
+        given = "(commandline -ct)"
+        functions["fish"].append(f"function {function}; printf '%s\\n' {choices}; __fish_complete_path {given}; end")
     completed["MODEL|SCAN|IMAGE"] = completed["MODEL"]
     for action in _actions(arguments.parser):
         if action.choices is None and action.metavar in completed:

@@ -9,6 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..errors import MissingExtraError
+from ..system.atomic import open_atomic, write_atomic
+from ..system.extras import require
 from ..types.choices import CAMERA
 from .arguments import Commands, add_command, add_model, add_network, chosen_models
 from .output import one_line, print_rows
@@ -36,7 +38,8 @@ def add_parser(commands: Commands) -> None:
         demo_command,
         help="perceive a bundled scene: a table, a picture and a 3-D page",
         description="Perceive one simulated hdl-64e scan with known labels. Print the results and the time, and write "
-        "scene.png (needs the extra 'view') and scene.html. The command needs no data.",
+        "scan.bin, the scan itself to try other commands on, scene.png (needs the extra 'view') and scene.html; with "
+        "--camera also image.png and camera.png. The command needs no data.",
         examples=[
             "edgeperc demo",
             "edgeperc demo --camera",
@@ -49,13 +52,13 @@ def add_parser(commands: Commands) -> None:
         type=Path,
         default=Path("edgeperc-demo"),
         metavar="DIR",
-        help="folder for scene.png and scene.html, made if needed (default: %(default)s)",
+        help="folder for scan.bin, scene.png and scene.html, made if needed (default: %(default)s)",
     )
     parser.add_argument(
         "--camera",
         action="store_true",
         help="also draw the image of a camera in the street, label it, carry its classes to the points and its road to "
-        "the top view, and write camera.png",
+        "the top view, and write image.png and camera.png",
     )
     models = parser.add_argument_group("models")
     add_model(models)
@@ -113,6 +116,9 @@ def demo_command(arguments: argparse.Namespace) -> int:
     except MissingExtraError as exc:
         rows.append(("picture", one_line(exc)))
     rows.append(("3-D page", f"{page} (open it in a browser)"))
+    file = arguments.out / "scan.bin"
+    write_atomic(file, scan.points.astype("<f4").tobytes())
+    rows.append(("scan", f"{file} (try: edgeperc info {file})"))
     if arguments.camera:
         rows += _camera_rows(scan, drawn, calibration, perception, arguments.out / "camera.png")
     print_rows(rows)
@@ -154,6 +160,10 @@ def _camera_rows(
     road = camera_road(perception, scan.points, calibration)
     rows.append(("road", f"{road.drivable_area_m2:.0f} m2 of the image's road lie on the ground that the scan shows"))
     try:
+        image = picture.with_name("image.png")
+        with open_atomic(image) as file:
+            require("PIL.Image", "camera", "Writing an image", package="pillow").fromarray(drawn.rgb).save(file, "PNG")
+        rows.append(("image", f"{image} (try: edgeperc run {image} --json)"))
         title = f"edgeperc demo, {source.partition(',')[0]}"  # what does not fit into the picture is cut
         view.draw_painted(perception, drawn.rgb, scan.points, calibration, picture, title=title)
         rows.append(("picture", str(picture)))

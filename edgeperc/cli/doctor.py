@@ -10,7 +10,7 @@ import os
 import platform
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from importlib import import_module, resources
 from importlib.util import find_spec
@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from .. import __version__
-from ..errors import EdgepercError, MissingExtraError
+from ..errors import EdgepercError, MissingExtraError, SettingsError
 from ..types.choices import DEFAULT_MODELS
 from .arguments import Commands, add_command
 from .output import many, one_line, print_columns, print_line
@@ -57,14 +57,30 @@ def add_parser(commands: Commands) -> None:
         description="Examine this installation: versions, processor, compiled kernels, execution providers and their "
         "devices, caches, the files of the models, extras. The default models are opened and checked against their "
         "golden inputs. The exit code is 1 if something that edgeperc needs is missing or broken.",
-        examples=["edgeperc doctor", "edgeperc doctor --json"],
+        examples=["edgeperc doctor", "edgeperc doctor --json", "edgeperc doctor --clean"],
+    )
+    parser.add_argument(
+        "--clean",
+        action="store_true",
+        help="examine nothing; delete what edgeperc keeps on this computer: compiled kernels, compiled models and "
+        "measured settings; nothing is left then for pip uninstall to leave behind",
     )
     output = parser.add_argument_group("output")
     output.add_argument("--json", action="store_true", help="print one JSON object")
 
 
 def doctor_command(arguments: argparse.Namespace) -> int:
-    """Print what `examine` finds; 1 if something is broken."""
+    """Print what `examine` finds; 1 if something is broken. With ``--clean``, delete what is kept."""
+    if arguments.clean:
+        files = [*kept_files(package_folders())]
+        n_bytes = sum(file.stat().st_size for file in files)
+        for file in files:
+            file.unlink()
+        for folder in sorted({parent for file in files for parent in [*file.parents][:3]}, reverse=True):
+            if folder.is_dir() and not any(folder.iterdir()):
+                folder.rmdir()
+        print_line(f"deleted {many(len(files), 'file')}, {n_bytes / 1e6:.1f} MB; the next start compiles again")
+        return 0
     findings = [*examine()]
     broken = [finding for finding in findings if finding.state == "broken"]
     if arguments.json:
@@ -81,6 +97,30 @@ def doctor_command(arguments: argparse.Namespace) -> int:
     else:
         print_line("What edgeperc needs is here and works.")
     return 1 if broken else 0
+
+
+def package_folders() -> list[Path]:
+    """The folders of the installed packages, beside whose sources kernels are kept."""
+    found = (find_spec(name) for name in ("edgeperc", "edgeperc_bench", "edgeperc_export"))
+    return [Path(spec.origin).parent for spec in found if spec is not None and spec.origin]
+
+
+def kept_files(packages: Sequence[Path]) -> Iterator[Path]:
+    """Every file that edgeperc keeps on this computer: kernels beside their sources, and those of its cache folder."""
+    from ..system.machine import cache_folder, settings_path
+
+    for package in packages:
+        yield from package.rglob("__pycache__/*.kernel")
+    if named := os.environ.get("NUMBA_CACHE_DIR"):
+        yield from Path(named).glob("*/*.kernel")
+    try:
+        cache = cache_folder()
+    except SettingsError:  # there is no home folder
+        return
+    for part in ("kernels", "compiled"):
+        yield from (file for file in (cache / part).rglob("*") if file.is_file() or file.is_symlink())
+    if settings_path().is_file():
+        yield settings_path()
 
 
 def examine() -> Iterator[Finding]:
@@ -219,7 +259,6 @@ def _providers() -> Iterator[Finding]:
 
 
 def _caches() -> Iterator[Finding]:
-    from ..errors import SettingsError
     from ..system.machine import cache_folder, fingerprint, read_setting, settings_path, unsafe_because
     from ..zoo import digest, resolve
 

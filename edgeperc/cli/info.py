@@ -16,7 +16,7 @@ from ..errors import EdgepercError, MissingExtraError, MountingError, PointsErro
 from ..system.atomic import write_atomic
 from ..types.choices import DEFAULT_MODELS
 from .arguments import Commands, add_command, add_fields, add_mounting, add_sensor, add_topic, reading_options
-from .output import print_error, print_line, print_rows
+from .output import many, print_error, print_line, print_rows
 from .scans import Sensors, stated_sensor, with_mounting
 
 if TYPE_CHECKING:
@@ -266,23 +266,38 @@ def _model_rows(variants: Sequence[Variant]) -> list[tuple[str, str]]:
 
 
 def _accuracy_rows(metrics: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """The main figures on each evaluated kind of scans, over all distances, in per cent."""
-    rows = []
+    """The main figures on each evaluated kind of scans: split, scans and drives, and of each class the objects."""
+    rows, split = [], metrics.get("split")
     for block, data in (("real", "KITTI"), ("semantickitti", "SemanticKITTI"), ("simulated", "simulation")):
         figures = metrics.get(block, {})
         points = figures.get("points", {}).get("all", {})
-        parts = [f"IoU {name} {_percent(row.get('iou'))}" for name, row in points.items() if row.get("n_objects")]
+        parts = [_figure("IoU", name, row, "iou", "n_objects") for name, row in points.items() if row.get("n_objects")]
         boxes = figures.get("boxes", {}).get("oriented", {}).get("all", {})
         parts += [
-            f"AP {name} {_percent(row.get('ap'))}"
+            _figure("AP", name, row, "ap", "n_truth")
             for name, row in boxes.items()
             if isinstance(row, Mapping) and row.get("n_truth")
         ]
         road = figures.get("road", {}).get("all", {})
         parts += [f"road F1 {_percent(road['f1'])}"] if road.get("f1") is not None else []
+        for name, measures in figures.get("kitti", {}).items():
+            row = measures.get("bird's eye 0.5", {}).get("moderate", {})
+            parts += [_figure("bird's eye AP at 0.5", name, row, "ap", "n_truth")] if row.get("n_truth") else []
         if parts:
-            rows.append((f"on {data}", f"{figures.get('n_frames', '?')} scans, %: {', '.join(parts)}"))
+            n, n_drives = figures.get("n_frames", "?"), figures.get("n_drives")
+            of_drives = "" if block == "simulated" or not n_drives else f" of {many(n_drives, 'drive')}"
+            of_drives += f", {split} split" if split and block != "simulated" else ""
+            rows.append((f"on {data}", f"{n} scans{of_drives}, %: {', '.join(parts)}"))
+    images = metrics.get("images", {})
+    if images.get("all", {}).get("mean_iou") is not None:
+        n = max((row.get("n_images", 0) for row in images.get("classes", {}).values()), default=0)
+        of_split = f" of the {split} split" if split else ""
+        rows.append(("on images", f"{n}{of_split}, %: mean IoU {_percent(images['all']['mean_iou'])}"))
     return rows
+
+
+def _figure(measure: str, name: str, row: Mapping[str, Any], key: str, count: str) -> str:
+    return f"{measure} {name} {_percent(row.get(key))} (n={row[count]})"
 
 
 def _percent(share: float | None) -> str:

@@ -97,6 +97,8 @@ def in_options(message: str) -> str:
     ``--threads is 0`` and ``--precision bf16``; an option that a message has in parentheses stands alone. The same word
     elsewhere in a sentence is not changed.
     """
+    of_data = r"sensor= a profile (?:whose remission_range is|with the remission_range of this data,)"
+    message = re.sub(rf"{of_data} \(([^,]+), ([^)]+)\)", r"--remission-range \1 \2", message)
     names = "|".join(_OPTIONS)
     message = re.sub(r"pass \w+=\S* \(on the command line ([^)]*)\)", r"pass \1", message)
     message = re.sub(rf"(?<![\w-])({names})= ", lambda m: f"{_OPTIONS[m[1]]} ", message)

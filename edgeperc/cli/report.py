@@ -133,5 +133,6 @@ def _summary(perception: Perception) -> str:
     parts.append(f"boxes: {boxes or 'none'}")
     if perception.points is not None:
         counts = perception.points.counts()
-        parts.append("points: " + ", ".join(f"{name} {counts[name]:,}" for name in perception.points.classes[1:]))
+        labeled = ", ".join(f"{name} {counts[name]:,}" for name in perception.points.classes[1:])
+        parts.append(f"points: {labeled} of {perception.points.n_in_view:,} in view")
     return "  ".join(parts)

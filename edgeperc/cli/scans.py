@@ -251,7 +251,7 @@ class Sensors:
 
 
 def with_mounting(sensor: str | SensorProfile, arguments: argparse.Namespace) -> str | SensorProfile:
-    """The sensor with what ``--extrinsic``, the options of single values and ``--ego-box`` give.
+    """The sensor with what ``--extrinsic``, the options of single values, ``--ego-box`` and ``--remission-range`` give.
 
     Raises SensorError.
     """
@@ -264,14 +264,17 @@ def with_mounting(sensor: str | SensorProfile, arguments: argparse.Namespace) ->
     if values.get("yaw_deg") == "street":
         values["yaw_deg"] = None
     file, ego = getattr(arguments, "extrinsic", None), getattr(arguments, "ego_box", None)
-    if not values and file is None and ego is None:
+    remission = getattr(arguments, "remission_range", None)
+    if not values and file is None and ego is None and remission is None:
         return sensor
     if sensor == AUTO_SENSOR:
         raise SensorError(
-            "--sensor auto and a mounting or --ego-box: write the sensor that is found, edgeperc info SCAN --write "
-            "FILE, and pass --sensor FILE"
+            "--sensor auto and a mounting, --ego-box or --remission-range: write the sensor that is found, "
+            "edgeperc info SCAN --write FILE, and pass --sensor FILE"
         )
     profile = get_sensor(sensor)
+    if remission is not None:
+        profile = replace(profile, remission_range=tuple(remission))
     if ego is not None:
         profile = replace(profile, ego_box=((ego[0], ego[1]), (ego[2], ego[3]), (ego[4], ego[5])))
     return replace(profile, mounting=replace(profile.mounting if file is None else Mounting.from_file(file), **values))

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields, replace
 from types import MappingProxyType
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import PointsError
+from ..errors import ModelError, PointsError
 from ..system.fields import Fields
 from .mounting import MODEL_MOUNTING, Mounting
 from .points import Labels, Mask
@@ -19,6 +19,7 @@ from .views import TopViewGeometry
 
 _FIELDS = Fields("box", PointsError, "write it with Box.to_dict", optional=("front",))
 _PART = 2**20
+_Part = TypeVar("_Part")
 ROADS = ("drivable", "road")  # names of classes of an image on which a vehicle may drive, in lower case
 
 
@@ -163,8 +164,13 @@ class PointLabels:
     in_view: Mask
     classes: tuple[str, ...]
 
+    @property
+    def n_in_view(self) -> int:
+        """Number of points in view, which `counts` counts; by default the network sees the quarter turn ahead."""
+        return int(np.count_nonzero(self.in_view))
+
     def counts(self) -> dict[str, int]:
-        """Number of points in view, by class."""
+        """Number of points by class, of the `n_in_view` points in view."""
         counted = np.bincount(self.labels[self.in_view], minlength=len(self.classes))
         return {name: int(counted[k]) for k, name in enumerate(self.classes)}
 
@@ -327,6 +333,22 @@ class Perception:
     ground: GroundSurface | None = None
     origin_m: tuple[float, float, float] | None = None
 
+    def require_points(self) -> PointLabels:
+        """``points``; `ModelError`, which names the model to add, if it is None."""
+        return _required(self.points, "no class for every point", "pointseg")
+
+    def require_top_view(self) -> TopView:
+        """``top_view``; `ModelError`, which names the model to add, if it is None."""
+        return _required(self.top_view, "no top view", "ssadnet")
+
+    def require_image(self) -> ImageLabels:
+        """``image``; `ModelError`, which names the model to add, if it is None."""
+        return _required(self.image, "no labels of an image", "camseg", "and pass image=")
+
+    def require_ground(self) -> GroundSurface:
+        """``ground``; `ModelError`, which names the model to add, if it is None."""
+        return _required(self.ground, "no ground", "pointseg", "and leave agree=True")
+
     def to_map(self, points: NDArray[Any]) -> NDArray[np.float64]:
         """Coordinates of points of the scan in the map, x, y, z [m], (n, 3) float64; exact, unlike float32.
 
@@ -363,9 +385,10 @@ class Perception:
         -------
         dict
             ``stamp_s``, ``n_points``, ``n_dropped``, ``dropped`` (by kind), ``stage_ms``, ``providers``, ``boxes``
-            (`Box.to_dict`), ``drivable_area_m2``, ``point_counts``, ``fitness``, ``mounting``, ``remission``,
-            ``image`` (`ImageLabels.to_dict`), ``origin_m`` and ``map_boxes``. Every key is always present; its value is
-            None if no model of that kind ran, if remission was only scaled, or if the place in a map was not given.
+            (`Box.to_dict`), ``drivable_area_m2``, ``point_counts``, ``n_in_view`` (their sum),
+            ``fitness``, ``mounting``, ``remission``, ``image`` (`ImageLabels.to_dict`), ``origin_m`` and
+            ``map_boxes``. Every key is always present; its value is None if no model of that kind ran, if
+            remission was only scaled, or if the place in a map was not given.
         """
         return {
             "stamp_s": self.stamp_s,
@@ -377,6 +400,7 @@ class Perception:
             "boxes": [box.to_dict() for box in self.boxes],
             "drivable_area_m2": None if self.top_view is None else round(self.top_view.drivable_area_m2, 2),
             "point_counts": None if self.points is None else self.points.counts(),
+            "n_in_view": None if self.points is None else self.points.n_in_view,
             "fitness": list(self.fitness),
             "mounting": self.mounting.to_dict(),
             "remission": None if self.remission is None else asdict(self.remission),
@@ -392,6 +416,16 @@ class Perception:
 
 
 _VIEWS = ("stage_ms", "providers")
+
+
+def _required(part: _Part | None, lacks: str, model: str, also: str = "") -> _Part:
+    """A part of a perception that its models need not give."""
+    if part is None:
+        raise ModelError(
+            f"the perception has {lacks}: no model that ran on this scan gives it; add {model!r} to the models of the "
+            f"Perceiver {also}".rstrip()
+        )
+    return part
 
 
 def _with_views(values: dict[str, Any]) -> Perception:

@@ -20,7 +20,7 @@ from ..system.names import check_text, nearest
 from .choices import AUTO_SENSOR
 from .mounting import MODEL_HEIGHT_M, UNKNOWN_MOUNTING, Mounting
 
-__all__ = ["REMISSION_KINDS", "SENSORS", "RemissionFunction", "SensorProfile", "get_sensor"]
+__all__ = ["PUBLIC_SENSORS", "REMISSION_KINDS", "SENSORS", "RemissionFunction", "SensorProfile", "get_sensor"]
 
 SCHEMA = 2  # of a sensor profile's file
 # Of a profile that states none. Empty beams of real recordings lie up to 0.45 m from the sensor, and the built-in
@@ -361,6 +361,20 @@ _BUILT_IN = (
 SENSORS: Mapping[str, SensorProfile] = MappingProxyType({profile.name: profile for profile in _BUILT_IN})
 """The built-in profiles by name."""
 
+_TWO_VLP_32C = tuple(sorted({*_VLP_32C, *(-deg for deg in _VLP_32C)}, reverse=True))  # one is upside down
+_LYFT = (*range(7, 2, -1), *(round(k / 3.0, 2) for k in range(6, -19, -1)), *range(-7, -17, -1))
+PUBLIC_SENSORS: Mapping[str, SensorProfile] = MappingProxyType(
+    {
+        "av2": replace(SENSORS["vlp-32c"], name="av2", elevations_deg=_TWO_VLP_32C, remission_range=(0.0, 1.0)),
+        "ddad": SensorProfile("ddad", np.linspace(10.0, -30.0, 64).round(2).tolist(), 720, max_range_m=250.0),
+        "lyft": SensorProfile("lyft", _LYFT, 1800, _BYTE, max_range_m=200.0),
+        "pandaset": SENSORS["pandar64"],
+        "semantickitti": SENSORS["hdl-64e"],
+        "vod": replace(SENSORS["hdl-64e"], name="vod", remission_range=_BYTE),
+    }
+)
+"""The profiles of public sets, which have names of their layouts; none is taken for the sensor of a scan unasked."""
+
 
 def _ego_box(who: str, given: Any) -> EgoBox:
     """The box as numbers; SensorError if it is not one."""
@@ -399,11 +413,13 @@ def get_sensor(sensor: str | os.PathLike[str] | SensorProfile) -> SensorProfile:
         except SensorError as exc:
             raise SensorError(f"{os.fspath(sensor)}: {exc}") from exc
     try:
-        return SENSORS[sensor]
+        return SENSORS[sensor] if sensor in SENSORS else PUBLIC_SENSORS[sensor]
     except (KeyError, TypeError):
         raise SensorError(
             "sensor 'auto' is found in the first scan by a Perceiver, and nothing is found here: pass Perceiver.sensor"
             if sensor == AUTO_SENSOR
-            else f"no sensor {sensor!r} is built in{nearest(str(sensor), SENSORS)}; known are {', '.join(SENSORS)}. "
+            else f"no sensor {sensor!r} is built in{nearest(str(sensor), (*SENSORS, *PUBLIC_SENSORS))}; "
+            f"known are {', '.join(SENSORS)}, "
+            f"and of public sets {', '.join(PUBLIC_SENSORS)}. "
             "Describe another with SensorProfile(...) or SensorProfile.uniform(...), or name a .json file."
         ) from None

@@ -111,6 +111,21 @@ def paint_points(points: Points, perception: Perception) -> tuple[list[str], NDA
     return names, painted
 
 
+def paint_vehicles(names: list[str], painted: NDArray[np.uint8], points: Points, boxes: Iterable[Box]) -> None:
+    """Give points of cars in the box of a van or a truck its class; networks of points have one class for all three."""
+    cars = np.flatnonzero(painted == names.index("car")) if "car" in names else np.empty(0, np.intp)
+    cars = cars[drawable_points(points[cars])]
+    for box in drawable_boxes(boxes):
+        if box.label in ("van", "truck") and len(cars):
+            away = points[cars, :2] - np.asarray(box.center[:2])
+            cos, sin = math.cos(box.yaw), math.sin(box.yaw)
+            along, across = np.abs(away @ [cos, sin]), np.abs(away @ [-sin, cos])
+            inside = cars[(along <= box.size[0] / 2.0) & (across <= box.size[1] / 2.0)]
+            if box.label not in names:
+                names.append(box.label)
+            painted[inside] = names.index(box.label)
+
+
 def ground_plane(perception: Perception, points: Points) -> tuple[float, float, float]:
     """The plane that a picture is drawn on: z = a + b x + c y [m], in the frame of the models.
 

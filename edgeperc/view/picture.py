@@ -38,16 +38,19 @@ from .content import (
     ground_plane,
     in_model_frame,
     paint_points,
+    paint_vehicles,
     perceived_image,
     provider_lines,
     timing_line,
 )
 
+_PARTS = {90.0: "90° ahead", 360.0: "all around"}
 # Sizes in pixels. A page that shows the picture 1000 pixels wide reduces text of 13 points to 8.
 _WIDTH, _MARGIN, _TOP, _BOTTOM = 1600, 28, 128, 868
 _AXIS = 62
 _NEAR_M = 1.0
 _HALF_STRIP_M = 1.0
+_AROUND_M = (48.0, 36.0)  # ahead and behind, to each side
 
 
 def draw(perception: Perception, points: Points, path: str | Path | None = None, *, title: str = "") -> bytes:
@@ -56,7 +59,8 @@ def draw(perception: Perception, points: Points, path: str | Path | None = None,
     Parameters
     ----------
     perception : Perception
-        Without a top view, the picture has no panel from above.
+        Without a top view, the picture has no panel from above. The panels show the whole turn if something behind the
+        sensor was perceived: a box from above, a class for points in the range image.
     points : (n, 4) float32
         The scan that was perceived: x, y, z [m] in the sensor frame, remission. Not drawn are points and boxes that are
         not finite or farther than 1 km.
@@ -86,8 +90,10 @@ def draw(perception: Perception, points: Points, path: str | Path | None = None,
     points, painted = points[seen], painted[seen]
     ground = ground_plane(perception, points)
     boxes = drawable_boxes(perception.boxes)
+    paint_vehicles(names, painted, points, boxes)
     top_view = perception.top_view
     road = None if top_view is None else road_ahead(top_view, boxes)
+    turn_deg = _turn_deg(perception, points, seen)
 
     facts = class_facts(perception)
     warnings = _wrapped_warnings(perception)
@@ -102,7 +108,7 @@ def draw(perception: Perception, points: Points, path: str | Path | None = None,
         left = _MARGIN + _AXIS + width + 34.0
     width = _WIDTH - _MARGIN - left
     _draw_from_behind(figure, (left, _TOP, width, 520), points, names, painted, top_view, road, boxes, ground)
-    _draw_range_image(figure, (left, 700, width, _BOTTOM - 700), points, names, painted)
+    _draw_range_image(figure, (left, 700, width, _BOTTOM - 700), points, names, painted, turn_deg)
 
     _write_header(figure, perception, title)
     draw_legend(figure, _MARGIN, legend_top, _WIDTH - 2 * _MARGIN, facts)
@@ -178,6 +184,11 @@ def _write_header(figure: Any, perception: Perception, title: str) -> None:
     write_at(figure, _MARGIN, 46, shorten(figure, title, 1100, **style), **style)
 
 
+def _turn_deg(perception: Perception, points: Points, seen: NDArray[np.bool_]) -> float:
+    """The part of the turn in which points have a class: the quarter ahead, or all of it. ``points`` are those seen."""
+    return 360.0 if perception.points is not None and (points[perception.points.in_view[seen], 0] < 0.0).any() else 90.0
+
+
 def _strip(ahead: FreeAhead, x_near: float) -> tuple[str, NDArray[np.float64] | None]:
     """The free distance ahead as text, and the corners x, y [m] of an arrow of that length; None for no arrow."""
     free_m = ahead.free_m
@@ -206,6 +217,9 @@ def _draw_top_view(
 
     (x_near, x_far), (y_right, y_left) = top_view.x_range_m, top_view.y_range_m
     low, high, right, left = min(-2.5, x_near - 2.5), x_far + 2.0, y_right - 4.0, y_left + 4.0
+    if any(box.center[0] < low for box in boxes):
+        along, across = _AROUND_M
+        low, high, right, left = min(low, -along), max(high, along), min(right, -across), max(left, across)
     px_per_m = min((_BOTTOM - _TOP) / (high - low), 560.0 / (left - right))
     width = px_per_m * (left - right)
     axes = add_axes(figure, _MARGIN + _AXIS, _TOP, width, px_per_m * (high - low))
@@ -234,6 +248,7 @@ def _draw_top_view(
 
     step = 10.0 if high - low > 25.0 else 5.0
     ticks = np.arange(math.ceil(low / step) * step, high, step)[:30]
+    step = step if left - right < 40.0 else 20.0
     beside = np.arange(math.ceil(right / step) * step, left, step)[:30]
     axes.set_yticks(ticks, labels=[f"{tick:.0f} m" for tick in ticks])
     axes.set_xticks(
@@ -285,22 +300,26 @@ def _draw_range_image(
     points: Points,
     names: list[str],
     painted: Labels,
+    turn_deg: float,
 ) -> None:
-    """Draw the quarter turn ahead as a range image. It is only a picture, not the projection of a network."""
+    """Draw a part of the turn as a range image. It is only a picture, not the projection of a network."""
     axes = add_axes(figure, *place)
-    write_heading(figure, place[0], place[1] - 20, "as the sensor sees it", "90° ahead, a class for every point")
+    write_heading(
+        figure, place[0], place[1] - 20, "as the sensor sees it", f"{_PARTS[turn_deg]}, a class for every point"
+    )
     x, y, z = points[:, :3].astype(np.float64).T
     range_m = np.sqrt(x * x + y * y + z * z)
     azimuth = np.degrees(np.arctan2(y, x))
-    ahead = np.flatnonzero((np.abs(azimuth) < 45.0) & (range_m > 0.5))
+    half = turn_deg / 2.0
+    ahead = np.flatnonzero((np.abs(azimuth) < half) & (range_m > 0.5))
     elevation = np.degrees(np.arcsin(z[ahead] / range_m[ahead]))
     # Percentiles, because stray reflections below the road would compress the image.
     low, high = np.percentile(elevation, [0.3, 99.9]) if len(ahead) else (-25.0, 3.0)
     low, high = low - 0.5, high + 0.5
-    columns = 512
+    columns = 512 if half == 45.0 else 1024
     rows = next((n for n in (16, 32, 64) if n >= len(ahead) / columns), 128)
     row = np.floor((high - elevation) / (high - low) * rows).astype(np.intp)
-    col = np.floor((45.0 - azimuth[ahead]) / 90.0 * columns).astype(np.intp)
+    col = np.floor((half - azimuth[ahead]) / turn_deg * columns).astype(np.intp)
     in_view = (row >= 0) & (row < rows) & (col >= 0) & (col < columns)
     ahead, row, col = ahead[in_view], row[in_view], col[in_view]
     nearest_last = np.argsort(-range_m[ahead], kind="stable")
@@ -320,8 +339,10 @@ def _draw_range_image(
     share = np.array([0.0 if k == 0 else 0.7 if name == "drivable" else 1.0 for k, name in enumerate(names)])
     share = share[painted[behind]][:, None]
     picture[hit] = (1.0 - share) * 0.72 * shade + share * rgb([color_of(name) for name in names])[painted[behind]]
-    axes.imshow(picture, extent=(45.0, -45.0, 0.0, 1.0), aspect="auto", interpolation="nearest")
-    axes.set_xticks([40, 20, 0, -20, -40], labels=["40° left", "20° left", "straight ahead", "20° right", "40° right"])
+    axes.imshow(picture, extent=(half, -half, 0.0, 1.0), aspect="auto", interpolation="nearest")
+    outer, inner = (40, 20) if half == 45.0 else (150, 75)
+    beside = [f"{outer}° left", f"{inner}° left", "straight ahead", f"{inner}° right", f"{outer}° right"]
+    axes.set_xticks([outer, inner, 0, -inner, -outer], labels=beside)
 
 
 def _draw_from_behind(

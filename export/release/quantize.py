@@ -437,6 +437,15 @@ def _choose(fp32: Calibrated, candidates: Sequence[str], limit: float, noise: fl
             fewest, kept = middle, noise
         else:
             most = middle
+    if fewest == 0 and ranked:
+        quiet = min(ranked, key=lambda name: alone[name] * times[name])
+        least = alone[quiet] * times[quiet]
+        if least > limit:
+            raise RefusedError(
+                f"no layer became int8: rounding the quietest of {len(ranked)} layers alone, {quiet}, makes noise of "
+                f"{least:.1e} of the outputs, above the limit of {limit:.0e}; calibrate on more scans, of your sensor"
+            )
+        return [quiet], least
     return ranked[:fewest], kept
 
 
@@ -611,6 +620,11 @@ def _rounded(
     for strength in STRENGTHS:
         fp32 = Calibrated.on(path, card, scans, seven_bits, strength)
         candidates = find_candidates(fp32.model.graph, exclude)
+        if not candidates:
+            raise RefusedError(
+                f"{path}: no layer became int8: the first convolution, the last ones and those of --exclude stay in "
+                "fp32, and the network has no other"
+            )
         tried.append((fp32.noise(candidates), fp32))
         if tried[-1][0] <= limit:
             break

@@ -10,7 +10,8 @@ from typing import Any
 import torch
 from torch import nn
 
-from edgeperc.errors import ModelError
+from edgeperc.errors import CardError, ModelError
+from edgeperc.preprocess.fitness import FitnessProfile
 from edgeperc.system.fields import Fields
 
 from ..networks import build
@@ -29,9 +30,9 @@ def read_checkpoint(path: Path, device: str | torch.device = "cpu") -> dict[str,
     """Read a checkpoint. Only tensors and plain values are unpickled.
 
     device : str or torch.device; where its tensors go.
-    Returns: ``recipe`` (a Recipe), ``before`` and ``curve`` (lists), ``frames`` (dict), ``n_simulated`` and ``step``
-        (int), ``averaged`` and ``best`` (weights by name; None if there was no best step), ``network`` and
-        ``optimizer``.
+    Returns: ``recipe`` (a Recipe), ``before`` and ``curve`` (lists), ``frames`` (dict), ``fitness`` (a FitnessProfile
+        of the real scans; None without one, or of an earlier version), ``n_simulated`` and ``step`` (int), ``averaged``
+        and ``best`` (weights by name; None if there was no best step), ``network`` and ``optimizer``.
     Raises CheckpointError, OSError.
     """
     try:
@@ -43,7 +44,7 @@ def read_checkpoint(path: Path, device: str | torch.device = "cpu") -> dict[str,
         raise CheckpointError(f"{path} cannot be read as a checkpoint ({reason}); train again") from exc
     try:
         return {**state, "recipe": _recipe(state["recipe"]), **_checked(state)}
-    except (KeyError, RecursionError, TypeError, ValueError) as exc:
+    except (CardError, KeyError, RecursionError, TypeError, ValueError) as exc:
         raise CheckpointError(
             f"{path} is not a checkpoint of edgeperc-export train ({type(exc).__name__}: {exc}); train again"
         ) from exc
@@ -90,4 +91,5 @@ def _checked(state: Mapping[str, Any]) -> dict[str, Any]:
             isinstance(key, str) and isinstance(value, torch.Tensor) for key, value in weights.items()
         ):
             raise TypeError(f"{name} is {type(weights).__name__}; expected tensors by name")
-    return texts
+    fitness = json.loads(state.get("fitness", "null"))
+    return texts | {"fitness": None if fitness is None else FitnessProfile.from_dict(fitness)}

@@ -24,6 +24,7 @@ from tqdm import tqdm
 
 from edgeperc.datasets.kitti import KittiObjects
 from edgeperc.datasets.scan_folder import ScanFolder
+from edgeperc.preprocess.fitness import FitnessProfile
 from edgeperc.simulation.scene import POINT_CLASSES
 from edgeperc.system.atomic import open_atomic
 
@@ -78,6 +79,9 @@ class Data:
     scan_sets: Sequence[ScanFolder] = ()
     given: RealScans | None = None
     fold: int | None = None
+
+
+FITNESS_SCANS = 64  # real scans, at least, that a card's check of inputs describes
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,6 +163,7 @@ def _train(recipe: Recipe, out: Path, data: Data, run: Run, ranks: Ranks) -> Pat
     model = _Model(network, forward, copy.deepcopy(network).eval(), make_optimizer(recipe, network))
     if checkpoint.exists():
         state = _resumed(checkpoint, recipe, model, samples, ranks.device)
+    state.fitness = source.fitness
 
     # Loop.
     progress = tqdm(
@@ -213,6 +218,7 @@ class _Source(NamedTuple):
     hashes: dict[str, str]
     n_real: int
     teacher: nn.Module | None = None
+    fitness: dict[str, Any] | None = None
 
 
 class _Model(NamedTuple):
@@ -237,6 +243,7 @@ class _State:
     lowest_loss: float = math.inf
     since_best: int = 0
     halvings: int = 0
+    fitness: dict[str, Any] | None = None
 
 
 def _step(
@@ -311,6 +318,7 @@ def _save(
                 "optimizer": model.optimizer.state_dict(),
                 "curve": json.dumps(state.curve),
                 "frames": json.dumps(state.hashes),
+                "fitness": json.dumps(state.fitness),
                 "fold": -1 if fold is None else fold,
                 "n_simulated": len(samples.simulated),
                 "odds": {name: torch.from_numpy(odds) for name, odds in samples.odds.items()},
@@ -387,7 +395,10 @@ def _scan_source(recipe: Recipe, data: Data, run: Run, device: torch.device) -> 
     paths = sorted(data.simulated.glob("*.npz")) if data.simulated else []
     samples = Samples(recipe, real, weights, paths, onnx_teacher, run.n_workers)
     watch = Watch(samples, watched) if watched else None
-    return _Source(task, samples, watch, hashes, len(real), teacher_network)
+    # Every set in its share: the scans of a set follow one another.
+    few = [scan.points for scan in real[:: max(1, len(real) // FITNESS_SCANS)]]
+    fitness = FitnessProfile.from_scans(few).to_dict() if few else None
+    return _Source(task, samples, watch, hashes, len(real), teacher_network, fitness)
 
 
 def _real(

@@ -194,8 +194,33 @@ def test_text_and_tables_hold_what_was_measured() -> None:
     for block in re.findall(r"(?:^\|.*\n)+", written, flags=re.M):
         counts = {len(re.findall(r"(?<!\\)\|", line)) for line in block.splitlines()}
         assert len(counts) == 1
+    assert shown.splitlines()[-2] == "Verdict"
+    assert "keeps 10 Hz with 7" in shown.splitlines()[-1]  # the slowest of 240 takes 21 to 25 ms
     interrupted = render.text(report.sections(document(20.0) | {"complete": False}))
     assert "interrupted" in interrupted
+
+
+@pytest.mark.parametrize(
+    ("ms", "rate_hz", "missed", "skipped", "sentence"),
+    [
+        ([20.0] * 50, 10.0, 0, 0, "keeps 10 Hz with 79 % to spare"),
+        ([20.0] * 2000, 20.0, 0, 0, "keeps 20 Hz with 58 % to spare"),
+        ([20.0] * 1995 + [40.0] * 5, 20.0, 0, 0, "keeps 20 Hz with 58 % to spare"),
+        ([120.0] * 50, 10.0, 50, 9, "does not keep 10 Hz: 59 of 59 scans were answered late or skipped"),
+        ([20.0] * 49 + [400.0], 10.0, 1, 3, "does not keep 10 Hz: 4 of 53 scans were answered late or skipped"),
+        ([38.0] * 50, None, 0, 0, "keeps 10 Hz with 61 % to spare (judged by scans back to back)"),
+        ([149.0] * 50, None, 0, 0, "does not keep 10 Hz: a scan takes 150 ms of 100 (judged by scans back to back)"),
+    ],
+)
+def test_the_verdict_is_one_sentence(
+    ms: list[float], rate_hz: float | None, missed: int, skipped: int, sentence: str
+) -> None:
+    setting = document(20.0)["settings"][0]
+    scenario = samples_document(ms, rate_hz) | {"missed": missed, "skipped": skipped}
+    setting["repeats"][0]["scenarios"] = {"only": scenario}
+    assert report.verdict(setting).endswith(f" threads: {sentence}")
+    setting["repeats"] = []
+    assert report.verdict(setting) == ""
 
 
 def test_a_live_table_replaces_itself_on_a_terminal_only() -> None:

@@ -383,7 +383,13 @@ def test_the_demo_with_a_camera(tmp_path: Path, capsys: pytest.CaptureFixture[st
     assert "the scene's true classes, not those of a network" in out
     assert float(re.search(r"([\d.]+) % of them have the class of their surface", out)[1]) > 98.0  # type: ignore[index]
     assert float(re.search(r"(\d+) m2 of the image's road", out)[1]) > 100.0  # type: ignore[index]
-    assert {file.name for file in (tmp_path / "out").iterdir()} == {"camera.png", "scene.html", "scene.png"}
+    assert {file.name for file in (tmp_path / "out").iterdir()} == {
+        "camera.png",
+        "image.png",
+        "scan.bin",
+        "scene.html",
+        "scene.png",
+    }
     # A network that calls every pixel road, sky or tree.
     assert cli.main(["demo", "--camera", *options, "--model", str(tiny_camera.write_camera(tmp_path))]) == 0
     out = capsys.readouterr().out

@@ -11,6 +11,7 @@ import subprocess
 import sys
 import warnings
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, ClassVar
@@ -33,8 +34,10 @@ from edgeperc.errors import InferenceError, ModelFileError, OptionError, PointsE
 from edgeperc.evaluation.judge import Perceiving
 from edgeperc.inference import providers, session
 from edgeperc.readers import captures
+from edgeperc.readers.files import read_points
 from edgeperc.simulation.samples import simulated_scan
 from edgeperc.types.perception import Box, Perception, PointLabels, TopView
+from edgeperc.types.sensor import get_sensor
 from scenes import Terminal, urban
 
 
@@ -123,6 +126,16 @@ def test_version_and_usage(capsys: pytest.CaptureFixture[str]) -> None:
     assert usage_code("run", "x.bin", "--threads", "0") == 2
     assert usage_code("run", "\0") == 2
     assert "1 or more" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("sensor", ["os1-64", "av2", "vod", "lyft"])
+def test_the_range_of_remission_is_an_option(sensor: str, tmp_path: Path, fake: type[FakePerceiver]) -> None:
+    scan = write_scan(tmp_path / "0.bin")
+    assert run("run", scan, "--sensor", sensor, "--remission-range", "0", "1000") == 0
+    assert run("run", scan, "--sensor", sensor) == 0
+    assert fake.made[0].given[1] == replace(get_sensor(sensor), remission_range=(0.0, 1000.0))
+    assert fake.made[1].given[1] == sensor
+    assert run("run", scan, "--sensor", sensor, "--remission-range", "5", "5") == 2
 
 
 def test_help_imports_nothing_heavy() -> None:
@@ -221,7 +234,7 @@ def test_run_prints_a_line_a_scan(
     assert "21.2 ms" in lines[1]
     assert "drivable 100.0 m2" in lines[1]
     assert "boxes: 1 car" in lines[1]
-    assert "car 600, pedestrian 0, cyclist 0" in lines[1]
+    assert "car 600, pedestrian 0, cyclist 0 of 1,200 in view" in lines[1]
     assert fake.made[0].given == ([*zoo.DEFAULT], "os1-64", "cpu", 2, "ignore")
     options = ("--boxes-from", "clusters", "--full-turn", "--precision", "bf16", "--adapt", "none", "--trusted")
     assert run("run", scans[0], *options, "--no-agreement", "--score-threshold", "0.4") == 0
@@ -283,6 +296,7 @@ def test_json_is_one_object_a_scan_and_nothing_else(tmp_path: Path, capsys: pyte
             "lane_width_m": None,
         },
         "point_counts": {"background": 3, "car": 2, "pedestrian": 0, "cyclist": 0},
+        "n_in_view": 5,
         "tracks": [],
         "fitness": ["the scan has 32 beams"],
         "mounting": {"height_m": 1.73, "roll_deg": 0.0, "pitch_deg": 0.66, "yaw_deg": 0.0, "origin_m": [0.0, 0.0]},
@@ -801,9 +815,10 @@ def test_demo(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert "heading   17 deg" in out
     assert "(true: 1,000)" in out
     assert "ssadnet: CPUExecutionProvider (fp32)" in out
-    for name in ("scene.png", "scene.html"):
+    for name in ("scene.png", "scene.html", "scan.bin"):
         assert str(tmp_path / "demo" / name) in out
         assert (tmp_path / "demo" / name).stat().st_size > 10_000
+    assert len(read_points(tmp_path / "demo/scan.bin")) == 1000
 
 
 @pytest.mark.usefixtures("fake_street")
@@ -816,7 +831,7 @@ def test_demo_without_matplotlib(
     out = capsys.readouterr().out
     assert "pip install 'edgeperc[view]'" in out
     assert "drivable" in out
-    assert [file.name for file in (tmp_path / "demo").iterdir()] == ["scene.html"]
+    assert sorted(file.name for file in (tmp_path / "demo").iterdir()) == ["scan.bin", "scene.html"]
 
 
 @pytest.mark.parametrize(
@@ -948,6 +963,8 @@ def test_mistyped_words_name_the_nearest(words: list[str], new: str, capsys: pyt
             "the sensor gives no remission; the provider's choice",
             "the sensor gives no remission; the provider's choice",
         ),
+        ("pass sensor= a profile whose remission_range is (0, 65535).", "pass --remission-range 0 65535."),
+        ("sensor= a profile with the remission_range of this data, (0, 1) if", "--remission-range 0 1 if"),
         ("pass sensor= a profile whose range is (0, 255)", "pass --sensor a profile whose range is (0, 255)"),
         ('pass on_mismatch="warn" (on the command line --anyway).', "pass --anyway."),
         ("pass mounting= (on the command line --mount-height or --extrinsic).", "pass --mount-height or --extrinsic."),

@@ -5,6 +5,8 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
+import os
+import shlex
 import shutil
 import subprocess
 import sys
@@ -73,7 +75,7 @@ def test_info_of_a_model(thing: str, tmp_path: Path, capsys: pytest.CaptureFixtu
     assert rows["classes"] == "background, car, pedestrian, cyclist"
     assert rows["data"] == "streets"
     assert rows["licence"] == "CC0"
-    assert rows["on"] == "KITTI  21 scans, %: IoU car 65.1"
+    assert rows["on"] == "KITTI  21 scans of 3 drives, test split, %: IoU car 65.1 (n=3)"
     assert rows["int8"] == "99.95 % of the labels as in fp32, 0.1 points lost"
     assert "frames" not in rows
 
@@ -275,13 +277,35 @@ def test_providers_are_listed(capsys: pytest.CaptureFixture[str]) -> None:
     assert len(capsys.readouterr().out.splitlines()) == 1 + len(records)
 
 
-@pytest.mark.parametrize("shell", ["bash", "zsh", "tcsh"])
+@pytest.mark.parametrize("shell", ["bash", "zsh", "fish", "tcsh"])
 def test_completion_knows_commands_options_and_names(shell: str, capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("shtab")
     assert run("completion", shell) == 0
     script = capsys.readouterr().out
-    for word in ("eval-tracking", "full-turn", "os1-64", "ssadnet", "openvino", "bf16"):
+    for word in ("eval-tracking", "full-turn", "os1-64", "av2", "ssadnet", "openvino", "bf16"):
         assert word in script
+
+
+@pytest.mark.skipif(shutil.which("fish") is None, reason="needs fish")
+@pytest.mark.parametrize(
+    ("typed", "found"),
+    [
+        ("edgeperc mod", {"models"}),
+        ("edgeperc run --full", {"--full-turn"}),
+        ("edgeperc run --sensor pandarx", {"pandarxt-32"}),
+        ("edgeperc run --model ssad", {"ssadnet", "ssadnet-open"}),
+        ("edgeperc info sca", {"scan.bin"}),
+    ],
+)
+def test_fish_completes(typed: str, found: set[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("shtab")
+    assert run("completion", "fish") == 0
+    (tmp_path / "scan.bin").touch()
+    (tmp_path / "edgeperc.fish").write_text(capsys.readouterr().out)
+    code = f"source edgeperc.fish; complete -C {shlex.quote(typed)}"
+    home = {**os.environ, "HOME": str(tmp_path)}
+    done = subprocess.run(["fish", "-c", code], cwd=tmp_path, env=home, capture_output=True, text=True, check=False)
+    assert {line.partition("\t")[0] for line in done.stdout.splitlines()} == found, done.stderr
 
 
 @pytest.mark.skipif(shutil.which("bash") is None, reason="needs bash")

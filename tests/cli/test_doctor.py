@@ -269,3 +269,31 @@ def test_a_package_that_pip_did_not_install(monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.setattr(importlib.metadata, "metadata", metadata)
     (found,) = doctor.find_extras()
     assert (found.name, found.state) == ("extras", "note")
+
+
+@pytest.mark.parametrize("kept", ["beside", "cache", "numba", "nothing"])
+def test_clean_leaves_nothing_of_edgeperc_and_all_of_others(
+    kept: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    package, cache = tmp_path / "edgeperc", tmp_path / "cache"
+    own = {
+        "beside": [package / "ground/__pycache__/planes.f-0123456789abcdef.kernel"],
+        "cache": [cache / "kernels/ground-0/a.kernel", cache / "compiled/b/c/blob", cache / "settings.json"],
+        "numba": [tmp_path / "numba/ground-0/a.kernel"],
+        "nothing": [],
+    }[kept]
+    others = [package / "ground/planes.py", package / "ground/__pycache__/planes.pyc", tmp_path / "numba/x/y.nbc"]
+    for file in (*own, *others):
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_bytes(b"123")
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "numba"))
+    monkeypatch.setattr(doctor, "package_folders", lambda: [package])
+    assert run("doctor", "--clean") == 0
+    assert f"deleted {len(own)} file" in capsys.readouterr().out
+    left = {file for file in tmp_path.rglob("*") if file.is_file()}
+    assert left == {*others}
+    assert not cache.exists()
+
+
+def test_the_packages_are_where_they_are_imported_from() -> None:
+    assert Path(str(zoo.__file__)).parents[1] / "edgeperc" in doctor.package_folders()

@@ -26,6 +26,8 @@ from edgeperc.errors import MountingError, OptionError, PointsError, SensorError
 from edgeperc.evaluation.evaluate import evaluate
 from edgeperc.evaluation.truth import cells_inside, folder_truth, road_cells
 from edgeperc.inference.projection import make_projector
+from edgeperc.preprocess.findings import check_fitness
+from edgeperc.preprocess.fitness import FitnessProfile
 from edgeperc.simulation.samples import IGNORE, simulated_scan
 from edgeperc.types.mounting import MODEL_MOUNTING, Mounting
 from edgeperc.types.perception import Box
@@ -675,3 +677,31 @@ def test_public_sets(data_root: Callable[[str], Path]) -> None:
         if name == "vod":  # the box of a cyclist holds that of the rider
             assert not (scans[0].labels == 1).any()
             assert (scans[0].labels == 3).sum() > 500
+
+
+@pytest.mark.parametrize("sensor", ["vlp-16", "hdl-32e"])
+def test_a_network_trained_on_a_sensor_does_not_call_it_foreign(tmp_path: Path, sensor: str) -> None:
+    pytest.importorskip("torch")
+    pytest.importorskip("onnx")
+    from edgeperc_export.recipe import Recipe
+    from edgeperc_export.training.checkpoint import CheckpointError, read_checkpoint
+    from edgeperc_export.training.train import Data, Run, train
+
+    root, _ = street(tmp_path / "set", sensor, seeds=(3, 4))
+    recipe = Recipe("pointseg", steps=1, batch=1, context_width=8, simulated_share=0.0, n_pasted=0.0)
+    checkpoint = train(recipe, tmp_path / "run", Data(scan_sets=[ScanFolder(root)]), Run(n_threads=1))
+    (scan, _), _, _ = read_scan_set(ScanFolder(root), "train")
+    fitness = read_checkpoint(checkpoint)["fitness"]
+    assert fitness.n_scans == 2
+    assert check_fitness(scan.points, fitness, get_sensor(sensor)) == ()
+    of_hdl = FitnessProfile.from_scans([simulated_scan(5).points])
+    assert any("rows of points" in finding for finding in check_fitness(scan.points, of_hdl, get_sensor(sensor)))
+
+    import torch
+
+    state = torch.load(checkpoint, weights_only=True)
+    torch.save({name: value for name, value in state.items() if name != "fitness"}, checkpoint)
+    assert read_checkpoint(checkpoint)["fitness"] is None  # of an earlier version
+    torch.save(state | {"fitness": '{"n_scans": 0}'}, checkpoint)
+    with pytest.raises(CheckpointError, match="fitness"):
+        read_checkpoint(checkpoint)

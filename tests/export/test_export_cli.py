@@ -17,6 +17,7 @@ onnx = pytest.importorskip("onnx")
 
 from training_helpers import ablate
 
+from edgeperc.zoo import model_path
 from edgeperc_export.cli import build_parser, main, recipe_of
 from edgeperc_export.networks import build
 from edgeperc_export.recipe import MODELS, NETWORKS, Recipe
@@ -136,3 +137,27 @@ def test_wrong_usage_is_reported_in_one_line(tmp_path: Path, capsys: pytest.Capt
     arguments = {"kitti": tmp_path, "simulated": tmp_path, "start_from": None, "fold": 0, "steps": 1}
     with pytest.raises(ValueError, match="pointseg has no variant 'half'; expected one of: as shipped; nothing pasted"):
         ablate("pointseg", tmp_path, **arguments, variants=["half"])
+
+
+@pytest.mark.parametrize(
+    ("words", "option"),
+    [
+        (["train", "pointseg", "out", "--start-from", "MODEL"], "start_from"),
+        (["train", "pointseg", "out", "--teacher", "MODEL"], "teacher"),
+        (["quantize", "MODEL", "int8.onnx"], "model"),
+        (["verify", "checkpoint.pt", "MODEL"], "model"),
+        (["ablate", "pointseg", "out", "--start-from", "MODEL"], "start_from"),
+    ],
+)
+def test_models_have_names(words: list[str], option: str, capsys: pytest.CaptureFixture[str]) -> None:
+    def parsed(model: str) -> Path:
+        path: Path = getattr(build_parser().parse_args([model if word == "MODEL" else word for word in words]), option)
+        return path
+
+    assert parsed("pointseg") == model_path("pointseg")
+    assert parsed("pointseg:int8") == model_path("pointseg:int8")
+    for file in ("runs/checkpoint.pt", "pointseg.onnx", "runs/pointseg"):
+        assert parsed(file) == Path(file)
+    with pytest.raises(SystemExit):
+        parsed("pointsg")
+    assert "did you mean pointseg" in capsys.readouterr().err

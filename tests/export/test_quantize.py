@@ -246,6 +246,20 @@ def test_excluded_nodes_stay_in_fp32(tmp_path: Path, small: Path, scans: list[np
         quantize(small, out, Calibration(scans), LabeledSets(), exclude=["nothing"], race=FASTER)
 
 
+@pytest.mark.parametrize("limit", [1e-30, 0.0, -1.0])
+def test_no_layer_below_the_limit_is_said(tmp_path: Path, small: Path, scans: list[np.ndarray], limit: float) -> None:
+    with pytest.raises(
+        RefusedError, match=r"no layer became int8: .* of 3 layers alone, \S+, makes noise of \d.*limit"
+    ):
+        quantize(small, tmp_path / "int8.onnx", Calibration(scans), ONE, max_noise=limit, race=FASTER)
+
+
+def test_a_network_without_inner_layers_is_said(tmp_path: Path, small: Path, scans: list[np.ndarray]) -> None:
+    inner = [n.name for n in onnx.load(small).graph.node if n.op_type == "Conv"]
+    with pytest.raises(RefusedError, match=r"no layer became int8: .* those of --exclude stay in fp32"):
+        quantize(small, tmp_path / "int8.onnx", Calibration(scans), ONE, exclude=inner, race=FASTER)
+
+
 def test_unpooling_is_not_rounded_on_one_side(tmp_path: Path, scans: list[np.ndarray]) -> None:
     class Unpooling(nn.Module):
         def __init__(self) -> None:

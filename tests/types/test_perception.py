@@ -17,7 +17,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from edgeperc import Box, Perception, PointLabels, PointsError, TopView, Tracker, TrackingError
+from edgeperc import Box, ModelError, Perception, PointLabels, PointsError, TopView, Tracker, TrackingError
 from edgeperc.records import SCAN_KEYS, read_boxes, scan_record
 
 CAR = Box("car", 0.87654321, (12.34567, -1.5, -0.9), (4.1, 1.7, 1.5), 0.1234567)
@@ -96,12 +96,13 @@ def test_perception_as_json_counts_points_by_class() -> None:
     assert json.loads(json.dumps(document, allow_nan=False)) == document
     assert document["stamp_s"] == 12.5
     assert document["point_counts"] == {"background": 1, "car": 2}
+    assert document["n_in_view"] == sum(document["point_counts"].values()) == 3
     assert document["drivable_area_m2"] == 320.0
     assert document["boxes"] == [CAR.to_dict()]
     assert document["stage_ms"] == {"infer": 1.235}
     empty = perception_of(labels=False).to_dict()
     assert empty.keys() == document.keys()
-    assert empty["point_counts"] is empty["drivable_area_m2"] is empty["stamp_s"] is None
+    assert empty["point_counts"] is empty["n_in_view"] is empty["drivable_area_m2"] is empty["stamp_s"] is None
 
 
 COPIES: dict[str, Callable[[Any], Any]] = {
@@ -220,3 +221,19 @@ def test_without_an_origin_nothing_is_in_a_map() -> None:
         _ = perception.map_boxes
     with pytest.raises(PointsError, match="place of the scan in a map is not known"):
         perception.to_map(np.zeros((3, 4), np.float32))
+
+
+PARTS = {"points": "pointseg", "top_view": "ssadnet", "image": "camseg", "ground": "pointseg"}
+
+
+@pytest.mark.parametrize("name", PARTS)
+def test_a_part_that_is_there_is_required_as_it_is(name: str) -> None:
+    part = object()
+    assert getattr(replace(perception_of(), **{name: part}), f"require_{name}")() is part  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(("name", "model"), PARTS.items())
+def test_a_part_that_is_missing_names_the_model_to_add(name: str, model: str) -> None:
+    without = replace(perception_of(), **{name: None})  # type: ignore[arg-type]
+    with pytest.raises(ModelError, match=f"add '{model}' to the models"):
+        getattr(without, f"require_{name}")()

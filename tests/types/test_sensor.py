@@ -17,11 +17,12 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 import twins.fitness
+from edgeperc.datasets.layout import known_layouts, read_layout
 from edgeperc.errors import CardError, PointsError, SensorError
 from edgeperc.preprocess.findings import check_fitness
 from edgeperc.preprocess.fitness import SUMS, FitnessProfile, Histograms, Rows, fill_scan_sums
 from edgeperc.readers.files import read_points
-from edgeperc.types.sensor import SENSORS, SensorProfile, get_sensor
+from edgeperc.types.sensor import PUBLIC_SENSORS, SENSORS, SensorProfile, get_sensor
 
 
 def test_built_in_profiles() -> None:
@@ -37,6 +38,15 @@ def test_built_in_profiles() -> None:
         assert profile.azimuth_resolution_deg * profile.columns == pytest.approx(360)
         raw = np.array(profile.remission_range)
         np.testing.assert_allclose((raw + profile.remission_offset) * profile.remission_scale, [0, 1])
+
+
+@pytest.mark.parametrize("name", known_layouts())
+def test_a_public_set_is_a_sensor(name: str) -> None:
+    """By the name of its layout, with the profile of its layout, and never beside the built-in ones."""
+    assert get_sensor(name) is PUBLIC_SENSORS[name]
+    assert read_layout(name).sensor == PUBLIC_SENSORS[name]
+    assert name not in SENSORS
+    assert {*PUBLIC_SENSORS} == {*known_layouts()}
 
 
 def test_vlp_16_is_evenly_spaced() -> None:

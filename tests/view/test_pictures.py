@@ -26,7 +26,7 @@ from edgeperc.types.perception import Box, Perception, PointLabels, TopView
 from edgeperc.view import draw_tracks, flatten_scan, write_html, write_labels, write_ply
 from edgeperc.view.canvas import Label, add_axes, free_place, new_figure, place_labels, shorten, wrap
 from edgeperc.view.colors import CLASS_COLORS, FALSE, FOUND, MISSED
-from edgeperc.view.content import ground_plane, paint_points
+from edgeperc.view.content import ground_plane, paint_points, paint_vehicles
 
 POINT_CLASSES = ("background", "car", "pedestrian", "cyclist")
 TOP_CLASSES = ("background", "drivable", "car", "van", "truck")
@@ -105,6 +105,39 @@ def test_picture_shows_classes_where_they_are(scan: np.ndarray, perception: Perc
     assert right_half[700:868].sum() > 20
     # Legend squares.
     assert all(near(picture[910:1010], name).sum() > 60 for name in {*POINT_CLASSES, *TOP_CLASSES})
+
+
+@pytest.mark.usefixtures("matplotlib")
+@pytest.mark.parametrize("behind_m", [15.0, 30.0, 44.0])
+def test_a_full_turn_is_drawn_whole(behind_m: float, scan: np.ndarray, perception: Perception) -> None:
+    """A box behind the sensor shows from above, and points behind it in the range image, at its ends."""
+    assert perception.points is not None
+    labels, in_view = perception.points.labels.copy(), perception.points.in_view.copy()
+    scan[-80:, 0], scan[-80:, 1], scan[-80:, 2] = -behind_m, np.linspace(-1.0, 1.0, 80), -0.5
+    labels[-80:], in_view[-80:] = POINT_CLASSES.index("cyclist"), True
+    rear = replace(CAR, label="cyclist", center=(-behind_m, 0.0, -0.8))
+    turn = replace(perception, boxes=(rear,), points=PointLabels(labels, in_view, POINT_CLASSES))
+    found = near(pixels(view.draw(turn, scan)), "cyclist")
+    row, col = 128 + int((48.0 + behind_m) * 740 / 96.0), 90 + int(36.0 * 740 / 96.0)
+    assert found[row - 30 : row + 30, col - 60 : col + 60].sum() > 60
+    assert found[700:868, 680:760].any()
+    assert found[700:868, 1492:1572].any()
+
+
+@pytest.mark.parametrize("label", ["van", "truck", "car"])
+def test_points_of_a_vehicle_have_the_color_of_its_box(label: str, scan: np.ndarray, perception: Perception) -> None:
+    assert perception.points is not None
+    box = replace(CAR, label=label, yaw=0.6)
+    cos, sin = np.cos(box.yaw), np.sin(box.yaw)
+    for k, (along, across) in enumerate([(1.8, 0.7), (-1.8, -0.7), (2.6, 0.0), (0.0, 1.4)]):
+        x, y = box.center[0] + cos * along - sin * across, box.center[1] + sin * along + cos * across
+        scan[k, :3] = x, y, box.center[2]
+    labels = np.zeros(len(scan), np.uint8)
+    labels[:4] = POINT_CLASSES.index("car")
+    seen = replace(perception, points=replace(perception.points, labels=labels), top_view=None, boxes=(box,))
+    names, painted = paint_points(scan, seen)
+    paint_vehicles(names, painted, scan, seen.boxes)
+    assert [names[k] for k in painted[:4]] == [label, label, "car", "car"]
 
 
 @pytest.mark.usefixtures("matplotlib")
