@@ -49,7 +49,7 @@ FLOORS = {
         objects.cluster objects.crops
         objects.persons
         objects.boxes
-        preprocess.__init__ preprocess.fitness preprocess.interpolation preprocess.returns
+        preprocess.__init__ preprocess.fitness preprocess.health preprocess.interpolation preprocess.returns
         preprocess.condition preprocess.ego preprocess.findings preprocess.motion preprocess.sensor_estimate
         preprocess.sensor_fit
         preprocess.remission
@@ -82,7 +82,7 @@ FLOORS = {
         readers.apart
         readers.captures
         records
-        simulation.raycast
+        simulation.raycast simulation.weather
         simulation.scene simulation.shapes
         simulation.vehicles
         simulation.people
