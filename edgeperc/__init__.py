@@ -64,7 +64,7 @@ if TYPE_CHECKING:
     from .types.card import ModelCard
     from .types.frame import ModelFrame
     from .types.mounting import Mounting
-    from .types.perception import Box, DroppedPoints, ImageLabels, Perception, PointLabels, TopView
+    from .types.perception import Box, DroppedPoints, ImageLabels, Perception, PointLabels, SensorHealth, TopView
     from .types.sensor import SensorProfile
     from .view import draw
 
@@ -103,6 +103,7 @@ __all__ = [
     "ProviderInfo",
     "RoadAhead",
     "SensorError",
+    "SensorHealth",
     "SensorInfo",
     "SensorProfile",
     "SettingsError",
@@ -163,6 +164,7 @@ MODULES = {
     "ProviderInfo": "inference.listing",
     "RoadAhead": "road.ahead",
     "SensorInfo": "inference.listing",
+    "SensorHealth": "types.perception",
     "SensorProfile": "types.sensor",
     "Stream": "live",
     "TimedScan": "readers.times",

@@ -31,13 +31,13 @@ _SAMPLE = 8192  # points
 _STEPS = (1, 3, 5, 7, 11, 13, 17, 19, 23, 29, 31, 37, 41, 43, 47, 53, 59, 61)  # that meet every beam in turn
 _FEWEST_OF_SECTOR, _BLOCKED = 6.0, 0.1  # sampled returns, and the share of them that a blocked sector has at most
 _WIDEST = 24  # sectors; a scan may be cropped to what a camera sees, or the sensor look ahead
-_NARROWEST, _NARROWEST_AT_FIRST, _WIDE = 2, 5, 4
+_NARROWEST, _NARROWEST_AT_FIRST, _WIDE = 2, 5, 6
 _WEDGE = 0.05  # around the four directions in which isolated returns are counted: 6 % of a turn
 _RADIUS_COLUMNS, _LEAST_RADIUS_M = 3.0, 0.06
-_FEWEST_NEAR, _ROOM = 100, 8192
+_FEWEST_NEAR, _USUAL_POINTS, _ROOM = 100, 1e5, 8192
 # Shares of the near returns that are isolated without a remission, and isolated and dim on nearly all sides, or on one
 # side in a cloud; the dim ones' share of the isolated.
-_ISOLATED, _ISOLATED_DIM, _CLOUD, _MOSTLY_DIM = 0.05, 0.02, 0.045, 0.4
+_ISOLATED, _ISOLATED_DIM, _CLOUD, _MOSTLY_DIM = 0.05, 0.02, 0.045, 0.7
 _OF_REMISSION = 1024  # points
 _DIM = 0.25  # of the usual remission, which drops are below
 _RANGE_SHARE, _SHRUNK, _FEWER_RETURNS = 0.95, 0.6, 0.85
@@ -89,35 +89,38 @@ def check_health(
     n_sampled = fill_sectors(points, eye, step, tans, counts, ranges)
     if n_sampled == 0:
         return SensorHealth(), normal
-    near, has_remission = _isolated(points, eye, sensor, _WEDGE, 0, None)
+    wedge = _WEDGE * min(1.0, _USUAL_POINTS / len(points))  # of as many points
+    near, has_remission = _isolated(points, eye, sensor, wedge, (0, 0), None)
     n_near = int(near[:, 0].sum())
     range_m = float(np.cumsum(ranges).searchsorted(_RANGE_SHARE * n_sampled)) + 0.5
-    blocked = _blocked(counts, normal, sensor, tans)
+    beams = np.tan(np.radians(sensor.elevations_deg))
+    is_judged = np.array([(beams < tans[0]).sum(), ((beams >= tans[0]) & (beams < tans[1])).sum()]) >= 2
+    blocked = _blocked(counts, normal) & is_judged
     isolated = float(near[:, 1].sum()) / n_near if n_near >= _FEWEST_NEAR else 0.0
     known = bool(normal.ranges_m)
     health = SensorHealth(
-        blocked=float(blocked.mean()),
+        blocked=float(blocked.sum() / max(1, N_SECTORS * is_judged.sum())),
         blocked_deg=_arcs(blocked.any(axis=1)),
         isolated=isolated,
         range_m=range_m,
         normal_range_m=_middle(normal.ranges_m) if known else None,
         returns_share=n_sampled * step / _middle(normal.returns) if known else None,
         has_drops=n_near >= _FEWEST_NEAR and _has_drops(near, has_remission),
-        has_fog=False,
     )
     health = replace(health, has_fog=_has_fog(health))
+    health = replace(health, findings=tuple(text for _, text in findings_of(health)))
     return health, normal.add(counts, range_m, float(n_sampled * step))
 
 
 def without_drops(
     points: Points, sensor: SensorProfile, eye_m: Sequence[float] = (0.0, 0.0, 0.0)
 ) -> tuple[NDArray[np.float32], int]:
-    """A scan (n, 4) in which near points with at most one neighbor are NaN, read-only, and how many there are.
+    """A scan (n, 4) in which near points with at most one neighbor, or four if they are dim, are NaN, and their number.
 
     Only for scans of which `check_health` says that there are drops: leaves and wires are as lonely.
     """
     mark = np.zeros(len(points), np.bool_)
-    counts, _ = _isolated(read_only(points), np.array(eye_m, np.float64), sensor, math.inf, 1, mark)
+    counts, _ = _isolated(read_only(points), np.array(eye_m, np.float64), sensor, math.inf, (1, 4), mark)
     n = int(counts[:, 1].sum())
     if n == 0:
         return points, 0
@@ -143,9 +146,9 @@ def findings_of(health: SensorHealth) -> tuple[tuple[str, str], ...]:
         found.append(
             (
                 "drops",
-                f"{health.isolated:.0%} of the points within {NEAR_M:g} m have no neighbor, and reflect little; in clear air "
-                f"hardly any do on all sides: rain, snow, dust or spray. They are left out of boxes, labels and cells. Expect a "
-                "shorter range, and drive slower.",
+                f"{health.isolated:.0%} of the points within {NEAR_M:g} m have no neighbor, and most of them "
+                "are dim; in clear air hardly any are: rain, snow, dust or spray. Such points are left out of boxes, "
+                "labels and cells. Expect a shorter range, and drive slower.",
             )
         )
     if health.has_fog:
@@ -182,7 +185,9 @@ def _has_drops(near: NDArray[np.int64], has_remission: bool) -> bool:
     if not has_remission:
         return _everywhere(near, 1) > _ISOLATED
     n, n_isolated, n_dim = near.sum(axis=0)
-    return bool(n_dim > _MOSTLY_DIM * n_isolated and (n_dim > _CLOUD * n or _everywhere(near, 2) > _ISOLATED_DIM))
+    everywhere = _everywhere(near, 2)
+    are_dim = n_dim > _MOSTLY_DIM * n_isolated
+    return bool(everywhere > _CLOUD or (are_dim and (n_dim > _CLOUD * n or everywhere > _ISOLATED_DIM)))
 
 
 def _has_fog(health: SensorHealth) -> bool:
@@ -193,24 +198,22 @@ def _has_fog(health: SensorHealth) -> bool:
     return is_dimmed and health.range_m < _SHRUNK * health.normal_range_m
 
 
-def _blocked(
-    counts: NDArray[np.float64], normal: Normal, sensor: SensorProfile, tans: NDArray[np.float64]
-) -> NDArray[np.bool_]:
+def _blocked(counts: NDArray[np.float64], normal: Normal) -> NDArray[np.bool_]:
     """Which sectors are blocked in the bands that meet the ground, (N_SECTORS, 2) bool."""
     lacks, blocked = np.empty(counts.shape, np.bool_), np.zeros((N_SECTORS, 2), np.bool_)
     fill_lacking(counts, np.full(counts.shape, np.inf) if normal.fewest is None else normal.fewest, lacks)
     if not lacks.any():
         return blocked
-    beams = np.tan(np.radians(np.asarray(sensor.elevations_deg)))
-    n_beams = (beams < tans[0]).sum(), ((beams >= tans[0]) & (beams < tans[1])).sum()
-    is_first = normal.fewest is None
+    least = _NARROWEST_AT_FIRST if normal.fewest is None else _NARROWEST
+    dark = lacks | (counts == 0.0)  # with what the vehicle hides
     for band in range(2):
         # What a part of the vehicle hides was hidden before, and beams above it return.
-        runs = _runs(lacks[:, band] & lacks[:, 3])
-        runs += [run for run in _runs(lacks[:, band]) if run[1] >= _WIDE and not is_first]
-        for first, n in runs if n_beams[band] >= 2 else ():
-            if (_NARROWEST_AT_FIRST if is_first else _NARROWEST) <= n <= _WIDEST:
-                blocked[np.arange(first, first + n) % N_SECTORS, band] = True
+        for columns, fewest in (((band, 3), least), ((band,), _WIDE if normal.fewest is not None else N_SECTORS)):
+            for first, n in _runs(dark[:, columns].all(axis=1)):
+                sectors = np.arange(first, first + n) % N_SECTORS
+                sectors = sectors[lacks[sectors][:, columns].all(axis=1)]
+                if fewest <= len(sectors) and n <= _WIDEST:
+                    blocked[sectors, band] = True
     return blocked
 
 
@@ -236,7 +239,12 @@ def _arcs(marks: NDArray[np.bool_]) -> tuple[tuple[float, float], ...]:
 
 
 def _isolated(
-    points: Points, eye: NDArray[np.float64], sensor: SensorProfile, wedge: float, most: int, mark: Mask | None
+    points: Points,
+    eye: NDArray[np.float64],
+    sensor: SensorProfile,
+    wedge: float,
+    most: tuple[int, int],
+    mark: Mask | None,
 ) -> tuple[NDArray[np.int64], bool]:
     """What `mark_isolated` counts, and whether the scan has a remission."""
     per_m = _RADIUS_COLUMNS * math.radians(sensor.azimuth_resolution_deg)
@@ -251,7 +259,7 @@ def _isolated(
     if not np.isfinite(remission.sum()):
         remission = remission[np.isfinite(remission)]
     dim = _DIM * float(np.partition(remission, len(remission) // 2)[len(remission) // 2]) if len(remission) else 0.0
-    mark_isolated(points, eye, (wedge, most, dim), radius, heads, buffers, mark, counts)
+    mark_isolated(points, eye, (wedge, most[0], most[1], dim), radius, heads, buffers, mark, counts)
     return counts, dim > 0.0
 
 
@@ -328,7 +336,7 @@ def fill_lacking(counts: NDArray[np.float64], fewest: NDArray[np.float64], lacks
 def mark_isolated(
     points: Points,
     eye: NDArray[np.float64],
-    of: tuple[float, int, float],
+    of: tuple[float, int, int, float],
     radius: NDArray[np.float64],
     heads: NDArray[np.int32],
     buffers: NDArray[np.int32],
@@ -337,15 +345,15 @@ def mark_isolated(
 ) -> None:
     """Count points within `NEAR_M`, and those with few others around them, which are marked.
 
-    of : only points whose smaller horizontal coordinate is at most this share of the larger one; how many others; the
-        remission below which a point is dim.
+    of : only points whose smaller horizontal coordinate is at most this share of the larger one; how many others;
+        how many if it is dim; the remission below which it is.
     radius : (3,); around a point, per meter of its range, at least, and at most [m].
     heads : (a power of two,), buffers : (2, most near points that are looked at); overwritten.
     mark : (n,) or (0,) bool, modified.
     counts : (4, 3), overwritten; of each side, with a larger x, y, -x and -y, the near points, those with few others
         around, and of these the dim ones.
     """
-    wedge, most, dim = of
+    wedge, most_bright, most_dim, dim = of
     n, full = 0, np.float64(NEAR_M * NEAR_M)
     rows, chain = buffers[0], buffers[1]
     for i in range(points.shape[0]):
@@ -375,16 +383,20 @@ def mark_isolated(
         side = (0 if x > 0.0 else 2) if abs(x) >= abs(y) else (1 if y > 0.0 else 3)
         counts[side, 0] += 1
         around = max(radius[0] * math.sqrt(x * x + y * y + z * z), radius[1])
+        is_dim = points[i, 3] < dim
+        most = most_dim if is_dim else most_bright
         # Neighbors of a beam are often beside one another in a scan.
         beside = 0
         for j in (k - 1, k + 1):
             if 0 <= j < n:
                 row = rows[j]
-                px, py, pz = points[row, 0] - points[i, 0], points[row, 1] - points[i, 1], points[row, 2] - points[i, 2]
-                beside += np.float64(px * px + py * py + pz * pz) <= around * around
+                px = np.float64(points[row, 0]) - np.float64(points[i, 0])
+                py = np.float64(points[row, 1]) - np.float64(points[i, 1])
+                pz = np.float64(points[row, 2]) - np.float64(points[i, 2])
+                beside += px * px + py * py + pz * pz <= around * around
         if beside <= most and is_isolated(points, eye, k, most, (around, radius[2]), heads, buffers):
             counts[side, 1] += 1
-            counts[side, 2] += points[i, 3] < dim
+            counts[side, 2] += is_dim
             if mark.shape[0] > 0:
                 mark[i] = True
 
@@ -421,15 +433,15 @@ def is_isolated(
         while j >= 0:
             row = rows[j]
             px, py, pz = points[row, 0] - x, points[row, 1] - y, points[row, 2] - z
-            # Another cell may have the same list.
-            if j != k and px * px + py * py + pz * pz <= radius[0] * radius[0]:
-                if (
-                    int((points[row, 0] - eye[0] + 16.0) * per_m) == u
-                    and int((points[row, 1] - eye[1] + 16.0) * per_m) == v
-                    and int((points[row, 2] - eye[2] + 16.0) * per_m) == w
-                ):
-                    found += 1
-                    if found > most:
-                        return False
+            is_near = j != k and px * px + py * py + pz * pz <= radius[0] * radius[0]
+            if (
+                is_near  # and of this cell, as another one may have the same list
+                and int((points[row, 0] - eye[0] + 16.0) * per_m) == u
+                and int((points[row, 1] - eye[1] + 16.0) * per_m) == v
+                and int((points[row, 2] - eye[2] + 16.0) * per_m) == w
+            ):
+                found += 1
+                if found > most:
+                    return False
             j = chain[j]
     return True

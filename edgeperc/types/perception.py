@@ -290,6 +290,8 @@ class SensorHealth:
         Isolated returns, or a range that shrank and returns that are missing, show weather.
     n_drops : int
         Points that were left out as drops; 0 in clear air. They are labeled 0, and not in view.
+    findings : tuple of str
+        One sentence for each sign: what came, what was expected, and what to do.
     """
 
     blocked: float = 0.0
@@ -301,11 +303,12 @@ class SensorHealth:
     has_drops: bool = False
     has_fog: bool = False
     n_drops: int = 0
+    findings: tuple[str, ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
         """Convert to a dict for JSON, shares rounded to 0.0001 and ranges to 0.1 m."""
         rounded = {"blocked": 4, "isolated": 4, "returns_share": 4, "range_m": 1, "normal_range_m": 1}
-        record = asdict(self) | {"blocked_deg": [[*arc] for arc in self.blocked_deg]}
+        record = asdict(self) | {"blocked_deg": [[*arc] for arc in self.blocked_deg], "findings": [*self.findings]}
         return record | {k: round(record[k], n) for k, n in rounded.items() if record[k] is not None}
 
 
@@ -408,8 +411,9 @@ class Perception:
         dict
             ``stamp_s``, ``n_points``, ``n_dropped``, ``dropped`` (by kind), ``stage_ms``, ``providers``, ``boxes``
             (`Box.to_dict`), ``drivable_area_m2``, ``point_counts``, ``fitness``, ``mounting``, ``remission``,
-            ``image`` (`ImageLabels.to_dict`), ``origin_m``, ``map_boxes`` and ``health``. Every key is always present; its value is
-            None if no model of that kind ran, if remission was only scaled, or if the place in a map was not given.
+            ``image`` (`ImageLabels.to_dict`), ``origin_m``, ``map_boxes`` and ``health`` (`SensorHealth.to_dict`).
+            Every key is always present; its value is None if no model of that kind ran, if remission was only scaled,
+            or if the place in a map was not given.
         """
         return {
             "stamp_s": self.stamp_s,
