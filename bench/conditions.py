@@ -69,14 +69,16 @@ def normal_of(scans: Iterable[Scan], sensor: SensorProfile) -> Normal:
     return normal
 
 
-def warned(health: SensorHealth) -> tuple[bool, bool, bool]:
-    """Whether of a blocked window, of drops, of fog."""
-    return bool(health.blocked_deg), health.has_drops, health.has_fog
+def warned(health: SensorHealth) -> tuple[bool, bool, bool, bool]:
+    """Whether of a blocked window, of drops, of a cloud, of fog."""
+    return bool(health.blocked_deg), health.has_drops, health.has_cloud, health.has_fog
 
 
 def print_warnings(name: str, scans: Sequence[Scan], sensor: SensorProfile) -> None:
     """A row for each condition: share of the scans that are warned of."""
-    print(f"\n| {name}, {len(scans)} scans | first scan | later | blocked | drops | fog |\n|---|---|---|---|---|---|")
+    print(
+        f"\n| {name}, {len(scans)} scans | first scan | later | blocked | drops | cloud | fog |\n|---|---|---|---|---|---|---|"
+    )
     for kind, (apply, strengths, unit) in {"clear air": (_clear, (0.0,), ""), **CONDITIONS}.items():
         for strength in strengths:
             first, later = [], []

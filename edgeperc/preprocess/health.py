@@ -36,10 +36,10 @@ _WEDGE = 0.05  # around the four directions in which isolated returns are counte
 _RADIUS_COLUMNS, _LEAST_RADIUS_M = 3.0, 0.06
 _FEWEST_NEAR, _USUAL_POINTS, _ROOM = 100, 1e5, 8192
 # Shares of the near returns that are isolated without a remission, and isolated and dim on nearly all sides, or on one
-# side in a cloud; the dim ones' share of the isolated.
-_ISOLATED, _ISOLATED_DIM, _CLOUD, _MOSTLY_DIM = 0.05, 0.02, 0.045, 0.7
+# side in a cloud; that are isolated in fog, if the range shrank, too; the dim ones' share of the isolated.
+_ISOLATED, _ISOLATED_DIM, _CLOUD, _HAZE, _MOSTLY_DIM = 0.05, 0.02, 0.04, 0.03, 0.6
 _OF_REMISSION = 1024  # points
-_DIM = 0.25  # of the usual remission, which drops are below
+_DIM = 0.15  # of the usual remission, which drops are below
 _RANGE_SHARE, _SHRUNK, _FEWER_RETURNS = 0.95, 0.6, 0.85
 
 
@@ -98,6 +98,7 @@ def check_health(
     blocked = _blocked(counts, normal) & is_judged
     isolated = float(near[:, 1].sum()) / n_near if n_near >= _FEWEST_NEAR else 0.0
     known = bool(normal.ranges_m)
+    has_drops, has_cloud = _has_drops(near, has_remission) if n_near >= _FEWEST_NEAR else (False, False)
     health = SensorHealth(
         blocked=float(blocked.sum() / max(1, N_SECTORS * is_judged.sum())),
         blocked_deg=_arcs(blocked.any(axis=1)),
@@ -105,9 +106,11 @@ def check_health(
         range_m=range_m,
         normal_range_m=_middle(normal.ranges_m) if known else None,
         returns_share=n_sampled * step / _middle(normal.returns) if known else None,
-        has_drops=n_near >= _FEWEST_NEAR and _has_drops(near, has_remission),
+        has_drops=has_drops,
+        has_cloud=has_cloud,
     )
-    health = replace(health, has_fog=_has_fog(health))
+    is_hazy = n_near >= _FEWEST_NEAR and _everywhere(near, near[:, 1]) > _HAZE
+    health = replace(health, has_fog=_has_fog(health, is_hazy))
     health = replace(health, findings=tuple(text for _, text in findings_of(health)))
     return health, normal.add(counts, range_m, float(n_sampled * step))
 
@@ -147,8 +150,17 @@ def findings_of(health: SensorHealth) -> tuple[tuple[str, str], ...]:
             (
                 "drops",
                 f"{health.isolated:.0%} of the points within {NEAR_M:g} m have no neighbor, and most of them "
-                "are dim; in clear air hardly any are: rain, snow, dust or spray. Such points are left out of boxes, "
-                "labels and cells. Expect a shorter range, and drive slower.",
+                "are dim; in clear air hardly any are: rain, snow, or dust all round. Such points are left out of "
+                "boxes, labels and cells. Expect a shorter range, and drive slower.",
+            )
+        )
+    if health.has_cloud:
+        found.append(
+            (
+                "cloud",
+                f"{health.isolated:.0%} of the points within {NEAR_M:g} m have no neighbor, and most of them are dim, on "
+                "one side; in clear air hardly any are: spray, dust or exhaust. It hides what is behind it, and may get "
+                "a box; keep more distance from the vehicle ahead.",
             )
         )
     if health.has_fog:
@@ -174,27 +186,27 @@ def _side(azimuth_deg: float) -> str:
     return f"{abs(azimuth_deg):g} degrees {'left' if azimuth_deg > 0.0 else 'right'}"
 
 
-def _everywhere(near: NDArray[np.int64], column: int) -> float:
-    """Share of the near points that few sides of the sensor have less of: leaves and wires are on one side."""
-    of_sides = np.sort(near[:, column] / np.maximum(near[:, 0], 1))[near[:, 0] >= _FEWEST_NEAR // 4]
+def _everywhere(near: NDArray[np.int64], lonely: NDArray[np.int64]) -> float:
+    """Share of the near points that is lonely on nearly all sides; leaves and wires are on one side."""
+    of_sides = np.sort(lonely / np.maximum(near[:, 0], 1))[near[:, 0] >= _FEWEST_NEAR // 4]
     return float(of_sides[(len(of_sides) - 1) // 3]) if len(of_sides) else 0.0
 
 
-def _has_drops(near: NDArray[np.int64], has_remission: bool) -> bool:
-    """By counts of `mark_isolated`."""
+def _has_drops(near: NDArray[np.int64], has_remission: bool) -> tuple[bool, bool]:
+    """Whether there are drops on nearly all sides, and a cloud of them on one, by counts of `mark_isolated`."""
     if not has_remission:
-        return _everywhere(near, 1) > _ISOLATED
-    n, n_isolated, n_dim = near.sum(axis=0)
-    everywhere = _everywhere(near, 2)
-    are_dim = n_dim > _MOSTLY_DIM * n_isolated
-    return bool(everywhere > _CLOUD or (are_dim and (n_dim > _CLOUD * n or everywhere > _ISOLATED_DIM)))
+        return _everywhere(near, near[:, 1]) > _ISOLATED, False
+    # Where leaves are, some are dim.
+    drops = np.where(near[:, 2] >= _MOSTLY_DIM * near[:, 1], near[:, 2], 0)
+    has_drops = _everywhere(near, drops) > _ISOLATED_DIM
+    return has_drops, not has_drops and bool(drops.max() > _CLOUD * near[:, 0].sum())
 
 
-def _has_fog(health: SensorHealth) -> bool:
+def _has_fog(health: SensorHealth, is_hazy: bool) -> bool:
     if health.normal_range_m is None or health.returns_share is None:
         return False
     # Walls near by shorten the range and add returns.
-    is_dimmed = health.has_drops or health.returns_share < _FEWER_RETURNS
+    is_dimmed = is_hazy or health.has_drops or health.has_cloud or health.returns_share < _FEWER_RETURNS
     return is_dimmed and health.range_m < _SHRUNK * health.normal_range_m
 
 
@@ -256,8 +268,7 @@ def _isolated(
     heads = np.empty(1 << (13 if math.isfinite(wedge) else 17), np.int32)
     counts = np.empty((4, 3), np.int64)
     remission = points[:: len(points) // _OF_REMISSION + 1, 3]
-    if not np.isfinite(remission.sum()):
-        remission = remission[np.isfinite(remission)]
+    remission = remission[np.isfinite(remission)]
     dim = _DIM * float(np.partition(remission, len(remission) // 2)[len(remission) // 2]) if len(remission) else 0.0
     mark_isolated(points, eye, (wedge, most[0], most[1], dim), radius, heads, buffers, mark, counts)
     return counts, dim > 0.0

@@ -286,10 +286,11 @@ class SensorHealth:
         The same in the first scans; None in the first one.
     returns_share : float or None
         Number of returns, as a share of that in the first scans.
-    has_drops, has_fog : bool
-        Isolated returns, or a range that shrank and returns that are missing, show weather.
+    has_drops, has_cloud, has_fog : bool
+        Isolated returns that are dim, on nearly all sides (rain, snow) or on one (spray, dust, exhaust); a range that
+        shrank, with returns that are isolated or missing.
     n_drops : int
-        Points that were left out as drops; 0 in clear air. They are labeled 0, and not in view.
+        Points that were left out as drops; 0 without ``has_drops``. They are labeled 0, and not in view.
     findings : tuple of str
         One sentence for each sign: what came, what was expected, and what to do.
     """
@@ -301,6 +302,7 @@ class SensorHealth:
     normal_range_m: float | None = None
     returns_share: float | None = None
     has_drops: bool = False
+    has_cloud: bool = False
     has_fog: bool = False
     n_drops: int = 0
     findings: tuple[str, ...] = ()

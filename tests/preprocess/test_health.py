@@ -209,12 +209,13 @@ WEATHER: dict[str, Callable[[Points], Points]] = {
 }
 
 
-@pytest.mark.parametrize("kind", WEATHER)
+@pytest.mark.parametrize("kind", sorted({*WEATHER} - {"fog"}))
 @pytest.mark.parametrize("seed", [5, 6])
 def test_weather_is_found_in_its_first_scan(kind: str, seed: int) -> None:
     health, _ = check_health(WEATHER[kind](clear(seed)), HDL, Normal())
-    assert health.has_drops
-    assert any("rain, snow, dust or spray" in text for text in health.findings)
+    assert health.has_drops or (health.has_cloud and kind in ("spray", "exhaust"))
+    (text,) = health.findings
+    assert ("spray, dust or exhaust" if health.has_cloud else "rain, snow, or dust all round") in text
 
 
 @pytest.mark.parametrize("seed", [5, 6, 7])

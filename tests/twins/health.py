@@ -28,7 +28,7 @@ def sectors(points: np.ndarray, eye: np.ndarray, step: int, tans: np.ndarray) ->
 def isolated(
     points: np.ndarray, eye: np.ndarray, wedge: float, most: int, dim: float, radius: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Twin of `health.mark_isolated`: counts (4, 3), and the points with at most ``most`` others around, a dim one with one more."""
+    """Twin of `health.mark_isolated`: counts (4, 3), and the points with at most ``most`` others."""
     counts, mark = np.zeros((4, 3), np.int64), np.zeros(len(points), np.bool_)
     xyz = points[:, :3].astype(np.float64) - eye
     with np.errstate(invalid="ignore", over="ignore"):
