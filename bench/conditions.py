@@ -76,9 +76,8 @@ def warned(health: SensorHealth) -> tuple[bool, bool, bool, bool]:
 
 def print_warnings(name: str, scans: Sequence[Scan], sensor: SensorProfile) -> None:
     """A row for each condition: share of the scans that are warned of."""
-    print(
-        f"\n| {name}, {len(scans)} scans | first scan | later | blocked | drops | cloud | fog |\n|---|---|---|---|---|---|---|"
-    )
+    print(f"\n| {name}, {len(scans)} scans | first scan | later | blocked | drops | cloud | fog |")
+    print("|---|---|---|---|---|---|---|")
     for kind, (apply, strengths, unit) in {"clear air": (_clear, (0.0,), ""), **CONDITIONS}.items():
         for strength in strengths:
             first, later = [], []
@@ -89,10 +88,7 @@ def print_warnings(name: str, scans: Sequence[Scan], sensor: SensorProfile) -> N
                 first.append(warned(check_health(bad, sensor, Normal())[0]))
                 later.append(warned(check_health(bad, sensor, normal_of(others, sensor))[0]))
             shares = [np.any(first, axis=1).mean(), np.any(later, axis=1).mean(), *np.mean(later, axis=0)]
-            print(
-                f"| {kind} {_text(strength, unit)} | " + " | ".join(f"{share:.0%}" for share in shares) + " |",
-                flush=True,
-            )
+            print(_row(kind, strength, unit, [f"{share:.0%}" for share in shares]), flush=True)
 
 
 def print_answers(name: str, scans: Sequence[Scan], sensor: SensorProfile) -> None:
@@ -121,7 +117,7 @@ def print_answers(name: str, scans: Sequence[Scan], sensor: SensorProfile) -> No
                     areas[k, j] = found_area / max(area, 1.0)
                     boxes[k, j] = sum(not _is_near(box, known) for box in found)
             shares = [f"{share:.0%}" for share in np.median(areas, axis=0)] + [f"{n:.2f}" for n in boxes.mean(axis=0)]
-            print(f"| {kind} {_text(strength, unit)} | " + " | ".join(shares) + " |", flush=True)
+            print(_row(kind, strength, unit, shares), flush=True)
 
 
 def print_clean(folder: Path, sensor: SensorProfile) -> None:
@@ -160,8 +156,8 @@ def _is_near(box: Box, others: Iterable[Box]) -> bool:
     return any(np.hypot(box.center[0] - o.center[0], box.center[1] - o.center[1]) < _SAME_M for o in others)
 
 
-def _text(strength: float, unit: str) -> str:
-    return f"{strength:g} {unit}" if unit else ""
+def _row(kind: str, strength: float, unit: str, cells: Iterable[str]) -> str:
+    return " | ".join([f"| {kind} {strength:g} {unit}" if unit else f"| {kind}", *cells]) + " |"
 
 
 def main() -> None:

@@ -158,9 +158,9 @@ def findings_of(health: SensorHealth) -> tuple[tuple[str, str], ...]:
         found.append(
             (
                 "cloud",
-                f"{health.isolated:.0%} of the points within {NEAR_M:g} m have no neighbor, and most of them are dim, on "
-                "one side; in clear air hardly any are: spray, dust or exhaust. It hides what is behind it, and may get "
-                "a box; keep more distance from the vehicle ahead.",
+                f"{health.isolated:.0%} of the points within {NEAR_M:g} m have no neighbor, and most of them "
+                "are dim, on one side; in clear air hardly any are: spray, dust or exhaust. It hides what is behind "
+                "it, and may get a box; keep more distance from the vehicle ahead.",
             )
         )
     if health.has_fog:

@@ -27,6 +27,7 @@ from edgeperc import (
     Perception,
     PointLabels,
     PointsError,
+    SensorHealth,
     TopView,
     Tracker,
     Tracks,
