@@ -64,7 +64,16 @@ if TYPE_CHECKING:
     from .types.card import ModelCard
     from .types.frame import ModelFrame
     from .types.mounting import Mounting
-    from .types.perception import Box, DroppedPoints, GroundSurface, ImageLabels, Perception, PointLabels, TopView
+    from .types.perception import (
+        Box,
+        DroppedPoints,
+        GroundSurface,
+        ImageLabels,
+        Perception,
+        PointLabels,
+        SensorHealth,
+        TopView,
+    )
     from .types.sensor import SensorProfile
     from .view import draw
 
@@ -104,6 +113,7 @@ __all__ = [
     "ProviderInfo",
     "RoadAhead",
     "SensorError",
+    "SensorHealth",
     "SensorInfo",
     "SensorProfile",
     "SettingsError",
@@ -165,6 +175,7 @@ MODULES = {
     "ProviderInfo": "inference.listing",
     "RoadAhead": "road.ahead",
     "SensorInfo": "inference.listing",
+    "SensorHealth": "types.perception",
     "SensorProfile": "types.sensor",
     "Stream": "live",
     "TimedScan": "readers.times",

@@ -24,6 +24,7 @@ from .pipeline import BoxesFrom, ObjectNetwork, Options, Pipeline, RangeImageNet
 from .preprocess.condition import scale
 from .preprocess.findings import Finding, check_beams, check_dropped, check_ground, check_profiles, with_raw_remission
 from .preprocess.fitness import FitnessProfile
+from .preprocess.health import Normal, check_health, findings_of, without_drops
 from .preprocess.interpolation import Interpolator
 from .preprocess.remission import RemissionMatcher
 from .preprocess.returns import about_too_near, returns
@@ -83,6 +84,8 @@ class Learned(NamedTuple):
         Whether further scans change nothing: the answer to a scan then depends on this scan alone.
     sensor_estimate : SensorEstimate or None
         What ``sensor="auto"`` found.
+    normal : Normal
+        What the sensor shows in clear air with a clean window.
     """
 
     mounting: MountingEstimator
@@ -90,6 +93,7 @@ class Learned(NamedTuple):
     to_check: int
     is_settled: bool
     sensor_estimate: SensorEstimate | None = None
+    normal: Normal = Normal()
 
 
 def _card_of(model: str | os.PathLike[str]) -> ModelCard | None:
@@ -270,7 +274,7 @@ class Perceiver:
         self._sensor_estimate: SensorEstimate | None = None
         self.sensor = get_sensor(DEFAULT_SENSOR if self._finds_sensor else sensor)
         self._set_mounting(MountingEstimator(self.sensor.mounting if mounting is None else mounting))
-        self._remission = RemissionMatcher(self.sensor)
+        self._remission, self._normal = RemissionMatcher(self.sensor), Normal()
         self.on_mismatch = on_mismatch
         self.score_threshold = score_threshold
         self.adapt = adapt
@@ -355,6 +359,7 @@ class Perceiver:
         self._fitness = [FitnessProfile.from_dict(card.fitness) for card in self.cards if card.fitness is not None]
         self._to_check = 0 if self.on_mismatch == "ignore" else CHECKED_SCANS
         self._told_of_near = False
+        self._told_of: set[str] = set()
         self._locks = {os.getpid(): threading.Lock()}
         self._lanes = Lanes(2 if at_once == 2 and all(session.shares_cores for session in self.sessions) else 1)
         self._pipeline = self._assemble(self.sensor)
@@ -443,7 +448,7 @@ class Perceiver:
         """
         with self._lock:
             self._sensor_estimate = None
-            self._remission = RemissionMatcher(self.sensor)
+            self._remission, self._normal = RemissionMatcher(self.sensor), Normal()
             self._set_mounting(MountingEstimator(self._estimator.known))
 
     @property
@@ -452,8 +457,9 @@ class Perceiver:
         is_settled = (
             self._is_sensor_known and self._estimator.is_complete and (self._remission.is_complete or not self._renders)
         )
-        is_settled = is_settled and self._to_check == 0
-        return Learned(self._estimator, self._remission, self._to_check, is_settled, self._sensor_estimate)
+        is_settled = is_settled and self._to_check == 0 and (self._normal.is_complete or self._pipeline is None)
+        estimate = self._sensor_estimate
+        return Learned(self._estimator, self._remission, self._to_check, is_settled, estimate, self._normal)
 
     def start_from(self, learned: Learned) -> None:
         """Forget the scans so far, and continue from what another perceiver has learned."""
@@ -461,7 +467,7 @@ class Perceiver:
             if self._finds_sensor:
                 self._sensor_estimate = learned.sensor_estimate
                 self._use(learned.remission.sensor)
-            self._remission, self._to_check = learned.remission, learned.to_check
+            self._remission, self._to_check, self._normal = learned.remission, learned.to_check, learned.normal
             self._set_mounting(learned.mounting)
 
     @property
@@ -478,7 +484,7 @@ class Perceiver:
         if sensor == self.sensor:
             return
         vars(self)["sensor"] = sensor
-        self._remission = RemissionMatcher(sensor)
+        self._remission, self._normal = RemissionMatcher(sensor), Normal()
         self._pipeline = self._assemble(sensor)
 
     def _set_mounting(self, estimator: MountingEstimator) -> None:
@@ -547,6 +553,10 @@ class Perceiver:
             if perception.dropped.too_near and not self._told_of_near:
                 self._told_of_near = True
                 sentences = (*sentences, about_too_near(perception.dropped, perception.n_points, self.sensor))
+            if perception.health is not None and self.on_mismatch != "ignore":
+                found = {kind: text for kind, text in findings_of(perception.health) if kind not in self._told_of}
+                self._told_of |= {*found}
+                sentences = (*sentences, *found.values())
         for sentence in sentences:
             warnings.warn(sentence, stacklevel=2)
         return perception
@@ -613,6 +623,10 @@ class Perceiver:
                 self._remission = matcher
                 self._sensor_estimate = None
                 raise
+        health, self._normal = check_health(scan, profile, self._normal, self._frame.eye)
+        if health.has_drops:
+            scan, n_drops = without_drops(scan, profile, self._frame.eye)
+            health = replace(health, n_drops=n_drops)
         watch.lap("check")
         assert self._pipeline is not None
         parts = self._pipeline(scan, self._mounting, watch)
@@ -630,6 +644,7 @@ class Perceiver:
             remission=profile.remission if self._renders else None,
             dropped=dropped,
             ground=parts.ground,
+            health=health,
         )
 
     def _without_ground(self, reason: MountingError) -> tuple[Finding, ...]:

@@ -40,6 +40,7 @@ SCAN_KEYS = (
     "image",
     "origin_m",
     "map_boxes",
+    "health",
 )
 """Keys of a record, in their written order; every record has all of them."""
 

@@ -56,6 +56,7 @@ from .pipeline import Pipeline, RangeImageNetwork, TopViewNetwork, View
 from .preprocess.condition import render
 from .preprocess.findings import check_profiles
 from .preprocess.fitness import FitnessProfile
+from .preprocess.health import Normal, check_health
 from .preprocess.remission import NO_REMISSION
 from .preprocess.returns import returns
 from .road.ahead import compile_kernels
@@ -151,6 +152,7 @@ def warm_up(
     with fewer_collections(), Helpers([part for part in needed if needed[part]]) as helpers:
         # The networks' own stages, with their outputs for the golden input
         few_points, _ = returns(few_points, sensor)
+        check_health(few_points, sensor, Normal())
         render(few_points, replace(sensor, remission=NO_REMISSION))
         check_profiles(few_points, fitness, sensor)
         if pipeline.needs_ground:

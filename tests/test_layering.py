@@ -49,7 +49,7 @@ FLOORS = {
         objects.cluster objects.crops
         objects.persons
         objects.boxes
-        preprocess.__init__ preprocess.fitness preprocess.interpolation preprocess.returns
+        preprocess.__init__ preprocess.fitness preprocess.health preprocess.interpolation preprocess.returns
         preprocess.condition preprocess.ego preprocess.findings preprocess.motion preprocess.sensor_estimate
         preprocess.sensor_fit
         preprocess.remission
@@ -82,7 +82,7 @@ FLOORS = {
         readers.apart
         readers.captures
         records
-        simulation.raycast
+        simulation.raycast simulation.weather
         simulation.scene simulation.shapes
         simulation.vehicles
         simulation.people
@@ -154,7 +154,7 @@ FLOORS = {
         __init__
     """,
     "edgeperc_bench": """
-        application context inputs options samples scenarios
+        application conditions context inputs options samples scenarios
         document loadgen render start
         plots report worker
         accuracy

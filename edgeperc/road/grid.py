@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..errors import CardError, OptionError, PointsError
 from ..ground.observed import OVERHEAD_M, Observer
 from ..ground.planes import heights_above
+from ..preprocess.health import without_drops
 from ..preprocess.returns import returns
 from ..system.atomic import write_atomic
 from ..system.clock import nanoseconds_of
@@ -250,6 +251,8 @@ def occupancy_grid(
     profile = get_sensor(sensor)
     frame = ModelFrame(perception.mounting)
     moved = read_only(frame.move(returns(rows, profile, perception.mounting.origin_m)[0]))
+    if perception.health is not None and perception.health.has_drops:
+        moved = read_only(without_drops(moved, profile, frame.eye)[0])
     ground = heights_above(perception.ground, moved)
 
     shape = (view.height, view.width)

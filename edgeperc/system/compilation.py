@@ -31,6 +31,7 @@ KERNELS: Mapping[str, str] = MappingProxyType(
     {
         "scans": "ground.planes.fill_lowest ground.planes.fit_first_plane inference.decode.fill_labels "
         "inference.projection.fill_image preprocess.condition.fill_rendered "
+        "preprocess.health.fill_lacking preprocess.health.fill_sectors preprocess.health.mark_isolated "
         "preprocess.returns.fill_returns preprocess.returns.has_returns_only types.frame.fill_moved",
         "fitness": "preprocess.fitness.fill_scan_sums",
         "crop": "inference.crop.fill_rows",

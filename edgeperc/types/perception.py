@@ -274,6 +274,52 @@ class DroppedPoints:
         return self.not_finite + self.too_near + self.ego
 
 
+@dataclass(frozen=True, slots=True)
+class SensorHealth:
+    """What the window of the sensor and the weather do to a scan (`edgeperc.preprocess.health`).
+
+    Attributes
+    ----------
+    blocked : float
+        Share of the sectors, in azimuth and elevation, that should show the ground and return nothing.
+    blocked_deg : tuple of tuples of 2 float
+        Left and right edge of each blocked sector [deg], counter-clockwise from x, in the frame of the models.
+    isolated : float
+        Share of the returns within 10 m that have no neighbor: drops of rain, flakes of snow, dust, spray.
+    range_m : float
+        95 % of the returns are nearer [m].
+    normal_range_m : float or None
+        The same in the first scans; None in the first one.
+    returns_share : float or None
+        Number of returns, as a share of that in the first scans.
+    has_drops, has_cloud, has_fog : bool
+        Isolated returns that are dim, on nearly all sides (rain, snow) or on one (spray, dust, exhaust); a range that
+        shrank, with returns that are isolated or missing.
+    n_drops : int
+        Points that were left out as drops; 0 without ``has_drops``. They are labeled 0, and not in view.
+    findings : tuple of str
+        One sentence for each sign: what came, what was expected, and what to do.
+    """
+
+    blocked: float = 0.0
+    blocked_deg: tuple[tuple[float, float], ...] = ()
+    isolated: float = 0.0
+    range_m: float = 0.0
+    normal_range_m: float | None = None
+    returns_share: float | None = None
+    has_drops: bool = False
+    has_cloud: bool = False
+    has_fog: bool = False
+    n_drops: int = 0
+    findings: tuple[str, ...] = ()
+
+    def to_dict(self) -> dict[str, Any]:
+        """Convert to a dict for JSON, shares rounded to 0.0001 and ranges to 0.1 m."""
+        rounded = {"blocked": 4, "isolated": 4, "returns_share": 4, "range_m": 1, "normal_range_m": 1}
+        record = asdict(self) | {"blocked_deg": [[*arc] for arc in self.blocked_deg], "findings": [*self.findings]}
+        return record | {k: round(record[k], n) for k, n in rounded.items() if record[k] is not None}
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Perception:
     """Everything perceived in one scan, in one image, or in both.
@@ -315,6 +361,8 @@ class Perception:
     origin_m : tuple of 3 float, or None
         Place of the frame of the scan in a map [m], as given with the scan: what was subtracted from the coordinates
         (`edgeperc.read_points`). The axes are the map's.
+    health : SensorHealth or None
+        What the sensor's window and the weather did to the scan; None without a scan.
     """
 
     n_points: int
@@ -332,6 +380,7 @@ class Perception:
     dropped: DroppedPoints = DroppedPoints()
     ground: GroundSurface | None = None
     origin_m: tuple[float, float, float] | None = None
+    health: SensorHealth | None = None
 
     def require_points(self) -> PointLabels:
         """``points``; `ModelError`, which names the model to add, if it is None."""
@@ -386,9 +435,9 @@ class Perception:
         dict
             ``stamp_s``, ``n_points``, ``n_dropped``, ``dropped`` (by kind), ``stage_ms``, ``providers``, ``boxes``
             (`Box.to_dict`), ``drivable_area_m2``, ``point_counts``, ``n_in_view`` (their sum),
-            ``fitness``, ``mounting``, ``remission``, ``image`` (`ImageLabels.to_dict`), ``origin_m`` and
-            ``map_boxes``. Every key is always present; its value is None if no model of that kind ran, if
-            remission was only scaled, or if the place in a map was not given.
+            ``fitness``, ``mounting``, ``remission``, ``image`` (`ImageLabels.to_dict`), ``origin_m``,
+            ``map_boxes`` and ``health`` (`SensorHealth.to_dict`). Every key is always present; its value is None if
+            no model of that kind ran, if remission was only scaled, or if the place in a map was not given.
         """
         return {
             "stamp_s": self.stamp_s,
@@ -407,6 +456,7 @@ class Perception:
             "image": None if self.image is None else self.image.to_dict(),
             "origin_m": None if self.origin_m is None else list(self.origin_m),
             "map_boxes": None if self.origin_m is None else [box.to_dict() for box in self.map_boxes],
+            "health": None if self.health is None else self.health.to_dict(),
         }
 
     def __reduce__(self) -> tuple[Any, ...]:

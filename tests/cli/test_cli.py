@@ -304,6 +304,7 @@ def test_json_is_one_object_a_scan_and_nothing_else(tmp_path: Path, capsys: pyte
         "image": None,
         "origin_m": None,
         "map_boxes": None,
+        "health": None,
     }
     complaints = captured.err.splitlines()
     assert [line.startswith("edgeperc: ") for line in complaints] == [True, True, True, False]

@@ -27,6 +27,7 @@ from edgeperc import (
     Perception,
     PointLabels,
     PointsError,
+    SensorHealth,
     TopView,
     Tracker,
     Tracks,
@@ -273,6 +274,13 @@ def test_diagnostics() -> None:
         "labels": "0 background, 1 car, 2 pedestrian, 3 cyclist",
         "unlike the training scans 1": "few points",
     }
+    wet = SensorHealth(has_drops=True, n_drops=7, findings=("It rains.",))
+    scan = perceived()
+    for health, level in (("OK", 1), ("LATE", 1), ("STALE", 3)):
+        rainy = replace(scan, perception=replace(scan.perception, health=wet), health=health)
+        (status,) = again(MESSAGES.diagnostics(rainy)).status
+        values = {v.key: v.value for v in status.values}
+        assert (status.level, values["sensor 1"], values["drops left out"]) == (level, "It rains.", "7")
     (none,) = MESSAGES.diagnostics(None).status
     assert (none.level, none.message, none.values) == (3, "no scan yet", [])
 
