@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from ..system.kernels import njit
 from ..types.mounting import MODEL_HEIGHT_M
@@ -73,7 +73,7 @@ class Normal:
 
 
 def check_health(
-    points: Points, sensor: SensorProfile, normal: Normal, eye_m: Sequence[float] = (0.0, 0.0, 0.0)
+    points: Points, sensor: SensorProfile, normal: Normal, eye_m: ArrayLike = (0.0, 0.0, 0.0)
 ) -> tuple[SensorHealth, Normal]:
     """Measure what window and weather do to a scan, and compare it with the first scans.
 
@@ -101,7 +101,7 @@ def check_health(
     has_drops, has_cloud = _has_drops(near, has_remission) if n_near >= _FEWEST_NEAR else (False, False)
     health = SensorHealth(
         blocked=float(blocked.sum() / max(1, N_SECTORS * is_judged.sum())),
-        blocked_deg=_arcs(blocked.any(axis=1)),
+        blocked_deg=_arcs(np.asarray(blocked.any(axis=1))),
         isolated=isolated,
         range_m=range_m,
         normal_range_m=_middle(normal.ranges_m) if known else None,
@@ -116,7 +116,7 @@ def check_health(
 
 
 def without_drops(
-    points: Points, sensor: SensorProfile, eye_m: Sequence[float] = (0.0, 0.0, 0.0)
+    points: Points, sensor: SensorProfile, eye_m: ArrayLike = (0.0, 0.0, 0.0)
 ) -> tuple[NDArray[np.float32], int]:
     """A scan (n, 4) in which near points with at most one neighbor, or four if they are dim, are NaN, and their number.
 
