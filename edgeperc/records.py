@@ -40,7 +40,7 @@ SCAN_KEYS = (
     "image",
     "origin_m",
     "map_boxes",
-    "health",
+    "sensor_health",
 )
 """Keys of a record, in their written order; every record has all of them."""
 

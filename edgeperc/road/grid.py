@@ -251,7 +251,7 @@ def occupancy_grid(
     profile = get_sensor(sensor)
     frame = ModelFrame(perception.mounting)
     moved = read_only(frame.move(returns(rows, profile, perception.mounting.origin_m)[0]))
-    if perception.health is not None and perception.health.has_drops:
+    if perception.health.has_drops:
         moved = read_only(without_drops(moved, profile, frame.eye)[0])
     ground = heights_above(perception.ground, moved)
 

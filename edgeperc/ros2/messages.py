@@ -347,10 +347,9 @@ class RosMessages:
             if perception.points is not None:
                 listed["labels"] = ", ".join(f"{k} {label}" for k, label in enumerate(perception.points.classes))
             listed |= {f"unlike the training scans {k}": sentence for k, sentence in enumerate(perception.fitness, 1)}
-            if perception.health is not None:
-                listed |= {f"sensor {k}": sentence for k, sentence in enumerate(perception.health.findings, 1)}
-                listed |= {"drops left out": perception.health.n_drops} if perception.health.n_drops else {}
-                level = max(level, 1) if perception.health.findings and level < 2 else level
+            listed |= {f"sensor {k}": sentence for k, sentence in enumerate(perception.health.findings, 1)}
+            listed |= {"drops left out": perception.health.n_drops} if perception.health.n_drops else {}
+            level = max(level, 1) if perception.health.findings and level < 2 else level
         status = self._make(
             "diagnostic_msgs/msg/DiagnosticStatus",
             level=level,

@@ -361,8 +361,8 @@ class Perception:
     origin_m : tuple of 3 float, or None
         Place of the frame of the scan in a map [m], as given with the scan: what was subtracted from the coordinates
         (`edgeperc.read_points`). The axes are the map's.
-    health : SensorHealth or None
-        What the sensor's window and the weather did to the scan; None without a scan.
+    health : SensorHealth
+        What the sensor's window and the weather did to the scan; nothing without a scan.
     """
 
     n_points: int
@@ -380,7 +380,7 @@ class Perception:
     dropped: DroppedPoints = DroppedPoints()
     ground: GroundSurface | None = None
     origin_m: tuple[float, float, float] | None = None
-    health: SensorHealth | None = None
+    health: SensorHealth = SensorHealth()
 
     def require_points(self) -> PointLabels:
         """``points``; `ModelError`, which names the model to add, if it is None."""
@@ -436,8 +436,8 @@ class Perception:
             ``stamp_s``, ``n_points``, ``n_dropped``, ``dropped`` (by kind), ``stage_ms``, ``providers``, ``boxes``
             (`Box.to_dict`), ``drivable_area_m2``, ``point_counts``, ``n_in_view`` (their sum),
             ``fitness``, ``mounting``, ``remission``, ``image`` (`ImageLabels.to_dict`), ``origin_m``,
-            ``map_boxes`` and ``health`` (`SensorHealth.to_dict`). Every key is always present; its value is None if
-            no model of that kind ran, if remission was only scaled, or if the place in a map was not given.
+            ``map_boxes`` and ``sensor_health`` (`SensorHealth.to_dict`). Every key is always present; its value is
+            None if no model of that kind ran, if remission was only scaled, or if the place in a map was not given.
         """
         return {
             "stamp_s": self.stamp_s,
@@ -456,7 +456,7 @@ class Perception:
             "image": None if self.image is None else self.image.to_dict(),
             "origin_m": None if self.origin_m is None else list(self.origin_m),
             "map_boxes": None if self.origin_m is None else [box.to_dict() for box in self.map_boxes],
-            "health": None if self.health is None else self.health.to_dict(),
+            "sensor_health": self.health.to_dict(),
         }
 
     def __reduce__(self) -> tuple[Any, ...]:

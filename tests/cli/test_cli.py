@@ -36,7 +36,7 @@ from edgeperc.inference import providers, session
 from edgeperc.readers import captures
 from edgeperc.readers.files import read_points
 from edgeperc.simulation.samples import simulated_scan
-from edgeperc.types.perception import Box, Perception, PointLabels, TopView
+from edgeperc.types.perception import Box, Perception, PointLabels, SensorHealth, TopView
 from edgeperc.types.sensor import get_sensor
 from scenes import Terminal, urban
 
@@ -304,7 +304,7 @@ def test_json_is_one_object_a_scan_and_nothing_else(tmp_path: Path, capsys: pyte
         "image": None,
         "origin_m": None,
         "map_boxes": None,
-        "health": None,
+        "sensor_health": SensorHealth().to_dict(),
     }
     complaints = captured.err.splitlines()
     assert [line.startswith("edgeperc: ") for line in complaints] == [True, True, True, False]

@@ -265,7 +265,6 @@ def test_a_perceiver_tells_of_each_kind_once_and_leaves_drops_out() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         found = perceive(scan)
-    assert found.health is not None
     assert (found.health.findings, found.health.n_drops) == ((), 0)
     for _ in range(5):
         perceive(scan)
@@ -280,10 +279,9 @@ def test_a_perceiver_tells_of_each_kind_once_and_leaves_drops_out() -> None:
         warnings.simplefilter("error")
         again = perceive(bad)
     assert again.health == snowy.health
-    assert snowy.health is not None
     assert snowy.health.n_drops > 100
     assert snowy.points is not None
-    record = scan_record(snowy)["health"]
+    record = scan_record(snowy)["sensor_health"]
     assert record["has_drops"]
     assert len(record["findings"]) == 2
     assert pickle.loads(pickle.dumps(snowy)).health == snowy.health
@@ -298,7 +296,6 @@ def test_ignoring_mismatches_keeps_quiet_and_another_vehicle_is_learned_anew() -
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         found = perceive(weather.dirty(clear(11), 60.0, 10.0))
-    assert found.health is not None
     assert found.health.blocked_deg
     assert len(perceive.learned.normal.returns) == 1
     other = Perceiver("pointseg", on_mismatch="ignore")
