@@ -43,7 +43,14 @@ from .scans import (
     stated_sensor,
     with_mounting,
 )
-from .side_by_side import add_engine, check_engine, has_workers, perceive_side_by_side, through_temporary
+from .side_by_side import (
+    add_engine,
+    check_engine,
+    check_scan_files,
+    has_workers,
+    perceive_side_by_side,
+    through_temporary,
+)
 from .sinks import Sinks, add_sinks, wanted_sinks
 
 if TYPE_CHECKING:
@@ -232,6 +239,7 @@ def run_command(arguments: argparse.Namespace) -> int:
     else:
         found = Scans([_live_source(arguments)], [], False) if arguments.live else find_scans(arguments.paths)
     scans = found.paths
+    check_scan_files(arguments, scans)
     names = output_names(scans, keep_folder=found.of_data_set) if kinds else []
     targets = [arguments.out / name for name in names] if kinds else [Path()] * len(scans)
     _check_outputs(arguments, kinds, images, scans, targets)

@@ -94,6 +94,17 @@ def check_engine(arguments: argparse.Namespace, sinks: Sequence[str]) -> None:
         )
 
 
+def check_scan_files(arguments: argparse.Namespace, scans: Sequence[Path | Remote]) -> None:
+    """Check that worker processes, if any, get scan files alone."""
+    from ..readers.captures import CAPTURE_SUFFIXES
+
+    for scan in scans if has_workers(arguments) else ():
+        if scan.suffix.lower() in CAPTURE_SUFFIXES or (isinstance(scan, Path) and scan.is_dir()):
+            arguments.usage_error(
+                f"{_asked_by(arguments)} takes scan files; {scan} is a capture, which is decoded in its order"
+            )
+
+
 def perceive_side_by_side(
     arguments: argparse.Namespace,
     alone: Alone,
@@ -109,13 +120,6 @@ def perceive_side_by_side(
     and what was learned from the first scans. A scan is not perceived again if its record says the same and its files
     have the recorded sizes. The first scans are always perceived again.
     """
-    from ..readers.captures import CAPTURE_SUFFIXES
-
-    for scan in scans:
-        if scan.suffix.lower() in CAPTURE_SUFFIXES or (isinstance(scan, Path) and scan.is_dir()):
-            arguments.usage_error(
-                f"{_asked_by(arguments)} takes scan files; {scan} is a capture, which is decoded in its order"
-            )
     perceive, run, _ = alone(arguments, perceivers)
     n_first = 0
     while n_first < min(len(scans), MOST_FIRST) and not perceive.learned.is_settled:

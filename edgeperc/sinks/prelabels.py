@@ -242,8 +242,8 @@ def _kitti_line(box: Box, T_cam_sensor: NDArray[np.float64], P2: NDArray[np.floa
 
 
 def _capital(label: str) -> str:
-    """KITTI's way to write a class: without blanks, with a capital."""
-    text = "_".join(label.split())
+    """KITTI's way to write a class: without blanks, with a capital; a class of blanks alone is unknown."""
+    text = "_".join(label.split()) or "unknown"
     return text[:1].upper() + text[1:]
 
 

@@ -165,6 +165,7 @@ def test_a_table_of_scans_names_no_path(name: str, tmp_path: Path) -> None:
 
 @settings(max_examples=25)
 @given(st.sampled_from(KINDS), names, names)
+@example("kitti", "", " ")
 def test_labels_of_a_run_stay_in_its_folder(kind: str, name: str, label: str) -> None:
     scan = a_scan()
     perception = replace(
