@@ -48,6 +48,7 @@ def off_deg(estimate: SensorEstimate, elevations_deg: np.ndarray) -> float:
     return float(np.abs(found[:, None] - elevations_deg).min(axis=1).max())
 
 
+@pytest.mark.kernel
 @pytest.mark.parametrize("n", [0, 1, 2, 300])
 def test_votes_are_those_of_the_twin(n: int) -> None:
     rng = np.random.default_rng(n)
