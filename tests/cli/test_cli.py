@@ -1021,5 +1021,6 @@ def test_files_with_few_points_are_the_defaults_unless_auto_asks(
 
 
 def test_auto_and_a_mounting_where_no_scan_is_read_first(capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("zenoh")
     assert run("ros2", "--sensor", "auto", "--mount-height", 2) == 2
     assert "edgeperc info SCAN --write" in capsys.readouterr().err
