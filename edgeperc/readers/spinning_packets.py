@@ -44,7 +44,8 @@ class Format(NamedTuple):
     clock : how and where the time is written.
     reference : the block that the time is of, 0 or -1.
     late_us : how much later the block fires.
-    unit_m, mask : of a distance; Hesai's packets say how many mm.
+    unit_m, mask : of a distance.
+    mm_at : the byte of a packet that says how many mm the unit is; 0: none does.
     lens_m : distance of the lasers from the axis, and height.
     lasers : 16: channels beyond are a second firing or return; 96: every second block has those beyond 48.
     elevations_deg : of every unit; empty: each unit has its own angles.
@@ -65,6 +66,7 @@ class Format(NamedTuple):
     late_us: float = 0.0
     unit_m: float = 0.004
     mask: int = 0xFFFF
+    mm_at: int = 0
     lens_m: tuple[float, float] = (0.0, 0.0)
     lasers: int = 0
     elevations_deg: tuple[float, ...] = ()
@@ -98,7 +100,7 @@ def _xt(name: str, n: int, elevations: Sequence[float]) -> Format:
     fires_us = tuple(6.0 + 1.512 * (32 // n) * k for k in range(n))
     return Format(
         name, f"Hesai {name.replace('p', 'P', 1).replace('xt', 'XT')}", 12, 8, n, 4, (body + 28,), b"", 2, fires_us,
-        _tail(body, 13, 19, 11), reference=-1, elevations_deg=tuple(elevations),
+        _tail(body, 13, 19, 11), reference=-1, mm_at=9, elevations_deg=tuple(elevations),
     )  # fmt: skip
 
 
@@ -111,14 +113,14 @@ _FORMATS = (
     Format("pandar40p", "Hesai Pandar40P", 0, 10, 40, 3, (1262, 1266), _OLD, 4, _NO_FIRES[:40],
            _tail(1240, 16, 10, 8), reference=-1, late_us=-28.58),
     Format("pandar64", "Hesai Pandar64", 8, 6, 64, 3, (1194, 1198), b"", 2, _NO_FIRES[:64],
-           _tail(1172, 16, 10, 8), reference=-1, late_us=-42.58),
+           _tail(1172, 16, 10, 8), reference=-1, late_us=-42.58, mm_at=5),
     _xt("pandarxt-32", 32, range(15, -17, -1)),
     _xt("pandarxt-16", 16, range(15, -17, -2)),
     Format("pandarqt-64", "Hesai PandarQT-64", 12, 4, 64, 4, (1068, 1072), b"", 2, _NO_FIRES[:64],
-           _tail(1044, 18, 12, 10), late_us=25.71),
+           _tail(1044, 18, 12, 10), late_us=25.71, mm_at=9),
     # Whether there are bytes of confidence and of functional safety is in the packet.
     Format("ot128", "Hesai OT128", 12, 2, 128, 3, (), b"", 2, _NO_FIRES,
-           _tail(788, 15, 21, 13), reference=-1),
+           _tail(788, 15, 21, 13), reference=-1, mm_at=9),
     Format("rs-16", "RoboSense RS-LiDAR-16", 42, 12, 32, 3, (1248,), _OLD, 4,
            tuple(2.8 * (k % 16) + 55.5 * (k // 16) for k in range(32)), _DATE, unit_m=0.005, lens_m=(0.03977, 0.0),
            lasers=16),
@@ -405,9 +407,7 @@ class SpinningStream:
         if np.isnan(azimuths).all():
             return
         row = self._row
-        unit_m = (
-            1e-3 * packets[0].content[5 if row.name == "pandar64" else 9] if row.is_hesai and row.header else row.unit_m
-        )
+        unit_m = 1e-3 * packets[0].content[row.mm_at] if row.mm_at else row.unit_m
         content = np.frombuffer(b"".join(each.content for each in packets), np.uint8).reshape(len(packets), -1)
         is_dual = row.lasers == 16 and self._angles.is_dual
         places = (
