@@ -25,7 +25,9 @@ BOX_FILES = {
     "sustechpoints": "label/{}.json",
     "cvat": "annotations/default.json",
 }
-COARSE = {"van": "car", "truck": "car", "person_sitting": "pedestrian"}
+COARSE = {"van": "car", "truck": "car", "person_sitting": "pedestrian", "drivable": "road"}
+# Parts of the background. Some sets tell poles from walls, some do not: theirs is "static object".
+STATIC = ("road", "sidewalk", "terrain", "building", "vegetation", "pole", "static object")
 SCHEMA = 1
 LAYOUTS = Path(__file__).with_name("layouts")
 BACKGROUND, DRIVABLE, IGNORED, ANY = "background", "drivable", "ignore", "*"
@@ -41,15 +43,15 @@ def class_number(name: str, classes: Sequence[str] = POINT_CLASSES) -> int:
 
     name : a value of `ScanLayout.boxes` or `ScanLayout.points`.
     classes : classes of the network, the background first.
-    Returns: Its index. Vans and trucks count as cars and sitting persons as pedestrians, if ``classes`` lacks them;
-        ``drivable`` is background. `IGNORE` for a class that the network does not have.
+    Returns: Its index. Vans and trucks count as cars, sitting persons as pedestrians and what is ``drivable`` as road, if
+        ``classes`` lacks them. A part of the background is background if the network has no such parts. `IGNORE` for a
+        class that the network does not have.
     """
+    name = name if name in classes else COARSE.get(name, name)
     if name in classes:
         return classes.index(name)
-    if name in (BACKGROUND, DRIVABLE):
-        return 0
-    coarse = COARSE.get(name)
-    return classes.index(coarse) if coarse in classes else IGNORE
+    whole = not any(part in classes for part in STATIC)
+    return 0 if name == BACKGROUND or (whole and name in STATIC) else IGNORE
 
 
 @dataclass(frozen=True)

@@ -34,7 +34,7 @@ from ..readers.files import read_points
 from ..simulation.samples import IGNORE
 from ..simulation.scene import POINT_CLASSES
 from ..types.geometry import inside
-from ..types.perception import Box
+from ..types.perception import ROADS, Box
 from ..types.points import Points
 from .annotations import read_datumaro, read_labelcloud, read_sustechpoints
 from .kitti import IMAGE_SIZE, SEQUENCE_DRIVES, KittiCalibration, KittiLabels, label_objects, read_labels
@@ -42,7 +42,6 @@ from .layout import (
     BACKGROUND,
     BOX_COLUMNS,
     BOX_FILES,
-    DRIVABLE,
     IGNORED,
     SUFFIXES,
     ScanLayout,
@@ -163,9 +162,9 @@ class ScanFrame:
 
         None if the points are not labeled, or no class of theirs is drivable.
         """
-        if self.point_classes is None or DRIVABLE not in self.class_names:
+        if self.point_classes is None or not set(ROADS) & set(self.class_names):
             return None
-        numbers = {DRIVABLE: 1, "car": 2, "van": 2, "truck": 2, IGNORED: IGNORE}
+        numbers = {**dict.fromkeys(ROADS, 1), "car": 2, "van": 2, "truck": 2, IGNORED: IGNORE}
         return np.array([numbers.get(name, 0) for name in self.class_names], np.uint8)[self.point_classes]
 
 

@@ -15,12 +15,19 @@ from ..types.perception import Box
 from ..types.sensor import SensorProfile
 from .drawn import random_scene
 from .layouts import scene_from_boxes
-from .scene import POINT_CLASS_OF, Scene, SimulatedScan, sensor_pose, simulate
+from .camera import CAMERA_CLASSES, true_classes
+from .scene import POINT_CLASS_OF, SCENE_CLASSES, Scene, SimulatedScan, sensor_pose, simulate
 
 IGNORE = 255
 
 # Measured: height of the bottom of KITTI's boxes above the ground around them (median of 720 boxes).
 BOX_ABOVE_GROUND_M = 0.03
+
+_TREE = CAMERA_CLASSES.index("Tree")  # CamVid counts grass as trees
+_OF_SURFACE = np.zeros(256, np.uint8)  # of `CAMERA_CLASSES`, among `SCENE_CLASSES`
+_OF_SURFACE[[CAMERA_CLASSES.index(n) for n in ("Road", "Pavement", "Building", "Tree", "Pole", "SignSymbol")]] = [
+    SCENE_CLASSES.index(n) for n in ("road", "sidewalk", "building", "vegetation", "pole", "pole")
+]
 
 
 def simulated_scan(
@@ -91,6 +98,13 @@ def labels_by_boxes(scan: SimulatedScan) -> NDArray[np.uint8]:
             raised = replace(box, center=(box.center[0], box.center[1], box.center[2] + BOX_ABOVE_GROUND_M))
             labels[inside(raised, scan.points)] = POINT_CLASS_OF.get(box.label, IGNORE)
     return labels
+
+
+def labels_of_scene(scan: SimulatedScan) -> NDArray[np.uint8]:
+    """As `labels_by_boxes`, with the background told apart by its surfaces: index into `SCENE_CLASSES`."""
+    labels, surface = labels_by_boxes(scan), true_classes(scan)
+    lawn = (surface == _TREE) & (scan.surfaces == -1)
+    return np.where(labels == 0, np.where(lawn, np.uint8(SCENE_CLASSES.index("terrain")), _OF_SURFACE[surface]), labels)
 
 
 FIRST_SEED = 2 * 10**9  # seeds of evaluated scenes; training scenes start at 0, scenes that verify exports at 10**9

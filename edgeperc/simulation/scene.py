@@ -32,6 +32,8 @@ from .raycast import (
 )
 
 POINT_CLASSES = ("background", "car", "pedestrian", "cyclist")
+# Classes of what a street is made of; the background is what is none of the others, such as walls and fences.
+SCENE_CLASSES = (*POINT_CLASSES, "road", "sidewalk", "terrain", "building", "vegetation", "pole")
 TOP_VIEW_CLASSES = ("background", "drivable", "car", "van", "truck")
 # Point class of an object: PointSeg's car includes all vehicles. KITTI also labels sitting people. Trams and "misc"
 # objects (trailers, parked motorcycles) belong to no class: real labels ignore their points.

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edgeperc.datasets.kitti import Frame
-from edgeperc.simulation.samples import IGNORE, labels_by_boxes
+from edgeperc.simulation.samples import IGNORE, labels_of_scene
 from edgeperc.simulation.scene import TOP_VIEW_CLASSES, SimulatedScan
 from edgeperc.system.atomic import open_atomic
 from edgeperc.types.geometry import draw_footprints, inside
@@ -63,10 +63,10 @@ class LabeledScan:
 
     @classmethod
     def from_simulation(cls, scan: SimulatedScan) -> LabeledScan:
-        """A simulated scan; everything is labeled."""
+        """A simulated scan; everything is labeled, by `SCENE_CLASSES`."""
         surface = scan.top_view_labels(SURFACE)
         surface = np.where(surface == 1, 1, np.where(surface >= 2, IGNORE, 0)).astype(np.uint8)
-        return cls(scan.points, labels_by_boxes(scan), scan.boxes, scan.box_points, surface)
+        return cls(scan.points, labels_of_scene(scan), scan.boxes, scan.box_points, surface)
 
     def save(self, path: Path) -> None:
         """Write an .npz file, without pickles."""

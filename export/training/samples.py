@@ -18,7 +18,7 @@ from edgeperc.datasets.kitti import KittiObjects, scan_hash
 from edgeperc.datasets.layout import class_number
 from edgeperc.inference.projection import make_projector
 from edgeperc.simulation.samples import IGNORE
-from edgeperc.simulation.scene import POINT_CLASSES
+from edgeperc.simulation.scene import POINT_CLASSES, SCENE_CLASSES
 
 from ..data.augment import NEGATIVES, Augmentation, ObjectBank, augmented, swapped, with_ground_ahead
 from ..data.processes import CONTEXT
@@ -69,7 +69,8 @@ class Samples:
             raise ValueError("no scans to train on; give --kitti, --scans, --simulated or several of them")
         self.task, self.recipe, self.teacher = task_of(recipe), recipe, teacher
         self.n_targets = len(self.task.card.outputs)
-        self.real, self.simulated = [with_ground_ahead(scan) for scan in real], simulated
+        self.real = [*real] if "road" in self.task.classes else [with_ground_ahead(scan) for scan in real]
+        self.simulated = simulated
         self.projector = make_projector(self.task.view, self.task.input)
         self.weights = {"real": np.asarray(real_weights, np.float64), "simulated": np.ones(len(simulated))}
         self.odds = {name: np.ones(len(weights)) for name, weights in self.weights.items()}
@@ -241,9 +242,9 @@ class Recent:
 
 
 def _numbers(classes: Sequence[str]) -> NDArray[np.uint8]:
-    """Number of each of `POINT_CLASSES` among a network's classes of points, by its label, (256,) uint8."""
+    """Number of each of `SCENE_CLASSES` among a network's classes of points, by its label, (256,) uint8."""
     numbers = np.arange(256, dtype=np.uint8)
-    numbers[: len(POINT_CLASSES)] = [class_number(name, classes or POINT_CLASSES) for name in POINT_CLASSES]
+    numbers[: len(SCENE_CLASSES)] = [class_number(name, classes or POINT_CLASSES) for name in SCENE_CLASSES]
     return numbers
 
 
