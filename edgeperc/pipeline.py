@@ -259,6 +259,11 @@ class Pipeline:
         elif self.ranged:
             labels = value("refine", self._label_ahead, near, scan, watch)
 
+        # Objects alone: classes such as road and building are background to the stages below
+        seen = labels
+        if self.ranged:
+            labels = value("refine", PointLabels.objects, seen)
+
         # Objects by the points of their candidates
         objects = candidates = absent
         if self.objects is not None:
@@ -297,7 +302,7 @@ class Pipeline:
         # The second lane ends with the objects, and what needs them; the first one has what needs labels. The lane that
         # finds no sector of a turn left makes the candidates, while the other one labels the last.
         spare = [candidates, strips] if sectors else []
-        whole = value("refine", _whole, agreed, near, len(points))
+        whole = value("refine", _whole, seen, agreed, near, len(points))
         self._lanes.run(
             [near, projected, scan, *sectors, *spare, labels, upright, strips, clusters, cells, surface, joined, view],
             [planes, boxes, *reversed(sectors), objects, strips, cells, support, surface, marks, whole, standing],
@@ -384,9 +389,11 @@ def _sorted(scan: Scan, distance_per_m: float) -> Strips:
     return sort_points(scan.points, ~scan.ground.mask, distance_per_m=distance_per_m)
 
 
-def _whole(labels: PointLabels | None, near: View, n: int) -> PointLabels | None:
-    """Labels of all n points of a scan."""
-    return None if labels is None else spread([(labels, near.rows)], n)
+def _whole(seen: PointLabels | None, agreed: PointLabels | None, near: View, n: int) -> PointLabels | None:
+    """Labels of all n points of a scan: of objects as agreed, and of all else as seen."""
+    if seen is None or agreed is None:
+        return None
+    return spread([(seen.with_objects(agreed), near.rows)], n)
 
 
 def _joined(near: View, *sectors: tuple[PointLabels, NDArray[np.int32] | None]) -> PointLabels:

@@ -15,6 +15,7 @@ from ..simulation.scene import POINT_CLASS_OF, POINT_CLASSES
 from ..system.fields import Fields
 from ..system.names import check_name, nearest
 from ..types.mounting import Mounting
+from ..types.perception import STATIC
 from ..types.sensor import SensorProfile, get_sensor
 from .splits import in_split
 
@@ -27,7 +28,7 @@ BOX_FILES = {
 }
 COARSE = {"van": "car", "truck": "car", "person_sitting": "pedestrian", "drivable": "road"}
 # Parts of the background. Some sets tell poles from walls, some do not: theirs is "static object".
-STATIC = ("road", "sidewalk", "terrain", "building", "vegetation", "pole", "static object")
+PARTS = (*STATIC, "static object")
 SCHEMA = 1
 LAYOUTS = Path(__file__).with_name("layouts")
 BACKGROUND, DRIVABLE, IGNORED, ANY = "background", "drivable", "ignore", "*"
@@ -43,15 +44,15 @@ def class_number(name: str, classes: Sequence[str] = POINT_CLASSES) -> int:
 
     name : a value of `ScanLayout.boxes` or `ScanLayout.points`.
     classes : classes of the network, the background first.
-    Returns: Its index. Vans and trucks count as cars, sitting persons as pedestrians and what is ``drivable`` as road, if
-        ``classes`` lacks them. A part of the background is background if the network has no such parts. `IGNORE` for a
-        class that the network does not have.
+    Returns: Its index. Vans and trucks count as cars, sitting persons as pedestrians and what is ``drivable`` as road,
+        if ``classes`` lacks them. A part of the background is background if the network has no such parts. `IGNORE`
+        for a class that the network does not have.
     """
     name = name if name in classes else COARSE.get(name, name)
     if name in classes:
         return classes.index(name)
-    whole = not any(part in classes for part in STATIC)
-    return 0 if name == BACKGROUND or (whole and name in STATIC) else IGNORE
+    whole = not any(part in classes for part in PARTS)
+    return 0 if name == BACKGROUND or (whole and name in PARTS) else IGNORE
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,9 @@ from ..types.perception import Perception, TopView
 from ..types.points import Heights, Points, as_points, read_only
 from ..types.sensor import SensorProfile, get_sensor
 from ..types.views import TopViewGeometry
+from .around import knows_road, nearest_is_road
 
+ALL_AROUND = TopViewGeometry((-40.0, 40.0), (-40.0, 40.0))
 UNKNOWN, FREE, OCCUPIED = -1, 0, 100  # values of nav_msgs/OccupancyGrid
 
 
@@ -39,8 +41,9 @@ class OccupancyGrid:
     Attributes
     ----------
     drivable : (rows, columns) bool
-        More than half of the cell is observed road, and no obstacle is in it. Row 0 is farthest ahead, column 0
-        leftmost. All False without a model with a top view.
+        More than half of the cell is observed road, and no obstacle is in it: by the top view where it sees, elsewhere
+        by the points if they have a class ``road``. Row 0 is farthest ahead, column 0 leftmost. All False if there is
+        neither.
     obstacle : (rows, columns) bool
         Something stands on the ground: a return above it, or the footprint of a box.
     height_m : (rows, columns) float32
@@ -194,13 +197,15 @@ def occupancy_grid(
     Parameters
     ----------
     perception : Perception
-        Drivable cells are those of its top view; boxes are obstacles.
+        Drivable cells are those of its top view and, where that does not see, cells whose nearest return of the ground
+        is a point of the road, if its points have such a class (``sceneseg``); boxes are obstacles.
     points : (n, 4) or (n, 3) array_like, or a structured array
         The scan that was perceived: it has the heights of obstacles, and its rays show what is unknown.
     cell_m : float
         Edge of a cell [m].
     x_range_m, y_range_m : tuple of 2 float, optional
-        Bounds of the grid [m], lower first; by default those of the top view. Outside the top view no cell is drivable.
+        Bounds of the grid [m], lower first; by default 40 m on all sides if points know the road, else those of the top
+        view.
     min_height_m : float
         Returns up to this height above the ground are no obstacles [m]. A kerb is 0.1 to 0.2 m high.
     sensor : str, Path or SensorProfile
@@ -242,6 +247,8 @@ def occupancy_grid(
         raise OptionError(f"min_height_m is {min_height_m}; expected meters from 0 to below {OVERHEAD_M:g}")
     top_view = perception.top_view
     usual = TopViewGeometry() if top_view is None else top_view.geometry
+    if knows_road(perception.points):
+        usual = ALL_AROUND
     try:
         view = TopViewGeometry(x_range_m or usual.x_range_m, y_range_m or usual.y_range_m, cell_m=cell_m)
     except (CardError, TypeError, ValueError) as exc:
@@ -265,8 +272,12 @@ def occupancy_grid(
         draw_footprints(inside, [box], view, ("free", box.label))
         np.fmax(tallest, np.float32(box.size[2]), out=tallest, where=inside > 0)
     obstacle = ~np.isnan(tallest)
+    drivable, seen = _drivable(top_view, view)
+    if perception.points is not None and knows_road(perception.points):
+        around = nearest_is_road(moved, perception.points, ground.height_m, view)
+        drivable = np.where(seen, drivable, around & observed)
     return OccupancyGrid(
-        drivable=_drivable(top_view, view) & ~obstacle,
+        drivable=drivable & ~obstacle,
         obstacle=obstacle,
         height_m=tallest,
         observed=observed,
@@ -278,11 +289,11 @@ def occupancy_grid(
     )
 
 
-def _drivable(top_view: TopView | None, view: TopViewGeometry) -> NDArray[np.bool_]:
-    """Cells of ``view`` of which more than half is drivable."""
+def _drivable(top_view: TopView | None, view: TopViewGeometry) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Cells of ``view`` of which more than half is drivable, and those of which more than half is in the top view."""
     shape = (view.height, view.width)
     if top_view is None:
-        return np.zeros(shape, np.bool_)
+        return np.zeros(shape, np.bool_), np.zeros(shape, np.bool_)
     # Each cell is sampled at its middle or, if it is larger than those of the top view, as finely as they are.
     parts = max(1, math.ceil(view.cell_m / top_view.cell_m - 1e-6))
     fine = (np.arange(parts) + 0.5) / parts
@@ -291,7 +302,8 @@ def _drivable(top_view: TopView | None, view: TopViewGeometry) -> NDArray[np.boo
     row, col, in_view = top_view.geometry.cells(*np.broadcast_arrays(x, y))
     found = np.zeros(in_view.shape, np.bool_)
     found[in_view] = top_view.drivable[row[in_view], col[in_view]]
-    return found.reshape(shape[0], parts, shape[1], parts).mean(axis=(1, 3)) > 0.5
+    parted = shape[0], parts, shape[1], parts
+    return found.reshape(parted).mean(axis=(1, 3)) > 0.5, in_view.reshape(parted).mean(axis=(1, 3)) > 0.5
 
 
 @njit(cache=True, nogil=True)

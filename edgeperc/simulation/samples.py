@@ -13,9 +13,9 @@ from ..types.geometry import inside
 from ..types.mounting import Mounting
 from ..types.perception import Box
 from ..types.sensor import SensorProfile
+from .camera import CAMERA_CLASSES, true_classes
 from .drawn import random_scene
 from .layouts import scene_from_boxes
-from .camera import CAMERA_CLASSES, true_classes
 from .scene import POINT_CLASS_OF, SCENE_CLASSES, Scene, SimulatedScan, sensor_pose, simulate
 
 IGNORE = 255

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..errors import PointsError
 from ..types.geometry import draw_footprints, wrapped
-from ..types.perception import Box
+from ..types.perception import STATIC, Box
 from ..types.points import Labels, Points
 from ..types.sensor import SensorProfile, get_sensor
 from ..types.views import TopViewGeometry
@@ -33,7 +33,7 @@ from .raycast import (
 
 POINT_CLASSES = ("background", "car", "pedestrian", "cyclist")
 # Classes of what a street is made of; the background is what is none of the others, such as walls and fences.
-SCENE_CLASSES = (*POINT_CLASSES, "road", "sidewalk", "terrain", "building", "vegetation", "pole")
+SCENE_CLASSES = (*POINT_CLASSES, *STATIC)
 TOP_VIEW_CLASSES = ("background", "drivable", "car", "van", "truck")
 # Point class of an object: PointSeg's car includes all vehicles. KITTI also labels sitting people. Trams and "misc"
 # objects (trailers, parked motorcycles) belong to no class: real labels ignore their points.

@@ -20,7 +20,9 @@ from .views import TopViewGeometry
 _FIELDS = Fields("box", PointsError, "write it with Box.to_dict", optional=("front",))
 _PART = 2**20
 _Part = TypeVar("_Part")
-ROADS = ("drivable", "road")  # names of classes of an image on which a vehicle may drive, in lower case
+ROADS = ("drivable", "road")  # names of classes on which a vehicle may drive, in lower case
+STATIC = ("road", "sidewalk", "terrain", "building", "vegetation", "pole")
+"""Names of classes of points that are no objects, beside the background."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -163,6 +165,40 @@ class PointLabels:
     labels: Labels
     in_view: Mask
     classes: tuple[str, ...]
+
+    def objects(self) -> PointLabels:
+        """The labels of objects alone.
+
+        Returns
+        -------
+        PointLabels
+            Points of the classes in `STATIC` are background, which has number 0. The same object if there are none.
+        """
+        names = tuple(name for name in self.classes if name not in STATIC)
+        if names == self.classes:
+            return self
+        number = np.array([names.index(name) if name in names else 0 for name in self.classes], np.uint8)
+        return PointLabels(number[self.labels], self.in_view, names)
+
+    def with_objects(self, objects: PointLabels) -> PointLabels:
+        """These labels with those of objects replaced.
+
+        Parameters
+        ----------
+        objects : PointLabels
+            Of the same points, with the classes of `objects`.
+
+        Returns
+        -------
+        PointLabels
+            An object that is none any more is background.
+        """
+        if objects.classes == self.classes:
+            return objects
+        number = np.array([self.classes.index(name) for name in objects.classes], np.uint8)
+        static = np.isin(self.labels, [k for k, name in enumerate(self.classes) if name in STATIC])
+        labels = np.where((objects.labels == 0) & static, self.labels, number[objects.labels])
+        return PointLabels(labels, objects.in_view, self.classes)
 
     @property
     def n_in_view(self) -> int:

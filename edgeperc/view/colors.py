@@ -18,14 +18,17 @@ CLASS_COLORS = {
     "pedestrian": "#ff93f0",
     "cyclist": "#2a90ff",
 }
-# Classes of a camera's images, by name in lower case; those that scans have too keep their colors.
-CAMERA_COLORS = {
+# Classes of the surroundings in scans and images, by name in lower case; those of objects and road keep their colors.
+SCENE_COLORS = {
     "sky": "#6fb7e8",
     "building": "#8f6f5e",
     "pole": "#d9d2c0",
     "road": CLASS_COLORS["drivable"],
     "pavement": "#b48ade",
+    "sidewalk": "#b48ade",
+    "terrain": "#a3a05a",
     "tree": "#5f7d1e",
+    "vegetation": "#5f7d1e",
     "signsymbol": "#fff04a",
     "fence": "#a34a2a",
     "bicyclist": CLASS_COLORS["cyclist"],
@@ -42,7 +45,7 @@ FOUND, MISSED, FALSE = "#5d7468", "#ff4d4d", "#ffe14d"
 def color_of(name: str) -> str:
     """Color of a class, ``"#rrggbb"``; white for a class without a color of its own."""
     lower = name.casefold()
-    return CLASS_COLORS.get(lower) or CAMERA_COLORS.get(lower, _OTHER_COLOR)
+    return CLASS_COLORS.get(lower) or SCENE_COLORS.get(lower, _OTHER_COLOR)
 
 
 def rgb(colors: list[str]) -> NDArray[np.float64]:

@@ -22,6 +22,12 @@ SEMANTICKITTI_IDS = {
     "pedestrian": 30,
     "cyclist": 31,
     "drivable": 40,
+    "road": 40,
+    "sidewalk": 48,
+    "terrain": 72,
+    "building": 50,
+    "vegetation": 70,
+    "pole": 80,
 }
 _OTHER_ID = 99
 

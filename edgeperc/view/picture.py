@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..road.ahead import FreeAhead, RoadAhead, road_ahead
-from ..types.perception import Box, Perception, TopView
+from ..types.perception import STATIC, Box, Perception, TopView
 from ..types.points import Labels, Points
 from .canvas import (
     Label,
@@ -104,7 +104,7 @@ def draw(perception: Perception, points: Points, path: str | Path | None = None,
 
     left = float(_MARGIN)
     if top_view is not None and road is not None:
-        width = _draw_top_view(figure, points, top_view, road, boxes, ground)
+        width = _draw_top_view(figure, points, top_view, road, boxes, ground, names, painted)
         left = _MARGIN + _AXIS + width + 34.0
     width = _WIDTH - _MARGIN - left
     _draw_from_behind(figure, (left, _TOP, width, 520), points, names, painted, top_view, road, boxes, ground)
@@ -211,13 +211,16 @@ def _draw_top_view(
     road: RoadAhead,
     boxes: Sequence[Box],
     ground: tuple[float, float, float],
+    names: list[str],
+    painted: Labels,
 ) -> float:
-    """Draw the panel from above; return its width [px]."""
+    """Draw the panel from above; return its width [px]. Points of the surroundings have the color of their class."""
     from matplotlib.patches import Polygon, Rectangle
 
     (x_near, x_far), (y_right, y_left) = top_view.x_range_m, top_view.y_range_m
     low, high, right, left = min(-2.5, x_near - 2.5), x_far + 2.0, y_right - 4.0, y_left + 4.0
-    if any(box.center[0] < low for box in boxes):
+    of_scene = np.array([name in STATIC for name in names])[painted]
+    if any(box.center[0] < low for box in boxes) or (points[of_scene, 0] < low).any():
         along, across = _AROUND_M
         low, high, right, left = min(low, -along), max(high, along), min(right, -across), max(left, across)
     px_per_m = min((_BOTTOM - _TOP) / (high - low), 560.0 / (left - right))
@@ -242,7 +245,9 @@ def _draw_top_view(
     inside = inside[np.argsort(z[inside], kind="stable")]
     a, b, c = ground
     above = z - (a + b * x + c * y)
-    axes.scatter(y[inside], x[inside], s=1.8, c=ramp(above[inside], -0.2, 2.5), alpha=0.8, linewidths=0, zorder=2)
+    shade = ramp(above[inside], -0.2, 2.5)
+    shade[of_scene[inside]] = rgb([color_of(name) for name in names])[painted[inside][of_scene[inside]]]
+    axes.scatter(y[inside], x[inside], s=1.8, c=shade, alpha=0.8, linewidths=0, zorder=2)
     bounds = Rectangle((y_right, x_near), y_left - y_right, x_far - x_near, fill=False, edgecolor=FAINT, linestyle="--")
     axes.add_patch(bounds)
 
@@ -336,7 +341,7 @@ def _draw_range_image(
     hit = index >= 0
     behind = index[hit]
     shade = ramp(-np.log(np.maximum(range_m[behind], 1.0)), -math.log(70.0), -math.log(4.0))
-    share = np.array([0.0 if k == 0 else 0.7 if name == "drivable" else 1.0 for k, name in enumerate(names)])
+    share = np.array([0.0 if k == 0 else 0.7 if name in ("drivable", *STATIC) else 1.0 for k, name in enumerate(names)])
     share = share[painted[behind]][:, None]
     picture[hit] = (1.0 - share) * 0.72 * shade + share * rgb([color_of(name) for name in names])[painted[behind]]
     axes.imshow(picture, extent=(half, -half, 0.0, 1.0), aspect="auto", interpolation="nearest")

@@ -19,7 +19,7 @@ from edgeperc.errors import ImageError
 from edgeperc.simulation.camera import CAMERA_CLASSES
 from edgeperc.types.perception import ImageLabels, Perception
 from edgeperc.view import draw_image
-from edgeperc.view.colors import CAMERA_COLORS, CLASS_COLORS, color_of
+from edgeperc.view.colors import CLASS_COLORS, SCENE_COLORS, color_of
 
 CPU = ("--provider", "cpu", "--threads", "1")
 
@@ -163,5 +163,5 @@ def test_classes_of_images_have_colors() -> None:
     colors = [color_of(name) for name in CAMERA_CLASSES]
     assert len({*colors}) == len(CAMERA_CLASSES) == 11
     assert color_of("Car") == CLASS_COLORS["car"]
-    assert not CAMERA_COLORS.keys() & CLASS_COLORS.keys()
+    assert not SCENE_COLORS.keys() & CLASS_COLORS.keys()
     assert edgeperc.__all__
