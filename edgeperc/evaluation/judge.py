@@ -30,7 +30,7 @@ from ..types.card import ModelCard
 from ..types.frame import ModelFrame
 from ..types.geometry import inside
 from ..types.mounting import MODEL_MOUNTING, Mounting
-from ..types.perception import Box, Perception, PointLabels, TopView
+from ..types.perception import STATIC, Box, Perception, PointLabels, TopView
 from ..types.points import Labels, Points
 from ..types.sensor import SensorProfile
 from ..types.views import TopViewGeometry
@@ -305,11 +305,13 @@ class Judge:
         range_m = np.hypot(truth.points[:, 0], truth.points[:, 1])
         labels = _renamed(predicted.labels, predicted.classes, self.point_classes)
         tallies |= banded(("points",), self.point_classes, labels, right, range_m)
-        sure = np.where((right > 0) & find_ground(truth.points).mask, IGNORE, right).astype(np.uint8)
+        objects = tuple(name for name in self.point_classes if name not in STATIC)
+        own, true = (_renamed(each, self.point_classes, objects) for each in (labels, right))
+        sure = np.where((true > 0) & find_ground(truth.points).mask, IGNORE, true).astype(np.uint8)
         for box in truth.boxes:
             if box.label == SITTING:
                 sure[inside(box, truth.points)] = IGNORE
-        tallies |= banded(("sure",), self.point_classes, labels, sure, range_m)
+        tallies |= banded(("sure",), objects, own, sure, range_m)
         if self.as_recorded:
             pixels = _renamed(self.from_sensor.point_labels(truth.points), predicted.classes, POINT_CLASSES)
             tallies |= banded(("pixels",), POINT_CLASSES, pixels, right, range_m)
@@ -336,8 +338,8 @@ class Judge:
                 hit.append(box)
             else:
                 missed.append((box, n_members))
-        wrong = np.where(counted & (labels != right), np.where(right > 0, 1, 2), 0).astype(np.uint8)
-        n_objects = int(np.count_nonzero(counted & ((right > 0) | (labels > 0))))
+        wrong = np.where(counted & (own != true), np.where(true > 0, 1, 2), 0).astype(np.uint8)
+        n_objects = int(np.count_nonzero(counted & ((true > 0) | (own > 0))))
         share = int(np.count_nonzero(wrong)) / max(n_objects, 1)
         return replace(mistakes, wrong=wrong[shown], found=tuple(hit), missed=tuple(missed), wrong_share=share)
 
@@ -418,10 +420,15 @@ def _without_vehicles(classes: tuple[str, ...], right: NDArray[np.uint8]) -> tup
 
 
 def _renamed(labels: Labels, names: Sequence[str], classes: Sequence[str]) -> NDArray[np.uint8]:
-    """Convert a model's labels to those of a table; classes that the table lacks become its first class."""
+    """Convert a model's labels to those of a table; classes that the table lacks become its first class.
+
+    `IGNORE` stays as it is.
+    """
     coarse = {"drivable": "road", **dict.fromkeys(VEHICLES, "vehicle")}
     renamed = [name if name in classes else coarse.get(name, "") for name in names]
-    return np.array([classes.index(name) if name in classes else 0 for name in renamed], np.uint8)[labels]
+    numbers = np.full(IGNORE + 1, IGNORE, np.uint8)
+    numbers[: len(names)] = [classes.index(name) if name in classes else 0 for name in renamed]
+    return numbers[labels]
 
 
 def training_scans_of(cards: Sequence[ModelCard]) -> dict[str, set[str]]:

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..types.perception import STATIC
 from ..types.points import Labels
 from .causes import BUMPER, CAUSES, FLOOR
 from .center_ap import CLASSES, CenterTable, center_scores
@@ -219,7 +220,7 @@ def _point_rows(confusion: Confusion, objects: Counter[tuple[str, ObjectKey]]) -
     for k, name in enumerate(confusion.classes):
         row = {rate: float(values[k]) for rate, values in rates.items()}
         row["n_points"] = int(confusion.counts[k].sum())
-        if k > 0:
+        if k > 0 and name not in STATIC:
             row["n_boxes"] = sum(n for (label, _), n in objects.items() if label == name)
             row |= _distinct(key for label, key in objects if label == name)
         rows[name] = row

@@ -88,6 +88,17 @@ def test_class_numbers() -> None:
     assert [class_number(name, own) for name in names] == [0, 2, IGNORE, 1, IGNORE, IGNORE, IGNORE]
 
 
+def test_class_numbers_of_the_surroundings() -> None:
+    names = ["road", "drivable", "building", "static object", "background", "car", "fence"]
+    assert [class_number(name) for name in names] == [0, 0, 0, 0, 0, 1, IGNORE]
+    assert [class_number(name, SCENE_CLASSES) for name in names] == [
+        *[SCENE_CLASSES.index(name) for name in ("road", "road", "building")],
+        *[IGNORE, 0, 1, IGNORE],
+    ]
+    half = ("background", "road")  # a building is no road, and nothing else is known of it
+    assert [class_number(name, half) for name in names] == [1, 1, IGNORE, IGNORE, 0, IGNORE, IGNORE]
+
+
 def test_truth_ends_where_nobody_labeled(tmp_path: Path) -> None:
     description = {**DESCRIPTION, "labeled_deg": [-30, 30], "labeled_m": 25, "min_points": 2}
     frame = ScanFolder(folder_of(tmp_path, description, label__a_dot_txt=LINES)).frame("a")

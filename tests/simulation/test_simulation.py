@@ -32,9 +32,10 @@ from edgeperc.simulation.raycast import (
     ground_at,
 )
 from edgeperc.simulation.roadside import add_cafe
-from edgeperc.simulation.samples import IGNORE, labels_by_boxes, simulated_scan
+from edgeperc.simulation.samples import IGNORE, labels_by_boxes, labels_of_scene, simulated_scan
 from edgeperc.simulation.scene import (
     POINT_CLASS_OF,
+    SCENE_CLASSES,
     TOP_VIEW_CLASSES,
     Scene,
     SceneObject,
@@ -46,7 +47,7 @@ from edgeperc.simulation.scene import (
 from edgeperc.simulation.shapes import block
 from edgeperc.simulation.street import SIZES, Street
 from edgeperc.types.mounting import Mounting
-from edgeperc.types.perception import Box
+from edgeperc.types.perception import STATIC, Box
 from edgeperc.types.sensor import SensorProfile
 from edgeperc.types.views import TopViewGeometry
 
@@ -545,6 +546,21 @@ def test_trams_and_trailers_belong_to_no_class() -> None:
 
 
 @pytest.mark.compiled
+def test_the_background_has_parts() -> None:
+    seen = set[str]()
+    for seed in range(3):
+        scan = simulated_scan(seed)
+        labels, objects = labels_of_scene(scan), labels_by_boxes(scan)
+        np.testing.assert_array_equal(labels[objects > 0], objects[objects > 0])
+        told = labels[objects == 0]
+        assert not np.isin(told, [1, 2, 3]).any()
+        ground = np.isin(labels, [SCENE_CLASSES.index(name) for name in ("road", "sidewalk", "terrain")])
+        assert (scan.surfaces[ground] == -1).all()
+        assert ground[(scan.surfaces == -1) & (objects == 0)].all()
+        seen |= {SCENE_CLASSES[k] for k in np.unique(told)}
+    assert seen == {"background", *STATIC}
+
+
 @pytest.mark.parametrize(("height_m", "pitch_deg", "roll_deg"), [(1.4, 3.0, 0.0), (2.2, -3.0, 2.0)])
 def test_scans_of_other_mountings(height_m: float, pitch_deg: float, roll_deg: float) -> None:
     mounting = Mounting(height_m=height_m, pitch_deg=pitch_deg, roll_deg=roll_deg)
