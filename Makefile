@@ -128,7 +128,7 @@ release sbom:
 
 .venv-test/installed: pyproject.toml constraints.txt
 	$(call environment,.venv-test)
-	$(TEST)/pip install --quiet --no-compile --constraint constraints.txt --editable '.[cpu,openvino,view,io,ouster,peers,database,ray,slam,docs,test]'
+	$(TEST)/pip install --quiet --no-compile --constraint constraints.txt --editable '.[cpu,openvino,view,io,ouster,peers,database,ray,slam,tensorboard,docs,test]'
 	@touch $@
 
 .venv-minimal/installed: pyproject.toml constraints.txt

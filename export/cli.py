@@ -192,7 +192,9 @@ def _simulate(args: argparse.Namespace) -> int:
 def _add_train(commands: Commands) -> None:
     train = commands.add_parser("train", help="train a network, or resume a stopped training run")
     train.add_argument("network", choices=NETWORKS, help="network to train")
-    train.add_argument("out", type=Path, help="folder for checkpoint.pt and log.jsonl; a checkpoint in it is resumed")
+    train.add_argument(
+        "out", type=Path, help="folder for checkpoint.pt, log.jsonl and log.csv; a checkpoint in it is resumed"
+    )
     _add_shared(train, "--kitti", "--scans")
     train.add_argument("--simulated", type=Path, help="folder of scans written by edgeperc-export simulate")
     train.add_argument("--camvid", type=Path, help=f"{CAMVID}; for networks of a camera")
@@ -222,6 +224,11 @@ def _add_train(commands: Commands) -> None:
         metavar="STEPS",
         help="steps between checkpoints, and between lines of log.jsonl (default 100)",
     )
+    train.add_argument(
+        "--tensorboard",
+        action="store_true",
+        help="also write the log for TensorBoard; see it with: tensorboard --logdir OUT",
+    )
     _add_shared(train, "--compile")
     _add_recipe_options(train)
     train.set_defaults(run=_train)
@@ -235,7 +242,15 @@ def _train(args: argparse.Namespace) -> int:
 
     scan_sets = [ScanFolder.parse(text) for text in args.scans]
     data = Data(args.kitti, args.simulated, args.camvid, scan_sets, fold=args.fold)
-    run = Run(args.start_from, args.teacher, args.threads, args.workers, args.compile, args.checkpoint_every)
+    run = Run(
+        args.start_from,
+        args.teacher,
+        args.threads,
+        args.workers,
+        args.compile,
+        args.checkpoint_every,
+        tensorboard=args.tensorboard,
+    )
     print_line(str(train(recipe, args.out, data, run)))
     return 0
 

@@ -6,6 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+from edgeperc.types.choices import STATIC
+
 TASKS: Mapping[str, tuple[str, ...]] = {
     "points": ("kulseg", "pointseg", "squeezesegv2"),
     "vehicles": ("ssadnet",),
@@ -417,5 +419,22 @@ MODELS = {
         replace(OPEN, network="ssadnet", height_above_ground=False, front=True, n_pasted=3.0), is_open=True
     ),
     "objects-open": Stage(replace(OBJECTS, steps=4000, detector=False), is_open=True),
+    # Poles and walls are classes here, and are not pasted as what is none.
+    "sceneseg": Stage(
+        replace(
+            OPEN,
+            classes=("background", "car", "pedestrian", "cyclist", *STATIC),
+            steps=4000,
+            reuse=3,
+            learning_rate=2e-3,
+            simulated_share=0.65,
+            n_pasted=3.0,
+            n_negatives=0.0,
+            turn_anywhere=0.7,
+            redraw_every=1000,
+        ),
+        after="pointseg-open",
+        is_open=True,
+    ),
 }
 """The training run of every model, by name; names that end in ``-start`` are intermediate results."""

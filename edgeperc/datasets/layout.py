@@ -14,8 +14,8 @@ from ..simulation.samples import IGNORE
 from ..simulation.scene import POINT_CLASS_OF, POINT_CLASSES
 from ..system.fields import Fields
 from ..system.names import check_name, nearest
+from ..types.choices import STATIC
 from ..types.mounting import Mounting
-from ..types.perception import STATIC
 from ..types.sensor import SensorProfile, get_sensor
 from .splits import in_split
 

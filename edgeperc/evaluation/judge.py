@@ -27,10 +27,11 @@ from ..pipeline import BoxesFrom
 from ..simulation.samples import IGNORE
 from ..simulation.scene import POINT_CLASSES
 from ..types.card import ModelCard
+from ..types.choices import STATIC
 from ..types.frame import ModelFrame
 from ..types.geometry import inside
 from ..types.mounting import MODEL_MOUNTING, Mounting
-from ..types.perception import STATIC, Box, Perception, PointLabels, TopView
+from ..types.perception import Box, Perception, PointLabels, TopView
 from ..types.points import Labels, Points
 from ..types.sensor import SensorProfile
 from ..types.views import TopViewGeometry

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..types.perception import STATIC
+from ..types.choices import STATIC
 from ..types.points import Labels
 from .causes import BUMPER, CAUSES, FLOOR
 from .center_ap import CLASSES, CenterTable, center_scores

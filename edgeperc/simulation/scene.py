@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import PointsError
+from ..types.choices import STATIC
 from ..types.geometry import draw_footprints, wrapped
-from ..types.perception import STATIC, Box
+from ..types.perception import Box
 from ..types.points import Labels, Points
 from ..types.sensor import SensorProfile, get_sensor
 from ..types.views import TopViewGeometry

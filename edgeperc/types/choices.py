@@ -10,3 +10,5 @@ DEFAULT_SENSOR = "hdl-64e"
 AUTO_SENSOR = "auto"  # found in the points
 PRECISIONS = ("fp32", "bf16", "int8")
 RULES = ("boxes", "cells", "column", "fill", "ground", "height", "person", "road", "share", "stand", "support")
+STATIC = ("road", "sidewalk", "terrain", "building", "vegetation", "pole")
+"""Classes of points that are no objects, beside the background."""

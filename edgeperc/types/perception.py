@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from ..errors import ModelError, PointsError
 from ..system.fields import Fields
+from .choices import STATIC
 from .mounting import MODEL_MOUNTING, Mounting
 from .points import Labels, Mask
 from .sensor import RemissionFunction
@@ -21,8 +22,6 @@ _FIELDS = Fields("box", PointsError, "write it with Box.to_dict", optional=("fro
 _PART = 2**20
 _Part = TypeVar("_Part")
 ROADS = ("drivable", "road")  # names of classes on which a vehicle may drive, in lower case
-STATIC = ("road", "sidewalk", "terrain", "building", "vegetation", "pole")
-"""Names of classes of points that are no objects, beside the background."""
 
 
 @dataclass(frozen=True, slots=True)

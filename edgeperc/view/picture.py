@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..road.ahead import FreeAhead, RoadAhead, road_ahead
-from ..types.perception import STATIC, Box, Perception, TopView
+from ..types.choices import STATIC
+from ..types.perception import Box, Perception, TopView
 from ..types.points import Labels, Points
 from .canvas import (
     Label,

@@ -9,7 +9,6 @@ from __future__ import annotations
 import copy
 import json
 import math
-import os
 import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -35,6 +34,7 @@ from ..recipe import Recipe
 from .camera import Camera
 from .checkpoint import build_network, read_checkpoint
 from .images import ImageSamples, ImageWatch, camvid_samples
+from .log import TrainingLog
 from .object_batches import ObjectBatches, ObjectWatch
 from .object_samples import load_samples
 from .object_sets import PASTED, VALIDATION, write_samples
@@ -100,6 +100,7 @@ class Run:
         ``stop_after``.
     save_every_s : seconds between checkpoints, at least; the last one is always written. Large networks take seconds
         to write.
+    tensorboard : the log is written for TensorBoard, too.
     """
 
     start_from: Path | None = None
@@ -109,6 +110,7 @@ class Run:
     compiled: bool = False
     checkpoint_every: int = 100
     save_every_s: float = 0.0
+    tensorboard: bool = False
 
 
 def train(recipe: Recipe, out: Path, data: Data, run: Run | None = None) -> Path:
@@ -117,7 +119,7 @@ def train(recipe: Recipe, out: Path, data: Data, run: Run | None = None) -> Path
     Under ``torchrun`` the processes share each batch (`training.ranks`): the samples are the same, and the
     weights equal those of one process up to rounding. The first process writes the files; all read the checkpoint.
 
-    out : folder for ``checkpoint.pt`` and ``log.jsonl``. A checkpoint of the same recipe in it is resumed.
+    out : folder for ``checkpoint.pt`` and the `TrainingLog`. A checkpoint of the same recipe in it is resumed.
     Returns: The checkpoint.
     Raises ValueError, FloatingPointError, RankError.
     """
@@ -171,13 +173,16 @@ def _train(recipe: Recipe, out: Path, data: Data, run: Run, ranks: Ranks) -> Pat
     )
     losses: list[float] = []
     saved_s = time.monotonic()
-    with (out / "log.jsonl" if ranks.is_first else Path(os.devnull)).open("a") as log, progress:
+    began_s, began = saved_s, state.step
+    with TrainingLog(out if ranks.is_first else None, tensorboard=run.tensorboard) as log, progress:
         for arrays in _batches(recipe, samples, state, epoch, run.n_workers, ranks):
             losses.append(_step(recipe, source, model, state, arrays, ranks))
             state.step += 1
             _average(model.averaged, network, min(recipe.ema, (1 + state.step) / (10 + state.step)))
             progress.update()
-            progress.set_postfix(loss=f"{losses[-1]:.3f}")
+            rate = (state.step - began) * recipe.batch / max(time.monotonic() - began_s, 1e-9)
+            figure_shown = {"best": f"{state.best_figure:.3f}"} if state.best_figure >= 0.0 else {}
+            progress.set_postfix(loss=f"{losses[-1]:.3f}", samples_per_s=f"{rate:.1f}", **figure_shown)
             if isinstance(samples, Samples) and recipe.redraw_every and state.step % recipe.redraw_every == 0:
                 if ranks.is_first:
                     samples.redraw(model.averaged, state.step)
@@ -198,8 +203,7 @@ def _train(recipe: Recipe, out: Path, data: Data, run: Run, ranks: Ranks) -> Pat
                 if recipe.halve_after and state.since_best >= recipe.halve_after * epoch:
                     state.halvings, state.since_best = state.halvings + 1, 0
             state.curve.append(line)
-            log.write(json.dumps(line) + "\n")
-            log.flush()
+            log.write(line | {"samples_per_s": round(rate, 2)})
             over = state.step >= last_step(recipe, state.curve, epoch)
             if ranks.is_first and (over or time.monotonic() - saved_s >= run.save_every_s):
                 _save(checkpoint, recipe, model, state, samples, data.fold)

@@ -29,6 +29,7 @@ from edgeperc.inference.projection import make_projector
 from edgeperc.preprocess.findings import check_fitness
 from edgeperc.preprocess.fitness import FitnessProfile
 from edgeperc.simulation.samples import IGNORE, simulated_scan
+from edgeperc.simulation.scene import SCENE_CLASSES
 from edgeperc.types.mounting import MODEL_MOUNTING, Mounting
 from edgeperc.types.perception import Box
 from edgeperc.types.sensor import get_sensor

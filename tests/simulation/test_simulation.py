@@ -46,8 +46,9 @@ from edgeperc.simulation.scene import (
 )
 from edgeperc.simulation.shapes import block
 from edgeperc.simulation.street import SIZES, Street
+from edgeperc.types.choices import STATIC
 from edgeperc.types.mounting import Mounting
-from edgeperc.types.perception import STATIC, Box
+from edgeperc.types.perception import Box
 from edgeperc.types.sensor import SensorProfile
 from edgeperc.types.views import TopViewGeometry
 

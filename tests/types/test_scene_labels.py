@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from edgeperc.types.perception import STATIC, PointLabels
+from edgeperc.types.choices import STATIC
+from edgeperc.types.perception import PointLabels
 
 CLASSES = ("background", "road", "car", "building", "pedestrian")
 

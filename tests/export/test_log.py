@@ -1,0 +1,69 @@
+"""The log of a training run: JSON, CSV and TensorBoard hold the same figures, and a resumed run goes on in them."""
+
+from __future__ import annotations
+
+import csv
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+pytest.importorskip("torch")
+
+from edgeperc.errors import MissingExtraError
+from edgeperc_export.training.log import TrainingLog, flat
+
+LINES: list[dict[str, Any]] = [
+    {"step": 100, "loss": 1.5, "validation": {"car": 0.25, "mean": None}},
+    {"step": 200, "loss": 0.75, "validation": {"car": 0.5, "mean": 0.125}},
+]
+
+
+def test_names_of_nested_figures_have_slashes() -> None:
+    assert flat({"step": 1, "a": {"b": {"c": 2.0}, "d": None}}) == {"step": 1, "a/b/c": 2.0, "a/d": None}
+    assert flat({}) == {}
+
+
+def test_a_resumed_run_goes_on_in_its_files(tmp_path: Path) -> None:
+    for line in LINES:
+        with TrainingLog(tmp_path) as log:
+            log.write(line)
+    assert [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()] == LINES
+    with (tmp_path / "log.csv").open(newline="") as file:
+        rows = [*csv.reader(file)]
+    assert rows == [
+        ["step", "loss", "validation/car", "validation/mean"],
+        ["100", "1.5", "0.25", ""],
+        ["200", "0.75", "0.5", "0.125"],
+    ]
+
+
+def test_without_a_folder_nothing_is_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    with TrainingLog(None, tensorboard=True) as log:
+        log.write(LINES[0])
+    assert not [*tmp_path.iterdir()]
+
+
+def test_tensorboard_reads_the_same_figures(tmp_path: Path) -> None:
+    reading = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
+    with TrainingLog(tmp_path, tensorboard=True) as log:
+        for line in LINES:
+            log.write(line)
+    events = reading.EventAccumulator(str(tmp_path))
+    events.Reload()
+    scalars = {tag: [(event.step, event.value) for event in events.Scalars(tag)] for tag in events.Tags()["scalars"]}
+    assert scalars == {
+        "step": [(100, 100.0), (200, 200.0)],
+        "loss": [(100, 1.5), (200, 0.75)],
+        "validation/car": [(100, 0.25), (200, 0.5)],
+        "validation/mean": [(200, 0.125)],
+    }
+
+
+def test_a_missing_tensorboard_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "tensorboard", None)
+    with pytest.raises(MissingExtraError, match=r"pip install 'edgeperc\[tensorboard\]'"):
+        TrainingLog(tmp_path, tensorboard=True)
