@@ -77,10 +77,13 @@ docs: .venv-test/installed
 test-wheel: .venv-test/installed
 	PYTHON=$(TEST)/python tests/wheel_demo.sh
 
-# The tests of kernels import no extra, nor do those of the cache, the first start and the source files.
+# The tests of kernels import no extra, nor do those of the cache, the first start, the source files and the packages that
+# compute alone: that each of their modules can be imported without extras is a test of the public API.
+test-minimal: COMPUTING = agreement evaluation ground objects preprocess road simulation tracking
 test-minimal: .venv-minimal/installed
 	$(MINIMAL)/python -c "import importlib.util as u; assert not any(map(u.find_spec, ['torch', 'onnx', 'matplotlib']))"
-	$(MINIMAL)/pytest -n $(JOBS) --dist worksteal -m 'not kernel and not compiled' --ignore tests/system/test_kernel_cache.py --ignore tests/test_warm_up.py --ignore tests/test_layering.py
+	$(MINIMAL)/pytest -n $(JOBS) --dist worksteal -m 'not kernel and not compiled' --ignore tests/system/test_kernel_cache.py --ignore tests/test_warm_up.py --ignore tests/test_layering.py \
+		$(COMPUTING:%=--ignore tests/%)
 
 # An old matplotlib uses what newer packages below it deprecate.
 test-lowest: .venv-lowest/installed
