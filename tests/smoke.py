@@ -15,6 +15,7 @@ from pathlib import Path
 # Modules that an extra brings, and arguments of pytest: tests that use them. The extras docs and test are whole jobs.
 # BESIDE has what these tests want, too.
 SMOKE: dict[str, tuple[list[str], list[str]]] = {
+    "all": (["fsspec", "rerun", "shtab", "zenoh"], ["tests/sinks/test_viewers.py", "tests/ros2/test_ros2_messages.py"]),
     "bags": (["lz4", "zstandard"], ["tests/readers/test_bags.py", "tests/readers/test_clouds.py"]),
     "bench": (["psutil"], ["tests/bench/test_bench_measure.py"]),
     "camera": (["PIL"], ["tests/camera/test_camera.py"]),
@@ -44,22 +45,27 @@ SMOKE: dict[str, tuple[list[str], list[str]]] = {
     "ray": (["ray.data"], ["tests/system/test_ray_cluster.py", "-k", "ray or process"]),
     "remote": (["fsspec"], ["tests/system/test_ray_cluster.py", "-k", "memory or fetched or protocol"]),
     "rerun": (["rerun"], ["tests/sinks/test_viewers.py", "-k", "rerun or rrd"]),
+    "robot": (["onnxruntime", "zenoh", "velodyne_decoder"], ["tests/ros2/test_ros2_node.py"]),
     "ros": (
         ["lz4", "rosbags", "zstandard"],
         ["tests/readers/test_bags.py", "tests/readers/test_times.py", "-k", "bag or mcap"],
     ),
     "ros2": (["rosbags", "zenoh"], ["tests/ros2/test_ros2_messages.py", "tests/ros2/test_ros2_node.py"]),
     "slam": (["kiss_icp"], ["tests/bench/test_slam.py"]),
+    "tensorboard": (["tensorboard", "torch"], ["tests/export/test_log.py"]),
     "velodyne": (
         ["velodyne_decoder"],
         ["tests/readers/test_captures.py", "tests/readers/test_times.py", "-k", "velodyne"],
     ),
     "view": (["matplotlib", "PIL"], ["tests/view/test_pictures.py"]),
+    "viewers": (["foxglove", "matplotlib", "rerun"], ["tests/sinks/test_viewers.py"]),
 }
 BESIDE = {
     "camera": ["--editable", ".[cpu]"],
     "database": ["--editable", ".[cpu,export]"],
     "foxglove": ["mcap>=1.2", "protobuf>=4"],
+    "viewers": ["mcap>=1.2", "protobuf>=4"],
+    "all": ["mcap>=1.2", "protobuf>=4"],
     "loadgen": ["--editable", ".[bench,cpu]"],
     "ray": ["--editable", ".[cpu]"],
     "remote": ["--editable", ".[cpu]"],

@@ -82,6 +82,20 @@ def test_no_library_that_excludes_another_is_in_two_extras() -> None:
     )
 
 
+def test_groups_of_extras_name_every_other_one() -> None:
+    extras = PROJECT["optional-dependencies"]
+
+    def members(extra: str) -> set[str]:
+        inner = {name for text in extras[extra] for name in packaging.Requirement(text).extras if "edgeperc" in text}
+        return {extra}.union(*map(members, inner))
+
+    apart = {"openvino", "gpu", "ouster"}  # other builds of onnxruntime; requirements that exclude those of rerun
+    makers = {"jit", "export", "tensorboard", "database", "loadgen", "peers", "geometry", "slam", "docs", "test"}
+    assert members("all") == extras.keys() - apart - makers
+    table = (REPOSITORY / "docs/quickstart.md").read_text("utf-8")
+    assert not [extra for extra in extras if f"`edgeperc[{extra}]`" not in table and f"`{extra}`" not in table]
+
+
 @pytest.mark.parametrize("machine", ["x86_64", "aarch64", "arm64", "ARM64"])
 def test_versions_that_leak_on_arm_are_excluded_there(machine: str) -> None:
     of_cpu = [packaging.Requirement(text) for text in PROJECT["optional-dependencies"]["cpu"]]
