@@ -58,7 +58,6 @@ for out, changes in json.loads(runs).items():
 RUNS = {
     "pointseg": {"network": "pointseg", "accumulate": 2},
     "ssadnet": {"network": "ssadnet", "edge": True, "width": 0.25, "front": True},
-    "lodnn": {"network": "lodnn", "learning_rate": 1e-3},
 }
 
 

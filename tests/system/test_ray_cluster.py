@@ -111,7 +111,7 @@ def test_workers_give_the_same_figures(tmp_path: Path, workers: tuple[str, ...])
     for name, options in (("one", ()), ("workers", workers)):
         file = tmp_path / f"{name}.json"
         with contextlib.redirect_stdout(io.StringIO()) as out:
-            assert cli.main(["eval", "simulation:8", *options, "--json", str(file)]) == 0
+            assert cli.main(["eval", "simulation:4", *options, "--json", str(file)]) == 0
         figures = json.loads(file.read_text())
         del figures["command"]
         # Ray itself prints that a process of its died, which a busy computer may bring about; the block is done again.
