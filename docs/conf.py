@@ -14,10 +14,12 @@ extensions = [
     "sphinx.ext.autodoc",
     "sphinx.ext.autosummary",
     "sphinx.ext.intersphinx",
+    "sphinx_copybutton",
     "sphinxarg.ext",
 ]
 exclude_patterns = ["_build"]
 templates_path = ["_templates"]
+copybutton_prompt_text = "$ "
 html_theme = "furo"
 html_title = f"edgeperc {version}"
 
