@@ -59,8 +59,14 @@ def print_set(name: str, sensor: SensorProfile, scans: list[tuple[Points, NDArra
         counts = {place: np.zeros(3, np.int64) for place in places}
         for points, cells in scans:
             perception = perceive(points)
-            ranges = {"x_range_m": VIEW.x_range_m, "y_range_m": VIEW.y_range_m}
-            grid = occupancy_grid(perception, points, **ranges, cell_m=VIEW.cell_m, sensor=sensor)
+            grid = occupancy_grid(
+                perception,
+                points,
+                x_range_m=VIEW.x_range_m,
+                y_range_m=VIEW.y_range_m,
+                cell_m=VIEW.cell_m,
+                sensor=sensor,
+            )
             for place, where in places.items():
                 counted, road = where & grid.observed & (cells != IGNORE), cells == 1
                 found = grid.drivable

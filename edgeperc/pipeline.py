@@ -260,9 +260,7 @@ class Pipeline:
             labels = value("refine", self._label_ahead, near, scan, watch)
 
         # Objects alone: classes such as road and building are background to the stages below
-        seen = labels
-        if self.ranged:
-            labels = value("refine", PointLabels.objects, seen)
+        seen, labels = labels, value("refine", PointLabels.objects, labels) if self.ranged else absent
 
         # Objects by the points of their candidates
         objects = candidates = absent

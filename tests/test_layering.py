@@ -68,8 +68,8 @@ FLOORS = {
         inference.__init__ inference.box_heads inference.crop inference.projection inference.providers
         inference.decode inference.listing
         inference.session
-        road.__init__ road.grid road.outline
-        road.ahead
+        road.__init__ road.around road.outline
+        road.ahead road.grid
         pipeline
         readers.__init__ readers.images readers.origin readers.packets readers.times readers.unknown
         readers.clouds readers.ouster readers.tables
@@ -131,7 +131,7 @@ FLOORS = {
         networks.camseg networks.edge networks.lodnn networks.segnet networks.squeezesegv2 networks.unet
         networks.fcn networks.kulseg
         networks.__init__
-        training.__init__ training.checkpoint training.curve training.losses training.object_task training.ranks
+        training.__init__ training.checkpoint training.curve training.log training.losses training.object_task training.ranks
         training.camera training.object_samples training.start training.task
         training.images training.object_sets training.teacher
         training.object_batches training.samples
