@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from .agreement.rules import RULES
 from .camera.image import ImageScaler, as_image, label_pixels
 from .errors import EdgepercError, FitnessError, ImageError, MountingError, OptionError, PointsError
+from .ground.ceiling import find_ceiling
 from .ground.leveling import MountingEstimate, MountingEstimator, near_support
 from .inference.session import Session
 from .objects.boxes import MIN_SCORE
@@ -609,7 +610,8 @@ class Perceiver:
             watch.lap("adapt")
         fitness = check_dropped(given, dropped, profile) if check else ()
         if check and not fitness:
-            fitness = turned or check_profiles(scan, self._fitness, profile, self._frame)
+            ceiling_m = find_ceiling(scan, float(self._frame.eye[2]))
+            fitness = turned or check_profiles(scan, self._fitness, profile, self._frame, ceiling_m)
             fitness = with_raw_remission(fitness, given[:, 3], profile)
         if check and not any(finding.gross for finding in fitness):
             fitness = (*fitness, *hidden)
