@@ -18,7 +18,7 @@ from .agreement.rules import RULES
 from .camera.image import ImageScaler, as_image, label_pixels
 from .errors import EdgepercError, FitnessError, ImageError, MountingError, OptionError, PointsError
 from .ground.ceiling import find_ceiling
-from .ground.leveling import MountingEstimate, MountingEstimator, near_support
+from .ground.leveling import MountingEstimate, MountingEstimator, near_support, share_below
 from .inference.session import Session
 from .objects.boxes import MIN_SCORE
 from .pipeline import BoxesFrom, ObjectNetwork, Options, Pipeline, RangeImageNetwork, TopViewNetwork
@@ -598,7 +598,7 @@ class Perceiver:
         watch.lap("adapt" if self._renders and profile.remission is not None else "check")
         if not before.is_complete and len(scan):
             if check and before.known.roll_deg is None:
-                turned = check_beams(scan, profile) or check_ground(scan, near_support)
+                turned = check_beams(scan, profile) or check_ground(scan, near_support, share_below)
             try:
                 self._set_mounting(before.add(scan))
                 hidden = self._about_tilt()

@@ -93,7 +93,7 @@ _OUTVOTED, _SURE_SUPPORT = 3.0, 150
 _MIN_CELLS = 60  # of half a meter, on the plane
 _MAX_BELOW = 0.8  # cells below the plane, as a share of the cells on it
 _CORRIDOR_M = (3.0, 15.0)  # half its width, and its length ahead and behind: the road that the vehicle stands on
-_BAND_M, _TRIM_M = 0.2, 0.1
+_BAND_M, _TRIM_M, _CLEAR_M = 0.2, 0.1, 0.3
 
 _STREET_M = (0.3, 3.0, 40.0)  # lowest and highest point above the road, and the farthest, that show the street's axis
 _STREET_BIN_M = 0.25
@@ -252,10 +252,20 @@ def _leveled(scan: Points, guess: Mounting, height_m: float | None) -> tuple[Mou
 
 def near_support(points: Points) -> int:
     """How many more cells of half a meter within 12 m lie on the ground than below it; 0 without ground."""
-    scan = read_only(points)
-    _, lowest, low = _lowest_returns(scan)
-    near = _near_plane(scan, lowest, low, _STARTS_M)
+    near = _ground_near(points)
     return 0 if near is None else near.support
+
+
+def share_below(points: Points) -> float:
+    """Of the points within 12 m that are clear of the ground, the share that lies below it; 1 without ground."""
+    near = _ground_near(points)
+    if near is None:
+        return 1.0
+    x, y, z = points[:, :3].astype(np.float64).T
+    with np.errstate(invalid="ignore", over="ignore"):
+        above_m = np.where(np.hypot(x, y) < _VOTING_M, z - x * near.abc[0] - y * near.abc[1] - near.abc[2], 0.0)
+        below, above = np.count_nonzero(above_m < -_CLEAR_M), np.count_nonzero(above_m > _CLEAR_M)
+    return below / max(1, below + above)
 
 
 class _Plane(NamedTuple):
@@ -299,6 +309,12 @@ def _ground_plane(
         plane = plane._replace(abc=_refined(scan, cell, plane.abc))
     a, b, c = plane.abc.tolist()
     return (a, b, c), float(plane.support), _uncertainty(scan, lowest, low, plane)
+
+
+def _ground_near(points: Points) -> _Plane | None:
+    scan = read_only(points)
+    _, lowest, low = _lowest_returns(scan)
+    return _near_plane(scan, lowest, low, _STARTS_M)
 
 
 def _lowest_returns(scan: Points) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.float64]]:

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from edgeperc.errors import MountingError
-from edgeperc.ground.leveling import MountingEstimator, near_support
+from edgeperc.ground.leveling import MountingEstimator, near_support, share_below
 from edgeperc.preprocess.condition import condition
 from edgeperc.preprocess.findings import (
     Finding,
@@ -217,7 +217,7 @@ def leveled(points: Points, sensor: str) -> list[Finding]:
     with contextlib.suppress(MountingError):
         estimator = estimator.add(points)
     frame = ModelFrame(estimator.mounting())
-    turned = check_beams(points, profile) or check_ground(points, near_support)
+    turned = check_beams(points, profile) or check_ground(points, near_support, share_below)
     return [*turned, *check_profiles(frame.move(points), PROFILES, profile, frame)]
 
 
@@ -410,7 +410,7 @@ def test_the_ground_tells_up_from_down(sensor: str, turn: str) -> None:
     """Beams that are as high as low do not."""
     for seed in SEEDS:
         points = street(seed, sensor)
-        assert not check_ground(points, near_support)
+        assert not check_ground(points, near_support, share_below)
         assert any("upside down" in finding for finding in leveled(points * TURNED[turn], sensor) if finding.gross)
 
 
@@ -419,7 +419,7 @@ def test_real_scans_that_are_upside_down_are_refused(kitti_root: Path, turn: str
     files = sorted(kitti_root.glob("training/velodyne/*.bin"))[::12]
     assert len(files) == 41
     scans = {file.name: read_points(file) for file in files}
-    assert [name for name, scan in scans.items() if check_ground(scan, near_support)] == []
+    assert [name for name, scan in scans.items() if check_ground(scan, near_support, share_below)] == []
     assert [
         name for name, scan in scans.items() if not any(f.gross for f in leveled(scan * TURNED[turn], "hdl-64e"))
     ] == []
@@ -428,9 +428,9 @@ def test_real_scans_that_are_upside_down_are_refused(kitti_root: Path, turn: str
 @pytest.mark.parametrize("size", [(300.0, 8.0, 5.0), (60.0, 20.0, 4.5), (26.0, 24.0, 3.0), (400.0, 4.0, 6.0)])
 def test_a_ceiling_is_not_the_ground_above(size: tuple[float, float, float]) -> None:
     for sensor in ("os0-64", "os1-64", "vlp-16", "hdl-32e"):
-        assert not check_ground(enclosed(size, 1.73, sensor), near_support)
+        assert not check_ground(enclosed(size, 1.73, sensor), near_support, share_below)
 
 
 @pytest.mark.parametrize("points", [np.zeros((0, 4)), np.full((9, 4), np.nan), np.zeros((50, 4)), np.eye(4)])
 def test_nothing_is_upside_down_in_a_scan_of_nothing(points: NDArray[np.float64]) -> None:
-    assert check_ground(points.astype(np.float32), near_support) == ()
+    assert check_ground(points.astype(np.float32), near_support, share_below) == ()
