@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from edgeperc.simulation import simulate
 from edgeperc.simulation.raycast import ASPHALT, BOX, MATTE, ROUGH, ROUNDING, TERRAIN
@@ -36,7 +35,12 @@ def _add_walls(street: Street, size: Vector, open_side: int | None, parapet_m: f
     """Walls and a ceiling about the origin; one side may be open (a gate), all may end at a parapet."""
     (length, width, height), paint = size, float(street.rng.uniform(0.15, 0.6))
     for side, (x, y, a, b) in enumerate(
-        [(length / 2, 0, 0.2, width), (-length / 2, 0, 0.2, width), (0, width / 2, length, 0.2), (0, -width / 2, length, 0.2)]
+        [
+            (length / 2, 0, 0.2, width),
+            (-length / 2, 0, 0.2, width),
+            (0, width / 2, length, 0.2),
+            (0, -width / 2, length, 0.2),
+        ]
     ):
         if side != open_side:
             high = parapet_m or height
@@ -55,10 +59,7 @@ def parking_garage(seed: int, sensor: str) -> SimulatedScan:
     gate = int(rng.integers(0, 4)) if rng.random() < 0.3 else None
     _add_walls(street, (length, width, height), gate, 1.1 if rng.random() < 0.2 else 0.0)
     paint, middle = float(rng.uniform(0.15, 0.6)), float(rng.uniform(-0.8, 0.8))
-    place = next(
-        (x, middle, float(rng.normal(0.0, 0.05)))
-        for x in [float(rng.uniform(-0.5, 0.5) * (length - 6.0))]
-    )
+    place = (float(rng.uniform(-0.5, 0.5) * (length - 6.0)), middle, float(rng.normal(0.0, 0.05)))
     street.take(place[0], middle, 5.0, 2.4, 0.0)
     aisle, step = float(rng.uniform(15.5, 17.5)), float(rng.choice([2.6, 5.2, 7.8]))  # with a row to both sides
     for y in np.arange(-3.0, 3.1) * aisle + middle:
@@ -99,16 +100,30 @@ def small_garage(seed: int, sensor: str) -> SimulatedScan:
     rng = np.random.default_rng((seed, 11))
     street = _flat(rng)
     bays = int(rng.choice([1, 2, 3, 4], p=[0.3, 0.4, 0.2, 0.1]))
-    length, width, height = float(rng.uniform(5.6, 8.5)), float(bays * rng.uniform(2.7, 3.2) + 0.5), float(rng.uniform(2.1, 2.9))
+    length, width, height = (
+        float(rng.uniform(5.6, 8.5)),
+        float(bays * rng.uniform(2.7, 3.2) + 0.5),
+        float(rng.uniform(2.1, 2.9)),
+    )
     _add_walls(street, (length, width, height), 0 if rng.random() < 0.5 else None, 0.0)
     bay = width / bays
-    place = (float(rng.uniform(-0.3, 0.6)), (int(rng.integers(0, bays)) + 0.5) * bay - width / 2, float(rng.normal(0.0, 0.03)))
+    place = (
+        float(rng.uniform(-0.3, 0.6)),
+        (int(rng.integers(0, bays)) + 0.5) * bay - width / 2,
+        float(rng.normal(0.0, 0.03)),
+    )
     street.take(*place[:2], 4.6, 1.9, 0.0)
     for k in range(bays):
         if rng.random() < 0.6:
-            street.add_object("car", float(rng.uniform(-0.3, 0.3)), (k + 0.5) * bay - width / 2, math.pi * (rng.random() < 0.5))
+            street.add_object(
+                "car", float(rng.uniform(-0.3, 0.3)), (k + 0.5) * bay - width / 2, math.pi * (rng.random() < 0.5)
+            )
     for _ in range(int(rng.integers(2, 9))):
-        a, b, c = float(rng.uniform(0.3, 1.6)), float(rng.uniform(0.25, 0.6)), float(rng.uniform(0.3, min(2.0, height - 0.2)))
+        a, b, c = (
+            float(rng.uniform(0.3, 1.6)),
+            float(rng.uniform(0.25, 0.6)),
+            float(rng.uniform(0.3, min(2.0, height - 0.2))),
+        )
         x, y, yaw = float(rng.uniform(-0.45, 0.45) * length), float(rng.choice([-1, 1]) * (width / 2 - 0.35)), 0.0
         if rng.random() < 0.4:
             x, y, yaw = -length / 2 + 0.4, float(rng.uniform(-0.45, 0.45) * width), math.pi / 2
@@ -116,33 +131,57 @@ def small_garage(seed: int, sensor: str) -> SimulatedScan:
             street.take(x, y, a, b, yaw)
             street.rows.append(block(MATTE, float(rng.uniform(0.1, 0.6)), (x, y, c / 2), (a, b, c), yaw=yaw))
     if rng.random() < 0.5:  # a beam or the rail of the gate
-        street.rows.append(block(MATTE, 0.3, (float(rng.uniform(-0.3, 0.3)) * length, 0, height - 0.15), (0.25, width, 0.3)))
+        street.rows.append(
+            block(MATTE, 0.3, (float(rng.uniform(-0.3, 0.3)) * length, 0, height - 0.15), (0.25, width, 0.3))
+        )
     return _from(street, sensor, place, height, seed)
 
 
 def furnished_room(seed: int, sensor: str) -> SimulatedScan:
-    """An office, a laboratory or a living room: tables, cupboards, chairs; the sensor on a tripod, a robot or a table."""
+    """An office or a living room: tables, cupboards, chairs; the sensor on a tripod, a robot or a table."""
     rng = np.random.default_rng((seed, 13))
     street = _flat(rng)
     length, width, height = float(rng.uniform(4.0, 14.0)), float(rng.uniform(3.5, 9.0)), float(rng.uniform(2.3, 3.3))
     _add_walls(street, (length, width, height), None, 0.0)
-    place = (float(rng.uniform(-0.3, 0.3) * length), float(rng.uniform(-0.3, 0.3) * width), float(rng.uniform(-math.pi, math.pi)))
+    place = (
+        float(rng.uniform(-0.3, 0.3) * length),
+        float(rng.uniform(-0.3, 0.3) * width),
+        float(rng.uniform(-math.pi, math.pi)),
+    )
     high = float(rng.choice([rng.uniform(0.25, 0.7), rng.uniform(0.9, 1.3), rng.uniform(1.3, 1.8)]))
     street.take(*place[:2], 0.8, 0.8, 0.0)
     for _ in range(int(length * width / 5.0)):
         what = int(rng.integers(0, 3))
-        x, y, yaw = float(rng.uniform(-0.45, 0.45) * length), float(rng.uniform(-0.45, 0.45) * width), float(rng.choice([0.0, math.pi / 2]))
+        x, y, yaw = (
+            float(rng.uniform(-0.45, 0.45) * length),
+            float(rng.uniform(-0.45, 0.45) * width),
+            float(rng.choice([0.0, math.pi / 2])),
+        )
         if what == 0:  # a table on four legs
             a, b, c = float(rng.uniform(1.0, 2.0)), float(rng.uniform(0.6, 1.0)), 0.73
             rows = [block(MATTE, 0.4, (x, y, c), (a, b, 0.05), yaw=yaw)]
-            rows += [block(MATTE, 0.3, (x + i * 0.4 * (a if yaw == 0 else b), y + j * 0.4 * (b if yaw == 0 else a), c / 2), (0.05, 0.05, c)) for i in (-1, 1) for j in (-1, 1)]
+            rows += [
+                block(
+                    MATTE,
+                    0.3,
+                    (x + i * 0.4 * (a if yaw == 0 else b), y + j * 0.4 * (b if yaw == 0 else a), c / 2),
+                    (0.05, 0.05, c),
+                )
+                for i in (-1, 1)
+                for j in (-1, 1)
+            ]
         elif what == 1:  # a cupboard
             a, b, c = float(rng.uniform(0.6, 2.0)), float(rng.uniform(0.35, 0.6)), float(rng.uniform(0.8, 2.1))
-            y = float(rng.choice([-1, 1]) * (width / 2 - 0.35)); yaw = 0.0
+            y = float(rng.choice([-1, 1]) * (width / 2 - 0.35))
+            yaw = 0.0
             rows = [block(MATTE, 0.4, (x, y, c / 2), (a, b, c))]
         else:  # a chair
             a, b, c = 0.5, 0.5, 0.95
-            rows = [block(MATTE, 0.3, (x, y, 0.45), (0.48, 0.48, 0.08)), block(MATTE, 0.3, (x + 0.22, y, 0.7), (0.05, 0.48, 0.5)), rod(0.2, (x, y, 0.0), (x, y, 0.45), 0.04)]
+            rows = [
+                block(MATTE, 0.3, (x, y, 0.45), (0.48, 0.48, 0.08)),
+                block(MATTE, 0.3, (x + 0.22, y, 0.7), (0.05, 0.48, 0.5)),
+                rod(0.2, (x, y, 0.0), (x, y, 0.45), 0.04),
+            ]
         if street.free(x, y, a, b, yaw, 0.0):
             street.take(x, y, a, b, yaw)
             street.rows += rows

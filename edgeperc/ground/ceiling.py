@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -17,7 +18,7 @@ _LEAST_SLOPE, _UPPER_PART, _FEWEST = 0.1, 0.4, 30
 # Of the points of the upper rays, as many lie at one height: 0.3 and more in most drawn garages, halls and small
 # garages of the sensors of such beams, at most 0.06 in 36 real scans of four sets and 0.1 in 75 drawn streets.
 _BELOW_M, _ABOVE_M, _SHARE, _SECTORS = 0.3, 0.15, 0.3, 0.35
-_CLEAR_M = 0.1  # between a vehicle and the ceiling
+_CLEAR_M, _ON_ROOF_M = 0.1, 0.5  # between a vehicle and the ceiling, and the sensor on it
 VEHICLES = ("car", "van", "truck")
 
 
@@ -48,17 +49,22 @@ def find_ceiling(points: Points, eye_m: float = 0.0) -> float | None:
 
 
 def without_impossible(boxes: Sequence[Box], points: Points, eye_m: float) -> tuple[Box, ...]:
-    """The boxes without vehicles around the sensor, and those that do not fit below a ceiling.
+    """The boxes without vehicles around the sensor, and without those that do not fit below a ceiling.
 
-    What is taken for such a vehicle is a small garage, or beams, pipes and walls.
+    What is taken for them is the own vehicle, a small garage, or beams, pipes and walls.
 
     points : (n, 4) float32 in the frame of the models.
+    eye_m : z of the sensor [m]. Below one on a pole, vehicles pass.
     """
-    kept = [box for box in boxes if box.label not in VEHICLES or not inside(box, np.array([[0.0, 0.0, box.center[2]]]))[0]]
-    tops_m = [box.center[2] + 0.5 * box.size[2] + MODEL_HEIGHT_M if box.label in VEHICLES else 0.0 for box in kept]
-    if max(tops_m, default=0.0) <= _LEAST_M - _CLEAR_M:
-        return tuple(kept)
-    ceiling_m = find_ceiling(points, eye_m)
-    if ceiling_m is None:
-        return tuple(kept)
-    return tuple(box for box, top_m in zip(kept, tops_m, strict=True) if top_m <= ceiling_m - _CLEAR_M)
+    tops_m = [box.center[2] + 0.5 * box.size[2] for box in boxes]
+    kept = [
+        (box, top_m)
+        for box, top_m in zip(boxes, tops_m, strict=True)
+        if box.label not in VEHICLES
+        or top_m < eye_m - _ON_ROOF_M
+        or not inside(box, np.array([[0.0, 0.0, box.center[2]]]))[0]
+    ]
+    tallest_m = max((top_m for box, top_m in kept if box.label in VEHICLES), default=-math.inf) + MODEL_HEIGHT_M
+    ceiling_m = find_ceiling(points, eye_m) if tallest_m > _LEAST_M - _CLEAR_M else None
+    most_m = math.inf if ceiling_m is None else ceiling_m - _CLEAR_M - MODEL_HEIGHT_M
+    return tuple(box for box, top_m in kept if box.label not in VEHICLES or top_m <= most_m)

@@ -83,7 +83,7 @@ _STARTS_M = (1.7, 0.9, 2.5, 0.1, 3.3, 4.1, -0.7)
 _VOTING_M = 12.0  # farther out, the land beside a road is often lower
 # A sensor on a truck, a pole or a crane may see no ground so near: the least reach counts in which its plane is seen.
 _FAR_STARTS_M = (1.7, 2.5, 3.3, 4.1, 4.9, 5.7, 6.5, 7.3, 8.1, 8.9)
-_HIGH_M = 2.8  # a lower sensor would see ground within 12 m: something hides it
+HIGH_M = 2.8  # a lower sensor would see ground within 12 m: something hides it
 _FAR_REACHES_M = (24.0, 28.0, 32.0, 40.0, 48.0, 60.0)
 _FEW_BELOW = 0.25  # cells below such a plane, as a share of the cells on it; if there is none, `_MAX_BELOW`
 _LEVEL_DEG = 3.0  # embankments and rows of roofs are steeper
@@ -346,7 +346,7 @@ def _lowest_plane(
     if near is not None and (near.support >= _SURE_SUPPORT or _counted(near.abc, low, _FAR_REACHES_M[-1]).is_lowest()):
         return near
     far = _far_plane(scan, lowest, low, far_starts_m)
-    if far is not None and far.abc[2] > -_HIGH_M:
+    if far is not None and far.abc[2] > -HIGH_M:
         far = None
     if near is None or far is None:
         return near or far

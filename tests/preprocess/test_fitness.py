@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from garages import furnished_room, small_garage, truck_depot
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -259,6 +260,17 @@ def test_rooms_with_furniture_windows_and_doors(sensor: str, window: float) -> N
         assert any("a room" in finding for finding in leveled(office(sensor, seed, window), sensor) if finding.gross)
 
 
+@pytest.mark.parametrize("sensor", ["hdl-64e", "os1-64", "pandar64", "os0-64", "vlp-32c"])
+def test_a_garage_of_a_house_is_no_room(sensor: str) -> None:
+    """A car fits around the sensor; what stands in a room would be inside it, or the sensor is lower."""
+    garages, rooms = (
+        [[f for f in leveled(place(seed, sensor).points, sensor) if "seems to be" in f] for seed in range(20, 32)]
+        for place in (small_garage, furnished_room)
+    )
+    assert sum(not any(finding.gross for finding in found) for found in garages) >= 11
+    assert sum(any(finding.gross for finding in found) for found in rooms) >= 11
+
+
 @pytest.mark.parametrize(
     ("size", "is_hall"),
     [
@@ -412,6 +424,21 @@ def test_the_ground_tells_up_from_down(sensor: str, turn: str) -> None:
         points = street(seed, sensor)
         assert not check_ground(points, near_support, share_below)
         assert any("upside down" in finding for finding in leveled(points * TURNED[turn], sensor) if finding.gross)
+
+
+@pytest.mark.parametrize("turn", TURNED)
+@pytest.mark.parametrize("sensor", ["pandar64", "os1-64", "vlp-16"])
+def test_an_origin_near_the_road_tells_up_from_down(sensor: str, turn: str) -> None:
+    """It sees the road above and below as the same plane; on a bank, there is as much below it as above."""
+    streets = [simulated_scan(seed, sensor).points + np.float32([0.0, 0.0, 1.55, 0.0]) for seed in SEEDS]
+    assert not any(check_ground(points, near_support, share_below) for points in streets)
+    assert sum(bool(check_ground(points * TURNED[turn], near_support, share_below)) for points in streets) >= 3
+
+
+@pytest.mark.parametrize("seed", [100, 166, 7])
+def test_a_ceiling_that_shows_more_than_the_floor_is_not_the_ground(seed: int) -> None:
+    for sensor in ("os0-64", "os1-64", "os0-128"):
+        assert not check_ground(truck_depot(seed, sensor).points, near_support, share_below)
 
 
 @pytest.mark.parametrize("turn", TURNED)
