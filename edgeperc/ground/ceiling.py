@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..types.geometry import inside
 from ..types.mounting import MODEL_HEIGHT_M
@@ -19,6 +20,7 @@ _LEAST_SLOPE, _UPPER_PART, _FEWEST = 0.1, 0.4, 30
 # garages of the sensors of such beams, at most 0.06 in 36 real scans of four sets and 0.1 in 75 drawn streets.
 _BELOW_M, _ABOVE_M, _SHARE, _SECTORS = 0.3, 0.15, 0.3, 0.35
 _CLEAR_M, _ON_ROOF_M = 0.1, 0.5  # between a vehicle and the ceiling, and the sensor on it
+_BEHIND_M = 1.5  # how much of a vehicle may be estimated to lie behind a wall
 VEHICLES = ("car", "van", "truck")
 
 
@@ -49,7 +51,7 @@ def find_ceiling(points: Points, eye_m: float = 0.0) -> float | None:
 
 
 def without_impossible(boxes: Sequence[Box], points: Points, eye_m: float) -> tuple[Box, ...]:
-    """The boxes without vehicles around the sensor, and without those that do not fit below a ceiling.
+    """The boxes without vehicles around the sensor, and without those that do not fit below a ceiling or between the walls there.
 
     What is taken for them is the own vehicle, a small garage, or beams, pipes and walls.
 
@@ -66,5 +68,26 @@ def without_impossible(boxes: Sequence[Box], points: Points, eye_m: float) -> tu
     ]
     tallest_m = max((top_m for box, top_m in kept if box.label in VEHICLES), default=-math.inf) + MODEL_HEIGHT_M
     ceiling_m = find_ceiling(points, eye_m) if tallest_m > _LEAST_M - _CLEAR_M else None
-    most_m = math.inf if ceiling_m is None else ceiling_m - _CLEAR_M - MODEL_HEIGHT_M
-    return tuple(box for box, top_m in kept if box.label not in VEHICLES or top_m <= most_m)
+    if ceiling_m is None:
+        return tuple(box for box, _ in kept)
+    most_m, outline = ceiling_m - _CLEAR_M - MODEL_HEIGHT_M, _outline(points)
+    return tuple(
+        box for box, top_m in kept if box.label not in VEHICLES or (top_m <= most_m and not _sticks_out(box, outline))
+    )
+
+
+_DIRECTIONS = np.stack([np.cos(np.arange(32) * np.pi / 16.0), np.sin(np.arange(32) * np.pi / 16.0)])
+
+
+def _outline(points: Points) -> NDArray[np.float64]:
+    """How far the points reach in each of the `_DIRECTIONS` [m]."""
+    xy = points[:: (len(points) // _SAMPLE) | 1, :2].astype(np.float64)
+    return (xy[np.isfinite(xy).all(axis=1)] @ _DIRECTIONS).max(axis=0)
+
+
+def _sticks_out(box: Box, outline: NDArray[np.float64]) -> bool:
+    """Whether a vehicle would stand partly behind the walls: a part of a wall was taken for its end."""
+    cos, sin = 0.5 * math.cos(box.yaw), 0.5 * math.sin(box.yaw)
+    middle = np.array(box.center[:2]) @ _DIRECTIONS
+    along, across = box.size[0] * np.array([cos, sin]), box.size[1] * np.array([-sin, cos])
+    return bool((middle + np.abs(along @ _DIRECTIONS) + np.abs(across @ _DIRECTIONS) > outline + _BEHIND_M).any())
