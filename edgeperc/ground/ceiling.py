@@ -8,16 +8,15 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from ..types.geometry import inside
 from ..types.mounting import MODEL_HEIGHT_M
 from ..types.perception import Box
 from ..types.points import Points
 
 _SAMPLE, _REACH_M, _LEAST_M = 8192, (1.5, 40.0), 2.0  # points; their range; their height above the road
 # A sensor whose rays rise less meets a ceiling too far away to tell it from facades.
-_LEAST_SLOPE, _UPPER_PART, _FEWEST = 0.1, 0.4, 30
-# Of the points of the upper rays, as many lie at one height: 0.3 and more in most drawn garages, halls and small
-# garages of the sensors of such beams, at most 0.06 in 36 real scans of four sets and 0.1 in 75 drawn streets.
+_LEAST_SLOPE, _RISING, _UPPER_PART, _FEWEST = 0.1, 0.002, 0.4, 30
+# Such a share of the points of the upper rays lies at one height: 0.3 and more in most drawn garages and halls, at most
+# 0.06 in 29 real scans of four sensors of such beams, and 0.1 in 75 drawn streets.
 _BELOW_M, _ABOVE_M, _SHARE, _SECTORS = 0.3, 0.15, 0.3, 0.35
 _CLEAR_M, _ON_ROOF_M = 0.1, 0.5  # between a vehicle and the ceiling, and the sensor on it
 _BEHIND_M = 1.5  # how much of a vehicle may be estimated to lie behind a wall
@@ -35,11 +34,12 @@ def find_ceiling(points: Points, eye_m: float = 0.0) -> float | None:
         across_m = np.hypot(x, y)
         near = (across_m > _REACH_M[0]) & np.isfinite(across_m + z)
         slope = (z - eye_m) / across_m
-    if np.count_nonzero(near) < _FEWEST:
+    n_rising, n_near = np.count_nonzero(near & (slope > _LEAST_SLOPE)), np.count_nonzero(near)
+    if n_near < _FEWEST or n_rising < _RISING * n_near:
         return None
-    steepest = float(np.percentile(slope[near], 99.8))
+    steepest = float(np.percentile(slope[near], 100.0 * (1.0 - _RISING)))
     upper = near & (across_m < _REACH_M[1]) & (slope > _UPPER_PART * steepest) & (z > _LEAST_M - MODEL_HEIGHT_M)
-    if steepest < _LEAST_SLOPE or np.count_nonzero(upper) < _FEWEST:
+    if np.count_nonzero(upper) < _FEWEST:
         return None
     top = z[upper]
     level = float(np.percentile(top, 95.0))
@@ -51,7 +51,7 @@ def find_ceiling(points: Points, eye_m: float = 0.0) -> float | None:
 
 
 def without_impossible(boxes: Sequence[Box], points: Points, eye_m: float) -> tuple[Box, ...]:
-    """The boxes without vehicles around the sensor, and without those that do not fit below a ceiling or between the walls there.
+    """The boxes without vehicles around the sensor, and without those that do not fit between a ceiling and walls.
 
     What is taken for them is the own vehicle, a small garage, or beams, pipes and walls.
 
@@ -62,18 +62,24 @@ def without_impossible(boxes: Sequence[Box], points: Points, eye_m: float) -> tu
     kept = [
         (box, top_m)
         for box, top_m in zip(boxes, tops_m, strict=True)
-        if box.label not in VEHICLES
-        or top_m < eye_m - _ON_ROOF_M
-        or not inside(box, np.array([[0.0, 0.0, box.center[2]]]))[0]
+        if box.label not in VEHICLES or top_m < eye_m - _ON_ROOF_M or not _is_around(box)
     ]
-    tallest_m = max((top_m for box, top_m in kept if box.label in VEHICLES), default=-math.inf) + MODEL_HEIGHT_M
-    ceiling_m = find_ceiling(points, eye_m) if tallest_m > _LEAST_M - _CLEAR_M else None
+    tall = [box.label in VEHICLES and top_m > _LEAST_M - _CLEAR_M - MODEL_HEIGHT_M for box, top_m in kept]
+    ceiling_m = find_ceiling(points, eye_m) if any(tall) else None
     if ceiling_m is None:
         return tuple(box for box, _ in kept)
     most_m, outline = ceiling_m - _CLEAR_M - MODEL_HEIGHT_M, _outline(points)
     return tuple(
-        box for box, top_m in kept if box.label not in VEHICLES or (top_m <= most_m and not _sticks_out(box, outline))
+        box
+        for (box, top_m), is_tall in zip(kept, tall, strict=True)
+        if not is_tall or (top_m <= most_m and not _sticks_out(box, outline))
     )
+
+
+def _is_around(box: Box) -> bool:
+    """Whether the footprint holds the sensor."""
+    (x, y, _), cos, sin = box.center, math.cos(box.yaw), math.sin(box.yaw)
+    return abs(x * cos + y * sin) <= 0.5 * box.size[0] and abs(y * cos - x * sin) <= 0.5 * box.size[1]
 
 
 _DIRECTIONS = np.stack([np.cos(np.arange(32) * np.pi / 16.0), np.sin(np.arange(32) * np.pi / 16.0)])

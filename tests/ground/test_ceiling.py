@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 
-from edgeperc import Perceiver
+from edgeperc import Box, Perceiver
 from edgeperc.ground.ceiling import find_ceiling, without_impossible
 from edgeperc.simulation.samples import simulated_scan
 from edgeperc.simulation.scene import SimulatedScan
@@ -71,13 +71,13 @@ def test_no_vehicle_is_around_the_sensor(label: str) -> None:
 @pytest.mark.parametrize("label", ["car", "van", "truck"])
 @pytest.mark.parametrize("ceiling_m", [2.4, 3.1, 4.5])
 def test_no_vehicle_reaches_the_ceiling(label: str, ceiling_m: float) -> None:
-    def tall(height_m: float) -> object:
+    def tall(height_m: float) -> Box:
         return box(9.0, 1.0, label, size=(5.0, 2.0, height_m), z=height_m / 2.0 - 1.73)
 
     person = box(5.0, 0.0, "pedestrian", size=(0.8, 0.7, ceiling_m), z=0.0)
     boxes = (tall(ceiling_m - 0.2), tall(ceiling_m), tall(ceiling_m + 0.5), person)
-    assert without_impossible(boxes, below(ceiling_m), 0.0) == (boxes[0], person)  # type: ignore[arg-type]
-    assert without_impossible(boxes, below(0.0), 0.0) == boxes  # type: ignore[arg-type]
+    assert without_impossible(boxes, below(ceiling_m), 0.0) == (boxes[0], person)
+    assert without_impossible(boxes, below(0.0), 0.0) == boxes
 
 
 # Of each, places in which walls, beams, pipes or the whole garage were taken for trucks.
@@ -115,3 +115,16 @@ def test_trucks_in_a_depot_are_found() -> None:
     assert len(near) >= 3
     for each in near:
         assert any(np.hypot(*np.subtract(each.center[:2], truck.center[:2])) < 2.0 for truck in trucks)
+
+
+@pytest.mark.parametrize("label", ["car", "van", "truck"])
+def test_no_vehicle_stands_behind_the_walls(label: str) -> None:
+    """Below a ceiling, the points end at 12 m."""
+
+    def tall(x: float, y: float, yaw: float = 0.0) -> Box:
+        return box(x, y, label, size=(5.0, 2.0, 2.2), z=-0.6, yaw=yaw)
+
+    between = (tall(9.0, 0.0), tall(0.0, -10.0, 1.5), box(20.0, 0.0, "cyclist", size=(1.8, 0.6, 2.2), z=-0.6))
+    behind = (tall(-15.0, 0.0), tall(0.0, 13.0, 1.5), tall(11.0, 8.0, 0.6))
+    assert without_impossible((*behind, *between), below(2.6), 0.0) == between
+    assert without_impossible((*behind, *between), below(0.0), 0.0) == (*behind, *between)
