@@ -17,7 +17,8 @@ from numpy.typing import ArrayLike, NDArray
 from .agreement.rules import RULES
 from .camera.image import ImageScaler, as_image, label_pixels
 from .errors import EdgepercError, FitnessError, ImageError, MountingError, OptionError, PointsError
-from .ground.leveling import MountingEstimate, MountingEstimator, near_support
+from .ground.ceiling import find_ceiling
+from .ground.leveling import HIGH_M, MountingEstimate, MountingEstimator, near_support, share_below
 from .inference.session import Session
 from .objects.boxes import MIN_SCORE
 from .pipeline import BoxesFrom, ObjectNetwork, Options, Pipeline, RangeImageNetwork, TopViewNetwork
@@ -597,10 +598,10 @@ class Perceiver:
         watch.lap("adapt" if self._renders and profile.remission is not None else "check")
         if not before.is_complete and len(scan):
             if check and before.known.roll_deg is None:
-                turned = check_beams(scan, profile) or check_ground(scan, near_support)
+                turned = check_beams(scan, profile) or check_ground(scan, near_support, share_below)
             try:
                 self._set_mounting(before.add(scan))
-                hidden = self._about_tilt()
+                hidden = (*self._about_height(), *self._about_tilt())
             except MountingError as exc:
                 hidden = self._without_ground(exc)
             watch.lap("check")
@@ -609,7 +610,8 @@ class Perceiver:
             watch.lap("adapt")
         fitness = check_dropped(given, dropped, profile) if check else ()
         if check and not fitness:
-            fitness = turned or check_profiles(scan, self._fitness, profile, self._frame)
+            ceiling_m = find_ceiling(scan, float(self._frame.eye[2]))
+            fitness = turned or check_profiles(scan, self._fitness, profile, self._frame, ceiling_m)
             fitness = with_raw_remission(fitness, given[:, 3], profile)
         if check and not any(finding.gross for finding in fitness):
             fitness = (*fitness, *hidden)
@@ -656,6 +658,20 @@ class Perceiver:
                 f"The mounting of the sensor cannot be estimated ({reason}); it is taken as "
                 f"{self._mounting.height_m:g} m above the road and level: pass mounting= (on the command line "
                 "--mount-height or --extrinsic)."
+            ),
+        )
+
+    def _about_height(self) -> tuple[Finding, ...]:
+        """What to say of a sensor that is so high that it sees little ground near by."""
+        found = self._estimator.estimate()
+        height_m = found.mounting.height_m
+        if self._estimator.known.height_m is not None or height_m is None or height_m <= HIGH_M:
+            return ()
+        return (
+            Finding(
+                f"The sensor seems to be {height_m:.1f} +- {found.height_sd_m:.1f} m above the road. So high, it sees "
+                "little of the road near by, and its height may be off by a meter: pass mounting= (on the command line "
+                "--mount-height)."
             ),
         )
 

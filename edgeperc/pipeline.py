@@ -22,6 +22,7 @@ from .agreement.rules import (
     without_poles,
 )
 from .agreement.votes import VEHICLE
+from .ground.ceiling import without_impossible
 from .ground.observed import Observer
 from .ground.planes import FIRST_REACH_HEIGHTS, FIRST_REACH_M, GroundFit, fit_ground
 from .ground.scan import Scan
@@ -293,6 +294,9 @@ class Pipeline:
         if self.objects is not None:
             by_labels = bool(self.ranged) and options.boxes_from != "network"
             standing = joined = value("cluster", _completed, objects, standing, by_labels, options.cluster_score)
+        eye_m = (mounting.height_m or MODEL_HEIGHT_M) - MODEL_HEIGHT_M
+        possible = value("agree", without_impossible, standing, points, eye_m)
+        joined = possible if joined is standing else joined
         if top is not None and rules:
             marks = value("agree", mark_cells, cells, scan, agreed, rules)
             view = value("agree", _agreed_cells, cells, agreed, joined, boxes, trusted, marks, rules)
@@ -303,9 +307,9 @@ class Pipeline:
         whole = value("refine", _whole, seen, agreed, near, len(points))
         self._lanes.run(
             [near, projected, scan, *sectors, *spare, labels, upright, strips, clusters, cells, surface, joined, view],
-            [planes, boxes, *reversed(sectors), objects, strips, cells, support, surface, marks, whole, standing],
+            [planes, boxes, *reversed(sectors), objects, strips, cells, support, surface, marks, whole, possible],
         )
-        return Parts(whole(), view(), standing(), surface())
+        return Parts(whole(), view(), possible(), surface())
 
     def _select(self, points: Points) -> View:
         return View(*self.crop.select(points))

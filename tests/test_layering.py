@@ -43,7 +43,7 @@ FLOORS = {
         types.perception
         types.frame types.geometry
         ground.observed ground.planes
-        ground.__init__ ground.leveling ground.scan
+        ground.__init__ ground.ceiling ground.leveling ground.scan
         objects.rectangles
         objects.__init__ objects.candidate_boxes objects.candidates objects.linkage objects.refine
         objects.cluster objects.crops

@@ -83,7 +83,7 @@ _STARTS_M = (1.7, 0.9, 2.5, 0.1, 3.3, 4.1, -0.7)
 _VOTING_M = 12.0  # farther out, the land beside a road is often lower
 # A sensor on a truck, a pole or a crane may see no ground so near: the least reach counts in which its plane is seen.
 _FAR_STARTS_M = (1.7, 2.5, 3.3, 4.1, 4.9, 5.7, 6.5, 7.3, 8.1, 8.9)
-_HIGH_M = 2.8  # a lower sensor would see ground within 12 m: something hides it
+HIGH_M = 2.8  # a lower sensor would see ground within 12 m: something hides it
 _FAR_REACHES_M = (24.0, 28.0, 32.0, 40.0, 48.0, 60.0)
 _FEW_BELOW = 0.25  # cells below such a plane, as a share of the cells on it; if there is none, `_MAX_BELOW`
 _LEVEL_DEG = 3.0  # embankments and rows of roofs are steeper
@@ -93,7 +93,7 @@ _OUTVOTED, _SURE_SUPPORT = 3.0, 150
 _MIN_CELLS = 60  # of half a meter, on the plane
 _MAX_BELOW = 0.8  # cells below the plane, as a share of the cells on it
 _CORRIDOR_M = (3.0, 15.0)  # half its width, and its length ahead and behind: the road that the vehicle stands on
-_BAND_M, _TRIM_M = 0.2, 0.1
+_BAND_M, _TRIM_M, _CLEAR_M = 0.2, 0.1, 0.3
 
 _STREET_M = (0.3, 3.0, 40.0)  # lowest and highest point above the road, and the farthest, that show the street's axis
 _STREET_BIN_M = 0.25
@@ -252,10 +252,20 @@ def _leveled(scan: Points, guess: Mounting, height_m: float | None) -> tuple[Mou
 
 def near_support(points: Points) -> int:
     """How many more cells of half a meter within 12 m lie on the ground than below it; 0 without ground."""
-    scan = read_only(points)
-    _, lowest, low = _lowest_returns(scan)
-    near = _near_plane(scan, lowest, low, _STARTS_M)
+    near = _ground_near(points)
     return 0 if near is None else near.support
+
+
+def share_below(points: Points) -> float:
+    """Of the points within 12 m that are clear of the ground, the share that lies below it; 1 without ground."""
+    near = _ground_near(points)
+    if near is None:
+        return 1.0
+    x, y, z = points[:, :3].astype(np.float64).T
+    with np.errstate(invalid="ignore", over="ignore"):
+        above_m = np.where(np.hypot(x, y) < _VOTING_M, z - x * near.abc[0] - y * near.abc[1] - near.abc[2], 0.0)
+        below, above = np.count_nonzero(above_m < -_CLEAR_M), np.count_nonzero(above_m > _CLEAR_M)
+    return below / max(1, below + above)
 
 
 class _Plane(NamedTuple):
@@ -301,6 +311,12 @@ def _ground_plane(
     return (a, b, c), float(plane.support), _uncertainty(scan, lowest, low, plane)
 
 
+def _ground_near(points: Points) -> _Plane | None:
+    scan = read_only(points)
+    _, lowest, low = _lowest_returns(scan)
+    return _near_plane(scan, lowest, low, _STARTS_M)
+
+
 def _lowest_returns(scan: Points) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.float64]]:
     """The cell of each point, the row of the lowest point in each cell, and these points (n, 3)."""
     cell = np.empty(len(scan), np.int32)
@@ -330,7 +346,7 @@ def _lowest_plane(
     if near is not None and (near.support >= _SURE_SUPPORT or _counted(near.abc, low, _FAR_REACHES_M[-1]).is_lowest()):
         return near
     far = _far_plane(scan, lowest, low, far_starts_m)
-    if far is not None and far.abc[2] > -_HIGH_M:
+    if far is not None and far.abc[2] > -HIGH_M:
         far = None
     if near is None or far is None:
         return near or far

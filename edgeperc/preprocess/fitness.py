@@ -298,6 +298,8 @@ class Measures:
     walls: Walls
     raised_m: float = 0.0  # the sensor, above that of the models
     is_on_car: bool = True  # it is as high above the ground as on a car
+    ceiling_m: float | None = None  # above the road
+    is_in_bay: bool = False  # there is room for a car around the sensor, in a place as long as a garage
 
 
 def _pseudo_azimuth(azimuth_deg: float) -> float:
@@ -369,7 +371,7 @@ def measure(points: Points, azimuth_deg: tuple[float, float]) -> Measures | None
 _WALL_DEPTH, _WALL_HEIGHT_M = 0.9, 0.3  # where a direction's end begins, as a share of it; how high it is
 _FEWEST_OF_SECTOR = 5  # points
 # 99 and 90 % of the points of 561 real streets reach farther than 33 and 11.6 m.
-_STREET_M, _MOST_OF_STREET_M = 30.0, 11.0
+_STREET_M, _MOST_OF_STREET_M = 30.0, 25.0
 
 
 def _walls(points: Points) -> Walls:

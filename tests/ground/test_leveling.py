@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import math
+import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import product
@@ -415,6 +416,21 @@ def test_high_sensors_are_found_from_the_ground(sensor: str, height_m: float) ->
         assert given.roll_deg == pytest.approx(0.0, abs=1.0)
     assert np.median(errors) < 0.1
     assert max(errors) < 0.6
+
+
+@pytest.mark.parametrize(("sensor", "height_m"), [("vlp-16", 8.0), ("os1-64", 5.0), ("hdl-64e", 6.5)])
+def test_a_height_that_is_found_from_afar_is_not_said_in_silence(sensor: str, height_m: float) -> None:
+    points = simulated_scan(5, sensor, mounting=Mounting(height_m, 0.0, 0.0, 0.0)).points
+    points = points * np.float32([1, 1, 1, get_sensor(sensor).remission_range[1]])
+    told = "its height may be off by a meter: pass mounting="
+    for known in (Mounting(), Mounting(height_m), Mounting(height_m, 0.0, 0.0)):
+        with warnings.catch_warnings(record=True) as shown:
+            warnings.simplefilter("always")
+            found = Perceiver(["ssadnet"], sensor=sensor, mounting=known)(points)
+        assert found.mounting is not None
+        assert any(told in finding for finding in found.fitness) == (known.height_m is None)
+        assert any(told in str(each.message) for each in shown) == (known.height_m is None)
+        assert known.height_m in (None, found.mounting.height_m)
 
 
 def test_heights_above_uneven_land_are_nearly_found() -> None:

@@ -1,0 +1,130 @@
+"""Ceilings above the road, and vehicles that cannot be below them."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from garages import parking_garage, small_garage, truck_depot
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from numpy.typing import NDArray
+
+from edgeperc import Box, Perceiver
+from edgeperc.ground.ceiling import find_ceiling, without_impossible
+from edgeperc.simulation.samples import simulated_scan
+from edgeperc.simulation.scene import SimulatedScan
+from edgeperc.types.mounting import Mounting
+from edgeperc.types.sensor import get_sensor
+from scenes import box
+
+SEEDS = (100, 101, 102)
+
+
+@pytest.mark.parametrize("place", [parking_garage, truck_depot])
+@pytest.mark.parametrize("sensor", ["os0-64", "os1-64", "os0-128"])
+def test_a_ceiling_is_found_at_its_height(place: Callable[[int, str], SimulatedScan], sensor: str) -> None:
+    for seed in SEEDS:
+        scan = place(seed, sensor)
+        highest_m = float(np.percentile(scan.points[:, 2], 99.8)) + 1.73
+        assert find_ceiling(scan.points) == pytest.approx(highest_m, abs=0.5)
+
+
+@pytest.mark.parametrize("sensor", ["hdl-64e", "vlp-16", "os1-64", "pandar64", "os0-64", "vlp-32c"])
+def test_a_street_has_no_ceiling(sensor: str) -> None:
+    for seed in SEEDS:
+        assert find_ceiling(simulated_scan(seed, sensor).points) is None
+    high = simulated_scan(1, sensor, mounting=Mounting(6.0, 0.0, 0.0, 0.0)).points + np.float32([0, 0, 4.27, 0])
+    assert find_ceiling(high, 4.27) is None
+
+
+any_points = arrays(np.float32, st.tuples(st.integers(0, 60), st.just(4)), elements=st.floats(width=32))
+
+
+@given(any_points)
+def test_any_points_have_a_ceiling_or_none(points: NDArray[np.float32]) -> None:
+    ceiling_m = find_ceiling(np.repeat(points, 9, axis=0))
+    assert ceiling_m is None or ceiling_m >= 2.0
+
+
+def below(height_m: float) -> NDArray[np.float32]:
+    """What rays that rise by up to 45 degrees meet below a ceiling, and the road."""
+    rng = np.random.default_rng(4)
+    azimuth, across = rng.uniform(-np.pi, np.pi, 6000), rng.uniform(2.0, 12.0, 6000)
+    z = np.where(np.arange(6000) % 2, height_m - 1.73, -1.73)
+    return np.column_stack([across * np.cos(azimuth), across * np.sin(azimuth), z, z]).astype(np.float32)
+
+
+@pytest.mark.parametrize("label", ["car", "van", "truck"])
+def test_no_vehicle_is_around_the_sensor(label: str) -> None:
+    around = box(1.0, 0.3, label, size=(6.0, 2.5, 2.0), z=-0.7, yaw=0.3)
+    others = (box(8.0, 0.0, label), box(0.0, 0.0, "pedestrian", size=(0.8, 0.7, 1.7)))
+    road = below(0.0)
+    assert without_impossible((around, *others), road, 0.0) == others
+    passing = (box(0.5, 0.2, label), *others)  # below a sensor on a pole
+    assert without_impossible(passing, road, 4.0) == passing
+
+
+@pytest.mark.parametrize("label", ["car", "van", "truck"])
+@pytest.mark.parametrize("ceiling_m", [2.4, 3.1, 4.5])
+def test_no_vehicle_reaches_the_ceiling(label: str, ceiling_m: float) -> None:
+    def tall(height_m: float) -> Box:
+        return box(9.0, 1.0, label, size=(5.0, 2.0, height_m), z=height_m / 2.0 - 1.73)
+
+    person = box(5.0, 0.0, "pedestrian", size=(0.8, 0.7, ceiling_m), z=0.0)
+    boxes = (tall(ceiling_m - 0.2), tall(ceiling_m), tall(ceiling_m + 0.5), person)
+    assert without_impossible(boxes, below(ceiling_m), 0.0) == (boxes[0], person)
+    assert without_impossible(boxes, below(0.0), 0.0) == boxes
+
+
+# Of each, places in which walls, beams, pipes or the whole garage were taken for trucks.
+@pytest.mark.parametrize(
+    ("place", "seed", "sensor"),
+    [
+        (parking_garage, 106, "os0-64"),
+        (parking_garage, 123, "pandar64"),
+        (parking_garage, 173, "vlp-32c"),
+        (parking_garage, 178, "os0-64"),
+        (small_garage, 105, "pandar64"),
+        (small_garage, 107, "vlp-32c"),
+        (small_garage, 126, "hdl-64e"),
+        (small_garage, 135, "pandar64"),
+    ],
+)
+def test_in_garages_there_is_a_warning_and_no_truck(
+    place: Callable[[int, str], SimulatedScan], seed: int, sensor: str
+) -> None:
+    points = place(seed, sensor).points * np.float32([1, 1, 1, get_sensor(sensor).remission_range[1]])
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        found = Perceiver(sensor=sensor, full_turn=True)(points)
+    assert any("a garage" in sentence for sentence in found.fitness)
+    assert not [each for each in found.boxes if each.label == "truck" and each.score >= 0.5]
+
+
+def test_trucks_in_a_depot_are_found() -> None:
+    scan = truck_depot(111, "pandar64")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        found = Perceiver(sensor="pandar64", full_turn=True)(scan.points * np.float32([1, 1, 1, 255]))
+    near = [each for each, n in zip(scan.boxes, scan.box_points, strict=True) if n > 1000]
+    trucks = [each for each in found.boxes if each.label == "truck" and each.score >= 0.5]
+    assert len(near) >= 3
+    for each in near:
+        assert any(np.hypot(*np.subtract(each.center[:2], truck.center[:2])) < 2.0 for truck in trucks)
+
+
+@pytest.mark.parametrize("label", ["car", "van", "truck"])
+def test_no_vehicle_stands_behind_the_walls(label: str) -> None:
+    """Below a ceiling, the points end at 12 m."""
+
+    def tall(x: float, y: float, yaw: float = 0.0) -> Box:
+        return box(x, y, label, size=(5.0, 2.0, 2.2), z=-0.6, yaw=yaw)
+
+    between = (tall(9.0, 0.0), tall(0.0, -10.0, 1.5), box(20.0, 0.0, "cyclist", size=(1.8, 0.6, 2.2), z=-0.6))
+    behind = (tall(-15.0, 0.0), tall(0.0, 13.0, 1.5), tall(11.0, 8.0, 0.6))
+    assert without_impossible((*behind, *between), below(2.6), 0.0) == between
+    assert without_impossible((*behind, *between), below(0.0), 0.0) == (*behind, *between)
