@@ -236,8 +236,8 @@ class Pipeline:
         absent = value("check", _absent)
         near = value("project", self._select, points)
         planes = scan = surface = absent
+        reach_m = max(FIRST_REACH_M, FIRST_REACH_HEIGHTS * (mounting.height_m or 0.0))
         if self.needs_ground:
-            reach_m = max(FIRST_REACH_M, FIRST_REACH_HEIGHTS * (mounting.height_m or 0.0))
             planes = value("cluster", fit_ground, points, mount_height_m=MODEL_HEIGHT_M, reach_m=reach_m)
             scan = value("cluster", _on_ground, near, planes)
             surface = value("cluster", GroundFit.surface, planes)
@@ -282,8 +282,7 @@ class Pipeline:
                 supporting = value("agree", _supporting, boxes, objects)
                 support = value("cluster", find_support, scan, labels, supporting, rules)
             agreed = value("agree", agree_on_points, scan, labels, clusters, support, upright, view=cells, rules=rules)
-            trusted = value("agree", agree_on_boxes, boxes, scan, agreed, rules)
-            joined = trusted
+            trusted = joined = value("agree", agree_on_boxes, boxes, scan, agreed, rules)
         if self.ranged and options.boxes_from != "network":
             left = agreed if self.objects is None or not rules else value("cluster", _unboxed, agreed, support)
             around = value("cluster", _objects, scan, left, clusters, trusted, options)
@@ -293,10 +292,9 @@ class Pipeline:
             standing = value("agree", stand_boxes, joined, scan, agreed, rules, options.distance_per_m)
         if self.objects is not None:
             by_labels = bool(self.ranged) and options.boxes_from != "network"
-            standing = joined = value("cluster", _completed, objects, standing, by_labels, options.cluster_score)
-        eye_m = (mounting.height_m or MODEL_HEIGHT_M) - MODEL_HEIGHT_M
-        possible = value("agree", without_impossible, standing, points, eye_m)
-        joined = possible if joined is standing else joined
+            standing = value("cluster", _completed, objects, standing, by_labels, options.cluster_score)
+        standing = value("agree", without_impossible, standing, points, mounting)
+        joined = joined if self.objects is None else standing
         if top is not None and rules:
             marks = value("agree", mark_cells, cells, scan, agreed, rules)
             view = value("agree", _agreed_cells, cells, agreed, joined, boxes, trusted, marks, rules)
@@ -307,9 +305,9 @@ class Pipeline:
         whole = value("refine", _whole, seen, agreed, near, len(points))
         self._lanes.run(
             [near, projected, scan, *sectors, *spare, labels, upright, strips, clusters, cells, surface, joined, view],
-            [planes, boxes, *reversed(sectors), objects, strips, cells, support, surface, marks, whole, possible],
+            [planes, boxes, *reversed(sectors), objects, strips, cells, support, surface, marks, whole, standing],
         )
-        return Parts(whole(), view(), possible(), surface())
+        return Parts(whole(), view(), standing(), surface())
 
     def _select(self, points: Points) -> View:
         return View(*self.crop.select(points))

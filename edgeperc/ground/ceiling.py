@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from ..types.mounting import MODEL_HEIGHT_M
+from ..types.mounting import MODEL_HEIGHT_M, Mounting
 from ..types.perception import Box
 from ..types.points import Points
 
@@ -50,14 +50,15 @@ def find_ceiling(points: Points, eye_m: float = 0.0) -> float | None:
     return float(np.median(top[on_it])) + MODEL_HEIGHT_M
 
 
-def without_impossible(boxes: Sequence[Box], points: Points, eye_m: float) -> tuple[Box, ...]:
+def without_impossible(boxes: Sequence[Box], points: Points, mounting: Mounting) -> tuple[Box, ...]:
     """The boxes without vehicles around the sensor, and without those that do not fit between a ceiling and walls.
 
     What is taken for them is the own vehicle, a small garage, or beams, pipes and walls.
 
     points : (n, 4) float32 in the frame of the models.
-    eye_m : z of the sensor [m]. Below one on a pole, vehicles pass.
+    mounting : of the sensor. Below one on a pole, vehicles pass.
     """
+    eye_m = (mounting.height_m or MODEL_HEIGHT_M) - MODEL_HEIGHT_M
     tops_m = [box.center[2] + 0.5 * box.size[2] for box in boxes]
     kept = [
         (box, top_m)
