@@ -131,7 +131,8 @@ FLOORS = {
         networks.camseg networks.edge networks.lodnn networks.segnet networks.squeezesegv2 networks.unet
         networks.fcn networks.kulseg
         networks.__init__
-        training.__init__ training.checkpoint training.curve training.log training.losses training.object_task training.ranks
+        training.__init__ training.checkpoint training.curve training.log training.losses training.object_task
+        training.ranks
         training.camera training.object_samples training.start training.task
         training.images training.object_sets training.teacher
         training.object_batches training.samples
