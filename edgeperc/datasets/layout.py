@@ -9,9 +9,12 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
+from numpy.typing import NDArray
+
 from ..errors import PointsError, SensorError
 from ..simulation.samples import IGNORE
-from ..simulation.scene import POINT_CLASS_OF, POINT_CLASSES
+from ..simulation.scene import POINT_CLASS_OF, POINT_CLASSES, SCENE_CLASSES
 from ..system.fields import Fields
 from ..system.names import check_name, nearest
 from ..types.choices import STATIC
@@ -53,6 +56,13 @@ def class_number(name: str, classes: Sequence[str] = POINT_CLASSES) -> int:
         return classes.index(name)
     whole = not any(part in classes for part in PARTS)
     return 0 if name == BACKGROUND or (whole and name in PARTS) else IGNORE
+
+
+def numbers_of_scene(classes: Sequence[str] = POINT_CLASSES) -> NDArray[np.uint8]:
+    """`class_number` of each of `SCENE_CLASSES`, by its index, (256,) uint8; other numbers stay as they are."""
+    numbers = np.arange(256, dtype=np.uint8)
+    numbers[: len(SCENE_CLASSES)] = [class_number(name, classes) for name in SCENE_CLASSES]
+    return numbers
 
 
 @dataclass(frozen=True)

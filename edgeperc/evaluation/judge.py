@@ -87,7 +87,8 @@ class Judge:
     mounted : perceive each scan as a sensor mounted so would have recorded it, with the mounting to be estimated from
         this scan alone. Points (not pixels) and boxes are evaluated. None: as recorded, on the training vehicle.
     sensor : the sensor of the scans for `record_scan`, with what is known of its mounting; their points are evaluated
-        by the classes of the model. None: the training vehicle's, and `POINT_CLASSES`.
+        by the classes of the model. None: the training vehicle's, and `POINT_CLASSES`; where
+        surroundings are told apart, simulated scans by the classes of the model, too.
     Raises ModelError, OptionError.
     """
 
@@ -115,7 +116,9 @@ class Judge:
         networks = [Network(session) for session in whole]
         self.from_sensor = next((n for n in networks if n.card.view.kind == "range_image"), None)
         self.from_above = next((n for n in networks if n.card.view.kind == "top_view"), None)
-        if sensor is not None and self.from_sensor is not None:
+        if self.from_sensor is not None and (
+            sensor is not None or not set(STATIC).isdisjoint(self.from_sensor.card.classes)
+        ):
             self.point_classes = self.from_sensor.card.classes
         self.view: TopViewGeometry | None = None
         if self.from_above is not None:
@@ -166,7 +169,7 @@ class Judge:
 
     def simulated(self, seed: int) -> Truth:
         """The truth of a simulated scene."""
-        return simulated_truth(seed, self.view)
+        return simulated_truth(seed, self.view, self.point_classes)
 
     def record(self, truth: Truth) -> tuple[Record, Mistakes | None]:
         """Evaluate one scan.
@@ -304,20 +307,20 @@ class Judge:
         assert truth.labels is not None
         right = np.where(predicted.in_view, truth.labels, IGNORE).astype(np.uint8)
         range_m = np.hypot(truth.points[:, 0], truth.points[:, 1])
-        labels = _renamed(predicted.labels, predicted.classes, self.point_classes)
-        tallies |= banded(("points",), self.point_classes, labels, right, range_m)
-        objects = tuple(name for name in self.point_classes if name not in STATIC)
-        own, true = (_renamed(each, self.point_classes, objects) for each in (labels, right))
+        labels = _renamed(predicted.labels, predicted.classes, truth.classes)
+        tallies |= banded(("points",), truth.classes, labels, right, range_m)
+        objects = tuple(name for name in truth.classes if name not in STATIC)
+        own, true = (_renamed(each, truth.classes, objects) for each in (labels, right))
         sure = np.where((true > 0) & find_ground(truth.points).mask, IGNORE, true).astype(np.uint8)
         for box in truth.boxes:
             if box.label == SITTING:
                 sure[inside(box, truth.points)] = IGNORE
         tallies |= banded(("sure",), objects, own, sure, range_m)
         if self.as_recorded:
-            pixels = _renamed(self.from_sensor.point_labels(truth.points), predicted.classes, POINT_CLASSES)
-            tallies |= banded(("pixels",), POINT_CLASSES, pixels, right, range_m)
+            pixels = _renamed(self.from_sensor.point_labels(truth.points), predicted.classes, truth.classes)
+            tallies |= banded(("pixels",), truth.classes, pixels, right, range_m)
         counted = right != IGNORE
-        if self.point_classes == POINT_CLASSES:
+        if truth.classes == POINT_CLASSES:
             tallies |= count_causes(
                 truth.points, labels, truth.labels, counted, predicted.in_view, truth.boxes, truth.drive
             )
@@ -325,14 +328,14 @@ class Judge:
         by_box = {id(box) for box in (*mistakes.found, *(box for box, _ in mistakes.missed))}
         hit, missed = [*mistakes.found], [*mistakes.missed]
         for box in truth.boxes:
-            kind, distance_m = class_number(box.label, self.point_classes), math.hypot(*box.center[:2])
+            kind, distance_m = class_number(box.label, truth.classes), math.hypot(*box.center[:2])
             members = inside(box, truth.points) & (right == kind)
             n_members = int(np.count_nonzero(members))
             if kind in (0, IGNORE) or n_members < FEWEST_RETURNS:
                 continue
             for band, within_m in BANDS.items():
                 if within(distance_m, within_m):
-                    tallies["objects", band][self.point_classes[kind], object_key(truth.drive, box)] += 1
+                    tallies["objects", band][truth.classes[kind], object_key(truth.drive, box)] += 1
             if id(box) in by_box or distance_m >= FARTHEST_M:
                 continue
             if 2 * int(np.count_nonzero(labels[members] == kind)) >= n_members:

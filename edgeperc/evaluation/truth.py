@@ -9,9 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..datasets.kitti import ROAD_CLASSES, Frame, RoadFrame
+from ..datasets.layout import numbers_of_scene
 from ..datasets.scan_folder import ScanFrame
 from ..ground.observed import Observer
-from ..simulation.samples import IGNORE, labels_by_boxes, simulated_scan
+from ..simulation.samples import IGNORE, labels_of_scene, simulated_scan
 from ..simulation.scene import POINT_CLASS_OF, POINT_CLASSES, TOP_VIEW_CLASSES
 from ..types.frame import ModelFrame
 from ..types.geometry import draw_footprints, inside
@@ -34,7 +35,7 @@ class Truth:
     """A scan and its ground truth.
 
     points : (n, 4) float32; x, y, z [m] in the sensor frame, remission.
-    labels : (n,) uint8 or None; index into `POINT_CLASSES`, or into the classes that `folder_truth` is given; `IGNORE`
+    labels : (n,) uint8 or None; index into ``classes``; `IGNORE`
         where unknown. None if points and objects are not labeled.
     boxes : in the sensor frame.
     returns : number of returns from each box's object.
@@ -44,6 +45,7 @@ class Truth:
     road : the table, and its class that counts as drivable.
     front : KITTI's labels of the image, if the scan has them.
     box_labels : classes that the boxes of the set tell apart; None: all.
+    classes : of ``labels``, the background first.
     """
 
     name: str
@@ -57,6 +59,7 @@ class Truth:
     road: tuple[str, str] | None = None
     front: FrontTruth | None = None
     box_labels: frozenset[str] | None = None
+    classes: tuple[str, ...] = POINT_CLASSES
 
 
 def kitti_truth(frame: Frame, view: TopViewGeometry | None, road: tuple[str, NDArray[np.bool_]] | None = None) -> Truth:
@@ -127,7 +130,10 @@ def folder_truth(
     if frame.calibration is not None and frame.image_labels is not None:
         front = FrontTruth(frame.image_labels, frame.calibration, image_size_of(frame.drive))
     box_labels = frozenset(frame.layout.boxes.values())
-    return Truth(frame.name, frame.drive, points, labels, boxes, frame.returns, known, cells, road, front, box_labels)
+    of_boxes = boxes, frame.returns, known
+    return Truth(
+        frame.name, frame.drive, points, labels, *of_boxes, cells, road, front, box_labels, classes=tuple(classes)
+    )
 
 
 def road_cells(frame: ScanFrame, mounting: Mounting, view: TopViewGeometry) -> NDArray[np.uint8] | None:
@@ -176,12 +182,16 @@ def cells_inside(polygons: Iterable[NDArray[np.float64]], view: TopViewGeometry)
     return inside_any
 
 
-def simulated_truth(seed: int, view: TopViewGeometry | None) -> Truth:
-    """Ground truth of a simulated scene, where everything is known. Each scene counts as a drive of its own."""
+def simulated_truth(seed: int, view: TopViewGeometry | None, classes: tuple[str, ...] = POINT_CLASSES) -> Truth:
+    """Ground truth of a simulated scene, where everything is known. Each scene counts as a drive of its own.
+
+    classes : classes of points, the background first.
+    """
     name, scan = f"scene {seed}", simulated_scan(seed)
     cells: Cells = {} if view is None else {EVERY_CELL: (TOP_VIEW_CLASSES, scan.top_view_labels(view))}
-    labels, road = labels_by_boxes(scan), (EVERY_CELL, "drivable")
-    return Truth(name, name, scan.points, labels, scan.boxes, scan.box_points, _everywhere, cells, road)
+    labels, road = numbers_of_scene(classes)[labels_of_scene(scan)], (EVERY_CELL, "drivable")
+    boxes = scan.boxes, scan.box_points, _everywhere
+    return Truth(name, name, scan.points, labels, *boxes, cells, road, classes=classes)
 
 
 def _drawn(boxes: Sequence[Box], view: TopViewGeometry) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:

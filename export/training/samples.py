@@ -15,10 +15,10 @@ from torch.utils.data import DataLoader
 from tqdm import tqdm
 
 from edgeperc.datasets.kitti import KittiObjects, scan_hash
-from edgeperc.datasets.layout import class_number
+from edgeperc.datasets.layout import numbers_of_scene
 from edgeperc.inference.projection import make_projector
 from edgeperc.simulation.samples import IGNORE
-from edgeperc.simulation.scene import POINT_CLASSES, SCENE_CLASSES
+from edgeperc.simulation.scene import POINT_CLASSES
 
 from ..data.augment import NEGATIVES, Augmentation, ObjectBank, augmented, swapped, with_ground_ahead
 from ..data.processes import CONTEXT
@@ -76,7 +76,7 @@ class Samples:
         self.odds = {name: np.ones(len(weights)) for name, weights in self.weights.items()}
         share = recipe.simulated_share if real else 1.0
         self.simulated_share = share if simulated else 0.0
-        self._numbers = _numbers(recipe.classes)
+        self._numbers = numbers_of_scene(recipe.classes or POINT_CLASSES)
         self.paste_odds = dict(self.task.paste_odds)
         if recipe.paste_cars > 0.0:
             others = {name: share * (1.0 - recipe.paste_cars) for name, share in self.paste_odds.items()}
@@ -241,13 +241,6 @@ class Recent:
         return [part[chosen] for part in self._parts]
 
 
-def _numbers(classes: Sequence[str]) -> NDArray[np.uint8]:
-    """Number of each of `SCENE_CLASSES` among a network's classes of points, by its label, (256,) uint8."""
-    numbers = np.arange(256, dtype=np.uint8)
-    numbers[: len(SCENE_CLASSES)] = [class_number(name, classes or POINT_CLASSES) for name in SCENE_CLASSES]
-    return numbers
-
-
 class RealScans(NamedTuple):
     """Real scans with labels that are not in KITTI's files, for instance hand-drawn roads.
 
@@ -274,7 +267,7 @@ def real_scans(
     scans: list[LabeledScan] = []
     weights: list[float] = []
     hashes: dict[str, str] = {}
-    numbers = _numbers(classes)
+    numbers = numbers_of_scene(classes or POINT_CLASSES)
     roads: dict[str, NDArray[np.uint8]] = drawn_roads() if drawn else {}
     frames = [kitti.frame(name) for name in tqdm(names, desc="reading real scans", leave=False)]
     drives = [frame.drive for frame in frames]
