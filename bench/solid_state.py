@@ -14,10 +14,11 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from edgeperc import Mounting, Perceiver, TimedScan, Trajectory, accumulate
+from edgeperc import Perceiver, TimedScan, Trajectory, accumulate
 from edgeperc.evaluation.metrics import BoxEvaluator, Confusion, boxes_to_find
 from edgeperc.simulation import POINT_CLASSES, SimulatedScan, random_scene, simulate, simulate_sequence
 from edgeperc.simulation.samples import FIRST_SEED
+from edgeperc.types.mounting import MODEL_MOUNTING
 from edgeperc.types.perception import Perception
 from edgeperc.types.sensor import SensorProfile, get_sensor
 
@@ -26,7 +27,6 @@ SPEEDS_MPS = (0.0, 10.0)
 FARTHEST_M = 50.0
 VEHICLES = ("car", "van", "truck")
 _RATE_HZ = 100.0  # of the places that a gathered scan is taken from
-_HANGING = Mounting(height_m=1.73, roll_deg=180.0, pitch_deg=0.0)
 
 
 class Figures:
@@ -80,7 +80,7 @@ def spun(
 
 def row_of(sensor: SensorProfile, accumulate_s: float, speed_mps: float, n_scans: int) -> str:
     """The figures of a sensor in some streets."""
-    perceive = Perceiver(sensor=sensor, provider="cpu", on_mismatch="ignore", full_turn=True)
+    perceive = Perceiver(sensor=sensor, provider="cpu", mounting=MODEL_MOUNTING, on_mismatch="ignore", full_turn=True)
     figures = Figures()
     for k in range(n_scans):
         take = gathered if sensor.pattern is not None else spun

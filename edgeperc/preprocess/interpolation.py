@@ -28,7 +28,7 @@ GROUND_SLOPE = 0.1
 # Neighboring beams or columns that are at most this many pixels apart leave no gap to fill.
 NO_GAP = 1.1
 # Points of a pattern lie at random along its beams: the next one may be so many columns away.
-_SCATTER = 2.0
+_SCATTER = 8.0
 
 
 class Interpolator:

@@ -96,8 +96,9 @@ class RemissionFunction:
             FIELDS.refuse("remission.to and source", (self.to, self.source), "two texts")
 
 
-# Points of a non-repeating sensor in a cell of its virtual beams and columns, on average.
-_POINTS_OF_CELL = 1.0
+# Pulses of a non-repeating sensor in a cell of its virtual beams and columns, on average; many meet the sky. With 1 in
+# place of 4, fewer gaps are filled: IoU of cars' points falls from 75 to 59 % on ten streets (Mid-360 upside down, 0.2 s).
+_POINTS_OF_CELL = 4.0
 
 
 @dataclass(frozen=True)
