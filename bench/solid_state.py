@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from edgeperc import Perceiver, TimedScan, Trajectory, accumulate
 from edgeperc.evaluation.metrics import BoxEvaluator, Confusion, boxes_to_find
-from edgeperc.simulation import POINT_CLASSES, SimulatedScan, random_scene, simulate, simulate_sequence
+from edgeperc.simulation import POINT_CLASSES, SimulatedScan, random_scene, simulate_sequence
 from edgeperc.simulation.samples import FIRST_SEED
 from edgeperc.types.mounting import MODEL_MOUNTING
 from edgeperc.types.perception import Perception
@@ -107,7 +107,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--scans", type=int, default=24, metavar="N", help="streets (default: 24)")
     parser.add_argument("--sensors", nargs="*", default=["mid-360", "mid-360-hanging"], metavar="NAME")
     given = parser.parse_args(arguments)
-    print("| sensor | speed | points | IoU car / pedestrian / cyclist | mean IoU | AP50 vehicles |\n|---|---|---|---|---|---|")
+    print(
+        "| sensor | speed | points | IoU car / pedestrian / cyclist | mean IoU | AP50 vehicles |\n|---|---|---|---|---|---|"
+    )
     for title, sensor, accumulate_s in sensors_of(given.sensors):
         for speed_mps in SPEEDS_MPS:
             row = row_of(sensor, accumulate_s, speed_mps, given.scans)

@@ -142,8 +142,7 @@ class RangeImageNetwork:
     def label(self, points: Points, height_m: Heights | None, watch: Stopwatch) -> PointLabels:
         """Project points, run the network, decode pixels, remove outliers and label the points (PointSeg 3.1, 3.4)."""
         pixel = np.empty(len(points), np.int32)
-        shown = points if self.interpolator is None else self.interpolator.align(points)
-        self.projector.fill(shown, self.session.input, self.index, pixel, height_m)
+        self.projector.fill(points, self.session.input, self.index, pixel, height_m)
         watch.lap("project")
         if self.interpolator is not None:
             assert isinstance(self.projector, RangeImageProjector)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ..errors import PointsError
 from ..system.kernels import njit
 from ..types.mounting import MODEL_HEIGHT_M
-from ..types.points import Points, read_only
+from ..types.points import Points
 from ..types.sensor import SensorProfile
 from ..types.views import RangeImageGeometry
 
@@ -27,8 +27,9 @@ GROUND_PER_M = 0.02  # of range; neither the sensor nor the road is exactly leve
 GROUND_SLOPE = 0.1
 # Neighboring beams or columns that are at most this many pixels apart leave no gap to fill.
 NO_GAP = 1.1
-# Points of a pattern lie at random along its beams: the next one may be so many columns away.
-_SCATTER = 8.0
+# Points of a pattern lie at random, not on beams: the next one in a row may be so many columns away. With 2, as with 8,
+# mean IoU is 0 to 6 points lower on twelve streets (Mid-360 of 0.2 and 0.5 s, HAP, Avia).
+_SCATTER = 4.0
 
 
 class Interpolator:
@@ -58,11 +59,9 @@ class Interpolator:
         self._ground_z = -MODEL_HEIGHT_M
         # Row coordinates of the beams; then, for each row, how many rows below it the next beam's return may be.
         beams = np.array(sensor.elevations_deg)
-        self._beam_step = 0.0
-        if sensor.pattern is not None:  # beams of its own choice, however it is mounted
+        if sensor.pattern is not None:  # such beams may be anywhere, however it is mounted
             step_deg = (sensor.fov_up_deg - sensor.fov_down_deg) / (sensor.n_beams - 1)
             beams = step_deg * np.arange(math.floor(90.0 / step_deg), -math.ceil(90.0 / step_deg), -1)
-            self._beam_step = math.radians(step_deg)
         places = np.interp(-beams, -rows, np.arange(len(rows)), left=-1.0, right=len(rows))
         self._row_reach = np.zeros(len(rows), np.int64)
         for upper, lower in pairwise(places.tolist()):
@@ -73,18 +72,6 @@ class Interpolator:
         self._col_reach = math.floor(step) + 1 if step > NO_GAP else 0
         self.shape = (view.height, view.width)
         self.needed = bool(self._row_reach.any() or self._col_reach)
-
-    def align(self, points: Points) -> NDArray[np.float32]:
-        """The points where the range image is to show them: those of a pattern on the nearest of its beams.
-
-        points : (n, 4) float32, read-only.
-        """
-        if not self._beam_step:
-            return points
-        flat = np.hypot(points[:, 0], points[:, 1])
-        aligned = points.copy()
-        aligned[:, 2] = flat * np.tan(np.rint(np.arctan2(points[:, 2], flat) / self._beam_step) * self._beam_step)
-        return read_only(aligned)
 
     def fill(self, points: Points, index: NDArray[np.int32]) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
         """Interpolate points in the gaps of a range image.

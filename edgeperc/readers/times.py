@@ -199,7 +199,9 @@ def accumulate(
     from ..preprocess.motion import Motion, Trajectory, deskew  # numba, which bags do without
 
     if not (isinstance(accumulate_s, int | float) and MIN_ACCUMULATE_S <= accumulate_s <= MAX_ACCUMULATE_S):
-        raise OptionError(f"accumulate_s is {accumulate_s!r:.80}; expected {MIN_ACCUMULATE_S} to {MAX_ACCUMULATE_S:g} s")
+        raise OptionError(
+            f"accumulate_s is {accumulate_s!r:.80}; expected {MIN_ACCUMULATE_S} to {MAX_ACCUMULATE_S:g} s"
+        )
     if not isinstance(motion, Motion | Trajectory | None):
         raise OptionError(f"motion is {motion!r:.200}; expected a Motion, a Trajectory or None")
 
@@ -219,7 +221,9 @@ def accumulate(
     for stamp_s, points, times_s in scans:
         if times_s is None:
             if stamp_s is None:
-                raise StampError("a scan has neither times of its points nor a stamp; expected one of them to gather by")
+                raise StampError(
+                    "a scan has neither times of its points nor a stamp; expected one of them to gather by"
+                )
             times_s = np.full(len(points), stamp_s)
         if not np.isfinite(times_s).any():
             continue

@@ -364,9 +364,7 @@ def simulate_sequence(
         chord = way * float(np.sinc(turn / (2.0 * math.pi)))
         x, y = chord * math.cos(heading + turn / 2.0), chord * math.sin(heading + turn / 2.0)
         T_world_sensor = sensor_pose(scene, sensor, x, y, yaw=heading + turn)
-        scan = simulate(
-            scene.at(stamp_s), sensor, seed + k, T_world_sensor, start_s=stamp_s, duration_s=1.0 / rate_hz
-        )
+        scan = simulate(scene.at(stamp_s), sensor, seed + k, T_world_sensor, start_s=stamp_s, duration_s=1.0 / rate_hz)
         yield stamp_s, T_world_sensor, scan
 
 
