@@ -230,12 +230,11 @@ def accumulate(
         first_s, newest_s = float(np.nanmin(times_s)), float(np.nanmax(times_s))
         if not kept or newest_s < end_s:
             kept.clear()
-            begin_s = first_s
+            begin_s, is_waiting = first_s, True
         kept.append((points, times_s, newest_s))
         end_s, last = newest_s, stamp_s
         while kept[0][2] <= end_s - accumulate_s:
             kept.popleft()
-        is_waiting = is_waiting or begin_s == first_s
         if end_s - begin_s >= _WHOLE * accumulate_s:
             yield joined(stamp_s)
             is_waiting = False

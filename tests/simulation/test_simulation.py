@@ -143,7 +143,7 @@ def test_cast_is_its_twin(seed: int, tilt: float) -> None:
     azimuths = np.arange(20) * 2 * np.pi / 20
     elevations = np.sort(np.radians(rng.uniform(-24, 8, 6)))[::-1].copy()
     pose = sensor_pose(scene, SMALL, 1.0, 0.3, yaw=0.2, pitch=tilt, roll=-tilt)
-    rays = Rays(elevations, azimuths, 40.0, KEY)
+    rays = Rays(elevations[:, None], azimuths, 40.0, KEY)
     placed, (ranges, hits, exits, cosines) = cast(scene, pose, rays)
     slow_ranges, slow_hits = twins.simulation.cast(placed, scene, pose, *rays)
     # Where a ray all but grazes the ground, a kerb between two samples may be missed too.
@@ -177,7 +177,7 @@ def test_cast_without_shapes_and_with_shapes_that_are_not_finite() -> None:
     pose = sensor_pose(scene, SMALL)
     for beams, n_columns in (((-0.2,), 1), ((0.1, -0.1, -0.3), 5)):
         azimuths = np.arange(n_columns) * 2 * np.pi / n_columns
-        rays = Rays(np.array(beams), azimuths, 40.0, KEY)
+        rays = Rays(np.array(beams)[:, None], azimuths, 40.0, KEY)
         placed, found = cast(empty, pose, rays)
         slow_ranges, slow_hits = twins.simulation.cast(placed, empty, pose, *rays)
         np.testing.assert_array_equal(found[1], slow_hits)
@@ -186,7 +186,7 @@ def test_cast_without_shapes_and_with_shapes_that_are_not_finite() -> None:
     strange = np.stack([plate(8.0, (0.2, 30.0, 20.0), material=material) for material in (0, LEAVES, POROUS)])
     for k, column, value in ((0, 4, np.nan), (1, 5, np.inf), (2, 7, np.nan)):
         strange[k, column] = value
-    rays = Rays(np.array([0.0, -0.1]), np.arange(8) * np.pi / 4, 40.0, KEY)
+    rays = Rays(np.array([[0.0], [-0.1]]), np.arange(8) * np.pi / 4, 40.0, KEY)
     plain = cast(empty, pose, rays)[1]
     for got, wanted in zip(cast(replace(scene, primitives=strange), pose, rays)[1], plain, strict=True):
         np.testing.assert_array_equal(got, wanted)
@@ -243,7 +243,7 @@ def test_points_are_those_of_the_twin(seed: int, noise: bool) -> None:
     pose = sensor_pose(scene, around, 1.0, 0.2, yaw=0.1, pitch=0.01, roll=-0.01)
     for sensor, reach in ((around, 80.0), (SensorProfile("one", (-10.0,), 1), 80.0), (SMALL, 1.0)):
         azimuths = np.arange(0.0, 2 * np.pi, 2 * np.pi / sensor.columns)
-        rays = Rays(np.radians(sensor.elevations_deg), azimuths, reach, KEY)
+        rays = Rays(np.radians(sensor.elevations_deg)[:, None], azimuths, reach, KEY)
         placed, hits = cast(scene, pose, rays)
         hits.ranges[:1, ::7] = np.nan  # no return, whatever it hit
         receiver = Receiver(*rng.normal(0.0, 0.02, (2, sensor.n_beams)), 0.9, noise, noise)
