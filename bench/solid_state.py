@@ -1,22 +1,24 @@
 """Sensors that do not spin, in simulated streets: accuracy by the time that a scan is gathered, standing and driving.
 
 Run as ``python -m edgeperc_bench.solid_state [--scans N] [--sensors mid-360 hap avia]``; a VLP-16 in the same place of
-the same streets stands beside. ``--turn`` times four sensors around a vehicle against one scan of as many points.
+the same streets stands beside. ``--turn hap`` times four of them around a vehicle against one scan of as many
+points.
 Prints tables of Markdown.
 """
 
 from __future__ import annotations
 
 import argparse
+import time
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from edgeperc import Perceiver, TimedScan, Trajectory, accumulate
+from edgeperc import Mounting, Perceiver, TimedScan, Trajectory, accumulate, merge
 from edgeperc.evaluation.metrics import BoxEvaluator, Confusion, boxes_to_find
-from edgeperc.simulation import POINT_CLASSES, SimulatedScan, random_scene, simulate_sequence
+from edgeperc.simulation import POINT_CLASSES, SimulatedScan, random_scene, simulate, simulate_sequence
 from edgeperc.simulation.samples import FIRST_SEED
 from edgeperc.types.mounting import MODEL_MOUNTING
 from edgeperc.types.perception import Perception
@@ -101,12 +103,72 @@ def sensors_of(names: Sequence[str]) -> Iterator[tuple[str, SensorProfile, float
             yield f"{name}, {accumulate_s:g} s", profile.accumulated(accumulate_s), accumulate_s
 
 
+def around(seed: int, sensor: SensorProfile) -> tuple[list[NDArray[np.float32]], list[NDArray[np.float64]]]:
+    """Scans of four sensors at the sides of a vehicle in a street, and their poses on it."""
+    scene = random_scene(seed)
+    places = [(2.2, 0.0, 1.7, 0.0), (0.0, 0.9, 1.7, 90.0), (-2.2, 0.0, 1.7, 180.0), (0.0, -0.9, 1.7, -90.0)]
+    T_vehicle_sensor = []
+    for x, y, z, yaw_deg in places:
+        T_vehicle_sensor.append(np.eye(4))
+        cos, sin = np.cos(np.radians(yaw_deg)), np.sin(np.radians(yaw_deg))
+        T_vehicle_sensor[-1][:2] = (cos, -sin, 0.0, x), (sin, cos, 0.0, y)
+        T_vehicle_sensor[-1][2, 3] = z
+    T_world_vehicle = np.eye(4)
+    T_world_vehicle[2, 3] = scene.ground_height(0.0, 0.0)
+    scans = [simulate(scene, sensor, seed, T_world_vehicle @ pose) for pose in T_vehicle_sensor]
+    return [scan.points * np.array([1, 1, 1, 255], np.float32) for scan in scans], T_vehicle_sensor
+
+
+def time_turn(name: str, n_turns: int) -> str:
+    """Median times of four sensors as one turn, and of single scans of as many points, in turns [ms].
+
+    The single scans are of a sensor of the same kind that sees all around, and of an HDL-64E, whose range image has no
+    gaps to fill.
+    """
+    profile = get_sensor(name)
+    assert profile.pattern is not None
+    scans, poses = around(FIRST_SEED, profile)
+    n, raised = sum(map(len, scans)), np.eye(4)
+    raised[2, 3] = 1.73
+    wide = replace(profile, pattern=replace(profile.pattern, width_deg=360.0))
+    duration_s = 6.0 * profile.pattern.accumulate_s
+    alike = simulate(random_scene(FIRST_SEED), wide, 0, duration_s=duration_s).points * np.array([1, 1, 1, 255])
+    hdl = simulate(random_scene(FIRST_SEED), "hdl-64e", 0).points
+    of_kind, of_hdl = (
+        Perceiver(sensor=sensor, mounting=mounting, on_mismatch="ignore", full_turn=True)
+        for sensor, mounting in ((profile, Mounting(0.0, 0.0, 0.0)), ("hdl-64e", MODEL_MOUNTING))
+    )
+    chosen = np.random.default_rng(0).permutation(np.resize(np.arange(len(alike)), n))
+    singles = [(of_kind, merge([alike[chosen]], [raised])), (of_hdl, np.resize(hdl, (n, 4)))]
+    takes: list[list[float]] = [[], [], []]
+    for _ in range(n_turns):
+        start = time.perf_counter()
+        of_kind(merge(scans, poses))
+        takes[0].append(time.perf_counter() - start)
+        for k, (perceive, points) in enumerate(singles):
+            start = time.perf_counter()
+            perceive(points)
+            takes[k + 1].append(time.perf_counter() - start)
+    four, same, other = (1e3 * float(np.median(each)) for each in takes)
+    ratios = [float(np.median(np.array(takes[0]) / np.array(takes[k]))) for k in (1, 2)]
+    return f"| {name} | {n:,} | {four:.0f} | {same:.0f} | {other:.0f} | {ratios[0]:.2f}; {ratios[1]:.2f} |"
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     """Print a table."""
     parser = argparse.ArgumentParser("edgeperc_bench.solid_state", description=(__doc__ or "").partition("\n\n")[0])
     parser.add_argument("--scans", type=int, default=24, metavar="N", help="streets (default: 24)")
     parser.add_argument("--sensors", nargs="*", default=["mid-360", "mid-360-hanging"], metavar="NAME")
+    parser.add_argument("--turn", nargs="*", metavar="NAME", help="only time four of these sensors as one turn")
+    parser.add_argument("--turns", type=int, default=40, metavar="N", help="scans that are timed (default: 40)")
     given = parser.parse_args(arguments)
+    if given.turn is not None:
+        print(
+            "| four | points | merged, ms | one of the kind, ms | one HDL-64E, ms | ratios |\n|---|---|---|---|---|---|"
+        )
+        for name in given.turn or ["hap", "avia"]:
+            print(time_turn(name, given.turns), flush=True)
+        return
     print(
         "| sensor | speed | points | IoU car / pedestrian / cyclist | mean IoU | AP50 vehicles |\n|---|---|---|---|---|---|"
     )

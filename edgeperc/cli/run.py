@@ -320,6 +320,8 @@ def _check_usage(arguments: argparse.Namespace, kinds: Sequence[str]) -> None:
         arguments.usage_error("--deskew needs --poses FILE or --track, and no --live")
     if arguments.poses is not None and not arguments.deskew:
         arguments.usage_error("--poses needs --deskew")
+    if arguments.accumulate is not None and arguments.sensor in (None, AUTO_SENSOR):
+        arguments.usage_error("--accumulate needs --sensor with the name of one that does not spin, such as mid-360")
     if arguments.live and any(value is not None for value in file_options(arguments).values()):
         arguments.usage_error("--columns, --remission-field and --origin need no --live")
     if arguments.quaternion is not None and arguments.poses is None:

@@ -251,7 +251,7 @@ class Sensors:
 
 
 def with_mounting(sensor: str | SensorProfile, arguments: argparse.Namespace) -> str | SensorProfile:
-    """The sensor with what ``--extrinsic``, the options of single values, ``--ego-box``, ``--remission-range``, ``--accumulate`` give.
+    """The sensor with what ``--extrinsic`` and the options of single values give, ``--accumulate`` and others.
 
     Raises SensorError.
     """
@@ -270,7 +270,7 @@ def with_mounting(sensor: str | SensorProfile, arguments: argparse.Namespace) ->
         return sensor
     if sensor == AUTO_SENSOR:
         raise SensorError(
-            "--sensor auto and a mounting, --ego-box, --remission-range or --accumulate: write the sensor that is found, "
+            "--sensor auto and a mounting, --ego-box or --remission-range: write the sensor that is found, "
             "edgeperc info SCAN --write FILE, and pass --sensor FILE"
         )
     profile = get_sensor(sensor)

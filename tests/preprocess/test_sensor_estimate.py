@@ -206,7 +206,9 @@ def test_what_cannot_be_told_is_refused(name: str) -> None:
 @pytest.mark.parametrize("name", [name for name, profile in SENSORS.items() if profile.pattern is not None])
 def test_sensors_without_beams_are_named_by_their_field_of_view(name: str, way: float) -> None:
     scan = simulated_scan(FIRST_SEED + 1, name).points * np.array([1.0, way, way, 1.0], np.float32)
-    with pytest.raises(SensorError, match=rf"{CANNOT_TELL}.*non-repeating.*by the field of view {name}\b.*pass sensor="):
+    with pytest.raises(
+        SensorError, match=rf"{CANNOT_TELL}.*non-repeating.*by the field of view {name}\b.*pass sensor="
+    ):
         estimate_sensor([scan])
 
 

@@ -308,9 +308,7 @@ def points(
 
     elevation = np.broadcast_to(elevations, hits.shape)[beam, column]
     level = np.cos(elevation)
-    direction = np.stack(
-        [level * np.cos(azimuths)[column], level * np.sin(azimuths)[column], np.sin(elevation)], 1
-    )
+    direction = np.stack([level * np.cos(azimuths)[column], level * np.sin(azimuths)[column], np.sin(elevation)], 1)
     world = (t[:, None] * direction) @ pose[:3, :3].T + pose[:3, 3]
     shapes = np.zeros((len(t), 20))
     shapes[hit >= 0] = primitives[hit[hit >= 0]]
