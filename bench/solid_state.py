@@ -163,9 +163,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--turns", type=int, default=40, metavar="N", help="scans that are timed (default: 40)")
     given = parser.parse_args(arguments)
     if given.turn is not None:
-        print(
-            "| four | points | merged, ms | one of the kind, ms | one HDL-64E, ms | ratios |\n|---|---|---|---|---|---|"
-        )
+        print("| four | points | merged, ms | one of the kind, ms | one HDL-64E, ms | ratios |")
+        print("|---|---|---|---|---|---|")
         for name in given.turn or ["hap", "avia"]:
             print(time_turn(name, given.turns), flush=True)
         return

@@ -154,7 +154,7 @@ FLOORS = {
         __init__
     """,
     "edgeperc_bench": """
-        application conditions context inputs options samples scenarios
+        application conditions context inputs options samples scenarios solid_state
         document loadgen render start
         plots report worker
         accuracy

@@ -502,8 +502,8 @@ class _Run:
             options = reading_options(self._arguments) | {"accumulate_s": _gathered_s(path, perceive)}
             if options["accumulate_s"] is not None and self._straightener is None:
                 warnings.warn(
-                    f"{shown}: the points of the last {options['accumulate_s']:g} s are taken as seen from one place; if "
-                    "the sensor moves, pass --deskew with --poses FILE or --track",
+                    f"{shown}: the points of the last {options['accumulate_s']:g} s are taken as seen from one place; "
+                    "if the sensor moves, pass --deskew with --poses FILE or --track",
                     stacklevel=2,
                 )
             if not numbered:

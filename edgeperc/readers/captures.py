@@ -69,8 +69,8 @@ def read_scans(
     origin_m : sequence of 3 float or "auto", optional
         Place of the sensor in the map of scan files, as in `edgeperc.read_points`.
     accumulate_s : float, optional
-        Time over which each scan is gathered, of a sensor that does not spin [s] (`edgeperc.accumulate`, which takes its
-        motion out, too). By default, scans are as they are stored.
+        Time over which each scan is gathered, of a sensor that does not spin [s] (`edgeperc.accumulate`, which takes
+        its motion out, too). By default, scans are as they are stored.
 
     Yields
     ------

@@ -235,8 +235,8 @@ def simulate(
         Whether the ego vehicle hides some directions of the lower beams, as on KITTI's car. Ignored if ``noise`` is
         False.
     start_s, duration_s : float
-        Of a sensor with a `ScanPattern`: when the scan begins, which decides its directions, and how long it is gathered
-        from this one place [s]; by default as long as its profile says. A moving sensor gathers several short scans
+        Of a sensor with a `ScanPattern`: when the scan begins, which decides its directions, and how long it is
+        gathered from this one place [s]; by default as long as its profile says. A moving sensor gathers several short scans
         (`simulate_sequence`).
 
     Returns

@@ -96,8 +96,8 @@ class RemissionFunction:
             FIELDS.refuse("remission.to and source", (self.to, self.source), "two texts")
 
 
-# Pulses of a non-repeating sensor in a cell of its virtual beams and columns, on average; many of them meet the sky. With
-# 1, the points of an object are linked less: AP50 of vehicles falls from 63 to 54 % on twelve streets (Mid-360, 0.2 s).
+# Pulses of a non-repeating sensor in a cell of its virtual beams and columns, on average; many of them meet the sky.
+# With 1, the points of an object are linked less: AP50 of vehicles falls from 63 to 54 % on twelve streets (Mid-360, 0.2 s).
 _POINTS_OF_CELL = 4.0
 
 
@@ -449,8 +449,8 @@ _BUILT_IN = (
     *_ouster("os2", 11.25, 0.8, 350.0),
     SensorProfile("pandar64", _PANDAR_64, 1800, _BYTE, min_range_m=0.3, max_range_m=200.0, remission=_OF_PANDASET),
     SensorProfile.uniform("pandarxt-32", 32, 15.0, -16.0, columns=2000, remission_range=_BYTE, min_range_m=0.05),
-    # By the maker's manuals. How fast their prisms turn is not in them; one beam turns here so fast that its lines are as
-    # dense as those of the several beams in the sensor.
+    # By the maker's manuals. How fast their prisms turn is not in them; one beam turns here so fast that its lines are
+    # as dense as those of the several beams in the sensor.
     _livox("mid-360", (52.0, -7.0), ScanPattern(200_000.0, 360.0, 0.2, (9.7, 1733.3)), 0.1, 70.0),
     _livox("hap", (12.5, -12.5), ScanPattern(452_000.0, 120.0, 0.1, (729.6, -466.2)), 0.5, 150.0),
     _livox("avia", (38.6, -38.6), ScanPattern(240_000.0, 70.4, 0.2, (729.6, -466.2)), 1.0, 190.0),

@@ -549,7 +549,7 @@ def test_what_cannot_be_gathered() -> None:
         with pytest.raises(OptionError, match=r"accumulate_s is .*expected 0.01 to 10 s"):
             next(accumulate([scan], value))  # type: ignore[arg-type]
     for motion in ((1.0, 0.0, 0.0), np.eye(4), "poses.txt"):
-        with pytest.raises(OptionError, match="(?s)motion is .*expected a Motion, a Trajectory or None"):
+        with pytest.raises(OptionError, match=r"(?s)motion is .*expected a Motion, a Trajectory or None"):
             next(accumulate([scan], 0.5, motion))  # type: ignore[arg-type]
     with pytest.raises(StampError, match="expected poses around it"):
         next(accumulate([TimedScan(7.0, np.ones((3, 4), np.float32), None)], 0.5, true_trajectory()))
