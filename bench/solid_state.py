@@ -168,9 +168,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         for name in given.turn or ["hap", "avia"]:
             print(time_turn(name, given.turns), flush=True)
         return
-    print(
-        "| sensor | speed | points | IoU car / pedestrian / cyclist | mean IoU | AP50 vehicles |\n|---|---|---|---|---|---|"
-    )
+    print("| sensor | speed | points | IoU car / pedestrian / cyclist | mean IoU | AP50 vehicles |")
+    print("|---|---|---|---|---|---|")
     for title, sensor, accumulate_s in sensors_of(given.sensors):
         for speed_mps in SPEEDS_MPS:
             row = row_of(sensor, accumulate_s, speed_mps, given.scans)

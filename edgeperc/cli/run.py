@@ -496,10 +496,11 @@ class _Run:
             return
         shown = shown or path
         try:
-            perceive = self._perceivers.of(self._perceivers.sensor_of(path))
+            sensor = self._perceivers.sensor_of(path)
+            perceive = self._perceivers.of(sensor)
             numbered = is_capture(path)
             read: Callable[..., Iterator[tuple[Any, ...]]] = read_timed_scans if self._straightener else read_scans
-            options = reading_options(self._arguments) | {"accumulate_s": _gathered_s(path, perceive)}
+            options = reading_options(self._arguments) | {"accumulate_s": _gathered_s(path, sensor)}
             if options["accumulate_s"] is not None and self._straightener is None:
                 warnings.warn(
                     f"{shown}: the points of the last {options['accumulate_s']:g} s are taken as seen from one place; "
@@ -568,10 +569,11 @@ class _Run:
         from ..live import stream
 
         name_of = scan_namer(path)
-        perceiver = self._perceivers.of(self._perceivers.sensor_of(path))
+        sensor = self._perceivers.sensor_of(path)
+        perceiver = self._perceivers.of(sensor)
         perceive = perceiver.__call__  # without a sensor, of which `stream` would warn again
         rate_hz, topic = self._arguments.rate, self._arguments.topic
-        gathered_s = _gathered_s(path, perceiver)
+        gathered_s = _gathered_s(path, sensor)
         tracker = None if self._tracker is None else self._track
         with stream(path, perceive, tracker, rate_hz=rate_hz, topic=topic, accumulate_s=gathered_s) as answers:
             while True:
@@ -645,11 +647,12 @@ def _alone(
     return perceive, run.scans, lambda target: [_file_of(target, kind) for kind in kinds]
 
 
-def _gathered_s(path: Path, perceive: Perceiver) -> float | None:
+def _gathered_s(path: Path, sensor: str | SensorProfile) -> float | None:
     """Time over which the scans of a capture are gathered; None for a sensor that spins, and for scan files."""
     from ..readers.captures import is_capture
+    from ..types.sensor import get_sensor
 
-    pattern = perceive.sensor.pattern
+    pattern = get_sensor(sensor).pattern
     return None if pattern is None or not is_capture(path) else pattern.accumulate_s
 
 

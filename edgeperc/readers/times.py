@@ -174,8 +174,8 @@ def accumulate(
         How long a scan is gathered [s].
     motion : Motion or Trajectory, optional
         Motion of the sensor, constant or by its poses. It is taken out (`edgeperc.deskew`), so that the points are
-        where a sensor that stands still at the last of them would have seen them. None: the sensor stands still. If it moves
-        all the same, what it saw earlier lies beside what it saw later, by 1 m at 10 m/s and 0.1 s.
+        where a sensor that stands still at the last of them would have seen them. None: the sensor stands still. If it
+        moves all the same, what it saw earlier lies beside what it saw later, by 1 m at 10 m/s and 0.1 s.
     min_range_m : float
         As in `edgeperc.deskew`.
 

@@ -236,8 +236,8 @@ def simulate(
         False.
     start_s, duration_s : float
         Of a sensor with a `ScanPattern`: when the scan begins, which decides its directions, and how long it is
-        gathered from this one place [s]; by default as long as its profile says. A moving sensor gathers several short scans
-        (`simulate_sequence`).
+        gathered from this one place [s]; by default as long as its profile says. A moving sensor gathers several short
+        scans (`simulate_sequence`).
 
     Returns
     -------

@@ -97,7 +97,8 @@ class RemissionFunction:
 
 
 # Pulses of a non-repeating sensor in a cell of its virtual beams and columns, on average; many of them meet the sky.
-# With 1, the points of an object are linked less: AP50 of vehicles falls from 63 to 54 % on twelve streets (Mid-360, 0.2 s).
+# With 1, the points of an object are linked less: AP50 of vehicles falls from 63 to 54 % on twelve streets (Mid-360 of
+# 0.2 s).
 _POINTS_OF_CELL = 4.0
 
 
