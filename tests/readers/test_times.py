@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from lidar_writers import T0_S, livox_packets
 from numpy.typing import NDArray
 from test_captures import write_pcap
 from test_motion import write_tum
@@ -489,9 +490,8 @@ def parts_of(n: int, part_s: float = 0.1, k: int = 300) -> list[TimedScan]:
 
 
 def true_trajectory() -> Trajectory:
-    screw = twins.motion.screw(MOTION.velocity_mps, MOTION.rate_radps)
     times = np.linspace(-0.1, 1.1, 13)
-    return Trajectory(times, np.array([twins.motion.exponential(screw * t) for t in times]))
+    return Trajectory(times, np.array([pose_at(t) for t in times]))
 
 
 @pytest.mark.parametrize("motion", [MOTION, true_trajectory()], ids=["motion", "trajectory"])
@@ -504,6 +504,30 @@ def test_gathered_scans_of_a_sensor_that_moves_are_straight(motion: Any, accumul
     assert off_the_walls(last.points) < 2e-3
     *_, bent = accumulate(parts, accumulate_s)
     assert off_the_walls(bent.points) > 10.0 * accumulate_s
+
+
+@pytest.mark.compiled
+@pytest.mark.filterwarnings("default::UserWarning")
+@pytest.mark.parametrize("accumulate_s", [0.1, 0.2, 0.3])
+def test_a_livox_that_moves_is_run_straight(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], accumulate_s: float
+) -> None:
+    """Packets of 0.3 s in the room, gathered and straightened by poses."""
+    pytest.importorskip("onnxruntime")
+    times = T0_S + np.arange(96 * 625) / 200_000.0
+    angle = 211.0 * (times - T0_S)
+    directions = np.column_stack([np.cos(angle), np.sin(angle), 0.3 * np.sin(5.3 * angle)])
+    points = directions * seen_from(times, float(times[-1]), directions)[:, None]
+    path = write_pcap(tmp_path / "a.pcap", livox_packets(1, points, np.full(len(points), 99), False))
+    ends = times[-1] + np.linspace(-0.5, 0.1, 13)
+    write_tum(tmp_path / "poses.txt", ends, [pose_at(t - times[-1]) for t in ends])
+    given = ["--sensor", "mid-360", "--accumulate", accumulate_s, "--on-mismatch", "ignore", "--model", "pointseg"]
+    out = ["--deskew", "--poses", tmp_path / "poses.txt", "--ply", "--out", tmp_path / "out"]
+    assert run("run", path, *given, *out) == 0
+    assert "seen from one place" not in capsys.readouterr().err
+    last = edgeperc.read_points(sorted((tmp_path / "out").rglob("*.ply"))[-1])
+    assert len(last) == pytest.approx(200_000 * accumulate_s, rel=0.06)
+    assert off_the_walls(last) < 0.02
 
 
 @given(
