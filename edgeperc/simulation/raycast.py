@@ -432,7 +432,7 @@ def fill_cast(shapes: Shapes, ground: Ground, T_world_sensor: NDArray[np.float64
     tangents = np.tan(rays.elevations)
     differ = 1 if tangents.shape[1] > 1 else 0
     n_sectors = shapes.starts.shape[0] - 1
-    lowest = tangents[n_beams - 1, 0]
+    lowest = 0.0
     for column in range(tangents.shape[1]):
         lowest = min(lowest, tangents[n_beams - 1, column])
     # Radii of ground samples start inside the ring of the lowest beam and grow by 3 %: at 30 m, by a third of the
