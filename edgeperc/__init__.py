@@ -55,7 +55,7 @@ if TYPE_CHECKING:
     from .readers.captures import read_scans, read_timed_scans, sensor_of
     from .readers.files import find_origin, read_points
     from .readers.images import read_image
-    from .readers.times import TimedScan
+    from .readers.times import TimedScan, accumulate
     from .road.ahead import FreeAhead, RoadAhead, free_ahead, road_ahead
     from .road.grid import OccupancyGrid, occupancy_grid
     from .tracking import Track, Tracker, Tracks
@@ -74,7 +74,7 @@ if TYPE_CHECKING:
         SensorHealth,
         TopView,
     )
-    from .types.sensor import SensorProfile
+    from .types.sensor import ScanPattern, SensorProfile
     from .view import draw
 
 __all__ = [
@@ -112,6 +112,7 @@ __all__ = [
     "ProviderError",
     "ProviderInfo",
     "RoadAhead",
+    "ScanPattern",
     "SensorError",
     "SensorHealth",
     "SensorInfo",
@@ -129,6 +130,7 @@ __all__ = [
     "Trajectory",
     "Zone",
     "__version__",
+    "accumulate",
     "camera_road",
     "deskew",
     "draw",
@@ -176,6 +178,7 @@ MODULES = {
     "RoadAhead": "road.ahead",
     "SensorInfo": "inference.listing",
     "SensorHealth": "types.perception",
+    "ScanPattern": "types.sensor",
     "SensorProfile": "types.sensor",
     "Stream": "live",
     "TimedScan": "readers.times",
@@ -185,6 +188,7 @@ MODULES = {
     "Tracks": "tracking",
     "Trajectory": "preprocess.motion",
     "Zone": "tracking.zones",
+    "accumulate": "readers.times",
     "camera_road": "camera.painting",
     "deskew": "preprocess.motion",
     "draw": "view",

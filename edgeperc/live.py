@@ -16,8 +16,10 @@ from typing import Any, Literal
 from .errors import EdgepercError, OptionError, PointsError, StampError
 from .readers.captures import read_scans, sensor_of
 from .readers.identify import contradicts
+from .readers.times import TimedScan, accumulate
 from .system.clock import LATEST_S, Clock
 from .types.perception import Perception
+from .types.points import as_points
 from .types.sensor import SensorProfile
 
 Health = Literal["OK", "LATE", "STALE"]
@@ -72,6 +74,7 @@ def stream(
     late_after_s: float | None = None,
     stale_after_s: float | None = None,
     topic: str | None = None,
+    accumulate_s: float | None = None,
 ) -> Stream:
     """Perceive the newest scan of a live source, repeatedly. Reading begins immediately.
 
@@ -92,6 +95,9 @@ def stream(
         Ages above which an answer is late or stale [s]; by default two and five periods of the sensor.
     topic : str, optional
         As in `edgeperc.read_scans`.
+    accumulate_s : float, optional
+        Time over which each scan is gathered, of a sensor that stands still and does not spin (`edgeperc.accumulate`)
+        [s]; scans of an iterable then have stamps. By default, each scan is perceived by itself.
 
     Returns
     -------
@@ -126,12 +132,16 @@ def stream(
     inbox = _Inbox()
     if isinstance(source, str | os.PathLike):
         _warn_of_another_sensor(source, perceiver, topic)
-        scans: Iterator[Any] = paced(read_scans(Path(source), topic=topic), rate_hz, inbox.stopped)
+        read = read_scans(Path(source), topic=topic, accumulate_s=accumulate_s)
+        scans: Iterator[Any] = paced(read, rate_hz, inbox.stopped)
     else:
         try:
             scans = iter(source)
         except TypeError as exc:
             raise PointsError(f"got a source of type {type(source).__name__}; expected scans or a path") from exc
+        if accumulate_s is not None:
+            timed = (TimedScan(stamp_s, as_points(points), None) for points, stamp_s in map(_stamped, scans))
+            scans = ((stamp_s, points) for stamp_s, points, _ in accumulate(timed, accumulate_s))
     return Stream(inbox, scans, perceiver, tracker, late_s, stale_s)
 
 

@@ -155,7 +155,7 @@ FLOORS = {
         __init__
     """,
     "edgeperc_bench": """
-        application conditions context inputs options samples scenarios surroundings
+        application conditions context inputs options samples scenarios solid_state surroundings
         document loadgen render start
         plots report worker
         accuracy

@@ -16,7 +16,7 @@ import pytest
 
 import edgeperc
 from edgeperc import live
-from edgeperc.errors import InferenceError, PointsError
+from edgeperc.errors import InferenceError, PointsError, StampError
 from edgeperc.live import stream
 from waiting import TIMEOUT_S, until
 
@@ -419,6 +419,22 @@ def save(folder: Path, n: int) -> Path:
     for k in range(1, n + 1):
         np.save(folder / f"{k:03}.npy", scan(k))
     return folder
+
+
+@pytest.mark.parametrize(("accumulate_s", "expected"), [(0.05, 5), (0.15, 9), (0.25, 12), (None, 5)])
+def test_scans_of_a_stream_are_gathered(accumulate_s: float | None, expected: int) -> None:
+    scans = [(0.1 * k, scan(k)) for k in (2, 3, 4, 5)]
+    with stream(iter(scans), perceive, accumulate_s=accumulate_s) as answers:
+        last = [*answers][-1]
+    assert (last.perception.n_points, last.stamp_s) == (expected, 0.5)
+
+
+def test_scans_without_stamps_are_not_gathered() -> None:
+    with (
+        stream(iter([scan(1), scan(2)]), perceive, accumulate_s=0.2) as answers,
+        pytest.raises(StampError, match="neither times of its points nor a stamp"),
+    ):
+        next(answers)
 
 
 def test_a_folder_is_a_source(tmp_path: Path) -> None:

@@ -31,7 +31,8 @@ def add_parser(commands: Commands) -> None:
             "the built-in sensors: beams, field of view, remission",
             "List the built-in sensors. Pass a name to --sensor, or a public set: av2, "
             "ddad, lyft, pandaset, semantickitti, vod. For another sensor, pass a .json file, see 'edgeperc "
-            "fit-sensor'. 'mapped to' is the sensor whose remission scale the remission is mapped to.",
+            "fit-sensor'. 'mapped to' is the sensor whose remission scale the remission is mapped to, "
+            "'gathered' the time of a scan of one that does not spin, with the beams and columns that then show.",
         ),
         (
             "providers",
@@ -94,6 +95,7 @@ def sensors_command(arguments: argparse.Namespace) -> int:
             "remission": lambda row: "{:g} .. {:g}".format(*row["remission_range"]),
             "range [m]": lambda row: "{:g} .. {:g}".format(*row["range_m"]),
             "mapped to": lambda row: row["rendered_as"] or "-",
+            "gathered": lambda row: "-" if row["accumulate_s"] is None else f"{row['accumulate_s']:g} s",
         },
         arguments,
     )

@@ -6,6 +6,7 @@ import argparse
 import os
 import sys
 import time
+import warnings
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -122,6 +123,13 @@ def add_parser(commands: Commands) -> None:
         action="store_true",
         help="straighten scans by the times of their points and the motion of the sensor: that of --poses, or with "
         "--track the tracker's own estimate from the scans before",
+    )
+    reading.add_argument(
+        "--accumulate",
+        type=positive_number,
+        metavar="S",
+        help="time over which each scan of a capture is gathered, of a sensor that does not spin (mid-360, hap, avia) "
+        "[s] (default: the sensor's)",
     )
     reading.add_argument(
         "--poses",
@@ -312,11 +320,13 @@ def _check_usage(arguments: argparse.Namespace, kinds: Sequence[str]) -> None:
         arguments.usage_error("--deskew needs --poses FILE or --track, and no --live")
     if arguments.poses is not None and not arguments.deskew:
         arguments.usage_error("--poses needs --deskew")
+    if arguments.accumulate is not None and arguments.sensor in (None, AUTO_SENSOR):
+        arguments.usage_error("--accumulate needs --sensor with the name of one that does not spin, such as mid-360")
     if arguments.live and any(value is not None for value in file_options(arguments).values()):
         arguments.usage_error("--columns, --remission-field and --origin need no --live")
     if arguments.quaternion is not None and arguments.poses is None:
         arguments.usage_error("--quaternion needs --poses FILE")
-    if arguments.sensor is not None or arguments.extrinsic is not None:
+    if arguments.sensor is not None or arguments.extrinsic is not None or arguments.accumulate is not None:
         from ..types.sensor import get_sensor
 
         get_sensor(with_mounting(stated_sensor(arguments), arguments))  # one error, before the first scan
@@ -486,10 +496,17 @@ class _Run:
             return
         shown = shown or path
         try:
-            perceive = self._perceivers.of(self._perceivers.sensor_of(path))
+            sensor = self._perceivers.sensor_of(path)
+            perceive = self._perceivers.of(sensor)
             numbered = is_capture(path)
             read: Callable[..., Iterator[tuple[Any, ...]]] = read_timed_scans if self._straightener else read_scans
-            options = reading_options(self._arguments)
+            options = reading_options(self._arguments) | {"accumulate_s": _gathered_s(path, sensor)}
+            if options["accumulate_s"] is not None and self._straightener is None:
+                warnings.warn(
+                    f"{shown}: the points of the last {options['accumulate_s']:g} s are taken as seen from one place; "
+                    "if the sensor moves, pass --deskew with --poses FILE or --track",
+                    stacklevel=2,
+                )
             if not numbered:
                 options["origin_m"] = self._origin(path)
             for k, (stamp_s, points, *times_s) in enumerate(read(path, **options)):
@@ -552,12 +569,13 @@ class _Run:
         from ..live import stream
 
         name_of = scan_namer(path)
-        perceiver = self._perceivers.of(self._perceivers.sensor_of(path))
+        sensor = self._perceivers.sensor_of(path)
+        perceiver = self._perceivers.of(sensor)
         perceive = perceiver.__call__  # without a sensor, of which `stream` would warn again
         rate_hz, topic = self._arguments.rate, self._arguments.topic
-        with stream(
-            path, perceive, None if self._tracker is None else self._track, rate_hz=rate_hz, topic=topic
-        ) as answers:
+        gathered_s = _gathered_s(path, sensor)
+        tracker = None if self._tracker is None else self._track
+        with stream(path, perceive, tracker, rate_hz=rate_hz, topic=topic, accumulate_s=gathered_s) as answers:
             while True:
                 try:
                     answer = answers.take()
@@ -627,6 +645,15 @@ def _alone(
     perceive = perceivers.of(with_mounting(stated_sensor(arguments), arguments))
     run = _Run(arguments, perceivers, kinds)
     return perceive, run.scans, lambda target: [_file_of(target, kind) for kind in kinds]
+
+
+def _gathered_s(path: Path, sensor: str | SensorProfile) -> float | None:
+    """Time over which the scans of a capture are gathered; None for a sensor that spins, and for scan files."""
+    from ..readers.captures import is_capture
+    from ..types.sensor import get_sensor
+
+    pattern = get_sensor(sensor).pattern
+    return None if pattern is None or not is_capture(path) else pattern.accumulate_s
 
 
 def _real(path: Path) -> str:

@@ -251,7 +251,7 @@ class Sensors:
 
 
 def with_mounting(sensor: str | SensorProfile, arguments: argparse.Namespace) -> str | SensorProfile:
-    """The sensor with what ``--extrinsic``, the options of single values, ``--ego-box`` and ``--remission-range`` give.
+    """The sensor with what ``--extrinsic`` and the options of single values give, ``--accumulate`` and others.
 
     Raises SensorError.
     """
@@ -265,7 +265,8 @@ def with_mounting(sensor: str | SensorProfile, arguments: argparse.Namespace) ->
         values["yaw_deg"] = None
     file, ego = getattr(arguments, "extrinsic", None), getattr(arguments, "ego_box", None)
     remission = getattr(arguments, "remission_range", None)
-    if not values and file is None and ego is None and remission is None:
+    accumulate_s = getattr(arguments, "accumulate", None)
+    if not values and file is None and ego is None and remission is None and accumulate_s is None:
         return sensor
     if sensor == AUTO_SENSOR:
         raise SensorError(
@@ -273,6 +274,8 @@ def with_mounting(sensor: str | SensorProfile, arguments: argparse.Namespace) ->
             "edgeperc info SCAN --write FILE, and pass --sensor FILE"
         )
     profile = get_sensor(sensor)
+    if accumulate_s is not None:
+        profile = profile.accumulated(accumulate_s)
     if remission is not None:
         profile = replace(profile, remission_range=tuple(remission))
     if ego is not None:

@@ -70,7 +70,7 @@ class SensorInfo:
     name : str
         Name for ``Perceiver(sensor=...)``.
     beams, columns : int
-        Beams, and azimuth steps in one turn.
+        Beams, and azimuth steps in one turn; of a sensor that does not spin, those of one that would show as much.
     field_of_view_deg : tuple of 2 float
         Elevation of the lowest and the highest beam [deg].
     remission_range : tuple of 2 float
@@ -79,6 +79,8 @@ class SensorInfo:
         Nearest and farthest return [m].
     rendered_as : str or None
         Sensor whose remission scale the remission is mapped to; None if it is only scaled to 0..1.
+    accumulate_s : float or None
+        Time over which a scan is gathered of a sensor that does not spin [s]; None if it spins.
     """
 
     name: str
@@ -88,6 +90,7 @@ class SensorInfo:
     remission_range: tuple[float, float]
     range_m: tuple[float, float]
     rendered_as: str | None
+    accumulate_s: float | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -163,6 +166,7 @@ def sensors() -> tuple[SensorInfo, ...]:
             remission_range=profile.remission_range,
             range_m=(profile.min_range_m, profile.max_range_m),
             rendered_as=None if profile.remission is None else profile.remission.to,
+            accumulate_s=None if profile.pattern is None else profile.pattern.accumulate_s,
         )
         for profile in SENSORS.values()
     )

@@ -159,22 +159,24 @@ def _findings(scan: Measures | None, profile: FitnessProfile, sensor: SensorProf
     if scan is None:
         return (Finding("The scan holds no finite point: is the sensor connected and its driver running?", True),)
     if scan.n_sampled < 300.0 and scan.points_in_view < 0.2 * profile.points_in_view[0]:
-        return (_too_few(scan, profile),)  # too few points for the other checks
+        return (_too_few(scan, profile, sensor),)  # too few points for the other checks
     findings = _geometry_findings(scan, profile, sensor)
     if sensor.remission is None or any(sensor.remission.coefficients[1:]):
         findings += _remission_findings(scan, profile, sensor)
     return tuple(findings)
 
 
-def _too_few(scan: Measures, profile: FitnessProfile) -> Finding:
-    fewest = profile.points_in_view[0]
+def _too_few(scan: Measures, profile: FitnessProfile, sensor: SensorProfile) -> Finding:
+    fewest, pattern = profile.points_in_view[0], sensor.pattern
+    share = 1.0 if pattern is None else min(1.0, pattern.points_per_s * pattern.accumulate_s / _PULSES)
     return Finding(
         f"The model's view holds about {scan.points_in_view:.0f} points, in training it held at least {fewest:.0f}: is "
         "the scan complete, and the sensor clean?",
-        scan.points_in_view < fewest / 20.0,
+        scan.points_in_view < share * fewest / 20.0,
     )
 
 
+_PULSES = 130_000  # of a turn of the training sensor; a scan that is gathered for a short time has fewer
 _NEARLY_ALL = 10  # near points for each that is left; also empty beams may be more than the returns
 _USUAL_M = 9.0  # median distance in a street
 
@@ -276,7 +278,7 @@ def _geometry_findings(scan: Measures, profile: FitnessProfile, sensor: SensorPr
         _cropped(scan, profile) or _turned(scan, profile),
         _room(scan, profile) or walls,
         _few_rows(scan, profile, sensor, has_ground),
-        _other_number(scan, profile),
+        _other_number(scan, profile, sensor),
     )
     return [finding for finding in found if finding is not None]
 
@@ -497,10 +499,10 @@ def _few_rows(scan: Measures, profile: FitnessProfile, sensor: SensorProfile, ha
     )
 
 
-def _other_number(scan: Measures, profile: FitnessProfile) -> Finding | None:
+def _other_number(scan: Measures, profile: FitnessProfile, sensor: SensorProfile) -> Finding | None:
     fewest, most = profile.points_in_view
     if scan.points_in_view < 0.2 * fewest:
-        return _too_few(scan, profile)
+        return _too_few(scan, profile, sensor)
     if scan.points_in_view <= 5.0 * most:
         return None
     return Finding(

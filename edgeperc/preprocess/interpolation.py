@@ -27,6 +27,9 @@ GROUND_PER_M = 0.02  # of range; neither the sensor nor the road is exactly leve
 GROUND_SLOPE = 0.1
 # Neighboring beams or columns that are at most this many pixels apart leave no gap to fill.
 NO_GAP = 1.1
+# Points of a pattern lie at random, not on beams: the next one in a row may be so many columns away. With 2, as with 8,
+# mean IoU is 0 to 6 points lower on twelve streets (Mid-360 of 0.2 and 0.5 s, HAP, Avia).
+_SCATTER = 4.0
 
 
 class Interpolator:
@@ -55,13 +58,17 @@ class Interpolator:
         self._directions = np.stack([np.cos(azimuths), np.sin(azimuths)])
         self._ground_z = -MODEL_HEIGHT_M
         # Row coordinates of the beams; then, for each row, how many rows below it the next beam's return may be.
-        places = np.interp(-np.array(sensor.elevations_deg), -rows, np.arange(len(rows)), left=-1.0, right=len(rows))
+        beams = np.array(sensor.elevations_deg)
+        if sensor.pattern is not None:  # such beams may be anywhere, however it is mounted
+            step_deg = (sensor.fov_up_deg - sensor.fov_down_deg) / (sensor.n_beams - 1)
+            beams = step_deg * np.arange(math.floor(90.0 / step_deg), -math.ceil(90.0 / step_deg), -1)
+        places = np.interp(-beams, -rows, np.arange(len(rows)), left=-1.0, right=len(rows))
         self._row_reach = np.zeros(len(rows), np.int64)
         for upper, lower in pairwise(places.tolist()):
             if lower - upper > NO_GAP and upper >= 0.0 and lower < len(rows):
                 between = self._row_reach[math.floor(upper) : math.ceil(lower) + 1]
                 between[:] = np.maximum(between, math.ceil(lower - upper) + 1)
-        step = sensor.azimuth_resolution_deg / column_deg
+        step = (1.0 if sensor.pattern is None else _SCATTER) * sensor.azimuth_resolution_deg / column_deg
         self._col_reach = math.floor(step) + 1 if step > NO_GAP else 0
         self.shape = (view.height, view.width)
         self.needed = bool(self._row_reach.any() or self._col_reach)

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from ..errors import SensorError
 from ..system.kernels import njit
 from ..types.points import Points
-from ..types.sensor import SENSORS, SensorProfile
+from ..types.sensor import SAY_PATTERN, SENSORS, SensorProfile
 
 __all__ = ["MOST_SCANS", "SensorEstimate", "compile_votes", "estimate_sensor", "fill_votes", "has_enough_points"]
 
@@ -71,6 +71,7 @@ _COLUMNS_OFF = 0.25  # another rate of turning
 _DENSEST, _LEAST_STEP_DEG = 8, 0.02  # beams whose azimuths are looked at; two returns of one ray are nearer
 
 _SECTOR_DEG = 5
+_OUTSIDE, _LEAST_SEEN = 0.002, 0.6  # share of points outside of a field of view; of its width that has points
 _FEWEST_SECTORS = 54  # of 72, of a sensor that is not known
 _ADVICE = (
     "pass sensor= (on the command line --sensor) with a name of edgeperc sensors, or a profile: "
@@ -206,8 +207,8 @@ def estimate_sensor(scans: Sequence[Points]) -> SensorEstimate:
     if on_beams < least:
         raise _unknown(
             f"no beams stand out in its {n_points:,} points: {len(beams.slopes)} explain {max(on_beams, 0.0):.0%} of "
-            "them. Points of a solid-state or non-repeating sensor, of several sensors, about another place than the "
-            "sensor or along other axes, and thinned ones have no beams"
+            f"them. {_patterns_of(polar)}Points of several sensors, about another place than the sensor or along other "
+            "axes, and thinned ones have no beams"
         )
     if match.part_of:
         raise _unknown(
@@ -240,6 +241,28 @@ def estimate_sensor(scans: Sequence[Points]) -> SensorEstimate:
         nearest_m=round(float(np.quantile(ranges, 0.001)), 2),
         blind_deg=blind,
     )
+
+
+def _patterns_of(polar: Sequence[Polar]) -> str:
+    """What to say of points without beams: which sensors that do not spin have such a field of view."""
+    elevation = np.degrees(np.concatenate([np.arctan2(each.z, each.flat) for each in polar]))
+    low, high = np.quantile(elevation, (_OUTSIDE, 1.0 - _OUTSIDE))
+    seen_deg = 360.0 - sum(end - start for start, end in _blind(np.concatenate([each.azimuth for each in polar])))
+    fitting = [
+        name
+        for name, profile in SENSORS.items()
+        if profile.pattern is not None
+        and _LEAST_SEEN * profile.pattern.width_deg <= seen_deg <= profile.pattern.width_deg + 2.0 * _SECTOR_DEG
+        and any(bottom - 1.0 <= low and high <= top + 1.0 for bottom, top in _both_ways(profile))
+    ]
+    which = f", by the field of view {' or '.join(fitting)}" if fitting else ""
+    return f"They may be of a solid-state or non-repeating sensor{which}. {SAY_PATTERN}. "
+
+
+def _both_ways(profile: SensorProfile) -> tuple[tuple[float, float], ...]:
+    """Lowest and highest elevation [deg], upright and upside down."""
+    bottom, top = profile.fov_down_deg, profile.fov_up_deg
+    return (bottom, top), (-top, -bottom)
 
 
 def has_enough_points(scan: Points) -> bool:
@@ -580,7 +603,7 @@ def _match(beams: Beams) -> Match:
     """The built-in sensor with these beams, also upside down, or the one that has them and many more."""
     found, n = [Match()], len(beams.slopes)
     for name, profile in SENSORS.items():
-        known = np.array(profile.elevations_deg)
+        known = np.array(profile.elevations_deg if profile.pattern is None else ())
         if not 0 < n <= len(known):
             continue
         for way in (1.0, -1.0):

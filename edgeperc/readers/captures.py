@@ -18,7 +18,7 @@ from .bags import bag_files
 from .files import FileOptions, read_points, read_timed_file
 from .identify import KnownSensor, of_cloud, of_livox, of_metadata, of_packets, of_velodyne
 from .packets import LVX_MAGIC, PCAP_MAGIC
-from .times import TimedScan
+from .times import TimedScan, accumulate
 
 SCAN_SUFFIXES = (".bin", ".npy", ".npz", ".pcd", ".ply")
 CAPTURE_SUFFIXES = (".bag", ".db3", ".lvx2", ".mcap", ".osf", ".pcap", ".pcapng")
@@ -41,6 +41,7 @@ def read_scans(
     remission_field: str | None = None,
     columns: int | Sequence[str] | None = None,
     origin_m: Sequence[float] | Literal["auto"] | None = None,
+    accumulate_s: float | None = None,
 ) -> Iterator[tuple[float | None, NDArray[np.float32]]]:
     """Read the scans of a recording, one after another; `read_timed_scans` gives the times of their points too.
 
@@ -67,6 +68,9 @@ def read_scans(
         What scan files without a header hold, as in `edgeperc.read_points`.
     origin_m : sequence of 3 float or "auto", optional
         Place of the sensor in the map of scan files, as in `edgeperc.read_points`.
+    accumulate_s : float, optional
+        Time over which each scan is gathered, of a sensor that does not spin [s] (`edgeperc.accumulate`, which takes
+        its motion out, too). By default, scans are as they are stored.
 
     Yields
     ------
@@ -91,8 +95,10 @@ def read_scans(
     UserWarning
         Damaged packets of an Ouster capture were dropped; the message has their number.
     """
-    options = _Options(topic, FileOptions(columns, remission_field, origin_m), times=False)
-    return ((stamp_s, points) for stamp_s, points, _ in _scans(Path(source), options))
+    options = _Options(topic, FileOptions(columns, remission_field, origin_m), times=accumulate_s is not None)
+    scans = _scans(Path(source), options)
+    gathered = scans if accumulate_s is None else accumulate(scans, accumulate_s)
+    return ((stamp_s, points) for stamp_s, points, _ in gathered)
 
 
 def read_timed_scans(
@@ -102,12 +108,13 @@ def read_timed_scans(
     remission_field: str | None = None,
     columns: int | Sequence[str] | None = None,
     origin_m: Sequence[float] | Literal["auto"] | None = None,
+    accumulate_s: float | None = None,
 ) -> Iterator[TimedScan]:
     """Like `read_scans`, with the time of each point, where the source holds it, for `edgeperc.deskew`.
 
     Parameters
     ----------
-    source, topic, remission_field, columns, origin_m
+    source, topic, remission_field, columns, origin_m, accumulate_s
         As in `read_scans`.
 
     Yields
@@ -127,7 +134,8 @@ def read_timed_scans(
         As `read_scans`. PointsError also if the times contradict the stamps of the scans, or if the azimuths turn once
         in a time that no LiDAR takes for a turn: below 33 ms, or above 350 ms.
     """
-    return _scans(Path(source), _Options(topic, FileOptions(columns, remission_field, origin_m), times=True))
+    scans = _scans(Path(source), _Options(topic, FileOptions(columns, remission_field, origin_m), times=True))
+    return scans if accumulate_s is None else accumulate(scans, accumulate_s)
 
 
 class _Options(NamedTuple):

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..errors import PointsError, SensorError
-from ..types.sensor import SENSORS, SensorProfile
+from ..types.sensor import SAY_PATTERN, SENSORS, SensorProfile
 from .clouds import is_ouster_cloud
 from .ouster import check_metadata, metadata_beside, read_metadata
 from .packets import velodyne_name, velodyne_packets, velodyne_senders
@@ -74,14 +74,13 @@ def of_packets(path: Path, topic: str | None = None) -> KnownSensor:
 
 
 class NotSpinningError(SensorError):
-    """The sensor is known, and makes no turns that could be perceived."""
+    """The sensor makes no turns, and must be named: its scans are gathered over time."""
 
 
 def of_livox() -> NotSpinningError:
     """What to say of Livox' sensors."""
     return NotSpinningError(
-        "the points are of a Livox sensor, which does not spin. edgeperc.read_scans reads them, but the models know "
-        f"turns of spinning sensors alone, and no profile is built in. {_CHOICES}"
+        f"the points are of a Livox sensor, which does not spin, and do not say of which model. {SAY_PATTERN}"
     )
 
 

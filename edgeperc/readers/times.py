@@ -5,13 +5,17 @@ from __future__ import annotations
 import statistics
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import PointsError
+from ..errors import OptionError, PointsError, StampError
 from ..types.points import Points
+from ..types.sensor import MAX_ACCUMULATE_S, MIN_ACCUMULATE_S
+
+if TYPE_CHECKING:
+    from ..preprocess.motion import Motion, Trajectory
 
 # Best first: of Ouster's and Velodyne's drivers, of Hesai's, RoboSense's and Livox', of others.
 _NAMES = ("t", "time", "timestamp", "timestamps", "time_stamp", "offset_time", "time_offset", "time_offset_ns")
@@ -31,6 +35,8 @@ _DAMAGED_SHARE, _DAMAGED_DISTANCE = 0.01, 1.0
 
 # A scan lasts no longer than it takes to the next one; stamps jitter.
 _LONGEST_OF_INTERVAL, _INTERVALS = 1.5, 9
+
+_WHOLE = 0.9  # share of the time over which a scan is gathered that its points must span
 
 
 class TimedScan(NamedTuple):
@@ -148,3 +154,89 @@ def of_plausible_duration(scans: Iterable[TimedScan]) -> Iterator[TimedScan]:
                     "--deskew, or pass the times in seconds to edgeperc.deskew"
                 )
         yield scan
+
+
+def accumulate(
+    scans: Iterable[TimedScan],
+    accumulate_s: float,
+    motion: Motion | Trajectory | None = None,
+    *,
+    min_range_m: float = 0.0,
+) -> Iterator[TimedScan]:
+    """Gather the scans of a sensor that does not spin: with each one, the points of the last tenths of a second.
+
+    Parameters
+    ----------
+    scans : iterable of TimedScan
+        In the order of time, such as those of `edgeperc.read_timed_scans`. Points without times of their own count as
+        taken at the stamp of their scan.
+    accumulate_s : float
+        How long a scan is gathered [s].
+    motion : Motion or Trajectory, optional
+        Motion of the sensor, constant or by its poses. It is taken out (`edgeperc.deskew`), so that the points are
+        where a sensor that stands still at the last of them would have seen them. None: the sensor stands still. If it
+        moves all the same, what it saw earlier lies beside what it saw later, by 1 m at 10 m/s and 0.1 s.
+    min_range_m : float
+        As in `edgeperc.deskew`.
+
+    Yields
+    ------
+    stamp_s : float or None
+        Of the last scan.
+    points : (n, 4) float32
+        From the oldest to the newest.
+    times_s : (n,) float64
+        As recorded. The scans at the beginning, and those after a step back of the clock, come when they span the time;
+        of a shorter recording, all together come at its end.
+
+    Raises
+    ------
+    StampError
+        A scan has neither times nor a stamp, or no pose of a trajectory is near its times.
+    OptionError
+        ``accumulate_s`` is not 0.01 to 10 s, or ``motion`` is neither.
+    """
+    from ..preprocess.motion import Motion, Trajectory, deskew  # numba, which bags do without
+
+    if not (isinstance(accumulate_s, int | float) and MIN_ACCUMULATE_S <= accumulate_s <= MAX_ACCUMULATE_S):
+        raise OptionError(
+            f"accumulate_s is {accumulate_s!r:.80}; expected {MIN_ACCUMULATE_S} to {MAX_ACCUMULATE_S:g} s"
+        )
+    if not isinstance(motion, Motion | Trajectory | None):
+        raise OptionError(f"motion is {motion!r:.200}; expected a Motion, a Trajectory or None")
+
+    def joined(stamp_s: float | None) -> TimedScan:
+        points, times_s = np.concatenate([each[0] for each in kept]), np.concatenate([each[1] for each in kept])
+        recent = ~(times_s <= end_s - accumulate_s)
+        points, times_s = points[recent], times_s[recent]
+        if motion is not None:
+            constant = motion if isinstance(motion, Motion) else motion.motion(float(np.nanmin(times_s)), end_s)
+            points = deskew(points, times_s, constant, at_s=end_s, min_range_m=min_range_m)
+        return TimedScan(stamp_s, points, times_s)
+
+    kept = deque[tuple[Points, NDArray[np.float64], float]]()
+    begin_s = end_s = 0.0
+    last: float | None = None
+    is_waiting = False
+    for stamp_s, points, times_s in scans:
+        if times_s is None:
+            if stamp_s is None:
+                raise StampError(
+                    "a scan has neither times of its points nor a stamp; expected one of them to gather by"
+                )
+            times_s = np.full(len(points), stamp_s)
+        if not np.isfinite(times_s).any():
+            continue
+        first_s, newest_s = float(np.nanmin(times_s)), float(np.nanmax(times_s))
+        if not kept or newest_s < end_s:
+            kept.clear()
+            begin_s, is_waiting = first_s, True
+        kept.append((points, times_s, newest_s))
+        end_s, last = newest_s, stamp_s
+        while kept[0][2] <= end_s - accumulate_s:
+            kept.popleft()
+        if end_s - begin_s >= _WHOLE * accumulate_s:
+            yield joined(stamp_s)
+            is_waiting = False
+    if is_waiting:
+        yield joined(last)

@@ -128,7 +128,7 @@ def render(
     elevations = np.arctan(slopes * np.cos(azimuths)[:, None])
     for column, sector in enumerate(sectors.tolist()):
         key = np.uint64(first_key + column * height)
-        rays = Rays(elevations[column], azimuths[column : column + 1], max_range_m, key)
+        rays = Rays(elevations[column][:, None], azimuths[column : column + 1], max_range_m, key)
         part = shapes._replace(starts=shapes.starts[sector : sector + 2])
         fill_cast(part, scene.ground, pose, rays, Hits(*(of[column] for of in found)))
     ranges, hits, _, cosines = (np.ascontiguousarray(of[:, :, 0].T) for of in found)

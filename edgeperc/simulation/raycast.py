@@ -41,18 +41,19 @@ class Ground(NamedTuple):
 
 
 class Shapes(NamedTuple):
-    """Primitives in the sensor frame, nearest first, and those that the rays of each column may hit."""
+    """Primitives in the sensor frame, nearest first, and those that the rays of each sector of the turn may hit."""
 
     primitives: NDArray[np.float64]  # (n, 20)
     bounds: NDArray[np.float64]  # (n, 5), from `fill_bounds`
-    starts: NDArray[np.int64]  # (columns + 1,), where each column's list begins in `rows`
+    starts: NDArray[np.int64]  # (sectors + 1,), where each sector's list begins in `rows`
     rows: Rows  # rows of `primitives`
 
 
 class Rays(NamedTuple):
     """The rays of a sensor at the origin: one for each beam and column."""
 
-    elevations: NDArray[np.float64]  # (beams,), top to bottom [rad]
+    # (beams, 1), or (beams, columns) where those of a beam differ; in each column from top to bottom [rad].
+    elevations: NDArray[np.float64]
     azimuths: NDArray[np.float64]  # (columns,) [rad]
     reach: float  # length [m]
     key: np.uint64  # seed of all draws
@@ -429,25 +430,31 @@ def fill_cast(shapes: Shapes, ground: Ground, T_world_sensor: NDArray[np.float64
     T = T_world_sensor
     n_beams, n_columns = rays.elevations.shape[0], rays.azimuths.shape[0]
     tangents = np.tan(rays.elevations)
+    differ = 1 if tangents.shape[1] > 1 else 0
+    n_sectors = shapes.starts.shape[0] - 1
+    lowest = 0.0
+    for column in range(tangents.shape[1]):
+        lowest = min(lowest, tangents[n_beams - 1, column])
     # Radii of ground samples start inside the ring of the lowest beam and grow by 3 %: at 30 m, by a third of the
     # distance between two rings.
     height = _height_above(ground, T, 0.0, 0.0, 0.0)
-    innermost = min(max(0.3, 0.4 * height / max(-tangents[n_beams - 1], 0.05)), 5.0)
+    innermost = min(max(0.3, 0.4 * height / max(-lowest, 0.05)), 5.0)
     n_radii = int(math.log(max(rays.reach / innermost, 2.0)) / math.log(1.03)) + 2
     radii, heights = np.empty(n_radii), np.empty(n_radii)
     for i in range(n_radii):
         radii[i] = innermost * 1.03**i
     for column in range(n_columns):
         level = math.cos(rays.azimuths[column]), math.sin(rays.azimuths[column])
+        sector = math.floor(rays.azimuths[column] * (n_sectors / (2.0 * math.pi))) % n_sectors
         _fill_profile(ground, T, level, radii, heights)
         # Higher beams meet the ground no nearer than lower ones, so one pass over the radii is enough for all beams.
         i = 0
         for b in range(n_beams - 1, -1, -1):
-            tan = tangents[b]
+            tan, elevation = tangents[b, differ * column], rays.elevations[b, differ * column]
             while i < n_radii and heights[i] < radii[i] * tan:
                 i += 1
-            ce = math.cos(rays.elevations[b])
-            direction = ce * level[0], ce * level[1], math.sin(rays.elevations[b])
+            ce = math.cos(elevation)
+            direction = ce * level[0], ce * level[1], math.sin(elevation)
             best, row, leave, cosine = rays.reach, _NOTHING, rays.reach, 0.0
             if i < n_radii:
                 r = _ground_radius(ground, T, level, tan, radii, heights, i)
@@ -456,7 +463,7 @@ def fill_cast(shapes: Shapes, ground: Ground, T_world_sensor: NDArray[np.float64
                     rise = _ground_rise(ground, T, level, tan, r)
                     row, cosine = _GROUND, abs(rise * ce - direction[2]) / math.sqrt(1.0 + rise * rise)
             ray = mixed_bits(np.uint64(rays.key + np.uint64(b * n_columns + column)))
-            nearer, k, exit, face = _first_shape(shapes, column, direction, tan, ray, best)
+            nearer, k, exit, face = _first_shape(shapes, sector, direction, tan, ray, best)
             if k >= 0:
                 best, row, leave = nearer, k, exit
                 cosine = 0.7 if face < 0 else _cosine(shapes.primitives[k], face, best, *direction)
@@ -534,11 +541,11 @@ def _ground_rise(ground: Ground, T: NDArray[np.float64], level: tuple[float, flo
 
 @njit(cache=True, nogil=True)
 def _first_shape(
-    shapes: Shapes, column: int, direction: tuple[float, float, float], tan: float, ray: np.uint64, reach: float
+    shapes: Shapes, sector: int, direction: tuple[float, float, float], tan: float, ray: np.uint64, reach: float
 ) -> tuple[float, int, float, int]:
     """Find the first primitive that a ray hits within ``reach`` [m]: range, row (-2: none), exit [m], face."""
     best, row, leave_best, face_best = reach, _NOTHING, reach, -1
-    for e in range(shapes.starts[column], shapes.starts[column + 1]):
+    for e in range(shapes.starts[sector], shapes.starts[sector + 1]):
         k = shapes.rows[e]
         if shapes.bounds[k, 4] >= best:
             break
@@ -644,9 +651,9 @@ def fill_points(
     Returns n: Number of returns.
     """
     n_beams, n_columns = hits.rows.shape
+    differ = 1 if rays.elevations.shape[1] > 1 else 0
     n = 0
     for b in range(n_beams):
-        ce, se = math.cos(rays.elevations[b]), math.sin(rays.elevations[b])
         for column in range(n_columns):
             k, t = hits.rows[b, column], hits.ranges[b, column]
             if k == _NOTHING or not math.isfinite(t):
@@ -658,10 +665,11 @@ def fill_points(
             spread = normal_draw(ray)
             ray = mixed_bits(ray)
             other = uniform_draw(ray)
-            azimuth, elevation = rays.azimuths[column], rays.elevations[b]
+            azimuth, elevation = rays.azimuths[column], rays.elevations[b, differ * column]
             if receiver.ego_shadow and _in_ego_shadow(azimuth + 0.01 * spread, elevation + 0.016 * (other - 0.5)):
                 continue
-            direction = ce * math.cos(azimuth), ce * math.sin(azimuth), se
+            ce = math.cos(elevation)
+            direction = ce * math.cos(azimuth), ce * math.sin(azimuth), math.sin(elevation)
             cosine, leave, o = hits.cosines[b, column], hits.exits[b, column], -1
             if k == _GROUND:
                 echo = _ground_echo(ground, T_world_sensor, direction, t, cosine)

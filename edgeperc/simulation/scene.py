@@ -14,7 +14,7 @@ from ..types.choices import STATIC
 from ..types.geometry import draw_footprints, wrapped
 from ..types.perception import Box
 from ..types.points import Labels, Points
-from ..types.sensor import SensorProfile, get_sensor
+from ..types.sensor import ScanPattern, SensorProfile, get_sensor
 from ..types.views import TopViewGeometry
 from .raycast import (
     Ground,
@@ -36,6 +36,7 @@ POINT_CLASSES = ("background", "car", "pedestrian", "cyclist")
 # Classes of what a street is made of; the background is what is none of the others, such as walls and fences.
 SCENE_CLASSES = (*POINT_CLASSES, *STATIC)
 TOP_VIEW_CLASSES = ("background", "drivable", "car", "van", "truck")
+_SECTORS = 1800  # of the shapes that rays of a pattern may hit
 # Point class of an object: PointSeg's car includes all vehicles. KITTI also labels sitting people. Trams and "misc"
 # objects (trailers, parked motorcycles) belong to no class: real labels ignore their points.
 POINT_CLASS_OF = {"car": 1, "van": 1, "truck": 1, "pedestrian": 2, "person_sitting": 2, "cyclist": 3}
@@ -215,6 +216,8 @@ def simulate(
     max_range_m: float = 80.0,
     noise: bool = True,
     ego_shadow: bool = True,
+    start_s: float = 0.0,
+    duration_s: float | None = None,
 ) -> SimulatedScan:
     """Simulate one scan.
 
@@ -234,6 +237,10 @@ def simulate(
     ego_shadow : bool
         Whether the ego vehicle hides some directions of the lower beams, as on KITTI's car. Ignored if ``noise`` is
         False.
+    start_s, duration_s : float
+        Of a sensor with a `ScanPattern`: when the scan begins, which decides its directions, and how long it is
+        gathered from this one place [s]; by default as long as its profile says. A moving sensor gathers several short
+        scans (`simulate_sequence`).
 
     Returns
     -------
@@ -249,20 +256,24 @@ def simulate(
     if pose.shape != (4, 4) or not np.isfinite(pose).all():
         raise PointsError(f"T_world_sensor has shape {pose.shape}; expected a finite (4, 4) matrix")
     rng = np.random.default_rng((int(seed) & 0x7FFFFFFFFFFFFFFF, 7919))
-    n_beams, n_columns = profile.n_beams, profile.columns
-    step = 2.0 * math.pi / n_columns
-    azimuths = np.arange(n_columns, dtype=np.float64) * np.float64(step)
+    if profile.pattern is None:
+        n_beams, n_columns = profile.n_beams, profile.columns
+        step = 2.0 * math.pi / n_columns
+        azimuths = np.arange(n_columns, dtype=np.float64) * np.float64(step)
+        elevations = np.radians(np.asarray(profile.elevations_deg))[:, None]
+    else:
+        azimuths, elevations = _pattern_rays(profile, profile.pattern, start_s, duration_s)
+        n_beams, n_columns = elevations.shape
     range_offsets, remission_offsets = np.zeros(n_beams), np.zeros(n_beams)
-    if noise:
+    if noise and profile.pattern is None:
         azimuths += rng.normal(0.0, 0.08, n_columns) * step
         # Measured: points on a flat road are 0.008 m off their neighbors of the same beam; beams differ by more.
         range_offsets = rng.normal(0.0, 0.012, n_beams)
         # Measured: the mean remission of the road differs by 0.08 between beams; a few beams return almost none.
         remission_offsets = np.clip(rng.normal(-0.01, 0.075, n_beams), -0.25, 0.1)
-    elevations = np.radians(np.asarray(profile.elevations_deg))
     reach = min(float(max_range_m), profile.max_range_m)
 
-    shapes = place_shapes(scene, pose, n_columns, reach)
+    shapes = place_shapes(scene, pose, _SECTORS if profile.pattern else n_columns, reach)
     shape = (n_beams, n_columns)
     hits = Hits(np.empty(shape), np.empty(shape, np.int32), np.empty(shape), np.empty(shape))
     rays = Rays(elevations, azimuths, reach, np.uint64(rng.integers(0, 2**63)))
@@ -288,6 +299,25 @@ def simulate(
         T_world_sensor=pose,
         scene=scene,
     )
+
+
+def _pattern_rays(
+    profile: SensorProfile, pattern: ScanPattern, start_s: float, duration_s: float | None
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Azimuths (n,) and elevations (1, n) of a pattern [rad], in the order of time.
+
+    A sensor that sees all around turns while its beam goes up and down. Others look through two prisms that turn at
+    different rates, so that the beam draws a rosette.
+    """
+    duration_s = pattern.accumulate_s if duration_s is None else duration_s
+    first = round(start_s * pattern.points_per_s)
+    times = np.arange(first, first + round(duration_s * pattern.points_per_s)) / pattern.points_per_s
+    a, b = (2.0 * math.pi * ((turns_hz * times) % 1.0) for turns_hz in pattern.turns_hz)
+    middle, half = (math.radians(profile.fov_up_deg + sign * profile.fov_down_deg) / 2.0 for sign in (1, -1))
+    if pattern.width_deg == 360.0:
+        return a, (middle + half * (np.abs(b / math.pi - 1.0) * 2.0 - 1.0))[None]
+    across, up = (np.cos(a) + np.cos(b)) / 2.0, (np.sin(a) + np.sin(b)) / 2.0
+    return math.radians(pattern.width_deg) / 2.0 * across, (middle + half * up)[None]
 
 
 def place_shapes(scene: Scene, T_world_sensor: NDArray[np.float64], n_columns: int, reach_m: float) -> Shapes:
@@ -322,6 +352,9 @@ def simulate_sequence(
 ) -> Iterator[tuple[float, NDArray[np.float64], SimulatedScan]]:
     """Simulate scans of a sensor that moves along the scene's first road, from the origin.
 
+    Each is taken from one place. That of a sensor with a pattern lasts until the next one, so a high rate shows how
+    motion bends what is gathered.
+
     Yields T_world_sensor: (4, 4) float64.
     Yields scan: ``scan.box_ids`` identify objects across scans.
     """
@@ -334,7 +367,8 @@ def simulate_sequence(
         chord = way * float(np.sinc(turn / (2.0 * math.pi)))
         x, y = chord * math.cos(heading + turn / 2.0), chord * math.sin(heading + turn / 2.0)
         T_world_sensor = sensor_pose(scene, sensor, x, y, yaw=heading + turn)
-        yield stamp_s, T_world_sensor, simulate(scene.at(stamp_s), sensor, seed + k, T_world_sensor)
+        scan = simulate(scene.at(stamp_s), sensor, seed + k, T_world_sensor, start_s=stamp_s, duration_s=1.0 / rate_hz)
+        yield stamp_s, T_world_sensor, scan
 
 
 def _box_in_sensor(each: SceneObject, T_world_sensor: NDArray[np.float64]) -> Box:

@@ -296,6 +296,29 @@ def test_only_scans_of_a_coarser_sensor_are_interpolated() -> None:
     assert Interpolator(VIEW, replace(fine, columns=1024)).needed
 
 
+@pytest.mark.parametrize("name", ["mid-360", "hap", "avia"])
+def test_points_that_lie_at_random_are_joined_however_the_sensor_is_mounted(name: str) -> None:
+    """A wall ahead, seen by as many points as the sensor has in its time, is filled but for a few pixels."""
+    sensor = get_sensor(name)
+    assert sensor.pattern is not None
+    field_deg2 = sensor.pattern.width_deg * (sensor.fov_up_deg - sensor.fov_down_deg)
+    n = int(90.0 * 26.0 * sensor.pattern.points_per_s * sensor.pattern.accumulate_s / field_deg2)
+    rng = np.random.default_rng(0)
+    azimuth, elevation = np.radians(rng.uniform(-45.0, 45.0, n)), np.radians(rng.uniform(-24.0, 2.0, n))
+    wall = np.column_stack(
+        [np.full(n, 10.0), 10.0 * np.tan(azimuth), 10.0 * np.tan(elevation) / np.cos(azimuth), np.full(n, 0.5)]
+    ).astype(np.float32)
+    index = project(wall)
+    interpolator = Interpolator(VIEW, sensor)
+    assert interpolator.needed
+    filled = interpolator.fill(wall, index)[1] >= 0
+    assert filled.mean() > 0.9
+    turned = replace(sensor, elevations_deg=tuple(-deg for deg in reversed(sensor.elevations_deg)))
+    np.testing.assert_array_equal(Interpolator(VIEW, turned).fill(wall, index)[1] >= 0, filled)
+    spun = replace(sensor, pattern=None, elevations_deg=tuple(np.linspace(2.0, -24.0, sensor.n_beams)))
+    assert (Interpolator(VIEW, spun).fill(wall, index)[1] >= 0).mean() < filled.mean()
+
+
 def project(points: np.ndarray, view: RangeImageGeometry = VIEW) -> np.ndarray:
     return RangeImageProjector(view, SPEC).project(points).index
 

@@ -61,7 +61,7 @@ def test_votes_are_those_of_the_twin(n: int) -> None:
     np.testing.assert_array_equal(found, votes(flat.tolist(), z.tolist(), offsets_m.tolist(), 0.9, 500))
 
 
-@pytest.mark.parametrize("name", SENSORS)
+@pytest.mark.parametrize("name", [name for name, profile in SENSORS.items() if profile.pattern is None])
 @pytest.mark.parametrize("order", ["as simulated", "shuffled"])
 def test_built_in_sensors_are_found(name: str, order: str) -> None:
     sensor = replace(SENSORS[name], remission_range=(0.0, 1.0))
@@ -200,6 +200,16 @@ OTHERS: dict[str, Callable[[], np.ndarray]] = {
 def test_what_cannot_be_told_is_refused(name: str) -> None:
     with pytest.raises(SensorError, match=f"{CANNOT_TELL}.*pass sensor="):
         estimate_sensor([OTHERS[name]().astype(np.float32)])
+
+
+@pytest.mark.parametrize("way", [1.0, -1.0], ids=["upright", "upside down"])
+@pytest.mark.parametrize("name", [name for name, profile in SENSORS.items() if profile.pattern is not None])
+def test_sensors_without_beams_are_named_by_their_field_of_view(name: str, way: float) -> None:
+    scan = simulated_scan(FIRST_SEED + 1, name).points * np.array([1.0, way, way, 1.0], np.float32)
+    with pytest.raises(
+        SensorError, match=rf"{CANNOT_TELL}.*non-repeating.*by the field of view {name}\b.*pass sensor="
+    ):
+        estimate_sensor([scan])
 
 
 def test_scans_of_two_sensors_are_refused() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -17,9 +18,10 @@ from test_packets import write_link
 
 import twins.packets
 from cli_helpers import run
-from edgeperc import PointsError, SensorError, read_scans, read_timed_scans, sensor_of
+from edgeperc import Motion, PointsError, SensorError, accumulate, deskew, read_scans, read_timed_scans, sensor_of
 from edgeperc.readers.livox_packets import LivoxStream, Points, fill_points, points_of
 from edgeperc.readers.times import TimedScan
+from edgeperc.simulation import random_scene, simulate
 from edgeperc.simulation.samples import simulated_scan
 
 KINDS = [(1, False), (2, False), (3, False), (0x11, False), (0, True), (1, True), (2, True), (3, True), (4, True)]
@@ -103,7 +105,8 @@ def test_a_livox_does_not_spin(tmp_path: Path, capsys: pytest.CaptureFixture[str
         with pytest.raises(SensorError, match="of a Livox sensor, which does not spin"):
             sensor_of(path)
         assert run("run", path) == 1
-        assert "does not spin" in capsys.readouterr().err
+        assert "which does not spin" in (said := capsys.readouterr().err)
+        assert "--sensor: mid-360, hap, avia" in said or "--sensor mid-360, hap, avia" in said
 
 
 def test_two_in_one_capture(tmp_path: Path) -> None:
@@ -174,3 +177,78 @@ def test_an_empty_file_is_refused(tmp_path: Path) -> None:
     path.write_bytes(b"")
     with pytest.raises(PointsError, match="cut short"):
         next(read_scans(path))
+
+
+@pytest.fixture(scope="module")
+def street() -> tuple[np.ndarray, np.ndarray]:
+    """Points of a Mid-360 in a street, 0.3 s of packets."""
+    points = np.resize(simulate(random_scene(2), "mid-360", 0, duration_s=1.0).points, (96 * 625, 4))
+    return points[:, :3].astype(np.float64), np.rint(255.0 * points[:, 3]).astype(np.int64)
+
+
+@pytest.mark.compiled
+@pytest.mark.filterwarnings("default::UserWarning")
+@pytest.mark.parametrize(
+    ("name", "options", "gathered_s"), [("a.pcap", [], 0.2), ("a.lvx2", ["--accumulate", 0.1], 0.1)]
+)
+def test_a_capture_without_turns_is_run_gathered(
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    street: tuple[np.ndarray, np.ndarray],
+    name: str,
+    options: list[object],
+    gathered_s: float,
+) -> None:
+    pytest.importorskip("onnxruntime")
+    packets, path = livox_packets(1, *street, False), tmp_path / name
+    path = write_pcap(path, packets) if name.endswith("pcap") else path
+    if name.endswith("lvx2"):
+        path.write_bytes(lvx2_file(packets))
+    given = ["--sensor", "mid-360", "--mount-height", 1.73, "--roll", 0, "--pitch", 0, "--json", *options]
+    assert run("run", path, *given) == 0
+    said = capsys.readouterr()
+    answers = [json.loads(line) for line in said.out.splitlines()]
+    assert f"the points of the last {gathered_s:g} s are taken as seen from one place" in said.err
+    expected = list(read_scans(path, accumulate_s=gathered_s))
+    assert [answer["n_points"] for answer in answers] == [len(points) for _, points in expected]
+    assert [answer["stamp_s"] for answer in answers] == [stamp_s for stamp_s, _ in expected]
+    assert len(expected) >= 2
+    assert np.mean([len(points) for _, points in expected]) > 0.9 * gathered_s * 200_000
+    assert any(answer["boxes"] for answer in answers)
+
+
+def test_gathered_captures_are_straightened_by_poses(tmp_path: Path, street: tuple[np.ndarray, np.ndarray]) -> None:
+    """The house's own way: the times of the points go with them, for `deskew` and ``--deskew``."""
+    path = write_pcap(tmp_path / "a.pcap", livox_packets(1, *street, False))
+    motion = Motion((10.0, 0.0, 0.0))
+    own, options = list(accumulate(read_timed_scans(path), 0.2, motion)), {"accumulate_s": 0.2}
+    for straight, (_, points, times_s) in zip(own, read_timed_scans(path, **options), strict=True):  # type: ignore[arg-type]
+        assert times_s is not None
+        np.testing.assert_array_equal(straight.points, deskew(points, times_s, motion))
+        assert np.abs(straight.points - points).max() == pytest.approx(10.0 * np.ptp(times_s), abs=0.01)
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--sensor", "vlp-16", "--accumulate", "0.2"], "sensor 'vlp-16' spins: each of its turns is a scan"),
+        (["--sensor", "mid-360", "--accumulate", "20"], "expected a number from 0.01 to 10"),
+        (["--sensor", "hap", "--accumulate", "0.001"], "expected a number from 0.01 to 10"),
+    ],
+)
+def test_what_is_not_gathered(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], options: list[str], said: str
+) -> None:
+    path = write_pcap(tmp_path / "a.pcap", livox_packets(1, *scene(96 * 300), False))
+    assert run("run", path, *options) == 2
+    assert said in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("options", [[], ["--sensor", "auto"], ["--sensor", "auto", "--live"]])
+def test_gathering_needs_the_name_of_the_sensor(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], options: list[str]
+) -> None:
+    path = write_pcap(tmp_path / "a.pcap", livox_packets(1, *scene(96 * 300), False))
+    with pytest.raises(SystemExit, match="2"):
+        run("run", path, "--accumulate", "0.2", *options)
+    assert "--accumulate needs --sensor with the name of one that does not spin" in capsys.readouterr().err

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from lidar_writers import T0_S, livox_packets
 from numpy.typing import NDArray
 from test_captures import write_pcap
 from test_motion import write_tum
@@ -21,9 +22,9 @@ from test_motion import write_tum
 import edgeperc
 import twins.motion
 from cli_helpers import run
-from edgeperc import Motion, deskew, read_timed_scans
+from edgeperc import Motion, TimedScan, Trajectory, accumulate, deskew, read_timed_scans
 from edgeperc.cli.straighten import Straightener
-from edgeperc.errors import PointsError
+from edgeperc.errors import OptionError, PointsError, StampError
 from edgeperc.readers.times import of_plausible_duration, point_times, time_name
 
 MOTION = Motion((18.0, 0.5, 0.0), (0.02, -0.03, 0.6))
@@ -475,3 +476,105 @@ def test_run_with_deskew(by: str, tmp_path: Path, capsys: pytest.CaptureFixture[
     assert len(off) == 3
     if by == "--poses":
         assert max(off) < 1e-3
+
+
+def parts_of(n: int, part_s: float = 0.1, k: int = 300) -> list[TimedScan]:
+    """Parts of what a moving sensor sees of the room, which is the frame of the last point."""
+    times = np.linspace(0.0, n * part_s, n * k, endpoint=False)
+    angle = 61.0 * times
+    directions = np.column_stack([np.cos(angle), np.sin(angle), 0.05 * np.cos(5 * angle)])
+    ranges = seen_from(times, float(times[-1]), directions)
+    points = np.column_stack([directions * ranges[:, None], np.full(len(times), 0.5)]).astype(np.float32)
+    parts = zip(np.split(points, n), np.split(times, n), strict=True)
+    return [TimedScan(float(moments[-1]), some, moments) for some, moments in parts]
+
+
+def true_trajectory() -> Trajectory:
+    times = np.linspace(-0.1, 1.1, 13)
+    return Trajectory(times, np.array([pose_at(t) for t in times]))
+
+
+@pytest.mark.parametrize("motion", [MOTION, true_trajectory()], ids=["motion", "trajectory"])
+@pytest.mark.parametrize("accumulate_s", [0.2, 0.5, 1.0])
+def test_gathered_scans_of_a_sensor_that_moves_are_straight(motion: Any, accumulate_s: float) -> None:
+    parts = parts_of(10)
+    *_, last = accumulate(parts, accumulate_s, motion)
+    assert last.stamp_s == parts[-1].stamp_s
+    assert len(last.points) == pytest.approx(3000 * accumulate_s, abs=1)
+    assert off_the_walls(last.points) < 2e-3
+    *_, bent = accumulate(parts, accumulate_s)
+    assert off_the_walls(bent.points) > 10.0 * accumulate_s
+
+
+@pytest.mark.compiled
+@pytest.mark.filterwarnings("default::UserWarning")
+@pytest.mark.parametrize("accumulate_s", [0.1, 0.2, 0.3])
+def test_a_livox_that_moves_is_run_straight(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], accumulate_s: float
+) -> None:
+    """Packets of 0.3 s in the room, gathered and straightened by poses."""
+    pytest.importorskip("onnxruntime")
+    times = T0_S + np.arange(96 * 625) / 200_000.0
+    angle = 211.0 * (times - T0_S)
+    directions = np.column_stack([np.cos(angle), np.sin(angle), 0.3 * np.sin(5.3 * angle)])
+    points = directions * seen_from(times, float(times[-1]), directions)[:, None]
+    path = write_pcap(tmp_path / "a.pcap", livox_packets(1, points, np.full(len(points), 99), False))
+    ends = times[-1] + np.linspace(-0.5, 0.1, 13)
+    write_tum(tmp_path / "poses.txt", ends, [pose_at(t - times[-1]) for t in ends])
+    given = ["--sensor", "mid-360", "--accumulate", accumulate_s, "--on-mismatch", "ignore", "--model", "pointseg"]
+    out = ["--deskew", "--poses", tmp_path / "poses.txt", "--ply", "--out", tmp_path / "out"]
+    assert run("run", path, *given, *out) == 0
+    assert "seen from one place" not in capsys.readouterr().err
+    last = edgeperc.read_points(sorted((tmp_path / "out").rglob("*.ply"))[-1])
+    assert len(last) == pytest.approx(200_000 * accumulate_s, rel=0.06)
+    assert off_the_walls(last) < 0.02
+
+
+@given(
+    gaps_s=st.lists(st.floats(0.01, 0.5), min_size=1, max_size=12),
+    counts=st.lists(st.integers(0, 6), min_size=12, max_size=12),
+    accumulate_s=st.floats(0.05, 1.0),
+    is_timed=st.booleans(),
+)
+def test_gathered_scans_have_the_points_of_that_time(
+    gaps_s: list[float], counts: list[int], accumulate_s: float, is_timed: bool
+) -> None:
+    stamps = np.cumsum(gaps_s).tolist()
+    scans, every = [], np.empty((0, 2))
+    for k, (stamp_s, n) in enumerate(zip(stamps, counts, strict=False)):
+        times = np.full(n, stamp_s)
+        scans.append(TimedScan(stamp_s, np.full((n, 4), k, np.float32), times if is_timed else None))
+        every = np.vstack([every, np.column_stack([times, np.full(n, k)])])
+    found = list(accumulate(scans, accumulate_s))
+    assert bool(found) == bool(sum(counts[: len(stamps)]))
+    for scan in found:
+        assert scan.times_s is not None
+        assert scan.stamp_s is not None
+        expected = every[(every[:, 0] <= scan.stamp_s) & (every[:, 0] > scan.stamp_s - accumulate_s)]
+        np.testing.assert_array_equal(np.column_stack([scan.times_s, scan.points[:, 0]]), expected)
+        assert len(expected) > 0
+
+
+def test_gathering_begins_anew_after_a_step_back_of_the_clock() -> None:
+    def scan(stamp_s: float) -> TimedScan:
+        return TimedScan(stamp_s, np.full((1, 4), stamp_s, np.float32), None)
+
+    found = [points[:, 0].tolist() for _, points, _ in accumulate(map(scan, (8.0, 8.5, 1.0, 1.5, 2.0)), 1.0)]
+    assert found == [[1.5, 2.0]]  # 1 s old is too old
+    found = [points[:, 0].tolist() for _, points, _ in accumulate(map(scan, (8.0, 8.5, 8.75)), 5.0)]
+    assert found == [[8.0, 8.5, 8.75]]  # shorter than the time: all at the end
+
+
+def test_what_cannot_be_gathered() -> None:
+    scan = TimedScan(None, np.ones((3, 4), np.float32), None)
+    with pytest.raises(StampError, match="neither times of its points nor a stamp"):
+        next(accumulate([scan], 0.5))
+    for value in (0.0, -1.0, 11.0, math.nan, "1"):
+        with pytest.raises(OptionError, match=r"accumulate_s is .*expected 0.01 to 10 s"):
+            next(accumulate([scan], value))  # type: ignore[arg-type]
+    for motion in ((1.0, 0.0, 0.0), np.eye(4), "poses.txt"):
+        with pytest.raises(OptionError, match=r"(?s)motion is .*expected a Motion, a Trajectory or None"):
+            next(accumulate([scan], 0.5, motion))  # type: ignore[arg-type]
+    with pytest.raises(StampError, match="expected poses around it"):
+        next(accumulate([TimedScan(7.0, np.ones((3, 4), np.float32), None)], 0.5, true_trajectory()))
+    assert list(accumulate([TimedScan(0.0, np.ones((2, 4), np.float32), np.full(2, np.nan))], 0.5)) == []

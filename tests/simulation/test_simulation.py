@@ -49,7 +49,7 @@ from edgeperc.simulation.street import SIZES, Street
 from edgeperc.types.choices import STATIC
 from edgeperc.types.mounting import Mounting
 from edgeperc.types.perception import Box
-from edgeperc.types.sensor import SensorProfile
+from edgeperc.types.sensor import SensorProfile, get_sensor
 from edgeperc.types.views import TopViewGeometry
 
 SMALL = SensorProfile.uniform("small", 24, 4.0, -24.0, columns=240)
@@ -145,7 +145,7 @@ def test_cast_is_its_twin(seed: int, tilt: float) -> None:
     azimuths = np.arange(20) * 2 * np.pi / 20
     elevations = np.sort(np.radians(rng.uniform(-24, 8, 6)))[::-1].copy()
     pose = sensor_pose(scene, SMALL, 1.0, 0.3, yaw=0.2, pitch=tilt, roll=-tilt)
-    rays = Rays(elevations, azimuths, 40.0, KEY)
+    rays = Rays(elevations[:, None], azimuths, 40.0, KEY)
     placed, (ranges, hits, exits, cosines) = cast(scene, pose, rays)
     slow_ranges, slow_hits = twins.simulation.cast(placed, scene, pose, *rays)
     # Where a ray all but grazes the ground, a kerb between two samples may be missed too.
@@ -179,7 +179,7 @@ def test_cast_without_shapes_and_with_shapes_that_are_not_finite() -> None:
     pose = sensor_pose(scene, SMALL)
     for beams, n_columns in (((-0.2,), 1), ((0.1, -0.1, -0.3), 5)):
         azimuths = np.arange(n_columns) * 2 * np.pi / n_columns
-        rays = Rays(np.array(beams), azimuths, 40.0, KEY)
+        rays = Rays(np.array(beams)[:, None], azimuths, 40.0, KEY)
         placed, found = cast(empty, pose, rays)
         slow_ranges, slow_hits = twins.simulation.cast(placed, empty, pose, *rays)
         np.testing.assert_array_equal(found[1], slow_hits)
@@ -188,7 +188,7 @@ def test_cast_without_shapes_and_with_shapes_that_are_not_finite() -> None:
     strange = np.stack([plate(8.0, (0.2, 30.0, 20.0), material=material) for material in (0, LEAVES, POROUS)])
     for k, column, value in ((0, 4, np.nan), (1, 5, np.inf), (2, 7, np.nan)):
         strange[k, column] = value
-    rays = Rays(np.array([0.0, -0.1]), np.arange(8) * np.pi / 4, 40.0, KEY)
+    rays = Rays(np.array([[0.0], [-0.1]]), np.arange(8) * np.pi / 4, 40.0, KEY)
     plain = cast(empty, pose, rays)[1]
     for got, wanted in zip(cast(replace(scene, primitives=strange), pose, rays)[1], plain, strict=True):
         np.testing.assert_array_equal(got, wanted)
@@ -245,7 +245,7 @@ def test_points_are_those_of_the_twin(seed: int, noise: bool) -> None:
     pose = sensor_pose(scene, around, 1.0, 0.2, yaw=0.1, pitch=0.01, roll=-0.01)
     for sensor, reach in ((around, 80.0), (SensorProfile("one", (-10.0,), 1), 80.0), (SMALL, 1.0)):
         azimuths = np.arange(0.0, 2 * np.pi, 2 * np.pi / sensor.columns)
-        rays = Rays(np.radians(sensor.elevations_deg), azimuths, reach, KEY)
+        rays = Rays(np.radians(sensor.elevations_deg)[:, None], azimuths, reach, KEY)
         placed, hits = cast(scene, pose, rays)
         hits.ranges[:1, ::7] = np.nan  # no return, whatever it hit
         receiver = Receiver(*rng.normal(0.0, 0.02, (2, sensor.n_beams)), 0.9, noise, noise)
@@ -683,3 +683,85 @@ def test_sequence() -> None:
         assert scan.boxes[0].center[0] == pytest.approx(15.0 + 0.8 * k - 0.5 * k)
         assert scan.box_points[0] > 0
     assert list(simulate_sequence(scene, SMALL, 0)) == []
+
+
+def patterned(name: str, duration_s: float = 0.02, start_s: float = 0.0) -> SimulatedScan:
+    """What a sensor without beams sees of a hall that is all around, so that every ray returns."""
+    scene = flat(street())
+    around = [plate(x, size, z=0.0) for x, size in ((20.0, (2.0, 90.0, 90.0)), (-20.0, (2.0, 90.0, 90.0)))]
+    ends = [np.array(block(0, 0.4, (0.0, y, 0.0), (90.0, 2.0, 90.0))) for y in (20.0, -20.0)]
+    roof = [np.array(block(0, 0.4, (0.0, 0.0, 30.0), (90.0, 90.0, 2.0)))]
+    hall = replace(scene, primitives=np.stack([*around, *ends, *roof]))
+    return simulate(hall, name, 0, noise=False, start_s=start_s, duration_s=duration_s)
+
+
+def angles_deg(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    flat_m = np.hypot(points[:, 0], points[:, 1])
+    return np.degrees(np.arctan2(points[:, 1], points[:, 0])), np.degrees(np.arctan2(points[:, 2], flat_m))
+
+
+@pytest.mark.parametrize("name", ["mid-360", "hap", "avia"])
+def test_a_pattern_fills_its_field_of_view_and_does_not_repeat(name: str) -> None:
+    sensor = get_sensor(name)
+    assert sensor.pattern is not None
+    first, second = patterned(name, 0.1), patterned(name, 0.1, 0.1)
+    assert len(first.points) == pytest.approx(0.1 * sensor.pattern.points_per_s, rel=0.01)
+    np.testing.assert_array_equal(patterned(name, 0.1).points, first.points)
+    azimuth, elevation = angles_deg(first.points)
+    half_deg = sensor.pattern.width_deg / 2.0
+    assert np.abs(azimuth).max() == pytest.approx(half_deg, rel=0.02)
+    assert elevation.min() == pytest.approx(sensor.fov_down_deg, abs=0.5)
+    assert elevation.max() == pytest.approx(sensor.fov_up_deg, abs=0.5)
+
+    def cells(points: np.ndarray, deg: float) -> set[tuple[int, int]]:
+        columns, rows = (np.floor(angle / deg).astype(int) for angle in angles_deg(points))
+        inside = np.hypot(columns * deg / half_deg, rows * deg / sensor.fov_up_deg) < 0.7
+        return {*zip(columns[inside].tolist(), rows[inside].tolist(), strict=True)}
+
+    # Even: in the middle, nearly every cell of five degrees has points; new: of fine cells, the next scan has others.
+    assert len(cells(first.points, 5.0) ^ cells(second.points, 5.0)) < 0.1 * len(cells(first.points, 5.0))
+    fine, next_fine = cells(first.points, 0.2), cells(second.points, 0.2)
+    assert len(fine & next_fine) < 0.7 * len(fine)
+
+
+@pytest.mark.parametrize("name", ["mid-360", "hap", "avia"])
+def test_parts_of_a_pattern_make_the_whole(name: str) -> None:
+    whole = patterned(name, 0.03).points
+    parts = [patterned(name, 0.01, start_s).points for start_s in (0.0, 0.01, 0.02)]
+    # On the ground, within what its samples allow.
+    np.testing.assert_allclose(np.concatenate(parts)[:, :3], whole[:, :3], rtol=0, atol=5e-3)
+
+
+def test_a_sequence_of_a_pattern_goes_on_from_scan_to_scan() -> None:
+    scene = random_scene(3)
+    steps = list(simulate_sequence(scene, "mid-360", 3, 100.0, 10.0))
+    assert [round(stamp_s, 3) for stamp_s, _, _ in steps] == [0.0, 0.01, 0.02]
+    for k, (stamp_s, pose, scan) in enumerate(steps):
+        again = simulate(scene.at(stamp_s), "mid-360", k, pose, start_s=stamp_s, duration_s=0.01)
+        np.testing.assert_array_equal(scan.points, again.points)
+        assert 0 < len(scan.points) <= 2000
+
+
+@pytest.mark.kernel
+@pytest.mark.parametrize(("seed", "n"), [(0, 60), (1, 1), (2, 0)])
+def test_rays_of_their_own_elevations_are_cast_as_by_the_twins(seed: int, n: int) -> None:
+    scene = near_scene(seed)
+    rng = np.random.default_rng(seed)
+    pose = sensor_pose(scene, SMALL, 1.0, 0.3, yaw=0.2)
+    rays = Rays(rng.uniform(-0.4, 0.2, (1, n)), np.sort(rng.uniform(0.0, 2 * np.pi, n)), 40.0, KEY)
+    placed, bounds = placed_primitives(scene, pose)
+    for n_sectors in (1, 36):
+        shapes = Shapes(placed, bounds, *columns_of(bounds, n_sectors, rays.reach))
+        hits = Hits(np.empty((1, n)), np.empty((1, n), np.int32), np.empty((1, n)), np.empty((1, n)))
+        raycast.fill_cast(shapes, scene.ground, pose, rays, hits)
+        slow_ranges, slow_hits = twins.simulation.cast(placed, scene, pose, *rays)
+        sure = (slow_ranges < 18.0) & (np.abs(hits.ranges - slow_ranges) < 0.5)
+        np.testing.assert_array_equal(hits.rows[sure], slow_hits[sure])
+        np.testing.assert_allclose(hits.ranges[sure], slow_ranges[sure], rtol=0, atol=0.03)
+        assert sure.sum() >= 0.9 * (slow_ranges < 18.0).sum()
+        receiver = Receiver(np.zeros(1), np.zeros(1), 0.5, True, True)
+        points, objects = np.empty((n, 4), np.float32), np.empty(n, np.int32)
+        count = raycast.fill_points(placed, scene.ground, pose, rays, hits, receiver, points, objects)
+        slow_points, slow_objects = twins.simulation.points(placed, scene, pose, rays, hits, receiver)
+        np.testing.assert_array_equal(objects[:count], slow_objects)
+        np.testing.assert_allclose(points[:count], slow_points, rtol=0, atol=2e-5)

@@ -203,8 +203,8 @@ def cast(
     with np.errstate(invalid="ignore"):
         radii = np.sqrt((1.0 / (primitives[:, 7:16].reshape(-1, 3, 3) ** 2).sum(axis=2)).sum(axis=1))
     ranges, hits = np.full(shape, float(reach)), np.full(shape, -2)
-    for b, elevation in enumerate(elevations):
-        for column, azimuth in enumerate(azimuths):
+    for b, row in enumerate(np.broadcast_to(elevations, shape)):
+        for column, (elevation, azimuth) in enumerate(zip(row, azimuths, strict=True)):
             level = np.array([np.cos(azimuth), np.sin(azimuth)]) * np.cos(elevation)
             direction = np.array([*level, np.sin(elevation)])
             steps = np.arange(0.0, reach, 0.005)
@@ -306,10 +306,9 @@ def points(
     spread = np.array([normal_draw(int(bits)) for bits in second], float)
     last_spread = np.array([normal_draw(int(bits)) for bits in draws(int(bits) ^ 0xABCDEF for bits in third)], float)
 
-    level = np.cos(elevations)[beam]
-    direction = np.stack(
-        [level * np.cos(azimuths)[column], level * np.sin(azimuths)[column], np.sin(elevations)[beam]], 1
-    )
+    elevation = np.broadcast_to(elevations, hits.shape)[beam, column]
+    level = np.cos(elevation)
+    direction = np.stack([level * np.cos(azimuths)[column], level * np.sin(azimuths)[column], np.sin(elevation)], 1)
     world = (t[:, None] * direction) @ pose[:3, :3].T + pose[:3, 3]
     shapes = np.zeros((len(t), 20))
     shapes[hit >= 0] = primitives[hit[hit >= 0]]
@@ -349,7 +348,7 @@ def points(
 
     kept = np.ones(len(t), bool)
     if ego_shadow:
-        kept = ~in_ego_shadow(azimuths[column] + 0.01 * spread, elevations[beam] + 0.016 * (other - 0.5))
+        kept = ~in_ego_shadow(azimuths[column] + 0.01 * spread, elevation + 0.016 * (other - 0.5))
     if noise:
         jitter = np.where(leaves, 1.6, 1.0)
         kept &= luck <= 1 - lost

@@ -26,7 +26,7 @@ from edgeperc.types.sensor import PUBLIC_SENSORS, SENSORS, SensorProfile, get_se
 
 
 def test_built_in_profiles() -> None:
-    beams = {name: profile.n_beams for name, profile in SENSORS.items()}
+    beams = {name: profile.n_beams for name, profile in SENSORS.items() if profile.pattern is None}
     assert beams == {
         **{"hdl-64e": 64, "hdl-32e": 32, "vlp-16": 16, "vlp-32c": 32, "pandar64": 64, "pandarxt-32": 32},
         **{f"{model}-{n}": n for model in ("os0", "os1", "os2") for n in (32, 64, 128)},
@@ -38,6 +38,56 @@ def test_built_in_profiles() -> None:
         assert profile.azimuth_resolution_deg * profile.columns == pytest.approx(360)
         raw = np.array(profile.remission_range)
         np.testing.assert_allclose((raw + profile.remission_offset) * profile.remission_scale, [0, 1])
+
+
+@pytest.mark.parametrize(
+    ("name", "points_per_s", "width_deg", "fov_deg"),
+    [
+        ("mid-360", 200_000, 360, (-7, 52)),
+        ("hap", 452_000, 120, (-12.5, 12.5)),
+        ("avia", 240_000, 70.4, (-38.6, 38.6)),
+    ],
+)
+def test_sensors_without_beams_show_more_the_longer_they_gather(
+    name: str, points_per_s: float, width_deg: float, fov_deg: tuple[float, float]
+) -> None:
+    profile = get_sensor(name)
+    assert profile.pattern is not None
+    assert (profile.pattern.points_per_s, profile.pattern.width_deg) == (points_per_s, width_deg)
+    assert (profile.fov_down_deg, profile.fov_up_deg) == fov_deg
+    assert profile.accumulated(profile.pattern.accumulate_s) == profile
+    short, long = profile.accumulated(0.1), profile.accumulated(0.4)
+    assert long.pattern == replace(profile.pattern, accumulate_s=0.4)
+    assert long.n_beams == pytest.approx(2 * short.n_beams, abs=1.5)
+    assert long.columns == pytest.approx(2 * short.columns, abs=1.5)
+    cells = short.n_beams * short.columns * width_deg / 360.0
+    assert 0.1 * points_per_s == pytest.approx(4.0 * cells, rel=0.05)
+    assert SensorProfile.from_json(long.to_json()) == long
+
+
+@pytest.mark.parametrize("seconds", [0.0, -0.1, 11.0, float("nan"), "0.1", True, None])
+def test_times_over_which_nothing_is_gathered(seconds: Any) -> None:
+    with pytest.raises(SensorError, match=r"pattern.accumulate_s is .*; expected a number from 0.01 to 10"):
+        get_sensor("mid-360").accumulated(seconds)
+
+
+@pytest.mark.parametrize("name", ["hdl-64e", "vlp-16", "lyft"])
+def test_turns_are_not_gathered(name: str) -> None:
+    with pytest.raises(SensorError, match=f"sensor '{name}' spins: each of its turns is a scan"):
+        get_sensor(name).accumulated(0.2)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("points_per_s", 0.0), ("width_deg", 361.0), ("turns_hz", (1.0,)), ("turns_hz", (1.0, float("inf")))],
+)
+def test_patterns_that_are_none(name: str, value: Any) -> None:
+    pattern = get_sensor("avia").pattern
+    assert pattern is not None
+    with pytest.raises(SensorError, match=f"pattern.{name}"):
+        replace(pattern, **{name: value})
+    with pytest.raises(SensorError, match="pattern is a ScanPattern or None"):
+        replace(get_sensor("avia"), pattern="rosette")  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("name", known_layouts())

@@ -1,0 +1,180 @@
+"""Sensors that do not spin, in simulated streets: accuracy by the time that a scan is gathered, standing and driving.
+
+Run as ``python -m edgeperc_bench.solid_state [--scans N] [--sensors mid-360 hap avia]``; a VLP-16 in the same place of
+the same streets stands beside. ``--turn hap`` times four of them around a vehicle against one scan of as many
+points.
+Prints tables of Markdown.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edgeperc import Mounting, Perceiver, TimedScan, Trajectory, accumulate, merge
+from edgeperc.evaluation.metrics import BoxEvaluator, Confusion, boxes_to_find
+from edgeperc.simulation import POINT_CLASSES, SimulatedScan, random_scene, simulate, simulate_sequence
+from edgeperc.simulation.samples import FIRST_SEED
+from edgeperc.types.mounting import MODEL_MOUNTING
+from edgeperc.types.perception import Perception
+from edgeperc.types.sensor import SensorProfile, get_sensor
+
+TIMES_S = (0.1, 0.2, 0.5)
+SPEEDS_MPS = (0.0, 10.0)
+FARTHEST_M = 50.0
+VEHICLES = ("car", "van", "truck")
+_RATE_HZ = 100.0  # of the places that a gathered scan is taken from
+
+
+class Figures:
+    """Counts over streets: classes of points, and boxes of vehicles all around."""
+
+    def __init__(self) -> None:
+        self.points, self.boxes, self.n_points = Confusion(POINT_CLASSES), BoxEvaluator(together=VEHICLES), [0]
+
+    def add(self, perception: Perception, points: NDArray[np.float32], labels: NDArray[np.uint8], last: SimulatedScan,
+            returns: Sequence[int]) -> None:  # fmt: skip
+        """Count a scan, whose boxes are those of the last part."""
+        found = perception.require_points()
+        near = found.in_view & (np.hypot(points[:, 0], points[:, 1]) < FARTHEST_M)
+        numbers = np.array([POINT_CLASSES.index(c) if c in POINT_CLASSES else 0 for c in found.classes], np.uint8)
+        self.points.update(numbers[found.labels[near]], labels[near])
+        boxes = [(box, n) for box, n in zip(last.boxes, returns, strict=True) if np.hypot(*box.center[:2]) < FARTHEST_M]
+        to_find, ignored = boxes_to_find(boxes, None, VEHICLES)
+        self.boxes.update([b for b in perception.boxes if b.label in VEHICLES], to_find, ignored=ignored)
+        self.n_points.append(len(points))
+
+    def row(self) -> str:
+        """Mean and single IoU of points and AP50 of vehicles, in per cent."""
+        iou = 100.0 * np.array(self.points.iou()[1:])
+        ap = 100.0 * self.boxes.overall().ap
+        return (
+            f"{np.sum(self.n_points) / max(1, len(self.n_points) - 1):,.0f} | {' / '.join(f'{v:.0f}' for v in iou)} | "
+            f"{np.nanmean(iou):.1f} | {ap:.0f}"
+        )
+
+
+def gathered(
+    seed: int, sensor: SensorProfile, accumulate_s: float, speed_mps: float
+) -> tuple[NDArray[np.float32], NDArray[np.uint8], SimulatedScan, list[int]]:
+    """Points, their labels, the last part of the scan, and the number of points on each of its boxes."""
+    n = round(accumulate_s * _RATE_HZ)
+    parts = list(simulate_sequence(random_scene(seed), sensor, n, _RATE_HZ, speed_mps, seed))
+    times, poses = np.array([part[0] for part in parts]), np.array([part[1] for part in parts])
+    timed = (TimedScan(stamp_s, scan.points, None) for stamp_s, _, scan in parts)
+    points = [each.points for each in accumulate(timed, accumulate_s, Trajectory(times, poses))][-1]
+    returns = np.sum([scan.box_points for _, _, scan in parts], axis=0).tolist()
+    return points, np.concatenate([scan.labels for _, _, scan in parts]), parts[-1][2], returns
+
+
+def spun(
+    seed: int, sensor: SensorProfile, duration_s: float, speed_mps: float
+) -> tuple[NDArray[np.float32], NDArray[np.uint8], SimulatedScan, list[int]]:
+    """The same of a spinning sensor, at the end of that time."""
+    *_, (_, _, scan) = simulate_sequence(random_scene(seed), sensor, 2, 1.0 / duration_s, speed_mps, seed)
+    return scan.points, scan.labels, scan, list(scan.box_points)
+
+
+def row_of(sensor: SensorProfile, accumulate_s: float, speed_mps: float, n_scans: int) -> str:
+    """The figures of a sensor in some streets."""
+    perceive = Perceiver(sensor=sensor, provider="cpu", mounting=MODEL_MOUNTING, on_mismatch="ignore", full_turn=True)
+    figures = Figures()
+    for k in range(n_scans):
+        take = gathered if sensor.pattern is not None else spun
+        points, labels, last, returns = take(FIRST_SEED + k, sensor, accumulate_s, speed_mps)
+        points[:, 3] *= 255.0
+        figures.add(perceive(points), points, labels, last, returns)
+    return figures.row()
+
+
+def sensors_of(names: Sequence[str]) -> Iterator[tuple[str, SensorProfile, float]]:
+    """Title, profile and time of each row; the simulator gives all of them the remission of the training sensor."""
+    yield "vlp-16", replace(get_sensor("vlp-16"), remission=None), 0.1
+    for name in names:
+        profile = get_sensor(name.removesuffix("-hanging"))
+        if name.endswith("-hanging"):  # as it sees the street: upside down
+            profile = replace(profile, elevations_deg=tuple(-deg for deg in reversed(profile.elevations_deg)))
+        for accumulate_s in TIMES_S:
+            yield f"{name}, {accumulate_s:g} s", profile.accumulated(accumulate_s), accumulate_s
+
+
+def around(seed: int, sensor: SensorProfile) -> tuple[list[NDArray[np.float32]], list[NDArray[np.float64]]]:
+    """Scans of four sensors at the sides of a vehicle in a street, and their poses on it."""
+    scene = random_scene(seed)
+    places = [(2.2, 0.0, 1.7, 0.0), (0.0, 0.9, 1.7, 90.0), (-2.2, 0.0, 1.7, 180.0), (0.0, -0.9, 1.7, -90.0)]
+    T_vehicle_sensor = []
+    for x, y, z, yaw_deg in places:
+        T_vehicle_sensor.append(np.eye(4))
+        cos, sin = np.cos(np.radians(yaw_deg)), np.sin(np.radians(yaw_deg))
+        T_vehicle_sensor[-1][:2] = (cos, -sin, 0.0, x), (sin, cos, 0.0, y)
+        T_vehicle_sensor[-1][2, 3] = z
+    T_world_vehicle = np.eye(4)
+    T_world_vehicle[2, 3] = scene.ground_height(0.0, 0.0)
+    scans = [simulate(scene, sensor, seed, T_world_vehicle @ pose) for pose in T_vehicle_sensor]
+    return [scan.points * np.array([1, 1, 1, 255], np.float32) for scan in scans], T_vehicle_sensor
+
+
+def time_turn(name: str, n_turns: int) -> str:
+    """Median times of four sensors as one turn, and of single scans of as many points, in turns [ms].
+
+    The single scans are of a sensor of the same kind that sees all around, and of an HDL-64E, whose range image has no
+    gaps to fill.
+    """
+    profile = get_sensor(name)
+    assert profile.pattern is not None
+    scans, poses = around(FIRST_SEED, profile)
+    n, raised = sum(map(len, scans)), np.eye(4)
+    raised[2, 3] = 1.73
+    wide = replace(profile, pattern=replace(profile.pattern, width_deg=360.0))
+    duration_s = 6.0 * profile.pattern.accumulate_s
+    alike = simulate(random_scene(FIRST_SEED), wide, 0, duration_s=duration_s).points * np.array([1, 1, 1, 255])
+    hdl = simulate(random_scene(FIRST_SEED), "hdl-64e", 0).points
+    of_kind, of_hdl = (
+        Perceiver(sensor=sensor, mounting=mounting, on_mismatch="ignore", full_turn=True)
+        for sensor, mounting in ((profile, Mounting(0.0, 0.0, 0.0)), ("hdl-64e", MODEL_MOUNTING))
+    )
+    chosen = np.random.default_rng(0).permutation(np.resize(np.arange(len(alike)), n))
+    singles = [(of_kind, merge([alike[chosen]], [raised])), (of_hdl, np.resize(hdl, (n, 4)))]
+    takes: list[list[float]] = [[], [], []]
+    for _ in range(n_turns):
+        start = time.perf_counter()
+        of_kind(merge(scans, poses))
+        takes[0].append(time.perf_counter() - start)
+        for k, (perceive, points) in enumerate(singles):
+            start = time.perf_counter()
+            perceive(points)
+            takes[k + 1].append(time.perf_counter() - start)
+    four, same, other = (1e3 * float(np.median(each)) for each in takes)
+    ratios = [float(np.median(np.array(takes[0]) / np.array(takes[k]))) for k in (1, 2)]
+    return f"| {name} | {n:,} | {four:.0f} | {same:.0f} | {other:.0f} | {ratios[0]:.2f}; {ratios[1]:.2f} |"
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Print a table."""
+    parser = argparse.ArgumentParser("edgeperc_bench.solid_state", description=(__doc__ or "").partition("\n\n")[0])
+    parser.add_argument("--scans", type=int, default=24, metavar="N", help="streets (default: 24)")
+    parser.add_argument("--sensors", nargs="*", default=["mid-360", "mid-360-hanging"], metavar="NAME")
+    parser.add_argument("--turn", nargs="*", metavar="NAME", help="only time four of these sensors as one turn")
+    parser.add_argument("--turns", type=int, default=40, metavar="N", help="scans that are timed (default: 40)")
+    given = parser.parse_args(arguments)
+    if given.turn is not None:
+        print("| four | points | merged, ms | one of the kind, ms | one HDL-64E, ms | ratios |")
+        print("|---|---|---|---|---|---|")
+        for name in given.turn or ["hap", "avia"]:
+            print(time_turn(name, given.turns), flush=True)
+        return
+    print("| sensor | speed | points | IoU car / pedestrian / cyclist | mean IoU | AP50 vehicles |")
+    print("|---|---|---|---|---|---|")
+    for title, sensor, accumulate_s in sensors_of(given.sensors):
+        for speed_mps in SPEEDS_MPS:
+            row = row_of(sensor, accumulate_s, speed_mps, given.scans)
+            print(f"| {title} | {speed_mps:g} m/s | {row} |", flush=True)
+
+
+if __name__ == "__main__":
+    main()
