@@ -218,7 +218,7 @@ def test_a_release_names_its_repository(repository: str, tmp_path: Path) -> None
     assert all(f", {repository}" in url for url in urls)
     version = edgeperc.__version__
     assert (
-        f"![A simulated street: drivable area, boxes of every class, labeled points]({repository}/raw/v{version}/"
+        f"![A simulated street from above: points, road, tracks with their speeds]({repository}/raw/v{version}/"
         in readme
     )
     assert f"[Quick start]({repository}/blob/v{version}/docs/quickstart.md)" in readme

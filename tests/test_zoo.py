@@ -29,7 +29,17 @@ def variants(**losses: float) -> tuple[Variant, Variant]:
 
 def test_every_name_has_one_file_per_variant() -> None:
     assert shipped_models() == (
-        *("camseg", "lodnn", "objects", "objects-open", "pointseg", "pointseg-open", "ssadnet", "ssadnet-open"),
+        *(
+            "camseg",
+            "lodnn",
+            "objects",
+            "objects-open",
+            "pointseg",
+            "pointseg-open",
+            "sceneseg",
+            "ssadnet",
+            "ssadnet-open",
+        ),
     )
     assert {*DEFAULT, *OPEN} <= set(shipped_models())
     names = [str(variant) for variant in listed()]
@@ -63,7 +73,7 @@ def test_the_wheels_models_are_small() -> None:
         (
             "pointnet",
             "no model is called 'pointnet' \\(did you mean pointseg\\?\\). Shipped: camseg, lodnn, objects, "
-            "objects-open, pointseg, pointseg-open, ssadnet, ssadnet-open",
+            "objects-open, pointseg, pointseg-open, sceneseg, ssadnet, ssadnet-open",
         ),
         ("", "no model is called ''"),
         ("nowhere.onnx", "nowhere.onnx"),
