@@ -58,6 +58,7 @@ if TYPE_CHECKING:
     from .readers.times import TimedScan
     from .road.ahead import FreeAhead, RoadAhead, free_ahead, road_ahead
     from .road.grid import OccupancyGrid, occupancy_grid
+    from .road.rolling import RollingGrid
     from .tracking import Track, Tracker, Tracks
     from .tracking.moving import movable_points, moving_points
     from .tracking.zones import Crossing, Line, Zone
@@ -112,6 +113,7 @@ __all__ = [
     "ProviderError",
     "ProviderInfo",
     "RoadAhead",
+    "RollingGrid",
     "SensorError",
     "SensorHealth",
     "SensorInfo",
@@ -174,6 +176,7 @@ MODULES = {
     "PointLabels": "types.perception",
     "ProviderInfo": "inference.listing",
     "RoadAhead": "road.ahead",
+    "RollingGrid": "road.rolling",
     "SensorInfo": "inference.listing",
     "SensorHealth": "types.perception",
     "SensorProfile": "types.sensor",

@@ -91,9 +91,7 @@ class OccupancyGrid:
         OptionError
             ``off_road`` is out of its range.
         """
-        if isinstance(off_road, bool) or not (isinstance(off_road, int) and UNKNOWN <= off_road <= OCCUPIED):
-            raise OptionError(f"off_road is {off_road!r}; expected a whole number from -1 to 100")
-        found = np.full(self.drivable.shape, off_road, np.int8)
+        found = np.full(self.drivable.shape, check_value("off_road", off_road), np.int8)
         found[self.drivable] = FREE
         found[self.obstacle] = OCCUPIED
         found[self.unknown] = UNKNOWN
@@ -177,6 +175,13 @@ class OccupancyGrid:
         )
         write_atomic(out / "map.yaml", text.encode())
         return out / "map.yaml"
+
+
+def check_value(name: str, value: int) -> int:
+    """A value of nav_msgs/OccupancyGrid, -1..100. Raises OptionError."""
+    if isinstance(value, bool) or not (isinstance(value, int) and UNKNOWN <= value <= OCCUPIED):
+        raise OptionError(f"{name} is {value!r}; expected a whole number from -1 to 100")
+    return value
 
 
 def occupancy_grid(
