@@ -19,7 +19,7 @@ pytest.importorskip("rosbags")
 
 from ros2_helpers import FIELDS, MESSAGES, Perceive, cloud, odometry, street, street_kinds
 
-from edgeperc import Box, ModelFileError, Mounting, OptionError, Perception, PointsError, RollingGrid, Tracker
+from edgeperc import Box, ModelFileError, OptionError, Perception, PointsError, RollingGrid, Tracker
 from edgeperc.readers.clouds import cloud_points
 from edgeperc.records import PerceivedScan
 from edgeperc.ros2 import node as node_module
@@ -386,6 +386,7 @@ def test_a_point_is_ground_or_obstacle_or_dropped(kind: str, height: int) -> Non
     for part, numbers in zip(parts, (ground, obstacle), strict=True):
         assert part.tobytes() == table[numbers].tobytes()
     kinds = street_kinds()
+    assert {*kinds} == {"ground", "obstacle", "neither"}
     np.testing.assert_array_equal(ground, np.flatnonzero(kinds == "ground"))
     np.testing.assert_array_equal(obstacle, np.flatnonzero(kinds == "obstacle"))
 
@@ -429,25 +430,6 @@ def test_the_grid_with_memory_follows_the_odometry() -> None:
         assert 100 in cells[row - 1 : row + 2, column]
         assert cells[row - 8, column] == 0
         assert grid.info.origin.position.z == pytest.approx(0.0)
-
-
-def test_where_the_sensor_is_without_a_pose_of_its_own() -> None:
-    """By the frames' names: that of the cloud itself, or above the vehicle's frame as the perceiver says."""
-    mounting = Mounting(2.0, 0.0, 0.0, 90.0)
-    same = Rolling().base_from_sensor("lidar", "lidar", mounting)
-    np.testing.assert_array_equal(same, np.eye(4))
-    above = Rolling().base_from_sensor("base_link", "lidar", mounting)
-    np.testing.assert_allclose(above @ [3.0, 0.0, 0.0, 1.0], [0.0, 3.0, 2.0, 1.0], atol=1e-12)
-    given = Rolling(sensor_pose=(1, 2, 3, 180, 0, 0)).base_from_sensor("lidar", "lidar", mounting)
-    np.testing.assert_allclose(given @ [0.0, 1.0, 1.0, 1.0], [1.0, 1.0, 2.0, 1.0], atol=1e-12)
-
-
-@pytest.mark.parametrize("wrong", [(1, 2, 3), (0, 0, 0, 0, 0, math.nan), (0, 0, 0, 0, 0, 361.0), ("x",) * 6, 3.0])
-def test_no_pose_of_a_sensor(wrong: Any) -> None:
-    with pytest.raises(OptionError, match="sensor_pose is"):
-        Rolling(sensor_pose=wrong)
-    with pytest.raises(OptionError, match="not a name of ROS 2"):
-        Rolling(topic="a b")
 
 
 def test_a_life_in_states(quick: None) -> None:
