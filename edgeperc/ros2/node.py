@@ -350,7 +350,8 @@ class PerceptionNode:
     def _report(self) -> Any:
         rates = self._rates.taken(self.n_scans, self._n_failed)
         error, newest = self._error, self._newest
-        level, message = None, None
+        level: int | None = None
+        message: str | None = None
         if self._state != "active":
             level, message = 0, self._state
         elif error is not None:

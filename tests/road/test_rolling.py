@@ -68,7 +68,7 @@ def perceived(points: NDArray[np.float32], stamp_s: float | None, **changes: Any
 
 def value(grid: RollingGrid, x: float, y: float, **options: int) -> int:
     """As a subscriber of the message reads it."""
-    message = grid.to_occupancy_grid(**options)
+    message = grid.to_occupancy_grid("odom", **options)
     info, origin = message["info"], message["info"]["origin"]["position"]
     column, row = ((p - o) // info["resolution"] for p, o in ((x, origin["x"]), (y, origin["y"])))
     assert 0 <= column < info["width"]

@@ -8,6 +8,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -465,9 +466,8 @@ def test_a_life_in_states(quick: None) -> None:
         assert (len(made), node.n_scans) == (2, 2)
         stamps = [MESSAGES.decode(raw, CLOUD).header.stamp.nanosec for raw in graph.published["/edgeperc/points"]]
         assert stamps == [2, 4]
-        graph.change("shutdown")
+        assert node.change_state("shutdown") == "finalized"
         assert [*outcomes] == []
-        assert node.state == "finalized"
     assert graph.closed == 1
 
 
@@ -513,6 +513,40 @@ def test_diagnostics_tell_rates_and_latencies(quick: None, monkeypatch: pytest.M
     assert "latency p50 [ms]" not in found[0]
     assert 0 <= int(found[-1]["latency p50 [ms]"]) <= int(found[-1]["latency p99 [ms]"]) < 1e3 * TIMEOUT_S
     assert (found[-1]["clouds dropped"], found[-1]["state"]) == ("0", "active")
+
+
+def test_the_page_configures_nav2_for_this_node() -> None:
+    """The YAML of the page: topics and frames are the node's, parameters those of the layers' sources."""
+    yaml = pytest.importorskip("yaml")
+    known = {
+        "nav2_ground_consistency_costmap_plugin::GroundConsistencyLayer": {
+            *("ground_points_topic", "nonground_points_topic", "tf_timeout", "ground_inc", "nonground_inc"),
+            *("ground_decay", "nonground_decay", "nonground_occ_thresh", "nonground_prob_thresh", "max_score"),
+            *("min_clearance", "robot_height", "footprint_clearing_enabled", "enable_kpi_logging", "max_data_range"),
+        },
+        "nav2_costmap_2d::StaticLayer": {
+            *("enabled", "map_topic", "map_subscribe_transient_local", "subscribe_to_updates", "transform_tolerance"),
+        },
+        "nav2_costmap_2d::InflationLayer": {"enabled", "inflation_radius", "cost_scaling_factor"},
+    }
+    graph = FakeGraph()
+    PerceptionNode(graph, lambda _: Perceive(), rolling=Rolling()).close()
+    page = (Path(__file__).parents[2] / "docs/howto/ros2.md").read_text("utf-8")
+    blocks = [yaml.safe_load(text) for text in re.findall(r"^```yaml\n(.*?)^```$", page, flags=re.M | re.S)]
+    assert len(blocks) == 3
+    topics = set()
+    for block in blocks[1:]:
+        costmap = block["local_costmap"]["local_costmap"]["ros__parameters"]
+        assert (costmap["global_frame"], costmap["rolling_window"]) == ("odom", True)
+        for layer in (costmap[name] for name in costmap["plugins"]):
+            assert {*layer} - {"plugin"} <= known[layer["plugin"]]
+            topics |= {value for name, value in layer.items() if name.endswith("_topic")}
+            # A latched map would be asked for, which the node does not offer.
+            assert layer.get("map_subscribe_transient_local", False) is False
+    assert topics == {"/edgeperc/ground_points", "/edgeperc/obstacle_points", "/edgeperc/rolling"}
+    assert topics < {*graph.types}
+    manager = blocks[0]["lifecycle_manager_edgeperc"]["ros__parameters"]
+    assert (manager["node_names"], manager["bond_timeout"]) == (["edgeperc"], 0.0)
 
 
 def test_without_vision_msgs_there_are_no_detections_and_a_warning() -> None:
