@@ -149,7 +149,7 @@ class PerceptionNode:
         # The queue is empty nearly always: the stream's thread takes what comes, and keeps the newest.
         self._stream = stream(iter(self._waiting.get, None), self._perceive, tracker, rate_hz=rate_hz)
         self._state: State = "unconfigured"
-        self._is_connected = False
+        self._is_connected, self._changing = False, threading.Lock()
         try:
             self.is_managed = lifecycle and graph.manage(self.change_state)
             for transition in () if lifecycle else ("configure", "activate"):
@@ -186,6 +186,10 @@ class PerceptionNode:
         OptionError
             There is no such transition from the present state; or a topic's name is not valid, or its package missing.
         """
+        with self._changing:
+            return self._changed(transition)
+
+    def _changed(self, transition: str) -> State:
         known = TRANSITIONS.get(transition)
         if known is None or self._state not in known[0]:
             possible = [name for name, (before, _) in TRANSITIONS.items() if self._state in before]
@@ -211,7 +215,7 @@ class PerceptionNode:
             except OptionError as exc:
                 if name != "detections":
                     raise
-                warnings.warn(f"no detections are published: {exc}", stacklevel=4)
+                warnings.warn(f"no detections are published: {exc}", stacklevel=5)
         if self._rolling is not None:
             self._graph.subscribe(self._rolling.topic, ODOMETRY, self._poses.receive)
         self._graph.subscribe(self._topic, CLOUD, self._receive)
@@ -308,7 +312,6 @@ class PerceptionNode:
         )
         if self._state != "active":
             return scan
-        self._remember(scan)
         parts: Split | None = None
         for name, output in self._outputs.items():
             if name == ROLLING or not output.is_wanted:
@@ -320,6 +323,7 @@ class PerceptionNode:
             else:
                 message = getattr(self._messages, name)(scan, self._stamp_ns)
             output.publish(self._messages.encode(message))
+        self._remember(scan)
         return scan
 
     def _remember(self, scan: PerceivedScan) -> None:
