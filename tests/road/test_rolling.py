@@ -26,7 +26,10 @@ from edgeperc import (
     TopView,
     Tracker,
     TrackingError,
+    occupancy_grid,
 )
+from edgeperc.simulation.drawn import random_scene
+from edgeperc.simulation.scene import simulate_sequence
 
 ROAD_M = -1.73
 Post = tuple[float, float]  # its middle in the odometry's frame; 1 m wide and high
@@ -262,3 +265,39 @@ def test_scans_that_cannot_be_taken_in_change_nothing() -> None:
             grid.values(off)  # type: ignore[arg-type]
         with pytest.raises(OptionError, match="unjudged is"):
             grid.to_occupancy_grid(unjudged=off)  # type: ignore[arg-type]
+
+
+def footprint(at: NDArray[np.float64], box: Box, grid: RollingGrid, margin_m: float) -> NDArray[np.bool_]:
+    """The cells of the window whose middles lie in a box that was seen from a pose."""
+    n = len(grid.values())
+    x, y = ((low + (np.arange(n) + 0.5) * 0.5) for low in grid.origin_m)
+    place, ahead = (at @ [*box.center, 1.0])[:2], at[:2, :2] @ [math.cos(box.yaw), math.sin(box.yaw)]
+    dx, dy = x[None, :] - place[0], y[:, None] - place[1]
+    length, width = (size / 2.0 + margin_m for size in box.size[:2])
+    return (np.abs(ahead[0] * dx + ahead[1] * dy) <= length) & (np.abs(ahead[0] * dy - ahead[1] * dx) <= width)
+
+
+@pytest.mark.parametrize("seed", [3, 7, 11])
+def test_a_drive_through_traffic(seed: int) -> None:
+    """Simulated scans with the true boxes: the grid knows more than a scan, and keeps hardly anything of what moved."""
+    grid, naive = rolling(size_m=40.0), rolling(size_m=40.0, classes=())
+    seen: dict[int, list[tuple[NDArray[np.float64], Box]]] = {}
+    for stamp_s, at, simulated in simulate_sequence(random_scene(seed, "urban"), "hdl-64e", 8, 5.0, 6.0, seed):
+        points = simulated.points
+        found = perceived(points, 10.0 + stamp_s, boxes=tuple(simulated.boxes))
+        for each in (grid, naive):
+            each.update(found, points, at)
+        for number, box in zip(simulated.box_ids, simulated.boxes, strict=True):
+            seen.setdefault(int(number), []).append((at, box))
+    now, before = np.zeros((2, 80, 80), np.bool_)
+    for history in seen.values():
+        first, last = ((pose @ [*box.center, 1.0])[:2] for pose, box in (history[0], history[-1]))
+        for pose, box in history:
+            if pose is at:
+                now |= footprint(pose, box, grid, 1.0)
+            elif np.hypot(*(first - last)) > 1.5:
+                before |= footprint(pose, box, grid, 0.0)
+    trails = [int(((each.values() == 100) & (each.ages_s() > 0.0) & before & ~now).sum()) for each in (grid, naive)]
+    assert trails[0] == 0 < trails[1]
+    single = occupancy_grid(found, points, cell_m=0.5, x_range_m=(-20.0, 20.0), y_range_m=(-20.0, 20.0))
+    assert (grid.values() == -1).mean() < 0.8 * single.unknown.mean()
