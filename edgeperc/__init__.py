@@ -58,6 +58,7 @@ if TYPE_CHECKING:
     from .readers.times import TimedScan, accumulate
     from .road.ahead import FreeAhead, RoadAhead, free_ahead, road_ahead
     from .road.grid import OccupancyGrid, occupancy_grid
+    from .road.rolling import RollingGrid
     from .tracking import Track, Tracker, Tracks
     from .tracking.moving import movable_points, moving_points
     from .tracking.zones import Crossing, Line, Zone
@@ -112,6 +113,7 @@ __all__ = [
     "ProviderError",
     "ProviderInfo",
     "RoadAhead",
+    "RollingGrid",
     "ScanPattern",
     "SensorError",
     "SensorHealth",
@@ -176,6 +178,7 @@ MODULES = {
     "PointLabels": "types.perception",
     "ProviderInfo": "inference.listing",
     "RoadAhead": "road.ahead",
+    "RollingGrid": "road.rolling",
     "SensorInfo": "inference.listing",
     "SensorHealth": "types.perception",
     "ScanPattern": "types.sensor",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 import threading
 import time
@@ -18,7 +19,7 @@ from edgeperc.simulation.scene import simulate
 from edgeperc.types.sensor import get_sensor
 from waiting import TIMEOUT_S, until
 
-__all__ = ["FIELDS", "MESSAGES", "Perceive", "cloud", "publish", "scans"]
+__all__ = ["FIELDS", "MESSAGES", "Perceive", "cloud", "odometry", "publish", "scans", "street", "street_kinds"]
 
 MESSAGES = RosMessages()
 FIELDS = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", "<f4")]
@@ -48,6 +49,48 @@ def cloud(points: np.ndarray, stamp_ns: int = 10**9, frame_id: str = "velodyne",
         "is_dense": True,
     }
     return MESSAGES.encode(make[CLOUD](**{**usual, **changes}))
+
+
+def odometry(stamp_ns: int, x: float, y: float, yaw: float, **changes: Any) -> bytes:
+    """The bytes of a nav_msgs/Odometry of base_link in odom."""
+    make = MESSAGES.types
+    stamp = make["builtin_interfaces/msg/Time"](sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9)
+    turn = {"x": 0.0, "y": 0.0, "z": math.sin(yaw / 2.0), "w": math.cos(yaw / 2.0), **changes}
+    pose = make["geometry_msgs/msg/Pose"](
+        position=make["geometry_msgs/msg/Point"](x=x, y=y, z=0.0),
+        orientation=make["geometry_msgs/msg/Quaternion"](**turn),
+    )
+    still = make["geometry_msgs/msg/Vector3"](x=0.0, y=0.0, z=0.0)
+    twist = make["geometry_msgs/msg/Twist"](linear=still, angular=still)
+    return MESSAGES.encode(
+        make["nav_msgs/msg/Odometry"](
+            header=make["std_msgs/msg/Header"](stamp=stamp, frame_id="odom"),
+            child_frame_id="base_link",
+            pose=make["geometry_msgs/msg/PoseWithCovariance"](pose=pose, covariance=np.zeros(36)),
+            twist=make["geometry_msgs/msg/TwistWithCovariance"](twist=twist, covariance=np.zeros(36)),
+        )
+    )
+
+
+def street() -> np.ndarray:
+    """Level road around an HDL-64E, a wall 12 m ahead, a crown above, and what is none of these; an even number."""
+    x, y = (axis.ravel() for axis in np.meshgrid(*2 * [np.arange(-14.0, 14.0, 0.25)]))
+    road = np.column_stack([x, y, np.full(x.size, -1.73)])[np.hypot(x, y) > 2.0]
+    y, z = (axis.ravel() for axis in np.meshgrid(np.arange(-3.0, 3.0, 0.1), np.arange(-1.43, 0.3, 0.1)))
+    wall = np.column_stack([np.full(y.size, 12.1), y, z])
+    crown = np.array([[5.0, 5.0, 2.5], [5.2, 5.0, 2.9]])
+    none = np.array([[math.nan, 1.0, 1.0], [0.0, 0.0, 0.0], [0.2, 0.1, 0.0], [6.0, 6.0, -3.5]])
+    points = np.vstack([road, wall, crown, none])[: (len(road) + len(wall) + 6) // 2 * 2]
+    return np.column_stack([points, np.full(len(points), 0.3)]).astype(np.float32)
+
+
+def street_kinds() -> np.ndarray:
+    """What each point of the `street` is: ground, obstacle, or neither (not a return, or a reflection)."""
+    points = street().astype(float)
+    distance, z = np.hypot(points[:, 0], points[:, 1]), points[:, 2]
+    kinds = np.where(z > -1.6, "obstacle", "ground").astype(object)
+    kinds[~np.isfinite(points).all(axis=1) | (distance < 0.9) | (z < -2.3)] = "neither"
+    return kinds.astype(str)
 
 
 class Perceive:

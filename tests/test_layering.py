@@ -70,6 +70,7 @@ FLOORS = {
         inference.session
         road.__init__ road.around road.outline
         road.ahead road.grid
+        road.rolling
         pipeline
         readers.__init__ readers.images readers.origin readers.packets readers.times readers.unknown
         readers.clouds readers.ouster readers.tables
@@ -107,6 +108,7 @@ FLOORS = {
         evaluation.judge
         evaluation.camvid evaluation.evaluate evaluation.found evaluation.tracking evaluation.transfer
         ros2.__init__ ros2.graph ros2.messages
+        ros2.odometry
         ros2.node ros2.rclpy_graph ros2.zenoh_graph
         sinks.__init__ sinks.names sinks.relay sinks.run_file sinks.scene
         sinks.foxglove sinks.page sinks.prelabels sinks.rerun sinks.rosbag sinks.static

@@ -23,6 +23,7 @@ from .scans import with_mounting
 if TYPE_CHECKING:
     from ..perceiver import Perceiver
     from ..ros2.graph import Graph
+    from ..ros2.odometry import Rolling
 
 
 def add_parser(commands: Commands) -> None:
@@ -76,7 +77,15 @@ def add_parser(commands: Commands) -> None:
         "--prefix",
         default="/edgeperc",
         metavar="NAME",
-        help="publish NAME/points, NAME/markers, NAME/occupancy and NAME/detections (default: %(default)s)",
+        help="name before those of the topics, as in NAME/points (default: %(default)s)",
+    )
+    output.add_argument(
+        "--publish",
+        nargs="+",
+        metavar="NAME[=TOPIC]",
+        help="what to publish, and on which topic if not PREFIX/NAME: points, markers, occupancy, detections, "
+        "diagnostics, ground_points, obstacle_points, rolling, detected_objects, tracked_objects, predicted_objects "
+        "(default: the first seven, and rolling with --odometry)",
     )
     output.add_argument("--no-track", action="store_true", help="do not track the boxes from scan to scan")
     output.add_argument("--frame", metavar="NAME", help="frame of the answers (default: that of the clouds)")
@@ -85,6 +94,28 @@ def add_parser(commands: Commands) -> None:
         metavar="NAME",
         help="frame of the grid: level, on the road below the sensor, x forward (default: that of the answers, with "
         "the pose of the ground in the grid's origin)",
+    )
+    memory = parser.add_argument_group("grid with memory")
+    memory.add_argument(
+        "--odometry", metavar="NAME", help="topic of nav_msgs/Odometry, for the output rolling (default: none)"
+    )
+    memory.add_argument(
+        "--sensor-pose",
+        nargs=6,
+        type=float,
+        metavar=("X", "Y", "Z", "ROLL", "PITCH", "YAW"),
+        help="of the clouds' frame in the odometry's child frame, in meters and degrees (default: the same if the "
+        "names are the same; otherwise above its origin, mounted as for the perception)",
+    )
+    memory.add_argument(
+        "--remember",
+        type=positive_number,
+        default=10.0,
+        metavar="SECONDS",
+        help="a cell that was not observed for longer is unknown again (default: 10)",
+    )
+    memory.add_argument(
+        "--grid-size", type=positive_number, default=40.0, metavar="METERS", help="edge of the window (default: 40)"
     )
     graph = parser.add_argument_group("graph")
     graph.add_argument("--name", default="edgeperc", metavar="NAME", help="name of the node (default: %(default)s)")
@@ -100,12 +131,18 @@ def add_parser(commands: Commands) -> None:
     )
     graph.add_argument("--rclpy", action="store_true", help="use rclpy of the sourced ROS installation, not Zenoh")
     graph.add_argument(
+        "--lifecycle",
+        action="store_true",
+        help="with --rclpy: a lifecycle node, which waits unconfigured for its manager (default: active at once)",
+    )
+    graph.add_argument(
         "--ros-args",
         nargs=argparse.REMAINDER,
         default=[],
         metavar="ARGUMENT",
         help="with --rclpy, last: remappings, and parameters in place of the options above: topic, sensor, model, "
-        "frame, grid_frame, prefix, rate; such as -p sensor:=os1-64 (default: none)",
+        "frame, grid_frame, prefix, rate, publish, odometry, sensor_pose, remember, grid_size; such as "
+        "-p sensor:=os1-64 (default: none)",
     )
     graph.add_argument(
         "--scans", type=positive, metavar="N", help="end after N perceived scans (default: when it is stopped)"
@@ -114,7 +151,7 @@ def add_parser(commands: Commands) -> None:
 
 def ros2_command(arguments: argparse.Namespace) -> int:
     """Run the node until it is stopped."""
-    from ..ros2.node import PerceptionNode
+    from ..ros2.node import USUAL_OUTPUTS, PerceptionNode
     from ..tracking.tracker import Tracker
 
     graph = _open_graph(arguments)
@@ -140,11 +177,15 @@ def ros2_command(arguments: argparse.Namespace) -> int:
             grid_frame_id=arguments.grid_frame,
             prefix=arguments.prefix,
             rate_hz=arguments.rate,
+            outputs=arguments.publish or USUAL_OUTPUTS,
+            rolling=_rolling(arguments),
+            lifecycle=arguments.lifecycle,
         )
     except BaseException:
         graph.close()
         raise
-    print_line(f"{graph.name}: waiting for clouds on {arguments.topic}, publishing {arguments.prefix}/*")
+    waiting = "unconfigured, waiting for its manager; clouds on" if node.is_managed else "waiting for clouds on"
+    print_line(f"{graph.name}: {waiting} {arguments.topic}, publishing {arguments.prefix}/*")
     n_answers, reported = 0, ""
     with node:
         try:
@@ -175,7 +216,9 @@ def _open_graph(arguments: argparse.Namespace) -> Graph:
 
         if arguments.connect is not None:
             arguments.usage_error("--connect needs Zenoh; leave it out, or leave out --rclpy")
-        return RclpyGraph(arguments.name, ros_args=arguments.ros_args, **names)
+        return RclpyGraph(arguments.name, ros_args=arguments.ros_args, managed=arguments.lifecycle, **names)
+    if arguments.lifecycle:
+        arguments.usage_error("--lifecycle needs --rclpy: a node over Zenoh offers no services to a manager")
     from ..ros2.zenoh_graph import ZenohGraph
 
     if arguments.ros_args:
@@ -185,10 +228,24 @@ def _open_graph(arguments: argparse.Namespace) -> Graph:
 
 def _take_parameters(graph: Graph, arguments: argparse.Namespace) -> None:
     """Let parameters of the node replace options; ROS has no None, so an option that was not passed is empty."""
-    for name in ("topic", "sensor", "frame", "grid_frame", "prefix"):
+    for name in ("topic", "sensor", "frame", "grid_frame", "prefix", "odometry"):
         setattr(arguments, name, graph.parameter(name, getattr(arguments, name) or "") or None)
     arguments.model = [*filter(None, graph.parameter("model", arguments.model or [""]))] or None
-    arguments.rate = graph.parameter("rate", arguments.rate)
+    arguments.publish = [*filter(None, graph.parameter("publish", arguments.publish or [""]))] or None
+    pose = [*graph.parameter("sensor_pose", arguments.sensor_pose or [0.0])]
+    arguments.sensor_pose = None if pose == [0.0] else pose
+    for name in ("rate", "remember", "grid_size"):
+        setattr(arguments, name, graph.parameter(name, getattr(arguments, name)))
+
+
+def _rolling(arguments: argparse.Namespace) -> Rolling | None:
+    from ..road.rolling import RollingGrid
+    from ..ros2.odometry import Rolling
+
+    if arguments.odometry is None:
+        return None
+    grid = RollingGrid(size_m=arguments.grid_size, remember_s=arguments.remember)
+    return Rolling(arguments.odometry, arguments.sensor_pose, grid)
 
 
 def _perceiver(arguments: argparse.Namespace, sensor: Any) -> Perceiver:

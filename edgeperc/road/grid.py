@@ -6,7 +6,7 @@ import math
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -23,7 +23,7 @@ from ..types.frame import ModelFrame, quaternion
 from ..types.geometry import draw_footprints
 from ..types.mounting import MODEL_HEIGHT_M, MODEL_MOUNTING, Mounting
 from ..types.perception import Perception, TopView
-from ..types.points import Heights, Points, as_points, read_only
+from ..types.points import Heights, Mask, Points, as_points, read_only
 from ..types.sensor import SensorProfile, get_sensor
 from ..types.views import TopViewGeometry
 from .around import knows_road, nearest_is_road
@@ -94,9 +94,7 @@ class OccupancyGrid:
         OptionError
             ``off_road`` is out of its range.
         """
-        if isinstance(off_road, bool) or not (isinstance(off_road, int) and UNKNOWN <= off_road <= OCCUPIED):
-            raise OptionError(f"off_road is {off_road!r}; expected a whole number from -1 to 100")
-        found = np.full(self.drivable.shape, off_road, np.int8)
+        found = np.full(self.drivable.shape, check_value("off_road", off_road), np.int8)
         found[self.drivable] = FREE
         found[self.obstacle] = OCCUPIED
         found[self.unknown] = UNKNOWN
@@ -182,6 +180,13 @@ class OccupancyGrid:
         return out / "map.yaml"
 
 
+def check_value(name: str, value: int) -> int:
+    """A value of nav_msgs/OccupancyGrid, -1..100. Raises OptionError."""
+    if isinstance(value, bool) or not (isinstance(value, int) and UNKNOWN <= value <= OCCUPIED):
+        raise OptionError(f"{name} is {value!r}; expected a whole number from -1 to 100")
+    return value
+
+
 def occupancy_grid(
     perception: Perception,
     points: ArrayLike,
@@ -238,11 +243,6 @@ def occupancy_grid(
     >>> grid.save_map("map")                                # doctest: +SKIP
     PosixPath('map/map.yaml')
     """
-    rows = as_points(points)
-    if len(rows) != perception.n_points:
-        raise PointsError(
-            f"{len(rows)} points with a perception of {perception.n_points}; expected the scan that was perceived"
-        )
     if not 0.0 <= min_height_m < OVERHEAD_M:
         raise OptionError(f"min_height_m is {min_height_m}; expected meters from 0 to below {OVERHEAD_M:g}")
     top_view = perception.top_view
@@ -255,11 +255,8 @@ def occupancy_grid(
         raise OptionError(
             f"got cell_m={cell_m!r}, x_range_m={x_range_m!r}, y_range_m={y_range_m!r}: no grid ({exc})"
         ) from exc
-    profile = get_sensor(sensor)
-    frame = ModelFrame(perception.mounting)
-    moved = read_only(frame.move(returns(rows, profile, perception.mounting.origin_m)[0]))
-    if perception.health.has_drops:
-        moved = read_only(without_drops(moved, profile, frame.eye)[0])
+    profile, frame = get_sensor(sensor), ModelFrame(perception.mounting)
+    moved = _returns_of(perception, points, profile, frame)
     ground = heights_above(perception.ground, moved)
 
     shape = (view.height, view.width)
@@ -287,6 +284,37 @@ def occupancy_grid(
         stamp_s=perception.stamp_s,
         mounting=perception.mounting,
     )
+
+
+class Split(NamedTuple):
+    """Points on the ground and points of what stands on it, (n,) bool each; a point is in one of them or in none."""
+
+    ground: Mask
+    obstacle: Mask
+
+
+def split_points(perception: Perception, points: ArrayLike, *, sensor: SensorProfile) -> Split:
+    """Separate the ground from what stands on it, by the ground that was perceived; parameters as `occupancy_grid`.
+
+    Ground is at most 0.125 m above and 0.5 m below it; an obstacle is anything higher, crowns and bridges, too. In
+    neither are points that are not returns (not finite, too near, of the own vehicle), drops, and reflections from more
+    than 0.5 m below the ground. A scan without ground has obstacles only.
+    Raises PointsError.
+    """
+    moved = _returns_of(perception, points, sensor, ModelFrame(perception.mounting))
+    found = heights_above(perception.ground, moved)
+    return Split(found.mask, (found.height_m > (0.0 if found.plane else -np.inf)) & ~found.mask)
+
+
+def _returns_of(perception: Perception, points: ArrayLike, profile: SensorProfile, frame: ModelFrame) -> Points:
+    """The scan that was perceived in the frame of the models; NaN in place of what is no return, and of drops."""
+    rows = as_points(points)
+    if len(rows) != perception.n_points:
+        raise PointsError(
+            f"{len(rows)} points with a perception of {perception.n_points}; expected the scan that was perceived"
+        )
+    moved = read_only(frame.move(returns(rows, profile, perception.mounting.origin_m)[0]))
+    return read_only(without_drops(moved, profile, frame.eye)[0]) if perception.health.has_drops else moved
 
 
 def _drivable(top_view: TopView | None, view: TopViewGeometry) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:

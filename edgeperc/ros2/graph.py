@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Literal, Protocol
 
 from ..errors import OptionError
 
@@ -25,6 +25,18 @@ SENSOR_DATA = Qos(reliable=False, depth=5)
 """ROS 2's profile for sensor data: it receives from reliable and from best-effort publishers."""
 RELIABLE = Qos(reliable=True, depth=10)
 """ROS 2's default profile. Subscribers of sensor data receive from it, too; those of RViz receive from nothing else."""
+
+
+State = Literal["unconfigured", "inactive", "active", "finalized"]
+"""Primary states of a managed node."""
+TRANSITIONS: Mapping[str, tuple[tuple[State, ...], State]] = {
+    "configure": (("unconfigured",), "inactive"),
+    "activate": (("inactive",), "active"),
+    "deactivate": (("active",), "inactive"),
+    "cleanup": (("inactive",), "unconfigured"),
+    "shutdown": (("unconfigured", "inactive", "active"), "finalized"),
+}
+"""From which states each transition leads, and where to."""
 
 
 class Output(Protocol):
@@ -54,6 +66,12 @@ class Graph(Protocol):
 
     def subscribe(self, topic: str, message_type: str, receive: Callable[[bytes], None]) -> None:
         """Call ``receive`` with the CDR bytes of each message, in a thread of the middleware, as sensor data."""
+
+    def manage(self, change: Callable[[str], object]) -> bool:
+        """Let lifecycle managers call ``change`` with the name of a transition, in a thread of the middleware.
+
+        Returns whether they can: whether the graph has services, and was made for a managed node.
+        """
 
     def close(self) -> None:
         """Leave the graph."""

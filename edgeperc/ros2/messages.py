@@ -7,6 +7,7 @@ scan, the one of the sensor. Only the grid can be in a frame of its own: see `Ro
 from __future__ import annotations
 
 import math
+import uuid
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
@@ -15,19 +16,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import OptionError, PointsError
+from ..readers.clouds import cloud_table
 from ..road.grid import OCCUPIED, occupancy_grid
 from ..system.clock import nanoseconds_of
 from ..system.extras import require
 from ..system.names import check_text
+from ..tracking.moving import moving_tracks
 from ..types.points import as_points
 from ..view.colors import color_of, rgb
 from ..view.content import EDGES, box_corners
 
 if TYPE_CHECKING:
     from ..records import PerceivedScan
+    from ..road.rolling import RollingGrid
+    from ..tracking import Track
     from ..types.perception import Box
 
-__all__ = ["CLOUD", "OUTPUTS", "RosMessages", "nanoseconds"]
+__all__ = ["CLOUD", "LIVE_OUTPUTS", "OUTPUTS", "RosMessages", "nanoseconds"]
 
 CLOUD = "sensor_msgs/msg/PointCloud2"
 DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
@@ -39,6 +44,17 @@ OUTPUTS: Mapping[str, str] = {
     "diagnostics": DIAGNOSTICS,
 }
 """Methods of `RosMessages` that make a message of a scan, and the types of these messages."""
+GROUND_POINTS, OBSTACLE_POINTS, ROLLING = "ground_points", "obstacle_points", "rolling"
+LIVE_OUTPUTS: Mapping[str, str] = {
+    **OUTPUTS,
+    GROUND_POINTS: CLOUD,
+    OBSTACLE_POINTS: CLOUD,
+    ROLLING: "nav_msgs/msg/OccupancyGrid",
+    "detected_objects": "autoware_perception_msgs/msg/DetectedObjects",
+    "tracked_objects": "autoware_perception_msgs/msg/TrackedObjects",
+    "predicted_objects": "autoware_perception_msgs/msg/PredictedObjects",
+}
+"""What a node can publish: also the two parts of the cloud, the rolling grid, and Autoware's objects."""
 
 # vision_msgs 4 (ROS 2 Humble and later), which rosbags does not have. The other definitions are rosbags' of ROS 2
 # Humble; their type hashes are the same from Iron to Lyrical.
@@ -49,6 +65,45 @@ _VISION = {
     "Detection3D": "std_msgs/Header header\nObjectHypothesisWithPose[] results\nBoundingBox3D bbox\nstring id\n",
     "Detection3DArray": "std_msgs/Header header\nDetection3D[] detections\n",
 }
+# autoware_perception_msgs 1.3 to 1.13.
+_WITH = "geometry_msgs/{0}WithCovariance {1}{2}_with_covariance\n".format
+_AUTOWARE = {
+    "ObjectClassification": "uint8 label\nfloat32 probability\n",
+    "Shape": "uint8 type\ngeometry_msgs/Polygon footprint\ngeometry_msgs/Vector3 dimensions\n",
+    "PredictedPath": "geometry_msgs/Pose[] path\nbuiltin_interfaces/Duration time_step\nfloat32 confidence\n",
+    "DetectedObjectKinematics": _WITH("Pose", "", "pose")
+    + "bool has_position_covariance\nuint8 orientation_availability\n"
+    + _WITH("Twist", "", "twist")
+    + "bool has_twist\nbool has_twist_covariance\n",
+    "TrackedObjectKinematics": _WITH("Pose", "", "pose")
+    + _WITH("Twist", "", "twist")
+    + _WITH("Accel", "", "acceleration")
+    + "uint8 orientation_availability\nbool is_stationary\n",
+    "PredictedObjectKinematics": _WITH("Pose", "initial_", "pose")
+    + _WITH("Twist", "initial_", "twist")
+    + _WITH("Accel", "initial_", "acceleration")
+    + "PredictedPath[] predicted_paths\n",
+    **{
+        f"{kind}Object": ("" if kind == "Detected" else "unique_identifier_msgs/UUID object_id\n")
+        + f"float32 existence_probability\nObjectClassification[] classification\n{kind}ObjectKinematics kinematics\n"
+        + "Shape shape\n"
+        for kind in ("Detected", "Tracked", "Predicted")
+    },
+    **{
+        f"{kind}Objects": f"std_msgs/Header header\n{kind}Object[] objects\n"
+        for kind in ("Detected", "Tracked", "Predicted")
+    },
+}
+# ObjectClassification.label; anything else is 0, UNKNOWN.
+_AUTOWARE_LABELS = {
+    **dict.fromkeys(("car", "van", "vehicle"), 1),
+    **{"truck": 2, "bus": 3, "trailer": 4},
+    **dict.fromkeys(("motorcycle", "motorcyclist"), 5),
+    **dict.fromkeys(("bicycle", "cyclist", "bicyclist"), 6),
+    **dict.fromkeys(("pedestrian", "person", "person_sitting"), 7),
+}
+_SIGN_UNKNOWN, _AVAILABLE = 1, 2  # orientation_availability
+_PATH_STEP_S, _PATH_STEPS = 0.5, 10
 _POINT = np.dtype(
     {
         "names": ["x", "y", "z", "intensity", "label", "in_view"],
@@ -123,8 +178,9 @@ class RosMessages:
             check_text("the frame is", frame, OptionError)
         typesys = require("rosbags.typesys", "ros", "Making ROS 2 messages")
         self.typestore: Any = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
-        for name, text in _VISION.items():
-            self.typestore.register(typesys.get_types_from_msg(text, f"vision_msgs/msg/{name}"))
+        for package, definitions in (("vision_msgs", _VISION), ("autoware_perception_msgs", _AUTOWARE)):
+            for name, text in definitions.items():
+                self.typestore.register(typesys.get_types_from_msg(text, f"{package}/msg/{name}"))
         self.types: Mapping[str, Any] = self.typestore.types
         self.frame_id, self.grid_frame_id = frame_id, grid_frame_id
         self._lifetime_s, self._cell_m, self._off_road = lifetime_s, cell_m, off_road
@@ -256,15 +312,69 @@ class RosMessages:
             pose = self._pose(center=[*placed["position"].values()], turned=tuple(placed["orientation"].values()))
         else:
             pose = self._pose(center=(grid.x_range_m[0], grid.y_range_m[0], 0.0))
+        return self._grid(header, fields, pose)
+
+    def rolling(self, grid: RollingGrid, frame_id: str, stamp_ns: int) -> Any:
+        """A grid with memory: a nav_msgs/OccupancyGrid in the frame of the odometry.
+
+        Parameters
+        ----------
+        grid : RollingGrid
+        frame_id : str
+            Of the odometry.
+        stamp_ns : int
+            Stamp of the header [ns].
+
+        Returns
+        -------
+        message
+        """
+        fields = grid.to_occupancy_grid(frame_id, self._off_road)
+        center = [*fields["info"]["origin"]["position"].values()]
+        return self._grid(self._header(None, stamp_ns, frame_id), fields, self._pose(center=center))
+
+    def _grid(self, header: Any, fields: Mapping[str, Any], origin: Any) -> Any:
         info = self._make(
             "nav_msgs/msg/MapMetaData",
             map_load_time=header.stamp,
-            resolution=fields["info"]["resolution"],
-            width=fields["info"]["width"],
-            height=fields["info"]["height"],
-            origin=pose,
+            **{name: fields["info"][name] for name in ("resolution", "width", "height")},
+            origin=origin,
         )
         return self._make("nav_msgs/msg/OccupancyGrid", header=header, info=info, data=fields["data"])
+
+    def part(self, scan: PerceivedScan, cloud: Any, mask: NDArray[np.bool_], stamp_ns: int | None = None) -> Any:
+        """Some points of a cloud, byte by byte, with all its fields: a sensor_msgs/PointCloud2 of one row.
+
+        Parameters
+        ----------
+        scan : PerceivedScan
+        cloud : object
+            The sensor_msgs/PointCloud2 of the scan.
+        mask : (n,) bool
+            Points to keep.
+        stamp_ns : int, optional
+            As in `points`.
+
+        Returns
+        -------
+        message
+        """
+        table, data = cloud_table(cloud), np.frombuffer(cloud.data, np.uint8)
+        step = table.dtype.itemsize
+        rows = np.ndarray((*table.shape, step), np.uint8, data, strides=(*table.strides, 1)) if table.size else data[:0]
+        kept = rows.reshape(-1, step)[mask]
+        return self._make(
+            CLOUD,
+            header=self._header(scan, stamp_ns),
+            height=1,
+            width=len(kept),
+            fields=cloud.fields,
+            is_bigendian=cloud.is_bigendian,
+            point_step=step,
+            row_step=kept.size,
+            data=kept.reshape(-1),
+            is_dense=True,
+        )
 
     def detections(self, scan: PerceivedScan, stamp_ns: int | None = None) -> Any:
         """Tracks or, without a tracker, boxes: a vision_msgs/Detection3DArray of vision_msgs 4.
@@ -286,7 +396,7 @@ class RosMessages:
             boxes = [(track.box, str(track.id)) for track in scan.tracked]
         detections = []
         for box, track_id in boxes:
-            pose = self._make("geometry_msgs/msg/PoseWithCovariance", pose=self._pose(box), covariance=np.zeros(36))
+            pose = self._with("Pose", self._pose(box))
             what = self._make("vision_msgs/msg/ObjectHypothesis", class_id=box.label, score=float(box.score))
             result = self._make("vision_msgs/msg/ObjectHypothesisWithPose", hypothesis=what, pose=pose)
             around = self._make("vision_msgs/msg/BoundingBox3D", center=self._pose(box), size=self._vector(box.size))
@@ -294,6 +404,141 @@ class RosMessages:
                 self._make("vision_msgs/msg/Detection3D", header=header, results=[result], bbox=around, id=track_id)
             )
         return self._make("vision_msgs/msg/Detection3DArray", header=header, detections=detections)
+
+    def detected_objects(self, scan: PerceivedScan, stamp_ns: int | None = None) -> Any:
+        """Boxes: an autoware_perception_msgs/DetectedObjects.
+
+        Parameters
+        ----------
+        scan, stamp_ns
+            As in `points`.
+
+        Returns
+        -------
+        message
+        """
+        objects = [
+            self._object(
+                "Detected",
+                box,
+                {
+                    "pose_with_covariance": self._with("Pose", self._pose(box)),
+                    "has_position_covariance": False,
+                    "orientation_availability": _SIGN_UNKNOWN if box.front is None else _AVAILABLE,
+                    "twist_with_covariance": self._with("Twist", self._twist()),
+                    "has_twist": False,
+                    "has_twist_covariance": False,
+                },
+            )
+            for box in scan.perception.boxes
+        ]
+        return self._objects("Detected", scan, stamp_ns, objects)
+
+    def tracked_objects(self, scan: PerceivedScan, stamp_ns: int | None = None) -> Any:
+        """Tracks: an autoware_perception_msgs/TrackedObjects, empty without a tracker.
+
+        Velocities are over ground along and across the box. The covariances are those of position, yaw and speed along
+        the heading.
+
+        Parameters
+        ----------
+        scan, stamp_ns
+            As in `points`.
+
+        Returns
+        -------
+        message
+        """
+        moving = {track.id for track in moving_tracks(scan.tracked or ())}
+        objects = []
+        for track in scan.tracked or ():
+            kinematics = {
+                **self._motion(scan, track, ""),
+                "orientation_availability": _SIGN_UNKNOWN if track.box.front is None else _AVAILABLE,
+                "is_stationary": track.id not in moving,
+            }
+            objects.append(self._object("Tracked", track.box, kinematics, self._uuid(scan, track)))
+        return self._objects("Tracked", scan, stamp_ns, objects)
+
+    def predicted_objects(self, scan: PerceivedScan, stamp_ns: int | None = None) -> Any:
+        """Tracks, each with one path of 5 s straight on: an autoware_perception_msgs/PredictedObjects.
+
+        The path is that of the track's velocity over ground, as seen from where the sensor was at the scan.
+
+        Parameters
+        ----------
+        scan, stamp_ns
+            As in `points`.
+
+        Returns
+        -------
+        message
+        """
+        nanoseconds = round(_PATH_STEP_S * 1e9)
+        step = self._make("builtin_interfaces/msg/Duration", sec=nanoseconds // 10**9, nanosec=nanoseconds % 10**9)
+        objects = []
+        for track in scan.tracked or ():
+            way = np.array([*track.velocity, 0.0]) * _PATH_STEP_S
+            places = [np.add(track.box.center, k * way).tolist() for k in range(_PATH_STEPS + 1)]
+            path = self._make(
+                "autoware_perception_msgs/msg/PredictedPath",
+                path=[self._pose(replace(track.box, center=tuple(place))) for place in places],
+                time_step=step,
+                confidence=1.0,
+            )
+            kinematics = {**self._motion(scan, track, "initial_"), "predicted_paths": [path]}
+            objects.append(self._object("Predicted", track.box, kinematics, self._uuid(scan, track)))
+        return self._objects("Predicted", scan, stamp_ns, objects)
+
+    def _objects(self, kind: str, scan: PerceivedScan, stamp_ns: int | None, objects: list[Any]) -> Any:
+        name = f"autoware_perception_msgs/msg/{kind}Objects"
+        return self._make(name, header=self._header(scan, stamp_ns), objects=objects)
+
+    def _object(self, kind: str, box: Box, kinematics: Mapping[str, Any], number: Any = None) -> Any:
+        package = "autoware_perception_msgs/msg"
+        what = {"label": _AUTOWARE_LABELS.get(box.label, 0), "probability": 1.0}
+        polygon = self._make("geometry_msgs/msg/Polygon", points=[])
+        return self._make(
+            f"{package}/{kind}Object",
+            **({} if number is None else {"object_id": number}),
+            existence_probability=float(box.score),
+            classification=[self._make(f"{package}/ObjectClassification", **what)],
+            kinematics=self._make(f"{package}/{kind}ObjectKinematics", **kinematics),
+            shape=self._make(f"{package}/Shape", type=0, footprint=polygon, dimensions=self._vector(box.size)),
+        )
+
+    def _motion(self, scan: PerceivedScan, track: Track, before: str) -> dict[str, Any]:
+        """Pose, twist and acceleration of a track; ``before`` their names."""
+        assert scan.tracks is not None
+        cos, sin = math.cos(track.box.yaw), math.sin(track.box.yaw)
+        vx, vy = track.velocity
+        pose, twist = np.zeros((6, 6)), np.zeros((6, 6))
+        R = scan.tracks.T_world_sensor[:2, :2]
+        pose[:2, :2], pose[5, 5], twist[0, 0] = R.T @ track.covariance[:2, :2] @ R, *track.covariance[[3, 2], [3, 2]]
+        zero = self._vector((0.0, 0.0, 0.0))
+        along = self._twist((cos * vx + sin * vy, cos * vy - sin * vx, 0.0), float(track.state[4]))
+        return {
+            f"{before}pose_with_covariance": self._with("Pose", self._pose(track.box), pose),
+            f"{before}twist_with_covariance": self._with("Twist", along, twist),
+            f"{before}acceleration_with_covariance": self._with(
+                "Accel", self._make("geometry_msgs/msg/Accel", linear=zero, angular=zero)
+            ),
+        }
+
+    def _twist(self, linear: tuple[float, float, float] = (0.0, 0.0, 0.0), turn: float = 0.0) -> Any:
+        return self._make(
+            "geometry_msgs/msg/Twist", linear=self._vector(linear), angular=self._vector((0.0, 0.0, turn))
+        )
+
+    def _with(self, kind: str, value: Any, covariance: NDArray[np.float64] | None = None) -> Any:
+        matrix = np.zeros(36) if covariance is None else covariance.ravel()
+        return self._make(f"geometry_msgs/msg/{kind}WithCovariance", **{kind.lower(): value}, covariance=matrix)
+
+    def _uuid(self, scan: PerceivedScan, track: Track) -> Any:
+        """The same for a track in every scan, another one for every other track of every session."""
+        session = 0 if scan.tracks is None else scan.tracks.session
+        number = uuid.uuid5(uuid.NAMESPACE_OID, f"edgeperc/{session}/{track.id}")
+        return self._make("unique_identifier_msgs/msg/UUID", uuid=np.frombuffer(number.bytes, np.uint8))
 
     def diagnostics(
         self,

@@ -2,25 +2,39 @@
 
 from __future__ import annotations
 
+import math
 import queue
 import threading
 import time
 import warnings
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-from ..errors import MissingExtraError, ModelError, OptionError, PointsError, ProviderError
+import numpy as np
+
+from ..errors import MissingExtraError, ModelError, OptionError, PointsError, ProviderError, TrackingError
 from ..live import stream
 from ..readers.clouds import cloud_points, describe_cloud
 from ..readers.tables import MAX_SCAN_BYTES
 from ..records import PerceivedScan
+from ..road.grid import Split, split_points
 from ..system.clock import Stamp
 from ..system.names import check_text
-from .graph import RELIABLE, Graph, Output
-from .messages import CLOUD, DIAGNOSTICS, OUTPUTS, RosMessages
+from .graph import RELIABLE, TRANSITIONS, Graph, Output, State, full_name
+from .messages import (
+    CLOUD,
+    DIAGNOSTICS,
+    GROUND_POINTS,
+    LIVE_OUTPUTS,
+    OBSTACLE_POINTS,
+    OUTPUTS,
+    ROLLING,
+    RosMessages,
+)
+from .odometry import ODOMETRY, Poses, Rolling
 
 if TYPE_CHECKING:
-    import numpy as np
     from numpy.typing import NDArray
 
     from ..live import Answer
@@ -30,7 +44,10 @@ if TYPE_CHECKING:
 
 __all__ = ["PerceptionNode"]
 
+USUAL_OUTPUTS = (*OUTPUTS, GROUND_POINTS, OBSTACLE_POINTS)
+"""What a node publishes unless it is told otherwise."""
 REPORT_EVERY_S = 1.0
+_LATENCIES = 1000  # of the last answers, for the percentiles
 # No scan heals what is wrong with the installation or the options.
 _FATAL = (MissingExtraError, ModelError, OptionError, ProviderError)
 
@@ -43,9 +60,10 @@ class PerceptionNode:
     computer's clock. Clouds that come late or twice are answered without tracks, and if the stamps jump, as when a
     recording begins again, tracking begins anew (`edgeperc.Tracker`).
 
-    It subscribes with the quality of service of sensor data. It publishes ``PREFIX/points``, ``PREFIX/markers``,
-    ``PREFIX/occupancy`` and ``PREFIX/detections``, each only while somebody subscribes, and ``/diagnostics`` once a
-    second, all reliably: best-effort subscribers receive them, too.
+    It subscribes with the quality of service of sensor data. It publishes ``PREFIX/NAME`` for each of its outputs, each
+    only while somebody subscribes, and ``/diagnostics`` once a second, all reliably: best-effort subscribers receive
+    them, too. ``ground_points`` and ``obstacle_points`` are the two parts of the cloud with all its fields
+    (`edgeperc.road.grid.split_points`); ``rolling`` is the grid with memory, in the frame of the odometry.
 
     Parameters
     ----------
@@ -67,8 +85,13 @@ class PerceptionNode:
     rate_hz : float
         Scans per second of the sensor; an answer is late after two periods and stale after five.
     outputs : sequence of str
-        Names of `OUTPUTS`. If ``detections`` cannot be published because vision_msgs is not installed, a warning says
-        so.
+        Names of `LIVE_OUTPUTS`, or ``NAME=TOPIC`` for another topic than ``PREFIX/NAME``. If ``detections`` cannot be
+        published because vision_msgs is not installed, a warning says so.
+    rolling : Rolling, optional
+        Odometry and grid of the output ``rolling``; without it, there is none.
+    lifecycle : bool
+        Begin unconfigured, and wait for `change_state` or, where the graph can, for a lifecycle manager. By default the
+        node is active at once.
 
     Raises
     ------
@@ -96,42 +119,111 @@ class PerceptionNode:
         grid_frame_id: str | None = None,
         prefix: str = "/edgeperc",
         rate_hz: float = 10.0,
-        outputs: Sequence[str] = tuple(OUTPUTS),
+        outputs: Sequence[str] = USUAL_OUTPUTS,
+        rolling: Rolling | None = None,
+        lifecycle: bool = False,
     ) -> None:
         if frame_id is not None:
             check_text("the frame is", frame_id, OptionError)
+        if not 0.0 < rate_hz < math.inf:
+            raise OptionError(f"rate_hz is {rate_hz}; expected scans a second, above 0")
         self._graph, self._perceiver_for = graph, perceiver_for
         self._topic, self._frame_id = topic, frame_id
         self._messages = RosMessages(grid_frame_id=grid_frame_id, lifetime_s=5.0 / rate_hz)
         self._perceiver: Perceiver | None = None
+        self._cloud: Any = None
         self._stamp_ns: int | None = None
         self._points: NDArray[np.float32] | None = None
         self._newest: PerceivedScan | None = None
-        self._n_answers = self._n_failed = self._n_reported = self._n_failed_reported = 0
+        self._n_failed = self._n_unplaced = 0
+        self._rates = _Rates()
         self._error: Exception | None = None
         self._waiting: queue.SimpleQueue[bytes | None] = queue.SimpleQueue()
         self._closed = threading.Event()
+        self._tracker, self._rolling, self._poses = tracker, rolling, Poses(self._messages)
+        self._forgets = False  # the next cloud begins anew
 
+        self._topics = _topics_of(outputs, prefix, rolling is not None)
         self._outputs: dict[str, Output] = {}
-        for name in outputs:
-            if name not in OUTPUTS:
-                raise OptionError(f"outputs has {name!r}; expected some of {', '.join(OUTPUTS)}")
-            if name != "diagnostics":
-                self._advertise(name, f"{prefix.rstrip('/')}/{name}")
         self._diagnostics = graph.advertise("/diagnostics", DIAGNOSTICS, RELIABLE) if "diagnostics" in outputs else None
         # The queue is empty nearly always: the stream's thread takes what comes, and keeps the newest.
         self._stream = stream(iter(self._waiting.get, None), self._perceive, tracker, rate_hz=rate_hz)
-        graph.subscribe(topic, CLOUD, self._waiting.put)
+        self._state: State = "unconfigured"
+        self._is_connected, self._changing = False, threading.Lock()
+        try:
+            self.is_managed = lifecycle and graph.manage(self.change_state)
+            for transition in () if lifecycle else ("configure", "activate"):
+                self.change_state(transition)
+        except BaseException:
+            self._waiting.put(None)
+            raise
         self._reporter = threading.Thread(target=self._report_always, name="edgeperc-diagnostics", daemon=True)
         self._reporter.start()
 
-    def _advertise(self, name: str, topic: str) -> None:
-        try:
-            self._outputs[name] = self._graph.advertise(topic, OUTPUTS[name], RELIABLE)
-        except OptionError as exc:
-            if name != "detections":
-                raise
-            warnings.warn(f"no detections are published: {exc}", stacklevel=4)
+    @property
+    def state(self) -> State:
+        """Of the node's life: unconfigured, inactive, active or finalized."""
+        return self._state
+
+    def change_state(self, transition: str) -> State:
+        """Configure, activate, deactivate, clean up or shut down the node.
+
+        While it is not active, clouds are ignored and nothing but diagnostics is published. Cleaning up forgets models,
+        tracks and the rolling grid; topics stay. Shutting down ends the iteration.
+
+        Parameters
+        ----------
+        transition : str
+            ``"configure"``, ``"activate"``, ``"deactivate"``, ``"cleanup"`` or ``"shutdown"``.
+
+        Returns
+        -------
+        str
+            The new state.
+
+        Raises
+        ------
+        OptionError
+            There is no such transition from the present state; or a topic's name is not valid, or its package missing.
+        """
+        with self._changing:
+            return self._changed(transition)
+
+    def _changed(self, transition: str) -> State:
+        known = TRANSITIONS.get(transition)
+        if known is None or self._state not in known[0]:
+            possible = [name for name, (before, _) in TRANSITIONS.items() if self._state in before]
+            raise OptionError(
+                f"the transition {transition!r} does not begin at {self._state}; expected one of {', '.join(possible)}"
+            )
+        if transition == "configure":
+            self._connect()
+        elif transition == "cleanup":
+            self._perceiver, self._newest, self._error, self._forgets = None, None, None, True
+        self._state = known[1]
+        if transition == "shutdown":
+            self._waiting.put(None)
+        return self._state
+
+    def _connect(self) -> None:
+        """Advertise and subscribe, once."""
+        if self._is_connected:
+            return
+        for name, topic in self._topics.items():
+            try:
+                self._outputs[name] = self._graph.advertise(topic, LIVE_OUTPUTS[name], RELIABLE)
+            except OptionError as exc:
+                if name != "detections":
+                    raise
+                warnings.warn(f"no detections are published: {exc}", stacklevel=5)
+        if self._rolling is not None:
+            self._graph.subscribe(self._rolling.topic, ODOMETRY, self._poses.receive)
+        self._graph.subscribe(self._topic, CLOUD, self._receive)
+        self._is_connected = True
+
+    def _receive(self, data: bytes) -> None:
+        if self._state == "active":
+            self._waiting.put(data)
 
     @property
     def n_scans(self) -> int:
@@ -176,12 +268,18 @@ class PerceptionNode:
                 yield exc
             else:
                 self._error, self._newest = None, scan
-                self._n_answers += 1
+                self._rates.add(self._stream.age_s)
                 yield scan
 
     def _perceive(self, data: bytes, *, stamp_s: float) -> Perception:
         """The answer to the bytes of a cloud. Its own stamp counts, not that of its arrival."""
-        self._points, self._stamp_ns = None, None
+        if self._forgets:
+            self._forgets = False
+            if self._tracker is not None:
+                self._tracker.reset()
+            if self._rolling is not None:
+                self._rolling.grid.reset()
+        self._points, self._stamp_ns, self._cloud = None, None, None
         if len(data) > MAX_SCAN_BYTES:
             raise PointsError(f"the cloud has {len(data):,} bytes; expected at most {MAX_SCAN_BYTES:,}")
         cloud = self._messages.decode(data, CLOUD)
@@ -191,17 +289,17 @@ class PerceptionNode:
                 f"{MAX_SCAN_BYTES // 16:,}"
             )
         points = cloud_points(cloud)
-        if self._perceiver is None:
-            self._perceiver = self._perceiver_for(describe_cloud(self._topic, cloud))
+        perceiver = self._perceiver
+        if perceiver is None:
+            perceiver = self._perceiver = self._perceiver_for(describe_cloud(self._topic, cloud))
         stamp_ns = cloud.header.stamp.sec * 10**9 + cloud.header.stamp.nanosec or time.time_ns()
         self._messages.frame_id = self._frame_id or cloud.header.frame_id or "lidar"
-        perception = self._perceiver(points, stamp_s=Stamp(stamp_ns * 1e-9, stamp_ns))
-        self._points, self._stamp_ns = points, stamp_ns
+        perception = perceiver(points, stamp_s=Stamp(stamp_ns * 1e-9, stamp_ns))
+        self._points, self._stamp_ns, self._cloud, self._sensor = points, stamp_ns, cloud, perceiver.sensor
         return perception
 
     def _publish(self, answer: Answer) -> PerceivedScan:
         assert self._points is not None
-        assert self._perceiver is not None
         assert answer.perception.stamp_s is not None
         scan = PerceivedScan(
             name=f"{self._topic}/{answer.n_scans - 1:06d}",
@@ -209,13 +307,44 @@ class PerceptionNode:
             points=self._points,
             perception=answer.perception,
             tracks=answer.tracks,
-            sensor=self._perceiver.sensor,
+            sensor=self._sensor,
             health=answer.health,
         )
+        if self._state != "active":
+            return scan
+        parts: Split | None = None
         for name, output in self._outputs.items():
-            if output.is_wanted:
-                output.publish(self._messages.encode(getattr(self._messages, name)(scan, self._stamp_ns)))
+            if name == ROLLING or not output.is_wanted:
+                continue
+            if name in (GROUND_POINTS, OBSTACLE_POINTS):
+                parts = parts or split_points(scan.perception, scan.points, sensor=scan.sensor)
+                mask = parts.ground if name == GROUND_POINTS else parts.obstacle
+                message = self._messages.part(scan, self._cloud, mask, self._stamp_ns)
+            else:
+                message = getattr(self._messages, name)(scan, self._stamp_ns)
+            output.publish(self._messages.encode(message))
+        self._remember(scan)
         return scan
+
+    def _remember(self, scan: PerceivedScan) -> None:
+        """Take a scan into the rolling grid and publish it; without a pose, count it."""
+        if self._rolling is None:
+            return
+        assert self._stamp_ns is not None
+        try:
+            pose = self._poses.at(self._stamp_ns)
+            if pose is None:
+                raise TrackingError("no pose at the time of the cloud")
+            frames = self._poses.child_frame_id, str(self._cloud.header.frame_id)
+            pose = pose @ self._rolling.base_from_sensor(*frames, scan.perception.mounting)
+            tracks = scan.tracked or ()
+            self._rolling.grid.update(scan.perception, scan.points, pose, tracks=tracks, sensor=scan.sensor)
+        except TrackingError:
+            self._n_unplaced += 1
+            return
+        if self._outputs[ROLLING].is_wanted:
+            message = self._messages.rolling(self._rolling.grid, self._poses.frame_id, self._stamp_ns)
+            self._outputs[ROLLING].publish(self._messages.encode(message))
 
     def _report_always(self) -> None:
         """Body of the thread that publishes the diagnostics, also while a scan is perceived."""
@@ -223,26 +352,35 @@ class PerceptionNode:
             self._diagnostics.publish(self._messages.encode(self._report()))
 
     def _report(self) -> Any:
-        n_answers, n_failed, error, newest = self._n_answers, self._n_failed, self._error, self._newest
-        level, message = None, None
-        if error is not None:
+        rates = self._rates.taken(self.n_scans, self._n_failed)
+        error, newest = self._error, self._newest
+        level: int | None = None
+        message: str | None = None
+        if self._state != "active":
+            level, message = 0, self._state
+        elif error is not None:
             level, message = 2, f"{type(error).__name__}: {error}"
         elif newest is not None:
             health = self._stream.health
             level, message = {"OK": (0, "OK"), "LATE": (1, "LATE"), "STALE": (3, "STALE: no answer of late")}[health]
-            if level == 0 and n_failed > self._n_failed_reported:
-                level, message = 1, f"{n_failed - self._n_failed_reported} clouds of the last second failed"
+            if level == 0 and rates.n_failed:
+                level, message = 1, f"{rates.n_failed} clouds of the last second failed"
         values = {
             "topic": self._topic,
+            "state": self._state,
             "clouds received": self.n_scans,
             "clouds dropped": self.n_dropped,
-            "clouds failed": n_failed,
-            "answers": n_answers,
-            "answers [Hz]": f"{(n_answers - self._n_reported) / REPORT_EVERY_S:.0f}",
+            "clouds failed": self._n_failed,
+            "answers": self._rates.n_answers,
+            "clouds [Hz]": f"{rates.clouds_hz:.1f}",
+            "answers [Hz]": f"{rates.answers_hz:.1f}",
         }
+        if rates.latency_ms is not None:
+            values |= {f"latency p{p} [ms]": f"{ms:.0f}" for p, ms in zip((50, 99), rates.latency_ms, strict=True)}
         if newest is not None:
             values["age of the newest answer [ms]"] = f"{1e3 * self._stream.age_s:.0f}"
-        self._n_reported, self._n_failed_reported = n_answers, n_failed
+        if self._rolling is not None:
+            values |= {"clouds without a pose": self._n_unplaced, "odometry not read": self._poses.n_failed}
         name = f"{self._graph.name.rpartition('/')[2]}: perception"
         return self._messages.diagnostics(
             newest, time.time_ns(), name=name, level=level, message=message, values=values
@@ -261,3 +399,54 @@ class PerceptionNode:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+
+class _Taken(NamedTuple):
+    """Since the last report; latencies (p50, p99) of the last answers, None before the first."""
+
+    n_failed: int
+    clouds_hz: float
+    answers_hz: float
+    latency_ms: tuple[float, float] | None
+
+
+class _Rates:
+    """Counts answers, and what came since the last report."""
+
+    def __init__(self) -> None:
+        self.n_answers = 0
+        self._last = (time.monotonic(), 0, 0, 0)
+        self._latencies_s: deque[float] = deque(maxlen=_LATENCIES)
+
+    def add(self, latency_s: float) -> None:
+        self._latencies_s.append(latency_s)
+        self.n_answers += 1
+
+    def taken(self, n_clouds: int, n_failed: int) -> _Taken:
+        last, self._last = self._last, (time.monotonic(), n_clouds, self.n_answers, n_failed)
+        elapsed_s, clouds, answers, failed = (now - then for now, then in zip(self._last, last, strict=True))
+        elapsed_s = max(elapsed_s, 1e-3)
+        latency_ms = None
+        if self._latencies_s:
+            p50, p99 = 1e3 * np.percentile(np.array(self._latencies_s), (50, 99))
+            latency_ms = float(p50), float(p99)
+        return _Taken(int(failed), clouds / elapsed_s, answers / elapsed_s, latency_ms)
+
+
+def _topics_of(outputs: Sequence[str], prefix: str, with_rolling: bool) -> dict[str, str]:
+    """The topic of each output. Raises OptionError."""
+    topics = {}
+    for text in outputs:
+        name, _, topic = text.partition("=")
+        if name not in LIVE_OUTPUTS or (topic and name == "diagnostics"):
+            raise OptionError(f"outputs has {text!r}; expected some of {', '.join(LIVE_OUTPUTS)}, or NAME=TOPIC")
+        if "=" in text:
+            full_name(topic)
+        if name == ROLLING and not with_rolling:
+            raise OptionError("the output rolling needs poses; pass rolling=, with a topic of nav_msgs/Odometry")
+        topics[name] = topic or f"{prefix.rstrip('/')}/{name}"
+    topics.pop("diagnostics", None)
+    return {
+        **topics,
+        **({ROLLING: f"{prefix.rstrip('/')}/{ROLLING}"} if with_rolling and ROLLING not in topics else {}),
+    }

@@ -8,7 +8,7 @@ from importlib import import_module
 from typing import Any
 
 from ..errors import OptionError
-from .graph import SENSOR_DATA, Qos
+from .graph import SENSOR_DATA, TRANSITIONS, Qos
 
 
 class RclpyGraph:
@@ -18,6 +18,7 @@ class RclpyGraph:
     domain : ROS_DOMAIN_ID; by default that of the environment.
     ros_args : what follows ``--ros-args``: remappings (``-r points:=/os/points``), parameters (``-p sensor:=os1-64``)
         and files of parameters.
+    managed : whether it is a lifecycle node: `manage` says what its transitions do.
     Raises OptionError.
     """
 
@@ -28,6 +29,7 @@ class RclpyGraph:
         namespace: str = "/",
         domain: int | None = None,
         ros_args: Sequence[str] = (),
+        managed: bool = False,
     ) -> None:
         try:
             self._rclpy: Any = import_module("rclpy")
@@ -47,13 +49,46 @@ class RclpyGraph:
                 domain_id=domain,
                 signal_handler_options=signals.SignalHandlerOptions.NO,
             )
-            self._node = self._rclpy.create_node(name, context=self._context, namespace=namespace)
+            self._change: Callable[[str], object] | None = None
+            make = self._managed_node() if managed else self._rclpy.create_node
+            self._managed = managed
+            self._node = make(name, context=self._context, namespace=namespace)
         except Exception as exc:
             raise OptionError(f"rclpy does not take name={name!r} with --ros-args {' '.join(ros_args)}: {exc}") from exc
         self.name = str(self._node.get_fully_qualified_name())
         self._executor = executors.SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self._node)
         self._thread = threading.Thread(target=self._executor.spin, name="edgeperc-rclpy", daemon=True)
+
+    def _managed_node(self) -> Any:
+        """A class of lifecycle nodes. Its methods are taken when a node is made, so they are looked up here later."""
+        lifecycle: Any = import_module("rclpy.lifecycle")
+        results = lifecycle.TransitionCallbackReturn
+
+        def callback(transition: str) -> Callable[[Any, Any], Any]:
+            def on_transition(node: Any, _state: Any) -> Any:
+                try:
+                    if self._change is not None:
+                        self._change(transition)
+                except Exception as exc:
+                    node.get_logger().error(f"{transition}: {exc}")
+                    return results.FAILURE
+                return results.SUCCESS
+
+            return on_transition
+
+        return type("Managed", (lifecycle.LifecycleNode,), {f"on_{name}": callback(name) for name in TRANSITIONS})
+
+    def manage(self, change: Callable[[str], object]) -> bool:
+        """Answer lifecycle managers from now on; see `Graph.manage`."""
+        if self._managed:
+            self._change = change
+            self._spin()
+        return self._managed
+
+    def _spin(self) -> None:
+        if not self._thread.ident:
+            self._thread.start()
 
     def parameter(self, name: str, default: Any) -> Any:
         """Declare a parameter; see `Graph.parameter`."""
@@ -65,13 +100,20 @@ class RclpyGraph:
 
     def advertise(self, topic: str, message_type: str, qos: Qos) -> _RclpyOutput:
         """Begin to publish; see `Graph.advertise`."""
-        return _RclpyOutput(self._node.create_publisher(_class_of(message_type), topic, self._profile(qos)))
+        kind, profile = _class_of(message_type), self._profile(qos)
+        try:
+            return _RclpyOutput(self._node.create_publisher(kind, topic, profile))
+        except Exception as exc:  # of rclpy, for a name
+            raise OptionError(f"rclpy does not publish on {topic!r}: {exc}") from exc
 
     def subscribe(self, topic: str, message_type: str, receive: Callable[[bytes], None]) -> None:
         """Receive messages; see `Graph.subscribe`. They come from now on."""
-        self._node.create_subscription(_class_of(message_type), topic, receive, self._profile(SENSOR_DATA), raw=True)
-        if not self._thread.ident:
-            self._thread.start()
+        kind, profile = _class_of(message_type), self._profile(SENSOR_DATA)
+        try:
+            self._node.create_subscription(kind, topic, receive, profile, raw=True)
+        except Exception as exc:
+            raise OptionError(f"rclpy does not subscribe to {topic!r}: {exc}") from exc
+        self._spin()
 
     def _profile(self, qos: Qos) -> Any:
         kinds = self._qos.ReliabilityPolicy

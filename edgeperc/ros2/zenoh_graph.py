@@ -125,6 +125,10 @@ class ZenohGraph:
         """The default: this node offers no services, so no parameters either."""
         return default
 
+    def manage(self, change: Callable[[str], object]) -> bool:
+        """No: this node offers no services, so no lifecycle manager reaches it."""
+        return False
+
     def advertise(self, topic: str, message_type: str, qos: Qos) -> _ZenohOutput:
         """Begin to publish; see `Graph.advertise`."""
         full, kind, digest = self._topic(topic, message_type)

@@ -22,14 +22,16 @@ import pytest
 
 pytest.importorskip("rosbags")
 
-from ros2_helpers import MESSAGES, Perceive, cloud, scans
+from ros2_helpers import MESSAGES, Perceive, cloud, odometry, scans
 
 from edgeperc import MissingExtraError, OptionError, Perceiver, Tracker
 from edgeperc.cli.main import main
 from edgeperc.records import PerceivedScan
+from edgeperc.road.grid import split_points
 from edgeperc.ros2.graph import RELIABLE, SENSOR_DATA
-from edgeperc.ros2.messages import CLOUD, DIAGNOSTICS, OUTPUTS
+from edgeperc.ros2.messages import CLOUD, DIAGNOSTICS, LIVE_OUTPUTS, OUTPUTS
 from edgeperc.ros2.node import PerceptionNode
+from edgeperc.ros2.odometry import ODOMETRY, Rolling
 from edgeperc.ros2.rclpy_graph import RclpyGraph
 from edgeperc.ros2.zenoh_graph import CONFIG_VARIABLE, ZenohGraph, attachment, qos_key, type_key
 from edgeperc.types.sensor import get_sensor
@@ -118,6 +120,7 @@ def test_a_node_is_seen_and_heard_as_one_of_rmw_zenoh(router: str, watch: Watch)
     try:
         assert graph.name == "/front/top"
         assert graph.parameter("sensor", "os1-64") == "os1-64"
+        assert not graph.manage(print)
         output = graph.advertise("points", CLOUD, SENSOR_DATA)
         graph.subscribe("/in", CLOUD, heard.append)
         zid = next(token.split("/")[2] for token in _of(watch, "top", 3))
@@ -203,14 +206,14 @@ def test_the_command_of_the_page_answers_another_process(router: str, watch: Wat
         )
     try:
         # The watch hears every topic, so a publisher is wanted from the start; the node must be there before it.
-        assert len(_of(watch, "edgeperc", 7)) == 7, log.read_text()  # the node, five topics, one subscription
+        assert len(_of(watch, "edgeperc", 9)) == 9, log.read_text()  # the node, seven topics, one subscription
         publisher = [sys.executable, str(TESTS / "ros2_helpers.py"), "3"]
         done = subprocess.run(publisher, env=environment, capture_output=True, text=True, timeout=2.0 * TIMEOUT_S)
         assert done.returncode == 0, done.stderr + log.read_text()
 
         def heard(name: str) -> list[bytes]:
             topic = "diagnostics" if name == "diagnostics" else f"edgeperc/{name}"
-            key = f"0/{topic}/{type_key(OUTPUTS[name])}/{MESSAGES.type_hash(OUTPUTS[name])}"
+            key = f"0/{topic}/{type_key(LIVE_OUTPUTS[name])}/{MESSAGES.type_hash(LIVE_OUTPUTS[name])}"
             return [data for found, data, _ in list(watch.samples) if found == key]
 
         _compare(heard)
@@ -252,6 +255,12 @@ def _compare(heard: Callable[[str], list[bytes]]) -> None:
         assert len(scan.perception.boxes) > 2
         for name in names:
             assert heard(name)[k] == MESSAGES.encode(getattr(MESSAGES, name)(scan, stamp_ns)), name
+        parts = split_points(perception, points, sensor=sensor)
+        source = MESSAGES.decode(cloud(points, stamp_ns, "velodyne_hdl64e"), CLOUD)
+        for name, mask in zip(("ground_points", "obstacle_points"), parts, strict=True):
+            until(lambda name=name, k=k: len(heard(name)) > k)  # type: ignore[misc]
+            assert heard(name)[k] == MESSAGES.encode(MESSAGES.part(scan, source, mask, stamp_ns)), name
+        assert 0.3 < parts.ground.mean() < 0.8
 
 
 class Bus:
@@ -263,6 +272,8 @@ class Bus:
         self.arguments: list[str] = []
         self.overrides: dict[str, Any] = {}
         self.ended: list[str] = []
+        self.transitions: dict[str, Callable[[], str]] = {}
+        self.logged: list[str] = []
 
     def modules(self) -> dict[str, ModuleType]:
         bus = self
@@ -312,19 +323,35 @@ class Bus:
                     raise TypeError(f"wrong parameter type of {name}")
                 return SimpleNamespace(value=value)
 
+            def get_logger(self) -> Any:
+                return SimpleNamespace(error=bus.logged.append)
+
             def create_publisher(self, kind: type, topic: str, profile: Any) -> Publisher:
-                assert kind.__name__ in {name.rpartition("/")[2] for name in OUTPUTS.values()}
+                assert kind.__name__ in {name.rpartition("/")[2] for name in LIVE_OUTPUTS.values()}
+                if " " in topic:
+                    raise ValueError("topic name is invalid")
                 bus.profiles[topic] = profile
                 return Publisher(topic)
 
             def create_subscription(self, kind: type, topic: str, receive: Any, profile: Any, *, raw: bool) -> None:
                 assert raw
-                assert kind.__name__ == "PointCloud2"
+                assert kind.__name__ in ("PointCloud2", "Odometry")
+                if " " in topic:
+                    raise ValueError("topic name is invalid")
                 bus.profiles[topic] = profile
                 bus.subscriptions.setdefault(topic, []).append(receive)
 
             def destroy_node(self) -> None:
                 bus.ended.append(self.name)
+
+        class LifecycleNode(Node):
+            """As rclpy's: the methods are taken once, when a node is made."""
+
+            def __init__(self, name: str, *, context: Context, namespace: str) -> None:
+                super().__init__(name, namespace)
+                for transition in ("configure", "activate", "deactivate", "cleanup", "shutdown"):
+                    on_transition = getattr(self, f"on_{transition}")
+                    bus.transitions[transition] = lambda on_transition=on_transition: on_transition(None)  # type: ignore[misc]
 
         def init(*, args: list[str], context: Context, domain_id: int | None, signal_handler_options: str) -> None:
             assert signal_handler_options == "none"
@@ -357,11 +384,16 @@ class Bus:
                     DurabilityPolicy=SimpleNamespace(VOLATILE="volatile"),
                     HistoryPolicy=SimpleNamespace(KEEP_LAST="keep last"),
                 ),
+                module(
+                    "rclpy.lifecycle",
+                    LifecycleNode=LifecycleNode,
+                    TransitionCallbackReturn=SimpleNamespace(SUCCESS="success", FAILURE="failure"),
+                ),
                 module("rclpy.signals", SignalHandlerOptions=SimpleNamespace(NO="none")),
                 module("rcl_interfaces.msg", ParameterDescriptor=SimpleNamespace),
                 module("sensor_msgs.msg", **messages("PointCloud2")),
                 module("visualization_msgs.msg", **messages("MarkerArray")),
-                module("nav_msgs.msg", **messages("OccupancyGrid")),
+                module("nav_msgs.msg", **messages("OccupancyGrid", "Odometry")),
                 module("diagnostic_msgs.msg", **messages("DiagnosticArray")),
             )
         }
@@ -398,6 +430,123 @@ def test_the_node_by_rclpy(bus: Bus) -> None:
     assert bus.ended == ["/front/top"]
 
 
+def test_a_lifecycle_manager_leads_the_node(bus: Bus) -> None:
+    graph = RclpyGraph("top", managed=True)
+    node = PerceptionNode(graph, lambda _: Perceive(), outputs=["points"], lifecycle=True)  # type: ignore[arg-type, return-value]
+    bus.subscriptions["/edgeperc/points"] = [lambda _: None]
+    with node:
+        assert (node.is_managed, node.state, [*bus.profiles]) == (True, "unconfigured", [])
+        assert bus.transitions["activate"]() == "failure"
+        assert "does not begin at unconfigured" in bus.logged[0]
+        for transition, state in (
+            ("configure", "inactive"),
+            ("activate", "active"),
+            ("deactivate", "inactive"),
+            ("activate", "active"),
+        ):
+            assert (bus.transitions[transition](), node.state) == ("success", state)
+        (receive,) = bus.subscriptions["/points"]
+        receive(cloud(POINTS))
+        assert isinstance(next(iter(node)), PerceivedScan)
+        assert (bus.transitions["deactivate"](), bus.transitions["cleanup"]()) == ("success", "success")
+        assert (bus.transitions["shutdown"](), node.state) == ("success", "finalized")
+        assert [*node] == []
+
+
+@pytest.mark.parametrize(
+    "options", [{"prefix": "/a b"}, {"topic": "/a b"}, {"outputs": ("points=~/points",)}, {"outputs": ("points=1/x",)}]
+)
+def test_names_that_rclpy_refuses(bus: Bus, options: dict[str, Any]) -> None:
+    graph = RclpyGraph("top")
+    try:
+        with pytest.raises(OptionError, match=r"rclpy does not|not a name of ROS 2"):
+            PerceptionNode(graph, lambda _: Perceive(), **{"outputs": ("points",), **options})  # type: ignore[arg-type, return-value]
+    finally:
+        graph.close()
+
+
+def test_what_autoware_is_asked_for_must_be_there(bus: Bus, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "autoware_perception_msgs.msg", None)
+    graph = RclpyGraph("top")
+    try:
+        with pytest.raises(OptionError, match="ros-DISTRIBUTION-autoware-perception-msgs"):
+            PerceptionNode(graph, lambda _: Perceive(), outputs=("tracked_objects",))  # type: ignore[arg-type, return-value]
+    finally:
+        graph.close()
+
+
+@pytest.mark.parametrize(
+    ("overrides", "said"),
+    [
+        ({"publish": ["points", "boxes"]}, "outputs has 'boxes'"),
+        ({"publish": ["rolling"]}, "needs poses"),
+        ({"publish": "points"}, "the parameter publish is not of type list"),
+        ({"odometry": "/odom", "sensor_pose": [1.0, 2.0]}, "sensor_pose is"),
+        ({"odometry": "/odom", "remember": -1.0}, "remember_s is -1"),
+        ({"odometry": "/odom", "remember": 5}, "the parameter remember is not of type float"),
+        ({"odometry": "/odom", "grid_size": 0.0}, "size_m is 0"),
+        ({"odometry": "an odometry"}, "not a name of ROS 2"),
+        ({"rate": -1.0}, "--rate is -1"),
+        ({"topic": "a topic"}, "rclpy does not subscribe to 'a topic'"),
+    ],
+)
+@pytest.mark.filterwarnings("ignore:no detections are published")
+def test_parameters_are_validated(
+    overrides: dict[str, Any], said: str, bus: Bus, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bus.overrides = overrides
+    assert main(["ros2", "--rclpy"]) == 2
+    assert said in capsys.readouterr().err
+    assert bus.ended == ["/edgeperc"]
+
+
+def test_parameters_make_the_grid_with_memory(bus: Bus, monkeypatch: pytest.MonkeyPatch) -> None:
+    made: list[dict[str, Any]] = []
+
+    def node(*_: Any, **options: Any) -> Any:
+        made.append(options)
+        raise OptionError("no node")
+
+    monkeypatch.setattr("edgeperc.ros2.node.PerceptionNode", node)
+    bus.overrides = {
+        "odometry": "/odometry/filtered",
+        "sensor_pose": [1.0, 0.0, 1.5, 0.0, 0.0, 90.0],
+        "grid_size": 20.0,
+        "publish": ["rolling=/grid", "ground_points"],
+    }
+    assert main(["ros2", "--rclpy", "--lifecycle"]) == 2
+    (options,) = made
+    assert (options["outputs"], options["lifecycle"]) == (["rolling=/grid", "ground_points"], True)
+    rolling = options["rolling"]
+    assert isinstance(rolling, Rolling)
+    assert (rolling.topic, rolling.sensor_pose) == ("/odometry/filtered", [1.0, 0.0, 1.5, 0.0, 0.0, 90.0])
+    assert rolling.grid.values().shape == (100, 100)
+
+
+def test_the_grid_with_memory_over_zenoh(router: str, watch: Watch) -> None:
+    graph, talker = ZenohGraph("top", connect=router), ZenohGraph("base", connect=router)
+    node = PerceptionNode(graph, lambda _: Perceive(), outputs=["rolling=/grid"], rolling=Rolling())  # type: ignore[arg-type, return-value]
+    with node:
+        odom, lidar = talker.advertise("/odom", ODOMETRY, RELIABLE), talker.advertise("/points", CLOUD, RELIABLE)
+        until(lambda: odom.is_wanted and lidar.is_wanted)
+        odom.publish(odometry(10**9, 3.0, 4.0, 0.0))
+        outcomes = iter(node)
+
+        def grids() -> list[bytes]:
+            """What came on /grid so far, after one more cloud: the pose may be on its way."""
+            lidar.publish(cloud(POINTS))
+            assert isinstance(next(outcomes), PerceivedScan)
+            return [data for key, data, _ in list(watch.samples) if key.startswith("0/grid/")]
+
+        until(grids)
+        raw = grids()[0]
+        grid = MESSAGES.decode(raw, LIVE_OUTPUTS["rolling"])
+        assert (grid.header.frame_id, grid.info.width) == ("odom", 200)
+        assert (grid.info.origin.position.x, grid.info.origin.position.y) == pytest.approx((-17.0, -16.0), abs=0.21)
+        assert 100 in grid.data
+    talker.close()
+
+
 def test_parameters_take_the_place_of_options(bus: Bus, capsys: pytest.CaptureFixture[str]) -> None:
     bus.overrides = {"topic": "/other", "rate": 20.0, "sensor": "no such sensor"}
     assert main(["ros2", "--rclpy", "--ros-args", "-p", "sensor:=x"]) == 2
@@ -413,6 +562,7 @@ def test_parameters_take_the_place_of_options(bus: Bus, capsys: pytest.CaptureFi
     [
         (["--ros-args", "-r", "a:=b"], "--ros-args needs --rclpy"),
         (["--rclpy", "--connect", "tcp/localhost:1"], "--connect needs Zenoh"),
+        (["--lifecycle"], "--lifecycle needs --rclpy"),
     ],
 )
 def test_options_that_exclude_one_another(arguments: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 import math
 import sys
 from collections.abc import Callable
@@ -250,6 +252,101 @@ def test_detections_are_the_tracks_or_the_boxes() -> None:
     tracks = tracked(6)
     found = again(MESSAGES.detections(perceived(tracks=tracks))).detections
     assert [d.id for d in found] == [str(track.id) for track in tracks]
+
+
+# Packages and fields as published (docs.ros.org, autoware_perception_msgs of Humble and Jazzy).
+AUTOWARE = {
+    "ObjectClassification": "uint8 label;float32 probability",
+    "Shape": "uint8 type;geometry_msgs/Polygon footprint;geometry_msgs/Vector3 dimensions",
+    "DetectedObjects": "std_msgs/Header header;DetectedObject[] objects",
+    "DetectedObject": "float32 existence_probability;ObjectClassification[] classification;"
+    "DetectedObjectKinematics kinematics;Shape shape",
+    "DetectedObjectKinematics": "geometry_msgs/PoseWithCovariance pose_with_covariance;bool has_position_covariance;"
+    "uint8 orientation_availability;geometry_msgs/TwistWithCovariance twist_with_covariance;bool has_twist;"
+    "bool has_twist_covariance",
+    "TrackedObjects": "std_msgs/Header header;TrackedObject[] objects",
+    "TrackedObject": "unique_identifier_msgs/UUID object_id;float32 existence_probability;"
+    "ObjectClassification[] classification;TrackedObjectKinematics kinematics;Shape shape",
+    "TrackedObjectKinematics": "geometry_msgs/PoseWithCovariance pose_with_covariance;"
+    "geometry_msgs/TwistWithCovariance twist_with_covariance;"
+    "geometry_msgs/AccelWithCovariance acceleration_with_covariance;uint8 orientation_availability;bool is_stationary",
+    "PredictedObjects": "std_msgs/Header header;PredictedObject[] objects",
+    "PredictedObject": "unique_identifier_msgs/UUID object_id;float32 existence_probability;"
+    "ObjectClassification[] classification;PredictedObjectKinematics kinematics;Shape shape",
+    "PredictedObjectKinematics": "geometry_msgs/PoseWithCovariance initial_pose_with_covariance;"
+    "geometry_msgs/TwistWithCovariance initial_twist_with_covariance;"
+    "geometry_msgs/AccelWithCovariance initial_acceleration_with_covariance;PredictedPath[] predicted_paths",
+    "PredictedPath": "geometry_msgs/Pose[] path;builtin_interfaces/Duration time_step;float32 confidence",
+}
+
+
+def test_the_types_of_autoware_are_those_of_its_package() -> None:
+    """Names, types and order of the fields make a type's hash (REP-2016); rosbags' are compared with ROS's above."""
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    for name, text in AUTOWARE.items():
+        store.register(get_types_from_msg(text.replace(";", "\n"), f"autoware_perception_msgs/msg/{name}"))
+    for name in AUTOWARE:
+        full = f"autoware_perception_msgs/msg/{name}"
+        assert MESSAGES.type_hash(full) == store.hash_rihs01(full), name
+    fields = [
+        {"name": name, "type": {"type_id": number, "capacity": 0, "string_capacity": 0, "nested_type_name": ""}}
+        for name, number in (("label", 3), ("probability", 10))
+    ]
+    name = "autoware_perception_msgs/msg/ObjectClassification"
+    described = {"type_description": {"type_name": name, "fields": fields}, "referenced_type_descriptions": []}
+    assert MESSAGES.type_hash(name) == "RIHS01_" + hashlib.sha256(json.dumps(described).encode()).hexdigest()
+
+
+def test_objects_of_autoware() -> None:
+    scan = perceived(tracks=tracked(6))
+    assert scan.tracks is not None
+    found = again(MESSAGES.detected_objects(scan))
+    assert (found.header.frame_id, found.header.stamp.sec) == ("lidar_top", 12)
+    assert [o.classification[0].label for o in found.objects] == [1, 7]
+    assert [o.existence_probability for o in found.objects] == pytest.approx([0.9, 0.6])
+    for each, box in zip(found.objects, BOXES, strict=True):
+        assert position(each.kinematics.pose_with_covariance.pose) == box.center
+        assert (each.shape.type, each.shape.dimensions.x, each.shape.dimensions.z) == (0, box.size[0], box.size[2])
+        assert (each.kinematics.has_twist, each.kinematics.orientation_availability) == (False, 1)
+    tracks = again(MESSAGES.tracked_objects(scan)).objects
+    paths = again(MESSAGES.predicted_objects(scan)).objects
+    assert [o.kinematics.is_stationary for o in tracks] == [math.hypot(*t.velocity) < 1.0 for t in scan.tracks]
+    assert {o.kinematics.is_stationary for o in tracks} == {True, False}
+    for track, each, path in zip(scan.tracks, tracks, paths, strict=True):
+        turned = rotation(each.kinematics.pose_with_covariance.pose)[:2, :2]
+        twist = each.kinematics.twist_with_covariance.twist.linear
+        np.testing.assert_allclose(turned @ [twist.x, twist.y], track.velocity, atol=1e-9)
+        covariance = each.kinematics.pose_with_covariance.covariance.reshape(6, 6)
+        np.testing.assert_allclose(covariance[:2, :2], track.covariance[:2, :2])
+        assert covariance[5, 5] == track.covariance[3, 3]
+        assert bytes(each.object_id.uuid) == bytes(path.object_id.uuid)
+        (way,) = path.kinematics.predicted_paths
+        assert (way.confidence, way.time_step.sec, way.time_step.nanosec, len(way.path)) == (1.0, 0, 500_000_000, 11)
+        gone = np.subtract(position(way.path[10]), track.center)
+        np.testing.assert_allclose(gone, [*np.multiply(track.velocity, 5), 0], atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("label", "number"),
+    [("car", 1), ("van", 1), ("truck", 2), ("bus", 3), ("cyclist", 6), ("pedestrian", 7), ("tram", 0), ("sofa", 0)],
+)
+def test_classes_of_autoware(label: str, number: int) -> None:
+    scan = perceived(boxes=(replace(BOXES[0], label=label, front=0.8),))
+    (found,) = again(MESSAGES.detected_objects(scan)).objects
+    assert [(c.label, c.probability) for c in found.classification] == [(number, 1.0)]
+    assert found.kinematics.orientation_availability == 2
+
+
+def test_ids_of_autoware_last_as_long_as_tracks() -> None:
+    scans = [perceived(tracks=tracked(k)) for k in (5, 6)]
+    first, second = ([bytes(o.object_id.uuid) for o in MESSAGES.tracked_objects(scan).objects] for scan in scans)
+    assert first == second
+    assert len({*first}) == 2
+    none = perceived()
+    assert not MESSAGES.tracked_objects(none).objects
+    assert not MESSAGES.predicted_objects(none).objects
 
 
 def test_diagnostics() -> None:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 import re
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,15 +18,16 @@ from hypothesis import strategies as st
 
 pytest.importorskip("rosbags")
 
-from ros2_helpers import FIELDS, MESSAGES, Perceive, cloud
+from ros2_helpers import FIELDS, MESSAGES, Perceive, cloud, odometry, street, street_kinds
 
-from edgeperc import Box, ModelFileError, OptionError, Perception, PointsError, Tracker
+from edgeperc import Box, ModelFileError, OptionError, Perception, PointsError, RollingGrid, Tracker
 from edgeperc.readers.clouds import cloud_points
 from edgeperc.records import PerceivedScan
 from edgeperc.ros2 import node as node_module
 from edgeperc.ros2.graph import RELIABLE, Qos, full_name
 from edgeperc.ros2.messages import CLOUD, DIAGNOSTICS, OUTPUTS
 from edgeperc.ros2.node import PerceptionNode
+from edgeperc.ros2.odometry import ODOMETRY, Rolling
 from waiting import TIMEOUT_S, until
 
 SLOW_HZ = 0.01  # no answer is late
@@ -39,6 +42,8 @@ class FakeGraph:
         self.types: dict[str, tuple[str, Qos]] = {}
         self.wanted = True
         self.give: Callable[[bytes], None]
+        self.odometry: Callable[[bytes], None]
+        self.change: Callable[[str], object] | None = None
 
     def parameter(self, name: str, default: Any) -> Any:
         return default
@@ -58,8 +63,15 @@ class FakeGraph:
         return Output()
 
     def subscribe(self, topic: str, message_type: str, receive: Callable[[bytes], None]) -> None:
-        assert message_type == CLOUD
-        self.give = receive
+        if message_type == CLOUD:
+            self.give = receive
+        else:
+            assert (topic, message_type) == ("/odom", ODOMETRY)
+            self.odometry = receive
+
+    def manage(self, change: Callable[[str], object]) -> bool:
+        self.change = change
+        return True
 
     def close(self) -> None:
         self.closed += 1
@@ -111,6 +123,8 @@ def test_a_cloud_is_answered_with_its_stamp_and_frame() -> None:
     assert graph.types == {
         "/diagnostics": (DIAGNOSTICS, RELIABLE),
         **{f"/edgeperc/{name}": (kind, RELIABLE) for name, kind in OUTPUTS.items() if name != "diagnostics"},
+        "/edgeperc/ground_points": (CLOUD, RELIABLE),
+        "/edgeperc/obstacle_points": (CLOUD, RELIABLE),
     }
 
 
@@ -332,6 +346,209 @@ def test_diagnostics_tell_of_silence(quick: None, monkeypatch: pytest.MonkeyPatc
         )
 
 
+@pytest.mark.parametrize("kind", ["<f4", ">f4", "<f8"])
+@pytest.mark.parametrize("height", [1, 2])
+def test_a_point_is_ground_or_obstacle_or_dropped(kind: str, height: int) -> None:
+    """With all its fields, byte by byte; organized or not, with padding at the end of rows."""
+    points = street()
+    fields = [(name, kind) for name in ("x", "y", "z")] + [("ring", "<u2"), ("time", "<f8"), ("rest", "V3")]
+    table = np.zeros(len(points), fields)
+    for column, name in enumerate("xyz"):
+        table[name] = points[:, column]
+    table["ring"], table["time"] = np.arange(len(points)), np.arange(len(points)) * 1e-6
+    table["rest"] = np.random.default_rng(1).bytes(3)
+    make, sizes = MESSAGES.types["sensor_msgs/msg/PointField"], {"<f4": 7, ">f4": 7, "<f8": 8, "<u2": 4}
+    described = [
+        make(name=name, offset=table.dtype.fields[name][1], datatype=sizes.get(code, 8), count=1)  # type: ignore[index]
+        for name, code in fields
+        if name != "rest"
+    ]
+    step, width = table.dtype.itemsize, len(points) // height
+    rows = table.view(np.uint8).reshape(height, -1)
+    padded = np.hstack([rows, np.full((height, 5 * (height - 1)), 255, np.uint8)])
+    graph = FakeGraph()
+    with PerceptionNode(graph, lambda _: Perceive(), rate_hz=SLOW_HZ) as node:
+        shape = {"height": height, "width": width, "point_step": step, "row_step": padded.shape[1]}
+        data = cloud(points, 77, is_bigendian=kind == ">f4", fields=described, data=padded.ravel(), **shape)
+        graph.give(data)
+        scan = next(iter(node))
+        assert isinstance(scan, PerceivedScan), scan
+    parts = []
+    for name in ("ground_points", "obstacle_points"):
+        part = MESSAGES.decode(graph.published[f"/edgeperc/{name}"][0], CLOUD)
+        assert (part.header.frame_id, part.header.stamp.nanosec, part.is_bigendian) == ("velodyne", 77, kind == ">f4")
+        assert [(f.name, f.offset, f.datatype) for f in part.fields] == [
+            (f.name, f.offset, f.datatype) for f in described
+        ]
+        assert (part.height, part.width * step, part.row_step) == (1, part.data.size, part.data.size)
+        parts.append(part.data.view(table.dtype))
+    ground, obstacle = (np.sort([int(row["time"].round(6) * 1e6 + 0.5) for row in part]) for part in parts)
+    assert not {*ground} & {*obstacle}
+    for part, numbers in zip(parts, (ground, obstacle), strict=True):
+        assert part.tobytes() == table[numbers].tobytes()
+    kinds = street_kinds()
+    assert {*kinds} == {"ground", "obstacle", "neither"}
+    np.testing.assert_array_equal(ground, np.flatnonzero(kinds == "ground"))
+    np.testing.assert_array_equal(obstacle, np.flatnonzero(kinds == "obstacle"))
+
+
+def test_topics_have_names_of_ones_own() -> None:
+    graph = FakeGraph()
+    outputs = ["ground_points=/ground", "obstacle_points=/nonground_points", "tracked_objects=objects", "markers"]
+    PerceptionNode(graph, lambda _: Perceive(), outputs=outputs, prefix="/x").close()
+    assert {topic: kind for topic, (kind, _) in graph.types.items()} == {
+        "/ground": CLOUD,
+        "/nonground_points": CLOUD,
+        "objects": "autoware_perception_msgs/msg/TrackedObjects",
+        "/x/markers": OUTPUTS["markers"],
+    }
+
+
+def test_the_grid_with_memory_follows_the_odometry() -> None:
+    """A sensor 1 m ahead of the vehicle's middle, turned to the left, on a vehicle that turns as it drives."""
+    graph, points, n = FakeGraph(), street(), 4
+    rolling = Rolling(sensor_pose=(1.0, 0.0, 1.73, 0.0, 0.0, 90.0), grid=RollingGrid(size_m=60.0, cell_m=0.5))
+    with PerceptionNode(graph, lambda _: Perceive(), rolling=rolling, rate_hz=SLOW_HZ) as node:
+        outcomes = iter(node)
+        for k in range(n):
+            stamp_ns = 10**9 + k * 10**8
+            graph.odometry(odometry(stamp_ns - 5 * 10**7, 10.0 + k - 0.5, 20.0, 0.0))
+            graph.odometry(odometry(stamp_ns + 5 * 10**7, 10.0 + k + 0.5, 20.0, 0.0))
+            graph.give(cloud(points, stamp_ns))
+            assert isinstance(next(outcomes), PerceivedScan)
+            graph.odometry(b"no odometry")
+        graph.give(cloud(points, 10**10))
+        assert isinstance(next(outcomes), PerceivedScan)  # without a pose
+    grids = [MESSAGES.decode(raw, OUTPUTS["occupancy"]) for raw in graph.published["/edgeperc/rolling"]]
+    assert len(grids) == n
+    assert {grid.header.frame_id for grid in grids} == {"odom"}
+    assert [grid.header.stamp.nanosec for grid in grids] == [k * 10**8 for k in range(n)]
+    for k, grid in enumerate(grids):
+        cells = grid.data.reshape(grid.info.height, grid.info.width)
+        # The wall 12 m ahead of the sensor lies 12 m to the left of the vehicle.
+        x, y = grid.info.origin.position.x, grid.info.origin.position.y
+        column, row = int((10.0 + k + 1.0 - x) / 0.5), int((20.0 + 12.1 - y) / 0.5)
+        assert 100 in cells[row - 1 : row + 2, column]
+        assert cells[row - 8, column] == 0
+        assert grid.info.origin.position.z == pytest.approx(0.0)
+
+
+def test_a_life_in_states(quick: None) -> None:
+    graph, made, tracker = FakeGraph(), [], Tracker()
+
+    def perceiver_for(_: Mapping[str, Any]) -> Any:
+        made.append(Perceive())
+        return made[-1]
+
+    with PerceptionNode(graph, perceiver_for, tracker=tracker, lifecycle=True, rate_hz=SLOW_HZ) as node:
+        outcomes = iter(node)
+        assert (node.state, node.is_managed) == ("unconfigured", True)
+        assert graph.types.keys() == {"/diagnostics"}
+        until(lambda: graph.published["/diagnostics"])
+        assert (last_status(graph).level, last_status(graph).message) == (0, "unconfigured")
+        assert graph.change is not None
+        graph.change("configure")
+        assert node.state == "inactive"
+        assert "/edgeperc/points" in graph.types
+        graph.give(cloud(POINTS, 1))
+        assert node.change_state("activate") == "active"
+        graph.give(cloud(POINTS, 2))
+        assert isinstance(next(outcomes), PerceivedScan)
+        assert (len(made), node.n_scans) == (1, 1)
+        graph.change("deactivate")
+        graph.give(cloud(POINTS, 3))
+        until(lambda: last_status(graph).message == "inactive")
+        graph.change("cleanup")
+        graph.change("configure")
+        graph.change("activate")
+        graph.give(cloud(POINTS, 4))
+        assert isinstance(next(outcomes), PerceivedScan)
+        assert (len(made), node.n_scans) == (2, 2)
+        stamps = [MESSAGES.decode(raw, CLOUD).header.stamp.nanosec for raw in graph.published["/edgeperc/points"]]
+        assert stamps == [2, 4]
+        assert node.change_state("shutdown") == "finalized"
+        assert [*outcomes] == []
+    assert graph.closed == 1
+
+
+@pytest.mark.parametrize(
+    ("way", "wrong"),
+    [
+        ([], "activate"),
+        ([], "cleanup"),
+        ([], "explode"),
+        (["configure"], "configure"),
+        (["configure", "activate"], "cleanup"),
+        (["shutdown"], "configure"),
+    ],
+)
+def test_transitions_that_there_are_not(way: list[str], wrong: str) -> None:
+    with PerceptionNode(FakeGraph(), lambda _: Perceive(), lifecycle=True) as node:
+        for transition in way:
+            node.change_state(transition)
+        before = node.state
+        with pytest.raises(OptionError, match=f"'{wrong}' does not begin at {before}"):
+            node.change_state(wrong)
+        assert node.state == before
+
+
+def test_diagnostics_tell_rates_and_latencies(quick: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    graph = FakeGraph()
+    with PerceptionNode(graph, lambda _: Perceive(), rate_hz=SLOW_HZ) as node:
+        outcomes = iter(node)
+        monkeypatch.setattr(node_module, "REPORT_EVERY_S", 0.3)
+        until(lambda: graph.published["/diagnostics"])
+        for k in range(20):
+            graph.give(cloud(POINTS, 10**9 + k))
+            next(outcomes)
+
+        def values() -> list[dict[str, str]]:
+            statuses = [MESSAGES.decode(raw, DIAGNOSTICS).status[0] for raw in graph.published["/diagnostics"]]
+            return [{v.key: v.value for v in status.values} for status in statuses]
+
+        until(lambda: values()[-1]["answers"] == "20" and values()[-1]["answers [Hz]"] == "0.0")
+    found = values()
+    assert max(float(each["clouds [Hz]"]) for each in found) > 5.0
+    assert max(float(each["answers [Hz]"]) for each in found) > 5.0
+    assert "latency p50 [ms]" not in found[0]
+    assert 0 <= int(found[-1]["latency p50 [ms]"]) <= int(found[-1]["latency p99 [ms]"]) < 1e3 * TIMEOUT_S
+    assert (found[-1]["clouds dropped"], found[-1]["state"]) == ("0", "active")
+
+
+def test_the_page_configures_nav2_for_this_node() -> None:
+    """The YAML of the page: topics and frames are the node's, parameters those of the layers' sources."""
+    yaml = pytest.importorskip("yaml")
+    known = {
+        "nav2_ground_consistency_costmap_plugin::GroundConsistencyLayer": {
+            *("ground_points_topic", "nonground_points_topic", "tf_timeout", "ground_inc", "nonground_inc"),
+            *("ground_decay", "nonground_decay", "nonground_occ_thresh", "nonground_prob_thresh", "max_score"),
+            *("min_clearance", "robot_height", "footprint_clearing_enabled", "enable_kpi_logging", "max_data_range"),
+        },
+        "nav2_costmap_2d::StaticLayer": {
+            *("enabled", "map_topic", "map_subscribe_transient_local", "subscribe_to_updates", "transform_tolerance"),
+        },
+        "nav2_costmap_2d::InflationLayer": {"enabled", "inflation_radius", "cost_scaling_factor"},
+    }
+    graph = FakeGraph()
+    PerceptionNode(graph, lambda _: Perceive(), rolling=Rolling()).close()
+    page = (Path(__file__).parents[2] / "docs/howto/ros2.md").read_text("utf-8")
+    blocks = [yaml.safe_load(text) for text in re.findall(r"^```yaml\n(.*?)^```$", page, flags=re.M | re.S)]
+    assert len(blocks) == 3
+    topics = set()
+    for block in blocks[1:]:
+        costmap = block["local_costmap"]["local_costmap"]["ros__parameters"]
+        assert (costmap["global_frame"], costmap["rolling_window"]) == ("odom", True)
+        for layer in (costmap[name] for name in costmap["plugins"]):
+            assert {*layer} - {"plugin"} <= known[layer["plugin"]]
+            topics |= {value for name, value in layer.items() if name.endswith("_topic")}
+            # A latched map would be asked for, which the node does not offer.
+            assert layer.get("map_subscribe_transient_local", False) is False
+    assert topics == {"/edgeperc/ground_points", "/edgeperc/obstacle_points", "/edgeperc/rolling"}
+    assert topics < {*graph.types}
+    manager = blocks[0]["lifecycle_manager_edgeperc"]["ros__parameters"]
+    assert (manager["node_names"], manager["bond_timeout"]) == (["edgeperc"], 0.0)
+
+
 def test_without_vision_msgs_there_are_no_detections_and_a_warning() -> None:
     graph = FakeGraph(missing="vision_msgs")
     with pytest.warns(UserWarning, match="no detections are published"):
@@ -340,9 +557,21 @@ def test_without_vision_msgs_there_are_no_detections_and_a_warning() -> None:
     assert "/edgeperc/markers" in graph.types
 
 
-def test_unknown_outputs() -> None:
-    with pytest.raises(OptionError, match="expected some of points"):
-        PerceptionNode(FakeGraph(), lambda _: Perceive(), outputs=("boxes",))
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"outputs": ("boxes",)}, "expected some of points"),
+        ({"outputs": ("points=",)}, "not a name of ROS 2"),
+        ({"outputs": ("points=a b",)}, "not a name of ROS 2"),
+        ({"outputs": ("diagnostics=/mine",)}, "outputs has 'diagnostics=/mine'"),
+        ({"outputs": ("rolling",)}, "needs poses"),
+        ({"rate_hz": 0.0}, "rate_hz is 0"),
+        ({"rate_hz": math.nan}, "rate_hz is nan"),
+    ],
+)
+def test_options_of_no_node(options: dict[str, Any], said: str) -> None:
+    with pytest.raises(OptionError, match=said):
+        PerceptionNode(FakeGraph(), lambda _: Perceive(), **options)
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,345 @@
+"""A grid for navigation that moves with the vehicle, remembers what earlier scans showed, and forgets it again."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Collection, Iterable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..errors import CardError, OptionError, StampError, TrackingError
+from ..system.clock import LATEST_S, Clock, nanoseconds_of
+from ..tracking import Track
+from ..tracking.moving import MOVABLE, movable_points
+from ..types.frame import ModelFrame
+from ..types.geometry import draw_footprints
+from ..types.mounting import MODEL_HEIGHT_M
+from ..types.perception import Box, Perception
+from ..types.points import as_points
+from ..types.rigid import rigid
+from ..types.sensor import SensorProfile
+from ..types.views import TopViewGeometry
+from .grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, check_value, occupancy_grid
+
+# What a cell holds.
+_NOTHING, _ROAD, _OFF_ROAD, _OBSTACLE, _GROUND = range(5)
+_FARTHEST_M = 1e8  # of a pose: cells are still counted exactly
+_SMALLEST_AREA = 0.05  # of a cell of the road as odometry sees it from above; less, and the road stands upright
+
+
+class RollingGrid:
+    """A grid for navigation in the frame of an odometry: what the scans of the last seconds showed around the vehicle.
+
+    Its cells are fixed to the odometry's frame; the window moves by whole cells and keeps the sensor in its middle.
+    Each scan replaces what it observed, so that an obstacle that is gone is cleared where the scan sees the ground, and
+    nowhere else: what is hidden now keeps what was known, for `remember_s`. Then it is unknown, never free.
+
+    Objects that could move are not remembered: their cells are unknown again with the next scan, unless it sees them.
+
+    Parameters
+    ----------
+    size_m : float
+        Edge of the window [m].
+    cell_m : float
+        Edge of a cell [m].
+    remember_s : float
+        A cell is unknown again when it was not observed for longer than this [s].
+    min_height_m : float
+        As in `edgeperc.occupancy_grid`.
+    classes : collection of str
+        Classes of points, boxes and tracks that are not remembered.
+    margin_m : float
+        Boxes of such objects are grown by this on every side [m].
+
+    Raises
+    ------
+    OptionError
+        A number is out of its range, or the grid has too many cells.
+
+    Examples
+    --------
+    >>> rolling = edgeperc.RollingGrid(remember_s=5.0)       # doctest: +SKIP
+    >>> rolling.update(found, points, T_odom_sensor)         # doctest: +SKIP
+    >>> message = rolling.to_occupancy_grid("odom")          # doctest: +SKIP
+    """
+
+    def __init__(
+        self,
+        *,
+        size_m: float = 40.0,
+        cell_m: float = 0.2,
+        remember_s: float = 10.0,
+        min_height_m: float = 0.2,
+        classes: Collection[str] = MOVABLE,
+        margin_m: float = 0.3,
+    ) -> None:
+        for name, value, low in (("size_m", size_m, 1.0), ("cell_m", cell_m, 0.01), ("remember_s", remember_s, 0.0)):
+            if not (low <= value < 1e4):
+                raise OptionError(f"{name} is {value}; expected {low:g} or more, and less than 10,000")
+        if not (0.0 <= margin_m < 10.0 and cell_m <= size_m):
+            raise OptionError(
+                f"got margin_m={margin_m}, cell_m={cell_m}, size_m={size_m}; expected cells in the window"
+            )
+        self._cell_m, self._remember_s, self._min_height_m = float(cell_m), float(remember_s), min_height_m
+        self._classes, self._margin_m = frozenset(classes), float(margin_m)
+        n = round(size_m / cell_m)
+        # A scan's own cells lie around the sensor, turned; in their square, the window fits however it is turned.
+        reach_m = (math.ceil(n * math.sqrt(0.5)) + 1) * self._cell_m
+        self._reach = (-reach_m, reach_m)
+        try:
+            self._view = TopViewGeometry(self._reach, self._reach, cell_m=self._cell_m)
+        except CardError as exc:
+            raise OptionError(f"got size_m={size_m} and cell_m={cell_m}: no grid ({exc})") from exc
+        self._kind = np.zeros((n, n), np.uint8)
+        self._seen_s = np.full((n, n), -math.inf)
+        self._fleeting = np.zeros((n, n), np.bool_)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget everything."""
+        self._clock, self._z_m = Clock(), 0.0
+        self._corner = (0, 0)  # cells from the odometry's origin to the window's corner with the lowest x and y
+        self._stamp_s: float | None = None
+        self._forget(np.ones(self._kind.shape, np.bool_))
+
+    def _forget(self, where: NDArray[np.bool_]) -> None:
+        self._kind[where], self._seen_s[where], self._fleeting[where] = _NOTHING, -math.inf, False
+
+    @property
+    def stamp_s(self) -> float | None:
+        """Time of the newest scan [s]; None before the first."""
+        return self._stamp_s
+
+    @property
+    def origin_m(self) -> tuple[float, float]:
+        """x and y of the window's corner with the lowest ones, in the frame of the odometry [m]."""
+        return self._corner[0] * self._cell_m, self._corner[1] * self._cell_m
+
+    def update(
+        self,
+        perception: Perception,
+        points: ArrayLike,
+        T_odom_sensor: ArrayLike,
+        *,
+        tracks: Iterable[Track] = (),
+        sensor: str | os.PathLike[str] | SensorProfile = "hdl-64e",
+    ) -> None:
+        """Take in a scan. A late or doubled one changes nothing; where the clock jumps, everything is forgotten.
+
+        Parameters
+        ----------
+        perception : Perception
+            With its time; a top view says which ground is road.
+        points : (n, 4) or (n, 3) array_like, or a structured array
+            The scan that was perceived.
+        T_odom_sensor : (4, 4) array_like
+            Pose of the frame of the scan in that of the odometry, at the time of the scan.
+        tracks : iterable of Track
+            `Tracks` of this scan: objects that coast are not remembered, either.
+        sensor : str, Path or SensorProfile
+            As passed to `Perceiver`.
+
+        Raises
+        ------
+        StampError
+            The perception has no time.
+        TrackingError
+            The pose is not rigid, too far, or lays the sensor on its side.
+        PointsError, SensorError
+            As `edgeperc.occupancy_grid`.
+        """
+        stamp_s = perception.stamp_s
+        if stamp_s is None or not abs(stamp_s) <= LATEST_S:
+            raise StampError(f"the perception has the time {stamp_s}; call the perceiver with stamp_s=, in seconds")
+        pose = rigid("T_odom_sensor", T_odom_sensor, TrackingError)
+        to_odom, z_m = _road_in(pose, perception)
+        step, clock = self._clock.after(stamp_s)
+        if step == "late":
+            self._clock = clock
+            return
+        grid = occupancy_grid(
+            perception,
+            points,
+            cell_m=self._cell_m,
+            x_range_m=self._reach,
+            y_range_m=self._reach,
+            min_height_m=self._min_height_m,
+            sensor=sensor,
+        )
+        kinds, movable = self._kinds_of(grid, perception), self._movable(perception, points, tracks)
+        if step != "next":
+            self.reset()
+        self._clock, self._stamp_s, self._z_m = clock, stamp_s, z_m
+        n = len(self._kind)
+        self._roll(*(math.floor(along / self._cell_m) - n // 2 for along in pose[:2, 3]))
+        self._forget(self._fleeting | (self._seen_s < stamp_s - self._remember_s))
+        self._observe(kinds, movable & (kinds == _OBSTACLE), to_odom, stamp_s)
+
+    def _kinds_of(self, grid: OccupancyGrid, perception: Perception) -> NDArray[np.uint8]:
+        """What the scan shows of its own cells."""
+        judged = np.zeros(grid.observed.shape, np.bool_)
+        if perception.top_view is not None:
+            judged = perception.top_view.geometry.cells(*self._view.cell_centers())[2]
+        kinds = np.where(judged, _OFF_ROAD, _GROUND).astype(np.uint8)
+        kinds[grid.drivable] = _ROAD
+        kinds[grid.obstacle] = _OBSTACLE
+        kinds[grid.unknown] = _NOTHING
+        return kinds
+
+    def _movable(self, perception: Perception, points: ArrayLike, tracks: Iterable[Track]) -> NDArray[np.bool_]:
+        """The scan's own cells in which something is that could move."""
+        frame = ModelFrame(perception.mounting)
+        boxes = [box for box in (*perception.boxes, *(track.box for track in tracks)) if box.label in self._classes]
+        drawn = np.zeros((self._view.height, self._view.width), np.uint8)
+        grown = [_grown(box, self._margin_m) for box in frame.move_boxes(boxes)]
+        draw_footprints(drawn, grown, self._view, ("nothing", "movable"))
+        scan = as_points(points)
+        mark = movable_points(perception, scan, classes=self._classes, margin_m=self._margin_m)
+        moved = frame.move(scan)[mark]
+        row, col, in_view = self._view.cells(moved[:, 0], moved[:, 1])
+        drawn[row[in_view], col[in_view]] = 1
+        return drawn.astype(np.bool_)
+
+    def _roll(self, x: int, y: int) -> None:
+        """Move the window to another corner; what comes into it is unknown."""
+        dx, dy = x - self._corner[0], y - self._corner[1]
+        self._corner = x, y
+        n = len(self._kind)
+        if not (dx or dy):
+            return
+        if abs(dx) >= n or abs(dy) >= n:
+            self._forget(np.ones((n, n), np.bool_))
+            return
+        for array in (self._kind, self._seen_s, self._fleeting):
+            array[:] = np.roll(array, (-dy, -dx), (0, 1))
+        new = np.zeros((n, n), np.bool_)
+        new[n - dy if dy > 0 else 0 : n if dy > 0 else -dy] = True
+        new[:, n - dx if dx > 0 else 0 : n if dx > 0 else -dx] = True
+        self._forget(new)
+
+    def _observe(
+        self, kinds: NDArray[np.uint8], fleeting: NDArray[np.bool_], to_odom: NDArray[np.float64], stamp_s: float
+    ) -> None:
+        """Write what a scan shows of its own cells into those of the window."""
+        # Every cell of the window asks the scan's cell at its middle, so that none is left out between two of them.
+        n = len(self._kind)
+        x, y = ((corner + np.arange(n) + 0.5) * self._cell_m for corner in self._corner)
+        back = np.linalg.inv(to_odom[:, :2])
+        dx, dy = x[None, :] - to_odom[0, 2], y[:, None] - to_odom[1, 2]
+        row, col, asked = self._view.cells(back[0, 0] * dx + back[0, 1] * dy, back[1, 0] * dx + back[1, 1] * dy)
+        row[~asked], col[~asked] = 0, 0
+        seen = np.where(asked, kinds[row, col], np.uint8(_NOTHING))
+        # Ground beside the top view: an earlier scan may have seen whether it is road.
+        known = (seen == _GROUND) & ((self._kind == _ROAD) | (self._kind == _OFF_ROAD))
+        new = (seen != _NOTHING) & ~known
+        self._kind[new], self._fleeting[new] = seen[new], fleeting[row, col][new]
+        self._seen_s[seen != _NOTHING] = stamp_s
+        # Every obstacle of the scan is in the cell that holds its middle, so that none falls between two of them.
+        across, along = (axis.ravel() for axis in np.broadcast_arrays(*self._view.cell_centers()))
+        at = np.flatnonzero(kinds.ravel() == _OBSTACLE)
+        place = np.floor((to_odom @ [across[at], along[at], np.ones(len(at))]) / self._cell_m).astype(np.int64)
+        col, row = place - np.array(self._corner)[:, None]
+        inside = (row >= 0) & (row < n) & (col >= 0) & (col < n)
+        row, col, at = row[inside], col[inside], at[inside]
+        self._kind[row, col], self._seen_s[row, col] = _OBSTACLE, stamp_s
+        # Of two in one cell, the one that stands there for good is remembered.
+        self._fleeting[row, col] = True
+        lasting = ~fleeting.ravel()[at]
+        self._fleeting[row[lasting], col[lasting]] = False
+
+    def values(self, off_road: int = OCCUPIED, unjudged: int = FREE) -> NDArray[np.int8]:
+        """Values of a map at the time of the newest scan, (cells along y, cells along x) int8, from the lowest x and y.
+
+        Parameters
+        ----------
+        off_road : int
+            Value in -1..100 of ground that a top view showed not to be road.
+        unjudged : int
+            Value in -1..100 of observed ground that no top view has shown, such as that behind the vehicle at first.
+
+        Returns
+        -------
+        ndarray
+            -1 unknown, 0 drivable, 100 obstacle.
+
+        Raises
+        ------
+        OptionError
+            A value is out of its range.
+        """
+        found = (UNKNOWN, FREE, check_value("off_road", off_road), OCCUPIED, check_value("unjudged", unjudged))
+        return np.array(found, np.int8)[self._kind]
+
+    def ages_s(self) -> NDArray[np.float64]:
+        """Time since each cell was last observed, as of the newest scan [s]; infinite where nothing is known.
+
+        Returns
+        -------
+        ndarray
+            In the order of `values`.
+        """
+        return (0.0 if self._stamp_s is None else self._stamp_s) - self._seen_s
+
+    def to_occupancy_grid(
+        self, frame_id: str = "odom", off_road: int = OCCUPIED, unjudged: int = FREE
+    ) -> dict[str, Any]:
+        """Convert to the fields of a ROS message nav_msgs/OccupancyGrid.
+
+        Parameters
+        ----------
+        frame_id : str
+            Name of the frame of the odometry.
+        off_road, unjudged : int
+            As in `values`.
+
+        Returns
+        -------
+        dict
+            ``header``, ``info`` and ``data`` (n,) int8, as of `OccupancyGrid.to_occupancy_grid`. The origin lies at the
+            height of the road below the sensor and is not turned.
+
+        Raises
+        ------
+        OptionError
+            A value is out of its range.
+        """
+        values = self.values(off_road, unjudged)
+        nanoseconds = nanoseconds_of(self._stamp_s or 0.0)
+        stamp = {"sec": nanoseconds // 10**9, "nanosec": nanoseconds % 10**9}
+        return {
+            "header": {"stamp": stamp, "frame_id": frame_id},
+            "info": {
+                "map_load_time": dict(stamp),
+                "resolution": self._cell_m,
+                "width": values.shape[1],
+                "height": values.shape[0],
+                "origin": {
+                    "position": dict(zip("xyz", (*self.origin_m, self._z_m), strict=True)),
+                    "orientation": {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0},
+                },
+            },
+            "data": values.reshape(-1),
+        }
+
+
+def _road_in(pose: NDArray[np.float64], perception: Perception) -> tuple[NDArray[np.float64], float]:
+    """What takes x, y, 1 of the road in the frame of the models to x, y of the odometry, and the road's z there [m]."""
+    frame = ModelFrame(perception.mounting)
+    R = pose[:3, :3] @ frame.R.T
+    t = pose[:3, 3] - R @ frame.t - MODEL_HEIGHT_M * R[:, 2]
+    to_odom = np.column_stack([R[:2, :2], t[:2]])
+    if np.abs(t).max() > _FARTHEST_M or abs(np.linalg.det(R[:2, :2])) < _SMALLEST_AREA:
+        raise TrackingError(
+            f"T_odom_sensor puts the road below the sensor at {t.round(1).tolist()}, or upright; expected at most "
+            f"{_FARTHEST_M:g} m, and a frame with z upwards"
+        )
+    return to_odom, float(t[2])
+
+
+def _grown(box: Box, margin_m: float) -> Box:
+    length, width, height = box.size
+    return replace(box, label="movable", size=(length + 2.0 * margin_m, width + 2.0 * margin_m, height))

@@ -1,0 +1,153 @@
+"""Where the sensor was when a cloud was made: poses of a topic of nav_msgs/Odometry, by time."""
+
+from __future__ import annotations
+
+import bisect
+import math
+import threading
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import OptionError, PointsError, TrackingError
+from ..road.rolling import RollingGrid
+from ..types.mounting import Mounting
+from ..types.rigid import rigid
+from .graph import full_name
+from .messages import RosMessages
+
+ODOMETRY = "nav_msgs/msg/Odometry"
+TOLERANCE_S = 0.2
+"""A cloud may be newer than the newest pose by this; then the newest one is taken."""
+_MOST = 1000  # poses that are kept; 5 s at 200 Hz
+
+
+@dataclass(frozen=True, eq=False)
+class Rolling:
+    """What a node needs for a grid with memory.
+
+    Attributes
+    ----------
+    topic : str
+        Of nav_msgs/Odometry.
+    sensor_pose : sequence of 6 float, optional
+        Pose of the frame of the clouds in the child frame of the odometry: x, y, z [m], roll, pitch, yaw [deg]. By
+        default the two frames are one if they have one name; otherwise the sensor is above the child frame's origin,
+        mounted as the perceiver says.
+    grid : RollingGrid
+
+    Raises
+    ------
+    OptionError
+        The name or the pose is not valid.
+    """
+
+    topic: str = "/odom"
+    sensor_pose: Sequence[float] | None = None
+    grid: RollingGrid = field(default_factory=RollingGrid)
+
+    def __post_init__(self) -> None:
+        full_name(self.topic)
+        given = self.sensor_pose
+        try:
+            if given is not None and not (len(given) == 6 and all(map(math.isfinite, given))):
+                raise ValueError("not six finite numbers")
+            self.base_from_sensor("", "", Mounting())
+        except (TypeError, ValueError) as exc:  # SensorError is one
+            raise OptionError(
+                f"sensor_pose is {given!r} ({exc}); expected x, y, z in meters, roll, pitch, yaw in degrees"
+            ) from exc
+
+    def base_from_sensor(self, child_frame: str, cloud_frame: str, mounting: Mounting) -> NDArray[np.float64]:
+        """Pose (4, 4) of the frame of the clouds in the child frame of the odometry."""
+        pose = np.eye(4)
+        if self.sensor_pose is not None:
+            *place, roll, pitch, yaw = map(float, self.sensor_pose)
+            pose[:3, :3] = Mounting(0.0, roll, pitch, yaw).rotation()
+            pose[:3, 3] = place
+        elif child_frame != cloud_frame:
+            pose[:3, :3] = mounting.rotation()
+            pose[:3, 3] = [0.0, 0.0, mounting.height_m or 0.0] - pose[:3, :2] @ mounting.origin_m
+        return pose
+
+
+class Poses:
+    """The poses that came of late; received in a thread of the middleware, asked for in another.
+
+    Attributes
+    ----------
+    frame_id, child_frame_id : of the newest pose.
+    n_failed : number of messages that were no poses.
+    """
+
+    def __init__(self, messages: RosMessages) -> None:
+        self._messages, self._lock = messages, threading.Lock()
+        self._times: list[int] = []
+        self._poses: list[tuple[NDArray[np.float64], NDArray[np.float64]]] = []
+        self.frame_id = self.child_frame_id = ""
+        self.n_failed = 0
+
+    def receive(self, data: bytes) -> None:
+        """Take the bytes of a message; what is no pose is counted."""
+        try:
+            message = self._messages.decode(data, ODOMETRY)
+            place, turn = _parts(message.pose.pose)
+        except (PointsError, TrackingError):
+            self.n_failed += 1
+            return
+        ns = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
+        with self._lock:
+            if self._times and ns <= self._times[-1]:
+                # As when a recording begins again. A pose that came twice is taken once.
+                keep = bisect.bisect_left(self._times, ns)
+                del self._times[keep:], self._poses[keep:]
+            self._times.append(ns)
+            self._poses.append((place, turn))
+            del self._times[:-_MOST], self._poses[:-_MOST]
+            self.frame_id, self.child_frame_id = message.header.frame_id, message.child_frame_id
+
+    def at(self, stamp_ns: int) -> NDArray[np.float64] | None:
+        """Pose (4, 4) of the child frame at a time, between the two around it; None if there is none.
+
+        Raises TrackingError.
+        """
+        with self._lock:
+            k = bisect.bisect_left(self._times, stamp_ns)
+            if k == len(self._times):
+                if not k or stamp_ns - self._times[-1] > TOLERANCE_S * 1e9:
+                    return None
+                (place, turn), share = self._poses[-1], 0.0
+                other = place, turn
+            elif self._times[k] == stamp_ns:
+                (place, turn), other, share = self._poses[k], self._poses[k], 0.0
+            elif k == 0:
+                return None
+            else:
+                (place, turn), other = self._poses[k - 1], self._poses[k]
+                share = (stamp_ns - self._times[k - 1]) / (self._times[k] - self._times[k - 1])
+        near = other[1] if turn @ other[1] >= 0.0 else -other[1]
+        x, y, z, w = _unit((1.0 - share) * turn + share * near)
+        pose = np.eye(4)
+        pose[:3, 3] = (1.0 - share) * place + share * other[0]
+        pose[:3, :3] = [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+        return rigid("the odometry's pose", pose, TrackingError)
+
+
+def _parts(pose: Any) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Position (3,) and unit quaternion x, y, z, w of a geometry_msgs/Pose. Raises TrackingError."""
+    place = np.array([pose.position.x, pose.position.y, pose.position.z])
+    turn = np.array([getattr(pose.orientation, axis) for axis in "xyzw"])
+    if not (np.isfinite(place).all() and abs(np.linalg.norm(turn) - 1.0) < 1e-2):
+        raise TrackingError(f"got the place {place} and the quaternion {turn}; expected finite numbers of length 1")
+    return place, _unit(turn)
+
+
+def _unit(turn: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.asarray(turn / np.linalg.norm(turn), np.float64)
