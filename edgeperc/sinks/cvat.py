@@ -126,9 +126,9 @@ def init_context(context: Any) -> None:
 
 def handler(context: Any, event: Any) -> Any:
     """Answer one request; an error has its kind and message, which are in the log of the function, too."""
-    status, answer = HTTPStatus.OK, []
+    status = HTTPStatus.OK
     try:
-        answer = context.user_data.function.annotate(event.body)
+        answer: object = context.user_data.function.annotate(event.body)
     except EdgepercError as exc:
         status = _STATUS.get(type(exc), HTTPStatus.INTERNAL_SERVER_ERROR)
         answer = {"error": type(exc).__name__, "message": str(exc)}
