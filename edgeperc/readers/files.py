@@ -121,6 +121,11 @@ class FileOptions(NamedTuple):
     origin_m: Sequence[float] | Literal["auto"] | None
 
 
+def parse_points(content: bytes, name: str) -> NDArray[np.float32]:
+    """Read the points in the content of a file of this name; errors as `read_points`."""
+    return _parse_named(np.frombuffer(content, np.uint8), Path(name), FileOptions(None, None, None)).points
+
+
 def read_timed_file(path: Path, options: FileOptions) -> TimedScan:
     """Read a scan file with the times of its points; errors as `read_points`."""
     points, fields, _ = _read(path, options)
@@ -147,6 +152,10 @@ def _read(path: Path, options: FileOptions) -> _Read:
         raise PointsError(f"{path}: the file cannot be read ({exc})") from exc
     if data is None:
         raise PointsError(f"{path}: there is no such file; expected a scan as .bin, .npy, .npz, .pcd or .ply")
+    return _parse_named(data, path, options)
+
+
+def _parse_named(data: NDArray[np.uint8], path: Path, options: FileOptions) -> _Read:
     try:
         return _parse(data, path.name.lower(), options)
     except PointsError as exc:
@@ -182,7 +191,11 @@ def _parse(data: NDArray[np.uint8], name: str, options: FileOptions) -> _Read:
             f"neither PCD, PLY, .npy, .npz nor text by its first bytes, {head[:8]!r}; if they are raw float32 values, "
             "name it .bin or pass columns=4 (x, y, z, remission)"
         )
-    raw = parse_raw(data, options.columns, 5 if name.endswith(".pcd.bin") else 4)
+    try:
+        raw = parse_raw(data, options.columns, 5 if name.endswith(".pcd.bin") else 4)
+    except PointsError as exc:
+        advice = advice_for(head)
+        raise exc if advice is None else PointsError(f"{exc}; its first bytes are those of {advice}") from exc
     if options.columns is None or isinstance(options.columns, int | np.integer):  # fields without names
         return _of_columns(raw, options._replace(remission_field=None))._replace(fields={})
     return _of_columns(raw, options)

@@ -22,7 +22,7 @@ from ..types.perception import Box
 from .names import ScanFiles, stem_of
 from .run_file import RunFile, warn_of
 
-__all__ = ["KINDS", "PrelabelSink"]
+__all__ = ["KINDS", "PrelabelSink", "cvat_cuboid"]
 
 KINDS = ("labelcloud", "cvat", "kitti", "sustechpoints")
 """The tools and formats."""
@@ -182,9 +182,7 @@ class PrelabelSink:
                     "attributes": attributes,
                     "group": 0,
                     "label_id": self._classes.index(box.label),
-                    "position": _rounded(box.center),
-                    "rotation": [0.0, 0.0, *_rounded([wrapped(box.yaw)])],
-                    "scale": _rounded(box.size),
+                    **cvat_cuboid(box),
                 }
             )
         item = {"id": name, "annotations": annotations, "attr": {"frame": self._n_items}}
@@ -214,6 +212,15 @@ class PrelabelSink:
         target = self._files.checked(self._folder / name, scan)
         target.parent.mkdir(exist_ok=True)
         write_atomic(target, content)
+
+
+def cvat_cuboid(box: Box) -> dict[str, list[float]]:
+    """Center, angles about x, y, z and size of a box as CVAT has them: 9 numbers, in this order."""
+    return {
+        "position": _rounded(box.center),
+        "rotation": [0.0, 0.0, *_rounded([wrapped(box.yaw)])],
+        "scale": _rounded(box.size),
+    }
 
 
 def _kitti_line(box: Box, T_cam_sensor: NDArray[np.float64], P2: NDArray[np.float64]) -> str:
