@@ -112,11 +112,10 @@ FLOORS = {
         ros2.node ros2.rclpy_graph ros2.zenoh_graph
         sinks.__init__ sinks.names sinks.relay sinks.run_file sinks.scene
         sinks.foxglove sinks.page sinks.prelabels sinks.rerun sinks.rosbag sinks.static
-        sinks.cvat
         cli.arguments cli.evaluation.__init__ cli.output cli.straighten
         cli.completion cli.doctor cli.evaluation.box_tables cli.evaluation.painting cli.lists cli.program
         cli.report cli.scans cli.sinks
-        cli.evaluation.sensors cli.fit_sensor cli.info cli.side_by_side
+        cli.cvat cli.evaluation.sensors cli.fit_sensor cli.info cli.side_by_side
         cli.evaluation.scans cli.run
         cli.demo cli.evaluation.tracking cli.ros2
         cli.main

@@ -1,5 +1,5 @@
 """The entry point of function.yaml: nuclio looks for both names here."""
 
-from edgeperc.sinks.cvat import handler, init_context
+from edgeperc.cli.cvat import handler, init_context
 
 __all__ = ["handler", "init_context"]

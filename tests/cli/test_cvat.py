@@ -20,7 +20,7 @@ from test_files import packed_pcd, pcd, text_rows
 
 from checkout import REPOSITORY
 from edgeperc import Box, OptionError, Perceiver
-from edgeperc.sinks.cvat import OPTIONS_VARIABLE, CvatFunction, handler, init_context
+from edgeperc.cli.cvat import OPTIONS_VARIABLE, CvatFunction, handler, init_context
 from edgeperc.zoo import DEFAULT, OPEN, resolve
 from scenes import urban
 

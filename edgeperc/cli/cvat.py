@@ -15,9 +15,9 @@ from typing import Any
 from ..errors import EdgepercError, FitnessError, OptionError, PointsError, SensorError
 from ..perceiver import Learned, Perceiver
 from ..readers.files import parse_points
+from ..sinks.prelabels import cvat_cuboid
 from ..system.names import nearest
 from ..types.perception import Box
-from .prelabels import cvat_cuboid
 
 __all__ = ["OPTIONS_VARIABLE", "CvatFunction", "handler", "init_context"]
 
