@@ -75,7 +75,8 @@ class ScanLayout:
     sensor : its ``mounting`` is what is known of the mounting.
     boxes, points : class of a label file, in lower case -> class of edgeperc: ``car``, ``van``, ``truck``,
         ``pedestrian``, ``person_sitting``, ``cyclist``, ``background``, a new name, or ``ignore`` (objects and points
-        of which nothing is known); for points also ``drivable``. The key ``*`` stands for all other classes.
+        of which nothing is known); for points also ``drivable`` and the `PARTS` of the background. The key ``*`` stands
+        for all other classes.
     box_format : ``"plain"``: ``label/NAME.txt``; ``"kitti"``: ``label_2/NAME.txt`` with ``calib/NAME.txt``; or what an
         annotation tool saves: ``"labelcloud"``: ``labels/NAME.json``, ``"sustechpoints"``: ``label/NAME.json``,
         ``"cvat"``: ``annotations/default.json`` of its format "Datumaro 3D".
