@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from edgeperc import Perceiver, Perception, occupancy_grid
+from edgeperc import Perceiver, Perception, RollingGrid, occupancy_grid
 from edgeperc.simulation.samples import FIRST_SEED, labels_of_scene, simulated_scan
 from edgeperc.simulation.scene import SCENE_CLASSES, SimulatedScan
 from edgeperc.types.choices import STATIC
@@ -83,3 +85,13 @@ def test_one_and_two_threads_give_the_same(perceived: tuple[SimulatedScan, Perce
     again = Perceiver(["ssadnet", "sceneseg", "objects"], full_turn=True, n_threads=2)(scan.points)
     np.testing.assert_array_equal(again.require_points().labels, perception.require_points().labels)
     assert again.boxes == perception.boxes
+
+
+def test_a_rolling_grid_judges_the_ground_on_all_sides(perceived: tuple[SimulatedScan, Perception]) -> None:
+    scan, perception = perceived
+    seen = []
+    for labels in (perception.points, perception.require_points().objects()):
+        rolling = RollingGrid(remember_s=1.0)
+        rolling.update(replace(perception, points=labels, stamp_s=1.0), scan.points, np.eye(4))
+        seen.append(np.count_nonzero(rolling.values(off_road=50, unjudged=25)[:, :90] == 25))  # columns behind
+    assert seen[0] == 0 < seen[1]

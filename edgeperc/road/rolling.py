@@ -23,6 +23,7 @@ from ..types.points import as_points
 from ..types.rigid import rigid
 from ..types.sensor import SensorProfile
 from ..types.views import TopViewGeometry
+from .around import knows_road
 from .grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, check_value, occupancy_grid
 
 # What a cell holds.
@@ -181,9 +182,9 @@ class RollingGrid:
 
     def _kinds_of(self, grid: OccupancyGrid, perception: Perception) -> NDArray[np.uint8]:
         """What the scan shows of its own cells."""
-        judged = np.zeros(grid.observed.shape, np.bool_)
+        judged = np.full(grid.observed.shape, knows_road(perception.points))
         if perception.top_view is not None:
-            judged = perception.top_view.geometry.cells(*self._view.cell_centers())[2]
+            judged |= perception.top_view.geometry.cells(*self._view.cell_centers())[2]
         kinds = np.where(judged, _OFF_ROAD, _GROUND).astype(np.uint8)
         kinds[grid.drivable] = _ROAD
         kinds[grid.obstacle] = _OBSTACLE
@@ -257,9 +258,9 @@ class RollingGrid:
         Parameters
         ----------
         off_road : int
-            Value in -1..100 of ground that a top view showed not to be road.
+            Value in -1..100 of ground that a top view, or points with a class ``road``, showed not to be road.
         unjudged : int
-            Value in -1..100 of observed ground that no top view has shown, such as that behind the vehicle at first.
+            Value in -1..100 of observed ground that neither has shown, such as that behind the vehicle at first.
 
         Returns
         -------
