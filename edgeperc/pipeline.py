@@ -293,7 +293,7 @@ class Pipeline:
         if self.objects is not None:
             by_labels = bool(self.ranged) and options.boxes_from != "network"
             standing = value("cluster", _completed, objects, standing, by_labels, options.cluster_score)
-        standing = value("agree", without_impossible, standing, points, mounting)
+        standing = value("agree", without_impossible, standing, points, mounting) if "ceiling" in rules else standing
         joined = joined if self.objects is None else standing
         if top is not None and rules:
             marks = value("agree", mark_cells, cells, scan, agreed, rules)

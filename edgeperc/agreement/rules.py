@@ -58,7 +58,8 @@ points say otherwise becomes background. ``"fill"``: a cluster gets the class th
 ``"person"``: a cluster of a person's size and shape is one person, a cyclist if longer than a stride; labeled points of
 that size stay in any cluster. ``"support"``: boxes of the top view keep and add labels. ``"ground"``: a point on the
 ground is labeled only below an object. ``"boxes"``: uncertain boxes without labeled points are dropped. ``"stand"``:
-a vehicle's box stands on the ground below its points, and is as tall as they are. ``"road"``: cells below boxes,
+a vehicle's box stands on the ground below its points, and is as tall as they are. ``"ceiling"``: no vehicle's box is
+around the sensor, reaches a ceiling or stands behind walls below one (`ground.ceiling`). ``"road"``: cells below boxes,
 labeled points and obstacles are not drivable.
 """
 _NEED_GROUND = frozenset({"column", "height", "person", "ground", "stand", "road"})

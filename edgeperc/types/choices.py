@@ -9,6 +9,19 @@ CAMERA = "camseg"
 DEFAULT_SENSOR = "hdl-64e"
 AUTO_SENSOR = "auto"  # found in the points
 PRECISIONS = ("fp32", "bf16", "int8")
-RULES = ("boxes", "cells", "column", "fill", "ground", "height", "person", "road", "share", "stand", "support")
+RULES = (
+    "boxes",
+    "ceiling",
+    "cells",
+    "column",
+    "fill",
+    "ground",
+    "height",
+    "person",
+    "road",
+    "share",
+    "stand",
+    "support",
+)
 STATIC = ("road", "sidewalk", "terrain", "building", "vegetation", "pole")
 """Classes of points that are no objects, beside the background."""
