@@ -18,8 +18,8 @@ def add_parser(subparsers: Subparsers) -> None:
         parents=[model_options(), scan_options(), engine_options(), output_options()],
         help="compare edgeperc with torch, other engines and numpy (extra 'peers')",
         description="Measure edgeperc, the same networks in torch, torch.compile, onnxruntime, OpenVINO, MNN and ncnn "
-        "with a pipeline in numpy, and the fastest matrix products and memory copies of this computer, all in turns; and "
-        "networks and methods of others beside edgeperc's whole answers. "
+        "with a pipeline in numpy, and the fastest matrix products and memory copies of this computer, all in turns. "
+        "Then measure networks and methods of others beside edgeperc's whole answers. "
         "What is not installed is listed and left out.",
         allow_abbrev=False,
     )

@@ -55,8 +55,8 @@ class Contender:
     """One row of a table.
 
     kind : A key of `turns.MAKERS`.
-    engine : A provider for the kinds ``"edgeperc"``, ``"default"``, ``"session"`` and those of `ANSWERS`, else as `open_engine` or
-        `matrix_product` take it.
+    engine : A provider for the kinds ``"edgeperc"``, ``"default"``, ``"session"`` and those of `ANSWERS`, else as
+        `open_engine` or `matrix_product` take it.
     precision : as the provider or the engine takes it; empty if it has no choice.
     paths : models.
     cards : the models' cards, JSON.

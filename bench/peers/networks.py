@@ -64,11 +64,12 @@ def write_others(folder: Path) -> None:
     """
     import onnx
     import torch
+    from onnxruntime.quantization import CalibrationDataReader, QuantType, quantize_static
+    from onnxruntime.quantization.quant_utils import add_pre_process_metadata
+
     from edgeperc_export.networks.pointseg import initialize
     from edgeperc_export.release.quantize import ROUNDED_OPS, folded
     from edgeperc_export.release.to_onnx import traced
-    from onnxruntime.quantization import CalibrationDataReader, QuantType, quantize_static
-    from onnxruntime.quantization.quant_utils import add_pre_process_metadata
 
     class Once(CalibrationDataReader):  # type: ignore[misc]
         def __init__(self, image: NDArray[np.float32]) -> None:

@@ -64,11 +64,8 @@ def methods_table(title: str, measured: Sequence[Measured], n_threads: int) -> d
     for each in measured:
         quartiles = [number(percentile(each.ms, q)) for q in (25.0, 50.0, 75.0)]
         ratio = number(each.p50 / measured[0].p50)
-        memory = number(each.rss_mb, 0)
-        rows.append(
-            [each.contender.name, each.contender.timed, f"{len(each.ms):,}", *quartiles, ratio, memory]
-            + [each.missing or "-"]
-        )
+        end = number(each.rss_mb, 0), each.missing or "-"
+        rows.append([each.contender.name, each.contender.timed, f"{len(each.ms):,}", *quartiles, ratio, *end])
     sentences = [
         f"ms; onnxruntime's CPU provider, {n_threads} threads; ratios are of medians to the first row",
         "weights of others are random: they take the time of trained ones, and their answers mean nothing",
