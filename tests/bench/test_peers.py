@@ -251,7 +251,7 @@ def test_networks_of_others_are_written_in_fp32_and_int8(
 def pillars_in_numpy(points: np.ndarray, weights: np.ndarray, image: np.ndarray) -> None:
     image[:] = 0.0
     _, n_rows, n_columns = image.shape
-    across = np.floor(points[:, :2].astype(np.float64) / CELL_M) + (0, n_rows // 2)
+    across = np.add(np.floor(points[:, :2].astype(np.float64) / CELL_M), (0, n_rows // 2))
     inside = ((across >= 0) & (across < (n_columns, n_rows))).all(axis=1)
     inside &= (points[:, 2] >= LOWEST_M) & (points[:, 2] < HIGHEST_M)
     for cell in np.unique(across[inside], axis=0):
