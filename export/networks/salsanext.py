@@ -20,7 +20,7 @@ def conv(c_in: int, c_out: int, kernel: int, *, dilation: int = 1) -> nn.Sequent
 
 
 class Context(nn.Module):
-    """A receptive field of 3, then of 7 pixels, added to a 1x1 convolution (Figure 2, left)."""
+    """A receptive field of 3, then of 7 pixels, added to a 1x1 convolution."""
 
     def __init__(self, c_in: int, c_out: int) -> None:
         super().__init__()

@@ -656,7 +656,7 @@ def test_pointpillars_has_two_anchors_at_half_resolution(height: int, width: int
 @pytest.mark.parametrize(
     ("make", "shape", "parameters", "gmac"),
     [
-        (SalsaNext, (1, 5, 64, 2048), 6_711_572, 62.298),  # the paper's Table III: 6.73 M, 62.84 G
+        (SalsaNext, (1, 5, 64, 2048), 6_711_572, 62.298),  # the paper: 6.73 M, 62.84 G
         (PointPillars, (1, 64, 496, 432), 4_814_100, 33.104),
     ],
 )
