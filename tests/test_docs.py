@@ -11,6 +11,7 @@ import shlex
 import sys
 from dataclasses import dataclass
 from pathlib import Path
+from string import Template
 
 import pytest
 
@@ -170,6 +171,31 @@ def parse(program: str, arguments: list[str]) -> None:
         else:
             code = 0
     assert not code, said.getvalue()
+
+
+def commands_of_results() -> list[str]:
+    """The commands of ``bench/RESULTS.md``, in blocks and in sentences, with its shell variables put in."""
+    text = (REPOSITORY / "bench" / "RESULTS.md").read_text("utf-8")
+    lines = [line for block in re.findall(r"^```\n(.*?)^```", text, flags=re.S | re.M) for line in block.splitlines()]
+    lines += [line.replace("\n", " ") for line in re.findall(r"`(edgeperc(?:-\w+)? [^`]*--[^`]*)`", text)]
+    variables = dict(re.findall(r'^([A-Z0-9]+)="(.*)"$', text, flags=re.M))
+    commands = [
+        Template(line).substitute(variables) for line in lines if line and line.partition("=")[0] not in variables
+    ]
+    assert len(commands) > 20
+    return commands
+
+
+@pytest.mark.parametrize("line", commands_of_results())
+def test_commands_of_the_results_are_known(line: str) -> None:
+    program, *arguments = (word for word in shlex.split(line, comments=True) if word != "..." and "=" not in word)
+    if program != "python":
+        parse(program, arguments)
+        return
+    source = (REPOSITORY / arguments[1].replace("edgeperc_bench.", "bench/").replace(".", "/")).with_suffix(".py")
+    assert {word for word in arguments if word.startswith("--")} <= {
+        *re.findall(r'"(--[\w-]+)"', source.read_text("utf-8"))
+    }
 
 
 def declared_extras() -> set[str]:

@@ -130,7 +130,8 @@ FLOORS = {
         recipe
         cards
         networks.objects networks.pointseg networks.ssadnet
-        networks.camseg networks.edge networks.lodnn networks.segnet networks.squeezesegv2 networks.unet
+        networks.camseg networks.edge networks.lodnn networks.pointpillars networks.salsanext networks.segnet
+        networks.squeezesegv2 networks.unet
         networks.fcn networks.kulseg
         networks.__init__
         training.__init__ training.checkpoint training.curve training.log training.losses training.object_task
@@ -163,7 +164,7 @@ FLOORS = {
         accuracy
         measure
         peers.__init__ peers.arithmetic peers.networks peers.rounds
-        peers.engines peers.ground peers.projection peers.slam peers.tracking
+        peers.engines peers.ground peers.pillars peers.projection peers.slam peers.tracking
         peers.camera peers.family peers.numpy_pipeline
         peers.contenders
         peers.tables

@@ -7,7 +7,7 @@ import os
 import tempfile
 from pathlib import Path
 
-from ..options import Subparsers, at_least, engine_options, model_options, output_options, scan_options
+from ..options import Subparsers, at_least, choices, engine_options, model_options, output_options, scan_options
 from .common import new_document, prepare_input
 
 
@@ -19,6 +19,7 @@ def add_parser(subparsers: Subparsers) -> None:
         help="compare edgeperc with torch, other engines and numpy (extra 'peers')",
         description="Measure edgeperc, the same networks in torch, torch.compile, onnxruntime, OpenVINO, MNN and ncnn "
         "with a pipeline in numpy, and the fastest matrix products and memory copies of this computer, all in turns. "
+        "Then measure networks and methods of others beside edgeperc's whole answers. "
         "What is not installed is listed and left out.",
         allow_abbrev=False,
     )
@@ -28,6 +29,14 @@ def add_parser(subparsers: Subparsers) -> None:
         default=25,
         metavar="N",
         help="how often each contender takes its turn with all scans (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--tables",
+        type=choices(("engines", "methods")),
+        default="all",
+        metavar="LIST",
+        help="engines: the models elsewhere; methods: SalsaNext, SqueezeSegV2, PointPillars and Patchwork++ beside the "
+        "default models, in onnxruntime's CPU provider; or all (default: %(default)s)",
     )
     parser.set_defaults(run=run_command)
 
@@ -43,6 +52,7 @@ def run_command(arguments: argparse.Namespace) -> int:
             document,
             scans.files,
             Path(folder),
+            tables=arguments.tables,
             models=arguments.model or default_models(),
             provider=arguments.provider,
             precision=arguments.precision,

@@ -27,8 +27,11 @@ from edgeperc.zoo import DEFAULT, Variant, listed, resolve
 from ..samples import percentile
 from ..worker import Prediction
 from .camera import camera_images
+from .networks import OTHERS, POINTPILLARS, write_others
 
 INSTALL = "not installed: pip install 'edgeperc[peers]'"
+INSTALL_GEOMETRY = "not installed: pip install 'edgeperc[geometry]'"
+METHODS = "Methods of others on the same scans"
 TORCH = (("torch", "fp32"), ("torch.compile", "fp32"), ("torch", "bf16"), ("torch.compile", "bf16"))
 OPENVINO = (("openvino", "fp32"), ("openvino", "bf16"))
 # Engines for phones and small boards. They cannot run the int8 graphs: MNN 3.6 takes the weights of a dequantized
@@ -38,9 +41,11 @@ NEEDS = {
     "mnn": ("MNN", "onnx"),
     "ncnn": ("ncnn", "onnx", "pnnx"),
     "openvino": ("openvino",),
+    "patchwork": ("pypatchworkpp", "scipy"),
     "torch": ("torch", "onnx"),
     "torch.compile": ("torch", "onnx"),
 }
+ANSWERS = ("front", "full turn")
 NAMES = {"openvino": "OpenVINO API", "mnn": "MNN", "ncnn": "ncnn"}
 PEAKS = (("numpy", "fp32"), ("torch", "fp32"), ("torch", "bf16"), ("torch", "int8"), *OPENVINO)
 
@@ -50,13 +55,14 @@ class Contender:
     """One row of a table.
 
     kind : A key of `turns.MAKERS`.
-    engine : A provider for the kinds ``"edgeperc"``, ``"default"`` and ``"session"``, else as `open_engine` or
-        `matrix_product` take it.
+    engine : A provider for the kinds ``"edgeperc"``, ``"default"``, ``"session"`` and those of `ANSWERS`, else as
+        `open_engine` or `matrix_product` take it.
     precision : as the provider or the engine takes it; empty if it has no choice.
     paths : models.
     cards : the models' cards, JSON.
     image : input of a network alone, .npy.
     inputs : A camera's images, .npy, in place of the scans of the run.
+    timed : The part that is timed, where it differs within a table.
     """
 
     name: str
@@ -67,6 +73,7 @@ class Contender:
     cards: tuple[str, ...] = ()
     image: Path | None = None
     inputs: tuple[Path, ...] = ()
+    timed: str = ""
 
 
 @dataclass
@@ -92,13 +99,13 @@ class Measured:
 
 def why_missing(contender: Contender) -> str:
     """Why a contender cannot run here; empty if it can."""
-    if contender.kind in ("edgeperc", "default", "session"):
+    if contender.kind in ("edgeperc", "default", "session", *ANSWERS):
         known = contender.engine in ("auto", *available_providers())
         return "" if known else "onnxruntime offers no such provider on this computer"
     needed = NEEDS.get(contender.engine, ())
     # The parts of a network exist only if onnx is installed.
     here = all(importlib.util.find_spec(name) for name in needed) and all(path.exists() for path in contender.paths)
-    return "" if here else INSTALL
+    return "" if here else INSTALL_GEOMETRY if contender.engine == "patchwork" else INSTALL
 
 
 def default_models() -> list[str]:
@@ -163,6 +170,34 @@ def groups(
         if any(output.kind == "box_dense" for output in variant.card.outputs):
             tables[f"One network or two: {variant}"] = _one_or_two(variant, folder)
     return tables
+
+
+def methods(folder: Path) -> list[Contender]:
+    """edgeperc's whole answers, networks of others with random weights, and clusters without a network.
+
+    All networks run in onnxruntime's CPU provider.
+
+    folder : for the networks.
+    """
+    rows = [
+        Contender(f"edgeperc {view}, {label}", view, "cpu", precision, timed="scan to labels, cells and boxes")
+        for precision, label in (("auto", "as by default"), ("fp32", "fp32"))
+        for view in ANSWERS
+    ]
+    if not why_missing(Contender("", "network", "torch")):
+        write_others(folder)
+    for name in OTHERS:
+        image = folder / f"{name}.npy"
+        for kind in ("int8", "fp32"):
+            path = (folder / f"{name} {kind}.onnx",)
+            rows.append(Contender(f"{name} {kind}", "network", "onnxruntime", kind, path, (), image, (), "network"))
+            if name == POINTPILLARS:
+                timed = "scan to pillars, network"
+                rows.append(Contender(f"{name} {kind}", "pillars", "onnxruntime", kind, path, timed=timed))
+    return [
+        *rows,
+        Contender("Patchwork++, k-d tree", "clusters", "patchwork", timed="scan to ground and clusters, one thread"),
+    ]
 
 
 def _pipelines(models: Sequence[Variant], provider: str, precision: str) -> list[Contender]:

@@ -1,14 +1,28 @@
-"""The networks at other image sizes."""
+"""The networks at other image sizes, and the networks of others with random weights."""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from edgeperc import ModelError
+from edgeperc.inference.session import golden_input
 from edgeperc.types.views import TopViewGeometry
 from edgeperc.zoo import resolve
+
+POINTPILLARS = "PointPillars 496x432"
+OTHERS: dict[str, tuple[str, tuple[str, ...], tuple[int, int, int]]] = {
+    "SqueezeSegV2 64x512": ("squeezesegv2.SqueezeSegV2", ("logits",), (5, 64, 512)),
+    "SalsaNext 64x512": ("salsanext.SalsaNext", ("logits",), (5, 64, 512)),
+    "SalsaNext 64x2048": ("salsanext.SalsaNext", ("logits",), (5, 64, 2048)),
+    POINTPILLARS: ("pointpillars.PointPillars", ("scores", "boxes", "directions"), (64, 496, 432)),
+}
+"""Networks of others: where they are, their outputs, and the shape of their input."""
 
 
 def resized(model: str, share: float, folder: Path) -> Path:
@@ -39,3 +53,48 @@ def resized(model: str, share: float, folder: Path) -> Path:
     made = folder / f"{card.name}-{share:g}.onnx"
     write_card(to_graph(build(Recipe(**recipe)), card), card, made)
     return made
+
+
+def write_others(folder: Path) -> None:
+    """Write each network of `OTHERS` with random weights as ``NAME fp32.onnx`` and ``NAME int8.onnx``, and its input.
+
+    As in edgeperc's own models, int8 weights have a scale for each channel and activations are uint8, in the operators
+    for which onnxruntime's CPU provider has int8 kernels. Their ranges are those of the one input: random weights have
+    no accuracy to lose.
+    """
+    import onnx
+    import torch
+    from onnxruntime.quantization import CalibrationDataReader, QuantType, quantize_static
+    from onnxruntime.quantization.quant_utils import add_pre_process_metadata
+
+    from edgeperc_export.networks.pointseg import initialize
+    from edgeperc_export.release.quantize import ROUNDED_OPS, folded
+    from edgeperc_export.release.to_onnx import traced
+
+    class Once(CalibrationDataReader):  # type: ignore[misc]
+        def __init__(self, image: NDArray[np.float32]) -> None:
+            self._left = [{"image": image}]
+
+        def get_next(self) -> dict[str, NDArray[np.float32]] | None:
+            return self._left.pop() if self._left else None
+
+    for name, (where, outputs, shape) in OTHERS.items():
+        module, _, made = where.partition(".")
+        torch.manual_seed(0)
+        network = getattr(import_module(f"edgeperc_export.networks.{module}"), made)()
+        initialize(network)
+        image = golden_input(0, (1, *shape))
+        np.save(folder / f"{name}.npy", image[0])
+        fp32 = folder / f"{name} fp32.onnx"
+        onnx.save(traced(network, "forward", torch.from_numpy(image), "image", outputs), fp32)
+        model = folded(fp32)
+        add_pre_process_metadata(model)  # else it asks for it
+        quantize_static(
+            model,
+            folder / f"{name} int8.onnx",
+            Once(image),
+            op_types_to_quantize=[*ROUNDED_OPS, "AveragePool", "LeakyRelu"],
+            per_channel=True,
+            activation_type=QuantType.QUInt8,
+            weight_type=QuantType.QInt8,
+        )

@@ -12,7 +12,7 @@ from edgeperc.types.card import ModelCard
 
 from ..accuracy import agreement
 from ..render import number, share
-from ..samples import noise_floor, summary
+from ..samples import noise_floor, percentile, summary
 from .arithmetic import COPY_BYTES, PRODUCT_SIZE, cost
 from .contenders import INSTALL, OPENVINO, Contender, Measured, why_missing
 
@@ -55,6 +55,22 @@ def latency_table(title: str, measured: Sequence[Measured], n_threads: int) -> d
         if ratios:
             sentences.append(f"scan to result / {alone.contender.name}: {'; '.join(ratios)}")
     head = ["contender", "n", "p50", "p90", "p99", "noise", "x edgeperc", "labels equal", "boxes", "RSS MB", "note"]
+    return {"title": title, "sentences": sentences, "head": head, "rows": rows}
+
+
+def methods_table(title: str, measured: Sequence[Measured], n_threads: int) -> dict[str, Any]:
+    """Table of quartiles of whole answers, networks and methods, with the part that is timed."""
+    rows = []
+    for each in measured:
+        quartiles = [number(percentile(each.ms, q)) for q in (25.0, 50.0, 75.0)]
+        ratio = number(each.p50 / measured[0].p50)
+        end = number(each.rss_mb, 0), each.missing or "-"
+        rows.append([each.contender.name, each.contender.timed, f"{len(each.ms):,}", *quartiles, ratio, *end])
+    sentences = [
+        f"ms; onnxruntime's CPU provider, {n_threads} threads; ratios are of medians to the first row",
+        "weights of others are random: they take the time of trained ones, and their answers mean nothing",
+    ]
+    head = ["contender", "timed", "n", "25 %", "median", "75 %", "x edgeperc", "RSS MB", "note"]
     return {"title": title, "sentences": sentences, "head": head, "rows": rows}
 
 

@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, replace
 from functools import partial
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -27,11 +28,13 @@ from ..worker import Prediction
 from . import projection
 from .arithmetic import matrix_product, memory_copy
 from .camera import NumpyCamera, small_unet
-from .contenders import Contender, Measured, groups, why_missing
+from .contenders import METHODS, Contender, Measured, groups, methods, why_missing
 from .engines import Engine, open_engine
+from .ground import ground_finders, tree_clusters
 from .numpy_pipeline import NumpyPipeline
+from .pillars import fill_pillars, random_weights
 from .rounds import elapsed_ms
-from .tables import floor_table, latency_table
+from .tables import floor_table, latency_table, methods_table
 
 PAUSE_S = 0.02  # threads of the previous contender spin for some milliseconds
 Calls = list[Callable[[], object]]
@@ -55,6 +58,41 @@ def make_perceiver(contender: Contender, scans: Sequence[NDArray[Any]], sensor: 
     if contender.inputs:
         return [partial(perceive, image=image) for image in scans]
     return [partial(perceive, scan) for scan in scans]
+
+
+def make_answers(contender: Contender, scans: Sequence[NDArray[Any]], sensor: str, n_threads: int) -> Calls:
+    """edgeperc as by default: its models, boxes from networks and clusters, every rule; two threads at most."""
+    perceive = Perceiver(
+        sensor=sensor,
+        provider=contender.engine,
+        precision=contender.precision,
+        n_threads=1 if n_threads == 1 else None,
+        on_mismatch="ignore",
+        full_turn=contender.kind == "full turn",
+    )
+    return [partial(perceive, scan) for scan in scans]
+
+
+def make_pillars(contender: Contender, scans: Sequence[NDArray[Any]], sensor: str, n_threads: int) -> Calls:
+    """PointPillars from scan to the outputs of its network, which mean nothing."""
+    (path,), weights = contender.paths, random_weights()
+    network = open_engine(contender.engine, contender.precision, path, n_threads)
+
+    def call(scan: NDArray[np.float32]) -> object:
+        fill_pillars(scan, weights, network.input)
+        return network.run()
+
+    return [partial(call, scan) for scan in scans]
+
+
+def make_clusters(contender: Contender, scans: Sequence[NDArray[Any]], sensor: str, n_threads: int) -> Calls:
+    """Patchwork++, and a k-d tree's clusters of what it leaves; both know one thread only."""
+    find_ground = ground_finders({"pypatchworkpp": import_module("pypatchworkpp")}, get_sensor(sensor))["Patchwork++"]
+
+    def call(scan: NDArray[np.float32], ground: Callable[[], NDArray[np.bool_]]) -> object:
+        return tree_clusters(scan[~ground()])
+
+    return [partial(call, scan, find_ground(scan)) for scan in scans]
 
 
 def make_pipeline(contender: Contender, scans: Sequence[NDArray[Any]], sensor: str, n_threads: int) -> Calls:
@@ -105,6 +143,10 @@ def make_peak(contender: Contender, scans: Sequence[NDArray[np.float32]], sensor
 MAKERS: Mapping[str, Callable[[Contender, Sequence[NDArray[np.float32]], str, int], Calls]] = {
     "edgeperc": make_perceiver,
     "default": make_perceiver,
+    "front": make_answers,
+    "full turn": make_answers,
+    "pillars": make_pillars,
+    "clusters": make_clusters,
     "pipeline": make_pipeline,
     "unet": make_unet,
     "session": make_network,
@@ -222,6 +264,7 @@ def run(
     files: Sequence[Path],
     folder: Path,
     *,
+    tables: Sequence[str],
     models: Sequence[str],
     provider: str,
     precision: str,
@@ -230,12 +273,19 @@ def run(
     n_rounds: int,
     note: Callable[[str], None],
 ) -> None:
-    """Measure every table, one after the other, and record it in a report's document."""
+    """Measure tables, one after the other, and record them in a report's document.
+
+    tables : ``"engines"`` for the same networks elsewhere, ``"methods"`` for other networks and methods.
+    """
     document["peers"] = {}
-    for package in ("mnn", "ncnn", "onnx", "openvino", "torch"):
+    for package in ("mnn", "ncnn", "onnx", "openvino", "pypatchworkpp", "scipy", "torch"):
         with suppress(importlib.metadata.PackageNotFoundError):
             document["software"][package] = importlib.metadata.version(package)
-    for title, contenders in groups(models, provider, precision, folder, files[0], sensor).items():
+    measuring = groups(models, provider, precision, folder, files[0], sensor) if "engines" in tables else {}
+    if "methods" in tables:
+        note("writing the networks of others with random weights")
+        measuring[METHODS] = methods(folder)
+    for title, contenders in measuring.items():
         note(f"{title}: {len(contenders)} contenders")
         before, spent_s, measured = conditions(), _cpu_s(), list[Measured]()
         try:
@@ -260,7 +310,8 @@ def run(
                 for each in measured
             ]
             if any(each.rounds for each in measured):
-                document["tables"].append(latency_table(title, measured, n_threads))
+                table = methods_table if title == METHODS else latency_table
+                document["tables"].append(table(title, measured, n_threads))
                 if any(each.contender.kind == "peak" for each in measured):
                     document["tables"].append(floor_table(title, measured))
 

@@ -111,19 +111,22 @@ def to_graph(network: nn.Module, card: ModelCard) -> onnx.ModelProto:
     example = torch.from_numpy(golden_input(0, golden_shape(card)))
     names = [o.name for o in card.outputs]
     if isinstance(network, ObjectNet):
-        look = _traced(network.look, "forward", example, card.input.name, names)
-        model = with_first_look(look, _traced(network, "closely", example, card.input.name, names))
+        look = traced(network.look, "forward", example, card.input.name, names)
+        model = with_first_look(look, traced(network, "closely", example, card.input.name, names))
         _halve(model.graph)
         return model
     has_blocks = any(output.block != (1, 1) for output in card.outputs)
-    model = _traced(network, "blocks" if has_blocks else "forward", example, card.input.name, names)
+    model = traced(network, "blocks" if has_blocks else "forward", example, card.input.name, names)
     if not isinstance(network, UNPOOLING):
         _halve(model.graph)
     return model
 
 
-def _traced(network: nn.Module, method: str, example: Tensor, input_name: str, names: Sequence[str]) -> onnx.ModelProto:
-    """A method of a network as a graph; of an input with three axes, for any length of the first two."""
+def traced(network: nn.Module, method: str, example: Tensor, input_name: str, names: Sequence[str]) -> onnx.ModelProto:
+    """A method of a network as a graph; of an input with three axes, for any length of the first two.
+
+    names : of the outputs.
+    """
     exported = network
     if method != "forward":
         exported = copy.copy(network)

@@ -14,6 +14,7 @@ import tiny_camera
 
 from edgeperc import ModelCard, ModelError, Perceiver
 from edgeperc.inference.session import Session, golden_input
+from edgeperc.objects.cluster import find_clusters
 from edgeperc.simulation.samples import FIRST_SEED, simulated_scan
 from edgeperc.types.mounting import MODEL_MOUNTING
 from edgeperc.types.perception import Box
@@ -21,14 +22,16 @@ from edgeperc.types.sensor import get_sensor
 from edgeperc.zoo import model_path
 from edgeperc_bench import cli
 from edgeperc_bench.accuracy import agreement
-from edgeperc_bench.peers import arithmetic, family, turns
+from edgeperc_bench.peers import arithmetic, family, networks, turns
 from edgeperc_bench.peers import contenders as peers
 from edgeperc_bench.peers.arithmetic import PRODUCT_SIZE, cost, matrix_product, n_taps_inside
 from edgeperc_bench.peers.camera import N_IMAGES, NumpyCamera, small_unet
 from edgeperc_bench.peers.engines import open_engine, torch_network
-from edgeperc_bench.peers.networks import resized
+from edgeperc_bench.peers.ground import DISTANCE_M, VOXEL_M, by_first_point, tree_clusters
+from edgeperc_bench.peers.networks import OTHERS, POINTPILLARS, resized, write_others
 from edgeperc_bench.peers.numpy_pipeline import NumpyPipeline, iou
-from edgeperc_bench.peers.tables import floor_table, latency_table
+from edgeperc_bench.peers.pillars import CELL_M, HIGHEST_M, LOWEST_M, fill_pillars, random_weights
+from edgeperc_bench.peers.tables import floor_table, latency_table, methods_table
 from edgeperc_bench.peers.turns import measure
 from edgeperc_bench.worker import Prediction
 from twins.decode import oriented_iou
@@ -209,6 +212,133 @@ def test_overlaps_are_those_of_the_reference() -> None:
     boxes = [Box("car", 1.0, (x, y, 0.0), (length, width, 1.5), yaw) for x, y, length, width, yaw in rows.tolist()]
     found = [[iou(a, b) for b in boxes] for a in boxes]
     np.testing.assert_allclose(found, oriented_iou(rows, rows), atol=1e-9)
+
+
+# methods of others
+
+
+@pytest.mark.parametrize(
+    ("name", "shape", "expected"),
+    [
+        ("SqueezeSegV2 64x512", (5, 8, 32), {"logits": (4, 8, 32)}),
+        ("SalsaNext 64x2048", (5, 16, 32), {"logits": (20, 16, 32)}),
+        (POINTPILLARS, (64, 16, 24), {"scores": (2, 8, 12), "boxes": (14, 8, 12), "directions": (4, 8, 12)}),
+    ],
+)
+def test_networks_of_others_are_written_in_fp32_and_int8(
+    name: str,
+    shape: tuple[int, int, int],
+    expected: dict[str, tuple[int, ...]],
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+) -> None:
+    for package in ("onnx", "onnxscript", "torch", "tqdm"):
+        pytest.importorskip(package)
+    monkeypatch.setattr(networks, "OTHERS", {name: (*OTHERS[name][:2], shape)})
+    write_others(tmp_path)
+    found = {}
+    for kind in ("fp32", "int8"):
+        engine = open_engine("onnxruntime", kind, tmp_path / f"{name} {kind}.onnx", 1)
+        engine.input[:] = np.load(tmp_path / f"{name}.npy")
+        found[kind] = engine.run()
+    for output, size in expected.items():
+        fp32, int8 = found["fp32"][output], found["int8"][output]
+        assert fp32.shape == int8.shape == size
+        apart = np.linalg.norm(int8 - fp32) / np.linalg.norm(fp32)
+        assert 0.0 < apart < 0.2
+
+
+def pillars_in_numpy(points: np.ndarray, weights: np.ndarray, image: np.ndarray) -> None:
+    image[:] = 0.0
+    _, n_rows, n_columns = image.shape
+    across = np.add(np.floor(points[:, :2].astype(np.float64) / CELL_M), (0, n_rows // 2))
+    inside = ((across >= 0) & (across < (n_columns, n_rows))).all(axis=1)
+    inside &= (points[:, 2] >= LOWEST_M) & (points[:, 2] < HIGHEST_M)
+    for cell in np.unique(across[inside], axis=0):
+        own = points[inside & (across == cell).all(axis=1)]
+        center = (cell - (0, n_rows // 2) + 0.5) * CELL_M
+        values = np.hstack((own, own[:, :3] - own[:, :3].mean(axis=0), own[:, :2] - center))
+        image[:, int(cell[1]), int(cell[0])] = np.maximum(values @ weights, 0.0).max(axis=0)
+
+
+@pytest.mark.parametrize("n", [0, 1, 2, 500])
+def test_pillars_agree_with_their_twin(n: int) -> None:
+    rng = np.random.default_rng(n)
+    points = rng.uniform((-0.5, -1.5, -4.0, 0.0), (4.0, 1.5, 2.0, 1.0), (n, 4)).astype(np.float32)
+    points[::7, n % 3] = np.nan
+    points[::11, 1] = np.inf
+    weights, image = random_weights(), np.ones((64, 16, 24), np.float32)
+    fill_pillars(points, weights, image)
+    with np.errstate(invalid="ignore"):
+        pillars_in_numpy(points, weights, expected := np.empty_like(image))
+    np.testing.assert_allclose(image, expected, rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("n", [1, 2, 40, 600])
+def test_what_stands_on_the_ground_has_the_clusters_of_points_within_half_a_metre(n: int) -> None:
+    pytest.importorskip("scipy")
+    rng = np.random.default_rng(n)
+    voxels = np.unique(rng.integers(-12, 12, (n, 3)), axis=0)  # one point each
+    points = rng.permutation(((voxels + 0.5) * VOXEL_M).astype(np.float32))
+    expected = find_clusters(points, min_distance_m=DISTANCE_M, distance_per_m=0.0, max_range_m=200.0, min_points=1)
+    np.testing.assert_array_equal(by_first_point(tree_clusters(points)), by_first_point(expected))
+    twice = np.concatenate((points, points + np.float32(0.01)))
+    found = tree_clusters(twice)
+    np.testing.assert_array_equal(found[: len(points)], found[len(points) :])
+
+
+def test_ground_and_clusters_of_others_are_timed(tmp_path: Path, scan: np.ndarray) -> None:
+    for package in (*peers.NEEDS["patchwork"], "psutil"):
+        pytest.importorskip(package)
+    np.save(tmp_path / "scan.npy", scan)
+    clusters = peers.Contender("Patchwork++, k-d tree", "clusters", "patchwork")
+    (found,) = measure([clusters], [tmp_path / "scan.npy"])
+    assert not found.missing
+    assert len(found.ms) == 1
+
+
+def test_methods_of_others_are_rows_of_one_table(
+    tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for package in ("onnx", "onnxscript", "psutil", "torch", "tqdm"):
+        pytest.importorskip(package)
+    for name in {*OTHERS} - {POINTPILLARS}:
+        monkeypatch.delitem(OTHERS, name)
+    monkeypatch.setitem(OTHERS, POINTPILLARS, (*OTHERS[POINTPILLARS][:2], (64, 16, 24)))
+    file = tmp_path / "peers.json"
+    command = ["peers", "--tables", "methods", "--scans", "1", "--rounds", "2", "--threads", "1", "--json", str(file)]
+    assert cli.main(command) == 0
+    (title, rows), *others = json.loads(file.read_text("utf-8"))["peers"].items()
+    assert (title, others) == (peers.METHODS, [])
+    clusters = rows.pop()
+    assert [row["kind"] for row in rows] == [*peers.ANSWERS, *peers.ANSWERS, *("network", "pillars") * 2]
+    for row in rows:
+        assert not row["missing"], row
+        assert [len(ms) for ms in row["rounds"]] == [1, 1]
+        assert row["timed"]
+    assert clusters["missing"] in ("", peers.INSTALL_GEOMETRY)
+    printed = capsys.readouterr().out
+    assert "weights of others are random" in printed
+    assert "scan to pillars, network" in printed
+
+
+def test_methods_that_are_not_installed_name_their_line(alone: None, tmp_path: Path) -> None:
+    rows = peers.methods(tmp_path)
+    assert [peers.why_missing(row) for row in rows[:4]] == [""] * 4
+    assert {peers.why_missing(row) for row in rows[4:-1]} == {peers.INSTALL}
+    assert peers.why_missing(rows[-1]) == "not installed: pip install 'edgeperc[geometry]'"
+    table = methods_table(peers.METHODS, [peers.Measured(row, missing=peers.why_missing(row)) for row in rows], 2)
+    assert [row[-1] for row in table["rows"]] == [*["-"] * 4, *[peers.INSTALL] * 10, peers.INSTALL_GEOMETRY]
+
+
+def test_quartiles_and_ratios_are_of_all_rounds() -> None:
+    rows = [measured("edgeperc front", "front", "cpu", "auto", 10.0), measured("other", "network", "", "", 0.0)]
+    rows[1].rounds = [[float(ms) for ms in range(1, 51)], [float(ms) for ms in range(51, 101)]]
+    table = methods_table(peers.METHODS, rows, 2)
+    assert [row[2:7] for row in table["rows"]] == [
+        ["120", "10.00", "10.00", "10.00", "1.00"],
+        ["100", "25.00", "50.00", "75.00", "5.00"],
+    ]
 
 
 # tables
@@ -398,6 +528,8 @@ def test_what_is_missing_is_reported(
     file = tmp_path / "peers.json"
     command = [
         "peers",
+        "--tables",
+        "engines",
         "--model",
         "ssadnet:fp32",
         "--provider",

@@ -18,7 +18,9 @@ from edgeperc_export.networks import ssadnet
 from edgeperc_export.networks.edge import PointSegEdge, SSADNetEdge, spread
 from edgeperc_export.networks.kulseg import KULSeg
 from edgeperc_export.networks.lodnn import EDGE_DILATIONS, LoDNN, LoDNNEdge
+from edgeperc_export.networks.pointpillars import PointPillars
 from edgeperc_export.networks.pointseg import ENLARGEMENT_RATES, Fire, FireDeconv, PointSeg, SqueezeReweight
+from edgeperc_export.networks.salsanext import SalsaNext
 from edgeperc_export.networks.squeezesegv2 import ContextAggregation, SqueezeSegV2
 
 # SSADNet, Table 1: dilation (width, height) and receptive field (width, height) of the context module's layers.
@@ -627,3 +629,40 @@ def test_lodnn_edge_is_a_shortcut_before_training() -> None:
     agree(network.context(x), x)
     logits, _ = run_and_record(network, torch.rand(1, 3, 40, 20))
     assert logits.abs().max() < 1.0
+
+
+# networks that are only measured against
+
+
+@pytest.mark.parametrize(("height", "width"), [(64, 2048), (64, 512), (32, 1024), (16, 16)])
+def test_salsanext_labels_every_pixel(height: int, width: int) -> None:
+    stages = {"context": (32, 1), "encoders.0": (64, 1), "encoders.4": (256, 16), "decoders.0": (128, 8)}
+    image = torch.empty(2, 5, height, width, device="meta")
+    logits, recorded = run_and_record(on_meta(SalsaNext), image, *stages)
+    for name, (channels, shrink) in stages.items():
+        assert tuple(recorded[name][1].shape) == (2, channels, height // shrink, width // shrink), name
+    assert logits.shape == (2, 20, height, width)
+
+
+@pytest.mark.parametrize(("height", "width"), [(496, 432), (248, 216), (8, 16)])
+def test_pointpillars_has_two_anchors_at_half_resolution(height: int, width: int) -> None:
+    image = torch.empty(1, 64, height, width, device="meta")
+    outputs, recorded = run_and_record(on_meta(PointPillars), image, "blocks.2", "ups.2")
+    assert tuple(recorded["blocks.2"][1].shape) == (1, 256, height // 8, width // 8)
+    assert tuple(recorded["ups.2"][1].shape) == (1, 128, height // 2, width // 2)
+    assert [tuple(output.shape) for output in outputs] == [(1, n, height // 2, width // 2) for n in (2, 14, 4)]
+
+
+@pytest.mark.parametrize(
+    ("make", "shape", "parameters", "gmac"),
+    [
+        (SalsaNext, (1, 5, 64, 2048), 6_711_572, 62.298),  # the paper: 6.73 M, 62.84 G
+        (PointPillars, (1, 64, 496, 432), 4_814_100, 33.104),
+    ],
+)
+def test_parameters_and_arithmetic_of_rivals(
+    make: Callable[[], torch.nn.Module], shape: tuple[int, ...], parameters: int, gmac: float
+) -> None:
+    network = on_meta(make)
+    assert n_parameters(network) == parameters
+    assert giga_macs(network, *shape) == pytest.approx(gmac, abs=0.001)
