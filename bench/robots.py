@@ -136,15 +136,11 @@ def rows_of(name: str, height_m: float, place: str, n_scans: int) -> list[str]:
     if place == "box-given":
         sensor = replace(sensor, ego_box=((-2.0, 0.1 - BOX_BEHIND_M), (-HALF_BOX_M, HALF_BOX_M), (-2.0, 2.0)))
     known = {"given": Mounting(height_m, 0.0, 0.0), "found": Mounting()}
-    perceivers = {
-        word: Perceiver(sensor=sensor, mounting=each, on_mismatch="warn", full_turn=True)
-        for word, each in known.items()
-    }
     figures = {word: Figures() for word in known}
     for k in range(n_scans):
         scan = scan_of(FIRST_SEED + k, sensor, height_m, place)
-        for word, perceive in perceivers.items():
-            perceive.reset_mounting()
+        for word, mounting in known.items():
+            perceive = Perceiver(sensor=sensor, mounting=mounting, on_mismatch="warn", full_turn=True)  # checks anew
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
                 figures[word].add(perceive(scan.points), scan, height_m)

@@ -598,7 +598,7 @@ class Perceiver:
         watch.lap("adapt" if self._renders and profile.remission is not None else "check")
         if not before.is_complete and len(scan):
             if check and before.known.roll_deg is None:
-                turned = check_beams(scan, profile) or check_ground(scan, near_support, share_below)
+                turned = check_beams(scan, profile) or check_ground(scan, near_support, share_below, profile)
             try:
                 self._set_mounting(before.add(scan))
                 hidden = (*self._about_height(), *self._about_tilt())

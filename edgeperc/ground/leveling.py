@@ -94,6 +94,7 @@ _OUTVOTED, _SURE_SUPPORT = 3.0, 150
 # scan shows. Levers are at most 3 in all but 2 of 481 KITTI scans, and if half of the turn is hidden; banks that were
 # taken for the ground have 4 to 14.
 _BANK_DEG, _ONE_SIDED, _SECTORS, _MOST_SECTORS = 4.0, 3.0, 16, 0.75
+_LOWEST_BEAM = 99.5  # percentile of the slopes at which returns are below the sensor
 _BESIDE_M = 3.0  # nearer returns may be of the own body
 _MIN_CELLS = 60  # of half a meter, on the plane
 _MAX_BELOW = 0.8  # cells below the plane, as a share of the cells on it
@@ -221,11 +222,12 @@ class MountingEstimator:
         return tuple(name for name, is_so in zip(("roll_deg", "pitch_deg"), doubtful.tolist(), strict=True) if is_so)
 
     def is_height_unsure(self) -> bool:
-        """Whether a height other than the usual one is used that was found from little ground, or from afar."""
-        height_m = self.mounting().height_m or 0.0
-        if self.known.height_m is not None or not self._found or height_m == MODEL_HEIGHT_M:
+        """Whether the scans suggest another height than the usual one, and show little ground, or only far away."""
+        if self.known.height_m is not None or not self._found:
             return False
-        return height_m > HIGH_M or max(scan[4] for scan in self._found) < _SURE_SUPPORT
+        height_m, scans = self.estimate().mounting.height_m or 0.0, np.array(self._found)
+        is_far = height_m > HIGH_M or float(np.median(scans[:, 5])) > 0.0
+        return abs(height_m - MODEL_HEIGHT_M) > SAME_HEIGHT_M and (is_far or scans[:, 4].max() < _SURE_SUPPORT)
 
     def _compared(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
         """How far height, roll, pitch and yaw are from the usual ones, and by how much they may be: as streets differ,
@@ -315,6 +317,15 @@ class _Plane(NamedTuple):
         middle, spread = on.mean(axis=0), np.cov(on.T) + CELL_M**2 / 12.0 * np.eye(2)
         return float(math.sqrt(1.0 + middle @ np.linalg.solve(spread, middle)))
 
+    def is_in_view(self, scan: Points) -> bool:
+        """Whether the lowest beams of a scan look at it within 12 m, so that something hides it if it is not seen there."""
+        x, y, z = scan[:, :3].astype(np.float64).T
+        range_m = np.hypot(x, y)
+        with np.errstate(invalid="ignore", over="ignore"):
+            is_far = (range_m > _BESIDE_M) & (np.abs(z) < range_m)
+            down = (x * self.abc[0] + y * self.abc[1] - z)[is_far] / range_m[is_far]
+        return bool(len(down)) and float(np.percentile(down, _LOWEST_BEAM)) * _VOTING_M > -self.abc[2]
+
     def _on(self, low: NDArray[np.float64]) -> NDArray[np.float64]:
         """Those of the lowest returns (n, 3) that are on it."""
         above = low[:, 2] - low[:, :2] @ self.abc[:2] - self.abc[2]
@@ -386,7 +397,7 @@ def _lowest_plane(
     if near is not None and (near.support >= _SURE_SUPPORT or _counted(near.abc, low, _FAR_REACHES_M[-1]).is_lowest()):
         return near
     far = _far_plane(scan, lowest, low, far_starts_m)
-    if far is not None and far.abc[2] > -high_m:
+    if far is not None and far.abc[2] > -high_m and far.is_in_view(scan):
         far = None
     if near is None or far is None:
         return near or far
