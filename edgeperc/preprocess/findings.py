@@ -398,7 +398,7 @@ def check_ground(
         return ()
     if sensor is not None:
         as_is, turned = _off_beams(scan, sensor)
-        if sensor.fov_up_deg + sensor.fov_down_deg > _ASYMMETRIC_DEG and as_is < 0.5 * turned:
+        if sensor.fov_up_deg + sensor.fov_down_deg > _ASYMMETRIC_DEG and turned - as_is > _ASYMMETRIC_DEG:
             return ()
     return (
         Finding(
@@ -511,7 +511,7 @@ def _few_rows(scan: Measures, profile: FitnessProfile, sensor: SensorProfile, ha
         f"The scan has about {scan.beams:.0f} rows of points (sensor {sensor.name}: {sensor.n_beams}), in "
         f"training it had at least {profile.beams[0]:.0f}: expect to lose far and small objects, or use a "
         "model trained for it.",
-        too_few_rows,
+        too_few_rows and sensor.pattern is None,  # which has no rows
     )
 
 
