@@ -36,7 +36,7 @@ VEHICLES = ("car", "van", "truck")
 
 
 def profile_of(name: str) -> SensorProfile:
-    """A sensor with the remission that the simulator gives all of them; "-hanging": as it sees the street upside down."""
+    """A sensor with the remission of the simulator; "-hanging": as it sees the street upside down."""
     profile = replace(get_sensor(name.removesuffix("-hanging")), remission=None, remission_range=(0.0, 1.0))
     if name.endswith("-hanging"):
         profile = replace(profile, elevations_deg=tuple(-deg for deg in reversed(profile.elevations_deg)))

@@ -318,7 +318,7 @@ class _Plane(NamedTuple):
         return float(math.sqrt(1.0 + middle @ np.linalg.solve(spread, middle)))
 
     def is_in_view(self, scan: Points) -> bool:
-        """Whether the lowest beams of a scan look at it within 12 m, so that something hides it if it is not seen there."""
+        """Whether the lowest beams of a scan look at it within 12 m: if it is not seen there, something hides it."""
         x, y, z = scan[:, :3].astype(np.float64).T
         range_m = np.hypot(x, y)
         with np.errstate(invalid="ignore", over="ignore"):

@@ -479,7 +479,13 @@ def test_a_sensor_that_hangs_needs_no_height(sensor: str, height_m: float) -> No
 
 @pytest.mark.parametrize(
     ("height_m", "seed", "mounting"),
-    [(1.73, 1, (5.0, -4.0)), (1.73, 3, (-4.0, 3.0)), (1.73, 4, (5.0, -4.0)), (2.2, 1, (-4.0, 3.0)), (3.0, 4, (5.0, -4.0))],
+    [
+        (1.73, 1, (5.0, -4.0)),
+        (1.73, 3, (-4.0, 3.0)),
+        (1.73, 4, (5.0, -4.0)),
+        (2.2, 1, (-4.0, 3.0)),
+        (3.0, 4, (5.0, -4.0)),
+    ],
 )
 def test_a_sensor_that_looks_up_is_found_from_the_road_far_away(
     height_m: float, seed: int, mounting: tuple[float, float]
