@@ -17,6 +17,7 @@ import numpy as np
 
 from edgeperc import Mounting, Perceiver
 from edgeperc.evaluation.metrics import BoxEvaluator, Confusion, boxes_to_find
+from edgeperc.cli.doctor import Finding
 from edgeperc.simulation import POINT_CLASSES, TOP_VIEW_CLASSES, Scene, SimulatedScan, random_scene, simulate
 from edgeperc.simulation.raycast import SLOPE_Y
 from edgeperc.simulation.samples import FIRST_SEED
@@ -100,7 +101,7 @@ class Figures:
         off = np.abs([(mounting.height_m or 0.0) - height_m, mounting.roll_deg or 0.0, mounting.pitch_deg or 0.0])
         self.off.append(tuple(off.tolist()))
         wrong = bool(off[0] > OFF_M or off[1:].max() > OFF_DEG)
-        self.n_refused += any(finding.gross for finding in perception.fitness)
+        self.n_refused += any(isinstance(finding, Finding) and finding.gross for finding in perception.fitness)
         self.n_wrong += wrong
         self.n_silent += wrong and not any("mount" in finding for finding in perception.fitness)
         found = perception.require_points()
