@@ -17,7 +17,7 @@ import numpy as np
 
 from edgeperc import Mounting, Perceiver
 from edgeperc.evaluation.metrics import BoxEvaluator, Confusion, boxes_to_find
-from edgeperc.cli.doctor import Finding
+from edgeperc.preprocess.findings import Finding
 from edgeperc.simulation import POINT_CLASSES, TOP_VIEW_CLASSES, Scene, SimulatedScan, random_scene, simulate
 from edgeperc.simulation.raycast import SLOPE_Y
 from edgeperc.simulation.samples import FIRST_SEED
