@@ -18,7 +18,7 @@ from .agreement.rules import RULES
 from .camera.image import ImageScaler, as_image, label_pixels
 from .errors import EdgepercError, FitnessError, ImageError, MountingError, OptionError, PointsError
 from .ground.ceiling import find_ceiling
-from .ground.leveling import HIGH_M, MountingEstimate, MountingEstimator, near_support, share_below
+from .ground.leveling import MountingEstimate, MountingEstimator, near_support, share_below
 from .inference.session import Session
 from .objects.boxes import MIN_SCORE
 from .pipeline import BoxesFrom, ObjectNetwork, Options, Pipeline, RangeImageNetwork, TopViewNetwork
@@ -598,7 +598,7 @@ class Perceiver:
         watch.lap("adapt" if self._renders and profile.remission is not None else "check")
         if not before.is_complete and len(scan):
             if check and before.known.roll_deg is None:
-                turned = check_beams(scan, profile) or check_ground(scan, near_support, share_below)
+                turned = check_beams(scan, profile) or check_ground(scan, near_support, share_below, profile)
             try:
                 self._set_mounting(before.add(scan))
                 hidden = (*self._about_height(), *self._about_tilt())
@@ -662,16 +662,15 @@ class Perceiver:
         )
 
     def _about_height(self) -> tuple[Finding, ...]:
-        """What to say of a sensor that is so high that it sees little ground near by."""
-        found = self._estimator.estimate()
-        height_m = found.mounting.height_m
-        if self._estimator.known.height_m is not None or height_m is None or height_m <= HIGH_M:
+        """What to say of a height that was found from little ground: that of a sensor that is high, or looks up."""
+        if not self._estimator.is_height_unsure():
             return ()
+        found = self._estimator.estimate()
         return (
             Finding(
-                f"The sensor seems to be {height_m:.1f} +- {found.height_sd_m:.1f} m above the road. So high, it sees "
-                "little of the road near by, and its height may be off by a meter: pass mounting= (on the command line "
-                "--mount-height)."
+                f"The sensor seems to be {found.mounting.height_m:.1f} +- {found.height_sd_m:.1f} m above the road. It "
+                "sees little of the road near by, and its height may be off by a meter: pass mounting= (on the command "
+                "line --mount-height)."
             ),
         )
 

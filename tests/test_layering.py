@@ -158,7 +158,7 @@ FLOORS = {
         __init__
     """,
     "edgeperc_bench": """
-        application conditions context inputs options samples scenarios solid_state surroundings
+        application conditions context inputs options robots samples scenarios solid_state surroundings
         document loadgen render start
         plots report worker
         accuracy

@@ -14,7 +14,7 @@ from ..errors import MountingError
 from ..types.frame import ModelFrame
 from ..types.mounting import MODEL_HEIGHT_M, MODEL_MOUNTING, Mounting
 from ..types.points import Points, read_only
-from .planes import N_CELLS, TOLERANCE_M, fill_lowest, fit_first_plane
+from .planes import CELL_M, N_CELLS, TOLERANCE_M, fill_lowest, fit_first_plane
 
 __all__ = ["FROZEN_AFTER", "MountingEstimate", "MountingEstimator"]
 
@@ -90,6 +90,12 @@ _LEVEL_DEG = 3.0  # embankments and rows of roofs are steeper
 # What lies high within 12 m, such as roofs of cars, is not the ground if a lower plane has so many times its support,
 # and most lies below it. Such roofs had a support of at most 106 in 400 simulated scans; streets have more.
 _OUTVOTED, _SURE_SUPPORT = 3.0, 150
+# A bank beside a road that is out of view is not the ground below the sensor: it is steep, and on one side of what the
+# scan shows. Levers are at most 3 in all but 2 of 481 KITTI scans, and if half of the turn is hidden; banks that were
+# taken for the ground have 4 to 14.
+_BANK_DEG, _ONE_SIDED, _SECTORS, _MOST_SECTORS = 4.0, 3.0, 16, 0.75
+_LOWEST_BEAM = 99.5  # percentile of the slopes at which returns are below the sensor
+_BESIDE_M = 3.0  # nearer returns may be of the own body
 _MIN_CELLS = 60  # of half a meter, on the plane
 _MAX_BELOW = 0.8  # cells below the plane, as a share of the cells on it
 _CORRIDOR_M = (3.0, 15.0)  # half its width, and its length ahead and behind: the road that the vehicle stands on
@@ -153,7 +159,9 @@ class MountingEstimator:
         scan = points
         if self.known.origin_m != (0.0, 0.0):
             scan = points - np.array([*self.known.origin_m, 0.0, 0.0], np.float32)
-        found = replace(MODEL_MOUNTING, yaw_deg=self.known.yaw_deg or 0.0)
+        # From a given tilt on: the ground of a sensor that hangs upside down is above it in the scan.
+        found = replace(_filled(self.known, _values(MODEL_MOUNTING)), height_m=MODEL_HEIGHT_M)
+        found = replace(found, yaw_deg=self.known.yaw_deg or 0.0, origin_m=(0.0, 0.0))
         found, support, uncertainty = _leveled(scan, found, self.known.height_m)
         yaw_deg = _street_axis(ModelFrame(found).move(scan)) if self.known.yaw_deg is None else self.known.yaw_deg
         more = MountingEstimator(self.known)
@@ -212,6 +220,14 @@ class MountingEstimator:
         if not is_uneven or not (doubtful & (off[1:3] > DOUBTED_DEG)).any():
             return ()
         return tuple(name for name, is_so in zip(("roll_deg", "pitch_deg"), doubtful.tolist(), strict=True) if is_so)
+
+    def is_height_unsure(self) -> bool:
+        """Whether the scans suggest another height than the usual one, and show little ground, or only far away."""
+        if self.known.height_m is not None or not self._found:
+            return False
+        height_m, scans = self.estimate().mounting.height_m or 0.0, np.array(self._found)
+        is_far = height_m > HIGH_M or float(np.median(scans[:, 5])) > 0.0
+        return abs(height_m - MODEL_HEIGHT_M) > SAME_HEIGHT_M and (is_far or scans[:, 4].max() < _SURE_SUPPORT)
 
     def _compared(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
         """How far height, roll, pitch and yaw are from the usual ones, and by how much they may be: as streets differ,
@@ -286,9 +302,43 @@ class _Plane(NamedTuple):
         tilt_deg = math.degrees(math.hypot(self.abc[0], self.abc[1]))
         return self.support / (1.0 + (tilt_deg / _LEVEL_DEG) ** 2)
 
+    def is_bank(self, low: NDArray[np.float64]) -> bool:
+        """Whether it is steep, and on one side of the lowest returns (n, 3)."""
+        if self.on < _MIN_CELLS or math.degrees(math.hypot(self.abc[0], self.abc[1])) < _BANK_DEG:
+            return False
+        if self.lever(low) <= _ONE_SIDED:
+            return False
+        far = low[np.hypot(low[:, 0], low[:, 1]) > _BESIDE_M]
+        return _n_sectors(self._on(far)) < _MOST_SECTORS * _n_sectors(far)
+
+    def lever(self, low: NDArray[np.float64]) -> float:
+        """By how much an error of the lowest returns (n, 3) on it grows towards the sensor: 1 if they surround it."""
+        on = self._on(low)[:, :2]
+        middle, spread = on.mean(axis=0), np.cov(on.T) + CELL_M**2 / 12.0 * np.eye(2)
+        return float(math.sqrt(1.0 + middle @ np.linalg.solve(spread, middle)))
+
+    def is_in_view(self, scan: Points) -> bool:
+        """Whether the lowest beams of a scan look at it within 12 m: if it is not seen there, something hides it."""
+        x, y, z = scan[:, :3].astype(np.float64).T
+        range_m = np.hypot(x, y)
+        with np.errstate(invalid="ignore", over="ignore"):
+            is_far = (range_m > _BESIDE_M) & (np.abs(z) < range_m)
+            down = (x * self.abc[0] + y * self.abc[1] - z)[is_far] / range_m[is_far]
+        return bool(len(down)) and float(np.percentile(down, _LOWEST_BEAM)) * _VOTING_M > -self.abc[2]
+
+    def _on(self, low: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Those of the lowest returns (n, 3) that are on it."""
+        above = low[:, 2] - low[:, :2] @ self.abc[:2] - self.abc[2]
+        return low[(np.hypot(low[:, 0], low[:, 1]) < self.reach_m) & (np.abs(above) <= TOLERANCE_M)]
+
     def is_lowest(self, share: float = _MAX_BELOW) -> bool:
         """Whether little lies below it, as below the ground."""
         return self.below <= share * self.on
+
+
+def _n_sectors(xyz: NDArray[np.float64]) -> int:
+    """How many of 16 sectors of the turn hold a point (n, 3)."""
+    return len(np.unique(np.floor(np.arctan2(xyz[:, 1], xyz[:, 0]) * (_SECTORS / (2.0 * math.pi))) % _SECTORS))
 
 
 def _ground_plane(
@@ -298,7 +348,7 @@ def _ground_plane(
     more cells lie on it than below; the `_uncertainty`.
     """
     cell, lowest, low = _lowest_returns(scan)
-    plane = None if height_m is None else _lowest_plane(scan, lowest, low, [height_m], [height_m])
+    plane = None if height_m is None else _lowest_plane(scan, lowest, low, [height_m], [height_m], high_m=-math.inf)
     plane = plane or _lowest_plane(scan, lowest, low, _STARTS_M, _FAR_STARTS_M)
     if plane is None:
         raise MountingError(
@@ -340,13 +390,14 @@ def _lowest_plane(
     low: NDArray[np.float64],
     starts_m: Sequence[float],
     far_starts_m: Sequence[float],
+    high_m: float = HIGH_M,
 ) -> _Plane | None:
-    """The ground within 12 m or, below a high sensor, farther away; from several heights above it."""
+    """The ground within 12 m or, below a sensor higher than ``high_m``, farther away; from several heights above it."""
     near = _near_plane(scan, lowest, low, starts_m)
     if near is not None and (near.support >= _SURE_SUPPORT or _counted(near.abc, low, _FAR_REACHES_M[-1]).is_lowest()):
         return near
     far = _far_plane(scan, lowest, low, far_starts_m)
-    if far is not None and far.abc[2] > -HIGH_M:
+    if far is not None and far.abc[2] > -high_m and far.is_in_view(scan):
         far = None
     if near is None or far is None:
         return near or far
@@ -376,7 +427,7 @@ def _planes(
         abc = np.array([0.0, 0.0, -start])
         if fit_first_plane(scan, lowest, reach_m, abc):
             plane = _counted(abc, low, reach_m)
-            if plane.support > 0:
+            if plane.support > 0 and not plane.is_bank(low):
                 yield plane
 
 

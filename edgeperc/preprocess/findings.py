@@ -336,6 +336,13 @@ _TURN_OVER = (
 _ASYMMETRIC_DEG = 8.0  # of beams that tell up from down
 
 
+def _off_beams(scan: Measures, sensor: SensorProfile) -> tuple[float, float]:
+    """How far the highest and lowest points are from the beams of a sensor the right way up, and upside down [deg]."""
+    up, down = max(sensor.elevations_deg), min(sensor.elevations_deg)
+    highest, lowest = scan.elevation_p99_deg, scan.elevation_p01_deg
+    return abs(highest - up) + abs(lowest - down), abs(highest + down) + abs(lowest + up)
+
+
 def check_beams(points: Points, sensor: SensorProfile) -> tuple[Finding, ...]:
     """Describe a scan with its ground above, whose elevations are those of the sensor's beams with the opposite sign.
 
@@ -347,8 +354,8 @@ def check_beams(points: Points, sensor: SensorProfile) -> tuple[Finding, ...]:
     if scan is None or scan.ground_m is None or scan.ground_m <= 0.5:
         return ()
     highest, lowest = scan.elevation_p99_deg, scan.elevation_p01_deg
-    as_is = abs(highest - up) + abs(lowest - down)
-    if as_is <= _ASYMMETRIC_DEG or abs(highest + down) + abs(lowest + up) >= 0.5 * as_is:
+    as_is, turned = _off_beams(scan, sensor)
+    if as_is <= _ASYMMETRIC_DEG or turned >= 0.5 * as_is:
         return ()
     return (
         Finding(
@@ -369,12 +376,17 @@ _SAME, _HANGING = 1.15, 0.5
 
 
 def check_ground(
-    points: Points, support_of: Callable[[Points], float], below_of: Callable[[Points], float]
+    points: Points,
+    support_of: Callable[[Points], float],
+    below_of: Callable[[Points], float],
+    sensor: SensorProfile | None = None,
 ) -> tuple[Finding, ...]:
     """Describe a scan that shows a plane above, as it should show the ground below, and little of a plane below.
 
     points : (n, 4) float32; returns in the frame of the scan, before a mounting moves them.
     support_of, below_of : `ground.leveling.near_support` and `ground.leveling.share_below`.
+    sensor : if its beams look up more than down, and so do the points, it is the right way up: it sees a roof above and
+        little ground.
     """
     above, below = support_of(points * np.array([1.0, -1.0, -1.0, 1.0], np.float32)), support_of(points)
     if above < _FEWEST_ABOVE or above <= _SAME * below:
@@ -384,6 +396,10 @@ def check_ground(
     scan = measure(points, (180.0, -180.0))
     if scan is None or scan.far_m < _HALL_M or scan.most_m < _MOST_OF_HALL_M:
         return ()
+    if sensor is not None:
+        as_is, turned = _off_beams(scan, sensor)
+        if sensor.fov_up_deg + sensor.fov_down_deg > _ASYMMETRIC_DEG and turned - as_is > _ASYMMETRIC_DEG:
+            return ()
     return (
         Finding(
             "The ground seems to lie above the sensor, and there is none below: it is mounted upside down, or z points "
@@ -495,7 +511,7 @@ def _few_rows(scan: Measures, profile: FitnessProfile, sensor: SensorProfile, ha
         f"The scan has about {scan.beams:.0f} rows of points (sensor {sensor.name}: {sensor.n_beams}), in "
         f"training it had at least {profile.beams[0]:.0f}: expect to lose far and small objects, or use a "
         "model trained for it.",
-        too_few_rows,
+        too_few_rows and sensor.pattern is None,  # which has no rows
     )
 
 

@@ -376,7 +376,7 @@ def test_the_mounting_is_settled_over_scans_and_refused_scans_teach_nothing(scan
 
 
 def test_a_scan_without_ground_is_told_of(scans: list[NDArray[np.float32]]) -> None:
-    scan = scans[0][np.hypot(*scans[0][:, :2].T) > 13.0]  # none of the road near the vehicle
+    scan = scans[0][(scans[0][:, 2] > -1.6) | (np.hypot(*scans[0][:, :2].T) < 3.0)]  # hardly any of the road
     perceive = Perceiver("pointseg", provider="cpu", on_mismatch="warn")
     with pytest.warns(UserWarning, match="--mount-height"):
         found = perceive(scan)
@@ -462,6 +462,76 @@ def test_land_below_a_bridge_is_not_its_road(seed: int) -> None:
     points[beside, 2] -= 6.0
     seen = points[~beside | (np.abs(points[:, 1]) > 17.0)]
     assert MountingEstimator(Mounting()).add(seen).mounting().height_m == pytest.approx(1.73, abs=0.1)
+
+
+@pytest.mark.parametrize("height_m", [0.5, 1.73, 3.0])
+@pytest.mark.parametrize("sensor", ["vlp-16", "os1-64", "os0-64"])
+def test_a_sensor_that_hangs_needs_no_height(sensor: str, height_m: float) -> None:
+    """Its ground is above it in the scan; the tilt that is given says so."""
+    high = replace(get_sensor(sensor), mounting=Mounting(height_m, 0.0, 0.0, 0.0))
+    hanging = simulate(flat(random_scene(1, "urban")), high, seed=1).points * np.float32([1, -1, -1, 1])
+    for known in (Mounting(roll_deg=180.0), Mounting(roll_deg=180.0, pitch_deg=0.0), Mounting(roll_deg=-180.0)):
+        found = MountingEstimator(known).add(hanging).estimate().mounting
+        assert found.height_m == pytest.approx(height_m, abs=0.15)
+        assert found.roll_deg == known.roll_deg
+        assert found.pitch_deg == pytest.approx(0.0, abs=0.7)
+
+
+@pytest.mark.parametrize(
+    ("height_m", "seed", "mounting"),
+    [
+        (1.73, 1, (5.0, -4.0)),
+        (1.73, 3, (-4.0, 3.0)),
+        (1.73, 4, (5.0, -4.0)),
+        (2.2, 1, (-4.0, 3.0)),
+        (3.0, 4, (5.0, -4.0)),
+    ],
+)
+def test_a_sensor_that_looks_up_is_found_from_the_road_far_away(
+    height_m: float, seed: int, mounting: tuple[float, float]
+) -> None:
+    """An upright Mid-360 sees the road from 14 m on."""
+    looking_up = replace(get_sensor("mid-360").accumulated(0.2), mounting=Mounting(height_m, 0.0, 0.0, 0.0))
+    level = simulate(flat(random_scene(seed, "urban")), looking_up, seed=seed).points
+    level[:, 2] += height_m - 1.73
+    scan = seen_by(Mounting(height_m, *mounting, 0.0), level)
+    for known in (Mounting(), Mounting(height_m)):
+        found = MountingEstimator(known).add(scan).mounting()
+        assert found.height_m == pytest.approx(height_m, abs=0.1)
+        assert (found.roll_deg, found.pitch_deg) == pytest.approx(mounting, abs=0.7)
+
+
+def bank(toward_deg: float, walls_deg: float) -> NDArray[np.float32]:
+    """A lawn that rises by 14 degrees from 5 m on, 2.5 m wide in view, and walls about the sensor."""
+    rng = np.random.default_rng(0)
+    away, along = rng.uniform(5.0, 10.0, 4000), rng.uniform(-9.0, 9.0, 4000)
+    lawn = np.column_stack([away, along, 0.25 * away - 3.2])
+    azimuth = np.radians(rng.uniform(-walls_deg, walls_deg, 8000))
+    walls = np.column_stack([20.0 * np.cos(azimuth), 20.0 * np.sin(azimuth), rng.uniform(0.5, 6.0, 8000)])
+    turn = Mounting(0.0, 0.0, 0.0, toward_deg).rotation()
+    xyz = np.vstack([lawn, walls]) @ turn.T
+    return np.column_stack([xyz, np.full(len(xyz), 0.3)]).astype(np.float32)
+
+
+@pytest.mark.parametrize("toward_deg", [-90.0, 0.0, 90.0, 180.0])
+def test_a_bank_beside_the_sensor_is_no_ground_below_it(toward_deg: float) -> None:
+    with pytest.raises(MountingError, match="ground"):
+        MountingEstimator(Mounting()).add(bank(toward_deg, 180.0))
+    # Of a sensor that looks to one side, it is all there is.
+    found = MountingEstimator(Mounting()).add(bank(toward_deg, 50.0)).estimate().mounting
+    assert found.height_m == pytest.approx(3.1, abs=0.2)
+
+
+@pytest.mark.parametrize(("seed", "height_m"), [(101, 2.2), (105, 2.2), (111, 3.0)])
+def test_a_height_from_little_ground_is_said(seed: int, height_m: float) -> None:
+    sensor = replace(get_sensor("mid-360").accumulated(0.2), remission=None, remission_range=(0.0, 1.0))
+    points = simulated_scan(2 * 10**9 + seed, sensor, mounting=Mounting(height_m, 0.0, 0.0)).points
+    for known in (Mounting(), Mounting(height_m)):
+        found = Perceiver(["ssadnet"], sensor=sensor, mounting=known, on_mismatch="warn")
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            told = [finding for finding in found(points).fitness if "little of the road near by" in finding]
+        assert len(told) == (known.height_m is None)
 
 
 Surface = Callable[[NDArray[np.float32], NDArray[np.float32]], NDArray[np.float32]]

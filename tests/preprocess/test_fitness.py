@@ -32,7 +32,7 @@ from edgeperc.preprocess.fitness import FitnessProfile
 from edgeperc.readers.files import read_points
 from edgeperc.simulation.samples import simulated_scan
 from edgeperc.types.frame import ModelFrame
-from edgeperc.types.mounting import Mounting
+from edgeperc.types.mounting import MODEL_MOUNTING, Mounting
 from edgeperc.types.sensor import SENSORS, get_sensor
 from edgeperc.zoo import listed
 
@@ -424,6 +424,20 @@ def test_the_ground_tells_up_from_down(sensor: str, turn: str) -> None:
         points = street(seed, sensor)
         assert not check_ground(points, near_support, share_below)
         assert any("upside down" in finding for finding in leveled(points * TURNED[turn], sensor) if finding.gross)
+
+
+@pytest.mark.parametrize("seed", [1, 8, 10])
+def test_a_sensor_that_looks_up_is_the_right_way_up(seed: int) -> None:
+    """Of an upright Mid-360, in streets in which it sees little road, or a roof above, and few rows."""
+    sensor = replace(get_sensor("mid-360").accumulated(0.2), remission=None, remission_range=(0.0, 1.0))
+    points = simulated_scan(2 * 10**9 + seed, sensor, mounting=MODEL_MOUNTING).points
+    assert not check_ground(points, near_support, share_below, sensor)
+    assert not [finding for finding in check_profiles(points, PROFILES, sensor) if finding.gross]
+    hanging = points * TURNED["about x"]
+    found = check_ground(hanging, near_support, share_below)
+    assert check_ground(hanging, near_support, share_below, sensor) == found
+    hdl = street(SEEDS[0], "hdl-64e") * TURNED["about x"]  # looks down: its profile excuses nothing
+    assert check_ground(hdl, near_support, share_below, get_sensor("hdl-64e"))
 
 
 @pytest.mark.parametrize("turn", TURNED)
