@@ -944,7 +944,7 @@ def test_a_network_has_one_task(network: str, simulated: Path) -> None:
     task = task_of(recipe)
     assert [network in networks for networks in TASKS.values()].count(True) == 1
     samples = Samples(recipe, [], [], sorted(simulated.glob("*.npz")))
-    image, labels, *boxes = samples.sample(LabeledScan.load(samples.simulated[0]))
+    image, labels, *boxes = samples.sample(samples.load(0))
     assert image.shape == (len(task.input.channels), task.view.height, task.view.width)
     assert labels.shape == image.shape[1:]
     assert {*np.unique(labels)} <= {*range(len(task.classes)), IGNORE}
