@@ -158,15 +158,22 @@ def traced(network: nn.Module, method: str, example: Tensor, input_name: str, na
     return model
 
 
-def _halve(graph: onnx.GraphProto) -> None:
-    """Store large weights in half precision, which halves the file; engines convert them to fp32 when they load it."""
+def _halve(graph: onnx.GraphProto, *, exactly: bool = False) -> None:
+    """Store large weights in half precision, which halves the file; engines convert them to fp32 when they load it.
+
+    exactly : only those that lose nothing.
+    """
     casts = []
     for weight in graph.initializer:
         values = onnx.numpy_helper.to_array(weight)
         if values.dtype != np.float32 or values.size < FEWEST_HALVED:
             continue
+        with np.errstate(over="ignore"):
+            half = values.astype(np.float16)
+        if exactly and not np.array_equal(half.astype(np.float32), values):
+            continue
         name = weight.name
-        weight.CopyFrom(onnx.numpy_helper.from_array(values.astype(np.float16), f"{name}_half"))
+        weight.CopyFrom(onnx.numpy_helper.from_array(half, f"{name}_half"))
         casts.append(onnx.helper.make_node("Cast", [weight.name], [name], to=onnx.TensorProto.FLOAT))
     kept = list(graph.node)
     del graph.node[:]
@@ -177,7 +184,8 @@ def write_card(model: onnx.ModelProto, card: ModelCard, path: Path) -> None:
     """Write a graph with its card, and read the card back through onnxruntime.
 
     The graph may be of any network with a range image or a top view as input and outputs of the kinds of
-    `edgeperc.types.card.OutputSpec`. It is changed in place: a card in it is replaced.
+    `edgeperc.types.card.OutputSpec`. It is changed in place: a card in it is replaced, and large weights that half
+    precision holds exactly are stored so.
 
     Raises CardError, CardMismatchError, ModelFileError, ParityError.
     """
@@ -185,6 +193,7 @@ def write_card(model: onnx.ModelProto, card: ModelCard, path: Path) -> None:
     del model.metadata_props[:]
     model.metadata_props.extend(kept)
     model.metadata_props.add(key=CARD_KEY, value=card.to_json())
+    _halve(model.graph, exactly=True)
     with open_atomic(path) as file:
         file.write(model.SerializeToString(deterministic=True))
         file.flush()

@@ -959,6 +959,20 @@ def test_a_network_has_one_task(network: str, simulated: Path) -> None:
     assert losses[0] + 5.0 < losses[1]
 
 
+def test_what_half_precision_holds_is_stored_so_and_loses_nothing(tmp_path: Path) -> None:
+    path, again = REPOSITORY / "models" / "pointseg-int8.onnx", tmp_path / "again.onnx"
+    write_card(onnx.load(path), ModelCard.read(path), again)
+    assert again.stat().st_size < path.stat().st_size
+    before, after = Session(path, "cpu"), Session(again, "cpu")
+    for session in (before, after):
+        session.input[:] = np.random.default_rng(0).normal(size=session.input.shape)
+    first, second = before.run(), after.run()
+    assert all(np.array_equal(first[name], second[name]) for name in first)
+    weights = [onnx.numpy_helper.to_array(tensor) for tensor in onnx.load(again).graph.initializer]
+    large = [values for values in weights if values.dtype == np.float32 and values.size >= 1024]
+    assert not any(np.array_equal(values.astype(np.float16).astype(np.float32), values) for values in large)
+
+
 def test_the_models_page_matches_the_cards() -> None:
     folder = REPOSITORY / "models"
     assert (folder / "MODELS.md").read_text() == models_page(folder), "run: edgeperc-export models models"
