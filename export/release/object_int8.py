@@ -24,7 +24,7 @@ from edgeperc.types.card import ModelCard
 
 from .object_parity import candidate_inputs
 from .quantize import N_RUNS, Calibration, folded, saturates, speed_of, training_of
-from .to_onnx import with_golden, write_card
+from .to_onnx import halve, with_golden, write_card
 
 ROUNDED = ("close_point2.weight", "close_point3.weight", "close_point4.weight")
 MOST = 0.99995  # quantile of a tensor's values that the largest 8-bit number stands for
@@ -59,6 +59,7 @@ def quantize_objects(
     card = replace(
         card, precision="int8", precisions={}, training=training_of(path, card, calibration, made), parity={}
     )
+    halve(model.graph, exactly=True)
     card = with_golden(model, card)
     trial = out.with_name(f".{out.name}.trial.onnx")
     try:

@@ -54,7 +54,7 @@ from edgeperc.zoo import INT8_FEATURES
 
 from ..data.simulate import parity_images, parity_scans
 from .int8_graph import equalize, repeat_pixels
-from .to_onnx import pixel_labels, views, with_golden, write_card
+from .to_onnx import halve, pixel_labels, views, with_golden, write_card
 
 # Operators that onnxruntime's CPU provider computes in int8. It has no int8 kernel for ConvTranspose, Elu or Equal.
 ROUNDED_OPS = (
@@ -589,6 +589,7 @@ def quantize(
     made = {"left_alone": kept, "noise": noise, "weight_bits": 7 if seven_bits else 8}
     training = training_of(path, card, calibration, made)
     card = replace(card, precision="int8", precisions={}, training=training, parity={}, metrics={})
+    halve(model.graph, exactly=True)
     card = with_golden(model, card)
     trial = out.with_name(f".{out.name}.trial.onnx")
     try:

@@ -113,12 +113,12 @@ def to_graph(network: nn.Module, card: ModelCard) -> onnx.ModelProto:
     if isinstance(network, ObjectNet):
         look = traced(network.look, "forward", example, card.input.name, names)
         model = with_first_look(look, traced(network, "closely", example, card.input.name, names))
-        _halve(model.graph)
+        halve(model.graph)
         return model
     has_blocks = any(output.block != (1, 1) for output in card.outputs)
     model = traced(network, "blocks" if has_blocks else "forward", example, card.input.name, names)
     if not isinstance(network, UNPOOLING):
-        _halve(model.graph)
+        halve(model.graph)
     return model
 
 
@@ -158,7 +158,7 @@ def traced(network: nn.Module, method: str, example: Tensor, input_name: str, na
     return model
 
 
-def _halve(graph: onnx.GraphProto, *, exactly: bool = False) -> None:
+def halve(graph: onnx.GraphProto, *, exactly: bool = False) -> None:
     """Store large weights in half precision, which halves the file; engines convert them to fp32 when they load it.
 
     exactly : only those that lose nothing.
@@ -184,8 +184,7 @@ def write_card(model: onnx.ModelProto, card: ModelCard, path: Path) -> None:
     """Write a graph with its card, and read the card back through onnxruntime.
 
     The graph may be of any network with a range image or a top view as input and outputs of the kinds of
-    `edgeperc.types.card.OutputSpec`. It is changed in place: a card in it is replaced, and large weights that half
-    precision holds exactly are stored so.
+    `edgeperc.types.card.OutputSpec`. It is changed in place: a card in it is replaced.
 
     Raises CardError, CardMismatchError, ModelFileError, ParityError.
     """
@@ -193,7 +192,6 @@ def write_card(model: onnx.ModelProto, card: ModelCard, path: Path) -> None:
     del model.metadata_props[:]
     model.metadata_props.extend(kept)
     model.metadata_props.add(key=CARD_KEY, value=card.to_json())
-    _halve(model.graph, exactly=True)
     with open_atomic(path) as file:
         file.write(model.SerializeToString(deterministic=True))
         file.flush()

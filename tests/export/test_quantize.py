@@ -118,6 +118,7 @@ def convolutions(path: Path) -> dict[str, int]:
     types |= {
         n.output[0]: types[n.input[0]] for n in graph.node if n.op_type == "DequantizeLinear" and n.input[0] in types
     }
+    types |= {n.output[0]: onnx.TensorProto.FLOAT for n in graph.node if n.op_type == "Cast" and n.input[0] in types}
     return {n.input[1].split(".")[0]: types[n.input[1]] for n in graph.node if n.op_type == "Conv"}
 
 
