@@ -34,9 +34,10 @@ def _fill(points: NDArray[np.float32], weights: NDArray[np.float32], image: NDAr
     cells, sums, features = np.empty((n, 2), np.int32), np.zeros((n, 4)), np.zeros((n, N_FEATURES), np.float32)
     for i in range(n):
         x, y, z = points[i, 0], points[i, 1], points[i, 2]
-        row, column = int(np.floor(y / CELL_M)) + n_rows // 2, int(np.floor(x / CELL_M))
-        if not (0 <= row < n_rows and 0 <= column < n_columns and LOWEST_M <= z < HIGHEST_M):
+        up, along = np.floor(y / CELL_M) + n_rows // 2, np.floor(x / CELL_M)
+        if not (0 <= up < n_rows and 0 <= along < n_columns and LOWEST_M <= z < HIGHEST_M):
             continue
+        row, column = int(up), int(along)
         k = pillar_at[row, column]
         if k < 0:
             k = pillar_at[row, column] = n_pillars

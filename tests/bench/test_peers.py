@@ -261,6 +261,7 @@ def pillars_in_numpy(points: np.ndarray, weights: np.ndarray, image: np.ndarray)
         image[:, int(cell[1]), int(cell[0])] = np.maximum(values @ weights, 0.0).max(axis=0)
 
 
+@pytest.mark.kernel
 @pytest.mark.parametrize("n", [0, 1, 2, 500])
 def test_pillars_agree_with_their_twin(n: int) -> None:
     rng = np.random.default_rng(n)
