@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -121,26 +122,12 @@ class OccupancyGrid:
         OptionError
             ``off_road`` is out of its range.
         """
-        values = self.values(off_road)
-        nanoseconds = nanoseconds_of(self.stamp_s or 0.0)
-        stamp = {"sec": nanoseconds // 10**9, "nanosec": nanoseconds % 10**9}
         frame = ModelFrame(self.mounting)
         R, t = (np.eye(3), np.zeros(3)) if frame.is_identity else (frame.R, frame.t)
         corner = R.T @ (np.array([self.x_range_m[0], self.y_range_m[0], -MODEL_HEIGHT_M]) - t)
-        return {
-            "header": {"stamp": stamp, "frame_id": frame_id},
-            "info": {
-                "map_load_time": dict(stamp),
-                "resolution": self.cell_m,
-                "width": values.shape[1],
-                "height": values.shape[0],
-                "origin": {
-                    "position": dict(zip("xyz", corner.tolist(), strict=True)),
-                    "orientation": dict(zip("xyzw", quaternion(R.T), strict=True)),
-                },
-            },
-            "data": values.reshape(-1),
-        }
+        return grid_message(
+            self.values(off_road), self.cell_m, self.stamp_s, frame_id, corner.tolist(), quaternion(R.T)
+        )
 
     def save_map(self, folder: str | os.PathLike[str], off_road: int = OCCUPIED) -> Path:
         """Write ``map.pgm`` and ``map.yaml`` for nav2's map server (mode trinary).
@@ -185,6 +172,38 @@ def check_value(name: str, value: int) -> int:
     if isinstance(value, bool) or not (isinstance(value, int) and UNKNOWN <= value <= OCCUPIED):
         raise OptionError(f"{name} is {value!r}; expected a whole number from -1 to 100")
     return value
+
+
+def grid_message(
+    values: NDArray[np.int8],
+    cell_m: float,
+    stamp_s: float | None,
+    frame_id: str,
+    corner_m: Sequence[float],
+    orientation: Sequence[float] = (0.0, 0.0, 0.0, 1.0),
+) -> dict[str, Any]:
+    """The fields of a nav_msgs/OccupancyGrid.
+
+    values : (cells along y, cells along x) int8.
+    corner_m, orientation : x, y, z of the corner with the lowest x and y [m], and quaternion x, y, z, w of the cells,
+        in the frame ``frame_id``.
+    """
+    nanoseconds = nanoseconds_of(stamp_s or 0.0)
+    stamp = {"sec": nanoseconds // 10**9, "nanosec": nanoseconds % 10**9}
+    return {
+        "header": {"stamp": stamp, "frame_id": frame_id},
+        "info": {
+            "map_load_time": dict(stamp),
+            "resolution": cell_m,
+            "width": values.shape[1],
+            "height": values.shape[0],
+            "origin": {
+                "position": dict(zip("xyz", corner_m, strict=True)),
+                "orientation": dict(zip("xyzw", orientation, strict=True)),
+            },
+        },
+        "data": values.reshape(-1),
+    }
 
 
 def occupancy_grid(

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import CardError, OptionError, StampError, TrackingError
-from ..system.clock import LATEST_S, Clock, nanoseconds_of
+from ..system.clock import LATEST_S, Clock
 from ..tracking import Track
 from ..tracking.moving import MOVABLE, movable_points
 from ..types.frame import ModelFrame
@@ -24,7 +24,7 @@ from ..types.rigid import rigid
 from ..types.sensor import SensorProfile
 from ..types.views import TopViewGeometry
 from .around import knows_road
-from .grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, check_value, occupancy_grid
+from .grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, check_value, grid_message, occupancy_grid
 
 # What a cell holds.
 _NOTHING, _ROAD, _OFF_ROAD, _OBSTACLE, _GROUND = range(5)
@@ -308,23 +308,8 @@ class RollingGrid:
         OptionError
             A value is out of its range.
         """
-        values = self.values(off_road, unjudged)
-        nanoseconds = nanoseconds_of(self._stamp_s or 0.0)
-        stamp = {"sec": nanoseconds // 10**9, "nanosec": nanoseconds % 10**9}
-        return {
-            "header": {"stamp": stamp, "frame_id": frame_id},
-            "info": {
-                "map_load_time": dict(stamp),
-                "resolution": self._cell_m,
-                "width": values.shape[1],
-                "height": values.shape[0],
-                "origin": {
-                    "position": dict(zip("xyz", (*self.origin_m, self._z_m), strict=True)),
-                    "orientation": {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0},
-                },
-            },
-            "data": values.reshape(-1),
-        }
+        corner_m = (*self.origin_m, self._z_m)
+        return grid_message(self.values(off_road, unjudged), self._cell_m, self._stamp_s, frame_id, corner_m)
 
 
 def _road_in(pose: NDArray[np.float64], perception: Perception) -> tuple[NDArray[np.float64], float]:
