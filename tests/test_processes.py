@@ -325,7 +325,7 @@ def test_a_signal_leaves_whole_files(folder: Path, tmp_path: Path, scan: Any, nu
     time.sleep(0.05)
     process.send_signal(number)
     _, errors = process.communicate(timeout=120)
-    assert process.returncode == code
+    assert process.returncode == code, errors
     assert "Traceback" not in errors
     files = [*out.iterdir()]
     assert 3 <= len([file for file in files if file.suffix == ".label"]) < 300

@@ -22,7 +22,8 @@ from ..system.names import nearest
 from ..system.printable import printable
 from .output import print_error, show_warning
 
-_DELICATE = ("llvmlite.", "importlib._bootstrap", "edgeperc.sinks.run_file", "logging")
+# Modules with functions that native code calls.
+_DELICATE = ("llvmlite.", "numba.core.serialize", "importlib._bootstrap", "edgeperc.sinks.run_file", "logging")
 
 
 class Parser(argparse.ArgumentParser):
@@ -66,26 +67,31 @@ def run_program(program: str, command: Callable[[], int], message: Callable[[Exc
     """
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")  # a file name may have characters that the terminal lacks
+    raised: list[int] = []
+    code = 0
     try:
         try:
-            with _signals_raise(), warnings.catch_warnings():
+            with _signals_raise(raised), warnings.catch_warnings():
                 warnings.showwarning = partial(show_warning, program=program)
                 try:
-                    return command()
+                    code = command()
                 finally:
                     if sys.stdout is not None:
                         sys.stdout.flush()
-        except (EdgepercError, OSError) as exc:
-            if isinstance(exc, BrokenPipeError) and _unread():
-                return 141
-            print_error(message(exc), program)
-            return 2
-        except KeyboardInterrupt:
-            print_error("interrupted", program)
-            return 130
-        except _TerminatedError:
-            print_error("terminated", program)
-            return 143
+        except BaseException as exc:
+            if isinstance(exc, KeyboardInterrupt) and not raised:  # by the process's own handler
+                raised.append(signal.SIGINT)
+            if not raised:  # else it may be what native code raised in place of the signal's
+                if not isinstance(exc, EdgepercError | OSError):
+                    raise
+                if isinstance(exc, BrokenPipeError) and _unread():
+                    return 141
+                print_error(message(exc), program)
+                return 2
+        if raised:
+            print_error("interrupted" if raised[0] == signal.SIGINT else "terminated", program)
+            return 128 + raised[0]
+        return code
     except BrokenPipeError:
         if _unread():
             return 141
@@ -117,8 +123,8 @@ def _is_closed_pipe(stream: TextIO) -> bool:
 
 
 @contextlib.contextmanager
-def _signals_raise() -> Iterator[None]:
-    """Let SIGINT and SIGTERM raise, unless the process has its own answer to them."""
+def _signals_raise(raised: list[int]) -> Iterator[None]:
+    """Let SIGINT and SIGTERM raise, and collect those that did, unless the process has its own answer to them."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -133,10 +139,9 @@ def _signals_raise() -> Iterator[None]:
             waiting[:] = [threading.Timer(0.05, _send_again, (number, main_thread))]
             waiting[0].daemon = True
             waiting[0].start()
-        elif number == signal.SIGINT:
-            raise KeyboardInterrupt
         else:
-            raise _TerminatedError(128 + number)
+            raised.append(number)
+            raise KeyboardInterrupt if number == signal.SIGINT else _TerminatedError(128 + number)
 
     defaults: dict[int, Any] = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: signal.SIG_DFL}
     defaults = {number: handler for number, handler in defaults.items() if signal.getsignal(number) is handler}

@@ -34,7 +34,7 @@ from .messages import RosMessages
 ROUTER = "tcp/localhost:7447"
 """Where rmw_zenoh's router listens."""
 CONFIG_VARIABLE = "ZENOH_SESSION_CONFIG_URI"
-_PATIENCE = "transport/link/tx/queue/congestion_control/drop/max_wait_before_drop_fragments"  # [us]
+_PATIENCE = "transport/link/tx/queue/congestion_control/drop"
 _DEFAULT_DEPTH = 42
 _CLOSING_S = 5.0
 _ATTACHMENT = struct.Struct("<qqB16s")
@@ -105,8 +105,9 @@ class ZenohGraph:
         config.insert_json5("connect/endpoints", f'["{connect or ROUTER}"]')
         config.insert_json5("listen/endpoints", '["tcp/localhost:0"]')
         config.insert_json5("scouting/multicast/enabled", "false")
-        # Zenoh drops a message of several packets after 50 ms of congestion; a cloud has 2 MB.
-        config.insert_json5(_PATIENCE, "500000")
+        # Zenoh drops a message after 1 ms without room for its first packet, and after 50 ms within it. A cloud has
+        # 2 MB, and one message follows another. [us]
+        config.insert_json5(_PATIENCE, '{"wait_before_drop": 50000, "max_wait_before_drop_fragments": 500000}')
         return config
 
     def _declare(self, kind: str, *more: str) -> str:

@@ -166,6 +166,25 @@ def test_a_signal_waits_for_the_end_of_an_import(tmp_path: Path, monkeypatch: py
 
 
 @posix
+@pytest.mark.parametrize("error", [SystemError, PointsError, OSError, None])
+def test_a_signal_that_code_in_between_changes_is_still_its_end(
+    error: type[Exception] | None, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Native code that calls Python raises a SystemError in place of what a signal raised there, or loses it."""
+
+    def command() -> int:
+        try:
+            signal.raise_signal(signal.SIGTERM)
+        except SystemExit as exc:
+            if error is not None:
+                raise error("returned a result with an exception set") from exc
+        return 1
+
+    assert run_program("program", command) == 143
+    assert capsys.readouterr().err == "program: terminated\n"
+
+
+@posix
 def test_a_host_keeps_its_own_handler() -> None:
     caught: list[int] = []
     before = signal.signal(signal.SIGTERM, lambda number, _: caught.append(number))

@@ -62,7 +62,7 @@ def test_the_attachment_has_33_bytes() -> None:
 
 def session(mode: str, endpoint: str, **more: Any) -> dict[str, Any]:
     """A Zenoh configuration that drops nothing on a busy computer."""
-    patient = {"drop": {"max_wait_before_drop_fragments": 60_000_000}}
+    patient = {"drop": {"wait_before_drop": 60_000_000, "max_wait_before_drop_fragments": 60_000_000}}
     return {
         "mode": mode,
         "listen" if mode == "router" else "connect": {"endpoints": [endpoint]},
@@ -209,7 +209,7 @@ def test_the_command_of_the_page_answers_another_process(router: str, watch: Wat
         assert len(_of(watch, "edgeperc", 9)) == 9, log.read_text()  # the node, seven topics, one subscription
         publisher = [sys.executable, str(TESTS / "ros2_helpers.py"), "3"]
         done = subprocess.run(publisher, env=environment, capture_output=True, text=True, timeout=2.0 * TIMEOUT_S)
-        assert done.returncode == 0, done.stderr + log.read_text()
+        assert done.returncode == 0, (done.stderr, log.read_text(), [key for key, _, _ in watch.samples])
 
         def heard(name: str) -> list[bytes]:
             topic = "diagnostics" if name == "diagnostics" else f"edgeperc/{name}"
