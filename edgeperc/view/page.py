@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 
 # Of a drive: a step of coordinates, the farthest one, the fewest points of a scan, and the steps in time.
 _STEP_M, _FARTHEST_M = 0.01, 320.0
-_FEWEST_POINTS = 3000
+_FEWEST_POINTS, _MOST_POINTS = 3000, 64 * 3000
 _SHORTEST_S, _LONGEST_S = 0.001, 1.0
 _MOST_WARNINGS = 5
 
@@ -88,10 +88,9 @@ def write_html(perception: Perception, points: Points, path: str | Path, *, titl
 class DrivePage:
     """An interactive 3-D page that plays the scans of a drive: play and pause, a slider, speeds and single steps.
 
-    Scans are thinned. A page begins with 12,000 points of each scan, chosen at random with a preference for far points
-    and for points on objects. If the page grows beyond its limit, the points of every scan are halved, down to 3,000;
-    then every second scan is left out, as often as needed. Points are rounded to 1 cm; those farther than 320 m along
-    an axis are left out.
+    A page begins with at most 192,000 points of each scan. If it grows beyond its limit, the points of every scan are
+    halved, down to 3,000, at random with a preference for far points and for points on objects; then every second scan
+    is left out, as often as needed. Points are rounded to 1 cm; those farther than 320 m along an axis are left out.
 
     Parameters
     ----------
@@ -108,9 +107,9 @@ class DrivePage:
     """
 
     def __init__(self, *, title: str = "", max_bytes: int = 48 * 2**20) -> None:
-        self.n_points, self.every = 12_000, 1
+        self.n_points, self.every = _MOST_POINTS, 1
         self._title, self._max_bytes = title, max_bytes
-        self._n = self.n_bytes = 0
+        self._n = self._most = self.n_bytes = 0
         self._classes: dict[str, int] = {}
         self._scans: list[_Thin] = []
         self._fitness: dict[str, None] = {}
@@ -158,6 +157,7 @@ class DrivePage:
         names = [*self._classes]
         near = (np.abs(xyz) < _FARTHEST_M).all(axis=1)
         xyz, remission, label = xyz[near], remission[near], label[near]
+        self._most = max(self._most, len(xyz))
         chosen = _sample(xyz, label, names, self.n_points)
         scan |= {"name": printable(name), "scale": _STEP_M}
         text = _in_script(json.dumps(scan, allow_nan=False))
@@ -190,7 +190,8 @@ class DrivePage:
         steps = np.clip(np.nan_to_num(np.diff(stamps)), _SHORTEST_S, _LONGEST_S)
         times = np.concatenate([np.zeros(min(1, len(stamps))), np.cumsum(steps)])
         kept = f"every {self.every}. of {self._n:,}" if self.every > 1 else "all"
-        facts = f"{len(self._scans):,} scans ({kept}), thinned to {self.n_points:,} points"
+        thinned = f"thinned to {self.n_points:,} points" if self._most > self.n_points else "with all points"
+        facts = f"{len(self._scans):,} scans ({kept}), {thinned}"
         texts = (scan.to_json() for scan in self._scans)
         _fill_page(path, self._title or "A drive", facts, self._fitness, self._classes, texts, times.round(3).tolist())
 
