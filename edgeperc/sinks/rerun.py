@@ -29,6 +29,7 @@ _POINT_BYTES, _ROOM_BYTES = 20, 8 * 2**20
 _PATIENCE_S = 60.0
 _RADIUS = -1.2  # a negative one is in points of the screen
 _BACKGROUND = [11, 15, 20]
+_TRACKED = "world/lidar/tracked"
 
 
 class RerunSink:
@@ -40,7 +41,8 @@ class RerunSink:
     ``/world``                  classes with their colors
     ``/world/lidar``            the sensor's pose: that of the tracker, or none
     ``/world/lidar/points``     finite points, their remission, class and color
-    ``/world/lidar/boxes``      boxes with class and score
+    ``/world/lidar/boxes``      boxes with class and score that no track has
+    ``/world/lidar/tracked``    those that a track has, which the view leaves out: it shows the boxes of the tracks
     ``/world/lidar/drivable``   the drivable cells, as a mesh
     ``/world/tracks``           boxes of the tracks with id, class and speed
     ``/world/trails``           the way of each track so far
@@ -77,7 +79,11 @@ class RerunSink:
         # The view moves with the sensor and looks ahead from behind and above it.
         eye = views.EyeControls3D(position=(-14.0, 0.0, 9.0), look_target=(12.0, 0.0, -1.7), eye_up=(0.0, 0.0, 1.0))
         seen = views.Spatial3DView(
-            origin="/world/lidar", contents="/world/**", background=_BACKGROUND, eye_controls=eye, name="scan"
+            origin="/world/lidar",
+            contents=["/world/**", f"- /{_TRACKED}"],
+            background=_BACKGROUND,
+            eye_controls=eye,
+            name="scan",
         )
         times = views.TimeSeriesView(origin="/status", name="stages [ms]")
         layout = views.Blueprint(views.Vertical(seen, times, row_shares=[4, 1]), collapse_panels=True)
@@ -116,8 +122,10 @@ class RerunSink:
         ids = np.array([self._classes[name] for name in classes], np.uint16)[labels[shown]]
         log("world/lidar/points", rr.Points3D(points[shown, :3], colors=colors[shown], class_ids=ids, radii=_RADIUS))
         log("world/lidar/points", rr.AnyValues(remission=points[shown, 3]))
-        texts = [box_text(box) for box in scan.perception.boxes]
-        log("world/lidar/boxes", self._boxes(scan.perception.boxes, texts, show=tracks is None))
+        of_tracks = set() if tracks is None else set(tracks.sources.tolist())
+        for name, is_tracked in (("world/lidar/boxes", False), (_TRACKED, True)):
+            listed = [box for k, box in enumerate(scan.perception.boxes) if (k in of_tracks) == is_tracked]
+            log(name, self._boxes(listed, [box_text(box) for box in listed], show=tracks is None))
         if view is not None:
             log("world/lidar/drivable", self._drivable(view, *base_pose(scan)))
         if tracks is not None:
@@ -126,10 +134,8 @@ class RerunSink:
             trails = self._trails.update(tracks)
             track_boxes = [track.world_box for track in tracks]
             log("world/tracks", self._boxes(track_boxes, [track_text(track) for track in tracks], show=True))
-            log(
-                "world/trails",
-                rr.LineStrips3D([trails[track.id] for track in tracks], class_ids=self._ids(track_boxes)),
-            )
+            ways = [trails[track.id] for track in tracks]
+            log("world/trails", rr.LineStrips3D(ways, class_ids=self._ids(track_boxes), show_labels=False))
         for name, ms in scan.perception.stage_ms.items():
             log(["status", printable(name)], rr.Scalars(ms))
         if scan.health is not None:
@@ -161,6 +167,7 @@ class RerunSink:
             quaternions=turns,
             class_ids=self._ids(listed),
             labels=texts,
+            fill_mode="majorwireframe",
             show_labels=show,
         )
 

@@ -486,7 +486,7 @@ def test_rrd_holds_what_went_in(tmp_path: Path, mounting: Mounting | None) -> No
     write(RerunSink(tmp_path / "run.rrd"), scans)
     assert [p.name for p in tmp_path.iterdir()] == ["run.rrd"]
     entities = read_rrd(tmp_path / "run.rrd")
-    points, boxes = entities["/world/lidar/points"], entities["/world/lidar/boxes"]
+    points = entities["/world/lidar/points"]
     context = component(entities["/world"], "context")[-1][0]
     names = {row["class_id"]: row["class_description"]["info"]["label"] for row in context}
     for k, scan in enumerate(scans):
@@ -497,16 +497,18 @@ def test_rrd_holds_what_went_in(tmp_path: Path, mounting: Mounting | None) -> No
         assert found is not None
         labels = found.labels[np.isfinite(scan.points).all(axis=1)]
         assert [names[id_] for id_ in component(points, "class_ids")[k]] == [found.classes[v] for v in labels]
-        np.testing.assert_allclose(
-            component(boxes, "centers")[k], [box.center for box in scan.perception.boxes], rtol=1e-6
-        )
-        np.testing.assert_allclose(
-            2 * np.array(component(boxes, "half_sizes")[k]), [box.size for box in scan.perception.boxes], rtol=1e-6
-        )
-        turns = np.array(component(boxes, "quaternions")[k])
-        np.testing.assert_allclose(
-            2 * np.arctan2(turns[:, 2], turns[:, 3]), [box.yaw for box in scan.perception.boxes], rtol=1e-6
-        )
+        # A box that a track has is apart, for the view shows the track's in its place.
+        sources = scan.tracks.sources if scan.tracks is not None else ()
+        for name, is_tracked in (("boxes", False), ("tracked", True)):
+            boxes = entities[f"/world/lidar/{name}"]
+            wanted = [box for i, box in enumerate(scan.perception.boxes) if (i in sources) == is_tracked]
+            rows = [np.array(component(boxes, part)[k]).reshape(-1, 3) for part in ("centers", "half_sizes")]
+            np.testing.assert_allclose(rows[0], np.reshape([box.center for box in wanted], (-1, 3)), rtol=1e-6)
+            np.testing.assert_allclose(2 * rows[1], np.reshape([box.size for box in wanted], (-1, 3)), rtol=1e-6)
+            turns = np.array(component(boxes, "quaternions")[k]).reshape(-1, 4)
+            np.testing.assert_allclose(2 * np.arctan2(turns[:, 2], turns[:, 3]), [box.yaw for box in wanted], rtol=1e-6)
+    assert any(component(entities["/world/lidar/tracked"], "centers"))
+    assert not any(component(entities["/world/trails"], "show_labels"))
     shown = [scan.tracks for scan in scans if scan.tracks]
     centers = [row for row in component(entities["/world/tracks"], "centers") if row]
     assert [len(row) for row in centers] == [len(tracks) for tracks in shown]
@@ -793,7 +795,9 @@ def test_the_page_on_a_touch_screen(browser: Any, tmp_path: Path, width: int, he
         left, top, right, bottom = rectangle(name)
         assert 0 <= left < right <= width
         assert bar[1] <= top < bottom <= bar[3]
-    assert min(rectangle("#toggle")[2] - rectangle("#toggle")[0], rectangle("#toggle")[3] - rectangle("#toggle")[1]) >= 40
+    assert (
+        min(rectangle("#toggle")[2] - rectangle("#toggle")[0], rectangle("#toggle")[3] - rectangle("#toggle")[1]) >= 40
+    )
     page.tap("#ahead")
     assert "2 of 8" in page.inner_text("#now")
     if small:
