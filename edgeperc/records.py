@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from .tracking.tracks import Tracks
+    from .tracking.tracks import Track, Tracks
     from .types.perception import Box, Perception
     from .types.sensor import SensorProfile
 
@@ -40,6 +40,7 @@ SCAN_KEYS = (
     "image",
     "origin_m",
     "map_boxes",
+    "map_tracks",
     "sensor_health",
 )
 """Keys of a record, in their written order; every record has all of them."""
@@ -53,7 +54,14 @@ def scan_record(perception: Perception, tracks: Tracks | None = None) -> dict[st
     record = perception.to_dict()
     record["road"] = _road_record(perception)
     record["tracks"] = [track.to_dict() for track in tracks or ()]
+    record["map_tracks"] = None if perception.origin_m is None else _map_tracks(perception, [*(tracks or ())])
     return {key: record[key] for key in SCAN_KEYS}
+
+
+def _map_tracks(perception: Perception, tracks: list[Track]) -> list[dict[str, Any]]:
+    """Boxes of the tracks in the map, each with the track's id."""
+    boxes = perception.in_map(track.box for track in tracks)
+    return [{"id": track.id, **box.to_dict()} for track, box in zip(tracks, boxes, strict=True)]
 
 
 def _road_record(perception: Perception) -> dict[str, Any] | None:

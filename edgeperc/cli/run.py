@@ -486,6 +486,7 @@ class _Run:
 
             self._straightener = Straightener(arguments.poses, arguments.quaternion)
         self._n = 0
+        self._first_place: tuple[float, float, float] | None = None
 
     def scans(self, path: Path, target: Path, shown: Path | None = None) -> Iterator[Outcome]:
         """Perceive each scan of a file or capture; ``shown`` is printed in place of its path."""
@@ -613,7 +614,9 @@ class _Run:
     ) -> Outcome:
         """Track the boxes and write everything about a scan."""
         stamp_s = self._stamp_s(perception)
-        tracks = None if self._tracker is None else self._tracker.update(perception.boxes, stamp_s)
+        tracks = None
+        if self._tracker is not None:
+            tracks = self._tracker.update(perception.boxes, stamp_s, self._pose(perception))
         if self._straightener is not None and tracks is not None:
             self._straightener.follow(tracks)
         try:
@@ -625,6 +628,14 @@ class _Run:
     def _track(self, perception: Perception) -> Tracks:
         assert self._tracker is not None
         return self._tracker.update(perception.boxes, self._stamp_s(perception))
+
+    def _pose(self, perception: Perception) -> list[list[float]] | None:
+        """Pose of a sensor whose place in a map is known, seen from that of the first scan; its axes are the map's."""
+        if perception.origin_m is None:
+            return None
+        self._first_place = self._first_place or perception.origin_m
+        x, y, z = (a - b for a, b in zip(perception.origin_m, self._first_place, strict=True))
+        return [[1.0, 0.0, 0.0, x], [0.0, 1.0, 0.0, y], [0.0, 0.0, 1.0, z], [0.0, 0.0, 0.0, 1.0]]
 
     def _stamp_s(self, perception: Perception) -> float:
         """Time of the next scan; scans without time stamps are 1 / ``--rate`` apart."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, fields, replace
 from types import MappingProxyType
 from typing import Any, TypeVar
@@ -451,8 +451,18 @@ class Perception:
     @property
     def map_boxes(self) -> tuple[Box, ...]:
         """The boxes with their centers in the map; PointsError if the place of the scan in a map was not given."""
+        return self.in_map(self.boxes)
+
+    def in_map(self, boxes: Iterable[Box]) -> tuple[Box, ...]:
+        """Boxes in the frame of the scan, such as those of tracks, with their centers in the map.
+
+        Raises
+        ------
+        PointsError
+            The place of the scan in a map was not given.
+        """
         ox, oy, oz = self._origin()
-        placed = [(box, *box.center) for box in self.boxes]
+        placed = [(box, *box.center) for box in boxes]
         return tuple(replace(box, center=(x + ox, y + oy, z + oz)) for box, x, y, z in placed)
 
     def _origin(self) -> tuple[float, float, float]:

@@ -35,7 +35,9 @@ from edgeperc.evaluation.judge import Perceiving
 from edgeperc.inference import providers, session
 from edgeperc.readers import captures
 from edgeperc.readers.files import read_points
+from edgeperc.simulation.drawn import random_scene
 from edgeperc.simulation.samples import simulated_scan
+from edgeperc.simulation.scene import simulate_sequence
 from edgeperc.types.perception import Box, Perception, PointLabels, SensorHealth, TopView
 from edgeperc.types.sensor import get_sensor
 from scenes import Terminal, urban
@@ -304,6 +306,7 @@ def test_json_is_one_object_a_scan_and_nothing_else(tmp_path: Path, capsys: pyte
         "image": None,
         "origin_m": None,
         "map_boxes": None,
+        "map_tracks": None,
         "sensor_health": SensorHealth().to_dict(),
     }
     complaints = captured.err.splitlines()
@@ -333,6 +336,26 @@ def test_boxes_come_back_in_the_map(
     (box,), (placed,) = answer["boxes"], answer["map_boxes"]
     np.testing.assert_allclose(np.subtract(placed["center"], answer["origin_m"]), box["center"], atol=1e-3)
     assert placed["yaw"] == box["yaw"]
+
+
+def test_tracks_are_placed_in_the_map(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The places of the scans are the sensor's motion: a box that stays ahead of it moves as fast as it."""
+    origin, files = np.array([512345.25, 5412345.5, 113.0]), []
+    drive = simulate_sequence(random_scene(4, "urban"), "os1-64", 4, ego_speed_mps=8.0, seed=4)
+    for k, (_, pose, scan) in enumerate(drive):
+        files.append(tmp_path / f"{k}.npy")
+        in_map = scan.points[:, :3].astype(np.float64) @ pose[:3, :3].T + pose[:3, 3] + origin
+        np.save(files[-1], np.column_stack([in_map, scan.points[:, 3]]))
+    assert run("run", *files, "--origin", "auto", "--track", "--json", "--model", "ssadnet", "--model", "pointseg") == 0
+    answers = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert [len(answer["tracks"]) for answer in answers] == [0, 1, 1, 1]
+    for answer in answers:
+        for track, placed in zip(answer["tracks"], answer["map_tracks"], strict=True):
+            assert (placed["id"], placed["label"], placed["yaw"]) == (track["id"], track["label"], track["yaw"])
+            np.testing.assert_allclose(np.subtract(placed["center"], answer["origin_m"]), track["center"], atol=1e-3)
+    assert np.hypot(*answers[-1]["tracks"][0]["velocity"]) == pytest.approx(8.0, abs=1.0)
+    moved = np.subtract(answers[-1]["map_tracks"][0]["center"], answers[1]["map_tracks"][0]["center"])
+    assert np.linalg.norm(moved) == pytest.approx(1.6, abs=0.3)
 
 
 @pytest.mark.parametrize(

@@ -216,7 +216,7 @@ def test_boxes_and_points_are_placed_in_the_map(origin: tuple[float, float, floa
 def test_without_an_origin_nothing_is_in_a_map() -> None:
     perception = perception_of(CAR)
     record = perception.to_dict()
-    assert (record["origin_m"], record["map_boxes"]) == (None, None)
+    assert (record["origin_m"], record["map_boxes"], scan_record(perception)["map_tracks"]) == (None, None, None)
     with pytest.raises(PointsError, match="origin_m="):
         _ = perception.map_boxes
     with pytest.raises(PointsError, match="place of the scan in a map is not known"):
