@@ -22,6 +22,8 @@ from edgeperc.readers.bags import bag_files
 from edgeperc.readers.captures import read_scans
 from edgeperc.readers.decoders import decode
 
+pytestmark = pytest.mark.usefixtures("in_this_process")
+
 STAMPS_S = [100.5, 101.5, 202.0]
 
 

@@ -20,6 +20,8 @@ from edgeperc.readers.clouds import cloud_points
 from edgeperc.readers.decoders import decode
 from edgeperc.system.clock import nanoseconds_of
 
+pytestmark = pytest.mark.usefixtures("in_this_process")
+
 POINTS = np.array(
     [[12.5, -3.25, -1.75, 0.25], [40.0, 8.5, 2.0, 99.0], [np.nan, 1.0, 1.0, 0.5], [5.0, np.inf, 0.0, 255.0]], np.float32
 )

@@ -24,6 +24,8 @@ from edgeperc.readers.times import TimedScan
 from edgeperc.simulation import random_scene, simulate
 from edgeperc.simulation.samples import simulated_scan
 
+pytestmark = pytest.mark.usefixtures("in_this_process")
+
 KINDS = [(1, False), (2, False), (3, False), (0x11, False), (0, True), (1, True), (2, True), (3, True), (4, True)]
 UNIT_M = {(2, False): 0.01}
 

@@ -19,6 +19,8 @@ from edgeperc import PointsError, read_timed_scans
 from edgeperc.readers.ouster_packets import PROFILES, OusterStream, fill_turn, layout_of
 from edgeperc.readers.times import TimedScan
 
+pytestmark = pytest.mark.usefixtures("in_this_process")
+
 WIDEST = "RNG19_RFL8_SIG16_NIR16_RGB16_DUAL"
 ANGLES = [float(9 - 3 * k) for k in range(8)]
 METADATA: dict[str, Any] = {

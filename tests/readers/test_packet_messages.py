@@ -23,6 +23,8 @@ from edgeperc import MissingExtraError, PointsError, SensorError, read_scans, re
 from edgeperc.readers.packet_messages import PACKET_READERS, VelodyneScan, VelodyneStream
 from edgeperc.types.sensor import SENSORS
 
+pytestmark = pytest.mark.usefixtures("in_this_process")
+
 SCAN = "velodyne_msgs/msg/VelodyneScan"
 PACKETS = "/velodyne_packets"
 

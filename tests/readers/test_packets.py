@@ -15,6 +15,8 @@ from test_captures import ouster as ouster
 from edgeperc.readers.captures import read_scans, sensor_of
 from edgeperc.readers.packets import velodyne_senders
 
+pytestmark = pytest.mark.usefixtures("in_this_process")
+
 # Headers in front of the IP header, by the link type.
 LINKS = {
     1: bytes(12) + b"\x08\x00",

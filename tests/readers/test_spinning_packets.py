@@ -39,6 +39,8 @@ from edgeperc.readers.spinning_packets import (
     read_angles,
 )
 
+pytestmark = pytest.mark.usefixtures("in_this_process")
+
 # When the channels of a block fire [us], by the makers' manuals; others are not stated, and count as one moment.
 FIRES_US: dict[str, Any] = {
     "pandarxt-32": 6 + 1.512 * np.arange(32),

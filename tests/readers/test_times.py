@@ -27,6 +27,8 @@ from edgeperc.cli.straighten import Straightener
 from edgeperc.errors import OptionError, PointsError, StampError
 from edgeperc.readers.times import of_plausible_duration, point_times, time_name
 
+pytestmark = pytest.mark.usefixtures("in_this_process")
+
 MOTION = Motion((18.0, 0.5, 0.0), (0.02, -0.03, 0.6))
 HALF_X_M, HALF_Y_M = 20.0, 15.0
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import subprocess
 import sys
 import textwrap
@@ -12,43 +11,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from pool_tasks import dying, failing, scaled, slowest_first, without_pickle
 
 from edgeperc.errors import EdgepercError
 from edgeperc.evaluation.transfer import compare
 from edgeperc.system.pool import MOST_KEPT, Lost, map_in_processes
-
-
-def scaled(factor: int, deadly: tuple[int, ...] = ()) -> Callable[[int], int]:
-    """What processes make: items times a factor; of some items a process dies, and seven cannot be scaled."""
-
-    def function(item: int) -> int:
-        if item in deadly:
-            os._exit(3)
-        if item == 7:
-            raise ValueError("seven")
-        return factor * item
-
-    return function
-
-
-def slowest_first(seconds: float) -> Callable[[int], tuple[int, float]]:
-    def function(item: int) -> tuple[int, float]:
-        time.sleep(seconds if item == 0 else 0.0)
-        return item, time.monotonic()
-
-    return function
-
-
-def without_pickle() -> Callable[[int], object]:
-    return lambda item: (lambda: item) if item == 1 else item
-
-
-def failing() -> Callable[[int], int]:
-    raise ValueError("no such model")
-
-
-def dying() -> Callable[[int], int]:
-    os._exit(4)
 
 
 @pytest.mark.parametrize(("workers", "n"), [(1, 0), (1, 1), (2, 1), (2, 100), (3, 8), (None, 9)])

@@ -1,0 +1,29 @@
+"""Captures that the tests decode without a process of their own."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from edgeperc.readers import captures
+from edgeperc.readers.decoders import decode
+from edgeperc.readers.times import TimedScan
+
+
+@pytest.fixture
+def in_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Captures are decoded here: a process takes a second to start. That it replies the same is for `test_apart`."""
+
+    def decoded(
+        path: Path, kind: str, topic: str | None, remission_field: str | None, times: bool
+    ) -> Iterator[TimedScan]:
+        def warn(text: str) -> None:
+            warnings.warn(text, UserWarning, stacklevel=2)
+
+        for one in decode(path, kind, topic, remission_field, warn, lambda: None, times=times):
+            yield TimedScan(one.stamp_s, one.points.copy(), one.times_s if times else None)
+
+    monkeypatch.setattr(captures, "decode_apart", decoded)
