@@ -253,7 +253,7 @@ def run_command(arguments: argparse.Namespace) -> int:
     _check_outputs(arguments, kinds, images, scans, targets)
     perceivers = _Perceivers(arguments)
     local = [scan for scan in scans if isinstance(scan, Path)]
-    perceivers.check([*filter(None, images.values())] if images else local, of_images=bool(images))
+    perceivers.check([*filter(None, images.values())] if images else scans, of_images=bool(images))
     for target in targets if kinds and isinstance(arguments.out, Path) else ():
         target.parent.mkdir(parents=True, exist_ok=True)
     report = Report(arguments, images)
@@ -264,7 +264,7 @@ def run_command(arguments: argparse.Namespace) -> int:
         run = _Run(arguments, perceivers, kinds, sinks)
         if has_workers(arguments):
             if arguments.sensor in (None, AUTO_SENSOR):  # of the first scans, for all workers
-                arguments.sensor = perceivers.sensor_of(local[0]) if local else stated_sensor(arguments)
+                arguments.sensor = perceivers.sensor_of((local or scans)[0]) if scans else stated_sensor(arguments)
             perceive_side_by_side(arguments, _alone, perceivers, scans, targets, report, show)
         for done, (scan, target) in enumerate(() if has_workers(arguments) else zip(scans, targets, strict=True)):
             show(done, len(scans))
@@ -421,9 +421,10 @@ class _Perceivers:
         self._made: dict[str | SensorProfile, Perceiver] = {}
         self._sensors = Sensors(arguments)
 
-    def check(self, scans: Sequence[Path], of_images: bool) -> None:
+    def check(self, scans: Sequence[Path | Remote], of_images: bool) -> None:
         """Make the first perceiver, so that errors of options and models come before any file is written."""
         self._sensors = Sensors(self._arguments, scans)
+        scans = [scan for scan in scans if isinstance(scan, Path)]
         for scan in scans:
             try:
                 self.sensor_of(scan)
@@ -448,9 +449,9 @@ class _Perceivers:
         if of_images and not scans and kinds != {"camera"}:
             raise ModelError("images alone need a camera model alone; leave out the others, or add --scan")
 
-    def sensor_of(self, path: Path) -> str | SensorProfile:
+    def sensor_of(self, path: Path | Remote, url: Remote | None = None) -> str | SensorProfile:
         """The sensor of ``--sensor``, of the capture, or the one that is found in the points."""
-        return self._sensors.of(path)[0]
+        return self._sensors.of(path, url)[0]
 
     def of(self, sensor: str | SensorProfile) -> Perceiver:
         """The perceiver of a sensor."""
@@ -497,7 +498,7 @@ class _Run:
             return
         shown = shown or path
         try:
-            sensor = self._perceivers.sensor_of(path)
+            sensor = self._perceivers.sensor_of(path, shown if isinstance(shown, Remote) else None)
             perceive = self._perceivers.of(sensor)
             numbered = is_capture(path)
             read: Callable[..., Iterator[tuple[Any, ...]]] = read_timed_scans if self._straightener else read_scans

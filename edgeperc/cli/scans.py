@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import os
 import re
+import tempfile
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
@@ -221,26 +222,23 @@ class Sensors:
     """The sensors of the scans of a command line: that of scan files is found once for each folder.
 
     arguments : as in `scan_sensor`.
-    scans : the scans and captures.
+    scans : the scans and captures; those at URLs are fetched to find it.
     """
 
-    def __init__(self, arguments: argparse.Namespace, scans: Sequence[Path] = ()) -> None:
+    def __init__(self, arguments: argparse.Namespace, scans: Sequence[Path | Remote] = ()) -> None:
         self._arguments, self._scans = arguments, scans
-        self._found: dict[Path, tuple[str | SensorProfile, str] | SensorError] = {}
+        self._found: dict[Path | Remote, tuple[str | SensorProfile, str] | SensorError] = {}
 
-    def of(self, path: Path) -> tuple[str | SensorProfile, str]:
-        """See `scan_sensor`; a file that was fetched from a URL is the default's, unless ``--sensor`` names another."""
+    def of(self, path: Path | Remote, url: Remote | None = None) -> tuple[str | SensorProfile, str]:
+        """See `scan_sensor`; ``url``: from where the path was fetched."""
         from ..readers.captures import is_capture
 
-        arguments = self._arguments
-        is_file = not (is_capture(path) or path.is_dir())
-        if is_file and self._scans and path not in self._scans and arguments.sensor in (None, AUTO_SENSOR):
-            return with_mounting(DEFAULT_SENSOR, arguments), "the default for scans at a URL"
-        key = path.parent if is_file else path
+        is_file = isinstance(path, Remote) or not (is_capture(path) or path.is_dir())
+        key = (url or path).parent if is_file else path
         if key not in self._found:
-            beside = [scan for scan in self._scans if is_file and scan.parent == key and not is_capture(scan)]
+            beside = [scan for scan in self._scans if is_file and scan.parent == key]
             try:
-                self._found[key] = scan_sensor(path, arguments, beside)
+                self._found[key] = self._of(path, beside)
             except SensorError as exc:
                 self._found[key] = exc
         found = self._found[key]
@@ -248,6 +246,19 @@ class Sensors:
             reason = str(found).removeprefix(f"{path}: ")
             raise SensorError(f"{path}: {reason}")
         return found
+
+    def _of(self, path: Path | Remote, beside: Sequence[Path | Remote]) -> tuple[str | SensorProfile, str]:
+        from ..readers.captures import is_capture
+
+        with tempfile.TemporaryDirectory(prefix="edgeperc-") as folder:
+            files = [scan for scan in beside if isinstance(scan, Path) and not is_capture(scan)]
+            for scan in beside[:_LOOKED_AT]:
+                if isinstance(scan, Remote):
+                    with suppress(EdgepercError, OSError):  # reported when the scan's turn comes
+                        files.append(scan.fetch(Path(folder)))
+            if isinstance(path, Remote):
+                path = next(iter(files), Path(path.name))
+            return scan_sensor(path, self._arguments, files)
 
 
 def with_mounting(sensor: str | SensorProfile, arguments: argparse.Namespace) -> str | SensorProfile:

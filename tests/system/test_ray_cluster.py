@@ -18,11 +18,16 @@ import numpy as np
 import pytest
 
 from edgeperc import cli
+from edgeperc.cli.main import build_parser
+from edgeperc.cli.scans import Sensors
 from edgeperc.errors import MissingExtraError, OptionError, PointsError
 from edgeperc.perceiver import Perceiver
+from edgeperc.simulation.drawn import random_scene
+from edgeperc.simulation.scene import simulate
 from edgeperc.system.pool import Lost
 from edgeperc.system.ray_cluster import map_on_ray, signals_kept
 from edgeperc.system.remote import Remote, location
+from edgeperc.types.sensor import SensorProfile
 from scenes import urban
 
 pytestmark = pytest.mark.filterwarnings("ignore")  # of Ray, boto and aiohttp
@@ -204,6 +209,23 @@ def _results_at_urls_are_those_of_paths(root: str, scans: Path, tmp_path: Path) 
     back = run(f"{root}/scans/a/0.bin", "--out", tmp_path / "back", "--labels")
     assert contents(tmp_path / "back") == {"0.label": contents(tmp_path / "out")["a/0.label"]}
     assert back[0] == 0
+
+
+@pytest.mark.parametrize(("sensor", "n_damaged"), [("vlp-16", 0), ("os1-64", 2)])
+def test_the_sensor_of_scans_at_a_url_is_found(sensor: str, n_damaged: int, tmp_path: Path) -> None:
+    """For workers, and for one process: from the first scans of the folder that can be read."""
+    pytest.importorskip("fsspec")
+    folder = Remote(f"memory://{sensor}/scans")
+    urls = [Remote(f"{folder.url}/{k}.bin") for k in range(4)]
+    for k, url in enumerate(urls):
+        points = simulate(random_scene(k, "urban"), sensor, seed=k).points
+        url.write_bytes(b"no scan" if k < n_damaged else points.tobytes())
+    arguments = build_parser().parse_args(["run", folder.url])
+    fetched = urls[n_damaged].fetch(tmp_path)
+    for found, how in (Sensors(arguments, urls).of(urls[0]), Sensors(arguments, urls).of(fetched, urls[n_damaged])):
+        assert isinstance(found, SensorProfile)
+        assert found.name == sensor
+        assert "beams found" in how
 
 
 def test_scans_in_memory(scans: Path, tmp_path: Path) -> None:
