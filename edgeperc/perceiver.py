@@ -358,7 +358,7 @@ class Perceiver:
             )
         self.providers = MappingProxyType({s.card.name: s.description for s in self.sessions})
         self._fitness = [FitnessProfile.from_dict(card.fitness) for card in self.cards if card.fitness is not None]
-        self._to_check = 0 if self.on_mismatch == "ignore" else CHECKED_SCANS
+        self._to_check = self._n_to_check
         self._told_of_near = False
         self._told_of: set[str] = set()
         self._locks = {os.getpid(): threading.Lock()}
@@ -445,12 +445,18 @@ class Perceiver:
     def reset_mounting(self) -> None:
         """Estimate mounting and remission anew, for scans of another vehicle; the next five scans settle both.
 
-        With ``sensor="auto"``, the next scan tells the sensor.
+        The next scans are checked as the first ones are (``on_mismatch``). With ``sensor="auto"``, the next one tells
+        the sensor.
         """
         with self._lock:
             self._sensor_estimate = None
+            self._to_check = self._n_to_check
             self._remission, self._normal = RemissionMatcher(self.sensor), Normal()
             self._set_mounting(MountingEstimator(self._estimator.known))
+
+    @property
+    def _n_to_check(self) -> int:
+        return 0 if self.on_mismatch == "ignore" else CHECKED_SCANS
 
     @property
     def learned(self) -> Learned:

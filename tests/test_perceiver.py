@@ -14,7 +14,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pytest
@@ -500,6 +500,23 @@ def test_other_differences_are_warned_of(scan: SimulatedScan) -> None:
         assert Perceiver("pointseg", mounting=MODEL_MOUNTING, provider="cpu")(raised).fitness
     with pytest.raises(FitnessError, match=r"The ground lies at z = -0\.7 m"):
         Perceiver("pointseg", mounting=MODEL_MOUNTING, provider="cpu", on_mismatch="raise")(raised)
+
+
+@pytest.mark.parametrize("fault", [fault for fault in FAULTS if fault != "no remission"])
+@pytest.mark.parametrize("on_mismatch", ["refuse", "ignore"])
+def test_the_scans_of_another_vehicle_are_checked_as_the_first(
+    scan: SimulatedScan, fault: str, on_mismatch: Literal["refuse", "ignore"]
+) -> None:
+    perceive = Perceiver("pointseg", provider="cpu", on_mismatch=on_mismatch)
+    for _ in range(5):
+        assert perceive(scan.points).fitness == ()
+    assert perceive(faulty(scan.points, fault)).fitness == ()  # not checked any more
+    perceive.reset_mounting()
+    if on_mismatch == "ignore":
+        assert perceive(faulty(scan.points, fault)).fitness == ()
+    else:
+        with pytest.raises(FitnessError, match=FAULTS[fault]):
+            perceive(faulty(scan.points, fault))
 
 
 def test_mismatch_can_be_ignored(scan: SimulatedScan) -> None:
