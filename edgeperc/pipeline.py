@@ -28,6 +28,8 @@ from .ground.planes import FIRST_REACH_HEIGHTS, FIRST_REACH_M, GroundFit, fit_gr
 from .ground.scan import Scan
 from .inference.crop import Crop, sectors_of_turn, spread
 from .inference.decode import decode_boxes, decode_cells, decode_labels
+from .inference.detections import best_rows, decode_detections
+from .inference.pillars import Pillarizer
 from .inference.projection import RangeImageProjector, input_heights, make_projector
 from .inference.session import MAX_ROWS, Session
 from .objects.boxes import join_boxes, objects_from_points
@@ -39,7 +41,8 @@ from .objects.linkage import Strips
 from .objects.refine import label_points, remove_outliers
 from .preprocess.interpolation import Interpolator
 from .system.lanes import Lanes, Once, Stopwatch
-from .types.frame import turned
+from .types.detector import PillarGeometry
+from .types.frame import turned, turned_back
 from .types.geometry import oriented_iou, rectangles, shared_area
 from .types.mounting import MODEL_HEIGHT_M, Mounting
 from .types.perception import Box, GroundSurface, PointLabels, TopView
@@ -194,6 +197,46 @@ class ObjectNetwork:
         return tuple(boxes_of_objects(merged, self.card.classes, min_score))
 
 
+class PillarNetwork:
+    """A detector of others: boxes from the pillars of all points in its range (PointPillars, CenterPoint).
+
+    score_threshold : lowest score of a box.
+    full_turn : run a network that looks ahead four times, on the scan turned by a quarter each.
+    """
+
+    def __init__(self, session: Session, score_threshold: float, full_turn: bool) -> None:
+        view = session.card.view
+        assert isinstance(view, PillarGeometry)
+        self.session, self.card, self.view, self._score = session, session.card, view, score_threshold
+        self._pillarizer = Pillarizer(view, session.card.input, MODEL_HEIGHT_M - session.card.mount_height_m)
+        quarters = 4 if full_turn and not view.is_all_around else 1
+        self.turns_rad = [math.radians(90.0 * k - view.ahead_deg) for k in range(quarters)]
+        corners = np.array([(x, y) for x in view.x_range_m for y in view.y_range_m])
+        seen = [corners @ [(math.cos(a), math.sin(a)), (-math.sin(a), math.cos(a))] for a in self.turns_rad]
+        low, high = np.min(np.concatenate(seen), axis=0), np.max(np.concatenate(seen), axis=0)
+        self.field = np.array([(*(0.5 * (low + high)), *(high - low), 0.0)])
+        """What it sees of the models' frame, as a rectangle (1, 5)."""
+
+    def find_boxes(self, points: Points) -> Sequence[Box]:
+        """Boxes in the frame of the models, best score first."""
+        boxes: list[Box] = []
+        for turn_rad in self.turns_rad:
+            n = self._pillarizer.fill(turned(points, turn_rad) if turn_rad else points)
+            if n == 0:
+                continue
+            for name, array in zip(self.session.inputs, self._pillarizer.inputs, strict=True):
+                self.session.inputs[name][:n] = array[:n]
+            found = decode_detections(self.card, self.session.run(n), self._score)
+            boxes += turned_back(found, turn_rad) if turn_rad else found
+        if len(self.turns_rad) == 1:
+            return boxes
+        assert self.card.head is not None
+        names, scores = np.array([box.label for box in boxes]), np.array([box.score for box in boxes])
+        across = self.card.head.across_classes
+        kept = best_rows(rectangles(boxes), scores, names, self.card.nms_iou, across_classes=across)
+        return [boxes[row] for row in kept.tolist()]
+
+
 class Pipeline:
     """Networks, and what makes one answer of theirs. The next scan overwrites their buffers.
 
@@ -207,9 +250,10 @@ class Pipeline:
         options: Options,
         lanes: Lanes,
         objects: ObjectNetwork | None = None,
+        pillars: PillarNetwork | None = None,
     ) -> None:
         self.top, self.ranged, self.options, self._lanes = top, ranged, options, lanes
-        self.objects = objects
+        self.objects, self.pillars = objects, pillars
         self._free = deque(ranged)
         projectors = [network.projector for network in (top, *ranged) if network is not None]
         self.needs_ground = (
@@ -263,8 +307,12 @@ class Pipeline:
         # Objects alone: classes such as road and building are background to the stages below
         seen, labels = labels, value("refine", PointLabels.objects, labels) if self.ranged else absent
 
-        # Objects by the points of their candidates
-        objects = candidates = absent
+        # Objects of a detector, and by the points of their candidates
+        detections = objects = value("check", tuple)
+        candidates = absent
+        detector = self.pillars if options.boxes_from != "clusters" else None
+        if detector is not None:
+            detections = value("infer", detector.find_boxes, points)
         if self.objects is not None:
             candidates = value("cluster", self.objects.crop, scan, detected, options)
             objects = value("infer", self.objects.find_boxes, candidates, options.object_score)
@@ -278,8 +326,8 @@ class Pipeline:
             support = value("cluster", find_support, scan, labels, boxes, rules)
             per_m = options.distance_per_m
             clusters = value("cluster", find_voters, scan, labels, support, strips, distance_per_m=per_m, rules=rules)
-            if self.objects is not None:  # whatever the clusters say, a box keeps and adds labels
-                supporting = value("agree", _supporting, boxes, objects)
+            if self.objects is not None or detector is not None:  # whatever the clusters say, these boxes keep labels
+                supporting = value("agree", _supporting, boxes, objects, detections)
                 support = value("cluster", find_support, scan, labels, supporting, rules)
             agreed = value("agree", agree_on_points, scan, labels, clusters, support, upright, view=cells, rules=rules)
             trusted = joined = value("agree", agree_on_boxes, boxes, scan, agreed, rules)
@@ -293,8 +341,10 @@ class Pipeline:
         if self.objects is not None:
             by_labels = bool(self.ranged) and options.boxes_from != "network"
             standing = value("cluster", _completed, objects, standing, by_labels, options.cluster_score)
+        if detector is not None:
+            standing = value("cluster", _detected, detections, standing, detector, options.cluster_score)
         standing = value("agree", without_impossible, standing, points, mounting) if "ceiling" in rules else standing
-        joined = joined if self.objects is None else standing
+        joined = joined if self.objects is None and detector is None else standing
         if top is not None and rules:
             marks = value("agree", mark_cells, cells, scan, agreed, rules)
             view = value("agree", _agreed_cells, cells, agreed, joined, boxes, trusted, marks, rules)
@@ -305,7 +355,20 @@ class Pipeline:
         whole = value("refine", _whole, seen, agreed, near, len(points))
         self._lanes.run(
             [near, projected, scan, *sectors, *spare, labels, upright, strips, clusters, cells, surface, joined, view],
-            [planes, boxes, *reversed(sectors), objects, strips, cells, support, surface, marks, whole, standing],
+            [
+                planes,
+                boxes,
+                *reversed(sectors),
+                detections,
+                objects,
+                strips,
+                cells,
+                support,
+                surface,
+                marks,
+                whole,
+                standing,
+            ],
         )
         return Parts(whole(), view(), standing(), surface())
 
@@ -336,12 +399,14 @@ class Pipeline:
         if self.options.boxes_from != "both":
             return objects
         if self.top is not None:
-            objects = weigh(objects, self.top.view, self.top.card.box_classes, self.options.cluster_score)
+            (near, far), (right, left) = self.top.view.x_range_m, self.top.view.y_range_m
+            field = np.array([(0.5 * (near + far), 0.5 * (right + left), far - near, left - right, 0.0)])
+            objects = weigh(objects, field, self.top.card.box_classes, self.options.cluster_score)
         return join_boxes(boxes, objects)
 
 
-def weigh(boxes: Sequence[Box], view: TopViewGeometry, classes: Sequence[str], min_score: float) -> list[Box]:
-    """Boxes around clusters that a network of the top view has not found, with the scores that both views give them.
+def weigh(boxes: Sequence[Box], field: NDArray[np.float64], classes: Sequence[str], min_score: float) -> list[Box]:
+    """Boxes around clusters that a network which sees a ``field`` (1, 5) has not found, with the scores of both.
 
     The score is the mean of the cluster's and that of the network, which is 0 where it sees the object. The network's
     has the weight of the share of the footprint in its view: out of the view, the cluster's score stands. Boxes below
@@ -351,8 +416,6 @@ def weigh(boxes: Sequence[Box], view: TopViewGeometry, classes: Sequence[str], m
     weighed = list(boxes)
     if rows:
         footprints = rectangles(boxes[row] for row in rows)
-        (near, far), (right, left) = view.x_range_m, view.y_range_m
-        field = np.array([(0.5 * (near + far), 0.5 * (right + left), far - near, left - right, 0.0)])
         areas = footprints[:, 2] * footprints[:, 3]
         seen = shared_area(oriented_iou(footprints, field), footprints, field)[:, 0] / areas
         for row, share in zip(rows, seen.tolist(), strict=True):
@@ -364,9 +427,9 @@ def _absent() -> None:
     """The value of a part without a network, or that no option asks for."""
 
 
-def _supporting(boxes: Sequence[Box], objects: Sequence[Box]) -> list[Box]:
-    """Boxes that keep and add labels of points: those of the top view, and of the object network."""
-    return [*boxes, *(replace(box, score=box.score - LESS_SURE) for box in objects)]
+def _supporting(boxes: Sequence[Box], objects: Sequence[Box], detections: Sequence[Box]) -> list[Box]:
+    """Boxes that keep and add labels of points: those of the top view, of a detector, and of the object network."""
+    return [*boxes, *detections, *(replace(box, score=box.score - LESS_SURE) for box in objects)]
 
 
 def _unboxed(labels: PointLabels, support: Support) -> PointLabels:
@@ -432,6 +495,13 @@ def _completed(objects: Sequence[Box], others: Sequence[Box], by_labels: bool, m
     kept = [box if box.label in PERSONS else replace(box, score=0.5 * box.score) for box in others]
     found = [box for box in objects if not by_labels or box.label not in PERSONS]
     return join_boxes(found, [box for box in kept if box.score >= min_score])
+
+
+def _detected(
+    detections: Sequence[Box], others: Sequence[Box], detector: PillarNetwork, min_score: float
+) -> tuple[Box, ...]:
+    """Boxes of a detector, and those of others where it has none: of its classes in its range, with half the score."""
+    return join_boxes(detections, weigh(others, detector.field, detector.card.box_classes, min_score))
 
 
 def _agreed_cells(

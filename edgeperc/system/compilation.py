@@ -63,6 +63,9 @@ KERNELS: Mapping[str, str] = MappingProxyType(
         "cells": "agreement.cells.clear_cells agreement.cells.fill_marks",
         "detections": "inference.box_heads.count_not_finite inference.box_heads.fill_footprint_sums "
         "inference.box_heads.mark_peaks inference.decode.clear_empty types.geometry.mark_nms",
+        "pillars": "inference.box_heads.count_not_finite inference.pillars.fill_pillars "
+        "inference.pillars.find_pillars types.geometry.fill_oriented_iou types.geometry.mark_nms",
+        "turned pillars": "types.frame.fill_turned",
         "blocks": "inference.decode.fill_pixels",
         "image": "camera.image.fill_image_labels camera.image.fill_scaled",
     }

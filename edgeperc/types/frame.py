@@ -71,6 +71,12 @@ def turned(points: Points, angle_rad: float) -> NDArray[np.float32]:
     return read_only(result)
 
 
+def turned_back(boxes: Iterable[Box], angle_rad: float) -> tuple[Box, ...]:
+    """Boxes in a scan of `turned`, in the frame of the scan before."""
+    cos, sin = math.cos(angle_rad), math.sin(angle_rad)
+    return _moved(boxes, np.array([(cos, -sin, 0.0), (sin, cos, 0.0), (0.0, 0.0, 1.0)]), np.zeros(3))
+
+
 def quaternion(R: NDArray[np.float64]) -> tuple[float, float, float, float]:
     """x, y, z, w of a rotation matrix (3, 3); w >= 0."""
     # Of these four rows, each the quaternion times four of its entries, the longest is the most exact.

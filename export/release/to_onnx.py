@@ -22,10 +22,10 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from edgeperc.camera.image import ImageScaler
-from edgeperc.errors import EdgepercError
+from edgeperc.errors import CardMismatchError, EdgepercError
 from edgeperc.inference.decode import decode_classes, decode_top_view
 from edgeperc.inference.projection import make_projector, project
-from edgeperc.inference.session import Session, golden_input, golden_shape
+from edgeperc.inference.session import WHOLE, Session, golden_feed, golden_input, golden_shape
 from edgeperc.preprocess.fitness import FitnessProfile
 from edgeperc.system.atomic import open_atomic
 from edgeperc.types.card import CARD_KEY, Golden, ModelCard
@@ -205,8 +205,16 @@ def with_golden(model: onnx.ModelProto, card: ModelCard) -> ModelCard:
     import onnxruntime
 
     session = onnxruntime.InferenceSession(model.SerializeToString(), providers=["CPUExecutionProvider"])
-    x = golden_input(0, golden_shape(card))
-    outputs = session.run([o.name for o in card.outputs], {card.input.name: x})
+    feed = golden_feed(card, 0)
+    x = feed[card.input.name]
+    for node in session.get_inputs():
+        if node.name not in feed:
+            raise CardMismatchError(f"the graph has the input {node.name!r}, its card declares {[*feed]}")
+        kind = WHOLE.get(node.type.removeprefix("tensor(").removesuffix(")"), np.float32)
+        n_more = max(node.shape[0] - len(x), 0) if len(feed) > 1 and isinstance(node.shape[0], int) else 0
+        padding = [(0, n_more), *[(0, 0)] * (feed[node.name].ndim - 1)]
+        feed[node.name] = np.pad(feed[node.name], padding, mode="edge").astype(kind)
+    outputs = session.run([o.name for o in card.outputs], feed)
     records = {}
     for spec, output in zip(card.outputs, outputs, strict=True):
         few = output.size <= N_GOLDEN_VALUES
