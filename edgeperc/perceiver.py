@@ -144,8 +144,9 @@ class Perceiver:
     ----------
     models : str, Path, sequence of these, or None
         Names of shipped models (``"ssadnet"``, ``"pointseg:int8"``) or paths of .onnx files with a card; at most one
-        model per view: top view, range image, objects, pillars (a detector of yours) and camera. None takes the LiDAR models together that ``weights``
-        names, by default the best ones, `edgeperc.zoo.DEFAULT`. The options of scans have no effect on a camera.
+        model per view: top view, range image, objects, pillars (a detector of yours) and camera. None takes the LiDAR
+        models together that ``weights`` names, by default the best ones, `edgeperc.zoo.DEFAULT`. The options of scans
+        have no effect on a camera.
     sensor : str, Path or SensorProfile
         The sensor that takes the scans: a built-in name (`edgeperc.sensors`), a file written by ``edgeperc
         fit-sensor``, or a profile. ``"auto"``: the one whose beams the first scan has, or a profile of its beams

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -326,7 +327,7 @@ class Pipeline:
             support = value("cluster", find_support, scan, labels, boxes, rules)
             per_m = options.distance_per_m
             clusters = value("cluster", find_voters, scan, labels, support, strips, distance_per_m=per_m, rules=rules)
-            if self.objects is not None or detector is not None:  # whatever the clusters say, these boxes keep labels
+            if self.objects is not None or detector is not None:  # boxes outvote clusters
                 supporting = value("agree", _supporting, boxes, objects, detections)
                 support = value("cluster", find_support, scan, labels, supporting, rules)
             agreed = value("agree", agree_on_points, scan, labels, clusters, support, upright, view=cells, rules=rules)

@@ -14,11 +14,9 @@ from ..types.detector import PillarGeometry
 from ..types.points import Points, read_only
 
 # What kernels compute, by the channel's place in the card's list of all.
-(
-    *(X, Y, Z, REMISSION, TIME),
-    *(FROM_MEAN_X, FROM_MEAN_Y, FROM_MEAN_Z, FROM_CENTER_X, FROM_CENTER_Y, FROM_CENTER_Z, RANGE),
-) = range(len(CHANNELS["pillars"]))
 AXES = 3
+X, Y, Z, REMISSION, TIME, FROM_MEAN_X = range(6)
+FROM_CENTER_X, RANGE = FROM_MEAN_X + AXES, FROM_MEAN_X + 2 * AXES
 
 
 class PillarGrid(NamedTuple):
@@ -74,7 +72,7 @@ class Pillarizer:
         self.pillars = Pillars(
             np.zeros((n, m, len(spec.channels)), np.float32), np.zeros(n, np.int32), np.zeros((n, 4), np.int32)
         )
-        self.inputs = [each for each, used in zip(self.pillars, (True, bool(view.num_points), True)) if used]
+        self.inputs = [each for each, used in zip(self.pillars, (1, view.num_points, 1), strict=True) if used]
         """Arrays of `pillars` in the order of the graph's inputs (`edgeperc.inference.session.input_shapes`)."""
         self._members = np.empty((n, m), np.int32)
         self._numbers = np.full((view.height, view.width), -1, np.int32)

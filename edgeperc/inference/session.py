@@ -44,8 +44,8 @@ from ..system.names import nearest
 from ..system.printable import printable
 from ..types.card import ModelCard
 from ..types.choices import PRECISIONS
-from ..types.onnx_file import check_graph, read_model
 from ..types.detector import PillarGeometry
+from ..types.onnx_file import check_graph, read_model
 from ..types.views import CameraGeometry, ObjectGeometry
 from ..zoo import Variant, choose, digest, resolve
 from .decode import fill_pixels
@@ -244,9 +244,9 @@ class Session:
         folds = check_graph(blob, self.path, trusted=self._trusted)
         if not folds and short not in ("cpu", "cuda"):
             raise ProviderError(
-                f"{self.path}: it computes sizes from constants alone, which provider {short!r} would do while it opens "
-                "the file, where nothing can stop it; choose provider 'cpu', or pass trusted=True, or --trusted, if "
-                "you know where it comes from"
+                f"{self.path}: it computes sizes from constants alone, which provider {short!r} would do while it "
+                "opens the file, where nothing can stop it; choose provider 'cpu', or pass trusted=True, or --trusted, "
+                "if you know where it comes from"
             )
         self.sha256 = hashlib.sha256(blob).hexdigest()
         cores = usable_cores()

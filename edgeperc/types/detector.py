@@ -85,7 +85,7 @@ class PillarGeometry:
     @property
     def is_all_around(self) -> bool:
         """Whether it reaches to every side of the sensor, a quarter as far as to its farthest side at least."""
-        reach = [side * limit for pair in (self.x_range_m, self.y_range_m) for side, limit in zip((-1, 1), pair)]
+        reach = [side for low, high in (self.x_range_m, self.y_range_m) for side in (-low, high)]
         return min(reach) >= 0.25 * max(reach)
 
 

@@ -28,10 +28,10 @@ MAX_SMALL = 2**16  # values of one arithmetic result of constants: shapes and sc
 
 _OPERATORS = """
 Abs Add And ArgMax AveragePool BatchNormalization Cast Ceil Clip Concat Constant ConstantOfShape Conv ConvInteger
-ConvTranspose DepthToSpace DequantizeLinear Div Dropout DynamicQuantizeLinear Elu Equal Erf Exp Expand Flatten Floor Gather
-GatherElements GatherND Gelu Gemm GlobalAveragePool GlobalMaxPool Greater GreaterOrEqual GroupNormalization
-HardSigmoid HardSwish Identity InstanceNormalization LRN LayerNormalization LeakyRelu Less LessOrEqual Log
-LogSoftmax MatMul MatMulInteger Max MaxPool Mean Min Mish Mul Neg NonZero Not Or PRelu Pad Pow QLinearConv QLinearMatMul
+ConvTranspose DepthToSpace DequantizeLinear Div Dropout DynamicQuantizeLinear Elu Equal Erf Exp Expand Flatten Floor
+Gather GatherElements GatherND Gelu Gemm GlobalAveragePool GlobalMaxPool Greater GreaterOrEqual GroupNormalization
+HardSigmoid HardSwish Identity InstanceNormalization LRN LayerNormalization LeakyRelu Less LessOrEqual Log LogSoftmax
+MatMul MatMulInteger Max MaxPool Mean Min Mish Mul Neg NonZero Not Or PRelu Pad Pow QLinearConv QLinearMatMul
 QuantizeLinear Range Reciprocal ReduceMax ReduceMean ReduceMin ReduceSum Relu Reshape Resize ScatterElements ScatterND
 Selu Shape Sigmoid Slice Softmax Softplus Softsign SpaceToDepth Split Sqrt Squeeze Sub Sum Tanh Tile TopK Transpose
 Unsqueeze Where
@@ -329,7 +329,7 @@ class _GraphCheck:
         n_needed = [len(names) for names in needed]
         while ready:
             node = self._nodes[ready.pop()]
-            if node.operator in DEFERRED and math.prod(self._constants[name] for name in node.inputs) <= MAX_SMALL:
+            if node.operator in DEFERRED and sum(self._constants[name] for name in node.inputs) <= MAX_SMALL:
                 self.is_deferred = True  # what it gives is computed in a run: no constant
                 continue
             n_values = self._n_computed(node)
@@ -350,7 +350,7 @@ class _GraphCheck:
         sizes = [max(self._constants[name], 1) for name in node.inputs]
         if node.operator in STEADY:
             return max(sizes, default=1)
-        n_values = math.prod(sizes)
+        n_values = sum(sizes) if node.operator == "Concat" else math.prod(sizes)
         if node.operator not in SMALL or n_values > MAX_SMALL:
             self._refuse_unless_trusted(f"has a {node.operator!r} that computes with constants alone")
         return n_values
