@@ -256,6 +256,7 @@ class Pipeline:
         self.top, self.ranged, self.options, self._lanes = top, ranged, options, lanes
         self.objects, self.pillars = objects, pillars
         self._free = deque(ranged)
+        self._least_score = options.network_score if objects is None else min(options.network_score, MIN_DETECTOR_SCORE)
         projectors = [network.projector for network in (top, *ranged) if network is not None]
         self.needs_ground = (
             bool(options.rules)
@@ -273,7 +274,7 @@ class Pipeline:
 
     def __call__(self, points: Points, mounting: Mounting, watch: Stopwatch) -> Parts:
         """Perceive points in the frame of the models, (n, 4) float32, read-only, finite or NaN."""
-        top, options, rules = self.top, self.options, self.options.rules
+        top, options, rules, per_m = self.top, self.options, self.options.rules, self.options.distance_per_m
 
         def value(stage: str, function: Callable[..., Any], *arguments: object, **named: object) -> Once[Any]:
             return Once(function, *arguments, stage=stage, watch=watch, **named)
@@ -281,24 +282,21 @@ class Pipeline:
         absent = value("check", _absent)
         near = value("project", self._select, points)
         planes = scan = surface = absent
-        reach_m = max(FIRST_REACH_M, FIRST_REACH_HEIGHTS * (mounting.height_m or 0.0))
         if self.needs_ground:
-            planes = value("cluster", fit_ground, points, mount_height_m=MODEL_HEIGHT_M, reach_m=reach_m)
+            planes = value("cluster", _fit_ground, points, mounting)
             scan = value("cluster", _on_ground, near, planes)
             surface = value("cluster", GroundFit.surface, planes)
 
         # The top view (SSADNet)
-        projected = cells = absent
-        boxes = detected = value("check", tuple)
+        projected = cells = labels = absent
+        boxes = detected = nothing = value("check", tuple)
         if top is not None:
             projected = value("project", top.project, near)
-            least = options.network_score if self.objects is None else min(options.network_score, MIN_DETECTOR_SCORE)
-            detected = value("infer", top.find_boxes, projected, least, options.network_score)
+            detected = value("infer", top.find_boxes, projected, self._least_score, options.network_score)
             boxes = value("decode", _at_least, detected, options.network_score)
             cells = value("decode", top.label_cells, near, boxes, mounting)
 
         # The range image (PointSeg), once or for each sector of a turn
-        labels = absent
         sectors = [value("refine", self._label_sector, k, near, scan, watch) for k in range(len(self.sectors))]
         if sectors:
             labels = value("refine", _joined, near, *sectors)
@@ -309,10 +307,8 @@ class Pipeline:
         seen, labels = labels, value("refine", PointLabels.objects, labels) if self.ranged else absent
 
         # Objects of a detector, and by the points of their candidates
-        detections = objects = value("check", tuple)
-        candidates = absent
-        detector = self.pillars if options.boxes_from != "clusters" else None
-        if detector is not None:
+        detections, objects, candidates = nothing, nothing, absent
+        if (detector := self.pillars if options.boxes_from != "clusters" else None) is not None:
             detections = value("infer", detector.find_boxes, points)
         if self.objects is not None:
             candidates = value("cluster", self.objects.crop, scan, detected, options)
@@ -322,14 +318,12 @@ class Pipeline:
         strips = clusters = upright = support = marks = absent
         agreed, trusted, joined, view = labels, boxes, boxes, cells
         if self.ranged and rules:
-            strips = value("cluster", _sorted, scan, options.distance_per_m)
+            strips = value("cluster", _sorted, scan, per_m)
             upright = value("agree", without_poles, scan, labels, rules)
             support = value("cluster", find_support, scan, labels, boxes, rules)
-            per_m = options.distance_per_m
             clusters = value("cluster", find_voters, scan, labels, support, strips, distance_per_m=per_m, rules=rules)
             if self.objects is not None or detector is not None:  # boxes outvote clusters
-                supporting = value("agree", _supporting, boxes, objects, detections)
-                support = value("cluster", find_support, scan, labels, supporting, rules)
+                support = value("cluster", _support, scan, labels, rules, boxes, objects, detections)
             agreed = value("agree", agree_on_points, scan, labels, clusters, support, upright, view=cells, rules=rules)
             trusted = joined = value("agree", agree_on_boxes, boxes, scan, agreed, rules)
         if self.ranged and options.boxes_from != "network":
@@ -338,7 +332,7 @@ class Pipeline:
             joined = value("cluster", self._join, trusted, around)
         standing = joined
         if rules and self.objects is None:
-            standing = value("agree", stand_boxes, joined, scan, agreed, rules, options.distance_per_m)
+            standing = value("agree", stand_boxes, joined, scan, agreed, rules, per_m)
         if self.objects is not None:
             by_labels = bool(self.ranged) and options.boxes_from != "network"
             standing = value("cluster", _completed, objects, standing, by_labels, options.cluster_score)
@@ -354,22 +348,10 @@ class Pipeline:
         # finds no sector of a turn left makes the candidates, while the other one labels the last.
         spare = [candidates, strips] if sectors else []
         whole = value("refine", _whole, seen, agreed, near, len(points))
+        last = [strips, cells, support, surface, marks, whole, standing]
         self._lanes.run(
             [near, projected, scan, *sectors, *spare, labels, upright, strips, clusters, cells, surface, joined, view],
-            [
-                planes,
-                boxes,
-                *reversed(sectors),
-                detections,
-                objects,
-                strips,
-                cells,
-                support,
-                surface,
-                marks,
-                whole,
-                standing,
-            ],
+            [planes, boxes, *reversed(sectors), detections, objects, *last],
         )
         return Parts(whole(), view(), standing(), surface())
 
@@ -428,9 +410,11 @@ def _absent() -> None:
     """The value of a part without a network, or that no option asks for."""
 
 
-def _supporting(boxes: Sequence[Box], objects: Sequence[Box], detections: Sequence[Box]) -> list[Box]:
-    """Boxes that keep and add labels of points: those of the top view, of a detector, and of the object network."""
-    return [*boxes, *detections, *(replace(box, score=box.score - LESS_SURE) for box in objects)]
+def _support(scan: Scan, labels: PointLabels, rules: frozenset[str], *found: Sequence[Box]) -> Support:
+    """Boxes that keep and add labels of points: of the top view, of the object network, and of a detector."""
+    boxes, objects, detections = found
+    sure = [*boxes, *detections, *(replace(box, score=box.score - LESS_SURE) for box in objects)]
+    return find_support(scan, labels, sure, rules)
 
 
 def _unboxed(labels: PointLabels, support: Support) -> PointLabels:
@@ -443,6 +427,11 @@ def _unboxed(labels: PointLabels, support: Support) -> PointLabels:
 
 def _at_least(boxes: Sequence[Box], min_score: float) -> list[Box]:
     return [box for box in boxes if box.score >= min_score]
+
+
+def _fit_ground(points: Points, mounting: Mounting) -> GroundFit:
+    reach_m = max(FIRST_REACH_M, FIRST_REACH_HEIGHTS * (mounting.height_m or 0.0))
+    return fit_ground(points, mount_height_m=MODEL_HEIGHT_M, reach_m=reach_m)
 
 
 def _on_ground(near: View, planes: GroundFit) -> Scan:

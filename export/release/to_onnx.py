@@ -30,7 +30,7 @@ from edgeperc.preprocess.fitness import FitnessProfile
 from edgeperc.system.atomic import open_atomic
 from edgeperc.types.card import CARD_KEY, Golden, ModelCard
 from edgeperc.types.perception import Box
-from edgeperc.types.views import CameraGeometry, ObjectGeometry
+from edgeperc.types.views import CameraGeometry, RangeImageGeometry, TopViewGeometry
 
 from ..cards import card_of
 from ..networks.lodnn import LoDNN
@@ -237,7 +237,7 @@ def views(card: ModelCard, samples: Sequence[NDArray[Any]]) -> Iterator[tuple[ND
             scaler.fill(sample, image)
             yield image, np.ones(image.shape[1:], np.bool_)
         return
-    assert not isinstance(card.view, ObjectGeometry)  # `compare_objects` makes their input
+    assert isinstance(card.view, RangeImageGeometry | TopViewGeometry)  # `compare_objects` makes inputs of objects
     projector = make_projector(card.view, card.input)
     for sample in samples:
         projected = project(projector, np.ascontiguousarray(sample, np.float32))
