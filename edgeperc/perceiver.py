@@ -106,12 +106,6 @@ def _card_of(model: str | os.PathLike[str]) -> ModelCard | None:
         return None
 
 
-def _is_turned(card: ModelCard, full_turn: bool) -> bool:
-    """Whether scans are turned for a detector."""
-    view = card.view
-    return isinstance(view, PillarGeometry) and (view.ahead_deg != 0 or (full_turn and not view.is_all_around))
-
-
 def _check_choice(option: str, value: object, choices: Sequence[object]) -> None:
     if value not in choices:
         *others, last = known = [*map(str, choices)]
@@ -332,7 +326,6 @@ class Perceiver:
             "cells": top_view and bool(self.agree),
             "detections": detections,
             "pillars": "pillars" in kinds,
-            "turned pillars": any(_is_turned(card, self.full_turn) for card in scans),
             "blocks": any(output.block != (1, 1) for card in scans for output in card.outputs),
             "image": "camera" in kinds,
         }

@@ -43,7 +43,7 @@ from .objects.refine import label_points, remove_outliers
 from .preprocess.interpolation import Interpolator
 from .system.lanes import Lanes, Once, Stopwatch
 from .types.detector import PillarGeometry
-from .types.frame import turned, turned_back
+from .types.frame import ModelFrame, turned
 from .types.geometry import oriented_iou, rectangles, shared_area
 from .types.mounting import MODEL_HEIGHT_M, Mounting
 from .types.perception import Box, GroundSurface, PointLabels, TopView
@@ -209,27 +209,31 @@ class PillarNetwork:
         view = session.card.view
         assert isinstance(view, PillarGeometry)
         self.session, self.card, self.view, self._score = session, session.card, view, score_threshold
-        self._pillarizer = Pillarizer(view, session.card.input, MODEL_HEIGHT_M - session.card.mount_height_m)
+        self._pillarizer = Pillarizer(view, session.card.input)
         quarters = 4 if full_turn and not view.is_all_around else 1
-        self.turns_rad = [math.radians(90.0 * k - view.ahead_deg) for k in range(quarters)]
-        corners = np.array([(x, y) for x in view.x_range_m for y in view.y_range_m])
-        seen = [corners @ [(math.cos(a), math.sin(a)), (-math.sin(a), math.cos(a))] for a in self.turns_rad]
-        low, high = np.min(np.concatenate(seen), axis=0), np.max(np.concatenate(seen), axis=0)
-        self.field = np.array([(*(0.5 * (low + high)), *(high - low), 0.0)])
-        """What it sees of the models' frame, as a rectangle (1, 5)."""
+        height_m, yaws_deg = session.card.mount_height_m, [view.yaw_deg + 90.0 * k for k in range(quarters)]
+        self.frames = [ModelFrame(Mounting(height_m, 0.0, view.pitch_deg, math.remainder(y, 360.0))) for y in yaws_deg]
+        corners = np.array([(x, y) for x in view.x_range_m for y in view.y_range_m]) @ self.frames[0].R[:2, :2].T
+        (x_low, y_low), (x_high, y_high) = corners.min(axis=0).tolist(), corners.max(axis=0).tolist()
+        reach_m = min(x_high, -y_low, y_high)
+        if quarters > 1 and reach_m > 0.0:
+            x_low, y_low, x_high, y_high = -reach_m, -reach_m, reach_m, reach_m
+        self.field = TopViewGeometry(
+            (x_low, x_high), (y_low, y_high), cell_m=min(100.0, x_high - x_low, y_high - y_low)
+        )
+        """What it sees of the models' frame; of a full turn, the square that is seen as a whole."""
 
     def find_boxes(self, points: Points) -> Sequence[Box]:
         """Boxes in the frame of the models, best score first."""
         boxes: list[Box] = []
-        for turn_rad in self.turns_rad:
-            n = self._pillarizer.fill(turned(points, turn_rad) if turn_rad else points)
+        for frame in self.frames:
+            n = self._pillarizer.fill(frame.move_back(points))
             if n == 0:
                 continue
             for name, array in zip(self.session.inputs, self._pillarizer.inputs, strict=True):
                 self.session.inputs[name][:n] = array[:n]
-            found = decode_detections(self.card, self.session.run(n), self._score)
-            boxes += turned_back(found, turn_rad) if turn_rad else found
-        if len(self.turns_rad) == 1:
+            boxes += frame.move_boxes(decode_detections(self.card, self.session.run(n), self._score))
+        if len(self.frames) == 1:
             return boxes
         assert self.card.head is not None
         names, scores = np.array([box.label for box in boxes]), np.array([box.score for box in boxes])
@@ -382,14 +386,12 @@ class Pipeline:
         if self.options.boxes_from != "both":
             return objects
         if self.top is not None:
-            (near, far), (right, left) = self.top.view.x_range_m, self.top.view.y_range_m
-            field = np.array([(0.5 * (near + far), 0.5 * (right + left), far - near, left - right, 0.0)])
-            objects = weigh(objects, field, self.top.card.box_classes, self.options.cluster_score)
+            objects = weigh(objects, self.top.view, self.top.card.box_classes, self.options.cluster_score)
         return join_boxes(boxes, objects)
 
 
-def weigh(boxes: Sequence[Box], field: NDArray[np.float64], classes: Sequence[str], min_score: float) -> list[Box]:
-    """Boxes around clusters that a network which sees a ``field`` (1, 5) has not found, with the scores of both.
+def weigh(boxes: Sequence[Box], view: TopViewGeometry, classes: Sequence[str], min_score: float) -> list[Box]:
+    """Boxes around clusters that a network of the top view has not found, with the scores that both views give them.
 
     The score is the mean of the cluster's and that of the network, which is 0 where it sees the object. The network's
     has the weight of the share of the footprint in its view: out of the view, the cluster's score stands. Boxes below
@@ -399,6 +401,8 @@ def weigh(boxes: Sequence[Box], field: NDArray[np.float64], classes: Sequence[st
     weighed = list(boxes)
     if rows:
         footprints = rectangles(boxes[row] for row in rows)
+        (near, far), (right, left) = view.x_range_m, view.y_range_m
+        field = np.array([(0.5 * (near + far), 0.5 * (right + left), far - near, left - right, 0.0)])
         areas = footprints[:, 2] * footprints[:, 3]
         seen = shared_area(oriented_iou(footprints, field), footprints, field)[:, 0] / areas
         for row, share in zip(rows, seen.tolist(), strict=True):

@@ -9,6 +9,7 @@ import io
 import math
 import warnings
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -26,7 +27,9 @@ from edgeperc_export.release.to_onnx import with_golden, write_card
 
 CLASSES, KINDS = ("Car", "Pedestrian", "Cyclist"), ("car", "pedestrian", "cyclist")
 STRIDE = 2
-VIEW = PillarGeometry((0.0, 25.6), (-12.8, 12.8), (-3.0, 1.0), 0.32, 16, 3000, 0, "voxel_num_points", "voxel_coords")
+VIEW = PillarGeometry(
+    (0.0, 25.6), (-12.8, 12.8), (-3.0, 1.0), 0.32, 16, 3000, 0.66, 0.0, "voxel_num_points", "voxel_coords"
+)
 RAW = ("x", "y", "z", "remission")
 DECORATED = (*RAW, *(f"from_{of}_{axis}" for of in ("mean", "center") for axis in "xyz"))
 ANCHORS = (
@@ -45,7 +48,7 @@ def card_of(kind: str, channels: Sequence[str] = RAW) -> ModelCard:
     return ModelCard(
         name=f"tiny-{kind}",
         version="1",
-        view=VIEW,
+        view=VIEW if "from_mean_x" not in channels else replace(VIEW, num_points=""),  # of no use to the graph
         input=InputSpec("voxels", tuple(channels), (0.0,) * len(channels), (1.0,) * len(channels)),
         outputs=tuple(OutputSpec(name, name) for name in names),
         classes=("background", *KINDS),
@@ -59,7 +62,7 @@ def card_of(kind: str, channels: Sequence[str] = RAW) -> ModelCard:
 class PillarNet(nn.Module):
     """PointPillars with few channels; with ``decorated``, the kernel has made all features of points."""
 
-    def __init__(self, kind: str, *, decorated: bool = False, static: bool = False) -> None:
+    def __init__(self, kind: str, *, decorated: bool = False) -> None:
         super().__init__()
         self.kind, self.decorated = kind, decorated
         self.linear, self.norm = nn.Linear(len(DECORATED), 16, bias=False), nn.BatchNorm1d(16)
@@ -93,7 +96,7 @@ class PillarNet(nn.Module):
 def inputs_of(card: ModelCard, points: NDArray[np.float32]) -> tuple[Tensor, ...]:
     """The pillars of a scan in the frame of the network, as tensors."""
     assert isinstance(card.view, PillarGeometry)
-    maker = Pillarizer(card.view, card.input, 0.0)
+    maker = Pillarizer(card.view, card.input)
     n = maker.fill(points)
     return tuple(torch.from_numpy(each[:n].copy()) for each in maker.pillars)
 

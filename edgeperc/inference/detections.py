@@ -23,7 +23,7 @@ def decode_detections(card: ModelCard, outputs: Values, score_threshold: float) 
     """Decode the boxes of a detector on pillars.
 
     outputs : by their names, with the batch's axis or without.
-    Returns: In the frame of the training sensor, best score first; of boxes of one class that overlap by more than the
+    Returns: In the frame of the training points, best score first; of boxes of one class that overlap by more than the
         card's ``nms_iou``, or with ``across_classes`` of any classes, only the best one. ``front`` is the probability
         of the direction's bin; of a center head, it is 1 if sine and cosine are those of an angle, and less the smaller
         both are: they are means of the headings that the network deems possible.

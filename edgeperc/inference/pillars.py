@@ -28,14 +28,11 @@ class PillarGrid(NamedTuple):
         Bounds along x, y and z [m].
     cell : float
         Edge of a pillar [m].
-    lift : float
-        Added to the z of points [m].
     """
 
     low: tuple[float, float, float]
     high: tuple[float, float, float]
     cell: float
-    lift: float
 
 
 class Pillars(NamedTuple):
@@ -57,15 +54,12 @@ class Pillars(NamedTuple):
 
 
 class Pillarizer:
-    """Makes the pillars of scans in a card's view; `pillars` are overwritten by the next scan.
+    """Makes the pillars of scans in a card's view; `pillars` are overwritten by the next scan."""
 
-    lift_m : added to the z of points: height of the scans' sensor less that of the training sensor [m].
-    """
-
-    def __init__(self, view: PillarGeometry, spec: InputSpec, lift_m: float) -> None:
+    def __init__(self, view: PillarGeometry, spec: InputSpec) -> None:
         bounds = (view.x_range_m, view.y_range_m, view.z_range_m)
         x, y, z = ((float(low), float(high)) for low, high in bounds)
-        self._grid = PillarGrid((x[0], y[0], z[0]), (x[1], y[1], z[1]), float(view.cell_m), float(lift_m))
+        self._grid = PillarGrid((x[0], y[0], z[0]), (x[1], y[1], z[1]), float(view.cell_m))
         self._channels = np.array([CHANNELS["pillars"].index(name) for name in spec.channels], np.int64)
         self._scale = np.array([spec.mean, spec.std], np.float32)
         n, m = view.max_pillars, view.max_points
@@ -78,7 +72,7 @@ class Pillarizer:
         self._numbers = np.full((view.height, view.width), -1, np.int32)
 
     def fill(self, points: Points) -> int:
-        """Write the pillars of points (n, 4) in the frame of the network, before the lift; returns how many."""
+        """Write the pillars of points (n, 4) in the frame of the training points; returns how many."""
         points = read_only(points)
         n = find_pillars(points, self._grid, self._numbers, self._members, self.pillars)
         fill_pillars(points, self._grid, self._channels, self._scale, self._members, n, self.pillars)
@@ -100,8 +94,7 @@ def find_pillars(
     n_rows, n_columns = numbers.shape
     n = 0
     for i in range(points.shape[0]):
-        x, y = np.float64(points[i, 0]), np.float64(points[i, 1])
-        z = np.float64(points[i, 2]) + grid.lift
+        x, y, z = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
         if not (
             (grid.low[0] <= x < grid.high[0])
             & (grid.low[1] <= y < grid.high[1])
@@ -157,14 +150,12 @@ def fill_pillars(
                 mean[axis] += points[members[k, j], axis]
         for axis in range(AXES):
             mean[axis] /= count
-        mean[2] += grid.lift
         center[0] = grid.low[0] + (pillars.places[k, 3] + 0.5) * grid.cell
         center[1] = grid.low[1] + (pillars.places[k, 2] + 0.5) * grid.cell
         center[2] = 0.5 * (grid.low[2] + grid.high[2])
         for j in range(count):
             i = members[k, j]
-            known[X], known[Y], known[REMISSION] = points[i, 0], points[i, 1], points[i, 3]
-            known[Z] = points[i, 2] + grid.lift
+            known[X], known[Y], known[Z], known[REMISSION] = points[i, 0], points[i, 1], points[i, 2], points[i, 3]
             for axis in range(AXES):
                 known[FROM_MEAN_X + axis] = known[axis] - mean[axis]
                 known[FROM_CENTER_X + axis] = known[axis] - center[axis]

@@ -65,7 +65,6 @@ KERNELS: Mapping[str, str] = MappingProxyType(
         "inference.box_heads.mark_peaks inference.decode.clear_empty types.geometry.mark_nms",
         "pillars": "inference.box_heads.count_not_finite inference.pillars.fill_pillars "
         "inference.pillars.find_pillars types.geometry.fill_oriented_iou types.geometry.mark_nms",
-        "turned pillars": "types.frame.fill_turned",
         "blocks": "inference.decode.fill_pixels",
         "image": "camera.image.fill_image_labels camera.image.fill_scaled",
     }

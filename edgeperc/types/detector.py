@@ -29,13 +29,14 @@ class PillarGeometry:
 
     Row 0 is the rightmost (lowest y), column 0 the nearest (lowest x) one.
 
-    x_range_m, y_range_m, z_range_m : bounds [m] in the frame of the training sensor, lower first; points outside are
+    x_range_m, y_range_m, z_range_m : bounds [m] in the frame of the training points, lower first; points outside are
         left out.
     cell_m : edge of a pillar [m].
     max_points : points of a pillar that the network sees: the first ones of the scan.
     max_pillars : pillars that it sees: those with the first points of the scan.
-    ahead_deg : direction in the training sensor's frame that points ahead of the vehicle [deg], counter-clockwise from
-        +x: 0, or 90 where x is to the right (nuScenes).
+    pitch_deg, yaw_deg : how the frame of the training points lies on the vehicle [deg], as in
+        `edgeperc.Mounting`; its height above the road is the card's ``mount_height_m``. 0.66 and 0 for KITTI; a yaw of
+        -90 where x is to the right (nuScenes).
     num_points, coords : names of the graph's inputs for the number of points in each pillar, (pillars,), and for its
         place, (pillars, 4): batch, z, row, column. ``num_points`` is empty if the graph does not take it.
     """
@@ -46,7 +47,8 @@ class PillarGeometry:
     cell_m: float
     max_points: int
     max_pillars: int
-    ahead_deg: Literal[0, 90, 180, -90]
+    pitch_deg: float
+    yaw_deg: float
     num_points: str
     coords: str
 
@@ -62,8 +64,8 @@ class PillarGeometry:
         check_size(self.height, self.width)
         _FIELDS.whole("view.max_points", self.max_points, 1, 4096)
         _FIELDS.whole("view.max_pillars", self.max_pillars, 1, min(self.height * self.width, MAX_VALUES))
-        if self.ahead_deg not in (0, 90, 180, -90):
-            _FIELDS.refuse("view.ahead_deg", self.ahead_deg, "0, 90, 180 or -90")
+        _FIELDS.number("view.pitch_deg", self.pitch_deg, -45.0, 45.0)
+        _FIELDS.number("view.yaw_deg", self.yaw_deg, -180.0, 180.0)
         check_text("view.coords", self.coords, CardError)
         if self.num_points:
             check_text("view.num_points", self.num_points, CardError)
@@ -94,7 +96,7 @@ class Anchor:
     """A box from which those of an anchor head start, at each position and in each direction.
 
     size_m : length, width, height [m].
-    bottom_m : z of its bottom in the frame of the training sensor [m].
+    bottom_m : z of its bottom in the frame of the training points [m].
     yaws_rad : its directions [rad].
     """
 

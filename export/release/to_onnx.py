@@ -207,9 +207,10 @@ def with_golden(model: onnx.ModelProto, card: ModelCard) -> ModelCard:
     session = onnxruntime.InferenceSession(model.SerializeToString(), providers=["CPUExecutionProvider"])
     feed = golden_feed(card, 0)
     x = feed[card.input.name]
-    for node in session.get_inputs():
-        if node.name not in feed:
-            raise CardMismatchError(f"the graph has the input {node.name!r}, its card declares {[*feed]}")
+    nodes = session.get_inputs()
+    if {node.name for node in nodes} != {*feed}:
+        raise CardMismatchError(f"card names inputs {[*feed]}, the graph has {[node.name for node in nodes]}")
+    for node in nodes:
         kind = WHOLE.get(node.type.removeprefix("tensor(").removesuffix(")"), np.float32)
         n_more = max(node.shape[0] - len(x), 0) if len(feed) > 1 and isinstance(node.shape[0], int) else 0
         padding = [(0, n_more), *[(0, 0)] * (feed[node.name].ndim - 1)]
