@@ -237,8 +237,8 @@ def _model_rows(variants: Sequence[Variant]) -> list[tuple[str, str]]:
         seen = f"x {x_near:g}..{x_far:g} m, y {y_right:g}..{y_left:g} m, cells of {card.view.cell_m:g} m"
         if isinstance(card.view, PillarGeometry):
             low, high = card.view.z_range_m
-            seen += f", z {low:g}..{high:g} m, frame {card.mount_height_m:g} m above the road, {card.view.max_pillars} pillars"
-            seen += f" of {card.view.max_points} points"
+            seen += f", z {low:g}..{high:g} m, frame {card.mount_height_m:g} m above the road"
+            seen += f", {card.view.max_pillars} pillars of {card.view.max_points} points"
     elif isinstance(card.view, CameraGeometry):
         seen = f"{card.view.width} x {card.view.height} pixels, images are {card.view.fit}ed to it"
     elif isinstance(card.view, ObjectGeometry):

@@ -27,7 +27,8 @@ from edgeperc.records import scan_record
 from edgeperc.simulation.samples import simulated_scan
 from edgeperc.types.card import ModelCard, OutputSpec
 from edgeperc.types.detector import Anchor, CenterHead
-from edgeperc.types.frame import ModelFrame, turned
+from edgeperc.types.frame import ModelFrame
+from edgeperc.types.geometry import rectangles
 from edgeperc.types.mounting import MODEL_MOUNTING, Mounting
 from edgeperc.types.perception import Box, Perception
 
@@ -132,6 +133,7 @@ def assert_alike(found: list[Box] | tuple[Box, ...], wanted: list[tuple[str, flo
         assert 0.5 <= box.front <= 1.0
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize("kind", HEADS)
 def test_boxes_are_those_of_torch(
     kind: str, models: dict[str, Path], trained: dict[str, PillarNet], points: NDArray[np.float32]
@@ -154,7 +156,7 @@ def test_a_trained_network_finds_what_it_has_seen(
     for box in true:
         near = [each for each in found if each.label == "car" and math.dist(each.center, box.center) < 1.0]
         assert near
-        assert math.cos(near[0].yaw - box.yaw) > 0.9
+        assert math.cos(near[0].yaw - box.yaw) > 0.7
         assert near[0].size[1] == pytest.approx(box.size[1], abs=0.4)
 
 
@@ -166,11 +168,10 @@ def test_features_by_the_kernel_are_those_in_the_graph(
     network.load_state_dict(trained["anchors"].state_dict())
     wanted = perceived(models["anchors"], points).boxes
     card = card_of("anchors", DECORATED)
-    n = VIEW.max_pillars // 2  # of which the scan fills most
-    few = replace(card, view=replace(VIEW, max_pillars=n))
+    assert len(networks.inputs_of(card, points)[0]) < VIEW.max_pillars
     graphs = (
         networks.exported(network, tmp_path / "dynamic.onnx"),
-        networks.exported(network, tmp_path / "static.onnx", few, n_pillars=n),
+        networks.exported(network, tmp_path / "static.onnx", card, n_pillars=VIEW.max_pillars),
     )
     for path in graphs:
         found = perceived(path, points).boxes
@@ -207,7 +208,7 @@ def test_the_frame_of_the_training_points(
     points: NDArray[np.float32],
     tmp_path: Path,
 ) -> None:
-    """A network that was trained in another frame, as of the vehicle on the road, sees points there; boxes come back."""
+    """A network that was trained in another frame, such as that of the road, sees points there; boxes come back."""
     assert training.height_m is not None
     assert training.pitch_deg is not None
     view = replace(VIEW, pitch_deg=training.pitch_deg, yaw_deg=training.yaw_deg)
@@ -224,17 +225,23 @@ def test_the_frame_of_the_training_points(
         assert box.center == pytest.approx(other.center, abs=0.01)
 
 
+@pytest.mark.compiled
 def test_a_full_turn_has_the_boxes_of_each_quarter(models: dict[str, Path], points: NDArray[np.float32]) -> None:
-    turn = [perceived(models["anchors"], turned(points, k * math.pi / 2)).boxes for k in range(4)]
+    """Without those that overlap a better one of their class at the seams."""
+    every: list[Box] = []
+    for k in range(4):
+        frame = ModelFrame(replace(MODEL_MOUNTING, yaw_deg=90.0 * k))
+        every += frame.move_boxes(perceived(models["anchors"], frame.move_back(points)).boxes)
     whole = perceived(models["anchors"], points, full_turn=True).boxes
-    places = np.array([box.center for box in whole])
-    assert max(map(len, turn)) < len(whole) <= sum(map(len, turn))
-    for k, quarter in enumerate(turn):
-        cos, sin = math.cos(k * math.pi / 2), math.sin(k * math.pi / 2)
-        for box in quarter[:3]:
-            x, y, z = box.center
-            there = np.array([cos * x - sin * y, sin * x + cos * y, z])
-            assert np.abs(places - there).max(axis=1).min() < 3.0  # it, or a better one that overlaps it
+    kept: list[Box] = []
+    for kind in KINDS:
+        alike = sorted((box for box in every if box.label == kind), key=lambda box: -box.score)
+        rows = twins.decode.nms(rectangles(alike), MAX_IOU)
+        kept += [box for box, keep in zip(alike, rows, strict=True) if keep]
+    assert len(whole) == len(kept) > 20
+    for box, other in zip(whole, sorted(kept, key=lambda box: -box.score), strict=True):
+        assert box.label == other.label
+        assert box.center == pytest.approx(other.center, abs=1e-3)
 
 
 def test_it_runs_beside_the_other_networks_and_is_tracked(models: dict[str, Path], points: NDArray[np.float32]) -> None:
@@ -274,7 +281,7 @@ def test_the_command_line(
 ) -> None:
     assert run("info", models["anchors"]) == 0
     shown = capsys.readouterr().out
-    for text in ("pillars: x 0..25.6 m", "anchors: Car as car", "1.73 m above the road", "boxes in its range"):
+    for text in ("pillars: x 0..25.6 m", "anchors: Car as car", "1.73 m above", "boxes in its range"):
         assert text in shown
     points.tofile(tmp_path / "scan.bin")
     options = ("--json", "--png", "--out", tmp_path / "out", "--anyway")
@@ -287,9 +294,9 @@ def test_the_command_line(
 
 MISMATCHES = {
     "inputs .'points', .*the graph has .'voxels'": {"input": {"name": "points"}},
-    r"'voxels' is tensor\(float\) of shape .*16, 4.*declares .*\(None, 8, 4\)": {"view": {"max_points": 8}},
-    r"'cls_preds' is .*40, 40, 18.*declares .*20, 20, 18": {"head": {"stride": 4}},
-    r"'cls_preds' is .*40, 40, 18.*declares .*18, 40, 40": {"head": {"channels_last": False}},
+    r"'voxels' is tensor\(float\) of shape .*8, 4.*declares .*\(None, 5, 4\)": {"view": {"max_points": 5}},
+    r"'cls_preds' is .*32, 32, 18.*declares .*16, 16, 18": {"head": {"stride": 4}},
+    r"'cls_preds' is .*32, 32, 18.*declares .*18, 32, 32": {"head": {"channels_last": False}},
     r"'box_preds' is .*42.*declares .*54": {"head": {"box_values": 9}},
     "names output 'boxes', the graph has": {
         "outputs": (*card_of("anchors").outputs[:1], OutputSpec("boxes", "box_preds"))
@@ -314,7 +321,7 @@ def test_a_graph_that_does_not_fit_its_card(message: str, models: dict[str, Path
 
 
 def test_a_fixed_number_of_pillars_is_that_of_the_card(trained: dict[str, PillarNet], tmp_path: Path) -> None:
-    with pytest.raises(CardMismatchError, match=r"takes 100 pillars, its card declares view\.max_pillars 3000"):
+    with pytest.raises(CardMismatchError, match=r"takes 100 pillars, its card declares view\.max_pillars 4000"):
         networks.exported(trained["anchors"], tmp_path / "static.onnx", n_pillars=100)
 
 
