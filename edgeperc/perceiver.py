@@ -307,8 +307,9 @@ class Perceiver:
         )
         needs = {
             "scans": bool(scans),
+            "views": points or top_view,
             "fitness": self.on_mismatch != "ignore" and any(card.fitness is not None for card in scans),
-            "crop": bool(scans) and (self._finds_sensor or not gaps),
+            "crop": (points or top_view) and (self._finds_sensor or not gaps),
             "gaps": gaps,
             "turn": points and self.full_turn,
             "ground": bool(scans)

@@ -168,7 +168,9 @@ def _best(
     raw: NDArray[np.float32], head: AnchorHead | CenterHead, score_threshold: float
 ) -> tuple[tuple[NDArray[np.int64], ...], NDArray[np.int64], NDArray[np.float64]]:
     """Row, column and anchor of the best candidates of a map (rows, columns, anchors, classes), classes and scores."""
-    best = raw.max(axis=3)
+    best = raw[..., 0].copy()
+    for k in range(1, raw.shape[3]):  # a third of the time of a maximum along the short axis
+        np.maximum(best, raw[..., k], out=best)
     least = score_threshold
     if head.scores == "logits":
         least = math.log(least / (1.0 - least)) if 0.0 < least < 1.0 else math.copysign(math.inf, least - 0.5)

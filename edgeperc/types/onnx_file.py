@@ -42,12 +42,12 @@ networks. None runs another graph, and none repeats."""
 
 # Results of constants alone are computed while a file is opened, where nothing can stop it. These operators give at
 # most as many values as they take, ...
-_STEADY = "Cast DequantizeLinear Flatten Identity QuantizeLinear Reshape Squeeze Transpose Unsqueeze"
+_STEADY = "Cast DequantizeLinear Flatten Identity QuantizeLinear Reshape Slice Squeeze Transpose Unsqueeze"
 STEADY = frozenset(_STEADY.split())
 # ... these a product of them; of the others the size depends on values, or each value takes long.
 _SMALL = """
 Abs Add And Ceil Clip Concat Div Equal Exp Floor Gather Greater GreaterOrEqual Less LessOrEqual Log Max Min Mul Neg
-Not Or Pow Reciprocal ReduceMax ReduceMean ReduceMin ReduceSum Slice Sqrt Sub Sum Where
+Not Or Pow Reciprocal ReduceMax ReduceMean ReduceMin ReduceSum Sqrt Sub Sum Where
 """
 SMALL = frozenset(_SMALL.split())
 # The size of these depends on values. A graph with one that takes few constants is opened without computing with
