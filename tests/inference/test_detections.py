@@ -28,7 +28,7 @@ from edgeperc.simulation.samples import simulated_scan
 from edgeperc.types.card import ModelCard, OutputSpec
 from edgeperc.types.detector import Anchor, CenterHead
 from edgeperc.types.frame import ModelFrame
-from edgeperc.types.geometry import inside, rectangles
+from edgeperc.types.geometry import rectangles
 from edgeperc.types.mounting import MODEL_MOUNTING, Mounting
 from edgeperc.types.perception import Box, Perception
 
@@ -247,22 +247,32 @@ def test_a_full_turn_has_the_boxes_of_each_quarter(models: dict[str, Path], poin
 def test_it_runs_beside_the_other_networks_and_is_tracked(models: dict[str, Path], points: NDArray[np.float32]) -> None:
     alone = perceived(models["anchors"], points, agree=True)
     options = {"provider": "cpu", "mounting": MODEL_MOUNTING, "on_mismatch": "ignore", "adapt": "none"}
-    others = Perceiver(["pointseg", "ssadnet"], **options)(points)  # type: ignore[arg-type]
     every = [models["anchors"], "pointseg", "ssadnet"]
     together = Perceiver(every, score_threshold=SCORE, **options)(points)  # type: ignore[arg-type]
     assert {*alone.boxes} <= {*together.boxes}
     assert together.top_view is not None
     assert together.points is not None
-    assert others.points is not None
-    # Its boxes support the labels of their points, as those of the top view do.
-    sure = [box for box in alone.boxes if box.label == "car" and box.score > 0.6]
-    there = np.any([inside(box, points) for box in sure], axis=0)
-    labels, before = together.points.labels[there], others.points.labels[there]
-    assert np.count_nonzero(labels == 1) > np.count_nonzero(before == 1)
     tracks = Tracker().update(together.boxes, 0.0)
     assert len(tracks) + tracks.n_tentative == len(together.boxes)
     document = json.loads(json.dumps(scan_record(together)))
     assert len(document["boxes"]) == len(together.boxes)
+
+
+def test_its_boxes_add_labels(models: dict[str, Path], monkeypatch: pytest.MonkeyPatch) -> None:
+    """As those of the top view do: with true boxes of vehicles, more of their points are labeled."""
+    both = [models["anchors"], "pointseg"]
+    perceive = Perceiver(both, provider="cpu", on_mismatch="ignore", adapt="none")
+    assert perceive.pipeline is not None
+    for seed in (0, 2, 5):
+        scan, n_cars = simulated_scan(seed), []
+        sure = [replace(box, score=0.9) for box in scan.boxes if box.label in ("car", "van", "truck")]
+        for boxes in ([], sure):
+            monkeypatch.setattr(perceive.pipeline.pillars, "find_boxes", lambda _, boxes=boxes: boxes)
+            found = perceive(scan.points)
+            assert len(found.boxes) >= len(boxes)
+            assert found.points is not None
+            n_cars.append(np.count_nonzero(found.points.labels == 1))
+        assert n_cars[1] > n_cars[0] > 0
 
 
 def test_without_points_there_are_no_boxes(models: dict[str, Path]) -> None:
