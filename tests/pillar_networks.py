@@ -164,12 +164,23 @@ def trained(kind: str, *, decorated: bool = False, n_steps: int = 150, n_scans: 
     return network.eval()
 
 
-def exported(network: PillarNet, path: Path, card: ModelCard | None = None, *, n_pillars: int | None = None) -> Path:
-    """An .onnx file with a card, written by torch's exporter of 2020 to 2024; ``n_pillars`` makes the graph static."""
+def exported(
+    network: PillarNet,
+    path: Path,
+    card: ModelCard | None = None,
+    *,
+    n_pillars: int | None = None,
+    whole: torch.dtype = torch.int32,
+) -> Path:
+    """An .onnx file with a card, written by torch's exporter of 2020 to 2024; ``n_pillars`` makes the graph static.
+
+    whole : type of the numbers of points and of the places.
+    """
     card = card_of(network.kind, DECORATED if network.decorated else RAW) if card is None else card
     example = tuple(each.clone() for each in inputs_of(card, simulated_scan(0).points))
     if n_pillars is not None:
         example = tuple(each[torch.arange(n_pillars) % len(each)] for each in example)
+    example = (example[0], *(each.to(whole) for each in example[1:]))
     names = [card.input.name, "voxel_num_points", "voxel_coords"]
     buffer = io.BytesIO()
     with warnings.catch_warnings():

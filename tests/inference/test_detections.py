@@ -163,7 +163,7 @@ def test_a_trained_network_finds_what_it_has_seen(
 def test_features_by_the_kernel_are_those_in_the_graph(
     trained: dict[str, PillarNet], models: dict[str, Path], points: NDArray[np.float32], tmp_path: Path
 ) -> None:
-    """The same weights with points that come decorated, from a graph of a fixed number of pillars, too."""
+    """The same weights with points that come decorated, a fixed number of pillars, and other types of inputs."""
     network = PillarNet("anchors", decorated=True).eval()
     network.load_state_dict(trained["anchors"].state_dict())
     wanted = perceived(models["anchors"], points).boxes
@@ -171,7 +171,8 @@ def test_features_by_the_kernel_are_those_in_the_graph(
     assert len(networks.inputs_of(card, points)[0]) < VIEW.max_pillars
     graphs = (
         networks.exported(network, tmp_path / "dynamic.onnx"),
-        networks.exported(network, tmp_path / "static.onnx", card, n_pillars=VIEW.max_pillars),
+        networks.exported(network, tmp_path / "static.onnx", card, n_pillars=VIEW.max_pillars, whole=torch.int64),
+        networks.exported(trained["anchors"], tmp_path / "floats.onnx", whole=torch.float32),
     )
     for path in graphs:
         found = perceived(path, points).boxes
