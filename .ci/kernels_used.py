@@ -9,10 +9,13 @@ import numpy as np
 
 import edgeperc
 from edgeperc.cli import main
+from edgeperc.inference.pillars import Pillarizer
 from edgeperc.readers.livox_packets import NEW_KINDS, LivoxStream, Points
 from edgeperc.readers.ouster_packets import OusterStream, layout_of
 from edgeperc.readers.spinning_packets import FORMATS, Angles, SpinningStream
 from edgeperc.simulation.samples import simulated_scan
+from edgeperc.types.card import InputSpec
+from edgeperc.types.detector import PillarGeometry
 
 SET_UPS = ({}, {"full_turn": True}, {"models": "lodnn"}, {"boxes_from": "clusters"}, {"agree": False, "precision": "fp32"})
 
@@ -33,6 +36,8 @@ def run() -> None:
     with tempfile.TemporaryDirectory() as folder:
         main(["demo", "--out", folder])
     decode_packets()
+    view = PillarGeometry((0.0, 64.0), (-32.0, 32.0), (-3.0, 1.0), 0.5, 8, 100, 0.0, 0.0, "num_points", "coors")
+    Pillarizer(view, InputSpec("voxels", ("x", "range"), (0.0, 0.0), (1.0, 1.0))).fill(simulated_scan(1).points)
     with tempfile.TemporaryDirectory() as folder:  # a sensor that is found
         simulated_scan(1, "hdl-64e").points.tofile(f"{folder}/scan.bin")
         main(["run", f"{folder}/scan.bin"])

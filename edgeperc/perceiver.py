@@ -21,7 +21,7 @@ from .ground.ceiling import find_ceiling
 from .ground.leveling import MountingEstimate, MountingEstimator, near_support, share_below
 from .inference.session import Session
 from .objects.boxes import MIN_SCORE
-from .pipeline import BoxesFrom, ObjectNetwork, Options, Pipeline, RangeImageNetwork, TopViewNetwork
+from .pipeline import BoxesFrom, ObjectNetwork, Options, PillarNetwork, Pipeline, RangeImageNetwork, TopViewNetwork
 from .preprocess.condition import scale
 from .preprocess.findings import Finding, check_beams, check_dropped, check_ground, check_profiles, with_raw_remission
 from .preprocess.fitness import FitnessProfile
@@ -35,6 +35,7 @@ from .system.lanes import Lanes, Stopwatch
 from .system.names import nearest
 from .types.card import ModelCard
 from .types.choices import AUTO_SENSOR, DEFAULT_SENSOR, WEIGHTS
+from .types.detector import PillarGeometry
 from .types.frame import ModelFrame
 from .types.mounting import Mounting
 from .types.perception import ImageLabels, Perception
@@ -137,8 +138,9 @@ class Perceiver:
     ----------
     models : str, Path, sequence of these, or None
         Names of shipped models (``"ssadnet"``, ``"pointseg:int8"``) or paths of .onnx files with a card; at most one
-        model per view: top view, range image, objects and camera. None takes the LiDAR models together that ``weights``
-        names, by default the best ones, `edgeperc.zoo.DEFAULT`. The options of scans have no effect on a camera.
+        model per view: top view, range image, objects, pillars (a detector of yours) and camera. None takes the LiDAR
+        models together that ``weights`` names, by default the best ones, `edgeperc.zoo.DEFAULT`. The options of scans
+        have no effect on a camera.
     sensor : str, Path or SensorProfile
         The sensor that takes the scans: a built-in name (`edgeperc.sensors`), a file written by ``edgeperc
         fit-sensor``, or a profile. ``"auto"``: the one whose beams the first scan has, or a profile of its beams
@@ -178,9 +180,12 @@ class Perceiver:
         part.
         A model of objects replaces both, at candidates from the top view, from clusters of points of any class, or from
         both; boxes of people are still those around labeled points, if points are labeled.
+        Boxes of a detector on pillars stay as they are; with ``"clusters"`` it does not run. Other boxes are dropped
+        where it has one. In its range, those of its classes keep half of their score, as it has not found them.
     full_turn : bool
         Run a range-image model once for each sector, four times for the shipped models. Every point then has a class,
-        and there are boxes next to and behind the vehicle.
+        and there are boxes next to and behind the vehicle. A detector that looks ahead runs four times, too, one that
+        looks all around once.
     agree : bool or collection of str
         Correct the parts of the result by one another (`agreement.rules`): the clusters of points above the ground
         vote on their class, boxes support or complete labels, and no cell below an object is drivable. Boxes below
@@ -294,6 +299,7 @@ class Perceiver:
         points, top_view, objects = "range_image" in kinds, "top_view" in kinds, "objects" in kinds
         boxes = points and self.boxes_from != "network"
         agreement = points and bool(self.agree)
+        detections = any(card.box_classes for card in scans if card.view.kind == "top_view")
         gaps = self._interpolates and any(
             self._finds_sensor or Interpolator(card.view, self.sensor).needed
             for card in scans
@@ -301,8 +307,9 @@ class Perceiver:
         )
         needs = {
             "scans": bool(scans),
+            "views": points or top_view,
             "fitness": self.on_mismatch != "ignore" and any(card.fitness is not None for card in scans),
-            "crop": bool(scans) and (self._finds_sensor or not gaps),
+            "crop": (points or top_view) and (self._finds_sensor or not gaps),
             "gaps": gaps,
             "turn": points and self.full_turn,
             "ground": bool(scans)
@@ -315,10 +322,11 @@ class Perceiver:
             "agreement": agreement,
             "objects": objects,
             "candidates": objects and self.boxes_from != "network",
-            "standing": bool(self.agree) and not objects and (boxes or any(card.box_classes for card in scans)),
+            "standing": bool(self.agree) and not objects and (boxes or detections),
             "road": top_view,
             "cells": top_view and bool(self.agree),
-            "detections": any(card.box_classes for card in scans if card.view.kind == "top_view"),
+            "detections": detections,
+            "pillars": "pillars" in kinds,
             "blocks": any(output.block != (1, 1) for card in scans for output in card.outputs),
             "image": "camera" in kinds,
         }
@@ -381,6 +389,7 @@ class Perceiver:
         top: TopViewNetwork | None = None
         ranged: list[RangeImageNetwork] = []
         objects: ObjectNetwork | None = None
+        pillars: PillarNetwork | None = None
         for session in self.sessions:
             if isinstance(session.card.view, TopViewGeometry):
                 top = TopViewNetwork(session, sensor)
@@ -390,7 +399,10 @@ class Perceiver:
                 ranged = [RangeImageNetwork(session, needed)]
             elif isinstance(session.card.view, ObjectGeometry):
                 objects = ObjectNetwork(session)
-        if top is None and not ranged and objects is None:
+            elif isinstance(session.card.view, PillarGeometry):
+                least = session.card.score_threshold if self.score_threshold is None else self.score_threshold
+                pillars = PillarNetwork(session, least, self.full_turn)
+        if top is None and not ranged and objects is None and pillars is None:
             return None
         if self.full_turn and self._lanes.n == 2 and ranged:  # either lane may take a sector
             ranged.append(ranged[0].second())
@@ -409,7 +421,7 @@ class Perceiver:
             distance_per_m=sensor.link_per_m,
             full_turn=self.full_turn,
         )
-        return Pipeline(top, ranged, options, self._lanes, objects)
+        return Pipeline(top, ranged, options, self._lanes, objects, pillars)
 
     def __setattr__(self, name: str, value: object) -> None:
         if not name.startswith("_") and "_locks" in vars(self):  # the last attribute of construction

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -28,6 +29,8 @@ from .ground.planes import FIRST_REACH_HEIGHTS, FIRST_REACH_M, GroundFit, fit_gr
 from .ground.scan import Scan
 from .inference.crop import Crop, sectors_of_turn, spread
 from .inference.decode import decode_boxes, decode_cells, decode_labels
+from .inference.detections import best_rows, decode_detections
+from .inference.pillars import Pillarizer
 from .inference.projection import RangeImageProjector, input_heights, make_projector
 from .inference.session import MAX_ROWS, Session
 from .objects.boxes import join_boxes, objects_from_points
@@ -39,7 +42,8 @@ from .objects.linkage import Strips
 from .objects.refine import label_points, remove_outliers
 from .preprocess.interpolation import Interpolator
 from .system.lanes import Lanes, Once, Stopwatch
-from .types.frame import turned
+from .types.detector import PillarGeometry
+from .types.frame import ModelFrame, turned
 from .types.geometry import oriented_iou, rectangles, shared_area
 from .types.mounting import MODEL_HEIGHT_M, Mounting
 from .types.perception import Box, GroundSurface, PointLabels, TopView
@@ -194,6 +198,50 @@ class ObjectNetwork:
         return tuple(boxes_of_objects(merged, self.card.classes, min_score))
 
 
+class PillarNetwork:
+    """A detector of others: boxes from the pillars of all points in its range (PointPillars, CenterPoint).
+
+    score_threshold : lowest score of a box.
+    full_turn : run a network that looks ahead four times, on the scan turned by a quarter each.
+    """
+
+    def __init__(self, session: Session, score_threshold: float, full_turn: bool) -> None:
+        view = session.card.view
+        assert isinstance(view, PillarGeometry)
+        self.session, self.card, self.view, self._score = session, session.card, view, score_threshold
+        self._pillarizer = Pillarizer(view, session.card.input)
+        quarters = 4 if full_turn and not view.is_all_around else 1
+        height_m, yaws_deg = session.card.mount_height_m, [view.yaw_deg + 90.0 * k for k in range(quarters)]
+        self.frames = [ModelFrame(Mounting(height_m, 0.0, view.pitch_deg, math.remainder(y, 360.0))) for y in yaws_deg]
+        corners = np.array([(x, y) for x in view.x_range_m for y in view.y_range_m]) @ self.frames[0].R[:2, :2].T
+        (x_low, y_low), (x_high, y_high) = corners.min(axis=0).tolist(), corners.max(axis=0).tolist()
+        reach_m = min(x_high, -y_low, y_high)
+        if quarters > 1 and reach_m > 0.0:
+            x_low, y_low, x_high, y_high = -reach_m, -reach_m, reach_m, reach_m
+        self.field = TopViewGeometry(
+            (x_low, x_high), (y_low, y_high), cell_m=min(100.0, x_high - x_low, y_high - y_low)
+        )
+        """What it sees of the models' frame; of a full turn, the square that is seen as a whole."""
+
+    def find_boxes(self, points: Points) -> Sequence[Box]:
+        """Boxes in the frame of the models, best score first."""
+        boxes: list[Box] = []
+        for frame in self.frames:
+            n = self._pillarizer.fill(frame.move_back(points))
+            if n == 0:
+                continue
+            for name, array in zip(self.session.inputs, self._pillarizer.inputs, strict=True):
+                self.session.inputs[name][:n] = array[:n]
+            boxes += frame.move_boxes(decode_detections(self.card, self.session.run(n), self._score))
+        if len(self.frames) == 1:
+            return boxes
+        assert self.card.head is not None
+        names, scores = np.array([box.label for box in boxes]), np.array([box.score for box in boxes])
+        across = self.card.head.across_classes
+        kept = best_rows(rectangles(boxes), scores, names, self.card.nms_iou, across_classes=across)
+        return [boxes[row] for row in kept.tolist()]
+
+
 class Pipeline:
     """Networks, and what makes one answer of theirs. The next scan overwrites their buffers.
 
@@ -207,10 +255,12 @@ class Pipeline:
         options: Options,
         lanes: Lanes,
         objects: ObjectNetwork | None = None,
+        pillars: PillarNetwork | None = None,
     ) -> None:
         self.top, self.ranged, self.options, self._lanes = top, ranged, options, lanes
-        self.objects = objects
+        self.objects, self.pillars = objects, pillars
         self._free = deque(ranged)
+        self._least_score = options.network_score if objects is None else min(options.network_score, MIN_DETECTOR_SCORE)
         projectors = [network.projector for network in (top, *ranged) if network is not None]
         self.needs_ground = (
             bool(options.rules)
@@ -228,7 +278,7 @@ class Pipeline:
 
     def __call__(self, points: Points, mounting: Mounting, watch: Stopwatch) -> Parts:
         """Perceive points in the frame of the models, (n, 4) float32, read-only, finite or NaN."""
-        top, options, rules = self.top, self.options, self.options.rules
+        top, options, rules, per_m = self.top, self.options, self.options.rules, self.options.distance_per_m
 
         def value(stage: str, function: Callable[..., Any], *arguments: object, **named: object) -> Once[Any]:
             return Once(function, *arguments, stage=stage, watch=watch, **named)
@@ -236,24 +286,21 @@ class Pipeline:
         absent = value("check", _absent)
         near = value("project", self._select, points)
         planes = scan = surface = absent
-        reach_m = max(FIRST_REACH_M, FIRST_REACH_HEIGHTS * (mounting.height_m or 0.0))
         if self.needs_ground:
-            planes = value("cluster", fit_ground, points, mount_height_m=MODEL_HEIGHT_M, reach_m=reach_m)
+            planes = value("cluster", _fit_ground, points, mounting)
             scan = value("cluster", _on_ground, near, planes)
             surface = value("cluster", GroundFit.surface, planes)
 
         # The top view (SSADNet)
-        projected = cells = absent
-        boxes = detected = value("check", tuple)
+        projected = cells = labels = absent
+        boxes = detected = nothing = value("check", tuple)
         if top is not None:
             projected = value("project", top.project, near)
-            least = options.network_score if self.objects is None else min(options.network_score, MIN_DETECTOR_SCORE)
-            detected = value("infer", top.find_boxes, projected, least, options.network_score)
+            detected = value("infer", top.find_boxes, projected, self._least_score, options.network_score)
             boxes = value("decode", _at_least, detected, options.network_score)
             cells = value("decode", top.label_cells, near, boxes, mounting)
 
         # The range image (PointSeg), once or for each sector of a turn
-        labels = absent
         sectors = [value("refine", self._label_sector, k, near, scan, watch) for k in range(len(self.sectors))]
         if sectors:
             labels = value("refine", _joined, near, *sectors)
@@ -263,8 +310,10 @@ class Pipeline:
         # Objects alone: classes such as road and building are background to the stages below
         seen, labels = labels, value("refine", PointLabels.objects, labels) if self.ranged else absent
 
-        # Objects by the points of their candidates
-        objects = candidates = absent
+        # Objects of a detector, and by the points of their candidates
+        detections, objects, candidates = nothing, nothing, absent
+        if (detector := self.pillars if options.boxes_from != "clusters" else None) is not None:
+            detections = value("infer", detector.find_boxes, points)
         if self.objects is not None:
             candidates = value("cluster", self.objects.crop, scan, detected, options)
             objects = value("infer", self.objects.find_boxes, candidates, options.object_score)
@@ -273,14 +322,12 @@ class Pipeline:
         strips = clusters = upright = support = marks = absent
         agreed, trusted, joined, view = labels, boxes, boxes, cells
         if self.ranged and rules:
-            strips = value("cluster", _sorted, scan, options.distance_per_m)
+            strips = value("cluster", _sorted, scan, per_m)
             upright = value("agree", without_poles, scan, labels, rules)
             support = value("cluster", find_support, scan, labels, boxes, rules)
-            per_m = options.distance_per_m
             clusters = value("cluster", find_voters, scan, labels, support, strips, distance_per_m=per_m, rules=rules)
-            if self.objects is not None:  # whatever the clusters say, a box keeps and adds labels
-                supporting = value("agree", _supporting, boxes, objects)
-                support = value("cluster", find_support, scan, labels, supporting, rules)
+            if self.objects is not None or detector is not None:  # boxes outvote clusters
+                support = value("cluster", _support, scan, labels, rules, boxes, objects, detections)
             agreed = value("agree", agree_on_points, scan, labels, clusters, support, upright, view=cells, rules=rules)
             trusted = joined = value("agree", agree_on_boxes, boxes, scan, agreed, rules)
         if self.ranged and options.boxes_from != "network":
@@ -289,12 +336,14 @@ class Pipeline:
             joined = value("cluster", self._join, trusted, around)
         standing = joined
         if rules and self.objects is None:
-            standing = value("agree", stand_boxes, joined, scan, agreed, rules, options.distance_per_m)
+            standing = value("agree", stand_boxes, joined, scan, agreed, rules, per_m)
         if self.objects is not None:
             by_labels = bool(self.ranged) and options.boxes_from != "network"
             standing = value("cluster", _completed, objects, standing, by_labels, options.cluster_score)
+        if detector is not None:
+            standing = value("cluster", _detected, detections, standing, detector, options.cluster_score)
         standing = value("agree", without_impossible, standing, points, mounting) if "ceiling" in rules else standing
-        joined = joined if self.objects is None else standing
+        joined = joined if self.objects is None and detector is None else standing
         if top is not None and rules:
             marks = value("agree", mark_cells, cells, scan, agreed, rules)
             view = value("agree", _agreed_cells, cells, agreed, joined, boxes, trusted, marks, rules)
@@ -303,9 +352,10 @@ class Pipeline:
         # finds no sector of a turn left makes the candidates, while the other one labels the last.
         spare = [candidates, strips] if sectors else []
         whole = value("refine", _whole, seen, agreed, near, len(points))
+        last = [strips, cells, support, surface, marks, whole, standing]
         self._lanes.run(
             [near, projected, scan, *sectors, *spare, labels, upright, strips, clusters, cells, surface, joined, view],
-            [planes, boxes, *reversed(sectors), objects, strips, cells, support, surface, marks, whole, standing],
+            [planes, boxes, *reversed(sectors), detections, objects, *last],
         )
         return Parts(whole(), view(), standing(), surface())
 
@@ -364,9 +414,11 @@ def _absent() -> None:
     """The value of a part without a network, or that no option asks for."""
 
 
-def _supporting(boxes: Sequence[Box], objects: Sequence[Box]) -> list[Box]:
-    """Boxes that keep and add labels of points: those of the top view, and of the object network."""
-    return [*boxes, *(replace(box, score=box.score - LESS_SURE) for box in objects)]
+def _support(scan: Scan, labels: PointLabels, rules: frozenset[str], *found: Sequence[Box]) -> Support:
+    """Boxes that keep and add labels of points: of the top view, of the object network, and of a detector."""
+    boxes, objects, detections = found
+    sure = [*boxes, *detections, *(replace(box, score=box.score - LESS_SURE) for box in objects)]
+    return find_support(scan, labels, sure, rules)
 
 
 def _unboxed(labels: PointLabels, support: Support) -> PointLabels:
@@ -379,6 +431,11 @@ def _unboxed(labels: PointLabels, support: Support) -> PointLabels:
 
 def _at_least(boxes: Sequence[Box], min_score: float) -> list[Box]:
     return [box for box in boxes if box.score >= min_score]
+
+
+def _fit_ground(points: Points, mounting: Mounting) -> GroundFit:
+    reach_m = max(FIRST_REACH_M, FIRST_REACH_HEIGHTS * (mounting.height_m or 0.0))
+    return fit_ground(points, mount_height_m=MODEL_HEIGHT_M, reach_m=reach_m)
 
 
 def _on_ground(near: View, planes: GroundFit) -> Scan:
@@ -432,6 +489,13 @@ def _completed(objects: Sequence[Box], others: Sequence[Box], by_labels: bool, m
     kept = [box if box.label in PERSONS else replace(box, score=0.5 * box.score) for box in others]
     found = [box for box in objects if not by_labels or box.label not in PERSONS]
     return join_boxes(found, [box for box in kept if box.score >= min_score])
+
+
+def _detected(
+    detections: Sequence[Box], others: Sequence[Box], detector: PillarNetwork, min_score: float
+) -> tuple[Box, ...]:
+    """Boxes of a detector, and those of others where it has none: of its classes in its range, with half the score."""
+    return join_boxes(detections, weigh(others, detector.field, detector.card.box_classes, min_score))
 
 
 def _agreed_cells(

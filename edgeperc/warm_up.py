@@ -49,6 +49,7 @@ from .errors import MountingError
 from .ground.leveling import MountingEstimator
 from .ground.planes import Ground, fill_planes, find_ground
 from .ground.scan import Scan
+from .inference.detections import decode_detections
 from .inference.session import Session
 from .objects.boxes import fill_rectangle, join_boxes, objects_from_points
 from .objects.linkage import fill_clusters
@@ -139,7 +140,7 @@ def warm_up(
         return
     few_points = np.array([[10, 0, -1, 0], [20, 1, -1, 0], [0, 0, 0, 0]], np.float32)
     options, top, ranged = pipeline.options, pipeline.top, pipeline.ranged
-    objects = copy(pipeline.objects)
+    objects, pillars = copy(pipeline.objects), copy(pipeline.pillars)
     boxes_points = bool(ranged) and options.boxes_from != "network"
     needed = {
         "ground": pipeline.needs_ground,
@@ -173,6 +174,12 @@ def warm_up(
         floor[:, 3] = labels.labels
         if objects is not None:
             objects.session = Rehearsed(objects.session)
+        if pillars is not None:
+            pillars.session = Rehearsed(pillars.session)
+            pillars.find_boxes(read_only(floor))
+            decode_detections(pillars.card, pillars.session.outputs, 1.0)
+            join_boxes([UNCERTAIN], [UNCERTAIN])
+            suppress_overlaps(np.zeros((2, 5)), np.zeros(2), 0.0)
         rehearsed_top = None if top is None else _RehearsedTop(top)
         rehearsed = Pipeline(
             rehearsed_top,
@@ -180,6 +187,7 @@ def warm_up(
             replace(options, full_turn=False),
             alone,
             objects,
+            pillars,
         )
         rehearsed(read_only(floor), MODEL_MOUNTING, Stopwatch())
         if boxes_points:

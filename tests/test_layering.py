@@ -39,6 +39,7 @@ FLOORS = {
         system.compilation system.draws
         types.rigid
         types.__init__ types.choices types.mounting types.onnx_file types.points types.views
+        types.detector
         types.card types.sensor
         types.perception
         types.frame types.geometry
@@ -65,8 +66,8 @@ FLOORS = {
         agreement.cells
         camera.__init__ camera.calibration camera.image
         camera.painting
-        inference.__init__ inference.box_heads inference.crop inference.projection inference.providers
-        inference.decode inference.listing
+        inference.__init__ inference.box_heads inference.crop inference.pillars inference.projection inference.providers
+        inference.decode inference.detections inference.listing
         inference.session
         road.__init__ road.around road.outline
         road.ahead road.grid
@@ -195,6 +196,7 @@ SAME_NAME = {
     "names": (2, "names in messages, names in what viewers show"),
     "page": (2, "the page, and the sink that writes it"),
     "painting": (3, "painting, its evaluation, the command of that"),
+    "pillars": (2, "a detector's input, its rivals' input"),
     "projection": (2, "the projection, and its rivals"),
     "report": (2, "of a scan, of a benchmark"),
     "run": (2, "a command of two programs"),

@@ -120,10 +120,16 @@ def test_what_is_counted_is_what_is_compiled(first: tuple[Path, Any]) -> None:
         pytest.param({"models": "lodnn", "on_mismatch": "ignore"}, id="road"),
         pytest.param({"boxes_from": "network", "full_turn": True}, id="full turn"),
         pytest.param({"models": "pointseg", "sensor": "vlp-16", "agree": False}, id="coarse sensor"),
+        pytest.param({"models": "a detector", "full_turn": True}, id="detector"),
     ],
 )
 def test_what_is_counted_is_what_is_used(first: tuple[Path, Any], options: dict[str, Any], tmp_path: Path) -> None:
     """Every kernel that Python is said to call is called, and no other; what is loaded hides the kernels it calls."""
+    if options.get("models") == "a detector":
+        pytest.importorskip("torch")
+        networks = pytest.importorskip("pillar_networks")
+        network = networks.PillarNet("anchors").eval()
+        options = {**options, "models": str(networks.exported(network, tmp_path / "detector.onnx"))}
     shutil.copytree(first[0] / "cache", tmp_path / "cache")
     for file in (tmp_path / "cache").rglob("*.fill_returns-*"):
         file.unlink()  # nothing is counted as long as nothing is missing

@@ -18,7 +18,7 @@ from edgeperc.evaluation.evaluate import NETWORK_ALONE, evaluate
 from edgeperc.inference.projection import make_projector, project
 from edgeperc.simulation.samples import simulated_scan
 from edgeperc.types.card import ModelCard
-from edgeperc.types.views import CameraGeometry, ObjectGeometry
+from edgeperc.types.views import RangeImageGeometry, TopViewGeometry
 from edgeperc.zoo import listed
 
 from ..plots import as_svg
@@ -44,7 +44,7 @@ def times(paths: Sequence[Path], n_rounds: int, n_threads: int) -> dict[str, flo
     points = simulated_scan(0).points
     for k, path in enumerate(paths):
         card = ModelCard.read(path)
-        assert not isinstance(card.view, CameraGeometry | ObjectGeometry)
+        assert isinstance(card.view, RangeImageGeometry | TopViewGeometry)
         image = project(make_projector(card.view, card.input), points).image
         for library, precision in ENGINES.items():
             engine = open_engine(library, precision, path, n_threads)

@@ -221,6 +221,7 @@ def _folded(rows: Sequence[tuple[str, str]], max_lines: int | None) -> list[tupl
 def _model_rows(variants: Sequence[Variant]) -> list[tuple[str, str]]:
     """Rows that describe a model; accuracy and geometry come from the card of its first variant."""
     from ..inference.listing import purpose
+    from ..types.detector import PillarGeometry
     from ..types.views import CameraGeometry, ObjectGeometry, TopViewGeometry
 
     path, card = variants[0].path, variants[0].card
@@ -231,9 +232,13 @@ def _model_rows(variants: Sequence[Variant]) -> list[tuple[str, str]]:
         ("variants", size),
         ("sha256", hashlib.sha256(path.read_bytes()).hexdigest()),
     ]
-    if isinstance(card.view, TopViewGeometry):
+    if isinstance(card.view, TopViewGeometry | PillarGeometry):
         (x_near, x_far), (y_right, y_left) = card.view.x_range_m, card.view.y_range_m
         seen = f"x {x_near:g}..{x_far:g} m, y {y_right:g}..{y_left:g} m, cells of {card.view.cell_m:g} m"
+        if isinstance(card.view, PillarGeometry):
+            low, high = card.view.z_range_m
+            seen += f", z {low:g}..{high:g} m, frame {card.mount_height_m:g} m above the road"
+            seen += f", {card.view.max_pillars} pillars of {card.view.max_points} points"
     elif isinstance(card.view, CameraGeometry):
         seen = f"{card.view.width} x {card.view.height} pixels, images are {card.view.fit}ed to it"
     elif isinstance(card.view, ObjectGeometry):
@@ -250,6 +255,9 @@ def _model_rows(variants: Sequence[Variant]) -> list[tuple[str, str]]:
         ("outputs", ", ".join(f"{output.name} ({output.kind})" for output in card.outputs)),
         ("classes", ", ".join(card.classes)),
     ]
+    if card.head is not None:
+        names = zip(card.head.classes, card.box_classes, strict=True)
+        rows.append(("head", f"{card.head.kind}: {', '.join(f'{own} as {name}' for own, name in names)}"))
     if card.box_classes:
         rows.append(("boxes", f"{', '.join(card.box_classes)}, score from {card.score_threshold:g}"))
     rows += [(key, str(card.training[key])) for key in ("data", "licence") if key in card.training]

@@ -112,7 +112,7 @@ class Judge:
         self.as_recorded = mounted is None and sensor is None
         self.point_classes: tuple[str, ...] = POINT_CLASSES
         self.drive: str | None = None
-        whole = [session for session in self.perceive.sessions if session.card.view.kind != "objects"]
+        whole = [session for session in self.perceive.sessions if session.card.view.kind not in ("objects", "pillars")]
         networks = [Network(session) for session in whole]
         self.from_sensor = next((n for n in networks if n.card.view.kind == "range_image"), None)
         self.from_above = next((n for n in networks if n.card.view.kind == "top_view"), None)
@@ -131,7 +131,7 @@ class Judge:
         self.detected_in = self.view if self.box_classes else None  # None: anywhere
         if not self.box_classes and self.from_sensor is not None and perceiving.boxes_from != "network":
             self.box_classes = classes_of_boxes(self.from_sensor.card.classes)
-        of_objects = next((card for card in self.perceive.cards if card.view.kind == "objects"), None)
+        of_objects = next((card for card in self.perceive.cards if card.view.kind in ("objects", "pillars")), None)
         if not self.box_classes and of_objects is not None:
             self.box_classes = of_objects.box_classes
         drawing = replace(perceiving, boxes_from="network", rules=())

@@ -148,6 +148,8 @@ def purpose(card: ModelCard) -> str:
         return f"a class for every point ({', '.join(card.classes[1:])})"
     if card.view.kind == "camera":
         return f"a class for every pixel of a camera's image ({len(card.classes)} classes)"
+    if card.view.kind == "pillars":
+        return f"boxes in its range, by pillars of points ({', '.join(dict.fromkeys(card.box_classes))})"
     if card.view.kind == "objects":
         return f"boxes all around, by their points ({', '.join(card.box_classes)})"
     found = ["drivable area"] if "drivable" in card.classes else []

@@ -44,6 +44,7 @@ from ..system.names import nearest
 from ..system.printable import printable
 from ..types.card import ModelCard
 from ..types.choices import PRECISIONS
+from ..types.detector import PillarGeometry
 from ..types.onnx_file import check_graph, read_model
 from ..types.views import CameraGeometry, ObjectGeometry
 from ..zoo import Variant, choose, digest, resolve
@@ -60,6 +61,8 @@ MAX_GOLDEN_DEVIATION = {"fp32": 0.02, "bf16": 0.5, "int8": 0.5}
 GOLDEN_SHARE = 0.9
 # Candidates of one run of an object network, and of its golden input.
 MAX_ROWS, GOLDEN_ROWS = 256, 16
+# Of a detector's inputs beside the points: onnxruntime's names of the types that a graph may take.
+WHOLE = {"int32": np.int32, "int64": np.int64, "float": np.float32}
 # The largest network of this project takes 0.2 s on one core of a server.
 MAX_FIRST_RUN_S = 30.0
 
@@ -123,10 +126,12 @@ class Session:
         Settings of onnxruntime's session and of the provider, for reports.
     input : (C, H, W) float32
         Write the network's input here, then `run`. Of an object network: (`MAX_ROWS`, points, channels), a row for
-        each candidate.
+        each candidate. Of a detector: (pillars, points, channels).
+    inputs : mapping of str to ndarray
+        All inputs of a detector by name, of the types that the graph takes, a row for each pillar.
     outputs : mapping of str to ndarray
-        Outputs by output *kind*, without the batch axis; overwritten by every `run`. Values of blocks are written to
-        their pixels (`edgeperc.card.OutputSpec`).
+        Outputs by output *kind*, of a detector by name, without the batch axis; overwritten by every `run`. Values of
+        blocks are written to their pixels (`edgeperc.card.OutputSpec`).
     raw : mapping of str to ndarray
         The same as the graph gives them.
     shares_cores : bool
@@ -236,7 +241,13 @@ class Session:
         self.path, self.card = variant.path, variant.card
         self.short, self.provider, self.precision = short, PROVIDERS[short], precision
         blob = read_model(self.path)
-        check_graph(blob, self.path, trusted=self._trusted)
+        folds = check_graph(blob, self.path, trusted=self._trusted)
+        if not folds and short not in ("cpu", "cuda"):
+            raise ProviderError(
+                f"{self.path}: it computes sizes from constants alone, which provider {short!r} would do while it "
+                "opens the file, where nothing can stop it; choose provider 'cpu', or pass trusted=True, or --trusted, "
+                "if you know where it comes from"
+            )
         self.sha256 = hashlib.sha256(blob).hexdigest()
         cores = usable_cores()
         self.shares_cores = n_threads is None and short in SHARING and 1 < self._at_once <= cores
@@ -244,7 +255,7 @@ class Session:
             n_threads = cores // self._at_once
         self._has_threads = short != "cpu" or n_threads != 1
         with native_call():
-            self.inference = kept_in_forks(self._open(ort, blob, short, precision, n_threads))
+            self.inference = kept_in_forks(self._open(ort, blob, short, precision, n_threads, folds))
         self._check_graph()
         with terminated(ort, None if self._trusted else MAX_FIRST_RUN_S) as run_options:
             self._bind(run_options)
@@ -255,7 +266,9 @@ class Session:
         """The active network, precision and provider: ``"pointseg int8, CPUExecutionProvider"``."""
         return f"{self.card.name} {self.precision}, {self.provider}"
 
-    def _open(self, ort: Any, blob: bytes, short: str, precision: str, n_threads: int | None) -> Any:
+    def _open(
+        self, ort: Any, blob: bytes, short: str, precision: str, n_threads: int | None, folds: bool = True
+    ) -> Any:
         options = ort.SessionOptions()
         options.log_severity_level = 4
         options.inter_op_num_threads = 1
@@ -295,7 +308,10 @@ class Session:
                 options.add_provider_for_devices(plugin[:1], settings)
                 session = ort.InferenceSession(blob, options, enable_fallback=0)
             else:
-                session = ort.InferenceSession(blob, options, [PROVIDERS[short]], enable_fallback=0)
+                unused = [] if folds else ["ConstantFolding"]
+                session = ort.InferenceSession(
+                    blob, options, [PROVIDERS[short]], enable_fallback=0, disabled_optimizers=unused
+                )
             session.disable_fallback()  # of runs; enable_fallback=0: of opening, which would print to stdout
             for each in (*session.get_inputs(), *session.get_outputs()):
                 _ = each.name, each.shape  # fails if one is not UTF-8
@@ -314,36 +330,47 @@ class Session:
         card = self.card
         inputs = {i.name: i for i in self.inference.get_inputs()}
         outputs = {o.name: o for o in self.inference.get_outputs()}
-        if list(inputs) != [card.input.name]:
-            raise CardMismatchError(f"{self.path}: card names input {card.input.name!r}, the graph has {list(inputs)}")
-        self._match(card.input.name, inputs[card.input.name], card.input_shape)
+        expected = input_shapes(card)
+        if set(inputs) != set(expected):
+            named = f"input {card.input.name!r}" if len(expected) == 1 else f"inputs {list(expected)}"
+            raise CardMismatchError(f"{self.path}: card names {named}, the graph has {list(inputs)}")
+        for name, shape in expected.items():
+            self._match(name, inputs[name], shape, ("float",) if name == card.input.name else tuple(WHOLE))
         for output in card.outputs:
             if output.name not in outputs:
                 raise CardMismatchError(
                     f"{self.path}: card names output {output.name!r}, the graph has {list(outputs)}"
                 )
-            self._match(output.name, outputs[output.name], self.card.output_shape(output.kind))
+            self._match(output.name, outputs[output.name], self.card.shape_of(output))
 
-    def _match(self, name: str, node: Any, expected: tuple[int | None, ...]) -> None:
+    def _match(
+        self, name: str, node: Any, expected: tuple[int | None, ...], types: tuple[str, ...] = ("float",)
+    ) -> None:
         shape = tuple(node.shape)
         # A graph may leave a dimension open (a name or None); the first run then checks the shape.
         fits = len(shape) == len(expected) and all(
             e is None or not isinstance(s, int) or s == e for s, e in zip(shape, expected, strict=True)
         )
-        if not fits or node.type != "tensor(float)":
+        if not fits or node.type not in [f"tensor({each})" for each in types]:
             raise CardMismatchError(
-                f"{self.path}: {name!r} is {node.type} of shape {shape} in the graph; its card declares tensor(float) "
-                f"of shape {expected} (None: any)"
+                f"{self.path}: {name!r} is {node.type} of shape {shape} in the graph; its card declares "
+                f"tensor({' or '.join(types)}) of shape {expected} (None: any)"
             )
 
     def _bind(self, run_options: Any) -> None:
         card = self.card
-        batch = np.zeros([MAX_ROWS if n is None else n for n in card.input_shape], np.float32)
+        n_rows = card.view.max_pillars if isinstance(card.view, PillarGeometry) else MAX_ROWS
+        batch = np.zeros([n_rows if n is None else n for n in card.input_shape], np.float32)
         self.binding = self.inference.io_binding()
         self.raw: dict[str, NDArray[np.float32]] = {}
         self.outputs: dict[str, NDArray[np.float32]] = {}
         self._batch = batch  # the binding holds a bare pointer
+        self._pillars = isinstance(card.view, PillarGeometry)
         self._has_rows = card.input_shape[0] is None
+        self.inputs: dict[str, NDArray[Any]] = {}
+        if self._pillars:
+            self._bind_pillars(run_options)
+            return
         if self._has_rows:
             self.input: NDArray[np.float32] = batch
             for output in card.outputs:
@@ -351,7 +378,7 @@ class Session:
                 self.raw[output.kind] = self.outputs[output.kind] = np.zeros((MAX_ROWS, *shape[1:]), np.float32)
             return
         self.input = batch[0]
-        for output, shape in zip(card.outputs, self._shapes(batch, run_options), strict=True):
+        for output, shape in zip(card.outputs, self._shapes({card.input.name: batch}, run_options), strict=True):
             if isinstance(card.view, CameraGeometry) and (card.view.height % shape[2] or card.view.width % shape[3]):
                 raise CardMismatchError(
                     f"{self.path}: {output.name!r} has shape {shape}; expected rows and columns that divide the view's "
@@ -366,7 +393,30 @@ class Session:
                 self.outputs[output.kind] = np.zeros(pixels, np.float32)
         self._bound_input = (card.input.name, "cpu", 0, np.float32, batch.shape, batch.ctypes.data)
 
-    def _shapes(self, batch: NDArray[np.float32], run_options: Any) -> list[tuple[int, ...]]:
+    def _bind_pillars(self, run_options: Any) -> None:
+        """Buffers of a detector: as many rows as there are pillars, where the graph does not want all of them."""
+        card, nodes = self.card, {each.name: each for each in self.inference.get_inputs()}
+        for name, shape in input_shapes(card).items():
+            kind = WHOLE[nodes[name].type.removeprefix("tensor(").removesuffix(")")]
+            whole = (len(self._batch), *(n for n in shape[1:] if n is not None))
+            self.inputs[name] = self._batch if name == card.input.name else np.zeros(whole, kind)
+        self.input = self._batch
+        declared = [nodes[name].shape[0] for name in self.inputs]
+        self._all_rows = any(isinstance(n, int) for n in declared)
+        wrong = [n for n in declared if isinstance(n, int) and n != len(self._batch)]
+        if wrong:
+            raise CardMismatchError(
+                f"{self.path}: the graph takes {wrong[0]} pillars, its card declares view.max_pillars "
+                f"{len(self._batch)}; expected the same number, or a graph that takes any"
+            )
+        n_rows = len(self._batch) if self._all_rows else 1
+        feed = {name: array[:n_rows] for name, array in self.inputs.items()}
+        for output, shape in zip(card.outputs, self._shapes(feed, run_options), strict=True):
+            buffer = np.zeros(shape, np.float32)
+            self.binding.bind_output(output.name, "cpu", 0, np.float32, buffer.shape, buffer.ctypes.data)
+            self.raw[output.name] = self.outputs[output.name] = buffer[0]
+
+    def _shapes(self, feed: Mapping[str, NDArray[Any]], run_options: Any) -> list[tuple[int, ...]]:
         """Shapes of the outputs, from the graph, or from a run if the graph leaves dimensions open."""
         declared = {o.name: tuple(o.shape) for o in self.inference.get_outputs()}
         shapes = [declared[o.name] for o in self.card.outputs]
@@ -374,13 +424,11 @@ class Session:
             return shapes
         try:
             with native_call():
-                answers = self.inference.run(
-                    [o.name for o in self.card.outputs], {self.card.input.name: batch}, run_options
-                )
+                answers = self.inference.run([o.name for o in self.card.outputs], feed, run_options)
         except Exception as exc:  # onnxruntime's errors share no base but Exception
             raise InferenceError(f"{self.path}: the first run on {self.provider} failed: {exc}") from exc
         for output, answer in zip(self.card.outputs, answers, strict=True):
-            expected = self.card.output_shape(output.kind)
+            expected = self.card.shape_of(output)
             if answer.ndim != len(expected) or any(
                 e is not None and s != e for s, e in zip(answer.shape, expected, strict=True)
             ):
@@ -391,7 +439,10 @@ class Session:
 
     def warm_up(self, limit: float, run_options: Any) -> float:
         """Run the golden input; return the largest deviation from the recorded answers."""
-        golden, n_rows = self.card.golden, GOLDEN_ROWS if self._has_rows else 1
+        golden, n_rows = self.card.golden, golden_shape(self.card)[0] if self._has_rows else 1
+        if self._pillars:
+            for name, array in golden_feed(self.card, 0 if golden is None else golden.seed).items():
+                self.inputs[name][:n_rows] = array
         if golden is None:
             logger.warning(
                 "the card of %s has no golden record: the outputs on %s are not compared with the exporter's",
@@ -408,8 +459,9 @@ class Session:
         self.input[:] = 0.0
         deviation = 0.0
         for output in self.card.outputs:
-            known, here = golden.outputs.get(output.name), self.raw[output.kind]
-            here = (here[:n_rows] if self._has_rows else here).reshape(-1)
+            known = golden.outputs.get(output.name)
+            here = self.raw[output.name if self._pillars else output.kind]
+            here = (here[:n_rows] if self._has_rows and not self._pillars else here).reshape(-1)
             if known is None:
                 raise CardMismatchError(f"{self.path}: the card's golden record lacks output {output.name!r}")
             try:
@@ -431,7 +483,7 @@ class Session:
         """Run the network on `input`.
 
         ``n_rows``: of an object network, how many rows of `input`, from the first one on, hold candidates; 1 to
-        `MAX_ROWS`.
+        `MAX_ROWS`. Of a detector, how many rows of `inputs` hold pillars, at least 1; the others may be overwritten.
         Returns mapping of str to ndarray: `outputs`, which the next run overwrites; of an object network, its first
         ``n_rows`` rows are new.
         Raises InferenceError.
@@ -476,7 +528,13 @@ class Session:
         """One run on the bound buffers, of so many rows where the batch has rows."""
         try:
             # Bind before every run: a provider with its own memory copies the input only when it is bound.
-            if self._has_rows:
+            if self._pillars:
+                for name, array in self.inputs.items():
+                    if self._all_rows:
+                        array[n_rows:] = array[n_rows - 1]  # the same pillar again changes nothing
+                    rows = array if self._all_rows else array[:n_rows]
+                    self.binding.bind_input(name, "cpu", 0, rows.dtype, rows.shape, rows.ctypes.data)
+            elif self._has_rows:
                 array = self._batch[:n_rows]
                 self.binding.bind_input(self.card.input.name, "cpu", 0, np.float32, array.shape, array.ctypes.data)
                 for output in self.card.outputs:
@@ -512,9 +570,31 @@ def terminated(ort: Any, after_s: float | None) -> Iterator[Any]:
         timer.cancel()
 
 
+def input_shapes(card: ModelCard) -> dict[str, tuple[int | None, ...]]:
+    """Shapes of the graph's inputs by name; None where any length is allowed."""
+    shapes = {card.input.name: card.input_shape}
+    if isinstance(card.view, PillarGeometry):
+        shapes |= {card.view.num_points: (None,)} if card.view.num_points else {}
+        shapes |= {card.view.coords: (None, 4)}
+    return shapes
+
+
 def golden_shape(card: ModelCard) -> tuple[int, ...]:
-    """Shape of the input of a card's golden record; `GOLDEN_ROWS` candidates."""
-    return tuple(GOLDEN_ROWS if n is None else n for n in card.input_shape)
+    """Shape of the input of a card's golden record; `GOLDEN_ROWS` candidates or pillars."""
+    n_rows = min(GOLDEN_ROWS, card.view.max_pillars) if isinstance(card.view, PillarGeometry) else GOLDEN_ROWS
+    return tuple(n_rows if n is None else n for n in card.input_shape)
+
+
+def golden_feed(card: ModelCard, seed: int) -> dict[str, NDArray[Any]]:
+    """The inputs of a card's golden record: `golden_input`; pillars are full and lie in the first cells."""
+    shape = golden_shape(card)
+    feed: dict[str, NDArray[Any]] = {card.input.name: golden_input(seed, shape)}
+    if isinstance(card.view, PillarGeometry):
+        if card.view.num_points:
+            feed[card.view.num_points] = np.full(shape[0], shape[1], np.int32)
+        rows, columns = np.divmod(np.arange(shape[0], dtype=np.int32), card.view.width)
+        feed[card.view.coords] = np.stack([0 * rows, 0 * rows, rows, columns], axis=1)
+    return feed
 
 
 def golden_input(seed: int, shape: tuple[int, ...]) -> NDArray[np.float32]:

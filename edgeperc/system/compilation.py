@@ -29,10 +29,10 @@ PACKAGE = "edgeperc"
 # Kernels that Python calls, by what needs them; tests compare them with what is compiled.
 KERNELS: Mapping[str, str] = MappingProxyType(
     {
-        "scans": "ground.planes.fill_lowest ground.planes.fit_first_plane inference.decode.fill_labels "
-        "inference.projection.fill_image preprocess.condition.fill_rendered "
+        "scans": "ground.planes.fill_lowest ground.planes.fit_first_plane preprocess.condition.fill_rendered "
         "preprocess.health.fill_lacking preprocess.health.fill_sectors preprocess.health.mark_isolated "
         "preprocess.returns.fill_returns preprocess.returns.has_returns_only types.frame.fill_moved",
+        "views": "inference.decode.fill_labels inference.projection.fill_image",
         "fitness": "preprocess.fitness.fill_scan_sums",
         "crop": "inference.crop.fill_rows",
         "gaps": "preprocess.interpolation.fill_between",
@@ -63,6 +63,8 @@ KERNELS: Mapping[str, str] = MappingProxyType(
         "cells": "agreement.cells.clear_cells agreement.cells.fill_marks",
         "detections": "inference.box_heads.count_not_finite inference.box_heads.fill_footprint_sums "
         "inference.box_heads.mark_peaks inference.decode.clear_empty types.geometry.mark_nms",
+        "pillars": "inference.box_heads.count_not_finite inference.pillars.fill_pillars "
+        "inference.pillars.find_pillars types.geometry.fill_oriented_iou types.geometry.mark_nms",
         "blocks": "inference.decode.fill_pixels",
         "image": "camera.image.fill_image_labels camera.image.fill_scaled",
     }

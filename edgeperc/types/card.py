@@ -16,6 +16,7 @@ from typing import Any, Literal
 from ..errors import CardError
 from ..system.fields import Fields
 from ..system.names import check_name, check_text
+from .detector import ANCHOR_KINDS, CENTER_KINDS, HEADS, MAX_VALUES, AnchorHead, CenterHead, PillarGeometry
 from .onnx_file import read_metadata
 from .views import CameraGeometry, ObjectGeometry, RangeImageGeometry, TopViewGeometry
 
@@ -28,7 +29,10 @@ MAX_TEXT = 100_000  # characters of one text of the free-form metadata
 MAX_CHANNELS = 16
 MAX_BLOCK = 16
 MIN_GOLDEN_VALUES, MAX_GOLDEN_VALUES = 16, 100_000
-OUTPUT_KINDS = ("class_logits", "class_probabilities", "box_slots", "box_dense", "camera_logits", "objects")
+OUTPUT_KINDS = (
+    *("class_logits", "class_probabilities", "box_slots", "box_dense", "camera_logits", "objects"),
+    *(*ANCHOR_KINDS, *CENTER_KINDS),
+)
 CHANNELS = {
     "camera": ("red", "green", "blue"),
     "top_view": ("distance", "remission", "height"),
@@ -37,16 +41,24 @@ CHANNELS = {
         *("x", "y", "height_above_ground", "remission", "beyond_length", "beyond_width"),
         *("length", "width", "top", "sensor_ahead", "sensor_left", "range", "n_points"),
     ),
+    "pillars": (
+        *("x", "y", "z", "remission", "time"),
+        *("from_mean_x", "from_mean_y", "from_mean_z", "from_center_x", "from_center_y", "from_center_z", "range"),
+    ),
 }
 N_DENSE_CHANNELS, N_FRONT_CHANNELS = 9, 2
 N_OBJECT_VALUES = 8  # in addition to the classes and the sizes: place, axis, front, overlap
-FIELDS = Fields("the card", CardError, "export the model again", optional=("front", "block"))  # earlier cards lack them
+FIELDS = Fields(
+    "the card", CardError, "export the model again", optional=("front", "block", "head")
+)  # earlier cards lack them
 VIEWS = {
     "top_view": TopViewGeometry,
     "range_image": RangeImageGeometry,
     "camera": CameraGeometry,
     "objects": ObjectGeometry,
+    "pillars": PillarGeometry,
 }
+Geometry = TopViewGeometry | RangeImageGeometry | CameraGeometry | ObjectGeometry | PillarGeometry
 
 
 @dataclass(frozen=True, slots=True)
@@ -173,7 +185,7 @@ class ModelCard:
         The name may become that of files and of models on a server: see `edgeperc.system.names.check_name`.
     precision : {"fp32", "int8"}
         Precision of the stored weights. ``"int8"``: weights and activations are 8-bit integers.
-    view : TopViewGeometry, RangeImageGeometry, CameraGeometry or ObjectGeometry
+    view : TopViewGeometry, RangeImageGeometry, CameraGeometry, ObjectGeometry or PillarGeometry
     input : InputSpec
     outputs : tuple of OutputSpec
         A camera model has one output of kind ``"camera_logits"``, float32 of shape (1, classes, h, w): logits on a grid
@@ -181,7 +193,8 @@ class ModelCard:
     classes : tuple of str
         Index 0 is the background; a camera model has none.
     box_classes : tuple of str
-        Classes that boxes may have; a subset of ``classes``.
+        Classes that boxes may have; a subset of ``classes``. Of a detector, that of each class of its head, in the
+        head's order; several may be one.
     box_size_priors : mapping
         Class to usual (length, width, height) [m].
     box_size_spreads : mapping
@@ -204,11 +217,13 @@ class ModelCard:
         post-processing: ``n_scans``, ``label_agreement`` (share of pixels or cells), ``mean_iou`` and ``ap`` with
         ``fp32_mean_iou`` and ``fp32_ap`` (0..1; AP is None without boxes), ``loss`` (the larger loss of mean IoU and
         AP in percentage points, 0 if neither is lower), ``by`` (engine and processor) and ``command``.
+    head : AnchorHead, CenterHead or None
+        What the outputs of a detector on pillars mean (`edgeperc.types.detector`); None for other views.
     """
 
     name: str
     version: str
-    view: TopViewGeometry | RangeImageGeometry | CameraGeometry | ObjectGeometry
+    view: Geometry
     input: InputSpec
     outputs: tuple[OutputSpec, ...]
     classes: tuple[str, ...]
@@ -225,6 +240,7 @@ class ModelCard:
     golden: Golden | None = None
     precision: Precision = "fp32"
     precisions: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    head: AnchorHead | CenterHead | None = None
 
     def __post_init__(self) -> None:
         if self.precision not in ("fp32", "int8"):
@@ -243,15 +259,20 @@ class ModelCard:
                 f"input channels {reprlib.repr(unknown)} are unknown to a {self.view.kind}; "
                 f"expected some of {', '.join(CHANNELS[self.view.kind])}"
             )
+        if (self.head is None) == (self.view.kind == "pillars"):
+            given = "is missing" if self.head is None else "is given"
+            raise CardError(f"head {given} in a card of {self.view.kind}; expected one for pillars alone")
         kinds = [o.kind for o in self.outputs]
         if self.view.kind == "camera":
             self._check_camera(kinds)
         elif self.view.kind == "objects":
             self._check_objects(kinds)
+        elif self.view.kind == "pillars":
+            self._check_pillars(kinds)
         elif (
             sum(k.startswith("class_") for k in kinds) != 1
             or len(kinds) != len(set(kinds))
-            or {"camera_logits", "objects"} & {*kinds}
+            or {"camera_logits", "objects", *ANCHOR_KINDS, *CENTER_KINDS} & {*kinds}
         ):
             raise CardError(f"output kinds {kinds}; expected one class output and at most one of each box kind")
         for rows, cols in (output.block for output in self.outputs if output.block != (1, 1)):
@@ -261,7 +282,7 @@ class ModelCard:
                     f"output.block is {(rows, cols)}; expected divisors of the view's {self.view.height} rows and "
                     f"{self.view.width} columns"
                 )
-        if any(k.startswith("box_") for k in kinds):
+        if any(k in ("box_slots", "box_dense") for k in kinds):
             if self.view.kind != "top_view":
                 raise CardError(f"output kinds {kinds} in a {self.view.kind}; boxes need a top_view")
             if not self.box_classes:
@@ -289,7 +310,7 @@ class ModelCard:
                 FIELDS.number(f"precisions.{name}.loss", record["loss"], 0.0, 100.0)
         if self.golden is not None:
             for output in self.outputs:
-                shape = self.output_shape(output.kind)
+                shape = self.shape_of(output)
                 if output.name in self.golden.outputs and None not in shape:
                     self.golden.check_output(output.name, math.prod(n for n in shape if n is not None))
 
@@ -318,20 +339,57 @@ class ModelCard:
         if self.fitness is not None:
             raise CardError("candidates with a fitness, which is of scans; expected null")
 
+    def _check_pillars(self, kinds: list[str]) -> None:
+        view, head = self.view, self.head
+        assert isinstance(view, PillarGeometry)
+        assert head is not None
+        head.check_kinds(kinds)
+        if view.height % head.stride or view.width % head.stride:
+            raise CardError(
+                f"head.stride is {head.stride}; expected a divisor of the view's {view.height} rows and {view.width} "
+                "columns"
+            )
+        if len(self.box_classes) != len(head.classes):
+            raise CardError(
+                f"box_classes {reprlib.repr(self.box_classes)} of a detector of {len(head.classes)} classes "
+                f"{reprlib.repr(head.classes)}; expected a class of boxes for each, in this order"
+            )
+        n_values = view.max_pillars * view.max_points * len(self.input.channels)
+        if n_values > MAX_VALUES:
+            raise CardError(f"the input has {n_values} values (view.max_pillars); expected at most {MAX_VALUES}")
+        names = [self.input.name, view.coords, *filter(None, [view.num_points])]
+        for what, given in (("inputs", names), ("outputs", [output.name for output in self.outputs])):
+            if len(given) != len({*given}):
+                raise CardError(f"the {what} are named {reprlib.repr(given)}; expected different names")
+
     @property
     def input_shape(self) -> tuple[int | None, ...]:
-        """Shape of the input, with the batch: (1, channels, rows, columns); of candidates (any, points, channels)."""
+        """Shape of the input, with the batch: (1, channels, rows, columns); of candidates and of pillars (any, points,
+        channels).
+        """
         if isinstance(self.view, ObjectGeometry):
             return (None, self.view.n_points, len(self.input.channels))
+        if isinstance(self.view, PillarGeometry):
+            return (None, self.view.max_points, len(self.input.channels))
         return (1, len(self.input.channels), self.view.height, self.view.width)
+
+    def shape_of(self, output: OutputSpec) -> tuple[int | None, ...]:
+        """`output_shape` of one of `outputs`; a detector may have several of a kind."""
+        if self.head is None:
+            return self.output_shape(output.kind)
+        assert isinstance(self.view, PillarGeometry)
+        alike = [each.name for each in self.outputs if each.kind == output.kind]
+        n = self.head.n_channels(output.kind, alike.index(output.name), len(alike))
+        rows, columns = self.view.height // self.head.stride, self.view.width // self.head.stride
+        return (1, rows, columns, n) if self.head.channels_last else (1, n, rows, columns)
 
     def output_shape(self, kind: str) -> tuple[int | None, ...]:
         """Shape of the output of a kind, with the batch; None where any length is allowed."""
         if kind == "objects":
             n_classes = len(self.classes)
             return (None, n_classes + 3 * (n_classes - 1) + N_OBJECT_VALUES)
-        if isinstance(self.view, ObjectGeometry):
-            raise CardError(f"a {self.view.kind} has no output of kind {kind}; expected objects")
+        if isinstance(self.view, ObjectGeometry | PillarGeometry):
+            raise CardError(f"a card of {self.view.kind} has no output of kind {kind}")
         if kind == "box_slots":
             return (1, None, None)
         if kind == "camera_logits":
@@ -344,9 +402,14 @@ class ModelCard:
 
     def to_json(self) -> str:
         """Canonical JSON: sorted keys, no blanks, no NaN."""
-        view: dict[str, Any] = {"kind": self.view.kind}
-        view |= {name: getattr(self.view, name) for name in type(self.view).__dataclass_fields__}
-        document = {name: getattr(self, name) for name in type(self).__dataclass_fields__}
+        view: dict[str, Any] = {"kind": self.view.kind, **_entries(self.view)}
+        document = _entries(self)
+        if self.head is None:
+            del document["head"]
+        else:
+            document["head"] = {"kind": self.head.kind, **_entries(self.head)}
+            if isinstance(self.head, AnchorHead):
+                document["head"]["anchors"] = [_entries(anchor) for anchor in self.head.anchors]
         document |= {
             "schema": SCHEMA,
             "view": view,
@@ -393,9 +456,19 @@ class ModelCard:
         _check_tree(document)
         view = FIELDS.read(Mapping[str, Any], document.get("view"), "view")  # type: ignore[type-abstract]
         if view.get("kind") not in [*VIEWS]:
-            FIELDS.refuse("view.kind", view.get("kind"), "top_view, range_image, camera or objects")
+            FIELDS.refuse("view.kind", view.get("kind"), "top_view, range_image, camera, objects or pillars")
         geometry = FIELDS.entry(VIEWS[view["kind"]], view, "view")
-        return FIELDS.read(cls, {**document, "view": geometry})
+        head = document.get("head")
+        if head is not None:
+            kind = head.get("kind") if isinstance(head, Mapping) else head
+            if kind not in [*HEADS]:
+                FIELDS.refuse("head.kind", kind, "anchors or centers")
+            head = FIELDS.entry(HEADS[kind], head, "head")
+        return FIELDS.read(cls, {**document, "view": geometry, "head": head})
+
+
+def _entries(record: Any) -> dict[str, Any]:
+    return {name: getattr(record, name) for name in type(record).__dataclass_fields__}
 
 
 def _check_tree(document: Any) -> None:

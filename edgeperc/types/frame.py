@@ -49,11 +49,11 @@ class ModelFrame:
 
     def move(self, points: Points) -> NDArray[np.float32]:
         """Scan (n, 4) float32 in the models' frame, read-only; the same array if nothing moves."""
-        if self.is_identity:
-            return points
-        moved = np.empty(points.shape, np.float32)
-        fill_moved(read_only(points), self.R, self.t, moved)
-        return read_only(moved)
+        return points if self.is_identity else _moved_points(points, self.R, self.t)
+
+    def move_back(self, points: Points) -> NDArray[np.float32]:
+        """Points (n, 4) float32 of the models' frame as a sensor of this mounting sees them, read-only."""
+        return points if self.is_identity else _moved_points(points, self.R.T.copy(), -self.R.T @ self.t)
 
     def move_boxes(self, boxes: Iterable[Box]) -> tuple[Box, ...]:
         """Boxes of the scan's frame in the models' frame. They stay upright: a box has no tilt."""
@@ -85,6 +85,12 @@ def quaternion(R: NDArray[np.float64]) -> tuple[float, float, float, float]:
     row = rows[np.argmax(np.diag(rows))]
     x, y, z, w = (math.copysign(1.0, row[3]) * row / np.linalg.norm(row)).tolist()
     return x, y, z, w
+
+
+def _moved_points(points: Points, R: NDArray[np.float64], t: NDArray[np.float64]) -> NDArray[np.float32]:
+    moved = np.empty(points.shape, np.float32)
+    fill_moved(read_only(points), R, t, moved)
+    return read_only(moved)
 
 
 def _moved(boxes: Iterable[Box], R: NDArray[np.float64], t: NDArray[np.float64]) -> tuple[Box, ...]:

@@ -27,13 +27,14 @@ MAX_FOLDED = 2**28  # values that onnxruntime computes from constants while it o
 MAX_SMALL = 2**16  # values of one arithmetic result of constants: shapes and scales, not weights
 
 _OPERATORS = """
-Abs Add And ArgMax AveragePool BatchNormalization Cast Ceil Clip Concat Constant Conv ConvInteger ConvTranspose
-DepthToSpace DequantizeLinear Div Dropout DynamicQuantizeLinear Elu Equal Erf Exp Expand Flatten Floor Gather
-GatherElements GatherND Gelu Gemm GlobalAveragePool GlobalMaxPool Greater GreaterOrEqual GroupNormalization
-HardSigmoid HardSwish Identity InstanceNormalization LRN LayerNormalization LeakyRelu Less LessOrEqual Log
-LogSoftmax MatMul MatMulInteger Max MaxPool Mean Min Mish Mul Neg Not Or PRelu Pad Pow QLinearConv QLinearMatMul
-QuantizeLinear Reciprocal ReduceMax ReduceMean ReduceMin ReduceSum Relu Reshape Resize Selu Shape Sigmoid Slice
-Softmax Softplus Softsign SpaceToDepth Split Sqrt Squeeze Sub Sum Tanh TopK Transpose Unsqueeze Where
+Abs Add And ArgMax AveragePool BatchNormalization Cast Ceil Clip Concat Constant ConstantOfShape Conv ConvInteger
+ConvTranspose DepthToSpace DequantizeLinear Div Dropout DynamicQuantizeLinear Elu Equal Erf Exp Expand Flatten Floor
+Gather GatherElements GatherND Gelu Gemm GlobalAveragePool GlobalMaxPool Greater GreaterOrEqual GroupNormalization
+HardSigmoid HardSwish Identity InstanceNormalization LRN LayerNormalization LeakyRelu Less LessOrEqual Log LogSoftmax
+MatMul MatMulInteger Max MaxPool Mean Min Mish Mul Neg NonZero Not Or PRelu Pad Pow QLinearConv QLinearMatMul
+QuantizeLinear Range Reciprocal ReduceMax ReduceMean ReduceMin ReduceSum Relu Reshape Resize ScatterElements ScatterND
+Selu Shape Sigmoid Slice Softmax Softplus Softsign SpaceToDepth Split Sqrt Squeeze Sub Sum Tanh Tile TopK Transpose
+Unsqueeze Where
 """
 OPERATORS = frozenset(_OPERATORS.split())
 """Operators of ONNX that a model may consist of: what edgeperc exports, and what else is common in convolutional
@@ -41,14 +42,19 @@ networks. None runs another graph, and none repeats."""
 
 # Results of constants alone are computed while a file is opened, where nothing can stop it. These operators give at
 # most as many values as they take, ...
-_STEADY = "Cast DequantizeLinear Flatten Identity QuantizeLinear Reshape Squeeze Transpose Unsqueeze"
+_STEADY = "Cast DequantizeLinear Flatten Identity QuantizeLinear Reshape Slice Squeeze Transpose Unsqueeze"
 STEADY = frozenset(_STEADY.split())
 # ... these a product of them; of the others the size depends on values, or each value takes long.
 _SMALL = """
 Abs Add And Ceil Clip Concat Div Equal Exp Floor Gather Greater GreaterOrEqual Less LessOrEqual Log Max Min Mul Neg
-Not Or Pow Reciprocal ReduceMax ReduceMean ReduceMin ReduceSum Slice Sqrt Sub Sum Where
+Not Or Pow Reciprocal ReduceMax ReduceMean ReduceMin ReduceSum Sqrt Sub Sum Where
 """
 SMALL = frozenset(_SMALL.split())
+# The size of these depends on values. A graph with one that takes few constants is opened without computing with
+# constants: a scatter of pillars has them.
+DEFERRED = frozenset(
+    {"ConstantOfShape", "Expand", "GatherND", "NonZero", "Range", "ScatterElements", "ScatterND", "Tile"}
+)
 
 
 def open_model(path: str | os.PathLike[str]) -> BinaryIO:
@@ -192,18 +198,22 @@ class _Reader:
         raise ValueError(f"the number at byte {file.tell()} has more than ten bytes")
 
 
-def check_graph(blob: bytes, path: str | os.PathLike[str], *, trusted: bool = False) -> None:
+def check_graph(blob: bytes, path: str | os.PathLike[str], *, trusted: bool = False) -> bool:
     """Refuse a graph that could read other files, run without end or take all memory while it is opened.
 
     blob : the content of an .onnx file.
     path : named in messages.
     trusted : only refuse what is damaged or reads other files.
+    Returns: Whether what depends on constants alone may be computed while the file is opened; else it has to wait for
+        the first run, which can be stopped.
     Raises ModelFileError.
     """
     if blob[4:8] == b"ORTM":  # onnxruntime would read it in its own format, which is not checked here
         raise ModelFileError(f"{os.fspath(path)} is in onnxruntime's own format; expected an .onnx file")
     try:
-        _GraphCheck(blob, os.fspath(path), trusted).model()
+        check = _GraphCheck(blob, os.fspath(path), trusted)
+        check.model()
+        return not check.is_deferred
     except ValueError as exc:
         raise _damaged(path, exc) from exc
 
@@ -223,6 +233,7 @@ class _GraphCheck:
         self._reader = _Reader(io.BytesIO(blob), MAX_FIELDS)
         self._size, self._path, self._trusted = len(blob), path, trusted
         self._n_weight_bytes = self._n_folded = 0
+        self.is_deferred = False
         self._constants: dict[bytes, int] = {}  # name to number of values
         self._nodes: list[_Node] = []
 
@@ -318,6 +329,9 @@ class _GraphCheck:
         n_needed = [len(names) for names in needed]
         while ready:
             node = self._nodes[ready.pop()]
+            if node.operator in DEFERRED and sum(self._constants[name] for name in node.inputs) <= MAX_SMALL:
+                self.is_deferred = True  # what it gives is computed in a run: no constant
+                continue
             n_values = self._n_computed(node)
             self._n_folded += n_values
             if self._n_folded > MAX_FOLDED:
@@ -336,7 +350,7 @@ class _GraphCheck:
         sizes = [max(self._constants[name], 1) for name in node.inputs]
         if node.operator in STEADY:
             return max(sizes, default=1)
-        n_values = math.prod(sizes)
+        n_values = sum(sizes) if node.operator == "Concat" else math.prod(sizes)
         if node.operator not in SMALL or n_values > MAX_SMALL:
             self._refuse_unless_trusted(f"has a {node.operator!r} that computes with constants alone")
         return n_values

@@ -12,7 +12,7 @@ from typing import Any
 from edgeperc.datasets.splits import FOLDS, TEST_DRIVES, VALIDATION_DRIVES
 from edgeperc.evaluation.tables import BANDS
 from edgeperc.types.card import ModelCard
-from edgeperc.types.views import CameraGeometry, ObjectGeometry, TopViewGeometry
+from edgeperc.types.views import CameraGeometry, ObjectGeometry, RangeImageGeometry, TopViewGeometry
 from edgeperc.zoo import DEFAULT, MAX_LOSS, OPEN, Variant, digest, resolve
 
 from ..recipe import Recipe
@@ -115,6 +115,7 @@ def _view(card: ModelCard) -> str:
         return f"{view.height} x {view.width} pixels, images are {view.fit}ed to it"
     if isinstance(view, ObjectGeometry):
         return f"{view.n_points} points within {view.margin_m:g} m of each candidate"
+    assert isinstance(view, RangeImageGeometry)  # no detector on pillars is shipped
     return (
         f"{view.height} x {view.width} pixels, azimuth {view.azimuth_left_deg:g} to {view.azimuth_right_deg:g} degrees"
     )

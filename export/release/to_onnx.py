@@ -22,15 +22,15 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from edgeperc.camera.image import ImageScaler
-from edgeperc.errors import EdgepercError
+from edgeperc.errors import CardMismatchError, EdgepercError
 from edgeperc.inference.decode import decode_classes, decode_top_view
 from edgeperc.inference.projection import make_projector, project
-from edgeperc.inference.session import Session, golden_input, golden_shape
+from edgeperc.inference.session import WHOLE, Session, golden_feed, golden_input, golden_shape
 from edgeperc.preprocess.fitness import FitnessProfile
 from edgeperc.system.atomic import open_atomic
 from edgeperc.types.card import CARD_KEY, Golden, ModelCard
 from edgeperc.types.perception import Box
-from edgeperc.types.views import CameraGeometry, ObjectGeometry
+from edgeperc.types.views import CameraGeometry, RangeImageGeometry, TopViewGeometry
 
 from ..cards import card_of
 from ..networks.lodnn import LoDNN
@@ -205,8 +205,17 @@ def with_golden(model: onnx.ModelProto, card: ModelCard) -> ModelCard:
     import onnxruntime
 
     session = onnxruntime.InferenceSession(model.SerializeToString(), providers=["CPUExecutionProvider"])
-    x = golden_input(0, golden_shape(card))
-    outputs = session.run([o.name for o in card.outputs], {card.input.name: x})
+    feed = golden_feed(card, 0)
+    x = feed[card.input.name]
+    nodes = session.get_inputs()
+    if {node.name for node in nodes} != {*feed}:
+        raise CardMismatchError(f"card names inputs {[*feed]}, the graph has {[node.name for node in nodes]}")
+    for node in nodes:
+        kind = WHOLE.get(node.type.removeprefix("tensor(").removesuffix(")"), np.float32)
+        n_more = max(node.shape[0] - len(x), 0) if len(feed) > 1 and isinstance(node.shape[0], int) else 0
+        padding = [(0, n_more), *[(0, 0)] * (feed[node.name].ndim - 1)]
+        feed[node.name] = np.pad(feed[node.name], padding, mode="edge").astype(kind)
+    outputs = session.run([o.name for o in card.outputs], feed)
     records = {}
     for spec, output in zip(card.outputs, outputs, strict=True):
         few = output.size <= N_GOLDEN_VALUES
@@ -229,7 +238,7 @@ def views(card: ModelCard, samples: Sequence[NDArray[Any]]) -> Iterator[tuple[ND
             scaler.fill(sample, image)
             yield image, np.ones(image.shape[1:], np.bool_)
         return
-    assert not isinstance(card.view, ObjectGeometry)  # `compare_objects` makes their input
+    assert isinstance(card.view, RangeImageGeometry | TopViewGeometry)  # `compare_objects` makes inputs of objects
     projector = make_projector(card.view, card.input)
     for sample in samples:
         projected = project(projector, np.ascontiguousarray(sample, np.float32))

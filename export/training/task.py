@@ -23,7 +23,7 @@ from edgeperc.inference.projection import Projection
 from edgeperc.simulation.samples import IGNORE
 from edgeperc.types.card import ModelCard
 from edgeperc.types.perception import Box
-from edgeperc.types.views import CameraGeometry, ObjectGeometry, RangeImageGeometry, TopViewGeometry
+from edgeperc.types.views import RangeImageGeometry, TopViewGeometry
 
 from ..cards import Carded, card_of
 from ..data.scans import LabeledScan
@@ -85,7 +85,7 @@ class Task(Carded, ABC):
     @property
     def view(self) -> RangeImageGeometry | TopViewGeometry:
         """The grid of the network's input."""
-        assert not isinstance(self.card.view, CameraGeometry | ObjectGeometry)
+        assert isinstance(self.card.view, RangeImageGeometry | TopViewGeometry)
         return self.card.view
 
     @abstractmethod

@@ -186,7 +186,7 @@ UNUSUAL = {
     "has a node 'If'": graph(node("If", "x", "y")),
     "has a node 'Scan'": graph(node("Scan", "x", "y")),
     "has a node 'SequenceMap'": graph(node("SequenceMap", "x", "y")),
-    "has a node 'ConstantOfShape'": graph(node("ConstantOfShape", "x", "y")),
+    "has a node 'RandomNormal'": graph(node("RandomNormal", "", "y")),
     r"has a node 'com\.microsoft\.Conv'": graph(node("Conv", "x w", "y", field(7, b"com.microsoft")), INITIALIZER),
     "has a node that holds a graph": graph(node("Conv", "x w", "y", field(5, field(6, b""))), INITIALIZER),
     "holds a sparse tensor": graph(CONVOLUTION, field(15, b"")),
@@ -199,6 +199,19 @@ UNUSUAL = {
     ),
     "more than 20000 nodes": graph(*[node("Relu", "x", "y")] * 20_001),
 }
+
+
+SMALL_SHAPE = field(5, tensor("shape", (2,), np.array([2**20, 2**20]).astype("<i8").tobytes(), 7))
+
+
+@pytest.mark.parametrize("operator", ["ConstantOfShape", "Range", "Expand", "Tile", "NonZero"])
+def test_sizes_by_constants_wait_for_a_run(operator: str) -> None:
+    """Whatever they are, nothing is computed while the file is opened: neither they nor what follows from them."""
+    later = graph(SMALL_SHAPE, node(operator, "shape", "z"), node("Tanh", "z", "y"))
+    assert not check_graph(model(later), "model.onnx")
+    by_input = graph(SMALL_SHAPE, node(operator, "x", "z"), node("Tanh", "z", "y"))
+    assert check_graph(model(by_input), "model.onnx")
+    assert check_graph(model(graph(CONVOLUTION, INITIALIZER)), "model.onnx")
 
 
 @pytest.mark.parametrize("message", UNUSUAL)
