@@ -23,11 +23,8 @@ MOST_LOST = 0.01
 
 
 def agreement(reference: Sequence[Prediction], found: Sequence[Prediction]) -> dict[str, Any]:
-    """Compare predictions with those of the reference on the same scans.
-
-    Returns: ``"n_scans"``; for ``"points"`` in view, ``"cells"`` and ``"pixels"`` of images: the share of ``equal``
-        labels, and ``mean_iou`` with the reference as ground truth; for ``"boxes"``: ``n_reference``, ``n_found``,
-        ``n_both`` (IoU at least 0.5) and ``f1``. An entry is None if the models do not predict it.
+    """Compare predictions with the reference's on the same scans: of points in view, cells and pixels the share of
+    equal labels and the mean IoU, of boxes the matches at IoU 0.5 and F1. None for what the models do not predict.
     """
     result: dict[str, Any] = {"n_scans": len(reference), "points": None, "cells": None, "pixels": None, "boxes": None}
     points, cells, pixels = [], [], []
@@ -61,10 +58,8 @@ def agreement(reference: Sequence[Prediction], found: Sequence[Prediction]) -> d
 
 
 def correctness(predictions: Sequence[Prediction], truth: Sequence[SimulatedScan]) -> dict[str, float | None]:
-    """Evaluate on the ground truth of simulated scans: ``points_mean_iou``, ``cells_mean_iou``, ``vehicle_ap50``.
-
-    An entry is None if the models do not predict it, or predict other classes than the simulator's. A few scans only
-    check an engine; `edgeperc eval` evaluates a model.
+    """Figures on the truth of simulated scans; None for what is not predicted, or has other classes than the
+    simulator's. A few scans only check an engine; `edgeperc eval` evaluates a model.
     """
     points, cells, boxes = Confusion(POINT_CLASSES), Confusion(TOP_VIEW_CLASSES), BoxEvaluator()
     for predicted, scan in zip(predictions, truth, strict=True):
@@ -86,10 +81,7 @@ def correctness(predictions: Sequence[Prediction], truth: Sequence[SimulatedScan
 
 
 def agrees(accuracy: Mapping[str, Any]) -> bool:
-    """Whether predictions are as good as the reference's.
-
-    accuracy : ``"agreement"`` from `agreement`; ``"truth"`` and ``"reference_truth"`` from `correctness`, or None.
-    """
+    """Whether predictions are as good as the reference's: `agreement` with it, and `correctness` of both, or None."""
     same = accuracy["agreement"]
     if any(same[kind] is not None and same[kind]["equal"] < LEAST_EQUAL for kind in ("points", "cells")):
         return False

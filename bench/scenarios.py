@@ -33,45 +33,29 @@ class Clock:
 
 @dataclass(frozen=True)
 class Limits:
-    """How long a scenario lasts: until all limits are reached.
-
-    warm_up_scans : scans before the first one that counts.
-    stride : only every ``stride``-th scan leaves a sample, because the samples of a long run would themselves be memory
-        growth.
-    """
+    """How long a scenario lasts: until all limits are reached."""
 
     min_scans: int = 100
     min_seconds: float = 10.0
-    warm_up_scans: int = 20
-    stride: int = 1
+    warm_up_scans: int = 20  # before the first one that counts
+    stride: int = 1  # every ``stride``-th scan leaves a sample: those of a long run would be memory growth
 
 
 @dataclass
 class Timings:
-    """Measurements of one scenario, one number per scan, in order.
+    """Measurements of one scenario, one number per sampled scan, in order."""
 
-    n : scans perceived, without the warm-up.
-    stride : every ``stride``-th scan has a sample.
-    first_s : when the first scan that counts arrived, on the clock.
-    start_s : start of each call since then [s].
-    ms : wall time of each call, from scan to result.
-    age_ms : time from the arrival of each scan to its result; equal to ``ms`` if scans do not arrive at a rate.
-    stage_ms : as `edgeperc.Perception.stage_ms`.
-    warm_up_ms : wall time of the calls before those that count.
-    missed : results that were not complete when the next scan arrived.
-    skipped : scans left out because a newer one had arrived before their turn; they have no sample.
-    """
-
-    n: int = 0
+    n: int = 0  # scans perceived, without the warm-up
     stride: int = 1
-    first_s: float = 0.0
-    start_s: list[float] = field(default_factory=list)
-    ms: list[float] = field(default_factory=list)
+    first_s: float = 0.0  # when the first scan that counts arrived, on the clock
+    start_s: list[float] = field(default_factory=list)  # since then
+    ms: list[float] = field(default_factory=list)  # from scan to result
+    # from the arrival of the scan; ``ms`` if scans do not arrive at a rate
     age_ms: list[float] = field(default_factory=list)
-    stage_ms: dict[str, list[float]] = field(default_factory=dict)
+    stage_ms: dict[str, list[float]] = field(default_factory=dict)  # as `edgeperc.Perception.stage_ms`
     warm_up_ms: list[float] = field(default_factory=list)
-    missed: int = 0
-    skipped: int = 0
+    missed: int = 0  # results that were not complete when the next scan arrived
+    skipped: int = 0  # scans that a newer one overtook; they have no sample
 
     def add(self, start_s: float, ms: float, age_ms: float, stage_ms: Mapping[str, float]) -> None:
         """Record one call."""
@@ -113,10 +97,8 @@ def back_to_back(
     keep_going: KeepGoing = lambda timings: True,
     on_start: Callable[[], None] = lambda: None,
 ) -> Timings:
-    """Perceive one scan after the other, the next as soon as there is a result (MLPerf's single stream).
-
-    scans : sequence of (n, 4) float32; used in turn.
-    on_start : called between the warm-up and the first scan that counts.
+    """Perceive one scan after the other, the next as soon as there is a result (MLPerf's single stream); ``on_start``
+    is called between the warm-up and the first scan that counts.
     """
     clock = clock or Clock()
     timings = _warm_up(perceive, scans, limits, clock, keep_going)
@@ -141,13 +123,8 @@ def paced(
     keep_going: KeepGoing = lambda timings: True,
     on_start: Callable[[], None] = lambda: None,
 ) -> Timings:
-    """Perceive scans as they arrive, ``rate_hz`` per second.
-
-    Scan k arrives at the first one's time plus k / rate on the monotonic clock, so the schedule does not drift. Until
-    then the thread sleeps, so that cores idle and clocks fall as they do in a vehicle. After a late result, the newest
-    scan that has arrived is next and those before it are skipped.
-
-    perceive, scans, limits, clock, keep_going, on_start : as in `back_to_back`. Warm-up is back to back.
+    """Perceive scans as they arrive: scan k at the first one's time plus k / rate, so that the schedule does not drift.
+    Until then the thread sleeps, as in a vehicle; after a late result the newest scan is next. Warm-up is back to back.
     """
     clock = clock or Clock()
     timings = _warm_up(perceive, scans, limits, clock, keep_going)
@@ -171,11 +148,8 @@ def paced(
 
 
 def throughput(calls: Sequence[tuple[Sequence[float], Sequence[float]]]) -> tuple[float, float]:
-    """Scans per second of several processes together, while all of them were running.
-
-    calls : sequence of (start_s, ms); of each process, on one clock.
-    Returns scans_per_s: NaN if there was no such time.
-    Returns seconds: Length of that time.
+    """Scans per second of processes' calls (start_s, ms) while all of them were running, NaN without such a time; its
+    length [s].
     """
     ends = [np.asarray(start) + np.asarray(ms) / 1e3 for start, ms in calls]
     if not ends or not all(map(len, ends)):

@@ -120,10 +120,8 @@ def around(seed: int, sensor: SensorProfile) -> tuple[list[NDArray[np.float32]],
 
 
 def time_turn(name: str, n_turns: int) -> str:
-    """Median times of four sensors as one turn, and of single scans of as many points, in turns [ms].
-
-    The single scans are of a sensor of the same kind that sees all around, and of an HDL-64E, whose range image has no
-    gaps to fill.
+    """Median times [ms] of four sensors as one turn, and of single scans of as many points in turns: of a sensor of the
+    same kind that sees all around, and of an HDL-64E, whose range image has no gaps to fill.
     """
     profile = get_sensor(name)
     assert profile.pattern is not None

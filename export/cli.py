@@ -57,10 +57,8 @@ SHARED: Mapping[str, Mapping[str, Any]] = {
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one command.
-
-    Returns: 0: success; 1: a model was refused or a scene was left out; 2: wrong usage or unusable files; 130
-        interrupted, 141 the program that reads the output closed it, 143 terminated.
+    """Run one command: 0 success, 1 a model was refused or a scene left out, 2 wrong usage or unusable files, 130
+    interrupted, 141 the program that reads the output closed it, 143 terminated.
     """
     given = list(sys.argv[1:] if argv is None else argv)
     return run_program("edgeperc-export", lambda: _run(given))
@@ -145,10 +143,7 @@ def _title(networks: tuple[str, ...]) -> str:
 
 
 def recipe_of(args: argparse.Namespace) -> Recipe:
-    """The recipe of a ``train`` command.
-
-    Raises ValueError.
-    """
+    """The recipe of a ``train`` command; ValueError for options without effect."""
     if args.recipe == "paper" and args.network not in PAPER:
         raise ValueError(f"--recipe paper is for {', '.join(PAPER)}; got {args.network}")
     given = {}

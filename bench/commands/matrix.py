@@ -111,13 +111,8 @@ def run_command(arguments: argparse.Namespace) -> int:
 def settings_to_try(
     model: str, providers: Sequence[str], precisions: Sequence[str], present: Sequence[str]
 ) -> tuple[list[tuple[str, str]], list[str]]:
-    """Select the settings of a model that this computer can run.
-
-    model : as `edgeperc.Perceiver` takes it.
-    providers, precisions : what the user asked for.
-    present : the providers of this computer.
-    Returns settings: list of (provider, precision).
-    Returns skipped: One sentence for each requested setting that this computer cannot run.
+    """The (provider, precision) of a model among those asked for that this computer can run with the providers that are
+    ``present``, and a sentence for each other one.
     """
     variants = resolve(model)
     settings, skipped = [], []

@@ -72,13 +72,8 @@ def run_command(arguments: argparse.Namespace) -> int:
 
 
 def memory_growth(rss_mb: Sequence[Sequence[float]], settling: int) -> dict[str, Any]:
-    """Test whether memory grew.
-
-    rss_mb : sequence of (scans done, MB)
-    settling : number of scans before the first sample.
-    Returns: ``verdict`` (grows, level, undecided), ``growth_mb`` over the run by a straight line and its
-        ``growth_error_mb`` (half of a 95 % interval), ``last_minus_first_mb``, ``sentences``. Memory grows if the
-        interval lies above 0 and the growth above `LEVEL_MB`; it is level if the interval ends below `LEVEL_MB`.
+    """Whether memory, samples of (scans done, MB), grew after settling: if the 95 % interval of a line's growth lies
+    above 0 and the growth above `LEVEL_MB`; it is level if the interval ends below `LEVEL_MB`.
     """
     done, mb = np.asarray(rss_mb, np.float64).reshape(-1, 2).T
     line = trend(done, mb)

@@ -37,9 +37,8 @@ def camera_images(view: CameraGeometry, folder: Path) -> tuple[Path, ...]:
 
 
 class NumpyCamera:
-    """`edgeperc.Perceiver` of images without edgeperc's stages, for images of the model's own size.
-
-    card : of the camera; its class output is the engine's only one.
+    """`edgeperc.Perceiver` of images of the model's own size without edgeperc's stages; the class output is the
+    engine's only one.
     """
 
     def __init__(self, card: ModelCard, engine: Engine) -> None:
@@ -70,9 +69,8 @@ def _table(n_in: int, n_out: int) -> NDArray[np.float32]:
 
 
 def small_unet(card: ModelCard, precision: str, n_threads: int) -> Callable[[NDArray[np.uint8]], Any]:
-    """The small U-Net in torch, eagerly: a function from an image (H, W, 3) uint8 to labels that mean nothing.
-
-    Input, classes and scaling are those of a card; ``"bf16"`` is by autocast.
+    """The small U-Net in torch, eagerly (``"bf16"`` by autocast), with a card's input, classes and scaling: from an
+    image (H, W, 3) uint8 to labels that mean nothing.
     """
     import torch
 

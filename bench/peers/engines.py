@@ -21,10 +21,8 @@ from .arithmetic import openvino_request
 
 @dataclass(frozen=True)
 class Engine:
-    """A network ready to run.
-
-    input : (C, H, W) float32; write here, then `run`.
-    run : returns the outputs by their names in the graph, without the batch axis.
+    """A network ready to run: write its ``input`` (C, H, W), then ``run`` returns the outputs by name, without the
+    batch axis.
     """
 
     input: NDArray[np.float32]
@@ -32,11 +30,8 @@ class Engine:
 
 
 def open_engine(library: str, precision: str, path: Path, n_threads: int) -> Engine:
-    """Open a model in an engine.
-
-    library : onnxruntime is its CPU provider. MNN and ncnn run the graph as their own converters translate it.
-    precision : ``"fp32"`` or ``"bf16"``, in torch by autocast; onnxruntime, MNN and ncnn ignore it.
-    Raises ModelError.
+    """Open a model in an engine; onnxruntime is its CPU provider. Only torch (by autocast) and openvino know
+    ``"bf16"``; MNN and ncnn run what their converters make of the graph. Raises ModelError.
     """
     if library in ("mnn", "ncnn"):
         with tempfile.TemporaryDirectory() as folder:
@@ -158,10 +153,7 @@ def _signature(path: Path) -> tuple[str, tuple[int, ...], list[str]]:
 
 
 def torch_network(path: Path) -> tuple[Any, tuple[int, ...], list[str]]:
-    """Translate a model's graph to a torch module; also the shape of its input and the names of its outputs.
-
-    Raises ModelError.
-    """
+    """A model's graph as a torch module, the shape of its input and the names of its outputs. Raises ModelError."""
     import onnx
     import torch
 

@@ -106,10 +106,7 @@ def ground_finders(peers: Mapping[str, Any], sensor: SensorProfile = SENSOR) -> 
 
 
 def clusterers(points: Scan, peers: Mapping[str, Any]) -> dict[str, Clusterer]:
-    """By name: calls that cluster the points, (n,) int.
-
-    Raises AssertionError.
-    """
+    """By name: calls that cluster the points, (n,) int; AssertionError if DBSCAN's differ from `find_clusters`'."""
     calls: dict[str, Clusterer] = {
         "find_clusters": lambda: find_clusters(points),
         "find_clusters, 0.5 m": lambda: find_clusters(
@@ -131,9 +128,8 @@ def clusterers(points: Scan, peers: Mapping[str, Any]) -> dict[str, Clusterer]:
 
 
 def tree_clusters(points: Scan) -> NDArray[np.signedinteger[Any]]:
-    """Clusters by a k-d tree, (n,) int: points in voxels whose first points have no gap above `DISTANCE_M`.
-
-    Voxels, then distances: as `pcl::EuclideanClusterExtraction` is mostly used, with scipy's tree.
+    """Clusters by a k-d tree, (n,) int: voxels whose first points have no gap above `DISTANCE_M`, as
+    `pcl::EuclideanClusterExtraction` is mostly used.
     """
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components

@@ -56,11 +56,7 @@ RANGE_IMAGE_INPUT = InputSpec(
 
 @njit(cache=True, nogil=True)
 def fill_copy(points: NDArray[np.float32], copy: NDArray[np.float32]) -> None:
-    """Copy the points, number by number.
-
-    points : (n, 4) float32, C-contiguous
-    copy : (n, 4) float32, overwritten
-    """
+    """Copy the points (n, 4), number by number."""
     for i in range(points.shape[0]):
         for k in range(4):
             copy[i, k] = points[i, k]
@@ -105,10 +101,7 @@ class _NumpyProjector:
 
 
 class NumpyTopView(_NumpyProjector):
-    """`TopViewProjector` in numpy.
-
-    input : channels distance, remission, height.
-    """
+    """`TopViewProjector` in numpy, of the channels distance, remission, height."""
 
     def __init__(self, view: TopViewGeometry, input: InputSpec) -> None:
         super().__init__(view, input)
@@ -136,9 +129,8 @@ class NumpyTopView(_NumpyProjector):
 
 
 class NumpyRangeImage(_NumpyProjector):
-    """`RangeImageProjector` in numpy, for the front quarter.
-
-    input : channels x, y, z, remission, range and, if wanted, height_above_ground.
+    """`RangeImageProjector` in numpy, for the front quarter: x, y, z, remission, range and, if wanted,
+    height_above_ground.
     """
 
     def __init__(self, view: RangeImageGeometry, input: InputSpec) -> None:
@@ -187,10 +179,7 @@ def winners(
 
 
 def contenders(points: NDArray[np.float32]) -> dict[str, Callable[[], object]]:
-    """The calls to measure, by their names in the table, each with its own buffers.
-
-    Raises AssertionError.
-    """
+    """The calls to measure by their names in the table, each with its own buffers; AssertionError if results differ."""
     copy = np.empty_like(points)
     calls: dict[str, Callable[[], object]] = {"copy loop": lambda: fill_copy(points, copy)}
 

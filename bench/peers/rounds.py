@@ -21,10 +21,8 @@ def elapsed_ms(call: Callable[[], object]) -> float:
 
 
 def measure(calls: Mapping[str, Callable[[], object]], n_rounds: int) -> dict[str, NDArray[np.float64]]:
-    """Milliseconds of each call in each round, by name.
-
-    Each round makes every call once, in a new random order, so that caches and other busy processes affect all of them
-    equally. The first `N_WARM_UP` rounds do not count.
+    """Milliseconds of each call in each round, by name; the first `N_WARM_UP` do not count. Each round makes every call
+    in a new random order, so that caches and other processes affect all of them equally.
     """
     ms = {name: np.empty(N_WARM_UP + n_rounds) for name in calls}
     rng = np.random.default_rng(0)

@@ -73,25 +73,16 @@ Odometry = Callable[[Sequence[Points]], Poses]
 
 @dataclass(frozen=True, eq=False)
 class Drive:
-    """Consecutive scans.
-
-    scans : list of (n, 4) float32
-    poses : (k, 4, 4) float64 or None; true poses of the sensor.
-    moving : list of (n,) bool, or None; points on objects that move; None: from ``labels``.
-    usable : list of (n,) bool; points for KISS-ICP.
-    known : list of (n,) bool; points of which it is known whether they move.
-    labels : true boxes of each scan, of all objects; empty if ``moving`` is known.
-    trained : whether a model was trained on one of the scans.
-    """
+    """Consecutive scans."""
 
     name: str
     scans: list[Points]
-    poses: Poses | None
-    moving: list[NDArray[np.bool_]] | None
-    usable: list[NDArray[np.bool_]]
-    known: list[NDArray[np.bool_]]
-    labels: list[list[Box]]
-    trained: bool = False
+    poses: Poses | None  # (k, 4, 4), true poses of the sensor
+    moving: list[NDArray[np.bool_]] | None  # points on objects that move; None: from ``labels``
+    usable: list[NDArray[np.bool_]]  # points for KISS-ICP
+    known: list[NDArray[np.bool_]]  # points of which it is known whether they move
+    labels: list[list[Box]]  # true boxes of each scan, of all objects; empty if ``moving`` is known
+    trained: bool = False  # a model was trained on one of the scans
 
 
 def drawn_streets(n_scans: int, wanted: Sequence[str] = ()) -> Iterator[Drive]:
@@ -139,9 +130,8 @@ def real_drives(
 
 
 def moving_boxes(labels: Sequence[Sequence[Box]], poses: Poses) -> list[list[Box]]:
-    """The boxes of objects that move, by scan: labels tracked with known poses of the sensor.
-
-    An object moves in a scan if its track moves in this one or in one of `MOVING_AROUND` before or after it.
+    """The boxes of objects that move, by scan: labels tracked with known poses. An object moves in a scan if its track
+    moves in this one or in one of `MOVING_AROUND` before or after it.
     """
     tracker = Tracker()
     numbers: list[dict[int, int]] = []  # index of a box -> its track
@@ -163,10 +153,7 @@ def moving_boxes(labels: Sequence[Sequence[Box]], poses: Poses) -> list[list[Box
 
 
 def trajectory_error(true: Poses, found: Poses) -> float:
-    """Root of the mean squared distance of positions [m], after the best rigid alignment.
-
-    true, found : (k, 4, 4) float64
-    """
+    """Root of the mean squared distance of positions of poses (k, 4, 4) [m], after the best rigid alignment."""
     a, b = (poses[:, :3, 3] - poses[:, :3, 3].mean(axis=0) for poses in (true, found))
     u, _, v = np.linalg.svd(b.T @ a)
     turn = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ v))]) @ v
@@ -192,12 +179,7 @@ def ghost_share(
     moving: Sequence[NDArray[np.bool_]],
     poses: Poses,
 ) -> float:
-    """Share of the map's cells that hold a kept point of a moving object.
-
-    scans : sequence of (n, 4) float32
-    kept, moving : sequence of (n,) bool
-    poses : (k, 4, 4) float64
-    """
+    """Share of the map's cells that hold a kept point of a moving object, of scans at their poses (k, 4, 4)."""
     cells: list[list[NDArray[np.int64]]] = [[], []]
     for points, stays, moves, pose in zip(scans, kept, moving, poses, strict=True):
         places = np.floor((points[:, :3] @ pose[:3, :3].T + pose[:3, 3]) / CELL_M).astype(np.int64)
@@ -223,15 +205,11 @@ def kiss_icp(scans: Sequence[Points]) -> Poses:
 
 @dataclass(frozen=True)
 class Seen:
-    """What is left out of the scans of a drive, and the median processor time of a scan.
+    """What is left out of the scans of a drive, and the median processor time of a scan."""
 
-    kept : dict of str to list of (n,) bool; by variant, in their order; without the second pass.
-    poses : (k, 4, 4) float64; of the sensor, as the tracker estimates them.
-    """
-
-    kept: dict[str, list[NDArray[np.bool_]]]
+    kept: dict[str, list[NDArray[np.bool_]]]  # by variant in their order, without the second pass
     perceptions: list[Perception]
-    poses: Poses
+    poses: Poses  # (k, 4, 4), of the sensor, as the tracker estimates them
     ms: float
 
 

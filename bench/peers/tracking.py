@@ -66,9 +66,8 @@ def drawn_street(n_scans: int = 400, seed: int = 0) -> list[list[Box]]:
 def crossing(
     n_scans: int, n_targets: int = 200, n_false: int = 100, seed: int = 0
 ) -> Iterator[tuple[list[Box], NDArray[np.float64]]]:
-    """Boxes, and true places (n_targets, 2), of cars that cross in 120 m by 120 m and turn around at its edges.
-
-    Every other car is missed in three scans of ten; false alarms lie anywhere.
+    """Boxes, and true places (n_targets, 2), of cars that cross in 120 m by 120 m and turn around at its edges; every
+    other one is missed in three scans of ten, and false alarms lie anywhere.
     """
     rng = np.random.default_rng(seed)
     places, heading = rng.uniform(-60.0, 60.0, (n_targets, 2)), rng.uniform(-math.pi, math.pi, n_targets)
@@ -86,10 +85,8 @@ def crossing(
 
 
 def every_second_beam(root: Path, out: Path) -> None:
-    """Write the drives of an HDL-64E as if it had half the beams and its remission were squared, as a byte.
-
-    root : an object set with track ids; its scans hold one beam after the other, each a turn from ahead, as KITTI's.
-    out : becomes an object set; its ``sensor.json`` is the coarser sensor, without a fitted remission function.
+    """Write the drives of an object set with track ids, of an HDL-64E beam by beam, as if it had half the beams and its
+    remission were squared, as a byte; ``sensor.json`` is that sensor.
     """
     for folder in ("label_2", "track_id", "calib"):
         shutil.copytree(root / "training" / folder, out / "training" / folder)

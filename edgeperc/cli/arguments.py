@@ -29,13 +29,8 @@ def add_command(
     description: str,
     examples: Sequence[str],
 ) -> argparse.ArgumentParser:
-    """Add a subcommand.
-
-    commands : argparse's subparsers
-    command : takes the parsed arguments and returns the exit code.
-    help : the line in the list of commands.
-    examples : command lines, printed below the options.
-    Returns argparse.ArgumentParser.
+    """Add a subcommand: ``command`` takes the parsed arguments and returns the exit code, ``examples`` are printed
+    below the options.
     """
     parser: argparse.ArgumentParser = commands.add_parser(
         name,

@@ -33,18 +33,12 @@ _REINSTALL = "pip install --force-reinstall edgeperc"
 
 @dataclass(frozen=True)
 class Finding:
-    """One line of the report.
+    """One line of the report."""
 
-    name : what was examined, e.g. ``"cache folder"``.
-    state : {"ok", "note", "broken"}; ``"note"`` is something that edgeperc works without; ``"broken"`` something that
-        it needs.
-    advice : A command or what to do; empty if nothing is to be done.
-    """
-
-    name: str
-    state: Literal["ok", "note", "broken"]
+    name: str  # what was examined, e.g. "cache folder"
+    state: Literal["ok", "note", "broken"]  # "note": edgeperc works without it; "broken": it needs it
     found: str
-    advice: str = ""
+    advice: str = ""  # a command or what to do; empty if nothing is to be done
 
 
 def add_parser(commands: Commands) -> None:

@@ -20,11 +20,8 @@ if TYPE_CHECKING:
 
 
 class Report:
-    """Prints the result of each scan, and counts scans and failures.
-
-    n, n_failed : int; number of scans, and of failed scans.
-    tracks : list of Tracks; tracks of every scan, kept only for ``--gif``.
-    under : list of bytes; `edgeperc.view.flatten_scan` of every scan, drawn under the tracks.
+    """Prints the result of each scan, and counts scans and failures; for ``--gif`` it keeps the tracks of every scan,
+    and its `edgeperc.view.flatten_scan` to draw under them.
     """
 
     def __init__(self, arguments: argparse.Namespace, images: Mapping[Path, Path | None]) -> None:

@@ -114,11 +114,8 @@ def perceive_side_by_side(
     report: Report,
     show: Callable[[int, int], None],
 ) -> None:
-    """Perceive scan files in worker processes, and report them in their order.
-
-    Next to the files of a scan, ``.run/NAME.json`` records what they were made of: the scan, the options, the models,
-    and what was learned from the first scans. A scan is not perceived again if its record says the same and its files
-    have the recorded sizes. The first scans are always perceived again.
+    """Perceive scan files in worker processes, and report them in their order. ``.run/NAME.json`` next to a scan's
+    files says what they were made of; a later run keeps those that are the same and complete, but the first scans.
     """
     perceive, run, _ = alone(arguments, perceivers)
     n_first = 0

@@ -111,11 +111,8 @@ def wanted_sinks(arguments: argparse.Namespace) -> list[str]:
 
 
 class Sinks:
-    """The sinks of the passed options: each gets every scan and is closed, whatever becomes of the others.
-
-    Errors of options and missing extras come from the constructor, before the first scan.
-
-    n_failed : int; files that could not be finished.
+    """The sinks of the passed options, made before the first scan: each gets every scan and is closed, whatever becomes
+    of the others. ``n_failed`` counts files that could not be finished.
     """
 
     def __init__(self, arguments: argparse.Namespace) -> None:
@@ -139,10 +136,7 @@ class Sinks:
         self._stack.close()
 
     def write(self, scan: PerceivedScan) -> None:
-        """Write one scan.
-
-        Raises EdgepercError, OSError: A sink could not; the first error.
-        """
+        """Write one scan to all sinks; raises the first EdgepercError or OSError of them."""
         errors: list[Exception] = []
         for sink in self._sinks:
             try:

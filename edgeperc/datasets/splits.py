@@ -72,13 +72,8 @@ def fold_of(drive: str) -> int | None:
 
 
 def in_split(drive: str, split: str, fold: int | None = None) -> bool:
-    """Whether a drive belongs to ``"train"``, ``"validation"``, ``"test"`` or ``"all"``.
-
-    With a ``fold``, that fold is for validation and the other two for training. Without one, all folds are for training
-    and `VALIDATION_DRIVES` for validation. A drive that is not listed here (a user's own scans) is for both training
-    and testing; `unseen` then detects training scans by the hashes in a model's card.
-
-    Raises OptionError.
+    """Whether a drive is of "train", "validation", "test" or "all". With a ``fold`` that one is for validation, else
+    `VALIDATION_DRIVES`. A user's own drive is for training and testing: cards hold hashes. Raises OptionError.
     """
     if split not in ("train", "validation", "test", "all"):
         raise OptionError(f"split is {split!r}; expected train, validation, test or all")

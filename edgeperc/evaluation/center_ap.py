@@ -51,12 +51,8 @@ def count_centers(
     drive: str,
     unknown: Collection[str] = ("ignore",),
 ) -> CenterTable:
-    """Match the detections of one scan.
-
-    boxes : detections where objects are labeled.
-    to_find, ignored : from `metrics.boxes_to_find`. A detection without a match does not count if an ignored object
-        of its class or of an ``unknown`` class is as near as a match.
-    unknown : collection of str
+    """Match the detections of one scan, where objects are labeled, with those of `metrics.boxes_to_find`; one without a
+    match does not count if an ignored object of its or an ``unknown`` class is as near as a match.
     """
     table = CenterTable()
     for label, farthest_m in CLASSES.items():
@@ -72,10 +68,8 @@ def count_centers(
 
 
 def center_scores(table: CenterTable, label: str) -> dict[str, float]:
-    """Scores of one class: ``"ap"``, ``"ap_0.5"`` .. ``"ap_4"``, and the errors of matches within 2 m.
-
-    ``"ate"`` is the mean error of the place [m], ``"ase"`` that of the size and ``"aoe"`` that of the heading [rad];
-    means over the recalls from 0.1 to the largest one, 1 if that is not reached. All are NaN without objects.
+    """AP of one class, mean and by distance; mean errors of matches within 2 m of place [m], size and heading [rad],
+    over recalls from 0.1 to the largest one, 1 if that is not reached. All are NaN without objects.
     """
     n_truth = len(table.objects.get(label, ()))
     curves = {d: _curve(table.guesses.get((label, d), ()), n_truth) for d in DISTANCES_M}

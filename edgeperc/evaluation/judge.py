@@ -76,20 +76,8 @@ NETWORK_ALONE = Perceiving(boxes_from="network", rules=())
 
 
 class Judge:
-    """Perceives scans and compares the results with their truth.
-
-    models : names of shipped models, or paths. Range-image models are evaluated by points, top-view models by boxes
-        and cells.
-    n_threads : as in `Perceiver`.
-    road_by : a top-view model that supplies the true road of KITTI frames, because KITTI's labels have no road.
-        SSADNet (3.1.2) uses LoDNN in this way.
-    training_scans : also evaluate scans that a model was trained on.
-    mounted : perceive each scan as a sensor mounted so would have recorded it, with the mounting to be estimated from
-        this scan alone. Points (not pixels) and boxes are evaluated. None: as recorded, on the training vehicle.
-    sensor : the sensor of the scans for `record_scan`, with what is known of its mounting; their points are evaluated
-        by the classes of the model. None: the training vehicle's, and `POINT_CLASSES`; where
-        surroundings are told apart, simulated scans by the classes of the model, too.
-    Raises ModelError, OptionError.
+    """Compares perceptions with their truth. ``road_by`` draws the road that KITTI's labels lack (SSADNet 3.1.2);
+    ``mounted``: scans as of a sensor mounted so, found from each alone; ``sensor``: of `record_scan`.
     """
 
     def __init__(
@@ -147,10 +135,7 @@ class Judge:
         self.trained_on = {} if training_scans else training_scans_of(cards)
 
     def kitti(self, frame: Frame) -> Truth:
-        """The truth of a KITTI frame.
-
-        Raises SplitError.
-        """
+        """The truth of a KITTI frame; raises SplitError."""
         check_unseen(self.trained_on, frame.name, frame.drive, frame.points)
         if self.draw_road is None:
             return kitti_truth(frame, self.view)
@@ -160,10 +145,7 @@ class Judge:
         return kitti_truth(frame, self.view, (f"road drawn by {card.name} {card.version}", drawn.road))
 
     def semantickitti(self, frame: RoadFrame) -> Truth:
-        """The truth of a SemanticKITTI frame.
-
-        Raises SplitError.
-        """
+        """The truth of a SemanticKITTI frame; raises SplitError."""
         check_unseen(self.trained_on, frame.name, frame.drive, frame.points)
         return semantickitti_truth(frame, self.view)
 
@@ -172,18 +154,12 @@ class Judge:
         return simulated_truth(seed, self.view, self.point_classes)
 
     def record(self, truth: Truth) -> tuple[Record, Mistakes | None]:
-        """Evaluate one scan.
-
-        truth : from `kitti`, `semantickitti` or `simulated`.
-        Returns record: Counts for `edgeperc.evaluation.tables.figures`.
-        Returns mistakes: None if the objects of the scan are not labeled.
-        """
+        """Evaluate one scan; there are no mistakes of scans whose objects are not labeled."""
         perception = self._perceive(truth.points)
         return self._compare(truth, perception, perception.boxes)
 
     def record_scan(self, frame: ScanFrame) -> tuple[Record, Mistakes | None]:
         """Evaluate one scan of a `ScanFolder`, perceived as a user's: its mounting is found from scans of its drive.
-
         Raises SplitError.
         """
         truth, perception, scan_boxes = self._perceive_frame(frame)
@@ -241,10 +217,8 @@ class Judge:
     def _count_boxes(
         self, tallies: dict[tuple[str, ...], Any], truth: Truth, perception: Perception, mistakes: Mistakes
     ) -> Mistakes:
-        """Match boxes where the truth is known; predicted and true ones with their center elsewhere count for nothing.
-
-        Boxes of the classes and in the view that are detected are matched by axis-aligned and by oriented footprints.
-        Vehicles, pedestrians and cyclists are matched all round, detected or not.
+        """Match boxes where the truth is known, upright and oriented, of the classes and in the view that are detected;
+        and vehicles, pedestrians and cyclists all round, detected or not.
         """
 
         def known(box: Box) -> bool:
@@ -299,9 +273,8 @@ class Judge:
         mistakes: Mistakes,
         shown: NDArray[np.bool_],
     ) -> Mistakes:
-        """Count point labels after refinement, pixel labels before it, and the causes of wrong labels.
-
-        Objects of classes without evaluated boxes count as found if at least half of their points have their label.
+        """Count labels of points, of pixels before refinement, and causes of wrong ones. Objects of classes without
+        evaluated boxes count as found if at least half of their points have their label.
         """
         assert self.from_sensor is not None
         assert truth.labels is not None
@@ -424,10 +397,7 @@ def _without_vehicles(classes: tuple[str, ...], right: NDArray[np.uint8]) -> tup
 
 
 def _renamed(labels: Labels, names: Sequence[str], classes: Sequence[str]) -> NDArray[np.uint8]:
-    """Convert a model's labels to those of a table; classes that the table lacks become its first class.
-
-    `IGNORE` stays as it is.
-    """
+    """A model's labels as those of a table, whose first class stands for what it lacks; `IGNORE` stays as it is."""
     coarse = {"drivable": "road", **dict.fromkeys(VEHICLES, "vehicle")}
     renamed = [name if name in classes else coarse.get(name, "") for name in names]
     numbers = np.full(IGNORE + 1, IGNORE, np.uint8)

@@ -37,17 +37,11 @@ BIRDS_EYE, IN_3D = "bird's eye", "3-D"
 
 @dataclass(frozen=True, slots=True)
 class Counts:
-    """Matches of one scan, for one class and one rule.
+    """Matches of one scan, for one class and one rule."""
 
-    objects : one for each object to find.
-    hits : scores of the first pass: of the best detection of each object.
-    steps : tuple of (float, int, int); change of the number of true and of false positives as the threshold falls to a
-        score, best score first.
-    """
-
-    objects: tuple[ObjectKey, ...]
-    hits: tuple[float, ...]
-    steps: tuple[tuple[float, int, int], ...]
+    objects: tuple[ObjectKey, ...]  # one for each object to find
+    hits: tuple[float, ...]  # scores of the first pass: of the best detection of each object
+    steps: tuple[tuple[float, int, int], ...]  # change of true and false positives as the threshold falls to a score
 
 
 @dataclass(slots=True)
@@ -87,11 +81,8 @@ def image_size_of(drive: str) -> tuple[int, int]:
 
 
 def count_in_image(truth: FrontTruth, boxes: Sequence[Box], drive: str) -> ApTable:
-    """Count the matches of one scan as KITTI's benchmark does.
-
-    truth : DontCare rectangles have no 3-D boxes, so no detection is excused by them from above and in 3-D.
-    boxes : detections in the sensor frame. Those that the image does not show are left out, as in a submission. The
-        rectangle of a detection is its projection, clipped to the image.
+    """Count the matches of one scan as KITTI's benchmark does. Detections that the image does not show are left out, as
+    in a submission. DontCare has no 3-D boxes, so it excuses no detection from above and in 3-D.
     """
     kinds, numbers = _objects(truth.labels)
     placed = truth.calibration.sensor_boxes(numbers[:, 7:14])
@@ -134,12 +125,8 @@ def count_all_round(
     drive: str,
     unknown: Collection[str] = ("ignore",),
 ) -> ApTable:
-    """Count the matches of one scan without the limits in the image.
-
-    boxes : detections where objects are labeled.
-    to_find, ignored : from `metrics.boxes_to_find`. Ignored objects of a class, of its neighbors or of an ``unknown``
-        class may be found; those of other classes may not.
-    unknown : collection of str
+    """Count the matches of one scan without the limits in the image. Ignored objects of a class, its neighbors or an
+    ``unknown`` class may be found.
     """
     every = [*to_find, *ignored]
     guesses, rights = _rows(boxes), _rows(every)
@@ -168,20 +155,8 @@ def count_all_round(
 def best_candidates(
     truth: FrontTruth, candidates: Sequence[Box], drive: str, level: str = "moderate"
 ) -> list[Candidate]:
-    """Find the best candidate of each object of a level.
-
-    Parameters
-    ----------
-    truth : FrontTruth
-    candidates : sequence of Box
-        Of any class and score, in the sensor frame, such as rectangles around clusters. One may cover several objects.
-    drive : str
-    level : {"easy", "moderate", "hard"}
-
-    Returns
-    -------
-    list of Candidate
-        One for each object of `CLASSES` within the limits of the level; IoU 0 without a candidate.
+    """The best of the candidates, of any class and score, for each object of `CLASSES` within the limits of a level;
+    IoU 0 without one. One may cover several objects.
     """
     kinds, numbers = _objects(truth.labels)
     placed = truth.calibration.sensor_boxes(numbers[:, 7:14])
@@ -214,18 +189,8 @@ def count_matches(
     small: Sequence[bool],
     excused: Sequence[bool],
 ) -> Counts:
-    """Match detections to objects in the two passes of the development kit, at every threshold at which they change.
-
-    Objects choose in their order: in the first pass the detection with the best score, in the second, among those
-    that reach the threshold, the one with the largest overlap, and one that is not small before one that is.
-
-    overlaps : (n, m) float64; IoU of each detection with each object.
-    scores : sequence of float, n
-    least_iou : a match has a larger IoU.
-    objects : sequence of ObjectKey, m
-    optional : sequence of bool, m; objects that may be found but need not.
-    small : sequence of bool, n; detections too small in the image: neither hits nor false positives.
-    excused : sequence of bool, n; detections that are not false positives, but may be hits.
+    """Match detections (n) to objects (m) in the kit's two passes, at every threshold at which they change. Objects
+    choose in order: by score, then by overlap among those above the threshold, preferring what is not small.
     """
     candidates = [
         [(j, float(overlaps[j, k])) for j in np.flatnonzero(overlaps[:, k] > least_iou).tolist()]
@@ -276,13 +241,8 @@ def _second_pass(
 
 
 def average_precisions(counts: Sequence[Counts]) -> tuple[float, float, float]:
-    """Average precision of any number of scans.
-
-    Returns ap_r40, ap_r11: As the development kit computes it: precision at the thresholds of 41 recall positions,
-        best from each on; the mean without recall 0, and of every fourth. With fewer than 41 objects there are fewer
-        thresholds than positions, and the others count as 0.
-    Returns ap: Mean of the best precision at recalls 1/40, 2/40 .. 1, read from the whole curve; for any number of
-        objects. All are NaN without objects.
+    """AP at 40 and at 11 recall positions as the kit computes it (with fewer than 41 objects the positions left count
+    as 0), and at recalls 1/40 .. 1 read from the whole curve. All are NaN without objects.
     """
     n_truth = sum(len(count.objects) for count in counts)
     if n_truth == 0:

@@ -22,13 +22,8 @@ ObjectKey = tuple[str, str, float, float, float]
 
 
 class Confusion:
-    """Counts of predicted against true labels, summed over scans or images.
-
-    A class without true and predicted labels has NaN scores.
-
-    classes : sequence of str
-    ignore : int; true label of cells or points that are not counted.
-    counts : (C, C) int64; rows are the truth, columns the prediction.
+    """Counts (C, C) of predicted (columns) against true labels (rows), over scans or images; the true label ``ignore``
+    is not counted. A class without true and predicted labels has NaN scores.
     """
 
     def __init__(self, classes: Sequence[str], *, ignore: int = 255) -> None:
@@ -37,12 +32,7 @@ class Confusion:
         self.counts = np.zeros((len(self.classes), len(self.classes)), dtype=np.int64)
 
     def update(self, predicted: ArrayLike, truth: ArrayLike) -> None:
-        """Count the labels of one scan or image.
-
-        predicted, truth : array_like of int; same shape; indices into ``classes``. ``truth`` may also hold
-            ``ignore``.
-        Raises PointsError.
-        """
+        """Count the labels of one scan or image, two arrays of one shape. Raises PointsError."""
         guess, right = np.asarray(predicted), np.asarray(truth)
         if guess.shape != right.shape:
             raise PointsError(f"got predicted {guess.shape} and truth {right.shape}; expected the same shape")
@@ -100,13 +90,8 @@ class Confusion:
 
 
 def average_precision(scores: ArrayLike, hits: ArrayLike, n_truth: int) -> float:
-    """Eleven-point average precision: mean of the best precision at recalls 0, 0.1 .. 1 (SSADNet equation A4).
-
-    scores : (n,) array_like of float; one for each prediction. Equal scores keep their order.
-    hits : (n,) array_like of bool; whether each prediction is correct.
-    n_truth : number of objects to find.
-    Returns: In 0..1; NaN if ``n_truth`` is 0.
-    Raises PointsError.
+    """Eleven-point average precision: mean of the best precision at recalls 0, 0.1 .. 1 (SSADNet equation A4), NaN
+    without objects to find; equal scores keep their order. Raises PointsError.
     """
     values, right = np.asarray(scores, dtype=np.float64), np.asarray(hits, dtype=np.bool_)
     if values.ndim != 1 or values.shape != right.shape:
@@ -133,22 +118,15 @@ def interpolated_precision(
 
 
 class ProbabilitySweep:
-    """Precision and recall of one class over all thresholds of its probability (KITTI road, LoDNN).
-
-    counts : (2, 256) int64; histograms of the probability in steps of 1/255. Row 0: cells of other classes. Row 1:
-        cells of the class.
+    """Precision and recall of one class over all thresholds of its probability (KITTI road, LoDNN), from histograms (2,
+    256) of cells of other classes and of the class.
     """
 
     def __init__(self) -> None:
         self.counts = np.zeros((2, 256), dtype=np.int64)
 
     def update(self, probability: ArrayLike, truth: ArrayLike) -> None:
-        """Count one image.
-
-        probability : array_like of float; probability of the class, in 0..1.
-        truth : array_like of bool; same shape. Do not pass cells with unknown truth.
-        Raises PointsError.
-        """
+        """Count the probabilities of cells with known truth in one image. Raises PointsError."""
         values, right = np.asarray(probability, dtype=np.float64), np.asarray(truth, dtype=np.bool_)
         if values.shape != right.shape or not ((values >= 0.0) & (values <= 1.0)).all():
             raise PointsError(
@@ -182,33 +160,21 @@ class ProbabilitySweep:
 
 @dataclass(frozen=True, slots=True)
 class BoxScores:
-    """Scores of the boxes of one class, or of all classes together.
+    """Scores of the boxes of one class, or of all classes together; NaN where nothing is counted."""
 
-    ap : `average_precision`; NaN if there was no box to find.
-    precision, recall : over all predictions with any score; NaN without predictions, or without boxes to find.
-    mean_iou_50, mean_iou_70 : mean IoU of the predictions with an IoU of at least 0.5, or 0.7 (SSADNet table 5); NaN
-        without any.
-    heading, axis : share of the hits whose yaw is within 45 degrees of the true one: over the full turn, where front
-        for rear is wrong, and modulo half a turn. NaN without hits; a yaw that is not finite is wrong.
-    front_known : share of the hits with a known front (`Box.front`); the yaw of the others counts as it is.
-    n_truth, n_predicted, n_hits : ignored boxes are not counted.
-    n_objects, n_found : distinct objects (`object_key`) of the boxes to find, and of the hits.
-    n_drives : drives of the boxes to find.
-    """
-
-    ap: float
-    precision: float
+    ap: float  # `average_precision`
+    precision: float  # of all predictions, with any score
     recall: float
-    mean_iou_50: float
+    mean_iou_50: float  # of predictions with an IoU of at least 0.5 (SSADNet table 5)
     mean_iou_70: float
-    heading: float
-    axis: float
-    front_known: float
-    n_truth: int
+    heading: float  # share of hits within 45 degrees of the true yaw over the full turn; not finite is wrong
+    axis: float  # modulo half a turn
+    front_known: float  # share of the hits with a known `Box.front`
+    n_truth: int  # ignored boxes are not counted
     n_predicted: int
     n_hits: int
-    n_objects: int
-    n_found: int
+    n_objects: int  # distinct objects (`object_key`) of the boxes to find
+    n_found: int  # distinct objects of the hits
     n_drives: int
 
 
@@ -228,17 +194,8 @@ class _Matches:
 
 
 class BoxEvaluator:
-    """Matches predicted boxes to true boxes, over any number of scans.
-
-    In each scan, predictions are matched in the order of their scores. A prediction takes the unmatched true box with
-    the largest IoU (the earlier one on ties), if that IoU reaches the threshold. An unmatched prediction is ignored if
-    its IoU with an ignored box reaches the threshold, or if at least half of it lies in an ignored region. Other
-    unmatched predictions are false positives.
-
-    iou_threshold : smallest IoU of the footprints, seen from above, of a match.
-    oriented : compare the oriented footprints; False compares their axis-aligned bounds, as SSADNet does.
-    together : collection of str; classes that `overall` joins; all by default.
-    Raises PointsError.
+    """Matches predicted boxes to true boxes, over any number of scans: best score first, each to the free true box of
+    the largest IoU from ``iou_threshold`` on. ``together``: classes that `overall` joins; all by default.
     """
 
     def __init__(
@@ -261,14 +218,8 @@ class BoxEvaluator:
         ignored_regions: ArrayLike = (),
         drive: str = "",
     ) -> list[tuple[Box | None, Box | None]]:
-        """Count the boxes of one scan.
-
-        ignored : objects that a detector may find but need not: out of view, with too few returns, or of a
-            neighboring class. A prediction of any class may match them.
-        ignored_regions : (r, 5) array_like; x, y, length, width [m], yaw [rad] of areas with unknown truth.
-        drive : the recording; distinct objects are counted by drive.
-        Returns list of (Box or None, Box or None): Pairs of a prediction and its true box, matched regardless of
-            class. A false positive is (box, None), a missed true box (None, box). Ignored predictions are left out.
+        """Count the boxes of one scan, and pair them whatever their class; false positives and missed boxes have None.
+        Those that match ``ignored``, or lie half in ``ignored_regions`` (r, 5) of unknown truth, are left out.
         """
         guesses = sorted(predicted, key=lambda box: -box.score)
         rights, spares = list(truth), list(ignored)
@@ -295,11 +246,8 @@ class BoxEvaluator:
         return both
 
     def per_class(self, within_m: tuple[float, float] = EVERYWHERE) -> dict[str, BoxScores]:
-        """Scores of every class so far; predictions are matched to true boxes of their own class only.
-
-        ``within_m`` is a range of horizontal distances from the sensor [m], with the lower and without the upper
-        bound. Only true boxes with their center in it, predictions matched to them, and false positives with their
-        center in it are counted.
+        """Scores of every class so far, each matched within itself; of a range of distances only true boxes with their
+        center in it, predictions matched to them, and false positives with their center in it.
         """
         return {label: self._scores(matches, within_m) for label, matches in self._classes.items()}
 
@@ -391,14 +339,8 @@ def boxes_to_find(
     *,
     known: Callable[[Box], bool] = lambda box: True,
 ) -> tuple[list[Box], list[Box]]:
-    """Split true boxes into those that a detector must find, and those that it may find but need not.
-
-    truth : iterable of (Box, int); true boxes, and the number of returns from each.
-    view : boxes count only if their center is in this view; None: anywhere.
-    classes : collection of str; classes that count.
-    known : whether the scan is labeled at the place of a box.
-    Returns to_find: Boxes that count, where the scan is labeled, with at least `FEWEST_RETURNS` returns.
-    Returns ignored: All others. Pass them to `BoxEvaluator.update` as ``ignored``.
+    """Split true boxes, with their numbers of returns, into those that a detector must find (of the classes, in the
+    view, where the scan is labeled, with `FEWEST_RETURNS`) and all others, which it may find.
     """
     to_find: list[Box] = []
     ignored: list[Box] = []
@@ -409,10 +351,8 @@ def boxes_to_find(
 
 
 def object_key(drive: str, box: Box) -> ObjectKey:
-    """Identify the object of a true box in all scans of its drive: by its label and its size in centimeters.
-
-    Labelers give an object one size for all scans. On KITTI's drive 0005 this counts the same 15 objects as the track
-    numbers of its labels.
+    """Identify an object in all scans of its drive by its label and its size in centimeters: labelers give it one. On
+    KITTI's drive 0005 this counts the same 15 objects as the track numbers of its labels.
     """
     length, width, height = (round(side, 2) for side in box.size)
     return drive, box.label, length, width, height

@@ -47,17 +47,12 @@ VELODYNE_BYTE = (
 
 @dataclass(frozen=True, eq=False)
 class Scan:
-    """A labeled scan of another sensor.
-
-    points : (n, 4) float32; x, y, z [m] in the sensor frame, raw remission.
-    labels : (n,) uint8; index into `POINT_CLASSES`, `IGNORE` where unknown.
-    objects : frozenset of (str, ObjectKey) or None; labeled objects within 50 m, by the class of their points; None if
-        only points or pixels are labeled.
-    """
+    """A labeled scan of another sensor."""
 
     name: str
-    points: Points
-    labels: Labels
+    points: Points  # x, y, z [m] in the sensor frame, raw remission
+    labels: Labels  # index into `POINT_CLASSES`, `IGNORE` where unknown
+    # labeled ones within 50 m by class; None if only points or pixels are labeled
     objects: frozenset[tuple[str, ObjectKey]] | None
 
 
@@ -74,27 +69,8 @@ def compare(
     workers: int | None = None,
     on_scan: Callable[[int, int], None] = lambda done, total: None,
 ) -> dict[str, Any]:
-    """Compute the IoU of points by class, for each dataset and each of `edgeperc.perceiver.ADAPTATIONS`.
-
-    datasets : ``SENSOR=SOURCE``. The sensor is a built-in name or the file of a profile; "auto" finds that of labeled
-        scans in the first three. The source is
-        ``simulation:N``, a folder of labeled scans (`scan_folder.ScanFolder.parse`), or one with range images
-        ``NAME.npy`` (H, W, 6). Labeled scans need no ``SENSOR=``, because their description names it; those of test
-        drives count. Their points are labeled by boxes, as KITTI's are. Scans go through a `Perceiver` as a user's
-        do, with ``full_turn=True``: it finds the mounting, and nothing from the labels helps it. The remission
-        function of a simulated sensor is fitted to eight other scenes. That of a real sensor comes from its profile.
-    model : a range-image model.
-    provider, precision : as in `Perceiver`.
-    workers : number of worker processes, each with one data set at a time; None: this process alone.
-    on_scan : called after each scan, or data set of a worker, with the number of scans done and that of all scans, over
-        all adaptations.
-    Returns: By dataset: ``"n_scans"``, ``"function"``, and by adaptation ``"iou"`` (class -> IoU, None for a class
-        that does not occur), ``"mean_iou"`` over the classes except the background, ``"n_points"`` (class -> count).
-        In ``"n_objects"`` distinct objects by class, or None if only points are labeled, and in ``"few"`` the classes
-        with fewer than `tables.FEWEST_OBJECTS`: their figures say little. In ``"boxes"`` the figures ``"kitti"`` and
-        ``"centers"`` of `tables.figures` for labeled scans with boxes: those of the default models, all round,
-        with ``model`` for the points.
-    Raises PointsError, ModelError, SplitError.
+    """IoU of points by class for each dataset and each of `ADAPTATIONS`, of labeled scans with boxes also their
+    figures. Scans are perceived as a user's; the function of a simulated sensor is fitted to other scenes.
     """
     sets = {name: _dataset(name) for name in datasets}
     sizes = {name: (len(ADAPTATIONS) + (folder is not None)) * n for name, (_, n, _, folder) in sets.items()}

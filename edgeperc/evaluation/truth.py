@@ -32,42 +32,26 @@ Cells = dict[str, tuple[tuple[str, ...], NDArray[np.uint8]]]
 
 @dataclass(frozen=True)
 class Truth:
-    """A scan and its ground truth.
-
-    points : (n, 4) float32; x, y, z [m] in the sensor frame, remission.
-    labels : (n,) uint8 or None; index into ``classes``; `IGNORE`
-        where unknown. None if points and objects are not labeled.
-    boxes : in the sensor frame.
-    returns : number of returns from each box's object.
-    known : takes places (k, 3) [m] in the sensor frame and returns whether objects are labeled there, (k,) bool.
-    cells : by name of a table: its classes, and the true class of each cell (rows, columns) uint8, `IGNORE` where
-        unknown.
-    road : the table, and its class that counts as drivable.
-    front : KITTI's labels of the image, if the scan has them.
-    box_labels : classes that the boxes of the set tell apart; None: all.
-    classes : of ``labels``, the background first.
-    """
+    """A scan and its ground truth."""
 
     name: str
     drive: str
-    points: Points
-    labels: Labels | None
-    boxes: tuple[Box, ...]
-    returns: tuple[int, ...]
+    points: Points  # x, y, z [m] in the sensor frame, remission
+    labels: Labels | None  # index into ``classes``, `IGNORE` where unknown; None without labels
+    boxes: tuple[Box, ...]  # in the sensor frame
+    returns: tuple[int, ...]  # from each box's object
+    # whether objects are labeled at places (k, 3) [m] in the sensor frame
     known: Callable[[NDArray[np.float64]], NDArray[np.bool_]]
-    cells: Cells
-    road: tuple[str, str] | None = None
-    front: FrontTruth | None = None
-    box_labels: frozenset[str] | None = None
-    classes: tuple[str, ...] = POINT_CLASSES
+    cells: Cells  # by table: classes, and the true class of each cell, `IGNORE` where unknown
+    road: tuple[str, str] | None = None  # a table, and its class that is drivable
+    front: FrontTruth | None = None  # KITTI's labels of the image
+    box_labels: frozenset[str] | None = None  # what the boxes of the set tell apart; None: all
+    classes: tuple[str, ...] = POINT_CLASSES  # the background first
 
 
 def kitti_truth(frame: Frame, view: TopViewGeometry | None, road: tuple[str, NDArray[np.bool_]] | None = None) -> Truth:
-    """Ground truth of a KITTI frame: boxes, points and cells in the camera's field of view, outside DontCare.
-
-    view : grid of the cells; None: no cells.
-    road : tuple of str and (rows, columns) bool; name and drivable cells of a second table, which combines this road
-        with the labeled vehicles (SSADNet 3.1.2).
+    """Ground truth of a KITTI frame in the camera's field of view, outside DontCare; no cells without a view. ``road``:
+    name and drivable cells of a second table, with the labeled vehicles (SSADNet 3.1.2).
     """
     cells: Cells = {}
     if view is not None:
@@ -101,11 +85,8 @@ def folder_truth(
     view: TopViewGeometry | None,
     classes: Sequence[str] = POINT_CLASSES,
 ) -> Truth:
-    """Ground truth of a scan of a `ScanFolder`, moved into the frame of the models.
-
-    mounting : the mounting that the runtime used for this scan: its results are compared in the frame that it had.
-    view : grid of the cells; None: no cells.
-    classes : classes of points, the background first.
+    """Ground truth of a scan of a `ScanFolder`, in the frame of the models with the mounting that the runtime used:
+    results are compared in the frame that they had.
     """
     model = ModelFrame(mounting)
     boxes = model.move_boxes(frame.boxes or ())
@@ -137,12 +118,8 @@ def folder_truth(
 
 
 def road_cells(frame: ScanFrame, mounting: Mounting, view: TopViewGeometry) -> NDArray[np.uint8] | None:
-    """True surface of each cell by the labels of points, or else by the polygons of a scan.
-
-    mounting : a known one.
-    view : grid in the frame of the models.
-    Returns (rows, columns) uint8 or None: Index into `ROAD_CLASSES`; `IGNORE` for cells that the scan did not
-        observe. None: the scan has no such labels.
+    """True surface of each cell of a view by the labels of points, or else polygons: index into `ROAD_CLASSES`,
+    `IGNORE` where the scan did not observe it; None if the scan has no such labels.
     """
     model = ModelFrame(mounting)
     points, labels = model.move(frame.points), frame.road_labels()
@@ -183,10 +160,7 @@ def cells_inside(polygons: Iterable[NDArray[np.float64]], view: TopViewGeometry)
 
 
 def simulated_truth(seed: int, view: TopViewGeometry | None, classes: tuple[str, ...] = POINT_CLASSES) -> Truth:
-    """Ground truth of a simulated scene, where everything is known. Each scene counts as a drive of its own.
-
-    classes : classes of points, the background first.
-    """
+    """Ground truth of a simulated scene, where everything is known. Each scene counts as a drive of its own."""
     name, scan = f"scene {seed}", simulated_scan(seed)
     cells: Cells = {} if view is None else {EVERY_CELL: (TOP_VIEW_CLASSES, scan.top_view_labels(view))}
     labels, road = numbers_of_scene(classes)[labels_of_scene(scan)], (EVERY_CELL, "drivable")

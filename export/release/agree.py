@@ -67,22 +67,8 @@ def agree(
     n_scans: int | None = None,
     on_scan: Callable[[str], None] = lambda precision: None,
 ) -> dict[str, dict[str, Any]]:
-    """Measure every precision that the files of one network can run in, and write the record into their cards.
-
-    fp32 and int8 run on stock onnxruntime's CPU provider. bf16 runs the fp32 file in OpenVINO's own Python API. It is
-    measured if OpenVINO is installed and the processor has bf16 instructions.
-
-    models : files of one network, or its name for all its variants. One of them is in fp32.
-    kitti, semantickitti : roots of a KITTI object set and of SemanticKITTI. Their labels are the ground truth: of
-        points or vehicles (KITTI) and of road (SemanticKITTI). All scans of SemanticKITTI are used, although they are
-        of a test drive, because no other real scans have road labels.
-    camvid : folder of CamVid, for a network of a camera; then the other sets are not used.
-    split : drives of the KITTI object set (`edgeperc.datasets.splits.in_split`), or images of CamVid
-        (`edgeperc.datasets.images.LabeledImages.files`).
-    n_scans : at most this many scans, or images, of each set, evenly spread; None takes all.
-    on_scan : called with the precision after each scan.
-    Returns precisions: Precision -> its record (`edgeperc.ModelCard`, ``precisions``).
-    Raises ModelError, PointsError, SplitError.
+    """Measure every precision that the files of one network can run in on labeled scans or images, at most ``n_scans``
+    of each set, and write the record into their cards. Raises ModelError, PointsError, SplitError.
     """
     variants = {variant.precision: variant for model in models for variant in resolve(model)}
     names = {f"{variant.name} {variant.card.version}" for variant in variants.values()}
@@ -201,9 +187,8 @@ def _measure(
 def _measure_objects(
     variant: Variant, objects: KittiObjects, split: str, n_scans: int | None, on_scan: Callable[[str], None]
 ) -> Measured:
-    """Class of each cluster; overlap from above of each object to find with the best box; mean AP of cars.
-
-    AP is the mean of bird's eye and 3-D at 0.7, moderate, with the boxes of the top view as candidates, too.
+    """Class of each cluster; overlap from above of each object with the best box; mean AP of cars (bird's eye and 3-D
+    at 0.7, moderate), with the boxes of the top view as candidates, too.
     """
     perceive = Perceiver(
         [TOP_VIEW, variant.path],

@@ -40,10 +40,8 @@ def quantize_objects(
     seven_bits: bool | None = None,
     n_threads: int | None = None,
 ) -> ModelCard:
-    """Write an object network in int8, if it is faster on this computer.
-
-    Parameters are those of `release.quantize.quantize`; the scans of the calibration must have clusters.
-    Raises RefusedError, ModelError, PointsError.
+    """Write an object network in int8, if it is faster on this computer; parameters as of `quantize`, of scans with
+    clusters. Raises RefusedError, ModelError, PointsError.
     """
     card = ModelCard.read(path)
     if card.precision != "fp32":
@@ -118,9 +116,8 @@ def candidate_batches(card: ModelCard, scans: Sequence[NDArray[np.float32]]) -> 
 def rounded(
     model: onnx.ModelProto, batches: Sequence[NDArray[np.float32]], input_name: str, *, seven_bits: bool = False
 ) -> onnx.ModelProto:
-    """A graph of `release.object_graph.with_first_look`, folded, with the products of `ROUNDED` in int8.
-
-    Weights are rounded by output channel, inputs of products by their range in the batches.
+    """A folded graph of `with_first_look` with the products of `ROUNDED` in int8: weights by output channel, inputs by
+    their range in the batches.
     """
     copy = onnx.ModelProto()
     copy.CopyFrom(model)

@@ -96,18 +96,12 @@ class Calibration(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class LabeledSets:
-    """What two models are compared on.
+    """What two models are compared on."""
 
-    kitti : root of a KITTI object set: on its validation drives; the card's figures are of its test drives.
-    semantickitti : root of SemanticKITTI: on its roads.
-    camvid : folder of CamVid: on its validation images.
-    n_simulated : number of simulated scans, other than those of the calibration.
-    """
-
-    kitti: Path | None = None
-    semantickitti: Path | None = None
-    camvid: Path | None = None
-    n_simulated: int = 48
+    kitti: Path | None = None  # its validation drives; the card's figures are of its test drives
+    semantickitti: Path | None = None  # its roads
+    camvid: Path | None = None  # its validation images
+    n_simulated: int = 48  # scans, other than those of the calibration
 
 
 Losses = Mapping[str, tuple[float, float, float, float]]
@@ -115,12 +109,8 @@ Losses = Mapping[str, tuple[float, float, float, float]]
 
 
 def calibration_scans(paths: Sequence[Path] = (), *, kitti: Path | None = None, n_simulated: int = 0) -> Calibration:
-    """Scans to calibrate on, the real ones first.
-
-    paths : scans, or folders of ``.bin`` files.
-    kitti : root of a KITTI object set; 64 scans of its training drives are taken, evenly spread.
-    n_simulated : number of simulated scans.
-    Raises SplitError, PointsError.
+    """Scans to calibrate on, the real ones first: files or folders of ``.bin``, 64 of KITTI's training drives, evenly
+    spread, and simulated ones. Raises SplitError, PointsError.
     """
     files = [file for path in paths for file in (sorted(path.rglob("*.bin")) if path.is_dir() else [path])]
     for file in files:
@@ -183,9 +173,8 @@ def folded(path: Path) -> onnx.ModelProto:
 
 @dataclass(frozen=True)
 class Calibrated:
-    """A network in fp32, the range of each of its tensors, and its outputs for some images.
-
-    ``means`` are those of the convolutions whose shift is corrected.
+    """A network in fp32, the ranges of its tensors, its outputs for some images, and means of convolutions to
+    correct.
     """
 
     card: ModelCard
@@ -343,9 +332,8 @@ def _between(graph: onnx.GraphProto, convolutions: Collection[str]) -> set[str]:
 
 
 def _unround(graph: onnx.GraphProto, rounded: Collection[str]) -> None:
-    """Connect operators in fp32 directly to outputs in fp32, without rounding in between.
-
-    SSADNet's unpooling compares a tensor with its maxima. With one side rounded, few values would be equal.
+    """Connect operators in fp32 directly to outputs in fp32: SSADNet's unpooling compares a tensor with its maxima, few
+    of which would be equal with one side rounded.
     """
     maker = {output: node for node in graph.node for output in node.output}
     origin = {}
@@ -378,9 +366,8 @@ def _outputs(
 def _noise(
     outputs: Sequence[Mapping[str, NDArray[np.float32]]], expected: Sequence[Mapping[str, NDArray[np.float32]]]
 ) -> float:
-    """Squared error as a share of the squares, of the output where it is largest.
-
-    It hardly depends on single labels or boxes, so that a few scans are enough to compare convolutions.
+    """Squared error as a share of the squares, of the worst output. It hardly depends on single labels or boxes, so
+    that a few scans are enough to compare convolutions.
     """
     shares = []
     for kind in expected[0]:
@@ -417,10 +404,8 @@ def _multiplications(model: onnx.ModelProto) -> dict[str, int]:
 
 
 def _choose(fp32: Calibrated, candidates: Sequence[str], limit: float, noise: float) -> tuple[list[str], float]:
-    """The convolutions to round, and their noise: all of them, which make ``noise``, or as many as the limit allows.
-
-    Those that make most noise for the time that they take, alone, are left out first. Takes at most n + log2(n) trials
-    for n convolutions.
+    """The convolutions to round, and their noise: all, which make ``noise``, or as many as the limit allows; those with
+    most noise for their time are left out first. At most n + log2(n) trials for n convolutions.
     """
     if noise <= limit:
         return [*candidates], noise
@@ -519,9 +504,8 @@ def _later(evaluate: Callable[[Any], Truth], read: Callable[[Any], Any], name: A
 
 
 def losses_of(before: Mapping[str, Sequence[Record]], after: Mapping[str, Sequence[Record]]) -> Losses:
-    """Compare the scores of both models; intervals are over resampled drives.
-
-    Both models are resampled alike, because they err on the same scans. With one drive the interval is the loss itself.
+    """Compare the scores of both models, which are resampled by drive alike, because they err on the same scans; with
+    one drive the interval is the loss itself.
     """
     losses = {}
     for block in before:
@@ -561,20 +545,8 @@ def quantize(
     max_noise: float = MAX_NOISE,
     race: Race = race,
 ) -> ModelCard:
-    """Write the int8 variant of a model, with its own card and figures.
-
-    ``precision="auto"`` takes the variant only after `edgeperc_export.release.agree` has measured it.
-
-    path, out : the model in fp32, and the .onnx to write.
-    calibration : from `calibration_scans` or, for a camera's model, `calibration_images`.
-    labeled : what both models are compared on.
-    exclude : nodes to keep in fp32.
-    seven_bits : use 7-bit weights. x86 without VNNI needs them, because its sums of 8-bit products saturate; None: if
-        this computer needs them.
-    n_threads : for timing; None leaves it to onnxruntime.
-    max_noise : largest noise of the outputs, as a share of their variance; above it, convolutions stay in fp32.
-    race : two paths and ``n_threads`` -> times of paired runs of both models [ms].
-    Raises RefusedError, ModelError, PointsError, OptionError.
+    """Write the int8 variant of a model if it is faster here (``race``) and as accurate; "auto" takes it only after
+    `release.agree`. Above ``max_noise``, convolutions stay in fp32. Raises RefusedError, ModelError, OptionError.
     """
     if not calibration.scans:
         raise PointsError("no scan to calibrate on; expected at least one")

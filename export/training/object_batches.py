@@ -79,11 +79,8 @@ class Drawn:
 
 
 class ObjectBatches:
-    """Batches of samples, of sources by their ``names``.
-
-    n_targets : number of arrays of a batch that are targets.
-    simulated : as many as there are simulated scans.
-    odds : always empty, as in `training.images.ImageSamples`.
+    """Batches of samples of named sources; ``simulated`` is as long as there are simulated scans, ``odds`` always
+    empty.
     """
 
     n_targets = 2
@@ -220,10 +217,8 @@ class ObjectWatch:
 
     @torch.no_grad()
     def validate(self, network: nn.Module) -> tuple[float, float, dict[str, float | None]]:
-        """The decisive figure, the mean loss, and figures by name.
-
-        Of each class, the recall of its label; the mean overlap in space of its boxes; and the precision of labels of
-        objects. The figure is the mean of the overlap of all classes with samples.
+        """The mean overlap in space of the boxes of all classes, the mean loss, and figures by name: recall and overlap
+        of each class, precision of labels of objects.
         """
         losses, right, overlaps = [], [], []
         device = next(network.parameters()).device

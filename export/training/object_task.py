@@ -43,11 +43,8 @@ class Objects(Carded):
         return self.card.view
 
     def loss(self, outputs: tuple[Tensor, Tensor], targets: Sequence[Tensor]) -> Tensor:
-        """The loss of a batch.
-
-        outputs : (B, n) and (B,), of the network, and the logits of its first look.
-        targets : classes (B,) int64, or `VEHICLE`; boxes (B, 7) in the candidate's frame: x, y, bottom above the
-            ground, length, width, height [m], yaw [rad].
+        """The loss of a batch: outputs (B, n) and logits (B,) of the first look; classes (B,) or `VEHICLE`, and boxes
+        (B, 7) in the candidate's frame, with the bottom above the ground.
         """
         (values, look), (labels, boxes) = outputs, targets
         parts = parts_of(values, len(self.classes))

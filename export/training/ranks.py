@@ -28,10 +28,8 @@ class RankError(EdgepercError):
 
 
 class Ranks:
-    """The processes of a run: one, or those of ``torchrun``, which sets ``RANK``, ``WORLD_SIZE`` and ``LOCAL_RANK``.
-
-    rank, world : number of this process, and of all.
-    device : torch.device; the GPU of this process, or the CPU.
+    """The processes of a run, this one's number ``rank`` of ``world``: one, or those of ``torchrun`` by ``RANK``,
+    ``WORLD_SIZE`` and ``LOCAL_RANK``; ``device`` is its GPU, or the CPU.
     """
 
     def __init__(self) -> None:
@@ -46,10 +44,7 @@ class Ranks:
 
     @contextmanager
     def together(self) -> Iterator[None]:
-        """Connect the ranks: by NCCL on GPUs, by gloo on CPUs.
-
-        Raises RankError.
-        """
+        """Connect the ranks: by NCCL on GPUs, by gloo on CPUs. Raises RankError."""
         if self.world == 1:
             yield
             return
