@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from ..options import Subparsers, at_least, engine_options, model_options, output_options
+from ..options import add_command, add_engine, add_model, add_output, at_least
 from ..samples import trend
 from ..scenarios import Limits
 from ..worker import MEMORY_SAMPLES, Scenario
@@ -24,28 +24,20 @@ LEVEL_MB = 1.0
 SETTLING_SHARE = 0.1
 
 
-def add_parser(subparsers: Subparsers) -> None:
+def add_parser(subparsers: Any) -> None:
     """Declare the command."""
-    parser = subparsers.add_parser(
+    add = add_command(
+        subparsers,
         "soak",
-        parents=[model_options(), engine_options(), output_options(html=False)],
+        run_command,
+        add_model,
+        add_engine,
+        add_output,
         help="tell whether memory grows over a long run",
         description="Run many simulated scans in one process and fit a line to its memory.",
-        allow_abbrev=False,
     )
-    parser.add_argument(
-        "--scans",
-        type=at_least(1000),
-        default=20_000,
-        metavar="N",
-        help="the number of scans, 1000 at least (default: %(default)s)",
-    )
-    parser.add_argument(
-        "--application",
-        action="store_true",
-        help="also stream, track, write JSON and draw every 100th scan, as applications do (extra 'view')",
-    )
-    parser.set_defaults(run=run_command)
+    add("--scans N", "the number of scans, 1000 at least (default: %(default)s)", type=at_least(1000), default=20_000)
+    add("--application", "also stream, track, write JSON and draw every 100th scan, as applications do (extra 'view')")
 
 
 def run_command(arguments: argparse.Namespace) -> int:

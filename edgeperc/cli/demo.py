@@ -12,7 +12,7 @@ from ..errors import MissingExtraError
 from ..system.atomic import open_atomic, write_atomic
 from ..system.extras import require
 from ..types.choices import CAMERA
-from .arguments import Commands, add_command, add_model, add_network, chosen_models
+from .arguments import Commands, add_command, add_model, add_network, chosen_models, options
 from .output import one_line, print_rows
 from .run import make_perceiver
 
@@ -46,21 +46,18 @@ def add_parser(commands: Commands) -> None:
             "edgeperc demo --out /tmp/demo --model pointseg --full-turn",
         ],
     )
-    output = parser.add_argument_group("output")
-    output.add_argument(
-        "--out",
-        type=Path,
+    output = options(parser, "output")
+    output(
+        "--out DIR",
+        "folder for scan.bin, scene.png and scene.html, made if needed (default: %(default)s)",
         default=Path("edgeperc-demo"),
-        metavar="DIR",
-        help="folder for scan.bin, scene.png and scene.html, made if needed (default: %(default)s)",
     )
-    parser.add_argument(
+    options(parser)(
         "--camera",
-        action="store_true",
-        help="also draw the image of a camera in the street, label it, carry its classes to the points and its road to "
+        "also draw the image of a camera in the street, label it, carry its classes to the points and its road to "
         "the top view, and write image.png and camera.png",
     )
-    models = parser.add_argument_group("models")
+    models = options(parser, "models")
     add_model(models)
     add_network(models)
 

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 from ..errors import EdgepercError, MissingExtraError, MountingError, PointsError
 from ..system.atomic import write_atomic
 from ..types.choices import DEFAULT_MODELS
-from .arguments import Commands, add_command, add_fields, add_mounting, add_sensor, add_topic, reading_options
+from .arguments import Commands, add_command, add_fields, add_mounting, add_sensor, add_topic, options, reading_options
 from .output import many, print_error, print_line, print_rows
 from .scans import Sensors, stated_sensor, with_mounting
 
@@ -58,36 +58,26 @@ def add_parser(commands: Commands) -> None:
             "edgeperc info street.jpg",
         ],
     )
-    reading = parser.add_argument_group("input")
-    reading.add_argument(
-        "things",
-        nargs="+",
-        metavar="MODEL|SCAN|IMAGE",
-        help="a name from 'edgeperc models', an .onnx file, a scan, a capture (its first scan; its mounting by the "
+    reading = options(parser, "input")
+    reading(
+        "things MODEL|SCAN|IMAGE...",
+        "a name from 'edgeperc models', an .onnx file, a scan, a capture (its first scan; its mounting by the "
         "first five), or an image",
     )
     add_sensor(reading, of_capture=True)
     add_mounting(reading)
     add_topic(reading)
     add_fields(reading)
-    reading.add_argument(
+    reading(
         "--suggest-ego-box",
-        action="store_true",
-        help=f"suggest --ego-box: returns near the sensor that never move in up to {_MOST_SCANS} scans of a drive, "
+        f"suggest --ego-box: returns near the sensor that never move in up to {_MOST_SCANS} scans of a drive, "
         "while the street does; look at it before you use it (default: no)",
     )
-    output = parser.add_argument_group("output")
-    output.add_argument(
-        "--json",
-        action="store_true",
-        help="print one JSON object for each thing: a model's whole card, a scan's measurements",
-    )
-    output.add_argument(
-        "--write",
-        type=Path,
-        metavar="FILE",
-        help="write the sensor's profile with the mounting that the scans show, a .json file for --sensor "
-        "(default: none)",
+    output = options(parser, "output")
+    output("--json", "print one JSON object for each thing: a model's whole card, a scan's measurements")
+    output(
+        "--write FILE",
+        "write the sensor's profile with the mounting that the scans show, a .json file for --sensor (default: none)",
     )
 
 

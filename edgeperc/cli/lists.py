@@ -11,7 +11,7 @@ from typing import Any
 
 from ..errors import SettingsError
 from ..types.choices import DEFAULT_SENSOR
-from .arguments import Commands, add_command
+from .arguments import Commands, add_command, options
 from .output import print_columns, print_line
 
 
@@ -50,8 +50,7 @@ def add_parser(commands: Commands) -> None:
             description=description,
             examples=[f"edgeperc {name}", f"edgeperc {name} --json"],
         )
-        output = parser.add_argument_group("output")
-        output.add_argument("--json", action="store_true", help="print one JSON object for each line of the table")
+        options(parser, "output")("--json", "print one JSON object for each line of the table")
 
 
 def models_command(arguments: argparse.Namespace) -> int:

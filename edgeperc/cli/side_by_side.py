@@ -25,7 +25,7 @@ from ..system.atomic import write_atomic
 from ..system.pool import MOST_FIRST, Lost
 from ..system.ray_cluster import ENGINES
 from ..system.remote import Remote
-from .arguments import positive
+from .arguments import options, positive
 from .output import many, one_line, print_line
 from .report import Report
 
@@ -46,20 +46,19 @@ Alone = Callable[..., "tuple[Perceiver, Scan, Callable[[Any], list[Any]]]"]
 
 def add_engine(parser: argparse.ArgumentParser) -> None:
     """Add ``--engine`` and ``--workers``."""
-    group = parser.add_argument_group("engine")
-    group.add_argument(
+    group = options(parser, "engine")
+    group(
         "--engine",
+        "local: this computer; ray: worker processes with one thread each, on the cluster that the environment "
+        "variable RAY_ADDRESS names, else on this computer (extra 'ray'). The results are the same (default: local)",
         choices=("local", "ray"),
         default="local",
-        help="local: this computer; ray: worker processes with one thread each, on the cluster that the environment "
-        "variable RAY_ADDRESS names, else on this computer (extra 'ray'). The results are the same (default: local)",
     )
-    group.add_argument(
-        "--workers",
-        type=positive,
-        metavar="N",
-        help="number of worker processes with one thread each, among which the scans are divided; the results are the "
+    group(
+        "--workers N",
+        "number of worker processes with one thread each, among which the scans are divided; the results are the "
         "same (default: this process alone; with --engine ray, one for each CPU of the cluster)",
+        type=positive,
     )
 
 

@@ -6,95 +6,67 @@ import argparse
 import sys
 from contextlib import ExitStack
 from functools import partial
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..errors import EdgepercError
+from .arguments import options
 from .output import print_error, print_line
 
 if TYPE_CHECKING:
     from ..records import PerceivedScan, Sink
 
 
-SINKS: tuple[str, ...] = (
-    "mcap",
-    "serve",
-    "rrd",
-    "play",
-    "static",
-    "labels_for",
-    "bag",
-)
+SINKS = ("mcap", "serve", "rrd", "play", "static", "labels_for", "bag")
 """Names of the options below as attributes of the arguments."""
 
 
 def add_sinks(parser: argparse.ArgumentParser) -> None:
     """Add the options."""
-    group = parser.add_argument_group("files of the whole run")
-    group.add_argument(
-        "--mcap",
-        type=Path,
-        metavar="FILE",
-        help="write points, boxes, tracks, drivable cells and stage times to an MCAP file for Foxglove and other "
+    group = options(parser, "files of the whole run")
+    group(
+        "--mcap FILE",
+        "write points, boxes, tracks, drivable cells and stage times to an MCAP file for Foxglove and other "
         "viewers (needs the extra 'foxglove'; default: none)",
     )
-    group.add_argument(
-        "--serve",
+    group(
+        "--serve HOST:PORT",
+        "stream the same to viewers while it runs, over Foxglove's WebSocket protocol; anyone who reaches "
+        "HOST:PORT can watch (needs the extra 'foxglove'; without a value: 127.0.0.1:8765, this computer only; "
+        "default: none)",
         type=_address,
         nargs="?",
         const=("127.0.0.1", 8765),
-        metavar="HOST:PORT",
-        help="stream the same to viewers while it runs, over Foxglove's WebSocket protocol; anyone who reaches "
-        "HOST:PORT can watch (needs the extra 'foxglove'; without a value: 127.0.0.1:8765, this computer only; "
-        "default: none)",
     )
-    group.add_argument(
-        "--rrd",
-        type=Path,
-        metavar="FILE",
-        help="write a recording for the Rerun viewer (needs the extra 'rerun'; default: none)",
-    )
-    group.add_argument(
-        "--play",
-        type=Path,
-        metavar="FILE",
-        help="write one HTML page that plays all scans of the drive in 3-D, of at most 48 MB: scans are thinned "
+    group("--rrd FILE", "write a recording for the Rerun viewer (needs the extra 'rerun'; default: none)")
+    group(
+        "--play FILE",
+        "write one HTML page that plays all scans of the drive in 3-D, of at most 48 MB: scans are thinned "
         "(default: none)",
     )
-    group.add_argument(
-        "--static",
-        type=Path,
-        metavar="DIR",
-        help="write every scan without its points on moving objects, as DIR/NAME in the format of the scan; scans of "
+    group(
+        "--static DIR",
+        "write every scan without its points on moving objects, as DIR/NAME in the format of the scan; scans of "
         "captures become .bin. Needs --track, or --movable (default: no scans)",
     )
-    group.add_argument(
-        "--movable",
-        action="store_true",
-        help="with --static: leave out the points on everything that could move, too: vehicles and people",
-    )
-    group.add_argument(
+    group("--movable", "with --static: leave out the points on everything that could move, too: vehicles and people")
+    group(
         "--labels-for",
-        choices=("labelcloud", "cvat", "kitti", "sustechpoints"),
-        help="write the boxes to --out as labels for an annotation tool; with --track with the ids of tracks. kitti "
+        "write the boxes to --out as labels for an annotation tool; with --track with the ids of tracks. kitti "
         "takes the camera of --calib (a file, or a folder with one for each scan), or a nominal one (default: none)",
+        choices=("labelcloud", "cvat", "kitti", "sustechpoints"),
     )
-    group.add_argument(
-        "--bag",
-        type=Path,
-        metavar="DIR",
-        help="write a ROS 2 bag, a folder that must not exist: points with classes, markers, grid, detections, "
+    group(
+        "--bag DIR",
+        "write a ROS 2 bag, a folder that must not exist: points with classes, markers, grid, detections, "
         "diagnostics (needs the extra 'ros'; default: no bag)",
     )
-    group.add_argument(
+    group(
         "--bag-storage",
+        "format of the file in --bag; mcap needs rosbags 0.10 (default: %(default)s)",
         choices=("sqlite3", "mcap"),
         default="sqlite3",
-        help="format of the file in --bag; mcap needs rosbags 0.10 (default: %(default)s)",
     )
-    group.add_argument(
-        "--bag-frame", default="lidar", metavar="NAME", help="frame of the messages in --bag (default: %(default)s)"
-    )
+    group("--bag-frame NAME", "frame of the messages in --bag (default: %(default)s)", default="lidar")
 
 
 def _address(text: str) -> tuple[str, int]:
