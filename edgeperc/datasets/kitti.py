@@ -122,6 +122,16 @@ class KittiLabels:
     kinds: tuple[str, ...]  # classes in lower case, "dontcare" among them
     numbers: NDArray[np.float64]
 
+    @property
+    def is_object(self) -> NDArray[np.bool_]:
+        """Which rows are not DontCare regions."""
+        return np.array([kind != "dontcare" for kind in self.kinds], np.bool_)
+
+    @property
+    def objects(self) -> tuple[list[str], NDArray[np.float64]]:
+        """Classes and numbers of the rows that are not DontCare regions."""
+        return [kind for kind in self.kinds if kind != "dontcare"], self.numbers[self.is_object]
+
 
 @dataclass(frozen=True)
 class Frame:
@@ -183,14 +193,13 @@ def read_objects(label_path: Path, calibration: KittiCalibration) -> tuple[tuple
 
 def label_objects(labels: KittiLabels, calibration: KittiCalibration) -> tuple[tuple[Box, ...], NDArray[np.float64]]:
     """Boxes of labels in the sensor frame, and (k, 4) DontCare rectangles [px]."""
-    is_object = np.array([kind != "dontcare" for kind in labels.kinds], np.bool_)
-    placed = calibration.sensor_boxes(labels.numbers[is_object, 7:14])
-    kinds = [kind for kind in labels.kinds if kind != "dontcare"]
+    kinds, numbers = labels.objects
+    placed = calibration.sensor_boxes(numbers[:, 7:14])
     boxes = tuple(
         Box(kind, 1.0, (x, y, z), (length, width, height), yaw)
         for kind, (x, y, z, length, width, height, yaw) in zip(kinds, placed.tolist(), strict=True)
     )
-    return boxes, labels.numbers[~is_object, 3:7]
+    return boxes, labels.numbers[~labels.is_object, 3:7]
 
 
 def scan_hash(points: Points) -> str:

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from ..types.geometry import wrapped
 from ..types.perception import Box
+from .metrics import box_rows
 from .tracking_metrics import box_iou, fill_assignment
 
 
@@ -65,7 +66,7 @@ class Ab3dmot:
         the index of each one's detection in this scan, -1 for none.
         """
         self._n_scans += 1
-        given = np.array([(*box.center, *box.size, box.yaw) for box in boxes], np.float64).reshape(-1, 7)
+        given = box_rows(boxes)
         states = self._states @ _F.T
         states[:, 3] = wrapped(states[:, 3])
         covariances = _F @ self._covariances @ _F.T + _Q

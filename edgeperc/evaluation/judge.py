@@ -194,7 +194,7 @@ class Judge:
             shown = (x > -2.0) & (x < 52.0) & (np.abs(y) < 27.0)
             mistakes = Mistakes(truth.name, truth.drive, truth.points[shown], np.zeros(int(shown.sum()), np.uint8))
             if self.box_classes or perception.points is not None:
-                seen = (box for box, n in zip(truth.boxes, truth.returns, strict=True) if n >= FEWEST_RETURNS)
+                seen = (box for box, n in truth.counted if n >= FEWEST_RETURNS)
                 tallies["labeled",] = Counter(object_key(truth.drive, box) for box in seen)
             if self.box_classes:
                 mistakes = self._count_boxes(tallies, truth, perception, mistakes)
@@ -220,20 +220,16 @@ class Judge:
         """Match boxes where the truth is known, upright and oriented, of the classes and in the view that are detected;
         and vehicles, pedestrians and cyclists all round, detected or not.
         """
-
-        def known(box: Box) -> bool:
-            return bool(truth.known(np.array([box.center]))[0])
-
-        predicted = [box for box in perception.boxes if known(box)]
-        returns = list(zip(truth.boxes, truth.returns, strict=True))
+        predicted = [box for box in perception.boxes if truth.knows(box)]
+        returns = truth.counted
         classes, view = self.box_classes, self.detected_in
         detected = [b for b in predicted if b.label in classes and (view is None or view.holds(*b.center[:2]))]
-        to_find, ignored = boxes_to_find(returns, view, classes, known=known)
+        to_find, ignored = boxes_to_find(returns, view, classes, known=truth.knows)
         for kind in ("upright", "oriented"):
             evaluator = tallies["boxes", kind] = BoxEvaluator(oriented=kind == "oriented", together=VEHICLES)
             pairs = evaluator.update(detected, to_find, ignored=ignored, drive=truth.drive)
         every = tuple(name for classes, _ in ALL_ROUND.values() for name in classes)
-        to_find, ignored = boxes_to_find(returns, None, every, known=known)
+        to_find, ignored = boxes_to_find(returns, None, every, known=truth.knows)
         for group, (names, least_iou) in ALL_ROUND.items():
             evaluator = tallies["all_round", group] = BoxEvaluator(least_iou, together=names)
             guesses, rights = ([box for box in boxes if box.label in names] for boxes in (predicted, to_find))
@@ -250,15 +246,11 @@ class Judge:
         self, tallies: dict[tuple[str, ...], Any], truth: Truth, boxes: Sequence[Box], scan_boxes: Sequence[Box]
     ) -> None:
         """Match all boxes as KITTI's benchmark does, in its image or all round, and as nuScenes does, all round."""
-
-        def known(box: Box) -> bool:
-            return bool(truth.known(np.array([box.center]))[0])
-
-        predicted = [box for box in boxes if known(box)]
+        predicted = [box for box in boxes if truth.knows(box)]
         if truth.box_labels is not None:
             predicted = [replace(box, label=box_label(box.label, truth.box_labels)) for box in predicted]
-        returns = list(zip(truth.boxes, truth.returns, strict=True))
-        to_find, ignored = boxes_to_find(returns, None, {box.label for box in truth.boxes} - {IGNORED}, known=known)
+        labels = {box.label for box in truth.boxes} - {IGNORED}
+        to_find, ignored = boxes_to_find(truth.counted, None, labels, known=truth.knows)
         if truth.front is not None:
             tallies["kitti",] = count_in_image(truth.front, scan_boxes, truth.drive)
         else:
@@ -280,17 +272,17 @@ class Judge:
         assert truth.labels is not None
         right = np.where(predicted.in_view, truth.labels, IGNORE).astype(np.uint8)
         range_m = np.hypot(truth.points[:, 0], truth.points[:, 1])
-        labels = _renamed(predicted.labels, predicted.classes, truth.classes)
+        labels = renamed(predicted.labels, predicted.classes, truth.classes)
         tallies |= banded(("points",), truth.classes, labels, right, range_m)
         objects = tuple(name for name in truth.classes if name not in STATIC)
-        own, true = (_renamed(each, truth.classes, objects) for each in (labels, right))
+        own, true = (renamed(each, truth.classes, objects) for each in (labels, right))
         sure = np.where((true > 0) & find_ground(truth.points).mask, IGNORE, true).astype(np.uint8)
         for box in truth.boxes:
             if box.label == SITTING:
                 sure[inside(box, truth.points)] = IGNORE
         tallies |= banded(("sure",), objects, own, sure, range_m)
         if self.as_recorded:
-            pixels = _renamed(self.from_sensor.point_labels(truth.points), predicted.classes, truth.classes)
+            pixels = renamed(self.from_sensor.point_labels(truth.points), predicted.classes, truth.classes)
             tallies |= banded(("pixels",), truth.classes, pixels, right, range_m)
         counted = right != IGNORE
         if truth.classes == POINT_CLASSES:
@@ -328,7 +320,7 @@ class Judge:
                 classes, right = _without_vehicles(classes, right)
             if len(classes) < 2:
                 continue
-            labels = _renamed(view.labels, view.classes, classes)
+            labels = renamed(view.labels, view.classes, classes)
             tallies |= banded(("segmentation", table), classes, labels, right, self.cell_range_m)
         if truth.road is None or "drivable" not in view.classes:
             return
@@ -396,7 +388,7 @@ def _without_vehicles(classes: tuple[str, ...], right: NDArray[np.uint8]) -> tup
     return others, number[right]
 
 
-def _renamed(labels: Labels, names: Sequence[str], classes: Sequence[str]) -> NDArray[np.uint8]:
+def renamed(labels: Labels, names: Sequence[str], classes: Sequence[str]) -> NDArray[np.uint8]:
     """A model's labels as those of a table, whose first class stands for what it lacks; `IGNORE` stays as it is."""
     coarse = {"drivable": "road", **dict.fromkeys(VEHICLES, "vehicle")}
     renamed = [name if name in classes else coarse.get(name, "") for name in names]

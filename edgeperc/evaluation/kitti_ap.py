@@ -15,11 +15,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..datasets.kitti import IMAGE_SIZE, IMAGE_SIZES, KittiCalibration, KittiLabels
-from ..types.geometry import oriented_iou, shared_area
 from ..types.perception import Box
-from .metrics import EVERYWHERE, ObjectKey, interpolated_precision, object_key
-
-N_POSITIONS = 40  # recall positions of the curve, without recall 0
+from .metrics import (
+    EVERYWHERE,
+    N_POSITIONS,
+    ObjectKey,
+    box_overlaps,
+    box_rows,
+    interpolated_precision,
+    object_key,
+    recall_positions,
+)
 
 # Smallest IoU of a match, the benchmark's own and a looser one, and neighboring classes that a detector may find.
 CLASSES = {
@@ -84,11 +90,11 @@ def count_in_image(truth: FrontTruth, boxes: Sequence[Box], drive: str) -> ApTab
     """Count the matches of one scan as KITTI's benchmark does. Detections that the image does not show are left out, as
     in a submission. DontCare has no 3-D boxes, so it excuses no detection from above and in 3-D.
     """
-    kinds, numbers = _objects(truth.labels)
+    kinds, numbers = truth.labels.objects
     placed = truth.calibration.sensor_boxes(numbers[:, 7:14])
     right_m = np.hypot(placed[:, 0], placed[:, 1])
     objects = [_key(drive, kind, row) for kind, row in zip(kinds, numbers, strict=True)]
-    guesses = _rows(boxes)
+    guesses = box_rows(boxes)
     seen = truth.calibration.image_rectangles(guesses, truth.image_size)
     shown = ((seen[:, 2:] - seen[:, :2]) > 0.0).all(axis=1)
     guesses, seen, boxes = guesses[shown], seen[shown], [boxes[k] for k in np.flatnonzero(shown).tolist()]
@@ -129,7 +135,7 @@ def count_all_round(
     ``unknown`` class may be found.
     """
     every = [*to_find, *ignored]
-    guesses, rights = _rows(boxes), _rows(every)
+    guesses, rights = box_rows(boxes), box_rows(every)
     guess_m, right_m = (np.hypot(rows[:, 0], rows[:, 1]) for rows in (guesses, rights))
     overlaps = _overlaps(guesses, rights)
     table = ApTable()
@@ -158,25 +164,17 @@ def best_candidates(
     """The best of the candidates, of any class and score, for each object of `CLASSES` within the limits of a level;
     IoU 0 without one. One may cover several objects.
     """
-    kinds, numbers = _objects(truth.labels)
+    kinds, numbers = truth.labels.objects
     placed = truth.calibration.sensor_boxes(numbers[:, 7:14])
     best = np.zeros(len(kinds))
     if candidates:
-        guesses = truth.calibration.in_camera(_rows(candidates))
+        guesses = truth.calibration.in_camera(box_rows(candidates))
         best = _overlaps(guesses, _level_rows(numbers[:, 7:14]))[BIRDS_EYE].max(axis=0)
     return [
         Candidate(_key(drive, kinds[k], numbers[k]), kinds[k], float(np.hypot(*placed[k, :2])), float(best[k]))
         for k in np.flatnonzero(~_hidden(numbers, level)).tolist()
         if kinds[k] in CLASSES
     ]
-
-
-def candidate_recall(found: Sequence[Candidate], least_iou: float = 0.3) -> dict[str, tuple[float, int]]:
-    """Share of the objects of each class with a candidate of at least this IoU, and the number of objects."""
-    by_class = {
-        label: [candidate.iou >= least_iou for candidate in found if candidate.label == label] for label in CLASSES
-    }
-    return {label: (sum(hits) / len(hits) if hits else math.nan, len(hits)) for label, hits in by_class.items()}
 
 
 def count_matches(
@@ -263,19 +261,6 @@ def average_precisions(counts: Sequence[Counts]) -> tuple[float, float, float]:
     return float(curve[1:].mean()), float(curve[::4].mean()), ap
 
 
-def recall_positions(n_hits: int, n_truth: int) -> Iterator[int]:
-    """Which hits, best first, give the thresholds of the recall positions (``getThresholds``)."""
-    recall, k = 0.0, 0
-    while k < n_hits:
-        # All but a few of the hits that are skipped, without a loop over them.
-        k = max(k, min(int(n_truth * recall - 1.5) - 2, n_hits - 1))
-        while k < n_hits - 1 and (k + 2) / n_truth - recall < recall - (k + 1) / n_truth:
-            k += 1
-        yield k
-        recall += 1.0 / N_POSITIONS
-        k += 1
-
-
 def _rules(levels: Collection[str], of_ranges: str) -> Iterator[tuple[str, str, float, str, tuple[float, float]]]:
     """Class, kind of overlap, smallest IoU, level or range, and range of distances of each row."""
     for label, (least_ious, _) in CLASSES.items():
@@ -285,12 +270,6 @@ def _rules(levels: Collection[str], of_ranges: str) -> Iterator[tuple[str, str, 
                     yield label, overlap_name, least_iou, level, EVERYWHERE
         for band, within_m in RANGES.items():
             yield label, BIRDS_EYE, RANGE_IOU, band, within_m
-
-
-def _objects(labels: KittiLabels) -> tuple[list[str], NDArray[np.float64]]:
-    """Classes and numbers of the rows that are not DontCare regions."""
-    is_object = np.array([kind != "dontcare" for kind in labels.kinds], np.bool_)
-    return [kind for kind in labels.kinds if kind != "dontcare"], labels.numbers[is_object]
 
 
 def _hidden(numbers: NDArray[np.float64], level: str) -> NDArray[np.bool_]:
@@ -305,11 +284,6 @@ def _key(drive: str, kind: str, numbers: NDArray[np.float64]) -> ObjectKey:
     return object_key(drive, Box(kind, 1.0, (0.0, 0.0, 0.0), (length, width, height), 0.0))
 
 
-def _rows(boxes: Sequence[Box]) -> NDArray[np.float64]:
-    """x, y, z of the center, length, width, height, yaw, (n, 7)."""
-    return np.array([(*box.center, *box.size, box.yaw) for box in boxes], np.float64).reshape(-1, 7)
-
-
 def _level_rows(numbers: NDArray[np.float64]) -> NDArray[np.float64]:
     """Labels (n, 7) in the camera's frame as `KittiCalibration.in_camera` returns boxes."""
     height, width, length, x, y, z, turn = numbers.T
@@ -318,12 +292,4 @@ def _level_rows(numbers: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _overlaps(a: NDArray[np.float64], b: NDArray[np.float64]) -> Mapping[str, NDArray[np.float64]]:
-    """IoU of boxes (n, 7) and (m, 7) from above and in 3-D, (n, m) each."""
-    flat_a, flat_b = a[:, [0, 1, 3, 4, 6]], b[:, [0, 1, 3, 4, 6]]
-    from_above = oriented_iou(flat_a, flat_b)
-    top = np.minimum.outer(a[:, 2] + a[:, 5] / 2.0, b[:, 2] + b[:, 5] / 2.0)
-    bottom = np.maximum.outer(a[:, 2] - a[:, 5] / 2.0, b[:, 2] - b[:, 5] / 2.0)
-    shared = shared_area(from_above, flat_a, flat_b) * np.maximum(top - bottom, 0.0)
-    volumes = np.add.outer(a[:, 3:6].prod(axis=1), b[:, 3:6].prod(axis=1))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return {BIRDS_EYE: from_above, IN_3D: np.where(shared > 0.0, shared / (volumes - shared), 0.0)}
+    return dict(zip((BIRDS_EYE, IN_3D), box_overlaps(a, b), strict=True))

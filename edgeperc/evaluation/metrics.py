@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -16,6 +16,7 @@ from ..types.views import TopViewGeometry
 
 EVERYWHERE = (0.0, math.inf)
 FEWEST_RETURNS = 3  # an object with fewer returns cannot be distinguished from clutter
+N_POSITIONS = 40  # recall positions of KITTI's curves, without recall 0
 HEADING_RAD = math.pi / 4.0  # largest error of a correct heading
 
 ObjectKey = tuple[str, str, float, float, float]
@@ -297,7 +298,8 @@ class BoxEvaluator:
             right = pairs[-1][1]
             matches.scores.append(box.score)
             matches.ranges_m.append(_range_m(right or box))
-            matches.turns.append(math.nan if right is None else _turn(box.yaw - right.yaw))
+            turn = math.nan if right is None else box.yaw - right.yaw
+            matches.turns.append(abs(math.remainder(turn, 2.0 * math.pi)) if math.isfinite(turn) else math.nan)
             matches.fronts.append(box.front is not None)
             matches.matched.append(None if right is None else object_key(drive, right))
         return [*pairs, *((None, box) for box in missed.values())]
@@ -350,17 +352,43 @@ def boxes_to_find(
     return to_find, ignored
 
 
+def box_rows(boxes: Iterable[Box]) -> NDArray[np.float64]:
+    """x, y, z of the center, length, width, height, yaw, (n, 7)."""
+    return np.array([(*box.center, *box.size, box.yaw) for box in boxes], np.float64).reshape(-1, 7)
+
+
+def box_overlaps(a: NDArray[np.float64], b: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """IoU of boxes (n, 7) and (m, 7) from above and in 3-D, (n, m) each; 0 in 3-D for boxes without a finite volume."""
+    flat_a, flat_b = a[:, [0, 1, 3, 4, 6]], b[:, [0, 1, 3, 4, 6]]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        from_above = oriented_iou(flat_a, flat_b)
+        top = np.minimum.outer(a[:, 2] + a[:, 5] / 2.0, b[:, 2] + b[:, 5] / 2.0)
+        bottom = np.maximum.outer(a[:, 2] - a[:, 5] / 2.0, b[:, 2] - b[:, 5] / 2.0)
+        shared = shared_area(from_above, flat_a, flat_b) * np.maximum(top - bottom, 0.0)
+        volumes = np.add.outer(a[:, 3:6].prod(axis=1), b[:, 3:6].prod(axis=1))
+        return from_above, np.nan_to_num(shared / (volumes - shared), nan=0.0, posinf=0.0, neginf=0.0)
+
+
+def recall_positions(n_hits: int, n_truth: int) -> Iterator[int]:
+    """Which hits, best first, give the thresholds at the recalls 0, 1/40 .. 1 (``getThresholds`` of KITTI's kit)."""
+    recall, k = 0.0, 0
+    while k < n_hits:
+        # All but a few of the hits that are skipped, without a loop over them.
+        k = max(k, min(int(n_truth * recall - 1.5) - 2, n_hits - 1))
+        # With equal distances rounding decides, so this is written as in KITTI's program.
+        while k < n_hits - 1 and (k + 2) / n_truth - recall < recall - (k + 1) / n_truth:
+            k += 1
+        yield k
+        recall += 1.0 / N_POSITIONS
+        k += 1
+
+
 def object_key(drive: str, box: Box) -> ObjectKey:
     """Identify an object in all scans of its drive by its label and its size in centimeters: labelers give it one. On
     KITTI's drive 0005 this counts the same 15 objects as the track numbers of its labels.
     """
     length, width, height = (round(side, 2) for side in box.size)
     return drive, box.label, length, width, height
-
-
-def _turn(angle: float) -> float:
-    """Absolute difference of two headings [rad], 0..pi."""
-    return abs(math.remainder(angle, 2.0 * math.pi)) if math.isfinite(angle) else math.nan
 
 
 def _range_m(box: Box) -> float:

@@ -14,9 +14,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..errors import TrackingError
 from ..system.kernels import njit
-from ..types.geometry import oriented_iou, shared_area
+from .metrics import N_POSITIONS, box_overlaps, recall_positions
 
-N_RECALLS = 40
 HOTA_ALPHAS = np.linspace(0.05, 0.95, 19)
 
 
@@ -85,45 +84,18 @@ class TrackingScores:
 
 
 def box_iou(a: ArrayLike, b: ArrayLike) -> NDArray[np.float64]:
-    """3-D intersection over union of each box of ``a`` with each box of ``b``.
-
-    a : (n, 7) array_like
-    b : (m, 7) array_like
-    Returns (n, m) float64: In 0..1; 0 if a box is not finite or has no volume.
-    """
-    first = np.asarray(a, dtype=np.float64).reshape(-1, 7)
-    second = np.asarray(b, dtype=np.float64).reshape(-1, 7)
-    footprints = first[:, [0, 1, 3, 4, 6]], second[:, [0, 1, 3, 4, 6]]
-    with np.errstate(invalid="ignore", divide="ignore"):
-        shared = shared_area(oriented_iou(*footprints), *footprints)
-        top = np.minimum.outer(first[:, 2] + first[:, 5] / 2.0, second[:, 2] + second[:, 5] / 2.0)
-        bottom = np.maximum.outer(first[:, 2] - first[:, 5] / 2.0, second[:, 2] - second[:, 5] / 2.0)
-        shared *= np.maximum(top - bottom, 0.0)
-        volumes = np.add.outer(first[:, 3:6].prod(axis=1), second[:, 3:6].prod(axis=1))
-        iou = shared / (volumes - shared)
-    return np.nan_to_num(iou, nan=0.0, posinf=0.0, neginf=0.0)
+    """3-D IoU (n, m) of boxes (n, 7) and (m, 7), in 0..1; 0 if a box is not finite or has no volume."""
+    first, second = (np.asarray(boxes, np.float64).reshape(-1, 7) for boxes in (a, b))
+    return box_overlaps(first, second)[1]
 
 
 def recall_thresholds(scores: ArrayLike, n_truth: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Scores at which the recall is nearest to 1/40, 2/40 .. 1 (AB3DMOT's protocol, after KITTI's).
-
-    scores : (n,) array_like; score of the matched track, for each match.
-    n_truth : number of possible matches.
-    Returns thresholds, recalls ((k,) float64): At most 40, with falling thresholds. The lowest score is used for the
-        first recall that is not reached.
+    """Scores of matches at which the recall is nearest to 1/40, 2/40 .. 1, and these recalls (AB3DMOT's protocol, after
+    KITTI's). The lowest score is used for the first recall that is not reached.
     """
     falling = np.sort(np.asarray(scores, dtype=np.float64))[::-1]
-    ranks: list[int] = []
-    recalls: list[float] = []
-    recall = 0.0
-    for rank in range(len(falling)):
-        # The next rank is nearer. With equal distances rounding decides, so this is written as in KITTI's program.
-        if rank < len(falling) - 1 and (rank + 2) / n_truth - recall < recall - (rank + 1) / n_truth:
-            continue
-        ranks.append(rank)
-        recalls.append(recall)
-        recall += 1.0 / N_RECALLS
-    return falling[ranks[1:]], np.array(recalls[1:], np.float64)
+    ranks = [*recall_positions(len(falling), n_truth)][1:]
+    return falling[ranks], np.cumsum(np.full(len(ranks), 1.0 / N_POSITIONS))
 
 
 def evaluate_tracks(
@@ -152,7 +124,7 @@ def evaluate_tracks(
             best = clear
     if as_ab3dmot:
         best = _at_threshold(packed, best.threshold)
-    samota, amota, amotp = (sums / N_RECALLS if everything.n_truth else np.full(3, math.nan)).tolist()
+    samota, amota, amotp = (sums / N_POSITIONS if everything.n_truth else np.full(3, math.nan)).tolist()
     return TrackingScores(
         samota=samota,
         amota=amota,

@@ -24,9 +24,10 @@ from ..types.perception import Box
 from ..types.points import Labels, Points
 from ..types.sensor import SensorProfile, get_sensor
 from ..zoo import DEFAULT
-from .judge import Judge, Perceiving, check_unseen, training_scans_of
+from .judge import Judge, Perceiving, check_unseen, renamed, training_scans_of
 from .metrics import FEWEST_RETURNS, Confusion, ObjectKey, object_key
 from .tables import FEWEST_OBJECTS, figures
+from .truth import seeds_of
 
 N_FITTED = 8  # scenes for a remission function, from seeds before the evaluated ones
 FARTHEST_M = 50.0
@@ -169,8 +170,7 @@ def _count(confusion: Confusion, perceive: Perceiver, scan: Scan) -> None:
         raise ModelError(f"{perceive.cards[0].name} labels no points; pass a range-image model")
     near = np.hypot(scan.points[:, 0], scan.points[:, 1]) < FARTHEST_M
     known = predicted.in_view & near & (scan.labels != IGNORE)
-    numbers = np.array([POINT_CLASSES.index(c) if c in POINT_CLASSES else 0 for c in predicted.classes], np.uint8)
-    confusion.update(numbers[predicted.labels[known]], scan.labels[known])
+    confusion.update(renamed(predicted.labels[known], predicted.classes, POINT_CLASSES), scan.labels[known])
 
 
 def _row(confusion: Confusion) -> dict[str, Any]:
@@ -190,14 +190,11 @@ def _dataset(name: str) -> _DataSet:
         first = [frame.points for frame in islice(_frames(folder), MOST_SCANS)]
         return _of_folder(folder, replace(estimate_sensor(first).profile, mounting=folder.layout.sensor.mounting))
     sensor = get_sensor(sensor_name)
-    kind, _, number = source.partition(":")
-    if kind == "simulation":
-        if not (number or "24").isdecimal() or number == "0":
-            raise PointsError(f"got {source!r}; expected simulation, or simulation:N with a number of scans from 1")
-        n = int(number or 24)
+    if source.partition(":")[0] == "simulation":
+        seeds = seeds_of(source)
         sensor = replace(sensor, remission_range=(0.0, _raw_model(sensor)[0]), remission=None)
         fitted, _ = fit_sensor([_simulated(sensor, FIRST_SEED - 1 - k).points for k in range(N_FITTED)], sensor)
-        return fitted, n, lambda: (_simulated(sensor, FIRST_SEED + k) for k in range(n)), None
+        return fitted, len(seeds), lambda: (_simulated(sensor, seed) for seed in seeds), None
     images = sorted(Path(source).glob("*.npy"))
     if images:
         return sensor, len(images), lambda: map(_from_image, images), None
@@ -205,13 +202,9 @@ def _dataset(name: str) -> _DataSet:
 
 
 def _of_folder(folder: ScanFolder, sensor: SensorProfile | None = None) -> _DataSet:
-    n_scans = len(folder.names("test"))
-    return (
-        sensor or folder.layout.sensor,
-        n_scans,
-        lambda: map(_of_frame, _frames(folder)),
-        folder if folder.layout.boxes else None,
-    )
+    with_boxes = folder if folder.layout.boxes else None
+    names = folder.names("test")
+    return sensor or folder.layout.sensor, len(names), lambda: map(_of_frame, _frames(folder)), with_boxes
 
 
 def _folder(source: str) -> ScanFolder:

@@ -111,10 +111,7 @@ def repeat_pixels(model: onnx.ModelProto) -> None:
         graph.node.remove(after[0])
         if not any(before.output[0] in node.input for node in graph.node):
             graph.node.remove(before)
-    _sort(graph)
-    used = {name for node in graph.node for name in node.input}
-    for each in [each for each in graph.initializer if each.name not in used]:
-        graph.initializer.remove(each)
+    sort(graph)
 
 
 def _constant(graph: onnx.GraphProto, name: str, values: Sequence[int]) -> str:
@@ -122,8 +119,11 @@ def _constant(graph: onnx.GraphProto, name: str, values: Sequence[int]) -> str:
     return name
 
 
-def _sort(graph: onnx.GraphProto) -> None:
-    """Put every node behind those that make its inputs."""
+def sort(graph: onnx.GraphProto) -> None:
+    """Let each node follow those that make its inputs, and remove weights that nothing reads."""
+    used = {name for node in graph.node for name in node.input}
+    for each in [each for each in graph.initializer if each.name not in used]:
+        graph.initializer.remove(each)
     made = {"", *(each.name for each in (*graph.input, *graph.initializer))}
     left, ordered = [*graph.node], []
     while left:

@@ -20,7 +20,7 @@ import platform
 import re
 import tempfile
 import time
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -435,16 +435,24 @@ def _choose(fp32: Calibrated, candidates: Sequence[str], limit: float, noise: fl
 
 
 def race(
-    one: Path, other: Path, n_threads: int | None, n_runs: int = N_RUNS
+    one: Path,
+    other: Path,
+    n_threads: int | None,
+    n_runs: int = N_RUNS,
+    batches: Sequence[NDArray[np.float32]] = (),
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Times of the runs of two networks [ms], measured in turn; the first run of each turn is a warm-up."""
+    """Times of the runs of two networks [ms], measured in turn, for one batch of rows after the other; the first run of
+    each turn is a warm-up.
+    """
     sessions = [Session(path, "cpu", n_threads=n_threads) for path in (one, other)]
     times = np.empty((2, n_runs))
     for run in range(n_runs):
+        rows = batches[run % len(batches)] if batches else sessions[0].input[:1]
         for k, session in enumerate(sessions):
-            session.run()
+            session.input[: len(rows)] = rows
+            session.run(len(rows))
             start = time.perf_counter()
-            session.run()
+            session.run(len(rows))
             times[k, run] = 1e3 * (time.perf_counter() - start)
     return times[0], times[1]
 
@@ -481,26 +489,27 @@ def _compared(before: Path, after: Path, labeled: LabeledSets) -> list[dict[str,
     """Counts of both models on KITTI's validation drives, on SemanticKITTI's roads and on simulated scans, by set."""
     judges = [Judge([path], NETWORK_ALONE) for path in (before, after)]
     read = judges[1]  # it was also calibrated on scans, which must not be among these
-    truths: list[tuple[str, Callable[[], Truth]]] = [
-        ("simulated", partial(read.simulated, samples.FIRST_SEED + k)) for k in range(labeled.n_simulated)
-    ]
+
+    def later(
+        block: str, truth_of: Callable[[Any], Truth], names: Iterable[Any]
+    ) -> list[tuple[str, Callable[[], Truth]]]:
+        return [(block, partial(truth_of, name)) for name in names]
+
+    first = samples.FIRST_SEED
+    truths = later("simulated", read.simulated, range(first, first + labeled.n_simulated))
     if labeled.kitti is not None:
         objects = KittiObjects(labeled.kitti)
         names = objects.names("validation") or objects.names("test")  # a set of other drives has no validation drives
-        truths += [("real", partial(_later, read.kitti, objects.frame, name)) for name in names]
+        truths += later("real", lambda name: read.kitti(objects.frame(name)), names)
     if labeled.semantickitti is not None and read.from_above is not None:
         roads = SemanticKitti(labeled.semantickitti)
-        truths += [("road", partial(_later, read.semantickitti, roads.frame, name)) for name in roads.names("all")]
+        truths += later("road", lambda name: read.semantickitti(roads.frame(name)), roads.names("all"))
     records: list[dict[str, list[Record]]] = [{}, {}]
     for block, make in tqdm(truths, desc="comparing", unit="scan"):
         truth = make()
         for judge, of in zip(judges, records, strict=True):
             of.setdefault(block, []).append(judge.record(truth)[0])
     return records
-
-
-def _later(evaluate: Callable[[Any], Truth], read: Callable[[Any], Any], name: Any) -> Truth:
-    return evaluate(read(name))
 
 
 def losses_of(before: Mapping[str, Sequence[Record]], after: Mapping[str, Sequence[Record]]) -> Losses:
