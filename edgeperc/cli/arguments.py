@@ -143,17 +143,15 @@ def with_whole_options(given: Sequence[str]) -> list[str]:
     return whole
 
 
-def add_topic(group: Options) -> None:
-    """Add ``--topic``."""
+def add_capture(group: Options) -> None:
+    """Add the sensor, its mounting, and how scans are read; `reading_options` takes those."""
+    add_sensor(group, of_capture=True)
+    add_mounting(group)
     group(
         "--topic NAME",
         "what to read of several sensors: the topic of a bag, TOPIC@FRAME, the serial number of an Ouster, the "
         "address of a Velodyne (default: the only one)",
     )
-
-
-def add_fields(group: Options) -> None:
-    """Add ``--columns``, ``--remission-field``, ``--remission-range`` and ``--origin``."""
     group(
         "--columns NAME...",
         "what .bin files hold for each point, in order; after the paths: --columns x y z intensity ring (default: "
@@ -179,12 +177,12 @@ def add_fields(group: Options) -> None:
 
 
 def reading_options(arguments: argparse.Namespace) -> dict[str, Any]:
-    """Options of `edgeperc.read_scans` from ``--topic`` and those of `add_fields`."""
+    """Options of `edgeperc.read_scans` from those of `add_capture`."""
     return {"topic": arguments.topic, **file_options(arguments)}
 
 
 def file_options(arguments: argparse.Namespace) -> dict[str, Any]:
-    """Options of `edgeperc.read_points` from those of `add_fields`."""
+    """Options of `edgeperc.read_points` from those of `add_capture`."""
     origin = arguments.origin
     if origin is not None and "auto" in origin:
         if set(origin) != {"auto"}:
@@ -193,12 +191,12 @@ def file_options(arguments: argparse.Namespace) -> dict[str, Any]:
     return {"columns": arguments.columns, "remission_field": arguments.remission_field, "origin_m": origin}
 
 
-def add_model(group: Options, default: Sequence[str] = DEFAULT_MODELS) -> None:
+def add_model(group: Options) -> None:
     """Add ``--model``, which may be repeated."""
     group(
         "--model MODEL",
         "a name from 'edgeperc models', one of its variants such as pointseg:int8, or the path of an .onnx file "
-        f"with a card; repeat the option to run one model of each kind (default: {' and '.join(default)})",
+        f"with a card; repeat the option to run one model of each kind (default: {' and '.join(DEFAULT_MODELS)})",
         action="append",
     )
     group(
@@ -217,7 +215,7 @@ def chosen_models(arguments: argparse.Namespace) -> Sequence[str]:
     return arguments.model or WEIGHTS[arguments.weights]
 
 
-def add_provider(group: Options, *, provider: str = "auto", precision: str = "auto") -> None:
+def add_provider(group: Options, *, provider: str = "auto") -> None:
     """Add ``--provider`` and ``--precision``."""
     group(
         "--provider PROVIDER",
@@ -231,12 +229,14 @@ def add_provider(group: Options, *, provider: str = "auto", precision: str = "au
         "number format of the networks' arithmetic; auto takes bf16 or int8 only if the model's card shows that "
         "its results agree with fp32 (default: %(default)s)",
         choices=PRECISIONS,
-        default=precision,
+        default="auto",
     )
 
 
-def add_network(group: Options) -> None:
-    """Add options of networks: `add_provider`, ``--threads``, ``--trusted``, ``--boxes-from``, ``--full-turn``."""
+def add_networks(parser: argparse.ArgumentParser, title: str = "models", *, adapt: bool = True) -> None:
+    """Add a group with the options of `add_model` and of a perceiver's networks."""
+    group = options(parser, title)
+    add_model(group)
     add_provider(group)
     group(
         "--threads N",
@@ -255,6 +255,15 @@ def add_network(group: Options) -> None:
         "run the range-image model on all four quarters of the turn, so that every point around the vehicle gets "
         "a class; the network takes four times as long (default: only the quarter ahead)",
     )
+    if adapt:
+        group(
+            "--adapt",
+            "how to adapt scans of a sensor other than the training sensor: remission maps its remission to the "
+            "training sensor's, interpolation fills the range image between its beams; no effect on an hdl-64e "
+            "(default: %(default)s)",
+            choices=("both", "remission", "interpolation", "none"),
+            default="both",
+        )
 
 
 def add_boxes_from(group: Options) -> None:
@@ -281,18 +290,6 @@ def add_agreement(group: Options) -> None:
         "--no-agreement",
         "return the labels, boxes and cells of the networks as they are (default: correct them by one another, by "
         "the ground and by clusters)",
-    )
-
-
-def add_adapt(group: Options) -> None:
-    """Add ``--adapt``."""
-    group(
-        "--adapt",
-        "how to adapt scans of a sensor other than the training sensor: remission maps its remission to the "
-        "training sensor's, interpolation fills the range image between its beams; no effect on an hdl-64e (default: "
-        "%(default)s)",
-        choices=("both", "remission", "interpolation", "none"),
-        default="both",
     )
 
 

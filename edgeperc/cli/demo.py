@@ -12,7 +12,7 @@ from ..errors import MissingExtraError
 from ..system.atomic import open_atomic, write_atomic
 from ..system.extras import require
 from ..types.choices import CAMERA
-from .arguments import Commands, add_command, add_model, add_network, chosen_models, options
+from .arguments import Commands, add_command, add_networks, chosen_models, options
 from .output import one_line, print_rows
 from .run import make_perceiver
 
@@ -57,9 +57,7 @@ def add_parser(commands: Commands) -> None:
         "also draw the image of a camera in the street, label it, carry its classes to the points and its road to "
         "the top view, and write image.png and camera.png",
     )
-    models = options(parser, "models")
-    add_model(models)
-    add_network(models)
+    add_networks(parser, adapt=False)
 
 
 def demo_command(arguments: argparse.Namespace) -> int:

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 from ..errors import EdgepercError, MissingExtraError, MountingError, PointsError
 from ..system.atomic import write_atomic
 from ..types.choices import DEFAULT_MODELS
-from .arguments import Commands, add_command, add_fields, add_mounting, add_sensor, add_topic, options, reading_options
+from .arguments import Commands, add_capture, add_command, options, reading_options
 from .output import many, print_error, print_line, print_rows
 from .scans import Sensors, stated_sensor, with_mounting
 
@@ -64,10 +64,7 @@ def add_parser(commands: Commands) -> None:
         "a name from 'edgeperc models', an .onnx file, a scan, a capture (its first scan; its mounting by the "
         "first five), or an image",
     )
-    add_sensor(reading, of_capture=True)
-    add_mounting(reading)
-    add_topic(reading)
-    add_fields(reading)
+    add_capture(reading)
     reading(
         "--suggest-ego-box",
         f"suggest --ego-box: returns near the sensor that never move in up to {_MOST_SCANS} scans of a drive, "

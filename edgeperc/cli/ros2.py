@@ -6,17 +6,7 @@ import argparse
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
-from .arguments import (
-    Commands,
-    add_adapt,
-    add_command,
-    add_model,
-    add_mounting,
-    add_network,
-    options,
-    positive,
-    positive_number,
-)
+from .arguments import Commands, add_command, add_mounting, add_networks, options, positive, positive_number
 from .output import many, print_error, print_line
 from .run import make_perceiver
 from .scans import with_mounting
@@ -64,10 +54,7 @@ def add_parser(commands: Commands) -> None:
         "perceive scans that differ grossly from those that a model was trained on, too, with a warning (default: "
         "refuse them)",
     )
-    models = options(parser, "models")
-    add_model(models)
-    add_network(models)
-    add_adapt(models)
+    add_networks(parser)
     output = options(parser, "output")
     output(
         "--prefix NAME",

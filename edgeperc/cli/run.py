@@ -18,14 +18,9 @@ from ..system.remote import Remote, location
 from ..types.choices import AUTO_SENSOR, CAMERA
 from .arguments import (
     Commands,
-    add_adapt,
+    add_capture,
     add_command,
-    add_fields,
-    add_model,
-    add_mounting,
-    add_network,
-    add_sensor,
-    add_topic,
+    add_networks,
     chosen_models,
     file_options,
     options,
@@ -109,10 +104,7 @@ def add_parser(commands: Commands) -> None:
         "KITTI's calibration of camera and LiDAR, the same for all images; with --scan and --png, NAME_both.png "
         "shows the classes of the image on the points, and its road from above (default: no such picture)",
     )
-    add_sensor(reading, of_capture=True)
-    add_mounting(reading)
-    add_topic(reading)
-    add_fields(reading)
+    add_capture(reading)
     reading(
         "--deskew",
         "straighten scans by the times of their points and the motion of the sensor: that of --poses, or with "
@@ -149,10 +141,7 @@ def add_parser(commands: Commands) -> None:
         action="store_const",
         const="warn",
     )
-    models = options(parser, "models")
-    add_model(models)
-    add_network(models)
-    add_adapt(models)
+    add_networks(parser)
     output = options(parser, "output")
     output("--json", "print one JSON object for each scan, and nothing else, on stdout")
     output("--out DIR", "folder or URL for the files below, made if needed (default: no files)", type=location)

@@ -29,7 +29,6 @@ def evaluate_images(
     split: str | None = None,
     provider: str = "cpu",
     precision: str = "auto",
-    n_resamples: int = 1000,
     on_image: Callable[[int, int], None] = lambda done, total: None,
 ) -> dict[str, Any]:
     """Compute the figures of a camera model on labeled images; ``split`` None is that of the test images if there are
@@ -64,7 +63,7 @@ def evaluate_images(
         "providers": dict(perceive.providers),
         "split": split,
         "fold": None,
-        "images": image_figures(card.classes, np.stack(counts), n_resamples),
+        "images": image_figures(card.classes, np.stack(counts)),
     }
 
 

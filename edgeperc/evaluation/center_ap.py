@@ -7,7 +7,7 @@ AP is the area of the precision over recall beyond 0.1 of both, averaged over th
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -44,20 +44,14 @@ class CenterTable:
         )
 
 
-def count_centers(
-    boxes: Sequence[Box],
-    to_find: Sequence[Box],
-    ignored: Sequence[Box],
-    drive: str,
-    unknown: Collection[str] = ("ignore",),
-) -> CenterTable:
+def count_centers(boxes: Sequence[Box], to_find: Sequence[Box], ignored: Sequence[Box], drive: str) -> CenterTable:
     """Match the detections of one scan, where objects are labeled, with those of `metrics.boxes_to_find`; one without a
-    match does not count if an ignored object of its or an ``unknown`` class is as near as a match.
+    match does not count if an ignored object of its class or of the class ``ignore`` is as near as a match.
     """
     table = CenterTable()
     for label, farthest_m in CLASSES.items():
         rights = [box for box in to_find if box.label == label and math.hypot(*box.center[:2]) <= farthest_m]
-        spares = [box for box in ignored if box.label == label or box.label in unknown]
+        spares = [box for box in ignored if box.label in (label, "ignore")]
         guesses = [box for box in boxes if box.label == label and math.hypot(*box.center[:2]) <= farthest_m]
         guesses.sort(key=lambda box: -box.score)
         away_m, spare_m = _distances(guesses, rights), _distances(guesses, spares)

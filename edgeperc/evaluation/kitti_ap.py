@@ -124,15 +124,9 @@ def count_in_image(truth: FrontTruth, boxes: Sequence[Box], drive: str) -> ApTab
     return table
 
 
-def count_all_round(
-    boxes: Sequence[Box],
-    to_find: Sequence[Box],
-    ignored: Sequence[Box],
-    drive: str,
-    unknown: Collection[str] = ("ignore",),
-) -> ApTable:
+def count_all_round(boxes: Sequence[Box], to_find: Sequence[Box], ignored: Sequence[Box], drive: str) -> ApTable:
     """Count the matches of one scan without the limits in the image. Ignored objects of a class, its neighbors or an
-    ``unknown`` class may be found.
+    unknown class (``ignore``) may be found.
     """
     every = [*to_find, *ignored]
     guesses, rights = box_rows(boxes), box_rows(every)
@@ -140,7 +134,7 @@ def count_all_round(
     overlaps = _overlaps(guesses, rights)
     table = ApTable()
     for label, overlap_name, least_iou, level, (near, far) in _rules((ALL_ROUND,), ALL_ROUND):
-        may_be = (label, *CLASSES[label][1], *unknown)
+        may_be = (label, *CLASSES[label][1], "ignore")
         columns = [k for k, box in enumerate(every) if box.label in may_be]
         rows = [k for k, box in enumerate(boxes) if box.label == label]
         optional = [k >= len(to_find) or every[k].label != label or not near <= right_m[k] < far for k in columns]
@@ -158,10 +152,8 @@ def count_all_round(
     return table
 
 
-def best_candidates(
-    truth: FrontTruth, candidates: Sequence[Box], drive: str, level: str = "moderate"
-) -> list[Candidate]:
-    """The best of the candidates, of any class and score, for each object of `CLASSES` within the limits of a level;
+def best_candidates(truth: FrontTruth, candidates: Sequence[Box], drive: str) -> list[Candidate]:
+    """The best of the candidates, of any class and score, for each object of `CLASSES` within the limits of "moderate";
     IoU 0 without one. One may cover several objects.
     """
     kinds, numbers = truth.labels.objects
@@ -172,7 +164,7 @@ def best_candidates(
         best = _overlaps(guesses, _level_rows(numbers[:, 7:14]))[BIRDS_EYE].max(axis=0)
     return [
         Candidate(_key(drive, kinds[k], numbers[k]), kinds[k], float(np.hypot(*placed[k, :2])), float(best[k]))
-        for k in np.flatnonzero(~_hidden(numbers, level)).tolist()
+        for k in np.flatnonzero(~_hidden(numbers, "moderate")).tolist()
         if kinds[k] in CLASSES
     ]
 

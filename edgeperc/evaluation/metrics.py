@@ -216,17 +216,16 @@ class BoxEvaluator:
         truth: Iterable[Box],
         *,
         ignored: Iterable[Box] = (),
-        ignored_regions: ArrayLike = (),
         drive: str = "",
     ) -> list[tuple[Box | None, Box | None]]:
         """Count the boxes of one scan, and pair them whatever their class; false positives and missed boxes have None.
-        Those that match ``ignored``, or lie half in ``ignored_regions`` (r, 5) of unknown truth, are left out.
+        Those that match ``ignored`` are left out.
         """
         guesses = sorted(predicted, key=lambda box: -box.score)
         rights, spares = list(truth), list(ignored)
         overlap = oriented_iou(self._rectangles(guesses), self._rectangles(rights))
-        excused = (oriented_iou(self._rectangles(guesses), self._rectangles(spares)) >= self.iou_threshold).any(axis=1)
-        excused |= _share_inside(rectangles(guesses), np.asarray(ignored_regions, dtype=np.float64)) >= 0.5
+        spared = oriented_iou(self._rectangles(guesses), self._rectangles(spares)) >= self.iou_threshold
+        excused = np.asarray(spared.any(axis=1))
         for label in dict.fromkeys(box.label for box in (*guesses, *rights)):
             matches = self._classes.setdefault(label, _Matches())
             self._match(matches, guesses, rights, overlap, excused, drive, {label})
@@ -255,10 +254,6 @@ class BoxEvaluator:
     def overall(self, within_m: tuple[float, float] = EVERYWHERE) -> BoxScores:
         """Scores of the boxes of the classes ``together``, by default all, as if they were one class."""
         return self._scores(self._all, within_m)
-
-    def mean_ap(self, within_m: tuple[float, float] = EVERYWHERE) -> float:
-        """Mean AP over the classes that have true boxes (SSADNet appendix A, mAP)."""
-        return mean([scores.ap for scores in self.per_class(within_m).values()])
 
     def _rectangles(self, boxes: list[Box]) -> NDArray[np.float64]:
         rows = rectangles(boxes)
@@ -393,15 +388,6 @@ def object_key(drive: str, box: Box) -> ObjectKey:
 
 def _range_m(box: Box) -> float:
     return math.hypot(box.center[0], box.center[1])
-
-
-def _share_inside(rows: NDArray[np.float64], regions: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Largest share of each rectangle's area that lies in one region, (n,)."""
-    if len(rows) == 0 or regions.size == 0:
-        return np.zeros(len(rows))
-    shared = shared_area(oriented_iou(rows, regions), rows, regions)
-    areas = rows[:, 2] * rows[:, 3]
-    return np.asarray(np.max(shared / np.maximum(areas, np.finfo(np.float64).tiny)[:, None], axis=1))
 
 
 def _share(part: ArrayLike, whole: ArrayLike) -> NDArray[np.float64]:

@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -65,7 +65,6 @@ def agree(
     camvid: Path | None = None,
     split: str = "validation",
     n_scans: int | None = None,
-    on_scan: Callable[[str], None] = lambda precision: None,
 ) -> dict[str, dict[str, Any]]:
     """Measure every precision that the files of one network can run in on labeled scans or images, at most ``n_scans``
     of each set, and write the record into their cards. Raises ModelError, PointsError, SplitError.
@@ -96,9 +95,7 @@ def agree(
         measure = partial(_measure_objects, objects=KittiObjects(kitti), split=split, n_scans=n_scans)
     else:
         measure = partial(_measure, kitti=kitti, semantickitti=semantickitti, split=split, n_scans=n_scans)
-    measured = {
-        precision: measure(variant, precision, partial(on_scan, precision)) for precision, variant in runs.items()
-    }
+    measured = {precision: measure(variant, precision) for precision, variant in runs.items()}
     options = [f"--kitti KITTI --split {split}"] * (kitti is not None)
     options += [f"--camvid CAMVID --split {split}"] * (camvid is not None)
     options += ["--semantickitti SEMANTICKITTI"] * (semantickitti is not None) + [f"--scans {n_scans}"] * bool(n_scans)
@@ -143,7 +140,6 @@ def record_of(own: Measured, fp32: Measured, command: str) -> dict[str, Any]:
 def _measure(
     variant: Variant,
     precision: str,
-    count: Callable[[], None],
     *,
     kitti: Path | None,
     semantickitti: Path | None,
@@ -168,7 +164,6 @@ def _measure(
     for block, truth in truths():
         records.setdefault(block, []).append(judge.record(truth)[0])
         labels.append(_labels(judge.perceive(truth.points)))
-        count()
     if not labels:
         raise PointsError(f"no labeled scan of {split} drives in {kitti}, {semantickitti}; name a KITTI object set")
     blocks = [figures(of_block, 0) for of_block in records.values()]
@@ -180,7 +175,6 @@ def _measure(
 def _measure_objects(
     variant: Variant,
     precision: str,
-    count: Callable[[], None],
     *,
     objects: KittiObjects,
     split: str,
@@ -209,7 +203,6 @@ def _measure_objects(
         session.input[: len(inputs[:MAX_ROWS])] = inputs[:MAX_ROWS]
         outputs = session.run(min(len(inputs), MAX_ROWS))["objects"][: len(inputs)] if len(inputs) else inputs[:, 0]
         labels.append(outputs[:, : len(session.card.classes)].argmax(axis=1).astype(np.uint8))
-        count()
     aps = [average_precisions(table.counts["car", overlap, "moderate"])[2] for overlap in ("bird's eye 0.7", "3-D 0.7")]
     return Measured(labels, float(np.mean(overlaps)), float(np.mean(aps)), _engine(session, precision))
 
@@ -217,7 +210,6 @@ def _measure_objects(
 def _measure_images(
     variant: Variant,
     precision: str,
-    count: Callable[[], None],
     *,
     data: LabeledImages,
     split: str,
@@ -232,7 +224,6 @@ def _measure_images(
         assert found is not None
         labels.append(found.labels.ravel())
         confusion.update(found.labels, truth)
-        count()
     return Measured(labels, confusion.mean_iou(), None, by)
 
 

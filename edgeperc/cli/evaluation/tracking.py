@@ -10,17 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from ...errors import PointsError
 from ...system.extras import require
-from ..arguments import (
-    Commands,
-    add_adapt,
-    add_command,
-    add_figures_file,
-    add_model,
-    add_network,
-    add_sensor,
-    options,
-    positive_number,
-)
+from ..arguments import Commands, add_command, add_figures_file, add_networks, add_sensor, options, positive_number
 from ..output import many, print_line, progress, table_lines, without_nan, write_figures
 from ..run import make_perceiver
 
@@ -86,10 +76,7 @@ def add_parser(commands: Commands) -> None:
         "evaluate AB3DMOT's method, implemented again, on the same boxes by the same rules (default: none)",
         choices=("ab3dmot",),
     )
-    models = options(parser, "models, if the boxes come from scans")
-    add_model(models)
-    add_network(models)
-    add_adapt(models)
+    add_networks(parser, "models, if the boxes come from scans")
     output = options(parser, "output")
     add_figures_file(output)
     output(
