@@ -20,7 +20,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 import edgeperc.errors
 from edgeperc import EdgepercError, Perceiver
@@ -28,7 +27,7 @@ from edgeperc import EdgepercError, Perceiver
 from .application import Application
 from .context import EnergyMeter, conditions, peak_rss_mb, rss_mb
 from .loadgen import single_stream
-from .scenarios import Limits, Perceive, Timings, back_to_back, paced
+from .scenarios import Limits, Timings, back_to_back, paced
 
 TICK_S = 0.25
 MEMORY_SAMPLES = 500  # at most, in a scenario: a longer list would itself be memory growth
@@ -116,7 +115,8 @@ def work(connection: Any, job: Job) -> dict[str, Any]:
         began = time.perf_counter()
         perceive = make_perceiver(job)
         result: dict[str, Any] = {"construct_s": time.perf_counter() - began, "first_call_ms": None}
-        scans = {path: np.load(path) for path in dict.fromkeys((*_paths(job), *job.predict))}
+        named = [path for scenario in job.scenarios for path in scenario.scans]
+        scans = {path: np.load(path) for path in dict.fromkeys((*named, *job.predict))}
         if scans:
             began = time.perf_counter()
             perceive(next(iter(scans.values())))
@@ -140,19 +140,10 @@ def work(connection: Any, job: Job) -> dict[str, Any]:
             stopped = watch.stopped
         result |= {"interrupted": stopped, "rss_mb": rss_mb(), "peak_rss_mb": peak_rss_mb()}
         if not stopped:
-            result["predictions"] = [_predict(perceive, scans[path]) for path in job.predict]
+            found = [perceive(scans[path]) for path in job.predict]
+            result["predictions"] = [Prediction(each.points, each.top_view, each.boxes) for each in found]
     result["warnings"] = list(dict.fromkeys(str(each.message) for each in caught))
     return result
-
-
-def _paths(job: Job) -> Iterator[Path]:
-    for scenario in job.scenarios:
-        yield from scenario.scans
-
-
-def _predict(perceive: Perceive, scan: NDArray[np.float32]) -> Prediction:
-    perception = perceive(scan)
-    return Prediction(perception.points, perception.top_view, perception.boxes)
 
 
 def active_engines(perceive: Perceiver) -> list[dict[str, Any]]:

@@ -16,7 +16,6 @@ multiples of the copy loop's, and numpy's time as a multiple of the kernel's. On
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
@@ -42,7 +41,7 @@ from edgeperc.types.sensor import get_sensor
 from edgeperc.types.views import RangeImageGeometry, TopViewGeometry
 
 from ..render import Section, number, text
-from .rounds import measure, versions
+from .rounds import measure, parser_of, versions
 
 SENSOR = "hdl-64e"
 TOP_VIEW = TopViewGeometry()
@@ -215,13 +214,9 @@ def table(ms: Mapping[str, NDArray[np.float64]]) -> Section:
 
 def main() -> None:
     """Run the command line."""
-    parser = argparse.ArgumentParser(
-        prog="python -m edgeperc_bench.peers.projection", description=(__doc__ or "").splitlines()[0]
-    )
-    parser.add_argument("scan", nargs="?", type=Path, help="a scan file (default: a simulated scan)")
-    parser.add_argument(
-        "--rounds", type=int, default=300, metavar="N", help="how often each is measured (default: %(default)s)"
-    )
+    parser, add = parser_of("projection", __doc__)
+    add("scan", "a scan file (default: a simulated scan)", nargs="?", type=Path)
+    add("--rounds N", "how often each is measured (default: %(default)s)", type=int, default=300)
     arguments = parser.parse_args()
     if arguments.scan is None:
         name, points = "a simulated scan", simulate(random_scene(3), get_sensor(SENSOR), 0).points

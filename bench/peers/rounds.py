@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import platform
 from collections.abc import Callable, Mapping
 from time import perf_counter_ns
@@ -9,6 +10,8 @@ from time import perf_counter_ns
 import numba
 import numpy as np
 from numpy.typing import NDArray
+
+from edgeperc.cli.arguments import Options, options
 
 N_WARM_UP = 3
 
@@ -36,3 +39,10 @@ def versions(**others: str) -> str:
     """Versions of numpy, numba, Python and other packages, and the processor's architecture."""
     packages = {"numpy": np.__version__, "numba": numba.__version__, "Python": platform.python_version()} | others
     return ", ".join([*(f"{name} {version}" for name, version in packages.items()), platform.machine()])
+
+
+def parser_of(module: str, text: str | None) -> tuple[argparse.ArgumentParser, Options]:
+    """The parser of a module that is a command, described by the first line of its text, and what adds its options."""
+    description = (text or "").splitlines()[0]
+    parser = argparse.ArgumentParser(prog=f"python -m edgeperc_bench.peers.{module}", description=description)
+    return parser, options(parser)

@@ -31,7 +31,6 @@ the true one, median and 95th percentile. On real drives KISS-ICP stands in for 
 
 from __future__ import annotations
 
-import argparse
 import importlib.metadata
 import math
 import time
@@ -55,7 +54,7 @@ from edgeperc.tracking.moving import moving_tracks
 from edgeperc.types.geometry import inside
 
 from ..render import Section, number, text
-from .rounds import versions
+from .rounds import parser_of, versions
 
 RATE_HZ = 10.0
 CELL_M = 0.2
@@ -333,21 +332,13 @@ def draw_maps(drive: Drive, seen: Seen, odometry: Odometry, path: Path) -> None:
 
 def main() -> None:
     """Run the command line."""
-    parser = argparse.ArgumentParser(
-        prog="python -m edgeperc_bench.peers.slam", description=(__doc__ or "").splitlines()[0]
-    )
-    parser.add_argument("root", nargs="?", type=Path, help="a KITTI object set (default: drawn streets)")
-    parser.add_argument(
-        "--drive", nargs="+", default=[], metavar="DRIVE", help="only drives that end so, such as 0001 or urban"
-    )
-    parser.add_argument(
-        "--least", type=int, default=20, metavar="N", help="drives with at least N scans (default: %(default)s)"
-    )
-    parser.add_argument(
-        "--scans", type=int, default=0, metavar="N", help="the first N scans of each drive (default: all; drawn: 60)"
-    )
-    parser.add_argument("--second-pass", action="store_true", help="also track with KISS-ICP's poses")
-    parser.add_argument("--picture", type=Path, metavar="FILE", help="draw the maps of the first drawn street")
+    parser, add = parser_of("slam", __doc__)
+    add("root", "a KITTI object set (default: drawn streets)", nargs="?", type=Path)
+    add("--drive DRIVE...", "only drives that end so, such as 0001 or urban", default=[])
+    add("--least N", "drives with at least N scans (default: %(default)s)", type=int, default=20)
+    add("--scans N", "the first N scans of each drive (default: all; drawn: 60)", type=int, default=0)
+    add("--second-pass", "also track with KISS-ICP's poses")
+    add("--picture FILE", "draw the maps of the first drawn street")
     arguments = parser.parse_args()
     require("kiss_icp", "slam", "The comparison with KISS-ICP", package="kiss-icp")
     if arguments.picture and arguments.root is not None:

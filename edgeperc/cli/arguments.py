@@ -47,10 +47,11 @@ def add_command(
     return parser
 
 
-def options(parser: argparse.ArgumentParser, title: str | None = None) -> Options:
+def options(parser: argparse.ArgumentParser, title: str | None = None, **defaults: Any) -> Options:
     """A function that adds options, to the group of a title, as the help shows them: ``--live``, ``--json FILE``,
-    ``paths PATH...``, ``--size W H``. One without a value is a flag, a FILE or DIR is a path.
+    ``paths PATH...``, ``--size W H``. One without a value is a flag, a FILE or DIR is a path. ``defaults`` are kept.
     """
+    parser.set_defaults(**defaults)
     group = parser if title is None else parser.add_argument_group(title)
 
     def add(shown: str, help: str, **settings: Any) -> None:
@@ -62,7 +63,7 @@ def options(parser: argparse.ArgumentParser, title: str | None = None) -> Option
         if values:
             metavar = values[0] if len(values) == 1 else tuple(values)
             settings = {"metavar": metavar, "type": _PATHS.get(values[0])} | settings
-        elif "choices" not in settings:
+        elif name.startswith("-") and "choices" not in settings:
             settings.setdefault("action", "store_true")
         group.add_argument(name, help=help, **settings)
 

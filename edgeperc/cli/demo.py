@@ -88,7 +88,9 @@ def demo_command(arguments: argparse.Namespace) -> int:
     rows = [("scene", f"{perception.n_points:,} points, a simulated hdl-64e in a street with known labels")]
     if perception.top_view is not None:
         area_m2 = perception.top_view.drivable_area_m2
-        rows.append(("drivable", f"{area_m2:.0f} m2 of the {_extent(perception)} ahead"))
+        (x_near, x_far), (y_right, y_left) = perception.top_view.x_range_m, perception.top_view.y_range_m
+        extent = f"{x_far - x_near:.0f} x {y_left - y_right:.0f} m"
+        rows.append(("drivable", f"{area_m2:.0f} m2 of the {extent} ahead"))
     texts = [_box_text(box) for box in perception.boxes] or ["none"]
     rows += [("boxes" if k == 0 else "", text) for k, text in enumerate(texts)]
     if perception.points is not None:
@@ -165,12 +167,6 @@ def _camera_rows(
     except MissingExtraError as exc:
         rows.append(("picture", one_line(exc)))
     return rows
-
-
-def _extent(perception: Perception) -> str:
-    assert perception.top_view is not None
-    (x_near, x_far), (y_right, y_left) = perception.top_view.x_range_m, perception.top_view.y_range_m
-    return f"{x_far - x_near:.0f} x {y_left - y_right:.0f} m"
 
 
 def _box_text(box: Box) -> str:

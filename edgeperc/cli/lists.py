@@ -130,11 +130,6 @@ def _mark(flag: bool) -> str:
     return "yes" if flag else "-"
 
 
-def _plain(value: object) -> object:
-    """A mapping as a dict and a path as text, for JSON."""
-    return dict(value) if isinstance(value, Mapping) else str(value)
-
-
 def _print(
     records: Sequence[Mapping[str, Any]],
     columns: Mapping[str, Callable[[Mapping[str, Any]], str]],
@@ -142,7 +137,8 @@ def _print(
 ) -> int:
     if arguments.json:
         for record in records:
-            print_line(json.dumps(record, allow_nan=False, default=_plain))
+            plain = {key: dict(value) if isinstance(value, Mapping) else value for key, value in record.items()}
+            print_line(json.dumps(plain, allow_nan=False, default=str))
     else:
         print_columns([*columns], [[cell(record) for cell in columns.values()] for record in records])
     return 0

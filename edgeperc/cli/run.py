@@ -564,6 +564,8 @@ class _Run:
         title: str | None = None,
     ) -> Outcome:
         """Track the boxes and write everything about a scan."""
+        from .. import view
+
         stamp_s = self._stamp_s(perception)
         tracks = None if self._tracker is None else self._tracker.update(perception.boxes, stamp_s)
         if self._straightener is not None and tracks is not None:
@@ -572,7 +574,7 @@ class _Run:
             _write(points, perception, wanted, title=title or str(name))
         finally:  # a picture that cannot be written costs no sink its scan
             self._sink(PerceivedScan(str(name), stamp_s, points, perception, tracks, sensor))
-        return name, perception, tracks, _under(points, perception) if self._arguments.gif else None
+        return name, perception, tracks, view.flatten_scan(points, perception) if self._arguments.gif else None
 
     def _track(self, perception: Perception) -> Tracks:
         assert self._tracker is not None
@@ -646,9 +648,3 @@ def _write(points: Points, perception: Perception, wanted: Mapping[str, Path], t
         view.write_labels(perception, wanted["labels"])
     if "ply" in wanted:
         view.write_ply(perception, points, wanted["ply"])
-
-
-def _under(points: Points, perception: Perception) -> bytes:
-    from ..view import flatten_scan
-
-    return flatten_scan(points, perception)
