@@ -183,20 +183,8 @@ def accuracy_sentences(accuracy: Mapping[str, Any]) -> list[str]:
 
 
 def _matrix(document: Mapping[str, Any]) -> Section:
-    rows = [
-        [
-            "model",
-            "ran as",
-            "p50",
-            "p90",
-            "p99",
-            "noise",
-            "CPU s/scan",
-            "peak RSS MB",
-            "labels equal",
-            "agrees",
-        ]
-    ]
+    head = ["model", "ran as", "p50", "p90", "p99", "noise", "CPU s/scan", "peak RSS MB", "labels equal", "agrees"]
+    rows = [head]
     for setting in document["settings"]:
         for name in scenario_names(setting):
             t, accuracy = latency(setting, name), setting["accuracy"]

@@ -59,9 +59,7 @@ class Verdict:
 
 
 def compare(a: Sequence[ArrayLike], b: Sequence[ArrayLike], seed: int = 0) -> Verdict:
-    """Compare the repeats of run B with those of run A; "unusable" with fewer than two repeats, because the noise is
-    unknown.
-    """
+    """Compare the repeats of run B with those of run A; "unusable" with fewer than two, which have no noise."""
     noises = [noise_floor(a), noise_floor(b)]
     if None in noises:
         return Verdict("unusable", math.nan, (math.nan, math.nan), math.nan)

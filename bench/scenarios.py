@@ -75,9 +75,20 @@ class KeepGoing(Protocol):
     def __call__(self, timings: Timings) -> bool: ...
 
 
-def _warm_up(
-    perceive: Perceive, scans: Sequence[NDArray[np.float32]], limits: Limits, clock: Clock, keep_going: KeepGoing
+def back_to_back(
+    perceive: Perceive,
+    scans: Sequence[NDArray[np.float32]],
+    limits: Limits,
+    *,
+    rate_hz: float | None = None,
+    clock: Clock | None = None,
+    keep_going: KeepGoing = lambda timings: True,
+    on_start: Callable[[], None] = lambda: None,
 ) -> Timings:
+    """Perceive one scan after the other, the next as soon as there is a result (MLPerf's single stream), or as `paced`;
+    ``on_start`` is called between the warm-up, always back to back, and the first scan that counts.
+    """
+    clock = clock or Clock()
     timings = Timings(stride=limits.stride)
     for k in range(limits.warm_up_scans):
         began = clock.now()
@@ -85,72 +96,37 @@ def _warm_up(
         timings.warm_up_ms.append(1e3 * (clock.now() - began))
         if not keep_going(timings):
             break
-    return timings
-
-
-def back_to_back(
-    perceive: Perceive,
-    scans: Sequence[NDArray[np.float32]],
-    limits: Limits,
-    *,
-    clock: Clock | None = None,
-    keep_going: KeepGoing = lambda timings: True,
-    on_start: Callable[[], None] = lambda: None,
-) -> Timings:
-    """Perceive one scan after the other, the next as soon as there is a result (MLPerf's single stream); ``on_start``
-    is called between the warm-up and the first scan that counts.
-    """
-    clock = clock or Clock()
-    timings = _warm_up(perceive, scans, limits, clock, keep_going)
-    on_start()
-    first = timings.first_s = clock.now()
-    while keep_going(timings) and (timings.n < limits.min_scans or clock.now() - first < limits.min_seconds):
-        scan = scans[timings.n % len(scans)]
-        began = clock.now()
-        perception = perceive(scan)
-        took_ms = 1e3 * (clock.now() - began)
-        timings.add(began - first, took_ms, took_ms, perception.stage_ms)
-    return timings
-
-
-def paced(
-    perceive: Perceive,
-    scans: Sequence[NDArray[np.float32]],
-    rate_hz: float,
-    limits: Limits,
-    *,
-    clock: Clock | None = None,
-    keep_going: KeepGoing = lambda timings: True,
-    on_start: Callable[[], None] = lambda: None,
-) -> Timings:
-    """Perceive scans as they arrive: scan k at the first one's time plus k / rate, so that the schedule does not drift.
-    Until then the thread sleeps, as in a vehicle; after a late result the newest scan is next. Warm-up is back to back.
-    """
-    clock = clock or Clock()
-    timings = _warm_up(perceive, scans, limits, clock, keep_going)
     on_start()
     first = timings.first_s = clock.now()
     k = 0
     while keep_going(timings) and (timings.n < limits.min_scans or clock.now() - first < limits.min_seconds):
-        newest = math.floor((clock.now() - first) * rate_hz + 1e-9)
-        if newest > k:
+        due = None
+        if rate_hz is not None:
+            newest = max(k, math.floor((clock.now() - first) * rate_hz + 1e-9))
             timings.skipped += newest - k
             k = newest
-        scan, due = scans[k % len(scans)], first + k / rate_hz
-        clock.sleep_until(due)
+            due = first + k / rate_hz
+            clock.sleep_until(due)
         began = clock.now()
-        perception = perceive(scan)
-        done = clock.now()
-        timings.missed += done > due + 1.0 / rate_hz
-        timings.add(began - first, 1e3 * (done - began), 1e3 * (done - due), perception.stage_ms)
+        perception = perceive(scans[k % len(scans)])
+        done, arrived = clock.now(), began if due is None else due
+        timings.missed += rate_hz is not None and done > arrived + 1.0 / rate_hz
+        timings.add(began - first, 1e3 * (done - began), 1e3 * (done - arrived), perception.stage_ms)
         k += 1
     return timings
 
 
-def throughput(calls: Sequence[tuple[Sequence[float], Sequence[float]]]) -> tuple[float, float]:
-    """Scans per second of processes' calls (start_s, ms) while all of them were running, NaN without such a time; its
-    length [s].
+def paced(
+    perceive: Perceive, scans: Sequence[NDArray[np.float32]], rate_hz: float, limits: Limits, **how: Any
+) -> Timings:
+    """Perceive scans as they arrive: scan k at the first one's time plus k / rate, so that the schedule does not drift.
+    Until then the thread sleeps, as in a vehicle; after a late result the newest scan is next. Warm-up is back to back.
     """
+    return back_to_back(perceive, scans, limits, rate_hz=rate_hz, **how)
+
+
+def throughput(calls: Sequence[tuple[Sequence[float], Sequence[float]]]) -> tuple[float, float]:
+    """Scans per second of processes' calls (start_s, ms) while all ran, NaN if they never did; for how long [s]."""
     ends = [np.asarray(start) + np.asarray(ms) / 1e3 for start, ms in calls]
     if not ends or not all(map(len, ends)):
         return math.nan, 0.0

@@ -37,9 +37,7 @@ def camera_images(view: CameraGeometry, folder: Path) -> tuple[Path, ...]:
 
 
 class NumpyCamera:
-    """`edgeperc.Perceiver` of images of the model's own size without edgeperc's stages; the class output is the
-    engine's only one.
-    """
+    """`edgeperc.Perceiver` of images of the model's own size without edgeperc's stages, by the engine's only output."""
 
     def __init__(self, card: ModelCard, engine: Engine) -> None:
         self.card, self.engine = card, engine

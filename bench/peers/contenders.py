@@ -157,8 +157,8 @@ def groups(
 
 
 def methods(folder: Path) -> list[Contender]:
-    """edgeperc's whole answers, networks of others with random weights (written to ``folder``; all in onnxruntime's CPU
-    provider), and clusters without a network.
+    """edgeperc's whole answers, others' networks with random weights (in ``folder``), and clusters without a
+    network.
     """
     rows = [
         Contender(f"edgeperc {view}, {label}", view, "cpu", precision, timed="scan to labels, cells and boxes")

@@ -21,9 +21,7 @@ from .arithmetic import openvino_request
 
 @dataclass(frozen=True)
 class Engine:
-    """A network ready to run: write its ``input`` (C, H, W), then ``run`` returns the outputs by name, without the
-    batch axis.
-    """
+    """A network ready to run: ``run`` returns the outputs of ``input`` (C, H, W) by name, without the batch axis."""
 
     input: NDArray[np.float32]
     run: Callable[[], Mapping[str, NDArray[np.float32]]]
@@ -195,19 +193,11 @@ def _in_torch(op: str, inputs: Sequence[Any], attributes: Mapping[str, Any]) -> 
     }  # fmt: skip
     if op in plain:
         return plain[op], list(inputs)
+    bias = others[1] if len(others) > 1 else None
     if op == "Conv":
-        bias = others[1] if len(others) > 1 else None
-        return F.conv2d, [
-            x,
-            others[0],
-            bias,
-            attributes["strides"],
-            pads[:2],
-            attributes["dilations"],
-            attributes["group"],
-        ]
+        last = [attributes["dilations"], attributes["group"]]
+        return F.conv2d, [x, others[0], bias, attributes["strides"], pads[:2], *last]
     if op == "ConvTranspose":
-        bias = others[1] if len(others) > 1 else None
         extra = attributes.get("output_padding", [0, 0])
         last = [extra, attributes.get("group", 1), attributes.get("dilations", [1, 1])]
         return F.conv_transpose2d, [x, others[0], bias, attributes["strides"], pads[:2], *last]
@@ -221,14 +211,11 @@ def _in_torch(op: str, inputs: Sequence[Any], attributes: Mapping[str, Any]) -> 
         return torch.mean, [x, others[0].tolist(), bool(attributes.get("keepdims", 1))]
     if op == "Expand":
         return torch.Tensor.expand, [x, [-1 if n == 1 else n for n in others[0].tolist()]]
-    if op == "Resize" and attributes.get("mode") == b"nearest":
+    modes = {b"nearest": "nearest", b"linear": "bilinear"}
+    if op == "Resize" and attributes.get("mode") in modes:
         _, scales, *sizes = others
         size = sizes[0].tolist()[2:] if sizes else None
-        return F.interpolate, [x, size, None if sizes else scales.tolist()[2:], "nearest"]
-    if op == "Resize" and attributes.get("mode") == b"linear":
-        _, scales, *sizes = others
-        size = sizes[0].tolist()[2:] if sizes else None
-        return F.interpolate, [x, size, None if sizes else scales.tolist()[2:], "bilinear"]
+        return F.interpolate, [x, size, None if sizes else scales.tolist()[2:], modes[attributes["mode"]]]
     if op == "DepthToSpace" and attributes.get("mode") == b"CRD":
         return F.pixel_shuffle, [x, attributes["blocksize"]]
     if op == "Reshape":

@@ -127,9 +127,7 @@ def clusterers(points: Scan, peers: Mapping[str, Any]) -> dict[str, Clusterer]:
 
 
 def tree_clusters(points: Scan) -> NDArray[np.signedinteger[Any]]:
-    """Clusters by a k-d tree, (n,) int: voxels whose first points have no gap above `DISTANCE_M`, as
-    `pcl::EuclideanClusterExtraction` is mostly used.
-    """
+    """Clusters by a k-d tree, (n,) int: voxels with no gap above `DISTANCE_M`, as PCL's Euclidean ones mostly are."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
     from scipy.spatial import KDTree

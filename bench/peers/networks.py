@@ -26,9 +26,7 @@ OTHERS: dict[str, tuple[str, tuple[str, ...], tuple[int, int, int]]] = {
 
 
 def resized(model: str, share: float, folder: Path) -> Path:
-    """Make a model's network with random weights in fp32 for ``share`` times the pixels: columns of a range image,
-    range of a top view. Raises ModelError.
-    """
+    """A model's network with random weights in fp32 for ``share`` times the columns or range. Raises ModelError."""
     from edgeperc_export.networks import build
     from edgeperc_export.recipe import Recipe
     from edgeperc_export.release.to_onnx import to_graph, write_card

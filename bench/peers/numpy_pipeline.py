@@ -33,9 +33,7 @@ WINDOW, N_VOTES, MAX_RANGE_GAP_M = 2, 5, 1.0
 
 
 class NumpyPipeline:
-    """`edgeperc.Perceiver` without edgeperc's stages, of cards of a front quarter or a top view with dense boxes, each
-    with an engine.
-    """
+    """`edgeperc.Perceiver` without its stages, of cards of a front quarter or a dense top view, each with an engine."""
 
     def __init__(self, cards: Sequence[ModelCard], engines: Sequence[Engine], sensor: SensorProfile) -> None:
         self.sensor = sensor

@@ -128,9 +128,7 @@ class NumpyTopView(_NumpyProjector):
 
 
 class NumpyRangeImage(_NumpyProjector):
-    """`RangeImageProjector` in numpy, for the front quarter: x, y, z, remission, range and, if wanted,
-    height_above_ground.
-    """
+    """`RangeImageProjector` in numpy, for the front quarter: the usual channels and, if wanted, height_above_ground."""
 
     def __init__(self, view: RangeImageGeometry, input: InputSpec) -> None:
         super().__init__(view, input)

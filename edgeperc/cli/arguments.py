@@ -32,9 +32,7 @@ def add_command(
     description: str,
     examples: Sequence[str],
 ) -> argparse.ArgumentParser:
-    """Add a subcommand: ``command`` takes the parsed arguments and returns the exit code, ``examples`` are printed
-    below the options.
-    """
+    """Add a subcommand: ``command`` returns the exit code, ``examples`` are printed below the options."""
     parser: argparse.ArgumentParser = commands.add_parser(
         name,
         help=help,

@@ -23,9 +23,7 @@ from .program import Parser, run_program
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line, by default that of this process, and return the exit code. Wrong usage raises argparse's
-    SystemExit.
-    """
+    """Run the command line, by default this process's; return the exit code. Raises argparse's SystemExit."""
     given = sys.argv[1:] if argv is None else list(argv)
 
     def message(exc: Exception) -> str:

@@ -42,9 +42,7 @@ def print_line(text: str, file: TextIO | None = None, *, gray: bool = False) -> 
 
 
 def print_result(text: str) -> None:
-    """Print a line on stdout; of a line that does not fit on a full disk, nothing stays, nor waits in a buffer. Raises
-    OSError.
-    """
+    """Print a line on stdout; of one that does not fit on a full disk, nothing stays or waits. Raises OSError."""
     try:
         number = sys.stdout.fileno()
     except (AttributeError, OSError, ValueError):  # no stream, or one without a file
@@ -113,9 +111,7 @@ def show_warning(
 
 @contextlib.contextmanager
 def progress(unit: str = "scan") -> Iterator[Callable[[int, int], None]]:
-    """Yield a function ``show(done, total)`` that draws a bar on stderr if that is a terminal, ``total`` is above 1 and
-    tqdm is installed (extra ``progress``).
-    """
+    """Yield ``show(done, total)``, which draws a bar on stderr if that is a terminal and tqdm is installed."""
     with contextlib.ExitStack() as stack:
         bars: list[Any] = []
 
@@ -171,9 +167,7 @@ def many(n: int, noun: str) -> str:
 def table_lines(
     title: str, columns: Sequence[tuple[str, str]], rows: Sequence[tuple[tuple[str, str], Mapping[str, Any]]]
 ) -> list[str]:
-    """Lay out a table: columns (heading, key), and rows of two names (a first one that repeats is printed once) with
-    figures by key. Empty without rows.
-    """
+    """A table: columns (heading, key), rows of two names, a repeated first one shown once, and figures by key."""
     if not rows:
         return []
     cells = [["", "", *(printable(heading) for heading, _ in columns)]]

@@ -55,9 +55,7 @@ def scan_folders(root: Path) -> list[Path]:
 
 
 def find_scans(paths: Sequence[Path]) -> Scans:
-    """Find scan files and captures, in the order of ``paths``; those of a folder or data set are sorted, those at a URL
-    may lie in any folder below it.
-    """
+    """Scan files and captures in the order of ``paths``; those of a folder, data set or URL's folders are sorted."""
     from ..readers.captures import CAPTURE_SUFFIXES, SCAN_SUFFIXES, is_capture, scan_files
 
     scans: dict[str, Path] = {}
@@ -80,9 +78,7 @@ def find_scans(paths: Sequence[Path]) -> Scans:
 
 
 def find_images(paths: Sequence[Path]) -> list[Path]:
-    """Find image files, in the order of ``paths``; those of a folder without scans are sorted. Empty if there are none.
-    Raises ImageError for a mixture.
-    """
+    """Image files in the order of ``paths``, those of folders sorted; ImageError for a mixture with scans."""
     from ..readers.captures import is_capture
     from ..readers.images import IMAGE_SUFFIXES
 
@@ -230,7 +226,7 @@ class Sensors:
 
 
 def with_mounting(sensor: str | SensorProfile, arguments: argparse.Namespace) -> str | SensorProfile:
-    """The sensor with what ``--extrinsic`` and the options of single values give, ``--accumulate`` and others. Raises
+    """The sensor with ``--extrinsic``, the options of single values, ``--accumulate`` and others. Raises
     SensorError.
     """
     from ..types.mounting import Mounting
@@ -262,8 +258,8 @@ def with_mounting(sensor: str | SensorProfile, arguments: argparse.Namespace) ->
 
 
 def output_names(scans: Sequence[Path], *, keep_folder: bool = False) -> list[Path]:
-    """Name the output files of each scan: its own name, after as few folders (with ``keep_folder``, at least one) as
-    make all differ.
+    """Names of the scans' output files, after as few folders (with ``keep_folder``, at least one) as make all
+    differ.
     """
     whole = [Path(_absolute(scan)).parts[1:] for scan in scans]
     short = [(*(p for p in parts[:-1] if p not in _LAYOUT_FOLDERS), parts[-1]) for parts in whole]

@@ -119,35 +119,30 @@ class Sinks:
             raise errors[0]
 
     def _open(self, arguments: argparse.Namespace) -> None:
-        if arguments.serve is not None:
-            from ..sinks.foxglove import ServeSink
+        if not wanted_sinks(arguments):
+            return
+        from ..sinks.foxglove import McapSink, ServeSink
+        from ..sinks.page import PageSink
+        from ..sinks.prelabels import PrelabelSink
+        from ..sinks.rerun import RerunSink
+        from ..sinks.rosbag import BagSink
+        from ..sinks.static import StaticSink
 
+        if arguments.serve is not None:
             served = ServeSink(*arguments.serve)
             self._add(served)
             print_line(f"open {served.url} in Foxglove", sys.stderr)
         if arguments.mcap is not None:
-            from ..sinks.foxglove import McapSink
-
             self._add(McapSink(arguments.mcap))
         if arguments.rrd is not None:
-            from ..sinks.rerun import RerunSink
-
             self._add(RerunSink(arguments.rrd))
         if arguments.play is not None:
-            from ..sinks.page import PageSink
-
             self._add(PageSink(arguments.play))
         if arguments.static is not None:
-            from ..sinks.static import StaticSink
-
             self._add(StaticSink(arguments.static, without="movable" if arguments.movable else "moving"))
         if arguments.labels_for is not None:
-            from ..sinks.prelabels import PrelabelSink
-
             self._add(PrelabelSink(arguments.out, arguments.labels_for, calib=arguments.calib))
         if arguments.bag is not None:
-            from ..sinks.rosbag import BagSink
-
             self._add(BagSink(arguments.bag, storage=arguments.bag_storage, frame_id=arguments.bag_frame))
 
     def _add(self, sink: Sink) -> None:

@@ -45,9 +45,7 @@ class LabeledImages:
         return annotated and (root / "classes.json").is_file()
 
     def files(self, split: str) -> list[Path]:
-        """The images of "train", "validation", "test", "held-back" (the last two) or "all", sorted; ImageError without
-        any.
-        """
+        """The images of "train", "validation", "test", "held-back" (the last two) or "all"; ImageError without any."""
         parts = {"held-back": ("validation", "test"), "all": tuple(FOLDERS)}.get(split, (split,))
         folders = [self.root / FOLDERS[part] for part in parts]
         files = [

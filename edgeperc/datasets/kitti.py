@@ -84,8 +84,8 @@ class KittiCalibration:
     def image_rectangles(
         self, rows: NDArray[np.float64], image_size: tuple[int, int] = IMAGE_SIZE
     ) -> NDArray[np.float64]:
-        """Left, top, right, bottom [px] of boxes (n, 7) in the sensor frame, clipped to the image; without area if one
-        is not in it.
+        """Left, top, right, bottom [px] of boxes (n, 7) in the sensor frame, clipped to the image; no area
+        outside it.
         """
         signs = np.array([[a, b, c] for a in (-0.5, 0.5) for b in (-0.5, 0.5) for c in (-0.5, 0.5)])
         local = signs[None] * rows[:, None, 3:6]
@@ -299,9 +299,7 @@ class RoadFrame:
     labels: Labels  # index into `ROAD_CLASSES`, `IGNORE` for unlabeled points
 
     def top_view(self, geometry: TopViewGeometry) -> NDArray[np.uint8]:
-        """True class of each cell (index into `ROAD_CLASSES`): that of more than half of its labeled returns, `IGNORE`
-        without one.
-        """
+        """Index into `ROAD_CLASSES` of each cell: that of most of its labeled returns, `IGNORE` without one."""
         p, known = self.points, self.labels != IGNORE
         row, col, in_view = geometry.cells(p[:, 0], p[:, 1])
         known &= in_view
@@ -317,7 +315,7 @@ class RoadFrame:
 
 
 class SemanticKitti:
-    """The scans with point labels below a SemanticKITTI root (``sequences/00/velodyne``, ``labels``), by drive. Raises
+    """The scans with point labels below a SemanticKITTI root (``sequences/00/velodyne``), by drive. Raises
     PointsError.
     """
 

@@ -114,8 +114,8 @@ class ScanLayout:
             raise PointsError(f"splits lists {', '.join(twice)[:80]} twice; whole drives belong to one split")
 
     def in_split(self, drive: str, split: str, fold: int | None = None) -> bool:
-        """As `splits.in_split`, with the description's own lists first. Drives that it lists are in no fold: with a
-        ``fold``, its validation drives stay out.
+        """As `splits.in_split`, with the description's own lists first; with a ``fold``, its validation drives stay
+        out.
         """
         unlisted = in_split(drive, split, fold)  # checks the arguments too
         listed = next((key for key, drives in self.splits.items() if drive in drives), None)
@@ -136,9 +136,7 @@ def known_layouts() -> tuple[str, ...]:
 
 
 def read_layout(layout: str | Path) -> ScanLayout:
-    """Read the description of a public set by name, or a file (a Path, or a str in ``.json``). Raises PointsError,
-    SensorError.
-    """
+    """The description of a public set by name, or of a Path or a str in ``.json``. Raises PointsError, SensorError."""
     if isinstance(layout, str) and not layout.endswith(".json"):
         known = known_layouts()
         if layout not in known:

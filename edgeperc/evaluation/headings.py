@@ -47,9 +47,7 @@ class Headings:
 
 
 def speeds(truth: Sequence[FrameTruth], tracks: Sequence[Tracks]) -> list[NDArray[np.float64]]:
-    """Speed over ground of each true box by frame [m/s], from its places up to `WINDOW` frames before and after; NaN
-    for an object without other frames nearby.
-    """
+    """Speed over ground of each true box by frame [m/s], from places up to `WINDOW` frames away; NaN without others."""
     places: list[dict[int, NDArray[np.float64]]] = []
     for frame, result in zip(truth, tracks, strict=True):
         world = frame.boxes[:, :3] @ result.T_world_sensor[:3, :3].T + result.T_world_sensor[:3, 3]
@@ -69,9 +67,7 @@ def speeds(truth: Sequence[FrameTruth], tracks: Sequence[Tracks]) -> list[NDArra
 def count_headings(
     truth: Sequence[FrameTruth], tracks: Sequence[Tracks], labels: Collection[str], iou_threshold: float
 ) -> Headings:
-    """Count right headings in one sequence, of tracks with one of the ``labels`` whose 3-D IoU with a label is large
-    enough.
-    """
+    """Count right headings in one sequence, of tracks of ``labels`` whose 3-D IoU with a label is large enough."""
     rows: list[tuple[int, int, bool, bool]] = []  # kind, track, resolved, right
     moved: set[int] = set()
     for frame, result, speed in zip(truth, tracks, speeds(truth, tracks), strict=True):

@@ -159,8 +159,8 @@ class Judge:
         return self._compare(truth, perception, perception.boxes)
 
     def record_scan(self, frame: ScanFrame) -> tuple[Record, Mistakes | None]:
-        """Evaluate one scan of a `ScanFolder`, perceived as a user's: its mounting is found from scans of its drive.
-        Raises SplitError.
+        """Evaluate a scan of a `ScanFolder` as a user's: its mounting is that of its drive's scans. Raises
+        SplitError.
         """
         truth, perception, scan_boxes = self._perceive_frame(frame)
         return self._compare(truth, perception, scan_boxes)

@@ -125,9 +125,7 @@ def count_in_image(truth: FrontTruth, boxes: Sequence[Box], drive: str) -> ApTab
 
 
 def count_all_round(boxes: Sequence[Box], to_find: Sequence[Box], ignored: Sequence[Box], drive: str) -> ApTable:
-    """Count the matches of one scan without the limits in the image. Ignored objects of a class, its neighbors or an
-    unknown class (``ignore``) may be found.
-    """
+    """Count the matches of a scan without limits in the image; ignored, neighbors and ``ignore`` may be found."""
     every = [*to_find, *ignored]
     guesses, rights = box_rows(boxes), box_rows(every)
     guess_m, right_m = (np.hypot(rows[:, 0], rows[:, 1]) for rows in (guesses, rights))
@@ -153,8 +151,8 @@ def count_all_round(boxes: Sequence[Box], to_find: Sequence[Box], ignored: Seque
 
 
 def best_candidates(truth: FrontTruth, candidates: Sequence[Box], drive: str) -> list[Candidate]:
-    """The best of the candidates, of any class and score, for each object of `CLASSES` within the limits of "moderate";
-    IoU 0 without one. One may cover several objects.
+    """The best candidate, of any class and score, for each object of `CLASSES` that is "moderate"; IoU 0
+    without one.
     """
     kinds, numbers = truth.labels.objects
     placed = truth.calibration.sensor_boxes(numbers[:, 7:14])

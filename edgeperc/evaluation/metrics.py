@@ -218,8 +218,8 @@ class BoxEvaluator:
         ignored: Iterable[Box] = (),
         drive: str = "",
     ) -> list[tuple[Box | None, Box | None]]:
-        """Count the boxes of one scan, and pair them whatever their class; false positives and missed boxes have None.
-        Those that match ``ignored`` are left out.
+        """Count the boxes of a scan, but those that match ``ignored``, and pair them whatever their class, or with
+        None.
         """
         guesses = sorted(predicted, key=lambda box: -box.score)
         rights, spares = list(truth), list(ignored)

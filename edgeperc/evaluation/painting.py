@@ -68,9 +68,7 @@ def count_painting(
     calibration: Calibration,
     sensor: str | os.PathLike[str] | SensorProfile,
 ) -> Counter[str]:
-    """Numbers of points and cells of one street that get their true class, by the names that `evaluate_painting`
-    divides.
-    """
+    """Numbers of points and cells of a street that get their true class, by `evaluate_painting`'s names."""
     labels = ImageLabels(image.labels, CAMERA_CLASSES)
     painted, true = paint(labels, scan.points, calibration, sensor=sensor), true_classes(scan)
     u, v, depth = calibration.project(scan.points)

@@ -45,9 +45,7 @@ Tallies = Mapping[tuple[str, ...], Any]
 
 @dataclass(frozen=True)
 class Record:
-    """Counts of one evaluated scan by the keys of their figures, such as ``("points", "0-15 m")``; those of several
-    scans can be added.
-    """
+    """Counts of one evaluated scan by the keys of their figures, such as ``("points", "0-15 m")``; they add up."""
 
     name: str
     drive: str

@@ -268,9 +268,7 @@ def read_sequence(
 def _read_detections(
     root: Path, name: str, classes: Sequence[str], calibration: KittiCalibration, n_frames: int
 ) -> tuple[list[list[Box]], list[NDArray[np.float64]]]:
-    """Detections and their image rectangles by frame, from columns frame, type, left, top, right, bottom, logit,
-    height, width, length, x, y, z, turn, alpha.
-    """
+    """Detections and image rectangles by frame: frame, type, rectangle, logit, h, w, l, x, y, z, turn, alpha."""
     detections: list[list[Box]] = [[] for _ in range(n_frames)]
     image_boxes: list[list[NDArray[np.float64]]] = [[] for _ in range(n_frames)]
     for label in classes:

@@ -65,9 +65,7 @@ class RunFile:
                 self.fail(exc)
 
     def close(self, whole: bool = True) -> None:
-        """Give the file its name, or with a warning that of a part if the run ended before its last scan. Raises an
-        OSError that `check` has not raised.
-        """
+        """Give the file its name, or that of a part if the run ended before its last scan. Raises OSError, once."""
         try:
             self.flush()
             self._file.close()

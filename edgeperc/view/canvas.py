@@ -156,6 +156,8 @@ def place_labels(
     """Write each label, the most important first, at the free place of the axes nearest to its object, with a line to
     it if they are apart; none covers another or an object. Returns the number for which there was no place.
     """
+    from matplotlib.lines import Line2D
+
     figure, panel, gap = axes.figure, axes.get_window_extent(), 4.0
     taken = np.array([*(label.area for label in labels), *avoid], dtype=np.float64).reshape(-1, 4)
     n_omitted = max(0, len(labels) - _MOST_LABELS)
@@ -176,7 +178,11 @@ def place_labels(
         taken = np.vstack([taken, [*(middle - half), *(middle + half)]])
         if apart > 3.0 * gap:
             area = np.array(label.area).reshape(2, 2)
-            _draw_leader(figure, np.clip(area.mean(axis=0), middle - half, middle + half), area, label.color)
+            start = np.clip(area.mean(axis=0), middle - half, middle + half)
+            end = np.clip(start, area[0], area[1])
+            line = Line2D([start[0], end[0]], [start[1], end[1]], color=label.color, linewidth=1.2, alpha=0.9, zorder=6)
+            line.set_transform(None)
+            figure.add_artist(line)
     return n_omitted
 
 
@@ -206,12 +212,3 @@ def free_place(
     # Mainly the distance between the rectangles, then that between their centers.
     best = int(np.argmin(apart + 0.08 * np.hypot(*(middles - named.mean(axis=0)).T)))
     return (middles[best], float(apart[best])) if apart[best] < _FARTHEST else None
-
-
-def _draw_leader(figure: Any, start: NDArray[np.float64], area: NDArray[np.float64], color: str) -> None:
-    from matplotlib.lines import Line2D
-
-    end = np.clip(start, area[0], area[1])
-    line = Line2D([start[0], end[0]], [start[1], end[1]], color=color, linewidth=1.2, alpha=0.9, zorder=6)
-    line.set_transform(None)
-    figure.add_artist(line)

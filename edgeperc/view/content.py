@@ -79,9 +79,7 @@ def drawable_boxes(boxes: Iterable[Box]) -> list[Box]:
 
 
 def paint_points(points: Points, perception: Perception) -> tuple[list[str], NDArray[np.uint8]]:
-    """Classes of both views, and the one to show for every point: its own or, for background, that of its cell in the
-    top view.
-    """
+    """Classes of both views, and the one to show for every point: its own or that of its cell for background."""
     names = list(perception.points.classes if perception.points is not None else ("background",))
     painted = np.zeros(len(points), dtype=np.uint8)
     if perception.points is not None:
@@ -123,9 +121,7 @@ def paint_vehicles(names: list[str], painted: NDArray[np.uint8], points: Points,
 
 
 def ground_plane(perception: Perception, points: Points) -> tuple[float, float, float]:
-    """The plane that a picture is drawn on: z = a + b x + c y [m] in the frame of the models; fitted to the scan if
-    need be.
-    """
+    """The plane that a picture is drawn on, a + b x + c y [m] in the frame of the models; fitted if need be."""
     ground = perception.ground or fit_ground(points, mount_height_m=MODEL_HEIGHT_M).surface()
     slope_x, slope_y, level = ground.expected
     return level, slope_x, slope_y

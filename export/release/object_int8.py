@@ -99,8 +99,8 @@ def candidate_batches(card: ModelCard, scans: Sequence[NDArray[np.float32]]) -> 
 def rounded(
     model: onnx.ModelProto, batches: Sequence[NDArray[np.float32]], input_name: str, *, seven_bits: bool = False
 ) -> onnx.ModelProto:
-    """A folded graph of `with_first_look` with the products of `ROUNDED` in int8: weights by output channel, inputs by
-    their range in the batches.
+    """A folded graph of `with_first_look` with the products of `ROUNDED` in int8: inputs by their range in the
+    batches.
     """
     copy = onnx.ModelProto()
     copy.CopyFrom(model)

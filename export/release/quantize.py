@@ -173,9 +173,7 @@ def folded(path: Path) -> onnx.ModelProto:
 
 @dataclass(frozen=True)
 class Calibrated:
-    """A network in fp32, the ranges of its tensors, its outputs for some images, and means of convolutions to
-    correct.
-    """
+    """A network in fp32, the ranges of its tensors, its outputs for some images, and means of convolutions."""
 
     card: ModelCard
     model: onnx.ModelProto
@@ -441,9 +439,7 @@ def race(
     n_runs: int = N_RUNS,
     batches: Sequence[NDArray[np.float32]] = (),
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Times of the runs of two networks [ms], measured in turn, for one batch of rows after the other; the first run of
-    each turn is a warm-up.
-    """
+    """Times of runs of two networks [ms], in turn, for one batch of rows after the other; the first is a warm-up."""
     sessions = [Session(path, "cpu", n_threads=n_threads) for path in (one, other)]
     times = np.empty((2, n_runs))
     for run in range(n_runs):
@@ -513,9 +509,7 @@ def _compared(before: Path, after: Path, labeled: LabeledSets) -> list[dict[str,
 
 
 def losses_of(before: Mapping[str, Sequence[Record]], after: Mapping[str, Sequence[Record]]) -> Losses:
-    """Compare the scores of both models, which are resampled by drive alike, because they err on the same scans; with
-    one drive the interval is the loss itself.
-    """
+    """Compare the scores of both models, resampled by drive alike; with one drive the interval is the loss."""
     losses = {}
     for block in before:
         pairs = [_by_drive(of[block]) for of in (before, after)]

@@ -104,9 +104,7 @@ def _training(recipe: Recipe, notes: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def to_graph(network: nn.Module, card: ModelCard) -> onnx.ModelProto:
-    """The network as an ONNX graph, without paths of this computer and without a card; it ends with the network's
-    ``blocks`` if the card's outputs have some.
-    """
+    """The network as an ONNX graph, without paths and card; it ends with ``blocks`` if the card's outputs have some."""
     example = torch.from_numpy(golden_input(0, golden_shape(card)))
     names = [o.name for o in card.outputs]
     if isinstance(network, ObjectNet):
@@ -122,9 +120,7 @@ def to_graph(network: nn.Module, card: ModelCard) -> onnx.ModelProto:
 
 
 def traced(network: nn.Module, method: str, example: Tensor, input_name: str, names: Sequence[str]) -> onnx.ModelProto:
-    """A method of a network as a graph with outputs of these names; of an input with three axes, for any length of the
-    first two.
-    """
+    """A method of a network as a graph with outputs of these names; the first two of three axes may have any length."""
     exported = network
     if method != "forward":
         exported = copy.copy(network)
@@ -157,9 +153,7 @@ def traced(network: nn.Module, method: str, example: Tensor, input_name: str, na
 
 
 def halve(graph: onnx.GraphProto, *, exactly: bool = False) -> None:
-    """Store large weights (``exactly``: those that lose nothing) in half precision, which halves the file; engines
-    convert them to fp32 when they load it.
-    """
+    """Store large weights (``exactly``: those that lose nothing) in half precision; engines convert them on loading."""
     casts = []
     for weight in graph.initializer:
         values = onnx.numpy_helper.to_array(weight)

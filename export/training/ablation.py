@@ -115,9 +115,7 @@ def ablate(
 
 
 def plot(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
-    """Draw the search for LoDNN's learning rate, number of scans and batch size, like Figure 16; ValueError without a
-    run.
-    """
+    """Draw the search for LoDNN's learning rate, scans and batch size, like Figure 16; ValueError without a run."""
     from matplotlib.figure import Figure
 
     rows = [row for row in rows if row["network"] == "lodnn"]

@@ -39,9 +39,7 @@ def cross_entropy(
 
 
 def lovasz_softmax(logits: Tensor, labels: Tensor) -> Tensor:
-    """A differentiable bound of 1 - mean IoU over the classes present (Berman et al., 2018); the batch counts as one
-    image.
-    """
+    """A differentiable bound of 1 - mean IoU of the classes present (Berman et al., 2018); a batch is one image."""
     if logits.is_cuda:
         return lovasz_at_once(logits, labels)
     known = labels != IGNORE
@@ -96,9 +94,7 @@ def pointseg_loss(
 
 
 def road_loss(logits: Tensor, labels: Tensor, lovasz_weight: float = 0.0) -> Tensor:
-    """Cross-entropy of a road map plus ``lovasz_weight`` times `lovasz_softmax` of every fourth cell, because sorting
-    all would take a tenth of a training step.
-    """
+    """Cross-entropy of a road map plus ``lovasz_weight`` times `lovasz_softmax` of every fourth cell, for time."""
     loss = cross_entropy(logits, labels)
     if lovasz_weight > 0.0:
         loss = loss + lovasz_weight * lovasz_softmax(logits[:, :, ::2, ::2], labels[:, ::2, ::2])

@@ -78,9 +78,7 @@ class Drawn:
 
 
 class ObjectBatches:
-    """Batches of samples of named sources; ``simulated`` is as long as there are simulated scans, ``odds`` always
-    empty.
-    """
+    """Batches of samples of named sources; ``simulated`` has the length of simulated scans, ``odds`` is empty."""
 
     n_targets = 2
 
@@ -210,9 +208,7 @@ class ObjectWatch:
 
     @torch.no_grad()
     def validate(self, network: nn.Module) -> tuple[float, float, dict[str, float | None]]:
-        """The mean overlap in space of the boxes of all classes, the mean loss, and figures by name: recall and overlap
-        of each class, precision of labels of objects.
-        """
+        """Mean overlap in space of the boxes of all classes, mean loss, and recall, overlap and precision by name."""
         losses, right, overlaps = [], [], []
         device = next(network.parameters()).device
         for batch in self._batches:

@@ -102,9 +102,7 @@ def _huber(found: Tensor, right: Tensor, scale: Tensor | float, beta: float) -> 
 
 @njit(cache=True, nogil=True)
 def fill_box_ious(a: NDArray[np.float64], b: NDArray[np.float64], iou: NDArray[np.float64]) -> None:
-    """Write the overlap in space of each box of ``a`` (n, 7: x, y, bottom, length, width, height, yaw) with that of
-    ``b``.
-    """
+    """Write the overlap in space of each box of ``a`` (n, 7: x, y, bottom, sizes, yaw) with that of ``b``."""
     first, second = np.empty(5), np.empty(5)
     for i in range(len(a)):
         for box, flat in ((a, first), (b, second)):

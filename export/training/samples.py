@@ -95,9 +95,7 @@ class Samples:
             self.bank = ObjectBank.of(scans, classes=recipe.classes or POINT_CLASSES, n_workers=n_workers)
 
     def batch(self, step: int) -> Targets:
-        """The arrays of one step, always the same for the same step and `odds`: inputs (B, C, H, W), targets, and the
-        teacher's class probabilities and boxes.
-        """
+        """Inputs (B, C, H, W), targets and the teacher's answers of a step, the same for the same step and `odds`."""
         rng = np.random.default_rng((self.recipe.seed, step))
         drawn = []
         for _ in range(self.recipe.batch):
@@ -114,9 +112,7 @@ class Samples:
 
     @torch.no_grad()
     def redraw(self, network: nn.Module, step: int) -> None:
-        """Let a network label some of the scans, chosen by seed and step, and draw those with many false objects more
-        often (`odds`).
-        """
+        """Label some scans by a network, and draw those with many false objects more often (`odds`)."""
         rng = np.random.default_rng((self.recipe.seed, step, 1))
         device = next(network.parameters()).device
         objects = np.array([name not in ("background", "drivable") for name in self.task.classes])

@@ -84,9 +84,7 @@ class Task(Carded, ABC):
 
     @abstractmethod
     def target(self, scan: LabeledScan, projected: Projection) -> Targets:
-        """The targets of a scan, projected into `view`: labels (H, W) uint8, `IGNORE` where unknown, and box targets if
-        any.
-        """
+        """The targets of a scan in `view`: labels (H, W) uint8, `IGNORE` where unknown, and box targets if any."""
 
     @abstractmethod
     def loss(self, outputs: Outputs, targets: Sequence[Tensor]) -> Tensor:

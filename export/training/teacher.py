@@ -48,9 +48,7 @@ def unlabeled_scans(objects: KittiObjects, fold: int | None) -> list[LabeledScan
 def pseudo_labeled(
     network: nn.Module, task: Task, scans: Iterable[LabeledScan], sure: float = SURE
 ) -> list[LabeledScan]:
-    """The scans, labeled on all sides by a network of points where it is sure of its class; they keep their own
-    labels.
-    """
+    """The scans, labeled on all sides where a network of points is sure; they keep their own labels."""
     projector = make_projector(task.view, task.input)
     network.eval()
     labeled = []
