@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,20 +21,21 @@ def add_command(
     subparsers: Any,
     name: str,
     command: Callable[[argparse.Namespace], int],
-    *shared: Callable[[Options], None],
+    shared: Sequence[str] = (),
+    *,
     help: str,
     description: str,
 ) -> Options:
-    """Declare a command with the options that it shares with others; returns what adds its own."""
+    """Declare a command with the options that it shares with others, by `SHARED`; returns what adds its own."""
     parser = subparsers.add_parser(name, help=help, description=description, allow_abbrev=False)
     parser.set_defaults(run=command)
     add = options(parser)
-    for add_shared in shared:
-        add_shared(add)
+    for each in shared:
+        SHARED[each](add)
     return add
 
 
-def add_model(add: Options) -> None:
+def _add_model(add: Options) -> None:
     """``--model`` and ``--sensor``."""
     add(
         "--model NAME",
@@ -50,7 +51,7 @@ def add_model(add: Options) -> None:
     )
 
 
-def add_scans(add: Options) -> None:
+def _add_scans(add: Options) -> None:
     """``--input`` and ``--scans``."""
     add(
         "--input SCANS...",
@@ -60,7 +61,7 @@ def add_scans(add: Options) -> None:
     add("--scans N", "the number of simulated scans, used in turn (default: %(default)s)", type=at_least(1), default=8)
 
 
-def add_engine(add: Options) -> None:
+def _add_engine(add: Options) -> None:
     """``--provider``, ``--precision`` and ``--threads``."""
     add(
         "--provider P",
@@ -77,15 +78,20 @@ def add_engine(add: Options) -> None:
     add("--threads N", "the number of threads inside a model (default: the provider's choice)", type=at_least(1))
 
 
-def add_output(add: Options) -> None:
+def _add_output(add: Options) -> None:
     """``--json`` and ``--markdown``."""
     add("--json FILE", "write the report, with every sample, to this file")
     add("--markdown FILE", "write the tables as Markdown to this file")
 
 
-def add_page(add: Options) -> None:
+def _add_page(add: Options) -> None:
     """``--html``."""
     add("--html FILE", "write a page with plots to this file (needs the extra 'view')")
+
+
+SHARED: Mapping[str, Callable[[Options], None]] = {
+    **{"model": _add_model, "scans": _add_scans, "engine": _add_engine, "output": _add_output, "page": _add_page}
+}
 
 
 def add_limits(add: Options, min_scans: int, min_seconds: float, repeats: int) -> None:

@@ -17,17 +17,7 @@ from edgeperc.types.choices import PRECISIONS
 from edgeperc.zoo import DEFAULT, choose, resolve
 
 from ..document import pooled, repeats_ms, setting_label
-from ..options import (
-    SINGLE_STREAM,
-    add_command,
-    add_limits,
-    add_model,
-    add_output,
-    add_page,
-    add_scans,
-    choices,
-    numbers,
-)
+from ..options import SINGLE_STREAM, add_command, add_limits, choices, numbers
 from ..render import LiveTable
 from ..samples import compare, percentile
 from ..worker import Job, Prediction, Scenario
@@ -44,10 +34,7 @@ def add_parser(subparsers: Any) -> None:
         subparsers,
         "matrix",
         run_command,
-        add_model,
-        add_scans,
-        add_output,
-        add_page,
+        ("model", "scans", "output", "page"),
         help="measure many settings and recommend the fastest",
         description="Measure each model on every provider, in every precision and with every number of threads, and "
         "recommend the fastest setting whose results agree with fp32 on the CPU.",

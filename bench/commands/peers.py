@@ -8,7 +8,7 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from ..options import add_command, add_engine, add_model, add_output, add_page, add_scans, at_least, choices
+from ..options import add_command, at_least, choices
 from .common import new_document, prepare_input
 
 
@@ -18,11 +18,7 @@ def add_parser(subparsers: Any) -> None:
         subparsers,
         "peers",
         run_command,
-        add_model,
-        add_scans,
-        add_engine,
-        add_output,
-        add_page,
+        ("model", "scans", "engine", "output", "page"),
         help="compare edgeperc with torch, other engines and numpy (extra 'peers')",
         description="Measure edgeperc, the same networks in torch, torch.compile, onnxruntime, OpenVINO, MNN and ncnn "
         "with a pipeline in numpy, and the fastest matrix products and memory copies of this computer, all in turns. "

@@ -11,17 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from .. import loadgen
-from ..options import (
-    SINGLE_STREAM,
-    add_command,
-    add_engine,
-    add_limits,
-    add_model,
-    add_output,
-    add_page,
-    add_scans,
-    scenario,
-)
+from ..options import SINGLE_STREAM, add_command, add_limits, scenario
 from ..render import LiveTable
 from ..scenarios import Limits
 from ..worker import Job, Scenario
@@ -36,11 +26,7 @@ def add_parser(subparsers: Any) -> None:
         subparsers,
         "run",
         run_command,
-        add_model,
-        add_scans,
-        add_engine,
-        add_output,
-        add_page,
+        ("model", "scans", "engine", "output", "page"),
         help="measure one setting (the default command)",
         description="Measure the latency of one setting, each scenario in fresh processes, and compare its results "
         "with fp32 on the CPU.",

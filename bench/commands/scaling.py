@@ -19,7 +19,7 @@ from edgeperc.system.extras import require
 
 from .. import plots
 from ..document import latency, stage_medians
-from ..options import add_command, add_engine, add_limits, add_model, add_output, numbers
+from ..options import add_command, add_limits, numbers
 from ..render import LiveTable, number
 from ..samples import trend
 from ..worker import Job, Scenario
@@ -37,9 +37,7 @@ def add_parser(subparsers: Any) -> None:
         subparsers,
         "scaling",
         run_command,
-        add_model,
-        add_engine,
-        add_output,
+        ("model", "engine", "output"),
         help="measure how the time grows with points, cars, image size and processes",
         description="Measure how the time of a scan grows with its number of points, with the number of cars in it, "
         "with the size of the networks' images and with the number of processes.",

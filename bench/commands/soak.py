@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from ..options import add_command, add_engine, add_model, add_output, at_least
+from ..options import add_command, at_least
 from ..samples import trend
 from ..scenarios import Limits
 from ..worker import MEMORY_SAMPLES, Scenario
@@ -30,9 +30,7 @@ def add_parser(subparsers: Any) -> None:
         subparsers,
         "soak",
         run_command,
-        add_model,
-        add_engine,
-        add_output,
+        ("model", "engine", "output"),
         help="tell whether memory grows over a long run",
         description="Run many simulated scans in one process and fit a line to its memory.",
     )
