@@ -139,9 +139,7 @@ def _ask(question: Callable[[], Any], otherwise: Any) -> Any:
 def disturbances(
     hardware: Mapping[str, Any], before: Mapping[str, Any], after: Mapping[str, Any], own_cpu_s: float
 ) -> list[str]:
-    """What disturbed the samples between two `conditions`, beside the measured process's own CPU time; a
-    sentence each.
-    """
+    """What disturbed the samples between two `conditions` beside the measured process's own CPU time, in sentences."""
     sentences = []
     wall_s = max(after["at_s"] - before["at_s"], 1e-9)
     others = (after["busy_s"] - before["busy_s"] - own_cpu_s) / wall_s

@@ -42,9 +42,7 @@ def new_setting(job: Job) -> dict[str, Any]:
 def repeat(
     setting: dict[str, Any], job: Job, n_repeats: int, document: dict[str, Any], on_tick: OnTick
 ) -> list[Prediction]:
-    """Do a job in this many fresh processes, one after the other, each recorded in ``setting`` when it is done; returns
-    the first one's predictions. Raises KeyboardInterrupt.
-    """
+    """Do a job in so many fresh processes, each recorded in ``setting`` when done; returns the first's predictions."""
     predictions: list[Prediction] = []
     for k in range(n_repeats):
         (result,) = measure([job if k == 0 else replace(job, predict=())], on_tick)

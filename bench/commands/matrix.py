@@ -97,9 +97,7 @@ def run_command(arguments: argparse.Namespace) -> int:
 def settings_to_try(
     model: str, providers: Sequence[str], precisions: Sequence[str], present: Sequence[str]
 ) -> tuple[list[tuple[str, str]], list[str]]:
-    """The (provider, precision) of a model among those asked for that this computer can run with the providers that are
-    ``present``, and a sentence for each other one.
-    """
+    """The (provider, precision) of a model that this computer can run by ``present``; a sentence for each other."""
     variants = resolve(model)
     settings, skipped = [], []
     for provider in providers:

@@ -82,9 +82,7 @@ def n_taps_inside(n_here: int, n_there: int, kernel: int, stride: int, pad: int,
 
 
 def matrix_product(library: str, precision: str, n_threads: int) -> Callable[[], object]:
-    """A square matrix product of `PRODUCT_SIZE` ** 3 multiplications, by numpy, torch or openvino; numpy takes its
-    number of threads from the environment when the process starts.
-    """
+    """A product of `PRODUCT_SIZE` ** 3 multiplications; numpy takes its threads from the environment at the start."""
     n = PRODUCT_SIZE
     a, b = np.random.default_rng(0).standard_normal((2, n, n), np.float32)
     if library == "numpy":

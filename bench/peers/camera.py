@@ -67,9 +67,7 @@ def _table(n_in: int, n_out: int) -> NDArray[np.float32]:
 
 
 def small_unet(card: ModelCard, precision: str, n_threads: int) -> Callable[[NDArray[np.uint8]], Any]:
-    """The small U-Net in torch, eagerly (``"bf16"`` by autocast), with a card's input, classes and scaling: from an
-    image (H, W, 3) uint8 to labels that mean nothing.
-    """
+    """The small U-Net in torch (``"bf16"`` by autocast) with a card's input: from an image to meaningless labels."""
     import torch
 
     from edgeperc_export.networks.unet import UNet

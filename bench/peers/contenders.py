@@ -157,9 +157,7 @@ def groups(
 
 
 def methods(folder: Path) -> list[Contender]:
-    """edgeperc's whole answers, others' networks with random weights (in ``folder``), and clusters without a
-    network.
-    """
+    """edgeperc's whole answers, others' networks with random weights (in ``folder``), clusters without a network."""
     rows = [
         Contender(f"edgeperc {view}, {label}", view, "cpu", precision, timed="scan to labels, cells and boxes")
         for precision, label in (("auto", "as by default"), ("fp32", "fp32"))
@@ -219,9 +217,7 @@ def _small_unet(variant: Variant) -> list[Contender]:
 
 
 def _one_or_two(variant: Variant, folder: Path) -> list[Contender]:
-    """SSADNet, and two networks of its parts that give its results together; the third row is a lower bound for any
-    detector: the box head on the bare input, with random weights.
-    """
+    """SSADNet, two networks of its parts, and, as a lower bound for any detector, the box head on the bare input."""
     card, path = variant.card, variant.path
     image = folder / f"{path.stem}-input.npy"
     segmentation, detection, lean = (

@@ -84,8 +84,8 @@ def crossing(
 
 
 def every_second_beam(root: Path, out: Path) -> None:
-    """Write the drives of an object set with track ids, of an HDL-64E beam by beam, as if it had half the beams and its
-    remission were squared, as a byte; ``sensor.json`` is that sensor.
+    """Write an object set with track ids as of half an HDL-64E's beams, its remission squared; ``sensor.json``
+    is it.
     """
     for folder in ("label_2", "track_id", "calib"):
         shutil.copytree(root / "training" / folder, out / "training" / folder)

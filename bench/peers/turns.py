@@ -201,9 +201,7 @@ def measure(
     note: Callable[[str], None] = print,
     measured: list[Measured] | None = None,
 ) -> list[Measured]:
-    """Let contenders take turns on .npy scans; ``missing`` says why one has no results. ``measured`` is filled
-    meanwhile, so that results are left after an interruption.
-    """
+    """Let contenders take turns on .npy scans, filling ``measured``, so that results survive an interruption."""
     measured = [] if measured is None else measured
     spawn, rng = multiprocessing.get_context("spawn"), np.random.default_rng(0)
     running: list[tuple[Measured, Any, Any]] = []

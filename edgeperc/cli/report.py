@@ -20,9 +20,7 @@ if TYPE_CHECKING:
 
 
 class Report:
-    """Prints the result of each scan, and counts scans and failures; for ``--gif`` it keeps the tracks of every scan,
-    and its `edgeperc.view.flatten_scan` to draw under them.
-    """
+    """Prints the result of each scan, counts scans and failures, and keeps what ``--gif`` draws of every scan."""
 
     def __init__(self, arguments: argparse.Namespace, images: Mapping[Path, Path | None]) -> None:
         self.n = self.n_failed = 0

@@ -123,9 +123,7 @@ def stated_sensor(arguments: argparse.Namespace) -> str:
 
 
 def find_sensor(paths: Sequence[Path], options: Mapping[str, Any]) -> SensorEstimate | None:
-    """The sensor that the points of the first scans of files or captures show; None if no scan that can be read has
-    enough points. Raises SensorError if they do not tell.
-    """
+    """The sensor that the first scans show; None if none that can be read has enough points. Raises SensorError."""
     from ..preprocess.sensor_estimate import MOST_SCANS, estimate_sensor, has_enough_points
     from ..readers.captures import is_capture, read_scans
 
@@ -226,9 +224,7 @@ class Sensors:
 
 
 def with_mounting(sensor: str | SensorProfile, arguments: argparse.Namespace) -> str | SensorProfile:
-    """The sensor with ``--extrinsic``, the options of single values, ``--accumulate`` and others. Raises
-    SensorError.
-    """
+    """The sensor with ``--extrinsic``, options of single values, ``--accumulate`` and others. Raises SensorError."""
     from ..types.mounting import Mounting
     from ..types.sensor import get_sensor
 
@@ -258,9 +254,7 @@ def with_mounting(sensor: str | SensorProfile, arguments: argparse.Namespace) ->
 
 
 def output_names(scans: Sequence[Path], *, keep_folder: bool = False) -> list[Path]:
-    """Names of the scans' output files, after as few folders (with ``keep_folder``, at least one) as make all
-    differ.
-    """
+    """Names of the scans' output files, after as few folders (``keep_folder``: at least one) as make all differ."""
     whole = [Path(_absolute(scan)).parts[1:] for scan in scans]
     short = [(*(p for p in parts[:-1] if p not in _LAYOUT_FOLDERS), parts[-1]) for parts in whole]
     deepest = max(map(len, whole), default=0)

@@ -20,9 +20,7 @@ if TYPE_CHECKING:
 
 
 class Straightener:
-    """Straightens scans by the poses of a file (`edgeperc.Trajectory.from_tum`), or by the motion between the last two
-    scans that were tracked. Raises TrackingError.
-    """
+    """Straightens scans by the poses of a file, or by the motion between tracked scans. Raises TrackingError."""
 
     def __init__(self, poses: Path | None, quaternion: Literal["xyzw", "wxyz"] | None = None) -> None:
         self._trajectory = None if poses is None else Trajectory.from_tum(poses, quaternion=quaternion)

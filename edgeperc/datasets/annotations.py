@@ -15,9 +15,7 @@ LARGEST_TILT = math.radians(20.0)
 
 
 def read_labelcloud(path: Path) -> list[Box]:
-    """Read ``labels/NAME.json`` of labelCloud; ``_classes.json`` beside it names the format, centroid_rel (radians, the
-    default) or centroid_abs. Raises PointsError.
-    """
+    """Read ``labels/NAME.json`` of labelCloud, in the format that ``_classes.json`` names. Raises PointsError."""
     settings = path.with_name("_classes.json")
     known = _read(settings).get("format", "centroid_rel") if settings.exists() else "centroid_rel"
     if known not in ("centroid_rel", "centroid_abs"):

@@ -20,9 +20,7 @@ LEVEL = 0.95
 
 
 class LabeledImages:
-    """Images and the classes of their pixels (without that of unlabeled ones): ``{train,val,test}/NAME``,
-    ``{...}annot/NAME.png`` and ``classes.json``. Raises ImageError.
-    """
+    """Images and the classes of their pixels: ``{train,val,test}/NAME``, ``{...}annot/NAME.png``. Raises ImageError."""
 
     def __init__(self, root: Path) -> None:
         self.root = root

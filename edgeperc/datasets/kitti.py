@@ -84,9 +84,7 @@ class KittiCalibration:
     def image_rectangles(
         self, rows: NDArray[np.float64], image_size: tuple[int, int] = IMAGE_SIZE
     ) -> NDArray[np.float64]:
-        """Left, top, right, bottom [px] of boxes (n, 7) in the sensor frame, clipped to the image; no area
-        outside it.
-        """
+        """Left, top, right, bottom [px] of boxes (n, 7) in the sensor frame, clipped to the image; no area outside."""
         signs = np.array([[a, b, c] for a in (-0.5, 0.5) for b in (-0.5, 0.5) for c in (-0.5, 0.5)])
         local = signs[None] * rows[:, None, 3:6]
         cos, sin = np.cos(rows[:, 6])[:, None], np.sin(rows[:, 6])[:, None]
@@ -315,9 +313,7 @@ class RoadFrame:
 
 
 class SemanticKitti:
-    """The scans with point labels below a SemanticKITTI root (``sequences/00/velodyne``), by drive. Raises
-    PointsError.
-    """
+    """The scans with point labels below a SemanticKITTI root (``sequences/00``), by drive. Raises PointsError."""
 
     def __init__(self, root: Path | str) -> None:
         self.root = Path(root)

@@ -114,9 +114,7 @@ class ScanLayout:
             raise PointsError(f"splits lists {', '.join(twice)[:80]} twice; whole drives belong to one split")
 
     def in_split(self, drive: str, split: str, fold: int | None = None) -> bool:
-        """As `splits.in_split`, with the description's own lists first; with a ``fold``, its validation drives stay
-        out.
-        """
+        """As `splits.in_split`, the description's own lists first; with a ``fold``, its validation drives stay out."""
         unlisted = in_split(drive, split, fold)  # checks the arguments too
         listed = next((key for key, drives in self.splits.items() if drive in drives), None)
         listed = listed or next((key for key, drives in self.splits.items() if ANY in drives), None)

@@ -62,8 +62,8 @@ class Ab3dmot:
     def update(
         self, boxes: Sequence[Box], scores: Sequence[float]
     ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
-        """Track the boxes of one scan: ids, rows (center, size, yaw), scores (of the last detection) of the tracks, and
-        the index of each one's detection in this scan, -1 for none.
+        """Track the boxes of a scan: ids, rows, scores of the last detection, and the detections' indices, -1
+        for none.
         """
         self._n_scans += 1
         given = box_rows(boxes)

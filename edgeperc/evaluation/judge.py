@@ -159,9 +159,7 @@ class Judge:
         return self._compare(truth, perception, perception.boxes)
 
     def record_scan(self, frame: ScanFrame) -> tuple[Record, Mistakes | None]:
-        """Evaluate a scan of a `ScanFolder` as a user's: its mounting is that of its drive's scans. Raises
-        SplitError.
-        """
+        """Evaluate a scan of a `ScanFolder` as a user's: its mounting is that of its drive. Raises SplitError."""
         truth, perception, scan_boxes = self._perceive_frame(frame)
         return self._compare(truth, perception, scan_boxes)
 
@@ -217,9 +215,7 @@ class Judge:
     def _count_boxes(
         self, tallies: dict[tuple[str, ...], Any], truth: Truth, perception: Perception, mistakes: Mistakes
     ) -> Mistakes:
-        """Match boxes where the truth is known, upright and oriented, of the classes and in the view that are detected;
-        and vehicles, pedestrians and cyclists all round, detected or not.
-        """
+        """Match boxes where the truth is known, of detected classes in the view, and of the three kinds all round."""
         predicted = [box for box in perception.boxes if truth.knows(box)]
         returns = truth.counted
         classes, view = self.box_classes, self.detected_in

@@ -110,17 +110,10 @@ def count_in_image(truth: FrontTruth, boxes: Sequence[Box], drive: str) -> ApTab
         columns = np.flatnonzero([kind == label or kind in neighbors for kind in kinds])
         rows = np.flatnonzero(small | np.array([box.label == label for box in boxes], np.bool_))
         optional = [bool(hidden[k]) or kinds[k] != label for k in columns]
-        table.counts[label, f"{overlap_name} {least_iou:g}", level] = (
-            count_matches(
-                overlaps[overlap_name][np.ix_(rows, columns)],
-                [boxes[k].score for k in rows],
-                least_iou,
-                [objects[k] for k in columns],
-                optional=optional,
-                small=small[rows].tolist(),
-                excused=((guess_m < near) | (guess_m >= far))[rows].tolist(),
-            ),
-        )
+        excused = ((guess_m < near) | (guess_m >= far))[rows].tolist()
+        own = overlaps[overlap_name][np.ix_(rows, columns)], [boxes[k].score for k in rows], least_iou
+        counts = count_matches(*own, [objects[k] for k in columns], optional, small[rows].tolist(), excused)
+        table.counts[label, f"{overlap_name} {least_iou:g}", level] = (counts,)
     return table
 
 
@@ -136,24 +129,16 @@ def count_all_round(boxes: Sequence[Box], to_find: Sequence[Box], ignored: Seque
         columns = [k for k, box in enumerate(every) if box.label in may_be]
         rows = [k for k, box in enumerate(boxes) if box.label == label]
         optional = [k >= len(to_find) or every[k].label != label or not near <= right_m[k] < far for k in columns]
-        table.counts[label, f"{overlap_name} {least_iou:g}", level] = (
-            count_matches(
-                overlaps[overlap_name][np.ix_(rows, columns)],
-                [boxes[k].score for k in rows],
-                least_iou,
-                [object_key(drive, every[k]) for k in columns],
-                optional=optional,
-                small=[False] * len(rows),
-                excused=[not near <= guess_m[k] < far for k in rows],
-            ),
-        )
+        excused = [not near <= guess_m[k] < far for k in rows]
+        own = overlaps[overlap_name][np.ix_(rows, columns)], [boxes[k].score for k in rows], least_iou
+        keys = [object_key(drive, every[k]) for k in columns]
+        counts = count_matches(*own, keys, optional, [False] * len(rows), excused)
+        table.counts[label, f"{overlap_name} {least_iou:g}", level] = (counts,)
     return table
 
 
 def best_candidates(truth: FrontTruth, candidates: Sequence[Box], drive: str) -> list[Candidate]:
-    """The best candidate, of any class and score, for each object of `CLASSES` that is "moderate"; IoU 0
-    without one.
-    """
+    """The best candidate, of any class and score, for each "moderate" object of `CLASSES`; IoU 0 without one."""
     kinds, numbers = truth.labels.objects
     placed = truth.calibration.sensor_boxes(numbers[:, 7:14])
     best = np.zeros(len(kinds))
@@ -172,7 +157,6 @@ def count_matches(
     scores: Sequence[float],
     least_iou: float,
     objects: Sequence[ObjectKey],
-    *,
     optional: Sequence[bool],
     small: Sequence[bool],
     excused: Sequence[bool],

@@ -119,9 +119,7 @@ def interpolated_precision(
 
 
 class ProbabilitySweep:
-    """Precision and recall of one class over all thresholds of its probability (KITTI road, LoDNN), from histograms (2,
-    256) of cells of other classes and of the class.
-    """
+    """Precision and recall of a class over all thresholds of its probability, from histograms (2, 256) of cells."""
 
     def __init__(self) -> None:
         self.counts = np.zeros((2, 256), dtype=np.int64)
@@ -218,9 +216,7 @@ class BoxEvaluator:
         ignored: Iterable[Box] = (),
         drive: str = "",
     ) -> list[tuple[Box | None, Box | None]]:
-        """Count the boxes of a scan, but those that match ``ignored``, and pair them whatever their class, or with
-        None.
-        """
+        """Count the boxes of a scan, but those that match ``ignored``, and pair them of any class, or with None."""
         guesses = sorted(predicted, key=lambda box: -box.score)
         rights, spares = list(truth), list(ignored)
         overlap = oriented_iou(self._rectangles(guesses), self._rectangles(rights))

@@ -84,9 +84,7 @@ _LEGEND = (
 def draw_mistakes(
     scans: Sequence[Mistakes], path: str | Path | None = None, *, title: str = "", columns: int = 3
 ) -> bytes:
-    """Draw missed objects and false detections from above, a panel for each scan with mistakes, in their order; returns
-    a PNG, 1600 pixels wide. Raises MissingExtraError, OSError.
-    """
+    """Draw mistakes from above, a panel for each scan with some; returns a PNG. Raises MissingExtraError, OSError."""
     wrong = [scan for scan in scans if scan.n_errors > 0]
     columns = max(1, min(columns, max(1, len(wrong))))
     # A single panel takes half of the width.

@@ -90,9 +90,7 @@ def folder_truth(
     view: TopViewGeometry | None,
     classes: Sequence[str] = POINT_CLASSES,
 ) -> Truth:
-    """Ground truth of a scan of a `ScanFolder`, in the frame of the models with the mounting that the runtime used:
-    results are compared in the frame that they had.
-    """
+    """Ground truth of a scan of a `ScanFolder`, in the frame of the models with the mounting that the runtime used."""
     model = ModelFrame(mounting)
     boxes = model.move_boxes(frame.boxes or ())
     labels = None if frame.boxes is None and frame.point_classes is None else frame.labels(classes)

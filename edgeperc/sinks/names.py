@@ -11,9 +11,7 @@ _SUFFIXES = (".pcd.bin", ".bin", ".npy", ".npz", ".pcd", ".ply")
 
 
 def stem_of(name: str) -> tuple[str, str]:
-    """Name of a scan without folder and suffix, and its suffix in lower case: none of a capture's scan,
-    ``drive.pcap/000003``, nor of an image, whose scan has the image's name.
-    """
+    """Name of a scan without folder and suffix, and its suffix in lower case, none for a capture's or an image's."""
     last = Path(name).name
     suffix = next((ending for ending in _SUFFIXES if last.lower().endswith(ending)), "")
     return (last[: -len(suffix)] if suffix else Path(last).stem), suffix

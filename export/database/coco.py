@@ -24,9 +24,7 @@ SMOOTH_CELLS, SIMPLIFIED_CELLS = 5.0, 1.5
 
 
 def draft(labels: NDArray[np.uint8]) -> list[list[list[float]]]:
-    """Polygons around the road of a map, for a person to correct: corners [x, y] in pixels from the upper left corner.
-    Holes are filled, and details below 1 m smoothed.
-    """
+    """Polygons around the road of a map [px], for a person to correct, without holes and details below 1 m."""
     from shapely import box, union_all
 
     bars = []

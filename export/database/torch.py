@@ -13,9 +13,7 @@ from .files import TopViewDatabase
 
 
 class TopViewDataset(Dataset[tuple[Tensor, Tensor]]):
-    """A `TopViewDatabase`: item k is the image, (3, 400, 200) float32 in 0..1, and the map, (400, 200) int64. The
-    vehicles, in any number, are in ``database[k].rectangles``.
-    """
+    """A `TopViewDatabase`: item k is the image, (3, 400, 200) float32 in 0..1, and the map, (400, 200) int64."""
 
     def __init__(self, root: Path | str, split: str = "all", fold: int | None = None) -> None:
         self.database = TopViewDatabase(root, split, fold)

@@ -40,8 +40,8 @@ def quantize_objects(
     seven_bits: bool | None = None,
     n_threads: int | None = None,
 ) -> ModelCard:
-    """Write an object network in int8, if it is faster on this computer; parameters as of `quantize`, of scans with
-    clusters. Raises RefusedError, ModelError, PointsError.
+    """Write an object network in int8, if it is faster here, as `quantize`. Raises RefusedError, ModelError,
+    PointsError.
     """
     card = ModelCard.read(path)
     if card.precision != "fp32":
@@ -99,9 +99,7 @@ def candidate_batches(card: ModelCard, scans: Sequence[NDArray[np.float32]]) -> 
 def rounded(
     model: onnx.ModelProto, batches: Sequence[NDArray[np.float32]], input_name: str, *, seven_bits: bool = False
 ) -> onnx.ModelProto:
-    """A folded graph of `with_first_look` with the products of `ROUNDED` in int8: inputs by their range in the
-    batches.
-    """
+    """A folded graph of `with_first_look` with the products of `ROUNDED` in int8, inputs by their range in batches."""
     copy = onnx.ModelProto()
     copy.CopyFrom(model)
     graph = copy.graph

@@ -109,8 +109,8 @@ Losses = Mapping[str, tuple[float, float, float, float]]
 
 
 def calibration_scans(paths: Sequence[Path] = (), *, kitti: Path | None = None, n_simulated: int = 0) -> Calibration:
-    """Scans to calibrate on, the real ones first: files or folders of ``.bin``, 64 of KITTI's training drives, evenly
-    spread, and simulated ones. Raises SplitError, PointsError.
+    """Scans to calibrate on: files or folders, 64 of KITTI's training drives, simulated. Raises SplitError,
+    PointsError.
     """
     files = [file for path in paths for file in (sorted(path.rglob("*.bin")) if path.is_dir() else [path])]
     for file in files:
@@ -330,9 +330,7 @@ def _between(graph: onnx.GraphProto, convolutions: Collection[str]) -> set[str]:
 
 
 def _unround(graph: onnx.GraphProto, rounded: Collection[str]) -> None:
-    """Connect operators in fp32 directly to outputs in fp32: SSADNet's unpooling compares a tensor with its maxima, few
-    of which would be equal with one side rounded.
-    """
+    """Connect operators in fp32 to outputs in fp32: SSADNet's unpooling compares a tensor with its maxima."""
     maker = {output: node for node in graph.node for output in node.output}
     origin = {}
     for node in graph.node:
@@ -364,9 +362,7 @@ def _outputs(
 def _noise(
     outputs: Sequence[Mapping[str, NDArray[np.float32]]], expected: Sequence[Mapping[str, NDArray[np.float32]]]
 ) -> float:
-    """Squared error as a share of the squares, of the worst output. It hardly depends on single labels or boxes, so
-    that a few scans are enough to compare convolutions.
-    """
+    """Squared error as a share of the squares, of the worst output; it hardly depends on single labels or boxes."""
     shares = []
     for kind in expected[0]:
         pairs = [(one[kind].astype(np.float64), other[kind]) for one, other in zip(expected, outputs, strict=True)]

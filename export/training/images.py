@@ -151,9 +151,7 @@ def _in_other_light(images: Tensor, rng: np.random.Generator) -> Tensor:
 
 
 class ImageSamples:
-    """Batches of images on the training device, of the size of the task's view, each drawn once in an epoch; there are
-    no simulated ones, and none is drawn more often.
-    """
+    """Batches of images on the training device, of the size of the task's view, each drawn once in an epoch."""
 
     n_targets = 1
     simulated: ClassVar[tuple[()]] = ()
@@ -183,9 +181,7 @@ class ImageSamples:
 def confusions(
     network: nn.Module, images: ImageSet, truth: Tensor, spec: InputSpec
 ) -> tuple[NDArray[np.int64], float, Tensor]:
-    """Compare a network's labels with the truth at the truth's size: confusion (n, C, C) of each image (rows are the
-    truth), mean cross-entropy without weights, and labels on the device.
-    """
+    """Confusion (n, C, C) of each image at the truth's size, mean cross-entropy, and the labels on the device."""
     counts, losses, predicted = [], [], []
     for first in range(0, len(images.hashes), VALIDATION_BATCH):
         x = normalized(images.images[first : first + VALIDATION_BATCH], spec)

@@ -107,9 +107,7 @@ def distillation_loss(logits: Tensor, probabilities: Tensor) -> Tensor:
 
 
 def box_distillation_loss(predicted: Tensor, teacher: Tensor) -> Tensor:
-    """Difference of dense boxes (B, 9 or 11, H, W) from a teacher's: cross-entropy of heat maps and box errors, by the
-    teacher's heat. Fronts count if both networks predict them.
-    """
+    """Cross-entropy of heat maps and box errors (B, 9 or 11, H, W) by a teacher's heat; fronts if both predict them."""
     predicted, teacher = predicted.float(), teacher.float()
     heat = teacher[:, 0].sigmoid()
     heat_loss = F.binary_cross_entropy_with_logits(predicted[:, 0], heat, reduction="sum")
@@ -168,8 +166,8 @@ def dense_loss(predicted: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _box_error(predicted: Tensor, target: Tensor, heading: Tensor, likely: Tensor | None) -> Tensor:
-    """Error of each cell's box, (B, H, W): weighted absolute errors, and the front's cross-entropy by the probability
-    (B, 1, H, W) that it is towards ``heading`` (B, 2, H, W), if known.
+    """Error of each cell's box, (B, H, W), with the front's cross-entropy, (B, 1, H, W), towards ``heading``,
+    if known.
     """
     apart = (predicted[:, 1:N_GEOMETRY] - target[:, 1:N_GEOMETRY]).abs()
     error = (apart * predicted.new_tensor(GEOMETRY_WEIGHTS).view(1, -1, 1, 1)).sum(1)

@@ -80,9 +80,7 @@ def build_samples(
     detector: bool = True,
     n_workers: int = 0,
 ) -> None:
-    """Write the samples of scans (drive, and the scan, its file, or what makes it) into ``folder``, in parts; finished
-    ones are kept. Boxes of `DETECTOR` may be candidates, too.
-    """
+    """Write the samples of scans of drives into ``folder``, in parts; finished ones are kept."""
     folder.mkdir(parents=True, exist_ok=True)
     parts = [scans[first : first + PART] for first in range(0, len(scans), PART)]
     missing = [k for k in range(len(parts)) if not (folder / f"{name}-{k:03d}.npz").exists()]

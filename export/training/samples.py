@@ -226,9 +226,7 @@ class RealScans(NamedTuple):
 def real_scans(
     kitti: KittiObjects, names: Sequence[str], *, drawn: bool = False, classes: Sequence[str] = ()
 ) -> tuple[list[LabeledScan], list[float], dict[str, str]]:
-    """Read labeled scans of KITTI, how often to draw each, relative to the others, and their hashes by name; ``drawn``:
-    with the hand-drawn road where there is one.
-    """
+    """Labeled scans of KITTI (``drawn``: with the hand-drawn roads), their weights, and their hashes by name."""
     scans: list[LabeledScan] = []
     weights: list[float] = []
     hashes: dict[str, str] = {}

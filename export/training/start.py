@@ -150,9 +150,7 @@ def _by_class(given: Tensor, own: Tensor, classes: Sequence[str], own_classes: S
 
 @torch.no_grad()
 def _unfold(network: nn.Module, offsets: Mapping[str, Tensor | None], images: Sequence[Tensor]) -> None:
-    """Give each batch norm the statistics of its input, with the scale and offset that cancel them; an offset that was
-    folded into the convolution before it is None if there is none.
-    """
+    """Give each batch norm its input's statistics and what cancels them; an offset that was folded may be None."""
     norms = {name: network.get_submodule(name) for name, offset in offsets.items() if offset is not None}
     sums: dict[str, list[Tensor]] = {name: [] for name in norms}
 

@@ -67,8 +67,8 @@ def pseudo_labeled(
 
 
 class OnnxTeacher:
-    """An exported network as the teacher: it answers for each sample from its own channels of the same scan, in the
-    process that makes the sample. Raises ValueError.
+    """An exported network as the teacher, of the channels of each sample, in the process that makes it. Raises
+    ValueError.
     """
 
     def __init__(self, path: Path, task: Task) -> None:
