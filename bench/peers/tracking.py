@@ -84,9 +84,7 @@ def crossing(
 
 
 def every_second_beam(root: Path, out: Path) -> None:
-    """Write an object set with track ids as of half an HDL-64E's beams, its remission squared; ``sensor.json``
-    is it.
-    """
+    """Write an object set with track ids as of a sensor with half the beams and the remission squared, as a byte."""
     for folder in ("label_2", "track_id", "calib"):
         shutil.copytree(root / "training" / folder, out / "training" / folder)
     shutil.copy(root / "frames.csv", out)

@@ -62,9 +62,7 @@ class Ab3dmot:
     def update(
         self, boxes: Sequence[Box], scores: Sequence[float]
     ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
-        """Track the boxes of a scan: ids, rows, scores of the last detection, and the detections' indices, -1
-        for none.
-        """
+        """Track the boxes of a scan: ids, rows, scores of the last detection, the detections' indices (-1: none)."""
         self._n_scans += 1
         given = box_rows(boxes)
         states = self._states @ _F.T

@@ -40,9 +40,7 @@ def quantize_objects(
     seven_bits: bool | None = None,
     n_threads: int | None = None,
 ) -> ModelCard:
-    """Write an object network in int8, if it is faster here, as `quantize`. Raises RefusedError, ModelError,
-    PointsError.
-    """
+    """Write an object network in int8, if it is faster here; parameters and errors as of `quantize`."""
     card = ModelCard.read(path)
     if card.precision != "fp32":
         raise ModelError(f"{path} is in {card.precision}; quantize the model in fp32")

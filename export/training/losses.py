@@ -166,8 +166,8 @@ def dense_loss(predicted: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _box_error(predicted: Tensor, target: Tensor, heading: Tensor, likely: Tensor | None) -> Tensor:
-    """Error of each cell's box, (B, H, W), with the front's cross-entropy, (B, 1, H, W), towards ``heading``,
-    if known.
+    """Error of each cell's box, (B, H, W), with the front's cross-entropy by its probability, if ``heading`` is
+    known.
     """
     apart = (predicted[:, 1:N_GEOMETRY] - target[:, 1:N_GEOMETRY]).abs()
     error = (apart * predicted.new_tensor(GEOMETRY_WEIGHTS).view(1, -1, 1, 1)).sum(1)

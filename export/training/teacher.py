@@ -67,7 +67,7 @@ def pseudo_labeled(
 
 
 class OnnxTeacher:
-    """An exported network as the teacher, of the channels of each sample, in the process that makes it. Raises
+    """An exported network as the teacher, in the process that makes a sample, by its own channels. Raises
     ValueError.
     """
 
