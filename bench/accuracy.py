@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from edgeperc.evaluation.judge import renamed
 from edgeperc.evaluation.metrics import BoxEvaluator, Confusion, boxes_to_find
 from edgeperc.evaluation.tables import VEHICLES
 from edgeperc.simulation.samples import IGNORE, labels_by_boxes
 from edgeperc.simulation.scene import POINT_CLASSES, TOP_VIEW_CLASSES, SimulatedScan
+from edgeperc.types.perception import Box, Perception
+from edgeperc.types.sensor import SensorProfile, get_sensor
 from edgeperc.types.views import TopViewGeometry
 
 from .worker import Prediction
@@ -20,14 +25,12 @@ from .worker import Prediction
 LEAST_EQUAL = 0.99
 LEAST_BOX_F1 = 0.9
 MOST_LOST = 0.01
+FARTHEST_M = 50.0
 
 
 def agreement(reference: Sequence[Prediction], found: Sequence[Prediction]) -> dict[str, Any]:
-    """Compare predictions with those of the reference on the same scans.
-
-    Returns: ``"n_scans"``; for ``"points"`` in view, ``"cells"`` and ``"pixels"`` of images: the share of ``equal``
-        labels, and ``mean_iou`` with the reference as ground truth; for ``"boxes"``: ``n_reference``, ``n_found``,
-        ``n_both`` (IoU at least 0.5) and ``f1``. An entry is None if the models do not predict it.
+    """Compare predictions with the reference's on the same scans: of points in view, cells and pixels the share of
+    equal labels and the mean IoU, of boxes the matches at IoU 0.5 and F1. None for what the models do not predict.
     """
     result: dict[str, Any] = {"n_scans": len(reference), "points": None, "cells": None, "pixels": None, "boxes": None}
     points, cells, pixels = [], [], []
@@ -61,10 +64,8 @@ def agreement(reference: Sequence[Prediction], found: Sequence[Prediction]) -> d
 
 
 def correctness(predictions: Sequence[Prediction], truth: Sequence[SimulatedScan]) -> dict[str, float | None]:
-    """Evaluate on the ground truth of simulated scans: ``points_mean_iou``, ``cells_mean_iou``, ``vehicle_ap50``.
-
-    An entry is None if the models do not predict it, or predict other classes than the simulator's. A few scans only
-    check an engine; `edgeperc eval` evaluates a model.
+    """Figures on the truth of simulated scans; None for what is not predicted, or has other classes than the
+    simulator's. A few scans only check an engine; `edgeperc eval` evaluates a model.
     """
     points, cells, boxes = Confusion(POINT_CLASSES), Confusion(TOP_VIEW_CLASSES), BoxEvaluator()
     for predicted, scan in zip(predictions, truth, strict=True):
@@ -86,10 +87,7 @@ def correctness(predictions: Sequence[Prediction], truth: Sequence[SimulatedScan
 
 
 def agrees(accuracy: Mapping[str, Any]) -> bool:
-    """Whether predictions are as good as the reference's.
-
-    accuracy : ``"agreement"`` from `agreement`; ``"truth"`` and ``"reference_truth"`` from `correctness`, or None.
-    """
+    """Whether predictions are as good as the reference's: `agreement` with it, and `correctness` of both, or None."""
     same = accuracy["agreement"]
     if any(same[kind] is not None and same[kind]["equal"] < LEAST_EQUAL for kind in ("points", "cells")):
         return False
@@ -103,3 +101,35 @@ def agrees(accuracy: Mapping[str, Any]) -> bool:
 
 def _rounded(value: float) -> float | None:
     return None if math.isnan(value) else round(value, 6)
+
+
+def profile_of(name: str) -> SensorProfile:
+    """A sensor; "-hanging": as it sees the street upside down."""
+    profile = get_sensor(name.removesuffix("-hanging"))
+    if name.endswith("-hanging"):
+        profile = replace(profile, elevations_deg=tuple(-deg for deg in reversed(profile.elevations_deg)))
+    return profile
+
+
+class NearFigures:
+    """Counts of simulated scans within `FARTHEST_M`: classes of points, and boxes by each evaluator's classes."""
+
+    def __init__(self, *evaluators: BoxEvaluator) -> None:
+        self.points, self.evaluators = Confusion(POINT_CLASSES), evaluators
+
+    def count(
+        self,
+        perception: Perception,
+        points: NDArray[np.float32],
+        labels: NDArray[np.uint8],
+        boxes: Iterable[tuple[Box, int]],
+    ) -> None:
+        """Count a scan by its true labels, and boxes with their returns."""
+        found = perception.require_points()
+        near = found.in_view & (np.hypot(points[:, 0], points[:, 1]) < FARTHEST_M)
+        self.points.update(renamed(found.labels[near], found.classes, POINT_CLASSES), labels[near])
+        near_boxes = [(box, n) for box, n in boxes if math.hypot(*box.center[:2]) < FARTHEST_M]
+        for evaluator in self.evaluators:
+            classes = evaluator.together or ()
+            to_find, ignored = boxes_to_find(near_boxes, None, classes)
+            evaluator.update([box for box in perception.boxes if box.label in classes], to_find, ignored=ignored)

@@ -17,9 +17,8 @@ PERIOD_S = 0.1
 
 
 class Application:
-    """Called in place of a Perceiver: each scan goes through a live stream with a tracker, and every answer is used.
-
-    draw_every : every this many scans a picture is drawn; 0: never.
+    """Called in place of a Perceiver: each scan goes through a stream and a tracker; every ``draw_every``-th is
+    drawn.
     """
 
     def __init__(self, perceive: Perceiver, draw_every: int = 100) -> None:

@@ -21,11 +21,7 @@ COMMANDS = {"run": run, "compare": compare, "matrix": matrix, "scaling": scaling
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line.
-
-    argv : arguments without the program's name; by default those of this process.
-    Returns code: The exit code. Wrong usage raises argparse's ``SystemExit(2)``.
-    """
+    """Run the command line, by default that of this process; wrong usage raises argparse's ``SystemExit(2)``."""
     typed = with_command(sys.argv[1:] if argv is None else argv)
     return run_program("edgeperc-bench", lambda: _run(typed))
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import argparse
 import csv
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -78,7 +78,7 @@ def print_warnings(name: str, scans: Sequence[Scan], sensor: SensorProfile) -> N
     """A row for each condition: share of the scans that are warned of."""
     print(f"\n| {name}, {len(scans)} scans | first scan | later | blocked | drops | cloud | fog |")
     print("|---|---|---|---|---|---|---|")
-    for kind, (apply, strengths, unit) in {"clear air": (_clear, (0.0,), ""), **CONDITIONS}.items():
+    for kind, (apply, strengths, unit) in {"clear air": (lambda scan, *_: scan, (0.0,), ""), **CONDITIONS}.items():
         for strength in strengths:
             first, later = [], []
             for k, scan in enumerate(scans):
@@ -115,7 +115,8 @@ def print_answers(name: str, scans: Sequence[Scan], sensor: SensorProfile) -> No
                 answers.append(answer(without_drops(bad, sensor)[0]) if has_drops else answers[0])
                 for j, (found_area, found) in enumerate(answers):
                     areas[k, j] = found_area / max(area, 1.0)
-                    boxes[k, j] = sum(not _is_near(box, known) for box in found)
+                    centers = np.array([box.center[:2] for box in known]).reshape(-1, 2)
+                    boxes[k, j] = sum(np.all(np.hypot(*(centers - b.center[:2]).T) >= _SAME_M) for b in found)
             shares = [f"{share:.0%}" for share in np.median(areas, axis=0)] + [f"{n:.2f}" for n in boxes.mean(axis=0)]
             print(_row(kind, strength, unit, shares), flush=True)
 
@@ -135,25 +136,12 @@ def print_clean(folder: Path, sensor: SensorProfile) -> None:
 def _drives(folder: Path) -> dict[str, str]:
     """The drive of each scan by its name, from the tables ``frames*.csv`` near by."""
     found: dict[str, str] = {}
-    for path in _tables(folder):
+    for path in [path for above in (folder.parent, folder.parent.parent) for path in sorted(above.glob("frames*.csv"))]:
         with path.open(encoding="utf-8", newline="") as file:
             for row in csv.DictReader(file):
                 name = row.get("name") or row.get("frame") or row.get("id") or ""
                 found[name] = row.get("drive", "")
     return found
-
-
-def _tables(folder: Path) -> Iterator[Path]:
-    for above in (folder.parent, folder.parent.parent):
-        yield from sorted(above.glob("frames*.csv"))
-
-
-def _clear(scan: Scan, strength: float, seed: int) -> Scan:
-    return scan
-
-
-def _is_near(box: Box, others: Iterable[Box]) -> bool:
-    return any(np.hypot(box.center[0] - o.center[0], box.center[1] - o.center[1]) < _SAME_M for o in others)
 
 
 def _row(kind: str, strength: float, unit: str, cells: Iterable[str]) -> str:

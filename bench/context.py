@@ -139,12 +139,7 @@ def _ask(question: Callable[[], Any], otherwise: Any) -> Any:
 def disturbances(
     hardware: Mapping[str, Any], before: Mapping[str, Any], after: Mapping[str, Any], own_cpu_s: float
 ) -> list[str]:
-    """List what disturbed the samples between two `conditions`, one sentence each.
-
-    hardware : from `machine`.
-    before, after : from `conditions`.
-    own_cpu_s : CPU time of the measured process itself [s].
-    """
+    """What disturbed the samples between two `conditions` beside the measured process's own CPU time, in sentences."""
     sentences = []
     wall_s = max(after["at_s"] - before["at_s"], 1e-9)
     others = (after["busy_s"] - before["busy_s"] - own_cpu_s) / wall_s
@@ -208,14 +203,8 @@ def peak_rss_mb() -> float | None:
 
 
 class EnergyMeter:
-    """Energy by the machine's own counters: RAPL domains, and INA power rails as on Jetson boards.
-
-    The energy is that of whole packages or boards, including idle power and all other processes. Call `tick` often,
-    because counters wrap, and because rails show only power, which is integrated here.
-
-    root : Path; ``/sys``.
-    rails : tuple of str
-    joules : dict of str to float; since construction, by rail.
+    """Joules by rail since construction: RAPL domains, and INA power rails as on Jetson boards, of whole packages or
+    boards. Call `tick` often: counters wrap, and rails show only power, which is integrated here.
     """
 
     def __init__(self, root: Path = Path("/sys")) -> None:

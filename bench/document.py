@@ -33,10 +33,7 @@ def write_report(document: Mapping[str, Any], path: Path) -> None:
 
 
 def read_report(path: Path) -> dict[str, Any]:
-    """Read what `write_report` wrote.
-
-    Raises ReportError.
-    """
+    """Read what `write_report` wrote; raises ReportError."""
     try:
         document = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as exc:

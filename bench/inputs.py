@@ -20,16 +20,11 @@ from edgeperc.types.sensor import get_sensor
 
 @dataclass(frozen=True)
 class Input:
-    """Scans as files for measuring processes.
+    """Scans as files for measuring processes."""
 
-    files : .npy, (n, 4) float32 in the sensor's raw unit of remission.
-    truth : empty if there is no ground truth.
-    record : for the report; two reports with the same ``sha256`` are of the same scans.
-    """
-
-    files: tuple[Path, ...]
-    truth: tuple[SimulatedScan, ...]
-    record: dict[str, Any]
+    files: tuple[Path, ...]  # .npy, (n, 4) float32 in the sensor's raw unit of remission
+    truth: tuple[SimulatedScan, ...]  # empty if there is none
+    record: dict[str, Any]  # for the report; two reports with the same ``sha256`` are of the same scans
 
 
 def simulated_input(folder: Path, n: int, sensor: str) -> Input:
@@ -49,10 +44,7 @@ def raw(points: NDArray[np.float32], sensor: str) -> NDArray[np.float32]:
 
 
 def read_input(folder: Path, paths: Sequence[Path], sensor: str) -> Input:
-    """The user's scans: files, and all scan files of folders.
-
-    Raises PointsError.
-    """
+    """The user's scans: files, and all scan files of folders; raises PointsError where there is none."""
     get_sensor(sensor)
     files: list[Path] = []
     for path in paths:

@@ -34,11 +34,9 @@ def single_stream(
     keep_going: KeepGoing = lambda timings: True,
     on_start: Callable[[], None] = lambda: None,
 ) -> Timings:
-    """MLPerf's single stream: LoadGen draws a scan, waits for its answer, draws the next.
-
-    folder : where LoadGen writes ``mlperf_log_summary.txt``, ``mlperf_log_detail.txt`` and so on.
-    perceive, scans, limits, keep_going, on_start : as in `back_to_back`, but a test cannot be stopped once it runs.
-    Returns: The calls as measured here, for the stages; LoadGen's own results are in its logs (`read_summary`).
+    """MLPerf's single stream: LoadGen draws a scan, waits for its answer, draws the next, and writes its logs to
+    ``folder``. The timings are those measured here, for the stages. Otherwise as `back_to_back`, but it cannot be
+    stopped.
     """
     loadgen = load()
     timings = back_to_back(perceive, scans, Limits(0, 0.0, limits.warm_up_scans), keep_going=keep_going)

@@ -42,11 +42,7 @@ def new_setting(job: Job) -> dict[str, Any]:
 def repeat(
     setting: dict[str, Any], job: Job, n_repeats: int, document: dict[str, Any], on_tick: OnTick
 ) -> list[Prediction]:
-    """Do a job in this many fresh processes, one after the other; each is recorded in ``setting`` when it is done.
-
-    Returns predictions: Of the first process.
-    Raises KeyboardInterrupt.
-    """
+    """Do a job in so many fresh processes, each recorded in ``setting`` when done; returns the first's predictions."""
     predictions: list[Prediction] = []
     for k in range(n_repeats):
         (result,) = measure([job if k == 0 else replace(job, predict=())], on_tick)
@@ -118,9 +114,8 @@ def offline(job: Job, files: Sequence[Path], n_processes: int, limits: Limits, o
 
 
 def cold_starts(job: Job, scan: Path, n: int) -> list[dict[str, Any]]:
-    """Start processes that perceive one scan: the first finds empty caches, the others find what it cached.
-
-    The caches are numba's and those in the user's cache folder. The operating system keeps the files in memory.
+    """Start processes that perceive one scan: the first finds empty caches (numba's, and the user's cache folder), the
+    others what it cached. The operating system keeps the files in memory.
     """
     starts = []
     with tempfile.TemporaryDirectory() as folder:

@@ -4,129 +4,116 @@ from __future__ import annotations
 
 import argparse
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TypeAlias
+from typing import Any
 
+from edgeperc.cli.arguments import Options, options
 from edgeperc.inference.providers import PROVIDERS
 from edgeperc.system.names import nearest
 from edgeperc.types.choices import DEFAULT_MODELS as DEFAULT
 from edgeperc.types.choices import PRECISIONS
 
 SINGLE_STREAM = "single-stream"
-Subparsers: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 
 
-# Options that several commands share, each group as a parent parser
+def add_command(
+    subparsers: Any,
+    name: str,
+    command: Callable[[argparse.Namespace], int],
+    shared: Sequence[str] = (),
+    *,
+    help: str,
+    description: str,
+) -> Options:
+    """Declare a command with the options that it shares with others, by `SHARED`; returns what adds its own."""
+    parser = subparsers.add_parser(name, help=help, description=description, allow_abbrev=False)
+    parser.set_defaults(run=command)
+    add = options(parser)
+    for each in shared:
+        SHARED[each](add)
+    return add
 
 
-def model_options() -> argparse.ArgumentParser:
+def _add_model(add: Options) -> None:
     """``--model`` and ``--sensor``."""
-    parser = argparse.ArgumentParser(add_help=False)
-    parser.add_argument(
-        "--model",
-        action="append",
-        metavar="NAME",
-        help="a shipped model (ssadnet), one variant of it (ssadnet:int8) or the path of an .onnx file; may be "
+    add(
+        "--model NAME",
+        "a shipped model (ssadnet), one variant of it (ssadnet:int8) or the path of an .onnx file; may be "
         f"repeated (default: {', '.join(DEFAULT)})",
+        action="append",
     )
-    parser.add_argument(
-        "--sensor",
-        default="hdl-64e",
-        metavar="NAME",
-        help="the sensor that recorded the scans: a name that 'edgeperc sensors' lists, or a .json file "
+    add(
+        "--sensor NAME",
+        "the sensor that recorded the scans: a name that 'edgeperc sensors' lists, or a .json file "
         "(default: %(default)s)",
+        default="hdl-64e",
     )
-    return parser
 
 
-def scan_options() -> argparse.ArgumentParser:
+def _add_scans(add: Options) -> None:
     """``--input`` and ``--scans``."""
-    parser = argparse.ArgumentParser(add_help=False)
-    parser.add_argument(
-        "--input",
-        nargs="+",
+    add(
+        "--input SCANS...",
+        "measure with these scan files, or all scan files of these folders (default: simulated scans)",
         type=Path,
-        metavar="SCANS",
-        help="measure with these scan files, or all scan files of these folders (default: simulated scans)",
     )
-    parser.add_argument(
-        "--scans",
-        type=at_least(1),
-        default=8,
-        metavar="N",
-        help="the number of simulated scans, used in turn (default: %(default)s)",
-    )
-    return parser
+    add("--scans N", "the number of simulated scans, used in turn (default: %(default)s)", type=at_least(1), default=8)
 
 
-def engine_options() -> argparse.ArgumentParser:
+def _add_engine(add: Options) -> None:
     """``--provider``, ``--precision`` and ``--threads``."""
-    parser = argparse.ArgumentParser(add_help=False)
-    parser.add_argument(
-        "--provider",
+    add(
+        "--provider P",
+        f"the execution provider that runs the models: auto, {', '.join(PROVIDERS)} (default: %(default)s)",
         type=provider,
         default="auto",
-        metavar="P",
-        help=f"the execution provider that runs the models: auto, {', '.join(PROVIDERS)} (default: %(default)s)",
     )
-    parser.add_argument(
-        "--precision",
+    add(
+        "--precision P",
+        f"the precision in which the models run: auto, {', '.join(PRECISIONS)} (default: %(default)s)",
         choices=("auto", *PRECISIONS),
         default="auto",
-        metavar="P",
-        help=f"the precision in which the models run: auto, {', '.join(PRECISIONS)} (default: %(default)s)",
     )
-    parser.add_argument(
-        "--threads",
-        type=at_least(1),
-        metavar="N",
-        help="the number of threads inside a model (default: the provider's choice)",
-    )
-    return parser
+    add("--threads N", "the number of threads inside a model (default: the provider's choice)", type=at_least(1))
 
 
-def output_options(html: bool = True) -> argparse.ArgumentParser:
-    """``--json``, ``--markdown`` and, if the command has a page, ``--html``."""
-    parser = argparse.ArgumentParser(add_help=False)
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write the report, with every sample, to this file")
-    parser.add_argument("--markdown", type=Path, metavar="FILE", help="write the tables as Markdown to this file")
-    if html:
-        parser.add_argument(
-            "--html", type=Path, metavar="FILE", help="write a page with plots to this file (needs the extra 'view')"
-        )
-    return parser
+def _add_output(add: Options) -> None:
+    """``--json`` and ``--markdown``."""
+    add("--json FILE", "write the report, with every sample, to this file")
+    add("--markdown FILE", "write the tables as Markdown to this file")
 
 
-def add_limits(parser: argparse.ArgumentParser, min_scans: int, min_seconds: float, repeats: int) -> None:
+def _add_page(add: Options) -> None:
+    """``--html``."""
+    add("--html FILE", "write a page with plots to this file (needs the extra 'view')")
+
+
+SHARED: Mapping[str, Callable[[Options], None]] = {
+    **{"model": _add_model, "scans": _add_scans, "engine": _add_engine, "output": _add_output, "page": _add_page}
+}
+
+
+def add_limits(add: Options, min_scans: int, min_seconds: float, repeats: int) -> None:
     """``--min-scans``, ``--min-seconds``, ``--warm-up`` and ``--repeats`` with a command's own defaults."""
-    parser.add_argument(
-        "--min-scans",
+    add(
+        "--min-scans N",
+        "measure at least this many scans in each scenario (default: %(default)s)",
         type=at_least(1),
         default=min_scans,
-        metavar="N",
-        help="measure at least this many scans in each scenario (default: %(default)s)",
     )
-    parser.add_argument(
-        "--min-seconds",
+    add(
+        "--min-seconds S",
+        "measure each scenario for at least this long (default: %(default)s)",
         type=seconds,
         default=min_seconds,
-        metavar="S",
-        help="measure each scenario for at least this long (default: %(default)s)",
     )
-    parser.add_argument(
-        "--warm-up",
-        type=at_least(0),
-        default=20,
-        metavar="N",
-        help="scans before the first one that counts (default: %(default)s)",
-    )
-    parser.add_argument(
-        "--repeats",
+    add("--warm-up N", "scans before the first one that counts (default: %(default)s)", type=at_least(0), default=20)
+    add(
+        "--repeats N",
+        "repeat the measurement in this many fresh processes; their spread is the noise (default: %(default)s)",
         type=at_least(1),
         default=repeats,
-        metavar="N",
-        help="repeat the measurement in this many fresh processes; their spread is the noise (default: %(default)s)",
     )
 
 

@@ -85,10 +85,7 @@ POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:; base-uri
 
 
 def html_page(parts: Iterable[Section], title: str, pictures: Sequence[str] = ()) -> str:
-    """Format sections as an HTML page without external files.
-
-    pictures : ``<svg>`` elements; shown after the second section.
-    """
+    """Format sections as an HTML page without external files; ``<svg>`` pictures are shown after the second section."""
     escape, title = html.escape, printable(title)
     body = [f"<h1>{escape(title)}</h1>"]
     for k, part in enumerate(map(_printable, parts)):

@@ -27,11 +27,8 @@ def sections(document: Mapping[str, Any]) -> list[Section]:
 
 
 def verdict(setting: Mapping[str, Any]) -> str:
-    """One sentence: which rates of a sensor a setting keeps, and with how much to spare; empty without any sample.
-
-    A rate is kept if every result was complete before the next scan arrived; what is spare, is spare of 99 % of the
-    results, or of all if they are too few for that percentile. Without a paced scenario, 10 Hz is judged by scans
-    back to back.
+    """Which rates a setting keeps, every result complete before the next scan arrives, with how much to spare of 99 %
+    of them, or of all if they are too few; 10 Hz by scans back to back without a paced scenario. Empty without samples.
     """
     figures = {name: latency(setting, name) for name in scenario_names(setting)}
     judged = [t for t in figures.values() if t["rate_hz"]] or [*figures.values()][:1]
@@ -186,20 +183,8 @@ def accuracy_sentences(accuracy: Mapping[str, Any]) -> list[str]:
 
 
 def _matrix(document: Mapping[str, Any]) -> Section:
-    rows = [
-        [
-            "model",
-            "ran as",
-            "p50",
-            "p90",
-            "p99",
-            "noise",
-            "CPU s/scan",
-            "peak RSS MB",
-            "labels equal",
-            "agrees",
-        ]
-    ]
+    head = ["model", "ran as", "p50", "p90", "p99", "noise", "CPU s/scan", "peak RSS MB", "labels equal", "agrees"]
+    rows = [head]
     for setting in document["settings"]:
         for name in scenario_names(setting):
             t, accuracy = latency(setting, name), setting["accuracy"]

@@ -16,15 +16,18 @@ from dataclasses import replace
 import numpy as np
 
 from edgeperc import Mounting, Perceiver
-from edgeperc.evaluation.metrics import BoxEvaluator, Confusion, boxes_to_find
+from edgeperc.evaluation.metrics import BoxEvaluator, Confusion
+from edgeperc.evaluation.tables import VEHICLES
 from edgeperc.preprocess.findings import Finding
 from edgeperc.simulation import POINT_CLASSES, TOP_VIEW_CLASSES, Scene, SimulatedScan, random_scene, simulate
 from edgeperc.simulation.raycast import SLOPE_Y
 from edgeperc.simulation.samples import FIRST_SEED
 from edgeperc.simulation.scene import sensor_pose
 from edgeperc.types.perception import Perception
-from edgeperc.types.sensor import SensorProfile, get_sensor
+from edgeperc.types.sensor import SensorProfile
 from edgeperc.types.views import TopViewGeometry
+
+from .accuracy import NearFigures, profile_of
 
 PLACES = ("road", "pavement", "slope", "half", "box", "box-given")
 SENSORS = ("vlp-16", "os1-64", "hdl-64e", "mid-360")
@@ -32,15 +35,11 @@ HEIGHTS_M = (0.3, 0.5, 0.8, 1.2, 1.73, 3.0)
 SLOPE_DEG = 6.5  # across the street; a robot stands on it, so that houses and people lean
 BOX_BEHIND_M, HALF_BOX_M = 0.6, 1.0  # how far behind the sensor the side of a box is, and half its width
 OFF_M, OFF_DEG = 0.3, 3.0  # a mounting that is farther off is wrong
-FARTHEST_M = 50.0
-VEHICLES = ("car", "van", "truck")
 
 
-def profile_of(name: str) -> SensorProfile:
+def sensor_of(name: str) -> SensorProfile:
     """A sensor with the remission of the simulator; "-hanging": as it sees the street upside down."""
-    profile = replace(get_sensor(name.removesuffix("-hanging")), remission=None, remission_range=(0.0, 1.0))
-    if name.endswith("-hanging"):
-        profile = replace(profile, elevations_deg=tuple(-deg for deg in reversed(profile.elevations_deg)))
+    profile = replace(profile_of(name), remission=None, remission_range=(0.0, 1.0))
     return profile.accumulated(0.2) if profile.pattern is not None else profile
 
 
@@ -86,12 +85,12 @@ def scan_of(seed: int, sensor: SensorProfile, height_m: float, place: str) -> Si
     return scan
 
 
-class Figures:
+class Figures(NearFigures):
     """Counts over streets."""
 
     def __init__(self) -> None:
-        self.points, self.road = Confusion(POINT_CLASSES), Confusion(("other", "road"))
-        self.vehicles, self.people = BoxEvaluator(0.5, together=VEHICLES), BoxEvaluator(0.25, together=("pedestrian",))
+        super().__init__(BoxEvaluator(0.5, together=VEHICLES), BoxEvaluator(0.25, together=("pedestrian",)))
+        self.road = Confusion(("other", "road"))
         self.off: list[tuple[float, float, float]] = []
         self.n_refused = self.n_wrong = self.n_silent = 0
 
@@ -104,15 +103,8 @@ class Figures:
         self.n_refused += any(isinstance(finding, Finding) and finding.gross for finding in perception.fitness)
         self.n_wrong += wrong
         self.n_silent += wrong and not any("mount" in finding for finding in perception.fitness)
-        found = perception.require_points()
-        near = found.in_view & (np.hypot(scan.points[:, 0], scan.points[:, 1]) < FARTHEST_M)
-        numbers = np.array([POINT_CLASSES.index(c) if c in POINT_CLASSES else 0 for c in found.classes], np.uint8)
-        self.points.update(numbers[found.labels[near]], scan.labels[near])
         returns = np.bincount(scan.objects[scan.objects >= 0], minlength=len(scan.boxes)).tolist()
-        boxes = [(b, n) for b, n in zip(scan.boxes, returns, strict=True) if math.hypot(*b.center[:2]) < FARTHEST_M]
-        for evaluator, classes in ((self.vehicles, VEHICLES), (self.people, ("pedestrian",))):
-            to_find, ignored = boxes_to_find(boxes, None, classes)
-            evaluator.update([b for b in perception.boxes if b.label in classes], to_find, ignored=ignored)
+        self.count(perception, scan.points, scan.labels, zip(scan.boxes, returns, strict=True))
         view = perception.require_top_view()
         true = scan.top_view_labels(TopViewGeometry()) == TOP_VIEW_CLASSES.index("drivable")
         self.road.update(view.road.astype(np.uint8), true.astype(np.uint8))
@@ -124,7 +116,7 @@ class Figures:
             f"{np.median(each):.{d}f}; {each.max():.{d}f}" for each, d in zip(off.T, (2, 1, 1), strict=True)
         )
         iou = dict(zip(POINT_CLASSES, 100.0 * np.array(self.points.iou()), strict=True))
-        aps = " / ".join(f"{100.0 * each.overall().ap:.0f}" for each in (self.vehicles, self.people))
+        aps = " / ".join(f"{100.0 * each.overall().ap:.0f}" for each in self.evaluators)
         return (
             f"{len(off) - self.n_refused} of {len(off)} | {self.n_wrong} / {self.n_silent} | {errors} | "
             f"{iou['car']:.0f} / {iou['pedestrian']:.0f} | {aps} | {100.0 * self.road.iou()[1]:.0f}"
@@ -133,7 +125,7 @@ class Figures:
 
 def rows_of(name: str, height_m: float, place: str, n_scans: int) -> list[str]:
     """The figures of a sensor in some streets, with the mounting given and found."""
-    sensor, rows = profile_of(name), []
+    sensor, rows = sensor_of(name), []
     if place == "box-given":
         sensor = replace(sensor, ego_box=((-2.0, 0.1 - BOX_BEHIND_M), (-HALF_BOX_M, HALF_BOX_M), (-2.0, 2.0)))
     known = {"given": Mounting(height_m, 0.0, 0.0), "found": Mounting()}

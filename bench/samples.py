@@ -50,32 +50,16 @@ def noise_floor(repeats: Sequence[ArrayLike]) -> float | None:
 
 @dataclass(frozen=True)
 class Verdict:
-    """Result of comparing a run B with a run A.
+    """A run B compared with a run A."""
 
-    word : {"faster", "slower", "no difference", "unusable"}
-    ratio : median of B over that of A.
-    interval : 95 % bootstrap interval of the ratio.
-    noise : the larger `noise_floor` of the two runs; NaN if a run was not repeated.
-    """
-
-    word: str
-    ratio: float
-    interval: tuple[float, float]
-    noise: float
+    word: str  # {"faster", "slower", "no difference", "unusable"}
+    ratio: float  # median of B over that of A
+    interval: tuple[float, float]  # 95 % bootstrap interval of the ratio
+    noise: float  # the larger `noise_floor` of the two runs; NaN if a run was not repeated
 
 
 def compare(a: Sequence[ArrayLike], b: Sequence[ArrayLike], seed: int = 0) -> Verdict:
-    """Compare the repeats of run B with those of run A.
-
-    The runs differ if the interval of the ratio excludes 1 *and* their medians are farther apart than those of either
-    run's own repeats. The bootstrap draws repeats, and from each repeat medians of blocks of consecutive samples,
-    because neighbors in time are correlated. The second condition is needed because the bootstrap alone is
-    overconfident with three repeats.
-
-    a, b : sequence of array_like; milliseconds of each repeat, in the order of measuring.
-    seed : seed of the bootstrap.
-    Returns: ``"unusable"`` if a run has fewer than two repeats, because its noise is unknown.
-    """
+    """Compare the repeats of run B with those of run A; "unusable" with fewer than two, which have no noise."""
     noises = [noise_floor(a), noise_floor(b)]
     if None in noises:
         return Verdict("unusable", math.nan, (math.nan, math.nan), math.nan)
@@ -84,6 +68,7 @@ def compare(a: Sequence[ArrayLike], b: Sequence[ArrayLike], seed: int = 0) -> Ve
     ratio = _middle(b) / _middle(a)
     low, high = np.percentile(_resampled(b, rng) / _resampled(a, rng), [2.5, 97.5])
     word = "no difference"
+    # The bootstrap, of blocks because neighbors in time are correlated, alone is overconfident with three repeats.
     if not low <= 1.0 <= high and abs(ratio - 1.0) > noise:
         word = "slower" if ratio > 1.0 else "faster"
     return Verdict(word, ratio, (float(low), float(high)), noise)
@@ -106,23 +91,17 @@ def _resampled(repeats: Sequence[ArrayLike], rng: np.random.Generator) -> NDArra
 
 @dataclass(frozen=True)
 class Trend:
-    """A straight line through samples.
-
-    error : half of the slope's 95 % interval.
-    r2 : share of the variance that the line explains; NaN if the variance is 0.
-    """
+    """A straight line through samples."""
 
     slope: float
-    error: float
+    error: float  # half of the slope's 95 % interval
     intercept: float
-    r2: float
+    r2: float  # share of the variance that the line explains; NaN if the variance is 0
 
 
 def trend(x: ArrayLike, y: ArrayLike) -> Trend:
-    """Fit a straight line by least squares, with an interval that accounts for correlated residuals.
-
-    Consecutive samples of memory are not independent: with a lag-1 correlation r of the residuals, n samples count as
-    n (1 - r) / (1 + r). All NaN for fewer than three samples.
+    """Fit a line by least squares; all NaN for fewer than three samples. Consecutive samples are not independent: with
+    a lag-1 correlation r of the residuals, n samples count as n (1 - r) / (1 + r).
     """
     t, values = np.asarray(x, np.float64), np.asarray(y, np.float64)
     if len(t) < 3 or np.ptp(t) == 0.0:

@@ -33,45 +33,29 @@ class Clock:
 
 @dataclass(frozen=True)
 class Limits:
-    """How long a scenario lasts: until all limits are reached.
-
-    warm_up_scans : scans before the first one that counts.
-    stride : only every ``stride``-th scan leaves a sample, because the samples of a long run would themselves be memory
-        growth.
-    """
+    """How long a scenario lasts: until all limits are reached."""
 
     min_scans: int = 100
     min_seconds: float = 10.0
-    warm_up_scans: int = 20
-    stride: int = 1
+    warm_up_scans: int = 20  # before the first one that counts
+    stride: int = 1  # every ``stride``-th scan leaves a sample: those of a long run would be memory growth
 
 
 @dataclass
 class Timings:
-    """Measurements of one scenario, one number per scan, in order.
+    """Measurements of one scenario, one number per sampled scan, in order."""
 
-    n : scans perceived, without the warm-up.
-    stride : every ``stride``-th scan has a sample.
-    first_s : when the first scan that counts arrived, on the clock.
-    start_s : start of each call since then [s].
-    ms : wall time of each call, from scan to result.
-    age_ms : time from the arrival of each scan to its result; equal to ``ms`` if scans do not arrive at a rate.
-    stage_ms : as `edgeperc.Perception.stage_ms`.
-    warm_up_ms : wall time of the calls before those that count.
-    missed : results that were not complete when the next scan arrived.
-    skipped : scans left out because a newer one had arrived before their turn; they have no sample.
-    """
-
-    n: int = 0
+    n: int = 0  # scans perceived, without the warm-up
     stride: int = 1
-    first_s: float = 0.0
-    start_s: list[float] = field(default_factory=list)
-    ms: list[float] = field(default_factory=list)
+    first_s: float = 0.0  # when the first scan that counts arrived, on the clock
+    start_s: list[float] = field(default_factory=list)  # since then
+    ms: list[float] = field(default_factory=list)  # from scan to result
+    # from the arrival of the scan; ``ms`` if scans do not arrive at a rate
     age_ms: list[float] = field(default_factory=list)
-    stage_ms: dict[str, list[float]] = field(default_factory=dict)
+    stage_ms: dict[str, list[float]] = field(default_factory=dict)  # as `edgeperc.Perception.stage_ms`
     warm_up_ms: list[float] = field(default_factory=list)
-    missed: int = 0
-    skipped: int = 0
+    missed: int = 0  # results that were not complete when the next scan arrived
+    skipped: int = 0  # scans that a newer one overtook; they have no sample
 
     def add(self, start_s: float, ms: float, age_ms: float, stage_ms: Mapping[str, float]) -> None:
         """Record one call."""
@@ -91,9 +75,20 @@ class KeepGoing(Protocol):
     def __call__(self, timings: Timings) -> bool: ...
 
 
-def _warm_up(
-    perceive: Perceive, scans: Sequence[NDArray[np.float32]], limits: Limits, clock: Clock, keep_going: KeepGoing
+def back_to_back(
+    perceive: Perceive,
+    scans: Sequence[NDArray[np.float32]],
+    limits: Limits,
+    *,
+    rate_hz: float | None = None,
+    clock: Clock | None = None,
+    keep_going: KeepGoing = lambda timings: True,
+    on_start: Callable[[], None] = lambda: None,
 ) -> Timings:
+    """Perceive one scan after the other, the next as soon as there is a result (MLPerf's single stream), or as `paced`;
+    ``on_start`` is called between the warm-up, always back to back, and the first scan that counts.
+    """
+    clock = clock or Clock()
     timings = Timings(stride=limits.stride)
     for k in range(limits.warm_up_scans):
         began = clock.now()
@@ -101,82 +96,37 @@ def _warm_up(
         timings.warm_up_ms.append(1e3 * (clock.now() - began))
         if not keep_going(timings):
             break
-    return timings
-
-
-def back_to_back(
-    perceive: Perceive,
-    scans: Sequence[NDArray[np.float32]],
-    limits: Limits,
-    *,
-    clock: Clock | None = None,
-    keep_going: KeepGoing = lambda timings: True,
-    on_start: Callable[[], None] = lambda: None,
-) -> Timings:
-    """Perceive one scan after the other, the next as soon as there is a result (MLPerf's single stream).
-
-    scans : sequence of (n, 4) float32; used in turn.
-    on_start : called between the warm-up and the first scan that counts.
-    """
-    clock = clock or Clock()
-    timings = _warm_up(perceive, scans, limits, clock, keep_going)
-    on_start()
-    first = timings.first_s = clock.now()
-    while keep_going(timings) and (timings.n < limits.min_scans or clock.now() - first < limits.min_seconds):
-        scan = scans[timings.n % len(scans)]
-        began = clock.now()
-        perception = perceive(scan)
-        took_ms = 1e3 * (clock.now() - began)
-        timings.add(began - first, took_ms, took_ms, perception.stage_ms)
-    return timings
-
-
-def paced(
-    perceive: Perceive,
-    scans: Sequence[NDArray[np.float32]],
-    rate_hz: float,
-    limits: Limits,
-    *,
-    clock: Clock | None = None,
-    keep_going: KeepGoing = lambda timings: True,
-    on_start: Callable[[], None] = lambda: None,
-) -> Timings:
-    """Perceive scans as they arrive, ``rate_hz`` per second.
-
-    Scan k arrives at the first one's time plus k / rate on the monotonic clock, so the schedule does not drift. Until
-    then the thread sleeps, so that cores idle and clocks fall as they do in a vehicle. After a late result, the newest
-    scan that has arrived is next and those before it are skipped.
-
-    perceive, scans, limits, clock, keep_going, on_start : as in `back_to_back`. Warm-up is back to back.
-    """
-    clock = clock or Clock()
-    timings = _warm_up(perceive, scans, limits, clock, keep_going)
     on_start()
     first = timings.first_s = clock.now()
     k = 0
     while keep_going(timings) and (timings.n < limits.min_scans or clock.now() - first < limits.min_seconds):
-        newest = math.floor((clock.now() - first) * rate_hz + 1e-9)
-        if newest > k:
+        due = None
+        if rate_hz is not None:
+            newest = max(k, math.floor((clock.now() - first) * rate_hz + 1e-9))
             timings.skipped += newest - k
             k = newest
-        scan, due = scans[k % len(scans)], first + k / rate_hz
-        clock.sleep_until(due)
+            due = first + k / rate_hz
+            clock.sleep_until(due)
         began = clock.now()
-        perception = perceive(scan)
-        done = clock.now()
-        timings.missed += done > due + 1.0 / rate_hz
-        timings.add(began - first, 1e3 * (done - began), 1e3 * (done - due), perception.stage_ms)
+        perception = perceive(scans[k % len(scans)])
+        done, arrived = clock.now(), began if due is None else due
+        timings.missed += rate_hz is not None and done > arrived + 1.0 / rate_hz
+        timings.add(began - first, 1e3 * (done - began), 1e3 * (done - arrived), perception.stage_ms)
         k += 1
     return timings
 
 
-def throughput(calls: Sequence[tuple[Sequence[float], Sequence[float]]]) -> tuple[float, float]:
-    """Scans per second of several processes together, while all of them were running.
-
-    calls : sequence of (start_s, ms); of each process, on one clock.
-    Returns scans_per_s: NaN if there was no such time.
-    Returns seconds: Length of that time.
+def paced(
+    perceive: Perceive, scans: Sequence[NDArray[np.float32]], rate_hz: float, limits: Limits, **how: Any
+) -> Timings:
+    """Perceive scans as they arrive: scan k at the first one's time plus k / rate, so that the schedule does not drift.
+    Until then the thread sleeps, as in a vehicle; after a late result the newest scan is next. Warm-up is back to back.
     """
+    return back_to_back(perceive, scans, limits, rate_hz=rate_hz, **how)
+
+
+def throughput(calls: Sequence[tuple[Sequence[float], Sequence[float]]]) -> tuple[float, float]:
+    """Scans per second of processes' calls (start_s, ms) while all ran, NaN if they never did; for how long [s]."""
     ends = [np.asarray(start) + np.asarray(ms) / 1e3 for start, ms in calls]
     if not ends or not all(map(len, ends)):
         return math.nan, 0.0

@@ -17,45 +17,33 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edgeperc import Mounting, Perceiver, TimedScan, Trajectory, accumulate, merge
-from edgeperc.evaluation.metrics import BoxEvaluator, Confusion, boxes_to_find
-from edgeperc.simulation import POINT_CLASSES, SimulatedScan, random_scene, simulate, simulate_sequence
+from edgeperc.evaluation.metrics import BoxEvaluator
+from edgeperc.evaluation.tables import VEHICLES
+from edgeperc.simulation import SimulatedScan, random_scene, simulate, simulate_sequence
 from edgeperc.simulation.samples import FIRST_SEED
 from edgeperc.types.mounting import MODEL_MOUNTING
-from edgeperc.types.perception import Perception
 from edgeperc.types.sensor import SensorProfile, get_sensor
+
+from .accuracy import NearFigures, profile_of
 
 TIMES_S = (0.1, 0.2, 0.5)
 SPEEDS_MPS = (0.0, 10.0)
-FARTHEST_M = 50.0
-VEHICLES = ("car", "van", "truck")
 _RATE_HZ = 100.0  # of the places that a gathered scan is taken from
 
 
-class Figures:
+class Figures(NearFigures):
     """Counts over streets: classes of points, and boxes of vehicles all around."""
 
     def __init__(self) -> None:
-        self.points, self.boxes, self.n_points = Confusion(POINT_CLASSES), BoxEvaluator(together=VEHICLES), [0]
-
-    def add(self, perception: Perception, points: NDArray[np.float32], labels: NDArray[np.uint8], last: SimulatedScan,
-            returns: Sequence[int]) -> None:  # fmt: skip
-        """Count a scan, whose boxes are those of the last part."""
-        found = perception.require_points()
-        near = found.in_view & (np.hypot(points[:, 0], points[:, 1]) < FARTHEST_M)
-        numbers = np.array([POINT_CLASSES.index(c) if c in POINT_CLASSES else 0 for c in found.classes], np.uint8)
-        self.points.update(numbers[found.labels[near]], labels[near])
-        boxes = [(box, n) for box, n in zip(last.boxes, returns, strict=True) if np.hypot(*box.center[:2]) < FARTHEST_M]
-        to_find, ignored = boxes_to_find(boxes, None, VEHICLES)
-        self.boxes.update([b for b in perception.boxes if b.label in VEHICLES], to_find, ignored=ignored)
-        self.n_points.append(len(points))
+        super().__init__(BoxEvaluator(together=VEHICLES))
+        self.n_points: list[int] = []
 
     def row(self) -> str:
         """Mean and single IoU of points and AP50 of vehicles, in per cent."""
         iou = 100.0 * np.array(self.points.iou()[1:])
-        ap = 100.0 * self.boxes.overall().ap
+        ap = 100.0 * self.evaluators[0].overall().ap
         return (
-            f"{np.sum(self.n_points) / max(1, len(self.n_points) - 1):,.0f} | {' / '.join(f'{v:.0f}' for v in iou)} | "
-            f"{np.nanmean(iou):.1f} | {ap:.0f}"
+            f"{np.mean(self.n_points):,.0f} | {' / '.join(f'{v:.0f}' for v in iou)} | {np.nanmean(iou):.1f} | {ap:.0f}"
         )
 
 
@@ -88,7 +76,8 @@ def row_of(sensor: SensorProfile, accumulate_s: float, speed_mps: float, n_scans
         take = gathered if sensor.pattern is not None else spun
         points, labels, last, returns = take(FIRST_SEED + k, sensor, accumulate_s, speed_mps)
         points[:, 3] *= 255.0
-        figures.add(perceive(points), points, labels, last, returns)
+        figures.count(perceive(points), points, labels, zip(last.boxes, returns, strict=True))
+        figures.n_points.append(len(points))
     return figures.row()
 
 
@@ -96,9 +85,7 @@ def sensors_of(names: Sequence[str]) -> Iterator[tuple[str, SensorProfile, float
     """Title, profile and time of each row; the simulator gives all of them the remission of the training sensor."""
     yield "vlp-16", replace(get_sensor("vlp-16"), remission=None), 0.1
     for name in names:
-        profile = get_sensor(name.removesuffix("-hanging"))
-        if name.endswith("-hanging"):  # as it sees the street: upside down
-            profile = replace(profile, elevations_deg=tuple(-deg for deg in reversed(profile.elevations_deg)))
+        profile = profile_of(name)
         for accumulate_s in TIMES_S:
             yield f"{name}, {accumulate_s:g} s", profile.accumulated(accumulate_s), accumulate_s
 
@@ -120,10 +107,8 @@ def around(seed: int, sensor: SensorProfile) -> tuple[list[NDArray[np.float32]],
 
 
 def time_turn(name: str, n_turns: int) -> str:
-    """Median times of four sensors as one turn, and of single scans of as many points, in turns [ms].
-
-    The single scans are of a sensor of the same kind that sees all around, and of an HDL-64E, whose range image has no
-    gaps to fill.
+    """Median times [ms] of four sensors as one turn, and of single scans of as many points in turns: of a sensor of the
+    same kind that sees all around, and of an HDL-64E, whose range image has no gaps to fill.
     """
     profile = get_sensor(name)
     assert profile.pattern is not None

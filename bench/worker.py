@@ -20,7 +20,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 import edgeperc.errors
 from edgeperc import EdgepercError, Perceiver
@@ -28,7 +27,7 @@ from edgeperc import EdgepercError, Perceiver
 from .application import Application
 from .context import EnergyMeter, conditions, peak_rss_mb, rss_mb
 from .loadgen import single_stream
-from .scenarios import Limits, Perceive, Timings, back_to_back, paced
+from .scenarios import Limits, Timings, back_to_back, paced
 
 TICK_S = 0.25
 MEMORY_SAMPLES = 500  # at most, in a scenario: a longer list would itself be memory growth
@@ -42,29 +41,18 @@ class WorkerError(EdgepercError):
 
 @dataclass(frozen=True)
 class Scenario:
-    """How scans arrive: back to back, or at a rate.
-
-    scans : .npy files, (n, 4) float32 each, with remission in the sensor's raw unit.
-    rate_hz : none for back to back.
-    application : also stream, track, write JSON and draw, as `Application` does.
-    """
+    """How scans arrive."""
 
     name: str
-    scans: tuple[Path, ...]
+    scans: tuple[Path, ...]  # .npy files, (n, 4) float32, with remission in the sensor's raw unit
     limits: Limits
-    rate_hz: float | None = None
-    application: bool = False
+    rate_hz: float | None = None  # None: back to back
+    application: bool = False  # also stream, track, write JSON and draw, as `Application` does
 
 
 @dataclass(frozen=True)
 class Job:
-    """The work of one process.
-
-    provider, precision, n_threads, sensor, full_turn : as in `Perceiver`.
-    scenarios : one after the other.
-    predict : scans whose predictions are returned; perceived after everything else.
-    loadgen : folder for MLPerf LoadGen's logs; if given, LoadGen drives the scenarios in place of `back_to_back`.
-    """
+    """The work of one process; options as of `Perceiver`."""
 
     models: tuple[str, ...]
     provider: str = "auto"
@@ -72,9 +60,9 @@ class Job:
     n_threads: int | None = None
     sensor: str = "hdl-64e"
     full_turn: bool = False
-    scenarios: tuple[Scenario, ...] = ()
-    predict: tuple[Path, ...] = ()
-    loadgen: Path | None = None
+    scenarios: tuple[Scenario, ...] = ()  # one after the other
+    predict: tuple[Path, ...] = ()  # scans whose predictions are returned; perceived after everything else
+    loadgen: Path | None = None  # folder of MLPerf LoadGen's logs; then LoadGen drives the scenarios
 
 
 @dataclass(frozen=True)
@@ -127,7 +115,8 @@ def work(connection: Any, job: Job) -> dict[str, Any]:
         began = time.perf_counter()
         perceive = make_perceiver(job)
         result: dict[str, Any] = {"construct_s": time.perf_counter() - began, "first_call_ms": None}
-        scans = {path: np.load(path) for path in dict.fromkeys((*_paths(job), *job.predict))}
+        named = [path for scenario in job.scenarios for path in scenario.scans]
+        scans = {path: np.load(path) for path in dict.fromkeys((*named, *job.predict))}
         if scans:
             began = time.perf_counter()
             perceive(next(iter(scans.values())))
@@ -151,19 +140,10 @@ def work(connection: Any, job: Job) -> dict[str, Any]:
             stopped = watch.stopped
         result |= {"interrupted": stopped, "rss_mb": rss_mb(), "peak_rss_mb": peak_rss_mb()}
         if not stopped:
-            result["predictions"] = [_predict(perceive, scans[path]) for path in job.predict]
+            found = [perceive(scans[path]) for path in job.predict]
+            result["predictions"] = [Prediction(each.points, each.top_view, each.boxes) for each in found]
     result["warnings"] = list(dict.fromkeys(str(each.message) for each in caught))
     return result
-
-
-def _paths(job: Job) -> Iterator[Path]:
-    for scenario in job.scenarios:
-        yield from scenario.scans
-
-
-def _predict(perceive: Perceive, scan: NDArray[np.float32]) -> Prediction:
-    perception = perceive(scan)
-    return Prediction(perception.points, perception.top_view, perception.boxes)
 
 
 def active_engines(perceive: Perceiver) -> list[dict[str, Any]]:
@@ -264,15 +244,8 @@ def _interrupts() -> Iterator[_Interrupts]:
 
 
 def measure(jobs: Sequence[Job], on_tick: OnTick = lambda name, ms: None) -> list[dict[str, Any]]:
-    """Run several jobs concurrently, each in a fresh process; all start when all are ready.
-
-    Ctrl-C asks the processes for their results so far, which are returned with ``"interrupted"`` set; a second one ends
-    them. Call this from the main thread.
-
-    on_tick : called with the name of a scenario and the milliseconds of its calls since the last time.
-    Returns: By job: ``engines``, ``construct_s``, ``first_call_ms``, ``scenarios``, ``rss_mb``, ``peak_rss_mb``,
-        ``predictions`` and so on.
-    Raises EdgepercError.
+    """Run jobs concurrently, each in a fresh process; all start when all are ready. Ctrl-C asks for their results so
+    far, a second one ends them. Call this from the main thread. Raises EdgepercError.
     """
     spawn = multiprocessing.get_context("spawn")
     workers = []

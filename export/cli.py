@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 from edgeperc import __version__
+from edgeperc.cli.arguments import Options, options
 from edgeperc.cli.output import print_error, print_line
 from edgeperc.cli.program import Parser, run_program
 from edgeperc.errors import EdgepercError, MissingExtraError, ModelError
@@ -25,42 +26,41 @@ PROOF = "scan (or image) files on which torch and onnxruntime must agree, in add
 
 # Options that several commands have.
 SHARED: Mapping[str, Mapping[str, Any]] = {
-    "--kitti": {"type": Path, "help": KITTI},
-    "--layouts": {
+    "--kitti KITTI": {"type": Path, "help": KITTI},
+    "--layouts LAYOUTS": {
         "type": Path,
         "help": "folder of KITTI's label_2, calib and frames.csv: half of the simulated scenes get their boxes",
     },
-    "--semantickitti": {"type": Path, "help": "root folder of SemanticKITTI, to evaluate the drivable area"},
-    "--camvid": {"type": Path, "help": CAMVID},
-    "--fold": {
+    "--semantickitti SEMANTICKITTI": {
+        "type": Path,
+        "help": "root folder of SemanticKITTI, to evaluate the drivable area",
+    },
+    "--camvid CAMVID": {"type": Path, "help": CAMVID},
+    "--fold FOLD": {
         "type": int,
         "help": "fold of the training drives (0, 1 or 2) to validate on instead of training on it",
     },
-    "--scans": {
+    "--scans FOLDER[:LAYOUT]": {
         "action": "append",
         "default": [],
-        "metavar": "FOLDER[:LAYOUT]",
         "help": "more real scans: FOLDER with a scans.json, or FOLDER:LAYOUT; may be repeated",
     },
-    "--threads": {"type": int, "help": "number of CPU threads (default: one for each core)"},
-    "--workers": {
+    "--threads THREADS": {"type": int, "help": "number of CPU threads (default: one for each core)"},
+    "--workers WORKERS": {
         "type": int,
         "default": 1,
         "help": "number of processes that make the training samples (default 1)",
     },
     "--compile": {
-        "action": "store_true",
         "help": "run the network through torch.compile, which needs a C++ compiler and a minute to start",
     },
-    "--model-version": {"default": "1.0.0", "help": "version to write into the card (default 1.0.0)"},
+    "--model-version MODEL_VERSION": {"default": "1.0.0", "help": "version to write into the card (default 1.0.0)"},
 }
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one command.
-
-    Returns: 0: success; 1: a model was refused or a scene was left out; 2: wrong usage or unusable files; 130
-        interrupted, 141 the program that reads the output closed it, 143 terminated.
+    """Run one command: 0 success, 1 a model was refused or a scene left out, 2 wrong usage or unusable files, 130
+    interrupted, 141 the program that reads the output closed it, 143 terminated.
     """
     given = list(sys.argv[1:] if argv is None else argv)
     return run_program("edgeperc-export", lambda: _run(given))
@@ -90,9 +90,9 @@ def build_parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _add_shared(parser: argparse._ActionsContainer, *options: str) -> None:
-    for option in options:
-        parser.add_argument(option, **SHARED[option])
+def _add_shared(add: Options, *shown: str) -> None:
+    for option in shown:
+        add(option, **SHARED[option])
 
 
 def _model_file(text: str) -> Path:
@@ -145,10 +145,7 @@ def _title(networks: tuple[str, ...]) -> str:
 
 
 def recipe_of(args: argparse.Namespace) -> Recipe:
-    """The recipe of a ``train`` command.
-
-    Raises ValueError.
-    """
+    """The recipe of a ``train`` command; ValueError for options without effect."""
     if args.recipe == "paper" and args.network not in PAPER:
         raise ValueError(f"--recipe paper is for {', '.join(PAPER)}; got {args.network}")
     given = {}
@@ -170,16 +167,13 @@ def recipe_of(args: argparse.Namespace) -> Recipe:
 
 
 def _add_simulate(commands: Commands) -> None:
-    simulate = commands.add_parser("simulate", help="write simulated, labeled scans to train on")
-    simulate.add_argument("out", type=Path, help="folder for the scans; existing scans in it are kept")
-    simulate.add_argument("-n", type=int, default=1000, help="number of scans (default 1000)")
-    simulate.add_argument("--first", type=int, default=0, help="number of the first scan, and its seed (default 0)")
-    _add_shared(simulate, "--layouts")
-    simulate.add_argument("--sensor", default="hdl-64e", help="sensor to simulate (default hdl-64e)")
-    simulate.add_argument(
-        "--workers", type=int, default=0, help="number of processes that simulate (default: this one)"
-    )
-    simulate.set_defaults(run=_simulate)
+    add = options(commands.add_parser("simulate", help="write simulated, labeled scans to train on"), run=_simulate)
+    add("out", "folder for the scans; existing scans in it are kept", type=Path)
+    add("-n N", "number of scans (default 1000)", type=int, default=1000)
+    add("--first FIRST", "number of the first scan, and its seed (default 0)", type=int, default=0)
+    _add_shared(add, "--layouts LAYOUTS")
+    add("--sensor SENSOR", "sensor to simulate (default hdl-64e)", default="hdl-64e")
+    add("--workers WORKERS", "number of processes that simulate (default: this one)", type=int, default=0)
 
 
 def _simulate(args: argparse.Namespace) -> int:
@@ -191,47 +185,40 @@ def _simulate(args: argparse.Namespace) -> int:
 
 def _add_train(commands: Commands) -> None:
     train = commands.add_parser("train", help="train a network, or resume a stopped training run")
-    train.add_argument("network", choices=NETWORKS, help="network to train")
-    train.add_argument(
-        "out", type=Path, help="folder for checkpoint.pt, log.jsonl and log.csv; a checkpoint in it is resumed"
-    )
-    _add_shared(train, "--kitti", "--scans")
-    train.add_argument("--simulated", type=Path, help="folder of scans written by edgeperc-export simulate")
-    train.add_argument("--camvid", type=Path, help=f"{CAMVID}; for networks of a camera")
-    _add_shared(train, "--fold")
-    train.add_argument(
+    add = options(train, run=_train)
+    add("network", "network to train", choices=NETWORKS)
+    add("out", "folder for checkpoint.pt, log.jsonl and log.csv; a checkpoint in it is resumed", type=Path)
+    _add_shared(add, "--kitti KITTI", "--scans FOLDER[:LAYOUT]")
+    add("--simulated SIMULATED", "folder of scans written by edgeperc-export simulate", type=Path)
+    add("--camvid CAMVID", f"{CAMVID}; for networks of a camera", type=Path)
+    _add_shared(add, "--fold FOLD")
+    add(
         "--recipe",
+        f"source of the options not given below: the defaults shown, or the network's paper ({', '.join(PAPER)})",
         choices=("ours", "paper"),
         default="ours",
-        help=f"source of the options not given below: the defaults shown, or the network's paper ({', '.join(PAPER)})",
     )
-    train.add_argument(
-        "--start-from",
+    add(
+        "--start-from START_FROM",
+        "checkpoint.pt, fp32 model.onnx, or name of a model such as pointseg, whose weights the run starts from",
         type=_model_file,
-        help="checkpoint.pt, fp32 model.onnx, or name of a model such as pointseg, whose weights the run starts from",
     )
-    train.add_argument(
-        "--teacher",
-        type=_model_file,
-        help="checkpoint.pt, model.onnx or name of the network to distil from; with --distil 0, checkpoint.pt of one "
+    add(
+        "--teacher TEACHER",
+        "checkpoint.pt, model.onnx or name of the network to distil from; with --distil 0, checkpoint.pt of one "
         "that labels the unlabeled points",
+        type=_model_file,
     )
-    _add_shared(train, "--threads", "--workers")
-    train.add_argument(
-        "--checkpoint-every",
+    _add_shared(add, "--threads THREADS", "--workers WORKERS")
+    add(
+        "--checkpoint-every STEPS",
+        "steps between checkpoints, and between lines of log.jsonl (default 100)",
         type=int,
         default=100,
-        metavar="STEPS",
-        help="steps between checkpoints, and between lines of log.jsonl (default 100)",
     )
-    train.add_argument(
-        "--tensorboard",
-        action="store_true",
-        help="also write the log for TensorBoard; see it with: tensorboard --logdir OUT",
-    )
-    _add_shared(train, "--compile")
+    add("--tensorboard", "also write the log for TensorBoard; see it with: tensorboard --logdir OUT")
+    _add_shared(add, "--compile")
     _add_recipe_options(train)
-    train.set_defaults(run=_train)
 
 
 def _train(args: argparse.Namespace) -> int:
@@ -256,10 +243,12 @@ def _train(args: argparse.Namespace) -> int:
 
 
 def _add_curve(commands: Commands) -> None:
-    curve = commands.add_parser("curve", help="show the validation figures of training runs over the samples seen")
-    curve.add_argument("runs", type=Path, nargs="+", metavar="OUT", help="folder of a training run, with its log.jsonl")
-    curve.add_argument("--lines", type=int, default=12, help="at most this many lines for each run (default 12)")
-    curve.set_defaults(run=_curve)
+    add = options(
+        commands.add_parser("curve", help="show the validation figures of training runs over the samples seen"),
+        run=_curve,
+    )
+    add("runs OUT...", "folder of a training run, with its log.jsonl", type=Path)
+    add("--lines LINES", "at most this many lines for each run (default 12)", type=int, default=12)
 
 
 def _curve(args: argparse.Namespace) -> int:
@@ -272,25 +261,24 @@ def _curve(args: argparse.Namespace) -> int:
 
 
 def _add_export(commands: Commands) -> None:
-    export = commands.add_parser("export", help="write a checkpoint as an .onnx model with a card")
-    export.add_argument("checkpoint", type=Path, help="checkpoint.pt of a training run")
-    export.add_argument("out", type=Path, help=".onnx file to write; not written if torch and onnxruntime disagree")
-    export.add_argument("--scans", type=Path, nargs="*", default=[], help=PROOF)
-    export.add_argument(
-        "--kitti",
-        type=Path,
-        help=f"{KITTI}; of a checkpoint that does not describe its real scans, the card describes these, for the check "
+    add = options(commands.add_parser("export", help="write a checkpoint as an .onnx model with a card"), run=_export)
+    add("checkpoint", "checkpoint.pt of a training run", type=Path)
+    add("out", ".onnx file to write; not written if torch and onnxruntime disagree", type=Path)
+    add("--scans SCANS", PROOF, type=Path, nargs="*", default=[])
+    add(
+        "--kitti KITTI",
+        f"{KITTI}; of a checkpoint that does not describe its real scans, the card describes these, for the check "
         "of inputs",
+        type=Path,
     )
-    export.add_argument("--metrics", type=Path, help="JSON file of edgeperc eval --json, to write into the card")
-    export.add_argument("--name", help="name of the model (default: the network's)")
-    _add_shared(export, "--model-version")
-    export.add_argument(
-        "--licence",
+    add("--metrics METRICS", "JSON file of edgeperc eval --json, to write into the card", type=Path)
+    add("--name NAME", "name of the model (default: the network's)")
+    _add_shared(add, "--model-version MODEL_VERSION")
+    add(
+        "--licence LICENCE",
+        "license of weights trained on simulation alone (default Apache-2.0); KITTI's applies to all others",
         default="Apache-2.0",
-        help="license of weights trained on simulation alone (default Apache-2.0); KITTI's applies to all others",
     )
-    export.set_defaults(run=_export)
 
 
 def _export(args: argparse.Namespace) -> int:
@@ -316,11 +304,10 @@ def _export(args: argparse.Namespace) -> int:
 
 
 def _add_verify(commands: Commands) -> None:
-    verify = commands.add_parser("verify", help="compare an .onnx model with its checkpoint")
-    verify.add_argument("checkpoint", type=Path, help="checkpoint.pt that the model was exported from")
-    verify.add_argument("model", type=_model_file, help=".onnx file, or name of a model")
-    verify.add_argument("--scans", type=Path, nargs="*", default=[], help=PROOF)
-    verify.set_defaults(run=_verify)
+    add = options(commands.add_parser("verify", help="compare an .onnx model with its checkpoint"), run=_verify)
+    add("checkpoint", "checkpoint.pt that the model was exported from", type=Path)
+    add("model", ".onnx file, or name of a model", type=_model_file)
+    add("--scans SCANS", PROOF, type=Path, nargs="*", default=[])
 
 
 def _verify(args: argparse.Namespace) -> int:
@@ -334,13 +321,13 @@ def _verify(args: argparse.Namespace) -> int:
 
 
 def _add_card(commands: Commands) -> None:
-    card = commands.add_parser(
-        "card", help="add a card to an .onnx network made elsewhere, so that edgeperc can run it"
+    add = options(
+        commands.add_parser("card", help="add a card to an .onnx network made elsewhere, so that edgeperc can run it"),
+        run=_card,
     )
-    card.add_argument("model", type=Path, help=".onnx file of the network")
-    card.add_argument("card", type=Path, help="JSON file of the card; edgeperc info MODEL --json prints one to edit")
-    card.add_argument("out", type=Path, help=".onnx file to write")
-    card.set_defaults(run=_card)
+    add("model", ".onnx file of the network", type=Path)
+    add("card", "JSON file of the card; edgeperc info MODEL --json prints one to edit", type=Path)
+    add("out", ".onnx file to write", type=Path)
 
 
 def _card(args: argparse.Namespace) -> int:
@@ -362,42 +349,25 @@ def _card(args: argparse.Namespace) -> int:
 
 
 def _add_quantize(commands: Commands) -> None:
-    quantize = commands.add_parser(
-        "quantize", help="make an int8 model, if it is faster on this computer and as accurate"
+    add = options(
+        commands.add_parser("quantize", help="make an int8 model, if it is faster on this computer and as accurate"),
+        run=_quantize,
     )
-    quantize.add_argument("model", type=_model_file, help=".onnx file, or name, of the fp32 model")
-    quantize.add_argument("out", type=Path, help=".onnx file to write")
-    quantize.add_argument(
-        "--scans", type=Path, nargs="*", default=[], help="scans, or folders of .bin, to calibrate on"
-    )
-    quantize.add_argument(
-        "--kitti", type=Path, help=f"{KITTI}; calibrates on training drives, compares on validation drives"
-    )
-    quantize.add_argument(
-        "--simulated", type=int, default=64, metavar="N", help="simulated scans to calibrate on (default 64)"
-    )
-    _add_shared(quantize, "--semantickitti")
-    quantize.add_argument(
-        "--camvid", type=Path, help=f"{CAMVID}; for a camera's model: calibrates on training images, not on scans"
-    )
-    quantize.add_argument(
+    add("model", ".onnx file, or name, of the fp32 model", type=_model_file)
+    add("out", ".onnx file to write", type=Path)
+    add("--scans SCANS", "scans, or folders of .bin, to calibrate on", type=Path, nargs="*", default=[])
+    add("--kitti KITTI", f"{KITTI}; calibrates on training drives, compares on validation drives", type=Path)
+    add("--simulated N", "simulated scans to calibrate on (default 64)", type=int, default=64)
+    _add_shared(add, "--semantickitti SEMANTICKITTI")
+    add("--camvid CAMVID", f"{CAMVID}; for a camera's model: calibrates on training images, not on scans", type=Path)
+    add(
         "--seven-bits",
-        action="store_true",
+        "use 7-bit weights, which x86 without VNNI needs (default: if this computer needs them)",
         default=None,
-        help="use 7-bit weights, which x86 without VNNI needs (default: if this computer needs them)",
     )
-    quantize.add_argument(
-        "--evaluate-on",
-        type=int,
-        default=48,
-        metavar="N",
-        help="simulated scans to evaluate both models on (default 48)",
-    )
-    quantize.add_argument("--exclude", nargs="*", default=[], metavar="NODE", help="graph nodes to keep in fp32")
-    quantize.add_argument(
-        "--threads", type=int, help="number of CPU threads for timing (default: onnxruntime's choice)"
-    )
-    quantize.set_defaults(run=_quantize)
+    add("--evaluate-on N", "simulated scans to evaluate both models on (default 48)", type=int, default=48)
+    add("--exclude NODE", "graph nodes to keep in fp32", nargs="*", default=[])
+    add("--threads THREADS", "number of CPU threads for timing (default: onnxruntime's choice)", type=int)
 
 
 def _quantize(args: argparse.Namespace) -> int:
@@ -436,14 +406,16 @@ def _quantize(args: argparse.Namespace) -> int:
 
 
 def _add_agree(commands: Commands) -> None:
-    agree = commands.add_parser("agree", help="compare bf16 and int8 with fp32, and write the agreement into the cards")
-    agree.add_argument("models", nargs="+", metavar="MODEL", help="a network's name, or its files, one of them in fp32")
-    agree.add_argument("--kitti", type=Path, help="root of a KITTI object set")
-    agree.add_argument("--semantickitti", type=Path, help="root of SemanticKITTI, for the road")
-    agree.add_argument("--camvid", type=Path, help=f"{CAMVID}; for a network of a camera")
-    agree.add_argument("--split", default="validation", help="drives of the KITTI set, or images (default: validation)")
-    agree.add_argument("--scans", type=int, metavar="N", help="at most N scans of each set (default: all)")
-    agree.set_defaults(run=_agree)
+    add = options(
+        commands.add_parser("agree", help="compare bf16 and int8 with fp32, and write the agreement into the cards"),
+        run=_agree,
+    )
+    add("models MODEL...", "a network's name, or its files, one of them in fp32")
+    add("--kitti KITTI", "root of a KITTI object set", type=Path)
+    add("--semantickitti SEMANTICKITTI", "root of SemanticKITTI, for the road", type=Path)
+    add("--camvid CAMVID", f"{CAMVID}; for a network of a camera", type=Path)
+    add("--split SPLIT", "drives of the KITTI set, or images (default: validation)", default="validation")
+    add("--scans N", "at most N scans of each set (default: all)", type=int)
 
 
 def _agree(args: argparse.Namespace) -> int:
@@ -465,20 +437,16 @@ def _agree(args: argparse.Namespace) -> int:
 
 
 def _add_make(commands: Commands) -> None:
-    make = commands.add_parser("make", help="make a shipped model from scratch: simulate, train, export, evaluate")
+    does = "make a shipped model from scratch: simulate, train, export, evaluate"
+    add = options(commands.add_parser("make", help=does), run=_make)
     shipped = sorted(name for name in MODELS if not name.endswith("-start"))
-    make.add_argument(
-        "name",
-        choices=shipped,
-        help="model to make; the models that it starts from or is distilled from are made first",
-    )
-    make.add_argument("out", type=Path, help="folder for scans, checkpoints and models; finished ones in it are kept")
-    _add_shared(make, "--kitti", "--layouts", "--semantickitti")
-    make.add_argument("--camvid", type=Path, help=f"{CAMVID}; for camseg")
-    _add_shared(make, "--fold", "--scans")
-    make.add_argument("--steps", type=int, help="training steps (default: as many as for the shipped model)")
-    _add_shared(make, "--threads", "--workers", "--compile", "--model-version")
-    make.set_defaults(run=_make)
+    add("name", "model to make; the models that it starts from or is distilled from are made first", choices=shipped)
+    add("out", "folder for scans, checkpoints and models; finished ones in it are kept", type=Path)
+    _add_shared(add, "--kitti KITTI", "--layouts LAYOUTS", "--semantickitti SEMANTICKITTI")
+    add("--camvid CAMVID", f"{CAMVID}; for camseg", type=Path)
+    _add_shared(add, "--fold FOLD", "--scans FOLDER[:LAYOUT]")
+    add("--steps STEPS", "training steps (default: as many as for the shipped model)", type=int)
+    _add_shared(add, "--threads THREADS", "--workers WORKERS", "--compile", "--model-version MODEL_VERSION")
 
 
 def _make(args: argparse.Namespace) -> int:
@@ -503,41 +471,36 @@ def _make(args: argparse.Namespace) -> int:
 
 
 def _add_ablate(commands: Commands) -> None:
-    ablate = commands.add_parser(
-        "ablate", help="measure the effect of each part of the training on a fold, or compare networks on CamVid"
-    )
-    ablate.add_argument(
+    does = "measure the effect of each part of the training on a fold, or compare networks on CamVid"
+    ablate = commands.add_parser("ablate", help=does)
+    add = options(ablate, run=_ablate)
+    add(
         "network",
+        "network whose variants are trained, or camvid: eleven networks under one budget",
         choices=["ssadnet", "pointseg", "lodnn", "camvid"],
-        help="network whose variants are trained, or camvid: eleven networks under one budget",
     )
-    ablate.add_argument("out", type=Path, help="folder for the runs and their figures; finished runs in it are kept")
-    scans = ablate.add_argument_group("variants of a network")
-    _add_shared(scans, "--kitti")
-    scans.add_argument("--simulated", type=Path, help="folder of scans from edgeperc-export simulate")
-    scans.add_argument(
-        "--start-from",
+    add("out", "folder for the runs and their figures; finished runs in it are kept", type=Path)
+    scans = options(ablate, "variants of a network")
+    _add_shared(scans, "--kitti KITTI")
+    scans("--simulated SIMULATED", "folder of scans from edgeperc-export simulate", type=Path)
+    scans(
+        "--start-from START_FROM",
+        "checkpoint.pt, .onnx file or name of NETWORK-sim; lodnn starts from random weights",
         type=_model_file,
-        help="checkpoint.pt, .onnx file or name of NETWORK-sim; lodnn starts from random weights",
     )
-    scans.add_argument("--fold", type=int, default=0, help="fold of the training drives to evaluate on (default 0)")
-    scans.add_argument("--steps", type=int, default=150, help="training steps of each run (default 150)")
-    scans.add_argument("--plot", type=Path, metavar="PNG", help="also draw the results (lodnn only)")
-    images = ablate.add_argument_group("networks on CamVid")
-    _add_shared(images, "--camvid")
-    images.add_argument(
-        "--size", type=_size, default=(120, 90), metavar="WxH", help="size of the images (default 120x90)"
-    )
-    images.add_argument("--epochs", type=int, default=10, help="how often each image is trained on (default 10)")
-    images.add_argument("--batch", type=int, default=8, help="images in each step (default 8)")
-    images.add_argument("--learning-rate", type=float, help="learning rate (default 3e-4)")
-    images.add_argument("--no-plots", action="store_true", help="write the table alone, without matplotlib")
+    scans("--fold FOLD", "fold of the training drives to evaluate on (default 0)", type=int, default=0)
+    scans("--steps STEPS", "training steps of each run (default 150)", type=int, default=150)
+    scans("--plot PNG", "also draw the results (lodnn only)", type=Path)
+    images = options(ablate, "networks on CamVid")
+    _add_shared(images, "--camvid CAMVID")
+    images("--size WxH", "size of the images (default 120x90)", type=_size, default=(120, 90))
+    images("--epochs EPOCHS", "how often each image is trained on (default 10)", type=int, default=10)
+    images("--batch BATCH", "images in each step (default 8)", type=int, default=8)
+    images("--learning-rate LEARNING_RATE", "learning rate (default 3e-4)", type=float)
+    images("--no-plots", "write the table alone, without matplotlib")
     _add_shared(images, "--compile")
-    ablate.add_argument(
-        "--variant", action="append", default=[], help="run this variant, or network, only; may be repeated"
-    )
-    _add_shared(ablate, "--threads")
-    ablate.set_defaults(run=_ablate)
+    add("--variant VARIANT", "run this variant, or network, only; may be repeated", action="append", default=[])
+    _add_shared(add, "--threads THREADS")
 
 
 def _ablate(args: argparse.Namespace) -> int:
@@ -602,16 +565,16 @@ def _ablate_camvid(args: argparse.Namespace) -> int:
 
 
 def _add_triton(commands: Commands) -> None:
-    triton = commands.add_parser("triton", help="write a model repository for NVIDIA's Triton Inference Server")
-    triton.add_argument("out", type=Path, help="folder of the repository; models of the same names are replaced")
-    triton.add_argument(
-        "--model",
-        action="append",
-        metavar="MODEL",
-        help="name or file of a network of scans; may be repeated (default: ssadnet, pointseg and objects)",
+    add = options(
+        commands.add_parser("triton", help="write a model repository for NVIDIA's Triton Inference Server"), run=_triton
     )
-    triton.add_argument("--sensor", default="hdl-64e", help="sensor of the scans (default hdl-64e)")
-    triton.set_defaults(run=_triton)
+    add("out", "folder of the repository; models of the same names are replaced", type=Path)
+    add(
+        "--model MODEL",
+        "name or file of a network of scans; may be repeated (default: ssadnet, pointseg and objects)",
+        action="append",
+    )
+    add("--sensor SENSOR", "sensor of the scans (default hdl-64e)", default="hdl-64e")
 
 
 def _triton(args: argparse.Namespace) -> int:
@@ -625,9 +588,10 @@ def _triton(args: argparse.Namespace) -> int:
 
 
 def _add_models(commands: Commands) -> None:
-    models = commands.add_parser("models", help="write MODELS.md from the cards of a folder's models")
-    models.add_argument("folder", type=Path, help="folder of .onnx models")
-    models.set_defaults(run=_models)
+    add = options(
+        commands.add_parser("models", help="write MODELS.md from the cards of a folder's models"), run=_models
+    )
+    add("folder", "folder of .onnx models", type=Path)
 
 
 def _models(args: argparse.Namespace) -> int:

@@ -111,10 +111,7 @@ def measure_offline(
     document: dict[str, Any],
     live: LiveTable,
 ) -> None:
-    """Measure the throughput of several processes into ``setting``.
-
-    Raises KeyboardInterrupt.
-    """
+    """Measure the throughput of several processes into ``setting``; raises KeyboardInterrupt if it was interrupted."""
     from ..measure import offline
 
     live.note(f"offline, {n_processes} processes")

@@ -10,22 +10,22 @@ from typing import Any
 from edgeperc.cli.output import print_line
 
 from ..document import ReportError, read_report, repeats_ms, scenario_names, setting_label
-from ..options import Subparsers
+from ..options import add_command
 from ..samples import compare
 
 
-def add_parser(subparsers: Subparsers) -> None:
+def add_parser(subparsers: Any) -> None:
     """Declare the command."""
-    parser = subparsers.add_parser(
+    add = add_command(
+        subparsers,
         "compare",
+        run_command,
         help="tell whether report B is faster or slower than report A",
         description="Compare two reports of the same scans, setting by setting. A difference counts only if it is "
         "larger than the noise of both. Exit code: 0 no difference or faster, 1 slower, 2 not comparable.",
-        allow_abbrev=False,
     )
-    parser.add_argument("a", type=Path, metavar="A.json", help="the report to compare with, written by --json")
-    parser.add_argument("b", type=Path, metavar="B.json", help="the report that may be faster or slower")
-    parser.set_defaults(run=run_command)
+    add("a A.json", "the report to compare with, written by --json", type=Path)
+    add("b B.json", "the report that may be faster or slower", type=Path)
 
 
 def run_command(arguments: argparse.Namespace) -> int:

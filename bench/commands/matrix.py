@@ -17,16 +17,7 @@ from edgeperc.types.choices import PRECISIONS
 from edgeperc.zoo import DEFAULT, choose, resolve
 
 from ..document import pooled, repeats_ms, setting_label
-from ..options import (
-    SINGLE_STREAM,
-    Subparsers,
-    add_limits,
-    choices,
-    model_options,
-    numbers,
-    output_options,
-    scan_options,
-)
+from ..options import SINGLE_STREAM, add_command, add_limits, choices, numbers
 from ..render import LiveTable
 from ..samples import compare, percentile
 from ..worker import Job, Prediction, Scenario
@@ -37,48 +28,43 @@ if TYPE_CHECKING:
     from ..measure import Reference
 
 
-def add_parser(subparsers: Subparsers) -> None:
+def add_parser(subparsers: Any) -> None:
     """Declare the command."""
-    parser = subparsers.add_parser(
+    add = add_command(
+        subparsers,
         "matrix",
-        parents=[model_options(), scan_options(), output_options()],
+        run_command,
+        ("model", "scans", "output", "page"),
         help="measure many settings and recommend the fastest",
         description="Measure each model on every provider, in every precision and with every number of threads, and "
         "recommend the fastest setting whose results agree with fp32 on the CPU.",
-        allow_abbrev=False,
     )
-    add_limits(parser, min_scans=50, min_seconds=3.0, repeats=2)
-    parser.add_argument(
-        "--providers",
+    add_limits(add, min_scans=50, min_seconds=3.0, repeats=2)
+    add(
+        "--providers A,B",
+        f"execution providers with commas between them, or all; one of {', '.join(PROVIDERS)} (default: all)",
         type=choices(tuple(PROVIDERS)),
         default=list(PROVIDERS),
-        metavar="A,B",
-        help=f"execution providers with commas between them, or all; one of {', '.join(PROVIDERS)} (default: all)",
     )
-    parser.add_argument(
-        "--precisions",
+    add(
+        "--precisions A,B",
+        f"precisions with commas between them, or all; one of {', '.join(PRECISIONS)} (default: all)",
         type=choices(tuple(PRECISIONS)),
         default=list(PRECISIONS),
-        metavar="A,B",
-        help=f"precisions with commas between them, or all; one of {', '.join(PRECISIONS)} (default: all)",
     )
-    parser.add_argument(
-        "--threads",
+    add(
+        "--threads 1,2,4",
+        "numbers of threads with commas between them (default: 1 and the number of cores)",
         type=numbers(1),
         default=list(dict.fromkeys([1, os.cpu_count() or 1])),
-        metavar="1,2,4",
-        help="numbers of threads with commas between them (default: 1 and the number of cores)",
     )
-    parser.add_argument(
-        "--recommend",
-        type=Path,
+    add(
+        "--recommend FILE",
+        "save the recommendation to FILE; without FILE, to settings.json in the folder EDGEPERC_CACHE_DIR, by "
+        "default edgeperc in the user's cache folder, where Perceiver(provider='auto') finds it",
         nargs="?",
         const="",
-        metavar="FILE",
-        help="save the recommendation to FILE; without FILE, to settings.json in the folder EDGEPERC_CACHE_DIR, by "
-        "default edgeperc in the user's cache folder, where Perceiver(provider='auto') finds it",
     )
-    parser.set_defaults(run=run_command)
 
 
 def run_command(arguments: argparse.Namespace) -> int:
@@ -111,14 +97,7 @@ def run_command(arguments: argparse.Namespace) -> int:
 def settings_to_try(
     model: str, providers: Sequence[str], precisions: Sequence[str], present: Sequence[str]
 ) -> tuple[list[tuple[str, str]], list[str]]:
-    """Select the settings of a model that this computer can run.
-
-    model : as `edgeperc.Perceiver` takes it.
-    providers, precisions : what the user asked for.
-    present : the providers of this computer.
-    Returns settings: list of (provider, precision).
-    Returns skipped: One sentence for each requested setting that this computer cannot run.
-    """
+    """The (provider, precision) of a model that this computer can run by ``present``; a sentence for each other."""
     variants = resolve(model)
     settings, skipped = [], []
     for provider in providers:

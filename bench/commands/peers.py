@@ -6,39 +6,38 @@ import argparse
 import os
 import tempfile
 from pathlib import Path
+from typing import Any
 
-from ..options import Subparsers, at_least, choices, engine_options, model_options, output_options, scan_options
+from ..options import add_command, at_least, choices
 from .common import new_document, prepare_input
 
 
-def add_parser(subparsers: Subparsers) -> None:
+def add_parser(subparsers: Any) -> None:
     """Declare the command."""
-    parser = subparsers.add_parser(
+    add = add_command(
+        subparsers,
         "peers",
-        parents=[model_options(), scan_options(), engine_options(), output_options()],
+        run_command,
+        ("model", "scans", "engine", "output", "page"),
         help="compare edgeperc with torch, other engines and numpy (extra 'peers')",
         description="Measure edgeperc, the same networks in torch, torch.compile, onnxruntime, OpenVINO, MNN and ncnn "
         "with a pipeline in numpy, and the fastest matrix products and memory copies of this computer, all in turns. "
         "Then measure networks and methods of others beside edgeperc's whole answers. "
         "What is not installed is listed and left out.",
-        allow_abbrev=False,
     )
-    parser.add_argument(
-        "--rounds",
+    add(
+        "--rounds N",
+        "how often each contender takes its turn with all scans (default: %(default)s)",
         type=at_least(1),
         default=25,
-        metavar="N",
-        help="how often each contender takes its turn with all scans (default: %(default)s)",
     )
-    parser.add_argument(
-        "--tables",
+    add(
+        "--tables LIST",
+        "engines: the models elsewhere; methods: SalsaNext, SqueezeSegV2, PointPillars and Patchwork++ beside the "
+        "default models, in onnxruntime's CPU provider; or all (default: %(default)s)",
         type=choices(("engines", "methods")),
         default="all",
-        metavar="LIST",
-        help="engines: the models elsewhere; methods: SalsaNext, SqueezeSegV2, PointPillars and Patchwork++ beside the "
-        "default models, in onnxruntime's CPU provider; or all (default: %(default)s)",
     )
-    parser.set_defaults(run=run_command)
 
 
 def run_command(arguments: argparse.Namespace) -> int:

@@ -11,16 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from .. import loadgen
-from ..options import (
-    SINGLE_STREAM,
-    Subparsers,
-    add_limits,
-    engine_options,
-    model_options,
-    output_options,
-    scan_options,
-    scenario,
-)
+from ..options import SINGLE_STREAM, add_command, add_limits, scenario
 from ..render import LiveTable
 from ..scenarios import Limits
 from ..worker import Job, Scenario
@@ -29,38 +20,28 @@ from .common import job_of, limits_of, measure_offline, new_document, prepare_in
 DEFAULT_SCENARIOS = (SINGLE_STREAM, "paced:10", "paced:20", "offline", "cold-start")
 
 
-def add_parser(subparsers: Subparsers) -> None:
+def add_parser(subparsers: Any) -> None:
     """Declare the command."""
-    parser = subparsers.add_parser(
+    add = add_command(
+        subparsers,
         "run",
-        parents=[model_options(), scan_options(), engine_options(), output_options()],
+        run_command,
+        ("model", "scans", "engine", "output", "page"),
         help="measure one setting (the default command)",
         description="Measure the latency of one setting, each scenario in fresh processes, and compare its results "
         "with fp32 on the CPU.",
-        allow_abbrev=False,
     )
-    add_limits(parser, min_scans=100, min_seconds=10.0, repeats=3)
-    parser.add_argument(
-        "--scenario",
-        action="append",
-        type=scenario,
-        metavar="S",
-        help=f"{SINGLE_STREAM} (back to back), paced:HZ (scans arrive at this rate), offline or offline:PROCESSES "
+    add_limits(add, min_scans=100, min_seconds=10.0, repeats=3)
+    add(
+        "--scenario S",
+        f"{SINGLE_STREAM} (back to back), paced:HZ (scans arrive at this rate), offline or offline:PROCESSES "
         "(throughput of several processes), cold-start (from starting a process to its first answer); may be repeated "
         f"(default: {', '.join(DEFAULT_SCENARIOS)})",
+        action="append",
+        type=scenario,
     )
-    parser.add_argument(
-        "--full-turn",
-        action="store_true",
-        help="run the range-image model on all four quarters of the turn (default: only the quarter ahead)",
-    )
-    parser.add_argument(
-        "--loadgen",
-        type=Path,
-        metavar="DIR",
-        help="measure with MLPerf LoadGen, too, and keep its logs in DIR (needs the extra 'loadgen')",
-    )
-    parser.set_defaults(run=run_command)
+    add("--full-turn", "run the range-image model on all four quarters of the turn (default: only the quarter ahead)")
+    add("--loadgen DIR", "measure with MLPerf LoadGen, too, and keep its logs in DIR (needs the extra 'loadgen')")
 
 
 def run_command(arguments: argparse.Namespace) -> int:

@@ -19,7 +19,7 @@ from edgeperc.system.extras import require
 
 from .. import plots
 from ..document import latency, stage_medians
-from ..options import Subparsers, add_limits, engine_options, model_options, numbers, output_options
+from ..options import add_command, add_limits, numbers
 from ..render import LiveTable, number
 from ..samples import trend
 from ..worker import Job, Scenario
@@ -31,22 +31,23 @@ SIZES = (50, 100, 200, 400)
 Curve = list[tuple[float, float]]
 
 
-def add_parser(subparsers: Subparsers) -> None:
+def add_parser(subparsers: Any) -> None:
     """Declare the command."""
-    parser = subparsers.add_parser(
+    add = add_command(
+        subparsers,
         "scaling",
-        parents=[model_options(), engine_options(), output_options(html=False)],
+        run_command,
+        ("model", "engine", "output"),
         help="measure how the time grows with points, cars, image size and processes",
         description="Measure how the time of a scan grows with its number of points, with the number of cars in it, "
         "with the size of the networks' images and with the number of processes.",
-        allow_abbrev=False,
     )
-    add_limits(parser, min_scans=20, min_seconds=1.0, repeats=1)
+    add_limits(add, min_scans=20, min_seconds=1.0, repeats=1)
 
     def add_counts(option: str, least: int, most: int | None, default: Sequence[int] | None, text: str) -> None:
         shown = "1, 2, 4 .. up to the cores" if default is None else ",".join(map(str, default))
-        kwargs: dict[str, Any] = {"type": numbers(least, most), "default": default, "metavar": "N,N"}
-        parser.add_argument(option, help=f"{text}, with commas between them (default: {shown})", **kwargs)
+        help = f"{text}, with commas between them (default: {shown})"
+        add(f"{option} N,N", help, type=numbers(least, most), default=default)
 
     add_counts("--points", 100, None, POINT_COUNTS, "numbers of points in a scan")
     add_counts("--cars", 0, CAR_COUNTS[-1], CAR_COUNTS, f"numbers of cars in a scan, {CAR_COUNTS[-1]} at most")
@@ -55,10 +56,7 @@ def add_parser(subparsers: Subparsers) -> None:
         "image sizes in per cent of the model's own pixels, with random weights (needs the extra 'export')",
     )  # fmt: skip
     add_counts("--processes", 1, None, None, "numbers of concurrent processes")
-    parser.add_argument(
-        "--plot", type=Path, metavar="FILE", help="draw the curves to a .svg or .png file (needs the extra 'view')"
-    )
-    parser.set_defaults(run=run_command)
+    add("--plot FILE", "draw the curves to a .svg or .png file (needs the extra 'view')")
 
 
 def run_command(arguments: argparse.Namespace) -> int:

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from ..options import Subparsers, at_least, engine_options, model_options, output_options
+from ..options import add_command, at_least
 from ..samples import trend
 from ..scenarios import Limits
 from ..worker import MEMORY_SAMPLES, Scenario
@@ -24,28 +24,18 @@ LEVEL_MB = 1.0
 SETTLING_SHARE = 0.1
 
 
-def add_parser(subparsers: Subparsers) -> None:
+def add_parser(subparsers: Any) -> None:
     """Declare the command."""
-    parser = subparsers.add_parser(
+    add = add_command(
+        subparsers,
         "soak",
-        parents=[model_options(), engine_options(), output_options(html=False)],
+        run_command,
+        ("model", "engine", "output"),
         help="tell whether memory grows over a long run",
         description="Run many simulated scans in one process and fit a line to its memory.",
-        allow_abbrev=False,
     )
-    parser.add_argument(
-        "--scans",
-        type=at_least(1000),
-        default=20_000,
-        metavar="N",
-        help="the number of scans, 1000 at least (default: %(default)s)",
-    )
-    parser.add_argument(
-        "--application",
-        action="store_true",
-        help="also stream, track, write JSON and draw every 100th scan, as applications do (extra 'view')",
-    )
-    parser.set_defaults(run=run_command)
+    add("--scans N", "the number of scans, 1000 at least (default: %(default)s)", type=at_least(1000), default=20_000)
+    add("--application", "also stream, track, write JSON and draw every 100th scan, as applications do (extra 'view')")
 
 
 def run_command(arguments: argparse.Namespace) -> int:
@@ -72,13 +62,8 @@ def run_command(arguments: argparse.Namespace) -> int:
 
 
 def memory_growth(rss_mb: Sequence[Sequence[float]], settling: int) -> dict[str, Any]:
-    """Test whether memory grew.
-
-    rss_mb : sequence of (scans done, MB)
-    settling : number of scans before the first sample.
-    Returns: ``verdict`` (grows, level, undecided), ``growth_mb`` over the run by a straight line and its
-        ``growth_error_mb`` (half of a 95 % interval), ``last_minus_first_mb``, ``sentences``. Memory grows if the
-        interval lies above 0 and the growth above `LEVEL_MB`; it is level if the interval ends below `LEVEL_MB`.
+    """Whether memory, samples of (scans done, MB), grew after settling: if the 95 % interval of a line's growth lies
+    above 0 and the growth above `LEVEL_MB`; it is level if the interval ends below `LEVEL_MB`.
     """
     done, mb = np.asarray(rss_mb, np.float64).reshape(-1, 2).T
     line = trend(done, mb)

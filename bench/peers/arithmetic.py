@@ -25,26 +25,16 @@ COPY_BYTES = 1 << 28
 
 @dataclass(frozen=True)
 class Cost:
-    """The work of a network; traffic is counted in values, not bytes.
+    """The work of a network; traffic is counted in values, not bytes."""
 
-    macs : multiply-accumulates including padding, as usually reported.
-    padding_macs : multiply-accumulates with padding only; part of ``macs``.
-    weights, activations : values that convolutions and matrix products read, and read or write; other operators can be
-        fused into them.
-    """
-
-    macs: int
-    padding_macs: int
-    weights: int
-    activations: int
+    macs: int  # multiply-accumulates including padding, as usually reported
+    padding_macs: int  # the part of them that meets padding only
+    weights: int  # read by convolutions and matrix products; other operators can be fused into them
+    activations: int  # read or written by them
 
 
 def cost(model: Path | Any) -> Cost:
-    """Count a network's multiplications and traffic.
-
-    model : Path or onnx.ModelProto
-    Raises ModelError.
-    """
+    """Count the multiplications and traffic of a network, of a file or an onnx.ModelProto. Raises ModelError."""
     import onnx
 
     loaded = onnx.load(model) if isinstance(model, Path) else model
@@ -92,10 +82,7 @@ def n_taps_inside(n_here: int, n_there: int, kernel: int, stride: int, pad: int,
 
 
 def matrix_product(library: str, precision: str, n_threads: int) -> Callable[[], object]:
-    """A square matrix product of `PRODUCT_SIZE` ** 3 multiplications, by numpy, torch or openvino.
-
-    numpy takes its number of threads from the environment when the process starts.
-    """
+    """A product of `PRODUCT_SIZE` ** 3 multiplications; numpy takes its threads from the environment at the start."""
     n = PRODUCT_SIZE
     a, b = np.random.default_rng(0).standard_normal((2, n, n), np.float32)
     if library == "numpy":

@@ -37,10 +37,7 @@ def camera_images(view: CameraGeometry, folder: Path) -> tuple[Path, ...]:
 
 
 class NumpyCamera:
-    """`edgeperc.Perceiver` of images without edgeperc's stages, for images of the model's own size.
-
-    card : of the camera; its class output is the engine's only one.
-    """
+    """`edgeperc.Perceiver` of images of the model's own size without edgeperc's stages, by the engine's only output."""
 
     def __init__(self, card: ModelCard, engine: Engine) -> None:
         self.card, self.engine = card, engine
@@ -70,10 +67,7 @@ def _table(n_in: int, n_out: int) -> NDArray[np.float32]:
 
 
 def small_unet(card: ModelCard, precision: str, n_threads: int) -> Callable[[NDArray[np.uint8]], Any]:
-    """The small U-Net in torch, eagerly: a function from an image (H, W, 3) uint8 to labels that mean nothing.
-
-    Input, classes and scaling are those of a card; ``"bf16"`` is by autocast.
-    """
+    """The small U-Net in torch (``"bf16"`` by autocast) with a card's input: from an image to meaningless labels."""
     import torch
 
     from edgeperc_export.networks.unet import UNet

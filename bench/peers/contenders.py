@@ -52,28 +52,17 @@ PEAKS = (("numpy", "fp32"), ("torch", "fp32"), ("torch", "bf16"), ("torch", "int
 
 @dataclass(frozen=True)
 class Contender:
-    """One row of a table.
-
-    kind : A key of `turns.MAKERS`.
-    engine : A provider for the kinds ``"edgeperc"``, ``"default"``, ``"session"`` and those of `ANSWERS`, else as
-        `open_engine` or `matrix_product` take it.
-    precision : as the provider or the engine takes it; empty if it has no choice.
-    paths : models.
-    cards : the models' cards, JSON.
-    image : input of a network alone, .npy.
-    inputs : A camera's images, .npy, in place of the scans of the run.
-    timed : The part that is timed, where it differs within a table.
-    """
+    """One row of a table."""
 
     name: str
-    kind: str
-    engine: str = ""
-    precision: str = ""
+    kind: str  # a key of `turns.MAKERS`
+    engine: str = ""  # a provider for edgeperc's own kinds, else as `open_engine` or `matrix_product` take it
+    precision: str = ""  # as the provider or the engine takes it; empty if it has no choice
     paths: tuple[Path, ...] = ()
-    cards: tuple[str, ...] = ()
-    image: Path | None = None
-    inputs: tuple[Path, ...] = ()
-    timed: str = ""
+    cards: tuple[str, ...] = ()  # the models' cards, JSON
+    image: Path | None = None  # input of a network alone, .npy
+    inputs: tuple[Path, ...] = ()  # a camera's images, .npy, in place of the scans of the run
+    timed: str = ""  # the part that is timed, where it differs within a table
 
 
 @dataclass
@@ -116,13 +105,8 @@ def default_models() -> list[str]:
 def groups(
     models: Sequence[str], provider: str, precision: str, folder: Path, scan: Path, sensor: str
 ) -> dict[str, list[Contender]]:
-    """All contenders, by the title of their table.
-
-    models : names or paths; a name stands for its variant in fp32. Range-image models are paired with top-view
-        models, the first with the first.
-    provider, precision : for edgeperc itself.
-    folder : for inputs and for the two networks in place of one.
-    scan : the scan that is the input of networks alone.
+    """All contenders of some models, by the title of their table; a name stands for its fp32 file, and range-image
+    models are paired with top-view models in order. ``scan`` is the input of networks alone.
     """
     points, _ = condition(np.load(scan), get_sensor(sensor), rendered=False)
     views: dict[str, list[Variant]] = {"range_image": [], "top_view": [], "camera": [], "objects": []}
@@ -173,12 +157,7 @@ def groups(
 
 
 def methods(folder: Path) -> list[Contender]:
-    """edgeperc's whole answers, networks of others with random weights, and clusters without a network.
-
-    All networks run in onnxruntime's CPU provider.
-
-    folder : for the networks.
-    """
+    """edgeperc's whole answers, others' networks with random weights (in ``folder``), clusters without a network."""
     rows = [
         Contender(f"edgeperc {view}, {label}", view, "cpu", precision, timed="scan to labels, cells and boxes")
         for precision, label in (("auto", "as by default"), ("fp32", "fp32"))
@@ -238,11 +217,7 @@ def _small_unet(variant: Variant) -> list[Contender]:
 
 
 def _one_or_two(variant: Variant, folder: Path) -> list[Contender]:
-    """Compare SSADNet with two networks made of its parts: segmentation, and detection with its own trunk.
-
-    The two networks together give SSADNet's results. The third row is a lower bound for any detector: the box head on
-    the bare input, without a trunk, with random weights.
-    """
+    """SSADNet, two networks of its parts, and, as a lower bound for any detector, the box head on the bare input."""
     card, path = variant.card, variant.path
     image = folder / f"{path.stem}-input.npy"
     segmentation, detection, lean = (

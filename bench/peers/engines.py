@@ -21,22 +21,15 @@ from .arithmetic import openvino_request
 
 @dataclass(frozen=True)
 class Engine:
-    """A network ready to run.
-
-    input : (C, H, W) float32; write here, then `run`.
-    run : returns the outputs by their names in the graph, without the batch axis.
-    """
+    """A network ready to run: ``run`` returns the outputs of ``input`` (C, H, W) by name, without the batch axis."""
 
     input: NDArray[np.float32]
     run: Callable[[], Mapping[str, NDArray[np.float32]]]
 
 
 def open_engine(library: str, precision: str, path: Path, n_threads: int) -> Engine:
-    """Open a model in an engine.
-
-    library : onnxruntime is its CPU provider. MNN and ncnn run the graph as their own converters translate it.
-    precision : ``"fp32"`` or ``"bf16"``, in torch by autocast; onnxruntime, MNN and ncnn ignore it.
-    Raises ModelError.
+    """Open a model in an engine; onnxruntime is its CPU provider. Only torch (by autocast) and openvino know
+    ``"bf16"``; MNN and ncnn run what their converters make of the graph. Raises ModelError.
     """
     if library in ("mnn", "ncnn"):
         with tempfile.TemporaryDirectory() as folder:
@@ -158,10 +151,7 @@ def _signature(path: Path) -> tuple[str, tuple[int, ...], list[str]]:
 
 
 def torch_network(path: Path) -> tuple[Any, tuple[int, ...], list[str]]:
-    """Translate a model's graph to a torch module; also the shape of its input and the names of its outputs.
-
-    Raises ModelError.
-    """
+    """A model's graph as a torch module, the shape of its input and the names of its outputs. Raises ModelError."""
     import onnx
     import torch
 
@@ -203,19 +193,11 @@ def _in_torch(op: str, inputs: Sequence[Any], attributes: Mapping[str, Any]) -> 
     }  # fmt: skip
     if op in plain:
         return plain[op], list(inputs)
+    bias = others[1] if len(others) > 1 else None
     if op == "Conv":
-        bias = others[1] if len(others) > 1 else None
-        return F.conv2d, [
-            x,
-            others[0],
-            bias,
-            attributes["strides"],
-            pads[:2],
-            attributes["dilations"],
-            attributes["group"],
-        ]
+        last = [attributes["dilations"], attributes["group"]]
+        return F.conv2d, [x, others[0], bias, attributes["strides"], pads[:2], *last]
     if op == "ConvTranspose":
-        bias = others[1] if len(others) > 1 else None
         extra = attributes.get("output_padding", [0, 0])
         last = [extra, attributes.get("group", 1), attributes.get("dilations", [1, 1])]
         return F.conv_transpose2d, [x, others[0], bias, attributes["strides"], pads[:2], *last]
@@ -229,14 +211,11 @@ def _in_torch(op: str, inputs: Sequence[Any], attributes: Mapping[str, Any]) -> 
         return torch.mean, [x, others[0].tolist(), bool(attributes.get("keepdims", 1))]
     if op == "Expand":
         return torch.Tensor.expand, [x, [-1 if n == 1 else n for n in others[0].tolist()]]
-    if op == "Resize" and attributes.get("mode") == b"nearest":
+    modes = {b"nearest": "nearest", b"linear": "bilinear"}
+    if op == "Resize" and attributes.get("mode") in modes:
         _, scales, *sizes = others
         size = sizes[0].tolist()[2:] if sizes else None
-        return F.interpolate, [x, size, None if sizes else scales.tolist()[2:], "nearest"]
-    if op == "Resize" and attributes.get("mode") == b"linear":
-        _, scales, *sizes = others
-        size = sizes[0].tolist()[2:] if sizes else None
-        return F.interpolate, [x, size, None if sizes else scales.tolist()[2:], "bilinear"]
+        return F.interpolate, [x, size, None if sizes else scales.tolist()[2:], modes[attributes["mode"]]]
     if op == "DepthToSpace" and attributes.get("mode") == b"CRD":
         return F.pixel_shuffle, [x, attributes["blocksize"]]
     if op == "Reshape":

@@ -19,7 +19,6 @@ not count. ``--accuracy`` takes more scans and prints the means.
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Callable, Mapping
 from importlib import import_module
 from importlib.util import find_spec
@@ -37,7 +36,7 @@ from edgeperc.simulation.scene import simulate
 from edgeperc.types.sensor import SensorProfile, get_sensor
 
 from ..render import Section, number, share, text
-from .rounds import measure, versions
+from .rounds import measure, parser_of, versions
 
 SENSOR = get_sensor("hdl-64e")
 DISTANCE_M = 0.5
@@ -106,10 +105,7 @@ def ground_finders(peers: Mapping[str, Any], sensor: SensorProfile = SENSOR) -> 
 
 
 def clusterers(points: Scan, peers: Mapping[str, Any]) -> dict[str, Clusterer]:
-    """By name: calls that cluster the points, (n,) int.
-
-    Raises AssertionError.
-    """
+    """By name: calls that cluster the points, (n,) int; AssertionError if DBSCAN's differ from `find_clusters`'."""
     calls: dict[str, Clusterer] = {
         "find_clusters": lambda: find_clusters(points),
         "find_clusters, 0.5 m": lambda: find_clusters(
@@ -131,10 +127,7 @@ def clusterers(points: Scan, peers: Mapping[str, Any]) -> dict[str, Clusterer]:
 
 
 def tree_clusters(points: Scan) -> NDArray[np.signedinteger[Any]]:
-    """Clusters by a k-d tree, (n,) int: points in voxels whose first points have no gap above `DISTANCE_M`.
-
-    Voxels, then distances: as `pcl::EuclideanClusterExtraction` is mostly used, with scipy's tree.
-    """
+    """Clusters by a k-d tree, (n,) int: voxels with no gap above `DISTANCE_M`, as PCL's Euclidean ones mostly are."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
     from scipy.spatial import KDTree
@@ -192,21 +185,11 @@ def table(title: str, ms: Mapping[str, NDArray[np.float64]], reference: str) -> 
 
 def main() -> None:
     """Run the command line."""
-    parser = argparse.ArgumentParser(
-        prog="python -m edgeperc_bench.peers.ground", description=(__doc__ or "").splitlines()[0]
-    )
-    parser.add_argument("scan", nargs="?", type=Path, help="a scan file (default: a simulated scan)")
-    parser.add_argument(
-        "--rounds", type=int, default=20, metavar="N", help="how often each is measured (default: %(default)s)"
-    )
-    parser.add_argument(
-        "--accuracy",
-        nargs="*",
-        type=Path,
-        default=[],
-        metavar="SCAN",
-        help="more SemanticKITTI scans with labels, for recall and precision",
-    )
+    parser, add = parser_of("ground", __doc__)
+    add("scan", "a scan file (default: a simulated scan)", nargs="?", type=Path)
+    add("--rounds N", "how often each is measured (default: %(default)s)", type=int, default=20)
+    wanted = "more SemanticKITTI scans with labels, for recall and precision"
+    add("--accuracy SCAN", wanted, nargs="*", type=Path, default=[])
     arguments = parser.parse_args()
     peers = installed_peers()
     scans: list[tuple[Scan, Truth]] = []

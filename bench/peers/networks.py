@@ -26,12 +26,7 @@ OTHERS: dict[str, tuple[str, tuple[str, ...], tuple[int, int, int]]] = {
 
 
 def resized(model: str, share: float, folder: Path) -> Path:
-    """Make the same network for a view with ``share`` times the pixels, with random weights in fp32.
-
-    A range image gets ``share`` times the columns, a top view ``share`` times the range.
-
-    Raises ModelError.
-    """
+    """A model's network with random weights in fp32 for ``share`` times the columns or range. Raises ModelError."""
     from edgeperc_export.networks import build
     from edgeperc_export.recipe import Recipe
     from edgeperc_export.release.to_onnx import to_graph, write_card
@@ -56,11 +51,8 @@ def resized(model: str, share: float, folder: Path) -> Path:
 
 
 def write_others(folder: Path) -> None:
-    """Write each network of `OTHERS` with random weights as ``NAME fp32.onnx`` and ``NAME int8.onnx``, and its input.
-
-    As in edgeperc's own models, int8 weights have a scale for each channel and activations are uint8, in the operators
-    for which onnxruntime's CPU provider has int8 kernels. Their ranges are those of the one input: random weights have
-    no accuracy to lose.
+    """Write each network of `OTHERS` with random weights in fp32 and int8, and its input. int8 is as in edgeperc's
+    models; the ranges are of the one input, because random weights have no accuracy to lose.
     """
     import onnx
     import torch

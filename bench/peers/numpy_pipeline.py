@@ -33,11 +33,7 @@ WINDOW, N_VOTES, MAX_RANGE_GAP_M = 2, 5, 1.0
 
 
 class NumpyPipeline:
-    """`edgeperc.Perceiver` without edgeperc's stages.
-
-    cards : each of the front quarter as a range image, or of a top view with dense boxes.
-    engines : one for each card.
-    """
+    """`edgeperc.Perceiver` without its stages, of cards of a front quarter or a dense top view, each with an engine."""
 
     def __init__(self, cards: Sequence[ModelCard], engines: Sequence[Engine], sensor: SensorProfile) -> None:
         self.sensor = sensor

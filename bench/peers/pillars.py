@@ -17,11 +17,8 @@ def random_weights() -> NDArray[np.float32]:
 
 
 def fill_pillars(points: NDArray[np.float32], weights: NDArray[np.float32], image: NDArray[np.float32]) -> None:
-    """Write the image (64, H, W) of a scan (n, 4) for PointPillars' backbone: rows along y around 0, x from 0 on.
-
-    A point has nine values: x, y, z, remission, its offset from its pillar's mean, and that from its pillar's center. A
-    linear layer and ReLU make 64 of them, and a pillar has the maximum over its points. The paper's limits, 12,000
-    pillars and 100 points in each, serve tensors of a fixed size, which loops do not need.
+    """Write the image (64, H, W) of a scan (n, 4): rows along y around 0, x from 0. The paper's limits of 12,000
+    pillars and 100 points each serve tensors of a fixed size, which loops do not need.
     """
     image.fill(0.0)
     _fill(points, weights, image)

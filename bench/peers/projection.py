@@ -16,7 +16,6 @@ multiples of the copy loop's, and numpy's time as a multiple of the kernel's. On
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
@@ -42,7 +41,7 @@ from edgeperc.types.sensor import get_sensor
 from edgeperc.types.views import RangeImageGeometry, TopViewGeometry
 
 from ..render import Section, number, text
-from .rounds import measure, versions
+from .rounds import measure, parser_of, versions
 
 SENSOR = "hdl-64e"
 TOP_VIEW = TopViewGeometry()
@@ -56,11 +55,7 @@ RANGE_IMAGE_INPUT = InputSpec(
 
 @njit(cache=True, nogil=True)
 def fill_copy(points: NDArray[np.float32], copy: NDArray[np.float32]) -> None:
-    """Copy the points, number by number.
-
-    points : (n, 4) float32, C-contiguous
-    copy : (n, 4) float32, overwritten
-    """
+    """Copy the points (n, 4), number by number."""
     for i in range(points.shape[0]):
         for k in range(4):
             copy[i, k] = points[i, k]
@@ -105,10 +100,7 @@ class _NumpyProjector:
 
 
 class NumpyTopView(_NumpyProjector):
-    """`TopViewProjector` in numpy.
-
-    input : channels distance, remission, height.
-    """
+    """`TopViewProjector` in numpy, of the channels distance, remission, height."""
 
     def __init__(self, view: TopViewGeometry, input: InputSpec) -> None:
         super().__init__(view, input)
@@ -136,10 +128,7 @@ class NumpyTopView(_NumpyProjector):
 
 
 class NumpyRangeImage(_NumpyProjector):
-    """`RangeImageProjector` in numpy, for the front quarter.
-
-    input : channels x, y, z, remission, range and, if wanted, height_above_ground.
-    """
+    """`RangeImageProjector` in numpy, for the front quarter: the usual channels and, if wanted, height_above_ground."""
 
     def __init__(self, view: RangeImageGeometry, input: InputSpec) -> None:
         super().__init__(view, input)
@@ -187,10 +176,7 @@ def winners(
 
 
 def contenders(points: NDArray[np.float32]) -> dict[str, Callable[[], object]]:
-    """The calls to measure, by their names in the table, each with its own buffers.
-
-    Raises AssertionError.
-    """
+    """The calls to measure by their names in the table, each with its own buffers; AssertionError if results differ."""
     copy = np.empty_like(points)
     calls: dict[str, Callable[[], object]] = {"copy loop": lambda: fill_copy(points, copy)}
 
@@ -226,13 +212,9 @@ def table(ms: Mapping[str, NDArray[np.float64]]) -> Section:
 
 def main() -> None:
     """Run the command line."""
-    parser = argparse.ArgumentParser(
-        prog="python -m edgeperc_bench.peers.projection", description=(__doc__ or "").splitlines()[0]
-    )
-    parser.add_argument("scan", nargs="?", type=Path, help="a scan file (default: a simulated scan)")
-    parser.add_argument(
-        "--rounds", type=int, default=300, metavar="N", help="how often each is measured (default: %(default)s)"
-    )
+    parser, add = parser_of("projection", __doc__)
+    add("scan", "a scan file (default: a simulated scan)", nargs="?", type=Path)
+    add("--rounds N", "how often each is measured (default: %(default)s)", type=int, default=300)
     arguments = parser.parse_args()
     if arguments.scan is None:
         name, points = "a simulated scan", simulate(random_scene(3), get_sensor(SENSOR), 0).points

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import platform
 from collections.abc import Callable, Mapping
 from time import perf_counter_ns
@@ -9,6 +10,8 @@ from time import perf_counter_ns
 import numba
 import numpy as np
 from numpy.typing import NDArray
+
+from edgeperc.cli.arguments import Options, options
 
 N_WARM_UP = 3
 
@@ -21,10 +24,8 @@ def elapsed_ms(call: Callable[[], object]) -> float:
 
 
 def measure(calls: Mapping[str, Callable[[], object]], n_rounds: int) -> dict[str, NDArray[np.float64]]:
-    """Milliseconds of each call in each round, by name.
-
-    Each round makes every call once, in a new random order, so that caches and other busy processes affect all of them
-    equally. The first `N_WARM_UP` rounds do not count.
+    """Milliseconds of each call in each round, by name; the first `N_WARM_UP` do not count. Each round makes every call
+    in a new random order, so that caches and other processes affect all of them equally.
     """
     ms = {name: np.empty(N_WARM_UP + n_rounds) for name in calls}
     rng = np.random.default_rng(0)
@@ -38,3 +39,10 @@ def versions(**others: str) -> str:
     """Versions of numpy, numba, Python and other packages, and the processor's architecture."""
     packages = {"numpy": np.__version__, "numba": numba.__version__, "Python": platform.python_version()} | others
     return ", ".join([*(f"{name} {version}" for name, version in packages.items()), platform.machine()])
+
+
+def parser_of(module: str, text: str | None) -> tuple[argparse.ArgumentParser, Options]:
+    """The parser of a module that is a command, described by the first line of its text, and what adds its options."""
+    description = (text or "").splitlines()[0]
+    parser = argparse.ArgumentParser(prog=f"python -m edgeperc_bench.peers.{module}", description=description)
+    return parser, options(parser)

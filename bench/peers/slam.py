@@ -31,7 +31,6 @@ the true one, median and 95th percentile. On real drives KISS-ICP stands in for 
 
 from __future__ import annotations
 
-import argparse
 import importlib.metadata
 import math
 import time
@@ -55,7 +54,7 @@ from edgeperc.tracking.moving import moving_tracks
 from edgeperc.types.geometry import inside
 
 from ..render import Section, number, text
-from .rounds import versions
+from .rounds import parser_of, versions
 
 RATE_HZ = 10.0
 CELL_M = 0.2
@@ -73,25 +72,16 @@ Odometry = Callable[[Sequence[Points]], Poses]
 
 @dataclass(frozen=True, eq=False)
 class Drive:
-    """Consecutive scans.
-
-    scans : list of (n, 4) float32
-    poses : (k, 4, 4) float64 or None; true poses of the sensor.
-    moving : list of (n,) bool, or None; points on objects that move; None: from ``labels``.
-    usable : list of (n,) bool; points for KISS-ICP.
-    known : list of (n,) bool; points of which it is known whether they move.
-    labels : true boxes of each scan, of all objects; empty if ``moving`` is known.
-    trained : whether a model was trained on one of the scans.
-    """
+    """Consecutive scans."""
 
     name: str
     scans: list[Points]
-    poses: Poses | None
-    moving: list[NDArray[np.bool_]] | None
-    usable: list[NDArray[np.bool_]]
-    known: list[NDArray[np.bool_]]
-    labels: list[list[Box]]
-    trained: bool = False
+    poses: Poses | None  # (k, 4, 4), true poses of the sensor
+    moving: list[NDArray[np.bool_]] | None  # points on objects that move; None: from ``labels``
+    usable: list[NDArray[np.bool_]]  # points for KISS-ICP
+    known: list[NDArray[np.bool_]]  # points of which it is known whether they move
+    labels: list[list[Box]]  # true boxes of each scan, of all objects; empty if ``moving`` is known
+    trained: bool = False  # a model was trained on one of the scans
 
 
 def drawn_streets(n_scans: int, wanted: Sequence[str] = ()) -> Iterator[Drive]:
@@ -139,9 +129,8 @@ def real_drives(
 
 
 def moving_boxes(labels: Sequence[Sequence[Box]], poses: Poses) -> list[list[Box]]:
-    """The boxes of objects that move, by scan: labels tracked with known poses of the sensor.
-
-    An object moves in a scan if its track moves in this one or in one of `MOVING_AROUND` before or after it.
+    """The boxes of objects that move, by scan: labels tracked with known poses. An object moves in a scan if its track
+    moves in this one or in one of `MOVING_AROUND` before or after it.
     """
     tracker = Tracker()
     numbers: list[dict[int, int]] = []  # index of a box -> its track
@@ -163,10 +152,7 @@ def moving_boxes(labels: Sequence[Sequence[Box]], poses: Poses) -> list[list[Box
 
 
 def trajectory_error(true: Poses, found: Poses) -> float:
-    """Root of the mean squared distance of positions [m], after the best rigid alignment.
-
-    true, found : (k, 4, 4) float64
-    """
+    """Root of the mean squared distance of positions of poses (k, 4, 4) [m], after the best rigid alignment."""
     a, b = (poses[:, :3, 3] - poses[:, :3, 3].mean(axis=0) for poses in (true, found))
     u, _, v = np.linalg.svd(b.T @ a)
     turn = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ v))]) @ v
@@ -192,12 +178,7 @@ def ghost_share(
     moving: Sequence[NDArray[np.bool_]],
     poses: Poses,
 ) -> float:
-    """Share of the map's cells that hold a kept point of a moving object.
-
-    scans : sequence of (n, 4) float32
-    kept, moving : sequence of (n,) bool
-    poses : (k, 4, 4) float64
-    """
+    """Share of the map's cells that hold a kept point of a moving object, of scans at their poses (k, 4, 4)."""
     cells: list[list[NDArray[np.int64]]] = [[], []]
     for points, stays, moves, pose in zip(scans, kept, moving, poses, strict=True):
         places = np.floor((points[:, :3] @ pose[:3, :3].T + pose[:3, 3]) / CELL_M).astype(np.int64)
@@ -223,15 +204,11 @@ def kiss_icp(scans: Sequence[Points]) -> Poses:
 
 @dataclass(frozen=True)
 class Seen:
-    """What is left out of the scans of a drive, and the median processor time of a scan.
+    """What is left out of the scans of a drive, and the median processor time of a scan."""
 
-    kept : dict of str to list of (n,) bool; by variant, in their order; without the second pass.
-    poses : (k, 4, 4) float64; of the sensor, as the tracker estimates them.
-    """
-
-    kept: dict[str, list[NDArray[np.bool_]]]
+    kept: dict[str, list[NDArray[np.bool_]]]  # by variant in their order, without the second pass
     perceptions: list[Perception]
-    poses: Poses
+    poses: Poses  # (k, 4, 4), of the sensor, as the tracker estimates them
     ms: float
 
 
@@ -355,21 +332,13 @@ def draw_maps(drive: Drive, seen: Seen, odometry: Odometry, path: Path) -> None:
 
 def main() -> None:
     """Run the command line."""
-    parser = argparse.ArgumentParser(
-        prog="python -m edgeperc_bench.peers.slam", description=(__doc__ or "").splitlines()[0]
-    )
-    parser.add_argument("root", nargs="?", type=Path, help="a KITTI object set (default: drawn streets)")
-    parser.add_argument(
-        "--drive", nargs="+", default=[], metavar="DRIVE", help="only drives that end so, such as 0001 or urban"
-    )
-    parser.add_argument(
-        "--least", type=int, default=20, metavar="N", help="drives with at least N scans (default: %(default)s)"
-    )
-    parser.add_argument(
-        "--scans", type=int, default=0, metavar="N", help="the first N scans of each drive (default: all; drawn: 60)"
-    )
-    parser.add_argument("--second-pass", action="store_true", help="also track with KISS-ICP's poses")
-    parser.add_argument("--picture", type=Path, metavar="FILE", help="draw the maps of the first drawn street")
+    parser, add = parser_of("slam", __doc__)
+    add("root", "a KITTI object set (default: drawn streets)", nargs="?", type=Path)
+    add("--drive DRIVE...", "only drives that end so, such as 0001 or urban", default=[])
+    add("--least N", "drives with at least N scans (default: %(default)s)", type=int, default=20)
+    add("--scans N", "the first N scans of each drive (default: all; drawn: 60)", type=int, default=0)
+    add("--second-pass", "also track with KISS-ICP's poses")
+    add("--picture FILE", "draw the maps of the first drawn street")
     arguments = parser.parse_args()
     require("kiss_icp", "slam", "The comparison with KISS-ICP", package="kiss-icp")
     if arguments.picture and arguments.root is not None:

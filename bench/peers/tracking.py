@@ -22,7 +22,6 @@ The table shows wall time and processor time; other busy processes lengthen the 
 
 from __future__ import annotations
 
-import argparse
 import importlib.metadata
 import importlib.util
 import math
@@ -42,7 +41,7 @@ from edgeperc.evaluation.tracking import CLASSES, FRAME_S, read_sequence, sequen
 from edgeperc.types.sensor import get_sensor
 
 from ..render import Section, number, text
-from .rounds import elapsed_ms, versions
+from .rounds import elapsed_ms, parser_of, versions
 
 Scans = Sequence[Sequence[Box]]
 
@@ -66,9 +65,8 @@ def drawn_street(n_scans: int = 400, seed: int = 0) -> list[list[Box]]:
 def crossing(
     n_scans: int, n_targets: int = 200, n_false: int = 100, seed: int = 0
 ) -> Iterator[tuple[list[Box], NDArray[np.float64]]]:
-    """Boxes, and true places (n_targets, 2), of cars that cross in 120 m by 120 m and turn around at its edges.
-
-    Every other car is missed in three scans of ten; false alarms lie anywhere.
+    """Boxes, and true places (n_targets, 2), of cars that cross in 120 m by 120 m and turn around at its edges; every
+    other one is missed in three scans of ten, and false alarms lie anywhere.
     """
     rng = np.random.default_rng(seed)
     places, heading = rng.uniform(-60.0, 60.0, (n_targets, 2)), rng.uniform(-math.pi, math.pi, n_targets)
@@ -86,11 +84,7 @@ def crossing(
 
 
 def every_second_beam(root: Path, out: Path) -> None:
-    """Write the drives of an HDL-64E as if it had half the beams and its remission were squared, as a byte.
-
-    root : an object set with track ids; its scans hold one beam after the other, each a turn from ahead, as KITTI's.
-    out : becomes an object set; its ``sensor.json`` is the coarser sensor, without a fitted remission function.
-    """
+    """Write an object set with track ids as of a sensor with half the beams and the remission squared, as a byte."""
     for folder in ("label_2", "track_id", "calib"):
         shutil.copytree(root / "training" / folder, out / "training" / folder)
     shutil.copy(root / "frames.csv", out)
@@ -199,28 +193,15 @@ def stone_soup(scans: Scans, seconds: float) -> int:
 
 def main() -> None:
     """Run the command line."""
-    parser = argparse.ArgumentParser(
-        prog="python -m edgeperc_bench.peers.tracking", description=(__doc__ or "").splitlines()[0]
-    )
-    parser.add_argument("root", nargs="?", type=Path, help="KITTI's tracking sequences (default: a drawn street)")
-    parser.add_argument("--sequence", default="0004", metavar="SEQ", help="measured with both (default: %(default)s)")
-    parser.add_argument(
-        "--score",
-        type=float,
-        default=0.5,
-        metavar="X",
-        help="both get the boxes of --sequence with a higher score (default: %(default)s)",
-    )
-    parser.add_argument(
-        "--seconds", type=float, default=60.0, metavar="S", help="run Stone Soup this long (default: %(default)s)"
-    )
-    parser.add_argument("--crossing", type=int, metavar="N", help="measure only N scans of crossing targets")
-    parser.add_argument(
-        "--targets", type=int, default=200, metavar="N", help="the number of crossing targets (default: %(default)s)"
-    )
-    parser.add_argument(
-        "--every-second-beam", type=Path, metavar="OUT", help="only write the drives of ROOT as of a coarser sensor"
-    )
+    parser, add = parser_of("tracking", __doc__)
+    add("root", "KITTI's tracking sequences (default: a drawn street)", nargs="?", type=Path)
+    add("--sequence SEQ", "measured with both (default: %(default)s)", default="0004")
+    higher = "both get the boxes of --sequence with a higher score (default: %(default)s)"
+    add("--score X", higher, type=float, default=0.5)
+    add("--seconds S", "run Stone Soup this long (default: %(default)s)", type=float, default=60.0)
+    add("--crossing N", "measure only N scans of crossing targets", type=int)
+    add("--targets N", "the number of crossing targets (default: %(default)s)", type=int, default=200)
+    add("--every-second-beam OUT", "only write the drives of ROOT as of a coarser sensor", type=Path)
     arguments = parser.parse_args()
     if arguments.crossing:
         print(endurance(arguments.crossing, arguments.targets))
@@ -250,7 +231,7 @@ def main() -> None:
 
     rows = [["", "scans", "boxes/scan", "scans/s", "by processor time"]]
 
-    def add(name: str, measured: tuple[int, float, float], boxes_per_scan: float) -> float:
+    def add_row(name: str, measured: tuple[int, float, float], boxes_per_scan: float) -> float:
         """Add a row; return the processor time of a scan [s]."""
         done, wall_s, cpu_s = measured
         rows.append([name, f"{done:,}", number(boxes_per_scan, 1), number(done / wall_s, 0), number(done / cpu_s, 0)])
@@ -258,13 +239,13 @@ def main() -> None:
 
     for name, sequences in of_class.items():
         n_boxes, n_scans = sum(len(scan) for scans in sequences for scan in scans), sum(map(len, sequences))
-        add(name, time_tracker(sequences), n_boxes / n_scans)
+        add_row(name, time_tracker(sequences), n_boxes / n_scans)
     each = sum(map(len, shared)) / len(shared)
-    own_s = add(f"one sequence, score > {arguments.score}", time_tracker([shared] * 5), each)
+    own_s = add_row(f"one sequence, score > {arguments.score}", time_tracker([shared] * 5), each)
     sentences = [f"one thread; {versions()}"]
     if importlib.util.find_spec("stonesoup"):
         name = f"Stone Soup {importlib.metadata.version('stonesoup')} JPDA"
-        theirs_s = add(name, timed(partial(stone_soup, shared, arguments.seconds)), each)
+        theirs_s = add_row(name, timed(partial(stone_soup, shared, arguments.seconds)), each)
         sentences.append(f"Stone Soup takes {theirs_s / own_s:,.0f} times as long for a scan")
     else:
         sentences.append("Stone Soup's JPDA is not installed. Run: pip install 'edgeperc[peers]'")

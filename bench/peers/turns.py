@@ -201,14 +201,7 @@ def measure(
     note: Callable[[str], None] = print,
     measured: list[Measured] | None = None,
 ) -> list[Measured]:
-    """Let contenders take turns.
-
-    files : scans, .npy (n, 4), in the sensor's raw unit of remission.
-    n_threads : the same for every library.
-    note : called with the name of each contender before it starts.
-    measured : filled while measuring, so that the results so far are left after an interruption.
-    Returns: In the order of ``contenders``; ``missing`` says why a contender has no results.
-    """
+    """Let contenders take turns on .npy scans, filling ``measured``, so that results survive an interruption."""
     measured = [] if measured is None else measured
     spawn, rng = multiprocessing.get_context("spawn"), np.random.default_rng(0)
     running: list[tuple[Measured, Any, Any]] = []
@@ -273,10 +266,7 @@ def run(
     n_rounds: int,
     note: Callable[[str], None],
 ) -> None:
-    """Measure tables, one after the other, and record them in a report's document.
-
-    tables : ``"engines"`` for the same networks elsewhere, ``"methods"`` for other networks and methods.
-    """
+    """Measure ``tables`` ("engines": the same networks elsewhere; "methods": others), and record them in a document."""
     document["peers"] = {}
     for package in ("mnn", "ncnn", "onnx", "openvino", "pypatchworkpp", "scipy", "torch"):
         with suppress(importlib.metadata.PackageNotFoundError):

@@ -16,6 +16,9 @@ from ..types.choices import DEFAULT_MODELS, DEFAULT_SENSOR, WEIGHTS
 Commands = Any  # what ArgumentParser.add_subparsers returns; argparse keeps its class private
 _WIDTH = 78
 
+Options = Callable[..., None]  # of `options`
+_PATHS = {"FILE": Path, "DIR": Path}
+
 PROVIDERS = ("auto", *sorted(providers.PROVIDERS))
 PRECISIONS = ("auto", *choices.PRECISIONS)
 
@@ -29,14 +32,7 @@ def add_command(
     description: str,
     examples: Sequence[str],
 ) -> argparse.ArgumentParser:
-    """Add a subcommand.
-
-    commands : argparse's subparsers
-    command : takes the parsed arguments and returns the exit code.
-    help : the line in the list of commands.
-    examples : command lines, printed below the options.
-    Returns argparse.ArgumentParser.
-    """
+    """Add a subcommand: ``command`` returns the exit code, ``examples`` are printed below the options."""
     parser: argparse.ArgumentParser = commands.add_parser(
         name,
         help=help,
@@ -49,69 +45,83 @@ def add_command(
     return parser
 
 
-def add_sensor(group: Any, *, required: bool = False, of_capture: bool = False) -> None:
+def options(parser: argparse.ArgumentParser, title: str | None = None, **defaults: Any) -> Options:
+    """A function that adds options, to the group of a title, as the help shows them: ``--live``, ``--json FILE``,
+    ``paths PATH...``, ``--size W H``. One without a value is a flag, a FILE or DIR is a path. ``defaults`` are kept.
+    """
+    parser.set_defaults(**defaults)
+    group = parser if title is None else parser.add_argument_group(title)
+
+    def add(shown: str, help: str, **settings: Any) -> None:
+        name, *values = shown.removesuffix("...").split()
+        if shown.endswith("..."):
+            settings["nargs"] = "+"
+        elif len(values) > 1:
+            settings["nargs"] = len(values)
+        if values:
+            metavar = values[0] if len(values) == 1 else tuple(values)
+            settings = {"metavar": metavar, "type": _PATHS.get(values[0])} | settings
+        elif name.startswith("-") and "choices" not in settings:
+            settings.setdefault("action", "store_true")
+        group.add_argument(name, help=help, **settings)
+
+    return add
+
+
+def add_sensor(group: Options, *, required: bool = False, of_capture: bool = False) -> None:
     """Add ``--sensor``; with ``of_capture``, it is None by default, for the sensor that a capture names."""
     default = "auto" if of_capture else DEFAULT_SENSOR
-    group.add_argument(
-        "--sensor",
-        required=required,
-        default=None if required or of_capture else DEFAULT_SENSOR,
-        metavar="SENSOR",
-        help="the LiDAR that recorded the scans: a name from 'edgeperc sensors', a public set (av2, ddad, lyft, "
+    group(
+        "--sensor SENSOR",
+        "the LiDAR that recorded the scans: a name from 'edgeperc sensors', a public set (av2, ddad, lyft, "
         "pandaset, semantickitti, vod), a .json file written by 'edgeperc "
         "fit-sensor' or 'edgeperc info --write', or auto: the one that a capture names, otherwise the one whose beams "
         "are found in the points of the first scans" + (" (required)" if required else f" (default: {default})"),
+        required=required,
+        default=None if required or of_capture else DEFAULT_SENSOR,
     )
 
 
-def add_mounting(group: Any) -> None:
+def add_mounting(group: Options) -> None:
     """Add options of the mounting and ``--ego-box``; `edgeperc.cli.scans.with_mounting` reads them."""
-    group.add_argument(
-        "--mount-height",
+    group(
+        "--mount-height M",
+        "height of the scan's origin above the road [m] (default: found from the ground in the scans)",
         type=finite_number,
-        metavar="M",
-        help="height of the scan's origin above the road [m] (default: found from the ground in the scans)",
     )
-    group.add_argument(
-        "--roll",
-        type=finite_number,
-        metavar="DEG",
-        help="tilt of the sensor to the right, its left side up [deg]; 180: it hangs upside down (default: found from "
+    group(
+        "--roll DEG",
+        "tilt of the sensor to the right, its left side up [deg]; 180: it hangs upside down (default: found from "
         "the ground in the scans)",
-    )
-    group.add_argument(
-        "--pitch",
         type=finite_number,
-        metavar="DEG",
-        help="tilt of the sensor, positive if it looks down ahead [deg] (default: found from the ground in the scans)",
     )
-    group.add_argument(
-        "--turn",
-        type=_yaw,
-        metavar="DEG",
-        help="direction of the scan's x axis, counter-clockwise from straight ahead [deg]: -90 for x right, y forward; "
+    group(
+        "--pitch DEG",
+        "tilt of the sensor, positive if it looks down ahead [deg] (default: found from the ground in the scans)",
+        type=finite_number,
+    )
+    group(
+        "--turn DEG",
+        "direction of the scan's x axis, counter-clockwise from straight ahead [deg]: -90 for x right, y forward; "
         "or 'street': the direction of the street, found from the scans (default: 0)",
+        type=_yaw,
     )
-    group.add_argument(
-        "--extrinsic",
-        type=Path,
-        metavar="FILE",
-        help="T_vehicle_sensor, a 4 x 4 matrix as JSON or text: maps points of a scan into a vehicle frame with x "
+    group(
+        "--extrinsic FILE",
+        "T_vehicle_sensor, a 4 x 4 matrix as JSON or text: maps points of a scan into a vehicle frame with x "
         "forward, z up, and z = 0 on the road (default: tilt is found from the ground in the scans)",
     )
     add_ego_box(group)
 
 
-def add_ego_box(group: Any) -> None:
+def add_ego_box(group: Options) -> None:
     """Add ``--ego-box``; `edgeperc.cli.scans.with_mounting` reads it."""
-    group.add_argument(
-        "--ego-box",
-        nargs=6,
-        type=finite_number,
-        metavar=("X", "X", "Y", "Y", "Z", "Z"),
-        help="the vehicle or robot that carries the sensor: lowest and highest x, y and z about the sensor, along the "
+    group(
+        "--ego-box X X Y Y Z Z",
+        "the vehicle or robot that carries the sensor: lowest and highest x, y and z about the sensor, along the "
         "scan's axes [m]; points inside are dropped, e.g. --ego-box -2.5 1.5 -1 1 -1.5 -0.2; 'edgeperc info' suggests "
         "it from several scans (default: the profile's, none for the built-in ones)",
+        type=finite_number,
     )
 
 
@@ -132,56 +142,46 @@ def with_whole_options(given: Sequence[str]) -> list[str]:
     return whole
 
 
-def add_topic(group: Any) -> None:
-    """Add ``--topic``."""
-    group.add_argument(
-        "--topic",
-        metavar="NAME",
-        help="what to read of several sensors: the topic of a bag, TOPIC@FRAME, the serial number of an Ouster, the "
+def add_capture(group: Options) -> None:
+    """Add the sensor, its mounting, and how scans are read; `reading_options` takes those."""
+    add_sensor(group, of_capture=True)
+    add_mounting(group)
+    group(
+        "--topic NAME",
+        "what to read of several sensors: the topic of a bag, TOPIC@FRAME, the serial number of an Ouster, the "
         "address of a Velodyne (default: the only one)",
     )
-
-
-def add_fields(group: Any) -> None:
-    """Add ``--columns``, ``--remission-field``, ``--remission-range`` and ``--origin``."""
-    group.add_argument(
-        "--columns",
-        nargs="+",
-        metavar="NAME",
-        help="what .bin files hold for each point, in order; after the paths: --columns x y z intensity ring (default: "
+    group(
+        "--columns NAME...",
+        "what .bin files hold for each point, in order; after the paths: --columns x y z intensity ring (default: "
         "x y z remission, unless the values show that there are more or fewer)",
     )
-    group.add_argument(
-        "--remission-field",
-        metavar="NAME",
-        help="the field to take the remission from (default: the first of remission, intensity, i, reflectivity, "
+    group(
+        "--remission-field NAME",
+        "the field to take the remission from (default: the first of remission, intensity, i, reflectivity, "
         "reflectance; reflectivity for an Ouster)",
     )
-    group.add_argument(
-        "--remission-range",
-        nargs=2,
+    group(
+        "--remission-range LOW HIGH",
+        "lowest and highest raw value of the remission, such as 0 65535 (default: the sensor's)",
         type=finite_number,
-        metavar=("LOW", "HIGH"),
-        help="lowest and highest raw value of the remission, such as 0 65535 (default: the sensor's)",
     )
-    group.add_argument(
-        "--origin",
-        nargs=3,
-        type=_place,
-        metavar=("X", "Y", "Z"),
-        help="place of the sensor in the map [m], for scan files with coordinates of a map: it is subtracted, and "
+    group(
+        "--origin X Y Z",
+        "place of the sensor in the map [m], for scan files with coordinates of a map: it is subtracted, and "
         "--json and --ply give boxes and points in the map; or 'auto', for a level sensor: where its beams meet "
         "(default: 0 0 0)",
+        type=_place,
     )
 
 
 def reading_options(arguments: argparse.Namespace) -> dict[str, Any]:
-    """Options of `edgeperc.read_scans` from ``--topic`` and those of `add_fields`."""
+    """Options of `edgeperc.read_scans` from those of `add_capture`."""
     return {"topic": arguments.topic, **file_options(arguments)}
 
 
 def file_options(arguments: argparse.Namespace) -> dict[str, Any]:
-    """Options of `edgeperc.read_points` from those of `add_fields`."""
+    """Options of `edgeperc.read_points` from those of `add_capture`."""
     origin = arguments.origin
     if origin is not None and "auto" in origin:
         if set(origin) != {"auto"}:
@@ -190,21 +190,20 @@ def file_options(arguments: argparse.Namespace) -> dict[str, Any]:
     return {"columns": arguments.columns, "remission_field": arguments.remission_field, "origin_m": origin}
 
 
-def add_model(group: Any, default: Sequence[str] = DEFAULT_MODELS) -> None:
+def add_model(group: Options) -> None:
     """Add ``--model``, which may be repeated."""
-    group.add_argument(
-        "--model",
+    group(
+        "--model MODEL",
+        "a name from 'edgeperc models', one of its variants such as pointseg:int8, or the path of an .onnx file "
+        f"with a card; repeat the option to run one model of each kind (default: {' and '.join(DEFAULT_MODELS)})",
         action="append",
-        metavar="MODEL",
-        help="a name from 'edgeperc models', one of its variants such as pointseg:int8, or the path of an .onnx file "
-        f"with a card; repeat the option to run one model of each kind (default: {' and '.join(default)})",
     )
-    group.add_argument(
+    group(
         "--weights",
+        f"open: {', '.join(WEIGHTS['open'])}, which anyone may use commercially, in place of the most accurate "
+        "models, whose weights have the terms of KITTI (default: %(default)s)",
         choices=(*WEIGHTS,),
         default="default",
-        help=f"open: {', '.join(WEIGHTS['open'])}, which anyone may use commercially, in place of the most accurate "
-        "models, whose weights have the terms of KITTI (default: %(default)s)",
     )
 
 
@@ -215,88 +214,81 @@ def chosen_models(arguments: argparse.Namespace) -> Sequence[str]:
     return arguments.model or WEIGHTS[arguments.weights]
 
 
-def add_provider(group: Any, *, provider: str = "auto", precision: str = "auto") -> None:
+def add_provider(group: Options, *, provider: str = "auto") -> None:
     """Add ``--provider`` and ``--precision``."""
-    group.add_argument(
-        "--provider",
-        default=provider,
-        metavar="PROVIDER",
-        help=f"the onnxruntime execution provider: {', '.join(PROVIDERS)}; auto takes the fastest one measured "
+    group(
+        "--provider PROVIDER",
+        f"the onnxruntime execution provider: {', '.join(PROVIDERS)}; auto takes the fastest one measured "
         "on this computer or, without a measurement, the first of cuda, openvino and cpu that runs the model; with any "
         "other name, it is an error if that provider is not available (default: %(default)s)",
+        default=provider,
     )
-    group.add_argument(
+    group(
         "--precision",
-        choices=PRECISIONS,
-        default=precision,
-        help="number format of the networks' arithmetic; auto takes bf16 or int8 only if the model's card shows that "
+        "number format of the networks' arithmetic; auto takes bf16 or int8 only if the model's card shows that "
         "its results agree with fp32 (default: %(default)s)",
+        choices=PRECISIONS,
+        default="auto",
     )
 
 
-def add_network(group: Any) -> None:
-    """Add options of networks: `add_provider`, ``--threads``, ``--trusted``, ``--boxes-from``, ``--full-turn``."""
+def add_networks(parser: argparse.ArgumentParser, title: str = "models", *, adapt: bool = True) -> None:
+    """Add a group with the options of `add_model` and of a perceiver's networks."""
+    group = options(parser, title)
+    add_model(group)
     add_provider(group)
-    group.add_argument(
-        "--threads",
+    group(
+        "--threads N",
+        "threads inside one network (default: the provider's choice, usually one for each core)",
         type=positive,
-        metavar="N",
-        help="threads inside one network (default: the provider's choice, usually one for each core)",
     )
-    group.add_argument(
+    group(
         "--trusted",
-        action="store_true",
-        help="open models whose graphs have unusual operators, subgraphs or sizes; only for files whose "
+        "open models whose graphs have unusual operators, subgraphs or sizes; only for files whose "
         "origin you know (default: refuse them)",
     )
     add_boxes_from(group)
     add_agreement(group)
-    group.add_argument(
+    group(
         "--full-turn",
-        action="store_true",
-        help="run the range-image model on all four quarters of the turn, so that every point around the vehicle gets "
+        "run the range-image model on all four quarters of the turn, so that every point around the vehicle gets "
         "a class; the network takes four times as long (default: only the quarter ahead)",
     )
+    if adapt:
+        group(
+            "--adapt",
+            "how to adapt scans of a sensor other than the training sensor: remission maps its remission to the "
+            "training sensor's, interpolation fills the range image between its beams; no effect on an hdl-64e "
+            "(default: %(default)s)",
+            choices=("both", "remission", "interpolation", "none"),
+            default="both",
+        )
 
 
-def add_boxes_from(group: Any) -> None:
+def add_boxes_from(group: Options) -> None:
     """Add ``--score-threshold`` and ``--boxes-from``."""
-    group.add_argument(
-        "--score-threshold",
-        type=share,
-        metavar="S",
-        help="return boxes from this score on, 0 to 1; published figures of detectors are mostly from 0.1 on "
+    group(
+        "--score-threshold S",
+        "return boxes from this score on, 0 to 1; published figures of detectors are mostly from 0.1 on "
         "(default: each model's)",
+        type=share,
     )
-    group.add_argument(
+    group(
         "--boxes-from",
-        choices=("both", "network", "clusters"),
-        default="both",
-        help="network: boxes of the top-view model (vehicles ahead); clusters: boxes around clusters of labeled "
+        "network: boxes of the top-view model (vehicles ahead); clusters: boxes around clusters of labeled "
         "points (every class, where points have a class); both: network boxes, and cluster boxes where there are no "
         "network boxes (default: %(default)s)",
-    )
-
-
-def add_agreement(group: Any) -> None:
-    """Add ``--no-agreement``."""
-    group.add_argument(
-        "--no-agreement",
-        action="store_true",
-        help="return the labels, boxes and cells of the networks as they are (default: correct them by one another, by "
-        "the ground and by clusters)",
-    )
-
-
-def add_adapt(group: Any) -> None:
-    """Add ``--adapt``."""
-    group.add_argument(
-        "--adapt",
-        choices=("both", "remission", "interpolation", "none"),
+        choices=("both", "network", "clusters"),
         default="both",
-        help="how to adapt scans of a sensor other than the training sensor: remission maps its remission to the "
-        "training sensor's, interpolation fills the range image between its beams; no effect on an hdl-64e (default: "
-        "%(default)s)",
+    )
+
+
+def add_agreement(group: Options) -> None:
+    """Add ``--no-agreement``."""
+    group(
+        "--no-agreement",
+        "return the labels, boxes and cells of the networks as they are (default: correct them by one another, by "
+        "the ground and by clusters)",
     )
 
 
@@ -332,11 +324,9 @@ def share(text: str) -> float:
     return value
 
 
-def add_figures_file(group: Any) -> None:
+def add_figures_file(group: Options) -> None:
     """Add ``--json FILE``, for the commands that print tables."""
-    group.add_argument(
-        "--json",
-        type=Path,
-        metavar="FILE",
-        help="write all figures to this JSON file, with the command line that produced them (default: tables only)",
+    group(
+        "--json FILE",
+        "write all figures to this JSON file, with the command line that produced them (default: tables only)",
     )

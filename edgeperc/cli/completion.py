@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from ..system.extras import require
-from .arguments import PROVIDERS, Commands, add_command
+from .arguments import PROVIDERS, Commands, add_command, options
 
 SHELLS = ("bash", "zsh", "fish", "tcsh")
 
@@ -28,7 +28,7 @@ def add_parser(commands: Commands) -> None:
             "edgeperc completion tcsh > ~/.edgeperc.tcsh     # with source ~/.edgeperc.tcsh",
         ],
     )
-    parser.add_argument("shell", choices=SHELLS, metavar="SHELL", help="bash, zsh, fish or tcsh")
+    options(parser)("shell SHELL", "bash, zsh, fish or tcsh", choices=SHELLS)
 
 
 def completion_command(arguments: argparse.Namespace) -> int:

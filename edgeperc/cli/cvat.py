@@ -17,7 +17,6 @@ from ..perceiver import Learned, Perceiver
 from ..readers.files import parse_points
 from ..sinks.prelabels import cvat_cuboid
 from ..system.names import nearest
-from ..types.perception import Box
 
 __all__ = ["OPTIONS_VARIABLE", "CvatFunction", "handler", "init_context"]
 
@@ -77,20 +76,18 @@ class CvatFunction:
         points = parse_points(content, "image.bin")  # of this name, it may be raw values
         perceive, fresh = self._perceiver(threshold)
         perceive.start_from(fresh)
-        return [
-            {"confidence": str(round(box.score, 4)), "label": box.label, "type": "cuboid", "points": _numbers(box)}
-            for box in perceive(points).boxes
-        ]
+        answers = []
+        for box in perceive(points).boxes:
+            numbers = [*chain.from_iterable(cvat_cuboid(box).values())]
+            numbers += [0.0] * (_N_NUMBERS - len(numbers))
+            score = str(round(box.score, 4))
+            answers.append({"confidence": score, "label": box.label, "type": "cuboid", "points": numbers})
+        return answers
 
     def _make(self, threshold: float | None) -> tuple[Perceiver, Learned]:
         options = self._options if threshold is None else self._options | {"score_threshold": threshold}
         perceiver = Perceiver(**options)
         return perceiver, perceiver.learned
-
-
-def _numbers(box: Box) -> list[float]:
-    numbers = [*chain.from_iterable(cvat_cuboid(box).values())]
-    return numbers + [0.0] * (_N_NUMBERS - len(numbers))
 
 
 def _read(request: object) -> tuple[bytes, float | None]:

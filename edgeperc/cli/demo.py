@@ -12,7 +12,7 @@ from ..errors import MissingExtraError
 from ..system.atomic import open_atomic, write_atomic
 from ..system.extras import require
 from ..types.choices import CAMERA
-from .arguments import Commands, add_command, add_model, add_network, chosen_models
+from .arguments import Commands, add_command, add_networks, chosen_models, options
 from .output import one_line, print_rows
 from .run import make_perceiver
 
@@ -46,23 +46,18 @@ def add_parser(commands: Commands) -> None:
             "edgeperc demo --out /tmp/demo --model pointseg --full-turn",
         ],
     )
-    output = parser.add_argument_group("output")
-    output.add_argument(
-        "--out",
-        type=Path,
+    output = options(parser, "output")
+    output(
+        "--out DIR",
+        "folder for scan.bin, scene.png and scene.html, made if needed (default: %(default)s)",
         default=Path("edgeperc-demo"),
-        metavar="DIR",
-        help="folder for scan.bin, scene.png and scene.html, made if needed (default: %(default)s)",
     )
-    parser.add_argument(
+    options(parser)(
         "--camera",
-        action="store_true",
-        help="also draw the image of a camera in the street, label it, carry its classes to the points and its road to "
+        "also draw the image of a camera in the street, label it, carry its classes to the points and its road to "
         "the top view, and write image.png and camera.png",
     )
-    models = parser.add_argument_group("models")
-    add_model(models)
-    add_network(models)
+    add_networks(parser, adapt=False)
 
 
 def demo_command(arguments: argparse.Namespace) -> int:
@@ -93,7 +88,9 @@ def demo_command(arguments: argparse.Namespace) -> int:
     rows = [("scene", f"{perception.n_points:,} points, a simulated hdl-64e in a street with known labels")]
     if perception.top_view is not None:
         area_m2 = perception.top_view.drivable_area_m2
-        rows.append(("drivable", f"{area_m2:.0f} m2 of the {_extent(perception)} ahead"))
+        (x_near, x_far), (y_right, y_left) = perception.top_view.x_range_m, perception.top_view.y_range_m
+        extent = f"{x_far - x_near:.0f} x {y_left - y_right:.0f} m"
+        rows.append(("drivable", f"{area_m2:.0f} m2 of the {extent} ahead"))
     texts = [_box_text(box) for box in perception.boxes] or ["none"]
     rows += [("boxes" if k == 0 else "", text) for k, text in enumerate(texts)]
     if perception.points is not None:
@@ -170,12 +167,6 @@ def _camera_rows(
     except MissingExtraError as exc:
         rows.append(("picture", one_line(exc)))
     return rows
-
-
-def _extent(perception: Perception) -> str:
-    assert perception.top_view is not None
-    (x_near, x_far), (y_right, y_left) = perception.top_view.x_range_m, perception.top_view.y_range_m
-    return f"{x_far - x_near:.0f} x {y_left - y_right:.0f} m"
 
 
 def _box_text(box: Box) -> str:

@@ -20,7 +20,7 @@ from typing import Any, Literal
 from .. import __version__
 from ..errors import EdgepercError, MissingExtraError, SettingsError
 from ..types.choices import DEFAULT_MODELS
-from .arguments import Commands, add_command
+from .arguments import Commands, add_command, options
 from .output import many, one_line, print_columns, print_line
 
 # Extras for work on edgeperc itself, and the builds of onnxruntime, of which one at a time can be installed.
@@ -33,18 +33,12 @@ _REINSTALL = "pip install --force-reinstall edgeperc"
 
 @dataclass(frozen=True)
 class Finding:
-    """One line of the report.
+    """One line of the report."""
 
-    name : what was examined, e.g. ``"cache folder"``.
-    state : {"ok", "note", "broken"}; ``"note"`` is something that edgeperc works without; ``"broken"`` something that
-        it needs.
-    advice : A command or what to do; empty if nothing is to be done.
-    """
-
-    name: str
-    state: Literal["ok", "note", "broken"]
+    name: str  # what was examined, e.g. "cache folder"
+    state: Literal["ok", "note", "broken"]  # "note": edgeperc works without it; "broken": it needs it
     found: str
-    advice: str = ""
+    advice: str = ""  # a command or what to do; empty if nothing is to be done
 
 
 def add_parser(commands: Commands) -> None:
@@ -59,14 +53,12 @@ def add_parser(commands: Commands) -> None:
         "golden inputs. The exit code is 1 if something that edgeperc needs is missing or broken.",
         examples=["edgeperc doctor", "edgeperc doctor --json", "edgeperc doctor --clean"],
     )
-    parser.add_argument(
+    options(parser)(
         "--clean",
-        action="store_true",
-        help="examine nothing; delete what edgeperc keeps on this computer: compiled kernels, compiled models and "
+        "examine nothing; delete what edgeperc keeps on this computer: compiled kernels, compiled models and "
         "measured settings; nothing is left then for pip uninstall to leave behind",
     )
-    output = parser.add_argument_group("output")
-    output.add_argument("--json", action="store_true", help="print one JSON object")
+    options(parser, "output")("--json", "print one JSON object")
 
 
 def doctor_command(arguments: argparse.Namespace) -> int:

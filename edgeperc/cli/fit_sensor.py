@@ -7,7 +7,7 @@ from pathlib import Path
 
 from ..errors import PointsError, SensorError
 from ..system.atomic import write_atomic
-from .arguments import Commands, add_command, add_ego_box, add_sensor
+from .arguments import Commands, add_command, add_ego_box, add_sensor, options
 from .output import print_rows
 from .scans import find_scans, with_mounting
 
@@ -27,22 +27,17 @@ def add_parser(commands: Commands) -> None:
             "edgeperc run drives/ --sensor my-os1.json",
         ],
     )
-    reading = parser.add_argument_group("input")
-    reading.add_argument(
-        "scans", nargs="+", type=Path, metavar="SCAN", help="scan files, captures, or folders of them, as for 'run'"
-    )
+    reading = options(parser, "input")
+    reading("scans SCAN...", "scan files, captures, or folders of them, as for 'run'", type=Path)
     add_sensor(reading, required=True)
     add_ego_box(reading)
-    reading.add_argument(
-        "--to",
+    reading(
+        "--to SENSOR",
+        "the sensor to map to: the one that the models were trained on (default: %(default)s)",
         default="hdl-64e",
-        metavar="SENSOR",
-        help="the sensor to map to: the one that the models were trained on (default: %(default)s)",
     )
-    output = parser.add_argument_group("output")
-    output.add_argument(
-        "--out", type=Path, required=True, metavar="FILE", help="the profile to write, a .json file (required)"
-    )
+    output = options(parser, "output")
+    output("--out FILE", "the profile to write, a .json file (required)", required=True)
 
 
 def fit_sensor_command(arguments: argparse.Namespace) -> int:

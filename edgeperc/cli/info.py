@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 from ..errors import EdgepercError, MissingExtraError, MountingError, PointsError
 from ..system.atomic import write_atomic
 from ..types.choices import DEFAULT_MODELS
-from .arguments import Commands, add_command, add_fields, add_mounting, add_sensor, add_topic, reading_options
+from .arguments import Commands, add_capture, add_command, options, reading_options
 from .output import many, print_error, print_line, print_rows
 from .scans import Sensors, stated_sensor, with_mounting
 
@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from ..ground.leveling import MountingEstimator
-    from ..types.card import ModelCard
     from ..types.frame import ModelFrame
     from ..types.perception import DroppedPoints
     from ..types.points import Points
@@ -58,42 +57,30 @@ def add_parser(commands: Commands) -> None:
             "edgeperc info street.jpg",
         ],
     )
-    reading = parser.add_argument_group("input")
-    reading.add_argument(
-        "things",
-        nargs="+",
-        metavar="MODEL|SCAN|IMAGE",
-        help="a name from 'edgeperc models', an .onnx file, a scan, a capture (its first scan; its mounting by the "
+    reading = options(parser, "input")
+    reading(
+        "things MODEL|SCAN|IMAGE...",
+        "a name from 'edgeperc models', an .onnx file, a scan, a capture (its first scan; its mounting by the "
         "first five), or an image",
     )
-    add_sensor(reading, of_capture=True)
-    add_mounting(reading)
-    add_topic(reading)
-    add_fields(reading)
-    reading.add_argument(
+    add_capture(reading)
+    reading(
         "--suggest-ego-box",
-        action="store_true",
-        help=f"suggest --ego-box: returns near the sensor that never move in up to {_MOST_SCANS} scans of a drive, "
+        f"suggest --ego-box: returns near the sensor that never move in up to {_MOST_SCANS} scans of a drive, "
         "while the street does; look at it before you use it (default: no)",
     )
-    output = parser.add_argument_group("output")
-    output.add_argument(
-        "--json",
-        action="store_true",
-        help="print one JSON object for each thing: a model's whole card, a scan's measurements",
-    )
-    output.add_argument(
-        "--write",
-        type=Path,
-        metavar="FILE",
-        help="write the sensor's profile with the mounting that the scans show, a .json file for --sensor "
-        "(default: none)",
+    output = options(parser, "output")
+    output("--json", "print one JSON object for each thing: a model's whole card, a scan's measurements")
+    output(
+        "--write FILE",
+        "write the sensor's profile with the mounting that the scans show, a .json file for --sensor (default: none)",
     )
 
 
 def info_command(arguments: argparse.Namespace) -> int:
     """Describe models, scans and images; 1 if some failed, or ``edgeperc run`` refuses a scan."""
     from ..readers.images import IMAGE_SUFFIXES
+    from ..zoo import resolve
 
     if arguments.sensor is not None or arguments.extrinsic is not None:
         from ..types.sensor import get_sensor
@@ -108,7 +95,7 @@ def info_command(arguments: argparse.Namespace) -> int:
     for thing in arguments.things:
         try:
             if _is_model(thing):
-                variants = _variants(thing)
+                variants = resolve(thing)
                 rows, document = _model_rows(variants), json.loads(variants[0].card.to_json())
             elif Path(thing).suffix.lower() in IMAGE_SUFFIXES:
                 rows, document = _image_rows(Path(thing))
@@ -202,12 +189,6 @@ def _is_model(thing: str) -> bool:
     return path.suffix == ".onnx" or not (path.exists() or path.suffix or len(path.parts) > 1)
 
 
-def _variants(thing: str) -> Sequence[Variant]:
-    from ..zoo import resolve
-
-    return resolve(thing)
-
-
 def _folded(rows: Sequence[tuple[str, str]], max_lines: int | None) -> list[tuple[str, str]]:
     """Rows with long values wrapped to `_WIDTH`, or cut off after so many lines."""
     width = _WIDTH - max(len(name) for name, _ in rows) - 2
@@ -225,7 +206,7 @@ def _model_rows(variants: Sequence[Variant]) -> list[tuple[str, str]]:
     from ..types.views import CameraGeometry, ObjectGeometry, TopViewGeometry
 
     path, card = variants[0].path, variants[0].card
-    size = ", ".join(f"{variant.precision} {_megabytes(variant.path)}" for variant in variants)
+    size = ", ".join(f"{variant.precision} {variant.path.stat().st_size / 1e6:.1f} MB" for variant in variants)
     rows = [
         ("model", f"{card.name} {card.version}: {purpose(card)}"),
         ("file", str(path)),
@@ -251,7 +232,7 @@ def _model_rows(variants: Sequence[Variant]) -> list[tuple[str, str]]:
     channels = card.input.channels
     rows += [
         ("view", f"{card.view.kind}: {seen}"),
-        ("input", f"{_shape(card)}: {', '.join(channels)}"),
+        ("input", f"{' x '.join(map(str, card.input_shape[1:]))}: {', '.join(channels)}"),
         ("outputs", ", ".join(f"{output.name} ({output.kind})" for output in card.outputs)),
         ("classes", ", ".join(card.classes)),
     ]
@@ -312,10 +293,6 @@ def _percent(share: float | None) -> str:
     return "-" if share is None else f"{100.0 * share:.1f}"
 
 
-def _megabytes(path: Path) -> str:
-    return f"{path.stat().st_size / 1e6:.1f} MB"
-
-
 def _estimated(
     estimator: MountingEstimator, scans: Sequence[NDArray[np.float32]]
 ) -> tuple[MountingEstimator, MountingError | None]:
@@ -345,22 +322,11 @@ def _image_rows(path: Path) -> tuple[list[tuple[str, str]], dict[str, Any]]:
     models = {}
     for card in {variant.name: variant.card for variant in listed()}.values():
         if card.view.kind == "camera":
+            *_, high, wide = card.input_shape
             scales = round(card.view.width / width, 4), round(card.view.height / height, 4)
             models[card.name] = {"scale_x": scales[0], "scale_y": scales[1]}
-            rows.append((card.name, "scales it to {} x {}: by {:g} across, {:g} down".format(*_size(card), *scales)))
+            rows.append((card.name, "scales it to {} x {}: by {:g} across, {:g} down".format(wide, high, *scales)))
     return rows, {"image": str(path), "width": width, "height": height, "mean": mean, "models": models}
-
-
-def _size(card: ModelCard) -> tuple[int, int]:
-    _, _, height, width = card.input_shape
-    assert height is not None
-    assert width is not None
-    return width, height
-
-
-def _shape(card: ModelCard) -> str:
-    """Shape of the input without the batch."""
-    return " x ".join(map(str, card.input_shape[1:]))
 
 
 def _dropped_text(dropped: DroppedPoints, sensor: SensorProfile) -> str:

@@ -11,7 +11,7 @@ from typing import Any
 
 from ..errors import SettingsError
 from ..types.choices import DEFAULT_SENSOR
-from .arguments import Commands, add_command
+from .arguments import Commands, add_command, options
 from .output import print_columns, print_line
 
 
@@ -50,8 +50,7 @@ def add_parser(commands: Commands) -> None:
             description=description,
             examples=[f"edgeperc {name}", f"edgeperc {name} --json"],
         )
-        output = parser.add_argument_group("output")
-        output.add_argument("--json", action="store_true", help="print one JSON object for each line of the table")
+        options(parser, "output")("--json", "print one JSON object for each line of the table")
 
 
 def models_command(arguments: argparse.Namespace) -> int:
@@ -131,11 +130,6 @@ def _mark(flag: bool) -> str:
     return "yes" if flag else "-"
 
 
-def _plain(value: object) -> object:
-    """A mapping as a dict and a path as text, for JSON."""
-    return dict(value) if isinstance(value, Mapping) else str(value)
-
-
 def _print(
     records: Sequence[Mapping[str, Any]],
     columns: Mapping[str, Callable[[Mapping[str, Any]], str]],
@@ -143,7 +137,8 @@ def _print(
 ) -> int:
     if arguments.json:
         for record in records:
-            print_line(json.dumps(record, allow_nan=False, default=_plain))
+            plain = {key: dict(value) if isinstance(value, Mapping) else value for key, value in record.items()}
+            print_line(json.dumps(plain, allow_nan=False, default=str))
     else:
         print_columns([*columns], [[cell(record) for cell in columns.values()] for record in records])
     return 0

@@ -23,12 +23,7 @@ from .program import Parser, run_program
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line.
-
-    argv : arguments without the program's name; by default those of this process.
-    Returns code: The exit code.
-    Raises SystemExit.
-    """
+    """Run the command line, by default this process's; return the exit code. Raises argparse's SystemExit."""
     given = sys.argv[1:] if argv is None else list(argv)
 
     def message(exc: Exception) -> str:

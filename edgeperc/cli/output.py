@@ -27,10 +27,7 @@ def one_line(text: object) -> str:
 
 
 def print_line(text: str, file: TextIO | None = None, *, gray: bool = False) -> None:
-    """Print and flush a line, by default on stdout; a progress bar moves below it. See `printable`.
-
-    A gray line is gray on a terminal, unless the environment variable NO_COLOR is set.
-    """
+    """Print a line, by default on stdout, above any progress bar; a gray one is gray on a terminal without NO_COLOR."""
     tqdm = getattr(sys.modules.get("tqdm"), "tqdm", None)  # imported only while a bar is drawn
     shown = printable(text)
     if gray and (file or sys.stdout).isatty() and not os.environ.get("NO_COLOR"):
@@ -45,10 +42,7 @@ def print_line(text: str, file: TextIO | None = None, *, gray: bool = False) -> 
 
 
 def print_result(text: str) -> None:
-    """Print a line on stdout; of a line that does not fit on a full disk, nothing stays, nor waits in a buffer.
-
-    Raises OSError.
-    """
+    """Print a line on stdout; of one that does not fit on a full disk, nothing stays or waits. Raises OSError."""
     try:
         number = sys.stdout.fileno()
     except (AttributeError, OSError, ValueError):  # no stream, or one without a file
@@ -91,11 +85,8 @@ _OPTIONS = {
 
 
 def in_options(message: str) -> str:
-    """Replace the library's argument names in a message by command-line options.
-
-    ``provider 'cuda' is ...``, ``n_threads is 0`` and ``precision="bf16"`` become ``--provider 'cuda' is ...``,
-    ``--threads is 0`` and ``--precision bf16``; an option that a message has in parentheses stands alone. The same word
-    elsewhere in a sentence is not changed.
+    """Replace the library's argument names by options: ``provider 'cuda' is``, ``n_threads is 0``,
+    ``precision="bf16"``, and options in parentheses; the same word elsewhere in a sentence is not changed.
     """
     of_data = r"sensor= a profile (?:whose remission_range is|with the remission_range of this data,)"
     message = re.sub(rf"{of_data} \(([^,]+), ([^)]+)\)", r"--remission-range \1 \2", message)
@@ -120,11 +111,7 @@ def show_warning(
 
 @contextlib.contextmanager
 def progress(unit: str = "scan") -> Iterator[Callable[[int, int], None]]:
-    """Yield a function ``show(done, total)`` that draws a progress bar.
-
-    The bar is drawn on stderr if stderr is a terminal, ``total`` is above 1 and tqdm is installed (extra ``progress``).
-    Without tqdm the commands print the same lines and no bar.
-    """
+    """Yield ``show(done, total)``, which draws a bar on stderr if that is a terminal and tqdm is installed."""
     with contextlib.ExitStack() as stack:
         bars: list[Any] = []
 
@@ -180,13 +167,7 @@ def many(n: int, noun: str) -> str:
 def table_lines(
     title: str, columns: Sequence[tuple[str, str]], rows: Sequence[tuple[tuple[str, str], Mapping[str, Any]]]
 ) -> list[str]:
-    """Lay out a table of figures as lines of text.
-
-    columns : sequence of (heading, key)
-    rows : sequence of ((first name, second name), figures by key); a first name that repeats in successive rows is
-        printed once.
-    Returns: Empty if there are no rows.
-    """
+    """A table: columns (heading, key), rows of two names, a repeated first one shown once, and figures by key."""
     if not rows:
         return []
     cells = [["", "", *(printable(heading) for heading, _ in columns)]]

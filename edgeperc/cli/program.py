@@ -56,14 +56,8 @@ class _TerminatedError(SystemExit):
 
 
 def run_program(program: str, command: Callable[[], int], message: Callable[[Exception], str] = str) -> int:
-    """Run a program's command line. Warnings and errors are printed on stderr, each as one line.
-
-    program : its name, printed before each line.
-    command : parses the arguments, does the work and returns the exit code.
-    message : the text to print for an error.
-    Returns code: What ``command`` returned; 2 after an `EdgepercError` or `OSError`; 130 after SIGINT (Ctrl-C); 143
-        after SIGTERM; 141, without a message, if the program that reads stdout or stderr closed it.
-    Raises SystemExit.
+    """Run a program's command line, its warnings and errors (as ``message`` says them) one line each on stderr; 2 after
+    an `EdgepercError` or `OSError`, 130 after SIGINT, 143 after SIGTERM, 141 in silence if what reads it closed it.
     """
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")  # a file name may have characters that the terminal lacks
@@ -157,10 +151,8 @@ def _signals_raise(raised: list[int]) -> Iterator[None]:
 
 
 def _is_delicate(frame: FrameType | None) -> bool:
-    """Whether what native code called, or an import, is at work in this program.
-
-    LLVM, and libraries that write a file or a log, call Python back. An exception there is lost, and the process may
-    crash. Native modules turn it into an `ImportError`, which looks as if a package were missing.
+    """Whether LLVM, or a library that writes a file or a log, called Python back, where an exception is lost and may
+    crash; or an import of a native module is at work, which would turn it into an `ImportError`.
     """
     while frame is not None and frame.f_code is not run_program.__code__:
         if str(frame.f_globals.get("__name__")).startswith(_DELICATE):

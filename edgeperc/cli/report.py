@@ -20,12 +20,7 @@ if TYPE_CHECKING:
 
 
 class Report:
-    """Prints the result of each scan, and counts scans and failures.
-
-    n, n_failed : int; number of scans, and of failed scans.
-    tracks : list of Tracks; tracks of every scan, kept only for ``--gif``.
-    under : list of bytes; `edgeperc.view.flatten_scan` of every scan, drawn under the tracks.
-    """
+    """Prints the result of each scan, counts scans and failures, and keeps what ``--gif`` draws of every scan."""
 
     def __init__(self, arguments: argparse.Namespace, images: Mapping[Path, Path | None]) -> None:
         self.n = self.n_failed = 0

@@ -6,16 +6,7 @@ import argparse
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
-from .arguments import (
-    Commands,
-    add_adapt,
-    add_command,
-    add_model,
-    add_mounting,
-    add_network,
-    positive,
-    positive_number,
-)
+from .arguments import Commands, add_command, add_mounting, add_networks, options, positive, positive_number
 from .output import many, print_error, print_line
 from .run import make_perceiver
 from .scans import with_mounting
@@ -44,109 +35,83 @@ def add_parser(commands: Commands) -> None:
             "edgeperc ros2 --rclpy --topic /points --ros-args -r __ns:=/front",
         ],
     )
-    reading = parser.add_argument_group("input")
-    reading.add_argument(
-        "--topic", default="/points", metavar="NAME", help="topic of sensor_msgs/PointCloud2 (default: %(default)s)"
-    )
-    reading.add_argument(
-        "--sensor",
-        metavar="SENSOR",
-        help="the LiDAR: a name from 'edgeperc sensors', or a .json file written by 'edgeperc fit-sensor' (default: "
+    reading = options(parser, "input")
+    reading("--topic NAME", "topic of sensor_msgs/PointCloud2 (default: %(default)s)", default="/points")
+    reading(
+        "--sensor SENSOR",
+        "the LiDAR: a name from 'edgeperc sensors', or a .json file written by 'edgeperc fit-sensor' (default: "
         "the one that the first cloud names by its fields, frame, topic and rings)",
     )
     add_mounting(reading)
-    reading.add_argument(
-        "--rate",
+    reading(
+        "--rate HZ",
+        "scans per second of the sensor: an answer is late after two periods, stale after five (default: 10)",
         type=positive_number,
         default=10.0,
-        metavar="HZ",
-        help="scans per second of the sensor: an answer is late after two periods, stale after five (default: 10)",
     )
-    reading.add_argument(
+    reading(
         "--anyway",
-        action="store_true",
-        help="perceive scans that differ grossly from those that a model was trained on, too, with a warning (default: "
+        "perceive scans that differ grossly from those that a model was trained on, too, with a warning (default: "
         "refuse them)",
     )
-    models = parser.add_argument_group("models")
-    add_model(models)
-    add_network(models)
-    add_adapt(models)
-    output = parser.add_argument_group("output")
-    output.add_argument(
-        "--prefix",
+    add_networks(parser)
+    output = options(parser, "output")
+    output(
+        "--prefix NAME",
+        "name before those of the topics, as in NAME/points (default: %(default)s)",
         default="/edgeperc",
-        metavar="NAME",
-        help="name before those of the topics, as in NAME/points (default: %(default)s)",
     )
-    output.add_argument(
-        "--publish",
-        nargs="+",
-        metavar="NAME[=TOPIC]",
-        help="what to publish, and on which topic if not PREFIX/NAME: points, markers, occupancy, detections, "
+    output(
+        "--publish NAME[=TOPIC]...",
+        "what to publish, and on which topic if not PREFIX/NAME: points, markers, occupancy, detections, "
         "diagnostics, ground_points, obstacle_points, rolling, detected_objects, tracked_objects, predicted_objects "
         "(default: the first seven, and rolling with --odometry)",
     )
-    output.add_argument("--no-track", action="store_true", help="do not track the boxes from scan to scan")
-    output.add_argument("--frame", metavar="NAME", help="frame of the answers (default: that of the clouds)")
-    output.add_argument(
-        "--grid-frame",
-        metavar="NAME",
-        help="frame of the grid: level, on the road below the sensor, x forward (default: that of the answers, with "
+    output("--no-track", "do not track the boxes from scan to scan")
+    output("--frame NAME", "frame of the answers (default: that of the clouds)")
+    output(
+        "--grid-frame NAME",
+        "frame of the grid: level, on the road below the sensor, x forward (default: that of the answers, with "
         "the pose of the ground in the grid's origin)",
     )
-    memory = parser.add_argument_group("grid with memory")
-    memory.add_argument(
-        "--odometry", metavar="NAME", help="topic of nav_msgs/Odometry, for the output rolling (default: none)"
-    )
-    memory.add_argument(
-        "--sensor-pose",
-        nargs=6,
-        type=float,
-        metavar=("X", "Y", "Z", "ROLL", "PITCH", "YAW"),
-        help="of the clouds' frame in the odometry's child frame, in meters and degrees (default: the same if the "
+    memory = options(parser, "grid with memory")
+    memory("--odometry NAME", "topic of nav_msgs/Odometry, for the output rolling (default: none)")
+    memory(
+        "--sensor-pose X Y Z ROLL PITCH YAW",
+        "of the clouds' frame in the odometry's child frame, in meters and degrees (default: the same if the "
         "names are the same; otherwise above its origin, mounted as for the perception)",
+        type=float,
     )
-    memory.add_argument(
-        "--remember",
+    memory(
+        "--remember SECONDS",
+        "a cell that was not observed for longer is unknown again (default: 10)",
         type=positive_number,
         default=10.0,
-        metavar="SECONDS",
-        help="a cell that was not observed for longer is unknown again (default: 10)",
     )
-    memory.add_argument(
-        "--grid-size", type=positive_number, default=40.0, metavar="METERS", help="edge of the window (default: 40)"
-    )
-    graph = parser.add_argument_group("graph")
-    graph.add_argument("--name", default="edgeperc", metavar="NAME", help="name of the node (default: %(default)s)")
-    graph.add_argument("--namespace", default="/", metavar="NAME", help="namespace of the node (default: %(default)s)")
-    graph.add_argument(
-        "--domain", type=int, metavar="N", help="ROS domain (default: that of the variable ROS_DOMAIN_ID, or 0)"
-    )
-    graph.add_argument(
-        "--connect",
-        metavar="ENDPOINT",
-        help="Zenoh endpoint of a router or a peer (default: the configuration that the variable "
+    memory("--grid-size METERS", "edge of the window (default: 40)", type=positive_number, default=40.0)
+    graph = options(parser, "graph")
+    graph("--name NAME", "name of the node (default: %(default)s)", default="edgeperc")
+    graph("--namespace NAME", "namespace of the node (default: %(default)s)", default="/")
+    graph("--domain N", "ROS domain (default: that of the variable ROS_DOMAIN_ID, or 0)", type=int)
+    graph(
+        "--connect ENDPOINT",
+        "Zenoh endpoint of a router or a peer (default: the configuration that the variable "
         "ZENOH_SESSION_CONFIG_URI names, or tcp/localhost:7447)",
     )
-    graph.add_argument("--rclpy", action="store_true", help="use rclpy of the sourced ROS installation, not Zenoh")
-    graph.add_argument(
+    graph("--rclpy", "use rclpy of the sourced ROS installation, not Zenoh")
+    graph(
         "--lifecycle",
-        action="store_true",
-        help="with --rclpy: a lifecycle node, which waits unconfigured for its manager (default: active at once)",
+        "with --rclpy: a lifecycle node, which waits unconfigured for its manager (default: active at once)",
     )
-    graph.add_argument(
-        "--ros-args",
-        nargs=argparse.REMAINDER,
-        default=[],
-        metavar="ARGUMENT",
-        help="with --rclpy, last: remappings, and parameters in place of the options above: topic, sensor, model, "
+    graph(
+        "--ros-args ARGUMENT",
+        "with --rclpy, last: remappings, and parameters in place of the options above: topic, sensor, model, "
         "frame, grid_frame, prefix, rate, publish, odometry, sensor_pose, remember, grid_size; such as "
         "-p sensor:=os1-64 (default: none)",
+        nargs=argparse.REMAINDER,
+        default=[],
     )
-    graph.add_argument(
-        "--scans", type=positive, metavar="N", help="end after N perceived scans (default: when it is stopped)"
-    )
+    graph("--scans N", "end after N perceived scans (default: when it is stopped)", type=positive)
 
 
 def ros2_command(arguments: argparse.Namespace) -> int:

@@ -18,16 +18,12 @@ from ..system.remote import Remote, location
 from ..types.choices import AUTO_SENSOR, CAMERA
 from .arguments import (
     Commands,
-    add_adapt,
+    add_capture,
     add_command,
-    add_fields,
-    add_model,
-    add_mounting,
-    add_network,
-    add_sensor,
-    add_topic,
+    add_networks,
     chosen_models,
     file_options,
+    options,
     positive_number,
     reading_options,
 )
@@ -88,127 +84,83 @@ def add_parser(commands: Commands) -> None:
             "edgeperc run 0.png --scan 0.bin --calib calib.txt --png --out pictures",
         ],
     )
-    reading = parser.add_argument_group("input")
-    reading.add_argument(
-        "paths",
-        nargs="+",
-        type=location,
-        metavar="PATH",
-        help="scan files (.bin, .pcd, .ply, .npy, .npz); folders of them; the root of a KITTI object set, of "
+    reading = options(parser, "input")
+    reading(
+        "paths PATH...",
+        "scan files (.bin, .pcd, .ply, .npy, .npz); folders of them; the root of a KITTI object set, of "
         "SemanticKITTI or of a KITTI raw drive; captures: .pcap, .osf, .bag, .mcap, a ROS 2 bag's folder "
         "(extras 'velodyne', 'bags', and 'ouster' for .osf); or images (.jpg, .png, .webp, .bmp, .ppm) and folders of "
         "them (extra 'camera')",
+        type=location,
     )
-    reading.add_argument(
-        "--scan",
-        nargs="+",
+    reading(
+        "--scan SCAN...",
+        "the scan of each image, in their order: both are perceived in one call (default: images alone)",
         type=Path,
         default=[],
-        metavar="SCAN",
-        help="the scan of each image, in their order: both are perceived in one call (default: images alone)",
     )
-    reading.add_argument(
-        "--calib",
-        type=Path,
-        metavar="FILE",
-        help="KITTI's calibration of camera and LiDAR, the same for all images; with --scan and --png, NAME_both.png "
+    reading(
+        "--calib FILE",
+        "KITTI's calibration of camera and LiDAR, the same for all images; with --scan and --png, NAME_both.png "
         "shows the classes of the image on the points, and its road from above (default: no such picture)",
     )
-    add_sensor(reading, of_capture=True)
-    add_mounting(reading)
-    add_topic(reading)
-    add_fields(reading)
-    reading.add_argument(
+    add_capture(reading)
+    reading(
         "--deskew",
-        action="store_true",
-        help="straighten scans by the times of their points and the motion of the sensor: that of --poses, or with "
+        "straighten scans by the times of their points and the motion of the sensor: that of --poses, or with "
         "--track the tracker's own estimate from the scans before",
     )
-    reading.add_argument(
-        "--accumulate",
-        type=positive_number,
-        metavar="S",
-        help="time over which each scan of a capture is gathered, of a sensor that does not spin (mid-360, hap, avia) "
+    reading(
+        "--accumulate S",
+        "time over which each scan of a capture is gathered, of a sensor that does not spin (mid-360, hap, avia) "
         "[s] (default: the sensor's)",
+        type=positive_number,
     )
-    reading.add_argument(
-        "--poses",
-        type=Path,
-        metavar="FILE",
-        help="poses of the sensor on the clock of the scans, for --deskew: lines of time [s], x, y, z [m] and the "
+    reading(
+        "--poses FILE",
+        "poses of the sensor on the clock of the scans, for --deskew: lines of time [s], x, y, z [m] and the "
         "quaternion x, y, z, w, TUM's format (default: the tracker's estimate)",
     )
-    reading.add_argument(
+    reading(
         "--quaternion",
+        "order of the quaternions in --poses (default: xyzw, unless the poses contradict it)",
         choices=("xyzw", "wxyz"),
-        help="order of the quaternions in --poses (default: xyzw, unless the poses contradict it)",
     )
-    reading.add_argument(
+    reading(
         "--on-mismatch",
-        choices=("refuse", "warn", "raise", "ignore"),
-        default="refuse",
-        help="if a scan differs from the scans that a model was trained on. refuse: fail the scan if the difference is "
+        "if a scan differs from the scans that a model was trained on. refuse: fail the scan if the difference is "
         "gross (another unit, other axes, no remission, a room), print a warning otherwise; warn: print a warning; "
         "raise: fail the scan; ignore: do not check (default: %(default)s)",
+        choices=("refuse", "warn", "raise", "ignore"),
+        default="refuse",
     )
-    reading.add_argument(
+    reading(
         "--anyway",
+        "perceive scans that differ grossly too, with a warning: --on-mismatch warn",
         dest="on_mismatch",
         action="store_const",
         const="warn",
-        help="perceive scans that differ grossly too, with a warning: --on-mismatch warn",
     )
-    models = parser.add_argument_group("models")
-    add_model(models)
-    add_network(models)
-    add_adapt(models)
-    output = parser.add_argument_group("output")
-    output.add_argument(
-        "--json", action="store_true", help="print one JSON object for each scan, and nothing else, on stdout"
-    )
-    output.add_argument(
-        "--out",
-        type=location,
-        metavar="DIR",
-        help="folder or URL for the files below, made if needed (default: no files)",
-    )
-    output.add_argument(
-        "--png",
-        action="store_true",
-        help="write NAME.png, a picture (needs the extra 'view'); NAME_scan.png is that of an image's --scan",
-    )
-    output.add_argument("--html", action="store_true", help="write NAME.html, the labeled points in 3-D for a browser")
-    output.add_argument(
-        "--labels", action="store_true", help="write NAME.label, SemanticKITTI's layout: one uint32 for each point"
-    )
-    output.add_argument("--ply", action="store_true", help="write NAME.ply, the points with labels and colors")
+    add_networks(parser)
+    output = options(parser, "output")
+    output("--json", "print one JSON object for each scan, and nothing else, on stdout")
+    output("--out DIR", "folder or URL for the files below, made if needed (default: no files)", type=location)
+    output("--png", "write NAME.png, a picture (needs the extra 'view'); NAME_scan.png is that of an image's --scan")
+    output("--html", "write NAME.html, the labeled points in 3-D for a browser")
+    output("--labels", "write NAME.label, SemanticKITTI's layout: one uint32 for each point")
+    output("--ply", "write NAME.ply, the points with labels and colors")
     add_sinks(parser)
     add_engine(parser)
-    tracking = parser.add_argument_group("tracking")
-    tracking.add_argument(
+    tracking = options(parser, "tracking")
+    tracking(
         "--track",
-        action="store_true",
-        help="track the boxes from scan to scan; the scans must be one drive, in order. Late scans have no tracks, and "
+        "track the boxes from scan to scan; the scans must be one drive, in order. Late scans have no tracks, and "
         "after a jump of the clock tracking begins anew",
     )
-    tracking.add_argument(
-        "--gif",
-        action="store_true",
-        help="write tracks.gif, the tracks drawn from above; needs --track, --out and the extra 'view'",
-    )
-    live = parser.add_argument_group("live")
-    live.add_argument(
-        "--live",
-        action="store_true",
-        help="replay one PATH in real time; always take the newest scan and drop older ones that still wait",
-    )
-    live.add_argument(
-        "--rate",
-        type=positive_number,
-        default=10.0,
-        metavar="HZ",
-        help="scans per second of files without time stamps (default: 10)",
-    )
+    tracking("--gif", "write tracks.gif, the tracks drawn from above; needs --track, --out and the extra 'view'")
+    live = options(parser, "live")
+    live("--live", "replay one PATH in real time; always take the newest scan and drop older ones that still wait")
+    live("--rate HZ", "scans per second of files without time stamps (default: 10)", type=positive_number, default=10.0)
 
 
 def make_perceiver(
@@ -502,21 +454,21 @@ class _Run:
             perceive = self._perceivers.of(sensor)
             numbered = is_capture(path)
             read: Callable[..., Iterator[tuple[Any, ...]]] = read_timed_scans if self._straightener else read_scans
-            options = reading_options(self._arguments) | {"accumulate_s": _gathered_s(path, sensor)}
-            if options["accumulate_s"] is not None and self._straightener is None:
+            how = reading_options(self._arguments) | {"accumulate_s": _gathered_s(path, sensor)}
+            if how["accumulate_s"] is not None and self._straightener is None:
                 warnings.warn(
-                    f"{shown}: the points of the last {options['accumulate_s']:g} s are taken as seen from one place; "
+                    f"{shown}: the points of the last {how['accumulate_s']:g} s are taken as seen from one place; "
                     "if the sensor moves, pass --deskew with --poses FILE or --track",
                     stacklevel=2,
                 )
             if not numbered:
-                options["origin_m"] = self._origin(path)
-            for k, (stamp_s, points, *times_s) in enumerate(read(path, **options)):
+                how["origin_m"] = self._origin(path)
+            for k, (stamp_s, points, *times_s) in enumerate(read(path, **how)):
                 name, file = (shown / f"{k:06d}", target / f"{k:06d}") if numbered else (shown, target)
                 try:
                     if self._straightener is not None:
                         points = self._straightener.straighten(stamp_s, points, times_s[0], perceive.sensor)
-                    perception = perceive(points, stamp_s, origin_m=options["origin_m"])
+                    perception = perceive(points, stamp_s, origin_m=how["origin_m"])
                     if self._kinds and numbered:
                         target.mkdir(exist_ok=True)
                     wanted = {kind: _file_of(file, kind) for kind in self._kinds}
@@ -547,8 +499,8 @@ class _Run:
             image = read_image(path)
             perceive = perceivers.of(perceivers.sensor_of(scan) if scan else stated_sensor(arguments))
             origin = None if scan is None else self._origin(scan)
-            options = file_options(arguments) | {"origin_m": origin}
-            points = None if scan is None else read_points(scan, **options)
+            how = file_options(arguments) | {"origin_m": origin}
+            points = None if scan is None else read_points(scan, **how)
             perception = perceive(points, image=image, origin_m=origin)
             wanted = _files_of(target, self._kinds, **_pictures_of(arguments, [path]))
             if "image" in wanted:
@@ -614,6 +566,8 @@ class _Run:
         title: str | None = None,
     ) -> Outcome:
         """Track the boxes and write everything about a scan."""
+        from .. import view
+
         stamp_s = self._stamp_s(perception)
         tracks = None
         if self._tracker is not None:
@@ -624,7 +578,7 @@ class _Run:
             _write(points, perception, wanted, title=title or str(name))
         finally:  # a picture that cannot be written costs no sink its scan
             self._sink(PerceivedScan(str(name), stamp_s, points, perception, tracks, sensor))
-        return name, perception, tracks, _under(points, perception) if self._arguments.gif else None
+        return name, perception, tracks, view.flatten_scan(points, perception) if self._arguments.gif else None
 
     def _track(self, perception: Perception) -> Tracks:
         assert self._tracker is not None
@@ -706,9 +660,3 @@ def _write(points: Points, perception: Perception, wanted: Mapping[str, Path], t
         view.write_labels(perception, wanted["labels"])
     if "ply" in wanted:
         view.write_ply(perception, points, wanted["ply"])
-
-
-def _under(points: Points, perception: Perception) -> bytes:
-    from ..view import flatten_scan
-
-    return flatten_scan(points, perception)

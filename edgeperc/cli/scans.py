@@ -38,23 +38,15 @@ _LAYOUT_FOLDERS = ("velodyne", "velodyne_points", "data")
 
 
 class Scans(NamedTuple):
-    """Scans found at the paths of a command line.
+    """Scans found at the paths of a command line."""
 
-    paths : scan files and captures, each once.
-    empty : folders without scans.
-    of_data_set : whether a path is the root of a data set. Its sequences all number their scans from 0.
-    """
-
-    paths: list[Path]
-    empty: list[Path]
-    of_data_set: bool
+    paths: list[Path]  # scan files and captures, each once
+    empty: list[Path]  # folders without scans
+    of_data_set: bool  # a path is the root of a data set, whose sequences all number their scans from 0
 
 
 def scan_folders(root: Path) -> list[Path]:
-    """Folders with scans: ``root`` itself, or the folders of a data set below it.
-
-    Data sets are KITTI's object and tracking sets, SemanticKITTI and KITTI's raw drives.
-    """
+    """Folders with scans: ``root`` itself, or those of a data set below it (`_LAYOUTS`)."""
     from ..readers.captures import scan_files
 
     if scan_files(root):
@@ -64,10 +56,7 @@ def scan_folders(root: Path) -> list[Path]:
 
 
 def find_scans(paths: Sequence[Path]) -> Scans:
-    """Find scan files and captures, in the order of ``paths``; the scans of a folder or data set are sorted.
-
-    Those at a URL may lie in any folder below it.
-    """
+    """Scan files and captures in the order of ``paths``; those of a folder, data set or URL's folders are sorted."""
     from ..readers.captures import CAPTURE_SUFFIXES, SCAN_SUFFIXES, is_capture, scan_files
 
     scans: dict[str, Path] = {}
@@ -90,10 +79,7 @@ def find_scans(paths: Sequence[Path]) -> Scans:
 
 
 def find_images(paths: Sequence[Path]) -> list[Path]:
-    """Find image files, in the order of ``paths``; those of a folder without scans are sorted. Empty if there are none.
-
-    Raises ImageError.
-    """
+    """Image files in the order of ``paths``, those of folders sorted; ImageError for a mixture with scans."""
     from ..readers.captures import is_capture
     from ..readers.images import IMAGE_SUFFIXES
 
@@ -138,12 +124,7 @@ def stated_sensor(arguments: argparse.Namespace) -> str:
 
 
 def find_sensor(paths: Sequence[Path], options: Mapping[str, Any]) -> SensorEstimate | None:
-    """The sensor that the points of the first scans show; None if no scan that can be read has enough points.
-
-    paths : scan files or captures of one sensor.
-    options : of `edgeperc.read_scans`.
-    Raises SensorError.
-    """
+    """The sensor that the first scans show; None if none that can be read has enough points. Raises SensorError."""
     from ..preprocess.sensor_estimate import MOST_SCANS, estimate_sensor, has_enough_points
     from ..readers.captures import is_capture, read_scans
 
@@ -172,12 +153,8 @@ def find_sensor(paths: Sequence[Path], options: Mapping[str, Any]) -> SensorEsti
 def scan_sensor(
     path: Path, arguments: argparse.Namespace, beside: Sequence[Path] = ()
 ) -> tuple[str | SensorProfile, str]:
-    """The sensor of a scan or capture, and how it is known: by ``--sensor``, by the capture, or by the points.
-
-    arguments : argparse.Namespace; with ``sensor``, ``topic`` and the options of files.
-    beside : scan files of the same sensor, with ``path``; those of its folder if it is one.
-    Raises SensorError, PointsError, MissingExtraError.
-    Warns UserWarning: ``--sensor`` contradicts the capture.
+    """The sensor of a scan or capture, and how it is known: by ``--sensor`` (which warns if the capture contradicts),
+    by the capture, or by the points of it and the files ``beside``. Raises SensorError, PointsError, MissingExtraError.
     """
     from ..readers.captures import is_capture, known_sensor, scan_files
     from ..readers.identify import NotSpinningError, contradicts
@@ -219,10 +196,9 @@ def scan_sensor(
 
 
 class Sensors:
-    """The sensors of the scans of a command line: that of scan files is found once for each folder.
+    """The sensors of the scans and captures of a command line: that of scan files is found once for each folder.
 
-    arguments : as in `scan_sensor`.
-    scans : the scans and captures; those at URLs are fetched to find it.
+    Scans at URLs are fetched for that.
     """
 
     def __init__(self, arguments: argparse.Namespace, scans: Sequence[Path | Remote] = ()) -> None:
@@ -262,10 +238,7 @@ class Sensors:
 
 
 def with_mounting(sensor: str | SensorProfile, arguments: argparse.Namespace) -> str | SensorProfile:
-    """The sensor with what ``--extrinsic`` and the options of single values give, ``--accumulate`` and others.
-
-    Raises SensorError.
-    """
+    """The sensor with ``--extrinsic``, options of single values, ``--accumulate`` and others. Raises SensorError."""
     from ..types.mounting import Mounting
     from ..types.sensor import get_sensor
 
@@ -295,10 +268,7 @@ def with_mounting(sensor: str | SensorProfile, arguments: argparse.Namespace) ->
 
 
 def output_names(scans: Sequence[Path], *, keep_folder: bool = False) -> list[Path]:
-    """Name the output files of each scan: its own name, after as few folder names as make all names different.
-
-    keep_folder : include at least one folder, such as the sequence of a data set.
-    """
+    """Names of the scans' output files, after as few folders (``keep_folder``: at least one) as make all differ."""
     whole = [Path(_absolute(scan)).parts[1:] for scan in scans]
     short = [(*(p for p in parts[:-1] if p not in _LAYOUT_FOLDERS), parts[-1]) for parts in whole]
     deepest = max(map(len, whole), default=0)

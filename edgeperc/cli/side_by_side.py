@@ -25,7 +25,7 @@ from ..system.atomic import write_atomic
 from ..system.pool import MOST_FIRST, Lost
 from ..system.ray_cluster import ENGINES
 from ..system.remote import Remote
-from .arguments import positive
+from .arguments import options, positive
 from .output import many, one_line, print_line
 from .report import Report
 
@@ -46,20 +46,19 @@ Alone = Callable[..., "tuple[Perceiver, Scan, Callable[[Any], list[Any]]]"]
 
 def add_engine(parser: argparse.ArgumentParser) -> None:
     """Add ``--engine`` and ``--workers``."""
-    group = parser.add_argument_group("engine")
-    group.add_argument(
+    group = options(parser, "engine")
+    group(
         "--engine",
+        "local: this computer; ray: worker processes with one thread each, on the cluster that the environment "
+        "variable RAY_ADDRESS names, else on this computer (extra 'ray'). The results are the same (default: local)",
         choices=("local", "ray"),
         default="local",
-        help="local: this computer; ray: worker processes with one thread each, on the cluster that the environment "
-        "variable RAY_ADDRESS names, else on this computer (extra 'ray'). The results are the same (default: local)",
     )
-    group.add_argument(
-        "--workers",
-        type=positive,
-        metavar="N",
-        help="number of worker processes with one thread each, among which the scans are divided; the results are the "
+    group(
+        "--workers N",
+        "number of worker processes with one thread each, among which the scans are divided; the results are the "
         "same (default: this process alone; with --engine ray, one for each CPU of the cluster)",
+        type=positive,
     )
 
 
@@ -114,11 +113,8 @@ def perceive_side_by_side(
     report: Report,
     show: Callable[[int, int], None],
 ) -> None:
-    """Perceive scan files in worker processes, and report them in their order.
-
-    Next to the files of a scan, ``.run/NAME.json`` records what they were made of: the scan, the options, the models,
-    and what was learned from the first scans. A scan is not perceived again if its record says the same and its files
-    have the recorded sizes. The first scans are always perceived again.
+    """Perceive scan files in worker processes, and report them in their order. ``.run/NAME.json`` next to a scan's
+    files says what they were made of; a later run keeps those that are the same and complete, but the first scans.
     """
     perceive, run, _ = alone(arguments, perceivers)
     n_first = 0

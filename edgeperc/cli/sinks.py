@@ -6,95 +6,67 @@ import argparse
 import sys
 from contextlib import ExitStack
 from functools import partial
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..errors import EdgepercError
+from .arguments import options
 from .output import print_error, print_line
 
 if TYPE_CHECKING:
     from ..records import PerceivedScan, Sink
 
 
-SINKS: tuple[str, ...] = (
-    "mcap",
-    "serve",
-    "rrd",
-    "play",
-    "static",
-    "labels_for",
-    "bag",
-)
+SINKS = ("mcap", "serve", "rrd", "play", "static", "labels_for", "bag")
 """Names of the options below as attributes of the arguments."""
 
 
 def add_sinks(parser: argparse.ArgumentParser) -> None:
     """Add the options."""
-    group = parser.add_argument_group("files of the whole run")
-    group.add_argument(
-        "--mcap",
-        type=Path,
-        metavar="FILE",
-        help="write points, boxes, tracks, drivable cells and stage times to an MCAP file for Foxglove and other "
+    group = options(parser, "files of the whole run")
+    group(
+        "--mcap FILE",
+        "write points, boxes, tracks, drivable cells and stage times to an MCAP file for Foxglove and other "
         "viewers (needs the extra 'foxglove'; default: none)",
     )
-    group.add_argument(
-        "--serve",
+    group(
+        "--serve HOST:PORT",
+        "stream the same to viewers while it runs, over Foxglove's WebSocket protocol; anyone who reaches "
+        "HOST:PORT can watch (needs the extra 'foxglove'; without a value: 127.0.0.1:8765, this computer only; "
+        "default: none)",
         type=_address,
         nargs="?",
         const=("127.0.0.1", 8765),
-        metavar="HOST:PORT",
-        help="stream the same to viewers while it runs, over Foxglove's WebSocket protocol; anyone who reaches "
-        "HOST:PORT can watch (needs the extra 'foxglove'; without a value: 127.0.0.1:8765, this computer only; "
-        "default: none)",
     )
-    group.add_argument(
-        "--rrd",
-        type=Path,
-        metavar="FILE",
-        help="write a recording for the Rerun viewer (needs the extra 'rerun'; default: none)",
-    )
-    group.add_argument(
-        "--play",
-        type=Path,
-        metavar="FILE",
-        help="write one HTML page that plays all scans of the drive in 3-D, of at most 48 MB: scans are thinned "
+    group("--rrd FILE", "write a recording for the Rerun viewer (needs the extra 'rerun'; default: none)")
+    group(
+        "--play FILE",
+        "write one HTML page that plays all scans of the drive in 3-D, of at most 48 MB: scans are thinned "
         "(default: none)",
     )
-    group.add_argument(
-        "--static",
-        type=Path,
-        metavar="DIR",
-        help="write every scan without its points on moving objects, as DIR/NAME in the format of the scan; scans of "
+    group(
+        "--static DIR",
+        "write every scan without its points on moving objects, as DIR/NAME in the format of the scan; scans of "
         "captures become .bin. Needs --track, or --movable (default: no scans)",
     )
-    group.add_argument(
-        "--movable",
-        action="store_true",
-        help="with --static: leave out the points on everything that could move, too: vehicles and people",
-    )
-    group.add_argument(
+    group("--movable", "with --static: leave out the points on everything that could move, too: vehicles and people")
+    group(
         "--labels-for",
-        choices=("labelcloud", "cvat", "kitti", "sustechpoints"),
-        help="write the boxes to --out as labels for an annotation tool; with --track with the ids of tracks. kitti "
+        "write the boxes to --out as labels for an annotation tool; with --track with the ids of tracks. kitti "
         "takes the camera of --calib (a file, or a folder with one for each scan), or a nominal one (default: none)",
+        choices=("labelcloud", "cvat", "kitti", "sustechpoints"),
     )
-    group.add_argument(
-        "--bag",
-        type=Path,
-        metavar="DIR",
-        help="write a ROS 2 bag, a folder that must not exist: points with classes, markers, grid, detections, "
+    group(
+        "--bag DIR",
+        "write a ROS 2 bag, a folder that must not exist: points with classes, markers, grid, detections, "
         "diagnostics (needs the extra 'ros'; default: no bag)",
     )
-    group.add_argument(
+    group(
         "--bag-storage",
+        "format of the file in --bag; mcap needs rosbags 0.10 (default: %(default)s)",
         choices=("sqlite3", "mcap"),
         default="sqlite3",
-        help="format of the file in --bag; mcap needs rosbags 0.10 (default: %(default)s)",
     )
-    group.add_argument(
-        "--bag-frame", default="lidar", metavar="NAME", help="frame of the messages in --bag (default: %(default)s)"
-    )
+    group("--bag-frame NAME", "frame of the messages in --bag (default: %(default)s)", default="lidar")
 
 
 def _address(text: str) -> tuple[str, int]:
@@ -111,11 +83,8 @@ def wanted_sinks(arguments: argparse.Namespace) -> list[str]:
 
 
 class Sinks:
-    """The sinks of the passed options: each gets every scan and is closed, whatever becomes of the others.
-
-    Errors of options and missing extras come from the constructor, before the first scan.
-
-    n_failed : int; files that could not be finished.
+    """The sinks of the passed options, made before the first scan: each gets every scan and is closed, whatever becomes
+    of the others. ``n_failed`` counts files that could not be finished.
     """
 
     def __init__(self, arguments: argparse.Namespace) -> None:
@@ -139,10 +108,7 @@ class Sinks:
         self._stack.close()
 
     def write(self, scan: PerceivedScan) -> None:
-        """Write one scan.
-
-        Raises EdgepercError, OSError: A sink could not; the first error.
-        """
+        """Write one scan to all sinks; raises the first EdgepercError or OSError of them."""
         errors: list[Exception] = []
         for sink in self._sinks:
             try:
@@ -153,35 +119,30 @@ class Sinks:
             raise errors[0]
 
     def _open(self, arguments: argparse.Namespace) -> None:
-        if arguments.serve is not None:
-            from ..sinks.foxglove import ServeSink
+        if not wanted_sinks(arguments):
+            return
+        from ..sinks.foxglove import McapSink, ServeSink
+        from ..sinks.page import PageSink
+        from ..sinks.prelabels import PrelabelSink
+        from ..sinks.rerun import RerunSink
+        from ..sinks.rosbag import BagSink
+        from ..sinks.static import StaticSink
 
+        if arguments.serve is not None:
             served = ServeSink(*arguments.serve)
             self._add(served)
             print_line(f"open {served.url} in Foxglove", sys.stderr)
         if arguments.mcap is not None:
-            from ..sinks.foxglove import McapSink
-
             self._add(McapSink(arguments.mcap))
         if arguments.rrd is not None:
-            from ..sinks.rerun import RerunSink
-
             self._add(RerunSink(arguments.rrd))
         if arguments.play is not None:
-            from ..sinks.page import PageSink
-
             self._add(PageSink(arguments.play))
         if arguments.static is not None:
-            from ..sinks.static import StaticSink
-
             self._add(StaticSink(arguments.static, without="movable" if arguments.movable else "moving"))
         if arguments.labels_for is not None:
-            from ..sinks.prelabels import PrelabelSink
-
             self._add(PrelabelSink(arguments.out, arguments.labels_for, calib=arguments.calib))
         if arguments.bag is not None:
-            from ..sinks.rosbag import BagSink
-
             self._add(BagSink(arguments.bag, storage=arguments.bag_storage, frame_id=arguments.bag_frame))
 
     def _add(self, sink: Sink) -> None:

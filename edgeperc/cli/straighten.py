@@ -20,13 +20,7 @@ if TYPE_CHECKING:
 
 
 class Straightener:
-    """Straightens scans, by poses or by what the tracker found of the scans before.
-
-    poses : a file for `edgeperc.Trajectory.from_tum`; by default the motion is that between the last two scans that
-        were tracked.
-    quaternion : as for `edgeperc.Trajectory.from_tum`.
-    Raises TrackingError.
-    """
+    """Straightens scans by the poses of a file, or by the motion between tracked scans. Raises TrackingError."""
 
     def __init__(self, poses: Path | None, quaternion: Literal["xyzw", "wxyz"] | None = None) -> None:
         self._trajectory = None if poses is None else Trajectory.from_tum(poses, quaternion=quaternion)
@@ -39,13 +33,9 @@ class Straightener:
         times_s: NDArray[np.float64] | None,
         sensor: SensorProfile | None = None,
     ) -> NDArray[np.float32]:
-        """Points in the sensor's frame at the scan's stamp, or at its last point if it has none.
-
-        stamp_s, points, times_s : a `edgeperc.TimedScan`.
-        sensor : what it drops of the scan stays where it is: the own vehicle moves with the sensor.
-        Raises PointsError, TrackingError.
-        Warns UserWarning: Without poses: the tracker does not know the motion during the first two scans of a
-            session, which stay as they are.
+        """Points in the sensor's frame at the scan's stamp, or at its last point; what the sensor drops stays where it
+        is: the own vehicle moves with it. Without poses, the first two scans of a session stay as they are, with a
+        warning.
         """
         if times_s is None:
             raise PointsError(

@@ -15,13 +15,7 @@ LARGEST_TILT = math.radians(20.0)
 
 
 def read_labelcloud(path: Path) -> list[Box]:
-    """Read ``labels/NAME.json`` of labelCloud, formats ``centroid_rel`` and ``centroid_abs``.
-
-    ``_classes.json`` in the same folder names the format; without it, angles are in radians.
-
-    Returns: With the classes of the file, in the frame of the scan.
-    Raises PointsError.
-    """
+    """Read ``labels/NAME.json`` of labelCloud, in the format that ``_classes.json`` names. Raises PointsError."""
     settings = path.with_name("_classes.json")
     known = _read(settings).get("format", "centroid_rel") if settings.exists() else "centroid_rel"
     if known not in ("centroid_rel", "centroid_abs"):
@@ -53,11 +47,8 @@ def read_sustechpoints(path: Path) -> list[Box]:
 
 
 def read_datumaro(path: Path) -> dict[str, list[Box]]:
-    """Read ``annotations/default.json`` of "Datumaro 3D 1.0", which CVAT exports.
-
-    Returns dict of str to list of Box: By the name of the scan, without folders. Boxes of tracks that are outside are
-        left out.
-    Raises PointsError.
+    """Read ``annotations/default.json`` of "Datumaro 3D 1.0", which CVAT exports, by the name of the scan without
+    folders; boxes of tracks that are outside are left out. Raises PointsError.
     """
     document, boxes = _read(path), dict[str, list[Box]]()
     try:

@@ -20,22 +20,7 @@ LEVEL = 0.95
 
 
 class LabeledImages:
-    """Images and the classes of their pixels: ``{train,val,test}/NAME``, ``{...}annot/NAME.png`` and ``classes.json``.
-
-    Parameters
-    ----------
-    root : Path
-
-    Attributes
-    ----------
-    classes : tuple of str
-        By id, without the one of unlabeled pixels.
-
-    Raises
-    ------
-    ImageError
-        ``classes.json`` cannot be read, or holds something else.
-    """
+    """Images and the classes of their pixels: ``{train,val,test}/NAME``, ``{...}annot/NAME.png``. Raises ImageError."""
 
     def __init__(self, root: Path) -> None:
         self.root = root
@@ -58,10 +43,7 @@ class LabeledImages:
         return annotated and (root / "classes.json").is_file()
 
     def files(self, split: str) -> list[Path]:
-        """The images of ``"train"``, ``"validation"``, ``"test"``, ``"held-back"`` (the last two) or ``"all"``, sorted.
-
-        Raises ImageError.
-        """
+        """The images of "train", "validation", "test", "held-back" (the last two) or "all"; ImageError without any."""
         parts = {"held-back": ("validation", "test"), "all": tuple(FOLDERS)}.get(split, (split,))
         folders = [self.root / FOLDERS[part] for part in parts]
         files = [
@@ -76,12 +58,7 @@ class LabeledImages:
         return files
 
     def read(self, file: Path) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-        """Read an image and its labels.
-
-        Returns image: (H, W, 3) uint8.
-        Returns labels ((H, W) uint8): Index into ``classes``; 255 where unlabeled.
-        Raises ImageError.
-        """
+        """Read an image (H, W, 3) and its labels (H, W), 255 where unlabeled. Raises ImageError."""
         image = read_image(file)
         path = file.parent.with_name(f"{file.parent.name}annot") / f"{file.stem}.png"
         pillow = require("PIL.Image", "camera", "Reading an image", package="pillow")

@@ -41,14 +41,10 @@ IMAGE_SIZES = {
 
 @dataclass(frozen=True)
 class KittiCalibration:
-    """Pose and projection of the left color camera.
+    """Pose and projection of the left color camera."""
 
-    T_cam_velo : (4, 4) float64; sensor frame to rectified camera frame.
-    P2 : (3, 4) float64; rectified camera frame to the image of the left color camera.
-    """
-
-    T_cam_velo: NDArray[np.float64]
-    P2: NDArray[np.float64]
+    T_cam_velo: NDArray[np.float64]  # (4, 4), sensor frame to rectified camera frame
+    P2: NDArray[np.float64]  # (3, 4), rectified camera frame to the image
 
     @classmethod
     def read(cls, path: Path) -> KittiCalibration:
@@ -56,11 +52,8 @@ class KittiCalibration:
         return cls(*read_kitti_calibration(path))
 
     def to_image(self, points: NDArray[Any]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Project points into the image.
-
-        points : (n, 3+) array; x, y, z [m] in the sensor frame; further columns are ignored.
-        Returns pixels ((n, 2) float64): Column and row [px]. Not valid for points behind the camera.
-        Returns depth ((n,) float64): Distance along the optical axis [m], negative behind the camera.
+        """Column and row (n, 2) [px] of points (n, 3+) in the sensor frame, not valid behind the camera; and their
+        distance along the optical axis [m], negative there.
         """
         cam = np.asarray(points[:, :3], np.float64) @ self.T_cam_velo[:3, :3].T + self.T_cam_velo[:3, 3]
         image = cam @ self.P2[:, :3].T + self.P2[:, 3]
@@ -69,11 +62,8 @@ class KittiCalibration:
             return image[:, :2] / depth[:, None], depth
 
     def sensor_boxes(self, rows: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Convert boxes from KITTI's camera frame to the sensor frame.
-
-        rows : (n, 7) float64; height, width, length, x, y, z of the bottom face's center [m], rotation about the
-            camera's y axis [rad].
-        Returns (n, 7) float64: x, y, z of the center, length, width, height [m], yaw [rad].
+        """Boxes (n, 7) in the sensor frame (center, length, width, height, yaw) from KITTI's: height, width, length, x,
+        y, z of the bottom face's center in the camera's frame [m], rotation about its y axis [rad].
         """
         T_velo_cam = np.linalg.inv(self.T_cam_velo)
         height, width, length, x, y, z, turn = rows.T
@@ -94,13 +84,7 @@ class KittiCalibration:
     def image_rectangles(
         self, rows: NDArray[np.float64], image_size: tuple[int, int] = IMAGE_SIZE
     ) -> NDArray[np.float64]:
-        """Project boxes into the image.
-
-        rows : (n, 7) float64; x, y, z of the center, length, width, height [m], yaw [rad] in the sensor frame.
-        image_size : tuple of 2 int; width and height [px].
-        Returns (n, 4) float64: Left, top, right, bottom [px], clipped to the image; without area if a box is not in
-            it.
-        """
+        """Left, top, right, bottom [px] of boxes (n, 7) in the sensor frame, clipped to the image; no area outside."""
         signs = np.array([[a, b, c] for a in (-0.5, 0.5) for b in (-0.5, 0.5) for c in (-0.5, 0.5)])
         local = signs[None] * rows[:, None, 3:6]
         cos, sin = np.cos(rows[:, 6])[:, None], np.sin(rows[:, 6])[:, None]
@@ -131,38 +115,34 @@ class KittiCalibration:
 
 @dataclass(frozen=True)
 class KittiLabels:
-    """Rows of a KITTI label file, in its own frame.
+    """Rows of a KITTI label file, in its own frame."""
 
-    kinds : classes in lower case, ``"dontcare"`` among them.
-    numbers : (n, 14) float64; truncation, occlusion, observation angle [rad]; left, top, right, bottom [px]; height,
-        width, length, x, y, z [m] and rotation [rad] as in `KittiCalibration.sensor_boxes`.
-    """
-
-    kinds: tuple[str, ...]
+    kinds: tuple[str, ...]  # classes in lower case, "dontcare" among them
     numbers: NDArray[np.float64]
+
+    @property
+    def is_object(self) -> NDArray[np.bool_]:
+        """Which rows are not DontCare regions."""
+        return np.array([kind != "dontcare" for kind in self.kinds], np.bool_)
+
+    @property
+    def objects(self) -> tuple[list[str], NDArray[np.float64]]:
+        """Classes and numbers of the rows that are not DontCare regions."""
+        return [kind for kind in self.kinds if kind != "dontcare"], self.numbers[self.is_object]
 
 
 @dataclass(frozen=True)
 class Frame:
-    """One KITTI scan and its labels.
-
-    grade : ``"A"`` if the boxes were checked to fit the scan.
-    points : (n, 4) float32; x, y, z [m] in the sensor frame, remission.
-    boxes : in the sensor frame, labels in lower case (car, van, truck, pedestrian, person_sitting, cyclist, tram,
-        misc).
-    unlabeled : (k, 4) float64; image rectangles (left, top, right, bottom) [px] in which objects are not labeled
-        (DontCare).
-    labels : the rows that ``boxes`` and ``unlabeled`` come from; None: unknown.
-    """
+    """One KITTI scan and its labels."""
 
     name: str
     drive: str
-    grade: str
-    points: Points
-    boxes: tuple[Box, ...]
-    unlabeled: NDArray[np.float64]
+    grade: str  # "A" if the boxes were checked to fit the scan
+    points: Points  # x, y, z [m] in the sensor frame, remission
+    boxes: tuple[Box, ...]  # in the sensor frame, labels in lower case
+    unlabeled: NDArray[np.float64]  # (k, 4), DontCare: left, top, right, bottom [px] where objects are not labeled
     calibration: KittiCalibration
-    labels: KittiLabels | None = None
+    labels: KittiLabels | None = None  # what ``boxes`` and ``unlabeled`` come from, if known
 
     @cached_property
     def known(self) -> NDArray[np.bool_]:
@@ -211,14 +191,13 @@ def read_objects(label_path: Path, calibration: KittiCalibration) -> tuple[tuple
 
 def label_objects(labels: KittiLabels, calibration: KittiCalibration) -> tuple[tuple[Box, ...], NDArray[np.float64]]:
     """Boxes of labels in the sensor frame, and (k, 4) DontCare rectangles [px]."""
-    is_object = np.array([kind != "dontcare" for kind in labels.kinds], np.bool_)
-    placed = calibration.sensor_boxes(labels.numbers[is_object, 7:14])
-    kinds = [kind for kind in labels.kinds if kind != "dontcare"]
+    kinds, numbers = labels.objects
+    placed = calibration.sensor_boxes(numbers[:, 7:14])
     boxes = tuple(
         Box(kind, 1.0, (x, y, z), (length, width, height), yaw)
         for kind, (x, y, z, length, width, height, yaw) in zip(kinds, placed.tolist(), strict=True)
     )
-    return boxes, labels.numbers[~is_object, 3:7]
+    return boxes, labels.numbers[~labels.is_object, 3:7]
 
 
 def scan_hash(points: Points) -> str:
@@ -227,27 +206,8 @@ def scan_hash(points: Points) -> str:
 
 
 class KittiObjects:
-    """The labeled scans below a KITTI root (``training/velodyne``, ``label_2``, ``calib``), by drive.
-
-    ``frames.csv`` and ``frames-*.csv`` next to ``training`` give the drive of each scan (columns ``name``,
-    ``drive`` and optionally ``grade``). Scans without an entry are left out, because a model may have been trained on
-    their drive. Without any table, each scan counts as a drive of its own.
-
-    Parameters
-    ----------
-    root : str or Path
-
-    Attributes
-    ----------
-    drives : dict of str to str
-        Name of each scan, labeled or not -> its drive.
-    rows : list of dict
-        Rows of the tables, of the labeled scans.
-
-    Raises
-    ------
-    PointsError
-        There are no label files, or a row of a table lacks the name or the drive.
+    """The labeled scans below a KITTI root, by drive, as ``frames*.csv`` beside ``training`` says. A scan without a row
+    is left out, as a model may know its drive; without a table, each scan is a drive. Raises PointsError.
     """
 
     def __init__(self, root: Path | str) -> None:
@@ -329,22 +289,15 @@ SEQUENCE_DRIVES = {
 
 @dataclass(frozen=True)
 class RoadFrame:
-    """One SemanticKITTI scan with labels of road and vehicles.
-
-    points : (n, 4) float32; x, y, z [m] in the sensor frame, remission.
-    labels : (n,) uint8; index into `ROAD_CLASSES`, `IGNORE` for unlabeled points.
-    """
+    """One SemanticKITTI scan with labels of road and vehicles."""
 
     name: str
     drive: str
-    points: Points
-    labels: Labels
+    points: Points  # x, y, z [m] in the sensor frame, remission
+    labels: Labels  # index into `ROAD_CLASSES`, `IGNORE` for unlabeled points
 
     def top_view(self, geometry: TopViewGeometry) -> NDArray[np.uint8]:
-        """True class of each cell, (rows, columns) uint8: index into `ROAD_CLASSES`.
-
-        A cell gets the class of more than half of its labeled returns, and `IGNORE` if it has no labeled return.
-        """
+        """Index into `ROAD_CLASSES` of each cell: that of most of its labeled returns, `IGNORE` without one."""
         p, known = self.points, self.labels != IGNORE
         row, col, in_view = geometry.cells(p[:, 0], p[:, 1])
         known &= in_view
@@ -360,10 +313,7 @@ class RoadFrame:
 
 
 class SemanticKitti:
-    """The scans with point labels below a SemanticKITTI root (``sequences/00/velodyne``, ``labels``), by drive.
-
-    Raises PointsError.
-    """
+    """The scans with point labels below a SemanticKITTI root (``sequences/00``), by drive. Raises PointsError."""
 
     def __init__(self, root: Path | str) -> None:
         self.root = Path(root)

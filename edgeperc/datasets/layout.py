@@ -43,13 +43,8 @@ _MOUNTING = Fields("mounting", SensorError, optional=("*",), exact=True)
 
 
 def class_number(name: str, classes: Sequence[str] = POINT_CLASSES) -> int:
-    """Label of a class of a description among the classes of points of a network.
-
-    name : a value of `ScanLayout.boxes` or `ScanLayout.points`.
-    classes : classes of the network, the background first.
-    Returns: Its index. Vans and trucks count as cars, sitting persons as pedestrians and what is ``drivable`` as road,
-        if ``classes`` lacks them. A part of the background is background if the network has no such parts. `IGNORE`
-        for a class that the network does not have.
+    """Label of a description's class in a network's ``classes``: that of a coarser one if they lack it (`COARSE`), 0
+    for a part of the background if they have none, `IGNORE` for what they do not have.
     """
     name = name if name in classes else COARSE.get(name, name)
     if name in classes:
@@ -67,53 +62,30 @@ def numbers_of_scene(classes: Sequence[str] = POINT_CLASSES) -> NDArray[np.uint8
 
 @dataclass(frozen=True)
 class ScanLayout:
-    """What ``scans.json`` says of the scans of a folder.
-
-    name : name of the set, in tables and in cards.
-    files : ``"plain"``, or ``"semantickitti"``: the tree of that set; a scan is called ``SEQ/NAME``, and its drive is
-        that of its sequence (`datasets.SEQUENCE_DRIVES`).
-    sensor : its ``mounting`` is what is known of the mounting.
-    boxes, points : class of a label file, in lower case -> class of edgeperc: ``car``, ``van``, ``truck``,
-        ``pedestrian``, ``person_sitting``, ``cyclist``, ``background``, a new name, or ``ignore`` (objects and points
-        of which nothing is known); for points also ``drivable`` and the `PARTS` of the background. The key ``*`` stands
-        for all other classes.
-    box_format : ``"plain"``: ``label/NAME.txt``; ``"kitti"``: ``label_2/NAME.txt`` with ``calib/NAME.txt``; or what an
-        annotation tool saves: ``"labelcloud"``: ``labels/NAME.json``, ``"sustechpoints"``: ``label/NAME.json``,
-        ``"cvat"``: ``annotations/default.json`` of its format "Datumaro 3D".
-    box_columns : columns of ``label/NAME.txt``. Columns that are not among `BOX_COLUMNS` are skipped; columns after the
-        listed ones are too.
-    point_names : names of the numbers in ``semseg``; None: ``semseg_classes.json`` has them.
-    labeled_deg : sector in which all objects have boxes, as azimuths counter-clockwise from x [deg].
-    labeled_m : distance up to which all objects have boxes [m].
-    min_points : A box with fewer points need not be detected, and its object is not counted.
-    drives : ``"table"``: ``frames.csv`` names them, and without that file each scan is a drive of its own; ``"scan"``:
-        each scan is a drive of its own; ``"one"``: all scans are of one drive.
-    splits : ``"train"``, ``"validation"`` or ``"test"`` -> drives; ``*`` stands for all drives that are not listed.
-        Drives that no entry covers are for training and testing, as in `splits.in_split`.
+    """What ``scans.json`` says of the scans of a folder. ``boxes`` and ``points`` map classes of label files, in lower
+    case, to ours, a new name or "ignore" (nothing is known of them); the key ``*`` stands for all others.
     """
 
-    name: str
-    sensor: SensorProfile
+    name: str  # in tables and in cards
+    sensor: SensorProfile  # with what is known of its mounting
     boxes: Mapping[str, str]
-    points: Mapping[str, str]
-    files: Literal["plain", "semantickitti"] = "plain"
+    points: Mapping[str, str]  # also ``drivable`` and the `PARTS` of the background
+    files: Literal["plain", "semantickitti"] = "plain"  # "semantickitti": its tree; scans are called SEQ/NAME
+    # "plain": label/NAME.txt; others: `BOX_FILES`
     box_format: Literal["plain", "kitti", "labelcloud", "sustechpoints", "cvat"] = "plain"
+    # of ``label/NAME.txt``; others than `BOX_COLUMNS`, and those after them, are skipped
     box_columns: tuple[str, ...] = BOX_COLUMNS
-    point_names: Mapping[int, str] | None = None
-    labeled_deg: tuple[float, float] = (-180.0, 180.0)
-    labeled_m: float = math.inf
-    min_points: int = 1
-    drives: Literal["table", "scan", "one"] = "table"
+    point_names: Mapping[int, str] | None = None  # of the numbers in ``semseg``; None: semseg_classes.json has them
+    labeled_deg: tuple[float, float] = (-180.0, 180.0)  # azimuths between which all objects have boxes
+    labeled_m: float = math.inf  # up to where all objects have boxes
+    min_points: int = 1  # a box with fewer need not be detected, and its object is not counted
+    drives: Literal["table", "scan", "one"] = "table"  # each by frames.csv (or scan without it), each scan, or all one
+    # drives by split; ``*``: all that are not listed
     splits: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
     @classmethod
     def from_json(cls, text: str, folder: Path | None = None) -> ScanLayout:
-        """Read a description.
-
-        text : JSON.
-        folder : folder of the profile that ``sensor`` names, if it is a file.
-        Raises PointsError, SensorError.
-        """
+        """Read a description; a profile that ``sensor`` names lies in ``folder``. Raises PointsError, SensorError."""
         given = _FIELDS.document(text, SCHEMA)
         boxes, points = (_classes(given, key) for key in ("boxes", "points"))
         if DRIVABLE in boxes.values():
@@ -142,10 +114,7 @@ class ScanLayout:
             raise PointsError(f"splits lists {', '.join(twice)[:80]} twice; whole drives belong to one split")
 
     def in_split(self, drive: str, split: str, fold: int | None = None) -> bool:
-        """Whether a drive belongs to a split, as `splits.in_split` says, with the description's own lists first.
-
-        Drives that a description lists are in no fold: with a ``fold``, its validation drives stay out.
-        """
+        """As `splits.in_split`, the description's own lists first; with a ``fold``, its validation drives stay out."""
         unlisted = in_split(drive, split, fold)  # checks the arguments too
         listed = next((key for key, drives in self.splits.items() if drive in drives), None)
         listed = listed or next((key for key, drives in self.splits.items() if ANY in drives), None)
@@ -165,10 +134,7 @@ def known_layouts() -> tuple[str, ...]:
 
 
 def read_layout(layout: str | Path) -> ScanLayout:
-    """Read a description by the name of a public set, or from a file (a Path, or a str that ends in ``.json``).
-
-    Raises PointsError, SensorError.
-    """
+    """The description of a public set by name, or of a Path or a str in ``.json``. Raises PointsError, SensorError."""
     if isinstance(layout, str) and not layout.endswith(".json"):
         known = known_layouts()
         if layout not in known:

@@ -10,59 +10,34 @@ from __future__ import annotations
 
 from ..errors import OptionError
 
+
+def _drives(*names: str) -> frozenset[str]:
+    """Drives of KITTI in 2011, by month, day and number."""
+    return frozenset(f"2011_{name[:5]}_drive_{name[6:]}" for name in names)
+
+
 # Three object drives with cars, vans, trucks, pedestrians and cyclists, and all of SemanticKITTI's sequence 00.
-TEST_DRIVES = frozenset(
-    {"2011_09_26_drive_0011", "2011_09_26_drive_0015", "2011_09_26_drive_0032", "2011_10_03_drive_0027"}
-)
+TEST_DRIVES = _drives("09_26 0011", "09_26 0015", "09_26 0032", "10_03 0027")
 
 # Fold 0 is one long drive with most of the cyclists; the others are many short drives.
 FOLDS = (
-    frozenset({"2011_09_26_drive_0005"}),
-    frozenset(
-        {
-            "2011_09_26_drive_0029",
-            "2011_09_26_drive_0036",
-            "2011_09_26_drive_0046",
-            "2011_09_26_drive_0048",
-            "2011_09_26_drive_0052",
-            "2011_09_26_drive_0064",
-            "2011_09_26_drive_0096",
-            "2011_09_28_drive_0002",
-        }
+    _drives("09_26 0005"),
+    _drives(
+        *("09_26 0029", "09_26 0036", "09_26 0046", "09_26 0048", "09_26 0052", "09_26 0064", "09_26 0096"),
+        "09_28 0002",
     ),
-    frozenset(
-        {
-            "2011_09_26_drive_0013",
-            "2011_09_26_drive_0014",
-            "2011_09_26_drive_0022",
-            "2011_09_26_drive_0023",
-            "2011_09_26_drive_0059",
-            "2011_09_26_drive_0070",
-            "2011_09_29_drive_0026",
-            "2011_10_03_drive_0047",
-        }
+    _drives(
+        *("09_26 0013", "09_26 0014", "09_26 0022", "09_26 0023", "09_26 0059", "09_26 0070"),
+        *("09_29 0026", "10_03 0047"),
     ),
 )
 
 
 # No shipped model was trained on these scans, but simulated training scenes use their layouts. These drives decide
 # which network is shipped for a task, and which precisions are accurate enough.
-VALIDATION_DRIVES = frozenset(
-    {
-        "2011_09_26_drive_0001",
-        "2011_09_26_drive_0020",
-        "2011_09_26_drive_0027",
-        "2011_09_26_drive_0039",
-        "2011_09_26_drive_0060",
-        "2011_09_26_drive_0087",
-        "2011_09_26_drive_0095",
-        "2011_09_28_drive_0001",
-        "2011_09_28_drive_0016",
-        "2011_09_28_drive_0043",
-        "2011_09_28_drive_0141",
-        "2011_09_28_drive_0185",
-        "2011_09_29_drive_0071",
-    }
+VALIDATION_DRIVES = _drives(
+    *("09_26 0001", "09_26 0020", "09_26 0027", "09_26 0039", "09_26 0060", "09_26 0087", "09_26 0095"),
+    *("09_28 0001", "09_28 0016", "09_28 0043", "09_28 0141", "09_28 0185", "09_29 0071"),
 )
 
 
@@ -72,13 +47,8 @@ def fold_of(drive: str) -> int | None:
 
 
 def in_split(drive: str, split: str, fold: int | None = None) -> bool:
-    """Whether a drive belongs to ``"train"``, ``"validation"``, ``"test"`` or ``"all"``.
-
-    With a ``fold``, that fold is for validation and the other two for training. Without one, all folds are for training
-    and `VALIDATION_DRIVES` for validation. A drive that is not listed here (a user's own scans) is for both training
-    and testing; `unseen` then detects training scans by the hashes in a model's card.
-
-    Raises OptionError.
+    """Whether a drive is of "train", "validation", "test" or "all". With a ``fold`` that one is for validation, else
+    `VALIDATION_DRIVES`. A user's own drive is for training and testing: cards hold hashes. Raises OptionError.
     """
     if split not in ("train", "validation", "test", "all"):
         raise OptionError(f"split is {split!r}; expected train, validation, test or all")

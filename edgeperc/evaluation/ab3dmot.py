@@ -17,24 +17,19 @@ from numpy.typing import NDArray
 
 from ..types.geometry import wrapped
 from ..types.perception import Box
+from .metrics import box_rows
 from .tracking_metrics import box_iou, fill_assignment
 
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """Association and life of the tracks of one class.
+    """Association and life of the tracks of one class."""
 
-    by_distance : associate by the distance of the centers, instead of generalized 3-D IoU.
-    greedy : assign the best pair first, instead of the best sum.
-    least : lowest affinity of a pair: generalized IoU, or the negative distance [m].
-    min_hits, max_age : detections before a track is reported; scans without a detection after which it is deleted.
-    """
-
-    by_distance: bool
-    greedy: bool
-    least: float
-    min_hits: int
-    max_age: int
+    by_distance: bool  # associate by the distance of the centers, instead of generalized 3-D IoU
+    greedy: bool  # assign the best pair first, instead of the best sum
+    least: float  # lowest affinity of a pair: generalized IoU, or the negative distance [m]
+    min_hits: int  # detections before a track is reported
+    max_age: int  # scans without a detection after which it is deleted
 
 
 SETTINGS = {
@@ -67,16 +62,9 @@ class Ab3dmot:
     def update(
         self, boxes: Sequence[Box], scores: Sequence[float]
     ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
-        """Track the boxes of one scan.
-
-        scores : any numbers, one for each box.
-        Returns ids: (n,) int64.
-        Returns rows ((n, 7) float64): Center, size and yaw.
-        Returns scores ((n,) float64): Of the last detection of each track.
-        Returns sources ((n,) int64): Index of the detection of this scan; -1 for none.
-        """
+        """Track the boxes of a scan: ids, rows, scores of the last detection, the detections' indices (-1: none)."""
         self._n_scans += 1
-        given = np.array([(*box.center, *box.size, box.yaw) for box in boxes], np.float64).reshape(-1, 7)
+        given = box_rows(boxes)
         states = self._states @ _F.T
         states[:, 3] = wrapped(states[:, 3])
         covariances = _F @ self._covariances @ _F.T + _Q
@@ -142,11 +130,8 @@ class Ab3dmot:
 
 
 def generalized_iou(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Generalized 3-D IoU: IoU less the share of the smallest upright prism around both that neither fills.
-
-    a : (n, 7) float64; x, y, z, length, width, height [m], yaw [rad].
-    b : (m, 7) float64
-    Returns (n, m) float64: In -1..1. Boxes farther apart than the sum of their lengths and widths have -1.
+    """Generalized 3-D IoU (n, m) of boxes (n, 7) and (m, 7): IoU less the share of the smallest upright prism around
+    both that neither fills; -1 for boxes farther apart than the sum of their lengths and widths.
     """
     iou = box_iou(a, b)
     volumes = np.add.outer(a[:, 3:6].prod(axis=1), b[:, 3:6].prod(axis=1))

@@ -29,18 +29,10 @@ def evaluate_images(
     split: str | None = None,
     provider: str = "cpu",
     precision: str = "auto",
-    n_resamples: int = 1000,
     on_image: Callable[[int, int], None] = lambda done, total: None,
 ) -> dict[str, Any]:
-    """Compute the figures of a camera model on labeled images.
-
-    roots : folders in CamVid's layout (`LabeledImages`).
-    split : as in `LabeledImages.files`. None: the test images if there are any, else the validation images.
-    provider, precision : as in `edgeperc.Perceiver`.
-    n_resamples : number of resamples of the images for the intervals.
-    on_image : called after each image with the number of images done and of all images.
-    Returns: ``"models"``, ``"providers"``, ``"split"``, ``"fold"`` (None) and ``"images"``: `image_figures`.
-    Raises ImageError, CardMismatchError, OptionError, SplitError.
+    """Compute the figures of a camera model on labeled images; ``split`` None is that of the test images if there are
+    any, else of the validation images. Raises ImageError, CardMismatchError, OptionError, SplitError.
     """
     perceive = Perceiver([model], provider=provider, precision=precision)
     (card,) = perceive.cards
@@ -71,19 +63,13 @@ def evaluate_images(
         "providers": dict(perceive.providers),
         "split": split,
         "fold": None,
-        "images": image_figures(card.classes, np.stack(counts), n_resamples),
+        "images": image_figures(card.classes, np.stack(counts)),
     }
 
 
 def image_figures(classes: Sequence[str], counts: NDArray[np.int64], n_resamples: int = 1000) -> dict[str, Any]:
-    """Figures of the summed confusion matrices of images, with 95 % intervals over resampled images.
-
-    classes : sequence of C str
-    counts : (n, C, C) int64; of each image; rows are the truth.
-    Returns: ``"n_images"``; ``"all"``: ``mean_iou`` over the classes that occur, ``mean_accuracy`` (mean recall of
-        the classes), ``accuracy``, ``n_pixels``; ``"classes"``: ``iou``, ``precision``, ``recall``, ``n_pixels``,
-        ``n_images`` of each class. Shares have four decimals, None for those of no pixels, and with each its
-        ``..._interval``, None with fewer than two images.
+    """Figures of the summed confusion matrices (n, C, C) of images, of all and of each class, with 95 % intervals over
+    resampled images (None with fewer than two); shares have four decimals, None for those of no pixels.
     """
     n, n_classes, _ = counts.shape
     rng = np.random.default_rng(0)

@@ -50,20 +50,8 @@ def count_causes(
     boxes: Sequence[Box],
     drive: str,
 ) -> Counts:
-    """Count the wrong points of one scan by cause.
-
-    points : (n, 3 or more) float32; x, y, z [m] in the frame of the models.
-    labels, right : (n,) uint8; predicted and true class, indices into `POINT_CLASSES`. Values of ``right`` beyond
-        them are unknown.
-    known, in_view : (n,) bool; points that count, and points that have a prediction.
-    boxes : the true boxes.
-    Returns dict of tuple of str to Counter: ``("errors", "points")``: number of points by (error, cause). The cause
-        ``"all"`` has all points of an error, ``"of"`` the points that it is a share of: true points of the class if
-        they are missed, predicted ones if they are false. ``("errors", "scans")``: 1 by (error, cause, drive) with
-        points. ``("errors", "objects")``: 1 by (error, cause, `object_key`) with missed points. The error `BUMPER`
-        has all points in view that are labeled car at the bumper of the own vehicle, except those of true objects.
-        Where the truth is unknown, there may be a car next to the ego vehicle; the cause `FLOOR` counts the points
-        on the ground alone.
+    """Count one scan's wrong points by (error, cause), and 1 by drive and by missed object. The cause "all" has all of
+    an error, "of" what it is a share of. Where the truth is unknown, `BUMPER` may be a car.
     """
     scan = _Scan(points, boxes)
     at_bumper = scan.at_bumper & in_view & (labels == 1) & ~((right > 0) & (right < len(POINT_CLASSES)))

@@ -7,7 +7,7 @@ AP is the area of the precision over recall beyond 0.1 of both, averaged over th
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -44,24 +44,14 @@ class CenterTable:
         )
 
 
-def count_centers(
-    boxes: Sequence[Box],
-    to_find: Sequence[Box],
-    ignored: Sequence[Box],
-    drive: str,
-    unknown: Collection[str] = ("ignore",),
-) -> CenterTable:
-    """Match the detections of one scan.
-
-    boxes : detections where objects are labeled.
-    to_find, ignored : from `metrics.boxes_to_find`. A detection without a match does not count if an ignored object
-        of its class or of an ``unknown`` class is as near as a match.
-    unknown : collection of str
+def count_centers(boxes: Sequence[Box], to_find: Sequence[Box], ignored: Sequence[Box], drive: str) -> CenterTable:
+    """Match the detections of one scan, where objects are labeled, with those of `metrics.boxes_to_find`; one without a
+    match does not count if an ignored object of its class or of the class ``ignore`` is as near as a match.
     """
     table = CenterTable()
     for label, farthest_m in CLASSES.items():
         rights = [box for box in to_find if box.label == label and math.hypot(*box.center[:2]) <= farthest_m]
-        spares = [box for box in ignored if box.label == label or box.label in unknown]
+        spares = [box for box in ignored if box.label in (label, "ignore")]
         guesses = [box for box in boxes if box.label == label and math.hypot(*box.center[:2]) <= farthest_m]
         guesses.sort(key=lambda box: -box.score)
         away_m, spare_m = _distances(guesses, rights), _distances(guesses, spares)
@@ -72,10 +62,8 @@ def count_centers(
 
 
 def center_scores(table: CenterTable, label: str) -> dict[str, float]:
-    """Scores of one class: ``"ap"``, ``"ap_0.5"`` .. ``"ap_4"``, and the errors of matches within 2 m.
-
-    ``"ate"`` is the mean error of the place [m], ``"ase"`` that of the size and ``"aoe"`` that of the heading [rad];
-    means over the recalls from 0.1 to the largest one, 1 if that is not reached. All are NaN without objects.
+    """AP of one class, mean and by distance; mean errors of matches within 2 m of place [m], size and heading [rad],
+    over recalls from 0.1 to the largest one, 1 if that is not reached. All are NaN without objects.
     """
     n_truth = len(table.objects.get(label, ()))
     curves = {d: _curve(table.guesses.get((label, d), ()), n_truth) for d in DISTANCES_M}

@@ -7,7 +7,7 @@ over resampled drives.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import groupby
@@ -19,7 +19,6 @@ from ..datasets.layout import known_layouts
 from ..datasets.scan_folder import ScanFolder
 from ..errors import OptionError, PointsError
 from ..perceiver import Learned, Perceiver
-from ..simulation.samples import FIRST_SEED
 from ..system.pool import MOST_FIRST, taken
 from ..system.ray_cluster import ENGINES
 from ..types.mounting import Mounting
@@ -27,6 +26,7 @@ from ..zoo import DEFAULT
 from .judge import BY_DEFAULT, NETWORK_ALONE, Judge, Perceiving
 from .mistakes import Mistakes
 from .tables import Record, figures
+from .truth import Truth, seeds_of
 
 __all__ = ["NETWORK_ALONE", "Perceiving", "evaluate"]
 
@@ -209,45 +209,35 @@ def _folder(dataset: str | Path) -> ScanFolder | None:
 
 
 def _folder_scans(judge: Judge, folder: ScanFolder, split: str, fold: int | None) -> list[_Scan]:
-    names = _names(folder, split, fold)
-    if not names:
-        raise PointsError(
-            f"{folder.root} has no scans of the {split} drives (fold: {fold}); pass another split, or 'all'"
-        )
-    block, drives = f"{OF_FOLDER}{folder.layout.name}", folder.drives
-    return [(block, drives[name], _later(judge.record_scan, folder.frame, name)) for name in names]
+    block = f"{OF_FOLDER}{folder.layout.name}"
+    return [
+        (block, folder.drives[name], partial(lambda name: judge.record_scan(folder.frame(name)), name))
+        for name in _names(folder.root, folder, split, fold)
+    ]
 
 
-def _names(scans: ScanFolder | KittiObjects | SemanticKitti, split: str, fold: int | None) -> list[str]:
+def _names(
+    dataset: str | Path, scans: ScanFolder | KittiObjects | SemanticKitti, split: str, fold: int | None
+) -> list[str]:
     parts = ("validation", "test") if split == "held-back" else (split,)
-    return [name for part in parts for name in scans.names(part, fold=fold)]
+    names = [name for part in parts for name in scans.names(part, fold=fold)]
+    if not names:
+        raise PointsError(f"{dataset} has no scans of the {split} drives (fold: {fold}); pass another split, or 'all'")
+    return names
 
 
 def _scans(judge: Judge, dataset: str | Path, split: str, fold: int | None) -> list[_Scan]:
     """For each scan of the other kinds: its block of figures, and a function that evaluates it."""
-    kind, _, number = str(dataset).partition(":")
-    if kind == "simulation":
-        if not (number or "24").isdecimal() or number == "0":
-            raise PointsError(f"got {dataset!r}; expected simulation, or simulation:N with a number of scans from 1")
-        seeds = range(FIRST_SEED, FIRST_SEED + int(number or 24))
-        return [("simulated", None, _later(judge.record, judge.simulated, seed)) for seed in seeds]
+
+    def later(block: str, truth_of: Callable[[Any], Truth], names: Iterable[Any]) -> list[_Scan]:
+        return [(block, None, partial(lambda name: judge.record(truth_of(name)), name)) for name in names]
+
+    if str(dataset).partition(":")[0] == "simulation":
+        return later("simulated", judge.simulated, seeds_of(str(dataset)))
     root = Path(dataset)
     if (root / "training" / "label_2").is_dir():
         objects = KittiObjects(root)
-        names = _names(objects, split, fold)
-        read = objects.frame
-        scans: list[_Scan] = [("real", None, _later(judge.record, lambda n: judge.kitti(read(n)), n)) for n in names]
-    else:
-        sequences = SemanticKitti(root)
-        names = _names(sequences, split, fold)
-        frame_of = sequences.frame
-        scans = [
-            ("semantickitti", None, _later(judge.record, lambda n: judge.semantickitti(frame_of(n)), n)) for n in names
-        ]
-    if not scans:
-        raise PointsError(f"{dataset} has no scans of the {split} drives (fold: {fold}); pass another split, or 'all'")
-    return scans
-
-
-def _later(evaluate: Callable[[Any], _Figures], read: Callable[[Any], Any], name: object) -> Callable[[], _Figures]:
-    return lambda: evaluate(read(name))
+        return later("real", lambda name: judge.kitti(objects.frame(name)), _names(dataset, objects, split, fold))
+    roads = SemanticKitti(root)
+    names = _names(dataset, roads, split, fold)
+    return later("semantickitti", lambda name: judge.semantickitti(roads.frame(name)), names)

@@ -21,14 +21,8 @@ RIGHT_DEG = 0.1  # of an elevation
 
 
 def find_sensors(datasets: Sequence[str]) -> dict[str, dict[str, Any]]:
-    """Find the sensor of each set of scans: of each of its first three scans alone, and of the three together.
-
-    datasets : ``SENSOR=SOURCE``, a sensor's name or the file of a profile, and ``simulation`` or a scan file, folder or
-        capture; a capture that names its sensor; or labeled scans (`scan_folder.ScanFolder.parse`).
-    Returns: By dataset ``"sensor"``; ``"found"``, the distinct names; how many of the estimates were ``"right"``,
-        ``"cannot_tell"`` and ``"wrong"``; and ``"off_deg"``, the largest error of an elevation, None if none was told.
-        Right is an estimate whose beams are all within 0.1 degrees of one of the sensor each, without a gap.
-    Raises PointsError, SensorError.
+    """Find the sensor of each set: of its first three scans, each alone, and of all. An estimate is right if its beams
+    are all within 0.1 degrees of one of the sensor each, without a gap. Raises PointsError, SensorError.
     """
     return {dataset: _of_one(*_source(dataset)) for dataset in datasets}
 

@@ -22,19 +22,13 @@ FRAME_S = 0.1
 
 @dataclass(frozen=True, slots=True)
 class Standing:
-    """Counts of boxes of tracks that match a label, without ignored ones.
-
-    n_boxes, n_tracks : boxes, and tracks with at least one of them.
-    n_resolved : boxes with a front (`edgeperc.Box.front`); for the others the heading is known up to half a turn.
-    n_right : boxes with a front, whose heading is less than a quarter turn from the label's.
-    n_right_of_all : all boxes whose heading is less than a quarter turn from the label's.
-    """
+    """Counts of boxes of tracks that match a label, without ignored ones."""
 
     n_boxes: int = 0
     n_tracks: int = 0
-    n_resolved: int = 0
-    n_right: int = 0
-    n_right_of_all: int = 0
+    n_resolved: int = 0  # with a front (`edgeperc.Box.front`); the others' heading is known up to half a turn
+    n_right: int = 0  # of these, less than a quarter turn from the label's heading
+    n_right_of_all: int = 0  # of all boxes
 
     def __add__(self, other: Standing) -> Standing:
         return Standing(*(a + b for a, b in zip(astuple(self), astuple(other), strict=True)))
@@ -53,11 +47,7 @@ class Headings:
 
 
 def speeds(truth: Sequence[FrameTruth], tracks: Sequence[Tracks]) -> list[NDArray[np.float64]]:
-    """Speed over ground of each true box, from its places up to `WINDOW` frames before and after.
-
-    tracks : one for each frame; their ``T_world_sensor`` is used.
-    Returns list of (n,) float64: By frame [m/s]; NaN for an object without other frames nearby.
-    """
+    """Speed over ground of each true box by frame [m/s], from places up to `WINDOW` frames away; NaN without others."""
     places: list[dict[int, NDArray[np.float64]]] = []
     for frame, result in zip(truth, tracks, strict=True):
         world = frame.boxes[:, :3] @ result.T_world_sensor[:3, :3].T + result.T_world_sensor[:3, 3]
@@ -77,12 +67,7 @@ def speeds(truth: Sequence[FrameTruth], tracks: Sequence[Tracks]) -> list[NDArra
 def count_headings(
     truth: Sequence[FrameTruth], tracks: Sequence[Tracks], labels: Collection[str], iou_threshold: float
 ) -> Headings:
-    """Count right headings in one sequence.
-
-    tracks : one for each frame.
-    labels : collection of str; labels of the tracks that count.
-    iou_threshold : smallest 3-D IoU of a track and its label.
-    """
+    """Count right headings in one sequence, of tracks of ``labels`` whose 3-D IoU with a label is large enough."""
     rows: list[tuple[int, int, bool, bool]] = []  # kind, track, resolved, right
     moved: set[int] = set()
     for frame, result, speed in zip(truth, tracks, speeds(truth, tracks), strict=True):

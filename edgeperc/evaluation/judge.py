@@ -76,20 +76,8 @@ NETWORK_ALONE = Perceiving(boxes_from="network", rules=())
 
 
 class Judge:
-    """Perceives scans and compares the results with their truth.
-
-    models : names of shipped models, or paths. Range-image models are evaluated by points, top-view models by boxes
-        and cells.
-    n_threads : as in `Perceiver`.
-    road_by : a top-view model that supplies the true road of KITTI frames, because KITTI's labels have no road.
-        SSADNet (3.1.2) uses LoDNN in this way.
-    training_scans : also evaluate scans that a model was trained on.
-    mounted : perceive each scan as a sensor mounted so would have recorded it, with the mounting to be estimated from
-        this scan alone. Points (not pixels) and boxes are evaluated. None: as recorded, on the training vehicle.
-    sensor : the sensor of the scans for `record_scan`, with what is known of its mounting; their points are evaluated
-        by the classes of the model. None: the training vehicle's, and `POINT_CLASSES`; where
-        surroundings are told apart, simulated scans by the classes of the model, too.
-    Raises ModelError, OptionError.
+    """Compares perceptions with their truth. ``road_by`` draws the road that KITTI's labels lack (SSADNet 3.1.2);
+    ``mounted``: scans as of a sensor mounted so, found from each alone; ``sensor``: of `record_scan`.
     """
 
     def __init__(
@@ -147,10 +135,7 @@ class Judge:
         self.trained_on = {} if training_scans else training_scans_of(cards)
 
     def kitti(self, frame: Frame) -> Truth:
-        """The truth of a KITTI frame.
-
-        Raises SplitError.
-        """
+        """The truth of a KITTI frame; raises SplitError."""
         check_unseen(self.trained_on, frame.name, frame.drive, frame.points)
         if self.draw_road is None:
             return kitti_truth(frame, self.view)
@@ -160,10 +145,7 @@ class Judge:
         return kitti_truth(frame, self.view, (f"road drawn by {card.name} {card.version}", drawn.road))
 
     def semantickitti(self, frame: RoadFrame) -> Truth:
-        """The truth of a SemanticKITTI frame.
-
-        Raises SplitError.
-        """
+        """The truth of a SemanticKITTI frame; raises SplitError."""
         check_unseen(self.trained_on, frame.name, frame.drive, frame.points)
         return semantickitti_truth(frame, self.view)
 
@@ -172,20 +154,12 @@ class Judge:
         return simulated_truth(seed, self.view, self.point_classes)
 
     def record(self, truth: Truth) -> tuple[Record, Mistakes | None]:
-        """Evaluate one scan.
-
-        truth : from `kitti`, `semantickitti` or `simulated`.
-        Returns record: Counts for `edgeperc.evaluation.tables.figures`.
-        Returns mistakes: None if the objects of the scan are not labeled.
-        """
+        """Evaluate one scan; there are no mistakes of scans whose objects are not labeled."""
         perception = self._perceive(truth.points)
         return self._compare(truth, perception, perception.boxes)
 
     def record_scan(self, frame: ScanFrame) -> tuple[Record, Mistakes | None]:
-        """Evaluate one scan of a `ScanFolder`, perceived as a user's: its mounting is found from scans of its drive.
-
-        Raises SplitError.
-        """
+        """Evaluate a scan of a `ScanFolder` as a user's: its mounting is that of its drive. Raises SplitError."""
         truth, perception, scan_boxes = self._perceive_frame(frame)
         return self._compare(truth, perception, scan_boxes)
 
@@ -218,7 +192,7 @@ class Judge:
             shown = (x > -2.0) & (x < 52.0) & (np.abs(y) < 27.0)
             mistakes = Mistakes(truth.name, truth.drive, truth.points[shown], np.zeros(int(shown.sum()), np.uint8))
             if self.box_classes or perception.points is not None:
-                seen = (box for box, n in zip(truth.boxes, truth.returns, strict=True) if n >= FEWEST_RETURNS)
+                seen = (box for box, n in truth.counted if n >= FEWEST_RETURNS)
                 tallies["labeled",] = Counter(object_key(truth.drive, box) for box in seen)
             if self.box_classes:
                 mistakes = self._count_boxes(tallies, truth, perception, mistakes)
@@ -241,25 +215,17 @@ class Judge:
     def _count_boxes(
         self, tallies: dict[tuple[str, ...], Any], truth: Truth, perception: Perception, mistakes: Mistakes
     ) -> Mistakes:
-        """Match boxes where the truth is known; predicted and true ones with their center elsewhere count for nothing.
-
-        Boxes of the classes and in the view that are detected are matched by axis-aligned and by oriented footprints.
-        Vehicles, pedestrians and cyclists are matched all round, detected or not.
-        """
-
-        def known(box: Box) -> bool:
-            return bool(truth.known(np.array([box.center]))[0])
-
-        predicted = [box for box in perception.boxes if known(box)]
-        returns = list(zip(truth.boxes, truth.returns, strict=True))
+        """Match boxes where the truth is known, of detected classes in the view, and of the three kinds all round."""
+        predicted = [box for box in perception.boxes if truth.knows(box)]
+        returns = truth.counted
         classes, view = self.box_classes, self.detected_in
         detected = [b for b in predicted if b.label in classes and (view is None or view.holds(*b.center[:2]))]
-        to_find, ignored = boxes_to_find(returns, view, classes, known=known)
+        to_find, ignored = boxes_to_find(returns, view, classes, known=truth.knows)
         for kind in ("upright", "oriented"):
             evaluator = tallies["boxes", kind] = BoxEvaluator(oriented=kind == "oriented", together=VEHICLES)
             pairs = evaluator.update(detected, to_find, ignored=ignored, drive=truth.drive)
         every = tuple(name for classes, _ in ALL_ROUND.values() for name in classes)
-        to_find, ignored = boxes_to_find(returns, None, every, known=known)
+        to_find, ignored = boxes_to_find(returns, None, every, known=truth.knows)
         for group, (names, least_iou) in ALL_ROUND.items():
             evaluator = tallies["all_round", group] = BoxEvaluator(least_iou, together=names)
             guesses, rights = ([box for box in boxes if box.label in names] for boxes in (predicted, to_find))
@@ -276,15 +242,11 @@ class Judge:
         self, tallies: dict[tuple[str, ...], Any], truth: Truth, boxes: Sequence[Box], scan_boxes: Sequence[Box]
     ) -> None:
         """Match all boxes as KITTI's benchmark does, in its image or all round, and as nuScenes does, all round."""
-
-        def known(box: Box) -> bool:
-            return bool(truth.known(np.array([box.center]))[0])
-
-        predicted = [box for box in boxes if known(box)]
+        predicted = [box for box in boxes if truth.knows(box)]
         if truth.box_labels is not None:
             predicted = [replace(box, label=box_label(box.label, truth.box_labels)) for box in predicted]
-        returns = list(zip(truth.boxes, truth.returns, strict=True))
-        to_find, ignored = boxes_to_find(returns, None, {box.label for box in truth.boxes} - {IGNORED}, known=known)
+        labels = {box.label for box in truth.boxes} - {IGNORED}
+        to_find, ignored = boxes_to_find(truth.counted, None, labels, known=truth.knows)
         if truth.front is not None:
             tallies["kitti",] = count_in_image(truth.front, scan_boxes, truth.drive)
         else:
@@ -299,25 +261,24 @@ class Judge:
         mistakes: Mistakes,
         shown: NDArray[np.bool_],
     ) -> Mistakes:
-        """Count point labels after refinement, pixel labels before it, and the causes of wrong labels.
-
-        Objects of classes without evaluated boxes count as found if at least half of their points have their label.
+        """Count labels of points, of pixels before refinement, and causes of wrong ones. Objects of classes without
+        evaluated boxes count as found if at least half of their points have their label.
         """
         assert self.from_sensor is not None
         assert truth.labels is not None
         right = np.where(predicted.in_view, truth.labels, IGNORE).astype(np.uint8)
         range_m = np.hypot(truth.points[:, 0], truth.points[:, 1])
-        labels = _renamed(predicted.labels, predicted.classes, truth.classes)
+        labels = renamed(predicted.labels, predicted.classes, truth.classes)
         tallies |= banded(("points",), truth.classes, labels, right, range_m)
         objects = tuple(name for name in truth.classes if name not in STATIC)
-        own, true = (_renamed(each, truth.classes, objects) for each in (labels, right))
+        own, true = (renamed(each, truth.classes, objects) for each in (labels, right))
         sure = np.where((true > 0) & find_ground(truth.points).mask, IGNORE, true).astype(np.uint8)
         for box in truth.boxes:
             if box.label == SITTING:
                 sure[inside(box, truth.points)] = IGNORE
         tallies |= banded(("sure",), objects, own, sure, range_m)
         if self.as_recorded:
-            pixels = _renamed(self.from_sensor.point_labels(truth.points), predicted.classes, truth.classes)
+            pixels = renamed(self.from_sensor.point_labels(truth.points), predicted.classes, truth.classes)
             tallies |= banded(("pixels",), truth.classes, pixels, right, range_m)
         counted = right != IGNORE
         if truth.classes == POINT_CLASSES:
@@ -355,7 +316,7 @@ class Judge:
                 classes, right = _without_vehicles(classes, right)
             if len(classes) < 2:
                 continue
-            labels = _renamed(view.labels, view.classes, classes)
+            labels = renamed(view.labels, view.classes, classes)
             tallies |= banded(("segmentation", table), classes, labels, right, self.cell_range_m)
         if truth.road is None or "drivable" not in view.classes:
             return
@@ -423,11 +384,8 @@ def _without_vehicles(classes: tuple[str, ...], right: NDArray[np.uint8]) -> tup
     return others, number[right]
 
 
-def _renamed(labels: Labels, names: Sequence[str], classes: Sequence[str]) -> NDArray[np.uint8]:
-    """Convert a model's labels to those of a table; classes that the table lacks become its first class.
-
-    `IGNORE` stays as it is.
-    """
+def renamed(labels: Labels, names: Sequence[str], classes: Sequence[str]) -> NDArray[np.uint8]:
+    """A model's labels as those of a table, whose first class stands for what it lacks; `IGNORE` stays as it is."""
     coarse = {"drivable": "road", **dict.fromkeys(VEHICLES, "vehicle")}
     renamed = [name if name in classes else coarse.get(name, "") for name in names]
     numbers = np.full(IGNORE + 1, IGNORE, np.uint8)

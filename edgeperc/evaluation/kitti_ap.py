@@ -15,11 +15,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..datasets.kitti import IMAGE_SIZE, IMAGE_SIZES, KittiCalibration, KittiLabels
-from ..types.geometry import oriented_iou, shared_area
 from ..types.perception import Box
-from .metrics import EVERYWHERE, ObjectKey, interpolated_precision, object_key
-
-N_POSITIONS = 40  # recall positions of the curve, without recall 0
+from .metrics import (
+    EVERYWHERE,
+    N_POSITIONS,
+    ObjectKey,
+    box_overlaps,
+    box_rows,
+    interpolated_precision,
+    object_key,
+    recall_positions,
+)
 
 # Smallest IoU of a match, the benchmark's own and a looser one, and neighboring classes that a detector may find.
 CLASSES = {
@@ -37,17 +43,11 @@ BIRDS_EYE, IN_3D = "bird's eye", "3-D"
 
 @dataclass(frozen=True, slots=True)
 class Counts:
-    """Matches of one scan, for one class and one rule.
+    """Matches of one scan, for one class and one rule."""
 
-    objects : one for each object to find.
-    hits : scores of the first pass: of the best detection of each object.
-    steps : tuple of (float, int, int); change of the number of true and of false positives as the threshold falls to a
-        score, best score first.
-    """
-
-    objects: tuple[ObjectKey, ...]
-    hits: tuple[float, ...]
-    steps: tuple[tuple[float, int, int], ...]
+    objects: tuple[ObjectKey, ...]  # one for each object to find
+    hits: tuple[float, ...]  # scores of the first pass: of the best detection of each object
+    steps: tuple[tuple[float, int, int], ...]  # change of true and false positives as the threshold falls to a score
 
 
 @dataclass(slots=True)
@@ -87,17 +87,14 @@ def image_size_of(drive: str) -> tuple[int, int]:
 
 
 def count_in_image(truth: FrontTruth, boxes: Sequence[Box], drive: str) -> ApTable:
-    """Count the matches of one scan as KITTI's benchmark does.
-
-    truth : DontCare rectangles have no 3-D boxes, so no detection is excused by them from above and in 3-D.
-    boxes : detections in the sensor frame. Those that the image does not show are left out, as in a submission. The
-        rectangle of a detection is its projection, clipped to the image.
+    """Count the matches of one scan as KITTI's benchmark does. Detections that the image does not show are left out, as
+    in a submission. DontCare has no 3-D boxes, so it excuses no detection from above and in 3-D.
     """
-    kinds, numbers = _objects(truth.labels)
+    kinds, numbers = truth.labels.objects
     placed = truth.calibration.sensor_boxes(numbers[:, 7:14])
     right_m = np.hypot(placed[:, 0], placed[:, 1])
     objects = [_key(drive, kind, row) for kind, row in zip(kinds, numbers, strict=True)]
-    guesses = _rows(boxes)
+    guesses = box_rows(boxes)
     seen = truth.calibration.image_rectangles(guesses, truth.image_size)
     shown = ((seen[:, 2:] - seen[:, :2]) > 0.0).all(axis=1)
     guesses, seen, boxes = guesses[shown], seen[shown], [boxes[k] for k in np.flatnonzero(shown).tolist()]
@@ -113,95 +110,46 @@ def count_in_image(truth: FrontTruth, boxes: Sequence[Box], drive: str) -> ApTab
         columns = np.flatnonzero([kind == label or kind in neighbors for kind in kinds])
         rows = np.flatnonzero(small | np.array([box.label == label for box in boxes], np.bool_))
         optional = [bool(hidden[k]) or kinds[k] != label for k in columns]
-        table.counts[label, f"{overlap_name} {least_iou:g}", level] = (
-            count_matches(
-                overlaps[overlap_name][np.ix_(rows, columns)],
-                [boxes[k].score for k in rows],
-                least_iou,
-                [objects[k] for k in columns],
-                optional=optional,
-                small=small[rows].tolist(),
-                excused=((guess_m < near) | (guess_m >= far))[rows].tolist(),
-            ),
-        )
+        excused = ((guess_m < near) | (guess_m >= far))[rows].tolist()
+        own = overlaps[overlap_name][np.ix_(rows, columns)], [boxes[k].score for k in rows], least_iou
+        counts = count_matches(*own, [objects[k] for k in columns], optional, small[rows].tolist(), excused)
+        table.counts[label, f"{overlap_name} {least_iou:g}", level] = (counts,)
     return table
 
 
-def count_all_round(
-    boxes: Sequence[Box],
-    to_find: Sequence[Box],
-    ignored: Sequence[Box],
-    drive: str,
-    unknown: Collection[str] = ("ignore",),
-) -> ApTable:
-    """Count the matches of one scan without the limits in the image.
-
-    boxes : detections where objects are labeled.
-    to_find, ignored : from `metrics.boxes_to_find`. Ignored objects of a class, of its neighbors or of an ``unknown``
-        class may be found; those of other classes may not.
-    unknown : collection of str
-    """
+def count_all_round(boxes: Sequence[Box], to_find: Sequence[Box], ignored: Sequence[Box], drive: str) -> ApTable:
+    """Count the matches of a scan without limits in the image; ignored, neighbors and ``ignore`` may be found."""
     every = [*to_find, *ignored]
-    guesses, rights = _rows(boxes), _rows(every)
+    guesses, rights = box_rows(boxes), box_rows(every)
     guess_m, right_m = (np.hypot(rows[:, 0], rows[:, 1]) for rows in (guesses, rights))
     overlaps = _overlaps(guesses, rights)
     table = ApTable()
     for label, overlap_name, least_iou, level, (near, far) in _rules((ALL_ROUND,), ALL_ROUND):
-        may_be = (label, *CLASSES[label][1], *unknown)
+        may_be = (label, *CLASSES[label][1], "ignore")
         columns = [k for k, box in enumerate(every) if box.label in may_be]
         rows = [k for k, box in enumerate(boxes) if box.label == label]
         optional = [k >= len(to_find) or every[k].label != label or not near <= right_m[k] < far for k in columns]
-        table.counts[label, f"{overlap_name} {least_iou:g}", level] = (
-            count_matches(
-                overlaps[overlap_name][np.ix_(rows, columns)],
-                [boxes[k].score for k in rows],
-                least_iou,
-                [object_key(drive, every[k]) for k in columns],
-                optional=optional,
-                small=[False] * len(rows),
-                excused=[not near <= guess_m[k] < far for k in rows],
-            ),
-        )
+        excused = [not near <= guess_m[k] < far for k in rows]
+        own = overlaps[overlap_name][np.ix_(rows, columns)], [boxes[k].score for k in rows], least_iou
+        keys = [object_key(drive, every[k]) for k in columns]
+        counts = count_matches(*own, keys, optional, [False] * len(rows), excused)
+        table.counts[label, f"{overlap_name} {least_iou:g}", level] = (counts,)
     return table
 
 
-def best_candidates(
-    truth: FrontTruth, candidates: Sequence[Box], drive: str, level: str = "moderate"
-) -> list[Candidate]:
-    """Find the best candidate of each object of a level.
-
-    Parameters
-    ----------
-    truth : FrontTruth
-    candidates : sequence of Box
-        Of any class and score, in the sensor frame, such as rectangles around clusters. One may cover several objects.
-    drive : str
-    level : {"easy", "moderate", "hard"}
-
-    Returns
-    -------
-    list of Candidate
-        One for each object of `CLASSES` within the limits of the level; IoU 0 without a candidate.
-    """
-    kinds, numbers = _objects(truth.labels)
+def best_candidates(truth: FrontTruth, candidates: Sequence[Box], drive: str) -> list[Candidate]:
+    """The best candidate, of any class and score, for each "moderate" object of `CLASSES`; IoU 0 without one."""
+    kinds, numbers = truth.labels.objects
     placed = truth.calibration.sensor_boxes(numbers[:, 7:14])
     best = np.zeros(len(kinds))
     if candidates:
-        guesses = truth.calibration.in_camera(_rows(candidates))
+        guesses = truth.calibration.in_camera(box_rows(candidates))
         best = _overlaps(guesses, _level_rows(numbers[:, 7:14]))[BIRDS_EYE].max(axis=0)
     return [
         Candidate(_key(drive, kinds[k], numbers[k]), kinds[k], float(np.hypot(*placed[k, :2])), float(best[k]))
-        for k in np.flatnonzero(~_hidden(numbers, level)).tolist()
+        for k in np.flatnonzero(~_hidden(numbers, "moderate")).tolist()
         if kinds[k] in CLASSES
     ]
-
-
-def candidate_recall(found: Sequence[Candidate], least_iou: float = 0.3) -> dict[str, tuple[float, int]]:
-    """Share of the objects of each class with a candidate of at least this IoU, and the number of objects."""
-    by_class = {
-        label: [candidate.iou >= least_iou for candidate in found if candidate.label == label] for label in CLASSES
-    }
-    return {label: (sum(hits) / len(hits) if hits else math.nan, len(hits)) for label, hits in by_class.items()}
 
 
 def count_matches(
@@ -209,23 +157,12 @@ def count_matches(
     scores: Sequence[float],
     least_iou: float,
     objects: Sequence[ObjectKey],
-    *,
     optional: Sequence[bool],
     small: Sequence[bool],
     excused: Sequence[bool],
 ) -> Counts:
-    """Match detections to objects in the two passes of the development kit, at every threshold at which they change.
-
-    Objects choose in their order: in the first pass the detection with the best score, in the second, among those
-    that reach the threshold, the one with the largest overlap, and one that is not small before one that is.
-
-    overlaps : (n, m) float64; IoU of each detection with each object.
-    scores : sequence of float, n
-    least_iou : a match has a larger IoU.
-    objects : sequence of ObjectKey, m
-    optional : sequence of bool, m; objects that may be found but need not.
-    small : sequence of bool, n; detections too small in the image: neither hits nor false positives.
-    excused : sequence of bool, n; detections that are not false positives, but may be hits.
+    """Match detections (n) to objects (m) in the kit's two passes, at every threshold at which they change. Objects
+    choose in order: by score, then by overlap among those above the threshold, preferring what is not small.
     """
     candidates = [
         [(j, float(overlaps[j, k])) for j in np.flatnonzero(overlaps[:, k] > least_iou).tolist()]
@@ -276,13 +213,8 @@ def _second_pass(
 
 
 def average_precisions(counts: Sequence[Counts]) -> tuple[float, float, float]:
-    """Average precision of any number of scans.
-
-    Returns ap_r40, ap_r11: As the development kit computes it: precision at the thresholds of 41 recall positions,
-        best from each on; the mean without recall 0, and of every fourth. With fewer than 41 objects there are fewer
-        thresholds than positions, and the others count as 0.
-    Returns ap: Mean of the best precision at recalls 1/40, 2/40 .. 1, read from the whole curve; for any number of
-        objects. All are NaN without objects.
+    """AP at 40 and at 11 recall positions as the kit computes it (with fewer than 41 objects the positions left count
+    as 0), and at recalls 1/40 .. 1 read from the whole curve. All are NaN without objects.
     """
     n_truth = sum(len(count.objects) for count in counts)
     if n_truth == 0:
@@ -303,19 +235,6 @@ def average_precisions(counts: Sequence[Counts]) -> tuple[float, float, float]:
     return float(curve[1:].mean()), float(curve[::4].mean()), ap
 
 
-def recall_positions(n_hits: int, n_truth: int) -> Iterator[int]:
-    """Which hits, best first, give the thresholds of the recall positions (``getThresholds``)."""
-    recall, k = 0.0, 0
-    while k < n_hits:
-        # All but a few of the hits that are skipped, without a loop over them.
-        k = max(k, min(int(n_truth * recall - 1.5) - 2, n_hits - 1))
-        while k < n_hits - 1 and (k + 2) / n_truth - recall < recall - (k + 1) / n_truth:
-            k += 1
-        yield k
-        recall += 1.0 / N_POSITIONS
-        k += 1
-
-
 def _rules(levels: Collection[str], of_ranges: str) -> Iterator[tuple[str, str, float, str, tuple[float, float]]]:
     """Class, kind of overlap, smallest IoU, level or range, and range of distances of each row."""
     for label, (least_ious, _) in CLASSES.items():
@@ -325,12 +244,6 @@ def _rules(levels: Collection[str], of_ranges: str) -> Iterator[tuple[str, str, 
                     yield label, overlap_name, least_iou, level, EVERYWHERE
         for band, within_m in RANGES.items():
             yield label, BIRDS_EYE, RANGE_IOU, band, within_m
-
-
-def _objects(labels: KittiLabels) -> tuple[list[str], NDArray[np.float64]]:
-    """Classes and numbers of the rows that are not DontCare regions."""
-    is_object = np.array([kind != "dontcare" for kind in labels.kinds], np.bool_)
-    return [kind for kind in labels.kinds if kind != "dontcare"], labels.numbers[is_object]
 
 
 def _hidden(numbers: NDArray[np.float64], level: str) -> NDArray[np.bool_]:
@@ -345,11 +258,6 @@ def _key(drive: str, kind: str, numbers: NDArray[np.float64]) -> ObjectKey:
     return object_key(drive, Box(kind, 1.0, (0.0, 0.0, 0.0), (length, width, height), 0.0))
 
 
-def _rows(boxes: Sequence[Box]) -> NDArray[np.float64]:
-    """x, y, z of the center, length, width, height, yaw, (n, 7)."""
-    return np.array([(*box.center, *box.size, box.yaw) for box in boxes], np.float64).reshape(-1, 7)
-
-
 def _level_rows(numbers: NDArray[np.float64]) -> NDArray[np.float64]:
     """Labels (n, 7) in the camera's frame as `KittiCalibration.in_camera` returns boxes."""
     height, width, length, x, y, z, turn = numbers.T
@@ -358,12 +266,4 @@ def _level_rows(numbers: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _overlaps(a: NDArray[np.float64], b: NDArray[np.float64]) -> Mapping[str, NDArray[np.float64]]:
-    """IoU of boxes (n, 7) and (m, 7) from above and in 3-D, (n, m) each."""
-    flat_a, flat_b = a[:, [0, 1, 3, 4, 6]], b[:, [0, 1, 3, 4, 6]]
-    from_above = oriented_iou(flat_a, flat_b)
-    top = np.minimum.outer(a[:, 2] + a[:, 5] / 2.0, b[:, 2] + b[:, 5] / 2.0)
-    bottom = np.maximum.outer(a[:, 2] - a[:, 5] / 2.0, b[:, 2] - b[:, 5] / 2.0)
-    shared = shared_area(from_above, flat_a, flat_b) * np.maximum(top - bottom, 0.0)
-    volumes = np.add.outer(a[:, 3:6].prod(axis=1), b[:, 3:6].prod(axis=1))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return {BIRDS_EYE: from_above, IN_3D: np.where(shared > 0.0, shared / (volumes - shared), 0.0)}
+    return dict(zip((BIRDS_EYE, IN_3D), box_overlaps(a, b), strict=True))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -16,19 +16,15 @@ from ..types.views import TopViewGeometry
 
 EVERYWHERE = (0.0, math.inf)
 FEWEST_RETURNS = 3  # an object with fewer returns cannot be distinguished from clutter
+N_POSITIONS = 40  # recall positions of KITTI's curves, without recall 0
 HEADING_RAD = math.pi / 4.0  # largest error of a correct heading
 
 ObjectKey = tuple[str, str, float, float, float]
 
 
 class Confusion:
-    """Counts of predicted against true labels, summed over scans or images.
-
-    A class without true and predicted labels has NaN scores.
-
-    classes : sequence of str
-    ignore : int; true label of cells or points that are not counted.
-    counts : (C, C) int64; rows are the truth, columns the prediction.
+    """Counts (C, C) of predicted (columns) against true labels (rows), over scans or images; the true label ``ignore``
+    is not counted. A class without true and predicted labels has NaN scores.
     """
 
     def __init__(self, classes: Sequence[str], *, ignore: int = 255) -> None:
@@ -37,12 +33,7 @@ class Confusion:
         self.counts = np.zeros((len(self.classes), len(self.classes)), dtype=np.int64)
 
     def update(self, predicted: ArrayLike, truth: ArrayLike) -> None:
-        """Count the labels of one scan or image.
-
-        predicted, truth : array_like of int; same shape; indices into ``classes``. ``truth`` may also hold
-            ``ignore``.
-        Raises PointsError.
-        """
+        """Count the labels of one scan or image, two arrays of one shape. Raises PointsError."""
         guess, right = np.asarray(predicted), np.asarray(truth)
         if guess.shape != right.shape:
             raise PointsError(f"got predicted {guess.shape} and truth {right.shape}; expected the same shape")
@@ -100,13 +91,8 @@ class Confusion:
 
 
 def average_precision(scores: ArrayLike, hits: ArrayLike, n_truth: int) -> float:
-    """Eleven-point average precision: mean of the best precision at recalls 0, 0.1 .. 1 (SSADNet equation A4).
-
-    scores : (n,) array_like of float; one for each prediction. Equal scores keep their order.
-    hits : (n,) array_like of bool; whether each prediction is correct.
-    n_truth : number of objects to find.
-    Returns: In 0..1; NaN if ``n_truth`` is 0.
-    Raises PointsError.
+    """Eleven-point average precision: mean of the best precision at recalls 0, 0.1 .. 1 (SSADNet equation A4), NaN
+    without objects to find; equal scores keep their order. Raises PointsError.
     """
     values, right = np.asarray(scores, dtype=np.float64), np.asarray(hits, dtype=np.bool_)
     if values.ndim != 1 or values.shape != right.shape:
@@ -133,22 +119,13 @@ def interpolated_precision(
 
 
 class ProbabilitySweep:
-    """Precision and recall of one class over all thresholds of its probability (KITTI road, LoDNN).
-
-    counts : (2, 256) int64; histograms of the probability in steps of 1/255. Row 0: cells of other classes. Row 1:
-        cells of the class.
-    """
+    """Precision and recall of a class over all thresholds of its probability, from histograms (2, 256) of cells."""
 
     def __init__(self) -> None:
         self.counts = np.zeros((2, 256), dtype=np.int64)
 
     def update(self, probability: ArrayLike, truth: ArrayLike) -> None:
-        """Count one image.
-
-        probability : array_like of float; probability of the class, in 0..1.
-        truth : array_like of bool; same shape. Do not pass cells with unknown truth.
-        Raises PointsError.
-        """
+        """Count the probabilities of cells with known truth in one image. Raises PointsError."""
         values, right = np.asarray(probability, dtype=np.float64), np.asarray(truth, dtype=np.bool_)
         if values.shape != right.shape or not ((values >= 0.0) & (values <= 1.0)).all():
             raise PointsError(
@@ -182,33 +159,21 @@ class ProbabilitySweep:
 
 @dataclass(frozen=True, slots=True)
 class BoxScores:
-    """Scores of the boxes of one class, or of all classes together.
+    """Scores of the boxes of one class, or of all classes together; NaN where nothing is counted."""
 
-    ap : `average_precision`; NaN if there was no box to find.
-    precision, recall : over all predictions with any score; NaN without predictions, or without boxes to find.
-    mean_iou_50, mean_iou_70 : mean IoU of the predictions with an IoU of at least 0.5, or 0.7 (SSADNet table 5); NaN
-        without any.
-    heading, axis : share of the hits whose yaw is within 45 degrees of the true one: over the full turn, where front
-        for rear is wrong, and modulo half a turn. NaN without hits; a yaw that is not finite is wrong.
-    front_known : share of the hits with a known front (`Box.front`); the yaw of the others counts as it is.
-    n_truth, n_predicted, n_hits : ignored boxes are not counted.
-    n_objects, n_found : distinct objects (`object_key`) of the boxes to find, and of the hits.
-    n_drives : drives of the boxes to find.
-    """
-
-    ap: float
-    precision: float
+    ap: float  # `average_precision`
+    precision: float  # of all predictions, with any score
     recall: float
-    mean_iou_50: float
+    mean_iou_50: float  # of predictions with an IoU of at least 0.5 (SSADNet table 5)
     mean_iou_70: float
-    heading: float
-    axis: float
-    front_known: float
-    n_truth: int
+    heading: float  # share of hits within 45 degrees of the true yaw over the full turn; not finite is wrong
+    axis: float  # modulo half a turn
+    front_known: float  # share of the hits with a known `Box.front`
+    n_truth: int  # ignored boxes are not counted
     n_predicted: int
     n_hits: int
-    n_objects: int
-    n_found: int
+    n_objects: int  # distinct objects (`object_key`) of the boxes to find
+    n_found: int  # distinct objects of the hits
     n_drives: int
 
 
@@ -228,17 +193,8 @@ class _Matches:
 
 
 class BoxEvaluator:
-    """Matches predicted boxes to true boxes, over any number of scans.
-
-    In each scan, predictions are matched in the order of their scores. A prediction takes the unmatched true box with
-    the largest IoU (the earlier one on ties), if that IoU reaches the threshold. An unmatched prediction is ignored if
-    its IoU with an ignored box reaches the threshold, or if at least half of it lies in an ignored region. Other
-    unmatched predictions are false positives.
-
-    iou_threshold : smallest IoU of the footprints, seen from above, of a match.
-    oriented : compare the oriented footprints; False compares their axis-aligned bounds, as SSADNet does.
-    together : collection of str; classes that `overall` joins; all by default.
-    Raises PointsError.
+    """Matches predicted boxes to true boxes, over any number of scans: best score first, each to the free true box of
+    the largest IoU from ``iou_threshold`` on. ``together``: classes that `overall` joins; all by default.
     """
 
     def __init__(
@@ -258,23 +214,14 @@ class BoxEvaluator:
         truth: Iterable[Box],
         *,
         ignored: Iterable[Box] = (),
-        ignored_regions: ArrayLike = (),
         drive: str = "",
     ) -> list[tuple[Box | None, Box | None]]:
-        """Count the boxes of one scan.
-
-        ignored : objects that a detector may find but need not: out of view, with too few returns, or of a
-            neighboring class. A prediction of any class may match them.
-        ignored_regions : (r, 5) array_like; x, y, length, width [m], yaw [rad] of areas with unknown truth.
-        drive : the recording; distinct objects are counted by drive.
-        Returns list of (Box or None, Box or None): Pairs of a prediction and its true box, matched regardless of
-            class. A false positive is (box, None), a missed true box (None, box). Ignored predictions are left out.
-        """
+        """Count the boxes of a scan, but those that match ``ignored``, and pair them of any class, or with None."""
         guesses = sorted(predicted, key=lambda box: -box.score)
         rights, spares = list(truth), list(ignored)
         overlap = oriented_iou(self._rectangles(guesses), self._rectangles(rights))
-        excused = (oriented_iou(self._rectangles(guesses), self._rectangles(spares)) >= self.iou_threshold).any(axis=1)
-        excused |= _share_inside(rectangles(guesses), np.asarray(ignored_regions, dtype=np.float64)) >= 0.5
+        spared = oriented_iou(self._rectangles(guesses), self._rectangles(spares)) >= self.iou_threshold
+        excused = np.asarray(spared.any(axis=1))
         for label in dict.fromkeys(box.label for box in (*guesses, *rights)):
             matches = self._classes.setdefault(label, _Matches())
             self._match(matches, guesses, rights, overlap, excused, drive, {label})
@@ -295,21 +242,14 @@ class BoxEvaluator:
         return both
 
     def per_class(self, within_m: tuple[float, float] = EVERYWHERE) -> dict[str, BoxScores]:
-        """Scores of every class so far; predictions are matched to true boxes of their own class only.
-
-        ``within_m`` is a range of horizontal distances from the sensor [m], with the lower and without the upper
-        bound. Only true boxes with their center in it, predictions matched to them, and false positives with their
-        center in it are counted.
+        """Scores of every class so far, each matched within itself; of a range of distances only true boxes with their
+        center in it, predictions matched to them, and false positives with their center in it.
         """
         return {label: self._scores(matches, within_m) for label, matches in self._classes.items()}
 
     def overall(self, within_m: tuple[float, float] = EVERYWHERE) -> BoxScores:
         """Scores of the boxes of the classes ``together``, by default all, as if they were one class."""
         return self._scores(self._all, within_m)
-
-    def mean_ap(self, within_m: tuple[float, float] = EVERYWHERE) -> float:
-        """Mean AP over the classes that have true boxes (SSADNet appendix A, mAP)."""
-        return mean([scores.ap for scores in self.per_class(within_m).values()])
 
     def _rectangles(self, boxes: list[Box]) -> NDArray[np.float64]:
         rows = rectangles(boxes)
@@ -349,7 +289,8 @@ class BoxEvaluator:
             right = pairs[-1][1]
             matches.scores.append(box.score)
             matches.ranges_m.append(_range_m(right or box))
-            matches.turns.append(math.nan if right is None else _turn(box.yaw - right.yaw))
+            turn = math.nan if right is None else box.yaw - right.yaw
+            matches.turns.append(abs(math.remainder(turn, 2.0 * math.pi)) if math.isfinite(turn) else math.nan)
             matches.fronts.append(box.front is not None)
             matches.matched.append(None if right is None else object_key(drive, right))
         return [*pairs, *((None, box) for box in missed.values())]
@@ -391,14 +332,8 @@ def boxes_to_find(
     *,
     known: Callable[[Box], bool] = lambda box: True,
 ) -> tuple[list[Box], list[Box]]:
-    """Split true boxes into those that a detector must find, and those that it may find but need not.
-
-    truth : iterable of (Box, int); true boxes, and the number of returns from each.
-    view : boxes count only if their center is in this view; None: anywhere.
-    classes : collection of str; classes that count.
-    known : whether the scan is labeled at the place of a box.
-    Returns to_find: Boxes that count, where the scan is labeled, with at least `FEWEST_RETURNS` returns.
-    Returns ignored: All others. Pass them to `BoxEvaluator.update` as ``ignored``.
+    """Split true boxes, with their numbers of returns, into those that a detector must find (of the classes, in the
+    view, where the scan is labeled, with `FEWEST_RETURNS`) and all others, which it may find.
     """
     to_find: list[Box] = []
     ignored: list[Box] = []
@@ -408,32 +343,47 @@ def boxes_to_find(
     return to_find, ignored
 
 
-def object_key(drive: str, box: Box) -> ObjectKey:
-    """Identify the object of a true box in all scans of its drive: by its label and its size in centimeters.
+def box_rows(boxes: Iterable[Box]) -> NDArray[np.float64]:
+    """x, y, z of the center, length, width, height, yaw, (n, 7)."""
+    return np.array([(*box.center, *box.size, box.yaw) for box in boxes], np.float64).reshape(-1, 7)
 
-    Labelers give an object one size for all scans. On KITTI's drive 0005 this counts the same 15 objects as the track
-    numbers of its labels.
+
+def box_overlaps(a: NDArray[np.float64], b: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """IoU of boxes (n, 7) and (m, 7) from above and in 3-D, (n, m) each; 0 in 3-D for boxes without a finite volume."""
+    flat_a, flat_b = a[:, [0, 1, 3, 4, 6]], b[:, [0, 1, 3, 4, 6]]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        from_above = oriented_iou(flat_a, flat_b)
+        top = np.minimum.outer(a[:, 2] + a[:, 5] / 2.0, b[:, 2] + b[:, 5] / 2.0)
+        bottom = np.maximum.outer(a[:, 2] - a[:, 5] / 2.0, b[:, 2] - b[:, 5] / 2.0)
+        shared = shared_area(from_above, flat_a, flat_b) * np.maximum(top - bottom, 0.0)
+        volumes = np.add.outer(a[:, 3:6].prod(axis=1), b[:, 3:6].prod(axis=1))
+        return from_above, np.nan_to_num(shared / (volumes - shared), nan=0.0, posinf=0.0, neginf=0.0)
+
+
+def recall_positions(n_hits: int, n_truth: int) -> Iterator[int]:
+    """Which hits, best first, give the thresholds at the recalls 0, 1/40 .. 1 (``getThresholds`` of KITTI's kit)."""
+    recall, k = 0.0, 0
+    while k < n_hits:
+        # All but a few of the hits that are skipped, without a loop over them.
+        k = max(k, min(int(n_truth * recall - 1.5) - 2, n_hits - 1))
+        # With equal distances rounding decides, so this is written as in KITTI's program.
+        while k < n_hits - 1 and (k + 2) / n_truth - recall < recall - (k + 1) / n_truth:
+            k += 1
+        yield k
+        recall += 1.0 / N_POSITIONS
+        k += 1
+
+
+def object_key(drive: str, box: Box) -> ObjectKey:
+    """Identify an object in all scans of its drive by its label and its size in centimeters: labelers give it one. On
+    KITTI's drive 0005 this counts the same 15 objects as the track numbers of its labels.
     """
     length, width, height = (round(side, 2) for side in box.size)
     return drive, box.label, length, width, height
 
 
-def _turn(angle: float) -> float:
-    """Absolute difference of two headings [rad], 0..pi."""
-    return abs(math.remainder(angle, 2.0 * math.pi)) if math.isfinite(angle) else math.nan
-
-
 def _range_m(box: Box) -> float:
     return math.hypot(box.center[0], box.center[1])
-
-
-def _share_inside(rows: NDArray[np.float64], regions: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Largest share of each rectangle's area that lies in one region, (n,)."""
-    if len(rows) == 0 or regions.size == 0:
-        return np.zeros(len(rows))
-    shared = shared_area(oriented_iou(rows, regions), rows, regions)
-    areas = rows[:, 2] * rows[:, 3]
-    return np.asarray(np.max(shared / np.maximum(areas, np.finfo(np.float64).tiny)[:, None], axis=1))
 
 
 def _share(part: ArrayLike, whole: ArrayLike) -> NDArray[np.float64]:

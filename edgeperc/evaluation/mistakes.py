@@ -32,25 +32,16 @@ from ..view.content import drawable_boxes, drawable_points
 
 @dataclass(frozen=True, eq=False)
 class Mistakes:
-    """A scan compared with its ground truth, to be drawn.
-
-    points : (n, 4) float32; the points to draw: x, y, z [m] in the sensor frame, remission.
-    wrong : (n,) uint8; 1: point of an object with another label. 2: background point with the label of an object. 0:
-        all others.
-    found : true boxes that were found.
-    missed : tuple of (Box, int); true boxes that were not found, and the number of points in each.
-    false : predicted boxes where there is no object.
-    wrong_share : wrong points divided by all points that are on objects or were labeled as objects.
-    """
+    """A scan compared with its ground truth, to be drawn."""
 
     name: str
     drive: str
-    points: Points
-    wrong: NDArray[np.uint8]
+    points: Points  # to draw: x, y, z [m] in the sensor frame, remission
+    wrong: NDArray[np.uint8]  # 1: point of an object with another label; 2: background with that of an object
     found: tuple[Box, ...] = ()
-    missed: tuple[tuple[Box, int], ...] = ()
-    false: tuple[Box, ...] = ()
-    wrong_share: float = 0.0
+    missed: tuple[tuple[Box, int], ...] = ()  # with the number of points in each
+    false: tuple[Box, ...] = ()  # where there is no object
+    wrong_share: float = 0.0  # of the points that are on objects or were labeled as objects
 
     @property
     def n_errors(self) -> float:
@@ -93,31 +84,7 @@ _LEGEND = (
 def draw_mistakes(
     scans: Sequence[Mistakes], path: str | Path | None = None, *, title: str = "", columns: int = 3
 ) -> bytes:
-    """Draw missed objects and false detections from above, one panel for each scan.
-
-    Parameters
-    ----------
-    scans : sequence of Mistakes
-        Drawn in this order. Scans without a mistake are only counted in the heading.
-    path : str or Path, optional
-        File to write as well; an existing file is replaced atomically.
-    title : str
-        For example the names of the models.
-    columns : int
-        Largest number of panels side by side.
-
-    Returns
-    -------
-    png : bytes
-        1600 pixels wide.
-
-    Raises
-    ------
-    MissingExtraError
-        matplotlib is not installed.
-    OSError
-        The file cannot be written.
-    """
+    """Draw mistakes from above, a panel for each scan with some; returns a PNG. Raises MissingExtraError, OSError."""
     wrong = [scan for scan in scans if scan.n_errors > 0]
     columns = max(1, min(columns, max(1, len(wrong))))
     # A single panel takes half of the width.

@@ -35,17 +35,8 @@ def evaluate_painting(
     at_m: tuple[float, float, float] = (0.27, 0.0, -0.08),
     on_scene: Callable[[int, int], None] = lambda done, total: None,
 ) -> dict[str, int | float]:
-    """Evaluate painting on simulated streets that no model was trained on.
-
-    at_m : tuple of 3 float; place of the camera in the frame of the LiDAR: x ahead, y left, z up [m].
-    on_scene : called with the number of scenes that are done and their total.
-    Returns: Over all scenes: ``n_scenes``; ``n_points``, painted points at least `EDGE_PX` from edges;
-        ``points_right``, share of them with the class of their surface; ``points_right_untested``, if every point
-        took the class of its pixel, hidden or not; ``points_seen``, share of the points visible to the camera that
-        are painted; ``n_cells``, observed cells of the top view outside vehicles; ``cells_right`` and
-        ``near_cells_right`` (up to 26 m), share of them that are rightly road or not; ``road_iou``; ``road_seen``,
-        share of the road that is observed.
-    Raises OptionError, SensorError, CalibrationError.
+    """Shares of points and observed cells that are painted rightly in simulated streets that no model was trained on,
+    with the camera ``at_m`` in the LiDAR's frame. Raises OptionError, SensorError, CalibrationError.
     """
     if n_scenes < 1:
         raise OptionError(f"n_scenes is {n_scenes}; expected at least 1")
@@ -77,11 +68,7 @@ def count_painting(
     calibration: Calibration,
     sensor: str | os.PathLike[str] | SensorProfile,
 ) -> Counter[str]:
-    """Count the points and cells of one street that get their true class.
-
-    image : of the same scene, from the same place.
-    Returns: Numbers of points and cells, by the names that `evaluate_painting` divides.
-    """
+    """Numbers of points and cells of a street that get their true class, by `evaluate_painting`'s names."""
     labels = ImageLabels(image.labels, CAMERA_CLASSES)
     painted, true = paint(labels, scan.points, calibration, sensor=sensor), true_classes(scan)
     u, v, depth = calibration.project(scan.points)

@@ -45,11 +45,7 @@ Tallies = Mapping[tuple[str, ...], Any]
 
 @dataclass(frozen=True)
 class Record:
-    """Counts of one evaluated scan.
-
-    tallies : counts, by the keys of their figures in the result, such as ``("points", "0-15 m")``. Counts of several
-        scans can be added.
-    """
+    """Counts of one evaluated scan by the keys of their figures, such as ``("points", "0-15 m")``; they add up."""
 
     name: str
     drive: str
@@ -68,13 +64,7 @@ def banded(
     right: NDArray[np.uint8],
     range_m: NDArray[Any],
 ) -> dict[tuple[str, ...], Confusion]:
-    """Count a confusion matrix for each band of distance.
-
-    table : start of the keys of the result.
-    labels, right : uint8, one shape; predicted and true class; a true class of 255 is unknown and not counted.
-    range_m : float, same shape; horizontal distance [m].
-    Returns dict of tuple of str to Confusion: By ``(*table, band)``.
-    """
+    """A confusion matrix for each band of distance, by ``(*table, band)``; a true class of 255 is not counted."""
     known = right != 255
     labels, right, range_m = labels[known], right[known], range_m[known]
     confusions: dict[tuple[str, ...], Confusion] = {}
@@ -313,10 +303,8 @@ def _map_row(confusion: Confusion) -> dict[str, Any]:
 
 
 def _road_row(sweep: ProbabilitySweep, decision: Confusion, drivable: Confusion) -> dict[str, Any]:
-    """Figures of the model's own decision, and best F1 and average precision over thresholds of its probability.
-
-    ``"confusion"`` holds shares of all cells; rows are the truth (top-view database, Figure 21). The figures
-    ``"drivable_..."`` are of `TopView.drivable`, which leaves out road that the scan did not observe.
+    """Figures of the model's own decision, of `TopView.drivable` ("drivable_..."), which leaves out road that the scan
+    did not observe, and over thresholds of its probability; "confusion" are shares of all cells (Figure 21).
     """
     (_, false), (missed, hits) = decision.counts.tolist()
     return {

@@ -25,6 +25,7 @@ from ..types.perception import Box
 from .ab3dmot import SETTINGS, Ab3dmot
 from .headings import Headings, count_headings
 from .judge import check_unseen, training_scans_of
+from .metrics import box_rows
 from .tracking_metrics import FrameTracks, FrameTruth, evaluate_tracks
 
 __all__ = [
@@ -240,7 +241,7 @@ def read_sequence(
         )
     else:
         detections = [list(of_frame) for of_frame in boxes]
-        image_boxes = [calibration.image_rectangles(_rows(of_frame)) for of_frame in detections]
+        image_boxes = [calibration.image_rectangles(box_rows(of_frame)) for of_frame in detections]
     n_frames = len(detections)
     placed = calibration.sensor_boxes(values[:, 9:16])
     ignored = (values[:, 2] > MAX_TRUNCATION) | (values[:, 3] > MAX_OCCLUSION)
@@ -267,10 +268,7 @@ def read_sequence(
 def _read_detections(
     root: Path, name: str, classes: Sequence[str], calibration: KittiCalibration, n_frames: int
 ) -> tuple[list[list[Box]], list[NDArray[np.float64]]]:
-    """Read detections and their image rectangles by frame.
-
-    Columns: frame, type, left, top, right, bottom, logit, height, width, length, x, y, z, turn, alpha.
-    """
+    """Detections and image rectangles by frame: frame, type, rectangle, logit, h, w, l, x, y, z, turn, alpha."""
     detections: list[list[Box]] = [[] for _ in range(n_frames)]
     image_boxes: list[list[NDArray[np.float64]]] = [[] for _ in range(n_frames)]
     for label in classes:
@@ -294,10 +292,6 @@ def _read_detections(
             detections[frame].append(Box(label, score, (row[0], row[1], row[2]), (row[3], row[4], row[5]), row[6]))
             image_boxes[frame].append(seen)
     return detections, [np.array(of_frame).reshape(-1, 4) for of_frame in image_boxes]
-
-
-def _rows(boxes: Sequence[Box]) -> NDArray[np.float64]:
-    return np.array([(*box.center, *box.size, box.yaw) for box in boxes], np.float64).reshape(-1, 7)
 
 
 def track_sequence(

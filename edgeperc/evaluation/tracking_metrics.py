@@ -14,66 +14,43 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..errors import TrackingError
 from ..system.kernels import njit
-from ..types.geometry import oriented_iou, shared_area
+from .metrics import N_POSITIONS, box_overlaps, recall_positions
 
-N_RECALLS = 40
 HOTA_ALPHAS = np.linspace(0.05, 0.95, 19)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameTruth:
-    """True objects of one frame.
+    """True objects of one frame."""
 
-    ids : (n,) int64; id of the object in each box, the same in all frames.
-    boxes : (n, 7) float64
-    ignored : (n,) bool; objects that a tracker may find but need not: occluded, truncated, or of a neighboring class.
-    """
-
-    ids: NDArray[np.int64]
-    boxes: NDArray[np.float64]
-    ignored: NDArray[np.bool_]
+    ids: NDArray[np.int64]  # (n,), the same in all frames
+    boxes: NDArray[np.float64]  # (n, 7)
+    ignored: NDArray[np.bool_]  # may be found but need not: occluded, truncated, or of a neighboring class
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameTracks:
-    """Tracks of one frame.
-
-    ids : (m,) int64
-    boxes : (m, 7) float64
-    scores : (m,) float64; the score of a track is the mean over its frames.
-    excused : (m,) bool; boxes that do not count as false positives: too small in the image, or in a region without
-        labels.
-    """
+    """Tracks of one frame."""
 
     ids: NDArray[np.int64]
-    boxes: NDArray[np.float64]
-    scores: NDArray[np.float64]
-    excused: NDArray[np.bool_]
+    boxes: NDArray[np.float64]  # (m, 7)
+    scores: NDArray[np.float64]  # the score of a track is the mean over its frames
+    excused: NDArray[np.bool_]  # no false positives: too small in the image, or in a region without labels
 
 
 @dataclass(frozen=True, slots=True)
 class Clear:
-    """CLEAR-MOT counts of the tracks above one score (false alarms, missed and ID SW in KUL-Seg's Table 7).
+    """CLEAR-MOT counts of the tracks above one score (false alarms, missed and ID SW in KUL-Seg's Table 7)."""
 
-    threshold : lowest mean score of a counted track.
-    n_truth : true boxes, without ignored ones.
-    n_found : matched true boxes, with ignored ones.
-    n_false, n_missed : false alarms and missed detections.
-    n_switches, n_fragments : how often the track of an object changed between frames, and how often it resumed after a
-        gap.
-    mota, motp : accuracy 1 - (missed + false + switches) / truth, NaN without true boxes; mean IoU of the matches, NaN
-        without matches.
-    """
-
-    threshold: float
-    n_truth: int
-    n_found: int
+    threshold: float  # lowest mean score of a counted track
+    n_truth: int  # true boxes, without ignored ones
+    n_found: int  # matched true boxes, with ignored ones
     n_false: int
     n_missed: int
-    n_switches: int
-    n_fragments: int
-    mota: float
-    motp: float
+    n_switches: int  # how often the track of an object changed between frames
+    n_fragments: int  # how often it resumed after a gap
+    mota: float  # 1 - (missed + false + switches) / truth; NaN without true boxes
+    motp: float  # mean IoU of the matches; NaN without any
 
     def scaled_mota(self, recall: float) -> float:
         """MOTA that does not count objects beyond ``recall`` as missed, in 0..1 (AB3DMOT's sMOTA)."""
@@ -83,10 +60,8 @@ class Clear:
 
 @dataclass(frozen=True, slots=True)
 class Hota:
-    """Higher order tracking accuracy, mean over the IoU thresholds 0.05, 0.10 .. 0.95 (Luiten et al., IJCV 2020).
-
-    hota, deta, assa : HOTA, detection accuracy and association accuracy, in 0..1; NaN if there are neither true boxes
-        nor tracks.
+    """Higher order tracking accuracy, of detection and of association: means over the IoU thresholds 0.05, 0.10 .. 0.95
+    (Luiten et al., IJCV 2020); NaN if there are neither true boxes nor tracks.
     """
 
     hota: float
@@ -96,66 +71,31 @@ class Hota:
 
 @dataclass(frozen=True, slots=True)
 class TrackingScores:
-    """All figures of one class.
+    """All figures of one class; means over forty recalls are NaN without true boxes."""
 
-    samota, amota, amotp : means over forty recalls of scaled MOTA, MOTA and MOTP (AB3DMOT); a recall that is never
-        reached counts as 0. NaN without true boxes.
-    all_tracks : counts of all reported tracks, with any score.
-    best : counts at the score threshold with the highest MOTA.
-    hota : at the same threshold.
-    n_frames, n_objects : number of frames, and of true objects that are not ignored in every frame.
-    """
-
-    samota: float
+    samota: float  # scaled MOTA (AB3DMOT); a recall that is never reached counts as 0
     amota: float
     amotp: float
-    all_tracks: Clear
-    best: Clear
-    hota: Hota
+    all_tracks: Clear  # with any score
+    best: Clear  # at the score threshold with the highest MOTA
+    hota: Hota  # at the same threshold
     n_frames: int
-    n_objects: int
+    n_objects: int  # that are not ignored in every frame
 
 
 def box_iou(a: ArrayLike, b: ArrayLike) -> NDArray[np.float64]:
-    """3-D intersection over union of each box of ``a`` with each box of ``b``.
-
-    a : (n, 7) array_like
-    b : (m, 7) array_like
-    Returns (n, m) float64: In 0..1; 0 if a box is not finite or has no volume.
-    """
-    first = np.asarray(a, dtype=np.float64).reshape(-1, 7)
-    second = np.asarray(b, dtype=np.float64).reshape(-1, 7)
-    footprints = first[:, [0, 1, 3, 4, 6]], second[:, [0, 1, 3, 4, 6]]
-    with np.errstate(invalid="ignore", divide="ignore"):
-        shared = shared_area(oriented_iou(*footprints), *footprints)
-        top = np.minimum.outer(first[:, 2] + first[:, 5] / 2.0, second[:, 2] + second[:, 5] / 2.0)
-        bottom = np.maximum.outer(first[:, 2] - first[:, 5] / 2.0, second[:, 2] - second[:, 5] / 2.0)
-        shared *= np.maximum(top - bottom, 0.0)
-        volumes = np.add.outer(first[:, 3:6].prod(axis=1), second[:, 3:6].prod(axis=1))
-        iou = shared / (volumes - shared)
-    return np.nan_to_num(iou, nan=0.0, posinf=0.0, neginf=0.0)
+    """3-D IoU (n, m) of boxes (n, 7) and (m, 7), in 0..1; 0 if a box is not finite or has no volume."""
+    first, second = (np.asarray(boxes, np.float64).reshape(-1, 7) for boxes in (a, b))
+    return box_overlaps(first, second)[1]
 
 
 def recall_thresholds(scores: ArrayLike, n_truth: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Scores at which the recall is nearest to 1/40, 2/40 .. 1 (AB3DMOT's protocol, after KITTI's).
-
-    scores : (n,) array_like; score of the matched track, for each match.
-    n_truth : number of possible matches.
-    Returns thresholds, recalls ((k,) float64): At most 40, with falling thresholds. The lowest score is used for the
-        first recall that is not reached.
+    """Scores of matches at which the recall is nearest to 1/40, 2/40 .. 1, and these recalls (AB3DMOT's protocol, after
+    KITTI's). The lowest score is used for the first recall that is not reached.
     """
     falling = np.sort(np.asarray(scores, dtype=np.float64))[::-1]
-    ranks: list[int] = []
-    recalls: list[float] = []
-    recall = 0.0
-    for rank in range(len(falling)):
-        # The next rank is nearer. With equal distances rounding decides, so this is written as in KITTI's program.
-        if rank < len(falling) - 1 and (rank + 2) / n_truth - recall < recall - (rank + 1) / n_truth:
-            continue
-        ranks.append(rank)
-        recalls.append(recall)
-        recall += 1.0 / N_RECALLS
-    return falling[ranks[1:]], np.array(recalls[1:], np.float64)
+    ranks = [*recall_positions(len(falling), n_truth)][1:]
+    return falling[ranks], np.cumsum(np.full(len(ranks), 1.0 / N_POSITIONS))
 
 
 def evaluate_tracks(
@@ -164,26 +104,13 @@ def evaluate_tracks(
     *,
     as_ab3dmot: bool = False,
 ) -> TrackingScores:
-    """Evaluate the tracks of any number of sequences by AB3DMOT's protocol.
-
-    In each frame, true boxes and tracks are matched so that most pairs reach ``iou_threshold``; among such matchings,
-    the one with the largest sum of IoU is taken. This is done for all tracks, and then for each of forty recalls with
-    the tracks above the score threshold of that recall.
-
-    Each threshold is the mean score of one track, which should count at this threshold. AB3DMOT's program replaces the
-    scores of a track by their mean, and averages the copies again for each threshold, so rounding moves the mean in its
-    last digits. In about half of the cases the track is then below its own threshold. A long track is a large share of
-    the first recalls: on ten sequences of KITTI this costs 0 to 6 points of sAMOTA for cars, and more for pedestrians.
-    From Python 3.12 on, the same program counts otherwise, because ``sum`` rounds otherwise.
-
-    sequences : sequence of (sequence of FrameTruth, sequence of FrameTracks); frames in order, with equal numbers of
-        frames of truth and of tracks.
-    iou_threshold : smallest 3-D IoU of a match.
-    as_ab3dmot : round as AB3DMOT's program (commit 6a7fff5, Python 3.11 or older): scores are written and read with
-        six digits, and means of means. Also as there, a box that was matched at one threshold is not excused at the
-        next ones, and a track that finds an object only in its last frame is a fragment.
-    Raises TrackingError.
+    """Evaluate tracks by AB3DMOT's protocol: in each frame most pairs reach ``iou_threshold``, then their sum of IoU is
+    largest; of all tracks, and above the score threshold of each of forty recalls. Raises TrackingError.
     """
+    # AB3DMOT's program (6a7fff5, Python below 3.12, whose sum rounds otherwise) reads scores of six digits and averages
+    # means again for each threshold, so that about half of the tracks fall below their own: on ten sequences of KITTI 0
+    # to 6 points of sAMOTA for cars. There, what was matched once is not excused later, and a track that finds an
+    # object only in its last frame is a fragment.
     packed = [_Packed(truth, tracks, iou_threshold, as_ab3dmot) for truth, tracks in sequences]
     everything, scores = _clear(packed, -math.inf)
     n_matchable = everything.n_found + everything.n_missed
@@ -197,7 +124,7 @@ def evaluate_tracks(
             best = clear
     if as_ab3dmot:
         best = _at_threshold(packed, best.threshold)
-    samota, amota, amotp = (sums / N_RECALLS if everything.n_truth else np.full(3, math.nan)).tolist()
+    samota, amota, amotp = (sums / N_POSITIONS if everything.n_truth else np.full(3, math.nan)).tolist()
     return TrackingScores(
         samota=samota,
         amota=amota,
@@ -341,12 +268,8 @@ def _hota(packed: Sequence[_Packed], threshold: float) -> Hota:
 
 @njit(cache=True, nogil=True)
 def fill_assignment(gain: NDArray[np.float64], column: NDArray[np.int64]) -> None:
-    """Assign columns to rows for the largest sum of gains; -1 for rows without a column.
-
-    Shortest augmenting paths (Jonker and Volgenant 1987) over the columns and one dummy column for each row.
-
-    gain : (n, m) float64; pairs with a gain of 0 or less are never made.
-    column : (n,) int64, overwritten
+    """Write the column of each row, -1 for none, with the largest sum of gains (n, m) above 0: shortest augmenting
+    paths (Jonker and Volgenant 1987) over the columns and a dummy column for each row.
     """
     n, m = gain.shape
     width = m + n
@@ -395,12 +318,8 @@ def fill_assignment(gain: NDArray[np.float64], column: NDArray[np.int64]) -> Non
 
 @njit(cache=True, nogil=True)
 def fill_pairs(shapes: NDArray[np.int64], gain: NDArray[np.float64], pair: NDArray[np.int64]) -> None:
-    """Match true boxes and tracks in each frame for the largest sum of gains.
-
-    shapes : (frames, 2) int64; number of true boxes and of tracks in each frame.
-    gain : (pairs,) float64; gain of each pair of a frame, ordered by true box. Pairs with a gain of 0 or less are
-        never made.
-    pair : (truths,) int64, overwritten; index of the pair of each true box; -1 for none.
+    """Write the pair of each true box, -1 for none, for the largest sum of gains of each frame, of ``shapes`` (true
+    boxes, tracks); gains are ordered by true box, those of 0 or less are never made.
     """
     first, begun = 0, 0
     for n, m in shapes:
@@ -416,15 +335,8 @@ def fill_pairs(shapes: NDArray[np.int64], gain: NDArray[np.float64], pair: NDArr
 def count_breaks(
     truth: NDArray[np.int64], ids: NDArray[np.int64], ignored: NDArray[np.bool_], late: bool
 ) -> tuple[int, int]:
-    """Count ID switches and fragments as in KITTI's and AB3DMOT's evaluation.
-
-    truth : (n,) int64; object of each true box, in the order of frames.
-    ids : (n,) int64; track matched to each true box; -1 for none.
-    ignored : (n,) bool
-    late : whether an object that is first found in its last frame has a fragment, as in these programs.
-    Returns switches, fragments: Switch: different tracks follow the object in this and the previous frame. Fragment:
-        the object is tracked by another track than before, or again after a gap, and is also tracked in the next
-        frame. Ignored boxes reset both.
+    """ID switches (different tracks in this and the previous frame) and fragments (another track than before, or after
+    a gap, that goes on) of objects; ignored boxes reset both. ``late``: the last frame alone is one, too.
     """
     switches = 0
     fragments = 0

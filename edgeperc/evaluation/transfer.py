@@ -24,9 +24,10 @@ from ..types.perception import Box
 from ..types.points import Labels, Points
 from ..types.sensor import SensorProfile, get_sensor
 from ..zoo import DEFAULT
-from .judge import Judge, Perceiving, check_unseen, training_scans_of
+from .judge import Judge, Perceiving, check_unseen, renamed, training_scans_of
 from .metrics import FEWEST_RETURNS, Confusion, ObjectKey, object_key
 from .tables import FEWEST_OBJECTS, figures
+from .truth import seeds_of
 
 N_FITTED = 8  # scenes for a remission function, from seeds before the evaluated ones
 FARTHEST_M = 50.0
@@ -47,17 +48,12 @@ VELODYNE_BYTE = (
 
 @dataclass(frozen=True, eq=False)
 class Scan:
-    """A labeled scan of another sensor.
-
-    points : (n, 4) float32; x, y, z [m] in the sensor frame, raw remission.
-    labels : (n,) uint8; index into `POINT_CLASSES`, `IGNORE` where unknown.
-    objects : frozenset of (str, ObjectKey) or None; labeled objects within 50 m, by the class of their points; None if
-        only points or pixels are labeled.
-    """
+    """A labeled scan of another sensor."""
 
     name: str
-    points: Points
-    labels: Labels
+    points: Points  # x, y, z [m] in the sensor frame, raw remission
+    labels: Labels  # index into `POINT_CLASSES`, `IGNORE` where unknown
+    # labeled ones within 50 m by class; None if only points or pixels are labeled
     objects: frozenset[tuple[str, ObjectKey]] | None
 
 
@@ -74,27 +70,8 @@ def compare(
     workers: int | None = None,
     on_scan: Callable[[int, int], None] = lambda done, total: None,
 ) -> dict[str, Any]:
-    """Compute the IoU of points by class, for each dataset and each of `edgeperc.perceiver.ADAPTATIONS`.
-
-    datasets : ``SENSOR=SOURCE``. The sensor is a built-in name or the file of a profile; "auto" finds that of labeled
-        scans in the first three. The source is
-        ``simulation:N``, a folder of labeled scans (`scan_folder.ScanFolder.parse`), or one with range images
-        ``NAME.npy`` (H, W, 6). Labeled scans need no ``SENSOR=``, because their description names it; those of test
-        drives count. Their points are labeled by boxes, as KITTI's are. Scans go through a `Perceiver` as a user's
-        do, with ``full_turn=True``: it finds the mounting, and nothing from the labels helps it. The remission
-        function of a simulated sensor is fitted to eight other scenes. That of a real sensor comes from its profile.
-    model : a range-image model.
-    provider, precision : as in `Perceiver`.
-    workers : number of worker processes, each with one data set at a time; None: this process alone.
-    on_scan : called after each scan, or data set of a worker, with the number of scans done and that of all scans, over
-        all adaptations.
-    Returns: By dataset: ``"n_scans"``, ``"function"``, and by adaptation ``"iou"`` (class -> IoU, None for a class
-        that does not occur), ``"mean_iou"`` over the classes except the background, ``"n_points"`` (class -> count).
-        In ``"n_objects"`` distinct objects by class, or None if only points are labeled, and in ``"few"`` the classes
-        with fewer than `tables.FEWEST_OBJECTS`: their figures say little. In ``"boxes"`` the figures ``"kitti"`` and
-        ``"centers"`` of `tables.figures` for labeled scans with boxes: those of the default models, all round,
-        with ``model`` for the points.
-    Raises PointsError, ModelError, SplitError.
+    """IoU of points by class for each dataset and each of `ADAPTATIONS`, of labeled scans with boxes also their
+    figures. Scans are perceived as a user's; the function of a simulated sensor is fitted to other scenes.
     """
     sets = {name: _dataset(name) for name in datasets}
     sizes = {name: (len(ADAPTATIONS) + (folder is not None)) * n for name, (_, n, _, folder) in sets.items()}
@@ -193,8 +170,7 @@ def _count(confusion: Confusion, perceive: Perceiver, scan: Scan) -> None:
         raise ModelError(f"{perceive.cards[0].name} labels no points; pass a range-image model")
     near = np.hypot(scan.points[:, 0], scan.points[:, 1]) < FARTHEST_M
     known = predicted.in_view & near & (scan.labels != IGNORE)
-    numbers = np.array([POINT_CLASSES.index(c) if c in POINT_CLASSES else 0 for c in predicted.classes], np.uint8)
-    confusion.update(numbers[predicted.labels[known]], scan.labels[known])
+    confusion.update(renamed(predicted.labels[known], predicted.classes, POINT_CLASSES), scan.labels[known])
 
 
 def _row(confusion: Confusion) -> dict[str, Any]:
@@ -214,14 +190,11 @@ def _dataset(name: str) -> _DataSet:
         first = [frame.points for frame in islice(_frames(folder), MOST_SCANS)]
         return _of_folder(folder, replace(estimate_sensor(first).profile, mounting=folder.layout.sensor.mounting))
     sensor = get_sensor(sensor_name)
-    kind, _, number = source.partition(":")
-    if kind == "simulation":
-        if not (number or "24").isdecimal() or number == "0":
-            raise PointsError(f"got {source!r}; expected simulation, or simulation:N with a number of scans from 1")
-        n = int(number or 24)
+    if source.partition(":")[0] == "simulation":
+        seeds = seeds_of(source)
         sensor = replace(sensor, remission_range=(0.0, _raw_model(sensor)[0]), remission=None)
         fitted, _ = fit_sensor([_simulated(sensor, FIRST_SEED - 1 - k).points for k in range(N_FITTED)], sensor)
-        return fitted, n, lambda: (_simulated(sensor, FIRST_SEED + k) for k in range(n)), None
+        return fitted, len(seeds), lambda: (_simulated(sensor, seed) for seed in seeds), None
     images = sorted(Path(source).glob("*.npy"))
     if images:
         return sensor, len(images), lambda: map(_from_image, images), None
@@ -229,13 +202,9 @@ def _dataset(name: str) -> _DataSet:
 
 
 def _of_folder(folder: ScanFolder, sensor: SensorProfile | None = None) -> _DataSet:
-    n_scans = len(folder.names("test"))
-    return (
-        sensor or folder.layout.sensor,
-        n_scans,
-        lambda: map(_of_frame, _frames(folder)),
-        folder if folder.layout.boxes else None,
-    )
+    with_boxes = folder if folder.layout.boxes else None
+    names = folder.names("test")
+    return sensor or folder.layout.sensor, len(names), lambda: map(_of_frame, _frames(folder)), with_boxes
 
 
 def _folder(source: str) -> ScanFolder:

@@ -8,11 +8,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ..datasets.kitti import ROAD_CLASSES, Frame, RoadFrame
+from ..datasets.kitti import ROAD_CLASSES, Frame, KittiCalibration, KittiLabels, RoadFrame
 from ..datasets.layout import numbers_of_scene
 from ..datasets.scan_folder import ScanFrame
+from ..errors import PointsError
 from ..ground.observed import Observer
-from ..simulation.samples import IGNORE, labels_of_scene, simulated_scan
+from ..simulation.samples import FIRST_SEED, IGNORE, labels_of_scene, simulated_scan
 from ..simulation.scene import POINT_CLASS_OF, POINT_CLASSES, TOP_VIEW_CLASSES
 from ..types.frame import ModelFrame
 from ..types.geometry import draw_footprints, inside
@@ -32,58 +33,46 @@ Cells = dict[str, tuple[tuple[str, ...], NDArray[np.uint8]]]
 
 @dataclass(frozen=True)
 class Truth:
-    """A scan and its ground truth.
-
-    points : (n, 4) float32; x, y, z [m] in the sensor frame, remission.
-    labels : (n,) uint8 or None; index into ``classes``; `IGNORE`
-        where unknown. None if points and objects are not labeled.
-    boxes : in the sensor frame.
-    returns : number of returns from each box's object.
-    known : takes places (k, 3) [m] in the sensor frame and returns whether objects are labeled there, (k,) bool.
-    cells : by name of a table: its classes, and the true class of each cell (rows, columns) uint8, `IGNORE` where
-        unknown.
-    road : the table, and its class that counts as drivable.
-    front : KITTI's labels of the image, if the scan has them.
-    box_labels : classes that the boxes of the set tell apart; None: all.
-    classes : of ``labels``, the background first.
-    """
+    """A scan and its ground truth."""
 
     name: str
     drive: str
-    points: Points
-    labels: Labels | None
-    boxes: tuple[Box, ...]
-    returns: tuple[int, ...]
+    points: Points  # x, y, z [m] in the sensor frame, remission
+    labels: Labels | None  # index into ``classes``, `IGNORE` where unknown; None without labels
+    boxes: tuple[Box, ...]  # in the sensor frame
+    returns: tuple[int, ...]  # from each box's object
+    # whether objects are labeled at places (k, 3) [m] in the sensor frame
     known: Callable[[NDArray[np.float64]], NDArray[np.bool_]]
-    cells: Cells
-    road: tuple[str, str] | None = None
-    front: FrontTruth | None = None
-    box_labels: frozenset[str] | None = None
-    classes: tuple[str, ...] = POINT_CLASSES
+    cells: Cells  # by table: classes, and the true class of each cell, `IGNORE` where unknown
+    road: tuple[str, str] | None = None  # a table, and its class that is drivable
+    front: FrontTruth | None = None  # KITTI's labels of the image
+    box_labels: frozenset[str] | None = None  # what the boxes of the set tell apart; None: all
+    classes: tuple[str, ...] = POINT_CLASSES  # the background first
+
+    def knows(self, box: Box) -> bool:
+        """Whether objects are labeled at the center of a box."""
+        return bool(self.known(np.array([box.center]))[0])
+
+    @property
+    def counted(self) -> list[tuple[Box, int]]:
+        """Boxes, each with its returns."""
+        return [*zip(self.boxes, self.returns, strict=True)]
 
 
 def kitti_truth(frame: Frame, view: TopViewGeometry | None, road: tuple[str, NDArray[np.bool_]] | None = None) -> Truth:
-    """Ground truth of a KITTI frame: boxes, points and cells in the camera's field of view, outside DontCare.
-
-    view : grid of the cells; None: no cells.
-    road : tuple of str and (rows, columns) bool; name and drivable cells of a second table, which combines this road
-        with the labeled vehicles (SSADNet 3.1.2).
+    """Ground truth of a KITTI frame in the camera's field of view, outside DontCare; no cells without a view. ``road``:
+    name and drivable cells of a second table, with the labeled vehicles (SSADNet 3.1.2).
     """
     cells: Cells = {}
     if view is not None:
-        vehicles, known = _drawn(frame.boxes, view)
-        known &= frame.known_at(_cell_places(view)).reshape(known.shape)
-        by_boxes = np.where(vehicles > 0, vehicles - 1, 0)
-        cells[BY_BOXES] = ("background", *VEHICLES), np.where(known, by_boxes, IGNORE).astype(np.uint8)
+        vehicles, known = _drawn(frame.boxes, view, frame.known_at)
+        cells[BY_BOXES] = _by_boxes(vehicles, known)
         if road is not None:
             title, drivable = road
             surface = np.where(vehicles > 0, vehicles, drivable)
             cells[title] = TOP_VIEW_CLASSES, np.where(known, surface, IGNORE).astype(np.uint8)
     returns = tuple(int(np.count_nonzero(inside(box, frame.points, 0.1))) for box in frame.boxes)
-    labels = frame.point_labels()
-    front = None
-    if frame.labels is not None:
-        front = FrontTruth(frame.labels, frame.calibration, image_size_of(frame.drive))
+    labels, front = frame.point_labels(), _front(frame.labels, frame.calibration, frame.drive)
     return Truth(
         frame.name, frame.drive, frame.points, labels, frame.boxes, returns, frame.known_at, cells, front=front
     )
@@ -101,12 +90,7 @@ def folder_truth(
     view: TopViewGeometry | None,
     classes: Sequence[str] = POINT_CLASSES,
 ) -> Truth:
-    """Ground truth of a scan of a `ScanFolder`, moved into the frame of the models.
-
-    mounting : the mounting that the runtime used for this scan: its results are compared in the frame that it had.
-    view : grid of the cells; None: no cells.
-    classes : classes of points, the background first.
-    """
+    """Ground truth of a scan of a `ScanFolder`, in the frame of the models with the mounting that the runtime used."""
     model = ModelFrame(mounting)
     boxes = model.move_boxes(frame.boxes or ())
     labels = None if frame.boxes is None and frame.point_classes is None else frame.labels(classes)
@@ -118,17 +102,11 @@ def folder_truth(
     road = None
     if view is not None:
         if frame.boxes is not None:
-            vehicles, clear = _drawn(boxes, view)
-            clear &= known(_cell_places(view)).reshape(clear.shape)
-            by_boxes = np.where(vehicles > 0, vehicles - 1, 0)
-            cells[BY_BOXES] = ("background", *VEHICLES), np.where(clear, by_boxes, IGNORE).astype(np.uint8)
+            cells[BY_BOXES] = _by_boxes(*_drawn(boxes, view, known))
         surface = road_cells(frame, mounting, view)
         if surface is not None:
             cells[OBSERVED], road = (ROAD_CLASSES, surface), (OBSERVED, "road")
-    points = model.move(frame.points)
-    front = None
-    if frame.calibration is not None and frame.image_labels is not None:
-        front = FrontTruth(frame.image_labels, frame.calibration, image_size_of(frame.drive))
+    points, front = model.move(frame.points), _front(frame.image_labels, frame.calibration, frame.drive)
     box_labels = frozenset(frame.layout.boxes.values())
     of_boxes = boxes, frame.returns, known
     return Truth(
@@ -137,12 +115,8 @@ def folder_truth(
 
 
 def road_cells(frame: ScanFrame, mounting: Mounting, view: TopViewGeometry) -> NDArray[np.uint8] | None:
-    """True surface of each cell by the labels of points, or else by the polygons of a scan.
-
-    mounting : a known one.
-    view : grid in the frame of the models.
-    Returns (rows, columns) uint8 or None: Index into `ROAD_CLASSES`; `IGNORE` for cells that the scan did not
-        observe. None: the scan has no such labels.
+    """True surface of each cell of a view by the labels of points, or else polygons: index into `ROAD_CLASSES`,
+    `IGNORE` where the scan did not observe it; None if the scan has no such labels.
     """
     model = ModelFrame(mounting)
     points, labels = model.move(frame.points), frame.road_labels()
@@ -182,11 +156,16 @@ def cells_inside(polygons: Iterable[NDArray[np.float64]], view: TopViewGeometry)
     return inside_any
 
 
-def simulated_truth(seed: int, view: TopViewGeometry | None, classes: tuple[str, ...] = POINT_CLASSES) -> Truth:
-    """Ground truth of a simulated scene, where everything is known. Each scene counts as a drive of its own.
+def seeds_of(source: str) -> range:
+    """The scenes of ``simulation`` or ``simulation:N``, which no model was trained on; PointsError for another N."""
+    number = source.partition(":")[2] or "24"
+    if not number.isdecimal() or number == "0":
+        raise PointsError(f"got {source!r}; expected simulation, or simulation:N with a number of scans from 1")
+    return range(FIRST_SEED, FIRST_SEED + int(number))
 
-    classes : classes of points, the background first.
-    """
+
+def simulated_truth(seed: int, view: TopViewGeometry | None, classes: tuple[str, ...] = POINT_CLASSES) -> Truth:
+    """Ground truth of a simulated scene, where everything is known. Each scene counts as a drive of its own."""
     name, scan = f"scene {seed}", simulated_scan(seed)
     cells: Cells = {} if view is None else {EVERY_CELL: (TOP_VIEW_CLASSES, scan.top_view_labels(view))}
     labels, road = numbers_of_scene(classes)[labels_of_scene(scan)], (EVERY_CELL, "drivable")
@@ -194,20 +173,33 @@ def simulated_truth(seed: int, view: TopViewGeometry | None, classes: tuple[str,
     return Truth(name, name, scan.points, labels, *boxes, cells, road, classes=classes)
 
 
-def _drawn(boxes: Sequence[Box], view: TopViewGeometry) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
-    """Vehicle in each cell, index into `TOP_VIEW_CLASSES` or 0, and the cells without an object of unknown class."""
+def _front(labels: KittiLabels | None, calibration: KittiCalibration | None, drive: str) -> FrontTruth | None:
+    return None if labels is None or calibration is None else FrontTruth(labels, calibration, image_size_of(drive))
+
+
+def _by_boxes(vehicles: NDArray[np.uint8], known: NDArray[np.bool_]) -> tuple[tuple[str, ...], NDArray[np.uint8]]:
+    cells = np.where(known, np.where(vehicles > 0, vehicles - 1, 0), IGNORE)
+    return ("background", *VEHICLES), cells.astype(np.uint8)
+
+
+def _drawn(
+    boxes: Sequence[Box], view: TopViewGeometry, known: Callable[[NDArray[np.float64]], NDArray[np.bool_]] | None = None
+) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
+    """Vehicle in each cell, index into `TOP_VIEW_CLASSES` or 0, and the known cells without an object of another class.
+
+    Whether a cell is known is asked at its center near the ground.
+    """
     vehicles, unclear = np.zeros((2, view.height, view.width), np.uint8)
     draw_footprints(vehicles, boxes, view, TOP_VIEW_CLASSES)
     # Cells of trams and "misc" objects are ignored: they belong to no class, but are not background.
     strange = [replace(box, label="car") for box in boxes if box.label not in POINT_CLASS_OF]
     draw_footprints(unclear, strange, view, TOP_VIEW_CLASSES)
-    return vehicles, unclear == 0
-
-
-def _cell_places(view: TopViewGeometry) -> NDArray[np.float64]:
-    """Centers of the cells near the ground, (rows * columns, 3) float64 [m]."""
-    x, y = np.broadcast_arrays(*view.cell_centers())
-    return np.stack([x.ravel(), y.ravel(), np.full(x.size, GROUND_Z_M)], axis=1)
+    clear = unclear == 0
+    if known is not None:
+        x, y = np.broadcast_arrays(*view.cell_centers())
+        places = np.stack([x.ravel(), y.ravel(), np.full(x.size, GROUND_Z_M)], axis=1)
+        clear &= known(places).reshape(clear.shape)
+    return vehicles, clear
 
 
 def _everywhere(places: NDArray[np.float64]) -> NDArray[np.bool_]:

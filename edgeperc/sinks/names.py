@@ -11,10 +11,7 @@ _SUFFIXES = (".pcd.bin", ".bin", ".npy", ".npz", ".pcd", ".ply")
 
 
 def stem_of(name: str) -> tuple[str, str]:
-    """Name of a scan without its folder and its suffix, and its suffix in lower case.
-
-    The scan of a capture, ``drive.pcap/000003``, has no suffix. Neither has an image, whose scan has the image's name.
-    """
+    """Name of a scan without folder and suffix, and its suffix in lower case, none for a capture's or an image's."""
     last = Path(name).name
     suffix = next((ending for ending in _SUFFIXES if last.lower().endswith(ending)), "")
     return (last[: -len(suffix)] if suffix else Path(last).stem), suffix
@@ -27,10 +24,7 @@ class ScanFiles:
         self._sources: dict[Path, str] = {}
 
     def checked(self, target: Path, scan: str) -> Path:
-        """Return ``target`` for the scan of this name.
-
-        Raises OptionError.
-        """
+        """Return ``target`` for the scan of this name; OptionError if it is the scan itself, or another one's file."""
         if os.path.realpath(target) == os.path.realpath(scan):
             raise OptionError(f"{target} is the scan itself and would be overwritten; choose another folder")
         source = self._sources.setdefault(target, scan)

@@ -37,14 +37,8 @@ class _Viewer:
 
 
 class Relay:
-    """Passes bytes between viewers and a server on the loopback interface, in one thread.
-
-    It reads from the server only what the viewer takes, so that the server's own limit holds. A connection ends if it
-    has no handshake within 10 s, takes nothing for 30 s, or sends more than 4 MB. More viewers than `MAX_VIEWERS` are
-    refused.
-
-    listener : socket; bound and listening; the relay closes it.
-    port : the server's port on 127.0.0.1.
+    """Passes bytes between at most `MAX_VIEWERS` viewers and a server on 127.0.0.1, in one thread, reading only what a
+    viewer takes. One ends that greets nobody in 10 s, takes nothing for 30 s or sends over 4 MB.
     """
 
     def __init__(self, listener: socket.socket, port: int) -> None:

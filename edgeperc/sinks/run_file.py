@@ -13,14 +13,8 @@ from ..system.atomic import beside, name_part, name_whole
 
 
 class RunFile:
-    """A file for a library that writes it from native code, where an exception would be lost; a panic follows some.
-
-    It keeps its first error, which `check` raises. It is written beside its place and has its name after `close`; a
-    file that is not whole is called ``NAME.part``, and the existing one stays. A target that is not a regular file is
-    written directly.
-
-    path : the target; its folder exists.
-    Raises OSError.
+    """A file for native code, where an exception would be lost: it keeps the first error for `check`. It lies beside
+    its place until `close`, and stays ``NAME.part`` if it is not whole; a special file is written directly.
     """
 
     def __init__(self, path: Path) -> None:
@@ -71,11 +65,7 @@ class RunFile:
                 self.fail(exc)
 
     def close(self, whole: bool = True) -> None:
-        """Give the file its name, or that of a part, with a warning.
-
-        whole : False if the run ended before its last scan.
-        Raises OSError: The file could not be written, and `check` has not said so yet.
-        """
+        """Give the file its name, or that of a part if the run ended before its last scan. Raises OSError, once."""
         try:
             self.flush()
             self._file.close()
@@ -91,10 +81,7 @@ class RunFile:
 
 
 def settle(temporary: Path, path: Path, whole: bool) -> None:
-    """Give what a run has written its name, or leave it as a part and warn.
-
-    Raises OSError: It could not be written whole; it is a part.
-    """
+    """Give what a run has written its name, or leave it as a part and warn; OSError if it could not be written so."""
     try:
         if whole:
             name_whole(temporary, path)
@@ -109,10 +96,7 @@ def warn_of(part: Path, path: Path) -> None:
 
 
 class Pipe:
-    """A named pipe that a thread empties into a file, for a library that waits for ever if it cannot write its own.
-
-    file : what is written.
-    """
+    """A named pipe that a thread empties into a file, for a library that waits for ever if it cannot write its own."""
 
     def __init__(self, file: RunFile) -> None:
         self._file = file

@@ -44,13 +44,8 @@ def byte_colors(names: list[str]) -> NDArray[np.uint8]:
 def colored_points(
     scan: PerceivedScan,
 ) -> tuple[NDArray[np.float32], NDArray[np.uint8], tuple[str, ...], NDArray[np.uint8]]:
-    """The points of a scan with their classes and colors.
-
-    Returns points ((n, 4) float32): x, y, z [m] in the sensor's frame, remission. All points of the scan, in its
-        order, those that are not finite too.
-    Returns labels ((n,) uint8): Index into ``classes``; 0 if no model labels points.
-    Returns colors ((n, 3) uint8): Of the class; of the cell of the top view for a background point on the road.
-    Raises PointsError.
+    """All points of a scan in its order, their labels (0 without a network of points), the classes, and their colors:
+    of a background point on the road, that of its cell of the top view. Raises PointsError.
     """
     points, perception = as_points(scan.points), scan.perception
     check_points(points, perception)
@@ -85,10 +80,7 @@ class Trails:
 
 
 def nanoseconds(scan: PerceivedScan) -> int:
-    """The time of a scan [ns], which viewers hold as an unsigned number.
-
-    Raises PointsError.
-    """
+    """The time of a scan [ns], which viewers hold as an unsigned number. Raises PointsError."""
     if not 0.0 <= scan.stamp_s < 2.0**32:
         raise PointsError(f"the scan's time is {scan.stamp_s} s; a viewer needs one from 0 to 2^32 s")
     return nanoseconds_of(scan.stamp_s)

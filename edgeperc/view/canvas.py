@@ -25,10 +25,7 @@ _FARTHEST = 150.0
 
 
 def new_figure(width: int, height: int) -> Any:
-    """Make an empty figure of a size in pixels, without pyplot.
-
-    Raises MissingExtraError.
-    """
+    """Make an empty figure of a size in pixels, without pyplot. Raises MissingExtraError."""
     agg = require("matplotlib.backends.backend_agg", "view", "Drawing a picture")
     from matplotlib.figure import Figure
 
@@ -139,10 +136,7 @@ def draw_legend(figure: Any, left: float, top: float, width: float, facts: Mappi
 
 @dataclass(frozen=True)
 class Label:
-    """A text that names something in a picture.
-
-    area : the named object, in pixels of the figure: left, bottom, right, top.
-    """
+    """A text that names something in a picture, in an area of the figure [px]: left, bottom, right, top."""
 
     area: tuple[float, float, float, float]
     text: str
@@ -159,13 +153,11 @@ def area_of(axes: Any, places: Any) -> tuple[float, float, float, float]:
 def place_labels(
     axes: Any, labels: Sequence[Label], avoid: Sequence[tuple[float, float, float, float]] = (), **style: Any
 ) -> int:
-    """Write each label at the free place nearest to its object, with a line to the object if they are apart.
-
-    axes : labels stay inside.
-    labels : the most important first. No label covers another label or any named object.
-    avoid : sequence of tuple of 4 float; further rectangles that no label may cover [px].
-    Returns n_omitted: Labels for which there was no place.
+    """Write each label, the most important first, at the free place of the axes nearest to its object, with a line to
+    it if they are apart; none covers another or an object. Returns the number for which there was no place.
     """
+    from matplotlib.lines import Line2D
+
     figure, panel, gap = axes.figure, axes.get_window_extent(), 4.0
     taken = np.array([*(label.area for label in labels), *avoid], dtype=np.float64).reshape(-1, 4)
     n_omitted = max(0, len(labels) - _MOST_LABELS)
@@ -186,22 +178,19 @@ def place_labels(
         taken = np.vstack([taken, [*(middle - half), *(middle + half)]])
         if apart > 3.0 * gap:
             area = np.array(label.area).reshape(2, 2)
-            _draw_leader(figure, np.clip(area.mean(axis=0), middle - half, middle + half), area, label.color)
+            start = np.clip(area.mean(axis=0), middle - half, middle + half)
+            end = np.clip(start, area[0], area[1])
+            line = Line2D([start[0], end[0]], [start[1], end[1]], color=label.color, linewidth=1.2, alpha=0.9, zorder=6)
+            line.set_transform(None)
+            figure.add_artist(line)
     return n_omitted
 
 
 def free_place(
     area: Sequence[float], half: NDArray[np.float64], taken: NDArray[np.float64], panel: Sequence[float]
 ) -> tuple[NDArray[np.float64], float] | None:
-    """Find the free place for a label that is nearest to its object.
-
-    area : sequence of 4 float; the named object [px]: smallest x and y, largest x and y.
-    half : (2,) float64; half the label's width and height [px].
-    taken : (k, 4) float64; rectangles that the label must not cover [px], as ``area``.
-    panel : sequence of 4 float; rectangle that the label must not leave [px], as ``area``.
-    Returns middle ((2,) float64): Center of the label [px].
-    Returns apart: Distance between label and area [px].
-    Returns None if there is no free place within 150 pixels.
+    """Middle of the free place [px] nearest to a named area, for a label of ``half`` a width and height, and their
+    distance; inside the panel, on nothing that is taken (k, 4). None if there is none within 150 pixels.
     """
     named = np.array(area, dtype=np.float64).reshape(2, 2)
     low = np.maximum(np.array(panel[:2]) + half, named[0] - half - _FARTHEST)
@@ -223,12 +212,3 @@ def free_place(
     # Mainly the distance between the rectangles, then that between their centers.
     best = int(np.argmin(apart + 0.08 * np.hypot(*(middles - named.mean(axis=0)).T)))
     return (middles[best], float(apart[best])) if apart[best] < _FARTHEST else None
-
-
-def _draw_leader(figure: Any, start: NDArray[np.float64], area: NDArray[np.float64], color: str) -> None:
-    from matplotlib.lines import Line2D
-
-    end = np.clip(start, area[0], area[1])
-    line = Line2D([start[0], end[0]], [start[1], end[1]], color=color, linewidth=1.2, alpha=0.9, zorder=6)
-    line.set_transform(None)
-    figure.add_artist(line)

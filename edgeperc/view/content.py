@@ -79,13 +79,7 @@ def drawable_boxes(boxes: Iterable[Box]) -> list[Box]:
 
 
 def paint_points(points: Points, perception: Perception) -> tuple[list[str], NDArray[np.uint8]]:
-    """Choose the class to show for every point.
-
-    points : (n, 4) float32
-    Returns names: The classes of both views.
-    Returns painted ((n,) uint8): Index into ``names``: the class of the point or, for background, that of its cell in
-        the top view.
-    """
+    """Classes of both views, and the one to show for every point: its own or that of its cell for background."""
     names = list(perception.points.classes if perception.points is not None else ("background",))
     painted = np.zeros(len(points), dtype=np.uint8)
     if perception.points is not None:
@@ -127,10 +121,7 @@ def paint_vehicles(names: list[str], painted: NDArray[np.uint8], points: Points,
 
 
 def ground_plane(perception: Perception, points: Points) -> tuple[float, float, float]:
-    """The plane that a picture is drawn on: z = a + b x + c y [m], in the frame of the models.
-
-    points : (n, 4) float32; the scan, in that frame, for a perception without ground.
-    """
+    """The plane that a picture is drawn on, a + b x + c y [m] in the frame of the models; fitted if need be."""
     ground = perception.ground or fit_ground(points, mount_height_m=MODEL_HEIGHT_M).surface()
     slope_x, slope_y, level = ground.expected
     return level, slope_x, slope_y

@@ -15,9 +15,10 @@ from ..types.frame import ModelFrame
 from ..types.perception import Box, Perception, TopView
 from ..types.points import Labels, Points
 from ..types.sensor import SensorProfile
-from .canvas import add_axes, as_png, draw_legend, height_of_legend, new_figure, shorten, write_at, write_heading
+from .canvas import add_axes, as_png, height_of_legend, new_figure, write_heading
 from .colors import FAINT, INK, color_of, rgb
-from .content import check_points, drawable_boxes, drawable_points, perceived_image, provider_lines, timing_line
+from .content import check_points, drawable_boxes, drawable_points, perceived_image
+from .picture import write_frame
 
 # Sizes in pixels.
 _WIDTH, _MARGIN, _TOP, _GAP, _AXIS = 1600, 28, 128, 44, 62
@@ -92,14 +93,9 @@ def draw_painted(
     room = (left, _TOP, _WIDTH - _MARGIN - left, bottom - _TOP)
     _draw_from_above(figure, room, points, road, perception.boxes, colors, painted)
 
-    style = {"fontsize": 23.0, "fontweight": "bold"}
-    write_at(figure, _MARGIN, 46, shorten(figure, title, 1000, **style), **style)
     share = f"{np.count_nonzero(painted != UNSEEN):,} of {len(points):,} points are seen by the camera"
-    write_at(figure, _WIDTH - _MARGIN, 46, share, fontsize=18.0, ha="right", color=FAINT)
-    draw_legend(figure, _MARGIN, bottom + 40, _WIDTH - 2 * _MARGIN, facts)
-    ran = " · ".join([timing_line(perception), *provider_lines(perception)])
-    ran = shorten(figure, ran, _WIDTH - 2 * _MARGIN, fontsize=12.0)
-    write_at(figure, _MARGIN, bottom + 40 + height_of_legend(facts) + 34, ran, fontsize=12.0, color=FAINT)
+    tops = bottom + 40, bottom + 40 + height_of_legend(facts) + 34
+    write_frame(figure, perception, (title, 1000), share, facts, tops)
     return as_png(figure, path)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -94,13 +94,15 @@ def draw(perception: Perception, points: Points, path: str | Path | None = None,
     paint_vehicles(names, painted, points, boxes)
     top_view = perception.top_view
     road = None if top_view is None else road_ahead(top_view, boxes)
-    turn_deg = _turn_deg(perception, points, seen)
+    # The part of the turn in which points have a class: the quarter ahead, or all of it.
+    found = perception.points
+    turn_deg = 360.0 if found is not None and (points[found.in_view[seen], 0] < 0.0).any() else 90.0
 
     facts = class_facts(perception)
-    warnings = _wrapped_warnings(perception)
+    ruler = new_figure(_WIDTH, 100)
+    warnings = [line for text in perception.fitness for line in wrap(ruler, text, _WIDTH - 2 * _MARGIN, fontsize=13.0)]
     legend_top = _BOTTOM + 40
-    legend_height = height_of_legend(facts)
-    notes_top = legend_top + legend_height + 30
+    notes_top = legend_top + height_of_legend(facts) + 30
     figure = new_figure(_WIDTH, notes_top + 38 + 26 * len(warnings))
 
     left = float(_MARGIN)
@@ -111,11 +113,10 @@ def draw(perception: Perception, points: Points, path: str | Path | None = None,
     _draw_from_behind(figure, (left, _TOP, width, 520), points, names, painted, top_view, road, boxes, ground)
     _draw_range_image(figure, (left, 700, width, _BOTTOM - 700), points, names, painted, turn_deg)
 
-    _write_header(figure, perception, title)
-    draw_legend(figure, _MARGIN, legend_top, _WIDTH - 2 * _MARGIN, facts)
-    ran = " · ".join([timing_line(perception), *provider_lines(perception)])
-    ran = shorten(figure, ran, _WIDTH - 2 * _MARGIN, fontsize=12.0)
-    write_at(figure, _MARGIN, notes_top, ran, fontsize=12.0, color=FAINT)
+    count = f"{perception.n_points:,} points"
+    if perception.stage_ms:
+        count += f" in {sum(perception.stage_ms.values()):.0f} ms"
+    write_frame(figure, perception, (title, 1100), count, facts, (legend_top, notes_top))
     for k, line in enumerate(warnings):
         write_at(figure, _MARGIN, notes_top + 32 + 26 * k, line, fontsize=13.0, color=AMBER)
     return as_png(figure, path)
@@ -161,33 +162,35 @@ def draw_image(
     colors = rgb([color_of(name) for name in labels.classes]).astype(np.float32)[labels.labels]
     axes.imshow(0.55 * image.astype(np.float32) / 255.0 + 0.45 * colors, aspect="equal", interpolation="antialiased")
     size = f"{image.shape[1]} x {image.shape[0]} pixels, {100.0 * labels.drivable_share:.1f} % road"
-    write_at(figure, _WIDTH - _MARGIN, 46, size, fontsize=18.0, ha="right", color=FAINT)
-    style = {"fontsize": 23.0, "fontweight": "bold"}
-    write_at(figure, _MARGIN, 46, shorten(figure, title, 1000, **style), **style)
-    draw_legend(figure, _MARGIN, legend_top, _WIDTH - 2 * _MARGIN, facts)
-    ran = " · ".join([timing_line(perception), *provider_lines(perception)])
-    ran = shorten(figure, ran, _WIDTH - 2 * _MARGIN, fontsize=12.0)
-    write_at(figure, _MARGIN, legend_top + legend_height + 34, ran, fontsize=12.0, color=FAINT)
+    write_frame(figure, perception, (title, 1000), size, facts, (legend_top, legend_top + legend_height + 34))
     return as_png(figure, path)
 
 
-def _wrapped_warnings(perception: Perception) -> list[str]:
-    ruler = new_figure(_WIDTH, 100)
-    return [line for text in perception.fitness for line in wrap(ruler, text, _WIDTH - 2 * _MARGIN, fontsize=13.0)]
-
-
-def _write_header(figure: Any, perception: Perception, title: str) -> None:
-    facts = f"{perception.n_points:,} points"
-    if perception.stage_ms:
-        facts += f" in {sum(perception.stage_ms.values()):.0f} ms"
-    write_at(figure, _WIDTH - _MARGIN, 46, facts, fontsize=18.0, ha="right", color=FAINT)
+def write_frame(
+    figure: Any,
+    perception: Perception,
+    title: tuple[str, int],
+    about: str,
+    facts: Mapping[str, Sequence[str]],
+    tops: tuple[float, float],
+) -> None:
+    """Write what stands around panels: title of at most so many pixels and what is shown, below legend and timing."""
+    text, room = title
     style = {"fontsize": 23.0, "fontweight": "bold"}
-    write_at(figure, _MARGIN, 46, shorten(figure, title, 1100, **style), **style)
+    write_at(figure, _MARGIN, 46, shorten(figure, text, room, **style), **style)
+    write_at(figure, _WIDTH - _MARGIN, 46, about, fontsize=18.0, ha="right", color=FAINT)
+    draw_legend(figure, _MARGIN, tops[0], _WIDTH - 2 * _MARGIN, facts)
+    ran = " · ".join([timing_line(perception), *provider_lines(perception)])
+    ran = shorten(figure, ran, _WIDTH - 2 * _MARGIN, fontsize=12.0)
+    write_at(figure, _MARGIN, tops[1], ran, fontsize=12.0, color=FAINT)
 
 
-def _turn_deg(perception: Perception, points: Points, seen: NDArray[np.bool_]) -> float:
-    """The part of the turn in which points have a class: the quarter ahead, or all of it. ``points`` are those seen."""
-    return 360.0 if perception.points is not None and (points[perception.points.in_view[seen], 0] < 0.0).any() else 90.0
+def _draw_arrow(axes: Any, corners: NDArray[np.float64], zorder: int) -> None:
+    """Draw the outline of what is free ahead, filled with a veil."""
+    from matplotlib.patches import Polygon
+
+    axes.add_patch(Polygon(corners, closed=True, facecolor=INK, alpha=0.3, zorder=3))
+    axes.add_patch(Polygon(corners, closed=True, fill=False, edgecolor=INK, linewidth=1.5, zorder=zorder))
 
 
 def _strip(ahead: FreeAhead, x_near: float) -> tuple[str, NDArray[np.float64] | None]:
@@ -269,8 +272,7 @@ def _draw_top_view(
     strip = road.free_ahead(_HALF_STRIP_M)
     text, arrow = _strip(strip, x_near)
     if arrow is not None:
-        axes.add_patch(Polygon(arrow[:, ::-1], closed=True, facecolor=INK, alpha=0.3, zorder=3))
-        axes.add_patch(Polygon(arrow[:, ::-1], closed=True, fill=False, edgecolor=INK, linewidth=1.5, zorder=4))
+        _draw_arrow(axes, arrow[:, ::-1], 4)
     labels: list[Label] = []
     beside_arrow = area_of(axes, [[0.0, x_near]] if arrow is None else arrow[:, ::-1])
     avoid.append(beside_arrow)
@@ -412,8 +414,7 @@ def _draw_from_behind(
         if arrow is not None:
             flat = (np.column_stack([arrow, a + arrow @ [b, c] + 0.02]) - eye) @ turn.T
             flat = flat[:, :2] / np.maximum(flat[:, 2:], _NEAR_M)
-            axes.add_patch(Polygon(flat, closed=True, facecolor=INK, alpha=0.3, zorder=3))
-            axes.add_patch(Polygon(flat, closed=True, fill=False, edgecolor=INK, linewidth=1.5, zorder=3))
+            _draw_arrow(axes, flat, 3)
             labels.append(Label(area_of(axes, flat), text, INK))
     # The nearest boxes last, because they occlude the others.
     for box in sorted(boxes, key=lambda box: -box.center[0]):

@@ -73,7 +73,11 @@ def flatten_scan(points: Points, perception: Perception | None = None) -> bytes:
     seen = drawable_points(points)
     points, painted = points[seen], painted[seen]
     x, y = points[:, :2].astype(np.float64).T
-    level = np.clip(np.floor(_heights(points, perception) / 1.2 + 0.75), 0, 2)
+    if perception is None:
+        height_m = find_ground(points).height_m
+    else:
+        height_m = heights_above(perception.ground, ModelFrame(perception.mounting).move(points)).height_m
+    level = np.clip(np.floor(height_m / 1.2 + 0.75), 0, 2)
     order = [*CLASS_COLORS]
     as_pixel = np.array([_CLASS + order.index(name) if name in order else _OTHER for name in names], np.uint8)
     value = np.where(painted == 0, _POINT + level.astype(np.uint8), as_pixel[painted])
@@ -84,13 +88,6 @@ def flatten_scan(points: Points, perception: Perception | None = None) -> bytes:
     shown = shown[np.argsort(value[shown], kind="stable")]  # classes over the background
     image[row[shown].astype(np.intp), col[shown].astype(np.intp)] = value[shown]
     return zlib.compress(image.tobytes(), 1)
-
-
-def _heights(points: Points, perception: Perception | None) -> NDArray[np.float32]:
-    """Heights above the ground [m]."""
-    if perception is None:
-        return find_ground(points).height_m
-    return heights_above(perception.ground, ModelFrame(perception.mounting).move(points)).height_m
 
 
 def draw_tracks(

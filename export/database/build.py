@@ -45,30 +45,20 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Report:
-    """The result of a build.
-
-    scenes, made, kept : number of scenes in the database; number made by this build; number already finished.
-    skipped : dict of str to str; name of each scene left out -> the reason.
-    scores : scores of the road model on the drawn roads, by split: F1, accuracy, precision, recall.
-    notes : remarks on the inputs, such as drawn scenes that do not exist.
-    """
+    """The result of a build."""
 
     scenes: int
-    made: int
-    kept: int
-    skipped: dict[str, str]
+    made: int  # by this build
+    kept: int  # already finished
+    skipped: dict[str, str]  # name of each scene left out -> the reason
+    # of the road model on the drawn roads, by split: F1, accuracy, precision, recall
     scores: dict[str, dict[str, float | None]]
-    notes: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()  # remarks on the inputs, such as drawn scenes that do not exist
 
 
 def folds(drives: Iterable[str]) -> dict[str, int]:
-    """Assign drives to five folds (section 3.4, Figure 14).
-
-    All scenes of a drive are in one fold, because they look alike. Drives are assigned in order of their number of
-    scenes, largest first, each to the fold with the fewest scenes.
-
-    drives : the drive of every scene.
-    Returns dict of str to int: Drive -> fold.
+    """Assign drives, given for every scene, to five folds (section 3.4, Figure 14), because scenes of one look alike:
+    in order of their number of scenes, each to the fold with the fewest.
     """
     sizes = [0] * N_FOLDS
     chosen = {}
@@ -87,15 +77,8 @@ def build(
     engine: Literal["local", "ray"] = "local",
     workers: int | None = None,
 ) -> Report:
-    """Build a database, or resume a stopped build.
-
-    polygons : COCO files of hand-drawn roads. They take precedence over the road model.
-    test_drives : drives to keep for testing, in addition to `edgeperc.datasets.splits.TEST_DRIVES`.
-    recipe : edgeperc_export.recipe.Recipe; recipe of the road models if ``plan.road_by`` is ``"train"`` (default: the
-        paper's LoDNN).
-    engine : processes on this computer, or ``ray.data`` on the cluster named by ``RAY_ADDRESS``, else on a local one.
-    workers : scenes made in parallel (default: the number of cores; 1 starts no process).
-    Raises DatabaseError, PointsError, SensorError, ModelError, ProviderError.
+    """Build a database, or resume a stopped build, here or by ``ray.data``. Drawn roads (COCO files) take precedence
+    over the road model, of ``recipe`` if it is to be trained. Raises DatabaseError and the errors of models.
     """
     objects = KittiObjects(plan.kitti)
     drawn = read_coco(polygons)

@@ -9,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from edgeperc.cli.arguments import options
 from edgeperc.cli.output import print_error, print_line
 
 DATABASE = "folder of a database made by edgeperc-export database-build"
@@ -16,68 +17,72 @@ DATABASE = "folder of a database made by edgeperc-export database-build"
 
 def add_database_commands(commands: argparse._SubParsersAction[Any]) -> None:
     """Add the four commands to the parser's commands."""
-    build = commands.add_parser(
-        "database-build", help="make a top-view database of a KITTI object set, or resume a stopped build"
+    add = options(
+        commands.add_parser(
+            "database-build", help="make a top-view database of a KITTI object set, or resume a stopped build"
+        ),
+        run=_build,
+        extra="database",
     )
-    build.add_argument("kitti", type=Path, help="KITTI object set: a folder of training/velodyne, label_2 and calib")
-    build.add_argument("out", type=Path, help="folder for the database; finished scenes in it are kept")
-    build.add_argument("--polygons", type=Path, nargs="+", default=[], help="COCO files of hand-drawn roads")
-    build.add_argument(
-        "--road-by",
-        default="lodnn",
-        metavar="NAME|PATH|train",
-        help="source of the roads that are not drawn by hand: a shipped model (default lodnn), an .onnx file with a "
+    add("kitti", "KITTI object set: a folder of training/velodyne, label_2 and calib", type=Path)
+    add("out", "folder for the database; finished scenes in it are kept", type=Path)
+    add("--polygons POLYGONS...", "COCO files of hand-drawn roads", type=Path, default=[])
+    add(
+        "--road-by NAME|PATH|train",
+        "source of the roads that are not drawn by hand: a shipped model (default lodnn), an .onnx file with a "
         "card, or train, which trains a LoDNN for each fold on the drawn roads of the other folds",
+        default="lodnn",
     )
-    build.add_argument(
+    add(
         "--road-recipe",
+        "network for --road-by train: LoDNN-I as published, or that of the model lodnn, which takes a thirtieth "
+        "of the time (default paper)",
         choices=("paper", "small"),
         default="paper",
-        help="network for --road-by train: LoDNN-I as published, or that of the model lodnn, which takes a thirtieth "
-        "of the time (default paper)",
     )
-    build.add_argument(
-        "--road-steps", type=int, help="training steps of each fold for --road-by train (default: the recipe's)"
-    )
-    build.add_argument("--provider", default="cpu", help="execution provider of the road model (default cpu)")
-    build.add_argument("--sensor", default="hdl-64e", help="sensor of the scans (default hdl-64e)")
-    build.add_argument(
-        "--test-drive", action="append", default=[], metavar="DRIVE", help="drive to keep for testing; may be repeated"
-    )
-    build.add_argument(
-        "--variations",
+    add("--road-steps ROAD_STEPS", "training steps of each fold for --road-by train (default: the recipe's)", type=int)
+    add("--provider PROVIDER", "execution provider of the road model (default cpu)", default="cpu")
+    add("--sensor SENSOR", "sensor of the scans (default hdl-64e)", default="hdl-64e")
+    add("--test-drive DRIVE", "drive to keep for testing; may be repeated", action="append", default=[])
+    add(
+        "--variations N",
+        "turned and mirrored copies of each training scene with a drawn road (default 8)",
         type=int,
         default=8,
-        metavar="N",
-        help="turned and mirrored copies of each training scene with a drawn road (default 8)",
     )
-    build.add_argument(
+    add(
         "--engine",
+        "where scenes are made: processes on this computer, or a Ray cluster (default local)",
         choices=["local", "ray"],
         default="local",
-        help="where scenes are made: processes on this computer, or a Ray cluster (default local)",
     )
-    build.add_argument("--workers", type=int, metavar="N", help="scenes made in parallel (default: one for each core)")
-    build.set_defaults(run=_build, extra="database")
+    add("--workers N", "scenes made in parallel (default: one for each core)", type=int)
 
-    label = commands.add_parser("database-label", help="draw roads over a database's images, in a browser")
-    label.add_argument("out", type=Path, help=DATABASE)
-    label.add_argument("--polygons", type=Path, help="COCO file to read and write (default OUT/road.coco.json)")
-    label.add_argument(
-        "--kitti", type=Path, help="KITTI object set whose training/image_2 holds camera pictures to show"
+    add = options(
+        commands.add_parser("database-label", help="draw roads over a database's images, in a browser"),
+        run=_label,
+        extra="database",
     )
-    label.add_argument("--port", type=int, default=8117, help="port of the page; 0: any free port (default 8117)")
-    label.add_argument("--no-browser", action="store_true", help="print the page's address and open no browser")
-    label.set_defaults(run=_label, extra="database")
+    add("out", DATABASE, type=Path)
+    add("--polygons POLYGONS", "COCO file to read and write (default OUT/road.coco.json)", type=Path)
+    add("--kitti KITTI", "KITTI object set whose training/image_2 holds camera pictures to show", type=Path)
+    add("--port PORT", "port of the page; 0: any free port (default 8117)", type=int, default=8117)
+    add("--no-browser", "print the page's address and open no browser")
 
-    coco = commands.add_parser("database-coco", help="write a database's vehicles and roads as a COCO file")
-    coco.add_argument("out", type=Path, help=DATABASE)
-    coco.add_argument("file", type=Path, help="COCO file to write")
-    coco.set_defaults(run=_coco, extra="database")
+    add = options(
+        commands.add_parser("database-coco", help="write a database's vehicles and roads as a COCO file"),
+        run=_coco,
+        extra="database",
+    )
+    add("out", DATABASE, type=Path)
+    add("file", "COCO file to write", type=Path)
 
-    check = commands.add_parser("database-check", help="compare every file of a database with its hash")
-    check.add_argument("out", type=Path, help=DATABASE)
-    check.set_defaults(run=_check, extra="database")
+    add = options(
+        commands.add_parser("database-check", help="compare every file of a database with its hash"),
+        run=_check,
+        extra="database",
+    )
+    add("out", DATABASE, type=Path)
 
 
 def _build(args: argparse.Namespace) -> int:

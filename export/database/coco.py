@@ -24,11 +24,7 @@ SMOOTH_CELLS, SIMPLIFIED_CELLS = 5.0, 1.5
 
 
 def draft(labels: NDArray[np.uint8]) -> list[list[list[float]]]:
-    """Polygons around the road of a map, for a person to correct. Holes are filled, and details below 1 m smoothed.
-
-    labels : (400, 200) uint8; index into `CLASSES`.
-    Returns list of polygons of corners [x, y], in pixels from the upper left corner.
-    """
+    """Polygons around the road of a map [px], for a person to correct, without holes and details below 1 m."""
     from shapely import box, union_all
 
     bars = []
@@ -52,17 +48,8 @@ def draft(labels: NDArray[np.uint8]) -> list[list[list[float]]]:
 def varied(
     image: NDArray[np.uint8], mask: NDArray[np.uint8], name: str, k: int
 ) -> tuple[NDArray[np.uint8], NDArray[np.uint8], float, bool]:
-    """Variation ``k`` of a drawn scene (section 3.4): image and mask, turned by the same angle and perhaps mirrored.
-
-    They are turned about the sensor, so that the distances in the image stay correct. Cells are moved without
-    interpolation, so that the mask keeps its values. Variation 0 is the scene itself. The same name and number always
-    give the same variation.
-
-    image : (400, 200, 3) uint8
-    mask : (400, 200) uint8; 1 road, 0 no road.
-    name : name of the scene.
-    Returns image ((400, 200, 3) uint8): 0 outside the scene.
-    Returns mask ((400, 200) uint8): `IGNORE` outside the scene.
+    """Variation ``k`` of a drawn scene (section 3.4), always the same by its name; 0 is itself. Image and mask are
+    turned about the sensor and perhaps mirrored, without interpolation, 0 and `IGNORE` outside the scene.
     """
     if k == 0:
         return image, mask, 0.0, False
@@ -80,10 +67,8 @@ def varied(
 
 
 def write_database_coco(database: TopViewDatabase, file: IO[str]) -> int:
-    """Write a database as COCO, an annotation for each vehicle and each scene's road; returns their number.
-
-    Scenes are written one at a time, so that memory use does not grow with the database. Vehicles are complete, even if
-    a nearer one covers part of them in the map.
+    """Write a database as COCO, one scene at a time, an annotation for each vehicle (complete, even if a nearer one
+    covers part of it in the map) and each scene's road; returns their number.
     """
     from faster_coco_eval.core import mask as coco
 

@@ -43,15 +43,8 @@ FARTHEST_M = float(np.hypot(X_RANGE_M[1], Y_RANGE_M[1]))
 
 
 def picture(points: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """A scan seen from above (section 3.1).
-
-    Coordinates are rounded to pixels of 0.1 m and clamped to the image. A pixel shows its highest point, and the first
-    of equally high ones. Each channel is scaled from its range to 0..255.
-
-    points : (n, 4) float32; x, y, z [m] in the sensor frame, remission, clamped to 0..1 (`condition.condition` scales
-        a sensor's). Rows that are not finite are left out.
-    Returns (400, 200, 3) uint8: Distance in the plane 0..47.07 m, height -2.5..2.5 m, remission 0..1. Row 0 is
-        farthest, column 0 leftmost. The first channel is 0 in exactly the pixels without a return.
+    """A scan seen from above (section 3.1): distance, height and remission (0..1) of each pixel's highest point, the
+    first of equally high ones, scaled to 0..255. The first channel is 0 in exactly the pixels without a return.
     """
     p = points[(points[:, 0] >= X_RANGE_M[0]) & (points[:, 0] <= X_RANGE_M[1])]
     p = p[(p[:, 1] >= Y_RANGE_M[0]) & (p[:, 1] <= Y_RANGE_M[1]) & (p[:, 2] >= Z_RANGE_M[0]) & (p[:, 2] <= Z_RANGE_M[1])]
@@ -69,11 +62,8 @@ def picture(points: NDArray[np.float32]) -> NDArray[np.uint8]:
 
 
 def vehicles(boxes: Iterable[Box]) -> tuple[Box, ...]:
-    """Cars, vans and trucks that cover a cell of the view, as rectangles in the plane (section 3.2).
-
-    Numbers are rounded to 0.1 mm as in the label files, so that a map drawn from a label file is the same.
-
-    Raises DatabaseError.
+    """Cars, vans and trucks that cover a cell of the view, as rectangles (section 3.2), rounded to 0.1 mm as in the
+    label files, so that a map drawn from a file is the same. Raises DatabaseError.
     """
     kept = []
     for box in boxes:
@@ -92,14 +82,8 @@ def vehicles(boxes: Iterable[Box]) -> tuple[Box, ...]:
 
 
 def road_and_vehicles(road: NDArray[Any], boxes: Iterable[Box]) -> NDArray[np.uint8]:
-    """The map of a scene (section 3.8): the road, with the vehicles drawn over it.
-
-    A cell belongs to a vehicle if its center lies in the vehicle's rectangle. This is the paper's rotated box, without
-    the holes left by rotating whole pixels. Where two vehicles overlap, the nearer one is drawn.
-
-    road : (400, 200) bool or integer; 1 road, 0 other ground.
-    boxes : from `vehicles`.
-    Returns (400, 200) uint8: Index into `CLASSES`.
+    """The map of a scene (section 3.8), indices into `CLASSES`: the road, 1, with the vehicles over it, the nearer one
+    where two overlap; a cell is a vehicle's if its center is. It has no holes left by rotating whole pixels.
     """
     labels = road.astype(np.uint8)
     draw_footprints(labels, boxes, VIEW, CLASSES)
@@ -115,10 +99,7 @@ def write_labels(boxes: Iterable[Box]) -> str:
 
 
 def read_labels(path: Path) -> tuple[Box, ...]:
-    """Vehicles of a label file; their z and height are 0.
-
-    Raises DatabaseError.
-    """
+    """Vehicles of a label file; their z and height are 0. Raises DatabaseError."""
     boxes = []
     for line in path.read_text().splitlines():
         try:
@@ -148,21 +129,15 @@ def read_png(path: Path) -> NDArray[np.uint8]:
 
 @dataclass(frozen=True, eq=False)
 class TopViewScene:
-    """One scene of the database.
-
-    fold : None for test scenes.
-    image : (400, 200, 3) uint8
-    boxes : their z and height are 0.
-    map : (400, 200) uint8; index into `CLASSES`.
-    """
+    """One scene of the database."""
 
     name: str
     drive: str
     split: str
-    fold: int | None
+    fold: int | None  # None for test scenes
     image: NDArray[np.uint8]
-    boxes: tuple[Box, ...]
-    map: NDArray[np.uint8]
+    boxes: tuple[Box, ...]  # their z and height are 0
+    map: NDArray[np.uint8]  # index into `CLASSES`
 
     @property
     def rectangles(self) -> NDArray[np.float64]:
@@ -171,14 +146,8 @@ class TopViewScene:
 
 
 class TopViewDatabase:
-    """A finished database: a sequence of `TopViewScene`, read one at a time.
-
-    root : folder written by ``edgeperc-export database-build``.
-    split : ``"all"``, ``"train"``, ``"validation"`` or ``"test"``.
-    fold : validation is this fold, and training the other four. Without it, validation is empty.
-    manifest : content of ``manifest.json``.
-    rows : list of dict of str to str; the lines of the index that belong to the split.
-    Raises DatabaseError, ValueError.
+    """A finished database: a sequence of `TopViewScene`, read one at a time; of a split "all", "train", "test" or
+    "validation", which is a ``fold``, and empty without one. Raises DatabaseError, ValueError.
     """
 
     def __init__(self, root: Path | str, split: str = "all", fold: int | None = None) -> None:

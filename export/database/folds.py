@@ -32,25 +32,16 @@ from .files import N_FOLDS
 
 @dataclass(frozen=True)
 class DrawnScene:
-    """A scene with a drawn road.
-
-    road : COCO segmentations of the drawn road.
-    inputs : key of the scene's input files, from `edgeperc_export.database.scenes.inputs_of`.
-    """
+    """A scene with a drawn road."""
 
     fold: int
-    road: list[Any]
-    inputs: str
+    road: list[Any]  # COCO segmentations
+    inputs: str  # `scenes.inputs_of`
 
 
 def train_folds(objects: KittiObjects, drawn: Mapping[str, DrawnScene], recipe: Recipe, out: Path, work: Path) -> None:
-    """Write ``out/fold-0.onnx`` to ``fold-4.onnx``. A model of the same scenes and recipe is not made again.
-
-    drawn : mapping of str to DrawnScene; name of the scene -> the scene.
-    recipe : recipe of a top-view network with a class "drivable".
-    out : folder for the models.
-    work : folder for checkpoints, from which a stopped training run resumes.
-    Raises DatabaseError.
+    """Write ``out/fold-0.onnx`` to ``fold-4.onnx``, of drawn scenes by name; a model of the same scenes and recipe is
+    not made again. Stopped runs resume from ``work``. Raises DatabaseError.
     """
     made: dict[str, Path] = {}
     for fold in range(N_FOLDS):

@@ -58,18 +58,8 @@ HEADERS = {
 
 
 class LabelServer(ThreadingHTTPServer):
-    """The server of the page, on 127.0.0.1; ``serve_forever`` runs it.
-
-    root : a finished database.
-    polygons : COCO file to write; its polygons are read if it exists.
-    kitti : object set whose ``training/image_2`` holds camera pictures.
-    port : 0 takes any free port.
-    url : address of the page.
-    token : random; every write has it in the header ``X-Edgeperc-Token``.
-    hosts : the ``Host`` headers that are answered: of 127.0.0.1 and of localhost.
-    roads, drafts : dict of str to list; polygons of the drawn scenes, and of scenes with an unconfirmed draft. A
-        scene is in one of them at most.
-    Raises DatabaseError, OSError.
+    """The server of the page on 127.0.0.1, at ``url``: it answers to ``hosts`` alone and writes the COCO file, if a
+    header has ``token``. A scene is in ``roads`` or, unconfirmed, in ``drafts``. Raises DatabaseError, OSError.
     """
 
     daemon_threads = True

@@ -42,24 +42,14 @@ TRAIN, TRAINED = "train", ("road/models", ".build/road")
 
 @dataclass(frozen=True)
 class Plan:
-    """Settings of a database.
-
-    kitti, out : folders of the KITTI object set and of the database. All computers of a Ray cluster need them at
-        these paths.
-    road_by : source of the roads that are not drawn by hand: the name of a shipped model, the path of an .onnx with a
-        card, or ``"train"``: a model for each fold, trained on the drawn roads of the other folds.
-    sensor : sensor of the scans, as `edgeperc.Perceiver` takes it.
-    provider : as `edgeperc.Perceiver` takes it. With ``"auto"`` the provider, and so the roads, may change between
-        builds.
-    variations : number of variations of each drawn training scene (section 3.4).
-    """
+    """Settings of a database. All computers of a Ray cluster need its folders at these paths."""
 
     kitti: Path
     out: Path
-    road_by: str = "lodnn"
+    road_by: str = "lodnn"  # of roads that are not drawn: a model's name or path, or "train": one for each fold
     sensor: str = "hdl-64e"
-    provider: str = "cpu"
-    variations: int = 8
+    provider: str = "cpu"  # with "auto" the roads may change between builds
+    variations: int = 8  # of each drawn training scene (section 3.4)
 
     def road_model(self, fold: int | None) -> str:
         """The road model of a fold. Test scenes (None) take the first fold's, whose training set has no test scene."""
@@ -68,28 +58,18 @@ class Plan:
 
 @dataclass(frozen=True)
 class Job:
-    """One scene to make.
-
-    name, drive, grade, split : as in the index.
-    fold : None for test scenes.
-    road : COCO segmentations of the drawn road; None if none is drawn.
-    """
+    """One scene to make, as in the index."""
 
     name: str
     drive: str
     grade: str
     split: str
-    fold: int | None
-    road: list[Any] | None = field(default=None)
+    fold: int | None  # None for test scenes
+    road: list[Any] | None = field(default=None)  # COCO segmentations; None if none is drawn
 
 
 class RoadModel:
-    """Road maps by a network (section 3.7).
-
-    model : as `Plan.road_model` gives it.
-    on_mismatch : what to do if the scans differ from those the model was trained on.
-    Raises CardMismatchError.
-    """
+    """Road maps by a network (section 3.7), as `Plan.road_model` names it. Raises CardMismatchError."""
 
     def __init__(self, plan: Plan, model: str, on_mismatch: Literal["warn", "ignore"]) -> None:
         # One thread each, because scenes are made in parallel.
@@ -134,10 +114,7 @@ class RoadModel:
 
 
 class SceneBuilder:
-    """Makes scenes, one at a time (sections 3.1 to 3.4, 3.7 and 3.8).
-
-    on_mismatch : passed to `RoadModel`.
-    """
+    """Makes scenes, one at a time (sections 3.1 to 3.4, 3.7 and 3.8)."""
 
     def __init__(self, plan: Plan, on_mismatch: Literal["warn", "ignore"] = "ignore") -> None:
         self.plan = plan
@@ -167,10 +144,7 @@ class SceneBuilder:
             return False  # no record, or not one of this format: the scene is made again
 
     def __call__(self, job: Job) -> str:
-        """Make a scene; returns the reason if it is left out, else "".
-
-        Raises OSError.
-        """
+        """Make a scene; returns the reason if it is left out, else "". Raises OSError."""
         try:
             frame = self.objects.frame(job.name)
             boxes = vehicles(frame.boxes)
@@ -237,10 +211,7 @@ class SceneBuilder:
 
 
 def inputs_of(kitti: Path, name: str) -> str:
-    """A key of a scene's input files: hashes of label and calibration, and the size of the scan.
-
-    The scan is not hashed, because it is large.
-    """
+    """A key of a scene's input files: hashes of label and calibration, and the size of the scan, which is large."""
     training = kitti / "training"
     small = [training / "label_2" / f"{name}.txt", training / "calib" / f"{name}.txt"]
     facts = [hashlib.sha256(path.read_bytes()).hexdigest() for path in small]

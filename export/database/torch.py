@@ -13,11 +13,7 @@ from .files import TopViewDatabase
 
 
 class TopViewDataset(Dataset[tuple[Tensor, Tensor]]):
-    """Images and maps of a database; parameters and errors are those of `TopViewDatabase`.
-
-    Item k is the image, (3, 400, 200) float32 in 0..1 (section 3.6), and the map, (400, 200) int64, an index into
-    `edgeperc_export.data.roads.CLASSES`. The vehicles are in ``database[k].rectangles``, because their number varies.
-    """
+    """A `TopViewDatabase`: item k is the image, (3, 400, 200) float32 in 0..1, and the map, (400, 200) int64."""
 
     def __init__(self, root: Path | str, split: str = "all", fold: int | None = None) -> None:
         self.database = TopViewDatabase(root, split, fold)

@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -65,24 +65,9 @@ def agree(
     camvid: Path | None = None,
     split: str = "validation",
     n_scans: int | None = None,
-    on_scan: Callable[[str], None] = lambda precision: None,
 ) -> dict[str, dict[str, Any]]:
-    """Measure every precision that the files of one network can run in, and write the record into their cards.
-
-    fp32 and int8 run on stock onnxruntime's CPU provider. bf16 runs the fp32 file in OpenVINO's own Python API. It is
-    measured if OpenVINO is installed and the processor has bf16 instructions.
-
-    models : files of one network, or its name for all its variants. One of them is in fp32.
-    kitti, semantickitti : roots of a KITTI object set and of SemanticKITTI. Their labels are the ground truth: of
-        points or vehicles (KITTI) and of road (SemanticKITTI). All scans of SemanticKITTI are used, although they are
-        of a test drive, because no other real scans have road labels.
-    camvid : folder of CamVid, for a network of a camera; then the other sets are not used.
-    split : drives of the KITTI object set (`edgeperc.datasets.splits.in_split`), or images of CamVid
-        (`edgeperc.datasets.images.LabeledImages.files`).
-    n_scans : at most this many scans, or images, of each set, evenly spread; None takes all.
-    on_scan : called with the precision after each scan.
-    Returns precisions: Precision -> its record (`edgeperc.ModelCard`, ``precisions``).
-    Raises ModelError, PointsError, SplitError.
+    """Measure every precision that the files of one network can run in on labeled scans or images, at most ``n_scans``
+    of each set, and write the record into their cards. Raises ModelError, PointsError, SplitError.
     """
     variants = {variant.precision: variant for model in models for variant in resolve(model)}
     names = {f"{variant.name} {variant.card.version}" for variant in variants.values()}
@@ -103,22 +88,14 @@ def agree(
     if variants["fp32"].card.view.kind == "camera":
         if camvid is None:
             raise PointsError(f"{variants['fp32'].name} is of a camera, and there is no labeled image; name CamVid")
-        measured = {
-            precision: _measure_images(variant, precision, LabeledImages(camvid), split, n_scans, on_scan)
-            for precision, variant in runs.items()
-        }
+        measure = partial(_measure_images, data=LabeledImages(camvid), split=split, n_images=n_scans)
     elif of_objects:
         if kitti is None:
             raise PointsError("objects are compared on KITTI's boxes; name a KITTI object set")
-        measured = {
-            precision: _measure_objects(variant, KittiObjects(kitti), split, n_scans, on_scan)
-            for precision, variant in runs.items()
-        }
+        measure = partial(_measure_objects, objects=KittiObjects(kitti), split=split, n_scans=n_scans)
     else:
-        measured = {
-            precision: _measure(variant, precision, kitti, semantickitti, split, n_scans, on_scan)
-            for precision, variant in runs.items()
-        }
+        measure = partial(_measure, kitti=kitti, semantickitti=semantickitti, split=split, n_scans=n_scans)
+    measured = {precision: measure(variant, precision) for precision, variant in runs.items()}
     options = [f"--kitti KITTI --split {split}"] * (kitti is not None)
     options += [f"--camvid CAMVID --split {split}"] * (camvid is not None)
     options += ["--semantickitti SEMANTICKITTI"] * (semantickitti is not None) + [f"--scans {n_scans}"] * bool(n_scans)
@@ -163,47 +140,48 @@ def record_of(own: Measured, fp32: Measured, command: str) -> dict[str, Any]:
 def _measure(
     variant: Variant,
     precision: str,
+    *,
     kitti: Path | None,
     semantickitti: Path | None,
     split: str,
     n_scans: int | None,
-    on_scan: Callable[[str], None],
 ) -> Measured:
     judge = Judge([variant.path], Perceiving(boxes_from="network"))
-    (session,) = judge.perceive.sessions
-    by = f"onnxruntime {onnxruntime.__version__}, {session.provider}"
-    if precision == "bf16":
-        by = _run_in_openvino(session)
-    truths: list[tuple[str, Callable[[], Truth]]] = []
-    if kitti is not None:
-        objects = KittiObjects(kitti)
-        names = _spread(objects.names(split), n_scans)
-        truths += [("real", partial(_kitti, judge, objects, name)) for name in names]
-    if semantickitti is not None and judge.from_above is not None:
-        roads = SemanticKitti(semantickitti)
-        names = _spread(roads.names("all"), n_scans)
-        truths += [("road", partial(_semantickitti, judge, roads, name)) for name in names]
-    if not truths:
-        raise PointsError(f"no labeled scan of {split} drives in {kitti}, {semantickitti}; name a KITTI object set")
+    by = _engine(judge.perceive.sessions[0], precision)
+
+    def truths() -> Iterator[tuple[str, Truth]]:
+        if kitti is not None:
+            objects = KittiObjects(kitti)
+            for name in _spread(objects.names(split), n_scans):
+                yield "real", judge.kitti(objects.frame(name))
+        if semantickitti is not None and judge.from_above is not None:
+            roads = SemanticKitti(semantickitti)
+            for name in _spread(roads.names("all"), n_scans):
+                yield "road", judge.semantickitti(roads.frame(name))
+
     records: dict[str, list[Record]] = {}
     labels = []
-    for block, read in truths:
-        truth = read()
+    for block, truth in truths():
         records.setdefault(block, []).append(judge.record(truth)[0])
         labels.append(_labels(judge.perceive(truth.points)))
-        on_scan(precision)
+    if not labels:
+        raise PointsError(f"no labeled scan of {split} drives in {kitti}, {semantickitti}; name a KITTI object set")
     blocks = [figures(of_block, 0) for of_block in records.values()]
     ious = [iou for block in blocks for iou in _ious(block)]
     ap = [block["boxes"]["oriented"]["all"]["vehicle"]["ap"] for block in blocks if "boxes" in block]
-    return Measured(labels, float(np.nanmean(ious)), ap[0] if ap else None, f"{by}, {cpu_model()}")
+    return Measured(labels, float(np.nanmean(ious)), ap[0] if ap else None, by)
 
 
 def _measure_objects(
-    variant: Variant, objects: KittiObjects, split: str, n_scans: int | None, on_scan: Callable[[str], None]
+    variant: Variant,
+    precision: str,
+    *,
+    objects: KittiObjects,
+    split: str,
+    n_scans: int | None,
 ) -> Measured:
-    """Class of each cluster; overlap from above of each object to find with the best box; mean AP of cars.
-
-    AP is the mean of bird's eye and 3-D at 0.7, moderate, with the boxes of the top view as candidates, too.
+    """Class of each cluster; overlap from above of each object with the best box; mean AP of cars (bird's eye and 3-D
+    at 0.7, moderate), with the boxes of the top view as candidates, too.
     """
     perceive = Perceiver(
         [TOP_VIEW, variant.path],
@@ -225,25 +203,20 @@ def _measure_objects(
         session.input[: len(inputs[:MAX_ROWS])] = inputs[:MAX_ROWS]
         outputs = session.run(min(len(inputs), MAX_ROWS))["objects"][: len(inputs)] if len(inputs) else inputs[:, 0]
         labels.append(outputs[:, : len(session.card.classes)].argmax(axis=1).astype(np.uint8))
-        on_scan(session.precision)
     aps = [average_precisions(table.counts["car", overlap, "moderate"])[2] for overlap in ("bird's eye 0.7", "3-D 0.7")]
-    by = f"onnxruntime {onnxruntime.__version__}, {session.provider}, {cpu_model()}"
-    return Measured(labels, float(np.mean(overlaps)), float(np.mean(aps)), by)
+    return Measured(labels, float(np.mean(overlaps)), float(np.mean(aps)), _engine(session, precision))
 
 
 def _measure_images(
     variant: Variant,
     precision: str,
+    *,
     data: LabeledImages,
     split: str,
     n_images: int | None,
-    on_image: Callable[[str], None],
 ) -> Measured:
     perceive = Perceiver([variant.path])
-    (session,) = perceive.sessions
-    by = f"onnxruntime {onnxruntime.__version__}, {session.provider}"
-    if precision == "bf16":
-        by = _run_in_openvino(session)
+    by = _engine(perceive.sessions[0], precision)
     labels, confusion = [], Confusion(variant.card.classes)
     for file in _spread(data.files(split), n_images):
         image, truth = data.read(file)
@@ -251,16 +224,7 @@ def _measure_images(
         assert found is not None
         labels.append(found.labels.ravel())
         confusion.update(found.labels, truth)
-        on_image(precision)
-    return Measured(labels, confusion.mean_iou(), None, f"{by}, {cpu_model()}")
-
-
-def _kitti(judge: Judge, objects: KittiObjects, name: str) -> Truth:
-    return judge.kitti(objects.frame(name))
-
-
-def _semantickitti(judge: Judge, roads: SemanticKitti, name: str) -> Truth:
-    return judge.semantickitti(roads.frame(name))
+    return Measured(labels, confusion.mean_iou(), None, by)
 
 
 def _spread(names: Sequence[T], most: int | None) -> Sequence[T]:
@@ -284,8 +248,10 @@ def _ious(block: Mapping[str, Any]) -> list[float]:
     return [np.nan if iou is None else iou for iou in found]
 
 
-def _run_in_openvino(session: Session) -> str:
-    """Make a session compute its outputs in bf16 through OpenVINO's own API; returns the engine and its version."""
+def _engine(session: Session, precision: str) -> str:
+    """The engine, its version and the processor; for bf16 the session is made to compute through OpenVINO's own API."""
+    if precision != "bf16":
+        return f"onnxruntime {onnxruntime.__version__}, {session.provider}, {cpu_model()}"
     import openvino
 
     core = openvino.Core()
@@ -305,4 +271,4 @@ def _run_in_openvino(session: Session) -> str:
         return session.outputs
 
     session.run = run  # type: ignore[method-assign]
-    return f"OpenVINO {openvino.__version__.partition('-')[0]}"
+    return f"OpenVINO {openvino.__version__.partition('-')[0]}, {cpu_model()}"

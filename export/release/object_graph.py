@@ -13,11 +13,8 @@ from ..networks.objects import LEAST, rejected
 
 
 def with_first_look(look: onnx.ModelProto, close: onnx.ModelProto) -> onnx.ModelProto:
-    """Join two graphs of one input: ``close`` gets the candidates whose logit of ``look`` is at least `LEAST`.
-
-    The candidates are sorted by their logits, because no operator that scatters is among
-    `types.onnx_file.OPERATORS`: the first ones are looked at closely, and every candidate then takes its row of the
-    outputs, or that of `rejected`.
+    """Join two graphs of one input: ``close`` gets the candidates, sorted because no operator that scatters is allowed,
+    whose logit of ``look`` reaches `LEAST`; each then takes its row of the outputs, or that of `rejected`.
     """
     source, output = close.graph.input[0], close.graph.output[0]
     look, close = compose.add_prefix(look, "look_"), compose.add_prefix(close, "close_")

@@ -40,10 +40,8 @@ def candidate_inputs(
 
 
 def compare_objects(network: ObjectNet, session: Session, scans: Sequence[NDArray[Any]]) -> dict[str, float]:
-    """Differences between torch and onnxruntime on the clusters of scans, as `release.to_onnx.verify` says.
-
-    ``label_agreement`` is the share of candidates with a score of 0.1 or more that have the same class,
-    ``box_deviation`` the largest difference of their places and sizes [m].
+    """Differences between torch and onnxruntime on the clusters of scans, as `to_onnx.verify` says: of classes among
+    candidates with a score of 0.1 or more, of places and sizes [m].
     """
     card = session.card
     worst, agreement, box_deviation = 0.0, 1.0, 0.0

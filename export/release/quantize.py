@@ -20,7 +20,7 @@ import platform
 import re
 import tempfile
 import time
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -96,18 +96,12 @@ class Calibration(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class LabeledSets:
-    """What two models are compared on.
+    """What two models are compared on."""
 
-    kitti : root of a KITTI object set: on its validation drives; the card's figures are of its test drives.
-    semantickitti : root of SemanticKITTI: on its roads.
-    camvid : folder of CamVid: on its validation images.
-    n_simulated : number of simulated scans, other than those of the calibration.
-    """
-
-    kitti: Path | None = None
-    semantickitti: Path | None = None
-    camvid: Path | None = None
-    n_simulated: int = 48
+    kitti: Path | None = None  # its validation drives; the card's figures are of its test drives
+    semantickitti: Path | None = None  # its roads
+    camvid: Path | None = None  # its validation images
+    n_simulated: int = 48  # scans, other than those of the calibration
 
 
 Losses = Mapping[str, tuple[float, float, float, float]]
@@ -115,12 +109,8 @@ Losses = Mapping[str, tuple[float, float, float, float]]
 
 
 def calibration_scans(paths: Sequence[Path] = (), *, kitti: Path | None = None, n_simulated: int = 0) -> Calibration:
-    """Scans to calibrate on, the real ones first.
-
-    paths : scans, or folders of ``.bin`` files.
-    kitti : root of a KITTI object set; 64 scans of its training drives are taken, evenly spread.
-    n_simulated : number of simulated scans.
-    Raises SplitError, PointsError.
+    """Scans to calibrate on: files or folders, 64 of KITTI's training drives, simulated. Raises SplitError,
+    PointsError.
     """
     files = [file for path in paths for file in (sorted(path.rglob("*.bin")) if path.is_dir() else [path])]
     for file in files:
@@ -183,10 +173,7 @@ def folded(path: Path) -> onnx.ModelProto:
 
 @dataclass(frozen=True)
 class Calibrated:
-    """A network in fp32, the range of each of its tensors, and its outputs for some images.
-
-    ``means`` are those of the convolutions whose shift is corrected.
-    """
+    """A network in fp32, the ranges of its tensors, its outputs for some images, and means of convolutions."""
 
     card: ModelCard
     model: onnx.ModelProto
@@ -343,10 +330,7 @@ def _between(graph: onnx.GraphProto, convolutions: Collection[str]) -> set[str]:
 
 
 def _unround(graph: onnx.GraphProto, rounded: Collection[str]) -> None:
-    """Connect operators in fp32 directly to outputs in fp32, without rounding in between.
-
-    SSADNet's unpooling compares a tensor with its maxima. With one side rounded, few values would be equal.
-    """
+    """Connect operators in fp32 to outputs in fp32: SSADNet's unpooling compares a tensor with its maxima."""
     maker = {output: node for node in graph.node for output in node.output}
     origin = {}
     for node in graph.node:
@@ -378,10 +362,7 @@ def _outputs(
 def _noise(
     outputs: Sequence[Mapping[str, NDArray[np.float32]]], expected: Sequence[Mapping[str, NDArray[np.float32]]]
 ) -> float:
-    """Squared error as a share of the squares, of the output where it is largest.
-
-    It hardly depends on single labels or boxes, so that a few scans are enough to compare convolutions.
-    """
+    """Squared error as a share of the squares, of the worst output; it hardly depends on single labels or boxes."""
     shares = []
     for kind in expected[0]:
         pairs = [(one[kind].astype(np.float64), other[kind]) for one, other in zip(expected, outputs, strict=True)]
@@ -417,10 +398,8 @@ def _multiplications(model: onnx.ModelProto) -> dict[str, int]:
 
 
 def _choose(fp32: Calibrated, candidates: Sequence[str], limit: float, noise: float) -> tuple[list[str], float]:
-    """The convolutions to round, and their noise: all of them, which make ``noise``, or as many as the limit allows.
-
-    Those that make most noise for the time that they take, alone, are left out first. Takes at most n + log2(n) trials
-    for n convolutions.
+    """The convolutions to round, and their noise: all, which make ``noise``, or as many as the limit allows; those with
+    most noise for their time are left out first. At most n + log2(n) trials for n convolutions.
     """
     if noise <= limit:
         return [*candidates], noise
@@ -450,16 +429,22 @@ def _choose(fp32: Calibrated, candidates: Sequence[str], limit: float, noise: fl
 
 
 def race(
-    one: Path, other: Path, n_threads: int | None, n_runs: int = N_RUNS
+    one: Path,
+    other: Path,
+    n_threads: int | None,
+    n_runs: int = N_RUNS,
+    batches: Sequence[NDArray[np.float32]] = (),
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Times of the runs of two networks [ms], measured in turn; the first run of each turn is a warm-up."""
+    """Times of runs of two networks [ms], in turn, for one batch of rows after the other; the first is a warm-up."""
     sessions = [Session(path, "cpu", n_threads=n_threads) for path in (one, other)]
     times = np.empty((2, n_runs))
     for run in range(n_runs):
+        rows = batches[run % len(batches)] if batches else sessions[0].input[:1]
         for k, session in enumerate(sessions):
-            session.run()
+            session.input[: len(rows)] = rows
+            session.run(len(rows))
             start = time.perf_counter()
-            session.run()
+            session.run(len(rows))
             times[k, run] = 1e3 * (time.perf_counter() - start)
     return times[0], times[1]
 
@@ -496,16 +481,21 @@ def _compared(before: Path, after: Path, labeled: LabeledSets) -> list[dict[str,
     """Counts of both models on KITTI's validation drives, on SemanticKITTI's roads and on simulated scans, by set."""
     judges = [Judge([path], NETWORK_ALONE) for path in (before, after)]
     read = judges[1]  # it was also calibrated on scans, which must not be among these
-    truths: list[tuple[str, Callable[[], Truth]]] = [
-        ("simulated", partial(read.simulated, samples.FIRST_SEED + k)) for k in range(labeled.n_simulated)
-    ]
+
+    def later(
+        block: str, truth_of: Callable[[Any], Truth], names: Iterable[Any]
+    ) -> list[tuple[str, Callable[[], Truth]]]:
+        return [(block, partial(truth_of, name)) for name in names]
+
+    first = samples.FIRST_SEED
+    truths = later("simulated", read.simulated, range(first, first + labeled.n_simulated))
     if labeled.kitti is not None:
         objects = KittiObjects(labeled.kitti)
         names = objects.names("validation") or objects.names("test")  # a set of other drives has no validation drives
-        truths += [("real", partial(_later, read.kitti, objects.frame, name)) for name in names]
+        truths += later("real", lambda name: read.kitti(objects.frame(name)), names)
     if labeled.semantickitti is not None and read.from_above is not None:
         roads = SemanticKitti(labeled.semantickitti)
-        truths += [("road", partial(_later, read.semantickitti, roads.frame, name)) for name in roads.names("all")]
+        truths += later("road", lambda name: read.semantickitti(roads.frame(name)), roads.names("all"))
     records: list[dict[str, list[Record]]] = [{}, {}]
     for block, make in tqdm(truths, desc="comparing", unit="scan"):
         truth = make()
@@ -514,15 +504,8 @@ def _compared(before: Path, after: Path, labeled: LabeledSets) -> list[dict[str,
     return records
 
 
-def _later(evaluate: Callable[[Any], Truth], read: Callable[[Any], Any], name: Any) -> Truth:
-    return evaluate(read(name))
-
-
 def losses_of(before: Mapping[str, Sequence[Record]], after: Mapping[str, Sequence[Record]]) -> Losses:
-    """Compare the scores of both models; intervals are over resampled drives.
-
-    Both models are resampled alike, because they err on the same scans. With one drive the interval is the loss itself.
-    """
+    """Compare the scores of both models, resampled by drive alike; with one drive the interval is the loss."""
     losses = {}
     for block in before:
         pairs = [_by_drive(of[block]) for of in (before, after)]
@@ -561,20 +544,8 @@ def quantize(
     max_noise: float = MAX_NOISE,
     race: Race = race,
 ) -> ModelCard:
-    """Write the int8 variant of a model, with its own card and figures.
-
-    ``precision="auto"`` takes the variant only after `edgeperc_export.release.agree` has measured it.
-
-    path, out : the model in fp32, and the .onnx to write.
-    calibration : from `calibration_scans` or, for a camera's model, `calibration_images`.
-    labeled : what both models are compared on.
-    exclude : nodes to keep in fp32.
-    seven_bits : use 7-bit weights. x86 without VNNI needs them, because its sums of 8-bit products saturate; None: if
-        this computer needs them.
-    n_threads : for timing; None leaves it to onnxruntime.
-    max_noise : largest noise of the outputs, as a share of their variance; above it, convolutions stay in fp32.
-    race : two paths and ``n_threads`` -> times of paired runs of both models [ms].
-    Raises RefusedError, ModelError, PointsError, OptionError.
+    """Write the int8 variant of a model if it is faster here (``race``) and as accurate; "auto" takes it only after
+    `release.agree`. Above ``max_noise``, convolutions stay in fp32. Raises RefusedError, ModelError, OptionError.
     """
     if not calibration.scans:
         raise PointsError("no scan to calibrate on; expected at least one")

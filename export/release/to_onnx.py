@@ -104,10 +104,7 @@ def _training(recipe: Recipe, notes: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def to_graph(network: nn.Module, card: ModelCard) -> onnx.ModelProto:
-    """The network as an ONNX graph with its weights, without paths of this computer and without a card.
-
-    If the card's outputs have blocks, the graph ends where the network's ``blocks`` do.
-    """
+    """The network as an ONNX graph, without paths and card; it ends with ``blocks`` if the card's outputs have some."""
     example = torch.from_numpy(golden_input(0, golden_shape(card)))
     names = [o.name for o in card.outputs]
     if isinstance(network, ObjectNet):
@@ -123,10 +120,7 @@ def to_graph(network: nn.Module, card: ModelCard) -> onnx.ModelProto:
 
 
 def traced(network: nn.Module, method: str, example: Tensor, input_name: str, names: Sequence[str]) -> onnx.ModelProto:
-    """A method of a network as a graph; of an input with three axes, for any length of the first two.
-
-    names : of the outputs.
-    """
+    """A method of a network as a graph with outputs of these names; the first two of three axes may have any length."""
     exported = network
     if method != "forward":
         exported = copy.copy(network)
@@ -159,10 +153,7 @@ def traced(network: nn.Module, method: str, example: Tensor, input_name: str, na
 
 
 def halve(graph: onnx.GraphProto, *, exactly: bool = False) -> None:
-    """Store large weights in half precision, which halves the file; engines convert them to fp32 when they load it.
-
-    exactly : only those that lose nothing.
-    """
+    """Store large weights (``exactly``: those that lose nothing) in half precision; engines convert them on loading."""
     casts = []
     for weight in graph.initializer:
         values = onnx.numpy_helper.to_array(weight)
@@ -181,12 +172,8 @@ def halve(graph: onnx.GraphProto, *, exactly: bool = False) -> None:
 
 
 def write_card(model: onnx.ModelProto, card: ModelCard, path: Path) -> None:
-    """Write a graph with its card, and read the card back through onnxruntime.
-
-    The graph may be of any network with a range image or a top view as input and outputs of the kinds of
-    `edgeperc.types.card.OutputSpec`. It is changed in place: a card in it is replaced.
-
-    Raises CardError, CardMismatchError, ModelFileError, ParityError.
+    """Write a graph, of any network whose view and outputs a card knows, with its card in place of one in it, and read
+    it back through onnxruntime. Raises CardError, CardMismatchError, ModelFileError, ParityError.
     """
     kept = [p for p in model.metadata_props if p.key != CARD_KEY]
     del model.metadata_props[:]
@@ -251,16 +238,8 @@ def pixel_labels(raw: NDArray[np.float32], kind: str) -> NDArray[np.uint8]:
 
 
 def verify(network: nn.Module, path: Path, scans: Sequence[NDArray[Any]]) -> dict[str, float]:
-    """Compare an exported model with its torch network: raw outputs, and labels and boxes after post-processing.
-
-    network : nn.Module
-    path : the .onnx.
-    scans : sequence of (n, 4) float32; x, y, z [m] in the sensor frame, remission in 0..1. Of a camera's model:
-        images (H, W, 3) uint8.
-    Returns: ``n_scans``; ``max_deviation``: the 99.9 % quantile of the differences of raw outputs, in standard
-        deviations of the output; ``label_agreement``: the smallest share of pixels with the same label;
-        ``box_deviation``: the largest difference of a center's coordinate or a size [m].
-    Raises ParityError.
+    """Compare an exported model with its torch network on scans or images: the 99.9 % quantile of differences in
+    standard deviations, the smallest share of equal labels, the largest difference of boxes [m]. Raises ParityError.
     """
     session = Session(path, "cpu")
     card = session.card
@@ -338,15 +317,8 @@ def export(
     metrics: Mapping[str, Any] | None = None,
     licence: str = "Apache-2.0",
 ) -> ModelCard:
-    """Export a checkpoint, verify the file, and write it with its card.
-
-    path : the .onnx file to write.
-    scans : sequence of (n, 4) float32; scans to verify on, as for `verify`.
-    fitness : profile of the training scans, for the check of inputs at runtime; None for a camera's network.
-    name : name of the model; by default the network's.
-    metrics : figures to write into the card.
-    licence : license of weights trained on simulation alone; others have the terms of their real frames (`TERMS`).
-    Raises ParityError.
+    """Export a checkpoint, verify the file on scans, and write it with its card; ``fitness`` describes the training
+    scans, ``licence`` is of weights trained on simulation alone (others: `TERMS`). Raises ParityError.
     """
     network, recipe, notes = load(checkpoint)
     card = card_of(

@@ -23,14 +23,8 @@ PIPELINE = "edgeperc"
 
 
 def write_repository(out: Path, models: Sequence[str | Path] = DEFAULT, *, sensor: str = "hdl-64e") -> list[Path]:
-    """Write a model repository.
-
-    out : folder for it. Models of the same names in it are replaced.
-    models : names or paths of models, one for each view; a name stands for its fp32 file, ``pointseg:int8`` for that
-        one.
-    sensor : name of the sensor of the scans, a built-in profile.
-    Returns: The folders of the models.
-    Raises ModelError, SensorError.
+    """Write a model repository for networks of scans (a name stands for its fp32 file) and a built-in sensor; models of
+    the same names in it are replaced. Returns their folders. Raises ModelError, SensorError.
     """
     name = get_sensor(sensor).name
     files = [(ModelCard.read(path), path) for path in map(model_path, models)]

@@ -75,17 +75,8 @@ def ablate(
     steps: int,
     variants: Sequence[str] = (),
 ) -> list[dict[str, Any]]:
-    """Run variants and add their figures to ``out/ablation.json``; variants with figures there are not run again.
-
-    network : ``"pointseg"``, ``"ssadnet"`` or ``"lodnn"``.
-    out : folder for the runs and ``ablation.json``.
-    data : with the fold to evaluate on.
-    run : starts from the checkpoint of the network's ``-sim`` model; ``"lodnn"`` has none.
-    steps : training steps of each run, for the shipped model's batch size.
-    variants : names in `VARIANTS`, or `PAPERS`; by default all of them.
-    Returns: ``network``, ``variant``, ``fold``, ``steps``, number of ``scans`` drawn, and ``figures`` at the end of
-        the run.
-    Raises ValueError.
+    """Run variants (by default all, and `PAPERS`), each of ``steps`` for the shipped batch size, from the network's
+    ``-sim`` model, and add their figures to ``out/ablation.json``; those in it are not run again. Raises ValueError.
     """
     out.mkdir(parents=True, exist_ok=True)
     path = out / "ablation.json"
@@ -124,10 +115,7 @@ def ablate(
 
 
 def plot(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
-    """Draw the search for LoDNN's learning rate, number of scans and batch size, like the paper's Figure 16.
-
-    Raises ValueError.
-    """
+    """Draw the search for LoDNN's learning rate, scans and batch size, like Figure 16; ValueError without a run."""
     from matplotlib.figure import Figure
 
     rows = [row for row in rows if row["network"] == "lodnn"]

@@ -38,10 +38,8 @@ class Camera(Carded):
         return self.card.view
 
     def loss(self, outputs: ImageOutputs, targets: tuple[Tensor, ...] | list[Tensor]) -> Tensor:
-        """Cross-entropy (categorical, as in the comparison) and, by the recipe, `lovasz_softmax` and early logits.
-
-        Logits are interpolated to the labels (B, H, W). If they are coarser, every second row and column is compared.
-        Early logits count with cross-entropy alone, at a quarter of the labels' resolution.
+        """Cross-entropy and, by the recipe, `lovasz_softmax`, of logits interpolated to the labels (every second row
+        and column if they are coarser); and cross-entropy of early logits at a quarter of the resolution.
         """
         recipe, (labels,) = self.recipe, targets
         weights = _weights(labels.device) if recipe.class_weights else None

@@ -75,14 +75,8 @@ RESULTS, PREDICTIONS = "camvid.json", "camvid.npz"
 
 
 def figures_of(counts: NDArray[np.int64]) -> dict[str, float]:
-    """Accuracy, mean IoU, F1 and Dice by the paper's equations 1 to 6.
-
-    counts : (C, C) int64; pixels; rows are the truth, columns the prediction.
-    Returns: ``miou``: mean of equation 1 over the classes. ``accuracy``: equation 2 over pixels, the share of right
-        ones. ``f1``: mean over the classes of equation 5, of the precision and recall of equations 3 and 4. ``dice``:
-        equation 6 with all classes' masks together. As each labeled pixel is in one mask of the truth and in one of
-        the prediction, it equals the accuracy; averaged over the classes, it would equal the F1. Classes without true
-        and predicted pixels are left out.
+    """Accuracy, mean IoU, F1 and Dice by the paper's equations 1 to 6, of pixels (C, C) by truth and prediction,
+    without absent classes. Dice, of all classes' masks together, equals the accuracy; by class, it would be F1.
     """
     confusion = Confusion([str(k) for k in range(len(counts))])
     confusion.counts = counts
@@ -111,19 +105,8 @@ def ablate_camvid(
     n_threads: int | None = None,
     compiled: bool = False,
 ) -> list[dict[str, Any]]:
-    """Train and evaluate the networks of `ELEVEN`; those with results in ``out/camvid.json`` are not trained again.
-
-    camvid : folder of CamVid.
-    out : folder for ``camvid.json``, for ``camvid.npz`` (the labels of three validation images) and for the runs. A
-        run that was stopped is resumed; the checkpoint of a finished one is deleted.
-    networks : names in `ELEVEN`; by default all.
-    width, height : size that images are scaled to for training and inference. Labels are compared at their own size.
-    epochs, batch : the budget of each network: this many times all training images, in steps of ``batch`` images.
-    learning_rate : by default the recipe's.
-    compiled : as for `edgeperc_export.training.train.Run`.
-    Returns: For each network its name, ``budget``, `FIGURES`, ``miou_interval``, ``iou`` of each class,
-        ``parameters``, ``seconds`` and ``curve``.
-    Raises ValueError.
+    """Train and evaluate networks of `ELEVEN`, with ``epochs`` of images scaled to one size; those with results in
+    ``out/camvid.json`` are not trained again, a stopped run is resumed. Labels are compared at their own size.
     """
     if unknown := [name for name in networks if name not in ELEVEN]:
         raise ValueError(f"no network {unknown[0]!r}; expected one of: {'; '.join(ELEVEN)}")
@@ -214,10 +197,7 @@ def _color(name: str) -> str:
 
 
 def plot_camvid(rows: Sequence[Mapping[str, Any]], folder: Path) -> list[Path]:
-    """Draw the figures of the networks beside the paper's, like its figures 7 to 11, and the curves, like 12 to 19.
-
-    Returns: ``figures.png`` and ``curves.png`` in the folder.
-    """
+    """Draw ``figures.png``, the networks beside the paper's (figures 7 to 11), and ``curves.png`` (12 to 19)."""
     from matplotlib.figure import Figure
 
     names = [row["name"] for row in rows]
@@ -264,12 +244,8 @@ def plot_camvid(rows: Sequence[Mapping[str, Any]], folder: Path) -> list[Path]:
 
 
 def show_camvid(predictions: Path, path: Path, camvid: Path | None = None) -> None:
-    """Draw three validation images under all networks, like the paper's table 5.
-
-    predictions : the ``camvid.npz`` of `ablate_camvid`.
-    path : picture to write.
-    camvid : folder of CamVid: the images and their true labels come first. Without it, the picture shows nothing of
-        CamVid.
+    """Draw three validation images under all networks, like table 5, from ``camvid.npz``; with the folder of CamVid the
+    images and true labels come first, without it the picture shows nothing of CamVid.
     """
     from matplotlib.figure import Figure
 

@@ -27,13 +27,8 @@ class CheckpointError(ModelError):
 
 
 def read_checkpoint(path: Path, device: str | torch.device = "cpu") -> dict[str, Any]:
-    """Read a checkpoint. Only tensors and plain values are unpickled.
-
-    device : str or torch.device; where its tensors go.
-    Returns: ``recipe`` (a Recipe), ``before`` and ``curve`` (lists), ``frames`` (dict), ``fitness`` (a FitnessProfile
-        of the real scans; None without one, or of an earlier version), ``n_simulated`` and ``step`` (int), ``averaged``
-        and ``best`` (weights by name; None if there was no best step), ``network`` and ``optimizer``.
-    Raises CheckpointError, OSError.
+    """Read a checkpoint, its tensors to a device, with its texts decoded and checked; only tensors and plain values are
+    unpickled. ``fitness`` and ``best`` may be None. Raises CheckpointError, OSError.
     """
     try:
         state = torch.load(path, weights_only=True, map_location=device)
@@ -51,10 +46,7 @@ def read_checkpoint(path: Path, device: str | torch.device = "cpu") -> dict[str,
 
 
 def build_network(state: Mapping[str, Any], path: Path) -> nn.Module:
-    """The averaged network of a checkpoint, of its best step.
-
-    Raises CheckpointError.
-    """
+    """The averaged network of a checkpoint, of its best step; raises CheckpointError."""
     try:
         network = build(state["recipe"])
         network.load_state_dict(state["best"] or state["averaged"])

@@ -8,11 +8,8 @@ from pathlib import Path
 
 
 def curve_table(run: Path, n_lines: int = 12) -> Iterator[str]:
-    """Lines of a table: samples seen, loss, and each validation figure in percent, and what the last quarter brought.
-
-    run : folder with the ``log.jsonl`` of `edgeperc_export.training.train.train`.
-    n_lines : at most this many rows; each is the mean of neighboring lines of the log.
-    Raises ValueError.
+    """Lines of a table of a run's ``log.jsonl``, at most so many, means of neighboring ones: samples, loss, validation
+    figures in percent, and what the last quarter brought. Raises ValueError.
     """
     path = run / "log.jsonl"
     rows = [json.loads(line) for line in path.read_text().splitlines()] if path.is_file() else []

@@ -13,14 +13,8 @@ from edgeperc.system.extras import require
 
 
 class TrainingLog:
-    """Writes ``log.jsonl``, ``log.csv`` and, if asked, event files of TensorBoard into the folder of a run.
-
-    A resumed run goes on in the same files. CSV has the names of nested figures with slashes, as TensorBoard has:
-    ``validation/car``.
-
-    folder : None: nothing is written.
-    tensorboard : needs the extra of this name.
-    Raises MissingExtraError.
+    """Writes ``log.jsonl``, ``log.csv`` (names as of TensorBoard, ``validation/car``) and, if asked, event files into a
+    run's folder, where a resumed run goes on; nothing without a folder. Raises MissingExtraError.
     """
 
     def __init__(self, folder: Path | None, *, tensorboard: bool = False) -> None:

@@ -22,12 +22,8 @@ NEGLIGIBLE_ERROR = 1e-3  # of a pixel, in the Lovasz-softmax loss
 def cross_entropy(
     logits: Tensor, labels: Tensor, class_weights: Tensor | None = None, *, focal_gamma: float = 0.0
 ) -> Tensor:
-    """Cross-entropy averaged over the labeled pixels (SSADNet equation 4, where all pixels are labeled).
-
-    logits : (B, C, H, W) float
-    labels : (B, H, W) integer; `IGNORE` in unlabeled pixels. Without a labeled pixel the loss is 0.
-    class_weights : (C,) float; weights of the average, by true class.
-    focal_gamma : scale each pixel by (1 - probability of its true class) ** focal_gamma.
+    """Cross-entropy of logits (B, C, H, W) averaged over the labeled pixels (SSADNet equation 4), weighted by true
+    class; 0 without a label. ``focal_gamma`` scales a pixel by (1 - probability of its true class) ** focal_gamma.
     """
     log_p = F.log_softmax(logits.float(), dim=1)
     labels = labels.long()
@@ -43,10 +39,7 @@ def cross_entropy(
 
 
 def lovasz_softmax(logits: Tensor, labels: Tensor) -> Tensor:
-    """A differentiable bound of 1 - mean IoU over the classes present (Berman et al., 2018).
-
-    Shapes as for `cross_entropy`; the batch counts as one image.
-    """
+    """A differentiable bound of 1 - mean IoU of the classes present (Berman et al., 2018); a batch is one image."""
     if logits.is_cuda:
         return lovasz_at_once(logits, labels)
     known = labels != IGNORE
@@ -101,10 +94,7 @@ def pointseg_loss(
 
 
 def road_loss(logits: Tensor, labels: Tensor, lovasz_weight: float = 0.0) -> Tensor:
-    """Cross-entropy of a road map plus ``lovasz_weight`` times `lovasz_softmax` of every fourth cell.
-
-    Every fourth, because sorting all cells would take a tenth of a training step. Shapes as for `cross_entropy`.
-    """
+    """Cross-entropy of a road map plus ``lovasz_weight`` times `lovasz_softmax` of every fourth cell, for time."""
     loss = cross_entropy(logits, labels)
     if lovasz_weight > 0.0:
         loss = loss + lovasz_weight * lovasz_softmax(logits[:, :, ::2, ::2], labels[:, ::2, ::2])
@@ -117,11 +107,7 @@ def distillation_loss(logits: Tensor, probabilities: Tensor) -> Tensor:
 
 
 def box_distillation_loss(predicted: Tensor, teacher: Tensor) -> Tensor:
-    """Difference of dense boxes (B, 9 or 11, H, W) from a teacher's: cross-entropy of the heat maps, and box errors.
-
-    Both are divided by the sum of the teacher's heat, which also weights the errors (`dense_loss`). Fronts count if
-    both networks predict them.
-    """
+    """Cross-entropy of heat maps and box errors (B, 9 or 11, H, W) by a teacher's heat; fronts if both predict them."""
     predicted, teacher = predicted.float(), teacher.float()
     heat = teacher[:, 0].sigmoid()
     heat_loss = F.binary_cross_entropy_with_logits(predicted[:, 0], heat, reduction="sum")
@@ -135,13 +121,8 @@ def box_distillation_loss(predicted: Tensor, teacher: Tensor) -> Tensor:
 
 
 def slots_loss(predicted: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
-    """Loss of the presence and of the boxes of slots that each have a square of the view.
-
-    Both are (B, n_slots, 5), the target from `slot_targets`. The presence's loss is the cross-entropy of its logits in
-    the slots that are learned, the boxes' loss the error in the slots with an object: the distances of the centers
-    in shares of the true width and height, the differences of the logarithms of width and height, and 1 - IoU. Both
-    are sums divided by the number of objects. The paper's squared errors of shares of the whole image are near zero for
-    any box that is roughly in place: 1 m beside a car is an error of 0.0025.
+    """Losses of presence and boxes (B, n_slots, 5) of `slot_targets`, by object: errors of centers in shares of the
+    true size, of log sizes, and 1 - IoU. The paper's, in shares of the whole image, are near 0 for any box.
     """
     predicted = predicted.float()
     presence, share = target[..., 4], (target[..., 4] == 1.0).float()
@@ -158,10 +139,8 @@ def slots_loss(predicted: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def paper_slots_loss(predicted: Tensor, target: Tensor) -> Tensor:
-    """Mean squared errors of x, y, width and height, summed (SSADNet equations 5 and 6).
-
-    Both are (B, n_slots, 4). The mean is over the batch, as printed, and over the slots, which the paper does not
-    mention. Slots with a negative target are not learned.
+    """Mean squared errors of x, y, width and height (B, n_slots, 4), summed (SSADNet equations 5 and 6), over the batch
+    and, which the paper does not mention, the slots; negative targets are not learned.
     """
     known = (target >= 0.0).all(2, keepdim=True).float()
     squared = known * (predicted.float() - target) ** 2
@@ -169,12 +148,8 @@ def paper_slots_loss(predicted: Tensor, target: Tensor) -> Tensor:
 
 
 def dense_loss(predicted: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
-    """Loss of the heat map (penalty-reduced focal loss; Zhou et al., 2019) and of the geometry (L1).
-
-    The prediction is (B, 9 or 11, H, W), the target (B, 11, H, W) from `dense_targets`. The heat map's loss is a sum
-    divided by the number of boxes. An error of the geometry is the sum of a cell's absolute errors, weighted by
-    `GEOMETRY_WEIGHTS`, plus `FRONT_WEIGHT` times the cross-entropy of the front if it is predicted. The geometry's loss
-    is the mean error of the cells with a heat of at least `REGRESSED_FROM`, weighted by the heat.
+    """Losses of the heat map (penalty-reduced focal loss, by box; Zhou et al., 2019) and of the geometry (L1, by cells
+    with a heat of `REGRESSED_FROM`, weighted by it), of (B, 9 or 11, H, W) and `dense_targets`.
     """
     predicted = predicted.float()
     logit, heat = predicted[:, 0], target[:, 0]
@@ -191,9 +166,8 @@ def dense_loss(predicted: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _box_error(predicted: Tensor, target: Tensor, heading: Tensor, likely: Tensor | None) -> Tensor:
-    """Error of each cell's box, (B, H, W).
-
-    ``heading``: unit vectors (B, 2, H, W); ``likely``: probability (B, 1, H, W) that the front is there, if known.
+    """Error of each cell's box, (B, H, W), with the front's cross-entropy by its probability, if ``heading`` is
+    known.
     """
     apart = (predicted[:, 1:N_GEOMETRY] - target[:, 1:N_GEOMETRY]).abs()
     error = (apart * predicted.new_tensor(GEOMETRY_WEIGHTS).view(1, -1, 1, 1)).sum(1)
@@ -215,17 +189,8 @@ def ssadnet_loss(
     class_weights: Tensor | None = None,
     lovasz_weight: float = 0.0,
 ) -> tuple[Tensor, dict[str, Tensor]]:
-    """lw_seg x segmentation + lw_det x detection (SSADNet equation 3).
-
-    logits, boxes : outputs of the network.
-    labels : (B, H, W) integer; as for `cross_entropy`.
-    box_targets : (B, n_slots, 5) from `slot_targets`, (B, n_slots, 4) from `paper_slot_targets`, or (B, 11, H/4, W/4)
-        from `dense_targets`.
-    lw_seg, lw_det : weights of the two losses (Table 2).
-    class_weights : (C,) float; not in the paper.
-    lovasz_weight : weight of `lovasz_softmax` in the segmentation's loss. Not in the paper.
-    Returns parts: Detached losses: "seg", and "det" (the paper's slots), "presence" and "geometry" (slots) or "heat"
-        and "geometry" (dense).
+    """lw_seg x segmentation + lw_det x detection (SSADNet equation 3; weights of Table 2), of targets of slots, the
+    paper's slots or dense maps, and its detached parts. Class weights and `lovasz_softmax` are not in the paper.
     """
     seg = cross_entropy(logits, labels, class_weights)
     if lovasz_weight > 0.0:

@@ -17,7 +17,6 @@ from edgeperc.preprocess.remission import NO_REMISSION
 from ..cards import OBJECT_CLASSES
 from ..networks.objects import LEAST, Parts, parts_of
 from .object_samples import BACKGROUND, DETECTED, GROUP, N_STORED, TRUE, ObjectSamples
-from .object_sets import PASTED
 from .object_task import VEHICLE, Objects
 
 # Shares of the classes in a batch.
@@ -25,7 +24,7 @@ SHARES = {BACKGROUND: 0.45, 1: 0.26, 2: 0.08, 3: 0.04, 4: 0.09, 5: 0.07, VEHICLE
 SIMULATED = "simulated"
 SOURCE_WEIGHTS: Mapping[str, float] = {SIMULATED: 0.02, "pandaset": 1.0}
 """How often an object of a source counts, for one of KITTI; others: `OTHER_WEIGHT`."""
-OTHER_WEIGHT, PASTED_WEIGHT = 0.1, 0.3
+OTHER_WEIGHT = 0.1
 ALIKE = 0.5  # samples of one object count as this power of their number
 
 DETECTED_BACKGROUND, TRUE_WEIGHT = 2.0, 1.5
@@ -79,12 +78,7 @@ class Drawn:
 
 
 class ObjectBatches:
-    """Batches of samples, of sources by their ``names``.
-
-    n_targets : number of arrays of a batch that are targets.
-    simulated : as many as there are simulated scans.
-    odds : always empty, as in `training.images.ImageSamples`.
-    """
+    """Batches of samples of named sources; ``simulated`` has the length of simulated scans, ``odds`` is empty."""
 
     n_targets = 2
 
@@ -107,12 +101,6 @@ class ObjectBatches:
     def batches(self, start: int, stop: int) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
         """The batches of the steps from ``start`` to ``stop``."""
         return map(self.batch, range(start, stop))
-
-
-def _source_weight(name: str) -> float:
-    if name.startswith("kitti"):
-        return PASTED_WEIGHT if name.endswith(PASTED) else 1.0
-    return SOURCE_WEIGHTS.get(name, OTHER_WEIGHT)
 
 
 def _weights(samples: ObjectSamples, names: Sequence[str]) -> NDArray[np.float64]:
@@ -220,11 +208,7 @@ class ObjectWatch:
 
     @torch.no_grad()
     def validate(self, network: nn.Module) -> tuple[float, float, dict[str, float | None]]:
-        """The decisive figure, the mean loss, and figures by name.
-
-        Of each class, the recall of its label; the mean overlap in space of its boxes; and the precision of labels of
-        objects. The figure is the mean of the overlap of all classes with samples.
-        """
+        """Mean overlap in space of the boxes of all classes, mean loss, and recall, overlap and precision by name."""
         losses, right, overlaps = [], [], []
         device = next(network.parameters()).device
         for batch in self._batches:

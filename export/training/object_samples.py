@@ -58,28 +58,17 @@ NAMES = {name: k for k, name in enumerate(OBJECT_CLASSES)} | {
 
 
 class ObjectSamples(NamedTuple):
-    """Samples; all in the frame of the models.
+    """Samples; all in the frame of the models."""
 
-    points : (m, N_STORED, 4) float16, as in `objects.crops.Crops`.
-    counts : (m,) int32.
-    rectangles : (m, 5) float32, of the candidates.
-    level : (m,) float32.
-    origin : (m,) int8, `GROUP`, `DETECTED` or `TRUE`.
-    classes : (m,) int8, index into the classes of objects, or `VEHICLE`.
-    truth : (m, 7) float32, x, y, z of the middle, length, width, height [m], yaw [rad]; 0 for background.
-    objects : (m,) int64, the same for all samples of one object; for background, of one scan.
-    sources : (m,) int8, numbers of the sources; `load_samples` knows them.
-    """
-
-    points: NDArray[np.float16]
+    points: NDArray[np.float16]  # (m, N_STORED, 4), as in `objects.crops.Crops`
     counts: NDArray[np.int32]
-    rectangles: NDArray[np.float32]
+    rectangles: NDArray[np.float32]  # (m, 5), of the candidates
     level: NDArray[np.float32]
-    origin: NDArray[np.int8]
-    classes: NDArray[np.int8]
-    truth: NDArray[np.float32]
-    objects: NDArray[np.int64]
-    sources: NDArray[np.int8]
+    origin: NDArray[np.int8]  # `GROUP`, `DETECTED` or `TRUE`
+    classes: NDArray[np.int8]  # index into the classes of objects, or `VEHICLE`
+    truth: NDArray[np.float32]  # (m, 7), middle, length, width, height [m], yaw [rad]; 0 for background
+    objects: NDArray[np.int64]  # one number for all samples of an object; for background, of a scan
+    sources: NDArray[np.int8]  # numbers of the sources; `load_samples` knows them
 
 
 def build_samples(
@@ -91,12 +80,7 @@ def build_samples(
     detector: bool = True,
     n_workers: int = 0,
 ) -> None:
-    """Write the samples of scans into ``folder``, in parts; finished parts are kept.
-
-    name : of the source.
-    scans : the drive, and the scan, the file of one, or what makes it.
-    detector : boxes of `DETECTOR` are candidates too.
-    """
+    """Write the samples of scans of drives into ``folder``, in parts; finished ones are kept."""
     folder.mkdir(parents=True, exist_ok=True)
     parts = [scans[first : first + PART] for first in range(0, len(scans), PART)]
     missing = [k for k in range(len(parts)) if not (folder / f"{name}-{k:03d}.npz").exists()]
@@ -231,11 +215,8 @@ def _pseudo_boxes(groups: NDArray[np.float64], rng: np.random.Generator) -> NDAr
 def _assigned(
     scan: Scan, labels: NDArray[np.uint8], places: NDArray[np.float64], boxes: Sequence[Box]
 ) -> NDArray[np.int64]:
-    """The row of the object that each candidate covers, (m,); -1: none, -2: unknown or a part of one.
-
-    A candidate covers an object if they overlap by more than 0.4 (IoU), or if more than 0.6 of its points are the
-    object's and more than 0.3 of the object's are its own. What shares less than that, but more than a tenth or a
-    quarter, is neither an object nor background.
+    """The row of the object that each candidate covers: IoU above 0.4, or 0.6 of its points and 0.3 of the object's;
+    -1: none, -2: unknown or a part of one, which shares less than that but more than a tenth or a quarter.
     """
     unknown = read_only(np.column_stack([scan.points[:, :3], labels == IGNORE]))
     marked = Scan.of(unknown, scan.ground)

@@ -35,13 +35,8 @@ def write_samples(
     *,
     detector: bool = True,
 ) -> tuple[list[str], dict[str, dict[str, str]]]:
-    """Write the samples of all scans; those in ``out`` are kept.
-
-    Each fold of KITTI's training drives is a source of its own, so that a run can leave it out. So are the validation
-    drives, which are watched only. Test drives are not read.
-
-    Returns names: of the sources, `VALIDATION` among them if there is KITTI.
-    Returns hashes: of each source, name of each real scan -> its `datasets.kitti.scan_hash`.
+    """Write the samples of all scans, each fold of KITTI's training drives and its validation drives a source of its
+    own; those in ``out`` are kept. Returns the sources, and the hashes of real scans of each. Test drives are not read.
     """
     names: list[str] = []
     hashes: dict[str, dict[str, str]] = {}

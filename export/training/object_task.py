@@ -43,11 +43,8 @@ class Objects(Carded):
         return self.card.view
 
     def loss(self, outputs: tuple[Tensor, Tensor], targets: Sequence[Tensor]) -> Tensor:
-        """The loss of a batch.
-
-        outputs : (B, n) and (B,), of the network, and the logits of its first look.
-        targets : classes (B,) int64, or `VEHICLE`; boxes (B, 7) in the candidate's frame: x, y, bottom above the
-            ground, length, width, height [m], yaw [rad].
+        """The loss of a batch: outputs (B, n) and logits (B,) of the first look; classes (B,) or `VEHICLE`, and boxes
+        (B, 7) in the candidate's frame, with the bottom above the ground.
         """
         (values, look), (labels, boxes) = outputs, targets
         parts = parts_of(values, len(self.classes))
@@ -105,9 +102,7 @@ def _huber(found: Tensor, right: Tensor, scale: Tensor | float, beta: float) -> 
 
 @njit(cache=True, nogil=True)
 def fill_box_ious(a: NDArray[np.float64], b: NDArray[np.float64], iou: NDArray[np.float64]) -> None:
-    """Write the overlap in space of each box of ``a`` (n, 7: x, y, bottom, length, width, height, yaw) with that of
-    ``b``.
-    """
+    """Write the overlap in space of each box of ``a`` (n, 7: x, y, bottom, sizes, yaw) with that of ``b``."""
     first, second = np.empty(5), np.empty(5)
     for i in range(len(a)):
         for box, flat in ((a, first), (b, second)):

@@ -28,11 +28,7 @@ class RankError(EdgepercError):
 
 
 class Ranks:
-    """The processes of a run: one, or those of ``torchrun``, which sets ``RANK``, ``WORLD_SIZE`` and ``LOCAL_RANK``.
-
-    rank, world : number of this process, and of all.
-    device : torch.device; the GPU of this process, or the CPU.
-    """
+    """The processes of a run, number ``rank`` of ``world``, by ``torchrun``'s variables; ``device``: GPU or CPU."""
 
     def __init__(self) -> None:
         self.rank, self.world = (int(os.environ.get(name, usual)) for name, usual in (("RANK", 0), ("WORLD_SIZE", 1)))
@@ -46,10 +42,7 @@ class Ranks:
 
     @contextmanager
     def together(self) -> Iterator[None]:
-        """Connect the ranks: by NCCL on GPUs, by gloo on CPUs.
-
-        Raises RankError.
-        """
+        """Connect the ranks: by NCCL on GPUs, by gloo on CPUs. Raises RankError."""
         if self.world == 1:
             yield
             return
@@ -144,14 +137,12 @@ class _Gather(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, part: Tensor) -> Tensor:
-        """Gather."""
         parts = [torch.empty_like(part, memory_format=torch.contiguous_format) for _ in range(dist.get_world_size())]
         dist.all_gather(parts, part.contiguous())
         return torch.cat(parts)
 
     @staticmethod
     def backward(ctx: Any, slope: Tensor) -> Tensor:
-        """Keep this rank's part."""
         return slope.chunk(dist.get_world_size())[dist.get_rank()]
 
 
@@ -160,12 +151,10 @@ class _Sum(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, value: Tensor) -> Tensor:
-        """Add up."""
         return _summed(value)
 
     @staticmethod
     def backward(ctx: Any, slope: Tensor) -> Tensor:
-        """Add up."""
         return _summed(slope)
 
 
@@ -179,7 +168,6 @@ class _BatchNorm(nn.BatchNorm2d):
     """Batch norm with the mean and variance of the whole batch; torch's SyncBatchNorm is for GPUs alone."""
 
     def forward(self, input: Tensor) -> Tensor:
-        """Normalize."""
         if not self.training:
             return super().forward(input)
         assert self.running_mean is not None
@@ -213,7 +201,6 @@ class _Dropout(nn.Dropout):
     """Dropout of single values."""
 
     def forward(self, input: Tensor) -> Tensor:
-        """Drop."""
         return _drop(input, self.p, input.shape[1:]) if self.training and self.p else super().forward(input)
 
 
@@ -221,5 +208,4 @@ class _Dropout2d(nn.Dropout2d):
     """Dropout of whole channels."""
 
     def forward(self, input: Tensor) -> Tensor:
-        """Drop."""
         return _drop(input, self.p, (input.shape[1], 1, 1)) if self.training and self.p else super().forward(input)

@@ -43,17 +43,8 @@ RECENT_SAMPLES = 2048
 
 
 class Samples:
-    """Network inputs and targets, from real and simulated scans.
-
-    real_weights : how often each real scan is drawn, relative to the others.
-    simulated : files written by `LabeledScan.save`.
-    teacher : its answers come with the samples.
-    n_workers : number of processes that cut out the objects to paste; 0: this one.
-    n_targets : number of arrays of a batch that are targets; the first is the input, those after the targets are the
-        teacher's.
-    odds : dict of str to (n,) float64; how often each ``"real"`` and each ``"simulated"`` scan is drawn beside its
-        weight (`redraw`).
-    Raises ValueError.
+    """Network inputs and targets, from real scans, drawn by their weights and ``odds``, and files of simulated ones; a
+    batch has the input, ``n_targets`` targets, and the teacher's answers. Raises ValueError without scans.
     """
 
     def __init__(
@@ -104,10 +95,7 @@ class Samples:
             self.bank = ObjectBank.of(scans, classes=recipe.classes or POINT_CLASSES, n_workers=n_workers)
 
     def batch(self, step: int) -> Targets:
-        """The arrays of one step, always the same for the same step and `odds`.
-
-        Inputs (B, C, H, W) float32, the targets, and the teacher's class probabilities and boxes.
-        """
+        """Inputs (B, C, H, W), targets and the teacher's answers of a step, the same for the same step and `odds`."""
         rng = np.random.default_rng((self.recipe.seed, step))
         drawn = []
         for _ in range(self.recipe.batch):
@@ -124,11 +112,7 @@ class Samples:
 
     @torch.no_grad()
     def redraw(self, network: nn.Module, step: int) -> None:
-        """Let a network label some of the scans, and draw those with many false objects more often (`odds`).
-
-        network : nn.Module; in inference mode.
-        step : together with the recipe's seed it decides which scans are labeled.
-        """
+        """Label some scans by a network, and draw those with many false objects more often (`odds`)."""
         rng = np.random.default_rng((self.recipe.seed, step, 1))
         device = next(network.parameters()).device
         objects = np.array([name not in ("background", "drivable") for name in self.task.classes])
@@ -173,15 +157,8 @@ class Samples:
 def loaded(
     samples: Samples, start: int, stop: int, n_workers: int, ranks: Ranks | None = None
 ) -> Iterator[list[Tensor]]:
-    """The batches of the steps from ``start`` to ``stop``, made by ``n_workers`` processes ahead of their use.
-
-    With several ranks, each makes some of the batches and sends them to the others.
-
-    At multiples of the recipe's ``redraw_every``, the processes start anew, so that they see the new odds. With 0
-    workers each batch is made when it is asked for; the batches are the same.
-
-    If the recipe has a ``reuse`` above 1, only one batch in so many is new. The others are drawn from the newest
-    samples, which stay on the device.
+    """The batches of steps, made ahead by processes (with 0 workers when they are asked for), by the ranks in turn.
+    Processes start anew every ``redraw_every`` steps, to see the new odds. With ``reuse``, one batch in so many is new.
     """
     recipe = samples.recipe
     every, ranks = recipe.redraw_every or stop, ranks or Ranks()
@@ -214,10 +191,7 @@ def loaded(
 
 
 class Recent:
-    """The newest samples.
-
-    size : at most this many samples are kept, rounded up to whole batches.
-    """
+    """The newest samples, at most so many, rounded up to whole batches."""
 
     def __init__(self, size: int) -> None:
         self._size, self._n_added, self._n_kept = size, 0, 0
@@ -242,28 +216,17 @@ class Recent:
 
 
 class RealScans(NamedTuple):
-    """Real scans with labels that are not in KITTI's files, for instance hand-drawn roads.
-
-    scans : scans to train on.
-    hashes : dict of str to str; name of each scan -> its `edgeperc.datasets.kitti.scan_hash`, for the card.
-    watched : scans to validate on.
-    """
+    """Real scans with labels that are not in KITTI's files, for instance hand-drawn roads."""
 
     scans: list[LabeledScan]
-    hashes: dict[str, str]
-    watched: list[LabeledScan]
+    hashes: dict[str, str]  # name -> `scan_hash`, for the card
+    watched: list[LabeledScan]  # to validate on
 
 
 def real_scans(
     kitti: KittiObjects, names: Sequence[str], *, drawn: bool = False, classes: Sequence[str] = ()
 ) -> tuple[list[LabeledScan], list[float], dict[str, str]]:
-    """Read labeled scans of KITTI.
-
-    drawn : replace the ground truth by the hand-drawn road where a scan has one.
-    classes : classes of points, the background first; empty: edgeperc's.
-    Returns weights: How often to draw each scan, relative to the others.
-    Returns hashes (dict of str to str): Name of each scan -> its `edgeperc.datasets.kitti.scan_hash`.
-    """
+    """Labeled scans of KITTI (``drawn``: with the hand-drawn roads), their weights, and their hashes by name."""
     scans: list[LabeledScan] = []
     weights: list[float] = []
     hashes: dict[str, str] = {}

@@ -28,15 +28,8 @@ from .checkpoint import read_checkpoint
 def start(
     network: nn.Module, recipe: Recipe, path: Path, images: Sequence[Tensor]
 ) -> tuple[list[dict[str, Any]], dict[str, str]]:
-    """Copy the weights that a checkpoint or an exported model shares with the network.
-
-    network : nn.Module; the network of ``recipe``; changed.
-    path : a checkpoint.pt, or a model.onnx in fp32 made by ``edgeperc-export export``.
-    images : sequence of (B, C, H, W) float32; inputs to compute the statistics of batch norm from; used for an .onnx
-        only.
-    Returns before: The recipes of the earlier training runs, in order.
-    Returns frames (dict of str to str): Name of each real scan that they were trained on -> its hash.
-    Raises ValueError, CheckpointError, ModelError.
+    """Copy what a checkpoint or exported model (fp32) shares with the network; of a model, batch norm gets the
+    statistics of ``images``. Returns earlier recipes, and hashes of their scans. Raises ValueError, ModelError.
     """
     own_card = card_of(recipe, version="0")
     if path.suffix == ".onnx":
@@ -157,10 +150,7 @@ def _by_class(given: Tensor, own: Tensor, classes: Sequence[str], own_classes: S
 
 @torch.no_grad()
 def _unfold(network: nn.Module, offsets: Mapping[str, Tensor | None], images: Sequence[Tensor]) -> None:
-    """Give each batch norm the statistics of its input, with the scale and the offset that cancel them.
-
-    ``offsets``: name of a batch norm -> the offset folded into the convolution before it; None: it was not folded.
-    """
+    """Give each batch norm its input's statistics and what cancels them; an offset that was folded may be None."""
     norms = {name: network.get_submodule(name) for name, offset in offsets.items() if offset is not None}
     sums: dict[str, list[Tensor]] = {name: [] for name in norms}
 

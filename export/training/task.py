@@ -49,10 +49,7 @@ N_SLOTS = 16
 
 @dataclass
 class Tally:
-    """Counts of a network's labels and boxes compared with the ground truth.
-
-    boxes : None if the network has no boxes.
-    """
+    """Counts of a network's labels, and of its boxes if it has some, compared with the ground truth."""
 
     pixels: Confusion
     boxes: BoxEvaluator | None = None
@@ -72,11 +69,8 @@ class Tally:
 
 @dataclass(frozen=True)
 class Task(Carded, ABC):
-    """The task of a recipe's network: its input, targets, loss and validation.
-
-    paste_odds : mapping of str to float; how often each kind of object is pasted into a training scan.
-    swaps_sectors : whether a sector of a scan may be replaced by another scan's. This replaces points and their
-        labels, but neither boxes nor the ground.
+    """The task of a recipe's network: its input, targets, loss and validation. Objects are pasted into scans by odds;
+    swapped sectors replace points and their labels, but neither boxes nor the ground.
     """
 
     paste_odds: ClassVar[Mapping[str, float]]
@@ -90,10 +84,7 @@ class Task(Carded, ABC):
 
     @abstractmethod
     def target(self, scan: LabeledScan, projected: Projection) -> Targets:
-        """The targets of a scan: labels (H, W) uint8, `IGNORE` where unknown, and box targets if the network has boxes.
-
-        ``projected`` is the scan's projection into `view`.
-        """
+        """The targets of a scan in `view`: labels (H, W) uint8, `IGNORE` where unknown, and box targets if any."""
 
     @abstractmethod
     def loss(self, outputs: Outputs, targets: Sequence[Tensor]) -> Tensor:

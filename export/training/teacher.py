@@ -48,13 +48,7 @@ def unlabeled_scans(objects: KittiObjects, fold: int | None) -> list[LabeledScan
 def pseudo_labeled(
     network: nn.Module, task: Task, scans: Iterable[LabeledScan], sure: float = SURE
 ) -> list[LabeledScan]:
-    """The scans, labeled by a network on all sides.
-
-    network : nn.Module; a network that labels points.
-    task : the network's task.
-    scans : their own labels are kept.
-    sure : an unlabeled point gets the network's label if its probability is at least this.
-    """
+    """The scans, labeled on all sides where a network of points is sure; they keep their own labels."""
     projector = make_projector(task.view, task.input)
     network.eval()
     labeled = []
@@ -73,11 +67,8 @@ def pseudo_labeled(
 
 
 class OnnxTeacher:
-    """An exported network as the teacher: it answers for each sample, in the process that makes the sample.
-
-    path : the .onnx file. Its own channels are projected from the same scan as the input of the network to train.
-    task : that of the network to train.
-    Raises ValueError.
+    """An exported network as the teacher, in the process that makes a sample, by its own channels. Raises
+    ValueError.
     """
 
     def __init__(self, path: Path, task: Task) -> None:
@@ -116,10 +107,8 @@ class OnnxTeacher:
 
 @torch.no_grad()
 def teach(network: nn.Module, image: Tensor, inputs: InputSpec, *, mirror: bool) -> tuple[Tensor, Tensor | None]:
-    """A network's class probabilities (B, C, H, W) for a batch of inputs, and its boxes or None.
-
-    ``mirror`` averages the probabilities over each scene and its mirror image. In the mirror image, the channel y
-    changes its sign.
+    """A network's class probabilities (B, C, H, W) for a batch of inputs, and its boxes or None. ``mirror`` averages
+    them over each scene and its mirror image, in which the channel y changes its sign.
     """
     with torch.autocast(image.device.type, torch.bfloat16):
         outputs = network(image)

@@ -59,26 +59,15 @@ STATISTICS_BATCHES = 8
 
 @dataclass(frozen=True, slots=True)
 class Data:
-    """What a network is trained on and watched on.
+    """What a network is trained on and watched on; frames of test drives are not used."""
 
-    kitti : folder of a KITTI object set. Frames of test drives are not used; validation drives are for the curve
-        only. With a ``simulated_share`` of 1, all training drives are for validation only.
-    simulated : folder of scans written by ``edgeperc-export simulate``.
-    camvid : folder of CamVid, for a camera's networks: they are trained on its training images, and the curve is of
-        its validation images.
-    scan_sets : more real scans, of any sensor; their drives for training are trained on, those for validation are
-        watched.
-    given : real scans in place of those of ``kitti``.
-    fold : fold of the training drives to validate on instead of training on it. At every checkpoint the averaged
-        network is evaluated on it, and the best weights are kept (early stopping).
-    """
-
+    # an object set; its validation drives, or all if only simulated scans are trained on, are watched
     kitti: Path | None = None
-    simulated: Path | None = None
-    camvid: Path | None = None
-    scan_sets: Sequence[ScanFolder] = ()
-    given: RealScans | None = None
-    fold: int | None = None
+    simulated: Path | None = None  # folder of scans written by ``edgeperc-export simulate``
+    camvid: Path | None = None  # for a camera's networks: training images, and validation images for the curve
+    scan_sets: Sequence[ScanFolder] = ()  # of any sensor, by their own drives
+    given: RealScans | None = None  # in place of those of ``kitti``
+    fold: int | None = None  # validated on instead of trained on, and the best weights are kept (early stopping)
 
 
 FITNESS_SCANS = 64  # real scans, at least, that a card's check of inputs describes
@@ -86,42 +75,21 @@ FITNESS_SCANS = 64  # real scans, at least, that a card's check of inputs descri
 
 @dataclass(frozen=True, slots=True)
 class Run:
-    """What a training run starts from, and how it is carried out.
+    """What a training run starts from, and how it is carried out."""
 
-    start_from : a checkpoint or an exported model (.onnx) whose weights a new run starts from. Weights that the
-        networks do not share are ignored.
-    teacher : a checkpoint or an exported model (.onnx) of the network to distil from. If the recipe does not distil:
-        a checkpoint of a network that labels the unlabeled points of real scans.
-    n_threads : number of CPU threads; None leaves it to torch.
-    n_workers : number of processes that make the samples; 0: this one makes them between the steps. Each has one
-        thread.
-    compiled : use `torch.compile`, which takes a minute and a C++ compiler; PointSeg then trains a third faster.
-    checkpoint_every : steps between checkpoints, and between points of the curve; an epoch if the recipe has a
-        ``stop_after``.
-    save_every_s : seconds between checkpoints, at least; the last one is always written. Large networks take seconds
-        to write.
-    tensorboard : the log is written for TensorBoard, too.
-    """
-
-    start_from: Path | None = None
-    teacher: Path | None = None
-    n_threads: int | None = None
-    n_workers: int = 0
-    compiled: bool = False
-    checkpoint_every: int = 100
-    save_every_s: float = 0.0
-    tensorboard: bool = False
+    start_from: Path | None = None  # a checkpoint or exported model; weights that the networks do not share are ignored
+    teacher: Path | None = None  # to distil from; without distillation, a checkpoint that labels unlabeled points
+    n_threads: int | None = None  # None leaves it to torch
+    n_workers: int = 0  # processes that make samples, one thread each; 0: this one, between the steps
+    compiled: bool = False  # by `torch.compile`: a minute and a C++ compiler; PointSeg then trains a third faster
+    checkpoint_every: int = 100  # steps between checkpoints and points of the curve; an epoch with ``stop_after``
+    save_every_s: float = 0.0  # between checkpoints, at least, as large networks take seconds to write
+    tensorboard: bool = False  # write the log for it, too
 
 
 def train(recipe: Recipe, out: Path, data: Data, run: Run | None = None) -> Path:
-    """Train the network of a recipe, or resume its training.
-
-    Under ``torchrun`` the processes share each batch (`training.ranks`): the samples are the same, and the
-    weights equal those of one process up to rounding. The first process writes the files; all read the checkpoint.
-
-    out : folder for ``checkpoint.pt`` and the `TrainingLog`. A checkpoint of the same recipe in it is resumed.
-    Returns: The checkpoint.
-    Raises ValueError, FloatingPointError, RankError.
+    """Train the network of a recipe in a folder, or resume it; returns the checkpoint. ``torchrun``'s processes share
+    each batch: weights equal those of one up to rounding. Raises ValueError, FloatingPointError, RankError.
     """
     run = run or Run()
     ranks = Ranks()

@@ -14,11 +14,7 @@ from .samples import Samples
 
 
 class Watch:
-    """Validates a network on scans that are not in its training set.
-
-    samples : makes the inputs and targets.
-    scans : scans to validate on.
-    """
+    """Validates a network on scans that are not in its training set, with the inputs and targets of ``samples``."""
 
     def __init__(self, samples: Samples, scans: Sequence[LabeledScan]) -> None:
         self.task, self.scans = samples.task, scans

@@ -19,7 +19,7 @@ pytestmark = pytest.mark.compiled
 @pytest.mark.parametrize("place", robots.PLACES)
 def test_the_mounting_of_a_robot_is_found(place: str, height_m: float) -> None:
     for seed in (3, 5, 6):
-        scan = robots.scan_of(seed, robots.profile_of("os1-64"), height_m, place)
+        scan = robots.scan_of(seed, robots.sensor_of("os1-64"), height_m, place)
         assert len(scan.points) == len(scan.labels) == len(scan.objects)
         found = MountingEstimator(Mounting()).add(scan.points).mounting()
         assert found.height_m == pytest.approx(height_m, abs=0.15)
@@ -27,7 +27,7 @@ def test_the_mounting_of_a_robot_is_found(place: str, height_m: float) -> None:
 
 
 def test_places_differ() -> None:
-    sensor = robots.profile_of("vlp-16")
+    sensor = robots.sensor_of("vlp-16")
     road, slope, half, box = (robots.scan_of(3, sensor, 0.5, place) for place in ("road", "slope", "half", "box"))
     assert half.points[:, 0].min() >= 0.0
     assert np.count_nonzero(road.points[:, 0] >= 0.0) == len(half.points)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from ..arguments import Commands, add_command, add_figures_file
+from ..arguments import Commands, add_command, add_figures_file, options
 from ..output import many, print_line, progress, table_lines, write_figures
 
 # Places of the camera in the LiDAR's frame: as on KITTI's car, and behind a windscreen below a LiDAR on the roof.
@@ -37,17 +37,14 @@ def add_parser(commands: Commands) -> None:
             "edgeperc eval-painting --sensor os1-64 --scenes 20 --json painting.json",
         ],
     )
-    reading = parser.add_argument_group("input")
-    reading.add_argument(
-        "--sensor",
+    reading = options(parser, "input")
+    reading(
+        "--sensor SENSOR",
+        "a sensor's name or .json profile; repeat the option for several (default: hdl-64e, os1-64 and vlp-16)",
         action="append",
-        metavar="SENSOR",
-        help="a sensor's name or .json profile; repeat the option for several (default: hdl-64e, os1-64 and vlp-16)",
     )
-    reading.add_argument(
-        "--scenes", type=int, default=10, metavar="N", help="number of simulated streets (default: %(default)s)"
-    )
-    add_figures_file(parser.add_argument_group("output"))
+    reading("--scenes N", "number of simulated streets (default: %(default)s)", type=int, default=10)
+    add_figures_file(options(parser, "output"))
 
 
 def eval_painting_command(arguments: argparse.Namespace) -> int:

@@ -19,6 +19,7 @@ from ..arguments import (
     add_provider,
     chosen_models,
     finite_number,
+    options,
 )
 from ..output import FEW, many, print_line, progress, table_lines, write_figures
 from ..side_by_side import add_engine, has_workers
@@ -44,63 +45,53 @@ def add_parser(commands: Commands) -> None:
             "edgeperc eval CamVid/ --model camseg",
         ],
     )
-    reading = parser.add_argument_group("input")
-    reading.add_argument(
-        "datasets",
-        nargs="+",
-        metavar="DATASET",
-        help="the root of a KITTI object set or of SemanticKITTI, simulation:N for N simulated scans (simulation "
+    reading = options(parser, "input")
+    reading(
+        "datasets DATASET...",
+        "the root of a KITTI object set or of SemanticKITTI, simulation:N for N simulated scans (simulation "
         "alone: 24), or labeled scans of any sensor: a folder with scans.json, or FOLDER:LAYOUT with the name of a "
         "public set (pandaset, av2, vod, ddad, lyft, semantickitti); or labeled images: a folder with classes.json, "
         "train, trainannot, val, valannot as in CamVid",
     )
-    reading.add_argument(
+    reading(
         "--split",
-        choices=("test", "validation", "held-back", "train", "all"),
-        help="which drives (default: test, or those of --fold; of images without test images: validation); nothing is "
+        "which drives (default: test, or those of --fold; of images without test images: validation); nothing is "
         "trained on test and validation drives, which are the held-back ones",
+        choices=("test", "validation", "held-back", "train", "all"),
     )
-    reading.add_argument(
-        "--fold",
-        type=int,
-        choices=(0, 1, 2),
-        help="evaluate on the validation drives of this training fold (default: none)",
+    reading(
+        "--fold", "evaluate on the validation drives of this training fold (default: none)", type=int, choices=(0, 1, 2)
     )
-    reading.add_argument(
-        "--mounted",
-        type=_mounted,
-        metavar="M,DEG,DEG",
-        help="perceive each scan as a sensor of this height, roll and pitch would have recorded it, the mounting to be "
+    reading(
+        "--mounted M,DEG,DEG",
+        "perceive each scan as a sensor of this height, roll and pitch would have recorded it, the mounting to be "
         "estimated from that scan alone; evaluates points and boxes (default: as recorded)",
+        type=_mounted,
     )
     add_engine(parser)
-    models = parser.add_argument_group("models")
+    models = options(parser, "models")
     add_model(models)
     add_provider(models, provider="cpu")
     add_boxes_from(models)
     add_agreement(models)
-    models.add_argument(
-        "--without-rule",
+    models(
+        "--without-rule RULE",
+        "leave out one rule of the agreement, to measure what it is worth; may be repeated: "
+        f"{', '.join(RULES)} (default: none)",
         action="append",
         choices=RULES,
         default=[],
-        metavar="RULE",
-        help="leave out one rule of the agreement, to measure what it is worth; may be repeated: "
-        f"{', '.join(RULES)} (default: none)",
     )
-    models.add_argument(
-        "--road-by",
-        metavar="MODEL",
-        help="another top-view model whose drivable cells are the ground truth on KITTI, which has no road labels "
+    models(
+        "--road-by MODEL",
+        "another top-view model whose drivable cells are the ground truth on KITTI, which has no road labels "
         "(default: no road figures on KITTI)",
     )
-    output = parser.add_argument_group("output")
+    output = options(parser, "output")
     add_figures_file(output)
-    output.add_argument(
-        "--worst",
-        type=Path,
-        metavar="FILE",
-        help="write a picture, .png, of the scans with the most errors (needs the extra 'view'; default: none)",
+    output(
+        "--worst FILE",
+        "write a picture, .png, of the scans with the most errors (needs the extra 'view'; default: none)",
     )
 
 

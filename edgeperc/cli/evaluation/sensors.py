@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from ..arguments import Commands, add_command, add_figures_file, add_provider, positive
+from ..arguments import Commands, add_command, add_figures_file, add_provider, options, positive
 from ..output import FEW, many, print_line, progress, table_lines, write_figures
 from .box_tables import box_table_lines
 
@@ -26,37 +26,32 @@ def add_parser(commands: Commands) -> None:
             "edgeperc eval-sensors --find vlp-16=simulation KITTI/ drive.pcap",
         ],
     )
-    reading = parser.add_argument_group("input")
-    reading.add_argument(
-        "datasets",
-        nargs="+",
-        metavar="SENSOR=SOURCE",
-        help="a sensor's name or .json profile, and simulation:N or a folder of labeled range images NAME.npy; or "
+    reading = options(parser, "input")
+    reading(
+        "datasets SENSOR=SOURCE...",
+        "a sensor's name or .json profile, and simulation:N or a folder of labeled range images NAME.npy; or "
         "labeled scans, without SENSOR=: a folder with scans.json, or FOLDER:LAYOUT with the name of a public set. "
         "auto=SOURCE finds the sensor of labeled scans in their points",
     )
-    reading.add_argument(
+    reading(
         "--find",
-        action="store_true",
-        help="only print which sensors are found in the points of the first three scans of each set, and whether that "
+        "only print which sensors are found in the points of the first three scans of each set, and whether that "
         "is right; a set may then also be a capture, SENSOR=PATH of scans, or SENSOR=simulation (default: no)",
     )
-    models = parser.add_argument_group("models")
-    models.add_argument(
-        "--model",
+    models = options(parser, "models")
+    models(
+        "--model MODEL",
+        "a range-image model: a name from 'edgeperc models' or an .onnx file with a card (default: %(default)s)",
         default="pointseg",
-        metavar="MODEL",
-        help="a range-image model: a name from 'edgeperc models' or an .onnx file with a card (default: %(default)s)",
     )
     add_provider(models, provider="cpu")
-    models.add_argument(
-        "--workers",
-        type=positive,
-        metavar="N",
-        help="number of worker processes, each with one data set at a time; the results are the same (default: this "
+    models(
+        "--workers N",
+        "number of worker processes, each with one data set at a time; the results are the same (default: this "
         "process alone)",
+        type=positive,
     )
-    output = parser.add_argument_group("output")
+    output = options(parser, "output")
     add_figures_file(output)
 
 

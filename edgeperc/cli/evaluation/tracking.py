@@ -10,16 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from ...errors import PointsError
 from ...system.extras import require
-from ..arguments import (
-    Commands,
-    add_adapt,
-    add_command,
-    add_figures_file,
-    add_model,
-    add_network,
-    add_sensor,
-    positive_number,
-)
+from ..arguments import Commands, add_command, add_figures_file, add_networks, add_sensor, options, positive_number
 from ..output import many, print_line, progress, table_lines, without_nan, write_figures
 from ..run import make_perceiver
 
@@ -46,66 +37,51 @@ def add_parser(commands: Commands) -> None:
             "edgeperc eval-tracking KITTI/ --model pointseg --json figures.json",
         ],
     )
-    reading = parser.add_argument_group("input")
-    reading.add_argument(
-        "root",
-        type=Path,
-        metavar="ROOT",
-        help="folder with label_02, calib, and detections/DETECTOR_CLASS or velodyne; or a KITTI object set with "
+    reading = options(parser, "input")
+    reading(
+        "root ROOT",
+        "folder with label_02, calib, and detections/DETECTOR_CLASS or velodyne; or a KITTI object set with "
         "training/track_id",
-    )
-    reading.add_argument(
-        "--sequences", nargs="+", metavar="SEQ", help="names such as 0000 0002 (default: all that have labels)"
-    )
-    reading.add_argument(
-        "--boxes",
         type=Path,
-        metavar="FILE",
-        help="track the boxes in this file, which 'edgeperc run --json' printed for one sequence (default: none)",
+    )
+    reading("--sequences SEQ...", "names such as 0000 0002 (default: all that have labels)")
+    reading(
+        "--boxes FILE",
+        "track the boxes in this file, which 'edgeperc run --json' printed for one sequence (default: none)",
     )
     add_sensor(reading)
-    rules = parser.add_argument_group("evaluation")
-    rules.add_argument(
-        "--classes",
-        nargs="+",
+    rules = options(parser, "evaluation")
+    rules(
+        "--classes CLASS...",
+        "some of car, pedestrian, cyclist, vehicle; vehicle is cars, vans and trucks together, for boxes of "
+        "models (default: car pedestrian cyclist)",
         choices=("car", "pedestrian", "cyclist", "vehicle"),
         default=["car", "pedestrian", "cyclist"],
-        metavar="CLASS",
-        help="some of car, pedestrian, cyclist, vehicle; vehicle is cars, vans and trucks together, for boxes of "
-        "models (default: car pedestrian cyclist)",
     )
-    rules.add_argument(
-        "--iou",
+    rules(
+        "--iou X",
+        "smallest 3-D overlap (intersection over union) of a match, 0..1 (default: %(default)s)",
         type=positive_number,
         default=0.25,
-        metavar="X",
-        help="smallest 3-D overlap (intersection over union) of a match, 0..1 (default: %(default)s)",
     )
-    rules.add_argument(
-        "--rules",
+    rules(
+        "--rules RULES",
+        "ab3dmot: as AB3DMOT's program, with the image height of the detection instead of the track, sitting "
+        "people not excused, and rounded scores; edgeperc: thresholds are compared exactly (default: %(default)s)",
         choices=("edgeperc", "ab3dmot"),
         default="edgeperc",
-        metavar="RULES",
-        help="ab3dmot: as AB3DMOT's program, with the image height of the detection instead of the track, sitting "
-        "people not excused, and rounded scores; edgeperc: thresholds are compared exactly (default: %(default)s)",
     )
-    rules.add_argument(
-        "--rival",
+    rules(
+        "--rival METHOD",
+        "evaluate AB3DMOT's method, implemented again, on the same boxes by the same rules (default: none)",
         choices=("ab3dmot",),
-        metavar="METHOD",
-        help="evaluate AB3DMOT's method, implemented again, on the same boxes by the same rules (default: none)",
     )
-    models = parser.add_argument_group("models, if the boxes come from scans")
-    add_model(models)
-    add_network(models)
-    add_adapt(models)
-    output = parser.add_argument_group("output")
+    add_networks(parser, "models, if the boxes come from scans")
+    output = options(parser, "output")
     add_figures_file(output)
-    output.add_argument(
-        "--gif",
-        type=Path,
-        metavar="FILE",
-        help="draw the first sequence's tracks from above, as an animation (needs the extra 'view'; default: none)",
+    output(
+        "--gif FILE",
+        "draw the first sequence's tracks from above, as an animation (needs the extra 'view'; default: none)",
     )
 
 
