@@ -138,9 +138,10 @@ class Recipe:
         SCAN_NETWORKS,
     )
     weather: float = _option(0.1, "share of scans with rain, snow or fog added", SCAN_NETWORKS)
-    half_beams: float = _option(
+    beams: float = _option(
         0.1,
-        "share of scans of which every second beam is dropped, as for a sensor with 32 beams",
+        "share of scans of the training sensor that are thinned to the beams and columns of another one, drawn at "
+        "random: a known one, one with 12 to 48 beams, or one without beams",
         SCAN_NETWORKS,
     )
     tilt_deg: float = _option(
@@ -220,7 +221,7 @@ PLAIN: Mapping[str, Any] = {
     "n_negatives": 0.0,
     "turn_to_rare": 0.0,
     "weather": 0.0,
-    "half_beams": 0.0,
+    "beams": 0.0,
     "tilt_deg": 0.0,
     "no_remission": 0.0,
     "redraw_every": 0,
