@@ -315,6 +315,19 @@ EDGE = Recipe(
     redraw_every=4000,
 )
 
+# Continued with scans as other sensors take them, whose range images are filled between the beams as at run time.
+BEAMS = replace(
+    EDGE,
+    beams=0.6,
+    steps=1700,
+    batch=8,
+    reuse=2,
+    learning_rate=1.2e-3,
+    cooldown=0.9,
+    ema=0.995,
+    redraw_every=0,
+)
+
 # LoDNN-I's structure at a quarter of the resolution, distilled from the start from the network with the best roads.
 LODNN = Recipe(
     "lodnn",
@@ -399,7 +412,8 @@ MODELS = {
         after="ssadnet-full",
     ),
     "lodnn-paper": Stage(PUBLISHED),
-    "pointseg": Stage(EDGE),
+    "pointseg-start": Stage(EDGE),
+    "pointseg": Stage(BEAMS, after="pointseg-start"),
     "lodnn": Stage(LODNN, teacher="ssadnet"),
     # Three quarters of the channels: with all of them it learned the training scans, and found 8 of 255 boxes less.
     "ssadnet": Stage(
