@@ -172,6 +172,12 @@ class Recipe:
     ema: float = _option(
         0.998, "decay of the averaged weights, which are the ones exported; 0: export the last weights"
     )
+    kept: float = _option(
+        0.0,
+        "share of the weights of --start-from in the exported ones, which are then a mean of both: what the network "
+        "was good at is kept (WiSE-FT; Wortsman et al., 2022)",
+        SCAN_NETWORKS,
+    )
     context_width: int = _option(128, "channels of the context module", _TOP_VIEW, edge=False)
     batch_norm: bool = _option(
         True, "batch norm in the segmentation branch (ssadnet) or the whole network (lodnn)", _TOP_VIEW, edge=False
