@@ -325,6 +325,7 @@ EDGE = Recipe(
 BEAMS = replace(
     EDGE,
     beams=0.6,
+    kept=0.7,
     steps=1700,
     batch=8,
     reuse=2,
