@@ -138,9 +138,10 @@ class Recipe:
         SCAN_NETWORKS,
     )
     weather: float = _option(0.1, "share of scans with rain, snow or fog added", SCAN_NETWORKS)
-    half_beams: float = _option(
+    beams: float = _option(
         0.1,
-        "share of scans of which every second beam is dropped, as for a sensor with 32 beams",
+        "share of scans of the training sensor that are thinned to the beams and columns of another one, drawn at "
+        "random: a known one, one with 12 to 48 beams, or one without beams",
         SCAN_NETWORKS,
     )
     tilt_deg: float = _option(
@@ -170,6 +171,12 @@ class Recipe:
     )
     ema: float = _option(
         0.998, "decay of the averaged weights, which are the ones exported; 0: export the last weights"
+    )
+    kept: float = _option(
+        0.0,
+        "share of the weights of --start-from in the exported ones, which are then a mean of both: what the network "
+        "was good at is kept (WiSE-FT; Wortsman et al., 2022)",
+        SCAN_NETWORKS,
     )
     context_width: int = _option(128, "channels of the context module", _TOP_VIEW, edge=False)
     batch_norm: bool = _option(
@@ -220,7 +227,7 @@ PLAIN: Mapping[str, Any] = {
     "n_negatives": 0.0,
     "turn_to_rare": 0.0,
     "weather": 0.0,
-    "half_beams": 0.0,
+    "beams": 0.0,
     "tilt_deg": 0.0,
     "no_remission": 0.0,
     "redraw_every": 0,
@@ -314,6 +321,20 @@ EDGE = Recipe(
     redraw_every=4000,
 )
 
+# Continued with scans as other sensors take them, whose range images are filled between the beams as at run time.
+BEAMS = replace(
+    EDGE,
+    beams=0.6,
+    kept=0.7,
+    steps=1700,
+    batch=8,
+    reuse=2,
+    learning_rate=1.2e-3,
+    cooldown=0.9,
+    ema=0.995,
+    redraw_every=0,
+)
+
 # LoDNN-I's structure at a quarter of the resolution, distilled from the start from the network with the best roads.
 LODNN = Recipe(
     "lodnn",
@@ -398,7 +419,8 @@ MODELS = {
         after="ssadnet-full",
     ),
     "lodnn-paper": Stage(PUBLISHED),
-    "pointseg": Stage(EDGE),
+    "pointseg-start": Stage(EDGE),
+    "pointseg": Stage(BEAMS, after="pointseg-start"),
     "lodnn": Stage(LODNN, teacher="ssadnet"),
     # Three quarters of the channels: with all of them it learned the training scans, and found 8 of 255 boxes less.
     "ssadnet": Stage(

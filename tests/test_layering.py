@@ -127,8 +127,8 @@ FLOORS = {
     """,
     "edgeperc_export": """
         data.__init__ data.processes data.scans data.targets
-        data.augment data.roads data.simulate
-        data.scan_sets
+        data.beams data.roads data.simulate
+        data.augment data.scan_sets
         recipe
         cards
         networks.objects networks.pointseg networks.ssadnet

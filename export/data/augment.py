@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from edgeperc.datasets.layout import class_number
 from edgeperc.ground.planes import find_ground
-from edgeperc.inference.projection import row_edges
 from edgeperc.objects.cluster import find_clusters
 from edgeperc.preprocess.remission import NO_REMISSION
 from edgeperc.simulation.samples import IGNORE
@@ -21,9 +20,9 @@ from edgeperc.simulation.scene import POINT_CLASSES
 from edgeperc.types.geometry import inside
 from edgeperc.types.mounting import MODEL_HEIGHT_M
 from edgeperc.types.perception import Box
-from edgeperc.types.sensor import SensorProfile, get_sensor
-from edgeperc.types.views import RangeImageGeometry
+from edgeperc.types.sensor import SensorProfile
 
+from .beams import taken_by
 from .processes import mapped
 from .scans import LabeledScan, mirrored, turned, turned_box
 
@@ -284,20 +283,6 @@ def with_ground_ahead(scan: LabeledScan) -> LabeledScan:
     return replace(scan, labels=np.where(near, np.uint8(0), scan.labels)) if near.any() else scan
 
 
-def halved(scan: LabeledScan, sensor: SensorProfile | None = None) -> LabeledScan:
-    """The scan as a sensor with half the beams would see it; its range image is then filled as at runtime.
-
-    ``sensor`` is the profile with all beams, by default the HDL-64E's. A scan of another sensor is unchanged.
-    """
-    if scan.sensor is not None:
-        return scan
-    sensor = sensor or get_sensor("hdl-64e")
-    slope = scan.points[:, 2] / (np.hypot(scan.points[:, 0], scan.points[:, 1]) + np.abs(scan.points[:, 2]) + 1e-6)
-    kept = np.searchsorted(-row_edges(RangeImageGeometry(sensor.elevations_deg)), -slope) % 2 == 1
-    sensor = replace(sensor, elevations_deg=sensor.elevations_deg[::2])
-    return replace(scan, points=scan.points[kept], labels=scan.labels[kept], sensor=sensor)
-
-
 def tilted(scan: LabeledScan, roll: float, pitch: float, lift: float) -> LabeledScan:
     """The scan as it is levelled with an error: rolled and pitched [rad], and lifted [m]. Boxes stay upright."""
     turn = np.array(
@@ -332,7 +317,6 @@ class Augmentation:
     weather : share of scans in bad weather.
     n_negatives : mean number of pieces of background to paste.
     negatives : how often each kind is pasted.
-    half_beams : share of scans of which every second beam is left.
     tilt_deg : standard deviation of the errors of roll and pitch [deg]; the errors are at most twice as large.
     no_remission : share of scans whose remission is the constant that stands for a missing one.
     """
@@ -344,7 +328,6 @@ class Augmentation:
     weather: float = 0.0
     n_negatives: float = 0.0
     negatives: Mapping[str, float] = field(default_factory=lambda: NEGATIVES)
-    half_beams: float = 0.0
     tilt_deg: float = 0.0
     no_remission: float = 0.0
 
@@ -354,6 +337,7 @@ def augmented(
     rng: np.random.Generator,
     how: Augmentation = Augmentation(),  # it is immutable
     bank: ObjectBank | None = None,
+    sensor: SensorProfile | None = None,
 ) -> LabeledScan:
     """The scan turned, mirrored, thinned, shifted in height and scaled in remission, all at random.
 
@@ -361,6 +345,7 @@ def augmented(
     turned by a few degrees only.
 
     bank : objects to paste.
+    sensor : takes a scan of the training sensor (`beams.taken_by`); None: that one.
     """
     full = scan.azimuths[1] - scan.azimuths[0] >= 2.0 * np.pi
     angle = rng.normal(0.0, np.radians(5.0))
@@ -386,8 +371,8 @@ def augmented(
         scan = pasted(scan, bank, rng, int(rng.poisson(how.n_pasted + how.n_negatives)), shares)
     if rng.random() < how.weather:
         scan = weathered(scan, rng)
-    if rng.random() < how.half_beams:
-        scan = halved(scan)
+    if sensor is not None:
+        scan = taken_by(sensor, scan, rng)
     points, labels = scan.points, scan.labels
     if rng.random() < 0.3:
         kept = rng.random(len(points)) < rng.uniform(0.75, 1.0)

@@ -14,6 +14,7 @@ from edgeperc.datasets.scan_folder import ScanFolder
 from edgeperc.datasets.splits import FOLDS, fold_of
 
 from ..data.augment import Augmentation, ObjectBank, augmented
+from ..data.beams import drawn_sensor
 from ..data.scan_sets import read_scan_set
 from ..data.scans import LabeledScan
 from .object_samples import build_samples
@@ -21,9 +22,10 @@ from .object_samples import build_samples
 VALIDATION = "validation"
 PASTED = "pasted"
 """Suffix of a source: the scans of another one with objects of its scans pasted in."""
+BEAMS = 0.1  # share of the variants that another sensor takes
 N_VARIANTS = 4  # of each scan
 ODDS = {"car": 0.35, "van": 0.15, "truck": 0.05, "pedestrian": 0.25, "cyclist": 0.2}
-PASTING = Augmentation(n_pasted=6.0, odds=ODDS, n_negatives=2.0, half_beams=0.1, weather=0.05, tilt_deg=0.25)
+PASTING = Augmentation(n_pasted=6.0, odds=ODDS, n_negatives=2.0, weather=0.05, tilt_deg=0.25)
 
 
 def write_samples(
@@ -88,4 +90,6 @@ class _Pasted:
 
     def __call__(self) -> LabeledScan:
         scan = self.scan()
-        return augmented(scan, np.random.default_rng((self.seed, len(scan.points))), PASTING, self.bank())
+        rng = np.random.default_rng((self.seed, len(scan.points)))
+        sensor = drawn_sensor(rng) if rng.random() < BEAMS else None
+        return augmented(scan, rng, PASTING, self.bank(), sensor)

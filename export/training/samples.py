@@ -21,6 +21,7 @@ from edgeperc.simulation.samples import IGNORE
 from edgeperc.simulation.scene import POINT_CLASSES
 
 from ..data.augment import NEGATIVES, Augmentation, ObjectBank, augmented, swapped, with_ground_ahead
+from ..data.beams import drawn_sensor
 from ..data.processes import CONTEXT
 from ..data.roads import drawn_roads, sure_surface, with_road
 from ..data.scan_sets import seen_by_network
@@ -83,7 +84,6 @@ class Samples:
             weather=recipe.weather,
             n_negatives=recipe.n_negatives,
             negatives=self.negatives,
-            half_beams=recipe.half_beams,
             tilt_deg=recipe.tilt_deg,
             no_remission=recipe.no_remission,
         )
@@ -136,9 +136,10 @@ class Samples:
         scan = self._scan(rng)
         if not recipe.augment:
             return scan
-        scan = augmented(scan, rng, self.augmentation, self.bank)
+        sensor = drawn_sensor(rng) if rng.random() < recipe.beams else None
+        scan = augmented(scan, rng, self.augmentation, self.bank, sensor)
         if self.task.swaps_sectors and rng.random() < recipe.swap:
-            other = augmented(self._scan(rng), rng, self.augmentation, self.bank)
+            other = augmented(self._scan(rng), rng, self.augmentation, self.bank, sensor)
             scan = swapped(scan, other, rng) if other.sensor == scan.sensor else scan
         return scan
 

@@ -122,9 +122,10 @@ def _train(recipe: Recipe, out: Path, data: Data, run: Run, ranks: Ranks) -> Pat
 
     # Model.
     network, state = build(recipe), _State(hashes=source.hashes)
+    if recipe.kept > 0.0 and run.start_from is None:
+        raise ValueError(f"the recipe keeps weights ({recipe.kept:g}) but there are none; give --start-from")
     if run.start_from is not None and not checkpoint.exists():
-        images = [torch.as_tensor(samples.batch(k)[0]).cpu() for k in range(STATISTICS_BATCHES)]
-        state.before, frames = start(network, recipe, run.start_from, images)
+        state.before, frames = _start(network, recipe, samples, run.start_from)
         state.hashes = frames | state.hashes
     network = network.to(ranks.device, memory_format=torch.channels_last)  # type: ignore[call-overload]  # not in its stubs
     ranks.share(network)
@@ -147,6 +148,10 @@ def _train(recipe: Recipe, out: Path, data: Data, run: Run, ranks: Ranks) -> Pat
             losses.append(_step(recipe, source, model, state, arrays, ranks))
             state.step += 1
             _average(model.averaged, network, min(recipe.ema, (1 + state.step) / (10 + state.step)))
+            if recipe.kept > 0.0 and run.start_from is not None and state.step == recipe.steps:
+                begun = build(recipe)
+                _start(begun, recipe, samples, run.start_from)
+                _average(model.averaged, begun.to(ranks.device), 1.0 - recipe.kept)
             progress.update()
             rate = (state.step - began) * recipe.batch / max(time.monotonic() - began_s, 1e-9)
             figure_shown = {"best": f"{state.best_figure:.3f}"} if state.best_figure >= 0.0 else {}
@@ -200,6 +205,14 @@ class _Model(NamedTuple):
     forward: Any
     averaged: nn.Module
     optimizer: torch.optim.Optimizer
+
+
+def _start(
+    network: nn.Module, recipe: Recipe, samples: Samples | ImageSamples | ObjectBatches, path: Path
+) -> tuple[list[dict[str, Any]], dict[str, str]]:
+    """`start`, with the first batches for the statistics of batch norm."""
+    images = [torch.as_tensor(samples.batch(k)[0]).cpu() for k in range(STATISTICS_BATCHES)]
+    return start(network, recipe, path, images)
 
 
 @dataclass(slots=True)

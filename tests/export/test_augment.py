@@ -280,18 +280,6 @@ def test_the_ground_at_the_bumper_is_background() -> None:
     assert augment.with_ground_ahead(street) is street
 
 
-def test_every_second_beam_is_dropped(scan: LabeledScan) -> None:
-    out = augment.halved(scan)
-    assert out.sensor is not None
-    assert len(out.sensor.elevations_deg) == 32
-    assert 0.4 < len(out.points) / len(scan.points) < 0.6
-    flat = np.hypot(out.points[:, 0], out.points[:, 1])
-    elevations = np.degrees(np.arctan2(out.points[:, 2], flat))
-    apart = np.abs(elevations[:, None] - np.array(out.sensor.elevations_deg)).min(1)
-    assert np.quantile(apart, 0.99) < 0.3
-    assert augment.halved(out) is out
-
-
 def test_a_tilted_scan_keeps_its_objects(scan: LabeledScan) -> None:
     out = augment.tilted(scan, np.radians(0.5), np.radians(-0.5), 0.05)
     for box, other in zip(scan.boxes, out.boxes, strict=True):

@@ -154,6 +154,23 @@ def test_a_resumed_run_equals_an_uninterrupted_one(
 
 
 @pytest.mark.usefixtures("small_views")
+@pytest.mark.parametrize("network", ["lodnn", "pointseg", "ssadnet"])
+def test_a_run_may_keep_a_share_of_the_weights_that_it_starts_from(
+    tmp_path: Path, simulated: Path, network: str
+) -> None:
+    begun = untrained(network, tmp_path)
+    arguments = {"kitti": None, "simulated": simulated, "n_threads": 1, "start_from": begun}
+    made = [weights(train(small(network, kept=k), tmp_path / f"{k}", **arguments)) for k in (0.0, 0.25, 1.0)]
+    for name, before in weights(begun).items():
+        if before.dtype.is_floating_point:
+            own, mixed, same = (each[name] for each in made)
+            assert torch.allclose(same, before, atol=1e-6), name
+            assert torch.allclose(mixed, 0.75 * own + 0.25 * before, atol=1e-5), name
+    with pytest.raises(ValueError, match="give --start-from"):
+        train(small(network, kept=0.5), tmp_path / "none", **{**arguments, "start_from": None})
+
+
+@pytest.mark.usefixtures("small_views")
 def test_reused_samples_are_drawn_from_the_newest(tmp_path: Path, simulated: Path) -> None:
     recipe = small("pointseg", steps=7, batch=2, reuse=3, redraw_every=0)
     samples = Samples(recipe, [], [], sorted(simulated.glob("*.npz")))

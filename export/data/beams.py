@@ -1,0 +1,78 @@
+"""Scans of the training sensor as sensors with other beams would have taken them.
+
+The range image of such a scan is then filled between its beams as at run time (`scan_sets.seen_by_network`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from edgeperc.inference.projection import row_edges
+from edgeperc.types.sensor import PUBLIC_SENSORS, SENSORS, SensorProfile
+from edgeperc.types.views import RangeImageGeometry
+
+from .scans import LabeledScan
+
+TRAINING_SENSOR = SENSORS["hdl-64e"]
+# How often one with random beams, a known one that spins and one without beams is drawn.
+SHARES = (0.35, 0.45, 0.2)
+KNOWN = tuple(
+    sensor for name, sensor in {**SENSORS, **PUBLIC_SENSORS}.items() if name not in ("hdl-64e", "semantickitti", "vod")
+)
+SPINNING = tuple(sensor for sensor in KNOWN if sensor.pattern is None)
+PATTERNED = tuple(sensor for sensor in KNOWN if sensor.pattern is not None)
+ACCUMULATED_S = (0.1, 0.5)  # over which scans of a sensor without beams are gathered
+FARTHEST_DEG = 0.4  # a beam is the training sensor's nearest one, if it is no farther away
+# The function that maps a sensor's remission is only roughly right.
+GAMMA, NOISE = 0.3, 0.03
+
+
+def drawn_sensor(rng: np.random.Generator) -> SensorProfile:
+    """One with random beams, a known one that is a little tilted, or one without beams, which may hang upside down."""
+    kind = rng.choice(3, p=SHARES)
+    if kind == 0:
+        up, down = rng.uniform(0.0, 20.0), rng.uniform(-30.0, -12.0)
+        columns = int(rng.choice([900, 1024, 1800, 2048]))
+        return SensorProfile.uniform("random", int(rng.integers(12, 49)), up, down, columns=columns)
+    if kind == 1:
+        sensor, tilt = SPINNING[rng.integers(len(SPINNING))], rng.uniform(-0.5, 0.5)
+        return replace(sensor, elevations_deg=tuple(round(deg + tilt, 2) for deg in sensor.elevations_deg))
+    sensor = PATTERNED[rng.integers(len(PATTERNED))].accumulated(float(rng.uniform(*ACCUMULATED_S)))
+    hanging = tuple(-deg for deg in reversed(sensor.elevations_deg))
+    return replace(sensor, elevations_deg=hanging) if rng.random() < 0.5 else sensor
+
+
+def taken_by(sensor: SensorProfile, scan: LabeledScan, rng: np.random.Generator) -> LabeledScan:
+    """The points of a scan of the training sensor that another sensor would have; a scan of another one is unchanged.
+
+    Of the training sensor's beams, those nearest to the sensor's remain, with one return in each of its columns. Of a
+    sensor without beams, points in its field of view remain at random, as densely as it has them.
+    """
+    if scan.sensor is not None:
+        return scan
+    points, own = scan.points, np.array(TRAINING_SENSOR.elevations_deg)
+    slope = points[:, 2] / (np.hypot(points[:, 0], points[:, 1]) + np.abs(points[:, 2]) + 1e-6)
+    row = np.searchsorted(-row_edges(RangeImageGeometry(TRAINING_SENSOR.elevations_deg)), -slope) - 1
+    inside = (row >= 0) & (row < len(own))
+    row = np.clip(row, 0, len(own) - 1)
+    if sensor.pattern is not None:
+        fov_deg = sensor.fov_up_deg - sensor.fov_down_deg
+        density = sensor.pattern.points_per_s * sensor.pattern.accumulate_s / (sensor.pattern.width_deg * fov_deg)
+        share = 1.0 - np.exp(density * np.gradient(own) * TRAINING_SENSOR.azimuth_resolution_deg)
+        share[(own > sensor.fov_up_deg) | (own < sensor.fov_down_deg)] = 0.0
+        kept = np.nonzero(inside & (rng.random(len(points)) < share[row]))[0]
+    else:
+        beams = np.array(sensor.elevations_deg)
+        apart = np.abs(beams[:, None] - own)
+        rows = np.unique(apart.argmin(1)[apart.min(1) <= FARTHEST_DEG])
+        step = 2.0 * np.pi / min(sensor.columns, TRAINING_SENSOR.columns)
+        column = np.floor(np.arctan2(points[:, 1], points[:, 0]) / step).astype(np.int64)
+        kept = np.nonzero(inside & np.isin(row, rows))[0]
+        if sensor.columns < TRAINING_SENSOR.columns:
+            kept = np.sort(kept[np.unique(row[kept] * 10_000 + column[kept], return_index=True)[1]])
+    remission = points[kept, 3] ** np.float32(np.exp(rng.normal(0.0, GAMMA)))
+    remission += rng.normal(0.0, NOISE, len(kept)).astype(np.float32)
+    taken = np.column_stack([points[kept, :3], np.clip(remission, 0.0, 1.0)])
+    return replace(scan, points=taken.astype(np.float32), labels=scan.labels[kept], sensor=sensor)
