@@ -85,8 +85,9 @@ def test_points_labels_and_boxes_stay_together(scan: LabeledScan, seed: int) -> 
     assert ((out.points[:, 3] >= 0.0) & (out.points[:, 3] <= 1.0)).all()
     assert (out.boxes, out.counts, out.sensor) == (scan.boxes, scan.counts, sensor)
     places = {tuple(place): label for place, label in zip(scan.points[:, :3].tolist(), scan.labels, strict=True)}
-    kept = zip(out.points[:, :3].tolist(), out.labels, strict=True)
-    assert all(places[tuple(place)] == label for place, label in kept)
+    assert all(
+        places[tuple(place)] == label for place, label in zip(out.points[:, :3].tolist(), out.labels, strict=True)
+    )
 
 
 def test_empty_scans_and_those_of_another_sensor_are_as_they_were(scan: LabeledScan) -> None:
