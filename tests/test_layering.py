@@ -93,7 +93,8 @@ FLOORS = {
         simulation.__init__ simulation.samples
         view.colors
         view.canvas view.content
-        view.files view.page view.painted view.picture view.tracks
+        view.files view.page view.picture view.tracks
+        view.painted
         view.__init__
         datasets.__init__ datasets.annotations datasets.images datasets.splits
         datasets.kitti datasets.layout
@@ -158,10 +159,11 @@ FLOORS = {
         __init__
     """,
     "edgeperc_bench": """
-        application conditions context inputs options robots samples scenarios solid_state surroundings
+        application conditions context inputs options samples scenarios surroundings
         document loadgen render start
         plots report worker
         accuracy
+        robots solid_state
         measure
         peers.__init__ peers.arithmetic peers.networks peers.rounds
         peers.engines peers.ground peers.pillars peers.projection peers.slam peers.tracking
