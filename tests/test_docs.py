@@ -194,7 +194,7 @@ def test_commands_of_the_results_are_known(line: str) -> None:
         return
     source = (REPOSITORY / arguments[1].replace("edgeperc_bench.", "bench/").replace(".", "/")).with_suffix(".py")
     assert {word for word in arguments if word.startswith("--")} <= {
-        *re.findall(r'"(--[\w-]+)"', source.read_text("utf-8"))
+        *re.findall(r'"(--[\w-]+)[ "]', source.read_text("utf-8"))
     }
 
 

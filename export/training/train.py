@@ -148,10 +148,8 @@ def _train(recipe: Recipe, out: Path, data: Data, run: Run, ranks: Ranks) -> Pat
             losses.append(_step(recipe, source, model, state, arrays, ranks))
             state.step += 1
             _average(model.averaged, network, min(recipe.ema, (1 + state.step) / (10 + state.step)))
-            if recipe.kept > 0.0 and run.start_from is not None and state.step == recipe.steps:
-                begun = build(recipe)
-                _start(begun, recipe, samples, run.start_from)
-                _average(model.averaged, begun.to(ranks.device), 1.0 - recipe.kept)
+            if state.step == recipe.steps:
+                _keep(recipe, run, model, samples, ranks)
             progress.update()
             rate = (state.step - began) * recipe.batch / max(time.monotonic() - began_s, 1e-9)
             figure_shown = {"best": f"{state.best_figure:.3f}"} if state.best_figure >= 0.0 else {}
@@ -184,6 +182,16 @@ def _train(recipe: Recipe, out: Path, data: Data, run: Run, ranks: Ranks) -> Pat
             if over:
                 break
     return checkpoint
+
+
+def _keep(
+    recipe: Recipe, run: Run, model: _Model, samples: Samples | ImageSamples | ObjectBatches, ranks: Ranks
+) -> None:
+    """Average the trained weights with those that the run started from, as ``kept`` says."""
+    if recipe.kept > 0.0 and run.start_from is not None:
+        begun = build(recipe)
+        _start(begun, recipe, samples, run.start_from)
+        _average(model.averaged, begun.to(ranks.device), 1.0 - recipe.kept)
 
 
 class _Source(NamedTuple):
