@@ -148,8 +148,7 @@ def _train(recipe: Recipe, out: Path, data: Data, run: Run, ranks: Ranks) -> Pat
             losses.append(_step(recipe, source, model, state, arrays, ranks))
             state.step += 1
             _average(model.averaged, network, min(recipe.ema, (1 + state.step) / (10 + state.step)))
-            if state.step == recipe.steps:
-                _keep(recipe, run, model, samples, ranks)
+            _keep(recipe, run, model, state, samples, ranks.device)
             progress.update()
             rate = (state.step - began) * recipe.batch / max(time.monotonic() - began_s, 1e-9)
             figure_shown = {"best": f"{state.best_figure:.3f}"} if state.best_figure >= 0.0 else {}
@@ -185,13 +184,18 @@ def _train(recipe: Recipe, out: Path, data: Data, run: Run, ranks: Ranks) -> Pat
 
 
 def _keep(
-    recipe: Recipe, run: Run, model: _Model, samples: Samples | ImageSamples | ObjectBatches, ranks: Ranks
+    recipe: Recipe,
+    run: Run,
+    model: _Model,
+    state: _State,
+    samples: Samples | ImageSamples | ObjectBatches,
+    device: torch.device,
 ) -> None:
-    """Average the trained weights with those that the run started from, as ``kept`` says."""
-    if recipe.kept > 0.0 and run.start_from is not None:
+    """At the end, average the weights with those that the run started from, as ``kept`` says."""
+    if recipe.kept > 0.0 and run.start_from is not None and state.step == recipe.steps:
         begun = build(recipe)
         _start(begun, recipe, samples, run.start_from)
-        _average(model.averaged, begun.to(ranks.device), 1.0 - recipe.kept)
+        _average(model.averaged, begun.to(device), 1.0 - recipe.kept)
 
 
 class _Source(NamedTuple):
