@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -46,7 +46,8 @@ def resized(model: str, share: float, folder: Path) -> Path:
         view = replace(view, width=round(share * view.width))
     card = replace(card, view=view, golden=None, precision="fp32", precisions={})
     made = folder / f"{card.name}-{share:g}.onnx"
-    write_card(to_graph(build(Recipe(**recipe)), card), card, made)
+    known = {each.name for each in fields(Recipe)}  # an option that is gone was one of training, not of the network
+    write_card(to_graph(build(Recipe(**{name: recipe[name] for name in known & {*recipe}})), card), card, made)
     return made
 
 

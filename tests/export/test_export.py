@@ -977,11 +977,16 @@ def test_a_network_has_one_task(network: str, simulated: Path) -> None:
 
 
 def test_what_half_precision_holds_is_stored_so_and_loses_nothing(tmp_path: Path) -> None:
-    path, again = REPOSITORY / "models" / "pointseg-int8.onnx", tmp_path / "again.onnx"
-    model = onnx.load(path)
+    shipped, path, again = REPOSITORY / "models" / "pointseg.onnx", tmp_path / "model.onnx", tmp_path / "again.onnx"
+    model, card = onnx.load(shipped), replace(ModelCard.read(shipped), golden=None)
+    large = [tensor for tensor in model.graph.initializer if onnx.numpy_helper.to_array(tensor).size >= 1024]
+    for tensor in large[::2]:
+        values = onnx.numpy_helper.to_array(tensor).astype(np.float16).astype(np.float32)
+        tensor.CopyFrom(onnx.numpy_helper.from_array(values, tensor.name))
+    write_card(model, card, path)
     halve(model.graph, exactly=True)
-    write_card(model, ModelCard.read(path), again)
-    assert again.stat().st_size < path.stat().st_size
+    write_card(model, card, again)
+    assert again.stat().st_size < 0.8 * path.stat().st_size
     before, after = Session(path, "cpu"), Session(again, "cpu")
     for session in (before, after):
         session.input[:] = np.random.default_rng(0).normal(size=session.input.shape)
