@@ -5,21 +5,20 @@ from __future__ import annotations
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
-
-from edgeperc.readers import captures
-from edgeperc.readers.decoders import decode
-from edgeperc.readers.times import TimedScan
 
 
 @pytest.fixture
 def in_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
     """Captures are decoded here: a process takes a second to start. That it replies the same is for `test_apart`."""
+    # Here, because pytest imports this file before it counts the calls of kernels.
+    from edgeperc.readers import captures
+    from edgeperc.readers.decoders import decode
+    from edgeperc.readers.times import TimedScan
 
-    def decoded(
-        path: Path, kind: str, topic: str | None, remission_field: str | None, times: bool
-    ) -> Iterator[TimedScan]:
+    def decoded(path: Path, kind: str, topic: str | None, remission_field: str | None, times: bool) -> Iterator[Any]:
         def warn(text: str) -> None:
             warnings.warn(text, UserWarning, stacklevel=2)
 
