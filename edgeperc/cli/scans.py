@@ -7,7 +7,7 @@ import os
 import re
 import tempfile
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from itertools import islice
@@ -123,13 +123,13 @@ def stated_sensor(arguments: argparse.Namespace) -> str:
     return DEFAULT_SENSOR if arguments.sensor in (None, AUTO_SENSOR) else arguments.sensor
 
 
-def find_sensor(paths: Sequence[Path], options: Mapping[str, Any]) -> SensorEstimate | None:
+def find_sensor(paths: Iterable[Path], options: Mapping[str, Any]) -> SensorEstimate | None:
     """The sensor that the first scans show; None if none that can be read has enough points. Raises SensorError."""
     from ..preprocess.sensor_estimate import MOST_SCANS, estimate_sensor, has_enough_points
     from ..readers.captures import is_capture, read_scans
 
     scans: list[NDArray[np.float32]] = []
-    for path in paths[:_LOOKED_AT]:
+    for path in islice(paths, _LOOKED_AT):
         of_file = {} if is_capture(path) else {"origin_m": options.get("origin_m")}
         with suppress(EdgepercError, OSError):  # reported when the scan's turn comes
             read = islice(read_scans(path, **{**options, "origin_m": None, **of_file}), MOST_SCANS)
@@ -151,7 +151,7 @@ def find_sensor(paths: Sequence[Path], options: Mapping[str, Any]) -> SensorEsti
 
 
 def scan_sensor(
-    path: Path, arguments: argparse.Namespace, beside: Sequence[Path] = ()
+    path: Path | Remote, arguments: argparse.Namespace, beside: Iterable[Path] = ()
 ) -> tuple[str | SensorProfile, str]:
     """The sensor of a scan or capture, and how it is known: by ``--sensor`` (which warns if the capture contradicts),
     by the capture, or by the points of it and the files ``beside``. Raises SensorError, PointsError, MissingExtraError.
@@ -160,18 +160,20 @@ def scan_sensor(
     from ..readers.identify import NotSpinningError, contradicts
     from ..types.sensor import get_sensor
 
-    known: KnownSensor | None
+    known: KnownSensor | None = None
     if arguments.sensor in (None, AUTO_SENSOR):
         unnamed: EdgepercError | None = None
-        try:
-            known = known_sensor(path, arguments.topic)
-        except NotSpinningError:
-            raise
-        except SensorError as exc:
-            unnamed, known = exc, None
-        if known is not None:
-            return with_mounting(known.profile, arguments), known.because
-        files = scan_files(path) if path.is_dir() and not is_capture(path) else beside or [path]
+        files = beside
+        if isinstance(path, Path):  # what is at a URL is a scan file, which names no sensor
+            try:
+                known = known_sensor(path, arguments.topic)
+            except NotSpinningError:
+                raise
+            except SensorError as exc:
+                unnamed = exc
+            if known is not None:
+                return with_mounting(known.profile, arguments), known.because
+            files = scan_files(path) if path.is_dir() and not is_capture(path) else beside or [path]
         try:
             found = find_sensor(files, reading_options(arguments))
         except SensorError as exc:
@@ -183,7 +185,7 @@ def scan_sensor(
         return with_mounting(found.profile, arguments), str(found)
     given = get_sensor(arguments.sensor)
     try:
-        known = known_sensor(path, arguments.topic)
+        known = known_sensor(path, arguments.topic) if isinstance(path, Path) else None
     except EdgepercError:  # it need not name its sensor, and reading it tells of damage
         known = None
     if known is not None and contradicts(given, known.profile):
@@ -224,17 +226,21 @@ class Sensors:
         return found
 
     def _of(self, path: Path | Remote, beside: Sequence[Path | Remote]) -> tuple[str | SensorProfile, str]:
-        from ..readers.captures import is_capture
+        from ..readers.captures import CAPTURE_SUFFIXES, is_capture
 
-        with tempfile.TemporaryDirectory(prefix="edgeperc-") as folder:
+        urls = [scan for scan in beside if isinstance(scan, Remote) and scan.suffix.lower() not in CAPTURE_SUFFIXES]
+        if not urls or self._arguments.sensor not in (None, AUTO_SENSOR):
             files = [scan for scan in beside if isinstance(scan, Path) and not is_capture(scan)]
-            for scan in beside[:_LOOKED_AT]:
-                if isinstance(scan, Remote):
-                    with suppress(EdgepercError, OSError):  # reported when the scan's turn comes
-                        files.append(scan.fetch(Path(folder)))
-            if isinstance(path, Remote):
-                path = next(iter(files), Path(path.name))
             return scan_sensor(path, self._arguments, files)
+        with tempfile.TemporaryDirectory(prefix="edgeperc-") as folder:
+            return scan_sensor(path, self._arguments, _fetched(urls, Path(folder)))
+
+
+def _fetched(urls: Iterable[Remote], folder: Path) -> Iterator[Path]:
+    """The files at URLs, each fetched when it is asked for; one that cannot be is reported when its turn comes."""
+    for url in urls:
+        with suppress(EdgepercError, OSError):
+            yield url.fetch(folder)
 
 
 def with_mounting(sensor: str | SensorProfile, arguments: argparse.Namespace) -> str | SensorProfile:

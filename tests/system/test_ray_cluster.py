@@ -228,6 +228,45 @@ def test_the_sensor_of_scans_at_a_url_is_found(sensor: str, n_damaged: int, tmp_
         assert "beams found" in how
 
 
+def test_no_more_is_fetched_than_the_sensor_needs(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Three scans that can be read; none with ``--sensor``. Files of this computer need no temporary folder."""
+    pytest.importorskip("fsspec")
+    folder, fetched = Remote("memory://few/scans"), []
+    urls = [Remote(f"{folder.url}/{name}") for name in ("0.bin", "1.bin", "2.bin", "3.bin", "4.bin", "whole.pcap")]
+    points = simulate(random_scene(1, "urban"), "vlp-16", seed=1).points
+    for k, url in enumerate(urls):
+        url.write_bytes(b"no scan" if k == 0 else points.tobytes())
+    fetch = Remote.fetch
+
+    def counted(url: Remote, to: Path) -> Path:
+        fetched.append(url.name)
+        return fetch(url, to)
+
+    monkeypatch.setattr(Remote, "fetch", counted)
+    parser = build_parser()
+    assert Sensors(parser.parse_args(["run", folder.url]), urls).of(urls[0])[0] != "hdl-64e"
+    assert fetched == ["0.bin", "1.bin", "2.bin", "3.bin"]
+    given = parser.parse_args(["run", folder.url, "--sensor", "os1-64"])
+    (tmp_path / "4.bin").write_bytes(points.tobytes())
+    assert Sensors(given, urls).of(tmp_path / "4.bin", urls[4])[0] == "os1-64"
+    assert len(fetched) == 4
+    monkeypatch.setattr("edgeperc.cli.scans.tempfile.TemporaryDirectory", pytest.fail)
+    here = tmp_path / "4.bin"
+    sensor, _ = Sensors(parser.parse_args(["run", str(here)]), [here]).of(here)
+    assert isinstance(sensor, SensorProfile)
+    assert sensor.name == "vlp-16"
+
+
+def test_urls_that_cannot_be_fetched_are_reported_later(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("fsspec")
+    monkeypatch.setattr("edgeperc.system.remote.MOST_BYTES", 10)
+    urls = [Remote(f"memory://large/{k}.bin") for k in range(2)]
+    for url in urls:
+        url.write_bytes(bytes(16))
+    found = Sensors(build_parser().parse_args(["run", "memory://large"]), urls).of(urls[0])
+    assert found == ("hdl-64e", "the default: too few points to tell")
+
+
 def test_scans_in_memory(scans: Path, tmp_path: Path) -> None:
     pytest.importorskip("fsspec")
     _results_at_urls_are_those_of_paths("memory://edgeperc", scans, tmp_path)
