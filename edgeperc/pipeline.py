@@ -209,7 +209,9 @@ class PillarNetwork:
         view = session.card.view
         assert isinstance(view, PillarGeometry)
         self.session, self.card, self.view, self._score = session, session.card, view, score_threshold
-        self._pillarizer = Pillarizer(view, session.card.input)
+        self._pillarizer = Pillarizer(view, session.card.input, session.input)
+        # Beside the values, which are written in place; a graph may take them in another type.
+        self._beside = [*zip(session.inputs.values(), self._pillarizer.inputs, strict=True)][1:]
         quarters = 4 if full_turn and not view.is_all_around else 1
         height_m, yaws_deg = session.card.mount_height_m, [view.yaw_deg + 90.0 * k for k in range(quarters)]
         self.frames = [ModelFrame(Mounting(height_m, 0.0, view.pitch_deg, math.remainder(y, 360.0))) for y in yaws_deg]
@@ -230,8 +232,8 @@ class PillarNetwork:
             n = self._pillarizer.fill(frame.move_back(points))
             if n == 0:
                 continue
-            for name, array in zip(self.session.inputs, self._pillarizer.inputs, strict=True):
-                self.session.inputs[name][:n] = array[:n]
+            for taken, array in self._beside:
+                taken[:n] = array[:n]
             boxes += frame.move_boxes(decode_detections(self.card, self.session.run(n), self._score))
         if len(self.frames) == 1:
             return boxes

@@ -54,18 +54,20 @@ class Pillars(NamedTuple):
 
 
 class Pillarizer:
-    """Makes the pillars of scans in a card's view; `pillars` are overwritten by the next scan."""
+    """Makes the pillars of scans in a card's view; `pillars` are overwritten by the next scan.
 
-    def __init__(self, view: PillarGeometry, spec: InputSpec) -> None:
+    values : (max_pillars, points, channels) float32, where their values are written; None: an array of its own.
+    """
+
+    def __init__(self, view: PillarGeometry, spec: InputSpec, values: NDArray[np.float32] | None = None) -> None:
         bounds = (view.x_range_m, view.y_range_m, view.z_range_m)
         x, y, z = ((float(low), float(high)) for low, high in bounds)
         self._grid = PillarGrid((x[0], y[0], z[0]), (x[1], y[1], z[1]), float(view.cell_m))
         self._channels = np.array([CHANNELS["pillars"].index(name) for name in spec.channels], np.int64)
         self._scale = np.array([spec.mean, spec.std], np.float32)
         n, m = view.max_pillars, view.max_points
-        self.pillars = Pillars(
-            np.zeros((n, m, len(spec.channels)), np.float32), np.zeros(n, np.int32), np.zeros((n, 4), np.int32)
-        )
+        values = np.zeros((n, m, len(spec.channels)), np.float32) if values is None else values
+        self.pillars = Pillars(values, np.zeros(n, np.int32), np.zeros((n, 4), np.int32))
         self.inputs = [each for each, used in zip(self.pillars, (1, view.num_points, 1), strict=True) if used]
         """Arrays of `pillars` in the order of the graph's inputs (`edgeperc.inference.session.input_shapes`)."""
         self._members = np.empty((n, m), np.int32)

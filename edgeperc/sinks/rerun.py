@@ -16,7 +16,7 @@ from ..system.extras import require
 from ..system.printable import printable
 from ..types.mounting import MODEL_HEIGHT_M
 from ..types.perception import Box, TopView
-from ..view.content import box_text, track_text
+from ..view.content import box_text, drivable_strips, track_text
 from .run_file import Pipe, RunFile
 from .scene import Trails, base_pose, byte_colors, checked_target, colored_points, nanoseconds
 
@@ -173,9 +173,7 @@ class RerunSink:
 
     def _drivable(self, view: TopView, R: NDArray[np.float64], t: NDArray[np.float64]) -> Any:
         """Two triangles for each run of drivable cells along a row."""
-        padded = np.pad(view.drivable, ((0, 0), (1, 1))).astype(np.int8)
-        change = np.diff(padded, axis=1)
-        (row, first), (_, last) = np.nonzero(change == 1), np.nonzero(change == -1)
+        row, first, last = drivable_strips(view).T
         far, left = view.x_range_m[1] - view.cell_m * row, view.y_range_m[1] - view.cell_m * first
         near, right = far - view.cell_m, view.y_range_m[1] - view.cell_m * last
         x, y = np.stack([far, far, near, near], axis=1), np.stack([left, right, right, left], axis=1)

@@ -413,9 +413,9 @@ class ModelCard:
         document |= {
             "schema": SCHEMA,
             "view": view,
-            "input": {name: getattr(self.input, name) for name in InputSpec.__dataclass_fields__},
-            "outputs": [{n: getattr(o, n) for n in OutputSpec.__dataclass_fields__} for o in self.outputs],
-            "golden": self.golden and {n: getattr(self.golden, n) for n in Golden.__dataclass_fields__},
+            "input": _entries(self.input),
+            "outputs": [_entries(output) for output in self.outputs],
+            "golden": self.golden and _entries(self.golden),
         }
         return json.dumps(document, sort_keys=True, separators=(",", ":"), ensure_ascii=False, allow_nan=False)
 

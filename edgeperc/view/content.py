@@ -16,7 +16,7 @@ from ..ground.planes import fit_ground
 from ..system.printable import printable
 from ..types.frame import ModelFrame
 from ..types.mounting import MODEL_HEIGHT_M, MODEL_MOUNTING
-from ..types.perception import Box, ImageLabels, Perception
+from ..types.perception import Box, ImageLabels, Perception, TopView
 from ..types.points import Points
 from .colors import CLASS_COLORS
 
@@ -39,6 +39,14 @@ def check_points(points: Points, perception: Perception) -> None:
         raise PointsError(
             f"{len(points)} points with a perception of {perception.n_points}; expected the scan that was perceived"
         )
+
+
+def drivable_strips(view: TopView) -> NDArray[np.intp]:
+    """Runs of drivable cells along the rows: row, first column and one past the last column, (n, 3)."""
+    padded = np.pad(view.drivable, ((0, 0), (1, 1))).astype(np.int8)
+    change = np.diff(padded, axis=1)
+    (row, first), (_, last) = np.nonzero(change == 1), np.nonzero(change == -1)
+    return np.column_stack([row, first, last])
 
 
 def perceived_image(image: ArrayLike, perception: Perception) -> tuple[NDArray[np.uint8], ImageLabels]:

@@ -29,6 +29,7 @@ from .content import (
     class_facts,
     drawable_boxes,
     drawable_points,
+    drivable_strips,
     ground_plane,
     in_model_frame,
     paint_points,
@@ -334,15 +335,12 @@ def _policy(template: str) -> str:
 
 
 def _road(top_view: TopView) -> dict[str, Any]:
-    """The drivable cells, row by row: strips of row, first column and one past the last column."""
-    padded = np.pad(top_view.drivable, ((0, 0), (1, 1))).astype(np.int8)
-    change = np.diff(padded, axis=1)
-    (row, first), (_, last) = np.nonzero(change == 1), np.nonzero(change == -1)
+    """The drivable cells, as the page draws them."""
     return {
         "cell": top_view.cell_m,
         "x": top_view.x_range_m[1],
         "y": top_view.y_range_m[1],
-        "strips": np.column_stack([row, first, last]).tolist(),
+        "strips": drivable_strips(top_view).tolist(),
     }
 
 
