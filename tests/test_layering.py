@@ -90,7 +90,7 @@ FLOORS = {
         simulation.people
         simulation.street
         simulation.camera simulation.roadside
-        simulation.drawn simulation.layouts
+        simulation.drawn simulation.halls simulation.layouts
         simulation.__init__ simulation.samples
         view.colors
         view.canvas view.content

@@ -15,6 +15,7 @@ from ..types.perception import Box
 from ..types.sensor import SensorProfile
 from .camera import CAMERA_CLASSES, true_classes
 from .drawn import random_scene
+from .halls import CLEAR_M, hall
 from .layouts import scene_from_boxes
 from .scene import POINT_CLASS_OF, SCENE_CLASSES, Scene, SimulatedScan, sensor_pose, simulate
 
@@ -36,6 +37,7 @@ def simulated_scan(
     boxes: Sequence[Box] | None = None,
     *,
     mounting: Mounting | None = None,
+    indoors: bool = False,
 ) -> SimulatedScan:
     """Simulate one scan of a new scene. The vehicle is slightly pitched and rolled, beside the middle of its lane.
 
@@ -43,9 +45,13 @@ def simulated_scan(
     boxes : a real layout to build the scene around (`layouts.scene_from_boxes`); by default the scene is random.
     mounting : how the sensor is mounted: height, and tilt relative to the vehicle. Default: at the height of the
         sensor's own mounting, upright. Points and boxes are in the frame of the tilted sensor.
+    indoors : in a hall, without a layout (`halls.hall`); a sensor that is as high as the ceiling hangs below it.
     """
     rng = np.random.default_rng((seed, 1))
-    if boxes is None:
+    highest_m = math.inf
+    if indoors:
+        scene, (x, y, yaw), highest_m = hall(seed)
+    elif boxes is None:
         scene = random_scene(seed)
         x = y = 0.0
         yaw = float(rng.normal(0.0, 0.05))
@@ -63,6 +69,7 @@ def simulated_scan(
         pose[:3, :3] = pose[:3, :3] @ mounting.rotation()
         if mounting.height_m is not None:
             pose[2, 3] = scene.ground_height(x, y) + mounting.height_m
+    pose[2, 3] = min(pose[2, 3], scene.ground_height(x, y) + highest_m - CLEAR_M)
     # Vehicles differ in what they hide. KITTI's car is one of them.
     return simulate(scene, sensor, seed, pose, ego_shadow=bool(rng.random() < 0.85))
 

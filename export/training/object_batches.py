@@ -22,7 +22,7 @@ from .object_task import VEHICLE, Objects
 # Shares of the classes in a batch.
 SHARES = {BACKGROUND: 0.45, 1: 0.26, 2: 0.08, 3: 0.04, 4: 0.09, 5: 0.07, VEHICLE: 0.01}
 SIMULATED = "simulated"
-SOURCE_WEIGHTS: Mapping[str, float] = {SIMULATED: 0.02, "pandaset": 1.0}
+SOURCE_WEIGHTS: Mapping[str, float] = {SIMULATED: 0.02, "pandaset": 1.0, "pandaset-pasted": 0.5}
 """How often an object of a source counts, for one of KITTI; others: `OTHER_WEIGHT`."""
 OTHER_WEIGHT = 0.1
 ALIKE = 0.5  # samples of one object count as this power of their number
@@ -111,6 +111,8 @@ def _weights(samples: ObjectSamples, names: Sequence[str]) -> NDArray[np.float64
     weights = of_source[samples.sources]
     _, inverse, n_alike = np.unique(samples.objects, return_inverse=True, return_counts=True)
     is_object = samples.classes != BACKGROUND
+    of_simulation = np.array([name == SIMULATED for name in names])[samples.sources]
+    weights = np.where(of_simulation & ~is_object, 0.3, weights)
     weights = np.where(is_object, weights * n_alike[inverse.ravel()] ** -ALIKE, weights)
     weights = np.where(is_object & (samples.origin == TRUE), TRUE_WEIGHT * weights, weights)
     weights = np.where(~is_object & (samples.origin == DETECTED), DETECTED_BACKGROUND * weights, weights)

@@ -36,6 +36,9 @@ from ..data.scans import LabeledScan
 from ..data.simulate import TRAINING_SENSOR
 from .object_task import VEHICLE
 
+_Scan = tuple[str, LabeledScan | Path | Callable[[], LabeledScan]]
+"""A drive, and a scan of it or what it is made by."""
+
 DETECTOR = "ssadnet"
 """The model whose boxes are candidates."""
 
@@ -74,7 +77,7 @@ class ObjectSamples(NamedTuple):
 def build_samples(
     folder: Path,
     name: str,
-    scans: Sequence[tuple[str, LabeledScan | Path | Callable[[], LabeledScan]]],
+    scans: Sequence[_Scan],
     *,
     real: bool,
     detector: bool = True,
@@ -83,22 +86,15 @@ def build_samples(
     """Write the samples of scans of drives into ``folder``, in parts; finished ones are kept."""
     folder.mkdir(parents=True, exist_ok=True)
     parts = [scans[first : first + PART] for first in range(0, len(scans), PART)]
-    missing = [k for k in range(len(parts)) if not (folder / f"{name}-{k:03d}.npz").exists()]
-    write = partial(_write_part, folder=folder, name=name, parts=parts, real=real, detector=detector)
+    missing = [(k, part) for k, part in enumerate(parts) if not (folder / f"{name}-{k:03d}.npz").exists()]
+    write = partial(_write_part, folder=folder, name=name, real=real, detector=detector)
     with mapped(write, missing, n_workers) as done:
         for _ in tqdm(done, desc=f"candidates of {name}", unit="part", total=len(missing)):
             pass
 
 
-def _write_part(
-    part: int,
-    *,
-    folder: Path,
-    name: str,
-    parts: Sequence[Sequence[tuple[str, LabeledScan | Path | Callable[[], LabeledScan]]]],
-    real: bool,
-    detector: bool,
-) -> None:
+def _write_part(part: tuple[int, Sequence[_Scan]], *, folder: Path, name: str, real: bool, detector: bool) -> None:
+    number, scans = part
     perceive = detector and Perceiver(
         DETECTOR,
         mounting=MODEL_MOUNTING,
@@ -111,15 +107,15 @@ def _write_part(
         adapt="none",
     )
     samples = []
-    for k, (drive, given) in enumerate(parts[part]):
+    for k, (drive, given) in enumerate(scans):
         if isinstance(given, LabeledScan):
             scan = given
         else:
             scan = LabeledScan.load(given) if isinstance(given, Path) else given()
-        rng = np.random.default_rng((part, k, len(name)))
+        rng = np.random.default_rng((number, k, len(name)))
         samples.append(samples_of(scan, f"{name}/{drive}", perceive or None, rng, real=real))
     joined = ObjectSamples(*(np.concatenate(arrays) for arrays in zip(*samples, strict=True)))
-    with open_atomic(folder / f"{name}-{part:03d}.npz") as file:
+    with open_atomic(folder / f"{name}-{number:03d}.npz") as file:
         np.savez(file, **joined._asdict())
 
 

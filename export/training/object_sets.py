@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import cached_property, partial
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +18,8 @@ from ..data.beams import drawn_sensor
 from ..data.scan_sets import read_scan_set
 from ..data.scans import LabeledScan
 from .object_samples import build_samples
+
+_Scan = Callable[[], LabeledScan]
 
 VALIDATION = "validation"
 PASTED = "pasted"
@@ -57,17 +59,17 @@ def write_samples(
                 build(name, labeled, real=True)
                 names.append(name)
                 if name != VALIDATION:
-                    # Objects of this source alone, so that leaving it out leaves them out.
-                    bank = cache(partial(_bank, tuple(scan for _, scan in labeled)))
-                    changed = [(drive, _Pasted(scan, bank, k)) for drive, scan in labeled for k in range(N_VARIANTS)]
-                    build(f"{name}-{PASTED}", changed, real=True)
+                    build(f"{name}-{PASTED}", variants(labeled), real=True)
                     names.append(f"{name}-{PASTED}")
                     hashes[names[-1]] = {}
     for folder in scan_sets:
         of_set, _, hashes[folder.layout.name] = read_scan_set(folder, "train")
         drives = [folder.drives[name.partition("/")[2]] for name in hashes[folder.layout.name]]
-        build(folder.layout.name, list(zip(drives, of_set, strict=True)), real=True)
-        names.append(folder.layout.name)
+        labeled = [(drive, partial(_same, scan)) for drive, scan in zip(drives, of_set, strict=True)]
+        build(folder.layout.name, labeled, real=True)
+        build(f"{folder.layout.name}-{PASTED}", variants(labeled), real=True)
+        names += [folder.layout.name, f"{folder.layout.name}-{PASTED}"]
+        hashes[names[-1]] = {}
     if simulated is not None:
         files = sorted(simulated.glob("*.npz"))
         build("simulated", [(file.stem, file) for file in files], real=False)
@@ -76,8 +78,28 @@ def write_samples(
     return names, hashes
 
 
-def _bank(scans: Sequence[Callable[[], LabeledScan]]) -> ObjectBank:
-    return ObjectBank.of(scan() for scan in scans)
+def _same(scan: LabeledScan) -> LabeledScan:
+    return scan
+
+
+def variants(scans: Sequence[tuple[str, _Scan]]) -> list[tuple[str, _Scan]]:
+    """The scans of drives, with objects of these scans alone pasted in: leaving them out leaves those out."""
+    bank = _Bank([scan for _, scan in scans])
+    return [(drive, _Pasted(scan, bank, k)) for drive, scan in scans for k in range(N_VARIANTS)]
+
+
+class _Bank:
+    """The objects of scans, cut out when they are needed; another process gets these alone."""
+
+    def __init__(self, scans: Sequence[_Scan]) -> None:
+        self._scans = scans
+
+    @cached_property
+    def objects(self) -> ObjectBank:
+        return ObjectBank.of(scan() for scan in self._scans)
+
+    def __getstate__(self) -> dict[str, object]:
+        return {"objects": self.objects}
 
 
 @dataclass(frozen=True)
@@ -85,11 +107,11 @@ class _Pasted:
     """A scan that is made when it is needed, with objects of a bank among its own."""
 
     scan: Callable[[], LabeledScan]
-    bank: Callable[[], ObjectBank]
+    bank: _Bank
     seed: int
 
     def __call__(self) -> LabeledScan:
         scan = self.scan()
         rng = np.random.default_rng((self.seed, len(scan.points)))
         sensor = drawn_sensor(rng) if rng.random() < BEAMS else None
-        return augmented(scan, rng, PASTING, self.bank(), sensor)
+        return augmented(scan, rng, PASTING, self.bank.objects, sensor)

@@ -10,6 +10,7 @@ import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -32,6 +33,7 @@ from edgeperc.preprocess.fitness import FitnessProfile
 from edgeperc.simulation.samples import FIRST_SEED, IGNORE, simulated_scan
 from edgeperc.simulation.scene import SimulatedScan
 from edgeperc.types.card import CARD_KEY, InputSpec, ModelCard, OutputSpec
+from edgeperc.types.perception import Box
 from edgeperc.types.views import RangeImageGeometry, TopViewGeometry
 from edgeperc_export import cards
 from edgeperc_export import make as make_module
@@ -66,9 +68,9 @@ def _scans_are_simulated_once() -> Iterator[None]:
     """Verification and profiles need many simulated scans. Here they get four, which are simulated once."""
     once = functools.cache(simulated_scan)
 
-    def cached(seed: int, sensor: str = "hdl-64e", boxes: object = None) -> SimulatedScan:
+    def cached(seed: int, sensor: str = "hdl-64e", boxes: Sequence[Box] | None = None, **options: Any) -> SimulatedScan:
         seed = seed if seed < 10**9 else 10**9 + seed % 4
-        return once(seed, sensor) if boxes is None else simulated_scan(seed, sensor, boxes)  # type: ignore[arg-type]
+        return once(seed, sensor) if boxes is None else simulated_scan(seed, sensor, boxes, **options)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("edgeperc_export.data.simulate.simulated_scan", cached)

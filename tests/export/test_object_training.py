@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -47,6 +48,7 @@ from edgeperc_export.training.object_samples import (
     load_samples,
     samples_of,
 )
+from edgeperc_export.training.object_sets import variants
 from edgeperc_export.training.object_task import Objects, fill_box_ious
 from edgeperc_export.training.train import Data, Run, train
 
@@ -275,3 +277,14 @@ def test_only_fp32_and_scans_with_clusters_are_quantized(tmp_path: Path) -> None
         quantize_objects(model_path("objects:fp32"), tmp_path / "int8.onnx", nothing)
     with pytest.raises(ModelError, match="quantize the model in fp32"):
         quantize_objects(model_path("objects:int8"), tmp_path / "int8.onnx", nothing)
+
+
+def test_other_processes_paste_the_same_objects(labeled: LabeledScan, tmp_path: Path) -> None:
+    labeled.save(tmp_path / "scan.npz")
+    pasted = variants([("drive", partial(LabeledScan.load, tmp_path / "scan.npz"))])
+    assert len({len(scan().points) for _, scan in pasted}) > 1
+    for n_workers in (0, 1):
+        build_samples(tmp_path / str(n_workers), "pasted", pasted, real=True, detector=False, n_workers=n_workers)
+    ours, theirs = (load_samples(tmp_path / folder, ["pasted"]) for folder in ("0", "1"))
+    for one, other in zip(ours, theirs, strict=True):
+        np.testing.assert_array_equal(one, other)
