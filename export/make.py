@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -20,8 +21,22 @@ from .release.to_onnx import export, write_card
 from .training.train import Data, Run, train
 
 N_SIMULATED = 2400
-# The object network sees points, not beams: with scans of other sensors it learns how sparse an object may be.
-OTHER_SENSORS, N_OF_OTHERS = ("pandar64", "vlp-32c", "vlp-16"), 200
+HEIGHTS_OF = {
+    "hdl-64e": 140,
+    "vlp-16": 90,
+    "os1-64": 90,
+    "vlp-32c": 60,
+    "pandar64": 40,
+    "os0-32": 40,
+    "mid-360": 60,
+    "hap": 16,
+}
+MORE_SCANS: Mapping[str, tuple[int, Mapping[str, int], dict[str, bool]]] = {
+    "sensors": (10_000, dict.fromkeys(("pandar64", "vlp-32c", "vlp-16"), 200), {}),
+    "halls": (600_000, dict.fromkeys(("hdl-64e", "pandar64", "vlp-16", "os1-64"), 90), {"indoors": True}),
+    "heights": (800_000, HEIGHTS_OF, {"any_height": True}),
+}
+"""Simulated scans beside those of the training sensor: the first seed, how many of each sensor, and of which kind."""
 SOURCES = {"real", "semantickitti", "simulated"}
 # What a card holds of the figures of a source; `edgeperc eval` prints the rest, which is four times as long.
 OBJECT_FIGURES = ("n_frames", "n_drives", "kitti")
@@ -66,8 +81,7 @@ def make(
             layouts = None
         scans = out / ("scans" if without_kitti else "scans-with-layouts")
         simulate(scans, N_SIMULATED, layouts_root=layouts, n_workers=run.n_workers)
-        if recipe.task == "objects" or stage.is_open:
-            scans = _more_sensors(out, scans, layouts, run.n_workers)
+        scans = _with_more(out, scans, layouts, stage.also, run.n_workers)
         data = replace(data, simulated=scans, kitti=None if stage.is_open else data.kitti)
 
     def checkpoint_of(other: str | None) -> Path | None:
@@ -87,12 +101,18 @@ def make(
     return path
 
 
-def _more_sensors(out: Path, scans: Path, layouts: Path | None, n_workers: int) -> Path:
-    """A folder of the simulated scans and others of `OTHER_SENSORS`."""
-    every = out / f"{scans.name}-of-sensors"
+def _with_more(out: Path, scans: Path, layouts: Path | None, also: Sequence[str], n_workers: int) -> Path:
+    """A folder of the simulated scans and those of `MORE_SCANS`."""
+    if not also:
+        return scans
+    every = out / "-and-".join([scans.name, *also])
     every.mkdir(parents=True, exist_ok=True)
-    for k, sensor in enumerate(OTHER_SENSORS, start=1):
-        simulate(every, N_OF_OTHERS, first=10_000 * k, layouts_root=layouts, sensor=sensor, n_workers=n_workers)
+    for name in also:
+        first, sensors, options = MORE_SCANS[name]
+        for k, (sensor, n) in enumerate(sensors.items()):
+            simulate(
+                every, n, first=first + 1000 * k, layouts_root=layouts, sensor=sensor, n_workers=n_workers, **options
+            )
     for file in scans.glob("*.npz"):
         if not (every / file.name).exists():
             (every / file.name).symlink_to(file.resolve())

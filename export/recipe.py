@@ -292,12 +292,14 @@ class Stage:
     is_open : no scan and no layout of KITTI is read, so that anyone may use the weights.
     after : the model whose weights the run starts from.
     teacher : the model that the run is distilled from.
+    also : more simulated scans: of other sensors, in halls, at any height (`make.MORE_SCANS`).
     """
 
     recipe: Recipe
     is_open: bool = False
     after: str | None = None
     teacher: str | None = None
+    also: tuple[str, ...] = ()
 
 
 # From random weights, distilled from the first step; the focal loss is SqueezeSegV2's.
@@ -435,12 +437,16 @@ MODELS = {
         )
     ),
     "camseg": Stage(CAMSEG),
-    "objects": Stage(OBJECTS),
-    "pointseg-open": Stage(OPEN, is_open=True),
+    # The object network sees points, not beams: with scans of other sensors it learns how sparse an object may be.
+    # Without halls it took walls, beams and pipes for trucks.
+    "objects": Stage(OBJECTS, also=("sensors", "halls")),
+    "pointseg-open": Stage(OPEN, is_open=True, also=("sensors",)),
     "ssadnet-open": Stage(
-        replace(OPEN, network="ssadnet", height_above_ground=False, front=True, n_pasted=3.0), is_open=True
+        replace(OPEN, network="ssadnet", height_above_ground=False, front=True, n_pasted=3.0),
+        is_open=True,
+        also=("sensors",),
     ),
-    "objects-open": Stage(replace(OBJECTS, steps=4000, detector=False), is_open=True),
+    "objects-open": Stage(replace(OBJECTS, steps=4000, detector=False), is_open=True, also=("sensors",)),
     # Poles and walls are classes here, and are not pasted as what is none.
     "sceneseg": Stage(
         replace(
@@ -457,6 +463,7 @@ MODELS = {
         ),
         after="pointseg-open",
         is_open=True,
+        also=("sensors",),
     ),
 }
 """The training run of every model, by name; names that end in ``-start`` are intermediate results."""

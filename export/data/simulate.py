@@ -78,7 +78,7 @@ def _simulate(
     if mounting is not None:
         frame = ModelFrame(mounting)
         scan = replace(scan, points=frame.move(scan.points), boxes=frame.move_boxes(scan.boxes))
-    if sensor != TRAINING_SENSOR:
+    if sensor != TRAINING_SENSOR or any_height:
         scan = replace(scan, sensor=profile)
     scan.save(_path(out, seed))
 

@@ -24,6 +24,7 @@ SHARES = {BACKGROUND: 0.45, 1: 0.26, 2: 0.08, 3: 0.04, 4: 0.09, 5: 0.07, VEHICLE
 SIMULATED = "simulated"
 SOURCE_WEIGHTS: Mapping[str, float] = {SIMULATED: 0.02, "pandaset": 1.0, "pandaset-pasted": 0.5}
 """How often an object of a source counts, for one of KITTI; others: `OTHER_WEIGHT`."""
+SIMULATED_BACKGROUND = 0.3  # of walls, hedges and halls there are many kinds; real scans show those of few streets
 OTHER_WEIGHT = 0.1
 ALIKE = 0.5  # samples of one object count as this power of their number
 
@@ -112,7 +113,7 @@ def _weights(samples: ObjectSamples, names: Sequence[str]) -> NDArray[np.float64
     _, inverse, n_alike = np.unique(samples.objects, return_inverse=True, return_counts=True)
     is_object = samples.classes != BACKGROUND
     of_simulation = np.array([name == SIMULATED for name in names])[samples.sources]
-    weights = np.where(of_simulation & ~is_object, 0.3, weights)
+    weights = np.where(of_simulation & ~is_object, SIMULATED_BACKGROUND, weights)
     weights = np.where(is_object, weights * n_alike[inverse.ravel()] ** -ALIKE, weights)
     weights = np.where(is_object & (samples.origin == TRUE), TRUE_WEIGHT * weights, weights)
     weights = np.where(~is_object & (samples.origin == DETECTED), DETECTED_BACKGROUND * weights, weights)
