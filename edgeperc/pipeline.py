@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -29,11 +28,10 @@ from .ground.planes import FIRST_REACH_HEIGHTS, FIRST_REACH_M, GroundFit, fit_gr
 from .ground.scan import Scan
 from .inference.crop import Crop, sectors_of_turn, spread
 from .inference.decode import decode_boxes, decode_cells, decode_labels
-from .inference.detections import best_rows, decode_detections
-from .inference.pillars import Pillarizer
+from .inference.pillar_network import PillarNetwork
 from .inference.projection import RangeImageProjector, input_heights, make_projector
 from .inference.session import MAX_ROWS, Session
-from .objects.boxes import join_boxes, objects_from_points
+from .objects.boxes import join_boxes, objects_from_points, weigh
 from .objects.candidate_boxes import boxes_of_objects, decode_objects, merge_boxes
 from .objects.candidates import MIN_DETECTOR_SCORE, Candidates, CellBuffer, find_candidates
 from .objects.cluster import PERSONS, sort_points
@@ -42,9 +40,8 @@ from .objects.linkage import Strips
 from .objects.refine import label_points, remove_outliers
 from .preprocess.interpolation import Interpolator
 from .system.lanes import Lanes, Once, Stopwatch
-from .types.detector import PillarGeometry
-from .types.frame import ModelFrame, turned
-from .types.geometry import oriented_iou, rectangles, shared_area
+from .types.frame import turned
+from .types.geometry import rectangles
 from .types.mounting import MODEL_HEIGHT_M, Mounting
 from .types.perception import Box, GroundSurface, PointLabels, TopView
 from .types.points import Heights, Ids, Points, Rows
@@ -198,52 +195,6 @@ class ObjectNetwork:
         return tuple(boxes_of_objects(merged, self.card.classes, min_score))
 
 
-class PillarNetwork:
-    """A detector of others: boxes from the pillars of all points in its range (PointPillars, CenterPoint).
-
-    score_threshold : lowest score of a box.
-    full_turn : run a network that looks ahead four times, on the scan turned by a quarter each.
-    """
-
-    def __init__(self, session: Session, score_threshold: float, full_turn: bool) -> None:
-        view = session.card.view
-        assert isinstance(view, PillarGeometry)
-        self.session, self.card, self.view, self._score = session, session.card, view, score_threshold
-        self._pillarizer = Pillarizer(view, session.card.input, session.input)
-        # Beside the values, which are written in place; a graph may take them in another type.
-        self._beside = [*zip(session.inputs.values(), self._pillarizer.inputs, strict=True)][1:]
-        quarters = 4 if full_turn and not view.is_all_around else 1
-        height_m, yaws_deg = session.card.mount_height_m, [view.yaw_deg + 90.0 * k for k in range(quarters)]
-        self.frames = [ModelFrame(Mounting(height_m, 0.0, view.pitch_deg, math.remainder(y, 360.0))) for y in yaws_deg]
-        corners = np.array([(x, y) for x in view.x_range_m for y in view.y_range_m]) @ self.frames[0].R[:2, :2].T
-        (x_low, y_low), (x_high, y_high) = corners.min(axis=0).tolist(), corners.max(axis=0).tolist()
-        reach_m = min(x_high, -y_low, y_high)
-        if quarters > 1 and reach_m > 0.0:
-            x_low, y_low, x_high, y_high = -reach_m, -reach_m, reach_m, reach_m
-        self.field = TopViewGeometry(
-            (x_low, x_high), (y_low, y_high), cell_m=min(100.0, x_high - x_low, y_high - y_low)
-        )
-        """What it sees of the models' frame; of a full turn, the square that is seen as a whole."""
-
-    def find_boxes(self, points: Points) -> Sequence[Box]:
-        """Boxes in the frame of the models, best score first."""
-        boxes: list[Box] = []
-        for frame in self.frames:
-            n = self._pillarizer.fill(frame.move_back(points))
-            if n == 0:
-                continue
-            for taken, array in self._beside:
-                taken[:n] = array[:n]
-            boxes += frame.move_boxes(decode_detections(self.card, self.session.run(n), self._score))
-        if len(self.frames) == 1:
-            return boxes
-        assert self.card.head is not None
-        names, scores = np.array([box.label for box in boxes]), np.array([box.score for box in boxes])
-        across = self.card.head.across_classes
-        kept = best_rows(rectangles(boxes), scores, names, self.card.nms_iou, across_classes=across)
-        return [boxes[row] for row in kept.tolist()]
-
-
 class Pipeline:
     """Networks, and what makes one answer of theirs. The next scan overwrites their buffers.
 
@@ -390,26 +341,6 @@ class Pipeline:
         if self.top is not None:
             objects = weigh(objects, self.top.view, self.top.card.box_classes, self.options.cluster_score)
         return join_boxes(boxes, objects)
-
-
-def weigh(boxes: Sequence[Box], view: TopViewGeometry, classes: Sequence[str], min_score: float) -> list[Box]:
-    """Boxes around clusters that a network of the top view has not found, with the scores that both views give them.
-
-    The score is the mean of the cluster's and that of the network, which is 0 where it sees the object. The network's
-    has the weight of the share of the footprint in its view: out of the view, the cluster's score stands. Boxes below
-    ``min_score`` are dropped.
-    """
-    rows = [row for row, box in enumerate(boxes) if box.label in classes]
-    weighed = list(boxes)
-    if rows:
-        footprints = rectangles(boxes[row] for row in rows)
-        (near, far), (right, left) = view.x_range_m, view.y_range_m
-        field = np.array([(0.5 * (near + far), 0.5 * (right + left), far - near, left - right, 0.0)])
-        areas = footprints[:, 2] * footprints[:, 3]
-        seen = shared_area(oriented_iou(footprints, field), footprints, field)[:, 0] / areas
-        for row, share in zip(rows, seen.tolist(), strict=True):
-            weighed[row] = replace(boxes[row], score=boxes[row].score * (1.0 - 0.5 * share))
-    return [box for box in weighed if box.score >= min_score]
 
 
 def _absent() -> None:

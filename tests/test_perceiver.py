@@ -37,7 +37,8 @@ from edgeperc import (
 from edgeperc.ground import planes
 from edgeperc.inference import decode, projection, providers, session
 from edgeperc.objects import cluster, refine
-from edgeperc.pipeline import Pipeline, weigh
+from edgeperc.objects.boxes import weigh
+from edgeperc.pipeline import Pipeline
 from edgeperc.preprocess import condition, fitness
 from edgeperc.road import ahead
 from edgeperc.simulation.drawn import random_scene

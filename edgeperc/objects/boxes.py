@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from types import MappingProxyType
 
 import numpy as np
@@ -14,6 +15,7 @@ from ..system.kernels import njit
 from ..types.geometry import oriented_iou, rectangles, shared_area, suppress_overlaps
 from ..types.perception import Box
 from ..types.points import Cloud, Heights, Ids, Labeled, Labels, Mask, Points, read_only
+from ..types.views import TopViewGeometry
 from .cluster import MIN_PERSON_SHARE, PERSONS, Groups, find_clusters, group_points, labels_of_groups
 from .persons import PERSON, UNSEEN, fill_person_groups, fill_persons
 from .rectangles import fit_rectangle
@@ -336,6 +338,26 @@ def _persons(
         yaw = (yaw + math.pi / 2.0) % math.pi - math.pi / 2.0
         boxes.append(Box(name, score, (x, y, bottom + 0.5 * tall), (*sides, tall), yaw))
     return boxes
+
+
+def weigh(boxes: Sequence[Box], view: TopViewGeometry, classes: Sequence[str], min_score: float) -> list[Box]:
+    """Boxes around clusters that a network of the top view has not found, with the scores that both views give them.
+
+    The score is the mean of the cluster's and that of the network, which is 0 where it sees the object. The network's
+    has the weight of the share of the footprint in its view: out of the view, the cluster's score stands. Boxes below
+    ``min_score`` are dropped.
+    """
+    rows = [row for row, box in enumerate(boxes) if box.label in classes]
+    weighed = list(boxes)
+    if rows:
+        footprints = rectangles(boxes[row] for row in rows)
+        (near, far), (right, left) = view.x_range_m, view.y_range_m
+        field = np.array([(0.5 * (near + far), 0.5 * (right + left), far - near, left - right, 0.0)])
+        areas = footprints[:, 2] * footprints[:, 3]
+        seen = shared_area(oriented_iou(footprints, field), footprints, field)[:, 0] / areas
+        for row, share in zip(rows, seen.tolist(), strict=True):
+            weighed[row] = replace(boxes[row], score=boxes[row].score * (1.0 - 0.5 * share))
+    return [box for box in weighed if box.score >= min_score]
 
 
 def join_boxes(first: Sequence[Box], second: Sequence[Box]) -> tuple[Box, ...]:
