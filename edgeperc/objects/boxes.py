@@ -377,6 +377,13 @@ def join_boxes(first: Sequence[Box], second: Sequence[Box]) -> tuple[Box, ...]:
     return tuple(sorted((*first, *others), key=lambda box: -box.score))
 
 
+def not_among(first: Sequence[Box], second: Sequence[Box]) -> list[Box]:
+    """The boxes of ``second`` that are no object of ``first``."""
+    if not first or not second:
+        return [*second]
+    return [box for box, known in zip(second, _same_object(second, first).any(axis=1), strict=True) if not known]
+
+
 def _same_object(first: Sequence[Box], second: Sequence[Box]) -> NDArray[np.bool_]:
     """Whether boxes of two lists are the same object, (n, m) bool."""
     a, b = rectangles(first), rectangles(second)

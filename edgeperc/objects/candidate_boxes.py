@@ -51,6 +51,11 @@ def decode_objects(
     return boxes
 
 
+def footprints(boxes: NDArray[np.float64]) -> NDArray[np.float64]:
+    """x, y, length, width, yaw of boxes (m, 10), (m, 5)."""
+    return boxes.take([X, Y, LENGTH, WIDTH, YAW], axis=1)
+
+
 def merge_boxes(boxes: NDArray[np.float64], classes: Sequence[str]) -> NDArray[np.float64]:
     """Of boxes around one object, the one with the best score, averaged with those that overlap it by more than 0.5.
 
@@ -60,12 +65,26 @@ def merge_boxes(boxes: NDArray[np.float64], classes: Sequence[str]) -> NDArray[n
     """
     boxes = boxes[boxes[:, SCORE] >= LEAST_SCORE]
     boxes = boxes[np.argsort(-boxes[:, SCORE], kind="stable")]
-    flat = np.ascontiguousarray(boxes[:, [X, Y, LENGTH, WIDTH, YAW]])
+    flat = footprints(boxes)
     limits = np.array([MAX_OVERLAP.get(name, MAX_OVERLAP_OF_OTHERS) for name in classes])[boxes[:, LABEL].astype(int)]
     kept = suppress_overlaps(flat, boxes[:, SCORE], limits, max_inside=MAX_INSIDE)
     merged = boxes[kept]
     fill_merged(boxes, oriented_iou(flat[kept], flat), merged)
     return merged
+
+
+def confirm_boxes(found: NDArray[np.float64], again: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Each box, (k, 10), and what a second look at its place shows, (k, 10) with a score of 0 for nothing, as one.
+
+    The score is the mean of the two; class and front are those of the better one, with which the other is averaged as
+    in `merge_boxes`.
+    """
+    confirmed = np.where((again[:, SCORE] > found[:, SCORE])[:, None], again, found)
+    looks = np.concatenate([found, again])
+    overlap = oriented_iou(footprints(confirmed), footprints(looks))
+    fill_merged(looks, np.where(np.tile(np.eye(len(found), dtype=np.bool_), 2), overlap, 0.0), confirmed)
+    confirmed[:, SCORE] = 0.5 * (found[:, SCORE] + again[:, SCORE])
+    return confirmed
 
 
 def boxes_of_objects(boxes: NDArray[np.float64], classes: Sequence[str], min_score: float) -> list[Box]:

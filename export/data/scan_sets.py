@@ -149,7 +149,7 @@ def seen_by_network(
     if scan.sensor is None or isinstance(projector, TopViewProjector):
         return scan, projected
     interpolator = _interpolator(projector.view, scan.sensor)
-    if not interpolator.needed:
+    if not interpolator.needed or not len(points):
         return scan, projected
     dense, filled = interpolator.fill(points, projected.index)
     image = np.empty(projector.shape, np.float32)
