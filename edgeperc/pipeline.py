@@ -53,8 +53,8 @@ from .types.views import ObjectGeometry, RangeImageGeometry, TopViewGeometry
 # 304 from 0.5 to 0.7.
 LESS_SURE = 0.2
 
-# Where another network shows a vehicle, this one must see one with such a score. All round on PandaSet, Lyft, Argoverse 2
-# and DDAD, 8 of 25 such boxes with less are at a vehicle, and 26 of 33 others.
+# Where another network shows a vehicle, that of objects must see one with such a score. All round on PandaSet, Lyft,
+# Argoverse 2 and DDAD, 8 of 25 boxes with less are at a vehicle, and 26 of 33 others.
 SEEN = 0.1
 
 BoxesFrom = Literal["both", "network", "clusters"]
@@ -213,7 +213,7 @@ class ObjectNetwork:
         looks = self._look_at(scan, candidates[0]._replace(rectangles=rectangles(shown)))
         looks[:, SCORE] = np.where(looks[:, SCORE] < SEEN, 0.0, 0.5 * looks[:, SCORE] + [0.5 * b.score for b in shown])
         seen = boxes_of_objects(merge_boxes(looks, self.card.classes), self.card.classes, min_score)
-        return join_boxes(found, [*people, *seen])
+        return join_boxes(found, [*people, *(box for box in seen if box.label not in PERSONS)])
 
     def _look_at(self, scan: Scan, candidates: Candidates) -> NDArray[np.float64]:
         """What the network finds at places, (n, 10), with a score of 0 where there are too few points."""

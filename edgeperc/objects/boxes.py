@@ -379,9 +379,8 @@ def join_boxes(first: Sequence[Box], second: Sequence[Box]) -> tuple[Box, ...]:
 
 def not_among(first: Sequence[Box], second: Sequence[Box]) -> list[Box]:
     """The boxes of ``second`` that are no object of ``first``."""
-    if not first or not second:
-        return [*second]
-    return [box for box, known in zip(second, _same_object(second, first).any(axis=1), strict=True) if not known]
+    known = {*np.flatnonzero(_same_object(second, first).any(axis=1)).tolist()} if first and second else set()
+    return [box for row, box in enumerate(second) if row not in known]
 
 
 def _same_object(first: Sequence[Box], second: Sequence[Box]) -> NDArray[np.bool_]:
