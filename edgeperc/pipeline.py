@@ -198,8 +198,8 @@ class ObjectNetwork:
         candidates: tuple[Candidates, Crops],
         objects: Sequence[Box],
         others: Sequence[Box],
-        by_labels: bool,
-        min_score: float,
+        are_labeled: bool,
+        options: Options,
     ) -> tuple[Box, ...]:
         """Boxes of this network, vehicles that others show and it sees when it looks there, and people.
 
@@ -207,12 +207,13 @@ class ObjectNetwork:
         labels find more than this network (AP25 57 and 52), and there are too few on the folds to decide. The score of
         a vehicle is the mean of the two.
         """
+        by_labels = are_labeled and options.boxes_from != "network"
         found = [box for box in objects if not by_labels or box.label not in PERSONS]
         people = [box for box in others if box.label in PERSONS]
         shown = not_among(found, [box for box in others if box.label not in PERSONS])
         looks = self._look_at(scan, candidates[0]._replace(rectangles=rectangles(shown)))
         looks[:, SCORE] = np.where(looks[:, SCORE] < SEEN, 0.0, 0.5 * looks[:, SCORE] + [0.5 * b.score for b in shown])
-        seen = boxes_of_objects(merge_boxes(looks, self.card.classes), self.card.classes, min_score)
+        seen = boxes_of_objects(merge_boxes(looks, self.card.classes), self.card.classes, options.cluster_score)
         return join_boxes(found, [*people, *(box for box in seen if box.label not in PERSONS)])
 
     def _look_at(self, scan: Scan, candidates: Candidates) -> NDArray[np.float64]:
@@ -330,10 +331,8 @@ class Pipeline:
         if rules and self.objects is None:
             standing = value("agree", stand_boxes, joined, scan, agreed, rules, per_m)
         if self.objects is not None:
-            by_labels = bool(self.ranged) and options.boxes_from != "network"
-            standing = value(
-                "cluster", self.objects.complete, scan, candidates, objects, standing, by_labels, options.cluster_score
-            )
+            labeled = bool(self.ranged)
+            standing = value("cluster", self.objects.complete, scan, candidates, objects, standing, labeled, options)
         if detector is not None:
             standing = value("cluster", _detected, detections, standing, detector, options.cluster_score)
         standing = value("agree", without_impossible, standing, points, mounting) if "ceiling" in rules else standing
