@@ -332,7 +332,7 @@ class Pipeline:
             standing = value("agree", stand_boxes, joined, scan, agreed, rules, per_m)
         if self.objects is not None:
             labeled = bool(self.ranged)
-            standing = value("cluster", self.objects.complete, scan, candidates, objects, standing, labeled, options)
+            standing = value("infer", self.objects.complete, scan, candidates, objects, standing, labeled, options)
         if detector is not None:
             standing = value("cluster", _detected, detections, standing, detector, options.cluster_score)
         standing = value("agree", without_impossible, standing, points, mounting) if "ceiling" in rules else standing
