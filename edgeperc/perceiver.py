@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import threading
 import warnings
@@ -420,6 +421,7 @@ class Perceiver:
             cluster_score=MIN_SCORE if self.score_threshold is None else self.score_threshold,
             object_score=object_score,
             distance_per_m=sensor.link_per_m,
+            slope=math.tan(math.radians(min(sensor.fov_up_deg, 89.0))),
             full_turn=self.full_turn,
         )
         return Pipeline(top, ranged, options, self._lanes, objects, pillars)

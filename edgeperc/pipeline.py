@@ -21,7 +21,7 @@ from .agreement.rules import (
     stand_boxes,
     without_poles,
 )
-from .agreement.votes import VEHICLE
+from .agreement.votes import VEHICLE, Sight
 from .ground.ceiling import without_impossible
 from .ground.observed import Observer
 from .ground.planes import FIRST_REACH_HEIGHTS, FIRST_REACH_M, GroundFit, fit_ground
@@ -74,7 +74,7 @@ class Options:
     """How the parts become one answer (`edgeperc.Perceiver`).
 
     Boxes below ``network_score``, ``cluster_score`` and ``object_score`` are dropped. ``distance_per_m`` links the
-    points of an object (`edgeperc.objects.cluster.find_clusters`).
+    points of an object (`edgeperc.objects.cluster.find_clusters`); ``slope`` is that of the highest beam.
     """
 
     rules: frozenset[str]
@@ -83,6 +83,7 @@ class Options:
     cluster_score: float
     object_score: float
     distance_per_m: float
+    slope: float
     full_turn: bool
 
 
@@ -321,7 +322,9 @@ class Pipeline:
             clusters = value("cluster", find_voters, scan, labels, support, strips, distance_per_m=per_m, rules=rules)
             if self.objects is not None or detector is not None:  # boxes outvote clusters
                 support = value("cluster", _support, scan, labels, rules, boxes, objects, detections)
-            agreed = value("agree", agree_on_points, scan, labels, clusters, support, upright, view=cells, rules=rules)
+            sight = Sight(mounting.height_m or MODEL_HEIGHT_M, options.slope)
+            given = scan, labels, clusters, support, upright
+            agreed = value("agree", agree_on_points, *given, view=cells, sight=sight, rules=rules)
             trusted = joined = value("agree", agree_on_boxes, boxes, scan, agreed, rules)
         if self.ranged and options.boxes_from != "network":
             left = agreed if self.objects is None or not rules else value("cluster", _unboxed, agreed, support)

@@ -34,11 +34,13 @@ from ..types.points import Cloud, Heights, Ids, Labeled, Labels, Mask, Points
 from .votes import (
     CLUSTER,
     COMPLETING_SCORE,
+    EVERYTHING,
     MIN_VEHICLE_SHARE,
     PERSON,
     VEHICLE,
     Applied,
     Cells,
+    Sight,
     Tallies,
     apply_verdicts,
     fill_tallies,
@@ -152,6 +154,7 @@ def agree_on_points(
     upright: NDArray[np.uint8],
     *,
     view: TopView | None = None,
+    sight: Sight = EVERYTHING,
     rules: Collection[str] = RULES,
 ) -> PointLabels:
     """Correct the labels of points by clusters, ground and boxes.
@@ -170,6 +173,8 @@ def agree_on_points(
         From `without_poles`.
     view : TopView, optional
         Without it, or if it has no class of vehicles, the rule ``"cells"`` is skipped.
+    sight : Sight
+        How high the sensor sees, of which 0.7 is high enough for any cluster.
     rules : collection of str
         Of `RULES`; others are left out.
 
@@ -196,7 +201,7 @@ def agree_on_points(
     tallies = Tallies(np.empty(n, CLUSTER), np.empty((n, len(labels.classes) + 1), np.int32))
     votes = "cells" in rules and view is not None and not VEHICLES.isdisjoint(view.classes)
     fill_tallies(scan.cloud, in_view, agreed, clusters, cells_of(view if votes else None), tallies)
-    verdicts = _verdicts(labels.classes, tallies, rules)
+    verdicts = _verdicts(labels.classes, tallies, sight, rules)
     before = agreed.copy()
     apply_verdicts(in_view, clusters, verdicts, roles, support.scores, support.names, agreed)
     if "person" in rules:
@@ -321,7 +326,7 @@ def find_support(scan: Scan, labels: PointLabels, boxes: Sequence[Box], rules: C
     return support
 
 
-def _verdicts(classes: Sequence[str], tallies: Tallies, rules: Collection[str]) -> NDArray[np.uint8]:
+def _verdicts(classes: Sequence[str], tallies: Tallies, sight: Sight, rules: Collection[str]) -> NDArray[np.uint8]:
     """What becomes of each label in each cluster, (k, classes)."""
     clusters = tallies.clusters
     refused = clusters["n_in_both"] >= MIN_IN_TOP_VIEW * clusters["n_points"]
@@ -329,7 +334,9 @@ def _verdicts(classes: Sequence[str], tallies: Tallies, rules: Collection[str]) 
     parts = [(classes.index(p), classes.index(w)) for p, w in PART_OF.items() if p in classes and w in classes]
     verdicts = np.empty((len(clusters), len(classes)), np.uint8)
     applied = Applied("share" in rules, "height" in rules, "fill" in rules)
-    fill_verdicts(tallies, refused, roles_of(classes), np.array(parts, np.int64).reshape(-1, 2), applied, verdicts)
+    fill_verdicts(
+        tallies, refused, roles_of(classes), np.array(parts, np.int64).reshape(-1, 2), applied, sight, verdicts
+    )
     return verdicts
 
 

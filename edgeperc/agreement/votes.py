@@ -28,6 +28,8 @@ MIN_VEHICLE_TOP_M, MIN_PERSON_TOP_M = 0.5, 1.0
 # Nearer vehicles show enough of themselves to be higher. With 0.5 m for all, 4,140 more points of tables, kerbs and
 # hedges on the folds are called car, and 298 fewer points of cars are missed. Some sports cars are lower than 1.2 m.
 NEAR_M, MIN_NEAR_VEHICLE_TOP_M = 30.0, 1.0
+# A low sensor that hardly looks up sees the wheels of what is near: then this share of what it sees is high enough.
+MIN_VISIBLE, FAR_M = 0.7, 1000.0
 # What ends nearer to the sensor and is not a person is a part of the own vehicle, such as a mirror or an open door:
 # other vehicles are longer. Open doors in two KITTI scans reach to 2.5 m. What is both longer and higher than a door is
 # the flank or the rear of a truck.
@@ -92,6 +94,16 @@ class Cells(NamedTuple):
     labels: Labels
     is_vehicle: NDArray[np.bool_]
     grid: Grid
+
+
+class Sight(NamedTuple):
+    """How high a sensor sees: its height above the ground [m], and the slope of its highest beam."""
+
+    eye_m: float
+    slope: float
+
+
+EVERYTHING = Sight(math.inf, 0.0)
 
 
 class Applied(NamedTuple):
@@ -179,6 +191,7 @@ def fill_verdicts(
     roles: NDArray[np.uint8],
     parts: NDArray[np.int64],
     applied: Applied,
+    sight: Sight,
     verdicts: NDArray[np.uint8],
 ) -> None:
     """Decide what becomes of each label in each cluster.
@@ -208,12 +221,13 @@ def fill_verdicts(
         no_vehicle |= applied.share and vehicle_share < (MIN_LARGE_SHARE if is_large else MIN_VEHICLE_SHARE)
         no_person = applied.share and person_share < MIN_PERSON_SHARE
         if applied.height:
-            is_near = math.hypot(max(low_x, -high_x, 0.0), max(low_y, -high_y, 0.0)) < NEAR_M
+            away = math.hypot(max(low_x, -high_x, 0.0), max(low_y, -high_y, 0.0))
             reach = math.hypot(max(abs(low_x), abs(high_x)), max(abs(low_y), abs(high_y)))
-            no_vehicle |= top < (MIN_NEAR_VEHICLE_TOP_M if is_near else MIN_VEHICLE_TOP_M)
+            visible = MIN_VISIBLE * (sight.eye_m + sight.slope * min(away, FAR_M))
+            no_vehicle |= top < min(MIN_NEAR_VEHICLE_TOP_M if away < NEAR_M else MIN_VEHICLE_TOP_M, visible)
             is_door = length < DOOR_M or top < DOOR_TOP_M
             no_vehicle |= reach < OWN_REACH_M and is_door and person_share < MIN_PERSON_SHARE
-            no_person |= top < MIN_PERSON_TOP_M
+            no_person |= top < min(MIN_PERSON_TOP_M, visible)
         for c in range(n_classes):
             is_lost = (roles[c] == VEHICLE and no_vehicle) or (roles[c] == PERSON and no_person)
             verdicts[k, c] = 0 if is_lost else c

@@ -38,6 +38,7 @@ from edgeperc.agreement.votes import (
     MIN_VEHICLE_SHARE,
     Applied,
     Cells,
+    Sight,
     Tallies,
     apply_verdicts,
     fill_tallies,
@@ -211,8 +212,10 @@ def test_what_becomes_of_clusters_matches_the_twin(
     clusters = np.zeros(n, CLUSTER)
     for name, column in zip(BOUNDS, bounds.T, strict=True):
         clusters[name] = column
-    fill_verdicts(Tallies(clusters, counts), refused, ROLES, parts, Applied(*rules), found)
-    np.testing.assert_array_equal(found, twins.rules.verdict_table(counts, bounds, refused, ROLES, parts, *rules))
+    sight = Sight(*rng.choice([(0.3, 0.035), (0.5, -0.1), (1.73, 0.2), (math.inf, 0.0)]).tolist())
+    fill_verdicts(Tallies(clusters, counts), refused, ROLES, parts, Applied(*rules), sight, found)
+    right = twins.rules.verdict_table(counts, bounds, refused, ROLES, parts, *rules, *sight)
+    np.testing.assert_array_equal(found, right)
 
 
 def crowded(seed: int) -> tuple[NDArray[np.float32], PointLabels, Ground, list[Box]]:

@@ -166,6 +166,8 @@ def verdict_table(
     by_share: bool,
     by_height: bool,
     is_filled: Any,
+    eye_m: float,
+    slope: float,
 ) -> np.ndarray:
     """Twin of `edgeperc.agreement.votes.fill_verdicts`: all clusters at once."""
     vehicles, persons = np.flatnonzero(roles == 1), np.flatnonzero(roles == 2)
@@ -174,12 +176,13 @@ def verdict_table(
     length, top = np.hypot(*(bounds[:, 2:4].astype(np.float64) - bounds[:, :2]).T), bounds[:, 4]
     large = (length > 10.0) | (top > 4.0)
     low, high = bounds[:, :2].astype(np.float64), bounds[:, 2:4].astype(np.float64)
-    is_near = np.hypot(*np.maximum(np.maximum(low, -high), 0.0).T) < 30.0  # nearest place of the bounds
+    away = np.hypot(*np.maximum(np.maximum(low, -high), 0.0).T)  # of the nearest place of the bounds
+    visible = 0.7 * (eye_m + slope * np.minimum(away, 1000.0))
     is_own = (np.hypot(*np.maximum(np.abs(low), np.abs(high)).T) < 2.6) & (person_share < 0.1)
     is_own &= (length < 2.0) | (top < 1.7)
-    is_low = top < np.where(is_near, 1.0, 0.5)
+    is_low = top < np.minimum(np.where(away < 30.0, 1.0, 0.5), visible)
     no_vehicle = refused | by_share & (vehicle_share < np.where(large, 0.75, 0.6)) | by_height & (is_low | is_own)
-    no_person = by_share & (person_share < 0.1) | by_height & (top < 1.0)
+    no_person = by_share & (person_share < 0.1) | by_height & (top < np.minimum(1.0, visible))
     table = np.tile(np.arange(len(roles), dtype=np.uint8), (len(counts), 1))
     table[np.ix_(no_vehicle, vehicles)] = 0
     table[np.ix_(no_person, persons)] = 0
