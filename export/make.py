@@ -21,22 +21,11 @@ from .release.to_onnx import export, write_card
 from .training.train import Data, Run, train
 
 N_SIMULATED = 2400
-HEIGHTS_OF = {
-    "hdl-64e": 140,
-    "vlp-16": 90,
-    "os1-64": 90,
-    "vlp-32c": 60,
-    "pandar64": 40,
-    "os0-32": 40,
-    "mid-360": 60,
-    "hap": 16,
-}
 MORE_SCANS: Mapping[str, tuple[int, Mapping[str, int], dict[str, bool]]] = {
     "sensors": (10_000, dict.fromkeys(("pandar64", "vlp-32c", "vlp-16"), 200), {}),
     "halls": (600_000, dict.fromkeys(("hdl-64e", "pandar64", "vlp-16", "os1-64"), 90), {"indoors": True}),
-    "heights": (800_000, HEIGHTS_OF, {"any_height": True}),
 }
-"""Simulated scans beside those of the training sensor: the first seed, how many of each sensor, and of which kind."""
+"""Simulated scans beside those of the training sensor: the first seed, how many of each sensor, and which."""
 SOURCES = {"real", "semantickitti", "simulated"}
 # What a card holds of the figures of a source; `edgeperc eval` prints the rest, which is four times as long.
 OBJECT_FIGURES = ("n_frames", "n_drives", "kitti")

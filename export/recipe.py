@@ -292,7 +292,7 @@ class Stage:
     is_open : no scan and no layout of KITTI is read, so that anyone may use the weights.
     after : the model whose weights the run starts from.
     teacher : the model that the run is distilled from.
-    also : more simulated scans: of other sensors, in halls, at any height (`make.MORE_SCANS`).
+    also : more simulated scans: of other sensors, in halls (`make.MORE_SCANS`).
     """
 
     recipe: Recipe
@@ -379,7 +379,7 @@ CAMSEG = Recipe(
 
 OBJECTS = Recipe(
     "objects",
-    steps=40_000,
+    steps=30_000,
     batch=128,
     learning_rate=2e-3,
     weight_decay=0.02,

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from edgeperc import Box, PointLabels, TopView
 from edgeperc.agreement.cells import agree_on_cells, mark_cells
 from edgeperc.agreement.rules import RULES, agree_on_points, find_support, find_voters, without_poles
+from edgeperc.agreement.votes import EVERYTHING, Sight
 from edgeperc.ground.planes import Ground
 from edgeperc.ground.scan import Scan
 
@@ -33,11 +34,12 @@ def agreed_points(
     boxes: Sequence[Box] = (),
     *,
     view: TopView | None = None,
+    sight: Sight = EVERYTHING,
     rules: Collection[str] = RULES,
 ) -> PointLabels:
     scan = Scan.of(points, ground, labels)
     support, upright = find_support(scan, labels, boxes, rules), without_poles(scan, labels, rules)
-    return agree_on_points(scan, labels, clusters, support, upright, view=view, rules=rules)
+    return agree_on_points(scan, labels, clusters, support, upright, view=view, sight=sight, rules=rules)
 
 
 def agreed_cells(

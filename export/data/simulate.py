@@ -17,18 +17,13 @@ from edgeperc.readers.files import read_points
 from edgeperc.readers.images import read_image
 from edgeperc.simulation.camera import forward_camera, render
 from edgeperc.simulation.samples import simulated_scan
-from edgeperc.types.frame import ModelFrame
-from edgeperc.types.mounting import Mounting
 from edgeperc.types.perception import Box
 from edgeperc.types.sensor import get_sensor
 
-from .beams import ACCUMULATED_S
 from .processes import mapped
 from .scans import LabeledScan
 
 TRAINING_SENSOR = "hdl-64e"
-# Of sensors at any height [m]: robots, low vehicles, cars, tall vehicles; and how often each.
-HEIGHTS_M, HEIGHT_SHARES = ((0.3, 0.8), (0.8, 1.6), (1.73, 1.73), (1.9, 4.0)), (0.35, 0.2, 0.25, 0.2)
 
 
 def simulate(
@@ -39,7 +34,6 @@ def simulate(
     layouts_root: Path | None = None,
     sensor: str = "hdl-64e",
     indoors: bool = False,
-    any_height: bool = False,
     n_workers: int = 0,
 ) -> None:
     """Write ``n`` labeled scans into ``out``. Existing files are kept, so a stopped run resumes.
@@ -48,13 +42,12 @@ def simulate(
     layouts_root : folder of KITTI's labels; every other scene gets the boxes of one of its scans.
     sensor : name of the sensor to simulate.
     indoors : in halls, without layouts.
-    any_height : at the heights of robots and of vehicles of all kinds; points and boxes are in the models' frame.
     n_workers : number of processes that simulate; 0: this one. The scans are the same.
     """
     out.mkdir(parents=True, exist_ok=True)
     real = list(layouts(layouts_root)) if layouts_root else []
     missing = [seed for seed in range(first, first + n) if not _path(out, seed).exists()]
-    write = partial(_simulate, out=out, layouts=real, sensor=sensor, indoors=indoors, any_height=any_height)
+    write = partial(_simulate, out=out, layouts=real, sensor=sensor, indoors=indoors)
     with mapped(write, missing, n_workers) as done:
         for _ in tqdm(done, desc="simulating", unit="scan", total=len(missing)):
             pass
@@ -64,22 +57,12 @@ def _path(out: Path, seed: int) -> Path:
     return out / f"{seed:06d}.npz"
 
 
-def _simulate(
-    seed: int, *, out: Path, layouts: Sequence[Sequence[Box]], sensor: str, indoors: bool, any_height: bool
-) -> None:
+def _simulate(seed: int, *, out: Path, layouts: Sequence[Sequence[Box]], sensor: str, indoors: bool) -> None:
     # 4,973 is prime: neighboring seeds take layouts of different drives.
     boxes = layouts[seed * 4973 % len(layouts)] if layouts and seed % 2 and not indoors else None
-    rng, profile, mounting = np.random.default_rng((seed, 2)), get_sensor(sensor), None
-    if profile.pattern is not None:
-        profile = profile.accumulated(float(rng.uniform(*ACCUMULATED_S)))
-    if any_height:
-        mounting = Mounting(float(rng.uniform(*HEIGHTS_M[rng.choice(len(HEIGHTS_M), p=HEIGHT_SHARES)])))
-    scan = LabeledScan.from_simulation(simulated_scan(seed, profile, boxes, mounting=mounting, indoors=indoors))
-    if mounting is not None:
-        frame = ModelFrame(mounting)
-        scan = replace(scan, points=frame.move(scan.points), boxes=frame.move_boxes(scan.boxes))
-    if sensor != TRAINING_SENSOR or any_height:
-        scan = replace(scan, sensor=profile)
+    scan = LabeledScan.from_simulation(simulated_scan(seed, sensor, boxes, indoors=indoors))
+    if sensor != TRAINING_SENSOR:
+        scan = replace(scan, sensor=get_sensor(sensor))
     scan.save(_path(out, seed))
 
 

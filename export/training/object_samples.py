@@ -47,8 +47,6 @@ STORED_MARGIN_M = 1.5
 MAX_NEGATIVES = {"real": 120, "simulated": 48}  # groups without an object, of each scan
 PSEUDO_BOXES = 0.3  # share of the groups that also become a box of a vehicle's or a person's size
 PSEUDO_ODDS = {"car": 0.6, "van": 0.15, "truck": 0.05, "pedestrian": 0.1, "cyclist": 0.1}
-N_WALL_BOXES, WALL_LENGTHS_M, WALL_WIDTHS_M = 12, (4.5, 17.0), (1.8, 3.0)  # of each scan; sizes of trucks
-WALL_HEIGHTS_M, WALL_REACH_M, FEWEST_OF_WALL = (0.4, 3.5), 3.0, 8
 MIN_RETURNS = 3  # of an object that is a sample
 PART = 100  # scans
 
@@ -155,7 +153,6 @@ def samples_of(
     known = np.array([n >= MIN_RETURNS and box.label in NAMES for box, n in truths], np.bool_)
     n_groups = len(found.rectangles) - len(detected)
     pseudo = _pseudo_boxes(found.rectangles[rng.permutation(n_groups)[: int(PSEUDO_BOXES * n_groups)]], rng)
-    pseudo = np.concatenate([pseudo, _wall_boxes(scan, rng)])
     true = rectangles(box for box, use in zip(boxes, known, strict=True) if use and NAMES[box.label] != BACKGROUND)
     places = np.concatenate([found.rectangles, pseudo, true])
     origin = np.repeat(
@@ -209,27 +206,6 @@ def _pseudo_boxes(groups: NDArray[np.float64], rng: np.random.Generator) -> NDAr
         place[1] += sin * along + cos * across + rng.normal(0.0, 0.2)
         place[2:4] = length, width
     return places
-
-
-def _wall_boxes(scan: Scan, rng: np.random.Generator) -> NDArray[np.float64]:
-    """Rectangles of a truck's size along what stands at random points: what labels of a wall make of it."""
-    low, high = WALL_HEIGHTS_M
-    standing = np.flatnonzero(~scan.ground.mask & (scan.ground.height_m > low) & (scan.ground.height_m < high))
-    places = []
-    for row in rng.choice(standing, min(N_WALL_BOXES, len(standing)), replace=False):
-        middle = scan.points[row, :2].astype(np.float64)
-        around = scan.points[standing, :2] - middle
-        around = around[np.abs(around).max(axis=1) < WALL_REACH_M]
-        if len(around) < FEWEST_OF_WALL:
-            continue
-        (a, b), (_, c) = np.cov(around.T)
-        yaw = 0.5 * math.atan2(2.0 * b, a - c) + float(rng.normal(0.0, 0.05))  # of the longest extent
-        length, width = float(rng.uniform(*WALL_LENGTHS_M)), float(rng.uniform(*WALL_WIDTHS_M))
-        side = math.copysign(1.0, math.cos(yaw) * middle[1] - math.sin(yaw) * middle[0])  # away from the sensor
-        along, across = float(rng.uniform(-0.5, 0.5)) * length, side * width * float(rng.uniform(0.0, 0.5))
-        x, y = middle + np.array([[math.cos(yaw), -math.sin(yaw)], [math.sin(yaw), math.cos(yaw)]]) @ [along, across]
-        places.append((x, y, length, width, yaw))
-    return np.array(places).reshape(-1, 5)
 
 
 def _assigned(

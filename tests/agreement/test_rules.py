@@ -406,7 +406,11 @@ def block(
 
 
 def agreed_scene(
-    *parts: NDArray[np.float64], boxes: tuple[Box, ...] = (), view: TopView | None = None, rules: frozenset[str] = RULES
+    *parts: NDArray[np.float64],
+    boxes: tuple[Box, ...] = (),
+    view: TopView | None = None,
+    sight: Sight = EVERYTHING,
+    rules: frozenset[str] = RULES,
 ) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
     """Rows x, y, height, label of parts on a floor, and their labels after the agreement."""
     x, y = (v.ravel() for v in np.meshgrid(np.arange(0.0, 30.0, 0.35), np.arange(-15.0, 15.0, 0.35)))
@@ -415,7 +419,7 @@ def agreed_scene(
     labels = PointLabels(rows[:, 3].astype(np.uint8), np.ones(len(rows), np.bool_), CLASSES)
     ground = find_ground(points)
     clusters = voters_of(points, labels, ground, boxes, rules)
-    return rows, agreed_points(points, labels, ground, clusters, boxes, view=view, rules=rules).labels
+    return rows, agreed_points(points, labels, ground, clusters, boxes, view=view, sight=sight, rules=rules).labels
 
 
 CAR = (4.0, 1.7, 1.5)
@@ -556,6 +560,15 @@ def test_near_table_is_no_car() -> None:
     is_near = (rows[:, 2] > 0.0) & (rows[:, 0] < 20.0)
     assert not labels[is_near].any()
     assert (labels[(rows[:, 2] > 0.0) & ~is_near] == 1).all()
+
+
+@pytest.mark.parametrize(("sight", "n_kept"), [(Sight(0.3, 0.035), 2), (Sight(1.73, 0.035), 0), (EVERYTHING, 0)])
+def test_a_low_sensor_sees_the_lower_half_of_a_car_and_the_legs_of_a_person(sight: Sight, n_kept: int) -> None:
+    rows, labels = agreed_scene(
+        block(8.0, 3.0, (3.9, 1.7, 0.55), 1), block(8.0, -4.0, (0.5, 0.4, 0.55), 2, 0.1), sight=sight
+    )
+    kept = {int(label) for label in labels[rows[:, 2] > 0.0]} - {0}
+    assert len(kept) == n_kept
 
 
 def test_doors_of_the_own_vehicle_are_no_cars_and_a_person_beside_it_stays() -> None:
