@@ -19,24 +19,15 @@ from edgeperc.simulation.scene import SimulatedScan
 from .accuracy import agreement, agrees, correctness
 from .context import conditions, disturbances
 from .scenarios import Limits, throughput
-from .worker import Job, OnTick, Prediction, Scenario, WorkerError, measure, perceiver_arguments
+from .worker import Job, OnTick, Prediction, Scenario, WorkerError, measure, settings_of
 
 
-def new_setting(job: Job) -> dict[str, Any]:
-    """The record of one setting as asked for, with nothing measured yet."""
-    return {
-        "models": list(job.models),
-        "provider": job.provider,
-        "precision": job.precision,
-        "n_threads": job.n_threads,
-        "sensor": job.sensor,
-        "full_turn": job.full_turn,
-        "repeats": [],
-        "accuracy": None,
-        "offline": [],
-        "cold_start": [],
-        "loadgen": None,
-    }
+def new_setting(job: Job, document: dict[str, Any] | None = None) -> dict[str, Any]:
+    """The record of one setting as asked for, with nothing measured yet; it is added to a document."""
+    setting = settings_of(job) | {"repeats": [], "accuracy": None, "offline": [], "cold_start": [], "loadgen": None}
+    if document is not None:
+        document["settings"].append(setting)
+    return setting
 
 
 def repeat(
@@ -124,8 +115,7 @@ def cold_starts(job: Job, scan: Path, n: int) -> list[dict[str, Any]]:
         # An installed package has its byte code; to compile a checkout's sources at every start takes 0.2 s.
         environment.pop("PYTHONDONTWRITEBYTECODE", None)
         for k in range(n):
-            request: dict[str, Any] = perceiver_arguments(job)
-            request |= {"scan": str(scan), "spawned_s": time.perf_counter()}
+            request = settings_of(job) | {"scan": str(scan), "spawned_s": time.perf_counter(), "on_mismatch": "warn"}
             command = [sys.executable, "-m", "edgeperc_bench.start", json.dumps(request)]
             done = subprocess.run(command, env=environment, capture_output=True, text=True)
             if done.returncode:

@@ -82,8 +82,7 @@ def run_command(arguments: argparse.Namespace) -> int:
             for n in counts
         }
         job = job_of(arguments)
-        setting = new_setting(job)
-        document["settings"].append(setting)
+        setting = new_setting(job, document)
         repeat(setting, replace(job, scenarios=tuple(scenarios.values())), arguments.repeats, document, live)
         curves: dict[str, Curve] = {}
         for kind, unit, per in (("points", "1,000 points", 1000.0), ("cars", "car", 1.0)):
@@ -153,8 +152,7 @@ def _growth_with_images(
         models = tuple(str(resized(name, percent / 100.0, folder)) for name in job.models)
         scenario = Scenario(f"{percent} % of the pixels", (scan,), limits)
         own = replace(job, models=models, scenarios=(scenario,))
-        setting = new_setting(own)
-        document["settings"].append(setting)
+        setting = new_setting(own, document)
         repeat(setting, own, arguments.repeats, document, live)
         settings.append((percent, setting, scenario.name))
     return _add_table(
