@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -119,8 +120,8 @@ def finish(
     data, semantickitti, version : as for `make`.
     """
     stage, kitti, fold = MODELS[name], data.kitti, data.fold
-    task, sources = stage.recipe.task, CARD_FIGURES
-    fitness = None
+    task, fitness = stage.recipe.task, None
+    kept: Sequence[str] = CARD_FIGURES
     if task not in ("camera", "objects"):
         fitness = fitness_of(None if stage.is_open or stage.recipe.simulated_share == 1.0 else kitti)
     card = export(checkpoint, path, scans=parity_samples(task), fitness=fitness, name=name, version=version)
@@ -133,7 +134,7 @@ def finish(
         if kitti is None:
             return
         figures, _ = evaluate([kitti], [TOP_VIEW, path], Perceiving(rules=()), fold=fold)
-        sources = OBJECT_FIGURES
+        kept = OBJECT_FIGURES
         command = f"edgeperc eval KITTI --model {TOP_VIEW} --model {name}:fp32 --no-agreement"
         command += f" --fold {fold}" if fold is not None else ""
     else:
@@ -150,7 +151,7 @@ def finish(
         options = [f"--road-by {ROAD_TRUTH}"] * learned_road + [f"--fold {fold}"] * (fold is not None)
         command = " ".join(["edgeperc eval", *datasets, f"--model {name}", *options, "--no-agreement"])
     for source in SOURCES & figures.keys():
-        figures[source] = {name: of for name, of in figures[source].items() if name in sources}
+        figures[source] = {name: of for name, of in figures[source].items() if name in kept}
     figures |= {"command": command}
     path.with_suffix(".json").write_text(json.dumps(figures, indent=1, sort_keys=True) + "\n")
     write_card(onnx.load(path), replace(card, metrics=figures), path)

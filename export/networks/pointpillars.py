@@ -22,13 +22,11 @@ class PointPillars(nn.Module):
 
     In: (B, 64, 496, 432) float32, features of pillars; any height and width divisible by 8.
     Out: scores (B, 2, 248, 216), boxes (B, 14, 248, 216) and directions (B, 4, 248, 216), float32.
-
-    n_channels : features of a pillar.
     """
 
-    def __init__(self, *, n_channels: int = 64) -> None:
+    def __init__(self) -> None:
         super().__init__()
-        self.blocks, self.ups, c_in = nn.ModuleList(), nn.ModuleList(), n_channels
+        self.blocks, self.ups, c_in = nn.ModuleList(), nn.ModuleList(), 64
         for n_layers, c_out, up in BLOCKS:
             layers: list[nn.Module] = []
             for k in range(n_layers):

@@ -108,20 +108,13 @@ class PointSeg(nn.Module):
     Out: logits (B, 4, 64, 512) float32.
 
     n_channels, n_classes : channels of the input; classes of the output.
-    enlargement_width : channels of each branch of the enlargement layer.
     dropout : probability of dropping a channel before the last convolution, as in SqueezeSeg.
     deep_supervision : in training, also return early logits (B, n_classes, H, W/4), from the decoder at a quarter of
         the width.
     """
 
     def __init__(
-        self,
-        *,
-        n_channels: int = 5,
-        n_classes: int = 4,
-        enlargement_width: int = 80,
-        dropout: float = 0.25,
-        deep_supervision: bool = False,
+        self, *, n_channels: int = 5, n_classes: int = 4, dropout: float = 0.25, deep_supervision: bool = False
     ) -> None:
         super().__init__()
         self.fire1 = conv_bn_relu(n_channels, 64, 3, stride=(1, 2))
@@ -130,7 +123,7 @@ class PointSeg(nn.Module):
         self.fire4, self.fire5, self.sr2 = Fire(128, 256), Fire(256, 256), SqueezeReweight(256)
         self.fire6, self.fire7 = Fire(256, 384), Fire(384, 384)
         self.fire8, self.fire9, self.sr3 = Fire(384, 512), Fire(512, 512), SqueezeReweight(512)
-        self.enlarge = Enlargement(512, enlargement_width)
+        self.enlarge = Enlargement(512, 80)
         self.deconv1_enlarged = FireDeconv(128, 128)
         self.deconv1 = FireDeconv(512, 128)
         self.deconv2 = FireDeconv(256, 128)
