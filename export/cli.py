@@ -237,13 +237,7 @@ def _train(args: argparse.Namespace) -> int:
     scan_sets = [ScanFolder.parse(text) for text in args.scans]
     data = Data(args.kitti, args.simulated, args.camvid, scan_sets, fold=args.fold)
     run = Run(
-        args.start_from,
-        args.teacher,
-        args.threads,
-        args.workers,
-        args.compile,
-        args.checkpoint_every,
-        tensorboard=args.tensorboard,
+        args.start_from, args.teacher, args.threads, args.workers, args.compile, args.checkpoint_every, args.tensorboard
     )
     print_line(str(train(recipe, args.out, data, run)))
     return 0
@@ -375,6 +369,7 @@ def _quantize(args: argparse.Namespace) -> int:
     from .release.quantize import LabeledSets, calibration_images, calibration_scans, quantize
 
     of_objects = ModelCard.read(args.model).view.kind == "objects"
+    how = {"seven_bits": args.seven_bits, "n_threads": args.threads}
     if args.camvid is not None and not of_objects:
         calibration = calibration_images(args.camvid)
     else:
@@ -382,18 +377,11 @@ def _quantize(args: argparse.Namespace) -> int:
     if of_objects:
         from .release.object_int8 import quantize_objects
 
-        card = quantize_objects(args.model, args.out, calibration, seven_bits=args.seven_bits, n_threads=args.threads)
+        card = quantize_objects(args.model, args.out, calibration, **how)
         print_line(f"{args.out}: {card.name} {card.version}: {card.parity['speed']}")
         return 0
-    card = quantize(
-        args.model,
-        args.out,
-        calibration,
-        LabeledSets(args.kitti, args.semantickitti, args.camvid, args.evaluate_on),
-        exclude=args.exclude,
-        seven_bits=args.seven_bits,
-        n_threads=args.threads,
-    )
+    labeled = LabeledSets(args.kitti, args.semantickitti, args.camvid, args.evaluate_on)
+    card = quantize(args.model, args.out, calibration, labeled, exclude=args.exclude, **how)
     print_line(
         f"{args.out}: {card.name} {card.version}, kept in fp32: {', '.join(card.training['quantized']['left_alone'])}"
     )

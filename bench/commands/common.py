@@ -87,14 +87,9 @@ def prepare_input(arguments: argparse.Namespace, folder: Path, document: dict[st
 
 def job_of(arguments: argparse.Namespace) -> Job:
     """The job from ``--model``, ``--provider``, ``--precision``, ``--threads``, ``--sensor`` and ``--full-turn``."""
-    return Job(
-        tuple(arguments.model or DEFAULT),
-        provider=arguments.provider,
-        precision=arguments.precision,
-        n_threads=arguments.threads,
-        sensor=arguments.sensor,
-        full_turn=getattr(arguments, "full_turn", False),  # not every command has it
-    )
+    given = arguments.provider, arguments.precision, arguments.threads, arguments.sensor
+    full_turn = getattr(arguments, "full_turn", False)  # not every command has it
+    return Job(tuple(arguments.model or DEFAULT), *given, full_turn)
 
 
 def limits_of(arguments: argparse.Namespace) -> Limits:

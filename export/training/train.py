@@ -82,8 +82,8 @@ class Run:
     n_workers: int = 0  # processes that make samples, one thread each; 0: this one, between the steps
     compiled: bool = False  # by `torch.compile`: a minute and a C++ compiler; PointSeg then trains a third faster
     checkpoint_every: int = 100  # steps between checkpoints and points of the curve; an epoch with ``stop_after``
-    save_every_s: float = 0.0  # between checkpoints, at least, as large networks take seconds to write
     tensorboard: bool = False  # write the log for it, too
+    save_every_s: float = 0.0  # between checkpoints, at least, as large networks take seconds to write
 
 
 def train(recipe: Recipe, out: Path, data: Data, run: Run | None = None) -> Path:
