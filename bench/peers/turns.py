@@ -8,13 +8,13 @@ import os
 import signal
 import time
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace
 from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,6 +36,8 @@ from .numpy_pipeline import NumpyPipeline
 from .pillars import fill_pillars, random_weights
 from .tables import floor_table, latency_table, methods_table
 
+# From which libraries take their number of threads when a process starts.
+THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 PAUSE_S = 0.02  # threads of the previous contender spin for some milliseconds
 Calls = list[Callable[[], object]]
 
@@ -170,19 +172,6 @@ def serve(connection: Any, contender: Contender, files: Sequence[Path], sensor: 
 # The parent's side
 
 
-@contextmanager
-def _threads(n: int) -> Iterator[None]:
-    """Set the environment from which libraries take their number of threads when a process starts."""
-    names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-    before = {name: os.environ.get(name) for name in names}
-    os.environ.update(dict.fromkeys(names, str(n)))
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            os.environ.pop(name) if value is None else os.environ.update({name: value})
-
-
 def measure(
     contenders: Sequence[Contender],
     files: Sequence[Path],
@@ -206,7 +195,7 @@ def measure(
             here, there = spawn.Pipe()
             inputs = contender.inputs or tuple(files)
             process = spawn.Process(target=serve, args=(there, contender, inputs, sensor, n_threads))
-            with _threads(n_threads):
+            with patch.dict(os.environ, dict.fromkeys(THREADS, str(n_threads))):
                 process.start()
             there.close()
             running.append((contest, here, process))

@@ -261,7 +261,9 @@ def inner_tensors(
     augmented = copy.deepcopy(model)
     known = {each.name for each in (*model.graph.input, *model.graph.output)}
     augmented.graph.output.extend(onnx.helper.make_empty_tensor_value_info(name) for name in names if name not in known)
-    session = _session(augmented)
+    options = onnxruntime.SessionOptions()
+    options.log_severity_level = 3
+    session = onnxruntime.InferenceSession(augmented.SerializeToString(), options, providers=["CPUExecutionProvider"])
     inner = [name for name in names if name != card.input.name]
     for image in images:
         own = {card.input.name: image} if len(inner) < len(names) else {}
@@ -330,20 +332,12 @@ def _unround(graph: onnx.GraphProto, rounded: Collection[str]) -> None:
             node.input[:] = [origin.get(name, name) for name in node.input]
 
 
-def _session(model: onnx.ModelProto) -> onnxruntime.InferenceSession:
-    options = onnxruntime.SessionOptions()
-    options.log_severity_level = 3
-    return onnxruntime.InferenceSession(model.SerializeToString(), options, providers=["CPUExecutionProvider"])
-
-
 def _outputs(
     model: onnx.ModelProto, card: ModelCard, images: Sequence[NDArray[np.float32]]
 ) -> list[dict[str, NDArray[np.float32]]]:
     """Raw outputs by kind, without the batch axis."""
-    session = _session(model)
-    names, kinds = [o.name for o in card.outputs], [o.kind for o in card.outputs]
-    runs = (session.run(names, {card.input.name: image}) for image in images)
-    return [{kind: output[0] for kind, output in zip(kinds, run, strict=True)} for run in runs]
+    runs = inner_tensors(model, card, images, [o.name for o in card.outputs])
+    return [{o.kind: run[o.name][0] for o in card.outputs} for run in runs]
 
 
 def _noise(
