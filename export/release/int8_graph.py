@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -92,8 +92,8 @@ def repeat_pixels(model: onnx.ModelProto) -> None:
         if height % rows or width % cols or 0 in (batch, channels, rows, cols):
             continue
         name = resize.name
-        wide = constant(graph, f"{name}_wide", np.array([batch, rows, 1, width * channels], np.int64))
-        high = constant(graph, f"{name}_high", np.array([batch, height, width, channels], np.int64))
+        wide = _constant(graph, f"{name}_wide", [batch, rows, 1, width * channels])
+        high = _constant(graph, f"{name}_high", [batch, height, width, channels])
         steps: list[tuple[str, dict[str, Any], tuple[Any, ...]]] = [
             ("Transpose", {"perm": [0, 2, 3, 1]}, ()),
             ("Concat", {"axis": 3}, (width // cols,)),
@@ -114,9 +114,8 @@ def repeat_pixels(model: onnx.ModelProto) -> None:
     sort(graph)
 
 
-def constant(graph: onnx.GraphProto, name: str, value: NDArray[Any]) -> str:
-    """Add a constant to a graph; returns its name."""
-    graph.initializer.append(numpy_helper.from_array(value, name))
+def _constant(graph: onnx.GraphProto, name: str, values: Sequence[int]) -> str:
+    graph.initializer.append(numpy_helper.from_array(np.array(values, np.int64), name))
     return name
 
 

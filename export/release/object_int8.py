@@ -6,7 +6,6 @@ the largest values over points, and add, as fast in fp32.
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -14,15 +13,24 @@ from typing import Any
 import numpy as np
 import onnx
 from numpy.typing import NDArray
-from onnx import helper, numpy_helper
 
 from edgeperc.errors import PointsError
 from edgeperc.inference.session import Session
 from edgeperc.types.card import ModelCard
 
-from .int8_graph import constant, sort
+from .int8_graph import sort
 from .object_parity import candidate_inputs, objects_of
-from .quantize import Calibration, check_fp32, folded, inner_tensors, race, saturates, speed_of, write_int8
+from .quantize import (
+    Calibration,
+    check_fp32,
+    folded,
+    in_int8,
+    inner_tensors,
+    race,
+    saturates,
+    speed_of,
+    write_int8,
+)
 
 ROUNDED = ("close_point2.weight", "close_point3.weight", "close_point4.weight")
 MOST = 0.99995  # quantile of a tensor's values that the largest 8-bit number stands for
@@ -81,17 +89,13 @@ def rounded(
     model: onnx.ModelProto, card: ModelCard, batches: Sequence[NDArray[np.float32]], *, seven_bits: bool = False
 ) -> onnx.ModelProto:
     """A folded graph of `with_first_look` with the products of `ROUNDED` in int8, inputs by their range in batches."""
-    made = copy.deepcopy(model)
-    graph = made.graph
-    products = [node for node in graph.node if node.op_type == "Gemm" and node.input[1] in ROUNDED]
+    products = [node for node in model.graph.node if node.op_type == "Gemm" and node.input[1] in ROUNDED]
     if len(products) != len(ROUNDED):
         raise ValueError(f"the graph has {len(products)} of the {len(ROUNDED)} products; export the network again")
     ranges = _ranges(model, card, batches, [node.input[0] for node in products])
-    for node in products:
-        low, high = ranges[node.input[0]]
-        _round_weights(graph, node, (high - low) / 255.0, 63 if seven_bits else 127)
-        _round_input(graph, node, low, high)
-    sort(graph)
+    names, settings = [node.name for node in products], {"OpTypesToExcludeOutputQuantization": ["Gemm"]}
+    made = in_int8(model, names, ranges, ["Gemm"], seven_bits, settings)
+    sort(made.graph)
     return made
 
 
@@ -110,36 +114,3 @@ def _ranges(
         low, high = np.quantile(every, 1.0 - MOST), np.quantile(every, MOST)
         found[name] = (min(float(low), 0.0), max(float(high), 1e-6))
     return found
-
-
-def _round_input(graph: onnx.GraphProto, node: onnx.NodeProto, low: float, high: float) -> None:
-    """Quantize the input of a product, and dequantize it: engines compute what is between in int8."""
-    name, scale = node.input[0], np.float32((high - low) / 255.0)
-    steps = [
-        constant(graph, f"{name}_scale", np.array(scale)),
-        constant(graph, f"{name}_zero", np.array(np.clip(np.round(-low / scale), 0, 255), np.uint8)),
-    ]
-    node.input[0] = f"{name}_rounded"
-    graph.node.append(helper.make_node("QuantizeLinear", [name, *steps], [f"{name}_q"]))
-    graph.node.append(helper.make_node("DequantizeLinear", [f"{name}_q", *steps], [node.input[0]]))
-
-
-def _round_weights(graph: onnx.GraphProto, node: onnx.NodeProto, of_input: float, most: int) -> None:
-    """Weights (outputs, inputs) in int8 by output, and offsets in int32, in steps of both scales."""
-    values = {weight.name: numpy_helper.to_array(weight) for weight in graph.initializer}
-    weight, offset = (values[name].astype(np.float64) for name in node.input[1:3])
-    scale = (np.maximum(np.abs(weight).max(axis=1), 1e-9) / most).astype(np.float32)
-    of_sums = scale * np.float32(of_input)
-    numbers: list[tuple[NDArray[Any], NDArray[np.float32]]] = [
-        (np.round(weight / scale[:, None]).astype(np.int8), scale),
-        (np.round(offset / of_sums).astype(np.int32), of_sums),
-    ]
-    for k, (integers, steps) in enumerate(numbers, start=1):
-        name = node.input[k]
-        given = [
-            constant(graph, f"{name}_q", integers),
-            constant(graph, f"{name}_scale", steps),
-            constant(graph, f"{name}_zero", np.zeros(len(steps), integers.dtype)),
-        ]
-        node.input[k] = f"{name}_rounded"
-        graph.node.append(helper.make_node("DequantizeLinear", given, [node.input[k]], axis=0))

@@ -79,6 +79,8 @@ BIN_BITS = 13  # of a float32: sign, exponent and four bits of the mantissa
 N_RUNS = 40
 DRIVE = re.compile(r"\d{4}_\d\d_\d\d_drive_\d{4}")
 
+Ranges = Mapping[str, tuple[float, float]]
+"""Smallest and largest value of tensors, by name."""
 Race = Callable[[Path, Path, "int | None"], tuple[NDArray[np.float64], NDArray[np.float64]]]
 
 
@@ -178,7 +180,7 @@ class Calibrated:
 
     card: ModelCard
     model: onnx.ModelProto
-    ranges: TensorsData
+    ranges: Ranges
     images: Sequence[NDArray[np.float32]]
     means: Mapping[str, NDArray[np.float64]]
     probes: Sequence[NDArray[np.float32]]
@@ -225,22 +227,14 @@ class Calibrated:
         return rounded
 
     def _rounded(self, fp32: onnx.ModelProto, convolutions: Collection[str]) -> onnx.ModelProto:
-        names, model = _between(fp32.graph, convolutions), copy.deepcopy(fp32)
-        if not names:
-            return model
-        types = QuantType.QInt8, QuantType.QUInt8
-        quantizer = QDQQuantizer(model, True, self.seven_bits, *types, self.ranges, [*names], [], [*ROUNDED_OPS], {})
-        quantizer.quantize_model()
-        rounded: onnx.ModelProto = quantizer.model.model
-        _unround(rounded.graph, names)
-        return rounded
+        return in_int8(fp32, _between(fp32.graph, convolutions), self.ranges, ROUNDED_OPS, self.seven_bits)
 
     def noise(self, convolutions: Collection[str]) -> float:
         """`_noise` of the outputs if these convolutions are in int8."""
         return _noise(_outputs(self.rounded(convolutions), self.card, self.probes), self.outputs)
 
 
-def _ranges(model: onnx.ModelProto, card: ModelCard, images: Sequence[NDArray[np.float32]]) -> TensorsData:
+def _ranges(model: onnx.ModelProto, card: ModelCard, images: Sequence[NDArray[np.float32]]) -> Ranges:
     """The range of every tensor of a network, from a histogram of its values over all images."""
     names = [card.input.name, *(name for node in model.graph.node for name in node.output if name)]
     counts = {name: np.zeros(1 << BIN_BITS, np.int64) for name in names}
@@ -249,9 +243,28 @@ def _ranges(model: onnx.ModelProto, card: ModelCard, images: Sequence[NDArray[np
             if values.dtype == np.float32:
                 bins = np.ascontiguousarray(values).view(np.uint32).ravel() >> (32 - BIN_BITS)
                 counts[name] += np.bincount(bins, minlength=1 << BIN_BITS)
-    ranges = {name: range_of(count) for name, count in counts.items()}
-    data = {name: tuple(np.array(bound, np.float32) for bound in bounds) for name, bounds in ranges.items()}
-    return TensorsData(CalibrationMethod.MinMax, data)
+    return {name: range_of(count) for name, count in counts.items()}
+
+
+def in_int8(
+    fp32: onnx.ModelProto,
+    names: Collection[str],
+    ranges: Ranges,
+    kinds: Sequence[str],
+    seven_bits: bool,
+    settings: Mapping[str, Any] | None = None,
+) -> onnx.ModelProto:
+    """A graph with the operators of these names and kinds in int8; ``settings`` are onnxruntime's."""
+    if not names:
+        return copy.deepcopy(fp32)
+    bounds = {name: tuple(np.array(bound, np.float32) for bound in of) for name, of in ranges.items()}
+    given: Sequence[Any]
+    given = QuantType.QInt8, QuantType.QUInt8, TensorsData(CalibrationMethod.MinMax, bounds), [*names], [], [*kinds]
+    quantizer = QDQQuantizer(copy.deepcopy(fp32), True, seven_bits, *given, dict(settings or {}))
+    quantizer.quantize_model()
+    rounded: onnx.ModelProto = quantizer.model.model
+    _unround(rounded.graph, names)
+    return rounded
 
 
 def inner_tensors(
