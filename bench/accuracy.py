@@ -33,22 +33,15 @@ def agreement(reference: Sequence[Prediction], found: Sequence[Prediction]) -> d
     equal labels and the mean IoU, of boxes the matches at IoU 0.5 and F1. None for what the models do not predict.
     """
     result: dict[str, Any] = {"n_scans": len(reference), "points": None, "cells": None, "pixels": None, "boxes": None}
-    points, cells, pixels = [], [], []
-    for right, guess in zip(reference, found, strict=True):
-        if right.points is not None and guess.points is not None:
-            seen = right.points.in_view
-            points.append((right.points.classes, guess.points.labels[seen], right.points.labels[seen]))
-        if right.top_view is not None and guess.top_view is not None:
-            cells.append((right.top_view.classes, guess.top_view.labels, right.top_view.labels))
-        if right.image is not None and guess.image is not None:
-            pixels.append((right.image.classes, guess.image.labels, right.image.labels))
-    for name, pairs in (("points", points), ("cells", cells), ("pixels", pixels)):
-        if pairs:
-            confusion = Confusion(pairs[0][0])
-            for _, guess_labels, right_labels in pairs:
-                confusion.update(guess_labels, right_labels)
+    for name, part in (("points", "points"), ("cells", "top_view"), ("pixels", "image")):
+        pairs = [(getattr(right, part), getattr(guess, part)) for right, guess in zip(reference, found, strict=True)]
+        if pairs := [pair for pair in pairs if pair[0] is not None and pair[1] is not None]:
+            confusion = Confusion(pairs[0][0].classes)
+            for right, guess in pairs:
+                seen = right.in_view if name == "points" else ...
+                confusion.update(guess.labels[seen], right.labels[seen])
             result[name] = {"equal": _rounded(confusion.accuracy()), "mean_iou": _rounded(confusion.mean_iou())}
-    if cells:
+    if result["cells"] is not None:
         boxes = BoxEvaluator()
         for right, guess in zip(reference, found, strict=True):
             boxes.update(guess.boxes, right.boxes)

@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import csv
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -30,21 +31,18 @@ from edgeperc.types.sensor import SensorProfile, get_sensor
 Scan = NDArray[np.float32]
 Condition = Callable[[Scan, float, int], Scan]
 
+
+def _cloud(middle: tuple[float, float, float], radius_m: float, scan: Scan, per_m: float, seed: int) -> Scan:
+    return weather.cloud(scan, middle, radius_m, per_m, seed=seed)
+
+
 CONDITIONS: Mapping[str, tuple[Condition, tuple[float, ...], str]] = {
     "dirt over": (lambda scan, deg, seed: weather.dirty(scan, 60.0, 60.0 - deg, seed=seed), (15.0, 30.0, 60.0), "deg"),
     "rain": (lambda scan, rate, seed: weather.rain(scan, rate, seed=seed), (5.0, 25.0, 100.0), "mm/h"),
     "snow": (lambda scan, rate, seed: weather.snow(scan, rate, seed=seed), (0.5, 1.5, 2.5), "mm/h"),
     "fog, visibility": (lambda scan, far_m, seed: weather.fog(scan, far_m, seed=seed), (100.0, 50.0, 25.0), "m"),
-    "spray ahead": (
-        lambda scan, per_m, seed: weather.cloud(scan, (8.0, 0.0, -1.0), 2.5, per_m, seed=seed),
-        (0.1, 0.3, 1.0),
-        "/m",
-    ),
-    "exhaust behind": (
-        lambda scan, per_m, seed: weather.cloud(scan, (-4.0, -0.5, -1.2), 1.5, per_m, seed=seed),
-        (0.1, 0.3, 1.0),
-        "/m",
-    ),
+    "spray ahead": (partial(_cloud, (8.0, 0.0, -1.0), 2.5), (0.1, 0.3, 1.0), "/m"),
+    "exhaust behind": (partial(_cloud, (-4.0, -0.5, -1.2), 1.5), (0.1, 0.3, 1.0), "/m"),
 }
 _SAME_M = 2.0  # between the middles of boxes of one object
 
@@ -94,11 +92,11 @@ def print_warnings(name: str, scans: Sequence[Scan], sensor: SensorProfile) -> N
 def print_answers(name: str, scans: Sequence[Scan], sensor: SensorProfile) -> None:
     """A row for each condition: drivable area and boxes that are nowhere in clear air, with drops and without them."""
     perceive = Perceiver(sensor=sensor)
-    assert perceive.pipeline is not None
+    pipeline = perceive.pipeline
+    assert pipeline is not None
 
     def answer(scan: Scan) -> tuple[float, Sequence[Box]]:
-        assert perceive.pipeline is not None
-        parts = perceive.pipeline(read_only(scan), MODEL_MOUNTING, Stopwatch())
+        parts = pipeline(read_only(scan), MODEL_MOUNTING, Stopwatch())
         return 0.0 if parts.top_view is None else parts.top_view.drivable_area_m2, parts.boxes
 
     clear = [condition(scan, sensor)[0] for scan in scans]

@@ -68,19 +68,21 @@ def machine() -> dict[str, Any]:
     }
 
 
+def version_of(package: str) -> str | None:
+    """The version of an installed package."""
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return None
+
+
 def software() -> dict[str, Any]:
     """Versions and environment settings."""
-    versions: dict[str, str | None] = {}
-    for package in PACKAGES:
-        try:
-            versions[package] = importlib.metadata.version(package)
-        except importlib.metadata.PackageNotFoundError:
-            versions[package] = None
     return {
         "edgeperc": __version__,
         "python": platform.python_version(),
         "os": platform.platform(),
-        **versions,
+        **{package: version_of(package) for package in PACKAGES},
         "environment": {name: os.environ[name] for name in VARIABLES if name in os.environ},
         "niceness": os.nice(0) if hasattr(os, "nice") else None,
         "measured": datetime.datetime.now(datetime.timezone.utc).isoformat(timespec="seconds"),

@@ -18,25 +18,17 @@ from edgeperc.simulation.scene import SimulatedScan
 
 from .accuracy import agreement, agrees, correctness
 from .context import conditions, disturbances
+from .render import LiveTable
 from .scenarios import Limits, throughput
-from .worker import Job, OnTick, Prediction, Scenario, WorkerError, measure, perceiver_arguments
+from .worker import Job, OnTick, Prediction, Scenario, WorkerError, measure, settings_of
 
 
-def new_setting(job: Job) -> dict[str, Any]:
-    """The record of one setting as asked for, with nothing measured yet."""
-    return {
-        "models": list(job.models),
-        "provider": job.provider,
-        "precision": job.precision,
-        "n_threads": job.n_threads,
-        "sensor": job.sensor,
-        "full_turn": job.full_turn,
-        "repeats": [],
-        "accuracy": None,
-        "offline": [],
-        "cold_start": [],
-        "loadgen": None,
-    }
+def new_setting(job: Job, document: dict[str, Any] | None = None) -> dict[str, Any]:
+    """The record of one setting as asked for, with nothing measured yet; it is added to a document."""
+    setting = settings_of(job) | {"repeats": [], "accuracy": None, "offline": [], "cold_start": [], "loadgen": None}
+    if document is not None:
+        document["settings"].append(setting)
+    return setting
 
 
 def repeat(
@@ -88,29 +80,50 @@ def accuracy_of(right: Reference, found: Sequence[Prediction], truth: Sequence[S
     return accuracy | {"agrees": agrees(accuracy)}
 
 
-def offline(job: Job, files: Sequence[Path], n_processes: int, limits: Limits, on_tick: OnTick) -> dict[str, Any]:
-    """Measure the throughput of several processes, each back to back, by default with one thread each."""
-    name = f"offline x {n_processes}"
+def offline(
+    setting: dict[str, Any],
+    job: Job,
+    files: Sequence[Path],
+    n: int,
+    limits: Limits,
+    document: dict[str, Any],
+    live: LiveTable,
+) -> None:
+    """Measure the throughput of several processes into ``setting``, each back to back, by default with one thread each;
+    raises KeyboardInterrupt if it was interrupted.
+    """
+    live.note(f"offline, {n} processes")
+    name = f"offline x {n}"
     own = replace(job, n_threads=job.n_threads or 1, scenarios=(Scenario(name, tuple(files), limits),))
     before = conditions()
-    results = measure([own] * n_processes, on_tick)
+    results = measure([own] * n, live)
+    after = conditions()
     parts = [result["scenarios"][name] for result in results if name in result["scenarios"]]
     stamps = [([part["first_s"] + start for start in part["start_s"]], part["ms"]) for part in parts]
     scans_per_s, seconds = throughput(stamps)
-    n_scans = sum(part["n"] for part in parts)
-    return {
-        "processes": n_processes,
-        "n_threads": own.n_threads,
-        "scans_per_s": None if math.isnan(scans_per_s) else scans_per_s,
-        "seconds": seconds,
-        "n_scans": n_scans,
-        "cpu_s_per_scan": sum(part["cpu_s"] for part in parts) / n_scans if n_scans else None,
-        "rss_mb": sum(result["rss_mb"] for result in results),
-        "parts": parts,
-        "before": before,
-        "after": conditions(),
-        "interrupted": any(result["interrupted"] for result in results),
-    }
+    n_scans, cpu_s = sum(part["n"] for part in parts), sum(part["cpu_s"] for part in parts)
+    interrupted = any(result["interrupted"] for result in results)
+    setting["offline"].append(
+        {
+            "processes": n,
+            "n_threads": own.n_threads,
+            "scans_per_s": None if math.isnan(scans_per_s) else scans_per_s,
+            "seconds": seconds,
+            "n_scans": n_scans,
+            "cpu_s_per_scan": cpu_s / n_scans if n_scans else None,
+            "rss_mb": sum(result["rss_mb"] for result in results),
+            "parts": parts,
+            "before": before,
+            "after": after,
+            "interrupted": interrupted,
+        }
+    )
+    for disturbance in disturbances(document["machine"], before, after, cpu_s):
+        # The start-up of the measuring processes would count as work of other processes.
+        if not disturbance.startswith("other processes"):
+            document["disturbances"].append(f"{name}: {disturbance}")
+    if interrupted:
+        raise KeyboardInterrupt
 
 
 def cold_starts(job: Job, scan: Path, n: int) -> list[dict[str, Any]]:
@@ -124,8 +137,7 @@ def cold_starts(job: Job, scan: Path, n: int) -> list[dict[str, Any]]:
         # An installed package has its byte code; to compile a checkout's sources at every start takes 0.2 s.
         environment.pop("PYTHONDONTWRITEBYTECODE", None)
         for k in range(n):
-            request: dict[str, Any] = perceiver_arguments(job)
-            request |= {"scan": str(scan), "spawned_s": time.perf_counter()}
+            request = settings_of(job) | {"scan": str(scan), "spawned_s": time.perf_counter(), "on_mismatch": "warn"}
             command = [sys.executable, "-m", "edgeperc_bench.start", json.dumps(request)]
             done = subprocess.run(command, env=environment, capture_output=True, text=True)
             if done.returncode:

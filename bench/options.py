@@ -30,68 +30,9 @@ def add_command(
     parser = subparsers.add_parser(name, help=help, description=description, allow_abbrev=False)
     parser.set_defaults(run=command)
     add = options(parser)
-    for each in shared:
-        SHARED[each](add)
+    for shown, text, settings in (option for group in shared for option in SHARED[group]):
+        add(shown, text, **settings)
     return add
-
-
-def _add_model(add: Options) -> None:
-    """``--model`` and ``--sensor``."""
-    add(
-        "--model NAME",
-        "a shipped model (ssadnet), one variant of it (ssadnet:int8) or the path of an .onnx file; may be "
-        f"repeated (default: {', '.join(DEFAULT)})",
-        action="append",
-    )
-    add(
-        "--sensor NAME",
-        "the sensor that recorded the scans: a name that 'edgeperc sensors' lists, or a .json file "
-        "(default: %(default)s)",
-        default="hdl-64e",
-    )
-
-
-def _add_scans(add: Options) -> None:
-    """``--input`` and ``--scans``."""
-    add(
-        "--input SCANS...",
-        "measure with these scan files, or all scan files of these folders (default: simulated scans)",
-        type=Path,
-    )
-    add("--scans N", "the number of simulated scans, used in turn (default: %(default)s)", type=at_least(1), default=8)
-
-
-def _add_engine(add: Options) -> None:
-    """``--provider``, ``--precision`` and ``--threads``."""
-    add(
-        "--provider P",
-        f"the execution provider that runs the models: auto, {', '.join(PROVIDERS)} (default: %(default)s)",
-        type=provider,
-        default="auto",
-    )
-    add(
-        "--precision P",
-        f"the precision in which the models run: auto, {', '.join(PRECISIONS)} (default: %(default)s)",
-        choices=("auto", *PRECISIONS),
-        default="auto",
-    )
-    add("--threads N", "the number of threads inside a model (default: the provider's choice)", type=at_least(1))
-
-
-def _add_output(add: Options) -> None:
-    """``--json`` and ``--markdown``."""
-    add("--json FILE", "write the report, with every sample, to this file")
-    add("--markdown FILE", "write the tables as Markdown to this file")
-
-
-def _add_page(add: Options) -> None:
-    """``--html``."""
-    add("--html FILE", "write a page with plots to this file (needs the extra 'view')")
-
-
-SHARED: Mapping[str, Callable[[Options], None]] = {
-    **{"model": _add_model, "scans": _add_scans, "engine": _add_engine, "output": _add_output, "page": _add_page}
-}
 
 
 def add_limits(add: Options, min_scans: int, min_seconds: float, repeats: int) -> None:
@@ -200,3 +141,55 @@ def scenario(text: str) -> str:
             f"got {text!r}; expected {SINGLE_STREAM}, paced:HZ, offline, offline:PROCESSES or cold-start"
         )
     return text
+
+
+SHARED: Mapping[str, Sequence[tuple[str, str, Mapping[str, Any]]]] = {
+    "model": (
+        (
+            "--model NAME",
+            "a shipped model (ssadnet), one variant of it (ssadnet:int8) or the path of an .onnx file; may be "
+            f"repeated (default: {', '.join(DEFAULT)})",
+            {"action": "append"},
+        ),
+        (
+            "--sensor NAME",
+            "the sensor that recorded the scans: a name that 'edgeperc sensors' lists, or a .json file "
+            "(default: %(default)s)",
+            {"default": "hdl-64e"},
+        ),
+    ),
+    "scans": (
+        (
+            "--input SCANS...",
+            "measure with these scan files, or all scan files of these folders (default: simulated scans)",
+            {"type": Path},
+        ),
+        (
+            "--scans N",
+            "the number of simulated scans, used in turn (default: %(default)s)",
+            {"type": at_least(1), "default": 8},
+        ),
+    ),
+    "engine": (
+        (
+            "--provider P",
+            f"the execution provider that runs the models: auto, {', '.join(PROVIDERS)} (default: %(default)s)",
+            {"type": provider, "default": "auto"},
+        ),
+        (
+            "--precision P",
+            f"the precision in which the models run: auto, {', '.join(PRECISIONS)} (default: %(default)s)",
+            {"choices": ("auto", *PRECISIONS), "default": "auto"},
+        ),
+        (
+            "--threads N",
+            "the number of threads inside a model (default: the provider's choice)",
+            {"type": at_least(1)},
+        ),
+    ),
+    "output": (
+        ("--json FILE", "write the report, with every sample, to this file", {}),
+        ("--markdown FILE", "write the tables as Markdown to this file", {}),
+    ),
+    "page": (("--html FILE", "write a page with plots to this file (needs the extra 'view')", {}),),
+}

@@ -46,15 +46,9 @@ def _aligned(rows: Sequence[Sequence[str]]) -> list[str]:
     if not rows:
         return []
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    right = [k > 0 and width <= TEXT_WIDTH for k, width in enumerate(widths)]
-    cells = [
-        [
-            cell.rjust(width) if to_right else cell.ljust(width)
-            for cell, width, to_right in zip(row, widths, right, strict=True)
-        ]
-        for row in rows
-    ]
-    return [f"  {'  '.join(row)}".rstrip() for row in cells]
+    sides = [">" if k and width <= TEXT_WIDTH else "<" for k, width in enumerate(widths)]
+    form = "  ".join(["", *(f"{{:{side}{width}}}" for side, width in zip(sides, widths, strict=True))])
+    return [form.format(*row).rstrip() for row in rows]
 
 
 def markdown(parts: Iterable[Section], title: str) -> str:
@@ -92,11 +86,8 @@ def html_page(parts: Iterable[Section], title: str, pictures: Sequence[str] = ()
         body.append(f"<h2>{escape(part.title)}</h2>")
         body += [f"<p>{escape(sentence)}</p>" for sentence in part.sentences]
         if part.rows:
-            rows = [
-                "<tr>" + "".join(_cell(tag, cell) for cell in row) + "</tr>"
-                for row, tag in zip(part.rows, ["th", *["td"] * (len(part.rows) - 1)], strict=True)
-            ]
-            body.append(f"<table>{''.join(rows)}</table>")
+            rows = ("".join(_cell("td" if k else "th", cell) for cell in row) for k, row in enumerate(part.rows))
+            body.append(f"<table>{''.join(f'<tr>{row}</tr>' for row in rows)}</table>")
         if k == 1:
             body += [f"<figure>{picture}</figure>" for picture in pictures]
     policy = f'<meta http-equiv="Content-Security-Policy" content="{POLICY}"/>'
@@ -114,9 +105,9 @@ def number(value: float | None, digits: int = 2) -> str:
     return "-" if value is None or math.isnan(value) else f"{value:,.{digits}f}"
 
 
-def share(value: float | None) -> str:
+def share(value: float | None, digits: int = 1) -> str:
     """Format a share in per cent; a dash if it is unknown."""
-    return "-" if value is None or math.isnan(value) else f"{100.0 * value:.1f} %"
+    return "-" if value is None or math.isnan(value) else f"{100.0 * value:.{digits}f} %"
 
 
 @dataclass
@@ -138,14 +129,8 @@ class LiveTable:
             rows = [["scenario", "scans", *QUANTILES, "last"]]
             for stage, values in self.ms.items():
                 figures = summary(values)
-                rows.append(
-                    [
-                        stage,
-                        f"{len(values):,}",
-                        *(number(figures[q]) for q in QUANTILES),
-                        number(values[-1] if values else None),
-                    ]
-                )
+                last = values[-1] if values else None
+                rows.append([stage, f"{len(values):,}", *(number(figures[q]) for q in QUANTILES), number(last)])
             lines = _aligned(rows)
             self.stream.write("\n".join(lines) + "\n")
             self.stream.flush()

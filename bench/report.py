@@ -13,7 +13,9 @@ from .samples import percentile
 
 def sections(document: Mapping[str, Any]) -> list[Section]:
     """Every section of a document, in the order in which they are shown."""
-    parts = [_reliability(document)]
+    sentences = [] if document["complete"] else ["interrupted: only what was measured before is shown"]
+    sentences += [f"disturbed: {sentence}" for sentence in document["disturbances"]]
+    parts = [Section("Reliability", sentences or ["no disturbance was seen"])]
     if document["kind"] == "matrix":
         parts.append(_matrix(document))
     for setting in document.get("settings", ()) if document["kind"] == "run" else ():
@@ -47,12 +49,6 @@ def verdict(setting: Mapping[str, Any]) -> str:
             parts.append(f"does not keep {rate_hz:g} Hz: a scan takes {slow_ms:.0f} ms of {1e3 / rate_hz:.0f}")
     back_to_back = " (judged by scans back to back)" if parts and not judged[0]["rate_hz"] else ""
     return f"{setting_label(setting)}: {'; '.join(parts)}{back_to_back}" if parts else ""
-
-
-def _reliability(document: Mapping[str, Any]) -> Section:
-    sentences = [] if document["complete"] else ["interrupted: only what was measured before is shown"]
-    sentences += [f"disturbed: {sentence}" for sentence in document["disturbances"]]
-    return Section("Reliability", sentences or ["no disturbance was seen"])
 
 
 def _setting(setting: Mapping[str, Any]) -> list[Section]:

@@ -10,8 +10,9 @@ stopping asks for 64, 662 and 6,636 queries for p90, p99 and p99.9.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from time import perf_counter_ns
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -20,6 +21,13 @@ PERCENTILES = (50.0, 90.0, 99.0, 99.9)
 SAMPLES_ABOVE = 10
 N_BLOCKS = 20
 N_RESAMPLES = 2000
+
+
+def elapsed_ms(call: Callable[[], object]) -> float:
+    """Wall time of one call [ms]."""
+    start = perf_counter_ns()
+    call()
+    return (perf_counter_ns() - start) / 1e6
 
 
 def percentile(values: ArrayLike, p: float) -> float:

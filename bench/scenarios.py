@@ -85,8 +85,10 @@ def back_to_back(
     keep_going: KeepGoing = lambda timings: True,
     on_start: Callable[[], None] = lambda: None,
 ) -> Timings:
-    """Perceive one scan after the other, the next as soon as there is a result (MLPerf's single stream), or as `paced`;
-    ``on_start`` is called between the warm-up, always back to back, and the first scan that counts.
+    """Perceive one scan after the other, the next as soon as there is a result (MLPerf's single stream), or, by
+    ``rate_hz``, as they arrive: scan k at the first one's time plus k / rate, so that the schedule does not drift.
+    Until then the thread sleeps, as in a vehicle; after a late result the newest scan is next. ``on_start`` is called
+    between the warm-up, always back to back, and the first scan that counts.
     """
     clock = clock or Clock()
     timings = Timings(stride=limits.stride)
@@ -114,15 +116,6 @@ def back_to_back(
         timings.add(began - first, 1e3 * (done - began), 1e3 * (done - arrived), perception.stage_ms)
         k += 1
     return timings
-
-
-def paced(
-    perceive: Perceive, scans: Sequence[NDArray[np.float32]], rate_hz: float, limits: Limits, **how: Any
-) -> Timings:
-    """Perceive scans as they arrive: scan k at the first one's time plus k / rate, so that the schedule does not drift.
-    Until then the thread sleeps, as in a vehicle; after a late result the newest scan is next. Warm-up is back to back.
-    """
-    return back_to_back(perceive, scans, limits, rate_hz=rate_hz, **how)
 
 
 def throughput(calls: Sequence[tuple[Sequence[float], Sequence[float]]]) -> tuple[float, float]:

@@ -9,9 +9,9 @@ Prints tables of Markdown.
 from __future__ import annotations
 
 import argparse
-import time
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +25,7 @@ from edgeperc.types.mounting import MODEL_MOUNTING
 from edgeperc.types.sensor import SensorProfile, get_sensor
 
 from .accuracy import NearFigures, profile_of
+from .samples import elapsed_ms
 
 TIMES_S = (0.1, 0.2, 0.5)
 SPEEDS_MPS = (0.0, 10.0)
@@ -124,18 +125,11 @@ def time_turn(name: str, n_turns: int) -> str:
         for sensor, mounting in ((profile, Mounting(0.0, 0.0, 0.0)), ("hdl-64e", MODEL_MOUNTING))
     )
     chosen = np.random.default_rng(0).permutation(np.resize(np.arange(len(alike)), n))
-    singles = [(of_kind, merge([alike[chosen]], [raised])), (of_hdl, np.resize(hdl, (n, 4)))]
-    takes: list[list[float]] = [[], [], []]
-    for _ in range(n_turns):
-        start = time.perf_counter()
-        of_kind(merge(scans, poses))
-        takes[0].append(time.perf_counter() - start)
-        for k, (perceive, points) in enumerate(singles):
-            start = time.perf_counter()
-            perceive(points)
-            takes[k + 1].append(time.perf_counter() - start)
-    four, same, other = (1e3 * float(np.median(each)) for each in takes)
-    ratios = [float(np.median(np.array(takes[0]) / np.array(takes[k]))) for k in (1, 2)]
+    one, of_other = merge([alike[chosen]], [raised]), np.resize(hdl, (n, 4))
+    calls = (lambda: of_kind(merge(scans, poses))), partial(of_kind, one), partial(of_hdl, of_other)
+    takes = np.array([[elapsed_ms(call) for call in calls] for _ in range(n_turns)])
+    four, same, other = np.median(takes, axis=0).tolist()
+    ratios = np.median(takes[:, :1] / takes[:, 1:], axis=0).tolist()
     return f"| {name} | {n:,} | {four:.0f} | {same:.0f} | {other:.0f} | {ratios[0]:.2f}; {ratios[1]:.2f} |"
 
 

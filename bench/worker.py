@@ -27,7 +27,7 @@ from edgeperc import EdgepercError, Perceiver
 from .application import Application
 from .context import EnergyMeter, conditions, peak_rss_mb, rss_mb
 from .loadgen import single_stream
-from .scenarios import Limits, Timings, back_to_back, paced
+from .scenarios import Limits, Timings, back_to_back
 
 TICK_S = 0.25
 MEMORY_SAMPLES = 500  # at most, in a scenario: a longer list would itself be memory growth
@@ -78,22 +78,15 @@ class Prediction:
 OnTick = Callable[[str, Sequence[float]], None]
 
 
-def perceiver_arguments(job: Job) -> dict[str, Any]:
-    """The arguments of a job's Perceiver, as JSON types."""
-    return {
-        "models": list(job.models),
-        "sensor": job.sensor,
-        "provider": job.provider,
-        "precision": job.precision,
-        "n_threads": job.n_threads,
-        "full_turn": job.full_turn,
-        "on_mismatch": "warn",  # the time is of interest even for scans that are too large or sparse for the models
-    }
+def settings_of(job: Job) -> dict[str, Any]:
+    """The arguments of a job's Perceiver that a report names, as JSON types."""
+    names = ("provider", "precision", "n_threads", "sensor", "full_turn")
+    return {"models": list(job.models), **{name: getattr(job, name) for name in names}}
 
 
 def make_perceiver(job: Job) -> Perceiver:
-    """Make a job's Perceiver."""
-    return Perceiver(**perceiver_arguments(job))
+    """Make a job's Perceiver: the time is of interest even for scans that are too large or sparse for the models."""
+    return Perceiver(**settings_of(job), on_mismatch="warn")
 
 
 def serve(connection: Any, job: Job) -> None:
@@ -130,10 +123,9 @@ def work(connection: Any, job: Job) -> dict[str, Any]:
                 break
             watch = _Watch(connection, scenario)
             inputs = [scans[path] for path in scenario.scans]
+            run: Callable[..., Timings] = partial(back_to_back, rate_hz=scenario.rate_hz)
             if job.loadgen is not None:
-                run: Callable[..., Timings] = partial(single_stream, folder=job.loadgen)
-            else:
-                run = back_to_back if scenario.rate_hz is None else partial(paced, rate_hz=scenario.rate_hz)
+                run = partial(single_stream, folder=job.loadgen)
             with closing(Application(perceive)) if scenario.application else nullcontext(perceive) as called:
                 timings = run(called, inputs, limits=scenario.limits, keep_going=watch, on_start=watch.start)
             result["scenarios"][scenario.name] = watch.record(timings)
@@ -148,19 +140,11 @@ def work(connection: Any, job: Job) -> dict[str, Any]:
 
 def active_engines(perceive: Perceiver) -> list[dict[str, Any]]:
     """The active engines, one record per network."""
+    names = ("sha256", "digest", "provider", "precision", "description", "options")
     return [
-        {
-            "name": session.card.name,
-            "variant": session.card.precision,
-            "version": session.card.version,
-            "sha256": session.sha256,
-            "digest": session.digest,
-            "provider": session.provider,
-            "precision": session.precision,
-            "description": session.description,
-            "options": session.options,
-            "golden_deviation": None if np.isnan(session.golden_deviation) else session.golden_deviation,
-        }
+        {"name": session.card.name, "variant": session.card.precision, "version": session.card.version}
+        | {name: getattr(session, name) for name in names}
+        | {"golden_deviation": None if np.isnan(session.golden_deviation) else session.golden_deviation}
         for session in perceive.sessions
     ]
 
@@ -221,24 +205,19 @@ def _rounded(value: Any) -> Any:
     return round(value, 6) if isinstance(value, float) else value
 
 
-class _Interrupts:
-    """Ctrl-C: the first sets ``asked``, the second raises, so that the first does not cut a message in two."""
-
-    def __init__(self) -> None:
-        self.asked = False
-
-    def __call__(self, *_: Any) -> None:
-        if self.asked:
-            raise KeyboardInterrupt
-        self.asked = True
-
-
 @contextmanager
-def _interrupts() -> Iterator[_Interrupts]:
-    requests = _Interrupts()
-    old = signal.signal(signal.SIGINT, requests)
+def _interrupts() -> Iterator[list[int]]:
+    """Ctrl-C: the first is kept in the list, the second raises, so that the first does not cut a message in two."""
+    asked: list[int] = []
+
+    def note(number: int, _: Any) -> None:
+        if asked:
+            raise KeyboardInterrupt
+        asked.append(number)
+
+    old = signal.signal(signal.SIGINT, note)
     try:
-        yield requests
+        yield asked
     finally:
         signal.signal(signal.SIGINT, old)
 
@@ -273,7 +252,7 @@ def measure(jobs: Sequence[Job], on_tick: OnTick = lambda name, ms: None) -> lis
                         on_tick(*content)
                     else:
                         results[k] = content
-                if interrupts.asked and not stop_by_s:
+                if interrupts and not stop_by_s:
                     stop_by_s = time.perf_counter() + STOP_S
                     for each in pending:
                         with suppress(OSError):  # the process has just ended

@@ -57,51 +57,39 @@ PLAIN_CAMERA_INPUT = InputSpec("image", ("red", "green", "blue"), (0.0, 0.0, 0.0
 def card_of(recipe: Recipe, **facts: Any) -> ModelCard:
     """The card of a recipe's network; ``facts`` are further arguments of `ModelCard`, at least ``version``."""
     facts = {"name": recipe.network, **facts}
-    task = recipe.task
     block = EDGE_BLOCKS.get(recipe.network, (1, 1)) if recipe.edge else (1, 1)
-    if task == "objects":
-        return ModelCard(
-            view=OBJECT_VIEW,
-            input=OBJECT_INPUT,
-            outputs=(OutputSpec("objects", "objects"),),
-            classes=OBJECT_CLASSES,
-            box_classes=OBJECT_CLASSES[1:],
-            box_size_priors=box_sizes(),
-            # On the folds, the F1 of cars is 0.79 with 0.5 and 0.65 with 0.3; AP is the same.
-            **{"score_threshold": 0.5, **facts},
-        )
-    if task == "camera":
-        return ModelCard(
-            view=CameraGeometry(recipe.image_width, recipe.image_height),
-            input=CAMERA_INPUT if recipe.network == "camseg" else PLAIN_CAMERA_INPUT,
-            outputs=(OutputSpec("logits", "camera_logits"),),
-            classes=CAMERA_CLASSES,
-            **facts,
-        )
-    if task == "points":
-        return ModelCard(
-            view=RANGE_IMAGE,
-            input=HEIGHT_INPUT if recipe.height_above_ground else RANGE_IMAGE_INPUT,
-            outputs=(OutputSpec("logits", "class_logits", block=block),),
-            classes=recipe.classes or POINT_CLASSES,
-            **facts,
-        )
-    if task == "road":
-        outputs = (OutputSpec("segmentation", "class_logits"),)
-        return ModelCard(view=TOP_VIEW, input=TOP_VIEW_INPUT, outputs=outputs, classes=ROAD_CLASSES, **facts)
-    boxes = OutputSpec("boxes", "box_dense" if recipe.head == "dense" else "box_slots", recipe.front)
-    return ModelCard(
-        view=TOP_VIEW,
-        input=TOP_VIEW_INPUT,
-        outputs=(OutputSpec("segmentation", "class_logits", block=block), boxes),
-        classes=TOP_VIEW_CLASSES,
-        box_classes=("car", "van", "truck"),
+    view: CameraGeometry | ObjectGeometry | RangeImageGeometry | TopViewGeometry = TOP_VIEW
+    input, outputs = TOP_VIEW_INPUT, [OutputSpec("segmentation", "class_logits", block=block)]
+    classes: tuple[str, ...] = TOP_VIEW_CLASSES
+    if recipe.task == "objects":
+        view, input, outputs = OBJECT_VIEW, OBJECT_INPUT, [OutputSpec("objects", "objects")]
+        classes = OBJECT_CLASSES
+        # On the folds, the F1 of cars is 0.79 with 0.5 and 0.65 with 0.3; AP is the same.
+        facts = {"score_threshold": 0.5, "box_classes": classes[1:], "box_size_priors": box_sizes(), **facts}
+    elif recipe.task == "camera":
+        view = CameraGeometry(recipe.image_width, recipe.image_height)
+        input = CAMERA_INPUT if recipe.network == "camseg" else PLAIN_CAMERA_INPUT
+        outputs, classes = [OutputSpec("logits", "camera_logits")], CAMERA_CLASSES
+    elif recipe.task == "points":
+        view, input = RANGE_IMAGE, HEIGHT_INPUT if recipe.height_above_ground else RANGE_IMAGE_INPUT
+        outputs, classes = [OutputSpec("logits", "class_logits", block=block)], recipe.classes or POINT_CLASSES
+    elif recipe.task == "road":
+        outputs, classes = [OutputSpec("segmentation", "class_logits")], ROAD_CLASSES
+    else:
+        outputs.append(OutputSpec("boxes", "box_dense" if recipe.head == "dense" else "box_slots", recipe.front))
         # Length, width, height: geometric means, and standard deviations of the logarithms, of 28,963 labels of KITTI
         # without test drives.
-        box_size_priors={"car": (3.86, 1.63, 1.52), "van": (5.0, 1.9, 2.18), "truck": (10.02, 2.58, 3.2)},
-        box_size_spreads={"car": (0.11, 0.06, 0.084), "van": (0.164, 0.087, 0.143), "truck": (0.291, 0.09, 0.144)},
-        **facts,
-    )
+        facts = {
+            "box_classes": ("car", "van", "truck"),
+            "box_size_priors": {"car": (3.86, 1.63, 1.52), "van": (5.0, 1.9, 2.18), "truck": (10.02, 2.58, 3.2)},
+            "box_size_spreads": {
+                "car": (0.11, 0.06, 0.084),
+                "van": (0.164, 0.087, 0.143),
+                "truck": (0.291, 0.09, 0.144),
+            },
+            **facts,
+        }
+    return ModelCard(view=view, input=input, outputs=tuple(outputs), classes=classes, **facts)
 
 
 def box_sizes() -> dict[str, tuple[float, float, float]]:

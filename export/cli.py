@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import Field, fields, replace
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -19,7 +19,7 @@ from edgeperc.errors import EdgepercError, MissingExtraError, ModelError
 from .database.cli import add_database_commands
 from .recipe import MODELS, NETWORKS, PAPER, TASKS, Recipe
 
-Commands: TypeAlias = "argparse._SubParsersAction[Any]"
+Command: TypeAlias = "Callable[..., argparse.ArgumentParser]"
 KITTI = "KITTI object set: a folder of training/velodyne, label_2, calib and of frames.csv"
 CAMVID = "folder of CamVid: train, trainannot, val, valannot and classes.json"
 PROOF = "scan (or image) files on which torch and onnxruntime must agree, in addition to four simulated ones"
@@ -84,9 +84,16 @@ def build_parser() -> argparse.ArgumentParser:
     parser.set_defaults(extra="export")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
 
+    def command(
+        name: str, help: str, run: Callable[[argparse.Namespace], int], **defaults: Any
+    ) -> argparse.ArgumentParser:
+        made: argparse.ArgumentParser = commands.add_parser(name, help=help)
+        made.set_defaults(run=run, **defaults)
+        return made
+
     before = _add_simulate, _add_train, _add_curve, _add_export, _add_verify, _add_card, _add_quantize, _add_agree
     for add in (*before, _add_make, _add_ablate, add_database_commands, _add_triton, _add_models):
-        add(commands)
+        add(command)
     return parser
 
 
@@ -166,8 +173,8 @@ def recipe_of(args: argparse.Namespace) -> Recipe:
 # --- commands ---------------------------------------------------------------------------------------------------------
 
 
-def _add_simulate(commands: Commands) -> None:
-    add = options(commands.add_parser("simulate", help="write simulated, labeled scans to train on"), run=_simulate)
+def _add_simulate(command: Command) -> None:
+    add = options(command("simulate", "write simulated, labeled scans to train on", _simulate))
     add("out", "folder for the scans; existing scans in it are kept", type=Path)
     add("-n N", "number of scans (default 1000)", type=int, default=1000)
     add("--first FIRST", "number of the first scan, and its seed (default 0)", type=int, default=0)
@@ -183,9 +190,9 @@ def _simulate(args: argparse.Namespace) -> int:
     return 0
 
 
-def _add_train(commands: Commands) -> None:
-    train = commands.add_parser("train", help="train a network, or resume a stopped training run")
-    add = options(train, run=_train)
+def _add_train(command: Command) -> None:
+    train = command("train", "train a network, or resume a stopped training run", _train)
+    add = options(train)
     add("network", "network to train", choices=NETWORKS)
     add("out", "folder for checkpoint.pt, log.jsonl and log.csv; a checkpoint in it is resumed", type=Path)
     _add_shared(add, "--kitti KITTI", "--scans FOLDER[:LAYOUT]")
@@ -230,23 +237,14 @@ def _train(args: argparse.Namespace) -> int:
     scan_sets = [ScanFolder.parse(text) for text in args.scans]
     data = Data(args.kitti, args.simulated, args.camvid, scan_sets, fold=args.fold)
     run = Run(
-        args.start_from,
-        args.teacher,
-        args.threads,
-        args.workers,
-        args.compile,
-        args.checkpoint_every,
-        tensorboard=args.tensorboard,
+        args.start_from, args.teacher, args.threads, args.workers, args.compile, args.checkpoint_every, args.tensorboard
     )
     print_line(str(train(recipe, args.out, data, run)))
     return 0
 
 
-def _add_curve(commands: Commands) -> None:
-    add = options(
-        commands.add_parser("curve", help="show the validation figures of training runs over the samples seen"),
-        run=_curve,
-    )
+def _add_curve(command: Command) -> None:
+    add = options(command("curve", "show the validation figures of training runs over the samples seen", _curve))
     add("runs OUT...", "folder of a training run, with its log.jsonl", type=Path)
     add("--lines LINES", "at most this many lines for each run (default 12)", type=int, default=12)
 
@@ -260,8 +258,8 @@ def _curve(args: argparse.Namespace) -> int:
     return 0
 
 
-def _add_export(commands: Commands) -> None:
-    add = options(commands.add_parser("export", help="write a checkpoint as an .onnx model with a card"), run=_export)
+def _add_export(command: Command) -> None:
+    add = options(command("export", "write a checkpoint as an .onnx model with a card", _export))
     add("checkpoint", "checkpoint.pt of a training run", type=Path)
     add("out", ".onnx file to write; not written if torch and onnxruntime disagree", type=Path)
     add("--scans SCANS", PROOF, type=Path, nargs="*", default=[])
@@ -282,7 +280,7 @@ def _add_export(commands: Commands) -> None:
 
 
 def _export(args: argparse.Namespace) -> int:
-    from .data.simulate import fitness_of, parity_images, parity_scans
+    from .data.simulate import fitness_of, parity_samples
     from .release.to_onnx import export
     from .training.checkpoint import read_checkpoint
 
@@ -292,7 +290,7 @@ def _export(args: argparse.Namespace) -> int:
     card = export(
         args.checkpoint,
         args.out,
-        scans=parity_images(args.scans) if task == "camera" else parity_scans(args.scans),
+        scans=parity_samples(task, args.scans),
         fitness=None if task in ("camera", "objects") else trained["fitness"] or fitness_of(args.kitti),
         name=args.name,
         version=args.model_version,
@@ -303,28 +301,25 @@ def _export(args: argparse.Namespace) -> int:
     return 0
 
 
-def _add_verify(commands: Commands) -> None:
-    add = options(commands.add_parser("verify", help="compare an .onnx model with its checkpoint"), run=_verify)
+def _add_verify(command: Command) -> None:
+    add = options(command("verify", "compare an .onnx model with its checkpoint", _verify))
     add("checkpoint", "checkpoint.pt that the model was exported from", type=Path)
     add("model", ".onnx file, or name of a model", type=_model_file)
     add("--scans SCANS", PROOF, type=Path, nargs="*", default=[])
 
 
 def _verify(args: argparse.Namespace) -> int:
-    from .data.simulate import parity_images, parity_scans
+    from .data.simulate import parity_samples
     from .release.to_onnx import load, verify
 
     network, recipe, _ = load(args.checkpoint)
-    samples = parity_images(args.scans) if recipe.task == "camera" else parity_scans(args.scans)
-    print_line(json.dumps(verify(network, args.model, samples)))
+    print_line(json.dumps(verify(network, args.model, parity_samples(recipe.task, args.scans))))
     return 0
 
 
-def _add_card(commands: Commands) -> None:
-    add = options(
-        commands.add_parser("card", help="add a card to an .onnx network made elsewhere, so that edgeperc can run it"),
-        run=_card,
-    )
+def _add_card(command: Command) -> None:
+    does = "add a card to an .onnx network made elsewhere, so that edgeperc can run it"
+    add = options(command("card", does, _card))
     add("model", ".onnx file of the network", type=Path)
     add("card", "JSON file of the card; edgeperc info MODEL --json prints one to edit", type=Path)
     add("out", ".onnx file to write", type=Path)
@@ -348,11 +343,9 @@ def _card(args: argparse.Namespace) -> int:
     return 0
 
 
-def _add_quantize(commands: Commands) -> None:
-    add = options(
-        commands.add_parser("quantize", help="make an int8 model, if it is faster on this computer and as accurate"),
-        run=_quantize,
-    )
+def _add_quantize(command: Command) -> None:
+    does = "make an int8 model, if it is faster on this computer and as accurate"
+    add = options(command("quantize", does, _quantize))
     add("model", ".onnx file, or name, of the fp32 model", type=_model_file)
     add("out", ".onnx file to write", type=Path)
     add("--scans SCANS", "scans, or folders of .bin, to calibrate on", type=Path, nargs="*", default=[])
@@ -375,26 +368,20 @@ def _quantize(args: argparse.Namespace) -> int:
 
     from .release.quantize import LabeledSets, calibration_images, calibration_scans, quantize
 
-    if ModelCard.read(args.model).view.kind == "objects":
-        from .release.object_int8 import quantize_objects
-
-        calibration = calibration_scans(args.scans, kitti=args.kitti, n_simulated=args.simulated)
-        card = quantize_objects(args.model, args.out, calibration, seven_bits=args.seven_bits, n_threads=args.threads)
-        print_line(f"{args.out}: {card.name} {card.version}: {card.parity['speed']}")
-        return 0
-    if args.camvid is not None:
+    of_objects = ModelCard.read(args.model).view.kind == "objects"
+    how = {"seven_bits": args.seven_bits, "n_threads": args.threads}
+    if args.camvid is not None and not of_objects:
         calibration = calibration_images(args.camvid)
     else:
         calibration = calibration_scans(args.scans, kitti=args.kitti, n_simulated=args.simulated)
-    card = quantize(
-        args.model,
-        args.out,
-        calibration,
-        LabeledSets(args.kitti, args.semantickitti, args.camvid, args.evaluate_on),
-        exclude=args.exclude,
-        seven_bits=args.seven_bits,
-        n_threads=args.threads,
-    )
+    if of_objects:
+        from .release.object_int8 import quantize_objects
+
+        card = quantize_objects(args.model, args.out, calibration, **how)
+        print_line(f"{args.out}: {card.name} {card.version}: {card.parity['speed']}")
+        return 0
+    labeled = LabeledSets(args.kitti, args.semantickitti, args.camvid, args.evaluate_on)
+    card = quantize(args.model, args.out, calibration, labeled, exclude=args.exclude, **how)
     print_line(
         f"{args.out}: {card.name} {card.version}, kept in fp32: {', '.join(card.training['quantized']['left_alone'])}"
     )
@@ -405,11 +392,9 @@ def _quantize(args: argparse.Namespace) -> int:
     return 0
 
 
-def _add_agree(commands: Commands) -> None:
-    add = options(
-        commands.add_parser("agree", help="compare bf16 and int8 with fp32, and write the agreement into the cards"),
-        run=_agree,
-    )
+def _add_agree(command: Command) -> None:
+    does = "compare bf16 and int8 with fp32, and write the agreement into the cards"
+    add = options(command("agree", does, _agree))
     add("models MODEL...", "a network's name, or its files, one of them in fp32")
     add("--kitti KITTI", "root of a KITTI object set", type=Path)
     add("--semantickitti SEMANTICKITTI", "root of SemanticKITTI, for the road", type=Path)
@@ -436,9 +421,8 @@ def _agree(args: argparse.Namespace) -> int:
     return 0
 
 
-def _add_make(commands: Commands) -> None:
-    does = "make a shipped model from scratch: simulate, train, export, evaluate"
-    add = options(commands.add_parser("make", help=does), run=_make)
+def _add_make(command: Command) -> None:
+    add = options(command("make", "make a shipped model from scratch: simulate, train, export, evaluate", _make))
     shipped = sorted(name for name in MODELS if not name.endswith("-start"))
     add("name", "model to make; the models that it starts from or is distilled from are made first", choices=shipped)
     add("out", "folder for scans, checkpoints and models; finished ones in it are kept", type=Path)
@@ -470,10 +454,10 @@ def _make(args: argparse.Namespace) -> int:
     return 0
 
 
-def _add_ablate(commands: Commands) -> None:
+def _add_ablate(command: Command) -> None:
     does = "measure the effect of each part of the training on a fold, or compare networks on CamVid"
-    ablate = commands.add_parser("ablate", help=does)
-    add = options(ablate, run=_ablate)
+    ablate = command("ablate", does, _ablate)
+    add = options(ablate)
     add(
         "network",
         "network whose variants are trained, or camvid: eleven networks under one budget",
@@ -564,10 +548,8 @@ def _ablate_camvid(args: argparse.Namespace) -> int:
     return 0
 
 
-def _add_triton(commands: Commands) -> None:
-    add = options(
-        commands.add_parser("triton", help="write a model repository for NVIDIA's Triton Inference Server"), run=_triton
-    )
+def _add_triton(command: Command) -> None:
+    add = options(command("triton", "write a model repository for NVIDIA's Triton Inference Server", _triton))
     add("out", "folder of the repository; models of the same names are replaced", type=Path)
     add(
         "--model MODEL",
@@ -587,10 +569,8 @@ def _triton(args: argparse.Namespace) -> int:
     return 0
 
 
-def _add_models(commands: Commands) -> None:
-    add = options(
-        commands.add_parser("models", help="write MODELS.md from the cards of a folder's models"), run=_models
-    )
+def _add_models(command: Command) -> None:
+    add = options(command("models", "write MODELS.md from the cards of a folder's models", _models))
     add("folder", "folder of .onnx models", type=Path)
 
 

@@ -12,9 +12,8 @@ import onnx
 
 from edgeperc.evaluation.camvid import evaluate_images
 from edgeperc.evaluation.evaluate import NETWORK_ALONE, Perceiving, evaluate
-from edgeperc.types.card import ModelCard
 
-from .data.simulate import fitness_of, parity_images, parity_scans, simulate
+from .data.simulate import fitness_of, parity_samples, simulate
 from .recipe import MODELS
 from .release.object_parity import TOP_VIEW
 from .release.to_onnx import export, write_card
@@ -129,45 +128,38 @@ def finish(
     data, semantickitti, version : as for `make`.
     """
     stage, kitti, fold = MODELS[name], data.kitti, data.fold
-    if stage.recipe.task == "camera":
+    task, fitness = stage.recipe.task, None
+    kept: Sequence[str] = CARD_FIGURES
+    if task not in ("camera", "objects"):
+        fitness = fitness_of(None if stage.is_open or stage.recipe.simulated_share == 1.0 else kitti)
+    card = export(checkpoint, path, scans=parity_samples(task), fitness=fitness, name=name, version=version)
+    figures: dict[str, Any]
+    if task == "camera":
         assert data.camvid is not None
-        card = export(checkpoint, path, scans=parity_images([]), fitness=None, name=name, version=version)
         figures = evaluate_images([data.camvid], path, split="validation")
-        _write_figures(
-            path, card, figures | {"command": f"edgeperc eval CAMVID --split validation --model {name}:fp32"}
-        )
-        return
-    if stage.recipe.task == "objects":
-        card = export(checkpoint, path, scans=parity_scans([]), fitness=None, name=name, version=version)
-        if kitti is not None:
-            figures, _ = evaluate([kitti], [TOP_VIEW, path], Perceiving(rules=()), fold=fold)
-            figures["real"] = {name: of for name, of in figures["real"].items() if name in OBJECT_FIGURES}
-            printed = f"edgeperc eval KITTI --model {TOP_VIEW} --model {name}:fp32 --no-agreement"
-            _write_figures(path, card, figures | {"command": printed + (f" --fold {fold}" if fold is not None else "")})
-        return
-    fitness = fitness_of(None if stage.is_open or stage.recipe.simulated_share == 1.0 else kitti)
-    card = export(checkpoint, path, scans=parity_scans([]), fitness=fitness, name=name, version=version)
-    datasets: dict[str, str | Path] = {"simulation": "simulation"}
-    if semantickitti is not None and fold is None:
-        datasets = {"SEMANTICKITTI": semantickitti, **datasets}
-    if kitti is not None:
-        datasets = {"KITTI": kitti, **datasets}
-    # SSADNet 3.1.2 takes another network's road as ground truth where no road is labeled.
-    truth = path.with_name(f"{ROAD_TRUTH}.onnx")
-    learned_road = "drivable" in card.classes and kitti is not None and path != truth and truth.exists()
-    road_by = truth if learned_road else None
-    # The figures of a card are of its network alone.
-    figures, _ = evaluate([*datasets.values()], [path], NETWORK_ALONE, fold=fold, road_by=road_by)
-    command = ["edgeperc eval", *datasets, f"--model {name}"]
-    command += [f"--road-by {ROAD_TRUTH}"] if road_by else []
-    command += [f"--fold {fold}"] if fold is not None else []
-    command += ["--no-agreement"]
+        command = f"edgeperc eval CAMVID --split validation --model {name}:fp32"
+    elif task == "objects":
+        if kitti is None:
+            return
+        figures, _ = evaluate([kitti], [TOP_VIEW, path], Perceiving(rules=()), fold=fold)
+        kept = OBJECT_FIGURES
+        command = f"edgeperc eval KITTI --model {TOP_VIEW} --model {name}:fp32 --no-agreement"
+        command += f" --fold {fold}" if fold is not None else ""
+    else:
+        datasets: dict[str, str | Path] = {"KITTI": kitti} if kitti is not None else {}
+        if semantickitti is not None and fold is None:
+            datasets["SEMANTICKITTI"] = semantickitti
+        datasets["simulation"] = "simulation"
+        # SSADNet 3.1.2 takes another network's road as ground truth where no road is labeled.
+        truth = path.with_name(f"{ROAD_TRUTH}.onnx")
+        learned_road = "drivable" in card.classes and kitti is not None and path != truth and truth.exists()
+        road_by = truth if learned_road else None
+        # The figures of a card are of its network alone.
+        figures, _ = evaluate([*datasets.values()], [path], NETWORK_ALONE, fold=fold, road_by=road_by)
+        options = [f"--road-by {ROAD_TRUTH}"] * learned_road + [f"--fold {fold}"] * (fold is not None)
+        command = " ".join(["edgeperc eval", *datasets, f"--model {name}", *options, "--no-agreement"])
     for source in SOURCES & figures.keys():
-        figures[source] = {name: of for name, of in figures[source].items() if name in CARD_FIGURES}
-    _write_figures(path, card, figures | {"command": " ".join(command)})
-
-
-def _write_figures(path: Path, card: ModelCard, figures: dict[str, Any]) -> None:
-    """Write figures into a model's card and into the JSON file beside it."""
+        figures[source] = {name: of for name, of in figures[source].items() if name in kept}
+    figures |= {"command": command}
     path.with_suffix(".json").write_text(json.dumps(figures, indent=1, sort_keys=True) + "\n")
     write_card(onnx.load(path), replace(card, metrics=figures), path)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 from edgeperc.types.choices import STATIC
@@ -46,7 +47,8 @@ def _option(
     return field(default=default, metadata={"help": text, "networks": networks, "edge": edge, "choices": choices})
 
 
-_TOP_VIEW = (*TASKS["vehicles"], *TASKS["road"])
+_points, _vehicles, _camera = (partial(_option, networks=TASKS[task]) for task in ("points", "vehicles", "camera"))
+_scans, _top_view = (partial(_option, networks=of) for of in (SCAN_NETWORKS, (*TASKS["vehicles"], *TASKS["road"])))
 
 
 @dataclass(frozen=True)
@@ -59,33 +61,29 @@ class Recipe:
     """
 
     network: str
-    head: str = _option(
+    head: str = _vehicles(
         "dense",
         "box head: dense (one prediction every four cells), slots (SSADNet's own: a fixed number of upright boxes, "
         "here one for each square of 3.2 m) or slots-paper (as published: nearest first, averaged over the image)",
-        TASKS["vehicles"],
         edge=False,
         choices=("dense", "slots", "slots-paper"),
     )
-    front: bool = _option(
-        False, "the box head also predicts which end of a vehicle is its front; only with head dense", TASKS["vehicles"]
+    front: bool = _vehicles(
+        False, "the box head also predicts which end of a vehicle is its front; only with head dense"
     )
-    height_above_ground: bool = _option(
-        False, "the input has a channel with the height of each point above the ground", TASKS["points"]
-    )
-    classes: tuple[str, ...] = _option(
-        (), "classes of points, the background first, separated by commas; empty: those of edgeperc", TASKS["points"]
+    height_above_ground: bool = _points(False, "the input has a channel with the height of each point above the ground")
+    classes: tuple[str, ...] = _points(
+        (), "classes of points, the background first, separated by commas; empty: those of edgeperc"
     )
     steps: int = _option(2000, "training steps")
     batch: int = _option(8, "scans, or images, in each step")
     accumulate: int = _option(
         1, "number of parts of a batch whose gradients are added up, for a batch that does not fit into memory"
     )
-    reuse: int = _option(
+    reuse: int = _scans(
         1,
         "how often each sample is used; the later times are drawn from the newest samples. For a GPU that trains "
         "faster than samples are made. Above 1, a resumed run differs from an uninterrupted one",
-        SCAN_NETWORKS,
     )
     optimizer: str = _option("adamw", "optimizer", choices=("adamw", "adam", "adagrad"))
     learning_rate: float = _option(
@@ -97,74 +95,49 @@ class Recipe:
         "share of the steps in which the learning rate falls to zero; 0: constant from the first step. Until it "
         "begins, a longer run equals a shorter one",
     )
-    halve_after: int = _option(
-        0,
-        "halve the learning rate after this many epochs without a lower validation loss (SSADNet 3.2); 0: never",
-        SCAN_NETWORKS,
+    halve_after: int = _scans(
+        0, "halve the learning rate after this many epochs without a lower validation loss (SSADNet 3.2); 0: never"
     )
-    stop_after: int = _option(
-        0,
-        "stop after this many epochs without a better validation figure, and keep the best weights; 0: never",
-        TASKS["camera"],
+    stop_after: int = _camera(
+        0, "stop after this many epochs without a better validation figure, and keep the best weights; 0: never"
     )
-    image_width: int = _option(480, "columns that images are scaled to", TASKS["camera"])
-    image_height: int = _option(360, "rows that images are scaled to", TASKS["camera"])
-    simulated_share: float = _option(
-        0.5, "share of simulated scans; the rest are real. 1: no real scan is read", SCAN_NETWORKS
-    )
+    image_width: int = _camera(480, "columns that images are scaled to")
+    image_height: int = _camera(360, "rows that images are scaled to")
+    simulated_share: float = _scans(0.5, "share of simulated scans; the rest are real. 1: no real scan is read")
     augment: bool = _option(
         True, "turn, mirror, thin and shift every scan; scale, crop, mirror and recolor every image"
     )
-    n_pasted: float = _option(
-        6.0, "mean number of objects cut from other scans and pasted into each scan", SCAN_NETWORKS
+    n_pasted: float = _scans(6.0, "mean number of objects cut from other scans and pasted into each scan")
+    swap: float = _points(0.3, "share of scans that get one sector of another scan")
+    paste_cars: float = _points(0.0, "share of cars among pasted objects; 0: cars are not pasted into range images")
+    n_negatives: float = _scans(
+        2.0, "mean number of poles, trunks and pieces of walls that are cut from other scans and pasted into each scan"
     )
-    swap: float = _option(0.3, "share of scans that get one sector of another scan", TASKS["points"])
-    paste_cars: float = _option(
-        0.0,
-        "share of cars among pasted objects; 0: cars are not pasted into range images",
-        TASKS["points"],
+    turn_to_rare: float = _scans(0.3, "share of simulated scans turned so that a pedestrian or cyclist is ahead")
+    turn_anywhere: float = _scans(
+        0.0, "share of simulated scans turned by any angle, so that vehicles appear away from the street ahead"
     )
-    n_negatives: float = _option(
-        2.0,
-        "mean number of poles, trunks and pieces of walls that are cut from other scans and pasted into each scan",
-        SCAN_NETWORKS,
-    )
-    turn_to_rare: float = _option(
-        0.3, "share of simulated scans turned so that a pedestrian or cyclist is ahead", SCAN_NETWORKS
-    )
-    turn_anywhere: float = _option(
-        0.0,
-        "share of simulated scans turned by any angle, so that vehicles appear away from the street ahead",
-        SCAN_NETWORKS,
-    )
-    weather: float = _option(0.1, "share of scans with rain, snow or fog added", SCAN_NETWORKS)
-    beams: float = _option(
+    weather: float = _scans(0.1, "share of scans with rain, snow or fog added")
+    beams: float = _scans(
         0.1,
         "share of scans of the training sensor that are thinned to the beams and columns of another one, drawn at "
         "random: a known one, one with 12 to 48 beams, or one without beams",
-        SCAN_NETWORKS,
     )
-    tilt_deg: float = _option(
-        0.25,
-        "standard deviation of the roll and pitch by which scans are tilted [deg]: errors of the leveling",
-        SCAN_NETWORKS,
+    tilt_deg: float = _scans(
+        0.25, "standard deviation of the roll and pitch by which scans are tilted [deg]: errors of the leveling"
     )
-    no_remission: float = _option(
-        0.05, "share of scans whose remission is the constant that stands for a missing one at run time", SCAN_NETWORKS
+    no_remission: float = _scans(
+        0.05, "share of scans whose remission is the constant that stands for a missing one at run time"
     )
-    redraw_every: int = _option(
-        1000,
-        "after this many steps, label some training scans and draw those with false objects more often; 0: never",
-        SCAN_NETWORKS,
+    redraw_every: int = _scans(
+        1000, "after this many steps, label some training scans and draw those with false objects more often; 0: never"
     )
     class_weights: bool = _option(
         True,
         "weight rare classes more in the cross-entropy",
         (*TASKS["points"], *TASKS["vehicles"], *TASKS["camera"]),
     )
-    focal_gamma: float = _option(
-        0.0, "focal loss exponent of the cross-entropy; 0: plain cross-entropy", TASKS["points"]
-    )
+    focal_gamma: float = _points(0.0, "focal loss exponent of the cross-entropy; 0: plain cross-entropy")
     lovasz_weight: float = _option(1.0, "weight of the Lovasz-softmax loss, added to the cross-entropy")
     deep_supervision: float = _option(
         0.0, "weight of additional losses of early logits", ("camseg", "pointseg"), edge=False
@@ -172,26 +145,21 @@ class Recipe:
     ema: float = _option(
         0.998, "decay of the averaged weights, which are the ones exported; 0: export the last weights"
     )
-    kept: float = _option(
+    kept: float = _scans(
         0.0,
         "share of the weights of --start-from in the exported ones, which are then a mean of both: what the network "
         "was good at is kept (WiSE-FT; Wortsman et al., 2022)",
-        SCAN_NETWORKS,
     )
-    context_width: int = _option(128, "channels of the context module", _TOP_VIEW, edge=False)
-    batch_norm: bool = _option(
-        True, "batch norm in the segmentation branch (ssadnet) or the whole network (lodnn)", _TOP_VIEW, edge=False
+    context_width: int = _top_view(128, "channels of the context module", edge=False)
+    batch_norm: bool = _top_view(
+        True, "batch norm in the segmentation branch (ssadnet) or the whole network (lodnn)", edge=False
     )
     dropout: float = _option(0.25, "dropout probability", edge=False)
-    distil: float = _option(
-        0.0,
-        "weight of the distillation loss (Hinton et al., 2015) towards --teacher's outputs; 0: no distillation",
-        SCAN_NETWORKS,
+    distil: float = _scans(
+        0.0, "weight of the distillation loss (Hinton et al., 2015) towards --teacher's outputs; 0: no distillation"
     )
-    seen_twice: bool = _option(
-        True,
-        "average the teacher's outputs over each scan and its mirror image; doubles the teacher's time",
-        SCAN_NETWORKS,
+    seen_twice: bool = _scans(
+        True, "average the teacher's outputs over each scan and its mirror image; doubles the teacher's time"
     )
     edge: bool = _option(
         False, "train the network's version for small computers, with the same inputs and outputs", EDGE_NETWORKS
@@ -199,15 +167,10 @@ class Recipe:
     width: float = _option(
         1.0, "factor of the channels of a network for small computers (with --edge)", ("pointseg", "ssadnet")
     )
-    head_only: bool = _option(
-        False,
-        "train only the box head and keep the segmentation branch from --start-from",
-        TASKS["vehicles"],
-        edge=False,
+    head_only: bool = _vehicles(
+        False, "train only the box head and keep the segmentation branch from --start-from", edge=False
     )
-    drawn_roads: bool = _option(
-        False, "use the hand-drawn roads as ground truth where a training scan has one", _TOP_VIEW
-    )
+    drawn_roads: bool = _top_view(False, "use the hand-drawn roads as ground truth where a training scan has one")
     detector: bool = _option(
         True, "boxes of ssadnet, a network that was trained on KITTI, are candidates in training too", TASKS["objects"]
     )
@@ -220,23 +183,10 @@ class Recipe:
 
 
 PLAIN: Mapping[str, Any] = {
-    "simulated_share": 0.0,
-    "augment": False,
-    "n_pasted": 0.0,
-    "swap": 0.0,
-    "n_negatives": 0.0,
-    "turn_to_rare": 0.0,
-    "weather": 0.0,
-    "beams": 0.0,
-    "tilt_deg": 0.0,
-    "no_remission": 0.0,
+    **dict.fromkeys(("augment", "class_weights", "batch_norm"), False),
+    **dict.fromkeys(("simulated_share", "n_pasted", "swap", "n_negatives", "turn_to_rare", "weather", "beams"), 0.0),
+    **dict.fromkeys(("tilt_deg", "no_remission", "lovasz_weight", "weight_decay", "cooldown", "ema"), 0.0),
     "redraw_every": 0,
-    "class_weights": False,
-    "lovasz_weight": 0.0,
-    "weight_decay": 0.0,
-    "cooldown": 0.0,
-    "ema": 0.0,
-    "batch_norm": False,
 }
 """Settings that switch off everything that the papers do not mention."""
 

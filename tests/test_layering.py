@@ -135,14 +135,13 @@ FLOORS = {
         networks.objects networks.pointseg networks.ssadnet
         networks.camseg networks.edge networks.lodnn networks.pointpillars networks.salsanext networks.segnet
         networks.squeezesegv2 networks.unet
-        networks.fcn networks.kulseg
+        networks.fcn
         networks.__init__
         training.__init__ training.checkpoint training.curve training.log training.losses training.object_task
         training.ranks
         training.camera training.object_samples training.start training.task
         training.images training.object_sets training.teacher
         training.object_batches training.samples
-        training.watch
         training.train
         training.ablation training.camvid
         release.__init__ release.int8_graph release.models_page release.object_graph release.object_parity
@@ -153,7 +152,6 @@ FLOORS = {
         database.__init__ database.files
         database.coco database.folds database.torch
         database.label_page database.scenes
-        database.workers
         database.build
         database.cli
         make

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -87,40 +87,11 @@ def prepare_input(arguments: argparse.Namespace, folder: Path, document: dict[st
 
 def job_of(arguments: argparse.Namespace) -> Job:
     """The job from ``--model``, ``--provider``, ``--precision``, ``--threads``, ``--sensor`` and ``--full-turn``."""
-    return Job(
-        tuple(arguments.model or DEFAULT),
-        provider=arguments.provider,
-        precision=arguments.precision,
-        n_threads=arguments.threads,
-        sensor=arguments.sensor,
-        full_turn=getattr(arguments, "full_turn", False),  # not every command has it
-    )
+    given = arguments.provider, arguments.precision, arguments.threads, arguments.sensor
+    full_turn = getattr(arguments, "full_turn", False)  # not every command has it
+    return Job(tuple(arguments.model or DEFAULT), *given, full_turn)
 
 
 def limits_of(arguments: argparse.Namespace) -> Limits:
     """The limits from ``--min-scans``, ``--min-seconds`` and ``--warm-up``."""
     return Limits(arguments.min_scans, arguments.min_seconds, arguments.warm_up)
-
-
-def measure_offline(
-    setting: dict[str, Any],
-    job: Job,
-    files: Sequence[Path],
-    n_processes: int,
-    limits: Limits,
-    document: dict[str, Any],
-    live: LiveTable,
-) -> None:
-    """Measure the throughput of several processes into ``setting``; raises KeyboardInterrupt if it was interrupted."""
-    from ..measure import offline
-
-    live.note(f"offline, {n_processes} processes")
-    measured = offline(job, files, n_processes, limits, live)
-    setting["offline"].append(measured)
-    cpu_s = sum(part["cpu_s"] for part in measured["parts"])
-    for disturbance in context.disturbances(document["machine"], measured["before"], measured["after"], cpu_s):
-        # The start-up of the measuring processes would count as work of other processes.
-        if not disturbance.startswith("other processes"):
-            document["disturbances"].append(f"offline x {n_processes}: {disturbance}")
-    if measured["interrupted"]:
-        raise KeyboardInterrupt

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import os
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -42,22 +41,9 @@ def add_parser(subparsers: Any) -> None:
 
 def run_command(arguments: argparse.Namespace) -> int:
     """Measure every table, one after the other."""
-    from ..peers.contenders import default_models
     from ..peers.turns import run
 
     with new_document("peers", arguments) as (document, live), tempfile.TemporaryDirectory() as folder:
         scans = prepare_input(arguments, Path(folder), document, live)
-        run(
-            document,
-            scans.files,
-            Path(folder),
-            tables=arguments.tables,
-            models=arguments.model or default_models(),
-            provider=arguments.provider,
-            precision=arguments.precision,
-            sensor=arguments.sensor,
-            n_threads=arguments.threads or document["machine"]["usable_cores"] or os.cpu_count() or 1,
-            n_rounds=arguments.rounds,
-            note=live.note,
-        )
+        run(document, scans.files, Path(folder), arguments, live.note)
     return 0

@@ -15,7 +15,7 @@ from ..options import SINGLE_STREAM, add_command, add_limits, scenario
 from ..render import LiveTable
 from ..scenarios import Limits
 from ..worker import Job, Scenario
-from .common import job_of, limits_of, measure_offline, new_document, prepare_input
+from .common import job_of, limits_of, new_document, prepare_input
 
 DEFAULT_SCENARIOS = (SINGLE_STREAM, "paced:10", "paced:20", "offline", "cold-start")
 
@@ -46,7 +46,7 @@ def add_parser(subparsers: Any) -> None:
 
 def run_command(arguments: argparse.Namespace) -> int:
     """Measure the scenarios one after the other."""
-    from ..measure import accuracy_of, cold_starts, new_setting, reference, repeat
+    from ..measure import accuracy_of, cold_starts, new_setting, offline, reference, repeat
 
     if arguments.loadgen:
         loadgen.load()
@@ -61,8 +61,7 @@ def run_command(arguments: argparse.Namespace) -> int:
             if name == SINGLE_STREAM or name.startswith("paced")
         )
         job = replace(job_of(arguments), scenarios=scenarios)
-        setting = new_setting(job)
-        document["settings"].append(setting)
+        setting = new_setting(job, document)
         live.note(f"{arguments.repeats} repeats of {', '.join(s.name for s in scenarios) or 'nothing but the start'}")
         predictions = repeat(setting, replace(job, predict=scans.files), arguments.repeats, document, live)
         live.note("comparing the results with fp32 on the CPU provider")
@@ -71,7 +70,7 @@ def run_command(arguments: argparse.Namespace) -> int:
             kind, _, value = name.partition(":")
             if kind == "offline":
                 n = int(value or document["machine"]["usable_cores"] or os.cpu_count() or 1)
-                measure_offline(setting, job, scans.files, n, limits, document, live)
+                offline(setting, job, scans.files, n, limits, document, live)
             elif kind == "cold-start":
                 live.note("cold starts")
                 setting["cold_start"] = cold_starts(job, scans.files[0], 1 + arguments.repeats)

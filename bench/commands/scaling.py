@@ -23,7 +23,7 @@ from ..options import add_command, add_limits, numbers
 from ..render import LiveTable, number
 from ..samples import trend
 from ..worker import Job, Scenario
-from .common import job_of, limits_of, measure_offline, new_document
+from .common import job_of, limits_of, new_document
 
 POINT_COUNTS = (10_000, 20_000, 50_000, 100_000, 200_000, 500_000, 1_000_000, 2_000_000)
 CAR_COUNTS = (0, 4, 8, 16, 28)
@@ -62,7 +62,7 @@ def add_parser(subparsers: Any) -> None:
 def run_command(arguments: argparse.Namespace) -> int:
     """Measure the four curves."""
     from .. import inputs
-    from ..measure import new_setting, repeat
+    from ..measure import new_setting, offline, repeat
 
     if arguments.plot:
         require("matplotlib", "view", "Drawing the curves")
@@ -82,8 +82,7 @@ def run_command(arguments: argparse.Namespace) -> int:
             for n in counts
         }
         job = job_of(arguments)
-        setting = new_setting(job)
-        document["settings"].append(setting)
+        setting = new_setting(job, document)
         repeat(setting, replace(job, scenarios=tuple(scenarios.values())), arguments.repeats, document, live)
         curves: dict[str, Curve] = {}
         for kind, unit, per in (("points", "1,000 points", 1000.0), ("cars", "car", 1.0)):
@@ -94,7 +93,7 @@ def run_command(arguments: argparse.Namespace) -> int:
         curves["pixels %"] = _growth_with_images(document, live, job, arguments, Path(folder), scan)
         cores = document["machine"]["usable_cores"] or os.cpu_count() or 1
         for n in arguments.processes or sorted({*(2**k for k in range(cores.bit_length())), cores}):
-            measure_offline(setting, job, [scan], n, limits, document, live)
+            offline(setting, job, [scan], n, limits, document, live)
         curves["processes"] = [(each["processes"], each["scans_per_s"] or math.nan) for each in setting["offline"]]
         one = curves["processes"][0][1] / curves["processes"][0][0]
         rows = [[f"{n}", number(rate), number(rate / one)] for n, rate in curves["processes"]]
@@ -153,8 +152,7 @@ def _growth_with_images(
         models = tuple(str(resized(name, percent / 100.0, folder)) for name in job.models)
         scenario = Scenario(f"{percent} % of the pixels", (scan,), limits)
         own = replace(job, models=models, scenarios=(scenario,))
-        setting = new_setting(own)
-        document["settings"].append(setting)
+        setting = new_setting(own, document)
         repeat(setting, own, arguments.repeats, document, live)
         settings.append((percent, setting, scenario.name))
     return _add_table(

@@ -50,8 +50,7 @@ def run_command(arguments: argparse.Namespace) -> int:
         limits = Limits(arguments.scans - settling, 0.0, settling, max(1, arguments.scans // MEMORY_SAMPLES))
         scenario = Scenario("soak", scans.files, limits, application=arguments.application)
         job = replace(job_of(arguments), scenarios=(scenario,))
-        setting = new_setting(job)
-        document["settings"].append(setting)
+        setting = new_setting(job, document)
         try:
             repeat(setting, job, 1, document, live)
         finally:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import platform
 from collections.abc import Callable, Mapping
-from time import perf_counter_ns
 
 import numba
 import numpy as np
@@ -13,14 +12,9 @@ from numpy.typing import NDArray
 
 from edgeperc.cli.arguments import Options, options
 
+from ..samples import elapsed_ms
+
 N_WARM_UP = 3
-
-
-def elapsed_ms(call: Callable[[], object]) -> float:
-    """Wall time of one call [ms]."""
-    start = perf_counter_ns()
-    call()
-    return (perf_counter_ns() - start) / 1e6
 
 
 def measure(calls: Mapping[str, Callable[[], object]], n_rounds: int) -> dict[str, NDArray[np.float64]]:

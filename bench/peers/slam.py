@@ -53,7 +53,7 @@ from edgeperc.system.extras import require
 from edgeperc.tracking.moving import moving_tracks
 from edgeperc.types.geometry import inside
 
-from ..render import Section, number, text
+from ..render import Section, number, share, text
 from .rounds import parser_of, versions
 
 RATE_HZ = 10.0
@@ -256,11 +256,9 @@ def compared(
                 for points, boxes in zip(drive.scans, moving_boxes(drive.labels, poses), strict=True)
             ]
         counted = [np.logical_and.reduce(masks) for masks in zip(staying, drive.known, drive.usable, strict=True)]
-        n_still = sum(int(np.count_nonzero(known & ~moves)) for known, moves in zip(drive.known, moving, strict=True))
-        n_lost = sum(
-            int(np.count_nonzero(known & ~moves & ~mask))
-            for known, moves, mask in zip(drive.known, moving, staying, strict=True)
-        )
+        still = [known & ~moves for known, moves in zip(drive.known, moving, strict=True)]
+        n_still = sum(int(np.count_nonzero(mask)) for mask in still)
+        n_lost = sum(int(np.count_nonzero(mask & ~stays)) for mask, stays in zip(still, staying, strict=True))
         way_m = float(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1).sum())
         known = any(mask.any() for mask in drive.known)
         rows.append(
@@ -270,8 +268,8 @@ def compared(
                 f"{len(scans)}, {way_m:.0f} m",
                 "-" if drive.poses is None else f"{trajectory_error(drive.poses, poses):.3f} m",
                 f"{gap:.3f} m",
-                per_cent(ghost_share(drive.scans, counted, moving, poses)) if known else "-",
-                per_cent(n_lost / max(n_still, 1)) if known else "-",
+                share(ghost_share(drive.scans, counted, moving, poses), 2) if known else "-",
+                share(n_lost / max(n_still, 1), 2) if known else "-",
                 "-" if name == ALL else number(seen.ms, 0),
                 number(ms, 0),
             ]
@@ -288,10 +286,6 @@ def compared(
 def chosen(drive: Drive, kept: Sequence[NDArray[np.bool_]]) -> list[Points]:
     """The kept points of each scan that KISS-ICP can use."""
     return [points[mask & usable] for points, mask, usable in zip(drive.scans, kept, drive.usable, strict=True)]
-
-
-def per_cent(value: float) -> str:
-    return f"{100.0 * value:.2f} %"
 
 
 def on_objects(points: Points, boxes: Sequence[Box]) -> NDArray[np.bool_]:

@@ -41,7 +41,8 @@ from edgeperc.evaluation.tracking import CLASSES, FRAME_S, read_sequence, sequen
 from edgeperc.types.sensor import get_sensor
 
 from ..render import Section, number, text
-from .rounds import elapsed_ms, parser_of, versions
+from ..samples import elapsed_ms
+from .rounds import parser_of, versions
 
 Scans = Sequence[Sequence[Box]]
 

@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-import importlib.metadata
+import argparse
 import multiprocessing
 import os
 import signal
 import time
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace
 from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,19 +23,21 @@ from edgeperc import ModelCard, Perceiver
 from edgeperc.inference.session import Session
 from edgeperc.types.sensor import get_sensor
 
-from ..context import conditions, disturbances, rss_mb
+from ..context import conditions, disturbances, rss_mb, version_of
+from ..samples import elapsed_ms
 from ..worker import Prediction
 from . import projection
 from .arithmetic import matrix_product, memory_copy
 from .camera import NumpyCamera, small_unet
-from .contenders import METHODS, Contender, Measured, groups, methods, why_missing
+from .contenders import ANSWERS, METHODS, Contender, Measured, default_models, groups, methods, why_missing
 from .engines import Engine, open_engine
 from .ground import ground_finders, tree_clusters
 from .numpy_pipeline import NumpyPipeline
 from .pillars import fill_pillars, random_weights
-from .rounds import elapsed_ms
 from .tables import floor_table, latency_table, methods_table
 
+# From which libraries take their number of threads when a process starts.
+THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 PAUSE_S = 0.02  # threads of the previous contender spin for some milliseconds
 Calls = list[Callable[[], object]]
 
@@ -44,32 +46,24 @@ Calls = list[Callable[[], object]]
 
 
 def make_perceiver(contender: Contender, scans: Sequence[NDArray[Any]], sensor: str, n_threads: int) -> Calls:
-    """edgeperc; as by default, without a number of threads, both networks run concurrently, each on one thread."""
+    """edgeperc: a contender's models with boxes from networks and without rules, as the numpy pipelines; or, of
+    `ANSWERS`, as by default, in two threads at most. Without a number of threads, networks run concurrently.
+    """
+    chosen: dict[str, Any] = {"full_turn": contender.kind == "full turn"}
+    concurrent = n_threads > 1
+    if contender.kind not in ANSWERS:
+        chosen = {"models": list(contender.paths), "boxes_from": "network", "agree": False}
+        concurrent = contender.kind == "default"
     perceive = Perceiver(
-        list(contender.paths),
         sensor=sensor,
         provider=contender.engine,
         precision=contender.precision,
-        n_threads=None if contender.kind == "default" else n_threads,
+        n_threads=None if concurrent else n_threads,
         on_mismatch="ignore",
-        boxes_from="network",  # as the numpy pipelines
-        agree=False,
+        **chosen,
     )
     if contender.inputs:
         return [partial(perceive, image=image) for image in scans]
-    return [partial(perceive, scan) for scan in scans]
-
-
-def make_answers(contender: Contender, scans: Sequence[NDArray[Any]], sensor: str, n_threads: int) -> Calls:
-    """edgeperc as by default: its models, boxes from networks and clusters, every rule; two threads at most."""
-    perceive = Perceiver(
-        sensor=sensor,
-        provider=contender.engine,
-        precision=contender.precision,
-        n_threads=1 if n_threads == 1 else None,
-        on_mismatch="ignore",
-        full_turn=contender.kind == "full turn",
-    )
     return [partial(perceive, scan) for scan in scans]
 
 
@@ -143,8 +137,8 @@ def make_peak(contender: Contender, scans: Sequence[NDArray[np.float32]], sensor
 MAKERS: Mapping[str, Callable[[Contender, Sequence[NDArray[np.float32]], str, int], Calls]] = {
     "edgeperc": make_perceiver,
     "default": make_perceiver,
-    "front": make_answers,
-    "full turn": make_answers,
+    "front": make_perceiver,
+    "full turn": make_perceiver,
     "pillars": make_pillars,
     "clusters": make_clusters,
     "pipeline": make_pipeline,
@@ -178,19 +172,6 @@ def serve(connection: Any, contender: Contender, files: Sequence[Path], sensor: 
 # The parent's side
 
 
-@contextmanager
-def _threads(n: int) -> Iterator[None]:
-    """Set the environment from which libraries take their number of threads when a process starts."""
-    names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-    before = {name: os.environ.get(name) for name in names}
-    os.environ.update(dict.fromkeys(names, str(n)))
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            os.environ.pop(name) if value is None else os.environ.update({name: value})
-
-
 def measure(
     contenders: Sequence[Contender],
     files: Sequence[Path],
@@ -214,7 +195,7 @@ def measure(
             here, there = spawn.Pipe()
             inputs = contender.inputs or tuple(files)
             process = spawn.Process(target=serve, args=(there, contender, inputs, sensor, n_threads))
-            with _threads(n_threads):
+            with patch.dict(os.environ, dict.fromkeys(THREADS, str(n_threads))):
                 process.start()
             there.close()
             running.append((contest, here, process))
@@ -256,23 +237,22 @@ def run(
     document: dict[str, Any],
     files: Sequence[Path],
     folder: Path,
-    *,
-    tables: Sequence[str],
-    models: Sequence[str],
-    provider: str,
-    precision: str,
-    sensor: str,
-    n_threads: int,
-    n_rounds: int,
+    arguments: argparse.Namespace,
     note: Callable[[str], None],
 ) -> None:
-    """Measure ``tables`` ("engines": the same networks elsewhere; "methods": others), and record them in a document."""
+    """Measure the ``tables`` of the command's arguments ("engines": the same networks elsewhere; "methods": others),
+    and record them in a document.
+    """
+    models, sensor = arguments.model or default_models(), arguments.sensor
+    n_threads = arguments.threads or document["machine"]["usable_cores"] or os.cpu_count() or 1
+    measuring: dict[str, list[Contender]] = {}
     document["peers"] = {}
     for package in ("mnn", "ncnn", "onnx", "openvino", "pypatchworkpp", "scipy", "torch"):
-        with suppress(importlib.metadata.PackageNotFoundError):
-            document["software"][package] = importlib.metadata.version(package)
-    measuring = groups(models, provider, precision, folder, files[0], sensor) if "engines" in tables else {}
-    if "methods" in tables:
+        if version := version_of(package):
+            document["software"][package] = version
+    if "engines" in arguments.tables:
+        measuring = groups(models, arguments.provider, arguments.precision, folder, files[0], sensor)
+    if "methods" in arguments.tables:
         note("writing the networks of others with random weights")
         measuring[METHODS] = methods(folder)
     for title, contenders in measuring.items():
@@ -284,7 +264,7 @@ def run(
                 files,
                 sensor=sensor,
                 n_threads=n_threads,
-                n_rounds=n_rounds,
+                n_rounds=arguments.rounds,
                 note=lambda name: note(f"  starting {name}"),
                 measured=measured,
             )

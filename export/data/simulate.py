@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
-import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
@@ -66,18 +66,16 @@ def _simulate(seed: int, *, out: Path, layouts: Sequence[Sequence[Box]], sensor:
     scan.save(_path(out, seed))
 
 
-def parity_scans(paths: Sequence[Path]) -> list[NDArray[np.float32]]:
-    """Scans to verify an export on: the given files, and four simulated scans that are in no training set."""
-    return [read_points(p) for p in paths] + [simulated_scan(10**9 + k).points for k in range(4)]
-
-
-def parity_images(paths: Sequence[Path]) -> list[NDArray[np.uint8]]:
-    """Images to verify an export on: the given files, and four of simulated streets."""
-    images = [read_image(path) for path in paths]
-    for seed in range(10**9, 10**9 + 4):
-        scan = simulated_scan(seed)
-        images.append(render(scan.scene, forward_camera(480, 360), scan.T_world_sensor, seed).rgb)
-    return images
+def parity_samples(task: str, paths: Sequence[Path] = ()) -> list[NDArray[Any]]:
+    """Scans, or a camera's images, to verify an export on: the given files, and four simulated ones in no training
+    set.
+    """
+    scans = [simulated_scan(seed) for seed in range(10**9, 10**9 + 4)]
+    if task != "camera":
+        return [*map(read_points, paths), *(scan.points for scan in scans)]
+    camera = forward_camera(480, 360)
+    streets = (render(scan.scene, camera, scan.T_world_sensor, seed) for seed, scan in enumerate(scans, start=10**9))
+    return [*map(read_image, paths), *(street.rgb for street in streets)]
 
 
 def fitness_of(kitti: Path | None) -> FitnessProfile:

@@ -60,7 +60,7 @@ def slot_targets(
 def paper_slot_targets(boxes: ArrayLike, view: TopViewGeometry, n_slots: int) -> NDArray[np.float32]:
     """Targets of head "slots-paper": upright boxes around rotated footprints, nearest first (SSADNet 3.1.1).
 
-    boxes : (m, 7) array_like; x, y, z of the center, length, width, height [m], yaw [rad], in the sensor frame.
+    boxes : as for `dense_targets`.
     n_slots : number of boxes to keep, nearest first.
     Returns (n_slots, 4) float32: Center column, center row, width and height as shares of the image's width and
         height; zeros in empty slots. Boxes whose center is outside the view are left out.
@@ -83,30 +83,16 @@ def dense_targets(
 ) -> NDArray[np.float32]:
     """Heat map and geometry for head "dense".
 
-    Parameters
-    ----------
-    boxes : (m, 7) array_like
-        As for `slot_targets`.
-    view : TopViewGeometry
-        Height and width divisible by 4.
-    labeled : (height, width) bool, optional
-        False in cells where boxes are not labeled, such as outside the camera's view.
-    unsure : (k, 7) array_like, optional
-        Boxes that count neither as found nor as missed, such as those without returns. Cells near them are not
-        learned.
-
-    Returns
-    -------
-    (11, height/4, width/4) float32
-        Channel 0, the heat: 1 in the output cell that holds a box's center; around it a Gaussian shaped like the box,
-        whose edges are three standard deviations away; -1 in cells that are not learned. Channels 1 to 8: the geometry
-        of the box with the highest heat, in the format of box_dense, where that heat is at least `REGRESSED_FROM`; else
-        0. Channels 9 and 10: x and y of the unit vector towards its front.
-
-    Raises
-    ------
-    ValueError
-        A length, width or height is not positive.
+    boxes : (m, 7) array_like; x, y, z of the center, length, width, height [m], yaw [rad], in the sensor frame.
+    view : height and width divisible by 4.
+    labeled : (height, width) bool; False in cells where boxes are not labeled, such as outside the camera's view.
+    unsure : (k, 7) array_like; boxes that count neither as found nor as missed, such as those without returns. Cells
+        near them are not learned.
+    Returns (11, height/4, width/4) float32: Channel 0, the heat: 1 in the output cell that holds a box's center; around
+        it a Gaussian shaped like the box, whose edges are three standard deviations away; -1 in cells that are not
+        learned. Channels 1 to 8: the geometry of the box with the highest heat, in the format of box_dense, where that
+        heat is at least `REGRESSED_FROM`; else 0. Channels 9 and 10: x and y of the unit vector towards its front.
+    Raises ValueError: A length, width or height is not positive.
     """
     height, width = view.height // STRIDE, view.width // STRIDE
     target = np.zeros((N_DENSE_CHANNELS + N_FRONT_CHANNELS, height, width), np.float32)

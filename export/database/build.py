@@ -18,7 +18,7 @@ import json
 import os
 import shutil
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -33,11 +33,12 @@ from edgeperc.datasets.splits import TEST_DRIVES
 from edgeperc.errors import MissingExtraError
 from edgeperc.evaluation.metrics import Confusion
 from edgeperc.system.atomic import write_atomic
+from edgeperc.system.pool import Lost
+from edgeperc.system.ray_cluster import ENGINES
 
 from ..data.roads import CLASSES, VEHICLES, VIEW, Z_RANGE_M, DatabaseError, read_coco
 from .files import FARTHEST_M, FORMAT, N_FOLDS
 from .scenes import FOLDERS, INDEX, ROAD_FOLDERS, ROAD_INDEX, TRAIN, TRAINED, Job, Plan, SceneBuilder, inputs_of
-from .workers import run_jobs
 
 if TYPE_CHECKING:
     from ..recipe import Recipe
@@ -147,7 +148,7 @@ def _build(plan: Plan, jobs: list[Job], engine: str, workers: int, notes: tuple[
     (plan.out / "manifest.json").unlink(missing_ok=True)
     skipped = {}
     with tqdm(total=len(jobs), initial=len(jobs) - len(pending), desc="building", unit="scene") as bar:
-        for name, reason in run_jobs(builder, pending, engine, workers):
+        for name, reason in _made(builder, pending, engine, workers):
             bar.update()
             if reason:
                 skipped[name] = reason
@@ -155,6 +156,20 @@ def _build(plan: Plan, jobs: list[Job], engine: str, workers: int, notes: tuple[
     kept = len(jobs) - len(pending)
     scores = _finish(builder, [job for job in jobs if job.name not in skipped], skipped)
     return Report(len(jobs) - len(skipped), len(pending) - len(skipped), kept, skipped, scores, notes)
+
+
+def _made(builder: SceneBuilder, jobs: list[Job], engine: str, workers: int) -> Iterator[tuple[str, str]]:
+    """Make scenes in their order; yields each name with the reason if the scene is left out, else ""."""
+    # The first scene is made in this process: warnings are shown, and errors that concern all scenes stop the build.
+    n_here = len(jobs) if engine == "local" and workers == 1 else 1
+    for job in jobs[:n_here]:
+        yield job.name, builder(job)
+    rest = jobs[n_here:]
+    reasons = ENGINES[engine](SceneBuilder, (builder.plan,), rest, workers=workers)
+    for job, reason in zip(rest, reasons, strict=True):
+        if isinstance(reason, Lost):
+            raise DatabaseError(f"scene {job.name}: {reason.reason}")
+        yield job.name, reason
 
 
 def _finish(builder: SceneBuilder, jobs: list[Job], skipped: dict[str, str]) -> dict[str, dict[str, float | None]]:

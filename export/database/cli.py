@@ -5,9 +5,10 @@ from __future__ import annotations
 import argparse
 import contextlib
 import webbrowser
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from typing import Any
 
 from edgeperc.cli.arguments import options
 from edgeperc.cli.output import print_error, print_line
@@ -15,15 +16,11 @@ from edgeperc.cli.output import print_error, print_line
 DATABASE = "folder of a database made by edgeperc-export database-build"
 
 
-def add_database_commands(commands: argparse._SubParsersAction[Any]) -> None:
-    """Add the four commands to the parser's commands."""
-    add = options(
-        commands.add_parser(
-            "database-build", help="make a top-view database of a KITTI object set, or resume a stopped build"
-        ),
-        run=_build,
-        extra="database",
-    )
+def add_database_commands(command: Callable[..., argparse.ArgumentParser]) -> None:
+    """Add the four commands by what adds one."""
+    command = partial(command, extra="database")
+    does = "make a top-view database of a KITTI object set, or resume a stopped build"
+    add = options(command("database-build", does, _build))
     add("kitti", "KITTI object set: a folder of training/velodyne, label_2 and calib", type=Path)
     add("out", "folder for the database; finished scenes in it are kept", type=Path)
     add("--polygons POLYGONS...", "COCO files of hand-drawn roads", type=Path, default=[])
@@ -58,30 +55,18 @@ def add_database_commands(commands: argparse._SubParsersAction[Any]) -> None:
     )
     add("--workers N", "scenes made in parallel (default: one for each core)", type=int)
 
-    add = options(
-        commands.add_parser("database-label", help="draw roads over a database's images, in a browser"),
-        run=_label,
-        extra="database",
-    )
+    add = options(command("database-label", "draw roads over a database's images, in a browser", _label))
     add("out", DATABASE, type=Path)
     add("--polygons POLYGONS", "COCO file to read and write (default OUT/road.coco.json)", type=Path)
     add("--kitti KITTI", "KITTI object set whose training/image_2 holds camera pictures to show", type=Path)
     add("--port PORT", "port of the page; 0: any free port (default 8117)", type=int, default=8117)
     add("--no-browser", "print the page's address and open no browser")
 
-    add = options(
-        commands.add_parser("database-coco", help="write a database's vehicles and roads as a COCO file"),
-        run=_coco,
-        extra="database",
-    )
+    add = options(command("database-coco", "write a database's vehicles and roads as a COCO file", _coco))
     add("out", DATABASE, type=Path)
     add("file", "COCO file to write", type=Path)
 
-    add = options(
-        commands.add_parser("database-check", help="compare every file of a database with its hash"),
-        run=_check,
-        extra="database",
-    )
+    add = options(command("database-check", "compare every file of a database with its hash", _check))
     add("out", DATABASE, type=Path)
 
 

@@ -12,7 +12,6 @@ from __future__ import annotations
 import contextlib
 import http.client
 import json
-import math
 import secrets
 import socket
 import sys
@@ -28,6 +27,7 @@ from urllib.parse import unquote
 from edgeperc.cli.output import print_error
 from edgeperc.errors import EdgepercError
 from edgeperc.system.atomic import write_atomic
+from edgeperc.system.fields import Fields
 from edgeperc.system.printable import printable
 
 from ..data.roads import HEIGHT, WIDTH, DatabaseError, read_coco, write_coco
@@ -42,6 +42,7 @@ REQUEST_S = 20.0  # to receive, answer and send
 
 TOKEN = "X-Edgeperc-Token"
 EXPECTED = f"expected a list of polygons, each of three corners [x, y] or more, with 0..{WIDTH} x 0..{HEIGHT} pixels"
+_FIELDS = Fields("a drawing", ValueError)
 
 # The page may use its own script and style, marked with a nonce, and pictures and data of this server only.
 POLICY = (
@@ -143,7 +144,7 @@ def _polygons(path: Path) -> tuple[dict[str, list[Any]], dict[str, list[Any]], d
     content = json.loads(path.read_text())
     scans = {Path(image["file_name"]).stem: image["scan"] for image in content["images"] if "scan" in image}
     try:
-        drafts = {name: [_clamped_ring(ring) for ring in rings] for name, rings in content.get("drafts", {}).items()}
+        drafts = {name: _clamped(rings) for name, rings in content.get("drafts", {}).items()}
     except (AttributeError, TypeError, _RefusedError) as exc:
         raise DatabaseError(f"{path} has drafts that are no polygons ({exc}); expected them by scene") from exc
     return roads, {name: rings for name, rings in drafts.items() if rings and name not in roads}, scans
@@ -255,7 +256,10 @@ class _Handler(BaseHTTPRequestHandler):
             raise _RefusedError(HTTPStatus.UNSUPPORTED_MEDIA_TYPE, "expected application/json")
         if what not in ("road", "draft") or name not in self.server.names:
             raise _RefusedError(HTTPStatus.NOT_FOUND, "there is no such scene")
-        polygons = _clamped(body)
+        try:
+            polygons = _clamped(json.loads(body))
+        except (ValueError, RecursionError) as exc:
+            raise _RefusedError(HTTPStatus.BAD_REQUEST, f"not JSON ({str(exc)[:200]}); {EXPECTED}") from exc
         self.server.save(name, polygons, confirmed=what == "road")
         self._send_json(len(polygons))
 
@@ -303,32 +307,16 @@ class _Handler(BaseHTTPRequestHandler):
         """Log no requests."""
 
 
-def _clamped(body: bytes) -> list[list[list[float]]]:
-    """The polygons of a request, inside the image, rounded to 0.01 pixels."""
+def _clamped(content: Any) -> list[list[list[float]]]:
+    """Polygons as JSON has them, inside the image, rounded to 0.01 pixels."""
     try:
-        content = json.loads(body)
-    except (ValueError, RecursionError) as exc:
-        raise _RefusedError(HTTPStatus.BAD_REQUEST, f"not JSON ({str(exc)[:200]}); {EXPECTED}") from exc
-    if not isinstance(content, list):
-        raise _RefusedError(HTTPStatus.BAD_REQUEST, EXPECTED)
-    return [_clamped_ring(ring) for ring in content]
-
-
-def _clamped_ring(ring: Any) -> list[list[float]]:
-    if not isinstance(ring, list) or len(ring) < 3:
+        rings = _FIELDS.read(tuple[tuple[tuple[float, float], ...], ...], content, "polygons")
+    except ValueError as exc:
+        raise _RefusedError(HTTPStatus.BAD_REQUEST, f"{exc}; {EXPECTED}") from exc
+    if any(len(ring) < 3 for ring in rings):
         raise _RefusedError(HTTPStatus.BAD_REQUEST, f"a polygon has fewer than three corners; {EXPECTED}")
-    for corner in ring:
-        if not (isinstance(corner, list) and len(corner) == 2 and all(map(_is_finite, corner))):
-            raise _RefusedError(HTTPStatus.BAD_REQUEST, f"a corner is not a pair of finite numbers; {EXPECTED}")
-    return [[_within(x, WIDTH), _within(y, HEIGHT)] for x, y in ring]
-
-
-def _is_finite(value: Any) -> bool:
-    try:
-        return type(value) in (int, float) and math.isfinite(value)
-    except OverflowError:  # an integer of more than 308 digits
-        return False
-
-
-def _within(value: float, limit: int) -> float:
-    return round(min(max(float(value), 0.0), float(limit)), 2)
+    size = WIDTH, HEIGHT
+    return [
+        [[round(min(max(v, 0.0), most), 2) for v, most in zip(corner, size, strict=True)] for corner in ring]
+        for ring in rings
+    ]

@@ -108,9 +108,7 @@ class RoadModel:
     def __call__(self, points: NDArray[np.float32]) -> NDArray[np.bool_]:
         """Road of a scan, (400, 200) bool."""
         # The scan is moved by the offset between the views, so that its points are in the same cells of both.
-        top_view = self.perceive(points + self._shift.astype(np.float32)).top_view
-        assert top_view is not None
-        return top_view.road
+        return self.perceive(points + self._shift.astype(np.float32)).require_top_view().road
 
 
 class SceneBuilder:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import torch
@@ -12,12 +14,11 @@ from ..recipe import Recipe, task_name
 from .camseg import CamSeg
 from .edge import PointSegEdge, SSADNetEdge
 from .fcn import FCN
-from .kulseg import KULSeg
 from .lodnn import LoDNN, LoDNNEdge
 from .objects import ObjectNet
 from .pointseg import PointSeg
 from .segnet import SegNet
-from .squeezesegv2 import SqueezeSegV2
+from .squeezesegv2 import KULSeg, SqueezeSegV2
 from .ssadnet import SSADNet
 from .unet import UNet
 
@@ -25,11 +26,11 @@ __all__ = ["EDGE", "build"]
 
 EDGE: dict[str, type[nn.Module]] = {"lodnn": LoDNNEdge, "pointseg": PointSegEdge, "ssadnet": SSADNetEdge}
 
-UNETS: dict[str, dict[str, Any]] = {
-    "unet": {},
-    "unet-small": {"width": 16},
-    "unet-small-leaky": {"width": 16, "leaky": True},
-    "unet-long": {"n_levels": 7},
+LARGE: dict[str, Callable[..., nn.Module]] = {
+    **{"camseg": CamSeg, "segnet": SegNet, "fcn8": partial(FCN, stride=8), "fcn16": partial(FCN, stride=16)},
+    **{"unet": UNet, "unet-small": partial(UNet, width=16), "unet-small-leaky": partial(UNet, width=16, leaky=True)},
+    **{"unet-long": partial(UNet, n_levels=7), "objects": ObjectNet, "pointseg": PointSeg},
+    **{"squeezesegv2": SqueezeSegV2, "kulseg": KULSeg, "lodnn": LoDNN, "ssadnet": SSADNet},
 }
 
 
@@ -53,23 +54,10 @@ def build(recipe: Recipe) -> nn.Module:
     if recipe.width != 1.0:
         raise ValueError(f"width is {recipe.width:g}; only networks for small computers (--edge) have one")
     sizes["dropout"] = recipe.dropout
-    if recipe.network == "objects":
-        return ObjectNet(**sizes)
-    if recipe.network == "camseg":
-        return CamSeg(**sizes, early=recipe.deep_supervision > 0.0)
-    if recipe.network == "segnet":
-        return SegNet(**sizes)
-    if recipe.network.startswith("fcn"):
-        return FCN(stride=int(recipe.network[3:]), **sizes)
-    if recipe.network.startswith("unet"):
-        return UNet(**UNETS[recipe.network], **sizes)
-    if recipe.network == "pointseg":
-        return PointSeg(**sizes, deep_supervision=recipe.deep_supervision > 0.0)
-    if recipe.network == "squeezesegv2":
-        return SqueezeSegV2(**sizes)
-    if recipe.network == "kulseg":
-        return KULSeg(**sizes)
-    sizes |= {"context_width": recipe.context_width, "batch_norm": recipe.batch_norm}
-    if recipe.network == "lodnn":
-        return LoDNN(**sizes)
-    return SSADNet(head=recipe.head, **sizes)
+    if recipe.network in ("camseg", "pointseg"):
+        sizes["deep_supervision"] = recipe.deep_supervision > 0.0
+    if recipe.network in ("lodnn", "ssadnet"):
+        sizes |= {"context_width": recipe.context_width, "batch_norm": recipe.batch_norm}
+    if recipe.network == "ssadnet":
+        sizes["head"] = recipe.head
+    return LARGE[recipe.network](**sizes)

@@ -50,11 +50,13 @@ class CamSeg(nn.Module):
 
     n_channels, n_classes : channels of the input; classes of the output.
     dropout : probability of dropping a channel before the last convolution.
-    early : in training, also return early logits from the encoder, (B, n_classes, H/8, W/8) and (B, n_classes, H/16,
-        W/16).
+    deep_supervision : in training, also return early logits from the encoder, (B, n_classes, H/8, W/8) and (B,
+        n_classes, H/16, W/16).
     """
 
-    def __init__(self, *, n_channels: int = 3, n_classes: int = 11, dropout: float = 0.1, early: bool = False) -> None:
+    def __init__(
+        self, *, n_channels: int = 3, n_classes: int = 11, dropout: float = 0.1, deep_supervision: bool = False
+    ) -> None:
         super().__init__()
         half = FINE // 2
         self.stem = conv_bn_relu(n_channels, half, 3, stride=(2, 2))
@@ -71,8 +73,8 @@ class CamSeg(nn.Module):
         self.merge2 = conv_bn_relu(FINE, FINE, 3)
         self.dropout = nn.Dropout2d(dropout)
         self.classifier = nn.Conv2d(FINE, n_classes, 1)
-        self.early = nn.ModuleList(nn.Conv2d(c, n_classes, 1) for c in (MIDDLE, COARSE)) if early else None
-        initialize(self, self.classifier, *(self.early or ()))
+        self.early = nn.ModuleList(nn.Conv2d(c, n_classes, 1) for c in (MIDDLE, COARSE) if deep_supervision)
+        initialize(self, self.classifier, *self.early)
         for module in self.modules():
             if isinstance(module, Bottleneck):
                 nn.init.zeros_(module.norm.weight)  # an untrained block is the identity
@@ -84,7 +86,7 @@ class CamSeg(nn.Module):
         coarse = coarse + self.average(coarse.mean((2, 3), keepdim=True))
         merged = self.merge1(F.relu(_resized(self.up1(coarse), middle) + middle))
         logits: Tensor = self.classifier(self.dropout(self.merge2(_resized(merged, fine) + fine)))
-        if self.early is None or not self.training:
+        if not self.early or not self.training:
             return logits
         return logits, self.early[0](middle), self.early[1](coarse)
 

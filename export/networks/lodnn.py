@@ -90,11 +90,11 @@ class LoDNNEdge(nn.Module):
     Out: logits (B, n_classes, 400, 200) float32.
 
     n_channels, n_classes : channels of the input; classes of the output.
-    fine, context_width : channels at half and at a quarter of the resolution.
     """
 
-    def __init__(self, *, n_channels: int = 3, n_classes: int = 2, fine: int = 16, context_width: int = 48) -> None:
+    def __init__(self, *, n_channels: int = 3, n_classes: int = 2) -> None:
         super().__init__()
+        fine, context_width = 16, 48  # channels at half and at a quarter of the resolution
         self.stem = conv_bn_relu(n_channels, fine, 3, stride=(2, 2))
         self.down = conv_bn_relu(fine, context_width, 3, stride=(2, 2))
         self.context = nn.Sequential(*(Dilated(context_width, (along, across)) for across, along in EDGE_DILATIONS))

@@ -9,6 +9,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from .pointseg import conv_bn_relu
+
 # Layers, channels and the factor of the upsampling of each block (sections 2.2 and 3.1); each halves the resolution.
 BLOCKS = ((4, 64, 1), (6, 128, 2), (6, 256, 4))
 UPSAMPLED = 128
@@ -22,19 +24,15 @@ class PointPillars(nn.Module):
 
     In: (B, 64, 496, 432) float32, features of pillars; any height and width divisible by 8.
     Out: scores (B, 2, 248, 216), boxes (B, 14, 248, 216) and directions (B, 4, 248, 216), float32.
-
-    n_channels : features of a pillar.
     """
 
-    def __init__(self, *, n_channels: int = 64) -> None:
+    def __init__(self) -> None:
         super().__init__()
-        self.blocks, self.ups, c_in = nn.ModuleList(), nn.ModuleList(), n_channels
+        self.blocks, self.ups, c_in = nn.ModuleList(), nn.ModuleList(), 64
         for n_layers, c_out, up in BLOCKS:
             layers: list[nn.Module] = []
             for k in range(n_layers):
-                stride = 2 if k == 0 else 1
-                layers.append(nn.Conv2d(c_in if k == 0 else c_out, c_out, 3, stride=stride, padding=1, bias=False))
-                layers += [nn.BatchNorm2d(c_out), nn.ReLU()]
+                layers += conv_bn_relu(c_out if k else c_in, c_out, 3, stride=(1, 1) if k else (2, 2))
             larger = nn.ConvTranspose2d(c_out, UPSAMPLED, up, stride=up, bias=False)
             self.blocks.append(nn.Sequential(*layers))
             self.ups.append(nn.Sequential(larger, nn.BatchNorm2d(UPSAMPLED), nn.ReLU()))

@@ -16,6 +16,8 @@ What the paper leaves open, and the choices made here:
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
@@ -44,36 +46,28 @@ def pool(x: Tensor) -> Tensor:
 class Fire(nn.Module):
     """Squeeze, by default to a quarter, and expand by 1x1 and 3x3 (section 4.1; Figure 4, left)."""
 
-    def __init__(self, c_in: int, c_out: int, c_mid: int | None = None) -> None:
-        super().__init__()
-        c_mid = c_in // 4 if c_mid is None else c_mid
-        self.squeeze = conv_bn_relu(c_in, c_mid, 1)
-        self.expand1 = conv_bn_relu(c_mid, c_out // 2, 1)
-        self.expand3 = conv_bn_relu(c_mid, c_out // 2, 3)
-
-    def forward(self, x: Tensor) -> Tensor:
-        x = self.squeeze(x)
-        return torch.cat([self.expand1(x), self.expand3(x)], dim=1)
-
-
-class FireDeconv(nn.Module):
-    """A fire layer that doubles the width between squeeze and expand (Figure 4, right)."""
+    doubles: ClassVar[bool] = False
 
     def __init__(self, c_in: int, c_out: int, c_mid: int | None = None) -> None:
         super().__init__()
         c_mid = c_in // 4 if c_mid is None else c_mid
         self.squeeze = conv_bn_relu(c_in, c_mid, 1)
-        self.deconv = nn.Sequential(
-            nn.ConvTranspose2d(c_mid, c_mid, (1, 4), stride=(1, 2), padding=(0, 1), bias=False),
-            nn.BatchNorm2d(c_mid),
-            nn.ReLU(),
-        )
+        self.deconv = nn.Sequential()
+        if self.doubles:
+            self.deconv.append(nn.ConvTranspose2d(c_mid, c_mid, (1, 4), stride=(1, 2), padding=(0, 1), bias=False))
+            self.deconv.extend([nn.BatchNorm2d(c_mid), nn.ReLU()])
         self.expand1 = conv_bn_relu(c_mid, c_out // 2, 1)
         self.expand3 = conv_bn_relu(c_mid, c_out // 2, 3)
 
     def forward(self, x: Tensor) -> Tensor:
         x = self.deconv(self.squeeze(x))
         return torch.cat([self.expand1(x), self.expand3(x)], dim=1)
+
+
+class FireDeconv(Fire):
+    """A fire layer that doubles the width between squeeze and expand (Figure 4, right)."""
+
+    doubles = True
 
 
 class SqueezeReweight(nn.Module):
@@ -114,20 +108,13 @@ class PointSeg(nn.Module):
     Out: logits (B, 4, 64, 512) float32.
 
     n_channels, n_classes : channels of the input; classes of the output.
-    enlargement_width : channels of each branch of the enlargement layer.
     dropout : probability of dropping a channel before the last convolution, as in SqueezeSeg.
     deep_supervision : in training, also return early logits (B, n_classes, H, W/4), from the decoder at a quarter of
         the width.
     """
 
     def __init__(
-        self,
-        *,
-        n_channels: int = 5,
-        n_classes: int = 4,
-        enlargement_width: int = 80,
-        dropout: float = 0.25,
-        deep_supervision: bool = False,
+        self, *, n_channels: int = 5, n_classes: int = 4, dropout: float = 0.25, deep_supervision: bool = False
     ) -> None:
         super().__init__()
         self.fire1 = conv_bn_relu(n_channels, 64, 3, stride=(1, 2))
@@ -136,7 +123,7 @@ class PointSeg(nn.Module):
         self.fire4, self.fire5, self.sr2 = Fire(128, 256), Fire(256, 256), SqueezeReweight(256)
         self.fire6, self.fire7 = Fire(256, 384), Fire(384, 384)
         self.fire8, self.fire9, self.sr3 = Fire(384, 512), Fire(512, 512), SqueezeReweight(512)
-        self.enlarge = Enlargement(512, enlargement_width)
+        self.enlarge = Enlargement(512, 80)
         self.deconv1_enlarged = FireDeconv(128, 128)
         self.deconv1 = FireDeconv(512, 128)
         self.deconv2 = FireDeconv(256, 128)

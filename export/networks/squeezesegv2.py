@@ -1,4 +1,4 @@
-"""SqueezeSegV2: segmentation of a range image (Wu et al., 2018), the network that KUL-Seg extends.
+"""SqueezeSegV2: segmentation of a range image (Wu et al., 2018), and KUL-Seg, which extends it.
 
 It has SqueezeSeg's fire layers and three of the paper's four additions: context aggregation, the mask of returns, and
 batch norm. The fourth is the focal loss (`edgeperc_export.training.losses.cross_entropy`).
@@ -87,3 +87,14 @@ class SqueezeSegV2(nn.Module):
         x = self.deconv13(x) + skip1  # (B, 64, 64, 512)
         logits: Tensor = self.classifier(self.dropout(x))  # (B, 4, 64, 512)
         return logits
+
+
+class KULSeg(SqueezeSegV2):
+    """SqueezeSegV2 with a Fire 7_b between Fire 7 and Fire 8 (Kim et al., 2024, section 4): the variant "single 7b
+    (same)" of its Table 3, one more fire layer with as many filters as Fire 7.
+    """
+
+    def __init__(self, *, n_channels: int = 5, n_classes: int = 4, dropout: float = 0.25) -> None:
+        super().__init__(n_channels=n_channels, n_classes=n_classes, dropout=dropout)
+        self.fire7b = Fire(384, 384, 48)
+        initialize(self.fire7b)

@@ -48,16 +48,6 @@ SLOT_PRIORS = (math.log(0.1), math.log(0.1), -math.log(1.0 / 0.05 - 1.0))
 ELU_GAIN = 1.55
 
 
-def receptive_fields(dilations: tuple[tuple[int, int], ...] = CONTEXT_DILATIONS) -> list[tuple[int, int]]:
-    """Receptive field (width, height) after each of a chain of 3x3 convolutions (Table 1)."""
-    width = height = 1
-    fields = []
-    for across, along in dilations:
-        width, height = width + 2 * across, height + 2 * along
-        fields.append((width, height))
-    return fields
-
-
 def max_pool_with_mask(x: Tensor) -> tuple[Tensor, Tensor]:
     """2x2 max-pooling with stride 2, and the positions of the maxima.
 

@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -32,15 +32,14 @@ from edgeperc.evaluation.kitti_ap import (
 from edgeperc.evaluation.metrics import Confusion
 from edgeperc.evaluation.tables import Record, figures
 from edgeperc.evaluation.truth import Truth
-from edgeperc.inference.session import MAX_ROWS, Session
+from edgeperc.inference.session import Session
 from edgeperc.objects.candidate_boxes import LEAST_SCORE
 from edgeperc.perceiver import Perceiver
 from edgeperc.system.machine import cpu_features, cpu_model
 from edgeperc.types.mounting import MODEL_MOUNTING
-from edgeperc.types.perception import Perception
 from edgeperc.zoo import BF16_FEATURES, Variant, resolve
 
-from .object_parity import TOP_VIEW, candidate_inputs
+from .object_parity import TOP_VIEW, candidate_inputs, objects_of
 from .to_onnx import write_card
 
 T = TypeVar("T")
@@ -76,30 +75,28 @@ def agree(
             f"got {', '.join(map(str, variants.values()))} of {', '.join(sorted(names))}; "
             "expected files of one network, one of them in fp32"
         )
-    runs: dict[str, Variant] = {"fp32": variants["fp32"]}
-    of_objects = variants["fp32"].card.view.kind == "objects"
-    if (
-        not of_objects
-        and importlib.util.find_spec("openvino") is not None
-        and not BF16_FEATURES.isdisjoint(cpu_features())
-    ):
-        runs["bf16"] = variants["fp32"]
+    fp32 = variants["fp32"]
+    runs: dict[str, Variant] = {"fp32": fp32}
+    kind, has_bf16 = fp32.card.view.kind, not BF16_FEATURES.isdisjoint(cpu_features())
+    if kind != "objects" and importlib.util.find_spec("openvino") is not None and has_bf16:
+        runs["bf16"] = fp32
     runs |= variants
-    if variants["fp32"].card.view.kind == "camera":
+    measure: Callable[..., Measured]
+    if kind == "camera":
         if camvid is None:
-            raise PointsError(f"{variants['fp32'].name} is of a camera, and there is no labeled image; name CamVid")
-        measure = partial(_measure_images, data=LabeledImages(camvid), split=split, n_images=n_scans)
-    elif of_objects:
+            raise PointsError(f"{fp32.name} is of a camera, and there is no labeled image; name CamVid")
+        measure = partial(_measure_images, data=LabeledImages(camvid))
+    elif kind == "objects":
         if kitti is None:
             raise PointsError("objects are compared on KITTI's boxes; name a KITTI object set")
-        measure = partial(_measure_objects, objects=KittiObjects(kitti), split=split, n_scans=n_scans)
+        measure = partial(_measure_objects, objects=KittiObjects(kitti))
     else:
-        measure = partial(_measure, kitti=kitti, semantickitti=semantickitti, split=split, n_scans=n_scans)
-    measured = {precision: measure(variant, precision) for precision, variant in runs.items()}
+        measure = partial(_measure, kitti=kitti, semantickitti=semantickitti)
+    measured = {precision: measure(variant, precision, split, n_scans) for precision, variant in runs.items()}
     options = [f"--kitti KITTI --split {split}"] * (kitti is not None)
     options += [f"--camvid CAMVID --split {split}"] * (camvid is not None)
     options += ["--semantickitti SEMANTICKITTI"] * (semantickitti is not None) + [f"--scans {n_scans}"] * bool(n_scans)
-    command = " ".join(["edgeperc-export agree", variants["fp32"].name, *options])
+    command = " ".join(["edgeperc-export agree", fp32.name, *options])
     records = {precision: record_of(each, measured["fp32"], command) for precision, each in measured.items()}
     for variant in variants.values():
         own = {precision: records[precision] for precision, each in runs.items() if each is variant}
@@ -140,11 +137,11 @@ def record_of(own: Measured, fp32: Measured, command: str) -> dict[str, Any]:
 def _measure(
     variant: Variant,
     precision: str,
+    split: str,
+    n_scans: int | None,
     *,
     kitti: Path | None,
     semantickitti: Path | None,
-    split: str,
-    n_scans: int | None,
 ) -> Measured:
     judge = Judge([variant.path], Perceiving(boxes_from="network"))
     by = _engine(judge.perceive.sessions[0], precision)
@@ -163,7 +160,8 @@ def _measure(
     labels = []
     for block, truth in truths():
         records.setdefault(block, []).append(judge.record(truth)[0])
-        labels.append(_labels(judge.perceive(truth.points)))
+        found = judge.perceive(truth.points)
+        labels.append(found.points.labels if found.points is not None else found.require_top_view().labels.ravel())
     if not labels:
         raise PointsError(f"no labeled scan of {split} drives in {kitti}, {semantickitti}; name a KITTI object set")
     blocks = [figures(of_block, 0) for of_block in records.values()]
@@ -173,12 +171,7 @@ def _measure(
 
 
 def _measure_objects(
-    variant: Variant,
-    precision: str,
-    *,
-    objects: KittiObjects,
-    split: str,
-    n_scans: int | None,
+    variant: Variant, precision: str, split: str, n_scans: int | None, *, objects: KittiObjects
 ) -> Measured:
     """Class of each cluster; overlap from above of each object with the best box; mean AP of cars (bird's eye and 3-D
     at 0.7, moderate), with the boxes of the top view as candidates, too.
@@ -200,28 +193,21 @@ def _measure_objects(
         table += count_in_image(truth, boxes, frame.drive)
         overlaps += [each.iou for each in best_candidates(truth, boxes, frame.drive)]
         inputs, _, _ = candidate_inputs(session.card, frame.points)
-        session.input[: len(inputs[:MAX_ROWS])] = inputs[:MAX_ROWS]
-        outputs = session.run(min(len(inputs), MAX_ROWS))["objects"][: len(inputs)] if len(inputs) else inputs[:, 0]
+        outputs = objects_of(session, inputs) if len(inputs) else inputs[:, 0]
         labels.append(outputs[:, : len(session.card.classes)].argmax(axis=1).astype(np.uint8))
     aps = [average_precisions(table.counts["car", overlap, "moderate"])[2] for overlap in ("bird's eye 0.7", "3-D 0.7")]
     return Measured(labels, float(np.mean(overlaps)), float(np.mean(aps)), _engine(session, precision))
 
 
 def _measure_images(
-    variant: Variant,
-    precision: str,
-    *,
-    data: LabeledImages,
-    split: str,
-    n_images: int | None,
+    variant: Variant, precision: str, split: str, n_images: int | None, *, data: LabeledImages
 ) -> Measured:
     perceive = Perceiver([variant.path])
     by = _engine(perceive.sessions[0], precision)
     labels, confusion = [], Confusion(variant.card.classes)
     for file in _spread(data.files(split), n_images):
         image, truth = data.read(file)
-        found = perceive(image=image).image
-        assert found is not None
+        found = perceive(image=image).require_image()
         labels.append(found.labels.ravel())
         confusion.update(found.labels, truth)
     return Measured(labels, confusion.mean_iou(), None, by)
@@ -230,14 +216,6 @@ def _measure_images(
 def _spread(names: Sequence[T], most: int | None) -> Sequence[T]:
     """At most ``most`` of the names or files, evenly spread."""
     return names if most is None else names[:: max(1, -(-len(names) // most))]
-
-
-def _labels(found: Perception) -> NDArray[np.uint8]:
-    """Labels of points or of cells after post-processing, flat."""
-    if found.points is not None:
-        return found.points.labels
-    assert found.top_view is not None
-    return found.top_view.labels.ravel()
 
 
 def _ious(block: Mapping[str, Any]) -> list[float]:

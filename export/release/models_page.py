@@ -182,24 +182,19 @@ def _validation(path: Path) -> Iterable[str]:
         "scenes. Relative time: time of the network alone in stock onnxruntime with two threads, divided by the time "
         "of the shipped fp32 file. Both were measured in turn on a busy computer (`bench/RESULTS.md` has times)."
     )
-    for title, key, columns in (
-        ("points", "points", ("car", "pedestrian", "cyclist")),
-        ("vehicles", "vehicles", ("ap", "precision", "recall", "iou")),
-    ):
-        own = [row for row in rows if key in row]
-        if key == "points":
-            head = [f"IoU {name}" for name in columns]
-            counts = [f"{own[0][key][c]['n_points']:,} points of {own[0][key][c]['n_objects']} {c}s" for c in columns]
-        else:
-            head = ["AP50", "precision", "recall", "IoU of cells"]
-            counts = [f"{own[0][key]['n_boxes']} boxes", f"{own[0][key]['n_cells']:,} cells"]
-        yield from _head(f"{title} ({', '.join(counts)})", [*head, "relative time"])
-        for row in own:
-            if key == "points":
-                cells = [_percent(row[key][name], "iou") for name in columns]
-            else:
-                cells = [_percent(row[key], name) for name in columns]
-            yield _row(f"`{row['file']}`", *cells, f"{row['relative_time']:.1f}")
+    of_points, of_vehicles = ([row for row in rows if key in row] for key in ("points", "vehicles"))
+    classes, first = ("car", "pedestrian", "cyclist"), of_points[0]["points"]
+    counts = [f"{first[c]['n_points']:,} points of {first[c]['n_objects']} {c}s" for c in classes]
+    yield from _head(f"points ({', '.join(counts)})", [*(f"IoU {c}" for c in classes), "relative time"])
+    for row in of_points:
+        cells = [_percent(row["points"][c], "iou") for c in classes]
+        yield _row(f"`{row['file']}`", *cells, f"{row['relative_time']:.1f}")
+    first = of_vehicles[0]["vehicles"]
+    title = f"vehicles ({first['n_boxes']} boxes, {first['n_cells']:,} cells)"
+    yield from _head(title, ["AP50", "precision", "recall", "IoU of cells", "relative time"])
+    for row in of_vehicles:
+        cells = [_percent(row["vehicles"], name) for name in ("ap", "precision", "recall", "iou")]
+        yield _row(f"`{row['file']}`", *cells, f"{row['relative_time']:.1f}")
     yield from ("", f"Made by `{_alone(table['command'])}`.")
 
 

@@ -7,24 +7,30 @@ the largest values over points, and add, as fast in fp32.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import onnx
-import onnxruntime
 from numpy.typing import NDArray
-from onnx import helper, numpy_helper
 
-from edgeperc.errors import ModelError, PointsError
+from edgeperc.errors import PointsError
 from edgeperc.inference.session import Session
 from edgeperc.types.card import ModelCard
 
 from .int8_graph import sort
-from .object_parity import candidate_inputs
-from .quantize import Calibration, folded, race, saturates, speed_of, training_of
-from .to_onnx import halve, with_golden, write_card
+from .object_parity import candidate_inputs, objects_of
+from .quantize import (
+    Calibration,
+    check_fp32,
+    folded,
+    in_int8,
+    inner_tensors,
+    race,
+    saturates,
+    speed_of,
+    write_int8,
+)
 
 ROUNDED = ("close_point2.weight", "close_point3.weight", "close_point4.weight")
 MOST = 0.99995  # quantile of a tensor's values that the largest 8-bit number stands for
@@ -42,24 +48,13 @@ def quantize_objects(
 ) -> ModelCard:
     """Write an object network in int8, if it is faster here; parameters and errors as of `quantize`."""
     card = ModelCard.read(path)
-    if card.precision != "fp32":
-        raise ModelError(f"{path} is in {card.precision}; quantize the model in fp32")
+    check_fp32(path, card)
     batches = list(candidate_batches(card, calibration.scans))
     if not batches:
         raise PointsError(f"no candidate in {len(calibration.scans)} scans to calibrate on; name scans with objects")
     seven_bits = saturates() if seven_bits is None else seven_bits
-    model = rounded(folded(path), batches, card.input.name, seven_bits=seven_bits)
-    model.producer_name, model.producer_version = "edgeperc", ""
-    left_alone = ["the first layer of points", "the first look", "the layers of a candidate"]
-    made = {"left_alone": left_alone, "weight_bits": 7 if seven_bits else 8}
-    card = replace(
-        card, precision="int8", precisions={}, training=training_of(path, card, calibration, made), parity={}
-    )
-    halve(model.graph, exactly=True)
-    card = with_golden(model, card)
-    trial = out.with_name(f".{out.name}.trial.onnx")
-    try:
-        write_card(model, card, trial)
+
+    def compared(trial: Path) -> dict[str, Any]:
         share = f"{len(ROUNDED)} products in int8, {len(batches[0])} candidates"
         speed = speed_of(path, share, race(path, trial, n_threads, batches=batches))
         parity = {
@@ -67,23 +62,19 @@ def quantize_objects(
             "label_agreement": _agreement(path, trial, batches, len(card.classes)),
             "speed": f"{speed}, {len(batches[0])} candidates",
         }
-        card = replace(card, parity=parity)
-        write_card(model, card, out)
-    finally:
-        trial.unlink(missing_ok=True)
-    return card
+        return {"parity": parity}
+
+    model = rounded(folded(path), card, batches, seven_bits=seven_bits)
+    left_alone = ["the first layer of points", "the first look", "the layers of a candidate"]
+    made = {"left_alone": left_alone, "weight_bits": 7 if seven_bits else 8}
+    return write_int8(path, out, model, card, calibration, made, compared)
 
 
 def _agreement(one: Path, other: Path, batches: Sequence[NDArray[np.float32]], n_classes: int) -> float:
     """Share of the candidates to which two networks give the same class."""
-    classes = []
-    for session in (Session(path, "cpu") for path in (one, other)):
-        found = []
-        for batch in batches:
-            session.input[: len(batch)] = batch
-            found.append(session.run(len(batch))["objects"][: len(batch), :n_classes].argmax(axis=1))
-        classes.append(np.concatenate(found))
-    return float((classes[0] == classes[1]).mean())
+    sessions = [Session(path, "cpu") for path in (one, other)]
+    classes = [[objects_of(session, batch)[:, :n_classes].argmax(axis=1) for batch in batches] for session in sessions]
+    return float((np.concatenate(classes[0]) == np.concatenate(classes[1])).mean())
 
 
 def candidate_batches(card: ModelCard, scans: Sequence[NDArray[np.float32]]) -> Iterator[NDArray[np.float32]]:
@@ -95,35 +86,26 @@ def candidate_batches(card: ModelCard, scans: Sequence[NDArray[np.float32]]) -> 
 
 
 def rounded(
-    model: onnx.ModelProto, batches: Sequence[NDArray[np.float32]], input_name: str, *, seven_bits: bool = False
+    model: onnx.ModelProto, card: ModelCard, batches: Sequence[NDArray[np.float32]], *, seven_bits: bool = False
 ) -> onnx.ModelProto:
     """A folded graph of `with_first_look` with the products of `ROUNDED` in int8, inputs by their range in batches."""
-    copy = onnx.ModelProto()
-    copy.CopyFrom(model)
-    graph = copy.graph
-    products = [node for node in graph.node if node.op_type == "Gemm" and node.input[1] in ROUNDED]
+    products = [node for node in model.graph.node if node.op_type == "Gemm" and node.input[1] in ROUNDED]
     if len(products) != len(ROUNDED):
         raise ValueError(f"the graph has {len(products)} of the {len(ROUNDED)} products; export the network again")
-    ranges = _ranges(model, batches, input_name, [node.input[0] for node in products])
-    for node in products:
-        low, high = ranges[node.input[0]]
-        _round_weights(graph, node, (high - low) / 255.0, 63 if seven_bits else 127)
-        _round_input(graph, node, low, high)
-    sort(graph)
-    return copy
+    ranges = _ranges(model, card, batches, [node.input[0] for node in products])
+    names, settings = [node.name for node in products], {"OpTypesToExcludeOutputQuantization": ["Gemm"]}
+    made = in_int8(model, names, ranges, ["Gemm"], seven_bits, settings)
+    sort(made.graph)
+    return made
 
 
 def _ranges(
-    model: onnx.ModelProto, batches: Sequence[NDArray[np.float32]], input_name: str, names: Sequence[str]
+    model: onnx.ModelProto, card: ModelCard, batches: Sequence[NDArray[np.float32]], names: Sequence[str]
 ) -> dict[str, tuple[float, float]]:
     """Smallest and largest value of inner tensors that count; 0 is between them."""
-    watched = onnx.ModelProto()
-    watched.CopyFrom(model)
-    watched.graph.output.extend(helper.make_empty_tensor_value_info(name) for name in names)
-    session = onnxruntime.InferenceSession(watched.SerializeToString(), providers=["CPUExecutionProvider"])
     values: Mapping[str, list[NDArray[np.float32]]] = {name: [] for name in names}
-    for batch in batches:
-        for name, value in zip(names, session.run(list(names), {input_name: batch}), strict=True):
+    for tensors in inner_tensors(model, card, batches, names):
+        for name, value in tensors.items():
             flat = value.reshape(-1)
             values[name].append(flat[:: max(1, len(flat) // N_VALUES)])
     found = {}
@@ -132,41 +114,3 @@ def _ranges(
         low, high = np.quantile(every, 1.0 - MOST), np.quantile(every, MOST)
         found[name] = (min(float(low), 0.0), max(float(high), 1e-6))
     return found
-
-
-def _round_input(graph: onnx.GraphProto, node: onnx.NodeProto, low: float, high: float) -> None:
-    """Quantize the input of a product, and dequantize it: engines compute what is between in int8."""
-    name, scale = node.input[0], np.float32((high - low) / 255.0)
-    steps = [
-        _constant(graph, f"{name}_scale", np.array(scale)),
-        _constant(graph, f"{name}_zero", np.array(np.clip(np.round(-low / scale), 0, 255), np.uint8)),
-    ]
-    node.input[0] = f"{name}_rounded"
-    graph.node.append(helper.make_node("QuantizeLinear", [name, *steps], [f"{name}_q"]))
-    graph.node.append(helper.make_node("DequantizeLinear", [f"{name}_q", *steps], [node.input[0]]))
-
-
-def _round_weights(graph: onnx.GraphProto, node: onnx.NodeProto, of_input: float, most: int) -> None:
-    """Weights (outputs, inputs) in int8 by output, and offsets in int32, in steps of both scales."""
-    values = {weight.name: numpy_helper.to_array(weight) for weight in graph.initializer}
-    weight, offset = (values[name].astype(np.float64) for name in node.input[1:3])
-    scale = (np.maximum(np.abs(weight).max(axis=1), 1e-9) / most).astype(np.float32)
-    of_sums = scale * np.float32(of_input)
-    numbers: list[tuple[NDArray[Any], NDArray[np.float32]]] = [
-        (np.round(weight / scale[:, None]).astype(np.int8), scale),
-        (np.round(offset / of_sums).astype(np.int32), of_sums),
-    ]
-    for k, (integers, steps) in enumerate(numbers, start=1):
-        name = node.input[k]
-        given = [
-            _constant(graph, f"{name}_q", integers),
-            _constant(graph, f"{name}_scale", steps),
-            _constant(graph, f"{name}_zero", np.zeros(len(steps), integers.dtype)),
-        ]
-        node.input[k] = f"{name}_rounded"
-        graph.node.append(helper.make_node("DequantizeLinear", given, [node.input[k]], axis=0))
-
-
-def _constant(graph: onnx.GraphProto, name: str, value: NDArray[Any]) -> str:
-    graph.initializer.append(numpy_helper.from_array(value, name))
-    return name

@@ -39,7 +39,14 @@ def candidate_inputs(
     return features, places, crops.level
 
 
-def compare_objects(network: ObjectNet, session: Session, scans: Sequence[NDArray[Any]]) -> dict[str, float]:
+def objects_of(session: Session, inputs: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Outputs of the network for candidates, at most `MAX_ROWS`."""
+    n = min(len(inputs), MAX_ROWS)
+    session.input[:n] = inputs[:n]
+    return session.run(n)["objects"][:n]
+
+
+def compare_objects(network: ObjectNet, session: Session, scans: Sequence[NDArray[Any]]) -> tuple[float, float, float]:
     """Differences between torch and onnxruntime on the clusters of scans, as `to_onnx.verify` says: of classes among
     candidates with a score of 0.1 or more, of places and sizes [m].
     """
@@ -52,8 +59,7 @@ def compare_objects(network: ObjectNet, session: Session, scans: Sequence[NDArra
             continue
         with torch.no_grad():
             expected = network.eval().detect(torch.from_numpy(features)).numpy()
-        session.input[: len(features)] = features
-        actual = session.run(len(features))["objects"][: len(features)]
+        actual = objects_of(session, features)
         worst = max(worst, float(np.quantile(np.abs(actual - expected), 0.999)) / max(float(expected.std()), 1e-6))
         boxes, right = (decode_objects(card, outputs, places, level) for outputs in (actual, expected))
         likely = right[:, SCORE] >= 0.1
@@ -62,9 +68,4 @@ def compare_objects(network: ObjectNet, session: Session, scans: Sequence[NDArra
             agreement = min(agreement, float(alike.sum() / likely.sum()))
         if alike.any():
             box_deviation = max(box_deviation, float(np.abs(boxes - right)[alike, :6].max()))
-    return {
-        "n_scans": len(scans),
-        "max_deviation": worst,
-        "label_agreement": agreement,
-        "box_deviation": box_deviation,
-    }
+    return worst, agreement, box_deviation

@@ -15,6 +15,7 @@ convolutions in int8.
 
 from __future__ import annotations
 
+import copy
 import hashlib
 import platform
 import re
@@ -52,9 +53,9 @@ from edgeperc.system.machine import cpu_features
 from edgeperc.types.card import ModelCard
 from edgeperc.zoo import INT8_FEATURES
 
-from ..data.simulate import parity_images, parity_scans
+from ..data.simulate import parity_samples
 from .int8_graph import equalize, repeat_pixels
-from .to_onnx import halve, pixel_labels, views, with_golden, write_card
+from .to_onnx import halve, pixel_labels, views, write_checked
 
 # Operators that onnxruntime's CPU provider computes in int8. It has no int8 kernel for ConvTranspose, Elu or Equal.
 ROUNDED_OPS = (
@@ -78,6 +79,8 @@ BIN_BITS = 13  # of a float32: sign, exponent and four bits of the mantissa
 N_RUNS = 40
 DRIVE = re.compile(r"\d{4}_\d\d_\d\d_drive_\d{4}")
 
+Ranges = Mapping[str, tuple[float, float]]
+"""Smallest and largest value of tensors, by name."""
 Race = Callable[[Path, Path, "int | None"], tuple[NDArray[np.float64], NDArray[np.float64]]]
 
 
@@ -177,7 +180,7 @@ class Calibrated:
 
     card: ModelCard
     model: onnx.ModelProto
-    ranges: TensorsData
+    ranges: Ranges
     images: Sequence[NDArray[np.float32]]
     means: Mapping[str, NDArray[np.float64]]
     probes: Sequence[NDArray[np.float32]]
@@ -200,7 +203,7 @@ class Calibrated:
         names = [name for node in model.graph.node for name in node.output if name]
         if strength:
             sizes = {name: np.zeros(1) for name in names}
-            for tensors in _tensors(model, card, images, names):
+            for tensors in inner_tensors(model, card, images, names):
                 sizes |= {name: np.maximum(sizes[name], _by_channel(abs(v)).max(1)) for name, v in tensors.items()}
             equalize(model, {name: size**strength for name, size in sizes.items()})
         made = [node.output[0] for node in model.graph.node if node.op_type == "Conv"]
@@ -209,8 +212,7 @@ class Calibrated:
 
     def rounded(self, convolutions: Collection[str]) -> onnx.ModelProto:
         """The network with these convolutions, and the operators between them, in int8."""
-        model = onnx.ModelProto()
-        model.CopyFrom(self.model)
+        model = copy.deepcopy(self.model)
         biases = {each.name: each for each in model.graph.initializer}
         corrected = [node for node in model.graph.node if node.name in convolutions and node.output[0] in self.means]
         for node in [node for node in corrected if len(node.input) > 2]:
@@ -225,56 +227,56 @@ class Calibrated:
         return rounded
 
     def _rounded(self, fp32: onnx.ModelProto, convolutions: Collection[str]) -> onnx.ModelProto:
-        names = _between(fp32.graph, convolutions)
-        model = onnx.ModelProto()
-        model.CopyFrom(fp32)
-        if not names:
-            return model
-        quantizer = QDQQuantizer(
-            model,
-            True,
-            self.seven_bits,
-            QuantType.QInt8,
-            QuantType.QUInt8,
-            self.ranges,
-            [*names],
-            [],
-            [*ROUNDED_OPS],
-            {},
-        )
-        quantizer.quantize_model()
-        rounded: onnx.ModelProto = quantizer.model.model
-        _unround(rounded.graph, names)
-        return rounded
+        return in_int8(fp32, _between(fp32.graph, convolutions), self.ranges, ROUNDED_OPS, self.seven_bits)
 
     def noise(self, convolutions: Collection[str]) -> float:
         """`_noise` of the outputs if these convolutions are in int8."""
         return _noise(_outputs(self.rounded(convolutions), self.card, self.probes), self.outputs)
 
 
-def _ranges(model: onnx.ModelProto, card: ModelCard, images: Sequence[NDArray[np.float32]]) -> TensorsData:
+def _ranges(model: onnx.ModelProto, card: ModelCard, images: Sequence[NDArray[np.float32]]) -> Ranges:
     """The range of every tensor of a network, from a histogram of its values over all images."""
     names = [card.input.name, *(name for node in model.graph.node for name in node.output if name)]
     counts = {name: np.zeros(1 << BIN_BITS, np.int64) for name in names}
-    for tensors in tqdm(_tensors(model, card, images, names), desc="calibrating", total=len(images), unit="scan"):
+    for tensors in tqdm(inner_tensors(model, card, images, names), desc="calibrating", total=len(images), unit="scan"):
         for name, values in tensors.items():
             if values.dtype == np.float32:
                 bins = np.ascontiguousarray(values).view(np.uint32).ravel() >> (32 - BIN_BITS)
                 counts[name] += np.bincount(bins, minlength=1 << BIN_BITS)
-    ranges = {name: range_of(count) for name, count in counts.items()}
-    data = {name: tuple(np.array(bound, np.float32) for bound in bounds) for name, bounds in ranges.items()}
-    return TensorsData(CalibrationMethod.MinMax, data)
+    return {name: range_of(count) for name, count in counts.items()}
 
 
-def _tensors(
+def in_int8(
+    fp32: onnx.ModelProto,
+    names: Collection[str],
+    ranges: Ranges,
+    kinds: Sequence[str],
+    seven_bits: bool,
+    settings: Mapping[str, Any] | None = None,
+) -> onnx.ModelProto:
+    """A graph with the operators of these names and kinds in int8; ``settings`` are onnxruntime's."""
+    if not names:
+        return copy.deepcopy(fp32)
+    bounds = {name: tuple(np.array(bound, np.float32) for bound in of) for name, of in ranges.items()}
+    given: Sequence[Any]
+    given = QuantType.QInt8, QuantType.QUInt8, TensorsData(CalibrationMethod.MinMax, bounds), [*names], [], [*kinds]
+    quantizer = QDQQuantizer(copy.deepcopy(fp32), True, seven_bits, *given, dict(settings or {}))
+    quantizer.quantize_model()
+    rounded: onnx.ModelProto = quantizer.model.model
+    _unround(rounded.graph, names)
+    return rounded
+
+
+def inner_tensors(
     model: onnx.ModelProto, card: ModelCard, images: Sequence[NDArray[np.float32]], names: Sequence[str]
 ) -> Iterator[dict[str, NDArray[Any]]]:
     """Inner tensors of a network by their names, for one image after the other."""
-    augmented = onnx.ModelProto()
-    augmented.CopyFrom(model)
+    augmented = copy.deepcopy(model)
     known = {each.name for each in (*model.graph.input, *model.graph.output)}
     augmented.graph.output.extend(onnx.helper.make_empty_tensor_value_info(name) for name in names if name not in known)
-    session = _session(augmented)
+    options = onnxruntime.SessionOptions()
+    options.log_severity_level = 3
+    session = onnxruntime.InferenceSession(augmented.SerializeToString(), options, providers=["CPUExecutionProvider"])
     inner = [name for name in names if name != card.input.name]
     for image in images:
         own = {card.input.name: image} if len(inner) < len(names) else {}
@@ -291,7 +293,7 @@ def channel_means(
 ) -> dict[str, NDArray[np.float64]]:
     """Mean of each channel of some tensors (1, C, ...) over all images."""
     sums: dict[str, NDArray[np.float64]] = {}
-    for tensors in _tensors(model, card, images, names):
+    for tensors in inner_tensors(model, card, images, names):
         for name, values in tensors.items():
             sums[name] = sums.get(name, 0.0) + _by_channel(values).mean(axis=1, dtype=np.float64) / len(images)
     return sums
@@ -343,20 +345,12 @@ def _unround(graph: onnx.GraphProto, rounded: Collection[str]) -> None:
             node.input[:] = [origin.get(name, name) for name in node.input]
 
 
-def _session(model: onnx.ModelProto) -> onnxruntime.InferenceSession:
-    options = onnxruntime.SessionOptions()
-    options.log_severity_level = 3
-    return onnxruntime.InferenceSession(model.SerializeToString(), options, providers=["CPUExecutionProvider"])
-
-
 def _outputs(
     model: onnx.ModelProto, card: ModelCard, images: Sequence[NDArray[np.float32]]
 ) -> list[dict[str, NDArray[np.float32]]]:
     """Raw outputs by kind, without the batch axis."""
-    session = _session(model)
-    names, kinds = [o.name for o in card.outputs], [o.kind for o in card.outputs]
-    runs = (session.run(names, {card.input.name: image}) for image in images)
-    return [{kind: output[0] for kind, output in zip(kinds, run, strict=True)} for run in runs]
+    runs = inner_tensors(model, card, images, [o.name for o in card.outputs])
+    return [{o.kind: run[o.name][0] for o in card.outputs} for run in runs]
 
 
 def _noise(
@@ -550,23 +544,16 @@ def quantize(
     if not calibration.scans:
         raise PointsError("no scan to calibrate on; expected at least one")
     card = Session(path, "cpu").card
-    if card.view.kind == "camera" and labeled.camvid is None:
+    camera = card.view.kind == "camera"
+    if camera and labeled.camvid is None:
         raise OptionError(f"{path} is of a camera; give --camvid to calibrate and evaluate it on")
-    if card.precision != "fp32":
-        raise ModelError(f"{path} is in {card.precision}; quantize the model in fp32")
+    check_fp32(path, card)
     seven_bits = saturates() if seven_bits is None else seven_bits
     model, chosen, kept, noise = _rounded(path, card, calibration.scans, exclude, seven_bits, max_noise)
-    share = f"{len(chosen)} of {len(chosen) + len(kept)} convolutions in int8"
-    made = {"left_alone": kept, "noise": noise, "weight_bits": 7 if seven_bits else 8}
-    training = training_of(path, card, calibration, made)
-    card = replace(card, precision="int8", precisions={}, training=training, parity={}, metrics={})
-    halve(model.graph, exactly=True)
-    card = with_golden(model, card)
-    trial = out.with_name(f".{out.name}.trial.onnx")
-    try:
-        write_card(model, card, trial)
+
+    def compared(trial: Path) -> dict[str, Any]:
+        share = f"{len(chosen)} of {len(chosen) + len(kept)} convolutions in int8"
         speed = speed_of(path, share, race(path, trial, n_threads))
-        camera = card.view.kind == "camera"
         figures, losses = (_evaluated_on_images if camera else _evaluated_on_scans)(path, trial, out.name, labeled)
         lines = {
             name: f"{name} {score:.3f} to {own:.3f} (loss {low:.3f} to {high:.3f})"
@@ -576,12 +563,42 @@ def quantize(
         if worse:
             raise RefusedError(f"{path}: more than {MAX_LOSS} lost with {share}: {'; '.join(worse)} ({speed})")
         worst = lines[max(losses, key=lambda name: losses[name][0] - losses[name][1])] if losses else "none"
-        parity = {**_parity(path, trial), "speed": speed, "largest_loss": worst}
-        card = replace(card, parity=parity, metrics=figures)
-        write_card(model, card, out)
-    finally:
-        trial.unlink(missing_ok=True)
-    return card
+        return {"parity": {**_parity(path, trial), "speed": speed, "largest_loss": worst}, "metrics": figures}
+
+    made = {"left_alone": kept, "noise": noise, "weight_bits": 7 if seven_bits else 8}
+    return write_int8(path, out, model, replace(card, metrics={}), calibration, made, compared)
+
+
+def check_fp32(path: Path, card: ModelCard) -> None:
+    """Raise `ModelError` if a model is not in fp32."""
+    if card.precision != "fp32":
+        raise ModelError(f"{path} is in {card.precision}; quantize the model in fp32")
+
+
+def write_int8(
+    path: Path,
+    out: Path,
+    model: onnx.ModelProto,
+    card: ModelCard,
+    calibration: Calibration,
+    made: Mapping[str, Any],
+    compared: Callable[[Path], dict[str, Any]],
+) -> ModelCard:
+    """Write the rounded graph of a model with its card, if ``compared`` with it raises nothing (`write_checked`)."""
+    (scans, hashes), frames = calibration, card.training.get("frames")
+    kinds = f"{len(hashes)} real and {len(scans) - len(hashes)} simulated scans"
+    quantized = {
+        "from": f"{card.name} {card.version}",
+        "graph_sha256": hashlib.sha256(onnx.load(path).graph.SerializeToString(deterministic=True)).hexdigest(),
+        "calibration": f"{len(hashes)} images of CamVid" if card.view.kind == "camera" else kinds,
+        **made,
+    }
+    frames = {**dict(zip(hashes, hashes, strict=True)), **(frames if isinstance(frames, Mapping) else {})}
+    training = dict(card.training) | {"frames": frames, "quantized": quantized}
+    model.producer_name, model.producer_version = "edgeperc", ""
+    halve(model.graph, exactly=True)
+    int8 = replace(card, precision="int8", precisions={}, training=training, parity={})
+    return write_checked(model, int8, out, compared)
 
 
 def _rounded(
@@ -603,25 +620,8 @@ def _rounded(
     noise, fp32 = min(tried, key=lambda each: each[0])
     chosen, noise = _choose(fp32, candidates, limit, noise)
     model = fp32.rounded(chosen)
-    model.producer_name, model.producer_version = "edgeperc", ""
     kept = [n.name for n in fp32.model.graph.node if n.op_type == "Conv" and n.name not in chosen]
     return model, chosen, kept, noise
-
-
-def training_of(path: Path, card: ModelCard, calibration: Calibration, made: Mapping[str, Any]) -> dict[str, Any]:
-    """What the card of the int8 model says of its training and of how it was ``made``."""
-    (scans, hashes), frames = calibration, card.training.get("frames")
-    return dict(card.training) | {
-        "frames": {**dict(zip(hashes, hashes, strict=True)), **(frames if isinstance(frames, Mapping) else {})},
-        "quantized": {
-            "from": f"{card.name} {card.version}",
-            "graph_sha256": hashlib.sha256(onnx.load(path).graph.SerializeToString(deterministic=True)).hexdigest(),
-            "calibration": f"{len(hashes)} images of CamVid"
-            if card.view.kind == "camera"
-            else f"{len(hashes)} real and {len(scans) - len(hashes)} simulated scans",
-            **made,
-        },
-    }
 
 
 def speed_of(path: Path, share: str, times: tuple[NDArray[np.float64], NDArray[np.float64]]) -> str:
@@ -664,7 +664,7 @@ def _parity(path: Path, rounded: Path) -> dict[str, float]:
     """Smallest share of pixels with the same label as in fp32, on simulated scans outside training and calibration."""
     sessions, agreement = [Session(each, "cpu") for each in (path, rounded)], 1.0
     card = sessions[0].card
-    scans: Sequence[NDArray[Any]] = parity_images([]) if card.view.kind == "camera" else parity_scans([])
+    scans = parity_samples(card.view.kind)
     for image, _ in views(card, scans):
         labels = []
         for session in sessions:

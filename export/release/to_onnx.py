@@ -10,7 +10,7 @@ import copy
 import hashlib
 import json
 import warnings
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -187,6 +187,23 @@ def write_card(model: onnx.ModelProto, card: ModelCard, path: Path) -> None:
             raise ParityError(f"{path}: the card read back differs from the card written")
 
 
+def write_checked(
+    model: onnx.ModelProto, card: ModelCard, path: Path, check: Callable[[Path], Mapping[str, Any]]
+) -> ModelCard:
+    """Write a graph with its card, a golden record, and what ``check`` of a trial file adds to the card, if it raises
+    nothing. Raises as `write_card` and the check.
+    """
+    card = with_golden(model, card)
+    trial = path.with_name(f".{path.name}.trial.onnx")
+    try:
+        write_card(model, card, trial)
+        card = replace(card, **check(trial))
+        write_card(model, card, path)
+    finally:
+        trial.unlink(missing_ok=True)
+    return card
+
+
 def with_golden(model: onnx.ModelProto, card: ModelCard) -> ModelCard:
     """The card with a golden record: a known input, and this computer's outputs for it."""
     import onnxruntime
@@ -244,9 +261,7 @@ def verify(network: nn.Module, path: Path, scans: Sequence[NDArray[Any]]) -> dic
     session = Session(path, "cpu")
     card = session.card
     if isinstance(network, ObjectNet):
-        parity = compare_objects(network, session, scans)
-        _check_parity(path, parity)
-        return parity
+        return _checked_parity(path, len(scans), *compare_objects(network, session, scans))
     worst, agreement, box_deviation = 0.0, 1.0, 0.0
     for image, returned in views(card, scans):
         with torch.no_grad():
@@ -270,25 +285,19 @@ def verify(network: nn.Module, path: Path, scans: Sequence[NDArray[Any]]) -> dic
             ((kind, logits),) = expected.items()
             labels, expected_labels = (pixel_labels(raw, kind) for raw in (actual[kind], logits))
         agreement = min(agreement, float((labels == expected_labels).mean()))
-    parity = {
-        "n_scans": len(scans),
-        "max_deviation": worst,
-        "label_agreement": agreement,
-        "box_deviation": box_deviation,
-    }
-    _check_parity(path, parity)
-    return parity
+    return _checked_parity(path, len(scans), worst, agreement, box_deviation)
 
 
-def _check_parity(path: Path, parity: Mapping[str, float]) -> None:
-    """Raise `ParityError` if a difference exceeds its limit."""
-    worst, agreement, box_deviation = (parity[n] for n in ("max_deviation", "label_agreement", "box_deviation"))
+def _checked_parity(path: Path, n_scans: int, worst: float, agreement: float, box_deviation: float) -> dict[str, float]:
+    """What the card says of the differences; raises `ParityError` if one exceeds its limit."""
     if worst > MAX_DEVIATION or agreement < MIN_AGREEMENT or box_deviation > 0.05:
         raise ParityError(
             f"{path}: raw outputs differ by {worst:.3g} standard deviations (at most {MAX_DEVIATION}), labels "
             f"agree on {agreement:.4%} of the pixels or candidates (at least {MIN_AGREEMENT:.2%}), boxes differ by up "
             f"to {box_deviation:.3g} m (at most 0.05)"
         )
+    found = {"max_deviation": worst, "label_agreement": agreement, "box_deviation": box_deviation}
+    return {"n_scans": n_scans, **found}
 
 
 def _deviation(boxes: Sequence[Box], expected: Sequence[Box]) -> float:
@@ -329,13 +338,4 @@ def export(
         training=_training(recipe, notes | {"licence": licence}),
         metrics=dict(metrics or {}),
     )
-    model = to_graph(network, card)
-    card = with_golden(model, card)
-    trial = path.with_name(f".{path.name}.trial.onnx")
-    try:
-        write_card(model, card, trial)
-        card = replace(card, parity=verify(network, trial, scans))
-        write_card(model, card, path)
-    finally:
-        trial.unlink(missing_ok=True)
-    return card
+    return write_checked(to_graph(network, card), card, path, lambda trial: {"parity": verify(network, trial, scans)})

@@ -31,38 +31,23 @@ from .checkpoint import build_network, read_checkpoint
 from .images import camvid_samples, confusions, read_camvid
 from .train import Data, Run, train
 
-ELEVEN: Mapping[str, tuple[str, float]] = {
-    "U-Net ReLU": ("unet", 0.0),
-    "Small U-Net ReLU": ("unet-small", 0.0),
-    "Small U-Net Leaky ReLU": ("unet-small-leaky", 0.0),
-    "Long U-Net (dropout 0.7)": ("unet-long", 0.7),
-    "Long U-Net (dropout 0.5)": ("unet-long", 0.5),
-    "SegNet": ("segnet", 0.0),
-    "SegNet (dropout 0.5)": ("segnet", 0.5),
-    "FCN-16": ("fcn16", 0.0),
-    "FCN-16 (dropout 0.5)": ("fcn16", 0.5),
-    "FCN-8": ("fcn8", 0.0),
-    "FCN-8 (dropout 0.5)": ("fcn8", 0.5),
+ELEVEN: Mapping[str, tuple[str, float, tuple[float, ...]]] = {
+    "U-Net ReLU": ("unet", 0.0, (0.3823, 0.8974, 0.5366, 0.6045, 0.9183)),
+    "Small U-Net ReLU": ("unet-small", 0.0, (0.5254, 0.8796, 0.5331, 0.5954, 0.9029)),
+    "Small U-Net Leaky ReLU": ("unet-small-leaky", 0.0, (0.4436, 0.8780, 0.5203, 0.5767, 0.9039)),
+    "Long U-Net (dropout 0.7)": ("unet-long", 0.7, (0.3971, 0.8985, 0.5442, 0.6098, 0.9190)),
+    "Long U-Net (dropout 0.5)": ("unet-long", 0.5, (0.3901, 0.8913, 0.5731, 0.6384, 0.9139)),
+    "SegNet": ("segnet", 0.0, (0.4978, 0.8537, 0.4861, 0.5373, 0.8820)),
+    "SegNet (dropout 0.5)": ("segnet", 0.5, (0.5652, 0.8397, 0.4652, 0.5031, 0.8665)),
+    "FCN-16": ("fcn16", 0.0, (0.5027, 0.8492, 0.5000, 0.5623, 0.8805)),
+    "FCN-16 (dropout 0.5)": ("fcn16", 0.5, (0.4482, 0.8585, 0.5102, 0.5639, 0.8834)),
+    "FCN-8": ("fcn8", 0.0, (0.4860, 0.8603, 0.5039, 0.5686, 0.8891)),
+    "FCN-8 (dropout 0.5)": ("fcn8", 0.5, (0.4216, 0.8700, 0.5176, 0.5744, 0.8938)),
 }
-"""Name -> network and dropout, in the order of the paper's table 4."""
-
-FIGURES = ("loss", "accuracy", "miou", "f1", "dice")
-PAPER_ROWS: Mapping[str, tuple[float, ...]] = {
-    "U-Net ReLU": (0.3823, 0.8974, 0.5366, 0.6045, 0.9183),
-    "Small U-Net ReLU": (0.5254, 0.8796, 0.5331, 0.5954, 0.9029),
-    "Small U-Net Leaky ReLU": (0.4436, 0.8780, 0.5203, 0.5767, 0.9039),
-    "Long U-Net (dropout 0.7)": (0.3971, 0.8985, 0.5442, 0.6098, 0.9190),
-    "Long U-Net (dropout 0.5)": (0.3901, 0.8913, 0.5731, 0.6384, 0.9139),
-    "SegNet": (0.4978, 0.8537, 0.4861, 0.5373, 0.8820),
-    "SegNet (dropout 0.5)": (0.5652, 0.8397, 0.4652, 0.5031, 0.8665),
-    "FCN-16": (0.5027, 0.8492, 0.5000, 0.5623, 0.8805),
-    "FCN-16 (dropout 0.5)": (0.4482, 0.8585, 0.5102, 0.5639, 0.8834),
-    "FCN-8": (0.4860, 0.8603, 0.5039, 0.5686, 0.8891),
-    "FCN-8 (dropout 0.5)": (0.4216, 0.8700, 0.5176, 0.5744, 0.8938),
-}
-"""The paper's table 4: `FIGURES` of each network."""
+"""Name -> network, dropout, and the paper's `FIGURES`, in the order of its table 4."""
 
 TITLES = {"loss": "loss", "accuracy": "accuracy", "miou": "mean IoU", "f1": "F1", "dice": "Dice"}
+FIGURES = (*TITLES,)
 N_SHOWN = 3
 N_POINTS = 12  # of each curve
 # Colors of CamVid's eleven classes, as its authors draw them.
@@ -116,7 +101,7 @@ def ablate_camvid(
     rows: list[dict[str, Any]] = json.loads(path.read_text()) if path.exists() else []
     n_images = len(read_camvid(camvid, "train").hashes)
     for name in networks or ELEVEN:
-        network, dropout = ELEVEN[name]
+        network, dropout, _ = ELEVEN[name]
         recipe = replace(
             PAPER[network],
             dropout=dropout,
@@ -185,7 +170,7 @@ def table(rows: Sequence[Mapping[str, Any]]) -> str:
     head = ["network", "parameters", *(f"{TITLES[name]} (paper)" for name in FIGURES), "95 % interval of mean IoU"]
     lines = [head, ["---", *["---:"] * (len(head) - 1)]]
     for row in rows:
-        theirs = PAPER_ROWS[row["name"]]
+        *_, theirs = ELEVEN[row["name"]]
         low, high = row["miou_interval"]
         cells = [f"{row[figure]:.3f} ({value:.3f})" for figure, value in zip(FIGURES, theirs, strict=True)]
         lines.append([row["name"], f"{row['parameters'] / 1e6:.1f} M", *cells, f"{low:.3f} to {high:.3f}"])
@@ -205,7 +190,7 @@ def plot_camvid(rows: Sequence[Mapping[str, Any]], folder: Path) -> list[Path]:
     at = np.arange(len(names))
     for axes, key in zip(figure.subplots(1, len(FIGURES), sharey=True), FIGURES, strict=True):
         axes.barh(at, [row[key] for row in rows], 0.7, color=[_color(name) for name in names])
-        theirs = [PAPER_ROWS[name][FIGURES.index(key)] for name in names]
+        theirs = [ELEVEN[name][2][FIGURES.index(key)] for name in names]
         axes.plot(theirs, at, "D", color="#202020", markersize=4, label="paper (32 classes)")
         if key == "miou":
             bounds = np.array([row["miou_interval"] for row in rows]).T

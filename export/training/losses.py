@@ -80,24 +80,21 @@ def lovasz_at_once(logits: Tensor, labels: Tensor) -> Tensor:
     return ((errors * steps).sum(1) * present).sum() / present.sum().clamp(min=1)
 
 
-def pointseg_loss(
+def pixel_loss(
     logits: Tensor,
     labels: Tensor,
     class_weights: Tensor | None = None,
     *,
     focal_gamma: float = 0.0,
     lovasz_weight: float = 0.0,
+    stride: int = 1,
 ) -> Tensor:
-    """`cross_entropy` plus ``lovasz_weight`` times `lovasz_softmax`. Parameters are those of `cross_entropy`."""
+    """`cross_entropy` plus ``lovasz_weight`` times `lovasz_softmax` of one row and column in ``stride``: sorting all
+    cells of a top view would take a tenth of a training step.
+    """
     loss = cross_entropy(logits, labels, class_weights, focal_gamma=focal_gamma)
-    return loss + lovasz_weight * lovasz_softmax(logits, labels) if lovasz_weight > 0.0 else loss
-
-
-def road_loss(logits: Tensor, labels: Tensor, lovasz_weight: float = 0.0) -> Tensor:
-    """Cross-entropy of a road map plus ``lovasz_weight`` times `lovasz_softmax` of every fourth cell, for time."""
-    loss = cross_entropy(logits, labels)
     if lovasz_weight > 0.0:
-        loss = loss + lovasz_weight * lovasz_softmax(logits[:, :, ::2, ::2], labels[:, ::2, ::2])
+        loss = loss + lovasz_weight * lovasz_softmax(logits[:, :, ::stride, ::stride], labels[:, ::stride, ::stride])
     return loss
 
 
@@ -188,21 +185,17 @@ def ssadnet_loss(
     lw_det: float = 0.1,
     class_weights: Tensor | None = None,
     lovasz_weight: float = 0.0,
-) -> tuple[Tensor, dict[str, Tensor]]:
+) -> Tensor:
     """lw_seg x segmentation + lw_det x detection (SSADNet equation 3; weights of Table 2), of targets of slots, the
-    paper's slots or dense maps, and its detached parts. Class weights and `lovasz_softmax` are not in the paper.
+    paper's slots or dense maps. Class weights and `lovasz_softmax` are not in the paper.
     """
-    seg = cross_entropy(logits, labels, class_weights)
-    if lovasz_weight > 0.0:
-        # Every fourth cell, because sorting all of them would take a tenth of a training step.
-        seg = seg + lovasz_weight * lovasz_softmax(logits[:, :, ::2, ::2], labels[:, ::2, ::2])
-    parts = {"seg": seg}
+    seg = pixel_loss(logits, labels, class_weights, lovasz_weight=lovasz_weight, stride=2)
     if boxes.ndim == 4:
-        parts["heat"], parts["geometry"] = dense_loss(boxes, box_targets)
-        det = parts["heat"] + parts["geometry"]
+        heat, geometry = dense_loss(boxes, box_targets)
+        det = heat + geometry
     elif boxes.shape[2] == 5:
-        parts["presence"], parts["geometry"] = slots_loss(boxes, box_targets)
-        det = parts["presence"] + parts["geometry"]
+        presence, geometry = slots_loss(boxes, box_targets)
+        det = presence + geometry
     else:
-        det = parts["det"] = paper_slots_loss(boxes, box_targets)
-    return lw_seg * seg + lw_det * det, {name: part.detach() for name, part in parts.items()}
+        det = paper_slots_loss(boxes, box_targets)
+    return lw_seg * seg + lw_det * det

@@ -76,17 +76,9 @@ class Samples:
         self.paste_odds |= {name: OWN_ODDS for name in recipe.classes[1:] if name not in POINT_CLASSES}
         # A top view's road goes on under a pole, but not through a wall.
         self.negatives = NEGATIVES if recipe.task == "points" else {"pole": 1.0}
-        self.augmentation = Augmentation(
-            n_pasted=recipe.n_pasted,
-            odds=self.paste_odds,
-            turn_to_rare=recipe.turn_to_rare,
-            turn_anywhere=recipe.turn_anywhere,
-            weather=recipe.weather,
-            n_negatives=recipe.n_negatives,
-            negatives=self.negatives,
-            tilt_deg=recipe.tilt_deg,
-            no_remission=recipe.no_remission,
-        )
+        alike = ("n_pasted", "turn_to_rare", "turn_anywhere", "weather", "n_negatives", "tilt_deg", "no_remission")
+        settings = {name: getattr(recipe, name) for name in alike}
+        self.augmentation = Augmentation(odds=self.paste_odds, negatives=self.negatives, **settings)
         self.bank: ObjectBank | None = None
         if max(recipe.n_pasted, recipe.n_negatives) > 0.0:
             stride = max(1, len(simulated) // BANK_SCANS)
@@ -153,6 +145,28 @@ class Samples:
         """A simulated scan, labeled with the classes of the training."""
         scan = LabeledScan.load(self.simulated[number])
         return replace(scan, labels=self._numbers[scan.labels])
+
+
+class Watch:
+    """Validates a network on scans that are not in its training set, with the inputs and targets of ``samples``."""
+
+    def __init__(self, samples: Samples, scans: Sequence[LabeledScan]) -> None:
+        self.task, self.scans = samples.task, scans
+        seen = [seen_by_network(samples.projector, scan) for scan in scans]
+        self.projected = [projected for _, projected in seen]
+        self.targets = [self.task.target(scan, projected) for scan, projected in seen]
+
+    def validate(self, network: nn.Module) -> tuple[float, float, dict[str, float | None]]:
+        """Validate a network: the decisive figure (`Tally.decisive`), the mean loss, and all figures by name."""
+        losses, tally = [], self.task.tally()
+        device = next(network.parameters()).device
+        for scan, projected, targets in zip(self.scans, self.projected, self.targets, strict=True):
+            with torch.no_grad():
+                outputs = network(torch.from_numpy(projected.image[None]).to(device))
+            batch = [torch.from_numpy(target[None]).to(device) for target in targets]
+            losses.append(float(self.task.loss(outputs, batch)))
+            self.task.count(outputs, projected, targets, scan, tally)
+        return tally.decisive(), float(np.mean(losses)), tally.figures()
 
 
 def loaded(

@@ -16,6 +16,7 @@ import numpy as np
 import onnx
 import torch
 from torch import Tensor, nn
+from torch.utils.hooks import RemovableHandle
 
 from edgeperc.inference.session import golden_input, golden_shape
 from edgeperc.types.card import ModelCard
@@ -101,12 +102,19 @@ def _layers(network: nn.Module, image: Tensor) -> tuple[dict[str, str], set[str]
             hooks.append(module.register_forward_hook(convolved(name)))
         elif isinstance(module, nn.BatchNorm2d):
             hooks.append(module.register_forward_pre_hook(normed(name)))
+    _run(network, [image], hooks)
+    return pairs, first
+
+
+def _run(network: nn.Module, images: Sequence[Tensor], hooks: Sequence[RemovableHandle]) -> None:
+    """Run a network as at run time, and remove its hooks."""
     training = network.training
-    network.eval()(image)
+    network.eval()
+    for image in images:
+        network(image)
     network.train(training)
     for hook in hooks:
         hook.remove()
-    return pairs, first
 
 
 def _by_channel(given: Tensor, own: Tensor, card: ModelCard, own_card: ModelCard, path: Path) -> Tensor | None:
@@ -169,13 +177,7 @@ def _unfold(network: nn.Module, offsets: Mapping[str, Tensor | None], images: Se
         nn.init.zeros_(norm.running_mean)  # type: ignore[arg-type]  # it tracks them
         norm.running_var.fill_(1.0 - norm.eps)  # type: ignore[union-attr]
         hooks.append(norm.register_forward_pre_hook(watched(name)))
-    training = network.training
-    network.eval()
-    for image in images:
-        network(image)
-    network.train(training)
-    for hook in hooks:
-        hook.remove()
+    _run(network, images, hooks)
     for name, norm in norms.items():
         assert isinstance(norm, nn.BatchNorm2d)
         mean, square = torch.stack(sums[name]).mean(0)

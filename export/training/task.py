@@ -10,6 +10,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, ClassVar, TypeAlias
 
 import numpy as np
@@ -29,7 +30,7 @@ from ..cards import Carded, card_of
 from ..data.scans import LabeledScan
 from ..data.targets import dense_targets, paper_slot_targets, slot_targets
 from ..recipe import Recipe
-from .losses import box_distillation_loss, distillation_loss, pointseg_loss, road_loss, ssadnet_loss
+from .losses import box_distillation_loss, distillation_loss, pixel_loss, ssadnet_loss
 
 Outputs: TypeAlias = "Tensor | tuple[Tensor, Tensor]"
 """What a network returns: logits (B, C, H, W), or logits and boxes, or PointSeg's logits and early logits."""
@@ -114,16 +115,14 @@ class Points(Task):
         return (np.append(scan.labels, np.uint8(IGNORE))[projected.index],)  # the index of an empty pixel is -1
 
     def loss(self, outputs: Outputs, targets: Sequence[Tensor]) -> Tensor:
-        """`pointseg_loss`; with deep supervision, plus that of the early logits."""
+        """`pixel_loss`; with deep supervision, plus that of the early logits."""
         recipe, (labels,) = self.recipe, targets
         weights = None
         if recipe.class_weights:
             weights = torch.tensor([POINT_WEIGHTS.get(c, OWN_WEIGHT) for c in self.classes], device=labels.device)
-
-        def one(logits: Tensor, labels: Tensor) -> Tensor:
-            gamma, lovasz = recipe.focal_gamma, recipe.lovasz_weight
-            return pointseg_loss(logits, labels, weights, focal_gamma=gamma, lovasz_weight=lovasz)
-
+        one = partial(
+            pixel_loss, class_weights=weights, focal_gamma=recipe.focal_gamma, lovasz_weight=recipe.lovasz_weight
+        )
         if isinstance(outputs, Tensor):
             return one(outputs, labels)
         logits, early = outputs
@@ -159,7 +158,7 @@ class Vehicles(Task):
         lw_det, lovasz_weight = BOX_WEIGHT[self.recipe.head], self.recipe.lovasz_weight
         return ssadnet_loss(
             logits, boxes, labels, box_targets, lw_det=lw_det, class_weights=weights, lovasz_weight=lovasz_weight
-        )[0]
+        )
 
     def distillation(self, outputs: Outputs, probabilities: Tensor, boxes: Tensor | None = None) -> Tensor:
         """Towards the teacher's classes, and towards its boxes if the head is dense."""
@@ -205,8 +204,8 @@ class Road(Task):
         return (np.where(truth == IGNORE, IGNORE, truth == 1).astype(np.uint8),)
 
     def loss(self, outputs: Outputs, targets: Sequence[Tensor]) -> Tensor:
-        """`road_loss`."""
-        return road_loss(_logits(outputs), targets[0], self.recipe.lovasz_weight)
+        """`pixel_loss`."""
+        return pixel_loss(_logits(outputs), targets[0], lovasz_weight=self.recipe.lovasz_weight, stride=2)
 
     def distillation(self, outputs: Outputs, probabilities: Tensor, boxes: Tensor | None = None) -> Tensor:
         """Towards the teacher's drivable class; all its other classes, vehicles included, count as one."""

@@ -40,11 +40,10 @@ from .object_samples import load_samples
 from .object_sets import PASTED, VALIDATION, write_samples
 from .object_task import Objects
 from .ranks import Ranks
-from .samples import RealScans, Samples, loaded, real_scans
+from .samples import RealScans, Samples, Watch, loaded, real_scans
 from .start import start
 from .task import Task, task_of
 from .teacher import OnnxTeacher, pseudo_labeled, teach, unlabeled_scans
-from .watch import Watch
 
 WARM_UP_STEPS = 100
 OBJECT_SAMPLES = "object-samples"
@@ -83,8 +82,8 @@ class Run:
     n_workers: int = 0  # processes that make samples, one thread each; 0: this one, between the steps
     compiled: bool = False  # by `torch.compile`: a minute and a C++ compiler; PointSeg then trains a third faster
     checkpoint_every: int = 100  # steps between checkpoints and points of the curve; an epoch with ``stop_after``
-    save_every_s: float = 0.0  # between checkpoints, at least, as large networks take seconds to write
     tensorboard: bool = False  # write the log for it, too
+    save_every_s: float = 0.0  # between checkpoints, at least, as large networks take seconds to write
 
 
 def train(recipe: Recipe, out: Path, data: Data, run: Run | None = None) -> Path:
@@ -95,136 +94,19 @@ def train(recipe: Recipe, out: Path, data: Data, run: Run | None = None) -> Path
     ranks = Ranks()
     ranks.check(recipe.batch, recipe.accumulate, run.compiled)
     with ranks.together():
-        return _train(recipe, out, data, run, ranks)
-
-
-def _train(recipe: Recipe, out: Path, data: Data, run: Run, ranks: Ranks) -> Path:
-    """`train` in one of the ranks."""
-    # Settings.
-    out.mkdir(parents=True, exist_ok=True)
-    checkpoint = out / "checkpoint.pt"
-    if run.n_threads is not None:
-        torch.set_num_threads(run.n_threads)
-    torch.backends.cudnn.benchmark = True  # inputs have one size
-
-    # Data.
-    if recipe.task == "camera":
-        source = _image_source(recipe, data, run, ranks.device)
-    elif recipe.task == "objects":
-        source = _object_source(recipe, out.parent / OBJECT_SAMPLES, data, run)
-    else:
-        source = _scan_source(recipe, data, run, ranks.device)
-    samples, watch = source.samples, source.watch
-    epoch = max(1, source.n_real // recipe.batch)
-    every = epoch if recipe.stop_after else run.checkpoint_every
-    # Where no real scan or image is trained on, or other scans are given, the validation decides which step is best.
-    stops = data.fold is not None or data.given is not None or recipe.simulated_share == 1.0 or recipe.stop_after > 0
-
-    # Model.
-    network, state = build(recipe), _State(hashes=source.hashes)
-    if recipe.kept > 0.0 and run.start_from is None:
-        raise ValueError(f"the recipe keeps weights ({recipe.kept:g}) but there are none; give --start-from")
-    if run.start_from is not None and not checkpoint.exists():
-        state.before, frames = _start(network, recipe, samples, run.start_from)
-        state.hashes = frames | state.hashes
-    network = network.to(ranks.device, memory_format=torch.channels_last)  # type: ignore[call-overload]  # not in its stubs
-    ranks.share(network)
-    # The compiled network shares its weights with the original, which is averaged and saved.
-    forward = torch.compile(network) if run.compiled else network
-    model = _Model(network, forward, copy.deepcopy(network).eval(), make_optimizer(recipe, network))
-    if checkpoint.exists():
-        state = _resumed(checkpoint, recipe, model, samples, ranks.device)
-    state.fitness = source.fitness
-
-    # Loop.
-    progress = tqdm(
-        total=recipe.steps, initial=state.step, desc=recipe.network, unit="step", disable=not ranks.is_first
-    )
-    losses: list[float] = []
-    saved_s = time.monotonic()
-    began_s, began = saved_s, state.step
-    with TrainingLog(out if ranks.is_first else None, tensorboard=run.tensorboard) as log, progress:
-        for arrays in _batches(recipe, samples, state, epoch, run.n_workers, ranks):
-            losses.append(_step(recipe, source, model, state, arrays, ranks))
-            state.step += 1
-            _average(model.averaged, network, min(recipe.ema, (1 + state.step) / (10 + state.step)))
-            _keep(recipe, run, model, state, samples, ranks.device)
-            progress.update()
-            rate = (state.step - began) * recipe.batch / max(time.monotonic() - began_s, 1e-9)
-            figure_shown = {"best": f"{state.best_figure:.3f}"} if state.best_figure >= 0.0 else {}
-            progress.set_postfix(loss=f"{losses[-1]:.3f}", samples_per_s=f"{rate:.1f}", **figure_shown)
-            if isinstance(samples, Samples) and recipe.redraw_every and state.step % recipe.redraw_every == 0:
-                if ranks.is_first:
-                    samples.redraw(model.averaged, state.step)
-                samples.odds = ranks.from_first(samples.odds)
-            if state.step % every and state.step != recipe.steps:
-                continue
-            line: dict[str, Any] = {"step": state.step, "samples": state.step * recipe.batch}
-            line["loss"] = round(float(np.mean(losses)), 5)
-            losses.clear()
-            if watch is not None:
-                validated = watch.validate(model.averaged) if ranks.is_first else None
-                figure, loss, figures = ranks.from_first(validated) or (0.0, 0.0, {})
-                line |= {"validation_loss": round(loss, 5), "validation": figures}
-                if figure > state.best_figure and stops:
-                    state.best_figure, state.best = figure, copy.deepcopy(model.averaged.state_dict())
-                state.since_best = 0 if loss < state.lowest_loss else state.since_best + every
-                state.lowest_loss = min(state.lowest_loss, loss)
-                if recipe.halve_after and state.since_best >= recipe.halve_after * epoch:
-                    state.halvings, state.since_best = state.halvings + 1, 0
-            state.curve.append(line)
-            log.write(line | {"samples_per_s": round(rate, 2)})
-            over = state.step >= last_step(recipe, state.curve, epoch)
-            if ranks.is_first and (over or time.monotonic() - saved_s >= run.save_every_s):
-                _save(checkpoint, recipe, model, state, samples, data.fold)
-                saved_s = time.monotonic()
-            if over:
-                break
-    return checkpoint
-
-
-def _keep(
-    recipe: Recipe,
-    run: Run,
-    model: _Model,
-    state: _State,
-    samples: Samples | ImageSamples | ObjectBatches,
-    device: torch.device,
-) -> None:
-    """At the end, average the weights with those that the run started from, as ``kept`` says."""
-    if recipe.kept > 0.0 and run.start_from is not None and state.step == recipe.steps:
-        begun = build(recipe)
-        _start(begun, recipe, samples, run.start_from)
-        _average(model.averaged, begun.to(device), 1.0 - recipe.kept)
+        return _Training(recipe, out, data, run, ranks).finish()
 
 
 class _Source(NamedTuple):
     """What a network is trained on and watched on, read."""
 
     task: Task | Camera | Objects
-    samples: Samples | ImageSamples | ObjectBatches | ObjectBatches
+    samples: Samples | ImageSamples | ObjectBatches
     watch: Watch | ImageWatch | ObjectWatch | None
     hashes: dict[str, str]
     n_real: int
     teacher: nn.Module | None = None
     fitness: dict[str, Any] | None = None
-
-
-class _Model(NamedTuple):
-    """A network, what runs it, its averaged weights, and its optimizer."""
-
-    network: Any
-    forward: Any
-    averaged: nn.Module
-    optimizer: torch.optim.Optimizer
-
-
-def _start(
-    network: nn.Module, recipe: Recipe, samples: Samples | ImageSamples | ObjectBatches, path: Path
-) -> tuple[list[dict[str, Any]], dict[str, str]]:
-    """`start`, with the first batches for the statistics of batch norm."""
-    images = [torch.as_tensor(samples.batch(k)[0]).cpu() for k in range(STATISTICS_BATCHES)]
-    return start(network, recipe, path, images)
 
 
 @dataclass(slots=True)
@@ -240,109 +122,181 @@ class _State:
     lowest_loss: float = math.inf
     since_best: int = 0
     halvings: int = 0
-    fitness: dict[str, Any] | None = None
 
 
-def _step(
-    recipe: Recipe, source: _Source, model: _Model, state: _State, arrays: Sequence[Tensor], ranks: Ranks
-) -> float:
-    """One step of the optimizer on a batch; returns the loss."""
-    task, network, optimizer = source.task, model.network, model.optimizer
-    for group in optimizer.param_groups:
-        group["lr"] = recipe.learning_rate * make_schedule(recipe, state.step) * 0.5**state.halvings
-    torch.manual_seed((recipe.seed << 32) + state.step)
-    network.train()
-    if recipe.head_only:
-        network.segmentation.requires_grad_(False).eval()
-    optimizer.zero_grad(set_to_none=True)
-    total = torch.zeros((), device=ranks.device)
-    for inputs, *others in zip(*(array.chunk(recipe.accumulate) for array in arrays), strict=True):
-        x = ranks.part(inputs)
-        x = x.contiguous(memory_format=torch.channels_last if x.ndim == 4 else torch.contiguous_format)
-        y = others[: source.samples.n_targets]
-        taught: tuple[Any, ...] = tuple(others[source.samples.n_targets :])
-        with torch.autocast(ranks.device.type, torch.bfloat16):
-            outputs = ranks.whole(model.forward(x))
-        loss = task.loss(outputs, y)
-        if source.teacher is not None and recipe.distil > 0.0:
-            taught = ranks.whole(teach(source.teacher, x, task.input, mirror=recipe.seen_twice))
-        if taught and isinstance(task, Task):
-            loss = loss + recipe.distil * task.distillation(outputs, *taught)
-        loss = loss * (len(inputs) / len(arrays[0]))
-        torch.autograd.backward(loss)
-        total += loss.detach()
-    ranks.add_gradients(network)
-    found = float(total.item())
-    if not math.isfinite(found):
-        raise FloatingPointError(f"the loss is {found} at step {state.step}; lower --learning-rate")
-    nn.utils.clip_grad_norm_(network.parameters(), 5.0)
-    optimizer.step()
-    return found
+class _Training:
+    """A run in one of the ranks."""
 
+    def __init__(self, recipe: Recipe, out: Path, data: Data, run: Run, ranks: Ranks) -> None:
+        self.recipe, self.run, self.ranks, self.fold = recipe, run, ranks, data.fold
+        self.out, self.checkpoint = out, out / "checkpoint.pt"
+        out.mkdir(parents=True, exist_ok=True)
+        if run.n_threads is not None:
+            torch.set_num_threads(run.n_threads)
+        torch.backends.cudnn.benchmark = True  # inputs have one size
+        if recipe.task == "camera":
+            self.source = _image_source(recipe, data, ranks.device)
+        elif recipe.task == "objects":
+            self.source = _object_source(recipe, out.parent / OBJECT_SAMPLES, data, run)
+        else:
+            self.source = _scan_source(recipe, data, run, ranks.device)
+        self.epoch = max(1, self.source.n_real // recipe.batch)
+        self.every = self.epoch if recipe.stop_after else run.checkpoint_every
+        # Without a real scan or image, or with other scans, the validation decides which step is best.
+        validated_elsewhere = data.fold is not None or data.given is not None
+        self.stops = validated_elsewhere or recipe.simulated_share == 1.0 or recipe.stop_after > 0
 
-def _batches(
-    recipe: Recipe,
-    samples: Samples | ImageSamples | ObjectBatches,
-    state: _State,
-    epoch: int,
-    n_workers: int,
-    ranks: Ranks,
-) -> Iterator[Sequence[Tensor]]:
-    """The batches that are left."""
-    if not isinstance(samples, Samples):
-        return samples.batches(state.step, last_step(recipe, state.curve, epoch))
-    return loaded(samples, state.step, recipe.steps, n_workers, ranks)
+        network, self.state = build(recipe), _State(hashes=self.source.hashes)
+        if recipe.kept > 0.0 and run.start_from is None:
+            raise ValueError(f"the recipe keeps weights ({recipe.kept:g}) but there are none; give --start-from")
+        if run.start_from is not None and not self.checkpoint.exists():
+            self.state.before, frames = self._start(network, run.start_from)
+            self.state.hashes = frames | self.state.hashes
+        self.network: Any = network.to(ranks.device, memory_format=torch.channels_last)  # type: ignore[call-overload]  # not in its stubs
+        ranks.share(self.network)
+        # The compiled network shares its weights with the original, which is averaged and saved.
+        self.forward: Any = torch.compile(self.network) if run.compiled else self.network
+        self.averaged = copy.deepcopy(self.network).eval()
+        self.optimizer = make_optimizer(recipe, self.network)
+        if self.checkpoint.exists():
+            self._resume()
 
+    def _start(self, network: nn.Module, path: Path) -> tuple[list[dict[str, Any]], dict[str, str]]:
+        """`start`, with the first batches for the statistics of batch norm."""
+        images = [torch.as_tensor(self.source.samples.batch(k)[0]).cpu() for k in range(STATISTICS_BATCHES)]
+        return start(network, self.recipe, path, images)
 
-def _save(
-    checkpoint: Path,
-    recipe: Recipe,
-    model: _Model,
-    state: _State,
-    samples: Samples | ImageSamples | ObjectBatches,
-    fold: int | None,
-) -> None:
-    with open_atomic(checkpoint) as file:
-        torch.save(
-            {
-                "recipe": json.dumps(asdict(recipe)),
-                "before": json.dumps(state.before),
-                "step": state.step,
-                "network": model.network.state_dict(),
-                "averaged": model.averaged.state_dict(),
-                "best": state.best,
-                "watched": (state.best_figure, state.lowest_loss, state.since_best, state.halvings),
-                "optimizer": model.optimizer.state_dict(),
-                "curve": json.dumps(state.curve),
-                "frames": json.dumps(state.hashes),
-                "fitness": json.dumps(state.fitness),
-                "fold": -1 if fold is None else fold,
-                "n_simulated": len(samples.simulated),
-                "odds": {name: torch.from_numpy(odds) for name, odds in samples.odds.items()},
-            },
-            file,
+    def finish(self) -> Path:
+        """Make the steps that are left; returns the checkpoint."""
+        recipe, run, ranks, state, samples = self.recipe, self.run, self.ranks, self.state, self.source.samples
+        progress = tqdm(
+            total=recipe.steps, initial=state.step, desc=recipe.network, unit="step", disable=not ranks.is_first
         )
+        losses: list[float] = []
+        began_s, began = time.monotonic(), state.step
+        saved_s = began_s
+        batches: Iterator[Sequence[Tensor]] = (
+            loaded(samples, state.step, recipe.steps, run.n_workers, ranks)
+            if isinstance(samples, Samples)
+            else samples.batches(state.step, last_step(recipe, state.curve, self.epoch))
+        )
+        with TrainingLog(self.out if ranks.is_first else None, tensorboard=run.tensorboard) as log, progress:
+            for arrays in batches:
+                losses.append(self._step(arrays))
+                state.step += 1
+                _average(self.averaged, self.network, min(recipe.ema, (1 + state.step) / (10 + state.step)))
+                if recipe.kept > 0.0 and run.start_from is not None and state.step == recipe.steps:
+                    begun = build(recipe)
+                    self._start(begun, run.start_from)
+                    _average(self.averaged, begun.to(ranks.device), 1.0 - recipe.kept)
+                progress.update()
+                rate = (state.step - began) * recipe.batch / max(time.monotonic() - began_s, 1e-9)
+                figure_shown = {"best": f"{state.best_figure:.3f}"} if state.best_figure >= 0.0 else {}
+                progress.set_postfix(loss=f"{losses[-1]:.3f}", samples_per_s=f"{rate:.1f}", **figure_shown)
+                if isinstance(samples, Samples) and recipe.redraw_every and state.step % recipe.redraw_every == 0:
+                    if ranks.is_first:
+                        samples.redraw(self.averaged, state.step)
+                    samples.odds = ranks.from_first(samples.odds)
+                if state.step % self.every and state.step != recipe.steps:
+                    continue
+                line: dict[str, Any] = {"step": state.step, "samples": state.step * recipe.batch}
+                line["loss"] = round(float(np.mean(losses)), 5)
+                losses.clear()
+                state.curve.append(line | self._validated())
+                log.write(state.curve[-1] | {"samples_per_s": round(rate, 2)})
+                over = state.step >= last_step(recipe, state.curve, self.epoch)
+                if ranks.is_first and (over or time.monotonic() - saved_s >= run.save_every_s):
+                    self._save()
+                    saved_s = time.monotonic()
+                if over:
+                    break
+        return self.checkpoint
+
+    def _validated(self) -> dict[str, Any]:
+        """The validation's part of a line of the log; the best weights are kept."""
+        recipe, state, watch = self.recipe, self.state, self.source.watch
+        if watch is None:
+            return {}
+        validated = watch.validate(self.averaged) if self.ranks.is_first else None
+        figure, loss, figures = self.ranks.from_first(validated) or (0.0, 0.0, {})
+        if figure > state.best_figure and self.stops:
+            state.best_figure, state.best = figure, copy.deepcopy(self.averaged.state_dict())
+        state.since_best = 0 if loss < state.lowest_loss else state.since_best + self.every
+        state.lowest_loss = min(state.lowest_loss, loss)
+        if recipe.halve_after and state.since_best >= recipe.halve_after * self.epoch:
+            state.halvings, state.since_best = state.halvings + 1, 0
+        return {"validation_loss": round(loss, 5), "validation": figures}
+
+    def _step(self, arrays: Sequence[Tensor]) -> float:
+        """One step of the optimizer on a batch; returns the loss."""
+        recipe, ranks, source, task = self.recipe, self.ranks, self.source, self.source.task
+        for group in self.optimizer.param_groups:
+            group["lr"] = recipe.learning_rate * make_schedule(recipe, self.state.step) * 0.5**self.state.halvings
+        torch.manual_seed((recipe.seed << 32) + self.state.step)
+        self.network.train()
+        if recipe.head_only:
+            self.network.segmentation.requires_grad_(False).eval()
+        self.optimizer.zero_grad(set_to_none=True)
+        total = torch.zeros((), device=ranks.device)
+        for inputs, *others in zip(*(array.chunk(recipe.accumulate) for array in arrays), strict=True):
+            x = ranks.part(inputs)
+            x = x.contiguous(memory_format=torch.channels_last if x.ndim == 4 else torch.contiguous_format)
+            y = others[: source.samples.n_targets]
+            taught: tuple[Any, ...] = tuple(others[source.samples.n_targets :])
+            with torch.autocast(ranks.device.type, torch.bfloat16):
+                outputs = ranks.whole(self.forward(x))
+            loss = task.loss(outputs, y)
+            if source.teacher is not None and recipe.distil > 0.0:
+                taught = ranks.whole(teach(source.teacher, x, task.input, mirror=recipe.seen_twice))
+            if taught and isinstance(task, Task):
+                loss = loss + recipe.distil * task.distillation(outputs, *taught)
+            loss = loss * (len(inputs) / len(arrays[0]))
+            torch.autograd.backward(loss)
+            total += loss.detach()
+        ranks.add_gradients(self.network)
+        found = float(total.item())
+        if not math.isfinite(found):
+            raise FloatingPointError(f"the loss is {found} at step {self.state.step}; lower --learning-rate")
+        nn.utils.clip_grad_norm_(self.network.parameters(), 5.0)
+        self.optimizer.step()
+        return found
+
+    def _save(self) -> None:
+        state, samples = self.state, self.source.samples
+        with open_atomic(self.checkpoint) as file:
+            torch.save(
+                {
+                    "recipe": json.dumps(asdict(self.recipe)),
+                    "before": json.dumps(state.before),
+                    "step": state.step,
+                    "network": self.network.state_dict(),
+                    "averaged": self.averaged.state_dict(),
+                    "best": state.best,
+                    "watched": (state.best_figure, state.lowest_loss, state.since_best, state.halvings),
+                    "optimizer": self.optimizer.state_dict(),
+                    "curve": json.dumps(state.curve),
+                    "frames": json.dumps(state.hashes),
+                    "fitness": json.dumps(self.source.fitness),
+                    "fold": -1 if self.fold is None else self.fold,
+                    "n_simulated": len(samples.simulated),
+                    "odds": {name: torch.from_numpy(odds) for name, odds in samples.odds.items()},
+                },
+                file,
+            )
+
+    def _resume(self) -> None:
+        """Load the checkpoint."""
+        kept = read_checkpoint(self.checkpoint, self.ranks.device)
+        if kept["recipe"] != self.recipe:
+            raise ValueError(f"{self.checkpoint} is of another recipe: {kept['recipe']}; give an empty folder")
+        self.network.load_state_dict(kept["network"])
+        self.averaged.load_state_dict(kept["averaged"])
+        self.optimizer.load_state_dict(kept["optimizer"])
+        self.source.samples.odds = {name: odds.cpu().numpy() for name, odds in kept["odds"].items()}
+        self.state = _State(kept["frames"], kept["before"], kept["curve"], kept["step"], kept["best"], *kept["watched"])
 
 
-def _resumed(
-    checkpoint: Path,
-    recipe: Recipe,
-    model: _Model,
-    samples: Samples | ImageSamples | ObjectBatches,
-    device: torch.device,
-) -> _State:
-    """Load a checkpoint into the model and the samples."""
-    kept = read_checkpoint(checkpoint, device)
-    if kept["recipe"] != recipe:
-        raise ValueError(f"{checkpoint} is of another recipe: {kept['recipe']}; give an empty folder")
-    model.network.load_state_dict(kept["network"])
-    model.averaged.load_state_dict(kept["averaged"])
-    model.optimizer.load_state_dict(kept["optimizer"])
-    samples.odds = {name: odds.cpu().numpy() for name, odds in kept["odds"].items()}
-    return _State(kept["frames"], kept["before"], kept["curve"], kept["step"], kept["best"], *kept["watched"])
-
-
-def _image_source(recipe: Recipe, data: Data, run: Run, device: torch.device) -> _Source:
+def _image_source(recipe: Recipe, data: Data, device: torch.device) -> _Source:
     """The training images of CamVid; the validation images are watched."""
     if data.camvid is None:
         raise ValueError(f"no images to train {recipe.network} on; give --camvid")
@@ -454,18 +408,16 @@ def make_schedule(recipe: Recipe, step: int) -> float:
 
 def make_optimizer(recipe: Recipe, network: nn.Module) -> torch.optim.Optimizer:
     """The optimizer that the recipe names."""
-    if recipe.optimizer == "adagrad":
-        return torch.optim.Adagrad(network.parameters(), lr=recipe.learning_rate)
-    if recipe.optimizer == "adam":
-        return torch.optim.Adam(network.parameters(), lr=recipe.learning_rate)
+    if recipe.optimizer in ("adagrad", "adam"):
+        kind = torch.optim.Adagrad if recipe.optimizer == "adagrad" else torch.optim.Adam
+        return kind(network.parameters(), lr=recipe.learning_rate)
     if recipe.optimizer != "adamw":
         raise ValueError(f"optimizer is {recipe.optimizer!r}; expected adamw, adam or adagrad")
-    decayed = [p for p in network.parameters() if p.ndim > 1]
-    kept = [p for p in network.parameters() if p.ndim <= 1]
-    return torch.optim.AdamW(
-        [{"params": decayed, "weight_decay": recipe.weight_decay}, {"params": kept, "weight_decay": 0.0}],
-        lr=recipe.learning_rate,
-    )
+    groups = [
+        {"params": [p for p in network.parameters() if (p.ndim > 1) == decays], "weight_decay": decay}
+        for decays, decay in ((True, recipe.weight_decay), (False, 0.0))
+    ]
+    return torch.optim.AdamW(groups, lr=recipe.learning_rate)
 
 
 class _Teacher(nn.Module):

@@ -16,7 +16,7 @@ from edgeperc.errors import MissingExtraError, ModelFileError
 from edgeperc_bench import cli, context, loadgen
 from edgeperc_bench.commands.soak import memory_growth
 from edgeperc_bench.samples import compare, noise_floor, percentile, summary, supported, trend
-from edgeperc_bench.scenarios import Clock, Limits, back_to_back, paced, throughput
+from edgeperc_bench.scenarios import Clock, Limits, back_to_back, throughput
 
 # samples
 
@@ -160,7 +160,7 @@ def test_back_to_back_wants_both_scans_and_seconds() -> None:
 
 def test_the_pace_is_kept_without_drift() -> None:
     clock = FakeClock(late_s=0.003)
-    samples = paced(FakePerceiver(clock, [0.02]), ["a"], 10.0, Limits(1000, 0.0, 0), clock=clock)
+    samples = back_to_back(FakePerceiver(clock, [0.02]), ["a"], Limits(1000, 0.0, 0), rate_hz=10.0, clock=clock)
     # Only the very first scan is there without sleeping; every later one starts 3 ms late, the thousandth too.
     assert samples.start_s[-1] == pytest.approx(99.903)
     assert samples.age_ms[1:] == pytest.approx([23.0] * 999)
@@ -170,7 +170,7 @@ def test_the_pace_is_kept_without_drift() -> None:
 def test_a_late_answer_is_counted_and_the_newest_scan_is_next() -> None:
     clock = FakeClock()
     perceive = FakePerceiver(clock, [0.05, 0.35, 0.05, 0.05])
-    samples = paced(perceive, list(range(10)), 10.0, Limits(4, 0.0, 0), clock=clock)
+    samples = back_to_back(perceive, list(range(10)), Limits(4, 0.0, 0), rate_hz=10.0, clock=clock)
     # The second scan arrives at 0.1 s and is answered at 0.45 s: scans 2 and 3 are overtaken by scan 4, of 0.4 s.
     assert perceive.seen == [0, 1, 4, 5]
     assert samples.skipped == 2

@@ -527,22 +527,8 @@ def test_what_is_missing_is_reported(
 
     monkeypatch.setattr(turns, "groups", groups)
     file = tmp_path / "peers.json"
-    command = [
-        "peers",
-        "--tables",
-        "engines",
-        "--model",
-        "ssadnet:fp32",
-        "--provider",
-        "cpu",
-        "--scans",
-        "1",
-        "--rounds",
-        "1",
-        "--threads",
-        "1",
-    ]
-    assert cli.main([*command, "--json", str(file)]) == 0
+    asked = "peers --tables engines --model ssadnet:fp32 --provider cpu --scans 1 --rounds 1 --threads 1"
+    assert cli.main([*asked.split(), "--json", str(file)]) == 0
     document = json.loads(file.read_text("utf-8"))
     assert document["complete"]
     for title, contenders in document["peers"].items():

@@ -42,7 +42,7 @@ from edgeperc_export.cli import main
 from edgeperc_export.data.augment import ObjectBank
 from edgeperc_export.data.roads import DRAWN, drawn_roads
 from edgeperc_export.data.scans import LabeledScan, mirrored
-from edgeperc_export.data.simulate import parity_scans, simulate
+from edgeperc_export.data.simulate import parity_samples, simulate
 from edgeperc_export.networks import build
 from edgeperc_export.recipe import MODELS, PAPER, SCAN_NETWORKS, TASKS, Recipe, Stage
 from edgeperc_export.release import to_onnx
@@ -50,12 +50,11 @@ from edgeperc_export.release.models_page import models_page
 from edgeperc_export.release.to_onnx import ParityError, export, halve, load, terms_of, to_graph, verify, write_card
 from edgeperc_export.training.ablation import PAPERS, SHIPPED, VARIANTS, plot
 from edgeperc_export.training.curve import curve_table
-from edgeperc_export.training.samples import Recent, Samples, loaded, real_scans
+from edgeperc_export.training.samples import Recent, Samples, Watch, loaded, real_scans
 from edgeperc_export.training.start import start
 from edgeperc_export.training.task import Task, task_of
 from edgeperc_export.training.teacher import OnnxTeacher, pseudo_labeled, teach, unlabeled_scans
 from edgeperc_export.training.train import make_optimizer, make_schedule
-from edgeperc_export.training.watch import Watch
 
 
 @pytest.fixture(scope="module")
@@ -599,7 +598,7 @@ def test_a_run_with_an_exported_teacher_equals_one_with_workers(
     checkpoint = train(small("pointseg", edge=True, steps=1), tmp_path / "teacher", kitti=None, simulated=simulated)
     monkeypatch.setattr(to_onnx, "MIN_AGREEMENT", 0.9)
     teacher = tmp_path / "teacher.onnx"
-    export(checkpoint, teacher, scans=parity_scans([])[:1], fitness=None)
+    export(checkpoint, teacher, scans=parity_samples("points")[:1], fitness=None)
     recipe = small("pointseg", edge=True, distil=1.0, steps=2)
     arguments = {"kitti": None, "simulated": simulated, "teacher": teacher, "n_threads": 1}
     one, other = (weights(train(recipe, tmp_path / f"with-{n}", n_workers=n, **arguments)) for n in (0, 1))
@@ -1013,6 +1012,6 @@ def test_parity_scans_are_no_training_scans(monkeypatch: pytest.MonkeyPatch) -> 
         return scan
 
     monkeypatch.setattr("edgeperc_export.data.simulate.simulated_scan", recorded)
-    assert len(parity_scans([])) == len({*seeds}) == 4
+    assert len(parity_samples("points")) == len({*seeds}) == 4
     # Seeds of training scenes start at 0 (a set has thousands), seeds of evaluation scenes at `FIRST_SEED`.
     assert 10**8 < min(seeds) <= max(seeds) < FIRST_SEED - 10**8

@@ -261,7 +261,7 @@ def test_int8_agrees_with_fp32(tmp_path: Path) -> None:
     path, rounded_path = model_path("objects:fp32"), tmp_path / "int8.onnx"
     card = Session(path, "cpu").card
     (batch,) = candidate_batches(card, [simulated_scan(SEED).points])
-    model = rounded(folded(path), [batch], card.input.name)
+    model = rounded(folded(path), card, [batch])
     write_card(model, with_golden(model, replace(card, precision="int8", precisions={})), rounded_path)
     (other,) = candidate_batches(card, [simulated_scan(SEED + 1).points])
     classes = []
