@@ -33,6 +33,7 @@ from ..errors import PointsError
 from ..readers.files import read_points
 from ..simulation.samples import IGNORE
 from ..simulation.scene import POINT_CLASSES
+from ..types.choices import VEHICLES
 from ..types.geometry import inside
 from ..types.perception import ROADS, Box
 from ..types.points import Points
@@ -164,7 +165,7 @@ class ScanFrame:
         """
         if self.point_classes is None or not set(ROADS) & set(self.class_names):
             return None
-        numbers = {**dict.fromkeys(ROADS, 1), "car": 2, "van": 2, "truck": 2, IGNORED: IGNORE}
+        numbers = {**dict.fromkeys(ROADS, 1), **dict.fromkeys(VEHICLES, 2), IGNORED: IGNORE}
         return np.array([numbers.get(name, 0) for name in self.class_names], np.uint8)[self.point_classes]
 
 

@@ -17,14 +17,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..types.choices import STATIC
+from ..types.choices import STATIC, VEHICLES
 from ..types.points import Labels
 from .causes import BUMPER, CAUSES, FLOOR
 from .center_ap import CLASSES, CenterTable, center_scores
 from .kitti_ap import ApTable, average_precisions
 from .metrics import BoxEvaluator, BoxScores, Confusion, ObjectKey, ProbabilitySweep, mean
-
-VEHICLES = ("car", "van", "truck")
 
 # Groups of classes whose boxes are evaluated wherever the truth is known: their classes, and the smallest IoU of a
 # match. A person's box is hardly larger than the spacing of the points on it, so it is matched at 0.25.

@@ -21,6 +21,7 @@ from ..perceiver import Perceiver
 from ..readers.files import read_points
 from ..tracking.tracker import Tracker
 from ..tracking.tracks import ClassParameters, Tracks
+from ..types.choices import VEHICLES
 from ..types.perception import Box
 from .ab3dmot import SETTINGS, Ab3dmot
 from .headings import Headings, count_headings
@@ -47,7 +48,7 @@ __all__ = [
 CLASSES = ("car", "pedestrian", "cyclist")
 
 # Labels of each evaluated class; KUL-Seg's Table 7 evaluates vehicles.
-KINDS = {**{of: (of,) for of in CLASSES}, "vehicle": ("car", "van", "truck")}
+KINDS = {**{of: (of,) for of in CLASSES}, "vehicle": VEHICLES}
 
 # From KITTI's evaluation: labels that may be confused with each class, and limits of objects to find.
 NEIGHBORS = {"car": ("van",), "pedestrian": ("person", "person_sitting"), "cyclist": (), "vehicle": ("tram", "misc")}

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..camera.calibration import Calibration
 from ..errors import CalibrationError
+from ..types.choices import VEHICLES
 from ..types.points import Labels
 from .raycast import FACADE, GLASS, LEAVES, PAINT, RETRO, Hits, Rays, fill_cast, fill_ground_kinds
 from .scene import Scene, SimulatedScan, place_shapes
@@ -28,7 +29,7 @@ _AHEAD = np.array([[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0,
 _SKY, _ROAD, _PAVEMENT, _TREE = (CAMERA_CLASSES.index(name) for name in ("Sky", "Road", "Pavement", "Tree"))
 _OF_GROUND = np.array([_ROAD, _PAVEMENT, _TREE], np.uint8)  # CamVid counts grass as trees
 _OF_OBJECT = {
-    **dict.fromkeys(("car", "van", "truck", "tram", "misc"), CAMERA_CLASSES.index("Car")),
+    **dict.fromkeys((*VEHICLES, "tram", "misc"), CAMERA_CLASSES.index("Car")),
     **dict.fromkeys(("pedestrian", "person_sitting"), CAMERA_CLASSES.index("Pedestrian")),
     "cyclist": CAMERA_CLASSES.index("Bicyclist"),
 }

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import PointsError
-from ..types.choices import STATIC
+from ..types.choices import STATIC, VEHICLES
 from ..types.geometry import draw_footprints, wrapped
 from ..types.perception import Box
 from ..types.points import Labels, Points
@@ -35,11 +35,11 @@ from .raycast import (
 POINT_CLASSES = ("background", "car", "pedestrian", "cyclist")
 # Classes of what a street is made of; the background is what is none of the others, such as walls and fences.
 SCENE_CLASSES = (*POINT_CLASSES, *STATIC)
-TOP_VIEW_CLASSES = ("background", "drivable", "car", "van", "truck")
+TOP_VIEW_CLASSES = ("background", "drivable", *VEHICLES)
 _SECTORS = 1800  # of the shapes that rays of a pattern may hit
 # Point class of an object: PointSeg's car includes all vehicles. KITTI also labels sitting people. Trams and "misc"
 # objects (trailers, parked motorcycles) belong to no class: real labels ignore their points.
-POINT_CLASS_OF = {"car": 1, "van": 1, "truck": 1, "pedestrian": 2, "person_sitting": 2, "cyclist": 3}
+POINT_CLASS_OF = {**dict.fromkeys(VEHICLES, 1), "pedestrian": 2, "person_sitting": 2, "cyclist": 3}
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,6 +8,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from ..types.choices import VEHICLES
 from ..types.geometry import wrapped
 from .people import cyclist, pedestrian, person_sitting
 from .raycast import (
@@ -291,4 +292,4 @@ IN_BAYS = 0.75
 
 def any_vehicle(rng: np.random.Generator, trucks: float) -> str:
     """Draw a class of vehicle, with a given share of trucks."""
-    return str(rng.choice(["car", "van", "truck"], p=[0.84 - trucks, 0.16, trucks]))
+    return str(rng.choice(VEHICLES, p=[0.84 - trucks, 0.16, trucks]))

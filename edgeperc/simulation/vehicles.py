@@ -33,8 +33,8 @@ def _paint(rng: np.random.Generator, light_share: float) -> tuple[float, float]:
     """Draw remission and drop-out of car paint."""
     # Measured: mean remission of cars 0.01, 0.06, 0.11, 0.18, 0.27 (5, 25, 50, 75, 95 %), of vans 0.24 in the middle.
     if rng.random() < light_share:
-        return float(rng.uniform(0.35, 0.6)), float(rng.uniform(0.0, 0.2))
-    return float(rng.uniform(0.0, 0.22)), float(rng.uniform(0.1, 0.75))
+        return rng.uniform(0.35, 0.6), rng.uniform(0.0, 0.2)
+    return rng.uniform(0.0, 0.22), rng.uniform(0.1, 0.75)
 
 
 def car(size: Vector, rng: np.random.Generator) -> list[Row]:
@@ -129,7 +129,7 @@ def truck(size: Vector, rng: np.random.Generator) -> list[Row]:
         return bus(size, rng)
     length, width, height = size[0] - 0.04, size[1] - 0.04, size[2]
     paint, lost = _paint(rng, 0.6)
-    cargo = float(rng.uniform(0.15, 0.6))
+    cargo = rng.uniform(0.15, 0.6)
     cab = min(2.3, 0.35 * length)
     cab_height = min(height, 0.75 * height + 0.5)
     front = length / 2
@@ -160,8 +160,8 @@ def bus(size: Vector, rng: np.random.Generator) -> list[Row]:
     """Make a bus or a tram: a long hull with a band of windows."""
     length, width, height = size[0] - 0.04, size[1] - 0.04, size[2]
     paint, lost = _paint(rng, 0.6)
-    clearance = float(rng.uniform(0.2, 0.35))
-    sill, lintel = float(rng.uniform(0.9, 1.2)), height - float(rng.uniform(0.4, 0.7))
+    clearance = rng.uniform(0.2, 0.35)
+    sill, lintel = rng.uniform(0.9, 1.2), height - rng.uniform(0.4, 0.7)
     rows = [
         block(PAINT, paint, (0, 0, (clearance + sill) / 2), (length, width, sill - clearance), density=lost),
         block(GLASS, 0.03, (0, 0, (sill + lintel) / 2), (length * 0.99, width * 0.98, lintel - sill),

@@ -17,6 +17,7 @@ from ..camera.calibration import read_kitti_calibration
 from ..errors import OptionError
 from ..records import PerceivedScan
 from ..system.atomic import part_of, write_atomic
+from ..types.choices import VEHICLES
 from ..types.geometry import wrapped
 from ..types.perception import Box
 from .names import ScanFiles, stem_of
@@ -27,7 +28,7 @@ __all__ = ["KINDS", "PrelabelSink", "cvat_cuboid"]
 KINDS = ("labelcloud", "cvat", "kitti", "sustechpoints")
 """The tools and formats."""
 
-_CLASSES = ("car", "van", "truck", "pedestrian", "cyclist")
+_CLASSES = (*VEHICLES, "pedestrian", "cyclist")
 _COLORS = ("#4363d8", "#42d4f4", "#f58231", "#e6194b", "#3cb44b", "#911eb4", "#f032e6", "#bfef45", "#9a6324", "#808000")
 _SUSTECH_CLASSES = {"cyclist": "BicycleRider"}  # the others have their own names, with a capital
 

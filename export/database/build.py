@@ -33,8 +33,9 @@ from edgeperc.datasets.splits import TEST_DRIVES
 from edgeperc.errors import MissingExtraError
 from edgeperc.evaluation.metrics import Confusion
 from edgeperc.system.atomic import write_atomic
+from edgeperc.types.choices import VEHICLES
 
-from ..data.roads import CLASSES, VEHICLES, VIEW, Z_RANGE_M, DatabaseError, read_coco
+from ..data.roads import CLASSES, VIEW, Z_RANGE_M, DatabaseError, read_coco
 from .files import FARTHEST_M, FORMAT, N_FOLDS
 from .scenes import FOLDERS, INDEX, ROAD_FOLDERS, ROAD_INDEX, TRAIN, TRAINED, Job, Plan, SceneBuilder, inputs_of
 from .workers import run_jobs
