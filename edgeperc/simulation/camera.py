@@ -13,7 +13,7 @@ from ..camera.calibration import Calibration
 from ..errors import CalibrationError
 from ..types.choices import VEHICLES
 from ..types.points import Labels
-from .raycast import FACADE, GLASS, LEAVES, PAINT, RETRO, Hits, Rays, fill_cast, fill_ground_kinds
+from .raycast import FACADE, GLASS, LEAVES, PAINT, RETRO, Hits, Rays, fill_cast
 from .scene import Scene, SimulatedScan, place_shapes
 from .street import CAMERA_CLASSES
 
@@ -172,10 +172,7 @@ def _ground_at(
     scene: Scene, places: NDArray[Any], T_world_frame: NDArray[np.float64]
 ) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
     """Kind and remission of the ground at places (n, 3) of a frame."""
-    world = places.astype(np.float64) @ T_world_frame[:3, :3].T + T_world_frame[:3, 3]
-    kinds, remissions = np.empty(len(world), np.uint8), np.empty(len(world))
-    fill_ground_kinds(scene.ground, world[:, :2].copy(), kinds, remissions)
-    return kinds, remissions
+    return scene.surface((places.astype(np.float64) @ T_world_frame[:3, :3].T + T_world_frame[:3, 3])[:, :2])
 
 
 def surface_classes(scene: Scene) -> NDArray[np.uint8]:
