@@ -100,17 +100,7 @@ class PrelabelSink:
             self._document.write(b'{"info": {}, "items": [')
 
     def write(self, scan: PerceivedScan) -> None:
-        """Write the labels of one scan.
-
-        Raises
-        ------
-        OptionError
-            Another scan of the run has this name.
-        CalibrationError
-            The calibration of the scan is malformed.
-        OSError
-            The file cannot be written, or the calibration cannot be read.
-        """
+        """Write the labels of one scan. Raises OptionError if another one has its name, CalibrationError, OSError."""
         boxes: list[Named] = [(box, None) for box in scan.perception.boxes]
         if scan.tracked is not None:
             boxes = [(track.box, track.id) for track in scan.tracked if not track.coasting]

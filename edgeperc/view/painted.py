@@ -18,7 +18,7 @@ from ..types.sensor import SensorProfile
 from .canvas import add_axes, as_png, height_of_legend, new_figure, write_heading
 from .colors import FAINT, INK, color_of, rgb
 from .content import check_points, drawable_boxes, drawable_points, perceived_image
-from .picture import write_frame
+from .picture import Place, write_frame
 
 # Sizes in pixels.
 _WIDTH, _MARGIN, _TOP, _GAP, _AXIS = 1600, 28, 128, 44, 62
@@ -100,11 +100,7 @@ def draw_painted(
 
 
 def _draw_image(
-    figure: Any,
-    place: tuple[float, float, float, float],
-    image: NDArray[np.uint8],
-    colors: NDArray[np.float64],
-    labels: Labels,
+    figure: Any, place: Place, image: NDArray[np.uint8], colors: NDArray[np.float64], labels: Labels
 ) -> None:
     write_heading(figure, place[0], place[1] - 20, "the camera", "a class for every pixel")
     known = labels < len(colors)
@@ -115,7 +111,7 @@ def _draw_image(
 
 def _draw_points(
     figure: Any,
-    place: tuple[float, float, float, float],
+    place: Place,
     image: NDArray[np.uint8],
     points: Points,
     calibration: Calibration,
@@ -139,7 +135,7 @@ def _draw_points(
 
 def _draw_from_above(
     figure: Any,
-    room: tuple[float, float, float, float],
+    room: Place,
     points: Points,
     road: TopView,
     boxes: tuple[Box, ...],
