@@ -184,13 +184,8 @@ def read_labels(path: Path) -> KittiLabels:
     return KittiLabels(tuple(kind for kind, _ in rows), numbers)
 
 
-def read_objects(label_path: Path, calibration: KittiCalibration) -> tuple[tuple[Box, ...], NDArray[np.float64]]:
-    """Read a KITTI label file: boxes in the sensor frame, and (k, 4) DontCare rectangles [px] (SSADNet 3.1.1)."""
-    return label_objects(read_labels(label_path), calibration)
-
-
 def label_objects(labels: KittiLabels, calibration: KittiCalibration) -> tuple[tuple[Box, ...], NDArray[np.float64]]:
-    """Boxes of labels in the sensor frame, and (k, 4) DontCare rectangles [px]."""
+    """Boxes of labels in the sensor frame, and (k, 4) DontCare rectangles [px] (SSADNet 3.1.1)."""
     kinds, numbers = labels.objects
     placed = calibration.sensor_boxes(numbers[:, 7:14])
     boxes = tuple(
@@ -243,17 +238,23 @@ class KittiObjects:
 
 def _frame_rows(root: Path) -> list[dict[str, str]]:
     """Rows of ``frames.csv`` and ``frames-*.csv``; an empty list without a table."""
-    rows: list[dict[str, str]] = []
-    for table in (root / "frames.csv", *sorted(root.glob("frames-*.csv"))):
-        if not table.exists():
-            continue
-        with table.open(newline="") as file:
-            rows += csv.DictReader(file)
-        nowhere = next((row for row in rows if not (row.get("name") and row.get("drive"))), None)
-        if nowhere is not None:
-            raise PointsError(f"{table}: got {nowhere}; expected columns name and drive, both filled in every row")
-    for name in [row["name"] for row in rows]:
-        check_file(f"{root}: a scan in frames.csv is called", name, PointsError)
+    tables = (root / "frames.csv", *sorted(root.glob("frames-*.csv")))
+    rows = [row for table in tables if table.exists() for row in read_drives(table)]
+    for row in rows:
+        check_file(f"{root}: a scan in frames.csv is called", row["name"], PointsError)
+    return rows
+
+
+def read_drives(table: Path) -> list[dict[str, str]]:
+    """Rows of a table of scans, each with at least its ``name`` and its ``drive``. Raises PointsError."""
+    try:
+        with table.open(newline="", encoding="utf-8") as file:
+            rows = [*csv.DictReader(file)]
+    except (OSError, UnicodeDecodeError, csv.Error) as exc:
+        raise PointsError(f"{table} cannot be read ({exc}); expected columns name and drive") from exc
+    nowhere = next((row for row in rows if not (row.get("name") and row.get("drive"))), None)
+    if nowhere is not None:
+        raise PointsError(f"{table}: got {nowhere}; expected columns name and drive, both filled in every row")
     return rows
 
 
@@ -262,7 +263,7 @@ def layouts(root: Path | str) -> Iterator[tuple[Box, ...]]:
     root = Path(root)
     for name in [row["name"] for row in _frame_rows(root) if row["drive"] not in TEST_DRIVES]:
         calibration = KittiCalibration.read(root / "calib" / f"{name}.txt")
-        yield read_objects(root / "label_2" / f"{name}.txt", calibration)[0]
+        yield label_objects(read_labels(root / "label_2" / f"{name}.txt"), calibration)[0]
 
 
 ROAD_CLASSES = ("other", "road", "vehicle")

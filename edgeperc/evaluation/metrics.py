@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -20,6 +21,13 @@ N_POSITIONS = 40  # recall positions of KITTI's curves, without recall 0
 HEADING_RAD = math.pi / 4.0  # largest error of a correct heading
 
 ObjectKey = tuple[str, str, float, float, float]
+
+
+class Listed(dict[Any, tuple[Any, ...]]):
+    """What was counted of scans, by key: adding joins what two of them list."""
+
+    def __add__(self, other: Listed) -> Listed:
+        return Listed({key: self.get(key, ()) + other.get(key, ()) for key in {**self, **other}})
 
 
 class Confusion:
