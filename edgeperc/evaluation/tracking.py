@@ -79,7 +79,7 @@ class FrameResult:
 
 
 def sequence_names(root: Path | str) -> list[str]:
-    """Names of the sequences below ``root``: of KITTI's tracking (``label_02/NAME.txt``), or the drives of an object set
+    """Names of the sequences below ``root``: of KITTI's tracking (``label_02/NAME.txt``), or drives of an object set
     with ``training/track_id``, an id for each label (`datasets.kitti.KittiObjects`). Raises TrackingError.
     """
     root = Path(root)
