@@ -112,7 +112,7 @@ FLOORS = {
         ros2.__init__ ros2.graph ros2.messages
         ros2.odometry
         ros2.node ros2.rclpy_graph ros2.zenoh_graph
-        sinks.__init__ sinks.names sinks.relay sinks.run_file sinks.scene
+        sinks.__init__ sinks.relay sinks.run_file sinks.scene
         sinks.foxglove sinks.page sinks.prelabels sinks.rerun sinks.rosbag sinks.static
         cli.arguments cli.evaluation.__init__ cli.output cli.straighten
         cli.completion cli.doctor cli.evaluation.box_tables cli.evaluation.painting cli.lists cli.program
@@ -194,7 +194,6 @@ SAME_NAME = {
     "cli": (3, "one a program"),
     "files": (3, "the files of readers, of pictures, of the database"),
     "images": (3, "images read, labeled, trained on"),
-    "names": (2, "names in messages, names in what viewers show"),
     "page": (2, "the page, and the sink that writes it"),
     "painting": (3, "painting, its evaluation, the command of that"),
     "pillars": (2, "a detector's input, its rivals' input"),

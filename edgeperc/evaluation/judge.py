@@ -92,10 +92,8 @@ class Judge:
         n_threads: int | None = None,
     ) -> None:
         mounting = MODEL_MOUNTING if mounted is None else Mounting()
-        if sensor is None:
-            self.perceive = _perceiver(models, perceiving, n_threads, mounting)
-        else:
-            self.perceive = _perceiver(models, perceiving, n_threads, sensor.mounting, sensor)
+        mounting = mounting if sensor is None else sensor.mounting
+        self.perceive = _perceiver(models, perceiving, n_threads, mounting, sensor)
         self.mounted = None if mounted is None else ModelFrame(mounted)
         self.as_recorded = mounted is None and sensor is None
         self.point_classes: tuple[str, ...] = POINT_CLASSES

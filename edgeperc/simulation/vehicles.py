@@ -54,6 +54,8 @@ def car(size: Vector, rng: np.random.Generator) -> list[Row]:
     middle = (nose + tail) / 2.0
     roof = height - 0.07
     rise = roof - belt
+    # The roof lies on the glass; the pillars are inside its edges.
+    front, rear = half * (1 - screen * rise / half * 1.6), half * (1 - back * rise / half * 1.6)
     rows = [
         block(PAINT, paint, (0, 0, (clearance + hood) / 2), (length, width, hood - clearance), density=lost,
                taper=(0.05, 0.04, 0.05)),
@@ -61,14 +63,9 @@ def car(size: Vector, rng: np.random.Generator) -> list[Row]:
                (nose + length / 2 - 0.08, width * 0.97, belt - hood), density=lost, taper=(0.1, 0.02, 0.02)),
         block(GLASS, 0.03, (middle, 0, (belt + roof) / 2), (2 * half, width * 0.93, rise),
                density=rng.uniform(0.5, 0.97), taper=(screen * rise / half * 1.6, back * rise / half * 1.6, sides)),
-        block(PAINT, paint, (0, 0, 0), (1, 1, 1), density=lost),
+        block(PAINT, paint, (middle + (front - rear) / 2, 0, (roof + height) / 2),
+               (front + rear, width * 0.93 * (1 - sides), height - roof), density=lost, taper=(0.15, 0.1, 0.15)),
     ]  # fmt: skip
-    # The roof lies on the glass; the pillars are inside its edges.
-    front, rear = half * (1 - screen * rise / half * 1.6), half * (1 - back * rise / half * 1.6)
-    rows[3] = block(
-        PAINT, paint, (middle + (front - rear) / 2, 0, (roof + height) / 2),
-        (front + rear, width * 0.93 * (1 - sides), height - roof), density=lost, taper=(0.15, 0.1, 0.15),
-    )  # fmt: skip
     for x_low, x_high in (
         (middle + half, middle + front),
         (middle - half, middle - rear),

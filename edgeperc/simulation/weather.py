@@ -79,9 +79,8 @@ def fog(points: Points, visibility_m: float, *, max_range_m: float = 120.0, seed
     is_soft = (soft > hard) & (ranges > at)
     scattered = at * rng.uniform(0.5, 1.5, len(points))
     is_lost = hard / np.maximum(ranges, 1e-9) ** 2 < LEAST_REMISSION / max_range_m**2
-    foggy = _with_drops(
-        points, points[:, :3] / np.maximum(ranges, 1e-9)[:, None], ranges, _or_never(is_soft, scattered)
-    )
+    rays = points[:, :3] / np.maximum(ranges, 1e-9)[:, None]
+    foggy = _with_drops(points, rays, ranges, np.where(is_soft, scattered, np.inf))
     foggy[:, 3] = np.where(is_soft, np.minimum(soft, 1.0), points[:, 3] * np.exp(-2.0 * per_m * ranges))
     return foggy[is_soft | ~is_lost]
 
@@ -119,7 +118,3 @@ def _with_drops(
     wet[nearer, :3] = (rays[nearer] * at[nearer, None]).astype(np.float32)
     wet[nearer, 3] = np.minimum(wet[nearer, 3], DROP_REMISSION)
     return wet
-
-
-def _or_never(chosen: NDArray[np.bool_], at: NDArray[np.float64]) -> NDArray[np.float64]:
-    return np.where(chosen, at, np.inf)

@@ -20,8 +20,7 @@ from ..system.atomic import part_of, write_atomic
 from ..types.choices import VEHICLES
 from ..types.geometry import wrapped
 from ..types.perception import Box
-from .names import ScanFiles, stem_of
-from .run_file import RunFile, warn_of
+from .run_file import RunFile, ScanFiles, stem_of, warn_of
 
 __all__ = ["KINDS", "PrelabelSink", "cvat_cuboid"]
 

@@ -13,7 +13,7 @@ from ..records import PerceivedScan
 from ..system.atomic import write_atomic
 from ..tracking.moving import movable_points, moving_points
 from ..types.points import Mask, Points, as_points
-from .names import ScanFiles, stem_of
+from .run_file import ScanFiles, stem_of
 
 __all__ = ["StaticSink"]
 
