@@ -98,18 +98,13 @@ class KittiCalibration:
         high = np.where(ahead[..., None], pixel, -np.inf).max(axis=1).clip(0.0, image_size)
         return np.hstack([low, np.maximum(high, low)])
 
-    def in_image(self, points: NDArray[Any]) -> NDArray[np.bool_]:
-        """Which points (n, 3+) in the sensor frame lie in the camera's field of view, (n,) bool."""
-        pixel, depth = self.to_image(points)
-        return (depth > 0.1) & (pixel >= 0).all(axis=1) & (pixel[:, 0] < IMAGE_SIZE[0]) & (pixel[:, 1] < IMAGE_SIZE[1])
-
     def labeled_at(self, places: NDArray[Any], unlabeled: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Which places (n, 3+) in the sensor frame are in the image and in no ``unlabeled`` (k, 4) rectangle [px]."""
-        labeled = self.in_image(places)
-        pixel, _ = self.to_image(places)
+        pixel, depth = self.to_image(places)
+        column, row = pixel.T
+        labeled = (depth > 0.1) & (pixel >= 0).all(axis=1) & (column < IMAGE_SIZE[0]) & (row < IMAGE_SIZE[1])
         for left, top, right, bottom in unlabeled:
-            within = (pixel[:, 0] >= left) & (pixel[:, 0] <= right) & (pixel[:, 1] >= top) & (pixel[:, 1] <= bottom)
-            labeled &= ~within
+            labeled &= ~((column >= left) & (column <= right) & (row >= top) & (row <= bottom))
         return labeled
 
 

@@ -83,13 +83,9 @@ def count_headings(
             kind = 0 if moves[i] else 1 if int(frame.ids[i]) in moved else 2
             rows.append((kind, int(result.ids[track]), bool(result.fronts[track] >= 0.5), right))
     counted = []
-    for kind in range(3):
-        of_kind = [row for row in rows if row[0] == kind]
-        resolved = [row for row in of_kind if row[2]]
-        n_right = sum(row[3] for row in resolved)
-        counted.append(
-            Standing(
-                len(of_kind), len({row[1] for row in of_kind}), len(resolved), n_right, sum(row[3] for row in of_kind)
-            )
-        )
+    for number in range(3):
+        of_kind = [row for row in rows if row[0] == number]
+        resolved, right = ([bool(row[k]) for row in of_kind] for k in (2, 3))
+        n_tracks, n_both = len({row[1] for row in of_kind}), sum(map(min, resolved, right))
+        counted.append(Standing(len(of_kind), n_tracks, sum(resolved), n_both, sum(right)))
     return Headings(*counted)

@@ -24,7 +24,7 @@ from ..tracking.tracks import ClassParameters, Tracks
 from ..types.choices import VEHICLES
 from ..types.perception import Box
 from .ab3dmot import SETTINGS, Ab3dmot
-from .headings import Headings, count_headings
+from .headings import FRAME_S, Headings, count_headings
 from .judge import check_unseen, training_scans_of
 from .metrics import box_rows
 from .tracking_metrics import FrameTracks, FrameTruth, evaluate_tracks
@@ -39,7 +39,6 @@ KINDS = {**{of: (of,) for of in CLASSES}, "vehicle": VEHICLES}
 # From KITTI's evaluation: labels that may be confused with each class, and limits of objects to find.
 NEIGHBORS = {"car": ("van",), "pedestrian": ("person", "person_sitting"), "cyclist": (), "vehicle": ("tram", "misc")}
 MAX_OCCLUSION, MAX_TRUNCATION, MIN_HEIGHT_PX, MIN_UNLABELED = 2, 0, 25.0, 0.5
-FRAME_S = 0.1
 
 # "edgeperc": a track's image box is the projection of its 3-D box, and scores are compared exactly.
 # "ab3dmot": as AB3DMOT's program. Boxes are upright in the camera's frame, whose y axis is up to 1 degree off the

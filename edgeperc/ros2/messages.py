@@ -362,21 +362,17 @@ class RosMessages:
 
     def detected_objects(self, scan: PerceivedScan, stamp_ns: int | None = None) -> Any:
         """Boxes: an autoware_perception_msgs/DetectedObjects."""
-        objects = [
-            self._object(
-                "Detected",
-                box,
-                {
-                    "pose_with_covariance": self._with("Pose", self._pose(box)),
-                    "has_position_covariance": False,
-                    "orientation_availability": _SIGN_UNKNOWN if box.front is None else _AVAILABLE,
-                    "twist_with_covariance": self._with("Twist", self._twist()),
-                    "has_twist": False,
-                    "has_twist_covariance": False,
-                },
-            )
-            for box in scan.perception.boxes
-        ]
+        objects = []
+        for box in scan.perception.boxes:
+            kinematics = {
+                "pose_with_covariance": self._with("Pose", self._pose(box)),
+                "has_position_covariance": False,
+                "orientation_availability": _SIGN_UNKNOWN if box.front is None else _AVAILABLE,
+                "twist_with_covariance": self._with("Twist", self._twist()),
+                "has_twist": False,
+                "has_twist_covariance": False,
+            }
+            objects.append(self._object("Detected", box, kinematics))
         return self._objects("Detected", scan, stamp_ns, objects)
 
     def tracked_objects(self, scan: PerceivedScan, stamp_ns: int | None = None) -> Any:

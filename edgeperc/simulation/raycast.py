@@ -176,37 +176,27 @@ def ground_at(ground: Ground, x: float, y: float) -> tuple[float, float, float, 
     return z, outside, outside_bays, u_first, s_first
 
 
-@njit(cache=True, nogil=True)
-def fill_placed(
-    primitives: NDArray[np.float64],
-    poses: NDArray[np.float64],
-    T_world_sensor: NDArray[np.float64],
-    placed: NDArray[np.float64],
-) -> None:
-    """Transform primitives into the sensor frame.
+@np.errstate(invalid="ignore")
+def placed(
+    primitives: NDArray[np.float64], poses: NDArray[np.float64], T_world_sensor: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Primitives (n, 20), of the frame of their object or of the world, in the sensor frame.
 
-    primitives : (n, 20) float64; in the frame of their object, or of the world.
     poses : (m, 4) float64; x, y, z [m], yaw [rad] of the objects.
-    T_world_sensor : (4, 4) float64
-    placed : (n, 20) float64, overwritten
     """
-    T = T_world_sensor
-    for k in range(primitives.shape[0]):
-        placed[k] = primitives[k]
-        x, y, z, cos, sin = 0.0, 0.0, 0.0, 1.0, 0.0
-        o = int(primitives[k, 19])
-        if o >= 0:
-            x, y, z, cos, sin = poses[o, 0], poses[o, 1], poses[o, 2], math.cos(poses[o, 3]), math.sin(poses[o, 3])
-        cx, cy, cz = primitives[k, 4], primitives[k, 5], primitives[k, 6]
-        dx = cos * cx - sin * cy + x - T[0, 3]
-        dy = sin * cx + cos * cy + y - T[1, 3]
-        dz = cz + z - T[2, 3]
-        for i in range(3):
-            placed[k, 4 + i] = T[0, i] * dx + T[1, i] * dy + T[2, i] * dz
-            ax, ay, az = primitives[k, 7 + 3 * i], primitives[k, 8 + 3 * i], primitives[k, 9 + 3 * i]
-            wx, wy = cos * ax - sin * ay, sin * ax + cos * ay
-            for j in range(3):
-                placed[k, 7 + 3 * i + j] = wx * T[0, j] + wy * T[1, j] + az * T[2, j]
+    T, result = T_world_sensor, primitives.copy()
+    of_world = [0.0, 0.0, 0.0, 1.0, 0.0]
+    frames = np.array([*([x, y, z, math.cos(yaw), math.sin(yaw)] for x, y, z, yaw in poses.tolist()), of_world])
+    x, y, z, cos, sin = frames[np.maximum(primitives[:, 19], -1.0).astype(np.int64)].T
+    cx, cy, cz = primitives[:, 4:7].T
+    dx, dy, dz = cos * cx - sin * cy + x - T[0, 3], sin * cx + cos * cy + y - T[1, 3], cz + z - T[2, 3]
+    for i in range(3):
+        result[:, 4 + i] = T[0, i] * dx + T[1, i] * dy + T[2, i] * dz
+        ax, ay, az = primitives[:, 7 + 3 * i : 10 + 3 * i].T
+        wx, wy = cos * ax - sin * ay, sin * ax + cos * ay
+        for j in range(3):
+            result[:, 7 + 3 * i + j] = wx * T[0, j] + wy * T[1, j] + az * T[2, j]
+    return result
 
 
 @njit(cache=True, nogil=True)

@@ -26,9 +26,9 @@ from .raycast import (
     fill_bounds,
     fill_cast,
     fill_ground_kinds,
-    fill_placed,
     fill_points,
     ground_at,
+    placed,
 )
 
 POINT_CLASSES = ("background", "car", "pedestrian", "cyclist")
@@ -336,9 +336,8 @@ def place_shapes(scene: Scene, T_world_sensor: NDArray[np.float64], n_columns: i
     n_columns : number of sectors of a turn, counter-clockwise from +x.
     The last column of the returned primitives is their row of ``scene.primitives``.
     """
-    primitives = np.empty_like(scene.primitives)
     poses = np.array([(*o.center[:2], o.center[2] - o.size[2] / 2.0, o.yaw) for o in scene.objects]).reshape(-1, 4)
-    fill_placed(scene.primitives, poses, T_world_sensor, primitives)
+    primitives = placed(scene.primitives, poses, T_world_sensor)
     bounds = np.empty((len(primitives), 5))
     fill_bounds(primitives, bounds)
     near_first = np.argsort(bounds[:, 4], kind="stable")

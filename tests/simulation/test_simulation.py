@@ -95,8 +95,7 @@ def in_box(points: np.ndarray, each: Box, grown: float) -> np.ndarray:
 
 def placed_primitives(scene: Scene, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Primitives of a scene in the sensor frame, nearest first, and their bounds."""
-    placed = np.empty_like(scene.primitives)
-    raycast.fill_placed(scene.primitives, poses_of(scene), pose, placed)
+    placed = raycast.placed(scene.primitives, poses_of(scene), pose)
     bounds = np.empty((len(placed), 5))
     raycast.fill_bounds(placed, bounds)
     order = np.argsort(bounds[:, 4], kind="stable")
@@ -193,8 +192,7 @@ def test_placing_is_its_twin(n: int) -> None:
     primitives[:, 19] = rng.integers(-1, 3, n)
     primitives[1::5, 5] = np.nan
     pose = sensor_pose(flat(street()), SMALL, 3.0, -2.0, yaw=0.7, pitch=0.03, roll=-0.02)
-    placed = np.empty_like(primitives)
-    raycast.fill_placed(primitives, poses, pose, placed)
+    placed = raycast.placed(primitives, poses, pose)
     np.testing.assert_allclose(placed, twins.simulation.placed(primitives, poses, pose), atol=1e-9)
 
 

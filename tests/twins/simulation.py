@@ -78,7 +78,7 @@ def cosine(primitive: np.ndarray, direction: np.ndarray, t: float) -> float:
 
 
 def placed(primitives: np.ndarray, poses: np.ndarray, pose: np.ndarray) -> np.ndarray:
-    """Twin of `fill_placed`."""
+    """Twin of `placed` of `raycast`."""
     out = primitives.copy()
     for row in out:
         x, y, z, yaw = poses[int(row[19])] if row[19] >= 0 else np.zeros(4)
