@@ -108,7 +108,7 @@ FLOORS = {
         evaluation.tables
         evaluation.truth
         evaluation.judge
-        evaluation.camvid evaluation.evaluate evaluation.found evaluation.tracking evaluation.transfer
+        evaluation.camvid evaluation.evaluate evaluation.tracking evaluation.transfer
         ros2.__init__ ros2.graph ros2.messages
         ros2.odometry
         ros2.node ros2.rclpy_graph ros2.zenoh_graph

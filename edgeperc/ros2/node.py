@@ -21,7 +21,7 @@ from ..records import PerceivedScan
 from ..road.grid import Split, split_points
 from ..system.clock import Stamp
 from ..system.names import check_text
-from .graph import RELIABLE, TRANSITIONS, Graph, Output, State, full_name
+from .graph import TRANSITIONS, Graph, Output, State, full_name
 from .messages import (
     CLOUD,
     DIAGNOSTICS,
@@ -145,7 +145,7 @@ class PerceptionNode:
 
         self._topics = _topics_of(outputs, prefix, rolling is not None)
         self._outputs: dict[str, Output] = {}
-        self._diagnostics = graph.advertise("/diagnostics", DIAGNOSTICS, RELIABLE) if "diagnostics" in outputs else None
+        self._diagnostics = graph.advertise("/diagnostics", DIAGNOSTICS) if "diagnostics" in outputs else None
         # The queue is empty nearly always: the stream's thread takes what comes, and keeps the newest.
         self._stream = stream(iter(self._waiting.get, None), self._perceive, tracker, rate_hz=rate_hz)
         self._state: State = "unconfigured"
@@ -211,7 +211,7 @@ class PerceptionNode:
             return
         for name, topic in self._topics.items():
             try:
-                self._outputs[name] = self._graph.advertise(topic, LIVE_OUTPUTS[name], RELIABLE)
+                self._outputs[name] = self._graph.advertise(topic, LIVE_OUTPUTS[name])
             except OptionError as exc:
                 if name != "detections":
                     raise
