@@ -86,7 +86,11 @@ def draw_painted(
     }
     figure = new_figure(_WIDTH, int(bottom) + 40 + height_of_legend(facts) + 68)
     colors = rgb([color_of(name) for name in labels.classes])
-    _draw_image(figure, (_MARGIN, _TOP, width, height), image, colors, labels.labels)
+    write_heading(figure, _MARGIN, _TOP - 20, "the camera", "a class for every pixel")
+    known = labels.labels < len(colors)
+    tint = np.where(known[..., None], colors[np.where(known, labels.labels, 0)], 0.5)
+    axes = add_axes(figure, _MARGIN, _TOP, width, height)
+    axes.imshow(0.5 * image / 255.0 + 0.5 * tint, aspect="auto", interpolation="antialiased")
     place = (_MARGIN, _TOP + height + _GAP, width, height)
     _draw_points(figure, place, image, points, calibration, colors, painted)
     left = _MARGIN + width + 34.0 + _AXIS
@@ -97,16 +101,6 @@ def draw_painted(
     tops = bottom + 40, bottom + 40 + height_of_legend(facts) + 34
     write_frame(figure, perception, (title, 1000), share, facts, tops)
     return as_png(figure, path)
-
-
-def _draw_image(
-    figure: Any, place: Place, image: NDArray[np.uint8], colors: NDArray[np.float64], labels: Labels
-) -> None:
-    write_heading(figure, place[0], place[1] - 20, "the camera", "a class for every pixel")
-    known = labels < len(colors)
-    tint = np.where(known[..., None], colors[np.where(known, labels, 0)], 0.5)
-    axes = add_axes(figure, *place)
-    axes.imshow(0.5 * image / 255.0 + 0.5 * tint, aspect="auto", interpolation="antialiased")
 
 
 def _draw_points(
