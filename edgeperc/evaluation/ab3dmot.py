@@ -45,16 +45,8 @@ _Q = np.diag([1.0] * N_SEEN + [0.01] * 3)
 _P = np.diag([10.0] * N_SEEN + [10000.0] * 3)
 _ORDER = [0, 1, 2, 6, 3, 4, 5]  # a box's row -> the state's order
 _BACK = [0, 1, 2, 4, 5, 6, 3]
-_TRACK = np.dtype(
-    [
-        ("id", "i8"),
-        ("state", "f8", N_STATE),
-        ("covariance", "f8", _P.shape),
-        ("hits", "i8"),
-        ("missed", "i8"),
-        ("score", "f8"),
-    ]
-)
+_NUMBERS = [(name, "i8") for name in ("id", "hits", "missed")]
+_TRACK = np.dtype([*_NUMBERS, ("score", "f8"), ("state", "f8", N_STATE), ("covariance", "f8", _P.shape)])
 
 
 class Ab3dmot:
