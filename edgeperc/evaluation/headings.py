@@ -84,8 +84,8 @@ def count_headings(
             rows.append((kind, int(result.ids[track]), bool(result.fronts[track] >= 0.5), right))
     counted = []
     for number in range(3):
-        of_kind = [row for row in rows if row[0] == number]
-        resolved, right = ([bool(row[k]) for row in of_kind] for k in (2, 3))
-        n_tracks, n_both = len({row[1] for row in of_kind}), sum(map(min, resolved, right))
-        counted.append(Standing(len(of_kind), n_tracks, sum(resolved), n_both, sum(right)))
+        of_kind = [row[1:] for row in rows if row[0] == number]
+        n_tracks, n_resolved = len({track for track, *_ in of_kind}), sum(resolved for _, resolved, _ in of_kind)
+        n_right = sum(resolved and right for _, resolved, right in of_kind)
+        counted.append(Standing(len(of_kind), n_tracks, n_resolved, n_right, sum(right for *_, right in of_kind)))
     return Headings(*counted)

@@ -123,8 +123,8 @@ def _count(
     for label, overlap_name, least_iou, level, (near, far) in _rules(levels):
         hidden, small = levels.get(level, last)
         may_be = (label, *CLASSES[label][1], *also)
-        columns = np.flatnonzero([kind in may_be for kind in kinds])
-        rows = np.flatnonzero(small | (labels == label))
+        columns = np.flatnonzero([kind in may_be for kind in kinds]).tolist()
+        rows = np.flatnonzero(small | (labels == label)).tolist()
         away = hidden | (right_m < near) | (right_m >= far)
         optional = [bool(away[k]) or kinds[k] != label for k in columns]
         excused = ((guess_m < near) | (guess_m >= far))[rows].tolist()
