@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from edgeperc.evaluation.judge import renamed
 from edgeperc.evaluation.metrics import BoxEvaluator, Confusion, boxes_to_find
-from edgeperc.evaluation.tables import VEHICLES
 from edgeperc.simulation.samples import IGNORE, labels_by_boxes
 from edgeperc.simulation.scene import POINT_CLASSES, TOP_VIEW_CLASSES, SimulatedScan
+from edgeperc.types.choices import VEHICLES
 from edgeperc.types.perception import Box, Perception
 from edgeperc.types.sensor import SensorProfile, get_sensor
 from edgeperc.types.views import TopViewGeometry

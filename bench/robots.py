@@ -17,12 +17,12 @@ import numpy as np
 
 from edgeperc import Mounting, Perceiver
 from edgeperc.evaluation.metrics import BoxEvaluator, Confusion
-from edgeperc.evaluation.tables import VEHICLES
 from edgeperc.preprocess.findings import Finding
 from edgeperc.simulation import POINT_CLASSES, TOP_VIEW_CLASSES, Scene, SimulatedScan, random_scene, simulate
 from edgeperc.simulation.raycast import SLOPE_Y
 from edgeperc.simulation.samples import FIRST_SEED
 from edgeperc.simulation.scene import sensor_pose
+from edgeperc.types.choices import VEHICLES
 from edgeperc.types.perception import Perception
 from edgeperc.types.sensor import SensorProfile
 from edgeperc.types.views import TopViewGeometry

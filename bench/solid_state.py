@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 
 from edgeperc import Mounting, Perceiver, TimedScan, Trajectory, accumulate, merge
 from edgeperc.evaluation.metrics import BoxEvaluator
-from edgeperc.evaluation.tables import VEHICLES
 from edgeperc.simulation import SimulatedScan, random_scene, simulate, simulate_sequence
 from edgeperc.simulation.samples import FIRST_SEED
+from edgeperc.types.choices import VEHICLES
 from edgeperc.types.mounting import MODEL_MOUNTING
 from edgeperc.types.sensor import SensorProfile, get_sensor
 

@@ -10,6 +10,7 @@ from edgeperc.objects.crops import FEATURES
 from edgeperc.simulation.scene import POINT_CLASSES, TOP_VIEW_CLASSES
 from edgeperc.simulation.street import CAMERA_CLASSES
 from edgeperc.types.card import InputSpec, ModelCard, OutputSpec
+from edgeperc.types.choices import VEHICLES
 from edgeperc.types.sensor import get_sensor
 from edgeperc.types.views import CameraGeometry, ObjectGeometry, RangeImageGeometry, TopViewGeometry
 
@@ -18,7 +19,7 @@ from .recipe import EDGE_BLOCKS, Recipe
 ROAD_CLASSES = TOP_VIEW_CLASSES[:2]
 """LoDNN's classes; the ground under a vehicle is background."""
 
-OBJECT_CLASSES = ("background", "car", "van", "truck", "pedestrian", "cyclist")
+OBJECT_CLASSES = ("background", *VEHICLES, "pedestrian", "cyclist")
 
 TOP_VIEW = TopViewGeometry()
 OBJECT_VIEW = ObjectGeometry(n_points=48)
@@ -80,7 +81,7 @@ def card_of(recipe: Recipe, **facts: Any) -> ModelCard:
         # Length, width, height: geometric means, and standard deviations of the logarithms, of 28,963 labels of KITTI
         # without test drives.
         facts = {
-            "box_classes": ("car", "van", "truck"),
+            "box_classes": VEHICLES,
             "box_size_priors": {"car": (3.86, 1.63, 1.52), "van": (5.0, 1.9, 2.18), "truck": (10.02, 2.58, 3.2)},
             "box_size_spreads": {
                 "car": (0.11, 0.06, 0.084),

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 
 from edgeperc import Perception, PointLabels
-from edgeperc.ros2.graph import SENSOR_DATA
 from edgeperc.ros2.messages import CLOUD, RosMessages
 from edgeperc.ros2.zenoh_graph import ZenohGraph
 from edgeperc.simulation.drawn import random_scene
@@ -121,7 +120,7 @@ def publish(n: int) -> None:
     graph = ZenohGraph("lidar", messages=MESSAGES)
     try:
         graph.subscribe("/edgeperc/points", CLOUD, lambda _: answered.release())
-        output = graph.advertise("/points", CLOUD, SENSOR_DATA)
+        output = graph.advertise("/points", CLOUD)
         until(lambda: output.is_wanted)
         for k, points in enumerate(scans(n)):
             output.publish(cloud(points, 10**18 + k * 10**8, "velodyne_hdl64e"))

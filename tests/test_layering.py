@@ -109,11 +109,11 @@ FLOORS = {
         evaluation.tables
         evaluation.truth
         evaluation.judge
-        evaluation.camvid evaluation.evaluate evaluation.found evaluation.tracking evaluation.transfer
+        evaluation.camvid evaluation.evaluate evaluation.tracking evaluation.transfer
         ros2.__init__ ros2.graph ros2.messages
         ros2.odometry
         ros2.node ros2.rclpy_graph ros2.zenoh_graph
-        sinks.__init__ sinks.names sinks.relay sinks.run_file sinks.scene
+        sinks.__init__ sinks.relay sinks.run_file sinks.scene
         sinks.foxglove sinks.page sinks.prelabels sinks.rerun sinks.rosbag sinks.static
         cli.arguments cli.evaluation.__init__ cli.output cli.straighten
         cli.completion cli.doctor cli.evaluation.box_tables cli.evaluation.painting cli.lists cli.program
@@ -193,7 +193,6 @@ SAME_NAME = {
     "cli": (3, "one a program"),
     "files": (3, "the files of readers, of pictures, of the database"),
     "images": (3, "images read, labeled, trained on"),
-    "names": (2, "names in messages, names in what viewers show"),
     "page": (2, "the page, and the sink that writes it"),
     "painting": (3, "painting, its evaluation, the command of that"),
     "pillars": (2, "a detector's input, its rivals' input"),
@@ -374,8 +373,8 @@ def test_the_listing_explains_the_system() -> None:
 
 
 @pytest.mark.parametrize("name", sorted(modules()))
-def test_files_have_at_most_800_lines(name: str) -> None:
-    assert modules()[name].read_text("utf-8").count("\n") <= 800
+def test_files_have_at_most_750_lines(name: str) -> None:
+    assert modules()[name].read_text("utf-8").count("\n") <= 750
 
 
 def functions(tree: ast.AST) -> Iterator[ast.FunctionDef | ast.AsyncFunctionDef]:

@@ -43,7 +43,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edgeperc import Box, Perceiver, Perception, Tracker, movable_points, moving_points
-from edgeperc.datasets.kitti import KittiCalibration, KittiObjects, read_objects
+from edgeperc.datasets.kitti import KittiCalibration, KittiObjects, label_objects, read_labels
 from edgeperc.errors import SplitError
 from edgeperc.evaluation.judge import check_unseen, training_scans_of
 from edgeperc.readers.files import read_points
@@ -115,7 +115,9 @@ def real_drives(
             points = read_points(root / "training/velodyne" / f"{name}.bin")
             calibration = KittiCalibration.read(root / "training/calib" / f"{name}.txt")
             path = root / "training/label_2" / f"{name}.txt"
-            boxes, unlabeled = read_objects(path, calibration) if path.exists() else ((), np.zeros((0, 4)))
+            boxes, unlabeled = (
+                label_objects(read_labels(path), calibration) if path.exists() else ((), np.zeros((0, 4)))
+            )
             seen = calibration.labeled_at(points, unlabeled) if path.exists() else np.zeros(len(points), np.bool_)
             try:
                 check_unseen(trained_on, name, drive, points)

@@ -37,7 +37,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edgeperc import Box, Tracker
-from edgeperc.evaluation.tracking import CLASSES, FRAME_S, read_sequence, sequence_names, sequence_scans
+from edgeperc.evaluation.headings import FRAME_S
+from edgeperc.evaluation.tracking import CLASSES, read_sequence, sequence_names, sequence_scans
 from edgeperc.types.sensor import get_sensor
 
 from ..render import Section, number, text

@@ -27,6 +27,7 @@ from ..objects.linkage import Strips
 from ..objects.persons import complete_persons
 from ..system.kernels import njit
 from ..types import choices
+from ..types.choices import VEHICLES
 from ..types.geometry import Grid, box_records, is_inside
 from ..types.mounting import MODEL_HEIGHT_M
 from ..types.perception import Box, PointLabels, TopView
@@ -66,7 +67,6 @@ labeled points and obstacles are not drivable.
 """
 _NEED_GROUND = frozenset({"column", "height", "person", "ground", "stand", "road"})
 
-VEHICLES = frozenset({"car", "van", "truck"})
 # Height [m] above the ground up to which the column of points at a person may reach. At 2.2 and 2.4 m instead of 2.0 m,
 # 24 and 38 % fewer of the false pedestrian points are removed; no pedestrian is lost at any of them.
 PERSON_TOP_M: Mapping[str, float] = MappingProxyType({"pedestrian": 2.0, "cyclist": 2.2})
@@ -199,7 +199,7 @@ def agree_on_points(
     agreed, in_view, roles = upright, labels.in_view, roles_of(labels.classes)
     n = int(clusters.max(initial=-1)) + 1
     tallies = Tallies(np.empty(n, CLUSTER), np.empty((n, len(labels.classes) + 1), np.int32))
-    votes = "cells" in rules and view is not None and not VEHICLES.isdisjoint(view.classes)
+    votes = "cells" in rules and view is not None and not {*VEHICLES}.isdisjoint(view.classes)
     fill_tallies(scan.cloud, in_view, agreed, clusters, cells_of(view if votes else None), tallies)
     verdicts = _verdicts(labels.classes, tallies, sight, rules)
     before = agreed.copy()

@@ -8,6 +8,7 @@ import sys
 import time
 import warnings
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -370,8 +371,8 @@ class _Perceivers:
 
     def __init__(self, arguments: argparse.Namespace) -> None:
         self._arguments = arguments
-        self._made: dict[str | SensorProfile, Perceiver] = {}
         self._sensors = Sensors(arguments)
+        self.of = lru_cache(maxsize=_MOST_PERCEIVERS)(self._make)
 
     def check(self, scans: Sequence[Path | Remote], of_images: bool) -> None:
         """Make the first perceiver, so that errors of options and models come before any file is written."""
@@ -405,15 +406,9 @@ class _Perceivers:
         """The sensor of ``--sensor``, of the capture, or the one that is found in the points."""
         return self._sensors.of(path, url)[0]
 
-    def of(self, sensor: str | SensorProfile) -> Perceiver:
-        """The perceiver of a sensor."""
-        if sensor not in self._made:
-            if len(self._made) >= _MOST_PERCEIVERS:
-                del self._made[next(iter(self._made))]
-            self._made[sensor] = make_perceiver(
-                self._arguments, sensor=sensor, on_mismatch=self._arguments.on_mismatch, adapt=self._arguments.adapt
-            )
-        return self._made[sensor]
+    def _make(self, sensor: str | SensorProfile) -> Perceiver:
+        arguments = self._arguments
+        return make_perceiver(arguments, sensor=sensor, on_mismatch=arguments.on_mismatch, adapt=arguments.adapt)
 
 
 Outcome = tuple[Path, "Perception | Answer | Exception", "Tracks | None", "bytes | None"]

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +22,7 @@ def read_labelcloud(path: Path) -> list[Box]:
     known = _read(settings).get("format", "centroid_rel") if settings.exists() else "centroid_rel"
     if known not in ("centroid_rel", "centroid_abs"):
         raise PointsError(f"{settings} has format {known!r:.40}; save the labels as centroid_rel or centroid_abs")
-    try:
+    with _holding(path, "labels of labelCloud"):
         return [
             _box(
                 item["name"],
@@ -30,20 +32,16 @@ def read_labelcloud(path: Path) -> list[Box]:
             )
             for item in _read(path)["objects"]
         ]
-    except (KeyError, OverflowError, TypeError, ValueError) as exc:
-        raise PointsError(f"{path} holds no labels of labelCloud ({type(exc).__name__}: {exc})") from exc
 
 
 def read_sustechpoints(path: Path) -> list[Box]:
     """Read ``label/NAME.json`` of SUSTechPOINTS. Parameters, results and errors as in `read_labelcloud`."""
-    try:
+    with _holding(path, "labels of SUSTechPOINTS"):
         parts = [(item["obj_type"], item["psr"]) for item in _read(path, list)]
         return [
             _box(name, *([psr[part][axis] for axis in "xyz"] for part in ("position", "scale", "rotation")))
             for name, psr in parts
         ]
-    except (KeyError, OverflowError, TypeError, ValueError) as exc:
-        raise PointsError(f"{path} holds no labels of SUSTechPOINTS ({type(exc).__name__}: {exc})") from exc
 
 
 def read_datumaro(path: Path) -> dict[str, list[Box]]:
@@ -51,7 +49,7 @@ def read_datumaro(path: Path) -> dict[str, list[Box]]:
     folders; boxes of tracks that are outside are left out. Raises PointsError.
     """
     document, boxes = _read(path), dict[str, list[Box]]()
-    try:
+    with _holding(path, "annotations of Datumaro"):
         names = [str(label["name"]) for label in document["categories"]["label"]["labels"]]
         for item in document["items"]:
             name = str(item["id"]).rpartition("/")[2]
@@ -62,11 +60,18 @@ def read_datumaro(path: Path) -> dict[str, list[Box]]:
                 for annotation in item["annotations"]
                 if annotation["type"] == "cuboid_3d" and not annotation.get("attributes", {}).get("outside", False)
             ]
+    return boxes
+
+
+@contextmanager
+def _holding(path: Path, what: str) -> Iterator[None]:
+    """Raise `PointsError` for what is wrong with the entries of a document."""
+    try:
+        yield
     except PointsError:
         raise
     except (AttributeError, IndexError, KeyError, OverflowError, TypeError, ValueError) as exc:
-        raise PointsError(f"{path} holds no annotations of Datumaro ({type(exc).__name__}: {exc})") from exc
-    return boxes
+        raise PointsError(f"{path} holds no {what} ({type(exc).__name__}: {exc})") from exc
 
 
 def _read(path: Path, kind: type = dict) -> Any:
@@ -90,10 +95,8 @@ def _angle(value: float, known: str) -> float:
 def _box(name: str, center: Any, size: Any, rotation: Any) -> Box:
     (x, y, z), (length, width, height) = (map(float, values) for values in (center, size))
     roll, pitch, yaw = (math.remainder(float(angle), 2.0 * math.pi) for angle in rotation)
-    if (
-        not all(map(math.isfinite, (x, y, z, length, width, height, roll, pitch, yaw)))
-        or min(length, width, height) <= 0.0
-    ):
+    numbers = x, y, z, length, width, height, roll, pitch, yaw
+    if not all(map(math.isfinite, numbers)) or min(length, width, height) <= 0.0:
         raise ValueError(f"a box at {center} of size {size}; expected finite numbers and sizes above 0")
     if max(abs(roll), abs(pitch)) > LARGEST_TILT:
         raise ValueError(f"a box is tilted by {math.degrees(max(abs(roll), abs(pitch))):.0f} degrees; expected a yaw")

@@ -98,18 +98,13 @@ class KittiCalibration:
         high = np.where(ahead[..., None], pixel, -np.inf).max(axis=1).clip(0.0, image_size)
         return np.hstack([low, np.maximum(high, low)])
 
-    def in_image(self, points: NDArray[Any]) -> NDArray[np.bool_]:
-        """Which points (n, 3+) in the sensor frame lie in the camera's field of view, (n,) bool."""
-        pixel, depth = self.to_image(points)
-        return (depth > 0.1) & (pixel >= 0).all(axis=1) & (pixel[:, 0] < IMAGE_SIZE[0]) & (pixel[:, 1] < IMAGE_SIZE[1])
-
     def labeled_at(self, places: NDArray[Any], unlabeled: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Which places (n, 3+) in the sensor frame are in the image and in no ``unlabeled`` (k, 4) rectangle [px]."""
-        labeled = self.in_image(places)
-        pixel, _ = self.to_image(places)
+        pixel, depth = self.to_image(places)
+        column, row = pixel.T
+        labeled = (depth > 0.1) & (pixel >= 0).all(axis=1) & (column < IMAGE_SIZE[0]) & (row < IMAGE_SIZE[1])
         for left, top, right, bottom in unlabeled:
-            within = (pixel[:, 0] >= left) & (pixel[:, 0] <= right) & (pixel[:, 1] >= top) & (pixel[:, 1] <= bottom)
-            labeled &= ~within
+            labeled &= ~((column >= left) & (column <= right) & (row >= top) & (row <= bottom))
         return labeled
 
 
@@ -184,13 +179,8 @@ def read_labels(path: Path) -> KittiLabels:
     return KittiLabels(tuple(kind for kind, _ in rows), numbers)
 
 
-def read_objects(label_path: Path, calibration: KittiCalibration) -> tuple[tuple[Box, ...], NDArray[np.float64]]:
-    """Read a KITTI label file: boxes in the sensor frame, and (k, 4) DontCare rectangles [px] (SSADNet 3.1.1)."""
-    return label_objects(read_labels(label_path), calibration)
-
-
 def label_objects(labels: KittiLabels, calibration: KittiCalibration) -> tuple[tuple[Box, ...], NDArray[np.float64]]:
-    """Boxes of labels in the sensor frame, and (k, 4) DontCare rectangles [px]."""
+    """Boxes of labels in the sensor frame, and (k, 4) DontCare rectangles [px] (SSADNet 3.1.1)."""
     kinds, numbers = labels.objects
     placed = calibration.sensor_boxes(numbers[:, 7:14])
     boxes = tuple(
@@ -243,17 +233,23 @@ class KittiObjects:
 
 def _frame_rows(root: Path) -> list[dict[str, str]]:
     """Rows of ``frames.csv`` and ``frames-*.csv``; an empty list without a table."""
-    rows: list[dict[str, str]] = []
-    for table in (root / "frames.csv", *sorted(root.glob("frames-*.csv"))):
-        if not table.exists():
-            continue
-        with table.open(newline="") as file:
-            rows += csv.DictReader(file)
-        nowhere = next((row for row in rows if not (row.get("name") and row.get("drive"))), None)
-        if nowhere is not None:
-            raise PointsError(f"{table}: got {nowhere}; expected columns name and drive, both filled in every row")
-    for name in [row["name"] for row in rows]:
-        check_file(f"{root}: a scan in frames.csv is called", name, PointsError)
+    tables = (root / "frames.csv", *sorted(root.glob("frames-*.csv")))
+    rows = [row for table in tables if table.exists() for row in read_drives(table)]
+    for row in rows:
+        check_file(f"{root}: a scan in frames.csv is called", row["name"], PointsError)
+    return rows
+
+
+def read_drives(table: Path) -> list[dict[str, str]]:
+    """Rows of a table of scans, each with at least its ``name`` and its ``drive``. Raises PointsError."""
+    try:
+        with table.open(newline="", encoding="utf-8") as file:
+            rows = [*csv.DictReader(file)]
+    except (OSError, UnicodeDecodeError, csv.Error) as exc:
+        raise PointsError(f"{table} cannot be read ({exc}); expected columns name and drive") from exc
+    nowhere = next((row for row in rows if not (row.get("name") and row.get("drive"))), None)
+    if nowhere is not None:
+        raise PointsError(f"{table}: got {nowhere}; expected columns name and drive, both filled in every row")
     return rows
 
 
@@ -262,7 +258,7 @@ def layouts(root: Path | str) -> Iterator[tuple[Box, ...]]:
     root = Path(root)
     for name in [row["name"] for row in _frame_rows(root) if row["drive"] not in TEST_DRIVES]:
         calibration = KittiCalibration.read(root / "calib" / f"{name}.txt")
-        yield read_objects(root / "label_2" / f"{name}.txt", calibration)[0]
+        yield label_objects(read_labels(root / "label_2" / f"{name}.txt"), calibration)[0]
 
 
 ROAD_CLASSES = ("other", "road", "vehicle")

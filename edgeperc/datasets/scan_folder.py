@@ -17,7 +17,6 @@ public sets. With ``"files": "semantickitti"`` in the description, the folder is
 
 from __future__ import annotations
 
-import csv
 import json
 import math
 from collections.abc import Sequence
@@ -33,11 +32,12 @@ from ..errors import PointsError
 from ..readers.files import read_points
 from ..simulation.samples import IGNORE
 from ..simulation.scene import POINT_CLASSES
+from ..types.choices import VEHICLES
 from ..types.geometry import inside
 from ..types.perception import ROADS, Box
 from ..types.points import Points
 from .annotations import read_datumaro, read_labelcloud, read_sustechpoints
-from .kitti import IMAGE_SIZE, SEQUENCE_DRIVES, KittiCalibration, KittiLabels, label_objects, read_labels
+from .kitti import IMAGE_SIZE, SEQUENCE_DRIVES, KittiCalibration, KittiLabels, label_objects, read_drives, read_labels
 from .layout import (
     BACKGROUND,
     BOX_COLUMNS,
@@ -164,7 +164,7 @@ class ScanFrame:
         """
         if self.point_classes is None or not set(ROADS) & set(self.class_names):
             return None
-        numbers = {**dict.fromkeys(ROADS, 1), "car": 2, "van": 2, "truck": 2, IGNORED: IGNORE}
+        numbers = {**dict.fromkeys(ROADS, 1), **dict.fromkeys(VEHICLES, 2), IGNORED: IGNORE}
         return np.array([numbers.get(name, 0) for name in self.class_names], np.uint8)[self.point_classes]
 
 
@@ -318,16 +318,10 @@ class ScanFolder:
         table = self.root / "frames.csv"
         if self.layout.drives == "scan" or not table.exists():
             return {name: name for name in labeled}
-        try:
-            with table.open(newline="", encoding="utf-8") as file:
-                rows = list(csv.DictReader(file))
-        except (OSError, UnicodeDecodeError, csv.Error) as exc:
-            raise PointsError(f"{table} cannot be read ({exc}); expected columns name and drive") from exc
-        drives = {row.get("name") or "": row.get("drive") or "" for row in rows}
-        if not rows or "" in drives or "" in drives.values():
-            raise PointsError(f"{table}: expected columns name and drive, both filled in every row")
+        drives = {row["name"]: row["drive"] for row in read_drives(table)}
         if missing := [name for name in labeled if name not in drives]:
-            raise PointsError(f"{table} has no drive of {', '.join(missing[:5])}; add a row for every labeled scan")
+            listed = ", ".join(missing[:5])
+            raise PointsError(f"{table} has no drive of {listed}; add a row, both filled in, for every labeled scan")
         return {name: drives[name] for name in labeled}
 
     def _read_boxes(self, path: Path, name: str) -> list[Box]:

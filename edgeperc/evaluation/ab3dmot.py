@@ -45,6 +45,8 @@ _Q = np.diag([1.0] * N_SEEN + [0.01] * 3)
 _P = np.diag([10.0] * N_SEEN + [10000.0] * 3)
 _ORDER = [0, 1, 2, 6, 3, 4, 5]  # a box's row -> the state's order
 _BACK = [0, 1, 2, 4, 5, 6, 3]
+_NUMBERS = [(name, "i8") for name in ("id", "hits", "missed")]
+_TRACK = np.dtype([*_NUMBERS, ("score", "f8"), ("state", "f8", N_STATE), ("covariance", "f8", _P.shape)])
 
 
 class Ab3dmot:
@@ -54,27 +56,24 @@ class Ab3dmot:
         self.settings = settings
         self._n_scans = 0
         self._next_id = 1
-        self._ids = np.zeros(0, np.int64)
-        self._states, self._covariances = np.zeros((0, N_STATE)), np.zeros((0, N_STATE, N_STATE))
-        self._hits, self._missed = np.zeros(0, np.int64), np.zeros(0, np.int64)
-        self._scores = np.zeros(0)
+        self._tracks = np.zeros(0, _TRACK)
 
     def update(
         self, boxes: Sequence[Box], scores: Sequence[float]
     ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
         """Track the boxes of a scan: ids, rows, scores of the last detection, the detections' indices (-1: none)."""
         self._n_scans += 1
-        given = box_rows(boxes)
-        states = self._states @ _F.T
+        given, tracks = box_rows(boxes), self._tracks
+        states = np.ascontiguousarray(tracks["state"]) @ _F.T
         states[:, 3] = wrapped(states[:, 3])
-        covariances = _F @ self._covariances @ _F.T + _Q
+        covariances = _F @ np.ascontiguousarray(tracks["covariance"]) @ _F.T + _Q
         source = np.full(len(states), -1)
         for detection, track in self._pairs(given, states[:, _BACK]):
             source[track] = detection
         is_matched = source >= 0
-        self._missed = np.where(is_matched, 0, self._missed + 1)
-        self._hits = self._hits + is_matched
-        self._scores = np.where(is_matched, np.append(scores, 0.0)[source], self._scores)
+        tracks["missed"] = np.where(is_matched, 0, tracks["missed"] + 1)
+        tracks["hits"] += is_matched
+        tracks["score"] = np.where(is_matched, np.append(scores, 0.0)[source], tracks["score"])
 
         # Headings are known up to half a turn; the state turns to the detection's direction.
         seen = given[source[is_matched]][:, _ORDER]
@@ -88,25 +87,20 @@ class Ab3dmot:
         states[is_matched] = mine + (gain @ innovation[:, :, None])[:, :, 0]
         states[:, 3] = wrapped(states[:, 3])
         covariances[is_matched] = spread - gain @ spread[:, :N_SEEN]
+        tracks["state"], tracks["covariance"] = states, covariances
 
         new = np.setdiff1d(np.arange(len(given)), source)
-        born = np.zeros((len(new), N_STATE))
-        born[:, :N_SEEN] = given[new][:, _ORDER]
-        self._states = np.concatenate([states, born])
-        self._covariances = np.concatenate([covariances, np.broadcast_to(_P, (len(new), N_STATE, N_STATE))])
-        self._ids = np.concatenate([self._ids, self._next_id + np.arange(len(new))])
+        born = np.zeros(len(new), _TRACK)
+        born["id"] = self._next_id + np.arange(len(new))
         self._next_id += len(new)
-        self._hits = np.concatenate([self._hits, np.ones(len(new), np.int64)])
-        self._missed = np.concatenate([self._missed, np.zeros(len(new), np.int64)])
-        self._scores = np.concatenate([self._scores, np.asarray(scores, np.float64)[new]])
-        source = np.concatenate([source, new])
+        born["state"][:, :N_SEEN] = given[new][:, _ORDER]
+        born["covariance"], born["hits"], born["score"] = _P, 1, np.asarray(scores, np.float64)[new]
+        tracks, source = np.concatenate([tracks, born]), np.concatenate([source, new])
 
-        stays = self._missed < self.settings.max_age
-        shown = stays & ((self._hits >= self.settings.min_hits) | (self._n_scans <= self.settings.min_hits))
-        result = self._ids[shown], self._states[shown][:, _BACK], self._scores[shown], source[shown]
-        for name in ("_ids", "_states", "_covariances", "_hits", "_missed", "_scores"):
-            setattr(self, name, getattr(self, name)[stays])
-        return result
+        stays = tracks["missed"] < self.settings.max_age
+        shown = stays & ((tracks["hits"] >= self.settings.min_hits) | (self._n_scans <= self.settings.min_hits))
+        self._tracks = tracks[stays]
+        return tracks["id"][shown], tracks["state"][shown][:, _BACK], tracks["score"][shown], source[shown]
 
     def _pairs(self, boxes: NDArray[np.float64], tracks: NDArray[np.float64]) -> list[tuple[int, int]]:
         """Pairs (detection, track) of at least the lowest affinity."""

@@ -53,15 +53,17 @@ def count_causes(
     """Count one scan's wrong points by (error, cause), and 1 by drive and by missed object. The cause "all" has all of
     an error, "of" what it is a share of. Where the truth is unknown, `BUMPER` may be a car.
     """
-    scan = _Scan(points, boxes)
-    at_bumper = scan.at_bumper & in_view & (labels == 1) & ~((right > 0) & (right < len(POINT_CLASSES)))
+    scan, (x, y, z) = _Scan(points), points[:, :3].T
+    at_bumper = (x < BUMPER_X_M) & (np.abs(y) < BUMPER_Y_M) & (z < BUMPER_Z_M)
+    at_bumper &= in_view & (labels == 1) & ~((right > 0) & (right < len(POINT_CLASSES)))
     chosen = {(BUMPER, "all"): at_bumper, (BUMPER, FLOOR): at_bumper & scan.ground.mask}
     for number, name in enumerate(POINT_CLASSES[1:], start=1):
         true, predicted = known & (right == number), known & (labels == number)
         missed, false = true & ~predicted, predicted & ~true
         background = false & (right == 0)
-        of_missed = {"of": true, "all": missed, FAR: missed & (np.hypot(points[:, 0], points[:, 1]) >= FAR_M)}
-        of_false = {"of": predicted, "all": false, OTHER: false & ~background, NEAR: scan.near_objects(background)}
+        of_missed = {"of": true, "all": missed, FAR: missed & (np.hypot(x, y) >= FAR_M)}
+        near = scan.within(background, boxes, NEAR_M)
+        of_false = {"of": predicted, "all": false, OTHER: false & ~background, NEAR: near}
         if name == "car":
             of_missed[VANS] = scan.within(missed, [box for box in boxes if box.label in ("van", "truck")])
             of_missed[FLOOR] = missed & scan.ground.mask  # KITTI's boxes hold the road below a car
@@ -87,18 +89,12 @@ def count_causes(
 class _Scan:
     """Where points lie: each method takes and returns a mask (n,) bool."""
 
-    def __init__(self, points: Points, boxes: Sequence[Box]) -> None:
-        self.points, self.boxes = points, boxes
+    def __init__(self, points: Points) -> None:
+        self.points = points
 
     @cached_property
     def ground(self) -> Ground:
         return find_ground(self.points)
-
-    @property
-    def at_bumper(self) -> NDArray[np.bool_]:
-        x, y, z = self.points[:, :3].T
-        is_near: NDArray[np.bool_] = (x < BUMPER_X_M) & (np.abs(y) < BUMPER_Y_M) & (z < BUMPER_Z_M)
-        return is_near
 
     def within(self, mask: Mask, boxes: Sequence[Box], margin_m: float = 0.0) -> NDArray[np.bool_]:
         """Points in one of the boxes."""
@@ -106,10 +102,6 @@ class _Scan:
         for box in boxes:
             is_near[rows] |= inside(box, self.points[rows], margin_m)
         return is_near
-
-    def near_objects(self, mask: Mask) -> NDArray[np.bool_]:
-        """Points in a true box, or next to one."""
-        return self.within(mask, self.boxes, NEAR_M)
 
     def on_large_structures(self, mask: Mask) -> NDArray[np.bool_]:
         """Points above the ground, in a cluster that is too large for a car."""

@@ -8,13 +8,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..types.perception import Box
-from .metrics import ObjectKey, object_key
+from .metrics import Listed, object_key
 
 DISTANCES_M = (0.5, 1.0, 2.0, 4.0)
 ERROR_DISTANCE_M = 2.0
@@ -29,44 +28,30 @@ FIRST = round(100 * MIN_RECALL) + 1
 Guess = tuple[float, bool, float, float, float]
 
 
-@dataclass(slots=True)
-class CenterTable:
-    """Matches of any number of scans: objects by class, and detections by class and distance."""
-
-    objects: dict[str, tuple[ObjectKey, ...]] = field(default_factory=dict)
-    guesses: dict[tuple[str, float], tuple[Guess, ...]] = field(default_factory=dict)
-
-    def __add__(self, other: CenterTable) -> CenterTable:
-        """Add the scans of both."""
-        return CenterTable(
-            {key: self.objects.get(key, ()) + other.objects.get(key, ()) for key in {**self.objects, **other.objects}},
-            {key: self.guesses.get(key, ()) + other.guesses.get(key, ()) for key in {**self.guesses, **other.guesses}},
-        )
-
-
-def count_centers(boxes: Sequence[Box], to_find: Sequence[Box], ignored: Sequence[Box], drive: str) -> CenterTable:
+def count_centers(boxes: Sequence[Box], to_find: Sequence[Box], ignored: Sequence[Box], drive: str) -> Listed:
     """Match the detections of one scan, where objects are labeled, with those of `metrics.boxes_to_find`; one without a
-    match does not count if an ignored object of its class or of the class ``ignore`` is as near as a match.
+    match does not count if an ignored object of its class or of the class ``ignore`` is as near as a match. Lists the
+    objects to find by class, and each `Guess` by class and distance.
     """
-    table = CenterTable()
+    table = Listed()
     for label, farthest_m in CLASSES.items():
         rights = [box for box in to_find if box.label == label and math.hypot(*box.center[:2]) <= farthest_m]
         spares = [box for box in ignored if box.label in (label, "ignore")]
         guesses = [box for box in boxes if box.label == label and math.hypot(*box.center[:2]) <= farthest_m]
         guesses.sort(key=lambda box: -box.score)
         away_m, spare_m = _distances(guesses, rights), _distances(guesses, spares)
-        table.objects[label] = tuple(object_key(drive, box) for box in rights)
+        table[label] = tuple(object_key(drive, box) for box in rights)
         for least_m in DISTANCES_M:
-            table.guesses[label, least_m] = _matched(guesses, rights, away_m, spare_m, least_m)
+            table[label, least_m] = _matched(guesses, rights, away_m, spare_m, least_m)
     return table
 
 
-def center_scores(table: CenterTable, label: str) -> dict[str, float]:
+def center_scores(table: Listed, label: str) -> dict[str, float]:
     """AP of one class, mean and by distance; mean errors of matches within 2 m of place [m], size and heading [rad],
     over recalls from 0.1 to the largest one, 1 if that is not reached. All are NaN without objects.
     """
-    n_truth = len(table.objects.get(label, ()))
-    curves = {d: _curve(table.guesses.get((label, d), ()), n_truth) for d in DISTANCES_M}
+    n_truth = len(table.get(label, ()))
+    curves = {d: _curve(table.get((label, d), ()), n_truth) for d in DISTANCES_M}
     aps = {f"ap_{d:g}": _average_precision(curve[0]) if n_truth else math.nan for d, curve in curves.items()}
     errors = curves[ERROR_DISTANCE_M][1].tolist() if n_truth else [math.nan] * 3
     ap = float(np.mean([*aps.values()]))

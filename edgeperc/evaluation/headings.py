@@ -83,13 +83,9 @@ def count_headings(
             kind = 0 if moves[i] else 1 if int(frame.ids[i]) in moved else 2
             rows.append((kind, int(result.ids[track]), bool(result.fronts[track] >= 0.5), right))
     counted = []
-    for kind in range(3):
-        of_kind = [row for row in rows if row[0] == kind]
-        resolved = [row for row in of_kind if row[2]]
-        n_right = sum(row[3] for row in resolved)
-        counted.append(
-            Standing(
-                len(of_kind), len({row[1] for row in of_kind}), len(resolved), n_right, sum(row[3] for row in of_kind)
-            )
-        )
+    for number in range(3):
+        of_kind = [row[1:] for row in rows if row[0] == number]
+        n_tracks, n_resolved = len({track for track, *_ in of_kind}), sum(resolved for _, resolved, _ in of_kind)
+        n_right = sum(resolved and right for _, resolved, right in of_kind)
+        counted.append(Standing(len(of_kind), n_tracks, n_resolved, n_right, sum(right for *_, right in of_kind)))
     return Headings(*counted)

@@ -27,7 +27,7 @@ from ..pipeline import BoxesFrom
 from ..simulation.samples import IGNORE
 from ..simulation.scene import POINT_CLASSES
 from ..types.card import ModelCard
-from ..types.choices import STATIC
+from ..types.choices import STATIC, VEHICLES
 from ..types.frame import ModelFrame
 from ..types.geometry import inside
 from ..types.mounting import MODEL_MOUNTING, Mounting
@@ -40,7 +40,7 @@ from .center_ap import count_centers
 from .kitti_ap import count_all_round, count_in_image
 from .metrics import FEWEST_RETURNS, BoxEvaluator, ProbabilitySweep, boxes_to_find, object_key
 from .mistakes import Mistakes
-from .tables import ALL_ROUND, BANDS, SITTING, VEHICLES, Record, banded, within
+from .tables import ALL_ROUND, BANDS, SITTING, Record, banded, within
 from .truth import Truth, folder_truth, kitti_truth, semantickitti_truth, simulated_truth
 
 FARTHEST_M = 46.0  # farther objects are evaluated by their points, but never listed as mistakes
@@ -92,10 +92,8 @@ class Judge:
         n_threads: int | None = None,
     ) -> None:
         mounting = MODEL_MOUNTING if mounted is None else Mounting()
-        if sensor is None:
-            self.perceive = _perceiver(models, perceiving, n_threads, mounting)
-        else:
-            self.perceive = _perceiver(models, perceiving, n_threads, sensor.mounting, sensor)
+        mounting = mounting if sensor is None else sensor.mounting
+        self.perceive = _perceiver(models, perceiving, n_threads, mounting, sensor)
         self.mounted = None if mounted is None else ModelFrame(mounted)
         self.as_recorded = mounted is None and sensor is None
         self.point_classes: tuple[str, ...] = POINT_CLASSES

@@ -8,8 +8,8 @@ sensor are labeled, the same matching is used without these limits.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +19,7 @@ from ..types.perception import Box
 from .metrics import (
     EVERYWHERE,
     N_POSITIONS,
+    Listed,
     ObjectKey,
     box_overlaps,
     box_rows,
@@ -50,18 +51,6 @@ class Counts:
     steps: tuple[tuple[float, int, int], ...]  # change of true and false positives as the threshold falls to a score
 
 
-@dataclass(slots=True)
-class ApTable:
-    """Counts of any number of scans by class, kind of overlap with its threshold, and level or range."""
-
-    counts: dict[tuple[str, str, str], tuple[Counts, ...]] = field(default_factory=dict)
-
-    def __add__(self, other: ApTable) -> ApTable:
-        """Add the scans of both."""
-        keys = dict.fromkeys((*self.counts, *other.counts))
-        return ApTable({key: self.counts.get(key, ()) + other.counts.get(key, ()) for key in keys})
-
-
 @dataclass(frozen=True)
 class FrontTruth:
     """Labels of a KITTI scan and what is needed to see boxes as the camera does."""
@@ -86,7 +75,7 @@ def image_size_of(drive: str) -> tuple[int, int]:
     return IMAGE_SIZES.get(drive[:10], IMAGE_SIZE)
 
 
-def count_in_image(truth: FrontTruth, boxes: Sequence[Box], drive: str) -> ApTable:
+def count_in_image(truth: FrontTruth, boxes: Sequence[Box], drive: str) -> Listed:
     """Count the matches of one scan as KITTI's benchmark does. Detections that the image does not show are left out, as
     in a submission. DontCare has no 3-D boxes, so it excuses no detection from above and in 3-D.
     """
@@ -100,40 +89,48 @@ def count_in_image(truth: FrontTruth, boxes: Sequence[Box], drive: str) -> ApTab
     guesses, seen, boxes = guesses[shown], seen[shown], [boxes[k] for k in np.flatnonzero(shown).tolist()]
     # The development kit keeps whole pixels of a detection's height, and the exact height of an object.
     guess_px, guess_m = np.floor(seen[:, 3] - seen[:, 1]), np.hypot(guesses[:, 0], guesses[:, 1])
+    levels = {level: (_hidden(numbers, level), guess_px < least_px) for level, (least_px, _, _) in LEVELS.items()}
     overlaps = _overlaps(truth.calibration.in_camera(guesses), _level_rows(numbers[:, 7:14]))
-    table = ApTable()
-    for label, overlap_name, least_iou, level, (near, far) in _rules(LEVELS, "hard"):
-        limits = level if level in LEVELS else "hard"
-        neighbors = CLASSES[label][1]
-        hidden = _hidden(numbers, limits) | (right_m < near) | (right_m >= far)
-        small = guess_px < LEVELS[limits][0]
-        columns = np.flatnonzero([kind == label or kind in neighbors for kind in kinds])
-        rows = np.flatnonzero(small | np.array([box.label == label for box in boxes], np.bool_))
-        optional = [bool(hidden[k]) or kinds[k] != label for k in columns]
-        excused = ((guess_m < near) | (guess_m >= far))[rows].tolist()
-        own = overlaps[overlap_name][np.ix_(rows, columns)], [boxes[k].score for k in rows], least_iou
-        counts = count_matches(*own, [objects[k] for k in columns], optional, small[rows].tolist(), excused)
-        table.counts[label, f"{overlap_name} {least_iou:g}", level] = (counts,)
-    return table
+    return _count(levels, boxes, guess_m, objects, (*kinds,), right_m, overlaps)
 
 
-def count_all_round(boxes: Sequence[Box], to_find: Sequence[Box], ignored: Sequence[Box], drive: str) -> ApTable:
+def count_all_round(boxes: Sequence[Box], to_find: Sequence[Box], ignored: Sequence[Box], drive: str) -> Listed:
     """Count the matches of a scan without limits in the image; ignored, neighbors and ``ignore`` may be found."""
     every = [*to_find, *ignored]
     guesses, rights = box_rows(boxes), box_rows(every)
     guess_m, right_m = (np.hypot(rows[:, 0], rows[:, 1]) for rows in (guesses, rights))
-    overlaps = _overlaps(guesses, rights)
-    table = ApTable()
-    for label, overlap_name, least_iou, level, (near, far) in _rules((ALL_ROUND,), ALL_ROUND):
-        may_be = (label, *CLASSES[label][1], "ignore")
-        columns = [k for k, box in enumerate(every) if box.label in may_be]
-        rows = [k for k, box in enumerate(boxes) if box.label == label]
-        optional = [k >= len(to_find) or every[k].label != label or not near <= right_m[k] < far for k in columns]
-        excused = [not near <= guess_m[k] < far for k in rows]
+    levels = {ALL_ROUND: (np.arange(len(every)) >= len(to_find), np.zeros(len(boxes), np.bool_))}
+    objects, kinds = [object_key(drive, box) for box in every], tuple(box.label for box in every)
+    return _count(levels, boxes, guess_m, objects, kinds, right_m, _overlaps(guesses, rights), "ignore")
+
+
+def _count(
+    levels: Mapping[str, tuple[NDArray[np.bool_], NDArray[np.bool_]]],
+    boxes: Sequence[Box],
+    guess_m: NDArray[np.float64],
+    objects: Sequence[ObjectKey],
+    kinds: Sequence[str],
+    right_m: NDArray[np.float64],
+    overlaps: Mapping[str, NDArray[np.float64]],
+    *also: str,
+) -> Listed:
+    """Count the matches of one scan by class, kind of overlap with its threshold, and level or range.
+
+    levels : which objects are hidden, and which detections are too small; ranges are of the last one.
+    also : labels of objects that may be found, beside those of neighbors.
+    """
+    table, (*_, last), labels = Listed(), levels.values(), np.array([box.label for box in boxes], np.str_)
+    for label, overlap_name, least_iou, level, (near, far) in _rules(levels):
+        hidden, small = levels.get(level, last)
+        may_be = (label, *CLASSES[label][1], *also)
+        columns = np.flatnonzero([kind in may_be for kind in kinds]).tolist()
+        rows = np.flatnonzero(small | (labels == label)).tolist()
+        away = hidden | (right_m < near) | (right_m >= far)
+        optional = [bool(away[k]) or kinds[k] != label for k in columns]
+        excused = ((guess_m < near) | (guess_m >= far))[rows].tolist()
         own = overlaps[overlap_name][np.ix_(rows, columns)], [boxes[k].score for k in rows], least_iou
-        keys = [object_key(drive, every[k]) for k in columns]
-        counts = count_matches(*own, keys, optional, [False] * len(rows), excused)
-        table.counts[label, f"{overlap_name} {least_iou:g}", level] = (counts,)
+        counts = count_matches(*own, [objects[k] for k in columns], optional, small[rows].tolist(), excused)
+        table[label, f"{overlap_name} {least_iou:g}", level] = (counts,)
     return table
 
 
@@ -235,7 +232,7 @@ def average_precisions(counts: Sequence[Counts]) -> tuple[float, float, float]:
     return float(curve[1:].mean()), float(curve[::4].mean()), ap
 
 
-def _rules(levels: Collection[str], of_ranges: str) -> Iterator[tuple[str, str, float, str, tuple[float, float]]]:
+def _rules(levels: Iterable[str]) -> Iterator[tuple[str, str, float, str, tuple[float, float]]]:
     """Class, kind of overlap, smallest IoU, level or range, and range of distances of each row."""
     for label, (least_ious, _) in CLASSES.items():
         for least_iou in least_ious:

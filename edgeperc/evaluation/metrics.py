@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -20,6 +21,13 @@ N_POSITIONS = 40  # recall positions of KITTI's curves, without recall 0
 HEADING_RAD = math.pi / 4.0  # largest error of a correct heading
 
 ObjectKey = tuple[str, str, float, float, float]
+
+
+class Listed(dict[Any, tuple[Any, ...]]):
+    """What was counted of scans, by key: adding joins what two of them list."""
+
+    def __add__(self, other: Listed) -> Listed:
+        return Listed({key: self.get(key, ()) + other.get(key, ()) for key in {**self, **other}})
 
 
 class Confusion:
@@ -177,19 +185,24 @@ class BoxScores:
     n_drives: int
 
 
+class _Guess(NamedTuple):
+    """A predicted box."""
+
+    score: float
+    overlap: float  # IoU with the matched true box; 0 without a match
+    range_m: float  # of the matched true box, else of the prediction
+    turn: float  # error of the yaw, 0..pi; NaN without a match
+    knows_front: bool
+    object: ObjectKey | None  # of the matched true box
+
+
 @dataclass(slots=True)
 class _Matches:
-    scores: list[float] = field(default_factory=list)
-    overlaps: list[float] = field(default_factory=list)  # IoU with the matched true box; 0 without a match
-    ranges_m: list[float] = field(default_factory=list)  # distance of the matched true box, else of the prediction
-    turns: list[float] = field(default_factory=list)  # error of the yaw, 0..pi; NaN without a match
-    fronts: list[bool] = field(default_factory=list)  # the prediction knows its front
-    matched: list[ObjectKey | None] = field(default_factory=list)  # object of the matched true box
-    truth_m: list[float] = field(default_factory=list)  # distance of every box to find
-    objects: list[ObjectKey] = field(default_factory=list)  # object of every box to find
+    guesses: list[_Guess] = field(default_factory=list)
+    objects: list[tuple[float, ObjectKey]] = field(default_factory=list)  # distance and object of every box to find
 
     def __add__(self, other: _Matches) -> _Matches:
-        return _Matches(*(getattr(self, name) + getattr(other, name) for name in _Matches.__slots__))
+        return _Matches(self.guesses + other.guesses, self.objects + other.objects)
 
 
 class BoxEvaluator:
@@ -273,54 +286,45 @@ class BoxEvaluator:
         free = overlap.copy()
         missed = dict(enumerate(rights))
         pairs: list[tuple[Box | None, Box | None]] = []
-        matches.truth_m += [_range_m(box) for box in rights]
-        matches.objects += [object_key(drive, box) for box in rights]
+        matches.objects += [(_range_m(box), object_key(drive, box)) for box in rights]
         for i, box in enumerate(guesses):
             best = int(np.argmax(free[i])) if rights else -1
+            overlap_of, right, key, turn = 0.0, None, None, math.nan
             if best >= 0 and free[i, best] >= self.iou_threshold:
-                matches.overlaps.append(float(free[i, best]))
+                overlap_of, right = float(free[i, best]), missed.pop(best)
                 free[:, best] = -1.0
-                pairs.append((box, missed.pop(best)))
+                key, turn = object_key(drive, right), box.yaw - right.yaw
             elif excused[i]:
                 continue
-            else:
-                matches.overlaps.append(0.0)
-                pairs.append((box, None))
-            right = pairs[-1][1]
-            matches.scores.append(box.score)
-            matches.ranges_m.append(_range_m(right or box))
-            turn = math.nan if right is None else box.yaw - right.yaw
-            matches.turns.append(abs(math.remainder(turn, 2.0 * math.pi)) if math.isfinite(turn) else math.nan)
-            matches.fronts.append(box.front is not None)
-            matches.matched.append(None if right is None else object_key(drive, right))
+            pairs.append((box, right))
+            turn = abs(math.remainder(turn, 2.0 * math.pi)) if math.isfinite(turn) else math.nan
+            front = box.front is not None
+            matches.guesses.append(_Guess(box.score, overlap_of, _range_m(right or box), turn, front, key))
         return [*pairs, *((None, box) for box in missed.values())]
 
     def _scores(self, matches: _Matches, within_m: tuple[float, float]) -> BoxScores:
         near, far = within_m
-        ranges_m, truth_m = np.array(matches.ranges_m), np.array(matches.truth_m)
-        in_range = (ranges_m >= near) & (ranges_m < far)
-        scores, overlaps = np.array(matches.scores)[in_range], np.array(matches.overlaps)[in_range]
-        to_find = np.flatnonzero((truth_m >= near) & (truth_m < far))
-        n_truth = len(to_find)
+        guesses = [guess for guess in matches.guesses if near <= guess.range_m < far]
+        overlaps = np.array([guess.overlap for guess in guesses])
+        to_find = [key for range_m, key in matches.objects if near <= range_m < far]
+        objects, n_truth = {*to_find}, len(to_find)
         hits = overlaps >= self.iou_threshold
-        n_hits = int(np.count_nonzero(hits))
-        turns = np.array(matches.turns)[in_range][hits]
-        fronts = np.array(matches.fronts, dtype=np.bool_)[in_range][hits]
-        objects = {matches.objects[k] for k in to_find}
+        right = [guess for guess, hit in zip(guesses, hits.tolist(), strict=True) if hit]
+        n_hits, turns = len(right), np.array([guess.turn for guess in right])
         return BoxScores(
-            ap=average_precision(scores, hits, n_truth),
+            ap=average_precision([guess.score for guess in guesses], hits, n_truth),
             precision=float(_share(n_hits, len(hits))),
             recall=float(_share(n_hits, n_truth)),
             mean_iou_50=mean(overlaps[overlaps >= max(0.5, self.iou_threshold)]),
             mean_iou_70=mean(overlaps[overlaps >= max(0.7, self.iou_threshold)]),
             heading=float(_share(np.count_nonzero(turns <= HEADING_RAD), n_hits)),
             axis=float(_share(np.count_nonzero(np.minimum(turns, math.pi - turns) <= HEADING_RAD), n_hits)),
-            front_known=float(_share(np.count_nonzero(fronts), n_hits)),
+            front_known=float(_share(sum(guess.knows_front for guess in right), n_hits)),
             n_truth=n_truth,
             n_predicted=len(hits),
             n_hits=n_hits,
             n_objects=len(objects),
-            n_found=len({matches.matched[k] for k in np.flatnonzero(in_range)[hits]}),
+            n_found=len({guess.object for guess in right}),
             n_drives=len({drive for drive, *_ in objects}),
         )
 

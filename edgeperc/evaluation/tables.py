@@ -17,14 +17,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..types.choices import STATIC
+from ..types.choices import STATIC, VEHICLES
 from ..types.points import Labels
 from .causes import BUMPER, CAUSES, FLOOR
-from .center_ap import CLASSES, CenterTable, center_scores
-from .kitti_ap import ApTable, average_precisions
-from .metrics import BoxEvaluator, BoxScores, Confusion, ObjectKey, ProbabilitySweep, mean
-
-VEHICLES = ("car", "van", "truck")
+from .center_ap import CLASSES, center_scores
+from .kitti_ap import average_precisions
+from .metrics import BoxEvaluator, BoxScores, Confusion, Listed, ObjectKey, ProbabilitySweep, mean
 
 # Groups of classes whose boxes are evaluated wherever the truth is known: their classes, and the smallest IoU of a
 # match. A person's box is hardly larger than the spacing of the points on it, so it is matched at 0.25.
@@ -234,10 +232,10 @@ def _box_rows(scores_of: Mapping[str, BoxScores]) -> dict[str, Any]:
     }
 
 
-def _kitti_rows(table: ApTable) -> dict[str, Any]:
+def _kitti_rows(table: Listed) -> dict[str, Any]:
     """By class, overlap and level or range."""
     rows: dict[str, Any] = {}
-    for (label, overlap, level), counts in table.counts.items():
+    for (label, overlap, level), counts in table.items():
         objects = [key for count in counts for key in count.objects]
         scores = dict(zip(("ap_r40", "ap_r11", "ap"), average_precisions(counts), strict=True))
         row = scores | {"n_truth": len(objects)} | _distinct(objects)
@@ -245,10 +243,10 @@ def _kitti_rows(table: ApTable) -> dict[str, Any]:
     return rows
 
 
-def _center_rows(table: CenterTable) -> dict[str, Any]:
+def _center_rows(table: Listed) -> dict[str, Any]:
     rows: dict[str, Any] = {}
     for label in CLASSES:
-        objects = table.objects.get(label, ())
+        objects = table.get(label, ())
         rows[label] = center_scores(table, label) | {"n_truth": len(objects)} | _distinct(objects)
     return {"mean_ap": mean([row["ap"] for row in rows.values()])} | rows
 

@@ -21,38 +21,24 @@ from ..perceiver import Perceiver
 from ..readers.files import read_points
 from ..tracking.tracker import Tracker
 from ..tracking.tracks import ClassParameters, Tracks
+from ..types.choices import VEHICLES
 from ..types.perception import Box
 from .ab3dmot import SETTINGS, Ab3dmot
-from .headings import Headings, count_headings
+from .headings import FRAME_S, Headings, count_headings
 from .judge import check_unseen, training_scans_of
 from .metrics import box_rows
 from .tracking_metrics import FrameTracks, FrameTruth, evaluate_tracks
 
-__all__ = [
-    "CLASSES",
-    "FRAME_S",
-    "KINDS",
-    "RULES",
-    "FrameResult",
-    "TrackingSequence",
-    "ab3dmot_sequence",
-    "evaluate_kitti",
-    "perceive_drive",
-    "read_sequence",
-    "sequence_names",
-    "sequence_scans",
-    "track_sequence",
-]
+__all__ = ["CLASSES", "KINDS", "RULES", "evaluate_kitti"]
 
 CLASSES = ("car", "pedestrian", "cyclist")
 
 # Labels of each evaluated class; KUL-Seg's Table 7 evaluates vehicles.
-KINDS = {**{of: (of,) for of in CLASSES}, "vehicle": ("car", "van", "truck")}
+KINDS = {**{of: (of,) for of in CLASSES}, "vehicle": VEHICLES}
 
 # From KITTI's evaluation: labels that may be confused with each class, and limits of objects to find.
 NEIGHBORS = {"car": ("van",), "pedestrian": ("person", "person_sitting"), "cyclist": (), "vehicle": ("tram", "misc")}
 MAX_OCCLUSION, MAX_TRUNCATION, MIN_HEIGHT_PX, MIN_UNLABELED = 2, 0, 25.0, 0.5
-FRAME_S = 0.1
 
 # "edgeperc": a track's image box is the projection of its 3-D box, and scores are compared exactly.
 # "ab3dmot": as AB3DMOT's program. Boxes are upright in the camera's frame, whose y axis is up to 1 degree off the
@@ -63,51 +49,25 @@ RULES = ("edgeperc", "ab3dmot")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TrackingSequence:
-    """One sequence: detections and truth.
-
-    Attributes
-    ----------
-    name : str
-    detections : tuple of tuple of Box
-        By frame, of all classes, in the sensor frame. Scores are in 0..1.
-    image_boxes : tuple of (k, 4) float64
-        By frame: image rectangle (left, top, right, bottom) of each detection [px].
-    truth : mapping of str to tuple of FrameTruth
-        By class and frame.
-    unlabeled : tuple of (k, 4) float64
-        By frame: image rectangles (left, top, right, bottom) without labels (DontCare).
-    calibration : KittiCalibration
-    """
+    """One sequence: detections and truth, by frame."""
 
     name: str
-    detections: tuple[tuple[Box, ...], ...]
-    image_boxes: tuple[NDArray[np.float64], ...]
-    truth: Mapping[str, tuple[FrameTruth, ...]]
-    unlabeled: tuple[NDArray[np.float64], ...]
+    detections: tuple[tuple[Box, ...], ...]  # of all classes, in the sensor frame; scores are in 0..1
+    image_boxes: tuple[NDArray[np.float64], ...]  # left, top, right, bottom [px] of each detection, (k, 4)
+    truth: Mapping[str, tuple[FrameTruth, ...]]  # by class
+    unlabeled: tuple[NDArray[np.float64], ...]  # left, top, right, bottom [px] of regions without labels, (k, 4)
     calibration: KittiCalibration
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameResult:
-    """What a tracker reports for one frame.
+    """What a tracker reports for one frame."""
 
-    Attributes
-    ----------
-    ids : (n,) int64
-    labels : list of str
-    boxes : (n, 7) float64
-        In the sensor frame.
-    scores : (n,) float64
-        Log odds, or any other scores: only their order and their mean over the frames of a track matter.
-    sources : (n,) int64
-        Index of the detection of this frame; -1 for none.
-    """
-
-    ids: NDArray[np.int64]
+    ids: NDArray[np.int64]  # (n,)
     labels: Sequence[str]
-    boxes: NDArray[np.float64]
-    scores: NDArray[np.float64]
-    sources: NDArray[np.int64]
+    boxes: NDArray[np.float64]  # (n, 7), in the sensor frame
+    scores: NDArray[np.float64]  # log odds, or others: only their order and their mean over a track's frames matter
+    sources: NDArray[np.int64]  # index of the detection of this frame; -1 for none
 
     @classmethod
     def of(cls, tracks: Tracks) -> FrameResult:
@@ -118,22 +78,8 @@ class FrameResult:
 
 
 def sequence_names(root: Path | str) -> list[str]:
-    """Names of the sequences below ``root``: KITTI's tracking sequences, or drives of an object set with track ids.
-
-    Parameters
-    ----------
-    root : str or Path
-        Has ``label_02/NAME.txt``, or ``training/label_2``, ``training/track_id`` (one line for each label) and
-        ``frames.csv`` (`edgeperc.datasets.kitti.KittiObjects`).
-
-    Returns
-    -------
-    list of str
-
-    Raises
-    ------
-    TrackingError
-        ``root`` has neither.
+    """Names of the sequences below ``root``: of KITTI's tracking (``label_02/NAME.txt``), or drives of an object set
+    with ``training/track_id``, an id for each label (`datasets.kitti.KittiObjects`). Raises TrackingError.
     """
     root = Path(root)
     names = sorted(path.stem for path in (root / "label_02").glob("*.txt"))
@@ -149,19 +95,7 @@ def sequence_names(root: Path | str) -> list[str]:
 
 
 def sequence_scans(root: Path | str, name: str) -> dict[int, Path]:
-    """Files of the scans of a sequence, by frame: ``velodyne/NAME/FRAME.bin``, or the scans of the drive.
-
-    Parameters
-    ----------
-    root : str or Path
-    name : str
-        Of `sequence_names`.
-
-    Returns
-    -------
-    dict of int to Path
-        Empty if there are no scans.
-    """
+    """Files of the scans of a sequence, by frame: ``velodyne/NAME/FRAME.bin``, or those of the drive; maybe none."""
     root = Path(root)
     if (root / "label_02").is_dir():
         return {int(path.stem): path for path in sorted((root / "velodyne" / name).glob("*.bin"))}
@@ -198,32 +132,8 @@ def read_sequence(
     *,
     rules: str = RULES[0],
 ) -> TrackingSequence:
-    """Read labels, calibration and detections (``detections/DETECTOR_CLASS/NAME.txt``) of a sequence below ``root``.
-
-    Parameters
-    ----------
-    root : str or Path
-        As in `sequence_names`.
-    name : str
-        Such as ``"0000"``.
-    classes : sequence of str
-        Keys of `KINDS`.
-    boxes : sequence of sequence of Box, optional
-        Detections by frame, instead of the files.
-    rules : str
-        Of `RULES`.
-
-    Returns
-    -------
-    TrackingSequence
-
-    Raises
-    ------
-    TrackingError
-        A file does not have KITTI's format, a class has no folder of detections, or there are fewer frames of boxes
-        than of labels.
-    OSError
-        A file cannot be read.
+    """Read labels, calibration and detections (``detections/DETECTOR_CLASS/NAME.txt``, or ``boxes`` by frame) of a
+    sequence (`sequence_names`) of the classes of `KINDS`, by one of the `RULES`. Raises TrackingError, OSError.
     """
     root = Path(root)
     label_path, labels, calibration = _labels(root, name)
@@ -297,20 +207,7 @@ def _read_detections(
 def track_sequence(
     sequence: TrackingSequence, parameters: Mapping[str, ClassParameters] | None = None
 ) -> tuple[list[Tracks], float]:
-    """Run a new `edgeperc.Tracker` over a sequence, without poses.
-
-    Parameters
-    ----------
-    sequence : TrackingSequence
-    parameters : mapping of str to ClassParameters, optional
-
-    Returns
-    -------
-    tracks : list of Tracks
-        One for each frame.
-    seconds : float
-        Time spent in the tracker [s].
-    """
+    """Run a new `edgeperc.Tracker` over a sequence, without poses: the tracks by frame, and the seconds it took."""
     # Labels and detections cover the field of view of the left color camera.
     (fx, _, cx), width_px = sequence.calibration.P2[0, :3], IMAGE_SIZE[0]
     edges = math.degrees(math.atan(cx / fx)), -math.degrees(math.atan((width_px - cx) / fx))
@@ -323,17 +220,8 @@ def track_sequence(
 
 
 def ab3dmot_sequence(sequence: TrackingSequence, classes: Sequence[str] = CLASSES) -> list[FrameResult]:
-    """Run AB3DMOT's method (`edgeperc.evaluation.ab3dmot`) over a sequence, with one tracker for each class.
-
-    Parameters
-    ----------
-    sequence : TrackingSequence
-    classes : sequence of str
-
-    Returns
-    -------
-    list of FrameResult
-        One for each frame. Classes without settings of AB3DMOT's have no tracks.
+    """Run AB3DMOT's method (`edgeperc.evaluation.ab3dmot`) over a sequence, with one tracker for each class that it has
+    settings for; the others have no tracks.
     """
     trackers = {label: Ab3dmot(SETTINGS[label]) for label in classes if label in SETTINGS}
     results = []
@@ -353,11 +241,10 @@ def ab3dmot_sequence(sequence: TrackingSequence, classes: Sequence[str] = CLASSE
     return results
 
 
-def _frame_truth(sequence: TrackingSequence, label: str, rules: str) -> list[FrameTruth]:
+def _frame_truth(sequence: TrackingSequence, label: str, rules: str) -> Sequence[FrameTruth]:
     """True boxes of one class for the metrics, by frame."""
-    if rules != "ab3dmot":
-        return [*sequence.truth[label]]
-    return [replace(frame, boxes=sequence.calibration.in_camera(frame.boxes)) for frame in sequence.truth[label]]
+    truth, in_camera = sequence.truth[label], sequence.calibration.in_camera
+    return truth if rules != "ab3dmot" else [replace(frame, boxes=in_camera(frame.boxes)) for frame in truth]
 
 
 def _frame_tracks(sequence: TrackingSequence, results: Sequence[FrameResult], of: str, rules: str) -> list[FrameTracks]:
@@ -483,29 +370,8 @@ def evaluate_kitti(
 def perceive_drive(
     perceive: Perceiver, scans: Mapping[int, Path], drive: str, on_scan: Callable[[], None] = lambda: None
 ) -> list[list[Box]]:
-    """Detect the boxes in the scans of a drive.
-
-    Parameters
-    ----------
-    perceive : Perceiver
-    scans : mapping of int to Path
-        Scan files by frame. A frame without a scan has no boxes.
-    drive : str
-        Name of the drive, for error messages.
-    on_scan : callable
-        Called after each scan.
-
-    Returns
-    -------
-    list of list of Box
-        By frame.
-
-    Raises
-    ------
-    SplitError
-        A model was trained on one of the scans.
-    PointsError
-        A scan cannot be read.
+    """Detect the boxes in the scans of a drive, by frame; one without a scan has none. ``on_scan`` is called after each
+    scan. Raises SplitError, PointsError.
     """
     trained_on = training_scans_of(perceive.cards)
     boxes: list[list[Box]] = [[] for _ in range(1 + max(scans, default=-1))]

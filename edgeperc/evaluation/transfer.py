@@ -1,4 +1,6 @@
-"""Accuracy of a model on sensors that it was not trained on, with and without adaptation (KUL-Seg, Table 6)."""
+"""Other sensors: the accuracy of a model that was not trained on them, with and without adaptation (KUL-Seg, Table 6),
+and which of them are found in the points of scans.
+"""
 
 from __future__ import annotations
 
@@ -12,10 +14,11 @@ import numpy as np
 
 from ..datasets.layout import class_number
 from ..datasets.scan_folder import ScanFolder, ScanFrame
-from ..errors import ModelError, PointsError
+from ..errors import ModelError, PointsError, SensorError
 from ..perceiver import ADAPTATIONS, Perceiver
 from ..preprocess.sensor_estimate import MOST_SCANS, estimate_sensor
 from ..preprocess.sensor_fit import fit_sensor
+from ..readers.captures import known_sensor, read_scans
 from ..simulation.samples import FIRST_SEED, IGNORE, labels_by_boxes, simulated_scan
 from ..simulation.scene import POINT_CLASSES
 from ..system.pool import map_in_processes, taken
@@ -31,6 +34,7 @@ from .truth import seeds_of
 
 N_FITTED = 8  # scenes for a remission function, from seeds before the evaluated ones
 FARTHEST_M = 50.0
+RIGHT_DEG = 0.1  # of an elevation
 
 # Train ids of PCLSegmentation's range images: Road to Vegetation, Person, Two-wheeler, Car, Truck, Bus, None.
 IMAGE_LABELS = np.array([0, 0, 0, 0, 0, 2, IGNORE, 1, 1, 1, IGNORE], np.uint8)
@@ -207,13 +211,12 @@ def _of_folder(folder: ScanFolder, sensor: SensorProfile | None = None) -> _Data
     return sensor or folder.layout.sensor, len(names), lambda: map(_of_frame, _frames(folder)), with_boxes
 
 
-def _folder(source: str) -> ScanFolder:
+def _folder(source: str, others: str = "SENSOR=simulation:N, SENSOR=FOLDER of range images NAME.npy") -> ScanFolder:
     try:
         return ScanFolder.parse(source)
     except PointsError as exc:
         raise PointsError(
-            f"{exc}. Expected SENSOR=simulation:N, SENSOR=FOLDER of range images NAME.npy, or labeled scans: a folder "
-            "with scans.json, or FOLDER:LAYOUT"
+            f"{exc}. Expected {others}, or labeled scans: a folder with scans.json, or FOLDER:LAYOUT"
         ) from exc
 
 
@@ -268,3 +271,50 @@ def _from_image(path: Path) -> Scan:
             f"{path}: labels from {labels.min()} to {labels.max()}; expected 0 to {len(IMAGE_LABELS) - 1}"
         )
     return Scan(path.stem, np.ascontiguousarray(pixels[:, :4], np.float32), IMAGE_LABELS[labels], None)
+
+
+def find_sensors(datasets: Sequence[str]) -> dict[str, dict[str, Any]]:
+    """Find the sensor of each set: of its first three scans, each alone, and of all. An estimate is right if its beams
+    are all within 0.1 degrees of one of the sensor each, without a gap. Raises PointsError, SensorError.
+    """
+    return {dataset: _of_one(*_source(dataset)) for dataset in datasets}
+
+
+def _of_one(sensor: SensorProfile, scans: Iterator[Points]) -> dict[str, Any]:
+    taken = list(islice(scans, MOST_SCANS))
+    found: dict[str, None] = {}
+    counts, off_deg = {"right": 0, "cannot_tell": 0, "wrong": 0}, list[float]()
+    for some in ([[scan] for scan in taken] + [taken])[: len(taken) + (len(taken) > 1)]:
+        try:
+            profile = estimate_sensor(some).profile
+        except SensorError:
+            counts["cannot_tell"] += 1
+            continue
+        found[profile.name] = None
+        error_deg, is_whole = compare_beams(profile, sensor)
+        off_deg.append(error_deg)
+        counts["right" if error_deg <= RIGHT_DEG and is_whole else "wrong"] += 1
+    most_deg = round(max(off_deg), 3) if off_deg else None
+    return {"sensor": sensor.name, "found": [*found], "n_scans": len(taken), **counts, "off_deg": most_deg}
+
+
+def compare_beams(found: SensorProfile, sensor: SensorProfile) -> tuple[float, bool]:
+    """Largest difference between the beams found and those next to them [deg]; whether none between them is missing."""
+    off = np.abs(np.array(found.elevations_deg)[:, None] - np.array(sensor.elevations_deg))
+    nearest = off.argmin(axis=1)
+    return float(off.min(axis=1).max()), bool((np.diff(nearest) == 1).all())
+
+
+def _source(dataset: str) -> tuple[SensorProfile, Iterator[Points]]:
+    """The sensor of a set, and its scans."""
+    name, equals, source = dataset.partition("=")
+    if source == "simulation":
+        sensor = get_sensor(name)
+        return sensor, (simulated_scan(FIRST_SEED + k, sensor).points for k in range(MOST_SCANS))
+    path = Path(source if equals else name)
+    if equals:
+        return get_sensor(name), (points for _, points in read_scans(path))
+    if path.exists() and (known := known_sensor(path)) is not None:
+        return known.profile, (points for _, points in read_scans(path))
+    folder = _folder(dataset, "SENSOR=simulation, SENSOR=PATH of scans, a capture")
+    return folder.layout.sensor, (folder.frame(name).points for name in folder.names("all"))

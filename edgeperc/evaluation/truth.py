@@ -15,6 +15,7 @@ from ..errors import PointsError
 from ..ground.observed import Observer
 from ..simulation.samples import FIRST_SEED, IGNORE, labels_of_scene, simulated_scan
 from ..simulation.scene import POINT_CLASS_OF, POINT_CLASSES, TOP_VIEW_CLASSES
+from ..types.choices import VEHICLES
 from ..types.frame import ModelFrame
 from ..types.geometry import draw_footprints, inside
 from ..types.mounting import Mounting
@@ -22,7 +23,6 @@ from ..types.perception import Box
 from ..types.points import Labels, Points, read_only
 from ..types.views import TopViewGeometry
 from .kitti_ap import FrontTruth, image_size_of
-from .tables import VEHICLES
 
 GROUND_Z_M = -1.5  # height at which a cell is looked up in the camera image
 

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from ..types.choices import VEHICLES
 from ..types.mounting import MODEL_HEIGHT_M, Mounting
 from ..types.perception import Box
 from ..types.points import Points
@@ -20,7 +21,6 @@ _LEAST_SLOPE, _RISING, _UPPER_PART, _FEWEST = 0.1, 0.002, 0.4, 30
 _BELOW_M, _ABOVE_M, _SHARE, _SECTORS = 0.3, 0.15, 0.3, 0.35
 _CLEAR_M, _ON_ROOF_M = 0.1, 0.5  # between a vehicle and the ceiling, and the sensor on it
 _BEHIND_M = 1.5  # how much of a vehicle may be estimated to lie behind a wall
-VEHICLES = ("car", "van", "truck")
 
 
 def find_ceiling(points: Points, eye_m: float = 0.0) -> float | None:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from ..errors import PointsError
 from ..system.kernels import njit
+from ..types.choices import VEHICLES
 from ..types.geometry import oriented_iou, rectangles, shared_area, suppress_overlaps
 from ..types.perception import Box
 from ..types.points import Cloud, Heights, Ids, Labeled, Labels, Mask, Points, read_only
@@ -30,7 +31,6 @@ OBJECT_SIZE_M: Mapping[str, tuple[float, float, float]] = MappingProxyType(
         "cyclist": (1.77, 0.61, 1.74),
     }
 )
-L_SHAPED = frozenset({"car", "van", "truck"})
 # A cluster that is at least this high, or this long, is a van or a truck [m]. On the training drives, 100 % of 421 cars
 # on KITTI are lower and 80 % of 307 vans are higher; 91 % of 905 cars on PandaSet, with pickups, are lower.
 VAN_HEIGHT_M = 1.8
@@ -196,7 +196,7 @@ def objects_from_points(
     for k in kept.tolist():
         name = classes[found[k]]
         members = groups.order[groups.starts[k] : groups.starts[k + 1]]
-        rectangle, levels, top = _fitted(cloud, members, name in L_SHAPED)
+        rectangle, levels, top = _fitted(cloud, members, name in VEHICLES)
         levels.sort()
         if height_m is None:
             bottom = float(levels[0])

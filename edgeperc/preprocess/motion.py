@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..errors import EdgepercError, OptionError, PointsError, SensorError, StampError, TrackingError
 from ..system.kernels import njit
-from ..types.frame import fill_moved
+from ..types.frame import fill_moved, poses_of
 from ..types.points import Points, as_points, read_only
 from ..types.rigid import rigid
 from .returns import blank_too_near
@@ -187,8 +187,8 @@ class Trajectory:
             line = _line(content, int(np.argmin(rises)) + 1)
             raise StampError(f"{path}: the time of line {line} is not later than that before; expected times that rise")
         units = rows[:, 4:] / norm[:, None]
-        poses = _poses(rows[:, 1:4], units)
-        other = _poses(rows[:, 1:4], np.roll(units, -1, axis=1))
+        poses = poses_of(rows[:, 1:4], units)
+        other = poses_of(rows[:, 1:4], np.roll(units, -1, axis=1))
         if quaternion == "wxyz":
             poses = other
         elif quaternion is None and np.isfinite(rows).all() and _fits_better(other, poses):
@@ -361,17 +361,6 @@ def _line(content: bytes, k: int) -> int:
     """The number of the line of a text with the k-th row of numbers, from 1."""
     rows = [n for n, line in enumerate(content.splitlines(), start=1) if line.partition(b"#")[0].strip()]
     return rows[k] if k < len(rows) else k + 1
-
-
-def _poses(positions: NDArray[np.float64], quaternions: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Matrices (n, 4, 4) of positions and unit quaternions x, y, z, w."""
-    x, y, z, w = quaternions.T
-    poses = np.zeros((len(positions), 4, 4))
-    poses[:, 0, :3] = np.column_stack([1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)])
-    poses[:, 1, :3] = np.column_stack([2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)])
-    poses[:, 2, :3] = np.column_stack([2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)])
-    poses[:, :3, 3], poses[:, 3, 3] = positions, 1.0
-    return poses
 
 
 def _fits_better(other: NDArray[np.float64], poses: NDArray[np.float64]) -> bool:

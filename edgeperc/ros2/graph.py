@@ -1,31 +1,18 @@
-"""What a node needs of its middleware: names, qualities of service, and topics of CDR bytes."""
+"""What a node needs of its middleware: names, and topics of CDR bytes."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from typing import Any, Literal, Protocol
 
 from ..errors import OptionError
 
-
-@dataclass(frozen=True)
-class Qos:
-    """Quality of service: always volatile, and the last ``depth`` messages are kept.
-
-    reliable : false: best effort.
-    """
-
-    reliable: bool
-    depth: int
-
-
-SENSOR_DATA = Qos(reliable=False, depth=5)
-"""ROS 2's profile for sensor data: it receives from reliable and from best-effort publishers."""
-RELIABLE = Qos(reliable=True, depth=10)
-"""ROS 2's default profile. Subscribers of sensor data receive from it, too; those of RViz receive from nothing else."""
-
+PUBLISHED_DEPTH, RECEIVED_DEPTH = 10, 5
+"""Messages that are kept of a topic. What is published is reliable, as by ROS 2's default profile: subscribers of
+sensor data receive it, too, and those of RViz nothing else. What is received is sensor data, best effort: from reliable
+publishers, too. Both are volatile.
+"""
 
 State = Literal["unconfigured", "inactive", "active", "finalized"]
 """Primary states of a managed node."""
@@ -61,8 +48,8 @@ class Graph(Protocol):
     def parameter(self, name: str, default: Any) -> Any:
         """Declare a parameter that does not change later. Returns its value: the default, unless the user set it."""
 
-    def advertise(self, topic: str, message_type: str, qos: Qos) -> Output:
-        """Begin to publish on a topic."""
+    def advertise(self, topic: str, message_type: str) -> Output:
+        """Begin to publish on a topic, reliably."""
 
     def subscribe(self, topic: str, message_type: str, receive: Callable[[bytes], None]) -> None:
         """Call ``receive`` with the CDR bytes of each message, in a thread of the middleware, as sensor data."""

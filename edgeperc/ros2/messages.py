@@ -136,6 +136,8 @@ def nanoseconds(stamp_s: float) -> int:
 class RosMessages:
     """Makes messages of perceived scans, serializes them and reads clouds.
 
+    Methods that make one of a scan take the scan and the stamp of its header [ns], by default that of the scan.
+
     Parameters
     ----------
     frame_id : str
@@ -212,16 +214,6 @@ class RosMessages:
 
         Fields are ``x``, ``y``, ``z``, ``intensity`` (the remission as it came; 0 without one), ``label`` (uint8, index
         into the classes that `diagnostics` lists) and ``in_view`` (uint8, 0 where the label is not a prediction).
-
-        Parameters
-        ----------
-        scan : PerceivedScan
-        stamp_ns : int, optional
-            Stamp of the header [ns], by default that of the scan.
-
-        Returns
-        -------
-        message
         """
         points, labels = as_points(scan.points), scan.perception.points
         rows = np.zeros(len(points), _POINT)
@@ -258,15 +250,6 @@ class RosMessages:
         The first marker deletes those of the scan before. Namespaces are ``boxes`` (cubes; ids count from 0),
         ``tracks`` (edges of the box), ``track_labels`` (class, id, speed) and ``track_velocities`` (an arrow of the way
         in one second); in the latter three, the id of a marker is that of its track.
-
-        Parameters
-        ----------
-        scan, stamp_ns
-            As in `points`.
-
-        Returns
-        -------
-        message
         """
         header = self._header(scan, stamp_ns)
         markers = [self._marker(header, "", 0, _CUBE, action=_DELETE_ALL)]
@@ -293,17 +276,7 @@ class RosMessages:
         return self._make("visualization_msgs/msg/MarkerArray", markers=markers)
 
     def occupancy(self, scan: PerceivedScan, stamp_ns: int | None = None) -> Any:
-        """The grid of `edgeperc.occupancy_grid`: a nav_msgs/OccupancyGrid, 0 drivable, 100 obstacle, -1 unknown.
-
-        Parameters
-        ----------
-        scan, stamp_ns
-            As in `points`.
-
-        Returns
-        -------
-        message
-        """
+        """The grid of `edgeperc.occupancy_grid`: a nav_msgs/OccupancyGrid, 0 drivable, 100 obstacle, -1 unknown."""
         grid = occupancy_grid(scan.perception, scan.points, cell_m=self._cell_m, sensor=scan.sensor)
         fields = grid.to_occupancy_grid(off_road=self._off_road)
         header = self._header(scan, stamp_ns, self.grid_frame_id)
@@ -324,10 +297,6 @@ class RosMessages:
             Of the odometry.
         stamp_ns : int
             Stamp of the header [ns].
-
-        Returns
-        -------
-        message
         """
         fields = grid.to_occupancy_grid(frame_id, self._off_road)
         center = [*fields["info"]["origin"]["position"].values()]
@@ -353,11 +322,6 @@ class RosMessages:
         mask : (n,) bool
             Points to keep.
         stamp_ns : int, optional
-            As in `points`.
-
-        Returns
-        -------
-        message
         """
         table, data = cloud_table(cloud), np.frombuffer(cloud.data, np.uint8)
         step = table.dtype.itemsize
@@ -380,15 +344,6 @@ class RosMessages:
         """Tracks or, without a tracker, boxes: a vision_msgs/Detection3DArray of vision_msgs 4.
 
         The class is its name; the id is that of the track, empty without one.
-
-        Parameters
-        ----------
-        scan, stamp_ns
-            As in `points`.
-
-        Returns
-        -------
-        message
         """
         header = self._header(scan, stamp_ns)
         boxes = [(box, "") for box in scan.perception.boxes]
@@ -399,39 +354,25 @@ class RosMessages:
             pose = self._with("Pose", self._pose(box))
             what = self._make("vision_msgs/msg/ObjectHypothesis", class_id=box.label, score=float(box.score))
             result = self._make("vision_msgs/msg/ObjectHypothesisWithPose", hypothesis=what, pose=pose)
-            around = self._make("vision_msgs/msg/BoundingBox3D", center=self._pose(box), size=self._vector(box.size))
+            around = self._make("vision_msgs/msg/BoundingBox3D", center=self._pose(box), size=self._xyz(box.size))
             detections.append(
                 self._make("vision_msgs/msg/Detection3D", header=header, results=[result], bbox=around, id=track_id)
             )
         return self._make("vision_msgs/msg/Detection3DArray", header=header, detections=detections)
 
     def detected_objects(self, scan: PerceivedScan, stamp_ns: int | None = None) -> Any:
-        """Boxes: an autoware_perception_msgs/DetectedObjects.
-
-        Parameters
-        ----------
-        scan, stamp_ns
-            As in `points`.
-
-        Returns
-        -------
-        message
-        """
-        objects = [
-            self._object(
-                "Detected",
-                box,
-                {
-                    "pose_with_covariance": self._with("Pose", self._pose(box)),
-                    "has_position_covariance": False,
-                    "orientation_availability": _SIGN_UNKNOWN if box.front is None else _AVAILABLE,
-                    "twist_with_covariance": self._with("Twist", self._twist()),
-                    "has_twist": False,
-                    "has_twist_covariance": False,
-                },
-            )
-            for box in scan.perception.boxes
-        ]
+        """Boxes: an autoware_perception_msgs/DetectedObjects."""
+        objects = []
+        for box in scan.perception.boxes:
+            kinematics = {
+                "pose_with_covariance": self._with("Pose", self._pose(box)),
+                "has_position_covariance": False,
+                "orientation_availability": _SIGN_UNKNOWN if box.front is None else _AVAILABLE,
+                "twist_with_covariance": self._with("Twist", self._twist()),
+                "has_twist": False,
+                "has_twist_covariance": False,
+            }
+            objects.append(self._object("Detected", box, kinematics))
         return self._objects("Detected", scan, stamp_ns, objects)
 
     def tracked_objects(self, scan: PerceivedScan, stamp_ns: int | None = None) -> Any:
@@ -439,15 +380,6 @@ class RosMessages:
 
         Velocities are over ground along and across the box. The covariances are those of position, yaw and speed along
         the heading.
-
-        Parameters
-        ----------
-        scan, stamp_ns
-            As in `points`.
-
-        Returns
-        -------
-        message
         """
         moving = {track.id for track in moving_tracks(scan.tracked or ())}
         objects = []
@@ -464,18 +396,8 @@ class RosMessages:
         """Tracks, each with one path of 5 s straight on: an autoware_perception_msgs/PredictedObjects.
 
         The path is that of the track's velocity over ground, as seen from where the sensor was at the scan.
-
-        Parameters
-        ----------
-        scan, stamp_ns
-            As in `points`.
-
-        Returns
-        -------
-        message
         """
-        nanoseconds = round(_PATH_STEP_S * 1e9)
-        step = self._make("builtin_interfaces/msg/Duration", sec=nanoseconds // 10**9, nanosec=nanoseconds % 10**9)
+        step = self._duration(_PATH_STEP_S)
         objects = []
         for track in scan.tracked or ():
             way = np.array([*track.velocity, 0.0]) * _PATH_STEP_S
@@ -504,7 +426,7 @@ class RosMessages:
             existence_probability=float(box.score),
             classification=[self._make(f"{package}/ObjectClassification", **what)],
             kinematics=self._make(f"{package}/{kind}ObjectKinematics", **kinematics),
-            shape=self._make(f"{package}/Shape", type=0, footprint=polygon, dimensions=self._vector(box.size)),
+            shape=self._make(f"{package}/Shape", type=0, footprint=polygon, dimensions=self._xyz(box.size)),
         )
 
     def _motion(self, scan: PerceivedScan, track: Track, before: str) -> dict[str, Any]:
@@ -515,7 +437,7 @@ class RosMessages:
         pose, twist = np.zeros((6, 6)), np.zeros((6, 6))
         R = scan.tracks.T_world_sensor[:2, :2]
         pose[:2, :2], pose[5, 5], twist[0, 0] = R.T @ track.covariance[:2, :2] @ R, *track.covariance[[3, 2], [3, 2]]
-        zero = self._vector((0.0, 0.0, 0.0))
+        zero = self._xyz((0.0, 0.0, 0.0))
         along = self._twist((cos * vx + sin * vy, cos * vy - sin * vx, 0.0), float(track.state[4]))
         return {
             f"{before}pose_with_covariance": self._with("Pose", self._pose(track.box), pose),
@@ -526,9 +448,7 @@ class RosMessages:
         }
 
     def _twist(self, linear: tuple[float, float, float] = (0.0, 0.0, 0.0), turn: float = 0.0) -> Any:
-        return self._make(
-            "geometry_msgs/msg/Twist", linear=self._vector(linear), angular=self._vector((0.0, 0.0, turn))
-        )
+        return self._make("geometry_msgs/msg/Twist", linear=self._xyz(linear), angular=self._xyz((0.0, 0.0, turn)))
 
     def _with(self, kind: str, value: Any, covariance: NDArray[np.float64] | None = None) -> Any:
         matrix = np.zeros(36) if covariance is None else covariance.ravel()
@@ -557,7 +477,7 @@ class RosMessages:
         scan : PerceivedScan or None
             The newest; None if there is none yet.
         stamp_ns : int, optional
-            As in `points`; 0 without a scan.
+            0 without a scan.
         name : str
             Name of the only status.
         level : int, optional
@@ -566,10 +486,6 @@ class RosMessages:
             By default the health.
         values : mapping, optional
             More keys and values, before the others.
-
-        Returns
-        -------
-        message
         """
         listed: dict[str, object] = dict(values or {})
         if scan is None:
@@ -610,6 +526,10 @@ class RosMessages:
     def _make(self, kind: str, /, **fields: Any) -> Any:
         return self.types[kind](**fields)
 
+    def _duration(self, seconds: float) -> Any:
+        whole, rest = divmod(nanoseconds(seconds), 10**9)
+        return self._make("builtin_interfaces/msg/Duration", sec=whole, nanosec=rest)
+
     def _header(self, scan: PerceivedScan | None, stamp_ns: int | None, frame_id: str | None = None) -> Any:
         if stamp_ns is None:
             stamp_ns = 0 if scan is None else nanoseconds(scan.stamp_s)
@@ -637,7 +557,6 @@ class RosMessages:
         points: NDArray[np.float64] | None = None,
         text: str = "",
     ) -> Any:
-        lasting_ns = nanoseconds(self._lifetime_s)
         (red, green, blue), alpha = rgb([color_of(color[0])])[0].tolist(), color[1]
         image = self._make("sensor_msgs/msg/CompressedImage", header=header, format="", data=np.zeros(0, np.uint8))
         mesh = self._make("visualization_msgs/msg/MeshFile", filename="", data=np.zeros(0, np.uint8))
@@ -649,11 +568,11 @@ class RosMessages:
             type=kind,
             action=action,
             pose=self._pose() if pose is None else pose,
-            scale=self._vector(scale),
+            scale=self._xyz(scale),
             color=self._make("std_msgs/msg/ColorRGBA", r=red, g=green, b=blue, a=alpha),
-            lifetime=self._make("builtin_interfaces/msg/Duration", sec=lasting_ns // 10**9, nanosec=lasting_ns % 10**9),
+            lifetime=self._duration(self._lifetime_s),
             frame_locked=False,
-            points=[self._point(point) for point in (() if points is None else points)],
+            points=[self._xyz(point, "Point") for point in (() if points is None else points)],
             colors=[],
             texture_resource="",
             texture=image,
@@ -664,11 +583,8 @@ class RosMessages:
             mesh_use_embedded_materials=False,
         )
 
-    def _point(self, place: Any) -> Any:
-        return self._make("geometry_msgs/msg/Point", x=float(place[0]), y=float(place[1]), z=float(place[2]))
-
-    def _vector(self, along: Any) -> Any:
-        return self._make("geometry_msgs/msg/Vector3", x=float(along[0]), y=float(along[1]), z=float(along[2]))
+    def _xyz(self, values: Any, kind: str = "Vector3") -> Any:
+        return self._make(f"geometry_msgs/msg/{kind}", **dict(zip("xyz", map(float, values), strict=True)))
 
     def _pose(
         self,
@@ -680,4 +596,4 @@ class RosMessages:
         if box is not None:
             center, turned = box.center, (0.0, 0.0, math.sin(box.yaw / 2.0), math.cos(box.yaw / 2.0))
         orientation = self._make("geometry_msgs/msg/Quaternion", **dict(zip("xyzw", turned, strict=True)))
-        return self._make("geometry_msgs/msg/Pose", position=self._point(center), orientation=orientation)
+        return self._make("geometry_msgs/msg/Pose", position=self._xyz(center, "Point"), orientation=orientation)

@@ -9,7 +9,7 @@ import time
 import warnings
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -21,7 +21,7 @@ from ..records import PerceivedScan
 from ..road.grid import Split, split_points
 from ..system.clock import Stamp
 from ..system.names import check_text
-from .graph import RELIABLE, TRANSITIONS, Graph, Output, State, full_name
+from .graph import TRANSITIONS, Graph, Output, State, full_name
 from .messages import (
     CLOUD,
     DIAGNOSTICS,
@@ -145,7 +145,7 @@ class PerceptionNode:
 
         self._topics = _topics_of(outputs, prefix, rolling is not None)
         self._outputs: dict[str, Output] = {}
-        self._diagnostics = graph.advertise("/diagnostics", DIAGNOSTICS, RELIABLE) if "diagnostics" in outputs else None
+        self._diagnostics = graph.advertise("/diagnostics", DIAGNOSTICS) if "diagnostics" in outputs else None
         # The queue is empty nearly always: the stream's thread takes what comes, and keeps the newest.
         self._stream = stream(iter(self._waiting.get, None), self._perceive, tracker, rate_hz=rate_hz)
         self._state: State = "unconfigured"
@@ -211,7 +211,7 @@ class PerceptionNode:
             return
         for name, topic in self._topics.items():
             try:
-                self._outputs[name] = self._graph.advertise(topic, LIVE_OUTPUTS[name], RELIABLE)
+                self._outputs[name] = self._graph.advertise(topic, LIVE_OUTPUTS[name])
             except OptionError as exc:
                 if name != "detections":
                     raise
@@ -352,7 +352,7 @@ class PerceptionNode:
             self._diagnostics.publish(self._messages.encode(self._report()))
 
     def _report(self) -> Any:
-        rates = self._rates.taken(self.n_scans, self._n_failed)
+        n_failed, rates = self._rates.taken(self.n_scans, self._n_failed)
         error, newest = self._error, self._newest
         level: int | None = None
         message: str | None = None
@@ -363,8 +363,8 @@ class PerceptionNode:
         elif newest is not None:
             health = self._stream.health
             level, message = {"OK": (0, "OK"), "LATE": (1, "LATE"), "STALE": (3, "STALE: no answer of late")}[health]
-            if level == 0 and rates.n_failed:
-                level, message = 1, f"{rates.n_failed} clouds of the last second failed"
+            if level == 0 and n_failed:
+                level, message = 1, f"{n_failed} clouds of the last second failed"
         values = {
             "topic": self._topic,
             "state": self._state,
@@ -372,11 +372,8 @@ class PerceptionNode:
             "clouds dropped": self.n_dropped,
             "clouds failed": self._n_failed,
             "answers": self._rates.n_answers,
-            "clouds [Hz]": f"{rates.clouds_hz:.1f}",
-            "answers [Hz]": f"{rates.answers_hz:.1f}",
+            **rates,
         }
-        if rates.latency_ms is not None:
-            values |= {f"latency p{p} [ms]": f"{ms:.0f}" for p, ms in zip((50, 99), rates.latency_ms, strict=True)}
         if newest is not None:
             values["age of the newest answer [ms]"] = f"{1e3 * self._stream.age_s:.0f}"
         if self._rolling is not None:
@@ -401,15 +398,6 @@ class PerceptionNode:
         self.close()
 
 
-class _Taken(NamedTuple):
-    """Since the last report; latencies (p50, p99) of the last answers, None before the first."""
-
-    n_failed: int
-    clouds_hz: float
-    answers_hz: float
-    latency_ms: tuple[float, float] | None
-
-
 class _Rates:
     """Counts answers, and what came since the last report."""
 
@@ -422,15 +410,16 @@ class _Rates:
         self._latencies_s.append(latency_s)
         self.n_answers += 1
 
-    def taken(self, n_clouds: int, n_failed: int) -> _Taken:
+    def taken(self, n_clouds: int, n_failed: int) -> tuple[int, dict[str, str]]:
+        """Clouds that failed since the last report; rates since then, and latencies of the last answers."""
         last, self._last = self._last, (time.monotonic(), n_clouds, self.n_answers, n_failed)
         elapsed_s, clouds, answers, failed = (now - then for now, then in zip(self._last, last, strict=True))
         elapsed_s = max(elapsed_s, 1e-3)
-        latency_ms = None
+        values = {"clouds [Hz]": f"{clouds / elapsed_s:.1f}", "answers [Hz]": f"{answers / elapsed_s:.1f}"}
         if self._latencies_s:
-            p50, p99 = 1e3 * np.percentile(np.array(self._latencies_s), (50, 99))
-            latency_ms = float(p50), float(p99)
-        return _Taken(int(failed), clouds / elapsed_s, answers / elapsed_s, latency_ms)
+            latencies_ms = 1e3 * np.percentile(np.array(self._latencies_s), (50, 99))
+            values |= {f"latency p{p} [ms]": f"{ms:.0f}" for p, ms in zip((50, 99), latencies_ms, strict=True)}
+        return int(failed), values
 
 
 def _topics_of(outputs: Sequence[str], prefix: str, with_rolling: bool) -> dict[str, str]:

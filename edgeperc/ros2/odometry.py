@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from ..errors import OptionError, PointsError, TrackingError
 from ..road.rolling import RollingGrid
+from ..types.frame import poses_of
 from ..types.mounting import Mounting
 from ..types.rigid import rigid
 from .graph import full_name
@@ -115,28 +116,17 @@ class Poses:
         Raises TrackingError.
         """
         with self._lock:
-            k = bisect.bisect_left(self._times, stamp_ns)
-            if k == len(self._times):
-                if not k or stamp_ns - self._times[-1] > TOLERANCE_S * 1e9:
-                    return None
-                (place, turn), share = self._poses[-1], 0.0
-                other = place, turn
-            elif self._times[k] == stamp_ns:
-                (place, turn), other, share = self._poses[k], self._poses[k], 0.0
-            elif k == 0:
+            k = bisect.bisect_right(self._times, stamp_ns)  # the first that is later
+            if k == 0 or (k == len(self._times) and stamp_ns - self._times[-1] > TOLERANCE_S * 1e9):
                 return None
-            else:
-                (place, turn), other = self._poses[k - 1], self._poses[k]
+            (place, turn), share = self._poses[k - 1], 0.0
+            other = place, turn
+            if k < len(self._times):
+                other = self._poses[k]
                 share = (stamp_ns - self._times[k - 1]) / (self._times[k] - self._times[k - 1])
         near = other[1] if turn @ other[1] >= 0.0 else -other[1]
-        x, y, z, w = _unit((1.0 - share) * turn + share * near)
-        pose = np.eye(4)
-        pose[:3, 3] = (1.0 - share) * place + share * other[0]
-        pose[:3, :3] = [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
+        turned = _unit((1.0 - share) * turn + share * near)
+        (pose,) = poses_of(((1.0 - share) * place + share * other[0])[None], turned[None])
         return rigid("the odometry's pose", pose, TrackingError)
 
 

@@ -8,7 +8,7 @@ from importlib import import_module
 from typing import Any
 
 from ..errors import OptionError
-from .graph import SENSOR_DATA, TRANSITIONS, Qos
+from .graph import PUBLISHED_DEPTH, RECEIVED_DEPTH, TRANSITIONS
 
 
 class RclpyGraph:
@@ -98,9 +98,9 @@ class RclpyGraph:
         except Exception as exc:
             raise OptionError(f"the parameter {name} is not of type {type(default).__name__}: {exc}") from exc
 
-    def advertise(self, topic: str, message_type: str, qos: Qos) -> _RclpyOutput:
+    def advertise(self, topic: str, message_type: str) -> _RclpyOutput:
         """Begin to publish; see `Graph.advertise`."""
-        kind, profile = _class_of(message_type), self._profile(qos)
+        kind, profile = _class_of(message_type), self._profile("RELIABLE", PUBLISHED_DEPTH)
         try:
             return _RclpyOutput(self._node.create_publisher(kind, topic, profile))
         except Exception as exc:  # of rclpy, for a name
@@ -108,20 +108,19 @@ class RclpyGraph:
 
     def subscribe(self, topic: str, message_type: str, receive: Callable[[bytes], None]) -> None:
         """Receive messages; see `Graph.subscribe`. They come from now on."""
-        kind, profile = _class_of(message_type), self._profile(SENSOR_DATA)
+        kind, profile = _class_of(message_type), self._profile("BEST_EFFORT", RECEIVED_DEPTH)
         try:
             self._node.create_subscription(kind, topic, receive, profile, raw=True)
         except Exception as exc:
             raise OptionError(f"rclpy does not subscribe to {topic!r}: {exc}") from exc
         self._spin()
 
-    def _profile(self, qos: Qos) -> Any:
-        kinds = self._qos.ReliabilityPolicy
+    def _profile(self, reliability: str, depth: int) -> Any:
         return self._qos.QoSProfile(
-            reliability=kinds.RELIABLE if qos.reliable else kinds.BEST_EFFORT,
+            reliability=getattr(self._qos.ReliabilityPolicy, reliability),
             durability=self._qos.DurabilityPolicy.VOLATILE,
             history=self._qos.HistoryPolicy.KEEP_LAST,
-            depth=qos.depth,
+            depth=depth,
         )
 
     def close(self) -> None:

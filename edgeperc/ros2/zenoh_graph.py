@@ -28,14 +28,14 @@ from typing import Any
 from ..errors import OptionError
 from ..system.extras import require
 from ..system.lanes import returns
-from .graph import SENSOR_DATA, Qos, full_name
+from .graph import PUBLISHED_DEPTH, RECEIVED_DEPTH, full_name
 from .messages import RosMessages
 
 ROUTER = "tcp/localhost:7447"
 """Where rmw_zenoh's router listens."""
 CONFIG_VARIABLE = "ZENOH_SESSION_CONFIG_URI"
 _PATIENCE = "transport/link/tx/queue/congestion_control/drop"
-_DEFAULT_DEPTH = 42
+_PUBLISHED, _RECEIVED = f"::,{PUBLISHED_DEPTH}:,:,:,,", f"2::,{RECEIVED_DEPTH}:,:,:,,"  # qualities of service
 _CLOSING_S = 5.0
 _ATTACHMENT = struct.Struct("<qqB16s")
 
@@ -44,13 +44,6 @@ def type_key(name: str) -> str:
     """``"std_msgs/msg/String"`` as rmw_zenoh writes it: ``"std_msgs::msg::dds_::String_"``."""
     package, kind, plain = name.split("/")
     return f"{package}::{kind}::dds_::{plain}_"
-
-
-def qos_key(qos: Qos) -> str:
-    """The quality of service in a liveliness token: ``"2::,5:,:,:,,"`` for sensor data."""
-    reliability = "" if qos.reliable else "2"
-    depth = "" if qos.depth == _DEFAULT_DEPTH else str(qos.depth)
-    return f"{reliability}::,{depth}:,:,:,,"
 
 
 def attachment(number: int, stamp_ns: int, publisher_id: bytes) -> bytes:
@@ -130,14 +123,14 @@ class ZenohGraph:
         """No: this node offers no services, so no lifecycle manager reaches it."""
         return False
 
-    def advertise(self, topic: str, message_type: str, qos: Qos) -> _ZenohOutput:
+    def advertise(self, topic: str, message_type: str) -> _ZenohOutput:
         """Begin to publish; see `Graph.advertise`."""
         full, kind, digest = self._topic(topic, message_type)
         publisher = self._session.declare_publisher(
             f"{self._domain}{full}/{kind}/{digest}",
             congestion_control=self._zenoh.CongestionControl.DROP,
         )
-        token = self._declare("MP", _mangled(full), kind, digest, qos_key(qos))
+        token = self._declare("MP", _mangled(full), kind, digest, _PUBLISHED)
         return _ZenohOutput(publisher, hashlib.sha256(token.encode()).digest()[:16])
 
     def subscribe(self, topic: str, message_type: str, receive: Callable[[bytes], None]) -> None:
@@ -149,7 +142,7 @@ class ZenohGraph:
 
         # Any hash: Humble writes none, and what the bytes are is checked when they are read.
         self._kept.append(self._session.declare_subscriber(f"{self._domain}{full}/{kind}/*", on_sample))
-        self._declare("MS", _mangled(full), kind, digest, qos_key(SENSOR_DATA))
+        self._declare("MS", _mangled(full), kind, digest, _RECEIVED)
 
     def _topic(self, topic: str, message_type: str) -> tuple[str, str, str]:
         return full_name(topic, self._namespace), type_key(message_type), self._messages.type_hash(message_type)

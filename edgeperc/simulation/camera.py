@@ -11,8 +11,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..camera.calibration import Calibration
 from ..errors import CalibrationError
+from ..types.choices import VEHICLES
 from ..types.points import Labels
-from .raycast import FACADE, GLASS, LEAVES, PAINT, RETRO, Hits, Rays, fill_cast, fill_ground_kinds
+from .raycast import FACADE, GLASS, LEAVES, PAINT, RETRO, Hits, Rays, fill_cast
 from .scene import Scene, SimulatedScan, place_shapes
 from .street import CAMERA_CLASSES
 
@@ -28,7 +29,7 @@ _AHEAD = np.array([[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0,
 _SKY, _ROAD, _PAVEMENT, _TREE = (CAMERA_CLASSES.index(name) for name in ("Sky", "Road", "Pavement", "Tree"))
 _OF_GROUND = np.array([_ROAD, _PAVEMENT, _TREE], np.uint8)  # CamVid counts grass as trees
 _OF_OBJECT = {
-    **dict.fromkeys(("car", "van", "truck", "tram", "misc"), CAMERA_CLASSES.index("Car")),
+    **dict.fromkeys((*VEHICLES, "tram", "misc"), CAMERA_CLASSES.index("Car")),
     **dict.fromkeys(("pedestrian", "person_sitting"), CAMERA_CLASSES.index("Pedestrian")),
     "cyclist": CAMERA_CLASSES.index("Bicyclist"),
 }
@@ -171,10 +172,7 @@ def _ground_at(
     scene: Scene, places: NDArray[Any], T_world_frame: NDArray[np.float64]
 ) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
     """Kind and remission of the ground at places (n, 3) of a frame."""
-    world = places.astype(np.float64) @ T_world_frame[:3, :3].T + T_world_frame[:3, 3]
-    kinds, remissions = np.empty(len(world), np.uint8), np.empty(len(world))
-    fill_ground_kinds(scene.ground, world[:, :2].copy(), kinds, remissions)
-    return kinds, remissions
+    return scene.surface((places.astype(np.float64) @ T_world_frame[:3, :3].T + T_world_frame[:3, 3])[:, :2])
 
 
 def surface_classes(scene: Scene) -> NDArray[np.uint8]:

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from ..types.choices import VEHICLES
 from ..types.geometry import wrapped
 from ..types.perception import Box
 from .raycast import LANE, SLOPE_X, SLOPE_Y
@@ -15,7 +16,6 @@ from .scene import Scene
 from .shapes import Row
 from .street import IN_BAYS, ROW_RANGE_M, SHAPES, Street, any_vehicle, random_terrain, strip_row
 
-_VEHICLES = ("car", "van", "truck")
 _ROW_GAP_M = 9.0  # between the centers of two parked cars
 
 
@@ -39,9 +39,9 @@ def scene_from_boxes(boxes: Sequence[Box], seed: int, *, mount_height_m: float =
         differs slightly from the boxes.
     """
     rng = np.random.default_rng((int(seed) & 0x7FFFFFFFFFFFFFFF, 15485863))
-    vehicles = [box for box in boxes if box.label in _VEHICLES]
+    vehicles = [box for box in boxes if box.label in VEHICLES]
     heading, curvature = _road_direction(vehicles)
-    lane = float(rng.uniform(2.9, 3.6))
+    lane = rng.uniform(2.9, 3.6)
     # Vehicles along the road widen it; vehicles across it stand on another road or in a yard.
     beside: list[tuple[float, float, float, float]] = []
     across: list[float] = []
@@ -56,8 +56,8 @@ def scene_from_boxes(boxes: Sequence[Box], seed: int, *, mount_height_m: float =
     left = max([lane / 2 + 0.2, *(u + w + 0.3 for _, u, w, _ in beside)])
     if left < 3.0 and rng.random() < 0.7:
         left += lane  # an empty lane for oncoming traffic
-    right -= float(rng.uniform(0.0, 0.8))
-    left += float(rng.uniform(0.0, 0.8))
+    right -= rng.uniform(0.0, 0.8)
+    left += rng.uniform(0.0, 0.8)
     on_foot = any(box.label == "pedestrian" for box in boxes)
     fast = len(beside) > 0 and not on_foot and rng.random() < 0.15
     place = str(rng.choice(["urban", "residential"])) if not fast else str(rng.choice(["rural", "highway"]))
@@ -67,12 +67,12 @@ def scene_from_boxes(boxes: Sequence[Box], seed: int, *, mount_height_m: float =
     strips = [strip_row(0, 0, heading, curvature, right, left)]
     crossings: list[float] = []
     if across or rng.random() < 0.4:
-        s = float(np.median(across)) if across else float(rng.uniform(10.0, 55.0))
+        s = float(np.median(across)) if across else rng.uniform(10.0, 55.0)
         crossings.append(s)
         x, y = s * math.cos(heading), s * math.sin(heading) + curvature * s * s / 2
-        width = float(rng.uniform(2.4, 5.5))
+        width = rng.uniform(2.4, 5.5)
         ends = ((-200.0, 200.0), (0.0, 200.0), (-200.0, 0.0))[int(rng.integers(0, 3)) if not across else 0]
-        turn = heading + curvature * s + math.pi / 2 + float(rng.normal(0.0, 0.2)) * (not across)
+        turn = heading + curvature * s + math.pi / 2 + rng.normal(0.0, 0.2) * (not across)
         strips.append(strip_row(x, y, turn, 0.0, -width, width, ends))
     strips += bays
     terrain = random_terrain(rng, place)
@@ -103,7 +103,7 @@ def scene_from_boxes(boxes: Sequence[Box], seed: int, *, mount_height_m: float =
     # Objects behind the sensor and far to its sides are not labeled, so mirror some of the labeled vehicles.
     for s, u, _, ahead in beside:
         if rng.random() < 0.7:
-            x, y, yaw = street.on_strip(-s + float(rng.normal(0, 3.0)), u)
+            x, y, yaw = street.on_strip(-s + rng.normal(0, 3.0), u)
             yaw += math.pi * (ahead < 0.0)
             street.add_object(any_vehicle(rng, 0.03), x, y, yaw)
     _add_unlabeled_people(street, boxes)
@@ -147,7 +147,7 @@ def _add_unlabeled_people(street: Street, boxes: Sequence[Box]) -> None:
     rng = street.rng
     for box in boxes:
         if box.label in ("pedestrian", "cyclist") and rng.random() < 0.7:
-            x, y = -box.center[0] + float(rng.normal(0, 2)), box.center[1] + float(rng.normal(0, 0.3))
+            x, y = -box.center[0] + rng.normal(0, 2), box.center[1] + rng.normal(0, 0.3)
             street.add_object(box.label, x, y, box.yaw, box.size, 1.0)
 
 

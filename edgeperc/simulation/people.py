@@ -17,7 +17,7 @@ def _cloth(rng: np.random.Generator) -> float:
 
 
 def _head(x: float, h: float, rng: np.random.Generator) -> list[Row]:
-    rows = [blob(MATTE, float(rng.uniform(0.3, 0.55)), (x, 0.0, 0.935 * h), (0.2, 0.17, 0.13 * h))]
+    rows = [blob(MATTE, rng.uniform(0.3, 0.55), (x, 0.0, 0.935 * h), (0.2, 0.17, 0.13 * h))]
     if rng.random() < 0.2:  # a hat or a hood
         rows.append(blob(MATTE, _cloth(rng), (x - 0.02, 0.0, 0.95 * h), (0.27, 0.25, 0.1 * h)))
     return rows
@@ -33,20 +33,20 @@ def pedestrian(size: Vector, rng: np.random.Generator) -> list[Row]:
         rows.append(rod(0.3, (0.12, 0.1, 0.55 * h), (0.02, 0.0, h - 0.05), 0.012))
         h *= 0.9
     cloth, trousers = _cloth(rng), _cloth(rng)
-    bulk = float(rng.uniform(0.85, 1.2)) * h / 1.75
+    bulk = rng.uniform(0.85, 1.2) * h / 1.75
     most = max(0.03, length / 2 - 0.16)
     # Measured: 0.54 of the length of real boxes holds returns, 0.34 if everybody stands.
-    stride = most * float(rng.uniform(0.55, 1.0)) if rng.random() < 0.75 else min(most, float(rng.uniform(0.0, 0.1)))
+    stride = most * rng.uniform(0.55, 1.0) if rng.random() < 0.75 else min(most, rng.uniform(0.0, 0.1))
     half = max(0.12, min(0.26 * bulk, width / 2 - 0.08))
     widest = max(half, width / 2 - 0.06)
     hip, shoulder = 0.51 * h, 0.82 * h
-    lean = float(rng.uniform(0.0, 0.08)) * (stride > 0.1)
-    apart = float(rng.uniform(0.06, 0.13))
+    lean = rng.uniform(0.0, 0.08) * (stride > 0.1)
+    apart = rng.uniform(0.06, 0.13)
     pose = str(rng.choice(["swing", "hang", "hips", "front", "phone", "pockets"], p=[0.4, 0.2, 0.08, 0.12, 0.1, 0.1]))
     skirt = rng.random() < 0.2
     for s in (-1.0, 1.0):
         foot = (s * stride, s * apart, 0.06)
-        bend = float(rng.uniform(0.02, 0.16)) * min(1.0, most / 0.2)
+        bend = rng.uniform(0.02, 0.16) * min(1.0, most / 0.2)
         knee = (min(s * stride * 0.5 + bend, length / 2 - 0.1), s * apart, 0.28 * h)
         rows.append(rod(cloth if skirt else trousers, (0.0, s * 0.09 * bulk, hip), knee, 0.085 * bulk))
         rows.append(rod(trousers, knee, foot, 0.06 * bulk))
@@ -61,23 +61,23 @@ def pedestrian(size: Vector, rng: np.random.Generator) -> list[Row]:
         elif pose == "pockets":
             elbow, hand = (-0.1, side, 0.64 * h), (0.08, s * 0.17, 0.51 * h)
         else:
-            swing = stride * float(rng.uniform(0.3, 0.9)) if pose == "swing" else 0.02
+            swing = stride * rng.uniform(0.3, 0.9) if pose == "swing" else 0.02
             hand = (max(-reach, min(reach, -s * swing)), s * min(widest, half + 0.05), 0.46 * h)
             elbow = (hand[0] * 0.4 - 0.04, s * min(widest, half + 0.03), 0.63 * h)
         rows.append(rod(cloth, (lean, s * half * 0.8, shoulder), elbow, 0.055 * bulk))
         rows.append(rod(cloth, elbow, hand, 0.045 * bulk))
         if rng.random() < 0.1 and not one and pose != "pockets":  # a bag
-            edge = (min(0.34, length - 0.1), 0.1, float(rng.uniform(0.2, 0.42)))
+            edge = (min(0.34, length - 0.1), 0.1, rng.uniform(0.2, 0.42))
             low = max(0.02, hand[2] - edge[2])
             x = max(edge[0] / 2 - length / 2, min(length / 2 - edge[0] / 2, hand[0]))
             rows.append(
                 block(MATTE, _cloth(rng), (x, s * min(abs(hand[1]), width / 2 - 0.06), low + edge[2] / 2), edge)
             )
-    girth, breadth = float(rng.uniform(0.2, 0.28)) * bulk, min(0.46 * bulk, 2 * half)
+    girth, breadth = rng.uniform(0.2, 0.28) * bulk, min(0.46 * bulk, 2 * half)
     rows.append(blob(MATTE, cloth, (lean / 2, 0.0, 0.66 * h), (girth * 1.15, breadth, 0.42 * h)))
     rows.append(block(MATTE, cloth, (lean / 2, 0, 0.66 * h), (girth, 0.85 * breadth, 0.34 * h), kind=CYLINDER))
     if skirt:  # or a coat
-        low = float(rng.uniform(0.2, 0.4)) * h
+        low = rng.uniform(0.2, 0.4) * h
         around = min(0.42 * bulk, length - 0.04, width - 0.04)
         rows.append(
             block(MATTE, cloth, (0, 0, (low + 0.56 * h) / 2), (around * 0.85, around, 0.56 * h - low), kind=CYLINDER)
@@ -102,16 +102,16 @@ def person_sitting(size: Vector, rng: np.random.Generator) -> list[Row]:
         elbow = (back + 0.06, s * half, 0.55 * h)
         rows.append(rod(cloth, (back, s * half * 0.8, 0.74 * h), elbow, 0.055))
         rows.append(rod(cloth, elbow, (knees * 0.6, s * 0.12, seat + 0.15), 0.045))
-    lean = float(rng.uniform(-0.04, 0.12))
+    lean = rng.uniform(-0.04, 0.12)
     rows.append(rod(cloth, (back, 0, seat), (back + lean, 0, 0.72 * h), 0.12))
     rows.append(blob(MATTE, cloth, (back + lean / 2, 0, 0.56 * h), (0.28, min(0.44, 2 * half), 0.52 * h)))
-    rows.append(blob(MATTE, float(rng.uniform(0.3, 0.55)), (back + lean + 0.03, 0, 0.9 * h), (0.2, 0.17, 0.19 * h)))
+    rows.append(blob(MATTE, rng.uniform(0.3, 0.55), (back + lean + 0.03, 0, 0.9 * h), (0.2, 0.17, 0.19 * h)))
     return rows
 
 
 def pram(rng: np.random.Generator) -> list[Row]:
     """Make a pram, a trolley or a walking frame, 0.9 m long."""
-    cover, high = _cloth(rng), float(rng.uniform(0.85, 1.05))
+    cover, high = _cloth(rng), rng.uniform(0.85, 1.05)
     rows = [block(MATTE, cover, (0, 0, 0.6), (0.7, 0.36, 0.35), taper=(0.2, 0.1, 0.1))]
     if rng.random() < 0.6:
         rows.append(blob(MATTE, cover, (0.12, 0, 0.82), (0.5, 0.38, 0.42)))
@@ -157,7 +157,7 @@ def cyclist(size: Vector, rng: np.random.Generator) -> list[Row]:
     """Make a rider on a bicycle or a moped: upright or bent, pedalling, or with a foot on the ground."""
     length, width, h = size
     cloth, trousers = _cloth(rng), _cloth(rng)
-    bulk = float(rng.uniform(0.9, 1.2))
+    bulk = rng.uniform(0.9, 1.2)
     half, widest = min(0.25 * bulk, width / 2 - 0.06), max(0.16, width / 2 - 0.07)
     moped = width > 0.52 and rng.random() < 0.12
     bent = float(rng.uniform(0.06, 0.16) if rng.random() < 0.6 else rng.uniform(0.16, 0.3))
@@ -166,10 +166,10 @@ def cyclist(size: Vector, rng: np.random.Generator) -> list[Row]:
     if moped:
         rows = motorcycle(length, width, 1.1, rng)
     else:
-        rows = bicycle(length, min(float(rng.uniform(0.2, 0.32)), width / 2 - 0.02), rng)
-    turn = float(rng.uniform(0.0, 2.0 * math.pi))
+        rows = bicycle(length, min(rng.uniform(0.2, 0.32), width / 2 - 0.02), rng)
+    turn = rng.uniform(0.0, 2.0 * math.pi)
     grounded = rng.random() < 0.12
-    knees = min(widest, float(rng.uniform(0.1, 0.2)))
+    knees = min(widest, rng.uniform(0.1, 0.2))
     for s in (-1.0, 1.0):
         pedal = (-0.06 * length + s * 0.16 * math.cos(turn), s * 0.12, 0.32 + s * 0.16 * math.sin(turn))
         if moped:
@@ -192,7 +192,5 @@ def cyclist(size: Vector, rng: np.random.Generator) -> list[Row]:
     head = min(0.93 * h, shoulder[2] + 0.11 * h)
     rows.append(blob(MATTE, 0.45, (shoulder[0] + 0.07, 0, head), (0.22, 0.18, 0.14 * h)))
     if rng.random() < 0.4:  # a helmet
-        rows.append(
-            blob(MATTE, float(rng.uniform(0.2, 0.6)), (shoulder[0] + 0.06, 0, head + 0.03), (0.28, 0.2, 0.1 * h))
-        )
+        rows.append(blob(MATTE, rng.uniform(0.2, 0.6), (shoulder[0] + 0.06, 0, head + 0.03), (0.28, 0.2, 0.1 * h)))
     return rows

@@ -54,16 +54,16 @@ def simulated_scan(
     elif boxes is None:
         scene = random_scene(seed)
         x = y = 0.0
-        yaw = float(rng.normal(0.0, 0.05))
+        yaw = rng.normal(0.0, 0.05)
         for _ in range(8):
-            place = float(rng.normal(0.0, 4.0)), float(rng.normal(0.0, 0.5))
+            place = rng.normal(0.0, 4.0), rng.normal(0.0, 0.5)
             if _is_free(scene, *place, yaw):
                 x, y = place
                 break
     else:
         scene, x, y, yaw = scene_from_boxes(boxes, seed), 0.0, 0.0, 0.0
     # Measured: the road is pitched by 0.4 and rolled by 0.75 degrees (medians) against the sensor.
-    pitch, roll = float(rng.normal(0.0, 0.006)), float(rng.normal(0.0, 0.013))
+    pitch, roll = rng.normal(0.0, 0.006), rng.normal(0.0, 0.013)
     pose = sensor_pose(scene, sensor, x, y, yaw=yaw, pitch=pitch, roll=roll)
     if mounting is not None:
         pose[:3, :3] = pose[:3, :3] @ mounting.rotation()

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import PointsError
-from ..types.choices import STATIC
+from ..types.choices import STATIC, VEHICLES
 from ..types.geometry import draw_footprints, wrapped
 from ..types.perception import Box
 from ..types.points import Labels, Points
@@ -22,24 +22,23 @@ from .raycast import (
     Rays,
     Receiver,
     Shapes,
+    columns_of,
     fill_bounds,
     fill_cast,
-    fill_column_counts,
-    fill_column_rows,
-    fill_drivable,
-    fill_placed,
+    fill_ground_kinds,
     fill_points,
     ground_at,
+    placed,
 )
 
 POINT_CLASSES = ("background", "car", "pedestrian", "cyclist")
 # Classes of what a street is made of; the background is what is none of the others, such as walls and fences.
 SCENE_CLASSES = (*POINT_CLASSES, *STATIC)
-TOP_VIEW_CLASSES = ("background", "drivable", "car", "van", "truck")
+TOP_VIEW_CLASSES = ("background", "drivable", *VEHICLES)
 _SECTORS = 1800  # of the shapes that rays of a pattern may hit
 # Point class of an object: PointSeg's car includes all vehicles. KITTI also labels sitting people. Trams and "misc"
 # objects (trailers, parked motorcycles) belong to no class: real labels ignore their points.
-POINT_CLASS_OF = {"car": 1, "van": 1, "truck": 1, "pedestrian": 2, "person_sitting": 2, "cyclist": 3}
+POINT_CLASS_OF = {**dict.fromkeys(VEHICLES, 1), "pedestrian": 2, "person_sitting": 2, "cyclist": 3}
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,6 +121,14 @@ class Scene:
         """Whether x, y [m], world frame, is on a road surface; parking bays are not."""
         return bool(ground_at(self.ground, float(x), float(y))[1] < 0.0)
 
+    def surface(self, xy: NDArray[np.float64]) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
+        """Kind of the ground (0 road, 1 bay or pavement, 2 grass) and remission at places (..., 2), world frame."""
+        kinds, remissions = np.empty(xy.shape[:-1], np.uint8), np.empty(xy.shape[:-1])
+        fill_ground_kinds(
+            self.ground, np.ascontiguousarray(xy).reshape(-1, 2), kinds.reshape(-1), remissions.reshape(-1)
+        )
+        return kinds, remissions
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SimulatedScan:
@@ -172,9 +179,11 @@ class SimulatedScan:
             surface. Below trams and ``"misc"`` objects is background.
         """
         view = TopViewGeometry() if geometry is None else geometry
-        x, y = view.cell_centers()
-        labels = np.zeros((view.height, view.width), dtype=np.uint8)
-        fill_drivable(self.scene.ground, self.T_world_sensor, x.ravel(), y.ravel(), labels)
+        (x, y), T = view.cell_centers(), self.T_world_sensor
+        # An approximate height of the ground; it matters only if the sensor is tilted.
+        xy = [T[i, 0] * x + T[i, 1] * y + T[i, 2] * -T[2, 3] + T[i, 3] for i in (0, 1)]
+        kinds, _ = self.scene.surface(np.stack(xy, axis=-1))
+        labels = (kinds == 0).astype(np.uint8)
         others = [replace(box, label="background") for box in self.boxes if box.label in ("tram", "misc")]
         draw_footprints(labels, [*others, *self.boxes], view, TOP_VIEW_CLASSES)
         return labels
@@ -327,19 +336,14 @@ def place_shapes(scene: Scene, T_world_sensor: NDArray[np.float64], n_columns: i
     n_columns : number of sectors of a turn, counter-clockwise from +x.
     The last column of the returned primitives is their row of ``scene.primitives``.
     """
-    primitives = np.empty_like(scene.primitives)
     poses = np.array([(*o.center[:2], o.center[2] - o.size[2] / 2.0, o.yaw) for o in scene.objects]).reshape(-1, 4)
-    fill_placed(scene.primitives, poses, T_world_sensor, primitives)
+    primitives = placed(scene.primitives, poses, T_world_sensor)
     bounds = np.empty((len(primitives), 5))
     fill_bounds(primitives, bounds)
     near_first = np.argsort(bounds[:, 4], kind="stable")
     primitives, bounds = np.ascontiguousarray(primitives[near_first]), np.ascontiguousarray(bounds[near_first])
     primitives[:, 19] = near_first
-    starts = np.zeros(n_columns + 1, dtype=np.int64)
-    fill_column_counts(bounds, n_columns, reach_m, starts)
-    rows = np.empty(starts[-1], dtype=np.int32)
-    fill_column_rows(bounds, n_columns, reach_m, starts, rows)
-    return Shapes(primitives, bounds, starts, rows)
+    return Shapes(primitives, bounds, *columns_of(bounds, n_columns, reach_m))
 
 
 def simulate_sequence(

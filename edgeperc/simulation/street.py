@@ -8,44 +8,11 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from ..types.choices import VEHICLES
 from ..types.geometry import wrapped
+from . import raycast
 from .people import cyclist, pedestrian, person_sitting
-from .raycast import (
-    ASPHALT,
-    BANK_RISE,
-    BANK_RISE_LEFT,
-    BANK_SLOPE,
-    BANK_SLOPE_LEFT,
-    BAY,
-    CROWN,
-    DITCH,
-    DROPPED,
-    GRASS,
-    KERB,
-    LANE,
-    LIP,
-    MARKING,
-    PAVEMENT,
-    PAVING,
-    RETRO,
-    ROUGH,
-    ROUNDING,
-    ROW,
-    SLOPE_X,
-    SLOPE_Y,
-    STRIP,
-    TERRAIN,
-    TILE,
-    WAVE_X,
-    WAVE_X_0,
-    WAVE_X_K,
-    WAVE_Y,
-    WAVE_Y_0,
-    WAVE_Y_K,
-    WEAR,
-    Ground,
-    ground_at,
-)
+from .raycast import Ground, ground_at
 from .scene import Scene, SceneObject
 from .shapes import Row, Vector
 from .vehicles import bus, car, misc, truck, van
@@ -96,7 +63,7 @@ class Street:
 
     def __init__(self, rng: np.random.Generator, strips: list[Row], terrain: NDArray[np.float64]) -> None:
         self.rng = rng
-        self.strips = np.array(strips, dtype=np.float64).reshape(-1, STRIP)
+        self.strips = np.array(strips, dtype=np.float64).reshape(-1, raycast.STRIP)
         self.terrain = terrain
         self.tile = _noise_tile(rng)
         self.objects: list[SceneObject] = []
@@ -105,7 +72,7 @@ class Street:
 
     def scene(self) -> Scene:
         """Return the finished scene."""
-        rows = np.array(self.rows, dtype=np.float64).reshape(-1, ROW)
+        rows = np.array(self.rows, dtype=np.float64).reshape(-1, raycast.ROW)
         return Scene(tuple(self.objects), rows, self.strips, self.terrain, self.tile)
 
     def ground(self, x: float, y: float) -> tuple[float, float]:
@@ -221,7 +188,7 @@ class Street:
             axes = []
             for i in (7, 10, 13):
                 axes += [cos * row[i] - sin * row[i + 1], sin * row[i] + cos * row[i + 1], row[i + 2]]
-            mine = _SIGN if of == "Pole" and row[1] == RETRO else number
+            mine = _SIGN if of == "Pole" and row[1] == raycast.RETRO else number
             where = (x + cos * cx - sin * cy, y + sin * cx + cos * cy, z + cz)
             self.rows.append((*row[:4], *where, *axes, *row[16:19], mine))
         return True
@@ -229,9 +196,9 @@ class Street:
 
 def _noise_tile(rng: np.random.Generator) -> NDArray[np.float64]:
     # Three periodic octaves: full, half and eighth resolution.
-    tile = rng.uniform(-1.0, 1.0, (TILE, TILE))
+    tile = rng.uniform(-1.0, 1.0, (raycast.TILE, raycast.TILE))
     for scale in (2, 8):
-        coarse = rng.uniform(-1.0, 1.0, (TILE // scale, TILE // scale))
+        coarse = rng.uniform(-1.0, 1.0, (raycast.TILE // scale, raycast.TILE // scale))
         smooth = np.repeat(np.repeat(coarse, scale, axis=0), scale, axis=1)
         for axis in (0, 1):
             smooth = sum((np.roll(smooth, k, axis) for k in range(scale)), np.zeros_like(smooth)) / scale
@@ -241,37 +208,40 @@ def _noise_tile(rng: np.random.Generator) -> NDArray[np.float64]:
 
 def random_terrain(rng: np.random.Generator, environment: str) -> NDArray[np.float64]:
     """Draw the terrain of an environment: slopes, waves, kerbs, banks, remissions."""
-    terrain = np.zeros(TERRAIN)
+    terrain = np.zeros(raycast.TERRAIN)
     open_land = environment in ("rural", "highway")
-    terrain[[SLOPE_X, SLOPE_Y]] = rng.normal(0.0, 0.005, 2)
+    terrain[[raycast.SLOPE_X, raycast.SLOPE_Y]] = rng.normal(0.0, 0.005, 2)
     # Measured: the road 22 to 45 m ahead is 0.08 m (median) and 0.24 m (90 %) off the plane of the road nearby. Most
     # waves have a crest or a trough at the origin, because the vehicle stands level on the road.
     high = 0.6 if open_land else 0.45
-    terrain[[WAVE_X, WAVE_Y]] = rng.uniform(0.0, high), rng.uniform(0.0, high / 2)
-    terrain[[WAVE_X_K, WAVE_Y_K]] = 2.0 * math.pi / rng.uniform(60.0, 130.0, 2)
-    terrain[[WAVE_X_0, WAVE_Y_0]] = (rng.choice([-0.5, 0.5], 2) + rng.normal(0.0, 0.08, 2)) * math.pi
-    terrain[CROWN] = rng.uniform(0.0, 0.035)
-    terrain[KERB] = 0.0 if open_land else rng.choice([0.03, 0.08, 0.12, 0.15, 0.18], p=[0.15, 0.2, 0.3, 0.25, 0.1])
-    terrain[PAVEMENT] = rng.uniform(0.0, 0.7) if open_land else rng.uniform(1.2, 4.5)
+    terrain[[raycast.WAVE_X, raycast.WAVE_Y]] = rng.uniform(0.0, high), rng.uniform(0.0, high / 2)
+    terrain[[raycast.WAVE_X_K, raycast.WAVE_Y_K]] = 2.0 * math.pi / rng.uniform(60.0, 130.0, 2)
+    terrain[[raycast.WAVE_X_0, raycast.WAVE_Y_0]] = (rng.choice([-0.5, 0.5], 2) + rng.normal(0.0, 0.08, 2)) * math.pi
+    terrain[raycast.CROWN] = rng.uniform(0.0, 0.035)
+    if not open_land:
+        terrain[raycast.KERB] = rng.choice([0.03, 0.08, 0.12, 0.15, 0.18], p=[0.15, 0.2, 0.3, 0.25, 0.1])
+    terrain[raycast.PAVEMENT] = rng.uniform(0.0, 0.7) if open_land else rng.uniform(1.2, 4.5)
     # Measured: the ground 9 to 13 m beside the road is 0.25 m (median) and 1.0 m (90 %) above or below its plane.
-    for slope, rise in ((BANK_SLOPE, BANK_RISE), (BANK_SLOPE_LEFT, BANK_RISE_LEFT)):
+    for slope, rise in ((raycast.BANK_SLOPE, raycast.BANK_RISE), (raycast.BANK_SLOPE_LEFT, raycast.BANK_RISE_LEFT)):
         steep = rng.random() < (0.4 if open_land else 0.25)
         terrain[slope] = rng.uniform(0.15, 0.7) if steep else abs(rng.normal(0.0, 0.1 if open_land else 0.05))
         terrain[rise] = rng.uniform(0.2, 2.2) * (1.0 if rng.random() < 0.75 else -0.6)
-    terrain[ROUGH] = rng.uniform(0.02, 0.2) if open_land else rng.choice([0.03, 0.06, 0.15]) * rng.uniform(0.3, 1.0)
-    terrain[DITCH] = rng.uniform(0.0, 0.5) if open_land and rng.random() < 0.5 else 0.0
-    terrain[ROUNDING] = rng.uniform(3.0, 9.0)
+    terrain[raycast.ROUGH] = (
+        rng.uniform(0.02, 0.2) if open_land else rng.choice([0.03, 0.06, 0.15]) * rng.uniform(0.3, 1.0)
+    )
+    terrain[raycast.DITCH] = rng.uniform(0.0, 0.5) if open_land and rng.random() < 0.5 else 0.0
+    terrain[raycast.ROUNDING] = rng.uniform(3.0, 9.0)
     # Measured: asphalt 0.2..0.3 by road, pavement and parking 0.30, grass 0.37.
-    terrain[ASPHALT] = rng.uniform(0.19, 0.33)
-    terrain[PAVING] = rng.uniform(0.24, 0.36)
-    terrain[GRASS] = rng.uniform(0.33, 0.45)
-    terrain[MARKING] = rng.uniform(0.35, 0.6) if rng.random() < (0.9 if open_land else 0.55) else 0.0
-    terrain[LANE] = 3.4
-    terrain[DROPPED] = rng.uniform(0.0, 23.0)
-    terrain[WEAR] = rng.uniform(0.1, 0.35)
+    terrain[raycast.ASPHALT] = rng.uniform(0.19, 0.33)
+    terrain[raycast.PAVING] = rng.uniform(0.24, 0.36)
+    terrain[raycast.GRASS] = rng.uniform(0.33, 0.45)
+    terrain[raycast.MARKING] = rng.uniform(0.35, 0.6) if rng.random() < (0.9 if open_land else 0.55) else 0.0
+    terrain[raycast.LANE] = 3.4
+    terrain[raycast.DROPPED] = rng.uniform(0.0, 23.0)
+    terrain[raycast.WEAR] = rng.uniform(0.1, 0.35)
     # Parking bays are paved like the pavement, or have the road's asphalt.
-    terrain[LIP] = rng.uniform(0.0, 0.04)
-    terrain[BAY] = terrain[PAVING if rng.random() < 0.5 else ASPHALT]
+    terrain[raycast.LIP] = rng.uniform(0.0, 0.04)
+    terrain[raycast.BAY] = terrain[raycast.PAVING if rng.random() < 0.5 else raycast.ASPHALT]
     return terrain
 
 
@@ -291,4 +261,4 @@ IN_BAYS = 0.75
 
 def any_vehicle(rng: np.random.Generator, trucks: float) -> str:
     """Draw a class of vehicle, with a given share of trucks."""
-    return str(rng.choice(["car", "van", "truck"], p=[0.84 - trucks, 0.16, trucks]))
+    return str(rng.choice(VEHICLES, p=[0.84 - trucks, 0.16, trucks]))

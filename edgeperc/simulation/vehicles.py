@@ -33,8 +33,8 @@ def _paint(rng: np.random.Generator, light_share: float) -> tuple[float, float]:
     """Draw remission and drop-out of car paint."""
     # Measured: mean remission of cars 0.01, 0.06, 0.11, 0.18, 0.27 (5, 25, 50, 75, 95 %), of vans 0.24 in the middle.
     if rng.random() < light_share:
-        return float(rng.uniform(0.35, 0.6)), float(rng.uniform(0.0, 0.2))
-    return float(rng.uniform(0.0, 0.22)), float(rng.uniform(0.1, 0.75))
+        return rng.uniform(0.35, 0.6), rng.uniform(0.0, 0.2)
+    return rng.uniform(0.0, 0.22), rng.uniform(0.1, 0.75)
 
 
 def car(size: Vector, rng: np.random.Generator) -> list[Row]:
@@ -54,6 +54,8 @@ def car(size: Vector, rng: np.random.Generator) -> list[Row]:
     middle = (nose + tail) / 2.0
     roof = height - 0.07
     rise = roof - belt
+    # The roof lies on the glass; the pillars are inside its edges.
+    front, rear = half * (1 - screen * rise / half * 1.6), half * (1 - back * rise / half * 1.6)
     rows = [
         block(PAINT, paint, (0, 0, (clearance + hood) / 2), (length, width, hood - clearance), density=lost,
                taper=(0.05, 0.04, 0.05)),
@@ -61,14 +63,9 @@ def car(size: Vector, rng: np.random.Generator) -> list[Row]:
                (nose + length / 2 - 0.08, width * 0.97, belt - hood), density=lost, taper=(0.1, 0.02, 0.02)),
         block(GLASS, 0.03, (middle, 0, (belt + roof) / 2), (2 * half, width * 0.93, rise),
                density=rng.uniform(0.5, 0.97), taper=(screen * rise / half * 1.6, back * rise / half * 1.6, sides)),
-        block(PAINT, paint, (0, 0, 0), (1, 1, 1), density=lost),
+        block(PAINT, paint, (middle + (front - rear) / 2, 0, (roof + height) / 2),
+               (front + rear, width * 0.93 * (1 - sides), height - roof), density=lost, taper=(0.15, 0.1, 0.15)),
     ]  # fmt: skip
-    # The roof lies on the glass; the pillars are inside its edges.
-    front, rear = half * (1 - screen * rise / half * 1.6), half * (1 - back * rise / half * 1.6)
-    rows[3] = block(
-        PAINT, paint, (middle + (front - rear) / 2, 0, (roof + height) / 2),
-        (front + rear, width * 0.93 * (1 - sides), height - roof), density=lost, taper=(0.15, 0.1, 0.15),
-    )  # fmt: skip
     for x_low, x_high in (
         (middle + half, middle + front),
         (middle - half, middle - rear),
@@ -129,7 +126,7 @@ def truck(size: Vector, rng: np.random.Generator) -> list[Row]:
         return bus(size, rng)
     length, width, height = size[0] - 0.04, size[1] - 0.04, size[2]
     paint, lost = _paint(rng, 0.6)
-    cargo = float(rng.uniform(0.15, 0.6))
+    cargo = rng.uniform(0.15, 0.6)
     cab = min(2.3, 0.35 * length)
     cab_height = min(height, 0.75 * height + 0.5)
     front = length / 2
@@ -160,8 +157,8 @@ def bus(size: Vector, rng: np.random.Generator) -> list[Row]:
     """Make a bus or a tram: a long hull with a band of windows."""
     length, width, height = size[0] - 0.04, size[1] - 0.04, size[2]
     paint, lost = _paint(rng, 0.6)
-    clearance = float(rng.uniform(0.2, 0.35))
-    sill, lintel = float(rng.uniform(0.9, 1.2)), height - float(rng.uniform(0.4, 0.7))
+    clearance = rng.uniform(0.2, 0.35)
+    sill, lintel = rng.uniform(0.9, 1.2), height - rng.uniform(0.4, 0.7)
     rows = [
         block(PAINT, paint, (0, 0, (clearance + sill) / 2), (length, width, sill - clearance), density=lost),
         block(GLASS, 0.03, (0, 0, (sill + lintel) / 2), (length * 0.99, width * 0.98, lintel - sill),

@@ -54,8 +54,7 @@ def cloud(
     points: Points, center_m: tuple[float, float, float], radius_m: float, per_m: float, *, seed: int = 0
 ) -> Scan:
     """A ball of dust, spray or exhaust: a beam through it returns from inside with this probability a meter."""
-    rng, ranges = np.random.default_rng(seed), np.linalg.norm(points[:, :3].astype(np.float64), axis=1)
-    rays = points[:, :3] / np.maximum(ranges, 1e-9)[:, None]
+    rng, ranges, rays = _beams(points, seed)
     along = rays @ np.array(center_m)
     half = np.sqrt(np.maximum(radius_m**2 - (np.dot(center_m, center_m) - along**2), 0.0))
     first = np.maximum(along - half, 0.5)
@@ -65,7 +64,7 @@ def cloud(
 
 def fog(points: Points, visibility_m: float, *, max_range_m: float = 120.0, seed: int = 0) -> Scan:
     """Fog by its visibility (meteorological optical range): attenuated returns, and those of the fog itself."""
-    rng, ranges = np.random.default_rng(seed), np.linalg.norm(points[:, :3].astype(np.float64), axis=1)
+    rng, ranges, rays = _beams(points, seed)
     per_m, backscatter = math.log(20.0) / visibility_m, 0.046 / visibility_m
     reach, time = np.arange(0.5, 30.0, 0.1), np.linspace(0.0, 2.0 * _PULSE_S, 161)
     from_m = np.maximum(reach[:, None] - 0.5 * _LIGHT_M_PER_S * time, 1e-3)
@@ -79,11 +78,15 @@ def fog(points: Points, visibility_m: float, *, max_range_m: float = 120.0, seed
     is_soft = (soft > hard) & (ranges > at)
     scattered = at * rng.uniform(0.5, 1.5, len(points))
     is_lost = hard / np.maximum(ranges, 1e-9) ** 2 < LEAST_REMISSION / max_range_m**2
-    foggy = _with_drops(
-        points, points[:, :3] / np.maximum(ranges, 1e-9)[:, None], ranges, _or_never(is_soft, scattered)
-    )
+    foggy = _with_drops(points, rays, ranges, np.where(is_soft, scattered, np.inf))
     foggy[:, 3] = np.where(is_soft, np.minimum(soft, 1.0), points[:, 3] * np.exp(-2.0 * per_m * ranges))
     return foggy[is_soft | ~is_lost]
+
+
+def _beams(points: Points, seed: int) -> tuple[np.random.Generator, NDArray[np.float64], NDArray[np.float64]]:
+    """Random numbers, the ranges of the returns (n,), and the directions of their beams (n, 3)."""
+    ranges = np.linalg.norm(points[:, :3].astype(np.float64), axis=1)
+    return np.random.default_rng(seed), ranges, points[:, :3] / np.maximum(ranges, 1e-9)[:, None]
 
 
 def _fallen(points: Points, sizes: tuple[float, float, float], max_range_m: float, seed: int) -> Scan:
@@ -93,19 +96,17 @@ def _fallen(points: Points, sizes: tuple[float, float, float], max_range_m: floa
         attenuation [1/m].
     """
     n0, slope, per_m = sizes
-    rng, ranges = np.random.default_rng(seed), np.linalg.norm(points[:, :3].astype(np.float64), axis=1)
+    rng, ranges, rays = _beams(points, seed)
     least = LEAST_REMISSION / max_range_m**2
     reach = np.arange(0.5, 40.0, 0.05)
     width_mm = 1e3 * DIVERGENCE_RAD * reach
-    seen_mm = (
-        width_mm * reach * np.sqrt(LEAST_OF_DROP / max_range_m**2 / DROP_REMISSION) * np.exp(per_m * reach)
-    )  # the smallest that is
-    seen_mm = np.where(seen_mm <= width_mm, seen_mm, np.inf)  # a larger one returns no more than all of the beam
+    # The smallest that is seen; one larger than the beam returns no more than all of it.
+    seen_mm = width_mm * reach * np.sqrt(LEAST_OF_DROP / max_range_m**2 / DROP_REMISSION) * np.exp(per_m * reach)
+    seen_mm = np.where(seen_mm <= width_mm, seen_mm, np.inf)
     per_beam = n0 / slope * np.exp(-slope * seen_mm) * math.pi / 4.0 * (1e-3 * width_mm) ** 2
     expected = np.cumsum(per_beam) * 0.05
     at = np.interp(rng.exponential(1.0, len(points)), expected, reach, right=np.inf)
     power = np.maximum(points[:, 3], LEAST_REMISSION) * np.exp(-2.0 * per_m * ranges) / np.maximum(ranges, 1e-9) ** 2
-    rays = points[:, :3] / np.maximum(ranges, 1e-9)[:, None]
     wet = _with_drops(points, rays, ranges, at)
     return wet[(at < ranges) | (power >= least)]
 
@@ -119,7 +120,3 @@ def _with_drops(
     wet[nearer, :3] = (rays[nearer] * at[nearer, None]).astype(np.float32)
     wet[nearer, 3] = np.minimum(wet[nearer, 3], DROP_REMISSION)
     return wet
-
-
-def _or_never(chosen: NDArray[np.bool_], at: NDArray[np.float64]) -> NDArray[np.float64]:
-    return np.where(chosen, at, np.inf)

@@ -327,15 +327,7 @@ class McapSink:
         return _Channels(context)
 
     def write(self, scan: PerceivedScan) -> None:
-        """Write one scan.
-
-        Raises
-        ------
-        PointsError
-            The points are not those that were perceived, or the scan's time is out of the range of MCAP.
-        OSError
-            The file cannot be written.
-        """
+        """Write one scan. Raises PointsError for points that were not perceived or a time that MCAP lacks, OSError."""
         if self._channels is None:
             self._channels = self._start()
         self._file.check()
@@ -401,12 +393,8 @@ class ServeSink:
         self._has_warned = False
 
     def write(self, scan: PerceivedScan) -> None:
-        """Send one scan to all viewers that are connected, without waiting for them.
-
-        Raises
-        ------
-        PointsError
-            The points are not those that were perceived, or the scan's time is negative or not finite.
+        """Send one scan to all viewers that are connected, without waiting for them. Raises PointsError for points that
+        were not perceived, and for a time that is negative or not finite.
         """
         self._channels.write(scan)
         if self._relay.n_refused and not self._has_warned:

@@ -33,23 +33,11 @@ class PageSink:
         self._page = DrivePage(title=self._path.stem)
 
     def write(self, scan: PerceivedScan) -> None:
-        """Add one scan.
-
-        Raises
-        ------
-        PointsError
-            The points are not those that were perceived.
-        """
+        """Add one scan. Raises PointsError for points that were not perceived."""
         self._page.add(scan.perception, as_points(scan.points), scan.stamp_s, scan.tracks, name=scan.name)
 
     def close(self, whole: bool = True) -> None:
-        """Write the page; without scans, none is written. See `Sink.close`.
-
-        Raises
-        ------
-        OSError
-            The file cannot be written; nothing of it is left.
-        """
+        """Write the page; without scans, none is written. See `Sink.close`. After an OSError, nothing of it is left."""
         if len(self._page):
             try:
                 self._page.write(self._path if whole else part_of(self._path))

@@ -17,17 +17,17 @@ from ..camera.calibration import read_kitti_calibration
 from ..errors import OptionError
 from ..records import PerceivedScan
 from ..system.atomic import part_of, write_atomic
+from ..types.choices import VEHICLES
 from ..types.geometry import wrapped
 from ..types.perception import Box
-from .names import ScanFiles, stem_of
-from .run_file import RunFile, warn_of
+from .run_file import RunFile, ScanFiles, stem_of, warn_of
 
 __all__ = ["KINDS", "PrelabelSink", "cvat_cuboid"]
 
 KINDS = ("labelcloud", "cvat", "kitti", "sustechpoints")
 """The tools and formats."""
 
-_CLASSES = ("car", "van", "truck", "pedestrian", "cyclist")
+_CLASSES = (*VEHICLES, "pedestrian", "cyclist")
 _COLORS = ("#4363d8", "#42d4f4", "#f58231", "#e6194b", "#3cb44b", "#911eb4", "#f032e6", "#bfef45", "#9a6324", "#808000")
 _SUSTECH_CLASSES = {"cyclist": "BicycleRider"}  # the others have their own names, with a capital
 
@@ -99,17 +99,7 @@ class PrelabelSink:
             self._document.write(b'{"info": {}, "items": [')
 
     def write(self, scan: PerceivedScan) -> None:
-        """Write the labels of one scan.
-
-        Raises
-        ------
-        OptionError
-            Another scan of the run has this name.
-        CalibrationError
-            The calibration of the scan is malformed.
-        OSError
-            The file cannot be written, or the calibration cannot be read.
-        """
+        """Write the labels of one scan. Raises OptionError if another one has its name, CalibrationError, OSError."""
         boxes: list[Named] = [(box, None) for box in scan.perception.boxes]
         if scan.tracked is not None:
             boxes = [(track.box, track.id) for track in scan.tracked if not track.coasting]

@@ -2,63 +2,43 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
-import selectors
 import socket
 import threading
 import time
-from dataclasses import dataclass, field
 
 MAX_VIEWERS = 8
 _CHUNK = 2**18
 _BUFFER = 2**20  # of the kernel, for each socket
 MAX_RECEIVED = 4 * 2**20  # a viewer sends names of topics and answers to pings
 GREETING_S = 10.0  # until the server has answered the handshake
-STALLED_S = 30.0  # without reading what waits
-TICK_S = 0.5
+STALLED_S = 30.0  # without taking the chunk that waits
 _FULL = (
     b"HTTP/1.1 503 Service Unavailable\r\nContent-Type: text/plain\r\nConnection: close\r\n\r\n"
     b"as many viewers as edgeperc serves are connected\n"
 )
 
 
-@dataclass(eq=False)
-class _Viewer:
-    """A connection: the viewer's socket, that to the server, and what waits for each."""
-
-    client: socket.socket
-    server: socket.socket
-    since_s: float = field(default_factory=time.monotonic)  # of the connection, then of the last bytes that it took
-    to_client: memoryview = field(default_factory=lambda: memoryview(b""))
-    to_server: memoryview = field(default_factory=lambda: memoryview(b""))
-    n_received: int = 0
-    is_greeted: bool = False
-    is_ended: bool = False  # by the server
-
-
 class Relay:
     """Passes bytes between at most `MAX_VIEWERS` viewers and a server on 127.0.0.1, in one thread, reading only what a
-    viewer takes. One ends that greets nobody in 10 s, takes nothing for 30 s or sends over 4 MB.
+    viewer takes. One ends that greets nobody in 10 s, does not take 256 kB in 30 s or sends over 4 MB.
     """
 
     def __init__(self, listener: socket.socket, port: int) -> None:
         self.n_refused = 0
+        self.viewers: dict[asyncio.Task[None], bool] = {}  # whether the server has greeted each
         self._listener, self._port = listener, port
-        self.viewers: list[_Viewer] = []
-        self._wake, self._woken = socket.socketpair()
-        self._ending_s: float | None = None
-        self._selector = selectors.DefaultSelector()
-        for each in (listener, self._woken):
-            each.setblocking(False)
-            self._selector.register(each, selectors.EVENT_READ)
+        listener.setblocking(False)
+        self._loop, self._ending = asyncio.SelectorEventLoop(), asyncio.Event()
+        self._loop.add_reader(listener, self._accept)
         self._thread = threading.Thread(target=self._run, name="edgeperc viewers", daemon=True)
         self._thread.start()
 
     def end(self, grace_s: float) -> None:
         """Accept nobody any more, and end all connections after so many seconds; returns immediately."""
-        self._ending_s = time.monotonic() + grace_s
-        with contextlib.suppress(OSError):
-            self._wake.send(b"x")
+        with contextlib.suppress(RuntimeError):  # it has ended
+            self._loop.call_soon_threadsafe(self._end, grace_s)
 
     def close(self) -> None:
         """End all connections."""
@@ -67,30 +47,21 @@ class Relay:
 
     def _run(self) -> None:
         try:
-            while self._ending_s is None or (self.viewers and time.monotonic() < self._ending_s):
-                for key, events in self._selector.select(TICK_S if self._ending_s is None else 0.05):
-                    if key.fileobj is self._listener:
-                        self._accept()
-                    elif key.fileobj is self._woken:
-                        self._woken.recv(16)
-                        self._stop_listening()
-                    elif key.data in self.viewers:
-                        self._pass(key.data, key.fileobj, events)
-                self._drop_silent()
+            self._loop.run_until_complete(self._until_ended())
         finally:
-            for viewer in [*self.viewers]:
-                self._drop(viewer)
-            self._stop_listening()
-            self._selector.close()
-            self._wake.close()
-            self._woken.close()
+            self._loop.close()
 
-    def _stop_listening(self) -> None:
-        if self._listener.fileno() >= 0:
-            self._selector.unregister(self._listener)
-            self._listener.close()
-        for viewer in [viewer for viewer in self.viewers if not viewer.is_greeted]:
-            self._drop(viewer)
+    async def _until_ended(self) -> None:
+        await self._ending.wait()
+        while self.viewers:
+            await asyncio.wait([*self.viewers])
+
+    def _end(self, grace_s: float) -> None:
+        self._ending.set()
+        self._loop.remove_reader(self._listener)
+        self._listener.close()
+        for viewer, is_greeted in self.viewers.items():
+            self._loop.call_later(grace_s if is_greeted else 0.0, viewer.cancel)
 
     def _accept(self) -> None:
         try:
@@ -99,82 +70,49 @@ class Relay:
             time.sleep(0.02)
             return
         client.setblocking(False)
-        try:
-            if len(self.viewers) >= MAX_VIEWERS:
-                self.n_refused += 1
+        if len(self.viewers) >= MAX_VIEWERS:
+            self.n_refused += 1
+            with client, contextlib.suppress(OSError):
                 client.send(_FULL)
                 client.shutdown(socket.SHUT_WR)
-                client.close()
-                return
+            return
+        viewer = self._loop.create_task(self._serve(client))
+        self.viewers[viewer] = False
+        viewer.add_done_callback(lambda _: client.close())
+        viewer.add_done_callback(self.viewers.pop)
+
+    async def _serve(self, client: socket.socket) -> None:
+        """Pass on what the viewer and the server send, until one of them ends."""
+        viewer = asyncio.current_task()
+        assert viewer is not None
+        with socket.socket() as server, contextlib.suppress(OSError):
             client.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _BUFFER)
             client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            server = socket.socket()
             server.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER)
-            server.settimeout(1.0)
-            server.connect(("127.0.0.1", self._port))
             server.setblocking(False)
-        except OSError:
-            client.close()
-            return
-        self.viewers.append(viewer := _Viewer(client, server))
-        self._watch(viewer)
+            await self._loop.sock_connect(server, ("127.0.0.1", self._port))
+            both = self._up(client, server), self._down(server, client, viewer)
+            ways = [self._loop.create_task(way) for way in both]
+            try:
+                await asyncio.wait(ways, return_when=asyncio.FIRST_COMPLETED)
+            finally:
+                for way in ways:
+                    way.cancel()
+                await asyncio.gather(*ways, return_exceptions=True)
 
-    def _watch(self, viewer: _Viewer) -> None:
-        """Wait for what can go on: a side is read when the other one has taken all."""
-        read, write = selectors.EVENT_READ, selectors.EVENT_WRITE
-        sides = (
-            (viewer.client, (not viewer.to_server) * read | bool(viewer.to_client) * write),
-            (viewer.server, (not viewer.to_client and not viewer.is_ended) * read | bool(viewer.to_server) * write),
-        )
-        for side, events in sides:
-            known = side in self._selector.get_map()
-            if not events and known:
-                self._selector.unregister(side)
-            elif events and not known:
-                self._selector.register(side, events, viewer)
-            elif events and self._selector.get_key(side).events != events:
-                self._selector.modify(side, events, viewer)
+    async def _up(self, client: socket.socket, server: socket.socket) -> None:
+        n_received = 0
+        while data := await self._loop.sock_recv(client, _CHUNK):
+            n_received += len(data)
+            if n_received > MAX_RECEIVED:
+                return
+            await self._loop.sock_sendall(server, data)
 
-    def _pass(self, viewer: _Viewer, side: object, events: int) -> None:
-        is_client = side is viewer.client
-        try:
-            if events & selectors.EVENT_WRITE:
-                if is_client:
-                    viewer.to_client = viewer.to_client[viewer.client.send(viewer.to_client) :]
-                    viewer.since_s = time.monotonic()
-                else:
-                    viewer.to_server = viewer.to_server[viewer.server.send(viewer.to_server) :]
-            if events & selectors.EVENT_READ and is_client:
-                viewer.to_server = memoryview(viewer.client.recv(_CHUNK))
-                viewer.n_received += len(viewer.to_server)
-                if not viewer.to_server or viewer.n_received > MAX_RECEIVED:
-                    self._drop(viewer)
-                    return
-            elif events & selectors.EVENT_READ:
-                viewer.to_client = memoryview(viewer.server.recv(_CHUNK))
-                viewer.since_s = time.monotonic()
-                viewer.is_greeted = True
-                viewer.is_ended = not viewer.to_client
-        except (BlockingIOError, InterruptedError):
-            pass
-        except OSError:
-            self._drop(viewer)
-            return
-        if viewer.is_ended and not viewer.to_client:
-            self._drop(viewer)
-        else:
-            self._watch(viewer)
-
-    def _drop_silent(self) -> None:
-        now = time.monotonic()
-        for viewer in [*self.viewers]:
-            limit_s = STALLED_S if viewer.is_greeted else GREETING_S
-            if now - viewer.since_s > limit_s and (viewer.to_client or not viewer.is_greeted):
-                self._drop(viewer)
-
-    def _drop(self, viewer: _Viewer) -> None:
-        self.viewers.remove(viewer)
-        for side in (viewer.client, viewer.server):
-            if side in self._selector.get_map():
-                self._selector.unregister(side)
-            side.close()
+    async def _down(self, server: socket.socket, client: socket.socket, viewer: asyncio.Task[None]) -> None:
+        limit = self._loop.call_later(GREETING_S, viewer.cancel)
+        while data := await self._loop.sock_recv(server, _CHUNK):
+            self.viewers[viewer] = True
+            limit.cancel()
+            limit = self._loop.call_later(STALLED_S, viewer.cancel)
+            await self._loop.sock_sendall(client, data)
+            limit.cancel()

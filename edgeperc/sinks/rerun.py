@@ -99,15 +99,7 @@ class RerunSink:
         self._recording.log("world", self._rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
 
     def write(self, scan: PerceivedScan) -> None:
-        """Write one scan.
-
-        Raises
-        ------
-        PointsError
-            The points are not those that were perceived, or the scan's time is out of the range of the viewer.
-        OSError
-            The file cannot be written.
-        """
+        """Write one scan. Raises PointsError for other points than perceived or a time that viewers lack, OSError."""
         points, labels, classes, colors = colored_points(scan)
         stamp_ns = nanoseconds(scan)
         if self._recording is None:

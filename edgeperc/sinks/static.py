@@ -13,7 +13,7 @@ from ..records import PerceivedScan
 from ..system.atomic import write_atomic
 from ..tracking.moving import movable_points, moving_points
 from ..types.points import Mask, Points, as_points
-from .names import ScanFiles, stem_of
+from .run_file import ScanFiles, stem_of
 
 __all__ = ["StaticSink"]
 
@@ -58,16 +58,8 @@ class StaticSink:
         self.n_points = self.n_removed = 0
 
     def write(self, scan: PerceivedScan) -> None:
-        """Write one scan.
-
-        Raises
-        ------
-        OptionError
-            There are no tracks, the file would replace the scan itself, or another scan of the run has its name.
-        PointsError
-            A ``.pcd.bin`` file holds another number of points than the scan.
-        OSError
-            The file cannot be written.
+        """Write one scan. Raises OptionError without tracks, and if the file would replace the scan or that of another;
+        PointsError if a ``.pcd.bin`` file holds another number of points than the scan; OSError.
         """
         points = as_points(scan.points)
         gone = np.zeros(len(points), np.bool_)

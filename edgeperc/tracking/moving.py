@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..errors import OptionError, PointsError
 from ..system.kernels import njit
+from ..types.choices import VEHICLES
 from ..types.perception import Box, Perception
 from ..types.points import Mask, Points, as_points, read_only
 from . import Track
@@ -17,7 +18,8 @@ from .tracks import PARAMETERS
 
 MOVABLE = frozenset(
     {
-        *("car", "van", "truck", "bus", "tram", "trailer", "vehicle", "motorcycle", "bicycle"),
+        *VEHICLES,
+        *("bus", "tram", "trailer", "vehicle", "motorcycle", "bicycle"),
         *("pedestrian", "person", "person_sitting", "cyclist", "bicyclist", "motorcyclist"),
     }
 )

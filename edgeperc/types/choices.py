@@ -23,5 +23,7 @@ RULES = (
     "stand",
     "support",
 )
+VEHICLES = ("car", "van", "truck")
+"""Classes of vehicles that models tell apart."""
 STATIC = ("road", "sidewalk", "terrain", "building", "vegetation", "pole")
 """Classes of points that are no objects, beside the background."""

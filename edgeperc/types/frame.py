@@ -87,6 +87,17 @@ def quaternion(R: NDArray[np.float64]) -> tuple[float, float, float, float]:
     return x, y, z, w
 
 
+def poses_of(positions: NDArray[np.float64], quaternions: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Matrices (n, 4, 4) of positions (n, 3) and unit quaternions x, y, z, w (n, 4)."""
+    x, y, z, w = quaternions.T
+    poses = np.zeros((len(positions), 4, 4))
+    poses[:, 0, :3] = np.column_stack([1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)])
+    poses[:, 1, :3] = np.column_stack([2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)])
+    poses[:, 2, :3] = np.column_stack([2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)])
+    poses[:, :3, 3], poses[:, 3, 3] = positions, 1.0
+    return poses
+
+
 def _moved_points(points: Points, R: NDArray[np.float64], t: NDArray[np.float64]) -> NDArray[np.float32]:
     moved = np.empty(points.shape, np.float32)
     fill_moved(read_only(points), R, t, moved)

@@ -18,7 +18,7 @@ from ..types.sensor import SensorProfile
 from .canvas import add_axes, as_png, height_of_legend, new_figure, write_heading
 from .colors import FAINT, INK, color_of, rgb
 from .content import check_points, drawable_boxes, drawable_points, perceived_image
-from .picture import write_frame
+from .picture import Place, write_frame
 
 # Sizes in pixels.
 _WIDTH, _MARGIN, _TOP, _GAP, _AXIS = 1600, 28, 128, 44, 62
@@ -86,7 +86,11 @@ def draw_painted(
     }
     figure = new_figure(_WIDTH, int(bottom) + 40 + height_of_legend(facts) + 68)
     colors = rgb([color_of(name) for name in labels.classes])
-    _draw_image(figure, (_MARGIN, _TOP, width, height), image, colors, labels.labels)
+    write_heading(figure, _MARGIN, _TOP - 20, "the camera", "a class for every pixel")
+    known = labels.labels < len(colors)
+    tint = np.where(known[..., None], colors[np.where(known, labels.labels, 0)], 0.5)
+    axes = add_axes(figure, _MARGIN, _TOP, width, height)
+    axes.imshow(0.5 * image / 255.0 + 0.5 * tint, aspect="auto", interpolation="antialiased")
     place = (_MARGIN, _TOP + height + _GAP, width, height)
     _draw_points(figure, place, image, points, calibration, colors, painted)
     left = _MARGIN + width + 34.0 + _AXIS
@@ -99,23 +103,9 @@ def draw_painted(
     return as_png(figure, path)
 
 
-def _draw_image(
-    figure: Any,
-    place: tuple[float, float, float, float],
-    image: NDArray[np.uint8],
-    colors: NDArray[np.float64],
-    labels: Labels,
-) -> None:
-    write_heading(figure, place[0], place[1] - 20, "the camera", "a class for every pixel")
-    known = labels < len(colors)
-    tint = np.where(known[..., None], colors[np.where(known, labels, 0)], 0.5)
-    axes = add_axes(figure, *place)
-    axes.imshow(0.5 * image / 255.0 + 0.5 * tint, aspect="auto", interpolation="antialiased")
-
-
 def _draw_points(
     figure: Any,
-    place: tuple[float, float, float, float],
+    place: Place,
     image: NDArray[np.uint8],
     points: Points,
     calibration: Calibration,
@@ -139,7 +129,7 @@ def _draw_points(
 
 def _draw_from_above(
     figure: Any,
-    room: tuple[float, float, float, float],
+    room: Place,
     points: Points,
     road: TopView,
     boxes: tuple[Box, ...],

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,6 +52,33 @@ _AXIS = 62
 _NEAR_M = 1.0
 _HALF_STRIP_M = 1.0
 _AROUND_M = (48.0, 36.0)  # ahead and behind, to each side
+
+Place = tuple[float, float, float, float]
+"""Left, top, width and height of a panel [px]."""
+
+
+class _Drawn(NamedTuple):
+    """What panels show, in the frame of the models."""
+
+    points: Points
+    names: list[str]  # of classes
+    painted: Labels  # the class to show for each point
+    top_view: TopView | None
+    road: RoadAhead | None
+    boxes: Sequence[Box]
+    ground: tuple[float, float, float]  # `ground_plane`
+
+    @property
+    def above_m(self) -> NDArray[np.float64]:
+        """Heights of the points above the ground."""
+        a, b, c = self.ground
+        x, y, z = self.points[:, :3].astype(np.float64).T
+        return z - (a + b * x + c * y)
+
+    @property
+    def colors(self) -> NDArray[np.float64]:
+        """Colors of the points' classes."""
+        return rgb([color_of(name) for name in self.names])[self.painted]
 
 
 def draw(perception: Perception, points: Points, path: str | Path | None = None, *, title: str = "") -> bytes:
@@ -105,13 +132,12 @@ def draw(perception: Perception, points: Points, path: str | Path | None = None,
     notes_top = legend_top + height_of_legend(facts) + 30
     figure = new_figure(_WIDTH, notes_top + 38 + 26 * len(warnings))
 
-    left = float(_MARGIN)
+    drawn, left = _Drawn(points, names, painted, top_view, road, boxes, ground), float(_MARGIN)
     if top_view is not None and road is not None:
-        width = _draw_top_view(figure, points, top_view, road, boxes, ground, names, painted)
-        left = _MARGIN + _AXIS + width + 34.0
+        left = _MARGIN + _AXIS + _draw_top_view(figure, drawn, top_view, road) + 34.0
     width = _WIDTH - _MARGIN - left
-    _draw_from_behind(figure, (left, _TOP, width, 520), points, names, painted, top_view, road, boxes, ground)
-    _draw_range_image(figure, (left, 700, width, _BOTTOM - 700), points, names, painted, turn_deg)
+    _draw_from_behind(figure, (left, _TOP, width, 520), drawn)
+    _draw_range_image(figure, (left, 700, width, _BOTTOM - 700), drawn, turn_deg)
 
     count = f"{perception.n_points:,} points"
     if perception.stage_ms:
@@ -208,22 +234,14 @@ def _strip(ahead: FreeAhead, x_near: float) -> tuple[str, NDArray[np.float64] | 
     )
 
 
-def _draw_top_view(
-    figure: Any,
-    points: Points,
-    top_view: TopView,
-    road: RoadAhead,
-    boxes: Sequence[Box],
-    ground: tuple[float, float, float],
-    names: list[str],
-    painted: Labels,
-) -> float:
+def _draw_top_view(figure: Any, drawn: _Drawn, top_view: TopView, road: RoadAhead) -> float:
     """Draw the panel from above; return its width [px]. Points of the surroundings have the color of their class."""
     from matplotlib.patches import Polygon, Rectangle
 
+    points, boxes = drawn.points, drawn.boxes
     (x_near, x_far), (y_right, y_left) = top_view.x_range_m, top_view.y_range_m
     low, high, right, left = min(-2.5, x_near - 2.5), x_far + 2.0, y_right - 4.0, y_left + 4.0
-    of_scene = np.array([name in STATIC for name in names])[painted]
+    of_scene = np.array([name in STATIC for name in drawn.names])[drawn.painted]
     if any(box.center[0] < low for box in boxes) or (points[of_scene, 0] < low).any():
         along, across = _AROUND_M
         low, high, right, left = min(low, -along), max(high, along), min(right, -across), max(left, across)
@@ -247,10 +265,8 @@ def _draw_top_view(
     x, y, z = points[:, :3].astype(np.float64).T
     inside = np.flatnonzero((x >= low) & (x <= high) & (y >= right) & (y <= left))
     inside = inside[np.argsort(z[inside], kind="stable")]
-    a, b, c = ground
-    above = z - (a + b * x + c * y)
-    shade = ramp(above[inside], -0.2, 2.5)
-    shade[of_scene[inside]] = rgb([color_of(name) for name in names])[painted[inside][of_scene[inside]]]
+    shade = ramp(drawn.above_m[inside], -0.2, 2.5)
+    shade[of_scene[inside]] = drawn.colors[inside][of_scene[inside]]
     axes.scatter(y[inside], x[inside], s=1.8, c=shade, alpha=0.8, linewidths=0, zorder=2)
     bounds = Rectangle((y_right, x_near), y_left - y_right, x_far - x_near, fill=False, edgecolor=FAINT, linestyle="--")
     axes.add_patch(bounds)
@@ -302,20 +318,14 @@ def _omitted(text: str, n_omitted: int) -> str:
     return f"{text}; {n_omitted} label{'s' * (n_omitted != 1)} omitted" if n_omitted else text
 
 
-def _draw_range_image(
-    figure: Any,
-    place: tuple[float, float, float, float],
-    points: Points,
-    names: list[str],
-    painted: Labels,
-    turn_deg: float,
-) -> None:
+def _draw_range_image(figure: Any, place: Place, drawn: _Drawn, turn_deg: float) -> None:
     """Draw a part of the turn as a range image. It is only a picture, not the projection of a network."""
     axes = add_axes(figure, *place)
     write_heading(
         figure, place[0], place[1] - 20, "as the sensor sees it", f"{_PARTS[turn_deg]}, a class for every point"
     )
-    x, y, z = points[:, :3].astype(np.float64).T
+    names, painted = drawn.names, drawn.painted
+    x, y, z = drawn.points[:, :3].astype(np.float64).T
     range_m = np.sqrt(x * x + y * y + z * z)
     azimuth = np.degrees(np.arctan2(y, x))
     half = turn_deg / 2.0
@@ -346,27 +356,18 @@ def _draw_range_image(
     shade = ramp(-np.log(np.maximum(range_m[behind], 1.0)), -math.log(70.0), -math.log(4.0))
     share = np.array([0.0 if k == 0 else 0.7 if name in ("drivable", *STATIC) else 1.0 for k, name in enumerate(names)])
     share = share[painted[behind]][:, None]
-    picture[hit] = (1.0 - share) * 0.72 * shade + share * rgb([color_of(name) for name in names])[painted[behind]]
+    picture[hit] = (1.0 - share) * 0.72 * shade + share * drawn.colors[behind]
     axes.imshow(picture, extent=(half, -half, 0.0, 1.0), aspect="auto", interpolation="nearest")
     outer, inner = (40, 20) if half == 45.0 else (150, 75)
     beside = [f"{outer}° left", f"{inner}° left", "straight ahead", f"{inner}° right", f"{outer}° right"]
     axes.set_xticks([outer, inner, 0, -inner, -outer], labels=beside)
 
 
-def _draw_from_behind(
-    figure: Any,
-    place: tuple[float, float, float, float],
-    points: Points,
-    names: list[str],
-    painted: Labels,
-    top_view: TopView | None,
-    road: RoadAhead | None,
-    boxes: Sequence[Box],
-    ground: tuple[float, float, float],
-) -> None:
+def _draw_from_behind(figure: Any, place: Place, drawn: _Drawn) -> None:
     from matplotlib.collections import LineCollection
     from matplotlib.patches import Polygon
 
+    points, names, painted, top_view, road, boxes, ground = drawn
     axes = add_axes(figure, *place)
     panel = axes.get_window_extent()
     tall = 0.27
@@ -395,10 +396,8 @@ def _draw_from_behind(
     order = np.flatnonzero(shown)
     order = order[np.argsort(-seen[order, 2], kind="stable")]
     depth = seen[order, 2]
-    colors = rgb([color_of(name) for name in names])[painted[order]]
-    plain = painted[order] == 0
-    x, y, z = points[order[plain], :3].astype(np.float64).T
-    colors[plain] = ramp(z - (a + b * x + c * y), -0.3, 3.0)
+    colors, plain = drawn.colors[order], painted[order] == 0
+    colors[plain] = ramp(drawn.above_m[order[plain]], -0.3, 3.0)
     if "drivable" in names:
         colors[painted[order] == names.index("drivable")] *= 1.35
     size = np.clip(32.0 / depth, 1.1, 3.6) ** 1.5 * np.where(plain, 0.85, 1.5)

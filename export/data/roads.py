@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from edgeperc.errors import EdgepercError, MissingExtraError
 from edgeperc.simulation.samples import IGNORE
+from edgeperc.types.choices import VEHICLES
 from edgeperc.types.views import TopViewGeometry
 
 from .scans import SURFACE
@@ -251,8 +252,7 @@ def write_coco(roads: Mapping[str, Sequence[Sequence[Sequence[float]]]], scans: 
     return json.dumps(content, indent=1) + "\n"
 
 
-CLASSES = ("background", "road", "car", "van", "truck")
-VEHICLES = CLASSES[2:]
+CLASSES = ("background", "road", *VEHICLES)
 
 # The view of section 3.1 and SSADNet 2.1.2; both ends of each range belong to it.
 X_RANGE_M, Y_RANGE_M, Z_RANGE_M, CELL_M = (6.0, 46.0), (-10.0, 10.0), (-2.5, 2.5), 0.1

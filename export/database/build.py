@@ -35,8 +35,9 @@ from edgeperc.evaluation.metrics import Confusion
 from edgeperc.system.atomic import write_atomic
 from edgeperc.system.pool import Lost
 from edgeperc.system.ray_cluster import ENGINES
+from edgeperc.types.choices import VEHICLES
 
-from ..data.roads import CLASSES, VEHICLES, VIEW, Z_RANGE_M, DatabaseError, read_coco
+from ..data.roads import CLASSES, VIEW, Z_RANGE_M, DatabaseError, read_coco
 from .files import FARTHEST_M, FORMAT, N_FOLDS
 from .scenes import FOLDERS, INDEX, ROAD_FOLDERS, ROAD_INDEX, TRAIN, TRAINED, Job, Plan, SceneBuilder, inputs_of
 

@@ -32,10 +32,11 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from edgeperc.system.names import check_file
+from edgeperc.types.choices import VEHICLES
 from edgeperc.types.geometry import draw_footprints, rectangles
 from edgeperc.types.perception import Box
 
-from ..data.roads import CELL_M, CLASSES, HEIGHT, VEHICLES, VIEW, WIDTH, X_RANGE_M, Y_RANGE_M, Z_RANGE_M, DatabaseError
+from ..data.roads import CELL_M, CLASSES, HEIGHT, VIEW, WIDTH, X_RANGE_M, Y_RANGE_M, Z_RANGE_M, DatabaseError
 
 FORMAT = 1
 N_FOLDS = 5

@@ -19,12 +19,13 @@ from edgeperc.datasets.kitti import KittiObjects, scan_hash
 from edgeperc.errors import CardMismatchError, EdgepercError
 from edgeperc.preprocess.condition import condition
 from edgeperc.system.atomic import write_atomic
+from edgeperc.types.choices import VEHICLES
 from edgeperc.types.mounting import MODEL_MOUNTING
 from edgeperc.types.sensor import get_sensor
 from edgeperc.types.views import TopViewGeometry
 from edgeperc.zoo import model_path
 
-from ..data.roads import CLASSES, HEIGHT, VEHICLES, VIEW, WIDTH, mask_of
+from ..data.roads import CLASSES, HEIGHT, VIEW, WIDTH, mask_of
 from .coco import varied
 from .files import FORMAT, picture, png, road_and_vehicles, vehicles, write_labels
 

@@ -21,15 +21,8 @@ from edgeperc.datasets.images import LabeledImages
 from edgeperc.datasets.kitti import KittiLabels, KittiObjects, SemanticKitti
 from edgeperc.errors import ModelError, PointsError
 from edgeperc.evaluation.judge import Judge, Perceiving
-from edgeperc.evaluation.kitti_ap import (
-    ApTable,
-    FrontTruth,
-    average_precisions,
-    best_candidates,
-    count_in_image,
-    image_size_of,
-)
-from edgeperc.evaluation.metrics import Confusion
+from edgeperc.evaluation.kitti_ap import FrontTruth, average_precisions, best_candidates, count_in_image, image_size_of
+from edgeperc.evaluation.metrics import Confusion, Listed
 from edgeperc.evaluation.tables import Record, figures
 from edgeperc.evaluation.truth import Truth
 from edgeperc.inference.session import Session
@@ -185,7 +178,7 @@ def _measure_objects(
         on_mismatch="ignore",
     )
     session = next(session for session in perceive.sessions if session.card.view.kind == "objects")
-    labels, overlaps, table = [], [], ApTable()
+    labels, overlaps, table = [], [], Listed()
     for name in _spread(objects.names(split), n_scans):
         frame = objects.frame(name)
         truth = FrontTruth(frame.labels or NO_LABELS, frame.calibration, image_size_of(frame.drive))
@@ -195,7 +188,7 @@ def _measure_objects(
         inputs, _, _ = candidate_inputs(session.card, frame.points)
         outputs = objects_of(session, inputs) if len(inputs) else inputs[:, 0]
         labels.append(outputs[:, : len(session.card.classes)].argmax(axis=1).astype(np.uint8))
-    aps = [average_precisions(table.counts["car", overlap, "moderate"])[2] for overlap in ("bird's eye 0.7", "3-D 0.7")]
+    aps = [average_precisions(table["car", overlap, "moderate"])[2] for overlap in ("bird's eye 0.7", "3-D 0.7")]
     return Measured(labels, float(np.mean(overlaps)), float(np.mean(aps)), _engine(session, precision))
 
 

@@ -32,6 +32,7 @@ from edgeperc.agreement.rules import (
 )
 from edgeperc.agreement.votes import (
     CLUSTER,
+    EVERYTHING,
     MAX_LENGTH_M,
     MAX_TOP_M,
     MIN_LARGE_SHARE,

@@ -19,9 +19,9 @@ from edgeperc.datasets.kitti import (
     KittiObjects,
     RoadFrame,
     SemanticKitti,
+    label_objects,
     layouts,
     read_labels,
-    read_objects,
 )
 from edgeperc.datasets.splits import FOLDS, TEST_DRIVES, VALIDATION_DRIVES, fold_of, in_split
 from edgeperc.errors import CalibrationError, OptionError, PointsError
@@ -52,7 +52,7 @@ def calibration(tmp_path: Path) -> KittiCalibration:
 def objects(tmp_path: Path, calibration: KittiCalibration, *lines: str) -> tuple[tuple[Box, ...], np.ndarray]:
     path = tmp_path / "label.txt"
     path.write_text("\n".join(lines) + "\n")
-    return read_objects(path, calibration)
+    return label_objects(read_labels(path), calibration)
 
 
 def test_a_box_comes_into_the_sensor_frame(tmp_path: Path, calibration: KittiCalibration) -> None:
@@ -311,7 +311,7 @@ def test_layouts_of_test_drives_are_left_out(data_root: Callable[[str], Path]) -
     first = next(iter(layouts(root)))
     name = kept[0].split(",")[0]
     calibration = KittiCalibration.read(root / "calib" / f"{name}.txt")
-    assert first == read_objects(root / "label_2" / f"{name}.txt", calibration)[0]
+    assert first == label_objects(read_labels(root / "label_2" / f"{name}.txt"), calibration)[0]
     assert sum(1 for _ in itertools.islice(layouts(root), 50)) == 50
 
 

@@ -10,7 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from edgeperc.evaluation.center_ap import CLASSES, CenterTable, center_scores, count_centers
+from edgeperc.evaluation.center_ap import CLASSES, center_scores, count_centers
+from edgeperc.evaluation.metrics import Listed
 from edgeperc.types.perception import Box
 from scenes import box
 from twins import center_ap as twin
@@ -18,8 +19,8 @@ from twins import center_ap as twin
 car = partial(box, size=(4.0, 2.0, 1.5))
 
 
-def table_of(*scans: tuple[list[Box], list[Box]], ignored: tuple[Box, ...] = ()) -> CenterTable:
-    table = CenterTable()
+def table_of(*scans: tuple[list[Box], list[Box]], ignored: tuple[Box, ...] = ()) -> Listed:
+    table = Listed()
     for k, (rights, guesses) in enumerate(scans):
         table += count_centers(guesses, rights, ignored, f"drive {k}")
     return table
@@ -45,14 +46,14 @@ def test_ignored_and_unknown_objects_excuse_a_detection_near_them() -> None:
     cars, few, unknown = [car(10.0)], car(20.0), car(30.0, label="ignore")
     guesses = [car(10.0), car(20.5), car(30.5), car(40.0)]
     table = table_of((cars, guesses), ignored=(few, unknown))
-    assert [hit for _, hit, *_ in table.guesses["car", 2.0]] == [True, False]
-    assert len(table.objects["car"]) == 1
+    assert [hit for _, hit, *_ in table["car", 2.0]] == [True, False]
+    assert len(table["car"]) == 1
 
 
 def test_objects_and_detections_beyond_the_range_of_the_class_do_not_count() -> None:
     table = table_of(([car(51.0), car(10.0)], [car(51.0), car(52.0)]))
-    assert len(table.objects["car"]) == 1
-    assert table.guesses["car", 4.0] == ()
+    assert len(table["car"]) == 1
+    assert table["car", 4.0] == ()
 
 
 def test_without_objects_there_are_no_scores_and_without_hits_errors_are_one() -> None:
@@ -87,6 +88,6 @@ def test_the_steps_of_nuscenes_give_the_same_numbers(given_scans: list[tuple[lis
         n += len(guesses)
     table = table_of(*apart)
     for label in ("car", "pedestrian"):
-        if table.objects[label]:
+        if table[label]:
             expected = twin.scores(apart, label, CLASSES[label])
             assert center_scores(table, label) == pytest.approx(expected, abs=1e-9)

@@ -11,7 +11,7 @@ import pytest
 
 from cli_helpers import run
 from edgeperc.errors import PointsError
-from edgeperc.evaluation.found import compare_beams, find_sensors
+from edgeperc.evaluation.transfer import compare_beams, find_sensors
 from edgeperc.types.sensor import SENSORS, SensorProfile, get_sensor
 from scenes import urban
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from edgeperc.datasets.kitti import KittiCalibration, KittiLabels
 from edgeperc.evaluation import kitti_ap
+from edgeperc.evaluation.metrics import Listed
 from edgeperc.types.perception import Box
 from twins import kitti_ap as twin
 
@@ -47,15 +48,15 @@ def labels(*rows: tuple[str, list[float]]) -> KittiLabels:
     return KittiLabels(tuple(kind for kind, _ in rows), np.array([n for _, n in rows], np.float64).reshape(-1, 14))
 
 
-def table_of(*scans: Scan) -> kitti_ap.ApTable:
-    table = kitti_ap.ApTable()
+def table_of(*scans: Scan) -> Listed:
+    table = Listed()
     for k, (of_scan, boxes) in enumerate(scans):
         table += kitti_ap.count_in_image(kitti_ap.FrontTruth(of_scan, CAMERA), boxes, f"drive {k}")
     return table
 
 
-def scores(table: kitti_ap.ApTable, label: str, overlap: str, level: str) -> tuple[float, float, float]:
-    return kitti_ap.average_precisions(table.counts[label, overlap, level])
+def scores(table: Listed, label: str, overlap: str, level: str) -> tuple[float, float, float]:
+    return kitti_ap.average_precisions(table[label, overlap, level])
 
 
 def street(n: int) -> list[Box]:
@@ -94,7 +95,7 @@ def test_neighbors_hidden_and_small_objects_count_neither_way() -> None:
     rows += [("car", label_row(hidden, occlusion=2)), ("car", label_row(cut, truncation=0.4)), ("car", label_row(far))]
     guesses = [replace(each, label="car", score=0.5) for each in (car, van, truck, hidden, cut, far)]
     table = table_of((labels(*rows), guesses))
-    counts = {level: table.counts["car", "3-D 0.7", level][0] for level in kitti_ap.LEVELS}
+    counts = {level: table["car", "3-D 0.7", level][0] for level in kitti_ap.LEVELS}
     assert {level: len(each.objects) for level, each in counts.items()} == {"easy": 1, "moderate": 1, "hard": 3}
     # The truck's detection is the only false positive; the far car is 18 px high.
     assert {level: each.steps for level, each in counts.items()} == {
@@ -109,20 +110,20 @@ def test_detections_outside_the_image_are_not_submitted() -> None:
     behind, beside = box("car", -15, 0, score=0.9), box("car", 5, 30, score=0.9)
     half = box("car", 12, 11.5, score=0.9)  # partly in the image
     table = table_of((labels(("car", label_row(car))), [car, behind, beside, half]))
-    assert table.counts["car", "bird's eye 0.7", "easy"][0].steps == ((1.0, 1, 0), (0.9, 0, 1))
+    assert table["car", "bird's eye 0.7", "easy"][0].steps == ((1.0, 1, 0), (0.9, 0, 1))
 
 
 def test_dont_care_regions_excuse_nothing_from_above() -> None:
     car, wrong = box("car", 15, 0), box("car", 20, 5)
     table = table_of((labels(("car", label_row(car)), ("dontcare", DONT_CARE)), [car, wrong]))
-    assert table.counts["car", "3-D 0.7", "hard"][0].steps == ((1.0, 1, 1),)
+    assert table["car", "3-D 0.7", "hard"][0].steps == ((1.0, 1, 1),)
 
 
 def test_ranges_count_objects_and_false_positives_in_them_alone() -> None:
     near, far = box("car", 10, 0), box("car", 14.9, 5)
     scan = labels(("car", label_row(near)), ("car", label_row(far)))  # the second at 15.7 m
     table = table_of((scan, [near, replace(far, center=(14.0, 5.0, -1.0)), box("car", 20, 0)]))
-    counts = {band: table.counts["car", "bird's eye 0.5", band][0] for band in ("0-15 m", "15-30 m")}
+    counts = {band: table["car", "bird's eye 0.5", band][0] for band in ("0-15 m", "15-30 m")}
     assert [len(each.objects) for each in counts.values()] == [1, 1]
     # The shifted detection of the far car lies nearer than 15 m, and is its hit all the same.
     assert [each.steps for each in counts.values()] == [((1.0, 1, 0),), ((1.0, 1, 1),)]
@@ -138,7 +139,7 @@ def test_all_round_boxes_of_unknown_objects_may_be_found_and_others_may_not() ->
     unknown = Box("ignore", 1.0, (0.0, 20.0, -1.0), SIZES["car"], 0.0)
     guesses = [replace(each, label="car", score=0.5) for each in (car, few, truck, unknown)]
     table = kitti_ap.count_all_round(guesses, [car, truck], [few, unknown], "a")
-    (counts,) = table.counts["car", "3-D 0.7", "all round"]
+    (counts,) = table["car", "3-D 0.7", "all round"]
     assert (len(counts.objects), counts.steps) == (1, ((0.5, 1, 1),))
 
 
@@ -205,7 +206,7 @@ def test_the_development_kit_step_by_step_gives_the_same_numbers(given_scans: li
         for metric in ("bird's eye", "3-D"):
             for least_iou in least_ious:
                 for level in kitti_ap.LEVELS:
-                    counts = table.counts[label, f"{metric} {least_iou:g}", level]
+                    counts = table[label, f"{metric} {least_iou:g}", level]
                     n_truth, r40, r11 = (
                         twin.eval_class(read, label, level, metric, least_iou)
                         if any(each.objects for each in counts)

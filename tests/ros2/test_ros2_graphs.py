@@ -28,12 +28,11 @@ from edgeperc import MissingExtraError, OptionError, Perceiver, Tracker
 from edgeperc.cli.main import main
 from edgeperc.records import PerceivedScan
 from edgeperc.road.grid import split_points
-from edgeperc.ros2.graph import RELIABLE, SENSOR_DATA
 from edgeperc.ros2.messages import CLOUD, DIAGNOSTICS, LIVE_OUTPUTS, OUTPUTS
 from edgeperc.ros2.node import PerceptionNode
 from edgeperc.ros2.odometry import ODOMETRY, Rolling
 from edgeperc.ros2.rclpy_graph import RclpyGraph
-from edgeperc.ros2.zenoh_graph import CONFIG_VARIABLE, ZenohGraph, attachment, qos_key, type_key
+from edgeperc.ros2.zenoh_graph import CONFIG_VARIABLE, ZenohGraph, attachment, type_key
 from edgeperc.types.sensor import get_sensor
 from waiting import TIMEOUT_S, until
 
@@ -45,12 +44,9 @@ POINT_CLOUD = (
 POINTS = np.array([[10.0, 1.0, -1.0, 0.5], [5.0, -2.0, 0.25, 1.0]], np.float32)
 
 
-def test_types_and_qualities_in_keys() -> None:
-    """As in the examples of rmw_zenoh's design: an empty part is a default."""
+def test_types_in_keys() -> None:
+    """As in the examples of rmw_zenoh's design."""
     assert type_key("std_msgs/msg/String") == "std_msgs::msg::dds_::String_"
-    assert qos_key(RELIABLE) == "::,10:,:,:,,"
-    assert qos_key(SENSOR_DATA) == "2::,5:,:,:,,"
-    assert qos_key(replace(RELIABLE, depth=42)) == "::,:,:,:,,"
 
 
 def test_the_attachment_has_33_bytes() -> None:
@@ -121,13 +117,13 @@ def test_a_node_is_seen_and_heard_as_one_of_rmw_zenoh(router: str, watch: Watch)
         assert graph.name == "/front/top"
         assert graph.parameter("sensor", "os1-64") == "os1-64"
         assert not graph.manage(print)
-        output = graph.advertise("points", CLOUD, SENSOR_DATA)
+        output = graph.advertise("points", CLOUD)
         graph.subscribe("/in", CLOUD, heard.append)
         zid = next(token.split("/")[2] for token in _of(watch, "top", 3))
         space = f"@ros2_lv/7/{zid}/0"
         assert _of(watch, "top", 3) == {
             f"{space}/0/NN/%/%front/top",
-            f"{space}/1/MP/%/%front/top/%front%points/{POINT_CLOUD}/2::,5:,:,:,,",
+            f"{space}/1/MP/%/%front/top/%front%points/{POINT_CLOUD}/::,10:,:,:,,",
             f"{space}/2/MS/%/%front/top/%in/{POINT_CLOUD}/2::,5:,:,:,,",
         }
         until(lambda: output.is_wanted)  # the watch hears everything
@@ -143,7 +139,7 @@ def test_a_node_is_seen_and_heard_as_one_of_rmw_zenoh(router: str, watch: Watch)
         assert first[16:] == second[16:]
         assert first[16] == 16
         for each in (elsewhere, other):
-            talker = each.advertise("/in", CLOUD, RELIABLE)
+            talker = each.advertise("/in", CLOUD)
             until(lambda talker=talker: talker.is_wanted)  # type: ignore[misc]
             talker.publish(each.name.encode() if each is other else b"of another domain")
         until(lambda: heard)
@@ -527,7 +523,7 @@ def test_the_grid_with_memory_over_zenoh(router: str, watch: Watch) -> None:
     graph, talker = ZenohGraph("top", connect=router), ZenohGraph("base", connect=router)
     node = PerceptionNode(graph, lambda _: Perceive(), outputs=["rolling=/grid"], rolling=Rolling())  # type: ignore[arg-type, return-value]
     with node:
-        odom, lidar = talker.advertise("/odom", ODOMETRY, RELIABLE), talker.advertise("/points", CLOUD, RELIABLE)
+        odom, lidar = talker.advertise("/odom", ODOMETRY), talker.advertise("/points", CLOUD)
         until(lambda: odom.is_wanted and lidar.is_wanted)
         odom.publish(odometry(10**9, 3.0, 4.0, 0.0))
         outcomes = iter(node)
@@ -589,7 +585,7 @@ def test_over_the_real_rclpy() -> None:
     heard: list[bytes] = []
     try:
         listener.subscribe("/edgeperc_test", CLOUD, heard.append)
-        output = talker.advertise("/edgeperc_test", CLOUD, RELIABLE)
+        output = talker.advertise("/edgeperc_test", CLOUD)
         until(lambda: output.is_wanted)
         # The other side may discover the publisher later, so the first messages may be lost.
         until(lambda: output.publish(cloud(POINTS)) or heard)

@@ -24,7 +24,7 @@ from edgeperc import Box, ModelFileError, OptionError, Perception, PointsError, 
 from edgeperc.readers.clouds import cloud_points
 from edgeperc.records import PerceivedScan
 from edgeperc.ros2 import node as node_module
-from edgeperc.ros2.graph import RELIABLE, Qos, full_name
+from edgeperc.ros2.graph import full_name
 from edgeperc.ros2.messages import CLOUD, DIAGNOSTICS, OUTPUTS
 from edgeperc.ros2.node import PerceptionNode
 from edgeperc.ros2.odometry import ODOMETRY, Rolling
@@ -39,7 +39,7 @@ class FakeGraph:
     def __init__(self, missing: str = "") -> None:
         self.name, self.closed, self.missing = "/here/edgeperc", 0, missing
         self.published: dict[str, list[bytes]] = {}
-        self.types: dict[str, tuple[str, Qos]] = {}
+        self.types: dict[str, str] = {}
         self.wanted = True
         self.give: Callable[[bytes], None]
         self.odometry: Callable[[bytes], None]
@@ -48,10 +48,10 @@ class FakeGraph:
     def parameter(self, name: str, default: Any) -> Any:
         return default
 
-    def advertise(self, topic: str, message_type: str, qos: Qos) -> Any:
+    def advertise(self, topic: str, message_type: str) -> Any:
         if self.missing and self.missing in message_type:
             raise OptionError(f"{self.missing} is not installed")
-        self.types[topic] = message_type, qos
+        self.types[topic] = message_type
         kept, graph = self.published.setdefault(topic, []), self
 
         class Output:
@@ -121,10 +121,10 @@ def test_a_cloud_is_answered_with_its_stamp_and_frame() -> None:
     assert (stamp.sec, stamp.nanosec, answer.header.frame_id) == (1_700_000_000, 123_456_789, "velodyne")
     np.testing.assert_array_equal(cloud_points(answer), POINTS)
     assert graph.types == {
-        "/diagnostics": (DIAGNOSTICS, RELIABLE),
-        **{f"/edgeperc/{name}": (kind, RELIABLE) for name, kind in OUTPUTS.items() if name != "diagnostics"},
-        "/edgeperc/ground_points": (CLOUD, RELIABLE),
-        "/edgeperc/obstacle_points": (CLOUD, RELIABLE),
+        "/diagnostics": DIAGNOSTICS,
+        **{f"/edgeperc/{name}": kind for name, kind in OUTPUTS.items() if name != "diagnostics"},
+        "/edgeperc/ground_points": CLOUD,
+        "/edgeperc/obstacle_points": CLOUD,
     }
 
 
@@ -396,7 +396,7 @@ def test_topics_have_names_of_ones_own() -> None:
     graph = FakeGraph()
     outputs = ["ground_points=/ground", "obstacle_points=/nonground_points", "tracked_objects=objects", "markers"]
     PerceptionNode(graph, lambda _: Perceive(), outputs=outputs, prefix="/x").close()
-    assert {topic: kind for topic, (kind, _) in graph.types.items()} == {
+    assert graph.types == {
         "/ground": CLOUD,
         "/nonground_points": CLOUD,
         "objects": "autoware_perception_msgs/msg/TrackedObjects",

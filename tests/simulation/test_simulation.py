@@ -95,8 +95,7 @@ def in_box(points: np.ndarray, each: Box, grown: float) -> np.ndarray:
 
 def placed_primitives(scene: Scene, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Primitives of a scene in the sensor frame, nearest first, and their bounds."""
-    placed = np.empty_like(scene.primitives)
-    raycast.fill_placed(scene.primitives, poses_of(scene), pose, placed)
+    placed = raycast.placed(scene.primitives, poses_of(scene), pose)
     bounds = np.empty((len(placed), 5))
     raycast.fill_bounds(placed, bounds)
     order = np.argsort(bounds[:, 4], kind="stable")
@@ -107,21 +106,13 @@ def poses_of(scene: Scene) -> np.ndarray:
     return np.array([(*o.center[:2], o.center[2] - o.size[2] / 2, o.yaw) for o in scene.objects]).reshape(-1, 4)
 
 
-def columns_of(bounds: np.ndarray, n_columns: int, reach: float) -> tuple[np.ndarray, np.ndarray]:
-    starts = np.zeros(n_columns + 1, np.int64)
-    raycast.fill_column_counts(bounds, n_columns, reach, starts)
-    rows = np.empty(starts[-1], np.int32)
-    raycast.fill_column_rows(bounds, n_columns, reach, starts, rows)
-    return starts, rows
-
-
 KEY = np.uint64(99)
 
 
 def cast(scene: Scene, pose: np.ndarray, rays: Rays) -> tuple[np.ndarray, Hits]:
     """Primitives in the sensor frame, nearest first; what the rays hit."""
     placed, bounds = placed_primitives(scene, pose)
-    shapes = Shapes(placed, bounds, *columns_of(bounds, len(rays.azimuths), rays.reach))
+    shapes = Shapes(placed, bounds, *raycast.columns_of(bounds, len(rays.azimuths), rays.reach))
     shape = (len(rays.elevations), len(rays.azimuths))
     hits = Hits(np.empty(shape), np.empty(shape, np.int32), np.empty(shape), np.empty(shape))
     raycast.fill_cast(shapes, scene.ground, pose, rays, hits)
@@ -201,8 +192,7 @@ def test_placing_is_its_twin(n: int) -> None:
     primitives[:, 19] = rng.integers(-1, 3, n)
     primitives[1::5, 5] = np.nan
     pose = sensor_pose(flat(street()), SMALL, 3.0, -2.0, yaw=0.7, pitch=0.03, roll=-0.02)
-    placed = np.empty_like(primitives)
-    raycast.fill_placed(primitives, poses, pose, placed)
+    placed = raycast.placed(primitives, poses, pose)
     np.testing.assert_allclose(placed, twins.simulation.placed(primitives, poses, pose), atol=1e-9)
 
 
@@ -217,7 +207,7 @@ def test_bounds_and_columns_are_their_twins() -> None:
         raycast.fill_bounds(primitives, bounds)
         np.testing.assert_allclose(bounds, twins.simulation.bounds(primitives), rtol=1e-7, atol=1e-7)
         for n_columns, reach in ((1, 80.0), (36, 80.0), (720, 20.0)):
-            starts, rows = columns_of(bounds, n_columns, reach)
+            starts, rows = raycast.columns_of(bounds, n_columns, reach)
             lists = twins.simulation.columns(bounds, n_columns, reach)
             assert [rows[a:b].tolist() for a, b in pairwise(starts)] == lists
 
@@ -226,15 +216,10 @@ def test_drivable_cells_are_those_of_the_twin() -> None:
     for seed, tilt in ((0, 0.0), (5, 0.05)):
         scene = random_scene(seed)
         pose = sensor_pose(scene, SMALL, 2.0, -1.0, yaw=0.3, pitch=tilt, roll=tilt)
-        for x, y in (
-            (np.linspace(40.0, -40.0, 50), np.linspace(20.0, -20.0, 31)),
-            (np.array([5.0]), np.array([0.0])),
-            (np.zeros(0), np.array([0.0])),
-            (np.array([5.0, np.nan]), np.array([0.0, np.nan])),
-        ):
-            labels = np.full((len(x), len(y)), 9, np.uint8)
-            raycast.fill_drivable(scene.ground, pose, x, y, labels)
-            np.testing.assert_array_equal(labels, twins.simulation.drivable(scene, pose, x, y))
+        scan = replace(simulate(scene, SMALL, 0, pose), boxes=())
+        for view in (TopViewGeometry(), TopViewGeometry(x_range_m=(0.0, 1.0), y_range_m=(-1.0, 1.0), cell_m=1.0)):
+            x, y = (centers.ravel() for centers in view.cell_centers())
+            np.testing.assert_array_equal(scan.top_view_labels(view), twins.simulation.drivable(scene, pose, x, y))
 
 
 @pytest.mark.parametrize(("seed", "noise"), [(3, False), (4, True)])
@@ -751,7 +736,7 @@ def test_rays_of_their_own_elevations_are_cast_as_by_the_twins(seed: int, n: int
     rays = Rays(rng.uniform(-0.4, 0.2, (1, n)), np.sort(rng.uniform(0.0, 2 * np.pi, n)), 40.0, KEY)
     placed, bounds = placed_primitives(scene, pose)
     for n_sectors in (1, 36):
-        shapes = Shapes(placed, bounds, *columns_of(bounds, n_sectors, rays.reach))
+        shapes = Shapes(placed, bounds, *raycast.columns_of(bounds, n_sectors, rays.reach))
         hits = Hits(np.empty((1, n)), np.empty((1, n), np.int32), np.empty((1, n)), np.empty((1, n)))
         raycast.fill_cast(shapes, scene.ground, pose, rays, hits)
         slow_ranges, slow_hits = twins.simulation.cast(placed, scene, pose, *rays)

@@ -124,14 +124,13 @@ def test_the_viewers_are_bounded_and_a_place_becomes_free(relayed: Opener) -> No
 
 def test_who_says_nothing_or_reads_nothing_is_dropped(relayed: Opener, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(relay_module, "GREETING_S", 0.1)
-    monkeypatch.setattr(relay_module, "TICK_S", 0.05)
+    monkeypatch.setattr(relay_module, "STALLED_S", 0.1)
     _, connect = relayed(echo)
     assert has_ended(connect())
     relay, connect = relayed(flood)
     deaf = connect()
     while not relay.viewers:
         time.sleep(0.01)
-    monkeypatch.setattr(relay_module, "STALLED_S", 0.1)
     while relay.viewers:
         time.sleep(0.05)
     assert has_ended(deaf)

@@ -20,8 +20,8 @@ from cli_helpers import POINTSEG
 from edgeperc.datasets.kitti import KittiObjects
 from edgeperc.errors import CardError, OptionError, PointsError, SensorError
 from edgeperc.records import PerceivedScan
-from edgeperc.sinks.names import stem_of
 from edgeperc.sinks.prelabels import KINDS, PrelabelSink
+from edgeperc.sinks.run_file import stem_of
 from edgeperc.system.names import check_file, check_name, check_text
 from edgeperc.types.card import ModelCard
 from edgeperc.types.perception import Box

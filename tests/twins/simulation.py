@@ -78,7 +78,7 @@ def cosine(primitive: np.ndarray, direction: np.ndarray, t: float) -> float:
 
 
 def placed(primitives: np.ndarray, poses: np.ndarray, pose: np.ndarray) -> np.ndarray:
-    """Twin of `fill_placed`."""
+    """Twin of `placed` of `raycast`."""
     out = primitives.copy()
     for row in out:
         x, y, z, yaw = poses[int(row[19])] if row[19] >= 0 else np.zeros(4)
@@ -119,7 +119,7 @@ def bounds(primitives: np.ndarray) -> np.ndarray:
 
 
 def columns(bounds: np.ndarray, n_columns: int, reach: float) -> list[list[int]]:
-    """Twin of `fill_column_counts` and `fill_column_rows`: the primitives of each column."""
+    """Twin of `columns_of`: the primitives of each column."""
     lists: list[list[int]] = [[] for _ in range(n_columns)]
     step = 2 * math.pi / n_columns
     for k, (azimuth, width, _, _, near) in enumerate(bounds):
@@ -131,7 +131,7 @@ def columns(bounds: np.ndarray, n_columns: int, reach: float) -> list[list[int]]
 
 
 def drivable(scene: Any, pose: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Twin of `fill_drivable`; a place that is not finite is no road."""
+    """Twin of the road of `SimulatedScan.top_view_labels`."""
     with np.errstate(invalid="ignore"):
         places = np.stack(np.broadcast_arrays(x[:, None], y[None, :], -pose[2, 3]), axis=-1) @ pose[:3, :3].T
         outside, _, islands, *_ = road_places(scene, *(places + pose[:3, 3])[..., :2].transpose(2, 0, 1))

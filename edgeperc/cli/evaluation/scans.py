@@ -232,13 +232,11 @@ def figure_lines(figures: Mapping[str, Any]) -> list[str]:
     for name, of_block in (*blocks, *figures.get("folders", {}).items()):
         if of_block is not None:
             lines += ["", f"== {name}: {many(of_block['n_frames'], 'scan')}, {many(of_block['n_drives'], 'drive')} =="]
-            lines += [
-                *_labeled_lines(of_block),
-                *_point_lines(of_block),
-                *box_lines(of_block),
-                *box_table_lines(of_block),
-            ]
-            lines += [*error_lines(of_block), *_cell_lines(of_block), *_road_lines(of_block)]
+            title = "labeled objects; each distinct object counts once, however often it is seen"
+            rows = [((_marked(label, row), ""), row) for label, row in of_block.get("labeled", {}).items()]
+            lines += table_lines(title, _LABELED_COLUMNS, rows)
+            for part in (_point_lines, box_lines, box_table_lines, error_lines, _cell_lines, _road_lines):
+                lines += part(of_block)
     return lines
 
 
@@ -254,13 +252,6 @@ def _image_lines(figures: Mapping[str, Any]) -> list[str]:
         *table_lines("all pixels", _IMAGE_COLUMNS, [(("all", ""), images["all"])]),
         *table_lines("classes", _PIXEL_COLUMNS, [((name, ""), row) for name, row in images["classes"].items()]),
     ]
-
-
-def _labeled_lines(of_block: Mapping[str, Any]) -> list[str]:
-    rows = [((_marked(name, row), ""), row) for name, row in of_block.get("labeled", {}).items()]
-    return table_lines(
-        "labeled objects; each distinct object counts once, however often it is seen", _LABELED_COLUMNS, rows
-    )
 
 
 def _point_lines(of_block: Mapping[str, Any]) -> list[str]:

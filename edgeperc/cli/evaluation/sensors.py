@@ -91,7 +91,7 @@ def eval_sensors_command(arguments: argparse.Namespace) -> int:
 
 def _find(arguments: argparse.Namespace) -> int:
     """Print which sensors are found in the points."""
-    from ...evaluation.found import find_sensors
+    from ...evaluation.transfer import find_sensors
 
     figures = find_sensors(arguments.datasets)
     for name, result in figures.items():
