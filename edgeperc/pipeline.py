@@ -56,6 +56,7 @@ LESS_SURE = 0.2
 # Where another network shows a vehicle, that of objects must see one with such a score. All round on PandaSet, Lyft,
 # Argoverse 2 and DDAD, 8 of 25 boxes with less are at a vehicle, and 26 of 33 others.
 SEEN = 0.1
+AGAIN = 0.15  # boxes with less are not looked at again: a second look confirmed none of them on PandaSet and Lyft
 
 BoxesFrom = Literal["both", "network", "clusters"]
 
@@ -190,6 +191,7 @@ class ObjectNetwork:
         """Boxes of the candidates, and of a second look at each box that was found (Cai and Vasconcelos, 2018)."""
         (places, cells), crops = candidates
         found = merge_boxes(self._look(places, crops), self.card.classes)
+        found = found[found[:, SCORE] >= AGAIN]
         confirmed = confirm_boxes(found, self._look_at(scan, Candidates(footprints(found), cells)))
         return tuple(boxes_of_objects(merge_boxes(confirmed, self.card.classes), self.card.classes, min_score))
 
