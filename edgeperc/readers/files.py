@@ -217,8 +217,10 @@ def _origin(fields: Mapping[str, NDArray[Any]], options: FileOptions) -> Sequenc
     """The given place of the sensor, or the one that is found; fields without coordinates are refused afterwards."""
     if not isinstance(options.origin_m, str) or options.origin_m != "auto":
         return options.origin_m
-    has_coordinates = all(axis in fields for axis in "xyz")
-    return find_place(np.column_stack([fields[axis].astype(np.float64) for axis in "xyz"])) if has_coordinates else None
+    if not all(axis in fields for axis in "xyz"):
+        return None
+    with np.errstate(invalid="ignore"):  # signalling NaN
+        return find_place(np.column_stack([fields[axis].astype(np.float64) for axis in "xyz"]))
 
 
 def _parse_npy(data: NDArray[np.uint8]) -> NDArray[Any]:
