@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import PointsError
-from ..types.points import as_points, assemble, table_columns
+from ..types.points import as_float64, as_points, assemble, table_columns
 from .inflate import inflate, most_bytes
 from .origin import find_place
 from .pcd import begins_like_pcd, parse_pcd
@@ -219,8 +219,7 @@ def _origin(fields: Mapping[str, NDArray[Any]], options: FileOptions) -> Sequenc
         return options.origin_m
     if not all(axis in fields for axis in "xyz"):
         return None
-    with np.errstate(invalid="ignore"):  # signalling NaN
-        return find_place(np.column_stack([fields[axis].astype(np.float64) for axis in "xyz"]))
+    return find_place(np.column_stack([as_float64(fields[axis]) for axis in "xyz"]))
 
 
 def _parse_npy(data: NDArray[np.uint8]) -> NDArray[Any]:
