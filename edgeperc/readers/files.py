@@ -150,6 +150,8 @@ def _read(path: Path, options: FileOptions) -> _Read:
         raise
     except (MemoryError, OSError, ValueError) as exc:  # ValueError: a NUL in the name
         raise PointsError(f"{path}: the file cannot be read ({exc})") from exc
+    if data is None and path.exists() and not path.is_dir():
+        raise PointsError(f"{path}: a pipe or a device, not a file; write what it gives into a file, and pass that")
     if data is None:
         raise PointsError(f"{path}: there is no such file; expected a scan as .bin, .npy, .npz, .pcd or .ply")
     return _parse_named(data, path, options)

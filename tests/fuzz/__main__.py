@@ -26,8 +26,7 @@ from .running import Kind, State, attempt, new_case, run_job, summary_of, superv
 KINDS = ("scans", "captures", "readers", "packets", "images", "models", "trackers", "commands")
 READERS = tuple(
     f"readers.{name}"
-    for name in "pcd ply raw npy text others clouds calibration labels poses bag1 bag2 mcap velodyne lidar lvx2 ouster"
-    .split()
+    for name in "pcd ply raw npy text others clouds calibration labels poses bag1 bag2 mcap velodyne lidar lvx2 ouster".split()
 )
 """Parts of the kind ``readers``, each alone."""
 
@@ -40,7 +39,9 @@ def kind_of(name: str, seed: int) -> Kind:
 
 def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m tests.fuzz", description=__doc__)
-    parser.add_argument("kinds", nargs="*", choices=[*KINDS, *READERS, []], metavar="KIND", help=", ".join([*KINDS, *READERS]))
+    parser.add_argument(
+        "kinds", nargs="*", choices=[*KINDS, *READERS, []], metavar="KIND", help=", ".join([*KINDS, *READERS])
+    )
     parser.add_argument("--cases", type=int, default=1 << 40, help="cases of each kind (default: until the time is up)")
     parser.add_argument("--seconds", type=float, default=None, help="time for all kinds together (default: no limit)")
     parser.add_argument("--seed", type=int, default=None, help="default: the time")

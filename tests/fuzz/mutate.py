@@ -71,7 +71,11 @@ def mutated_words(content: bytes, case: Case, most: int = 4, within: int = 400) 
     rng = case.rng
     parts = re.split(rb"([ \n])", content[:within])  # words at even places
     for _ in range(int(rng.integers(1, most + 1))):
-        at, other, way = 2 * int(rng.integers((len(parts) + 1) // 2)), int(rng.integers(len(WORDS))), int(rng.integers(8))
+        at, other, way = (
+            2 * int(rng.integers((len(parts) + 1) // 2)),
+            int(rng.integers(len(WORDS))),
+            int(rng.integers(8)),
+        )
         if way <= 3:
             parts[at] = WORDS[other]
         elif way == 4:

@@ -172,7 +172,10 @@ class Readers:
             path = case.folder / name
             path.write_bytes(content)
             columns = case.pick([None, 3, 4, 5, 8, 65, 0, ("x", "y", "z"), ("x", "y", "z", "intensity", "t"), ("a",)])
-            field, origin = case.pick([None, None, "intensity", "ring", ""]), case.pick([*[None] * 8, "auto", (1, 2, 3)])
+            field, origin = (
+                case.pick([None, None, "intensity", "ring", ""]),
+                case.pick([*[None] * 8, "auto", (1, 2, 3)]),
+            )
             check_scan(None, read_timed_file(path, FileOptions(columns, field, origin)).points)
             return "scan with options"
         points = parse_points(content, name)
