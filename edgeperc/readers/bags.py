@@ -279,12 +279,13 @@ def _plain(data: memoryview) -> memoryview:
 def _ros1_records(file: BinaryIO, at: int, end: int) -> Iterator[tuple[dict[str, bytes], memoryview]]:
     """Fields of the header and content of each record."""
     while at < end:
+        start = at
         file.seek(at)
         fields = _ros1_fields(_piece(file, at, end))
         at = file.tell()
         content = _piece(file, at, end)
         if "op" not in fields:  # zeros, as a file system leaves them when power is lost, among others
-            raise PointsError(f"the file is damaged or cut short: what ends at byte {file.tell():,} is no record")
+            raise PointsError(f"the file is damaged or cut short: there is no record at byte {start:,}")
         at = file.tell()
         yield fields, content
 

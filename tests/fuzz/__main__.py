@@ -24,10 +24,11 @@ from edgeperc.system.atomic import write_atomic
 from .running import Kind, State, attempt, new_case, run_job, summary_of, supervise
 
 KINDS = ("scans", "captures", "readers", "packets", "images", "models", "trackers", "commands")
-READERS = tuple(
-    f"readers.{name}"
-    for name in "pcd ply raw npy text others clouds calibration labels poses bag1 bag2 mcap velodyne lidar lvx2 ouster".split()
-)
+READERS = (
+    "readers.pcd", "readers.ply", "readers.raw", "readers.npy", "readers.text", "readers.others", "readers.clouds",
+    "readers.calibration", "readers.labels", "readers.poses", "readers.bag1", "readers.bag2", "readers.mcap",
+    "readers.velodyne", "readers.lidar", "readers.lvx2", "readers.ouster",
+)  # fmt: skip
 """Parts of the kind ``readers``, each alone."""
 
 
