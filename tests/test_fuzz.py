@@ -30,6 +30,7 @@ from tiny_model import field
 
 import edgeperc.perceiver as perceiver_module
 from edgeperc import Box, Perceiver, SensorProfile, Tracker
+from edgeperc.camera.calibration import read_kitti_calibration
 from edgeperc.errors import EdgepercError, InferenceError, ModelFileError, PointsError, TrackingError
 from edgeperc.inference.session import Session
 from edgeperc.preprocess.fitness import FitnessProfile
@@ -48,7 +49,8 @@ def _round(kind: str, cases: int) -> State:
 
 
 @pytest.mark.parametrize(
-    ("kind", "cases"), [("scans", 600), ("packets", 150), ("trackers", 250), ("models", 250), ("images", 400)]
+    ("kind", "cases"),
+    [("scans", 600), ("readers", 1700), ("packets", 150), ("trackers", 250), ("models", 250), ("images", 400)],
 )
 def test_a_round(kind: str, cases: int) -> None:
     # In a process of its own: other tests may have left this one with more memory than a case may take.
@@ -56,7 +58,8 @@ def test_a_round(kind: str, cases: int) -> None:
         state = pool.submit(_round, kind, cases).result()
     assert state.cases == cases
     assert not state.failures, state.failures[0]["traceback"]
-    assert sum(count for name, count in state.outcomes.items() if "answer" in name) > cases // 15, state.outcomes
+    answers = sum(count for name, count in state.outcomes.items() if "answer" in name or "scan" in name)
+    assert answers > cases // 15, state.outcomes
 
 
 @pytest.mark.parametrize(("kind", "cases"), [("captures", 40), ("commands", 12)])
@@ -138,6 +141,7 @@ def read_card(path: Path, folder: Path) -> object:
 
 READERS: dict[str, Callable[[Path, Path], object]] = {
     "boxes": lambda path, _: read_boxes(path),
+    "calibration": lambda path, _: read_kitti_calibration(path),
     "card": read_card,
     "sensor": lambda path, _: get_sensor(path),
     "settings": lambda path, _: read_setting(path, "machine", "digest"),

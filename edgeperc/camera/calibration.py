@@ -169,6 +169,8 @@ def read_kitti_calibration(path: str | os.PathLike[str]) -> tuple[NDArray[np.flo
                 key, _, numbers = line.replace(":", " ", 1).partition(" ")
                 if numbers.strip() and key not in _NO_NUMBERS:
                     values[key] = np.array([float(v) for v in numbers.split()])
+                    if not np.isfinite(values[key]).all():
+                        raise ValueError(f"{key} has a value that is not finite")
         rectify, from_velo = np.eye(4), np.eye(4)
         if is_raw:
             rectify[:3, :3] = values["R_rect_00"].reshape(3, 3)

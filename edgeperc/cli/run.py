@@ -8,6 +8,7 @@ import sys
 import time
 import warnings
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import suppress
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -366,6 +367,18 @@ def _live_source(arguments: argparse.Namespace) -> Path:
 _MOST_PERCEIVERS = 4
 
 
+def _needs_no_camera(scans: Sequence[Path]) -> str:
+    """What to say of scans with a camera model: what the first one is, if it is a film, an image or another format."""
+    from ..readers.unknown import advice_for
+
+    for scan in scans[:1]:
+        if scan.suffix.lower() != ".bin" and scan.is_file():  # values may begin with any bytes
+            with suppress(OSError), scan.open("rb") as file:
+                if advice := advice_for(file.read(300)):
+                    return f"{scan}: this is {advice}"
+    return "scans without images need no camera model; leave it out, or pass images, with their --scan"
+
+
 class _Perceivers:
     """A perceiver for each sensor, made when its first scan comes."""
 
@@ -395,9 +408,7 @@ class _Perceivers:
         kinds = {c.view.kind for c in cards}
         if ("camera" in kinds) != of_images:
             raise ModelError(
-                f"images need a camera model; add --model {CAMERA}"
-                if of_images
-                else "scans without images need no camera model; leave it out, or pass images, with their --scan"
+                f"images need a camera model; add --model {CAMERA}" if of_images else _needs_no_camera(scans)
             )
         if of_images and not scans and kinds != {"camera"}:
             raise ModelError("images alone need a camera model alone; leave out the others, or add --scan")

@@ -216,13 +216,17 @@ class Ros1Bag:
                 yield stamp_ns, data
 
     def _learn_from_index(self, file: BinaryIO) -> None:
+        for fields, content in _ros1_records(file, self._index(file), self._path.stat().st_size):
+            self._learn(fields, content)
+
+    def _index(self, file: BinaryIO) -> int:
+        """Where the index begins, which is behind all messages; PointsError if the file ends before."""
         size = self._path.stat().st_size
         head, _ = next(_ros1_records(file, 13, size), ({}, None))
         (index,) = unpack("<Q", head.get("index_pos", bytes(8)))
         if not 13 < index <= size:
-            raise PointsError("the bag has no index")
-        for fields, content in _ros1_records(file, index, size):
-            self._learn(fields, content)
+            raise PointsError("the file is damaged or cut short: it ends before its index, as if recording broke off")
+        return int(index)
 
     def _messages(self) -> Iterator[tuple[int, int, memoryview]]:
         size = self._path.stat().st_size
@@ -238,6 +242,7 @@ class Ros1Bag:
                     yield from self._of_chunk(memoryview(chunk))
                 else:
                     yield from self._message(fields, content)
+            self._index(file)
 
     def _of_chunk(self, chunk: memoryview) -> Iterator[tuple[int, int, memoryview]]:
         """Its messages in the order of time; damage is raised after those before it."""
@@ -274,10 +279,13 @@ def _plain(data: memoryview) -> memoryview:
 def _ros1_records(file: BinaryIO, at: int, end: int) -> Iterator[tuple[dict[str, bytes], memoryview]]:
     """Fields of the header and content of each record."""
     while at < end:
+        start = at
         file.seek(at)
         fields = _ros1_fields(_piece(file, at, end))
         at = file.tell()
         content = _piece(file, at, end)
+        if "op" not in fields:  # zeros, as a file system leaves them when power is lost, among others
+            raise PointsError(f"the file is damaged or cut short: there is no record at byte {start:,}")
         at = file.tell()
         yield fields, content
 

@@ -19,6 +19,7 @@ from .files import FileOptions, read_points, read_timed_file
 from .identify import KnownSensor, of_cloud, of_livox, of_metadata, of_packets, of_velodyne
 from .packets import LVX_MAGIC, PCAP_MAGIC
 from .times import TimedScan, accumulate
+from .unknown import advice_for
 
 SCAN_SUFFIXES = (".bin", ".npy", ".npz", ".pcd", ".ply")
 CAPTURE_SUFFIXES = (".bag", ".db3", ".lvx2", ".mcap", ".osf", ".pcap", ".pcapng")
@@ -243,6 +244,8 @@ def _readable_kind(path: Path) -> str:
     kind = _kind(path)
     if kind == ".pcapng":
         raise PointsError(f"{path}: a pcapng file; expected pcap. Run: editcap -F pcap {path.name} {path.stem}.pcap")
+    if kind in CAPTURE_SUFFIXES and _kind_of(head := _head(path)) is None and (advice := advice_for(head)):
+        raise PointsError(f"{path}: this is {advice}")
     return kind
 
 
@@ -253,15 +256,23 @@ def _kind(path: Path) -> str:
         return "ros2" if is_bag and bag_files(path) else "folder"
     if not path.is_file():  # opening a pipe would block
         return "scan"
-    try:
-        with path.open("rb") as file:
-            head = file.read(16)
-    except OSError as exc:
-        raise PointsError(f"{path}: the file cannot be read ({exc})") from exc
+    by_name = path.suffix.lower() if path.suffix.lower() in CAPTURE_SUFFIXES else "scan"
+    return _kind_of(_head(path)) or by_name
+
+
+def _kind_of(head: bytes) -> str | None:
+    """The kind of a capture with these first bytes, if they are of one."""
     if head[8:11] == b"OSF":
         return ".osf"
-    by_name = path.suffix.lower() if path.suffix.lower() in CAPTURE_SUFFIXES else "scan"
-    return next((kind for magic, kind in _MAGIC.items() if head.startswith(magic)), by_name)
+    return next((kind for magic, kind in _MAGIC.items() if head.startswith(magic)), None)
+
+
+def _head(path: Path) -> bytes:
+    try:
+        with path.open("rb") as file:
+            return file.read(300)
+    except OSError as exc:
+        raise PointsError(f"{path}: the file cannot be read ({exc})") from exc
 
 
 def _folder(folder: Path, options: _Options) -> Iterator[TimedScan]:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import PointsError
-from ..types.points import as_points
+from ..types.points import as_float64, as_points
 
 # PointField.datatype, from 1.
 _CLOUD_TYPES = ("i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8")
@@ -266,12 +266,12 @@ def _ring_elevations(message: Any) -> list[float | None]:
     cloud = cloud_table(message)
     names = cloud.dtype.names or ()
     if "ring" in names:
-        ring = cloud["ring"].ravel().astype(np.float64)
+        ring = as_float64(cloud["ring"].ravel())
     elif cloud.ndim == 2 and 1 < len(cloud) <= _MOST_RINGS:
         ring = np.repeat(np.arange(len(cloud), dtype=np.float64), cloud.shape[1])
     else:
         return []
-    points = as_points(cloud).astype(np.float64)
+    points = as_float64(as_points(cloud))
     across = np.hypot(points[:, 0], points[:, 1])
     with np.errstate(invalid="ignore"):
         far = np.isfinite(points).all(axis=1) & (across > _ELEVATION_FROM_M)

@@ -35,7 +35,7 @@ from .packet_messages import (
 from .packets import (
     Datagrams,
     copy_as_ethernet,
-    is_ethernet,
+    is_plain,
     pcap_packets,
     velodyne_name,
     velodyne_packets,
@@ -178,8 +178,8 @@ def _packet_scans(
 
 
 def _decodable(path: Path, alive: Callable[[], None], sender: str | None) -> Path:
-    """The capture, or a copy of one sender's packets behind Ethernet's header."""
-    if sender is None and is_ethernet(path):
+    """The capture, or a copy of one sender's packets, whole and behind Ethernet's header."""
+    if sender is None and is_plain(path):
         return path
     if shutil.disk_usage(tempfile.gettempdir()).free < path.stat().st_size:
         raise PointsError("the temporary folder has no room for a copy whose packets begin with Ethernet's header")

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import PointsError
-from ..types.points import as_points, assemble, table_columns
+from ..types.points import as_float64, as_points, assemble, table_columns
 from .inflate import inflate, most_bytes
 from .origin import find_place
 from .pcd import begins_like_pcd, parse_pcd
@@ -150,6 +150,8 @@ def _read(path: Path, options: FileOptions) -> _Read:
         raise
     except (MemoryError, OSError, ValueError) as exc:  # ValueError: a NUL in the name
         raise PointsError(f"{path}: the file cannot be read ({exc})") from exc
+    if data is None and path.exists() and not path.is_dir():
+        raise PointsError(f"{path}: a pipe or a device, not a file; write what it gives into a file, and pass that")
     if data is None:
         raise PointsError(f"{path}: there is no such file; expected a scan as .bin, .npy, .npz, .pcd or .ply")
     return _parse_named(data, path, options)
@@ -217,8 +219,9 @@ def _origin(fields: Mapping[str, NDArray[Any]], options: FileOptions) -> Sequenc
     """The given place of the sensor, or the one that is found; fields without coordinates are refused afterwards."""
     if not isinstance(options.origin_m, str) or options.origin_m != "auto":
         return options.origin_m
-    has_coordinates = all(axis in fields for axis in "xyz")
-    return find_place(np.column_stack([fields[axis].astype(np.float64) for axis in "xyz"])) if has_coordinates else None
+    if not all(axis in fields for axis in "xyz"):
+        return None
+    return find_place(np.column_stack([as_float64(fields[axis]) for axis in "xyz"]))
 
 
 def _parse_npy(data: NDArray[np.uint8]) -> NDArray[Any]:

@@ -112,6 +112,8 @@ def _records(file: BinaryIO, offset: int, end: int) -> Iterator[tuple[int, memor
         kind, length = struct.unpack("<BQ", head) if len(head) == 9 else (0, end)
         if offset + 9 + length > end:
             raise PointsError(f"the file is damaged or cut short: the record at byte {offset:,} is not whole")
+        if kind == 0:  # a file system fills with zeros what was not written when power was lost
+            raise PointsError(f"the file is damaged or cut short: there are zeros in place of a record at {offset:,}")
         if kind in (_HEADER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _DATA_END):
             if length > MAX_BYTES:
                 raise PointsError(f"the record at byte {offset:,} has {length:,} bytes; expected at most {MAX_BYTES:,}")

@@ -17,6 +17,7 @@ _N_POINTS = 16_000  # that are looked at
 _N_SECTORS = 90  # of a turn, which has as many points everywhere around the sensor
 _ROUGH_STEPS_M = ((24.0, 4.0), (4.0, 1.0), (1.0, 0.5))  # reach and step of the rough search, around the last place
 _FEWEST = 2000
+_REACH_M = 1000.0  # of any LiDAR; damaged coordinates lie farther from the others
 # The sensor is 0.4 to 9 m above the ground, and at most 2 m from the roughly known place.
 _ASIDE_M, _ASIDE_STEP_M = 2.0, 0.4
 _HEIGHTS_M = np.arange(0.4, 9.1, 0.1)
@@ -42,6 +43,10 @@ def find_place(xyz: NDArray[np.float64]) -> tuple[float, float, float]:
     if len(finite) < _FEWEST:
         raise _unknown(f"it has {len(finite):,} finite points, expected at least {_FEWEST:,}")
     middle = np.median(finite, axis=0)
+    with np.errstate(over="ignore", invalid="ignore"):
+        finite = finite[(np.abs(finite - middle) < _REACH_M).all(axis=1)]
+    if len(finite) < _FEWEST:
+        raise _unknown(f"{len(finite):,} points are within {_REACH_M:g} m of most, expected at least {_FEWEST:,}")
     sample = np.random.default_rng(0).permutation(finite)[:_N_POINTS] - middle
     x, y = _rough_place(sample)
     place = _far_place(sample, x, y)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
@@ -28,6 +29,7 @@ _LINKS = {1: (14, 12), 113: (16, 14), 276: (20, 0)}
 _LOOPBACK_LINKS, _RAW_LINKS = (0, 108), (12, 14, 101, 228)  # four bytes in front of the IP header, none
 
 VELODYNE_BYTES = 1206
+_MOST_COPIED = 2048  # bytes of a datagram; a Velodyne's are shorter
 
 # The last byte of a Velodyne's packet, behind the return mode: the model's beam angles. VLS-128 has two by firmware.
 _PRODUCTS = {
@@ -101,17 +103,18 @@ class Datagrams:
 
     path : a pcap file; one that is cut short is read up to the cut.
     alive : called now and then, for large files.
+    most : packets of the file that are looked at; None: all.
     n_bad : so far, those that are empty, incomplete, or contradict themselves.
     """
 
-    def __init__(self, path: Path, alive: Callable[[], None]) -> None:
-        self._path, self._alive, self.n_bad = path, alive, 0
+    def __init__(self, path: Path, alive: Callable[[], None], most: int | None = None) -> None:
+        self._path, self._alive, self._most, self.n_bad = path, alive, most, 0
         self._pending: dict[bytes, list[memoryview]] = {}  # by source: fragments so far
 
     def __iter__(self) -> Iterator[Datagram]:
         end, link, order = 24, _link_type(self._path), PCAP_MAGIC.get(_magic(self._path), "<")
         fraction_s = 1e-9 if b"\x4d" in _magic(self._path) else 1e-6
-        for k, (offset, packet) in enumerate(pcap_packets(self._path, whole=False)):
+        for k, (offset, packet) in enumerate(islice(pcap_packets(self._path, whole=False), self._most)):
             if k % 10_000 == 0:
                 self._alive()
             end = offset + 16 + len(packet)
@@ -182,6 +185,10 @@ def velodyne_senders(path: Path) -> list[str]:
 
 
 def _velodyne_packets(path: Path) -> Iterator[tuple[str, memoryview]]:
+    """Sender and content, in fragments or with bytes of the link behind; without a sender where none is known."""
+    for datagram in Datagrams(path, lambda: None, _SNIFFED_PACKETS):
+        if len(datagram.payload) == VELODYNE_BYTES and bytes(datagram.payload[:2]) == b"\xff\xee":
+            yield datagram.sender, datagram.payload
     link = _link_type(path)
     for _, packet in islice(pcap_packets(path, whole=False), _SNIFFED_PACKETS):
         # The first of twelve blocks begins with the flag 0xEEFF, behind the headers of the link, IP and UDP.
@@ -192,10 +199,6 @@ def _velodyne_packets(path: Path) -> Iterator[tuple[str, memoryview]]:
                 at = None
             if at is None or len(packet) < at + 28 + VELODYNE_BYTES:
                 yield "", packet[-VELODYNE_BYTES:]
-                continue
-            udp = at + 4 * (packet[at] & 15)
-            if int.from_bytes(packet[udp + 4 : udp + 6], "big") == 8 + VELODYNE_BYTES:  # RoboSense's end like these
-                yield _address(packet[at + 12 : at + 16]), packet[-VELODYNE_BYTES:]
 
 
 def _ip_at(packet: memoryview, link: int) -> int | None:
@@ -230,36 +233,37 @@ def _fragment(packet: memoryview, link: int) -> _Fragment | None:
     return _Fragment(source, packet[offset + 12 : offset + 16], 8 * (place & 0x1FFF), bool(place & 0x2000), payload)
 
 
-def is_ethernet(path: Path) -> bool:
-    """Whether a pcap file's packets begin with Ethernet's header, as the libraries that decode them expect."""
-    return _link_type(path) == 1
+def is_plain(path: Path) -> bool:
+    """Whether the first packets of a pcap file are as the libraries that decode them expect.
+
+    They begin with Ethernet's header, and none is in fragments.
+    """
+    link = _link_type(path)
+    for _, packet in islice(pcap_packets(path, whole=False), _SNIFFED_PACKETS):
+        with suppress(ValueError):
+            part = _fragment(packet, link)
+            if part is not None and (part.more or part.start):
+                return False
+    return link == 1
 
 
 def copy_as_ethernet(path: Path, target: Path, alive: Callable[[], None], sender: str | None = None) -> None:
-    """Copy the IPv4 packets of a pcap file, of one sender or all, behind Ethernet's header.
+    """Copy the datagrams of a pcap file, of one sender or all, each as one packet behind Ethernet's header.
 
-    ``tcpdump -i any`` writes Linux's cooked headers; tunnels and phones write raw IP.
+    ``tcpdump -i any`` writes Linux's cooked headers; tunnels and phones write raw IP; a narrow link sends fragments.
     """
-    link = _link_type(path)
-    order = PCAP_MAGIC[_magic(path)]
-    record = struct.Struct(f"{order}IIII")
-    with path.open("rb") as source, target.open("wb") as out:
-        out.write(source.read(20) + struct.pack(f"{order}I", 1))
-        for k, (at, packet) in enumerate(pcap_packets(path, whole=False)):
-            if k % 10_000 == 0:
-                alive()
-            try:
-                ip_at = _ip_at(packet, link)
-            except ValueError:
+    with target.open("wb") as out:
+        out.write(struct.pack("<IHHiIII", 0xA1B2C3D4, 2, 4, 0, 0, 65535, 1))
+        for datagram in Datagrams(path, alive):
+            size = len(datagram.payload)
+            if size > _MOST_COPIED or sender not in (None, datagram.sender):
                 continue
-            if ip_at is None or len(packet) < ip_at + 20:
-                continue
-            if sender is not None and _address(packet[ip_at + 12 : ip_at + 16]) != sender:
-                continue
-            source.seek(at)
-            seconds, fraction, _, _ = record.unpack(source.read(16))
-            content = bytes(12) + b"\x08\x00" + bytes(packet[ip_at:])
-            out.write(record.pack(seconds, fraction, len(content), len(content)) + content)
+            seconds, microseconds = divmod(round(1e6 * datagram.stamp_s), 10**6)
+            addresses = bytes(map(int, datagram.sender.split("."))) + b"\xff" * 4
+            ip = struct.pack(">BBHHHBBH", 0x45, 0, 28 + size, 0, 0, 64, 17, 0) + addresses
+            udp = struct.pack(">HHHH", datagram.port, datagram.port, 8 + size, 0)
+            content = bytes(12) + b"\x08\x00" + ip + udp + datagram.payload
+            out.write(struct.pack("<IIII", seconds, microseconds, len(content), len(content)) + content)
 
 
 def _address(four: memoryview) -> str:

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import PointsError
+from ..types.points import as_float64
 from .tables import Columns
 
 TEXT_BYTES = np.zeros(256, dtype=np.bool_)
@@ -87,7 +88,7 @@ def _difference(values: NDArray[np.float32], distance: int) -> float:
     starts = np.linspace(0, max(0, len(values) - _BLOCK - distance), _BLOCKS).astype(np.int64)
     total = n = 0.0
     for start in np.unique(starts):
-        block = values[start : start + _BLOCK + distance].astype(np.float64)
+        block = as_float64(values[start : start + _BLOCK + distance])
         one, other = block[:-distance], block[distance:]
         difference = np.abs(one - other) / (np.abs(one) + np.abs(other) + 0.01)
         known = np.isfinite(difference)

@@ -23,6 +23,7 @@ _KNOWN = {
     b"DRACO": "a Draco file; decode it to .ply",
     b"\x1f\x8b": _ARCHIVE,
     b"BZh": _ARCHIVE,
+    b"\xff\xfe": "text in UTF-16, if text at all; save it as UTF-8",
     b"\xfd7zXZ": _ARCHIVE,
     b"7z\xbc\xaf": _ARCHIVE,
     b"\x28\xb5\x2f\xfd": _ARCHIVE,

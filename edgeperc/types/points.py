@@ -167,6 +167,12 @@ def plain_name(name: str) -> str:
     return name.lower().removeprefix("scalar_")
 
 
+def as_float64(values: NDArray[Any]) -> NDArray[np.float64]:
+    """Values in float64; a signalling NaN, as damaged files hold them, is a NaN without a warning."""
+    with np.errstate(invalid="ignore"):
+        return values.astype(np.float64)
+
+
 def remission_name(names: Iterable[str], wanted: str | None) -> str | None:
     """Name of the remission field: the wanted one, or the first known name that is present; None if there is none.
 
@@ -205,9 +211,9 @@ def assemble(
     remission = remission_name(fields, remission_field)
     xyz = [fields[axis] for axis in "xyz"]
     if origin_m is not None:
-        xyz = [values.astype(np.float64) - origin for values, origin in zip(xyz, as_origin(origin_m), strict=True)]
+        xyz = [as_float64(values) - origin for values, origin in zip(xyz, as_origin(origin_m), strict=True)]
     if any(_is_rounded(values) for values in xyz):
-        middle = ", ".join(f"{np.median(values.astype(np.float64)[np.isfinite(values)]):,.1f}" for values in xyz)
+        middle = ", ".join(f"{np.median(as_float64(values)[np.isfinite(values)]):,.1f}" for values in xyz)
         raise PointsError(
             f"the coordinates are those of a map, about ({middle}) m, and would be rounded by more than "
             f"{1e3 * MAX_ROUNDING_M:g} mm as float32; pass the place of the sensor, which is subtracted first: "
@@ -240,7 +246,7 @@ def _is_rounded(values: NDArray[Any]) -> bool:
     """Whether float32 rounds most of the coordinates of an axis by more than they are measured to."""
     if values.dtype.itemsize <= 4 or not values.size:
         return False
-    exact = values[:: max(1, len(values) // 4096)].astype(np.float64)
+    exact = as_float64(values[:: max(1, len(values) // 4096)])
     with np.errstate(over="ignore", invalid="ignore"):
         # Half the distance of float32 numbers there; larger ones are no map's. What float32 holds is not rounded.
         off = (np.abs(exact) >= MAX_ROUNDING_M * 2**24) & (np.abs(exact) < MAX_MAP_M) & (exact != exact.astype("f4"))

@@ -202,7 +202,8 @@ def test_an_odometry_calibration_without_the_velodyne(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "text",
     ["", "nonsense", KITTI.replace("P2", "P9"), KITTI.replace("44.86 ", ""), KITTI.replace("721.5", "many"),
-     KITTI.replace("R0_rect", "R9"), KITTI.replace("721.5", "0"), "\xff\xfe"],
+     KITTI.replace("R0_rect", "R9"), KITTI.replace("721.5", "0"), "\xff\xfe", KITTI.replace("721.5", "nan"),
+     KITTI.replace("44.86", "inf"), KITTI + "R_rect: -1e999 0 0\n"],
 )  # fmt: skip
 def test_a_damaged_file_of_kitti_is_refused(tmp_path: Path, text: str) -> None:
     path = tmp_path / "000000.txt"

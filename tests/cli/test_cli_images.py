@@ -103,6 +103,10 @@ def test_an_image_that_fails_leaves_the_others(tmp_path: Path, model: Path, caps
 
 def test_wrong_usage(tmp_path: Path, model: Path, capsys: pytest.CaptureFixture[str]) -> None:
     image, scan = write_image(tmp_path / "a.png"), write_scan(tmp_path / "b.bin")
+    others = {"a.mp4": b"\0\0\0\x20ftypisom", "a.tif": b"II*\0", "a.las": b"LASF"}
+    film, tiff, las = (tmp_path / name for name in others)
+    for name, head in others.items():
+        (tmp_path / name).write_bytes(head + bytes(400))
     out = ("--out", tmp_path / "out")
     for arguments, said in (
         ((image, "--scan", scan, scan.with_name("c.bin"), "--model", model), "--scan: 2 scans for 1 image"),
@@ -121,6 +125,9 @@ def test_wrong_usage(tmp_path: Path, model: Path, capsys: pytest.CaptureFixture[
         ((image, "--model", "pointseg"), "images need a camera model; add --model camseg"),
         ((image, "--model", "pointseg", "--model", model), "images alone need a camera model alone"),
         ((scan, "--model", model), "scans without images need no camera model"),
+        ((film, "--model", model), "a.mp4: this is a film"),
+        ((tiff, "--model", model), "a.tif: this is a TIFF image"),
+        ((las, "--model", model), "a.las: this is a LAS or LAZ file"),
     ):
         assert run("run", *arguments, *CPU) == 2
         assert said in capsys.readouterr().err

@@ -23,18 +23,26 @@ from edgeperc.system.atomic import write_atomic
 
 from .running import Kind, State, attempt, new_case, run_job, summary_of, supervise
 
-KINDS = ("scans", "captures", "packets", "images", "models", "trackers", "commands")
+KINDS = ("scans", "captures", "readers", "packets", "images", "models", "trackers", "commands")
+READERS = (
+    "readers.pcd", "readers.ply", "readers.raw", "readers.npy", "readers.text", "readers.others", "readers.clouds",
+    "readers.calibration", "readers.labels", "readers.poses", "readers.bag1", "readers.bag2", "readers.mcap",
+    "readers.velodyne", "readers.lidar", "readers.lvx2", "readers.ouster",
+)  # fmt: skip
+"""Parts of the kind ``readers``, each alone."""
 
 
 def kind_of(name: str, seed: int) -> Kind:
-    module = import_module(f".{name}", __package__)
-    made: Kind = module.make(seed)
+    module, _, part = name.partition(".")
+    made: Kind = import_module(f".{module}", __package__).make(seed, *[part] * bool(part))
     return made
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m tests.fuzz", description=__doc__)
-    parser.add_argument("kinds", nargs="*", choices=[*KINDS, []], metavar="KIND", help=", ".join(KINDS))
+    parser.add_argument(
+        "kinds", nargs="*", choices=[*KINDS, *READERS, []], metavar="KIND", help=", ".join([*KINDS, *READERS])
+    )
     parser.add_argument("--cases", type=int, default=1 << 40, help="cases of each kind (default: until the time is up)")
     parser.add_argument("--seconds", type=float, default=None, help="time for all kinds together (default: no limit)")
     parser.add_argument("--seed", type=int, default=None, help="default: the time")
@@ -90,7 +98,7 @@ def main() -> int:
     n_failures = 0
     print(f"seed {seed}", flush=True)
     for name in kinds:
-        made = import_module(f".{name}", __package__)
+        made = import_module(f".{name.partition('.')[0]}", __package__)
         command = [sys.executable, "-m", "tests.fuzz", name, "--cases", str(arguments.cases), "--seed", str(seed)]
         whole = supervise(
             [*command, "--out", str(arguments.out)],
@@ -114,7 +122,7 @@ def main() -> int:
 def table(out: Path) -> str:
     """The runs of every kind in a folder, added up, as rows of a Markdown table; then how processes died."""
     rows, died = [], []
-    for kind in KINDS:
+    for kind in (*KINDS, *READERS):
         states = [State.read(file) for file in sorted(out.glob(f"{kind}-*of*.json"))]
         if not states:
             continue

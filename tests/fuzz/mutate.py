@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import json
+import re
 from typing import Any
 
 from tiny_model import varint
@@ -15,6 +16,7 @@ __all__ = [
     "mutated_document",
     "mutated_json",
     "mutated_message",
+    "mutated_words",
     "noise",
     "parse",
     "unparse",
@@ -55,6 +57,40 @@ def mutated_bytes(content: bytes, case: Case, most: int = 8, near: int = 0) -> b
         else:
             damaged[at : at + length] = bytes([int(rng.choice(MAGIC_BYTES))]) * len(damaged[at : at + length])
     return bytes(damaged)
+
+
+WORDS = [
+    b"0", b"1", b"-1", b"2", b"3", b"4", b"8", b"1e9", b"1e400", b"nan", b"inf", b"-0.0", b"4294967296", b"65537",
+    b"9" * 30, b"9" * 5000, b"", b"x", b"y", b"z", b"intensity", b"t", b"_", b"F", b"U", b"I", b"\xff", b"float",
+    b"double", b"uchar", b"list", b"list uchar int", b"vertex", b"#", b":", b"\0", b"true", b"1,5", b"0x10", b"1_0",
+]  # fmt: skip
+
+
+def mutated_words(content: bytes, case: Case, most: int = 4, within: int = 400) -> bytes:
+    """Words among the first bytes replaced, removed, doubled or swapped, or a line removed or doubled."""
+    rng = case.rng
+    parts = re.split(rb"([ \n])", content[:within])  # words at even places
+    for _ in range(int(rng.integers(1, most + 1))):
+        at, other, way = (
+            2 * int(rng.integers((len(parts) + 1) // 2)),
+            int(rng.integers(len(WORDS))),
+            int(rng.integers(8)),
+        )
+        if way <= 3:
+            parts[at] = WORDS[other]
+        elif way == 4:
+            parts[at] = b""
+        elif way == 5:
+            parts[at] += b" " + parts[at]
+        elif way == 6:
+            k = 2 * (other % ((len(parts) + 1) // 2))
+            parts[at], parts[k] = parts[k], parts[at]
+        else:
+            lines = b"".join(parts).split(b"\n")
+            k = other % len(lines)
+            lines[k : k + 1] = [lines[k]] * int(case.pick([0, 2]))
+            parts = re.split(rb"([ \n])", b"\n".join(lines))
+    return b"".join(parts) + content[within:]
 
 
 Field = list[Any]

@@ -159,6 +159,43 @@ def test_ros_1(tmp_path: Path, compression: str | None) -> None:
     assert whole_scans(write_bag1(tmp_path / "drive.bag", compression=compression)) == (3, "")
 
 
+@pytest.mark.parametrize("share", [0.5, 0.7, 0.95])
+def test_zeros_in_place_of_the_end(recording: Path, tmp_path: Path, share: float) -> None:
+    """As a file system leaves a file when power is lost."""
+    content, path = recording.read_bytes(), tmp_path / recording.name
+    start = int(share * len(content))
+    path.write_bytes(content[:start] + bytes(len(content) - start))
+    n, error = whole_scans(path)
+    assert error or n == 3
+
+
+@pytest.mark.parametrize("name", ["ros1.bag", "packed.bag", "one.mcap"])
+def test_zeros_behind_the_messages(tmp_path: Path, name: str) -> None:
+    path = tmp_path / name
+    content = (write_bag1(path, compression="BZ2") if name == "packed.bag" else BAGS[name](path)).read_bytes()
+    if path.suffix == ".bag":
+        (end,) = struct.unpack_from("<Q", content, content.index(b"index_pos=") + len(b"index_pos="))
+    else:
+        end = content.rindex(b"\x0f" + struct.pack("<Q", 4))  # what ends the data
+    path.write_bytes(content[:end] + bytes(1 << 16))
+    n, error = whole_scans(path)
+    assert n == 3
+    assert f"there is no record at byte {end:,}" in error or f"zeros in place of a record at {end:,}" in error
+
+
+@pytest.mark.parametrize("compression", [None, "BZ2"])
+@pytest.mark.parametrize("index", [0, 1 << 20, 1 << 63])
+def test_a_bag_of_ros_1_that_ends_before_its_index(tmp_path: Path, compression: str | None, index: int) -> None:
+    """Cut between two chunks, or of a recorder that broke off: what is there comes, and that more may be missing."""
+    path = write_bag1(tmp_path / "drive.bag", compression=compression)
+    content = path.read_bytes()
+    at = content.index(b"index_pos=") + len(b"index_pos=")
+    path.write_bytes(content[:at] + struct.pack("<Q", index) + content[at + 8 :])
+    n, error = whole_scans(path)
+    assert n == 3
+    assert "after 3 scans the file is damaged or cut short: it ends before its index" in error
+
+
 @pytest.mark.parametrize("version", ["1.2", "1.3", "3.0"])
 def test_ros_1_of_another_version(tmp_path: Path, version: str) -> None:
     path = tmp_path / "old.bag"

@@ -530,6 +530,10 @@ def test_packets_without_a_lidar_are_refused(tmp_path: Path, ouster: Path) -> No
         ("text.mcap", b"no capture at all", "damaged"),
         ("text.osf", b"no capture at all", "damaged"),
         ("empty.osf", b"", "damaged"),
+        ("lfs.pcap", b"version https://git-lfs.github.com/spec/v1\n", "git lfs pull"),
+        ("lfs.mcap", b"version https://git-lfs.github.com/spec/v1\n", "git lfs pull"),
+        ("packed.bag", b"\x1f\x8b\x08" + bytes(40), "this is an archive"),
+        ("page.db3", b"<!DOCTYPE html><html>not found</html>", "a download may have failed"),
         ("text.db3", b"no database", "damaged or cut short: it begins with b'no database'"),
     ],
 )

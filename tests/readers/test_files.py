@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import os
 import struct
 import tempfile
 import zipfile
@@ -687,7 +688,8 @@ def test_tables_of_text_with_names(separator: Any, names: Any, end: Any, comment
 
 
 @pytest.mark.parametrize(
-    ("name", "head", "n"), [("a.xyz", "", 3), ("b.xyz", "", 4), ("a.txt", "", 4), ("a.pts", "5\n", 4)]
+    ("name", "head", "n"),
+    [("a.xyz", "", 3), ("b.xyz", "", 4), ("a.txt", "", 4), ("a.pts", "5\n", 3), ("b.pts", "5\n", 4)],
 )
 def test_tables_of_text_without_names(tmp_path: Path, name: str, head: Any, n: int) -> None:
     values = np.arange(5.0 * n).reshape(5, n) * 1.25
@@ -699,16 +701,51 @@ def test_tables_of_text_without_names(tmp_path: Path, name: str, head: Any, n: i
     np.testing.assert_array_equal(named[:, :3], values[:, [2, 1, 0]])
 
 
+@pytest.mark.parametrize("n", [6, 7])
+def test_pts_with_colors(tmp_path: Path, n: int) -> None:
+    values = np.arange(5.0 * n).reshape(5, n)
+    points = read_points(save(tmp_path, "a.pts", b"5\n" + text_rows(values)))
+    np.testing.assert_array_equal(points, np.c_[values[:, :3], values[:, 3] if n == 7 else np.zeros(5)])
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="this system has no named pipes")
+@pytest.mark.parametrize("name", ["a.bin", "a.pcd", "a.pcap"])
+def test_a_pipe_is_not_waited_for(tmp_path: Path, name: str) -> None:
+    os.mkfifo(tmp_path / name)
+    with pytest.raises(PointsError, match="a pipe or a device, not a file"):
+        next(edgeperc.read_scans(tmp_path / name))
+
+
+SIGNALLING = np.frombuffer(b"\1\0\x80\x7f", "<f4")
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("name", ["a.pcd", "a.ply", "a.npy", "a.bin"])
+def test_signalling_nan_is_nan(tmp_path: Path, name: str) -> None:
+    points = POINTS.copy()
+    points[1, :1] = SIGNALLING
+    content = {
+        "a.pcd": pcd("x y z i", "F F F F", "4 4 4 4", "1 1 1 1", 4, "binary", points.tobytes()),
+        "a.ply": ply("binary_little_endian", points.tobytes()), "a.npy": npy(points), "a.bin": points.tobytes(),
+    }[name]  # fmt: skip
+    for origin in (None, (1.0, 0.0, 0.0)):
+        read = read_points(save(tmp_path, name, content), origin_m=origin)
+        assert np.isnan(read[:, 0]).tolist() == [False, True, True, False]
+
+
 @pytest.mark.parametrize(
     ("content", "error"),
     [
-        (b"1 2 3 4 5 6\n" * 9, "a row has 6 numbers, and there are no line of names: pass columns="),
+        (b"1 2 3 4 5 6\n" * 9, "a row has 6 numbers, and there are no names: pass columns="),
         (b"x y z i\n1 2 3 4 5\n", "a row has 5 numbers, and there are 4 names"),
         (b"1 2 3 4\n1 2 3\n", "does not hold 4 numbers"),
         (b"1 2 3 4\nfar 2 3 1\n", "does not hold 4 numbers"),
         (b"Dear reader,\nno points here\n", "no table of points: it has a line 'Dear reader'"),
         (b"# x y z\n", "no row of three numbers"),
-        (b"300\n200\n0 0 0\n1 0 0\n0 1 0\n0 0 1\n1 0 0 0\n", "does not hold 3 numbers"),  # PTX
+        (b"300\n200\n0 0 0\n1 0 0\n0 1 0\n0 0 1\n1 0 0 0\n", "this is a PTX file"),
+        (b"3\n1 2 3 4\n4 5 6 7\n", "cut short: the first line declares 3 points, 2 rows follow"),
+        (b"1\n1 2 3\n4 5 6\n", "the first line declares 1 points, 2 rows follow"),
+        (b"9" * 5000 + b"\n1 2 3\n4 5 6\n", "no table of points"),
     ],
 )
 def test_text_that_is_no_table(tmp_path: Path, content: bytes, error: str) -> None:
@@ -729,6 +766,7 @@ def test_text_that_is_no_table(tmp_path: Path, content: bytes, error: str) -> No
         (b"\x1f\x8b\x08" + bytes(40), "an archive; unpack it"),
         (bytes(257) + b"ustar" + bytes(99), "an archive; unpack it"),
         (b"ASTM-E57" + bytes(40), "an E57 file"),
+        ("x,y,z\n1,2,3\n".encode("utf-16"), "text in UTF-16"),
         (b"\x80\x04\x95" + bytes(40), "a pickle, which is never unpickled"),
         (b"<!DOCTYPE html><html>not found</html>", "a download may have failed"),
         (b'{"points": []}', "JSON"),

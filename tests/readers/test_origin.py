@@ -31,6 +31,21 @@ def test_the_place_of_a_level_sensor(sensor: str, place: str, yaw_deg: float) ->
     np.testing.assert_allclose(found, PLACES[place], atol=0.1)
 
 
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("damaged", [1e30, -3.4e38, 1.7e308, 1e4])
+def test_damaged_coordinates_are_left_out(damaged: float) -> None:
+    xyz = in_map(simulated_scan(3, "os1-64").points, PLACES["UTM"], 0.0)
+    xyz[::100, 2], xyz[7::100, 0] = damaged, -damaged
+    np.testing.assert_allclose(find_place(xyz), PLACES["UTM"], atol=0.1)
+
+
+@pytest.mark.parametrize("values", [1e30, 1e300, 1e5])
+def test_points_that_are_all_far_apart_are_refused(values: float) -> None:
+    xyz = np.random.default_rng(0).normal(0.0, values, (5000, 3))
+    with pytest.raises(PointsError, match="within 1000 m of most"):
+        find_place(xyz)
+
+
 def test_the_places_of_real_scans(kitti_root: Path) -> None:
     """KITTI's lasers sit 0.21 and 0.12 m above the origin of its scans."""
     files = sorted(kitti_root.glob("training/velodyne/*.bin"))[:480:120]

@@ -59,6 +59,37 @@ def test_a_velodyne_behind_any_link(tmp_path: Path, link: int, head: bytes) -> N
     assert sensor.name == "vlp-16"
 
 
+@pytest.mark.parametrize(
+    ("link", "head", "first", "behind"),
+    [(1, LINKS[1], 800, b""), (1, VLAN, 1208, b""), (113, LINKS[113], 16, b""), (1, LINKS[1], 0, b"\1\2\3\4"),
+     (1, LINKS[1], 600, bytes(18))],
+)  # fmt: skip
+def test_a_velodyne_in_fragments_or_with_bytes_behind(
+    tmp_path: Path, link: int, head: bytes, first: int, behind: bytes
+) -> None:
+    """A narrow link divides packets after so many bytes; some cards capture the checksum of a frame, or padding."""
+    pytest.importorskip("velodyne_decoder")
+    packets = vlp16_packets(1.2)
+    expected = list(read_scans(write_link(tmp_path / "whole.pcap", 1, packets)))
+    content = struct.pack("<IHHIIII", 0xA1B2C3D4, 2, 4, 0, 0, 65535, link)
+    for k, payload in enumerate(packets):
+        udp = struct.pack(">HHHH", 2368, 2368, 8 + len(payload), 0) + payload
+        for start, end in ((0, first), (first, len(udp))) if first else ((0, len(udp)),):
+            place = start // 8 | (0x2000 if end < len(udp) else 0)
+            addresses = socket.inet_aton("192.168.1.201") + b"\xff" * 4
+            ip = struct.pack(">BBHHHBBH", 0x45, 0, 20 + end - start, k, place, 64, 17, 0) + addresses
+            frame = head + ip + udp[start:end] + behind
+            content += struct.pack("<IIII", 1000 + k // 1000, 1000 * (k % 1000), len(frame), len(frame)) + frame
+    path = tmp_path / "other.pcap"
+    path.write_bytes(content)
+    scans = list(read_scans(path))
+    assert len(scans) == len(expected) == 2
+    for (stamp, points), (other_stamp, other_points) in zip(scans, expected, strict=True):
+        assert stamp == other_stamp
+        np.testing.assert_array_equal(points, other_points)
+    assert velodyne_senders(path) == ["192.168.1.201"]
+
+
 @pytest.mark.parametrize("link", [113, 276, 101])
 def test_an_ouster_behind_any_link(ouster: Path, tmp_path: Path, link: int) -> None:
     content, at, records = (ouster / "sphere.pcap").read_bytes(), 24, b""
