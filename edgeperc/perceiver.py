@@ -402,29 +402,28 @@ class Perceiver:
             elif isinstance(session.card.view, ObjectGeometry):
                 objects = ObjectNetwork(session)
             elif isinstance(session.card.view, PillarGeometry):
-                least = session.card.score_threshold if self.score_threshold is None else self.score_threshold
-                pillars = PillarNetwork(session, least, self.full_turn)
+                pillars = PillarNetwork(session, self._least_score(session), self.full_turn)
         if top is None and not ranged and objects is None and pillars is None:
             return None
         if self.full_turn and self._lanes.n == 2 and ranged:  # either lane may take a sector
             ranged.append(ranged[0].second())
-        network_score = self.score_threshold
-        if network_score is None:
-            network_score = MIN_SCORE if top is None else top.card.score_threshold
-        object_score = self.score_threshold
-        if object_score is None:
-            object_score = MIN_SCORE if objects is None else objects.card.score_threshold
         options = Options(
             rules=frozenset(RULES if self.agree is True else self.agree or ()),
             boxes_from=self.boxes_from,
-            network_score=network_score,
-            cluster_score=MIN_SCORE if self.score_threshold is None else self.score_threshold,
-            object_score=object_score,
+            network_score=self._least_score(top),
+            cluster_score=self._least_score(None),
+            object_score=self._least_score(objects),
             distance_per_m=sensor.link_per_m,
             slope=math.tan(math.radians(min(sensor.fov_up_deg, 89.0))),
             full_turn=self.full_turn,
         )
         return Pipeline(top, ranged, options, self._lanes, objects, pillars)
+
+    def _least_score(self, network: TopViewNetwork | ObjectNetwork | Session | None) -> float:
+        """The lowest score of a box: as given, of the network's card, or of boxes around clusters."""
+        if self.score_threshold is not None:
+            return self.score_threshold
+        return MIN_SCORE if network is None else network.card.score_threshold
 
     def __setattr__(self, name: str, value: object) -> None:
         if not name.startswith("_") and "_locks" in vars(self):  # the last attribute of construction
