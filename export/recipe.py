@@ -396,7 +396,7 @@ MODELS = {
         is_open=True,
         also=("sensors",),
     ),
-    "objects-open": Stage(replace(OBJECTS, steps=4000, detector=False), is_open=True, also=("sensors",)),
+    "objects-open": Stage(replace(OBJECTS, steps=16_000, detector=False), is_open=True, also=("sensors", "halls")),
     # Poles and walls are classes here, and are not pasted as what is none.
     "sceneseg": Stage(
         replace(
