@@ -324,9 +324,7 @@ class Pipeline:
             clusters = value("cluster", find_voters, scan, labels, support, strips, distance_per_m=per_m, rules=rules)
             if self.objects is not None or detector is not None:  # boxes outvote clusters
                 support = value("cluster", _support, scan, labels, rules, boxes, objects, detections)
-            sight = Sight(mounting.height_m or MODEL_HEIGHT_M, options.slope)
-            given = scan, labels, clusters, support, upright
-            agreed = value("agree", agree_on_points, *given, view=cells, sight=sight, rules=rules)
+            agreed = value("agree", self._agreed, scan, labels, clusters, support, upright, cells, mounting)
             trusted = joined = value("agree", agree_on_boxes, boxes, scan, agreed, rules)
         if self.ranged and options.boxes_from != "network":
             left = agreed if self.objects is None or not rules else value("cluster", _unboxed, agreed, support)
@@ -378,6 +376,19 @@ class Pipeline:
             return network.label(turned(points, turn_rad) if k else points, heights, watch), rows
         finally:
             self._free.append(network)
+
+    def _agreed(
+        self,
+        scan: Scan,
+        labels: PointLabels,
+        clusters: Ids,
+        support: Support,
+        upright: NDArray[np.uint8],
+        cells: TopView | None,
+        mounting: Mounting,
+    ) -> PointLabels:
+        sight, rules = Sight(mounting.height_m or MODEL_HEIGHT_M, self.options.slope), self.options.rules
+        return agree_on_points(scan, labels, clusters, support, upright, view=cells, sight=sight, rules=rules)
 
     def _join(self, boxes: Sequence[Box], objects: Sequence[Box]) -> Sequence[Box]:
         """Boxes of the network, and those around clusters; one that the network should have found is weighed."""
