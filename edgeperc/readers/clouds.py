@@ -234,6 +234,9 @@ def cloud_table(message: Any) -> NDArray[Any]:
             row_step = width * step
         # A field with several values per point, such as a descriptor, is not a coordinate.
         fields = {f.name: f for f in message.fields if f.count in (0, 1) and 1 <= f.datatype <= len(_CLOUD_TYPES)}
+        for f in fields.values():  # numpy's own check of this overflows at 2**31, and then it reads foreign memory
+            if not 0 <= f.offset <= step - int(_CLOUD_TYPES[f.datatype - 1][1]):
+                raise ValueError(f"the field {f.name!r} at byte {f.offset} is not within the {step} bytes of a point")
         order = ">" if message.is_bigendian else "<"
         dtype = np.dtype(
             {
