@@ -20,6 +20,7 @@ _LEAST_SLOPE, _RISING, _UPPER_PART, _FEWEST = 0.1, 0.002, 0.4, 30
 # 0.06 in 29 real scans of four sensors of such beams, and 0.1 in 75 drawn streets.
 _BELOW_M, _ABOVE_M, _SHARE, _SECTORS = 0.3, 0.15, 0.3, 0.35
 _CLEAR_M, _ON_ROOF_M = 0.1, 0.5  # between a vehicle and the ceiling, and the sensor on it
+_SURE = 0.5  # half of the score has what the object network does not see: below a ceiling, a wall or a beam
 _BEHIND_M = 1.5  # how much of a vehicle may be estimated to lie behind a wall
 
 
@@ -73,7 +74,7 @@ def without_impossible(boxes: Sequence[Box], points: Points, mounting: Mounting)
     return tuple(
         box
         for (box, top_m), is_tall in zip(kept, tall, strict=True)
-        if not is_tall or (top_m <= most_m and not _sticks_out(box, outline))
+        if not is_tall or (box.score > _SURE and top_m <= most_m and not _sticks_out(box, outline))
     )
 
 

@@ -261,7 +261,7 @@ def test_most_drops_are_left_out_and_hardly_anything_else(kind: str) -> None:
 
 
 def test_a_perceiver_tells_of_each_kind_once_and_leaves_drops_out() -> None:
-    perceive, scan = Perceiver(), clear(10)
+    perceive, scan = Perceiver(), clear(11)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         found = perceive(scan)
