@@ -366,12 +366,14 @@ def _live_source(arguments: argparse.Namespace) -> Path:
 _MOST_PERCEIVERS = 4
 
 
-def _needs_no_camera(scans: Sequence[Path]) -> str:
+def _needs_no_camera(scans: Sequence[Path | Remote]) -> str:
     """What to say of scans with a camera model: what the first one is, if it is a film, an image or another format."""
     from ..readers.unknown import advice_for
 
     for scan in scans[:1]:
-        if scan.suffix.lower() != ".bin" and scan.is_file():  # values may begin with any bytes
+        if (
+            isinstance(scan, Path) and scan.suffix.lower() != ".bin" and scan.is_file()
+        ):  # values may begin with any bytes
             with suppress(OSError), scan.open("rb") as file:
                 if advice := advice_for(file.read(300)):
                     return f"{scan}: this is {advice}"

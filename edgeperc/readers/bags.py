@@ -218,6 +218,8 @@ class Ros1Bag:
     def _learn_from_index(self, file: BinaryIO) -> None:
         for fields, content in _ros1_records(file, self._index(file), self._path.stat().st_size):
             self._learn(fields, content)
+        if not self._connections:
+            raise PointsError("the index of the bag names no topic")
 
     def _index(self, file: BinaryIO) -> int:
         """Where the index begins, which is behind all messages; PointsError if the file ends before."""

@@ -72,7 +72,8 @@ def ros1_bag(path: Path, topics: Sequence[tuple[str, str, str, Sequence[bytes]]]
         )
         for n, message in enumerate(sent):
             content += fields(op=b"\2", conn=number, time=struct.pack("<II", 1000, step_ns * n)) + sized(message)
-    path.write_bytes(content)
+    # The index, which is empty, begins at the end of the file.
+    path.write_bytes(content.replace(b"index_pos=" + bytes(8), b"index_pos=" + struct.pack("<Q", len(content)), 1))
     return path
 
 
