@@ -29,7 +29,7 @@ from fuzz.tiny import GRAPH, model
 from tiny_model import field
 
 import edgeperc.perceiver as perceiver_module
-from edgeperc import Box, Perceiver, SensorProfile, Tracker
+from edgeperc import Box, Perceiver, SensorProfile, Tracker, Trajectory
 from edgeperc.camera.calibration import read_kitti_calibration
 from edgeperc.errors import EdgepercError, InferenceError, ModelFileError, PointsError, TrackingError
 from edgeperc.inference.session import Session
@@ -287,3 +287,16 @@ def test_damaged_checkpoints(tmp_path: Path, change: int) -> None:
         path.write_bytes(damaged[change - len(CHANGES)])
     with pytest.raises(CheckpointError, match=r"checkpoint\.pt"):
         load(path)
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize(("column", "value"), [(0, "inf"), (0, "-1e999"), (2, "nan"), (5, "inf")])
+def test_poses_that_are_not_finite_are_refused(tmp_path: Path, column: int, value: str) -> None:
+    """Two infinite times made numpy warn."""
+    rows = [[f"{k}.5", "1", "2", "3", "0", "0", "0.6", "0.8"] for k in range(4)]
+    for row in rows[1:3]:
+        row[column] = value
+    path = tmp_path / "poses.txt"
+    path.write_text("\n".join(" ".join(row) for row in rows))
+    with pytest.raises(EdgepercError, match=r"poses\.txt"):
+        Trajectory.from_tum(path)

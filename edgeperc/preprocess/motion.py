@@ -182,7 +182,7 @@ class Trajectory:
         if not (np.abs(norm - 1.0) < 1e-2).all():
             line = _line(content, int(np.argmax(~(np.abs(norm - 1.0) < 1e-2))))
             raise TrackingError(f"{path}: the quaternion of line {line} has not length 1")
-        rises = np.diff(rows[:, 0]) > 0.0
+        rises = rows[1:, 0] > rows[:-1, 0]
         if not rises.all():
             line = _line(content, int(np.argmin(rises)) + 1)
             raise StampError(f"{path}: the time of line {line} is not later than that before; expected times that rise")
