@@ -185,7 +185,7 @@ class ObjectNetwork:
         candidates = Candidates(detected, cells)
         if options.boxes_from != "network":
             candidates = find_candidates(scan, cells, detected, options.distance_per_m)
-        return with_points(candidates, crop_candidates(scan, candidates, self.view.n_points, self.view.margin_m))
+        return with_points(candidates, self._crop(scan, candidates))
 
     def find_boxes(self, scan: Scan, candidates: tuple[Candidates, Crops], min_score: float) -> tuple[Box, ...]:
         """Boxes of the candidates, and of a second look at each box that was found (Cai and Vasconcelos, 2018)."""
@@ -226,10 +226,13 @@ class ObjectNetwork:
 
     def _look_at(self, scan: Scan, candidates: Candidates) -> NDArray[np.float64]:
         """What the network finds at places, (n, 10), with a score of 0 where there are too few points."""
-        crops = crop_candidates(scan, candidates, self.view.n_points, self.view.margin_m)
+        crops = self._crop(scan, candidates)
         looks = self._look(candidates.rectangles, crops)
         looks[crops.counts < MIN_COUNT] = 0.0
         return looks
+
+    def _crop(self, scan: Scan, candidates: Candidates) -> Crops:
+        return crop_candidates(scan, candidates, self.view.n_points, self.view.margin_m)
 
     def _look(self, places: NDArray[np.float64], crops: Crops) -> NDArray[np.float64]:
         """Run the network on rectangles (n, 5), and decode what it finds there, (n, 10)."""

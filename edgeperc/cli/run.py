@@ -372,9 +372,8 @@ def _needs_no_camera(scans: Sequence[Path | Remote]) -> str:
     from ..readers.unknown import advice_for
 
     for scan in scans[:1]:
-        if (
-            isinstance(scan, Path) and scan.suffix.lower() != ".bin" and scan.is_file()
-        ):  # values may begin with any bytes
+        # The values of a .bin may begin with any bytes.
+        if isinstance(scan, Path) and scan.suffix.lower() != ".bin" and scan.is_file():
             with suppress(OSError), scan.open("rb") as file:
                 if advice := advice_for(file.read(300)):
                     return f"{scan}: this is {advice}"

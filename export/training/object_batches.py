@@ -109,11 +109,10 @@ def _weights(samples: ObjectSamples, names: Sequence[str]) -> NDArray[np.float64
     of_source = np.array(
         [1.0 if name.startswith("kitti") else SOURCE_WEIGHTS.get(name, OTHER_WEIGHT) for name in names]
     )
-    weights = of_source[samples.sources]
+    of_background = np.where(np.array(names) == SIMULATED, SIMULATED_BACKGROUND, of_source)
     _, inverse, n_alike = np.unique(samples.objects, return_inverse=True, return_counts=True)
     is_object = samples.classes != BACKGROUND
-    of_simulation = np.array([name == SIMULATED for name in names])[samples.sources]
-    weights = np.where(of_simulation & ~is_object, SIMULATED_BACKGROUND, weights)
+    weights = np.where(is_object, of_source[samples.sources], of_background[samples.sources])
     weights = np.where(is_object, weights * n_alike[inverse.ravel()] ** -ALIKE, weights)
     weights = np.where(is_object & (samples.origin == TRUE), TRUE_WEIGHT * weights, weights)
     weights = np.where(~is_object & (samples.origin == DETECTED), DETECTED_BACKGROUND * weights, weights)

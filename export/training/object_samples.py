@@ -36,8 +36,8 @@ from ..data.scans import LabeledScan
 from ..data.simulate import TRAINING_SENSOR
 from .object_task import VEHICLE
 
-_Scan = tuple[str, LabeledScan | Path | Callable[[], LabeledScan]]
-"""A drive, and a scan of it or what it is made by."""
+DriveScan = tuple[str, Callable[[], LabeledScan]]
+"""A drive, and what reads or makes a scan of it."""
 
 DETECTOR = "ssadnet"
 """The model whose boxes are candidates."""
@@ -77,7 +77,7 @@ class ObjectSamples(NamedTuple):
 def build_samples(
     folder: Path,
     name: str,
-    scans: Sequence[_Scan],
+    scans: Sequence[DriveScan],
     *,
     real: bool,
     detector: bool = True,
@@ -93,7 +93,7 @@ def build_samples(
             pass
 
 
-def _write_part(part: tuple[int, Sequence[_Scan]], *, folder: Path, name: str, real: bool, detector: bool) -> None:
+def _write_part(part: tuple[int, Sequence[DriveScan]], *, folder: Path, name: str, real: bool, detector: bool) -> None:
     number, scans = part
     perceive = detector and Perceiver(
         DETECTOR,
@@ -107,13 +107,9 @@ def _write_part(part: tuple[int, Sequence[_Scan]], *, folder: Path, name: str, r
         adapt="none",
     )
     samples = []
-    for k, (drive, given) in enumerate(scans):
-        if isinstance(given, LabeledScan):
-            scan = given
-        else:
-            scan = LabeledScan.load(given) if isinstance(given, Path) else given()
+    for k, (drive, scan) in enumerate(scans):
         rng = np.random.default_rng((number, k, len(name)))
-        samples.append(samples_of(scan, f"{name}/{drive}", perceive or None, rng, real=real))
+        samples.append(samples_of(scan(), f"{name}/{drive}", perceive or None, rng, real=real))
     joined = ObjectSamples(*(np.concatenate(arrays) for arrays in zip(*samples, strict=True)))
     with open_atomic(folder / f"{name}-{number:03d}.npz") as file:
         np.savez(file, **joined._asdict())

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
 
@@ -17,9 +17,7 @@ from ..data.augment import Augmentation, ObjectBank, augmented
 from ..data.beams import drawn_sensor
 from ..data.scan_sets import read_scan_set
 from ..data.scans import LabeledScan
-from .object_samples import build_samples
-
-_Scan = Callable[[], LabeledScan]
+from .object_samples import DriveScan, build_samples
 
 VALIDATION = "validation"
 PASTED = "pasted"
@@ -65,24 +63,20 @@ def write_samples(
     for folder in scan_sets:
         of_set, _, hashes[folder.layout.name] = read_scan_set(folder, "train")
         drives = [folder.drives[name.partition("/")[2]] for name in hashes[folder.layout.name]]
-        labeled = [(drive, partial(_same, scan)) for drive, scan in zip(drives, of_set, strict=True)]
+        labeled = [(drive, partial(replace, scan)) for drive, scan in zip(drives, of_set, strict=True)]
         build(folder.layout.name, labeled, real=True)
         build(f"{folder.layout.name}-{PASTED}", variants(labeled), real=True)
         names += [folder.layout.name, f"{folder.layout.name}-{PASTED}"]
         hashes[names[-1]] = {}
     if simulated is not None:
         files = sorted(simulated.glob("*.npz"))
-        build("simulated", [(file.stem, file) for file in files], real=False)
+        build("simulated", [(file.stem, partial(LabeledScan.load, file)) for file in files], real=False)
         names.append("simulated")
         hashes["simulated"] = {}
     return names, hashes
 
 
-def _same(scan: LabeledScan) -> LabeledScan:
-    return scan
-
-
-def variants(scans: Sequence[tuple[str, _Scan]]) -> list[tuple[str, _Scan]]:
+def variants(scans: Sequence[DriveScan]) -> list[DriveScan]:
     """The scans of drives, with objects of these scans alone pasted in: leaving them out leaves those out."""
     bank = _Bank([scan for _, scan in scans])
     return [(drive, _Pasted(scan, bank, k)) for drive, scan in scans for k in range(N_VARIANTS)]
@@ -91,7 +85,7 @@ def variants(scans: Sequence[tuple[str, _Scan]]) -> list[tuple[str, _Scan]]:
 class _Bank:
     """The objects of scans, cut out when they are needed; another process gets these alone."""
 
-    def __init__(self, scans: Sequence[_Scan]) -> None:
+    def __init__(self, scans: Sequence[Callable[[], LabeledScan]]) -> None:
         self._scans = scans
 
     @cached_property
