@@ -5,10 +5,12 @@ JOBS ?= 2
 SHELL := /bin/bash
 .SHELLFLAGS := -euo pipefail -c
 .DELETE_ON_ERROR:
-# Each pytest takes all cores. What takes one runs beside others of its kind: ALONGSIDE=1 is for `make test` itself.
+# Each pytest takes all cores. What takes one runs beside others of its kind: ALONGSIDE=1 is for `make test` itself. With one
+# process for each, the tests are imported once, and no two compile the same kernel.
 ifndef ALONGSIDE
 .NOTPARALLEL:
 endif
+WORKERS = $(if $(ALONGSIDE),0,$(JOBS))
 # Without .pyc files, each of the tests' processes would compile what it imports.
 unexport PYTHONDONTWRITEBYTECODE
 .DEFAULT_GOAL := help
@@ -28,7 +30,7 @@ SCANS ?= 20000
 # Of make test-extra.
 EXTRA ?= ros
 
-.PHONY: help demo test check test-full test-kernels test-wheel test-minimal test-lowest test-ahead test-newest test-extra test-arm docs fuzz soak release sbom clean
+.PHONY: help demo test check test-full test-kernels test-interpreted test-bounds test-wheel test-minimal test-lowest test-ahead test-newest test-extra test-arm docs fuzz soak release sbom clean
 
 help:
 	@echo "make demo          perceive the bundled scene: a table, and a picture in demo/"
@@ -53,8 +55,8 @@ demo: .venv/installed
 	$(BIN)/edgeperc demo --out demo
 
 test: .venv-test/installed
-	$(MAKE) --no-print-directory --jobs $(JOBS) ALONGSIDE=1 check docs test-wheel .venv-minimal/installed
-	$(MAKE) --no-print-directory test-full test-kernels test-minimal
+	$(MAKE) --no-print-directory --jobs $(JOBS) ALONGSIDE=1 test-minimal test-interpreted test-bounds check docs test-wheel
+	$(MAKE) --no-print-directory test-full
 
 check: .venv-test/installed
 	$(TEST)/ruff check .
@@ -64,11 +66,17 @@ check: .venv-test/installed
 test-full: .venv-test/installed
 	$(TEST)/pytest -n $(JOBS) --dist worksteal
 
-# Interpreted, a kernel answers as it does compiled; compiled, it stays inside its arrays. To import the other tests took 11 s.
-test-kernels: KERNEL = -m kernel $$(grep --recursive --files-with-matches --include='test_*.py' -E 'twins|mark\.kernel' tests)
+# Interpreted, a kernel answers as it does compiled; compiled, it stays inside its arrays, which is known without optimizing
+# it. To import the other tests took 11 s.
 test-kernels: .venv-test/installed
-	NUMBA_DISABLE_JIT=1 $(TEST)/pytest -q -n $(JOBS) --dist worksteal --every-kernel $(KERNEL)
-	NUMBA_BOUNDSCHECK=1 NUMBA_CACHE_DIR=$(CURDIR)/.venv-test/bounds-checked $(TEST)/pytest -q -n $(JOBS) --dist worksteal $(KERNEL)
+	$(MAKE) --no-print-directory --jobs $(JOBS) ALONGSIDE=1 test-interpreted test-bounds
+
+test-interpreted test-bounds: KERNEL = -q -m kernel $$(grep --recursive --files-with-matches --include='test_*.py' -E 'twins|mark\.kernel' tests)
+test-interpreted: .venv-test/installed
+	NUMBA_DISABLE_JIT=1 $(TEST)/pytest --every-kernel $(KERNEL)
+
+test-bounds: .venv-test/installed
+	NUMBA_BOUNDSCHECK=1 NUMBA_OPT=0 NUMBA_CACHE_DIR=$(CURDIR)/.venv-test/bounds-checked $(TEST)/pytest $(KERNEL)
 
 docs: .venv-test/installed
 	$(TEST)/python -m sphinx -W --keep-going -q -b html docs docs/_build/html

@@ -304,7 +304,8 @@ def edgeperc_run(*arguments: object, limit: Callable[[], None] = lambda: None, *
         signal.signal(signal.SIGINT, signal.default_int_handler)
         limit()
 
-    command = [sys.executable, "-m", "edgeperc", "run", *map(str, arguments)]
+    # -B, because Python would keep the half of a .pyc file that is larger than a limit, and fail with it from then on.
+    command = [sys.executable, "-B", "-m", "edgeperc", "run", *map(str, arguments)]
     command += ["--provider", "cpu", "--threads", "1", "--on-mismatch", "ignore"]
     options = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True} | options
     return subprocess.Popen(command, preexec_fn=with_signals, **options)
@@ -384,9 +385,7 @@ def test_files_that_are_too_large_fail_their_scan(folder: Path, tmp_path: Path, 
     def limit() -> None:
         resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096))
 
-    command = [sys.executable, "-m", "edgeperc", "run", str(folder), "--json", "--model", "pointseg"]
-    command += ["--provider", "cpu", "--threads", "1", "--on-mismatch", "ignore", kind, "--out", str(tmp_path / "out")]
-    process = subprocess.Popen(command, preexec_fn=limit, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    process = edgeperc_run(folder, "--json", "--model", "pointseg", kind, "--out", tmp_path / "out", limit=limit)
     check_failed(process, tmp_path / "out", "File too large")
 
 
