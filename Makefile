@@ -85,13 +85,14 @@ docs: .venv-test/installed
 test-wheel: .venv-test/installed
 	PYTHON=$(TEST)/python tests/wheel_demo.sh
 
-# The tests of kernels import no extra, nor do those of the cache, the first start, the source files and the packages that
-# compute alone: that each of their modules can be imported without extras is a test of the public API.
-test-minimal: COMPUTING = agreement evaluation ground objects preprocess road simulation tracking
+# Packages with a module that loads an extra (tests/test_layering.py holds the others to loading none), and the whole: all other
+# tests would run the same code again.
+test-minimal: WHOLE = live perceiver processes public_api silence zoo
+test-minimal: LOADING = bench cli datasets readers ros2 sinks system view
 test-minimal: .venv-minimal/installed
 	$(MINIMAL)/python -c "import importlib.util as u; assert not any(map(u.find_spec, ['torch', 'onnx', 'matplotlib']))"
-	$(MINIMAL)/pytest -n $(JOBS) --dist worksteal -m 'not kernel and not compiled' --ignore tests/system/test_kernel_cache.py --ignore tests/test_warm_up.py --ignore tests/test_layering.py \
-		$(COMPUTING:%=--ignore tests/%)
+	$(MINIMAL)/pytest -q -n $(WORKERS) --dist worksteal -m 'not kernel and not compiled' $(WHOLE:%=tests/test_%.py) $(LOADING:%=tests/%) \
+		--ignore tests/system/test_kernel_cache.py --ignore tests/system/test_pool.py
 
 # An old matplotlib uses what newer packages below it deprecate.
 test-lowest: .venv-lowest/installed

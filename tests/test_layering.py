@@ -178,7 +178,7 @@ FLOORS = {
 }
 
 NEVER = {"edgeperc_bench", "edgeperc_export", "onnx", "pydantic", "scipy", "torch", "yaml"}
-ONLY_IN_FUNCTIONS = {"PIL", "matplotlib", "onnxruntime"}
+NEEDED = {"edgeperc", "llvmlite", "numba", "numpy", *sys.stdlib_module_names}
 RIVALS = "edgeperc_bench.peers."
 TALK_TO_ONNXRUNTIME = {"edgeperc.inference.providers", "edgeperc.inference.session"}
 # Names with an underscore of argparse, named tuples, numba and ouster-sdk that tests use.
@@ -423,8 +423,15 @@ def test_the_runtime_is_light(name: str) -> None:
     assert name in TALK_TO_ONNXRUNTIME or "onnxruntime" not in packages, f"only {TALK_TO_ONNXRUNTIME} talk to it"
     for statement in at_import(tree):
         if isinstance(statement, ast.Import | ast.ImportFrom):
-            packages = packages_imported(name, statement)
-            assert not packages & ONLY_IN_FUNCTIONS, f"line {statement.lineno}: import {packages} where it is used"
+            others = packages_imported(name, statement) - NEEDED
+            assert not others, f"line {statement.lineno}: import {others} where it is used"
+
+
+def test_the_tests_of_what_loads_extras_run_without_them() -> None:
+    """By ``make test-minimal``. `evaluation` draws, and its tests of that are skipped without matplotlib."""
+    loading = {name for name in RUNTIME if packages_imported(name, tree_of(name)) - NEEDED - {"onnxruntime"}}
+    (line,) = (line for line in (REPOSITORY / "Makefile").read_text().splitlines() if "LOADING = " in line)
+    assert {name.split(".")[1] for name in loading} == {*line.partition("= ")[2].split(), "evaluation"} - {"bench"}
 
 
 @pytest.mark.parametrize("name", RUNTIME)

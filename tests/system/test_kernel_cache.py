@@ -110,7 +110,7 @@ def flipped(at: int) -> Callable[[bytes], bytes]:
 
 
 DAMAGE: dict[str, Callable[[bytes], bytes]] = {
-    **{f"cut to {n}": lambda content, n=n: content[:n] for n in (0, 1, 31, 32, 33, 63, 64, 65, 100, 1000)},
+    **{f"cut to {n}": lambda content, n=n: content[:n] for n in (0, 31, 64, 1000)},
     "cut in half": lambda content: content[: len(content) // 2],
     "without its last byte": lambda content: content[:-1],
     "one byte longer": lambda content: content + b"\0",
@@ -118,7 +118,7 @@ DAMAGE: dict[str, Callable[[bytes], bytes]] = {
     "zeros": lambda content: bytes(len(content)),
     "text": lambda _: b"not machine code\n" * 100,
     "random": lambda content: np.random.default_rng(0).bytes(len(content)),
-    **{f"bit flipped at {at}": flipped(at) for at in [*range(0, 70, 9), *range(101, 8000, 997)]},
+    **{f"bit flipped at {at}": flipped(at) for at in [0, 31, 32, 63, 64, *range(101, 8000, 3000)]},
 }
 
 
@@ -424,10 +424,13 @@ def refusing(owner: Any, name: str, error: type[Exception]) -> Callable[..., Any
 
 
 @pytest.mark.parametrize(
-    ("owner", "name"),
-    [(CPUCodeLibrary, "_get_module_for_linking"), (CompileResult, "_reduce"), (serialize, "dumps")],
+    ("owner", "name", "error"),
+    [
+        (CPUCodeLibrary, "_get_module_for_linking", AttributeError),
+        (CompileResult, "_reduce", AssertionError),
+        (serialize, "dumps", pickle.PicklingError),
+    ],
 )
-@pytest.mark.parametrize("error", [AttributeError, pickle.PicklingError, AssertionError])
 def test_a_kernel_that_numba_cannot_write_is_compiled_at_every_start(
     place: Place, monkeypatch: pytest.MonkeyPatch, owner: Any, name: str, error: type[Exception]
 ) -> None:
