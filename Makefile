@@ -87,7 +87,7 @@ test-wheel: .venv-test/installed
 
 # Packages with a module that loads an extra (tests/test_layering.py holds the others to loading none), and the whole: all other
 # tests would run the same code again.
-test-minimal: WHOLE = live perceiver processes public_api silence zoo
+test-minimal: WHOLE = live perceiver public_api silence zoo
 test-minimal: LOADING = bench cli datasets readers ros2 sinks system view
 test-minimal: .venv-minimal/installed
 	$(MINIMAL)/python -c "import importlib.util as u; assert not any(map(u.find_spec, ['torch', 'onnx', 'matplotlib']))"

@@ -146,6 +146,19 @@ def own_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
         yield
 
 
+@pytest.fixture(scope="session", autouse=True)
+def scenes_are_simulated_once() -> Iterator[None]:
+    """Evaluations, exports and benchmarks take the same scenes. In `simulation` each is drawn anew."""
+    from edgeperc.simulation import samples
+    from scenes import Once
+
+    once = Once()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(samples, "random_scene", once.scene)
+        patch.setattr(samples, "simulate", once.scan)
+        yield
+
+
 @pytest.fixture(autouse=True)
 def own_signals() -> Iterator[None]:
     """No test may leave a handler: the next one that raises its signal would end the whole run."""

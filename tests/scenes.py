@@ -4,9 +4,14 @@ from __future__ import annotations
 
 import functools
 import io
+from collections import OrderedDict
+from dataclasses import fields, replace
+from typing import Any
+
+import numpy as np
 
 from edgeperc.simulation import random_scene, simulate
-from edgeperc.simulation.scene import SimulatedScan
+from edgeperc.simulation.scene import Scene, SimulatedScan
 from edgeperc.types.perception import Box
 from edgeperc.types.sensor import SensorProfile
 
@@ -30,6 +35,29 @@ def urban(seed: int, sensor: str | SensorProfile = "hdl-64e") -> SimulatedScan:
     scan = simulate(random_scene(seed, "urban"), sensor, seed=seed)
     scan.points.flags.writeable = False
     return scan
+
+
+class Once:
+    """In place of the two functions of `edgeperc.simulation.samples` that take time: the last scenes and scans are kept."""
+
+    MOST = 40
+
+    def __init__(self) -> None:
+        self.scene = functools.lru_cache(self.MOST)(random_scene)
+        self._scans: OrderedDict[Any, tuple[Scene, SimulatedScan]] = OrderedDict()
+
+    def scan(self, scene: Scene, *arguments: Any, **options: Any) -> SimulatedScan:
+        """Each caller has arrays of its own."""
+        values = (*arguments, *options.items())
+        key = id(scene), repr([(each.tobytes() if isinstance(each, np.ndarray) else each) for each in values])
+        if key not in self._scans:
+            self._scans[key] = scene, simulate(scene, *arguments, **options)
+            while len(self._scans) > self.MOST:
+                self._scans.popitem(last=False)
+        self._scans.move_to_end(key)
+        scan = self._scans[key][1]
+        arrays = {field.name: getattr(scan, field.name) for field in fields(scan)}
+        return replace(scan, **{name: a.copy() for name, a in arrays.items() if isinstance(a, np.ndarray)})
 
 
 class Terminal(io.StringIO):

@@ -304,19 +304,18 @@ def test_a_closed_stdout_is_no_error(program: str) -> None:
 
 @posix
 @pytest.mark.skipif(sys.platform != "linux", reason="elsewhere file names are Unicode")
-@pytest.mark.parametrize("encoding", ["utf-8", "ascii"])
 @pytest.mark.parametrize(
-    ("program", "arguments"),
+    ("program", "arguments", "encoding"),
     [
-        ("edgeperc", ["info", "NAME"]),
-        ("edgeperc", ["run", "NAME"]),
-        ("edgeperc", ["NAME"]),
-        ("edgeperc", ["models", "--NAME"]),
-        ("edgeperc-bench", ["compare", "NAME", "NAME"]),
-        ("edgeperc-bench", ["compare", "a", "b", "NAME"]),
-        ("edgeperc-export", ["database-check", "NAME"]),
-        ("edgeperc-export", ["card", "NAME", "NAME", "NAME"]),
-        ("edgeperc-export", ["NAME"]),
+        ("edgeperc", ["info", "NAME"], "utf-8"),
+        ("edgeperc", ["run", "NAME"], "ascii"),
+        ("edgeperc", ["NAME"], "utf-8"),
+        ("edgeperc", ["models", "--NAME"], "ascii"),
+        ("edgeperc-bench", ["compare", "NAME", "NAME"], "utf-8"),
+        ("edgeperc-bench", ["compare", "a", "b", "NAME"], "ascii"),
+        ("edgeperc-export", ["database-check", "NAME"], "utf-8"),
+        ("edgeperc-export", ["card", "NAME", "NAME", "NAME"], "ascii"),
+        ("edgeperc-export", ["NAME"], "utf-8"),
     ],
 )
 def test_names_of_files_cannot_control_the_terminal(
