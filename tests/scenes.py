@@ -38,7 +38,7 @@ def urban(seed: int, sensor: str | SensorProfile = "hdl-64e") -> SimulatedScan:
 
 
 class Once:
-    """In place of the two functions of `edgeperc.simulation.samples` that take time: the last scenes and scans are kept."""
+    """In place of what takes time in `edgeperc.simulation.samples`: the last scenes and scans are kept."""
 
     MOST = 40
 
