@@ -90,17 +90,6 @@ def use_kernels(site: Path, **environment: str) -> dict[str, Any]:
     return report
 
 
-def home(folder: Path) -> dict[str, str]:
-    """Settings that make ``folder`` the home of a user, on each platform."""
-    return {name: str(folder) for name in ("HOME", "USERPROFILE", "LOCALAPPDATA", "XDG_CACHE_HOME")}
-
-
-def forbid_writing(site: Path) -> None:
-    """Make the package's cache folders impossible to create; permissions would not stop root."""
-    for folder in {source.parent for source in (site / "edgeperc").rglob("*.py")}:
-        (folder / "__pycache__").write_bytes(b"")
-
-
 @needs_compiler
 def test_the_second_process_compiles_nothing_and_an_edited_kernel_is_compiled_again(site: Path) -> None:
     first, second = use_kernels(site), use_kernels(site)
@@ -117,27 +106,6 @@ def test_the_second_process_compiles_nothing_and_an_edited_kernel_is_compiled_ag
     edited = use_kernels(site)
     assert edited["misses"] == 1  # that of the kernel that reads it
     assert edited["sum"] == first["sum"]
-
-
-@needs_compiler
-def test_a_read_only_installation_caches_in_the_users_folder(site: Path, tmp_path: Path) -> None:
-    forbid_writing(site)
-    first, second = use_kernels(site, **home(tmp_path / "home")), use_kernels(site, **home(tmp_path / "home"))
-    assert all(Path(folder).is_relative_to(tmp_path / "home") for folder in first["folders"])
-    assert second["hits"] == first["misses"] == first["kernels"]
-    assert second["sum"] == first["sum"]
-
-
-@needs_compiler
-def test_read_only_system_caches_in_the_given_folder(site: Path, tmp_path: Path) -> None:
-    """No folder of the package or of the user can be written; ``NUMBA_CACHE_DIR`` names one that can."""
-    forbid_writing(site)
-    nowhere = tmp_path / "nowhere"
-    nowhere.write_bytes(b"")
-    settings = home(nowhere / "home") | {"NUMBA_CACHE_DIR": str(tmp_path / "cache")}
-    first, second = use_kernels(site, **settings), use_kernels(site, **settings)
-    assert all(Path(folder).is_relative_to(tmp_path / "cache") for folder in first["folders"])
-    assert second["hits"] == first["misses"] == first["kernels"]
 
 
 def test_without_onnxruntime_a_perceiver_names_the_install_command(site: Path) -> None:

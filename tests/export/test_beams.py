@@ -75,16 +75,23 @@ def test_a_sensor_without_beams_has_points_in_its_field_of_view_alone(scan: Labe
     assert shares[0] < shares[1] < shares[2]
 
 
+@pytest.fixture(scope="module")
+def places(scan: LabeledScan) -> dict[tuple[float, ...], int]:
+    """The label of the point at a place."""
+    return {tuple(place): label for place, label in zip(scan.points[:, :3].tolist(), scan.labels, strict=True)}
+
+
 @given(st.integers(0, 2**32))
 @settings(max_examples=40, deadline=None)
-def test_points_labels_and_boxes_stay_together(scan: LabeledScan, seed: int) -> None:
+def test_points_labels_and_boxes_stay_together(
+    scan: LabeledScan, places: dict[tuple[float, ...], int], seed: int
+) -> None:
     rng = np.random.default_rng(seed)
     sensor = drawn_sensor(rng)
     out = taken_by(sensor, scan, rng)
     assert out.points.dtype == np.float32
     assert ((out.points[:, 3] >= 0.0) & (out.points[:, 3] <= 1.0)).all()
     assert (out.boxes, out.counts, out.sensor) == (scan.boxes, scan.counts, sensor)
-    places = {tuple(place): label for place, label in zip(scan.points[:, :3].tolist(), scan.labels, strict=True)}
     assert all(
         places[tuple(place)] == label for place, label in zip(out.points[:, :3].tolist(), out.labels, strict=True)
     )
