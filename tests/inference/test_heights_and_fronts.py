@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 from unittest import mock
@@ -23,6 +24,7 @@ from edgeperc.inference.projection import make_projector, project
 from edgeperc.inference.session import Session
 from edgeperc.pipeline import BoxesFrom
 from edgeperc.simulation.samples import simulated_scan
+from edgeperc.types.card import ModelCard
 from edgeperc.types.mounting import MODEL_MOUNTING
 from edgeperc_export.networks import build
 from edgeperc_export.recipe import Recipe
@@ -55,18 +57,34 @@ def untrained(recipe: Recipe, path: Path) -> Path:
     return path
 
 
+@pytest.fixture(scope="module")
+def exported(
+    tmp_path_factory: pytest.TempPathFactory, scans: Sequence[NDArray[np.float32]]
+) -> Callable[[Recipe], tuple[Path, ModelCard]]:
+    """An untrained network, exported once. That raises if onnxruntime's labels or boxes differ."""
+
+    @functools.cache
+    def of(recipe: Recipe) -> tuple[Path, ModelCard]:
+        folder = tmp_path_factory.mktemp("exported")
+        path = folder / "model.onnx"
+        return path, export(untrained(recipe, folder / "checkpoint.pt"), path, scans=scans, fitness=None)
+
+    return of
+
+
+HEIGHTS = Recipe("pointseg", edge=True, height_above_ground=True)
+
+
 @pytest.mark.parametrize(
-    "recipe",
-    [
-        Recipe("pointseg", edge=True, height_above_ground=True),
-        Recipe("ssadnet", edge=True, front=True),
-    ],
-    ids=lambda recipe: recipe.network,
+    "recipe", [HEIGHTS, Recipe("ssadnet", edge=True, front=True)], ids=lambda recipe: recipe.network
 )
-def test_from_training_to_the_vehicle(tmp_path: Path, scans: Sequence[NDArray[np.float32]], recipe: Recipe) -> None:
-    path, top = tmp_path / "model.onnx", recipe.network == "ssadnet"
-    checkpoint = untrained(recipe, tmp_path / "checkpoint.pt")
-    card = export(checkpoint, path, scans=scans, fitness=None)  # raises if onnxruntime's labels or boxes differ
+def test_from_training_to_the_vehicle(
+    exported: Callable[[Recipe], tuple[Path, ModelCard]],
+    tmp_path: Path,
+    scans: Sequence[NDArray[np.float32]],
+    recipe: Recipe,
+) -> None:
+    (path, card), top = exported(recipe), recipe.network == "ssadnet"
     assert card.parity["n_scans"] == N_SCANS
     assert card.input.needs_ground is not top
     assert card.output_shape("box_dense")[1] == (11 if top else 9)
@@ -92,7 +110,7 @@ def test_from_training_to_the_vehicle(tmp_path: Path, scans: Sequence[NDArray[np
             path,
             rounded,
             Calibration(scans),
-            LabeledSets(n_simulated=2),
+            LabeledSets(n_simulated=1),
             max_noise=9.0,
             race=lambda *_: (10.0 + NOISE[0], 5.0 + NOISE[1]),
         )
@@ -101,9 +119,10 @@ def test_from_training_to_the_vehicle(tmp_path: Path, scans: Sequence[NDArray[np
     assert session.precision == "int8"
 
 
-def test_interpolated_points_have_heights_too(tmp_path: Path, scans: Sequence[NDArray[np.float32]]) -> None:
-    recipe, path = Recipe("pointseg", edge=True, height_above_ground=True), tmp_path / "model.onnx"
-    export(untrained(recipe, tmp_path / "checkpoint.pt"), path, scans=scans[:1], fitness=None)
+def test_interpolated_points_have_heights_too(
+    exported: Callable[[Recipe], tuple[Path, ModelCard]], scans: Sequence[NDArray[np.float32]]
+) -> None:
+    path, _ = exported(HEIGHTS)
     coarse: dict[str, Any] = {"sensor": SensorProfile.uniform("coarse", 32, 2.0, -24.8), "on_mismatch": "ignore"}
     for full_turn in (False, True):
         filled = Perceiver(path, provider="cpu", full_turn=full_turn, **coarse)
