@@ -25,6 +25,7 @@ BoxesFrom = Literal["both", "network", "clusters"]
 # A look that gives less sees nothing. All round on PandaSet, Lyft, Argoverse 2 and DDAD, 8 of 25 boxes that others show
 # and the network of objects does not see are at a vehicle, and 26 of 33 that it sees.
 SEEN = 0.1
+HALF_TURN = np.array([0.0, 0.0, 0.0, 0.0, np.pi])  # of a rectangle
 AGAIN = 0.15  # boxes with less are not looked at again: a second look confirmed none of them on PandaSet and Lyft
 
 
@@ -50,11 +51,16 @@ class ObjectNetwork:
         return with_points(candidates, self._crop(scan, candidates))
 
     def find_boxes(self, scan: Scan, candidates: tuple[Candidates, Crops], min_score: float) -> tuple[Box, ...]:
-        """Boxes of the candidates, and of a second look at each box that was found (Cai and Vasconcelos, 2018)."""
+        """Boxes of the candidates, and of a second look at each (Cai and Vasconcelos, 2018), from both of its ends.
+
+        What the network makes of points depends a little on the end of the rectangle that they are given from.
+        """
         (places, cells), crops = candidates
         found = merge_boxes(self._look(places, crops), self.card.classes)
         found = found[found[:, SCORE] >= AGAIN]
-        confirmed = confirm_boxes(found, self._look_at(scan, Candidates(footprints(found), cells)))
+        ends = np.concatenate([footprints(found), footprints(found) + HALF_TURN])
+        again = self._look_at(scan, Candidates(ends, cells)).reshape(2, *found.shape)
+        confirmed = confirm_boxes(found, again)
         return tuple(boxes_of_objects(merge_boxes(confirmed, self.card.classes), self.card.classes, min_score))
 
     def complete(
