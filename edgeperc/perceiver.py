@@ -20,10 +20,11 @@ from .camera.image import ImageScaler, as_image, label_pixels
 from .errors import EdgepercError, FitnessError, ImageError, MountingError, OptionError, PointsError
 from .ground.ceiling import find_ceiling
 from .ground.leveling import MountingEstimate, MountingEstimator, near_support, share_below
+from .inference.object_network import BoxesFrom, ObjectNetwork
 from .inference.pillar_network import PillarNetwork
 from .inference.session import Session
 from .objects.boxes import MIN_SCORE
-from .pipeline import BoxesFrom, ObjectNetwork, Options, Pipeline, RangeImageNetwork, TopViewNetwork
+from .pipeline import Options, Pipeline, RangeImageNetwork, TopViewNetwork
 from .preprocess.condition import scale
 from .preprocess.findings import Finding, check_beams, check_dropped, check_ground, check_profiles, with_raw_remission
 from .preprocess.fitness import FitnessProfile

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,37 +28,28 @@ from .ground.planes import FIRST_REACH_HEIGHTS, FIRST_REACH_M, GroundFit, fit_gr
 from .ground.scan import Scan
 from .inference.crop import Crop, sectors_of_turn, spread
 from .inference.decode import decode_boxes, decode_cells, decode_labels
+from .inference.object_network import BoxesFrom, ObjectNetwork
 from .inference.pillar_network import PillarNetwork
 from .inference.projection import RangeImageProjector, input_heights, make_projector
-from .inference.session import MAX_ROWS, Session
-from .objects.boxes import join_boxes, not_among, objects_from_points, weigh
-from .objects.candidate_boxes import SCORE, boxes_of_objects, confirm_boxes, decode_objects, footprints, merge_boxes
-from .objects.candidates import MIN_DETECTOR_SCORE, Candidates, CellBuffer, find_candidates
-from .objects.cluster import PERSONS, sort_points
-from .objects.crops import MIN_COUNT, Crops, crop_candidates, fill_features, with_points
+from .inference.session import Session
+from .objects.boxes import join_boxes, objects_from_points, weigh
+from .objects.candidates import MIN_DETECTOR_SCORE
+from .objects.cluster import sort_points
 from .objects.linkage import Strips
 from .objects.refine import label_points, remove_outliers
 from .preprocess.interpolation import Interpolator
 from .system.lanes import Lanes, Once, Stopwatch
 from .types.frame import turned
-from .types.geometry import rectangles
 from .types.mounting import MODEL_HEIGHT_M, Mounting
 from .types.perception import Box, GroundSurface, PointLabels, TopView
 from .types.points import Heights, Ids, Points, Rows
 from .types.sensor import SensorProfile
-from .types.views import ObjectGeometry, RangeImageGeometry, TopViewGeometry
+from .types.views import RangeImageGeometry, TopViewGeometry
 
 # What is taken from the scores of the object network, so that points are completed from 0.7 and supported from 0.5 on.
 # All round on PandaSet, Lyft, Argoverse 2 and DDAD, 191 of 191 vehicles' boxes from 0.7 on are at a vehicle, and 236 of
 # 304 from 0.5 to 0.7.
 LESS_SURE = 0.2
-
-# A look that gives less sees nothing. All round on PandaSet, Lyft, Argoverse 2 and DDAD, 8 of 25 boxes that others show
-# and the network of objects does not see are at a vehicle, and 26 of 33 that it sees.
-SEEN = 0.1
-AGAIN = 0.15  # boxes with less are not looked at again: a second look confirmed none of them on PandaSet and Lyft
-
-BoxesFrom = Literal["both", "network", "clusters"]
 
 
 class Parts(NamedTuple):
@@ -168,84 +159,6 @@ class RangeImageNetwork:
         return PointLabels(labels, pixel >= 0, self.card.classes)
 
 
-class ObjectNetwork:
-    """Objects all around: class, box and front from the points of every place where an object may be."""
-
-    def __init__(self, session: Session) -> None:
-        view = session.card.view
-        assert isinstance(view, ObjectGeometry)
-        self.session, self.card, self.view = session, session.card, view
-        self._cells = CellBuffer()
-        self._scale = np.array([session.card.input.mean, session.card.input.std], np.float32)
-
-    def crop(self, scan: Scan, boxes: Sequence[Box], options: Options) -> tuple[Candidates, Crops]:
-        """Where objects may be, with the points there: clusters, and boxes of the top view."""
-        cells = self._cells.sort(scan, self.view.height_range_m)
-        detected = rectangles(boxes if options.boxes_from != "clusters" else ())
-        candidates = Candidates(detected, cells)
-        if options.boxes_from != "network":
-            candidates = find_candidates(scan, cells, detected, options.distance_per_m)
-        return with_points(candidates, self._crop(scan, candidates))
-
-    def find_boxes(self, scan: Scan, candidates: tuple[Candidates, Crops], min_score: float) -> tuple[Box, ...]:
-        """Boxes of the candidates, and of a second look at each box that was found (Cai and Vasconcelos, 2018)."""
-        (places, cells), crops = candidates
-        found = merge_boxes(self._look(places, crops), self.card.classes)
-        found = found[found[:, SCORE] >= AGAIN]
-        confirmed = confirm_boxes(found, self._look_at(scan, Candidates(footprints(found), cells)))
-        return tuple(boxes_of_objects(merge_boxes(confirmed, self.card.classes), self.card.classes, min_score))
-
-    def complete(
-        self,
-        scan: Scan,
-        candidates: tuple[Candidates, Crops],
-        objects: Sequence[Box],
-        others: Sequence[Box],
-        are_labeled: bool,
-        options: Options,
-    ) -> tuple[Box, ...]:
-        """Boxes of this network, vehicles that others show, and people.
-
-        People are those by the labels of their points, if any: of 31 pedestrians on the validation and test drives,
-        labels find more than this network (AP25 57 and 52), and there are too few on the folds to decide. What
-        others show gets a look: if this network sees a vehicle there, that is the box, with the mean of the two scores;
-        else it keeps half of its score. Points that show an object are not left without a box.
-        """
-        by_labels = are_labeled and options.boxes_from != "network"
-        found = [box for box in objects if not by_labels or box.label not in PERSONS]
-        people = [box for box in others if box.label in PERSONS]
-        shown = not_among(found, [box for box in others if box.label not in PERSONS])
-        looks = self._look_at(scan, candidates[0]._replace(rectangles=rectangles(shown)))
-        halved, is_seen = [replace(box, score=0.5 * box.score) for box in shown], looks[:, SCORE] >= SEEN
-        looks[:, SCORE] = np.where(is_seen, 0.5 * looks[:, SCORE] + [box.score for box in halved], 0.0)
-        doubted = [box for box, seen in zip(halved, is_seen.tolist(), strict=True) if not seen]
-        boxes = boxes_of_objects(merge_boxes(looks, self.card.classes), self.card.classes, options.cluster_score)
-        vehicles = [box for box in boxes if box.label not in PERSONS]
-        kept = [box for box in not_among(vehicles, doubted) if box.score >= options.cluster_score]
-        return join_boxes(found, [*people, *vehicles, *kept])
-
-    def _look_at(self, scan: Scan, candidates: Candidates) -> NDArray[np.float64]:
-        """What the network finds at places, (n, 10), with a score of 0 where there are too few points."""
-        crops = self._crop(scan, candidates)
-        looks = self._look(candidates.rectangles, crops)
-        looks[crops.counts < MIN_COUNT] = 0.0
-        return looks
-
-    def _crop(self, scan: Scan, candidates: Candidates) -> Crops:
-        return crop_candidates(scan, candidates, self.view.n_points, self.view.margin_m)
-
-    def _look(self, places: NDArray[np.float64], crops: Crops) -> NDArray[np.float64]:
-        """Run the network on rectangles (n, 5), and decode what it finds there, (n, 10)."""
-        found = [np.empty((0, 10))]
-        for first in range(0, len(places), MAX_ROWS):
-            part = slice(first, first + MAX_ROWS)
-            n = len(places[part])
-            fill_features(crops.points[part], crops.counts[part], places[part], self._scale, self.session.input[:n])
-            outputs = self.session.run(n)["objects"][:n]
-            found.append(decode_objects(self.card, outputs, places[part], crops.level[part]))
-        return np.concatenate(found)
-
-
 class Pipeline:
     """Networks, and what makes one answer of theirs. The next scan overwrites their buffers.
 
@@ -319,7 +232,7 @@ class Pipeline:
         if (detector := self.pillars if options.boxes_from != "clusters" else None) is not None:
             detections = value("infer", detector.find_boxes, points)
         if self.objects is not None:
-            candidates = value("cluster", self.objects.crop, scan, detected, options)
+            candidates = value("cluster", self.objects.crop, scan, detected, options.boxes_from, per_m)
             objects = value("infer", self.objects.find_boxes, scan, candidates, options.object_score)
 
         # Objects, and what the parts say of one another (KUL-Seg 5.2)
@@ -342,8 +255,8 @@ class Pipeline:
         if rules and self.objects is None:
             standing = value("agree", stand_boxes, joined, scan, agreed, rules, per_m)
         if self.objects is not None:
-            labeled = bool(self.ranged)
-            standing = value("infer", self.objects.complete, scan, candidates, objects, standing, labeled, options)
+            labeled, score = bool(self.ranged) and options.boxes_from != "network", options.cluster_score
+            standing = value("infer", self.objects.complete, scan, candidates, objects, standing, labeled, score)
         if detector is not None:
             standing = value("cluster", _detected, detections, standing, detector, options.cluster_score)
         standing = value("agree", without_impossible, standing, points, mounting) if "ceiling" in rules else standing

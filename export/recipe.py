@@ -315,10 +315,11 @@ PUBLISHED = Recipe(
     dropout=0.0,
 )
 
+# 690 epochs, which a GPU draws in ten minutes: with 152, mean IoU is 72.3 in place of 75.1 %.
 CAMSEG = Recipe(
     "camseg",
-    steps=7000,
-    batch=8,
+    steps=15_817,
+    batch=16,
     learning_rate=2e-3,
     weight_decay=0.02,
     cooldown=0.8,

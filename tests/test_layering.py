@@ -69,7 +69,7 @@ FLOORS = {
         inference.__init__ inference.box_heads inference.crop inference.pillars inference.projection inference.providers
         inference.decode inference.detections inference.listing
         inference.session
-        inference.pillar_network
+        inference.object_network inference.pillar_network
         road.__init__ road.around road.outline
         road.ahead road.grid
         road.rolling

@@ -19,11 +19,11 @@ from ..datasets.scan_folder import ScanFrame
 from ..errors import ModelError, SplitError
 from ..ground.planes import find_ground
 from ..inference.decode import decode_classes
+from ..inference.object_network import BoxesFrom
 from ..inference.projection import make_projector, project
 from ..inference.session import Session
 from ..objects.boxes import classes_of_boxes
 from ..perceiver import Perceiver
-from ..pipeline import BoxesFrom
 from ..simulation.samples import IGNORE
 from ..simulation.scene import POINT_CLASSES
 from ..types.card import ModelCard

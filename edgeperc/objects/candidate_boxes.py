@@ -74,16 +74,17 @@ def merge_boxes(boxes: NDArray[np.float64], classes: Sequence[str]) -> NDArray[n
 
 
 def confirm_boxes(found: NDArray[np.float64], again: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Each box, (k, 10), and what a second look at its place shows, (k, 10) with a score of 0 for nothing, as one.
+    """Each box, (k, 10), and what further looks at its place show, (r, k, 10) with a score of 0 for nothing, as one.
 
-    The score is the mean of the two; class and front are those of the better one, with which the other is averaged as
-    in `merge_boxes`.
+    The score is the mean of the box's and the looks' mean; class and front are those of the best one, with which the
+    others are averaged as in `merge_boxes`.
     """
-    confirmed = np.where((again[:, SCORE] > found[:, SCORE])[:, None], again, found)
-    looks = np.concatenate([found, again])
-    overlap = oriented_iou(footprints(confirmed), footprints(looks))
-    fill_merged(looks, np.where(np.tile(np.eye(len(found), dtype=np.bool_), 2), overlap, 0.0), confirmed)
-    confirmed[:, SCORE] = 0.5 * (found[:, SCORE] + again[:, SCORE])
+    looks = np.concatenate([found[None], again])
+    scores, every = looks[:, :, SCORE], looks.reshape(-1, looks.shape[2])
+    confirmed = looks[scores.argmax(axis=0), np.arange(len(found))]
+    overlap = oriented_iou(footprints(confirmed), footprints(every))
+    fill_merged(every, np.where(np.tile(np.eye(len(found), dtype=np.bool_), len(looks)), overlap, 0.0), confirmed)
+    confirmed[:, SCORE] = 0.5 * (scores[0] + scores[1:].mean(axis=0))
     return confirmed
 
 

@@ -20,9 +20,9 @@ import edgeperc.pipeline as pipeline_module
 import edgeperc_export.release.quantize as quantize_module
 from edgeperc import Perceiver, SensorProfile
 from edgeperc.ground.planes import fit_ground
+from edgeperc.inference.object_network import BoxesFrom
 from edgeperc.inference.projection import make_projector, project
 from edgeperc.inference.session import Session
-from edgeperc.pipeline import BoxesFrom
 from edgeperc.simulation.samples import simulated_scan
 from edgeperc.types.card import ModelCard
 from edgeperc.types.mounting import MODEL_MOUNTING

@@ -285,26 +285,28 @@ def test_boxes_of_one_object_are_merged_and_others_are_kept() -> None:
     assert len(merge_boxes(rows[:0], CLASSES)) == 0
 
 
+@pytest.mark.parametrize("n_looks", [1, 2])
 @pytest.mark.parametrize("n", [0, 1, 40])
-def test_a_second_look_confirms_a_box_or_lowers_its_score(n: int) -> None:
+def test_more_looks_confirm_a_box_or_lower_its_score(n: int, n_looks: int) -> None:
     rng = np.random.default_rng(n)
     found = rng.uniform(0.1, 1.0, (n, 10)) * [40, 40, 1, 5, 2, 2, 3, 1, 3, 1]
-    again = found + rng.normal(0.0, 0.1, (n, 10)) * [1, 1, 1, 1, 1, 1, 1, 1, 0, 0]
-    again[:, 6] += math.pi * rng.integers(0, 2, n)  # the other way round
-    again[:, SCORE] = rng.uniform(0.0, 1.0, n)
-    again[::3, 0] += 5.0  # another object
-    again[1::3] = 0.0  # nothing
+    again = found + rng.normal(0.0, 0.1, (n_looks, n, 10)) * [1, 1, 1, 1, 1, 1, 1, 1, 0, 0]
+    again[:, :, 6] += math.pi * rng.integers(0, 2, (n_looks, n))  # the other way round
+    again[:, :, SCORE] = rng.uniform(0.0, 1.0, (n_looks, n))
+    again[:, ::3, 0] += 5.0  # another object
+    again[0, 1::3] = 0.0  # nothing
     confirmed = confirm_boxes(found, again)
     assert confirmed.shape == (n, 10)
-    for one, other, both in zip(found, again, confirmed, strict=True):
-        better = other if other[SCORE] > one[SCORE] else one
-        near = [look for look in (one, other) if oriented_iou(footprints(look[None]), footprints(better[None])) > 0.5]
+    for k, both in enumerate(confirmed):
+        looks = [found[k], *again[:, k]]
+        best = max(looks, key=lambda look: look[SCORE])
+        near = [look for look in looks if oriented_iou(footprints(look[None]), footprints(best[None])) > 0.5]
         weights = [look[SCORE] for look in near]
         np.testing.assert_allclose(both[:6], np.average([look[:6] for look in near], axis=0, weights=weights))
-        assert both[SCORE] == pytest.approx((one[SCORE] + other[SCORE]) / 2)
-        assert both[8:].tolist() == better[8:].tolist()
-        assert abs(math.remainder(both[6] - better[6], 2.0 * math.pi)) < 0.5
-    nothing = confirm_boxes(found, np.zeros((n, 10)))
+        assert both[SCORE] == pytest.approx((found[k, SCORE] + again[:, k, SCORE].mean()) / 2)
+        assert both[8:].tolist() == best[8:].tolist()
+        assert abs(math.remainder(both[6] - best[6], 2.0 * math.pi)) < 0.5
+    nothing = confirm_boxes(found, np.zeros((n_looks, n, 10)))
     np.testing.assert_allclose(nothing[:, :6], found[:, :6])
     np.testing.assert_allclose(nothing[:, SCORE], found[:, SCORE] / 2)
 
