@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import pytest
 
-from edgeperc.simulation import random_scene, samples, simulate
-
 
 @pytest.fixture(autouse=True)
 def drawn_anew(monkeypatch: pytest.MonkeyPatch) -> None:
+    # Kernels that are imported with this file would be compiled before `--every-kernel` can count their calls.
+    from edgeperc.simulation import random_scene, samples, simulate
+
     monkeypatch.setattr(samples, "random_scene", random_scene)
     monkeypatch.setattr(samples, "simulate", simulate)
