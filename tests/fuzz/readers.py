@@ -40,13 +40,13 @@ __all__ = ["LIMIT_MB", "LIMIT_S", "READERS", "Readers", "make"]
 LIMIT_S, LIMIT_MB = 20.0, 2700.0
 CAPTURES = {
     "bag1": ("bag1",), "bag2": ("bag2",), "mcap": ("mcap", "chunked"), "velodyne": ("velodyne",), "lidar": ("lidar",),
-    "lvx2": ("lvx2",), "ouster": ("ouster",),
+    "lvx2": ("lvx2",), "ouster": ("ouster",), "pcapng": ("pcapng",),
 }  # fmt: skip
 """Kinds of the seeds of each reader of captures; without OSF, whose library ends processes."""
 READERS = ("pcd", "ply", "raw", "npy", "text", "others", "clouds", "calibration", "labels", "poses", *CAPTURES)
 CUT_SHARE, WHOLE_SHARE, ON_DISK_SHARE = 0.1, 0.01, 0.02
-# Of which no cut shows.
-UNMARKED = ("raw", "text", "others")
+# Of which a cut does not show, or not between packets.
+UNMARKED = ("raw", "text", "others", "velodyne", "lidar", "ouster", "pcapng")
 
 TEXTS: dict[str, tuple[Callable[[Path], object], list[bytes]]] = {
     "calibration": (
@@ -228,7 +228,7 @@ class Readers:
             cause = type(exc.__cause__).__name__
             of = "" if cause in ("PointsError", "NoneType") else f" ({cause})"
             return f"{'scans, then ' if n_scans else ''}PointsError{of}"
-        if topic is None and reader not in ("velodyne", "lidar", "ouster"):  # a cut between packets does not show
+        if topic is None:
             self.expect(case, (reader, k), way, n)
         return "scans"
 
