@@ -12,6 +12,7 @@ from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import numpy as np
 import test_captures as capture_tests
@@ -222,8 +223,9 @@ class Readers:
         topic = case.pick(["/lidar/points", "991", "", "x" * 1000, "/imu/text@x"]) if case.chance(0.05) else None
         n = n_scans = 0
         try:
-            for points in _decoded(path, topic):
-                n, n_scans = n + len(points), n_scans + 1
+            with mock.patch.object(tempfile, "tempdir", str(case.folder)):  # copies of captures go with the case
+                for points in _decoded(path, topic):
+                    n, n_scans = n + len(points), n_scans + 1
         except PointsError as exc:
             cause = type(exc.__cause__).__name__
             of = "" if cause in ("PointsError", "NoneType") else f" ({cause})"
