@@ -153,8 +153,8 @@ def add_capture(group: Options) -> None:
     )
     group(
         "--columns NAME...",
-        "what .bin files hold for each point, in order; after the paths: --columns x y z intensity ring (default: "
-        "x y z remission, unless the values show that there are more or fewer)",
+        "what .bin files, and .npy files of numbers, hold for each point, in order; after the paths: --columns x y z "
+        "intensity ring (default: x y z remission, unless the values of a .bin show that there are more or fewer)",
     )
     group(
         "--remission-field NAME",

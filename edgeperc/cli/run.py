@@ -90,7 +90,7 @@ def add_parser(commands: Commands) -> None:
     reading(
         "paths PATH...",
         "scan files (.bin, .pcd, .ply, .npy, .npz); folders of them; the root of a KITTI object set, of "
-        "SemanticKITTI or of a KITTI raw drive; captures: .pcap, .osf, .bag, .mcap, a ROS 2 bag's folder "
+        "SemanticKITTI or of a KITTI raw drive; captures: .pcap, .pcapng, .osf, .bag, .mcap, a ROS 2 bag's folder "
         "(extras 'velodyne', 'bags', and 'ouster' for .osf); or images (.jpg, .png, .webp, .bmp, .ppm) and folders of "
         "them (extra 'camera')",
         type=location,

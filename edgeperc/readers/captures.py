@@ -17,7 +17,8 @@ from .apart import decode_apart, describe_apart
 from .bags import bag_files
 from .files import FileOptions, read_points, read_timed_file
 from .identify import KnownSensor, of_cloud, of_livox, of_metadata, of_packets, of_velodyne
-from .packets import LVX_MAGIC, PCAP_MAGIC
+from .packets import LVX_MAGIC
+from .pcap import PCAP_MAGIC
 from .times import TimedScan, accumulate
 from .unknown import advice_for
 
@@ -27,7 +28,6 @@ CAPTURE_SUFFIXES = (".bag", ".db3", ".lvx2", ".mcap", ".osf", ".pcap", ".pcapng"
 # First bytes of captures.
 _MAGIC = {
     **dict.fromkeys(PCAP_MAGIC, ".pcap"),
-    b"\x0a\x0d\x0d\x0a": ".pcapng",
     b"#ROSBAG V": ".bag",
     b"\x89MCAP0\r\n": ".mcap",
     b"SQLite format 3\0": ".db3",
@@ -55,11 +55,11 @@ def read_scans(
     source : str or path
         A scan file (`edgeperc.read_points`); a folder of scan files and captures, read in the order of their names; a
         Velodyne ``.pcap``; an Ouster ``.osf``, or ``.pcap`` with its metadata next to it in a ``.json`` file whose name
-        has the same beginning; a ``.pcap`` of Hesai's, RoboSense's or Livox' sensors, or an ``.lvx2``; a ROS 1
-        ``.bag``, a ROS 2 bag's folder or one file of it, or an ``.mcap`` file. Bags are read for messages of type
-        ``sensor_msgs/PointCloud2``, MCAP files for ``foxglove.PointCloud`` (protobuf), too; without such, for packets
-        of a Velodyne, ``velodyne_msgs/VelodyneScan``, or an Ouster, ``PacketMsg``. The first bytes of a file decide its
-        format, not its name.
+        has the same beginning; a ``.pcap`` of Hesai's, RoboSense's or Livox' sensors, or an ``.lvx2``; each ``.pcap``
+        may be a ``.pcapng``; a ROS 1 ``.bag``, a ROS 2 bag's folder or one file of it, or an ``.mcap`` file. Bags are
+        read for messages of type ``sensor_msgs/PointCloud2``, MCAP files for ``foxglove.PointCloud`` (protobuf), too;
+        without such, for packets of a Velodyne, ``velodyne_msgs/VelodyneScan``, or an Ouster, ``PacketMsg``. The first
+        bytes of a file decide its format, not its name.
     topic : str, optional
         What to read if there are several sensors: the topic of point clouds; ``TOPIC@FRAME`` for those of one frame;
         the serial number of an Ouster or in an ``.lvx2``; the IPv4 address of another sensor.
@@ -242,22 +242,20 @@ def _readable_kind(path: Path) -> str:
             f"{path}: there is no such file or folder; expected a scan, a folder of scans, a .pcap, .osf, .bag or .mcap"
         )
     kind = _kind(path)
-    if kind == ".pcapng":
-        raise PointsError(f"{path}: a pcapng file; expected pcap. Run: editcap -F pcap {path.name} {path.stem}.pcap")
     if kind in CAPTURE_SUFFIXES and _kind_of(head := _head(path)) is None and (advice := advice_for(head)):
         raise PointsError(f"{path}: this is {advice}")
     return kind
 
 
 def _kind(path: Path) -> str:
-    """``"scan"``, ``"folder"``, ``"ros2"`` or one of `CAPTURE_SUFFIXES`, by content or else by name."""
+    """``"scan"``, ``"folder"``, ``"ros2"`` or one of `CAPTURE_SUFFIXES` but ``.pcapng``, by content or else by name."""
     if path.is_dir():
         is_bag = (path / "metadata.yaml").is_file() or any(path.glob("*.db3"))
         return "ros2" if is_bag and bag_files(path) else "folder"
     if not path.is_file():  # opening a pipe would block
         return "scan"
     by_name = path.suffix.lower() if path.suffix.lower() in CAPTURE_SUFFIXES else "scan"
-    return _kind_of(_head(path)) or by_name
+    return _kind_of(_head(path)) or by_name.replace("pcapng", "pcap")
 
 
 def _kind_of(head: bytes) -> str | None:

@@ -36,11 +36,11 @@ from .packets import (
     Datagrams,
     copy_as_ethernet,
     is_plain,
-    pcap_packets,
     velodyne_name,
     velodyne_packets,
     velodyne_senders,
 )
+from .pcap import pcap_packets
 from .tables import MAX_BYTES
 from .times import TimedScan, of_plausible_duration, point_times
 

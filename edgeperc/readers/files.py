@@ -20,7 +20,7 @@ from .inflate import inflate, most_bytes
 from .origin import find_place
 from .pcd import begins_like_pcd, parse_pcd
 from .ply import parse_ply
-from .raw import parse_raw
+from .raw import column_names, parse_raw
 from .tables import MAX_HEADER_BYTES, MAX_SCAN_BYTES, Columns
 from .text import begins_like_text, parse_text
 from .times import TimedScan, point_times
@@ -51,9 +51,9 @@ def read_points(
         binary, binary_compressed), ``.ply`` (ascii, binary), a table of text (``.csv``, ``.xyz``, ``.txt``, ``.pts``),
         or an array for `as_points`.
     columns : int or sequence of str, optional
-        What a raw file or a text without names holds for each point: the names of the values in order, such as
-        ``("x", "y", "z", "intensity", "ring")``; or, of a raw file, the number of float32 values, at least 3, of which
-        the first are x, y, z and remission. Ignored for other files.
+        What a raw file, an array or a text without names holds for each point: the names of the values in order, such
+        as ``("x", "y", "z", "intensity", "ring")``; or, of a raw file or an array, the number of values, at least 3, of
+        which the first are x, y, z and remission. Ignored for files that have names, and if ``source`` is an array.
     remission_field : str, optional
         Name of the remission field, for formats with named fields. By default the first existing one of remission,
         intensity, i, reflectivity, reflectance.
@@ -174,9 +174,9 @@ def _parse(data: NDArray[np.uint8], name: str, options: FileOptions) -> _Read:
         )
     head = data[:MAX_HEADER_BYTES].tobytes()
     if head.startswith(b"\x93NUMPY"):
-        return _of_array(_parse_npy(data), options)
+        return _of_stored(_parse_npy(data), options)
     if head.startswith(b"PK\x03\x04"):
-        return _of_array(_parse_npz(data), options)
+        return _of_stored(_parse_npz(data), options)
     if head.startswith((b"ply\n", b"ply\r")):
         return _of_columns(parse_ply(data, head, options.remission_field), options)
     if begins_like_pcd(head):
@@ -198,9 +198,32 @@ def _parse(data: NDArray[np.uint8], name: str, options: FileOptions) -> _Read:
     except PointsError as exc:
         advice = advice_for(head)
         raise exc if advice is None else PointsError(f"{exc}; its first bytes are those of {advice}") from exc
-    if options.columns is None or isinstance(options.columns, int | np.integer):  # fields without names
-        return _of_columns(raw, options._replace(remission_field=None))._replace(fields={})
-    return _of_columns(raw, options)
+    return _of_values(raw, options)
+
+
+def _of_values(columns: Columns, options: FileOptions) -> _Read:
+    """Of a file whose columns have the names of the options, or none."""
+    if options.columns is None or isinstance(options.columns, int | np.integer):
+        return _of_columns(columns, options._replace(remission_field=None))._replace(fields={})
+    return _of_columns(columns, options)
+
+
+def _of_stored(array: NDArray[Any], options: FileOptions) -> _Read:
+    """Of the array of a file."""
+    usual = array.ndim == 2 and (array.shape[1] <= 4 or array.shape[0] in (3, 4))
+    if array.dtype.kind not in "fiu" or array.ndim != 2 or (options.columns is None and usual):
+        return _of_array(array, options)
+    if options.columns is None:
+        raise PointsError(
+            f"the array has the shape {array.shape}; expected (n, 4): x, y, z, remission. Say what its columns hold: "
+            "columns=, or --columns x y z intensity ring"
+        )
+    names = column_names(options.columns)
+    if len(names) != array.shape[1]:
+        raise PointsError(
+            f"the array has the shape {array.shape}, and columns= (--columns) names {len(names)} values a point"
+        )
+    return _of_values(Columns(len(array), dict(zip(names, array.T, strict=True)), names), options)
 
 
 def _of_array(array: NDArray[Any], options: FileOptions) -> _Read:

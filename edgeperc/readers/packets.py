@@ -1,4 +1,4 @@
-"""Packet captures (pcap): their packets, and those that are whole."""
+"""Packet captures: the UDP datagrams in their packets, and those that are whole."""
 
 from __future__ import annotations
 
@@ -9,17 +9,7 @@ from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
 
-import numpy as np
-
-from ..errors import PointsError
-
-# First bytes of a pcap file, and the byte order that they stand for.
-PCAP_MAGIC = {
-    b"\xd4\xc3\xb2\xa1": "<",
-    b"\xa1\xb2\xc3\xd4": ">",
-    b"\x4d\x3c\xb2\xa1": "<",
-    b"\xa1\xb2\x3c\x4d": ">",
-}
+from .pcap import CutShortError, is_ethernet, pcap_packets
 
 LVX_MAGIC = b"livox_tech"
 """First bytes of Livox' own files."""
@@ -48,32 +38,6 @@ _SNIFFED_PACKETS = 2000
 
 # Datagrams of which fragments are awaited; more than a few at the same time are damage.
 _PENDING = 256
-
-
-def pcap_packets(path: Path, whole: bool = True) -> Iterator[tuple[int, memoryview]]:
-    """The place in the file of each captured packet's record, and the packet with its network headers.
-
-    whole : raise `PointsError` if the file ends inside a packet; otherwise stop in front of that packet.
-    """
-    size = path.stat().st_size
-    if size < 24:
-        raise PointsError(f"cut short: {size} bytes; expected a pcap file of 24 bytes and more")
-    data = np.memmap(path, np.uint8, "r").data
-    if bytes(data[:4]) not in PCAP_MAGIC:
-        raise PointsError("not a pcap file by its first bytes")
-    header = struct.Struct(f"{PCAP_MAGIC[bytes(data[:4])]}8xI4x")
-    offset, n_packets = 24, 0
-    while offset < size:
-        end = offset + 16 + (header.unpack_from(data, offset)[0] if offset + 16 <= size else size)
-        if end > size and not whole:
-            return
-        if end > size:
-            raise PointsError(
-                f"cut short or damaged: the file ends inside packet {n_packets + 1}, at byte {size:,}; all packets "
-                "before it were read"
-            )
-        yield offset, data[offset + 16 : end]
-        offset, n_packets = end, n_packets + 1
 
 
 class Datagram(NamedTuple):
@@ -112,26 +76,22 @@ class Datagrams:
         self._pending: dict[bytes, list[memoryview]] = {}  # by source: fragments so far
 
     def __iter__(self) -> Iterator[Datagram]:
-        end, link, order = 24, _link_type(self._path), PCAP_MAGIC.get(_magic(self._path), "<")
-        fraction_s = 1e-9 if b"\x4d" in _magic(self._path) else 1e-6
-        for k, (offset, packet) in enumerate(islice(pcap_packets(self._path, whole=False), self._most)):
-            if k % 10_000 == 0:
-                self._alive()
-            end = offset + 16 + len(packet)
-            try:
-                part = _fragment(packet, link)
-                payload = None if part is None else self._whole(part)
-            except ValueError:
-                self.n_bad += 1
-                continue
-            if part is not None and payload is not None:
-                port, length = struct.unpack_from(">2xHH", payload)
-                if length != len(payload) or length == 8:
+        with suppress(CutShortError):  # a cut file says so itself
+            for k, (link, stamp_s, packet) in enumerate(islice(pcap_packets(self._path), self._most)):
+                if k % 10_000 == 0:
+                    self._alive()
+                try:
+                    part = _fragment(packet, link)
+                    payload = None if part is None else self._whole(part)
+                except ValueError:
                     self.n_bad += 1
                     continue
-                seconds, fraction = struct.unpack_from(f"{order}II", packet.obj, offset)
-                yield Datagram(_address(part.sender), port, seconds + fraction_s * fraction, payload[8:])
-        if end == self._path.stat().st_size:  # a cut file says so itself
+                if part is not None and payload is not None:
+                    port, length = struct.unpack_from(">2xHH", payload)
+                    if length != len(payload) or length == 8:
+                        self.n_bad += 1
+                        continue
+                    yield Datagram(_address(part.sender), port, stamp_s, payload[8:])
             self.n_bad += len(self._pending)
 
     def _whole(self, part: _Fragment) -> memoryview | None:
@@ -150,13 +110,6 @@ class Datagrams:
             del self._pending[next(iter(self._pending))]
             self.n_bad += 1
         return None
-
-
-def _link_type(path: Path) -> int:
-    with path.open("rb") as file:
-        head = file.read(24)
-    order = PCAP_MAGIC.get(head[:4], "<")
-    return int(struct.unpack(f"{order}I", head[20:24])[0]) & 0xFFFF if len(head) == 24 else 1
 
 
 def velodyne_packets(path: Path, sender: str | None = None) -> Iterator[memoryview]:
@@ -189,8 +142,7 @@ def _velodyne_packets(path: Path) -> Iterator[tuple[str, memoryview]]:
     for datagram in Datagrams(path, lambda: None, _SNIFFED_PACKETS):
         if len(datagram.payload) == VELODYNE_BYTES and bytes(datagram.payload[:2]) == b"\xff\xee":
             yield datagram.sender, datagram.payload
-    link = _link_type(path)
-    for _, packet in islice(pcap_packets(path, whole=False), _SNIFFED_PACKETS):
+    for link, _, packet in islice(pcap_packets(path, whole=False), _SNIFFED_PACKETS):
         # The first of twelve blocks begins with the flag 0xEEFF, behind the headers of the link, IP and UDP.
         if len(packet) > VELODYNE_BYTES and bytes(packet[-VELODYNE_BYTES : 2 - VELODYNE_BYTES]) == b"\xff\xee":
             try:
@@ -234,17 +186,16 @@ def _fragment(packet: memoryview, link: int) -> _Fragment | None:
 
 
 def is_plain(path: Path) -> bool:
-    """Whether the first packets of a pcap file are as the libraries that decode them expect.
+    """Whether a capture and its first packets are as the libraries that decode them expect.
 
-    They begin with Ethernet's header, and none is in fragments.
+    They begin with Ethernet's header, and none is in fragments; the file is not a pcapng.
     """
-    link = _link_type(path)
-    for _, packet in islice(pcap_packets(path, whole=False), _SNIFFED_PACKETS):
+    for link, _, packet in islice(pcap_packets(path, whole=False), _SNIFFED_PACKETS):
         with suppress(ValueError):
             part = _fragment(packet, link)
             if part is not None and (part.more or part.start):
                 return False
-    return link == 1
+    return is_ethernet(path)
 
 
 def copy_as_ethernet(path: Path, target: Path, alive: Callable[[], None], sender: str | None = None) -> None:
@@ -263,13 +214,8 @@ def copy_as_ethernet(path: Path, target: Path, alive: Callable[[], None], sender
             ip = struct.pack(">BBHHHBBH", 0x45, 0, 28 + size, 0, 0, 64, 17, 0) + addresses
             udp = struct.pack(">HHHH", datagram.port, datagram.port, 8 + size, 0)
             content = bytes(12) + b"\x08\x00" + ip + udp + datagram.payload
-            out.write(struct.pack("<IIII", seconds, microseconds, len(content), len(content)) + content)
+            out.write(struct.pack("<IIII", seconds & 0xFFFFFFFF, microseconds, len(content), len(content)) + content)
 
 
 def _address(four: memoryview) -> str:
     return ".".join(map(str, four))
-
-
-def _magic(path: Path) -> bytes:
-    with path.open("rb") as file:
-        return file.read(4)

@@ -22,6 +22,7 @@ _BLOCKS, _BLOCK = 4, 6000  # what is looked at: so many pieces of so many values
 # Values of one column are alike. Of 561 real scans of 4 values, the difference at the right width is at most 1.05 times
 # the smallest one; wrong widths have 1.2 times and more, even where the points are shuffled.
 _ALIKE, _UNLIKE = 1.15, 1.2
+_ODD_SHARE = 0.2  # of points with odd coordinates, above which the values are of another format
 
 
 def parse_raw(data: NDArray[np.uint8], columns: int | Sequence[str] | None, usual: int) -> Columns:
@@ -30,7 +31,7 @@ def parse_raw(data: NDArray[np.uint8], columns: int | Sequence[str] | None, usua
     columns : number of values of a point, or their names; None: ``usual``, unless the values show another number.
     Raises PointsError.
     """
-    names = _names(columns)
+    names = column_names(columns)
     if TEXT_BYTES[data[:4096]].all():
         raise PointsError("the file holds text, not float32 values; expected x, y, z, remission as raw float32")
     if columns is None:
@@ -47,7 +48,12 @@ def parse_raw(data: NDArray[np.uint8], columns: int | Sequence[str] | None, usua
     # Coordinates do not have such values. Most rows do if float64, big-endian or other bytes are read as float32.
     with np.errstate(invalid="ignore"):  # comparing signalling NaN
         absurd = ((xyz > 1e7) & (xyz < np.inf)) | ((xyz > 0.0) & (xyz < 1e-30))
-    if absurd.any(axis=1).mean() > 0.2:
+        odd = absurd | ((xyz > 0.0) & (xyz < 1e-3))
+    if odd.any(axis=1).mean() > _ODD_SHARE and _are_halves(data):
+        raise PointsError(
+            "the values are float16; expected float32, as np.fromfile(path, np.float16).astype(np.float32) has them"
+        )
+    if absurd.any(axis=1).mean() > _ODD_SHARE:
         raise PointsError(
             "the values are not coordinates; expected little-endian float32 x, y, z, remission, not float64 or "
             "another format"
@@ -55,7 +61,7 @@ def parse_raw(data: NDArray[np.uint8], columns: int | Sequence[str] | None, usua
     return Columns(len(values), dict(zip(names, values.T, strict=True)), names)
 
 
-def _names(columns: int | Sequence[str] | None) -> tuple[str, ...]:
+def column_names(columns: int | Sequence[str] | None) -> tuple[str, ...]:
     """The names of the columns; the first four of a number of them are x, y, z and remission."""
     if columns is None:
         return ()
@@ -81,6 +87,13 @@ def _width(values: NDArray[np.float32], usual: int) -> int:
     best = float(differences.min())
     width = _WIDTHS[int(np.argmax(differences <= _ALIKE * best))]
     return width if differences[usual - _WIDTHS[0]] > _UNLIKE * best else usual
+
+
+def _are_halves(data: NDArray[np.uint8]) -> bool:
+    """Whether the bytes read as float16 are values of points; a third of the lower halves of float32 are not."""
+    middle = data.size // 4 * 2
+    values = np.abs(data[middle : middle + 4 * _BLOCK].view("<f2").astype(np.float64))
+    return bool(((values == 0.0) | ((values > 1e-3) & (values < 1e3))).mean() > 0.98 and (values > 0.0).mean() > 0.6)
 
 
 def _difference(values: NDArray[np.float32], distance: int) -> float:

@@ -21,6 +21,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from test_captures import vlp16_packets, write_pcap
+from test_pcap import as_pcapng, packets_in
 
 from cli_helpers import OBJECTS, POINTSEG, SSADNET, run, write_scan
 from edgeperc import __version__, live, zoo
@@ -376,6 +377,35 @@ def test_an_origin_is_not_for_recordings(tmp_path: Path, capsys: pytest.CaptureF
     assert "a recording, whose scans are in the sensor's frame" in capsys.readouterr().err
     with pytest.raises(PointsError, match="the origin is that of scan files"):
         next(captures.read_scans(path, origin_m=(1.0, 2.0, 3.0)))
+
+
+@pytest.mark.parametrize("names", [("x", "y", "z", "intensity", "ring"), ("ring", "z", "y", "x", "remission", "time")])
+def test_an_array_of_more_columns_takes_their_names(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], names: tuple[str, ...]
+) -> None:
+    points = read_points(write_scan(tmp_path / "a.bin"))
+    columns = {**dict(zip(("x", "y", "z", "remission"), points.T, strict=True)), "intensity": points[:, 3]}
+    np.save(tmp_path / "a.npy", np.column_stack([columns.get(name, np.zeros(len(points))) for name in names]))
+    assert run("run", tmp_path / "a.bin", tmp_path / "a.npy", "--json") == 1
+    first, second = map(json.loads, capsys.readouterr().out.splitlines())
+    assert "--columns x y z intensity ring" in second["error"]
+    assert run("run", tmp_path / "a.npy", "--json", "--columns", *names) == 0
+    answer = json.loads(capsys.readouterr().out)
+    assert answer["point_counts"] == first["point_counts"]
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+def test_a_pcapng_is_read_as_a_pcap(tmp_path: Path, capsys: pytest.CaptureFixture[str], order: str) -> None:
+    pytest.importorskip("velodyne_decoder")
+    path = write_pcap(tmp_path / "a.pcap", vlp16_packets(1.2))
+    path.with_suffix(".pcapng").write_bytes(as_pcapng(packets_in(path.read_bytes()), order, 9))
+    answers = []
+    for suffix in (".pcap", ".pcapng"):
+        assert run("run", path.with_suffix(suffix), "--json") == 0
+        answers.append([json.loads(line)["point_counts"] for line in capsys.readouterr().out.splitlines()])
+        assert run("info", path.with_suffix(suffix)) == 0
+        assert "vlp-16" in capsys.readouterr().out
+    assert answers[0] == answers[1] != []
 
 
 def test_an_origin_that_cannot_be_found_fails_the_scan(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -27,7 +27,7 @@ KINDS = ("scans", "captures", "readers", "packets", "images", "models", "tracker
 READERS = (
     "readers.pcd", "readers.ply", "readers.raw", "readers.npy", "readers.text", "readers.others", "readers.clouds",
     "readers.calibration", "readers.labels", "readers.poses", "readers.bag1", "readers.bag2", "readers.mcap",
-    "readers.velodyne", "readers.lidar", "readers.lvx2", "readers.ouster",
+    "readers.velodyne", "readers.lidar", "readers.lvx2", "readers.ouster", "readers.pcapng",
 )  # fmt: skip
 """Parts of the kind ``readers``, each alone."""
 

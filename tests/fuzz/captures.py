@@ -30,6 +30,7 @@ from typing import Any, ClassVar, NoReturn
 from unittest import mock
 
 import numpy as np
+import test_pcap as pcap_tests
 
 from edgeperc.errors import PointsError
 from edgeperc.readers import apart, worker
@@ -326,6 +327,32 @@ def _of_lidar(files: Files, case: Case, seed: Seed) -> Files:
     return damaged
 
 
+def _of_pcapng(files: Files, case: Case, seed: Seed) -> Files:
+    """Blocks changed, most with lengths that fit and some with the header of their packet as it was; moved, or cut."""
+    content, at, blocks = files["cap.pcap"], 0, list[bytes]()
+    while at < len(content):
+        end = at + int.from_bytes(content[at + 4 : at + 8], "little")
+        blocks.append(content[at:end])
+        at = end
+    for _ in range(int(case.rng.integers(1, 8))):
+        k, way = int(case.rng.integers(len(blocks))), int(case.rng.integers(8))
+        if way <= 3:
+            first = int(case.pick([8, 8, 28]))
+            kind = int.from_bytes(blocks[k][:4], "little") if case.chance(0.9) else int(case.rng.integers(8))
+            body = mutated_bytes(blocks[k][first:-4], case, 4, near=case.pick([8, 20, 60]))
+            blocks[k] = pcap_tests.block(kind, blocks[k][8:first] + body)
+        elif way == 4:
+            blocks[k] = mutated_bytes(blocks[k], case, 2, near=12)
+        elif way == 5:
+            blocks.insert(int(case.rng.integers(len(blocks))), blocks[k])
+        elif way == 6:
+            case.rng.shuffle(blocks)  # type: ignore[arg-type]
+        elif len(blocks) > 1:
+            del blocks[k]
+    content = b"".join(blocks)
+    return {**files, "cap.pcap": content[: int(case.rng.integers(len(content)))] if case.chance(0.05) else content}
+
+
 def _of_osf(files: Files, case: Case, seed: Seed) -> Files:
     content = bytearray(files["cap.osf"])
     blocks, at = [], 0
@@ -411,6 +438,7 @@ DAMAGES: dict[str, Callable[[Files, Case, Seed], Files]] = {
     "velodyne": _of_velodyne,
     "lidar": _of_lidar,
     "lvx2": _of_bytes,
+    "pcapng": _of_pcapng,
     "osf": _of_osf,
     "bag1": _of_bytes,
     "bag2": _of_bag2,

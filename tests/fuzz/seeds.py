@@ -17,6 +17,7 @@ import test_captures as capture_tests
 import test_clouds as cloud_tests
 import test_packet_messages as message_tests
 import test_packets as packet_tests
+import test_pcap as pcap_tests
 
 __all__ = ["Seed", "pcap_records", "real_seeds", "synthetic_seeds"]
 
@@ -49,6 +50,7 @@ def synthetic_seeds(folder: Path) -> list[Seed]:
         path = packet_tests.write_link(folder / "link.pcap", link, capture_tests.vlp16_packets(0.02))
         seeds.append(Seed("velodyne", {"cap.pcap": path.read_bytes()}, "cap.pcap"))
     seeds += _lidars(folder)
+    seeds += [_pcapng(seed, k) for k, seed in enumerate(seeds) if seed.entry == "cap.pcap"]
     seeds += [Seed("bag1", {"cap.bag": capture_tests.write_bag1(folder / "one.bag").read_bytes()}, "cap.bag")]
     seeds += [Seed("bag1", {"cap.bag": _packed_bag(folder, m)}, "cap.bag") for m in ("BZ2", "LZ4")]
     bag2 = capture_tests.write_bag2(folder / "bag2")
@@ -69,6 +71,14 @@ def synthetic_seeds(folder: Path) -> list[Seed]:
             packed = apart_tests.chunked_mcap(folder / "packed.mcap", method, summary=summary)
             seeds.append(Seed("chunked", {"cap.mcap": packed.read_bytes()}, "cap.mcap"))
     return seeds
+
+
+def _pcapng(seed: Seed, k: int) -> Seed:
+    """The same packets as pcapng."""
+    packets = pcap_tests.packets_in(seed.files["cap.pcap"])
+    kind, resolution = (pcap_tests.OLD if k % 5 == 4 else pcap_tests.ENHANCED), (None, 9, 0x80 | 20)[k % 3]
+    content = pcap_tests.as_pcapng(packets, resolution=resolution, offset_s=k % 2, kind=kind)
+    return Seed("pcapng", {**seed.files, "cap.pcap": content}, seed.entry)
 
 
 def real_seeds(root: Path, n_packets: int = 40) -> list[Seed]:

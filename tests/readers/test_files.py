@@ -238,7 +238,7 @@ BAD_FILES = {
     "complex.npy": (npy(POINTS.astype(np.complex64)), "complex64"),
     "bool.npy": (npy(np.ones((3, 4), dtype=bool)), "bool"),
     "flat.npy": (npy(POINTS.ravel()), r"shape \(16,\)"),
-    "wide.npy": (npy(np.zeros((9, 5))), r"points\[:, :4\]"),
+    "wide.npy": (npy(np.zeros((9, 5))), "--columns x y z intensity ring"),
     "turned.npy": (npy(np.zeros((4, 9))), r"points\.T"),
     "huge.npy": (npy(POINTS).replace(b"(4, 4)", b"(10**9, 4)"[:6]), "header"),
     "many.npy": (npy(POINTS).replace(b"(4, 4), }    ", b"(4000000000, 4), }"[:13]), "header"),
@@ -578,6 +578,67 @@ def test_named_columns_have_times(tmp_path: Path) -> None:
     (scan,) = edgeperc.read_timed_scans(path)
     assert scan.times_s is None
     np.testing.assert_array_equal(scan.points, points)
+
+
+@pytest.mark.parametrize("kind", ["<f2", "<f4", ">f8", "<i4"])
+@pytest.mark.parametrize("width", [3, 4, 5, 6, 12])
+@pytest.mark.parametrize("name", ["a.npy", "a.npz"])
+def test_stored_arrays_take_columns(tmp_path: Path, name: str, width: int, kind: str) -> None:
+    """As a raw file of the same values; only if there are more than four need they be said."""
+    rows = np.round(np.column_stack([street(3, 600)] * 3)[:, :width] * 8.0).astype(kind)
+    path, raw = tmp_path / name, save(tmp_path, "raw.bin", rows.astype("<f4").tobytes())
+    (np.save if name.endswith("npy") else np.savez)(path, np.asfortranarray(rows))
+    names = ("z", "Ring", "x", "y", "time", "intensity", "a", "b", "c", "d", "e", "f")[:width]
+    for columns in (width, *[names] * (width > 3)):
+        np.testing.assert_array_equal(read_points(path, columns=columns), read_points(raw, columns=columns))
+    if width > 3:
+        np.testing.assert_array_equal(read_points(path, columns=names, remission_field="ring")[:, 3], rows[:, 1])
+    if width > 4:
+        with pytest.raises(PointsError, match=rf"shape \(600, {width}\).*--columns x y z intensity ring"):
+            read_points(path)
+    with pytest.raises(PointsError, match=rf"shape \(600, {width}\), and columns= \(--columns\) names 13 values"):
+        read_points(path, columns=13)
+    with pytest.raises(PointsError, match="3 to 64"):
+        read_points(path, columns=2)
+
+
+def test_columns_of_a_stored_array_have_times_and_places(tmp_path: Path) -> None:
+    points, path = street(2), tmp_path / "a.npy"
+    times_s, origin = np.linspace(0.0, 0.1, len(points)), np.array(MAPS["UTM"])
+    np.save(path, np.column_stack([times_s, points[:, :3].astype("f8") + origin, points[:, 3]]))
+    names = ("time", "x", "y", "z", "intensity")
+    (scan,) = edgeperc.read_timed_scans(path, columns=names, origin_m=MAPS["UTM"])
+    np.testing.assert_array_equal(scan.times_s, times_s)
+    np.testing.assert_allclose(scan.points, points, atol=1e-6)
+    with pytest.raises(PointsError, match="are those of a map"):
+        read_points(path, columns=names)
+
+
+@given(
+    seed=st.integers(0, 9),
+    others=st.lists(st.sampled_from(["time", "ring", "unknown", "elongation"]), max_size=3),
+    remission=st.sampled_from([0.0, 1.0, 255.0]),
+    shuffled=st.booleans(),
+)
+@settings(max_examples=60, deadline=None)
+def test_raw_float16_is_refused_and_stored_float16_is_exact(
+    seed: int, others: list[str], remission: float, shuffled: bool
+) -> None:
+    rng = np.random.default_rng(seed)
+    points = street(seed)
+    points[:, 3] *= remission
+    rows = np.column_stack([points, *(OTHERS[name](len(points), rng) for name in others)]).astype("<f2")
+    rows = rng.permutation(rows) if shuffled else rows
+    with tempfile.TemporaryDirectory() as folder:
+        path = save(Path(folder), "scan.bin", rows.tobytes())
+        for columns in (None, 4, 3):
+            with pytest.raises(PointsError, match=r"are float16; expected float32|whole number|are not coordinates"):
+                read_points(path, columns=columns)
+        np.save(Path(folder) / "scan.npy", rows)
+        found = read_points(Path(folder) / "scan.npy", columns=rows.shape[1])
+        np.testing.assert_array_equal(found, rows[:, :4].astype("<f4"))
+        exact = save(Path(folder), "exact.bin", rows.astype("<f4").tobytes())  # what is advised
+        np.testing.assert_array_equal(read_points(exact, columns=rows.shape[1]), found)
 
 
 # --- coordinates of a map --------------------------------------------------------------------------------------------
