@@ -265,15 +265,14 @@ def test_two_threads_share_the_sectors_of_a_full_turn(
 
     def run(name: str, run: Callable[[], object]) -> object:
         runs[name] += 1
-        if name == "aside":
-            taken.set()
-        elif name == "sectors" and failing in ("aside", None):
-            taken.wait(60.0)  # until the other thread has a sector, too
+        if name in taken and failing != "top view":  # wait until the other thread has a sector, too
+            taken[name].set()
+            taken["aside" if name == "sectors" else "sectors"].wait(60.0)
         if name == failing:
             raise InferenceError("no memory left")
         return run()
 
-    taken = threading.Event()
+    taken = {"aside": threading.Event(), "sectors": threading.Event()}
     with monkeypatch.context() as counted:
         for name, each in of.items():
             counted.setattr(each, "run", partial(run, name, each.run))
