@@ -56,7 +56,7 @@ for out, changes in json.loads(runs).items():
 """
 
 RUNS = {
-    "pointseg": {"network": "pointseg", "accumulate": 2},
+    "pointseg": {"network": "pointseg", "accumulate": 2, "edge": True, "width": 0.25},
     "ssadnet": {"network": "ssadnet", "edge": True, "width": 0.25, "front": True},
 }
 
