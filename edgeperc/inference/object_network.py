@@ -25,8 +25,8 @@ BoxesFrom = Literal["both", "network", "clusters"]
 # A look that gives less sees nothing. All round on PandaSet, Lyft, Argoverse 2 and DDAD, 8 of 25 boxes that others show
 # and the network of objects does not see are at a vehicle, and 26 of 33 that it sees.
 SEEN = 0.1
-HALF_TURN = np.array([0.0, 0.0, 0.0, 0.0, np.pi])  # of a rectangle
 AGAIN = 0.15  # boxes with less are not looked at again: a second look confirmed none of them on PandaSet and Lyft
+HALF_TURN = np.array([0.0, 0.0, 0.0, 0.0, np.pi])  # of a rectangle
 
 
 class ObjectNetwork:
@@ -58,9 +58,9 @@ class ObjectNetwork:
         (places, cells), crops = candidates
         found = merge_boxes(self._look(places, crops), self.card.classes)
         found = found[found[:, SCORE] >= AGAIN]
-        ends = np.concatenate([footprints(found), footprints(found) + HALF_TURN])
-        again = self._look_at(scan, Candidates(ends, cells)).reshape(2, *found.shape)
-        confirmed = confirm_boxes(found, again)
+        flat = footprints(found)
+        again = self._look_at(scan, Candidates(np.concatenate([flat, flat + HALF_TURN]), cells))
+        confirmed = confirm_boxes(found, again.reshape(2, *found.shape))
         return tuple(boxes_of_objects(merge_boxes(confirmed, self.card.classes), self.card.classes, min_score))
 
     def complete(

@@ -98,11 +98,6 @@ def test_two_ranks_train_what_one_trains_and_resume(tmp_path: Path, simulated: P
     starts = {f"{name}-start": {**run, "learning_rate": 0.0, "steps": 1} for name, run in RUNS.items()}
     done = trained(tmp_path / "one", RUNS | starts, simulated, 1)
     assert done.returncode == 0, done.stderr
-    # A rank that is killed ends the run, which resumes.
-    cut = trained(tmp_path / "two", {"ssadnet": RUNS["ssadnet"]}, simulated, 2, dies="1")
-    assert cut.returncode != 0
-    assert "another rank" in cut.stderr or re.search("Signal 9|exitcode: -9", cut.stderr), cut.stderr
-    assert checkpoint(tmp_path / "two/ssadnet")["step"] == 2
     for network, run in RUNS.items():
         done = trained(tmp_path / "two", {network: run}, simulated, 2)
         assert done.returncode == 0, done.stderr
@@ -116,6 +111,16 @@ def test_two_ranks_train_what_one_trains_and_resume(tmp_path: Path, simulated: P
         assert {*one["odds"]} == {*two["odds"]}
         lines = (tmp_path / "two" / network / "log.jsonl").read_text().splitlines()
         assert [json.loads(line)["step"] for line in lines] == [2, 4, 6]
+    # A rank that is killed ends the run, which resumes. The last of those above is whole.
+    runs = {"ssadnet": RUNS["ssadnet"]}
+    cut = trained(tmp_path / "cut", runs, simulated, 2, dies="1")
+    assert cut.returncode != 0
+    assert "another rank" in cut.stderr or re.search("Signal 9|exitcode: -9", cut.stderr), cut.stderr
+    assert checkpoint(tmp_path / "cut/ssadnet")["step"] == 2
+    resumed = trained(tmp_path / "cut", runs, simulated, 2)
+    assert resumed.returncode == 0, resumed.stderr
+    one, other = (checkpoint(tmp_path / name / "ssadnet")["network"] for name in ("two", "cut"))
+    assert all(torch.equal(one[name], other[name]) for name in one)
 
 
 def test_what_ranks_cannot_share(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -707,10 +707,9 @@ def test_the_origin_of_a_level_sensor_is_found(tmp_path: Path, kind: str) -> Non
     }[kind]()
     read = read_points(source, origin_m="auto")
     np.testing.assert_allclose(read, points, atol=0.05)
-    if kind == "array":
-        found = edgeperc.find_origin(source)
-        np.testing.assert_allclose(found, origin, atol=0.05)
-        np.testing.assert_array_equal(read, read_points(source, origin_m=found))
+    found = edgeperc.find_origin(source)
+    np.testing.assert_allclose(found, origin, atol=0.05)
+    np.testing.assert_array_equal(read, read_points(source, origin_m=found))
 
 
 @pytest.mark.parametrize("source", [POINTS, np.zeros((5, 2)), np.zeros(3), np.zeros((9, 4))])
