@@ -404,5 +404,5 @@ def check_unseen(trained_on: Mapping[str, set[str]], name: str, drive: str, poin
         if digest in hashes:
             raise SplitError(
                 f"{model} was trained on scan {name} of drive {drive}, so figures on it are too good; evaluate the "
-                "test split, or a model trained without this drive, or ask for split 'train'"
+                "test split, or models trained without this drive (--model), or ask for split 'train'"
             )

@@ -14,7 +14,7 @@ import numpy as np
 
 from ..datasets.layout import class_number
 from ..datasets.scan_folder import ScanFolder, ScanFrame
-from ..errors import ModelError, PointsError, SensorError
+from ..errors import ModelError, PointsError, SensorError, SplitError
 from ..perceiver import ADAPTATIONS, Perceiver
 from ..preprocess.sensor_estimate import MOST_SCANS, estimate_sensor
 from ..preprocess.sensor_fit import fit_sensor
@@ -153,9 +153,12 @@ def _compare_one(
         top_view, _, of_objects = DEFAULT
         judge = Judge([top_view, model, of_objects], Perceiving(provider, precision), sensor=sensor)
         records = []
-        for frame in _frames(folder):
-            records.append(judge.record_boxes(frame))
-            count()
+        try:
+            for frame in _frames(folder):
+                records.append(judge.record_boxes(frame))
+                count()
+        except SplitError as exc:  # of the network of objects: points were measured
+            return {**result, "no_boxes": str(exc)}
         measured = figures(records)
         result["boxes"] = {key: measured[key] for key in ("kitti", "centers") if key in measured}
     return result

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,15 +17,14 @@ from edgeperc.preprocess.remission import NO_REMISSION
 from ..cards import OBJECT_CLASSES
 from ..networks.objects import LEAST, Parts, parts_of
 from .object_samples import BACKGROUND, DETECTED, GROUP, N_STORED, TRUE, ObjectSamples
+from .object_sets import PASTED
 from .object_task import VEHICLE, Objects
 
 # Shares of the classes in a batch.
 SHARES = {BACKGROUND: 0.45, 1: 0.26, 2: 0.08, 3: 0.04, 4: 0.09, 5: 0.07, VEHICLE: 0.01}
 SIMULATED = "simulated"
-SOURCE_WEIGHTS: Mapping[str, float] = {SIMULATED: 0.02, "pandaset": 1.0, "pandaset-pasted": 0.5}
-"""How often an object of a source counts, for one of KITTI; others: `OTHER_WEIGHT`."""
+SIMULATED_WEIGHT, PASTED_WEIGHT = 0.02, 0.5  # of an object of simulation or pasted into scans, for one of KITTI
 SIMULATED_BACKGROUND = 0.3  # of walls, hedges and halls there are many kinds; real scans show those of few streets
-OTHER_WEIGHT = 0.1
 ALIKE = 0.5  # samples of one object count as this power of their number
 
 DETECTED_BACKGROUND, TRUE_WEIGHT = 2.0, 1.5
@@ -104,11 +103,16 @@ class ObjectBatches:
         return map(self.batch, range(start, stop))
 
 
+def _of_source(name: str) -> float:
+    """How often an object of a source counts, for one of KITTI."""
+    if name == SIMULATED:
+        return SIMULATED_WEIGHT
+    return PASTED_WEIGHT if name.endswith(f"-{PASTED}") and not name.startswith("kitti") else 1.0
+
+
 def _weights(samples: ObjectSamples, names: Sequence[str]) -> NDArray[np.float64]:
     """How often each sample is drawn: by class; within it by object, once each, and by source."""
-    of_source = np.array(
-        [1.0 if name.startswith("kitti") else SOURCE_WEIGHTS.get(name, OTHER_WEIGHT) for name in names]
-    )
+    of_source = np.array([_of_source(name) for name in names])
     of_background = np.where(np.array(names) == SIMULATED, SIMULATED_BACKGROUND, of_source)
     _, inverse, n_alike = np.unique(samples.objects, return_inverse=True, return_counts=True)
     is_object = samples.classes != BACKGROUND

@@ -182,7 +182,7 @@ class _Training:
         )
         with TrainingLog(self.out if ranks.is_first else None, tensorboard=run.tensorboard) as log, progress:
             for arrays in batches:
-                losses.append(self._step(arrays))
+                losses.append(self._step([array.to(ranks.device, non_blocking=True) for array in arrays]))
                 state.step += 1
                 _average(self.averaged, self.network, min(recipe.ema, (1 + state.step) / (10 + state.step)))
                 if recipe.kept > 0.0 and run.start_from is not None and state.step == recipe.steps:

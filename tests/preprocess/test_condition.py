@@ -543,6 +543,24 @@ def test_eval_sensors_counts_test_drives_only(tmp_path: Path, monkeypatch: pytes
         compare([str(tmp_path)])
 
 
+def test_eval_sensors_measures_points_where_the_objects_network_was_trained(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "velodyne").mkdir()
+    (tmp_path / "label").mkdir()
+    scan = urban(4)
+    scan.points.tofile(tmp_path / "velodyne" / "a.bin")
+    (tmp_path / "label" / "a.txt").write_text("")
+    (tmp_path / "scans.json").write_text(json.dumps({"schema": 1, "sensor": "hdl-64e", "boxes": {"*": "ignore"}}))
+    assert "boxes" in compare([str(tmp_path)])[str(tmp_path)]
+    seen = {"objects 1": {scan_hash(scan.points)}}
+    monkeypatch.setattr("edgeperc.evaluation.judge.training_scans_of", lambda cards: seen)
+    assert cli.main(["eval-sensors", str(tmp_path)]) == 0
+    printed = capsys.readouterr().out
+    assert "no boxes: objects 1 was trained on scan a of drive" in printed
+    assert "IoU of points" in printed
+
+
 def test_eval_sensors(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Two simulated scans, and the same street as boxes and as range images."""
     scan = urban(4)

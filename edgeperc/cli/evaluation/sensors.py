@@ -83,6 +83,8 @@ def eval_sensors_command(arguments: argparse.Namespace) -> int:
         title = f"{name}: {many(result['n_scans'], 'scan')}, {counts}; remission: {function}"
         lines += table_lines(title, (*columns, ("mIoU", "mean")), rows)
         lines += box_table_lines(result.get("boxes", {}))
+        if "no_boxes" in result:
+            lines.append(f"  no boxes: {result['no_boxes']}")
     for line in lines:
         print_line(line)
     write_figures(arguments, figures)
