@@ -60,8 +60,15 @@ FEWEST_HALVED = 1024
 UNPOOLING = (LoDNN, SegNet, SSADNet)
 N_GOLDEN_VALUES = 64
 # Terms of weights by the data sets of the real frames; a frame of a set is called SET/NAME.
-TERMS = {"pandaset": "CC BY 4.0, as PandaSet's (Hesai and Scale AI), with its terms of use"}
-OTHER_TERMS = "terms of the data sets of the real frames; KITTI: CC BY-NC-SA 3.0"
+TERMS = {
+    "KITTI": "KITTI: CC BY-NC-SA 3.0",
+    "av2": "Argoverse 2: CC BY-NC-SA 4.0",
+    "ddad": "DDAD: CC BY-NC-SA 4.0",
+    "lyft": "Lyft Level 5: CC BY-NC-SA 4.0",
+    "pandaset": "CC BY 4.0, as PandaSet's (Hesai and Scale AI), with its terms of use",
+    "semantickitti": "SemanticKITTI: CC BY-NC-SA 4.0",
+    "vod": "View of Delft: research only",
+}
 CAMVID_LICENCE = (
     "terms of CamVid: free for research; cite Brostow, Fauqueur and Cipolla (2009), and Brostow et al. (2008)"
 )
@@ -81,7 +88,7 @@ def load(checkpoint: Path) -> tuple[nn.Module, Recipe, dict[str, Any]]:
 def terms_of(frames: Iterable[str]) -> str:
     """Terms of weights that were trained on real scans of these names; empty without one."""
     sets = {name.partition("/")[0] if "/" in name else "KITTI" for name in frames}
-    return "; ".join(TERMS[name] for name in sorted(sets)) if sets <= TERMS.keys() else OTHER_TERMS
+    return "; ".join(TERMS.get(name, f"{name}: terms of that set") for name in sorted(sets))
 
 
 def _training(recipe: Recipe, notes: Mapping[str, Any]) -> dict[str, Any]:

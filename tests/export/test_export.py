@@ -924,8 +924,9 @@ def test_a_card_that_does_not_fit_writes_nothing(tmp_path: Path, third_party: tu
 def test_weights_have_the_terms_of_their_scans() -> None:
     assert terms_of([]) == ""
     assert terms_of(["pandaset/002_00", "pandaset/002_01"]).startswith("CC BY 4.0")
-    for frames in (["pandaset/002_00", "000001"], ["lyft/7"], ["000001"]):
-        assert "KITTI: CC BY-NC-SA 3.0" in terms_of(frames)
+    assert terms_of(["lyft/7", "000001"]) == "KITTI: CC BY-NC-SA 3.0; Lyft Level 5: CC BY-NC-SA 4.0"
+    assert terms_of(["pandaset/002_00", "000001"]).startswith("KITTI: CC BY-NC-SA 3.0; CC BY 4.0, as PandaSet's")
+    assert terms_of(["mine/1"]) == "mine: terms of that set"
 
 
 def test_a_card_replaces_an_existing_one(tmp_path: Path, third_party: tuple[Path, ModelCard]) -> None:
