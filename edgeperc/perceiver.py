@@ -182,7 +182,8 @@ class Perceiver:
         that detects its class, and sees it, but has not found it, halves its score, in part if it sees the object in
         part.
         A model of objects replaces both, at candidates from the top view, from clusters of points of any class, or from
-        both; boxes of people are still those around labeled points, if points are labeled.
+        both. Boxes of labeled people stay, with the mean of both scores; people without labels, if points are labeled,
+        keep half of their scores.
         Boxes of a detector on pillars stay as they are; with ``"clusters"`` it does not run. Other boxes are dropped
         where it has one. In its range, those of its classes keep half of their score, as it has not found them.
     full_turn : bool
