@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import functools
+import gc
 import hashlib
 import inspect
 import os
@@ -157,6 +158,13 @@ def scenes_are_simulated_once() -> Iterator[None]:
         patch.setattr(samples, "random_scene", once.scene)
         patch.setattr(samples, "simulate", once.scan)
         yield
+
+
+@pytest.fixture(scope="module", autouse=True)
+def what_was_there_is_no_garbage() -> None:
+    """Else each of thousands of collections goes through all of torch, numba and the kernels."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture(autouse=True)
