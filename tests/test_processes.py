@@ -454,6 +454,7 @@ def test_what_cannot_be_written_is_said_and_is_no_result(
         code = process.returncode
     else:
         monkeypatch.chdir(out)
+        monkeypatch.setattr(sys, "dont_write_bytecode", True)  # as -B above
         before = resource.getrlimit(resource.RLIMIT_FSIZE)
         resource.setrlimit(resource.RLIMIT_FSIZE, largest)
         try:
