@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import functools
+import gc
 import hashlib
 import inspect
 import os
@@ -148,7 +149,10 @@ def own_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 
 @pytest.fixture(scope="session", autouse=True)
 def scenes_are_simulated_once() -> Iterator[None]:
-    """Evaluations, exports and benchmarks take the same scenes. In `simulation` each is drawn anew."""
+    """Evaluations, exports and benchmarks take the same scenes, readers of maps the same scans. In `simulation` each
+    is drawn anew.
+    """
+    from edgeperc.readers import files as readers
     from edgeperc.simulation import samples
     from scenes import Once
 
@@ -156,7 +160,15 @@ def scenes_are_simulated_once() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(samples, "random_scene", once.scene)
         patch.setattr(samples, "simulate", once.scan)
+        patch.setattr(readers, "find_place", once.place)
         yield
+
+
+@pytest.fixture(scope="module", autouse=True)
+def what_was_there_is_no_garbage() -> None:
+    """Else each of thousands of collections goes through all of torch, numba and the kernels."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture(autouse=True)

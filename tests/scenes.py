@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import functools
+import hashlib
 import io
 from collections import OrderedDict
 from dataclasses import fields, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from edgeperc.readers.origin import find_place
 from edgeperc.simulation import random_scene, simulate
 from edgeperc.simulation.scene import Scene, SimulatedScan
 from edgeperc.types.perception import Box
@@ -38,13 +41,16 @@ def urban(seed: int, sensor: str | SensorProfile = "hdl-64e") -> SimulatedScan:
 
 
 class Once:
-    """In place of what takes time in `edgeperc.simulation.samples`: the last scenes and scans are kept."""
+    """In place of what takes time in `edgeperc.simulation.samples`: the last scenes and scans are kept. And where the
+    sensors of scans in a map were.
+    """
 
     MOST = 40
 
     def __init__(self) -> None:
         self.scene = functools.lru_cache(self.MOST)(random_scene)
         self._scans: OrderedDict[Any, tuple[Scene, SimulatedScan]] = OrderedDict()
+        self._places: dict[bytes, tuple[float, float, float]] = {}
 
     def scan(self, scene: Scene, *arguments: Any, **options: Any) -> SimulatedScan:
         """Each caller has arrays of its own."""
@@ -58,6 +64,13 @@ class Once:
         scan = self._scans[key][1]
         arrays = {field.name: getattr(scan, field.name) for field in fields(scan)}
         return replace(scan, **{name: a.copy() for name, a in arrays.items() if isinstance(a, np.ndarray)})
+
+    def place(self, xyz: NDArray[np.float64]) -> tuple[float, float, float]:
+        """Of the sensor, in the map; an error is raised anew."""
+        key = hashlib.sha256(xyz.tobytes()).digest()
+        if key not in self._places:
+            self._places[key] = find_place(xyz)
+        return self._places[key]
 
 
 class Terminal(io.StringIO):

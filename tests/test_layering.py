@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ast
-import copy
 import functools
 import graphlib
 import subprocess
@@ -230,9 +229,24 @@ def tree_of(name: str) -> ast.Module:
 RUNTIME = sorted(name for name in modules() if name.startswith("edgeperc."))
 
 
-def imported(name: str, tree: ast.AST) -> Iterator[str]:
+def last_name(node: ast.expr) -> str:
+    """Of a name or an attribute."""
+    return str(getattr(node, "attr", getattr(node, "id", "")))
+
+
+def nodes(tree: ast.AST, running: bool) -> Iterator[ast.AST]:
+    """Of a module; ``running``: without what only type checkers read."""
+    pending = [tree]
+    while pending:
+        node = pending.pop()
+        if not (running and isinstance(node, ast.If) and last_name(node.test) == "TYPE_CHECKING"):
+            yield node
+            pending.extend(ast.iter_child_nodes(node))
+
+
+def imported(name: str, tree: ast.AST, running: bool = False) -> Iterator[str]:
     """Absolute dotted names of everything that a module imports, inside functions too."""
-    for node in ast.walk(tree):
+    for node in nodes(tree, running):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
@@ -240,7 +254,7 @@ def imported(name: str, tree: ast.AST) -> Iterator[str]:
             assert above or not node.level, f"line {node.lineno}: a relative import that leaves the package"
             origin = ".".join(filter(None, [*above, node.module]))
             yield from (f"{origin}.{alias.name}" for alias in node.names)
-        elif isinstance(node, ast.Call) and ast.unparse(node.func).endswith(("import_module", "__import__", "require")):
+        elif isinstance(node, ast.Call) and last_name(node.func).endswith(("import_module", "__import__", "require")):
             yield from (str(name.value) for name in node.args[:1] if isinstance(name, ast.Constant))
 
 
@@ -249,19 +263,11 @@ def packages_imported(name: str, tree: ast.AST) -> set[str]:
     return {dotted.partition(".")[0] for dotted in imported(name, tree)}
 
 
-class Running(ast.NodeTransformer):
-    """A module without what only type checkers read."""
-
-    def visit_If(self, node: ast.If) -> ast.AST | None:
-        return None if ast.unparse(node.test) == "TYPE_CHECKING" else self.generic_visit(node)
-
-
 @functools.cache
 def own_imports(name: str, running: bool = False) -> set[str]:
     """Modules of the three packages that a module imports, for its types, too, unless ``running``."""
     known, found = modules(), set()
-    tree = tree_of(name)
-    for dotted in imported(name, Running().visit(copy.deepcopy(tree)) if running else tree):
+    for dotted in imported(name, tree_of(name), running):
         parent = dotted.rpartition(".")[0]
         candidates = (dotted, f"{dotted}.__init__", parent, f"{parent}.__init__")
         found |= {next((each for each in candidates if each in known), name)}
@@ -342,11 +348,9 @@ def test_tests_use_public_names() -> None:
             names: list[str] = []
             if isinstance(node, ast.ImportFrom) and str(node.module).startswith("edgeperc"):
                 names = [alias.name for alias in node.names]
-            elif isinstance(node, ast.Attribute) and ast.unparse(node.value) not in others:
+            elif isinstance(node, ast.Attribute) and node.attr[0] == "_" and ast.unparse(node.value) not in others:
                 names = [node.attr]
-            elif isinstance(node, ast.Call) and ast.unparse(node.func).endswith(
-                ("setattr", "patch.object", "multiple")
-            ):
+            elif isinstance(node, ast.Call) and last_name(node.func).endswith(("setattr", "object", "multiple")):
                 names = [str(a.value).rpartition(".")[2] for a in node.args[:2] if isinstance(a, ast.Constant)]
                 names += [str(keyword.arg) for keyword in node.keywords]
             private = {each for each in names if each.startswith("_") and each[1:2] != "_"} - OF_OTHERS

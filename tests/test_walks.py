@@ -95,6 +95,9 @@ def test_no_object_that_points_show_is_without_a_box(full_turn: bool) -> None:
         if not places:
             continue
         scan = scan_of(places, seed)
+        shown = [np.count_nonzero(scan.objects == k) >= MIN_POINTS[place[0]] for k, place in enumerate(places)]
+        if not any(shown):
+            continue
         perception = perceive(scan.points)
         assert perception.points is not None
         for k, (kind, x, y, _) in enumerate(places):

@@ -8,6 +8,7 @@ import re
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -25,6 +26,8 @@ import json, os, signal, sys
 from dataclasses import replace
 from pathlib import Path
 import torch
+import torch._dynamo  # which every optimizer imports
+from torch.distributed.launcher.api import LaunchConfig, elastic_launch
 from edgeperc.types.views import TopViewGeometry
 from edgeperc_export import cards
 from edgeperc_export.recipe import Recipe
@@ -41,18 +44,28 @@ torch.autocast = lambda device, kind: autocast(device, kind, enabled=False)
 torch.set_default_dtype(torch.float64)
 torch.from_numpy = lambda array: from_numpy(array.astype("float64") if array.dtype == "float32" else array)
 ranks.Ranks.part = lambda self, batch: part(self, batch).double()
-runs, simulated, dies = sys.argv[1:]
-if dies == os.environ.get("RANK"):
-    add, calls = ranks.Ranks.add_gradients, []
-    def dying(self, network):
-        calls.append(1)
-        if len(calls) == 4:
-            os.kill(os.getpid(), signal.SIGKILL)
-        add(self, network)
-    ranks.Ranks.add_gradients = dying
-for out, changes in json.loads(runs).items():
-    recipe = Recipe(**{"steps": 6, "batch": 4, "context_width": 8, "redraw_every": 3, **changes})
-    train(recipe, Path(out), Data(simulated=Path(simulated)), Run(n_threads=1, checkpoint_every=2))
+
+def rank(runs, simulated, dies=None):
+    # One after the other; `dies` is killed in its fourth step.
+    if dies == os.environ["RANK"]:
+        add, calls = ranks.Ranks.add_gradients, []
+        def dying(self, network):
+            calls.append(1)
+            if len(calls) == 4:
+                os.kill(os.getpid(), signal.SIGKILL)
+            add(self, network)
+        ranks.Ranks.add_gradients = dying
+    for out, changes in runs.items():
+        recipe = Recipe(**{"steps": 6, "batch": 4, "context_width": 8, "redraw_every": 3, **changes})
+        train(recipe, Path(out), Data(simulated=Path(simulated)), Run(n_threads=1, checkpoint_every=2))
+
+if __name__ == "__main__":
+    worlds, *given = json.loads(sys.argv[1])
+    if "RANK" in os.environ:
+        rank(*given)
+    for world, runs in worlds:  # what torchrun does with a script: here its processes have imported all of the above
+        local = {"rdzv_backend": "c10d", "rdzv_endpoint": "localhost:0", "start_method": "fork"}
+        elastic_launch(LaunchConfig(1, 1, world, max_restarts=0, **local), rank)(runs, *given[1:])
 """
 
 RUNS = {
@@ -68,18 +81,9 @@ def simulated(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-def trained(
-    folder: Path, runs: dict[str, dict], simulated: Path, world: int, dies: str = ""
-) -> subprocess.CompletedProcess[str]:
-    """Train one after the other in ``world`` processes; rank ``dies`` is killed in its fourth step."""
-    folder.mkdir(exist_ok=True)
-    script = folder / "train.py"
-    script.write_text(SCRIPT)
-    command = [sys.executable]
-    if world > 1:
-        command += ["-m", "torch.distributed.run", "--standalone", f"--nproc-per-node={world}"]
-    outs = {str(folder / name): changes for name, changes in runs.items()}
-    command += [str(script), json.dumps(outs), str(simulated), dies]
+def trained(folder: Path, launcher: list[str], *given: Any) -> subprocess.CompletedProcess[str]:
+    (folder / "train.py").write_text(SCRIPT)
+    command = [sys.executable, *launcher, str(folder / "train.py"), json.dumps(given)]
     return subprocess.run(command, capture_output=True, text=True, env=os.environ | {"OMP_NUM_THREADS": "1"})
 
 
@@ -94,13 +98,22 @@ def distance(one: dict[str, torch.Tensor], other: dict[str, torch.Tensor]) -> fl
 
 
 def test_two_ranks_train_what_one_trains_and_resume(tmp_path: Path, simulated: Path) -> None:
-    # One process trains all, which saves seconds for each. torchrun connects its processes only once.
+    def of(world: str, runs: dict[str, Any] = RUNS) -> dict[str, Any]:
+        return {str(tmp_path / world / name): run for name, run in runs.items()}
+
+    # A rank of torchrun that is killed ends the run, which resumes.
+    one_network = {"ssadnet": RUNS["ssadnet"]}
+    torchrun = ["-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2"]
+    cut = trained(tmp_path, torchrun, [], of("cut", one_network), str(simulated), "1")
+    assert cut.returncode != 0
+    assert "another rank" in cut.stderr or re.search("Signal 9|exitcode: -9", cut.stderr), cut.stderr
+    assert checkpoint(tmp_path / "cut/ssadnet")["step"] == 2
+    # To import torch takes seconds for each process, so the others are forked. Connected ones are not connected again.
     starts = {f"{name}-start": {**run, "learning_rate": 0.0, "steps": 1} for name, run in RUNS.items()}
-    done = trained(tmp_path / "one", RUNS | starts, simulated, 1)
+    each = [(2, {out: run}) for out, run in (of("two") | of("cut", one_network)).items()]
+    done = trained(tmp_path, [], [(1, of("one", RUNS | starts)), *each], None, str(simulated))
     assert done.returncode == 0, done.stderr
-    for network, run in RUNS.items():
-        done = trained(tmp_path / "two", {network: run}, simulated, 2)
-        assert done.returncode == 0, done.stderr
+    for network in RUNS:
         one, two = states = [checkpoint(tmp_path / world / network) for world in ("one", "two")]
         moved = distance(checkpoint(tmp_path / f"one/{network}-start")["network"], one["network"])
         apart = distance(one["network"], two["network"])
@@ -111,14 +124,6 @@ def test_two_ranks_train_what_one_trains_and_resume(tmp_path: Path, simulated: P
         assert {*one["odds"]} == {*two["odds"]}
         lines = (tmp_path / "two" / network / "log.jsonl").read_text().splitlines()
         assert [json.loads(line)["step"] for line in lines] == [2, 4, 6]
-    # A rank that is killed ends the run, which resumes. The last of those above is whole.
-    runs = {"ssadnet": RUNS["ssadnet"]}
-    cut = trained(tmp_path / "cut", runs, simulated, 2, dies="1")
-    assert cut.returncode != 0
-    assert "another rank" in cut.stderr or re.search("Signal 9|exitcode: -9", cut.stderr), cut.stderr
-    assert checkpoint(tmp_path / "cut/ssadnet")["step"] == 2
-    resumed = trained(tmp_path / "cut", runs, simulated, 2)
-    assert resumed.returncode == 0, resumed.stderr
     one, other = (checkpoint(tmp_path / name / "ssadnet")["network"] for name in ("two", "cut"))
     assert all(torch.equal(one[name], other[name]) for name in one)
 
