@@ -91,12 +91,12 @@ class ObjectNetwork:
         doubted = not_among(more, doubted)
         if by_labels:
             doubted += not_among(labeled, people)
-            people = [
+            labeled = [
                 replace(box, score=max(0.5 * (box.score + score), min_score))
                 for box, score in zip(labeled, seen[len(shown) :], strict=True)
             ]
         kept = [replace(box, score=0.5 * box.score) for box in doubted if 0.5 * box.score >= min_score]
-        return join_boxes(vehicles, [*more, *people, *kept])
+        return join_boxes(vehicles if by_labels else objects, [*more, *labeled, *kept])
 
     def _look_at(self, scan: Scan, candidates: Candidates) -> NDArray[np.float64]:
         """What the network finds at places, (n, 10), with a score of 0 where there are too few points."""

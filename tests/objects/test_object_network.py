@@ -10,12 +10,16 @@ import pytest
 
 from edgeperc import Perceiver
 from edgeperc.errors import OptionError
+from edgeperc.ground.planes import find_ground
+from edgeperc.ground.scan import Scan
+from edgeperc.inference.object_network import ObjectNetwork
+from edgeperc.inference.session import Session
 from edgeperc.objects.boxes import MIN_SCORE
 from edgeperc.objects.cluster import PERSONS
 from edgeperc.simulation.samples import FIRST_SEED, simulated_scan
 from edgeperc.simulation.scene import SimulatedScan
 from edgeperc.types.geometry import inside
-from edgeperc.types.perception import Perception
+from edgeperc.types.perception import Box, Perception
 
 SEED = FIRST_SEED + 3
 
@@ -84,6 +88,19 @@ def test_people_are_those_of_the_labels_and_of_the_network(seed: int) -> None:
             assert all(np.hypot(center[0] - x, center[1] - y) > 0.3 for x, y, _ in labeled)
     least = {6: 1, 8: 0, SEED: 1}[seed]
     assert len(both) >= len(labeled) + least
+
+
+@pytest.mark.parametrize(("by_labels", "min_score", "score"), [(False, 0.3, 0.9), (True, 0.3, 0.45), (True, 0.6, 0.6)])
+def test_no_person_that_others_show_is_lost(
+    scan: SimulatedScan, by_labels: bool, min_score: float, score: float
+) -> None:
+    """Where this network sees nothing, labels keep half of their score, and another network's box all of it."""
+    network = ObjectNetwork(Session("objects", "cpu"))
+    seen = Scan.of(scan.points, find_ground(scan.points))
+    candidates = network.crop(seen, (), "both", 0.0)
+    person = Box("pedestrian", 0.9, (1.0, 60.0, -0.8), (0.8, 0.6, 1.8), 0.0)
+    (kept,) = network.complete(seen, candidates, (), [person], by_labels, min_score)
+    assert kept == replace(person, score=score)
 
 
 def test_the_answer_does_not_depend_on_the_threads(scan: SimulatedScan) -> None:
