@@ -165,7 +165,8 @@ def _packet_scans(
             scans = _ouster_turns(path, topic, remission_field, warn, alive)
         else:
             known = lidar.senders
-            scans = turns_of(path, lidar, known[_choose(lidar.title, known, topic)] if len(known) > 1 else None, alive)
+            sender = known[_choose(lidar.title, known, topic)] if len(known) > 1 else None
+            scans = turns_of(path, lidar, sender, alive, warn)
     n_scans = 0
     for scan in scans:
         n_scans += 1

@@ -138,11 +138,9 @@ def velodyne_packets(path: Path, sender: str | None = None) -> Iterator[memoryvi
     sender : one of `velodyne_senders`; None: all.
     """
     most = _SNIFFED_PACKETS if sender is None else None
-    for datagram in islice(_velodyne_datagrams(path, most), _SNIFFED_PACKETS):
-        if datagram.is_from(sender):
-            yield datagram.payload
-    for packet in _bare_velodyne_packets(path):
-        yield packet
+    known = (datagram.payload for datagram in _velodyne_datagrams(path, most) if datagram.is_from(sender))
+    yield from islice(known, _SNIFFED_PACKETS)
+    yield from _bare_velodyne_packets(path)
 
 
 def velodyne_name(packet: memoryview) -> str | None:

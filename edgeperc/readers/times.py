@@ -33,8 +33,8 @@ _TURN_FIT = 0.9  # length of the mean of directions that turn with time; 1 where
 # Share of times on either side that may be damaged, and how far outside of the others they then lie [their duration].
 _DAMAGED_SHARE, _DAMAGED_DISTANCE = 0.01, 1.0
 
-# Clocks begin anew after a second, a minute, an hour, a day or a week [s], and counters after 32 bits. Where one does so
-# during a scan, no point has a time of most of its range; nor where a value stands for no time.
+# Clocks begin anew after a second, a minute, an hour, a day or a week [s], and counters after 32 bits. Where one does
+# so during a scan, no point has a time of most of its range; nor where a value stands for no time.
 _CLOCKS_S, _COUNTER, _EMPTY_SHARE = (1.0, 60.0, 3600.0, 86400.0, 604800.0), 2.0**32, 0.7
 
 # A scan lasts no longer than it takes to the next one; stamps jitter.

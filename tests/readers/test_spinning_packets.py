@@ -213,6 +213,19 @@ def test_several_sensors_are_told_apart(tmp_path: Path) -> None:
     np.testing.assert_array_equal(scan.points, alone.points)
 
 
+@pytest.mark.parametrize("other", ["10.0.0.2", "10.0.0.1:2369"])
+@pytest.mark.parametrize("name", ["pandarxt-16", "pandarxt-32"])
+def test_a_sensor_that_begins_late_is_left_out_with_a_warning(tmp_path: Path, name: str, other: str) -> None:
+    model = MODELS[name]
+    packets = packets_of(model, blocks_of(model, *ranges(model, 64))) * 300
+    path = write_link(tmp_path / "two.pcap", 1, packets, begin=2100, one="10.0.0.1:2368", two=other)
+    with pytest.warns(UserWarning, match=r"10\.0\.0\.1:2368 alone; later, .* several sensors, 10.*, 10.*--topic"):
+        scans = list(read_timed_scans(path))
+    expected = list(read_timed_scans(write_link(tmp_path / "one.pcap", 1, packets)))
+    for scan, alone in zip(scans, expected, strict=True):
+        np.testing.assert_array_equal(scan.points, alone.points)
+
+
 OTHERS = {
     "Hesai AT128": bytes.fromhex("eeff0403000080020004017f") + bytes(1106),
     "Hesai QT128": bytes.fromhex("eeff03020000800200040107") + bytes(1115),

@@ -479,7 +479,7 @@ def test_late_scans_and_those_of_another_session_give_no_motion(tmp_path: Path) 
 
 
 def test_scans_without_times_are_not_straightened() -> None:
-    with pytest.raises(edgeperc.PointsError, match="the scan has no times of points: .* leave out --deskew"):
+    with pytest.raises(edgeperc.PointsError, match=r"the scan has no times of points: .* leave out --deskew"):
         Straightener(None).straighten(1.0, np.zeros((8, 4), np.float32), None)
     points = np.zeros((8, 4), np.float32)
     assert Straightener(None).straighten(1.0, points, np.full(8, np.nan)) is points
