@@ -218,6 +218,8 @@ def check_dropped(points: Points, dropped: DroppedPoints, sensor: SensorProfile)
     )
 
 
+# Around the sensor, 1 % of the points are nearer than half of the median distance; in a map, all are about as far.
+_AWAY, _STEPS_M = 0.7, 0.01
 _UNITS = (("millimeters", 1e3), ("centimeters", 1e2), ("kilometers", 1e-3))
 # Bounds of a gross difference.
 # Less than the height of a sensor on a car, so that an origin on the road is found. The ground of 481
@@ -287,6 +289,15 @@ def _other_unit(scan: Measures, profile: FitnessProfile) -> Finding | None:
     near, far = profile.range_median_m
     if near / 20.0 <= scan.range_median_m <= far * 20.0:
         return None
+    if scan.nearest_m > _AWAY * scan.range_median_m:
+        steps = float(np.spacing(np.float32(scan.range_median_m)))
+        rounded = f" As float32, they are rounded to {steps:.2g} m: subtract it in double." if steps > _STEPS_M else ""
+        return Finding(
+            f"The points are about {scan.range_median_m:,.0f} m away, all in one direction: the sensor is not at the "
+            f"origin, as in the frame of a map; subtract the sensor's position from the points: origin_m= or --origin "
+            f"X Y Z.{rounded}",
+            True,
+        )
     factor = scan.range_median_m / math.sqrt(near * far)
     unit = next((name for name, size in _UNITS if 0.2 * size < factor < 5.0 * size), "another unit")
     return Finding(
