@@ -15,7 +15,7 @@ import numpy as np
 from ..errors import MissingExtraError, PointsError
 from ..system.clock import Stamp
 from ..system.extras import require
-from ..types.points import as_points, table_columns
+from ..types.points import MapError, as_points, table_columns
 from .bags import BagFile, open_bag
 from .clouds import CLOUD_READERS, Cloud, cloud_points, cloud_table, describe_cloud
 from .mcap import Channel
@@ -289,7 +289,14 @@ def _bag_scans(
                 )
                 yield from turns.add(message, stamp_s)
                 continue
-            points = cloud_points(message, remission_field=remission_field)
+            try:
+                points = cloud_points(message, remission_field=remission_field)
+            except MapError as exc:
+                raise PointsError(
+                    f"the clouds have coordinates of a map (frame {message.header.frame_id!r}), which float32 would "
+                    "round; record those of the sensor, before they are moved, or save each as a .npy, and pass its "
+                    "place there: origin_m= or --origin X Y Z"
+                ) from exc
             times_s = point_times(table_columns(cloud_table(message)), points, stamp_s) if times else None
             yield TimedScan(stamp_s, points, times_s)
     except PointsError:  # the end of the file, which is damaged

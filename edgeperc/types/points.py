@@ -28,6 +28,10 @@ MAX_ROUNDING_M = 5e-3  # of coordinates; a LiDAR measures to 1 to 3 cm
 MAX_MAP_M = 1e8  # of a map's coordinates; projected ones are up to 1e7
 
 
+class MapError(PointsError):
+    """The coordinates are those of a map, which float32 would round."""
+
+
 class Cloud(NamedTuple):
     """Points as kernels take them.
 
@@ -214,7 +218,7 @@ def assemble(
         xyz = [as_float64(values) - origin for values, origin in zip(xyz, as_origin(origin_m), strict=True)]
     if any(_is_rounded(values) for values in xyz):
         middle = ", ".join(f"{np.median(as_float64(values)[np.isfinite(values)]):,.1f}" for values in xyz)
-        raise PointsError(
+        raise MapError(
             f"the coordinates are those of a map, about ({middle}) m, and would be rounded by more than "
             f"{1e3 * MAX_ROUNDING_M:g} mm as float32; pass the place of the sensor, which is subtracted first: "
             'origin_m= or --origin X Y Z; "auto" finds that of a level sensor'
