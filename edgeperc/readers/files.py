@@ -153,6 +153,8 @@ def _read(path: Path, options: FileOptions) -> _Read:
     if data is None and path.exists() and not path.is_dir():
         raise PointsError(f"{path}: a pipe or a device, not a file; write what it gives into a file, and pass that")
     if data is None:
+        if path.is_dir():
+            raise PointsError(f"{path}: a folder; expected one scan file. edgeperc.read_scans reads those in a folder")
         raise PointsError(f"{path}: there is no such file; expected a scan as .bin, .npy, .npz, .pcd or .ply")
     return _parse_named(data, path, options)
 
