@@ -14,7 +14,7 @@ _KNOWN = {
     b"ARROW1": f"a Feather (Arrow) table, as of Argoverse 2; {_TABLE}",
     b"PAR1": f"a Parquet table; {_TABLE}",
     b"ASTM-E57": "an E57 file; convert it with CloudCompare or pdal, to .pcd or .ply",
-    b"\x89HDF": "an HDF5 file; read it with h5py, and pass the columns x, y, z and intensity as an array of shape (n, 4)",
+    b"\x89HDF": "an HDF5 file; read it with h5py, and pass x, y, z and intensity as an array of shape (n, 4)",
     b"MATLAB": "a MATLAB file; save the points as .npy or .pcd",
     b"\x80\x02": "a pickle, which is never unpickled; save the points as .npy",
     b"\x80\x03": "a pickle, which is never unpickled; save the points as .npy",
