@@ -193,7 +193,7 @@ def _parse(data: NDArray[np.uint8], name: str, options: FileOptions) -> _Read:
     if options.columns is None and not name.endswith(".bin"):
         raise PointsError(
             f"neither PCD, PLY, .npy, .npz nor text by its first bytes, {head[:8]!r}; if they are raw float32 values, "
-            "name it .bin or pass columns=4 (x, y, z, remission)"
+            "name it .bin, or pass columns= (--columns) x y z remission"
         )
     try:
         raw = parse_raw(data, options.columns, 5 if name.endswith(".pcd.bin") else 4)

@@ -441,6 +441,9 @@ def test_folders_are_opened_and_sorted(tmp_path: Path, capsys: pytest.CaptureFix
     assert answers[0]["scan"] == str(bare)
     assert "no scan in this folder" in answers[0]["error"]
     assert answers[1]["n_points"] == 40
+    (bare / "0.csv").write_text("x,y,z\n1,2,3\n")
+    assert run("run", bare) == 1
+    assert f"pass tables of text by name: {bare}/*.csv" in capsys.readouterr().err
 
 
 def test_huge_scans_fail_and_the_others_go_on(
