@@ -7,6 +7,7 @@ import shutil
 import tempfile
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence, Set
+from contextlib import nullcontext, suppress
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -35,6 +36,7 @@ from .packet_messages import (
 from .packets import (
     Datagrams,
     copy_as_ethernet,
+    has_other_lidars,
     is_plain,
     velodyne_name,
     velodyne_packets,
@@ -153,20 +155,25 @@ def _packet_scans(
         from .livox_packets import lvx2_scans, lvx2_sensors  # numba, which bags do without
 
         scans = lvx2_scans(path, _choose("sensor", lvx2_sensors(path), topic), alive)
-    elif next(velodyne_packets(path), None) is not None:
-        senders = velodyne_senders(path)
-        sender = senders[_choose("Velodyne", senders, topic)] if len(senders) > 1 else None
-        scans = _velodyne_scans(_decodable(path, alive, sender))
     else:
-        from .lidars import lidar_of, turns_of
+        is_velodyne = next(velodyne_packets(path), None) is not None
+        senders = velodyne_senders(path) if is_velodyne else []
+        lidar = None
+        if not is_velodyne or has_other_lidars(path):
+            from .lidars import lidar_of, turns_of  # numba
 
-        lidar = lidar_of(path)
-        if lidar is None:
-            scans = _ouster_turns(path, topic, remission_field, warn, alive)
-        else:
-            known = lidar.senders
-            sender = known[_choose(lidar.title, known, topic)] if len(known) > 1 else None
+            with suppress(PointsError) if is_velodyne else nullcontext():  # one that is not decoded
+                lidar = lidar_of(path)
+        others = [] if lidar is None else lidar.senders
+        known = [*senders, *others]
+        title = "Velodyne" if lidar is None else "LiDAR" if senders else lidar.title
+        sender = known[_choose(title, known, topic)] if len(known) > 1 else None
+        if lidar is not None and (not is_velodyne or sender in others):
             scans = turns_of(path, lidar, sender, alive, warn)
+        elif is_velodyne:
+            scans = _velodyne_scans(_decodable(path, alive, sender))
+        else:
+            scans = _ouster_turns(path, topic, remission_field, warn, alive)
     n_scans = 0
     for scan in scans:
         n_scans += 1

@@ -12,7 +12,7 @@ import numpy as np
 
 from ..errors import PointsError
 from .livox_packets import LivoxStream, points_of
-from .packets import Datagrams, sender_names
+from .packets import Datagrams, is_of_velodyne, sender_names
 from .spinning_packets import (
     DIFOP,
     FORMATS,
@@ -55,13 +55,13 @@ class Lidar(NamedTuple):
 
 
 def lidar_of(path: Path) -> Lidar | None:
-    """The LiDAR of a pcap file; None if it is none of these makers'.
+    """The LiDAR of a pcap file, beside a Velodyne's packets or without; None if it is none of these makers'.
 
     Raises PointsError: It is one that is not decoded.
     """
     names, senders, rows = Counter[str | None](), dict[str, Counter[tuple[str, int]]](), dict[str, Format]()
     for datagram in islice(Datagrams(path, lambda: None), _SNIFFED_PACKETS):
-        if bytes(datagram.payload[:8]) == DIFOP:
+        if bytes(datagram.payload[:8]) == DIFOP or is_of_velodyne(datagram):
             continue
         row = format_of(datagram.payload)
         name = _name_of(datagram.payload) if row is None else row.name

@@ -20,6 +20,7 @@ _LINKS = {1: (14, 12), 113: (16, 14), 276: (20, 0)}
 _LOOPBACK_LINKS, _RAW_LINKS = (0, 108), (12, 14, 101, 228)  # four bytes in front of the IP header, none
 
 VELODYNE_BYTES = 1206
+_GPS_BYTES = 512  # of a Velodyne's packet with its position
 _FLAG = b"\xff\xee"  # 0xEEFF, with which the first of twelve blocks begins
 _MOST_COPIED = 2048  # bytes of a datagram; a Velodyne's are shorter
 
@@ -166,10 +167,19 @@ def velodyne_senders(path: Path) -> list[str]:
     return sender_names(counts)
 
 
+def is_of_velodyne(datagram: Datagram) -> bool:
+    """Whether it is a Velodyne's by its size and its first bytes."""
+    return len(datagram.payload) == VELODYNE_BYTES and bytes(datagram.payload[:2]) == _FLAG
+
+
+def has_other_lidars(path: Path) -> bool:
+    """Whether the first datagrams of a pcap file may be those of other LiDARs than Velodyne's."""
+    first = Datagrams(path, lambda: None, _SNIFFED_PACKETS)
+    return any(len(datagram.payload) > _GPS_BYTES and not is_of_velodyne(datagram) for datagram in first)
+
+
 def _velodyne_datagrams(path: Path, most: int | None) -> Iterator[Datagram]:
-    for datagram in Datagrams(path, lambda: None, most):
-        if len(datagram.payload) == VELODYNE_BYTES and bytes(datagram.payload[:2]) == _FLAG:
-            yield datagram
+    return filter(is_of_velodyne, Datagrams(path, lambda: None, most))
 
 
 def _bare_velodyne_packets(path: Path) -> Iterator[memoryview]:
