@@ -38,6 +38,7 @@ from .packets import (
     copy_as_ethernet,
     has_other_lidars,
     is_plain,
+    sender_names,
     velodyne_name,
     velodyne_packets,
     velodyne_senders,
@@ -229,6 +230,7 @@ def _ouster_turns(
     stream = OusterStream(chosen, remission_field)
     sizes = {size for layout in layouts for size in (layout.packet_bytes, *layout.other_bytes)}
     ports, n_other_sizes, n_others, n_used = set[int](), Counter[int](), 0, 0
+    senders = Counter[tuple[str, int]]()
     datagrams = Datagrams(path, alive)
     for datagram in datagrams:
         size = len(datagram.payload)
@@ -241,6 +243,10 @@ def _ouster_turns(
         if not stream.is_of_sensor(datagram.payload) or (len(layouts) > 1 and chosen.port not in (0, datagram.port)):
             n_others += 1
             continue
+        if not (chosen.serial or chosen.init_id):  # the packets of old firmware do not say whose they are
+            senders[datagram.sender, datagram.port] += 1
+            if next(iter(senders)) != (datagram.sender, datagram.port):
+                continue
         n_used += 1
         yield from stream.add(bytes(datagram.payload))
     yield from stream.end()
@@ -248,6 +254,12 @@ def _ouster_turns(
         raise PointsError(
             f"the metadata is of the sensor {chosen.name} (initialization_id {chosen.init_id}), and none of the "
             f"{n_others:,} packets is; expected the metadata that was saved with the capture"
+        )
+    names = sender_names(senders)
+    if len(names) > 1:
+        warn(
+            f"{path}: the scans are those of the first of several sensors, {', '.join(names)}, whose packets carry no "
+            "serial number: save those of each in a file of its own, with its metadata"
         )
     n_bad = datagrams.n_bad + sum(n_other_sizes[port] for port in ports)
     if n_bad and n_used:

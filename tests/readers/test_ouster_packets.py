@@ -13,6 +13,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_captures import error_of, write_pcap
+from test_packets import write_link
 
 import twins.packets
 from edgeperc import PointsError, read_timed_scans
@@ -243,6 +244,28 @@ def test_several_sensors_in_one_capture(tmp_path: Path) -> None:
         wanted = [scan for turn in turns for packet in turn for scan in stream.add(bytes(packet.buf))]
         assert [len(scan.points) for scan in scans] == [len(scan.points) for scan in wanted]
         np.testing.assert_array_equal(scans[1].points, wanted[1].points)
+
+
+@pytest.mark.parametrize("other", ["10.0.0.2", "10.0.0.1:7503", "10.0.0.9:7502"])
+def test_a_second_sensor_of_old_firmware_is_left_out_with_a_warning(tmp_path: Path, other: str) -> None:
+    """Its packets carry neither a serial number nor an initialization_id."""
+    content = changed(lidar_data_format__udp_profile_lidar="LEGACY")
+    records = []
+    for seed, sender in ((1, "10.0.0.1:7502"), (2, other)):
+        payloads = [bytes(packet.buf) for turn in random_packets(content, 2, seed) for packet in turn]
+        data = write_link(tmp_path / f"{seed}.pcap", 1, payloads, one=sender).read_bytes()
+        size = len(data[24:]) // len(payloads)
+        records.append([data[24 + k * size : 24 + (k + 1) * size] for k in range(len(payloads))])
+    both = tmp_path / "both.pcap"
+    both.write_bytes(data[:24] + b"".join(one + two for one, two in zip(*records, strict=True)))
+    for name in ("1", "both"):
+        (tmp_path / f"{name}.json").write_text(json.dumps(content))
+    with pytest.warns(UserWarning, match=r"the first of several sensors, 10\.0\.0\..*whose packets carry no serial"):
+        found = [*read_timed_scans(both)]
+    expected = [*read_timed_scans(tmp_path / "1.pcap")]
+    assert len(found) == len(expected) == 2
+    for one, two in zip(found, expected, strict=True):
+        np.testing.assert_array_equal(one.points, two.points)
 
 
 @settings(max_examples=60, deadline=None)
