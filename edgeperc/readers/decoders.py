@@ -8,6 +8,7 @@ import tempfile
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence, Set
 from contextlib import nullcontext, suppress
+from itertools import islice
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -166,10 +167,14 @@ def _packet_scans(
             with suppress(PointsError) if is_velodyne else nullcontext():  # one that is not decoded
                 lidar = lidar_of(path)
         others = [] if lidar is None else lidar.senders
-        known = [*senders, *others]
-        title = "Velodyne" if lidar is None else "LiDAR" if senders else lidar.title
+        ousters = _ousters_beside(path) if is_velodyne or lidar is not None else []
+        known = [*senders, *others, *ousters]
+        is_one_kind = [bool(senders), bool(others), bool(ousters)].count(True) == 1
+        title = "LiDAR" if not is_one_kind else "Velodyne" if lidar is None else lidar.title
         sender = known[_choose(title, known, topic)] if len(known) > 1 else None
-        if lidar is not None and (not is_velodyne or sender in others):
+        if sender in ousters:
+            scans = _ouster_turns(path, sender, remission_field, warn, alive)
+        elif lidar is not None and (not is_velodyne or sender in others):
             scans = turns_of(path, lidar, sender, alive, warn)
         elif is_velodyne:
             scans = _velodyne_scans(_decodable(path, alive, sender))
@@ -184,6 +189,17 @@ def _packet_scans(
     if not n_scans:
         content = f"has {n_packets} packets, none from a supported LiDAR" if kind == ".pcap" else "holds no scan"
         raise PointsError(f"the capture {content}; expected a capture of a LiDAR, an Ouster's with its metadata")
+
+
+def _ousters_beside(path: Path) -> list[str]:
+    """Serial numbers in metadata beside a capture whose packets are among the first."""
+    from .ouster_packets import layout_of
+
+    layouts = []
+    with suppress(PointsError):  # there is none
+        layouts = [layout_of(json.loads(read_metadata(file))) for file in metadata_beside(path)]
+    sizes = {len(datagram.payload) for datagram in islice(Datagrams(path, lambda: None), 2000)} if layouts else set()
+    return [layout.name for layout in layouts if layout.packet_bytes in sizes]
 
 
 def _decodable(path: Path, alive: Callable[[], None], sender: str | None) -> Path:

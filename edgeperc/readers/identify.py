@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Collection, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -57,10 +58,11 @@ def of_packets(path: Path, topic: str | None = None) -> KnownSensor:
     sender = topic if topic in velodyne_senders(path) else None
     names = {velodyne_name(packet) for packet in velodyne_packets(path, sender)}
     is_other = not names or (topic is not None and sender is None and has_other_lidars(path))
-    known = _of_lidar(path, topic, beside=bool(names)) if is_other else None
+    by_serial = topic is not None and topic in _serials_beside(path)
+    known = _of_lidar(path, topic, beside=bool(names)) if is_other and not by_serial else None
     if known is not None:
         return known
-    if names:
+    if names and not by_serial:
         return of_velodyne(names)
     files = metadata_beside(path)
     contents = [(file.name, json.loads(read_metadata(file))) for file in files]
@@ -72,6 +74,12 @@ def of_packets(path: Path, topic: str | None = None) -> KnownSensor:
             "(--topic)"
         )
     return sensors[0]
+
+
+def _serials_beside(path: Path) -> list[str]:
+    with suppress(PointsError):
+        return [_serial(json.loads(read_metadata(file))) for file in metadata_beside(path)]
+    return []
 
 
 class NotSpinningError(SensorError):

@@ -12,11 +12,12 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from test_captures import error_of, write_pcap
+from lidar_writers import MODELS, blocks_of, packets_of, ranges
+from test_captures import error_of, vlp16_packets, write_pcap
 from test_packets import write_link
 
 import twins.packets
-from edgeperc import PointsError, read_timed_scans
+from edgeperc import PointsError, read_timed_scans, sensor_of
 from edgeperc.readers.ouster_packets import PROFILES, OusterStream, fill_turn, layout_of
 from edgeperc.readers.times import TimedScan
 
@@ -244,6 +245,34 @@ def test_several_sensors_in_one_capture(tmp_path: Path) -> None:
         wanted = [scan for turn in turns for packet in turn for scan in stream.add(bytes(packet.buf))]
         assert [len(scan.points) for scan in scans] == [len(scan.points) for scan in wanted]
         np.testing.assert_array_equal(scans[1].points, wanted[1].points)
+
+
+@pytest.mark.parametrize("other", ["velodyne", "pandarxt-16", "pandarxt-32"])
+@pytest.mark.parametrize("is_first", [True, False])
+def test_an_ouster_beside_another_makers_sensor_is_told_apart(tmp_path: Path, other: str, is_first: bool) -> None:
+    if other == "velodyne":
+        pytest.importorskip("velodyne_decoder")
+        payloads = vlp16_packets(2.0)[:110]
+    else:
+        model = MODELS[other]
+        payloads = packets_of(model, blocks_of(model, *ranges(model, 1024)))
+    ousters = [bytes(packet.buf) for turn in random_packets(METADATA, 2, 1) for packet in turn]
+    parts = [
+        write_link(tmp_path / "alone.pcap", 1, payloads, one="10.0.0.9").read_bytes(),
+        write_link(tmp_path / "ouster.pcap", 1, ousters, one="10.0.0.1:7502").read_bytes(),
+    ]
+    both = tmp_path / "both.pcap"
+    first, second = parts if is_first else parts[::-1]
+    both.write_bytes(first + second[24:])
+    for name in ("both", "ouster"):
+        (tmp_path / f"{name}.json").write_text(json.dumps(METADATA))
+    assert "expected one LiDAR, there are 10.0.0.9, 122246000293; choose one" in error_of(both)
+    for topic, path in (("10.0.0.9", tmp_path / "alone.pcap"), ("122246000293", tmp_path / "ouster.pcap")):
+        found, expected = [*read_timed_scans(both, topic=topic)], [*read_timed_scans(path)]
+        assert len(found) == len(expected) > 0
+        for one, two in zip(found, expected, strict=True):
+            np.testing.assert_array_equal(one.points, two.points)
+        assert sensor_of(both, topic=topic) == sensor_of(path)
 
 
 @pytest.mark.parametrize("other", ["10.0.0.2", "10.0.0.1:7503", "10.0.0.9:7502"])
