@@ -33,6 +33,7 @@ from .preprocess.interpolation import Interpolator
 from .preprocess.remission import RemissionMatcher
 from .preprocess.returns import about_too_near, returns
 from .preprocess.sensor_estimate import SensorEstimate, compile_votes, estimate_sensor
+from .system.clock import check_seconds
 from .system.compilation import Compilation, kernels_of
 from .system.lanes import Lanes, Stopwatch
 from .system.names import nearest
@@ -552,8 +553,12 @@ class Perceiver:
             The scan differs from the training scans, grossly if ``on_mismatch`` is ``"refuse"``.
         OptionError
             ``origin_m`` is not three finite numbers.
+        StampError
+            ``stamp_s`` is not a number.
         """
         self._check_given(points, image)
+        if stamp_s is not None:
+            check_seconds(stamp_s)
         place = None if origin_m is None else as_origin(origin_m)
         scan = None if points is None else as_points(points)
         pixels = None if image is None else as_image(image)

@@ -50,7 +50,8 @@ FLOORS = {
         objects.persons
         objects.boxes
         preprocess.__init__ preprocess.fitness preprocess.health preprocess.interpolation preprocess.returns
-        preprocess.condition preprocess.ego preprocess.findings preprocess.motion preprocess.sensor_estimate
+        preprocess.condition preprocess.ego preprocess.findings preprocess.motion
+        preprocess.sensor_estimate
         preprocess.sensor_fit
         preprocess.remission
         tracking.imm tracking.jpda tracking.ukf

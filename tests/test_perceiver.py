@@ -32,6 +32,7 @@ from edgeperc import (
     PointsError,
     ProviderError,
     SensorError,
+    StampError,
     pipeline,
 )
 from edgeperc.ground import planes
@@ -431,6 +432,12 @@ def test_ten_million_points(perceive: Perceiver, scan: SimulatedScan) -> None:
 def test_arrays_that_are_not_scans_are_a_points_error(perceive: Perceiver, bad: object) -> None:
     with pytest.raises(PointsError):
         perceive(bad)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("stamp_s", ["now", np.datetime64("2025-05-01"), [1.0]])
+def test_what_is_no_time_is_a_stamp_error(perceive: Perceiver, scan: SimulatedScan, stamp_s: Any) -> None:
+    with pytest.raises(StampError, match="expected the time of the scan"):
+        perceive(scan.points, stamp_s)
 
 
 def test_remission_is_scaled_by_the_sensors_profile(perception: Perception, scan: SimulatedScan) -> None:

@@ -16,7 +16,7 @@ from ..errors import EdgepercError, MissingExtraError, MountingError, PointsErro
 from ..system.atomic import write_atomic
 from ..types.choices import DEFAULT_MODELS
 from .arguments import Commands, add_capture, add_command, options, reading_options
-from .output import many, print_error, print_line, print_rows
+from .output import in_options, many, print_error, print_line, print_rows
 from .scans import Sensors, stated_sensor, with_mounting
 
 if TYPE_CHECKING:
@@ -107,7 +107,7 @@ def info_command(arguments: argparse.Namespace) -> int:
             raise
         except EdgepercError as exc:
             n_failed += 1
-            print_error(exc)
+            print_error(in_options(str(exc)))
             continue
         if arguments.json:
             print_line(json.dumps(document, allow_nan=False))

@@ -71,6 +71,7 @@ _OPTIONS = {
     "fold": "--fold",
     "full_turn": "--full-turn",
     "models": "--model",
+    "origin_m": "--origin",
     "n_threads": "--threads",
     "on_mismatch": "--on-mismatch",
     "precision": "--precision",
@@ -86,15 +87,16 @@ _OPTIONS = {
 
 def in_options(message: str) -> str:
     """Replace the library's argument names by options: ``provider 'cuda' is``, ``n_threads is 0``,
-    ``precision="bf16"``, and options in parentheses; the same word elsewhere in a sentence is not changed.
+    ``precision="bf16"``, and options that are named beside; the same word elsewhere in a sentence is not changed.
     """
     of_data = r"sensor= a profile (?:whose remission_range is|with the remission_range of this data,)"
     message = re.sub(rf"{of_data} \(([^,]+), ([^)]+)\)", r"--remission-range \1 \2", message)
     names = "|".join(_OPTIONS)
     message = re.sub(r"pass \w+=\S* \(on the command line ([^)]*)\)", r"pass \1", message)
+    message = re.sub(r"\b\w+= (?:or (--[\w-]+)|\((--[\w-]+)\))", lambda m: m[1] or m[2], message)
     message = re.sub(rf"(?<![\w-])({names})= ", lambda m: f"{_OPTIONS[m[1]]} ", message)
     message = re.sub(rf"(?<![\w-])({names})=(['\"]?)([\w.:-]+)\2", lambda m: f"{_OPTIONS[m[1]]} {m[3]}", message)
-    return re.sub(rf"(?<![\w-])({names})(?= is | are | '| \[)", lambda m: _OPTIONS[m[1]], message)
+    return re.sub(rf"(?<![\w-])(?<!the )({names})(?= is | are | '| \[)", lambda m: _OPTIONS[m[1]], message)
 
 
 def print_error(text: object, program: str = "edgeperc") -> None:

@@ -212,7 +212,10 @@ def run_command(arguments: argparse.Namespace) -> int:
         target.parent.mkdir(parents=True, exist_ok=True)
     report = Report(arguments, images)
     for folder in found.empty:
-        report.add(folder, PointsError("no scan in this folder; expected scans, captures or a ROS 2 bag's folder"))
+        has_tables = isinstance(folder, Path) and any(folder.glob("*.csv"))
+        tables = f"; pass tables of text by name: {folder}/*.csv" if has_tables else ""
+        nothing = f"no scan in this folder; expected scans, captures or a ROS 2 bag's folder{tables}"
+        report.add(folder, PointsError(nothing))
     started = time.perf_counter()
     with progress("file") as show, Sinks(arguments) as sinks:
         run = _Run(arguments, perceivers, kinds, sinks)

@@ -39,7 +39,8 @@ class Straightener:
         """
         if times_s is None:
             raise PointsError(
-                "the scan has no times of points; leave out --deskew, or record them: a field t, time or timestamp"
+                "the scan has no times of points: no field t, time or timestamp, or its values do not span the 2 ms to "
+                "2 s of a scan in any unit; leave out --deskew, or record them"
             )
         known = times_s[np.isfinite(times_s)]
         if not len(known):

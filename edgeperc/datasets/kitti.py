@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import csv
 import hashlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -171,12 +171,34 @@ def read_labels(path: Path) -> KittiLabels:
             values = [float(word) for word in words[1:15]]
         except ValueError as exc:
             raise PointsError(f"{path}, line {number}: {exc}; expected a class and 14 numbers") from exc
-        if len(values) < 14 or not np.isfinite(values).all():
-            got = "one that is not finite" if len(values) == 14 else f"{len(values)}, as labels of images have"
-            raise PointsError(f"{path}, line {number}: expected a class and 14 finite numbers, got {got}")
+        if len(values) < 14:
+            of_image = ", as labels of images have" if len(values) == 7 else ""
+            raise PointsError(
+                f"{path}, line {number}: expected a class and 14 finite numbers, got {len(values)}{of_image}"
+            )
+        if wrong := wrong_in_label(words[0], values):
+            raise PointsError(f"{path}, line {number}: {wrong}")
         rows.append((words[0].lower(), values))
     numbers = np.array([values for _, values in rows], np.float64).reshape(-1, 14)
     return KittiLabels(tuple(kind for kind, _ in rows), numbers)
+
+
+def wrong_in_label(kind: str, numbers: Sequence[float]) -> str:
+    """What is wrong with the 14 numbers of a label, as a sentence; empty if nothing is."""
+    if not np.isfinite(numbers).all():
+        return "expected a class and 14 finite numbers, got one that is not finite"
+    if kind.lower() == "dontcare":
+        return ""
+    *size, _, _, _, turn = numbers[7:14]
+    if not all(0.0 < meters < _LARGEST_M for meters in size):
+        return (
+            f"expected a height, width and length above 0 m, got {', '.join(f'{each:g}' for each in size)}; an object "
+            "without a box in 3-D is a DontCare"
+        )
+    return "" if abs(turn) <= _WHOLE_TURN else f"expected a direction in radians, got {turn:g}, as if in degrees"
+
+
+_LARGEST_M, _WHOLE_TURN = 100.0, 6.3  # of KITTI's objects, a tram is the longest, 35 m
 
 
 def label_objects(labels: KittiLabels, calibration: KittiCalibration) -> tuple[tuple[Box, ...], NDArray[np.float64]]:

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..datasets.kitti import IMAGE_SIZE, KittiCalibration, KittiObjects
+from ..datasets.kitti import IMAGE_SIZE, KittiCalibration, KittiObjects, wrong_in_label
 from ..errors import TrackingError
 from ..perceiver import Perceiver
 from ..readers.files import read_points
@@ -109,7 +109,11 @@ def _labels(root: Path, name: str) -> tuple[Path, list[list[str]], KittiCalibrat
     """Read the labels of a sequence: their path, KITTI's 17 columns of each label as text, and the calibration."""
     path = root / "label_02" / f"{name}.txt"
     if path.parent.is_dir():
-        lines = [line.split() for line in path.read_text().splitlines() if line.strip()]
+        try:
+            text = path.read_bytes().decode("utf-8-sig")
+        except UnicodeDecodeError as exc:
+            raise TrackingError(f"{path}: the labels cannot be read ({exc})") from exc
+        lines = [line.split() for line in text.splitlines() if line.strip()]
         return path, lines, KittiCalibration.read(root / "calib" / f"{name}.txt")
     path, lines, stem = root / "training/label_2", [], ""
     for frame, scan in sequence_scans(root, name).items():
@@ -122,6 +126,24 @@ def _labels(root: Path, name: str) -> tuple[Path, list[list[str]], KittiCalibrat
             )
         lines += [[str(frame), one, *label.split()] for one, label in zip(ids, labels, strict=True)]
     return path, lines, KittiCalibration.read(root / "training/calib" / f"{stem}.txt")
+
+
+def _values(labels: Sequence[Sequence[str]], path: Path) -> NDArray[np.float64]:
+    """The numbers of labels: frame, track, and the 14 of an object."""
+    try:
+        values = np.array([[*columns[:2], *columns[3:17]] for columns in labels], np.float64).reshape(-1, 16)
+    except ValueError as exc:
+        raise TrackingError(f"{path} is not a file of KITTI tracking labels; expected 17 columns") from exc
+    for number, (columns, numbers) in enumerate(zip(labels, values.tolist(), strict=True), start=1):
+        wrong = wrong_in_label(columns[2], numbers[2:])
+        if not 0.0 <= numbers[0] <= _MOST_FRAMES or not abs(numbers[1]) < 2**53:
+            wrong = f"expected the numbers of a frame and of a track, got {columns[0]}, {columns[1]}"
+        if wrong:
+            raise TrackingError(f"{path}, label {number}: {wrong}")
+    return values
+
+
+_MOST_FRAMES = 1_000_000
 
 
 def read_sequence(
@@ -137,10 +159,7 @@ def read_sequence(
     """
     root = Path(root)
     label_path, labels, calibration = _labels(root, name)
-    try:
-        values = np.array([[*columns[:2], *columns[3:17]] for columns in labels], np.float64).reshape(-1, 16)
-    except ValueError as exc:
-        raise TrackingError(f"{label_path} is not a file of KITTI tracking labels; expected 17 columns") from exc
+    values = _values(labels, label_path)
     kinds = np.array([columns[2].lower() for columns in labels], np.str_)
     n_frames = 1 + int(values[:, 0].max(initial=-1.0))
     if boxes is None:

@@ -218,6 +218,9 @@ def check_dropped(points: Points, dropped: DroppedPoints, sensor: SensorProfile)
     )
 
 
+# Around the sensor, 1 % of the points are nearer than half of the median distance; in a map, all are about as far.
+_AWAY, _FARTHEST_M, _STEPS_M = 0.7, 8.9e6, 0.01
+_STREET_M = (7.0, 12.0)  # median distance in streets
 _UNITS = (("millimeters", 1e3), ("centimeters", 1e2), ("kilometers", 1e-3))
 # Bounds of a gross difference.
 # Less than the height of a sensor on a car, so that an origin on the road is found. The ground of 481
@@ -266,7 +269,11 @@ def _geometry_findings(scan: Measures, profile: FitnessProfile, sensor: SensorPr
     walls = _walls(scan)
     room = walls if walls is not None and walls.gross else None  # its ceiling may count as ground
     axes = _other_axes(scan)
-    mistake = _other_unit(scan, profile) or (axes if scan.flat_axis in (0, 1) else room or axes) or _other_origin(scan)
+    mistake = (
+        _other_unit(scan, profile.range_median_m)
+        or (axes if scan.flat_axis in (0, 1) else room or axes)
+        or _other_origin(scan)
+    )
     mistake = mistake or _upside_down(scan, profile)
     if mistake is not None:
         return [mistake]
@@ -283,10 +290,28 @@ def _geometry_findings(scan: Measures, profile: FitnessProfile, sensor: SensorPr
     return [finding for finding in found if finding is not None]
 
 
-def _other_unit(scan: Measures, profile: FitnessProfile) -> Finding | None:
-    near, far = profile.range_median_m
+def check_coordinates(points: Points) -> Finding | None:
+    """What is wrong with the unit, the axes or the origin of a scan of any sensor; None if nothing is found.
+
+    points : (n, 4) float32; finite.
+    """
+    scan = measure(points, (180.0, -180.0))
+    return None if scan is None else _other_unit(scan, _STREET_M) or _other_axes(scan) or _other_origin(scan)
+
+
+def _other_unit(scan: Measures, usual_m: Range) -> Finding | None:
+    near, far = usual_m
     if near / 20.0 <= scan.range_median_m <= far * 20.0:
         return None
+    if _AWAY * scan.range_median_m < scan.nearest_m < _FARTHEST_M:
+        steps = float(np.spacing(np.float32(scan.range_median_m)))
+        rounded = f" As float32, they are rounded to {steps:.2g} m: subtract it in double." if steps > _STEPS_M else ""
+        return Finding(
+            f"The points are about {scan.range_median_m:,.0f} m away, all in one direction: the sensor is not at the "
+            f"origin, as in the frame of a map; subtract the sensor's position from the points: origin_m= or --origin "
+            f"X Y Z.{rounded}",
+            True,
+        )
     factor = scan.range_median_m / math.sqrt(near * far)
     unit = next((name for name, size in _UNITS if 0.2 * size < factor < 5.0 * size), "another unit")
     return Finding(

@@ -24,6 +24,7 @@ MAX_RATE = 1e4  # of m/s and rad/s
 MAX_TURN = 3.1  # rad; the axis of half a turn has no sign
 MAX_BYTES = 1 << 28  # of a file of poses; a line has about 100
 MIN_STEP_M, MIN_WAY_M = 1.0, 5.0  # of a trajectory, until its directions of travel count
+FASTEST_MPS = 150.0  # of a trajectory; trains are slower
 UPRIGHT, FORWARD, SAME_WAY = 0.7, 0.7, 0.95  # cosines: z is up, x is ahead; the way keeps its direction in the sensor
 OUTSIDE_S = 0.2  # the motion at the ends of a trajectory holds for two scans of 10 Hz
 
@@ -159,8 +160,9 @@ class Trajectory:
         Raises
         ------
         TrackingError
-            The file cannot be read, or a line is not such eight numbers. Or the order is not given, and only as
-            ``"wxyz"`` does the z axis of the sensor point up and its x axis along its way.
+            The file cannot be read, a line is not such eight numbers, or the sensor moves at more than 150 m/s. Or the
+            order is not given, and only as ``"wxyz"`` does the z axis of the sensor point up and its x axis along its
+            way.
         StampError
             Fewer than two lines, or their times do not rise.
         OptionError
@@ -170,10 +172,8 @@ class Trajectory:
             raise OptionError(f"quaternion is {quaternion!r}; expected 'xyzw' or 'wxyz'")
         try:
             with Path(path).open("rb") as file:
-                content = file.read(MAX_BYTES + 1)
-            rows = np.loadtxt(io.BytesIO(content[:MAX_BYTES]), np.float64, ndmin=2, encoding="latin-1")
-            if len(content) > MAX_BYTES or rows.shape[1] != 8:
-                raise ValueError(f"{len(content):,} bytes, {rows.shape[1]} numbers in a line")
+                content = file.read(MAX_BYTES + 1).removeprefix(b"\xef\xbb\xbf")
+            rows = _rows(content)
         except (OSError, ValueError) as exc:
             raise TrackingError(
                 f"{path} cannot be read as poses ({exc}); expected lines of time, x, y, z, qx, qy, qz, qw"
@@ -186,6 +186,14 @@ class Trajectory:
         if not rises.all():
             line = _line(content, int(np.argmin(rises)) + 1)
             raise StampError(f"{path}: the time of line {line} is not later than that before; expected times that rise")
+        with np.errstate(all="ignore"):
+            speeds = np.linalg.norm(np.diff(rows[:, 1:4], axis=0), axis=1) / np.diff(rows[:, 0])
+            speed = float(np.median(speeds)) if len(speeds) else 0.0
+        if FASTEST_MPS < speed < math.inf:
+            raise TrackingError(
+                f"{path}: by its poses, the sensor moves at {speed:,.0f} m/s; expected positions in meters and times "
+                "in seconds"
+            )
         units = rows[:, 4:] / norm[:, None]
         poses = poses_of(rows[:, 1:4], units)
         other = poses_of(rows[:, 1:4], np.roll(units, -1, axis=1))
@@ -355,6 +363,20 @@ def _meters(min_range_m: float) -> float:
     if not 0.0 <= meters < math.inf:
         raise OptionError(f"min_range_m is {min_range_m!r:.80}; expected meters from 0")
     return meters
+
+
+def _rows(content: bytes) -> NDArray[np.float64]:
+    """The numbers in a file of poses, (n, 8); ValueError says what else it holds."""
+    first = next((line for line in content.splitlines() if line.partition(b"#")[0].strip()), b"")
+    if not first:
+        raise ValueError("no line of numbers")
+    if b"," in first:
+        raise ValueError("its values are separated by commas, as EuRoC's, whose times are nanoseconds")
+    rows = np.loadtxt(io.BytesIO(content[:MAX_BYTES]), np.float64, ndmin=2, encoding="latin-1")
+    if len(content) > MAX_BYTES or rows.shape[1] != 8:
+        kind = ", as KITTI's poses, which have no times" if rows.shape[1] == 12 else ""
+        raise ValueError(f"{len(content):,} bytes, {rows.shape[1]} numbers in a line{kind}")
+    return rows
 
 
 def _line(content: bytes, k: int) -> int:

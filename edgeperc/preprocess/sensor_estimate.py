@@ -19,6 +19,7 @@ from ..errors import SensorError
 from ..system.kernels import njit
 from ..types.points import Points
 from ..types.sensor import SAY_PATTERN, SENSORS, SensorProfile
+from .findings import check_coordinates
 
 __all__ = ["MOST_SCANS", "SensorEstimate", "compile_votes", "estimate_sensor", "fill_votes", "has_enough_points"]
 
@@ -205,6 +206,9 @@ def estimate_sensor(scans: Sequence[Points]) -> SensorEstimate:
         on_beams = on_beams if match.name else min(on_beams, _ON_KNOWN)  # moved beams are not sure to 0.1 degrees
     least = _ON_MOVED if match.name == "hdl-64e" else _ON_KNOWN if match.name else _ON_BEAM
     if on_beams < least:
+        mistake = check_coordinates(max(clean, key=len))
+        if mistake is not None:
+            raise SensorError(f"the sensor cannot be told from the scan. {mistake}")
         raise _unknown(
             f"no beams stand out in its {n_points:,} points: {len(beams.slopes)} explain {max(on_beams, 0.0):.0%} of "
             f"them. {_patterns_of(polar)}Points of several sensors, about another place than the sensor or along other "

@@ -62,7 +62,7 @@ def read_scans(
         bytes of a file decide its format, not its name.
     topic : str, optional
         What to read if there are several sensors: the topic of point clouds; ``TOPIC@FRAME`` for those of one frame;
-        the serial number of an Ouster or in an ``.lvx2``; the IPv4 address of another sensor.
+        the serial number of an Ouster or in an ``.lvx2``; the IPv4 address of another sensor, or ``ADDRESS:PORT``.
     remission_field : str, optional
         Name of the remission field, as in `edgeperc.read_points`; ``reflectivity`` by default for an Ouster capture.
     columns : int or sequence of str, optional
@@ -97,7 +97,7 @@ def read_scans(
         Damaged packets of an Ouster capture were dropped; the message has their number.
     """
     options = _Options(topic, FileOptions(columns, remission_field, origin_m), times=accumulate_s is not None)
-    scans = _scans(Path(source), options)
+    scans = _scans(_path(source), options)
     gathered = scans if accumulate_s is None else accumulate(scans, accumulate_s)
     return ((stamp_s, points) for stamp_s, points, _ in gathered)
 
@@ -135,8 +135,18 @@ def read_timed_scans(
         As `read_scans`. PointsError also if the times contradict the stamps of the scans, or if the azimuths turn once
         in a time that no LiDAR takes for a turn: below 33 ms, or above 350 ms.
     """
-    scans = _scans(Path(source), _Options(topic, FileOptions(columns, remission_field, origin_m), times=True))
+    scans = _scans(_path(source), _Options(topic, FileOptions(columns, remission_field, origin_m), times=True))
     return scans if accumulate_s is None else accumulate(scans, accumulate_s)
+
+
+def _path(source: object) -> Path:
+    """The path of a recording. Raises PointsError."""
+    if not isinstance(source, str | os.PathLike):
+        raise PointsError(
+            f"got a {type(source).__name__}; expected the path of one recording, folder or scan file. Call it for each "
+            "of several paths; arrays of points are scans already"
+        )
+    return Path(source)
 
 
 class _Options(NamedTuple):
@@ -191,7 +201,7 @@ def sensor_of(source: str | os.PathLike[str], *, topic: str | None = None) -> Se
     PointsError, MissingExtraError
         As `edgeperc.read_scans`.
     """
-    known = known_sensor(Path(source), topic)
+    known = known_sensor(_path(source), topic)
     return None if known is None else known.profile
 
 

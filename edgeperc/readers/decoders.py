@@ -7,6 +7,8 @@ import shutil
 import tempfile
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence, Set
+from contextlib import nullcontext, suppress
+from itertools import islice
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -15,7 +17,7 @@ import numpy as np
 from ..errors import MissingExtraError, PointsError
 from ..system.clock import Stamp
 from ..system.extras import require
-from ..types.points import as_points, table_columns
+from ..types.points import MapError, as_points, table_columns
 from .bags import BagFile, open_bag
 from .clouds import CLOUD_READERS, Cloud, cloud_points, cloud_table, describe_cloud
 from .mcap import Channel
@@ -35,7 +37,9 @@ from .packet_messages import (
 from .packets import (
     Datagrams,
     copy_as_ethernet,
+    has_other_lidars,
     is_plain,
+    sender_names,
     velodyne_name,
     velodyne_packets,
     velodyne_senders,
@@ -153,19 +157,29 @@ def _packet_scans(
         from .livox_packets import lvx2_scans, lvx2_sensors  # numba, which bags do without
 
         scans = lvx2_scans(path, _choose("sensor", lvx2_sensors(path), topic), alive)
-    elif next(velodyne_packets(path), None) is not None:
-        senders = velodyne_senders(path)
-        sender = senders[_choose("Velodyne", senders, topic)] if len(senders) > 1 else None
-        scans = _velodyne_scans(_decodable(path, alive, sender))
     else:
-        from .lidars import lidar_of, turns_of
+        is_velodyne = next(velodyne_packets(path), None) is not None
+        senders = velodyne_senders(path) if is_velodyne else []
+        lidar = None
+        if not is_velodyne or has_other_lidars(path):
+            from .lidars import lidar_of, turns_of  # numba
 
-        lidar = lidar_of(path)
-        if lidar is None:
-            scans = _ouster_turns(path, topic, remission_field, warn, alive)
+            with suppress(PointsError) if is_velodyne else nullcontext():  # one that is not decoded
+                lidar = lidar_of(path)
+        others = [] if lidar is None else lidar.senders
+        ousters = _ousters_beside(path) if is_velodyne or lidar is not None else []
+        known = [*senders, *others, *ousters]
+        is_one_kind = [bool(senders), bool(others), bool(ousters)].count(True) == 1
+        title = "LiDAR" if not is_one_kind else "Velodyne" if lidar is None else lidar.title
+        sender = known[_choose(title, known, topic)] if len(known) > 1 else None
+        if sender in ousters:
+            scans = _ouster_turns(path, sender, remission_field, warn, alive)
+        elif lidar is not None and (not is_velodyne or sender in others):
+            scans = turns_of(path, lidar, sender, alive, warn)
+        elif is_velodyne:
+            scans = _velodyne_scans(_decodable(path, alive, sender))
         else:
-            known = lidar.senders
-            scans = turns_of(path, lidar, known[_choose(lidar.title, known, topic)] if len(known) > 1 else None, alive)
+            scans = _ouster_turns(path, topic, remission_field, warn, alive)
     n_scans = 0
     for scan in scans:
         n_scans += 1
@@ -175,6 +189,17 @@ def _packet_scans(
     if not n_scans:
         content = f"has {n_packets} packets, none from a supported LiDAR" if kind == ".pcap" else "holds no scan"
         raise PointsError(f"the capture {content}; expected a capture of a LiDAR, an Ouster's with its metadata")
+
+
+def _ousters_beside(path: Path) -> list[str]:
+    """Serial numbers in metadata beside a capture whose packets are among the first."""
+    from .ouster_packets import layout_of
+
+    layouts = []
+    with suppress(PointsError):  # there is none
+        layouts = [layout_of(json.loads(read_metadata(file))) for file in metadata_beside(path)]
+    sizes = {len(datagram.payload) for datagram in islice(Datagrams(path, lambda: None), 2000)} if layouts else set()
+    return [layout.name for layout in layouts if layout.packet_bytes in sizes]
 
 
 def _decodable(path: Path, alive: Callable[[], None], sender: str | None) -> Path:
@@ -221,6 +246,7 @@ def _ouster_turns(
     stream = OusterStream(chosen, remission_field)
     sizes = {size for layout in layouts for size in (layout.packet_bytes, *layout.other_bytes)}
     ports, n_other_sizes, n_others, n_used = set[int](), Counter[int](), 0, 0
+    senders = Counter[tuple[str, int]]()
     datagrams = Datagrams(path, alive)
     for datagram in datagrams:
         size = len(datagram.payload)
@@ -233,6 +259,10 @@ def _ouster_turns(
         if not stream.is_of_sensor(datagram.payload) or (len(layouts) > 1 and chosen.port not in (0, datagram.port)):
             n_others += 1
             continue
+        if not (chosen.serial or chosen.init_id):  # the packets of old firmware do not say whose they are
+            senders[datagram.sender, datagram.port] += 1
+            if next(iter(senders)) != (datagram.sender, datagram.port):
+                continue
         n_used += 1
         yield from stream.add(bytes(datagram.payload))
     yield from stream.end()
@@ -240,6 +270,12 @@ def _ouster_turns(
         raise PointsError(
             f"the metadata is of the sensor {chosen.name} (initialization_id {chosen.init_id}), and none of the "
             f"{n_others:,} packets is; expected the metadata that was saved with the capture"
+        )
+    names = sender_names(senders)
+    if len(names) > 1:
+        warn(
+            f"{path}: the scans are those of the first of several sensors, {', '.join(names)}, whose packets carry no "
+            "serial number: save those of each in a file of its own, with its metadata"
         )
     n_bad = datagrams.n_bad + sum(n_other_sizes[port] for port in ports)
     if n_bad and n_used:
@@ -288,7 +324,14 @@ def _bag_scans(
                 )
                 yield from turns.add(message, stamp_s)
                 continue
-            points = cloud_points(message, remission_field=remission_field)
+            try:
+                points = cloud_points(message, remission_field=remission_field)
+            except MapError as exc:
+                raise PointsError(
+                    f"the clouds have coordinates of a map (frame {message.header.frame_id!r}), which float32 would "
+                    "round; record those of the sensor, before they are moved, or save each as a .npy, and pass its "
+                    "place there: origin_m= or --origin X Y Z"
+                ) from exc
             times_s = point_times(table_columns(cloud_table(message)), points, stamp_s) if times else None
             yield TimedScan(stamp_s, points, times_s)
     except PointsError:  # the end of the file, which is damaged

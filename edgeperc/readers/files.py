@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import PointsError
-from ..types.points import as_float64, as_points, assemble, table_columns
+from ..types.points import as_float64, as_points, assemble, plain_name, remission_name, table_columns
 from .inflate import inflate, most_bytes
 from .origin import find_place
 from .pcd import begins_like_pcd, parse_pcd
@@ -47,9 +47,9 @@ def read_points(
     Parameters
     ----------
     source : str, path or array
-        ``.bin``, ``.pcd.bin``, ``.npy``, ``.npz`` (its only array, or the one called ``points``), ``.pcd`` (ascii,
-        binary, binary_compressed), ``.ply`` (ascii, binary), a table of text (``.csv``, ``.xyz``, ``.txt``, ``.pts``),
-        or an array for `as_points`.
+        ``.bin``, ``.pcd.bin``, ``.npy``, ``.npz`` (its only array, or the one called ``points``, with the remission
+        beside), ``.pcd`` (ascii, binary, binary_compressed), ``.ply`` (ascii, binary), a table of text (``.csv``,
+        ``.xyz``, ``.txt``, ``.pts``), or an array for `as_points`.
     columns : int or sequence of str, optional
         What a raw file, an array or a text without names holds for each point: the names of the values in order, such
         as ``("x", "y", "z", "intensity", "ring")``; or, of a raw file or an array, the number of values, at least 3, of
@@ -153,6 +153,8 @@ def _read(path: Path, options: FileOptions) -> _Read:
     if data is None and path.exists() and not path.is_dir():
         raise PointsError(f"{path}: a pipe or a device, not a file; write what it gives into a file, and pass that")
     if data is None:
+        if path.is_dir():
+            raise PointsError(f"{path}: a folder; expected one scan file. edgeperc.read_scans reads those in a folder")
         raise PointsError(f"{path}: there is no such file; expected a scan as .bin, .npy, .npz, .pcd or .ply")
     return _parse_named(data, path, options)
 
@@ -191,7 +193,7 @@ def _parse(data: NDArray[np.uint8], name: str, options: FileOptions) -> _Read:
     if options.columns is None and not name.endswith(".bin"):
         raise PointsError(
             f"neither PCD, PLY, .npy, .npz nor text by its first bytes, {head[:8]!r}; if they are raw float32 values, "
-            "name it .bin or pass columns=4 (x, y, z, remission)"
+            "name it .bin, or pass columns= (--columns) x y z remission"
         )
     try:
         raw = parse_raw(data, options.columns, 5 if name.endswith(".pcd.bin") else 4)
@@ -282,22 +284,34 @@ def _parse_npz(data: NDArray[np.uint8]) -> NDArray[Any]:
         # zipfile raises BadZipFile, RuntimeError (encrypted), NotImplementedError, zlib.error, EOFError and others.
         with zipfile.ZipFile(io.BytesIO(data.tobytes())) as archive:
             members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
-            if "points" in members:
-                member = members["points"]
-            elif len(members) == 1:
-                (member,) = members.values()
-            else:
-                raise PointsError(f"several arrays and none called points: {', '.join(members)}")
-            if member.file_size > most_bytes(data.size):
+            name = "points" if "points" in members else next(iter(members), "")
+            if len(members) != 1 and name != "points":
                 raise PointsError(
-                    f"{data.size} bytes claim to unpack to {member.file_size}; no scan packs so well, so it is not "
-                    "unpacked. Save it as .npy"
+                    f"several arrays and none called points: {', '.join(members)}; save one of shape (n, 4), x, y, z "
+                    "and remission, as points"
                 )
-            content = _unpack_member(data, member)
+            points = _parse_member(data, members[name])
+            remission = remission_name(map(plain_name, members), None)
+            if remission is None or points.dtype.names or points.shape[1:] != (3,):
+                return points
+            beside = next(member for other, member in members.items() if plain_name(other) == remission)
+            values = _parse_member(data, beside).reshape(-1, 1)
+            if len(values) != len(points) or not {points.dtype.kind, values.dtype.kind} <= {*"fiu"}:
+                raise PointsError(f"{beside.filename!r} in the archive is not one number for each of the points")
+            return np.hstack([points, values])
     except PointsError:
         raise
     except Exception as exc:
         raise PointsError(f"the .npz archive cannot be read: {exc}") from exc
+
+
+def _parse_member(data: NDArray[np.uint8], member: zipfile.ZipInfo) -> NDArray[Any]:
+    if member.file_size > most_bytes(data.size):
+        raise PointsError(
+            f"{data.size} bytes claim to unpack to {member.file_size}; no scan packs so well, so it is not "
+            "unpacked. Save it as .npy"
+        )
+    content = _unpack_member(data, member)
     if not content.startswith(b"\x93NUMPY"):
         raise PointsError(f"{member.filename!r} in the archive is not a .npy array")
     return _parse_npy(np.frombuffer(content, dtype=np.uint8))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Collection, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -15,7 +16,7 @@ from ..errors import PointsError, SensorError
 from ..types.sensor import SAY_PATTERN, SENSORS, SensorProfile
 from .clouds import is_ouster_cloud
 from .ouster import check_metadata, metadata_beside, read_metadata
-from .packets import velodyne_name, velodyne_packets, velodyne_senders
+from .packets import has_other_lidars, velodyne_name, velodyne_packets, velodyne_senders
 
 _CHOICES = f"Pass its name, sensor= or --sensor: {', '.join(SENSORS)}; or a profile of your own, a .json file."
 
@@ -56,11 +57,13 @@ def of_packets(path: Path, topic: str | None = None) -> KnownSensor:
     """
     sender = topic if topic in velodyne_senders(path) else None
     names = {velodyne_name(packet) for packet in velodyne_packets(path, sender)}
-    if names:
-        return of_velodyne(names)
-    known = _of_lidar(path, topic)
+    is_other = not names or (topic is not None and sender is None and has_other_lidars(path))
+    by_serial = topic is not None and topic in _serials_beside(path)
+    known = _of_lidar(path, topic, beside=bool(names)) if is_other and not by_serial else None
     if known is not None:
         return known
+    if names and not by_serial:
+        return of_velodyne(names)
     files = metadata_beside(path)
     contents = [(file.name, json.loads(read_metadata(file))) for file in files]
     chosen = [entry for entry in contents if topic is None or _serial(entry[1]) == topic] or contents
@@ -71,6 +74,12 @@ def of_packets(path: Path, topic: str | None = None) -> KnownSensor:
             "(--topic)"
         )
     return sensors[0]
+
+
+def _serials_beside(path: Path) -> list[str]:
+    with suppress(PointsError):
+        return [_serial(json.loads(read_metadata(file))) for file in metadata_beside(path)]
+    return []
 
 
 class NotSpinningError(SensorError):
@@ -84,12 +93,15 @@ def of_livox() -> NotSpinningError:
     )
 
 
-def _of_lidar(path: Path, topic: str | None) -> KnownSensor | None:
-    """The sensor of Hesai's or RoboSense's packets, with the angles of the unit; None if they are not theirs."""
+def _of_lidar(path: Path, topic: str | None, *, beside: bool = False) -> KnownSensor | None:
+    """The sensor of Hesai's or RoboSense's packets, with the angles of the unit; None if they are not theirs.
+
+    beside : there are a Velodyne's, too, so that the topic must name it.
+    """
     from .lidars import columns_of, lidar_of, open_spinning  # numba
 
     lidar = lidar_of(path)
-    if lidar is None:
+    if lidar is None or (beside and topic not in lidar.senders):
         return None
     if lidar.row is None:
         raise of_livox()

@@ -12,7 +12,7 @@ import numpy as np
 
 from ..errors import PointsError
 from .livox_packets import LivoxStream, points_of
-from .packets import Datagrams
+from .packets import Datagrams, is_of_velodyne, sender_names
 from .spinning_packets import (
     DIFOP,
     FORMATS,
@@ -30,7 +30,6 @@ from .times import TimedScan
 # Enough to find a LiDAR's packet among those of a GPS, and quick to read.
 _SNIFFED_PACKETS = 2000
 _OTHER_BYTES = 600  # what LiDARs send of their GPS is shorter
-_LEAST_SHARE = 0.05  # of a sensor's packets; a damaged address has less
 _LIVOX = "livox"
 _LIVOX_SIZES = (1380, 804, 996)
 _STEPS = 200  # packets that show how far apart columns are
@@ -41,11 +40,13 @@ class Lidar(NamedTuple):
     """What sends most of the first packets.
 
     row : the format of a spinning sensor; None: Livox.
-    senders : IPv4 addresses of such sensors, sorted.
+    senders : such sensors, as `packets.sender_names` calls them.
+    first : address and port of the one with the most packets.
     """
 
     row: Format | None
     senders: list[str]
+    first: str
 
     @property
     def title(self) -> str:
@@ -54,13 +55,13 @@ class Lidar(NamedTuple):
 
 
 def lidar_of(path: Path) -> Lidar | None:
-    """The LiDAR of a pcap file; None if it is none of these makers'.
+    """The LiDAR of a pcap file, beside a Velodyne's packets or without; None if it is none of these makers'.
 
     Raises PointsError: It is one that is not decoded.
     """
-    names, senders, rows = Counter[str | None](), dict[str, Counter[str]](), dict[str, Format]()
+    names, senders, rows = Counter[str | None](), dict[str, Counter[tuple[str, int]]](), dict[str, Format]()
     for datagram in islice(Datagrams(path, lambda: None), _SNIFFED_PACKETS):
-        if bytes(datagram.payload[:8]) == DIFOP:
+        if bytes(datagram.payload[:8]) == DIFOP or is_of_velodyne(datagram):
             continue
         row = format_of(datagram.payload)
         name = _name_of(datagram.payload) if row is None else row.name
@@ -68,13 +69,13 @@ def lidar_of(path: Path) -> Lidar | None:
             rows.setdefault(row.name, row)
         if name is not None or len(datagram.payload) > _OTHER_BYTES:
             names[name] += 1
-            senders.setdefault(name or "", Counter())[datagram.sender] += 1
+            senders.setdefault(name or "", Counter())[datagram.sender, datagram.port] += 1
     name, n = max(names.items(), key=lambda item: item[1], default=(None, 0))
     if name is None or 2 * n <= names.total():  # packets of other sensors may begin like these by chance
         return None
-    known = sorted(sender for sender, count in senders[name].items() if count >= _LEAST_SHARE * n)
     if name in rows or name == _LIVOX:
-        return Lidar(rows.get(name), known)
+        (address, port), _ = senders[name].most_common(1)[0]
+        return Lidar(rows.get(name), sender_names(senders[name]), f"{address}:{port}")
     raise PointsError(
         f"a capture of a {name}, which cannot be decoded; the documentation lists those that are. Convert it with "
         f"{name.split()[0]}'s driver, to a ROS bag or to .pcd files"
@@ -102,7 +103,7 @@ def open_spinning(path: Path, row: Format, sender: str | None, alive: Callable[[
     file = next((each for each in files if each.stem.startswith(path.stem)), None)
     said = Angles(np.array([[each, 0.0] for each in row.elevations_deg])) if row.elevations_deg else None
     for datagram in () if row.is_hesai else Datagrams(path, alive):
-        if sender not in (None, datagram.sender):
+        if not datagram.is_from(sender):
             continue
         if row.name == "helios-32" and angles_of_difop(FORMATS["helios-16"], datagram.payload) is not None:
             row = FORMATS["helios-16"] if has_16_lasers(datagram.payload) else row
@@ -132,33 +133,59 @@ def columns_of(path: Path, row: Format, sender: str | None) -> int:
     return round(firings * 360.0 / float(np.median(steps))) if len(steps) else 0
 
 
-def _of_format(path: Path, row: Format, sender: str | None, alive: Callable[[], None]) -> Iterator[memoryview]:
-    """The packets of a sensor, all of one size."""
+def _of_format(
+    path: Path,
+    row: Format,
+    sender: str | None,
+    alive: Callable[[], None],
+    seen: Counter[tuple[str, int]] | None = None,
+) -> Iterator[memoryview]:
+    """The packets of a sensor, all of one size.
+
+    seen : gets the packets of each address and port.
+    """
     size = 0
     for datagram in Datagrams(path, alive):
-        found = format_of(datagram.payload) if sender in (None, datagram.sender) else None
+        found = format_of(datagram.payload)
         if found is None or (found != row and {found.name, row.name} != _ALIKE):
+            continue
+        if seen is not None:
+            seen[datagram.sender, datagram.port] += 1
+        if not datagram.is_from(sender):
             continue
         size = size or len(datagram.payload)
         if len(datagram.payload) == size:
             yield datagram.payload
 
 
-def turns_of(path: Path, lidar: Lidar, sender: str | None, alive: Callable[[], None]) -> Iterator[TimedScan]:
+def turns_of(
+    path: Path, lidar: Lidar, sender: str | None, alive: Callable[[], None], warn: Callable[[str], None]
+) -> Iterator[TimedScan]:
     """The turns of a spinning sensor, or what a Livox sees in tenths of a second.
 
+    sender : None: the only one among the first packets; a warning names those that begin later.
     Raises PointsError: As `open_spinning`.
     """
+    seen = Counter[tuple[str, int]]()
+    first = sender or lidar.first
     if lidar.row is not None:
         row, angles = open_spinning(path, lidar.row, sender, alive)
         stream = SpinningStream(row, angles)
-        for payload in _of_format(path, row, sender, alive):
+        for payload in _of_format(path, row, first, alive, seen):
             yield from stream.add(payload)
         yield from stream.end()
-        return
-    livox = LivoxStream()
-    for datagram in Datagrams(path, alive):
-        points = points_of(datagram.payload) if sender in (None, datagram.sender) else None
-        if points is not None:
-            yield from livox.add(points)
-    yield from livox.end()
+    else:
+        livox = LivoxStream()
+        for datagram in Datagrams(path, alive):
+            points = points_of(datagram.payload)
+            if points is not None:
+                seen[datagram.sender, datagram.port] += 1
+                if datagram.is_from(first):
+                    yield from livox.add(points)
+        yield from livox.end()
+    names = sender_names(seen)
+    if sender is None and len(names) > 1:
+        warn(
+            f"{path}: the scans are those of {first} alone; later, there are packets of several sensors, "
+            f"{', '.join(names)}: choose one by topic (--topic)"
+        )

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Iterator
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from itertools import islice
 from pathlib import Path
@@ -19,6 +20,8 @@ _LINKS = {1: (14, 12), 113: (16, 14), 276: (20, 0)}
 _LOOPBACK_LINKS, _RAW_LINKS = (0, 108), (12, 14, 101, 228)  # four bytes in front of the IP header, none
 
 VELODYNE_BYTES = 1206
+_GPS_BYTES = 512  # of a Velodyne's packet with its position
+_FLAG = b"\xff\xee"  # 0xEEFF, with which the first of twelve blocks begins
 _MOST_COPIED = 2048  # bytes of a datagram; a Velodyne's are shorter
 
 # The last byte of a Velodyne's packet, behind the return mode: the model's beam angles. VLS-128 has two by firmware.
@@ -36,6 +39,9 @@ _RETURN_MODES = (0x37, 0x38, 0x39, 0x3A, 0x3B)
 # Enough to find a LiDAR's packet among those of a GPS, and quick to read.
 _SNIFFED_PACKETS = 2000
 
+# Of a sensor's packets; of a damaged address, there are fewer.
+_LEAST_SHARE, _FEWEST_PACKETS = 0.05, 60
+
 # Datagrams of which fragments are awaited; more than a few at the same time are damage.
 _PENDING = 256
 
@@ -52,6 +58,10 @@ class Datagram(NamedTuple):
     port: int
     stamp_s: float
     payload: memoryview
+
+    def is_from(self, sender: str | None) -> bool:
+        """Whether it is one of a sender's, as `sender_names` calls them; None: any."""
+        return sender in (None, self.sender, f"{self.sender}:{self.port}")
 
 
 class _Fragment(NamedTuple):
@@ -112,14 +122,26 @@ class Datagrams:
         return None
 
 
+def sender_names(counts: Mapping[tuple[str, int], int]) -> list[str]:
+    """Names of the sensors that send packets: the address, with the port where those of one address go to several.
+
+    counts : packets by address and port; few are damaged, unless they are as many as in a tenth of a second.
+    """
+    fewest = min(_FEWEST_PACKETS, _LEAST_SHARE * max(counts.values(), default=0))
+    known = [source for source, n in counts.items() if n >= fewest]
+    ports = Counter(address for address, _ in known)
+    return sorted(address if ports[address] == 1 else f"{address}:{port}" for address, port in known)
+
+
 def velodyne_packets(path: Path, sender: str | None = None) -> Iterator[memoryview]:
-    """A Velodyne's packets among the first of a pcap file, of 1206 bytes each.
+    """A Velodyne's packets among the first of a pcap file, or of a sender, of 1206 bytes each.
 
     sender : one of `velodyne_senders`; None: all.
     """
-    for address, packet in _velodyne_packets(path):
-        if sender is None or address in (sender, ""):
-            yield packet
+    most = _SNIFFED_PACKETS if sender is None else None
+    known = (datagram.payload for datagram in _velodyne_datagrams(path, most) if datagram.is_from(sender))
+    yield from islice(known, _SNIFFED_PACKETS)
+    yield from _bare_velodyne_packets(path)
 
 
 def velodyne_name(packet: memoryview) -> str | None:
@@ -133,24 +155,43 @@ def velodyne_name(packet: memoryview) -> str | None:
 
 
 def velodyne_senders(path: Path) -> list[str]:
-    """IPv4 addresses that a Velodyne's packets come from, among the first of a pcap file; sorted."""
-    return sorted({address for address, _ in _velodyne_packets(path)} - {""})
+    """What `sender_names` calls the senders of a Velodyne's packets in a whole pcap file: a second may begin late."""
+    counts = Counter[tuple[str, int]]()
+    for datagram in _velodyne_datagrams(path, _SNIFFED_PACKETS):
+        counts[datagram.sender, datagram.port] += 1
+    for link, _, packet in islice(pcap_packets(path, whole=False), _SNIFFED_PACKETS, None):
+        with suppress(ValueError):
+            at = _ip_at(packet, link) if len(packet) > VELODYNE_BYTES else None
+            if at is not None and bytes(packet[at + 28 : at + 30]) == _FLAG:  # behind headers of 20 and 8 bytes
+                counts[_address(packet[at + 12 : at + 16]), int.from_bytes(packet[at + 22 : at + 24], "big")] += 1
+    return sender_names(counts)
 
 
-def _velodyne_packets(path: Path) -> Iterator[tuple[str, memoryview]]:
-    """Sender and content, in fragments or with bytes of the link behind; without a sender where none is known."""
-    for datagram in Datagrams(path, lambda: None, _SNIFFED_PACKETS):
-        if len(datagram.payload) == VELODYNE_BYTES and bytes(datagram.payload[:2]) == b"\xff\xee":
-            yield datagram.sender, datagram.payload
+def is_of_velodyne(datagram: Datagram) -> bool:
+    """Whether it is a Velodyne's by its size and its first bytes."""
+    return len(datagram.payload) == VELODYNE_BYTES and bytes(datagram.payload[:2]) == _FLAG
+
+
+def has_other_lidars(path: Path) -> bool:
+    """Whether the first datagrams of a pcap file may be those of other LiDARs than Velodyne's."""
+    first = Datagrams(path, lambda: None, _SNIFFED_PACKETS)
+    return any(len(datagram.payload) > _GPS_BYTES and not is_of_velodyne(datagram) for datagram in first)
+
+
+def _velodyne_datagrams(path: Path, most: int | None) -> Iterator[Datagram]:
+    return filter(is_of_velodyne, Datagrams(path, lambda: None, most))
+
+
+def _bare_velodyne_packets(path: Path) -> Iterator[memoryview]:
+    """Those among the first whose sender is not known, with whatever is in front of them."""
     for link, _, packet in islice(pcap_packets(path, whole=False), _SNIFFED_PACKETS):
-        # The first of twelve blocks begins with the flag 0xEEFF, behind the headers of the link, IP and UDP.
-        if len(packet) > VELODYNE_BYTES and bytes(packet[-VELODYNE_BYTES : 2 - VELODYNE_BYTES]) == b"\xff\xee":
+        if len(packet) > VELODYNE_BYTES and bytes(packet[-VELODYNE_BYTES : 2 - VELODYNE_BYTES]) == _FLAG:
             try:
                 at = _ip_at(packet, link)
             except ValueError:
                 at = None
             if at is None or len(packet) < at + 28 + VELODYNE_BYTES:
-                yield "", packet[-VELODYNE_BYTES:]
+                yield packet[-VELODYNE_BYTES:]
 
 
 def _ip_at(packet: memoryview, link: int) -> int | None:
@@ -207,7 +248,7 @@ def copy_as_ethernet(path: Path, target: Path, alive: Callable[[], None], sender
         out.write(struct.pack("<IHHiIII", 0xA1B2C3D4, 2, 4, 0, 0, 65535, 1))
         for datagram in Datagrams(path, alive):
             size = len(datagram.payload)
-            if size > _MOST_COPIED or sender not in (None, datagram.sender):
+            if size > _MOST_COPIED or not datagram.is_from(sender):
                 continue
             seconds, microseconds = divmod(round(1e6 * datagram.stamp_s), 10**6)
             addresses = bytes(map(int, datagram.sender.split("."))) + b"\xff" * 4

@@ -33,6 +33,10 @@ _TURN_FIT = 0.9  # length of the mean of directions that turn with time; 1 where
 # Share of times on either side that may be damaged, and how far outside of the others they then lie [their duration].
 _DAMAGED_SHARE, _DAMAGED_DISTANCE = 0.01, 1.0
 
+# Clocks begin anew after a second, a minute, an hour, a day or a week [s], and counters after 32 bits. Where one does
+# so during a scan, no point has a time of most of its range; nor where a value stands for no time.
+_CLOCKS_S, _COUNTER, _EMPTY_SHARE = (1.0, 60.0, 3600.0, 86400.0, 604800.0), 2.0**32, 0.7
+
 # A scan lasts no longer than it takes to the next one; stamps jitter.
 _LONGEST_OF_INTERVAL, _INTERVALS = 1.5, 9
 
@@ -76,8 +80,8 @@ def point_times(
     points : (n, 4) float32; times of points without a return, which are not finite or lie in the origin, do not show
         the unit.
     stamp_s : None counts from 0.
-    Returns (n,) float64 or None: [s]; NaN where a time is damaged and lies far from all others; None without such a
-        field, or if no unit gives a duration of 2 ms to 2 s, as where all times are 0.
+    Returns (n,) float64 or None: [s]; NaN where a time is damaged and lies far from all others, or is missing; None
+        without such a field, or if no unit gives a duration of 2 ms to 2 s, as where all times are 0.
     Raises PointsError: By these times and the azimuths, the sensor takes less than 33 or more than 350 ms for
         a turn.
     """
@@ -86,10 +90,13 @@ def point_times(
         return None
     with np.errstate(over="ignore", invalid="ignore"):
         moments = fields[name].astype(np.float64)
+    moments[np.isinf(moments)] = np.nan
     xyz = points[:, :3]
-    shows = np.isfinite(moments) & np.isfinite(xyz).all(axis=1) & (xyz != 0.0).any(axis=1)
+    shows = ~np.isnan(moments) & np.isfinite(xyz).all(axis=1) & (xyz != 0.0).any(axis=1)
     if not shows.any():
         return None
+    _carry_on(moments, shows)
+    shows &= ~np.isnan(moments)
     first, last = _range(moments[shows])
     for unit in _UNITS_S:
         if _SHORTEST_S <= (last - first) * unit < _LONGEST_S:
@@ -100,6 +107,28 @@ def point_times(
             with np.errstate(over="ignore", invalid="ignore"):
                 return moments * unit + (stamp_s or 0.0 if counted else 0.0)
     return None
+
+
+def _carry_on(moments: NDArray[np.float64], shows: NDArray[np.bool_]) -> None:
+    """Carry on the times after their clock began anew, and remove a value that stands for no time."""
+    first, last = _range(moments[shows])
+    early = shows & (moments < 0.5 * (first + last))
+    late = shows & ~early
+    if not early.any():
+        return
+    ended, began = float(moments[early].max()), float(moments[late].min())
+    if began - ended <= _EMPTY_SHARE * (last - first):
+        return
+    periods = ((unit, period) for unit in _UNITS_S for period in (*(clock / unit for clock in _CLOCKS_S), _COUNTER))
+    for unit, period in periods:
+        duration = ended + period - began
+        is_clock = first >= 0.0 and last <= period and duration < (1.0 - _EMPTY_SHARE) * period
+        if is_clock and _SHORTEST_S <= duration * unit < _LONGEST_S:
+            moments[moments <= ended] += period
+            return
+    is_one = [np.ptp(moments[side]) == 0.0 and np.count_nonzero(side) > 1 for side in (early, late)]
+    if is_one[0] != is_one[1]:
+        moments[moments <= ended if is_one[0] else moments >= began] = np.nan
 
 
 def _range(moments: NDArray[np.float64]) -> tuple[float, float]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 _ARCHIVE = "an archive; unpack it first"
 _FILM = "a film; edgeperc reads images (.jpg, .png), for a camera model"
 _IMAGE = "an image; pass it with a camera model: --model camseg"
-_TABLE = "read it with pandas, and pass the columns x, y, z and intensity as an array of shape (n, 4)"
+_TABLE = "read it with pandas, and pass a data frame of its columns x, y, z and intensity"
 
 # First bytes, and what to say of them.
 _KNOWN = {
@@ -14,7 +14,7 @@ _KNOWN = {
     b"ARROW1": f"a Feather (Arrow) table, as of Argoverse 2; {_TABLE}",
     b"PAR1": f"a Parquet table; {_TABLE}",
     b"ASTM-E57": "an E57 file; convert it with CloudCompare or pdal, to .pcd or .ply",
-    b"\x89HDF": f"an HDF5 file; {_TABLE.replace('pandas', 'h5py')}",
+    b"\x89HDF": "an HDF5 file; read it with h5py, and pass x, y, z and intensity as an array of shape (n, 4)",
     b"MATLAB": "a MATLAB file; save the points as .npy or .pcd",
     b"\x80\x02": "a pickle, which is never unpickled; save the points as .npy",
     b"\x80\x03": "a pickle, which is never unpickled; save the points as .npy",

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, SupportsFloat
+
+from ..errors import StampError
 
 SHORTEST_STEP_S = 1e-6  # a stamp that is less than this later than the last one is of a doubled scan
 LATE_S = 0.25  # a stamp that is earlier by more than this is not of a late scan
@@ -30,6 +32,18 @@ class Stamp(float):
 
     def __reduce__(self) -> tuple[type[Stamp], tuple[float, int]]:
         return Stamp, (float(self), self.ns)
+
+
+def check_seconds(stamp_s: object) -> None:
+    """Raise StampError for a date, a text or whatever else is no number of seconds."""
+    try:
+        if not isinstance(stamp_s, SupportsFloat):  # a text can be converted, too
+            raise TypeError
+        float(stamp_s)
+    except (OverflowError, TypeError, ValueError):
+        raise StampError(
+            f"stamp_s is {stamp_s!r:.80}, a {type(stamp_s).__name__}; expected the time of the scan [s]"
+        ) from None
 
 
 def nanoseconds_of(stamp_s: float) -> int:

@@ -28,6 +28,10 @@ MAX_ROUNDING_M = 5e-3  # of coordinates; a LiDAR measures to 1 to 3 cm
 MAX_MAP_M = 1e8  # of a map's coordinates; projected ones are up to 1e7
 
 
+class MapError(PointsError):
+    """The coordinates are those of a map, which float32 would round."""
+
+
 class Cloud(NamedTuple):
     """Points as kernels take them.
 
@@ -65,7 +69,7 @@ def as_points(
     array : (n, 4) or (n, 3) array of numbers, or a structured array; any float or integer dtype, byte order and
         memory layout. The columns are x, y, z [m], remission; without the fourth, remission is 0. A structured array
         (any shape, e.g. that of a PointCloud2 message) needs the fields x, y and z; other fields and padding are
-        skipped.
+        skipped. So does a data frame with such names (pandas, polars).
     remission_field : as in `read_points`; structured arrays only.
     origin_m : subtracted from x, y, z [m] before they become float32.
     Returns (n, 4) float32, C-contiguous: The given array itself if it already has this form. Values beyond the range
@@ -78,9 +82,12 @@ def as_points(
         raise PointsError(f"got {what[0]}; expected (n, 4) x, y, z, remission: pass {what[1]}")
     try:
         # Ragged sequences raise ValueError; the __array__ of an object may raise anything.
+        named = {} if isinstance(array, np.ndarray) else _frame_columns(array)
         values = np.asarray(array)
     except Exception as exc:
         raise PointsError(f"got an object that is not an array: {exc}; expected (n, 4) x, y, z, remission") from exc
+    if named:
+        return assemble(len(values), named, [*named], remission_field, origin_m)
     if values.dtype.names is not None:
         return assemble(values.size, table_columns(values), values.dtype.names, remission_field, origin_m)
     if values.dtype.kind not in "fiu":
@@ -101,6 +108,17 @@ def as_points(
         return np.require(values, dtype=np.float32, requirements=["C", "A"])
 
 
+def _frame_columns(thing: Any) -> dict[str, NDArray[Any]]:
+    """The numeric columns of a data frame (pandas, polars) by `plain_name`; empty if none are called x, y and z."""
+    names = getattr(thing, "columns", None) if hasattr(thing, "__array__") else None
+    columns: dict[str, NDArray[Any]] = {}
+    for name in () if names is None else names:
+        values = np.asarray(thing[name])
+        if isinstance(name, str) and values.ndim == 1 and values.dtype.kind in "fiu":
+            columns.setdefault(plain_name(name), values)
+    return columns if {"x", "y", "z"} <= columns.keys() else {}
+
+
 def _to_convert(thing: Any) -> tuple[str, str] | None:
     """What something is that people have in place of an array, and what to pass; None if it may be an array."""
     first = next(iter(thing), None) if isinstance(thing, list | tuple) else None
@@ -114,6 +132,12 @@ def _to_convert(thing: Any) -> tuple[str, str] | None:
         return "paths", "one scan a call, edgeperc.read_points(path)"
     if isinstance(thing, bytes | bytearray):
         return f"{len(thing):,} bytes", "np.frombuffer(data, np.float32).reshape(-1, 4), if these are float32"
+    if isinstance(thing, Mapping):
+        keys = ", ".join(map(str, thing))
+        return (
+            f"a mapping of {keys[:100] or 'nothing'} ({kind})",
+            "the array of points in it, or np.column_stack of its columns",
+        )
     if hasattr(thing, "__array__"):
         return None
     if all(hasattr(thing, name) for name in ("point_step", "fields", "data")):
@@ -181,9 +205,9 @@ def remission_name(names: Iterable[str], wanted: str | None) -> str | None:
     present = list(names)
     if wanted is None:
         return next((name for name in _REMISSION_NAMES if name in present), None)
-    if plain_name(wanted) not in present:
+    if plain_name(str(wanted)) not in present:
         raise PointsError(f"there is no numeric field {wanted!r} for the remission, only {', '.join(present)}")
-    return plain_name(wanted)
+    return plain_name(str(wanted))
 
 
 def assemble(
@@ -214,7 +238,7 @@ def assemble(
         xyz = [as_float64(values) - origin for values, origin in zip(xyz, as_origin(origin_m), strict=True)]
     if any(_is_rounded(values) for values in xyz):
         middle = ", ".join(f"{np.median(as_float64(values)[np.isfinite(values)]):,.1f}" for values in xyz)
-        raise PointsError(
+        raise MapError(
             f"the coordinates are those of a map, about ({middle}) m, and would be rounded by more than "
             f"{1e3 * MAX_ROUNDING_M:g} mm as float32; pass the place of the sensor, which is subtracted first: "
             'origin_m= or --origin X Y Z; "auto" finds that of a level sensor'

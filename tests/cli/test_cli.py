@@ -441,6 +441,9 @@ def test_folders_are_opened_and_sorted(tmp_path: Path, capsys: pytest.CaptureFix
     assert answers[0]["scan"] == str(bare)
     assert "no scan in this folder" in answers[0]["error"]
     assert answers[1]["n_points"] == 40
+    (bare / "0.csv").write_text("x,y,z\n1,2,3\n")
+    assert run("run", bare) == 1
+    assert f"pass tables of text by name: {bare}/*.csv" in capsys.readouterr().err
 
 
 def test_huge_scans_fail_and_the_others_go_on(
@@ -1019,6 +1022,14 @@ def test_mistyped_words_name_the_nearest(words: list[str], new: str, capsys: pyt
         ),
         ("pass sensor= a profile whose remission_range is (0, 65535).", "pass --remission-range 0 65535."),
         ("sensor= a profile with the remission_range of this data, (0, 1) if", "--remission-range 0 1 if"),
+        (
+            "meters: the sensor is mounted higher, the sensor 'x' is",
+            "meters: the sensor is mounted higher, the sensor 'x' is",
+        ),
+        ("Pass its name, sensor= or --sensor: hap", "Pass its name, --sensor: hap"),
+        ("subtract it: origin_m= or --origin X Y Z.", "subtract it: --origin X Y Z."),
+        ("pass columns= (--columns) with their names", "pass --columns with their names"),
+        ("quaternion= or --quaternion, xyzw or wxyz", "--quaternion, xyzw or wxyz"),
         ("pass sensor= a profile whose range is (0, 255)", "pass --sensor a profile whose range is (0, 255)"),
         ('pass on_mismatch="warn" (on the command line --anyway).', "pass --anyway."),
         ("pass mounting= (on the command line --mount-height or --extrinsic).", "pass --mount-height or --extrinsic."),

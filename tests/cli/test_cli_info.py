@@ -478,7 +478,10 @@ def test_info_says_that_a_sensor_cannot_be_told(
 ) -> None:
     scan = write_scan(tmp_path / "0.bin", 5000)
     assert run("info", scan) == 1
-    assert f"{scan}: the sensor cannot be told from the scan" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert f"{scan}: the sensor cannot be told from the scan" in said
+    assert "pass --sensor with a name" in said
+    assert "sensor=" not in said
     assert run("info", write_scan(tmp_path / "few" / "0.bin"), "--sensor", "auto") == 1
     assert "pass --sensor" in capsys.readouterr().err
     assert run("info", scan, "--sensor", "hdl-64e") in (0, 1)

@@ -350,7 +350,12 @@ CAR_LINE = "Car 0 0 0 500 150 700 300 1.5 1.6 3.9 1.0 1.7 12.0 1.57"
         (CAR_LINE.replace("12.0", "far"), r"line 1: could not convert string to float: 'far'"),
         ("\n\n" + CAR_LINE.replace("12.0", "nan"), r"line 3: .* one that is not finite"),
         (CAR_LINE.replace("12.0", "1e999"), r"line 1: .* one that is not finite"),
-        ("Car", r"line 1: .* got 0"),
+        ("Car", r"line 1: .* got 0$"),
+        (CAR_LINE.replace("1.5 1.6 3.9", "-1 -1 -1"), r"line 1: .* above 0 m, got -1, -1, -1; .* DontCare"),
+        (CAR_LINE.replace("1.5 1.6 3.9", "0 0 0"), r"line 1: expected a height, width and length above 0 m"),
+        (CAR_LINE + "\n" + CAR_LINE.replace("3.9", "1e30"), r"line 2: .* got 1\.5, 1\.6, 1e\+30"),
+        (CAR_LINE.replace("1.57", "90"), r"line 1: expected a direction in radians, got 90, as if in degrees"),
+        (CAR_LINE.replace("1.57", "-179.5"), r"line 1: .* as if in degrees"),
         (CAR_LINE.replace(" ", ","), r"line 1: .* got 0"),
         ("\ufeff" + CAR_LINE + "\n\x00", r"line 2: "),
         (CAR_LINE.encode("utf-16"), "the labels cannot be read"),
@@ -368,5 +373,7 @@ def test_malformed_labels_name_the_line(text: str | bytes, error: str, tmp_path:
 def test_labels_as_other_tools_write_them(mark: str, end: str, tmp_path: Path) -> None:
     (tmp_path / "a.txt").write_bytes((mark + CAR_LINE + end).encode())
     labels = read_labels(tmp_path / "a.txt")
+    (tmp_path / "b.txt").write_text("DontCare -1 -1 -10 503 169 590 190 -1 -1 -1 -1000 -1000 -1000 -10\n")
+    assert read_labels(tmp_path / "b.txt").kinds == ("dontcare",)
     assert labels.kinds == ("car",)
     np.testing.assert_array_equal(labels.numbers, [[float(word) for word in CAR_LINE.split()[1:]]])

@@ -224,6 +224,29 @@ def test_kitti_errors(kitti: Path, tmp_path: Path) -> None:
         tracking.read_sequence(kitti, "0000")
 
 
+LABEL = "0 1 Car 0 0 0 500 150 700 300 1.5 1.6 3.9 1.0 1.7 12.0 1.57"
+
+
+@pytest.mark.parametrize(
+    ("text", "error"),
+    [
+        (LABEL.encode("utf-16"), "the labels cannot be read"),
+        ("\n\n" + LABEL.replace("12.0", "nan"), "label 1: .* not finite"),
+        (LABEL.replace("0 1", "inf 1", 1), "label 1: expected the numbers of a frame and of a track, got inf, 1"),
+        (LABEL.replace("0 1", "nan 1", 1), "label 1: expected the numbers of a frame"),
+        (LABEL + "\n" + LABEL.replace("0 1", "1000000001 1", 1), "label 2: expected the numbers of a frame"),
+        (LABEL.replace("0 1", "-3 1", 1), "label 1: expected the numbers of a frame"),
+        (LABEL.replace("0 1", "0 nan", 1), "label 1: expected the numbers of a frame"),
+        (LABEL.replace("1.5 1.6 3.9", "0 0 0"), "label 1: .* above 0 m"),
+        (LABEL.replace("1.57", "90"), "label 1: .* in degrees"),
+    ],
+)
+def test_malformed_labels_of_tracks_name_the_label(kitti: Path, text: str | bytes, error: str) -> None:
+    (kitti / "label_02/0000.txt").write_bytes(text if isinstance(text, bytes) else text.encode())
+    with pytest.raises(TrackingError, match=rf"0000\.txt[,:] {error}"):
+        tracking.read_sequence(kitti, "0000")
+
+
 def test_eval_tracking_prints_the_tables(kitti: Path, capsys: pytest.CaptureFixture[str]) -> None:
     arguments = ["eval-tracking", str(kitti), "--json", str(kitti / "out/figures.json")]
     assert cli.main(arguments) == 0

@@ -386,6 +386,20 @@ def test_the_frame_of_a_map(seed: int, direction_deg: float, distance_m: float) 
     assert any("is not at the" in sentence for sentence in gross(street(seed) + away))
 
 
+@pytest.mark.parametrize("place", [(512345.25, 5412345.5, 113.0), (4.1e6, 6e5, 4.8e6), (-3e5, 0.0, 0.0)])
+def test_the_coordinates_of_a_map_as_float32(place: tuple[float, float, float]) -> None:
+    """UTM, ECEF and others: neither millimeters nor another unit, and too late for the origin."""
+    for seed in SEEDS:
+        found = gross(street(seed) + np.float32([*place, 0.0]))
+        assert found
+        for sentence in found:
+            assert "not at the origin, as in the frame of a map" in sentence
+            assert "--origin X Y Z. As float32, they are rounded to 0." in sentence
+        found = gross(street(seed) + np.float32([9000.0, -2000.0, 0.0, 0.0]))
+        assert found
+        assert not any("rounded" in sentence or "as in the frame of a map" not in sentence for sentence in found)
+
+
 @pytest.mark.parametrize(
     ("sensor", "height_m"),
     [("os1-64", 3.0), ("os1-64", 8.0), ("hdl-64e", 5.0), ("vlp-16", 3.0), ("vlp-16", 6.5), ("pandar64", 8.0)],

@@ -181,7 +181,10 @@ def test_poses_of_another_time_are_refused(first_s: float, last_s: float) -> Non
     ("text", "error"),
     [
         ("", "cannot be read as poses|2 or more|two or more"),
+        ("# only a comment\n", "no line of numbers"),
         ("no numbers", "cannot be read as poses"),
+        ("#timestamp, p_x\n1403636580838555648,4.6,-1.7,0.7,0.5,-0.1,-0.8,-0.1\n", "commas, as EuRoC's"),
+        ("1 0 0 0 0 1 0 0 0 0 1 0\n", "12 numbers in a line, as KITTI's poses, which have no times"),
         ("0 0 0 0 0 0 0", "7 numbers in a line"),
         ("0 0 0 0 0 0 0 1", "two or more"),
         ("0 0 0 0 0 0 0 1\n0 0 0 0 0 0 0 1", "that rise"),
@@ -192,7 +195,7 @@ def test_poses_of_another_time_are_refused(first_s: float, last_s: float) -> Non
         ("0 0 0 0 0 0 0 1\n1 0 0 0", "cannot be read as poses"),
     ],
 )
-@pytest.mark.filterwarnings("ignore:loadtxt")
+@pytest.mark.filterwarnings("error")
 def test_files_that_are_no_poses_are_refused(text: str, error: str, tmp_path: Path) -> None:
     (tmp_path / "poses.txt").write_text(text)
     with pytest.raises(TrackingError, match=error):
@@ -219,6 +222,27 @@ def write_w_first(path: Path, times: Any, poses: Any) -> Path:
     rows = [line.split() for line in lines]
     path.write_text("\n".join(" ".join([*row[:4], row[7], *row[4:7]]) for row in rows))
     return path
+
+
+@pytest.mark.parametrize(("meters", "seconds"), [(1000.0, 1.0), (1.0, 0.01), (100.0, 1.0), (3.28, 0.1)])
+@pytest.mark.parametrize("turn", [0.0, 0.5])
+def test_poses_in_other_units_are_refused(meters: float, seconds: float, turn: float, tmp_path: Path) -> None:
+    """Straightened by them, points would move by as much too far."""
+    times, poses = drive(turn)
+    np.testing.assert_array_equal(Trajectory.from_tum(write_tum(tmp_path / "a.txt", times, poses)).times_s, times)
+    poses = np.array(poses)
+    poses[:, :3, 3] *= meters
+    with pytest.raises(
+        TrackingError, match=r"b\.txt: by its poses, the sensor moves at [\d,]+ m/s; expected positions in m"
+    ):
+        Trajectory.from_tum(write_tum(tmp_path / "b.txt", times * seconds, poses))
+
+
+def test_a_byte_order_mark_is_no_pose(tmp_path: Path) -> None:
+    path = write_tum(tmp_path / "a.txt", *drive(0.2))
+    expected = Trajectory.from_tum(path).T_world_sensor
+    path.write_text("\ufeff" + path.read_text(), encoding="utf-8")
+    np.testing.assert_array_equal(Trajectory.from_tum(path).T_world_sensor, expected)
 
 
 HANGING = np.diag([1.0, -1.0, -1.0, 1.0])

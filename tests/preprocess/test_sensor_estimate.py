@@ -198,7 +198,7 @@ OTHERS: dict[str, Callable[[], np.ndarray]] = {
 
 @pytest.mark.parametrize("name", OTHERS)
 def test_what_cannot_be_told_is_refused(name: str) -> None:
-    with pytest.raises(SensorError, match=f"{CANNOT_TELL}.*pass sensor="):
+    with pytest.raises(SensorError, match=rf"{CANNOT_TELL}.*(pass sensor=|convert them)"):
         estimate_sensor([OTHERS[name]().astype(np.float32)])
 
 
@@ -210,6 +210,37 @@ def test_sensors_without_beams_are_named_by_their_field_of_view(name: str, way: 
         SensorError, match=rf"{CANNOT_TELL}.*non-repeating.*by the field of view {name}\b.*pass sensor="
     ):
         estimate_sensor([scan])
+
+
+MISTAKES = {
+    "UTM": (512345, 5412345, 113, 0),
+    "ECEF": (4.1e6, 6e5, 4.8e6, 0),
+    "a local map": (-6000, 2000, 5, 0),
+}
+
+
+@pytest.mark.parametrize("name", MISTAKES)
+@pytest.mark.parametrize("sensor", ["hdl-64e", "vlp-32c", "os1-64"])
+def test_a_mistake_in_the_coordinates_is_named(name: str, sensor: str) -> None:
+    """It explains why there are no beams; the scan is of no sensor that does not spin."""
+    scan = simulated_scan(FIRST_SEED + 2, sensor).points + np.array(MISTAKES[name])
+    with pytest.raises(SensorError, match=rf"{CANNOT_TELL}\. The .* in the frame of a map.*--origin"):
+        estimate_sensor([scan.astype(np.float32)])
+
+
+@pytest.mark.parametrize(("unit", "factor"), [("millimeters", 1000.0), ("centimeters", 100.0), ("millimeters", 700.0)])
+def test_another_unit_is_named(unit: str, factor: float) -> None:
+    scan = OTHERS["random elevations"]() * np.array([factor, factor, factor, 1.0])
+    with pytest.raises(SensorError, match=rf"{CANNOT_TELL}\. The median distance .* in {unit}; convert them"):
+        estimate_sensor([scan.astype(np.float32)])
+
+
+@pytest.mark.parametrize("axes", [((1, -1), (2, -1), (0, 1)), ((1, -1), (2, 1), (0, 1)), ((2, 1), (0, 1), (1, 1))])
+def test_other_axes_are_named(axes: tuple[tuple[int, int], ...]) -> None:
+    points = simulated_scan(FIRST_SEED + 2, "hdl-64e").points
+    scan = np.column_stack([*(sign * points[:, axis] for axis, sign in axes), points[:, 3]])
+    with pytest.raises(SensorError, match=f"{CANNOT_TELL}. The ground seems to lie towards .[xy].*the axes are not"):
+        estimate_sensor([scan.astype(np.float32)])
 
 
 def test_scans_of_two_sensors_are_refused() -> None:

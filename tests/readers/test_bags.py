@@ -300,3 +300,15 @@ def test_frames_of_one_topic_are_several_sensors(tmp_path: Path, frames: Sequenc
         folder, topic=f"{LIDAR}@rear"
     )
     assert f"no topic of type sensor_msgs/PointCloud2 '{OTHER}'" in error_of(folder, topic=f"{OTHER}@front")
+
+
+@pytest.mark.parametrize("name", [*BAGS])
+@pytest.mark.parametrize("place", [(512345.25, 5412345.5, 113.0, 0.0), (4.1e6, 6e5, 4.8e6, 0.0), (0.0, -3e5, 0.0, 0.0)])
+def test_clouds_with_coordinates_of_a_map_are_not_sent_to_an_option_that_refuses_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, place: Sequence[float]
+) -> None:
+    monkeypatch.setattr("test_captures.LAYOUT", [(axis, "f8") for axis in ("x", "y", "z", "intensity")])
+    monkeypatch.setattr("test_captures.POINTS", POINTS.astype("f8") + np.array(place) + 0.123)
+    error = error_of(BAGS[name](tmp_path / name))
+    assert "the clouds have coordinates of a map (frame 'lidar')" in error
+    assert "record those of the sensor, before they are moved, or save each as a .npy" in error

@@ -180,6 +180,7 @@ def test_malformed_clouds_are_refused(changes: dict[str, Any], error: str) -> No
 
 
 LIDAR, OTHER = "/lidar/points", "/imu/text"
+LAYOUT: Sequence[tuple[str, str]] = FLOATS
 
 
 def messages(typesys: Any, ros: int) -> tuple[Any, list[tuple[str, str, int, Any]]]:
@@ -188,7 +189,7 @@ def messages(typesys: Any, ros: int) -> tuple[Any, list[tuple[str, str, int, Any
     types = store.types
     sent = []
     for k in range(3):
-        source = cloud(POINTS + np.float32(k), order="<>"[k % 2], padding=2)
+        source = cloud(POINTS + np.float32(k), LAYOUT, order="<>"[k % 2], padding=2)
         stamp = (
             types["builtin_interfaces/msg/Time"](100 + k, 500_000_000)
             if k < 2

@@ -12,10 +12,12 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from test_captures import error_of, write_pcap
+from lidar_writers import MODELS, blocks_of, packets_of, ranges
+from test_captures import error_of, vlp16_packets, write_pcap
+from test_packets import write_link
 
 import twins.packets
-from edgeperc import PointsError, read_timed_scans
+from edgeperc import PointsError, read_timed_scans, sensor_of
 from edgeperc.readers.ouster_packets import PROFILES, OusterStream, fill_turn, layout_of
 from edgeperc.readers.times import TimedScan
 
@@ -243,6 +245,56 @@ def test_several_sensors_in_one_capture(tmp_path: Path) -> None:
         wanted = [scan for turn in turns for packet in turn for scan in stream.add(bytes(packet.buf))]
         assert [len(scan.points) for scan in scans] == [len(scan.points) for scan in wanted]
         np.testing.assert_array_equal(scans[1].points, wanted[1].points)
+
+
+@pytest.mark.parametrize("other", ["velodyne", "pandarxt-16", "pandarxt-32"])
+@pytest.mark.parametrize("is_first", [True, False])
+def test_an_ouster_beside_another_makers_sensor_is_told_apart(tmp_path: Path, other: str, is_first: bool) -> None:
+    if other == "velodyne":
+        pytest.importorskip("velodyne_decoder")
+        payloads = vlp16_packets(2.0)[:110]
+    else:
+        model = MODELS[other]
+        payloads = packets_of(model, blocks_of(model, *ranges(model, 1024)))
+    ousters = [bytes(packet.buf) for turn in random_packets(METADATA, 2, 1) for packet in turn]
+    parts = [
+        write_link(tmp_path / "alone.pcap", 1, payloads, one="10.0.0.9").read_bytes(),
+        write_link(tmp_path / "ouster.pcap", 1, ousters, one="10.0.0.1:7502").read_bytes(),
+    ]
+    both = tmp_path / "both.pcap"
+    first, second = parts if is_first else parts[::-1]
+    both.write_bytes(first + second[24:])
+    for name in ("both", "ouster"):
+        (tmp_path / f"{name}.json").write_text(json.dumps(METADATA))
+    assert "expected one LiDAR, there are 10.0.0.9, 122246000293; choose one" in error_of(both)
+    for topic, path in (("10.0.0.9", tmp_path / "alone.pcap"), ("122246000293", tmp_path / "ouster.pcap")):
+        found, expected = [*read_timed_scans(both, topic=topic)], [*read_timed_scans(path)]
+        assert len(found) == len(expected) > 0
+        for one, two in zip(found, expected, strict=True):
+            np.testing.assert_array_equal(one.points, two.points)
+        assert sensor_of(both, topic=topic) == sensor_of(path)
+
+
+@pytest.mark.parametrize("other", ["10.0.0.2", "10.0.0.1:7503", "10.0.0.9:7502"])
+def test_a_second_sensor_of_old_firmware_is_left_out_with_a_warning(tmp_path: Path, other: str) -> None:
+    """Its packets carry neither a serial number nor an initialization_id."""
+    content = changed(lidar_data_format__udp_profile_lidar="LEGACY")
+    records = []
+    for seed, sender in ((1, "10.0.0.1:7502"), (2, other)):
+        payloads = [bytes(packet.buf) for turn in random_packets(content, 2, seed) for packet in turn]
+        data = write_link(tmp_path / f"{seed}.pcap", 1, payloads, one=sender).read_bytes()
+        size = len(data[24:]) // len(payloads)
+        records.append([data[24 + k * size : 24 + (k + 1) * size] for k in range(len(payloads))])
+    both = tmp_path / "both.pcap"
+    both.write_bytes(data[:24] + b"".join(one + two for one, two in zip(*records, strict=True)))
+    for name in ("1", "both"):
+        (tmp_path / f"{name}.json").write_text(json.dumps(content))
+    with pytest.warns(UserWarning, match=r"the first of several sensors, 10\.0\.0\..*whose packets carry no serial"):
+        found = [*read_timed_scans(both)]
+    expected = [*read_timed_scans(tmp_path / "1.pcap")]
+    assert len(found) == len(expected) == 2
+    for one, two in zip(found, expected, strict=True):
+        np.testing.assert_array_equal(one.points, two.points)
 
 
 @settings(max_examples=60, deadline=None)

@@ -29,14 +29,20 @@ LINKS = {
 VLAN = bytes(12) + b"\x81\x00\x00\x05\x08\x00"
 
 
-def write_link(path: Path, link: int, payloads: Sequence[bytes], head: bytes | None = None, **sent: str) -> Path:
-    """UDP in IPv4 behind a link's header, 1 ms apart; by turns from each of several addresses."""
+def write_link(
+    path: Path, link: int, payloads: Sequence[bytes], head: bytes | None = None, begin: int = 0, **sent: str
+) -> Path:
+    """UDP in IPv4 behind a link's header, 1 ms apart; by turns from each of several addresses, ``ADDRESS[:PORT]``.
+
+    begin : how many packets the first sends alone.
+    """
     senders = [*sent.values()] or ["192.168.1.201"]
     content = struct.pack("<IHHIIII", 0xA1B2C3D4, 2, 4, 0, 0, 65535, link)
     for k, payload in enumerate(payloads):
-        for sender in senders:
-            udp = struct.pack(">HHHH", 2368, 2368, 8 + len(payload), 0) + payload
-            addresses = socket.inet_aton(sender) + b"\xff" * 4
+        for sender in senders if k >= begin else senders[:1]:
+            address, _, port = sender.partition(":")
+            udp = struct.pack(">HHHH", 2368, int(port or 2368), 8 + len(payload), 0) + payload
+            addresses = socket.inet_aton(address) + b"\xff" * 4
             ip = struct.pack(">BBHHHBBH", 0x45, 0, 20 + len(udp), k % 65536, 0, 64, 17, 0) + addresses + udp
             frame = (LINKS[link] if head is None else head) + ip
             content += struct.pack("<IIII", 1000 + k // 1000, 1000 * (k % 1000), len(frame), len(frame)) + frame
@@ -107,7 +113,15 @@ def test_an_ouster_behind_any_link(ouster: Path, tmp_path: Path, link: int) -> N
         np.testing.assert_array_equal(points, other_points)
 
 
-@pytest.mark.parametrize("senders", [("10.0.0.1", "10.0.0.2"), ("10.0.0.9", "10.0.0.10", "192.168.1.201")])
+@pytest.mark.parametrize(
+    "senders",
+    [
+        ("10.0.0.1", "10.0.0.2"),
+        ("10.0.0.9", "10.0.0.10", "192.168.1.201"),
+        ("10.0.0.1:2368", "10.0.0.1:2369"),
+        ("10.0.0.1:2368", "10.0.0.1:8308", "10.0.0.2"),
+    ],
+)
 @pytest.mark.parametrize("link", [1, 113])
 def test_several_velodynes_are_told_apart(tmp_path: Path, link: int, senders: tuple[str, ...]) -> None:
     pytest.importorskip("velodyne_decoder")
@@ -120,6 +134,25 @@ def test_several_velodynes_are_told_apart(tmp_path: Path, link: int, senders: tu
     for sender in senders:
         assert [len(points) for _, points in read_scans(path, topic=sender)] == expected
     assert "no Velodyne '10.1.1.1'" in error_of(path, topic="10.1.1.1")
+
+
+@pytest.mark.parametrize("link", [1, 113, 101])
+@pytest.mark.parametrize("other", ["10.0.0.2", "10.0.0.1:2369"])
+def test_a_velodyne_that_begins_late_is_told_apart(tmp_path: Path, link: int, other: str) -> None:
+    pytest.importorskip("velodyne_decoder")
+    packets = vlp16_packets(30.0)
+    path = write_link(tmp_path / "two.pcap", link, packets, begin=2100, one="10.0.0.1:2368", two=other)
+    first, second = velodyne_senders(path)
+    assert "expected one Velodyne, there are 10.0.0.1" in error_of(path)
+    expected = [len(points) for _, points in read_scans(write_pcap(tmp_path / "one.pcap", packets))]
+    assert [len(points) for _, points in read_scans(path, topic=first)] == expected
+    assert sum(len(points) for _, points in read_scans(path, topic=second)) == (len(packets) - 2100) * 12 * 32
+    assert sensor_of(path, topic=second) == sensor_of(path, topic=first)
+
+
+def test_a_few_damaged_addresses_are_no_sensors(tmp_path: Path) -> None:
+    path = write_link(tmp_path / "a.pcap", 1, vlp16_packets(30.0), begin=2200, one="10.0.0.1", two="74.0.0.1")
+    assert velodyne_senders(path) == ["10.0.0.1"]
 
 
 @pytest.mark.parametrize(

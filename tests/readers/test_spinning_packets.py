@@ -23,11 +23,11 @@ from lidar_writers import (
     unit_angles,
 )
 from numpy.typing import NDArray
-from test_captures import error_of, write_pcap
+from test_captures import error_of, vlp16_packets, write_pcap
 from test_packets import write_link
 
 import twins.packets
-from edgeperc import PointsError, read_timed_scans, sensor_of
+from edgeperc import PointsError, read_scans, read_timed_scans, sensor_of
 from edgeperc.readers.spinning_packets import (
     FORMATS,
     Angles,
@@ -211,6 +211,44 @@ def test_several_sensors_are_told_apart(tmp_path: Path) -> None:
     (scan,) = list(read_timed_scans(path, topic="10.0.0.2"))
     (alone,) = list(read_timed_scans(write_link(tmp_path / "one.pcap", 113, packets)))
     np.testing.assert_array_equal(scan.points, alone.points)
+
+
+@pytest.mark.parametrize("name", ["pandarxt-16", "pandarxt-32", "rs-16", "helios-32"])
+@pytest.mark.parametrize("is_first", [True, False])
+def test_a_velodyne_beside_another_sensor_is_told_apart(tmp_path: Path, name: str, is_first: bool) -> None:
+    pytest.importorskip("velodyne_decoder")
+    model, angles = MODELS[name], unit_angles(MODELS[name])
+    packets = packets_of(model, blocks_of(model, *ranges(model, 128)))
+    if not name.startswith("pandar"):
+        packets = [difop(model, angles), *packets]
+    velodyne = vlp16_packets(2.0)[:110]
+    parts = [
+        write_link(tmp_path / "velodyne.pcap", 1, velodyne, one="10.0.0.9").read_bytes(),
+        write_link(tmp_path / "other.pcap", 1, packets, one="10.0.0.1").read_bytes(),
+    ]
+    both = tmp_path / "both.pcap"
+    first, second = parts if is_first else parts[::-1]
+    both.write_bytes(first + second[24:])
+    assert "expected one LiDAR, there are 10.0.0.9, 10.0.0.1; choose one" in error_of(both)
+    for address, alone in (("10.0.0.9", "velodyne.pcap"), ("10.0.0.1", "other.pcap")):
+        found, expected = list(read_scans(both, topic=address)), list(read_scans(tmp_path / alone))
+        assert len(found) == len(expected) > 0
+        for (_, points), (_, other_points) in zip(found, expected, strict=True):
+            np.testing.assert_array_equal(points, other_points)
+        assert sensor_of(both, topic=address) == sensor_of(tmp_path / alone)
+
+
+@pytest.mark.parametrize("other", ["10.0.0.2", "10.0.0.1:2369"])
+@pytest.mark.parametrize("name", ["pandarxt-16", "pandarxt-32"])
+def test_a_sensor_that_begins_late_is_left_out_with_a_warning(tmp_path: Path, name: str, other: str) -> None:
+    model = MODELS[name]
+    packets = packets_of(model, blocks_of(model, *ranges(model, 64))) * 300
+    path = write_link(tmp_path / "two.pcap", 1, packets, begin=2100, one="10.0.0.1:2368", two=other)
+    with pytest.warns(UserWarning, match=r"10\.0\.0\.1:2368 alone; later, .* several sensors, 10.*, 10.*--topic"):
+        scans = list(read_timed_scans(path))
+    expected = list(read_timed_scans(write_link(tmp_path / "one.pcap", 1, packets)))
+    for scan, alone in zip(scans, expected, strict=True):
+        np.testing.assert_array_equal(scan.points, alone.points)
 
 
 OTHERS = {

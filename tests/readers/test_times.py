@@ -123,6 +123,49 @@ def test_a_damaged_time_costs_its_point_alone(damage: int, places: list[int], st
     np.testing.assert_allclose(times[rest], expected[rest], atol=1e-6)
 
 
+@pytest.mark.parametrize("unit", [1.0, 1e-3, 1e-6, 1e-9])
+@pytest.mark.parametrize("clock_s", [1.0, 60.0, 3600.0, 86400.0, 604800.0])
+@pytest.mark.parametrize(("before_s", "duration_s"), [(0.05, 0.1), (0.01, 0.1), (0.095, 0.1), (0.03, 0.05)])
+def test_a_clock_that_begins_anew_goes_on(unit: float, clock_s: float, before_s: float, duration_s: float) -> None:
+    went = np.linspace(0.0, duration_s, 2000)
+    times = point_times({"t": (clock_s - before_s + went) % clock_s / unit}, np.ones((2000, 4), np.float32), None)
+    assert times is not None
+    np.testing.assert_allclose(times, clock_s - before_s + went, atol=1e-6)
+
+
+@pytest.mark.parametrize("unit", [1e-6, 1e-9])
+@pytest.mark.parametrize("first_us", [0, -40_000, -50_000, -90_000])
+def test_a_counter_of_32_bits_that_overflows_goes_on(unit: float, first_us: int) -> None:
+    """Also times from the end of a scan, which are negative, in a field that holds none."""
+    counts = (first_us + np.linspace(0, 1e5, 3000).astype(np.int64)) * round(1e-6 / unit)
+    times = point_times({"offset_time": counts.astype(np.uint32)}, np.ones((3000, 4), np.float32), None)
+    assert times is not None
+    np.testing.assert_allclose(times - times[0], np.linspace(0.0, 0.1, 3000), atol=2e-6)
+
+
+@pytest.mark.parametrize("value", [0.0, -1.0, 2.0**63])
+@pytest.mark.parametrize("share", [0.03, 0.5, 0.9])
+def test_a_value_that_stands_for_no_time_costs_its_points_alone(value: float, share: float) -> None:
+    times = 1.7e9 + np.linspace(0.0, 0.1, 4000)
+    lack = np.random.default_rng(4).random(4000) < share
+    found = point_times({"timestamp": np.where(lack, value, times)}, np.ones((4000, 4), np.float32), 5.0)
+    np.testing.assert_allclose(np.nan_to_num(found), np.where(lack, 0.0, times), rtol=0, atol=1e-6)
+
+
+def test_two_instants_are_both_kept() -> None:
+    """Two sensors that see all at once: neither stands for no time."""
+    times = np.repeat([0.0, 0.05], 500)
+    np.testing.assert_array_equal(point_times({"t": times}, np.ones((1000, 4), np.float32), None), times)
+
+
+@pytest.mark.parametrize("bad", [np.inf, -np.inf, np.nan])
+def test_times_that_are_not_finite_cost_their_points_alone(bad: float) -> None:
+    times = np.linspace(0.0, 0.1, 1000)
+    times[::90] = bad
+    found = point_times({"t": times}, np.ones((1000, 4), np.float32), 7.0)
+    np.testing.assert_array_equal(found, np.where(np.isfinite(times), times + 7.0, np.nan))
+
+
 @pytest.mark.parametrize("count", [10.0, 0.1, 4e3, 1.5e4])
 @pytest.mark.parametrize("direction", [1.0, -1.0])
 def test_times_that_contradict_the_turn_are_refused(count: float, direction: float) -> None:
@@ -436,7 +479,7 @@ def test_late_scans_and_those_of_another_session_give_no_motion(tmp_path: Path) 
 
 
 def test_scans_without_times_are_not_straightened() -> None:
-    with pytest.raises(edgeperc.PointsError, match="the scan has no times of points; leave out --deskew"):
+    with pytest.raises(edgeperc.PointsError, match=r"the scan has no times of points: .* leave out --deskew"):
         Straightener(None).straighten(1.0, np.zeros((8, 4), np.float32), None)
     points = np.zeros((8, 4), np.float32)
     assert Straightener(None).straighten(1.0, points, np.full(8, np.nan)) is points

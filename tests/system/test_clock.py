@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import datetime
 import math
 import pickle
 import warnings
@@ -14,7 +15,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from edgeperc import Box, Tracker, Tracks
+from edgeperc import Box, StampError, Tracker, Tracks
 from edgeperc.system.clock import (
     GAP_S,
     LATE_S,
@@ -22,6 +23,7 @@ from edgeperc.system.clock import (
     MOST_LATE,
     Clock,
     Stamp,
+    check_seconds,
     elapsed_s,
     nanoseconds_of,
     step_between,
@@ -196,3 +198,16 @@ def test_a_stamp_keeps_its_nanoseconds(ns: int) -> None:
         assert nanoseconds_of(same) == ns
     assert type(stamp + 0.0) is float
     assert nanoseconds_of(float(stamp)) == round(ns * 1e-9 * 1e9)
+
+
+@pytest.mark.parametrize(
+    "stamp_s", ["now", "5.0", b"5", datetime.datetime(2025, 5, 1), np.datetime64("2025-05-01"), [1.0], 1j, 10**400]
+)
+def test_what_is_no_time_in_seconds_is_refused(stamp_s: object) -> None:
+    with pytest.raises(StampError, match=r"stamp_s is .* expected the time of the scan \[s\]"):
+        check_seconds(stamp_s)
+
+
+@pytest.mark.parametrize("stamp_s", [5, 1.7e9, np.float32(3.0), np.int64(7), np.array(2.0), math.nan, True])
+def test_any_number_is_a_time(stamp_s: object) -> None:
+    check_seconds(stamp_s)

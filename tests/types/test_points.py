@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from types import SimpleNamespace
+from types import MappingProxyType, SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
+import edgeperc
 from edgeperc import PointsError, read_points, read_scans
 from edgeperc.readers.clouds import cloud_points
 from edgeperc.types.points import as_points
@@ -61,6 +62,12 @@ THINGS: dict[str, tuple[Callable[[Path], Any], str]] = {
     "stamped": (lambda path: next(iter(read_scans(path))), "with its stamp; .*for stamp_s, points in read_scans"),
     "stamped with times": (lambda path: (1.0, POINTS, None), "with its stamp; .*its points alone"),
     "scans": (read_scans, "got an iterator .*one scan a call"),
+    "dict": (lambda path: {"points": POINTS}, r"a mapping of points \(builtins\.dict\)"),
+    "dict of columns": (
+        lambda path: dict(zip("xyz", POINTS.T, strict=False)),
+        "a mapping of x, y, z .*np.column_stack",
+    ),
+    "mapping": (lambda path: MappingProxyType({"xyz": POINTS}), "a mapping of xyz .*the array of points in it"),
     "columns": (lambda path: SimpleNamespace(x=POINTS[:, 0], y=POINTS[:, 1], z=POINTS[:, 2]), r"np\.column_stack"),
 }
 
@@ -71,6 +78,25 @@ def test_what_is_no_array_names_the_call_that_converts_it(thing: str, file: Path
     with pytest.raises(PointsError, match=text) as error:
         as_points(make(file))
     assert "; expected (n, 4) x, y, z, remission: pass " in str(error.value)
+
+
+@pytest.mark.parametrize("order", [("x", "y", "z", "intensity"), ("Intensity", "Z", "ring", "Y", "X"), ("z", "y", "x")])
+def test_the_columns_of_a_data_frame_have_names(order: tuple[str, ...]) -> None:
+    """By position, they would be other axes."""
+    pandas = pytest.importorskip("pandas")
+    columns = {"x": POINTS[:, 0], "y": POINTS[:, 1], "z": POINTS[:, 2], "intensity": POINTS[:, 3], "ring": POINTS[:, 0]}
+    frame = pandas.DataFrame({name: columns[name.lower()] for name in order}).assign(label="car", box=None)
+    expected = POINTS if len(order) > 3 else POINTS * np.float32([1, 1, 1, 0])
+    np.testing.assert_array_equal(as_points(frame), expected)
+    np.testing.assert_array_equal(as_points(frame, remission_field="X")[:, 3], POINTS[:, 0])
+    np.testing.assert_array_equal(as_points(pandas.DataFrame(POINTS)), POINTS)
+
+
+@pytest.mark.parametrize("source", [None, 5, POINTS, ["a.bin", "b.bin"], b"a.bin"])
+def test_what_is_no_path_is_no_recording(source: Any) -> None:
+    for read in (read_scans, edgeperc.read_timed_scans, edgeperc.sensor_of):
+        with pytest.raises(PointsError, match=r"got a \w+; expected the path of one recording"):
+            read(source)
 
 
 def test_the_named_calls_convert(file: Path) -> None:
