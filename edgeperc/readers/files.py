@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import math
 import os
+import warnings
 import zipfile
 import zlib
 from collections.abc import Mapping, Sequence
@@ -122,22 +123,33 @@ class FileOptions(NamedTuple):
 
 
 def parse_points(content: bytes, name: str) -> NDArray[np.float32]:
-    """Read the points in the content of a file of this name; errors as `read_points`."""
-    return _parse_named(np.frombuffer(content, np.uint8), Path(name), FileOptions(None, None, None)).points
+    """Read the points in the content of a file of this name; errors as `read_points`, and for one that is cut short."""
+    read = _parse_named(np.frombuffer(content, np.uint8), Path(name), FileOptions(None, None, None))
+    if read.n_missing:
+        raise PointsError(f"{name}: {read.missing()}")
+    return read.points
 
 
 def read_timed_file(path: Path, options: FileOptions) -> TimedScan:
     """Read a scan file with the times of its points; errors as `read_points`."""
-    points, fields, _ = _read(path, options)
-    return TimedScan(None, points, point_times(fields, points, None))
+    read = _read(path, options)
+    return TimedScan(None, read.points, point_times(read.fields, read.points, None))
 
 
 class _Read(NamedTuple):
-    """Points, the fields of the file if they have names, and the place in a map that was subtracted."""
+    """Points, the fields of the file if they have names, the place in a map that was subtracted, and how many points a
+    file that was cut short lacks.
+    """
 
     points: NDArray[np.float32]
     fields: Mapping[str, NDArray[Any]]
     origin_m: Sequence[float] | None
+    n_missing: int = 0
+
+    def missing(self) -> str:
+        """What a file that was cut short lacks, as a sentence."""
+        there = f"the first {len(self.points):,} of {len(self.points) + self.n_missing:,} points are there"
+        return f"cut short: {there}, so a part of the surroundings is missing"
 
 
 def _read(path: Path, options: FileOptions) -> _Read:
@@ -156,7 +168,10 @@ def _read(path: Path, options: FileOptions) -> _Read:
         if path.is_dir():
             raise PointsError(f"{path}: a folder; expected one scan file. edgeperc.read_scans reads those in a folder")
         raise PointsError(f"{path}: there is no such file; expected a scan as .bin, .npy, .npz, .pcd or .ply")
-    return _parse_named(data, path, options)
+    read = _parse_named(data, path, options)
+    if read.n_missing:
+        warnings.warn(f"{path}: {read.missing()}", UserWarning, stacklevel=3)
+    return read
 
 
 def _parse_named(data: NDArray[np.uint8], path: Path, options: FileOptions) -> _Read:
@@ -237,7 +252,8 @@ def _of_array(array: NDArray[Any], options: FileOptions) -> _Read:
 
 def _of_columns(columns: Columns, options: FileOptions) -> _Read:
     origin = _origin(columns.fields, options)
-    return _Read(assemble(*columns, options.remission_field, origin), columns.fields, origin)
+    n, fields, names, n_missing = columns
+    return _Read(assemble(n, fields, names, options.remission_field, origin), fields, origin, n_missing)
 
 
 def _origin(fields: Mapping[str, NDArray[Any]], options: FileOptions) -> Sequence[float] | None:

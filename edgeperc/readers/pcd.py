@@ -16,10 +16,10 @@ from .tables import (
     MAX_SCAN_BYTES,
     Columns,
     column,
-    cut_short,
     header_lines,
     parse_table,
     whole_number,
+    whole_points,
 )
 
 _PCD_TYPES = {f"{kind}{size}": f"<{kind.lower()}{size}" for kind in "IU" for size in (1, 2, 4, 8)} | {
@@ -102,8 +102,7 @@ def parse_pcd(data: NDArray[np.uint8], head: bytes, remission_field: str | None)
             body, 0, n, {name: sum(header.counts[:k]) for name, k in single.items()}, header.names, remission_field
         )
     if header.encoding == "binary":
-        if n * record > body.size:
-            raise cut_short(n, record, body.size)
+        n = whole_points(n, record, body.size)
         fields = {name: column(body, header.types[k], n, sum(widths[:k]), record) for name, k in single.items()}
     elif header.encoding == "binary_compressed":
         unpacked = _unpack_pcd(body, n * record)
@@ -112,7 +111,7 @@ def parse_pcd(data: NDArray[np.uint8], head: bytes, remission_field: str | None)
         }
     else:
         raise PointsError(f"PCD data is ascii, binary or binary_compressed, got {header.encoding!r}")
-    return Columns(n, fields, header.names)
+    return Columns(n, fields, header.names, header.n_points - n)
 
 
 def _unpack_pcd(body: NDArray[np.uint8], n_bytes: int) -> NDArray[np.uint8]:

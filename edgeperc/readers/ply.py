@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ..errors import PointsError
 from ..types.points import plain_name
-from .tables import Columns, column, cut_short, header_lines, parse_table, whole_number
+from .tables import Columns, column, cut_short, header_lines, parse_table, whole_number, whole_points
 
 _PLY_TYPES = {
     **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"},
@@ -90,8 +90,10 @@ def parse_ply(data: NDArray[np.uint8], head: bytes, remission_field: str | None)
     offset = 0
     for element in before:
         offset = _row_starts(body, offset, element, order)[1]
-    starts, _ = _row_starts(body, offset, vertex, order)
     n = vertex.count
+    if not vertex.has_lists:
+        n = whole_points(n, sum(int(np.dtype(kind).itemsize) for _, kind, _ in vertex.properties), body.size - offset)
+    starts, _ = _row_starts(body, offset, replace(vertex, count=n), order)
     fields: dict[str, NDArray[Any]] = {}
     if starts is None:
         widths = [int(np.dtype(kind).itemsize) for _, kind, _ in vertex.properties]
@@ -104,7 +106,7 @@ def parse_ply(data: NDArray[np.uint8], head: bytes, remission_field: str | None)
             kind = order + vertex.properties[k][1]
             octets = starts[:, k, None] + np.arange(np.dtype(kind).itemsize)
             fields[name] = body[octets].reshape(-1).view(kind)
-    return Columns(n, fields, names)
+    return Columns(n, fields, names, vertex.count - n)
 
 
 def _row_starts(

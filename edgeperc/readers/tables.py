@@ -22,6 +22,8 @@ MAX_BYTES = 1 << 31
 # so much text takes 2 GiB of memory.
 MAX_SCAN_BYTES = 1 << 28
 
+_LEAST_ROW_BYTES = 6  # of text: three digits, two blanks and the end
+
 
 class Columns(NamedTuple):
     """The fields of a scan, for `edgeperc.types.points.assemble`.
@@ -29,11 +31,13 @@ class Columns(NamedTuple):
     n : number of points.
     fields : mapping of str to (n,) array; columns by `edgeperc.types.points.plain_name`.
     names : all fields of the source.
+    n_missing : points that the header declares, and that a file that was cut short lacks.
     """
 
     n: int
     fields: Mapping[str, NDArray[Any]]
     names: Sequence[str]
+    n_missing: int = 0
 
 
 def column(data: NDArray[np.uint8], kind: str, n: int, offset: int, stride: int) -> NDArray[Any]:
@@ -68,6 +72,17 @@ def whole_number(text: str) -> int:
     return value
 
 
+def whole_points(n: int, record: int, size: int) -> int:
+    """How many of the declared points of ``record`` bytes are whole in ``size`` bytes; PointsError for none, and for a
+    number that no scan has.
+    """
+    if n * record <= size:
+        return n
+    if size < record or n * record > MAX_SCAN_BYTES:
+        raise cut_short(n, record, size)
+    return size // record
+
+
 def cut_short(n: int, record: int, size: int) -> PointsError:
     """The error for a file that ends before the points its header declares."""
     return PointsError(
@@ -91,10 +106,14 @@ def parse_table(
             wanted[name] = places[name]
     if not {"x", "y", "z"} <= wanted.keys() or n == 0:
         return Columns(0, {name: np.empty(0) for name in wanted}, names)
-    ends = np.flatnonzero(np.append(body, np.uint8(10)) == 10) + 1
-    if skipped_rows + n > len(ends):
+    ends = np.flatnonzero(body == 10) + 1
+    n_ended = len(ends)
+    if len(body[ends[-1] if n_ended else 0 :].tobytes().split()) > max(wanted.values()):
+        ends = np.append(ends, body.size)  # the last row needs no end, but after a cut it may be half a number
+    n_there = n if skipped_rows + n <= len(ends) else n_ended - skipped_rows
+    if n_there < 1 or n * _LEAST_ROW_BYTES > MAX_SCAN_BYTES:
         raise PointsError(f"cut short: {skipped_rows + n} rows declared, {len(ends)} are there")
-    text = body[ends[skipped_rows - 1] if skipped_rows else 0 : ends[skipped_rows + n - 1]].tobytes()
+    text = body[ends[skipped_rows - 1] if skipped_rows else 0 : ends[skipped_rows + n_there - 1]].tobytes()
     if not text.strip():
         raise PointsError(f"cut short: {n} rows declared, none are there")
     try:
@@ -103,6 +122,6 @@ def parse_table(
         )
     except (ValueError, OverflowError) as exc:
         raise PointsError(f"a row of text does not hold numbers: {exc}") from exc
-    if len(rows) != n:
+    if len(rows) != n_there:
         raise PointsError(f"cut short: {n} rows declared, {len(rows)} of numbers are there")
-    return Columns(n, dict(zip(wanted, rows.T, strict=True)), names)
+    return Columns(n_there, dict(zip(wanted, rows.T, strict=True)), names, n - n_there)
