@@ -35,6 +35,7 @@ from .packet_messages import (
     read_text,
 )
 from .packets import (
+    SNIFFED_PACKETS,
     Datagrams,
     copy_as_ethernet,
     has_other_lidars,
@@ -198,7 +199,8 @@ def _ousters_beside(path: Path) -> list[str]:
     layouts = []
     with suppress(PointsError):  # there is none
         layouts = [layout_of(json.loads(read_metadata(file))) for file in metadata_beside(path)]
-    sizes = {len(datagram.payload) for datagram in islice(Datagrams(path, lambda: None), 2000)} if layouts else set()
+    first = islice(Datagrams(path, lambda: None), SNIFFED_PACKETS if layouts else 0)
+    sizes = {len(datagram.payload) for datagram in first}
     return [layout.name for layout in layouts if layout.packet_bytes in sizes]
 
 

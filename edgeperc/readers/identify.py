@@ -55,7 +55,7 @@ def of_packets(path: Path, topic: str | None = None) -> KnownSensor:
     topic : the serial number, if there is metadata of several Ouster sensors; the address of a Velodyne.
     Raises PointsError, SensorError.
     """
-    sender = topic if topic in velodyne_senders(path) else None
+    sender = topic if topic is not None and topic in velodyne_senders(path) else None  # reads the whole file
     names = {velodyne_name(packet) for packet in velodyne_packets(path, sender)}
     is_other = not names or (topic is not None and sender is None and has_other_lidars(path))
     by_serial = topic is not None and topic in _serials_beside(path)

@@ -12,7 +12,7 @@ import numpy as np
 
 from ..errors import PointsError
 from .livox_packets import LivoxStream, points_of
-from .packets import Datagrams, is_of_velodyne, sender_names
+from .packets import SNIFFED_PACKETS, Datagrams, is_of_velodyne, sender_names
 from .spinning_packets import (
     DIFOP,
     FORMATS,
@@ -27,8 +27,6 @@ from .spinning_packets import (
 )
 from .times import TimedScan
 
-# Enough to find a LiDAR's packet among those of a GPS, and quick to read.
-_SNIFFED_PACKETS = 2000
 _OTHER_BYTES = 600  # what LiDARs send of their GPS is shorter
 _LIVOX = "livox"
 _LIVOX_SIZES = (1380, 804, 996)
@@ -60,7 +58,7 @@ def lidar_of(path: Path) -> Lidar | None:
     Raises PointsError: It is one that is not decoded.
     """
     names, senders, rows = Counter[str | None](), dict[str, Counter[tuple[str, int]]](), dict[str, Format]()
-    for datagram in islice(Datagrams(path, lambda: None), _SNIFFED_PACKETS):
+    for datagram in islice(Datagrams(path, lambda: None), SNIFFED_PACKETS):
         if bytes(datagram.payload[:8]) == DIFOP or is_of_velodyne(datagram):
             continue
         row = format_of(datagram.payload)

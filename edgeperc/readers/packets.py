@@ -37,7 +37,7 @@ _PRODUCTS = {
 _RETURN_MODES = (0x37, 0x38, 0x39, 0x3A, 0x3B)
 
 # Enough to find a LiDAR's packet among those of a GPS, and quick to read.
-_SNIFFED_PACKETS = 2000
+SNIFFED_PACKETS = 2000
 
 # Of a sensor's packets; of a damaged address, there are fewer.
 _LEAST_SHARE, _FEWEST_PACKETS = 0.05, 60
@@ -138,9 +138,9 @@ def velodyne_packets(path: Path, sender: str | None = None) -> Iterator[memoryvi
 
     sender : one of `velodyne_senders`; None: all.
     """
-    most = _SNIFFED_PACKETS if sender is None else None
+    most = SNIFFED_PACKETS if sender is None else None
     known = (datagram.payload for datagram in _velodyne_datagrams(path, most) if datagram.is_from(sender))
-    yield from islice(known, _SNIFFED_PACKETS)
+    yield from islice(known, SNIFFED_PACKETS)
     yield from _bare_velodyne_packets(path)
 
 
@@ -157,9 +157,9 @@ def velodyne_name(packet: memoryview) -> str | None:
 def velodyne_senders(path: Path) -> list[str]:
     """What `sender_names` calls the senders of a Velodyne's packets in a whole pcap file: a second may begin late."""
     counts = Counter[tuple[str, int]]()
-    for datagram in _velodyne_datagrams(path, _SNIFFED_PACKETS):
+    for datagram in _velodyne_datagrams(path, SNIFFED_PACKETS):
         counts[datagram.sender, datagram.port] += 1
-    for link, _, packet in islice(pcap_packets(path, whole=False), _SNIFFED_PACKETS, None):
+    for link, _, packet in islice(pcap_packets(path, whole=False), SNIFFED_PACKETS, None):
         with suppress(ValueError):
             at = _ip_at(packet, link) if len(packet) > VELODYNE_BYTES else None
             if at is not None and bytes(packet[at + 28 : at + 30]) == _FLAG:  # behind headers of 20 and 8 bytes
@@ -174,7 +174,7 @@ def is_of_velodyne(datagram: Datagram) -> bool:
 
 def has_other_lidars(path: Path) -> bool:
     """Whether the first datagrams of a pcap file may be those of other LiDARs than Velodyne's."""
-    first = Datagrams(path, lambda: None, _SNIFFED_PACKETS)
+    first = Datagrams(path, lambda: None, SNIFFED_PACKETS)
     return any(len(datagram.payload) > _GPS_BYTES and not is_of_velodyne(datagram) for datagram in first)
 
 
@@ -184,7 +184,7 @@ def _velodyne_datagrams(path: Path, most: int | None) -> Iterator[Datagram]:
 
 def _bare_velodyne_packets(path: Path) -> Iterator[memoryview]:
     """Those among the first whose sender is not known, with whatever is in front of them."""
-    for link, _, packet in islice(pcap_packets(path, whole=False), _SNIFFED_PACKETS):
+    for link, _, packet in islice(pcap_packets(path, whole=False), SNIFFED_PACKETS):
         if len(packet) > VELODYNE_BYTES and bytes(packet[-VELODYNE_BYTES : 2 - VELODYNE_BYTES]) == _FLAG:
             try:
                 at = _ip_at(packet, link)
@@ -231,7 +231,7 @@ def is_plain(path: Path) -> bool:
 
     They begin with Ethernet's header, and none is in fragments; the file is not a pcapng.
     """
-    for link, _, packet in islice(pcap_packets(path, whole=False), _SNIFFED_PACKETS):
+    for link, _, packet in islice(pcap_packets(path, whole=False), SNIFFED_PACKETS):
         with suppress(ValueError):
             part = _fragment(packet, link)
             if part is not None and (part.more or part.start):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
@@ -91,17 +91,17 @@ def parse_ply(data: NDArray[np.uint8], head: bytes, remission_field: str | None)
     for element in before:
         offset = _row_starts(body, offset, element, order)[1]
     n = vertex.count
-    if not vertex.has_lists:
-        n = whole_points(n, sum(int(np.dtype(kind).itemsize) for _, kind, _ in vertex.properties), body.size - offset)
-    starts, _ = _row_starts(body, offset, replace(vertex, count=n), order)
     fields: dict[str, NDArray[Any]] = {}
-    if starts is None:
+    if not vertex.has_lists:
         widths = [int(np.dtype(kind).itemsize) for _, kind, _ in vertex.properties]
         record = sum(widths)
+        n = whole_points(n, record, body.size - offset)
         for name, k in places.items():
             kind = order + vertex.properties[k][1]
             fields[name] = column(body, kind, n, offset + sum(widths[:k]), record)
     else:
+        starts, _ = _row_starts(body, offset, vertex, order)
+        assert starts is not None
         for name, k in places.items():
             kind = order + vertex.properties[k][1]
             octets = starts[:, k, None] + np.arange(np.dtype(kind).itemsize)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import random
 import struct
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -25,6 +25,16 @@ pytestmark = pytest.mark.usefixtures("in_this_process")
 POINTS = np.array(
     [[12.5, -3.25, -1.75, 0.25], [40.0, 8.5, 2.0, 99.0], [np.nan, 1.0, 1.0, 0.5], [5.0, np.inf, 0.0, 255.0]], np.float32
 )
+
+
+def check_told_apart(both: Path, alone: Mapping[str, Path]) -> None:
+    """By its name, each sensor of a capture of several gives the points and the profile of its capture alone."""
+    for topic, path in alone.items():
+        found, expected = list(read_scans(both, topic=topic)), list(read_scans(path))
+        assert len(found) == len(expected) > 0
+        for (_, points), (_, other_points) in zip(found, expected, strict=True):
+            np.testing.assert_array_equal(points, other_points)
+        assert edgeperc.sensor_of(both, topic=topic) == edgeperc.sensor_of(path)
 
 
 def error_of(path: Path, **options: Any) -> str:

@@ -13,11 +13,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from lidar_writers import MODELS, blocks_of, packets_of, ranges
-from test_captures import error_of, vlp16_packets, write_pcap
+from test_captures import check_told_apart, error_of, vlp16_packets, write_pcap
 from test_packets import write_link
 
 import twins.packets
-from edgeperc import PointsError, read_timed_scans, sensor_of
+from edgeperc import PointsError, read_timed_scans
 from edgeperc.readers.ouster_packets import PROFILES, OusterStream, fill_turn, layout_of
 from edgeperc.readers.times import TimedScan
 
@@ -267,12 +267,7 @@ def test_an_ouster_beside_another_makers_sensor_is_told_apart(tmp_path: Path, ot
     for name in ("both", "ouster"):
         (tmp_path / f"{name}.json").write_text(json.dumps(METADATA))
     assert "expected one LiDAR, there are 10.0.0.9, 122246000293; choose one" in error_of(both)
-    for topic, path in (("10.0.0.9", tmp_path / "alone.pcap"), ("122246000293", tmp_path / "ouster.pcap")):
-        found, expected = [*read_timed_scans(both, topic=topic)], [*read_timed_scans(path)]
-        assert len(found) == len(expected) > 0
-        for one, two in zip(found, expected, strict=True):
-            np.testing.assert_array_equal(one.points, two.points)
-        assert sensor_of(both, topic=topic) == sensor_of(path)
+    check_told_apart(both, {"10.0.0.9": tmp_path / "alone.pcap", "122246000293": tmp_path / "ouster.pcap"})
 
 
 @pytest.mark.parametrize("other", ["10.0.0.2", "10.0.0.1:7503", "10.0.0.9:7502"])

@@ -23,11 +23,11 @@ from lidar_writers import (
     unit_angles,
 )
 from numpy.typing import NDArray
-from test_captures import error_of, vlp16_packets, write_pcap
+from test_captures import check_told_apart, error_of, vlp16_packets, write_pcap
 from test_packets import write_link
 
 import twins.packets
-from edgeperc import PointsError, read_scans, read_timed_scans, sensor_of
+from edgeperc import PointsError, read_timed_scans, sensor_of
 from edgeperc.readers.spinning_packets import (
     FORMATS,
     Angles,
@@ -230,12 +230,7 @@ def test_a_velodyne_beside_another_sensor_is_told_apart(tmp_path: Path, name: st
     first, second = parts if is_first else parts[::-1]
     both.write_bytes(first + second[24:])
     assert "expected one LiDAR, there are 10.0.0.9, 10.0.0.1; choose one" in error_of(both)
-    for address, alone in (("10.0.0.9", "velodyne.pcap"), ("10.0.0.1", "other.pcap")):
-        found, expected = list(read_scans(both, topic=address)), list(read_scans(tmp_path / alone))
-        assert len(found) == len(expected) > 0
-        for (_, points), (_, other_points) in zip(found, expected, strict=True):
-            np.testing.assert_array_equal(points, other_points)
-        assert sensor_of(both, topic=address) == sensor_of(tmp_path / alone)
+    check_told_apart(both, {"10.0.0.9": tmp_path / "velodyne.pcap", "10.0.0.1": tmp_path / "other.pcap"})
 
 
 @pytest.mark.parametrize("other", ["10.0.0.2", "10.0.0.1:2369"])
