@@ -71,8 +71,11 @@ def _digest(kernel: Any, texts: list[str], anew: bool) -> bytes:
 
 
 def called_by(kernel: Any) -> tuple[Any, ...]:
-    """The kernels that a kernel calls itself. Raises TypeError as `stamp_of` does."""
-    return _describe(kernel).called
+    """The kernels that a kernel calls itself; none are known of one that `stamp_of` refuses."""
+    try:
+        return _describe(kernel).called
+    except TypeError:  # its cache reports it
+        return ()
 
 
 def settings() -> tuple[str, ...]:
@@ -144,6 +147,8 @@ def _content(value: Any, reader: FunctionType | None, called: list[Any] | None) 
     if isinstance(value, np.generic | np.ndarray) and not value.dtype.hasobject:
         layout = value.flags.c_contiguous, value.flags.f_contiguous, value.flags.writeable
         return str(value.dtype), value.shape, layout, hashlib.sha256(value.tobytes()).hexdigest()
+    if isinstance(value, slice):  # a constant of code since Python 3.14
+        return each_of((value.start, value.stop, value.step))
     if isinstance(value, tuple | list):
         return each_of(value)
     if isinstance(value, set | frozenset):

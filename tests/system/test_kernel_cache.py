@@ -17,7 +17,7 @@ import sys
 from collections.abc import Callable, Iterator
 from importlib import import_module
 from pathlib import Path
-from types import SimpleNamespace
+from types import FunctionType, SimpleNamespace
 from typing import Any
 
 import llvmlite
@@ -606,7 +606,18 @@ def test_a_value_without_a_digest_is_named(place: Place) -> None:
     spec.loader.exec_module(module)
     with pytest.raises(TypeError, match="squared reads WHAT, a list_iterator, which has no digest"):
         kernel_stamp.stamp_of(module.total)
+    assert kernel_stamp.called_by(module.squared) == ()
     assert not module.total._cache.is_missing()
+
+
+@pytest.mark.parametrize("other", [slice(1, 2), slice(0, 3), slice(0, 2, 1), slice(None, 2), (0, 2, None)])
+def test_slices_have_a_digest(other: object) -> None:
+    # Since Python 3.14, they are constants of a function's code.
+    code = compile("PART", "part", "eval")
+    first, again, changed = (
+        kernel_stamp.stamp_of(FunctionType(code, {"PART": value})) for value in (slice(0, 2), slice(0, 2), other)
+    )
+    assert first == again != changed
 
 
 STAMPS = """
