@@ -173,7 +173,7 @@ def warm_up(
         # Objects and agreement
         floor[:, 3] = labels.labels
         if objects is not None:
-            objects.session = Rehearsed(objects.session)
+            objects.session = objects.closely = Rehearsed(objects.session)
         if pillars is not None:
             pillars.session = Rehearsed(pillars.session)
             pillars.find_boxes(read_only(floor))

@@ -175,6 +175,7 @@ class Session:
         _check_names(provider, precision)
         self._trusted, self._at_once = trusted, at_once
         self._made_in, self._running_in = os.getpid(), 0
+        self._constants: dict[str, Any] = {}
         ort = load_onnxruntime()
         variants = resolve(model)
         self.digest = digest(variants)
@@ -254,8 +255,9 @@ class Session:
         if self.shares_cores:
             n_threads = cores // self._at_once
         self._has_threads = short != "cpu" or n_threads != 1
+        self._opened_with = short, precision, n_threads, folds
         with native_call():
-            self.inference = kept_in_forks(self._open(ort, blob, short, precision, n_threads, folds))
+            self.inference = kept_in_forks(self._open(ort, blob, *self._opened_with))
         self._check_graph()
         with terminated(ort, None if self._trusted else MAX_FIRST_RUN_S) as run_options:
             self._bind(run_options)
@@ -270,6 +272,8 @@ class Session:
         self, ort: Any, blob: bytes, short: str, precision: str, n_threads: int | None, folds: bool = True
     ) -> Any:
         options = ort.SessionOptions()
+        for name, value in self._constants.items():
+            options.add_initializer(name, value)
         options.log_severity_level = 4
         options.inter_op_num_threads = 1
         options.use_deterministic_compute = True
@@ -510,6 +514,20 @@ class Session:
         twin = object.__new__(Session)
         vars(twin).update(vars(self))
         with terminated(load_onnxruntime(), None) as run_options:
+            twin._bind(run_options)
+        return twin
+
+    def with_constants(self, **constants: float) -> Session:
+        """The same network with scalars of its graph in place of those in the file, and with buffers of its own."""
+        ort, twin = load_onnxruntime(), object.__new__(Session)
+        vars(twin).update(vars(self))
+        # onnxruntime does not own them.
+        twin._constants = {
+            name: ort.OrtValue.ortvalue_from_numpy(np.array(value, np.float32)) for name, value in constants.items()
+        }
+        with native_call():
+            twin.inference = kept_in_forks(twin._open(ort, read_model(self.path), *self._opened_with))
+        with terminated(ort, None) as run_options:
             twin._bind(run_options)
         return twin
 

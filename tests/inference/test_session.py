@@ -73,6 +73,24 @@ def test_a_second_run_overwrites_the_first() -> None:
     np.testing.assert_array_equal(first, logits)
 
 
+def test_a_graph_with_other_constants_has_its_own_answers_and_buffers() -> None:
+    session = Session("objects", "cpu", n_threads=1)
+    all_closely, none_closely = session.with_constants(least=-np.inf), session.with_constants(least=np.inf)
+    batch = np.random.default_rng(0).normal(size=(40, *session.input.shape[1:])).astype(np.float32)
+
+    def dropped(network: Session) -> int:
+        network.input[:40] = batch
+        return int(np.count_nonzero(network.run(40)["objects"][:40, 0] == 12.0))  # the logit of background
+
+    for _ in range(3):
+        assert dropped(all_closely) == 0
+        assert dropped(none_closely) == 40
+        assert 0 < dropped(session) < 40
+        none_closely = session.with_constants(least=np.inf, unknown=1.0)  # the former one is destroyed
+    session.input[:40] = 0.0
+    np.testing.assert_array_equal(all_closely.input[:40], batch)
+
+
 def test_the_golden_input_never_changes() -> None:
     x = golden_input(0, (2, 3))
     assert x.dtype == np.float32
