@@ -37,6 +37,14 @@ def _psutil() -> Any:
     return require("psutil", "bench", "Measuring")
 
 
+def _measured(name: str) -> Any:
+    """What psutil measures by a function of this name; None where the system has none, or no /sys."""
+    try:
+        return getattr(_psutil(), name)()
+    except (AttributeError, OSError):
+        return None
+
+
 def _number(path: Path) -> int | None:
     text = read_text(path)
     return int(text) if text is not None and text.lstrip("-").isdigit() else None
@@ -49,7 +57,7 @@ def machine() -> dict[str, Any]:
     governors = {text for path in CPU.glob("cpu[0-9]*/cpufreq/scaling_governor") if (text := read_text(path))}
     no_turbo, boost = _number(CPU / "intel_pstate/no_turbo"), _number(CPU / "cpufreq/boost")
     quota, model = cpu_quota(), board()
-    frequency = psutil.cpu_freq()
+    frequency = _measured("cpu_freq")
     return {
         "cpu": cpu_model(),
         "board": model.rstrip("\0") if model else None,
@@ -92,13 +100,12 @@ def software() -> dict[str, Any]:
 def conditions() -> dict[str, Any]:
     """The state of the machine at this moment; two of them show what happened in between (`disturbances`)."""
     psutil = _psutil()
-    frequency = psutil.cpu_freq()
-    sensors = psutil.sensors_temperatures() if hasattr(psutil, "sensors_temperatures") else {}
+    frequency, sensors = _measured("cpu_freq"), _measured("sensors_temperatures") or {}
     sensors_read = [each for group in sensors.values() for each in group if each.current]
     throttles = [_number(path) for path in CPU.glob("cpu[0-9]*/thermal_throttle/*_throttle_count")]
     quota = dict(line.split() for line in (read_text(Path("/sys/fs/cgroup/cpu.stat")) or "").splitlines())
     times = psutil.cpu_times()
-    battery = psutil.sensors_battery() if hasattr(psutil, "sensors_battery") else None
+    battery = _measured("sensors_battery")
     # Time of guests is part of user and nice.
     idle = times.idle + getattr(times, "iowait", 0.0)
     busy = sum(times) - idle - getattr(times, "guest", 0.0) - getattr(times, "guest_nice", 0.0)
