@@ -165,17 +165,16 @@ def methods(folder: Path) -> list[Contender]:
     ]
     if not why_missing(Contender("", "network", "torch")):
         write_others(folder)
-    for name in OTHERS:
-        image = folder / f"{name}.npy"
+    for name, (_, outputs, _) in OTHERS.items():
+        image, answers = folder / f"{name}.npy", "labels only" if outputs == ("logits",) else "boxes only"
         for kind in ("int8", "fp32"):
-            path = (folder / f"{name} {kind}.onnx",)
-            rows.append(Contender(f"{name} {kind}", "network", "onnxruntime", kind, path, (), image, (), "network"))
+            row = Contender(f"{name} {kind}", "network", "onnxruntime", kind, (folder / f"{name} {kind}.onnx",))
+            rows.append(replace(row, image=image, timed=f"network, {answers}"))
             if name == POINTPILLARS:
-                timed = "scan to pillars, network"
-                rows.append(Contender(f"{name} {kind}", "pillars", "onnxruntime", kind, path, timed=timed))
+                rows.append(replace(row, kind="pillars", timed=f"scan to pillars, network, {answers}"))
     return [
         *rows,
-        Contender("Patchwork++, k-d tree", "clusters", "patchwork", timed="scan to ground and clusters, one thread"),
+        Contender("Patchwork++, k-d tree", "clusters", "patchwork", timed="scan to ground and clusters only, one thread"),
     ]
 
 
