@@ -25,7 +25,7 @@ OTHERS: dict[str, tuple[str, tuple[str, ...], tuple[int, int, int]]] = {
     "SFA3D 608x608": ("resnets.SFA3D", ("heat", "offset", "direction", "height", "size"), (3, 608, 608)),
     POINTPILLARS: ("pointpillars.PointPillars", ("scores", "boxes", "directions"), (64, 496, 432)),
 }
-"""Networks of others: where they are, their outputs (logits of labels, or what boxes are read off), their input's shape."""
+"""Networks of others: where they are, their outputs, logits or what boxes are read off, and their input's shape."""
 
 
 def resized(model: str, share: float, folder: Path) -> Path:
