@@ -1,11 +1,11 @@
 """FIDNet, CENet and SFA3D, networks of residual blocks, to be measured against. They are never trained here.
 
-FIDNet and CENet label range images (Zhao et al., 2021; Cheng et al., 2022): four stages of a ResNet-34 whose outputs are
-enlarged to the resolution of the input, concatenated and classified. CENet has convolutions of 3x3 pixels in place of
-1x1, fewer channels, and Hardswish. Its auxiliary heads serve the training only and are left out, as is the softmax.
+FIDNet and CENet label range images (Zhao et al., 2021; Cheng et al., 2022): the outputs of a ResNet-34's four stages
+are enlarged to the resolution of the input, concatenated and classified. CENet has convolutions of 3x3 pixels in place
+of 1x1, fewer channels, and Hardswish. Its auxiliary heads serve the training only and are left out, as is the softmax.
 
-SFA3D (Nguyen Mau Dung, 2020) finds boxes in a bird's-eye view of height, intensity and density: a ResNet-18 with RTM3D's
-keypoint feature pyramid. Widths and depths are those of the authors' released networks.
+SFA3D (Nguyen Mau Dung, 2020) finds boxes in a bird's-eye view of height, intensity and density: a ResNet-18 with the
+keypoint feature pyramid of RTM3D. Widths and depths are those of the authors' released networks.
 """
 
 from __future__ import annotations
