@@ -187,15 +187,13 @@ def main() -> None:
     add("--accuracy SCAN", wanted, nargs="*", type=Path, default=[])
     arguments = parser.parse_args()
     peers = installed_peers()
-    scans: list[tuple[Scan, Truth]] = []
+    truth: Truth | None
     if arguments.scan is None:
-        name = "a simulated scan"
-        points, truth = simulated()
-        scans.append((points, truth))
+        name, (points, truth) = "a simulated scan", simulated()
     else:
         name, points = str(arguments.scan), read_points(arguments.scan)
-        if (known := read_truth(arguments.scan, len(points))) is not None:
-            scans.append((points, known))
+        truth = read_truth(arguments.scan, len(points))
+    scans = [(points, truth)] if truth is not None else []
     for path in arguments.accuracy:
         more = read_points(path)
         if (known := read_truth(path, len(more))) is None:

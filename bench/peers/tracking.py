@@ -209,10 +209,8 @@ def main() -> None:
         street = drawn_street()
         of_class, cars = {"car (drawn)": [street]}, street
     else:
-        read = {
-            path.stem: read_sequence(arguments.root, path.stem).detections
-            for path in sorted((arguments.root / "label_02").glob("*.txt"))
-        }
+        names = [path.stem for path in sorted((arguments.root / "label_02").glob("*.txt"))]
+        read = {name: read_sequence(arguments.root, name).detections for name in names}
         of_class = {
             label: [[[box for box in scan if box.label == label] for scan in scans] for scans in read.values()]
             for label in CLASSES
