@@ -253,8 +253,8 @@ def compared(
             ]
         counted = [np.logical_and.reduce(masks) for masks in zip(staying, drive.known, drive.usable, strict=True)]
         still = [known & ~moves for known, moves in zip(drive.known, moving, strict=True)]
-        n_still = np.count_nonzero(np.concatenate(still))
-        n_lost = np.count_nonzero(np.concatenate(still) & ~np.concatenate(staying))
+        n_still = int(np.count_nonzero(np.concatenate(still)))
+        n_lost = int(np.count_nonzero(np.concatenate(still) & ~np.concatenate(staying)))
         way_m = float(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1).sum())
         known = any(mask.any() for mask in drive.known)
         rows.append(

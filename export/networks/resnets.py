@@ -25,15 +25,19 @@ N_BOX_VALUES = {"heat": 3, "offset": 2, "direction": 2, "height": 1, "size": 3}
 Activation = Callable[[], nn.Module]
 
 
+def conv_bn(c_in: int, c_out: int, kernel: int, stride: int = 1) -> list[nn.Module]:
+    """A convolution without bias, and batch norm."""
+    return [*conv_bn_relu(c_in, c_out, kernel, stride=(stride, stride))][:2]
+
+
 class Residual(nn.Module):
     """Two convolutions of 3x3, added to the input, or to its 1x1 convolution where the shape changes."""
 
     def __init__(self, c_in: int, c_out: int, stride: int, activation: Activation) -> None:
         super().__init__()
-        first = conv_bn_relu(c_in, c_out, 3, stride=(stride, stride))[:2]
-        self.layers = nn.Sequential(*first, activation(), *conv_bn_relu(c_out, c_out, 3)[:2])
+        self.layers = nn.Sequential(*conv_bn(c_in, c_out, 3, stride), activation(), *conv_bn(c_out, c_out, 3))
         same = stride == 1 and c_in == c_out
-        self.shortcut = nn.Identity() if same else conv_bn_relu(c_in, c_out, 1, stride=(stride, stride))[:2]
+        self.shortcut = nn.Sequential(*([] if same else conv_bn(c_in, c_out, 1, stride)))
         self.activation = activation()
 
     def forward(self, x: Tensor) -> Tensor:
@@ -80,8 +84,10 @@ class FIDNet(nn.Module):
         self.classifier = nn.Conv2d(self.head_widths[-1], n_classes, 1)
 
     def _chain(self, *widths: int) -> nn.Sequential:
-        pairs = [[*conv_bn_relu(*pair, self.kernel)[:2], type(self).activation()] for pair in pairwise(widths)]
-        return nn.Sequential(*(layer for pair in pairs for layer in pair))
+        layers: list[nn.Module] = []
+        for pair in pairwise(widths):
+            layers += [*conv_bn(*pair, self.kernel), type(self).activation()]
+        return nn.Sequential(*layers)
 
     def forward(self, x: Tensor) -> Tensor:
         seen = [self.stem(x)]
@@ -100,6 +106,21 @@ class CENet(FIDNet):
     activation = nn.Hardswish
 
 
+class PyramidHead(nn.Module):
+    """``n`` values of a pixel: the sum over levels, weighted by their softmax, at the resolution of the last one."""
+
+    def __init__(self, n: int, widths: Sequence[int]) -> None:
+        super().__init__()
+        layers = [[nn.Conv2d(c, 64, 3, padding=1), nn.ReLU(), nn.Conv2d(64, n, 1)] for c in widths]
+        self.levels = nn.ModuleList(nn.Sequential(*each) for each in layers)
+
+    def forward(self, levels: Sequence[Tensor]) -> Tensor:
+        size = levels[-1].shape[2:]
+        found = [layers(x) for layers, x in zip(self.levels, levels, strict=True)]
+        stacked = torch.stack([x if x.shape[2:] == size else F.interpolate(x, size) for x in found])
+        return (stacked * stacked.softmax(dim=0)).sum(dim=0)
+
+
 class SFA3D(nn.Module):
     """Finds boxes: heat maps of their centers, and values at each pixel for a center there.
 
@@ -111,11 +132,9 @@ class SFA3D(nn.Module):
         super().__init__()
         self.stem = nn.Sequential(*conv_bn_relu(3, 64, 7, stride=(2, 2)), nn.MaxPool2d(3, stride=2, padding=1))
         self.stages = stages(64, (64, 128, 256, 512), (2, 2, 2, 2), nn.ReLU)
-        self.ups = nn.ModuleList(nn.Conv2d(3 * c, c, 1) for c in (256, 128, 64))
-        self.heads = nn.ModuleList()
-        for n in N_BOX_VALUES.values():
-            levels = [[nn.Conv2d(c, 64, 3, padding=1), nn.ReLU(), nn.Conv2d(64, n, 1)] for c in (256, 128, 64)]
-            self.heads.append(nn.ModuleList(nn.Sequential(*level) for level in levels))
+        widths = (256, 128, 64)
+        self.ups = nn.ModuleList(nn.Conv2d(3 * c, c, 1) for c in widths)
+        self.heads = nn.ModuleList(PyramidHead(n, widths) for n in N_BOX_VALUES.values())
 
     def forward(self, x: Tensor) -> tuple[Tensor, ...]:
         seen = [self.stem(x)]  # (B, 64, 152, 152)
@@ -125,11 +144,4 @@ class SFA3D(nn.Module):
         for up in self.ups:
             x = up(torch.cat([enlarged(x, seen[-1]), seen.pop()], dim=1))
             levels.append(enlarged(x, seen[-1]))
-        return tuple(_weighted([head(level) for head, level in zip(each, levels, strict=True)]) for each in self.heads)
-
-
-def _weighted(levels: Sequence[Tensor]) -> Tensor:
-    """Sum of the levels, weighted by their softmax at each pixel, at the resolution of the last."""
-    size = levels[-1].shape[2:]
-    stacked = torch.stack([x if x.shape[2:] == size else F.interpolate(x, size) for x in levels])
-    return (stacked * stacked.softmax(dim=0)).sum(dim=0)
+        return tuple(head(levels) for head in self.heads)

@@ -676,15 +676,15 @@ def test_a_residual_block_adds_its_input(c_in: int, c_out: int, stride: int) -> 
     nn.init.zeros_(block.layers[-1].weight)  # of the last batch norm
     with torch.no_grad():
         agree(block(x), block.shortcut(x).relu())
-    assert isinstance(block.shortcut, nn.Identity) == (c_in == c_out and stride == 1)
+    assert (len(block.shortcut) == 0) == (c_in == c_out and stride == 1)
 
 
 @pytest.mark.parametrize(("height", "width"), [(608, 608), (64, 96), (32, 32)])
 def test_sfa3d_has_five_heads_at_a_quarter_of_the_resolution(height: int, width: int) -> None:
     image = torch.empty(1, 3, height, width, device="meta")
-    outputs, recorded = run_and_record(on_meta(SFA3D), image, "stages.3", *(f"heads.0.{k}" for k in range(3)))
+    outputs, recorded = run_and_record(on_meta(SFA3D), image, "stages.3", *(f"heads.0.levels.{k}" for k in range(3)))
     assert tuple(recorded["stages.3"][1].shape) == (1, 512, height // 32, width // 32)
-    shrinks = {f"heads.0.{k}": shrink for k, shrink in enumerate((8, 4, 4))}
+    shrinks = {f"heads.0.levels.{k}": shrink for k, shrink in enumerate((8, 4, 4))}
     assert {name: height // recorded[name][0].shape[2] for name in shrinks} == shrinks
     assert [tuple(output.shape) for output in outputs] == [
         (1, n, height // 4, width // 4) for n in N_BOX_VALUES.values()
@@ -693,7 +693,7 @@ def test_sfa3d_has_five_heads_at_a_quarter_of_the_resolution(height: int, width:
 
 @pytest.mark.parametrize("size", [32, 64, 96])
 def test_sfa3d_weights_its_levels_by_their_softmax(size: int) -> None:
-    names = [f"heads.0.{k}" for k in range(3)]
+    names = [f"heads.0.levels.{k}" for k in range(3)]
     (heat, *_), recorded = run_and_record(SFA3D().eval(), torch.randn(1, 3, size, size), *names)
     coarse, *finer = (recorded[name][1] for name in names)
     levels = torch.stack([coarse.repeat_interleave(2, 2).repeat_interleave(2, 3), *finer])
