@@ -41,9 +41,8 @@ def repeat(
         predictions += result.pop("predictions")
         setting["repeats"].append(result)
         for name, scenario in result["scenarios"].items():
-            for disturbance in disturbances(
-                document["machine"], scenario["before"], scenario["after"], scenario["cpu_s"]
-            ):
+            states = scenario["before"], scenario["after"], scenario["cpu_s"]
+            for disturbance in disturbances(document["machine"], *states):
                 document["disturbances"].append(f"{name}, repeat {k + 1}: {disturbance}")
         if result["interrupted"]:
             raise KeyboardInterrupt

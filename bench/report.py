@@ -103,13 +103,8 @@ def _setting(setting: Mapping[str, Any]) -> list[Section]:
             ]
             for o in setting["offline"]
         ]
-        parts.append(
-            Section(
-                "Offline",
-                ["several concurrent processes, each back to back; counted while all of them run"],
-                [head, *rows],
-            )
-        )
+        sentences = ["several concurrent processes, each back to back; counted while all of them run"]
+        parts.append(Section("Offline", sentences, [head, *rows]))
     if setting.get("cold_start"):
         steps = ("interpreter_s", "import_s", "read_s", "construct_s", "first_call_s", "total_s")
         head = ["start", *(step.removesuffix("_s").replace("_", " ") for step in steps), "peak RSS MB"]
@@ -213,10 +208,8 @@ def _context(document: Mapping[str, Any]) -> list[Section]:
         options = ", ".join(f"{key} {value}" for key, value in e["options"].items())
         how = f"{e['precision']}, {e['provider']}, {options}, SHA-256 {e['sha256']}"
         rows.append([f"{e['name']}:{e['variant']} {e['version']}", how])
-    rows += (
-        [["input", f"{document['input']['source']}; sensor {document['input']['sensor']}"]] if document["input"] else []
-    )
     if document["input"]:
+        rows.append(["input", f"{document['input']['source']}; sensor {document['input']['sensor']}"])
         points = document["input"]["n_points"]
         rows.append(["points per scan", f"{min(points):,} to {max(points):,}"])
         rows.append(["input SHA-256", document["input"]["sha256"]])

@@ -10,7 +10,7 @@ import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -69,10 +69,8 @@ class Timings:
             self.stage_ms.setdefault(stage, []).append(took)
 
 
-class KeepGoing(Protocol):
-    """Called after every scan, including the warm-up; False ends the scenario and keeps its measurements."""
-
-    def __call__(self, timings: Timings) -> bool: ...
+KeepGoing = Callable[[Timings], bool]
+"""Called after every scan, including the warm-up; False ends the scenario and keeps its measurements."""
 
 
 def back_to_back(

@@ -30,6 +30,7 @@ from .samples import elapsed_ms
 TIMES_S = (0.1, 0.2, 0.5)
 SPEEDS_MPS = (0.0, 10.0)
 _RATE_HZ = 100.0  # of the places that a gathered scan is taken from
+Taken = tuple[NDArray[np.float32], NDArray[np.uint8], SimulatedScan, list[int]]
 
 
 class Figures(NearFigures):
@@ -48,9 +49,7 @@ class Figures(NearFigures):
         )
 
 
-def gathered(
-    seed: int, sensor: SensorProfile, accumulate_s: float, speed_mps: float
-) -> tuple[NDArray[np.float32], NDArray[np.uint8], SimulatedScan, list[int]]:
+def gathered(seed: int, sensor: SensorProfile, accumulate_s: float, speed_mps: float) -> Taken:
     """Points, their labels, the last part of the scan, and the number of points on each of its boxes."""
     n = round(accumulate_s * _RATE_HZ)
     parts = list(simulate_sequence(random_scene(seed), sensor, n, _RATE_HZ, speed_mps, seed))
@@ -61,9 +60,7 @@ def gathered(
     return points, np.concatenate([scan.labels for _, _, scan in parts]), parts[-1][2], returns
 
 
-def spun(
-    seed: int, sensor: SensorProfile, duration_s: float, speed_mps: float
-) -> tuple[NDArray[np.float32], NDArray[np.uint8], SimulatedScan, list[int]]:
+def spun(seed: int, sensor: SensorProfile, duration_s: float, speed_mps: float) -> Taken:
     """The same of a spinning sensor, at the end of that time."""
     *_, (_, _, scan) = simulate_sequence(random_scene(seed), sensor, 2, 1.0 / duration_s, speed_mps, seed)
     return scan.points, scan.labels, scan, list(scan.box_points)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +25,7 @@ from edgeperc.types.sensor import SensorProfile, get_sensor
 from edgeperc.types.views import TopViewGeometry
 
 VIEW = TopViewGeometry(ALL_AROUND.x_range_m, ALL_AROUND.y_range_m, cell_m=0.2)
+EXTENT: dict[str, Any] = {"x_range_m": VIEW.x_range_m, "y_range_m": VIEW.y_range_m, "cell_m": VIEW.cell_m}
 MODELS = {
     "top view": ("ssadnet", "objects"),
     "points": ("sceneseg", "objects"),
@@ -59,14 +61,7 @@ def print_set(name: str, sensor: SensorProfile, scans: list[tuple[Points, NDArra
         counts = {place: np.zeros(3, np.int64) for place in places}
         for points, cells in scans:
             perception = perceive(points)
-            grid = occupancy_grid(
-                perception,
-                points,
-                x_range_m=VIEW.x_range_m,
-                y_range_m=VIEW.y_range_m,
-                cell_m=VIEW.cell_m,
-                sensor=sensor,
-            )
+            grid = occupancy_grid(perception, points, sensor=sensor, **EXTENT)
             for place, where in places.items():
                 counted, road = where & grid.observed & (cells != IGNORE), cells == 1
                 found = grid.drivable

@@ -133,8 +133,8 @@ FLOORS = {
         recipe
         cards
         networks.objects networks.pointseg networks.ssadnet
-        networks.camseg networks.edge networks.lodnn networks.pointpillars networks.salsanext networks.segnet
-        networks.squeezesegv2 networks.unet
+        networks.camseg networks.edge networks.lodnn networks.pointpillars networks.resnets networks.salsanext
+        networks.segnet networks.squeezesegv2 networks.unet
         networks.fcn
         networks.__init__
         training.__init__ training.checkpoint training.curve training.log training.losses training.object_task

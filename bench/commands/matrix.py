@@ -40,18 +40,12 @@ def add_parser(subparsers: Any) -> None:
         "recommend the fastest setting whose results agree with fp32 on the CPU.",
     )
     add_limits(add, min_scans=50, min_seconds=3.0, repeats=2)
-    add(
-        "--providers A,B",
-        f"execution providers with commas between them, or all; one of {', '.join(PROVIDERS)} (default: all)",
-        type=choices(tuple(PROVIDERS)),
-        default=list(PROVIDERS),
-    )
-    add(
-        "--precisions A,B",
-        f"precisions with commas between them, or all; one of {', '.join(PRECISIONS)} (default: all)",
-        type=choices(tuple(PRECISIONS)),
-        default=list(PRECISIONS),
-    )
+    for option, what, known in (
+        ("--providers A,B", "execution providers", tuple(PROVIDERS)),
+        ("--precisions A,B", "precisions", tuple(PRECISIONS)),
+    ):
+        text = f"{what} with commas between them, or all; one of {', '.join(known)} (default: all)"
+        add(option, text, type=choices(known), default=list(known))
     add(
         "--threads 1,2,4",
         "numbers of threads with commas between them (default: 1 and the number of cores)",

@@ -32,8 +32,8 @@ def add_parser(subparsers: Any) -> None:
     )
     add(
         "--tables LIST",
-        "engines: the models elsewhere; methods: SalsaNext, SqueezeSegV2, PointPillars and Patchwork++ beside the "
-        "default models, in onnxruntime's CPU provider; or all (default: %(default)s)",
+        "engines: the models elsewhere; methods: SalsaNext, SqueezeSegV2, FIDNet, CENet, PointPillars, SFA3D and "
+        "Patchwork++ beside the default models, in onnxruntime's CPU provider; or all (default: %(default)s)",
         type=choices(("engines", "methods")),
         default="all",
     )

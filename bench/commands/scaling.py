@@ -71,16 +71,11 @@ def run_command(arguments: argparse.Namespace) -> int:
     limits = replace(limits, warm_up_scans=min(limits.warm_up_scans, 5))
     with new_document("scaling", arguments) as (document, live), tempfile.TemporaryDirectory() as folder:
         live.note("simulating scans")
-        scenarios = {
-            (kind, n): Scenario(
-                f"{n:,} {kind}", (inputs.store(Path(folder), f"{kind}{n}", make(n, arguments.sensor)),), limits
-            )
-            for kind, counts, make in (
-                ("points", arguments.points, inputs.sized),
-                ("cars", arguments.cars, inputs.crowd),
-            )
-            for n in counts
-        }
+        scenarios = {}
+        for kind, counts, make in (("points", arguments.points, inputs.sized), ("cars", arguments.cars, inputs.crowd)):
+            for n in counts:
+                file = inputs.store(Path(folder), f"{kind}{n}", make(n, arguments.sensor))
+                scenarios[kind, n] = Scenario(f"{n:,} {kind}", (file,), limits)
         job = job_of(arguments)
         setting = new_setting(job, document)
         repeat(setting, replace(job, scenarios=tuple(scenarios.values())), arguments.repeats, document, live)
@@ -121,17 +116,9 @@ def _add_table(
         curve.append((float(n), math.nan if measured["p50"] is None else float(measured["p50"])))
     line = trend(*(np.array(curve, np.float64).reshape(-1, 2) / (per, 1.0)).T)
     fitted = f"{line.intercept:.2f} ms + {line.slope:.4f} ms per {unit} (+- {line.error:.4f}), R2 {line.r2:.4f}"
-    document["tables"].append(
-        {
-            "title": f"Growth with {kind}",
-            "sentences": [
-                *sentences,
-                *([] if math.isnan(line.slope) else [f"a straight line through the medians: {fitted}"]),
-            ],
-            "head": [kind, "p50 ms", "p90 ms", "beside the network ms"],
-            "rows": rows,
-        }
-    )
+    said = [*sentences, *([] if math.isnan(line.slope) else [f"a straight line through the medians: {fitted}"])]
+    head = [kind, "p50 ms", "p90 ms", "beside the network ms"]
+    document["tables"].append({"title": f"Growth with {kind}", "sentences": said, "head": head, "rows": rows})
     return curve
 
 
@@ -155,9 +142,8 @@ def _growth_with_images(
         setting = new_setting(own, document)
         repeat(setting, own, arguments.repeats, document, live)
         settings.append((percent, setting, scenario.name))
-    return _add_table(
-        document, "pixels %", settings, unit, sentences=["new networks with random weights, stored in fp32"]
-    )
+    said = ["new networks with random weights, stored in fp32"]
+    return _add_table(document, "pixels %", settings, unit, sentences=said)
 
 
 def _plot(curves: Mapping[str, Curve], path: Path) -> None:

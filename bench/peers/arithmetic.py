@@ -39,8 +39,8 @@ def cost(model: Path | Any) -> Cost:
 
     loaded = onnx.load(model) if isinstance(model, Path) else model
     graph = onnx.shape_inference.infer_shapes(loaded, data_prop=True).graph
-    shapes = {v.name: tuple(d.dim_value for d in v.type.tensor_type.shape.dim) for v in (*graph.input, *graph.output)}
-    shapes |= {v.name: tuple(d.dim_value for d in v.type.tensor_type.shape.dim) for v in graph.value_info}
+    named = *graph.input, *graph.output, *graph.value_info
+    shapes = {v.name: tuple(d.dim_value for d in v.type.tensor_type.shape.dim) for v in named}
     shapes |= {t.name: tuple(t.dims) for t in graph.initializer}
     constant = {t.name for t in graph.initializer}
     macs = inside = weights = activations = 0

@@ -55,7 +55,7 @@ class Contender:
     """One row of a table."""
 
     name: str
-    kind: str  # a key of `turns.MAKERS`
+    kind: str  # as `turns.make_calls` takes it
     engine: str = ""  # a provider for edgeperc's own kinds, else as `open_engine` or `matrix_product` take it
     precision: str = ""  # as the provider or the engine takes it; empty if it has no choice
     paths: tuple[Path, ...] = ()
@@ -139,12 +139,16 @@ def groups(
         ]
         pipelines = _pipelines([variant], provider, precision)
         if images:
-            pipelines = [replace(pipeline, inputs=images) for pipeline in (*pipelines, *_small_unet(variant))]
+            unet = Contender("", "unet", "torch", cards=(card.to_json(),))
+            unets = [replace(unet, name=f"torch {kind}, small U-Net", precision=kind) for kind in ("fp32", "bf16")]
+            pipelines = [replace(pipeline, inputs=images) for pipeline in (*pipelines, *unets)]
         tables[f"{'Image' if images else 'Scan'} to result: {variant}"] = [
             *pipelines, *_full_networks([variant]), *alone, *peaks
         ]  # fmt: skip
     for pair in zip(views["range_image"], views["top_view"], strict=False):
-        at_once = Contender("edgeperc, both at once, as by default", "default", provider, precision, _paths(pair))
+        at_once = Contender(
+            "edgeperc, both at once, as by default", "default", provider, precision, tuple(each.path for each in pair)
+        )
         pipelines = [*_pipelines(pair, provider, precision), at_once, *_full_networks(pair)]
         tables[f"Scan to result: {pair[0]} and {pair[1]}"] = pipelines
     for view in ("range image", "top view") if views["range_image"] or views["top_view"] else ():
@@ -165,23 +169,20 @@ def methods(folder: Path) -> list[Contender]:
     ]
     if not why_missing(Contender("", "network", "torch")):
         write_others(folder)
-    for name in OTHERS:
-        image = folder / f"{name}.npy"
+    for name, (_, outputs, _) in OTHERS.items():
+        image, answers = folder / f"{name}.npy", "labels only" if outputs == ("logits",) else "boxes only"
         for kind in ("int8", "fp32"):
-            path = (folder / f"{name} {kind}.onnx",)
-            rows.append(Contender(f"{name} {kind}", "network", "onnxruntime", kind, path, (), image, (), "network"))
+            row = Contender(f"{name} {kind}", "network", "onnxruntime", kind, (folder / f"{name} {kind}.onnx",))
+            rows.append(replace(row, image=image, timed=f"network, {answers}"))
             if name == POINTPILLARS:
-                timed = "scan to pillars, network"
-                rows.append(Contender(f"{name} {kind}", "pillars", "onnxruntime", kind, path, timed=timed))
-    return [
-        *rows,
-        Contender("Patchwork++, k-d tree", "clusters", "patchwork", timed="scan to ground and clusters, one thread"),
-    ]
+                rows.append(replace(row, kind="pillars", timed=f"scan to pillars, network, {answers}"))
+    timed = "scan to ground and clusters only, one thread"
+    return [*rows, Contender("Patchwork++, k-d tree", "clusters", "patchwork", timed=timed)]
 
 
 def _pipelines(models: Sequence[Variant], provider: str, precision: str) -> list[Contender]:
     """All pipelines from scan to result. The first one is edgeperc's, the reference of the ratios."""
-    paths, cards = _paths(models), tuple(model.card.to_json() for model in models)
+    paths, cards = tuple(model.path for model in models), tuple(model.card.to_json() for model in models)
     int8 = any(model.precision == "int8" for model in models)
     settings = dict.fromkeys(((provider, precision), ("cpu", "auto"), *([("openvino", "auto")] if int8 else OPENVINO)))
     if (provider, precision) == ("auto", "auto") and available_providers() == ("cpu",):
@@ -204,16 +205,6 @@ def _full_networks(models: Sequence[Variant]) -> list[Contender]:
         return []
     name, cards = " and ".join(path.stem for path in paths), tuple(ModelCard.read(path).to_json() for path in paths)
     return [Contender(f"numpy + torch fp32, {name}", "pipeline", "torch", "fp32", paths, cards)]
-
-
-def _paths(models: Sequence[Variant]) -> tuple[Path, ...]:
-    return tuple(model.path for model in models)
-
-
-def _small_unet(variant: Variant) -> list[Contender]:
-    """The small U-Net in torch at the size of a camera model's input (`camera.small_unet`)."""
-    card = variant.card.to_json()
-    return [Contender(f"torch {kind}, small U-Net", "unet", "torch", kind, (), (card,)) for kind in ("fp32", "bf16")]
 
 
 def _one_or_two(variant: Variant, folder: Path) -> list[Contender]:

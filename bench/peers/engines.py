@@ -6,7 +6,7 @@ import importlib.util
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -45,11 +45,7 @@ def open_engine(library: str, precision: str, path: Path, n_threads: int) -> Eng
         session = onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
         (entry,) = session.get_inputs()
         names, batch = [o.name for o in session.get_outputs()], np.zeros(entry.shape, np.float32)
-
-        def by_onnxruntime() -> dict[str, NDArray[np.float32]]:
-            return {n: a[0] for n, a in zip(names, session.run(names, {entry.name: batch}), strict=True)}
-
-        return Engine(batch[0], by_onnxruntime)
+        return Engine(batch[0], lambda: _first(names, session.run(names, {entry.name: batch})))
     if library == "openvino":
         import openvino
 
@@ -76,8 +72,7 @@ def open_engine(library: str, precision: str, path: Path, n_threads: int) -> Eng
 
     def by_torch() -> dict[str, NDArray[np.float32]]:
         with torch.inference_mode(), torch.autocast("cpu", torch.bfloat16, enabled=precision == "bf16"):
-            outputs = network(tensor)
-        return {n: a[0].float().numpy() for n, a in zip(names, outputs, strict=True)}
+            return _first(names, (output.float().numpy() for output in network(tensor)))
 
     return Engine(tensor.numpy()[0], by_torch)
 
@@ -100,7 +95,7 @@ def _open_mnn(path: Path, folder: Path, n_threads: int) -> Engine:
         outputs = network.forward([image])
         if len(outputs) != len(names):  # it prints why, and answers with nothing
             raise ModelError(f"MNN cannot run {path.name}")
-        return {n: MNN.expr.convert(o, MNN.expr.NCHW).read()[0] for n, o in zip(names, outputs, strict=True)}
+        return _first(names, (MNN.expr.convert(o, MNN.expr.NCHW).read() for o in outputs))
 
     return Engine(batch[0], by_mnn)
 
@@ -141,6 +136,11 @@ def _convert(command: Sequence[str], path: Path, made: Path) -> None:
         raise ModelError(f"{Path(command[0]).name} cannot convert {path.name}: {reason}")
 
 
+def _first(names: Sequence[str], outputs: Iterable[Any]) -> dict[str, NDArray[np.float32]]:
+    """Outputs by name, without the batch axis."""
+    return {name: output[0] for name, output in zip(names, outputs, strict=True)}
+
+
 def _signature(path: Path) -> tuple[str, tuple[int, ...], list[str]]:
     """Name and shape of a graph's input, and the names of its outputs."""
     import onnx
@@ -159,8 +159,8 @@ def torch_network(path: Path) -> tuple[Any, tuple[int, ...], list[str]]:
     root, traced = torch.nn.Module(), torch.fx.Graph()
     # Constants are tensors, everything else is a node of the traced graph.
     values: dict[str, Any] = {t.name: torch.from_numpy(onnx.numpy_helper.to_array(t).copy()) for t in graph.initializer}
-    (entry,) = graph.input
-    values[entry.name] = traced.placeholder("x")
+    name, shape, names = _signature(path)
+    values[name] = traced.placeholder("x")
     for k, node in enumerate(graph.node):
         attributes = {a.name: onnx.helper.get_attribute_value(a) for a in node.attribute}
         inputs = [values[name] if name else None for name in node.input]
@@ -173,9 +173,8 @@ def torch_network(path: Path) -> tuple[Any, tuple[int, ...], list[str]]:
                 root.register_buffer(f"constant_{k}_{j}", value)
                 arguments[j] = traced.get_attr(f"constant_{k}_{j}")
         values[node.output[0]] = traced.call_function(function, tuple(arguments))
-    traced.output(tuple(values[o.name] for o in graph.output))
-    shape = tuple(d.dim_value for d in entry.type.tensor_type.shape.dim)
-    return torch.fx.GraphModule(root, traced).eval(), shape, [o.name for o in graph.output]
+    traced.output(tuple(values[name] for name in names))
+    return torch.fx.GraphModule(root, traced).eval(), shape, names
 
 
 def _in_torch(op: str, inputs: Sequence[Any], attributes: Mapping[str, Any]) -> tuple[Callable[..., Any], list[Any]]:
@@ -198,8 +197,7 @@ def _in_torch(op: str, inputs: Sequence[Any], attributes: Mapping[str, Any]) -> 
         last = [attributes["dilations"], attributes["group"]]
         return F.conv2d, [x, others[0], bias, attributes["strides"], pads[:2], *last]
     if op == "ConvTranspose":
-        extra = attributes.get("output_padding", [0, 0])
-        last = [extra, attributes.get("group", 1), attributes.get("dilations", [1, 1])]
+        last = [attributes.get(*each) for each in (("output_padding", [0, 0]), ("group", 1), ("dilations", [1, 1]))]
         return F.conv_transpose2d, [x, others[0], bias, attributes["strides"], pads[:2], *last]
     if op == "Elu":
         return F.elu, [x, attributes.get("alpha", 1.0)]

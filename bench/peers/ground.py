@@ -89,12 +89,7 @@ def ground_finders(peers: Mapping[str, Any], sensor: SensorProfile = SENSOR) -> 
         parameters.sensor_height = sensor.mount_height_m
         # It adapts its thresholds from scan to scan, so every evaluated scan gets a new instance.
         finder = peers["pypatchworkpp"].patchworkpp(parameters)
-
-        def call() -> NDArray[np.bool_]:
-            finder.estimateGround(points)
-            return by_rows(len(points), finder.getGroundIndices())
-
-        return call
+        return lambda: by_rows(len(points), (finder.estimateGround(points), finder.getGroundIndices())[1])
 
     finders = {"find_ground": edgeperc(True), "find_ground, one plane": edgeperc(False)}
     if "open3d" in peers:
@@ -192,15 +187,13 @@ def main() -> None:
     add("--accuracy SCAN", wanted, nargs="*", type=Path, default=[])
     arguments = parser.parse_args()
     peers = installed_peers()
-    scans: list[tuple[Scan, Truth]] = []
+    truth: Truth | None
     if arguments.scan is None:
-        name = "a simulated scan"
-        points, truth = simulated()
-        scans.append((points, truth))
+        name, (points, truth) = "a simulated scan", simulated()
     else:
         name, points = str(arguments.scan), read_points(arguments.scan)
-        if (known := read_truth(arguments.scan, len(points))) is not None:
-            scans.append((points, known))
+        truth = read_truth(arguments.scan, len(points))
+    scans = [(points, truth)] if truth is not None else []
     for path in arguments.accuracy:
         more = read_points(path)
         if (known := read_truth(path, len(more))) is None:

@@ -20,9 +20,12 @@ OTHERS: dict[str, tuple[str, tuple[str, ...], tuple[int, int, int]]] = {
     "SqueezeSegV2 64x512": ("squeezesegv2.SqueezeSegV2", ("logits",), (5, 64, 512)),
     "SalsaNext 64x512": ("salsanext.SalsaNext", ("logits",), (5, 64, 512)),
     "SalsaNext 64x2048": ("salsanext.SalsaNext", ("logits",), (5, 64, 2048)),
+    "FIDNet 64x2048": ("resnets.FIDNet", ("logits",), (5, 64, 2048)),
+    "CENet 64x2048": ("resnets.CENet", ("logits",), (5, 64, 2048)),
+    "SFA3D 608x608": ("resnets.SFA3D", ("heat", "offset", "direction", "height", "size"), (3, 608, 608)),
     POINTPILLARS: ("pointpillars.PointPillars", ("scores", "boxes", "directions"), (64, 496, 432)),
 }
-"""Networks of others: where they are, their outputs, and the shape of their input."""
+"""Networks of others: where they are, their outputs, logits or what boxes are read off, and their input's shape."""
 
 
 def resized(model: str, share: float, folder: Path) -> Path:

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +23,7 @@ from edgeperc.types.card import ModelCard
 from edgeperc.types.geometry import draw_footprints
 from edgeperc.types.mounting import MODEL_HEIGHT_M
 from edgeperc.types.sensor import SensorProfile
-from edgeperc.types.views import RangeImageGeometry, TopViewGeometry
+from edgeperc.types.views import TopViewGeometry
 
 from ..worker import Prediction
 from .engines import Engine
@@ -39,14 +40,10 @@ class NumpyPipeline:
         self.sensor = sensor
         self.networks = []
         for card, engine in zip(cards, engines, strict=True):
-            projector: NumpyTopView | NumpyRangeImage
-            if isinstance(card.view, TopViewGeometry):
-                projector = NumpyTopView(card.view, card.input)
-            else:
-                assert isinstance(card.view, RangeImageGeometry)
-                projector = NumpyRangeImage(card.view, card.input)
+            view: Any = card.view
+            made = NumpyTopView if isinstance(view, TopViewGeometry) else NumpyRangeImage
             index = np.empty(engine.input.shape[1:], np.int32)
-            self.networks.append((card, engine, projector, index))
+            self.networks.append((card, engine, made(view, card.input), index))
 
     def __call__(self, points: NDArray[np.float32]) -> Prediction:
         """Compute labels and boxes of a scan (n, 4) with remission in the sensor's raw unit."""
@@ -57,7 +54,9 @@ class NumpyPipeline:
         boxes: tuple[Box, ...] = ()
         for card, engine, projector, index in self.networks:
             pixel = np.empty(len(points), np.int32)
-            projector.fill(points, engine.input, index, pixel, _heights(projector, points))
+            # By edgeperc's kernels: numpy would take seconds.
+            high = find_ground(points, mount_height_m=MODEL_HEIGHT_M).height_m if projector.needs_ground else None
+            projector.fill(points, engine.input, index, pixel, high)
             by_name = engine.run()
             outputs = {o.kind: spread(by_name[o.name], o.block) for o in card.outputs}
             logits = next(v for kind, v in outputs.items() if kind.startswith("class_"))
@@ -107,11 +106,6 @@ def vote(
     winner = np.take_along_axis(votes, same.argmax(axis=1)[:, None], axis=1)[:, 0]
     classes[hidden] = np.where(winner < n_classes, winner, 0)
     return classes
-
-
-def _heights(projector: NumpyTopView | NumpyRangeImage, points: NDArray[np.float32]) -> NDArray[np.float32] | None:
-    """Heights above the ground, by edgeperc's kernels: numpy would take seconds."""
-    return find_ground(points, mount_height_m=MODEL_HEIGHT_M).height_m if projector.needs_ground else None
 
 
 def dense_boxes(card: ModelCard, logits: NDArray[np.float32], dense: NDArray[np.float32]) -> list[Box]:

@@ -16,16 +16,12 @@ def random_weights() -> NDArray[np.float32]:
     return np.random.default_rng(0).standard_normal((N_VALUES, N_FEATURES), np.float32)
 
 
+@njit(cache=True, nogil=True)
 def fill_pillars(points: NDArray[np.float32], weights: NDArray[np.float32], image: NDArray[np.float32]) -> None:
     """Write the image (64, H, W) of a scan (n, 4): rows along y around 0, x from 0. The paper's limits of 12,000
     pillars and 100 points each serve tensors of a fixed size, which loops do not need.
     """
     image.fill(0.0)
-    _fill(points, weights, image)
-
-
-@njit(cache=True, nogil=True)
-def _fill(points: NDArray[np.float32], weights: NDArray[np.float32], image: NDArray[np.float32]) -> None:
     n, n_pillars, (_, n_rows, n_columns) = len(points), 0, image.shape
     pillar_at, pillar_of = np.full((n_rows, n_columns), -1, np.int32), np.full(n, -1, np.int32)
     cells, sums, features = np.empty((n, 2), np.int32), np.zeros((n, 4)), np.zeros((n, N_FEATURES), np.float32)

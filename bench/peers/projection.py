@@ -51,6 +51,7 @@ TOP_VIEW_INPUT = InputSpec("top_view", ("distance", "remission", "height"), (0.0
 RANGE_IMAGE_INPUT = InputSpec(
     "range_image", ("x", "y", "z", "remission", "range"), (13.0, 0.0, -1.3, 0.23, 14.5), (11.4, 7.9, 0.8, 0.15, 12.3)
 )
+Selection = tuple[NDArray[np.intp], NDArray[np.int32], NDArray[np.float32]]
 
 
 @njit(cache=True, nogil=True)
@@ -83,18 +84,16 @@ class _NumpyProjector:
         pixel[rows] = flat
         seen, winner = winners(flat, rank, index.reshape(-1), rows)
         image[:] = 0.0
-        raw = self.planes(*points[winner].T)
+        raw = self.planes(points[winner])
         if height_m is not None:
             raw = np.vstack((raw, np.clip(height_m[winner], *HEIGHT_RANGE_M)))
         image.reshape(len(image), -1)[:, seen] = (raw - self.mean) / self.std
 
-    def select(self, points: NDArray[np.float32]) -> tuple[NDArray[np.intp], NDArray[np.int32], NDArray[np.float32]]:
+    def select(self, points: NDArray[np.float32]) -> Selection:
         """Rows in view, the flat pixel of each, and its rank: the smallest rank wins the pixel."""
         raise NotImplementedError
 
-    def planes(
-        self, x: NDArray[np.float32], y: NDArray[np.float32], z: NDArray[np.float32], remission: NDArray[np.float32]
-    ) -> NDArray[np.float32]:
+    def planes(self, points: NDArray[np.float32]) -> NDArray[np.float32]:
         """Channels of the points that won a pixel, not normalized yet."""
         raise NotImplementedError
 
@@ -107,7 +106,7 @@ class NumpyTopView(_NumpyProjector):
         self.low, self.high = np.array([view.x_range_m, view.y_range_m, view.z_range_m], np.float32).T
         self.cells_per_m = np.float32(1.0 / view.cell_m)
 
-    def select(self, points: NDArray[np.float32]) -> tuple[NDArray[np.intp], NDArray[np.int32], NDArray[np.float32]]:
+    def select(self, points: NDArray[np.float32]) -> Selection:
         """See `_NumpyProjector.select`; the highest point wins."""
         _, height, width = self.shape
         x, y, z, remission = points.T
@@ -120,10 +119,9 @@ class NumpyTopView(_NumpyProjector):
         flat: NDArray[np.int32] = (height - 1 - ahead) * width + (width - 1 - left)
         return rows, flat, -z
 
-    def planes(
-        self, x: NDArray[np.float32], y: NDArray[np.float32], z: NDArray[np.float32], remission: NDArray[np.float32]
-    ) -> NDArray[np.float32]:
+    def planes(self, points: NDArray[np.float32]) -> NDArray[np.float32]:
         """See `_NumpyProjector.planes`."""
+        x, y, z, remission = points.T
         return np.stack((np.sqrt(x * x + y * y), remission, z))
 
 
@@ -134,7 +132,7 @@ class NumpyRangeImage(_NumpyProjector):
         super().__init__(view, input)
         self.rows, self.cols = tabulate(row_edges(view), "rows"), tabulate(column_edges(view), "columns")
 
-    def select(self, points: NDArray[np.float32]) -> tuple[NDArray[np.intp], NDArray[np.int32], NDArray[np.float32]]:
+    def select(self, points: NDArray[np.float32]) -> Selection:
         """See `_NumpyProjector.select`; the nearest point wins."""
         rows = np.flatnonzero((points[:, 0] > 0.0) & (np.abs(points[:, 1]) <= points[:, 0]))
         x, y, z, remission = points[rows].T
@@ -147,11 +145,10 @@ class NumpyRangeImage(_NumpyProjector):
         flat = look_up(elevation[inside], self.rows) * self.shape[2] + look_up(azimuth[inside], self.cols)
         return rows[inside], flat, squared_range[inside]
 
-    def planes(
-        self, x: NDArray[np.float32], y: NDArray[np.float32], z: NDArray[np.float32], remission: NDArray[np.float32]
-    ) -> NDArray[np.float32]:
+    def planes(self, points: NDArray[np.float32]) -> NDArray[np.float32]:
         """See `_NumpyProjector.planes`."""
-        return np.stack((x, y, z, remission, np.sqrt(x * x + y * y + z * z)))
+        x, y, z, _ = points.T
+        return np.stack((*points.T, np.sqrt(x * x + y * y + z * z)))
 
 
 def look_up(values: NDArray[np.float32], table: Intervals) -> NDArray[np.int32]:

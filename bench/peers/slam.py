@@ -89,16 +89,13 @@ def drawn_streets(n_scans: int, wanted: Sequence[str] = ()) -> Iterator[Drive]:
     for place, seed, speed in STREETS:
         if wanted and place not in wanted:
             continue
-        scans, poses, moving, usable = [], [], [], []
         scene = random_scene(seed, place)
         moves = np.array([*(abs(thing.speed_mps) > 0.5 for thing in scene.objects), False])  # -1 is the background
-        for _, pose, scan in simulate_sequence(scene, "hdl-64e", n_scans, RATE_HZ, speed, seed):
-            scans.append(scan.points)
-            poses.append(pose)
-            moving.append(moves[scan.objects])
-            usable.append(scan.surfaces >= 0)
+        parts = list(simulate_sequence(scene, "hdl-64e", n_scans, RATE_HZ, speed, seed))
+        scans, poses = [scan.points for *_, scan in parts], np.array([pose for _, pose, _ in parts])
+        moving, usable = [moves[scan.objects] for *_, scan in parts], [scan.surfaces >= 0 for *_, scan in parts]
         known = [np.ones(len(points), np.bool_) for points in scans]
-        yield Drive(f"drawn {place}, {speed:.0f} m/s", scans, np.array(poses), moving, usable, known, [])
+        yield Drive(f"drawn {place}, {speed:.0f} m/s", scans, poses, moving, usable, known, [])
 
 
 def real_drives(
@@ -115,10 +112,11 @@ def real_drives(
             points = read_points(root / "training/velodyne" / f"{name}.bin")
             calibration = KittiCalibration.read(root / "training/calib" / f"{name}.txt")
             path = root / "training/label_2" / f"{name}.txt"
-            boxes, unlabeled = (
-                label_objects(read_labels(path), calibration) if path.exists() else ((), np.zeros((0, 4)))
-            )
-            seen = calibration.labeled_at(points, unlabeled) if path.exists() else np.zeros(len(points), np.bool_)
+            boxes: Sequence[Box] = ()
+            seen = np.zeros(len(points), np.bool_)
+            if path.exists():
+                boxes, unlabeled = label_objects(read_labels(path), calibration)
+                seen = calibration.labeled_at(points, unlabeled)
             try:
                 check_unseen(trained_on, name, drive, points)
             except SplitError:
@@ -217,7 +215,8 @@ class Seen:
 def look(perceive: Callable[..., Any], drive: Drive) -> Seen:
     """Perceive and track a drive, without its poses."""
     tracker, perceptions, poses, ms = Tracker(), list[Perception](), [], []
-    masks: dict[str, list[NDArray[np.bool_]]] = {name: [] for name in (ALL, MOVING, MOVABLE)}
+    masks: dict[str, list[NDArray[np.bool_]]] = {ALL: [np.ones(len(points), np.bool_) for points in drive.scans]}
+    masks |= {MOVING: [], MOVABLE: []}
     for k, points in enumerate(drive.scans):
         started = time.process_time()
         perceptions.append(perceive(points, k / RATE_HZ))
@@ -226,7 +225,6 @@ def look(perceive: Callable[..., Any], drive: Drive) -> Seen:
         masks[MOVING].append(~moving)
         masks[MOVABLE].append(~(moving | movable_points(perceptions[-1], points)))
         ms.append(1e3 * (time.process_time() - started))
-        masks[ALL].append(np.ones(len(points), np.bool_))
         poses.append(tracks.T_world_sensor)
     return Seen(masks, perceptions, np.array(poses), float(np.median(ms)))
 
@@ -237,16 +235,12 @@ def compared(
     """The rows of a drive in the table, one for each variant; the row of its motion in the second table."""
     rows, moving, first = [], drive.moving, None
     for name in VARIANTS:
-        if name == SECOND:
-            if not second_pass:
-                continue
-            assert first is not None
-            tracker, stays = Tracker(), []
-            for points, perception, pose in zip(drive.scans, seen.perceptions, first, strict=True):
-                stays.append(~moving_points(tracker(perception, pose), points))
-            staying = stays
-        else:
-            staying = seen.kept[name]
+        if name == SECOND and not second_pass:
+            continue
+        staying = seen.kept.get(name, [])
+        if first is not None and name == SECOND:
+            tracker, answers = Tracker(), zip(drive.scans, seen.perceptions, first, strict=True)
+            staying = [~moving_points(tracker(perception, pose), points) for points, perception, pose in answers]
         scans = chosen(drive, staying)
         started = time.process_time()
         poses, gap = closure(odometry, scans)
@@ -259,8 +253,8 @@ def compared(
             ]
         counted = [np.logical_and.reduce(masks) for masks in zip(staying, drive.known, drive.usable, strict=True)]
         still = [known & ~moves for known, moves in zip(drive.known, moving, strict=True)]
-        n_still = sum(int(np.count_nonzero(mask)) for mask in still)
-        n_lost = sum(int(np.count_nonzero(mask & ~stays)) for mask, stays in zip(still, staying, strict=True))
+        n_still = int(np.count_nonzero(np.concatenate(still)))
+        n_lost = int(np.count_nonzero(np.concatenate(still) & ~np.concatenate(staying)))
         way_m = float(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1).sum())
         known = any(mask.any() for mask in drive.known)
         rows.append(
@@ -340,17 +334,11 @@ def main() -> None:
     if arguments.picture and arguments.root is not None:
         parser.error("--picture shows a drawn street; leave ROOT out")
     perceive = Perceiver(sensor="hdl-64e", full_turn=True)
-    drives = (
-        drawn_streets(arguments.scans or 60, arguments.drive)
-        if arguments.root is None
-        else real_drives(
-            arguments.root,
-            arguments.drive,
-            arguments.least,
-            arguments.scans or 10**9,
-            training_scans_of(perceive.cards),
-        )
-    )
+    if arguments.root is None:
+        drives = drawn_streets(arguments.scans or 60, arguments.drive)
+    else:
+        counts, trained_on = (arguments.least, arguments.scans or 10**9), training_scans_of(perceive.cards)
+        drives = real_drives(arguments.root, arguments.drive, *counts, trained_on)
     rows = [["drive", "map of", "scans", "error", "closure", "map", "lost", "edgeperc, ms", "KISS-ICP, ms"]]
     motions = [["drive", "against", "KISS-ICP, median", "95 %", "tracker, median", "95 %"]]
     for k, drive in enumerate(drives):
@@ -362,17 +350,9 @@ def main() -> None:
             draw_maps(drive, seen, kiss_icp, arguments.picture)
     if len(rows) == 1:
         parser.error(f"{arguments.root or 'drawn streets'}: no such drive of {arguments.least} scans or more")
-    version = importlib.metadata.version("kiss-icp")
-    print(
-        text(
-            [
-                Section(
-                    "KISS-ICP", [f"KISS-ICP in one thread; processor times; {versions(**{'KISS-ICP': version})}"], rows
-                ),
-                Section("Motion between scans", ["Distance from where the next scan truly is."], motions),
-            ]
-        )
-    )
+    software = versions(**{"KISS-ICP": importlib.metadata.version("kiss-icp")})
+    part = Section("KISS-ICP", [f"KISS-ICP in one thread; processor times; {software}"], rows)
+    print(text([part, Section("Motion between scans", ["Distance from where the next scan truly is."], motions)]))
 
 
 if __name__ == "__main__":

@@ -88,7 +88,8 @@ def floor_table(title: str, measured: Sequence[Measured]) -> dict[str, Any]:
     if why_missing(Contender("", "network", "torch")):
         sentences.append(f"multiplications are not counted: onnx is {INSTALL}")
     else:
-        work, int8 = cost(path), ModelCard.read(path).precision == "int8"
+        work, stored = cost(path), "int8" if ModelCard.read(path).precision == "int8" else "fp32"
+        as_stored = ("", "auto", "fp32", "bf16") if stored == "int8" else ("", "auto")
         sentences.append(
             f"{work.macs / 1e9:.2f} GMAC, {work.padding_macs / 1e9:.2f} of them on padding, which the floor leaves "
             f"out; {work.weights / 1e6:.1f} M weights; {work.activations / 1e6:.1f} M activations"
@@ -103,7 +104,7 @@ def floor_table(title: str, measured: Sequence[Measured]) -> dict[str, Any]:
                 for each in measured
                 if each.contender.kind in ("network", "session")
                 and each.ms
-                and ("int8" if int8 else _precision(each.contender)) == precision
+                and (stored if each.contender.precision in as_stored else each.contender.precision) == precision
             ]
             fastest = min(networks, key=lambda each: each.p50, default=None)
             took = fastest.p50 if fastest else math.nan
@@ -119,7 +120,3 @@ def floor_table(title: str, measured: Sequence[Measured]) -> dict[str, Any]:
         "peak: the fastest matrix product; traffic: all values of every layer to and from memory once, less with caches"
     )
     return {"title": f"Floor: {title.partition(': ')[2]}", "sentences": sentences, "head": head, "rows": rows}
-
-
-def _precision(contender: Contender) -> str:
-    return contender.precision if contender.precision not in ("", "auto") else "fp32"

@@ -99,13 +99,8 @@ def every_second_beam(root: Path, out: Path) -> None:
         sparse[:, 3] = 255.0 * sparse[:, 3] ** 2
         sparse.tofile(out / "training/velodyne" / path.name)
     full = get_sensor("hdl-64e")
-    half = replace(
-        full,
-        name="every second beam",
-        elevations_deg=full.elevations_deg[::2],
-        remission_range=(0.0, 255.0),
-        remission=None,
-    )
+    half = replace(full, name="every second beam", elevations_deg=full.elevations_deg[::2])
+    half = replace(half, remission_range=(0.0, 255.0), remission=None)
     (out / "sensor.json").write_text(half.to_json(), encoding="utf-8")
 
 
@@ -174,16 +169,11 @@ def stone_soup(scans: Scans, seconds: float) -> int:
             if time.perf_counter() > stop:
                 return
             at = begin + timedelta(seconds=k * FRAME_S)
-            yield (
-                at,
-                {Detection(np.array([box.center[:2]]).T, timestamp=at, measurement_model=sensor) for box in boxes},
-            )
+            places = [np.array([box.center[:2]]).T for box in boxes]
+            yield at, {Detection(place, timestamp=at, measurement_model=sensor) for place in places}
 
-    predictor = UnscentedKalmanPredictor(
-        CombinedLinearGaussianTransitionModel([ConstantVelocity(1.0), ConstantVelocity(1.0)])
-    )
+    predictor = UnscentedKalmanPredictor(CombinedLinearGaussianTransitionModel([ConstantVelocity(1.0)] * 2))
     updater = UnscentedKalmanUpdater(sensor)
-
     associator = JPDA(PDAHypothesiser(predictor, updater, 1e-3, prob_detect=0.9, prob_gate=0.95))
     nearest = NearestNeighbour(DistanceHypothesiser(predictor, updater, Mahalanobis(), missed_distance=3.0))
     prior = GaussianState(np.zeros((4, 1)), np.diag([0.04, 64.0, 0.04, 64.0]), timestamp=begin)
@@ -219,10 +209,8 @@ def main() -> None:
         street = drawn_street()
         of_class, cars = {"car (drawn)": [street]}, street
     else:
-        read = {
-            path.stem: read_sequence(arguments.root, path.stem).detections
-            for path in sorted((arguments.root / "label_02").glob("*.txt"))
-        }
+        names = [path.stem for path in sorted((arguments.root / "label_02").glob("*.txt"))]
+        read = {name: read_sequence(arguments.root, name).detections for name in names}
         of_class = {
             label: [[[box for box in scan if box.label == label] for scan in scans] for scans in read.values()]
             for label in CLASSES

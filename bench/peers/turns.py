@@ -8,7 +8,7 @@ import os
 import signal
 import time
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
 from functools import partial
 from importlib import import_module
@@ -30,7 +30,7 @@ from . import projection
 from .arithmetic import matrix_product, memory_copy
 from .camera import NumpyCamera, small_unet
 from .contenders import ANSWERS, METHODS, Contender, Measured, default_models, groups, methods, why_missing
-from .engines import Engine, open_engine
+from .engines import open_engine
 from .ground import ground_finders, tree_clusters
 from .numpy_pipeline import NumpyPipeline
 from .pillars import fill_pillars, random_weights
@@ -42,10 +42,10 @@ PAUSE_S = 0.02  # threads of the previous contender spin for some milliseconds
 Calls = list[Callable[[], object]]
 
 
-# What runs in a contender's process: each function returns one call per scan
+# What runs in a contender's process
 
 
-def make_perceiver(contender: Contender, scans: Sequence[NDArray[Any]], sensor: str, n_threads: int) -> Calls:
+def make_perceiver(contender: Contender, sensor: str, n_threads: int) -> Perceiver:
     """edgeperc: a contender's models with boxes from networks and without rules, as the numpy pipelines; or, of
     `ANSWERS`, as by default, in two threads at most. Without a number of threads, networks run concurrently.
     """
@@ -54,7 +54,7 @@ def make_perceiver(contender: Contender, scans: Sequence[NDArray[Any]], sensor: 
     if contender.kind not in ANSWERS:
         chosen = {"models": list(contender.paths), "boxes_from": "network", "agree": False}
         concurrent = contender.kind == "default"
-    perceive = Perceiver(
+    return Perceiver(
         sensor=sensor,
         provider=contender.engine,
         precision=contender.precision,
@@ -62,92 +62,42 @@ def make_perceiver(contender: Contender, scans: Sequence[NDArray[Any]], sensor: 
         on_mismatch="ignore",
         **chosen,
     )
-    if contender.inputs:
-        return [partial(perceive, image=image) for image in scans]
-    return [partial(perceive, scan) for scan in scans]
 
 
-def make_pillars(contender: Contender, scans: Sequence[NDArray[Any]], sensor: str, n_threads: int) -> Calls:
-    """PointPillars from scan to the outputs of its network, which mean nothing."""
-    (path,), weights = contender.paths, random_weights()
-    network = open_engine(contender.engine, contender.precision, path, n_threads)
-
-    def call(scan: NDArray[np.float32]) -> object:
-        fill_pillars(scan, weights, network.input)
-        return network.run()
-
+def make_calls(contender: Contender, scans: Sequence[NDArray[Any]], sensor: str, n_threads: int) -> Calls:
+    """What a contender does in a turn: one call per scan, or a peak of the machine."""
+    kind, how = contender.kind, (contender.engine, contender.precision)
+    if kind == "peak":
+        return [memory_copy(n_threads)] if contender.engine == "copy" else [matrix_product(*how, n_threads)] * 2
+    if kind == "projection":
+        return [projection.contenders(np.ascontiguousarray(scan))[contender.engine] for scan in scans]
+    if kind == "clusters":  # Patchwork++, and a k-d tree's clusters of what it leaves; both know one thread only
+        libraries = {"pypatchworkpp": import_module("pypatchworkpp")}
+        find_ground = ground_finders(libraries, get_sensor(sensor))["Patchwork++"]
+        return [partial(lambda scan, ground: tree_clusters(scan[~ground()]), scan, find_ground(scan)) for scan in scans]
+    call: Callable[[Any], object]
+    cards, networks = [ModelCard.from_json(card) for card in contender.cards], list[Any]()
+    if kind == "session":
+        networks = [Session(path, how[0], precision=how[1], n_threads=n_threads) for path in contender.paths]
+    elif kind in ("network", "pillars", "pipeline"):
+        networks = [open_engine(*how, path, n_threads) for path in contender.paths]
+    if contender.image is not None:  # networks alone, one after the other, with their input already written
+        for network in networks:
+            network.input[:] = np.load(contender.image)
+        return [lambda: [network.run() for network in networks]] * len(scans)
+    if kind == "pillars":  # from scan to the outputs of the network, which mean nothing
+        fill, (network,) = partial(fill_pillars, weights=random_weights(), image=networks[0].input), networks
+        return [partial(lambda scan: (fill(scan), network.run()), scan) for scan in scans]
+    if kind == "pipeline" and contender.inputs:
+        call = NumpyCamera(cards[0], *networks)
+    elif kind == "pipeline":
+        call = NumpyPipeline(cards, networks, get_sensor(sensor))
+    elif kind == "unet":  # from image to labels, which mean nothing and are not compared
+        call = small_unet(cards[0], contender.precision, n_threads)
+    else:
+        perceive = make_perceiver(contender, sensor, n_threads)
+        call = (lambda image: perceive(image=image)) if contender.inputs else perceive
     return [partial(call, scan) for scan in scans]
-
-
-def make_clusters(contender: Contender, scans: Sequence[NDArray[Any]], sensor: str, n_threads: int) -> Calls:
-    """Patchwork++, and a k-d tree's clusters of what it leaves; both know one thread only."""
-    find_ground = ground_finders({"pypatchworkpp": import_module("pypatchworkpp")}, get_sensor(sensor))["Patchwork++"]
-
-    def call(scan: NDArray[np.float32], ground: Callable[[], NDArray[np.bool_]]) -> object:
-        return tree_clusters(scan[~ground()])
-
-    return [partial(call, scan, find_ground(scan)) for scan in scans]
-
-
-def make_pipeline(contender: Contender, scans: Sequence[NDArray[Any]], sensor: str, n_threads: int) -> Calls:
-    """The pipeline in numpy around another engine."""
-    if contender.inputs:
-        (path,), card = contender.paths, ModelCard.from_json(contender.cards[0])
-        camera = NumpyCamera(card, open_engine(contender.engine, contender.precision, path, n_threads))
-        return [partial(camera, image) for image in scans]
-    engines = [open_engine(contender.engine, contender.precision, path, n_threads) for path in contender.paths]
-    pipeline = NumpyPipeline([ModelCard.from_json(card) for card in contender.cards], engines, get_sensor(sensor))
-    return [partial(pipeline, scan) for scan in scans]
-
-
-def make_unet(contender: Contender, images: Sequence[NDArray[Any]], sensor: str, n_threads: int) -> Calls:
-    """The small U-Net in torch, from image to labels, which mean nothing and are not compared."""
-    label = small_unet(ModelCard.from_json(contender.cards[0]), contender.precision, n_threads)
-    return [partial(label, image) for image in images]
-
-
-def make_network(contender: Contender, scans: Sequence[NDArray[np.float32]], sensor: str, n_threads: int) -> Calls:
-    """Networks alone, one after the other, with their input already written."""
-    assert contender.image is not None
-    image = np.load(contender.image)
-    runs: Calls = []
-    for path in contender.paths:
-        network: Session | Engine
-        if contender.kind == "session":
-            network = Session(path, contender.engine, precision=contender.precision, n_threads=n_threads)
-        else:
-            network = open_engine(contender.engine, contender.precision, path, n_threads)
-        network.input[:] = image
-        runs.append(network.run)
-    return [lambda: [run() for run in runs]] * len(scans)
-
-
-def make_projection(contender: Contender, scans: Sequence[NDArray[np.float32]], sensor: str, n_threads: int) -> Calls:
-    """One projection of a scan."""
-    return [projection.contenders(np.ascontiguousarray(scan))[contender.engine] for scan in scans]
-
-
-def make_peak(contender: Contender, scans: Sequence[NDArray[np.float32]], sensor: str, n_threads: int) -> Calls:
-    """A peak of the machine: a memory copy or a matrix product."""
-    if contender.engine == "copy":
-        return [memory_copy(n_threads)]
-    return [matrix_product(contender.engine, contender.precision, n_threads)] * 2
-
-
-MAKERS: Mapping[str, Callable[[Contender, Sequence[NDArray[np.float32]], str, int], Calls]] = {
-    "edgeperc": make_perceiver,
-    "default": make_perceiver,
-    "front": make_perceiver,
-    "full turn": make_perceiver,
-    "pillars": make_pillars,
-    "clusters": make_clusters,
-    "pipeline": make_pipeline,
-    "unet": make_unet,
-    "session": make_network,
-    "network": make_network,
-    "projection": make_projection,
-    "peak": make_peak,
-}
 
 
 def serve(connection: Any, contender: Contender, files: Sequence[Path], sensor: str, n_threads: int) -> None:
@@ -155,7 +105,7 @@ def serve(connection: Any, contender: Contender, files: Sequence[Path], sensor: 
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent gets it too, and ends this process
     warnings.simplefilter("ignore")  # deprecations of the libraries
     try:
-        calls = MAKERS[contender.kind](contender, [np.load(file) for file in files], sensor, n_threads)
+        calls = make_calls(contender, [np.load(file) for file in files], sensor, n_threads)
         results: list[Any] = [call() for call in calls]
         predictions = [Prediction(r.points, r.top_view, r.boxes, r.image) for r in results if hasattr(r, "top_view")]
         connection.send(("ready", predictions, rss_mb()))

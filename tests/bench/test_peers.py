@@ -222,6 +222,9 @@ def test_overlaps_are_those_of_the_reference() -> None:
     [
         ("SqueezeSegV2 64x512", (5, 8, 32), {"logits": (4, 8, 32)}),
         ("SalsaNext 64x2048", (5, 16, 32), {"logits": (20, 16, 32)}),
+        ("FIDNet 64x2048", (5, 16, 32), {"logits": (20, 16, 32)}),
+        ("CENet 64x2048", (5, 8, 48), {"logits": (20, 8, 48)}),
+        ("SFA3D 608x608", (3, 64, 96), {"heat": (3, 16, 24), "offset": (2, 16, 24), "size": (3, 16, 24)}),
         (POINTPILLARS, (64, 16, 24), {"scores": (2, 8, 12), "boxes": (14, 8, 12), "directions": (4, 8, 12)}),
     ],
 )
@@ -320,7 +323,7 @@ def test_methods_of_others_are_rows_of_one_table(
     assert clusters["missing"] in ("", peers.INSTALL_GEOMETRY)
     printed = capsys.readouterr().out
     assert "weights of others are random" in printed
-    assert "scan to pillars, network" in printed
+    assert "scan to pillars, network, boxes only" in printed
 
 
 def test_methods_that_are_not_installed_name_their_line(alone: None, tmp_path: Path) -> None:
@@ -329,7 +332,15 @@ def test_methods_that_are_not_installed_name_their_line(alone: None, tmp_path: P
     assert {peers.why_missing(row) for row in rows[4:-1]} == {peers.INSTALL}
     assert peers.why_missing(rows[-1]) == "not installed: pip install 'edgeperc[geometry]'"
     table = methods_table(peers.METHODS, [peers.Measured(row, missing=peers.why_missing(row)) for row in rows], 2)
-    assert [row[-1] for row in table["rows"]] == [*["-"] * 4, *[peers.INSTALL] * 10, peers.INSTALL_GEOMETRY]
+    assert [row[-1] for row in table["rows"]] == [*["-"] * 4, *[peers.INSTALL] * 16, peers.INSTALL_GEOMETRY]
+    answers = {
+        "labels only": 10,
+        "boxes only": 6,
+        "ground and clusters only, one thread": 1,
+        "labels, cells and boxes": 4,
+    }
+    assert {answer: sum(row.timed.endswith(answer) for row in rows) for answer in answers} == answers
+    assert sum(answers.values()) == len(rows)
 
 
 def test_quartiles_and_ratios_are_of_all_rounds() -> None:

@@ -19,6 +19,7 @@ from edgeperc_export.networks.edge import PointSegEdge, SSADNetEdge, spread
 from edgeperc_export.networks.lodnn import EDGE_DILATIONS, LoDNN, LoDNNEdge
 from edgeperc_export.networks.pointpillars import PointPillars
 from edgeperc_export.networks.pointseg import ENLARGEMENT_RATES, Fire, FireDeconv, PointSeg, SqueezeReweight
+from edgeperc_export.networks.resnets import N_BOX_VALUES, SFA3D, CENet, FIDNet, Residual
 from edgeperc_export.networks.salsanext import SalsaNext
 from edgeperc_export.networks.squeezesegv2 import ContextAggregation, KULSeg, SqueezeSegV2
 
@@ -654,11 +655,59 @@ def test_pointpillars_has_two_anchors_at_half_resolution(height: int, width: int
     assert [tuple(output.shape) for output in outputs] == [(1, n, height // 2, width // 2) for n in (2, 14, 4)]
 
 
+@pytest.mark.parametrize(("height", "width"), [(64, 2048), (64, 512), (40, 90)])
+@pytest.mark.parametrize(("make", "stem", "fused"), [(FIDNet, 512, 1024), (CENet, 128, 640)])
+def test_fidnet_and_cenet_fuse_five_resolutions(
+    make: Callable[[], torch.nn.Module], stem: int, fused: int, height: int, width: int
+) -> None:
+    names = ["stem", *(f"stages.{k}" for k in range(4)), "head"]
+    logits, recorded = run_and_record(on_meta(make), torch.empty(2, 5, height, width, device="meta"), *names)
+    assert tuple(recorded["stem"][1].shape) == (2, stem, height, width)
+    for k in range(4):
+        expected = (2, 128, -(-height // 2**k), -(-width // 2**k))
+        assert tuple(recorded[f"stages.{k}"][1].shape) == expected
+    assert tuple(recorded["head"][0].shape) == (2, fused, height, width)
+    assert logits.shape == (2, 20, height, width)
+
+
+@pytest.mark.parametrize(("c_in", "c_out", "stride"), [(8, 8, 1), (8, 4, 1), (8, 8, 2), (4, 16, 2)])
+def test_a_residual_block_adds_its_input(c_in: int, c_out: int, stride: int) -> None:
+    block, x = Residual(c_in, c_out, stride, nn.ReLU).eval(), torch.randn(2, c_in, 7, 9)
+    nn.init.zeros_(block.layers[-1].weight)  # of the last batch norm
+    with torch.no_grad():
+        agree(block(x), block.shortcut(x).relu())
+    assert (len(block.shortcut) == 0) == (c_in == c_out and stride == 1)
+
+
+@pytest.mark.parametrize(("height", "width"), [(608, 608), (64, 96), (32, 32)])
+def test_sfa3d_has_five_heads_at_a_quarter_of_the_resolution(height: int, width: int) -> None:
+    image = torch.empty(1, 3, height, width, device="meta")
+    outputs, recorded = run_and_record(on_meta(SFA3D), image, "stages.3", *(f"heads.0.levels.{k}" for k in range(3)))
+    assert tuple(recorded["stages.3"][1].shape) == (1, 512, height // 32, width // 32)
+    shrinks = {f"heads.0.levels.{k}": shrink for k, shrink in enumerate((8, 4, 4))}
+    assert {name: height // recorded[name][0].shape[2] for name in shrinks} == shrinks
+    assert [tuple(output.shape) for output in outputs] == [
+        (1, n, height // 4, width // 4) for n in N_BOX_VALUES.values()
+    ]
+
+
+@pytest.mark.parametrize("size", [32, 64, 96])
+def test_sfa3d_weights_its_levels_by_their_softmax(size: int) -> None:
+    names = [f"heads.0.levels.{k}" for k in range(3)]
+    (heat, *_), recorded = run_and_record(SFA3D().eval(), torch.randn(1, 3, size, size), *names)
+    coarse, *finer = (recorded[name][1] for name in names)
+    levels = torch.stack([coarse.repeat_interleave(2, 2).repeat_interleave(2, 3), *finer])
+    agree(heat, (levels * levels.exp()).sum(0) / levels.exp().sum(0))
+
+
 @pytest.mark.parametrize(
     ("make", "shape", "parameters", "gmac"),
     [
         (SalsaNext, (1, 5, 64, 2048), 6_711_572, 62.298),  # the paper: 6.73 M, 62.84 G
         (PointPillars, (1, 64, 496, 432), 4_814_100, 33.104),
+        (FIDNet, (1, 5, 64, 2048), 6_052_820, 338.438),
+        (CENet, (1, 5, 64, 2048), 6_774_228, 433.263),
+        (SFA3D, (1, 3, 608, 608), 12_728_353, 31.284),
     ],
 )
 def test_parameters_and_arithmetic_of_rivals(
@@ -667,3 +716,20 @@ def test_parameters_and_arithmetic_of_rivals(
     network = on_meta(make)
     assert n_parameters(network) == parameters
     assert giga_macs(network, *shape) == pytest.approx(gmac, abs=0.001)
+
+
+@pytest.mark.parametrize(
+    ("make", "published", "within"),
+    [(SalsaNext, 6.73, 0.02), (FIDNet, 6.05, 0.005), (CENet, 6.8, 0.05), (SFA3D, 13.0, 0.5)],
+)
+def test_rivals_have_as_many_parameters_as_published(
+    make: Callable[[], torch.nn.Module], published: float, within: float
+) -> None:
+    assert n_parameters(on_meta(make)) / 1e6 == pytest.approx(published, abs=within)
+
+
+def test_the_trunk_of_sfa3d_is_resnet_18() -> None:
+    network = on_meta(SFA3D)
+    assert n_parameters(network.stem) + n_parameters(network.stages) == 11_689_512 - 513_000  # without its classifier
+    trunk = giga_macs(nn.Sequential(network.stem, *network.stages), 1, 3, 224, 224)
+    assert trunk == pytest.approx(1.81, abs=0.005)  # as torchvision has it
