@@ -197,7 +197,8 @@ def _in_torch(op: str, inputs: Sequence[Any], attributes: Mapping[str, Any]) -> 
         last = [attributes["dilations"], attributes["group"]]
         return F.conv2d, [x, others[0], bias, attributes["strides"], pads[:2], *last]
     if op == "ConvTranspose":
-        last = [attributes.get(*each) for each in (("output_padding", [0, 0]), ("group", 1), ("dilations", [1, 1]))]
+        extra = attributes.get("output_padding", [0, 0])
+        last = [extra, attributes.get("group", 1), attributes.get("dilations", [1, 1])]
         return F.conv_transpose2d, [x, others[0], bias, attributes["strides"], pads[:2], *last]
     if op == "Elu":
         return F.elu, [x, attributes.get("alpha", 1.0)]

@@ -89,7 +89,12 @@ def ground_finders(peers: Mapping[str, Any], sensor: SensorProfile = SENSOR) -> 
         parameters.sensor_height = sensor.mount_height_m
         # It adapts its thresholds from scan to scan, so every evaluated scan gets a new instance.
         finder = peers["pypatchworkpp"].patchworkpp(parameters)
-        return lambda: by_rows(len(points), (finder.estimateGround(points), finder.getGroundIndices())[1])
+
+        def call() -> NDArray[np.bool_]:
+            finder.estimateGround(points)
+            return by_rows(len(points), finder.getGroundIndices())
+
+        return call
 
     finders = {"find_ground": edgeperc(True), "find_ground, one plane": edgeperc(False)}
     if "open3d" in peers:
