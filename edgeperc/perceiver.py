@@ -639,7 +639,7 @@ class Perceiver:
         if check and not fitness:
             ceiling_m = find_ceiling(scan, float(self._frame.eye[2]))
             fitness = turned or check_profiles(scan, self._fitness, profile, self._frame, ceiling_m)
-            fitness = with_raw_remission(fitness, given[:, 3], profile)
+            fitness = with_raw_remission(fitness, given, profile)
         if check and not any(finding.gross for finding in fitness):
             fitness = (*fitness, *hidden)
         if self.on_mismatch != "ignore":

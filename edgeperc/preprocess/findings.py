@@ -271,6 +271,7 @@ def _geometry_findings(scan: Measures, profile: FitnessProfile, sensor: SensorPr
     axes = _other_axes(scan)
     mistake = (
         _other_unit(scan, profile.range_median_m)
+        or _feet(scan, sensor)
         or (axes if scan.flat_axis in (0, 1) else room or axes)
         or _other_origin(scan)
     )
@@ -317,6 +318,26 @@ def _other_unit(scan: Measures, usual_m: Range) -> Finding | None:
     return Finding(
         f"The median distance is {scan.range_median_m:.3g}, in training it was {near:.0f} to {far:.0f} m: "
         f"the coordinates seem to be in {unit}; convert them to meters.",
+        True,
+    )
+
+
+FEET_PER_M = 3.28084
+BEYOND, _FAR_BEYOND, _ABOVE_CAR_M = 1.25, 2.2, 1.8
+"""Of the range of a sensor that 999 of 1,000 points are within: farther at any height, and above that of a car."""
+
+
+def _feet(scan: Measures, sensor: SensorProfile) -> Finding | None:
+    most = BEYOND if scan.raised_m > _ABOVE_CAR_M else _FAR_BEYOND
+    return in_feet(sensor) if scan.farthest_m > most * sensor.max_range_m else None
+
+
+def in_feet(sensor: SensorProfile) -> Finding:
+    """What to say of points beyond the range of a sensor."""
+    return Finding(
+        f"Points are farther away than the {sensor.name} measures ({sensor.max_range_m:g} m): the coordinates seem to "
+        f"be in feet; multiply them by {1.0 / FEET_PER_M:.4f}. If they are in meters, pass sensor= a profile with the "
+        "max_range_m of the sensor.",
         True,
     )
 
@@ -554,18 +575,54 @@ def _other_number(scan: Measures, profile: FitnessProfile, sensor: SensorProfile
 
 
 _ALL_ZERO = "Remission is 0 for"
+# Share of the variance of elevation and azimuth, and of the logarithm of the distance, that 128 steps of the remission
+# explain: at most 0.35, 0.15 and 0.5 in 120 real scans of nine sensors.
+_EXPLAINED = {"number of its beam": 0.97, "time or azimuth": 0.95, "distance": 0.99}
+_MOST_BEAMS, _FEWEST_PLACED = 256, 300
 
 
-def with_raw_remission(
-    findings: Iterable[Finding], remission: NDArray[np.floating], sensor: SensorProfile
-) -> tuple[Finding, ...]:
-    """The findings, but of a remission that is there in another unit, that, in place of one that is missing.
+def _place_as_remission(points: Points) -> Finding | None:
+    """What the remission is, if it follows from where the points are.
+
+    points : (n, 4) float32; as recorded.
+    """
+    sample = points[:: len(points) // (4 * _SAMPLE) + 1].astype(np.float64)
+    x, y, z, remission = sample[np.isfinite(sample).all(axis=1) & (np.hypot(sample[:, 0], sample[:, 1]) > 3.0)].T
+    if len(x) < _FEWEST_PLACED:
+        return None
+    values = np.unique(remission)
+    of_beams = len(values) <= _MOST_BEAMS and bool((values == np.floor(values)).all())
+    edges = np.unique(np.quantile(remission, np.linspace(0.0, 1.0, 129)))
+    step = np.searchsorted(values if of_beams else edges, remission, side="right")
+    n = np.maximum(np.bincount(step), 1)
+    flat = np.hypot(x, y)
+    places = (np.arctan2(z, flat) if of_beams else np.zeros(len(x)), (x + 1j * y) / flat, np.log(flat))
+    for (what, least), place in zip(_EXPLAINED.items(), places, strict=True):
+        mean = (np.bincount(step, place.real) + 1j * np.bincount(step, place.imag)) / n
+        if np.mean(np.abs(place - mean[step]) ** 2) < (1.0 - least) * np.mean(np.abs(place - place.mean()) ** 2):
+            return Finding(
+                f"The remission of a point follows from its {what}: the field holds something else. Say which "
+                "one is the remission: remission_field= or columns= (--remission-field, --columns).",
+                True,
+            )
+    return None
+
+
+def with_raw_remission(findings: Iterable[Finding], points: Points, sensor: SensorProfile) -> tuple[Finding, ...]:
+    """The findings, but of a remission that is there in another unit, that, in place of one that is missing, and of
+    one that is none, that alone.
 
     The function of a profile, such as a logarithm, maps all values of 0..1 to 0 where 0..255 is expected.
 
-    remission : (n,) as recorded.
+    points : (n, 4) float32; as recorded.
     """
     found = tuple(findings)
+    placed = (
+        None if any(finding.gross and "emission" not in finding for finding in found) else _place_as_remission(points)
+    )
+    if placed is not None:
+        return placed, *(finding for finding in found if "emission" not in finding)
+    remission = points[:, 3]
     if not any(finding.startswith(_ALL_ZERO) for finding in found):
         return found
     known = remission[np.isfinite(remission)].astype(np.float64)  # float32 may overflow in a difference

@@ -172,10 +172,10 @@ def is_of_velodyne(datagram: Datagram) -> bool:
     return len(datagram.payload) == VELODYNE_BYTES and bytes(datagram.payload[:2]) == _FLAG
 
 
-def has_other_lidars(path: Path) -> bool:
-    """Whether the first datagrams of a pcap file may be those of other LiDARs than Velodyne's."""
-    first = Datagrams(path, lambda: None, SNIFFED_PACKETS)
-    return any(len(datagram.payload) > _GPS_BYTES and not is_of_velodyne(datagram) for datagram in first)
+def has_other_lidars(path: Path, *, whole: bool = False) -> bool:
+    """Whether the first datagrams of a pcap file, or any, may be those of other LiDARs than Velodyne's."""
+    looked_at = Datagrams(path, lambda: None, None if whole else SNIFFED_PACKETS)
+    return any(len(datagram.payload) > _GPS_BYTES and not is_of_velodyne(datagram) for datagram in looked_at)
 
 
 def _velodyne_datagrams(path: Path, most: int | None) -> Iterator[Datagram]:

@@ -114,7 +114,7 @@ def test_a_livox_does_not_spin(tmp_path: Path, capsys: pytest.CaptureFixture[str
 def test_two_in_one_capture(tmp_path: Path) -> None:
     packets = livox_packets(2, *scene(96 * 100), False)
     path = write_link(tmp_path / "two.pcap", 1, packets, one="192.168.1.112", two="192.168.1.130")
-    assert "expected one Livox sensor, there are 192.168.1.112, 192.168.1.130" in error_of(path)
+    assert "expected one LiDAR, there are 192.168.1.112, 192.168.1.130" in error_of(path)
     assert (
         sum(len(points) for _, points in read_scans(path, topic="192.168.1.112")) == (scene(9600)[0] != 0).any(1).sum()
     )

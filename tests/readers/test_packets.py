@@ -130,10 +130,10 @@ def test_several_velodynes_are_told_apart(tmp_path: Path, link: int, senders: tu
     assert velodyne_senders(path) == sorted(senders)
     expected = [len(points) for _, points in read_scans(write_pcap(tmp_path / "one.pcap", packets))]
     error = error_of(path)
-    assert f"expected one Velodyne, there are {', '.join(sorted(senders))}; choose one" in error
+    assert f"expected one LiDAR, there are {', '.join(sorted(senders))}; choose one" in error
     for sender in senders:
         assert [len(points) for _, points in read_scans(path, topic=sender)] == expected
-    assert "no Velodyne '10.1.1.1'" in error_of(path, topic="10.1.1.1")
+    assert "no LiDAR '10.1.1.1'" in error_of(path, topic="10.1.1.1")
 
 
 @pytest.mark.parametrize("link", [1, 113, 101])
@@ -143,7 +143,7 @@ def test_a_velodyne_that_begins_late_is_told_apart(tmp_path: Path, link: int, ot
     packets = vlp16_packets(30.0)
     path = write_link(tmp_path / "two.pcap", link, packets, begin=2100, one="10.0.0.1:2368", two=other)
     first, second = velodyne_senders(path)
-    assert "expected one Velodyne, there are 10.0.0.1" in error_of(path)
+    assert "expected one LiDAR, there are 10.0.0.1" in error_of(path)
     expected = [len(points) for _, points in read_scans(write_pcap(tmp_path / "one.pcap", packets))]
     assert [len(points) for _, points in read_scans(path, topic=first)] == expected
     assert sum(len(points) for _, points in read_scans(path, topic=second)) == (len(packets) - 2100) * 12 * 32
