@@ -17,7 +17,7 @@ from ..system.atomic import write_atomic
 from ..types.choices import DEFAULT_MODELS
 from .arguments import Commands, add_capture, add_command, options, reading_options
 from .output import in_options, many, print_error, print_line, print_rows
-from .scans import Sensors, stated_sensor, with_mounting
+from .scans import Sensors, check_sensor
 
 if TYPE_CHECKING:
     import numpy as np
@@ -83,9 +83,7 @@ def info_command(arguments: argparse.Namespace) -> int:
     from ..zoo import resolve
 
     if arguments.sensor is not None or arguments.extrinsic is not None:
-        from ..types.sensor import get_sensor
-
-        get_sensor(with_mounting(stated_sensor(arguments), arguments))  # one error, before the first thing
+        check_sensor(arguments)
     if arguments.write is not None and arguments.write.suffix != ".json":
         arguments.usage_error(f"--write {arguments.write}: expected a name that ends in .json")
     estimators: dict[SensorProfile, MountingEstimator] = {}

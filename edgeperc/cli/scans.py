@@ -243,16 +243,40 @@ def _fetched(urls: Iterable[Remote], folder: Path) -> Iterator[Path]:
             yield url.fetch(folder)
 
 
+_MOUNTING = {"height_m": "mount_height", "roll_deg": "roll", "pitch_deg": "pitch", "yaw_deg": "turn"}
+_ROUNDED = 0.05  # m or degrees, between an option and a file that say the same
+
+
+def _given(arguments: argparse.Namespace) -> dict[str, float | None]:
+    """Values of a `Mounting` that options give; None: to be found."""
+    values = {name: getattr(arguments, option, None) for name, option in _MOUNTING.items()}
+    return {name: None if value == "street" else value for name, value in values.items() if value is not None}
+
+
+def check_sensor(arguments: argparse.Namespace) -> None:
+    """Check ``--sensor`` and options of its mounting before the first scan; say what of ``--extrinsic`` is not taken.
+
+    Raises SensorError.
+    """
+    from ..types.mounting import Mounting
+    from ..types.sensor import get_sensor
+
+    get_sensor(with_mounting(stated_sensor(arguments), arguments))
+    file, given = getattr(arguments, "extrinsic", None), _given(arguments)
+    said = Mounting() if file is None or not given else Mounting.from_file(file)
+    for name, value in given.items():
+        of_file = getattr(said, name)
+        if of_file is not None and (value is None or abs((value - of_file + 180.0) % 360.0 - 180.0) > _ROUNDED):
+            option, taken = _MOUNTING[name].replace("_", "-"), "street" if value is None else f"{value:g}"
+            warnings.warn(f"{file} says {name} = {of_file + 0.0:.2f}, and --{option} {taken}, which is taken", stacklevel=2)
+
+
 def with_mounting(sensor: str | SensorProfile, arguments: argparse.Namespace) -> str | SensorProfile:
     """The sensor with ``--extrinsic``, options of single values, ``--accumulate`` and others. Raises SensorError."""
     from ..types.mounting import Mounting
     from ..types.sensor import get_sensor
 
-    options = {"height_m": "mount_height", "roll_deg": "roll", "pitch_deg": "pitch", "yaw_deg": "turn"}
-    given = {name: getattr(arguments, option, None) for name, option in options.items()}
-    values: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
-    if values.get("yaw_deg") == "street":
-        values["yaw_deg"] = None
+    values: dict[str, Any] = _given(arguments)
     file, ego = getattr(arguments, "extrinsic", None), getattr(arguments, "ego_box", None)
     remission = getattr(arguments, "remission_range", None)
     accumulate_s = getattr(arguments, "accumulate", None)

@@ -409,6 +409,7 @@ def test_no_profile_is_written_without_ground_or_of_two_sensors(
         (["--extrinsic", "T.json", "--mount-height", "3"], {"height_m": 3.0, "yaw_deg": -90.0}),
     ],
 )
+@pytest.mark.filterwarnings("ignore:.*which is taken:UserWarning")
 def test_run_uses_the_given_mounting(
     options: list[str],
     mounting: dict[str, float],
@@ -422,6 +423,32 @@ def test_run_uses_the_given_mounting(
     assert run("run", *arguments, *options) == 0
     used = json.loads(capsys.readouterr().out)["mounting"]
     assert {name: round(used[name], 6) for name in mounting} == mounting
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--mount-height", "3"], "T.json says height_m = 1.90, and --mount-height 3, which is taken"),
+        (["--pitch", "4"], "T.json says pitch_deg = 0.00, and --pitch 4, which is taken"),
+        (["--turn", "street"], "T.json says yaw_deg = -90.00, and --turn street, which is taken"),
+        (["--turn", "270", "--mount-height", "1.9"], ""),
+    ],
+)
+@pytest.mark.parametrize("command", ["run", "info"])
+@pytest.mark.filterwarnings("always::UserWarning")
+def test_options_that_contradict_an_extrinsic_are_said_once(
+    command: str,
+    options: list[str],
+    said: str,
+    drive: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(drive)
+    (drive / "T.json").write_text("[[0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 1, 1.9], [0, 0, 0, 1]]")
+    run(command, "0.bin", "1.bin", "--sensor", "hdl-64e", "--extrinsic", "T.json", *options)
+    warned = [line for line in capsys.readouterr().err.splitlines() if "which is taken" in line]
+    assert warned == ([f"edgeperc: warning: {said}"] if said else [])
 
 
 @pytest.mark.parametrize(
