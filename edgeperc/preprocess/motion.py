@@ -419,28 +419,30 @@ def _speed(poses: NDArray[np.float64], times_s: NDArray[np.float64]) -> float:
 def _fits_better(other: NDArray[np.float64], poses: NDArray[np.float64], times_s: NDArray[np.float64]) -> bool:
     """Whether one reading of the same poses is that of a vehicle, and the second is not.
 
-    What is too fast is none. Where neither is, as for a camera's axes, a way that keeps its direction in the sensor
-    decides.
+    What is too fast is none. Where neither is, as for a camera's axes, or both, a way that keeps its direction in the
+    sensor decides; an upright robot may go to and fro.
     """
     too_fast = [_speed(each, times_s) > FASTEST_MPS for each in (other, poses)]
     if any(too_fast):
         return too_fast == [False, True]
-    (is_other, other_keeps), (is_vehicle, keeps) = _likeness(other), _likeness(poses)
-    if is_other == is_vehicle:
-        return other_keeps > SAME_WAY > keeps
-    return is_other and not keeps > SAME_WAY > other_keeps
+    (is_other, other_keeps, _), (is_vehicle, keeps, up) = _likeness(other), _likeness(poses)
+    if is_other != is_vehicle:
+        return is_other and not keeps > SAME_WAY > other_keeps
+    return other_keeps > SAME_WAY > keeps and (is_vehicle or up < UPRIGHT)
 
 
-def _likeness(poses: NDArray[np.float64]) -> tuple[bool, float]:
-    """Whether the poses are those of a vehicle, and how well its way keeps its direction in the sensor, 0 to 1."""
+def _likeness(poses: NDArray[np.float64]) -> tuple[bool, float, float]:
+    """Whether the poses are those of a vehicle, how well its way keeps its direction in the sensor, 0 to 1, and how
+    upright it is.
+    """
     up, way = _up_and_way(poses)
     is_vehicle = up > UPRIGHT and (way is None or way[0] > FORWARD)
-    return is_vehicle, SAME_WAY if way is None else float(np.linalg.norm(way))
+    return is_vehicle, SAME_WAY if way is None else float(np.linalg.norm(way)), up
 
 
 def _rank(poses: NDArray[np.float64]) -> tuple[bool, float]:
-    is_vehicle, keeps = _likeness(poses)
-    return is_vehicle, round(keeps + _up_and_way(poses)[0], 2)
+    is_vehicle, keeps, up = _likeness(poses)
+    return is_vehicle, round(keeps + up, 2)
 
 
 def _up_and_way(poses: NDArray[np.float64]) -> tuple[float, NDArray[np.float64] | None]:
