@@ -268,7 +268,9 @@ def check_sensor(arguments: argparse.Namespace) -> None:
         of_file = getattr(said, name)
         if of_file is not None and (value is None or abs((value - of_file + 180.0) % 360.0 - 180.0) > _ROUNDED):
             option, taken = _MOUNTING[name].replace("_", "-"), "street" if value is None else f"{value:g}"
-            warnings.warn(f"{file} says {name} = {of_file + 0.0:.2f}, and --{option} {taken}, which is taken", stacklevel=2)
+            warnings.warn(
+                f"{file} says {name} = {of_file + 0.0:.2f}, and --{option} {taken}, which is taken", stacklevel=2
+            )
 
 
 def with_mounting(sensor: str | SensorProfile, arguments: argparse.Namespace) -> str | SensorProfile:

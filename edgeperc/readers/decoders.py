@@ -17,6 +17,7 @@ from ..errors import MissingExtraError, PointsError
 from ..system.clock import Stamp
 from ..system.extras import require
 from ..types.points import MapError, as_points, table_columns
+from .alternation import told_apart
 from .bags import BagFile, open_bag
 from .clouds import CLOUD_READERS, Cloud, cloud_points, cloud_table, describe_cloud
 from .mcap import Channel
@@ -73,7 +74,10 @@ def decode(
     scans = (
         _packet_scans(path, kind, topic, remission_field, warn, alive)
         if kind in (".lvx2", ".osf", ".pcap")
-        else of_plausible_duration(_bag_scans(path, topic, remission_field, alive, times))
+        else told_apart(
+            of_plausible_duration(_bag_scans(path, topic, remission_field, alive, times)),
+            lambda text: warn(f"{path}: {text}"),
+        )
     )
     for stamp_s, points, times_s in _with_typed_errors(path, scans):
         yield TimedScan(stamp_s, points, times_s if times else None)
