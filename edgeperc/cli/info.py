@@ -82,8 +82,7 @@ def info_command(arguments: argparse.Namespace) -> int:
     from ..readers.images import IMAGE_SUFFIXES
     from ..zoo import resolve
 
-    if arguments.sensor is not None or arguments.extrinsic is not None:
-        check_sensor(arguments)
+    check_sensor(arguments)
     if arguments.write is not None and arguments.write.suffix != ".json":
         arguments.usage_error(f"--write {arguments.write}: expected a name that ends in .json")
     estimators: dict[SensorProfile, MountingEstimator] = {}

@@ -290,8 +290,7 @@ def _check_usage(arguments: argparse.Namespace, kinds: Sequence[str]) -> None:
         arguments.usage_error("--columns, --remission-field and --origin need no --live")
     if (arguments.quaternion or arguments.poses_from) is not None and arguments.poses is None:
         arguments.usage_error("--quaternion and --poses-from need --poses FILE")
-    if arguments.sensor is not None or arguments.extrinsic is not None or arguments.accumulate is not None:
-        check_sensor(arguments)
+    check_sensor(arguments)
     if arguments.png:
         require("matplotlib", "view", "Drawing a picture")
     if arguments.gif:

@@ -145,7 +145,12 @@ def find_sensor(paths: Iterable[Path], options: Mapping[str, Any]) -> SensorEsti
         for scan in scans[:MOST_SCANS]:
             with suppress(SensorError):
                 found.append(estimate_sensor([scan]))
-        if len({each.profile.name for each in found}) != 1:
+        names = sorted({each.profile.name for each in found})
+        if len(names) > 1:
+            raise SensorError(
+                f"the first scans are of several sensors: {', '.join(names)}; read those of each on their own"
+            ) from None
+        if not names:
             raise
         return found[0]
 

@@ -231,7 +231,7 @@ _GROUND_OFF_M = 1.3
 _TOO_HIGH_DEG = 12.0
 # A spinning sensor has as many returns in all directions: the fullest of 64 sectors has at most 2.6 times the mean in
 # KITTI, PandaSet, Argoverse 2, Lyft, DDAD, nuScenes and View of Delft; 6 and more if the origin is 45 m off.
-_MOST_UNEVEN = 4.0
+_MOST_UNEVEN, _EVEN = 4.0, 2.6
 _NEAREST_M = 25.0  # of 99 % of the points; at most 10 m in these data
 _NEAREST_HEIGHTS = 4.0  # the lowest beam of a vlp-16 meets the ground at 3.7 times its height
 _SAMPLE = 6000  # points
@@ -329,7 +329,9 @@ BEYOND, _FAR_BEYOND, _ABOVE_CAR_M = 1.25, 2.2, 1.8
 
 def _feet(scan: Measures, sensor: SensorProfile) -> Finding | None:
     most = BEYOND if scan.raised_m > _ABOVE_CAR_M else _FAR_BEYOND
-    return in_feet(sensor) if scan.farthest_m > most * sensor.max_range_m else None
+    if scan.farthest_m <= most * sensor.max_range_m:
+        return None
+    return in_feet(sensor) if scan.farthest_m <= _DECIMETERS * sensor.max_range_m else _IN_DECIMETERS
 
 
 def in_feet(sensor: SensorProfile) -> Finding:
@@ -340,6 +342,12 @@ def in_feet(sensor: SensorProfile) -> Finding:
         "max_range_m of the sensor.",
         True,
     )
+
+
+_DECIMETERS = 4.3  # times the range of a sensor
+_IN_DECIMETERS = Finding(
+    "Points are too far away, on all sides: the coordinates seem to be in decimeters; multiply them by 0.1.", True
+)
 
 
 def _other_axes(scan: Measures) -> Finding | None:
@@ -355,8 +363,11 @@ def _other_axes(scan: Measures) -> Finding | None:
 
 
 def _other_origin(scan: Measures) -> Finding | None:
-    if scan.unevenness <= _MOST_UNEVEN and scan.nearest_m <= _NEAREST_M + _NEAREST_HEIGHTS * max(0.0, scan.raised_m):
-        return None
+    if scan.nearest_m <= _NEAREST_M + _NEAREST_HEIGHTS * max(0.0, scan.raised_m):
+        if scan.unevenness <= _MOST_UNEVEN:
+            return None
+    elif scan.unevenness <= _EVEN and scan.range_median_m > _NEAREST_M:
+        return _IN_DECIMETERS
     return Finding(
         f"One direction holds {scan.unevenness:.1f} times as many points as the mean one, and the nearest "
         f"points are {scan.nearest_m:.0f} m away: the sensor is not at the origin, as in the frame of a map; "
@@ -575,10 +586,10 @@ def _other_number(scan: Measures, profile: FitnessProfile, sensor: SensorProfile
 
 
 _ALL_ZERO = "Remission is 0 for"
-# Share of the variance of elevation and azimuth, and of the logarithm of the distance, that 128 steps of the remission
-# explain: at most 0.35, 0.15 and 0.5 in 120 real scans of nine sensors.
-_EXPLAINED = {"number of its beam": 0.97, "time or azimuth": 0.95, "distance": 0.99}
-_MOST_BEAMS, _FEWEST_PLACED = 256, 300
+# Share of the variance of the elevation, the azimuth, the height and the logarithm of the distance that 128 steps of
+# the remission explain: at most 0.37, 0.15, 0.17 and 0.5 in 120 real scans of nine sensors.
+_EXPLAINED = {"number of the beam": 0.97, "time or azimuth": 0.95, "height": 0.98, "distance": 0.99}
+_FEWEST_PLACED = 300
 
 
 def _place_as_remission(points: Points) -> Finding | None:
@@ -590,19 +601,16 @@ def _place_as_remission(points: Points) -> Finding | None:
     x, y, z, remission = sample[np.isfinite(sample).all(axis=1) & (np.hypot(sample[:, 0], sample[:, 1]) > 3.0)].T
     if len(x) < _FEWEST_PLACED:
         return None
-    values = np.unique(remission)
-    of_beams = len(values) <= _MOST_BEAMS and bool((values == np.floor(values)).all())
     edges = np.unique(np.quantile(remission, np.linspace(0.0, 1.0, 129)))
-    step = np.searchsorted(values if of_beams else edges, remission, side="right")
-    n = np.maximum(np.bincount(step), 1)
-    flat = np.hypot(x, y)
-    places = (np.arctan2(z, flat) if of_beams else np.zeros(len(x)), (x + 1j * y) / flat, np.log(flat))
+    step = np.searchsorted(edges, remission, side="right")
+    n, flat = np.maximum(np.bincount(step), 1), np.hypot(x, y)
+    places = (np.arctan2(z, flat), (x + 1j * y) / flat, z, np.log(flat))
     for (what, least), place in zip(_EXPLAINED.items(), places, strict=True):
         mean = (np.bincount(step, place.real) + 1j * np.bincount(step, place.imag)) / n
         if np.mean(np.abs(place - mean[step]) ** 2) < (1.0 - least) * np.mean(np.abs(place - place.mean()) ** 2):
             return Finding(
-                f"The remission of a point follows from its {what}: the field holds something else. Say which "
-                "one is the remission: remission_field= or columns= (--remission-field, --columns).",
+                f"The remission of each point follows from the {what}: the field holds something else. Say which one "
+                "is the remission: remission_field= or columns= (--remission-field, --columns).",
                 True,
             )
     return None

@@ -33,8 +33,8 @@ def told_apart(scans: Iterator[TimedScan], say: Callable[[str], None]) -> Iterat
                 if len(latest) == _IN_A_ROW and statistics.median(latest) < _ALIKE and not is_said:
                     is_said = True
                     say(
-                        f"every {'second' if n == 2 else 'third'} scan is alike, and those between are not: {n} sensors "
-                        "share the topic and the frame, or each message has a part of a turn. They are "
+                        f"every {'second' if n == 2 else 'third'} scan is alike, and those between are not: {n} "
+                        "sensors share the topic and the frame, or each message has a part of a turn. They are "
                         "read as one sensor; record each on a topic of its own"
                     )
         yield scan

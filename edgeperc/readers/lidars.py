@@ -102,7 +102,8 @@ def _counted(path: Path, alive: Callable[[], None], most: int | None) -> tuple[C
     """How many packets each address and port has of each kind, None for unknown ones, and the formats of the kinds."""
     ouster_bytes = {layout.packet_bytes for layout in ousters_beside(path)}
     counts, rows = Counter[_Source](), dict[str, Format]()
-    for datagram in islice(Datagrams(path, alive), most):
+    datagrams = Datagrams(path, alive, most)
+    for datagram in datagrams:
         size = len(datagram.payload)
         if bytes(datagram.payload[:8]) == DIFOP:
             continue
@@ -117,6 +118,11 @@ def _counted(path: Path, alive: Callable[[], None], most: int | None) -> tuple[C
             kind = _name_of(datagram.payload)
         if kind is not None or size > _OTHER_BYTES:
             counts[kind, (datagram.sender, datagram.port)] += 1
+    if not counts and datagrams.n_cut > _BY_CHANCE:
+        raise PointsError(
+            f"{datagrams.n_cut:,} packets of the capture were not kept to their end, as with a limit of tcpdump or "
+            "Wireshark: capture whole packets (tcpdump -s 0)"
+        )
     return counts, rows
 
 

@@ -118,6 +118,12 @@ def test_feet(seed: int, factor: float) -> None:
     assert not any("feet" in finding for finding in check_fitness(street(seed), PROFILES[0], near))
 
 
+@pytest.mark.parametrize("seed", SEEDS)
+def test_decimeters(seed: int) -> None:
+    points = street(seed) * np.float32([10.0, 10.0, 10.0, 1.0])
+    assert any("decimeters" in finding for finding in gross(points))
+
+
 @settings(deadline=None, max_examples=30)
 @given(st.sampled_from(SEEDS), st.floats(-1.0, 300.0))
 def test_constant_remission(seed: int, value: float) -> None:
@@ -160,7 +166,7 @@ def test_a_missing_remission_is_called_so(value: float) -> None:
 
 
 @pytest.mark.parametrize("sensor", ["vlp-16", "hdl-64e", "os1-128", "pandar64"])
-@pytest.mark.parametrize("what", ["beam", "time or azimuth", "distance"])
+@pytest.mark.parametrize("what", ["beam", "time or azimuth", "height", "distance"])
 def test_a_remission_that_follows_from_the_place_is_refused(sensor: str, what: str) -> None:
     profile, points = get_sensor(sensor), simulated_scan(1, sensor).points
     raw = points[np.isfinite(points).all(axis=1) & (np.linalg.norm(points[:, :3], axis=1) > 1.0)]
@@ -170,6 +176,7 @@ def test_a_remission_that_follows_from_the_place_is_refused(sensor: str, what: s
     raw[:, 3] = {
         "beam": np.abs(elevation[:, None] - np.array(profile.elevations_deg)).argmin(axis=1),
         "time or azimuth": (np.arctan2(y, x) / (2.0 * np.pi) + 0.5) * 0.1,
+        "height": z,
         "distance": np.hypot(x, y),
     }[what]
     (found,) = with_raw_remission([Finding("Remission runs from 0 to 63", True)], raw, profile)

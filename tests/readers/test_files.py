@@ -968,3 +968,24 @@ def test_raw_values_may_begin_like_another_format(tmp_path: Path, first: Any) ->
     content = first + street(1).tobytes()[4:]
     assert len(read_points(save(tmp_path, "scan.bin", content))) == 6000
     assert len(read_points(save(tmp_path, "scan.raw", content), columns=4)) == 6000
+
+
+@pytest.mark.parametrize("name", ["a.bin", "a.pcd.bin", "a.npy"])
+@pytest.mark.parametrize(("wanted", "is_there"), [("ring", False), ("time", False), ("intensity", True)])
+def test_values_without_names_have_no_field_of_another_name(
+    tmp_path: Path, name: str, wanted: str, is_there: bool
+) -> None:
+    points = np.random.default_rng(1).normal(0.0, [20.0, 10.0, 1.0, 0.1], (2000, 4)).astype(np.float32)
+    path = tmp_path / name
+    if name == "a.npy":
+        np.save(path, points)
+    else:
+        stored = points if name == "a.bin" else np.hstack([points, np.arange(2000, dtype=np.float32)[:, None] % 32])
+        stored.tofile(path)
+    if is_there:
+        np.testing.assert_array_equal(read_points(path, remission_field=wanted), points)
+        return
+    with pytest.raises(
+        PointsError, match=rf"no field '{wanted}' for the remission: the values have no names.*--columns"
+    ):
+        read_points(path, remission_field=wanted)

@@ -304,7 +304,7 @@ def test_an_ouster_that_starts_anew_or_another_one_is_warned_of(tmp_path: Path, 
 def other_packets(name: str) -> list[bytes]:
     """Of a sensor of another maker."""
     if name == "Hesai AT128":
-        return [bytes.fromhex("eeff0403000080020004017f") + bytes(1106)] * 80
+        return [bytes.fromhex("eeff0403000080020004017f") + bytes([k]) + bytes(1105) for k in range(80)]
     if name == "livox":
         return livox_packets(1, np.full((96 * 300, 3), 7.5), np.arange(96 * 300) % 256, is_old=False)
     model = MODELS[name]
