@@ -162,8 +162,8 @@ def scan_sensor(
     by the capture, or by the points of it and the files ``beside``. Raises SensorError, PointsError, MissingExtraError.
     """
     from ..readers.captures import is_capture, known_sensor, scan_files
-    from ..readers.identify import NotSpinningError, contradicts
-    from ..types.sensor import get_sensor
+    from ..readers.identify import KnownSensor, NotSpinningError, contradicts
+    from ..types.sensor import SENSORS, get_sensor
 
     known: KnownSensor | None = None
     if arguments.sensor in (None, AUTO_SENSOR):
@@ -193,9 +193,21 @@ def scan_sensor(
         known = known_sensor(path, arguments.topic) if isinstance(path, Path) else None
     except EdgepercError:  # it need not name its sensor, and reading it tells of damage
         known = None
+    what = "the capture"
+    if (
+        known is None
+        and given.name in SENSORS
+        and given.pattern is None
+        and isinstance(path, Path)
+        and not is_capture(path)
+    ):
+        with suppress(SensorError):
+            found = find_sensor([next(iter(beside), path)], reading_options(arguments))
+            if found is not None and found.is_built_in:
+                known, what = KnownSensor(found.profile, str(found)), "the points"
     if known is not None and contradicts(given, known.profile):
         warnings.warn(
-            f"{path}: --sensor says {given.name}, the capture {known.profile.name} ({known.because}); it is read as "
+            f"{path}: --sensor says {given.name}, {what} {known.profile.name} ({known.because}); it is read as "
             f"{given.name}",
             stacklevel=2,
         )
@@ -268,10 +280,10 @@ def check_sensor(arguments: argparse.Namespace) -> None:
 
     get_sensor(with_mounting(stated_sensor(arguments), arguments))
     file, given = getattr(arguments, "extrinsic", None), _given(arguments)
-    said = Mounting() if file is None or not given else Mounting.from_file(file)
-    for name, value in given.items():
+    said = None if file is None or not given else Mounting.from_file(file)
+    for name, value in given.items() if said is not None else ():
         of_file = getattr(said, name)
-        if of_file is not None and (value is None or abs((value - of_file + 180.0) % 360.0 - 180.0) > _ROUNDED):
+        if value is None or abs((value - of_file + 180.0) % 360.0 - 180.0) > _ROUNDED:
             option, taken = _MOUNTING[name].replace("_", "-"), "street" if value is None else f"{value:g}"
             warnings.warn(
                 f"{file} says {name} = {of_file + 0.0:.2f}, and --{option} {taken}, which is taken", stacklevel=2

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..types.frame import ModelFrame
-from ..types.mounting import MODEL_HEIGHT_M
+from ..types.mounting import MODEL_HEIGHT_M, Mounting
 from ..types.perception import DroppedPoints
 from ..types.points import Points
 from ..types.sensor import SensorProfile
@@ -231,7 +231,7 @@ _GROUND_OFF_M = 1.3
 _TOO_HIGH_DEG = 12.0
 # A spinning sensor has as many returns in all directions: the fullest of 64 sectors has at most 2.6 times the mean in
 # KITTI, PandaSet, Argoverse 2, Lyft, DDAD, nuScenes and View of Delft; 6 and more if the origin is 45 m off.
-_MOST_UNEVEN, _EVEN = 4.0, 2.6
+_MOST_UNEVEN, _EVEN, _ALL_AROUND = 4.0, 2.6, 0.9
 _NEAREST_M = 25.0  # of 99 % of the points; at most 10 m in these data
 _NEAREST_HEIGHTS = 4.0  # the lowest beam of a vlp-16 meets the ground at 3.7 times its height
 _SAMPLE = 6000  # points
@@ -329,7 +329,7 @@ BEYOND, _FAR_BEYOND, _ABOVE_CAR_M = 1.25, 2.2, 1.8
 
 def _feet(scan: Measures, sensor: SensorProfile) -> Finding | None:
     most = BEYOND if scan.raised_m > _ABOVE_CAR_M else _FAR_BEYOND
-    if scan.farthest_m <= most * sensor.max_range_m:
+    if scan.farthest_m <= most * sensor.max_range_m or scan.view_covered < _ALL_AROUND:
         return None
     return in_feet(sensor) if scan.farthest_m <= _DECIMETERS * sensor.max_range_m else _IN_DECIMETERS
 
@@ -366,7 +366,7 @@ def _other_origin(scan: Measures) -> Finding | None:
     if scan.nearest_m <= _NEAREST_M + _NEAREST_HEIGHTS * max(0.0, scan.raised_m):
         if scan.unevenness <= _MOST_UNEVEN:
             return None
-    elif scan.unevenness <= _EVEN and scan.range_median_m > _NEAREST_M:
+    elif scan.unevenness <= _EVEN and scan.view_covered > _ALL_AROUND:
         return _IN_DECIMETERS
     return Finding(
         f"One direction holds {scan.unevenness:.1f} times as many points as the mean one, and the nearest "
@@ -461,6 +461,28 @@ def check_ground(
         Finding(
             "The ground seems to lie above the sensor, and there is none below: it is mounted upside down, or z points "
             f"down: {_TURN_OVER}",
+            True,
+        ),
+    )
+
+
+def check_hanging(
+    points: Points, support_of: Callable[[Points], float], below_of: Callable[[Points], float], known: Mounting
+) -> tuple[Finding, ...]:
+    """Describe a scan that is upside down because of the given roll, of a sensor that hangs.
+
+    points, support_of, below_of : as in `check_ground`.
+    """
+    if abs(known.roll_deg or 0.0) <= 90.0:
+        return ()
+    turned = points.copy()
+    turned[:, :3] = points[:, :3] @ known.rotation().T.astype(np.float32)
+    if not check_ground(turned, support_of, below_of):
+        return ()
+    return (
+        Finding(
+            f"With the given roll of {known.roll_deg:g} deg, the ground lies above the sensor, and none below: it "
+            "does not hang upside down, or the points are turned already: leave out the roll (--roll, --extrinsic).",
             True,
         ),
     )

@@ -10,7 +10,7 @@ import shlex
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,7 +21,9 @@ from cli_helpers import POINTSEG, SSADNET, run, write_scan
 from edgeperc import zoo
 from edgeperc.errors import ModelFileError
 from edgeperc.inference import listing, providers
+from edgeperc.preprocess.findings import Finding
 from edgeperc.preprocess.fitness import FitnessProfile
+from edgeperc.simulation.samples import simulated_scan
 from edgeperc.system import machine
 from edgeperc.types.card import ModelCard
 from edgeperc.types.frame import ModelFrame
@@ -107,9 +109,9 @@ def test_info_of_a_scan(tmp_path: Path, capsys: pytest.CaptureFixture[str], monk
 
     def check_fitness(
         points: np.ndarray, profile: FitnessProfile | None, sensor: SensorProfile | None, frame: ModelFrame
-    ) -> tuple[str, ...]:
+    ) -> tuple[Finding, ...]:
         checked.append((points, profile, sensor.name))
-        return ("it has 32 beams",)
+        return (Finding("it has 32 beams"),)
 
     monkeypatch.setattr("edgeperc.preprocess.findings.check_fitness", check_fitness)
     monkeypatch.setattr(FitnessProfile, "from_dict", dict)
@@ -513,3 +515,45 @@ def test_info_says_that_a_sensor_cannot_be_told(
     assert "pass --sensor" in capsys.readouterr().err
     assert run("info", scan, "--sensor", "hdl-64e") in (0, 1)
     assert "cannot be told" not in capsys.readouterr().err
+
+
+def write_simulated(path: Path, sensor: str, seed: int) -> Path:
+    """A scan with remission in 0..1."""
+    points = simulated_scan(seed, sensor).points
+    points = points[np.isfinite(points).all(axis=1)]
+    points[:, 3] /= max(1.0, points[:, 3].max())
+    points.tofile(path)
+    return path
+
+
+@pytest.mark.parametrize(("sensor", "said"), [("vlp-16", "os1-64"), ("hdl-64e", "vlp-16"), ("pandar64", "hdl-64e")])
+@pytest.mark.filterwarnings("always::UserWarning")
+def test_a_sensor_whose_beams_the_points_do_not_have_is_warned_of(
+    sensor: str, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scan = write_simulated(tmp_path / "0.bin", sensor, 1)
+    for name, is_warned in ((said, True), (sensor, False)):
+        run("run", scan, "--sensor", name, "--anyway", "--remission-range", "0", "1")
+        assert (f"--sensor says {name}, the points {sensor} (" in capsys.readouterr().err) == is_warned
+
+
+@pytest.mark.parametrize("sensors", [("hdl-64e", "vlp-16"), ("pandar64", "os1-64", "os1-64"), ("vlp-16", "vlp-32c")])
+def test_a_folder_of_several_sensors_is_said_to_be_one(
+    sensors: Sequence[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for k, sensor in enumerate(sensors):
+        write_simulated(tmp_path / f"{k}.bin", sensor, k)
+    assert run("run", tmp_path) == 1
+    names = ", ".join(sorted({*sensors}))
+    assert (
+        f"the first scans are of several sensors: {names}; read those of each on their own" in capsys.readouterr().err
+    )
+
+
+@pytest.mark.parametrize("roll", [180.0, -175.0, 170.0])
+def test_a_roll_that_turns_a_scan_upside_down_is_refused(
+    roll: float, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scan = write_simulated(tmp_path / "0.bin", "hdl-64e", 1)
+    assert run("run", scan, "--sensor", "hdl-64e", "--roll", str(roll)) == 1
+    assert "it does not hang upside down, or the points are turned already" in capsys.readouterr().err

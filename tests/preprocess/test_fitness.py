@@ -113,7 +113,7 @@ def test_z_as_the_number_of_a_row(seed: int, scale: float, from_top: bool) -> No
 def test_feet(seed: int, factor: float) -> None:
     """Of a sensor that was found high above the road, or by its range alone."""
     points = street(seed) * np.float32([factor, factor, factor, 1.0])
-    near = replace(KITTI, max_range_m=0.9 * np.quantile(np.linalg.norm(points[:, :3], axis=1), 0.99) / factor)
+    near = replace(KITTI, max_range_m=np.quantile(np.linalg.norm(street(seed)[:, :3], axis=1), 0.999))
     assert any("feet" in finding for finding in check_fitness(points, PROFILES[0], near))
     assert not any("feet" in finding for finding in check_fitness(street(seed), PROFILES[0], near))
 

@@ -877,8 +877,9 @@ def test_what_a_table_lacks_is_nan(tmp_path: Path, gap: str, separator: str) -> 
 @pytest.mark.parametrize(
     ("content", "error"),
     [
-        (b"x(mm),y(mm),z(mm),i\n1,2,3,4\n", "no table of points: it has a line 'x\\(mm\\)"),
-        (b"x [ft];y [ft];z [ft]\n1;2;3\n", "no table of points: it has a line 'x .ft.;y"),
+        (b"x(mm),y(mm),z(mm),i\n1,2,3,4\n", "coordinates are in 'mm' by the name 'x\\(mm\\)'; expected meters"),
+        (b"X (cm);Y (cm);Z (cm);I\n1;2;3;4\n", "coordinates are in 'cm' by the name 'X \\(cm\\)'"),
+        (b"x [ft];y [ft];z [ft]\n1;2;3\n", "the coordinates are in 'ft' by the name 'x .ft.'"),
         (b"x,y,z,i\n1,2,3,4\n1,2,3\n", "row 2 of 2 has 3, '1,2,3'; the file may be cut short"),
         (b"x,y,z,i\n1,2,3,4\n1,2\n1,2,3,4\n", "row 2 of 3 has 2, '1,2'$"),
         (b"x,y,z,i\n1,far,3,4\n1,2,3,4\n", "no numeric field y among x, y, z, i"),
