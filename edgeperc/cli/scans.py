@@ -114,6 +114,7 @@ def scan_namer(path: Path) -> Callable[[int], Path]:
     return lambda k: path / f"{k:06d}"
 
 
+_UNITS_DEG = 2.0  # between the beams of two units of a model
 # Files that are read for three scans with points.
 _LOOKED_AT = 10
 
@@ -163,7 +164,7 @@ def scan_sensor(
     """
     from ..readers.captures import is_capture, known_sensor, scan_files
     from ..readers.identify import KnownSensor, NotSpinningError, contradicts
-    from ..types.sensor import SENSORS, get_sensor
+    from ..types.sensor import PUBLIC_SENSORS, get_sensor
 
     known: KnownSensor | None = None
     if arguments.sensor in (None, AUTO_SENSOR):
@@ -193,25 +194,26 @@ def scan_sensor(
         known = known_sensor(path, arguments.topic) if isinstance(path, Path) else None
     except EdgepercError:  # it need not name its sensor, and reading it tells of damage
         known = None
-    what = "the capture"
-    if (
-        known is None
-        and given.name in SENSORS
-        and given.pattern is None
-        and isinstance(path, Path)
-        and not is_capture(path)
-    ):
+    what, is_other = "the capture", known is not None and contradicts(given, known.profile)
+    is_own = given.name not in PUBLIC_SENSORS and given.pattern is None
+    if known is None and is_own and isinstance(path, Path) and not is_capture(path):
         with suppress(SensorError):
             found = find_sensor([next(iter(beside), path)], reading_options(arguments))
             if found is not None and found.is_built_in:
                 known, what = KnownSensor(found.profile, str(found)), "the points"
-    if known is not None and contradicts(given, known.profile):
+                is_other = _has_other_beams(given, found.profile)
+    if known is not None and is_other:
         warnings.warn(
             f"{path}: --sensor says {given.name}, {what} {known.profile.name} ({known.because}); it is read as "
             f"{given.name}",
             stacklevel=2,
         )
     return with_mounting(arguments.sensor, arguments), "as --sensor says"
+
+
+def _has_other_beams(given: SensorProfile, found: SensorProfile) -> bool:
+    pairs = zip(given.elevations_deg, found.elevations_deg, strict=False)
+    return given.n_beams != found.n_beams or max(abs(one - other) for one, other in pairs) > _UNITS_DEG
 
 
 class Sensors:

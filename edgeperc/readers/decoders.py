@@ -97,7 +97,7 @@ def describe(path: Path, kind: str, topic: str | None, alive: Callable[[], None]
     def found() -> Iterator[dict[str, Any]]:
         if kind == ".osf":
             frames = _open_osf(path)
-            chosen = frames.sensor_info[_choose("sensor", [str(info.sn) for info in frames.sensor_info], topic)]
+            chosen = frames.sensor_info[_choose("LiDAR", [str(info.sn) for info in frames.sensor_info], topic)]
             yield {"metadata": chosen.to_json_string()}
         else:
             for name, message, _ in _clouds(path, topic, alive):
@@ -160,7 +160,7 @@ def _packet_scans(
     elif kind == ".lvx2":
         from .livox_packets import lvx2_scans, lvx2_sensors  # numba, which bags do without
 
-        scans = lvx2_scans(path, _choose("sensor", lvx2_sensors(path), topic), alive)
+        scans = lvx2_scans(path, _choose("LiDAR", lvx2_sensors(path), topic), alive)
     else:
         is_velodyne = next(velodyne_packets(path), None) is not None
         senders = velodyne_senders(path) if is_velodyne else []
@@ -257,7 +257,7 @@ def _ouster_turns(
             layouts.append(layout_of(json.loads(read_metadata(file))))
         except PointsError as exc:
             raise PointsError(f"the metadata {file.name} cannot be read: {exc}") from exc
-    chosen = layouts[_choose("sensor", [layout.name for layout in layouts], topic)]
+    chosen = layouts[_choose("LiDAR", [layout.name for layout in layouts], topic)]
     stream = OusterStream(chosen, remission_field)
     sizes = {size for layout in layouts for size in (layout.packet_bytes, *layout.other_bytes)}
     ports, n_other_sizes, n_others, n_used = set[int](), Counter[int](), 0, 0
@@ -308,7 +308,7 @@ def _ouster_turns(
 def _ouster_scans(frames: Any, topic: str | None, remission_field: str | None) -> Iterator[TimedScan]:
     core = require("ouster.sdk.core", "ouster", "Reading an Ouster capture", package="ouster-sdk")
     serials = [str(info.sn) for info in frames.sensor_info]
-    chosen = _choose("sensor", serials, topic)
+    chosen = _choose("LiDAR", serials, topic)
     to_xyz = core.XYZLut(frames.sensor_info[chosen], False)  # in the sensor's frame, not the vehicle's
     name = (remission_field or "reflectivity").upper()
     for frame_set in frames:

@@ -537,6 +537,21 @@ def test_a_sensor_whose_beams_the_points_do_not_have_is_warned_of(
         assert (f"--sensor says {name}, the points {sensor} (" in capsys.readouterr().err) == is_warned
 
 
+@pytest.mark.parametrize("sensor", ["vlp-16", "hdl-64e"])
+@pytest.mark.parametrize(("scale", "is_warned"), [(1.0, False), (np.pi / 180.0, True), (2.0, True)])
+@pytest.mark.filterwarnings("always::UserWarning")
+def test_a_profile_of_other_beams_is_warned_of(
+    sensor: str, scale: float, is_warned: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As in radians."""
+    scan, profile = write_simulated(tmp_path / "0.bin", sensor, 1), get_sensor(sensor)
+    elevations = tuple(scale * angle for angle in profile.elevations_deg)
+    other = replace(profile, elevations_deg=elevations, remission_range=(0.0, 1.0))
+    (tmp_path / "mine.json").write_text(other.to_json())
+    run("run", scan, "--sensor", tmp_path / "mine.json", "--anyway")
+    assert ("it is read as" in capsys.readouterr().err) == is_warned
+
+
 @pytest.mark.parametrize("sensors", [("hdl-64e", "vlp-16"), ("pandar64", "os1-64", "os1-64"), ("vlp-16", "vlp-32c")])
 def test_a_folder_of_several_sensors_is_said_to_be_one(
     sensors: Sequence[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]

@@ -82,7 +82,7 @@ def test_lvx2_files(tmp_path: Path, kind: int) -> None:
         np.testing.assert_allclose(one.times_s, other.times_s, atol=1e-6)  # type: ignore[arg-type]
     two = tmp_path / "two.lvx2"
     two.write_bytes(lvx2_file(packets, ("47MDL01", "47MDL02")))
-    assert "expected one sensor, there are 47MDL01, 47MDL02; choose one" in error_of(two)
+    assert "expected one LiDAR, there are 47MDL01, 47MDL02; choose one" in error_of(two)
     np.testing.assert_array_equal(
         joined(list(read_timed_scans(two, topic="47MDL02"))), joined(list(read_timed_scans(path)))
     )
