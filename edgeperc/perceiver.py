@@ -26,7 +26,15 @@ from .inference.session import Session
 from .objects.boxes import MIN_SCORE
 from .pipeline import Options, Pipeline, RangeImageNetwork, TopViewNetwork
 from .preprocess.condition import scale
-from .preprocess.findings import Finding, check_beams, check_dropped, check_ground, check_profiles, with_raw_remission
+from .preprocess.findings import (
+    Finding,
+    check_beams,
+    check_dropped,
+    check_ground,
+    check_hanging,
+    check_profiles,
+    with_raw_remission,
+)
 from .preprocess.fitness import FitnessProfile
 from .preprocess.health import Normal, check_health, findings_of, without_drops
 from .preprocess.interpolation import Interpolator
@@ -623,8 +631,11 @@ class Perceiver:
         scan, n_overflowed = scale(scan, profile, rendered=self._renders)
         dropped = replace(dropped, not_finite=dropped.not_finite + n_overflowed)
         watch.lap("adapt" if self._renders and profile.remission is not None else "check")
+        roll_deg = before.known.roll_deg
+        if check and roll_deg is not None:
+            turned = check_hanging(scan, near_support, share_below, before.known)
         if not before.is_complete and len(scan):
-            if check and before.known.roll_deg is None:
+            if check and roll_deg is None:
                 turned = check_beams(scan, profile) or check_ground(scan, near_support, share_below, profile)
             try:
                 self._set_mounting(before.add(scan))
@@ -639,7 +650,7 @@ class Perceiver:
         if check and not fitness:
             ceiling_m = find_ceiling(scan, float(self._frame.eye[2]))
             fitness = turned or check_profiles(scan, self._fitness, profile, self._frame, ceiling_m)
-            fitness = with_raw_remission(fitness, given[:, 3], profile)
+            fitness = with_raw_remission(fitness, given, profile)
         if check and not any(finding.gross for finding in fitness):
             fitness = (*fitness, *hidden)
         if self.on_mismatch != "ignore":

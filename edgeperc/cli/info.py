@@ -17,7 +17,7 @@ from ..system.atomic import write_atomic
 from ..types.choices import DEFAULT_MODELS
 from .arguments import Commands, add_capture, add_command, options, reading_options
 from .output import in_options, many, print_error, print_line, print_rows
-from .scans import Sensors, stated_sensor, with_mounting
+from .scans import Sensors, check_sensor
 
 if TYPE_CHECKING:
     import numpy as np
@@ -82,10 +82,7 @@ def info_command(arguments: argparse.Namespace) -> int:
     from ..readers.images import IMAGE_SUFFIXES
     from ..zoo import resolve
 
-    if arguments.sensor is not None or arguments.extrinsic is not None:
-        from ..types.sensor import get_sensor
-
-        get_sensor(with_mounting(stated_sensor(arguments), arguments))  # one error, before the first thing
+    check_sensor(arguments)
     if arguments.write is not None and arguments.write.suffix != ".json":
         arguments.usage_error(f"--write {arguments.write}: expected a name that ends in .json")
     estimators: dict[SensorProfile, MountingEstimator] = {}
@@ -382,7 +379,7 @@ def _scan_rows(
     (n_beams, _) = FitnessProfile.from_scans([scan]).beams
     beams = ("beams", f"about {n_beams:.0f} rows of points ({sensor.name}: {sensor.n_beams})")
     turned = check_beams(conditioned[0], used) if sensor.mounting.roll_deg is None else ()
-    model_rows, findings = _suiting_models(scan, scans[0][:, 3], used, frame, [*unit, *turned], reported)
+    model_rows, findings = _suiting_models(scan, scans[0], used, frame, [*unit, *turned], reported)
     document["refused"] |= any(_is_refused(findings.get(name) or ()) for name in DEFAULT_MODELS)
     document |= {**extents, "mounting": mounting, "beams": round(float(n_beams)), "models": findings}
     refusal = _refusal(document["refused"])
@@ -483,7 +480,7 @@ def _mounting_text(estimator: MountingEstimator) -> str:
 
 def _suiting_models(
     scan: Points,
-    remission: NDArray[np.float32],
+    recorded: Points,
     sensor: SensorProfile,
     frame: ModelFrame,
     unit: Sequence[str],
@@ -504,7 +501,7 @@ def _suiting_models(
             rows.append((card.name, "its card does not describe its training scans"))
             continue
         fitness = check_fitness(scan, FitnessProfile.from_dict(card.fitness), sensor, frame)
-        sentences = [*unit, *with_raw_remission(fitness, remission, sensor), *reported]
+        sentences = [*unit, *with_raw_remission(fitness, recorded, sensor), *reported]
         findings[card.name] = sentences
         rows += [(card.name, f"as a scan of {sensor.name}: {sentence}") for sentence in sentences]
         if not sentences:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from .arguments import Commands, add_command, add_mounting, add_networks, options, positive, positive_number
 from .output import many, print_error, print_line
 from .run import make_perceiver
-from .scans import with_mounting
+from .scans import check_sensor, with_mounting
 
 if TYPE_CHECKING:
     from ..perceiver import Perceiver
@@ -214,6 +214,7 @@ def _rolling(arguments: argparse.Namespace) -> Rolling | None:
 
 
 def _perceiver(arguments: argparse.Namespace, sensor: Any) -> Perceiver:
+    check_sensor(arguments)
     mounted = with_mounting(sensor, arguments)
     mismatch: Any = "warn" if arguments.anyway else "refuse"
     return make_perceiver(arguments, sensor=mounted, on_mismatch=mismatch, adapt=arguments.adapt)

@@ -34,6 +34,7 @@ from .report import Report
 from .scans import (
     Scans,
     Sensors,
+    check_sensor,
     find_images,
     find_scans,
     output_names,
@@ -127,6 +128,12 @@ def add_parser(commands: Commands) -> None:
         "--quaternion",
         "order of the quaternions in --poses (default: xyzw, unless the poses contradict it)",
         choices=("xyzw", "wxyz"),
+    )
+    reading(
+        "--poses-from",
+        "from where the poses in --poses map: sensor, to the world, or world, to the sensor (default: sensor, unless "
+        "the poses contradict it)",
+        choices=("sensor", "world"),
     )
     reading(
         "--on-mismatch",
@@ -281,12 +288,9 @@ def _check_usage(arguments: argparse.Namespace, kinds: Sequence[str]) -> None:
         arguments.usage_error("--accumulate needs --sensor with the name of one that does not spin, such as mid-360")
     if arguments.live and any(value is not None for value in file_options(arguments).values()):
         arguments.usage_error("--columns, --remission-field and --origin need no --live")
-    if arguments.quaternion is not None and arguments.poses is None:
-        arguments.usage_error("--quaternion needs --poses FILE")
-    if arguments.sensor is not None or arguments.extrinsic is not None or arguments.accumulate is not None:
-        from ..types.sensor import get_sensor
-
-        get_sensor(with_mounting(stated_sensor(arguments), arguments))  # one error, before the first scan
+    if (arguments.quaternion or arguments.poses_from) is not None and arguments.poses is None:
+        arguments.usage_error("--quaternion and --poses-from need --poses FILE")
+    check_sensor(arguments)
     if arguments.png:
         require("matplotlib", "view", "Drawing a picture")
     if arguments.gif:
@@ -447,7 +451,7 @@ class _Run:
         if arguments.deskew:
             from .straighten import Straightener
 
-            self._straightener = Straightener(arguments.poses, arguments.quaternion)
+            self._straightener = Straightener(arguments.poses, arguments.quaternion, arguments.poses_from)
         self._n = 0
         self._first_place: tuple[float, float, float] | None = None
 

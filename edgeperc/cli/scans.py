@@ -114,6 +114,7 @@ def scan_namer(path: Path) -> Callable[[int], Path]:
     return lambda k: path / f"{k:06d}"
 
 
+_UNITS_DEG = 2.0  # between the beams of two units of a model
 # Files that are read for three scans with points.
 _LOOKED_AT = 10
 
@@ -145,7 +146,12 @@ def find_sensor(paths: Iterable[Path], options: Mapping[str, Any]) -> SensorEsti
         for scan in scans[:MOST_SCANS]:
             with suppress(SensorError):
                 found.append(estimate_sensor([scan]))
-        if len({each.profile.name for each in found}) != 1:
+        names = sorted({each.profile.name for each in found})
+        if len(names) > 1:
+            raise SensorError(
+                f"the first scans are of several sensors: {', '.join(names)}; read those of each on their own"
+            ) from None
+        if not names:
             raise
         return found[0]
 
@@ -157,8 +163,8 @@ def scan_sensor(
     by the capture, or by the points of it and the files ``beside``. Raises SensorError, PointsError, MissingExtraError.
     """
     from ..readers.captures import is_capture, known_sensor, scan_files
-    from ..readers.identify import NotSpinningError, contradicts
-    from ..types.sensor import get_sensor
+    from ..readers.identify import KnownSensor, NotSpinningError, contradicts
+    from ..types.sensor import PUBLIC_SENSORS, get_sensor
 
     known: KnownSensor | None = None
     if arguments.sensor in (None, AUTO_SENSOR):
@@ -188,13 +194,26 @@ def scan_sensor(
         known = known_sensor(path, arguments.topic) if isinstance(path, Path) else None
     except EdgepercError:  # it need not name its sensor, and reading it tells of damage
         known = None
-    if known is not None and contradicts(given, known.profile):
+    what, is_other = "the capture", known is not None and contradicts(given, known.profile)
+    is_own = given.name not in PUBLIC_SENSORS and given.pattern is None
+    if known is None and is_own and isinstance(path, Path) and not is_capture(path):
+        with suppress(SensorError):
+            found = find_sensor([next(iter(beside), path)], reading_options(arguments))
+            if found is not None and found.is_built_in:
+                known, what = KnownSensor(found.profile, str(found)), "the points"
+                is_other = _has_other_beams(given, found.profile)
+    if known is not None and is_other:
         warnings.warn(
-            f"{path}: --sensor says {given.name}, the capture {known.profile.name} ({known.because}); it is read as "
+            f"{path}: --sensor says {given.name}, {what} {known.profile.name} ({known.because}); it is read as "
             f"{given.name}",
             stacklevel=2,
         )
     return with_mounting(arguments.sensor, arguments), "as --sensor says"
+
+
+def _has_other_beams(given: SensorProfile, found: SensorProfile) -> bool:
+    pairs = zip(given.elevations_deg, found.elevations_deg, strict=False)
+    return given.n_beams != found.n_beams or max(abs(one - other) for one, other in pairs) > _UNITS_DEG
 
 
 class Sensors:
@@ -243,16 +262,42 @@ def _fetched(urls: Iterable[Remote], folder: Path) -> Iterator[Path]:
             yield url.fetch(folder)
 
 
+_MOUNTING = {"height_m": "mount_height", "roll_deg": "roll", "pitch_deg": "pitch", "yaw_deg": "turn"}
+_ROUNDED = 0.05  # m or degrees, between an option and a file that say the same
+
+
+def _given(arguments: argparse.Namespace) -> dict[str, float | None]:
+    """Values of a `Mounting` that options give; None: to be found."""
+    values = {name: getattr(arguments, option, None) for name, option in _MOUNTING.items()}
+    return {name: None if value == "street" else value for name, value in values.items() if value is not None}
+
+
+def check_sensor(arguments: argparse.Namespace) -> None:
+    """Check ``--sensor`` and options of its mounting before the first scan; say what of ``--extrinsic`` is not taken.
+
+    Raises SensorError.
+    """
+    from ..types.mounting import Mounting
+    from ..types.sensor import get_sensor
+
+    get_sensor(with_mounting(stated_sensor(arguments), arguments))
+    file, given = getattr(arguments, "extrinsic", None), _given(arguments)
+    said = None if file is None or not given else Mounting.from_file(file)
+    for name, value in given.items() if said is not None else ():
+        of_file = getattr(said, name)
+        if value is None or abs((value - of_file + 180.0) % 360.0 - 180.0) > _ROUNDED:
+            option, taken = _MOUNTING[name].replace("_", "-"), "street" if value is None else f"{value:g}"
+            warnings.warn(
+                f"{file} says {name} = {of_file + 0.0:.2f}, and --{option} {taken}, which is taken", stacklevel=2
+            )
+
+
 def with_mounting(sensor: str | SensorProfile, arguments: argparse.Namespace) -> str | SensorProfile:
     """The sensor with ``--extrinsic``, options of single values, ``--accumulate`` and others. Raises SensorError."""
     from ..types.mounting import Mounting
     from ..types.sensor import get_sensor
 
-    options = {"height_m": "mount_height", "roll_deg": "roll", "pitch_deg": "pitch", "yaw_deg": "turn"}
-    given = {name: getattr(arguments, option, None) for name, option in options.items()}
-    values: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
-    if values.get("yaw_deg") == "street":
-        values["yaw_deg"] = None
+    values: dict[str, Any] = _given(arguments)
     file, ego = getattr(arguments, "extrinsic", None), getattr(arguments, "ego_box", None)
     remission = getattr(arguments, "remission_range", None)
     accumulate_s = getattr(arguments, "accumulate", None)

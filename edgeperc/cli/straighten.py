@@ -22,8 +22,14 @@ if TYPE_CHECKING:
 class Straightener:
     """Straightens scans by the poses of a file, or by the motion between tracked scans. Raises TrackingError."""
 
-    def __init__(self, poses: Path | None, quaternion: Literal["xyzw", "wxyz"] | None = None) -> None:
-        self._trajectory = None if poses is None else Trajectory.from_tum(poses, quaternion=quaternion)
+    def __init__(
+        self,
+        poses: Path | None,
+        quaternion: Literal["xyzw", "wxyz"] | None = None,
+        maps_from: Literal["sensor", "world"] | None = None,
+    ) -> None:
+        given = None if poses is None else Trajectory.from_tum(poses, quaternion=quaternion, maps_from=maps_from)
+        self._trajectory = given
         self._tracked: list[Tracks] = []
 
     def straighten(

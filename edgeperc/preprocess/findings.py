@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..types.frame import ModelFrame
-from ..types.mounting import MODEL_HEIGHT_M
+from ..types.mounting import MODEL_HEIGHT_M, Mounting
 from ..types.perception import DroppedPoints
 from ..types.points import Points
 from ..types.sensor import SensorProfile
@@ -231,7 +231,7 @@ _GROUND_OFF_M = 1.3
 _TOO_HIGH_DEG = 12.0
 # A spinning sensor has as many returns in all directions: the fullest of 64 sectors has at most 2.6 times the mean in
 # KITTI, PandaSet, Argoverse 2, Lyft, DDAD, nuScenes and View of Delft; 6 and more if the origin is 45 m off.
-_MOST_UNEVEN = 4.0
+_MOST_UNEVEN, _EVEN, _ALL_AROUND = 4.0, 2.6, 0.9
 _NEAREST_M = 25.0  # of 99 % of the points; at most 10 m in these data
 _NEAREST_HEIGHTS = 4.0  # the lowest beam of a vlp-16 meets the ground at 3.7 times its height
 _SAMPLE = 6000  # points
@@ -271,6 +271,7 @@ def _geometry_findings(scan: Measures, profile: FitnessProfile, sensor: SensorPr
     axes = _other_axes(scan)
     mistake = (
         _other_unit(scan, profile.range_median_m)
+        or _feet(scan, sensor)
         or (axes if scan.flat_axis in (0, 1) else room or axes)
         or _other_origin(scan)
     )
@@ -321,6 +322,34 @@ def _other_unit(scan: Measures, usual_m: Range) -> Finding | None:
     )
 
 
+FEET_PER_M = 3.28084
+BEYOND, _FAR_BEYOND, _ABOVE_CAR_M = 1.25, 2.2, 1.8
+"""Of the range of a sensor that 999 of 1,000 points are within: farther at any height, and above that of a car."""
+
+
+def _feet(scan: Measures, sensor: SensorProfile) -> Finding | None:
+    most = BEYOND if scan.raised_m > _ABOVE_CAR_M else _FAR_BEYOND
+    if scan.farthest_m <= most * sensor.max_range_m or scan.view_covered < _ALL_AROUND:
+        return None
+    return in_feet(sensor) if scan.farthest_m <= _DECIMETERS * sensor.max_range_m else _IN_DECIMETERS
+
+
+def in_feet(sensor: SensorProfile) -> Finding:
+    """What to say of points beyond the range of a sensor."""
+    return Finding(
+        f"Points are farther away than the {sensor.name} measures ({sensor.max_range_m:g} m): the coordinates seem to "
+        f"be in feet; multiply them by {1.0 / FEET_PER_M:.4f}. If they are in meters, pass sensor= a profile with the "
+        "max_range_m of the sensor.",
+        True,
+    )
+
+
+_DECIMETERS = 4.3  # times the range of a sensor
+_IN_DECIMETERS = Finding(
+    "Points are too far away, on all sides: the coordinates seem to be in decimeters; multiply them by 0.1.", True
+)
+
+
 def _other_axes(scan: Measures) -> Finding | None:
     if scan.flat_axis is None:
         return None
@@ -334,8 +363,11 @@ def _other_axes(scan: Measures) -> Finding | None:
 
 
 def _other_origin(scan: Measures) -> Finding | None:
-    if scan.unevenness <= _MOST_UNEVEN and scan.nearest_m <= _NEAREST_M + _NEAREST_HEIGHTS * max(0.0, scan.raised_m):
-        return None
+    if scan.nearest_m <= _NEAREST_M + _NEAREST_HEIGHTS * max(0.0, scan.raised_m):
+        if scan.unevenness <= _MOST_UNEVEN:
+            return None
+    elif scan.unevenness <= _EVEN and scan.view_covered > _ALL_AROUND:
+        return _IN_DECIMETERS
     return Finding(
         f"One direction holds {scan.unevenness:.1f} times as many points as the mean one, and the nearest "
         f"points are {scan.nearest_m:.0f} m away: the sensor is not at the origin, as in the frame of a map; "
@@ -429,6 +461,28 @@ def check_ground(
         Finding(
             "The ground seems to lie above the sensor, and there is none below: it is mounted upside down, or z points "
             f"down: {_TURN_OVER}",
+            True,
+        ),
+    )
+
+
+def check_hanging(
+    points: Points, support_of: Callable[[Points], float], below_of: Callable[[Points], float], known: Mounting
+) -> tuple[Finding, ...]:
+    """Describe a scan that is upside down because of the given roll, of a sensor that hangs.
+
+    points, support_of, below_of : as in `check_ground`.
+    """
+    if abs(known.roll_deg or 0.0) <= 90.0:
+        return ()
+    turned = points.copy()
+    turned[:, :3] = points[:, :3] @ known.rotation().T.astype(np.float32)
+    if not check_ground(turned, support_of, below_of):
+        return ()
+    return (
+        Finding(
+            f"With the given roll of {known.roll_deg:g} deg, the ground lies above the sensor, and none below: it "
+            "does not hang upside down, or the points are turned already: leave out the roll (--roll, --extrinsic).",
             True,
         ),
     )
@@ -554,18 +608,51 @@ def _other_number(scan: Measures, profile: FitnessProfile, sensor: SensorProfile
 
 
 _ALL_ZERO = "Remission is 0 for"
+# Share of the variance of the elevation, the azimuth, the height and the logarithm of the distance that 128 steps of
+# the remission explain: at most 0.37, 0.15, 0.17 and 0.5 in 120 real scans of nine sensors.
+_EXPLAINED = {"number of the beam": 0.97, "time or azimuth": 0.95, "height": 0.98, "distance": 0.99}
+_FEWEST_PLACED = 300
 
 
-def with_raw_remission(
-    findings: Iterable[Finding], remission: NDArray[np.floating], sensor: SensorProfile
-) -> tuple[Finding, ...]:
-    """The findings, but of a remission that is there in another unit, that, in place of one that is missing.
+def _place_as_remission(points: Points) -> Finding | None:
+    """What the remission is, if it follows from where the points are.
+
+    points : (n, 4) float32; as recorded.
+    """
+    sample = points[:: len(points) // (4 * _SAMPLE) + 1].astype(np.float64)
+    x, y, z, remission = sample[np.isfinite(sample).all(axis=1) & (np.hypot(sample[:, 0], sample[:, 1]) > 3.0)].T
+    if len(x) < _FEWEST_PLACED:
+        return None
+    edges = np.unique(np.quantile(remission, np.linspace(0.0, 1.0, 129)))
+    step = np.searchsorted(edges, remission, side="right")
+    n, flat = np.maximum(np.bincount(step), 1), np.hypot(x, y)
+    places = (np.arctan2(z, flat), (x + 1j * y) / flat, z, np.log(flat))
+    for (what, least), place in zip(_EXPLAINED.items(), places, strict=True):
+        mean = (np.bincount(step, place.real) + 1j * np.bincount(step, place.imag)) / n
+        if np.mean(np.abs(place - mean[step]) ** 2) < (1.0 - least) * np.mean(np.abs(place - place.mean()) ** 2):
+            return Finding(
+                f"The remission of each point follows from the {what}: the field holds something else. Say which one "
+                "is the remission: remission_field= or columns= (--remission-field, --columns).",
+                True,
+            )
+    return None
+
+
+def with_raw_remission(findings: Iterable[Finding], points: Points, sensor: SensorProfile) -> tuple[Finding, ...]:
+    """The findings, but of a remission that is there in another unit, that, in place of one that is missing, and of
+    one that is none, that alone.
 
     The function of a profile, such as a logarithm, maps all values of 0..1 to 0 where 0..255 is expected.
 
-    remission : (n,) as recorded.
+    points : (n, 4) float32; as recorded.
     """
     found = tuple(findings)
+    placed = (
+        None if any(finding.gross and "emission" not in finding for finding in found) else _place_as_remission(points)
+    )
+    if placed is not None:
+        return placed, *(finding for finding in found if "emission" not in finding)
+    remission = points[:, 3]
     if not any(finding.startswith(_ALL_ZERO) for finding in found):
         return found
     known = remission[np.isfinite(remission)].astype(np.float64)  # float32 may overflow in a difference

@@ -295,6 +295,7 @@ class Measures:
     nearest_m: float
     far_m: float
     most_m: float
+    farthest_m: float
     walls: Walls
     raised_m: float = 0.0  # the sensor, above that of the models
     is_on_car: bool = True  # it is as high above the ground as on a car
@@ -336,7 +337,7 @@ def measure(points: Points, azimuth_deg: tuple[float, float]) -> Measures | None
     low, high = (_quantile(elevations, share) / 2.0 - 90.0 if elevations.any() else 0.0 for share in (0.01, 0.99))
     peaks = heights.max(axis=1) / max(1.0, sums["n_near"])
     flattest = int(peaks.argmax())
-    most_m, far_m = (10.0 ** (_quantile(ranges, share) / 20.0 - 3.0) for share in (0.9, 0.99))
+    most_m, far_m, farthest_m = (10.0 ** (_quantile(ranges, share) / 20.0 - 3.0) for share in (0.9, 0.99, 0.999))
     has_ground = bool(peaks[2] >= _GROUND_SHARE)
     return Measures(
         points_in_view=sums["n_in_view"] * step,
@@ -364,6 +365,7 @@ def measure(points: Points, azimuth_deg: tuple[float, float]) -> Measures | None
         nearest_m=10.0 ** (_quantile(ranges, 0.01) / 20.0 - 3.0),
         far_m=far_m,
         most_m=most_m,
+        farthest_m=farthest_m,
         walls=_walls(points[::step]) if far_m < _STREET_M or most_m < _MOST_OF_STREET_M else Walls(),
     )
 

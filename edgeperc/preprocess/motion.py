@@ -146,7 +146,13 @@ class Trajectory:
         )
 
     @classmethod
-    def from_tum(cls, path: str | os.PathLike[str], *, quaternion: Literal["xyzw", "wxyz"] | None = None) -> Trajectory:
+    def from_tum(
+        cls,
+        path: str | os.PathLike[str],
+        *,
+        quaternion: Literal["xyzw", "wxyz"] | None = None,
+        maps_from: Literal["sensor", "world"] | None = None,
+    ) -> Trajectory:
         """Read a file in TUM's format, as kiss-icp, evo and others write it.
 
         Parameters
@@ -156,20 +162,25 @@ class Trajectory:
         quaternion : str, optional
             Order of the quaternion: ``"xyzw"`` (TUM) or ``"wxyz"`` (EuRoC, nuScenes, COLMAP). By default it is
             ``"xyzw"``, unless the poses contradict that.
+        maps_from : str, optional
+            ``"sensor"``: the poses are T_world_sensor (TUM); ``"world"``: they are its inverse (COLMAP, OpenCV). By
+            default they are T_world_sensor, unless they contradict that.
 
         Raises
         ------
         TrackingError
-            The file cannot be read, a line is not such eight numbers, or the sensor moves at more than 150 m/s. Or the
-            order is not given, and only as ``"wxyz"`` does the z axis of the sensor point up and its x axis along its
-            way.
+            The file cannot be read, a line is not such eight numbers, or the sensor moves at more than 150 m/s. Or
+            order and direction are not given, and only with others does the z axis of the sensor point up and its x
+            axis along its way.
         StampError
             Fewer than two lines, or their times do not rise.
         OptionError
-            ``quaternion`` is neither.
+            ``quaternion`` or ``maps_from`` is neither.
         """
         if quaternion not in (None, "xyzw", "wxyz"):
             raise OptionError(f"quaternion is {quaternion!r}; expected 'xyzw' or 'wxyz'")
+        if maps_from not in (None, "sensor", "world"):
+            raise OptionError(f"maps_from is {maps_from!r}; expected 'sensor' or 'world'")
         try:
             with Path(path).open("rb") as file:
                 content = file.read(MAX_BYTES + 1).removeprefix(b"\xef\xbb\xbf")
@@ -186,24 +197,26 @@ class Trajectory:
         if not rises.all():
             line = _line(content, int(np.argmin(rises)) + 1)
             raise StampError(f"{path}: the time of line {line} is not later than that before; expected times that rise")
-        with np.errstate(all="ignore"):
-            speeds = np.linalg.norm(np.diff(rows[:, 1:4], axis=0), axis=1) / np.diff(rows[:, 0])
-            speed = float(np.median(speeds)) if len(speeds) else 0.0
+        units, read_as = rows[:, 4:] / norm[:, None], (quaternion or "xyzw", maps_from or "sensor")
+        readings = {("xyzw", "sensor"): poses_of(rows[:, 1:4], units)}
+        readings["wxyz", "sensor"] = poses_of(rows[:, 1:4], np.roll(units, -1, axis=1))
+        readings |= {(order, "world"): _inverse(poses) for (order, _), poses in readings.items()}
+        poses = readings[read_as]
+        others = [key for key in readings if quaternion in (None, key[0]) and maps_from in (None, key[1])]
+        if np.isfinite(rows).all():
+            others = [key for key in others if _fits_better(readings[key], poses, rows[:, 0])]
+            if others:
+                best = max(others, key=lambda key: _rank(readings[key]))
+                raise TrackingError(
+                    f"{path}: read as {_reading(*read_as)}, the poses are those of a sensor whose z axis points "
+                    f"{_directions(poses)}; read as {_reading(*best)}, {_directions(readings[best])}. Say which is "
+                    "right: quaternion= or --quaternion, xyzw or wxyz; maps_from= or --poses-from, sensor or world"
+                )
+        speed = _speed(poses, rows[:, 0])
         if FASTEST_MPS < speed < math.inf:
             raise TrackingError(
                 f"{path}: by its poses, the sensor moves at {speed:,.0f} m/s; expected positions in meters and times "
                 "in seconds"
-            )
-        units = rows[:, 4:] / norm[:, None]
-        poses = poses_of(rows[:, 1:4], units)
-        other = poses_of(rows[:, 1:4], np.roll(units, -1, axis=1))
-        if quaternion == "wxyz":
-            poses = other
-        elif quaternion is None and np.isfinite(rows).all() and _fits_better(other, poses):
-            raise TrackingError(
-                f"{path}: read as x, y, z, w, the quaternions are those of a sensor whose z axis points "
-                f"{_directions(poses)}; read as w, x, y, z, {_directions(other)}. Say which is right: quaternion= or "
-                "--quaternion, xyzw or wxyz"
             )
         try:
             return cls(rows[:, 0], poses)
@@ -385,17 +398,51 @@ def _line(content: bytes, k: int) -> int:
     return rows[k] if k < len(rows) else k + 1
 
 
-def _fits_better(other: NDArray[np.float64], poses: NDArray[np.float64]) -> bool:
-    """Whether one reading of the same quaternions is that of a vehicle, and the second is not.
+def _inverse(poses: NDArray[np.float64]) -> NDArray[np.float64]:
+    inverse = poses.copy()
+    inverse[:, :3, :3] = poses[:, :3, :3].transpose(0, 2, 1)
+    with np.errstate(all="ignore"):
+        inverse[:, :3, 3] = -np.einsum("kij,kj->ki", inverse[:, :3, :3], poses[:, :3, 3])
+    return inverse
 
-    Where neither is, as for a camera's axes, a way that keeps its direction in the sensor decides.
+
+def _reading(quaternion: str, maps_from: str) -> str:
+    return f"{', '.join(quaternion)}{' and from the world to the sensor' if maps_from == 'world' else ''}"
+
+
+def _speed(poses: NDArray[np.float64], times_s: NDArray[np.float64]) -> float:
+    with np.errstate(all="ignore"):
+        speeds = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1) / np.diff(times_s)
+    return float(np.median(speeds)) if len(speeds) else 0.0
+
+
+def _fits_better(other: NDArray[np.float64], poses: NDArray[np.float64], times_s: NDArray[np.float64]) -> bool:
+    """Whether one reading of the same poses is that of a vehicle, and the second is not.
+
+    What is too fast is none. Where neither is, as for a camera's axes, or both, a way that keeps its direction in the
+    sensor decides; an upright robot may go to and fro.
     """
-    (other_up, other_way), (up, way) = _up_and_way(other), _up_and_way(poses)
-    is_other = other_up > UPRIGHT and (other_way is None or other_way[0] > FORWARD)
+    too_fast = [_speed(each, times_s) > FASTEST_MPS for each in (other, poses)]
+    if any(too_fast):
+        return too_fast == [False, True]
+    (is_other, other_keeps, _), (is_vehicle, keeps, up) = _likeness(other), _likeness(poses)
+    if is_other != is_vehicle:
+        return is_other and not keeps > SAME_WAY > other_keeps
+    return other_keeps > SAME_WAY > keeps and (is_vehicle or up < UPRIGHT)
+
+
+def _likeness(poses: NDArray[np.float64]) -> tuple[bool, float, float]:
+    """Whether the poses are those of a vehicle, how well its way keeps its direction in the sensor, 0 to 1, and how
+    upright it is.
+    """
+    up, way = _up_and_way(poses)
     is_vehicle = up > UPRIGHT and (way is None or way[0] > FORWARD)
-    if is_other or is_vehicle or other_way is None or way is None:
-        return is_other and not is_vehicle
-    return bool(np.linalg.norm(other_way) > SAME_WAY > np.linalg.norm(way))
+    return is_vehicle, SAME_WAY if way is None else float(np.linalg.norm(way)), up
+
+
+def _rank(poses: NDArray[np.float64]) -> tuple[bool, float]:
+    is_vehicle, keeps, up = _likeness(poses)
+    return is_vehicle, round(keeps + up, 2)
 
 
 def _up_and_way(poses: NDArray[np.float64]) -> tuple[float, NDArray[np.float64] | None]:

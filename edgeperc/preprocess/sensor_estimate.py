@@ -19,7 +19,7 @@ from ..errors import SensorError
 from ..system.kernels import njit
 from ..types.points import Points
 from ..types.sensor import SAY_PATTERN, SENSORS, SensorProfile
-from .findings import check_coordinates
+from .findings import BEYOND, FEET_PER_M, check_coordinates, in_feet
 
 __all__ = ["MOST_SCANS", "SensorEstimate", "compile_votes", "estimate_sensor", "fill_votes", "has_enough_points"]
 
@@ -204,8 +204,9 @@ def estimate_sensor(scans: Sequence[Points]) -> SensorEstimate:
         polar = [_straightened(each) for each in polar]
         beams, match, on_beams = _beams_of(polar)
         on_beams = on_beams if match.name else min(on_beams, _ON_KNOWN)  # moved beams are not sure to 0.1 degrees
-    least = _ON_MOVED if match.name == "hdl-64e" else _ON_KNOWN if match.name else _ON_BEAM
-    if on_beams < least:
+    if not match.name and (name := _in_feet(polar)):
+        raise SensorError(f"the sensor cannot be told from the scan. {in_feet(SENSORS[name])}")
+    if on_beams < _least_on_beams(match):
         mistake = check_coordinates(max(clean, key=len))
         if mistake is not None:
             raise SensorError(f"the sensor cannot be told from the scan. {mistake}")
@@ -245,6 +246,19 @@ def estimate_sensor(scans: Sequence[Points]) -> SensorEstimate:
         nearest_m=round(float(np.quantile(ranges, 0.001)), 2),
         blind_deg=blind,
     )
+
+
+def _least_on_beams(match: Match) -> float:
+    return _ON_MOVED if match.name == "hdl-64e" else _ON_KNOWN if match.name else _ON_BEAM
+
+
+def _in_feet(polar: Sequence[Polar]) -> str:
+    """The built-in sensor whose beams a scan has if its coordinates are in feet, and farther than it measures."""
+    scaled = [each._replace(flat=each.flat / FEET_PER_M, z=each.z / FEET_PER_M) for each in polar]
+    _, match, on_beams = _beams_of(scaled)
+    farthest = max(float(np.quantile(np.hypot(each.flat, each.z), 0.999)) for each in polar)
+    is_found = match.name and on_beams >= _least_on_beams(match)
+    return match.name if is_found and farthest > BEYOND * SENSORS[match.name].max_range_m else ""
 
 
 def _patterns_of(polar: Sequence[Polar]) -> str:

@@ -62,7 +62,7 @@ def read_scans(
         bytes of a file decide its format, not its name.
     topic : str, optional
         What to read if there are several sensors: the topic of point clouds; ``TOPIC@FRAME`` for those of one frame;
-        the serial number of an Ouster or in an ``.lvx2``; the IPv4 address of another sensor, or ``ADDRESS:PORT``.
+        the serial number of an Ouster or in an ``.lvx2``; the IP address of another sensor, or ``ADDRESS:PORT``.
     remission_field : str, optional
         Name of the remission field, as in `edgeperc.read_points`; ``reflectivity`` by default for an Ouster capture.
     columns : int or sequence of str, optional

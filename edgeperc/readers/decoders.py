@@ -7,7 +7,6 @@ import shutil
 import tempfile
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence, Set
-from contextlib import nullcontext, suppress
 from itertools import islice
 from pathlib import Path
 from typing import Any, TypeVar
@@ -18,6 +17,7 @@ from ..errors import MissingExtraError, PointsError
 from ..system.clock import Stamp
 from ..system.extras import require
 from ..types.points import MapError, as_points, table_columns
+from .alternation import told_apart
 from .bags import BagFile, open_bag
 from .clouds import CLOUD_READERS, Cloud, cloud_points, cloud_table, describe_cloud
 from .mcap import Channel
@@ -74,7 +74,10 @@ def decode(
     scans = (
         _packet_scans(path, kind, topic, remission_field, warn, alive)
         if kind in (".lvx2", ".osf", ".pcap")
-        else of_plausible_duration(_bag_scans(path, topic, remission_field, alive, times))
+        else told_apart(
+            of_plausible_duration(_bag_scans(path, topic, remission_field, alive, times)),
+            lambda text: warn(f"{path}: {text}"),
+        )
     )
     for stamp_s, points, times_s in _with_typed_errors(path, scans):
         yield TimedScan(stamp_s, points, times_s if times else None)
@@ -94,7 +97,7 @@ def describe(path: Path, kind: str, topic: str | None, alive: Callable[[], None]
     def found() -> Iterator[dict[str, Any]]:
         if kind == ".osf":
             frames = _open_osf(path)
-            chosen = frames.sensor_info[_choose("sensor", [str(info.sn) for info in frames.sensor_info], topic)]
+            chosen = frames.sensor_info[_choose("LiDAR", [str(info.sn) for info in frames.sensor_info], topic)]
             yield {"metadata": chosen.to_json_string()}
         else:
             for name, message, _ in _clouds(path, topic, alive):
@@ -157,26 +160,24 @@ def _packet_scans(
     elif kind == ".lvx2":
         from .livox_packets import lvx2_scans, lvx2_sensors  # numba, which bags do without
 
-        scans = lvx2_scans(path, _choose("sensor", lvx2_sensors(path), topic), alive)
+        scans = lvx2_scans(path, _choose("LiDAR", lvx2_sensors(path), topic), alive)
     else:
         is_velodyne = next(velodyne_packets(path), None) is not None
         senders = velodyne_senders(path) if is_velodyne else []
-        lidar = None
-        if not is_velodyne or has_other_lidars(path):
+        lidar, ousters = None, list[str]()
+        if not is_velodyne or has_other_lidars(path, whole=topic is not None):
             from .lidars import lidar_of, turns_of  # numba
 
-            with suppress(PointsError) if is_velodyne else nullcontext():  # one that is not decoded
-                lidar = lidar_of(path)
+            lidar = lidar_of(path, topic)
+            ousters = _ousters_in(path, whole=topic is not None) if is_velodyne or lidar is not None else []
         others = [] if lidar is None else lidar.senders
-        ousters = _ousters_beside(path) if is_velodyne or lidar is not None else []
         known = [*senders, *others, *ousters]
-        is_one_kind = [bool(senders), bool(others), bool(ousters)].count(True) == 1
-        title = "LiDAR" if not is_one_kind else "Velodyne" if lidar is None else lidar.title
-        sender = known[_choose(title, known, topic)] if len(known) > 1 else None
+        chosen = known[_choose("LiDAR", known, topic)] if len(known) > 1 or (known and topic is not None) else None
+        sender = chosen if len(known) > 1 else None
         if sender in ousters:
             scans = _ouster_turns(path, sender, remission_field, warn, alive)
         elif lidar is not None and (not is_velodyne or sender in others):
-            scans = turns_of(path, lidar, sender, alive, warn)
+            scans = turns_of(path, lidar, sender, alive)
         elif is_velodyne:
             scans = _velodyne_scans(_decodable(path, alive, sender))
         else:
@@ -187,21 +188,33 @@ def _packet_scans(
         yield scan
     # So far, there was no error if the file ends inside a packet, or has no packets of such a sensor.
     n_packets = sum(1 for _ in pcap_packets(path)) if kind == ".pcap" else 0
+    if n_scans and kind == ".pcap" and topic is None:
+        _warn_of_others(path, alive, warn)
     if not n_scans:
         content = f"has {n_packets} packets, none from a supported LiDAR" if kind == ".pcap" else "holds no scan"
         raise PointsError(f"the capture {content}; expected a capture of a LiDAR, an Ouster's with its metadata")
 
 
-def _ousters_beside(path: Path) -> list[str]:
-    """Serial numbers in metadata beside a capture whose packets are among the first."""
-    from .ouster_packets import layout_of
+def _ousters_in(path: Path, *, whole: bool) -> list[str]:
+    """Serial numbers in metadata beside a capture whose packets are among the first, or in the whole file."""
+    from .lidars import ousters_beside
 
-    layouts = []
-    with suppress(PointsError):  # there is none
-        layouts = [layout_of(json.loads(read_metadata(file))) for file in metadata_beside(path)]
-    first = islice(Datagrams(path, lambda: None), SNIFFED_PACKETS if layouts else 0)
-    sizes = {len(datagram.payload) for datagram in first}
+    layouts = ousters_beside(path)
+    looked_at = islice(Datagrams(path, lambda: None), (None if whole else SNIFFED_PACKETS) if layouts else 0)
+    sizes = {len(datagram.payload) for datagram in looked_at}
     return [layout.name for layout in layouts if layout.packet_bytes in sizes]
+
+
+def _warn_of_others(path: Path, alive: Callable[[], None], warn: Callable[[str], None]) -> None:
+    """Say which sensors a capture has where only one was among its first packets."""
+    if has_other_lidars(path, whole=True):
+        from .lidars import all_senders
+
+        if len(names := all_senders(path, alive)) > 1:
+            warn(
+                f"{path}: the scans are those of the first sensor alone; there are packets of several, "
+                f"{', '.join(names)}: choose one by topic (--topic)"
+            )
 
 
 def _decodable(path: Path, alive: Callable[[], None], sender: str | None) -> Path:
@@ -244,7 +257,7 @@ def _ouster_turns(
             layouts.append(layout_of(json.loads(read_metadata(file))))
         except PointsError as exc:
             raise PointsError(f"the metadata {file.name} cannot be read: {exc}") from exc
-    chosen = layouts[_choose("sensor", [layout.name for layout in layouts], topic)]
+    chosen = layouts[_choose("LiDAR", [layout.name for layout in layouts], topic)]
     stream = OusterStream(chosen, remission_field)
     sizes = {size for layout in layouts for size in (layout.packet_bytes, *layout.other_bytes)}
     ports, n_other_sizes, n_others, n_used = set[int](), Counter[int](), 0, 0
@@ -273,6 +286,11 @@ def _ouster_turns(
             f"the metadata is of the sensor {chosen.name} (initialization_id {chosen.init_id}), and none of the "
             f"{n_others:,} packets is; expected the metadata that was saved with the capture"
         )
+    if n_others and n_used and topic is None and len(layouts) == 1:
+        warn(
+            f"{path}: left out {n_others:,} packets of another Ouster, or of this one after it had started anew: their "
+            "serial number or initialization_id is not that of the metadata. Put that of each beside the capture"
+        )
     names = sender_names(senders)
     if len(names) > 1:
         warn(
@@ -290,7 +308,7 @@ def _ouster_turns(
 def _ouster_scans(frames: Any, topic: str | None, remission_field: str | None) -> Iterator[TimedScan]:
     core = require("ouster.sdk.core", "ouster", "Reading an Ouster capture", package="ouster-sdk")
     serials = [str(info.sn) for info in frames.sensor_info]
-    chosen = _choose("sensor", serials, topic)
+    chosen = _choose("LiDAR", serials, topic)
     to_xyz = core.XYZLut(frames.sensor_info[chosen], False)  # in the sensor's frame, not the vehicle's
     name = (remission_field or "reflectivity").upper()
     for frame_set in frames:

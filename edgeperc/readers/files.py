@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import PointsError
-from ..types.points import as_float64, as_points, assemble, plain_name, remission_name, table_columns
+from ..types.points import as_float64, as_points, assemble, is_remission_name, plain_name, remission_name, table_columns
 from .inflate import inflate, most_bytes
 from .origin import find_place
 from .pcd import begins_like_pcd, parse_pcd
@@ -221,8 +221,18 @@ def _parse(data: NDArray[np.uint8], name: str, options: FileOptions) -> _Read:
 def _of_values(columns: Columns, options: FileOptions) -> _Read:
     """Of a file whose columns have the names of the options, or none."""
     if options.columns is None or isinstance(options.columns, int | np.integer):
-        return _of_columns(columns, options._replace(remission_field=None))._replace(fields={})
+        return _of_columns(columns, _unnamed(options))._replace(fields={})
     return _of_columns(columns, options)
+
+
+def _unnamed(options: FileOptions) -> FileOptions:
+    """Options for values without names, of which the fourth is the remission. Raises PointsError."""
+    if options.remission_field is not None and not is_remission_name(options.remission_field):
+        raise PointsError(
+            f"there is no field {options.remission_field!r} for the remission: the values have no names. Say what they "
+            "are: columns=, or --columns x y z intensity ring"
+        )
+    return options._replace(remission_field=None)
 
 
 def _of_stored(array: NDArray[Any], options: FileOptions) -> _Read:
@@ -245,6 +255,7 @@ def _of_stored(array: NDArray[Any], options: FileOptions) -> _Read:
 
 def _of_array(array: NDArray[Any], options: FileOptions) -> _Read:
     fields = table_columns(array)
+    options = options if fields else _unnamed(options)
     xyz = fields if fields or array.ndim != 2 else dict(zip("xyz", array.T, strict=False))
     origin = _origin(xyz, options)
     return _Read(as_points(array, remission_field=options.remission_field, origin_m=origin), fields, origin)

@@ -57,7 +57,7 @@ def of_packets(path: Path, topic: str | None = None) -> KnownSensor:
     """
     sender = topic if topic is not None and topic in velodyne_senders(path) else None  # reads the whole file
     names = {velodyne_name(packet) for packet in velodyne_packets(path, sender)}
-    is_other = not names or (topic is not None and sender is None and has_other_lidars(path))
+    is_other = not names or (topic is not None and sender is None and has_other_lidars(path, whole=True))
     by_serial = topic is not None and topic in _serials_beside(path)
     known = _of_lidar(path, topic, beside=bool(names)) if is_other and not by_serial else None
     if known is not None:
@@ -100,7 +100,7 @@ def _of_lidar(path: Path, topic: str | None, *, beside: bool = False) -> KnownSe
     """
     from .lidars import columns_of, lidar_of, open_spinning  # numba
 
-    lidar = lidar_of(path)
+    lidar = lidar_of(path, topic)
     if lidar is None or (beside and topic not in lidar.senders):
         return None
     if lidar.row is None:

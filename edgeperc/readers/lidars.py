@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 from collections import Counter
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
@@ -12,6 +14,8 @@ import numpy as np
 
 from ..errors import PointsError
 from .livox_packets import LivoxStream, points_of
+from .ouster import metadata_beside, read_metadata
+from .ouster_packets import Layout, layout_of
 from .packets import SNIFFED_PACKETS, Datagrams, is_of_velodyne, sender_names
 from .spinning_packets import (
     DIFOP,
@@ -28,8 +32,11 @@ from .spinning_packets import (
 from .times import TimedScan
 
 _OTHER_BYTES = 600  # what LiDARs send of their GPS is shorter
-_LIVOX = "livox"
+_LIVOX, _VELODYNE, _OUSTER = "livox", "Velodyne", "Ouster"
+_OTHERS = {_VELODYNE, _OUSTER}  # that are decoded elsewhere
+_Source = tuple[str | None, tuple[str, int]]  # kind, address and port
 _LIVOX_SIZES = (1380, 804, 996)
+_BY_CHANCE = 20  # packets of other sensors that may begin like these
 _STEPS = 200  # packets that show how far apart columns are
 _ALIKE = {"helios-32", "helios-16"}  # by their packets; the angles tell them apart
 
@@ -38,7 +45,7 @@ class Lidar(NamedTuple):
     """What sends most of the first packets.
 
     row : the format of a spinning sensor; None: Livox.
-    senders : such sensors, as `packets.sender_names` calls them.
+    senders : of these makers, as `packets.sender_names` calls them.
     first : address and port of the one with the most packets.
     """
 
@@ -46,38 +53,84 @@ class Lidar(NamedTuple):
     senders: list[str]
     first: str
 
-    @property
-    def title(self) -> str:
-        """The model."""
-        return "Livox sensor" if self.row is None else self.row.title
 
+def lidar_of(path: Path, topic: str | None = None) -> Lidar | None:
+    """The LiDAR of a pcap file, beside a Velodyne's or an Ouster's packets or without; None if it is none of these
+    makers'.
 
-def lidar_of(path: Path) -> Lidar | None:
-    """The LiDAR of a pcap file, beside a Velodyne's packets or without; None if it is none of these makers'.
-
+    topic : if it is a sender, that one; a whole file is searched for it.
     Raises PointsError: It is one that is not decoded.
     """
-    names, senders, rows = Counter[str | None](), dict[str, Counter[tuple[str, int]]](), dict[str, Format]()
-    for datagram in islice(Datagrams(path, lambda: None), SNIFFED_PACKETS):
-        if bytes(datagram.payload[:8]) == DIFOP or is_of_velodyne(datagram):
-            continue
-        row = format_of(datagram.payload)
-        name = _name_of(datagram.payload) if row is None else row.name
-        if row is not None:
-            rows.setdefault(row.name, row)
-        if name is not None or len(datagram.payload) > _OTHER_BYTES:
-            names[name] += 1
-            senders.setdefault(name or "", Counter())[datagram.sender, datagram.port] += 1
-    name, n = max(names.items(), key=lambda item: item[1], default=(None, 0))
-    if name is None or 2 * n <= names.total():  # packets of other sensors may begin like these by chance
+    counts, rows = _counted(path, lambda: None, SNIFFED_PACKETS if topic is None else None)
+    is_beside = any(kind in _OTHERS for kind, _ in counts)
+    counts = Counter({key: n for key, n in counts.items() if key[0] not in _OTHERS})
+    names = _names(counts)
+    kinds, sources = Counter[str | None](), dict[str | None, Counter[tuple[str, int]]]()
+    for (kind, source), n in counts.items():
+        if topic not in names or topic in (source[0], f"{source[0]}:{source[1]}"):
+            kinds[kind] += n
+            sources.setdefault(kind, Counter())[source] += n
+    n_unknown = kinds.pop(None, 0)
+    kind, n = max(kinds.items(), key=lambda item: item[1], default=(None, 0))
+    if kind is None or n <= min(n_unknown, _BY_CHANCE):
         return None
-    if name in rows or name == _LIVOX:
-        (address, port), _ = senders[name].most_common(1)[0]
-        return Lidar(rows.get(name), sender_names(senders[name]), f"{address}:{port}")
+    if kind in rows or kind == _LIVOX:
+        (address, port), _ = sources[kind].most_common(1)[0]
+        return Lidar(rows.get(kind), names, f"{address}:{port}")
+    if is_beside:
+        return None
     raise PointsError(
-        f"a capture of a {name}, which cannot be decoded; the documentation lists those that are. Convert it with "
-        f"{name.split()[0]}'s driver, to a ROS bag or to .pcd files"
+        f"a capture of a {kind}, which cannot be decoded; the documentation lists those that are. Convert it with "
+        f"{kind.split()[0]}'s driver, to a ROS bag or to .pcd files"
     )
+
+
+def all_senders(path: Path, alive: Callable[[], None]) -> list[str]:
+    """What sends a LiDAR's packets in a whole pcap file, with one name for all Ousters."""
+    return _names(_counted(path, alive, None)[0])
+
+
+def _names(counts: Counter[_Source]) -> list[str]:
+    known = Counter[tuple[str, int]]()
+    for (kind, source), n in counts.items():
+        if kind is not None:
+            known[(_OUSTER, 0) if kind == _OUSTER else source] += n
+    return sender_names(known)
+
+
+def _counted(path: Path, alive: Callable[[], None], most: int | None) -> tuple[Counter[_Source], dict[str, Format]]:
+    """How many packets each address and port has of each kind, None for unknown ones, and the formats of the kinds."""
+    ouster_bytes = {layout.packet_bytes for layout in ousters_beside(path)}
+    counts, rows = Counter[_Source](), dict[str, Format]()
+    datagrams = Datagrams(path, alive, most)
+    for datagram in datagrams:
+        size = len(datagram.payload)
+        if bytes(datagram.payload[:8]) == DIFOP:
+            continue
+        if is_of_velodyne(datagram):
+            kind: str | None = _VELODYNE
+        elif size in ouster_bytes:
+            kind = _OUSTER
+        elif (row := format_of(datagram.payload)) is not None:
+            kind = row.name
+            rows.setdefault(kind, row)
+        else:
+            kind = _name_of(datagram.payload)
+        if kind is not None or size > _OTHER_BYTES:
+            counts[kind, (datagram.sender, datagram.port)] += 1
+    if not counts and datagrams.n_cut > _BY_CHANCE:
+        raise PointsError(
+            f"{datagrams.n_cut:,} packets of the capture were not kept to their end, as with a limit of tcpdump or "
+            "Wireshark: capture whole packets (tcpdump -s 0)"
+        )
+    return counts, rows
+
+
+def ousters_beside(path: Path) -> list[Layout]:
+    """What the metadata beside a capture says of Ousters; empty if there is none, or one cannot be read."""
+    with suppress(PointsError):
+        return [layout_of(json.loads(read_metadata(file))) for file in metadata_beside(path)]
+    return []
 
 
 def _name_of(payload: memoryview) -> str | None:
@@ -131,59 +184,35 @@ def columns_of(path: Path, row: Format, sender: str | None) -> int:
     return round(firings * 360.0 / float(np.median(steps))) if len(steps) else 0
 
 
-def _of_format(
-    path: Path,
-    row: Format,
-    sender: str | None,
-    alive: Callable[[], None],
-    seen: Counter[tuple[str, int]] | None = None,
-) -> Iterator[memoryview]:
-    """The packets of a sensor, all of one size.
-
-    seen : gets the packets of each address and port.
-    """
+def _of_format(path: Path, row: Format, sender: str | None, alive: Callable[[], None]) -> Iterator[memoryview]:
+    """The packets of a sensor, all of one size."""
     size = 0
     for datagram in Datagrams(path, alive):
         found = format_of(datagram.payload)
-        if found is None or (found != row and {found.name, row.name} != _ALIKE):
-            continue
-        if seen is not None:
-            seen[datagram.sender, datagram.port] += 1
-        if not datagram.is_from(sender):
+        if found is None or (found != row and {found.name, row.name} != _ALIKE) or not datagram.is_from(sender):
             continue
         size = size or len(datagram.payload)
         if len(datagram.payload) == size:
             yield datagram.payload
 
 
-def turns_of(
-    path: Path, lidar: Lidar, sender: str | None, alive: Callable[[], None], warn: Callable[[str], None]
-) -> Iterator[TimedScan]:
+def turns_of(path: Path, lidar: Lidar, sender: str | None, alive: Callable[[], None]) -> Iterator[TimedScan]:
     """The turns of a spinning sensor, or what a Livox sees in tenths of a second.
 
-    sender : None: the only one among the first packets; a warning names those that begin later.
+    sender : None: the only one among the first packets.
     Raises PointsError: As `open_spinning`.
     """
-    seen = Counter[tuple[str, int]]()
     first = sender or lidar.first
     if lidar.row is not None:
         row, angles = open_spinning(path, lidar.row, sender, alive)
         stream = SpinningStream(row, angles)
-        for payload in _of_format(path, row, first, alive, seen):
+        for payload in _of_format(path, row, first, alive):
             yield from stream.add(payload)
         yield from stream.end()
     else:
         livox = LivoxStream()
         for datagram in Datagrams(path, alive):
-            points = points_of(datagram.payload)
+            points = points_of(datagram.payload) if datagram.is_from(first) else None
             if points is not None:
-                seen[datagram.sender, datagram.port] += 1
-                if datagram.is_from(first):
-                    yield from livox.add(points)
+                yield from livox.add(points)
         yield from livox.end()
-    names = sender_names(seen)
-    if sender is None and len(names) > 1:
-        warn(
-            f"{path}: the scans are those of {first} alone; later, there are packets of several sensors, "
-            f"{', '.join(names)}: choose one by topic (--topic)"
-        )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ipaddress
 import struct
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
@@ -17,6 +18,7 @@ LVX_MAGIC = b"livox_tech"
 
 # Bytes in front of the IP header and the place of the EtherType, by the link type: Ethernet, Linux cooked 1 and 2.
 _LINKS = {1: (14, 12), 113: (16, 14), 276: (20, 0)}
+_FRAGMENT = 44  # header of IPv6
 _LOOPBACK_LINKS, _RAW_LINKS = (0, 108), (12, 14, 101, 228)  # four bytes in front of the IP header, none
 
 VELODYNE_BYTES = 1206
@@ -47,9 +49,9 @@ _PENDING = 256
 
 
 class Datagram(NamedTuple):
-    """What a UDP datagram over IPv4 carries.
+    """What a UDP datagram carries.
 
-    sender : the IPv4 address.
+    sender : the IPv4 or IPv6 address.
     port : that it was sent to.
     stamp_s : when its last part was captured.
     """
@@ -64,6 +66,10 @@ class Datagram(NamedTuple):
         return sender in (None, self.sender, f"{self.sender}:{self.port}")
 
 
+class _EndsEarlyError(ValueError):
+    """A packet was not captured to its end."""
+
+
 class _Fragment(NamedTuple):
     source: bytes  # addresses and identification: the same for all fragments of a datagram
     sender: memoryview
@@ -73,34 +79,41 @@ class _Fragment(NamedTuple):
 
 
 class Datagrams:
-    """The whole UDP datagrams over IPv4 of a pcap file, put together from fragments; packets of others are left out.
+    """The whole UDP datagrams of a pcap file, put together from fragments, each once; other packets are left out.
 
     path : a pcap file; one that is cut short is read up to the cut.
     alive : called now and then, for large files.
     most : packets of the file that are looked at; None: all.
     n_bad : so far, those that are empty, incomplete, or contradict themselves.
+    n_cut : packets of them that end early.
     """
 
     def __init__(self, path: Path, alive: Callable[[], None], most: int | None = None) -> None:
-        self._path, self._alive, self._most, self.n_bad = path, alive, most, 0
+        self._path, self._alive, self._most = path, alive, most
+        self.n_bad = self.n_cut = 0
         self._pending: dict[bytes, list[memoryview]] = {}  # by source: fragments so far
 
     def __iter__(self) -> Iterator[Datagram]:
         with suppress(CutShortError):  # a cut file says so itself
+            before: tuple[memoryview, ...] = ()
             for k, (link, stamp_s, packet) in enumerate(islice(pcap_packets(self._path), self._most)):
                 if k % 10_000 == 0:
                     self._alive()
                 try:
                     part = _fragment(packet, link)
                     payload = None if part is None else self._whole(part)
-                except ValueError:
+                except ValueError as exc:
                     self.n_bad += 1
+                    self.n_cut += isinstance(exc, _EndsEarlyError)
                     continue
                 if part is not None and payload is not None:
                     port, length = struct.unpack_from(">2xHH", payload)
                     if length != len(payload) or length == 8:
                         self.n_bad += 1
                         continue
+                    if length > _GPS_BYTES and (part.sender, payload) == before:  # on two interfaces, or mirrored
+                        continue
+                    before = part.sender, payload
                     yield Datagram(_address(part.sender), port, stamp_s, payload[8:])
             self.n_bad += len(self._pending)
 
@@ -162,8 +175,10 @@ def velodyne_senders(path: Path) -> list[str]:
     for link, _, packet in islice(pcap_packets(path, whole=False), SNIFFED_PACKETS, None):
         with suppress(ValueError):
             at = _ip_at(packet, link) if len(packet) > VELODYNE_BYTES else None
-            if at is not None and bytes(packet[at + 28 : at + 30]) == _FLAG:  # behind headers of 20 and 8 bytes
-                counts[_address(packet[at + 12 : at + 16]), int.from_bytes(packet[at + 22 : at + 24], "big")] += 1
+            header, address = (40, slice(8, 24)) if at is not None and packet[at] >> 4 == 6 else (20, slice(12, 16))
+            content = None if at is None else packet[at:]
+            if content is not None and bytes(content[header + 8 : header + 10]) == _FLAG:
+                counts[_address(content[address]), int.from_bytes(content[header + 2 : header + 4], "big")] += 1
     return sender_names(counts)
 
 
@@ -172,10 +187,10 @@ def is_of_velodyne(datagram: Datagram) -> bool:
     return len(datagram.payload) == VELODYNE_BYTES and bytes(datagram.payload[:2]) == _FLAG
 
 
-def has_other_lidars(path: Path) -> bool:
-    """Whether the first datagrams of a pcap file may be those of other LiDARs than Velodyne's."""
-    first = Datagrams(path, lambda: None, SNIFFED_PACKETS)
-    return any(len(datagram.payload) > _GPS_BYTES and not is_of_velodyne(datagram) for datagram in first)
+def has_other_lidars(path: Path, *, whole: bool = False) -> bool:
+    """Whether the first datagrams of a pcap file, or any, may be those of other LiDARs than Velodyne's."""
+    looked_at = Datagrams(path, lambda: None, None if whole else SNIFFED_PACKETS)
+    return any(len(datagram.payload) > _GPS_BYTES and not is_of_velodyne(datagram) for datagram in looked_at)
 
 
 def _velodyne_datagrams(path: Path, most: int | None) -> Iterator[Datagram]:
@@ -195,47 +210,72 @@ def _bare_velodyne_packets(path: Path) -> Iterator[memoryview]:
 
 
 def _ip_at(packet: memoryview, link: int) -> int | None:
-    """Where the IPv4 header begins in a packet, None if there is none; ValueError if it is cut inside the link's."""
+    """Where the header of IP begins in a packet, None if there is none; ValueError if it is cut inside the link's."""
     if link in _LINKS:
         offset, kind = _LINKS[link]
         if len(packet) < offset:
             raise ValueError("cut inside the link's header")
         while bytes(packet[kind : kind + 2]) in (b"\x81\x00", b"\x88\xa8") and len(packet) >= offset + 4:  # a VLAN
             offset, kind = offset + 4, kind + 4
-        return offset if bytes(packet[kind : kind + 2]) == b"\x08\x00" else None
+        return offset if bytes(packet[kind : kind + 2]) in (b"\x08\x00", b"\x86\xdd") else None
     if link in _LOOPBACK_LINKS:
         return 4
     return 0 if link in _RAW_LINKS else None
 
 
 def _fragment(packet: memoryview, link: int) -> _Fragment | None:
-    """The part of a UDP datagram over IPv4 in a packet, None if it holds none; ValueError if lengths contradict."""
+    """The part of a UDP datagram in a packet, None if it holds none; ValueError if lengths contradict."""
     offset = _ip_at(packet, link)
     if offset is None:
         return None
     if len(packet) < offset + 20:
         raise ValueError("cut inside the IP header")
+    if packet[offset] >> 4 == 6:
+        return _fragment_6(packet[offset:])
     if packet[offset] >> 4 != 4 or packet[offset + 9] != 17:
         return None
     header = 4 * (packet[offset] & 15)
     total, identification, place = struct.unpack_from(">HHH", packet, offset + 2)
-    if not 20 <= header < total <= len(packet) - offset:
+    if 20 <= header < total and total > len(packet) - offset:
+        raise _EndsEarlyError("the record is shorter than the length in the IP header")
+    if not 20 <= header < total:
         raise ValueError("the length in the IP header contradicts the record")
     source = bytes(packet[offset + 12 : offset + 20]) + identification.to_bytes(2, "big")
     payload = packet[offset + header : offset + total]
     return _Fragment(source, packet[offset + 12 : offset + 16], 8 * (place & 0x1FFF), bool(place & 0x2000), payload)
 
 
+def _fragment_6(packet: memoryview) -> _Fragment | None:
+    """The same of a packet that begins with the header of IPv6."""
+    if len(packet) < 48:
+        raise ValueError("cut inside the IP header")
+    kind, total = packet[6], 40 + int.from_bytes(packet[4:6], "big")
+    if total > len(packet):
+        raise _EndsEarlyError("the record is shorter than the length in the IP header")
+    begin, place, identification = 40, 0, b""
+    if kind == _FRAGMENT:
+        kind, begin, place, identification = packet[40], 48, int.from_bytes(packet[42:44], "big"), bytes(packet[44:48])
+    if kind != 17:
+        return None
+    source = bytes(packet[8:40]) + identification
+    return _Fragment(source, packet[8:24], place & 0xFFF8, bool(place & 1), packet[begin:total])
+
+
 def is_plain(path: Path) -> bool:
     """Whether a capture and its first packets are as the libraries that decode them expect.
 
-    They begin with Ethernet's header, and none is in fragments; the file is not a pcapng.
+    They begin with Ethernet's header, and none is in fragments, there twice or of IPv6; the file is not a pcapng.
     """
+    before: tuple[memoryview, ...] = ()
     for link, _, packet in islice(pcap_packets(path, whole=False), SNIFFED_PACKETS):
         with suppress(ValueError):
             part = _fragment(packet, link)
-            if part is not None and (part.more or part.start):
-                return False
+            if part is not None:
+                if part.more or part.start or len(part.sender) != 4:
+                    return False
+                if len(part.payload) > _GPS_BYTES and (part.sender, part.payload) == before:
+                    return False
+                before = part.sender, part.payload
     return is_ethernet(path)
 
 
@@ -251,12 +291,12 @@ def copy_as_ethernet(path: Path, target: Path, alive: Callable[[], None], sender
             if size > _MOST_COPIED or not datagram.is_from(sender):
                 continue
             seconds, microseconds = divmod(round(1e6 * datagram.stamp_s), 10**6)
-            addresses = bytes(map(int, datagram.sender.split("."))) + b"\xff" * 4
+            addresses = ipaddress.ip_address(datagram.sender).packed[-4:] + b"\xff" * 4
             ip = struct.pack(">BBHHHBBH", 0x45, 0, 28 + size, 0, 0, 64, 17, 0) + addresses
             udp = struct.pack(">HHHH", datagram.port, datagram.port, 8 + size, 0)
             content = bytes(12) + b"\x08\x00" + ip + udp + datagram.payload
             out.write(struct.pack("<IIII", seconds & 0xFFFFFFFF, microseconds, len(content), len(content)) + content)
 
 
-def _address(four: memoryview) -> str:
-    return ".".join(map(str, four))
+def _address(packed: memoryview) -> str:
+    return str(ipaddress.ip_address(bytes(packed)))

@@ -140,7 +140,9 @@ def _names(header: str, style: _Style, n: int) -> tuple[str, ...]:
 def _name(word: str) -> str:
     name = plain_name(word)
     unit = _UNIT.search(name)
-    if unit is not None and (name[: unit.start()] not in ("x", "y", "z") or unit[1] in _METERS):
+    if unit is not None:
+        if name[: unit.start()] in ("x", "y", "z") and unit[1] not in _METERS:
+            raise PointsError(f"the coordinates are in {unit[1]!r} by the name {word!r}; expected meters: convert them")
         name = name[: unit.start()]
     axis = _PARAVIEW.match(name)
     return name if axis is None else "xyz"[int(axis[1])]

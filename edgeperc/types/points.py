@@ -210,6 +210,11 @@ def remission_name(names: Iterable[str], wanted: str | None) -> str | None:
     return plain_name(str(wanted))
 
 
+def is_remission_name(name: str) -> bool:
+    """Whether a name is one of those that remissions have."""
+    return plain_name(str(name)) in _REMISSION_NAMES
+
+
 def assemble(
     n: int,
     fields: Mapping[str, NDArray[Any]],

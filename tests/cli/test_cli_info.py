@@ -10,7 +10,7 @@ import shlex
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,7 +21,9 @@ from cli_helpers import POINTSEG, SSADNET, run, write_scan
 from edgeperc import zoo
 from edgeperc.errors import ModelFileError
 from edgeperc.inference import listing, providers
+from edgeperc.preprocess.findings import Finding
 from edgeperc.preprocess.fitness import FitnessProfile
+from edgeperc.simulation.samples import simulated_scan
 from edgeperc.system import machine
 from edgeperc.types.card import ModelCard
 from edgeperc.types.frame import ModelFrame
@@ -107,9 +109,9 @@ def test_info_of_a_scan(tmp_path: Path, capsys: pytest.CaptureFixture[str], monk
 
     def check_fitness(
         points: np.ndarray, profile: FitnessProfile | None, sensor: SensorProfile | None, frame: ModelFrame
-    ) -> tuple[str, ...]:
+    ) -> tuple[Finding, ...]:
         checked.append((points, profile, sensor.name))
-        return ("it has 32 beams",)
+        return (Finding("it has 32 beams"),)
 
     monkeypatch.setattr("edgeperc.preprocess.findings.check_fitness", check_fitness)
     monkeypatch.setattr(FitnessProfile, "from_dict", dict)
@@ -409,6 +411,7 @@ def test_no_profile_is_written_without_ground_or_of_two_sensors(
         (["--extrinsic", "T.json", "--mount-height", "3"], {"height_m": 3.0, "yaw_deg": -90.0}),
     ],
 )
+@pytest.mark.filterwarnings("ignore:.*which is taken:UserWarning")
 def test_run_uses_the_given_mounting(
     options: list[str],
     mounting: dict[str, float],
@@ -422,6 +425,32 @@ def test_run_uses_the_given_mounting(
     assert run("run", *arguments, *options) == 0
     used = json.loads(capsys.readouterr().out)["mounting"]
     assert {name: round(used[name], 6) for name in mounting} == mounting
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--mount-height", "3"], "T.json says height_m = 1.90, and --mount-height 3, which is taken"),
+        (["--pitch", "4"], "T.json says pitch_deg = 0.00, and --pitch 4, which is taken"),
+        (["--turn", "street"], "T.json says yaw_deg = -90.00, and --turn street, which is taken"),
+        (["--turn", "270", "--mount-height", "1.9"], ""),
+    ],
+)
+@pytest.mark.parametrize("command", ["run", "info"])
+@pytest.mark.filterwarnings("always::UserWarning")
+def test_options_that_contradict_an_extrinsic_are_said_once(
+    command: str,
+    options: list[str],
+    said: str,
+    drive: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(drive)
+    (drive / "T.json").write_text("[[0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 1, 1.9], [0, 0, 0, 1]]")
+    run(command, "0.bin", "1.bin", "--sensor", "hdl-64e", "--extrinsic", "T.json", *options)
+    warned = [line for line in capsys.readouterr().err.splitlines() if "which is taken" in line]
+    assert warned == ([f"edgeperc: warning: {said}"] if said else [])
 
 
 @pytest.mark.parametrize(
@@ -486,3 +515,60 @@ def test_info_says_that_a_sensor_cannot_be_told(
     assert "pass --sensor" in capsys.readouterr().err
     assert run("info", scan, "--sensor", "hdl-64e") in (0, 1)
     assert "cannot be told" not in capsys.readouterr().err
+
+
+def write_simulated(path: Path, sensor: str, seed: int) -> Path:
+    """A scan with remission in 0..1."""
+    points = simulated_scan(seed, sensor).points
+    points = points[np.isfinite(points).all(axis=1)]
+    points[:, 3] /= max(1.0, points[:, 3].max())
+    points.tofile(path)
+    return path
+
+
+@pytest.mark.parametrize(("sensor", "said"), [("vlp-16", "os1-64"), ("hdl-64e", "vlp-16"), ("pandar64", "hdl-64e")])
+@pytest.mark.filterwarnings("always::UserWarning")
+def test_a_sensor_whose_beams_the_points_do_not_have_is_warned_of(
+    sensor: str, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scan = write_simulated(tmp_path / "0.bin", sensor, 1)
+    for name, is_warned in ((said, True), (sensor, False)):
+        run("run", scan, "--sensor", name, "--anyway", "--remission-range", "0", "1")
+        assert (f"--sensor says {name}, the points {sensor} (" in capsys.readouterr().err) == is_warned
+
+
+@pytest.mark.parametrize("sensor", ["vlp-16", "hdl-64e"])
+@pytest.mark.parametrize(("scale", "is_warned"), [(1.0, False), (np.pi / 180.0, True), (2.0, True)])
+@pytest.mark.filterwarnings("always::UserWarning")
+def test_a_profile_of_other_beams_is_warned_of(
+    sensor: str, scale: float, is_warned: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As in radians."""
+    scan, profile = write_simulated(tmp_path / "0.bin", sensor, 1), get_sensor(sensor)
+    elevations = tuple(scale * angle for angle in profile.elevations_deg)
+    other = replace(profile, elevations_deg=elevations, remission_range=(0.0, 1.0))
+    (tmp_path / "mine.json").write_text(other.to_json())
+    run("run", scan, "--sensor", tmp_path / "mine.json", "--anyway")
+    assert ("it is read as" in capsys.readouterr().err) == is_warned
+
+
+@pytest.mark.parametrize("sensors", [("hdl-64e", "vlp-16"), ("pandar64", "os1-64", "os1-64"), ("vlp-16", "vlp-32c")])
+def test_a_folder_of_several_sensors_is_said_to_be_one(
+    sensors: Sequence[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for k, sensor in enumerate(sensors):
+        write_simulated(tmp_path / f"{k}.bin", sensor, k)
+    assert run("run", tmp_path) == 1
+    names = ", ".join(sorted({*sensors}))
+    assert (
+        f"the first scans are of several sensors: {names}; read those of each on their own" in capsys.readouterr().err
+    )
+
+
+@pytest.mark.parametrize("roll", [180.0, -175.0, 170.0])
+def test_a_roll_that_turns_a_scan_upside_down_is_refused(
+    roll: float, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scan = write_simulated(tmp_path / "0.bin", "hdl-64e", 1)
+    assert run("run", scan, "--sensor", "hdl-64e", "--roll", str(roll)) == 1
+    assert "it does not hang upside down, or the points are turned already" in capsys.readouterr().err

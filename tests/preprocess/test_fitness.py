@@ -108,6 +108,22 @@ def test_z_as_the_number_of_a_row(seed: int, scale: float, from_top: bool) -> No
     assert gross(points)
 
 
+@pytest.mark.parametrize("factor", [3.28084, 3.2808333])
+@pytest.mark.parametrize("seed", SEEDS)
+def test_feet(seed: int, factor: float) -> None:
+    """Of a sensor that was found high above the road, or by its range alone."""
+    points = street(seed) * np.float32([factor, factor, factor, 1.0])
+    near = replace(KITTI, max_range_m=np.quantile(np.linalg.norm(street(seed)[:, :3], axis=1), 0.999))
+    assert any("feet" in finding for finding in check_fitness(points, PROFILES[0], near))
+    assert not any("feet" in finding for finding in check_fitness(street(seed), PROFILES[0], near))
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_decimeters(seed: int) -> None:
+    points = street(seed) * np.float32([10.0, 10.0, 10.0, 1.0])
+    assert any("decimeters" in finding for finding in gross(points))
+
+
 @settings(deadline=None, max_examples=30)
 @given(st.sampled_from(SEEDS), st.floats(-1.0, 300.0))
 def test_constant_remission(seed: int, value: float) -> None:
@@ -131,7 +147,7 @@ def test_a_remission_of_another_unit_is_not_called_missing(sensor: str, brightes
     raw[:, 3] *= brightest / raw[:, 3].max()
     scan = condition(raw, profile)[0]
     for fitness in PROFILES:
-        found = with_raw_remission(check_fitness(scan, fitness, profile), raw[:, 3], profile)
+        found = with_raw_remission(check_fitness(scan, fitness, profile), raw, profile)
         about = [finding for finding in found if "emission" in finding]
         assert any(finding.gross for finding in about) or sensor == "pandar64"  # whose function is weaker
         assert not any("missing" in finding for finding in found)
@@ -145,8 +161,29 @@ def test_a_missing_remission_is_called_so(value: float) -> None:
     raw = simulated_scan(1, "hdl-32e").points.copy()
     raw[:, 3] = value
     zeros = (Finding("Remission is 0 for 100% of the points: the field is missing", True), Finding("another"))
-    assert with_raw_remission(zeros, raw[:, 3], profile) == zeros
-    assert with_raw_remission((), raw[:, 3] + 1.0, profile) == ()
+    assert with_raw_remission(zeros, raw, profile) == zeros
+    assert with_raw_remission((), raw, profile) == ()
+
+
+@pytest.mark.parametrize("sensor", ["vlp-16", "hdl-64e", "os1-128", "pandar64"])
+@pytest.mark.parametrize("what", ["beam", "time or azimuth", "height", "distance"])
+def test_a_remission_that_follows_from_the_place_is_refused(sensor: str, what: str) -> None:
+    profile, points = get_sensor(sensor), simulated_scan(1, sensor).points
+    raw = points[np.isfinite(points).all(axis=1) & (np.linalg.norm(points[:, :3], axis=1) > 1.0)]
+    assert with_raw_remission((), raw, profile) == ()
+    x, y, z, _ = raw.T
+    elevation = np.degrees(np.arctan2(z, np.hypot(x, y)))
+    raw[:, 3] = {
+        "beam": np.abs(elevation[:, None] - np.array(profile.elevations_deg)).argmin(axis=1),
+        "time or azimuth": (np.arctan2(y, x) / (2.0 * np.pi) + 0.5) * 0.1,
+        "height": z,
+        "distance": np.hypot(x, y),
+    }[what]
+    (found,) = with_raw_remission([Finding("Remission runs from 0 to 63", True)], raw, profile)
+    assert found.gross
+    assert what in found
+    other = Finding("axes", True)
+    assert with_raw_remission([other], raw, profile) == (other,)
 
 
 def room(half_m: float, height_m: float) -> Points:

@@ -151,7 +151,7 @@ def test_poses_are_read_as_they_were_written(rate: Any, velocity: Any) -> None:
     poses = [twins.motion.exponential(screw * t) for t in (0.0, 0.5, 1.0)]
     with tempfile.TemporaryDirectory() as folder:
         path = write_tum(Path(folder) / "poses.txt", (10.0, 10.5, 11.0), poses)
-        found = Trajectory.from_tum(path, quaternion="xyzw")
+        found = Trajectory.from_tum(path, quaternion="xyzw", maps_from="sensor")
     np.testing.assert_allclose(found.T_world_sensor, poses, atol=1e-12)
     for first_s, last_s in ((10.1, 10.2), (10.4, 10.6), (9.9, 10.0), (11.0, 11.2), (10.5, 10.5)):
         motion = found.motion(first_s, last_s)
@@ -265,6 +265,57 @@ def test_quaternions_with_w_first_are_not_read_as_w_last(
         return  # both readings are upright
     with pytest.raises(TrackingError, match=r"first\.txt: read as x, y, z, w, .* read as w, x, y, z, .*--quaternion"):
         Trajectory.from_tum(path)
+
+
+def weave(heading: float, T_vehicle_sensor: Any, place: tuple[float, float] = (0.0, 0.0)) -> Any:
+    """As `drive`, to the left and to the right by turns."""
+    t = 0.01 * np.arange(600)
+    yaw = heading + 1.2 * np.sin(2.0 * t)
+    x, y = place[0] + np.cumsum(0.1 * np.cos(yaw)), place[1] + np.cumsum(0.1 * np.sin(yaw))
+    poses = np.tile(np.eye(4), (len(t), 1, 1))
+    poses[:, 0, 0], poses[:, 1, 1], poses[:, 1, 0], poses[:, 0, 1] = np.cos(yaw), np.cos(yaw), np.sin(yaw), -np.sin(yaw)
+    poses[:, 0, 3], poses[:, 1, 3] = x, y
+    return t[::10], poses[::10] @ T_vehicle_sensor
+
+
+@pytest.mark.parametrize("place", [(0.0, 0.0), (30.0, -70.0), (5e5, 4e6)], ids=["start", "near", "map"])
+@pytest.mark.parametrize("heading", [0.5, 1.5, -2.0])
+@pytest.mark.parametrize("T_vehicle_sensor", [np.eye(4), CAMERA], ids=["lidar", "camera"])
+@pytest.mark.parametrize("order", ["xyzw", "wxyz"])
+def test_inverse_poses_are_not_read_as_poses(
+    place: tuple[float, float], heading: float, T_vehicle_sensor: Any, order: Any, tmp_path: Path
+) -> None:
+    times, poses = weave(heading, T_vehicle_sensor, place)
+    write = write_tum if order == "xyzw" else write_w_first
+    path = write(tmp_path / "inverse.txt", times, np.linalg.inv(poses))
+    found = Trajectory.from_tum(path, quaternion=order, maps_from="world")
+    np.testing.assert_allclose(found.T_world_sensor, poses, atol=1e-6)
+    for said in (order, None):
+        with pytest.raises(TrackingError, match=r"read as .* and from the world to the sensor, .* --poses-from"):
+            Trajectory.from_tum(path, quaternion=said)
+    path = write(tmp_path / "poses.txt", times, poses)
+    np.testing.assert_allclose(Trajectory.from_tum(path, quaternion=order).T_world_sensor, poses, atol=1e-6)
+
+
+@pytest.mark.parametrize("heading", [0.5, 1.5, -2.0])
+def test_inverse_poses_of_a_straight_drive(heading: float, tmp_path: Path) -> None:
+    times, poses = drive(0.0, 10.0, heading)
+    path = write_tum(tmp_path / "inverse.txt", times, np.linalg.inv(poses))
+    with pytest.raises(TrackingError, match=r"read as .* and from the world to the sensor, .* --poses-from"):
+        Trajectory.from_tum(path)
+
+
+BACKWARD = np.diag([-1.0, -1.0, 1.0, 1.0])
+
+
+@pytest.mark.parametrize("T_vehicle_sensor", [BACKWARD, np.eye(4), HANGING @ CAMERA])
+@pytest.mark.parametrize("heading", [0.1, 1.5, 3.1])
+def test_sensors_that_look_elsewhere_are_told_by_turns(heading: float, T_vehicle_sensor: Any, tmp_path: Path) -> None:
+    times, poses = weave(heading, T_vehicle_sensor)
+    read = Trajectory.from_tum(write_tum(tmp_path / "poses.txt", times, poses))
+    np.testing.assert_allclose(read.T_world_sensor, poses, atol=1e-9)
+    with pytest.raises(OptionError, match="expected 'sensor' or 'world'"):
+        Trajectory.from_tum(tmp_path / "poses.txt", maps_from="vehicle")  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("T_vehicle_sensor", [CAMERA, HANGING @ CAMERA], ids=["camera", "camera upside down"])

@@ -477,7 +477,7 @@ def test_an_ouster_capture(ouster: Path, name: str) -> None:
     signal = [points[0, 3] for _, points in read_scans(ouster / name, remission_field="signal")]
     assert signal == [4000.0, 4001.0, 4002.0]
     assert "no field 'ECHO' for the remission" in error_of(ouster / name, remission_field="echo")
-    assert "no sensor '17'; there are 991" in error_of(ouster / name, topic="17")
+    assert "no LiDAR '17'; there are 991" in error_of(ouster / name, topic="17")
     assert len(list(read_scans(ouster / name, topic="991"))) == 3
 
 

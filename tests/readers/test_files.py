@@ -877,8 +877,9 @@ def test_what_a_table_lacks_is_nan(tmp_path: Path, gap: str, separator: str) -> 
 @pytest.mark.parametrize(
     ("content", "error"),
     [
-        (b"x(mm),y(mm),z(mm),i\n1,2,3,4\n", "no table of points: it has a line 'x\\(mm\\)"),
-        (b"x [ft];y [ft];z [ft]\n1;2;3\n", "no table of points: it has a line 'x .ft.;y"),
+        (b"x(mm),y(mm),z(mm),i\n1,2,3,4\n", "coordinates are in 'mm' by the name 'x\\(mm\\)'; expected meters"),
+        (b"X (cm);Y (cm);Z (cm);I\n1;2;3;4\n", "coordinates are in 'cm' by the name 'X \\(cm\\)'"),
+        (b"x [ft];y [ft];z [ft]\n1;2;3\n", "the coordinates are in 'ft' by the name 'x .ft.'"),
         (b"x,y,z,i\n1,2,3,4\n1,2,3\n", "row 2 of 2 has 3, '1,2,3'; the file may be cut short"),
         (b"x,y,z,i\n1,2,3,4\n1,2\n1,2,3,4\n", "row 2 of 3 has 2, '1,2'$"),
         (b"x,y,z,i\n1,far,3,4\n1,2,3,4\n", "no numeric field y among x, y, z, i"),
@@ -968,3 +969,24 @@ def test_raw_values_may_begin_like_another_format(tmp_path: Path, first: Any) ->
     content = first + street(1).tobytes()[4:]
     assert len(read_points(save(tmp_path, "scan.bin", content))) == 6000
     assert len(read_points(save(tmp_path, "scan.raw", content), columns=4)) == 6000
+
+
+@pytest.mark.parametrize("name", ["a.bin", "a.pcd.bin", "a.npy"])
+@pytest.mark.parametrize(("wanted", "is_there"), [("ring", False), ("time", False), ("intensity", True)])
+def test_values_without_names_have_no_field_of_another_name(
+    tmp_path: Path, name: str, wanted: str, is_there: bool
+) -> None:
+    points = np.random.default_rng(1).normal(0.0, [20.0, 10.0, 1.0, 0.1], (2000, 4)).astype(np.float32)
+    path = tmp_path / name
+    if name == "a.npy":
+        np.save(path, points)
+    else:
+        stored = points if name == "a.bin" else np.hstack([points, np.arange(2000, dtype=np.float32)[:, None] % 32])
+        stored.tofile(path)
+    if is_there:
+        np.testing.assert_array_equal(read_points(path, remission_field=wanted), points)
+        return
+    with pytest.raises(
+        PointsError, match=rf"no field '{wanted}' for the remission: the values have no names.*--columns"
+    ):
+        read_points(path, remission_field=wanted)

@@ -196,7 +196,7 @@ def test_a_capture_of_an_ouster(ouster: Path, tmp_path: Path) -> None:
             assert profile is not None
             assert (profile.name, profile.columns) == ("os1-64", 512)
             np.testing.assert_allclose(profile.elevations_deg, angles, atol=1e-9)
-    with pytest.raises(PointsError, match=r"no sensor '17'; there are 991"):
+    with pytest.raises(PointsError, match=r"no LiDAR '17'; there are 991"):
         sensor_of(ouster / "sphere.osf", topic="17")
 
 

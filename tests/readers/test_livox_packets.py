@@ -82,7 +82,7 @@ def test_lvx2_files(tmp_path: Path, kind: int) -> None:
         np.testing.assert_allclose(one.times_s, other.times_s, atol=1e-6)  # type: ignore[arg-type]
     two = tmp_path / "two.lvx2"
     two.write_bytes(lvx2_file(packets, ("47MDL01", "47MDL02")))
-    assert "expected one sensor, there are 47MDL01, 47MDL02; choose one" in error_of(two)
+    assert "expected one LiDAR, there are 47MDL01, 47MDL02; choose one" in error_of(two)
     np.testing.assert_array_equal(
         joined(list(read_timed_scans(two, topic="47MDL02"))), joined(list(read_timed_scans(path)))
     )
@@ -114,7 +114,7 @@ def test_a_livox_does_not_spin(tmp_path: Path, capsys: pytest.CaptureFixture[str
 def test_two_in_one_capture(tmp_path: Path) -> None:
     packets = livox_packets(2, *scene(96 * 100), False)
     path = write_link(tmp_path / "two.pcap", 1, packets, one="192.168.1.112", two="192.168.1.130")
-    assert "expected one Livox sensor, there are 192.168.1.112, 192.168.1.130" in error_of(path)
+    assert "expected one LiDAR, there are 192.168.1.112, 192.168.1.130" in error_of(path)
     assert (
         sum(len(points) for _, points in read_scans(path, topic="192.168.1.112")) == (scene(9600)[0] != 0).any(1).sum()
     )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from lidar_writers import MODELS, blocks_of, packets_of, ranges
+from lidar_writers import MODELS, blocks_of, livox_packets, packets_of, ranges
 from test_captures import check_told_apart, error_of, vlp16_packets, write_pcap
 from test_packets import write_link
 
@@ -268,6 +268,56 @@ def test_an_ouster_beside_another_makers_sensor_is_told_apart(tmp_path: Path, ot
         (tmp_path / f"{name}.json").write_text(json.dumps(METADATA))
     assert "expected one LiDAR, there are 10.0.0.9, 122246000293; choose one" in error_of(both)
     check_told_apart(both, {"10.0.0.9": tmp_path / "alone.pcap", "122246000293": tmp_path / "ouster.pcap"})
+
+
+@pytest.mark.parametrize("share", [0.1, 0.5, 2.0])
+@pytest.mark.parametrize("name", ["pandarxt-16", "pandarxt-32", "livox"])
+def test_a_sensor_beside_an_ouster_is_named_however_few_its_packets_are(
+    tmp_path: Path, name: str, share: float
+) -> None:
+    ousters = [bytes(packet.buf) for turn in random_packets(METADATA, 8, 1) for packet in turn]
+    few = other_packets(name)[: int(share * len(ousters))]
+    path = joined(tmp_path, [(ousters, "10.0.0.1:7502"), (few, "10.0.0.9")])
+    assert "expected one LiDAR, there are 10.0.0.9, 122246000293; choose one" in error_of(path)
+    assert "no LiDAR '10.0.0.77'" in error_of(path, topic="10.0.0.77")
+    assert len(list(read_timed_scans(path, topic="122246000293"))) == 8
+    assert len(list(read_timed_scans(path, topic="10.0.0.9"))) > 0
+
+
+@pytest.mark.parametrize("name", ["pandarxt-16", "pandarxt-32", "livox", "Hesai AT128"])
+def test_a_sensor_that_begins_late_beside_an_ouster_is_warned_of(tmp_path: Path, name: str) -> None:
+    ousters = [bytes(packet.buf) for turn in random_packets(METADATA, 64, 1) for packet in turn]
+    path = joined(tmp_path, [(ousters, "10.0.0.1:7502"), (other_packets(name), "10.0.0.9")])
+    with pytest.warns(UserWarning, match=r"of the first sensor alone; .* several, 10\.0\.0\.9, Ouster: .*--topic"):
+        assert len(list(read_timed_scans(path))) == 64
+
+
+@pytest.mark.parametrize(("at", "number"), [(4, b"\1\2\3"), (7, b"\1\2\3\4\5"), (4, b"\0\0\1")])
+def test_an_ouster_that_starts_anew_or_another_one_is_warned_of(tmp_path: Path, at: int, number: bytes) -> None:
+    ousters = [bytes(packet.buf) for turn in random_packets(METADATA, 2, 1) for packet in turn]
+    others = [packet[:at] + number + packet[at + len(number) :] for packet in ousters]
+    path = joined(tmp_path, [(ousters, "10.0.0.1"), (others, "10.0.0.1")])
+    with pytest.warns(UserWarning, match=rf"left out {len(others)} packets of another Ouster, or of this one after"):
+        assert len(list(read_timed_scans(path))) == 2
+
+
+def other_packets(name: str) -> list[bytes]:
+    """Of a sensor of another maker."""
+    if name == "Hesai AT128":
+        return [bytes.fromhex("eeff0403000080020004017f") + bytes([k]) + bytes(1105) for k in range(80)]
+    if name == "livox":
+        return livox_packets(1, np.full((96 * 300, 3), 7.5), np.arange(96 * 300) % 256, is_old=False)
+    model = MODELS[name]
+    return packets_of(model, blocks_of(model, *ranges(model, 1024)))
+
+
+def joined(folder: Path, parts: Sequence[tuple[Sequence[bytes], str]]) -> Path:
+    """A capture of packets and their sender, one after the other, with an Ouster's metadata beside it."""
+    path = folder / "both.pcap"
+    written = [write_link(path, 1, packets, one=sender).read_bytes() for packets, sender in parts]
+    path.write_bytes(b"".join(each[24 * (k > 0) :] for k, each in enumerate(written)))
+    path.with_suffix(".json").write_text(json.dumps(METADATA))
+    return path
 
 
 @pytest.mark.parametrize("other", ["10.0.0.2", "10.0.0.1:7503", "10.0.0.9:7502"])

@@ -9,9 +9,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from lidar_writers import MODELS, blocks_of, packets_of, ranges
 from test_captures import error_of, vlp16_packets, write_pcap
 from test_captures import ouster as ouster
 
+from edgeperc import PointsError
 from edgeperc.readers.captures import read_scans, sensor_of
 from edgeperc.readers.packets import velodyne_senders
 
@@ -63,6 +65,88 @@ def test_a_velodyne_behind_any_link(tmp_path: Path, link: int, head: bytes) -> N
     sensor = sensor_of(path)
     assert sensor is not None
     assert sensor.name == "vlp-16"
+
+
+def payloads_of(kind: str) -> list[bytes]:
+    """Packets of a sensor; those of a pandarxt-16 are of 64 columns."""
+    model = MODELS["pandarxt-16"]
+    return vlp16_packets(1.2) if kind == "velodyne" else packets_of(model, blocks_of(model, *ranges(model, 512)))
+
+
+@pytest.mark.parametrize("most", [96, 300, 500])
+@pytest.mark.parametrize("kind", ["velodyne", "hesai"])
+def test_packets_that_were_not_kept_to_their_end_are_named(tmp_path: Path, kind: str, most: int) -> None:
+    path = write_link(tmp_path / "a.pcap", 1, payloads_of(kind))
+    whole, content = path.read_bytes(), path.read_bytes()[:24]
+    at = 24
+    while at < len(whole):
+        seconds, microseconds, size, _ = struct.unpack_from("<IIII", whole, at)
+        content += (
+            struct.pack("<IIII", seconds, microseconds, min(size, most), size) + whole[at + 16 :][: min(size, most)]
+        )
+        at += 16 + size
+    path.write_bytes(content)
+    assert "packets of the capture were not kept to their end" in error_of(path)
+    with pytest.raises(PointsError, match="tcpdump -s 0"):
+        sensor_of(path)
+
+
+@pytest.mark.parametrize("kind", ["velodyne", "hesai"])
+@pytest.mark.parametrize("link", [1, 113, 276])
+def test_packets_that_were_captured_twice_count_once(tmp_path: Path, kind: str, link: int) -> None:
+    """As from a mirrored port, or ``tcpdump -i any`` beside a bridge."""
+    if kind == "velodyne":
+        pytest.importorskip("velodyne_decoder")
+    path = write_link(tmp_path / "once.pcap", link, payloads_of(kind))
+    expected = list(read_scans(path))
+    whole, content = path.read_bytes(), path.read_bytes()[:24]
+    at = 24
+    while at < len(whole):
+        record = whole[at : at + 16 + struct.unpack_from("<8xI", whole, at)[0]]
+        content += record + record
+        at += len(record)
+    path.write_bytes(content)
+    found = list(read_scans(path))
+    assert len(found) == len(expected) > 0
+    for (_, points), (_, other) in zip(found, expected, strict=True):
+        np.testing.assert_array_equal(points, other)
+
+
+def write_6(path: Path, payloads: Sequence[bytes], sender: str, most: int = 10_000) -> Path:
+    """UDP in IPv6 in fragments of at most so many bytes."""
+    content = struct.pack("<IHHIIII", 0xA1B2C3D4, 2, 4, 0, 0, 65535, 1)
+    addresses = socket.inet_pton(socket.AF_INET6, sender) + socket.inet_pton(socket.AF_INET6, "ff02::1")
+    for k, payload in enumerate(payloads):
+        udp = struct.pack(">HHHH", 2368, 2368, 8 + len(payload), 0) + payload
+        for begin in range(0, len(udp), most):
+            part, more = udp[begin : begin + most], begin + most < len(udp)
+            kind = 17
+            if begin or more:
+                kind, part = 44, struct.pack(">BBHI", 17, 0, begin | more, k) + part
+            frame = bytes(12) + b"\x86\xdd" + struct.pack(">IHBB", 6 << 28, len(part), kind, 64) + addresses + part
+            content += struct.pack("<IIII", 1000 + k // 1000, 1000 * (k % 1000), len(frame), len(frame)) + frame
+    path.write_bytes(content)
+    return path
+
+
+@pytest.mark.parametrize("kind", ["velodyne", "hesai"])
+@pytest.mark.parametrize("most", [10_000, 600, 64])
+def test_packets_of_ipv6(tmp_path: Path, kind: str, most: int) -> None:
+    if kind == "velodyne":
+        pytest.importorskip("velodyne_decoder")
+    expected = list(read_scans(write_link(tmp_path / "4.pcap", 1, payloads_of(kind))))
+    one = write_6(tmp_path / "6.pcap", payloads_of(kind), "fe80::1", most)
+    two = tmp_path / "two.pcap"
+    two.write_bytes(
+        one.read_bytes() + write_6(tmp_path / "b.pcap", payloads_of(kind), "fe80::2", most).read_bytes()[24:]
+    )
+    assert "there are fe80::1, fe80::2; choose one" in error_of(two)
+    assert sensor_of(one) == sensor_of(tmp_path / "4.pcap")
+    for path, topic in ((one, None), (two, "fe80::2")):
+        found = list(read_scans(path, topic=topic))
+        assert len(found) == len(expected) > 0
+        for (_, points), (_, other) in zip(found, expected, strict=True):
+            np.testing.assert_array_equal(points, other)
 
 
 @pytest.mark.parametrize(
@@ -130,10 +214,10 @@ def test_several_velodynes_are_told_apart(tmp_path: Path, link: int, senders: tu
     assert velodyne_senders(path) == sorted(senders)
     expected = [len(points) for _, points in read_scans(write_pcap(tmp_path / "one.pcap", packets))]
     error = error_of(path)
-    assert f"expected one Velodyne, there are {', '.join(sorted(senders))}; choose one" in error
+    assert f"expected one LiDAR, there are {', '.join(sorted(senders))}; choose one" in error
     for sender in senders:
         assert [len(points) for _, points in read_scans(path, topic=sender)] == expected
-    assert "no Velodyne '10.1.1.1'" in error_of(path, topic="10.1.1.1")
+    assert "no LiDAR '10.1.1.1'" in error_of(path, topic="10.1.1.1")
 
 
 @pytest.mark.parametrize("link", [1, 113, 101])
@@ -143,7 +227,7 @@ def test_a_velodyne_that_begins_late_is_told_apart(tmp_path: Path, link: int, ot
     packets = vlp16_packets(30.0)
     path = write_link(tmp_path / "two.pcap", link, packets, begin=2100, one="10.0.0.1:2368", two=other)
     first, second = velodyne_senders(path)
-    assert "expected one Velodyne, there are 10.0.0.1" in error_of(path)
+    assert "expected one LiDAR, there are 10.0.0.1" in error_of(path)
     expected = [len(points) for _, points in read_scans(write_pcap(tmp_path / "one.pcap", packets))]
     assert [len(points) for _, points in read_scans(path, topic=first)] == expected
     assert sum(len(points) for _, points in read_scans(path, topic=second)) == (len(packets) - 2100) * 12 * 32
