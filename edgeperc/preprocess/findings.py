@@ -630,10 +630,13 @@ def _place_as_remission(points: Points) -> Finding | None:
     for (what, least), place in zip(_EXPLAINED.items(), places, strict=True):
         mean = (np.bincount(step, place.real) + 1j * np.bincount(step, place.imag)) / n
         if np.mean(np.abs(place - mean[step]) ** 2) < (1.0 - least) * np.mean(np.abs(place - place.mean()) ** 2):
+            # Simulators such as CARLA have no other: exp(-a distance).
+            is_simulated = what == "distance" and np.corrcoef(place, remission)[0, 1] < 0.0
             return Finding(
-                f"The remission of each point follows from the {what}: the field holds something else. Say which one "
+                f"The remission of each point follows from the {what}: the field holds "
+                f"{'nothing else, as in some simulators' if is_simulated else 'something else'}. Say which one "
                 "is the remission: remission_field= or columns= (--remission-field, --columns).",
-                True,
+                not is_simulated,
             )
     return None
 

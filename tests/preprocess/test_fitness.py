@@ -186,6 +186,17 @@ def test_a_remission_that_follows_from_the_place_is_refused(sensor: str, what: s
     assert with_raw_remission([other], raw, profile) == (other,)
 
 
+@pytest.mark.parametrize("sensor", ["vlp-16", "hdl-64e", "os1-128"])
+@pytest.mark.parametrize("per_m", [0.004, 0.02, 0.1])
+def test_a_remission_that_falls_with_the_distance_is_a_simulators(sensor: str, per_m: float) -> None:
+    profile, points = get_sensor(sensor), simulated_scan(1, sensor).points
+    raw = points[np.isfinite(points).all(axis=1) & (np.linalg.norm(points[:, :3], axis=1) > 1.0)]
+    raw[:, 3] = np.exp(-per_m * np.linalg.norm(raw[:, :3], axis=1))
+    (found,) = with_raw_remission([], raw, profile)
+    assert not found.gross
+    assert "from the distance: the field holds nothing else" in found
+
+
 def room(half_m: float, height_m: float) -> Points:
     """The walls, floor and ceiling of a room, as a VLP-16 in its middle sees them."""
     elevation, azimuth = np.meshgrid(np.radians(np.arange(-15.0, 16.0, 2.0)), np.radians(np.arange(0.0, 360.0, 0.2)))
