@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from edgeperc.camera.image import ImageScaler
-from edgeperc.errors import CardMismatchError, ModelFileError, ParityError
+from edgeperc.errors import CardMismatchError, EdgepercError, ModelFileError
 from edgeperc.inference.decode import decode_classes, decode_top_view
 from edgeperc.inference.projection import make_projector, project
 from edgeperc.inference.session import WHOLE, Session, golden_feed, golden_input, golden_shape
@@ -215,8 +215,10 @@ def with_golden(model: onnx.ModelProto, card: ModelCard) -> ModelCard:
     """The card with a golden record: a known input, and this computer's outputs for it."""
     import onnxruntime
 
+    options = onnxruntime.SessionOptions()
+    options.log_severity_level = 4  # weights that are inputs, too, as mmdeploy leaves them, have a warning each
     try:
-        session = onnxruntime.InferenceSession(model.SerializeToString(), providers=["CPUExecutionProvider"])
+        session = onnxruntime.InferenceSession(model.SerializeToString(), options, providers=["CPUExecutionProvider"])
     except Exception as exc:  # onnxruntime's errors share no base but Exception
         raise ModelFileError(f"onnxruntime {onnxruntime.__version__} cannot open the graph: {exc}") from exc
     feed = golden_feed(card, 0)

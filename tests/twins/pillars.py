@@ -17,7 +17,9 @@ def pillars(
     size = np.float32([view.cell_m, view.cell_m, bounds[2, 1] - bounds[2, 0]])
     with np.errstate(invalid="ignore"):
         at = (points[:, :3] - bounds[:, 0].astype(np.float32)) / size  # float32
-        inside = np.isfinite(points).all(axis=1) & (at >= 0).all(axis=1) & (at < (view.width, view.height, 1)).all(axis=1)
+        inside = (
+            np.isfinite(points).all(axis=1) & (at >= 0).all(axis=1) & (at < (view.width, view.height, 1)).all(axis=1)
+        )
     cells: dict[tuple[int, int], list[np.ndarray]] = {}
     for point, (column, row, _) in zip(points[inside].astype(np.float64), at[inside].astype(int).tolist(), strict=True):
         cells.setdefault((row, column), []).append(point)
