@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -318,6 +319,8 @@ def test_the_command_line(
     assert [*(tmp_path / "out").glob("*.png")]
     document = json.loads(capsys.readouterr().out.splitlines()[0])
     assert document["boxes"]
+    assert run("run", tmp_path / "scan.bin", "--model", models["anchors"], "--provider", "cpu", "--anyway") == 0
+    assert re.search(rf"{len(points):,} points  [\d.]+ ms  boxes: \d+ ", capsys.readouterr().out)
     assert {box["label"] for box in document["boxes"]} <= {*KINDS}
 
 
