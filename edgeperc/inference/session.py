@@ -570,8 +570,8 @@ def terminated(ort: Any, after_s: float | None) -> Iterator[Any]:
         if not options.terminate:
             raise
         raise InferenceError(
-            f"{exc} (the first runs of a file that is not trusted may take {after_s:g} s); try again on an idle computer, "
-            "or pass trusted=True, or --trusted, if you know where it comes from"
+            f"{exc} (the first runs of a file that is not trusted may take {after_s:g} s); try again on an idle "
+            "computer, or pass trusted=True, or --trusted, if you know where it comes from"
         ) from exc
     finally:
         timer.cancel()

@@ -189,7 +189,10 @@ def write_card(model: onnx.ModelProto, card: ModelCard, path: Path) -> None:
     with open_atomic(path) as file:
         file.write(model.SerializeToString(deterministic=True))
         file.flush()
-        session = Session(Path(file.name), "cpu")
+        try:
+            session = Session(Path(file.name), "cpu")
+        except EdgepercError as exc:
+            raise type(exc)(str(exc).replace(file.name, str(path))) from exc
         if session.card.to_json() != card.to_json():
             raise ParityError(f"{path}: the card read back differs from the card written")
 
@@ -241,6 +244,11 @@ def with_golden(model: onnx.ModelProto, card: ModelCard) -> ModelCard:
         raise CardMismatchError(f"the graph does not run on inputs as the card declares them, {shapes}: {exc}") from exc
     records = {}
     for spec, output in zip(card.outputs, outputs, strict=True):
+        expected = card.shape_of(spec)
+        if len(expected) != output.ndim or any(n not in (None, m) for n, m in zip(expected, output.shape, strict=True)):
+            raise CardMismatchError(
+                f"{spec.name!r} has shape {output.shape} in the graph; its card declares {expected}"
+            )
         few = output.size <= N_GOLDEN_VALUES
         at = np.arange(output.size) if few else np.random.default_rng(0).integers(output.size, size=N_GOLDEN_VALUES)
         records[spec.name] = {
