@@ -85,7 +85,8 @@ class PillarNet(nn.Module):
             used = num_points.int().unsqueeze(1) > torch.arange(voxels.shape[1], dtype=torch.int).unsqueeze(0)
             x = x * used.unsqueeze(-1).type_as(x)
         n, m, c = x.shape
-        x = torch.relu(self.norm(self.linear(x.view(-1, c)))).view(n, m, -1).max(dim=1)[0]
+        x = torch.relu(self.norm(self.linear(x.view(-1, c)))).view(n, m, -1).max(dim=1, keepdim=True)[0]
+        x = x.squeeze()  # as OpenPCDet's PillarVFE: of a pillar alone, its axis goes, too
         canvas = torch.zeros(16, VIEW.height * VIEW.width, dtype=x.dtype)
         canvas[:, (coords[:, 1] + coords[:, 2] * VIEW.width + coords[:, 3]).long()] = x.t()
         x = self.backbone(canvas.view(1, 16, VIEW.height, VIEW.width))

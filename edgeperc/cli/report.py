@@ -113,7 +113,7 @@ def _summary(perception: Perception) -> str:
         height, width = perception.image.labels.shape
         shares = ((name, n / (width * height)) for name, n in perception.image.counts().items())
         parts.append(f"{width} x {height} pixels: {', '.join(f'{name} {100.0 * s:.1f} %' for name, s in shares if s)}")
-    if perception.points is None and perception.top_view is None:
+    if perception.image is not None and not perception.n_points:
         return "  ".join([*parts, f"{sum(perception.stage_ms.values()):.1f} ms"])
     parts += [f"{perception.n_points:,} points", f"{sum(perception.stage_ms.values()):.1f} ms"]
     if perception.top_view is not None:

@@ -23,10 +23,10 @@ def decode_detections(card: ModelCard, outputs: Values, score_threshold: float) 
     """Decode the boxes of a detector on pillars.
 
     outputs : by their names, with the batch's axis or without.
-    Returns: In the frame of the training points, best score first; of boxes of one class that overlap by more than the
-        card's ``nms_iou``, or with ``across_classes`` of any classes, only the best one. ``front`` is the probability
-        of the direction's bin; of a center head, it is 1 if sine and cosine are those of an angle, and less the smaller
-        both are: they are means of the headings that the network deems possible.
+    Returns: In the frame of the training points, best score first; of boxes of one class, or of one group of a center
+        head, that overlap by more than the card's ``nms_iou``, or with ``across_classes`` of any classes, only the best
+        one. ``front`` is the probability of the direction's bin; of a center head, it is 1 if sine and cosine are those
+        of an angle, and less the smaller both are: they are means of the headings that the network deems possible.
     Raises InferenceError.
     """
     view, head = card.view, card.head
@@ -47,8 +47,14 @@ def decode_detections(card: ModelCard, outputs: Values, score_threshold: float) 
     for axis, (low, high) in enumerate((view.x_range_m, view.y_range_m, view.z_range_m)):
         near &= (rows[:, axis] >= low - BEYOND_M) & (rows[:, axis] <= high + BEYOND_M)
     rows, scores, fronts = rows[near], scores[near], fronts[near]
-    names = np.array(card.box_classes)[labels[near]]
-    kept = best_rows(rows[:, [0, 1, 3, 4, 6]], scores, names, card.nms_iou, across_classes=head.across_classes)
+    alike = [np.array(card.box_classes)[labels[near]]]
+    if isinstance(head, CenterHead):  # whose groups OpenPCDet and mmdet3d take as one class here
+        alike.insert(0, np.repeat(np.arange(len(head.groups)), head.groups)[labels[near]].astype(str))
+    kept = np.arange(len(rows))
+    for each in alike:
+        footprints = rows[kept][:, [0, 1, 3, 4, 6]]
+        kept = kept[best_rows(footprints, scores[kept], each[kept], card.nms_iou, across_classes=head.across_classes)]
+    names = alike[-1]
     return [
         Box(str(name), score, (x, y, z), (length, width, height), yaw, None if math.isnan(front) else front)
         for (x, y, z, length, width, height, yaw), score, name, front in zip(

@@ -94,18 +94,16 @@ def find_pillars(
     Returns: Number of pillars, at most as many as there is room for.
     """
     n_rows, n_columns = numbers.shape
+    # In float32 as spconv and mmcv divide: points of sensors that round lie on the edges of cells by the thousand.
+    low_x, low_y, low_z = np.float32(grid.low[0]), np.float32(grid.low[1]), np.float32(grid.low[2])
+    cell, tall = np.float32(grid.cell), np.float32(grid.high[2] - grid.low[2])
     n = 0
     for i in range(points.shape[0]):
-        x, y, z = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
-        if not (
-            (grid.low[0] <= x < grid.high[0])
-            & (grid.low[1] <= y < grid.high[1])
-            & (grid.low[2] <= z < grid.high[2])
-            & (abs(points[i, 3]) < np.float32(math.inf))
-        ):
+        x, y, z = (points[i, 0] - low_x) / cell, (points[i, 1] - low_y) / cell, (points[i, 2] - low_z) / tall
+        inside = (0.0 <= x < n_columns) & (0.0 <= y < n_rows) & (0.0 <= z < 1.0)
+        if not (inside & (abs(points[i, 3]) < np.float32(math.inf))):
             continue
-        row = min(int((y - grid.low[1]) / grid.cell), n_rows - 1)
-        column = min(int((x - grid.low[0]) / grid.cell), n_columns - 1)
+        row, column = int(y), int(x)
         k = numbers[row, column]
         if k < 0:
             if n == members.shape[0]:

@@ -413,7 +413,7 @@ class Session:
                 f"{self.path}: the graph takes {wrong[0]} pillars, its card declares view.max_pillars "
                 f"{len(self._batch)}; expected the same number, or a graph that takes any"
             )
-        n_rows = len(self._batch) if self._all_rows else 1
+        n_rows = len(self._batch) if self._all_rows else 2
         feed = {name: array[:n_rows] for name, array in self.inputs.items()}
         for output, shape in zip(card.outputs, self._shapes(feed, run_options), strict=True):
             buffer = np.zeros(shape, np.float32)
@@ -548,9 +548,9 @@ class Session:
             # Bind before every run: a provider with its own memory copies the input only when it is bound.
             if self._pillars:
                 for name, array in self.inputs.items():
-                    if self._all_rows:
-                        array[n_rows:] = array[n_rows - 1]  # the same pillar again changes nothing
-                    rows = array if self._all_rows else array[:n_rows]
+                    # Of a pillar alone, OpenPCDet's graphs squeeze the axis away. The same one again changes nothing.
+                    rows = array if self._all_rows else array[: max(n_rows, 2)]
+                    rows[n_rows:] = rows[n_rows - 1]
                     self.binding.bind_input(name, "cpu", 0, rows.dtype, rows.shape, rows.ctypes.data)
             elif self._has_rows:
                 array = self._batch[:n_rows]
@@ -584,6 +584,13 @@ def terminated(ort: Any, after_s: float | None) -> Iterator[Any]:
     timer.start()
     try:
         yield options
+    except InferenceError as exc:
+        if not options.terminate:
+            raise
+        raise InferenceError(
+            f"{exc} (the first runs of a file that is not trusted may take {after_s:g} s); try again on an idle "
+            "computer, or pass trusted=True, or --trusted, if you know where it comes from"
+        ) from exc
     finally:
         timer.cancel()
 

@@ -16,7 +16,7 @@ from typing import Any, Literal
 from ..errors import CardError
 from ..system.fields import Fields
 from ..system.names import check_name, check_text
-from .detector import ANCHOR_KINDS, CENTER_KINDS, HEADS, MAX_VALUES, AnchorHead, CenterHead, PillarGeometry
+from .detector import ANCHOR_KINDS, CENTER_KINDS, HEADS, MAX_GROUPS, MAX_VALUES, AnchorHead, CenterHead, PillarGeometry
 from .onnx_file import read_metadata
 from .views import CameraGeometry, ObjectGeometry, RangeImageGeometry, TopViewGeometry
 
@@ -147,7 +147,7 @@ class Golden:
     def __post_init__(self) -> None:
         FIELDS.whole("golden.seed", self.seed, 0, 2**64 - 1)
         FIELDS.whole("the length of golden.input_sha256", len(self.input_sha256), 0, 64)
-        FIELDS.whole("the number of golden.outputs", len(self.outputs), 1, MAX_CHANNELS)
+        FIELDS.whole("the number of golden.outputs", len(self.outputs), 1, MAX_GROUPS * len(CENTER_KINDS))
         for name, record in self.outputs.items():
             field = f"golden.outputs[{reprlib.repr(name)}]"
             missing = {"std", "positions", "values"} - record.keys()

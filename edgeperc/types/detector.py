@@ -174,7 +174,7 @@ class CenterHead:
 
     classes, stride, scores, max_candidates, across_classes : as of `AnchorHead`; ``scores`` is of ``heatmap``.
     groups : numbers of classes that share one box at each position, in the order of the classes; they add up to
-        all classes.
+        all classes. Of a group's boxes that overlap, only the best one stays, whatever their classes.
     rotation : order of the channels of ``rot``: ``"sin_cos"`` of mmdet3d, ``"cos_sin"`` of OpenPCDet.
     """
 

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from edgeperc.camera.image import ImageScaler
-from edgeperc.errors import CardMismatchError, EdgepercError
+from edgeperc.errors import CardMismatchError, EdgepercError, ModelFileError
 from edgeperc.inference.decode import decode_classes, decode_top_view
 from edgeperc.inference.projection import make_projector, project
 from edgeperc.inference.session import WHOLE, Session, golden_feed, golden_input, golden_shape
@@ -189,7 +189,10 @@ def write_card(model: onnx.ModelProto, card: ModelCard, path: Path) -> None:
     with open_atomic(path) as file:
         file.write(model.SerializeToString(deterministic=True))
         file.flush()
-        session = Session(Path(file.name), "cpu")
+        try:
+            session = Session(Path(file.name), "cpu")
+        except EdgepercError as exc:
+            raise type(exc)(str(exc).replace(file.name, str(path))) from exc
         if session.card.to_json() != card.to_json():
             raise ParityError(f"{path}: the card read back differs from the card written")
 
@@ -215,20 +218,37 @@ def with_golden(model: onnx.ModelProto, card: ModelCard) -> ModelCard:
     """The card with a golden record: a known input, and this computer's outputs for it."""
     import onnxruntime
 
-    session = onnxruntime.InferenceSession(model.SerializeToString(), providers=["CPUExecutionProvider"])
+    options = onnxruntime.SessionOptions()
+    options.log_severity_level = 4  # weights that are inputs, too, as mmdeploy leaves them, have a warning each
+    try:
+        session = onnxruntime.InferenceSession(model.SerializeToString(), options, providers=["CPUExecutionProvider"])
+    except Exception as exc:  # onnxruntime's errors share no base but Exception
+        raise ModelFileError(f"onnxruntime {onnxruntime.__version__} cannot open the graph: {exc}") from exc
     feed = golden_feed(card, 0)
     x = feed[card.input.name]
     nodes = session.get_inputs()
     if {node.name for node in nodes} != {*feed}:
         raise CardMismatchError(f"card names inputs {[*feed]}, the graph has {[node.name for node in nodes]}")
+    names, present = [o.name for o in card.outputs], [node.name for node in session.get_outputs()]
+    if not {*names} <= {*present}:
+        raise CardMismatchError(f"card names outputs {names}, the graph has {present}")
     for node in nodes:
         kind = WHOLE.get(node.type.removeprefix("tensor(").removesuffix(")"), np.float32)
         n_more = max(node.shape[0] - len(x), 0) if len(feed) > 1 and isinstance(node.shape[0], int) else 0
         padding = [(0, n_more), *[(0, 0)] * (feed[node.name].ndim - 1)]
         feed[node.name] = np.pad(feed[node.name], padding, mode="edge").astype(kind)
-    outputs = session.run([o.name for o in card.outputs], feed)
+    try:
+        outputs = session.run(names, feed)
+    except Exception as exc:  # as above
+        shapes = {name: array.shape for name, array in feed.items()}
+        raise CardMismatchError(f"the graph does not run on inputs as the card declares them, {shapes}: {exc}") from exc
     records = {}
     for spec, output in zip(card.outputs, outputs, strict=True):
+        expected = card.shape_of(spec)
+        if len(expected) != output.ndim or any(n not in (None, m) for n, m in zip(expected, output.shape, strict=True)):
+            raise CardMismatchError(
+                f"{spec.name!r} has shape {output.shape} in the graph; its card declares {expected}"
+            )
         few = output.size <= N_GOLDEN_VALUES
         at = np.arange(output.size) if few else np.random.default_rng(0).integers(output.size, size=N_GOLDEN_VALUES)
         records[spec.name] = {

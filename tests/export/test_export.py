@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import itertools
 import json
+import re
 import shutil
 import warnings
 from collections.abc import Callable, Iterator, Sequence
@@ -911,14 +912,50 @@ def test_a_third_party_network_runs_with_a_card(
     assert len(np.unique(answer.points.labels[answer.points.in_view])) > 1
 
 
-def test_a_card_that_does_not_fit_writes_nothing(tmp_path: Path, third_party: tuple[Path, ModelCard]) -> None:
+def test_a_card_that_does_not_fit_writes_nothing(
+    tmp_path: Path, third_party: tuple[Path, ModelCard], capsys: pytest.CaptureFixture[str]
+) -> None:
     path, card = third_party
     wrong = replace(card, classes=("nothing", "car"))
-    with pytest.raises(CardMismatchError, match=r"'probabilities' is tensor\(float\) of shape \(1, 3, 32, 1024\)"):
+    with pytest.raises(CardMismatchError, match=r"/out.onnx: 'probabilities' is .* of shape \(1, 3, 32, 1024\)"):
         write_card(onnx.load(path), wrong, tmp_path / "out.onnx")
     assert not (tmp_path / "out.onnx").exists()
     (tmp_path / "card.json").write_text(wrong.to_json())
     assert main(["card", str(path), str(tmp_path / "card.json"), str(tmp_path / "out.onnx")]) == 2
+    assert "'probabilities' has shape (1, 3, 32, 1024) in the graph; its card declares" in capsys.readouterr().err
+
+
+def _renamed(model: onnx.ModelProto) -> None:
+    model.graph.output[0].name = model.graph.node[-1].output[0] = "scores"
+
+
+def _of_a_plugin(model: onnx.ModelProto) -> None:
+    model.graph.node[0].op_type = "PPScatterPlugin"
+
+
+def _of_two_scans(model: onnx.ModelProto) -> None:
+    model.graph.input[0].type.tensor_type.shape.dim[0].dim_value = 2
+
+
+FOREIGN = {
+    r"card names outputs \['probabilities'\], the graph has \['scores'\]": _renamed,
+    "cannot open the graph: .*PPScatterPlugin": _of_a_plugin,
+    r"does not run on inputs as the card declares them, \{'scan': \(1, 2, 32, 1024\)\}: .*Expected: 2": _of_two_scans,
+}
+
+
+@pytest.mark.parametrize("message", FOREIGN)
+def test_a_graph_that_does_not_fit_is_told_of(
+    message: str, tmp_path: Path, third_party: tuple[Path, ModelCard], capsys: pytest.CaptureFixture[str]
+) -> None:
+    """In a line that says what came and what was expected, with no trace of the program."""
+    path, card = third_party
+    model = onnx.load(path)
+    FOREIGN[message](model)
+    onnx.save(model, tmp_path / "wrong.onnx")
+    (tmp_path / "card.json").write_text(card.to_json())
+    assert main(["card", *(str(tmp_path / name) for name in ("wrong.onnx", "card.json", "out.onnx"))]) == 2
+    assert re.search(message, capsys.readouterr().err)
 
 
 def test_weights_have_the_terms_of_their_scans() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -22,10 +23,11 @@ from cli_helpers import run
 from edgeperc import Perceiver, Tracker
 from edgeperc.errors import CardMismatchError, InferenceError, ProviderError
 from edgeperc.inference.detections import decode_detections
+from edgeperc.inference.pillars import Pillarizer
 from edgeperc.inference.session import Session
 from edgeperc.records import scan_record
 from edgeperc.simulation.samples import simulated_scan
-from edgeperc.types.card import ModelCard, OutputSpec
+from edgeperc.types.card import Golden, ModelCard, OutputSpec
 from edgeperc.types.detector import Anchor, CenterHead
 from edgeperc.types.frame import ModelFrame
 from edgeperc.types.geometry import rectangles
@@ -111,8 +113,8 @@ def by_torch(network: PillarNet, card: ModelCard, points: NDArray[np.float32]) -
         near = (boxes[order, 2] >= -8.0) & (boxes[order, 2] <= 6.0)
         order = order[near]
         kept = []
-        for label in range(3):
-            alike = order[labels[order] == label]
+        groups = [order] if network.kind == "centers" else [order[labels[order] == label] for label in range(3)]
+        for alike in groups:
             flat = boxes[alike][:, [0, 1, 3, 4, 6]].double().numpy()
             kept += alike[torch.from_numpy(twins.decode.nms(flat, MAX_IOU))].tolist()
         kept.sort(key=lambda row: -float(scores[row]))
@@ -281,6 +283,23 @@ def test_without_points_there_are_no_boxes(models: dict[str, Path]) -> None:
         assert perceived(models["centers"], empty).boxes == ()
 
 
+@pytest.mark.parametrize("n", [1, 2, 3])
+@pytest.mark.parametrize("kind", HEADS)
+def test_few_pillars(kind: str, n: int, models: dict[str, Path], trained: dict[str, PillarNet]) -> None:
+    """A pillar alone is as the same one twice, which changes nothing."""
+    scan = np.float32([[5.0, 0.3, -1.0, 0.2], [9.0, 4.0, -1.5, 0.4], [20.0, -3.0, -0.5, 0.1]])[:n]
+    session, maker = Session(models[kind], "cpu"), Pillarizer(VIEW, card_of(kind).input)
+    assert maker.fill(scan) == n
+    for given, array in zip(session.inputs.values(), maker.pillars, strict=True):
+        given[:n] = array[:n]
+    found = session.run(n)
+    rows = torch.arange(max(n, 2)) % n
+    with torch.no_grad():
+        wanted = trained[kind](*(torch.from_numpy(array[:n])[rows] for array in maker.pillars))
+    for output, right in zip(card_of(kind).outputs, wanted, strict=True):
+        np.testing.assert_allclose(found[output.name], right[0].numpy(), atol=1e-3)
+
+
 def test_clusters_alone_leave_the_detector_out(models: dict[str, Path], points: NDArray[np.float32]) -> None:
     options = {"provider": "cpu", "mounting": MODEL_MOUNTING, "on_mismatch": "ignore", "boxes_from": "clusters"}
     with_detector = Perceiver([models["centers"], "pointseg"], **options)(points)  # type: ignore[arg-type]
@@ -300,6 +319,8 @@ def test_the_command_line(
     assert [*(tmp_path / "out").glob("*.png")]
     document = json.loads(capsys.readouterr().out.splitlines()[0])
     assert document["boxes"]
+    assert run("run", tmp_path / "scan.bin", "--model", models["anchors"], "--provider", "cpu", "--anyway") == 0
+    assert re.search(rf"{len(points):,} points  [\d.]+ ms  boxes: \d+ ", capsys.readouterr().out)
     assert {box["label"] for box in document["boxes"]} <= {*KINDS}
 
 
@@ -405,6 +426,26 @@ def test_order_of_sine_and_cosine_and_probabilities(seed: int) -> None:
     found = decoded({kind: (kind, values) for kind, values in likely.items()}, replace(GROUPS, scores="probabilities"))
     assert [box.center for box in found] == [box.center for box in one]
     assert [box.score for box in found] == pytest.approx([box.score for box in one], abs=1e-6)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_boxes_of_a_group_do_not_overlap(seed: int) -> None:
+    """Whatever their classes, as in OpenPCDet and mmdetection3d; those of two groups may."""
+    maps = random_maps(seed)
+    found = decoded({kind: (kind, values) for kind, values in maps.items()})
+    groups = [[box for box in found if box.label in kinds] for kinds in (KINDS[:1], KINDS[1:])]
+    for boxes in groups:
+        assert len(boxes) > 5
+        assert twins.decode.nms(rectangles(boxes), card_of("centers").nms_iou).all()
+    assert not twins.decode.nms(rectangles([*groups[0], *groups[1]]), card_of("centers").nms_iou).all()
+
+
+@pytest.mark.parametrize("n_groups", [1, 6, 64])
+def test_a_golden_record_of_an_output_for_each_part_and_group(n_groups: int) -> None:
+    """OpenPCDet's CenterPoint for nuScenes has 36 outputs."""
+    known = {"sha256": "0" * 64, "std": 1.0, "positions": [*range(16)], "values": [0.0] * 16}
+    outputs = {f"{kind}{k}": known for kind in MAPS for k in range(n_groups)}
+    assert len(Golden(0, "0" * 64, outputs).outputs) == 6 * n_groups
 
 
 def anchored(bins: list[float] | None, yaw: float, across_classes: bool = False, iou: float = 0.1) -> list[Box]:

@@ -49,6 +49,8 @@ HASHES = {
     "visualization_msgs/msg/MarkerArray": "86cb8800b6fb05b5eff1abd7a56f62a5641d3ae9a1c29e78e67e704f1d067dcf",
     "nav_msgs/msg/OccupancyGrid": "8d348150c12913a31ee0ec170fbf25089e4745d17035792a1ba94d6f0bc0cfc7",
     "diagnostic_msgs/msg/DiagnosticArray": "5a8a36efb05fb25070fa0fb3810290c0e6cd4862b54a8fb975a1ee8dc55a333e",
+    # As a client of ROS 2 in Elixir has it, which zenoh's keys must match.
+    "vision_msgs/msg/Detection3DArray": "793f5eab9595ac1c0da07873cc859db42eae51f0ee76056db8562515d830e018",
 }
 BOXES = (
     Box("car", 0.9, (12.0, 3.0, -0.9), (4.2, 1.8, 1.6), 0.3),

@@ -13,15 +13,15 @@ def pillars(
     points: np.ndarray, view: PillarGeometry, channels: Sequence[str], mean: np.ndarray, std: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Twin of `edgeperc.inference.pillars.Pillarizer.fill`: values, counts and places of the pillars."""
-    points = points.astype(np.float64)
     bounds = np.array([view.x_range_m, view.y_range_m, view.z_range_m])
+    size = np.float32([view.cell_m, view.cell_m, bounds[2, 1] - bounds[2, 0]])
     with np.errstate(invalid="ignore"):
-        inside = np.isfinite(points).all(axis=1)
-        inside &= ((points[:, :3] >= bounds[:, 0]) & (points[:, :3] < bounds[:, 1])).all(axis=1)
+        at = (points[:, :3] - bounds[:, 0].astype(np.float32)) / size  # float32
+        inside = (
+            np.isfinite(points).all(axis=1) & (at >= 0).all(axis=1) & (at < (view.width, view.height, 1)).all(axis=1)
+        )
     cells: dict[tuple[int, int], list[np.ndarray]] = {}
-    for point in points[inside]:
-        column = min(int((point[0] - bounds[0, 0]) / view.cell_m), view.width - 1)
-        row = min(int((point[1] - bounds[1, 0]) / view.cell_m), view.height - 1)
+    for point, (column, row, _) in zip(points[inside].astype(np.float64), at[inside].astype(int).tolist(), strict=True):
         cells.setdefault((row, column), []).append(point)
     kept = list(cells.items())[: view.max_pillars]
     values = np.zeros((len(kept), view.max_points, len(channels)))

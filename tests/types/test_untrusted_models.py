@@ -299,6 +299,17 @@ def test_a_first_run_without_end_is_given_up(tmp_path: Path, monkeypatch: pytest
     with pytest.raises(InferenceError, match=r"(?i)terminat"):
         session.run_bound(1, options)
     session.run()
+
+    def run_late() -> None:
+        with session_module.terminated(onnxruntime, 1e-9) as options:
+            while not options.terminate:
+                time.sleep(0.001)
+            session.run_bound(1, options)
+
+    with pytest.raises(InferenceError, match=r"may take 1e-09 s\); try again on an idle computer, or pass trusted"):
+        run_late()
+    with pytest.raises(InferenceError, match=r"^another$"), session_module.terminated(onnxruntime, 60.0):
+        raise InferenceError("another")
     monkeypatch.setattr(session_module, "terminated", late)
     with contextlib.suppress(InferenceError):  # the timer may come too late for so small a network
         Session(path, "cpu")
