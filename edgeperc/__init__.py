@@ -155,7 +155,7 @@ __all__ = [
     "stream",
 ]
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 MODULES = {
     "Answer": "live",
