@@ -43,7 +43,7 @@ values = st.one_of(
 scans = hnp.arrays(np.float32, st.tuples(st.integers(0, 40), st.just(4)), elements=values)
 
 
-def crowd(seed: int, n: int = 400, spread_m: float = 1.0) -> Points:
+def crowd(seed: int, n: int = 160, spread_m: float = 1.0) -> Points:
     """Points of which some have neighbors."""
     rng = np.random.default_rng(seed)
     places = rng.uniform(-9.0, 9.0, (n // 8, 3))[rng.integers(0, n // 8, n)]
