@@ -10,7 +10,7 @@ import sys
 import threading
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -35,17 +35,12 @@ from edgeperc import (
     StampError,
     pipeline,
 )
-from edgeperc.ground import planes
-from edgeperc.inference import decode, projection, providers, session
-from edgeperc.objects import cluster, refine
+from edgeperc.inference import providers, session
 from edgeperc.objects.boxes import weigh
 from edgeperc.pipeline import Pipeline
-from edgeperc.preprocess import condition, fitness
-from edgeperc.road import ahead
 from edgeperc.simulation.drawn import random_scene
 from edgeperc.simulation.scene import SimulatedScan, simulate
 from edgeperc.system.lanes import Stopwatch
-from edgeperc.types import geometry
 from edgeperc.types.geometry import inside, oriented_iou
 from edgeperc.types.mounting import MODEL_MOUNTING
 from edgeperc.types.perception import PointLabels
@@ -295,6 +290,14 @@ def test_result_does_not_depend_on_earlier_scans(perceive: Perceiver, perception
     assert_same(perception, perceive(again))
 
 
+def in_threads(work: Sequence[Callable[[], None]]) -> None:
+    threads = [threading.Thread(target=each) for each in work]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+
+
 def test_perceivers_in_threads_give_the_same_result(perception: Perception, scan: SimulatedScan) -> None:
     answers: list[Perception] = []
 
@@ -302,11 +305,7 @@ def test_perceivers_in_threads_give_the_same_result(perception: Perception, scan
         one = Perceiver(["ssadnet", "pointseg"], provider="cpu", n_threads=1)
         answers.extend(one(scan.points) for _ in range(3))
 
-    threads = [threading.Thread(target=work) for _ in range(3)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
+    in_threads([work] * 3)
     assert len(answers) == 9
     for answer in answers:
         assert_same(perception, answer)
@@ -316,11 +315,7 @@ def test_one_perceiver_in_threads_gives_the_same_result(perceive: Perceiver, sca
     scans = [scan.points, scan.points[::2], scan.points[:1000], scan.points[:0]]
     alone = [perceive(s) for s in scans]
     answers: dict[int, Perception] = {}
-    threads = [threading.Thread(target=lambda k=k: answers.update({k: perceive(scans[k])})) for k in range(4)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
+    in_threads([lambda k=k: answers.update({k: perceive(scans[k])}) for k in range(4)])
     for k in range(4):
         assert_same(alone[k], answers[k])
 
@@ -474,15 +469,11 @@ FAULTS = {
 
 
 @pytest.mark.parametrize("fault", FAULTS)
-def test_a_warning_names_the_fault(scan: SimulatedScan, fault: str) -> None:
+def test_a_warning_or_an_error_names_the_fault(scan: SimulatedScan, fault: str) -> None:
     perceive = Perceiver("pointseg", provider="cpu", on_mismatch="warn")
     with pytest.warns(UserWarning, match=FAULTS[fault]) as caught:
         answer = perceive(faulty(scan.points, fault))
     assert answer.fitness == tuple(str(w.message) for w in caught)
-
-
-@pytest.mark.parametrize("fault", FAULTS)
-def test_mismatch_can_be_an_error(scan: SimulatedScan, fault: str) -> None:
     with pytest.raises(FitnessError, match=FAULTS[fault]):
         Perceiver("pointseg", provider="cpu", on_mismatch="raise")(faulty(scan.points, fault))
 
@@ -732,9 +723,9 @@ def test_a_network_that_has_not_found_a_vehicle_lowers_its_score_as_far_as_it_se
     assert [box.label for box in weigh([car, person], view, vehicles, score + 0.01)] == ["pedestrian"] * (score < 0.89)
 
 
-@pytest.mark.parametrize(("seen", "n_boxes"), [(1.0, 1), (0.8, 1), (0.5, 1), (0.3, 1)])
+@pytest.mark.parametrize("seen", [1.0, 0.8, 0.5, 0.3])
 def test_car_cut_by_the_views_edge_gets_a_full_box_if_it_is_seen_at_all(
-    monkeypatch: pytest.MonkeyPatch, seen: float, n_boxes: int
+    monkeypatch: pytest.MonkeyPatch, seen: float
 ) -> None:
     perceive = Perceiver("pointseg", provider="cpu", n_threads=1)
     x, y = (v.ravel() for v in np.meshgrid(np.arange(-20.0, 20.0, 0.4), np.arange(-20.0, 20.0, 0.4)))
@@ -751,11 +742,9 @@ def test_car_cut_by_the_views_edge_gets_a_full_box_if_it_is_seen_at_all(
 
     assert perceive.pipeline is not None
     monkeypatch.setattr(perceive.pipeline.ranged[0], "label", label)
-    boxes = perceive.pipeline(scan, MODEL_MOUNTING, Stopwatch()).boxes
-    assert len(boxes) == n_boxes
-    for box in boxes:
-        np.testing.assert_allclose(box.center[0], 6.0, atol=0.05)
-        np.testing.assert_allclose(box.size[0], 4.0, atol=0.05)
+    (box,) = perceive.pipeline(scan, MODEL_MOUNTING, Stopwatch()).boxes
+    np.testing.assert_allclose(box.center[0], 6.0, atol=0.05)
+    np.testing.assert_allclose(box.size[0], 4.0, atol=0.05)
 
 
 def test_boxes_all_around_the_vehicle(scan: SimulatedScan) -> None:
@@ -777,47 +766,6 @@ def test_boxes_all_around_the_vehicle(scan: SimulatedScan) -> None:
     fresh = left.in_view & ~in_view
     assert (every.points.labels[fresh] == left.labels[fresh]).mean() > 0.999
     assert any(box.center[0] < 0.0 for box in every.boxes)
-
-
-LAYOUTS: dict[str, Callable[[NDArray[np.float32]], NDArray[np.float32]]] = {
-    "writable": np.copy,
-    "read-only": lambda p: np.frombuffer(p.tobytes(), np.float32).reshape(-1, 4),
-    "unaligned": lambda p: np.frombuffer(b"x" + p.tobytes(), np.float32, offset=1).reshape(-1, 4),
-    "by columns": np.asfortranarray,
-    "double precision": lambda p: p.astype(np.float64),
-    "one point": lambda p: p[:1],
-    "empty": lambda p: p[:0],
-    "not finite": lambda p: np.where(np.arange(len(p))[:, None] % 7, p, np.nan).astype(np.float32),
-}
-
-
-@pytest.mark.parametrize(
-    "options",
-    [
-        {"models": ["ssadnet", "pointseg"]},
-        {"models": "pointseg", "full_turn": True},
-        {"models": "pointseg", "sensor": "vlp-16"},
-        {"models": "pointseg", "sensor": "os1-64", "adapt": "none"},
-    ],
-)
-def test_the_first_call_compiles_nothing(scan: SimulatedScan, options: dict[str, Any]) -> None:
-    """Construction compiles every kernel that a call needs, whatever the layout of the scan in memory."""
-    kernels = {
-        f"{module.__name__}.{name}": kernel
-        for module in (ahead, cluster, condition, decode, fitness, geometry, planes, projection, refine)
-        for name, kernel in vars(module).items()
-        if hasattr(kernel, "signatures") and kernel.__module__ == module.__name__
-    }
-    if not kernels:
-        pytest.skip("numba compiles nothing")
-    perceive = Perceiver(**options, provider="cpu", n_threads=1, on_mismatch="warn")
-    compiled = {name: list(kernel.signatures) for name, kernel in kernels.items()}
-    for layout, change in LAYOUTS.items():
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # some of these are unlike the training scans
-            perceive(change(scan.points))
-        for name, kernel in kernels.items():
-            assert list(kernel.signatures) == compiled[name], f"a {layout} scan compiled {name} again"
 
 
 def test_boxes_from_clusters_need_a_range_image_model() -> None:
