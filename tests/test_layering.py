@@ -435,8 +435,13 @@ def test_the_runtime_is_light(name: str) -> None:
 def test_the_tests_of_what_loads_extras_run_without_them() -> None:
     """By ``make test-minimal``. `evaluation` draws, and its tests of that are skipped without matplotlib."""
     loading = {name for name in RUNTIME if packages_imported(name, tree_of(name)) - NEEDED - {"onnxruntime"}}
-    (line,) = (line for line in (REPOSITORY / "Makefile").read_text().splitlines() if "LOADING = " in line)
-    assert {name.split(".")[1] for name in loading} == {*line.partition("= ")[2].split(), "evaluation"} - {"bench"}
+    lines = (REPOSITORY / "Makefile").read_text().splitlines()
+    (run,) = (line.partition("= ")[2].split() for line in lines if "LOADING = " in line)
+    assert {name.split(".")[1] for name in loading} == {*run, "evaluation"} - {"bench"}
+    for name in " ".join(line.partition("= ")[2] for line in lines if "ALIKE " in line.partition("= ")[0]).split():
+        taken = {*imported(name, ast.parse((REPOSITORY / f"tests/{name}.py").read_text("utf-8")))}
+        taken |= {dotted.rpartition(".")[0] for dotted in taken}
+        assert not taken & loading - {"edgeperc.cli.output"}, name  # its bar is drawn in tests/cli/test_cli.py
 
 
 @pytest.mark.parametrize("name", RUNTIME)
