@@ -150,6 +150,7 @@ def test_commands_run(block: Block, line: str, place: Path, monkeypatch: pytest.
             pytest.importorskip({"--bag": "rosbags", "--mcap": "foxglove", "--rrd": "rerun"}[option])
         if sys.platform == "win32" and "models/research" in line:
             pytest.skip("no symbolic links")
+        arguments = ["simulation:2" if word.startswith("simulation:") else word for word in arguments]  # of any number
         with contextlib.redirect_stdout(io.StringIO()) as printed:
             assert cli.main(arguments) == 0, printed.getvalue()
 
