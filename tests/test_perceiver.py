@@ -67,13 +67,9 @@ def perception(perceive: Perceiver, scan: SimulatedScan) -> Perception:
 
 
 def assert_same(one: Perception, other: Perception) -> None:
-    assert one.points is not None
-    assert other.points is not None
-    assert one.top_view is not None
-    assert other.top_view is not None
-    np.testing.assert_array_equal(one.points.labels, other.points.labels)
-    np.testing.assert_array_equal(one.points.in_view, other.points.in_view)
-    np.testing.assert_array_equal(one.top_view.labels, other.top_view.labels)
+    np.testing.assert_array_equal(one.require_points().labels, other.require_points().labels)
+    np.testing.assert_array_equal(one.require_points().in_view, other.require_points().in_view)
+    np.testing.assert_array_equal(one.require_top_view().labels, other.require_top_view().labels)
     assert one.boxes == other.boxes  # bit for bit: tuples of floats
 
 
@@ -92,24 +88,21 @@ def test_every_point_has_a_label(perception: Perception, scan: SimulatedScan) ->
 
 
 def test_result_resembles_the_ground_truth(perception: Perception, scan: SimulatedScan) -> None:
-    assert perception.points is not None
-    assert perception.top_view is not None
-    seen = perception.points.in_view
-    found, true = perception.points.labels[seen] == 1, scan.labels[seen] == 1
+    seen = perception.require_points().in_view
+    found, true = perception.require_points().labels[seen] == 1, scan.labels[seen] == 1
     assert true.sum() > 500
     assert (found & true).sum() / (found | true).sum() > 0.5
     truth = scan.top_view_labels()
-    drivable = perception.top_view.drivable
+    drivable = perception.require_top_view().drivable
     assert (drivable & (truth == 1)).sum() / (drivable | (truth == 1)).sum() > 0.5
     assert any(b.score > 0.5 for b in perception.boxes)
 
 
 def test_other_fields_of_the_perception(perception: Perception, perceive: Perceiver) -> None:
     assert perception.stamp_s == 12.5
-    assert perception.top_view is not None
-    assert perception.top_view.labels.shape == (400, 200)
-    assert perception.top_view.classes == ("background", "drivable", "car", "van", "truck")
-    assert perception.top_view.to_meters(399, 0) == pytest.approx((6.05, 9.95))
+    assert perception.require_top_view().labels.shape == (400, 200)
+    assert perception.require_top_view().classes == ("background", "drivable", "car", "van", "truck")
+    assert perception.require_top_view().to_meters(399, 0) == pytest.approx((6.05, 9.95))
     assert set(perception.stage_ms) == {"check", "project", "infer", "decode", "refine", "cluster", "agree"}
     assert min(perception.stage_ms.values()) > 0.0
     assert [*perception.providers] == ["ssadnet", "pointseg"]
@@ -322,14 +315,11 @@ def test_one_perceiver_in_threads_gives_the_same_result(perceive: Perceiver, sca
 
 def test_results_own_their_arrays(perceive: Perceiver, scan: SimulatedScan) -> None:
     first = perceive(scan.points)
-    assert first.points is not None
-    assert first.top_view is not None
-    kept = first.points.labels.copy(), first.top_view.labels.copy()
+    kept = first.require_points().labels.copy(), first.require_top_view().labels.copy()
     other = perceive(scan.points[::3])
-    assert other.top_view is not None
-    assert (other.top_view.labels != kept[1]).any()
-    np.testing.assert_array_equal(first.points.labels, kept[0])
-    np.testing.assert_array_equal(first.top_view.labels, kept[1])
+    assert (other.require_top_view().labels != kept[1]).any()
+    np.testing.assert_array_equal(first.require_points().labels, kept[0])
+    np.testing.assert_array_equal(first.require_top_view().labels, kept[1])
 
 
 def test_non_finite_points_are_counted_and_ignored(
@@ -343,11 +333,9 @@ def test_non_finite_points_are_counted_and_ignored(
     dirty[at[300:], rng.integers(3, size=200)] = np.inf
     answer = perceive(dirty)
     assert answer.n_dropped == 500
-    assert answer.points is not None
-    assert perception.points is not None
-    assert not answer.points.labels[at].any()
-    assert not answer.points.in_view[at].any()
-    np.testing.assert_array_equal(np.delete(answer.points.labels, at), perception.points.labels)
+    assert not answer.require_points().labels[at].any()
+    assert not answer.require_points().in_view[at].any()
+    np.testing.assert_array_equal(np.delete(answer.require_points().labels, at), perception.require_points().labels)
     assert answer.boxes == perception.boxes
 
 
@@ -379,37 +367,31 @@ def test_few_points(perceive: Perceiver, n: int) -> None:
     points = np.array([[12.0, 1.0, -1.0, 0.3], [30.0, -2.0, -1.5, 0.1]], np.float32)[:n]
     answer = perceive(points)
     assert answer.n_points == n
-    assert answer.points is not None
-    assert answer.points.labels.shape == (n,)
-    assert answer.points.in_view.all()
-    assert answer.top_view is not None
-    assert answer.top_view.labels.shape == (400, 200)
+    assert answer.require_points().labels.shape == (n,)
+    assert answer.require_points().in_view.all()
+    assert answer.require_top_view().labels.shape == (400, 200)
     assert answer.boxes == ()
 
 
 def test_only_non_finite_points(perceive: Perceiver) -> None:
     answer = perceive(np.full((10, 4), np.nan, np.float32))
     assert answer.n_dropped == 10
-    assert answer.points is not None
-    assert not answer.points.in_view.any()
-    assert not answer.points.labels.any()
+    assert not answer.require_points().in_view.any()
+    assert not answer.require_points().labels.any()
     assert answer.boxes == ()
 
 
 def test_points_without_remission_have_none(perceive: Perceiver, perception: Perception, scan: SimulatedScan) -> None:
     answer = perceive(np.ascontiguousarray(scan.points[:, :3]))
     assert_same(answer, perceive(scan.points * np.array([1, 1, 1, 0], np.float32)))
-    assert answer.points is not None
-    assert perception.points is not None
-    assert (answer.points.labels != perception.points.labels).any()
+    assert (answer.require_points().labels != perception.require_points().labels).any()
 
 
 def test_ten_million_points(perceive: Perceiver, scan: SimulatedScan) -> None:
     many = np.resize(scan.points, (10_000_000, 4))
     answer = perceive(many)
-    assert answer.points is not None
-    assert answer.points.labels.shape == (10_000_000,)
-    assert np.count_nonzero(answer.points.labels == 1) > 10_000
+    assert answer.require_points().labels.shape == (10_000_000,)
+    assert np.count_nonzero(answer.require_points().labels == 1) > 10_000
 
 
 @pytest.mark.parametrize(
@@ -440,9 +422,7 @@ def test_remission_is_scaled_by_the_sensors_profile(perception: Perception, scan
     raw[:, 3] *= 255.0
     sensor = replace(get_sensor("hdl-64e"), remission_range=(0.0, 255.0))
     answer = Perceiver(["ssadnet", "pointseg"], sensor=sensor, provider="cpu")(raw)
-    assert answer.points is not None
-    assert perception.points is not None
-    assert (answer.points.labels == perception.points.labels).mean() > 0.999
+    assert (answer.require_points().labels == perception.require_points().labels).mean() > 0.999
 
 
 def faulty(points: NDArray[np.float32], how: str) -> NDArray[np.float32]:
@@ -549,12 +529,11 @@ def test_the_road_alone(scan: SimulatedScan) -> None:
     found = Perceiver("lodnn", provider="cpu", n_threads=1)(scan.points)
     assert found.points is None
     assert found.boxes == ()
-    assert found.top_view is not None
-    assert found.top_view.classes == ("background", "drivable")
+    assert found.require_top_view().classes == ("background", "drivable")
     road = scan.top_view_labels(TopViewGeometry()) == 1
-    assert (found.top_view.road & road).sum() > 0.85 * (found.top_view.road | road).sum()
-    assert (found.top_view.drivable & road).sum() > 0.7 * road.sum()  # cars hide the rest
-    ahead = edgeperc.road_ahead(found.top_view)
+    assert (found.require_top_view().road & road).sum() > 0.85 * (found.require_top_view().road | road).sum()
+    assert (found.require_top_view().drivable & road).sum() > 0.7 * road.sum()  # cars hide the rest
+    ahead = edgeperc.road_ahead(found.require_top_view())
     assert ahead.free_ahead_m() > 40.0
     assert ahead.lane_width_m == pytest.approx(3.0, abs=0.5)
 
@@ -652,10 +631,8 @@ def test_real_scans_are_perceived_without_warnings(kitti_root: Path) -> None:
     for name in ("000000", "000160", "000200", "000264", "000300"):
         points = edgeperc.read_points(kitti_root / "training/velodyne" / f"{name}.bin")
         answer = perceive(points)
-        assert answer.points is not None
-        assert answer.points.labels.shape == (len(points),)
-        assert answer.top_view is not None
-        assert answer.top_view.drivable_area_m2 > 50.0
+        assert answer.require_points().labels.shape == (len(points),)
+        assert answer.require_top_view().drivable_area_m2 > 50.0
 
 
 def overlaps(first: tuple[Box, ...], second: tuple[Box, ...]) -> NDArray[np.float64]:
@@ -677,13 +654,12 @@ def test_a_networks_boxes_are_vehicles_ahead(perceive: Perceiver, scan: Simulate
 def test_boxes_of_labeled_points_are_around_them(scan: SimulatedScan) -> None:
     perceive = Perceiver("pointseg", provider="cpu")
     answer = perceive(scan.points)
-    assert answer.points is not None
     assert answer.boxes
     assert answer.stage_ms["cluster"] > 0.0
     for box in answer.boxes:
         label = "car" if box.label in ("van", "truck") else box.label  # the network's name of any vehicle
-        number = answer.points.classes.index(label)
-        own = answer.points.labels[inside(box, scan.points, 0.05)]
+        number = answer.require_points().classes.index(label)
+        own = answer.require_points().labels[inside(box, scan.points, 0.05)]
         assert np.count_nonzero(own == number) >= 5
     assert answer.boxes == perceive(scan.points).boxes
 
@@ -753,18 +729,16 @@ def test_boxes_all_around_the_vehicle(scan: SimulatedScan) -> None:
         "pointseg", mounting=MODEL_MOUNTING, provider="cpu", n_threads=1, on_mismatch="ignore", full_turn=True
     )
     seen, every = ahead(scan.points), around(scan.points)
-    assert seen.points is not None
-    assert every.points is not None
-    in_view = seen.points.in_view
-    np.testing.assert_array_equal(every.points.labels[in_view], seen.points.labels[in_view])
+    in_view = seen.require_points().in_view
+    np.testing.assert_array_equal(every.require_points().labels[in_view], seen.require_points().labels[in_view])
     elevation = np.degrees(np.arcsin(scan.points[:, 2] / np.linalg.norm(scan.points[:, :3], axis=1)))
-    assert every.points.in_view[(elevation < 2.0) & (elevation > -23.0)].mean() > 0.98
+    assert every.require_points().in_view[(elevation < 2.0) & (elevation > -23.0)].mean() > 0.98
     # A quarter turn of the scan is a quarter turn of the answer, but for heights: the ground is found in other cells.
     behind = scan.points[:, [1, 0, 2, 3]] * np.array([1, -1, 1, 1], np.float32)  # what is left is ahead
     left = ahead(behind).points
     assert left is not None
     fresh = left.in_view & ~in_view
-    assert (every.points.labels[fresh] == left.labels[fresh]).mean() > 0.999
+    assert (every.require_points().labels[fresh] == left.labels[fresh]).mean() > 0.999
     assert any(box.center[0] < 0.0 for box in every.boxes)
 
 

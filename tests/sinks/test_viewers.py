@@ -626,9 +626,8 @@ def test_a_long_drive_stays_within_its_limit(tmp_path: Path) -> None:
     """Points are halved down to 3,000, then scans are left out; objects and far points are kept for longer."""
     points = np.tile(a_scan()[:-1], (4, 1)) * np.float32([1, 1, 1, 1])
     perception = a_perception(a_scan())
-    assert perception.points is not None
-    labels = np.tile(perception.points.labels[:-1], 4)
-    found = replace(perception.points, labels=labels, in_view=np.ones(len(labels), bool))
+    labels = np.tile(perception.require_points().labels[:-1], 4)
+    found = replace(perception.require_points(), labels=labels, in_view=np.ones(len(labels), bool))
     perception = replace(perception, n_points=len(points), n_dropped=0, points=found)
     page, limit = DrivePage(max_bytes=500_000), 500_000
     states = []
