@@ -70,16 +70,19 @@ class Place:
         """Load the kernels and call one; return the warnings and the number of compilations."""
         self._monkeypatch.setattr(kernel_cache, "reported", set())
         self._caplog.clear()
-        spec = importlib.util.spec_from_file_location("some_kernels", self.source)
-        assert spec is not None
-        assert spec.loader is not None
-        module = importlib.util.module_from_spec(spec)
-        self._monkeypatch.setitem(sys.modules, "some_kernels", module)
-        spec.loader.exec_module(module)
+        module = self.load()
         assert module.total(VALUES) == ANSWER
         n_compiled = sum(sum(kernel.stats.cache_misses.values()) for kernel in (module.total, module.squared))
         warnings = [r.getMessage() for r in self._caplog.records if r.levelno >= logging.WARNING]
         return warnings, n_compiled
+
+    def load(self) -> Any:
+        """The module, as by a new process."""
+        spec: Any = importlib.util.spec_from_file_location("some_kernels", self.source)
+        module = importlib.util.module_from_spec(spec)
+        self._monkeypatch.setitem(sys.modules, "some_kernels", module)
+        spec.loader.exec_module(module)
+        return module
 
     @property
     def files(self) -> list[Path]:
@@ -615,11 +618,7 @@ def test_a_constant_set_after_the_import_is_not_kept_for_others(place: Place) ->
 def test_a_value_without_a_digest_is_named(place: Place) -> None:
     place.source.write_text(SOURCE.replace("x * x", "x * x if x in WHAT else x * x") + "\nWHAT = iter([1.0])\n")
     kernel_cache.reported.clear()
-    spec = importlib.util.spec_from_file_location("some_kernels", place.source)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
+    module = place.load()
     with pytest.raises(TypeError, match="squared reads WHAT, a list_iterator, which has no digest"):
         kernel_stamp.stamp_of(module.total)
     assert not module.total._cache.is_missing()
