@@ -100,9 +100,9 @@ def start(folder: Path, n_cores: int, **environment: str) -> tuple[list[str], li
 
 @pytest.fixture(scope="module")
 def first(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, tuple[list[str], list[str], str, list[str]]]:
-    """The folder of a first start with a helper, which takes long though nothing is optimized, and what it said."""
+    """The folder of a first start with a helper, which takes long, and what it said."""
     folder = tmp_path_factory.mktemp("first") / "helped"
-    return folder, start(folder, 2, NUMBA_CACHE_DIR=str(folder / "cache"), NUMBA_OPT="0")
+    return folder, start(folder, 2, NUMBA_CACHE_DIR=str(folder / "cache"))
 
 
 def test_what_is_counted_is_what_is_compiled_once(first: tuple[Path, Any]) -> None:
@@ -135,7 +135,7 @@ def test_what_is_counted_is_what_is_used(first: tuple[Path, Any], options: dict[
     shutil.copytree(first[0] / "cache", tmp_path / "cache")
     for file in (tmp_path / "cache").rglob("*.fill_returns-*"):
         file.unlink()  # nothing is counted as long as nothing is missing
-    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "cache"), "NUMBA_OPT": "0"}
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "cache")}
     command = [sys.executable, "-W", "ignore", "-c", LATER, json.dumps(options)]
     done = subprocess.run(command, env=environment, capture_output=True, text=True)
     assert (done.returncode, done.stderr) == (0, "")
@@ -150,8 +150,8 @@ def test_helpers_fill_the_same_cache_and_change_no_result(cold: None, first: tup
     assert {own[name] for name in helped if name in own} - {"ground"} == set(Helpers([*PARTS]).own_parts) - {"ground"}
     assert (folder / "begun").read_text().count("\n") == 1, "a helper ran the caller's main module"
     assert not [*folder.rglob("*.part")]
-    assert start(folder, 2, NUMBA_CACHE_DIR=str(folder / "cache"), NUMBA_OPT="0")[:3] == ([], [], answer)
-    assert start(tmp_path / "alone", 1)[2] == answer  # with the kernels of all other tests, which are optimized
+    assert start(folder, 2, NUMBA_CACHE_DIR=str(folder / "cache"))[:3] == ([], [], answer)
+    assert start(tmp_path / "alone", 1)[2] == answer  # with the kernels of all other tests
 
 
 @pytest.fixture
