@@ -100,9 +100,9 @@ def test_processes_end_with_their_driver(tmp_path: Path, is_killed: bool) -> Non
 
 
 def test_workers_give_the_same_figures_of_other_sensors() -> None:
-    sets = ["vlp-16=simulation:1", "os1-64=simulation:1"]
+    sets = ["vlp-16=simulation:2", "os1-64=simulation:1"]
     seen: list[tuple[int, int]] = []
     one = compare(sets)
     two = compare(sets, workers=2, on_scan=lambda done, total: seen.append((done, total)))
     np.testing.assert_equal(two, one)
-    assert seen == [(4, 8), (8, 8)]
+    assert seen == [(8, 12), (12, 12)]
