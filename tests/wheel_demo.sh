@@ -33,6 +33,6 @@ wheel=$(echo "$away"/dist/*.whl)
 if [[ ${KERNELS:-} ]] && "$away/venv/bin/pip" show --quiet numba; then echo "numba is installed"; exit 1; fi
 cd "$away"
 "$away/venv/bin/python" -c "import edgeperc; assert edgeperc.__file__.startswith('$away'), edgeperc.__file__"
-NUMBA_OPT=0 "$away/venv/bin/edgeperc" demo --out demo # its kernels are compiled in less time, and optimized elsewhere
+"$away/venv/bin/edgeperc" demo --out demo
 [ -n "$(find demo -name '*.png' -size +1k)" ] || { echo "the demo made no picture in $away/demo"; exit 1; }
 echo "The wheel works outside the checkout: $(du -h "$wheel" | cut -f1), $(find demo -type f | tr '\n' ' ')"
