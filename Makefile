@@ -86,13 +86,15 @@ test-wheel: .venv-test/installed
 	PYTHON=$(TEST)/python tests/wheel_demo.sh
 
 # Packages with a module that loads an extra (tests/test_layering.py holds the others to loading none), and the whole: all other
-# tests would run the same code again.
+# tests would run the same code again, and so would those of ALIKE, whose modules load none, and of the worker processes here.
 test-minimal: WHOLE = live perceiver public_api silence zoo
 test-minimal: LOADING = bench cli datasets readers ros2 sinks system view
+test-minimal: ALIKE = cli/test_programs readers/test_origin system/test_atomic system/test_fields system/test_interpreter
+test-minimal: ALIKE += system/test_kernel_cache system/test_kernels system/test_lanes system/test_pool
 test-minimal: .venv-minimal/installed
 	$(MINIMAL)/python -c "import importlib.util as u; assert not any(map(u.find_spec, ['torch', 'onnx', 'matplotlib']))"
 	$(MINIMAL)/pytest -q -n $(WORKERS) --dist worksteal -m 'not kernel and not compiled' $(WHOLE:%=tests/test_%.py) $(LOADING:%=tests/%) \
-		--ignore tests/system/test_kernel_cache.py --ignore tests/system/test_pool.py
+		$(ALIKE:%=--ignore tests/%.py) --deselect tests/system/test_ray_cluster.py::test_workers_give_the_same
 
 # An old matplotlib uses what newer packages below it deprecate.
 test-lowest: .venv-lowest/installed

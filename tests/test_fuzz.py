@@ -50,7 +50,7 @@ def _round(kind: str, cases: int) -> State:
 
 @pytest.mark.parametrize(
     ("kind", "cases"),
-    [("scans", 240), ("readers", 700), ("packets", 80), ("trackers", 120), ("models", 120), ("images", 200)],
+    [("scans", 120), ("readers", 300), ("packets", 40), ("trackers", 60), ("models", 60), ("images", 100)],
 )
 def test_a_round(kind: str, cases: int) -> None:
     for library in ("lz4", "zstandard", "velodyne_decoder", "mcap", "rosbags") if kind == "readers" else ():

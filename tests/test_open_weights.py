@@ -39,10 +39,9 @@ def test_a_perceiver_takes_them() -> None:
     perceive = Perceiver(weights="open", n_threads=1)
     assert [card.name for card in perceive.cards] == [*OPEN]
     perception = perceive(scan.points)
-    assert perception.points is not None
-    vehicles = scan.labels == perception.points.classes.index("car")
-    known = perception.points.in_view & vehicles
-    assert (perception.points.labels[known] > 0).mean() > 0.5
+    vehicles = scan.labels == perception.require_points().classes.index("car")
+    known = perception.require_points().in_view & vehicles
+    assert (perception.require_points().labels[known] > 0).mean() > 0.5
     assert any(box.label == "car" for box in perception.boxes)
 
 

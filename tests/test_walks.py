@@ -99,9 +99,8 @@ def test_no_object_that_points_show_is_without_a_box(full_turn: bool) -> None:
         if not any(shown):
             continue
         perception = perceive(scan.points)
-        assert perception.points is not None
         for k, (kind, x, y, _) in enumerate(places):
-            seen = (scan.objects == k) & perception.points.in_view
+            seen = (scan.objects == k) & perception.require_points().in_view
             if np.count_nonzero(seen) < MIN_POINTS[kind]:
                 continue
             n_seen += 1

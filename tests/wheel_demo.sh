@@ -28,7 +28,7 @@ END
 
 "$python" -m venv "$away/venv"
 wheel=$(echo "$away"/dist/*.whl)
-"$away/venv/bin/pip" install --quiet "${wheel}[cpu,view]"
+"$away/venv/bin/pip" install --quiet --no-compile "${wheel}[cpu,view]"
 "$away/venv/bin/pip" check
 if [[ ${KERNELS:-} ]] && "$away/venv/bin/pip" show --quiet numba; then echo "numba is installed"; exit 1; fi
 cd "$away"

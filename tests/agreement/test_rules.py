@@ -242,7 +242,7 @@ def crowded(seed: int) -> tuple[NDArray[np.float32], PointLabels, Ground, list[B
     return points, PointLabels(labels, in_view, CLASSES), ground, boxes
 
 
-@pytest.mark.parametrize("seed", range(40))
+@pytest.mark.parametrize("seed", range(16))
 @pytest.mark.parametrize("rules", [RULES, RULES - {"share"}, RULES - {"support"}])
 def test_voters_give_the_results_of_complete_clusters(seed: int, rules: frozenset[str]) -> None:
     points, labels, ground, boxes = crowded(seed)

@@ -35,10 +35,8 @@ def scans(given: Any) -> tuple[dict[str, Any], dict[str, Any]]:
         started = time.perf_counter()
         for name in given.files:
             seen = perceive(given[name])
-            assert seen.points is not None
-            assert seen.top_view is not None
-            arrays[f"{precision} points {name}"] = seen.points.labels
-            arrays[f"{precision} cells {name}"] = seen.top_view.labels
+            arrays[f"{precision} points {name}"] = seen.require_points().labels
+            arrays[f"{precision} cells {name}"] = seen.require_top_view().labels
             document["boxes"][f"{precision} {name}"] = [box.to_dict() for box in seen.boxes]
             if precision == PRECISIONS[0] and name in given.files[:N_INPUTS]:
                 arrays |= {f"input {s.card.name} {name}": s.input.copy() for s in perceive.sessions}

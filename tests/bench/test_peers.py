@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import multiprocessing
+from collections.abc import Iterable
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -50,6 +51,11 @@ def right(scan: np.ndarray) -> Prediction:
         NAMES, provider="cpu", mounting=MODEL_MOUNTING, on_mismatch="ignore", boxes_from="network", agree=False
     )(scan)
     return Prediction(found.points, found.top_view, found.boxes)
+
+
+def need(packages: Iterable[str]) -> None:
+    for package in packages:
+        pytest.importorskip(package)
 
 
 def predict(engine: str, precision: str, scan: np.ndarray) -> Prediction:
@@ -153,15 +159,13 @@ def test_every_library_multiplies_the_same_matrices(
 
 @pytest.mark.parametrize("engine", ["onnxruntime", "torch", "openvino", "mnn"])
 def test_the_pipeline_in_numpy_agrees(engine: str, scan: np.ndarray, right: Prediction) -> None:
-    for package in peers.NEEDS.get(engine, (engine,)):
-        pytest.importorskip(package)
+    need(peers.NEEDS.get(engine, (engine,)))
     assert_agrees(right, predict(engine, "fp32", scan))
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_ncnn_computes_the_network_or_says_that_it_cannot(name: str) -> None:
-    for package in peers.NEEDS["ncnn"]:
-        pytest.importorskip(package)
+    need(peers.NEEDS["ncnn"])
     theirs, ours = (open_engine(engine, "fp32", model_path(name), 1) for engine in ("ncnn", "onnxruntime"))
     image = np.random.default_rng(0).normal(size=ours.input.shape)
     theirs.input[:] = ours.input[:] = image
@@ -193,8 +197,7 @@ def test_torch_has_the_very_network(name: str) -> None:
 
 
 def test_networks_of_several_sizes_are_timed_and_drawn() -> None:
-    for package in ("openvino", "matplotlib"):
-        pytest.importorskip(package)
+    need(("openvino", "matplotlib"))
     paths = [model_path(name) for name in ("pointseg:fp32", "pointseg:int8", "ssadnet:int8")]
     # In a process of its own: after OpenVINO 2026.4 had two networks, a process dies by SIGSEGV at its next signal.
     with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
@@ -235,8 +238,7 @@ def test_networks_of_others_are_written_in_fp32_and_int8(
     monkeypatch: pytest.MonkeyPatch,
     tmp_path: Path,
 ) -> None:
-    for package in ("onnx", "onnxscript", "torch", "tqdm"):
-        pytest.importorskip(package)
+    need(("onnx", "onnxscript", "torch", "tqdm"))
     monkeypatch.setattr(networks, "OTHERS", {name: (*OTHERS[name][:2], shape)})
     write_others(tmp_path)
     found = {}
@@ -292,8 +294,7 @@ def test_what_stands_on_the_ground_has_the_clusters_of_points_within_half_a_metr
 
 
 def test_ground_and_clusters_of_others_are_timed(tmp_path: Path, scan: np.ndarray) -> None:
-    for package in (*peers.NEEDS["patchwork"], "psutil"):
-        pytest.importorskip(package)
+    need((*peers.NEEDS["patchwork"], "psutil"))
     np.save(tmp_path / "scan.npy", scan)
     clusters = peers.Contender("Patchwork++, k-d tree", "clusters", "patchwork")
     (found,) = measure([clusters], [tmp_path / "scan.npy"])
@@ -304,8 +305,7 @@ def test_ground_and_clusters_of_others_are_timed(tmp_path: Path, scan: np.ndarra
 def test_methods_of_others_are_rows_of_one_table(
     tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for package in ("onnx", "onnxscript", "psutil", "torch", "tqdm"):
-        pytest.importorskip(package)
+    need(("onnx", "onnxscript", "psutil", "torch", "tqdm"))
     for name in {*OTHERS} - {POINTPILLARS}:
         monkeypatch.delitem(OTHERS, name)
     monkeypatch.setitem(OTHERS, POINTPILLARS, (*OTHERS[POINTPILLARS][:2], (64, 16, 24)))
@@ -422,8 +422,7 @@ def made(models: list[str], folder: Path, scan: np.ndarray, provider: str = "cpu
 
 
 def test_two_networks_give_the_results_of_one(tmp_path: Path, scan: np.ndarray) -> None:
-    for package in ("onnx", "onnxscript", "torch", "tqdm"):
-        pytest.importorskip(package)
+    need(("onnx", "onnxscript", "torch", "tqdm"))
     one, two, lean, *_ = made(["ssadnet"], tmp_path, scan)["One network or two: ssadnet:fp32"]
     assert one.image is not None
     outputs = []
@@ -442,8 +441,7 @@ def test_two_networks_give_the_results_of_one(tmp_path: Path, scan: np.ndarray) 
 def test_the_same_network_for_half_the_image(
     name: str, shape: tuple[int, int], tmp_path: Path, scan: np.ndarray
 ) -> None:
-    for package in ("onnx", "onnxscript", "torch", "tqdm"):
-        pytest.importorskip(package)
+    need(("onnx", "onnxscript", "torch", "tqdm"))
     half = resized(name, 0.5, tmp_path)
     assert cost(half).macs == pytest.approx(0.5 * cost(model_path(name)).macs, rel=0.01)
     perceive = Perceiver([half], provider="cpu", n_threads=1, on_mismatch="ignore")

@@ -156,12 +156,8 @@ def test_scan_and_image_in_one_call(model: Path, perceive: Perceiver, image: NDA
     both = Perceiver(["pointseg", model], **options)
     assert [card.name for card in both.cards] == ["pointseg", "tinycam"]
     found, of_image = both(scan, image=image), perceive(image=image)
-    assert found.points is not None
-    assert alone.points is not None
-    assert found.image is not None
-    assert of_image.image is not None
-    np.testing.assert_array_equal(found.points.labels, alone.points.labels)
-    np.testing.assert_array_equal(found.image.labels, of_image.image.labels)
+    np.testing.assert_array_equal(found.require_points().labels, alone.require_points().labels)
+    np.testing.assert_array_equal(found.require_image().labels, of_image.require_image().labels)
     assert found.boxes == alone.boxes
     assert alone.image is None
     assert [*found.providers] == ["pointseg", "tinycam"]

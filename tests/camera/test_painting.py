@@ -238,11 +238,10 @@ def test_a_perception_and_its_labels_paint_alike() -> None:
     labels[280:320, 300:340] = VOID
     image = replace(image, labels=labels)
     painted, found = paint(labels, scan.points, NEAR), perceived(scan, image)
-    assert found.image is not None
-    assert sum(found.image.counts().values()) == np.count_nonzero(labels != VOID)
+    assert sum(found.require_image().counts().values()) == np.count_nonzero(labels != VOID)
     np.testing.assert_array_equal(paint(found, scan.points, NEAR), painted)
-    np.testing.assert_array_equal(paint(found.image, scan.points, NEAR), painted)
-    by_mask = camera_road(found.image.drivable, scan.points, NEAR)
+    np.testing.assert_array_equal(paint(found.require_image(), scan.points, NEAR), painted)
+    by_mask = camera_road(found.require_image().drivable, scan.points, NEAR)
     road = camera_road(found, scan.points, NEAR)
     assert (by_mask.road & by_mask.observed)[road.observed].tolist() == road.road[road.observed].tolist()
     assert by_mask.observed.sum() > road.observed.sum()  # pixels without a class are not road, and not seen

@@ -763,16 +763,14 @@ def test_a_network_agrees_with_the_perceiver() -> None:
     found = judge.perceive(truth.points)
     assert judge.from_above is not None
     assert judge.from_sensor is not None
-    assert found.top_view is not None
-    assert found.points is not None
     drivable = judge.from_above.probability("drivable")
     assert drivable.min() >= 0.0
     assert drivable.max() <= 1.0
-    assert (found.top_view.labels[drivable > 0.5] > 0).all()  # drivable, or under a box
-    assert (drivable[found.top_view.drivable] > 1 / 5 - 1e-6).all()
+    assert (found.require_top_view().labels[drivable > 0.5] > 0).all()  # drivable, or under a box
+    assert (drivable[found.require_top_view().drivable] > 1 / 5 - 1e-6).all()
     pixels = judge.from_sensor.point_labels(truth.points)
-    assert (pixels[~found.points.in_view] == 0).all()
-    assert np.mean(pixels == found.points.labels) > 0.97
+    assert (pixels[~found.require_points().in_view] == 0).all()
+    assert np.mean(pixels == found.require_points().labels) > 0.97
 
 
 def test_the_command_on_simulated_scans(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

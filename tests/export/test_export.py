@@ -812,8 +812,7 @@ def test_an_export_is_verified(exported: Exported, scans: Sequence[np.ndarray], 
     answer = Perceiver(path, provider="cpu", on_mismatch="ignore")(scans[0])
     assert (answer.points is None) == (network in ("lodnn", "ssadnet"))
     if network == "lodnn":
-        assert answer.top_view is not None
-        assert answer.top_view.classes == ("background", "drivable")
+        assert answer.require_top_view().classes == ("background", "drivable")
         assert answer.boxes == ()
     if network == "kulseg":  # batch norm is folded, and every operator has a kernel in all engines
         plain = {"Add", "Cast", "Concat", "Conv", "ConvTranspose", "MaxPool", "Mul", "Relu", "Sigmoid"}
@@ -906,10 +905,9 @@ def test_a_third_party_network_runs_with_a_card(
     out = tmp_path / "carded.onnx"
     assert main(["card", str(path), str(tmp_path / "card.json"), str(out)]) == 0
     answer = Perceiver(out, provider="cpu")(scans[0])
-    assert answer.points is not None
-    assert answer.points.classes == ("nothing", "tree", "car")
-    assert answer.points.in_view.mean() > 0.9  # all around
-    assert len(np.unique(answer.points.labels[answer.points.in_view])) > 1
+    assert answer.require_points().classes == ("nothing", "tree", "car")
+    assert answer.require_points().in_view.mean() > 0.9  # all around
+    assert len(np.unique(answer.require_points().labels[answer.require_points().in_view])) > 1
 
 
 def test_a_card_that_does_not_fit_writes_nothing(

@@ -113,10 +113,8 @@ def test_the_python_model_answers_as_a_perceiver(repository: Path, monkeypatch: 
         expected = perceive(points, stamp_s)
         found = {tensor.name(): tensor.as_numpy() for tensor in answer.tensors}
         assert {*found} == {"record", "labels", "cells"}
-        assert expected.points is not None
-        assert expected.top_view is not None
-        np.testing.assert_array_equal(found["labels"], expected.points.labels)
-        np.testing.assert_array_equal(found["cells"], expected.top_view.labels)
+        np.testing.assert_array_equal(found["labels"], expected.require_points().labels)
+        np.testing.assert_array_equal(found["cells"], expected.require_top_view().labels)
         record, of_perceiver = json.loads(found["record"][0]), json.loads(json.dumps(scan_record(expected)))
         for each in (record, of_perceiver):
             del each["stage_ms"]

@@ -339,14 +339,12 @@ def test_answers_do_not_depend_on_the_mounting(scans: list[NDArray[np.float32]],
     assert estimated.mounting is None
     for perceive in (estimated, Perceiver(mounting=mounting, provider="cpu", on_mismatch="raise")):
         found = perceive(scan)
-        assert found.points is not None
-        assert usual.points is not None
-        objects = usual.points.labels > 0
-        assert (found.points.labels == usual.points.labels).mean() > 0.97
-        assert (found.points.labels[objects] == usual.points.labels[objects]).mean() > 0.85
-        assert found.top_view is not None
-        assert usual.top_view is not None
-        assert found.top_view.drivable_area_m2 == pytest.approx(usual.top_view.drivable_area_m2, rel=0.1)
+        objects = usual.require_points().labels > 0
+        assert (found.require_points().labels == usual.require_points().labels).mean() > 0.97
+        assert (found.require_points().labels[objects] == usual.require_points().labels[objects]).mean() > 0.85
+        assert found.require_top_view().drivable_area_m2 == pytest.approx(
+            usual.require_top_view().drivable_area_m2, rel=0.1
+        )
         assert found.mounting.height_m == pytest.approx(mounting.height_m, abs=0.1)
         assert found.to_dict()["mounting"] == found.mounting.to_dict()
         assert perceive.mounting is not None

@@ -342,10 +342,9 @@ def test_an_unobserved_cell_is_not_free() -> None:
 def test_an_empty_scan_has_no_road() -> None:
     for model in ("ssadnet", "lodnn"):
         found = Perceiver(model, provider="cpu")(np.empty((0, 4), np.float32))
-        assert found.top_view is not None
-        assert not found.top_view.observed.any()
-        assert found.top_view.drivable_area_m2 == found.to_dict()["drivable_area_m2"] == 0.0
-        assert len(road_ahead(found.top_view).outline) == 0
+        assert not found.require_top_view().observed.any()
+        assert found.require_top_view().drivable_area_m2 == found.to_dict()["drivable_area_m2"] == 0.0
+        assert len(road_ahead(found.require_top_view()).outline) == 0
 
 
 def top_view(points: NDArray[np.float32], sensor: str, mounting: Mounting = MODEL_MOUNTING) -> TopView:

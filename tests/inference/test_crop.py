@@ -174,11 +174,9 @@ def test_answers_of_a_full_turn_are_those_of_sectors_with_all_points() -> None:
         points = simulated_scan(FIRST_SEED + seed).points
         seen, expected = cropping(points), whole(points)
         assert seen.boxes == expected.boxes
-        assert seen.points is not None
-        assert expected.points is not None
-        assert seen.points.in_view.mean() > 0.9
-        np.testing.assert_array_equal(seen.points.labels, expected.points.labels)
-        np.testing.assert_array_equal(seen.points.in_view, expected.points.in_view)
+        assert seen.require_points().in_view.mean() > 0.9
+        np.testing.assert_array_equal(seen.require_points().labels, expected.require_points().labels)
+        np.testing.assert_array_equal(seen.require_points().in_view, expected.require_points().in_view)
 
 
 @pytest.mark.parametrize("full_turn", [False, True])

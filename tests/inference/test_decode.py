@@ -271,6 +271,11 @@ def class_logits(*patches: Any) -> np.ndarray:
     return logits
 
 
+def dense_boxes(dense: np.ndarray, logits: np.ndarray | None = None, **options: Any) -> list[Any]:
+    logits = class_logits() if logits is None else logits
+    return decode_dense(dense, logits, "class_logits", VIEW, CLASSES, VEHICLES, **options)
+
+
 def test_dense_boxes_are_decoded_exactly() -> None:
     a = (20.13, 3.37, -0.9, 4.2, 1.7, 1.5, 0.4, 3.0)
     b = (38.8, -6.1, -0.5, 9.5, 2.5, 3.1, -1.2, 1.0)
@@ -280,7 +285,7 @@ def test_dense_boxes_are_decoded_exactly() -> None:
         (slice(rows_a - 8, rows_a + 8), slice(cols_a - 8, cols_a + 8), 3, 6.0),
         (slice(rows_b - 30, rows_b + 30), slice(cols_b - 30, cols_b + 30), 4, 6.0),
     )
-    boxes = decode_dense(dense_of(b, a), logits, "class_logits", VIEW, CLASSES, VEHICLES)
+    boxes = dense_boxes(dense_of(b, a), logits)
     assert [box.label for box in boxes] == ["van", "truck"]
     for box, (x, y, z, length, width, height, yaw, logit) in zip(boxes, (a, b), strict=True):
         np.testing.assert_allclose(box.center, (x, y, z), atol=1e-5)
@@ -301,8 +306,8 @@ def with_front(dense: np.ndarray, x: float, y: float) -> np.ndarray:
 @pytest.mark.parametrize("front", [(0, 0), (3, 0), (-3, 0), (0, 3), (0.1, -0.2), (-0.1, -0.1), (800, 1), (3e38, -3e38)])
 def test_boxes_turn_to_their_fronts(yaw: float, front: tuple[float, float]) -> None:
     dense = dense_of((20.13, 3.37, -0.9, 4.2, 1.7, 1.5, yaw, 3.0), (38.8, -6.1, -0.5, 9.5, 2.5, 3.1, 0.7, 1.0))
-    plain = decode_dense(dense, class_logits(), "class_logits", VIEW, CLASSES, VEHICLES)
-    boxes = decode_dense(with_front(dense, *front), class_logits(), "class_logits", VIEW, CLASSES, VEHICLES)
+    plain = dense_boxes(dense)
+    boxes = dense_boxes(with_front(dense, *front))
     assert all(box.front is None for box in plain)
     for before, box in zip(plain, boxes, strict=True):
         expected_yaw, likely = twins.decode.facing(before.yaw, *front)
@@ -318,14 +323,14 @@ def test_each_box_has_its_own_front() -> None:
     dense = with_front(dense_of(ahead, away), 2.0, 0.0)
     row, col = int((VIEW.x_range_m[1] - away[0]) / 0.4), int((VIEW.y_range_m[1] - away[1]) / 0.4)
     dense[0, 9:, row, col] = -np.cos(0.7), -np.sin(0.7)
-    boxes = decode_dense(dense, class_logits(), "class_logits", VIEW, CLASSES, VEHICLES)
+    boxes = dense_boxes(dense)
     assert [box.yaw for box in boxes] == pytest.approx([0.4, 0.7 - math.pi], abs=1e-5)
     assert [box.front for box in boxes] == pytest.approx(
         [1 / (1 + math.exp(-2.0 * math.cos(0.4))), 1 / (1 + math.exp(-1.0))]
     )
     dense[0, 9, 0, 0] = np.nan
     with pytest.raises(InferenceError, match="1 of 55000 values of box_dense"):
-        decode_dense(dense, class_logits(), "class_logits", VIEW, CLASSES, VEHICLES)
+        dense_boxes(dense)
 
 
 def test_one_pixel_at_the_center_does_not_decide_the_class() -> None:
@@ -335,18 +340,14 @@ def test_one_pixel_at_the_center_does_not_decide_the_class() -> None:
         (slice(row - 15, row + 16), slice(col - 6, col + 7), 2, 5.0),
         (slice(row, row + 1), slice(col, col + 1), 4, 9.0),
     )
-    (box,) = decode_dense(
-        dense_of((x, y, -1.0, 4.0, 1.6, 1.5, 0.0, 2.0)), logits, "class_logits", VIEW, CLASSES, VEHICLES
-    )
+    (box,) = dense_boxes(dense_of((x, y, -1.0, 4.0, 1.6, 1.5, 0.0, 2.0)), logits)
     assert box.label == "car"
 
 
 def test_background_under_the_box_still_leaves_a_vehicle() -> None:
     logits = class_logits()
     logits[0, 3] = 0.1
-    (box,) = decode_dense(
-        dense_of((26.0, 0.0, -1.0, 4.0, 1.6, 1.5, 0.0, 2.0)), logits, "class_logits", VIEW, CLASSES, VEHICLES
-    )
+    (box,) = dense_boxes(dense_of((26.0, 0.0, -1.0, 4.0, 1.6, 1.5, 0.0, 2.0)), logits)
     assert box.label == "van"
 
 
@@ -356,15 +357,15 @@ def test_sizes_decide_between_equally_likely_classes() -> None:
     sizes = {"box_size_priors": priors, "box_size_spreads": spreads}
     for name, size in priors.items():
         dense = dense_of((26.0, 0.0, -1.0, *size, 0.0, 2.0))
-        (by_map,) = decode_dense(dense, class_logits(), "class_logits", VIEW, CLASSES, VEHICLES)
-        (by_both,) = decode_dense(dense, class_logits(), "class_logits", VIEW, CLASSES, VEHICLES, **sizes)
+        (by_map,) = dense_boxes(dense)
+        (by_both,) = dense_boxes(dense, **sizes)
         assert by_both.label == name
         assert replace(by_both, label=by_map.label) == by_map
     # A map that is sure of a car outweighs a size a little nearer to a van's.
     logits = class_logits((slice(None), slice(None), CLASSES.index("car"), 30.0))
     sizes["box_size_priors"] = priors | {"van": (4.15, 1.6, 1.5)}
     dense = dense_of((26.0, 0.0, -1.0, 4.1, 1.6, 1.5, 0.0, 2.0))
-    (box,) = decode_dense(dense, logits, "class_logits", VIEW, CLASSES, VEHICLES, **sizes)
+    (box,) = dense_boxes(dense, logits, **sizes)
     assert box.label == "car"
 
 
@@ -373,24 +374,24 @@ def test_overlapping_boxes_of_the_dense_head() -> None:
     second = (21.4, 3.4, -0.9, 4.2, 1.7, 1.5, 0.0, 2.0)
     beside = (20.2, 0.6, -0.9, 4.2, 1.7, 1.5, 0.0, 0.5)
     dense = dense_of(first, second, beside)
-    boxes = decode_dense(dense, class_logits(), "class_logits", VIEW, CLASSES, VEHICLES)
+    boxes = dense_boxes(dense)
     assert [round(box.center[0], 3) for box in boxes] == [21.4, 20.2]
     assert [round(box.center[1], 3) for box in boxes] == [3.4, 0.6]
-    everything = decode_dense(dense, class_logits(), "class_logits", VIEW, CLASSES, VEHICLES, iou_threshold=1.0)
+    everything = dense_boxes(dense, iou_threshold=1.0)
     assert len(everything) == 3
-    sure = decode_dense(dense, class_logits(), "class_logits", VIEW, CLASSES, VEHICLES, score_threshold=0.7)
+    sure = dense_boxes(dense, score_threshold=0.7)
     assert sure == boxes[:1]
-    weak_unnamed = decode_dense(dense, class_logits(), "class_logits", VIEW, CLASSES, VEHICLES, named_from=0.7)
+    weak_unnamed = dense_boxes(dense, named_from=0.7)
     assert weak_unnamed == [boxes[0], *(replace(box, label="") for box in boxes[1:])]
-    unnamed = decode_dense(dense, class_logits(), "class_logits", VIEW, CLASSES, VEHICLES, named_from=1.0)
+    unnamed = dense_boxes(dense, named_from=1.0)
     assert unnamed == [replace(box, label="") for box in boxes]
 
 
 def test_score_thresholds_0_and_1() -> None:
     dense = dense_of((26.0, 0.0, -1.0, 4.0, 1.6, 1.5, 0.0, 2.0))
-    assert decode_dense(dense, class_logits(), "class_logits", VIEW, CLASSES, VEHICLES, score_threshold=1.0) == []
+    assert dense_boxes(dense, score_threshold=1.0) == []
     # A flat heat map has one peak a plateau, and the plateau of -10 touches the real one.
-    everything = decode_dense(dense, class_logits(), "class_logits", VIEW, CLASSES, VEHICLES, score_threshold=0.0)
+    everything = dense_boxes(dense, score_threshold=0.0)
     assert 1 <= len(everything) <= 2
     assert decode_dense(dense, class_logits(), "class_logits", VIEW, CLASSES, ()) == []
 
@@ -398,21 +399,21 @@ def test_score_thresholds_0_and_1() -> None:
 def test_dense_clips_extreme_sizes_and_refuses_non_finite_values() -> None:
     dense = dense_of((26.0, 0.0, -1.0, 4.0, 1.6, 1.5, 0.0, 2.0))
     dense[0, [3, 4, 8], 50, 25] = 200.0, -200.0, 90.0
-    (box,) = decode_dense(dense, class_logits(), "class_logits", VIEW, CLASSES, VEHICLES)
+    (box,) = dense_boxes(dense)
     assert np.allclose(box.size, (40.0, 0.2, 40.0))
     dense[0, 7, 3, 3] = np.nan
     with pytest.raises(InferenceError, match="ssadnet: 1 of 45000 values of box_dense"):
-        decode_dense(dense, class_logits(), "class_logits", VIEW, CLASSES, VEHICLES, model="ssadnet")
+        dense_boxes(dense, model="ssadnet")
     logits = class_logits()
     logits[0, 1, 2, 3] = np.inf
     with pytest.raises(InferenceError, match="1 of 400000 values of class_logits"):
-        decode_dense(dense_of(), logits, "class_logits", VIEW, CLASSES, VEHICLES)
+        dense_boxes(dense_of(), logits)
     with pytest.raises(CardMismatchError, match=r"\(1, 8, 100, 50\).*\(1, 9, 100, 50\) or \(1, 11, 100, 50\)"):
-        decode_dense(dense[:, :8], class_logits(), "class_logits", VIEW, CLASSES, VEHICLES)
+        dense_boxes(dense[:, :8])
     with pytest.raises(CardMismatchError, match=r"\(1, 13, 100, 50\)"):
-        decode_dense(with_front(with_front(dense, 0, 0), 0, 0), class_logits(), "class_logits", VIEW, CLASSES, VEHICLES)
+        dense_boxes(with_front(with_front(dense, 0, 0), 0, 0))
     with pytest.raises(CardMismatchError, match=r"\(1, 4, 400, 200\)"):
-        decode_dense(dense_of(), class_logits()[:, :4], "class_logits", VIEW, CLASSES, VEHICLES)
+        dense_boxes(dense_of(), class_logits()[:, :4])
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 7), (20, 30)])

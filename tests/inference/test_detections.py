@@ -273,8 +273,7 @@ def test_its_boxes_add_labels(models: dict[str, Path], monkeypatch: pytest.Monke
             monkeypatch.setattr(perceive.pipeline.pillars, "find_boxes", lambda _, boxes=boxes: boxes)
             found = perceive(scan.points)
             assert len(found.boxes) >= len(boxes)
-            assert found.points is not None
-            n_cars.append(np.count_nonzero(found.points.labels == 1))
+            n_cars.append(np.count_nonzero(found.require_points().labels == 1))
         assert n_cars[1] > n_cars[0] > 0
 
 

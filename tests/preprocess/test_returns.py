@@ -178,11 +178,9 @@ def test_beams_without_a_return_change_nothing(street: Points, alone: Perception
     assert answer.mounting == alone.mounting
     assert answer.remission == alone.remission
     assert answer.fitness == alone.fitness
-    assert answer.points is not None
-    assert alone.points is not None
-    np.testing.assert_array_equal(answer.points.labels[: len(street)], alone.points.labels)
-    assert not answer.points.labels[len(street) :].any()
-    assert not answer.points.in_view[len(street) :].any()
+    np.testing.assert_array_equal(answer.require_points().labels[: len(street)], alone.require_points().labels)
+    assert not answer.require_points().labels[len(street) :].any()
+    assert not answer.require_points().in_view[len(street) :].any()
     assert answer.n_dropped == len(empty) == answer.dropped.total
     assert answer.dropped.not_finite == np.count_nonzero(np.isnan(empty[:, 0]))
     assert answer.to_dict()["dropped"] == {
@@ -210,8 +208,7 @@ def test_a_scan_without_returns_is_empty() -> None:
         answer = perceived(np.asarray(points, np.float32), on_mismatch="warn")
         assert answer.boxes == ()
         assert answer.n_dropped == answer.n_points == 500
-        assert answer.points is not None
-        assert not answer.points.in_view.any()
+        assert not answer.require_points().in_view.any()
 
 
 def test_a_street_in_kilometers_is_still_another_unit(street: Points) -> None:
@@ -234,8 +231,7 @@ def test_returns_of_the_own_vehicle_take_part_in_nothing(street: Points, alone: 
     answer = perceived(np.vstack([street, roof.astype(np.float32)]), replace(VLP, ego_box=BOX))
     assert answer.dropped == DroppedPoints(ego=3000)
     assert answer.boxes == alone.boxes
-    assert answer.points is not None
-    assert not answer.points.labels[len(street) :].any()
+    assert not answer.require_points().labels[len(street) :].any()
 
 
 def test_grid_for_navigation_has_no_obstacle_at_the_sensor(street: Points, alone: Perception) -> None:

@@ -34,10 +34,10 @@ def test_the_place_of_a_level_sensor(sensor: str, place: str, yaw_deg: float) ->
 
 
 @pytest.mark.filterwarnings("error")
-@pytest.mark.parametrize("damaged", [-3.4e38, 1.7e308, 1e4])
-def test_damaged_coordinates_are_left_out(damaged: float) -> None:
+def test_damaged_coordinates_are_left_out() -> None:
     xyz = in_map(simulated_scan(3, "os1-64").points, PLACES["UTM"], 0.0)
-    xyz[::100, 2], xyz[7::100, 0] = damaged, -damaged
+    for k, damaged in enumerate((-3.4e38, 1.7e308, 1e4)):
+        xyz[k::100, 2], xyz[k + 7 :: 100, 0] = damaged, -damaged
     np.testing.assert_allclose(find_place(xyz), PLACES["UTM"], atol=0.1)
 
 

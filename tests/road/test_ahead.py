@@ -159,8 +159,7 @@ def test_polygons_of_real_scans_are_valid(data_root: Callable[[str], Path]) -> N
         tolerances = []
         for file in files:
             found = perceive(read_points(file))
-            assert found.top_view is not None
-            tolerances.append(check_real(found.top_view, found.boxes))
+            tolerances.append(check_real(found.require_top_view(), found.boxes))
         assert np.median(tolerances) <= 0.4
         assert max(tolerances) <= 0.8
 

@@ -217,7 +217,10 @@ def test_drivable_cells_are_those_of_the_twin() -> None:
         scene = random_scene(seed)
         pose = sensor_pose(scene, SMALL, 2.0, -1.0, yaw=0.3, pitch=tilt, roll=tilt)
         scan = replace(simulate(scene, SMALL, 0, pose), boxes=())
-        for view in (TopViewGeometry(), TopViewGeometry(x_range_m=(0.0, 1.0), y_range_m=(-1.0, 1.0), cell_m=1.0)):
+        for view in (
+            TopViewGeometry(cell_m=0.4),
+            TopViewGeometry(x_range_m=(0.0, 1.0), y_range_m=(-1.0, 1.0), cell_m=1.0),
+        ):
             x, y = (centers.ravel() for centers in view.cell_centers())
             np.testing.assert_array_equal(scan.top_view_labels(view), twins.simulation.drivable(scene, pose, x, y))
 
@@ -547,6 +550,7 @@ def test_the_background_has_parts() -> None:
     assert seen == {"background", *STATIC}
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize(("height_m", "pitch_deg", "roll_deg"), [(1.4, 3.0, 0.0), (2.2, -3.0, 2.0)])
 def test_scans_of_other_mountings(height_m: float, pitch_deg: float, roll_deg: float) -> None:
     mounting = Mounting(height_m=height_m, pitch_deg=pitch_deg, roll_deg=roll_deg)

@@ -14,6 +14,7 @@ import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from dataclasses import replace
+from importlib import import_module
 from importlib.util import find_spec
 from itertools import pairwise
 from pathlib import Path
@@ -319,27 +320,6 @@ def test_mcap_refuses_and_keeps_the_old_file(tmp_path: Path) -> None:
     assert len(read_mcap(target)["/points"]) == 1
 
 
-@pytest.mark.usefixtures("foxglove")
-def test_a_full_disk_is_an_error(small_disk: Any) -> None:
-    from edgeperc.sinks.foxglove import McapSink
-
-    folder = small_disk(512)
-    (folder / "run.mcap").write_bytes(b"old")
-    sink, scans = McapSink(folder / "run.mcap"), a_run()
-    with pytest.raises(OSError, match="No space"):  # noqa: PT012
-        for k in range(100):
-            sink.write(replace(scans[k % 8], stamp_s=float(k)))
-    with pytest.raises(OSError, match="No space"):
-        sink.write(scans[0])
-    with pytest.warns(RuntimeWarning, match=r"run\.mcap\.part"):
-        sink.close()
-    assert {p.name for p in folder.iterdir()} == {"run.mcap", "run.mcap.part"}
-    assert (folder / "run.mcap").read_bytes() == b"old"
-    reading: Any = read_scans(folder / "run.mcap.part")
-    with closing(reading):
-        np.testing.assert_array_equal(next(reading)[1][:, :3], scans[0].points[:, :3])  # what there is of it
-
-
 class Viewer:
     """A client of Foxglove's WebSocket protocol, from a socket (RFC 6455)."""
 
@@ -528,20 +508,26 @@ def test_rrd_holds_what_went_in(tmp_path: Path, mounting: Mounting | None) -> No
     assert {round(value.total_seconds(), 6) for value in stamps} == {round(scan.stamp_s, 6) for scan in scans}
 
 
-def test_rrd_without_room_is_an_error(small_disk: Any) -> None:
-    pytest.importorskip("rerun")
-    from edgeperc.sinks.rerun import RerunSink
-
-    folder = small_disk(1024)
-    sink, scans = RerunSink(folder / "run.rrd"), a_run()
+@pytest.mark.parametrize(("name", "size_kib"), [("run.mcap", 512), ("run.rrd", 1024)])
+def test_a_full_disk_is_an_error(name: str, size_kib: int, small_disk: Any) -> None:
+    module = pytest.importorskip("foxglove" if name == "run.mcap" else "rerun").__name__
+    make = getattr(import_module(f"edgeperc.sinks.{module}"), {"foxglove": "McapSink", "rerun": "RerunSink"}[module])
+    folder, scans = small_disk(size_kib), a_run()
+    (folder / name).write_bytes(b"old")
+    sink = make(folder / name)
     with pytest.raises(OSError, match="No space"):  # noqa: PT012
         for k in range(100):
             sink.write(replace(scans[k % 8], stamp_s=float(k)))
     with pytest.raises(OSError, match="No space"):
         sink.write(scans[0])
-    with pytest.warns(RuntimeWarning, match=r"run\.rrd\.part"):
+    with pytest.warns(RuntimeWarning, match=rf"{name}\.part"):
         sink.close()
-    assert [p.name for p in folder.iterdir()] == ["run.rrd.part"]
+    assert {p.name for p in folder.iterdir()} == {name, f"{name}.part"}
+    assert (folder / name).read_bytes() == b"old"
+    if name == "run.mcap":
+        reading: Any = read_scans(folder / "run.mcap.part")
+        with closing(reading):
+            np.testing.assert_array_equal(next(reading)[1][:, :3], scans[0].points[:, :3])  # what there is of it
 
 
 def read_page(path: Path) -> list[Any]:
@@ -640,9 +626,8 @@ def test_a_long_drive_stays_within_its_limit(tmp_path: Path) -> None:
     """Points are halved down to 3,000, then scans are left out; objects and far points are kept for longer."""
     points = np.tile(a_scan()[:-1], (4, 1)) * np.float32([1, 1, 1, 1])
     perception = a_perception(a_scan())
-    assert perception.points is not None
-    labels = np.tile(perception.points.labels[:-1], 4)
-    found = replace(perception.points, labels=labels, in_view=np.ones(len(labels), bool))
+    labels = np.tile(perception.require_points().labels[:-1], 4)
+    found = replace(perception.require_points(), labels=labels, in_view=np.ones(len(labels), bool))
     perception = replace(perception, n_points=len(points), n_dropped=0, points=found)
     page, limit = DrivePage(max_bytes=500_000), 500_000
     states = []

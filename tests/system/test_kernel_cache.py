@@ -70,16 +70,19 @@ class Place:
         """Load the kernels and call one; return the warnings and the number of compilations."""
         self._monkeypatch.setattr(kernel_cache, "reported", set())
         self._caplog.clear()
-        spec = importlib.util.spec_from_file_location("some_kernels", self.source)
-        assert spec is not None
-        assert spec.loader is not None
-        module = importlib.util.module_from_spec(spec)
-        self._monkeypatch.setitem(sys.modules, "some_kernels", module)
-        spec.loader.exec_module(module)
+        module = self.load()
         assert module.total(VALUES) == ANSWER
         n_compiled = sum(sum(kernel.stats.cache_misses.values()) for kernel in (module.total, module.squared))
         warnings = [r.getMessage() for r in self._caplog.records if r.levelno >= logging.WARNING]
         return warnings, n_compiled
+
+    def load(self) -> Any:
+        """The module, as by a new process."""
+        spec: Any = importlib.util.spec_from_file_location("some_kernels", self.source)
+        module = importlib.util.module_from_spec(spec)
+        self._monkeypatch.setitem(sys.modules, "some_kernels", module)
+        spec.loader.exec_module(module)
+        return module
 
     @property
     def files(self) -> list[Path]:
@@ -498,20 +501,30 @@ class Kind(enum.IntEnum):
 RUN = """
 import sys
 sys.path.insert(0, sys.argv[1])
-from kernels.caller import answer
-print(float(answer(1.0)), answer.stats.cache_misses.total())
+from kernels.caller import answer, share
+print(float(answer(1.0)), answer.stats.cache_misses.total(), share.stats.cache_misses.total())
 """
 
 
-def ask(folder: Path, *options: str, **environment: str) -> tuple[float, int]:
+def start(folder: Path, **environment: str) -> subprocess.Popen[str]:
+    settings = os.environ | {"NUMBA_CACHE_DIR": str(folder / "cache")} | environment
+    command = [sys.executable, "-c", RUN, str(folder)]
+    return subprocess.Popen(command, env=settings, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def outcome(process: subprocess.Popen[str]) -> tuple[float, list[int], list[str]]:
+    """What a process answers, whether it compiled the caller and the callee, and the lines on standard error."""
+    out, err = process.communicate()
+    assert process.returncode == 0, err
+    answer, *n_compiled = out.split()
+    return float(answer), [*map(int, n_compiled)], err.splitlines()
+
+
+def ask(folder: Path, **environment: str) -> tuple[float, int]:
     """What a new process answers, and the number of callers that it compiled."""
-    settings = os.environ | {"NUMBA_CACHE_DIR": str(folder / "cache"), "PYTHONDONTWRITEBYTECODE": "1"} | environment
-    command = [sys.executable, *options, "-c", RUN, str(folder)]
-    done = subprocess.run(command, env=settings, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    assert not done.stderr
-    answer, n_compiled = done.stdout.split()
-    return float(answer), int(n_compiled)
+    answer, (n_compiled, _), said = outcome(start(folder, **environment))
+    assert not said
+    return answer, n_compiled
 
 
 @pytest.fixture
@@ -524,10 +537,20 @@ def package(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_a_kernel_sees_what_other_modules_define(package: Path) -> None:
+def test_a_kernel_sees_what_other_modules_define(package: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """numba freezes it into the caller, whose own source does not change, nor do the dates of the files."""
-    assert ask(package) == (1.25, 1)
-    assert ask(package) == (1.25, 0)
+    monkeypatch.syspath_prepend(package)
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
+    monkeypatch.setattr(numba.config, "CACHE_DIR", str(package / "cache"))
+
+    def imported_anew() -> tuple[float, int]:
+        for name in ("", ".caller", ".callee", ".constants"):
+            monkeypatch.delitem(sys.modules, f"kernels{name}", raising=False)
+        answer = import_module("kernels.caller").answer
+        return float(answer(1.0)), sum(answer.stats.cache_misses.values())
+
+    assert imported_anew() == (1.25, 1)
+    assert imported_anew() == (1.25, 0)
     for module, old, new, answer in (
         ("callee", "SHARE = 0.25", "SHARE = 0.75", 1.75),  # a constant of another module
         ("callee", "[0.0, 0.0]", "[0.0, 2.0]", 3.25),  # an array
@@ -542,10 +565,10 @@ def test_a_kernel_sees_what_other_modules_define(package: Path) -> None:
         assert source.count(old) == 1
         file.write_text(source.replace(old, new))
         os.utime(file, ns=(status.st_atime_ns, status.st_mtime_ns))
-        assert ask(package) == (answer, 1), new
+        assert imported_anew() == (answer, 1), new
         file.write_text(source)
         os.utime(file, ns=(status.st_atime_ns, status.st_mtime_ns))
-    assert ask(package) == (1.25, 1)
+    assert imported_anew() == (1.25, 1)
     assert ask(package) == (1.25, 0)
 
 
@@ -569,12 +592,8 @@ def test_another_version_of_what_compiles_has_another_stamp(place: Place, monkey
 
 def test_kernels_in_an_archive_are_kept(package: Path, tmp_path: Path) -> None:
     packed = Path(shutil.make_archive(str(tmp_path / "packed"), "zip", package, "kernels"))
-    code = RUN.replace("sys.argv[1]", repr(str(packed)))
     for n_compiled in (1, 0):
-        environment = os.environ | {"EDGEPERC_CACHE_DIR": str(tmp_path / "user"), "NUMBA_CACHE_DIR": ""}
-        command = [sys.executable, "-c", code]
-        done = subprocess.run(command, env=environment, capture_output=True, text=True)
-        assert (done.stdout, done.stderr) == (f"1.25 {n_compiled}\n", "")
+        assert ask(packed, EDGEPERC_CACHE_DIR=str(tmp_path / "user"), NUMBA_CACHE_DIR="") == (1.25, n_compiled)
 
 
 def test_kernels_without_sources_are_kept(package: Path) -> None:
@@ -599,11 +618,7 @@ def test_a_constant_set_after_the_import_is_not_kept_for_others(place: Place) ->
 def test_a_value_without_a_digest_is_named(place: Place) -> None:
     place.source.write_text(SOURCE.replace("x * x", "x * x if x in WHAT else x * x") + "\nWHAT = iter([1.0])\n")
     kernel_cache.reported.clear()
-    spec = importlib.util.spec_from_file_location("some_kernels", place.source)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
+    module = place.load()
     with pytest.raises(TypeError, match="squared reads WHAT, a list_iterator, which has no digest"):
         kernel_stamp.stamp_of(module.total)
     assert kernel_stamp.called_by(module.squared) == ()
@@ -709,47 +724,17 @@ def test_caches_of_other_libraries_are_untouched(place: Place) -> None:
     assert {file.suffix for file in place.files if "tripled" in file.name} == {".nbi", ".nbc"}
 
 
-START = """
-import numpy as np
-from edgeperc.inference import projection
-from edgeperc.types.card import InputSpec
-from edgeperc.types.views import TopViewGeometry
-
-channels = ("distance", "remission", "height")
-points = np.random.default_rng(7).uniform(-2.0, 40.0, (1000, 4)).astype(np.float32)
-projector = projection.make_projector(TopViewGeometry(), InputSpec("image", channels, (0.0,) * 3, (1.0,) * 3))
-print(float(projector.project(points).image.sum(dtype=np.float64)))
-print(sum(sum(kernel.stats.cache_misses.values()) for kernel in (projection.mark_top_view, projection.fill_image)))
-"""
-
-
-def start(folder: Path) -> subprocess.Popen[str]:
-    environment = os.environ | {"NUMBA_CACHE_DIR": str(folder)}
-    command = [sys.executable, "-c", START]
-    return subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-
-
-def outcome(process: subprocess.Popen[str]) -> tuple[str, int, list[str]]:
-    """The sum that it printed, the number of compilations, and the lines on standard error."""
-    out, err = process.communicate()
-    assert process.returncode == 0, err
-    total, n_compiled = out.splitlines()
-    return total, int(n_compiled), err.splitlines()
-
-
-def test_processes_start_from_a_damaged_cache_and_together(tmp_path: Path) -> None:
-    together = [start(tmp_path / "cache") for _ in range(2)]
-    (total, _, _), *others = found = [outcome(process) for process in together]
-    assert all((other[0], lines) == (total, []) for other in others for *_, lines in found)
-    assert outcome(start(tmp_path / "cache")) == (total, 0, [])
-    for k, file in enumerate(sorted((tmp_path / "cache").rglob("*.kernel"))):
+def test_processes_start_from_a_damaged_cache_and_together(package: Path) -> None:
+    found = [outcome(process) for process in [start(package) for _ in range(2)]]
+    assert [(answer, lines) for answer, _, lines in found] == [(1.25, [])] * 2
+    assert outcome(start(package)) == (1.25, [0, 0], [])
+    for k, file in enumerate(sorted((package / "cache").rglob("*.kernel"))):
         content = file.read_bytes()
         file.write_bytes(content[: len(content) // 2] if k % 2 else flipped(len(content) // 2)(content))
-    total_again, n_compiled, (line,) = outcome(start(tmp_path / "cache"))
-    assert (total_again, n_compiled) == (total, 2)
+    answer, n_compiled, (line,) = outcome(start(package))
+    assert (answer, n_compiled) == (1.25, [1, 1])
     assert "cannot be used and is compiled again" in line
-    assert outcome(start(tmp_path / "cache")) == (total, 0, [])
-    shutil.rmtree(tmp_path / "cache")
+    assert outcome(start(package)) == (1.25, [0, 0], [])
 
 
 LOADED = """

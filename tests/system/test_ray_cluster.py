@@ -106,7 +106,7 @@ def test_workers_give_the_same_bytes_and_resume(scans: Path, tmp_path: Path, wor
     assert again[:2] == (code, records)
     assert "1 scan of an earlier run kept" in again[2]
     assert contents(there) == contents(tmp_path / "local")
-    other = run(scans, "--out", there, *files, *workers, "--boxes-from", "network")
+    other = run(scans, "--out", there, *files, "--boxes-from", "network")
     assert "kept" not in other[2]
     assert other[1] != records
 

@@ -48,14 +48,12 @@ HOSTILE = (
 def perceived(scan: np.ndarray, names: tuple[str, ...]) -> Perception:
     """A perception whose classes and messages are ``names``."""
     perception = a_perception(scan)
-    assert perception.points is not None
-    assert perception.top_view is not None
     labels = (np.arange(len(scan)) % len(names)).astype(np.uint8)
-    top = replace(perception.top_view, classes=("background", "drivable", *names))
+    top = replace(perception.require_top_view(), classes=("background", "drivable", *names))
     boxes = tuple(Box(name, 0.9, (8.0 + 2 * k, 3.0, -0.9), (4.2, 1.8, 1.6), 0.3) for k, name in enumerate(names))
     return replace(
         perception,
-        points=PointLabels(labels, perception.points.in_view, names),
+        points=PointLabels(labels, perception.require_points().in_view, names),
         top_view=TopView(top.labels, top.classes, 0.1, top.x_range_m, top.y_range_m, np.ones_like(top.labels, bool)),
         boxes=boxes,
         fitness=names,

@@ -111,8 +111,7 @@ def test_picture_shows_classes_where_they_are(scan: np.ndarray, perception: Perc
 @pytest.mark.parametrize("behind_m", [15.0, 30.0, 44.0])
 def test_a_full_turn_is_drawn_whole(behind_m: float, scan: np.ndarray, perception: Perception) -> None:
     """A box behind the sensor shows from above, and points behind it in the range image, at its ends."""
-    assert perception.points is not None
-    labels, in_view = perception.points.labels.copy(), perception.points.in_view.copy()
+    labels, in_view = perception.require_points().labels.copy(), perception.require_points().in_view.copy()
     scan[-80:, 0], scan[-80:, 1], scan[-80:, 2] = -behind_m, np.linspace(-1.0, 1.0, 80), -0.5
     labels[-80:], in_view[-80:] = POINT_CLASSES.index("cyclist"), True
     rear = replace(CAR, label="cyclist", center=(-behind_m, 0.0, -0.8))
@@ -126,7 +125,6 @@ def test_a_full_turn_is_drawn_whole(behind_m: float, scan: np.ndarray, perceptio
 
 @pytest.mark.parametrize("label", ["van", "truck", "car"])
 def test_points_of_a_vehicle_have_the_color_of_its_box(label: str, scan: np.ndarray, perception: Perception) -> None:
-    assert perception.points is not None
     box = replace(CAR, label=label, yaw=0.6)
     cos, sin = np.cos(box.yaw), np.sin(box.yaw)
     for k, (along, across) in enumerate([(1.8, 0.7), (-1.8, -0.7), (2.6, 0.0), (0.0, 1.4)]):
@@ -134,7 +132,7 @@ def test_points_of_a_vehicle_have_the_color_of_its_box(label: str, scan: np.ndar
         scan[k, :3] = x, y, box.center[2]
     labels = np.zeros(len(scan), np.uint8)
     labels[:4] = POINT_CLASSES.index("car")
-    seen = replace(perception, points=replace(perception.points, labels=labels), top_view=None, boxes=(box,))
+    seen = replace(perception, points=replace(perception.require_points(), labels=labels), top_view=None, boxes=(box,))
     names, painted = paint_points(scan, seen)
     paint_vehicles(names, painted, scan, seen.boxes)
     assert [names[k] for k in painted[:4]] == [label, label, "car", "car"]
@@ -165,11 +163,10 @@ def test_picture_of_one_view(scan: np.ndarray, perception: Perception) -> None:
 
 @pytest.mark.usefixtures("matplotlib")
 def test_road_that_was_not_observed_is_gray(scan: np.ndarray, perception: Perception) -> None:
-    assert perception.top_view is not None
     bare = replace(perception, n_points=0, points=None, boxes=())
     observed = np.ones((400, 200), bool)
     observed[:250] = False  # from 21 m on
-    half = replace(bare, top_view=replace(perception.top_view, observed=observed))
+    half = replace(bare, top_view=replace(perception.require_top_view(), observed=observed))
     gray, green = (pixels(view.draw(each, scan[:0])) for each in (half, bare))
     # The panel from above: 2 to 3.5 m left of the sensor, 28 to 24 m and 18 to 10 m ahead. Beside the arrow.
     far, close = (slice(421, 480), slice(245, 266)), (slice(568, 684), slice(245, 266))
