@@ -78,28 +78,14 @@ class _Camera:
 
 
 class Learned(NamedTuple):
-    """What a perceiver has learned from its scans so far; it can be pickled.
-
-    Attributes
-    ----------
-    mounting : MountingEstimator
-    remission : RemissionMatcher
-    to_check : int
-        Number of scans that are still compared with the training scans.
-    is_settled : bool
-        Whether further scans change nothing: the answer to a scan then depends on this scan alone.
-    sensor_estimate : SensorEstimate or None
-        What ``sensor="auto"`` found.
-    normal : Normal
-        What the sensor shows in clear air with a clean window.
-    """
+    """What a perceiver has learned from its scans so far; it can be pickled."""
 
     mounting: MountingEstimator
     remission: RemissionMatcher
-    to_check: int
-    is_settled: bool
-    sensor_estimate: SensorEstimate | None = None
-    normal: Normal = Normal()
+    to_check: int  # number of scans that are still compared with the training scans
+    is_settled: bool  # whether further scans change nothing: the answer to a scan then depends on this scan alone
+    sensor_estimate: SensorEstimate | None = None  # what ``sensor="auto"`` found
+    normal: Normal = Normal()  # what the sensor shows in clear air with a clean window
 
 
 def _card_of(model: str | os.PathLike[str]) -> ModelCard | None:

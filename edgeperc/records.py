@@ -92,7 +92,6 @@ def read_boxes(path: Path | str) -> list[list[Box]]:
 
     path : a file of JSON lines.
     Returns: By scan, in the sensor frame.
-    Raises TrackingError, OSError.
     """
     from .types.perception import Box
 

@@ -240,21 +240,11 @@ def _compile_ground() -> None:
 
 
 class Part(NamedTuple):
-    """Kernels that a helper can compile.
+    """Kernels that a helper can compile."""
 
-    Attributes
-    ----------
-    compile : callable
-        Compiles them, by calling what uses them.
-    largest : Dispatcher
-        The kernel that takes longest.
-    seconds : float
-        What all of them take on a core at 2.4 GHz.
-    """
-
-    compile: Callable[[], None]
-    largest: Any
-    seconds: float
+    compile: Callable[[], None]  # compiles them, by calling what uses them
+    largest: Any  # the kernel that takes longest
+    seconds: float  # what all of them take on a core at 2.4 GHz
 
 
 PARTS: Mapping[str, Part] = MappingProxyType(
@@ -320,10 +310,7 @@ class Helpers:
 
 
 def compile_parts(parts: Sequence[str]) -> None:
-    """Compile parts of the kernels in this process, one after the other, into the cache.
-
-    parts : of `PARTS`.
-    """
+    """Compile parts of the kernels in this process, one after the other, into the cache."""
     with fewer_collections():
         for part in parts:
             PARTS[part].compile()

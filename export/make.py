@@ -54,7 +54,6 @@ def make(
     steps : number of training steps; by default the shipped model's.
     version : version to write into the card.
     Returns: ``out/NAME.onnx``, with its figures in its card.
-    Raises ValueError.
     """
     stage = MODELS[name]
     recipe = stage.recipe if steps is None else replace(stage.recipe, steps=steps)
@@ -125,7 +124,6 @@ def finish(
     name : a key of `MODELS`, and the name of the model.
     path : the .onnx file to write. The JSON file has the same name, but ends in .json. If ``ssadnet-sim.onnx`` is in
         the same folder, its road is the ground truth of KITTI's scans.
-    data, semantickitti, version : as for `make`.
     """
     stage, kitti, fold = MODELS[name], data.kitti, data.fold
     task, fitness = stage.recipe.task, None

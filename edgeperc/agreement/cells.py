@@ -30,21 +30,11 @@ def agree_on_cells(
 ) -> TopView:
     """Correct the cells of a top view by boxes, points and obstacles.
 
-    Parameters
-    ----------
-    view : TopView
-    labels : PointLabels or None
-        From `agree_on_points`.
-    boxes : sequence of Box
-        In the frame of the models.
-    dropped : sequence of Box
-        Boxes of the top-view network that `agree_on_boxes` dropped; their vehicle cells become background.
-    marks : (rows, columns) uint8
-        From `mark_cells`.
-    rules : collection of str
+    labels : from `agree_on_points`.
+    boxes : in the frame of the models.
+    dropped : boxes of the top-view network that `agree_on_boxes` dropped; their vehicle cells become background.
+    marks : (rows, columns) uint8; from `mark_cells`.
 
-    Notes
-    -----
     Drivable cells whose center lies in a box get the class of the box, or background if the top view has no such
     class. Drivable cells with a vehicle's or person's point become background, and those with a return 0.3 to 2 m
     above the ground and another one in the 3 x 3 cells around it. So do vehicle cells out of the boxes with a point
@@ -108,7 +98,6 @@ def fill_marks(
 ) -> None:
     """Write what the points show in each cell; see `mark_cells`.
 
-    in_view : (n,) bool
     labeled : roles are 1 for vehicles, 2 for persons, 0 for classes that are not objects.
     by_height : whether returns above the ground are obstacles, whatever their label.
     marks : (rows, columns) uint8, modified; zeros before.
@@ -150,7 +139,6 @@ def clear_cells(
     marked : (m,) int64; flat numbers of the cells with marks.
     is_vehicle : (256,) bool; labels of cells that the points may contradict.
     in_box : (rows, columns) bool; cells of vehicles that stay.
-    cells : (rows, columns) uint8, modified
     """
     n_rows, n_cols = cells.shape
     for at in marked:

@@ -159,27 +159,16 @@ def agree_on_points(
 ) -> PointLabels:
     """Correct the labels of points by clusters, ground and boxes.
 
-    Parameters
-    ----------
-    scan : Scan
-        If its ground has no plane, rules that need heights are skipped.
-    labels : PointLabels
-        Of vehicles (car, van, truck) and persons (pedestrian, cyclist); other classes are not changed.
-    clusters : (n,) int32, modified
-        From `find_voters`. A person that stays in a cluster that loses the label gets a number of its own.
-    support : Support
-        From `find_support`.
-    upright : (n,) uint8, modified
-        From `without_poles`.
-    view : TopView, optional
-        Without it, or if it has no class of vehicles, the rule ``"cells"`` is skipped.
-    sight : Sight
-        How high the sensor sees, of which 0.7 is high enough for any cluster.
-    rules : collection of str
-        Of `RULES`; others are left out.
+    scan : if its ground has no plane, rules that need heights are skipped.
+    labels : of vehicles (car, van, truck) and persons (pedestrian, cyclist); other classes are not changed.
+    clusters : (n,) int32, modified; from `find_voters`. A person that stays in a cluster that loses the label gets a
+        number of its own.
+    support : from `find_support`.
+    upright : (n,) uint8, modified; from `without_poles`.
+    view : without it, or if it has no class of vehicles, the rule ``"cells"`` is skipped.
+    sight : how high the sensor sees, of which 0.7 is high enough for any cluster.
+    rules : of `RULES`; others are left out.
 
-    Notes
-    -----
     First, a person's point becomes background if the points within about 0.3 m around go on to above 2.0 m (cyclist:
     2.2 m) without a gap of more than 0.3 m. Each cluster then votes, by the shares of its points in view. It loses its
     vehicle labels if less than 0.6 of its points have them (0.75 if it is longer than 10 m or higher than 4 m), or if
@@ -354,7 +343,6 @@ def cell_of(points: Points, i: int, n: int) -> tuple[int, int]:
 def clear_columns(points: Points, height: Heights, limits: NDArray[np.float64], labels: Labels) -> None:
     """Make persons background whose column of points goes on above a limit.
 
-    points : (n, 3 or more) float32, C-contiguous
     height : (n,) float32; [m] above the ground.
     limits : (classes,) float64; greatest height of a column [m] for each class; 0 for classes that are no persons.
     labels : (n,) uint8, modified; only points within 51.2 m along x and y are changed.
@@ -409,7 +397,6 @@ def fill_support(cloud: Cloud, among: Mask, labeled: Labeled, boxes: NDArray[np.
     """Find the best box around each point, among the boxes with enough vehicle points (`MIN_BOX_SHARE`).
 
     among : (n,) bool; points that may be in a box: those in view, above the ground.
-    boxes : (m,) `BOX`
     support : overwritten; the earlier box on ties.
     """
     points, height, labels, roles = cloud.points, cloud.height, labeled.labels, labeled.roles
@@ -471,11 +458,7 @@ def clear_ground(
 
     Within `NEAR_ROAD_M`, points lower than `ROAD_TOP_M` become background in any cell.
 
-    points : (n, 3 or more) float32, C-contiguous
-    height : (n,) float32
-    on_ground : (n,) bool
     roles : (classes,) uint8; 1 for vehicles, 2 for persons, 0 for classes that are not changed.
-    labels : (n,) uint8, modified
     """
     labeled = np.empty(points.shape[0], np.int32)
     n, n_lying = 0, 0
@@ -514,8 +497,6 @@ def count_inside(
 ) -> None:
     """Count the points above the ground in every box.
 
-    on_ground, in_view : (n,) bool
-    boxes : (m,) `BOX`
     counts : (m, 3) int64, overwritten; all points, those in view, and vehicle points in view.
     """
     points, height, labels, roles = cloud.points, cloud.height, labeled.labels, labeled.roles

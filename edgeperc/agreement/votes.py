@@ -66,33 +66,17 @@ CLUSTER = np.dtype(
 
 
 class Tallies(NamedTuple):
-    """What clusters hold.
+    """What clusters hold."""
 
-    Attributes
-    ----------
-    clusters : (k,) `CLUSTER`
-    counts : (k, classes + 1) int32
-        Points in view of each class; last, of all classes.
-    """
-
-    clusters: NDArray[np.void]
-    counts: NDArray[np.int32]
+    clusters: NDArray[np.void]  # (k,) `CLUSTER`
+    counts: NDArray[np.int32]  # (k, classes + 1) points in view of each class; last, of all classes
 
 
 class Cells(NamedTuple):
-    """A top view as kernels take it.
+    """A top view as kernels take it."""
 
-    Attributes
-    ----------
-    labels : (rows, columns) uint8, C-contiguous
-        No cells without a top view.
-    is_vehicle : (256,) bool
-        Which labels are vehicles that count.
-    grid : Grid
-    """
-
-    labels: Labels
-    is_vehicle: NDArray[np.bool_]
+    labels: Labels  # (rows, columns) no cells without a top view
+    is_vehicle: NDArray[np.bool_]  # (256,) which labels are vehicles that count
     grid: Grid
 
 
@@ -148,11 +132,7 @@ def fill_tallies(
     view: Cells,
     tallies: Tallies,
 ) -> None:
-    """Count the labels of every cluster, and measure it.
-
-    in_view, labels, cluster_of : (n,) bool, (n,) uint8, (n,) int32
-    tallies : overwritten
-    """
+    """Count the labels of every cluster, and measure it."""
     points, height, clusters, counts = cloud.points, cloud.height, tallies.clusters, tallies.counts
     cells, is_vehicle, grid = view.labels, view.is_vehicle, view.grid
     counts[:] = 0
@@ -199,7 +179,6 @@ def fill_verdicts(
     refused : (k,) bool; clusters that are not vehicles for another reason.
     roles : (classes,) uint8; 1 for vehicles, 2 for persons, 0 for others.
     parts : (p, 2) int64; class, and the class that it may be a part of.
-    verdicts : (k, classes) uint8, overwritten
     """
     clusters, counts = tallies.clusters, tallies.counts
     n_classes = len(roles)
@@ -258,12 +237,10 @@ def apply_verdicts(
 ) -> None:
     """Replace each label in view by what its cluster and the box around it say.
 
-    in_view : (n,) bool
     clusters : (n,) int32; -1 for none; -2 for a cluster in which no label of a vehicle or person stays.
     verdicts : (k, classes) uint8; new label by cluster and label.
     roles : (classes,) uint8; 1 for vehicles, 2 for persons, 0 for others.
     scores, names : (n,) float32, (n,) uint8; from `edgeperc.agreement.rules.fill_support`.
-    labels : (n,) uint8, modified
     """
     for i in range(labels.shape[0]):
         if not in_view[i]:
@@ -295,7 +272,6 @@ def find_persons_alone(
 ) -> list[NDArray[np.int32]]:
     """Find groups of points that are a person by themselves, though linked with something large.
 
-    roles : (classes,) uint8
     before, labels : (n,) uint8; labels before the clusters voted, and after.
     Returns list of (k,) int32: Rows of each person. Their labels were lost.
     """

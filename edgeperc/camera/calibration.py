@@ -158,7 +158,6 @@ def read_kitti_calibration(path: str | os.PathLike[str]) -> tuple[NDArray[np.flo
         includes the rectification.
     Returns T_rectified_sensor ((4, 4) float64): From the Velodyne's frame to the rectified frame of camera 0.
     Returns P2 ((3, 4) float64): From there to the image of the left color camera.
-    Raises CalibrationError, OSError.
     """
     folder = Path(path) if Path(path).is_dir() else Path(path).parent
     is_raw = Path(path).is_dir() or Path(path).name in _RAW_FILES
@@ -235,7 +234,6 @@ def fill_projected(
 ) -> None:
     """Project points: column, row and depth of each.
 
-    points : (n, 3 or more) float32, C-contiguous
     P : (3, 4) float64; ``K`` times the upper three rows of ``T_camera_sensor``.
     u, v : (n,) float64, overwritten; [px]; NaN unless the point is finite and in front of the camera.
     depth : (n,) float64, overwritten; [m]; NaN if the point is not finite.

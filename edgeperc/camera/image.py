@@ -36,22 +36,9 @@ def check_size(width: int, height: int) -> None:
 def as_image(array: ArrayLike) -> NDArray[np.uint8]:
     """Check that an array is an image.
 
-    Parameters
-    ----------
-    array : (H, W, 3) uint8
-        Red, green and blue, row 0 at the top, in any memory layout: ``image[:, :, ::-1]`` of one with blue first, as
-        OpenCV reads it. At most 2**26 pixels, and 2**15 along an edge.
-
-    Returns
-    -------
-    (H, W, 3) uint8, C-contiguous, read-only
-        A view of the array if it already has this layout, else a copy.
-
-    Raises
-    ------
-    ImageError
-        The array is not such an image. Nothing is converted: what values of another type or number of channels mean is
-        for the caller to say.
+    array : (H, W, 3) uint8; red, green and blue, row 0 at the top, in any memory layout: ``image[:, :, ::-1]`` of one
+        with blue first, as OpenCV reads it. At most 2**26 pixels, and 2**15 along an edge.
+    Returns (H, W, 3) uint8, C-contiguous, read-only: a view of the array if it already has this layout, else a copy.
     """
     if isinstance(array, np.ma.MaskedArray):
         raise ImageError("got a masked array; fill it first, e.g. with array.filled(0)")
@@ -131,7 +118,6 @@ class ImageScaler:
 
         image : (H, W, 3) uint8; from `as_image`.
         out : (C, height, width) float32, C-contiguous, overwritten; ``(value - mean) / std`` per channel.
-        Raises ImageError.
         """
         image = as_image(image)
         if out.shape != self.shape or out.dtype != np.float32 or not out.flags.carray:
@@ -168,7 +154,6 @@ def fill_scaled(
     """Scale and normalize an image: for each row of the output, first along columns, then along rows.
 
     image : (H, 3 * W) uint8, C-contiguous; red, green, blue of each pixel.
-    out : (C, h, w) float32, overwritten
     """
     row_start, row_weights = rows
     col_start, col_weights = columns
@@ -205,11 +190,9 @@ def label_pixels(
     outermost centers they stay the same. Between four centers of one class, that class is taken: whatever the weights,
     no other can have a larger sum.
 
-    logits : (C, h, w) float32
     height, width : of the image.
     model : name for messages.
     Returns (height, width) uint8: The lower class on ties.
-    Raises InferenceError, CardMismatchError.
     """
     if logits.ndim != 3 or not 1 <= logits.shape[0] <= 255 or 0 in logits.shape:
         raise CardMismatchError(f"{model}: camera_logits have shape {logits.shape}; expected (C, h, w), C up to 255")
@@ -230,8 +213,7 @@ def between(n_in: int, n_out: int) -> tuple[NDArray[np.int32], NDArray[np.float3
     Returns sides ((2, n_out) int32): The centers of the grid on the two sides of each pixel: one and the same where a
         pixel lies on it or outside.
     Returns weight ((n_out,) float32): Of the second center.
-    Returns runs ((n_runs + 1,) int32): Where runs of pixels between the same two centers begin; the last is
-        ``n_out``.
+    Returns runs ((n_runs + 1,) int32): Where runs of pixels between the same two centers begin; the last is ``n_out``.
     """
     at = np.clip((np.arange(n_out) + 0.5) * (n_in / n_out) - 0.5, 0.0, n_in - 1.0)
     first = np.floor(at).astype(np.int32)
@@ -254,9 +236,7 @@ def fill_image_labels(
 ) -> int:
     """Write every pixel's best class (`label_pixels`).
 
-    logits : (C, h, w) float32, C-contiguous
     row_sides, row_weight, row_runs, col_sides, col_weight, col_runs : from `between`.
-    labels : (H, W) uint8, overwritten
     Returns n_bad: Number of logits that are not finite; if there are any, the labels are undefined.
     """
     n_classes, height, width = logits.shape

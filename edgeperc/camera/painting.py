@@ -290,10 +290,7 @@ def _nearest(points: Points, calibration: Calibration, sensor: SensorProfile) ->
 
 @njit(cache=True, nogil=True)
 def fill_nearest(points: Points, pixels: Pixels, windows: Windows, buffer: DepthBuffer) -> None:
-    """Write the depth of the nearest point whose window covers each cell into ``buffer.nearest``.
-
-    points : (n, 3 or more) float32, C-contiguous
-    """
+    """Write the depth of the nearest point whose window covers each cell into ``buffer.nearest``."""
     u, v, depth = pixels
     between = windows.between
     nearest, cell_h, cell_w = buffer
@@ -339,10 +336,8 @@ def fill_painted(
 ) -> None:
     """Write the label of the pixel of each point that is not hidden, else `UNSEEN`.
 
-    labels : (H, W) uint8, C-contiguous
     slack_m, slack_share : a point is hidden if it is farther behind the nearest one than this [m], plus this share of
         its depth.
-    painted : (n,) uint8, overwritten
     """
     u, v, depth = pixels
     height, width = labels.shape

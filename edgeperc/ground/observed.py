@@ -68,20 +68,14 @@ MAX_REACH_M = 5.0
 
 
 class Observation(NamedTuple):
-    """What the rays of a scan say about the cells of a top view.
+    """What the rays of a scan say about the cells of a top view."""
 
-    Attributes
-    ----------
-    observed : (rows, columns) bool
-        Cells with a return at most 2 m above the ground, and cells between two connected returns on the ground that
-        the ray to the farther one passes at most `CLEARANCE_M` above the ground.
-    between_beams : (rows, columns) bool
-        Cells that are not observed in a gap that the spacing of the beams explains: from a return on the ground to the
-        next return of the neighboring beam, whose ray passes at most `BRIDGE_M` above the ground; and before the first
-        return, where its ray passes at most `CLEARANCE_M` above the road.
-    """
-
+    # (rows, columns) cells with a return at most 2 m above the ground, and cells between two connected returns on the
+    # ground that the ray to the farther one passes at most `CLEARANCE_M` above the ground
     observed: NDArray[np.bool_]
+    # (rows, columns) cells that are not observed in a gap that the spacing of the beams explains: from a return on the
+    # ground to the next return of the neighboring beam, whose ray passes at most `BRIDGE_M` above the ground; and
+    # before the first return, where its ray passes at most `CLEARANCE_M` above the road
     between_beams: NDArray[np.bool_]
 
 
@@ -139,29 +133,13 @@ class Observer:
     def observe(self, points: Points, index: NDArray[np.int32], mounting: Mounting = MODEL_MOUNTING) -> Observation:
         """Find the observed cells, and those between two beams.
 
-        Parameters
-        ----------
-        points : (n, 4) float32
-            x, y, z [m] in the sensor frame with the road at z = -1.73 m, to within 0.6 m, and remission. May be empty;
-            rows that are not finite are ignored.
-        index : (rows, columns) int32
-            Highest point of each cell, -1 without one (`TopViewProjector`).
-        mounting : Mounting
-            The one with which the scan was moved: its height is that of the beams above the road, its tilt tells which
-            beam a ray belongs to. Below 0.5 m, 1.73 m is used: either the origin of the points is not at the beams, or
-            the rays are so flat that this only connects fewer returns.
+        points : (n, 4) float32; x, y, z [m] in the sensor frame with the road at z = -1.73 m, to within 0.6 m, and
+            remission. May be empty; rows that are not finite are ignored.
+        index : (rows, columns) int32; highest point of each cell, -1 without one (`TopViewProjector`).
+        mounting : the one with which the scan was moved: its height is that of the beams above the road, its tilt tells
+            which beam a ray belongs to. Below 0.5 m, 1.73 m is used: either the origin of the points is not at the
+            beams, or the rays are so flat that this only connects fewer returns.
 
-        Returns
-        -------
-        Observation
-
-        Raises
-        ------
-        PointsError
-            An array has another shape or dtype.
-
-        Notes
-        -----
         Each sector is followed outwards, by the lowest return of each ring of two cells' width. A return is on the
         ground if the line from the last return on the ground is level: it rises or falls by at most 0.1 m and 10 % of
         the distance, with at most 0.6 m in total. The line begins on the road below the sensor. Two returns are
@@ -203,11 +181,10 @@ def fill_lowest_returns(
 ) -> None:
     """Write the lowest return of each bin of the polar grid.
 
-    points : (n, 4) float32, C-contiguous
     bounds : (2, 2) float64; lowest and highest x, and y, of the points that are used [m].
-    grid : (3,) float64; pseudo-azimuth of the first sector's edge, sectors per unit of pseudo-azimuth, width of a
-        ring [m]. The pseudo-azimuth is y / (|x| + |y|), unfolded to -2..2. It increases with the azimuth, and needs
-        no trigonometry.
+    grid : (3,) float64; pseudo-azimuth of the first sector's edge, sectors per unit of pseudo-azimuth, width of a ring
+        [m]. The pseudo-azimuth is y / (|x| + |y|), unfolded to -2..2. It increases with the azimuth, and needs no
+        trigonometry.
     lowest : (sectors, rings) float32, overwritten; z [m]; infinite without a return.
     """
     lowest[:] = np.float32(math.inf)
@@ -312,13 +289,10 @@ def mark_cells(
 ) -> None:
     """Mark the observed cells of a top view, and those between two beams.
 
-    points : (n, 4) float32, C-contiguous
     index : (rows, columns) int32, C-contiguous; highest point of each cell, -1 without one.
     bin_of_cell : (rows * columns,) int32; flat bin of each cell's center.
-    level : (sectors, rings) float32, C-contiguous
-    state : (sectors, rings) uint8, C-contiguous
-    observed, between : (rows, columns) bool, C-contiguous, overwritten; `PASSED` bins are between two beams where
-        both neighboring sectors are `SEEN` or `BETWEEN`: returns of a single sector are missing.
+    observed, between : (rows, columns) bool, C-contiguous, overwritten; `PASSED` bins are between two beams where both
+        neighboring sectors are `SEEN` or `BETWEEN`: returns of a single sector are missing.
     """
     highest, z_ground, state_of_bin = index.reshape(-1), level.reshape(-1), state.reshape(-1)
     is_observed, is_between = observed.reshape(-1), between.reshape(-1)

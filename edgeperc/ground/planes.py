@@ -137,30 +137,15 @@ def find_ground(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GroundFit:
-    """Planes of the ground below a scan, the first half of `find_ground`; `heights` is the second.
+    """Planes of the ground below a scan, the first half of `find_ground`; `heights` is the second."""
 
-    Attributes
-    ----------
-    points : (n, 4) float32
-        The scan; not a copy.
-    cell : (n,) int32
-        Cell of each point.
-    lowest : (N_CELLS, N_CELLS) int32
-        Row of the lowest point in each cell.
-    plane : (3,) float64
-        a, b, c around the vehicle.
-    planes : (N_REGIONS, N_REGIONS, 3) float64 or None
-        Of each region; None if there is the first plane only.
-    found : bool
-        Whether there is ground.
-    """
-
-    points: Points
-    cell: NDArray[np.int32]
-    lowest: NDArray[np.int32]
-    plane: NDArray[np.float64]
+    points: Points  # (n, 4) the scan; not a copy
+    cell: NDArray[np.int32]  # (n,) cell of each point
+    lowest: NDArray[np.int32]  # (N_CELLS, N_CELLS) row of the lowest point in each cell
+    plane: NDArray[np.float64]  # (3,) a, b, c around the vehicle
+    # (N_REGIONS, N_REGIONS, 3) of each region; None if there is the first plane only
     planes: NDArray[np.float64] | None
-    found: bool
+    found: bool  # whether there is ground
 
     def heights(self, rows: Rows | None = None, *, max_height_m: float = 0.125) -> Ground:
         """The ground of the points in some rows, or of all; parameters and errors as in `find_ground`."""
@@ -285,10 +270,9 @@ def _sorted_into_cells(points: Points) -> Sorted:
 def fill_lowest(points: Points, cell: NDArray[np.int32], lowest: NDArray[np.int32]) -> None:
     """Write every point's cell and every cell's lowest point.
 
-    points : (n, 4) float32, C-contiguous
     cell : (n,) int32, overwritten; flat cell, x by y; -1 for points that are not finite or out of the grid.
-    lowest : (N_CELLS, N_CELLS) int32, overwritten; row of ``points``, the earlier of two equally low; -1 where there
-        is none.
+    lowest : (N_CELLS, N_CELLS) int32, overwritten; row of ``points``, the earlier of two equally low; -1 where there is
+        none.
     """
     flat = lowest.reshape(-1)
     values = points.reshape(-1)
@@ -340,14 +324,9 @@ def taken_cells(points: Points, lowest: NDArray[np.int32]) -> tuple[NDArray[np.i
 class Patch(NamedTuple):
     """A square of cells to which a plane is fitted.
 
-    Attributes
-    ----------
-    row, col : int
-        The first cell.
-    size : int
-        Cells along each side.
-    x, y : float
-        Origin of the plane [m].
+    row, col : the first cell.
+    size : cells along each side.
+    x, y : origin of the plane [m].
     """
 
     row: int
@@ -389,8 +368,6 @@ def fill_planes(
 ) -> None:
     """Fit every region's plane, from the middle outwards.
 
-    points : (n, 3 or more) float32, C-contiguous
-    lowest : (N_CELLS, N_CELLS) int32
     first : (3,) float64; a, b, c around the vehicle.
     planes : (N_REGIONS, N_REGIONS, 3) float64, overwritten; slopes along x and y, and height in the region's middle
         [m]; the expected plane if too few cells agree.
@@ -572,11 +549,7 @@ def fill_levels(
 ) -> None:
     """Write the height of the ground in the middle of every cell that holds one of some points.
 
-    points : (n, 3 or more) float32, C-contiguous
-    lowest : (N_CELLS, N_CELLS) int32
-    planes : (N_REGIONS, N_REGIONS, 3) float64
     rows : (m,) int32; the points.
-    cell : (n,) int32
     level : (N_CELLS, N_CELLS) float32, overwritten; z [m]; NaN without a point, and anything in rows of cells that no
         point of ``rows`` is in or between.
     """
@@ -650,14 +623,9 @@ def fill_heights(
 ) -> None:
     """Write the heights of some points above the ground, and whether they are on the ground.
 
-    points : (n, 4) float32, C-contiguous
     rows : (m,) int32; the points.
-    cell : (n,) int32
-    level : (N_CELLS, N_CELLS) float32
-    planes : (N_REGIONS, N_REGIONS, 3) float64
     height : (m,) float32, overwritten; [m]; outside the grid, above the plane of the nearest region. NaN for points
         that are not finite.
-    mask : (m,) bool, overwritten
     """
     levels, slopes = level.reshape(-1), planes.reshape(-1)
     for k in range(rows.shape[0]):

@@ -38,18 +38,17 @@ def decode_slots(
 ) -> list[Box]:
     """Decode axis-aligned boxes; each gets the class of the segmentation at its center (SSADNet 2.2.1 B).
 
-    slots : (1, K, 4) or (K, 4) float32; center column, center row, extent across columns, extent along rows; shares
-        of the image's width and height, from its far left corner.
+    slots : (1, K, 4) or (K, 4) float32; center column, center row, extent across columns, extent along rows; shares of
+        the image's width and height, from its far left corner.
     labels, scores : (H, W) uint8, (H, W) float32; from `decode_classes`.
     classes : names of ``labels``.
     box_classes : classes that boxes may have.
     box_size_priors : class to (length, width, height) [m]; only the height is used, because the top view has none.
     mount_height_m : height of the sensor above the road [m]; boxes stand on the road.
     model : name for messages.
-    Returns: Best score first, the earlier slot on ties. The score is the probability of the class at the center
-        pixel. A slot is empty if an extent is below 0.5 m, if its center is out of view, or if the class there is not
-        a box class. The yaw is 0 if the longer side points ahead, else pi/2.
-    Raises InferenceError, CardMismatchError.
+    Returns: Best score first, the earlier slot on ties. The score is the probability of the class at the center pixel.
+        A slot is empty if an extent is below 0.5 m, if its center is out of view, or if the class there is not a box
+        class. The yaw is 0 if the longer side points ahead, else pi/2.
     """
     values = _slot_rows(slots, 4, box_classes, box_size_priors, model)
     height, width = geometry.height, geometry.width
@@ -87,12 +86,10 @@ def decode_scored_slots(
         there is an object.
     class_output, class_kind, classes, box_classes : as for `decode_dense`; the class of a box is the one with the
         largest sum of probabilities in its footprint.
-    geometry, box_size_priors, mount_height_m : as for `decode_slots`.
-    score_threshold, iou_threshold, model : as for `decode_dense`: of the best slots, those that overlap a
-        better one are dropped.
+    score_threshold, iou_threshold, model : as for `decode_dense`: of the best slots, those that overlap a better one
+        are dropped.
     Returns: Best score first, the earlier slot on ties. The yaw is 0 if the longer side points ahead, else pi/2.
         Extents are clipped to 0.2 to 40 m.
-    Raises InferenceError, CardMismatchError.
     """
     rows = _slot_rows(slots, 5, box_classes, box_size_priors, model)
     values = _cell_values(class_output, class_kind, geometry, classes, model)
@@ -192,49 +189,24 @@ def decode_dense(
 ) -> list[Box]:
     """Decode oriented boxes from a heat map of centers and a box regressed at every cell.
 
-    Parameters
-    ----------
-    dense : (1, C, H / 4, W / 4) or (C, H / 4, W / 4) float32
-        C is 9 or 11. Heat-map logit; center's offset from the cell's center in rows and columns [cells of this map];
-        logarithms of length and width [m]; sine and cosine of twice the yaw; center's z [m]; logarithm of the height
-        [m]. The last two are a vector (x, y) towards the front, whose component along a heading is the logit that the
-        front is there.
-    class_output : (1, C, H, W) or (C, H, W) float32
+    dense : (1, C, H / 4, W / 4) or (C, H / 4, W / 4) float32; C is 9 or 11. Heat-map logit; center's offset from the
+        cell's center in rows and columns [cells of this map]; logarithms of length and width [m]; sine and cosine of
+        twice the yaw; center's z [m]; logarithm of the height [m]. The last two are a vector (x, y) towards the front,
+        whose component along a heading is the logit that the front is there.
     class_kind : {"class_logits", "class_probabilities"}
-    geometry : TopViewGeometry
-    classes : sequence of str
-        Names of the class output's channels.
-    box_classes : sequence of str
-        Classes that boxes may have.
-    box_size_priors, box_size_spreads : mapping, optional
-        Usual length, width and height [m] of each box class, and the standard deviations of their logarithms. Without
-        spreads only the segmentation decides the class.
-    score_threshold : float
-        Lowest score of a box, in 0..1.
-    named_from : float
-        Boxes with a lower score are places only: their label is empty, which saves most of the time.
-    iou_threshold : float
-        If two boxes overlap by more, the one with the lower score is dropped, even if their classes differ.
-    model : str
-        Name for messages.
-
-    Returns
-    -------
-    list of Box
-        Best score first; on ties the box farther ahead, then the box farther left. The score is the probability in the
-        heat map. With nine channels the yaw is in -pi/2..pi/2 and ``front`` is None: the network, like the paper's,
+    classes : names of the class output's channels.
+    box_classes : classes that boxes may have.
+    box_size_priors, box_size_spreads : usual length, width and height [m] of each box class, and the standard
+        deviations of their logarithms. Without spreads only the segmentation decides the class.
+    score_threshold : lowest score of a box, in 0..1.
+    named_from : boxes with a lower score are places only: their label is empty, which saves most of the time.
+    iou_threshold : if two boxes overlap by more, the one with the lower score is dropped, even if their classes differ.
+    model : name for messages.
+    Returns: best score first; on ties the box farther ahead, then the box farther left. The score is the probability in
+        the heat map. With nine channels the yaw is in -pi/2..pi/2 and ``front`` is None: the network, like the paper's,
         does not distinguish front and rear. With eleven the yaw points to the likelier front, and ``front`` is 0.5 or
         more.
 
-    Raises
-    ------
-    InferenceError
-        An output holds values that are not finite.
-    CardMismatchError
-        Shapes disagree with the view or the classes.
-
-    Notes
-    -----
     The paper reads a box's class at its center pixel of the segmentation map. Here the probabilities of the box
     classes are summed over all pixels of the footprint and the largest sum wins (the earlier box class on ties), so
     that one pixel, such as a hole in the roof or an edge between two classes, does not decide. With spreads, each sum
@@ -401,7 +373,6 @@ def count_not_finite(values: NDArray[np.float32]) -> int:
 def mark_peaks(heat: NDArray[np.float32], threshold: float, peak: NDArray[np.bool_]) -> None:
     """Mark the cells that no neighbor exceeds.
 
-    heat : (H, W) float32
     threshold : cells below it are not peaks.
     peak : (H, W) bool, overwritten; of equal neighbors, the first one in row order is the peak.
     """

@@ -141,7 +141,6 @@ def _hull(
 def fill_rows(points: Points, lines: NDArray[np.float64], rows: Rows, kept: NDArray[np.float32]) -> int:
     """Copy the points between two lines.
 
-    points : (n, 4) float32, C-contiguous
     lines : (2, 3) float64; a, b and c; points with a x + b y >= c for both lines are kept.
     rows : (more than n,) int32, overwritten; rows of these points.
     kept : (more than n, 4) float32, overwritten; these points.
@@ -168,10 +167,6 @@ def fill_spread(
 ) -> None:
     """Write the labels of points in view to their rows in a whole scan.
 
-    rows : (m,) int32
-    labels : (m,) uint8
-    in_view : (m,) bool
-    all_labels : (n,) uint8, modified
     all_in_view : (n,) bool, modified; true at these rows.
     """
     for k in range(rows.shape[0]):

@@ -27,7 +27,6 @@ def decode_detections(card: ModelCard, outputs: Values, score_threshold: float) 
         card's ``nms_iou``, or with ``across_classes`` of any classes, only the best one. ``front`` is the probability
         of the direction's bin; of a center head, it is 1 if sine and cosine are those of an angle, and less the smaller
         both are: they are means of the headings that the network deems possible.
-    Raises InferenceError.
     """
     view, head = card.view, card.head
     assert isinstance(view, PillarGeometry)

@@ -22,12 +22,8 @@ FROM_CENTER_X, RANGE = FROM_MEAN_X + AXES, FROM_MEAN_X + 2 * AXES
 class PillarGrid(NamedTuple):
     """A grid of pillars as kernels take it.
 
-    Attributes
-    ----------
-    low, high : tuple of 3 float
-        Bounds along x, y and z [m].
-    cell : float
-        Edge of a pillar [m].
+    low, high : bounds along x, y and z [m].
+    cell : edge of a pillar [m].
     """
 
     low: tuple[float, float, float]
@@ -36,21 +32,11 @@ class PillarGrid(NamedTuple):
 
 
 class Pillars(NamedTuple):
-    """The pillars of a scan, as a network takes them; only the first ones that were written are valid.
+    """The pillars of a scan, as a network takes them; only the first ones that were written are valid."""
 
-    Attributes
-    ----------
-    values : (pillars, points, channels) float32
-        0 after the last point of a pillar.
-    counts : (pillars,) int32
-        Points of each pillar.
-    places : (pillars, 4) int32
-        Batch, z, row and column of each: 0, 0, and the cell.
-    """
-
-    values: NDArray[np.float32]
-    counts: NDArray[np.int32]
-    places: NDArray[np.int32]
+    values: NDArray[np.float32]  # (pillars, points, channels) 0 after the last point of a pillar
+    counts: NDArray[np.int32]  # (pillars,) points of each pillar
+    places: NDArray[np.int32]  # (pillars, 4) batch, z, row and column of each: 0, 0, and the cell
 
 
 class Pillarizer:

@@ -47,34 +47,21 @@ PIXEL_BLOCK = 64
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Projection:
-    """A scan projected to one view.
+    """A scan projected to one view."""
 
-    Attributes
-    ----------
-    image : (C, H, W) float32
-        The network's input: ``(raw - mean) / std`` per channel; 0 in every channel of a pixel without a return.
-    index : (H, W) int32
-        Row of the point whose values the pixel has; -1 without a return.
-    pixel : (n,) int32
-        Flat pixel ``row * W + column`` of every point, even if another point won that pixel; -1 for points that are
-        out of view, not finite or at the origin.
-    """
-
+    # (C, H, W) the network's input: ``(raw - mean) / std`` per channel; 0 in every channel of a pixel without a return
     image: NDArray[np.float32]
-    index: NDArray[np.int32]
+    index: NDArray[np.int32]  # (H, W) row of the point whose values the pixel has; -1 without a return
+    # (n,) flat pixel ``row * W + column`` of every point, even if another point won that pixel; -1 for points that are
+    # out of view, not finite or at the origin
     pixel: NDArray[np.int32]
 
 
 class Bounds(NamedTuple):
     """A top view as its kernel takes it.
 
-    Attributes
-    ----------
-    x_min, x_max, y_min, y_max, z_min, z_max : float32
-        [m]
-    cells_per_m : float32
-    height, width : int32
-        Rows and columns.
+    x_min, x_max, y_min, y_max, z_min, z_max : [m]
+    height, width : rows and columns.
     """
 
     x_min: np.float32
@@ -95,13 +82,7 @@ class Intervals(NamedTuple):
     float32, j is exactly ``base[k] + (value <= split[k])``: the edges are sorted into table cells by the same rounded
     arithmetic, and no two edges share a cell.
 
-    Attributes
-    ----------
-    first, last : float32
-        First and last edge; the last is lower than any value if it is straight behind the sensor.
-    cells_per_unit : float32
-    base : (cells + 2,) int32
-    split : (cells + 2,) float32
+    first, last : first and last edge; the last is lower than any value if it is straight behind the sensor.
     """
 
     first: np.float32
@@ -279,13 +260,10 @@ def fill_image(
 ) -> None:
     """Write the values of the points of ``index`` into ``image``.
 
-    points : (n, 4) float32, C-contiguous
     heights : (n,) or (0,) float32, C-contiguous; height of each point above the ground [m]; empty if no channel needs
         it.
     index : (pixels,) int32; row of points; -1 without a return.
     channels : (C,) int32; values of ``CHANNEL_CODES``.
-    mean, std : (C,) float32
-    image : (C, pixels) float32, overwritten
     """
     values = points.reshape(-1)
     rows = np.empty(4 * PIXEL_BLOCK, np.float32)
@@ -335,9 +313,8 @@ class TopViewProjector:
     ``x_min <= x < x_max``, ``y_min <= y < y_max`` and ``z_min <= z <= z_max``. The highest point wins a cell, the
     earlier one on ties.
 
-    input : channels, any of ``"distance"``, sqrt(x^2 + y^2) [m] (SSADNet equation 1), ``"remission"`` and
-        ``"height"``, z [m], in any order.
-    Raises CardError.
+    input : channels, any of ``"distance"``, sqrt(x^2 + y^2) [m] (SSADNet equation 1), ``"remission"`` and ``"height"``,
+        z [m], in any order.
     """
 
     def __init__(self, view: TopViewGeometry, input: InputSpec) -> None:
@@ -369,12 +346,8 @@ class TopViewProjector:
 
         points : (n, 4) float32, C-contiguous; x, y, z [m] in the sensor frame, remission in 0..1
             (`condition.condition`). May be empty or read-only.
-        image : (C, H, W) float32, C-contiguous, overwritten
-        index : (H, W) int32, C-contiguous, overwritten
-        pixel : (n,) int32, C-contiguous, overwritten; as in `Projection`.
         height_m : (n,) float32; height of each point above the ground [m] (`edgeperc.ground.planes.Ground.height_m`),
             for the channel ``"height_above_ground"``; without this channel it is ignored.
-        Raises PointsError.
         """
         points = _checked(self.shape, points, image, index, pixel)
         flat_index = index.reshape(-1)
@@ -399,25 +372,10 @@ class RangeImageProjector:
 
     Tables and scratch are made once and reused between calls, so use one instance per thread.
 
-    Parameters
-    ----------
-    view : RangeImageGeometry
-    input : InputSpec
-        Channels, any of ``"x"``, ``"y"``, ``"z"``, ``"remission"``, ``"range"`` and ``"height_above_ground"`` in any
-        order, meters. Heights above the ground are clipped to -1..5 m.
+    input : channels, any of ``"x"``, ``"y"``, ``"z"``, ``"remission"``, ``"range"`` and ``"height_above_ground"`` in
+        any order, meters. Heights above the ground are clipped to -1..5 m.
+    needs_ground : whether a channel is the height above the ground.
 
-    Attributes
-    ----------
-    needs_ground : bool
-        Whether a channel is the height above the ground.
-
-    Raises
-    ------
-    CardError
-        A channel is not one of these, or beams or columns lie too close to be separated.
-
-    Notes
-    -----
     PointSeg's equation 2 uses arcsin(y / sqrt(x^2 + y^2 + z^2)) as azimuth. That is arcsin(sin(azimuth) *
     cos(elevation)), which is smaller than the azimuth, and the error grows as the beam points farther down. At azimuth
     45 degrees, a beam at -24.8 degrees gets 39.9 degrees: an error of 29 of 512 columns, which would bend vertical
@@ -475,10 +433,7 @@ class RangeImageProjector:
 def make_projector(
     view: TopViewGeometry | RangeImageGeometry, input: InputSpec
 ) -> TopViewProjector | RangeImageProjector:
-    """Make the projector for a model's view and input.
-
-    Raises CardError.
-    """
+    """Make the projector for a model's view and input."""
     if isinstance(view, TopViewGeometry):
         return TopViewProjector(view, input)
     return RangeImageProjector(view, input)
@@ -516,7 +471,6 @@ def tabulate(edges: NDArray[np.float32], what: str) -> Intervals:
 
     edges : (m + 1,) float32; strictly decreasing.
     what : noun for the error message, e.g. ``"rows"``.
-    Raises CardError.
     """
     first, last = edges[0], edges[-1]
     inner = edges[1:-1]
@@ -620,6 +574,5 @@ def project(projector: TopViewProjector | RangeImageProjector, points: Points) -
     """Project a scan and, if the projector needs it, find the ground first, as a `Perceiver` does.
 
     points : (n, 4) float32, C-contiguous; x, y, z [m] in the frame of the models, remission in 0..1.
-    Raises PointsError.
     """
     return projector.project(points, input_heights(projector, points))

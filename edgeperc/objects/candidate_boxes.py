@@ -41,7 +41,6 @@ def decode_objects(
     Returns: (m, 10) float64: x, y, z of the middle, length, width, height [m], yaw [rad] towards the more probable
         front, score, class (a row of ``card.classes``), probability of the front. The score is the probability of the
         most probable class of objects times the overlap.
-    Raises InferenceError.
     """
     if not np.isfinite(outputs).all():
         raise InferenceError(f"{card.name} gives values that are not finite; check the scan, or the model file")

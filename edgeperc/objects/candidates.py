@@ -55,20 +55,13 @@ SCALES = (Scale(0.2, 2.6, 0.5, MAX_LENGTH_M), Scale(0.3, 2.2, 0.3, MAX_LENGTH_M)
 
 
 class Cells(NamedTuple):
-    """Points above the ground by the square cells that they lie in.
+    """Points above the ground by the square cells that they lie in."""
 
-    number : (N_SIDE, N_SIDE) int32, of each cell, x by y; -1 without a point.
-    flat : (k,) int32, flat index of each numbered cell.
-    scales : (k,) uint8, bit s: a point of the cell has a height of `SCALES[s]`.
-    starts : (k + 1,) int32, where the points of a cell start in ``rows``.
-    rows : (m,) int32, rows of the points, cell by cell.
-    """
-
-    number: NDArray[np.int32]
-    flat: NDArray[np.int32]
-    scales: NDArray[np.uint8]
-    starts: NDArray[np.int32]
-    rows: Rows
+    number: NDArray[np.int32]  # (N_SIDE, N_SIDE) of each cell, x by y; -1 without a point
+    flat: NDArray[np.int32]  # (k,) flat index of each numbered cell
+    scales: NDArray[np.uint8]  # (k,) bit s: a point of the cell has a height of `SCALES[s]`
+    starts: NDArray[np.int32]  # (k + 1,) where the points of a cell start in ``rows``
+    rows: Rows  # (m,) rows of the points, cell by cell
 
 
 class Candidates(NamedTuple):
@@ -116,7 +109,6 @@ def find_candidates(scan: Scan, cells: Cells, boxes: NDArray[np.float64], distan
     boxes : (k, 5) float64, rectangles of other origin, such as a detector's: x, y, length, width [m], yaw [rad].
     distance_per_m : as in `objects.cluster.find_clusters`: twice the angle between neighboring beams [rad].
     Returns: the groups at each of the `SCALES`, then ``boxes``.
-    Raises PointsError.
     """
     if boxes.ndim != 2 or boxes.shape[1] != 5:
         raise PointsError(f"got boxes of shape {boxes.shape}; expected (k, 5): x, y, length, width, yaw")
@@ -142,18 +134,12 @@ def find_candidates(scan: Scan, cells: Cells, boxes: NDArray[np.float64], distan
 
 
 class Groups(NamedTuple):
-    """Groups of cells, and the larger groups that they are parts of.
+    """Groups of cells, and the larger groups that they are parts of."""
 
-    order : (k,) int32, numbers of cells, group by group.
-    first : (groups + 1,) int32, where the cells of a group start in ``order``.
-    around : (cells,) int32, of each cell, its group at the first scale; -1: there is none.
-    sizes : (groups of the first scale,) int32, numbers of their cells.
-    """
-
-    order: NDArray[np.int32]
-    first: NDArray[np.int32]
-    around: NDArray[np.int32]
-    sizes: NDArray[np.int32]
+    order: NDArray[np.int32]  # (k,) numbers of cells, group by group
+    first: NDArray[np.int32]  # (groups + 1,) where the cells of a group start in ``order``
+    around: NDArray[np.int32]  # (cells,) of each cell, its group at the first scale; -1: there is none
+    sizes: NDArray[np.int32]  # (groups of the first scale,) numbers of their cells
 
 
 @njit(cache=True, nogil=True)

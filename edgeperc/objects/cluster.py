@@ -132,11 +132,7 @@ def sort_points(
     distance_per_m: float = 0.015,
     max_range_m: float = 100.0,
 ) -> Strips:
-    """The part of `find_clusters` that needs no labels, for a scan whose labels are not known yet.
-
-    points, among, min_distance_m, distance_per_m, max_range_m : as in `find_clusters`.
-    Raises PointsError.
-    """
+    """The part of `find_clusters` that needs no labels, for a scan whose labels are not known yet."""
     if points.ndim != 2 or points.shape[1] < 3:
         raise PointsError(f"got points of shape {points.shape}; expected (n, 4): x, y, z, remission")
     n = len(points)
@@ -172,11 +168,10 @@ def cluster_labels(
     clusters : (n,) int32; cluster of every point, -1 for none.
     labels : (n,) uint8; class of every point; 0 is the background.
     min_share : in 0..1.
-    part_of : mapping of int to int; class to the class that it may be a part of. If at least a quarter of the points
-        of these two classes have the second class, all of them count as the second class.
+    part_of : mapping of int to int; class to the class that it may be a part of. If at least a quarter of the points of
+        these two classes have the second class, all of them count as the second class.
     Returns classes ((k,) uint8): Class of every cluster, the lower one on ties; 0 if no class has the share.
     Returns shares ((k,) float64): Share of the cluster's points that have its most frequent class of objects.
-    Raises PointsError.
     """
     if clusters.ndim != 1 or labels.shape != clusters.shape:
         raise PointsError(
@@ -186,18 +181,11 @@ def cluster_labels(
 
 
 class Groups(NamedTuple):
-    """Points by the groups that they belong to.
+    """Points by the groups that they belong to."""
 
-    Attributes
-    ----------
-    order : (m,) int32
-        Rows of the points of group 0, in input order unless stated otherwise, then of group 1, and so on.
-    starts : (k + 1,) int64
-        Where each of the k groups begins in ``order``; last, where they end.
-    """
-
+    # (m,) rows of the points of group 0, in input order unless stated otherwise, then of group 1, and so on
     order: NDArray[np.int32]
-    starts: NDArray[np.int64]
+    starts: NDArray[np.int64]  # (k + 1,) where each of the k groups begins in ``order``; last, where they end
 
 
 def labels_of_groups(
@@ -248,10 +236,7 @@ def fill_cluster_labels(
 ) -> None:
     """Write the class of every cluster; see `cluster_labels`.
 
-    labels : (n,) uint8
     parts : (p, 2) int64; class, and the class that it may be a part of; below 256.
-    classes : (k,) uint8, overwritten
-    shares : (k,) float64, overwritten
     """
     order, starts = groups.order, groups.starts
     counts = np.zeros(256, np.int64)

@@ -38,17 +38,14 @@ MIN_COUNT = 3  # points of a candidate
 
 
 class Crops(NamedTuple):
-    """Points near candidates.
+    """Points near candidates."""
 
-    points : (m, n_points, 4) float32, x, y in the rectangle's frame, height above `level` [m], remission. Where there
-        are more points than ``n_points``, evenly chosen ones; where there are fewer, they repeat.
-    counts : (m,) int32, number of points in the rectangle and its margin, chosen or not. 0: the points are all 0.
-    level : (m,) float64, z of the ground below [m].
-    """
-
+    # (m, n_points, 4) x, y in the rectangle's frame, height above `level` [m], remission. Where there are more points
+    # than ``n_points``, evenly chosen ones; where there are fewer, they repeat.
     points: Points
+    # (m,) number of points in the rectangle and its margin, chosen or not. 0: the points are all 0.
     counts: NDArray[np.int32]
-    level: NDArray[np.float64]
+    level: NDArray[np.float64]  # (m,) z of the ground below [m]
 
 
 def crop_candidates(scan: Scan, candidates: Candidates, n_points: int, margin_m: float) -> Crops:

@@ -73,28 +73,15 @@ WORK = np.dtype(
 
 
 class Strips(NamedTuple):
-    """The points of a scan by strips: `STRIP` columns of one row of a grid; no labels are needed for it.
+    """The points of a scan by strips: `STRIP` columns of one row of a grid; no labels are needed for it."""
 
-    Attributes
-    ----------
-    points : (n, 3 or more) float32
-    rows : (m,) int32
-        Of the points that take part, in input order.
-    heads : (strips,) int32
-        A point of each strip, -1 without one. `fill_clusters` overwrites them: -2 - k for the k-th opened strip.
-    chain : (n,) int32
-        After each of the m points, the next one of its strip, or -1.
-    levels : (levels + 1,) `LEVEL`
-        The last one only ends the one before it.
-    distance_per_m, max_range_m : float
-        As in `edgeperc.objects.cluster.find_clusters`.
-    """
-
-    points: Points
-    rows: Rows
+    points: Points  # (n, 3 or more)
+    rows: Rows  # (m,) of the points that take part, in input order
+    # (strips,) a point of each strip, -1 without one. `fill_clusters` overwrites them: -2 - k for the k-th opened
+    # strip.
     heads: NDArray[np.int32]
-    chain: NDArray[np.int32]
-    levels: NDArray[np.void]
+    chain: NDArray[np.int32]  # (n,) after each of the m points, the next one of its strip, or -1
+    levels: NDArray[np.void]  # (levels + 1,) `LEVEL`; the last one only ends the one before it
     distance_per_m: float
     max_range_m: float
 
@@ -105,26 +92,14 @@ class Search(NamedTuple):
     A run holds points of one column, each linked with the one before. It is the root of a tree of smaller parts, which
     are made when they are needed (`halves_are_linked`). Runs are numbered from 0, smaller parts from the end down.
 
-    Attributes
-    ----------
-    order, xyz, reach, keys : (m,) int32, (m, 3) float32, (m,) float64, (m,) float64
-        Of each point: row, coordinates [m], reach [m], and scratch.
-    parts : (parts,) `PART`
-    run_votes : (runs, shares + 1) int32
-    owner : (runs,) int32
-        Cluster of each run, `FREE` or `DROPPED`.
-    run_of : (n,) int32
-        Run of each point of the scan.
-    firsts : (strips, STRIP + 1) int32
-        First run of each column of the opened strips, and the end.
-    queue : (runs,) int32
-        Runs of the cluster that grows.
-    near, pairs : (runs,) int32, (MAX_PAIRS, 2) int32
-        Scratch.
-    votes, votes_left : (shares + 1,) int64
-        Of the cluster that grows, and of the points in no cluster yet.
-    min_shares : (shares,) float64
-    work : (1,) `WORK`
+    order, xyz, reach, keys : (m,) int32, (m, 3) float32, (m,) float64, (m,) float64; of each point: row, coordinates
+        [m], reach [m], and scratch.
+    owner : (runs,) int32; cluster of each run, `FREE` or `DROPPED`.
+    run_of : (n,) int32; run of each point of the scan.
+    firsts : (strips, STRIP + 1) int32; first run of each column of the opened strips, and the end.
+    queue : (runs,) int32; runs of the cluster that grows.
+    near, pairs : (runs,) int32, (MAX_PAIRS, 2) int32; scratch.
+    votes, votes_left : (shares + 1,) int64; of the cluster that grows, and of the points in no cluster yet.
     """
 
     order: NDArray[np.int32]
@@ -170,9 +145,7 @@ def chain_points(
 ) -> tuple[int, NDArray[np.int32]]:
     """Write the grids of the levels, and the points of every strip; see `Strips`.
 
-    among : (n,) bool
     max_range : points with a larger x, y or z do not take part [m].
-    rows, chain : (n,) int32, overwritten
     Returns m: Number of points that take part.
     Returns heads: (strips,) int32.
     """
@@ -245,12 +218,10 @@ def fill_clusters(
     Clusters grow from seeds, run by run. Only strips within reach of a growing cluster are opened: sorted, and divided
     into runs. A run of another cluster is not linked with this one, which was complete.
 
-    seeds : (n,) bool
     votes : (n,) uint8; bit 0: the point counts. Bit k + 1: it may count for share k.
     min_shares : (k,) float64, at most 7
     clusters : (n,) int32, overwritten; -1 without a cluster; -2 for points of clusters without a sufficient share, as
         far as they were looked at.
-    work : (1,) `WORK`, overwritten
     """
     clusters[:] = FREE
     points, rows, levels, heads = strips.points, strips.rows, strips.levels, strips.heads
@@ -409,7 +380,6 @@ def find_near(
 
     firsts : (STRIP + 1,) int32; of the strip, as in `Search`.
     col, end : first column, and the one after the last.
-    near : (runs,) int32, overwritten
     """
     n_near, far = 0, SAFE * part["longest"]
     # If the columns hold many runs, they are searched one by one, by height.

@@ -69,14 +69,9 @@ PERSON = np.dtype(
 class Extent(NamedTuple):
     """A group of points along its principal axis, seen from above.
 
-    Attributes
-    ----------
-    cos, sin : float
-        Of the axis.
-    low_u, high_u, low_v, high_v : float
-        Lowest and highest coordinate along and across the axis [m].
-    top : float
-        Greatest height above the ground [m].
+    cos, sin : of the axis.
+    low_u, high_u, low_v, high_v : lowest and highest coordinate along and across the axis [m].
+    top : greatest height above the ground [m].
     """
 
     cos: float
@@ -180,8 +175,7 @@ def complete_persons(
     labels : (n,) uint8, modified; a cluster up to 2.3 m long and 0.7 m wide (0.8 m if the person rides), whose upper
         quarter is at most 0.8 m wide, and of which a fifth in view is labeled as persons, is one person, who rides if
         longer than a stride, or if a quarter of the persons' points says so. The persons' points of one who is longer
-        than a stride, or all points of one who is 1.3 to 2.0 m high and of whom at least 0.3 is labeled, get the
-        label.
+        than a stride, or all points of one who is 1.3 to 2.0 m high and of whom at least 0.3 is labeled, get the label.
     """
     numbers, n = np.empty(len(may_be), np.int32), 0
     for k in range(len(may_be)):
@@ -295,7 +289,6 @@ def fill_persons(
     n_whole : groups from this number on are labeled points of larger clusters.
     cluster_of, clusters : cluster of every point, (n,) int32, and points by cluster.
     min_points : smaller parts are dropped.
-    persons : (p,) `PERSON`, overwritten
     Returns: Number of persons. Those beyond p are left out, and groups with points that are not finite.
     """
     order, starts, others, other_starts = groups.order, groups.starts, clusters.order, clusters.starts

@@ -48,33 +48,14 @@ def remove_outliers(
 ) -> NDArray[np.uint8]:
     """Set to background the pixels whose points lie away from the object they were labeled with.
 
-    Parameters
-    ----------
-    points : (n, 4) float32
-        x, y, z [m] in the sensor frame, remission.
-    index : (H, W) int32
-        Row of ``points`` at each pixel of a range image; -1 without a return.
-    labels : (H, W) uint8
-        Index into ``classes`` of every pixel; 0 is the background.
-    classes : sequence of str
-    radius_m : mapping
-        Class to the radius [m] around an object's middle, seen from above, that holds its visible points. Classes
-        that are not in it are not changed.
-    full_turn : bool
-        The image's left and right edges meet.
+    points : (n, 4) float32; x, y, z [m] in the sensor frame, remission.
+    index : (H, W) int32; row of ``points`` at each pixel of a range image; -1 without a return.
+    labels : (H, W) uint8; index into ``classes`` of every pixel; 0 is the background.
+    radius_m : class to the radius [m] around an object's middle, seen from above, that holds its visible points.
+        Classes that are not in it are not changed.
+    full_turn : the image's left and right edges meet.
+    Returns (H, W) uint8: the cleaned labels, a copy. Deterministic.
 
-    Returns
-    -------
-    (H, W) uint8
-        The cleaned labels, a copy. Deterministic.
-
-    Raises
-    ------
-    PointsError
-        Arrays disagree in shape, or ``index`` refers to rows that ``points`` does not have.
-
-    Notes
-    -----
     PointSeg 5.2 refines its back projection by RANSAC but does not name a model; this one is our own. Connected
     pixels of one label (8 neighbors), at any range, are a component, so that bleeding pixels stay with their object.
     A hypothesis is a sampled point. Its center is the mean of the component's points within the class's radius of the
@@ -107,34 +88,16 @@ def label_points(
 ) -> NDArray[np.uint8]:
     """Label every point in view from the pixel labels (PointSeg 5.2).
 
-    Parameters
-    ----------
-    points : (n, 4) float32
-        x, y, z [m] in the sensor frame, remission.
-    pixel : (n,) int32
-        Flat pixel of each point; -1 for points out of view.
-    index : (H, W) int32
-        Row of ``points`` at each pixel of a range image; -1 without a return.
-    labels : (H, W) uint8
-        Class of every pixel; 0 is the background.
-    full_turn : bool
-        The image's left and right edges meet.
+    points : (n, 4) float32; x, y, z [m] in the sensor frame, remission.
+    pixel : (n,) int32; flat pixel of each point; -1 for points out of view.
+    index : (H, W) int32; row of ``points`` at each pixel of a range image; -1 without a return.
+    labels : (H, W) uint8; class of every pixel; 0 is the background.
+    full_turn : the image's left and right edges meet.
+    Returns (n,) uint8: a point that won its pixel has the pixel's label. The others are hidden behind a nearer point.
+        They take the majority label of 5 pixels: those nearest in range among the 5 x 5 around the point and within 1 m
+        of its range; 0 if there is none. On ties between labels, the label of the nearest pixel wins; on ties in range,
+        the pixel above, then left. Points out of view have 0.
 
-    Returns
-    -------
-    (n,) uint8
-        A point that won its pixel has the pixel's label. The others are hidden behind a nearer point. They take the
-        majority label of 5 pixels: those nearest in range among the 5 x 5 around the point and within 1 m of its range;
-        0 if there is none. On ties between labels, the label of the nearest pixel wins; on ties in range, the pixel
-        above, then left. Points out of view have 0.
-
-    Raises
-    ------
-    PointsError
-        Arrays disagree in shape, or ``pixel`` or ``index`` is out of range.
-
-    Notes
-    -----
     The vote is that of RangeNet++, restricted to hidden points. On 90 labeled KITTI frames with correct masks, it
     raises point IoU of car, pedestrian and cyclist from 0.946, 0.894, 0.881 to 0.994, 0.988, 0.997; windows of
     3 x 3 to 5 x 5, 1 to 5 votes, 0.5 to 1 m, Gaussian weights and distances in space were within 0.003 of that.
@@ -179,11 +142,7 @@ def fill_without_outliers(
 ) -> None:
     """Write ``labels`` without outliers; see `remove_outliers`.
 
-    points : (n, 4) float32
-    index : (H, W) int32
-    labels : (H, W) uint8
     radii : (classes,) float64; classes with 0 are not changed.
-    cleaned : (H, W) uint8, overwritten
     """
     height, width = labels.shape
     # Element by element: to copy an array, numba compiles a broadcast with its error messages, for 3 s.
@@ -334,14 +293,7 @@ def fill_point_labels(
     full_turn: bool,
     point_labels: NDArray[np.uint8],
 ) -> None:
-    """Write every point's label; see `label_points`.
-
-    points : (n, 4) float32
-    pixel : (n,) int32
-    index : (H, W) int32
-    labels : (H, W) uint8
-    point_labels : (n,) uint8, overwritten
-    """
+    """Write every point's label; see `label_points`."""
     height, width = labels.shape
     ranges = np.empty((height, width))  # of each pixel's point [m], computed when needed
     # Most hidden points have only background around them and need no vote: 0.5 ms a scan instead of 1.0.

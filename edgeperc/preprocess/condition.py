@@ -30,10 +30,9 @@ def condition(points: ArrayLike, sensor: SensorProfile, *, rendered: bool = True
     sensor : rows that are not returns of the world are dropped (`returns.returns`), and remission is scaled to 0..1
         (`scale`).
     rendered : convert the remission with ``sensor.remission`` (`render`), if the profile has a function.
-    Returns scan ((n, 4) float32, C-contiguous, read-only): x, y, z [m], remission in 0..1, in input order. Dropped
-        rows are NaN in all four columns. A view of ``points`` if nothing had to be changed.
+    Returns scan ((n, 4) float32, C-contiguous, read-only): x, y, z [m], remission in 0..1, in input order. Dropped rows
+        are NaN in all four columns. A view of ``points`` if nothing had to be changed.
     Returns n_dropped: Number of dropped rows, those whose scaled remission is not finite included.
-    Raises PointsError.
     """
     scan, dropped = returns(as_points(points), sensor)
     scan, n_overflowed = scale(scan, sensor, rendered=rendered)
@@ -44,7 +43,6 @@ def scale(points: Points, sensor: SensorProfile, *, rendered: bool = True) -> tu
     """Scale the remission of a scan, whose rows are finite or NaN, to 0..1.
 
     points : (n, 4) float32; from `edgeperc.preprocess.returns.returns`. Not modified.
-    rendered : as in `condition`.
     Returns scan ((n, 4) float32, C-contiguous, read-only): A view of ``points`` if nothing had to be changed.
     Returns n_overflowed: Number of rows that became NaN because their scaled remission is not finite.
     """
@@ -102,11 +100,9 @@ def fill_rendered(
 ) -> None:
     """Write the points with rendered remission into ``rendered``.
 
-    points : (n, 4) float32, C-contiguous
     kind : a value of ``KIND_CODES``.
-    coefficients : (3,) float64
-    offset, scale : the argument x of `RemissionFunction` is ``(raw + offset) * scale``; logarithm and power clip it
-        to 0 from below.
+    offset, scale : the argument x of `RemissionFunction` is ``(raw + offset) * scale``; logarithm and power clip it to
+        0 from below.
     rendered : (n, 4) float32, overwritten; a remission that is not finite becomes NaN.
     """
     # Most sensors report whole numbers up to 255. A table of their 256 results takes 0.3 instead of 2 ms.

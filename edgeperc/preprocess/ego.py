@@ -36,21 +36,11 @@ _AROUND_M, _HEIGHTS_M = (4.0, 25.0), (0.5, 2.5)
 
 @dataclass(frozen=True)
 class EgoSuggestion:
-    """The box of the own vehicle, as scans suggest it.
+    """The box of the own vehicle, as scans suggest it."""
 
-    Attributes
-    ----------
-    box : tuple of 3 tuples of 2 float, or None
-        For `SensorProfile.ego_box` [m]; None if nothing near the sensor stays where it is.
-    n_places : int
-        Different places of the vehicle.
-    n_directions : int
-        Directions, of 2 by 1 degrees, in which the nearest return stayed.
-    """
-
-    box: EgoBox | None
-    n_places: int
-    n_directions: int
+    box: EgoBox | None  # for `SensorProfile.ego_box` [m]; None if nothing near the sensor stays where it is
+    n_places: int  # different places of the vehicle
+    n_directions: int  # directions, of 2 by 1 degrees, in which the nearest return stayed
 
 
 def suggest_ego_box(scans: Iterable[NDArray[np.float32]], sensor: SensorProfile, mounting: Mounting) -> EgoSuggestion:
@@ -60,7 +50,6 @@ def suggest_ego_box(scans: Iterable[NDArray[np.float32]], sensor: SensorProfile,
         better from several streets.
     sensor : its ``ego_box`` is not used.
     mounting : a known one, for the height of the road.
-    Raises SensorError.
     """
     frame, plain = ModelFrame(mounting), replace(sensor, ego_box=None)
     x, y = mounting.origin_m

@@ -18,15 +18,9 @@ from .fitness import FitnessProfile, Measures, Range, measure
 
 
 class Finding(str):
-    """A sentence about how a scan differs from the training scans.
+    """A sentence about how a scan differs from the training scans."""
 
-    Attributes
-    ----------
-    gross : bool
-        The scan is so different that results would be meaningless; a `Perceiver` refuses it by default.
-    """
-
-    gross: bool
+    gross: bool  # the scan is so different that results would be meaningless; a `Perceiver` refuses it by default
 
     def __new__(cls, text: str, gross: bool = False) -> Finding:
         """Make a finding from its sentence."""
@@ -46,16 +40,15 @@ def check_fitness(
 
     points : (n, 4) float32; x, y, z [m], remission scaled to 0..1 by ``sensor``. Points that are not finite are
         skipped.
-    sensor : the sensor that the caller says recorded the scan. If its remission function is constant, because the
-        scan has no remission, remission is not checked.
+    sensor : the sensor that the caller says recorded the scan. If its remission function is constant, because the scan
+        has no remission, remission is not checked.
     frame : what moved the scan into the frame of the models. A sensor that is high, or leans, sees points that are
         higher there than its beams.
-    Returns: One sentence for each difference; empty if there is none. Gross are: another unit; a vertical axis that
-        is not z, or points down; ground more than 1.3 m from where it lay in training; no points below the horizon;
-        points far above the sensor's field of view; points in less than a quarter of the model's view; half of the
-        points as near as in a room; less than 1/20 of the fewest or more than 20 times the most points in training;
-        fewer than eight rows of points; remission that is constant, missing or off the sensor's range.
-    Raises PointsError.
+    Returns: One sentence for each difference; empty if there is none. Gross are: another unit; a vertical axis that is
+        not z, or points down; ground more than 1.3 m from where it lay in training; no points below the horizon; points
+        far above the sensor's field of view; points in less than a quarter of the model's view; half of the points as
+        near as in a room; less than 1/20 of the fewest or more than 20 times the most points in training; fewer than
+        eight rows of points; remission that is constant, missing or off the sensor's range.
     """
     return check_profiles(points, [profile], sensor, frame)
 
@@ -69,10 +62,8 @@ def check_profiles(
 ) -> tuple[Finding, ...]:
     """Describe how a scan differs from the training scans of several models, each difference once.
 
-    points, sensor, frame : as in `check_fitness`.
     profiles : the scan is measured once for all profiles of the same view.
     ceiling_m : `ground.ceiling.find_ceiling`.
-    Raises PointsError.
     """
     measured: dict[Range, Measures | None] = {}
     found: dict[Finding, None] = {}

@@ -51,39 +51,19 @@ SUMS = np.dtype(
 
 
 class Histograms(NamedTuple):
-    """Numbers of points.
+    """Numbers of points."""
 
-    Attributes
-    ----------
-    remissions : (258,) int64
-        Remission <= 0, 256 even bins in 0..1, above 1.
-    elevations : (360,) int64
-        Bins of half a degree from -90, of the points farther than 3 m.
-    ranges : (200,) int64
-        Horizontal distance, 20 bins a decade from 1 mm.
-    heights : (3, 100) int64
-        x, y and z of the points 3 to 25 m away, bins of 0.2 m from -10 m.
-    """
-
-    remissions: NDArray[np.int64]
-    elevations: NDArray[np.int64]
-    ranges: NDArray[np.int64]
-    heights: NDArray[np.int64]
+    remissions: NDArray[np.int64]  # (258,) remission <= 0, 256 even bins in 0..1, above 1
+    elevations: NDArray[np.int64]  # (360,) bins of half a degree from -90, of the points farther than 3 m
+    ranges: NDArray[np.int64]  # (200,) horizontal distance, 20 bins a decade from 1 mm
+    heights: NDArray[np.int64]  # (3, 100) x, y and z of the points 3 to 25 m away, bins of 0.2 m from -10 m
 
 
 class Rows(NamedTuple):
-    """Elevations in the eight directions ahead, left, behind, right and halfway between.
+    """Elevations in the eight directions ahead, left, behind, right and halfway between."""
 
-    Attributes
-    ----------
-    elevations : (8, 1024) float64
-        [deg]
-    counts : (8,) int64
-        How many of them each direction has.
-    """
-
-    elevations: NDArray[np.float64]
-    counts: NDArray[np.int64]
+    elevations: NDArray[np.float64]  # (8, 1024) [deg]
+    counts: NDArray[np.int64]  # (8,) how many of them each direction has
 
 
 @njit(cache=True, nogil=True)
@@ -101,8 +81,6 @@ def fill_scan_sums(
     points : (n, 4) float32; x, y, z [m], remission.
     beam_step : for ``rows``, every ``beam_step``-th point is used.
     view : right and left edge of the model's view as pseudo-azimuth.
-    histograms, rows : overwritten
-    sums : (1,) `SUMS`, overwritten
     """
     seen, far = np.zeros(N_SECTORS), np.zeros(N_SECTORS)  # 1 with points; points farther than 3 m
     fill_histograms(points, step, view, histograms, seen, far, sums)
@@ -250,21 +228,13 @@ def fill_rows(points: Points, step: int, rows: Rows) -> None:
 
 
 class Walls(NamedTuple):
-    """Where a scan ends, in `N_SECTORS` directions.
+    """Where a scan ends, in `N_SECTORS` directions."""
 
-    Attributes
-    ----------
-    enclosed : float
-        Share of the directions with points that end at a wall: the farthest points lie above one another.
-    mostly_enclosed : float
-        The same for the nearest three quarters of the points of each: the others may be seen through windows.
-    through_m : float
-        How far two opposite directions are seen [m], each by a tenth of its points.
-    """
-
+    # share of the directions with points that end at a wall: the farthest points lie above one another
     enclosed: float = 0.0
+    # the same for the nearest three quarters of the points of each: the others may be seen through windows
     mostly_enclosed: float = 0.0
-    through_m: float = math.inf
+    through_m: float = math.inf  # how far two opposite directions are seen [m], each by a tenth of its points
 
 
 @dataclass(frozen=True)
@@ -411,27 +381,17 @@ class FitnessProfile:
 
     The model's card holds it; `check_fitness` compares scans with it.
 
-    Attributes
-    ----------
-    n_scans : int
-    azimuth_deg : tuple of 2 float
-        Left and right edge of the model's view [deg].
-    points_in_view : tuple of 2 float
-        Points in that view.
-    view_covered : tuple of 2 float
-        Share of the view with returns, in steps of 1/64 turn.
-    remission_median, remission_p99, remission_zeros : tuple of 2 float
-        Median, 99th percentile and share of zeros of the remission, scaled to 0..1.
-    elevation_p01_deg, elevation_p99_deg : tuple of 2 float
-        1st and 99th percentile of the elevation of points farther than 3 m [deg].
-    beams, beams_per_deg : tuple of 2 float
-        Rows of points above one another, and their number per degree of elevation.
-    range_median_m : tuple of 2 float
-        Median horizontal distance [m].
-    ground_m : tuple of 2 float, or None
-        Height of the ground in the sensor frame [m]; None if no scan shows the ground.
-    road_ahead : tuple of 2 float, or None
-        Logarithm of the ratio of obstacles at the sides to those ahead and behind; None if no scan is a full turn.
+    azimuth_deg : left and right edge of the model's view [deg].
+    points_in_view : points in that view.
+    view_covered : share of the view with returns, in steps of 1/64 turn.
+    remission_median, remission_p99, remission_zeros : median, 99th percentile and share of zeros of the remission,
+        scaled to 0..1.
+    elevation_p01_deg, elevation_p99_deg : 1st and 99th percentile of the elevation of points farther than 3 m [deg].
+    beams, beams_per_deg : rows of points above one another, and their number per degree of elevation.
+    range_median_m : median horizontal distance [m].
+    ground_m : height of the ground in the sensor frame [m]; None if no scan shows the ground.
+    road_ahead : logarithm of the ratio of obstacles at the sides to those ahead and behind; None if no scan is a full
+        turn.
     """
 
     n_scans: int
@@ -457,7 +417,6 @@ class FitnessProfile:
 
         scans : iterable of (n, 4) float32; x, y, z [m], remission scaled to 0..1.
         azimuth_deg : tuple of 2 float; left and right edge of the model's view [deg], between 180 and -180.
-        Raises PointsError.
         """
         measures = [measured for scan in scans if (measured := measure(scan, azimuth_deg)) is not None]
         if not measures:
@@ -474,10 +433,7 @@ class FitnessProfile:
 
     @classmethod
     def from_dict(cls, document: Mapping[str, Any]) -> FitnessProfile:
-        """Read what `to_dict` wrote.
-
-        Raises CardError.
-        """
+        """Read what `to_dict` wrote."""
         profile = _FIELDS.read(cls, document, "fitness")
         _FIELDS.whole("fitness.n_scans", profile.n_scans, 1, 10**9)
         for name, (low, high) in _BOUNDS.items():

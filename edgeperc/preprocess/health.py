@@ -47,12 +47,8 @@ _RANGE_SHARE, _SHRUNK, _FEWER_RETURNS = 0.95, 0.6, 0.85
 class Normal:
     """What the first scans of a sensor showed.
 
-    Attributes
-    ----------
-    fewest : (N_SECTORS, 4) float64, or None
-        Least counts of `fill_sectors`; None before the first scan.
-    ranges_m, returns : tuple of float
-        High quantile of the ranges [m] and number of returns, one a scan.
+    fewest : (N_SECTORS, 4) float64, or None; least counts of `fill_sectors`; None before the first scan.
+    ranges_m, returns : high quantile of the ranges [m] and number of returns, one a scan.
     """
 
     fewest: NDArray[np.float64] | None = None
@@ -285,10 +281,9 @@ def fill_sectors(
 ) -> int:
     """Count every ``step``-th point by sector and band, and by range in meters; returns the number of them.
 
-    tans : (2,) tangents of the elevations below which beams are in the first, or else in the second band; others are
-        in the third.
+    tans : (2,) tangents of the elevations below which beams are in the first, or else in the second band; others are in
+        the third.
     counts : (N_SECTORS, 4), overwritten; sectors counter-clockwise from x; the last column is the sum of the bands.
-    ranges : (256,), overwritten
     """
     for k in range(counts.shape[0]):
         counts[k, 0] = counts[k, 1] = counts[k, 2] = counts[k, 3] = 0.0
@@ -323,7 +318,6 @@ def fill_lacking(counts: NDArray[np.float64], fewest: NDArray[np.float64], lacks
     """Write where returns are missing: fewer than in other sectors, and than the fewest before.
 
     counts, fewest : (N_SECTORS, 4) of `fill_sectors`; infinite before the first scan.
-    lacks : (N_SECTORS, 4) bool, overwritten
     """
     ordered = np.empty(counts.shape[0])
     for column in range(counts.shape[1]):
@@ -356,11 +350,10 @@ def mark_isolated(
 ) -> None:
     """Count points within `NEAR_M`, and those with few others around them, which are marked.
 
-    of : only points whose smaller horizontal coordinate is at most this share of the larger one; how many others;
-        how many if it is dim; the remission below which it is.
+    of : only points whose smaller horizontal coordinate is at most this share of the larger one; how many others; how
+        many if it is dim; the remission below which it is.
     radius : (3,); around a point, per meter of its range, at least, and at most [m].
     heads : (a power of two,), buffers : (2, most near points that are looked at); overwritten.
-    mark : (n,) or (0,) bool, modified.
     counts : (4, 3), overwritten; of each side, with a larger x, y, -x and -y, the near points, those with few others
         around, and of these the dim ones.
     """

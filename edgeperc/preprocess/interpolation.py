@@ -35,19 +35,10 @@ _SCATTER = 4.0
 class Interpolator:
     """Fills the pixels of a range image between neighboring beams and columns of a coarser sensor (KUL-Seg 5).
 
-    Parameters
-    ----------
-    view : RangeImageGeometry
-        The model's view.
-    sensor : SensorProfile
-        The sensor that takes the scans. The ground is where it is in the frame of the models.
-
-    Attributes
-    ----------
-    shape : tuple of 2 int
-        Height and width of the range image.
-    needed : bool
-        Whether the sensor is coarser than some part of the view.
+    view : the model's view.
+    sensor : the sensor that takes the scans. The ground is where it is in the frame of the models.
+    shape : height and width of the range image.
+    needed : whether the sensor is coarser than some part of the view.
     """
 
     def __init__(self, view: RangeImageGeometry, sensor: SensorProfile) -> None:
@@ -76,13 +67,11 @@ class Interpolator:
     def fill(self, points: Points, index: NDArray[np.int32]) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
         """Interpolate points in the gaps of a range image.
 
-        points : (n, 4) float32
         index : (H, W) int32; row of ``points`` at each pixel; -1 without a return.
-        Returns points ((n + m, 4) float32): The given points, then the interpolated ones: each on the line between
-            two neighbors, in the middle of its pixel.
+        Returns points ((n + m, 4) float32): The given points, then the interpolated ones: each on the line between two
+            neighbors, in the middle of its pixel.
         Returns index ((H, W) int32): Row of the returned points at each pixel, -1 if empty. Rows from n on are
             interpolated points.
-        Raises PointsError.
         """
         if points.ndim != 2 or points.shape[1] != 4 or points.dtype != np.float32:
             raise PointsError(f"got points of shape {points.shape} and {points.dtype}; expected (n, 4) float32")

@@ -430,10 +430,8 @@ def fill_deskewed(
 ) -> None:
     """Move points by the motion of the sensor (Rodrigues' formula for the turn and for its integral).
 
-    points : (n, 4) float32, C-contiguous
     after_s : (n,) float64; time of each point after the pose of the result [s].
     velocity, rate : (3,) float64; of the sensor, in its own frame [m/s, rad/s].
-    moved : (n, 4) float32, overwritten
     """
     wx, wy, wz = rate[0], rate[1], rate[2]
     squared = wx * wx + wy * wy + wz * wz

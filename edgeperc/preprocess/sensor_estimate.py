@@ -83,16 +83,10 @@ _ADVICE = (
 class Polar(NamedTuple):
     """Points of a scan about the sensor's axis.
 
-    Attributes
-    ----------
-    flat, z : (n,) float64
-        Horizontal distance and height [m].
-    azimuth : (n,) float64
-        [deg].
-    time : (n,) float64
-        When a point was taken, in turns from the middle of the scan, if the points come in turn.
-    rows : tuple of (k,) int64
-        The points of each beam, if they come beam by beam.
+    flat, z : (n,) float64; horizontal distance and height [m].
+    azimuth : (n,) float64; [deg].
+    time : (n,) float64; when a point was taken, in turns from the middle of the scan, if the points come in turn.
+    rows : the points of each beam, if they come beam by beam.
     """
 
     flat: NDArray[np.float64]
@@ -105,18 +99,12 @@ class Polar(NamedTuple):
 class Beams(NamedTuple):
     """Beams from the top down.
 
-    Attributes
-    ----------
-    elevations_deg, slopes, offsets_m : (n,) float64
-        A beam's points have z = offset + slope * horizontal distance; the elevation is the angle of that slope.
-    seen_deg : (n,) float64
-        Median elevation of its points as seen from the origin of the scan.
-    counts : (n,) float64
-        The number of its points.
-    pure : (n,) float64
-        Share of these on its line.
-    flat_m : (n,) float64
-        Their median distance.
+    elevations_deg, slopes, offsets_m : (n,) float64; a beam's points have z = offset + slope * horizontal distance; the
+        elevation is the angle of that slope.
+    seen_deg : (n,) float64; median elevation of its points as seen from the origin of the scan.
+    counts : (n,) float64; the number of its points.
+    pure : (n,) float64; share of these on its line.
+    flat_m : (n,) float64; their median distance.
     """
 
     elevations_deg: NDArray[np.float64]

@@ -105,7 +105,6 @@ def fit_functions(
     to, source : entries of `RemissionFunction`.
     Returns: Lowest ``rmse`` in ten-fold cross-validation first. A parabola is never worse than a line on the pairs it
         is fitted to, but it is the worst on held-back pairs, as in the paper (KUL-Seg, Table 5).
-    Raises SensorError.
     """
     x, y = np.asarray(raw, np.float64).ravel(), np.asarray(wanted, np.float64).ravel()
     if len(x) != len(y):
@@ -172,12 +171,11 @@ def stratify(
 
     scan : (n, 4) float32; x, y, z [m] in the sensor frame, remission. Points that are not finite or out of
         `RANGE_EDGES_M` are left out.
-    n_points : use about so many points: all returns in some of the cells in which `incidences` fits surfaces. None:
-        use all.
+    n_points : use about so many points: all returns in some of the cells in which `incidences` fits surfaces. None: use
+        all.
     cell_m : edge of the cells [m].
     Returns strata ((k,) int64): 0 to `N_STRATA` - 1.
     Returns remissions: (k,) float64.
-    Raises PointsError.
     """
     if scan.ndim != 2 or scan.shape[1] != 4:
         raise PointsError(f"got an array of shape {scan.shape}; expected (n, 4): x, y, z, remission")
@@ -208,7 +206,6 @@ def remission_strata(scans: Iterable[NDArray[np.float32]]) -> list[tuple[float, 
 
     scans : iterable of (n, 4) float32; x, y, z [m] in the sensor frame, remission.
     Returns list of (share, quantiles): One entry per stratum.
-    Raises PointsError.
     """
     return quantiles_by_stratum([stratify(scan) for scan in scans])
 
@@ -278,7 +275,6 @@ def fit_sensor(
     source : description of the scans; by default their number.
     Returns profile: ``sensor`` with the best function; a parabola that decreases before full scale is not used.
     Returns functions: All kinds, best first.
-    Raises SensorError, PointsError.
     """
     if to not in REFERENCES:
         raise SensorError(f"no reference remissions of {to!r}; known are {', '.join(REFERENCES)}")

@@ -43,18 +43,13 @@ def decode_apart(
     """Like `decoders.decode`, in a process of its own; without ``times``, those of the points are None.
 
     The process runs ahead by one scan and waits then, so the memory stays flat. It ends with the iterator.
-
-    Raises PointsError.
     """
     request = {"path": str(path), "kind": kind, "topic": topic, "remission_field": remission_field, "times": times}
     return _serve(request, path, [])
 
 
 def describe_apart(path: Path, kind: str, topic: str | None) -> dict[str, Any]:
-    """Like `decoders.describe`, in a process of its own.
-
-    Raises PointsError.
-    """
+    """Like `decoders.describe`, in a process of its own."""
     descriptions: list[Any] = []
     for _ in _serve({"path": str(path), "kind": kind, "topic": topic}, path, descriptions):
         break  # a scan was not asked for
@@ -104,7 +99,6 @@ class _Watch:
 
     since_s : float or None; since when a reply is awaited, on the monotonic clock; None while the reader of the scans
         takes its time.
-    expired : bool
     """
 
     def __init__(self, process: subprocess.Popen[bytes]) -> None:

@@ -192,10 +192,7 @@ CLOUD_READERS: MappingProxyType[tuple[str, str], Callable[[memoryview], Cloud]] 
 
 
 def describe_cloud(topic: str, message: Any) -> dict[str, Any]:
-    """What a point cloud message says about its sensor; see `decoders.describe`.
-
-    Raises PointsError.
-    """
+    """What a point cloud message says about its sensor; see `decoders.describe`."""
     return {
         "topic": topic,
         "frame": str(message.header.frame_id),

@@ -65,11 +65,9 @@ def decode(
 ) -> Iterator[TimedScan]:
     """The scans of a capture, decoded in this process.
 
-    topic, remission_field : as in `edgeperc.read_scans`.
     warn : called with a sentence about what was left out.
     alive : called now and then while a large file is checked before its first scan.
     times : false leaves out the times of points.
-    Raises PointsError, MissingExtraError.
     """
     scans = (
         _packet_scans(path, kind, topic, remission_field, warn, alive)
@@ -83,12 +81,9 @@ def decode(
 def describe(path: Path, kind: str, topic: str | None, alive: Callable[[], None]) -> dict[str, Any]:
     """What a capture says about its sensor, as JSON types; `identify` draws the conclusion.
 
-    topic : as in `edgeperc.read_scans`.
-    alive : as in `decode`.
     Returns: ``metadata`` of an Ouster, as text; ``velodyne``, the names in its packets; or ``topic``, ``frame``,
         ``fields`` and ``elevations_deg`` of a point cloud: the median elevation of each ring or, without rings, of each
         row of an organized cloud [deg], None where a ring has no return; empty without both.
-    Raises PointsError, MissingExtraError.
     """
 
     def found() -> Iterator[dict[str, Any]]:

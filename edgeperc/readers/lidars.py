@@ -35,16 +35,11 @@ _ALIKE = {"helios-32", "helios-16"}  # by their packets; the angles tell them ap
 
 
 class Lidar(NamedTuple):
-    """What sends most of the first packets.
+    """What sends most of the first packets."""
 
-    row : the format of a spinning sensor; None: Livox.
-    senders : such sensors, as `packets.sender_names` calls them.
-    first : address and port of the one with the most packets.
-    """
-
-    row: Format | None
-    senders: list[str]
-    first: str
+    row: Format | None  # the format of a spinning sensor; None: Livox
+    senders: list[str]  # such sensors, as `packets.sender_names` calls them
+    first: str  # address and port of the one with the most packets
 
     @property
     def title(self) -> str:

@@ -90,9 +90,7 @@ def fill_points(
 ) -> int:
     """Put the points that returned into an array.
 
-    content : (>= n * stride,) uint8.
     layout : 4: x, y, z in mm of 4 bytes; 2: in cm of 2 bytes; 3: mm of 4 bytes, zenith angle and azimuth of 2 bytes.
-    points : (n, 4) float32; filled.
     which : (n,) int64; filled with the number of each in the content.
     Returns int: how many.
     """
@@ -167,10 +165,7 @@ class LivoxStream:
 
 
 def lvx2_sensors(path: Path) -> list[str]:
-    """The serial numbers of the sensors in an .lvx2 file.
-
-    Raises PointsError.
-    """
+    """The serial numbers of the sensors in an .lvx2 file."""
     return [serial for serial, _ in _devices(np.memmap(path, np.uint8, "r").data)]
 
 

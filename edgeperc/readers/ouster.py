@@ -19,10 +19,7 @@ _MOST_JSON_BYTES = 1 << 24
 
 
 def metadata_beside(path: Path) -> list[Path]:
-    """The .json files whose names have the longest beginning in common with the capture's, as ouster-sdk chooses.
-
-    Raises PointsError.
-    """
+    """The .json files whose names have the longest beginning in common with the capture's, as ouster-sdk chooses."""
     files = sorted(file for file in path.absolute().parent.iterdir() if file.suffix.lower() == ".json")
     alike = {
         file: len(os.path.commonprefix([file.name, path.name]))  # noqa: RUF071 - of the characters

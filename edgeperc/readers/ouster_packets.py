@@ -206,11 +206,8 @@ def fill_turn(
 ) -> None:
     """Put the valid columns of packets where they belong in a turn; later ones replace earlier ones.
 
-    packets : (n, bytes of a packet) uint8.
     places : as `Layout.places`.
     fields : (k, 3) int64; bit, bits and shift of each.
-    values : (k, beams, columns) uint32; filled.
-    stamps_ns : (columns,) uint64; filled.
     """
     header, per_packet, column_bytes, status, first, pixel_bytes = places
     for packet in range(packets.shape[0]):

@@ -136,10 +136,7 @@ class OusterMessages:
 
 
 class VelodyneStream:
-    """Turns of a Velodyne from messages, which need not begin and end where a turn does.
-
-    Raises MissingExtraError.
-    """
+    """Turns of a Velodyne from messages, which need not begin and end where a turn does."""
 
     def __init__(self) -> None:
         self._velodyne = require(
@@ -148,10 +145,7 @@ class VelodyneStream:
         self._decoder = self._velodyne.StreamDecoder(self._velodyne.Config())
 
     def add(self, message: VelodyneScan) -> Iterator[TimedScan]:
-        """The turns that end in a message.
-
-        Raises PointsError.
-        """
+        """The turns that end in a message."""
         if any(velodyne_name(packet) == "hdl-64e" for _, packet in message.packets[:1]):
             raise PointsError(
                 "the packets are of an HDL-64E, and each has a calibration of its own: play the bag through "

@@ -47,16 +47,11 @@ _PENDING = 256
 
 
 class Datagram(NamedTuple):
-    """What a UDP datagram over IPv4 carries.
+    """What a UDP datagram over IPv4 carries."""
 
-    sender : the IPv4 address.
-    port : that it was sent to.
-    stamp_s : when its last part was captured.
-    """
-
-    sender: str
-    port: int
-    stamp_s: float
+    sender: str  # the IPv4 address
+    port: int  # that it was sent to
+    stamp_s: float  # when its last part was captured
     payload: memoryview
 
     def is_from(self, sender: str | None) -> bool:

@@ -30,16 +30,11 @@ _RESOLUTION, _OFFSET = 9, 14
 
 
 class Captured(NamedTuple):
-    """A captured packet.
+    """A captured packet."""
 
-    link : link type of the interface.
-    stamp_s : when it was captured; 0 if the file does not say.
-    data : the packet with its network headers.
-    """
-
-    link: int
-    stamp_s: float
-    data: memoryview
+    link: int  # link type of the interface
+    stamp_s: float  # when it was captured; 0 if the file does not say
+    data: memoryview  # the packet with its network headers
 
 
 class _Interface(NamedTuple):

@@ -84,8 +84,6 @@ def parse_pcd(data: NDArray[np.uint8], head: bytes, remission_field: str | None)
 
     data : (n_bytes,) uint8; the whole file.
     head : its beginning, with the whole header.
-    remission_field : as in `edgeperc.read_points`.
-    Raises PointsError.
     """
     header = _parse_pcd_header(head)
     n = header.n_points
@@ -137,8 +135,6 @@ def _unpack_pcd(body: NDArray[np.uint8], n_bytes: int) -> NDArray[np.uint8]:
 def fill_unpacked_lzf(packed: NDArray[np.uint8], unpacked: NDArray[np.uint8]) -> int:
     """Decompress LZF data into ``unpacked``.
 
-    packed : (m,) uint8
-    unpacked : (size,) uint8, overwritten
     Returns: Bytes written; -1 if a reference leaves the data or the output.
     """
     n_in = packed.shape[0]

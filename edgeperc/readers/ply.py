@@ -63,8 +63,6 @@ def parse_ply(data: NDArray[np.uint8], head: bytes, remission_field: str | None)
 
     data : (n_bytes,) uint8; the whole file.
     head : its beginning, with the whole header.
-    remission_field : as in `edgeperc.read_points`.
-    Raises PointsError.
     """
     encoding, elements, start = _parse_ply_header(head)
     before: list[_PlyElement] = []

@@ -29,7 +29,6 @@ def parse_raw(data: NDArray[np.uint8], columns: int | Sequence[str] | None, usua
     """The columns of a raw float32 file.
 
     columns : number of values of a point, or their names; None: ``usual``, unless the values show another number.
-    Raises PointsError.
     """
     names = column_names(columns)
     if TEXT_BYTES[data[:4096]].all():

@@ -265,10 +265,7 @@ def has_16_lasers(payload: memoryview) -> bool:
 
 
 def read_angles(path: Path, row: Format) -> Angles:
-    """The angles of a calibration file: ``channel,elevation,azimuth`` as Hesai's, or without channel, as RoboSense's.
-
-    Raises PointsError.
-    """
+    """The angles of a calibration file: ``channel,elevation,azimuth`` as Hesai's, or, without channel, RoboSense's."""
     n = row.lasers or row.n_channels
     rows = []
     for line in path.read_bytes()[: 1 << 20].decode("utf-8", "replace").splitlines():
@@ -297,14 +294,11 @@ def fill_returns(
 ) -> int:
     """Put the returns of packets into points; a second return at the distance of the first is left out.
 
-    packets : (n, bytes of a packet) uint8.
     places : header, bytes of a block, its first channel, bytes of a channel, whether numbers are big-endian, mask of a
         distance, and from a second return back to the first: blocks (of the same azimuth) or channels.
     blocks : (n, blocks, 3) float64; azimuth [deg], time [s] and speed [deg/s]; not finite: left out.
     beams : (blocks, channels, 3) float64; elevation [rad], azimuth [deg] and time [us] of each channel.
     lens : unit [m], direction of azimuth 0 [deg], distance of the lasers from the axis, height [m].
-    points : (>= n * blocks * channels, 4) float32; filled.
-    times_s : likewise.
     Returns int: how many.
     """
     header, block_bytes, first, channel_bytes, is_big, mask, back_blocks, back_channels = places

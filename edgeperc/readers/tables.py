@@ -26,18 +26,12 @@ _LEAST_ROW_BYTES = 6  # of text: three digits, two blanks and the end
 
 
 class Columns(NamedTuple):
-    """The fields of a scan, for `edgeperc.types.points.assemble`.
+    """The fields of a scan, for `edgeperc.types.points.assemble`."""
 
-    n : number of points.
-    fields : mapping of str to (n,) array; columns by `edgeperc.types.points.plain_name`.
-    names : all fields of the source.
-    n_missing : points that the header declares, and that a file that was cut short lacks.
-    """
-
-    n: int
-    fields: Mapping[str, NDArray[Any]]
-    names: Sequence[str]
-    n_missing: int = 0
+    n: int  # number of points
+    fields: Mapping[str, NDArray[Any]]  # columns by `edgeperc.types.points.plain_name`
+    names: Sequence[str]  # all fields of the source
+    n_missing: int = 0  # points that the header declares, and that a file that was cut short lacks
 
 
 def column(data: NDArray[np.uint8], kind: str, n: int, offset: int, stride: int) -> NDArray[Any]:
@@ -49,10 +43,7 @@ def column(data: NDArray[np.uint8], kind: str, n: int, offset: int, stride: int)
 
 
 def header_lines(head: bytes, last: str, kind: str) -> tuple[list[list[str]], int]:
-    """Words of each line of a header that ends with the line ``last``, and its length in bytes.
-
-    Raises PointsError.
-    """
+    """Words of each line of a header that ends with the line ``last``, and its length in bytes."""
     lines: list[list[str]] = []
     start = 0
     while not lines or lines[-1][:1] != [last]:

@@ -39,12 +39,9 @@ def begins_like_text(head: bytes) -> bool:
 
 
 class _Style(NamedTuple):
-    """How the rows of a table are written.
+    """How the rows of a table are written."""
 
-    separator : of the values; None: blanks.
-    """
-
-    separator: str | None
+    separator: str | None  # of the values; None: blanks
     decimal_comma: bool
 
     def values(self, row: str) -> list[str]:
@@ -59,7 +56,6 @@ def parse_text(data: NDArray[np.uint8], columns: Sequence[str] | int | None) -> 
     or without units; columns of words, such as classes, are left out. What is empty, or null, is NaN.
 
     columns : names of the columns, in place of those in the file.
-    Raises PointsError.
     """
     lines = data.tobytes().decode("utf-8-sig", "replace").replace('"', "").splitlines()
     given = columns if columns is None or not isinstance(columns, int | np.integer) else None

@@ -82,8 +82,7 @@ def point_times(
     stamp_s : None counts from 0.
     Returns (n,) float64 or None: [s]; NaN where a time is damaged and lies far from all others, or is missing; None
         without such a field, or if no unit gives a duration of 2 ms to 2 s, as where all times are 0.
-    Raises PointsError: By these times and the azimuths, the sensor takes less than 33 or more than 350 ms for
-        a turn.
+    Raises PointsError: By these times and the azimuths, the sensor takes less than 33 or more than 350 ms for a turn.
     """
     name = time_name(fields)
     if name is None:

@@ -331,7 +331,6 @@ def fill_first_cells(
 ) -> None:
     """Count the cells of each column, from the last row up, before the first of each kind.
 
-    objects, known, road : (rows, columns) bool, C-contiguous
     firsts : (3, columns) int64, overwritten; cells before the first that is an object; that is known and neither road
         nor an object; that is neither known nor an object. The number of rows if there is none.
     """
@@ -353,16 +352,10 @@ def fill_first_cells(
 def fill_corridor(drivable: NDArray[np.bool_], first: float, last: float, bounds: NDArray[np.int64]) -> None:
     """Follow the drivable cells ahead, row by row from the last one up.
 
-    Parameters
-    ----------
-    drivable : (rows, columns) bool
-    first, last : float
-        Columns between which the corridor has to begin.
-    bounds : (rows, 2) int64, overwritten
-        First column of the corridor in each row, and one past its last; -1, -1 in rows without a corridor.
+    first, last : columns between which the corridor has to begin.
+    bounds : (rows, 2) int64, overwritten; first column of the corridor in each row, and one past its last; -1, -1 in
+        rows without a corridor.
 
-    Notes
-    -----
     The corridor begins in the last row that has a run of drivable cells between ``first`` and ``last``. It continues
     with the run that shares most columns with the row before, the left one on ties, and ends where no run shares one.
     """

@@ -184,7 +184,6 @@ def grid_message(
 ) -> dict[str, Any]:
     """The fields of a nav_msgs/OccupancyGrid.
 
-    values : (cells along y, cells along x) int8.
     corner_m, orientation : x, y, z of the corner with the lowest x and y [m], and quaternion x, y, z, w of the cells,
         in the frame ``frame_id``.
     """
@@ -318,7 +317,6 @@ def split_points(perception: Perception, points: ArrayLike, *, sensor: SensorPro
     Ground is at most 0.125 m above and 0.5 m below it; an obstacle is anything higher, crowns and bridges, too. In
     neither are points that are not returns (not finite, too near, of the own vehicle), drops, and reflections from more
     than 0.5 m below the ground. A scan without ground has obstacles only.
-    Raises PointsError.
     """
     moved = _returns_of(perception, points, sensor, ModelFrame(perception.mounting))
     found = heights_above(perception.ground, moved)
@@ -365,7 +363,6 @@ def fill_standing(
 ) -> None:
     """Find what stands in each cell of a grid. Points higher than ``overhead`` above the ground are ignored.
 
-    points : (n, 4) float32, C-contiguous
     height_m : (n,) float32; height of each point above the ground [m].
     corner : (3,) float64; x and y of the upper left corner of the grid, edge of a cell [m].
     lowest, overhead : heights between which something stands on the ground [m].

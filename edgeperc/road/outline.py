@@ -25,17 +25,12 @@ FARTHEST = 8
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Outline:
-    """The outline of connected cells. A cell's upper left corner has the cell's row and column.
+    """The outline of connected cells. A cell's upper left corner has the cell's row and column."""
 
-    outer : (k, 2) int64; row and column of the corners, with the cells on the left. Shape (0, 2) if there are no
-        cells.
-    holes : tuple of (k, 2) int64; likewise.
-    factor : no cell that is left out is farther than this many times the tolerance from the edges of the cells.
-    """
-
+    # (k, 2) row and column of the corners, with the cells on the left. Shape (0, 2) if there are no cells.
     outer: NDArray[np.int64]
     holes: tuple[NDArray[np.int64], ...]
-    factor: float
+    factor: float  # no cell that is left out is farther than this many times the tolerance from the edges of the cells
 
 
 def outline_of(
@@ -56,13 +51,12 @@ def outline_of(
     than ``max_corners`` remain, pairs of neighbors are replaced by one corner that may be anywhere on the grid, by
     growing area between the old edges and the new ones, under the same condition.
 
-    cells : (rows, columns) bool
-    origin : tuple of 2 float; row and column of the place, where a cell's middle has the cell's row and column. It
-        may be outside the grid.
+    origin : tuple of 2 float; row and column of the place, where a cell's middle has the cell's row and column. It may
+        be outside the grid.
     obstacles : (rows, columns) bool; cells that are never included.
     in_holes : (rows, columns) bool; a hole without such a cell is filled.
-    tolerance : largest distance between the outline and the edges of the cells, in cells. 0 keeps all corners,
-        however many.
+    tolerance : largest distance between the outline and the edges of the cells, in cells. 0 keeps all corners, however
+        many.
     max_corners : largest number of corners of the outer ring, at least 4. If they do not suffice, cells are left out
         that are farther from the edges, at last all between holes and the first row; no more are added.
     Returns: A valid polygon: its rings neither touch nor cross themselves or one another, and the holes are inside.
@@ -195,9 +189,7 @@ def row_sums(cells: NDArray[np.bool_]) -> NDArray[np.int32]:
 def fill_grown(cells: NDArray[np.bool_], radius: float, grown: NDArray[np.bool_]) -> None:
     """Mark the cells whose middle is within a distance of the middle of a marked cell.
 
-    cells : (rows, columns) bool
     radius : in cells, 0 or more and finite.
-    grown : (rows, columns) bool, overwritten
     """
     height, width = cells.shape
     for row in range(height):
@@ -225,10 +217,9 @@ def fill_grown(cells: NDArray[np.bool_], radius: float, grown: NDArray[np.bool_]
 def resolve_contacts(cells: NDArray[np.bool_], addable: NDArray[np.bool_]) -> None:
     """Add or remove cells until no two marked cells share only a corner.
 
-    cells : (rows, columns) bool, modified
-    addable : (rows, columns) bool, modified; cells that may be added: of the two between such a pair, the one with
-        the larger row if possible. If neither may be, the one of the pair with the smaller row is removed, and not
-        added again.
+    addable : (rows, columns) bool, modified; cells that may be added: of the two between such a pair, the one with the
+        larger row if possible. If neither may be, the one of the pair with the smaller row is removed, and not added
+        again.
     """
     height, width = cells.shape
     changed = True
@@ -254,9 +245,7 @@ def resolve_contacts(cells: NDArray[np.bool_], addable: NDArray[np.bool_]) -> No
 def mark_connected(cells: NDArray[np.bool_], row: int, col: int, part: NDArray[np.bool_]) -> None:
     """Mark the cells that are connected to a start cell over shared sides.
 
-    cells : (rows, columns) bool
     row, col : a marked cell of ``cells``, where the search begins.
-    part : (rows, columns) bool, overwritten
     """
     height, width = cells.shape
     part[:] = False

@@ -38,12 +38,9 @@ class Output(Protocol):
 
 
 class Graph(Protocol):
-    """A node in a ROS graph; one for each middleware.
+    """A node in a ROS graph; one for each middleware."""
 
-    name : fully qualified name of the node.
-    """
-
-    name: str
+    name: str  # fully qualified name of the node
 
     def parameter(self, name: str, default: Any) -> Any:
         """Declare a parameter that does not change later. Returns its value: the default, unless the user set it."""
@@ -69,7 +66,6 @@ def full_name(name: str, namespace: str = "/") -> str:
 
     name : absolute (``"/points"``), or relative to the namespace.
     Returns: With a leading slash.
-    Raises OptionError.
     """
     full = name if name.startswith("/") else f"{namespace.rstrip('/')}/{name}"
     full = full if full.startswith("/") else f"/{full}"

@@ -28,25 +28,12 @@ _MOST = 1000  # poses that are kept; 5 s at 200 Hz
 
 @dataclass(frozen=True, eq=False)
 class Rolling:
-    """What a node needs for a grid with memory.
+    """What a node needs for a grid with memory."""
 
-    Attributes
-    ----------
-    topic : str
-        Of nav_msgs/Odometry.
-    sensor_pose : sequence of 6 float, optional
-        Pose of the frame of the clouds in the child frame of the odometry: x, y, z [m], roll, pitch, yaw [deg]. By
-        default the two frames are one if they have one name; otherwise the sensor is above the child frame's origin,
-        mounted as the perceiver says.
-    grid : RollingGrid
-
-    Raises
-    ------
-    OptionError
-        The name or the pose is not valid.
-    """
-
-    topic: str = "/odom"
+    topic: str = "/odom"  # of nav_msgs/Odometry
+    # pose of the frame of the clouds in the child frame of the odometry: x, y, z [m], roll, pitch, yaw [deg]. By
+    # default the two frames are one if they have one name; otherwise the sensor is above the child frame's origin,
+    # mounted as the perceiver says.
     sensor_pose: Sequence[float] | None = None
     grid: RollingGrid = field(default_factory=RollingGrid)
 
@@ -76,13 +63,7 @@ class Rolling:
 
 
 class Poses:
-    """The poses that came of late; received in a thread of the middleware, asked for in another.
-
-    Attributes
-    ----------
-    frame_id, child_frame_id : of the newest pose.
-    n_failed : number of messages that were no poses.
-    """
+    """The poses that came of late; received in a thread of the middleware, asked for in another."""
 
     def __init__(self, messages: RosMessages) -> None:
         self._messages, self._lock = messages, threading.Lock()
@@ -111,10 +92,7 @@ class Poses:
             self.frame_id, self.child_frame_id = message.header.frame_id, message.child_frame_id
 
     def at(self, stamp_ns: int) -> NDArray[np.float64] | None:
-        """Pose (4, 4) of the child frame at a time, between the two around it; None if there is none.
-
-        Raises TrackingError.
-        """
+        """Pose (4, 4) of the child frame at a time, between the two around it; None if there is none."""
         with self._lock:
             k = bisect.bisect_right(self._times, stamp_ns)  # the first that is later
             if k == 0 or (k == len(self._times) and stamp_ns - self._times[-1] > TOLERANCE_S * 1e9):

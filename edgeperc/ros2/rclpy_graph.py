@@ -19,7 +19,6 @@ class RclpyGraph:
     ros_args : what follows ``--ros-args``: remappings (``-r points:=/os/points``), parameters (``-p sensor:=os1-64``)
         and files of parameters.
     managed : whether it is a lifecycle node: `manage` says what its transitions do.
-    Raises OptionError.
     """
 
     def __init__(

@@ -59,7 +59,6 @@ class ZenohGraph:
     connect : zenoh endpoint of a router or a peer. By default the session is configured by the file that the variable
         ZENOH_SESSION_CONFIG_URI names or, without it, connects to `ROUTER`.
     messages : for the hashes of types.
-    Raises MissingExtraError, OptionError.
     """
 
     def __init__(

@@ -90,10 +90,9 @@ def _beams(points: Points, seed: int) -> tuple[np.random.Generator, NDArray[np.f
 
 
 def _fallen(points: Points, sizes: tuple[float, float, float], max_range_m: float, seed: int) -> Scan:
-    """Returns of drops that are nearer than the target and bright enough; targets that are too dim are lost.
-
-    sizes : number of drops per m3 and mm of diameter that the exponential begins with, its slope [1/mm], and the
+    """sizes : number of drops per m3 and mm of diameter that the exponential begins with, its slope [1/mm], and the
         attenuation [1/m].
+    Returns of drops that are nearer than the target and bright enough; targets that are too dim are lost.
     """
     n0, slope, per_m = sizes
     rng, ranges, rays = _beams(points, seed)

@@ -21,7 +21,6 @@ def open_atomic(path: str | Path, mode: str = "wb", permissions: int = 0o666) ->
     mode : ``"w"`` writes text as UTF-8.
     permissions : of a new file, reduced by the process's umask.
     Yields file: The temporary file, open for writing.
-    Raises OSError.
     """
     path = Path(os.path.realpath(path))
     if path.exists() and not path.is_file():
@@ -56,10 +55,7 @@ def beside(path: Path) -> Path:
 
 
 def name_whole(temporary: Path, path: Path) -> None:
-    """Give a file or folder that was written `beside` its name, once it is on the disk.
-
-    Raises OSError.
-    """
+    """Give a file or folder that was written `beside` its name, once it is on the disk."""
     for file in (temporary, *temporary.rglob("*")):
         if file.is_file():
             with file.open("rb+") as written:
@@ -68,10 +64,7 @@ def name_whole(temporary: Path, path: Path) -> None:
 
 
 def name_part(temporary: Path, path: Path) -> Path:
-    """Give what was written `beside` and is not whole the name ``NAME.part``; return it. An older folder stays.
-
-    Raises OSError.
-    """
+    """Give what was written `beside` and is not whole the name ``NAME.part``; return it. An older folder stays."""
     part, n = part_of(path), 1
     while part.is_dir():
         n += 1

@@ -18,7 +18,6 @@ def require(module: str, extra: str, purpose: str, *, package: str | None = None
     purpose : what needs the package; the beginning of the error message.
     package : name on PyPI if it is not the module's top-level name.
     Returns module.
-    Raises MissingExtraError.
     """
     try:
         return import_module(module)

@@ -54,7 +54,6 @@ def stamp_of(kernel: Any, passes: Any = None, *, anew: bool = False) -> bytes:
     passes : function; what chooses numba's passes.
     anew : look at the values as they are now, not as they were when this was first asked of a kernel.
     Returns: 32 bytes, the same in every process.
-    Raises TypeError.
     """
     return _digest(kernel, [versions(), "" if passes is None else repr(_fields(passes.__code__))], anew)
 

@@ -29,10 +29,7 @@ MAX_THREADS = 4096
 
 
 def cache_folder() -> Path:
-    """``$EDGEPERC_CACHE_DIR``, or ``edgeperc`` in the system's cache folder; not created by this call.
-
-    Raises SettingsError.
-    """
+    """``$EDGEPERC_CACHE_DIR``, or ``edgeperc`` in the system's cache folder; not created by this call."""
     given = os.environ.get("EDGEPERC_CACHE_DIR")
     if given:
         return Path(given)
@@ -163,7 +160,6 @@ def write_settings(path: Path, machine: str, entries: Mapping[str, Mapping[str, 
     machine : `fingerprint` of the computer that they were measured on.
     entries : a network's digest (`edgeperc.zoo.digest`) to ``provider``, ``precision`` and ``n_threads``, as
         `edgeperc.Perceiver` takes them, and any further keys.
-    Raises SettingsError, OSError.
     """
     document = _read(path) or {"schema": SCHEMA, "machines": {}}
     document["machines"].setdefault(machine, {}).update({sha: dict(entry) for sha, entry in entries.items()})
@@ -179,7 +175,6 @@ def read_setting(path: Path, machine: str, digest: str) -> dict[str, Any] | None
     """Read the setting for a computer (`fingerprint`) and a network (`edgeperc.zoo.digest`).
 
     Returns: ``provider``, ``precision``, ``n_threads`` and further keys; None if nothing was measured.
-    Raises SettingsError.
     """
     document = _read(path)
     entry = None if document is None else document["machines"].get(machine, {}).get(digest)

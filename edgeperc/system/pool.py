@@ -36,14 +36,10 @@ LAST_S = 5.0  # for a process to end by itself
 
 @dataclass(frozen=True)
 class Lost:
-    """In place of a result.
+    """In place of a result."""
 
-    reason : the traceback of an exception, or that the worker process died.
-    error : the exception, if it is one of edgeperc's.
-    """
-
-    reason: str
-    error: EdgepercError | None = None
+    reason: str  # the traceback of an exception, or that the worker process died
+    error: EdgepercError | None = None  # the exception, if it is one of edgeperc's
 
 
 def taken(answer: Any, what: str) -> Any:

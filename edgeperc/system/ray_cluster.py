@@ -42,7 +42,6 @@ def map_on_ray(
     n_threads : CPUs that Ray reserves for each worker.
     Yields result (object or Lost): In the order of the items. `Lost` if the function raised an exception, or if its
         process died twice.
-    Raises MissingExtraError.
     """
     if not items:
         return

@@ -21,11 +21,10 @@ def fill_interaction(
     """Mix the estimates of the motion models by a Markov chain (KUL-Seg's "interaction").
 
     states : (n, k, s) float64; state for each of k motion models.
-    covariances : (n, k, s, s) float64
     probabilities : (n, k) float64; probability of each motion model after the last update.
     stay : (n,) float64; probability that a track keeps its motion model; the others share the rest.
-    mixed : (n, k, s) float64, overwritten; initial state of each filter: x0_j = sum_i w_ij x_i with w_ij = p_ij mu_i
-        / prior_j.
+    mixed : (n, k, s) float64, overwritten; initial state of each filter: x0_j = sum_i w_ij x_i with w_ij = p_ij mu_i /
+        prior_j.
     mixed_covariances : (n, k, s, s) float64, overwritten; sum_i w_ij (P_i + (x_i - x0_j)(x_i - x0_j)')
     prior : (n, k) float64, overwritten; prior_j = sum_i p_ij mu_i
     """
@@ -113,9 +112,6 @@ def fill_combined(
 ) -> None:
     """Combine the estimates of the motion models into one for each track (KUL-Seg's "combination").
 
-    states : (n, k, s) float64
-    covariances : (n, k, s, s) float64
-    probabilities : (n, k) float64
     state : (n, s) float64, overwritten; x = sum_j mu_j x_j
     covariance : (n, s, s) float64, overwritten; sum_j mu_j (P_j + (x_j - x)(x_j - x)')
     """

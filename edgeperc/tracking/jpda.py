@@ -188,7 +188,6 @@ def fill_by_events(
 ) -> None:
     """Solve one cluster exactly: enumerate its joint events, depth first.
 
-    weights : (n, m) float64
     rows, columns : (r,), (c,) int64; tracks and detections of the cluster.
     beta : (n, m + 1) float64; the rows of the cluster are overwritten.
     """
@@ -236,8 +235,6 @@ def fill_by_propagation(
     Messages: mu_ij = w_ij / (1 + sum_j' w_ij' nu_j'i) over the other detections j', and nu_ji = 1 / (1 + sum_i' mu_i'j)
     over the other tracks i'. Rounds end when no nu changes by more than 1e-6, or after 200. beta_ij is proportional to
     w_ij nu_ji.
-
-    weights, rows, columns, beta : as in `fill_by_events`.
     """
     # Only gated pairs, which are few in a large cluster.
     n_pairs = 0

@@ -128,7 +128,6 @@ def mark_out_of_view(
 ) -> None:
     """Exclude undetected tracks from the report if a corner of the footprint is outside the field of view.
 
-    tracks : (n,) record
     pose : (4, 4) float64; T_world_sensor.
     left, right : azimuths of the edges of the view [rad].
     reported : (n,) bool; set to False for these tracks.
@@ -230,7 +229,6 @@ def update_shapes(
 ) -> None:
     """Smooth the height of the center and the size by Kalman filters; in place.
 
-    beta : (n, m + 1) float64; as in `edgeperc.tracking.jpda.fill_association`.
     shapes : (m, 4) float64; height of the center, length, width, height [m].
     sigmas : (n, 4) float64; standard deviations of ``shapes`` [m].
     walk : (4,) float64; standard deviations of their random walks between the scans [m].
@@ -266,7 +264,6 @@ def update_fronts(
     state : (n, 5) float64; x, y, v, heading, turn rate after the update.
     speed_sigma : (n,) float64; standard deviation of v [m/s].
     moving_mps : (n,) float64; a track moves if its speed is higher than this, and than three standard deviations.
-    beta : (n, m + 1) float64; as in `edgeperc.tracking.jpda.fill_association`.
     detections : (m, 3) float64; x, y [m], heading [rad].
     told : (m,) float64; log odds that the heading of the detection points to the front; 0 if that is unknown.
     fronts : (n, 3) float64; log odds from motion, in -4..4: objects move forward. Log odds from the detections, in
@@ -300,9 +297,7 @@ def update_lives(
 ) -> None:
     """Update hits, misses and detection of each track, its label by majority, and its existence; in place.
 
-    tracks : (n,) record
     classes : (n,) record; parameters of each track's class.
-    beta : (n, m + 1) float64; as in `edgeperc.tracking.jpda.fill_association`.
     hidden : (n,) float64; from `fill_hidden`.
     logits : (m,) float64; log odds of the detections' scores.
     kinds : (m,) int64; classes of the detections.

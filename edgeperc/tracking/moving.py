@@ -37,7 +37,6 @@ def moving_tracks(
     n_sigmas : the speed must also exceed its standard deviation by this factor.
     Returns: A new track has no certain speed, so it does not count as moving in its first scans. Tracks that coast
         count.
-    Raises OptionError.
     """
     for name, value in (("min_speed_mps", min_speed_mps), ("n_sigmas", n_sigmas)):
         if value is not None and not 0.0 <= value < math.inf:
@@ -150,8 +149,6 @@ def mark_in_boxes(boxes: NDArray[np.float64], points: Points, inside: Mask) -> N
 
     boxes : (m, 8) float64, C-contiguous, read-only; x, y, z of the center, half length, half width, half height [m],
         cosine and sine of the yaw.
-    points : (n, 3 or more) float32, C-contiguous, read-only
-    inside : (n,) bool, overwritten
     """
     for i in range(points.shape[0]):
         inside[i] = False

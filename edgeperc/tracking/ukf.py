@@ -37,11 +37,9 @@ def fill_predictions(
     kappa / (n + kappa) and 1 / (2 (n + kappa)), with n = 5 and kappa = 1.
 
     states : (n, 3, 5) float64; state for each motion model: constant velocity, CTRV, random motion.
-    covariances : (n, 3, 5, 5) float64
     noise : (n, 5) float64; standard deviations: acceleration [m/s2], turn acceleration [rad/s2], random walk of the
         place [m/s^0.5], of the heading [rad/s^0.5], and speed of random motion [m/s].
     dt : time step [s], not negative.
-    means : (n, 3, 5) float64, overwritten
     predicted : (n, 3, 5, 5) float64, overwritten; covariances, with additive process noise.
     """
     points = np.empty((11, 5))
@@ -102,9 +100,7 @@ def fill_process_noise(
     """Compute the process noise of one motion model: white accelerations, random walks of position and heading.
 
     heading : heading before the prediction [rad].
-    noise : (5,) float64; as in `fill_predictions`.
     dt : time step [s].
-    process : (5, 5) float64, overwritten
     """
     process[:] = 0.0
     acceleration, turn, walk, wander, speed = noise[0], noise[1], noise[2], noise[3], noise[4]
@@ -151,8 +147,6 @@ def fill_updates(
     sigmas : (n, 3) float64; standard deviations of a detection along and across its heading [m] and of its heading
         [rad].
     beta : (n, 3, m + 1) float64; for each motion model, as in `edgeperc.tracking.jpda.fill_association`.
-    states : (n, 3, 5) float64, overwritten
-    covariances : (n, 3, 5, 5) float64, overwritten
     """
     innovation = np.empty((3, 3))
     inverse = np.empty((3, 3))

@@ -233,12 +233,7 @@ def _places(name: str, given: Any) -> NDArray[np.float64]:
 
 @njit(cache=True, nogil=True)
 def mark_inside(polygon: NDArray[np.float64], points: NDArray[np.float64], inside: Mask) -> None:
-    """Mark the points from which a ray along y crosses the polygon an odd number of times.
-
-    polygon : (k, 2) float64, C-contiguous, read-only
-    points : (n, 2) float64, C-contiguous, read-only
-    inside : (n,) bool, overwritten
-    """
+    """Mark the points from which a ray along y crosses the polygon an odd number of times."""
     n_corners = polygon.shape[0]
     for i in range(points.shape[0]):
         x, y = points[i, 0], points[i, 1]

@@ -93,16 +93,11 @@ class PillarGeometry:
 
 @dataclass(frozen=True, slots=True)
 class Anchor:
-    """A box from which those of an anchor head start, at each position and in each direction.
+    """A box from which those of an anchor head start, at each position and in each direction."""
 
-    size_m : length, width, height [m].
-    bottom_m : z of its bottom in the frame of the training points [m].
-    yaws_rad : its directions [rad].
-    """
-
-    size_m: tuple[float, float, float]
-    bottom_m: float
-    yaws_rad: tuple[float, ...]
+    size_m: tuple[float, float, float]  # length, width, height [m]
+    bottom_m: float  # z of its bottom in the frame of the training points [m]
+    yaws_rad: tuple[float, ...]  # its directions [rad]
 
     def __post_init__(self) -> None:
         _FIELDS.numbers("head.anchors: size_m", self.size_m, 3, 0.01, 100.0)

@@ -117,9 +117,6 @@ def _moved(boxes: Iterable[Box], R: NDArray[np.float64], t: NDArray[np.float64])
 def fill_moved(points: Points, R: NDArray[np.float64], t: NDArray[np.float64], moved: Points) -> None:
     """Write ``R p + t`` of every point into ``moved`` (n, 4) float32, with its remission.
 
-    points : (n, 4) float32, C-contiguous
-    R : (3, 3) float64
-    t : (3,) float64
     moved : (n, 4) float32, overwritten; a coordinate beyond the range of float32 becomes infinite.
     """
     for i in range(points.shape[0]):
@@ -133,7 +130,6 @@ def fill_moved(points: Points, R: NDArray[np.float64], t: NDArray[np.float64], m
 def fill_turned(points: Points, cos: np.float32, sin: np.float32, turned: NDArray[np.float32]) -> None:
     """Write the points, turned about the z axis in float32.
 
-    points : (n, 4) float32, C-contiguous
     cos, sin : float32; of the angle by which the sensor is turned to the left.
     turned : (n, 4) float32, overwritten; a coordinate beyond the range of float32 becomes infinite.
     """

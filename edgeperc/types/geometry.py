@@ -38,12 +38,8 @@ BOX = np.dtype(
 class Grid(NamedTuple):
     """The cells of a top view as kernels take them.
 
-    Attributes
-    ----------
-    far, left : float
-        x of the far edge and y of the left edge [m].
-    cell : float
-        Edge of a cell [m].
+    far, left : x of the far edge and y of the left edge [m].
+    cell : edge of a cell [m].
     """
 
     far: float
@@ -65,7 +61,6 @@ def draw_footprints(labels: Labels, boxes: Iterable[Box], view: TopViewGeometry,
     A cell belongs to a box if its center lies in the footprint; the nearer of two boxes wins. Boxes of other classes
     are not drawn.
 
-    labels : (rows, columns) uint8, modified
     classes : names of the labels; a footprint gets the number of its box's class.
     """
     number = {name: k for k, name in enumerate(classes)}
@@ -113,7 +108,6 @@ def oriented_iou(a: ArrayLike, b: ArrayLike) -> NDArray[np.float64]:
     a : (n, 5) array_like; x, y, length, width [m], yaw [rad].
     b : (m, 5) array_like; as ``a``.
     Returns (n, m) float64: In 0..1. A rectangle that is not finite or has no area overlaps nothing, not even itself.
-    Raises PointsError.
     """
     first, second = _as_rectangles(a), _as_rectangles(b)
     iou = np.empty((len(first), len(second)))
@@ -125,8 +119,6 @@ def shared_area(iou: NDArray[np.float64], a: NDArray[np.float64], b: NDArray[np.
     """Area [m2] that rectangles share, from their overlap: ``iou = shared / (area of a + area of b - shared)``.
 
     iou : (n, m) float64; `oriented_iou` of ``a`` and ``b``.
-    a : (n, 5) float64
-    b : (m, 5) float64
     Returns (n, m) float64.
     """
     areas = np.add.outer(a[:, 2] * a[:, 3], b[:, 2] * b[:, 3])
@@ -139,14 +131,12 @@ def suppress_overlaps(
     """Greedy non-maximum suppression of oriented rectangles.
 
     rectangles : (n, 5) array_like; x, y, length, width [m], yaw [rad].
-    scores : (n,) array_like
     iou_threshold : float or (n,) array_like; a rectangle is dropped if it overlaps a kept one with a better score by
         more than this; with one threshold a rectangle, by more than the lower one of the two.
     max_inside : it is also dropped if the area shared with a better one is more than this share of the smaller one's
         area.
-    Returns (k,) int64: Rows kept, best score first, the earlier row on ties. Rows that are not finite overlap
-        nothing, so they are kept.
-    Raises PointsError.
+    Returns (k,) int64: Rows kept, best score first, the earlier row on ties. Rows that are not finite overlap nothing,
+        so they are kept.
     """
     rows = _as_rectangles(rectangles)
     values = np.asarray(scores, dtype=np.float64)
@@ -167,7 +157,6 @@ def bounding_rectangles(rectangles: ArrayLike) -> NDArray[np.float64]:
 
     rectangles : (n, 5) array_like; x, y, length, width [m], yaw [rad].
     Returns (n, 5) float64: Same centers; extent along x, extent along y; yaw 0.
-    Raises PointsError.
     """
     rows = _as_rectangles(rectangles)
     cos, sin = np.abs(np.cos(rows[:, 4])), np.abs(np.sin(rows[:, 4]))
@@ -189,10 +178,7 @@ def _as_rectangles(given: ArrayLike) -> NDArray[np.float64]:
 
 @njit(cache=True, nogil=True)
 def fill_footprints(boxes: NDArray[np.void], grid: Grid, labels: Labels) -> None:
-    """Write the label of each `BOX`, (m,), into the cells whose centers lie in its footprint, one after the other.
-
-    labels : (rows, columns) uint8, modified
-    """
+    """Write the label of each `BOX`, (m,), into the cells whose centers lie in its footprint, one after the other."""
     x_far, y_left, cell_m = grid
     n_rows, n_cols = labels.shape
     for k in range(boxes.shape[0]):
@@ -232,9 +218,7 @@ def cell_at(grid: Grid, shape: tuple[int, int], x: float, y: float) -> tuple[int
 def fill_oriented_iou(a: NDArray[np.float64], b: NDArray[np.float64], iou: NDArray[np.float64]) -> None:
     """Compute the overlap (IoU) of every pair.
 
-    a : (n, 5) float64, C-contiguous
     b : (m, 5) float64, C-contiguous; x, y, length, width [m], yaw [rad].
-    iou : (n, m) float64, overwritten
     """
     for i in range(a.shape[0]):
         for j in range(b.shape[0]):
@@ -248,7 +232,6 @@ def mark_nms(rectangles: NDArray[np.float64], limits: NDArray[np.float64], max_i
     rectangles : (n, 5) float64, C-contiguous; best first.
     limits : (n,) float64, C-contiguous; two may overlap by the lower one of their limits (IoU).
     max_inside : of the smaller area of two.
-    keep : (n,) bool, overwritten
     """
     for i in range(rectangles.shape[0]):
         keep[i] = True

@@ -58,10 +58,7 @@ DEFERRED = frozenset(
 
 
 def open_model(path: str | os.PathLike[str]) -> BinaryIO:
-    """Open a model's file, which has to be a regular file of at most 2 GB.
-
-    Raises ModelFileError.
-    """
+    """Open a model's file, which has to be a regular file of at most 2 GB."""
     try:
         # A pipe would be waited for if it were not opened without blocking.
         flags = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
@@ -78,10 +75,7 @@ def open_model(path: str | os.PathLike[str]) -> BinaryIO:
 
 
 def read_model(path: str | os.PathLike[str]) -> bytes:
-    """The bytes of a model's file.
-
-    Raises ModelFileError.
-    """
+    """The bytes of a model's file."""
     with open_model(path) as file:
         try:
             # A read of a size allocates it, however small the file is; one that grows meanwhile is no model.
@@ -95,7 +89,6 @@ def read_metadata(path: str | os.PathLike[str], key: str) -> str | None:
 
     path : an .onnx file.
     Returns: The last value if the key occurs several times, as in onnxruntime. None if the key is absent.
-    Raises ModelFileError, CardError.
     """
     wanted, value = key.encode(), None
     with open_model(path) as file:
@@ -206,7 +199,6 @@ def check_graph(blob: bytes, path: str | os.PathLike[str], *, trusted: bool = Fa
     trusted : only refuse what is damaged or reads other files.
     Returns: Whether what depends on constants alone may be computed while the file is opened; else it has to wait for
         the first run, which can be stopped.
-    Raises ModelFileError.
     """
     if blob[4:8] == b"ORTM":  # onnxruntime would read it in its own format, which is not checked here
         raise ModelFileError(f"{os.fspath(path)} is in onnxruntime's own format; expected an .onnx file")

@@ -33,32 +33,17 @@ class MapError(PointsError):
 
 
 class Cloud(NamedTuple):
-    """Points as kernels take them.
+    """Points as kernels take them."""
 
-    Attributes
-    ----------
-    points : (n, 3 or more) float32, C-contiguous, read-only
-        x, y, z [m].
-    height : (n,) float32, read-only
-        Above the ground [m].
-    """
-
-    points: NDArray[np.float32]
-    height: NDArray[np.float32]
+    points: NDArray[np.float32]  # (n, 3 or more) x, y, z [m]
+    height: NDArray[np.float32]  # (n,) above the ground [m]
 
 
 class Labeled(NamedTuple):
-    """Labels of points as kernels take them.
+    """Labels of points as kernels take them."""
 
-    Attributes
-    ----------
-    labels : (n,) uint8
-    roles : (classes,) uint8
-        What each label is for the kernel; 0 for what it does not treat.
-    """
-
-    labels: NDArray[np.uint8]
-    roles: NDArray[np.uint8]
+    labels: NDArray[np.uint8]  # (n,)
+    roles: NDArray[np.uint8]  # (classes,) what each label is for the kernel; 0 for what it does not treat
 
 
 def as_points(
@@ -198,10 +183,7 @@ def as_float64(values: NDArray[Any]) -> NDArray[np.float64]:
 
 
 def remission_name(names: Iterable[str], wanted: str | None) -> str | None:
-    """Name of the remission field: the wanted one, or the first known name that is present; None if there is none.
-
-    Raises PointsError.
-    """
+    """Name of the remission field: the wanted one, or the first known name that is present; None if there is none."""
     present = list(names)
     if wanted is None:
         return next((name for name in _REMISSION_NAMES if name in present), None)
@@ -222,9 +204,7 @@ def assemble(
     n : number of points.
     fields : mapping of str to (n,) array; columns by `plain_name`.
     names : all fields of the source, for the error message.
-    remission_field, origin_m : as in `as_points`.
     Returns (n, 4) float32: x, y, z [m], remission; 0 without a remission field.
-    Raises PointsError.
     """
     missing = [axis for axis in "xyz" if axis not in fields]
     if missing:
@@ -253,10 +233,7 @@ def assemble(
 
 
 def as_origin(given: Sequence[float]) -> tuple[float, float, float]:
-    """A place in a map, x, y, z [m].
-
-    Raises OptionError.
-    """
+    """A place in a map, x, y, z [m]."""
     try:
         x, y, z = (float(value) for value in given)
     except (OverflowError, TypeError, ValueError) as exc:

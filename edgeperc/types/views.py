@@ -161,16 +161,11 @@ class CameraGeometry:
 
 @dataclass(frozen=True, slots=True)
 class ObjectGeometry:
-    """The points of each place where an object may be, one row of the batch each (`edgeperc.objects.crops`).
+    """The points of each place where an object may be, one row of the batch each (`edgeperc.objects.crops`)."""
 
-    n_points : points of a candidate that the network sees.
-    margin_m : they lie in the candidate's rectangle, grown by this on every side [m].
-    height_range_m : lowest and greatest height above the ground of these points [m].
-    """
-
-    n_points: int = 64
-    margin_m: float = 0.8
-    height_range_m: tuple[float, float] = (0.1, 4.2)
+    n_points: int = 64  # points of a candidate that the network sees
+    margin_m: float = 0.8  # they lie in the candidate's rectangle, grown by this on every side [m]
+    height_range_m: tuple[float, float] = (0.1, 4.2)  # lowest and greatest height above the ground of these points [m]
 
     def __post_init__(self) -> None:
         _FIELDS.whole("view.n_points", self.n_points, 1, MAX_COLUMNS)

@@ -46,14 +46,10 @@ AHEAD_SLOPE, AHEAD_MARGIN_M = 1.43, 2.0
 
 @dataclass(frozen=True)
 class ObjectBank:
-    """Objects cut out of labeled scans, to paste into others (ground-truth sampling of SECOND; Yan et al., 2018).
+    """Objects cut out of labeled scans, to paste into others (ground-truth sampling of SECOND; Yan et al., 2018)."""
 
-    objects : dict of str to list of (Box, (n, 4) float32); label -> boxes and the points in them.
-    classes : classes of points that pasted objects get, the background first.
-    """
-
-    objects: dict[str, list[tuple[Box, NDArray[np.float32]]]]
-    classes: tuple[str, ...] = POINT_CLASSES
+    objects: dict[str, list[tuple[Box, NDArray[np.float32]]]]  # label -> boxes and the points in them
+    classes: tuple[str, ...] = POINT_CLASSES  # classes of points that pasted objects get, the background first
 
     @classmethod
     def of(
@@ -308,28 +304,18 @@ def facing(scan: LabeledScan, rng: np.random.Generator) -> float:
 
 @dataclass(frozen=True, slots=True)
 class Augmentation:
-    """How scans are changed at random.
+    """How scans are changed at random."""
 
-    n_pasted : mean number of objects to paste.
-    odds : how often each kind is pasted; None: equally often.
-    turn_to_rare : share of the scans labeled on all sides that are turned to a pedestrian or cyclist.
-    turn_anywhere : share of the remaining ones that are turned by any angle.
-    weather : share of scans in bad weather.
-    n_negatives : mean number of pieces of background to paste.
-    negatives : how often each kind is pasted.
-    tilt_deg : standard deviation of the errors of roll and pitch [deg]; the errors are at most twice as large.
-    no_remission : share of scans whose remission is the constant that stands for a missing one.
-    """
-
-    n_pasted: float = 0.0
-    odds: Mapping[str, float] | None = None
-    turn_to_rare: float = 0.0
-    turn_anywhere: float = 0.0
-    weather: float = 0.0
-    n_negatives: float = 0.0
-    negatives: Mapping[str, float] = field(default_factory=lambda: NEGATIVES)
+    n_pasted: float = 0.0  # mean number of objects to paste
+    odds: Mapping[str, float] | None = None  # how often each kind is pasted; None: equally often
+    turn_to_rare: float = 0.0  # share of the scans labeled on all sides that are turned to a pedestrian or cyclist
+    turn_anywhere: float = 0.0  # share of the remaining ones that are turned by any angle
+    weather: float = 0.0  # share of scans in bad weather
+    n_negatives: float = 0.0  # mean number of pieces of background to paste
+    negatives: Mapping[str, float] = field(default_factory=lambda: NEGATIVES)  # how often each kind is pasted
+    # standard deviation of the errors of roll and pitch [deg]; the errors are at most twice as large
     tilt_deg: float = 0.0
-    no_remission: float = 0.0
+    no_remission: float = 0.0  # share of scans whose remission is the constant that stands for a missing one
 
 
 def augmented(

@@ -110,8 +110,6 @@ def drawn_roads(path: Path = DRAWN) -> dict[str, NDArray[np.uint8]]:
     """Hand-drawn roads: hash of the scan (`edgeperc.datasets.kitti.scan_hash`) -> mask (400, 200) uint8, 1 road.
 
     The file keeps the hash as ``scan`` of each image, because names of scans differ between copies of KITTI.
-
-    Raises DatabaseError, MissingExtraError.
     """
     try:
         drawn = read_coco([path])
@@ -151,8 +149,6 @@ def read_coco(paths: Iterable[Path]) -> dict[str, list[Any]]:
 
     Annotations of a category "road" or "drivable" are road. Scenes have the names of their image files. A scene with
     annotations but none of road has an empty list.
-
-    Raises DatabaseError.
     """
     roads: dict[str, list[Any]] = {}
     for path in paths:
@@ -191,8 +187,6 @@ def mask_of(segmentations: Sequence[Any], source: str = "a polygon") -> NDArray[
     """The union of COCO segmentations, (400, 200) uint8: 1 inside, 0 outside (section 3.3).
 
     ``source`` starts the error message.
-
-    Raises DatabaseError.
     """
     from faster_coco_eval.core import mask as coco
 

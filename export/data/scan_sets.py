@@ -49,11 +49,9 @@ def read_scan_set(
     As in a `Perceiver`, what the description does not say of the mounting is estimated from the first scans of each
     drive, and the remission is matched to that of the training sensor.
 
-    split, fold : as in `ScanFolder.names`.
     classes : classes of points, the background first; objects of other classes are unknown (`IGNORE`).
     Returns weights: How often to draw each scan: all scans of a drive together as the square root of their number.
     Returns hashes (dict of str to str): ``SET/NAME`` of each scan -> its `edgeperc.datasets.kitti.scan_hash`.
-    Raises PointsError, MountingError.
     """
     layout, names = folder.layout, folder.names(split, fold=fold)
     n_scans = Counter(folder.drives[name] for name in names)
@@ -91,7 +89,6 @@ def labeled_scan(
 
     points : (n, 4) float32; its points, with the remission as `edgeperc.preprocess.condition.condition` returns it.
     mounting : a known one.
-    classes : as in `read_scan_set`.
     """
     model = ModelFrame(mounting)
     boxes = model.move_boxes(frame.boxes or ())

@@ -25,30 +25,21 @@ CAMERA_AZIMUTHS = (-0.70, 0.69)  # KITTI's left color camera sees 41.2 degrees t
 
 @dataclass(frozen=True)
 class LabeledScan:
-    """A scan and its ground truth.
+    """A scan and its ground truth."""
 
-    points : (n, 4) float32; x, y, z [m] in the frame of the models, remission in 0..1.
-    labels : (n,) uint8; the network's classes (PointSeg's, unless others are asked for), `IGNORE` where unknown.
-    counts : number of returns from each box.
-    surface : (500, 500) uint8; 0 background, 1 drivable, `IGNORE` unknown, over `SURFACE`, as it was before ``turn``
-        and ``mirrored``.
-    azimuths : tuple of 2 float; smallest and largest azimuth of the labeled sector [rad], counterclockwise from +x.
-    turn : angle by which the points were turned about +z [rad].
-    mirrored : whether left and right were swapped after that turn.
-    sensor : the sensor of the scan; None: the one that the models are trained for.
-    boxes_known : whether the objects in the labeled sector have boxes; False if only points are labeled.
-    """
-
-    points: NDArray[np.float32]
+    points: NDArray[np.float32]  # (n, 4) x, y, z [m] in the frame of the models, remission in 0..1
+    # (n,) the network's classes (PointSeg's, unless others are asked for), `IGNORE` where unknown
     labels: NDArray[np.uint8]
     boxes: tuple[Box, ...]
-    counts: tuple[int, ...]
+    counts: tuple[int, ...]  # number of returns from each box
+    # (500, 500) 0 background, 1 drivable, `IGNORE` unknown, over `SURFACE`, as it was before ``turn`` and ``mirrored``
     surface: NDArray[np.uint8]
+    # smallest and largest azimuth of the labeled sector [rad], counterclockwise from +x
     azimuths: tuple[float, float] = (-np.pi, np.pi)
-    turn: float = 0.0
-    mirrored: bool = False
-    sensor: SensorProfile | None = None
-    boxes_known: bool = True
+    turn: float = 0.0  # angle by which the points were turned about +z [rad]
+    mirrored: bool = False  # whether left and right were swapped after that turn
+    sensor: SensorProfile | None = None  # the sensor of the scan; None: the one that the models are trained for
+    boxes_known: bool = True  # whether the objects in the labeled sector have boxes; False if only points are labeled
 
     @classmethod
     def from_frame(

@@ -27,12 +27,10 @@ def slot_targets(
 ) -> NDArray[np.float32]:
     """Targets of head "slots": each slot has a square of the view, and the upright box of the object centered there.
 
-    boxes, labeled, unsure : as for `dense_targets`.
     view : height and width at least `SLOT_CELLS`.
     Returns (rows * columns, 5) float32: By rows from the far left square: center column, center row, width and height
         as in `paper_slot_targets`, and the presence: 1 with an object, 0 without one, -1 if it is not learned. A slot
         without an object has zeros. Of several objects in one square, the slot gets the nearest.
-    Raises ValueError.
     """
     n_rows, n_cols = view.height // SLOT_CELLS, view.width // SLOT_CELLS
     target = np.zeros((n_rows, n_cols, 5), np.float32)
@@ -60,11 +58,9 @@ def slot_targets(
 def paper_slot_targets(boxes: ArrayLike, view: TopViewGeometry, n_slots: int) -> NDArray[np.float32]:
     """Targets of head "slots-paper": upright boxes around rotated footprints, nearest first (SSADNet 3.1.1).
 
-    boxes : as for `dense_targets`.
     n_slots : number of boxes to keep, nearest first.
-    Returns (n_slots, 4) float32: Center column, center row, width and height as shares of the image's width and
-        height; zeros in empty slots. Boxes whose center is outside the view are left out.
-    Raises ValueError.
+    Returns (n_slots, 4) float32: Center column, center row, width and height as shares of the image's width and height;
+        zeros in empty slots. Boxes whose center is outside the view are left out.
     """
     boxes, rows, cols = _boxes_in_view(boxes, view)
     found = _upright(boxes, rows, cols, view)

@@ -28,7 +28,6 @@ N_DROPPED = 3
 def unpool(x: Tensor, positions: Tensor, size: tuple[int, int]) -> Tensor:
     """Put pooled values back where they were the maximum; all other values are 0.
 
-    x : (B, C, H, W) float
     positions : (B, C, H, W) int64; row x width + column of each value, as `torch.nn.functional.max_pool2d` returns
         them.
     size : (int, int); rows and columns of the result.

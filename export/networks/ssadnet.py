@@ -257,7 +257,6 @@ class SSADNet(nn.Module):
     dropout : probability of the spatial dropout in the context module and of the dropout in the B.B.R. blocks.
     batch_norm : use batch norm in the segmentation branch too.
     front : head "dense" also predicts which end of a vehicle is its front.
-    Raises ValueError.
     """
 
     def __init__(
