@@ -14,7 +14,6 @@ from dataclasses import replace
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
 from edgeperc import Mounting, Perceiver, TimedScan, Trajectory, accumulate, merge
 from edgeperc.evaluation.metrics import BoxEvaluator
@@ -22,6 +21,7 @@ from edgeperc.simulation import SimulatedScan, random_scene, simulate, simulate_
 from edgeperc.simulation.samples import FIRST_SEED
 from edgeperc.types.choices import VEHICLES
 from edgeperc.types.mounting import MODEL_MOUNTING
+from edgeperc.types.points import Bytes, Floats, Floats32
 from edgeperc.types.sensor import SensorProfile, get_sensor
 
 from .accuracy import NearFigures, profile_of
@@ -50,7 +50,7 @@ class Figures(NearFigures):
 
 def gathered(
     seed: int, sensor: SensorProfile, accumulate_s: float, speed_mps: float
-) -> tuple[NDArray[np.float32], NDArray[np.uint8], SimulatedScan, list[int]]:
+) -> tuple[Floats32, Bytes, SimulatedScan, list[int]]:
     """Points, their labels, the last part of the scan, and the number of points on each of its boxes."""
     n = round(accumulate_s * _RATE_HZ)
     parts = list(simulate_sequence(random_scene(seed), sensor, n, _RATE_HZ, speed_mps, seed))
@@ -63,7 +63,7 @@ def gathered(
 
 def spun(
     seed: int, sensor: SensorProfile, duration_s: float, speed_mps: float
-) -> tuple[NDArray[np.float32], NDArray[np.uint8], SimulatedScan, list[int]]:
+) -> tuple[Floats32, Bytes, SimulatedScan, list[int]]:
     """The same of a spinning sensor, at the end of that time."""
     *_, (_, _, scan) = simulate_sequence(random_scene(seed), sensor, 2, 1.0 / duration_s, speed_mps, seed)
     return scan.points, scan.labels, scan, list(scan.box_points)
@@ -91,7 +91,7 @@ def sensors_of(names: Sequence[str]) -> Iterator[tuple[str, SensorProfile, float
             yield f"{name}, {accumulate_s:g} s", profile.accumulated(accumulate_s), accumulate_s
 
 
-def around(seed: int, sensor: SensorProfile) -> tuple[list[NDArray[np.float32]], list[NDArray[np.float64]]]:
+def around(seed: int, sensor: SensorProfile) -> tuple[list[Floats32], list[Floats]]:
     """Scans of four sensors at the sides of a vehicle in a street, and their poses on it."""
     scene = random_scene(seed)
     places = [(2.2, 0.0, 1.7, 0.0), (0.0, 0.9, 1.7, 90.0), (-2.2, 0.0, 1.7, 180.0), (0.0, -0.9, 1.7, -90.0)]

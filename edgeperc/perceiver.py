@@ -13,7 +13,7 @@ from types import MappingProxyType
 from typing import Literal, NamedTuple, NoReturn
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from .agreement.rules import RULES
 from .camera.image import ImageScaler, as_image, label_pixels
@@ -43,7 +43,7 @@ from .types.detector import PillarGeometry
 from .types.frame import ModelFrame
 from .types.mounting import Mounting
 from .types.perception import ImageLabels, Perception
-from .types.points import Points, as_origin, as_points
+from .types.points import Bytes, Points, as_origin, as_points
 from .types.sensor import SensorProfile, get_sensor
 from .types.views import CameraGeometry, ObjectGeometry, RangeImageGeometry, TopViewGeometry
 from .warm_up import Rehearsed, n_processes, warm_up
@@ -65,7 +65,7 @@ class _Camera:
     session: Session
     scaler: ImageScaler
 
-    def label(self, image: NDArray[np.uint8], watch: Stopwatch) -> ImageLabels:
+    def label(self, image: Bytes, watch: Stopwatch) -> ImageLabels:
         """Class of every pixel of an image, at its own size."""
         card, (height, width, _) = self.session.card, image.shape
         self.scaler.fill(image, self.session.input)

@@ -4,19 +4,20 @@ from __future__ import annotations
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
+
+from edgeperc.types.points import Floats32, Points
 
 CELL_M = 0.16
 LOWEST_M, HIGHEST_M = -3.0, 1.0
 N_VALUES, N_FEATURES = 9, 64
 
 
-def random_weights() -> NDArray[np.float32]:
+def random_weights() -> Floats32:
     """The linear layer from a point's values to its features, (9, 64)."""
     return np.random.default_rng(0).standard_normal((N_VALUES, N_FEATURES), np.float32)
 
 
-def fill_pillars(points: NDArray[np.float32], weights: NDArray[np.float32], image: NDArray[np.float32]) -> None:
+def fill_pillars(points: Points, weights: Floats32, image: Floats32) -> None:
     """Write the image (64, H, W) of a scan (n, 4): rows along y around 0, x from 0. The paper's limits of 12,000
     pillars and 100 points each serve tensors of a fixed size, which loops do not need.
     """
@@ -25,7 +26,7 @@ def fill_pillars(points: NDArray[np.float32], weights: NDArray[np.float32], imag
 
 
 @njit(cache=True, nogil=True)
-def _fill(points: NDArray[np.float32], weights: NDArray[np.float32], image: NDArray[np.float32]) -> None:
+def _fill(points: Points, weights: Floats32, image: Floats32) -> None:
     n, n_pillars, (_, n_rows, n_columns) = len(points), 0, image.shape
     pillar_at, pillar_of = np.full((n_rows, n_columns), -1, np.int32), np.full(n, -1, np.int32)
     cells, sums, features = np.empty((n, 2), np.int32), np.zeros((n, 4)), np.zeros((n, N_FEATURES), np.float32)

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from edgeperc import ModelCard, Perceiver
 from edgeperc.inference.session import Session
+from edgeperc.types.points import Floats32, Mask, Points
 from edgeperc.types.sensor import get_sensor
 
 from ..context import conditions, disturbances, rss_mb, version_of
@@ -72,7 +73,7 @@ def make_pillars(contender: Contender, scans: Sequence[NDArray[Any]], sensor: st
     (path,), weights = contender.paths, random_weights()
     network = open_engine(contender.engine, contender.precision, path, n_threads)
 
-    def call(scan: NDArray[np.float32]) -> object:
+    def call(scan: Points) -> object:
         fill_pillars(scan, weights, network.input)
         return network.run()
 
@@ -83,7 +84,7 @@ def make_clusters(contender: Contender, scans: Sequence[NDArray[Any]], sensor: s
     """Patchwork++, and a k-d tree's clusters of what it leaves; both know one thread only."""
     find_ground = ground_finders({"pypatchworkpp": import_module("pypatchworkpp")}, get_sensor(sensor))["Patchwork++"]
 
-    def call(scan: NDArray[np.float32], ground: Callable[[], NDArray[np.bool_]]) -> object:
+    def call(scan: Points, ground: Callable[[], Mask]) -> object:
         return tree_clusters(scan[~ground()])
 
     return [partial(call, scan, find_ground(scan)) for scan in scans]
@@ -106,7 +107,7 @@ def make_unet(contender: Contender, images: Sequence[NDArray[Any]], sensor: str,
     return [partial(label, image) for image in images]
 
 
-def make_network(contender: Contender, scans: Sequence[NDArray[np.float32]], sensor: str, n_threads: int) -> Calls:
+def make_network(contender: Contender, scans: Sequence[Floats32], sensor: str, n_threads: int) -> Calls:
     """Networks alone, one after the other, with their input already written."""
     assert contender.image is not None
     image = np.load(contender.image)
@@ -122,19 +123,19 @@ def make_network(contender: Contender, scans: Sequence[NDArray[np.float32]], sen
     return [lambda: [run() for run in runs]] * len(scans)
 
 
-def make_projection(contender: Contender, scans: Sequence[NDArray[np.float32]], sensor: str, n_threads: int) -> Calls:
+def make_projection(contender: Contender, scans: Sequence[Floats32], sensor: str, n_threads: int) -> Calls:
     """One projection of a scan."""
     return [projection.contenders(np.ascontiguousarray(scan))[contender.engine] for scan in scans]
 
 
-def make_peak(contender: Contender, scans: Sequence[NDArray[np.float32]], sensor: str, n_threads: int) -> Calls:
+def make_peak(contender: Contender, scans: Sequence[Floats32], sensor: str, n_threads: int) -> Calls:
     """A peak of the machine: a memory copy or a matrix product."""
     if contender.engine == "copy":
         return [memory_copy(n_threads)]
     return [matrix_product(contender.engine, contender.precision, n_threads)] * 2
 
 
-MAKERS: Mapping[str, Callable[[Contender, Sequence[NDArray[np.float32]], str, int], Calls]] = {
+MAKERS: Mapping[str, Callable[[Contender, Sequence[Floats32], str, int], Calls]] = {
     "edgeperc": make_perceiver,
     "default": make_perceiver,
     "front": make_perceiver,

@@ -6,13 +6,12 @@ from collections.abc import Collection, Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..ground.scan import Scan
 from ..system.kernels import njit
 from ..types.geometry import cell_at, draw_footprints
 from ..types.perception import Box, PointLabels, TopView
-from ..types.points import Cloud, Labeled, Mask
+from ..types.points import Bytes, Cloud, Ints64, Labeled, Mask
 from .rules import RULES, cells_of, roles_of
 from .votes import VEHICLE, Cells
 
@@ -25,7 +24,7 @@ def agree_on_cells(
     labels: PointLabels | None,
     boxes: Sequence[Box],
     dropped: Sequence[Box],
-    marks: NDArray[np.uint8],
+    marks: Bytes,
     rules: Collection[str] = RULES,
 ) -> TopView:
     """Correct the cells of a top view by boxes, points and obstacles.
@@ -59,9 +58,7 @@ def agree_on_cells(
     return replace(view, labels=cells)
 
 
-def mark_cells(
-    view: TopView, scan: Scan, labels: PointLabels | None, rules: Collection[str] = RULES
-) -> NDArray[np.uint8]:
+def mark_cells(view: TopView, scan: Scan, labels: PointLabels | None, rules: Collection[str] = RULES) -> Bytes:
     """What the points show in each cell of a top view; it needs no boxes.
 
     Bits of (rows, columns) uint8: 1 with an obstacle, 2 with a second one or an object, 4 with a vehicle's point, 8
@@ -79,7 +76,7 @@ def mark_cells(
     return marks
 
 
-def _footprints(view: TopView, boxes: Sequence[Box]) -> NDArray[np.uint8]:
+def _footprints(view: TopView, boxes: Sequence[Box]) -> Bytes:
     """Class of the box over each cell; beyond those of the view if it has no such class; `_NO_BOX` without a box."""
     names = (*view.classes, *sorted({box.label for box in boxes} - {*view.classes}))
     drawn = np.full(view.labels.shape, _NO_BOX, np.uint8)
@@ -88,14 +85,7 @@ def _footprints(view: TopView, boxes: Sequence[Box]) -> NDArray[np.uint8]:
 
 
 @njit(cache=True, nogil=True)
-def fill_marks(
-    cloud: Cloud,
-    in_view: Mask,
-    labeled: Labeled,
-    by_height: bool,
-    view: Cells,
-    marks: NDArray[np.uint8],
-) -> None:
+def fill_marks(cloud: Cloud, in_view: Mask, labeled: Labeled, by_height: bool, view: Cells, marks: Bytes) -> None:
     """Write what the points show in each cell; see `mark_cells`.
 
     labeled : roles are 1 for vehicles, 2 for persons, 0 for classes that are not objects.
@@ -125,14 +115,7 @@ def fill_marks(
 
 
 @njit(cache=True, nogil=True)
-def clear_cells(
-    marks: NDArray[np.uint8],
-    marked: NDArray[np.int64],
-    drivable: int,
-    is_vehicle: NDArray[np.bool_],
-    in_box: NDArray[np.bool_],
-    cells: NDArray[np.uint8],
-) -> None:
+def clear_cells(marks: Bytes, marked: Ints64, drivable: int, is_vehicle: Mask, in_box: Mask, cells: Bytes) -> None:
     """Make background of drivable cells with objects or obstacles, and of vehicle cells that the points contradict.
 
     marks : (rows, columns) uint8; from `fill_marks`.

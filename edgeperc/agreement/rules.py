@@ -18,7 +18,6 @@ from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..ground.planes import Ground
 from ..ground.scan import Scan
@@ -31,7 +30,21 @@ from ..types.choices import VEHICLES
 from ..types.geometry import Grid, box_records, is_inside
 from ..types.mounting import MODEL_HEIGHT_M
 from ..types.perception import Box, PointLabels, TopView
-from ..types.points import Cloud, Heights, Ids, Labeled, Labels, Mask, Points
+from ..types.points import (
+    Bytes,
+    Cloud,
+    Floats,
+    Floats32,
+    Heights,
+    Ids,
+    Ints,
+    Ints64,
+    Labeled,
+    Labels,
+    Mask,
+    Points,
+    Records,
+)
 from .votes import (
     CLUSTER,
     COMPLETING_SCORE,
@@ -108,8 +121,8 @@ class Support(NamedTuple):
     ((n,) float32), and its class, 0 in no box ((n,) uint8).
     """
 
-    scores: NDArray[np.float32]
-    names: NDArray[np.uint8]
+    scores: Floats32
+    names: Bytes
 
 
 def find_voters(
@@ -120,7 +133,7 @@ def find_voters(
     *,
     distance_per_m: float = 0.015,
     rules: Collection[str] = RULES,
-) -> NDArray[np.int32]:
+) -> Ints:
     """Cluster of every point, as far as it matters for `agree_on_points`; -1 for none, (n,) int32.
 
     Labeled points of clusters in which too few points can have a label are in cluster -2: such a cluster is not
@@ -151,7 +164,7 @@ def agree_on_points(
     labels: PointLabels,
     clusters: Ids,
     support: Support,
-    upright: NDArray[np.uint8],
+    upright: Bytes,
     *,
     view: TopView | None = None,
     sight: Sight = EVERYTHING,
@@ -209,7 +222,7 @@ def agree_on_points(
     return PointLabels(agreed, labels.in_view, labels.classes)
 
 
-def without_poles(scan: Scan, labels: PointLabels, rules: Collection[str] = RULES) -> NDArray[np.uint8]:
+def without_poles(scan: Scan, labels: PointLabels, rules: Collection[str] = RULES) -> Bytes:
     """Labels without the persons whose column of points goes on above a person's height: a new (n,) uint8."""
     upright = labels.labels.copy()
     if "column" in _applicable(rules, scan.ground):
@@ -284,7 +297,7 @@ def _applicable(rules: Collection[str], ground: Ground) -> frozenset[str]:
     return frozenset(rules) if ground.plane is not None else frozenset(rules) - _NEED_GROUND
 
 
-def roles_of(classes: Sequence[str]) -> NDArray[np.uint8]:
+def roles_of(classes: Sequence[str]) -> Bytes:
     """For each class: 1 for vehicles, 2 for persons, 0 for others."""
     return np.array([VEHICLE if c in VEHICLES else PERSON if c in PERSON_TOP_M else 0 for c in classes], np.uint8)
 
@@ -299,7 +312,7 @@ def cells_of(view: TopView | None) -> Cells:
     return Cells(np.ascontiguousarray(view.labels), is_vehicle, grid)
 
 
-def as_rows(boxes: Sequence[Box], labels: Sequence[int] | None = None) -> NDArray[np.void]:
+def as_rows(boxes: Sequence[Box], labels: Sequence[int] | None = None) -> Records:
     """Boxes with a margin for points, (m,) `BOX`; ``labels`` are those of their points."""
     return box_records(boxes, labels or [0] * len(boxes), MARGIN_M, ABOVE_BOX_M)
 
@@ -315,7 +328,7 @@ def find_support(scan: Scan, labels: PointLabels, boxes: Sequence[Box], rules: C
     return support
 
 
-def _verdicts(classes: Sequence[str], tallies: Tallies, sight: Sight, rules: Collection[str]) -> NDArray[np.uint8]:
+def _verdicts(classes: Sequence[str], tallies: Tallies, sight: Sight, rules: Collection[str]) -> Bytes:
     """What becomes of each label in each cluster, (k, classes)."""
     clusters = tallies.clusters
     refused = clusters["n_in_both"] >= MIN_IN_TOP_VIEW * clusters["n_points"]
@@ -340,7 +353,7 @@ def cell_of(points: Points, i: int, n: int) -> tuple[int, int]:
 
 
 @njit(cache=True, nogil=True)
-def clear_columns(points: Points, height: Heights, limits: NDArray[np.float64], labels: Labels) -> None:
+def clear_columns(points: Points, height: Heights, limits: Floats, labels: Labels) -> None:
     """Make persons background whose column of points goes on above a limit.
 
     height : (n,) float32; [m] above the ground.
@@ -393,7 +406,7 @@ def clear_columns(points: Points, height: Heights, limits: NDArray[np.float64], 
 
 
 @njit(cache=True, nogil=True)
-def fill_support(cloud: Cloud, among: Mask, labeled: Labeled, boxes: NDArray[np.void], support: Support) -> None:
+def fill_support(cloud: Cloud, among: Mask, labeled: Labeled, boxes: Records, support: Support) -> None:
     """Find the best box around each point, among the boxes with enough vehicle points (`MIN_BOX_SHARE`).
 
     among : (n,) bool; points that may be in a box: those in view, above the ground.
@@ -435,7 +448,7 @@ def fill_support(cloud: Cloud, among: Mask, labeled: Labeled, boxes: NDArray[np.
 
 
 @njit(cache=True, nogil=True)
-def bounds_of(boxes: NDArray[np.void]) -> tuple[float, float, float, float]:
+def bounds_of(boxes: Records) -> tuple[float, float, float, float]:
     """Lowest and highest x, lowest and highest y of the circles around boxes; none is inside if there are no boxes."""
     low_x, high_x, low_y, high_y = math.inf, -math.inf, math.inf, -math.inf
     for k in range(boxes.shape[0]):
@@ -447,13 +460,7 @@ def bounds_of(boxes: NDArray[np.void]) -> tuple[float, float, float, float]:
 
 
 @njit(cache=True, nogil=True)
-def clear_ground(
-    points: Points,
-    height: Heights,
-    on_ground: NDArray[np.bool_],
-    roles: NDArray[np.uint8],
-    labels: Labels,
-) -> None:
+def clear_ground(points: Points, height: Heights, on_ground: Mask, roles: Bytes, labels: Labels) -> None:
     """Make points on the ground background, except in cells in which an object of their kind stands.
 
     Within `NEAR_ROAD_M`, points lower than `ROAD_TOP_M` become background in any cell.
@@ -488,12 +495,7 @@ def clear_ground(
 
 @njit(cache=True, nogil=True)
 def count_inside(
-    cloud: Cloud,
-    on_ground: NDArray[np.bool_],
-    in_view: Mask,
-    labeled: Labeled,
-    boxes: NDArray[np.void],
-    counts: NDArray[np.int64],
+    cloud: Cloud, on_ground: Mask, in_view: Mask, labeled: Labeled, boxes: Records, counts: Ints64
 ) -> None:
     """Count the points above the ground in every box.
 
@@ -515,14 +517,7 @@ def count_inside(
 
 
 @njit(cache=True, nogil=True)
-def sum_inside(
-    cloud: Cloud,
-    on_ground: NDArray[np.bool_],
-    in_view: Mask,
-    labeled: Labeled,
-    boxes: NDArray[np.void],
-    sums: NDArray[np.float64],
-) -> None:
+def sum_inside(cloud: Cloud, on_ground: Mask, in_view: Mask, labeled: Labeled, boxes: Records, sums: Floats) -> None:
     """Sum up the points above the ground in every box, (m,) `BOX`: vehicles', and those out of view.
 
     ``sums``, (m, 3), is overwritten: number of points, sum of the z of the ground below them, greatest height [m].

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from ..errors import CalibrationError, PointsError
 from ..system.kernels import njit
-from ..types.points import Points, read_only
+from ..types.points import Floats, Points, read_only
 from ..types.rigid import ROW_TOLERANCE, rigid
 
 MAX_EDGE, MAX_PIXELS = 2**15, 2**26  # of an image, as in `edgeperc.camera.image`
@@ -42,8 +42,8 @@ class Calibration:
         ``T_camera_sensor`` is not a rotation and a translation.
     """
 
-    K: NDArray[np.float64]
-    T_camera_sensor: NDArray[np.float64]
+    K: Floats
+    T_camera_sensor: Floats
     width: int
     height: int
 
@@ -118,7 +118,7 @@ class Calibration:
         half = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]])  # from centers of pixels to their edges
         return Calibration(np.linalg.inv(half) @ scale @ half @ self.K, self.T_camera_sensor, width, height)
 
-    def project(self, points: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    def project(self, points: ArrayLike) -> tuple[Floats, Floats, Floats]:
         """Project points into the image.
 
         Parameters
@@ -150,7 +150,7 @@ class Calibration:
         return u, v, depth
 
 
-def read_kitti_calibration(path: str | os.PathLike[str]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def read_kitti_calibration(path: str | os.PathLike[str]) -> tuple[Floats, Floats]:
     """Read a calibration of KITTI's object, tracking, odometry or raw data.
 
     path : of raw data the folder of a day, or either of its files calib_velo_to_cam.txt and calib_cam_to_cam.txt; a
@@ -161,7 +161,7 @@ def read_kitti_calibration(path: str | os.PathLike[str]) -> tuple[NDArray[np.flo
     """
     folder = Path(path) if Path(path).is_dir() else Path(path).parent
     is_raw = Path(path).is_dir() or Path(path).name in _RAW_FILES
-    values: dict[str, NDArray[np.float64]] = {}
+    values: dict[str, Floats] = {}
     try:
         for file in [folder / name for name in _RAW_FILES] if is_raw else [Path(path)]:
             for line in file.read_text("utf-8").splitlines():
@@ -212,9 +212,9 @@ def _pixels(name: str, given: object) -> int:
     return int(given)
 
 
-def _matrix(name: str, given: ArrayLike, n: int) -> NDArray[np.float64]:
+def _matrix(name: str, given: ArrayLike, n: int) -> Floats:
     try:
-        matrix: NDArray[np.float64] = np.array(given, dtype=np.float64)
+        matrix: Floats = np.array(given, dtype=np.float64)
     except (OverflowError, TypeError, ValueError) as exc:
         raise CalibrationError(f"{name} is not an array of numbers ({exc}); expected ({n}, {n})") from exc
     if matrix.shape != (n, n) or not np.isfinite(matrix).all():
@@ -225,13 +225,7 @@ def _matrix(name: str, given: ArrayLike, n: int) -> NDArray[np.float64]:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def fill_projected(
-    points: Points,
-    P: NDArray[np.float64],
-    u: NDArray[np.float64],
-    v: NDArray[np.float64],
-    depth: NDArray[np.float64],
-) -> None:
+def fill_projected(points: Points, P: Floats, u: Floats, v: Floats, depth: Floats) -> None:
     """Project points: column, row and depth of each.
 
     P : (3, 4) float64; ``K`` times the upper three rows of ``T_camera_sensor``.

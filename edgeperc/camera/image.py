@@ -10,12 +10,12 @@ import os
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from ..errors import CardMismatchError, ImageError, InferenceError
 from ..system.kernels import njit
 from ..types.card import CHANNELS, InputSpec
-from ..types.points import Labels, read_only
+from ..types.points import Bytes, Floats32, Ints, Labels, read_only
 from ..types.views import CameraGeometry
 
 MAX_PIXELS = 2**26  # 8192 x 8192: three times a photograph of 24 megapixels, 200 MB
@@ -33,7 +33,7 @@ def check_size(width: int, height: int) -> None:
         )
 
 
-def as_image(array: ArrayLike) -> NDArray[np.uint8]:
+def as_image(array: ArrayLike) -> Bytes:
     """Check that an array is an image.
 
     array : (H, W, 3) uint8; red, green and blue, row 0 at the top, in any memory layout: ``image[:, :, ::-1]`` of one
@@ -81,16 +81,16 @@ def _advice(shape: tuple[int, ...]) -> str:
 class Taps(NamedTuple):
     """The pixels of an image that count for each pixel of the output, along one axis."""
 
-    start: NDArray[np.int32]  # (n_out,), the first; ``start + K`` is at most the image's size
-    weights: NDArray[np.float32]  # (n_out, K), from there; their sum is 1, but for rounding
+    start: Ints  # (n_out,), the first; ``start + K`` is at most the image's size
+    weights: Floats32  # (n_out, K), from there; their sum is 1, but for rounding
 
 
 class Channels(NamedTuple):
     """The channels of a network's input, and what they are normalized by."""
 
-    source: NDArray[np.int32]  # (C,): 0 red, 1 green, 2 blue
-    mean: NDArray[np.float32]  # (C,)
-    std: NDArray[np.float32]  # (C,)
+    source: Ints  # (C,): 0 red, 1 green, 2 blue
+    mean: Floats32  # (C,)
+    std: Floats32  # (C,)
 
 
 class ImageScaler:
@@ -113,7 +113,7 @@ class ImageScaler:
         self._channels = Channels(source, np.array(input.mean, np.float32), np.array(input.std, np.float32))
         self._tables_of: tuple[int, int] | None = None
 
-    def fill(self, image: NDArray[np.uint8], out: NDArray[np.float32]) -> None:
+    def fill(self, image: Bytes, out: Floats32) -> None:
         """Scale an image into the caller's buffer.
 
         image : (H, W, 3) uint8; from `as_image`.
@@ -148,9 +148,7 @@ def taps(n_in: int, n_out: int) -> Taps:
 
 
 @njit(cache=True, nogil=True)
-def fill_scaled(
-    image: NDArray[np.uint8], rows: Taps, columns: Taps, channels: Channels, out: NDArray[np.float32]
-) -> None:
+def fill_scaled(image: Bytes, rows: Taps, columns: Taps, channels: Channels, out: Floats32) -> None:
     """Scale and normalize an image: for each row of the output, first along columns, then along rows.
 
     image : (H, 3 * W) uint8, C-contiguous; red, green, blue of each pixel.
@@ -181,9 +179,7 @@ def fill_scaled(
                 out[c, row, col] = (value - center) / spread
 
 
-def label_pixels(
-    logits: NDArray[np.float32], height: int, width: int, *, model: str = "the model"
-) -> NDArray[np.uint8]:
+def label_pixels(logits: Floats32, height: int, width: int, *, model: str = "the model") -> Bytes:
     """The most probable class of every pixel of an image.
 
     The logits are interpolated bilinearly between the centers of their grid, which covers the whole image; beyond the
@@ -207,7 +203,7 @@ def label_pixels(
     return labels
 
 
-def between(n_in: int, n_out: int) -> tuple[NDArray[np.int32], NDArray[np.float32], NDArray[np.int32]]:
+def between(n_in: int, n_out: int) -> tuple[Ints, Floats32, Ints]:
     """Interpolation along one axis.
 
     Returns sides ((2, n_out) int32): The centers of the grid on the two sides of each pixel: one and the same where a
@@ -225,13 +221,13 @@ def between(n_in: int, n_out: int) -> tuple[NDArray[np.int32], NDArray[np.float3
 
 @njit(cache=True, nogil=True)
 def fill_image_labels(
-    logits: NDArray[np.float32],
-    row_sides: NDArray[np.int32],
-    row_weight: NDArray[np.float32],
-    row_runs: NDArray[np.int32],
-    col_sides: NDArray[np.int32],
-    col_weight: NDArray[np.float32],
-    col_runs: NDArray[np.int32],
+    logits: Floats32,
+    row_sides: Ints,
+    row_weight: Floats32,
+    row_runs: Ints,
+    col_sides: Ints,
+    col_weight: Floats32,
+    col_runs: Ints,
     labels: Labels,
 ) -> int:
     """Write every pixel's best class (`label_pixels`).

@@ -6,12 +6,11 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..types.choices import VEHICLES
 from ..types.mounting import MODEL_HEIGHT_M, Mounting
 from ..types.perception import Box
-from ..types.points import Points
+from ..types.points import Floats, Points
 
 _SAMPLE, _REACH_M, _LEAST_M = 8192, (1.5, 40.0), 2.0  # points; their range; their height above the road
 # A sensor whose rays rise less meets a ceiling too far away to tell it from facades.
@@ -87,13 +86,13 @@ def _is_around(box: Box) -> bool:
 _DIRECTIONS = np.stack([np.cos(np.arange(32) * np.pi / 16.0), np.sin(np.arange(32) * np.pi / 16.0)])
 
 
-def _outline(points: Points) -> NDArray[np.float64]:
+def _outline(points: Points) -> Floats:
     """How far the points reach in each of the `_DIRECTIONS` [m]."""
     xy = points[:: (len(points) // _SAMPLE) | 1, :2].astype(np.float64)
     return (xy[np.isfinite(xy).all(axis=1)] @ _DIRECTIONS).max(axis=0)
 
 
-def _sticks_out(box: Box, outline: NDArray[np.float64]) -> bool:
+def _sticks_out(box: Box, outline: Floats) -> bool:
     """Whether a vehicle would stand partly behind the walls: a part of a wall was taken for its end."""
     cos, sin = 0.5 * math.cos(box.yaw), 0.5 * math.sin(box.yaw)
     middle = np.array(box.center[:2]) @ _DIRECTIONS

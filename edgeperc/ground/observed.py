@@ -14,13 +14,12 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..errors import PointsError
 from ..system.kernels import njit
 from ..types.frame import ModelFrame
 from ..types.mounting import MODEL_MOUNTING, Mounting
-from ..types.points import Points, read_only
+from ..types.points import Bytes, Floats, Floats32, Ints, Mask, Points, read_only
 from ..types.sensor import SensorProfile
 from ..types.views import TopViewGeometry
 
@@ -72,11 +71,11 @@ class Observation(NamedTuple):
 
     # (rows, columns) cells with a return at most 2 m above the ground, and cells between two connected returns on the
     # ground that the ray to the farther one passes at most `CLEARANCE_M` above the ground
-    observed: NDArray[np.bool_]
+    observed: Mask
     # (rows, columns) cells that are not observed in a gap that the spacing of the beams explains: from a return on the
     # ground to the next return of the neighboring beam, whose ray passes at most `BRIDGE_M` above the ground; and
     # before the first return, where its ray passes at most `CLEARANCE_M` above the road
-    between_beams: NDArray[np.bool_]
+    between_beams: Mask
 
 
 class Observer:
@@ -130,7 +129,7 @@ class Observer:
         # A direction of the models' frame has this much more gradient in the frame of the sensor.
         self._tilt = ModelFrame(mounting).R[:2, 2] @ self.ahead
 
-    def observe(self, points: Points, index: NDArray[np.int32], mounting: Mounting = MODEL_MOUNTING) -> Observation:
+    def observe(self, points: Points, index: Ints, mounting: Mounting = MODEL_MOUNTING) -> Observation:
         """Find the observed cells, and those between two beams.
 
         points : (n, 4) float32; x, y, z [m] in the sensor frame with the road at z = -1.73 m, to within 0.6 m, and
@@ -173,12 +172,7 @@ def beams_above_m(mounting: Mounting) -> float:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def fill_lowest_returns(
-    points: Points,
-    bounds: NDArray[np.float64],
-    grid: NDArray[np.float64],
-    lowest: NDArray[np.float32],
-) -> None:
+def fill_lowest_returns(points: Points, bounds: Floats, grid: Floats, lowest: Floats32) -> None:
     """Write the lowest return of each bin of the polar grid.
 
     bounds : (2, 2) float64; lowest and highest x, and y, of the points that are used [m].
@@ -210,14 +204,7 @@ def fill_lowest_returns(
 
 
 @njit(cache=True, nogil=True)
-def follow_rays(
-    lowest: NDArray[np.float32],
-    rays: NDArray[np.float64],
-    steps: NDArray[np.float64],
-    tilt: NDArray[np.float64],
-    level: NDArray[np.float32],
-    state: NDArray[np.uint8],
-) -> None:
+def follow_rays(lowest: Floats32, rays: Floats, steps: Floats, tilt: Floats, level: Floats32, state: Bytes) -> None:
     """Follow the ground outwards in every sector.
 
     lowest : (sectors, rings) float32; from `fill_lowest_returns`.
@@ -279,13 +266,7 @@ def follow_rays(
 
 @njit(cache=True, nogil=True)
 def mark_cells(
-    points: Points,
-    index: NDArray[np.int32],
-    bin_of_cell: NDArray[np.int32],
-    level: NDArray[np.float32],
-    state: NDArray[np.uint8],
-    observed: NDArray[np.bool_],
-    between: NDArray[np.bool_],
+    points: Points, index: Ints, bin_of_cell: Ints, level: Floats32, state: Bytes, observed: Mask, between: Mask
 ) -> None:
     """Mark the observed cells of a top view, and those between two beams.
 

@@ -13,13 +13,12 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..errors import PointsError
 from ..system.draws import drawn_of, next_draw
 from ..system.kernels import njit
 from ..types.perception import GroundSurface
-from ..types.points import Heights, Mask, Points, Rows, read_only
+from ..types.points import Floats, Floats32, Heights, Ints, Mask, Points, Rows, read_only
 
 # 256 x 256 cells of half a meter, in 16 x 16 regions of 16 x 16 cells. Farther out, few rays meet the ground.
 CELL_M = 0.5
@@ -140,11 +139,11 @@ class GroundFit:
     """Planes of the ground below a scan, the first half of `find_ground`; `heights` is the second."""
 
     points: Points  # (n, 4) the scan; not a copy
-    cell: NDArray[np.int32]  # (n,) cell of each point
-    lowest: NDArray[np.int32]  # (N_CELLS, N_CELLS) row of the lowest point in each cell
-    plane: NDArray[np.float64]  # (3,) a, b, c around the vehicle
+    cell: Ints  # (n,) cell of each point
+    lowest: Ints  # (N_CELLS, N_CELLS) row of the lowest point in each cell
+    plane: Floats  # (3,) a, b, c around the vehicle
     # (N_REGIONS, N_REGIONS, 3) of each region; None if there is the first plane only
-    planes: NDArray[np.float64] | None
+    planes: Floats | None
     found: bool  # whether there is ground
 
     def heights(self, rows: Rows | None = None, *, max_height_m: float = 0.125) -> Ground:
@@ -243,11 +242,11 @@ class Sorted(NamedTuple):
     """A scan, the cell of each of its points, and the row of the lowest point in each cell."""
 
     points: Points
-    cell: NDArray[np.int32]
-    lowest: NDArray[np.int32]
+    cell: Ints
+    lowest: Ints
 
 
-def _settle_ties(points: Points, cell: NDArray[np.int32], lowest: NDArray[np.int32]) -> None:
+def _settle_ties(points: Points, cell: Ints, lowest: Ints) -> None:
     """Of a cell's equally low points, take the one with the smallest x, then y."""
     flat = lowest.reshape(-1)
     inside = np.flatnonzero(cell >= 0)
@@ -267,7 +266,7 @@ def _sorted_into_cells(points: Points) -> Sorted:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def fill_lowest(points: Points, cell: NDArray[np.int32], lowest: NDArray[np.int32]) -> None:
+def fill_lowest(points: Points, cell: Ints, lowest: Ints) -> None:
     """Write every point's cell and every cell's lowest point.
 
     cell : (n,) int32, overwritten; flat cell, x by y; -1 for points that are not finite or out of the grid.
@@ -306,7 +305,7 @@ def fill_lowest(points: Points, cell: NDArray[np.int32], lowest: NDArray[np.int3
 
 
 @njit(cache=True, nogil=True)
-def taken_cells(points: Points, lowest: NDArray[np.int32]) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
+def taken_cells(points: Points, lowest: Ints) -> tuple[Ints, Floats32]:
     """The flat numbers of the cells with a point, (k,), and the lowest point of each, (k, 4)."""
     flat, n = lowest.reshape(-1), 0
     taken = np.empty(len(flat) + 1, np.int32)
@@ -337,7 +336,7 @@ class Patch(NamedTuple):
 
 
 @njit(cache=True, nogil=True)
-def fit_first_plane(points: Points, lowest: NDArray[np.int32], reach_m: float, plane: NDArray[np.float64]) -> bool:
+def fit_first_plane(points: Points, lowest: Ints, reach_m: float, plane: Floats) -> bool:
     """Replace ``plane`` (3,), the expected a, b, c, by the plane within ``reach_m``; False if there is none."""
     size = 2 * int(reach_m / CELL_M)
     start = (N_CELLS - size) // 2
@@ -360,12 +359,7 @@ def fit_first_plane(points: Points, lowest: NDArray[np.int32], reach_m: float, p
 
 
 @njit(cache=True, nogil=True)
-def fill_planes(
-    points: Points,
-    lowest: NDArray[np.int32],
-    first: NDArray[np.float64],
-    planes: NDArray[np.float64],
-) -> None:
+def fill_planes(points: Points, lowest: Ints, first: Floats, planes: Floats) -> None:
     """Fit every region's plane, from the middle outwards.
 
     first : (3,) float64; a, b, c around the vehicle.
@@ -421,13 +415,7 @@ def fill_planes(
 
 @njit(cache=True, nogil=True)
 def fill_residuals(
-    points: Points,
-    lowest: NDArray[np.int32],
-    patch: Patch,
-    expected: NDArray[np.float64],
-    band: float,
-    cone: float,
-    residuals: NDArray[np.float64],
+    points: Points, lowest: Ints, patch: Patch, expected: Floats, band: float, cone: float, residuals: Floats
 ) -> int:
     """Write x, y from the origin and z above the expected plane of the lowest returns of a patch.
 
@@ -451,13 +439,7 @@ def fill_residuals(
 
 @njit(cache=True, nogil=True)
 def find_plane(
-    residuals: NDArray[np.float64],
-    n: int,
-    max_slope: float,
-    max_shift: float,
-    n_hypotheses: int,
-    draw: int,
-    plane: NDArray[np.float64],
+    residuals: Floats, n: int, max_slope: float, max_shift: float, n_hypotheses: int, draw: int, plane: Floats
 ) -> None:
     """Write a, b, c of the best hypothesis into ``plane`` (3,); the first one is the expected plane, 0, 0, 0."""
     plane[:] = 0.0
@@ -487,7 +469,7 @@ def find_plane(
 
 
 @njit(cache=True, nogil=True)
-def count_support(residuals: NDArray[np.float64], n: int, a: float, b: float, c: float) -> int:
+def count_support(residuals: Floats, n: int, a: float, b: float, c: float) -> int:
     """Number of cells on the plane minus the number of cells below it."""
     x, y, z = residuals[0, :n], residuals[1, :n], residuals[2, :n]
     support = 0
@@ -498,9 +480,7 @@ def count_support(residuals: NDArray[np.float64], n: int, a: float, b: float, c:
 
 
 @njit(cache=True, nogil=True)
-def refine_plane(
-    residuals: NDArray[np.float64], n: int, prior: float, max_slope: float, max_shift: float, plane: NDArray[np.float64]
-) -> int:
+def refine_plane(residuals: Floats, n: int, prior: float, max_slope: float, max_shift: float, plane: Floats) -> int:
     """Replace ``plane`` by the least-squares plane of the cells on it; return their number, or 0 if there is no plane.
 
     ``prior`` [m2] is the weight of a slope of zero.
@@ -539,14 +519,7 @@ def refine_plane(
 
 
 @njit(cache=True, nogil=True)
-def fill_levels(
-    points: Points,
-    lowest: NDArray[np.int32],
-    planes: NDArray[np.float64],
-    rows: Rows,
-    cell: NDArray[np.int32],
-    level: NDArray[np.float32],
-) -> None:
+def fill_levels(points: Points, lowest: Ints, planes: Floats, rows: Rows, cell: Ints, level: Floats32) -> None:
     """Write the height of the ground in the middle of every cell that holds one of some points.
 
     rows : (m,) int32; the points.
@@ -614,9 +587,9 @@ def fill_levels(
 def fill_heights(
     points: Points,
     rows: Rows,
-    cell: NDArray[np.int32],
-    level: NDArray[np.float32],
-    planes: NDArray[np.float64],
+    cell: Ints,
+    level: Floats32,
+    planes: Floats,
     max_height: float,
     height: Heights,
     mask: Mask,
@@ -653,12 +626,7 @@ def fill_heights(
 
 @njit(cache=True, nogil=True)
 def fill_heights_above_plane(
-    points: Points,
-    rows: Rows,
-    plane: NDArray[np.float64],
-    max_height: float,
-    height: Heights,
-    mask: Mask,
+    points: Points, rows: Rows, plane: Floats, max_height: float, height: Heights, mask: Mask
 ) -> None:
     """Write the heights of some points above z = a x + b y + c (NaN if not finite), and whether they are on it."""
     for k in range(rows.shape[0]):

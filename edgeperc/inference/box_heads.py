@@ -13,7 +13,7 @@ from ..system.kernels import njit
 from ..types.card import N_DENSE_CHANNELS, N_FRONT_CHANNELS
 from ..types.geometry import suppress_overlaps
 from ..types.perception import Box
-from ..types.points import Labels
+from ..types.points import Floats, Floats32, Labels, Mask
 from ..types.views import TopViewGeometry
 
 STRIDE = 4  # cells of the top view behind one cell of a box_dense output, along each axis
@@ -25,9 +25,9 @@ MAX_PROBABILITY = 1.02  # rounded to bfloat16, probabilities add up to a little 
 
 
 def decode_slots(
-    slots: NDArray[np.float32],
+    slots: Floats32,
     labels: Labels,
-    scores: NDArray[np.float32],
+    scores: Floats32,
     geometry: TopViewGeometry,
     classes: Sequence[str],
     box_classes: Sequence[str],
@@ -67,8 +67,8 @@ def decode_slots(
 
 
 def decode_scored_slots(
-    slots: NDArray[np.float32],
-    class_output: NDArray[np.float32],
+    slots: Floats32,
+    class_output: Floats32,
     class_kind: str,
     geometry: TopViewGeometry,
     classes: Sequence[str],
@@ -110,8 +110,8 @@ def decode_scored_slots(
 
 
 def _cell_values(
-    class_output: NDArray[np.float32], class_kind: str, geometry: TopViewGeometry, classes: Sequence[str], model: str
-) -> NDArray[np.float32]:
+    class_output: Floats32, class_kind: str, geometry: TopViewGeometry, classes: Sequence[str], model: str
+) -> Floats32:
     """The values of all classes in all cells of a view, (classes, height, width) float32."""
     values = class_values(class_output, class_kind, model)
     expected = (len(classes), geometry.height, geometry.width)
@@ -123,12 +123,12 @@ def _cell_values(
 
 
 def _slot_rows(
-    slots: NDArray[np.float32],
+    slots: Floats32,
     n_columns: int,
     box_classes: Sequence[str],
     box_size_priors: Mapping[str, tuple[float, float, float]],
     model: str,
-) -> NDArray[np.float64]:
+) -> Floats:
     """The slots of one scan (K, n_columns), checked."""
     rows = slots[0] if slots.ndim == 3 and slots.shape[0] == 1 else slots
     if rows.ndim != 2 or rows.shape[1] != n_columns:
@@ -142,7 +142,7 @@ def _slot_rows(
     return rows.astype(np.float64)
 
 
-def _slot_rectangles(slots: NDArray[np.float64], geometry: TopViewGeometry) -> NDArray[np.float64]:
+def _slot_rectangles(slots: Floats, geometry: TopViewGeometry) -> Floats:
     """x, y, length, width [m] and yaw [rad] of slots: the length is the longer side."""
     along, across = slots[:, 3] * geometry.height * geometry.cell_m, slots[:, 2] * geometry.width * geometry.cell_m
     return np.stack(
@@ -158,7 +158,7 @@ def _slot_rectangles(slots: NDArray[np.float64], geometry: TopViewGeometry) -> N
 
 
 def _standing(
-    rectangles: NDArray[np.float64],
+    rectangles: Floats,
     scores: NDArray[np.floating],
     names: Sequence[str],
     box_size_priors: Mapping[str, tuple[float, float, float]],
@@ -173,8 +173,8 @@ def _standing(
 
 
 def decode_dense(
-    dense: NDArray[np.float32],
-    class_output: NDArray[np.float32],
+    dense: Floats32,
+    class_output: Floats32,
     class_kind: str,
     geometry: TopViewGeometry,
     classes: Sequence[str],
@@ -275,13 +275,13 @@ def decode_dense(
 
 
 def _footprint_evidence(
-    values: NDArray[np.float32],
+    values: Floats32,
     class_kind: str,
-    rectangles: NDArray[np.float64],
+    rectangles: Floats,
     geometry: TopViewGeometry,
     classes: Sequence[str],
     box_classes: Sequence[str],
-) -> NDArray[np.float64]:
+) -> Floats:
     """Sums of the probabilities of each box class in each rectangle, (n, box classes)."""
     sums = np.empty((len(rectangles), len(classes)))
     x_far, y_left = geometry.x_range_m[1], geometry.y_range_m[1]
@@ -289,16 +289,14 @@ def _footprint_evidence(
     return sums[:, [list(classes).index(name) for name in box_classes]]
 
 
-def _facing(
-    yaws: NDArray[np.float64], x: NDArray[np.float64], y: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _facing(yaws: Floats, x: Floats, y: Floats) -> tuple[Floats, Floats]:
     """Yaws in -pi..pi towards the likelier fronts, and their probabilities; a logit of 0 keeps the yaw."""
     logits = np.cos(yaws) * x + np.sin(yaws) * y
     opposite = np.where(yaws > 0.0, yaws - math.pi, yaws + math.pi)
     return np.where(logits >= 0.0, yaws, opposite), 1.0 / (1.0 + np.exp(-np.abs(logits)))
 
 
-def class_values(output: NDArray[np.float32], kind: str, model: str) -> NDArray[np.float32]:
+def class_values(output: Floats32, kind: str, model: str) -> Floats32:
     """The class output of a network as (classes, H, W), checked."""
     if kind not in ("class_logits", "class_probabilities"):
         raise CardMismatchError(f"{model}: got kind {kind!r}; expected class_logits or class_probabilities")
@@ -308,7 +306,7 @@ def class_values(output: NDArray[np.float32], kind: str, model: str) -> NDArray[
     return np.ascontiguousarray(values, dtype=np.float32)
 
 
-def _check_finite(values: NDArray[np.float32], kind: str, model: str) -> None:
+def _check_finite(values: Floats32, kind: str, model: str) -> None:
     n_bad = count_not_finite(values.reshape(-1))
     if n_bad:
         raise_not_finite(n_bad, values.size, kind, model)
@@ -331,7 +329,7 @@ def _logit(probability: float) -> float:
 
 
 @njit(cache=True, nogil=True)
-def fill_scores(values: NDArray[np.float32], scores: NDArray[np.float32]) -> None:
+def fill_scores(values: Floats32, scores: Floats32) -> None:
     """Replace every pixel's best logit by its softmax probability.
 
     values : (C, H, W) float32, C-contiguous; finite logits.
@@ -361,7 +359,7 @@ def fill_scores(values: NDArray[np.float32], scores: NDArray[np.float32]) -> Non
 
 
 @njit(cache=True, nogil=True)
-def count_not_finite(values: NDArray[np.float32]) -> int:
+def count_not_finite(values: Floats32) -> int:
     """Number of values (n,) that are not finite, without a temporary array."""
     n_bad = 0
     for i in range(len(values)):
@@ -370,7 +368,7 @@ def count_not_finite(values: NDArray[np.float32]) -> int:
 
 
 @njit(cache=True, nogil=True)
-def mark_peaks(heat: NDArray[np.float32], threshold: float, peak: NDArray[np.bool_]) -> None:
+def mark_peaks(heat: Floats32, threshold: float, peak: Mask) -> None:
     """Mark the cells that no neighbor exceeds.
 
     threshold : cells below it are not peaks.
@@ -392,13 +390,7 @@ def mark_peaks(heat: NDArray[np.float32], threshold: float, peak: NDArray[np.boo
 
 @njit(cache=True, nogil=True)
 def fill_footprint_sums(
-    values: NDArray[np.float32],
-    are_logits: bool,
-    rectangles: NDArray[np.float64],
-    x_far: float,
-    y_left: float,
-    cell: float,
-    sums: NDArray[np.float64],
+    values: Floats32, are_logits: bool, rectangles: Floats, x_far: float, y_left: float, cell: float, sums: Floats
 ) -> None:
     """Sum each class's probability over the pixels whose centers lie in a rectangle.
 
@@ -438,14 +430,7 @@ def fill_footprint_sums(
 
 
 @njit(cache=True, nogil=True)
-def add_probabilities(
-    values: NDArray[np.float32],
-    are_logits: bool,
-    row: int,
-    col: int,
-    pixel: NDArray[np.float64],
-    sums: NDArray[np.float64],
-) -> None:
+def add_probabilities(values: Floats32, are_logits: bool, row: int, col: int, pixel: Floats, sums: Floats) -> None:
     """Add one pixel's class probabilities to ``sums`` (C,); ``pixel`` (C,) is scratch."""
     n_classes = values.shape[0]
     best = np.float64(values[0, row, col])

@@ -10,12 +10,11 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..ground.observed import FARTHER
 from ..system.kernels import njit
 from ..types.perception import PointLabels
-from ..types.points import Labels, Mask, Points, Rows, read_only
+from ..types.points import Bytes, Floats, Floats32, Ints, Labels, Mask, Points, Rows, read_only
 from ..types.views import RangeImageGeometry, TopViewGeometry
 
 MARGIN_M = 5.0
@@ -48,7 +47,7 @@ class Crop:
         margin_m: float = MARGIN_M,
         turn_rad: float = 0.0,
     ) -> None:
-        self._lines: NDArray[np.float64] | None = None
+        self._lines: Floats | None = None
         self._rows, self._kept = np.empty(0, np.int32), np.empty((0, 4), np.float32)
         ahead = [_ahead(view) for view in views if isinstance(view, TopViewGeometry)]
         sectors = [_sector(view) for view in views if isinstance(view, RangeImageGeometry)] or ahead
@@ -61,7 +60,7 @@ class Crop:
             cos, sin = math.cos(turn_rad), math.sin(turn_rad)
             self._lines = np.column_stack([inward @ np.array([(cos, sin), (-sin, cos)]), np.min(nearest, axis=0)])
 
-    def select(self, points: Points) -> tuple[NDArray[np.float32], NDArray[np.int32] | None]:
+    def select(self, points: Points) -> tuple[Floats32, Ints | None]:
         """The points that matter, in their order.
 
         points : (n, 4) float32; x, y, z [m] in the frame of the models, remission. Rows that are not finite are left
@@ -93,7 +92,7 @@ def sectors_of_turn(view: RangeImageGeometry, *, whole: bool) -> list[tuple[floa
     return [(turn_rad, Crop(seen, margin_m=ROUNDING_M, turn_rad=turn_rad)) for turn_rad in turns_rad]
 
 
-def spread(parts: Sequence[tuple[PointLabels, NDArray[np.int32] | None]], n: int) -> PointLabels:
+def spread(parts: Sequence[tuple[PointLabels, Ints | None]], n: int) -> PointLabels:
     """Labels of a whole scan from those of parts of it.
 
     parts : labels of a part, and the rows of its points from `Crop.select`; None for all points. Of a point in view
@@ -123,9 +122,7 @@ def _ahead(view: TopViewGeometry) -> tuple[float, float]:
     return max(azimuths), min(azimuths)
 
 
-def _hull(
-    view: RangeImageGeometry | TopViewGeometry, margin_m: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _hull(view: RangeImageGeometry | TopViewGeometry, margin_m: float) -> tuple[Floats, Floats]:
     """Corners of the least region that must be kept between two lines, and the margin around each [m]."""
     if isinstance(view, RangeImageGeometry):
         return np.zeros((1, 2)), np.array([margin_m])  # the sector's own edges are the directions of the lines
@@ -138,7 +135,7 @@ def _hull(
 
 
 @njit(cache=True, nogil=True)
-def fill_rows(points: Points, lines: NDArray[np.float64], rows: Rows, kept: NDArray[np.float32]) -> int:
+def fill_rows(points: Points, lines: Floats, rows: Rows, kept: Floats32) -> int:
     """Copy the points between two lines.
 
     lines : (2, 3) float64; a, b and c; points with a x + b y >= c for both lines are kept.
@@ -158,13 +155,7 @@ def fill_rows(points: Points, lines: NDArray[np.float64], rows: Rows, kept: NDAr
 
 
 @njit(cache=True, nogil=True)
-def fill_spread(
-    rows: Rows,
-    labels: Labels,
-    in_view: Mask,
-    all_labels: NDArray[np.uint8],
-    all_in_view: NDArray[np.bool_],
-) -> None:
+def fill_spread(rows: Rows, labels: Labels, in_view: Mask, all_labels: Bytes, all_in_view: Mask) -> None:
     """Write the labels of points in view to their rows in a whole scan.
 
     all_in_view : (n,) bool, modified; true at these rows.

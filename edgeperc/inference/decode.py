@@ -6,14 +6,13 @@ import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..errors import InferenceError
 from ..system.kernels import njit
 from ..types.card import ModelCard
 from ..types.geometry import draw_footprints
 from ..types.perception import Box
-from ..types.points import Labels, read_only
+from ..types.points import Bytes, Floats32, Labels, Mask, read_only
 from ..types.views import TopViewGeometry
 from .box_heads import (
     MAX_PROBABILITY,
@@ -26,7 +25,7 @@ from .box_heads import (
 )
 
 
-def decode_labels(output: NDArray[np.float32], kind: str, *, model: str = "the model") -> NDArray[np.uint8]:
+def decode_labels(output: Floats32, kind: str, *, model: str = "the model") -> Bytes:
     """The most probable class of every pixel.
 
     output : (1, C, H, W) or (C, H, W) float32; logits or probabilities.
@@ -46,9 +45,7 @@ def decode_labels(output: NDArray[np.float32], kind: str, *, model: str = "the m
     return labels
 
 
-def decode_classes(
-    output: NDArray[np.float32], kind: str, *, model: str = "the model"
-) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+def decode_classes(output: Floats32, kind: str, *, model: str = "the model") -> tuple[Bytes, Floats32]:
     """The most probable class of every pixel, and its probability.
 
     Returns labels ((H, W) uint8): The lower class on ties.
@@ -63,7 +60,7 @@ def decode_classes(
 
 
 @njit(cache=True, nogil=True)
-def fill_labels(values: NDArray[np.float32], labels: Labels) -> tuple[int, float, float]:
+def fill_labels(values: Floats32, labels: Labels) -> tuple[int, float, float]:
     """Write every pixel's best class.
 
     values : (C, H, W) float32, C-contiguous; logits or probabilities.
@@ -103,7 +100,7 @@ def fill_labels(values: NDArray[np.float32], labels: Labels) -> tuple[int, float
 
 
 @njit(cache=True, nogil=True)
-def clear_empty(returned: NDArray[np.bool_], is_box: NDArray[np.bool_], labels: Labels) -> None:
+def clear_empty(returned: Mask, is_box: Mask, labels: Labels) -> None:
     """Make cells of box classes without a return background."""
     for row in range(labels.shape[0]):
         for col in range(labels.shape[1]):
@@ -112,15 +109,15 @@ def clear_empty(returned: NDArray[np.bool_], is_box: NDArray[np.bool_], labels: 
 
 
 def decode_top_view(
-    card: ModelCard, returned: NDArray[np.bool_], outputs: Mapping[str, NDArray[np.float32]], score_threshold: float
-) -> tuple[NDArray[np.uint8], list[Box]]:
+    card: ModelCard, returned: Mask, outputs: Mapping[str, Floats32], score_threshold: float
+) -> tuple[Bytes, list[Box]]:
     """Decode the labels and boxes of a top-view network: `decode_boxes`, then `decode_cells`."""
     found = decode_boxes(card, outputs, score_threshold)
     return decode_cells(card, returned, outputs, found), found
 
 
 def decode_boxes(
-    card: ModelCard, outputs: Mapping[str, NDArray[np.float32]], score_threshold: float, named_from: float = 0.0
+    card: ModelCard, outputs: Mapping[str, Floats32], score_threshold: float, named_from: float = 0.0
 ) -> list[Box]:
     """Decode the boxes of a top-view network (SSADNet 2.2.1 B, 3.1.2).
 
@@ -176,9 +173,7 @@ def decode_boxes(
     return [box for box in found if box.score >= score_threshold]
 
 
-def decode_cells(
-    card: ModelCard, returned: NDArray[np.bool_], outputs: Mapping[str, NDArray[np.float32]], boxes: Sequence[Box]
-) -> NDArray[np.uint8]:
+def decode_cells(card: ModelCard, returned: Mask, outputs: Mapping[str, Floats32], boxes: Sequence[Box]) -> Bytes:
     """Decode the labels of a top-view network.
 
     card : with a top view.
@@ -200,12 +195,12 @@ def decode_cells(
     return labels
 
 
-def _class_kind(outputs: Mapping[str, NDArray[np.float32]]) -> str:
+def _class_kind(outputs: Mapping[str, Floats32]) -> str:
     return next(kind for kind in outputs if kind.startswith("class_"))
 
 
 @njit(cache=True, nogil=True)
-def fill_pixels(blocks: NDArray[np.float32], rows: int, cols: int, pixels: NDArray[np.float32]) -> None:
+def fill_pixels(blocks: Floats32, rows: int, cols: int, pixels: Floats32) -> None:
     """Write the values of blocks to their pixels, as torch's PixelShuffle does for square blocks.
 
     rows, cols : size of a block.

@@ -6,12 +6,11 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..system.kernels import njit
 from ..types.card import CHANNELS, InputSpec
 from ..types.detector import PillarGeometry
-from ..types.points import Points, read_only
+from ..types.points import Floats32, Ints, Ints64, Points, read_only
 
 # What kernels compute, by the channel's place in the card's list of all.
 AXES = 3
@@ -34,9 +33,9 @@ class PillarGrid(NamedTuple):
 class Pillars(NamedTuple):
     """The pillars of a scan, as a network takes them; only the first ones that were written are valid."""
 
-    values: NDArray[np.float32]  # (pillars, points, channels) 0 after the last point of a pillar
-    counts: NDArray[np.int32]  # (pillars,) points of each pillar
-    places: NDArray[np.int32]  # (pillars, 4) batch, z, row and column of each: 0, 0, and the cell
+    values: Floats32  # (pillars, points, channels) 0 after the last point of a pillar
+    counts: Ints  # (pillars,) points of each pillar
+    places: Ints  # (pillars, 4) batch, z, row and column of each: 0, 0, and the cell
 
 
 class Pillarizer:
@@ -45,7 +44,7 @@ class Pillarizer:
     values : (max_pillars, points, channels) float32, where their values are written; None: an array of its own.
     """
 
-    def __init__(self, view: PillarGeometry, spec: InputSpec, values: NDArray[np.float32] | None = None) -> None:
+    def __init__(self, view: PillarGeometry, spec: InputSpec, values: Floats32 | None = None) -> None:
         bounds = (view.x_range_m, view.y_range_m, view.z_range_m)
         x, y, z = ((float(low), float(high)) for low, high in bounds)
         self._grid = PillarGrid((x[0], y[0], z[0]), (x[1], y[1], z[1]), float(view.cell_m))
@@ -68,9 +67,7 @@ class Pillarizer:
 
 
 @njit(cache=True, nogil=True)
-def find_pillars(
-    points: Points, grid: PillarGrid, numbers: NDArray[np.int32], members: NDArray[np.int32], pillars: Pillars
-) -> int:
+def find_pillars(points: Points, grid: PillarGrid, numbers: Ints, members: Ints, pillars: Pillars) -> int:
     """Write the counts and places of pillars, in the order of their first points.
 
     points : (n, 4) float32, C-contiguous; those that are not finite are in no pillar.
@@ -112,13 +109,7 @@ def find_pillars(
 
 @njit(cache=True, nogil=True)
 def fill_pillars(
-    points: Points,
-    grid: PillarGrid,
-    channels: NDArray[np.int64],
-    scale: NDArray[np.float32],
-    members: NDArray[np.int32],
-    n: int,
-    pillars: Pillars,
+    points: Points, grid: PillarGrid, channels: Ints64, scale: Floats32, members: Ints, n: int, pillars: Pillars
 ) -> None:
     """Write the values of the points of ``n`` pillars, after `find_pillars`.
 

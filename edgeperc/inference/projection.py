@@ -14,14 +14,13 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..errors import CardError, PointsError
 from ..ground.planes import find_ground
 from ..system.kernels import njit
 from ..types.card import InputSpec
 from ..types.mounting import MODEL_HEIGHT_M
-from ..types.points import Heights, Points, read_only
+from ..types.points import Floats32, Heights, Ints, Ints64, Points, read_only
 from ..types.views import RangeImageGeometry, TopViewGeometry
 
 # Number of each channel in the kernels. "height" is z; "distance" is the range in the x-y plane.
@@ -50,11 +49,11 @@ class Projection:
     """A scan projected to one view."""
 
     # (C, H, W) the network's input: ``(raw - mean) / std`` per channel; 0 in every channel of a pixel without a return
-    image: NDArray[np.float32]
-    index: NDArray[np.int32]  # (H, W) row of the point whose values the pixel has; -1 without a return
+    image: Floats32
+    index: Ints  # (H, W) row of the point whose values the pixel has; -1 without a return
     # (n,) flat pixel ``row * W + column`` of every point, even if another point won that pixel; -1 for points that are
     # out of view, not finite or at the origin
-    pixel: NDArray[np.int32]
+    pixel: Ints
 
 
 class Bounds(NamedTuple):
@@ -88,8 +87,8 @@ class Intervals(NamedTuple):
     first: np.float32
     last: np.float32
     cells_per_unit: np.float32
-    base: NDArray[np.int32]
-    split: NDArray[np.float32]
+    base: Ints
+    split: Floats32
 
 
 # The kernels process points in blocks, in short loops without branches that compile to vector instructions. Only the
@@ -102,7 +101,7 @@ class Intervals(NamedTuple):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def mark_top_view(points: Points, view: Bounds, index: NDArray[np.int32], pixel: NDArray[np.int32]) -> None:
+def mark_top_view(points: Points, view: Bounds, index: Ints, pixel: Ints) -> None:
     """Mark the highest point of each cell in ``index``, and the cell of each point in ``pixel``.
 
     points : (n, 4) float32, C-contiguous; x, y, z [m] in the sensor frame, remission.
@@ -159,13 +158,13 @@ def mark_top_view(points: Points, view: Bounds, index: NDArray[np.int32], pixel:
 @njit(cache=True, nogil=True, error_model="numpy")
 def mark_range_image(
     points: Points,
-    wedge: NDArray[np.float32],
+    wedge: Floats32,
     row_table: Intervals,
     col_table: Intervals,
     width: np.int32,
-    winner: NDArray[np.int64],
-    index: NDArray[np.int32],
-    pixel: NDArray[np.int32],
+    winner: Ints64,
+    index: Ints,
+    pixel: Ints,
 ) -> None:
     """Mark the nearest point of each pixel in ``index``, and the pixel of each point in ``pixel``.
 
@@ -250,13 +249,7 @@ def mark_range_image(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def fill_image(
-    points: Points,
-    heights: Heights,
-    index: NDArray[np.int32],
-    channels: NDArray[np.int32],
-    mean: NDArray[np.float32],
-    std: NDArray[np.float32],
-    image: NDArray[np.float32],
+    points: Points, heights: Heights, index: Ints, channels: Ints, mean: Floats32, std: Floats32, image: Floats32
 ) -> None:
     """Write the values of the points of ``index`` into ``image``.
 
@@ -334,14 +327,7 @@ class TopViewProjector:
             np.int32(view.width),
         )
 
-    def fill(
-        self,
-        points: Points,
-        image: NDArray[np.float32],
-        index: NDArray[np.int32],
-        pixel: NDArray[np.int32],
-        height_m: Heights | None = None,
-    ) -> None:
+    def fill(self, points: Points, image: Floats32, index: Ints, pixel: Ints, height_m: Heights | None = None) -> None:
         """Project into the caller's buffers.
 
         points : (n, 4) float32, C-contiguous; x, y, z [m] in the sensor frame, remission in 0..1
@@ -397,14 +383,7 @@ class RangeImageProjector:
         self._cols = tabulate(column_edges(view), "columns")
         self._winner = np.empty(view.height * view.width, np.int64)
 
-    def fill(
-        self,
-        points: Points,
-        image: NDArray[np.float32],
-        index: NDArray[np.int32],
-        pixel: NDArray[np.int32],
-        height_m: Heights | None = None,
-    ) -> None:
+    def fill(self, points: Points, image: Floats32, index: Ints, pixel: Ints, height_m: Heights | None = None) -> None:
         """Project into the caller's buffers; arguments and errors as in `TopViewProjector.fill`."""
         points = _checked(self.shape, points, image, index, pixel)
         flat_index = index.reshape(-1)
@@ -412,13 +391,7 @@ class RangeImageProjector:
         mark_range_image(points, self._wedge, self._rows, self._cols, width, self._winner, flat_index, pixel)
         self.fill_image(points, index, image, height_m)
 
-    def fill_image(
-        self,
-        points: Points,
-        index: NDArray[np.int32],
-        image: NDArray[np.float32],
-        height_m: Heights | None = None,
-    ) -> None:
+    def fill_image(self, points: Points, index: Ints, image: Floats32, height_m: Heights | None = None) -> None:
         """Write the image for a given ``index``; arguments and errors as in `TopViewProjector.fill`."""
         points = _checked(self.shape, points, image, index)
         heights = _heights(self.needs_ground, len(points), height_m)
@@ -439,7 +412,7 @@ def make_projector(
     return RangeImageProjector(view, input)
 
 
-def row_edges(view: RangeImageGeometry) -> NDArray[np.float32]:
+def row_edges(view: RangeImageGeometry) -> Floats32:
     """Pseudo-elevations z / (sqrt(x^2 + y^2) + |z|) of the H + 1 edges of rows, top to bottom, float32."""
     beams = np.asarray(view.row_elevations_deg, dtype=np.float64)
     middles = (beams[:-1] + beams[1:]) / 2.0
@@ -448,7 +421,7 @@ def row_edges(view: RangeImageGeometry) -> NDArray[np.float32]:
     return (np.sin(edges) / (np.abs(np.cos(edges)) + np.abs(np.sin(edges)))).astype(np.float32)
 
 
-def column_edges(view: RangeImageGeometry) -> NDArray[np.float32]:
+def column_edges(view: RangeImageGeometry) -> Floats32:
     """Pseudo-azimuths, y / (|x| + |y|) unfolded to -2..2, of the W + 1 edges of columns, left to right, float32."""
     edges = np.deg2rad(np.linspace(view.azimuth_left_deg, view.azimuth_right_deg, view.width + 1))
     x, y = np.cos(edges), np.sin(edges)
@@ -456,7 +429,7 @@ def column_edges(view: RangeImageGeometry) -> NDArray[np.float32]:
     return np.where(x >= 0.0, folded, np.copysign(2.0, edges) - folded).astype(np.float32)
 
 
-def wedge(view: RangeImageGeometry) -> NDArray[np.float32]:
+def wedge(view: RangeImageGeometry) -> Floats32:
     """Coefficients of x, y, x, y in two sums that are not negative for any point in view, (4,) float32."""
     if view.azimuth_left_deg - view.azimuth_right_deg > 179.0:
         return np.zeros(4, np.float32)
@@ -466,7 +439,7 @@ def wedge(view: RangeImageGeometry) -> NDArray[np.float32]:
     return np.array([math.sin(left), -math.cos(left), -math.sin(right), math.cos(right)], dtype=np.float32)
 
 
-def tabulate(edges: NDArray[np.float32], what: str) -> Intervals:
+def tabulate(edges: Floats32, what: str) -> Intervals:
     """Build tables that find the interval of a value with one comparison.
 
     edges : (m + 1,) float32; strictly decreasing.
@@ -491,9 +464,7 @@ def tabulate(edges: NDArray[np.float32], what: str) -> Intervals:
     )
 
 
-def _channels(
-    spec: InputSpec, known: tuple[str, ...]
-) -> tuple[NDArray[np.int32], NDArray[np.float32], NDArray[np.float32]]:
+def _channels(spec: InputSpec, known: tuple[str, ...]) -> tuple[Ints, Floats32, Floats32]:
     """Channel codes, means and deviations of an input, as the kernels take them."""
     unknown = [name for name in spec.channels if name not in known]
     if unknown:
@@ -503,12 +474,8 @@ def _channels(
 
 
 def _checked(
-    shape: tuple[int, int, int],
-    points: Points,
-    image: NDArray[np.float32],
-    index: NDArray[np.int32],
-    pixel: NDArray[np.int32] | None = None,
-) -> NDArray[np.float32]:
+    shape: tuple[int, int, int], points: Points, image: Floats32, index: Ints, pixel: Ints | None = None
+) -> Floats32:
     """The points as a read-only view, so that every scan runs the same compiled kernel; raises PointsError."""
     _check_points(points)
     for name, buffer, expected, dtype in (
@@ -526,7 +493,7 @@ def _checked(
     return read_only(points)
 
 
-def _heights(needed: bool, n: int, height_m: Heights | None) -> NDArray[np.float32]:
+def _heights(needed: bool, n: int, height_m: Heights | None) -> Floats32:
     """The heights as the kernel takes them; raises PointsError."""
     if not needed:
         return read_only(np.empty(0, np.float32))
@@ -550,11 +517,7 @@ def _check_points(points: Points) -> None:
         )
 
 
-def _project(
-    projector: TopViewProjector | RangeImageProjector,
-    points: Points,
-    height_m: Heights | None,
-) -> Projection:
+def _project(projector: TopViewProjector | RangeImageProjector, points: Points, height_m: Heights | None) -> Projection:
     _check_points(points)
     projection = Projection(
         image=np.empty(projector.shape, np.float32),
@@ -565,7 +528,7 @@ def _project(
     return projection
 
 
-def input_heights(projector: TopViewProjector | RangeImageProjector, points: Points) -> NDArray[np.float32] | None:
+def input_heights(projector: TopViewProjector | RangeImageProjector, points: Points) -> Floats32 | None:
     """Heights of points of the models' frame above the ground, (n,) float32 [m]; None if the projector needs none."""
     return find_ground(points, mount_height_m=MODEL_HEIGHT_M).height_m if projector.needs_ground else None
 

@@ -6,14 +6,13 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..errors import InferenceError
 from ..system.kernels import njit
 from ..types.card import ModelCard
 from ..types.geometry import oriented_iou, suppress_overlaps
 from ..types.perception import Box
-from ..types.points import read_only
+from ..types.points import Floats, Floats32, read_only
 
 # Columns of decoded boxes.
 X, Y, Z, LENGTH, WIDTH, HEIGHT, YAW, SCORE, LABEL, FRONT = range(10)
@@ -26,9 +25,7 @@ MERGED = 0.5  # IoU of boxes that are averaged
 LEAST_SCORE = 0.03
 
 
-def decode_objects(
-    card: ModelCard, outputs: NDArray[np.float32], rectangles: NDArray[np.float64], level: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def decode_objects(card: ModelCard, outputs: Floats32, rectangles: Floats, level: Floats) -> Floats:
     """Decode the outputs of candidates.
 
     outputs : (m, n) float32: logits of the classes, the background first; x, y of the middle in the candidate's frame
@@ -50,12 +47,12 @@ def decode_objects(
     return boxes
 
 
-def footprints(boxes: NDArray[np.float64]) -> NDArray[np.float64]:
+def footprints(boxes: Floats) -> Floats:
     """x, y, length, width, yaw of boxes (m, 10), (m, 5)."""
     return boxes.take([X, Y, LENGTH, WIDTH, YAW], axis=1)
 
 
-def merge_boxes(boxes: NDArray[np.float64], classes: Sequence[str]) -> NDArray[np.float64]:
+def merge_boxes(boxes: Floats, classes: Sequence[str]) -> Floats:
     """Of boxes around one object, the one with the best score, averaged with those that overlap it by more than 0.5.
 
     boxes : (m, 10) float64, from `decode_objects`.
@@ -72,7 +69,7 @@ def merge_boxes(boxes: NDArray[np.float64], classes: Sequence[str]) -> NDArray[n
     return merged
 
 
-def confirm_boxes(found: NDArray[np.float64], again: NDArray[np.float64]) -> NDArray[np.float64]:
+def confirm_boxes(found: Floats, again: Floats) -> Floats:
     """Each box, (k, 10), and what further looks at its place show, (r, k, 10) with a score of 0 for nothing, as one.
 
     The score is the mean of the box's and the looks' mean; class and front are those of the best one, with which the
@@ -87,7 +84,7 @@ def confirm_boxes(found: NDArray[np.float64], again: NDArray[np.float64]) -> NDA
     return confirmed
 
 
-def boxes_of_objects(boxes: NDArray[np.float64], classes: Sequence[str], min_score: float) -> list[Box]:
+def boxes_of_objects(boxes: Floats, classes: Sequence[str], min_score: float) -> list[Box]:
     """Rows of `merge_boxes` with at least a score, as boxes."""
     return [
         Box(classes[int(label)], score, (x, y, z), (length, width, height), yaw, front)
@@ -97,13 +94,7 @@ def boxes_of_objects(boxes: NDArray[np.float64], classes: Sequence[str], min_sco
 
 
 @njit(cache=True, nogil=True)
-def fill_boxes(
-    outputs: NDArray[np.float32],
-    rectangles: NDArray[np.float64],
-    level: NDArray[np.float64],
-    priors: NDArray[np.float64],
-    boxes: NDArray[np.float64],
-) -> None:
+def fill_boxes(outputs: Floats32, rectangles: Floats, level: Floats, priors: Floats, boxes: Floats) -> None:
     """Write the boxes of `decode_objects`; ``priors`` (c, 3) has the usual sizes."""
     c = priors.shape[0]
     for k in range(outputs.shape[0]):
@@ -134,7 +125,7 @@ def fill_boxes(
 
 
 @njit(cache=True, nogil=True)
-def fill_merged(boxes: NDArray[np.float64], iou: NDArray[np.float64], merged: NDArray[np.float64]) -> None:
+def fill_merged(boxes: Floats, iou: Floats, merged: Floats) -> None:
     """Average each row of ``merged`` (k, 10) with the ``boxes`` (m, 10) that overlap it enough, by ``iou`` (k, m)."""
     sums = np.empty(SCORE)
     for k in range(merged.shape[0]):

@@ -11,11 +11,10 @@ import math
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..errors import PointsError
 from ..system.kernels import njit
-from ..types.points import Heights, Points, Rows, read_only
+from ..types.points import Bytes, Floats, Heights, Ints, Points, Rows, read_only
 from .rectangles import fit_rectangle
 
 if TYPE_CHECKING:
@@ -57,17 +56,17 @@ SCALES = (Scale(0.2, 2.6, 0.5, MAX_LENGTH_M), Scale(0.3, 2.2, 0.3, MAX_LENGTH_M)
 class Cells(NamedTuple):
     """Points above the ground by the square cells that they lie in."""
 
-    number: NDArray[np.int32]  # (N_SIDE, N_SIDE) of each cell, x by y; -1 without a point
-    flat: NDArray[np.int32]  # (k,) flat index of each numbered cell
-    scales: NDArray[np.uint8]  # (k,) bit s: a point of the cell has a height of `SCALES[s]`
-    starts: NDArray[np.int32]  # (k + 1,) where the points of a cell start in ``rows``
+    number: Ints  # (N_SIDE, N_SIDE) of each cell, x by y; -1 without a point
+    flat: Ints  # (k,) flat index of each numbered cell
+    scales: Bytes  # (k,) bit s: a point of the cell has a height of `SCALES[s]`
+    starts: Ints  # (k + 1,) where the points of a cell start in ``rows``
     rows: Rows  # (m,) rows of the points, cell by cell
 
 
 class Candidates(NamedTuple):
     """Rectangles x, y, length, width [m], yaw [rad], (m, 5) float64, and the cells that they were found in."""
 
-    rectangles: NDArray[np.float64]
+    rectangles: Floats
     cells: Cells
 
 
@@ -76,7 +75,7 @@ class CellBuffer:
 
     def __init__(self) -> None:
         self._number = np.empty((N_SIDE, N_SIDE), np.int32)
-        self._taken: NDArray[np.int32] | None = None
+        self._taken: Ints | None = None
 
     def sort(self, scan: Scan, height_range_m: tuple[float, float]) -> Cells:
         """`sort_into_cells`; the next call overwrites the numbers of the cells."""
@@ -90,7 +89,7 @@ class CellBuffer:
         return cells
 
 
-def sort_into_cells(scan: Scan, height_range_m: tuple[float, float], number: NDArray[np.int32] | None = None) -> Cells:
+def sort_into_cells(scan: Scan, height_range_m: tuple[float, float], number: Ints | None = None) -> Cells:
     """Sort the points of a scan whose height above the ground is in a range [m]; ``number`` is -1 everywhere."""
     n = len(scan.points)
     number = np.full((N_SIDE, N_SIDE), -1, np.int32) if number is None else number
@@ -103,7 +102,7 @@ def sort_into_cells(scan: Scan, height_range_m: tuple[float, float], number: NDA
     return Cells(number, flat[:n_cells], scales[:n_cells], starts[: n_cells + 1], rows[:n_rows])
 
 
-def find_candidates(scan: Scan, cells: Cells, boxes: NDArray[np.float64], distance_per_m: float = 0.015) -> Candidates:
+def find_candidates(scan: Scan, cells: Cells, boxes: Floats, distance_per_m: float = 0.015) -> Candidates:
     """Find where an object may be.
 
     boxes : (k, 5) float64, rectangles of other origin, such as a detector's: x, y, length, width [m], yaw [rad].
@@ -136,20 +135,15 @@ def find_candidates(scan: Scan, cells: Cells, boxes: NDArray[np.float64], distan
 class Groups(NamedTuple):
     """Groups of cells, and the larger groups that they are parts of."""
 
-    order: NDArray[np.int32]  # (k,) numbers of cells, group by group
-    first: NDArray[np.int32]  # (groups + 1,) where the cells of a group start in ``order``
-    around: NDArray[np.int32]  # (cells,) of each cell, its group at the first scale; -1: there is none
-    sizes: NDArray[np.int32]  # (groups of the first scale,) numbers of their cells
+    order: Ints  # (k,) numbers of cells, group by group
+    first: Ints  # (groups + 1,) where the cells of a group start in ``order``
+    around: Ints  # (cells,) of each cell, its group at the first scale; -1: there is none
+    sizes: Ints  # (groups of the first scale,) numbers of their cells
 
 
 @njit(cache=True, nogil=True)
 def fill_cells(
-    points: Points,
-    height: Heights,
-    low: float,
-    high: float,
-    cells: Cells,
-    of_point: NDArray[np.int32],
+    points: Points, height: Heights, low: float, high: float, cells: Cells, of_point: Ints
 ) -> tuple[int, int]:
     """Write `Cells` with arrays as long as the scan (``starts``: one more); return how many cells and rows there are.
 
@@ -190,13 +184,7 @@ def fill_cells(
 
 @njit(cache=True, nogil=True)
 def fill_groups_of_cells(
-    cells: Cells,
-    scale: int,
-    link_m: float,
-    per_m: float,
-    group: NDArray[np.int32],
-    order: NDArray[np.int32],
-    first: NDArray[np.int32],
+    cells: Cells, scale: int, link_m: float, per_m: float, group: Ints, order: Ints, first: Ints
 ) -> int:
     """Link cells of a scale whose middles are near enough; return the number of groups.
 
@@ -252,14 +240,7 @@ def fill_groups_of_cells(
 
 
 @njit(cache=True, nogil=True)
-def fit_groups(
-    points: Points,
-    height: Heights,
-    cells: Cells,
-    scale: Scale,
-    groups: Groups,
-    fits: NDArray[np.float64],
-) -> int:
+def fit_groups(points: Points, height: Heights, cells: Cells, scale: Scale, groups: Groups, fits: Floats) -> int:
     """Write the rectangles of the groups that may be an object into ``fits`` (groups, 5); return their number.
 
     Left out are groups of few points, those that are low or long, and those that are about the group around them.

@@ -14,11 +14,10 @@ from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..errors import PointsError
 from ..system.kernels import njit
-from ..types.points import Ids, Labels, Mask, Points, read_only
+from ..types.points import Bytes, Floats, Ids, Ints, Ints64, Labels, Mask, Points, read_only
 from .linkage import COLUMN_EDGE, MAX_COLUMNS, TESTS_PER_POINT, WORK, Strips, chain_points, fill_clusters, levels_of
 
 WALKS, RIDES = 1, 2  # roles of labels
@@ -33,15 +32,15 @@ def find_clusters(
     points: Points,
     *,
     among: Mask | None = None,
-    seeds: NDArray[np.bool_] | None = None,
-    votes: NDArray[np.uint8] | None = None,
-    min_share: float | Sequence[float] | NDArray[np.float64] = 0.0,
+    seeds: Mask | None = None,
+    votes: Bytes | None = None,
+    min_share: float | Sequence[float] | Floats = 0.0,
     min_distance_m: float = 0.5,
     distance_per_m: float = 0.015,
     max_range_m: float = 100.0,
     min_points: int = 5,
     strips: Strips | None = None,
-) -> NDArray[np.int32]:
+) -> Ints:
     """Number the groups of linked points.
 
     Parameters
@@ -157,12 +156,8 @@ def sort_points(
 
 
 def cluster_labels(
-    clusters: Ids,
-    labels: Labels,
-    *,
-    min_share: float = 0.7,
-    part_of: Mapping[int, int] = MappingProxyType({}),
-) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
+    clusters: Ids, labels: Labels, *, min_share: float = 0.7, part_of: Mapping[int, int] = MappingProxyType({})
+) -> tuple[Bytes, Floats]:
     """The class that more than ``min_share`` of a cluster's points have (KUL-Seg 5.2).
 
     clusters : (n,) int32; cluster of every point, -1 for none.
@@ -184,13 +179,13 @@ class Groups(NamedTuple):
     """Points by the groups that they belong to."""
 
     # (m,) rows of the points of group 0, in input order unless stated otherwise, then of group 1, and so on
-    order: NDArray[np.int32]
-    starts: NDArray[np.int64]  # (k + 1,) where each of the k groups begins in ``order``; last, where they end
+    order: Ints
+    starts: Ints64  # (k + 1,) where each of the k groups begins in ``order``; last, where they end
 
 
 def labels_of_groups(
     groups: Groups, labels: Labels, min_share: float, part_of: Mapping[int, int]
-) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
+) -> tuple[Bytes, Floats]:
     """`cluster_labels` of groups."""
     classes = np.empty(len(groups.starts) - 1, np.uint8)
     shares = np.empty(len(groups.starts) - 1)
@@ -227,12 +222,7 @@ def fill_groups(clusters: Ids, groups: Groups) -> None:
 
 @njit(cache=True, nogil=True)
 def fill_cluster_labels(
-    labels: Labels,
-    groups: Groups,
-    parts: NDArray[np.int64],
-    min_share: float,
-    classes: NDArray[np.uint8],
-    shares: NDArray[np.float64],
+    labels: Labels, groups: Groups, parts: Ints64, min_share: float, classes: Bytes, shares: Floats
 ) -> None:
     """Write the class of every cluster; see `cluster_labels`.
 

@@ -10,10 +10,9 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..system.kernels import njit
-from ..types.points import Cloud, Ids, Labeled, Labels, Mask
+from ..types.points import Cloud, Ids, Ints, Labeled, Labels, Mask, Records
 from .cluster import MIN_OF_WHOLE, RIDES, Groups, fill_groups
 
 UNSEEN = 3  # role of points out of view, beside `WALKS` and `RIDES`: they say nothing about the class
@@ -84,7 +83,7 @@ class Extent(NamedTuple):
 
 
 @njit(cache=True, nogil=True)
-def measure(cloud: Cloud, members: NDArray[np.int32], above: float) -> Extent:
+def measure(cloud: Cloud, members: Ints, above: float) -> Extent:
     """Measure the members of a group that are higher than a limit [m], and the top of all; zeros if none is higher.
 
     members : (k,) int32; rows of the points.
@@ -118,7 +117,7 @@ def measure(cloud: Cloud, members: NDArray[np.int32], above: float) -> Extent:
 
 @njit(cache=True, nogil=True)
 def fill_person_groups(
-    cloud: Cloud, labeled: Labeled, clusters: Groups, groups: Groups, loose: NDArray[np.int32]
+    cloud: Cloud, labeled: Labeled, clusters: Groups, groups: Groups, loose: Ints
 ) -> tuple[int, int]:
     """List the clusters that may be one or a few persons, and the persons' points of the others.
 
@@ -159,13 +158,7 @@ def fill_person_groups(
 
 @njit(cache=True, nogil=True)
 def complete_persons(
-    cloud: Cloud,
-    in_view: Mask,
-    clusters: Ids,
-    may_be: NDArray[np.bool_],
-    walks: int,
-    rides: int,
-    labels: Labels,
+    cloud: Cloud, in_view: Mask, clusters: Ids, may_be: Mask, walks: int, rides: int, labels: Labels
 ) -> None:
     """Give the points of a cluster that has a person's size and shape one label.
 
@@ -214,7 +207,7 @@ def complete_persons(
 
 
 @njit(cache=True, nogil=True)
-def border_of(cloud: Cloud, members: NDArray[np.int32], above: float, extent: Extent) -> float:
+def border_of(cloud: Cloud, members: Ints, above: float, extent: Extent) -> float:
     """Where two persons meet along the axis of a group: at the fewest points, as near to the middle as possible."""
     points, height, cos, sin = cloud.points, cloud.height, extent.cos, extent.sin
     low, length = extent.low_u, extent.high_u - extent.low_u
@@ -238,7 +231,7 @@ def border_of(cloud: Cloud, members: NDArray[np.int32], above: float, extent: Ex
 
 
 @njit(cache=True, nogil=True)
-def head_width(cloud: Cloud, members: NDArray[np.int32], extent: Extent) -> float:
+def head_width(cloud: Cloud, members: Ints, extent: Extent) -> float:
     """Width of the widest part without a gap at the height of heads [m], along the axis of a group; 0 if not flat."""
     points, height, cos, sin = cloud.points, cloud.height, extent.cos, extent.sin
     low, length = extent.low_u, extent.high_u - extent.low_u
@@ -277,7 +270,7 @@ def fill_persons(
     cluster_of: Ids,
     clusters: Groups,
     min_points: int,
-    persons: NDArray[np.void],
+    persons: Records,
 ) -> int:
     """Divide groups into persons, and measure them.
 
@@ -324,7 +317,7 @@ def fill_persons(
 
 
 @njit(cache=True, nogil=True)
-def cut(cloud: Cloud, members: NDArray[np.int32], above: float) -> int:
+def cut(cloud: Cloud, members: Ints, above: float) -> int:
     """Put the points of the first of two persons first; their number, or -1 if a group is one person."""
     points, upper = cloud.points, measure(cloud, members, above)
     if not upper.high_u - upper.low_u > MAX_UPPER_M:
@@ -340,14 +333,7 @@ def cut(cloud: Cloud, members: NDArray[np.int32], above: float) -> int:
 
 
 @njit(cache=True, nogil=True)
-def fill_person(
-    cloud: Cloud,
-    labeled: Labeled,
-    members: NDArray[np.int32],
-    extent: Extent,
-    around: NDArray[np.int32],
-    person: np.void,
-) -> None:
+def fill_person(cloud: Cloud, labeled: Labeled, members: Ints, extent: Extent, around: Ints, person: np.void) -> None:
     """Write the record of a person.
 
     around : (m,) int32; of the larger cluster, of which the points within 0.2 m of the person count for the share.

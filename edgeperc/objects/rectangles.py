@@ -5,20 +5,14 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..system.kernels import njit
-from ..types.points import Points
+from ..types.points import Floats, Points, Rows
 
 
 @njit(cache=True, nogil=True)
 def fit_rectangle(
-    points: Points,
-    rows: NDArray[np.int32],
-    n_angles: int,
-    max_fitted: int,
-    l_shaped: bool,
-    rectangle: NDArray[np.float64],
+    points: Points, rows: Rows, n_angles: int, max_fitted: int, l_shaped: bool, rectangle: Floats
 ) -> None:
     """Write the rectangle around some points, which at most so many of them and so many headings decide.
 

@@ -11,18 +11,18 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from ..errors import PointsError, SensorError
 from ..system.kernels import njit
-from ..types.points import Points, as_points, read_only
+from ..types.points import Floats, Floats32, Points, as_points, read_only
 from ..types.sensor import SensorProfile
 from .returns import returns
 
 KIND_CODES = {"linear": 0, "polynomial": 1, "logarithm": 2, "power": 3}
 
 
-def condition(points: ArrayLike, sensor: SensorProfile, *, rendered: bool = True) -> tuple[NDArray[np.float32], int]:
+def condition(points: ArrayLike, sensor: SensorProfile, *, rendered: bool = True) -> tuple[Floats32, int]:
     """Prepare a scan for every stage: projection, fitness check, refinement, ground and clusters.
 
     points : array_like; a scan, as for `edgeperc.types.points.as_points`; remission in the sensor's raw unit. Not
@@ -39,7 +39,7 @@ def condition(points: ArrayLike, sensor: SensorProfile, *, rendered: bool = True
     return scan, dropped.total + n_overflowed
 
 
-def scale(points: Points, sensor: SensorProfile, *, rendered: bool = True) -> tuple[NDArray[np.float32], int]:
+def scale(points: Points, sensor: SensorProfile, *, rendered: bool = True) -> tuple[Floats32, int]:
     """Scale the remission of a scan, whose rows are finite or NaN, to 0..1.
 
     points : (n, 4) float32; from `edgeperc.preprocess.returns.returns`. Not modified.
@@ -61,7 +61,7 @@ def scale(points: Points, sensor: SensorProfile, *, rendered: bool = True) -> tu
     return read_only(scan), n_overflowed
 
 
-def render(points: Points, sensor: SensorProfile) -> NDArray[np.float32]:
+def render(points: Points, sensor: SensorProfile) -> Floats32:
     """Convert the remission to that of the sensor that the models were trained on, 0..1 (KUL-Seg 5).
 
     points : (n, 4) float32; x, y, z [m], remission in the sensor's raw unit. Not modified. Non-finite values stay
@@ -91,12 +91,7 @@ def render(points: Points, sensor: SensorProfile) -> NDArray[np.float32]:
 
 @njit(cache=True, nogil=True)
 def fill_rendered(
-    points: Points,
-    kind: int,
-    coefficients: NDArray[np.float64],
-    offset: float,
-    scale: float,
-    rendered: NDArray[np.float32],
+    points: Points, kind: int, coefficients: Floats, offset: float, scale: float, rendered: Floats32
 ) -> None:
     """Write the points with rendered remission into ``rendered``.
 
@@ -124,7 +119,7 @@ def fill_rendered(
 
 
 @njit(cache=True, nogil=True)
-def rendered_at(x: float, kind: int, coefficients: NDArray[np.float64]) -> float:
+def rendered_at(x: float, kind: int, coefficients: Floats) -> float:
     """Value of a `RemissionFunction` at a finite x."""
     a, b, c = coefficients[0], coefficients[1], coefficients[2]
     if kind == 3:

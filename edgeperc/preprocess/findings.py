@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ..types.frame import ModelFrame
 from ..types.mounting import MODEL_HEIGHT_M
 from ..types.perception import DroppedPoints
-from ..types.points import Points
+from ..types.points import Floats, Points
 from ..types.sensor import SensorProfile
 from .fitness import FitnessProfile, Measures, Range, measure
 
@@ -102,7 +102,7 @@ def _seen_again(scan: Measures, points: Points, sensor: SensorProfile, frame: Mo
     return scan
 
 
-def _is_road_below(sample: NDArray[np.float64]) -> bool:
+def _is_road_below(sample: Floats) -> bool:
     """Whether the lowest points of many cells near by are as high as the road, and those of few are lower."""
     lowest = _lowest_in_cells(sample, *_NEAR_AROUND_M)
     on_road = np.abs(lowest + MODEL_HEIGHT_M) <= _LEVEL_OFF_M
@@ -127,7 +127,7 @@ def _is_bay(points: Points) -> bool:
     return min(ends_m) >= _BUMPER_M and (deep_m <= _GARAGE_M or deep_m >= _HALL_LENGTH_M)
 
 
-def _lowest_in_cells(sample: NDArray[np.float64], reach_m: float, cell_m: float) -> NDArray[np.float64]:
+def _lowest_in_cells(sample: Floats, reach_m: float, cell_m: float) -> Floats:
     """The lowest z in each square of ``cell_m`` with points up to ``reach_m`` away."""
     x, y, z = sample[np.hypot(sample[:, 0], sample[:, 1]) < reach_m].T
     _, cell = np.unique(np.floor([x / cell_m, y / cell_m]).astype(np.int64), axis=1, return_inverse=True)
@@ -136,7 +136,7 @@ def _lowest_in_cells(sample: NDArray[np.float64], reach_m: float, cell_m: float)
     return lowest
 
 
-def _ground_far_around(sample: NDArray[np.float64]) -> float | None:
+def _ground_far_around(sample: Floats) -> float | None:
     """The height that many of the lowest points in cells up to 60 m away have [m]: that nearest to the road's.
 
     None if no height has many. Land beside a road may be higher or lower, and wider.

@@ -8,12 +8,11 @@ from dataclasses import asdict, dataclass, fields
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..errors import CardError, PointsError
 from ..system.fields import Fields
 from ..system.kernels import njit
-from ..types.points import Points, read_only
+from ..types.points import Floats, Floats32, Ints64, Points, Records, read_only
 
 # About 6,000 points are enough. Steps are prime, so that they do not align with the rows of an organized scan.
 _STEPS = np.array([1, 2, 3, 5, 7, 11, 13, 17, 19, 23, 29, 31, 37, 41, 43, 53, 61, 71, 83, 97, 127, 167, 223, 307, 401])
@@ -53,17 +52,17 @@ SUMS = np.dtype(
 class Histograms(NamedTuple):
     """Numbers of points."""
 
-    remissions: NDArray[np.int64]  # (258,) remission <= 0, 256 even bins in 0..1, above 1
-    elevations: NDArray[np.int64]  # (360,) bins of half a degree from -90, of the points farther than 3 m
-    ranges: NDArray[np.int64]  # (200,) horizontal distance, 20 bins a decade from 1 mm
-    heights: NDArray[np.int64]  # (3, 100) x, y and z of the points 3 to 25 m away, bins of 0.2 m from -10 m
+    remissions: Ints64  # (258,) remission <= 0, 256 even bins in 0..1, above 1
+    elevations: Ints64  # (360,) bins of half a degree from -90, of the points farther than 3 m
+    ranges: Ints64  # (200,) horizontal distance, 20 bins a decade from 1 mm
+    heights: Ints64  # (3, 100) x, y and z of the points 3 to 25 m away, bins of 0.2 m from -10 m
 
 
 class Rows(NamedTuple):
     """Elevations in the eight directions ahead, left, behind, right and halfway between."""
 
-    elevations: NDArray[np.float64]  # (8, 1024) [deg]
-    counts: NDArray[np.int64]  # (8,) how many of them each direction has
+    elevations: Floats  # (8, 1024) [deg]
+    counts: Ints64  # (8,) how many of them each direction has
 
 
 @njit(cache=True, nogil=True)
@@ -74,7 +73,7 @@ def fill_scan_sums(
     view: tuple[float, float],
     histograms: Histograms,
     rows: Rows,
-    sums: NDArray[np.void],
+    sums: Records,
 ) -> None:
     """Measure every ``step``-th point, for `check_fitness`. Points that are not finite are skipped.
 
@@ -100,9 +99,9 @@ def fill_histograms(
     step: int,
     view: tuple[float, float],
     histograms: Histograms,
-    seen: NDArray[np.float64],
-    far: NDArray[np.float64],
-    sums: NDArray[np.void],
+    seen: Floats,
+    far: Floats,
+    sums: Records,
 ) -> None:
     """Count the points; see `Histograms`.
 
@@ -155,9 +154,7 @@ def fill_histograms(
 
 
 @njit(cache=True, nogil=True)
-def measure_sectors(
-    view: tuple[float, float], seen: NDArray[np.float64], far: NDArray[np.float64], sums: NDArray[np.void]
-) -> None:
+def measure_sectors(view: tuple[float, float], seen: Floats, far: Floats, sums: Records) -> None:
     """Write how many sectors have points, the share of the view that has, and how uneven they are."""
     right, left = view
     n_seen, n_view, n_view_seen, n_far, n_sectors, fullest = 0.0, 0, 0.0, 0.0, 0.0, 0.0
@@ -278,7 +275,7 @@ def _pseudo_azimuth(azimuth_deg: float) -> float:
     return across if x >= 0.0 else math.copysign(2.0, azimuth_deg) - across
 
 
-def _quantile(histogram: NDArray[np.int64], share: float) -> float:
+def _quantile(histogram: Ints64, share: float) -> float:
     """Place in a histogram, in bins, below which ``share`` of it lies."""
     total = np.cumsum(histogram)
     return float(np.searchsorted(total, share * total[-1], side="right")) + 0.5
@@ -353,7 +350,7 @@ def _walls(points: Points) -> Walls:
     count = np.bincount(sector, minlength=N_SECTORS)
     first = np.cumsum(count) - count
 
-    def ends(share: float) -> NDArray[np.float64]:
+    def ends(share: float) -> Floats:
         """The range below which this share of a direction's points lies; 0 if it has too few."""
         row = np.minimum(first + np.floor(share * (count - 1.0)).astype(np.int64), len(across) - 1)
         return np.where(count > 0, across[row], 0.0)
@@ -410,9 +407,7 @@ class FitnessProfile:
     road_ahead: Range | None
 
     @classmethod
-    def from_scans(
-        cls, scans: Iterable[NDArray[np.float32]], azimuth_deg: tuple[float, float] = (45.0, -45.0)
-    ) -> FitnessProfile:
+    def from_scans(cls, scans: Iterable[Floats32], azimuth_deg: tuple[float, float] = (45.0, -45.0)) -> FitnessProfile:
         """Measure training scans.
 
         scans : iterable of (n, 4) float32; x, y, z [m], remission scaled to 0..1.

@@ -14,12 +14,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from ..system.kernels import njit
 from ..types.mounting import MODEL_HEIGHT_M
 from ..types.perception import SensorHealth
-from ..types.points import Mask, Points, read_only
+from ..types.points import Floats, Floats32, Ints, Ints64, Mask, Points, read_only
 from ..types.sensor import SensorProfile
 
 N_SECTORS = 72
@@ -51,7 +51,7 @@ class Normal:
     ranges_m, returns : high quantile of the ranges [m] and number of returns, one a scan.
     """
 
-    fewest: NDArray[np.float64] | None = None
+    fewest: Floats | None = None
     ranges_m: tuple[float, ...] = ()
     returns: tuple[float, ...] = ()
 
@@ -60,7 +60,7 @@ class Normal:
         """Whether further scans change nothing."""
         return len(self.returns) >= NORMAL_SCANS
 
-    def add(self, counts: NDArray[np.float64], range_m: float, n_returns: float) -> Normal:
+    def add(self, counts: Floats, range_m: float, n_returns: float) -> Normal:
         """With one more scan, unless it is complete."""
         if self.is_complete:
             return self
@@ -111,9 +111,7 @@ def check_health(
     return health, normal.add(counts, range_m, float(n_sampled * step))
 
 
-def without_drops(
-    points: Points, sensor: SensorProfile, eye_m: ArrayLike = (0.0, 0.0, 0.0)
-) -> tuple[NDArray[np.float32], int]:
+def without_drops(points: Points, sensor: SensorProfile, eye_m: ArrayLike = (0.0, 0.0, 0.0)) -> tuple[Floats32, int]:
     """A scan (n, 4) in which near points with at most one neighbor, or four if they are dim, are NaN, and their number.
 
     Only for scans of which `check_health` says that there are drops: leaves and wires are as lonely.
@@ -182,13 +180,13 @@ def _side(azimuth_deg: float) -> str:
     return f"{abs(azimuth_deg):g} degrees {'left' if azimuth_deg > 0.0 else 'right'}"
 
 
-def _everywhere(near: NDArray[np.int64], lonely: NDArray[np.int64]) -> float:
+def _everywhere(near: Ints64, lonely: Ints64) -> float:
     """Share of the near points that is lonely on nearly all sides; leaves and wires are on one side."""
     of_sides = np.sort(lonely / np.maximum(near[:, 0], 1))[near[:, 0] >= _FEWEST_NEAR // 4]
     return float(of_sides[(len(of_sides) - 1) // 3]) if len(of_sides) else 0.0
 
 
-def _has_drops(near: NDArray[np.int64], has_remission: bool) -> tuple[bool, bool]:
+def _has_drops(near: Ints64, has_remission: bool) -> tuple[bool, bool]:
     """Whether there are drops on nearly all sides, and a cloud of them on one, by counts of `mark_isolated`."""
     if not has_remission:
         return _everywhere(near, near[:, 1]) > _ISOLATED, False
@@ -206,7 +204,7 @@ def _has_fog(health: SensorHealth, is_hazy: bool) -> bool:
     return is_dimmed and health.range_m < _SHRUNK * health.normal_range_m
 
 
-def _blocked(counts: NDArray[np.float64], normal: Normal) -> NDArray[np.bool_]:
+def _blocked(counts: Floats, normal: Normal) -> Mask:
     """Which sectors are blocked in the bands that meet the ground, (N_SECTORS, 2) bool."""
     lacks, blocked = np.empty(counts.shape, np.bool_), np.zeros((N_SECTORS, 2), np.bool_)
     fill_lacking(counts, np.full(counts.shape, np.inf) if normal.fewest is None else normal.fewest, lacks)
@@ -225,7 +223,7 @@ def _blocked(counts: NDArray[np.float64], normal: Normal) -> NDArray[np.bool_]:
     return blocked
 
 
-def _runs(marks: NDArray[np.bool_]) -> list[tuple[int, int]]:
+def _runs(marks: Mask) -> list[tuple[int, int]]:
     """First sector and length of each run of marked ones; the last sector is beside the first."""
     if marks.all():
         return [(0, len(marks))]
@@ -234,7 +232,7 @@ def _runs(marks: NDArray[np.bool_]) -> list[tuple[int, int]]:
     return [(int(first), int(min((ends - first) % len(marks)))) for first in firsts]
 
 
-def _arcs(marks: NDArray[np.bool_]) -> tuple[tuple[float, float], ...]:
+def _arcs(marks: Mask) -> tuple[tuple[float, float], ...]:
     """Left and right edge of each run of sectors [deg], -180..180, left positive."""
     if not marks.any():
         return ()
@@ -247,13 +245,8 @@ def _arcs(marks: NDArray[np.bool_]) -> tuple[tuple[float, float], ...]:
 
 
 def _isolated(
-    points: Points,
-    eye: NDArray[np.float64],
-    sensor: SensorProfile,
-    wedge: float,
-    most: tuple[int, int],
-    mark: Mask | None,
-) -> tuple[NDArray[np.int64], bool]:
+    points: Points, eye: Floats, sensor: SensorProfile, wedge: float, most: tuple[int, int], mark: Mask | None
+) -> tuple[Ints64, bool]:
     """What `mark_isolated` counts, and whether the scan has a remission."""
     per_m = _RADIUS_COLUMNS * math.radians(sensor.azimuth_resolution_deg)
     radius = np.array([per_m, _LEAST_RADIUS_M, max(_LEAST_RADIUS_M, per_m * NEAR_M)])
@@ -271,14 +264,7 @@ def _isolated(
 
 
 @njit(cache=True, nogil=True)
-def fill_sectors(
-    points: Points,
-    eye: NDArray[np.float64],
-    step: int,
-    tans: NDArray[np.float64],
-    counts: NDArray[np.float64],
-    ranges: NDArray[np.float64],
-) -> int:
+def fill_sectors(points: Points, eye: Floats, step: int, tans: Floats, counts: Floats, ranges: Floats) -> int:
     """Count every ``step``-th point by sector and band, and by range in meters; returns the number of them.
 
     tans : (2,) tangents of the elevations below which beams are in the first, or else in the second band; others are in
@@ -314,7 +300,7 @@ def fill_sectors(
 
 
 @njit(cache=True, nogil=True)
-def fill_lacking(counts: NDArray[np.float64], fewest: NDArray[np.float64], lacks: Mask) -> None:
+def fill_lacking(counts: Floats, fewest: Floats, lacks: Mask) -> None:
     """Write where returns are missing: fewer than in other sectors, and than the fewest before.
 
     counts, fewest : (N_SECTORS, 4) of `fill_sectors`; infinite before the first scan.
@@ -340,13 +326,13 @@ def fill_lacking(counts: NDArray[np.float64], fewest: NDArray[np.float64], lacks
 @njit(cache=True, nogil=True)
 def mark_isolated(
     points: Points,
-    eye: NDArray[np.float64],
+    eye: Floats,
     of: tuple[float, int, int, float],
-    radius: NDArray[np.float64],
-    heads: NDArray[np.int32],
-    buffers: NDArray[np.int32],
+    radius: Floats,
+    heads: Ints,
+    buffers: Ints,
     mark: Mask,
-    counts: NDArray[np.int64],
+    counts: Ints64,
 ) -> None:
     """Count points within `NEAR_M`, and those with few others around them, which are marked.
 
@@ -413,13 +399,7 @@ def bucket(a: int, b: int, c: int, last: int) -> int:
 
 @njit(cache=True, nogil=True)
 def is_isolated(
-    points: Points,
-    eye: NDArray[np.float64],
-    k: int,
-    most: int,
-    radius: tuple[float, float],
-    heads: NDArray[np.int32],
-    buffers: NDArray[np.int32],
+    points: Points, eye: Floats, k: int, most: int, radius: tuple[float, float], heads: Ints, buffers: Ints
 ) -> bool:
     """Whether at most ``most`` of the other near points are around the k-th; its own cell is looked at first.
 

@@ -6,12 +6,11 @@ import math
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..errors import PointsError
 from ..system.kernels import njit
 from ..types.mounting import MODEL_HEIGHT_M
-from ..types.points import Points
+from ..types.points import Floats, Floats32, Ints, Ints64, Points
 from ..types.sensor import SensorProfile
 from ..types.views import RangeImageGeometry
 
@@ -64,7 +63,7 @@ class Interpolator:
         self.shape = (view.height, view.width)
         self.needed = bool(self._row_reach.any() or self._col_reach)
 
-    def fill(self, points: Points, index: NDArray[np.int32]) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
+    def fill(self, points: Points, index: Ints) -> tuple[Floats32, Ints]:
         """Interpolate points in the gaps of a range image.
 
         index : (H, W) int32; row of ``points`` at each pixel; -1 without a return.
@@ -113,10 +112,10 @@ def on_one_surface(points: Points, i: int, j: int, ground_z: float) -> bool:
 def fill_between(
     points: Points,
     n: int,
-    index: NDArray[np.int32],
-    row_slopes: NDArray[np.float64],
-    directions: NDArray[np.float64],
-    row_reach: NDArray[np.int64],
+    index: Ints,
+    row_slopes: Floats,
+    directions: Floats,
+    row_reach: Ints64,
     col_reach: int,
     ground_z: float,
 ) -> int:

@@ -11,12 +11,12 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from ..errors import EdgepercError, OptionError, PointsError, SensorError, StampError, TrackingError
 from ..system.kernels import njit
 from ..types.frame import fill_moved, poses_of
-from ..types.points import Points, as_points, read_only
+from ..types.points import Floats, Floats32, Points, as_points, read_only
 from ..types.rigid import rigid
 from .returns import blank_too_near
 
@@ -122,8 +122,8 @@ class Trajectory:
         Fewer than two times, or they do not rise.
     """
 
-    times_s: NDArray[np.float64]
-    T_world_sensor: NDArray[np.float64]
+    times_s: Floats
+    T_world_sensor: Floats
 
     def __post_init__(self) -> None:
         try:
@@ -241,7 +241,7 @@ class Trajectory:
 
 def deskew(
     points: ArrayLike, times: ArrayLike, motion: Motion, *, at_s: float | None = None, min_range_m: float = 0.0
-) -> NDArray[np.float32]:
+) -> Floats32:
     """Move each point of a scan to where a sensor that stands still would have seen it.
 
     A spinning sensor takes about 0.1 s for a scan. At 20 m/s it moves by 2 m in this time.
@@ -283,7 +283,7 @@ def deskew(
     rows = as_points(points)
     seen = blank_too_near(rows, _meters(min_range_m))
     try:
-        moments: NDArray[np.float64] = np.array(times, np.float64)
+        moments: Floats = np.array(times, np.float64)
     except (OverflowError, TypeError, ValueError) as exc:
         raise PointsError(f"got times that are not numbers ({exc}); expected ({len(rows)},) seconds") from exc
     if moments.shape != (len(rows),):
@@ -310,7 +310,7 @@ def deskew(
 
 def merge(
     scans: Sequence[ArrayLike], T_vehicle_sensor: Sequence[ArrayLike], *, min_range_m: float | Sequence[float] = 0.0
-) -> NDArray[np.float32]:
+) -> Floats32:
     """Join the scans of several sensors to one scan in the frame of the vehicle.
 
     Parameters
@@ -365,7 +365,7 @@ def _meters(min_range_m: float) -> float:
     return meters
 
 
-def _rows(content: bytes) -> NDArray[np.float64]:
+def _rows(content: bytes) -> Floats:
     """The numbers in a file of poses, (n, 8); ValueError says what else it holds."""
     first = next((line for line in content.splitlines() if line.partition(b"#")[0].strip()), b"")
     if not first:
@@ -385,7 +385,7 @@ def _line(content: bytes, k: int) -> int:
     return rows[k] if k < len(rows) else k + 1
 
 
-def _fits_better(other: NDArray[np.float64], poses: NDArray[np.float64]) -> bool:
+def _fits_better(other: Floats, poses: Floats) -> bool:
     """Whether one reading of the same quaternions is that of a vehicle, and the second is not.
 
     Where neither is, as for a camera's axes, a way that keeps its direction in the sensor decides.
@@ -398,7 +398,7 @@ def _fits_better(other: NDArray[np.float64], poses: NDArray[np.float64]) -> bool
     return bool(np.linalg.norm(other_way) > SAME_WAY > np.linalg.norm(way))
 
 
-def _up_and_way(poses: NDArray[np.float64]) -> tuple[float, NDArray[np.float64] | None]:
+def _up_and_way(poses: Floats) -> tuple[float, Floats | None]:
     """The mean of the z axes along z of the world, and of the directions of travel in the sensor; None if it stands."""
     up = float(poses[:, 2, 2].mean())
     kept = [0]
@@ -414,20 +414,14 @@ def _up_and_way(poses: NDArray[np.float64]) -> tuple[float, NDArray[np.float64] 
     return up, (ways / np.linalg.norm(ways, axis=1, keepdims=True).clip(1e-9)).mean(axis=0)
 
 
-def _directions(poses: NDArray[np.float64]) -> str:
+def _directions(poses: Floats) -> str:
     up, way = _up_and_way(poses)
     tilt = f"{math.degrees(math.acos(min(1.0, max(-1.0, up)))):.0f} deg from up"
     return tilt if way is None else f"{tilt} and that travels along {np.round(way, 1).tolist()}"
 
 
 @njit(cache=True, nogil=True)
-def fill_deskewed(
-    points: Points,
-    after_s: NDArray[np.float64],
-    velocity: NDArray[np.float64],
-    rate: NDArray[np.float64],
-    moved: Points,
-) -> None:
+def fill_deskewed(points: Points, after_s: Floats, velocity: Floats, rate: Floats, moved: Points) -> None:
     """Move points by the motion of the sensor (Rodrigues' formula for the turn and for its integral).
 
     after_s : (n,) float64; time of each point after the pose of the result [s].

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..types.perception import ROADS, PointLabels
-from ..types.points import Heights, Points
+from ..types.points import Heights, Mask, Points
 from ..types.views import TopViewGeometry
 
 OTHER_GROUND = ("sidewalk", "terrain")
@@ -24,7 +24,7 @@ def knows_road(labels: PointLabels | None) -> bool:
     return labels is not None and not set(ROADS).isdisjoint(labels.classes)
 
 
-def nearest_is_road(points: Points, labels: PointLabels, height_m: Heights, view: TopViewGeometry) -> NDArray[np.bool_]:
+def nearest_is_road(points: Points, labels: PointLabels, height_m: Heights, view: TopViewGeometry) -> Mask:
     """Whether the return of the ground nearest to each cell, along its azimuth, is of the road, (rows, columns) bool.
 
     points : (n, 4) float32; in the frame of the view.

@@ -24,7 +24,7 @@ from ..types.frame import ModelFrame, quaternion
 from ..types.geometry import draw_footprints
 from ..types.mounting import MODEL_HEIGHT_M, MODEL_MOUNTING, Mounting
 from ..types.perception import Perception, TopView
-from ..types.points import Heights, Mask, Points, as_points, read_only
+from ..types.points import Floats, Floats32, Heights, Ints, Mask, Points, as_points, read_only
 from ..types.sensor import SensorProfile, get_sensor
 from ..types.views import TopViewGeometry
 from .around import knows_road, nearest_is_road
@@ -62,10 +62,10 @@ class OccupancyGrid:
         the frame of the cells.
     """
 
-    drivable: NDArray[np.bool_]
-    obstacle: NDArray[np.bool_]
+    drivable: Mask
+    obstacle: Mask
     height_m: Heights
-    observed: NDArray[np.bool_]
+    observed: Mask
     cell_m: float
     x_range_m: tuple[float, float]
     y_range_m: tuple[float, float]
@@ -73,7 +73,7 @@ class OccupancyGrid:
     mounting: Mounting = MODEL_MOUNTING
 
     @property
-    def unknown(self) -> NDArray[np.bool_]:
+    def unknown(self) -> Mask:
         """Cells that no ray observed and no obstacle is known in, (rows, columns) bool."""
         return ~self.observed & ~self.obstacle
 
@@ -334,7 +334,7 @@ def _returns_of(perception: Perception, points: ArrayLike, profile: SensorProfil
     return read_only(without_drops(moved, profile, frame.eye)[0]) if perception.health.has_drops else moved
 
 
-def _drivable(top_view: TopView | None, view: TopViewGeometry) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+def _drivable(top_view: TopView | None, view: TopViewGeometry) -> tuple[Mask, Mask]:
     """Cells of ``view`` of which more than half is drivable, and those of which more than half is in the top view."""
     shape = (view.height, view.width)
     if top_view is None:
@@ -353,13 +353,7 @@ def _drivable(top_view: TopView | None, view: TopViewGeometry) -> tuple[NDArray[
 
 @njit(cache=True, nogil=True)
 def fill_standing(
-    points: Points,
-    height_m: Heights,
-    corner: NDArray[np.float64],
-    lowest: float,
-    overhead: float,
-    highest: NDArray[np.int32],
-    tallest: NDArray[np.float32],
+    points: Points, height_m: Heights, corner: Floats, lowest: float, overhead: float, highest: Ints, tallest: Floats32
 ) -> None:
     """Find what stands in each cell of a grid. Points higher than ``overhead`` above the ground are ignored.
 

@@ -12,10 +12,9 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..system.kernels import njit
-from ..types.points import Mask
+from ..types.points import Ints, Ints64, Mask
 
 REACHES = (1.0, 1.25, 1.5, 2.0, 4.0, 8.0)
 """Factors of the tolerance that are tried in turn if the outline has too many corners."""
@@ -28,19 +27,13 @@ class Outline:
     """The outline of connected cells. A cell's upper left corner has the cell's row and column."""
 
     # (k, 2) row and column of the corners, with the cells on the left. Shape (0, 2) if there are no cells.
-    outer: NDArray[np.int64]
-    holes: tuple[NDArray[np.int64], ...]
+    outer: Ints64
+    holes: tuple[Ints64, ...]
     factor: float  # no cell that is left out is farther than this many times the tolerance from the edges of the cells
 
 
 def outline_of(
-    cells: NDArray[np.bool_],
-    origin: tuple[float, float],
-    obstacles: NDArray[np.bool_],
-    in_holes: NDArray[np.bool_],
-    *,
-    tolerance: float,
-    max_corners: int,
+    cells: Mask, origin: tuple[float, float], obstacles: Mask, in_holes: Mask, *, tolerance: float, max_corners: int
 ) -> Outline:
     """Outline the connected cells that are nearest to a place.
 
@@ -103,7 +96,7 @@ def outline_of(
     return Outline(found[outer], tuple(ring for k, ring in enumerate(found) if k != outer), factor)
 
 
-def nearest_part(cells: NDArray[np.bool_], origin: tuple[float, float]) -> NDArray[np.bool_]:
+def nearest_part(cells: Mask, origin: tuple[float, float]) -> Mask:
     """The connected cells (rows, columns) around the one nearest to ``origin``; cells share sides."""
     part = np.zeros(cells.shape, np.bool_)
     rows, cols = np.nonzero(cells)
@@ -113,9 +106,7 @@ def nearest_part(cells: NDArray[np.bool_], origin: tuple[float, float]) -> NDArr
     return part
 
 
-def without_gaps(
-    cells: NDArray[np.bool_], addable: NDArray[np.bool_], origin: tuple[float, float], wanted: NDArray[np.bool_]
-) -> NDArray[np.bool_]:
+def without_gaps(cells: Mask, addable: Mask, origin: tuple[float, float], wanted: Mask) -> Mask:
     """The nearest part, without cells that touch only at a corner, and without holes that contain no wanted cell."""
     part = cells.copy()
     resolve_contacts(part, addable.copy())
@@ -130,20 +121,20 @@ def without_gaps(
     return part | holes
 
 
-def filled(cells: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def filled(cells: Mask) -> Mask:
     """The cells and their holes, in a grid whose border is not marked."""
     outside = np.empty_like(cells)
     mark_connected(~cells, 0, 0, outside)
     return ~outside
 
 
-def _grown(cells: NDArray[np.bool_], radius: float) -> NDArray[np.bool_]:
+def _grown(cells: Mask, radius: float) -> Mask:
     grown = np.empty_like(cells)
     fill_grown(cells, radius, grown)
     return grown
 
 
-def _opened(cells: NDArray[np.bool_], beside: NDArray[np.bool_], radius: float) -> NDArray[np.bool_]:
+def _opened(cells: Mask, beside: Mask, radius: float) -> Mask:
     """The cells without parts that no disc fits into. Without the second growth, corners would be round.
 
     ``beside`` are the other cells, grown by the radius.
@@ -151,7 +142,7 @@ def _opened(cells: NDArray[np.bool_], beside: NDArray[np.bool_], radius: float) 
     return cells & _grown(_grown(~beside, radius), radius)
 
 
-def rings_of(cells: NDArray[np.bool_]) -> list[NDArray[np.int64]]:
+def rings_of(cells: Mask) -> list[Ints64]:
     """Rings of corners (row, column) around cells of a grid whose border is not marked."""
     n_sides = sum(int(np.count_nonzero(cells & ~np.roll(cells, shift, axis))) for axis in (0, 1) for shift in (1, -1))
     corners, ends = np.empty((n_sides, 2), np.int64), np.empty(n_sides // 4 + 1, np.int64)
@@ -159,13 +150,7 @@ def rings_of(cells: NDArray[np.bool_]) -> list[NDArray[np.int64]]:
     return np.split(corners, ends[:n_rings])[:n_rings]
 
 
-def _needed(
-    rings: list[NDArray[np.int64]],
-    not_addable: NDArray[np.int32],
-    not_removable: NDArray[np.int32],
-    outer: int,
-    enough: int,
-) -> list[NDArray[np.int64]]:
+def _needed(rings: list[Ints64], not_addable: Ints, not_removable: Ints, outer: int, enough: int) -> list[Ints64]:
     """The rings with the corners that `mark_needed` keeps."""
     corners, ends = np.concatenate(rings), np.cumsum([len(ring) for ring in rings], dtype=np.int64)
     kept = np.ones(len(corners), np.bool_)
@@ -173,12 +158,12 @@ def _needed(
     return [ring[few] for ring, few in zip(rings, np.split(kept, ends[:-1]), strict=True)]
 
 
-def _area(ring: NDArray[np.int64]) -> int:
+def _area(ring: Ints64) -> int:
     row, col = ring.T
     return int(row @ np.roll(col, -1) - col @ np.roll(row, -1))
 
 
-def row_sums(cells: NDArray[np.bool_]) -> NDArray[np.int32]:
+def row_sums(cells: Mask) -> Ints:
     """Number of cells of each row before each column that are not marked, (rows, columns + 1)."""
     sums = np.zeros((cells.shape[0], cells.shape[1] + 1), np.int32)
     np.cumsum(~cells, axis=1, out=sums[:, 1:])
@@ -186,7 +171,7 @@ def row_sums(cells: NDArray[np.bool_]) -> NDArray[np.int32]:
 
 
 @njit(cache=True, nogil=True)
-def fill_grown(cells: NDArray[np.bool_], radius: float, grown: NDArray[np.bool_]) -> None:
+def fill_grown(cells: Mask, radius: float, grown: Mask) -> None:
     """Mark the cells whose middle is within a distance of the middle of a marked cell.
 
     radius : in cells, 0 or more and finite.
@@ -214,7 +199,7 @@ def fill_grown(cells: NDArray[np.bool_], radius: float, grown: NDArray[np.bool_]
 
 
 @njit(cache=True, nogil=True)
-def resolve_contacts(cells: NDArray[np.bool_], addable: NDArray[np.bool_]) -> None:
+def resolve_contacts(cells: Mask, addable: Mask) -> None:
     """Add or remove cells until no two marked cells share only a corner.
 
     addable : (rows, columns) bool, modified; cells that may be added: of the two between such a pair, the one with the
@@ -242,7 +227,7 @@ def resolve_contacts(cells: NDArray[np.bool_], addable: NDArray[np.bool_]) -> No
 
 
 @njit(cache=True, nogil=True)
-def mark_connected(cells: NDArray[np.bool_], row: int, col: int, part: NDArray[np.bool_]) -> None:
+def mark_connected(cells: Mask, row: int, col: int, part: Mask) -> None:
     """Mark the cells that are connected to a start cell over shared sides.
 
     row, col : a marked cell of ``cells``, where the search begins.
@@ -266,7 +251,7 @@ def mark_connected(cells: NDArray[np.bool_], row: int, col: int, part: NDArray[n
 
 
 @njit(cache=True, nogil=True)
-def fill_rings(cells: NDArray[np.bool_], corners: NDArray[np.int64], ends: NDArray[np.int64]) -> int:
+def fill_rings(cells: Mask, corners: Ints64, ends: Ints64) -> int:
     """Trace the edges of marked cells, with the cells on the left.
 
     cells : (rows, columns) bool; none marked along the border.
@@ -311,7 +296,7 @@ def fill_rings(cells: NDArray[np.bool_], corners: NDArray[np.int64], ends: NDArr
 
 
 @njit(cache=True, nogil=True)
-def may_change(ar: int, ac: int, br: int, bc: int, cr: int, cc: int, fixed: NDArray[np.int32]) -> bool:
+def may_change(ar: int, ac: int, br: int, bc: int, cr: int, cc: int, fixed: Ints) -> bool:
     """Whether all cells that a triangle touches may change sides.
 
     ar, ac, br, bc, cr, cc : row and column of its corners.
@@ -359,7 +344,7 @@ def meet(ar: int, ac: int, br: int, bc: int, cr: int, cc: int, dr: int, dc: int)
 
 
 @njit(cache=True, nogil=True)
-def is_apart(ring: NDArray[np.int64], edges: NDArray[np.int64], k: int, pr: int, pc: int) -> bool:
+def is_apart(ring: Ints64, edges: Ints64, k: int, pr: int, pc: int) -> bool:
     """Whether a ring stays valid with a corner p in place of its corners k and k + 1 (`merge_corners`)."""
     n = ring.shape[0]
     before, following, behind = (k - 1) % n, (k + 1) % n, (k + 2) % n
@@ -387,9 +372,7 @@ def is_apart(ring: NDArray[np.int64], edges: NDArray[np.int64], k: int, pr: int,
 
 
 @njit(cache=True, nogil=True)
-def merge_corners(
-    ring: NDArray[np.int64], edges: NDArray[np.int64], fixed: NDArray[np.int32], around: int, enough: int
-) -> int:
+def merge_corners(ring: Ints64, edges: Ints64, fixed: Ints, around: int, enough: int) -> int:
     """Replace two neighboring corners of a ring by one; smallest changes first.
 
     Between the neighbors a and d, the corner p replaces b and c. What changes sides lies in the triangles pab, pbc and
@@ -462,13 +445,7 @@ def merge_corners(
 
 @njit(cache=True, nogil=True)
 def mark_needed(
-    corners: NDArray[np.int64],
-    ends: NDArray[np.int64],
-    not_addable: NDArray[np.int32],
-    not_removable: NDArray[np.int32],
-    outer: int,
-    enough: int,
-    kept: Mask,
+    corners: Ints64, ends: Ints64, not_addable: Ints, not_removable: Ints, outer: int, enough: int, kept: Mask
 ) -> None:
     """Remove corners of rings that neither touch nor cross; smallest triangles first.
 

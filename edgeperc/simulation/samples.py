@@ -7,11 +7,11 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..types.geometry import inside
 from ..types.mounting import Mounting
 from ..types.perception import Box
+from ..types.points import Bytes
 from ..types.sensor import SensorProfile
 from .camera import CAMERA_CLASSES, true_classes
 from .drawn import random_scene
@@ -93,7 +93,7 @@ def _is_free(scene: Scene, x: float, y: float, yaw: float) -> bool:
     return True
 
 
-def labels_by_boxes(scan: SimulatedScan) -> NDArray[np.uint8]:
+def labels_by_boxes(scan: SimulatedScan) -> Bytes:
     """Label the points of a simulated scan by its boxes, as in KITTI: (n,) uint8, index into `POINT_CLASSES`.
 
     Every point in a box gets the class of the object, including ground points, if the object itself has returns.
@@ -107,7 +107,7 @@ def labels_by_boxes(scan: SimulatedScan) -> NDArray[np.uint8]:
     return labels
 
 
-def labels_of_scene(scan: SimulatedScan) -> NDArray[np.uint8]:
+def labels_of_scene(scan: SimulatedScan) -> Bytes:
     """As `labels_by_boxes`, with the background told apart by its surfaces: index into `SCENE_CLASSES`."""
     labels, surface = labels_by_boxes(scan), true_classes(scan)
     lawn = (surface == _TREE) & (scan.surfaces == -1)

@@ -9,9 +9,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..system.kernels import njit
+from ..types.points import Floats
 from .ukf import fill_inverse
 
 MAX_ROUNDS = 12
@@ -20,12 +20,7 @@ MAX_PROPOSALS = 256
 
 @njit(cache=True, nogil=True)
 def fit_motion(
-    landmarks: NDArray[np.float64],
-    detections: NDArray[np.float64],
-    prior: NDArray[np.float64],
-    prior_variances: NDArray[np.float64],
-    motion: NDArray[np.float64],
-    covariance: NDArray[np.float64],
+    landmarks: Floats, detections: Floats, prior: Floats, prior_variances: Floats, motion: Floats, covariance: Floats
 ) -> int:
     """Fit the rigid motion that moves detections to the predicted positions of tracks.
 
@@ -121,13 +116,7 @@ def fit_motion(
 
 
 @njit(cache=True, nogil=True)
-def support(
-    landmarks: NDArray[np.float64],
-    detections: NDArray[np.float64],
-    prior: NDArray[np.float64],
-    prior_variances: NDArray[np.float64],
-    motion: NDArray[np.float64],
-) -> float:
+def support(landmarks: Floats, detections: Floats, prior: Floats, prior_variances: Floats, motion: Floats) -> float:
     """Score a motion: minus its distance from the prior, minus the robust distances of all tracks; at most 0.
 
     The robust distance is Geman and McClure's r2 / (1 + r2 / 9) / 2. It is below 4.5, the cost of a track without a
@@ -143,9 +132,7 @@ def support(
 
 
 @njit(cache=True, nogil=True)
-def nearest_detection(
-    landmark: NDArray[np.float64], detections: NDArray[np.float64], motion: NDArray[np.float64]
-) -> tuple[int, float]:
+def nearest_detection(landmark: Floats, detections: Floats, motion: Floats) -> tuple[int, float]:
     """Find the detection nearest to a landmark (4,) under a motion (3,).
 
     Returns its index, -1 if there is none of the same group, and the squared distance in variances.

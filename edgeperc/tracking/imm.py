@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-import numpy as np
-from numpy.typing import NDArray
-
 from ..system.kernels import njit
+from ..types.points import Floats
 
 
 @njit(cache=True, nogil=True)
 def fill_interaction(
-    states: NDArray[np.float64],
-    covariances: NDArray[np.float64],
-    probabilities: NDArray[np.float64],
-    stay: NDArray[np.float64],
-    mixed: NDArray[np.float64],
-    mixed_covariances: NDArray[np.float64],
-    prior: NDArray[np.float64],
+    states: Floats,
+    covariances: Floats,
+    probabilities: Floats,
+    stay: Floats,
+    mixed: Floats,
+    mixed_covariances: Floats,
+    prior: Floats,
 ) -> None:
     """Mix the estimates of the motion models by a Markov chain (KUL-Seg's "interaction").
 
@@ -51,11 +49,7 @@ def fill_interaction(
 
 @njit(cache=True, nogil=True)
 def fill_mode_probabilities(
-    prior: NDArray[np.float64],
-    likelihoods: NDArray[np.float64],
-    beta: NDArray[np.float64],
-    shares: NDArray[np.float64],
-    probabilities: NDArray[np.float64],
+    prior: Floats, likelihoods: Floats, beta: Floats, shares: Floats, probabilities: Floats
 ) -> None:
     """Update the probability of each motion model by the association (KUL-Seg's "mode probability update").
 
@@ -104,11 +98,7 @@ def fill_mode_probabilities(
 
 @njit(cache=True, nogil=True)
 def fill_combined(
-    states: NDArray[np.float64],
-    covariances: NDArray[np.float64],
-    probabilities: NDArray[np.float64],
-    state: NDArray[np.float64],
-    covariance: NDArray[np.float64],
+    states: Floats, covariances: Floats, probabilities: Floats, state: Floats, covariance: Floats
 ) -> None:
     """Combine the estimates of the motion models into one for each track (KUL-Seg's "combination").
 

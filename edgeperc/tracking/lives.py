@@ -5,10 +5,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..system.kernels import njit
-from ..types.points import Mask
+from ..types.points import Floats, Ints64, Mask, Records
 from .jpda import Detections
 
 # Complete state of a track. The tracker replaces it as a whole, so a scan that raises an error changes nothing.
@@ -84,7 +83,7 @@ MOST_HIDDEN = 0.9
 
 
 @njit(cache=True, nogil=True)
-def fill_newborn(first_id: int, detections: Detections, classes: NDArray[np.void], tracks: NDArray[np.void]) -> None:
+def fill_newborn(first_id: int, detections: Detections, classes: Records, tracks: Records) -> None:
     """Begin a track at each detection, with speed 0.
 
     first_id : id of the first new track.
@@ -123,9 +122,7 @@ def fill_newborn(first_id: int, detections: Detections, classes: NDArray[np.void
 
 
 @njit(cache=True, nogil=True)
-def mark_out_of_view(
-    tracks: NDArray[np.void], pose: NDArray[np.float64], left: float, right: float, reported: NDArray[np.bool_]
-) -> None:
+def mark_out_of_view(tracks: Records, pose: Floats, left: float, right: float, reported: Mask) -> None:
     """Exclude undetected tracks from the report if a corner of the footprint is outside the field of view.
 
     pose : (4, 4) float64; T_world_sensor.
@@ -148,13 +145,7 @@ def mark_out_of_view(
 
 
 @njit(cache=True, nogil=True)
-def fill_hidden(
-    state: NDArray[np.float64],
-    shape: NDArray[np.float64],
-    seen: Mask,
-    sensor: NDArray[np.float64],
-    hidden: NDArray[np.float64],
-) -> None:
+def fill_hidden(state: Floats, shape: Floats, seen: Mask, sensor: Floats, hidden: Floats) -> None:
     """Compute the share of each track that other tracks hide from the sensor.
 
     state : (n, 5) float64; x, y [m], v [m/s], heading [rad], turn rate [rad/s].
@@ -187,9 +178,7 @@ def fill_hidden(
 
 
 @njit(cache=True, nogil=True)
-def mark_rivals(
-    state: NDArray[np.float64], shape: NDArray[np.float64], order: NDArray[np.int64], reported: NDArray[np.bool_]
-) -> None:
+def mark_rivals(state: Floats, shape: Floats, order: Ints64, reported: Mask) -> None:
     """Exclude a track from the report if its center lies in the footprint of a stronger track, or vice versa.
 
     Two objects cannot occupy one place. A cyclist, for example, is often detected as a pedestrian too.
@@ -219,14 +208,7 @@ def mark_rivals(
 
 
 @njit(cache=True, nogil=True)
-def update_shapes(
-    beta: NDArray[np.float64],
-    shapes: NDArray[np.float64],
-    sigmas: NDArray[np.float64],
-    walk: NDArray[np.float64],
-    shape: NDArray[np.float64],
-    variance: NDArray[np.float64],
-) -> None:
+def update_shapes(beta: Floats, shapes: Floats, sigmas: Floats, walk: Floats, shape: Floats, variance: Floats) -> None:
     """Smooth the height of the center and the size by Kalman filters; in place.
 
     shapes : (m, 4) float64; height of the center, length, width, height [m].
@@ -251,13 +233,13 @@ def update_shapes(
 
 @njit(cache=True, nogil=True)
 def update_fronts(
-    state: NDArray[np.float64],
-    speed_sigma: NDArray[np.float64],
-    moving_mps: NDArray[np.float64],
-    beta: NDArray[np.float64],
-    detections: NDArray[np.float64],
-    told: NDArray[np.float64],
-    fronts: NDArray[np.float64],
+    state: Floats,
+    speed_sigma: Floats,
+    moving_mps: Floats,
+    beta: Floats,
+    detections: Floats,
+    told: Floats,
+    fronts: Floats,
 ) -> None:
     """Collect evidence that the heading of each track points to its front and not to its rear; in place.
 
@@ -287,13 +269,7 @@ def update_fronts(
 
 @njit(cache=True, nogil=True)
 def update_lives(
-    tracks: NDArray[np.void],
-    classes: NDArray[np.void],
-    beta: NDArray[np.float64],
-    hidden: NDArray[np.float64],
-    logits: NDArray[np.float64],
-    kinds: NDArray[np.int64],
-    dt: float,
+    tracks: Records, classes: Records, beta: Floats, hidden: Floats, logits: Floats, kinds: Ints64, dt: float
 ) -> None:
     """Update hits, misses and detection of each track, its label by majority, and its existence; in place.
 

@@ -6,13 +6,13 @@ import math
 from collections.abc import Collection, Iterable
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from ..errors import OptionError, PointsError
 from ..system.kernels import njit
 from ..types.choices import VEHICLES
 from ..types.perception import Box, Perception
-from ..types.points import Mask, Points, as_points, read_only
+from ..types.points import Floats, Mask, Points, as_points, read_only
 from . import Track
 from .tracks import PARAMETERS
 
@@ -57,7 +57,7 @@ def moving_points(
     margin_m: float = 0.2,
     min_speed_mps: float | None = None,
     n_sigmas: float = 3.0,
-) -> NDArray[np.bool_]:
+) -> Mask:
     """Mark the points inside the boxes of tracks that move over ground.
 
     Parameters
@@ -88,12 +88,8 @@ def moving_points(
 
 
 def movable_points(
-    perception: Perception,
-    points: ArrayLike,
-    *,
-    classes: Collection[str] = MOVABLE,
-    margin_m: float = 0.2,
-) -> NDArray[np.bool_]:
+    perception: Perception, points: ArrayLike, *, classes: Collection[str] = MOVABLE, margin_m: float = 0.2
+) -> Mask:
     """Mark the points on things that could move, whether they move or not: by the classes of points and by boxes.
 
     Parameters
@@ -131,7 +127,7 @@ def movable_points(
     return found
 
 
-def _inside_any(boxes: list[Box], points: Points, margin_m: float) -> NDArray[np.bool_]:
+def _inside_any(boxes: list[Box], points: Points, margin_m: float) -> Mask:
     if not 0.0 <= margin_m < math.inf:
         raise OptionError(f"margin_m is {margin_m}; expected 0 or more meters")
     rows = [
@@ -144,7 +140,7 @@ def _inside_any(boxes: list[Box], points: Points, margin_m: float) -> NDArray[np
 
 
 @njit(cache=True, nogil=True)
-def mark_in_boxes(boxes: NDArray[np.float64], points: Points, inside: Mask) -> None:
+def mark_in_boxes(boxes: Floats, points: Points, inside: Mask) -> None:
     """Mark the points inside at least one box.
 
     boxes : (m, 8) float64, C-contiguous, read-only; x, y, z of the center, half length, half width, half height [m],

@@ -10,9 +10,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..system.kernels import njit
+from ..types.points import Floats
 
 CONSTANT_VELOCITY, CTRV, RANDOM_MOTION = 0, 1, 2
 MODES = ("constant_velocity", "constant_turn", "random_motion")
@@ -24,12 +24,7 @@ STRAIGHT_RAD_S = 1e-4  # below this turn rate, arc and chord differ by less than
 
 @njit(cache=True, nogil=True)
 def fill_predictions(
-    states: NDArray[np.float64],
-    covariances: NDArray[np.float64],
-    noise: NDArray[np.float64],
-    dt: float,
-    means: NDArray[np.float64],
-    predicted: NDArray[np.float64],
+    states: Floats, covariances: Floats, noise: Floats, dt: float, means: Floats, predicted: Floats
 ) -> None:
     """Predict each motion model of each track with sigma points (KUL-Seg's "prediction").
 
@@ -71,7 +66,7 @@ def fill_predictions(
 
 
 @njit(cache=True, nogil=True)
-def move(mode: int, state: NDArray[np.float64], dt: float) -> None:
+def move(mode: int, state: Floats, dt: float) -> None:
     """Predict one state (5,) by ``dt`` [s], in place; the turn rate becomes 0 except with CTRV."""
     v, heading, turn = state[2], state[3], state[4]
     if mode == CONSTANT_VELOCITY:
@@ -94,9 +89,7 @@ def move(mode: int, state: NDArray[np.float64], dt: float) -> None:
 
 
 @njit(cache=True, nogil=True)
-def fill_process_noise(
-    mode: int, heading: float, noise: NDArray[np.float64], dt: float, process: NDArray[np.float64]
-) -> None:
+def fill_process_noise(mode: int, heading: float, noise: Floats, dt: float, process: Floats) -> None:
     """Compute the process noise of one motion model: white accelerations, random walks of position and heading.
 
     heading : heading before the prediction [rad].
@@ -128,13 +121,13 @@ def fill_process_noise(
 
 @njit(cache=True, nogil=True)
 def fill_updates(
-    means: NDArray[np.float64],
-    predicted: NDArray[np.float64],
-    detections: NDArray[np.float64],
-    sigmas: NDArray[np.float64],
-    beta: NDArray[np.float64],
-    states: NDArray[np.float64],
-    covariances: NDArray[np.float64],
+    means: Floats,
+    predicted: Floats,
+    detections: Floats,
+    sigmas: Floats,
+    beta: Floats,
+    states: Floats,
+    covariances: Floats,
 ) -> None:
     """Update each motion model of each track with all detections, weighted by their association (PDA filter).
 
@@ -201,9 +194,7 @@ def fill_updates(
 
 
 @njit(cache=True, nogil=True)
-def fill_innovation(
-    heading: float, cov: NDArray[np.float64], sigmas: NDArray[np.float64], innovation: NDArray[np.float64]
-) -> None:
+def fill_innovation(heading: float, cov: Floats, sigmas: Floats, innovation: Floats) -> None:
     """Compute the innovation covariance (3, 3); the noise of a detection is along and across the heading."""
     cos, sin = math.cos(heading), math.sin(heading)
     along, across, turn = sigmas[0] * sigmas[0], sigmas[1] * sigmas[1], sigmas[2] * sigmas[2]
@@ -216,7 +207,7 @@ def fill_innovation(
 
 
 @njit(cache=True, nogil=True)
-def fill_inverse(matrix: NDArray[np.float64], inverse: NDArray[np.float64]) -> None:
+def fill_inverse(matrix: Floats, inverse: Floats) -> None:
     """Invert a symmetric positive definite (3, 3) matrix into ``inverse``, by cofactors."""
     a, b, c = matrix[0, 0], matrix[0, 1], matrix[0, 2]
     d, e, f = matrix[1, 1], matrix[1, 2], matrix[2, 2]
@@ -230,7 +221,7 @@ def fill_inverse(matrix: NDArray[np.float64], inverse: NDArray[np.float64]) -> N
 
 
 @njit(cache=True, nogil=True)
-def fill_cholesky(matrix: NDArray[np.float64], root: NDArray[np.float64]) -> None:
+def fill_cholesky(matrix: Floats, root: Floats) -> None:
     """Compute the lower Cholesky root (5, 5); a pivot that is negative by rounding counts as 0."""
     root[:] = 0.0
     for a in range(5):

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..errors import PointsError
 from ..system.kernels import njit
 from .perception import Box
-from .points import Labels, Mask, read_only
+from .points import Floats, Ints64, Labels, Mask, Records, read_only
 from .views import TopViewGeometry
 
 # A box as kernels take it.
@@ -47,7 +47,7 @@ class Grid(NamedTuple):
     cell: float
 
 
-Angle = TypeVar("Angle", float, NDArray[np.float64])
+Angle = TypeVar("Angle", float, Floats)
 
 
 def wrapped(angle: Angle) -> Angle:
@@ -73,9 +73,7 @@ def draw_footprints(labels: Labels, boxes: Iterable[Box], view: TopViewGeometry,
         labels[:] = drawn
 
 
-def box_records(
-    boxes: Sequence[Box], labels: Sequence[int], margin_m: float = 0.0, above_m: float = 0.0
-) -> NDArray[np.void]:
+def box_records(boxes: Sequence[Box], labels: Sequence[int], margin_m: float = 0.0, above_m: float = 0.0) -> Records:
     """Boxes as kernels take them, (m,) `BOX`.
 
     margin_m, above_m : by which footprints grow on every side, and tops upwards [m].
@@ -96,13 +94,13 @@ def box_records(
     return np.array(rows, BOX)
 
 
-def rectangles(boxes: Iterable[Box]) -> NDArray[np.float64]:
+def rectangles(boxes: Iterable[Box]) -> Floats:
     """Footprints of boxes, (n, 5): x, y, length, width [m], yaw [rad]."""
     rows = [(*box.center[:2], *box.size[:2], box.yaw) for box in boxes]
     return np.array(rows, dtype=np.float64).reshape(-1, 5)
 
 
-def oriented_iou(a: ArrayLike, b: ArrayLike) -> NDArray[np.float64]:
+def oriented_iou(a: ArrayLike, b: ArrayLike) -> Floats:
     """Intersection over union of every rectangle of ``a`` with every rectangle of ``b`` (SSADNet equation A1).
 
     a : (n, 5) array_like; x, y, length, width [m], yaw [rad].
@@ -115,7 +113,7 @@ def oriented_iou(a: ArrayLike, b: ArrayLike) -> NDArray[np.float64]:
     return iou
 
 
-def shared_area(iou: NDArray[np.float64], a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+def shared_area(iou: Floats, a: Floats, b: Floats) -> Floats:
     """Area [m2] that rectangles share, from their overlap: ``iou = shared / (area of a + area of b - shared)``.
 
     iou : (n, m) float64; `oriented_iou` of ``a`` and ``b``.
@@ -127,7 +125,7 @@ def shared_area(iou: NDArray[np.float64], a: NDArray[np.float64], b: NDArray[np.
 
 def suppress_overlaps(
     rectangles: ArrayLike, scores: ArrayLike, iou_threshold: ArrayLike, *, max_inside: float = math.inf
-) -> NDArray[np.int64]:
+) -> Ints64:
     """Greedy non-maximum suppression of oriented rectangles.
 
     rectangles : (n, 5) array_like; x, y, length, width [m], yaw [rad].
@@ -152,7 +150,7 @@ def suppress_overlaps(
     return order[keep]
 
 
-def bounding_rectangles(rectangles: ArrayLike) -> NDArray[np.float64]:
+def bounding_rectangles(rectangles: ArrayLike) -> Floats:
     """Axis-aligned bounds of rectangles, as rectangles of yaw 0.
 
     rectangles : (n, 5) array_like; x, y, length, width [m], yaw [rad].
@@ -167,7 +165,7 @@ def bounding_rectangles(rectangles: ArrayLike) -> NDArray[np.float64]:
     return bounds
 
 
-def _as_rectangles(given: ArrayLike) -> NDArray[np.float64]:
+def _as_rectangles(given: ArrayLike) -> Floats:
     rows = read_only(given, np.float64)
     if rows.size == 0:
         rows = rows.reshape(0, 5)
@@ -177,7 +175,7 @@ def _as_rectangles(given: ArrayLike) -> NDArray[np.float64]:
 
 
 @njit(cache=True, nogil=True)
-def fill_footprints(boxes: NDArray[np.void], grid: Grid, labels: Labels) -> None:
+def fill_footprints(boxes: Records, grid: Grid, labels: Labels) -> None:
     """Write the label of each `BOX`, (m,), into the cells whose centers lie in its footprint, one after the other."""
     x_far, y_left, cell_m = grid
     n_rows, n_cols = labels.shape
@@ -215,7 +213,7 @@ def cell_at(grid: Grid, shape: tuple[int, int], x: float, y: float) -> tuple[int
 
 
 @njit(cache=True, nogil=True)
-def fill_oriented_iou(a: NDArray[np.float64], b: NDArray[np.float64], iou: NDArray[np.float64]) -> None:
+def fill_oriented_iou(a: Floats, b: Floats, iou: Floats) -> None:
     """Compute the overlap (IoU) of every pair.
 
     b : (m, 5) float64, C-contiguous; x, y, length, width [m], yaw [rad].
@@ -226,7 +224,7 @@ def fill_oriented_iou(a: NDArray[np.float64], b: NDArray[np.float64], iou: NDArr
 
 
 @njit(cache=True, nogil=True)
-def mark_nms(rectangles: NDArray[np.float64], limits: NDArray[np.float64], max_inside: float, keep: Mask) -> None:
+def mark_nms(rectangles: Floats, limits: Floats, max_inside: float, keep: Mask) -> None:
     """Mark the rectangles that overlap no better kept rectangle too much.
 
     rectangles : (n, 5) float64, C-contiguous; best first.
@@ -248,7 +246,7 @@ def mark_nms(rectangles: NDArray[np.float64], limits: NDArray[np.float64], max_i
 
 
 @njit(cache=True, nogil=True)
-def pair_iou(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
+def pair_iou(a: Floats, b: Floats) -> float:
     """IoU of two rectangles (5,); the second is clipped by the first in the frame of the first."""
     area_a = a[2] * a[3]
     area_b = b[2] * b[3]
@@ -304,7 +302,7 @@ def pair_iou(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
     return float(shared / (area_a + area_b - shared))
 
 
-def inside(box: Box, points: NDArray[Any], margin_m: float = 0.0) -> NDArray[np.bool_]:
+def inside(box: Box, points: NDArray[Any], margin_m: float = 0.0) -> Mask:
     """Find the points inside a box.
 
     points : (n, 3 or more) array; x, y, z [m] in the frame of the box.

@@ -12,7 +12,13 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from ..errors import OptionError, PointsError
 
-# Arrays by what they hold; n points.
+# Arrays by the type of their numbers, and by what they hold; n points.
+Floats = NDArray[np.float64]
+Floats32 = NDArray[np.float32]
+Ints = NDArray[np.int32]
+Ints64 = NDArray[np.int64]
+Bytes = NDArray[np.uint8]
+Records = NDArray[np.void]
 Points = NDArray[np.float32]  # (n, 4): x, y, z [m], remission
 Heights = NDArray[np.float32]  # (n,): above the ground below [m]; NaN for points that are not finite
 Labels = NDArray[np.uint8]  # (n,) or (rows, columns): index of a class

@@ -8,10 +8,11 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from ..errors import CardError
 from ..system.fields import Fields
+from .points import Floats, Ints64, Mask
 
 MAX_ROWS, MAX_COLUMNS, MAX_PIXELS = 4096, 65_536, 16 * 10**6
 MIN_SECTOR_DEG = 1.0
@@ -69,7 +70,7 @@ class TopViewGeometry:
         (near, far), (right, left) = self.x_range_m, self.y_range_m
         return near <= x < far and right <= y < left
 
-    def cells(self, x: ArrayLike, y: ArrayLike) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]:
+    def cells(self, x: ArrayLike, y: ArrayLike) -> tuple[Ints64, Ints64, Mask]:
         """Find the cells that contain some positions.
 
         x, y : array_like; positions in the sensor frame [m]; their shapes must broadcast.
@@ -83,7 +84,7 @@ class TopViewGeometry:
         with np.errstate(invalid="ignore"):  # NaN and what int64 cannot hold are out of view
             return row.astype(np.int64), col.astype(np.int64), in_view
 
-    def cell_centers(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def cell_centers(self) -> tuple[Floats, Floats]:
         """Centers of the cells in the sensor frame [m]: x (rows, 1) and y (1, columns)."""
         # np.float64, because older type stubs of numpy widen the type of a product with a Python float
         cell_m = np.float64(self.cell_m)

@@ -9,7 +9,6 @@ from functools import partial
 from itertools import chain
 
 import numpy as np
-from numpy.typing import NDArray
 
 from edgeperc.datasets.layout import class_number
 from edgeperc.ground.planes import find_ground
@@ -20,6 +19,7 @@ from edgeperc.simulation.scene import POINT_CLASSES
 from edgeperc.types.geometry import inside
 from edgeperc.types.mounting import MODEL_HEIGHT_M
 from edgeperc.types.perception import Box
+from edgeperc.types.points import Floats32, Ints64, Points
 from edgeperc.types.sensor import SensorProfile
 
 from .beams import taken_by
@@ -48,7 +48,7 @@ AHEAD_SLOPE, AHEAD_MARGIN_M = 1.43, 2.0
 class ObjectBank:
     """Objects cut out of labeled scans, to paste into others (ground-truth sampling of SECOND; Yan et al., 2018)."""
 
-    objects: dict[str, list[tuple[Box, NDArray[np.float32]]]]  # label -> boxes and the points in them
+    objects: dict[str, list[tuple[Box, Floats32]]]  # label -> boxes and the points in them
     classes: tuple[str, ...] = POINT_CLASSES  # classes of points that pasted objects get, the background first
 
     @classmethod
@@ -63,16 +63,14 @@ class ObjectBank:
 
         ``n_workers`` processes look for them; 0: this one. The bank is the same.
         """
-        objects: dict[str, list[tuple[Box, NDArray[np.float32]]]] = {}
+        objects: dict[str, list[tuple[Box, Floats32]]] = {}
         with mapped(partial(_cut_out, fewest=fewest, classes=classes), scans, n_workers) as found:
             for name, piece in chain.from_iterable(found):
                 objects.setdefault(name, []).append(piece)
         return cls(objects, classes)
 
 
-def _cut_out(
-    scan: LabeledScan, *, fewest: int, classes: tuple[str, ...]
-) -> list[tuple[str, tuple[Box, NDArray[np.float32]]]]:
+def _cut_out(scan: LabeledScan, *, fewest: int, classes: tuple[str, ...]) -> list[tuple[str, tuple[Box, Floats32]]]:
     """The objects of one scan and pieces of its background, each with its kind."""
     found = []
     for box, count in zip(scan.boxes, scan.counts, strict=True):
@@ -86,7 +84,7 @@ def _cut_out(
     return found + [(box.label, (box, points)) for box, points in background_pieces(scan, fewest)]
 
 
-def background_pieces(scan: LabeledScan, fewest: int = 8) -> Iterator[tuple[Box, NDArray[np.float32]]]:
+def background_pieces(scan: LabeledScan, fewest: int = 8) -> Iterator[tuple[Box, Floats32]]:
     """Poles, trunks and signs, and pieces of walls, hedges and banks, cut out of what is known to be background.
 
     A pole is a cluster at most 0.9 m wide, between 0.4 and 1.8 m above the ground, that goes on above 2 m. A wall is a
@@ -203,7 +201,7 @@ def pasted(
     )
 
 
-def resized(box: Box, points: NDArray[np.float32], rng: np.random.Generator) -> tuple[Box, NDArray[np.float32]]:
+def resized(box: Box, points: Points, rng: np.random.Generator) -> tuple[Box, Floats32]:
     """An object 15 % smaller or larger and farther away by up to `MAX_STRETCH`, with one return in each ray."""
     x, y, z = box.center
     farthest = max(1.0, MAX_PERSON_RANGE_M / max(np.hypot(x, y), 1.0))
@@ -227,7 +225,7 @@ def _close(box: Box, other: Box) -> bool:
     return bool(apart < 0.45 * (np.hypot(*box.size[:2]) + np.hypot(*other.size[:2])))
 
 
-def _rays(points: NDArray[np.float32]) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+def _rays(points: Points) -> tuple[Ints64, Floats32]:
     """The ray number of each point, and its range [m]."""
     # The beams of an HDL-64E are 0.4 degrees apart, its columns 0.17.
     flat = np.hypot(points[:, 0], points[:, 1])

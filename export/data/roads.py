@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from edgeperc.errors import EdgepercError, MissingExtraError
 from edgeperc.simulation.samples import IGNORE
 from edgeperc.types.choices import VEHICLES
+from edgeperc.types.points import Bytes, Floats, Points
 from edgeperc.types.views import TopViewGeometry
 
 from .scans import SURFACE
@@ -29,7 +30,7 @@ LANE_RANGE_M = (3.0, 25.0)
 BRIGHTER = 0.15
 
 
-def ground_plane(points: NDArray[np.float32], seed: int = 0) -> NDArray[np.float64] | None:
+def ground_plane(points: Points, seed: int = 0) -> Floats | None:
     """The ground plane near the vehicle (RANSAC, then least squares).
 
     points : (n, 4) float32; x, y, z [m] in the frame of a sensor 1.73 m above the road, remission.
@@ -67,7 +68,7 @@ def ground_plane(points: NDArray[np.float32], seed: int = 0) -> NDArray[np.float
     return np.linalg.lstsq(np.c_[p[support, :2], np.ones(support.sum())], p[support, 2], rcond=None)[0]
 
 
-def sure_surface(points: NDArray[np.float32]) -> NDArray[np.uint8]:
+def sure_surface(points: Points) -> Bytes:
     """Ground truth of the cells of `SURFACE` that a scan makes certain.
 
     Low points in the lane ahead are road. Points above the ground, and areas brighter than the lane, are no road.
@@ -106,7 +107,7 @@ def sure_surface(points: NDArray[np.float32]) -> NDArray[np.uint8]:
     return surface
 
 
-def drawn_roads(path: Path = DRAWN) -> dict[str, NDArray[np.uint8]]:
+def drawn_roads(path: Path = DRAWN) -> dict[str, Bytes]:
     """Hand-drawn roads: hash of the scan (`edgeperc.datasets.kitti.scan_hash`) -> mask (400, 200) uint8, 1 road.
 
     The file keeps the hash as ``scan`` of each image, because names of scans differ between copies of KITTI.
@@ -119,7 +120,7 @@ def drawn_roads(path: Path = DRAWN) -> dict[str, NDArray[np.uint8]]:
     return {hashes[name]: mask_of(polygons, f"{path}: {name}") for name, polygons in drawn.items()}
 
 
-def with_road(surface: NDArray[np.uint8], road: NDArray[np.uint8]) -> NDArray[np.uint8]:
+def with_road(surface: Bytes, road: Bytes) -> Bytes:
     """Ground truth with a drawn road.
 
     surface : (500, 500) uint8; ground truth over `SURFACE`.
@@ -183,7 +184,7 @@ def read_coco(paths: Iterable[Path]) -> dict[str, list[Any]]:
     return roads
 
 
-def mask_of(segmentations: Sequence[Any], source: str = "a polygon") -> NDArray[np.uint8]:
+def mask_of(segmentations: Sequence[Any], source: str = "a polygon") -> Bytes:
     """The union of COCO segmentations, (400, 200) uint8: 1 inside, 0 outside (section 3.3).
 
     ``source`` starts the error message.

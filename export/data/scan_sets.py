@@ -14,7 +14,6 @@ from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 from tqdm import tqdm
 
 from edgeperc.datasets.kitti import scan_hash
@@ -32,6 +31,7 @@ from edgeperc.simulation.scene import POINT_CLASSES
 from edgeperc.types.frame import ModelFrame
 from edgeperc.types.geometry import draw_footprints
 from edgeperc.types.mounting import Mounting
+from edgeperc.types.points import Bytes, Ints, Labels, Points
 from edgeperc.types.sensor import SensorProfile
 from edgeperc.types.views import RangeImageGeometry
 
@@ -83,7 +83,7 @@ def read_scan_set(
 
 
 def labeled_scan(
-    frame: ScanFrame, points: NDArray[np.float32], mounting: Mounting, classes: Sequence[str] = POINT_CLASSES
+    frame: ScanFrame, points: Points, mounting: Mounting, classes: Sequence[str] = POINT_CLASSES
 ) -> LabeledScan:
     """A scan with its truth in the frame of the models.
 
@@ -118,7 +118,7 @@ def labeled_scan(
     )
 
 
-def _filled(cells: NDArray[np.uint8]) -> NDArray[np.uint8]:
+def _filled(cells: Bytes) -> Bytes:
     """Cells of `ROAD_CLASSES`, with road also between the returns.
 
     An unknown cell becomes road if three cells in the 1.4 m around it are road and no other one is known.
@@ -163,9 +163,7 @@ def _interpolator(view: RangeImageGeometry, sensor: SensorProfile) -> Interpolat
     return Interpolator(view, sensor)
 
 
-def _nearest_labels(
-    points: NDArray[np.float32], filled: NDArray[np.int32], index: NDArray[np.int32], labels: NDArray[np.uint8]
-) -> NDArray[np.uint8]:
+def _nearest_labels(points: Points, filled: Ints, index: Ints, labels: Labels) -> Bytes:
     """Label of the nearest of the next measured points left, right, above and below, (H, W) uint8.
 
     `IGNORE` without such a point, and where it is farther away than `NEAR_M` unless all are background: on the road,

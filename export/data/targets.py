@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from edgeperc.types.card import N_DENSE_CHANNELS, N_FRONT_CHANNELS
+from edgeperc.types.points import Floats, Floats32, Mask
 from edgeperc.types.views import TopViewGeometry
 
 STRIDE = 4
@@ -19,12 +20,8 @@ the true one, so the neighbors' geometry must be correct too."""
 
 
 def slot_targets(
-    boxes: ArrayLike,
-    view: TopViewGeometry,
-    *,
-    labeled: NDArray[np.bool_] | None = None,
-    unsure: ArrayLike | None = None,
-) -> NDArray[np.float32]:
+    boxes: ArrayLike, view: TopViewGeometry, *, labeled: Mask | None = None, unsure: ArrayLike | None = None
+) -> Floats32:
     """Targets of head "slots": each slot has a square of the view, and the upright box of the object centered there.
 
     view : height and width at least `SLOT_CELLS`.
@@ -55,7 +52,7 @@ def slot_targets(
     return target.reshape(-1, 5)
 
 
-def paper_slot_targets(boxes: ArrayLike, view: TopViewGeometry, n_slots: int) -> NDArray[np.float32]:
+def paper_slot_targets(boxes: ArrayLike, view: TopViewGeometry, n_slots: int) -> Floats32:
     """Targets of head "slots-paper": upright boxes around rotated footprints, nearest first (SSADNet 3.1.1).
 
     n_slots : number of boxes to keep, nearest first.
@@ -71,12 +68,8 @@ def paper_slot_targets(boxes: ArrayLike, view: TopViewGeometry, n_slots: int) ->
 
 
 def dense_targets(
-    boxes: ArrayLike,
-    view: TopViewGeometry,
-    *,
-    labeled: NDArray[np.bool_] | None = None,
-    unsure: ArrayLike | None = None,
-) -> NDArray[np.float32]:
+    boxes: ArrayLike, view: TopViewGeometry, *, labeled: Mask | None = None, unsure: ArrayLike | None = None
+) -> Floats32:
     """Heat map and geometry for head "dense".
 
     boxes : (m, 7) array_like; x, y, z of the center, length, width, height [m], yaw [rad], in the sensor frame.
@@ -117,9 +110,7 @@ def dense_targets(
     return target
 
 
-def _boxes_in_view(
-    boxes: ArrayLike, view: TopViewGeometry
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+def _boxes_in_view(boxes: ArrayLike, view: TopViewGeometry) -> tuple[Floats, Floats, Floats]:
     """Boxes whose center is in the view, and the rows and columns of the centers [cells from the far left corner]."""
     boxes = np.asarray(boxes, np.float64).reshape(-1, 7)
     if not (boxes[:, 3:6] > 0.0).all():
@@ -130,9 +121,7 @@ def _boxes_in_view(
     return boxes[inside], rows[inside], cols[inside]
 
 
-def _upright(
-    boxes: NDArray[np.float64], rows: NDArray[np.float64], cols: NDArray[np.float64], view: TopViewGeometry
-) -> NDArray[np.float64]:
+def _upright(boxes: Floats, rows: Floats, cols: Floats, view: TopViewGeometry) -> Floats:
     """Center column, center row, width and height of the upright boxes, (m, 4), as shares of the image's."""
     length, width, yaw = boxes[:, 3], boxes[:, 4], boxes[:, 6]
     across = np.abs(length * np.sin(yaw)) + np.abs(width * np.cos(yaw))
@@ -143,9 +132,7 @@ def _upright(
     )
 
 
-def _gaussian(
-    box: NDArray[np.float64], row: float, col: float, shape: tuple[int, int], cell_m: float
-) -> NDArray[np.float32]:
+def _gaussian(box: Floats, row: float, col: float, shape: tuple[int, int], cell_m: float) -> Floats32:
     """A bump of height 1 in the output cell that holds (row, col), as long and wide as the box."""
     forward = int(row) - np.arange(shape[0])[:, None]  # rows grow backwards, columns to the right
     left = int(col) - np.arange(shape[1])[None, :]
