@@ -27,17 +27,10 @@ def agree_on_cells(
     marks: Bytes,
     rules: Collection[str] = RULES,
 ) -> TopView:
-    """Correct the cells of a top view by boxes, points and obstacles.
+    """Correct the cells of a top view by boxes, points and obstacles (rules ``road`` and ``cells`` of
+    docs/concepts/agreement.md).
 
-    labels : from `agree_on_points`.
-    boxes : in the frame of the models.
     dropped : boxes of the top-view network that `agree_on_boxes` dropped; their vehicle cells become background.
-    marks : (rows, columns) uint8; from `mark_cells`.
-
-    Drivable cells whose center lies in a box get the class of the box, or background if the top view has no such
-    class. Drivable cells with a vehicle's or person's point become background, and those with a return 0.3 to 2 m
-    above the ground and another one in the 3 x 3 cells around it. So do vehicle cells out of the boxes with a point
-    in the range image's view, if none in the 3 x 3 cells has a vehicle's label.
     """
     of_road, of_vehicles = "road" in rules, "cells" in rules and labels is not None
     if not (of_road or of_vehicles):
@@ -59,10 +52,8 @@ def agree_on_cells(
 
 
 def mark_cells(view: TopView, scan: Scan, labels: PointLabels | None, rules: Collection[str] = RULES) -> Bytes:
-    """What the points show in each cell of a top view; it needs no boxes.
-
-    Bits of (rows, columns) uint8: 1 with an obstacle, 2 with a second one or an object, 4 with a vehicle's point, 8
-    with another point in view in a vehicle's cell.
+    """What the points show in each cell of a top view, in bits: 1 with an obstacle, 2 with a second one or an object, 4
+    with a vehicle's point, 8 with another point in view in a vehicle's cell.
     """
     if labels is None:
         nothing = np.zeros(len(scan.points), np.uint8)
@@ -86,11 +77,8 @@ def _footprints(view: TopView, boxes: Sequence[Box]) -> Bytes:
 
 @njit(cache=True, nogil=True)
 def fill_marks(cloud: Cloud, in_view: Mask, labeled: Labeled, by_height: bool, view: Cells, marks: Bytes) -> None:
-    """Write what the points show in each cell; see `mark_cells`.
-
-    labeled : roles are 1 for vehicles, 2 for persons, 0 for classes that are not objects.
-    by_height : whether returns above the ground are obstacles, whatever their label.
-    marks : (rows, columns) uint8, modified; zeros before.
+    """Write what the points show in each cell into ``marks``, zeros before; by roles 1 (vehicles) and 2 (persons), or
+    else by height alone.
     """
     points, height, labels, roles = cloud.points, cloud.height, labeled.labels, labeled.roles
     cells, is_vehicle, grid = view.labels, view.is_vehicle, view.grid
@@ -116,12 +104,8 @@ def fill_marks(cloud: Cloud, in_view: Mask, labeled: Labeled, by_height: bool, v
 
 @njit(cache=True, nogil=True)
 def clear_cells(marks: Bytes, marked: Ints64, drivable: int, is_vehicle: Mask, in_box: Mask, cells: Bytes) -> None:
-    """Make background of drivable cells with objects or obstacles, and of vehicle cells that the points contradict.
-
-    marks : (rows, columns) uint8; from `fill_marks`.
-    marked : (m,) int64; flat numbers of the cells with marks.
-    is_vehicle : (256,) bool; labels of cells that the points may contradict.
-    in_box : (rows, columns) bool; cells of vehicles that stay.
+    """Make background of drivable cells with objects or obstacles, and of vehicle cells that the points contradict,
+    unless ``in_box``; only the flat numbers ``marked`` have marks.
     """
     n_rows, n_cols = cells.shape
     for at in marked:

@@ -134,12 +134,10 @@ def find_voters(
     distance_per_m: float = 0.015,
     rules: Collection[str] = RULES,
 ) -> Ints:
-    """Cluster of every point, as far as it matters for `agree_on_points`; -1 for none, (n,) int32.
+    """Cluster of every point, as far as it matters for `agree_on_points`; -1 for none.
 
-    Labeled points of clusters in which too few points can have a label are in cluster -2: such a cluster is not
-    searched further as soon as that is certain, so a forest is not searched because of a few labels in it. The results
-    of `agree_on_points` and of `boxes.objects_from_points` are those for complete clusters. ``strips`` are
-    the points above the ground from `edgeperc.objects.cluster.sort_points`, with the same ``distance_per_m``.
+    Where too few points of a cluster can have a label, the labeled ones are in cluster -2 and the search ends, so a
+    forest is not searched because of a few labels in it. The results are those for complete clusters.
     """
     roles = roles_of(labels.classes)
     votes = np.empty(len(scan.points), np.uint8)
@@ -170,32 +168,12 @@ def agree_on_points(
     sight: Sight = EVERYTHING,
     rules: Collection[str] = RULES,
 ) -> PointLabels:
-    """Correct the labels of points by clusters, ground and boxes.
+    """Correct the labels of vehicles' and persons' points by clusters, ground and boxes, as docs/concepts/agreement.md
+    says.
 
-    scan : if its ground has no plane, rules that need heights are skipped.
-    labels : of vehicles (car, van, truck) and persons (pedestrian, cyclist); other classes are not changed.
-    clusters : (n,) int32, modified; from `find_voters`. A person that stays in a cluster that loses the label gets a
-        number of its own.
-    support : from `find_support`.
-    upright : (n,) uint8, modified; from `without_poles`.
-    view : without it, or if it has no class of vehicles, the rule ``"cells"`` is skipped.
-    sight : how high the sensor sees, of which 0.7 is high enough for any cluster.
-    rules : of `RULES`; others are left out.
-
-    First, a person's point becomes background if the points within about 0.3 m around go on to above 2.0 m (cyclist:
-    2.2 m) without a gap of more than 0.3 m. Each cluster then votes, by the shares of its points in view. It loses its
-    vehicle labels if less than 0.6 of its points have them (0.75 if it is longer than 10 m or higher than 4 m), or if
-    it is lower than 0.5 m (1.0 m within 30 m), or if all of it is within 2.6 m, it is shorter than 2 m or lower than
-    1.7 m, and less than 0.1 of it is labeled as a person's, or if at least 0.8 of its points are in both views and none
-    of them lies in a cell of a vehicle; labels in a box with a score of 0.3 stay. It loses its person labels below a
-    share of 0.1 or a height of 1.0 m. A share of 0.6 gives the class to all of its points in view; persons are cyclists
-    if a quarter of them is labeled so. A cluster up to 2.3 m long whose upper quarter is at most 0.8 m wide is one
-    person from a share of 0.2 on: a cyclist if longer than 1.1 m, more than a stride; from a share of 0.3 and with a
-    height from 1.3 to 2.0 m, with all of its points in view. Where a cluster loses a person's labels, a group of them
-    of that size stays if it is at least 1.4 m high and 0.15 m wide and has 0.7 of the points in its place. A box with a
-    score of 0.5 makes the points above the ground in it vehicle points, except persons. Boxes count only if a tenth of
-    their points in view have a vehicle's label. Last, points on the ground keep a label only in cells of 0.2 m in which
-    an object of their kind stands; within 6 m, points lower than 0.06 m lose it.
+    clusters, upright : modified. A person that stays in a cluster that loses the label gets a number of its own.
+    view : without it, or if it has no class of vehicles, the rule ``"cells"`` is skipped; without a plane of the
+        ground, rules that need heights.
     """
     rules = _applicable(rules, scan.ground)
     agreed, in_view, roles = upright, labels.in_view, roles_of(labels.classes)
@@ -234,10 +212,8 @@ def without_poles(scan: Scan, labels: PointLabels, rules: Collection[str] = RULE
 def agree_on_boxes(
     boxes: Sequence[Box], scan: Scan, labels: PointLabels, rules: Collection[str] = RULES
 ) -> tuple[Box, ...]:
-    """Drop the uncertain vehicle boxes of a top-view network that the agreed labels of points contradict.
-
-    A box with a score below 0.5 goes if it holds no points above the ground, or if less than a tenth of its points in
-    view are vehicle points. Boxes whose points are all out of view stay.
+    """Drop the uncertain vehicle boxes of a top-view network that the agreed labels contradict: without points above
+    the ground, or with too few vehicle points. Boxes out of the range image's view stay.
     """
     roles = roles_of(labels.classes)
     doubted = [k for k, box in enumerate(boxes) if box.score < COMPLETING_SCORE and box.label in VEHICLES]
@@ -259,15 +235,7 @@ def stand_boxes(
     rules: Collection[str] = RULES,
     distance_per_m: float = 0.015,
 ) -> tuple[Box, ...]:
-    """Give vehicles' boxes the height of their points, and put them on the ground below.
-
-    The bottom of a vehicle is 0.03 m above the ground below its points. Its top is at least as high as the highest of
-    them, and at most as much higher as two returns of an object may be apart (``distance_per_m`` as in
-    `cluster.find_clusters`): in between, the box keeps its height. The height is that of a vehicle of its
-    class (`TALL_M`); higher points hang over the vehicle and do not count. Vans and trucks, which may end above the
-    view, do not become lower. Points in view that are labeled as another class than a vehicle's do not count. Boxes of
-    other classes, and those that hold fewer than five points, are not changed.
-    """
+    """Give vehicles' boxes the height of their points, and put them on the ground (docs/concepts/agreement.md)."""
     vehicles = [k for k, box in enumerate(boxes) if box.label in TALL_M]
     if "stand" not in _applicable(rules, scan.ground) or not vehicles:
         return tuple(boxes)
@@ -354,11 +322,8 @@ def cell_of(points: Points, i: int, n: int) -> tuple[int, int]:
 
 @njit(cache=True, nogil=True)
 def clear_columns(points: Points, height: Heights, limits: Floats, labels: Labels) -> None:
-    """Make persons background whose column of points goes on above a limit.
-
-    height : (n,) float32; [m] above the ground.
-    limits : (classes,) float64; greatest height of a column [m] for each class; 0 for classes that are no persons.
-    labels : (n,) uint8, modified; only points within 51.2 m along x and y are changed.
+    """Make persons background whose column of points goes on above the limit of their class [m]; 0: not a person's
+    class.
     """
     first_row, last_row, first_col, last_col = N_COLUMNS, -1, N_COLUMNS, -1  # of the cells around persons
     for i in range(points.shape[0]):
@@ -407,10 +372,8 @@ def clear_columns(points: Points, height: Heights, limits: Floats, labels: Label
 
 @njit(cache=True, nogil=True)
 def fill_support(cloud: Cloud, among: Mask, labeled: Labeled, boxes: Records, support: Support) -> None:
-    """Find the best box around each point, among the boxes with enough vehicle points (`MIN_BOX_SHARE`).
-
-    among : (n,) bool; points that may be in a box: those in view, above the ground.
-    support : overwritten; the earlier box on ties.
+    """Find the best box around each point ``among`` those in view above the ground, of boxes with enough vehicle points
+    (`MIN_BOX_SHARE`).
     """
     points, height, labels, roles = cloud.points, cloud.height, labeled.labels, labeled.roles
     scores, names = support.scores, support.names
@@ -461,11 +424,8 @@ def bounds_of(boxes: Records) -> tuple[float, float, float, float]:
 
 @njit(cache=True, nogil=True)
 def clear_ground(points: Points, height: Heights, on_ground: Mask, roles: Bytes, labels: Labels) -> None:
-    """Make points on the ground background, except in cells in which an object of their kind stands.
-
-    Within `NEAR_ROAD_M`, points lower than `ROAD_TOP_M` become background in any cell.
-
-    roles : (classes,) uint8; 1 for vehicles, 2 for persons, 0 for classes that are not changed.
+    """Make points on the ground background, except in cells in which an object of their kind stands (roles 1 and 2);
+    within `NEAR_ROAD_M`, points below `ROAD_TOP_M` in any cell.
     """
     labeled = np.empty(points.shape[0], np.int32)
     n, n_lying = 0, 0

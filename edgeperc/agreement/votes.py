@@ -155,11 +155,9 @@ def fill_tallies(cloud: Cloud, in_view: Mask, labels: Labels, cluster_of: Ids, v
 def fill_verdicts(
     tallies: Tallies, refused: Mask, roles: Bytes, parts: Ints64, applied: Applied, sight: Sight, verdicts: Bytes
 ) -> None:
-    """Decide what becomes of each label in each cluster.
+    """Decide what becomes of each label in each cluster; ``refused`` clusters are not vehicles for another reason.
 
-    refused : (k,) bool; clusters that are not vehicles for another reason.
-    roles : (classes,) uint8; 1 for vehicles, 2 for persons, 0 for others.
-    parts : (p, 2) int64; class, and the class that it may be a part of.
+    parts : (p, 2) class, and the class that it may be a part of.
     """
     clusters, counts = tallies.clusters, tallies.counts
     n_classes = len(roles)
@@ -212,10 +210,8 @@ def apply_verdicts(
 ) -> None:
     """Replace each label in view by what its cluster and the box around it say.
 
-    clusters : (n,) int32; -1 for none; -2 for a cluster in which no label of a vehicle or person stays.
-    verdicts : (k, classes) uint8; new label by cluster and label.
-    roles : (classes,) uint8; 1 for vehicles, 2 for persons, 0 for others.
-    scores, names : (n,) float32, (n,) uint8; from `edgeperc.agreement.rules.fill_support`.
+    clusters : -1 for none; -2 for a cluster in which no label of a vehicle or person stays.
+    scores, names : from `edgeperc.agreement.rules.fill_support`.
     """
     for i in range(labels.shape[0]):
         if not in_view[i]:
@@ -243,11 +239,7 @@ def may_be_persons(tallies: Tallies, walks: int, rides: int) -> Mask:
 
 
 def find_persons_alone(cloud: Cloud, roles: Bytes, before: Bytes, labels: Labels) -> list[Ints]:
-    """Find groups of points that are a person by themselves, though linked with something large.
-
-    before, labels : (n,) uint8; labels before the clusters voted, and after.
-    Returns list of (k,) int32: Rows of each person. Their labels were lost.
-    """
+    """Rows of each group of points that lost its labels but is a person by itself, linked with something large."""
     points, height = cloud
     changed = np.flatnonzero(before != labels)
     lost = changed[(roles[before[changed]] == PERSON) & (labels[changed] == 0)].astype(np.int32)

@@ -151,13 +151,11 @@ class Calibration:
 
 
 def read_kitti_calibration(path: str | os.PathLike[str]) -> tuple[Floats, Floats]:
-    """Read a calibration of KITTI's object, tracking, odometry or raw data.
+    """Read a calibration of KITTI's object, tracking, odometry or raw data: T_rectified_sensor (4, 4), and P2 (3, 4)
+    from there to the left color image.
 
-    path : of raw data the folder of a day, or either of its files calib_velo_to_cam.txt and calib_cam_to_cam.txt; a
-        text file with P2, R0_rect (or R_rect) and Tr_velo_to_cam (or Tr_velo_cam); in odometry data P2 and Tr, which
-        includes the rectification.
-    Returns T_rectified_sensor ((4, 4) float64): From the Velodyne's frame to the rectified frame of camera 0.
-    Returns P2 ((3, 4) float64): From there to the image of the left color camera.
+    path : a text file with P2, R0_rect (or R_rect) and Tr_velo_to_cam (or Tr_velo_cam), or of odometry P2 and Tr, which
+        includes the rectification; of raw data the folder of a day, or either of its two files.
     """
     folder = Path(path) if Path(path).is_dir() else Path(path).parent
     is_raw = Path(path).is_dir() or Path(path).name in _RAW_FILES
@@ -226,11 +224,8 @@ def _matrix(name: str, given: ArrayLike, n: int) -> Floats:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def fill_projected(points: Points, P: Floats, u: Floats, v: Floats, depth: Floats) -> None:
-    """Project points: column, row and depth of each.
-
-    P : (3, 4) float64; ``K`` times the upper three rows of ``T_camera_sensor``.
-    u, v : (n,) float64, overwritten; [px]; NaN unless the point is finite and in front of the camera.
-    depth : (n,) float64, overwritten; [m]; NaN if the point is not finite.
+    """Project points by P, ``K`` times the upper rows of ``T_camera_sensor``: column, row and depth of each; NaN unless
+    finite, and u and v behind the camera.
     """
     for i in range(points.shape[0]):
         x, y, z = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])

@@ -34,11 +34,8 @@ def check_size(width: int, height: int) -> None:
 
 
 def as_image(array: ArrayLike) -> Bytes:
-    """Check that an array is an image.
-
-    array : (H, W, 3) uint8; red, green and blue, row 0 at the top, in any memory layout: ``image[:, :, ::-1]`` of one
-        with blue first, as OpenCV reads it. At most 2**26 pixels, and 2**15 along an edge.
-    Returns (H, W, 3) uint8, C-contiguous, read-only: a view of the array if it already has this layout, else a copy.
+    """Check that an array is an image: (H, W, 3) uint8, red first, in any layout, at most 2**26 pixels and 2**15 along
+    an edge; C-contiguous and read-only.
     """
     if isinstance(array, np.ma.MaskedArray):
         raise ImageError("got a masked array; fill it first, e.g. with array.filled(0)")
@@ -96,15 +93,10 @@ class Channels(NamedTuple):
 class ImageScaler:
     """Scale images of any size to a network's input, and normalize them.
 
-    All of the image is scaled to the view's width and height, whatever its aspect. A pixel of the input is the mean of
-    the image's pixels around its center, weighted by a triangle: half-pixel centers, one pixel of the input wide to
-    each side, and at least one of the image. Enlarging is therefore bilinear interpolation, an image of the input's
-    size stays as it is, and shrinking leaves out no pixel of the image. This is also what Pillow's ``BILINEAR`` and
-    ``torch.nn.functional.interpolate(mode="bilinear", antialias=True)`` compute.
-
-    The tables of the last size are kept, so use one instance per thread.
-
-    input : its channels, in any order.
+    A pixel of the input is the mean of the image's pixels around its center, weighted by a triangle: half-pixel
+    centers, one pixel of the input wide to each side, and at least one of the image. This is also what Pillow's
+    ``BILINEAR`` and ``torch.nn.functional.interpolate(mode="bilinear", antialias=True)`` compute. The tables of the
+    last size are kept, so use one instance per thread.
     """
 
     def __init__(self, view: CameraGeometry, input: InputSpec) -> None:
@@ -114,11 +106,7 @@ class ImageScaler:
         self._tables_of: tuple[int, int] | None = None
 
     def fill(self, image: Bytes, out: Floats32) -> None:
-        """Scale an image into the caller's buffer.
-
-        image : (H, W, 3) uint8; from `as_image`.
-        out : (C, height, width) float32, C-contiguous, overwritten; ``(value - mean) / std`` per channel.
-        """
+        """Scale an image into the caller's buffer: ``(value - mean) / std`` per channel."""
         image = as_image(image)
         if out.shape != self.shape or out.dtype != np.float32 or not out.flags.carray:
             raise ImageError(f"the buffer is {out.shape} {out.dtype}; expected {self.shape} float32, C-contiguous")
@@ -180,15 +168,11 @@ def fill_scaled(image: Bytes, rows: Taps, columns: Taps, channels: Channels, out
 
 
 def label_pixels(logits: Floats32, height: int, width: int, *, model: str = "the model") -> Bytes:
-    """The most probable class of every pixel of an image.
+    """The most probable class of every pixel of an image; the lower one on ties.
 
     The logits are interpolated bilinearly between the centers of their grid, which covers the whole image; beyond the
     outermost centers they stay the same. Between four centers of one class, that class is taken: whatever the weights,
     no other can have a larger sum.
-
-    height, width : of the image.
-    model : name for messages.
-    Returns (height, width) uint8: The lower class on ties.
     """
     if logits.ndim != 3 or not 1 <= logits.shape[0] <= 255 or 0 in logits.shape:
         raise CardMismatchError(f"{model}: camera_logits have shape {logits.shape}; expected (C, h, w), C up to 255")
@@ -204,12 +188,8 @@ def label_pixels(logits: Floats32, height: int, width: int, *, model: str = "the
 
 
 def between(n_in: int, n_out: int) -> tuple[Ints, Floats32, Ints]:
-    """Interpolation along one axis.
-
-    Returns sides ((2, n_out) int32): The centers of the grid on the two sides of each pixel: one and the same where a
-        pixel lies on it or outside.
-    Returns weight ((n_out,) float32): Of the second center.
-    Returns runs ((n_runs + 1,) int32): Where runs of pixels between the same two centers begin; the last is ``n_out``.
+    """Interpolation along one axis: the two centers of the grid beside each pixel (2, n_out), the weight of the second,
+    and where runs of pixels between the same two begin.
     """
     at = np.clip((np.arange(n_out) + 0.5) * (n_in / n_out) - 0.5, 0.0, n_in - 1.0)
     first = np.floor(at).astype(np.int32)
@@ -230,11 +210,7 @@ def fill_image_labels(
     col_runs: Ints,
     labels: Labels,
 ) -> int:
-    """Write every pixel's best class (`label_pixels`).
-
-    row_sides, row_weight, row_runs, col_sides, col_weight, col_runs : from `between`.
-    Returns n_bad: Number of logits that are not finite; if there are any, the labels are undefined.
-    """
+    """Write every pixel's best class (`label_pixels`), by what `between` gives; returns the number of logits not finite."""
     n_classes, height, width = logits.shape
     n_bad = 0
     coarse = np.empty((height, width), np.uint8)

@@ -211,10 +211,8 @@ def _hidden_by(
     mounting: Mounting | None,
     places: Floats | None = None,
 ) -> tuple[Floats32, DepthBuffer, Floats]:
-    """Find what stands on the ground, and the ground at ``places`` x, y (k, 2) in the frame of the models.
-
-    Returns the points, checked; the depth buffer of those above the ground; and the places (k, 3) on the ground, in the
-    frame of the sensor, NaN if the scan shows no ground.
+    """The checked points, the depth buffer of those above the ground, and ``places`` x, y on the ground in the sensor's
+    frame, NaN without ground.
     """
     if not isinstance(points, np.ndarray) or points.ndim != 2 or points.shape[1] < 3 or points.dtype.kind not in "fiu":
         raise PointsError(f"got {_described(points)} for points; expected an array (n, 3 or more): x, y, z")
@@ -329,10 +327,8 @@ def fill_nearest(points: Points, pixels: Pixels, windows: Windows, buffer: Depth
 def fill_painted(
     labels: Labels, pixels: Pixels, buffer: DepthBuffer, slack_m: float, slack_share: float, painted: Labels
 ) -> None:
-    """Write the label of the pixel of each point that is not hidden, else `UNSEEN`.
-
-    slack_m, slack_share : a point is hidden if it is farther behind the nearest one than this [m], plus this share of
-        its depth.
+    """Write the label of the pixel of each point, or `UNSEEN` if it is farther behind the nearest one than ``slack_m``
+    plus ``slack_share`` of its depth.
     """
     u, v, depth = pixels
     height, width = labels.shape

@@ -24,11 +24,7 @@ _BEHIND_M = 1.5  # how much of a vehicle may be estimated to lie behind a wall
 
 
 def find_ceiling(points: Points, eye_m: float = 0.0) -> float | None:
-    """Height of a ceiling above the road [m]; None if most rays that rise do not end at one height all around.
-
-    points : (n, 4) float32 in the frame of the models; rows that are not finite are skipped.
-    eye_m : z of the sensor [m].
-    """
+    """Height of a ceiling above the road [m]; None if most rays that rise do not end at one height all around."""
     x, y, z = points[:: (len(points) // _SAMPLE) | 1, :3].astype(np.float64).T
     with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
         across_m = np.hypot(x, y)
@@ -51,12 +47,8 @@ def find_ceiling(points: Points, eye_m: float = 0.0) -> float | None:
 
 
 def without_impossible(boxes: Sequence[Box], points: Points, mounting: Mounting) -> tuple[Box, ...]:
-    """The boxes without vehicles around the sensor, and without those that do not fit between a ceiling and walls.
-
-    What is taken for them is the own vehicle, a small garage, or beams, pipes and walls.
-
-    points : (n, 4) float32 in the frame of the models.
-    mounting : of the sensor. Below one on a pole, vehicles pass.
+    """The boxes without vehicles around the sensor, unless it is on a pole, and without those that do not fit between a
+    ceiling and walls: the own vehicle, a small garage, beams, pipes.
     """
     eye_m = (mounting.height_m or MODEL_HEIGHT_M) - MODEL_HEIGHT_M
     tops_m = [box.center[2] + 0.5 * box.size[2] for box in boxes]

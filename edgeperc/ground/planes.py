@@ -220,8 +220,7 @@ def fit_ground(
 ) -> GroundFit:
     """Fit the planes of the ground; parameters and errors as in `find_ground`.
 
-    any_order : whether the ground is the same for any order of the points, which takes 2 ms more. Otherwise, the
-        earlier of a cell's equally low points stands for it.
+    any_order : whether the ground is the same for any order of the points, which takes 2 ms more.
     reach_m : of the first plane; farther for a sensor so high that it sees no ground near by.
     """
     if not 0.0 < mount_height_m < math.inf:
@@ -267,12 +266,7 @@ def _sorted_into_cells(points: Points) -> Sorted:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def fill_lowest(points: Points, cell: Ints, lowest: Ints) -> None:
-    """Write every point's cell and every cell's lowest point.
-
-    cell : (n,) int32, overwritten; flat cell, x by y; -1 for points that are not finite or out of the grid.
-    lowest : (N_CELLS, N_CELLS) int32, overwritten; row of ``points``, the earlier of two equally low; -1 where there is
-        none.
-    """
+    """Write every point's flat cell, -1 outside, and every cell's lowest point, the first of equals, or -1."""
     flat = lowest.reshape(-1)
     values = points.reshape(-1)
     reach = np.float32(REACH_M)
@@ -321,12 +315,7 @@ def taken_cells(points: Points, lowest: Ints) -> tuple[Ints, Floats32]:
 
 
 class Patch(NamedTuple):
-    """A square of cells to which a plane is fitted.
-
-    row, col : the first cell.
-    size : cells along each side.
-    x, y : origin of the plane [m].
-    """
+    """A square of cells, from row and column on, to which a plane with its origin at x, y [m] is fitted."""
 
     row: int
     col: int
@@ -360,11 +349,8 @@ def fit_first_plane(points: Points, lowest: Ints, reach_m: float, plane: Floats)
 
 @njit(cache=True, nogil=True)
 def fill_planes(points: Points, lowest: Ints, first: Floats, planes: Floats) -> None:
-    """Fit every region's plane, from the middle outwards.
-
-    first : (3,) float64; a, b, c around the vehicle.
-    planes : (N_REGIONS, N_REGIONS, 3) float64, overwritten; slopes along x and y, and height in the region's middle
-        [m]; the expected plane if too few cells agree.
+    """Fit every region's plane, from the middle outwards: slopes along x and y, and height in the region's middle [m];
+    the expected plane if too few cells agree.
     """
     solved = np.empty((N_REGIONS, N_REGIONS))  # 1 and the cells that agree
     solved[:] = 0.0
@@ -417,10 +403,8 @@ def fill_planes(points: Points, lowest: Ints, first: Floats, planes: Floats) -> 
 def fill_residuals(
     points: Points, lowest: Ints, patch: Patch, expected: Floats, band: float, cone: float, residuals: Floats
 ) -> int:
-    """Write x, y from the origin and z above the expected plane of the lowest returns of a patch.
-
-    A return is skipped if it is farther from the plane than ``band`` plus ``cone`` times its distance from the origin.
-    Returns the number of columns written.
+    """Write x, y from the origin and z above the expected plane of the lowest returns of a patch; returns their number.
+    Those farther from the plane than ``band`` plus ``cone`` times their distance from the origin are skipped.
     """
     n = 0
     for row in range(patch.row, patch.row + patch.size):
@@ -520,11 +504,8 @@ def refine_plane(residuals: Floats, n: int, prior: float, max_slope: float, max_
 
 @njit(cache=True, nogil=True)
 def fill_levels(points: Points, lowest: Ints, planes: Floats, rows: Rows, cell: Ints, level: Floats32) -> None:
-    """Write the height of the ground in the middle of every cell that holds one of some points.
-
-    rows : (m,) int32; the points.
-    level : (N_CELLS, N_CELLS) float32, overwritten; z [m]; NaN without a point, and anything in rows of cells that no
-        point of ``rows`` is in or between.
+    """Write the height of the ground in the middle of every cell that holds one of the points ``rows``; NaN without a
+    point.
     """
     # Of the points ahead, the cells behind are not needed: half of the time.
     first, last = N_CELLS - 1, 0
@@ -594,11 +575,8 @@ def fill_heights(
     height: Heights,
     mask: Mask,
 ) -> None:
-    """Write the heights of some points above the ground, and whether they are on the ground.
-
-    rows : (m,) int32; the points.
-    height : (m,) float32, overwritten; [m]; outside the grid, above the plane of the nearest region. NaN for points
-        that are not finite.
+    """Write the heights of the points ``rows`` above the ground, outside the grid above the nearest region's plane, and
+    whether they are on it.
     """
     levels, slopes = level.reshape(-1), planes.reshape(-1)
     for k in range(rows.shape[0]):

@@ -36,19 +36,15 @@ def decode_slots(
     *,
     model: str = "the model",
 ) -> list[Box]:
-    """Decode axis-aligned boxes; each gets the class of the segmentation at its center (SSADNet 2.2.1 B).
+    """Decode axis-aligned boxes, best score first; each gets the class of the segmentation at its center (SSADNet 2.2.1
+    B).
 
-    slots : (1, K, 4) or (K, 4) float32; center column, center row, extent across columns, extent along rows; shares of
-        the image's width and height, from its far left corner.
-    labels, scores : (H, W) uint8, (H, W) float32; from `decode_classes`.
-    classes : names of ``labels``.
-    box_classes : classes that boxes may have.
-    box_size_priors : class to (length, width, height) [m]; only the height is used, because the top view has none.
-    mount_height_m : height of the sensor above the road [m]; boxes stand on the road.
-    model : name for messages.
-    Returns: Best score first, the earlier slot on ties. The score is the probability of the class at the center pixel.
-        A slot is empty if an extent is below 0.5 m, if its center is out of view, or if the class there is not a box
-        class. The yaw is 0 if the longer side points ahead, else pi/2.
+    slots : (K, 4), perhaps with the batch's axis; center column, center row, extent across columns and along rows, as
+        shares of the image from its far left corner.
+    labels, scores : from `decode_classes`; the score of a box is that of its center's class.
+    Returns boxes on the road, with the height of their class's prior. A slot is empty if an extent is below 0.5 m, if
+        its center is out of view, or if the class there is not a box class. The yaw is 0 if the longer side points
+        ahead, else pi/2.
     """
     values = _slot_rows(slots, 4, box_classes, box_size_priors, model)
     height, width = geometry.height, geometry.width
@@ -80,16 +76,11 @@ def decode_scored_slots(
     iou_threshold: float = 0.2,
     model: str = "the model",
 ) -> list[Box]:
-    """Decode axis-aligned boxes with scores of their own.
+    """Decode axis-aligned boxes with scores of their own, best first; those that overlap a better one are dropped.
 
-    slots : (1, K, 5) or (K, 5) float32; center column, center row, extents as for `decode_slots`, and the logit that
-        there is an object.
+    slots : as for `decode_slots`, and the logit that there is an object. Extents are clipped to 0.2 to 40 m.
     class_output, class_kind, classes, box_classes : as for `decode_dense`; the class of a box is the one with the
         largest sum of probabilities in its footprint.
-    score_threshold, iou_threshold, model : as for `decode_dense`: of the best slots, those that overlap a better one
-        are dropped.
-    Returns: Best score first, the earlier slot on ties. The yaw is 0 if the longer side points ahead, else pi/2.
-        Extents are clipped to 0.2 to 40 m.
     """
     rows = _slot_rows(slots, 5, box_classes, box_size_priors, model)
     values = _cell_values(class_output, class_kind, geometry, classes, model)
@@ -187,30 +178,23 @@ def decode_dense(
     iou_threshold: float = 0.2,
     model: str = "the model",
 ) -> list[Box]:
-    """Decode oriented boxes from a heat map of centers and a box regressed at every cell.
+    """Decode oriented boxes from a heat map of centers and a box regressed at every cell, best score in the heat map
+    first.
 
-    dense : (1, C, H / 4, W / 4) or (C, H / 4, W / 4) float32; C is 9 or 11. Heat-map logit; center's offset from the
+    dense : (C, H / 4, W / 4), perhaps with the batch's axis; C is 9 or 11. Heat-map logit; center's offset from the
         cell's center in rows and columns [cells of this map]; logarithms of length and width [m]; sine and cosine of
         twice the yaw; center's z [m]; logarithm of the height [m]. The last two are a vector (x, y) towards the front,
-        whose component along a heading is the logit that the front is there.
-    class_kind : {"class_logits", "class_probabilities"}
-    classes : names of the class output's channels.
-    box_classes : classes that boxes may have.
+        whose component along a heading is the logit that the front is there; without them the yaw is in -pi/2..pi/2 and
+        ``front`` is None.
     box_size_priors, box_size_spreads : usual length, width and height [m] of each box class, and the standard
         deviations of their logarithms. Without spreads only the segmentation decides the class.
-    score_threshold : lowest score of a box, in 0..1.
     named_from : boxes with a lower score are places only: their label is empty, which saves most of the time.
     iou_threshold : if two boxes overlap by more, the one with the lower score is dropped, even if their classes differ.
-    model : name for messages.
-    Returns: best score first; on ties the box farther ahead, then the box farther left. The score is the probability in
-        the heat map. With nine channels the yaw is in -pi/2..pi/2 and ``front`` is None: the network, like the paper's,
-        does not distinguish front and rear. With eleven the yaw points to the likelier front, and ``front`` is 0.5 or
-        more.
 
-    The paper reads a box's class at its center pixel of the segmentation map. Here the probabilities of the box
-    classes are summed over all pixels of the footprint and the largest sum wins (the earlier box class on ties), so
-    that one pixel, such as a hole in the roof or an edge between two classes, does not decide. With spreads, each sum
-    is multiplied by the likelihood of the measured size (log-normal): from above, vans and cars differ only in size.
+    The paper reads a box's class at its center pixel of the segmentation map. Here the probabilities of the box classes
+    are summed over all pixels of the footprint and the largest sum wins (the earlier box class on ties), so that one
+    pixel, such as a hole in the roof or an edge between two classes, does not decide. With spreads, each sum is
+    multiplied by the likelihood of the measured size (log-normal): from above, vans and cars differ only in size.
     """
     maps = dense[0] if dense.ndim == 4 and dense.shape[0] == 1 else dense
     height, width = geometry.height, geometry.width
@@ -330,11 +314,7 @@ def _logit(probability: float) -> float:
 
 @njit(cache=True, nogil=True)
 def fill_scores(values: Floats32, scores: Floats32) -> None:
-    """Replace every pixel's best logit by its softmax probability.
-
-    values : (C, H, W) float32, C-contiguous; finite logits.
-    scores : (H, W) float32, modified; the largest logit of each pixel.
-    """
+    """Replace every pixel's largest logit in ``scores`` by its softmax probability among ``values`` (C, H, W)."""
     n_classes, height, width = values.shape
     total = np.empty(width, np.float32)
     for row in range(height):
@@ -369,11 +349,7 @@ def count_not_finite(values: Floats32) -> int:
 
 @njit(cache=True, nogil=True)
 def mark_peaks(heat: Floats32, threshold: float, peak: Mask) -> None:
-    """Mark the cells that no neighbor exceeds.
-
-    threshold : cells below it are not peaks.
-    peak : (H, W) bool, overwritten; of equal neighbors, the first one in row order is the peak.
-    """
+    """Mark the cells from the threshold on that no neighbor exceeds; of equal neighbors, the first one in row order."""
     height, width = heat.shape
     for row in range(height):
         for col in range(width):
@@ -394,12 +370,10 @@ def fill_footprint_sums(
 ) -> None:
     """Sum each class's probability over the pixels whose centers lie in a rectangle.
 
-    values : (C, H, W) float32; logits or probabilities.
-    rectangles : (n, 5) float64; x, y, length, width [m], yaw [rad].
-    x_far, y_left : the view's far left corner [m].
-    cell : edge of a pixel [m].
-    sums : (n, C) float64, overwritten; a rectangle that holds no pixel center gets the nearest pixel in view. If its
-        bounds hold more than 2^18 values, only every other row and column is summed, or fewer still.
+    rectangles : (n, 5) x, y, length, width [m], yaw [rad].
+    x_far, y_left, cell : the view's far left corner, and edge of a pixel [m].
+    sums : (n, C), overwritten; a rectangle that holds no pixel center gets the nearest pixel in view. If its bounds
+        hold more than 2^18 values, only every other row and column is summed, or fewer still.
     """
     n_classes, height, width = values.shape
     pixel = np.empty(n_classes)

@@ -28,16 +28,12 @@ ROUNDING_M = 0.01  # of a point, when its scan is turned
 
 
 class Crop:
-    """Select the points that matter for some views: those between two lines, left and right.
+    """Select the points that matter for some views: those between two lines, left and right. One instance per thread.
 
-    The selected points are kept in buffers that are used again, so use one instance per thread.
-
-    views : of a range image, the sector and `MARGIN_M` beside it are kept. Of a top view, what `observed.Observer`
-        uses: up to 1.4 times as far as the view, between the directions of its sides; and 2.2 m beside it, where
-        boxes reach. Everything is kept without a view, for a sector of more than 180 degrees, and for a top view
-        alone that is not ahead of the sensor.
-    margin_m : in place of `MARGIN_M`.
-    turn_rad : by this angle the views are turned to the left.
+    Of a range image, the sector and ``margin_m`` beside it are kept. Of a top view, what `observed.Observer` uses: up
+    to 1.4 times as far as the view, between the directions of its sides; and 2.2 m beside it, where boxes reach.
+    Everything is kept without a view, for a sector of more than 180 degrees, and for a top view alone that is not ahead
+    of the sensor. ``turn_rad`` turns the views to the left.
     """
 
     def __init__(
@@ -61,13 +57,8 @@ class Crop:
             self._lines = np.column_stack([inward @ np.array([(cos, sin), (-sin, cos)]), np.min(nearest, axis=0)])
 
     def select(self, points: Points) -> tuple[Floats32, Ints | None]:
-        """The points that matter, in their order.
-
-        points : (n, 4) float32; x, y, z [m] in the frame of the models, remission. Rows that are not finite are left
-            out.
-        Returns kept ((m, 4) float32): Overwritten by the next call, unless it is ``points``.
-        Returns rows ((m,) int32 or None): Their rows in ``points``. None if all points matter; ``kept`` is then
-            ``points``.
+        """The points that matter, in their order, overwritten by the next call, and their rows in ``points``;
+        ``points`` and None if all matter. Rows that are not finite are left out.
         """
         if self._lines is None:
             return points, None
@@ -79,12 +70,8 @@ class Crop:
 
 
 def sectors_of_turn(view: RangeImageGeometry, *, whole: bool) -> list[tuple[float, Crop]]:
-    """The sectors of a full turn.
-
-    view : of the first sector.
-    whole : each sector gets all points, not only its own.
-    Returns list of (float, Crop): The angle by which each lies to the left of the first one [rad], and what selects
-        its points.
+    """The sectors of a full turn: by which angle each lies to the left of the first one [rad], and what selects its
+    points, or all if ``whole``.
     """
     width_deg = view.azimuth_left_deg - view.azimuth_right_deg
     turns_rad = [math.radians(k * width_deg) for k in range(math.ceil(360.0 / width_deg))]
@@ -93,11 +80,10 @@ def sectors_of_turn(view: RangeImageGeometry, *, whole: bool) -> list[tuple[floa
 
 
 def spread(parts: Sequence[tuple[PointLabels, Ints | None]], n: int) -> PointLabels:
-    """Labels of a whole scan from those of parts of it.
+    """Labels of all ``n`` points of a scan from those of parts of it, with their rows from `Crop.select` or None for
+    all.
 
-    parts : labels of a part, and the rows of its points from `Crop.select`; None for all points. Of a point in view
-        of several parts, the label is that of the first one. Points in no part are out of view.
-    n : number of points of the scan.
+    A point in view of several parts has the label of the first one; one in no part is out of view.
     """
     first, first_rows = parts[0]
     if len(parts) == 1 and first_rows is None:
@@ -136,13 +122,7 @@ def _hull(view: RangeImageGeometry | TopViewGeometry, margin_m: float) -> tuple[
 
 @njit(cache=True, nogil=True)
 def fill_rows(points: Points, lines: Floats, rows: Rows, kept: Floats32) -> int:
-    """Copy the points between two lines.
-
-    lines : (2, 3) float64; a, b and c; points with a x + b y >= c for both lines are kept.
-    rows : (more than n,) int32, overwritten; rows of these points.
-    kept : (more than n, 4) float32, overwritten; these points.
-    Returns: Number of these points.
-    """
+    """Copy the points with a x + b y >= c for both lines (a, b, c), and their rows; returns their number."""
     a, b, c = lines[0]
     d, e, f = lines[1]
     n = 0

@@ -21,13 +21,12 @@ Values = Mapping[str, Floats32]
 
 
 def decode_detections(card: ModelCard, outputs: Values, score_threshold: float) -> list[Box]:
-    """Decode the boxes of a detector on pillars.
+    """Decode the boxes of a detector on pillars from its outputs by name, in the frame of the training points, best
+    score first; of boxes that overlap by more than the card's ``nms_iou``, of one class or ``across_classes``, the
+    best.
 
-    outputs : by their names, with the batch's axis or without.
-    Returns: In the frame of the training points, best score first; of boxes of one class that overlap by more than the
-        card's ``nms_iou``, or with ``across_classes`` of any classes, only the best one. ``front`` is the probability
-        of the direction's bin; of a center head, it is 1 if sine and cosine are those of an angle, and less the smaller
-        both are: they are means of the headings that the network deems possible.
+    ``front`` is the probability of the direction's bin; of a center head, it is 1 if sine and cosine are those of an
+    angle, and less the smaller both are: they are means of the headings that the network deems possible.
     """
     view, head = card.view, card.head
     assert isinstance(view, PillarGeometry)
@@ -60,10 +59,8 @@ def decode_detections(card: ModelCard, outputs: Values, score_threshold: float) 
 def best_rows(
     footprints: Floats, scores: Floats, names: NDArray[np.str_], max_iou: float, *, across_classes: bool
 ) -> Ints64:
-    """Rows of boxes that overlap no better one by more than ``max_iou``, of the same class unless ``across_classes``.
-
-    footprints : (n, 5) float64; x, y, length, width [m], yaw [rad].
-    Returns: Best score first.
+    """Rows of boxes that overlap no better one by more than ``max_iou``, of the same class unless ``across_classes``;
+    the best first.
     """
     if across_classes:
         return suppress_overlaps(footprints, scores, max_iou)

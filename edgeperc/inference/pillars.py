@@ -19,11 +19,7 @@ FROM_CENTER_X, RANGE = FROM_MEAN_X + AXES, FROM_MEAN_X + 2 * AXES
 
 
 class PillarGrid(NamedTuple):
-    """A grid of pillars as kernels take it.
-
-    low, high : bounds along x, y and z [m].
-    cell : edge of a pillar [m].
-    """
+    """A grid of pillars as kernels take it: bounds along x, y and z, and edge of a pillar [m]."""
 
     low: tuple[float, float, float]
     high: tuple[float, float, float]
@@ -68,13 +64,11 @@ class Pillarizer:
 
 @njit(cache=True, nogil=True)
 def find_pillars(points: Points, grid: PillarGrid, numbers: Ints, members: Ints, pillars: Pillars) -> int:
-    """Write the counts and places of pillars, in the order of their first points.
+    """Write the counts and places of pillars, in the order of their first points; returns their number, at most as many
+    as there is room for.
 
-    points : (n, 4) float32, C-contiguous; those that are not finite are in no pillar.
-    numbers : (rows, columns) int32, -1 everywhere before and after.
-    members : (pillars, points) int32, overwritten; rows of the points of each pillar, the first ones of the scan.
-    pillars : counts and places are overwritten.
-    Returns: Number of pillars, at most as many as there is room for.
+    numbers : (rows, columns) -1 everywhere before and after.
+    members : (pillars, points) overwritten; rows of the points of each pillar, the first ones of the scan.
     """
     n_rows, n_columns = numbers.shape
     n = 0
@@ -111,11 +105,8 @@ def find_pillars(points: Points, grid: PillarGrid, numbers: Ints, members: Ints,
 def fill_pillars(
     points: Points, grid: PillarGrid, channels: Ints64, scale: Floats32, members: Ints, n: int, pillars: Pillars
 ) -> None:
-    """Write the values of the points of ``n`` pillars, after `find_pillars`.
-
-    channels : (channels,) int64; places in the card's list of channels.
-    scale : (2, channels) float32; mean and standard deviation of each.
-    pillars : values are overwritten.
+    """Write the values of the points of ``n`` pillars, after `find_pillars`; ``scale`` has mean and standard deviation
+    of each of the ``channels``, places in the card's list.
     """
     known = np.empty(RANGE + 1)
     mean, center = np.empty(AXES), np.empty(AXES)

@@ -57,11 +57,7 @@ class Projection:
 
 
 class Bounds(NamedTuple):
-    """A top view as its kernel takes it.
-
-    x_min, x_max, y_min, y_max, z_min, z_max : [m]
-    height, width : rows and columns.
-    """
+    """A top view as its kernel takes it: bounds [m], rows and columns."""
 
     x_min: np.float32
     x_max: np.float32
@@ -79,9 +75,8 @@ class Intervals(NamedTuple):
 
     Interval j holds ``edges[j] >= value > edges[j + 1]``. With ``k = int32((first - value) * cells_per_unit)`` in
     float32, j is exactly ``base[k] + (value <= split[k])``: the edges are sorted into table cells by the same rounded
-    arithmetic, and no two edges share a cell.
-
-    first, last : first and last edge; the last is lower than any value if it is straight behind the sensor.
+    arithmetic, and no two edges share a cell. The last edge is lower than any value if it is straight behind the
+    sensor.
     """
 
     first: np.float32
@@ -102,11 +97,8 @@ class Intervals(NamedTuple):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def mark_top_view(points: Points, view: Bounds, index: Ints, pixel: Ints) -> None:
-    """Mark the highest point of each cell in ``index``, and the cell of each point in ``pixel``.
-
-    points : (n, 4) float32, C-contiguous; x, y, z [m] in the sensor frame, remission.
-    index : (height * width,) int32, overwritten; row of points; -1 without a return.
-    pixel : (n,) int32, overwritten; flat pixel of each point; -1 out of view.
+    """Mark the row of the highest point of each cell in ``index``, -1 without a return, and the flat cell of each point
+    in ``pixel``, -1 out of view.
     """
     pixel[:] = np.int32(-1)
     index[:] = np.int32(-1)
@@ -166,14 +158,12 @@ def mark_range_image(
     index: Ints,
     pixel: Ints,
 ) -> None:
-    """Mark the nearest point of each pixel in ``index``, and the pixel of each point in ``pixel``.
+    """Mark the row of the nearest point of each pixel in ``index``, -1 without a return, and the flat pixel of each
+    point in ``pixel``, -1 out of view.
 
-    points : (n, 4) float32, C-contiguous; x, y, z [m] in the sensor frame, remission.
-    wedge : (4,) float32; coefficients of x, y, x, y in two sums that are not negative for any point in view: a cheap
-        test that saves the divisions for three quarters of a full turn.
-    winner : (height * width,) int64, overwritten; scratch: ``rank << 32 | row of points``, or ``EMPTY``.
-    index : (height * width,) int32, overwritten; row of points; -1 without a return.
-    pixel : (n,) int32, overwritten; flat pixel of each point; -1 out of view.
+    wedge : (4,) coefficients of x, y, x, y in two sums that are not negative for any point in view: a cheap test that
+        saves the divisions for three quarters of a full turn.
+    winner : scratch: ``rank << 32 | row of points``, or ``EMPTY``.
     """
     pixel[:] = np.int32(-1)
     winner[:] = EMPTY
@@ -251,12 +241,8 @@ def mark_range_image(
 def fill_image(
     points: Points, heights: Heights, index: Ints, channels: Ints, mean: Floats32, std: Floats32, image: Floats32
 ) -> None:
-    """Write the values of the points of ``index`` into ``image``.
-
-    heights : (n,) or (0,) float32, C-contiguous; height of each point above the ground [m]; empty if no channel needs
-        it.
-    index : (pixels,) int32; row of points; -1 without a return.
-    channels : (C,) int32; values of ``CHANNEL_CODES``.
+    """Write the values of the points of ``index`` into ``image``; ``heights`` above the ground are empty if no channel,
+    of ``CHANNEL_CODES``, needs them.
     """
     values = points.reshape(-1)
     rows = np.empty(4 * PIXEL_BLOCK, np.float32)
@@ -302,12 +288,9 @@ def fill_image(
 class TopViewProjector:
     """Project points to an image of the ground ahead (SSADNet 2.1.2). Row 0 is farthest ahead, column 0 leftmost.
 
-    Cells are half-open: a cell includes its near and right edges, not its far and left edges. The view is
-    ``x_min <= x < x_max``, ``y_min <= y < y_max`` and ``z_min <= z <= z_max``. The highest point wins a cell, the
-    earlier one on ties.
-
-    input : channels, any of ``"distance"``, sqrt(x^2 + y^2) [m] (SSADNet equation 1), ``"remission"`` and ``"height"``,
-        z [m], in any order.
+    Cells are half-open: a cell includes its near and right edges. The view is ``x_min <= x < x_max``, ``y_min <= y <
+    y_max`` and ``z_min <= z <= z_max``. The highest point wins a cell, the earlier one on ties. Channels, in any order:
+    ``"distance"``, sqrt(x^2 + y^2) [m] (SSADNet equation 1), ``"remission"`` and ``"height"``, z [m].
     """
 
     def __init__(self, view: TopViewGeometry, input: InputSpec) -> None:
@@ -328,12 +311,8 @@ class TopViewProjector:
         )
 
     def fill(self, points: Points, image: Floats32, index: Ints, pixel: Ints, height_m: Heights | None = None) -> None:
-        """Project into the caller's buffers.
-
-        points : (n, 4) float32, C-contiguous; x, y, z [m] in the sensor frame, remission in 0..1
-            (`condition.condition`). May be empty or read-only.
-        height_m : (n,) float32; height of each point above the ground [m] (`edgeperc.ground.planes.Ground.height_m`),
-            for the channel ``"height_above_ground"``; without this channel it is ignored.
+        """Project into the caller's buffers, C-contiguous as the points of `condition.condition`; ``height_m`` above
+        the ground is for the channel ``"height_above_ground"`` alone.
         """
         points = _checked(self.shape, points, image, index, pixel)
         flat_index = index.reshape(-1)
@@ -354,22 +333,18 @@ class RangeImageProjector:
     A point's row is the beam with the nearest elevation; the top and the bottom row reach half a beam spacing farther
     out. Its column follows from its azimuth, atan2(y, x). Pixels are half-open: a pixel includes its upper and left
     edges. The point nearest to the sensor wins a pixel (by squared range in float32), the earlier one on ties. Points
-    on the sensor's vertical axis have no azimuth and are out of view.
-
-    Tables and scratch are made once and reused between calls, so use one instance per thread.
-
-    input : channels, any of ``"x"``, ``"y"``, ``"z"``, ``"remission"``, ``"range"`` and ``"height_above_ground"`` in
-        any order, meters. Heights above the ground are clipped to -1..5 m.
-    needs_ground : whether a channel is the height above the ground.
+    on the sensor's vertical axis have no azimuth and are out of view. Channels, in any order: ``"x"``, ``"y"``,
+    ``"z"``, ``"remission"``, ``"range"`` and ``"height_above_ground"`` [m], the last clipped to -1..5 m. One instance
+    per thread.
 
     PointSeg's equation 2 uses arcsin(y / sqrt(x^2 + y^2 + z^2)) as azimuth. That is arcsin(sin(azimuth) *
     cos(elevation)), which is smaller than the azimuth, and the error grows as the beam points farther down. At azimuth
     45 degrees, a beam at -24.8 degrees gets 39.9 degrees: an error of 29 of 512 columns, which would bend vertical
     edges. This module uses the true azimuth.
 
-    No angle is computed for a point. Two functions that increase with azimuth and elevation replace them:
-    y / (|x| + |y|), unfolded over the half-planes, and z / (sqrt(x^2 + y^2) + |z|). The edges of the pixels are
-    converted to the same quantities.
+    No angle is computed for a point. Two functions that increase with azimuth and elevation replace them: y / (|x| +
+    |y|), unfolded over the half-planes, and z / (sqrt(x^2 + y^2) + |z|). The edges of the pixels are converted to the
+    same quantities.
     """
 
     def __init__(self, view: RangeImageGeometry, input: InputSpec) -> None:
@@ -440,10 +415,8 @@ def wedge(view: RangeImageGeometry) -> Floats32:
 
 
 def tabulate(edges: Floats32, what: str) -> Intervals:
-    """Build tables that find the interval of a value with one comparison.
-
-    edges : (m + 1,) float32; strictly decreasing.
-    what : noun for the error message, e.g. ``"rows"``.
+    """Build tables that find the interval of a value between strictly decreasing edges with one comparison; ``what`` is
+    named in errors.
     """
     first, last = edges[0], edges[-1]
     inner = edges[1:-1]

@@ -239,10 +239,8 @@ def _not_inside(boxes: list[Box], spans: Sequence[Floats], others: Sequence[Box]
 
 
 def _fitted(cloud: Cloud, members: Ints, l_shaped: bool) -> tuple[Floats, Floats, float]:
-    """What `fill_rectangle` finds: the rectangle, the levels and the highest point.
-
-    A vehicle is not wider than `MAX_WIDTH_M`. A wider cluster holds something beside it too: the rectangle is fitted
-    again to the points in the strip of that width that holds the most.
+    """What `fill_rectangle` finds. A vehicle is not wider than `MAX_WIDTH_M`: in a wider cluster, which holds something
+    else too, the rectangle is fitted to the points in the strip of that width that holds the most.
     """
     for _ in range(MAX_FITS):
         rectangle, levels = np.empty(5), np.empty(len(members))
@@ -338,10 +336,8 @@ def _persons(
 
 
 def weigh(boxes: Sequence[Box], view: TopViewGeometry, classes: Sequence[str], min_score: float) -> list[Box]:
-    """Boxes around clusters that a network of the top view has not found, with the scores that both views give them.
-
-    The score is the mean of the cluster's and that of the network, which is 0 where it sees the object. The network's
-    has the weight of the share of the footprint in its view: out of the view, the cluster's score stands. Boxes below
+    """Boxes around clusters that a network of the top view has not found, with the mean of the cluster's score and the
+    network's, 0 where it sees the object; that has the weight of the share of the footprint in its view. Boxes below
     ``min_score`` are dropped.
     """
     rows = [row for row, box in enumerate(boxes) if box.label in classes]
@@ -358,12 +354,10 @@ def weigh(boxes: Sequence[Box], view: TopViewGeometry, classes: Sequence[str], m
 
 
 def join_boxes(first: Sequence[Box], second: Sequence[Box]) -> tuple[Box, ...]:
-    """Join two lists of boxes; a box of ``second`` is dropped if ``first`` has the same object.
+    """Join two lists of boxes, best score first; a box of ``second`` is dropped if ``first`` has the same object.
 
     A person with the better score is kept, because people stand close to cars. Two boxes are one object if they overlap
     by more than 0.1 (IoU), or if more than half of one footprint lies in the other.
-
-    Returns: Best score first.
     """
     others: list[Box] = []
     same = _same_object(second, first) if first and second else np.zeros((len(second), 0), np.bool_)
@@ -426,14 +420,8 @@ def _completed(
 
 @njit(cache=True, nogil=True)
 def fill_rectangle(cloud: Cloud, members: Ints, l_shaped: bool, rectangle: Floats, levels: Floats) -> float:
-    """Write the rectangle around points seen from above, and what they stand on.
-
-    members : (m,) int32; rows of the points in the rectangle, at least one.
-    l_shaped : true: the heading for which most points lie near a side. False: the heading of the smallest rectangle.
-    rectangle : (5,) float64, overwritten; x, y of the middle, extent along and across the heading [m], heading [rad]
-        in 0..pi/2.
-    levels : (m,) float64, overwritten; z of the ground below each point [m].
-    Returns: z of the highest point [m].
+    """Write the rectangle around the points ``members`` (`rectangles.fit_rectangle`), and z of the ground below each
+    into ``levels``; returns z of the highest.
     """
     points, height = cloud.points, cloud.height
     fit_rectangle(points, members, np.int64(N_ANGLES), np.int64(MAX_FITTED), l_shaped, rectangle)

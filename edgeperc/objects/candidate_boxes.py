@@ -26,18 +26,15 @@ LEAST_SCORE = 0.03
 
 
 def decode_objects(card: ModelCard, outputs: Floats32, rectangles: Floats, level: Floats) -> Floats:
-    """Decode the outputs of candidates.
+    """Decode the outputs of candidates, whose rectangles (m, 5) are on the ground at ``level``.
 
-    outputs : (m, n) float32: logits of the classes, the background first; x, y of the middle in the candidate's frame
-        and height of the bottom above the ground [m]; for each class but the background, the logarithms of length,
-        width and height divided by the usual ones (``box_size_priors``); cosine and sine of twice the yaw; a vector
-        whose component along a heading is the logit that the front is there; logit of the overlap (IoU) with the
-        object.
-    rectangles : (m, 5) float64, of the candidates: x, y, length, width [m], yaw [rad].
-    level : (m,) float64, z of the ground at each [m] (`objects.crops.Crops`).
-    Returns: (m, 10) float64: x, y, z of the middle, length, width, height [m], yaw [rad] towards the more probable
-        front, score, class (a row of ``card.classes``), probability of the front. The score is the probability of the
-        most probable class of objects times the overlap.
+    outputs : (m, n): logits of the classes, the background first; x, y of the middle in the candidate's frame and
+        height of the bottom above the ground [m]; for each class but the background, the logarithms of length, width
+        and height divided by the usual ones (``box_size_priors``); cosine and sine of twice the yaw; a vector whose
+        component along a heading is the logit that the front is there; logit of the overlap (IoU) with the object.
+    Returns (m, 10): x, y, z of the middle, length, width, height [m], yaw [rad] towards the more probable front, score,
+        class (a row of ``card.classes``), probability of the front. The score is the probability of the most probable
+        class of objects times the overlap.
     """
     if not np.isfinite(outputs).all():
         raise InferenceError(f"{card.name} gives values that are not finite; check the scan, or the model file")
@@ -53,11 +50,8 @@ def footprints(boxes: Floats) -> Floats:
 
 
 def merge_boxes(boxes: Floats, classes: Sequence[str]) -> Floats:
-    """Of boxes around one object, the one with the best score, averaged with those that overlap it by more than 0.5.
-
-    boxes : (m, 10) float64, from `decode_objects`.
-    classes : the background first.
-    Returns: (k, 10) float64, best score first. Places, sizes and headings are means weighted by the scores.
+    """Of boxes (m, 10) of `decode_objects` around one object, the one with the best score, averaged by scores in place,
+    size and heading with those that overlap it by more than 0.5; the best first.
     """
     boxes = boxes[boxes[:, SCORE] >= LEAST_SCORE]
     boxes = boxes[np.argsort(-boxes[:, SCORE], kind="stable")]
@@ -70,10 +64,8 @@ def merge_boxes(boxes: Floats, classes: Sequence[str]) -> Floats:
 
 
 def confirm_boxes(found: Floats, again: Floats) -> Floats:
-    """Each box, (k, 10), and what further looks at its place show, (r, k, 10) with a score of 0 for nothing, as one.
-
-    The score is the mean of the box's and the looks' mean; class and front are those of the best one, with which the
-    others are averaged as in `merge_boxes`.
+    """Each box, (k, 10), and what further looks at its place show, (r, k, 10) with a score of 0 for nothing, as one
+    with the mean of the box's score and the looks' mean; class and front are those of the best one (`merge_boxes`).
     """
     looks = np.concatenate([found[None], again])
     scores, every = looks[:, :, SCORE], looks.reshape(-1, looks.shape[2])

@@ -103,11 +103,8 @@ def sort_into_cells(scan: Scan, height_range_m: tuple[float, float], number: Int
 
 
 def find_candidates(scan: Scan, cells: Cells, boxes: Floats, distance_per_m: float = 0.015) -> Candidates:
-    """Find where an object may be.
-
-    boxes : (k, 5) float64, rectangles of other origin, such as a detector's: x, y, length, width [m], yaw [rad].
-    distance_per_m : as in `objects.cluster.find_clusters`: twice the angle between neighboring beams [rad].
-    Returns: the groups at each of the `SCALES`, then ``boxes``.
+    """Find where an object may be: the groups at each of the `SCALES`, then ``boxes`` (k, 5) of other origin, such as a
+    detector's. ``distance_per_m`` is as in `objects.cluster.find_clusters`.
     """
     if boxes.ndim != 2 or boxes.shape[1] != 5:
         raise PointsError(f"got boxes of shape {boxes.shape}; expected (k, 5): x, y, length, width, yaw")
@@ -186,10 +183,9 @@ def fill_cells(
 def fill_groups_of_cells(
     cells: Cells, scale: int, link_m: float, per_m: float, group: Ints, order: Ints, first: Ints
 ) -> int:
-    """Link cells of a scale whose middles are near enough; return the number of groups.
+    """Link cells with points of a scale's heights whose middles are at most ``link_m`` apart, or ``per_m`` times the
+    range; return the number of groups.
 
-    scale : number of the `Scale`; a cell takes part if it has a point of these heights.
-    link_m, per_m : distance between linked cells [m], or more from ``per_m`` times the range on.
     ``group`` (k,) gets the group of each cell, -1 for none; ``order`` and ``first`` are those of `Groups`.
     """
     number, flat, scales = cells.number, cells.flat, cells.scales

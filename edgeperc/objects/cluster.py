@@ -158,15 +158,11 @@ def sort_points(
 def cluster_labels(
     clusters: Ids, labels: Labels, *, min_share: float = 0.7, part_of: Mapping[int, int] = MappingProxyType({})
 ) -> tuple[Bytes, Floats]:
-    """The class that more than ``min_share`` of a cluster's points have (KUL-Seg 5.2).
+    """The class that more than ``min_share`` of a cluster's points have (KUL-Seg 5.2), 0 if none has, and the share of
+    its most frequent class of objects.
 
-    clusters : (n,) int32; cluster of every point, -1 for none.
-    labels : (n,) uint8; class of every point; 0 is the background.
-    min_share : in 0..1.
-    part_of : mapping of int to int; class to the class that it may be a part of. If at least a quarter of the points of
-        these two classes have the second class, all of them count as the second class.
-    Returns classes ((k,) uint8): Class of every cluster, the lower one on ties; 0 if no class has the share.
-    Returns shares ((k,) float64): Share of the cluster's points that have its most frequent class of objects.
+    part_of : class to the class that it may be a part of. If at least a quarter of the points of these two classes have
+        the second class, all of them count as the second class.
     """
     if clusters.ndim != 1 or labels.shape != clusters.shape:
         raise PointsError(

@@ -118,10 +118,8 @@ def fill_crops(
 
 @njit(cache=True, nogil=True)
 def fill_features(points: Points, counts: Ints, rectangles: Floats, scale: Floats32, features: Floats32) -> None:
-    """Write the network's input of crops, (m, n_points, channels).
-
-    points, counts : (m, n_points, 4) float32 and (m,) int32, of `Crops`.
-    scale : (2, channels) float32, mean and standard deviation of the `FEATURES`.
+    """Write the network's input of crops (m, n_points, channels); ``scale`` has mean and standard deviation of the
+    `FEATURES`.
     """
     raw = np.empty(features.shape[2], np.float32)
     for k in range(points.shape[0]):

@@ -91,14 +91,13 @@ class Search(NamedTuple):
     A run holds points of one column, each linked with the one before. It is the root of a tree of smaller parts, which
     are made when they are needed (`halves_are_linked`). Runs are numbered from 0, smaller parts from the end down.
 
-    order, xyz, reach, keys : (m,) int32, (m, 3) float32, (m,) float64, (m,) float64; of each point: row, coordinates
-        [m], reach [m], and scratch.
-    owner : (runs,) int32; cluster of each run, `FREE` or `DROPPED`.
-    run_of : (n,) int32; run of each point of the scan.
-    firsts : (strips, STRIP + 1) int32; first run of each column of the opened strips, and the end.
-    queue : (runs,) int32; runs of the cluster that grows.
-    near, pairs : (runs,) int32, (MAX_PAIRS, 2) int32; scratch.
-    votes, votes_left : (shares + 1,) int64; of the cluster that grows, and of the points in no cluster yet.
+    order, xyz, reach : of each point, its row, coordinates [m] and reach [m].
+    owner : cluster of each run, `FREE` or `DROPPED`.
+    run_of : run of each point of the scan.
+    firsts : (strips, STRIP + 1) first run of each column of the opened strips, and the end.
+    queue : runs of the cluster that grows.
+    votes, votes_left : of the cluster that grows, and of the points in no cluster yet.
+    keys, near, pairs : scratch.
     """
 
     order: Ints
@@ -137,11 +136,8 @@ def levels_of(min_distance: float, distance_per_m: float, max_range: float) -> R
 def chain_points(
     points: Points, among: Mask, max_range: float, levels: Records, rows: Rows, chain: Ints
 ) -> tuple[int, Ints]:
-    """Write the grids of the levels, and the points of every strip; see `Strips`.
-
-    max_range : points with a larger x, y or z do not take part [m].
-    Returns m: Number of points that take part.
-    Returns heads: (strips,) int32.
+    """Write the grids of the levels, and the points of every strip within ``max_range`` along each axis; see `Strips`.
+    Returns the number of points that take part, and the heads of the strips.
     """
     m = 0
     low_x, low_y, high_x, high_y = math.inf, math.inf, -math.inf, -math.inf
@@ -204,12 +200,8 @@ def fill_clusters(
     """Compute every point's cluster; see `find_clusters`.
 
     Clusters grow from seeds, run by run. Only strips within reach of a growing cluster are opened: sorted, and divided
-    into runs. A run of another cluster is not linked with this one, which was complete.
-
-    votes : (n,) uint8; bit 0: the point counts. Bit k + 1: it may count for share k.
-    min_shares : (k,) float64, at most 7
-    clusters : (n,) int32, overwritten; -1 without a cluster; -2 for points of clusters without a sufficient share, as
-        far as they were looked at.
+    into runs. A run of another cluster is not linked with this one, which was complete. Points of clusters without a
+    sufficient share have -2, as far as they were looked at.
     """
     clusters[:] = FREE
     points, rows, levels, heads = strips.points, strips.rows, strips.levels, strips.heads
@@ -357,10 +349,8 @@ def columns_within(level: np.void, part: np.void) -> tuple[int, int, int, int]:
 def find_near(
     parts: Records, owner: Ints, firsts: Ints, col: int, end: int, part: np.void, near: Ints, work: Records
 ) -> int:
-    """List the runs of no cluster in columns of a strip that may be linked with a part.
-
-    firsts : (STRIP + 1,) int32; of the strip, as in `Search`.
-    col, end : first column, and the one after the last.
+    """List the runs of no cluster in columns of a strip, from ``col`` to before ``end``, that may be linked with a
+    part.
     """
     n_near, far = 0, SAFE * part["longest"]
     # If the columns hold many runs, they are searched one by one, by height.

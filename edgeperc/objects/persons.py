@@ -66,12 +66,7 @@ PERSON = np.dtype(
 
 
 class Extent(NamedTuple):
-    """A group of points along its principal axis, seen from above.
-
-    cos, sin : of the axis.
-    low_u, high_u, low_v, high_v : lowest and highest coordinate along and across the axis [m].
-    top : greatest height above the ground [m].
-    """
+    """A group of points along (u) and across (v) its principal axis from above [m]; ``top`` is above the ground."""
 
     cos: float
     sin: float
@@ -119,13 +114,8 @@ def measure(cloud: Cloud, members: Ints, above: float) -> Extent:
 def fill_person_groups(
     cloud: Cloud, labeled: Labeled, clusters: Groups, groups: Groups, loose: Ints
 ) -> tuple[int, int]:
-    """List the clusters that may be one or a few persons, and the persons' points of the others.
-
-    labeled : roles are 0 for labels that are not persons', `UNSEEN` for points out of view.
-    groups : with room for all points of ``clusters``, overwritten
-    loose : (m,) int32, overwritten; persons' points of clusters that are larger than a person or hold too few
-        persons' points.
-    Returns the numbers of groups and of loose points.
+    """List the clusters that may be one or a few persons, and the persons' points of the others, which are larger or
+    hold too few of them; returns both numbers. Roles are 0 for other labels, `UNSEEN` for points out of view.
     """
     labels, roles, order, starts = labeled.labels, labeled.roles, groups.order, groups.starts
     cluster_order, cluster_starts = clusters.order, clusters.starts
@@ -160,15 +150,10 @@ def fill_person_groups(
 def complete_persons(
     cloud: Cloud, in_view: Mask, clusters: Ids, may_be: Mask, walks: int, rides: int, labels: Labels
 ) -> None:
-    """Give the points of a cluster that has a person's size and shape one label.
+    """Give the points of a cluster that has a person's size and shape one label, ``walks`` or ``rides`` (rule
+    ``person`` of docs/concepts/agreement.md).
 
-    clusters : (n,) int32; negative for none.
-    may_be : (k,) bool; clusters whose bounds are not too large for a person, and that hold labeled points.
-    walks, rides : the labels of persons on foot and of those who ride.
-    labels : (n,) uint8, modified; a cluster up to 2.3 m long and 0.7 m wide (0.8 m if the person rides), whose upper
-        quarter is at most 0.8 m wide, and of which a fifth in view is labeled as persons, is one person, who rides if
-        longer than a stride, or if a quarter of the persons' points says so. The persons' points of one who is longer
-        than a stride, or all points of one who is 1.3 to 2.0 m high and of whom at least 0.3 is labeled, get the label.
+    may_be : clusters whose bounds are not too large for a person, and that hold labeled points.
     """
     numbers, n = np.empty(len(may_be), np.int32), 0
     for k in range(len(may_be)):
@@ -272,17 +257,13 @@ def fill_persons(
     min_points: int,
     persons: Records,
 ) -> int:
-    """Divide groups into persons, and measure them.
+    """Divide groups into persons, and measure them; returns their number, without groups that are not finite.
 
     A group whose upper quarter is wider than 0.8 m is cut where the fewest points are, and its parts again.
 
-    labeled : roles are 0 for labels that are not persons', `UNSEEN` for points out of view, `WALKS` or `RIDES` for
-        others.
-    groups : the points of a group are put in the order of its persons.
-    n_whole : groups from this number on are labeled points of larger clusters.
-    cluster_of, clusters : cluster of every point, (n,) int32, and points by cluster.
-    min_points : smaller parts are dropped.
-    Returns: Number of persons. Those beyond p are left out, and groups with points that are not finite.
+    labeled : roles are 0 for labels that are not persons', `UNSEEN` for points out of view, `WALKS` or `RIDES`.
+    groups : the points of a group are put in the order of its persons; from ``n_whole`` on, they are labeled points of
+        larger clusters.
     """
     order, starts, others, other_starts = groups.order, groups.starts, clusters.order, clusters.starts
     left = np.empty((MAX_CUTS + 1, 3), np.int64)  # parts: first and last place in `order`, number of cuts before

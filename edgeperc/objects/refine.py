@@ -45,28 +45,25 @@ def remove_outliers(
     radius_m: Mapping[str, float] = OBJECT_RADIUS_M,
     full_turn: bool = False,
 ) -> Bytes:
-    """Set to background the pixels whose points lie away from the object they were labeled with.
+    """Set to background the pixels whose points lie away from the object they were labeled with; deterministic.
 
-    points : (n, 4) float32; x, y, z [m] in the sensor frame, remission.
-    index : (H, W) int32; row of ``points`` at each pixel of a range image; -1 without a return.
-    labels : (H, W) uint8; index into ``classes`` of every pixel; 0 is the background.
-    radius_m : class to the radius [m] around an object's middle, seen from above, that holds its visible points.
-        Classes that are not in it are not changed.
+    index : (H, W) row of ``points`` at each pixel of a range image; -1 without a return.
+    radius_m : class to the radius [m] around an object's middle, seen from above, that holds its visible points. Other
+        classes are not changed.
     full_turn : the image's left and right edges meet.
-    Returns (H, W) uint8: the cleaned labels, a copy. Deterministic.
 
-    PointSeg 5.2 refines its back projection by RANSAC but does not name a model; this one is our own. Connected
-    pixels of one label (8 neighbors), at any range, are a component, so that bleeding pixels stay with their object.
-    A hypothesis is a sampled point. Its center is the mean of the component's points within the class's radius of the
+    PointSeg 5.2 refines its back projection by RANSAC but does not name a model; this one is our own. Connected pixels
+    of one label (8 neighbors), at any range, are a component, so that bleeding pixels stay with their object. A
+    hypothesis is a sampled point. Its center is the mean of the component's points within the class's radius of the
     sample, seen from above. Its consensus is the points within that radius of the center. The largest consensus is an
     object. The rest is searched in the same way: it is another object (the next car of a row) if its consensus has 5
     points and a tenth of them are more than 2 pixels from the objects found before. Otherwise all of the rest becomes
     background. At least one object of every component stays.
 
-    On 90 labeled KITTI frames, followed by `label_points`, point IoU of car, pedestrian and cyclist rises from
-    0.81, 0.63, 0.66 to 0.88, 0.86, 0.87 for masks dilated by one pixel, from 0.71, 0.47, 0.54 to 0.80, 0.74, 0.81
-    for two. It falls by at most 0.002 for correct masks. Removing points near a ground plane as well removed more
-    points of the objects' feet than of the ground.
+    On 90 labeled KITTI frames, followed by `label_points`, point IoU of car, pedestrian and cyclist rises from 0.81,
+    0.63, 0.66 to 0.88, 0.86, 0.87 for masks dilated by one pixel, from 0.71, 0.47, 0.54 to 0.80, 0.74, 0.81 for two. It
+    falls by at most 0.002 for correct masks. Removing points near a ground plane as well removed more points of the
+    objects' feet than of the ground.
     """
     arrays = _check(points, index, labels)
     radii = np.array([radius_m.get(name, 0.0) for name in classes])
@@ -78,21 +75,16 @@ def remove_outliers(
 
 
 def label_points(points: Points, pixel: Ints, index: Ints, labels: Labels, *, full_turn: bool = False) -> Bytes:
-    """Label every point in view from the pixel labels (PointSeg 5.2).
+    """Label every point in view from the pixel labels (PointSeg 5.2); points out of view (-1 in ``pixel``) have 0.
 
-    points : (n, 4) float32; x, y, z [m] in the sensor frame, remission.
-    pixel : (n,) int32; flat pixel of each point; -1 for points out of view.
-    index : (H, W) int32; row of ``points`` at each pixel of a range image; -1 without a return.
-    labels : (H, W) uint8; class of every pixel; 0 is the background.
-    full_turn : the image's left and right edges meet.
-    Returns (n,) uint8: a point that won its pixel has the pixel's label. The others are hidden behind a nearer point.
-        They take the majority label of 5 pixels: those nearest in range among the 5 x 5 around the point and within 1 m
-        of its range; 0 if there is none. On ties between labels, the label of the nearest pixel wins; on ties in range,
-        the pixel above, then left. Points out of view have 0.
+    A point that won its pixel (``index``) has the pixel's label. The others are hidden behind a nearer point. They take
+    the majority label of 5 pixels: those nearest in range among the 5 x 5 around the point and within 1 m of its range;
+    0 if there is none. On ties between labels, the label of the nearest pixel wins; on ties in range, the pixel above,
+    then left.
 
     The vote is that of RangeNet++, restricted to hidden points. On 90 labeled KITTI frames with correct masks, it
-    raises point IoU of car, pedestrian and cyclist from 0.946, 0.894, 0.881 to 0.994, 0.988, 0.997; windows of
-    3 x 3 to 5 x 5, 1 to 5 votes, 0.5 to 1 m, Gaussian weights and distances in space were within 0.003 of that.
+    raises point IoU of car, pedestrian and cyclist from 0.946, 0.894, 0.881 to 0.994, 0.988, 0.997; windows of 3 x 3 to
+    5 x 5, 1 to 5 votes, 0.5 to 1 m, Gaussian weights and distances in space were within 0.003 of that.
     """
     rows, behind, classes = _check(points, index, labels)
     if pixel.shape != (len(points),) or (pixel.size and int(pixel.max()) >= labels.size):

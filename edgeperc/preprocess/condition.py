@@ -23,16 +23,10 @@ KIND_CODES = {"linear": 0, "polynomial": 1, "logarithm": 2, "power": 3}
 
 
 def condition(points: ArrayLike, sensor: SensorProfile, *, rendered: bool = True) -> tuple[Floats32, int]:
-    """Prepare a scan for every stage: projection, fitness check, refinement, ground and clusters.
+    """Prepare a scan for every stage: returns of the world alone (`returns.returns`), remission in 0..1 (`scale`), by
+    ``sensor.remission`` if ``rendered``; dropped rows are NaN. Also returns how many these are.
 
-    points : array_like; a scan, as for `edgeperc.types.points.as_points`; remission in the sensor's raw unit. Not
-        modified.
-    sensor : rows that are not returns of the world are dropped (`returns.returns`), and remission is scaled to 0..1
-        (`scale`).
-    rendered : convert the remission with ``sensor.remission`` (`render`), if the profile has a function.
-    Returns scan ((n, 4) float32, C-contiguous, read-only): x, y, z [m], remission in 0..1, in input order. Dropped rows
-        are NaN in all four columns. A view of ``points`` if nothing had to be changed.
-    Returns n_dropped: Number of dropped rows, those whose scaled remission is not finite included.
+    The scan is read-only, and a view of ``points`` if nothing had to be changed.
     """
     scan, dropped = returns(as_points(points), sensor)
     scan, n_overflowed = scale(scan, sensor, rendered=rendered)
@@ -40,11 +34,8 @@ def condition(points: ArrayLike, sensor: SensorProfile, *, rendered: bool = True
 
 
 def scale(points: Points, sensor: SensorProfile, *, rendered: bool = True) -> tuple[Floats32, int]:
-    """Scale the remission of a scan, whose rows are finite or NaN, to 0..1.
-
-    points : (n, 4) float32; from `edgeperc.preprocess.returns.returns`. Not modified.
-    Returns scan ((n, 4) float32, C-contiguous, read-only): A view of ``points`` if nothing had to be changed.
-    Returns n_overflowed: Number of rows that became NaN because their scaled remission is not finite.
+    """Scale the remission of a scan of `returns.returns` to 0..1, read-only; and how many rows became NaN, because
+    theirs is not finite.
     """
     if rendered and sensor.remission is not None:
         return read_only(render(points, sensor)), 0
@@ -93,12 +84,11 @@ def render(points: Points, sensor: SensorProfile) -> Floats32:
 def fill_rendered(
     points: Points, kind: int, coefficients: Floats, offset: float, scale: float, rendered: Floats32
 ) -> None:
-    """Write the points with rendered remission into ``rendered``.
+    """Write the points with rendered remission, NaN if it is not finite.
 
     kind : a value of ``KIND_CODES``.
     offset, scale : the argument x of `RemissionFunction` is ``(raw + offset) * scale``; logarithm and power clip it to
         0 from below.
-    rendered : (n, 4) float32, overwritten; a remission that is not finite becomes NaN.
     """
     # Most sensors report whole numbers up to 255. A table of their 256 results takes 0.3 instead of 2 ms.
     whole = np.empty(256)

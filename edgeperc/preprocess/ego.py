@@ -45,9 +45,7 @@ class EgoSuggestion:
 def suggest_ego_box(scans: Iterable[Floats32], sensor: SensorProfile, mounting: Mounting) -> EgoSuggestion:
     """Find returns within 3 m of the sensor that never move with respect to it, while the street does.
 
-    scans : iterable of (n, 4) float32; of one sensor on one vehicle, from at least ten places a few meters apart,
-        better from several streets.
-    sensor : its ``ego_box`` is not used.
+    scans : of one sensor on one vehicle, from at least ten places a few meters apart, better from several streets.
     mounting : a known one, for the height of the road.
     """
     frame, plain = ModelFrame(mounting), replace(sensor, ego_box=None)

@@ -32,23 +32,17 @@ class Finding(str):
 def check_fitness(
     points: Points, profile: FitnessProfile, sensor: SensorProfile, frame: ModelFrame | None = None
 ) -> tuple[Finding, ...]:
-    """Describe how a scan differs from the scans that a model was trained on, and what to do about it.
+    """Describe how a scan differs from the scans that a model was trained on, and what to do about it
+    (docs/concepts/fitness.md).
 
     Margins are wide: the check finds gross mistakes (axes, units, remission scale, another sensor) and accepts ordinary
     scans of the right sensor, including scans cropped to the model's view. It does not find scans turned by 180 degrees
     or mirrored left to right, and misses one of nine scans turned by 90 degrees (measured on KITTI).
 
-    points : (n, 4) float32; x, y, z [m], remission scaled to 0..1 by ``sensor``. Points that are not finite are
-        skipped.
-    sensor : the sensor that the caller says recorded the scan. If its remission function is constant, because the scan
-        has no remission, remission is not checked.
+    sensor : that the caller says recorded the scan. If its remission function is constant, because the scan has no
+        remission, remission is not checked.
     frame : what moved the scan into the frame of the models. A sensor that is high, or leans, sees points that are
         higher there than its beams.
-    Returns: One sentence for each difference; empty if there is none. Gross are: another unit; a vertical axis that is
-        not z, or points down; ground more than 1.3 m from where it lay in training; no points below the horizon; points
-        far above the sensor's field of view; points in less than a quarter of the model's view; half of the points as
-        near as in a room; less than 1/20 of the fewest or more than 20 times the most points in training; fewer than
-        eight rows of points; remission that is constant, missing or off the sensor's range.
     """
     return check_profiles(points, [profile], sensor, frame)
 
@@ -60,10 +54,8 @@ def check_profiles(
     frame: ModelFrame | None = None,
     ceiling_m: float | None = None,
 ) -> tuple[Finding, ...]:
-    """Describe how a scan differs from the training scans of several models, each difference once.
-
-    profiles : the scan is measured once for all profiles of the same view.
-    ceiling_m : `ground.ceiling.find_ceiling`.
+    """Describe how a scan differs from the training scans of several models, each difference once; it is measured once
+    for all profiles of the same view.
     """
     measured: dict[Range, Measures | None] = {}
     found: dict[Finding, None] = {}
@@ -78,10 +70,8 @@ def check_profiles(
 
 
 def _seen_again(scan: Measures, points: Points, sensor: SensorProfile, frame: ModelFrame | None) -> Measures:
-    """The measures with the ground as the lowest points show it, if it is not where most points are, and with
-    elevations as the sensor sees them, if these are lower.
-
-    Most points may be on a ceiling or on walls; and a high sensor sees little of the ground near by.
+    """The measures with the ground as the lowest points show it, if it is not where most points are (on a ceiling, on
+    walls, or around a high sensor), and with elevations as the sensor sees them, if these are lower.
     """
     raised_m = 0.0 if frame is None else float(frame.eye[2])
     sample = points[:: len(points) // _SAMPLE + 1, :3].astype(np.float64)
@@ -173,10 +163,8 @@ _USUAL_M = 9.0  # median distance in a street
 
 
 def check_dropped(points: Points, dropped: DroppedPoints, sensor: SensorProfile) -> tuple[Finding, ...]:
-    """Describe a scan of which nearly all is nearer than the sensor measures: a street in another unit, or no returns.
-
-    points : (n, 4) float32; the scan before anything was dropped.
-    dropped : what `edgeperc.preprocess.returns.returns` dropped of it.
+    """Describe a scan of which nearly all was dropped, as nearer than the sensor measures: a street in another unit, or
+    no returns.
     """
     n_left = len(points) - dropped.total
     if dropped.too_near <= _NEARLY_ALL * n_left:
@@ -399,8 +387,7 @@ def check_ground(
 ) -> tuple[Finding, ...]:
     """Describe a scan that shows a plane above, as it should show the ground below, and little of a plane below.
 
-    points : (n, 4) float32; returns in the frame of the scan, before a mounting moves them.
-    support_of, below_of : `ground.leveling.near_support` and `ground.leveling.share_below`.
+    points : returns in the frame of the scan, before a mounting moves them.
     sensor : if its beams look up more than down, and so do the points, it is the right way up: it sees a roof above and
         little ground.
     """
@@ -550,11 +537,8 @@ _ALL_ZERO = "Remission is 0 for"
 def with_raw_remission(
     findings: Iterable[Finding], remission: NDArray[np.floating], sensor: SensorProfile
 ) -> tuple[Finding, ...]:
-    """The findings, but of a remission that is there in another unit, that, in place of one that is missing.
-
-    The function of a profile, such as a logarithm, maps all values of 0..1 to 0 where 0..255 is expected.
-
-    remission : (n,) as recorded.
+    """The findings, but of a remission that is there in another unit, that, in place of one that is missing: the
+    function of a profile, such as a logarithm, maps all values of 0..1 to 0 where 0..255 is expected.
     """
     found = tuple(findings)
     if not any(finding.startswith(_ALL_ZERO) for finding in found):

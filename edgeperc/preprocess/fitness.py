@@ -75,11 +75,8 @@ def fill_scan_sums(
     rows: Rows,
     sums: Records,
 ) -> None:
-    """Measure every ``step``-th point, for `check_fitness`. Points that are not finite are skipped.
-
-    points : (n, 4) float32; x, y, z [m], remission.
-    beam_step : for ``rows``, every ``beam_step``-th point is used.
-    view : right and left edge of the model's view as pseudo-azimuth.
+    """Measure every ``step``-th point, and for ``rows`` every ``beam_step``-th, for `check_fitness`; not finite ones
+    are skipped. ``view``: right and left edge of the model's view as pseudo-azimuth.
     """
     seen, far = np.zeros(N_SECTORS), np.zeros(N_SECTORS)  # 1 with points; points farther than 3 m
     fill_histograms(points, step, view, histograms, seen, far, sums)
@@ -377,42 +374,30 @@ class FitnessProfile:
     """Lowest and highest value of each statistic over the training scans.
 
     The model's card holds it; `check_fitness` compares scans with it.
-
-    azimuth_deg : left and right edge of the model's view [deg].
-    points_in_view : points in that view.
-    view_covered : share of the view with returns, in steps of 1/64 turn.
-    remission_median, remission_p99, remission_zeros : median, 99th percentile and share of zeros of the remission,
-        scaled to 0..1.
-    elevation_p01_deg, elevation_p99_deg : 1st and 99th percentile of the elevation of points farther than 3 m [deg].
-    beams, beams_per_deg : rows of points above one another, and their number per degree of elevation.
-    range_median_m : median horizontal distance [m].
-    ground_m : height of the ground in the sensor frame [m]; None if no scan shows the ground.
-    road_ahead : logarithm of the ratio of obstacles at the sides to those ahead and behind; None if no scan is a full
-        turn.
     """
 
     n_scans: int
-    azimuth_deg: Range
-    points_in_view: Range
-    view_covered: Range
+    azimuth_deg: Range  # left and right edge of the model's view [deg]
+    points_in_view: Range  # points in that view
+    view_covered: Range  # share of the view with returns, in steps of 1/64 turn
+    # median, 99th percentile and share of zeros of the remission, scaled to 0..1
     remission_median: Range
     remission_p99: Range
     remission_zeros: Range
+    # 1st and 99th percentile of the elevation of points farther than 3 m [deg]
     elevation_p01_deg: Range
     elevation_p99_deg: Range
+    # rows of points above one another, and their number per degree of elevation
     beams: Range
     beams_per_deg: Range
-    range_median_m: Range
-    ground_m: Range | None
+    range_median_m: Range  # median horizontal distance [m]
+    ground_m: Range | None  # height of the ground in the sensor frame [m]; None if no scan shows the ground
+    # logarithm of the ratio of obstacles at the sides to those ahead and behind; None if no scan is a full turn
     road_ahead: Range | None
 
     @classmethod
     def from_scans(cls, scans: Iterable[Floats32], azimuth_deg: tuple[float, float] = (45.0, -45.0)) -> FitnessProfile:
-        """Measure training scans.
-
-        scans : iterable of (n, 4) float32; x, y, z [m], remission scaled to 0..1.
-        azimuth_deg : tuple of 2 float; left and right edge of the model's view [deg], between 180 and -180.
-        """
+        """Measure training scans with remission in 0..1, for a view between a left and a right edge [deg]."""
         measures = [measured for scan in scans if (measured := measure(scan, azimuth_deg)) is not None]
         if not measures:
             raise PointsError("no scan with a finite point was given; a profile needs the training scans")

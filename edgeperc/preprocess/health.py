@@ -45,10 +45,8 @@ _RANGE_SHARE, _SHRUNK, _FEWER_RETURNS = 0.95, 0.6, 0.85
 
 @dataclass(frozen=True)
 class Normal:
-    """What the first scans of a sensor showed.
-
-    fewest : (N_SECTORS, 4) float64, or None; least counts of `fill_sectors`; None before the first scan.
-    ranges_m, returns : high quantile of the ranges [m] and number of returns, one a scan.
+    """What the first scans of a sensor showed: the least counts of `fill_sectors`, high quantiles of the ranges [m] and
+    numbers of returns, one a scan.
     """
 
     fewest: Floats | None = None
@@ -71,11 +69,8 @@ class Normal:
 def check_health(
     points: Points, sensor: SensorProfile, normal: Normal, eye_m: ArrayLike = (0.0, 0.0, 0.0)
 ) -> tuple[SensorHealth, Normal]:
-    """Measure what window and weather do to a scan, and compare it with the first scans.
-
-    points : (n, 4) float32; x, y, z [m] in the frame of the models, remission. Rows that are not finite are skipped.
-    eye_m : place of the sensor there.
-    Returns the health, and ``normal`` with this scan if that is not complete.
+    """Measure what window and weather do to a scan in the frame of the models, and compare it with the first scans;
+    returns the health, and ``normal`` with this scan if that is not complete.
     """
     eye, points = np.array(eye_m, np.float64), read_only(points)
     step = next((step for step in _STEPS if len(points) <= step * _SAMPLE), len(points) // _SAMPLE | 1)
@@ -267,9 +262,8 @@ def _isolated(
 def fill_sectors(points: Points, eye: Floats, step: int, tans: Floats, counts: Floats, ranges: Floats) -> int:
     """Count every ``step``-th point by sector and band, and by range in meters; returns the number of them.
 
-    tans : (2,) tangents of the elevations below which beams are in the first, or else in the second band; others are in
-        the third.
-    counts : (N_SECTORS, 4), overwritten; sectors counter-clockwise from x; the last column is the sum of the bands.
+    tans : tangents of the elevations below which beams are in the first, or else in the second band of three.
+    counts : (N_SECTORS, 4) sectors counter-clockwise from x; the last column is the sum of the bands.
     """
     for k in range(counts.shape[0]):
         counts[k, 0] = counts[k, 1] = counts[k, 2] = counts[k, 3] = 0.0
@@ -338,10 +332,10 @@ def mark_isolated(
 
     of : only points whose smaller horizontal coordinate is at most this share of the larger one; how many others; how
         many if it is dim; the remission below which it is.
-    radius : (3,); around a point, per meter of its range, at least, and at most [m].
-    heads : (a power of two,), buffers : (2, most near points that are looked at); overwritten.
-    counts : (4, 3), overwritten; of each side, with a larger x, y, -x and -y, the near points, those with few others
-        around, and of these the dim ones.
+    radius : (3,) around a point, per meter of its range, at least, and at most [m].
+    heads, buffers : scratch: a power of two, and 2 x the most near points that are looked at.
+    counts : (4, 3) of each side, with a larger x, y, -x and -y, the near points, those with few others around, and of
+        these the dim ones.
     """
     wedge, most_bright, most_dim, dim = of
     n, full = 0, np.float64(NEAR_M * NEAR_M)

@@ -422,10 +422,8 @@ def _directions(poses: Floats) -> str:
 
 @njit(cache=True, nogil=True)
 def fill_deskewed(points: Points, after_s: Floats, velocity: Floats, rate: Floats, moved: Points) -> None:
-    """Move points by the motion of the sensor (Rodrigues' formula for the turn and for its integral).
-
-    after_s : (n,) float64; time of each point after the pose of the result [s].
-    velocity, rate : (3,) float64; of the sensor, in its own frame [m/s, rad/s].
+    """Move points by the motion of the sensor in its own frame (Rodrigues' formula for the turn and for its integral),
+    of the time of each after the pose of the result [s].
     """
     wx, wy, wz = rate[0], rate[1], rate[2]
     squared = wx * wx + wy * wy + wz * wz

@@ -22,18 +22,13 @@ ROUNDING = 1e-6
 def returns(
     points: Points, sensor: SensorProfile, origin_m: tuple[float, float] | None = None
 ) -> tuple[Floats32, DroppedPoints]:
-    """Blank the rows of a scan that are not returns of the world.
+    """Blank the rows of a scan that are not returns of the world with NaN: not finite, too near, of the own vehicle. A
+    remission that is not finite becomes the median of the others, 0 if there are none.
 
-    points : (n, 4) float32; x, y, z [m] in the frame of the scan, before its mounting moves it; remission. Not
-        modified.
-    sensor : rows at most ``min_range_m`` from the sensor are too near; with ``min_range_m=0``, those of the sensor's
-        own place. Rows inside ``ego_box`` are of the own vehicle.
-    origin_m : tuple of 2 float; x, y of the sensor in the frame of the scan [m]; by default as the profile's mounting
-        says.
-    Returns scan ((n, 4) float32, C-contiguous, read-only): In input order. Blanked rows are NaN in all four columns. A
-        remission that is not finite is missing: it becomes the median of the others, 0 if there are none. A view of
-        ``points`` if nothing changes.
-    Returns dropped: A row of several kinds counts once, as the first of them.
+    points : in the frame of the scan, before its mounting moves it. The result is read-only, a view of them if nothing
+        changes.
+    sensor : rows at most ``min_range_m`` from the sensor are too near; with 0, those of the sensor's own place.
+    origin_m : x, y of the sensor in the frame of the scan [m]; by default as the profile's mounting says.
     """
     x, y = sensor.mounting.origin_m if origin_m is None else origin_m
     box = None if sensor.ego_box is None else np.array(sensor.ego_box)
@@ -103,12 +98,9 @@ def has_returns_only(values: Floats32, square: np.float32) -> bool:
 def fill_returns(
     points: Points, origin: Floats, square: float, box: Floats, cleaned: Floats32
 ) -> tuple[int, int, int, int]:
-    """Copy the points (n, 4) that are returns, NaN in place of others.
-
-    Returns the numbers of rows that are not finite, too near and of the ego, and of others without remission.
-
-    ``square`` is that of the nearest range [m2] about ``origin`` (3,); ``box`` (3, 2) has lowest and highest x, y, z
-    about it.
+    """Copy the points that are returns, NaN in place of others; returns the numbers of rows that are not finite, too
+    near and of the ego, and of others without remission. ``square`` is that of the nearest range [m2] about ``origin``,
+    as the ``box``.
     """
     n_not_finite, n_too_near, n_ego, n_unknown = 0, 0, 0, 0
     for i in range(points.shape[0]):

@@ -80,39 +80,27 @@ _ADVICE = (
 
 
 class Polar(NamedTuple):
-    """Points of a scan about the sensor's axis.
+    """Points of a scan about the sensor's axis."""
 
-    flat, z : (n,) float64; horizontal distance and height [m].
-    azimuth : (n,) float64; [deg].
-    time : (n,) float64; when a point was taken, in turns from the middle of the scan, if the points come in turn.
-    rows : the points of each beam, if they come beam by beam.
-    """
-
+    # (n,) horizontal distance and height [m]
     flat: Floats
     z: Floats
-    azimuth: Floats
-    time: Floats
-    rows: tuple[Ints64, ...]
+    azimuth: Floats  # (n,) [deg]
+    time: Floats  # (n,) when a point was taken, in turns from the middle of the scan, if the points come in turn
+    rows: tuple[Ints64, ...]  # the points of each beam, if they come beam by beam
 
 
 class Beams(NamedTuple):
-    """Beams from the top down.
+    """Beams from the top down."""
 
-    elevations_deg, slopes, offsets_m : (n,) float64; a beam's points have z = offset + slope * horizontal distance; the
-        elevation is the angle of that slope.
-    seen_deg : (n,) float64; median elevation of its points as seen from the origin of the scan.
-    counts : (n,) float64; the number of its points.
-    pure : (n,) float64; share of these on its line.
-    flat_m : (n,) float64; their median distance.
-    """
-
+    # (n,) a beam's points have z = offset + slope * horizontal distance; the elevation is the angle of that slope
     elevations_deg: Floats
     slopes: Floats
     offsets_m: Floats
-    seen_deg: Floats
-    counts: Floats
-    pure: Floats
-    flat_m: Floats
+    seen_deg: Floats  # (n,) median elevation of its points as seen from the origin of the scan
+    counts: Floats  # (n,) the number of its points
+    pure: Floats  # (n,) share of these on its line
+    flat_m: Floats  # (n,) their median distance
 
 
 class Match(NamedTuple):
@@ -443,11 +431,11 @@ def _blocks(flat: Floats, z: Floats) -> tuple[tuple[float, float], int]:
 
 
 def _straightened(polar: Polar) -> Polar:
-    """The points as seen from where the sensor was, about its axis.
+    """The points as seen from where the sensor was, about its axis. Data sets move points to one time, and turn them
+    level.
 
-    Data sets move points to one time, and turn them level. The place, the way of the sensor during the scan and its
-    tilt are fitted so that the points of each beam have one elevation: first of far points, which hardly depend on it,
-    and then of nearer ones.
+    The place, the way of the sensor during the scan and its tilt are fitted so that the points of each beam have one
+    elevation: first of far points, which hardly depend on it, and then of nearer ones.
     """
     flat, z, azimuth, time, rows = polar
     ahead, left = np.cos(np.radians(azimuth)), np.sin(np.radians(azimuth))

@@ -97,14 +97,14 @@ def fit_functions(
     to: str,
     source: str,
 ) -> tuple[RemissionFunction, ...]:
-    """Fit a line, a parabola, a logarithm and a power to pairs of remissions, the best first.
+    """Fit a line, a parabola, a logarithm and a power to pairs of remissions, the best in ten-fold cross-validation
+    first.
 
-    raw : (n,) array_like; remission of the sensor to adapt, from 0 (the lower end of its ``remission_range``).
-    wanted : (n,) array_like; remission of the other sensor at the same places, 0..1.
-    full_scale : width of the raw range, e.g. 255.
-    to, source : entries of `RemissionFunction`.
-    Returns: Lowest ``rmse`` in ten-fold cross-validation first. A parabola is never worse than a line on the pairs it
-        is fitted to, but it is the worst on held-back pairs, as in the paper (KUL-Seg, Table 5).
+    A parabola is never worse than a line on the pairs it is fitted to, but it is the worst on held-back pairs, as in
+    the paper (KUL-Seg, Table 5).
+
+    raw, wanted : of the sensor to adapt, from 0 on with a range of ``full_scale``, and of the other at the same places,
+        0..1.
     """
     x, y = np.asarray(raw, np.float64).ravel(), np.asarray(wanted, np.float64).ravel()
     if len(x) != len(y):
@@ -129,12 +129,8 @@ def fit_functions(
 
 
 def incidences(points: Points, cell_m: float = 0.8) -> Floats:
-    """Compute the cosine of the incidence, between each ray and the normal of the surface around its point.
-
-    points : (n, 3 or more) float32; x, y, z [m] in the sensor frame.
-    cell_m : edge of the cubic cells in which surfaces are fitted [m].
-    Returns (n,) float64: 0..1. NaN if the point's cell has fewer than six returns, or if these are not on a surface
-        (leaves).
+    """Compute the cosine of the incidence, between each ray and the normal of the surface around its point in cubes of
+    ``cell_m``; NaN if these have fewer than six returns, or no surface (leaves).
     """
     # Column by column: over rows of three values, numpy takes several times as long.
     x, y, z = np.ascontiguousarray(points[:, :3].T, np.float64)
@@ -165,15 +161,9 @@ def incidences(points: Points, cell_m: float = 0.8) -> Floats:
 
 
 def stratify(scan: Points, n_points: int | None = None, cell_m: float = 0.8) -> tuple[Ints64, Floats]:
-    """Find the stratum of each point, by range and incidence.
+    """Find the stratum of each point, by range and incidence, and its remission; without points out of `RANGE_EDGES_M`.
 
-    scan : (n, 4) float32; x, y, z [m] in the sensor frame, remission. Points that are not finite or out of
-        `RANGE_EDGES_M` are left out.
-    n_points : use about so many points: all returns in some of the cells in which `incidences` fits surfaces. None: use
-        all.
-    cell_m : edge of the cells [m].
-    Returns strata ((k,) int64): 0 to `N_STRATA` - 1.
-    Returns remissions: (k,) float64.
+    n_points : use about so many points: all returns in some of the cells in which `incidences` fits surfaces.
     """
     if scan.ndim != 2 or scan.shape[1] != 4:
         raise PointsError(f"got an array of shape {scan.shape}; expected (n, 4): x, y, z, remission")
@@ -198,12 +188,8 @@ def stratify(scan: Points, n_points: int | None = None, cell_m: float = 0.8) -> 
 
 
 def remission_strata(scans: Iterable[Floats32]) -> list[tuple[float, tuple[float, ...]]]:
-    """Compute the share of the points and `N_SHARES` quantiles of their remission in each stratum, as in `REFERENCES`.
-
-    A stratum of fewer than 200 points has a share of 0 and no quantiles.
-
-    scans : iterable of (n, 4) float32; x, y, z [m] in the sensor frame, remission.
-    Returns list of (share, quantiles): One entry per stratum.
+    """Compute the share of the points and `N_SHARES` quantiles of their remission in each stratum, as in `REFERENCES`;
+    one of fewer than 200 points has a share of 0 and no quantiles.
     """
     return quantiles_by_stratum([stratify(scan) for scan in scans])
 
@@ -230,15 +216,11 @@ def quantiles(values: Floats) -> Floats:
 def match_quantiles(
     strata: Sequence[tuple[float, Sequence[float]]], reference: Sequence[tuple[float, Sequence[float]]]
 ) -> tuple[Floats, Floats]:
-    """Match remissions of two sensors by quantile; no common scene is needed.
+    """Match remissions of two sensors in similar streets by quantile (`remission_strata`); no common scene is needed.
 
     Each stratum is weighted by the smaller of its two shares, so that a wider road or a sensor that looks higher up has
     no influence. Matching within each stratum was worse: the least-squares curve through all strata is too flat, and
     car IoU on PandaSet was 0.44 instead of 0.56.
-
-    strata, reference : sequence of (share, quantiles); from `remission_strata`: one of the sensor's scans, one of
-        another sensor in similar streets.
-    Returns raw, wanted ((k,) float64): Increasing; empty if no stratum is known for both.
     """
     both = [
         (min(share, other_share), own, other)
@@ -263,14 +245,13 @@ def _weighted_quantiles(values: Floats, weights: Floats) -> Floats:
 def fit_sensor(
     scans: Sequence[Floats32], sensor: SensorProfile, to: str = "hdl-64e", *, source: str = ""
 ) -> tuple[SensorProfile, tuple[RemissionFunction, ...]]:
-    """Fit the remission function of a sensor to scans of any street.
+    """Fit the remission function of a sensor to scans of any street: ``sensor`` with the best function, and all of
+    them.
 
-    scans : sequence of (n, 4) float32; with raw remissions.
-    sensor : the sensor that took them. What it drops (`edgeperc.preprocess.returns.returns`) is not used.
+    A parabola that decreases before full scale is not used.
+
     to : a key of `REFERENCES`.
     source : description of the scans; by default their number.
-    Returns profile: ``sensor`` with the best function; a parabola that decreases before full scale is not used.
-    Returns functions: All kinds, best first.
     """
     if to not in REFERENCES:
         raise SensorError(f"no reference remissions of {to!r}; known are {', '.join(REFERENCES)}")

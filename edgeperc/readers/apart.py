@@ -95,10 +95,8 @@ def start_process(folder: str) -> subprocess.Popen[bytes]:
 
 
 class _Watch:
-    """A thread that ends the process when a reply takes too long; not every system can wait for a pipe with a limit.
-
-    since_s : float or None; since when a reply is awaited, on the monotonic clock; None while the reader of the scans
-        takes its time.
+    """A thread that ends the process when a reply, awaited since ``since_s`` on the monotonic clock, takes too long;
+    not every system can wait for a pipe with a limit.
     """
 
     def __init__(self, process: subprocess.Popen[bytes]) -> None:

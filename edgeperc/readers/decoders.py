@@ -63,11 +63,8 @@ def decode(
     *,
     times: bool = True,
 ) -> Iterator[TimedScan]:
-    """The scans of a capture, decoded in this process.
-
-    warn : called with a sentence about what was left out.
-    alive : called now and then while a large file is checked before its first scan.
-    times : false leaves out the times of points.
+    """The scans of a capture, decoded in this process; ``warn`` gets a sentence about what was left out, ``alive`` is
+    called now and then while a large file is checked.
     """
     scans = (
         _packet_scans(path, kind, topic, remission_field, warn, alive)

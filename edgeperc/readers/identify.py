@@ -128,10 +128,8 @@ def of_velodyne(names: Collection[str | None]) -> KnownSensor:
 
 
 def of_metadata(content: Any, source: str) -> KnownSensor:
-    """The sensor that an Ouster's metadata describes, with its own beam angles and columns.
-
-    content : object; the metadata as `json.loads` returns it.
-    source : what to call it in messages.
+    """The sensor that an Ouster's metadata, as `json.loads` returns it, describes, with its own beam angles and
+    columns; errors name the ``source``.
     """
     try:
         check_metadata(content)

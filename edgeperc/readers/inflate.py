@@ -23,10 +23,8 @@ def most_bytes(n_packed: int) -> int:
 
 
 def inflate(packed: bytes, method: str, limit: int | None = None) -> bytes:
-    """Decompress bytes, but no more than a limit.
-
-    method : ``""``: not compressed. ``"lz4"`` is LZ4's frame format.
-    limit : most bytes of the result; by default 2 GiB, and never more than `most_bytes`.
+    """Decompress bytes (``"lz4"`` is LZ4's frame format, ``""`` not compressed), but no more than a limit, and never
+    more than `most_bytes`.
     """
     limit = min(MAX_BYTES if limit is None else limit, most_bytes(len(packed)) if method else MAX_BYTES)
     if method == "":

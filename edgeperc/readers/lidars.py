@@ -87,10 +87,8 @@ def _name_of(payload: memoryview) -> str | None:
 
 
 def open_spinning(path: Path, row: Format, sender: str | None, alive: Callable[[], None]) -> tuple[Format, Angles]:
-    """The format and the angles of a spinning sensor.
-
-    sender : None: any.
-    Raises PointsError: Neither the capture nor a file beside it has the angles.
+    """The format and the angles of a spinning sensor, or of a ``sender``; raises PointsError if neither the capture nor
+    a file beside it has the angles.
     """
     files = sorted(path.absolute().parent.glob("*.csv"))
     file = next((each for each in files if each.stem.startswith(path.stem)), None)
@@ -154,10 +152,8 @@ def _of_format(
 def turns_of(
     path: Path, lidar: Lidar, sender: str | None, alive: Callable[[], None], warn: Callable[[str], None]
 ) -> Iterator[TimedScan]:
-    """The turns of a spinning sensor, or what a Livox sees in tenths of a second.
-
-    sender : None: the only one among the first packets; a warning names those that begin later.
-    Raises PointsError: As `open_spinning`.
+    """The turns of a spinning sensor, or what a Livox sees in tenths of a second; without a ``sender``, those of the
+    only one among the first packets, and a warning names those that begin later.
     """
     seen = Counter[tuple[str, int]]()
     first = sender or lidar.first

@@ -33,11 +33,11 @@ _LEAST_CONTRAST, _LEAST_GAIN = 0.5, 2.7
 
 
 def find_place(xyz: NDArray[np.float64]) -> tuple[float, float, float]:
-    """Find where the sensor was when it took a scan; axes of the map, z up, the sensor nearly upright.
+    """Find where the sensor was when it took a scan, mostly to a centimeter; axes of the map, z up, the sensor nearly
+    upright.
 
-    xyz : (n, 3) float64; at least 2000 finite points of one turn, from one place: not moved point by point.
-    Returns x, y, z [m], mostly to a centimeter; of a sensor whose lasers are apart, the middle of most.
-    Raises PointsError: The elevations stand out nowhere, as in most scans of a sensor that leans by half a degree.
+    xyz : (n, 3) at least 2000 finite points of one turn, from one place: not moved point by point. Raises PointsError:
+        The elevations stand out nowhere, as in most scans of a sensor that leans by half a degree.
     """
     finite = xyz[np.isfinite(xyz).all(axis=1)]
     if len(finite) < _FEWEST:

@@ -52,10 +52,8 @@ def read_metadata(path: Path) -> str:
 
 
 def check_metadata(content: Any) -> None:
-    """Raise `PointsError` unless the numbers that arrays are made by are possible and agree.
-
-    content : object; the sensor's metadata as `json.loads` returns it, of any firmware. Fields that are absent are
-        not checked.
+    """Raise `PointsError` unless the numbers that arrays are made by, of any firmware, are possible and agree, as far
+    as they are there.
     """
     if not isinstance(content, dict):
         raise PointsError(f"expected an object, got {type(content).__name__}")

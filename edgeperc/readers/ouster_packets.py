@@ -67,44 +67,32 @@ _MOST_AHEAD = 4
 
 
 class Layout(NamedTuple):
-    """What the metadata says of packets and beams.
+    """What the metadata says of packets and beams."""
 
-    name : the serial number, as the metadata has it; "0" if it has none.
-    serial, init_id : that packets carry; 0 where they do not, or the metadata does not say.
-    port : that packets are sent to; 0 if the metadata does not say.
-    other_bytes : sizes of the packets with motion and zones.
-    frame_id : first byte and number of bytes of a packet's turn.
-    places : header, columns of a packet, bytes of a column, its status, its first pixel, bytes of a pixel.
-    shape : beams, columns of a turn.
-    packets_of_turn : fewer if the sensor looks to one side only.
-    altitude, azimuth : of each beam [rad].
-    to_lidar, to_sensor : (4, 4); from the beams' origin to the axis, and from there to the sensor [mm].
-    """
-
-    name: str
+    name: str  # the serial number, as the metadata has it; "0" if it has none
+    # that packets carry; 0 where they do not, or the metadata does not say
     serial: int
     init_id: int
-    port: int
+    port: int  # that packets are sent to; 0 if the metadata does not say
     fields: Mapping[str, Field]
     packet_bytes: int
-    other_bytes: frozenset[int]
-    frame_id: tuple[int, int]
+    other_bytes: frozenset[int]  # sizes of the packets with motion and zones
+    frame_id: tuple[int, int]  # first byte and number of bytes of a packet's turn
     is_fusa: bool
+    # header, columns of a packet, bytes of a column, its status, its first pixel, bytes of a pixel
     places: tuple[int, ...]
-    shape: tuple[int, int]
-    packets_of_turn: int
+    shape: tuple[int, int]  # beams, columns of a turn
+    packets_of_turn: int  # fewer if the sensor looks to one side only
+    # of each beam [rad]
     altitude: NDArray[np.float64]
     azimuth: NDArray[np.float64]
+    # (4, 4) from the beams' origin to the axis, and from there to the sensor [mm]
     to_lidar: NDArray[np.float64]
     to_sensor: NDArray[np.float64]
 
 
 def layout_of(content: Any) -> Layout:
-    """The layout of the packets of a sensor, of any firmware.
-
-    content : object; the metadata as `json.loads` returns it.
-    Raises PointsError: Something is missing or impossible.
-    """
+    """The layout of the packets of a sensor, of any firmware; PointsError if something is missing or impossible."""
     check_metadata(content)
     if "beam_intrinsics" in content and (missing := [name for name in _LATER if not _object(content, name)]):
         raise PointsError(f"it lacks {', '.join(missing)}, which come with beam_intrinsics")
@@ -233,12 +221,7 @@ def fill_turn(
 
 
 class OusterStream:
-    """Turns from an Ouster's packets; a packet may come a little late.
-
-    layout : what the metadata says.
-    remission_field : None: the reflectivity.
-    Raises PointsError: There is no such field.
-    """
+    """Turns from an Ouster's packets, with the reflectivity or the given field; a packet may come a little late."""
 
     def __init__(self, layout: Layout, remission_field: str | None) -> None:
         name = (remission_field or "reflectivity").upper()

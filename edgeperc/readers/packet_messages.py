@@ -103,12 +103,7 @@ def read_text(channel: Channel, content: memoryview) -> str:
 
 
 class OusterMessages:
-    """Turns of an Ouster from messages, on the clock of the computer that recorded the bag.
-
-    metadata : of the sensor.
-    remission_field : None: the reflectivity.
-    Raises PointsError: The metadata is not one, or there is no such field.
-    """
+    """Turns of an Ouster from messages, on the clock of the computer that recorded the bag."""
 
     def __init__(self, metadata: str, remission_field: str | None) -> None:
         from .ouster_packets import OusterStream, layout_of  # numba, which other messages do without

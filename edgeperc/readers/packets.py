@@ -68,10 +68,9 @@ class _Fragment(NamedTuple):
 
 
 class Datagrams:
-    """The whole UDP datagrams over IPv4 of a pcap file, put together from fragments; packets of others are left out.
+    """The whole UDP datagrams over IPv4 of a pcap file up to a cut, put together from fragments; packets of others are
+    left out.
 
-    path : a pcap file; one that is cut short is read up to the cut.
-    alive : called now and then, for large files.
     most : packets of the file that are looked at; None: all.
     n_bad : so far, those that are empty, incomplete, or contradict themselves.
     """

@@ -53,10 +53,8 @@ class _DamageError(Exception):
 
 
 def pcap_packets(path: Path, whole: bool = True) -> Iterator[Captured]:
-    """The packets of a file.
-
-    whole : raise `CutShortError` at a packet where the file ends or is damaged; otherwise stop there, if others came.
-    Raises PointsError: It is no such file.
+    """The packets of a file. Where it ends or is damaged, it stops if others came, or if ``whole`` raises
+    `CutShortError`.
     """
     size = path.stat().st_size
     if size < 24:

@@ -80,11 +80,7 @@ def _parse_pcd_header(head: bytes) -> _PcdHeader:
 
 
 def parse_pcd(data: NDArray[np.uint8], head: bytes, remission_field: str | None) -> Columns:
-    """Parse a PCD file: ascii, binary or binary_compressed.
-
-    data : (n_bytes,) uint8; the whole file.
-    head : its beginning, with the whole header.
-    """
+    """Parse a PCD file: ascii, binary or binary_compressed; ``head`` is its beginning, with the whole header."""
     header = _parse_pcd_header(head)
     n = header.n_points
     widths = [int(np.dtype(kind).itemsize) * count for kind, count in zip(header.types, header.counts, strict=True)]

@@ -59,10 +59,8 @@ def _parse_ply_header(head: bytes) -> tuple[str, list[_PlyElement], int]:
 
 
 def parse_ply(data: NDArray[np.uint8], head: bytes, remission_field: str | None) -> Columns:
-    """Parse the vertices of a PLY file: ascii, or binary in either byte order.
-
-    data : (n_bytes,) uint8; the whole file.
-    head : its beginning, with the whole header.
+    """Parse the vertices of a PLY file: ascii, or binary in either byte order; ``head`` is its beginning, with the
+    whole header.
     """
     encoding, elements, start = _parse_ply_header(head)
     before: list[_PlyElement] = []

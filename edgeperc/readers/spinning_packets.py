@@ -32,44 +32,29 @@ class Clock(NamedTuple):
 
 
 class Format(NamedTuple):
-    """One row of the table.
+    """One row of the table."""
 
-    name : the model, as its profile is called.
-    title : the model, as its maker calls it.
-    header, n_blocks, n_channels, channel_bytes : of a packet.
-    sizes : bytes that a packet may have.
-    flag : the bytes that a block begins with.
-    first : from there to the first channel; the azimuth is in the two bytes in front of it.
-    fires_us : when each channel fires, after its block.
-    clock : how and where the time is written.
-    reference : the block that the time is of, 0 or -1.
-    late_us : how much later the block fires.
-    unit_m, mask : of a distance.
-    mm_at : the byte of a packet that says how many mm the unit is; 0: none does.
-    lens_m : distance of the lasers from the axis, and height.
-    lasers : 16: channels beyond are a second firing or return; 96: every second block has those beyond 48.
-    elevations_deg : of every unit; empty: each unit has its own angles.
-    """
-
-    name: str
-    title: str
+    name: str  # the model, as its profile is called
+    title: str  # the model, as its maker calls it
+    # of a packet
     header: int
     n_blocks: int
     n_channels: int
     channel_bytes: int
-    sizes: tuple[int, ...]
-    flag: bytes
-    first: int
-    fires_us: tuple[float, ...]
-    clock: Clock
-    reference: int = 0
-    late_us: float = 0.0
+    sizes: tuple[int, ...]  # bytes that a packet may have
+    flag: bytes  # the bytes that a block begins with
+    first: int  # from there to the first channel; the azimuth is in the two bytes in front of it
+    fires_us: tuple[float, ...]  # when each channel fires, after its block
+    clock: Clock  # how and where the time is written
+    reference: int = 0  # the block that the time is of, 0 or -1
+    late_us: float = 0.0  # how much later the block fires
+    # of a distance
     unit_m: float = 0.004
     mask: int = 0xFFFF
-    mm_at: int = 0
-    lens_m: tuple[float, float] = (0.0, 0.0)
-    lasers: int = 0
-    elevations_deg: tuple[float, ...] = ()
+    mm_at: int = 0  # the byte of a packet that says how many mm the unit is; 0: none does
+    lens_m: tuple[float, float] = (0.0, 0.0)  # distance of the lasers from the axis, and height
+    lasers: int = 0  # 16: channels beyond are a second firing or return; 96: every second block has those beyond 48
+    elevations_deg: tuple[float, ...] = ()  # of every unit; empty: each unit has its own angles
 
     @property
     def is_hesai(self) -> bool:
@@ -292,14 +277,14 @@ def fill_returns(
     points: NDArray[np.float32],
     times_s: NDArray[np.float64],
 ) -> int:
-    """Put the returns of packets into points; a second return at the distance of the first is left out.
+    """Put the returns of packets into points; a second return at the distance of the first is left out. Returns how
+    many.
 
     places : header, bytes of a block, its first channel, bytes of a channel, whether numbers are big-endian, mask of a
         distance, and from a second return back to the first: blocks (of the same azimuth) or channels.
-    blocks : (n, blocks, 3) float64; azimuth [deg], time [s] and speed [deg/s]; not finite: left out.
-    beams : (blocks, channels, 3) float64; elevation [rad], azimuth [deg] and time [us] of each channel.
+    blocks : (n, blocks, 3) azimuth [deg], time [s] and speed [deg/s]; not finite: left out.
+    beams : (blocks, channels, 3) elevation [rad], azimuth [deg] and time [us] of each channel.
     lens : unit [m], direction of azimuth 0 [deg], distance of the lasers from the axis, height [m].
-    Returns int: how many.
     """
     header, block_bytes, first, channel_bytes, is_big, mask, back_blocks, back_channels = places
     n = 0
@@ -346,11 +331,7 @@ class _Packet(NamedTuple):
 
 
 class SpinningStream:
-    """Turns from the packets of a sensor.
-
-    row : the format of the packets.
-    angles : of the unit.
-    """
+    """Turns from the packets of a sensor, by their format and the angles of the unit."""
 
     def __init__(self, row: Format, angles: Angles) -> None:
         self._row, self._angles = row, angles

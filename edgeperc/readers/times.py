@@ -71,18 +71,15 @@ def time_name(names: Iterable[str]) -> str | None:
 def point_times(
     fields: Mapping[str, NDArray[Any]], points: Points, stamp_s: float | None
 ) -> NDArray[np.float64] | None:
-    """Find the times of points in a scan's fields.
+    """Find the times of points in a scan's fields [s]; NaN where one is missing, or damaged and far from all others.
 
     Drivers store seconds, milli-, micro- or nanoseconds, and no field says which. A scan takes 2 ms to 2 s, so the
-    difference between its first and its last time shows the unit. Times of less than 2 s count from ``stamp_s``.
+    difference between its first and its last time shows the unit. Times of less than 2 s count from ``stamp_s``, or 0.
+    None without such a field, or if no unit gives such a duration, as where all times are 0. Points without a return,
+    which are not finite or lie in the origin, do not show the unit.
 
-    fields : mapping of str to (n,) array; columns by `edgeperc.types.points.plain_name`.
-    points : (n, 4) float32; times of points without a return, which are not finite or lie in the origin, do not show
-        the unit.
-    stamp_s : None counts from 0.
-    Returns (n,) float64 or None: [s]; NaN where a time is damaged and lies far from all others, or is missing; None
-        without such a field, or if no unit gives a duration of 2 ms to 2 s, as where all times are 0.
-    Raises PointsError: By these times and the azimuths, the sensor takes less than 33 or more than 350 ms for a turn.
+    Raises PointsError if, by these times and the azimuths, the sensor takes less than 33 or more than 350 ms for a
+    turn.
     """
     name = time_name(fields)
     if name is None:

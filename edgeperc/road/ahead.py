@@ -325,10 +325,8 @@ def _lane_width(x: Floats, left: Floats, right: Floats) -> float:
 
 @njit(cache=True, nogil=True)
 def fill_first_cells(objects: Mask, known: Mask, road: Mask, firsts: Ints64) -> None:
-    """Count the cells of each column, from the last row up, before the first of each kind.
-
-    firsts : (3, columns) int64, overwritten; cells before the first that is an object; that is known and neither road
-        nor an object; that is neither known nor an object. The number of rows if there is none.
+    """Count the cells of each column, from the last row up, before the first that is an object; that is known and
+    neither road nor an object; that is neither known nor an object. The number of rows if there is none.
     """
     height, width = objects.shape
     for kind in range(3):
@@ -346,11 +344,8 @@ def fill_first_cells(objects: Mask, known: Mask, road: Mask, firsts: Ints64) -> 
 
 @njit(cache=True, nogil=True)
 def fill_corridor(drivable: Mask, first: float, last: float, bounds: Ints64) -> None:
-    """Follow the drivable cells ahead, row by row from the last one up.
-
-    first, last : columns between which the corridor has to begin.
-    bounds : (rows, 2) int64, overwritten; first column of the corridor in each row, and one past its last; -1, -1 in
-        rows without a corridor.
+    """Follow the drivable cells ahead, row by row from the last one up: first column of the corridor and one past its
+    last, or -1.
 
     The corridor begins in the last row that has a run of drivable cells between ``first`` and ``last``. It continues
     with the run that shares most columns with the row before, the left one on ties, and ends where no run shares one.

@@ -182,10 +182,8 @@ def grid_message(
     corner_m: Sequence[float],
     orientation: Sequence[float] = (0.0, 0.0, 0.0, 1.0),
 ) -> dict[str, Any]:
-    """The fields of a nav_msgs/OccupancyGrid.
-
-    corner_m, orientation : x, y, z of the corner with the lowest x and y [m], and quaternion x, y, z, w of the cells,
-        in the frame ``frame_id``.
+    """The fields of a nav_msgs/OccupancyGrid, by place of the corner with the lowest x and y [m] and quaternion x, y,
+    z, w of the cells in the frame.
     """
     nanoseconds = nanoseconds_of(stamp_s or 0.0)
     stamp = {"sec": nanoseconds // 10**9, "nanosec": nanoseconds % 10**9}
@@ -315,8 +313,8 @@ def split_points(perception: Perception, points: ArrayLike, *, sensor: SensorPro
     """Separate the ground from what stands on it, by the ground that was perceived; parameters as `occupancy_grid`.
 
     Ground is at most 0.125 m above and 0.5 m below it; an obstacle is anything higher, crowns and bridges, too. In
-    neither are points that are not returns (not finite, too near, of the own vehicle), drops, and reflections from more
-    than 0.5 m below the ground. A scan without ground has obstacles only.
+    neither are points that are not returns, drops, and reflections from more than 0.5 m below the ground. A scan
+    without ground has obstacles only.
     """
     moved = _returns_of(perception, points, sensor, ModelFrame(perception.mounting))
     found = heights_above(perception.ground, moved)
@@ -355,14 +353,11 @@ def _drivable(top_view: TopView | None, view: TopViewGeometry) -> tuple[Mask, Ma
 def fill_standing(
     points: Points, height_m: Heights, corner: Floats, lowest: float, overhead: float, highest: Ints, tallest: Floats32
 ) -> None:
-    """Find what stands in each cell of a grid. Points higher than ``overhead`` above the ground are ignored.
+    """Find what stands in each cell of a grid, between the heights ``lowest`` and ``overhead`` above the ground [m].
 
-    height_m : (n,) float32; height of each point above the ground [m].
-    corner : (3,) float64; x and y of the upper left corner of the grid, edge of a cell [m].
-    lowest, overhead : heights between which something stands on the ground [m].
-    highest : (rows, columns) int32, overwritten; the point with the largest height, the first of equals; -1 without
-        one.
-    tallest : (rows, columns) float32, overwritten; largest height above ``lowest`` [m]; NaN without one.
+    corner : x and y of the upper left corner of the grid, edge of a cell [m].
+    highest, tallest : the point with the largest height, the first of equals, or -1; its height above ``lowest`` [m],
+        or NaN.
     """
     n_rows, n_cols = highest.shape
     for r in range(n_rows):

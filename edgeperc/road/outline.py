@@ -35,7 +35,8 @@ class Outline:
 def outline_of(
     cells: Mask, origin: tuple[float, float], obstacles: Mask, in_holes: Mask, *, tolerance: float, max_corners: int
 ) -> Outline:
-    """Outline the connected cells that are nearest to a place.
+    """Outline the connected cells that are nearest to a place: a valid polygon, whose rings do not touch, with holes
+    inside.
 
     Closing by a disc fills gaps narrower than twice the tolerance, opening removes what is as narrow. So cells that are
     connected only over a narrower passage are left out. Where two cells share only a corner, a cell between them is
@@ -44,15 +45,12 @@ def outline_of(
     than ``max_corners`` remain, pairs of neighbors are replaced by one corner that may be anywhere on the grid, by
     growing area between the old edges and the new ones, under the same condition.
 
-    origin : tuple of 2 float; row and column of the place, where a cell's middle has the cell's row and column. It may
-        be outside the grid.
-    obstacles : (rows, columns) bool; cells that are never included.
-    in_holes : (rows, columns) bool; a hole without such a cell is filled.
-    tolerance : largest distance between the outline and the edges of the cells, in cells. 0 keeps all corners, however
-        many.
-    max_corners : largest number of corners of the outer ring, at least 4. If they do not suffice, cells are left out
-        that are farther from the edges, at last all between holes and the first row; no more are added.
-    Returns: A valid polygon: its rings neither touch nor cross themselves or one another, and the holes are inside.
+    origin : row and column of the place, where a cell's middle has the cell's row and column; perhaps outside the grid.
+    obstacles : cells that are never included.
+    in_holes : a hole without such a cell is filled.
+    tolerance : largest distance between the outline and the edges of the cells, in cells. 0 keeps all corners.
+    max_corners : of the outer ring, at least 4. If they do not suffice, cells are left out that are farther from the
+        edges, at last all between holes and the first row; no more are added.
     """
     # A kernel is compiled for arrays in C order.
     cells, obstacles, in_holes = (np.ascontiguousarray(mask, np.bool_) for mask in (cells, obstacles, in_holes))
@@ -200,11 +198,9 @@ def fill_grown(cells: Mask, radius: float, grown: Mask) -> None:
 
 @njit(cache=True, nogil=True)
 def resolve_contacts(cells: Mask, addable: Mask) -> None:
-    """Add or remove cells until no two marked cells share only a corner.
-
-    addable : (rows, columns) bool, modified; cells that may be added: of the two between such a pair, the one with the
-        larger row if possible. If neither may be, the one of the pair with the smaller row is removed, and not added
-        again.
+    """Add or remove cells until no two marked cells share only a corner. Of the two between such a pair, the one with
+    the larger row is added, if possible; if none is addable, the one of the pair with the smaller row is removed for
+    good.
     """
     height, width = cells.shape
     changed = True
@@ -252,13 +248,11 @@ def mark_connected(cells: Mask, row: int, col: int, part: Mask) -> None:
 
 @njit(cache=True, nogil=True)
 def fill_rings(cells: Mask, corners: Ints64, ends: Ints64) -> int:
-    """Trace the edges of marked cells, with the cells on the left.
+    """Trace the edges of marked cells, none of them along the border, with the cells on the left.
 
-    cells : (rows, columns) bool; none marked along the border.
-    corners : (n, 2) int64, overwritten; row and column of the corners where the trace turns, ring after ring; a
-        cell's upper left corner has its row and column. ``n`` is at least the number of sides between a marked and an
-        unmarked cell.
-    ends : (m,) int64, overwritten; where each ring ends in ``corners``; ``m`` at least a quarter of ``n``.
+    corners : (n, 2) corners where the trace turns, ring after ring; a cell's upper left corner has its row and column.
+        ``n`` is at least the number of sides between a marked and an unmarked cell.
+    ends : (m,) where each ring ends in ``corners``; ``m`` at least a quarter of ``n``.
     """
     height, width = cells.shape
     walked = np.empty((height, width), np.bool_)  # lower sides
@@ -297,10 +291,8 @@ def fill_rings(cells: Mask, corners: Ints64, ends: Ints64) -> int:
 
 @njit(cache=True, nogil=True)
 def may_change(ar: int, ac: int, br: int, bc: int, cr: int, cc: int, fixed: Ints) -> bool:
-    """Whether all cells that a triangle touches may change sides.
-
-    ar, ac, br, bc, cr, cc : row and column of its corners.
-    fixed : (rows, columns + 1) int32; number of cells of each row before each column that may not.
+    """Whether all cells that a triangle touches may change sides; ``fixed`` counts those before each column of a row
+    that may not.
     """
     # In the strip of a row, its columns are bounded by its corners there and by the crossings of its edges with the
     # strip's two lines.
@@ -373,18 +365,17 @@ def is_apart(ring: Ints64, edges: Ints64, k: int, pr: int, pc: int) -> bool:
 
 @njit(cache=True, nogil=True)
 def merge_corners(ring: Ints64, edges: Ints64, fixed: Ints, around: int, enough: int) -> int:
-    """Replace two neighboring corners of a ring by one; smallest changes first.
+    """Replace two neighboring corners of a valid ring by one, smallest changes first; returns how many corners are
+    left.
 
     Between the neighbors a and d, the corner p replaces b and c. What changes sides lies in the triangles pab, pbc and
     pcd. No cell that they touch may be fixed, and of all such p, that with the smallest sum of their areas is taken.
     The new edges may meet no other edge, so the ring stays valid. Holes stay inside if none of their cells may change.
 
-    ring : (n, 2) int64, modified; row and column of the corners of a ring that neither touches nor crosses itself.
-    edges : (m, 4) int64; row and column of the two ends of other edges, which the ring may not touch.
-    fixed : (rows, columns + 1) int32; number of cells of each row before each column that may not change sides.
+    edges : (m, 4) row and column of the two ends of other edges, which the ring may not touch.
+    fixed : (rows, columns + 1) number of cells of each row before each column that may not change sides.
     around : how far the new corner may lie from the rectangle around the two [cells].
     enough : the ring keeps at least so many corners, and at least 4.
-    Returns n_corners: The first so many rows of ``ring`` are the corners.
     """
     n, height, width = ring.shape[0], fixed.shape[0], fixed.shape[1] - 1
     tried = np.empty(n, np.int64)  # the limit at which a corner and the next one were tried in vain
@@ -447,15 +438,12 @@ def merge_corners(ring: Ints64, edges: Ints64, fixed: Ints, around: int, enough:
 def mark_needed(
     corners: Ints64, ends: Ints64, not_addable: Ints, not_removable: Ints, outer: int, enough: int, kept: Mask
 ) -> None:
-    """Remove corners of rings that neither touch nor cross; smallest triangles first.
+    """Mark the corners of rings, with the region on the left, that are left when those of the smallest triangles are
+    removed; at least three of each ring, and ``enough`` of the ``outer`` one.
 
-    corners : (n, 2) int64; row and column, ring after ring, with the region on the left.
-    ends : (m,) int64; where each ring ends in ``corners``.
-    not_addable, not_removable : (rows, columns + 1) int32; number of cells of each row before each column that may
-        not be added to the region, or removed from it.
-    outer : number of the outer ring.
-    enough : nothing more is removed once the outer ring has so few corners.
-    kept : (n,) bool, modified; the corners that are not removed; at least three of each ring.
+    ends : where each ring ends in ``corners``.
+    not_addable, not_removable : (rows, columns + 1) number of cells of each row before each column that may not be
+        added to the region, or removed from it.
     """
     n = corners.shape[0]
     before, after, ring_of = np.empty(n, np.int64), np.empty(n, np.int64), np.empty(n, np.int64)

@@ -62,11 +62,7 @@ class Graph(Protocol):
 
 
 def full_name(name: str, namespace: str = "/") -> str:
-    """Resolve the name of a topic or a node.
-
-    name : absolute (``"/points"``), or relative to the namespace.
-    Returns: With a leading slash.
-    """
+    """The absolute name of a topic or a node: of ``"/points"``, itself; others are relative to the namespace."""
     full = name if name.startswith("/") else f"{namespace.rstrip('/')}/{name}"
     full = full if full.startswith("/") else f"/{full}"
     if not re.fullmatch(r"(/[A-Za-z_][A-Za-z0-9_]*)+", full) or "__" in full:

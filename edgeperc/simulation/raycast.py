@@ -124,10 +124,8 @@ def _tile_at(tile: Floats, x: float, y: float, cell_m: float) -> float:
 
 @njit(cache=True, nogil=True)
 def ground_at(ground: Ground, x: float, y: float) -> tuple[float, float, float, float, float]:
-    """Evaluate the ground at x, y [m], world frame.
-
-    Returns height, distance outside the roads, distance outside the bays, and u and s in the first road's frame [m].
-    Both distances are negative inside; an island is outside. s is along the axis of the road, u to its left.
+    """Evaluate the ground at x, y [m], world frame: height, distance outside the roads and the bays (negative inside;
+    an island is outside), and u and s in the first road's frame [m], s along its axis, u to its left.
     """
     strips, terrain = ground.strips, ground.terrain
     outside, outside_bays, outside_islands, u_first, s_first = 1e9, 1e9, 1e9, 0.0, 0.0
@@ -198,11 +196,8 @@ def placed(primitives: Floats, poses: Floats, T_world_sensor: Floats) -> Floats:
 
 @njit(cache=True, nogil=True)
 def fill_bounds(primitives: Floats, bounds: Floats) -> None:
-    """Compute bounds of the rays from the origin that can hit each primitive.
-
-    primitives : (n, 20) float64; in the sensor frame.
-    bounds : (n, 5) float64, overwritten; first azimuth, width in azimuth [rad], lowest and highest tangent of the
-        elevation, horizontal distance [m]. Primitives that are not finite get an infinite distance.
+    """Compute bounds of the rays from the origin that can hit each primitive: first azimuth, width in azimuth [rad],
+    lowest and highest tangent of the elevation, horizontal distance [m], infinite if the primitive is not finite.
     """
     corners = np.empty((8, 3))
     for k in range(primitives.shape[0]):
@@ -573,12 +568,7 @@ def fill_points(
     points: Points,
     objects: Ints,
 ) -> int:
-    """Convert hits to returns, beam by beam.
-
-    points : (beams * columns, 4) float32, first rows overwritten
-    objects : (beams * columns,) int32, first rows overwritten; object of each point, -1 for none.
-    Returns n: Number of returns.
-    """
+    """Convert hits to returns, beam by beam, with the object of each, -1 for none; returns their number."""
     n_beams, n_columns = hits.rows.shape
     differ = 1 if rays.elevations.shape[1] > 1 else 0
     n = 0

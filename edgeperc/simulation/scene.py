@@ -199,10 +199,8 @@ def sensor_pose(
     pitch: float = 0.0,
     roll: float = 0.0,
 ) -> Floats:
-    """Make ``T_world_sensor`` for a sensor at its mounting height above the ground at x, y [m], world frame.
-
-    Returns (4, 4) float64: Rotated by roll about x, then by pitch about y (nose down is positive), then by yaw about
-        z [rad].
+    """Make ``T_world_sensor`` for a sensor at its mounting height above the ground at x, y [m], world frame: rotated by
+    roll about x, then by pitch about y (nose down is positive), then by yaw about z [rad].
     """
     T_world_sensor = np.eye(4)
     cy, sy, cp, sp = math.cos(yaw), math.sin(yaw), math.cos(pitch), math.sin(pitch)
@@ -330,11 +328,8 @@ def _pattern_rays(
 
 
 def place_shapes(scene: Scene, T_world_sensor: Floats, n_columns: int, reach_m: float) -> Shapes:
-    """Sort the shapes of a scene by the directions in which rays from a sensor may hit them.
-
-    T_world_sensor : (4, 4) float64
-    n_columns : number of sectors of a turn, counter-clockwise from +x.
-    The last column of the returned primitives is their row of ``scene.primitives``.
+    """Sort the shapes of a scene by the directions, ``n_columns`` counter-clockwise from +x, in which rays from a
+    sensor may hit them. The last column of the returned primitives is their row of ``scene.primitives``.
     """
     poses = np.array([(*o.center[:2], o.center[2] - o.size[2] / 2.0, o.yaw) for o in scene.objects]).reshape(-1, 4)
     primitives = placed(scene.primitives, poses, T_world_sensor)

@@ -161,11 +161,10 @@ class Street:
         *,
         of: str = "",
     ) -> bool:
-        """Place static shapes if the ground is free and off the roads. Return whether they were placed.
+        """Place static shapes if the ground is free and off the roads; return whether they were placed.
 
-        ``rows`` are primitives in a frame at x, y on the ground, turned by ``yaw``. They stand on the lowest ground
-        below them. ``of`` is their class in a camera's image (`CAMERA_CLASSES`), empty for none; retroreflectors on
-        poles are signs.
+        ``rows`` are primitives in a frame at x, y on the lowest ground below them, turned by ``yaw``. ``of`` is their
+        class in a camera's image (`CAMERA_CLASSES`), empty for none; retroreflectors on poles are signs.
         """
         number = -2.0 - CAMERA_CLASSES.index(of) if of else -1.0
         cos, sin = math.cos(yaw), math.sin(yaw)

@@ -15,12 +15,8 @@ def open_atomic(path: str | Path, mode: str = "wb", permissions: int = 0o666) ->
     """Open a temporary file in the target's folder; it replaces the target when the block ends without an error.
 
     A link is followed. A target that is not a regular file, such as ``/dev/stdout`` or a named pipe, is written
-    directly. What was written is on the disk before it has its name.
-
-    path : the target.
-    mode : ``"w"`` writes text as UTF-8.
-    permissions : of a new file, reduced by the process's umask.
-    Yields file: The temporary file, open for writing.
+    directly. What was written is on the disk before it has its name. ``permissions`` of a new file are reduced by the
+    umask.
     """
     path = Path(os.path.realpath(path))
     if path.exists() and not path.is_file():

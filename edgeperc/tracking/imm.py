@@ -16,15 +16,12 @@ def fill_interaction(
     mixed_covariances: Floats,
     prior: Floats,
 ) -> None:
-    """Mix the estimates of the motion models by a Markov chain (KUL-Seg's "interaction").
+    """Mix the estimates of n tracks by k motion models by a Markov chain (KUL-Seg's "interaction"); a track keeps its
+    model with probability ``stay``, and the others share the rest.
 
-    states : (n, k, s) float64; state for each of k motion models.
-    probabilities : (n, k) float64; probability of each motion model after the last update.
-    stay : (n,) float64; probability that a track keeps its motion model; the others share the rest.
-    mixed : (n, k, s) float64, overwritten; initial state of each filter: x0_j = sum_i w_ij x_i with w_ij = p_ij mu_i /
-        prior_j.
-    mixed_covariances : (n, k, s, s) float64, overwritten; sum_i w_ij (P_i + (x_i - x0_j)(x_i - x0_j)')
-    prior : (n, k) float64, overwritten; prior_j = sum_i p_ij mu_i
+    mixed : initial state of each filter: x0_j = sum_i w_ij x_i with w_ij = p_ij mu_i / prior_j.
+    mixed_covariances : sum_i w_ij (P_i + (x_i - x0_j)(x_i - x0_j)')
+    prior : prior_j = sum_i p_ij mu_i
     """
     n, k, s = states.shape
     for t in range(n):
@@ -56,12 +53,9 @@ def fill_mode_probabilities(
     Bayes' rule for motion model j and detection d: P(j, d) = beta_d prior_j L_jd / sum_i prior_i L_id. The sum over d
     is the probability of model j. P(j, d) divided by that sum is the association that the filter of model j uses.
 
-    prior : (n, k) float64; from `fill_interaction`.
-    likelihoods : (n, k, m) float64; likelihood of each detection under each motion model; 0 outside the gate.
-    beta : (n, m + 1) float64; column 0: probability that the track was not detected. Others: that the detection
-        belongs to it.
-    shares : (n, k, m + 1) float64, overwritten; association for each motion model; sums to 1 over the last axis.
-    probabilities : (n, k) float64, overwritten; probability of each motion model after the update.
+    likelihoods : (n, k, m) of each detection under each motion model; 0 outside the gate.
+    beta : (n, m + 1) as in `jpda.fill_association`.
+    shares : (n, k, m + 1) association for each motion model; sums to 1 over the last axis.
     """
     n, k, m = likelihoods.shape
     for t in range(n):
@@ -100,10 +94,8 @@ def fill_mode_probabilities(
 def fill_combined(
     states: Floats, covariances: Floats, probabilities: Floats, state: Floats, covariance: Floats
 ) -> None:
-    """Combine the estimates of the motion models into one for each track (KUL-Seg's "combination").
-
-    state : (n, s) float64, overwritten; x = sum_j mu_j x_j
-    covariance : (n, s, s) float64, overwritten; sum_j mu_j (P_j + (x_j - x)(x_j - x)')
+    """Combine the estimates of the motion models into one for each track (KUL-Seg's "combination"): x = sum_j mu_j x_j,
+    and sum_j mu_j (P_j + (x_j - x)(x_j - x)').
     """
     n, k, s = states.shape
     state[:] = 0.0

@@ -56,11 +56,8 @@ class Detections(NamedTuple):
 def fill_likelihoods(
     tracks: Predictions, gates: Gates, detections: Detections, likelihoods: Floats, weights: Floats
 ) -> None:
-    """Compute the likelihood of each detection under each motion model of each track, and the association weights.
-
-    likelihoods : (n, 3, m) float64, overwritten; [1/(m2 rad)]; 0 for all motion models if the detection is outside the
-        gate.
-    weights : (n, m) float64, overwritten; odds_t sum_k prior_tk L_tkj, the input of `fill_association`.
+    """Compute the likelihood of each detection under each motion model of each track (n, 3, m) [1/(m2 rad)], 0 outside
+    the gate, and the association weights odds_t sum_k prior_tk L_tkj.
 
     Headings are compared modulo pi, because a box looks the same from behind. Detectors are sometimes wrong by 90
     degrees, so deviations are limited to three standard deviations.
@@ -126,17 +123,16 @@ def fill_likelihoods(
 
 @njit(cache=True, nogil=True)
 def fill_association(weights: Floats, max_events: int, beta: Floats) -> int:
-    """Compute the marginal association probabilities.
+    """Compute the marginal association probabilities; returns how many tracks were solved by belief propagation.
 
     A joint event assigns at most one detection to each track and at most one track to each detection. Its probability
     is proportional to the product of the weights of its pairs.
 
-    weights : (n, m) float64; likelihood ratio of "the detection belongs to the track" to "the track was missed and
-        the detection is clutter"; 0 outside the gate.
+    weights : (n, m) likelihood ratio of "the detection belongs to the track" to "the track was missed and the detection
+        is clutter"; 0 outside the gate.
     max_events : clusters with a higher bound on the number of joint events are solved by belief propagation.
-    beta : (n, m + 1) float64, overwritten; column 0: probability that the track was not detected. Others: that the
-        detection belongs to it. Rows sum to 1.
-    Returns n_approximated: Tracks solved by belief propagation.
+    beta : (n, m + 1) column 0: probability that the track was not detected. Others: that the detection belongs to it.
+        Rows sum to 1.
     """
     n, m = weights.shape
     beta[:] = 0.0
@@ -180,11 +176,7 @@ def fill_association(weights: Floats, max_events: int, beta: Floats) -> int:
 
 @njit(cache=True, nogil=True)
 def fill_by_events(weights: Floats, rows: Ints64, columns: Ints64, beta: Floats) -> None:
-    """Solve one cluster exactly: enumerate its joint events, depth first.
-
-    rows, columns : (r,), (c,) int64; tracks and detections of the cluster.
-    beta : (n, m + 1) float64; the rows of the cluster are overwritten.
-    """
+    """Solve one cluster of tracks (rows) and detections (columns) exactly: enumerate its joint events, depth first."""
     n = len(rows)
     choice = np.full(n, -2, np.int64)  # -2: not begun; -1: missed; else an index into columns
     used = np.zeros(len(columns), np.bool_)

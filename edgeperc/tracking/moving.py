@@ -29,14 +29,10 @@ MOVABLE = frozenset(
 def moving_tracks(
     tracks: Iterable[Track], *, min_speed_mps: float | None = None, n_sigmas: float = 3.0
 ) -> tuple[Track, ...]:
-    """The tracks that move over ground, in their order.
+    """The tracks that move over ground, in their order, faster than ``min_speed_mps`` (by default
+    `ClassParameters.moving_mps`) and than ``n_sigmas`` standard deviations of their speed.
 
-    tracks : `Tracks` of one scan.
-    min_speed_mps : lowest speed over ground [m/s]. Default: `ClassParameters.moving_mps` of the class, 0.7 m/s for
-        pedestrians and 1 m/s for others.
-    n_sigmas : the speed must also exceed its standard deviation by this factor.
-    Returns: A new track has no certain speed, so it does not count as moving in its first scans. Tracks that coast
-        count.
+    A new track has no certain speed, so it does not count as moving in its first scans. Tracks that coast count.
     """
     for name, value in (("min_speed_mps", min_speed_mps), ("n_sigmas", n_sigmas)):
         if value is not None and not 0.0 <= value < math.inf:
@@ -141,10 +137,8 @@ def _inside_any(boxes: list[Box], points: Points, margin_m: float) -> Mask:
 
 @njit(cache=True, nogil=True)
 def mark_in_boxes(boxes: Floats, points: Points, inside: Mask) -> None:
-    """Mark the points inside at least one box.
-
-    boxes : (m, 8) float64, C-contiguous, read-only; x, y, z of the center, half length, half width, half height [m],
-        cosine and sine of the yaw.
+    """Mark the points inside at least one box (m, 8): x, y, z of the center, half length, half width, half height [m],
+    cosine and sine of the yaw.
     """
     for i in range(points.shape[0]):
         inside[i] = False

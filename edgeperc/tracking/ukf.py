@@ -26,16 +26,15 @@ STRAIGHT_RAD_S = 1e-4  # below this turn rate, arc and chord differ by less than
 def fill_predictions(
     states: Floats, covariances: Floats, noise: Floats, dt: float, means: Floats, predicted: Floats
 ) -> None:
-    """Predict each motion model of each track with sigma points (KUL-Seg's "prediction").
+    """Predict each motion model of each track with sigma points (KUL-Seg's "prediction"): constant velocity, CTRV,
+    random motion.
 
     The sigma points are x, and x plus and minus each column of the Cholesky root of (n + kappa) P. Their weights are
     kappa / (n + kappa) and 1 / (2 (n + kappa)), with n = 5 and kappa = 1.
 
-    states : (n, 3, 5) float64; state for each motion model: constant velocity, CTRV, random motion.
-    noise : (n, 5) float64; standard deviations: acceleration [m/s2], turn acceleration [rad/s2], random walk of the
-        place [m/s^0.5], of the heading [rad/s^0.5], and speed of random motion [m/s].
-    dt : time step [s], not negative.
-    predicted : (n, 3, 5, 5) float64, overwritten; covariances, with additive process noise.
+    noise : (n, 5) standard deviations: acceleration [m/s2], turn acceleration [rad/s2], random walk of the place
+        [m/s^0.5], of the heading [rad/s^0.5], and speed of random motion [m/s].
+    predicted : covariances, with additive process noise.
     """
     points = np.empty((11, 5))
     root = np.empty((5, 5))
@@ -90,11 +89,7 @@ def move(mode: int, state: Floats, dt: float) -> None:
 
 @njit(cache=True, nogil=True)
 def fill_process_noise(mode: int, heading: float, noise: Floats, dt: float, process: Floats) -> None:
-    """Compute the process noise of one motion model: white accelerations, random walks of position and heading.
-
-    heading : heading before the prediction [rad].
-    dt : time step [s].
-    """
+    """Compute the process noise of one motion model: white accelerations, random walks of position and heading."""
     process[:] = 0.0
     acceleration, turn, walk, wander, speed = noise[0], noise[1], noise[2], noise[3], noise[4]
     process[3, 3] = wander * wander * dt
@@ -132,14 +127,11 @@ def fill_updates(
     """Update each motion model of each track with all detections, weighted by their association (PDA filter).
 
     The measurement is part of the state, so the unscented cross-covariance and innovation covariance are exactly
-    columns and a block of the predicted covariance. Headings are compared modulo pi, and deviations are
-    limited to three standard deviations, as in `edgeperc.tracking.jpda.fill_likelihoods`.
+    columns and a block of the predicted covariance. Headings are compared modulo pi, and deviations are limited to
+    three standard deviations, as in `edgeperc.tracking.jpda.fill_likelihoods`.
 
-    means, predicted : from `fill_predictions`.
-    detections : (m, 3) float64; x, y [m], heading [rad], in the frame of the states.
-    sigmas : (n, 3) float64; standard deviations of a detection along and across its heading [m] and of its heading
-        [rad].
-    beta : (n, 3, m + 1) float64; for each motion model, as in `edgeperc.tracking.jpda.fill_association`.
+    sigmas : (n, 3) standard deviations of a detection along and across its heading [m] and of its heading [rad].
+    beta : (n, 3, m + 1) for each motion model, as in `edgeperc.tracking.jpda.fill_association`.
     """
     innovation = np.empty((3, 3))
     inverse = np.empty((3, 3))

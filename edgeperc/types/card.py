@@ -66,13 +66,11 @@ class InputSpec:
     """The network's input: ``(raw - mean) / std`` per channel; 0 in every channel of a pixel without a return.
 
     The raw values of a camera are 0..255 in ``"red"``, ``"green"`` and ``"blue"``, in the order that the network takes.
-
-    name : name of the input in the graph.
-    mean, std : one value per channel, in the channel's unit.
     """
 
-    name: str
+    name: str  # name of the input in the graph
     channels: tuple[str, ...]
+    # one value per channel, in the channel's unit
     mean: tuple[float, ...]
     std: tuple[float, ...]
 

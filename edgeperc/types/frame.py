@@ -127,11 +127,7 @@ def fill_moved(points: Points, R: Floats, t: Floats, moved: Points) -> None:
 
 @njit(cache=True, nogil=True)
 def fill_turned(points: Points, cos: np.float32, sin: np.float32, turned: Floats32) -> None:
-    """Write the points, turned about the z axis in float32.
-
-    cos, sin : float32; of the angle by which the sensor is turned to the left.
-    turned : (n, 4) float32, overwritten; a coordinate beyond the range of float32 becomes infinite.
-    """
+    """Write the points, turned about the z axis in float32 to the right, as the sensor is turned to the left."""
     for i in range(points.shape[0]):
         x, y = points[i, 0], points[i, 1]
         turned[i, 0] = cos * x + sin * y

@@ -36,15 +36,12 @@ BOX = np.dtype(
 
 
 class Grid(NamedTuple):
-    """The cells of a top view as kernels take them.
+    """The cells of a top view as kernels take them."""
 
-    far, left : x of the far edge and y of the left edge [m].
-    cell : edge of a cell [m].
-    """
-
+    # x of the far edge and y of the left edge [m]
     far: float
     left: float
-    cell: float
+    cell: float  # edge of a cell [m]
 
 
 Angle = TypeVar("Angle", float, Floats)
@@ -56,12 +53,9 @@ def wrapped(angle: Angle) -> Angle:
 
 
 def draw_footprints(labels: Labels, boxes: Iterable[Box], view: TopViewGeometry, classes: Sequence[str]) -> None:
-    """Draw the footprints of boxes over top-view labels, in place (SSADNet 3.1.2).
+    """Draw the footprints of boxes of the classes over top-view labels, in place (SSADNet 3.1.2).
 
-    A cell belongs to a box if its center lies in the footprint; the nearer of two boxes wins. Boxes of other classes
-    are not drawn.
-
-    classes : names of the labels; a footprint gets the number of its box's class.
+    A cell belongs to a box if its center lies in the footprint; the nearer of two boxes wins.
     """
     number = {name: k for k, name in enumerate(classes)}
     known = [box for box in boxes if box.label in number]
@@ -101,11 +95,8 @@ def rectangles(boxes: Iterable[Box]) -> Floats:
 
 
 def oriented_iou(a: ArrayLike, b: ArrayLike) -> Floats:
-    """Intersection over union of every rectangle of ``a`` with every rectangle of ``b`` (SSADNet equation A1).
-
-    a : (n, 5) array_like; x, y, length, width [m], yaw [rad].
-    b : (m, 5) array_like; as ``a``.
-    Returns (n, m) float64: In 0..1. A rectangle that is not finite or has no area overlaps nothing, not even itself.
+    """Intersection over union (n, m) of rectangles ``a`` (n, 5) with ``b`` (m, 5): x, y, length, width [m], yaw [rad]
+    (SSADNet equation A1). One that is not finite or has no area overlaps nothing, not even itself.
     """
     first, second = _as_rectangles(a), _as_rectangles(b)
     iou = np.empty((len(first), len(second)))
@@ -114,11 +105,7 @@ def oriented_iou(a: ArrayLike, b: ArrayLike) -> Floats:
 
 
 def shared_area(iou: Floats, a: Floats, b: Floats) -> Floats:
-    """Area [m2] that rectangles share, from their overlap: ``iou = shared / (area of a + area of b - shared)``.
-
-    iou : (n, m) float64; `oriented_iou` of ``a`` and ``b``.
-    Returns (n, m) float64.
-    """
+    """Area [m2] that rectangles share, from their overlap: ``iou = shared / (area of a + area of b - shared)``."""
     areas = np.add.outer(a[:, 2] * a[:, 3], b[:, 2] * b[:, 3])
     return np.asarray(iou / (1.0 + iou) * areas, np.float64)
 
@@ -126,15 +113,13 @@ def shared_area(iou: Floats, a: Floats, b: Floats) -> Floats:
 def suppress_overlaps(
     rectangles: ArrayLike, scores: ArrayLike, iou_threshold: ArrayLike, *, max_inside: float = math.inf
 ) -> Ints64:
-    """Greedy non-maximum suppression of oriented rectangles.
+    """Greedy non-maximum suppression of oriented rectangles: rows kept, best score first, the earlier row on ties. Rows
+    that are not finite overlap nothing, so they are kept.
 
-    rectangles : (n, 5) array_like; x, y, length, width [m], yaw [rad].
-    iou_threshold : float or (n,) array_like; a rectangle is dropped if it overlaps a kept one with a better score by
-        more than this; with one threshold a rectangle, by more than the lower one of the two.
+    iou_threshold : a rectangle is dropped if it overlaps a kept one with a better score by more than this; with one
+        threshold a rectangle, by more than the lower one of the two.
     max_inside : it is also dropped if the area shared with a better one is more than this share of the smaller one's
         area.
-    Returns (k,) int64: Rows kept, best score first, the earlier row on ties. Rows that are not finite overlap nothing,
-        so they are kept.
     """
     rows = _as_rectangles(rectangles)
     values = np.asarray(scores, dtype=np.float64)
@@ -151,11 +136,7 @@ def suppress_overlaps(
 
 
 def bounding_rectangles(rectangles: ArrayLike) -> Floats:
-    """Axis-aligned bounds of rectangles, as rectangles of yaw 0.
-
-    rectangles : (n, 5) array_like; x, y, length, width [m], yaw [rad].
-    Returns (n, 5) float64: Same centers; extent along x, extent along y; yaw 0.
-    """
+    """Axis-aligned bounds of rectangles (n, 5), as rectangles of yaw 0."""
     rows = _as_rectangles(rectangles)
     cos, sin = np.abs(np.cos(rows[:, 4])), np.abs(np.sin(rows[:, 4]))
     bounds = np.zeros_like(rows)
@@ -225,11 +206,8 @@ def fill_oriented_iou(a: Floats, b: Floats, iou: Floats) -> None:
 
 @njit(cache=True, nogil=True)
 def mark_nms(rectangles: Floats, limits: Floats, max_inside: float, keep: Mask) -> None:
-    """Mark the rectangles that overlap no better kept rectangle too much.
-
-    rectangles : (n, 5) float64, C-contiguous; best first.
-    limits : (n,) float64, C-contiguous; two may overlap by the lower one of their limits (IoU).
-    max_inside : of the smaller area of two.
+    """Mark the rectangles, best first, that overlap no better kept rectangle by more than the lower of their limits
+    (IoU), or than ``max_inside`` of the smaller area of two.
     """
     for i in range(rectangles.shape[0]):
         keep[i] = True
@@ -303,12 +281,7 @@ def pair_iou(a: Floats, b: Floats) -> float:
 
 
 def inside(box: Box, points: NDArray[Any], margin_m: float = 0.0) -> Mask:
-    """Find the points inside a box.
-
-    points : (n, 3 or more) array; x, y, z [m] in the frame of the box.
-    margin_m : the box is grown by this on every side [m].
-    Returns (n,) bool: False for points that are not finite.
-    """
+    """Find the points inside a box that is grown by a margin on every side [m]; not finite ones are outside."""
     offset = points[:, :3] - np.asarray(box.center, np.float32)
     cos, sin = np.cos(box.yaw), np.sin(box.yaw)
     along = offset[:, 0] * cos + offset[:, 1] * sin

@@ -85,11 +85,7 @@ def read_model(path: str | os.PathLike[str]) -> bytes:
 
 
 def read_metadata(path: str | os.PathLike[str], key: str) -> str | None:
-    """Read the text of a metadata entry.
-
-    path : an .onnx file.
-    Returns: The last value if the key occurs several times, as in onnxruntime. None if the key is absent.
-    """
+    """Read the text of a metadata entry: the last one if the key occurs several times, as in onnxruntime, or None."""
     wanted, value = key.encode(), None
     with open_model(path) as file:
         reader = _Reader(file, MAX_TOP_FIELDS)
@@ -192,12 +188,10 @@ class _Reader:
 
 
 def check_graph(blob: bytes, path: str | os.PathLike[str], *, trusted: bool = False) -> bool:
-    """Refuse a graph that could read other files, run without end or take all memory while it is opened.
+    """Refuse a graph that could read other files, run without end or take all memory while it is opened; if
+    ``trusted``, only one that is damaged or reads other files.
 
-    blob : the content of an .onnx file.
-    path : named in messages.
-    trusted : only refuse what is damaged or reads other files.
-    Returns: Whether what depends on constants alone may be computed while the file is opened; else it has to wait for
+    Returns whether what depends on constants alone may be computed while the file is opened; else it has to wait for
         the first run, which can be stopped.
     """
     if blob[4:8] == b"ORTM":  # onnxruntime would read it in its own format, which is not checked here

@@ -55,17 +55,14 @@ class Labeled(NamedTuple):
 def as_points(
     array: ArrayLike, *, remission_field: str | None = None, origin_m: Sequence[float] | None = None
 ) -> NDArray[np.float32]:
-    """Convert an array to points.
+    """Convert an array to points, (n, 4) float32 C-contiguous: itself if it has this form. Too large values become
+    infinite.
 
-    array : (n, 4) or (n, 3) array of numbers, or a structured array; any float or integer dtype, byte order and
-        memory layout. The columns are x, y, z [m], remission; without the fourth, remission is 0. A structured array
-        (any shape, e.g. that of a PointCloud2 message) needs the fields x, y and z; other fields and padding are
-        skipped. So does a data frame with such names (pandas, polars).
-    remission_field : as in `read_points`; structured arrays only.
-    origin_m : subtracted from x, y, z [m] before they become float32.
-    Returns (n, 4) float32, C-contiguous: The given array itself if it already has this form. Values beyond the range
-        of float32 become infinite.
-    Raises PointsError: Also for coordinates of a map, which float32 would round by more than 5 mm.
+    array : (n, 4) or (n, 3), of any float or integer dtype, byte order and memory layout: x, y, z [m], remission, 0
+        without it. A structured array (any shape, e.g. that of a PointCloud2 message) needs the fields x, y and z;
+        other fields and padding are skipped. So does a data frame with such names (pandas, polars).
+    origin_m : subtracted from x, y, z [m] before they become float32. Raises PointsError: Also for coordinates of a
+        map, which float32 would round by more than 5 mm.
     """
     if isinstance(array, np.ma.MaskedArray):
         raise PointsError("got a masked array; fill it first, e.g. with array.filled(np.nan)")
@@ -205,13 +202,7 @@ def assemble(
     remission_field: str | None,
     origin_m: Sequence[float] | None = None,
 ) -> NDArray[np.float32]:
-    """Build points from named columns.
-
-    n : number of points.
-    fields : mapping of str to (n,) array; columns by `plain_name`.
-    names : all fields of the source, for the error message.
-    Returns (n, 4) float32: x, y, z [m], remission; 0 without a remission field.
-    """
+    """Build points (n, 4) from columns by `plain_name`; errors list ``names``. Remission is 0 without such a field."""
     missing = [axis for axis in "xyz" if axis not in fields]
     if missing:
         raise PointsError(

@@ -85,14 +85,11 @@ def _cut_out(scan: LabeledScan, *, fewest: int, classes: tuple[str, ...]) -> lis
 
 
 def background_pieces(scan: LabeledScan, fewest: int = 8) -> Iterator[tuple[Box, Floats32]]:
-    """Poles, trunks and signs, and pieces of walls, hedges and banks, cut out of what is known to be background.
+    """Poles, trunks and signs, and pieces of walls, hedges and banks of at least ``fewest`` points, cut out of what is
+    known to be background; each with a box on the ground, a ``"pole"`` or a ``"wall"``.
 
     A pole is a cluster at most 0.9 m wide, between 0.4 and 1.8 m above the ground, that goes on above 2 m. A wall is a
     cluster longer than 4 m; each gives the piece around its nearest point and the one around its middle.
-
-    fewest : fewest points of a piece.
-    Yields box: Around the piece, standing on the ground, with the label ``"pole"`` or ``"wall"``.
-    Yields points: (n, 4) float32.
     """
     points = scan.points
     if not len(points):
@@ -326,10 +323,7 @@ def augmented(
     """The scan turned, mirrored, thinned, shifted in height and scaled in remission, all at random.
 
     A scan that is labeled on all sides (simulation) faces forwards or backwards along the street. Other scans are
-    turned by a few degrees only.
-
-    bank : objects to paste.
-    sensor : takes a scan of the training sensor (`beams.taken_by`); None: that one.
+    turned by a few degrees only. ``sensor`` takes a scan of the training sensor (`beams.taken_by`).
     """
     full = scan.azimuths[1] - scan.azimuths[0] >= 2.0 * np.pi
     angle = rng.normal(0.0, np.radians(5.0))

@@ -31,12 +31,8 @@ BRIGHTER = 0.15
 
 
 def ground_plane(points: Points, seed: int = 0) -> Floats | None:
-    """The ground plane near the vehicle (RANSAC, then least squares).
-
-    points : (n, 4) float32; x, y, z [m] in the frame of a sensor 1.73 m above the road, remission.
-    seed : of the random samples.
-    Returns (3,) float64 or None: a, b, c of z = a x + b y + c; None if there are fewer than 500 low points or no
-        plausible plane.
+    """The ground plane near the vehicle, z = a x + b y + c (RANSAC, then least squares), of a sensor 1.73 m above the
+    road; None with fewer than 500 low points or without a plausible plane.
     """
     # Not `edgeperc.ground.planes.find_ground`, which fits the lowest returns of cells: that plane is 0.3 to 12 cm lower
     # on 22 KITTI scans (median 4 cm). With it, the share of correct cells changes: of "no road" from 0.938 to
@@ -69,12 +65,9 @@ def ground_plane(points: Points, seed: int = 0) -> Floats | None:
 
 
 def sure_surface(points: Points) -> Bytes:
-    """Ground truth of the cells of `SURFACE` that a scan makes certain.
+    """Ground truth of the cells of `SURFACE` that a scan makes certain: 1 road, 0 no road, `IGNORE` elsewhere.
 
     Low points in the lane ahead are road. Points above the ground, and areas brighter than the lane, are no road.
-
-    points : (n, 4) float32; x, y, z [m] in the sensor frame, remission in 0..1.
-    Returns (500, 500) uint8: 1 road, 0 no road, `IGNORE` elsewhere.
     """
     surface = np.full((SURFACE.height, SURFACE.width), IGNORE, np.uint8)
     plane = ground_plane(points)
@@ -121,12 +114,7 @@ def drawn_roads(path: Path = DRAWN) -> dict[str, Bytes]:
 
 
 def with_road(surface: Bytes, road: Bytes) -> Bytes:
-    """Ground truth with a drawn road.
-
-    surface : (500, 500) uint8; ground truth over `SURFACE`.
-    road : (400, 200) uint8; the drawn road over `VIEW`, from `mask_of`.
-    Returns (500, 500) uint8: ``road`` in its view, ``surface`` elsewhere.
-    """
+    """Ground truth over `SURFACE` with a drawn road over `VIEW`, from `mask_of`."""
     x, y = SURFACE.cell_centers()
     row, col, drawn = VIEW.cells(x, y)
     return np.where(drawn, road[row % VIEW.height, col % VIEW.width], surface).astype(np.uint8)
@@ -216,11 +204,8 @@ def mask_of(segmentations: Sequence[Any], source: str = "a polygon") -> Bytes:
 
 
 def write_coco(roads: Mapping[str, Sequence[Sequence[Sequence[float]]]], scans: Mapping[str, str] | None = None) -> str:
-    """The text of a COCO file.
-
-    roads : mapping of str to sequence; scene -> polygons -> corners (x, y) in pixels.
-    scans : mapping of str to str; scene -> `edgeperc.datasets.kitti.scan_hash`, because names differ between copies
-        of KITTI.
+    """The text of a COCO file of roads, by scene, polygons of corners (x, y) in pixels; and of the hash of each scene's
+    scan, because names differ between copies of KITTI.
     """
     images: list[dict[str, Any]] = []
     annotations: list[dict[str, Any]] = []

@@ -44,14 +44,13 @@ NEAR_M = 0.5
 def read_scan_set(
     folder: ScanFolder, split: str, fold: int | None = None, *, classes: Sequence[str] = POINT_CLASSES
 ) -> tuple[list[LabeledScan], list[float], dict[str, str]]:
-    """Read the labeled scans of a split.
+    """Read the labeled scans of a split; objects of other classes than those of points are unknown (`IGNORE`).
 
     As in a `Perceiver`, what the description does not say of the mounting is estimated from the first scans of each
     drive, and the remission is matched to that of the training sensor.
 
-    classes : classes of points, the background first; objects of other classes are unknown (`IGNORE`).
     Returns weights: How often to draw each scan: all scans of a drive together as the square root of their number.
-    Returns hashes (dict of str to str): ``SET/NAME`` of each scan -> its `edgeperc.datasets.kitti.scan_hash`.
+    Returns hashes: ``SET/NAME`` of each scan -> its `edgeperc.datasets.kitti.scan_hash`.
     """
     layout, names = folder.layout, folder.names(split, fold=fold)
     n_scans = Counter(folder.drives[name] for name in names)
@@ -85,10 +84,8 @@ def read_scan_set(
 def labeled_scan(
     frame: ScanFrame, points: Points, mounting: Mounting, classes: Sequence[str] = POINT_CLASSES
 ) -> LabeledScan:
-    """A scan with its truth in the frame of the models.
-
-    points : (n, 4) float32; its points, with the remission as `edgeperc.preprocess.condition.condition` returns it.
-    mounting : a known one.
+    """A scan with its truth in the frame of the models; its remission is as `condition.condition` returns it, the
+    mounting a known one.
     """
     model = ModelFrame(mounting)
     boxes = model.move_boxes(frame.boxes or ())
@@ -119,9 +116,8 @@ def labeled_scan(
 
 
 def _filled(cells: Bytes) -> Bytes:
-    """Cells of `ROAD_CLASSES`, with road also between the returns.
-
-    An unknown cell becomes road if three cells in the 1.4 m around it are road and no other one is known.
+    """Cells of `ROAD_CLASSES`, with road also between the returns: where three cells in the 1.4 m around an unknown one
+    are road and no other one is known.
 
     In 16 simulated scans of two sensors, this makes the known road 2.5 and 4 times as large, and 99.6 % of what is
     added is road.

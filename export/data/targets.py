@@ -22,12 +22,11 @@ the true one, so the neighbors' geometry must be correct too."""
 def slot_targets(
     boxes: ArrayLike, view: TopViewGeometry, *, labeled: Mask | None = None, unsure: ArrayLike | None = None
 ) -> Floats32:
-    """Targets of head "slots": each slot has a square of the view, and the upright box of the object centered there.
+    """Targets of head "slots": each slot has a square of the view, and the upright box of the object centered there,
+    the nearest of several.
 
-    view : height and width at least `SLOT_CELLS`.
-    Returns (rows * columns, 5) float32: By rows from the far left square: center column, center row, width and height
-        as in `paper_slot_targets`, and the presence: 1 with an object, 0 without one, -1 if it is not learned. A slot
-        without an object has zeros. Of several objects in one square, the slot gets the nearest.
+    Returns (rows * columns, 5): By rows from the far left square: center column, center row, width and height as in
+        `paper_slot_targets`, and the presence: 1 with an object, 0 and zeros without one, -1 if it is not learned.
     """
     n_rows, n_cols = view.height // SLOT_CELLS, view.width // SLOT_CELLS
     target = np.zeros((n_rows, n_cols, 5), np.float32)
@@ -53,11 +52,8 @@ def slot_targets(
 
 
 def paper_slot_targets(boxes: ArrayLike, view: TopViewGeometry, n_slots: int) -> Floats32:
-    """Targets of head "slots-paper": upright boxes around rotated footprints, nearest first (SSADNet 3.1.1).
-
-    n_slots : number of boxes to keep, nearest first.
-    Returns (n_slots, 4) float32: Center column, center row, width and height as shares of the image's width and height;
-        zeros in empty slots. Boxes whose center is outside the view are left out.
+    """Targets of head "slots-paper": upright boxes around rotated footprints with their center in view, nearest first
+    (SSADNet 3.1.1): center column, center row, width and height as shares of the image; zeros in empty slots.
     """
     boxes, rows, cols = _boxes_in_view(boxes, view)
     found = _upright(boxes, rows, cols, view)
@@ -72,16 +68,13 @@ def dense_targets(
 ) -> Floats32:
     """Heat map and geometry for head "dense".
 
-    boxes : (m, 7) array_like; x, y, z of the center, length, width, height [m], yaw [rad], in the sensor frame.
-    view : height and width divisible by 4.
-    labeled : (height, width) bool; False in cells where boxes are not labeled, such as outside the camera's view.
-    unsure : (k, 7) array_like; boxes that count neither as found nor as missed, such as those without returns. Cells
-        near them are not learned.
-    Returns (11, height/4, width/4) float32: Channel 0, the heat: 1 in the output cell that holds a box's center; around
-        it a Gaussian shaped like the box, whose edges are three standard deviations away; -1 in cells that are not
-        learned. Channels 1 to 8: the geometry of the box with the highest heat, in the format of box_dense, where that
-        heat is at least `REGRESSED_FROM`; else 0. Channels 9 and 10: x and y of the unit vector towards its front.
-    Raises ValueError: A length, width or height is not positive.
+    boxes, unsure : (m, 7) x, y, z of the center, length, width, height [m], yaw [rad]; unsure ones, such as those
+        without returns, count neither as found nor as missed: cells near them are not learned.
+    labeled : False in cells where boxes are not labeled, such as outside the camera's view.
+    Returns (11, height/4, width/4): Channel 0, the heat: 1 in the output cell that holds a box's center; around it a
+        Gaussian shaped like the box, whose edges are three standard deviations away; -1 in cells that are not learned.
+        Channels 1 to 8: the geometry of the box with the highest heat, in the format of box_dense, where that heat is
+        at least `REGRESSED_FROM`; else 0. Channels 9 and 10: x and y of the unit vector towards its front.
     """
     height, width = view.height // STRIDE, view.width // STRIDE
     target = np.zeros((N_DENSE_CHANNELS + N_FRONT_CHANNELS, height, width), np.float32)

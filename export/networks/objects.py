@@ -62,8 +62,7 @@ class FirstLook(nn.Module):
 class ObjectNet(nn.Module):
     """Layers for each point, with the largest value of each channel over the points, and layers for the candidate.
 
-    n_channels : of the input; the first `objects.crops.N_POINT_FEATURES` differ from point to point.
-    n_classes : with the background.
+    n_channels : the first `objects.crops.N_POINT_FEATURES` differ from point to point.
     look : the exported network looks at a candidate closely only if this gives it a probability of `LEAST` or more.
     """
 
