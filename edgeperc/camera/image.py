@@ -210,7 +210,7 @@ def fill_image_labels(
     col_runs: Ints,
     labels: Labels,
 ) -> int:
-    """Write every pixel's best class (`label_pixels`), by what `between` gives; returns the number of logits not finite."""
+    """Write every pixel's best class (`label_pixels`, `between`); returns how many logits are not finite."""
     n_classes, height, width = logits.shape
     n_bad = 0
     coarse = np.empty((height, width), np.uint8)
