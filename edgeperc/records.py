@@ -88,9 +88,7 @@ def _road_record(perception: Perception) -> dict[str, Any] | None:
 
 
 def read_boxes(path: Path | str) -> list[list[Box]]:
-    """Read the boxes of a drive by scan, in the sensor frame, as ``edgeperc run --json`` prints them: one line for
-    each.
-    """
+    """Read the boxes of a drive by scan, in the sensor frame, as ``edgeperc run --json`` prints them."""
     from .types.perception import Box
 
     try:

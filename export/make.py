@@ -44,8 +44,7 @@ def make(
     steps: int | None = None,
     version: str = "1.0.0",
 ) -> Path:
-    """Simulate, train, export and evaluate a model; finished parts in ``out`` are not made again. ``out/NAME.onnx`` has
-    its figures in its card.
+    """Simulate, train, export and evaluate a model, ``out/NAME.onnx``; finished parts are not made again.
 
     name : a key of `MODELS`. The models that it starts from or is distilled from are made first.
     data : the real scans or images. Models whose name ends in ``-sim`` need none; ``kitti`` then serves for evaluation

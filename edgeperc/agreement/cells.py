@@ -27,8 +27,7 @@ def agree_on_cells(
     marks: Bytes,
     rules: Collection[str] = RULES,
 ) -> TopView:
-    """Correct the cells of a top view by boxes, points and obstacles (rules ``road`` and ``cells`` of
-    docs/concepts/agreement.md).
+    """Correct the cells of a top view by boxes, points and obstacles (docs/concepts/agreement.md).
 
     dropped : boxes of the top-view network that `agree_on_boxes` dropped; their vehicle cells become background.
     """
@@ -77,9 +76,7 @@ def _footprints(view: TopView, boxes: Sequence[Box]) -> Bytes:
 
 @njit(cache=True, nogil=True)
 def fill_marks(cloud: Cloud, in_view: Mask, labeled: Labeled, by_height: bool, view: Cells, marks: Bytes) -> None:
-    """Write what the points show in each cell into ``marks``, zeros before; by roles 1 (vehicles) and 2 (persons), or
-    else by height alone.
-    """
+    """Write what the points show in each cell into ``marks``, zeros before, by roles 1 (vehicles) and 2 (persons)."""
     points, height, labels, roles = cloud.points, cloud.height, labeled.labels, labeled.roles
     cells, is_vehicle, grid = view.labels, view.is_vehicle, view.grid
     n_rows, n_cols = cells.shape

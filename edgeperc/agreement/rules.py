@@ -168,8 +168,7 @@ def agree_on_points(
     sight: Sight = EVERYTHING,
     rules: Collection[str] = RULES,
 ) -> PointLabels:
-    """Correct the labels of vehicles' and persons' points by clusters, ground and boxes, as docs/concepts/agreement.md
-    says.
+    """Correct labels of vehicles' and persons' points by clusters, ground and boxes (docs/concepts/agreement.md).
 
     clusters, upright : modified. A person that stays in a cluster that loses the label gets a number of its own.
     view : without it, or if it has no class of vehicles, the rule ``"cells"`` is skipped; without a plane of the
@@ -322,9 +321,7 @@ def cell_of(points: Points, i: int, n: int) -> tuple[int, int]:
 
 @njit(cache=True, nogil=True)
 def clear_columns(points: Points, height: Heights, limits: Floats, labels: Labels) -> None:
-    """Make persons background whose column of points goes on above the limit of their class [m]; 0: not a person's
-    class.
-    """
+    """Make persons background whose column of points goes on above the limit of their class [m]; 0: not persons."""
     first_row, last_row, first_col, last_col = N_COLUMNS, -1, N_COLUMNS, -1  # of the cells around persons
     for i in range(points.shape[0]):
         if limits[labels[i]] > 0.0:
@@ -372,9 +369,7 @@ def clear_columns(points: Points, height: Heights, limits: Floats, labels: Label
 
 @njit(cache=True, nogil=True)
 def fill_support(cloud: Cloud, among: Mask, labeled: Labeled, boxes: Records, support: Support) -> None:
-    """Find the best box around each point ``among`` those in view above the ground, of boxes with enough vehicle points
-    (`MIN_BOX_SHARE`).
-    """
+    """Find the best box around each point ``among`` others, of those with enough vehicle points (`MIN_BOX_SHARE`)."""
     points, height, labels, roles = cloud.points, cloud.height, labeled.labels, labeled.roles
     scores, names = support.scores, support.names
     scores[:] = 0.0

@@ -211,9 +211,7 @@ def _hidden_by(
     mounting: Mounting | None,
     places: Floats | None = None,
 ) -> tuple[Floats32, DepthBuffer, Floats]:
-    """The checked points, the depth buffer of those above the ground, and ``places`` x, y on the ground in the sensor's
-    frame, NaN without ground.
-    """
+    """The points, the depth buffer of those above the ground, and ``places`` on the ground, NaN without ground."""
     if not isinstance(points, np.ndarray) or points.ndim != 2 or points.shape[1] < 3 or points.dtype.kind not in "fiu":
         raise PointsError(f"got {_described(points)} for points; expected an array (n, 3 or more): x, y, z")
     with np.errstate(over="ignore", invalid="ignore"):

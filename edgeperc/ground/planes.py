@@ -504,9 +504,7 @@ def refine_plane(residuals: Floats, n: int, prior: float, max_slope: float, max_
 
 @njit(cache=True, nogil=True)
 def fill_levels(points: Points, lowest: Ints, planes: Floats, rows: Rows, cell: Ints, level: Floats32) -> None:
-    """Write the height of the ground in the middle of every cell that holds one of the points ``rows``; NaN without a
-    point.
-    """
+    """Write the height of the ground in the middle of every cell that holds one of the points ``rows``, else NaN."""
     # Of the points ahead, the cells behind are not needed: half of the time.
     first, last = N_CELLS - 1, 0
     for k in range(rows.shape[0]):
@@ -575,9 +573,7 @@ def fill_heights(
     height: Heights,
     mask: Mask,
 ) -> None:
-    """Write the heights of the points ``rows`` above the ground, outside the grid above the nearest region's plane, and
-    whether they are on it.
-    """
+    """Write heights of the points ``rows`` above the ground, or the nearest region's plane, and which are on it."""
     levels, slopes = level.reshape(-1), planes.reshape(-1)
     for k in range(rows.shape[0]):
         i = rows[k]

@@ -36,7 +36,7 @@ def decode_slots(
     *,
     model: str = "the model",
 ) -> list[Box]:
-    """Decode axis-aligned boxes, best score first; each gets the class of the segmentation at its center (SSADNet 2.2.1
+    """Decode axis-aligned boxes, best score first, with the class of the segmentation at their centers (SSADNet 2.2.1
     B).
 
     slots : (K, 4), perhaps with the batch's axis; center column, center row, extent across columns and along rows, as
@@ -178,8 +178,7 @@ def decode_dense(
     iou_threshold: float = 0.2,
     model: str = "the model",
 ) -> list[Box]:
-    """Decode oriented boxes from a heat map of centers and a box regressed at every cell, best score in the heat map
-    first.
+    """Decode oriented boxes from a heat map of centers, best score first, and a box regressed at every cell.
 
     dense : (C, H / 4, W / 4), perhaps with the batch's axis; C is 9 or 11. Heat-map logit; center's offset from the
         cell's center in rows and columns [cells of this map]; logarithms of length and width [m]; sine and cosine of

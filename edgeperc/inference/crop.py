@@ -70,9 +70,7 @@ class Crop:
 
 
 def sectors_of_turn(view: RangeImageGeometry, *, whole: bool) -> list[tuple[float, Crop]]:
-    """The sectors of a full turn: by which angle each lies to the left of the first one [rad], and what selects its
-    points, or all if ``whole``.
-    """
+    """The sectors of a full turn: angle of each to the left of the first [rad], and what selects its points, or all."""
     width_deg = view.azimuth_left_deg - view.azimuth_right_deg
     turns_rad = [math.radians(k * width_deg) for k in range(math.ceil(360.0 / width_deg))]
     seen = [] if whole else [view]
@@ -80,8 +78,7 @@ def sectors_of_turn(view: RangeImageGeometry, *, whole: bool) -> list[tuple[floa
 
 
 def spread(parts: Sequence[tuple[PointLabels, Ints | None]], n: int) -> PointLabels:
-    """Labels of all ``n`` points of a scan from those of parts of it, with their rows from `Crop.select` or None for
-    all.
+    """Labels of all ``n`` points of a scan from those of parts of it, with their rows from `Crop.select`.
 
     A point in view of several parts has the label of the first one; one in no part is out of view.
     """

@@ -59,9 +59,7 @@ def decode_detections(card: ModelCard, outputs: Values, score_threshold: float) 
 def best_rows(
     footprints: Floats, scores: Floats, names: NDArray[np.str_], max_iou: float, *, across_classes: bool
 ) -> Ints64:
-    """Rows of boxes that overlap no better one by more than ``max_iou``, of the same class unless ``across_classes``;
-    the best first.
-    """
+    """Rows of boxes, best first, that overlap no better one of their class, or of any, by more than ``max_iou``."""
     if across_classes:
         return suppress_overlaps(footprints, scores, max_iou)
     kept = []

@@ -64,8 +64,7 @@ class Pillarizer:
 
 @njit(cache=True, nogil=True)
 def find_pillars(points: Points, grid: PillarGrid, numbers: Ints, members: Ints, pillars: Pillars) -> int:
-    """Write the counts and places of pillars, in the order of their first points; returns their number, at most as many
-    as there is room for.
+    """Write the counts and places of pillars, in the order of their first points; returns how many had room.
 
     numbers : (rows, columns) -1 everywhere before and after.
     members : (pillars, points) overwritten; rows of the points of each pillar, the first ones of the scan.

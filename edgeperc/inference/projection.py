@@ -241,9 +241,7 @@ def mark_range_image(
 def fill_image(
     points: Points, heights: Heights, index: Ints, channels: Ints, mean: Floats32, std: Floats32, image: Floats32
 ) -> None:
-    """Write the values of the points of ``index`` into ``image``; ``heights`` above the ground are empty if no channel,
-    of ``CHANNEL_CODES``, needs them.
-    """
+    """Write the values of the points of ``index`` into ``image``; ``heights`` are empty if no channel needs them."""
     values = points.reshape(-1)
     rows = np.empty(4 * PIXEL_BLOCK, np.float32)
     planes = np.empty((7, PIXEL_BLOCK), np.float32)
@@ -327,8 +325,7 @@ class TopViewProjector:
 
 
 class RangeImageProjector:
-    """Project points to a range image, the scan as the sensor sees it (PointSeg 3.1). Row 0 is the top beam, column 0
-    leftmost.
+    """Project points to a range image (PointSeg 3.1). Row 0 is the top beam, column 0 leftmost.
 
     A point's row is the beam with the nearest elevation; the top and the bottom row reach half a beam spacing farther
     out. Its column follows from its azimuth, atan2(y, x). Pixels are half-open: a pixel includes its upper and left
@@ -415,9 +412,7 @@ def wedge(view: RangeImageGeometry) -> Floats32:
 
 
 def tabulate(edges: Floats32, what: str) -> Intervals:
-    """Build tables that find the interval of a value between strictly decreasing edges with one comparison; ``what`` is
-    named in errors.
-    """
+    """Build tables that find the interval of a value between strictly decreasing edges with one comparison."""
     first, last = edges[0], edges[-1]
     inner = edges[1:-1]
     cells = 64

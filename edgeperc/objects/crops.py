@@ -118,9 +118,7 @@ def fill_crops(
 
 @njit(cache=True, nogil=True)
 def fill_features(points: Points, counts: Ints, rectangles: Floats, scale: Floats32, features: Floats32) -> None:
-    """Write the network's input of crops (m, n_points, channels); ``scale`` has mean and standard deviation of the
-    `FEATURES`.
-    """
+    """Write the network's input of crops (m, n_points, channels), by mean and standard deviation of the `FEATURES`."""
     raw = np.empty(features.shape[2], np.float32)
     for k in range(points.shape[0]):
         x, y = rectangles[k, 0], rectangles[k, 1]

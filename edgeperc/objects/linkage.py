@@ -349,9 +349,7 @@ def columns_within(level: np.void, part: np.void) -> tuple[int, int, int, int]:
 def find_near(
     parts: Records, owner: Ints, firsts: Ints, col: int, end: int, part: np.void, near: Ints, work: Records
 ) -> int:
-    """List the runs of no cluster in columns of a strip, from ``col`` to before ``end``, that may be linked with a
-    part.
-    """
+    """List the runs of no cluster in columns ``col`` to ``end`` of a strip that may be linked with a part."""
     n_near, far = 0, SAFE * part["longest"]
     # If the columns hold many runs, they are searched one by one, by height.
     one_by_one = end > col and firsts[end] - firsts[col] > MAX_SCANNED

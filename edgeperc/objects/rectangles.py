@@ -14,8 +14,7 @@ from ..types.points import Floats, Points, Rows
 def fit_rectangle(
     points: Points, rows: Rows, n_angles: int, max_fitted: int, l_shaped: bool, rectangle: Floats
 ) -> None:
-    """Write the rectangle around the points ``rows``, which at most ``max_fitted`` of them and ``n_angles`` headings
-    decide.
+    """Write the rectangle around points, which at most ``max_fitted`` of them and ``n_angles`` headings decide.
 
     l_shaped : true: the heading for which most points lie near a side. False: the heading of the smallest rectangle.
     rectangle : (5,) x, y of the middle, extent along and across the heading [m], heading [rad] in 0..pi/2.

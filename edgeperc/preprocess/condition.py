@@ -34,9 +34,7 @@ def condition(points: ArrayLike, sensor: SensorProfile, *, rendered: bool = True
 
 
 def scale(points: Points, sensor: SensorProfile, *, rendered: bool = True) -> tuple[Floats32, int]:
-    """Scale the remission of a scan of `returns.returns` to 0..1, read-only; and how many rows became NaN, because
-    theirs is not finite.
-    """
+    """The scan with remission scaled to 0..1, read-only; and how many rows became NaN, as theirs is not finite."""
     if rendered and sensor.remission is not None:
         return read_only(render(points, sensor)), 0
     offset, factor = np.float32(sensor.remission_offset), np.float32(sensor.remission_scale)

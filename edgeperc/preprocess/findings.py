@@ -32,8 +32,7 @@ class Finding(str):
 def check_fitness(
     points: Points, profile: FitnessProfile, sensor: SensorProfile, frame: ModelFrame | None = None
 ) -> tuple[Finding, ...]:
-    """Describe how a scan differs from the scans that a model was trained on, and what to do about it
-    (docs/concepts/fitness.md).
+    """Describe how a scan differs from those of the training, and what to do about it (docs/concepts/fitness.md).
 
     Margins are wide: the check finds gross mistakes (axes, units, remission scale, another sensor) and accepts ordinary
     scans of the right sensor, including scans cropped to the model's view. It does not find scans turned by 180 degrees
@@ -54,9 +53,7 @@ def check_profiles(
     frame: ModelFrame | None = None,
     ceiling_m: float | None = None,
 ) -> tuple[Finding, ...]:
-    """Describe how a scan differs from the training scans of several models, each difference once; it is measured once
-    for all profiles of the same view.
-    """
+    """Describe how a scan, measured once for each view, differs from the training scans of several models."""
     measured: dict[Range, Measures | None] = {}
     found: dict[Finding, None] = {}
     for profile in profiles:
@@ -163,9 +160,7 @@ _USUAL_M = 9.0  # median distance in a street
 
 
 def check_dropped(points: Points, dropped: DroppedPoints, sensor: SensorProfile) -> tuple[Finding, ...]:
-    """Describe a scan of which nearly all was dropped, as nearer than the sensor measures: a street in another unit, or
-    no returns.
-    """
+    """Describe a scan of which nearly all was dropped as too near: a street in another unit, or no returns."""
     n_left = len(points) - dropped.total
     if dropped.too_near <= _NEARLY_ALL * n_left:
         return ()

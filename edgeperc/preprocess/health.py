@@ -45,9 +45,7 @@ _RANGE_SHARE, _SHRUNK, _FEWER_RETURNS = 0.95, 0.6, 0.85
 
 @dataclass(frozen=True)
 class Normal:
-    """What the first scans of a sensor showed: the least counts of `fill_sectors`, high quantiles of the ranges [m] and
-    numbers of returns, one a scan.
-    """
+    """What a sensor's first scans showed: least counts of `fill_sectors`; high ranges [m] and returns of each scan."""
 
     fewest: Floats | None = None
     ranges_m: tuple[float, ...] = ()

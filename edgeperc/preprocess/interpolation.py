@@ -110,8 +110,7 @@ def fill_between(
     col_reach: int,
     ground_z: float,
 ) -> int:
-    """Fill the empty pixels between two returns of one surface, first along rows, then along columns; returns the
-    number of points.
+    """Fill empty pixels between two returns of one surface, along rows, then columns; returns the number of points.
 
     points : (n + H * W, 4) the first ``n`` rows are the input, those after them are overwritten.
     row_slopes, directions : tangent of each row's elevation; cosine and sine of each column's azimuth.

@@ -97,8 +97,7 @@ def fit_functions(
     to: str,
     source: str,
 ) -> tuple[RemissionFunction, ...]:
-    """Fit a line, a parabola, a logarithm and a power to pairs of remissions, the best in ten-fold cross-validation
-    first.
+    """Fit a line, a parabola, a logarithm and a power to pairs of remissions, the best in cross-validation first.
 
     A parabola is never worse than a line on the pairs it is fitted to, but it is the worst on held-back pairs, as in
     the paper (KUL-Seg, Table 5).
@@ -245,8 +244,7 @@ def _weighted_quantiles(values: Floats, weights: Floats) -> Floats:
 def fit_sensor(
     scans: Sequence[Floats32], sensor: SensorProfile, to: str = "hdl-64e", *, source: str = ""
 ) -> tuple[SensorProfile, tuple[RemissionFunction, ...]]:
-    """Fit the remission function of a sensor to scans of any street: ``sensor`` with the best function, and all of
-    them.
+    """Fit remission functions of a sensor to scans of any street: ``sensor`` with the best one, and all of them.
 
     A parabola that decreases before full scale is not used.
 

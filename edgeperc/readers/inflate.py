@@ -23,9 +23,7 @@ def most_bytes(n_packed: int) -> int:
 
 
 def inflate(packed: bytes, method: str, limit: int | None = None) -> bytes:
-    """Decompress bytes (``"lz4"`` is LZ4's frame format, ``""`` not compressed), but no more than a limit, and never
-    more than `most_bytes`.
-    """
+    """Decompress bytes (``"lz4"``: the frame format; ``""``: plain) up to a limit, and never more than `most_bytes`."""
     limit = min(MAX_BYTES if limit is None else limit, most_bytes(len(packed)) if method else MAX_BYTES)
     if method == "":
         content = packed

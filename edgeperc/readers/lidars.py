@@ -87,9 +87,7 @@ def _name_of(payload: memoryview) -> str | None:
 
 
 def open_spinning(path: Path, row: Format, sender: str | None, alive: Callable[[], None]) -> tuple[Format, Angles]:
-    """The format and the angles of a spinning sensor, or of a ``sender``; raises PointsError if neither the capture nor
-    a file beside it has the angles.
-    """
+    """The format and angles of a spinning sensor; PointsError if neither the capture nor a file beside it has them."""
     files = sorted(path.absolute().parent.glob("*.csv"))
     file = next((each for each in files if each.stem.startswith(path.stem)), None)
     said = Angles(np.array([[each, 0.0] for each in row.elevations_deg])) if row.elevations_deg else None

@@ -88,8 +88,7 @@ def _old_time(kind: int, stamp: bytes) -> float:
 def fill_points(
     content: NDArray[np.uint8], stride: int, layout: int, points: NDArray[np.float32], which: NDArray[np.int64]
 ) -> int:
-    """Put the points that returned into an array, and the number of each in the content into ``which``; returns how
-    many.
+    """Put the points that returned into an array, and their numbers in the content into ``which``; returns how many.
 
     layout : 4: x, y, z in mm of 4 bytes; 2: in cm of 2 bytes; 3: mm of 4 bytes, zenith angle and azimuth of 2 bytes.
     """
@@ -186,9 +185,7 @@ def _devices(data: memoryview) -> list[tuple[str, int]]:
 
 
 def lvx2_scans(path: Path, chosen: int, alive: Callable[[], None]) -> Iterator[TimedScan]:
-    """The scans of one sensor of an .lvx2 file, by its place among `lvx2_sensors`; of a damaged file, PointsError comes
-    after those before the damage.
-    """
+    """The scans of one sensor, by its place among `lvx2_sensors`; PointsError comes after those before a damage."""
     data = np.memmap(path, np.uint8, "r").data
     devices, stream = _devices(data), LivoxStream()
     only = devices[chosen][1] if len(devices) > 1 else None

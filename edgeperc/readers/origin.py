@@ -33,8 +33,7 @@ _LEAST_CONTRAST, _LEAST_GAIN = 0.5, 2.7
 
 
 def find_place(xyz: NDArray[np.float64]) -> tuple[float, float, float]:
-    """Find where the sensor was when it took a scan, mostly to a centimeter; axes of the map, z up, the sensor nearly
-    upright.
+    """Find where the sensor, nearly upright, was in the map when it took a scan, mostly to a centimeter.
 
     xyz : (n, 3) at least 2000 finite points of one turn, from one place: not moved point by point. Raises PointsError:
         The elevations stand out nowhere, as in most scans of a sensor that leans by half a degree.

@@ -52,9 +52,7 @@ def read_metadata(path: Path) -> str:
 
 
 def check_metadata(content: Any) -> None:
-    """Raise `PointsError` unless the numbers that arrays are made by, of any firmware, are possible and agree, as far
-    as they are there.
-    """
+    """Raise `PointsError` unless the numbers that arrays are made by, as far as they are there, are possible."""
     if not isinstance(content, dict):
         raise PointsError(f"expected an object, got {type(content).__name__}")
     layout = content.get("lidar_data_format", content.get("data_format", {}))

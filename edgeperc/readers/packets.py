@@ -68,8 +68,7 @@ class _Fragment(NamedTuple):
 
 
 class Datagrams:
-    """The whole UDP datagrams over IPv4 of a pcap file up to a cut, put together from fragments; packets of others are
-    left out.
+    """The whole UDP datagrams over IPv4 of a pcap file up to a cut, put together from fragments.
 
     most : packets of the file that are looked at; None: all.
     n_bad : so far, those that are empty, incomplete, or contradict themselves.

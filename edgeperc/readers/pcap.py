@@ -53,9 +53,7 @@ class _DamageError(Exception):
 
 
 def pcap_packets(path: Path, whole: bool = True) -> Iterator[Captured]:
-    """The packets of a file. Where it ends or is damaged, it stops if others came, or if ``whole`` raises
-    `CutShortError`.
-    """
+    """The packets of a file, up to where it is damaged or ends, which is a `CutShortError` if ``whole``."""
     size = path.stat().st_size
     if size < 24:
         raise PointsError(f"cut short: {size} bytes; expected a pcap file of 24 bytes and more")

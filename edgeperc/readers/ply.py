@@ -59,9 +59,7 @@ def _parse_ply_header(head: bytes) -> tuple[str, list[_PlyElement], int]:
 
 
 def parse_ply(data: NDArray[np.uint8], head: bytes, remission_field: str | None) -> Columns:
-    """Parse the vertices of a PLY file: ascii, or binary in either byte order; ``head`` is its beginning, with the
-    whole header.
-    """
+    """Parse the vertices of a PLY file, ascii or binary; ``head`` is its beginning, with the whole header."""
     encoding, elements, start = _parse_ply_header(head)
     before: list[_PlyElement] = []
     for vertex in elements:

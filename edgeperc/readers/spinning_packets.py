@@ -277,8 +277,7 @@ def fill_returns(
     points: NDArray[np.float32],
     times_s: NDArray[np.float64],
 ) -> int:
-    """Put the returns of packets into points; a second return at the distance of the first is left out. Returns how
-    many.
+    """Put the returns of packets into points, without second ones at the distance of the first; returns how many.
 
     places : header, bytes of a block, its first channel, bytes of a channel, whether numbers are big-endian, mask of a
         distance, and from a second return back to the first: blocks (of the same azimuth) or channels.

@@ -344,8 +344,7 @@ def fill_first_cells(objects: Mask, known: Mask, road: Mask, firsts: Ints64) -> 
 
 @njit(cache=True, nogil=True)
 def fill_corridor(drivable: Mask, first: float, last: float, bounds: Ints64) -> None:
-    """Follow the drivable cells ahead, row by row from the last one up: first column of the corridor and one past its
-    last, or -1.
+    """Follow the drivable cells ahead, from the last row up: first column of the corridor, one past its last, or -1.
 
     The corridor begins in the last row that has a run of drivable cells between ``first`` and ``last``. It continues
     with the run that shares most columns with the row before, the left one on ties, and ends where no run shares one.

@@ -182,9 +182,7 @@ def grid_message(
     corner_m: Sequence[float],
     orientation: Sequence[float] = (0.0, 0.0, 0.0, 1.0),
 ) -> dict[str, Any]:
-    """The fields of a nav_msgs/OccupancyGrid, by place of the corner with the lowest x and y [m] and quaternion x, y,
-    z, w of the cells in the frame.
-    """
+    """The fields of a nav_msgs/OccupancyGrid, by corner with the lowest x and y [m] and quaternion of the cells."""
     nanoseconds = nanoseconds_of(stamp_s or 0.0)
     stamp = {"sec": nanoseconds // 10**9, "nanosec": nanoseconds % 10**9}
     return {

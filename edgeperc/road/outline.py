@@ -35,8 +35,7 @@ class Outline:
 def outline_of(
     cells: Mask, origin: tuple[float, float], obstacles: Mask, in_holes: Mask, *, tolerance: float, max_corners: int
 ) -> Outline:
-    """Outline the connected cells that are nearest to a place: a valid polygon, whose rings do not touch, with holes
-    inside.
+    """Outline the connected cells that are nearest to a place: a valid polygon, with holes that touch nothing.
 
     Closing by a disc fills gaps narrower than twice the tolerance, opening removes what is as narrow. So cells that are
     connected only over a narrower passage are left out. Where two cells share only a corner, a cell between them is
@@ -291,9 +290,7 @@ def fill_rings(cells: Mask, corners: Ints64, ends: Ints64) -> int:
 
 @njit(cache=True, nogil=True)
 def may_change(ar: int, ac: int, br: int, bc: int, cr: int, cc: int, fixed: Ints) -> bool:
-    """Whether all cells that a triangle touches may change sides; ``fixed`` counts those before each column of a row
-    that may not.
-    """
+    """Whether all cells that a triangle touches may change sides; ``fixed`` counts those before each that may not."""
     # In the strip of a row, its columns are bounded by its corners there and by the crossings of its edges with the
     # strip's two lines.
     for row in range(min(ar, br, cr), max(ar, br, cr)):
@@ -365,8 +362,7 @@ def is_apart(ring: Ints64, edges: Ints64, k: int, pr: int, pc: int) -> bool:
 
 @njit(cache=True, nogil=True)
 def merge_corners(ring: Ints64, edges: Ints64, fixed: Ints, around: int, enough: int) -> int:
-    """Replace two neighboring corners of a valid ring by one, smallest changes first; returns how many corners are
-    left.
+    """Replace two neighboring corners of a valid ring by one, smallest changes first; returns how many are left.
 
     Between the neighbors a and d, the corner p replaces b and c. What changes sides lies in the triangles pab, pbc and
     pcd. No cell that they touch may be fixed, and of all such p, that with the smallest sum of their areas is taken.

@@ -111,9 +111,7 @@ class Kernel:
 
 
 class Library:
-    """A library of compiled kernels and its index: by kernel, the digest of its code, and the name of the function for
-    each list of types.
-    """
+    """A library of compiled kernels and its index: digest of each one's code, and its functions by types."""
 
     def __init__(self, module: Any, index: Mapping[str, Any]) -> None:
         self._module, self._index = module, index

@@ -58,8 +58,7 @@ def unsafe_because(status: os.stat_result) -> str | None:
 
 
 def compiled_folder(engine: str, sha256: str, precision: str) -> Path | None:
-    """Create the folder for the compiled form of a model, separate for each engine with its versions, file and
-    precision.
+    """Create the folder for the compiled form of a model, separate for each engine, its version, file and precision.
 
     None if there is no folder that this user can write and other users cannot. The engine then compiles at every start,
     and a warning in the log says so.

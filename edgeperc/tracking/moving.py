@@ -137,9 +137,7 @@ def _inside_any(boxes: list[Box], points: Points, margin_m: float) -> Mask:
 
 @njit(cache=True, nogil=True)
 def mark_in_boxes(boxes: Floats, points: Points, inside: Mask) -> None:
-    """Mark the points inside at least one box (m, 8): x, y, z of the center, half length, half width, half height [m],
-    cosine and sine of the yaw.
-    """
+    """Mark the points inside at least one box: center, half length, width and height [m], cosine and sine of yaw."""
     for i in range(points.shape[0]):
         inside[i] = False
         x, y, z = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])

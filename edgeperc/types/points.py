@@ -55,8 +55,7 @@ class Labeled(NamedTuple):
 def as_points(
     array: ArrayLike, *, remission_field: str | None = None, origin_m: Sequence[float] | None = None
 ) -> NDArray[np.float32]:
-    """Convert an array to points, (n, 4) float32 C-contiguous: itself if it has this form. Too large values become
-    infinite.
+    """Convert an array to points, (n, 4) float32 C-contiguous: itself if it has this form.
 
     array : (n, 4) or (n, 3), of any float or integer dtype, byte order and memory layout: x, y, z [m], remission, 0
         without it. A structured array (any shape, e.g. that of a PointCloud2 message) needs the fields x, y and z;

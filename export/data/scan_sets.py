@@ -84,9 +84,7 @@ def read_scan_set(
 def labeled_scan(
     frame: ScanFrame, points: Points, mounting: Mounting, classes: Sequence[str] = POINT_CLASSES
 ) -> LabeledScan:
-    """A scan with its truth in the frame of the models; its remission is as `condition.condition` returns it, the
-    mounting a known one.
-    """
+    """A scan, its remission as of `condition.condition`, with its truth in the frame of the models."""
     model = ModelFrame(mounting)
     boxes = model.move_boxes(frame.boxes or ())
     surface = np.full((SURFACE.height, SURFACE.width), IGNORE, np.uint8)

@@ -22,8 +22,7 @@ the true one, so the neighbors' geometry must be correct too."""
 def slot_targets(
     boxes: ArrayLike, view: TopViewGeometry, *, labeled: Mask | None = None, unsure: ArrayLike | None = None
 ) -> Floats32:
-    """Targets of head "slots": each slot has a square of the view, and the upright box of the object centered there,
-    the nearest of several.
+    """Targets of head "slots": each has a square of the view, and the upright box of the nearest object in it.
 
     Returns (rows * columns, 5): By rows from the far left square: center column, center row, width and height as in
         `paper_slot_targets`, and the presence: 1 with an object, 0 and zeros without one, -1 if it is not learned.

@@ -20,9 +20,7 @@ ANCHOR_VALUES = (1, 7, 2)
 
 
 class PointPillars(nn.Module):
-    """Scores (B, 2, H/2, W/2), boxes (B, 14, ...) and directions (B, 4, ...) of anchors, from features of pillars (B,
-    64, H, W), H and W divisible by 8.
-    """
+    """Scores (B, 2, H/2, W/2), boxes (B, 14, ...) and directions (B, 4, ...) from features of pillars (B, 64, H, W)."""
 
     def __init__(self) -> None:
         super().__init__()

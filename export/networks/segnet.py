@@ -26,9 +26,7 @@ N_DROPPED = 3
 
 
 def unpool(x: Tensor, positions: Tensor, size: tuple[int, int]) -> Tensor:
-    """Put pooled values back where they were the maximum; all other values are 0. Positions are those of
-    `torch.nn.functional.max_pool2d`.
-    """
+    """Put pooled values back at the positions of `torch.nn.functional.max_pool2d`; all other values are 0."""
     batch, channels = x.shape[:2]
     flat = x.new_zeros((batch, channels, size[0] * size[1]))
     return flat.scatter(2, positions.flatten(2), x.flatten(2)).view(batch, channels, *size)

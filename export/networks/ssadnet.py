@@ -239,8 +239,7 @@ class DenseHead(nn.Module):
 
 
 class SSADNet(nn.Module):
-    """Labels every cell of a top view and detects the vehicles in it; any height and width divisible by 8 (slots: at
-    least 32).
+    """Labels every cell of a top view and detects the vehicles in it; height and width divisible by 8 (slots: 32).
 
     head : ``"slots"`` is the paper's regressor with one slot for each square of 32 cells, ``"slots-paper"`` the same as
         published with ``n_slots``, ``"dense"`` one prediction every four cells.
