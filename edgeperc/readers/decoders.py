@@ -143,7 +143,6 @@ def _packet_scans(
     warn: Callable[[str], None],
     alive: Callable[[], None],
 ) -> Iterator[TimedScan]:
-    scans: Iterator[TimedScan] = iter(())
     if kind == ".osf":
         scans = _ouster_scans(_open_osf(path), topic, remission_field)
     elif kind == ".lvx2":
@@ -151,28 +150,7 @@ def _packet_scans(
 
         scans = lvx2_scans(path, _choose("sensor", lvx2_sensors(path), topic), alive)
     else:
-        is_velodyne = next(velodyne_packets(path), None) is not None
-        senders = velodyne_senders(path) if is_velodyne else []
-        lidar = None
-        if not is_velodyne or has_other_lidars(path):
-            from .lidars import lidar_of, turns_of  # numba
-
-            with suppress(PointsError) if is_velodyne else nullcontext():  # one that is not decoded
-                lidar = lidar_of(path)
-        others = [] if lidar is None else lidar.senders
-        ousters = _ousters_beside(path) if is_velodyne or lidar is not None else []
-        known = [*senders, *others, *ousters]
-        is_one_kind = [bool(senders), bool(others), bool(ousters)].count(True) == 1
-        title = "LiDAR" if not is_one_kind else "Velodyne" if lidar is None else lidar.title
-        sender = known[_choose(title, known, topic)] if len(known) > 1 else None
-        if sender in ousters:
-            scans = _ouster_turns(path, sender, remission_field, warn, alive)
-        elif lidar is not None and (not is_velodyne or sender in others):
-            scans = turns_of(path, lidar, sender, alive, warn)
-        elif is_velodyne:
-            scans = _velodyne_scans(_decodable(path, alive, sender))
-        else:
-            scans = _ouster_turns(path, topic, remission_field, warn, alive)
+        scans = _pcap_scans(path, topic, remission_field, warn, alive)
     n_scans = 0
     for scan in scans:
         n_scans += 1
@@ -182,6 +160,30 @@ def _packet_scans(
     if not n_scans:
         content = f"has {n_packets} packets, none from a supported LiDAR" if kind == ".pcap" else "holds no scan"
         raise PointsError(f"the capture {content}; expected a capture of a LiDAR, an Ouster's with its metadata")
+
+
+def _pcap_scans(
+    path: Path, topic: str | None, remission_field: str | None, warn: Callable[[str], None], alive: Callable[[], None]
+) -> Iterator[TimedScan]:
+    """The scans of the sensor that a topic names, or of the only one; the first kind of packets where none is named."""
+    kinds: dict[str, tuple[Sequence[str], Callable[[str | None], Iterator[TimedScan]]]] = {}
+    is_velodyne = next(velodyne_packets(path), None) is not None
+    if is_velodyne:
+        kinds["Velodyne"] = velodyne_senders(path), lambda sender: _velodyne_scans(_decodable(path, alive, sender))
+    if not is_velodyne or has_other_lidars(path):
+        from .lidars import lidar_of, turns_of  # numba
+
+        with suppress(PointsError) if is_velodyne else nullcontext():  # one that is not decoded
+            if lidar := lidar_of(path):
+                kinds[lidar.title] = lidar.senders, lambda sender: turns_of(path, lidar, sender, alive, warn)
+    ousters = _ousters_beside(path) if kinds else []
+    kinds["Ouster"] = ousters, lambda sender: _ouster_turns(path, sender or topic, remission_field, warn, alive)
+    known = [sender for senders, _ in kinds.values() for sender in senders]
+    titles = [title for title, (senders, _) in kinds.items() if senders]
+    if len(known) > 1:
+        sender = known[_choose(titles[0] if len(titles) == 1 else "LiDAR", known, topic)]
+        return next(read for senders, read in reversed(kinds.values()) if sender in senders)(sender)
+    return next(iter(kinds.values()))[1](None)
 
 
 def _ousters_beside(path: Path) -> list[str]:
