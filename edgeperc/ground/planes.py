@@ -176,24 +176,9 @@ class GroundFit:
 def heights_above(ground: GroundSurface | None, points: Points, *, max_height_m: float = 0.125) -> Ground:
     """Heights of any points above the ground that a scan showed.
 
-    Parameters
-    ----------
-    ground : GroundSurface or None
-        `edgeperc.Perception.ground`. None: the points are a scan, and show the ground themselves.
-    points : (n, 3 or more) float32
-        x, y, z [m] in the frame of the models (`edgeperc.ModelFrame`). For the scan's own points, the heights are those
-        of `find_ground`.
-    max_height_m : float
-        As in `find_ground`.
-
-    Returns
-    -------
-    Ground
-
-    Raises
-    ------
-    PointsError
-        As `find_ground`.
+    ground : `edgeperc.Perception.ground`. None: the points are a scan, and show the ground themselves.
+    points : (n, 3 or more) float32; x, y, z [m] in the frame of the models (`edgeperc.ModelFrame`). For the scan's own
+        points, the heights are those of `find_ground`.
     """
     if ground is None:
         return find_ground(points, max_height_m=max_height_m)

@@ -54,7 +54,6 @@ def fill_mode_probabilities(
     is the probability of model j. P(j, d) divided by that sum is the association that the filter of model j uses.
 
     likelihoods : (n, k, m) of each detection under each motion model; 0 outside the gate.
-    beta : (n, m + 1) as in `jpda.fill_association`.
     shares : (n, k, m + 1) association for each motion model; sums to 1 over the last axis.
     """
     n, k, m = likelihoods.shape
