@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from ..errors import MissingExtraError, PointsError
 from ..system.clock import Stamp
 from ..system.interpreter import interpreter_flags
-from ..types.points import Points
+from ..types.points import Floats, Points
 from .tables import MAX_BYTES, MAX_SCAN_BYTES
 from .times import TimedScan
 from .worker import ALIVE, END, ERROR, FOUND, HEADER, MISSING, READY, SCAN, TIMES, WARNING
@@ -126,7 +126,7 @@ def _replies(
     process: subprocess.Popen[bytes], replies: IO[bytes], path: Path, watch: _Watch, found: list[Any]
 ) -> Iterator[TimedScan]:
     n_scans, ready = 0, False
-    times_s: NDArray[np.float64] | None = None
+    times_s: Floats | None = None
     while True:
         watch.since_s = time.monotonic()
         header = replies.read(HEADER.size)

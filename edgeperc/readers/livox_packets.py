@@ -10,10 +10,10 @@ from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..errors import PointsError
 from ..system.kernels import njit
+from ..types.points import Bytes, Floats32, Ints64
 from .packets import LVX_MAGIC
 from .times import TimedScan
 
@@ -85,9 +85,7 @@ def _old_time(kind: int, stamp: bytes) -> float:
 
 
 @njit(cache=True, nogil=True)
-def fill_points(
-    content: NDArray[np.uint8], stride: int, layout: int, points: NDArray[np.float32], which: NDArray[np.int64]
-) -> int:
+def fill_points(content: Bytes, stride: int, layout: int, points: Floats32, which: Ints64) -> int:
     """Put the points that returned into an array, and their numbers in the content into ``which``; returns how many.
 
     layout : 4: x, y, z in mm of 4 bytes; 2: in cm of 2 bytes; 3: mm of 4 bytes, zenith angle and azimuth of 2 bytes.

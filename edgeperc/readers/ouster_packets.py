@@ -12,10 +12,9 @@ from numpy.typing import NDArray
 
 from ..errors import PointsError
 from ..system.kernels import njit
+from ..types.points import Bytes, Floats, Ints64
 from .ouster import check_metadata
 from .times import TimedScan
-
-Bytes = NDArray[np.uint8]
 
 
 class Field(NamedTuple):
@@ -84,11 +83,11 @@ class Layout(NamedTuple):
     shape: tuple[int, int]  # beams, columns of a turn
     packets_of_turn: int  # fewer if the sensor looks to one side only
     # of each beam [rad]
-    altitude: NDArray[np.float64]
-    azimuth: NDArray[np.float64]
+    altitude: Floats
+    azimuth: Floats
     # (4, 4) from the beams' origin to the axis, and from there to the sensor [mm]
-    to_lidar: NDArray[np.float64]
-    to_sensor: NDArray[np.float64]
+    to_lidar: Floats
+    to_sensor: Floats
 
 
 def layout_of(content: Any) -> Layout:
@@ -165,7 +164,7 @@ def _number(content: Mapping[str, Any], name: str, default: float) -> float:
     return value
 
 
-def _angles(content: Mapping[str, Any], name: str) -> NDArray[np.float64]:
+def _angles(content: Mapping[str, Any], name: str) -> Floats:
     values = content.get(name)
     if not isinstance(values, list) or any(isinstance(value, list) for value in values):
         raise PointsError(f"{name}: expected a list of numbers, one for each beam")
@@ -174,7 +173,7 @@ def _angles(content: Mapping[str, Any], name: str) -> NDArray[np.float64]:
     return np.radians(np.array(values, np.float64))
 
 
-def _transform(content: Mapping[str, Any], name: str, default: NDArray[np.float64]) -> NDArray[np.float64]:
+def _transform(content: Mapping[str, Any], name: str, default: Floats) -> Floats:
     values = content.get(name)
     if values is None:
         return default
@@ -186,11 +185,7 @@ def _transform(content: Mapping[str, Any], name: str, default: NDArray[np.float6
 
 @njit(cache=True, nogil=True)
 def fill_turn(
-    packets: Bytes,
-    places: NDArray[np.int64],
-    fields: NDArray[np.int64],
-    values: NDArray[np.uint32],
-    stamps_ns: NDArray[np.uint64],
+    packets: Bytes, places: Ints64, fields: Ints64, values: NDArray[np.uint32], stamps_ns: NDArray[np.uint64]
 ) -> None:
     """Put the valid columns of packets where they belong in a turn; later ones replace earlier ones.
 

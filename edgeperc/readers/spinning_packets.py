@@ -13,13 +13,11 @@ from pathlib import Path
 from typing import Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..errors import PointsError
 from ..system.kernels import njit
+from ..types.points import Bytes, Floats, Ints64, Points
 from .times import TimedScan
-
-Bytes = NDArray[np.uint8]
 
 
 class Clock(NamedTuple):
@@ -70,7 +68,7 @@ class Format(NamedTuple):
 class Angles(NamedTuple):
     """What is known of a unit: (lasers, 2) elevation and azimuth of each laser [deg], its speed, and returns."""
 
-    lasers_deg: NDArray[np.float64]
+    lasers_deg: Floats
     rpm: float = 600.0
     is_dual: bool = False
 
@@ -269,13 +267,7 @@ def read_angles(path: Path, row: Format) -> Angles:
 
 @njit(cache=True, nogil=True)
 def fill_returns(
-    packets: Bytes,
-    places: NDArray[np.int64],
-    blocks: NDArray[np.float64],
-    beams: NDArray[np.float64],
-    lens: NDArray[np.float64],
-    points: NDArray[np.float32],
-    times_s: NDArray[np.float64],
+    packets: Bytes, places: Ints64, blocks: Floats, beams: Floats, lens: Floats, points: Points, times_s: Floats
 ) -> int:
     """Put the returns of packets into points, without second ones at the distance of the first; returns how many.
 
@@ -326,7 +318,7 @@ class _Packet(NamedTuple):
     content: bytes
     time_s: float
     rpm: float
-    azimuths: NDArray[np.float64]  # of the blocks; NaN where one is left out
+    azimuths: Floats  # of the blocks; NaN where one is left out
 
 
 class SpinningStream:
@@ -404,7 +396,7 @@ def _part(packet: _Packet, begin: int, end: int) -> _Packet:
     return packet._replace(azimuths=azimuths)
 
 
-def _blocks(row: Format, packets: Sequence[_Packet]) -> NDArray[np.float64]:
+def _blocks(row: Format, packets: Sequence[_Packet]) -> Floats:
     """Azimuth, time and speed of each block: the blocks of a packet are as far apart in time as the sensor turns."""
     azimuths = np.array([packet.azimuths for packet in packets])
     speeds = 6.0 * np.array([packet.rpm for packet in packets])
@@ -418,7 +410,7 @@ def _blocks(row: Format, packets: Sequence[_Packet]) -> NDArray[np.float64]:
     )
 
 
-def _beams(row: Format, angles: Angles, is_dual: bool) -> NDArray[np.float64]:
+def _beams(row: Format, angles: Angles, is_dual: bool) -> Floats:
     """Elevation [rad], azimuth [deg] and time [us] of each channel of each block."""
     block, channel = np.mgrid[: row.n_blocks, : row.n_channels]
     laser = channel % 16 if row.lasers == 16 else channel + 48 * (block % 2) if row.lasers == 96 else channel

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import PointsError
-from ..types.points import remission_name
+from ..types.points import Bytes, remission_name
 from .times import time_name
 
 MAX_HEADER_BYTES = 65536
@@ -34,7 +34,7 @@ class Columns(NamedTuple):
     n_missing: int = 0  # points that the header declares, and that a file that was cut short lacks
 
 
-def column(data: NDArray[np.uint8], kind: str, n: int, offset: int, stride: int) -> NDArray[Any]:
+def column(data: Bytes, kind: str, n: int, offset: int, stride: int) -> NDArray[Any]:
     """View of one field of binary records, (n,); ``offset`` and ``stride`` in bytes."""
     if n == 0:
         return np.empty(0, dtype=kind)
@@ -83,12 +83,7 @@ def cut_short(n: int, record: int, size: int) -> PointsError:
 
 
 def parse_table(
-    body: NDArray[np.uint8],
-    skipped_rows: int,
-    n: int,
-    places: Mapping[str, int],
-    names: Sequence[str],
-    remission_field: str | None,
+    body: Bytes, skipped_rows: int, n: int, places: Mapping[str, int], names: Sequence[str], remission_field: str | None
 ) -> Columns:
     """Parse coordinates, remission and time from rows of text; ``places`` has each field's position in a row."""
     wanted = {name: places[name] for name in "xyz" if name in places}

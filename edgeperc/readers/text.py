@@ -9,10 +9,9 @@ from contextlib import suppress
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..errors import PointsError
-from ..types.points import plain_name
+from ..types.points import Bytes, Floats, plain_name
 from .raw import TEXT_BYTES
 from .tables import Columns
 
@@ -49,7 +48,7 @@ class _Style(NamedTuple):
         return [word.strip() for word in row.split(self.separator)]
 
 
-def parse_text(data: NDArray[np.uint8], columns: Sequence[str] | int | None) -> Columns:
+def parse_text(data: Bytes, columns: Sequence[str] | int | None) -> Columns:
     """The columns of a table: separated by blanks, commas or semicolons, below comments (``#``, ``//``).
 
     A first line of one whole number is the number of points, as in ``.pts``. Names are those of a line of words, with
@@ -153,7 +152,7 @@ def _is_number(word: str, style: _Style) -> bool:
     return True
 
 
-def _table(rows: Sequence[str], style: _Style, used: Sequence[int], n: int) -> NDArray[np.float64]:
+def _table(rows: Sequence[str], style: _Style, used: Sequence[int], n: int) -> Floats:
     """The numbers in some of ``n`` columns."""
     mark = style.separator
     for k, row in enumerate(rows):
@@ -178,5 +177,5 @@ def _table(rows: Sequence[str], style: _Style, used: Sequence[int], n: int) -> N
     raise error
 
 
-def _loaded(text: str, used: Sequence[int], mark: str | None) -> NDArray[np.float64]:
+def _loaded(text: str, used: Sequence[int], mark: str | None) -> Floats:
     return np.loadtxt(io.StringIO(text), np.float64, comments=None, ndmin=2, usecols=used, delimiter=mark)
