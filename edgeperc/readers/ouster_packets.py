@@ -187,10 +187,8 @@ def _transform(content: Mapping[str, Any], name: str, default: Floats) -> Floats
 def fill_turn(
     packets: Bytes, places: Ints64, fields: Ints64, values: NDArray[np.uint32], stamps_ns: NDArray[np.uint64]
 ) -> None:
-    """Put the valid columns of packets where they belong in a turn; later ones replace earlier ones.
-
-    places : as `Layout.places`.
-    fields : (k, 3) int64; bit, bits and shift of each.
+    """Put the valid columns of packets where they belong in a turn; later ones replace earlier ones. ``fields`` (k, 3)
+    are bit, bits and shift of each, places as `Layout.places`.
     """
     header, per_packet, column_bytes, status, first, pixel_bytes = places
     for packet in range(packets.shape[0]):

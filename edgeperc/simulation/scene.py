@@ -311,10 +311,8 @@ def simulate(
 def _pattern_rays(
     profile: SensorProfile, pattern: ScanPattern, start_s: float, duration_s: float | None
 ) -> tuple[Floats, Floats]:
-    """Azimuths (n,) and elevations (1, n) of a pattern [rad], in the order of time.
-
-    A sensor that sees all around turns while its beam goes up and down. Others look through two prisms that turn at
-    different rates, so that the beam draws a rosette.
+    """Azimuths (n,) and elevations (1, n) of a pattern [rad], in the order of time: of a turn while the beam goes up
+    and down, or of two prisms that turn at different rates, so that the beam draws a rosette.
     """
     duration_s = pattern.accumulate_s if duration_s is None else duration_s
     first = round(start_s * pattern.points_per_s)

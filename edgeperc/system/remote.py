@@ -26,10 +26,8 @@ def location(text: str) -> Path | Remote:
 
 @dataclass(frozen=True)
 class Remote:
-    """A file or folder at a URL; names and ``/`` work as for a `pathlib.Path`.
-
-    Every method may raise `OSError`, with the URL in the message; `MissingExtraError` without fsspec; `OptionError`
-    for a protocol that is unknown or whose package is not installed.
+    """A file or folder at a URL; names and ``/`` work as for a `pathlib.Path`. Every method may raise `OSError`, with
+    the URL in the message, `MissingExtraError` without fsspec, and `OptionError` for an unknown protocol.
     """
 
     url: str  # as fsspec has it. Its package for the protocol must be installed, e.g. s3fs for ``s3://``.
