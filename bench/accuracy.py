@@ -8,7 +8,6 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from edgeperc.evaluation.judge import renamed
 from edgeperc.evaluation.metrics import BoxEvaluator, Confusion, boxes_to_find
@@ -16,6 +15,7 @@ from edgeperc.simulation.samples import IGNORE, labels_by_boxes
 from edgeperc.simulation.scene import POINT_CLASSES, TOP_VIEW_CLASSES, SimulatedScan
 from edgeperc.types.choices import VEHICLES
 from edgeperc.types.perception import Box, Perception
+from edgeperc.types.points import Labels, Points
 from edgeperc.types.sensor import SensorProfile, get_sensor
 from edgeperc.types.views import TopViewGeometry
 
@@ -110,13 +110,7 @@ class NearFigures:
     def __init__(self, *evaluators: BoxEvaluator) -> None:
         self.points, self.evaluators = Confusion(POINT_CLASSES), evaluators
 
-    def count(
-        self,
-        perception: Perception,
-        points: NDArray[np.float32],
-        labels: NDArray[np.uint8],
-        boxes: Iterable[tuple[Box, int]],
-    ) -> None:
+    def count(self, perception: Perception, points: Points, labels: Labels, boxes: Iterable[tuple[Box, int]]) -> None:
         """Count a scan by its true labels, and boxes with their returns."""
         found = perception.require_points()
         near = found.in_view & (np.hypot(points[:, 0], points[:, 1]) < FARTHEST_M)

@@ -7,11 +7,9 @@ from collections.abc import Iterator
 from queue import SimpleQueue
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from edgeperc import Perceiver, Perception, Tracker, draw, stream
 from edgeperc.records import scan_record
+from edgeperc.types.points import Floats32, Points
 
 PERIOD_S = 0.1
 
@@ -22,7 +20,7 @@ class Application:
     """
 
     def __init__(self, perceive: Perceiver, draw_every: int = 100) -> None:
-        self._scans: SimpleQueue[NDArray[np.float32] | None] = SimpleQueue()
+        self._scans: SimpleQueue[Floats32 | None] = SimpleQueue()
         self._draw_every = draw_every
         self._n = 0
         # A stream takes the newest scan; here the next one comes after the answer, so that none is dropped.
@@ -34,7 +32,7 @@ class Application:
             yield n * PERIOD_S, scan
             n += 1
 
-    def __call__(self, points: NDArray[np.float32]) -> Perception:
+    def __call__(self, points: Points) -> Perception:
         """Perceive a scan."""
         self._scans.put(points)
         answer = next(self._live)

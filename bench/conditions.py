@@ -14,7 +14,6 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from edgeperc import Perceiver
 from edgeperc.preprocess.condition import condition
@@ -25,10 +24,10 @@ from edgeperc.simulation.samples import FIRST_SEED, simulated_scan
 from edgeperc.system.lanes import Stopwatch
 from edgeperc.types.mounting import MODEL_MOUNTING
 from edgeperc.types.perception import Box, SensorHealth
-from edgeperc.types.points import read_only
+from edgeperc.types.points import Floats32, read_only
 from edgeperc.types.sensor import SensorProfile, get_sensor
 
-Scan = NDArray[np.float32]
+Scan = Floats32
 Condition = Callable[[Scan, float, int], Scan]
 
 

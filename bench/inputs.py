@@ -9,12 +9,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from edgeperc import Box, PointsError, read_points
 from edgeperc.readers.captures import SCAN_SUFFIXES
 from edgeperc.simulation.samples import FIRST_SEED, simulated_scan
 from edgeperc.simulation.scene import SimulatedScan
+from edgeperc.types.points import Floats32, Points
 from edgeperc.types.sensor import get_sensor
 
 
@@ -35,7 +35,7 @@ def simulated_input(folder: Path, n: int, sensor: str) -> Input:
     return _stored(folder, scans, tuple(truth), source, sensor)
 
 
-def raw(points: NDArray[np.float32], sensor: str) -> NDArray[np.float32]:
+def raw(points: Points, sensor: str) -> Floats32:
     """Convert the remission of simulated points from 0..1 to the sensor's raw unit."""
     profile = get_sensor(sensor)
     points = points.copy()
@@ -57,7 +57,7 @@ def read_input(folder: Path, paths: Sequence[Path], sensor: str) -> Input:
     return _stored(folder, scans, (), source + (" ..." if len(files) > 8 else ""), sensor)
 
 
-def store(folder: Path, name: str, points: NDArray[np.float32]) -> Path:
+def store(folder: Path, name: str, points: Points) -> Path:
     """Write points to a file in ``folder``."""
     file = folder / f"{name}.npy"
     np.save(file, points)
@@ -65,7 +65,7 @@ def store(folder: Path, name: str, points: NDArray[np.float32]) -> Path:
 
 
 def _stored(
-    folder: Path, scans: Sequence[NDArray[np.float32]], truth: tuple[SimulatedScan, ...], source: str, sensor: str
+    folder: Path, scans: Sequence[Floats32], truth: tuple[SimulatedScan, ...], source: str, sensor: str
 ) -> Input:
     files = tuple(store(folder, f"{k:06d}", scan) for k, scan in enumerate(scans))
     record = {
@@ -78,9 +78,9 @@ def _stored(
     return Input(files, truth, record)
 
 
-def sized(n_points: int, sensor: str) -> NDArray[np.float32]:
+def sized(n_points: int, sensor: str) -> Floats32:
     """Make a scan of ``n_points`` points, sampled from one simulated scan or from several merged ones."""
-    scans: list[NDArray[np.float32]] = []
+    scans: list[Floats32] = []
     while sum(map(len, scans)) < n_points:
         scans.append(simulated_scan(FIRST_SEED + len(scans), sensor).points)
     points = np.concatenate(scans)
@@ -89,7 +89,7 @@ def sized(n_points: int, sensor: str) -> NDArray[np.float32]:
     return raw(points[rows], sensor)
 
 
-def crowd(n_cars: int, sensor: str) -> NDArray[np.float32]:
+def crowd(n_cars: int, sensor: str) -> Floats32:
     """Make a scan of a street with up to 28 cars in the top view, in rows of four, the nearest first."""
     size = (4.2, 1.8, 1.6)
     places = [(9.0 + 5.5 * row, y) for row in range(7) for y in (2.5, -2.5, 7.5, -7.5)][:n_cars]

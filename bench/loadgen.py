@@ -8,10 +8,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from edgeperc.system.extras import require
+from edgeperc.types.points import Floats32
 
 from .scenarios import KeepGoing, Limits, Perceive, Timings, back_to_back
 
@@ -27,7 +25,7 @@ def load() -> Any:
 
 def single_stream(
     perceive: Perceive,
-    scans: Sequence[NDArray[np.float32]],
+    scans: Sequence[Floats32],
     limits: Limits,
     *,
     folder: Path,

@@ -15,7 +15,9 @@ from dataclasses import dataclass
 from time import perf_counter_ns
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
+
+from edgeperc.types.points import Floats
 
 PERCENTILES = (50.0, 90.0, 99.0, 99.9)
 SAMPLES_ABOVE = 10
@@ -86,7 +88,7 @@ def _middle(repeats: Sequence[ArrayLike]) -> float:
     return float(np.median([percentile(repeat, 50.0) for repeat in repeats if np.size(repeat)]))
 
 
-def _resampled(repeats: Sequence[ArrayLike], rng: np.random.Generator) -> NDArray[np.float64]:
+def _resampled(repeats: Sequence[ArrayLike], rng: np.random.Generator) -> Floats:
     """Bootstrap medians, (N_RESAMPLES,)."""
     arrays = [np.asarray(repeat, np.float64) for repeat in repeats if np.size(repeat)]
     n_blocks = min(N_BLOCKS, *map(len, arrays))

@@ -13,9 +13,10 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-Perceive = Callable[[NDArray[np.float32]], Any]
+from edgeperc.types.points import Floats32
+
+Perceive = Callable[[Floats32], Any]
 
 
 class Clock:
@@ -75,7 +76,7 @@ KeepGoing = Callable[[Timings], bool]
 
 def back_to_back(
     perceive: Perceive,
-    scans: Sequence[NDArray[np.float32]],
+    scans: Sequence[Floats32],
     limits: Limits,
     *,
     rate_hz: float | None = None,

@@ -14,7 +14,6 @@ from dataclasses import replace
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
 from edgeperc import Mounting, Perceiver, TimedScan, Trajectory, accumulate, merge
 from edgeperc.evaluation.metrics import BoxEvaluator
@@ -22,6 +21,7 @@ from edgeperc.simulation import SimulatedScan, random_scene, simulate, simulate_
 from edgeperc.simulation.samples import FIRST_SEED
 from edgeperc.types.choices import VEHICLES
 from edgeperc.types.mounting import MODEL_MOUNTING
+from edgeperc.types.points import Bytes, Floats, Floats32
 from edgeperc.types.sensor import SensorProfile, get_sensor
 
 from .accuracy import NearFigures, profile_of
@@ -30,7 +30,7 @@ from .samples import elapsed_ms
 TIMES_S = (0.1, 0.2, 0.5)
 SPEEDS_MPS = (0.0, 10.0)
 _RATE_HZ = 100.0  # of the places that a gathered scan is taken from
-Taken = tuple[NDArray[np.float32], NDArray[np.uint8], SimulatedScan, list[int]]
+Taken = tuple[Floats32, Bytes, SimulatedScan, list[int]]
 
 
 class Figures(NearFigures):
@@ -88,7 +88,7 @@ def sensors_of(names: Sequence[str]) -> Iterator[tuple[str, SensorProfile, float
             yield f"{name}, {accumulate_s:g} s", profile.accumulated(accumulate_s), accumulate_s
 
 
-def around(seed: int, sensor: SensorProfile) -> tuple[list[NDArray[np.float32]], list[NDArray[np.float64]]]:
+def around(seed: int, sensor: SensorProfile) -> tuple[list[Floats32], list[Floats]]:
     """Scans of four sensors at the sides of a vehicle in a street, and their poses on it."""
     scene = random_scene(seed)
     places = [(2.2, 0.0, 1.7, 0.0), (0.0, 0.9, 1.7, 90.0), (-2.2, 0.0, 1.7, 180.0), (0.0, -0.9, 1.7, -90.0)]

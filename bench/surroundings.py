@@ -12,7 +12,6 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from edgeperc import Perceiver, occupancy_grid
 from edgeperc.datasets.scan_folder import ScanFolder
@@ -20,7 +19,7 @@ from edgeperc.evaluation.truth import road_cells
 from edgeperc.road.grid import ALL_AROUND
 from edgeperc.simulation.samples import FIRST_SEED, IGNORE, simulated_scan
 from edgeperc.types.choices import DEFAULT_SENSOR
-from edgeperc.types.points import Points
+from edgeperc.types.points import Bytes, Points
 from edgeperc.types.sensor import SensorProfile, get_sensor
 from edgeperc.types.views import TopViewGeometry
 
@@ -34,14 +33,14 @@ MODELS = {
 N_STREETS = 15
 
 
-def streets() -> Iterator[tuple[Points, NDArray[np.uint8]]]:
+def streets() -> Iterator[tuple[Points, Bytes]]:
     """Simulated scans with the true class of each cell: 1 for road."""
     for seed in range(FIRST_SEED, FIRST_SEED + N_STREETS):
         scan = simulated_scan(seed)
         yield scan.points, scan.top_view_labels(VIEW)
 
 
-def labeled(folder: ScanFolder) -> Iterator[tuple[Points, NDArray[np.uint8]]]:
+def labeled(folder: ScanFolder) -> Iterator[tuple[Points, Bytes]]:
     """Scans of the test drives of a set."""
     perceive = Perceiver("sceneseg", sensor=folder.layout.sensor, on_mismatch="ignore")
     for name in folder.names("test"):
@@ -51,7 +50,7 @@ def labeled(folder: ScanFolder) -> Iterator[tuple[Points, NDArray[np.uint8]]]:
             yield frame.points, cells
 
 
-def print_set(name: str, sensor: SensorProfile, scans: list[tuple[Points, NDArray[np.uint8]]]) -> None:
+def print_set(name: str, sensor: SensorProfile, scans: list[tuple[Points, Bytes]]) -> None:
     """Rows of a set: share of what is found that is road, of the road that is found, and their IoU."""
     x, y = np.broadcast_arrays(*VIEW.cell_centers())
     ahead = (x > 6.0) & (np.abs(y) < 10.0)

@@ -13,7 +13,7 @@ from types import MappingProxyType
 from typing import Literal, NamedTuple, NoReturn
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from .agreement.rules import RULES
 from .camera.image import ImageScaler, as_image, label_pixels
@@ -51,7 +51,7 @@ from .types.detector import PillarGeometry
 from .types.frame import ModelFrame
 from .types.mounting import Mounting
 from .types.perception import ImageLabels, Perception
-from .types.points import Points, as_origin, as_points
+from .types.points import Bytes, Points, as_origin, as_points
 from .types.sensor import SensorProfile, get_sensor
 from .types.views import CameraGeometry, ObjectGeometry, RangeImageGeometry, TopViewGeometry
 from .warm_up import Rehearsed, n_processes, warm_up
@@ -73,7 +73,7 @@ class _Camera:
     session: Session
     scaler: ImageScaler
 
-    def label(self, image: NDArray[np.uint8], watch: Stopwatch) -> ImageLabels:
+    def label(self, image: Bytes, watch: Stopwatch) -> ImageLabels:
         """Class of every pixel of an image, at its own size."""
         card, (height, width, _) = self.session.card, image.shape
         self.scaler.fill(image, self.session.input)
@@ -86,28 +86,14 @@ class _Camera:
 
 
 class Learned(NamedTuple):
-    """What a perceiver has learned from its scans so far; it can be pickled.
-
-    Attributes
-    ----------
-    mounting : MountingEstimator
-    remission : RemissionMatcher
-    to_check : int
-        Number of scans that are still compared with the training scans.
-    is_settled : bool
-        Whether further scans change nothing: the answer to a scan then depends on this scan alone.
-    sensor_estimate : SensorEstimate or None
-        What ``sensor="auto"`` found.
-    normal : Normal
-        What the sensor shows in clear air with a clean window.
-    """
+    """What a perceiver has learned from its scans so far; it can be pickled."""
 
     mounting: MountingEstimator
     remission: RemissionMatcher
-    to_check: int
-    is_settled: bool
-    sensor_estimate: SensorEstimate | None = None
-    normal: Normal = Normal()
+    to_check: int  # number of scans that are still compared with the training scans
+    is_settled: bool  # whether further scans change nothing: the answer to a scan then depends on this scan alone
+    sensor_estimate: SensorEstimate | None = None  # what ``sensor="auto"`` found
+    normal: Normal = Normal()  # what the sensor shows in clear air with a clean window
 
 
 def _card_of(model: str | os.PathLike[str]) -> ModelCard | None:

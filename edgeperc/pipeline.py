@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from .agreement.cells import agree_on_cells, mark_cells
 from .agreement.rules import (
@@ -42,7 +41,7 @@ from .system.lanes import Lanes, Once, Stopwatch
 from .types.frame import turned
 from .types.mounting import MODEL_HEIGHT_M, Mounting
 from .types.perception import Box, GroundSurface, PointLabels, TopView
-from .types.points import Heights, Ids, Points, Rows
+from .types.points import Bytes, Heights, Ids, Ints, Points, Rows
 from .types.sensor import SensorProfile
 from .types.views import RangeImageGeometry, TopViewGeometry
 
@@ -282,9 +281,7 @@ class Pipeline:
     def _label_ahead(self, near: View, scan: Scan | None, watch: Stopwatch) -> PointLabels:
         return self.ranged[0].label(near.points, None if scan is None else scan.ground.height_m, watch)
 
-    def _label_sector(
-        self, k: int, near: View, scan: Scan | None, watch: Stopwatch
-    ) -> tuple[PointLabels, NDArray[np.int32] | None]:
+    def _label_sector(self, k: int, near: View, scan: Scan | None, watch: Stopwatch) -> tuple[PointLabels, Ints | None]:
         """Labels of the points in a sector of the turn, by a network that is free, and their rows."""
         turn_rad, crop = self.sectors[k]
         points, rows = crop.select(near.points)
@@ -304,7 +301,7 @@ class Pipeline:
         labels: PointLabels,
         clusters: Ids,
         support: Support,
-        upright: NDArray[np.uint8],
+        upright: Bytes,
         cells: TopView | None,
         mounting: Mounting,
     ) -> PointLabels:
@@ -363,7 +360,7 @@ def _whole(seen: PointLabels | None, agreed: PointLabels | None, near: View, n: 
     return spread([(seen.with_objects(agreed), near.rows)], n)
 
 
-def _joined(near: View, *sectors: tuple[PointLabels, NDArray[np.int32] | None]) -> PointLabels:
+def _joined(near: View, *sectors: tuple[PointLabels, Ints | None]) -> PointLabels:
     """Labels of all points; one in two sectors keeps that of the first."""
     return spread(sectors, len(near.points))
 
@@ -402,7 +399,7 @@ def _agreed_cells(
     boxes: Sequence[Box],
     detected: Sequence[Box],
     trusted: Sequence[Box],
-    marks: NDArray[np.uint8],
+    marks: Bytes,
     rules: frozenset[str],
 ) -> TopView:
     dropped = [box for box in detected if box not in trusted]

@@ -88,12 +88,7 @@ def _road_record(perception: Perception) -> dict[str, Any] | None:
 
 
 def read_boxes(path: Path | str) -> list[list[Box]]:
-    """Read the boxes of a drive as ``edgeperc run --json`` prints them: one line for each scan.
-
-    path : a file of JSON lines.
-    Returns: By scan, in the sensor frame.
-    Raises TrackingError, OSError.
-    """
+    """Read the boxes of a drive by scan, in the sensor frame, as ``edgeperc run --json`` prints them."""
     from .types.perception import Box
 
     try:

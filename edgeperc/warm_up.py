@@ -32,7 +32,6 @@ from types import MappingProxyType, TracebackType
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from .agreement.cells import agree_on_cells, mark_cells
 from .agreement.rules import (
@@ -71,7 +70,7 @@ from .types.frame import ModelFrame
 from .types.geometry import suppress_overlaps
 from .types.mounting import MODEL_HEIGHT_M, MODEL_MOUNTING, Mounting
 from .types.perception import Box, PointLabels, TopView
-from .types.points import Heights, Points, read_only
+from .types.points import Floats32, Heights, Points, read_only
 from .types.sensor import SensorProfile
 
 logger = logging.getLogger(__name__)
@@ -84,7 +83,7 @@ LOOK_S = 0.25  # after which those who watch see how far the helpers are
 START = "import os, sys; sys.path[:] = sys.argv[2:]; from edgeperc.warm_up import main; main(sys.argv[1]); os._exit(0)"
 
 
-def car_and_person() -> tuple[NDArray[np.float32], PointLabels]:
+def car_and_person() -> tuple[Floats32, PointLabels]:
     """Nine points of a car and a person on a floor, and their labels: enough to compile every kernel of objects.
 
     Returns points: (n, 4) float32.
@@ -104,7 +103,7 @@ class Rehearsed(Session):
     def __init__(self, session: Session) -> None:
         vars(self).update(vars(session))
 
-    def run(self, n_rows: int = 1) -> Mapping[str, NDArray[np.float32]]:
+    def run(self, n_rows: int = 1) -> Mapping[str, Floats32]:
         """`Session.outputs`, without running the network."""
         return self.outputs
 
@@ -240,21 +239,11 @@ def _compile_ground() -> None:
 
 
 class Part(NamedTuple):
-    """Kernels that a helper can compile.
+    """Kernels that a helper can compile."""
 
-    Attributes
-    ----------
-    compile : callable
-        Compiles them, by calling what uses them.
-    largest : Dispatcher
-        The kernel that takes longest.
-    seconds : float
-        What all of them take on a core at 2.4 GHz.
-    """
-
-    compile: Callable[[], None]
-    largest: Any
-    seconds: float
+    compile: Callable[[], None]  # compiles them, by calling what uses them
+    largest: Any  # the kernel that takes longest
+    seconds: float  # what all of them take on a core at 2.4 GHz
 
 
 PARTS: Mapping[str, Part] = MappingProxyType(
@@ -320,10 +309,7 @@ class Helpers:
 
 
 def compile_parts(parts: Sequence[str]) -> None:
-    """Compile parts of the kernels in this process, one after the other, into the cache.
-
-    parts : of `PARTS`.
-    """
+    """Compile parts of the kernels in this process, one after the other, into the cache."""
     with fewer_collections():
         for part in parts:
             PARTS[part].compile()

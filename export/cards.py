@@ -103,13 +103,10 @@ _T = TypeVar("_T", bound="Carded")
 
 @dataclass(frozen=True)
 class Carded:
-    """What the task of every network has.
-
-    card : view, input, classes and outputs, as the exported model has them.
-    """
+    """What the task of every network has."""
 
     recipe: Recipe
-    card: ModelCard
+    card: ModelCard  # view, input, classes and outputs, as the exported model has them
 
     @classmethod
     def of(cls: type[_T], recipe: Recipe) -> _T:

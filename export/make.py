@@ -44,17 +44,12 @@ def make(
     steps: int | None = None,
     version: str = "1.0.0",
 ) -> Path:
-    """Simulate, train, export and evaluate a model. Finished parts are not made again.
+    """Simulate, train, export and evaluate a model, ``out/NAME.onnx``; finished parts are not made again.
 
     name : a key of `MODELS`. The models that it starts from or is distilled from are made first.
-    out : folder for scans, checkpoints and models.
     data : the real scans or images. Models whose name ends in ``-sim`` need none; ``kitti`` then serves for evaluation
-        only. Simulated scans are made.
+        only.
     layouts, semantickitti : folders of KITTI's labels and calibrations alone, and of SemanticKITTI.
-    steps : number of training steps; by default the shipped model's.
-    version : version to write into the card.
-    Returns: ``out/NAME.onnx``, with its figures in its card.
-    Raises ValueError.
     """
     stage = MODELS[name]
     recipe = stage.recipe if steps is None else replace(stage.recipe, steps=steps)
@@ -120,12 +115,8 @@ def finish(
     semantickitti: Path | None = None,
     version: str = "1.0.0",
 ) -> None:
-    """Export a checkpoint, evaluate the file, and write the figures into its card and a JSON file beside it.
-
-    name : a key of `MODELS`, and the name of the model.
-    path : the .onnx file to write. The JSON file has the same name, but ends in .json. If ``ssadnet-sim.onnx`` is in
-        the same folder, its road is the ground truth of KITTI's scans.
-    data, semantickitti, version : as for `make`.
+    """Export a checkpoint as the model ``name`` to an .onnx file, evaluate it, and write the figures into its card and
+    a JSON file beside it. If ``ssadnet-sim.onnx`` is in the same folder, its road is the ground truth of KITTI's scans.
     """
     stage, kitti, fold = MODELS[name], data.kitti, data.fold
     task, fitness = stage.recipe.task, None

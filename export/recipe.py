@@ -30,10 +30,7 @@ EDGE_BLOCKS: Mapping[str, tuple[int, int]] = {"pointseg": (2, 4), "ssadnet": (4,
 
 
 def task_name(network: str) -> str:
-    """The key of `TASKS` that a network belongs to.
-
-    Raises ValueError.
-    """
+    """The key of `TASKS` that a network belongs to."""
     for task, networks in TASKS.items():
         if network in networks:
             return task
@@ -235,21 +232,14 @@ PAPER = {
 
 @dataclass(frozen=True)
 class Stage:
-    """One training run on the way to a model.
+    """One training run on the way to a model."""
 
-    recipe : with a ``simulated_share`` of 1 the run reads no real scan and no real layout, so no data license
-        applies.
-    is_open : no scan and no layout of KITTI is read, so that anyone may use the weights.
-    after : the model whose weights the run starts from.
-    teacher : the model that the run is distilled from.
-    also : more simulated scans: of other sensors, in halls (`make.MORE_SCANS`).
-    """
-
+    # with a ``simulated_share`` of 1 the run reads no real scan and no real layout, so no data license applies
     recipe: Recipe
-    is_open: bool = False
-    after: str | None = None
-    teacher: str | None = None
-    also: tuple[str, ...] = ()
+    is_open: bool = False  # no scan and no layout of KITTI is read, so that anyone may use the weights
+    after: str | None = None  # the model whose weights the run starts from
+    teacher: str | None = None  # the model that the run is distilled from
+    also: tuple[str, ...] = ()  # more simulated scans: of other sensors, in halls (`make.MORE_SCANS`)
 
 
 # From random weights, distilled from the first step; the focal loss is SqueezeSegV2's.

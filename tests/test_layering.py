@@ -34,8 +34,8 @@ FLOORS = {
         system.kernel_cache
         system.kernels
         system.compilation system.draws
-        types.rigid
-        types.__init__ types.choices types.mounting types.onnx_file types.points types.views
+        types.points types.rigid
+        types.__init__ types.choices types.mounting types.onnx_file types.views
         types.detector
         types.card types.sensor
         types.perception

@@ -11,12 +11,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from edgeperc import ImageLabels
 from edgeperc.simulation.camera import forward_camera, render
 from edgeperc.simulation.samples import FIRST_SEED, simulated_scan
 from edgeperc.types.card import CHANNELS, ModelCard
+from edgeperc.types.points import Bytes, Floats32
 from edgeperc.types.views import CameraGeometry
 
 from ..worker import Prediction
@@ -44,9 +44,9 @@ class NumpyCamera:
         order = [CHANNELS["camera"].index(name) for name in card.input.channels]
         self._order = slice(None) if order == sorted(order) else order
         self._mean, self._std = (np.array(v, np.float32)[:, None, None] for v in (card.input.mean, card.input.std))
-        self._tables: tuple[NDArray[np.float32], NDArray[np.float32]] | None = None
+        self._tables: tuple[Floats32, Floats32] | None = None
 
-    def __call__(self, image: NDArray[np.uint8]) -> Prediction:
+    def __call__(self, image: Bytes) -> Prediction:
         """Compute the labels of an image (H, W, 3) uint8."""
         batch = self.engine.input
         np.subtract(image.transpose(2, 0, 1)[self._order], self._mean, out=batch)
@@ -60,13 +60,13 @@ class NumpyCamera:
         return Prediction(None, None, (), ImageLabels(logits.argmax(axis=0).astype(np.uint8), self.card.classes))
 
 
-def _table(n_in: int, n_out: int) -> NDArray[np.float32]:
+def _table(n_in: int, n_out: int) -> Floats32:
     """Bilinear weights of half-pixel centers along one axis, (n_out, n_in)."""
     places = (np.arange(n_out) + 0.5) * n_in / n_out - 0.5
     return np.stack([np.interp(places, np.arange(n_in), row) for row in np.eye(n_in)], axis=1).astype(np.float32)
 
 
-def small_unet(card: ModelCard, precision: str, n_threads: int) -> Callable[[NDArray[np.uint8]], Any]:
+def small_unet(card: ModelCard, precision: str, n_threads: int) -> Callable[[Bytes], Any]:
     """The small U-Net in torch (``"bf16"`` by autocast) with a card's input: from an image to meaningless labels."""
     import torch
 
@@ -77,7 +77,7 @@ def small_unet(card: ModelCard, precision: str, n_threads: int) -> Callable[[NDA
     network = UNet(n_channels=len(card.input.channels), n_classes=len(card.classes), width=16).eval()
     mean, std = (torch.tensor(values)[:, None, None] for values in (card.input.mean, card.input.std))
 
-    def label(image: NDArray[np.uint8]) -> Any:
+    def label(image: Bytes) -> Any:
         with torch.inference_mode(), torch.autocast("cpu", torch.bfloat16, enabled=precision == "bf16"):
             x = (torch.from_numpy(image).permute(2, 0, 1).float() - mean) / std
             return network(x[None])[0].argmax(dim=0).byte().numpy()

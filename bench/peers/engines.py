@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from edgeperc import ModelError
+from edgeperc.types.points import Floats32
 
 from .arithmetic import openvino_request
 
@@ -23,8 +23,8 @@ from .arithmetic import openvino_request
 class Engine:
     """A network ready to run: ``run`` returns the outputs of ``input`` (C, H, W) by name, without the batch axis."""
 
-    input: NDArray[np.float32]
-    run: Callable[[], Mapping[str, NDArray[np.float32]]]
+    input: Floats32
+    run: Callable[[], Mapping[str, Floats32]]
 
 
 def open_engine(library: str, precision: str, path: Path, n_threads: int) -> Engine:
@@ -54,7 +54,7 @@ def open_engine(library: str, precision: str, path: Path, n_threads: int) -> Eng
         batch = np.zeros(list(model.input(0).shape), np.float32)
         request.set_input_tensor(openvino.Tensor(batch, shared_memory=True))
 
-        def by_openvino() -> dict[str, NDArray[np.float32]]:
+        def by_openvino() -> dict[str, Floats32]:
             request.infer()
             return {o.any_name: request.get_tensor(o).data[0] for o in request.model_outputs}
 
@@ -70,7 +70,7 @@ def open_engine(library: str, precision: str, path: Path, n_threads: int) -> Eng
         network = torch.compile(network)
     tensor = torch.zeros(shape)
 
-    def by_torch() -> dict[str, NDArray[np.float32]]:
+    def by_torch() -> dict[str, Floats32]:
         with torch.inference_mode(), torch.autocast("cpu", torch.bfloat16, enabled=precision == "bf16"):
             return _first(names, (output.float().numpy() for output in network(tensor)))
 
@@ -90,7 +90,7 @@ def _open_mnn(path: Path, folder: Path, n_threads: int) -> Engine:
     network = MNN.nn.load_module_from_file(str(made), [name], names, runtime_manager=runtime)
     image, batch = MNN.expr.placeholder(list(shape), MNN.expr.NCHW), np.zeros(shape, np.float32)
 
-    def by_mnn() -> dict[str, NDArray[np.float32]]:
+    def by_mnn() -> dict[str, Floats32]:
         image.write(batch)
         outputs = network.forward([image])
         if len(outputs) != len(names):  # it prints why, and answers with nothing
@@ -120,7 +120,7 @@ def _open_ncnn(path: Path, folder: Path, n_threads: int) -> Engine:
         raise ModelError(f"ncnn cannot run {path.name}: it lacks a layer that pnnx translated the graph to")
     image = np.zeros(shape[1:], np.float32)
 
-    def by_ncnn() -> dict[str, NDArray[np.float32]]:
+    def by_ncnn() -> dict[str, Floats32]:
         extractor = network.create_extractor()
         extractor.input("in0", ncnn.Mat(image))
         return {n: np.asarray(extractor.extract(f"out{k}")[1]) for k, n in enumerate(names)}
@@ -136,7 +136,7 @@ def _convert(command: Sequence[str], path: Path, made: Path) -> None:
         raise ModelError(f"{Path(command[0]).name} cannot convert {path.name}: {reason}")
 
 
-def _first(names: Sequence[str], outputs: Iterable[Any]) -> dict[str, NDArray[np.float32]]:
+def _first(names: Sequence[str], outputs: Iterable[Any]) -> dict[str, Floats32]:
     """Outputs by name, without the batch axis."""
     return {name: output[0] for name, output in zip(names, outputs, strict=True)}
 

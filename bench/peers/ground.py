@@ -33,6 +33,7 @@ from edgeperc.objects.cluster import find_clusters
 from edgeperc.readers.files import read_points
 from edgeperc.simulation.drawn import random_scene
 from edgeperc.simulation.scene import simulate
+from edgeperc.types.points import Floats, Floats32, Ints64, Mask
 from edgeperc.types.sensor import SensorProfile, get_sensor
 
 from ..render import Section, number, share, text
@@ -47,9 +48,9 @@ GROUND_IDS, IGNORED_IDS = (40, 44, 48, 49, 60, 72), (0, 1, 70)
 # Points nearer than this to the simulator's ground are ground [m].
 ON_GROUND_M = 0.06
 PEERS = {"open3d": "open3d", "pypatchworkpp": "pypatchworkpp", "sklearn": "scikit-learn"}
-Scan = NDArray[np.float32]
-Truth = tuple[NDArray[np.bool_], NDArray[np.bool_]]  # which points are ground, which points count
-Finder = Callable[[Scan], Callable[[], NDArray[np.bool_]]]
+Scan = Floats32
+Truth = tuple[Mask, Mask]  # which points are ground, which points count
+Finder = Callable[[Scan], Callable[[], Mask]]
 Clusterer = Callable[[], NDArray[np.signedinteger[Any]]]
 
 
@@ -73,24 +74,24 @@ def ground_finders(peers: Mapping[str, Any], sensor: SensorProfile = SENSOR) -> 
     def edgeperc(regions: bool) -> Finder:
         return lambda points: lambda: find_ground(points, mount_height_m=sensor.mount_height_m, regions=regions).mask
 
-    def by_rows(n: int, rows: Any) -> NDArray[np.bool_]:
+    def by_rows(n: int, rows: Any) -> Mask:
         mask = np.zeros(n, bool)
         mask[np.asarray(rows, dtype=np.int64).ravel()] = True
         return mask
 
-    def open3d(points: Scan) -> Callable[[], NDArray[np.bool_]]:
+    def open3d(points: Scan) -> Callable[[], Mask]:
         cloud = peers["open3d"].geometry.PointCloud(peers["open3d"].utility.Vector3dVector(points[:, :3].astype(float)))
         peers["open3d"].utility.random.seed(0)
         return lambda: by_rows(len(points), cloud.segment_plane(0.15, 3, 100)[1])
 
-    def patchwork(points: Scan) -> Callable[[], NDArray[np.bool_]]:
+    def patchwork(points: Scan) -> Callable[[], Mask]:
         parameters = peers["pypatchworkpp"].Parameters()
         parameters.verbose = False
         parameters.sensor_height = sensor.mount_height_m
         # It adapts its thresholds from scan to scan, so every evaluated scan gets a new instance.
         finder = peers["pypatchworkpp"].patchworkpp(parameters)
 
-        def call() -> NDArray[np.bool_]:
+        def call() -> Mask:
             finder.estimateGround(points)
             return by_rows(len(points), finder.getGroundIndices())
 
@@ -140,7 +141,7 @@ def tree_clusters(points: Scan) -> NDArray[np.signedinteger[Any]]:
     return connected_components(edges, directed=False)[1][voxel]
 
 
-def by_first_point(clusters: NDArray[np.signedinteger[Any]]) -> NDArray[np.int64]:
+def by_first_point(clusters: NDArray[np.signedinteger[Any]]) -> Ints64:
     """Clusters numbered by their first points, so that two numberings can be compared."""
     _, first, inverse = np.unique(clusters, return_index=True, return_inverse=True)
     return first[inverse]
@@ -165,14 +166,14 @@ def simulated() -> tuple[Scan, Truth]:
     return scan.points, ((np.abs(above) < ON_GROUND_M) & (scan.objects < 0), np.ones(len(above), bool))
 
 
-def recall_and_precision(mask: NDArray[np.bool_], truth: Truth) -> tuple[float, float]:
+def recall_and_precision(mask: Mask, truth: Truth) -> tuple[float, float]:
     """Recall and precision of a ground mask over the points that count."""
     ground, counts = truth
     right, n_ground, n_found = (int(np.count_nonzero(mask_of & counts)) for mask_of in (mask & ground, ground, mask))
     return right / max(n_ground, 1), right / max(n_found, 1)
 
 
-def table(title: str, ms: Mapping[str, NDArray[np.float64]], reference: str) -> Section:
+def table(title: str, ms: Mapping[str, Floats], reference: str) -> Section:
     """Minimum and median of each call, and their ratios to the reference's."""
     rows = [["", "minimum, ms", "median, ms", "minimum x edgeperc", "median x edgeperc"]]
     for name, of_call in ms.items():

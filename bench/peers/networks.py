@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from edgeperc import ModelError
 from edgeperc.inference.session import golden_input
+from edgeperc.types.points import Floats32
 from edgeperc.types.views import TopViewGeometry
 from edgeperc.zoo import resolve
 
@@ -68,10 +68,10 @@ def write_others(folder: Path) -> None:
     from edgeperc_export.release.to_onnx import traced
 
     class Once(CalibrationDataReader):  # type: ignore[misc]
-        def __init__(self, image: NDArray[np.float32]) -> None:
+        def __init__(self, image: Floats32) -> None:
             self._left = [{"image": image}]
 
-        def get_next(self) -> dict[str, NDArray[np.float32]] | None:
+        def get_next(self) -> dict[str, Floats32] | None:
             return self._left.pop() if self._left else None
 
     for name, (where, outputs, shape) in OTHERS.items():

@@ -15,13 +15,13 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from edgeperc import Box, PointLabels, TopView
 from edgeperc.ground.planes import find_ground
 from edgeperc.types.card import ModelCard
 from edgeperc.types.geometry import draw_footprints
 from edgeperc.types.mounting import MODEL_HEIGHT_M
+from edgeperc.types.points import Bytes, Floats32, Ints, Labels, Points
 from edgeperc.types.sensor import SensorProfile
 from edgeperc.types.views import TopViewGeometry
 
@@ -45,7 +45,7 @@ class NumpyPipeline:
             index = np.empty(engine.input.shape[1:], np.int32)
             self.networks.append((card, engine, made(view, card.input), index))
 
-    def __call__(self, points: NDArray[np.float32]) -> Prediction:
+    def __call__(self, points: Points) -> Prediction:
         """Compute labels and boxes of a scan (n, 4) with remission in the sensor's raw unit."""
         scale, offset = np.float32(self.sensor.remission_scale), np.float32(self.sensor.remission_offset)
         if (scale, offset) != (1.0, 0.0):
@@ -75,20 +75,14 @@ class NumpyPipeline:
         return Prediction(labeled, top_view, boxes)
 
 
-def spread(values: NDArray[np.float32], block: tuple[int, int]) -> NDArray[np.float32]:
+def spread(values: Floats32, block: tuple[int, int]) -> Floats32:
     """`edgeperc.inference.decode.fill_pixels` in numpy."""
     (rows, cols), (n, height, width) = block, values.shape
     parts = values.reshape(n // (rows * cols), rows, cols, height, width)
     return parts.transpose(0, 3, 1, 4, 2).reshape(-1, height * rows, width * cols)
 
 
-def vote(
-    points: NDArray[np.float32],
-    pixel: NDArray[np.int32],
-    index: NDArray[np.int32],
-    labels: NDArray[np.uint8],
-    n_classes: int,
-) -> NDArray[np.uint8]:
+def vote(points: Points, pixel: Ints, index: Ints, labels: Labels, n_classes: int) -> Bytes:
     """`edgeperc.objects.refine.label_points` of a view that is not a full turn, in numpy."""
     classes = np.where(pixel >= 0, labels.reshape(-1)[pixel], 0).astype(np.uint8)
     hidden = np.flatnonzero((pixel >= 0) & (index.reshape(-1)[pixel] != np.arange(len(points))))
@@ -108,7 +102,7 @@ def vote(
     return classes
 
 
-def dense_boxes(card: ModelCard, logits: NDArray[np.float32], dense: NDArray[np.float32]) -> list[Box]:
+def dense_boxes(card: ModelCard, logits: Floats32, dense: Floats32) -> list[Box]:
     """`edgeperc.inference.box_heads.decode_dense` in numpy."""
     view = card.view
     assert isinstance(view, TopViewGeometry)

@@ -4,20 +4,21 @@ from __future__ import annotations
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
+
+from edgeperc.types.points import Floats32
 
 CELL_M = 0.16
 LOWEST_M, HIGHEST_M = -3.0, 1.0
 N_VALUES, N_FEATURES = 9, 64
 
 
-def random_weights() -> NDArray[np.float32]:
+def random_weights() -> Floats32:
     """The linear layer from a point's values to its features, (9, 64)."""
     return np.random.default_rng(0).standard_normal((N_VALUES, N_FEATURES), np.float32)
 
 
 @njit(cache=True, nogil=True)
-def fill_pillars(points: NDArray[np.float32], weights: NDArray[np.float32], image: NDArray[np.float32]) -> None:
+def fill_pillars(points: Floats32, weights: Floats32, image: Floats32) -> None:
     """Write the image (64, H, W) of a scan (n, 4): rows along y around 0, x from 0. The paper's limits of 12,000
     pillars and 100 points each serve tensors of a fixed size, which loops do not need.
     """

@@ -37,6 +37,7 @@ from edgeperc.readers.files import read_points
 from edgeperc.simulation.drawn import random_scene
 from edgeperc.simulation.scene import simulate
 from edgeperc.types.card import InputSpec
+from edgeperc.types.points import Floats, Floats32, Heights, Ints, Points
 from edgeperc.types.sensor import get_sensor
 from edgeperc.types.views import RangeImageGeometry, TopViewGeometry
 
@@ -51,11 +52,11 @@ TOP_VIEW_INPUT = InputSpec("top_view", ("distance", "remission", "height"), (0.0
 RANGE_IMAGE_INPUT = InputSpec(
     "range_image", ("x", "y", "z", "remission", "range"), (13.0, 0.0, -1.3, 0.23, 14.5), (11.4, 7.9, 0.8, 0.15, 12.3)
 )
-Selection = tuple[NDArray[np.intp], NDArray[np.int32], NDArray[np.float32]]
+Selection = tuple[NDArray[np.intp], Ints, Floats32]
 
 
 @njit(cache=True, nogil=True)
-def fill_copy(points: NDArray[np.float32], copy: NDArray[np.float32]) -> None:
+def fill_copy(points: Points, copy: Floats32) -> None:
     """Copy the points (n, 4), number by number."""
     for i in range(points.shape[0]):
         for k in range(4):
@@ -70,14 +71,7 @@ class _NumpyProjector:
         self.needs_ground = input.needs_ground
         self.mean, self.std = (np.array(of, np.float32)[:, None] for of in (input.mean, input.std))
 
-    def fill(
-        self,
-        points: NDArray[np.float32],
-        image: NDArray[np.float32],
-        index: NDArray[np.int32],
-        pixel: NDArray[np.int32],
-        height_m: NDArray[np.float32] | None = None,
-    ) -> None:
+    def fill(self, points: Points, image: Floats32, index: Ints, pixel: Ints, height_m: Heights | None = None) -> None:
         """Project into the caller's buffers, as `TopViewProjector.fill`; a height above the ground comes last."""
         rows, flat, rank = self.select(points)
         pixel[:] = -1
@@ -89,11 +83,11 @@ class _NumpyProjector:
             raw = np.vstack((raw, np.clip(height_m[winner], *HEIGHT_RANGE_M)))
         image.reshape(len(image), -1)[:, seen] = (raw - self.mean) / self.std
 
-    def select(self, points: NDArray[np.float32]) -> Selection:
+    def select(self, points: Floats32) -> Selection:
         """Rows in view, the flat pixel of each, and its rank: the smallest rank wins the pixel."""
         raise NotImplementedError
 
-    def planes(self, points: NDArray[np.float32]) -> NDArray[np.float32]:
+    def planes(self, points: Floats32) -> Floats32:
         """Channels of the points that won a pixel, not normalized yet."""
         raise NotImplementedError
 
@@ -106,7 +100,7 @@ class NumpyTopView(_NumpyProjector):
         self.low, self.high = np.array([view.x_range_m, view.y_range_m, view.z_range_m], np.float32).T
         self.cells_per_m = np.float32(1.0 / view.cell_m)
 
-    def select(self, points: NDArray[np.float32]) -> Selection:
+    def select(self, points: Floats32) -> Selection:
         """See `_NumpyProjector.select`; the highest point wins."""
         _, height, width = self.shape
         x, y, z, remission = points.T
@@ -116,10 +110,10 @@ class NumpyTopView(_NumpyProjector):
         rows, x, y, z = rows[inside], x[inside], y[inside], z[inside]
         ahead = np.minimum(((x - self.low[0]) * self.cells_per_m).astype(np.int32), height - 1)
         left = np.minimum(((y - self.low[1]) * self.cells_per_m).astype(np.int32), width - 1)
-        flat: NDArray[np.int32] = (height - 1 - ahead) * width + (width - 1 - left)
+        flat: Ints = (height - 1 - ahead) * width + (width - 1 - left)
         return rows, flat, -z
 
-    def planes(self, points: NDArray[np.float32]) -> NDArray[np.float32]:
+    def planes(self, points: Floats32) -> Floats32:
         """See `_NumpyProjector.planes`."""
         x, y, z, remission = points.T
         return np.stack((np.sqrt(x * x + y * y), remission, z))
@@ -132,7 +126,7 @@ class NumpyRangeImage(_NumpyProjector):
         super().__init__(view, input)
         self.rows, self.cols = tabulate(row_edges(view), "rows"), tabulate(column_edges(view), "columns")
 
-    def select(self, points: NDArray[np.float32]) -> Selection:
+    def select(self, points: Floats32) -> Selection:
         """See `_NumpyProjector.select`; the nearest point wins."""
         rows = np.flatnonzero((points[:, 0] > 0.0) & (np.abs(points[:, 1]) <= points[:, 0]))
         x, y, z, remission = points[rows].T
@@ -145,22 +139,20 @@ class NumpyRangeImage(_NumpyProjector):
         flat = look_up(elevation[inside], self.rows) * self.shape[2] + look_up(azimuth[inside], self.cols)
         return rows[inside], flat, squared_range[inside]
 
-    def planes(self, points: NDArray[np.float32]) -> NDArray[np.float32]:
+    def planes(self, points: Floats32) -> Floats32:
         """See `_NumpyProjector.planes`."""
         x, y, z, _ = points.T
         return np.stack((*points.T, np.sqrt(x * x + y * y + z * z)))
 
 
-def look_up(values: NDArray[np.float32], table: Intervals) -> NDArray[np.int32]:
+def look_up(values: Floats32, table: Intervals) -> Ints:
     """Find the intervals of the values with `tabulate`'s table; takes a third of searchsorted's time."""
     first, _, cells_per_unit, base, split = table
     cells = ((first - values) * cells_per_unit).astype(np.int32)
     return base[cells] + (values <= split[cells])
 
 
-def winners(
-    flat: NDArray[np.int32], rank: NDArray[np.float32], index: NDArray[np.int32], rows: NDArray[np.intp]
-) -> tuple[NDArray[np.intp], NDArray[np.int32]]:
+def winners(flat: Ints, rank: Floats32, index: Ints, rows: NDArray[np.intp]) -> tuple[NDArray[np.intp], Ints]:
     """Write into ``index`` the row of the smallest rank, the earlier of two; return the pixels seen and their rows."""
     best = np.full(len(index), np.inf, np.float32)
     np.minimum.at(best, flat, rank)
@@ -172,7 +164,7 @@ def winners(
     return seen, index[seen]
 
 
-def contenders(points: NDArray[np.float32]) -> dict[str, Callable[[], object]]:
+def contenders(points: Points) -> dict[str, Callable[[], object]]:
     """The calls to measure by their names in the table, each with its own buffers; AssertionError if results differ."""
     copy = np.empty_like(points)
     calls: dict[str, Callable[[], object]] = {"copy loop": lambda: fill_copy(points, copy)}
@@ -195,7 +187,7 @@ def contenders(points: NDArray[np.float32]) -> dict[str, Callable[[], object]]:
     return calls
 
 
-def table(ms: Mapping[str, NDArray[np.float64]]) -> Section:
+def table(ms: Mapping[str, Floats]) -> Section:
     """Minimum and median of each call, and their ratios."""
     rows = [["", *(f"{name}{of}" for name in ("minimum", "median") for of in (", ms", " x copy", " numpy /"))]]
     for name, of_call in ms.items():

@@ -8,16 +8,16 @@ from collections.abc import Callable, Mapping
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
 from edgeperc.cli.arguments import Options, options
+from edgeperc.types.points import Floats
 
 from ..samples import elapsed_ms
 
 N_WARM_UP = 3
 
 
-def measure(calls: Mapping[str, Callable[[], object]], n_rounds: int) -> dict[str, NDArray[np.float64]]:
+def measure(calls: Mapping[str, Callable[[], object]], n_rounds: int) -> dict[str, Floats]:
     """Milliseconds of each call in each round, by name; the first `N_WARM_UP` do not count. Each round makes every call
     in a new random order, so that caches and other processes affect all of them equally.
     """

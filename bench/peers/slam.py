@@ -40,7 +40,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from edgeperc import Box, Perceiver, Perception, Tracker, movable_points, moving_points
 from edgeperc.datasets.kitti import KittiCalibration, KittiObjects, label_objects, read_labels
@@ -52,6 +51,7 @@ from edgeperc.simulation.scene import simulate_sequence
 from edgeperc.system.extras import require
 from edgeperc.tracking.moving import moving_tracks
 from edgeperc.types.geometry import inside
+from edgeperc.types.points import Floats, Ints64, Mask, Points
 
 from ..render import Section, number, share, text
 from .rounds import parser_of, versions
@@ -65,8 +65,7 @@ STREETS = (("urban", 2_100_000_001, 6.0), ("residential", 2_100_000_001, 5.0), (
 MOVING_AROUND = 10  # scans around one in which an object moves for which it counts as moving too
 GROUND_M = 0.2  # points so near to the bottom of a label may be of the ground
 
-Points = NDArray[np.float32]
-Poses = NDArray[np.float64]
+Poses = Floats
 Odometry = Callable[[Sequence[Points]], Poses]
 
 
@@ -77,9 +76,9 @@ class Drive:
     name: str
     scans: list[Points]
     poses: Poses | None  # (k, 4, 4), true poses of the sensor
-    moving: list[NDArray[np.bool_]] | None  # points on objects that move; None: from ``labels``
-    usable: list[NDArray[np.bool_]]  # points for KISS-ICP
-    known: list[NDArray[np.bool_]]  # points of which it is known whether they move
+    moving: list[Mask] | None  # points on objects that move; None: from ``labels``
+    usable: list[Mask]  # points for KISS-ICP
+    known: list[Mask]  # points of which it is known whether they move
     labels: list[list[Box]]  # true boxes of each scan, of all objects; empty if ``moving`` is known
     trained: bool = False  # a model was trained on one of the scans
 
@@ -159,7 +158,7 @@ def trajectory_error(true: Poses, found: Poses) -> float:
     return float(np.sqrt(((b @ turn - a) ** 2).sum(axis=1).mean()))
 
 
-def step_errors(true: Poses, found: Poses) -> NDArray[np.float64]:
+def step_errors(true: Poses, found: Poses) -> Floats:
     """How far the motion between consecutive poses (k, 4, 4) ends from the true motion's end [m], (k - 1,) float64."""
     steps = (np.linalg.inv(poses[:-1]) @ poses[1:] for poses in (true, found))
     a, b = (each[:, :3, 3] for each in steps)
@@ -172,14 +171,9 @@ def closure(odometry: Odometry, scans: Sequence[Points]) -> tuple[Poses, float]:
     return poses[: len(scans)], float(math.dist(poses[1][:3, 3], poses[-2][:3, 3]))
 
 
-def ghost_share(
-    scans: Sequence[Points],
-    kept: Sequence[NDArray[np.bool_]],
-    moving: Sequence[NDArray[np.bool_]],
-    poses: Poses,
-) -> float:
+def ghost_share(scans: Sequence[Points], kept: Sequence[Mask], moving: Sequence[Mask], poses: Poses) -> float:
     """Share of the map's cells that hold a kept point of a moving object, of scans at their poses (k, 4, 4)."""
-    cells: list[list[NDArray[np.int64]]] = [[], []]
+    cells: list[list[Ints64]] = [[], []]
     for points, stays, moves, pose in zip(scans, kept, moving, poses, strict=True):
         places = np.floor((points[:, :3] @ pose[:3, :3].T + pose[:3, 3]) / CELL_M).astype(np.int64)
         numbers = (places + FARTHEST_CELL) @ [4 * FARTHEST_CELL**2, 2 * FARTHEST_CELL, 1]
@@ -206,7 +200,7 @@ def kiss_icp(scans: Sequence[Points]) -> Poses:
 class Seen:
     """What is left out of the scans of a drive, and the median processor time of a scan."""
 
-    kept: dict[str, list[NDArray[np.bool_]]]  # by variant in their order, without the second pass
+    kept: dict[str, list[Mask]]  # by variant in their order, without the second pass
     perceptions: list[Perception]
     poses: Poses  # (k, 4, 4), of the sensor, as the tracker estimates them
     ms: float
@@ -215,7 +209,7 @@ class Seen:
 def look(perceive: Callable[..., Any], drive: Drive) -> Seen:
     """Perceive and track a drive, without its poses."""
     tracker, perceptions, poses, ms = Tracker(), list[Perception](), [], []
-    masks: dict[str, list[NDArray[np.bool_]]] = {ALL: [np.ones(len(points), np.bool_) for points in drive.scans]}
+    masks: dict[str, list[Mask]] = {ALL: [np.ones(len(points), np.bool_) for points in drive.scans]}
     masks |= {MOVING: [], MOVABLE: []}
     for k, points in enumerate(drive.scans):
         started = time.process_time()
@@ -279,12 +273,12 @@ def compared(
     return rows, motion
 
 
-def chosen(drive: Drive, kept: Sequence[NDArray[np.bool_]]) -> list[Points]:
+def chosen(drive: Drive, kept: Sequence[Mask]) -> list[Points]:
     """The kept points of each scan that KISS-ICP can use."""
     return [points[mask & usable] for points, mask, usable in zip(drive.scans, kept, drive.usable, strict=True)]
 
 
-def on_objects(points: Points, boxes: Sequence[Box]) -> NDArray[np.bool_]:
+def on_objects(points: Points, boxes: Sequence[Box]) -> Mask:
     """The points (n, 4) inside boxes, above the ground, (n,) bool."""
     is_object = np.zeros(len(points), np.bool_)
     for box in boxes:

@@ -34,11 +34,11 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from edgeperc import Box, Tracker
 from edgeperc.evaluation.headings import FRAME_S
 from edgeperc.evaluation.tracking import CLASSES, read_sequence, sequence_names, sequence_scans
+from edgeperc.types.points import Floats
 from edgeperc.types.sensor import get_sensor
 
 from ..render import Section, number, text
@@ -66,7 +66,7 @@ def drawn_street(n_scans: int = 400, seed: int = 0) -> list[list[Box]]:
 
 def crossing(
     n_scans: int, n_targets: int = 200, n_false: int = 100, seed: int = 0
-) -> Iterator[tuple[list[Box], NDArray[np.float64]]]:
+) -> Iterator[tuple[list[Box], Floats]]:
     """Boxes, and true places (n_targets, 2), of cars that cross in 120 m by 120 m and turn around at its edges; every
     other one is missed in three scans of ten, and false alarms lie anywhere.
     """

@@ -6,13 +6,12 @@ from collections.abc import Collection, Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..ground.scan import Scan
 from ..system.kernels import njit
 from ..types.geometry import cell_at, draw_footprints
 from ..types.perception import Box, PointLabels, TopView
-from ..types.points import Cloud, Labeled, Mask
+from ..types.points import Bytes, Cloud, Ints64, Labeled, Mask
 from .rules import RULES, cells_of, roles_of
 from .votes import VEHICLE, Cells
 
@@ -25,30 +24,12 @@ def agree_on_cells(
     labels: PointLabels | None,
     boxes: Sequence[Box],
     dropped: Sequence[Box],
-    marks: NDArray[np.uint8],
+    marks: Bytes,
     rules: Collection[str] = RULES,
 ) -> TopView:
-    """Correct the cells of a top view by boxes, points and obstacles.
+    """Correct the cells of a top view by boxes, points and obstacles (docs/concepts/agreement.md).
 
-    Parameters
-    ----------
-    view : TopView
-    labels : PointLabels or None
-        From `agree_on_points`.
-    boxes : sequence of Box
-        In the frame of the models.
-    dropped : sequence of Box
-        Boxes of the top-view network that `agree_on_boxes` dropped; their vehicle cells become background.
-    marks : (rows, columns) uint8
-        From `mark_cells`.
-    rules : collection of str
-
-    Notes
-    -----
-    Drivable cells whose center lies in a box get the class of the box, or background if the top view has no such
-    class. Drivable cells with a vehicle's or person's point become background, and those with a return 0.3 to 2 m
-    above the ground and another one in the 3 x 3 cells around it. So do vehicle cells out of the boxes with a point
-    in the range image's view, if none in the 3 x 3 cells has a vehicle's label.
+    dropped : boxes of the top-view network that `agree_on_boxes` dropped; their vehicle cells become background.
     """
     of_road, of_vehicles = "road" in rules, "cells" in rules and labels is not None
     if not (of_road or of_vehicles):
@@ -69,13 +50,9 @@ def agree_on_cells(
     return replace(view, labels=cells)
 
 
-def mark_cells(
-    view: TopView, scan: Scan, labels: PointLabels | None, rules: Collection[str] = RULES
-) -> NDArray[np.uint8]:
-    """What the points show in each cell of a top view; it needs no boxes.
-
-    Bits of (rows, columns) uint8: 1 with an obstacle, 2 with a second one or an object, 4 with a vehicle's point, 8
-    with another point in view in a vehicle's cell.
+def mark_cells(view: TopView, scan: Scan, labels: PointLabels | None, rules: Collection[str] = RULES) -> Bytes:
+    """What the points show in each cell of a top view, in bits: 1 with an obstacle, 2 with a second one or an object, 4
+    with a vehicle's point, 8 with another point in view in a vehicle's cell.
     """
     if labels is None:
         nothing = np.zeros(len(scan.points), np.uint8)
@@ -89,7 +66,7 @@ def mark_cells(
     return marks
 
 
-def _footprints(view: TopView, boxes: Sequence[Box]) -> NDArray[np.uint8]:
+def _footprints(view: TopView, boxes: Sequence[Box]) -> Bytes:
     """Class of the box over each cell; beyond those of the view if it has no such class; `_NO_BOX` without a box."""
     names = (*view.classes, *sorted({box.label for box in boxes} - {*view.classes}))
     drawn = np.full(view.labels.shape, _NO_BOX, np.uint8)
@@ -98,21 +75,8 @@ def _footprints(view: TopView, boxes: Sequence[Box]) -> NDArray[np.uint8]:
 
 
 @njit(cache=True, nogil=True)
-def fill_marks(
-    cloud: Cloud,
-    in_view: Mask,
-    labeled: Labeled,
-    by_height: bool,
-    view: Cells,
-    marks: NDArray[np.uint8],
-) -> None:
-    """Write what the points show in each cell; see `mark_cells`.
-
-    in_view : (n,) bool
-    labeled : roles are 1 for vehicles, 2 for persons, 0 for classes that are not objects.
-    by_height : whether returns above the ground are obstacles, whatever their label.
-    marks : (rows, columns) uint8, modified; zeros before.
-    """
+def fill_marks(cloud: Cloud, in_view: Mask, labeled: Labeled, by_height: bool, view: Cells, marks: Bytes) -> None:
+    """Write what the points show in each cell into ``marks``, zeros before, by roles 1 (vehicles) and 2 (persons)."""
     points, height, labels, roles = cloud.points, cloud.height, labeled.labels, labeled.roles
     cells, is_vehicle, grid = view.labels, view.is_vehicle, view.grid
     n_rows, n_cols = cells.shape
@@ -136,21 +100,9 @@ def fill_marks(
 
 
 @njit(cache=True, nogil=True)
-def clear_cells(
-    marks: NDArray[np.uint8],
-    marked: NDArray[np.int64],
-    drivable: int,
-    is_vehicle: NDArray[np.bool_],
-    in_box: NDArray[np.bool_],
-    cells: NDArray[np.uint8],
-) -> None:
-    """Make background of drivable cells with objects or obstacles, and of vehicle cells that the points contradict.
-
-    marks : (rows, columns) uint8; from `fill_marks`.
-    marked : (m,) int64; flat numbers of the cells with marks.
-    is_vehicle : (256,) bool; labels of cells that the points may contradict.
-    in_box : (rows, columns) bool; cells of vehicles that stay.
-    cells : (rows, columns) uint8, modified
+def clear_cells(marks: Bytes, marked: Ints64, drivable: int, is_vehicle: Mask, in_box: Mask, cells: Bytes) -> None:
+    """Make background of drivable cells with objects or obstacles, and of vehicle cells that the points contradict,
+    unless ``in_box``; only the flat numbers ``marked`` have marks.
     """
     n_rows, n_cols = cells.shape
     for at in marked:

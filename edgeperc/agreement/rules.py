@@ -18,7 +18,6 @@ from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..ground.planes import Ground
 from ..ground.scan import Scan
@@ -31,7 +30,21 @@ from ..types.choices import VEHICLES
 from ..types.geometry import Grid, box_records, is_inside
 from ..types.mounting import MODEL_HEIGHT_M
 from ..types.perception import Box, PointLabels, TopView
-from ..types.points import Cloud, Heights, Ids, Labeled, Labels, Mask, Points
+from ..types.points import (
+    Bytes,
+    Cloud,
+    Floats,
+    Floats32,
+    Heights,
+    Ids,
+    Ints,
+    Ints64,
+    Labeled,
+    Labels,
+    Mask,
+    Points,
+    Records,
+)
 from .votes import (
     CLUSTER,
     COMPLETING_SCORE,
@@ -108,8 +121,8 @@ class Support(NamedTuple):
     ((n,) float32), and its class, 0 in no box ((n,) uint8).
     """
 
-    scores: NDArray[np.float32]
-    names: NDArray[np.uint8]
+    scores: Floats32
+    names: Bytes
 
 
 def find_voters(
@@ -120,13 +133,11 @@ def find_voters(
     *,
     distance_per_m: float = 0.015,
     rules: Collection[str] = RULES,
-) -> NDArray[np.int32]:
-    """Cluster of every point, as far as it matters for `agree_on_points`; -1 for none, (n,) int32.
+) -> Ints:
+    """Cluster of every point, as far as it matters for `agree_on_points`; -1 for none.
 
-    Labeled points of clusters in which too few points can have a label are in cluster -2: such a cluster is not
-    searched further as soon as that is certain, so a forest is not searched because of a few labels in it. The results
-    of `agree_on_points` and of `boxes.objects_from_points` are those for complete clusters. ``strips`` are
-    the points above the ground from `edgeperc.objects.cluster.sort_points`, with the same ``distance_per_m``.
+    Where too few points of a cluster can have a label, the labeled ones are in cluster -2 and the search ends, so a
+    forest is not searched because of a few labels in it. The results are those for complete clusters.
     """
     roles = roles_of(labels.classes)
     votes = np.empty(len(scan.points), np.uint8)
@@ -151,49 +162,17 @@ def agree_on_points(
     labels: PointLabels,
     clusters: Ids,
     support: Support,
-    upright: NDArray[np.uint8],
+    upright: Bytes,
     *,
     view: TopView | None = None,
     sight: Sight = EVERYTHING,
     rules: Collection[str] = RULES,
 ) -> PointLabels:
-    """Correct the labels of points by clusters, ground and boxes.
+    """Correct labels of vehicles' and persons' points by clusters, ground and boxes (docs/concepts/agreement.md).
 
-    Parameters
-    ----------
-    scan : Scan
-        If its ground has no plane, rules that need heights are skipped.
-    labels : PointLabels
-        Of vehicles (car, van, truck) and persons (pedestrian, cyclist); other classes are not changed.
-    clusters : (n,) int32, modified
-        From `find_voters`. A person that stays in a cluster that loses the label gets a number of its own.
-    support : Support
-        From `find_support`.
-    upright : (n,) uint8, modified
-        From `without_poles`.
-    view : TopView, optional
-        Without it, or if it has no class of vehicles, the rule ``"cells"`` is skipped.
-    sight : Sight
-        How high the sensor sees, of which 0.7 is high enough for any cluster.
-    rules : collection of str
-        Of `RULES`; others are left out.
-
-    Notes
-    -----
-    First, a person's point becomes background if the points within about 0.3 m around go on to above 2.0 m (cyclist:
-    2.2 m) without a gap of more than 0.3 m. Each cluster then votes, by the shares of its points in view. It loses its
-    vehicle labels if less than 0.6 of its points have them (0.75 if it is longer than 10 m or higher than 4 m), or if
-    it is lower than 0.5 m (1.0 m within 30 m), or if all of it is within 2.6 m, it is shorter than 2 m or lower than
-    1.7 m, and less than 0.1 of it is labeled as a person's, or if at least 0.8 of its points are in both views and none
-    of them lies in a cell of a vehicle; labels in a box with a score of 0.3 stay. It loses its person labels below a
-    share of 0.1 or a height of 1.0 m. A share of 0.6 gives the class to all of its points in view; persons are cyclists
-    if a quarter of them is labeled so. A cluster up to 2.3 m long whose upper quarter is at most 0.8 m wide is one
-    person from a share of 0.2 on: a cyclist if longer than 1.1 m, more than a stride; from a share of 0.3 and with a
-    height from 1.3 to 2.0 m, with all of its points in view. Where a cluster loses a person's labels, a group of them
-    of that size stays if it is at least 1.4 m high and 0.15 m wide and has 0.7 of the points in its place. A box with a
-    score of 0.5 makes the points above the ground in it vehicle points, except persons. Boxes count only if a tenth of
-    their points in view have a vehicle's label. Last, points on the ground keep a label only in cells of 0.2 m in which
-    an object of their kind stands; within 6 m, points lower than 0.06 m lose it.
+    clusters, upright : modified. A person that stays in a cluster that loses the label gets a number of its own.
+    view : without it, or if it has no class of vehicles, the rule ``"cells"`` is skipped; without a plane of the
+        ground, rules that need heights.
     """
     rules = _applicable(rules, scan.ground)
     agreed, in_view, roles = upright, labels.in_view, roles_of(labels.classes)
@@ -220,7 +199,7 @@ def agree_on_points(
     return PointLabels(agreed, labels.in_view, labels.classes)
 
 
-def without_poles(scan: Scan, labels: PointLabels, rules: Collection[str] = RULES) -> NDArray[np.uint8]:
+def without_poles(scan: Scan, labels: PointLabels, rules: Collection[str] = RULES) -> Bytes:
     """Labels without the persons whose column of points goes on above a person's height: a new (n,) uint8."""
     upright = labels.labels.copy()
     if "column" in _applicable(rules, scan.ground):
@@ -232,10 +211,8 @@ def without_poles(scan: Scan, labels: PointLabels, rules: Collection[str] = RULE
 def agree_on_boxes(
     boxes: Sequence[Box], scan: Scan, labels: PointLabels, rules: Collection[str] = RULES
 ) -> tuple[Box, ...]:
-    """Drop the uncertain vehicle boxes of a top-view network that the agreed labels of points contradict.
-
-    A box with a score below 0.5 goes if it holds no points above the ground, or if less than a tenth of its points in
-    view are vehicle points. Boxes whose points are all out of view stay.
+    """Drop the uncertain vehicle boxes of a top-view network that the agreed labels contradict: without points above
+    the ground, or with too few vehicle points. Boxes out of the range image's view stay.
     """
     roles = roles_of(labels.classes)
     doubted = [k for k, box in enumerate(boxes) if box.score < COMPLETING_SCORE and box.label in VEHICLES]
@@ -257,15 +234,7 @@ def stand_boxes(
     rules: Collection[str] = RULES,
     distance_per_m: float = 0.015,
 ) -> tuple[Box, ...]:
-    """Give vehicles' boxes the height of their points, and put them on the ground below.
-
-    The bottom of a vehicle is 0.03 m above the ground below its points. Its top is at least as high as the highest of
-    them, and at most as much higher as two returns of an object may be apart (``distance_per_m`` as in
-    `cluster.find_clusters`): in between, the box keeps its height. The height is that of a vehicle of its
-    class (`TALL_M`); higher points hang over the vehicle and do not count. Vans and trucks, which may end above the
-    view, do not become lower. Points in view that are labeled as another class than a vehicle's do not count. Boxes of
-    other classes, and those that hold fewer than five points, are not changed.
-    """
+    """Give vehicles' boxes the height of their points, and put them on the ground (docs/concepts/agreement.md)."""
     vehicles = [k for k, box in enumerate(boxes) if box.label in TALL_M]
     if "stand" not in _applicable(rules, scan.ground) or not vehicles:
         return tuple(boxes)
@@ -295,7 +264,7 @@ def _applicable(rules: Collection[str], ground: Ground) -> frozenset[str]:
     return frozenset(rules) if ground.plane is not None else frozenset(rules) - _NEED_GROUND
 
 
-def roles_of(classes: Sequence[str]) -> NDArray[np.uint8]:
+def roles_of(classes: Sequence[str]) -> Bytes:
     """For each class: 1 for vehicles, 2 for persons, 0 for others."""
     return np.array([VEHICLE if c in VEHICLES else PERSON if c in PERSON_TOP_M else 0 for c in classes], np.uint8)
 
@@ -310,7 +279,7 @@ def cells_of(view: TopView | None) -> Cells:
     return Cells(np.ascontiguousarray(view.labels), is_vehicle, grid)
 
 
-def as_rows(boxes: Sequence[Box], labels: Sequence[int] | None = None) -> NDArray[np.void]:
+def as_rows(boxes: Sequence[Box], labels: Sequence[int] | None = None) -> Records:
     """Boxes with a margin for points, (m,) `BOX`; ``labels`` are those of their points."""
     return box_records(boxes, labels or [0] * len(boxes), MARGIN_M, ABOVE_BOX_M)
 
@@ -326,7 +295,7 @@ def find_support(scan: Scan, labels: PointLabels, boxes: Sequence[Box], rules: C
     return support
 
 
-def _verdicts(classes: Sequence[str], tallies: Tallies, sight: Sight, rules: Collection[str]) -> NDArray[np.uint8]:
+def _verdicts(classes: Sequence[str], tallies: Tallies, sight: Sight, rules: Collection[str]) -> Bytes:
     """What becomes of each label in each cluster, (k, classes)."""
     clusters = tallies.clusters
     refused = clusters["n_in_both"] >= MIN_IN_TOP_VIEW * clusters["n_points"]
@@ -351,14 +320,8 @@ def cell_of(points: Points, i: int, n: int) -> tuple[int, int]:
 
 
 @njit(cache=True, nogil=True)
-def clear_columns(points: Points, height: Heights, limits: NDArray[np.float64], labels: Labels) -> None:
-    """Make persons background whose column of points goes on above a limit.
-
-    points : (n, 3 or more) float32, C-contiguous
-    height : (n,) float32; [m] above the ground.
-    limits : (classes,) float64; greatest height of a column [m] for each class; 0 for classes that are no persons.
-    labels : (n,) uint8, modified; only points within 51.2 m along x and y are changed.
-    """
+def clear_columns(points: Points, height: Heights, limits: Floats, labels: Labels) -> None:
+    """Make persons background whose column of points goes on above the limit of their class [m]; 0: not persons."""
     first_row, last_row, first_col, last_col = N_COLUMNS, -1, N_COLUMNS, -1  # of the cells around persons
     for i in range(points.shape[0]):
         if limits[labels[i]] > 0.0:
@@ -405,13 +368,8 @@ def clear_columns(points: Points, height: Heights, limits: NDArray[np.float64], 
 
 
 @njit(cache=True, nogil=True)
-def fill_support(cloud: Cloud, among: Mask, labeled: Labeled, boxes: NDArray[np.void], support: Support) -> None:
-    """Find the best box around each point, among the boxes with enough vehicle points (`MIN_BOX_SHARE`).
-
-    among : (n,) bool; points that may be in a box: those in view, above the ground.
-    boxes : (m,) `BOX`
-    support : overwritten; the earlier box on ties.
-    """
+def fill_support(cloud: Cloud, among: Mask, labeled: Labeled, boxes: Records, support: Support) -> None:
+    """Find the best box around each point ``among`` others, of those with enough vehicle points (`MIN_BOX_SHARE`)."""
     points, height, labels, roles = cloud.points, cloud.height, labeled.labels, labeled.roles
     scores, names = support.scores, support.names
     scores[:] = 0.0
@@ -448,7 +406,7 @@ def fill_support(cloud: Cloud, among: Mask, labeled: Labeled, boxes: NDArray[np.
 
 
 @njit(cache=True, nogil=True)
-def bounds_of(boxes: NDArray[np.void]) -> tuple[float, float, float, float]:
+def bounds_of(boxes: Records) -> tuple[float, float, float, float]:
     """Lowest and highest x, lowest and highest y of the circles around boxes; none is inside if there are no boxes."""
     low_x, high_x, low_y, high_y = math.inf, -math.inf, math.inf, -math.inf
     for k in range(boxes.shape[0]):
@@ -460,22 +418,9 @@ def bounds_of(boxes: NDArray[np.void]) -> tuple[float, float, float, float]:
 
 
 @njit(cache=True, nogil=True)
-def clear_ground(
-    points: Points,
-    height: Heights,
-    on_ground: NDArray[np.bool_],
-    roles: NDArray[np.uint8],
-    labels: Labels,
-) -> None:
-    """Make points on the ground background, except in cells in which an object of their kind stands.
-
-    Within `NEAR_ROAD_M`, points lower than `ROAD_TOP_M` become background in any cell.
-
-    points : (n, 3 or more) float32, C-contiguous
-    height : (n,) float32
-    on_ground : (n,) bool
-    roles : (classes,) uint8; 1 for vehicles, 2 for persons, 0 for classes that are not changed.
-    labels : (n,) uint8, modified
+def clear_ground(points: Points, height: Heights, on_ground: Mask, roles: Bytes, labels: Labels) -> None:
+    """Make points on the ground background, except in cells in which an object of their kind stands (roles 1 and 2);
+    within `NEAR_ROAD_M`, points below `ROAD_TOP_M` in any cell.
     """
     labeled = np.empty(points.shape[0], np.int32)
     n, n_lying = 0, 0
@@ -505,17 +450,10 @@ def clear_ground(
 
 @njit(cache=True, nogil=True)
 def count_inside(
-    cloud: Cloud,
-    on_ground: NDArray[np.bool_],
-    in_view: Mask,
-    labeled: Labeled,
-    boxes: NDArray[np.void],
-    counts: NDArray[np.int64],
+    cloud: Cloud, on_ground: Mask, in_view: Mask, labeled: Labeled, boxes: Records, counts: Ints64
 ) -> None:
     """Count the points above the ground in every box.
 
-    on_ground, in_view : (n,) bool
-    boxes : (m,) `BOX`
     counts : (m, 3) int64, overwritten; all points, those in view, and vehicle points in view.
     """
     points, height, labels, roles = cloud.points, cloud.height, labeled.labels, labeled.roles
@@ -534,14 +472,7 @@ def count_inside(
 
 
 @njit(cache=True, nogil=True)
-def sum_inside(
-    cloud: Cloud,
-    on_ground: NDArray[np.bool_],
-    in_view: Mask,
-    labeled: Labeled,
-    boxes: NDArray[np.void],
-    sums: NDArray[np.float64],
-) -> None:
+def sum_inside(cloud: Cloud, on_ground: Mask, in_view: Mask, labeled: Labeled, boxes: Records, sums: Floats) -> None:
     """Sum up the points above the ground in every box, (m,) `BOX`: vehicles', and those out of view.
 
     ``sums``, (m, 3), is overwritten: number of points, sum of the z of the ground below them, greatest height [m].

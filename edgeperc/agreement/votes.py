@@ -6,7 +6,6 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..objects.cluster import MIN_OF_WHOLE, MIN_PERSON_SHARE, find_clusters
 from ..objects.persons import MAX_LENGTH_M as MAX_PERSON_M
@@ -14,7 +13,7 @@ from ..objects.persons import MAX_RIDING_WIDTH_M, measure
 from ..objects.persons import MAX_TOP_M as MAX_PERSON_TOP_M
 from ..system.kernels import njit
 from ..types.geometry import Grid, cell_at
-from ..types.points import Cloud, Ids, Labeled, Labels, Mask
+from ..types.points import Bytes, Cloud, Floats32, Ids, Ints, Ints64, Labeled, Labels, Mask, Records
 
 VEHICLE, PERSON = 1, 2  # roles of classes
 NO_CLUSTER = -1
@@ -66,33 +65,17 @@ CLUSTER = np.dtype(
 
 
 class Tallies(NamedTuple):
-    """What clusters hold.
+    """What clusters hold."""
 
-    Attributes
-    ----------
-    clusters : (k,) `CLUSTER`
-    counts : (k, classes + 1) int32
-        Points in view of each class; last, of all classes.
-    """
-
-    clusters: NDArray[np.void]
-    counts: NDArray[np.int32]
+    clusters: Records  # (k,) `CLUSTER`
+    counts: Ints  # (k, classes + 1) points in view of each class; last, of all classes
 
 
 class Cells(NamedTuple):
-    """A top view as kernels take it.
+    """A top view as kernels take it."""
 
-    Attributes
-    ----------
-    labels : (rows, columns) uint8, C-contiguous
-        No cells without a top view.
-    is_vehicle : (256,) bool
-        Which labels are vehicles that count.
-    grid : Grid
-    """
-
-    labels: Labels
-    is_vehicle: NDArray[np.bool_]
+    labels: Labels  # (rows, columns) no cells without a top view
+    is_vehicle: Mask  # (256,) which labels are vehicles that count
     grid: Grid
 
 
@@ -115,12 +98,7 @@ class Applied(NamedTuple):
 
 
 @njit(cache=True, nogil=True)
-def fill_votes(
-    in_view: Mask,
-    labeled: Labeled,
-    scores: NDArray[np.float32],
-    votes: NDArray[np.uint8],
-) -> None:
+def fill_votes(in_view: Mask, labeled: Labeled, scores: Floats32, votes: Bytes) -> None:
     """Write what each point may count for in its cluster.
 
     in_view : (n,) bool
@@ -140,19 +118,8 @@ def fill_votes(
 
 
 @njit(cache=True, nogil=True)
-def fill_tallies(
-    cloud: Cloud,
-    in_view: Mask,
-    labels: Labels,
-    cluster_of: Ids,
-    view: Cells,
-    tallies: Tallies,
-) -> None:
-    """Count the labels of every cluster, and measure it.
-
-    in_view, labels, cluster_of : (n,) bool, (n,) uint8, (n,) int32
-    tallies : overwritten
-    """
+def fill_tallies(cloud: Cloud, in_view: Mask, labels: Labels, cluster_of: Ids, view: Cells, tallies: Tallies) -> None:
+    """Count the labels of every cluster, and measure it."""
     points, height, clusters, counts = cloud.points, cloud.height, tallies.clusters, tallies.counts
     cells, is_vehicle, grid = view.labels, view.is_vehicle, view.grid
     counts[:] = 0
@@ -186,20 +153,11 @@ def fill_tallies(
 
 @njit(cache=True, nogil=True)
 def fill_verdicts(
-    tallies: Tallies,
-    refused: NDArray[np.bool_],
-    roles: NDArray[np.uint8],
-    parts: NDArray[np.int64],
-    applied: Applied,
-    sight: Sight,
-    verdicts: NDArray[np.uint8],
+    tallies: Tallies, refused: Mask, roles: Bytes, parts: Ints64, applied: Applied, sight: Sight, verdicts: Bytes
 ) -> None:
-    """Decide what becomes of each label in each cluster.
+    """Decide what becomes of each label in each cluster; ``refused`` clusters are not vehicles for another reason.
 
-    refused : (k,) bool; clusters that are not vehicles for another reason.
-    roles : (classes,) uint8; 1 for vehicles, 2 for persons, 0 for others.
-    parts : (p, 2) int64; class, and the class that it may be a part of.
-    verdicts : (k, classes) uint8, overwritten
+    parts : (p, 2) class, and the class that it may be a part of.
     """
     clusters, counts = tallies.clusters, tallies.counts
     n_classes = len(roles)
@@ -248,22 +206,12 @@ def fill_verdicts(
 
 @njit(cache=True, nogil=True)
 def apply_verdicts(
-    in_view: Mask,
-    clusters: Ids,
-    verdicts: NDArray[np.uint8],
-    roles: NDArray[np.uint8],
-    scores: NDArray[np.float32],
-    names: NDArray[np.uint8],
-    labels: Labels,
+    in_view: Mask, clusters: Ids, verdicts: Bytes, roles: Bytes, scores: Floats32, names: Bytes, labels: Labels
 ) -> None:
     """Replace each label in view by what its cluster and the box around it say.
 
-    in_view : (n,) bool
-    clusters : (n,) int32; -1 for none; -2 for a cluster in which no label of a vehicle or person stays.
-    verdicts : (k, classes) uint8; new label by cluster and label.
-    roles : (classes,) uint8; 1 for vehicles, 2 for persons, 0 for others.
-    scores, names : (n,) float32, (n,) uint8; from `edgeperc.agreement.rules.fill_support`.
-    labels : (n,) uint8, modified
+    clusters : -1 for none; -2 for a cluster in which no label of a vehicle or person stays.
+    scores, names : from `edgeperc.agreement.rules.fill_support`.
     """
     for i in range(labels.shape[0]):
         if not in_view[i]:
@@ -279,7 +227,7 @@ def apply_verdicts(
         labels[i] = new
 
 
-def may_be_persons(tallies: Tallies, walks: int, rides: int) -> NDArray[np.bool_]:
+def may_be_persons(tallies: Tallies, walks: int, rides: int) -> Mask:
     """The clusters that hold labels of persons and whose bounds are not too large for one, (k,)."""
     clusters, counts = tallies
     edge = np.maximum(clusters["high_x"] - clusters["low_x"], clusters["high_y"] - clusters["low_y"])
@@ -290,15 +238,8 @@ def may_be_persons(tallies: Tallies, walks: int, rides: int) -> NDArray[np.bool_
     return np.asarray(is_small & (counts[:, walks] + counts[:, rides] > 0), np.bool_)
 
 
-def find_persons_alone(
-    cloud: Cloud, roles: NDArray[np.uint8], before: NDArray[np.uint8], labels: Labels
-) -> list[NDArray[np.int32]]:
-    """Find groups of points that are a person by themselves, though linked with something large.
-
-    roles : (classes,) uint8
-    before, labels : (n,) uint8; labels before the clusters voted, and after.
-    Returns list of (k,) int32: Rows of each person. Their labels were lost.
-    """
+def find_persons_alone(cloud: Cloud, roles: Bytes, before: Bytes, labels: Labels) -> list[Ints]:
+    """Rows of each group of points that lost its labels but is a person by itself, linked with something large."""
     points, height = cloud
     changed = np.flatnonzero(before != labels)
     lost = changed[(roles[before[changed]] == PERSON) & (labels[changed] == 0)].astype(np.int32)

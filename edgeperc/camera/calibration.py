@@ -8,11 +8,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from ..errors import CalibrationError, PointsError
 from ..system.kernels import njit
-from ..types.points import Points, read_only
+from ..types.points import Floats, Points, read_only
 from ..types.rigid import ROW_TOLERANCE, rigid
 
 MAX_EDGE, MAX_PIXELS = 2**15, 2**26  # of an image, as in `edgeperc.camera.image`
@@ -42,8 +42,8 @@ class Calibration:
         ``T_camera_sensor`` is not a rotation and a translation.
     """
 
-    K: NDArray[np.float64]
-    T_camera_sensor: NDArray[np.float64]
+    K: Floats
+    T_camera_sensor: Floats
     width: int
     height: int
 
@@ -118,7 +118,7 @@ class Calibration:
         half = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]])  # from centers of pixels to their edges
         return Calibration(np.linalg.inv(half) @ scale @ half @ self.K, self.T_camera_sensor, width, height)
 
-    def project(self, points: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    def project(self, points: ArrayLike) -> tuple[Floats, Floats, Floats]:
         """Project points into the image.
 
         Parameters
@@ -150,19 +150,16 @@ class Calibration:
         return u, v, depth
 
 
-def read_kitti_calibration(path: str | os.PathLike[str]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Read a calibration of KITTI's object, tracking, odometry or raw data.
+def read_kitti_calibration(path: str | os.PathLike[str]) -> tuple[Floats, Floats]:
+    """Read a calibration of KITTI's object, tracking, odometry or raw data: T_rectified_sensor (4, 4), and P2 (3, 4)
+    from there to the left color image.
 
-    path : of raw data the folder of a day, or either of its files calib_velo_to_cam.txt and calib_cam_to_cam.txt; a
-        text file with P2, R0_rect (or R_rect) and Tr_velo_to_cam (or Tr_velo_cam); in odometry data P2 and Tr, which
-        includes the rectification.
-    Returns T_rectified_sensor ((4, 4) float64): From the Velodyne's frame to the rectified frame of camera 0.
-    Returns P2 ((3, 4) float64): From there to the image of the left color camera.
-    Raises CalibrationError, OSError.
+    path : a text file with P2, R0_rect (or R_rect) and Tr_velo_to_cam (or Tr_velo_cam), or of odometry P2 and Tr, which
+        includes the rectification; of raw data the folder of a day, or either of its two files.
     """
     folder = Path(path) if Path(path).is_dir() else Path(path).parent
     is_raw = Path(path).is_dir() or Path(path).name in _RAW_FILES
-    values: dict[str, NDArray[np.float64]] = {}
+    values: dict[str, Floats] = {}
     try:
         for file in [folder / name for name in _RAW_FILES] if is_raw else [Path(path)]:
             for line in file.read_text("utf-8").splitlines():
@@ -213,9 +210,9 @@ def _pixels(name: str, given: object) -> int:
     return int(given)
 
 
-def _matrix(name: str, given: ArrayLike, n: int) -> NDArray[np.float64]:
+def _matrix(name: str, given: ArrayLike, n: int) -> Floats:
     try:
-        matrix: NDArray[np.float64] = np.array(given, dtype=np.float64)
+        matrix: Floats = np.array(given, dtype=np.float64)
     except (OverflowError, TypeError, ValueError) as exc:
         raise CalibrationError(f"{name} is not an array of numbers ({exc}); expected ({n}, {n})") from exc
     if matrix.shape != (n, n) or not np.isfinite(matrix).all():
@@ -226,19 +223,9 @@ def _matrix(name: str, given: ArrayLike, n: int) -> NDArray[np.float64]:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def fill_projected(
-    points: Points,
-    P: NDArray[np.float64],
-    u: NDArray[np.float64],
-    v: NDArray[np.float64],
-    depth: NDArray[np.float64],
-) -> None:
-    """Project points: column, row and depth of each.
-
-    points : (n, 3 or more) float32, C-contiguous
-    P : (3, 4) float64; ``K`` times the upper three rows of ``T_camera_sensor``.
-    u, v : (n,) float64, overwritten; [px]; NaN unless the point is finite and in front of the camera.
-    depth : (n,) float64, overwritten; [m]; NaN if the point is not finite.
+def fill_projected(points: Points, P: Floats, u: Floats, v: Floats, depth: Floats) -> None:
+    """Project points by P, ``K`` times the upper rows of ``T_camera_sensor``: column, row and depth of each; NaN unless
+    finite, and u and v behind the camera.
     """
     for i in range(points.shape[0]):
         x, y, z = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])

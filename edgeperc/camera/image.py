@@ -10,12 +10,12 @@ import os
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from ..errors import CardMismatchError, ImageError, InferenceError
 from ..system.kernels import njit
 from ..types.card import CHANNELS, InputSpec
-from ..types.points import Labels, read_only
+from ..types.points import Bytes, Floats32, Ints, Labels, read_only
 from ..types.views import CameraGeometry
 
 MAX_PIXELS = 2**26  # 8192 x 8192: three times a photograph of 24 megapixels, 200 MB
@@ -33,25 +33,9 @@ def check_size(width: int, height: int) -> None:
         )
 
 
-def as_image(array: ArrayLike) -> NDArray[np.uint8]:
-    """Check that an array is an image.
-
-    Parameters
-    ----------
-    array : (H, W, 3) uint8
-        Red, green and blue, row 0 at the top, in any memory layout: ``image[:, :, ::-1]`` of one with blue first, as
-        OpenCV reads it. At most 2**26 pixels, and 2**15 along an edge.
-
-    Returns
-    -------
-    (H, W, 3) uint8, C-contiguous, read-only
-        A view of the array if it already has this layout, else a copy.
-
-    Raises
-    ------
-    ImageError
-        The array is not such an image. Nothing is converted: what values of another type or number of channels mean is
-        for the caller to say.
+def as_image(array: ArrayLike) -> Bytes:
+    """Check that an array is an image: (H, W, 3) uint8, red first, in any layout, at most 2**26 pixels and 2**15 along
+    an edge; C-contiguous and read-only.
     """
     if isinstance(array, np.ma.MaskedArray):
         raise ImageError("got a masked array; fill it first, e.g. with array.filled(0)")
@@ -94,30 +78,25 @@ def _advice(shape: tuple[int, ...]) -> str:
 class Taps(NamedTuple):
     """The pixels of an image that count for each pixel of the output, along one axis."""
 
-    start: NDArray[np.int32]  # (n_out,), the first; ``start + K`` is at most the image's size
-    weights: NDArray[np.float32]  # (n_out, K), from there; their sum is 1, but for rounding
+    start: Ints  # (n_out,), the first; ``start + K`` is at most the image's size
+    weights: Floats32  # (n_out, K), from there; their sum is 1, but for rounding
 
 
 class Channels(NamedTuple):
     """The channels of a network's input, and what they are normalized by."""
 
-    source: NDArray[np.int32]  # (C,): 0 red, 1 green, 2 blue
-    mean: NDArray[np.float32]  # (C,)
-    std: NDArray[np.float32]  # (C,)
+    source: Ints  # (C,): 0 red, 1 green, 2 blue
+    mean: Floats32  # (C,)
+    std: Floats32  # (C,)
 
 
 class ImageScaler:
     """Scale images of any size to a network's input, and normalize them.
 
-    All of the image is scaled to the view's width and height, whatever its aspect. A pixel of the input is the mean of
-    the image's pixels around its center, weighted by a triangle: half-pixel centers, one pixel of the input wide to
-    each side, and at least one of the image. Enlarging is therefore bilinear interpolation, an image of the input's
-    size stays as it is, and shrinking leaves out no pixel of the image. This is also what Pillow's ``BILINEAR`` and
-    ``torch.nn.functional.interpolate(mode="bilinear", antialias=True)`` compute.
-
-    The tables of the last size are kept, so use one instance per thread.
-
-    input : its channels, in any order.
+    A pixel of the input is the mean of the image's pixels around its center, weighted by a triangle: half-pixel
+    centers, one pixel of the input wide to each side, and at least one of the image. This is also what Pillow's
+    ``BILINEAR`` and ``torch.nn.functional.interpolate(mode="bilinear", antialias=True)`` compute. The tables of the
+    last size are kept, so use one instance per thread.
     """
 
     def __init__(self, view: CameraGeometry, input: InputSpec) -> None:
@@ -126,13 +105,8 @@ class ImageScaler:
         self._channels = Channels(source, np.array(input.mean, np.float32), np.array(input.std, np.float32))
         self._tables_of: tuple[int, int] | None = None
 
-    def fill(self, image: NDArray[np.uint8], out: NDArray[np.float32]) -> None:
-        """Scale an image into the caller's buffer.
-
-        image : (H, W, 3) uint8; from `as_image`.
-        out : (C, height, width) float32, C-contiguous, overwritten; ``(value - mean) / std`` per channel.
-        Raises ImageError.
-        """
+    def fill(self, image: Bytes, out: Floats32) -> None:
+        """Scale an image into the caller's buffer: ``(value - mean) / std`` per channel."""
         image = as_image(image)
         if out.shape != self.shape or out.dtype != np.float32 or not out.flags.carray:
             raise ImageError(f"the buffer is {out.shape} {out.dtype}; expected {self.shape} float32, C-contiguous")
@@ -162,13 +136,10 @@ def taps(n_in: int, n_out: int) -> Taps:
 
 
 @njit(cache=True, nogil=True)
-def fill_scaled(
-    image: NDArray[np.uint8], rows: Taps, columns: Taps, channels: Channels, out: NDArray[np.float32]
-) -> None:
+def fill_scaled(image: Bytes, rows: Taps, columns: Taps, channels: Channels, out: Floats32) -> None:
     """Scale and normalize an image: for each row of the output, first along columns, then along rows.
 
     image : (H, 3 * W) uint8, C-contiguous; red, green, blue of each pixel.
-    out : (C, h, w) float32, overwritten
     """
     row_start, row_weights = rows
     col_start, col_weights = columns
@@ -196,20 +167,12 @@ def fill_scaled(
                 out[c, row, col] = (value - center) / spread
 
 
-def label_pixels(
-    logits: NDArray[np.float32], height: int, width: int, *, model: str = "the model"
-) -> NDArray[np.uint8]:
-    """The most probable class of every pixel of an image.
+def label_pixels(logits: Floats32, height: int, width: int, *, model: str = "the model") -> Bytes:
+    """The most probable class of every pixel of an image; the lower one on ties.
 
     The logits are interpolated bilinearly between the centers of their grid, which covers the whole image; beyond the
     outermost centers they stay the same. Between four centers of one class, that class is taken: whatever the weights,
     no other can have a larger sum.
-
-    logits : (C, h, w) float32
-    height, width : of the image.
-    model : name for messages.
-    Returns (height, width) uint8: The lower class on ties.
-    Raises InferenceError, CardMismatchError.
     """
     if logits.ndim != 3 or not 1 <= logits.shape[0] <= 255 or 0 in logits.shape:
         raise CardMismatchError(f"{model}: camera_logits have shape {logits.shape}; expected (C, h, w), C up to 255")
@@ -224,14 +187,9 @@ def label_pixels(
     return labels
 
 
-def between(n_in: int, n_out: int) -> tuple[NDArray[np.int32], NDArray[np.float32], NDArray[np.int32]]:
-    """Interpolation along one axis.
-
-    Returns sides ((2, n_out) int32): The centers of the grid on the two sides of each pixel: one and the same where a
-        pixel lies on it or outside.
-    Returns weight ((n_out,) float32): Of the second center.
-    Returns runs ((n_runs + 1,) int32): Where runs of pixels between the same two centers begin; the last is
-        ``n_out``.
+def between(n_in: int, n_out: int) -> tuple[Ints, Floats32, Ints]:
+    """Interpolation along one axis: the two centers of the grid beside each pixel (2, n_out), the weight of the second,
+    and where runs of pixels between the same two begin.
     """
     at = np.clip((np.arange(n_out) + 0.5) * (n_in / n_out) - 0.5, 0.0, n_in - 1.0)
     first = np.floor(at).astype(np.int32)
@@ -243,22 +201,16 @@ def between(n_in: int, n_out: int) -> tuple[NDArray[np.int32], NDArray[np.float3
 
 @njit(cache=True, nogil=True)
 def fill_image_labels(
-    logits: NDArray[np.float32],
-    row_sides: NDArray[np.int32],
-    row_weight: NDArray[np.float32],
-    row_runs: NDArray[np.int32],
-    col_sides: NDArray[np.int32],
-    col_weight: NDArray[np.float32],
-    col_runs: NDArray[np.int32],
+    logits: Floats32,
+    row_sides: Ints,
+    row_weight: Floats32,
+    row_runs: Ints,
+    col_sides: Ints,
+    col_weight: Floats32,
+    col_runs: Ints,
     labels: Labels,
 ) -> int:
-    """Write every pixel's best class (`label_pixels`).
-
-    logits : (C, h, w) float32, C-contiguous
-    row_sides, row_weight, row_runs, col_sides, col_weight, col_runs : from `between`.
-    labels : (H, W) uint8, overwritten
-    Returns n_bad: Number of logits that are not finite; if there are any, the labels are undefined.
-    """
+    """Write every pixel's best class (`label_pixels`, `between`); returns how many logits are not finite."""
     n_classes, height, width = logits.shape
     n_bad = 0
     coarse = np.empty((height, width), np.uint8)

@@ -21,7 +21,7 @@ from ..system.kernels import njit
 from ..types.frame import ModelFrame
 from ..types.mounting import MODEL_HEIGHT_M, MODEL_MOUNTING, Mounting
 from ..types.perception import ImageLabels, Perception, TopView
-from ..types.points import Labels, Points, read_only
+from ..types.points import Bytes, Floats, Floats32, Labels, Mask, Points, read_only
 from ..types.sensor import SensorProfile, get_sensor
 from ..types.views import TopViewGeometry
 from .calibration import Calibration
@@ -43,36 +43,36 @@ USUAL_CELLS, MAX_CELLS = 6, 24
 class Pixels(NamedTuple):
     """Where points fall in an image (`Calibration.project`)."""
 
-    u: NDArray[np.float64]  # (n,) [px]
-    v: NDArray[np.float64]  # (n,) [px]
-    depth: NDArray[np.float64]  # (n,) [m]
+    u: Floats  # (n,) [px]
+    v: Floats  # (n,) [px]
+    depth: Floats  # (n,) [m]
 
 
 class Windows(NamedTuple):
     """Half-sizes of a point's window [px], if the point is as far from the camera as from the sensor."""
 
-    between: NDArray[np.float64]  # (beams - 1,), tangent of the elevation between each two beams, from the top
-    up: NDArray[np.float64]  # (beams,)
-    down: NDArray[np.float64]  # (beams,)
+    between: Floats  # (beams - 1,), tangent of the elevation between each two beams, from the top
+    up: Floats  # (beams,)
+    down: Floats  # (beams,)
     side: float
 
 
 class DepthBuffer(NamedTuple):
     """Depth of the nearest point whose window covers each cell of an image."""
 
-    nearest: NDArray[np.float32]  # (rows, columns) [m]; infinite where no window is
+    nearest: Floats32  # (rows, columns) [m]; infinite where no window is
     cell_h: int  # [px]
     cell_w: int  # [px]
 
 
 def paint(
-    image: Perception | ImageLabels | NDArray[np.uint8],
+    image: Perception | ImageLabels | Bytes,
     points: Points,
     calibration: Calibration,
     *,
     sensor: str | os.PathLike[str] | SensorProfile = "hdl-64e",
     mounting: Mounting | None = None,
-) -> NDArray[np.uint8]:
+) -> Bytes:
     """Give each point the class of the pixel that it falls on, if the camera sees it.
 
     Parameters
@@ -131,7 +131,7 @@ def paint(
 
 
 def camera_road(
-    image: Perception | ImageLabels | NDArray[np.bool_],
+    image: Perception | ImageLabels | Mask,
     points: Points,
     calibration: Calibration,
     *,
@@ -209,13 +209,9 @@ def _hidden_by(
     calibration: Calibration,
     sensor: SensorProfile,
     mounting: Mounting | None,
-    places: NDArray[np.float64] | None = None,
-) -> tuple[NDArray[np.float32], DepthBuffer, NDArray[np.float64]]:
-    """Find what stands on the ground, and the ground at ``places`` x, y (k, 2) in the frame of the models.
-
-    Returns the points, checked; the depth buffer of those above the ground; and the places (k, 3) on the ground, in the
-    frame of the sensor, NaN if the scan shows no ground.
-    """
+    places: Floats | None = None,
+) -> tuple[Floats32, DepthBuffer, Floats]:
+    """The points, the depth buffer of those above the ground, and ``places`` on the ground, NaN without ground."""
     if not isinstance(points, np.ndarray) or points.ndim != 2 or points.shape[1] < 3 or points.dtype.kind not in "fiu":
         raise PointsError(f"got {_described(points)} for points; expected an array (n, 3 or more): x, y, z")
     with np.errstate(over="ignore", invalid="ignore"):
@@ -260,7 +256,7 @@ def _described(thing: object) -> str:
     return f"{thing.shape} {thing.dtype}" if isinstance(thing, np.ndarray) else type(thing).__name__
 
 
-def _road_of(image: Perception | ImageLabels | NDArray[np.bool_], calibration: Calibration) -> NDArray[np.uint8]:
+def _road_of(image: Perception | ImageLabels | Mask, calibration: Calibration) -> Bytes:
     """1 for road, 0 for others, 255 for pixels without a class."""
     found = image.image if isinstance(image, Perception) else image
     if not isinstance(found, ImageLabels):
@@ -290,10 +286,7 @@ def _nearest(points: Points, calibration: Calibration, sensor: SensorProfile) ->
 
 @njit(cache=True, nogil=True)
 def fill_nearest(points: Points, pixels: Pixels, windows: Windows, buffer: DepthBuffer) -> None:
-    """Write the depth of the nearest point whose window covers each cell into ``buffer.nearest``.
-
-    points : (n, 3 or more) float32, C-contiguous
-    """
+    """Write the depth of the nearest point whose window covers each cell into ``buffer.nearest``."""
     u, v, depth = pixels
     between = windows.between
     nearest, cell_h, cell_w = buffer
@@ -330,19 +323,10 @@ def fill_nearest(points: Points, pixels: Pixels, windows: Windows, buffer: Depth
 
 @njit(cache=True, nogil=True)
 def fill_painted(
-    labels: Labels,
-    pixels: Pixels,
-    buffer: DepthBuffer,
-    slack_m: float,
-    slack_share: float,
-    painted: Labels,
+    labels: Labels, pixels: Pixels, buffer: DepthBuffer, slack_m: float, slack_share: float, painted: Labels
 ) -> None:
-    """Write the label of the pixel of each point that is not hidden, else `UNSEEN`.
-
-    labels : (H, W) uint8, C-contiguous
-    slack_m, slack_share : a point is hidden if it is farther behind the nearest one than this [m], plus this share of
-        its depth.
-    painted : (n,) uint8, overwritten
+    """Write the label of the pixel of each point, or `UNSEEN` if it is farther behind the nearest one than ``slack_m``
+    plus ``slack_share`` of its depth.
     """
     u, v, depth = pixels
     height, width = labels.shape

@@ -20,13 +20,10 @@ from .output import in_options, many, print_error, print_line, print_rows
 from .scans import Sensors, check_sensor
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
     from ..ground.leveling import MountingEstimator
     from ..types.frame import ModelFrame
     from ..types.perception import DroppedPoints
-    from ..types.points import Points
+    from ..types.points import Floats32, Points
     from ..types.sensor import SensorProfile
     from ..zoo import Variant
 
@@ -291,7 +288,7 @@ def _percent(share: float | None) -> str:
 
 
 def _estimated(
-    estimator: MountingEstimator, scans: Sequence[NDArray[np.float32]]
+    estimator: MountingEstimator, scans: Sequence[Floats32]
 ) -> tuple[MountingEstimator, MountingError | None]:
     """The estimator after these scans, and why one was left out: a `Perceiver` too skips those without ground."""
     reason = None
@@ -395,12 +392,12 @@ def _refusal(is_refused: bool) -> list[tuple[str, str]]:
     return [("refused", "edgeperc run refuses this scan; with --anyway it warns")] if is_refused else []
 
 
-def _first_scans(path: Path, options: Mapping[str, Any]) -> tuple[list[NDArray[np.float32]], str]:
+def _first_scans(path: Path, options: Mapping[str, Any]) -> tuple[list[Floats32], str]:
     """The scans that decide a mounting, and what damage comes after them."""
     from ..ground.leveling import FROZEN_AFTER
     from ..readers.captures import read_scans
 
-    scans: list[NDArray[np.float32]] = []
+    scans: list[Floats32] = []
     try:
         scans.extend(points for _, points in islice(read_scans(path, **options), FROZEN_AFTER))
     except PointsError as exc:
@@ -435,7 +432,7 @@ def _extent_rows(points: Points) -> tuple[list[tuple[str, str]], dict[str, list[
 
 
 def _matched_remission(
-    scans: Sequence[NDArray[np.float32]], sensor: SensorProfile
+    scans: Sequence[Floats32], sensor: SensorProfile
 ) -> tuple[SensorProfile, list[str], list[tuple[str, str]]]:
     """The profile with the remission function that the scans need, and what was reported on the way."""
     from ..preprocess.remission import RemissionMatcher
@@ -451,11 +448,11 @@ def _matched_remission(
 
 
 def _mounting_rows(
-    scans: Sequence[NDArray[np.float32]],
+    scans: Sequence[Floats32],
     sensor: SensorProfile,
     used: SensorProfile,
     estimators: dict[SensorProfile, MountingEstimator],
-) -> tuple[list[NDArray[np.float32]], MountingEstimator, list[tuple[str, str]], dict[str, Any] | None]:
+) -> tuple[list[Floats32], MountingEstimator, list[tuple[str, str]], dict[str, Any] | None]:
     """Scaled scans and the mounting that they show; the sensor's estimator in ``estimators`` learns from them, too."""
     from ..ground.leveling import MountingEstimator
     from ..preprocess.condition import scale

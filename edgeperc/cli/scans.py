@@ -20,11 +20,9 @@ from ..types.choices import AUTO_SENSOR, DEFAULT_SENSOR
 from .arguments import reading_options
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
     from ..preprocess.sensor_estimate import SensorEstimate
     from ..readers.identify import KnownSensor
+    from ..types.points import Floats32
     from ..types.sensor import SensorProfile
 
 
@@ -129,7 +127,7 @@ def find_sensor(paths: Iterable[Path], options: Mapping[str, Any]) -> SensorEsti
     from ..preprocess.sensor_estimate import MOST_SCANS, estimate_sensor, has_enough_points
     from ..readers.captures import is_capture, read_scans
 
-    scans: list[NDArray[np.float32]] = []
+    scans: list[Floats32] = []
     for path in islice(paths, _LOOKED_AT):
         of_file = {} if is_capture(path) else {"origin_m": options.get("origin_m")}
         with suppress(EdgepercError, OSError):  # reported when the scan's turn comes

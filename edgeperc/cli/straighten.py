@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..errors import PointsError
 from ..preprocess.motion import Motion, Trajectory, deskew
 from ..preprocess.returns import returns
+from ..types.points import Floats, Floats32
 
 if TYPE_CHECKING:
     from ..tracking.tracks import Tracks
@@ -33,12 +33,8 @@ class Straightener:
         self._tracked: list[Tracks] = []
 
     def straighten(
-        self,
-        stamp_s: float | None,
-        points: Points,
-        times_s: NDArray[np.float64] | None,
-        sensor: SensorProfile | None = None,
-    ) -> NDArray[np.float32]:
+        self, stamp_s: float | None, points: Points, times_s: Floats | None, sensor: SensorProfile | None = None
+    ) -> Floats32:
         """Points in the sensor's frame at the scan's stamp, or at its last point; what the sensor drops stays where it
         is: the own vehicle moves with it. Without poses, the first two scans of a session stay as they are, with a
         warning.

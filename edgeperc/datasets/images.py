@@ -7,11 +7,11 @@ import json
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..errors import ImageError
 from ..readers.images import IMAGE_SUFFIXES, read_image
 from ..system.extras import require
+from ..types.points import Bytes
 
 FOLDERS = {"train": "train", "validation": "val", "test": "test"}
 UNLABELED = ("unlabeled", "unlabelled", "void")  # both spellings are in data sets
@@ -57,7 +57,7 @@ class LabeledImages:
             raise ImageError(f"{self.root} has no images of split {split}; expected some in {folders[0]}")
         return files
 
-    def read(self, file: Path) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+    def read(self, file: Path) -> tuple[Bytes, Bytes]:
         """Read an image (H, W, 3) and its labels (H, W), 255 where unlabeled. Raises ImageError."""
         image = read_image(file)
         path = file.parent.with_name(f"{file.parent.name}annot") / f"{file.stem}.png"
@@ -77,6 +77,6 @@ class LabeledImages:
         return image, self._of_id[ids]
 
 
-def image_hash(image: NDArray[np.uint8]) -> str:
+def image_hash(image: Bytes) -> str:
     """SHA-256 of an image's size and pixels, which a card records of the training images."""
     return hashlib.sha256(f"{image.shape}".encode() + np.ascontiguousarray(image).tobytes()).hexdigest()

@@ -24,7 +24,7 @@ from ..simulation.scene import POINT_CLASS_OF
 from ..system.names import check_file
 from ..types.geometry import inside
 from ..types.perception import Box
-from ..types.points import Labels, Points
+from ..types.points import Bytes, Floats, Labels, Mask, Points
 from ..types.views import TopViewGeometry
 from .splits import TEST_DRIVES, in_split
 
@@ -43,15 +43,15 @@ IMAGE_SIZES = {
 class KittiCalibration:
     """Pose and projection of the left color camera."""
 
-    T_cam_velo: NDArray[np.float64]  # (4, 4), sensor frame to rectified camera frame
-    P2: NDArray[np.float64]  # (3, 4), rectified camera frame to the image
+    T_cam_velo: Floats  # (4, 4), sensor frame to rectified camera frame
+    P2: Floats  # (3, 4), rectified camera frame to the image
 
     @classmethod
     def read(cls, path: Path) -> KittiCalibration:
         """Read a file of `read_kitti_calibration`, whose errors this raises."""
         return cls(*read_kitti_calibration(path))
 
-    def to_image(self, points: NDArray[Any]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def to_image(self, points: NDArray[Any]) -> tuple[Floats, Floats]:
         """Column and row (n, 2) [px] of points (n, 3+) in the sensor frame, not valid behind the camera; and their
         distance along the optical axis [m], negative there.
         """
@@ -61,7 +61,7 @@ class KittiCalibration:
         with np.errstate(divide="ignore", invalid="ignore"):
             return image[:, :2] / depth[:, None], depth
 
-    def sensor_boxes(self, rows: NDArray[np.float64]) -> NDArray[np.float64]:
+    def sensor_boxes(self, rows: Floats) -> Floats:
         """Boxes (n, 7) in the sensor frame (center, length, width, height, yaw) from KITTI's: height, width, length, x,
         y, z of the bottom face's center in the camera's frame [m], rotation about its y axis [rad].
         """
@@ -72,7 +72,7 @@ class KittiCalibration:
         ahead = np.stack([np.cos(turn), np.zeros_like(turn), -np.sin(turn)], axis=1) @ T_velo_cam[:3, :3].T
         return np.column_stack([centers, length, width, height, np.arctan2(ahead[:, 1], ahead[:, 0])])
 
-    def in_camera(self, rows: NDArray[np.float64]) -> NDArray[np.float64]:
+    def in_camera(self, rows: Floats) -> Floats:
         """Convert boxes (n, 7) to x ahead, y left, z up in the camera's frame: undoes `sensor_boxes`."""
         R, t = self.T_cam_velo[:3, :3], self.T_cam_velo[:3, 3]
         right, down, ahead = R @ rows[:, :3].T + t[:, None]
@@ -81,9 +81,7 @@ class KittiCalibration:
         heading = R @ np.stack([cos, sin, climb])
         return np.column_stack([ahead, -right, -down, rows[:, 3:6], np.arctan2(-heading[0], heading[2])])
 
-    def image_rectangles(
-        self, rows: NDArray[np.float64], image_size: tuple[int, int] = IMAGE_SIZE
-    ) -> NDArray[np.float64]:
+    def image_rectangles(self, rows: Floats, image_size: tuple[int, int] = IMAGE_SIZE) -> Floats:
         """Left, top, right, bottom [px] of boxes (n, 7) in the sensor frame, clipped to the image; no area outside."""
         signs = np.array([[a, b, c] for a in (-0.5, 0.5) for b in (-0.5, 0.5) for c in (-0.5, 0.5)])
         local = signs[None] * rows[:, None, 3:6]
@@ -98,7 +96,7 @@ class KittiCalibration:
         high = np.where(ahead[..., None], pixel, -np.inf).max(axis=1).clip(0.0, image_size)
         return np.hstack([low, np.maximum(high, low)])
 
-    def labeled_at(self, places: NDArray[Any], unlabeled: NDArray[np.float64]) -> NDArray[np.bool_]:
+    def labeled_at(self, places: NDArray[Any], unlabeled: Floats) -> Mask:
         """Which places (n, 3+) in the sensor frame are in the image and in no ``unlabeled`` (k, 4) rectangle [px]."""
         pixel, depth = self.to_image(places)
         column, row = pixel.T
@@ -113,15 +111,15 @@ class KittiLabels:
     """Rows of a KITTI label file, in its own frame."""
 
     kinds: tuple[str, ...]  # classes in lower case, "dontcare" among them
-    numbers: NDArray[np.float64]
+    numbers: Floats
 
     @property
-    def is_object(self) -> NDArray[np.bool_]:
+    def is_object(self) -> Mask:
         """Which rows are not DontCare regions."""
         return np.array([kind != "dontcare" for kind in self.kinds], np.bool_)
 
     @property
-    def objects(self) -> tuple[list[str], NDArray[np.float64]]:
+    def objects(self) -> tuple[list[str], Floats]:
         """Classes and numbers of the rows that are not DontCare regions."""
         return [kind for kind in self.kinds if kind != "dontcare"], self.numbers[self.is_object]
 
@@ -135,20 +133,20 @@ class Frame:
     grade: str  # "A" if the boxes were checked to fit the scan
     points: Points  # x, y, z [m] in the sensor frame, remission
     boxes: tuple[Box, ...]  # in the sensor frame, labels in lower case
-    unlabeled: NDArray[np.float64]  # (k, 4), DontCare: left, top, right, bottom [px] where objects are not labeled
+    unlabeled: Floats  # (k, 4), DontCare: left, top, right, bottom [px] where objects are not labeled
     calibration: KittiCalibration
     labels: KittiLabels | None = None  # what ``boxes`` and ``unlabeled`` come from, if known
 
     @cached_property
-    def known(self) -> NDArray[np.bool_]:
+    def known(self) -> Mask:
         """Which points have known labels, (n,) bool: those in the camera's field of view and outside DontCare."""
         return self.known_at(self.points)
 
-    def known_at(self, points: NDArray[Any]) -> NDArray[np.bool_]:
+    def known_at(self, points: NDArray[Any]) -> Mask:
         """Whether objects are labeled at places (n, 3+) in the sensor frame, (n,) bool."""
         return self.calibration.labeled_at(points, self.unlabeled)
 
-    def point_labels(self) -> NDArray[np.uint8]:
+    def point_labels(self) -> Bytes:
         """True class of each point, (n,) uint8: the class of the box around it, `IGNORE` where the truth is unknown."""
         labels = np.where(self.known, 0, IGNORE).astype(np.uint8)
         for box in self.boxes:
@@ -201,7 +199,7 @@ def wrong_in_label(kind: str, numbers: Sequence[float]) -> str:
 _LARGEST_M, _WHOLE_TURN = 100.0, 6.3  # of KITTI's objects, a tram is the longest, 35 m
 
 
-def label_objects(labels: KittiLabels, calibration: KittiCalibration) -> tuple[tuple[Box, ...], NDArray[np.float64]]:
+def label_objects(labels: KittiLabels, calibration: KittiCalibration) -> tuple[tuple[Box, ...], Floats]:
     """Boxes of labels in the sensor frame, and (k, 4) DontCare rectangles [px] (SSADNet 3.1.1)."""
     kinds, numbers = labels.objects
     placed = calibration.sensor_boxes(numbers[:, 7:14])
@@ -314,7 +312,7 @@ class RoadFrame:
     points: Points  # x, y, z [m] in the sensor frame, remission
     labels: Labels  # index into `ROAD_CLASSES`, `IGNORE` for unlabeled points
 
-    def top_view(self, geometry: TopViewGeometry) -> NDArray[np.uint8]:
+    def top_view(self, geometry: TopViewGeometry) -> Bytes:
         """Index into `ROAD_CLASSES` of each cell: that of most of its labeled returns, `IGNORE` without one."""
         p, known = self.points, self.labels != IGNORE
         row, col, in_view = geometry.cells(p[:, 0], p[:, 1])

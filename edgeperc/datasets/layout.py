@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..errors import PointsError, SensorError
 from ..simulation.samples import IGNORE
@@ -19,6 +18,7 @@ from ..system.fields import Fields
 from ..system.names import check_name, nearest
 from ..types.choices import STATIC
 from ..types.mounting import Mounting
+from ..types.points import Bytes
 from ..types.sensor import SensorProfile, get_sensor
 from .splits import in_split
 
@@ -53,7 +53,7 @@ def class_number(name: str, classes: Sequence[str] = POINT_CLASSES) -> int:
     return 0 if name == BACKGROUND or (whole and name in PARTS) else IGNORE
 
 
-def numbers_of_scene(classes: Sequence[str] = POINT_CLASSES) -> NDArray[np.uint8]:
+def numbers_of_scene(classes: Sequence[str] = POINT_CLASSES) -> Bytes:
     """`class_number` of each of `SCENE_CLASSES`, by its index, (256,) uint8; other numbers stay as they are."""
     numbers = np.arange(256, dtype=np.uint8)
     numbers[: len(SCENE_CLASSES)] = [class_number(name, classes) for name in SCENE_CLASSES]

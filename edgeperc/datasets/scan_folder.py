@@ -35,7 +35,7 @@ from ..simulation.scene import POINT_CLASSES
 from ..types.choices import VEHICLES
 from ..types.geometry import inside
 from ..types.perception import ROADS, Box
-from ..types.points import Points
+from ..types.points import Bytes, Floats, Mask, Points
 from .annotations import read_datumaro, read_labelcloud, read_sustechpoints
 from .kitti import IMAGE_SIZE, SEQUENCE_DRIVES, KittiCalibration, KittiLabels, label_objects, read_drives, read_labels
 from .layout import (
@@ -88,10 +88,10 @@ class ScanFrame:
     layout: ScanLayout
     points: Points
     boxes: tuple[Box, ...] | None
-    point_classes: NDArray[np.uint8] | None
-    drivable: tuple[NDArray[np.float64], ...] | None
+    point_classes: Bytes | None
+    drivable: tuple[Floats, ...] | None
     calibration: KittiCalibration | None = None
-    unlabeled: NDArray[np.float64] | None = None
+    unlabeled: Floats | None = None
     image_labels: KittiLabels | None = None
 
     @cached_property
@@ -114,7 +114,7 @@ class ScanFrame:
         focal, middle = self.calibration.P2[0, 0], self.calibration.P2[0, 2]
         return -math.atan2(IMAGE_SIZE[0] - middle, focal), math.atan2(middle, focal)
 
-    def known_at(self, places: NDArray[Any]) -> NDArray[np.bool_]:
+    def known_at(self, places: NDArray[Any]) -> Mask:
         """Whether all objects at places (n, 3+) [m] have boxes, (n,) bool."""
         if self.boxes is None:
             return np.zeros(len(places), np.bool_)
@@ -127,7 +127,7 @@ class ScanFrame:
             known &= self.calibration.labeled_at(places, self.unlabeled)
         return known
 
-    def labels(self, classes: Sequence[str] = POINT_CLASSES, *, by: str | None = None) -> NDArray[np.uint8]:
+    def labels(self, classes: Sequence[str] = POINT_CLASSES, *, by: str | None = None) -> Bytes:
         """True class of each point, (n,) uint8: index into ``classes``, `IGNORE` where unknown.
 
         Parameters
@@ -157,7 +157,7 @@ class ScanFrame:
             labels[inside(box, self.points, MARGIN_M)] = class_number(box.label, classes)
         return labels
 
-    def road_labels(self) -> NDArray[np.uint8] | None:
+    def road_labels(self) -> Bytes | None:
         """Index into `datasets.ROAD_CLASSES` of each point, (n,) uint8, `IGNORE` where unknown.
 
         None if the points are not labeled, or no class of theirs is drivable.
@@ -207,7 +207,7 @@ class ScanFolder:
         self.scans = self._scans()
         self._annotated = read_datumaro(self.root / BOX_FILES["cvat"]) if self.layout.box_format == "cvat" else {}
         self.drives = self._drives()
-        self._point_numbers: NDArray[np.uint8] | None = None
+        self._point_numbers: Bytes | None = None
 
     @classmethod
     def parse(cls, text: str | Path) -> ScanFolder:
@@ -339,7 +339,7 @@ class ScanFolder:
         renamed = (replace(box, label=class_of_name(box.label, self.layout.boxes, path, "boxes")) for box in boxes)
         return tuple(box for box in renamed if box.label != BACKGROUND)
 
-    def _read_classes(self, path: Path, n_points: int) -> NDArray[np.uint8]:
+    def _read_classes(self, path: Path, n_points: int) -> Bytes:
         data = np.fromfile(path, np.uint8)
         raw: NDArray[Any] = data
         if path.suffix == ".label":
@@ -362,7 +362,7 @@ class ScanFolder:
             )
         return self._point_numbers[raw]
 
-    def _numbers(self) -> NDArray[np.uint8]:
+    def _numbers(self) -> Bytes:
         """Raw number of a class -> index into the description's classes, `IGNORE` if it has no name."""
         names, source = self.layout.point_names, self.root / "semseg_classes.json"
         if names is None:
@@ -403,7 +403,7 @@ def _read_boxes(path: Path, columns: Sequence[str]) -> list[Box]:
     return boxes
 
 
-def _read_polygons(path: Path) -> tuple[NDArray[np.float64], ...]:
+def _read_polygons(path: Path) -> tuple[Floats, ...]:
     try:
         polygons = [np.array(ring, np.float64) for ring in json.loads(path.read_text(encoding="utf-8"))]
     except (OSError, RecursionError, TypeError, UnicodeDecodeError, ValueError) as exc:

@@ -13,10 +13,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..types.geometry import wrapped
 from ..types.perception import Box
+from ..types.points import Floats, Ints64
 from .metrics import box_rows
 from .tracking_metrics import box_iou, fill_assignment
 
@@ -58,9 +58,7 @@ class Ab3dmot:
         self._next_id = 1
         self._tracks = np.zeros(0, _TRACK)
 
-    def update(
-        self, boxes: Sequence[Box], scores: Sequence[float]
-    ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
+    def update(self, boxes: Sequence[Box], scores: Sequence[float]) -> tuple[Ints64, Floats, Floats, Ints64]:
         """Track the boxes of a scan: ids, rows, scores of the last detection, the detections' indices (-1: none)."""
         self._n_scans += 1
         given, tracks = box_rows(boxes), self._tracks
@@ -102,7 +100,7 @@ class Ab3dmot:
         self._tracks = tracks[stays]
         return tracks["id"][shown], tracks["state"][shown][:, _BACK], tracks["score"][shown], source[shown]
 
-    def _pairs(self, boxes: NDArray[np.float64], tracks: NDArray[np.float64]) -> list[tuple[int, int]]:
+    def _pairs(self, boxes: Floats, tracks: Floats) -> list[tuple[int, int]]:
         """Pairs (detection, track) of at least the lowest affinity."""
         if self.settings.by_distance:
             affinity = -np.linalg.norm(boxes[:, None, :3] - tracks[None, :, :3], axis=2)
@@ -123,7 +121,7 @@ class Ab3dmot:
         return [(i, j) for i, j in made if affinity[i, j] >= self.settings.least]
 
 
-def generalized_iou(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+def generalized_iou(a: Floats, b: Floats) -> Floats:
     """Generalized 3-D IoU (n, m) of boxes (n, 7) and (m, 7): IoU less the share of the smallest upright prism around
     both that neither fills; -1 for boxes farther apart than the sum of their lengths and widths.
     """
@@ -141,7 +139,7 @@ def generalized_iou(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[n
     return iou - 1.0 + union / np.maximum(around, union)
 
 
-def _corners(boxes: NDArray[np.float64]) -> list[list[tuple[float, float]]]:
+def _corners(boxes: Floats) -> list[list[tuple[float, float]]]:
     signs = np.array([[0.5, 0.5], [-0.5, 0.5], [-0.5, -0.5], [0.5, -0.5]])
     along, across = (signs[None] * boxes[:, None, 3:5]).transpose(2, 0, 1)
     cos, sin = np.cos(boxes[:, 6:]), np.sin(boxes[:, 6:])

@@ -13,11 +13,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..datasets.images import FOLDERS, IGNORE, LEVEL, LabeledImages, image_hash
 from ..errors import CardMismatchError, OptionError, SplitError
 from ..perceiver import Perceiver
+from ..types.points import Floats, Ints64
 from .judge import training_scans_of
 from .metrics import Confusion
 
@@ -67,7 +67,7 @@ def evaluate_images(
     }
 
 
-def image_figures(classes: Sequence[str], counts: NDArray[np.int64], n_resamples: int = 1000) -> dict[str, Any]:
+def image_figures(classes: Sequence[str], counts: Ints64, n_resamples: int = 1000) -> dict[str, Any]:
     """Figures of the summed confusion matrices (n, C, C) of images, of all and of each class, with 95 % intervals over
     resampled images (None with fewer than two); shares have four decimals, None for those of no pixels.
     """
@@ -90,7 +90,7 @@ def image_figures(classes: Sequence[str], counts: NDArray[np.int64], n_resamples
     return {"n_images": n, "all": rows.pop("all") | {"n_pixels": int(n_pixels.sum())}, "classes": rows}
 
 
-def _rates(counts: NDArray[np.int64]) -> Mapping[str, NDArray[np.float64]]:
+def _rates(counts: Ints64) -> Mapping[str, Floats]:
     """Rates of confusion matrices (m, C, C): per class (m, C), and over all (m,); NaN without pixels."""
     hits, truth, predicted = np.diagonal(counts, axis1=1, axis2=2), counts.sum(axis=2), counts.sum(axis=1)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -100,14 +100,14 @@ def _rates(counts: NDArray[np.int64]) -> Mapping[str, NDArray[np.float64]]:
     return {**rates, **means}
 
 
-def _means(rates: NDArray[np.float64]) -> NDArray[np.float64]:
+def _means(rates: Floats) -> Floats:
     """Mean of each row without NaN; NaN for a row of NaN."""
     known = ~np.isnan(rates)
     with np.errstate(invalid="ignore"):
         return np.asarray(np.where(known, rates, 0.0).sum(axis=1) / known.sum(axis=1))
 
 
-def _with_interval(key: str, value: float, samples: NDArray[np.float64]) -> dict[str, Any]:
+def _with_interval(key: str, value: float, samples: Floats) -> dict[str, Any]:
     known = samples[~np.isnan(samples)]
     bounds = None
     if known.size:

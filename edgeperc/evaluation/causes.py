@@ -8,14 +8,13 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..ground.planes import Ground, find_ground
 from ..objects.cluster import find_clusters
 from ..simulation.scene import POINT_CLASS_OF, POINT_CLASSES
 from ..types.geometry import inside
 from ..types.perception import Box
-from ..types.points import Labels, Mask, Points
+from ..types.points import Bytes, Labels, Mask, Points
 from .metrics import object_key
 
 BUMPER = "car at the own bumper"
@@ -42,13 +41,7 @@ Counts = dict[tuple[str, ...], "Counter[Any]"]
 
 
 def count_causes(
-    points: Points,
-    labels: Labels,
-    right: NDArray[np.uint8],
-    known: NDArray[np.bool_],
-    in_view: Mask,
-    boxes: Sequence[Box],
-    drive: str,
+    points: Points, labels: Labels, right: Bytes, known: Mask, in_view: Mask, boxes: Sequence[Box], drive: str
 ) -> Counts:
     """Count one scan's wrong points by (error, cause), and 1 by drive and by missed object. The cause "all" has all of
     an error, "of" what it is a share of. Where the truth is unknown, `BUMPER` may be a car.
@@ -96,14 +89,14 @@ class _Scan:
     def ground(self) -> Ground:
         return find_ground(self.points)
 
-    def within(self, mask: Mask, boxes: Sequence[Box], margin_m: float = 0.0) -> NDArray[np.bool_]:
+    def within(self, mask: Mask, boxes: Sequence[Box], margin_m: float = 0.0) -> Mask:
         """Points in one of the boxes."""
         rows, is_near = np.flatnonzero(mask), np.zeros(len(mask), np.bool_)
         for box in boxes:
             is_near[rows] |= inside(box, self.points[rows], margin_m)
         return is_near
 
-    def on_large_structures(self, mask: Mask) -> NDArray[np.bool_]:
+    def on_large_structures(self, mask: Mask) -> Mask:
         """Points above the ground, in a cluster that is too large for a car."""
         above = ~self.ground.mask & np.isfinite(self.points).all(axis=1)
         clusters = find_clusters(self.points, among=above, seeds=mask & above, min_points=1)
@@ -118,7 +111,7 @@ class _Scan:
             large[rows] = is_large[clusters[rows]]
         return mask & large
 
-    def on_poles(self, mask: Mask) -> NDArray[np.bool_]:
+    def on_poles(self, mask: Mask) -> Mask:
         """Points with a point higher than people above or below them, at most 0.3 m aside."""
         is_pole = np.zeros(len(mask), np.bool_)
         tall = self.points[self.ground.height_m > POLE_HEIGHT_M, :2]

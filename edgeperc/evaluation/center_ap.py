@@ -10,9 +10,9 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..types.perception import Box
+from ..types.points import Floats
 from .metrics import Listed, object_key
 
 DISTANCES_M = (0.5, 1.0, 2.0, 4.0)
@@ -59,11 +59,7 @@ def center_scores(table: Listed, label: str) -> dict[str, float]:
 
 
 def _matched(
-    guesses: Sequence[Box],
-    rights: Sequence[Box],
-    away_m: NDArray[np.float64],
-    spare_m: NDArray[np.float64],
-    least_m: float,
+    guesses: Sequence[Box], rights: Sequence[Box], away_m: Floats, spare_m: Floats, least_m: float
 ) -> tuple[Guess, ...]:
     free = away_m.copy()
     matched: list[Guess] = []
@@ -79,7 +75,7 @@ def _matched(
     return tuple(matched)
 
 
-def _curve(guesses: Sequence[Guess], n_truth: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _curve(guesses: Sequence[Guess], n_truth: int) -> tuple[Floats, Floats]:
     """Precision at `LEVELS` of recall (101,), and mean errors (3,)."""
     rows = np.array(guesses, np.float64).reshape(-1, 5)
     rows = rows[np.argsort(-rows[:, 0], kind="stable")]
@@ -100,11 +96,11 @@ def _curve(guesses: Sequence[Guess], n_truth: int) -> tuple[NDArray[np.float64],
     return at_levels, np.array([error[FIRST : last + 1].mean() for error in errors])
 
 
-def _average_precision(precision: NDArray[np.float64]) -> float:
+def _average_precision(precision: Floats) -> float:
     return float(np.maximum(precision[FIRST:] - MIN_PRECISION, 0.0).mean()) / (1.0 - MIN_PRECISION)
 
 
-def _distances(guesses: Sequence[Box], rights: Sequence[Box]) -> NDArray[np.float64]:
+def _distances(guesses: Sequence[Box], rights: Sequence[Box]) -> Floats:
     a, b = (np.array([box.center[:2] for box in part], np.float64).reshape(-1, 2) for part in (guesses, rights))
     return np.asarray(np.hypot(*(a[:, None] - b[None]).transpose(2, 0, 1)), np.float64)
 

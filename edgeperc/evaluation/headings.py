@@ -10,9 +10,9 @@ from collections.abc import Collection, Sequence
 from dataclasses import astuple, dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..tracking.tracks import Tracks
+from ..types.points import Floats
 from .tracking_metrics import FrameTruth, box_iou
 
 MOVING_MPS = 1.5  # objects with a lower speed stand
@@ -46,9 +46,9 @@ class Headings:
         return Headings(self.moving + other.moving, self.stopped + other.stopped, self.parked + other.parked)
 
 
-def speeds(truth: Sequence[FrameTruth], tracks: Sequence[Tracks]) -> list[NDArray[np.float64]]:
+def speeds(truth: Sequence[FrameTruth], tracks: Sequence[Tracks]) -> list[Floats]:
     """Speed over ground of each true box by frame [m/s], from places up to `WINDOW` frames away; NaN without others."""
-    places: list[dict[int, NDArray[np.float64]]] = []
+    places: list[dict[int, Floats]] = []
     for frame, result in zip(truth, tracks, strict=True):
         world = frame.boxes[:, :3] @ result.T_world_sensor[:3, :3].T + result.T_world_sensor[:3, 3]
         places.append(dict(zip(frame.ids.tolist(), world[:, :2], strict=True)))

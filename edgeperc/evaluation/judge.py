@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..agreement.rules import RULES
 from ..datasets.kitti import Frame, RoadFrame, scan_hash
@@ -32,7 +31,7 @@ from ..types.frame import ModelFrame
 from ..types.geometry import inside
 from ..types.mounting import MODEL_MOUNTING, Mounting
 from ..types.perception import Box, Perception, PointLabels, TopView
-from ..types.points import Labels, Points
+from ..types.points import Bytes, Floats, Labels, Mask, Points
 from ..types.sensor import SensorProfile
 from ..types.views import TopViewGeometry
 from .causes import count_causes
@@ -252,12 +251,7 @@ class Judge:
         tallies["centers",] = count_centers(predicted, to_find, ignored, truth.drive)
 
     def _count_points(
-        self,
-        tallies: dict[tuple[str, ...], Any],
-        truth: Truth,
-        predicted: PointLabels,
-        mistakes: Mistakes,
-        shown: NDArray[np.bool_],
+        self, tallies: dict[tuple[str, ...], Any], truth: Truth, predicted: PointLabels, mistakes: Mistakes, shown: Mask
     ) -> Mistakes:
         """Count labels of points, of pixels before refinement, and causes of wrong ones. Objects of classes without
         evaluated boxes count as found if at least half of their points have their label.
@@ -338,14 +332,14 @@ class Network:
         self.projector = make_projector(self.card.view, self.card.input)
         self.kind = next(output.kind for output in self.card.outputs if output.kind.startswith("class_"))
 
-    def probability(self, name: str) -> NDArray[np.float64]:
+    def probability(self, name: str) -> Floats:
         """Probability of one class in each pixel, (H, W) float64."""
         values = self.session.outputs[self.kind].astype(np.float64)
         if self.kind == "class_logits":
             values = np.exp(values - values.max(axis=0))
         return values[self.card.classes.index(name)] / values.sum(axis=0)
 
-    def point_labels(self, points: Points) -> NDArray[np.uint8]:
+    def point_labels(self, points: Points) -> Bytes:
         """Label of the pixel of each point before PointSeg's refinement, (n,) uint8; 0 out of view."""
         labels, _ = decode_classes(self.session.outputs[self.kind], self.kind, model=self.card.name)
         pixel = project(self.projector, points).pixel
@@ -374,7 +368,7 @@ def _perceiver(
     )
 
 
-def _without_vehicles(classes: tuple[str, ...], right: NDArray[np.uint8]) -> tuple[tuple[str, ...], NDArray[np.uint8]]:
+def _without_vehicles(classes: tuple[str, ...], right: Bytes) -> tuple[tuple[str, ...], Bytes]:
     """Remove vehicles from a table, for a model without vehicle classes: their cells become the first class."""
     others = tuple(name for name in classes if name not in (*VEHICLES, "vehicle"))
     number = np.full(256, IGNORE, np.uint8)
@@ -382,7 +376,7 @@ def _without_vehicles(classes: tuple[str, ...], right: NDArray[np.uint8]) -> tup
     return others, number[right]
 
 
-def renamed(labels: Labels, names: Sequence[str], classes: Sequence[str]) -> NDArray[np.uint8]:
+def renamed(labels: Labels, names: Sequence[str], classes: Sequence[str]) -> Bytes:
     """A model's labels as those of a table, whose first class stands for what it lacks; `IGNORE` stays as it is."""
     coarse = {"drivable": "road", **dict.fromkeys(VEHICLES, "vehicle")}
     renamed = [name if name in classes else coarse.get(name, "") for name in names]

@@ -12,10 +12,10 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..datasets.kitti import IMAGE_SIZE, IMAGE_SIZES, KittiCalibration, KittiLabels
 from ..types.perception import Box
+from ..types.points import Floats, Mask
 from .metrics import (
     EVERYWHERE,
     N_POSITIONS,
@@ -105,13 +105,13 @@ def count_all_round(boxes: Sequence[Box], to_find: Sequence[Box], ignored: Seque
 
 
 def _count(
-    levels: Mapping[str, tuple[NDArray[np.bool_], NDArray[np.bool_]]],
+    levels: Mapping[str, tuple[Mask, Mask]],
     boxes: Sequence[Box],
-    guess_m: NDArray[np.float64],
+    guess_m: Floats,
     objects: Sequence[ObjectKey],
     kinds: Sequence[str],
-    right_m: NDArray[np.float64],
-    overlaps: Mapping[str, NDArray[np.float64]],
+    right_m: Floats,
+    overlaps: Mapping[str, Floats],
     *also: str,
 ) -> Listed:
     """Count the matches of one scan by class, kind of overlap with its threshold, and level or range.
@@ -150,7 +150,7 @@ def best_candidates(truth: FrontTruth, candidates: Sequence[Box], drive: str) ->
 
 
 def count_matches(
-    overlaps: NDArray[np.float64],
+    overlaps: Floats,
     scores: Sequence[float],
     least_iou: float,
     objects: Sequence[ObjectKey],
@@ -243,24 +243,24 @@ def _rules(levels: Iterable[str]) -> Iterator[tuple[str, str, float, str, tuple[
             yield label, BIRDS_EYE, RANGE_IOU, band, within_m
 
 
-def _hidden(numbers: NDArray[np.float64], level: str) -> NDArray[np.bool_]:
+def _hidden(numbers: Floats, level: str) -> Mask:
     """Which objects exceed a limit of the level."""
     least_px, most_occluded, most_truncated = LEVELS[level]
     hidden = (numbers[:, 1] > most_occluded) | (numbers[:, 0] > most_truncated)
     return np.asarray(hidden | (numbers[:, 6] - numbers[:, 4] <= least_px), np.bool_)
 
 
-def _key(drive: str, kind: str, numbers: NDArray[np.float64]) -> ObjectKey:
+def _key(drive: str, kind: str, numbers: Floats) -> ObjectKey:
     height, width, length = numbers[7:10].tolist()
     return object_key(drive, Box(kind, 1.0, (0.0, 0.0, 0.0), (length, width, height), 0.0))
 
 
-def _level_rows(numbers: NDArray[np.float64]) -> NDArray[np.float64]:
+def _level_rows(numbers: Floats) -> Floats:
     """Labels (n, 7) in the camera's frame as `KittiCalibration.in_camera` returns boxes."""
     height, width, length, x, y, z, turn = numbers.T
     yaw = np.arctan2(-np.cos(turn), -np.sin(turn))
     return np.column_stack([z, -x, height / 2.0 - y, length, width, height, yaw])
 
 
-def _overlaps(a: NDArray[np.float64], b: NDArray[np.float64]) -> Mapping[str, NDArray[np.float64]]:
+def _overlaps(a: Floats, b: Floats) -> Mapping[str, Floats]:
     return dict(zip((BIRDS_EYE, IN_3D), box_overlaps(a, b), strict=True))

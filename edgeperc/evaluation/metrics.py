@@ -8,11 +8,12 @@ from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from ..errors import PointsError
 from ..types.geometry import bounding_rectangles, oriented_iou, rectangles, shared_area
 from ..types.perception import Box
+from ..types.points import Floats, Ints64, Mask
 from ..types.views import TopViewGeometry
 
 EVERYWHERE = (0.0, math.inf)
@@ -70,15 +71,15 @@ class Confusion:
         coarse.counts = member @ self.counts @ member.T
         return coarse
 
-    def precision(self) -> NDArray[np.float64]:
+    def precision(self) -> Floats:
         """Correct share of the predictions of each class, (C,) float64: P of PointSeg 5.1, equation A3 of SSADNet."""
         return _share(np.diag(self.counts), self.counts.sum(axis=0))
 
-    def recall(self) -> NDArray[np.float64]:
+    def recall(self) -> Floats:
         """Correctly predicted share of the true labels of each class, (C,) float64: R of PointSeg 5.1."""
         return _share(np.diag(self.counts), self.counts.sum(axis=1))
 
-    def iou(self) -> NDArray[np.float64]:
+    def iou(self) -> Floats:
         """Intersection over union of each class, (C,) float64: IoU of PointSeg 5.1, equation A1 of SSADNet."""
         hits = np.diag(self.counts)
         return _share(hits, self.counts.sum(axis=0) + self.counts.sum(axis=1) - hits)
@@ -111,14 +112,12 @@ def average_precision(scores: ArrayLike, hits: ArrayLike, n_truth: int) -> float
     return _eleven_points(n_right, np.arange(1, len(n_right) + 1), n_truth)
 
 
-def _eleven_points(found: NDArray[np.int64], predicted: NDArray[np.int64], n_truth: int) -> float:
+def _eleven_points(found: Ints64, predicted: Ints64, n_truth: int) -> float:
     """Eleven-point average precision; both counts are cumulative, (k,), over falling thresholds."""
     return interpolated_precision(found, predicted, n_truth, np.arange(11), 10)
 
 
-def interpolated_precision(
-    found: NDArray[np.int64], predicted: NDArray[np.int64], n_truth: int, levels: NDArray[np.int64], n_levels: int
-) -> float:
+def interpolated_precision(found: Ints64, predicted: Ints64, n_truth: int, levels: Ints64, n_levels: int) -> float:
     """Mean of the best precision at recalls ``levels / n_levels``; counts are (k,), over falling thresholds."""
     best_from_here = np.maximum.accumulate((found / np.maximum(predicted, 1))[::-1])[::-1]
     # In integers, because 0.1 * 3 > 0.3: a recall of exactly 3 in 10 must reach the level 0.3.
@@ -159,7 +158,7 @@ class ProbabilitySweep:
         n_truth = int(self.counts[1].sum())
         return _eleven_points(*self._above(), n_truth) if n_truth else float("nan")
 
-    def _above(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    def _above(self) -> tuple[Ints64, Ints64]:
         """True positives and positives, (256,) each, from the highest threshold to the lowest."""
         n_right = np.cumsum(self.counts[1, ::-1])
         return n_right, np.cumsum(self.counts.sum(axis=0)[::-1])
@@ -264,7 +263,7 @@ class BoxEvaluator:
         """Scores of the boxes of the classes ``together``, by default all, as if they were one class."""
         return self._scores(self._all, within_m)
 
-    def _rectangles(self, boxes: list[Box]) -> NDArray[np.float64]:
+    def _rectangles(self, boxes: list[Box]) -> Floats:
         rows = rectangles(boxes)
         return rows if self.oriented else bounding_rectangles(rows)
 
@@ -273,8 +272,8 @@ class BoxEvaluator:
         matches: _Matches,
         guesses: list[Box],
         rights: list[Box],
-        overlap: NDArray[np.float64],
-        excused: NDArray[np.bool_],
+        overlap: Floats,
+        excused: Mask,
         drive: str,
         labels: Collection[str] | None = None,
     ) -> list[tuple[Box | None, Box | None]]:
@@ -347,12 +346,12 @@ def boxes_to_find(
     return to_find, ignored
 
 
-def box_rows(boxes: Iterable[Box]) -> NDArray[np.float64]:
+def box_rows(boxes: Iterable[Box]) -> Floats:
     """x, y, z of the center, length, width, height, yaw, (n, 7)."""
     return np.array([(*box.center, *box.size, box.yaw) for box in boxes], np.float64).reshape(-1, 7)
 
 
-def box_overlaps(a: NDArray[np.float64], b: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def box_overlaps(a: Floats, b: Floats) -> tuple[Floats, Floats]:
     """IoU of boxes (n, 7) and (m, 7) from above and in 3-D, (n, m) each; 0 in 3-D for boxes without a finite volume."""
     flat_a, flat_b = a[:, [0, 1, 3, 4, 6]], b[:, [0, 1, 3, 4, 6]]
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -390,7 +389,7 @@ def _range_m(box: Box) -> float:
     return math.hypot(box.center[0], box.center[1])
 
 
-def _share(part: ArrayLike, whole: ArrayLike) -> NDArray[np.float64]:
+def _share(part: ArrayLike, whole: ArrayLike) -> Floats:
     """Quotient; NaN where ``whole`` is 0."""
     part, whole = np.asarray(part, dtype=np.float64), np.asarray(whole, dtype=np.float64)
     return np.divide(part, whole, out=np.full(whole.shape, np.nan), where=whole > 0.0)

@@ -10,10 +10,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..types.perception import Box
-from ..types.points import Points
+from ..types.points import Bytes, Points
 from ..view.canvas import (
     Label,
     add_axes,
@@ -37,7 +36,7 @@ class Mistakes:
     name: str
     drive: str
     points: Points  # to draw: x, y, z [m] in the sensor frame, remission
-    wrong: NDArray[np.uint8]  # 1: point of an object with another label; 2: background with that of an object
+    wrong: Bytes  # 1: point of an object with another label; 2: background with that of an object
     found: tuple[Box, ...] = ()
     missed: tuple[tuple[Box, int], ...] = ()  # with the number of points in each
     false: tuple[Box, ...] = ()  # where there is no object

@@ -10,7 +10,6 @@ from collections import Counter
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..camera.calibration import Calibration
 from ..camera.painting import UNSEEN, camera_road, paint
@@ -20,7 +19,7 @@ from ..simulation.drawn import random_scene
 from ..simulation.samples import FIRST_SEED
 from ..simulation.scene import SimulatedScan, simulate
 from ..types.perception import ImageLabels
-from ..types.points import Labels
+from ..types.points import Labels, Mask
 from ..types.sensor import SensorProfile, get_sensor
 
 EDGE_PX = 3
@@ -104,7 +103,7 @@ def count_painting(
     return Counter({name: int(np.count_nonzero(mask)) for name, mask in masks.items()})
 
 
-def beside_edges(labels: Labels) -> NDArray[np.bool_]:
+def beside_edges(labels: Labels) -> Mask:
     """Pixels with another class within `EDGE_PX` rows and columns."""
     least, most = labels.copy(), labels.copy()
     for axis in (0, 1):

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..types.choices import STATIC, VEHICLES
-from ..types.points import Labels
+from ..types.points import Bytes, Labels
 from .causes import BUMPER, CAUSES, FLOOR
 from .center_ap import CLASSES, center_scores
 from .kitti_ap import average_precisions
@@ -56,11 +56,7 @@ def within(range_m: Any, within_m: tuple[float, float]) -> Any:
 
 
 def banded(
-    table: tuple[str, ...],
-    classes: tuple[str, ...],
-    labels: Labels,
-    right: NDArray[np.uint8],
-    range_m: NDArray[Any],
+    table: tuple[str, ...], classes: tuple[str, ...], labels: Labels, right: Bytes, range_m: NDArray[Any]
 ) -> dict[tuple[str, ...], Confusion]:
     """A confusion matrix for each band of distance, by ``(*table, band)``; a true class of 255 is not counted."""
     known = right != 255

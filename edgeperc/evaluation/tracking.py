@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..datasets.kitti import IMAGE_SIZE, KittiCalibration, KittiObjects, wrong_in_label
 from ..errors import TrackingError
@@ -23,6 +22,7 @@ from ..tracking.tracker import Tracker
 from ..tracking.tracks import ClassParameters, Tracks
 from ..types.choices import VEHICLES
 from ..types.perception import Box
+from ..types.points import Floats, Ints64, Mask
 from .ab3dmot import SETTINGS, Ab3dmot
 from .headings import FRAME_S, Headings, count_headings
 from .judge import check_unseen, training_scans_of
@@ -53,9 +53,9 @@ class TrackingSequence:
 
     name: str
     detections: tuple[tuple[Box, ...], ...]  # of all classes, in the sensor frame; scores are in 0..1
-    image_boxes: tuple[NDArray[np.float64], ...]  # left, top, right, bottom [px] of each detection, (k, 4)
+    image_boxes: tuple[Floats, ...]  # left, top, right, bottom [px] of each detection, (k, 4)
     truth: Mapping[str, tuple[FrameTruth, ...]]  # by class
-    unlabeled: tuple[NDArray[np.float64], ...]  # left, top, right, bottom [px] of regions without labels, (k, 4)
+    unlabeled: tuple[Floats, ...]  # left, top, right, bottom [px] of regions without labels, (k, 4)
     calibration: KittiCalibration
 
 
@@ -63,11 +63,11 @@ class TrackingSequence:
 class FrameResult:
     """What a tracker reports for one frame."""
 
-    ids: NDArray[np.int64]  # (n,)
+    ids: Ints64  # (n,)
     labels: Sequence[str]
-    boxes: NDArray[np.float64]  # (n, 7), in the sensor frame
-    scores: NDArray[np.float64]  # log odds, or others: only their order and their mean over a track's frames matter
-    sources: NDArray[np.int64]  # index of the detection of this frame; -1 for none
+    boxes: Floats  # (n, 7), in the sensor frame
+    scores: Floats  # log odds, or others: only their order and their mean over a track's frames matter
+    sources: Ints64  # index of the detection of this frame; -1 for none
 
     @classmethod
     def of(cls, tracks: Tracks) -> FrameResult:
@@ -128,7 +128,7 @@ def _labels(root: Path, name: str) -> tuple[Path, list[list[str]], KittiCalibrat
     return path, lines, KittiCalibration.read(root / "training/calib" / f"{stem}.txt")
 
 
-def _values(labels: Sequence[Sequence[str]], path: Path) -> NDArray[np.float64]:
+def _values(labels: Sequence[Sequence[str]], path: Path) -> Floats:
     """The numbers of labels: frame, track, and the 14 of an object."""
     try:
         values = np.array([[*columns[:2], *columns[3:17]] for columns in labels], np.float64).reshape(-1, 16)
@@ -196,10 +196,10 @@ def read_sequence(
 
 def _read_detections(
     root: Path, name: str, classes: Sequence[str], calibration: KittiCalibration, n_frames: int
-) -> tuple[list[list[Box]], list[NDArray[np.float64]]]:
+) -> tuple[list[list[Box]], list[Floats]]:
     """Detections and image rectangles by frame: frame, type, rectangle, logit, h, w, l, x, y, z, turn, alpha."""
     detections: list[list[Box]] = [[] for _ in range(n_frames)]
-    image_boxes: list[list[NDArray[np.float64]]] = [[] for _ in range(n_frames)]
+    image_boxes: list[list[Floats]] = [[] for _ in range(n_frames)]
     for label in classes:
         folders = sorted((root / "detections").glob(f"*_{label.capitalize()}"))
         if not folders:
@@ -269,7 +269,7 @@ def _frame_truth(sequence: TrackingSequence, label: str, rules: str) -> Sequence
 def _frame_tracks(sequence: TrackingSequence, results: Sequence[FrameResult], of: str, rules: str) -> list[FrameTracks]:
     """Convert the tracks of one class for the metrics, by frame."""
     frames = []
-    last: dict[int, NDArray[np.float64]] = {}
+    last: dict[int, Floats] = {}
     for result, seen, unlabeled in zip(results, sequence.image_boxes, sequence.unlabeled, strict=True):
         mine = np.flatnonzero([label in KINDS[of] for label in result.labels])
         ids, boxes = result.ids[mine], result.boxes[mine]
@@ -284,7 +284,7 @@ def _frame_tracks(sequence: TrackingSequence, results: Sequence[FrameResult], of
     return frames
 
 
-def _excused(shown: NDArray[np.float64], unlabeled: NDArray[np.float64]) -> NDArray[np.bool_]:
+def _excused(shown: Floats, unlabeled: Floats) -> Mask:
     """Which image rectangles (n, 4) are at most 25 pixels high, or have over half of their area in DontCare."""
     low, high = shown[:, :2], shown[:, 2:]
     size = high - low

@@ -10,10 +10,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from ..errors import TrackingError
 from ..system.kernels import njit
+from ..types.points import Floats, Ints64, Mask
 from .metrics import N_POSITIONS, box_overlaps, recall_positions
 
 HOTA_ALPHAS = np.linspace(0.05, 0.95, 19)
@@ -23,19 +24,19 @@ HOTA_ALPHAS = np.linspace(0.05, 0.95, 19)
 class FrameTruth:
     """True objects of one frame."""
 
-    ids: NDArray[np.int64]  # (n,), the same in all frames
-    boxes: NDArray[np.float64]  # (n, 7)
-    ignored: NDArray[np.bool_]  # may be found but need not: occluded, truncated, or of a neighboring class
+    ids: Ints64  # (n,), the same in all frames
+    boxes: Floats  # (n, 7)
+    ignored: Mask  # may be found but need not: occluded, truncated, or of a neighboring class
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameTracks:
     """Tracks of one frame."""
 
-    ids: NDArray[np.int64]
-    boxes: NDArray[np.float64]  # (m, 7)
-    scores: NDArray[np.float64]  # the score of a track is the mean over its frames
-    excused: NDArray[np.bool_]  # no false positives: too small in the image, or in a region without labels
+    ids: Ints64
+    boxes: Floats  # (m, 7)
+    scores: Floats  # the score of a track is the mean over its frames
+    excused: Mask  # no false positives: too small in the image, or in a region without labels
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,13 +84,13 @@ class TrackingScores:
     n_objects: int  # that are not ignored in every frame
 
 
-def box_iou(a: ArrayLike, b: ArrayLike) -> NDArray[np.float64]:
+def box_iou(a: ArrayLike, b: ArrayLike) -> Floats:
     """3-D IoU (n, m) of boxes (n, 7) and (m, 7), in 0..1; 0 if a box is not finite or has no volume."""
     first, second = (np.asarray(boxes, np.float64).reshape(-1, 7) for boxes in (a, b))
     return box_overlaps(first, second)[1]
 
 
-def recall_thresholds(scores: ArrayLike, n_truth: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def recall_thresholds(scores: ArrayLike, n_truth: int) -> tuple[Floats, Floats]:
     """Scores of matches at which the recall is nearest to 1/40, 2/40 .. 1, and these recalls (AB3DMOT's protocol, after
     KITTI's). The lowest score is used for the first recall that is not reached.
     """
@@ -169,26 +170,26 @@ class _Packed:
         self.mean_score = self.averaged(scores)
         self.once_matched = np.zeros(len(self.track), np.bool_)
 
-    def averaged(self, scores: NDArray[np.float64]) -> NDArray[np.float64]:
+    def averaged(self, scores: Floats) -> Floats:
         """Mean score of each track; one term is added after the other, as in AB3DMOT's program."""
         counts = np.bincount(self.track, minlength=self.n_tracks)
         return np.asarray(np.bincount(self.track, scores, self.n_tracks) / np.maximum(counts, 1))
 
-    def matched(self, threshold: float) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    def matched(self, threshold: float) -> tuple[Ints64, Mask]:
         """Indices of the matched pairs, and which boxes of tracks are above the threshold."""
         is_scored = (self.mean_score >= threshold)[self.track]
         most = 1.0 + float(self.shapes[:, 0].max(initial=0))  # one more pair outweighs any IoU
         may = is_scored[self.column] & (self.iou >= self.iou_threshold)
         return self.assigned(np.where(may, most + self.iou, 0.0)), is_scored
 
-    def assigned(self, gain: NDArray[np.float64]) -> NDArray[np.int64]:
+    def assigned(self, gain: Floats) -> Ints64:
         """Indices of the pairs with the largest sum of gains in each frame; each box is in at most one pair."""
         pair = np.empty(len(self.truth), np.int64)
         fill_pairs(self.shapes, gain, pair)
         return pair[pair >= 0]
 
 
-def _counted(ids: Sequence[NDArray[np.int64]]) -> tuple[NDArray[np.int64], int]:
+def _counted(ids: Sequence[Ints64]) -> tuple[Ints64, int]:
     names, counted = np.unique(np.concatenate([np.zeros(0, np.int64), *ids]), return_inverse=True)
     return counted.astype(np.int64), len(names)
 
@@ -200,7 +201,7 @@ def _at_threshold(packed: Sequence[_Packed], threshold: float) -> Clear:
     return _clear(packed, threshold)[0]
 
 
-def _clear(packed: Sequence[_Packed], threshold: float) -> tuple[Clear, NDArray[np.float64]]:
+def _clear(packed: Sequence[_Packed], threshold: float) -> tuple[Clear, Floats]:
     """CLEAR-MOT of the tracks with at least this mean score, and the scores of all matches."""
     n_truth = n_found = n_false = n_missed = n_switches = n_fragments = 0
     total_overlap = 0.0
@@ -267,7 +268,7 @@ def _hota(packed: Sequence[_Packed], threshold: float) -> Hota:
 
 
 @njit(cache=True, nogil=True)
-def fill_assignment(gain: NDArray[np.float64], column: NDArray[np.int64]) -> None:
+def fill_assignment(gain: Floats, column: Ints64) -> None:
     """Write the column of each row, -1 for none, with the largest sum of gains (n, m) above 0: shortest augmenting
     paths (Jonker and Volgenant 1987) over the columns and a dummy column for each row.
     """
@@ -317,7 +318,7 @@ def fill_assignment(gain: NDArray[np.float64], column: NDArray[np.int64]) -> Non
 
 
 @njit(cache=True, nogil=True)
-def fill_pairs(shapes: NDArray[np.int64], gain: NDArray[np.float64], pair: NDArray[np.int64]) -> None:
+def fill_pairs(shapes: Ints64, gain: Floats, pair: Ints64) -> None:
     """Write the pair of each true box, -1 for none, for the largest sum of gains of each frame, of ``shapes`` (true
     boxes, tracks); gains are ordered by true box, those of 0 or less are never made.
     """
@@ -332,9 +333,7 @@ def fill_pairs(shapes: NDArray[np.int64], gain: NDArray[np.float64], pair: NDArr
 
 
 @njit(cache=True, nogil=True)
-def count_breaks(
-    truth: NDArray[np.int64], ids: NDArray[np.int64], ignored: NDArray[np.bool_], late: bool
-) -> tuple[int, int]:
+def count_breaks(truth: Ints64, ids: Ints64, ignored: Mask, late: bool) -> tuple[int, int]:
     """ID switches (different tracks in this and the previous frame) and fragments (another track than before, or after
     a gap, that goes on) of objects; ignored boxes reset both. ``late``: the last frame alone is one, too.
     """

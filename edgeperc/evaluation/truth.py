@@ -6,7 +6,6 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..datasets.kitti import ROAD_CLASSES, Frame, KittiCalibration, KittiLabels, RoadFrame
 from ..datasets.layout import numbers_of_scene
@@ -20,7 +19,7 @@ from ..types.frame import ModelFrame
 from ..types.geometry import draw_footprints, inside
 from ..types.mounting import Mounting
 from ..types.perception import Box
-from ..types.points import Labels, Points, read_only
+from ..types.points import Bytes, Floats, Labels, Mask, Points, read_only
 from ..types.views import TopViewGeometry
 from .kitti_ap import FrontTruth, image_size_of
 
@@ -28,7 +27,7 @@ GROUND_Z_M = -1.5  # height at which a cell is looked up in the camera image
 
 # Tables of the top view. Do not average them: each has its own ground truth.
 BY_BOXES, OBSERVED, EVERY_CELL = "vehicles from 3-D boxes", "observed cells", "every cell"
-Cells = dict[str, tuple[tuple[str, ...], NDArray[np.uint8]]]
+Cells = dict[str, tuple[tuple[str, ...], Bytes]]
 
 
 @dataclass(frozen=True)
@@ -42,7 +41,7 @@ class Truth:
     boxes: tuple[Box, ...]  # in the sensor frame
     returns: tuple[int, ...]  # from each box's object
     # whether objects are labeled at places (k, 3) [m] in the sensor frame
-    known: Callable[[NDArray[np.float64]], NDArray[np.bool_]]
+    known: Callable[[Floats], Mask]
     cells: Cells  # by table: classes, and the true class of each cell, `IGNORE` where unknown
     road: tuple[str, str] | None = None  # a table, and its class that is drivable
     front: FrontTruth | None = None  # KITTI's labels of the image
@@ -59,7 +58,7 @@ class Truth:
         return [*zip(self.boxes, self.returns, strict=True)]
 
 
-def kitti_truth(frame: Frame, view: TopViewGeometry | None, road: tuple[str, NDArray[np.bool_]] | None = None) -> Truth:
+def kitti_truth(frame: Frame, view: TopViewGeometry | None, road: tuple[str, Mask] | None = None) -> Truth:
     """Ground truth of a KITTI frame in the camera's field of view, outside DontCare; no cells without a view. ``road``:
     name and drivable cells of a second table, with the labeled vehicles (SSADNet 3.1.2).
     """
@@ -95,7 +94,7 @@ def folder_truth(
     boxes = model.move_boxes(frame.boxes or ())
     labels = None if frame.boxes is None and frame.point_classes is None else frame.labels(classes)
 
-    def known(places: NDArray[np.float64]) -> NDArray[np.bool_]:
+    def known(places: Floats) -> Mask:
         return frame.known_at((places[:, :3] - model.t) @ model.R)
 
     cells: Cells = {}
@@ -114,7 +113,7 @@ def folder_truth(
     )
 
 
-def road_cells(frame: ScanFrame, mounting: Mounting, view: TopViewGeometry) -> NDArray[np.uint8] | None:
+def road_cells(frame: ScanFrame, mounting: Mounting, view: TopViewGeometry) -> Bytes | None:
     """True surface of each cell of a view by the labels of points, or else polygons: index into `ROAD_CLASSES`,
     `IGNORE` where the scan did not observe it; None if the scan has no such labels.
     """
@@ -141,7 +140,7 @@ def road_cells(frame: ScanFrame, mounting: Mounting, view: TopViewGeometry) -> N
     return surface
 
 
-def cells_inside(polygons: Iterable[NDArray[np.float64]], view: TopViewGeometry) -> NDArray[np.bool_]:
+def cells_inside(polygons: Iterable[Floats], view: TopViewGeometry) -> Mask:
     """Cells whose center lies in a polygon (k, 2) of x, y [m], by the even-odd rule; (rows, columns) bool."""
     x, y = (centers.ravel() for centers in view.cell_centers())
     inside_any = np.zeros((len(x), len(y)), np.bool_)
@@ -177,14 +176,14 @@ def _front(labels: KittiLabels | None, calibration: KittiCalibration | None, dri
     return None if labels is None or calibration is None else FrontTruth(labels, calibration, image_size_of(drive))
 
 
-def _by_boxes(vehicles: NDArray[np.uint8], known: NDArray[np.bool_]) -> tuple[tuple[str, ...], NDArray[np.uint8]]:
+def _by_boxes(vehicles: Bytes, known: Mask) -> tuple[tuple[str, ...], Bytes]:
     cells = np.where(known, np.where(vehicles > 0, vehicles - 1, 0), IGNORE)
     return ("background", *VEHICLES), cells.astype(np.uint8)
 
 
 def _drawn(
-    boxes: Sequence[Box], view: TopViewGeometry, known: Callable[[NDArray[np.float64]], NDArray[np.bool_]] | None = None
-) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
+    boxes: Sequence[Box], view: TopViewGeometry, known: Callable[[Floats], Mask] | None = None
+) -> tuple[Bytes, Mask]:
     """Vehicle in each cell, index into `TOP_VIEW_CLASSES` or 0, and the known cells without an object of another class.
 
     Whether a cell is known is asked at its center near the ground.
@@ -202,5 +201,5 @@ def _drawn(
     return vehicles, clear
 
 
-def _everywhere(places: NDArray[np.float64]) -> NDArray[np.bool_]:
+def _everywhere(places: Floats) -> Mask:
     return np.ones(len(places), np.bool_)

@@ -6,12 +6,11 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..types.choices import VEHICLES
 from ..types.mounting import MODEL_HEIGHT_M, Mounting
 from ..types.perception import Box
-from ..types.points import Points
+from ..types.points import Floats, Points
 
 _SAMPLE, _REACH_M, _LEAST_M = 8192, (1.5, 40.0), 2.0  # points; their range; their height above the road
 # A sensor whose rays rise less meets a ceiling too far away to tell it from facades.
@@ -25,11 +24,7 @@ _BEHIND_M = 1.5  # how much of a vehicle may be estimated to lie behind a wall
 
 
 def find_ceiling(points: Points, eye_m: float = 0.0) -> float | None:
-    """Height of a ceiling above the road [m]; None if most rays that rise do not end at one height all around.
-
-    points : (n, 4) float32 in the frame of the models; rows that are not finite are skipped.
-    eye_m : z of the sensor [m].
-    """
+    """Height of a ceiling above the road [m]; None if most rays that rise do not end at one height all around."""
     x, y, z = points[:: (len(points) // _SAMPLE) | 1, :3].astype(np.float64).T
     with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
         across_m = np.hypot(x, y)
@@ -52,12 +47,8 @@ def find_ceiling(points: Points, eye_m: float = 0.0) -> float | None:
 
 
 def without_impossible(boxes: Sequence[Box], points: Points, mounting: Mounting) -> tuple[Box, ...]:
-    """The boxes without vehicles around the sensor, and without those that do not fit between a ceiling and walls.
-
-    What is taken for them is the own vehicle, a small garage, or beams, pipes and walls.
-
-    points : (n, 4) float32 in the frame of the models.
-    mounting : of the sensor. Below one on a pole, vehicles pass.
+    """The boxes without vehicles around the sensor, unless it is on a pole, and without those that do not fit between a
+    ceiling and walls: the own vehicle, a small garage, beams, pipes.
     """
     eye_m = (mounting.height_m or MODEL_HEIGHT_M) - MODEL_HEIGHT_M
     tops_m = [box.center[2] + 0.5 * box.size[2] for box in boxes]
@@ -87,13 +78,13 @@ def _is_around(box: Box) -> bool:
 _DIRECTIONS = np.stack([np.cos(np.arange(32) * np.pi / 16.0), np.sin(np.arange(32) * np.pi / 16.0)])
 
 
-def _outline(points: Points) -> NDArray[np.float64]:
+def _outline(points: Points) -> Floats:
     """How far the points reach in each of the `_DIRECTIONS` [m]."""
     xy = points[:: (len(points) // _SAMPLE) | 1, :2].astype(np.float64)
     return (xy[np.isfinite(xy).all(axis=1)] @ _DIRECTIONS).max(axis=0)
 
 
-def _sticks_out(box: Box, outline: NDArray[np.float64]) -> bool:
+def _sticks_out(box: Box, outline: Floats) -> bool:
     """Whether a vehicle would stand partly behind the walls: a part of a wall was taken for its end."""
     cos, sin = 0.5 * math.cos(box.yaw), 0.5 * math.sin(box.yaw)
     middle = np.array(box.center[:2]) @ _DIRECTIONS

@@ -8,12 +8,11 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..errors import MountingError
 from ..types.frame import ModelFrame
 from ..types.mounting import MODEL_HEIGHT_M, MODEL_MOUNTING, Mounting
-from ..types.points import Points, read_only
+from ..types.points import Floats, Ints, Points, read_only
 from .planes import CELL_M, N_CELLS, TOLERANCE_M, fill_lowest, fit_first_plane
 
 __all__ = ["FROZEN_AFTER", "MountingEstimate", "MountingEstimator"]
@@ -229,7 +228,7 @@ class MountingEstimator:
         is_far = height_m > HIGH_M or float(np.median(scans[:, 5])) > 0.0
         return abs(height_m - MODEL_HEIGHT_M) > SAME_HEIGHT_M and (is_far or scans[:, 4].max() < _SURE_SUPPORT)
 
-    def _compared(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    def _compared(self) -> tuple[Floats, Floats, Floats]:
         """How far height, roll, pitch and yaw are from the usual ones, and by how much they may be: as streets differ,
         and twice the standard deviation.
         """
@@ -241,20 +240,20 @@ class MountingEstimator:
         return off, np.array([SAME_HEIGHT_M, SAME_ROLL_DEG, SAME_PITCH_DEG, 0.0]), sure
 
 
-def _values(mounting: Mounting) -> NDArray[np.float64]:
+def _values(mounting: Mounting) -> Floats:
     """Height, roll, pitch and yaw, (4,); NaN where they are None."""
     values = (mounting.height_m, mounting.roll_deg, mounting.pitch_deg, mounting.yaw_deg)
     return np.array([math.nan if value is None else value for value in values])
 
 
-def _filled(mounting: Mounting, values: NDArray[np.float64]) -> Mounting:
+def _filled(mounting: Mounting, values: Floats) -> Mounting:
     """The mounting with ``values`` (4,) where its own are None."""
     own = _values(mounting)
     height_m, roll_deg, pitch_deg, yaw_deg = np.where(np.isnan(own), values, own).tolist()
     return Mounting(height_m, roll_deg, pitch_deg, yaw_deg, mounting.origin_m)
 
 
-def _leveled(scan: Points, guess: Mounting, height_m: float | None) -> tuple[Mounting, float, NDArray[np.float64]]:
+def _leveled(scan: Points, guess: Mounting, height_m: float | None) -> tuple[Mounting, float, Floats]:
     """The mounting by the ground in a scan, from a first guess and a height; its support; its `_uncertainty`."""
     frame = ModelFrame(guess)
     (a, b, c), support, uncertainty = _ground_plane(read_only(frame.move(scan)), height_m)
@@ -287,7 +286,7 @@ def share_below(points: Points) -> float:
 class _Plane(NamedTuple):
     """A plane z = a x + b y + c [m]: ``abc``, and how many cells of half a meter within a reach lie on and below it."""
 
-    abc: NDArray[np.float64]
+    abc: Floats
     reach_m: float
     on: int
     below: int
@@ -302,7 +301,7 @@ class _Plane(NamedTuple):
         tilt_deg = math.degrees(math.hypot(self.abc[0], self.abc[1]))
         return self.support / (1.0 + (tilt_deg / _LEVEL_DEG) ** 2)
 
-    def is_bank(self, low: NDArray[np.float64]) -> bool:
+    def is_bank(self, low: Floats) -> bool:
         """Whether it is steep, and on one side of the lowest returns (n, 3)."""
         if self.on < _MIN_CELLS or math.degrees(math.hypot(self.abc[0], self.abc[1])) < _BANK_DEG:
             return False
@@ -311,7 +310,7 @@ class _Plane(NamedTuple):
         far = low[np.hypot(low[:, 0], low[:, 1]) > _BESIDE_M]
         return _n_sectors(self._on(far)) < _MOST_SECTORS * _n_sectors(far)
 
-    def lever(self, low: NDArray[np.float64]) -> float:
+    def lever(self, low: Floats) -> float:
         """By how much an error of the lowest returns (n, 3) on it grows towards the sensor: 1 if they surround it."""
         on = self._on(low)[:, :2]
         middle, spread = on.mean(axis=0), np.cov(on.T) + CELL_M**2 / 12.0 * np.eye(2)
@@ -326,7 +325,7 @@ class _Plane(NamedTuple):
             down = (x * self.abc[0] + y * self.abc[1] - z)[is_far] / range_m[is_far]
         return bool(len(down)) and float(np.percentile(down, _LOWEST_BEAM)) * _VOTING_M > -self.abc[2]
 
-    def _on(self, low: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _on(self, low: Floats) -> Floats:
         """Those of the lowest returns (n, 3) that are on it."""
         above = low[:, 2] - low[:, :2] @ self.abc[:2] - self.abc[2]
         return low[(np.hypot(low[:, 0], low[:, 1]) < self.reach_m) & (np.abs(above) <= TOLERANCE_M)]
@@ -336,14 +335,12 @@ class _Plane(NamedTuple):
         return self.below <= share * self.on
 
 
-def _n_sectors(xyz: NDArray[np.float64]) -> int:
+def _n_sectors(xyz: Floats) -> int:
     """How many of 16 sectors of the turn hold a point (n, 3)."""
     return len(np.unique(np.floor(np.arctan2(xyz[:, 1], xyz[:, 0]) * (_SECTORS / (2.0 * math.pi))) % _SECTORS))
 
 
-def _ground_plane(
-    scan: Points, height_m: float | None
-) -> tuple[tuple[float, float, float], float, NDArray[np.float64]]:
+def _ground_plane(scan: Points, height_m: float | None) -> tuple[tuple[float, float, float], float, Floats]:
     """a, b, c of the ground z = a x + b y + c [m] around the sensor, near a given height below it or at any; how many
     more cells lie on it than below; the `_uncertainty`.
     """
@@ -367,7 +364,7 @@ def _ground_near(points: Points) -> _Plane | None:
     return _near_plane(scan, lowest, low, _STARTS_M)
 
 
-def _lowest_returns(scan: Points) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.float64]]:
+def _lowest_returns(scan: Points) -> tuple[Ints, Ints, Floats]:
     """The cell of each point, the row of the lowest point in each cell, and these points (n, 3)."""
     cell = np.empty(len(scan), np.int32)
     lowest = np.empty((N_CELLS, N_CELLS), np.int32)
@@ -375,9 +372,7 @@ def _lowest_returns(scan: Points) -> tuple[NDArray[np.int32], NDArray[np.int32],
     return cell, lowest, scan[lowest[lowest >= 0], :3].astype(np.float64)
 
 
-def _near_plane(
-    scan: Points, lowest: NDArray[np.int32], low: NDArray[np.float64], starts_m: Sequence[float]
-) -> _Plane | None:
+def _near_plane(scan: Points, lowest: Ints, low: Floats, starts_m: Sequence[float]) -> _Plane | None:
     """The ground within 12 m, from several heights above it."""
     planes = [plane for plane in _planes(scan, lowest, low, starts_m, _VOTING_M) if plane.is_lowest()]
     near = max(planes, key=lambda plane: plane.support, default=None)
@@ -386,8 +381,8 @@ def _near_plane(
 
 def _lowest_plane(
     scan: Points,
-    lowest: NDArray[np.int32],
-    low: NDArray[np.float64],
+    lowest: Ints,
+    low: Floats,
     starts_m: Sequence[float],
     far_starts_m: Sequence[float],
     high_m: float = HIGH_M,
@@ -405,9 +400,7 @@ def _lowest_plane(
     return far if is_outvoted else near
 
 
-def _far_plane(
-    scan: Points, lowest: NDArray[np.int32], low: NDArray[np.float64], starts_m: Sequence[float]
-) -> _Plane | None:
+def _far_plane(scan: Points, lowest: Ints, low: Floats, starts_m: Sequence[float]) -> _Plane | None:
     """The ground in the least reach that shows it."""
     seen = []
     for reach_m in _FAR_REACHES_M:
@@ -419,9 +412,7 @@ def _far_plane(
     return max(seen, key=lambda plane: plane.level_support, default=None)
 
 
-def _planes(
-    scan: Points, lowest: NDArray[np.int32], low: NDArray[np.float64], starts_m: Sequence[float], reach_m: float
-) -> Iterator[_Plane]:
+def _planes(scan: Points, lowest: Ints, low: Floats, starts_m: Sequence[float], reach_m: float) -> Iterator[_Plane]:
     """The plane near each of several heights below the origin, if there is one with support."""
     for start in starts_m:
         abc = np.array([0.0, 0.0, -start])
@@ -431,14 +422,14 @@ def _planes(
                 yield plane
 
 
-def _counted(abc: NDArray[np.float64], low: NDArray[np.float64], reach_m: float) -> _Plane:
+def _counted(abc: Floats, low: Floats, reach_m: float) -> _Plane:
     """The plane with the lowest returns (n, 3) that are on and below it."""
     within = low[np.hypot(low[:, 0], low[:, 1]) < reach_m]
     above = within[:, 2] - within[:, :2] @ abc[:2] - abc[2]
     return _Plane(abc, reach_m, int((np.abs(above) <= TOLERANCE_M).sum()), int((above < -TOLERANCE_M).sum()))
 
 
-def _refined(scan: Points, cell: NDArray[np.int32], plane: NDArray[np.float64]) -> NDArray[np.float64]:
+def _refined(scan: Points, cell: Ints, plane: Floats) -> Floats:
     """The plane by least squares in the corridor that the vehicle stands on."""
     across, along = _CORRIDOR_M
     # Half the time of taking the columns row by row.
@@ -459,9 +450,7 @@ def _refined(scan: Points, cell: NDArray[np.int32], plane: NDArray[np.float64]) 
     return plane
 
 
-def _uncertainty(
-    scan: Points, lowest: NDArray[np.int32], low: NDArray[np.float64], plane: _Plane
-) -> NDArray[np.float64]:
+def _uncertainty(scan: Points, lowest: Ints, low: Floats, plane: _Plane) -> Floats:
     """Standard errors of height [m], roll and pitch [deg], (3,), by how the quarters of the ground differ in slope.
 
     Left and right show one pitch, ahead and behind one roll: of the quarters, two are independent.

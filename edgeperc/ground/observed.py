@@ -14,13 +14,12 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..errors import PointsError
 from ..system.kernels import njit
 from ..types.frame import ModelFrame
 from ..types.mounting import MODEL_MOUNTING, Mounting
-from ..types.points import Points, read_only
+from ..types.points import Bytes, Floats, Floats32, Ints, Mask, Points, read_only
 from ..types.sensor import SensorProfile
 from ..types.views import TopViewGeometry
 
@@ -68,30 +67,21 @@ MAX_REACH_M = 5.0
 
 
 class Observation(NamedTuple):
-    """What the rays of a scan say about the cells of a top view.
+    """What the rays of a scan say about the cells of a top view."""
 
-    Attributes
-    ----------
-    observed : (rows, columns) bool
-        Cells with a return at most 2 m above the ground, and cells between two connected returns on the ground that
-        the ray to the farther one passes at most `CLEARANCE_M` above the ground.
-    between_beams : (rows, columns) bool
-        Cells that are not observed in a gap that the spacing of the beams explains: from a return on the ground to the
-        next return of the neighboring beam, whose ray passes at most `BRIDGE_M` above the ground; and before the first
-        return, where its ray passes at most `CLEARANCE_M` above the road.
-    """
-
-    observed: NDArray[np.bool_]
-    between_beams: NDArray[np.bool_]
+    # (rows, columns) cells with a return at most 2 m above the ground, and cells between two connected returns on the
+    # ground that the ray to the farther one passes at most `CLEARANCE_M` above the ground
+    observed: Mask
+    # (rows, columns) cells that are not observed in a gap that the spacing of the beams explains: from a return on the
+    # ground to the next return of the neighboring beam, whose ray passes at most `BRIDGE_M` above the ground; and
+    # before the first return, where its ray passes at most `CLEARANCE_M` above the road
+    between_beams: Mask
 
 
 class Observer:
-    """Find the cells of a top view that a scan observed, and those between two beams.
+    """Find the cells of a top view that a scan observed, and those between two beams; one instance per thread.
 
-    Tables and scratch are made once and reused between calls, so use one instance per thread.
-
-    sensor : its columns and beams. Sectors are at least 0.4 degrees wide, and at least two columns, so that a missing
-        return leaves no gap.
+    Sectors are at least 0.4 degrees and two columns of the sensor wide, so that a missing return leaves no gap.
     """
 
     def __init__(self, view: TopViewGeometry, sensor: SensorProfile) -> None:
@@ -136,42 +126,24 @@ class Observer:
         # A direction of the models' frame has this much more gradient in the frame of the sensor.
         self._tilt = ModelFrame(mounting).R[:2, 2] @ self.ahead
 
-    def observe(self, points: Points, index: NDArray[np.int32], mounting: Mounting = MODEL_MOUNTING) -> Observation:
+    def observe(self, points: Points, index: Ints, mounting: Mounting = MODEL_MOUNTING) -> Observation:
         """Find the observed cells, and those between two beams.
 
-        Parameters
-        ----------
-        points : (n, 4) float32
-            x, y, z [m] in the sensor frame with the road at z = -1.73 m, to within 0.6 m, and remission. May be empty;
-            rows that are not finite are ignored.
-        index : (rows, columns) int32
-            Highest point of each cell, -1 without one (`TopViewProjector`).
-        mounting : Mounting
-            The one with which the scan was moved: its height is that of the beams above the road, its tilt tells which
-            beam a ray belongs to. Below 0.5 m, 1.73 m is used: either the origin of the points is not at the beams, or
-            the rays are so flat that this only connects fewer returns.
+        points : with the road at z = -1.73 m, to within 0.6 m.
+        index : highest point of each cell, -1 without one (`TopViewProjector`).
+        mounting : its height is that of the beams above the road, its tilt tells which beam a ray belongs to. Below 0.5
+            m, 1.73 m is used: either the origin of the points is not at the beams, or the rays are so flat that this
+            only connects fewer returns.
 
-        Returns
-        -------
-        Observation
-
-        Raises
-        ------
-        PointsError
-            An array has another shape or dtype.
-
-        Notes
-        -----
         Each sector is followed outwards, by the lowest return of each ring of two cells' width. A return is on the
         ground if the line from the last return on the ground is level: it rises or falls by at most 0.1 m and 10 % of
         the distance, with at most 0.6 m in total. The line begins on the road below the sensor. Two returns are
         connected if one beam at most has no return between them, and no return lies below the line: then the ground
-        between them is that line. Cells behind objects are observed only if rays pass beside them or above them. Cells
-        beyond the last return are not observed.
+        between them is that line. Cells behind objects are observed only if rays pass beside them or above them.
 
-        A gap is bridged up to the next return, on the ground or on what stands there, but not beyond an object. Which
-        beam is next is read from the profile's elevations at the gradient of the last return on the ground, to within
-        1 degree. The ground before the first return is bridged for any beam: there the vehicle itself hides the ground.
+        A gap is bridged up to the next return, but not beyond an object. Which beam is next is read from the profile's
+        elevations at the gradient of the last return on the ground, to within 1 degree. The ground before the first
+        return is bridged for any beam: there the vehicle itself hides the ground.
         """
         if points.ndim != 2 or points.shape[1] != 4 or points.dtype != np.float32:
             raise PointsError(f"points are {points.shape} {points.dtype}; expected (n, 4) float32")
@@ -195,20 +167,12 @@ def beams_above_m(mounting: Mounting) -> float:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def fill_lowest_returns(
-    points: Points,
-    bounds: NDArray[np.float64],
-    grid: NDArray[np.float64],
-    lowest: NDArray[np.float32],
-) -> None:
-    """Write the lowest return of each bin of the polar grid.
+def fill_lowest_returns(points: Points, bounds: Floats, grid: Floats, lowest: Floats32) -> None:
+    """Write the z of the lowest return of each bin of the polar grid, infinite without one.
 
-    points : (n, 4) float32, C-contiguous
-    bounds : (2, 2) float64; lowest and highest x, and y, of the points that are used [m].
-    grid : (3,) float64; pseudo-azimuth of the first sector's edge, sectors per unit of pseudo-azimuth, width of a
-        ring [m]. The pseudo-azimuth is y / (|x| + |y|), unfolded to -2..2. It increases with the azimuth, and needs
-        no trigonometry.
-    lowest : (sectors, rings) float32, overwritten; z [m]; infinite without a return.
+    bounds : lowest and highest x, and y, of the points that are used [m].
+    grid : pseudo-azimuth of the first sector's edge, sectors per unit of it, width of a ring [m]. The pseudo-azimuth is
+        y / (|x| + |y|), unfolded to -2..2: it increases with the azimuth, and needs no trigonometry.
     """
     lowest[:] = np.float32(math.inf)
     n_sectors, n_rings = lowest.shape
@@ -233,28 +197,16 @@ def fill_lowest_returns(
 
 
 @njit(cache=True, nogil=True)
-def follow_rays(
-    lowest: NDArray[np.float32],
-    rays: NDArray[np.float64],
-    steps: NDArray[np.float64],
-    tilt: NDArray[np.float64],
-    level: NDArray[np.float32],
-    state: NDArray[np.uint8],
-) -> None:
-    """Follow the ground outwards in every sector.
+def follow_rays(lowest: Floats32, rays: Floats, steps: Floats, tilt: Floats, level: Floats32, state: Bytes) -> None:
+    """Follow the ground outwards in every sector; parameters (sectors, rings) unless stated otherwise.
 
-    lowest : (sectors, rings) float32; from `fill_lowest_returns`.
-    rays : (4,) float64; width of a ring [m]; z of the beams [m], from which all rays start; dz / dx of the lowest
-        beam; largest difference of the gradients of two connected returns.
-    steps : (n,) float64; largest difference of the gradients of two neighboring beams, by the bin of the lower one's
-        gradient.
-    tilt : (sectors,) float64; what a gradient is more in the frame of the sensor.
-    level : (sectors, rings) float32, overwritten; z of the ground [m]: on the line between two returns on the ground;
-        that of the last one beyond it.
-    state : (sectors, rings) uint8, overwritten; `SEEN`: bins with a return below `OVERHEAD_M`, and bins between two
-        connected returns that the ray to the farther one passes at most `CLEARANCE_M` above the ground. `BETWEEN`:
-        other bins of a gap that is bridged. `PASSED`: bins of a longer gap that a ray passes as closely as observed
-        ones.
+    rays : (4,) width of a ring [m]; z of the beams [m], from which all rays start; dz / dx of the lowest beam; largest
+        difference of the gradients of two connected returns.
+    steps : (n,) largest difference of the gradients of two neighboring beams, by the bin of the lower one's gradient.
+    tilt : (sectors,) what a gradient is more in the frame of the sensor.
+    level : overwritten; z of the ground [m], on the line between two returns on the ground or that of the last one.
+    state : overwritten; `SEEN`: observed (`Observer.observe`); `BETWEEN`: other bins of a gap that is bridged;
+        `PASSED`: bins of a longer gap that a ray passes as closely as observed ones.
     """
     n_sectors, n_rings = lowest.shape
     ring_m, z_beams, first_gradient, max_apart = rays[0], rays[1], rays[2], rays[3]
@@ -302,23 +254,11 @@ def follow_rays(
 
 @njit(cache=True, nogil=True)
 def mark_cells(
-    points: Points,
-    index: NDArray[np.int32],
-    bin_of_cell: NDArray[np.int32],
-    level: NDArray[np.float32],
-    state: NDArray[np.uint8],
-    observed: NDArray[np.bool_],
-    between: NDArray[np.bool_],
+    points: Points, index: Ints, bin_of_cell: Ints, level: Floats32, state: Bytes, observed: Mask, between: Mask
 ) -> None:
-    """Mark the observed cells of a top view, and those between two beams.
-
-    points : (n, 4) float32, C-contiguous
-    index : (rows, columns) int32, C-contiguous; highest point of each cell, -1 without one.
-    bin_of_cell : (rows * columns,) int32; flat bin of each cell's center.
-    level : (sectors, rings) float32, C-contiguous
-    state : (sectors, rings) uint8, C-contiguous
-    observed, between : (rows, columns) bool, C-contiguous, overwritten; `PASSED` bins are between two beams where
-        both neighboring sectors are `SEEN` or `BETWEEN`: returns of a single sector are missing.
+    """Mark the observed cells of a top view, and those between two beams, by the bin of each cell's center. `PASSED`
+    bins are between two beams where both neighboring sectors are `SEEN` or `BETWEEN`: returns of a single sector are
+    missing.
     """
     highest, z_ground, state_of_bin = index.reshape(-1), level.reshape(-1), state.reshape(-1)
     is_observed, is_between = observed.reshape(-1), between.reshape(-1)

@@ -13,13 +13,12 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..errors import PointsError
 from ..system.draws import drawn_of, next_draw
 from ..system.kernels import njit
 from ..types.perception import GroundSurface
-from ..types.points import Heights, Mask, Points, Rows, read_only
+from ..types.points import Floats, Floats32, Heights, Ints, Mask, Points, Rows, read_only
 
 # 256 x 256 cells of half a meter, in 16 x 16 regions of 16 x 16 cells. Farther out, few rays meet the ground.
 CELL_M = 0.5
@@ -137,30 +136,15 @@ def find_ground(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GroundFit:
-    """Planes of the ground below a scan, the first half of `find_ground`; `heights` is the second.
+    """Planes of the ground below a scan, the first half of `find_ground`; `heights` is the second."""
 
-    Attributes
-    ----------
-    points : (n, 4) float32
-        The scan; not a copy.
-    cell : (n,) int32
-        Cell of each point.
-    lowest : (N_CELLS, N_CELLS) int32
-        Row of the lowest point in each cell.
-    plane : (3,) float64
-        a, b, c around the vehicle.
-    planes : (N_REGIONS, N_REGIONS, 3) float64 or None
-        Of each region; None if there is the first plane only.
-    found : bool
-        Whether there is ground.
-    """
-
-    points: Points
-    cell: NDArray[np.int32]
-    lowest: NDArray[np.int32]
-    plane: NDArray[np.float64]
-    planes: NDArray[np.float64] | None
-    found: bool
+    points: Points  # (n, 4) the scan; not a copy
+    cell: Ints  # (n,) cell of each point
+    lowest: Ints  # (N_CELLS, N_CELLS) row of the lowest point in each cell
+    plane: Floats  # (3,) a, b, c around the vehicle
+    # (N_REGIONS, N_REGIONS, 3) of each region; None if there is the first plane only
+    planes: Floats | None
+    found: bool  # whether there is ground
 
     def heights(self, rows: Rows | None = None, *, max_height_m: float = 0.125) -> Ground:
         """The ground of the points in some rows, or of all; parameters and errors as in `find_ground`."""
@@ -192,24 +176,9 @@ class GroundFit:
 def heights_above(ground: GroundSurface | None, points: Points, *, max_height_m: float = 0.125) -> Ground:
     """Heights of any points above the ground that a scan showed.
 
-    Parameters
-    ----------
-    ground : GroundSurface or None
-        `edgeperc.Perception.ground`. None: the points are a scan, and show the ground themselves.
-    points : (n, 3 or more) float32
-        x, y, z [m] in the frame of the models (`edgeperc.ModelFrame`). For the scan's own points, the heights are those
-        of `find_ground`.
-    max_height_m : float
-        As in `find_ground`.
-
-    Returns
-    -------
-    Ground
-
-    Raises
-    ------
-    PointsError
-        As `find_ground`.
+    ground : `edgeperc.Perception.ground`. None: the points are a scan, and show the ground themselves.
+    points : (n, 3 or more) float32; x, y, z [m] in the frame of the models (`edgeperc.ModelFrame`). For the scan's own
+        points, the heights are those of `find_ground`.
     """
     if ground is None:
         return find_ground(points, max_height_m=max_height_m)
@@ -236,8 +205,7 @@ def fit_ground(
 ) -> GroundFit:
     """Fit the planes of the ground; parameters and errors as in `find_ground`.
 
-    any_order : whether the ground is the same for any order of the points, which takes 2 ms more. Otherwise, the
-        earlier of a cell's equally low points stands for it.
+    any_order : whether the ground is the same for any order of the points, which takes 2 ms more.
     reach_m : of the first plane; farther for a sensor so high that it sees no ground near by.
     """
     if not 0.0 < mount_height_m < math.inf:
@@ -258,11 +226,11 @@ class Sorted(NamedTuple):
     """A scan, the cell of each of its points, and the row of the lowest point in each cell."""
 
     points: Points
-    cell: NDArray[np.int32]
-    lowest: NDArray[np.int32]
+    cell: Ints
+    lowest: Ints
 
 
-def _settle_ties(points: Points, cell: NDArray[np.int32], lowest: NDArray[np.int32]) -> None:
+def _settle_ties(points: Points, cell: Ints, lowest: Ints) -> None:
     """Of a cell's equally low points, take the one with the smallest x, then y."""
     flat = lowest.reshape(-1)
     inside = np.flatnonzero(cell >= 0)
@@ -282,14 +250,8 @@ def _sorted_into_cells(points: Points) -> Sorted:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def fill_lowest(points: Points, cell: NDArray[np.int32], lowest: NDArray[np.int32]) -> None:
-    """Write every point's cell and every cell's lowest point.
-
-    points : (n, 4) float32, C-contiguous
-    cell : (n,) int32, overwritten; flat cell, x by y; -1 for points that are not finite or out of the grid.
-    lowest : (N_CELLS, N_CELLS) int32, overwritten; row of ``points``, the earlier of two equally low; -1 where there
-        is none.
-    """
+def fill_lowest(points: Points, cell: Ints, lowest: Ints) -> None:
+    """Write every point's flat cell, -1 outside, and every cell's lowest point, the first of equals, or -1."""
     flat = lowest.reshape(-1)
     values = points.reshape(-1)
     reach = np.float32(REACH_M)
@@ -322,7 +284,7 @@ def fill_lowest(points: Points, cell: NDArray[np.int32], lowest: NDArray[np.int3
 
 
 @njit(cache=True, nogil=True)
-def taken_cells(points: Points, lowest: NDArray[np.int32]) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
+def taken_cells(points: Points, lowest: Ints) -> tuple[Ints, Floats32]:
     """The flat numbers of the cells with a point, (k,), and the lowest point of each, (k, 4)."""
     flat, n = lowest.reshape(-1), 0
     taken = np.empty(len(flat) + 1, np.int32)
@@ -338,17 +300,7 @@ def taken_cells(points: Points, lowest: NDArray[np.int32]) -> tuple[NDArray[np.i
 
 
 class Patch(NamedTuple):
-    """A square of cells to which a plane is fitted.
-
-    Attributes
-    ----------
-    row, col : int
-        The first cell.
-    size : int
-        Cells along each side.
-    x, y : float
-        Origin of the plane [m].
-    """
+    """A square of cells, from row and column on, to which a plane with its origin at x, y [m] is fitted."""
 
     row: int
     col: int
@@ -358,7 +310,7 @@ class Patch(NamedTuple):
 
 
 @njit(cache=True, nogil=True)
-def fit_first_plane(points: Points, lowest: NDArray[np.int32], reach_m: float, plane: NDArray[np.float64]) -> bool:
+def fit_first_plane(points: Points, lowest: Ints, reach_m: float, plane: Floats) -> bool:
     """Replace ``plane`` (3,), the expected a, b, c, by the plane within ``reach_m``; False if there is none."""
     size = 2 * int(reach_m / CELL_M)
     start = (N_CELLS - size) // 2
@@ -381,19 +333,9 @@ def fit_first_plane(points: Points, lowest: NDArray[np.int32], reach_m: float, p
 
 
 @njit(cache=True, nogil=True)
-def fill_planes(
-    points: Points,
-    lowest: NDArray[np.int32],
-    first: NDArray[np.float64],
-    planes: NDArray[np.float64],
-) -> None:
-    """Fit every region's plane, from the middle outwards.
-
-    points : (n, 3 or more) float32, C-contiguous
-    lowest : (N_CELLS, N_CELLS) int32
-    first : (3,) float64; a, b, c around the vehicle.
-    planes : (N_REGIONS, N_REGIONS, 3) float64, overwritten; slopes along x and y, and height in the region's middle
-        [m]; the expected plane if too few cells agree.
+def fill_planes(points: Points, lowest: Ints, first: Floats, planes: Floats) -> None:
+    """Fit every region's plane, from the middle outwards: slopes along x and y, and height in the region's middle [m];
+    the expected plane if too few cells agree.
     """
     solved = np.empty((N_REGIONS, N_REGIONS))  # 1 and the cells that agree
     solved[:] = 0.0
@@ -444,18 +386,10 @@ def fill_planes(
 
 @njit(cache=True, nogil=True)
 def fill_residuals(
-    points: Points,
-    lowest: NDArray[np.int32],
-    patch: Patch,
-    expected: NDArray[np.float64],
-    band: float,
-    cone: float,
-    residuals: NDArray[np.float64],
+    points: Points, lowest: Ints, patch: Patch, expected: Floats, band: float, cone: float, residuals: Floats
 ) -> int:
-    """Write x, y from the origin and z above the expected plane of the lowest returns of a patch.
-
-    A return is skipped if it is farther from the plane than ``band`` plus ``cone`` times its distance from the origin.
-    Returns the number of columns written.
+    """Write x, y from the origin and z above the expected plane of the lowest returns of a patch; returns their number.
+    Those farther from the plane than ``band`` plus ``cone`` times their distance from the origin are skipped.
     """
     n = 0
     for row in range(patch.row, patch.row + patch.size):
@@ -474,13 +408,7 @@ def fill_residuals(
 
 @njit(cache=True, nogil=True)
 def find_plane(
-    residuals: NDArray[np.float64],
-    n: int,
-    max_slope: float,
-    max_shift: float,
-    n_hypotheses: int,
-    draw: int,
-    plane: NDArray[np.float64],
+    residuals: Floats, n: int, max_slope: float, max_shift: float, n_hypotheses: int, draw: int, plane: Floats
 ) -> None:
     """Write a, b, c of the best hypothesis into ``plane`` (3,); the first one is the expected plane, 0, 0, 0."""
     plane[:] = 0.0
@@ -510,7 +438,7 @@ def find_plane(
 
 
 @njit(cache=True, nogil=True)
-def count_support(residuals: NDArray[np.float64], n: int, a: float, b: float, c: float) -> int:
+def count_support(residuals: Floats, n: int, a: float, b: float, c: float) -> int:
     """Number of cells on the plane minus the number of cells below it."""
     x, y, z = residuals[0, :n], residuals[1, :n], residuals[2, :n]
     support = 0
@@ -521,9 +449,7 @@ def count_support(residuals: NDArray[np.float64], n: int, a: float, b: float, c:
 
 
 @njit(cache=True, nogil=True)
-def refine_plane(
-    residuals: NDArray[np.float64], n: int, prior: float, max_slope: float, max_shift: float, plane: NDArray[np.float64]
-) -> int:
+def refine_plane(residuals: Floats, n: int, prior: float, max_slope: float, max_shift: float, plane: Floats) -> int:
     """Replace ``plane`` by the least-squares plane of the cells on it; return their number, or 0 if there is no plane.
 
     ``prior`` [m2] is the weight of a slope of zero.
@@ -562,24 +488,8 @@ def refine_plane(
 
 
 @njit(cache=True, nogil=True)
-def fill_levels(
-    points: Points,
-    lowest: NDArray[np.int32],
-    planes: NDArray[np.float64],
-    rows: Rows,
-    cell: NDArray[np.int32],
-    level: NDArray[np.float32],
-) -> None:
-    """Write the height of the ground in the middle of every cell that holds one of some points.
-
-    points : (n, 3 or more) float32, C-contiguous
-    lowest : (N_CELLS, N_CELLS) int32
-    planes : (N_REGIONS, N_REGIONS, 3) float64
-    rows : (m,) int32; the points.
-    cell : (n,) int32
-    level : (N_CELLS, N_CELLS) float32, overwritten; z [m]; NaN without a point, and anything in rows of cells that no
-        point of ``rows`` is in or between.
-    """
+def fill_levels(points: Points, lowest: Ints, planes: Floats, rows: Rows, cell: Ints, level: Floats32) -> None:
+    """Write the height of the ground in the middle of every cell that holds one of the points ``rows``, else NaN."""
     # Of the points ahead, the cells behind are not needed: half of the time.
     first, last = N_CELLS - 1, 0
     for k in range(rows.shape[0]):
@@ -641,24 +551,14 @@ def fill_levels(
 def fill_heights(
     points: Points,
     rows: Rows,
-    cell: NDArray[np.int32],
-    level: NDArray[np.float32],
-    planes: NDArray[np.float64],
+    cell: Ints,
+    level: Floats32,
+    planes: Floats,
     max_height: float,
     height: Heights,
     mask: Mask,
 ) -> None:
-    """Write the heights of some points above the ground, and whether they are on the ground.
-
-    points : (n, 4) float32, C-contiguous
-    rows : (m,) int32; the points.
-    cell : (n,) int32
-    level : (N_CELLS, N_CELLS) float32
-    planes : (N_REGIONS, N_REGIONS, 3) float64
-    height : (m,) float32, overwritten; [m]; outside the grid, above the plane of the nearest region. NaN for points
-        that are not finite.
-    mask : (m,) bool, overwritten
-    """
+    """Write heights of the points ``rows`` above the ground, or the nearest region's plane, and which are on it."""
     levels, slopes = level.reshape(-1), planes.reshape(-1)
     for k in range(rows.shape[0]):
         i = rows[k]
@@ -685,12 +585,7 @@ def fill_heights(
 
 @njit(cache=True, nogil=True)
 def fill_heights_above_plane(
-    points: Points,
-    rows: Rows,
-    plane: NDArray[np.float64],
-    max_height: float,
-    height: Heights,
-    mask: Mask,
+    points: Points, rows: Rows, plane: Floats, max_height: float, height: Heights, mask: Mask
 ) -> None:
     """Write the heights of some points above z = a x + b y + c (NaN if not finite), and whether they are on it."""
     for k in range(rows.shape[0]):

@@ -14,18 +14,10 @@ from .planes import Ground
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Scan:
-    """Points in the frame of the models with the ground below them; every stage trusts it.
+    """Points in the frame of the models with the ground below them; every stage trusts it."""
 
-    Attributes
-    ----------
-    points : (n, 4) float32, C-contiguous, read-only
-        x, y, z [m], remission in 0..1; a row that is not finite is NaN.
-    ground : Ground
-        Of these points; its arrays are read-only.
-    """
-
-    points: Points
-    ground: Ground
+    points: Points  # (n, 4) x, y, z [m], remission in 0..1; a row that is not finite is NaN
+    ground: Ground  # of these points; its arrays are read-only
 
     @property
     def cloud(self) -> Cloud:
@@ -34,10 +26,7 @@ class Scan:
 
     @classmethod
     def of(cls, points: Points, ground: Ground, labels: PointLabels | None = None) -> Scan:
-        """A scan of given arrays, which are checked and not copied.
-
-        Raises PointsError.
-        """
+        """A scan of given arrays, which are checked and not copied."""
         if points.ndim != 2 or points.shape[1] < 3:
             raise PointsError(f"got points of shape {points.shape}; expected (n, 4): x, y, z, remission")
         n = len(points)

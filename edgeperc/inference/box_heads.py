@@ -13,7 +13,7 @@ from ..system.kernels import njit
 from ..types.card import N_DENSE_CHANNELS, N_FRONT_CHANNELS
 from ..types.geometry import suppress_overlaps
 from ..types.perception import Box
-from ..types.points import Labels
+from ..types.points import Floats, Floats32, Labels, Mask
 from ..types.views import TopViewGeometry
 
 STRIDE = 4  # cells of the top view behind one cell of a box_dense output, along each axis
@@ -25,9 +25,9 @@ MAX_PROBABILITY = 1.02  # rounded to bfloat16, probabilities add up to a little 
 
 
 def decode_slots(
-    slots: NDArray[np.float32],
+    slots: Floats32,
     labels: Labels,
-    scores: NDArray[np.float32],
+    scores: Floats32,
     geometry: TopViewGeometry,
     classes: Sequence[str],
     box_classes: Sequence[str],
@@ -36,20 +36,15 @@ def decode_slots(
     *,
     model: str = "the model",
 ) -> list[Box]:
-    """Decode axis-aligned boxes; each gets the class of the segmentation at its center (SSADNet 2.2.1 B).
+    """Decode axis-aligned boxes, best score first, with the class of the segmentation at their centers (SSADNet 2.2.1
+    B).
 
-    slots : (1, K, 4) or (K, 4) float32; center column, center row, extent across columns, extent along rows; shares
-        of the image's width and height, from its far left corner.
-    labels, scores : (H, W) uint8, (H, W) float32; from `decode_classes`.
-    classes : names of ``labels``.
-    box_classes : classes that boxes may have.
-    box_size_priors : class to (length, width, height) [m]; only the height is used, because the top view has none.
-    mount_height_m : height of the sensor above the road [m]; boxes stand on the road.
-    model : name for messages.
-    Returns: Best score first, the earlier slot on ties. The score is the probability of the class at the center
-        pixel. A slot is empty if an extent is below 0.5 m, if its center is out of view, or if the class there is not
-        a box class. The yaw is 0 if the longer side points ahead, else pi/2.
-    Raises InferenceError, CardMismatchError.
+    slots : (K, 4), perhaps with the batch's axis; center column, center row, extent across columns and along rows, as
+        shares of the image from its far left corner.
+    labels, scores : from `decode_classes`; the score of a box is that of its center's class.
+    Returns boxes on the road, with the height of their class's prior. A slot is empty if an extent is below 0.5 m, if
+        its center is out of view, or if the class there is not a box class. The yaw is 0 if the longer side points
+        ahead, else pi/2.
     """
     values = _slot_rows(slots, 4, box_classes, box_size_priors, model)
     height, width = geometry.height, geometry.width
@@ -68,8 +63,8 @@ def decode_slots(
 
 
 def decode_scored_slots(
-    slots: NDArray[np.float32],
-    class_output: NDArray[np.float32],
+    slots: Floats32,
+    class_output: Floats32,
     class_kind: str,
     geometry: TopViewGeometry,
     classes: Sequence[str],
@@ -81,18 +76,11 @@ def decode_scored_slots(
     iou_threshold: float = 0.2,
     model: str = "the model",
 ) -> list[Box]:
-    """Decode axis-aligned boxes with scores of their own.
+    """Decode axis-aligned boxes with scores of their own, best first; those that overlap a better one are dropped.
 
-    slots : (1, K, 5) or (K, 5) float32; center column, center row, extents as for `decode_slots`, and the logit that
-        there is an object.
+    slots : as for `decode_slots`, and the logit that there is an object. Extents are clipped to 0.2 to 40 m.
     class_output, class_kind, classes, box_classes : as for `decode_dense`; the class of a box is the one with the
         largest sum of probabilities in its footprint.
-    geometry, box_size_priors, mount_height_m : as for `decode_slots`.
-    score_threshold, iou_threshold, model : as for `decode_dense`: of the best slots, those that overlap a
-        better one are dropped.
-    Returns: Best score first, the earlier slot on ties. The yaw is 0 if the longer side points ahead, else pi/2.
-        Extents are clipped to 0.2 to 40 m.
-    Raises InferenceError, CardMismatchError.
     """
     rows = _slot_rows(slots, 5, box_classes, box_size_priors, model)
     values = _cell_values(class_output, class_kind, geometry, classes, model)
@@ -113,8 +101,8 @@ def decode_scored_slots(
 
 
 def _cell_values(
-    class_output: NDArray[np.float32], class_kind: str, geometry: TopViewGeometry, classes: Sequence[str], model: str
-) -> NDArray[np.float32]:
+    class_output: Floats32, class_kind: str, geometry: TopViewGeometry, classes: Sequence[str], model: str
+) -> Floats32:
     """The values of all classes in all cells of a view, (classes, height, width) float32."""
     values = class_values(class_output, class_kind, model)
     expected = (len(classes), geometry.height, geometry.width)
@@ -126,12 +114,12 @@ def _cell_values(
 
 
 def _slot_rows(
-    slots: NDArray[np.float32],
+    slots: Floats32,
     n_columns: int,
     box_classes: Sequence[str],
     box_size_priors: Mapping[str, tuple[float, float, float]],
     model: str,
-) -> NDArray[np.float64]:
+) -> Floats:
     """The slots of one scan (K, n_columns), checked."""
     rows = slots[0] if slots.ndim == 3 and slots.shape[0] == 1 else slots
     if rows.ndim != 2 or rows.shape[1] != n_columns:
@@ -145,7 +133,7 @@ def _slot_rows(
     return rows.astype(np.float64)
 
 
-def _slot_rectangles(slots: NDArray[np.float64], geometry: TopViewGeometry) -> NDArray[np.float64]:
+def _slot_rectangles(slots: Floats, geometry: TopViewGeometry) -> Floats:
     """x, y, length, width [m] and yaw [rad] of slots: the length is the longer side."""
     along, across = slots[:, 3] * geometry.height * geometry.cell_m, slots[:, 2] * geometry.width * geometry.cell_m
     return np.stack(
@@ -161,7 +149,7 @@ def _slot_rectangles(slots: NDArray[np.float64], geometry: TopViewGeometry) -> N
 
 
 def _standing(
-    rectangles: NDArray[np.float64],
+    rectangles: Floats,
     scores: NDArray[np.floating],
     names: Sequence[str],
     box_size_priors: Mapping[str, tuple[float, float, float]],
@@ -176,8 +164,8 @@ def _standing(
 
 
 def decode_dense(
-    dense: NDArray[np.float32],
-    class_output: NDArray[np.float32],
+    dense: Floats32,
+    class_output: Floats32,
     class_kind: str,
     geometry: TopViewGeometry,
     classes: Sequence[str],
@@ -190,55 +178,22 @@ def decode_dense(
     iou_threshold: float = 0.2,
     model: str = "the model",
 ) -> list[Box]:
-    """Decode oriented boxes from a heat map of centers and a box regressed at every cell.
+    """Decode oriented boxes from a heat map of centers, best score first, and a box regressed at every cell.
 
-    Parameters
-    ----------
-    dense : (1, C, H / 4, W / 4) or (C, H / 4, W / 4) float32
-        C is 9 or 11. Heat-map logit; center's offset from the cell's center in rows and columns [cells of this map];
-        logarithms of length and width [m]; sine and cosine of twice the yaw; center's z [m]; logarithm of the height
-        [m]. The last two are a vector (x, y) towards the front, whose component along a heading is the logit that the
-        front is there.
-    class_output : (1, C, H, W) or (C, H, W) float32
-    class_kind : {"class_logits", "class_probabilities"}
-    geometry : TopViewGeometry
-    classes : sequence of str
-        Names of the class output's channels.
-    box_classes : sequence of str
-        Classes that boxes may have.
-    box_size_priors, box_size_spreads : mapping, optional
-        Usual length, width and height [m] of each box class, and the standard deviations of their logarithms. Without
-        spreads only the segmentation decides the class.
-    score_threshold : float
-        Lowest score of a box, in 0..1.
-    named_from : float
-        Boxes with a lower score are places only: their label is empty, which saves most of the time.
-    iou_threshold : float
-        If two boxes overlap by more, the one with the lower score is dropped, even if their classes differ.
-    model : str
-        Name for messages.
+    dense : (C, H / 4, W / 4), perhaps with the batch's axis; C is 9 or 11. Heat-map logit; center's offset from the
+        cell's center in rows and columns [cells of this map]; logarithms of length and width [m]; sine and cosine of
+        twice the yaw; center's z [m]; logarithm of the height [m]. The last two are a vector (x, y) towards the front,
+        whose component along a heading is the logit that the front is there; without them the yaw is in -pi/2..pi/2 and
+        ``front`` is None.
+    box_size_priors, box_size_spreads : usual length, width and height [m] of each box class, and the standard
+        deviations of their logarithms. Without spreads only the segmentation decides the class.
+    named_from : boxes with a lower score are places only: their label is empty, which saves most of the time.
+    iou_threshold : if two boxes overlap by more, the one with the lower score is dropped, even if their classes differ.
 
-    Returns
-    -------
-    list of Box
-        Best score first; on ties the box farther ahead, then the box farther left. The score is the probability in the
-        heat map. With nine channels the yaw is in -pi/2..pi/2 and ``front`` is None: the network, like the paper's,
-        does not distinguish front and rear. With eleven the yaw points to the likelier front, and ``front`` is 0.5 or
-        more.
-
-    Raises
-    ------
-    InferenceError
-        An output holds values that are not finite.
-    CardMismatchError
-        Shapes disagree with the view or the classes.
-
-    Notes
-    -----
-    The paper reads a box's class at its center pixel of the segmentation map. Here the probabilities of the box
-    classes are summed over all pixels of the footprint and the largest sum wins (the earlier box class on ties), so
-    that one pixel, such as a hole in the roof or an edge between two classes, does not decide. With spreads, each sum
-    is multiplied by the likelihood of the measured size (log-normal): from above, vans and cars differ only in size.
+    The paper reads a box's class at its center pixel of the segmentation map. Here the probabilities of the box classes
+    are summed over all pixels of the footprint and the largest sum wins (the earlier box class on ties), so that one
+    pixel, such as a hole in the roof or an edge between two classes, does not decide. With spreads, each sum is
+    multiplied by the likelihood of the measured size (log-normal): from above, vans and cars differ only in size.
     """
     maps = dense[0] if dense.ndim == 4 and dense.shape[0] == 1 else dense
     height, width = geometry.height, geometry.width
@@ -303,13 +258,13 @@ def decode_dense(
 
 
 def _footprint_evidence(
-    values: NDArray[np.float32],
+    values: Floats32,
     class_kind: str,
-    rectangles: NDArray[np.float64],
+    rectangles: Floats,
     geometry: TopViewGeometry,
     classes: Sequence[str],
     box_classes: Sequence[str],
-) -> NDArray[np.float64]:
+) -> Floats:
     """Sums of the probabilities of each box class in each rectangle, (n, box classes)."""
     sums = np.empty((len(rectangles), len(classes)))
     x_far, y_left = geometry.x_range_m[1], geometry.y_range_m[1]
@@ -317,16 +272,14 @@ def _footprint_evidence(
     return sums[:, [list(classes).index(name) for name in box_classes]]
 
 
-def _facing(
-    yaws: NDArray[np.float64], x: NDArray[np.float64], y: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _facing(yaws: Floats, x: Floats, y: Floats) -> tuple[Floats, Floats]:
     """Yaws in -pi..pi towards the likelier fronts, and their probabilities; a logit of 0 keeps the yaw."""
     logits = np.cos(yaws) * x + np.sin(yaws) * y
     opposite = np.where(yaws > 0.0, yaws - math.pi, yaws + math.pi)
     return np.where(logits >= 0.0, yaws, opposite), 1.0 / (1.0 + np.exp(-np.abs(logits)))
 
 
-def class_values(output: NDArray[np.float32], kind: str, model: str) -> NDArray[np.float32]:
+def class_values(output: Floats32, kind: str, model: str) -> Floats32:
     """The class output of a network as (classes, H, W), checked."""
     if kind not in ("class_logits", "class_probabilities"):
         raise CardMismatchError(f"{model}: got kind {kind!r}; expected class_logits or class_probabilities")
@@ -336,7 +289,7 @@ def class_values(output: NDArray[np.float32], kind: str, model: str) -> NDArray[
     return np.ascontiguousarray(values, dtype=np.float32)
 
 
-def _check_finite(values: NDArray[np.float32], kind: str, model: str) -> None:
+def _check_finite(values: Floats32, kind: str, model: str) -> None:
     n_bad = count_not_finite(values.reshape(-1))
     if n_bad:
         raise_not_finite(n_bad, values.size, kind, model)
@@ -359,12 +312,8 @@ def _logit(probability: float) -> float:
 
 
 @njit(cache=True, nogil=True)
-def fill_scores(values: NDArray[np.float32], scores: NDArray[np.float32]) -> None:
-    """Replace every pixel's best logit by its softmax probability.
-
-    values : (C, H, W) float32, C-contiguous; finite logits.
-    scores : (H, W) float32, modified; the largest logit of each pixel.
-    """
+def fill_scores(values: Floats32, scores: Floats32) -> None:
+    """Replace every pixel's largest logit in ``scores`` by its softmax probability among ``values`` (C, H, W)."""
     n_classes, height, width = values.shape
     total = np.empty(width, np.float32)
     for row in range(height):
@@ -389,7 +338,7 @@ def fill_scores(values: NDArray[np.float32], scores: NDArray[np.float32]) -> Non
 
 
 @njit(cache=True, nogil=True)
-def count_not_finite(values: NDArray[np.float32]) -> int:
+def count_not_finite(values: Floats32) -> int:
     """Number of values (n,) that are not finite, without a temporary array."""
     n_bad = 0
     for i in range(len(values)):
@@ -398,13 +347,8 @@ def count_not_finite(values: NDArray[np.float32]) -> int:
 
 
 @njit(cache=True, nogil=True)
-def mark_peaks(heat: NDArray[np.float32], threshold: float, peak: NDArray[np.bool_]) -> None:
-    """Mark the cells that no neighbor exceeds.
-
-    heat : (H, W) float32
-    threshold : cells below it are not peaks.
-    peak : (H, W) bool, overwritten; of equal neighbors, the first one in row order is the peak.
-    """
+def mark_peaks(heat: Floats32, threshold: float, peak: Mask) -> None:
+    """Mark the cells from the threshold on that no neighbor exceeds; of equal neighbors, the first one in row order."""
     height, width = heat.shape
     for row in range(height):
         for col in range(width):
@@ -421,22 +365,14 @@ def mark_peaks(heat: NDArray[np.float32], threshold: float, peak: NDArray[np.boo
 
 @njit(cache=True, nogil=True)
 def fill_footprint_sums(
-    values: NDArray[np.float32],
-    are_logits: bool,
-    rectangles: NDArray[np.float64],
-    x_far: float,
-    y_left: float,
-    cell: float,
-    sums: NDArray[np.float64],
+    values: Floats32, are_logits: bool, rectangles: Floats, x_far: float, y_left: float, cell: float, sums: Floats
 ) -> None:
     """Sum each class's probability over the pixels whose centers lie in a rectangle.
 
-    values : (C, H, W) float32; logits or probabilities.
-    rectangles : (n, 5) float64; x, y, length, width [m], yaw [rad].
-    x_far, y_left : the view's far left corner [m].
-    cell : edge of a pixel [m].
-    sums : (n, C) float64, overwritten; a rectangle that holds no pixel center gets the nearest pixel in view. If its
-        bounds hold more than 2^18 values, only every other row and column is summed, or fewer still.
+    rectangles : (n, 5) x, y, length, width [m], yaw [rad].
+    x_far, y_left, cell : the view's far left corner, and edge of a pixel [m].
+    sums : (n, C), overwritten; a rectangle that holds no pixel center gets the nearest pixel in view. If its bounds
+        hold more than 2^18 values, only every other row and column is summed, or fewer still.
     """
     n_classes, height, width = values.shape
     pixel = np.empty(n_classes)
@@ -467,14 +403,7 @@ def fill_footprint_sums(
 
 
 @njit(cache=True, nogil=True)
-def add_probabilities(
-    values: NDArray[np.float32],
-    are_logits: bool,
-    row: int,
-    col: int,
-    pixel: NDArray[np.float64],
-    sums: NDArray[np.float64],
-) -> None:
+def add_probabilities(values: Floats32, are_logits: bool, row: int, col: int, pixel: Floats, sums: Floats) -> None:
     """Add one pixel's class probabilities to ``sums`` (C,); ``pixel`` (C,) is scratch."""
     n_classes = values.shape[0]
     best = np.float64(values[0, row, col])

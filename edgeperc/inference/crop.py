@@ -10,12 +10,11 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..ground.observed import FARTHER
 from ..system.kernels import njit
 from ..types.perception import PointLabels
-from ..types.points import Labels, Mask, Points, Rows, read_only
+from ..types.points import Bytes, Floats, Floats32, Ints, Labels, Mask, Points, Rows, read_only
 from ..types.views import RangeImageGeometry, TopViewGeometry
 
 MARGIN_M = 5.0
@@ -29,16 +28,12 @@ ROUNDING_M = 0.01  # of a point, when its scan is turned
 
 
 class Crop:
-    """Select the points that matter for some views: those between two lines, left and right.
+    """Select the points that matter for some views: those between two lines, left and right. One instance per thread.
 
-    The selected points are kept in buffers that are used again, so use one instance per thread.
-
-    views : of a range image, the sector and `MARGIN_M` beside it are kept. Of a top view, what `observed.Observer`
-        uses: up to 1.4 times as far as the view, between the directions of its sides; and 2.2 m beside it, where
-        boxes reach. Everything is kept without a view, for a sector of more than 180 degrees, and for a top view
-        alone that is not ahead of the sensor.
-    margin_m : in place of `MARGIN_M`.
-    turn_rad : by this angle the views are turned to the left.
+    Of a range image, the sector and ``margin_m`` beside it are kept. Of a top view, what `observed.Observer` uses: up
+    to 1.4 times as far as the view, between the directions of its sides; and 2.2 m beside it, where boxes reach.
+    Everything is kept without a view, for a sector of more than 180 degrees, and for a top view alone that is not ahead
+    of the sensor. ``turn_rad`` turns the views to the left.
     """
 
     def __init__(
@@ -48,7 +43,7 @@ class Crop:
         margin_m: float = MARGIN_M,
         turn_rad: float = 0.0,
     ) -> None:
-        self._lines: NDArray[np.float64] | None = None
+        self._lines: Floats | None = None
         self._rows, self._kept = np.empty(0, np.int32), np.empty((0, 4), np.float32)
         ahead = [_ahead(view) for view in views if isinstance(view, TopViewGeometry)]
         sectors = [_sector(view) for view in views if isinstance(view, RangeImageGeometry)] or ahead
@@ -61,14 +56,9 @@ class Crop:
             cos, sin = math.cos(turn_rad), math.sin(turn_rad)
             self._lines = np.column_stack([inward @ np.array([(cos, sin), (-sin, cos)]), np.min(nearest, axis=0)])
 
-    def select(self, points: Points) -> tuple[NDArray[np.float32], NDArray[np.int32] | None]:
-        """The points that matter, in their order.
-
-        points : (n, 4) float32; x, y, z [m] in the frame of the models, remission. Rows that are not finite are left
-            out.
-        Returns kept ((m, 4) float32): Overwritten by the next call, unless it is ``points``.
-        Returns rows ((m,) int32 or None): Their rows in ``points``. None if all points matter; ``kept`` is then
-            ``points``.
+    def select(self, points: Points) -> tuple[Floats32, Ints | None]:
+        """The points that matter, in their order, overwritten by the next call, and their rows in ``points``;
+        ``points`` and None if all matter. Rows that are not finite are left out.
         """
         if self._lines is None:
             return points, None
@@ -80,25 +70,17 @@ class Crop:
 
 
 def sectors_of_turn(view: RangeImageGeometry, *, whole: bool) -> list[tuple[float, Crop]]:
-    """The sectors of a full turn.
-
-    view : of the first sector.
-    whole : each sector gets all points, not only its own.
-    Returns list of (float, Crop): The angle by which each lies to the left of the first one [rad], and what selects
-        its points.
-    """
+    """The sectors of a full turn: angle of each to the left of the first [rad], and what selects its points, or all."""
     width_deg = view.azimuth_left_deg - view.azimuth_right_deg
     turns_rad = [math.radians(k * width_deg) for k in range(math.ceil(360.0 / width_deg))]
     seen = [] if whole else [view]
     return [(turn_rad, Crop(seen, margin_m=ROUNDING_M, turn_rad=turn_rad)) for turn_rad in turns_rad]
 
 
-def spread(parts: Sequence[tuple[PointLabels, NDArray[np.int32] | None]], n: int) -> PointLabels:
-    """Labels of a whole scan from those of parts of it.
+def spread(parts: Sequence[tuple[PointLabels, Ints | None]], n: int) -> PointLabels:
+    """Labels of all ``n`` points of a scan from those of parts of it, with their rows from `Crop.select`.
 
-    parts : labels of a part, and the rows of its points from `Crop.select`; None for all points. Of a point in view
-        of several parts, the label is that of the first one. Points in no part are out of view.
-    n : number of points of the scan.
+    A point in view of several parts has the label of the first one; one in no part is out of view.
     """
     first, first_rows = parts[0]
     if len(parts) == 1 and first_rows is None:
@@ -123,9 +105,7 @@ def _ahead(view: TopViewGeometry) -> tuple[float, float]:
     return max(azimuths), min(azimuths)
 
 
-def _hull(
-    view: RangeImageGeometry | TopViewGeometry, margin_m: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _hull(view: RangeImageGeometry | TopViewGeometry, margin_m: float) -> tuple[Floats, Floats]:
     """Corners of the least region that must be kept between two lines, and the margin around each [m]."""
     if isinstance(view, RangeImageGeometry):
         return np.zeros((1, 2)), np.array([margin_m])  # the sector's own edges are the directions of the lines
@@ -138,15 +118,8 @@ def _hull(
 
 
 @njit(cache=True, nogil=True)
-def fill_rows(points: Points, lines: NDArray[np.float64], rows: Rows, kept: NDArray[np.float32]) -> int:
-    """Copy the points between two lines.
-
-    points : (n, 4) float32, C-contiguous
-    lines : (2, 3) float64; a, b and c; points with a x + b y >= c for both lines are kept.
-    rows : (more than n,) int32, overwritten; rows of these points.
-    kept : (more than n, 4) float32, overwritten; these points.
-    Returns: Number of these points.
-    """
+def fill_rows(points: Points, lines: Floats, rows: Rows, kept: Floats32) -> int:
+    """Copy the points with a x + b y >= c for both lines (a, b, c), and their rows; returns their number."""
     a, b, c = lines[0]
     d, e, f = lines[1]
     n = 0
@@ -159,19 +132,9 @@ def fill_rows(points: Points, lines: NDArray[np.float64], rows: Rows, kept: NDAr
 
 
 @njit(cache=True, nogil=True)
-def fill_spread(
-    rows: Rows,
-    labels: Labels,
-    in_view: Mask,
-    all_labels: NDArray[np.uint8],
-    all_in_view: NDArray[np.bool_],
-) -> None:
+def fill_spread(rows: Rows, labels: Labels, in_view: Mask, all_labels: Bytes, all_in_view: Mask) -> None:
     """Write the labels of points in view to their rows in a whole scan.
 
-    rows : (m,) int32
-    labels : (m,) uint8
-    in_view : (m,) bool
-    all_labels : (n,) uint8, modified
     all_in_view : (n,) bool, modified; true at these rows.
     """
     for k in range(rows.shape[0]):

@@ -12,15 +12,18 @@ from ..types.card import ModelCard
 from ..types.detector import CENTER_VALUES, AnchorHead, CenterHead, PillarGeometry
 from ..types.geometry import suppress_overlaps, wrapped
 from ..types.perception import Box
+from ..types.points import Floats, Floats32, Ints64
 from .box_heads import SIZE_RANGE_M, count_not_finite, raise_not_finite
 
 BEYOND_M = 5.0
 """A box whose center is farther out of the view is dropped."""
-Values = Mapping[str, NDArray[np.float32]]
+Values = Mapping[str, Floats32]
 
 
 def decode_detections(card: ModelCard, outputs: Values, score_threshold: float) -> list[Box]:
-    """Decode the boxes of a detector on pillars.
+    """Decode the boxes of a detector on pillars from its outputs by name, in the frame of the training points, best
+    score first; of boxes that overlap by more than the card's ``nms_iou``, of one class or ``across_classes``, the
+    best.
 
     outputs : by their names, with the batch's axis or without.
     Returns: In the frame of the training points, best score first; of boxes of one class, or of one group of a center
@@ -31,7 +34,7 @@ def decode_detections(card: ModelCard, outputs: Values, score_threshold: float) 
     """
     view, head = card.view, card.head
     assert isinstance(view, PillarGeometry)
-    maps: dict[str, list[NDArray[np.float32]]] = {}
+    maps: dict[str, list[Floats32]] = {}
     for spec in card.outputs:
         values = outputs[spec.name].reshape(card.shape_of(spec)[1:])
         n_bad = count_not_finite(values.reshape(-1))
@@ -64,18 +67,9 @@ def decode_detections(card: ModelCard, outputs: Values, score_threshold: float) 
 
 
 def best_rows(
-    footprints: NDArray[np.float64],
-    scores: NDArray[np.float64],
-    names: NDArray[np.str_],
-    max_iou: float,
-    *,
-    across_classes: bool,
-) -> NDArray[np.int64]:
-    """Rows of boxes that overlap no better one by more than ``max_iou``, of the same class unless ``across_classes``.
-
-    footprints : (n, 5) float64; x, y, length, width [m], yaw [rad].
-    Returns: Best score first.
-    """
+    footprints: Floats, scores: Floats, names: NDArray[np.str_], max_iou: float, *, across_classes: bool
+) -> Ints64:
+    """Rows of boxes, best first, that overlap no better one of their class, or of any, by more than ``max_iou``."""
     if across_classes:
         return suppress_overlaps(footprints, scores, max_iou)
     kept = []
@@ -86,14 +80,14 @@ def best_rows(
     return every[np.argsort(-scores[every], kind="stable")]
 
 
-Decoded = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64], NDArray[np.float64]]
+Decoded = tuple[Floats, Floats, Ints64, Floats]
 """x, y, z, length, width, height, yaw (n, 7); scores, classes, and probabilities of the front, NaN if unknown (n,)."""
 
 
 def _anchor_boxes(maps: Values, view: PillarGeometry, head: AnchorHead, score_threshold: float) -> Decoded:
     """Boxes that start from anchors: SECOND's coding of residuals, with bins of directions."""
 
-    def per_anchor(kind: str) -> NDArray[np.float32]:
+    def per_anchor(kind: str) -> Floats32:
         values = maps[kind] if head.channels_last else np.moveaxis(maps[kind], 0, -1)
         return values.reshape(*values.shape[:2], head.n_anchors, -1)
 
@@ -126,7 +120,7 @@ def _anchor_boxes(maps: Values, view: PillarGeometry, head: AnchorHead, score_th
 
 
 def _center_boxes(
-    maps: Mapping[str, list[NDArray[np.float32]]], view: PillarGeometry, head: CenterHead, score_threshold: float
+    maps: Mapping[str, list[Floats32]], view: PillarGeometry, head: CenterHead, score_threshold: float
 ) -> Decoded:
     """Boxes at the cells of the heat maps, for each group of classes."""
     heat = np.concatenate(maps["heatmap"])
@@ -152,11 +146,9 @@ def _center_boxes(
     return rows, scores, labels, fronts
 
 
-def _values_at(
-    maps: Mapping[str, list[NDArray[np.float32]]], group: int, row: NDArray[np.int64], column: NDArray[np.int64]
-) -> dict[str, NDArray[np.float64]]:
+def _values_at(maps: Mapping[str, list[Floats32]], group: int, row: Ints64, column: Ints64) -> dict[str, Floats]:
     """Values of a group of classes at some positions, (n, values) of each part of a box."""
-    found: dict[str, NDArray[np.float64]] = {}
+    found: dict[str, Floats] = {}
     for kind, given in maps.items():
         if kind == "heatmap":
             continue
@@ -171,8 +163,8 @@ def _values_at(
 
 
 def _best(
-    raw: NDArray[np.float32], head: AnchorHead | CenterHead, score_threshold: float
-) -> tuple[tuple[NDArray[np.int64], ...], NDArray[np.int64], NDArray[np.float64]]:
+    raw: Floats32, head: AnchorHead | CenterHead, score_threshold: float
+) -> tuple[tuple[Ints64, ...], Ints64, Floats]:
     """Row, column and anchor of the best candidates of a map (rows, columns, anchors, classes), classes and scores."""
     best = raw[..., 0].copy()
     for k in range(1, raw.shape[3]):  # a third of the time of a maximum along the short axis
@@ -191,7 +183,7 @@ def _best(
     return place, raw[place].argmax(axis=1), np.clip(scores, 0.0, 1.0)
 
 
-def _positions(limits: tuple[float, float], n: int, centered: bool) -> NDArray[np.float64]:
+def _positions(limits: tuple[float, float], n: int, centered: bool) -> Floats:
     """Where anchors stand along an axis [m]."""
     low, high = limits
     if centered:
@@ -199,5 +191,5 @@ def _positions(limits: tuple[float, float], n: int, centered: bool) -> NDArray[n
     return np.linspace(low, high, n)
 
 
-def _sizes(logarithms: NDArray[np.float64]) -> NDArray[np.float64]:
+def _sizes(logarithms: Floats) -> Floats:
     return np.exp(np.clip(logarithms, *np.log(SIZE_RANGE_M)))

@@ -7,7 +7,6 @@ from dataclasses import replace
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..ground.scan import Scan
 from ..objects.boxes import join_boxes, not_among
@@ -17,6 +16,7 @@ from ..objects.cluster import PERSONS
 from ..objects.crops import MIN_COUNT, Crops, crop_candidates, fill_features, with_points
 from ..types.geometry import rectangles
 from ..types.perception import Box
+from ..types.points import Floats
 from ..types.views import ObjectGeometry
 from .session import MAX_ROWS, Session
 
@@ -102,7 +102,7 @@ class ObjectNetwork:
         kept = [replace(box, score=0.5 * box.score) for box in doubted if 0.5 * box.score >= min_score]
         return join_boxes(vehicles if by_labels else objects, [*more, *labeled, *kept])
 
-    def _look_at(self, scan: Scan, candidates: Candidates) -> NDArray[np.float64]:
+    def _look_at(self, scan: Scan, candidates: Candidates) -> Floats:
         """What the network finds at places, (n, 10), with a score of 0 where there are too few points."""
         crops = self._crop(scan, candidates)
         looks = self._look(candidates.rectangles, crops, self.closely)
@@ -112,7 +112,7 @@ class ObjectNetwork:
     def _crop(self, scan: Scan, candidates: Candidates) -> Crops:
         return crop_candidates(scan, candidates, self.view.n_points, self.view.margin_m)
 
-    def _look(self, places: NDArray[np.float64], crops: Crops, session: Session) -> NDArray[np.float64]:
+    def _look(self, places: Floats, crops: Crops, session: Session) -> Floats:
         """Run the network on rectangles (n, 5), and decode what it finds there, (n, 10)."""
         found = [np.empty((0, 10))]
         for first in range(0, len(places), MAX_ROWS):

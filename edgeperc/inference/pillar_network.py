@@ -20,10 +20,8 @@ from .session import Session
 
 
 class PillarNetwork:
-    """A detector of others: boxes from the pillars of all points in its range (PointPillars, CenterPoint).
-
-    score_threshold : lowest score of a box.
-    full_turn : run a network that looks ahead four times, on the scan turned by a quarter each.
+    """A detector of others: boxes from the pillars of all points in its range (PointPillars, CenterPoint); one that
+    looks ahead runs four times for a ``full_turn``.
     """
 
     def __init__(self, session: Session, score_threshold: float, full_turn: bool) -> None:

@@ -6,12 +6,11 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..system.kernels import njit
 from ..types.card import CHANNELS, InputSpec
 from ..types.detector import PillarGeometry
-from ..types.points import Points, read_only
+from ..types.points import Floats32, Ints, Ints64, Points, read_only
 
 # What kernels compute, by the channel's place in the card's list of all.
 AXES = 3
@@ -20,15 +19,7 @@ FROM_CENTER_X, RANGE = FROM_MEAN_X + AXES, FROM_MEAN_X + 2 * AXES
 
 
 class PillarGrid(NamedTuple):
-    """A grid of pillars as kernels take it.
-
-    Attributes
-    ----------
-    low, high : tuple of 3 float
-        Bounds along x, y and z [m].
-    cell : float
-        Edge of a pillar [m].
-    """
+    """A grid of pillars as kernels take it: bounds along x, y and z, and edge of a pillar [m]."""
 
     low: tuple[float, float, float]
     high: tuple[float, float, float]
@@ -36,21 +27,11 @@ class PillarGrid(NamedTuple):
 
 
 class Pillars(NamedTuple):
-    """The pillars of a scan, as a network takes them; only the first ones that were written are valid.
+    """The pillars of a scan, as a network takes them; only the first ones that were written are valid."""
 
-    Attributes
-    ----------
-    values : (pillars, points, channels) float32
-        0 after the last point of a pillar.
-    counts : (pillars,) int32
-        Points of each pillar.
-    places : (pillars, 4) int32
-        Batch, z, row and column of each: 0, 0, and the cell.
-    """
-
-    values: NDArray[np.float32]
-    counts: NDArray[np.int32]
-    places: NDArray[np.int32]
+    values: Floats32  # (pillars, points, channels) 0 after the last point of a pillar
+    counts: Ints  # (pillars,) points of each pillar
+    places: Ints  # (pillars, 4) batch, z, row and column of each: 0, 0, and the cell
 
 
 class Pillarizer:
@@ -59,7 +40,7 @@ class Pillarizer:
     values : (max_pillars, points, channels) float32, where their values are written; None: an array of its own.
     """
 
-    def __init__(self, view: PillarGeometry, spec: InputSpec, values: NDArray[np.float32] | None = None) -> None:
+    def __init__(self, view: PillarGeometry, spec: InputSpec, values: Floats32 | None = None) -> None:
         bounds = (view.x_range_m, view.y_range_m, view.z_range_m)
         x, y, z = ((float(low), float(high)) for low, high in bounds)
         self._grid = PillarGrid((x[0], y[0], z[0]), (x[1], y[1], z[1]), float(view.cell_m))
@@ -82,16 +63,11 @@ class Pillarizer:
 
 
 @njit(cache=True, nogil=True)
-def find_pillars(
-    points: Points, grid: PillarGrid, numbers: NDArray[np.int32], members: NDArray[np.int32], pillars: Pillars
-) -> int:
-    """Write the counts and places of pillars, in the order of their first points.
+def find_pillars(points: Points, grid: PillarGrid, numbers: Ints, members: Ints, pillars: Pillars) -> int:
+    """Write the counts and places of pillars, in the order of their first points; returns how many had room.
 
-    points : (n, 4) float32, C-contiguous; those that are not finite are in no pillar.
-    numbers : (rows, columns) int32, -1 everywhere before and after.
-    members : (pillars, points) int32, overwritten; rows of the points of each pillar, the first ones of the scan.
-    pillars : counts and places are overwritten.
-    Returns: Number of pillars, at most as many as there is room for.
+    numbers : (rows, columns) -1 everywhere before and after.
+    members : (pillars, points) overwritten; rows of the points of each pillar, the first ones of the scan.
     """
     n_rows, n_columns = numbers.shape
     # In float32 as spconv and mmcv divide: points of sensors that round lie on the edges of cells by the thousand.
@@ -124,19 +100,10 @@ def find_pillars(
 
 @njit(cache=True, nogil=True)
 def fill_pillars(
-    points: Points,
-    grid: PillarGrid,
-    channels: NDArray[np.int64],
-    scale: NDArray[np.float32],
-    members: NDArray[np.int32],
-    n: int,
-    pillars: Pillars,
+    points: Points, grid: PillarGrid, channels: Ints64, scale: Floats32, members: Ints, n: int, pillars: Pillars
 ) -> None:
-    """Write the values of the points of ``n`` pillars, after `find_pillars`.
-
-    channels : (channels,) int64; places in the card's list of channels.
-    scale : (2, channels) float32; mean and standard deviation of each.
-    pillars : values are overwritten.
+    """Write the values of the points of ``n`` pillars, after `find_pillars`; ``scale`` has mean and standard deviation
+    of each of the ``channels``, places in the card's list.
     """
     known = np.empty(RANGE + 1)
     mean, center = np.empty(AXES), np.empty(AXES)

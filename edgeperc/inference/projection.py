@@ -14,14 +14,13 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..errors import CardError, PointsError
 from ..ground.planes import find_ground
 from ..system.kernels import njit
 from ..types.card import InputSpec
 from ..types.mounting import MODEL_HEIGHT_M
-from ..types.points import Heights, Points, read_only
+from ..types.points import Floats32, Heights, Ints, Ints64, Points, read_only
 from ..types.views import RangeImageGeometry, TopViewGeometry
 
 # Number of each channel in the kernels. "height" is z; "distance" is the range in the x-y plane.
@@ -47,35 +46,18 @@ PIXEL_BLOCK = 64
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Projection:
-    """A scan projected to one view.
+    """A scan projected to one view."""
 
-    Attributes
-    ----------
-    image : (C, H, W) float32
-        The network's input: ``(raw - mean) / std`` per channel; 0 in every channel of a pixel without a return.
-    index : (H, W) int32
-        Row of the point whose values the pixel has; -1 without a return.
-    pixel : (n,) int32
-        Flat pixel ``row * W + column`` of every point, even if another point won that pixel; -1 for points that are
-        out of view, not finite or at the origin.
-    """
-
-    image: NDArray[np.float32]
-    index: NDArray[np.int32]
-    pixel: NDArray[np.int32]
+    # (C, H, W) the network's input: ``(raw - mean) / std`` per channel; 0 in every channel of a pixel without a return
+    image: Floats32
+    index: Ints  # (H, W) row of the point whose values the pixel has; -1 without a return
+    # (n,) flat pixel ``row * W + column`` of every point, even if another point won that pixel; -1 for points that are
+    # out of view, not finite or at the origin
+    pixel: Ints
 
 
 class Bounds(NamedTuple):
-    """A top view as its kernel takes it.
-
-    Attributes
-    ----------
-    x_min, x_max, y_min, y_max, z_min, z_max : float32
-        [m]
-    cells_per_m : float32
-    height, width : int32
-        Rows and columns.
-    """
+    """A top view as its kernel takes it: bounds [m], rows and columns."""
 
     x_min: np.float32
     x_max: np.float32
@@ -93,22 +75,15 @@ class Intervals(NamedTuple):
 
     Interval j holds ``edges[j] >= value > edges[j + 1]``. With ``k = int32((first - value) * cells_per_unit)`` in
     float32, j is exactly ``base[k] + (value <= split[k])``: the edges are sorted into table cells by the same rounded
-    arithmetic, and no two edges share a cell.
-
-    Attributes
-    ----------
-    first, last : float32
-        First and last edge; the last is lower than any value if it is straight behind the sensor.
-    cells_per_unit : float32
-    base : (cells + 2,) int32
-    split : (cells + 2,) float32
+    arithmetic, and no two edges share a cell. The last edge is lower than any value if it is straight behind the
+    sensor.
     """
 
     first: np.float32
     last: np.float32
     cells_per_unit: np.float32
-    base: NDArray[np.int32]
-    split: NDArray[np.float32]
+    base: Ints
+    split: Floats32
 
 
 # The kernels process points in blocks, in short loops without branches that compile to vector instructions. Only the
@@ -121,12 +96,9 @@ class Intervals(NamedTuple):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def mark_top_view(points: Points, view: Bounds, index: NDArray[np.int32], pixel: NDArray[np.int32]) -> None:
-    """Mark the highest point of each cell in ``index``, and the cell of each point in ``pixel``.
-
-    points : (n, 4) float32, C-contiguous; x, y, z [m] in the sensor frame, remission.
-    index : (height * width,) int32, overwritten; row of points; -1 without a return.
-    pixel : (n,) int32, overwritten; flat pixel of each point; -1 out of view.
+def mark_top_view(points: Points, view: Bounds, index: Ints, pixel: Ints) -> None:
+    """Mark the row of the highest point of each cell in ``index``, -1 without a return, and the flat cell of each point
+    in ``pixel``, -1 out of view.
     """
     pixel[:] = np.int32(-1)
     index[:] = np.int32(-1)
@@ -178,22 +150,20 @@ def mark_top_view(points: Points, view: Bounds, index: NDArray[np.int32], pixel:
 @njit(cache=True, nogil=True, error_model="numpy")
 def mark_range_image(
     points: Points,
-    wedge: NDArray[np.float32],
+    wedge: Floats32,
     row_table: Intervals,
     col_table: Intervals,
     width: np.int32,
-    winner: NDArray[np.int64],
-    index: NDArray[np.int32],
-    pixel: NDArray[np.int32],
+    winner: Ints64,
+    index: Ints,
+    pixel: Ints,
 ) -> None:
-    """Mark the nearest point of each pixel in ``index``, and the pixel of each point in ``pixel``.
+    """Mark the row of the nearest point of each pixel in ``index``, -1 without a return, and the flat pixel of each
+    point in ``pixel``, -1 out of view.
 
-    points : (n, 4) float32, C-contiguous; x, y, z [m] in the sensor frame, remission.
-    wedge : (4,) float32; coefficients of x, y, x, y in two sums that are not negative for any point in view: a cheap
-        test that saves the divisions for three quarters of a full turn.
-    winner : (height * width,) int64, overwritten; scratch: ``rank << 32 | row of points``, or ``EMPTY``.
-    index : (height * width,) int32, overwritten; row of points; -1 without a return.
-    pixel : (n,) int32, overwritten; flat pixel of each point; -1 out of view.
+    wedge : (4,) coefficients of x, y, x, y in two sums that are not negative for any point in view: a cheap test that
+        saves the divisions for three quarters of a full turn.
+    winner : scratch: ``rank << 32 | row of points``, or ``EMPTY``.
     """
     pixel[:] = np.int32(-1)
     winner[:] = EMPTY
@@ -269,24 +239,9 @@ def mark_range_image(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def fill_image(
-    points: Points,
-    heights: Heights,
-    index: NDArray[np.int32],
-    channels: NDArray[np.int32],
-    mean: NDArray[np.float32],
-    std: NDArray[np.float32],
-    image: NDArray[np.float32],
+    points: Points, heights: Heights, index: Ints, channels: Ints, mean: Floats32, std: Floats32, image: Floats32
 ) -> None:
-    """Write the values of the points of ``index`` into ``image``.
-
-    points : (n, 4) float32, C-contiguous
-    heights : (n,) or (0,) float32, C-contiguous; height of each point above the ground [m]; empty if no channel needs
-        it.
-    index : (pixels,) int32; row of points; -1 without a return.
-    channels : (C,) int32; values of ``CHANNEL_CODES``.
-    mean, std : (C,) float32
-    image : (C, pixels) float32, overwritten
-    """
+    """Write the values of the points of ``index`` into ``image``; ``heights`` are empty if no channel needs them."""
     values = points.reshape(-1)
     rows = np.empty(4 * PIXEL_BLOCK, np.float32)
     planes = np.empty((7, PIXEL_BLOCK), np.float32)
@@ -331,13 +286,9 @@ def fill_image(
 class TopViewProjector:
     """Project points to an image of the ground ahead (SSADNet 2.1.2). Row 0 is farthest ahead, column 0 leftmost.
 
-    Cells are half-open: a cell includes its near and right edges, not its far and left edges. The view is
-    ``x_min <= x < x_max``, ``y_min <= y < y_max`` and ``z_min <= z <= z_max``. The highest point wins a cell, the
-    earlier one on ties.
-
-    input : channels, any of ``"distance"``, sqrt(x^2 + y^2) [m] (SSADNet equation 1), ``"remission"`` and
-        ``"height"``, z [m], in any order.
-    Raises CardError.
+    Cells are half-open: a cell includes its near and right edges. The view is ``x_min <= x < x_max``, ``y_min <= y <
+    y_max`` and ``z_min <= z <= z_max``. The highest point wins a cell, the earlier one on ties. Channels, in any order:
+    ``"distance"``, sqrt(x^2 + y^2) [m] (SSADNet equation 1), ``"remission"`` and ``"height"``, z [m].
     """
 
     def __init__(self, view: TopViewGeometry, input: InputSpec) -> None:
@@ -357,24 +308,9 @@ class TopViewProjector:
             np.int32(view.width),
         )
 
-    def fill(
-        self,
-        points: Points,
-        image: NDArray[np.float32],
-        index: NDArray[np.int32],
-        pixel: NDArray[np.int32],
-        height_m: Heights | None = None,
-    ) -> None:
-        """Project into the caller's buffers.
-
-        points : (n, 4) float32, C-contiguous; x, y, z [m] in the sensor frame, remission in 0..1
-            (`condition.condition`). May be empty or read-only.
-        image : (C, H, W) float32, C-contiguous, overwritten
-        index : (H, W) int32, C-contiguous, overwritten
-        pixel : (n,) int32, C-contiguous, overwritten; as in `Projection`.
-        height_m : (n,) float32; height of each point above the ground [m] (`edgeperc.ground.planes.Ground.height_m`),
-            for the channel ``"height_above_ground"``; without this channel it is ignored.
-        Raises PointsError.
+    def fill(self, points: Points, image: Floats32, index: Ints, pixel: Ints, height_m: Heights | None = None) -> None:
+        """Project into the caller's buffers, C-contiguous as the points of `condition.condition`; ``height_m`` above
+        the ground is for the channel ``"height_above_ground"`` alone.
         """
         points = _checked(self.shape, points, image, index, pixel)
         flat_index = index.reshape(-1)
@@ -389,43 +325,23 @@ class TopViewProjector:
 
 
 class RangeImageProjector:
-    """Project points to a range image, the scan as the sensor sees it (PointSeg 3.1). Row 0 is the top beam, column 0
-    leftmost.
+    """Project points to a range image (PointSeg 3.1). Row 0 is the top beam, column 0 leftmost.
 
     A point's row is the beam with the nearest elevation; the top and the bottom row reach half a beam spacing farther
     out. Its column follows from its azimuth, atan2(y, x). Pixels are half-open: a pixel includes its upper and left
     edges. The point nearest to the sensor wins a pixel (by squared range in float32), the earlier one on ties. Points
-    on the sensor's vertical axis have no azimuth and are out of view.
+    on the sensor's vertical axis have no azimuth and are out of view. Channels, in any order: ``"x"``, ``"y"``,
+    ``"z"``, ``"remission"``, ``"range"`` and ``"height_above_ground"`` [m], the last clipped to -1..5 m. One instance
+    per thread.
 
-    Tables and scratch are made once and reused between calls, so use one instance per thread.
-
-    Parameters
-    ----------
-    view : RangeImageGeometry
-    input : InputSpec
-        Channels, any of ``"x"``, ``"y"``, ``"z"``, ``"remission"``, ``"range"`` and ``"height_above_ground"`` in any
-        order, meters. Heights above the ground are clipped to -1..5 m.
-
-    Attributes
-    ----------
-    needs_ground : bool
-        Whether a channel is the height above the ground.
-
-    Raises
-    ------
-    CardError
-        A channel is not one of these, or beams or columns lie too close to be separated.
-
-    Notes
-    -----
     PointSeg's equation 2 uses arcsin(y / sqrt(x^2 + y^2 + z^2)) as azimuth. That is arcsin(sin(azimuth) *
     cos(elevation)), which is smaller than the azimuth, and the error grows as the beam points farther down. At azimuth
     45 degrees, a beam at -24.8 degrees gets 39.9 degrees: an error of 29 of 512 columns, which would bend vertical
     edges. This module uses the true azimuth.
 
-    No angle is computed for a point. Two functions that increase with azimuth and elevation replace them:
-    y / (|x| + |y|), unfolded over the half-planes, and z / (sqrt(x^2 + y^2) + |z|). The edges of the pixels are
-    converted to the same quantities.
+    No angle is computed for a point. Two functions that increase with azimuth and elevation replace them: y / (|x| +
+    |y|), unfolded over the half-planes, and z / (sqrt(x^2 + y^2) + |z|). The edges of the pixels are converted to the
+    same quantities.
     """
 
     def __init__(self, view: RangeImageGeometry, input: InputSpec) -> None:
@@ -439,14 +355,7 @@ class RangeImageProjector:
         self._cols = tabulate(column_edges(view), "columns")
         self._winner = np.empty(view.height * view.width, np.int64)
 
-    def fill(
-        self,
-        points: Points,
-        image: NDArray[np.float32],
-        index: NDArray[np.int32],
-        pixel: NDArray[np.int32],
-        height_m: Heights | None = None,
-    ) -> None:
+    def fill(self, points: Points, image: Floats32, index: Ints, pixel: Ints, height_m: Heights | None = None) -> None:
         """Project into the caller's buffers; arguments and errors as in `TopViewProjector.fill`."""
         points = _checked(self.shape, points, image, index, pixel)
         flat_index = index.reshape(-1)
@@ -454,13 +363,7 @@ class RangeImageProjector:
         mark_range_image(points, self._wedge, self._rows, self._cols, width, self._winner, flat_index, pixel)
         self.fill_image(points, index, image, height_m)
 
-    def fill_image(
-        self,
-        points: Points,
-        index: NDArray[np.int32],
-        image: NDArray[np.float32],
-        height_m: Heights | None = None,
-    ) -> None:
+    def fill_image(self, points: Points, index: Ints, image: Floats32, height_m: Heights | None = None) -> None:
         """Write the image for a given ``index``; arguments and errors as in `TopViewProjector.fill`."""
         points = _checked(self.shape, points, image, index)
         heights = _heights(self.needs_ground, len(points), height_m)
@@ -475,16 +378,13 @@ class RangeImageProjector:
 def make_projector(
     view: TopViewGeometry | RangeImageGeometry, input: InputSpec
 ) -> TopViewProjector | RangeImageProjector:
-    """Make the projector for a model's view and input.
-
-    Raises CardError.
-    """
+    """Make the projector for a model's view and input."""
     if isinstance(view, TopViewGeometry):
         return TopViewProjector(view, input)
     return RangeImageProjector(view, input)
 
 
-def row_edges(view: RangeImageGeometry) -> NDArray[np.float32]:
+def row_edges(view: RangeImageGeometry) -> Floats32:
     """Pseudo-elevations z / (sqrt(x^2 + y^2) + |z|) of the H + 1 edges of rows, top to bottom, float32."""
     beams = np.asarray(view.row_elevations_deg, dtype=np.float64)
     middles = (beams[:-1] + beams[1:]) / 2.0
@@ -493,7 +393,7 @@ def row_edges(view: RangeImageGeometry) -> NDArray[np.float32]:
     return (np.sin(edges) / (np.abs(np.cos(edges)) + np.abs(np.sin(edges)))).astype(np.float32)
 
 
-def column_edges(view: RangeImageGeometry) -> NDArray[np.float32]:
+def column_edges(view: RangeImageGeometry) -> Floats32:
     """Pseudo-azimuths, y / (|x| + |y|) unfolded to -2..2, of the W + 1 edges of columns, left to right, float32."""
     edges = np.deg2rad(np.linspace(view.azimuth_left_deg, view.azimuth_right_deg, view.width + 1))
     x, y = np.cos(edges), np.sin(edges)
@@ -501,7 +401,7 @@ def column_edges(view: RangeImageGeometry) -> NDArray[np.float32]:
     return np.where(x >= 0.0, folded, np.copysign(2.0, edges) - folded).astype(np.float32)
 
 
-def wedge(view: RangeImageGeometry) -> NDArray[np.float32]:
+def wedge(view: RangeImageGeometry) -> Floats32:
     """Coefficients of x, y, x, y in two sums that are not negative for any point in view, (4,) float32."""
     if view.azimuth_left_deg - view.azimuth_right_deg > 179.0:
         return np.zeros(4, np.float32)
@@ -511,13 +411,8 @@ def wedge(view: RangeImageGeometry) -> NDArray[np.float32]:
     return np.array([math.sin(left), -math.cos(left), -math.sin(right), math.cos(right)], dtype=np.float32)
 
 
-def tabulate(edges: NDArray[np.float32], what: str) -> Intervals:
-    """Build tables that find the interval of a value with one comparison.
-
-    edges : (m + 1,) float32; strictly decreasing.
-    what : noun for the error message, e.g. ``"rows"``.
-    Raises CardError.
-    """
+def tabulate(edges: Floats32, what: str) -> Intervals:
+    """Build tables that find the interval of a value between strictly decreasing edges with one comparison."""
     first, last = edges[0], edges[-1]
     inner = edges[1:-1]
     cells = 64
@@ -537,9 +432,7 @@ def tabulate(edges: NDArray[np.float32], what: str) -> Intervals:
     )
 
 
-def _channels(
-    spec: InputSpec, known: tuple[str, ...]
-) -> tuple[NDArray[np.int32], NDArray[np.float32], NDArray[np.float32]]:
+def _channels(spec: InputSpec, known: tuple[str, ...]) -> tuple[Ints, Floats32, Floats32]:
     """Channel codes, means and deviations of an input, as the kernels take them."""
     unknown = [name for name in spec.channels if name not in known]
     if unknown:
@@ -549,12 +442,8 @@ def _channels(
 
 
 def _checked(
-    shape: tuple[int, int, int],
-    points: Points,
-    image: NDArray[np.float32],
-    index: NDArray[np.int32],
-    pixel: NDArray[np.int32] | None = None,
-) -> NDArray[np.float32]:
+    shape: tuple[int, int, int], points: Points, image: Floats32, index: Ints, pixel: Ints | None = None
+) -> Floats32:
     """The points as a read-only view, so that every scan runs the same compiled kernel; raises PointsError."""
     _check_points(points)
     for name, buffer, expected, dtype in (
@@ -572,7 +461,7 @@ def _checked(
     return read_only(points)
 
 
-def _heights(needed: bool, n: int, height_m: Heights | None) -> NDArray[np.float32]:
+def _heights(needed: bool, n: int, height_m: Heights | None) -> Floats32:
     """The heights as the kernel takes them; raises PointsError."""
     if not needed:
         return read_only(np.empty(0, np.float32))
@@ -596,11 +485,7 @@ def _check_points(points: Points) -> None:
         )
 
 
-def _project(
-    projector: TopViewProjector | RangeImageProjector,
-    points: Points,
-    height_m: Heights | None,
-) -> Projection:
+def _project(projector: TopViewProjector | RangeImageProjector, points: Points, height_m: Heights | None) -> Projection:
     _check_points(points)
     projection = Projection(
         image=np.empty(projector.shape, np.float32),
@@ -611,7 +496,7 @@ def _project(
     return projection
 
 
-def input_heights(projector: TopViewProjector | RangeImageProjector, points: Points) -> NDArray[np.float32] | None:
+def input_heights(projector: TopViewProjector | RangeImageProjector, points: Points) -> Floats32 | None:
     """Heights of points of the models' frame above the ground, (n,) float32 [m]; None if the projector needs none."""
     return find_ground(points, mount_height_m=MODEL_HEIGHT_M).height_m if projector.needs_ground else None
 
@@ -620,6 +505,5 @@ def project(projector: TopViewProjector | RangeImageProjector, points: Points) -
     """Project a scan and, if the projector needs it, find the ground first, as a `Perceiver` does.
 
     points : (n, 4) float32, C-contiguous; x, y, z [m] in the frame of the models, remission in 0..1.
-    Raises PointsError.
     """
     return projector.project(points, input_heights(projector, points))

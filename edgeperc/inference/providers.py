@@ -71,20 +71,14 @@ def plugin_devices(ort: Any, short: str) -> list[Any]:
 
 
 def available_providers() -> tuple[str, ...]:
-    """The providers that ``Perceiver(provider=...)`` accepts on this computer, as keys of `PROVIDERS`.
-
-    Raises MissingExtraError, ProviderError.
-    """
+    """The providers that ``Perceiver(provider=...)`` accepts on this computer, as keys of `PROVIDERS`."""
     ort = load_onnxruntime()
     stock = ort.get_available_providers()
     return tuple(s for s, name in PROVIDERS.items() if name in stock or (s in PLUGINS and plugin_devices(ort, s)))
 
 
 def runtime_version() -> str:
-    """The version of the installed onnxruntime.
-
-    Raises MissingExtraError.
-    """
+    """The version of the installed onnxruntime."""
     return str(load_onnxruntime().__version__)
 
 
@@ -92,8 +86,6 @@ def devices() -> tuple[str, ...]:
     """The devices that onnxruntime and its installed plugins offer here, such as ``"cpu: CPU Intel"``.
 
     Empty if onnxruntime is older than 1.23, which does not list them.
-
-    Raises MissingExtraError, ProviderError.
     """
     present, ort = available_providers(), load_onnxruntime()  # in this order, which loads the plugins
     found = ort.get_ep_devices() if hasattr(ort, "get_ep_devices") else ()

@@ -46,6 +46,7 @@ from ..types.card import ModelCard
 from ..types.choices import PRECISIONS
 from ..types.detector import PillarGeometry
 from ..types.onnx_file import check_graph, read_model
+from ..types.points import Floats32
 from ..types.views import CameraGeometry, ObjectGeometry
 from ..zoo import Variant, choose, digest, resolve
 from .decode import fill_pixels
@@ -366,8 +367,8 @@ class Session:
         n_rows = card.view.max_pillars if isinstance(card.view, PillarGeometry) else MAX_ROWS
         batch = np.zeros([n_rows if n is None else n for n in card.input_shape], np.float32)
         self.binding = self.inference.io_binding()
-        self.raw: dict[str, NDArray[np.float32]] = {}
-        self.outputs: dict[str, NDArray[np.float32]] = {}
+        self.raw: dict[str, Floats32] = {}
+        self.outputs: dict[str, Floats32] = {}
         self._batch = batch  # the binding holds a bare pointer
         self._pillars = isinstance(card.view, PillarGeometry)
         self._has_rows = card.input_shape[0] is None
@@ -376,7 +377,7 @@ class Session:
             self._bind_pillars(run_options)
             return
         if self._has_rows:
-            self.input: NDArray[np.float32] = batch
+            self.input: Floats32 = batch
             for output in card.outputs:
                 shape = card.output_shape(output.kind)
                 self.raw[output.kind] = self.outputs[output.kind] = np.zeros((MAX_ROWS, *shape[1:]), np.float32)
@@ -483,7 +484,7 @@ class Session:
             )
         return deviation
 
-    def run(self, n_rows: int = 1) -> Mapping[str, NDArray[np.float32]]:
+    def run(self, n_rows: int = 1) -> Mapping[str, Floats32]:
         """Run the network on `input`.
 
         ``n_rows``: of an object network, how many rows of `input`, from the first one on, hold candidates; 1 to
@@ -622,7 +623,7 @@ def golden_feed(card: ModelCard, seed: int) -> dict[str, NDArray[Any]]:
     return feed
 
 
-def golden_input(seed: int, shape: tuple[int, ...]) -> NDArray[np.float32]:
+def golden_input(seed: int, shape: tuple[int, ...]) -> Floats32:
     """The input of a card's golden record: uniform noise in -1..1, float32 of ``shape`` (`edgeperc.card.Golden`)."""
     # From raw bits: these bytes are the same on every platform and numpy version, which normal() does not promise.
     bits = np.random.PCG64(seed).random_raw(int(np.prod(shape)))

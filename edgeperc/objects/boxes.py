@@ -8,14 +8,13 @@ from dataclasses import replace
 from types import MappingProxyType
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..errors import PointsError
 from ..system.kernels import njit
 from ..types.choices import VEHICLES
 from ..types.geometry import oriented_iou, rectangles, shared_area, suppress_overlaps
 from ..types.perception import Box
-from ..types.points import Cloud, Heights, Ids, Labeled, Labels, Mask, Points, read_only
+from ..types.points import Bytes, Cloud, Floats, Heights, Ids, Ints, Labeled, Labels, Mask, Points, read_only
 from ..types.views import TopViewGeometry
 from .cluster import MIN_PERSON_SHARE, PERSONS, Groups, find_clusters, group_points, labels_of_groups
 from .persons import PERSON, UNSEEN, fill_person_groups, fill_persons
@@ -223,7 +222,7 @@ def objects_from_points(
     return join_boxes(_distinct(boxes, [MAX_OVERLAP] * len(boxes)), kept_persons)
 
 
-def _not_inside(boxes: list[Box], spans: Sequence[NDArray[np.float64]], others: Sequence[Box]) -> list[Box]:
+def _not_inside(boxes: list[Box], spans: Sequence[Floats], others: Sequence[Box]) -> list[Box]:
     """The boxes without those whose points lie mostly in a better one: glass, a mirror, the inside of a bus.
 
     ``spans`` has the rectangle around the points of each box, which is smaller than the box.
@@ -239,13 +238,9 @@ def _not_inside(boxes: list[Box], spans: Sequence[NDArray[np.float64]], others: 
     return [boxes[row] for row in np.flatnonzero(~inside.any(axis=1)).tolist()]
 
 
-def _fitted(
-    cloud: Cloud, members: NDArray[np.int32], l_shaped: bool
-) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
-    """What `fill_rectangle` finds: the rectangle, the levels and the highest point.
-
-    A vehicle is not wider than `MAX_WIDTH_M`. A wider cluster holds something beside it too: the rectangle is fitted
-    again to the points in the strip of that width that holds the most.
+def _fitted(cloud: Cloud, members: Ints, l_shaped: bool) -> tuple[Floats, Floats, float]:
+    """What `fill_rectangle` finds. A vehicle is not wider than `MAX_WIDTH_M`: in a wider cluster, which holds something
+    else too, the rectangle is fitted to the points in the strip of that width that holds the most.
     """
     for _ in range(MAX_FITS):
         rectangle, levels = np.empty(5), np.empty(len(members))
@@ -278,7 +273,7 @@ def _distinct(boxes: Sequence[Box], max_overlap: Sequence[float]) -> list[Box]:
     return [boxes[row] for row in best]
 
 
-def _roles(classes: Sequence[str]) -> NDArray[np.uint8]:
+def _roles(classes: Sequence[str]) -> Bytes:
     """For each label: `WALKS` or `RIDES` for persons, 0 for others, (256,)."""
     roles = np.zeros(256, np.uint8)
     roles[: len(classes)] = [PERSONS.get(name, 0) for name in classes[:256]]
@@ -341,10 +336,8 @@ def _persons(
 
 
 def weigh(boxes: Sequence[Box], view: TopViewGeometry, classes: Sequence[str], min_score: float) -> list[Box]:
-    """Boxes around clusters that a network of the top view has not found, with the scores that both views give them.
-
-    The score is the mean of the cluster's and that of the network, which is 0 where it sees the object. The network's
-    has the weight of the share of the footprint in its view: out of the view, the cluster's score stands. Boxes below
+    """Boxes around clusters that a network of the top view has not found, with the mean of the cluster's score and the
+    network's, 0 where it sees the object; that has the weight of the share of the footprint in its view. Boxes below
     ``min_score`` are dropped.
     """
     rows = [row for row, box in enumerate(boxes) if box.label in classes]
@@ -361,12 +354,10 @@ def weigh(boxes: Sequence[Box], view: TopViewGeometry, classes: Sequence[str], m
 
 
 def join_boxes(first: Sequence[Box], second: Sequence[Box]) -> tuple[Box, ...]:
-    """Join two lists of boxes; a box of ``second`` is dropped if ``first`` has the same object.
+    """Join two lists of boxes, best score first; a box of ``second`` is dropped if ``first`` has the same object.
 
     A person with the better score is kept, because people stand close to cars. Two boxes are one object if they overlap
     by more than 0.1 (IoU), or if more than half of one footprint lies in the other.
-
-    Returns: Best score first.
     """
     others: list[Box] = []
     same = _same_object(second, first) if first and second else np.zeros((len(second), 0), np.bool_)
@@ -383,12 +374,12 @@ def not_among(first: Sequence[Box], second: Sequence[Box]) -> list[Box]:
     return [box for row, box in enumerate(second) if row not in known]
 
 
-def _same_object(first: Sequence[Box], second: Sequence[Box]) -> NDArray[np.bool_]:
+def _same_object(first: Sequence[Box], second: Sequence[Box]) -> Mask:
     """Whether boxes of two lists are the same object, (n, m) bool."""
     a, b = rectangles(first), rectangles(second)
     overlap = oriented_iou(a, b)
     smaller = np.minimum.outer(a[:, 2] * a[:, 3], b[:, 2] * b[:, 3])
-    found: NDArray[np.bool_] = (overlap > MAX_OVERLAP) | (shared_area(overlap, a, b) > MAX_INSIDE * smaller)
+    found: Mask = (overlap > MAX_OVERLAP) | (shared_area(overlap, a, b) > MAX_INSIDE * smaller)
     return found
 
 
@@ -400,12 +391,7 @@ def _vehicle_of_size(length: float, height: float) -> str:
 
 
 def _completed(
-    name: str,
-    score: float,
-    rectangle: NDArray[np.float64],
-    bottom: float,
-    top: float,
-    usual: tuple[float, float, float],
+    name: str, score: float, rectangle: Floats, bottom: float, top: float, usual: tuple[float, float, float]
 ) -> Box:
     """The box around a rectangle of points, completed to the usual size of the class."""
     x, y, along, across, yaw = rectangle.tolist()
@@ -433,21 +419,9 @@ def _completed(
 
 
 @njit(cache=True, nogil=True)
-def fill_rectangle(
-    cloud: Cloud,
-    members: NDArray[np.int32],
-    l_shaped: bool,
-    rectangle: NDArray[np.float64],
-    levels: NDArray[np.float64],
-) -> float:
-    """Write the rectangle around points seen from above, and what they stand on.
-
-    members : (m,) int32; rows of the points in the rectangle, at least one.
-    l_shaped : true: the heading for which most points lie near a side. False: the heading of the smallest rectangle.
-    rectangle : (5,) float64, overwritten; x, y of the middle, extent along and across the heading [m], heading [rad]
-        in 0..pi/2.
-    levels : (m,) float64, overwritten; z of the ground below each point [m].
-    Returns: z of the highest point [m].
+def fill_rectangle(cloud: Cloud, members: Ints, l_shaped: bool, rectangle: Floats, levels: Floats) -> float:
+    """Write the rectangle around the points ``members`` (`rectangles.fit_rectangle`), and z of the ground below each
+    into ``levels``; returns z of the highest.
     """
     points, height = cloud.points, cloud.height
     fit_rectangle(points, members, np.int64(N_ANGLES), np.int64(MAX_FITTED), l_shaped, rectangle)

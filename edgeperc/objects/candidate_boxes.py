@@ -6,14 +6,13 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..errors import InferenceError
 from ..system.kernels import njit
 from ..types.card import ModelCard
 from ..types.geometry import oriented_iou, suppress_overlaps
 from ..types.perception import Box
-from ..types.points import read_only
+from ..types.points import Floats, Floats32, read_only
 
 # Columns of decoded boxes.
 X, Y, Z, LENGTH, WIDTH, HEIGHT, YAW, SCORE, LABEL, FRONT = range(10)
@@ -26,22 +25,16 @@ MERGED = 0.5  # IoU of boxes that are averaged
 LEAST_SCORE = 0.03
 
 
-def decode_objects(
-    card: ModelCard, outputs: NDArray[np.float32], rectangles: NDArray[np.float64], level: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Decode the outputs of candidates.
+def decode_objects(card: ModelCard, outputs: Floats32, rectangles: Floats, level: Floats) -> Floats:
+    """Decode the outputs of candidates, whose rectangles (m, 5) are on the ground at ``level``.
 
-    outputs : (m, n) float32: logits of the classes, the background first; x, y of the middle in the candidate's frame
-        and height of the bottom above the ground [m]; for each class but the background, the logarithms of length,
-        width and height divided by the usual ones (``box_size_priors``); cosine and sine of twice the yaw; a vector
-        whose component along a heading is the logit that the front is there; logit of the overlap (IoU) with the
-        object.
-    rectangles : (m, 5) float64, of the candidates: x, y, length, width [m], yaw [rad].
-    level : (m,) float64, z of the ground at each [m] (`objects.crops.Crops`).
-    Returns: (m, 10) float64: x, y, z of the middle, length, width, height [m], yaw [rad] towards the more probable
-        front, score, class (a row of ``card.classes``), probability of the front. The score is the probability of the
-        most probable class of objects times the overlap.
-    Raises InferenceError.
+    outputs : (m, n): logits of the classes, the background first; x, y of the middle in the candidate's frame and
+        height of the bottom above the ground [m]; for each class but the background, the logarithms of length, width
+        and height divided by the usual ones (``box_size_priors``); cosine and sine of twice the yaw; a vector whose
+        component along a heading is the logit that the front is there; logit of the overlap (IoU) with the object.
+    Returns (m, 10): x, y, z of the middle, length, width, height [m], yaw [rad] towards the more probable front, score,
+        class (a row of ``card.classes``), probability of the front. The score is the probability of the most probable
+        class of objects times the overlap.
     """
     if not np.isfinite(outputs).all():
         raise InferenceError(f"{card.name} gives values that are not finite; check the scan, or the model file")
@@ -51,17 +44,14 @@ def decode_objects(
     return boxes
 
 
-def footprints(boxes: NDArray[np.float64]) -> NDArray[np.float64]:
+def footprints(boxes: Floats) -> Floats:
     """x, y, length, width, yaw of boxes (m, 10), (m, 5)."""
     return boxes.take([X, Y, LENGTH, WIDTH, YAW], axis=1)
 
 
-def merge_boxes(boxes: NDArray[np.float64], classes: Sequence[str]) -> NDArray[np.float64]:
-    """Of boxes around one object, the one with the best score, averaged with those that overlap it by more than 0.5.
-
-    boxes : (m, 10) float64, from `decode_objects`.
-    classes : the background first.
-    Returns: (k, 10) float64, best score first. Places, sizes and headings are means weighted by the scores.
+def merge_boxes(boxes: Floats, classes: Sequence[str]) -> Floats:
+    """Of boxes (m, 10) of `decode_objects` around one object, the one with the best score, averaged by scores in place,
+    size and heading with those that overlap it by more than 0.5; the best first.
     """
     boxes = boxes[boxes[:, SCORE] >= LEAST_SCORE]
     boxes = boxes[np.argsort(-boxes[:, SCORE], kind="stable")]
@@ -73,11 +63,9 @@ def merge_boxes(boxes: NDArray[np.float64], classes: Sequence[str]) -> NDArray[n
     return merged
 
 
-def confirm_boxes(found: NDArray[np.float64], again: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Each box, (k, 10), and what further looks at its place show, (r, k, 10) with a score of 0 for nothing, as one.
-
-    The score is the mean of the box's and the looks' mean; class and front are those of the best one, with which the
-    others are averaged as in `merge_boxes`.
+def confirm_boxes(found: Floats, again: Floats) -> Floats:
+    """Each box, (k, 10), and what further looks at its place show, (r, k, 10) with a score of 0 for nothing, as one
+    with the mean of the box's score and the looks' mean; class and front are those of the best one (`merge_boxes`).
     """
     looks = np.concatenate([found[None], again])
     scores, every = looks[:, :, SCORE], looks.reshape(-1, looks.shape[2])
@@ -88,7 +76,7 @@ def confirm_boxes(found: NDArray[np.float64], again: NDArray[np.float64]) -> NDA
     return confirmed
 
 
-def boxes_of_objects(boxes: NDArray[np.float64], classes: Sequence[str], min_score: float) -> list[Box]:
+def boxes_of_objects(boxes: Floats, classes: Sequence[str], min_score: float) -> list[Box]:
     """Rows of `merge_boxes` with at least a score, as boxes."""
     return [
         Box(classes[int(label)], score, (x, y, z), (length, width, height), yaw, front)
@@ -98,13 +86,7 @@ def boxes_of_objects(boxes: NDArray[np.float64], classes: Sequence[str], min_sco
 
 
 @njit(cache=True, nogil=True)
-def fill_boxes(
-    outputs: NDArray[np.float32],
-    rectangles: NDArray[np.float64],
-    level: NDArray[np.float64],
-    priors: NDArray[np.float64],
-    boxes: NDArray[np.float64],
-) -> None:
+def fill_boxes(outputs: Floats32, rectangles: Floats, level: Floats, priors: Floats, boxes: Floats) -> None:
     """Write the boxes of `decode_objects`; ``priors`` (c, 3) has the usual sizes."""
     c = priors.shape[0]
     for k in range(outputs.shape[0]):
@@ -135,7 +117,7 @@ def fill_boxes(
 
 
 @njit(cache=True, nogil=True)
-def fill_merged(boxes: NDArray[np.float64], iou: NDArray[np.float64], merged: NDArray[np.float64]) -> None:
+def fill_merged(boxes: Floats, iou: Floats, merged: Floats) -> None:
     """Average each row of ``merged`` (k, 10) with the ``boxes`` (m, 10) that overlap it enough, by ``iou`` (k, m)."""
     sums = np.empty(SCORE)
     for k in range(merged.shape[0]):

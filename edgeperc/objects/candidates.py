@@ -11,11 +11,10 @@ import math
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..errors import PointsError
 from ..system.kernels import njit
-from ..types.points import Heights, Points, Rows, read_only
+from ..types.points import Bytes, Floats, Heights, Ints, Points, Rows, read_only
 from .rectangles import fit_rectangle
 
 if TYPE_CHECKING:
@@ -55,26 +54,19 @@ SCALES = (Scale(0.2, 2.6, 0.5, MAX_LENGTH_M), Scale(0.3, 2.2, 0.3, MAX_LENGTH_M)
 
 
 class Cells(NamedTuple):
-    """Points above the ground by the square cells that they lie in.
+    """Points above the ground by the square cells that they lie in."""
 
-    number : (N_SIDE, N_SIDE) int32, of each cell, x by y; -1 without a point.
-    flat : (k,) int32, flat index of each numbered cell.
-    scales : (k,) uint8, bit s: a point of the cell has a height of `SCALES[s]`.
-    starts : (k + 1,) int32, where the points of a cell start in ``rows``.
-    rows : (m,) int32, rows of the points, cell by cell.
-    """
-
-    number: NDArray[np.int32]
-    flat: NDArray[np.int32]
-    scales: NDArray[np.uint8]
-    starts: NDArray[np.int32]
-    rows: Rows
+    number: Ints  # (N_SIDE, N_SIDE) of each cell, x by y; -1 without a point
+    flat: Ints  # (k,) flat index of each numbered cell
+    scales: Bytes  # (k,) bit s: a point of the cell has a height of `SCALES[s]`
+    starts: Ints  # (k + 1,) where the points of a cell start in ``rows``
+    rows: Rows  # (m,) rows of the points, cell by cell
 
 
 class Candidates(NamedTuple):
     """Rectangles x, y, length, width [m], yaw [rad], (m, 5) float64, and the cells that they were found in."""
 
-    rectangles: NDArray[np.float64]
+    rectangles: Floats
     cells: Cells
 
 
@@ -83,7 +75,7 @@ class CellBuffer:
 
     def __init__(self) -> None:
         self._number = np.empty((N_SIDE, N_SIDE), np.int32)
-        self._taken: NDArray[np.int32] | None = None
+        self._taken: Ints | None = None
 
     def sort(self, scan: Scan, height_range_m: tuple[float, float]) -> Cells:
         """`sort_into_cells`; the next call overwrites the numbers of the cells."""
@@ -97,7 +89,7 @@ class CellBuffer:
         return cells
 
 
-def sort_into_cells(scan: Scan, height_range_m: tuple[float, float], number: NDArray[np.int32] | None = None) -> Cells:
+def sort_into_cells(scan: Scan, height_range_m: tuple[float, float], number: Ints | None = None) -> Cells:
     """Sort the points of a scan whose height above the ground is in a range [m]; ``number`` is -1 everywhere."""
     n = len(scan.points)
     number = np.full((N_SIDE, N_SIDE), -1, np.int32) if number is None else number
@@ -110,13 +102,9 @@ def sort_into_cells(scan: Scan, height_range_m: tuple[float, float], number: NDA
     return Cells(number, flat[:n_cells], scales[:n_cells], starts[: n_cells + 1], rows[:n_rows])
 
 
-def find_candidates(scan: Scan, cells: Cells, boxes: NDArray[np.float64], distance_per_m: float = 0.015) -> Candidates:
-    """Find where an object may be.
-
-    boxes : (k, 5) float64, rectangles of other origin, such as a detector's: x, y, length, width [m], yaw [rad].
-    distance_per_m : as in `objects.cluster.find_clusters`: twice the angle between neighboring beams [rad].
-    Returns: the groups at each of the `SCALES`, then ``boxes``.
-    Raises PointsError.
+def find_candidates(scan: Scan, cells: Cells, boxes: Floats, distance_per_m: float = 0.015) -> Candidates:
+    """Find where an object may be: the groups at each of the `SCALES`, then ``boxes`` (k, 5) of other origin, such as a
+    detector's. ``distance_per_m`` is as in `objects.cluster.find_clusters`.
     """
     if boxes.ndim != 2 or boxes.shape[1] != 5:
         raise PointsError(f"got boxes of shape {boxes.shape}; expected (k, 5): x, y, length, width, yaw")
@@ -142,28 +130,17 @@ def find_candidates(scan: Scan, cells: Cells, boxes: NDArray[np.float64], distan
 
 
 class Groups(NamedTuple):
-    """Groups of cells, and the larger groups that they are parts of.
+    """Groups of cells, and the larger groups that they are parts of."""
 
-    order : (k,) int32, numbers of cells, group by group.
-    first : (groups + 1,) int32, where the cells of a group start in ``order``.
-    around : (cells,) int32, of each cell, its group at the first scale; -1: there is none.
-    sizes : (groups of the first scale,) int32, numbers of their cells.
-    """
-
-    order: NDArray[np.int32]
-    first: NDArray[np.int32]
-    around: NDArray[np.int32]
-    sizes: NDArray[np.int32]
+    order: Ints  # (k,) numbers of cells, group by group
+    first: Ints  # (groups + 1,) where the cells of a group start in ``order``
+    around: Ints  # (cells,) of each cell, its group at the first scale; -1: there is none
+    sizes: Ints  # (groups of the first scale,) numbers of their cells
 
 
 @njit(cache=True, nogil=True)
 def fill_cells(
-    points: Points,
-    height: Heights,
-    low: float,
-    high: float,
-    cells: Cells,
-    of_point: NDArray[np.int32],
+    points: Points, height: Heights, low: float, high: float, cells: Cells, of_point: Ints
 ) -> tuple[int, int]:
     """Write `Cells` with arrays as long as the scan (``starts``: one more); return how many cells and rows there are.
 
@@ -204,18 +181,11 @@ def fill_cells(
 
 @njit(cache=True, nogil=True)
 def fill_groups_of_cells(
-    cells: Cells,
-    scale: int,
-    link_m: float,
-    per_m: float,
-    group: NDArray[np.int32],
-    order: NDArray[np.int32],
-    first: NDArray[np.int32],
+    cells: Cells, scale: int, link_m: float, per_m: float, group: Ints, order: Ints, first: Ints
 ) -> int:
-    """Link cells of a scale whose middles are near enough; return the number of groups.
+    """Link cells with points of a scale's heights whose middles are at most ``link_m`` apart, or ``per_m`` times the
+    range; return the number of groups.
 
-    scale : number of the `Scale`; a cell takes part if it has a point of these heights.
-    link_m, per_m : distance between linked cells [m], or more from ``per_m`` times the range on.
     ``group`` (k,) gets the group of each cell, -1 for none; ``order`` and ``first`` are those of `Groups`.
     """
     number, flat, scales = cells.number, cells.flat, cells.scales
@@ -266,14 +236,7 @@ def fill_groups_of_cells(
 
 
 @njit(cache=True, nogil=True)
-def fit_groups(
-    points: Points,
-    height: Heights,
-    cells: Cells,
-    scale: Scale,
-    groups: Groups,
-    fits: NDArray[np.float64],
-) -> int:
+def fit_groups(points: Points, height: Heights, cells: Cells, scale: Scale, groups: Groups, fits: Floats) -> int:
     """Write the rectangles of the groups that may be an object into ``fits`` (groups, 5); return their number.
 
     Left out are groups of few points, those that are low or long, and those that are about the group around them.

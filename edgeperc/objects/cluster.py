@@ -14,11 +14,10 @@ from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..errors import PointsError
 from ..system.kernels import njit
-from ..types.points import Ids, Labels, Mask, Points, read_only
+from ..types.points import Bytes, Floats, Ids, Ints, Ints64, Labels, Mask, Points, read_only
 from .linkage import COLUMN_EDGE, MAX_COLUMNS, TESTS_PER_POINT, WORK, Strips, chain_points, fill_clusters, levels_of
 
 WALKS, RIDES = 1, 2  # roles of labels
@@ -33,15 +32,15 @@ def find_clusters(
     points: Points,
     *,
     among: Mask | None = None,
-    seeds: NDArray[np.bool_] | None = None,
-    votes: NDArray[np.uint8] | None = None,
-    min_share: float | Sequence[float] | NDArray[np.float64] = 0.0,
+    seeds: Mask | None = None,
+    votes: Bytes | None = None,
+    min_share: float | Sequence[float] | Floats = 0.0,
     min_distance_m: float = 0.5,
     distance_per_m: float = 0.015,
     max_range_m: float = 100.0,
     min_points: int = 5,
     strips: Strips | None = None,
-) -> NDArray[np.int32]:
+) -> Ints:
     """Number the groups of linked points.
 
     Parameters
@@ -132,11 +131,7 @@ def sort_points(
     distance_per_m: float = 0.015,
     max_range_m: float = 100.0,
 ) -> Strips:
-    """The part of `find_clusters` that needs no labels, for a scan whose labels are not known yet.
-
-    points, among, min_distance_m, distance_per_m, max_range_m : as in `find_clusters`.
-    Raises PointsError.
-    """
+    """The part of `find_clusters` that needs no labels, for a scan whose labels are not known yet."""
     if points.ndim != 2 or points.shape[1] < 3:
         raise PointsError(f"got points of shape {points.shape}; expected (n, 4): x, y, z, remission")
     n = len(points)
@@ -161,22 +156,13 @@ def sort_points(
 
 
 def cluster_labels(
-    clusters: Ids,
-    labels: Labels,
-    *,
-    min_share: float = 0.7,
-    part_of: Mapping[int, int] = MappingProxyType({}),
-) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
-    """The class that more than ``min_share`` of a cluster's points have (KUL-Seg 5.2).
+    clusters: Ids, labels: Labels, *, min_share: float = 0.7, part_of: Mapping[int, int] = MappingProxyType({})
+) -> tuple[Bytes, Floats]:
+    """The class that more than ``min_share`` of a cluster's points have (KUL-Seg 5.2), 0 if none has, and the share of
+    its most frequent class of objects.
 
-    clusters : (n,) int32; cluster of every point, -1 for none.
-    labels : (n,) uint8; class of every point; 0 is the background.
-    min_share : in 0..1.
-    part_of : mapping of int to int; class to the class that it may be a part of. If at least a quarter of the points
-        of these two classes have the second class, all of them count as the second class.
-    Returns classes ((k,) uint8): Class of every cluster, the lower one on ties; 0 if no class has the share.
-    Returns shares ((k,) float64): Share of the cluster's points that have its most frequent class of objects.
-    Raises PointsError.
+    part_of : class to the class that it may be a part of. If at least a quarter of the points of these two classes have
+        the second class, all of them count as the second class.
     """
     if clusters.ndim != 1 or labels.shape != clusters.shape:
         raise PointsError(
@@ -186,23 +172,16 @@ def cluster_labels(
 
 
 class Groups(NamedTuple):
-    """Points by the groups that they belong to.
+    """Points by the groups that they belong to."""
 
-    Attributes
-    ----------
-    order : (m,) int32
-        Rows of the points of group 0, in input order unless stated otherwise, then of group 1, and so on.
-    starts : (k + 1,) int64
-        Where each of the k groups begins in ``order``; last, where they end.
-    """
-
-    order: NDArray[np.int32]
-    starts: NDArray[np.int64]
+    # (m,) rows of the points of group 0, in input order unless stated otherwise, then of group 1, and so on
+    order: Ints
+    starts: Ints64  # (k + 1,) where each of the k groups begins in ``order``; last, where they end
 
 
 def labels_of_groups(
     groups: Groups, labels: Labels, min_share: float, part_of: Mapping[int, int]
-) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
+) -> tuple[Bytes, Floats]:
     """`cluster_labels` of groups."""
     classes = np.empty(len(groups.starts) - 1, np.uint8)
     shares = np.empty(len(groups.starts) - 1)
@@ -239,19 +218,11 @@ def fill_groups(clusters: Ids, groups: Groups) -> None:
 
 @njit(cache=True, nogil=True)
 def fill_cluster_labels(
-    labels: Labels,
-    groups: Groups,
-    parts: NDArray[np.int64],
-    min_share: float,
-    classes: NDArray[np.uint8],
-    shares: NDArray[np.float64],
+    labels: Labels, groups: Groups, parts: Ints64, min_share: float, classes: Bytes, shares: Floats
 ) -> None:
     """Write the class of every cluster; see `cluster_labels`.
 
-    labels : (n,) uint8
     parts : (p, 2) int64; class, and the class that it may be a part of; below 256.
-    classes : (k,) uint8, overwritten
-    shares : (k,) float64, overwritten
     """
     order, starts = groups.order, groups.starts
     counts = np.zeros(256, np.int64)

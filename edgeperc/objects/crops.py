@@ -10,10 +10,9 @@ import math
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..system.kernels import njit
-from ..types.points import Heights, Points
+from ..types.points import Floats, Floats32, Heights, Ints, Points
 from .candidates import CELL_M, N_SIDE, REACH_M, Candidates, Cells
 
 if TYPE_CHECKING:
@@ -38,17 +37,14 @@ MIN_COUNT = 3  # points of a candidate
 
 
 class Crops(NamedTuple):
-    """Points near candidates.
+    """Points near candidates."""
 
-    points : (m, n_points, 4) float32, x, y in the rectangle's frame, height above `level` [m], remission. Where there
-        are more points than ``n_points``, evenly chosen ones; where there are fewer, they repeat.
-    counts : (m,) int32, number of points in the rectangle and its margin, chosen or not. 0: the points are all 0.
-    level : (m,) float64, z of the ground below [m].
-    """
-
+    # (m, n_points, 4) x, y in the rectangle's frame, height above `level` [m], remission. Where there are more points
+    # than ``n_points``, evenly chosen ones; where there are fewer, they repeat.
     points: Points
-    counts: NDArray[np.int32]
-    level: NDArray[np.float64]
+    # (m,) number of points in the rectangle and its margin, chosen or not. 0: the points are all 0.
+    counts: Ints
+    level: Floats  # (m,) z of the ground below [m]
 
 
 def crop_candidates(scan: Scan, candidates: Candidates, n_points: int, margin_m: float) -> Crops:
@@ -70,12 +66,7 @@ def with_points(candidates: Candidates, crops: Crops) -> tuple[Candidates, Crops
 
 @njit(cache=True, nogil=True)
 def fill_crops(
-    points: Points,
-    height: Heights,
-    cells: Cells,
-    rectangles: NDArray[np.float64],
-    margin_m: float,
-    crops: Crops,
+    points: Points, height: Heights, cells: Cells, rectangles: Floats, margin_m: float, crops: Crops
 ) -> None:
     """Write the points of each rectangle (m, 5), found by cells, into `Crops`."""
     number, starts, rows = cells.number, cells.starts, cells.rows
@@ -126,18 +117,8 @@ def fill_crops(
 
 
 @njit(cache=True, nogil=True)
-def fill_features(
-    points: Points,
-    counts: NDArray[np.int32],
-    rectangles: NDArray[np.float64],
-    scale: NDArray[np.float32],
-    features: NDArray[np.float32],
-) -> None:
-    """Write the network's input of crops, (m, n_points, channels).
-
-    points, counts : (m, n_points, 4) float32 and (m,) int32, of `Crops`.
-    scale : (2, channels) float32, mean and standard deviation of the `FEATURES`.
-    """
+def fill_features(points: Points, counts: Ints, rectangles: Floats, scale: Floats32, features: Floats32) -> None:
+    """Write the network's input of crops (m, n_points, channels), by mean and standard deviation of the `FEATURES`."""
     raw = np.empty(features.shape[2], np.float32)
     for k in range(points.shape[0]):
         x, y = rectangles[k, 0], rectangles[k, 1]

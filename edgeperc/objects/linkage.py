@@ -6,10 +6,9 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..system.kernels import njit
-from ..types.points import Ids, Mask, Points, Rows
+from ..types.points import Bytes, Floats, Ids, Ints, Ints64, Mask, Points, Records, Rows
 
 # A column's edge is slightly more than half the reach of its points. Points of one column are linked if their heights
 # differ by at most 0.7 of the reach: 2 * 0.50005^2 + 0.7^2 < 1.
@@ -73,28 +72,15 @@ WORK = np.dtype(
 
 
 class Strips(NamedTuple):
-    """The points of a scan by strips: `STRIP` columns of one row of a grid; no labels are needed for it.
+    """The points of a scan by strips: `STRIP` columns of one row of a grid; no labels are needed for it."""
 
-    Attributes
-    ----------
-    points : (n, 3 or more) float32
-    rows : (m,) int32
-        Of the points that take part, in input order.
-    heads : (strips,) int32
-        A point of each strip, -1 without one. `fill_clusters` overwrites them: -2 - k for the k-th opened strip.
-    chain : (n,) int32
-        After each of the m points, the next one of its strip, or -1.
-    levels : (levels + 1,) `LEVEL`
-        The last one only ends the one before it.
-    distance_per_m, max_range_m : float
-        As in `edgeperc.objects.cluster.find_clusters`.
-    """
-
-    points: Points
-    rows: Rows
-    heads: NDArray[np.int32]
-    chain: NDArray[np.int32]
-    levels: NDArray[np.void]
+    points: Points  # (n, 3 or more)
+    rows: Rows  # (m,) of the points that take part, in input order
+    # (strips,) a point of each strip, -1 without one. `fill_clusters` overwrites them: -2 - k for the k-th opened
+    # strip.
+    heads: Ints
+    chain: Ints  # (n,) after each of the m points, the next one of its strip, or -1
+    levels: Records  # (levels + 1,) `LEVEL`; the last one only ends the one before it
     distance_per_m: float
     max_range_m: float
 
@@ -105,47 +91,34 @@ class Search(NamedTuple):
     A run holds points of one column, each linked with the one before. It is the root of a tree of smaller parts, which
     are made when they are needed (`halves_are_linked`). Runs are numbered from 0, smaller parts from the end down.
 
-    Attributes
-    ----------
-    order, xyz, reach, keys : (m,) int32, (m, 3) float32, (m,) float64, (m,) float64
-        Of each point: row, coordinates [m], reach [m], and scratch.
-    parts : (parts,) `PART`
-    run_votes : (runs, shares + 1) int32
-    owner : (runs,) int32
-        Cluster of each run, `FREE` or `DROPPED`.
-    run_of : (n,) int32
-        Run of each point of the scan.
-    firsts : (strips, STRIP + 1) int32
-        First run of each column of the opened strips, and the end.
-    queue : (runs,) int32
-        Runs of the cluster that grows.
-    near, pairs : (runs,) int32, (MAX_PAIRS, 2) int32
-        Scratch.
-    votes, votes_left : (shares + 1,) int64
-        Of the cluster that grows, and of the points in no cluster yet.
-    min_shares : (shares,) float64
-    work : (1,) `WORK`
+    order, xyz, reach : of each point, its row, coordinates [m] and reach [m].
+    owner : cluster of each run, `FREE` or `DROPPED`.
+    run_of : run of each point of the scan.
+    firsts : (strips, STRIP + 1) first run of each column of the opened strips, and the end.
+    queue : runs of the cluster that grows.
+    votes, votes_left : of the cluster that grows, and of the points in no cluster yet.
+    keys, near, pairs : scratch.
     """
 
-    order: NDArray[np.int32]
+    order: Ints
     xyz: Points
-    reach: NDArray[np.float64]
-    keys: NDArray[np.float64]
-    parts: NDArray[np.void]
-    run_votes: NDArray[np.int32]
-    owner: NDArray[np.int32]
-    run_of: NDArray[np.int32]
-    firsts: NDArray[np.int32]
-    queue: NDArray[np.int32]
-    near: NDArray[np.int32]
-    pairs: NDArray[np.int32]
-    votes: NDArray[np.int64]
-    votes_left: NDArray[np.int64]
-    min_shares: NDArray[np.float64]
-    work: NDArray[np.void]
+    reach: Floats
+    keys: Floats
+    parts: Records
+    run_votes: Ints
+    owner: Ints
+    run_of: Ints
+    firsts: Ints
+    queue: Ints
+    near: Ints
+    pairs: Ints
+    votes: Ints64
+    votes_left: Ints64
+    min_shares: Floats
+    work: Records
 
 
-def levels_of(min_distance: float, distance_per_m: float, max_range: float) -> NDArray[np.void]:
+def levels_of(min_distance: float, distance_per_m: float, max_range: float) -> Records:
     """The levels of `Strips` without their grids."""
     reaches = [min_distance]
     power = LEVEL_STEP  # exact: there are fewer than 33 levels
@@ -161,20 +134,10 @@ def levels_of(min_distance: float, distance_per_m: float, max_range: float) -> N
 
 @njit(cache=True, nogil=True)
 def chain_points(
-    points: Points,
-    among: Mask,
-    max_range: float,
-    levels: NDArray[np.void],
-    rows: Rows,
-    chain: NDArray[np.int32],
-) -> tuple[int, NDArray[np.int32]]:
-    """Write the grids of the levels, and the points of every strip; see `Strips`.
-
-    among : (n,) bool
-    max_range : points with a larger x, y or z do not take part [m].
-    rows, chain : (n,) int32, overwritten
-    Returns m: Number of points that take part.
-    Returns heads: (strips,) int32.
+    points: Points, among: Mask, max_range: float, levels: Records, rows: Rows, chain: Ints
+) -> tuple[int, Ints]:
+    """Write the grids of the levels, and the points of every strip within ``max_range`` along each axis; see `Strips`.
+    Returns the number of points that take part, and the heads of the strips.
     """
     m = 0
     low_x, low_y, high_x, high_y = math.inf, math.inf, -math.inf, -math.inf
@@ -211,7 +174,7 @@ def strips_a_row(level: np.void) -> int:
 
 
 @njit(cache=True, nogil=True)
-def strip_of(points: Points, i: int, levels: NDArray[np.void]) -> int:
+def strip_of(points: Points, i: int, levels: Records) -> int:
     """The strip of columns that holds a point."""
     level = levels[level_of(points, np.int64(i), levels)]
     row = int((np.float64(points[i, 0]) - level["x"]) * level["columns_per_m"])
@@ -220,7 +183,7 @@ def strip_of(points: Points, i: int, levels: NDArray[np.void]) -> int:
 
 
 @njit(cache=True, nogil=True)
-def level_of(points: Points, i: int, levels: NDArray[np.void]) -> int:
+def level_of(points: Points, i: int, levels: Records) -> int:
     """The level whose squared ranges hold a point."""
     x, y, z = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
     squared_range = x * x + y * y + z * z
@@ -232,25 +195,13 @@ def level_of(points: Points, i: int, levels: NDArray[np.void]) -> int:
 
 @njit(cache=True, nogil=True)
 def fill_clusters(
-    strips: Strips,
-    seeds: NDArray[np.bool_],
-    votes: NDArray[np.uint8],
-    min_shares: NDArray[np.float64],
-    min_points: int,
-    clusters: Ids,
-    work: NDArray[np.void],
+    strips: Strips, seeds: Mask, votes: Bytes, min_shares: Floats, min_points: int, clusters: Ids, work: Records
 ) -> None:
     """Compute every point's cluster; see `find_clusters`.
 
     Clusters grow from seeds, run by run. Only strips within reach of a growing cluster are opened: sorted, and divided
-    into runs. A run of another cluster is not linked with this one, which was complete.
-
-    seeds : (n,) bool
-    votes : (n,) uint8; bit 0: the point counts. Bit k + 1: it may count for share k.
-    min_shares : (k,) float64, at most 7
-    clusters : (n,) int32, overwritten; -1 without a cluster; -2 for points of clusters without a sufficient share, as
-        far as they were looked at.
-    work : (1,) `WORK`, overwritten
+    into runs. A run of another cluster is not linked with this one, which was complete. Points of clusters without a
+    sufficient share have -2, as far as they were looked at.
     """
     clusters[:] = FREE
     points, rows, levels, heads = strips.points, strips.rows, strips.levels, strips.heads
@@ -281,7 +232,7 @@ def fill_clusters(
 
 
 @njit(cache=True, nogil=True)
-def new_search(n: int, m: int, min_shares: NDArray[np.float64], work: NDArray[np.void]) -> Search:
+def new_search(n: int, m: int, min_shares: Floats, work: Records) -> Search:
     """A search in which no strip is open; for n points, of which m take part."""
     n_parts, n_votes = m + m // 2 + 64, len(min_shares) + 1
     done = work[0]
@@ -311,7 +262,7 @@ def new_search(n: int, m: int, min_shares: NDArray[np.float64], work: NDArray[np
 
 
 @njit(cache=True, nogil=True)
-def grow(strips: Strips, votes: NDArray[np.uint8], search: Search, first: int, cluster: int) -> tuple[int, bool]:
+def grow(strips: Strips, votes: Bytes, search: Search, first: int, cluster: int) -> tuple[int, bool]:
     """Collect the runs of a cluster in the queue; their number, and whether the cluster has no sufficient share."""
     # Fields are taken out once, before the loops: each time counts references, which made this four times as slow.
     levels, heads, firsts, parts, owner = strips.levels, strips.heads, search.firsts, search.parts, search.owner
@@ -370,7 +321,7 @@ def n_points(part: np.void) -> int:
 
 
 @njit(cache=True, nogil=True)
-def levels_within(levels: NDArray[np.void], part: np.void, distance_per_m: float) -> tuple[int, int]:
+def levels_within(levels: Records, part: np.void, distance_per_m: float) -> tuple[int, int]:
     """The lowest and the highest level that may hold points linked with those of a part."""
     # The reaches of linked points differ by at most distance_per_m times the shorter one.
     differ = SAFE * (1.0 + distance_per_m)
@@ -396,21 +347,9 @@ def columns_within(level: np.void, part: np.void) -> tuple[int, int, int, int]:
 
 @njit(cache=True, nogil=True, forceinline=True)
 def find_near(
-    parts: NDArray[np.void],
-    owner: NDArray[np.int32],
-    firsts: NDArray[np.int32],
-    col: int,
-    end: int,
-    part: np.void,
-    near: NDArray[np.int32],
-    work: NDArray[np.void],
+    parts: Records, owner: Ints, firsts: Ints, col: int, end: int, part: np.void, near: Ints, work: Records
 ) -> int:
-    """List the runs of no cluster in columns of a strip that may be linked with a part.
-
-    firsts : (STRIP + 1,) int32; of the strip, as in `Search`.
-    col, end : first column, and the one after the last.
-    near : (runs,) int32, overwritten
-    """
+    """List the runs of no cluster in columns ``col`` to ``end`` of a strip that may be linked with a part."""
     n_near, far = 0, SAFE * part["longest"]
     # If the columns hold many runs, they are searched one by one, by height.
     one_by_one = end > col and firsts[end] - firsts[col] > MAX_SCANNED
@@ -444,7 +383,7 @@ def assign(search: Search, n_queued: int, cluster: int, clusters: Ids) -> int:
 
 
 @njit(cache=True, nogil=True)
-def renumber(is_kept: NDArray[np.bool_], clusters: Ids) -> None:
+def renumber(is_kept: Mask, clusters: Ids) -> None:
     """Number the clusters that are kept by their first points; points of others become `FREE`."""
     numbers = np.empty(len(is_kept), np.int32)
     numbers[:] = FREE
@@ -460,14 +399,14 @@ def renumber(is_kept: NDArray[np.bool_], clusters: Ids) -> None:
 
 
 @njit(cache=True, nogil=True)
-def add_votes(vote: np.uint8, counts: NDArray[np.int64]) -> None:
+def add_votes(vote: np.uint8, counts: Ints64) -> None:
     """Add a point's votes to ``counts``: one for every bit."""
     for k in range(len(counts)):
         counts[k] += (vote >> k) & 1
 
 
 @njit(cache=True, nogil=True)
-def may_reach(counts: NDArray[np.int64], left: NDArray[np.int64], min_shares: NDArray[np.float64]) -> bool:
+def may_reach(counts: Ints64, left: Ints64, min_shares: Floats) -> bool:
     """Whether a cluster may have more than one of the shares, if it gets all of the votes that are left."""
     for k in range(len(min_shares)):
         if (counts[k + 1] + left[k + 1]) / max(counts[0] + left[k + 1], 1) > min_shares[k]:
@@ -476,7 +415,7 @@ def may_reach(counts: NDArray[np.int64], left: NDArray[np.int64], min_shares: ND
 
 
 @njit(cache=True, nogil=True)
-def open_strip(strips: Strips, votes: NDArray[np.uint8], search: Search, strip: int) -> None:
+def open_strip(strips: Strips, votes: Bytes, search: Search, strip: int) -> None:
     """Sort the points of a strip by column and height, and divide them into runs."""
     points, parts, order, work = strips.points, search.parts, search.order, search.work[0]
     xyz, reach, owner, run_votes, run_of = search.xyz, search.reach, search.owner, search.run_votes, search.run_of
@@ -545,7 +484,7 @@ def sort_strip(strips: Strips, search: Search, strip: int, level: np.void) -> in
 
 
 @njit(cache=True, nogil=True)
-def first_above(parts: NDArray[np.void], first: int, last: int, z: float) -> int:
+def first_above(parts: Records, first: int, last: int, z: float) -> int:
     """The first of a column's runs whose top is not below z; ``last`` if there is none."""
     while first < last:
         middle = (first + last) // 2
@@ -557,7 +496,7 @@ def first_above(parts: NDArray[np.void], first: int, last: int, z: float) -> int
 
 
 @njit(cache=True, nogil=True)
-def set_bounds(xyz: Points, reach: NDArray[np.float64], part: np.void) -> None:
+def set_bounds(xyz: Points, reach: Floats, part: np.void) -> None:
     """Write the bounds of a part's points, and of their reaches."""
     low_x, low_y, low_z, shortest = math.inf, math.inf, math.inf, math.inf
     high_x, high_y, high_z, longest = -math.inf, -math.inf, -math.inf, 0.0
@@ -625,7 +564,7 @@ def halves_are_linked(search: Search, run: int, other: int) -> bool:
 
 
 @njit(cache=True, nogil=True)
-def test_points(xyz: Points, reach: NDArray[np.float64], a: np.void, b: np.void, work: NDArray[np.void]) -> bool:
+def test_points(xyz: Points, reach: Floats, a: np.void, b: np.void, work: Records) -> bool:
     """Whether a point of one part is near enough to a point of another, by pairs of points."""
     most = MAX_TESTED if work[0]["tests_left"] > 0 else MAX_LAST_TESTED
     stop_a, stop_b = min(a["stop"], a["first"] + most), min(b["stop"], b["first"] + most)

@@ -10,10 +10,9 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..system.kernels import njit
-from ..types.points import Cloud, Ids, Labeled, Labels, Mask
+from ..types.points import Cloud, Ids, Ints, Labeled, Labels, Mask, Records
 from .cluster import MIN_OF_WHOLE, RIDES, Groups, fill_groups
 
 UNSEEN = 3  # role of points out of view, beside `WALKS` and `RIDES`: they say nothing about the class
@@ -67,17 +66,7 @@ PERSON = np.dtype(
 
 
 class Extent(NamedTuple):
-    """A group of points along its principal axis, seen from above.
-
-    Attributes
-    ----------
-    cos, sin : float
-        Of the axis.
-    low_u, high_u, low_v, high_v : float
-        Lowest and highest coordinate along and across the axis [m].
-    top : float
-        Greatest height above the ground [m].
-    """
+    """A group of points along (u) and across (v) its principal axis from above [m]; ``top`` is above the ground."""
 
     cos: float
     sin: float
@@ -89,7 +78,7 @@ class Extent(NamedTuple):
 
 
 @njit(cache=True, nogil=True)
-def measure(cloud: Cloud, members: NDArray[np.int32], above: float) -> Extent:
+def measure(cloud: Cloud, members: Ints, above: float) -> Extent:
     """Measure the members of a group that are higher than a limit [m], and the top of all; zeros if none is higher.
 
     members : (k,) int32; rows of the points.
@@ -123,15 +112,10 @@ def measure(cloud: Cloud, members: NDArray[np.int32], above: float) -> Extent:
 
 @njit(cache=True, nogil=True)
 def fill_person_groups(
-    cloud: Cloud, labeled: Labeled, clusters: Groups, groups: Groups, loose: NDArray[np.int32]
+    cloud: Cloud, labeled: Labeled, clusters: Groups, groups: Groups, loose: Ints
 ) -> tuple[int, int]:
-    """List the clusters that may be one or a few persons, and the persons' points of the others.
-
-    labeled : roles are 0 for labels that are not persons', `UNSEEN` for points out of view.
-    groups : with room for all points of ``clusters``, overwritten
-    loose : (m,) int32, overwritten; persons' points of clusters that are larger than a person or hold too few
-        persons' points.
-    Returns the numbers of groups and of loose points.
+    """List the clusters that may be one or a few persons, and the persons' points of the others, which are larger or
+    hold too few of them; returns both numbers. Roles are 0 for other labels, `UNSEEN` for points out of view.
     """
     labels, roles, order, starts = labeled.labels, labeled.roles, groups.order, groups.starts
     cluster_order, cluster_starts = clusters.order, clusters.starts
@@ -164,24 +148,12 @@ def fill_person_groups(
 
 @njit(cache=True, nogil=True)
 def complete_persons(
-    cloud: Cloud,
-    in_view: Mask,
-    clusters: Ids,
-    may_be: NDArray[np.bool_],
-    walks: int,
-    rides: int,
-    labels: Labels,
+    cloud: Cloud, in_view: Mask, clusters: Ids, may_be: Mask, walks: int, rides: int, labels: Labels
 ) -> None:
-    """Give the points of a cluster that has a person's size and shape one label.
+    """Give the points of a cluster that has a person's size and shape one label, ``walks`` or ``rides`` (rule
+    ``person`` of docs/concepts/agreement.md).
 
-    clusters : (n,) int32; negative for none.
-    may_be : (k,) bool; clusters whose bounds are not too large for a person, and that hold labeled points.
-    walks, rides : the labels of persons on foot and of those who ride.
-    labels : (n,) uint8, modified; a cluster up to 2.3 m long and 0.7 m wide (0.8 m if the person rides), whose upper
-        quarter is at most 0.8 m wide, and of which a fifth in view is labeled as persons, is one person, who rides if
-        longer than a stride, or if a quarter of the persons' points says so. The persons' points of one who is longer
-        than a stride, or all points of one who is 1.3 to 2.0 m high and of whom at least 0.3 is labeled, get the
-        label.
+    may_be : clusters whose bounds are not too large for a person, and that hold labeled points.
     """
     numbers, n = np.empty(len(may_be), np.int32), 0
     for k in range(len(may_be)):
@@ -220,7 +192,7 @@ def complete_persons(
 
 
 @njit(cache=True, nogil=True)
-def border_of(cloud: Cloud, members: NDArray[np.int32], above: float, extent: Extent) -> float:
+def border_of(cloud: Cloud, members: Ints, above: float, extent: Extent) -> float:
     """Where two persons meet along the axis of a group: at the fewest points, as near to the middle as possible."""
     points, height, cos, sin = cloud.points, cloud.height, extent.cos, extent.sin
     low, length = extent.low_u, extent.high_u - extent.low_u
@@ -244,7 +216,7 @@ def border_of(cloud: Cloud, members: NDArray[np.int32], above: float, extent: Ex
 
 
 @njit(cache=True, nogil=True)
-def head_width(cloud: Cloud, members: NDArray[np.int32], extent: Extent) -> float:
+def head_width(cloud: Cloud, members: Ints, extent: Extent) -> float:
     """Width of the widest part without a gap at the height of heads [m], along the axis of a group; 0 if not flat."""
     points, height, cos, sin = cloud.points, cloud.height, extent.cos, extent.sin
     low, length = extent.low_u, extent.high_u - extent.low_u
@@ -283,20 +255,15 @@ def fill_persons(
     cluster_of: Ids,
     clusters: Groups,
     min_points: int,
-    persons: NDArray[np.void],
+    persons: Records,
 ) -> int:
-    """Divide groups into persons, and measure them.
+    """Divide groups into persons, and measure them; returns their number, without groups that are not finite.
 
     A group whose upper quarter is wider than 0.8 m is cut where the fewest points are, and its parts again.
 
-    labeled : roles are 0 for labels that are not persons', `UNSEEN` for points out of view, `WALKS` or `RIDES` for
-        others.
-    groups : the points of a group are put in the order of its persons.
-    n_whole : groups from this number on are labeled points of larger clusters.
-    cluster_of, clusters : cluster of every point, (n,) int32, and points by cluster.
-    min_points : smaller parts are dropped.
-    persons : (p,) `PERSON`, overwritten
-    Returns: Number of persons. Those beyond p are left out, and groups with points that are not finite.
+    labeled : roles are 0 for labels that are not persons', `UNSEEN` for points out of view, `WALKS` or `RIDES`.
+    groups : the points of a group are put in the order of its persons; from ``n_whole`` on, they are labeled points of
+        larger clusters.
     """
     order, starts, others, other_starts = groups.order, groups.starts, clusters.order, clusters.starts
     left = np.empty((MAX_CUTS + 1, 3), np.int64)  # parts: first and last place in `order`, number of cuts before
@@ -331,7 +298,7 @@ def fill_persons(
 
 
 @njit(cache=True, nogil=True)
-def cut(cloud: Cloud, members: NDArray[np.int32], above: float) -> int:
+def cut(cloud: Cloud, members: Ints, above: float) -> int:
     """Put the points of the first of two persons first; their number, or -1 if a group is one person."""
     points, upper = cloud.points, measure(cloud, members, above)
     if not upper.high_u - upper.low_u > MAX_UPPER_M:
@@ -347,14 +314,7 @@ def cut(cloud: Cloud, members: NDArray[np.int32], above: float) -> int:
 
 
 @njit(cache=True, nogil=True)
-def fill_person(
-    cloud: Cloud,
-    labeled: Labeled,
-    members: NDArray[np.int32],
-    extent: Extent,
-    around: NDArray[np.int32],
-    person: np.void,
-) -> None:
+def fill_person(cloud: Cloud, labeled: Labeled, members: Ints, extent: Extent, around: Ints, person: np.void) -> None:
     """Write the record of a person.
 
     around : (m,) int32; of the larger cluster, of which the points within 0.2 m of the person count for the share.

@@ -5,27 +5,19 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..system.kernels import njit
-from ..types.points import Points
+from ..types.points import Floats, Points, Rows
 
 
 @njit(cache=True, nogil=True)
 def fit_rectangle(
-    points: Points,
-    rows: NDArray[np.int32],
-    n_angles: int,
-    max_fitted: int,
-    l_shaped: bool,
-    rectangle: NDArray[np.float64],
+    points: Points, rows: Rows, n_angles: int, max_fitted: int, l_shaped: bool, rectangle: Floats
 ) -> None:
-    """Write the rectangle around some points, which at most so many of them and so many headings decide.
+    """Write the rectangle around points, which at most ``max_fitted`` of them and ``n_angles`` headings decide.
 
-    rows : (m,) int32; the points, at least one.
     l_shaped : true: the heading for which most points lie near a side. False: the heading of the smallest rectangle.
-    rectangle : (5,) float64, overwritten; x, y of the middle, extent along and across the heading [m], heading [rad]
-        in 0..pi/2.
+    rectangle : (5,) x, y of the middle, extent along and across the heading [m], heading [rad] in 0..pi/2.
     """
     # All headings at once for each point: processors compare and divide eight at a time, which takes a third of the
     # time of one heading after the other.

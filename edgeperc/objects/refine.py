@@ -12,12 +12,11 @@ from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..errors import PointsError
 from ..system.draws import drawn_of, next_draw
 from ..system.kernels import njit
-from ..types.points import Labels, Mask, Points, Rows, read_only
+from ..types.points import Bytes, Floats, Floats32, Ints, Labels, Mask, Points, Rows, read_only
 
 # Half of an object's diagonal seen from above, and a margin because the mean of the visible side is not its middle. On
 # 90 labeled KITTI frames, car IoU was 0.888, 0.884, 0.878 and 0.872 for 2.5, 3, 3.5 and 4.5 m for masks
@@ -39,54 +38,32 @@ MAX_RANGE_GAP_M = 1.0
 
 def remove_outliers(
     points: Points,
-    index: NDArray[np.int32],
+    index: Ints,
     labels: Labels,
     classes: Sequence[str],
     *,
     radius_m: Mapping[str, float] = OBJECT_RADIUS_M,
     full_turn: bool = False,
-) -> NDArray[np.uint8]:
-    """Set to background the pixels whose points lie away from the object they were labeled with.
+) -> Bytes:
+    """Set to background the pixels whose points lie away from the object they were labeled with; deterministic.
 
-    Parameters
-    ----------
-    points : (n, 4) float32
-        x, y, z [m] in the sensor frame, remission.
-    index : (H, W) int32
-        Row of ``points`` at each pixel of a range image; -1 without a return.
-    labels : (H, W) uint8
-        Index into ``classes`` of every pixel; 0 is the background.
-    classes : sequence of str
-    radius_m : mapping
-        Class to the radius [m] around an object's middle, seen from above, that holds its visible points. Classes
-        that are not in it are not changed.
-    full_turn : bool
-        The image's left and right edges meet.
+    index : (H, W) row of ``points`` at each pixel of a range image; -1 without a return.
+    radius_m : class to the radius [m] around an object's middle, seen from above, that holds its visible points. Other
+        classes are not changed.
+    full_turn : the image's left and right edges meet.
 
-    Returns
-    -------
-    (H, W) uint8
-        The cleaned labels, a copy. Deterministic.
-
-    Raises
-    ------
-    PointsError
-        Arrays disagree in shape, or ``index`` refers to rows that ``points`` does not have.
-
-    Notes
-    -----
-    PointSeg 5.2 refines its back projection by RANSAC but does not name a model; this one is our own. Connected
-    pixels of one label (8 neighbors), at any range, are a component, so that bleeding pixels stay with their object.
-    A hypothesis is a sampled point. Its center is the mean of the component's points within the class's radius of the
+    PointSeg 5.2 refines its back projection by RANSAC but does not name a model; this one is our own. Connected pixels
+    of one label (8 neighbors), at any range, are a component, so that bleeding pixels stay with their object. A
+    hypothesis is a sampled point. Its center is the mean of the component's points within the class's radius of the
     sample, seen from above. Its consensus is the points within that radius of the center. The largest consensus is an
     object. The rest is searched in the same way: it is another object (the next car of a row) if its consensus has 5
     points and a tenth of them are more than 2 pixels from the objects found before. Otherwise all of the rest becomes
     background. At least one object of every component stays.
 
-    On 90 labeled KITTI frames, followed by `label_points`, point IoU of car, pedestrian and cyclist rises from
-    0.81, 0.63, 0.66 to 0.88, 0.86, 0.87 for masks dilated by one pixel, from 0.71, 0.47, 0.54 to 0.80, 0.74, 0.81
-    for two. It falls by at most 0.002 for correct masks. Removing points near a ground plane as well removed more
-    points of the objects' feet than of the ground.
+    On 90 labeled KITTI frames, followed by `label_points`, point IoU of car, pedestrian and cyclist rises from 0.81,
+    0.63, 0.66 to 0.88, 0.86, 0.87 for masks dilated by one pixel, from 0.71, 0.47, 0.54 to 0.80, 0.74, 0.81 for two. It
+    falls by at most 0.002 for correct masks. Removing points near a ground plane as well removed more points of the
+    objects' feet than of the ground.
     """
     arrays = _check(points, index, labels)
     radii = np.array([radius_m.get(name, 0.0) for name in classes])
@@ -97,47 +74,17 @@ def remove_outliers(
     return cleaned
 
 
-def label_points(
-    points: Points,
-    pixel: NDArray[np.int32],
-    index: NDArray[np.int32],
-    labels: Labels,
-    *,
-    full_turn: bool = False,
-) -> NDArray[np.uint8]:
-    """Label every point in view from the pixel labels (PointSeg 5.2).
+def label_points(points: Points, pixel: Ints, index: Ints, labels: Labels, *, full_turn: bool = False) -> Bytes:
+    """Label every point in view from the pixel labels (PointSeg 5.2); points out of view (-1 in ``pixel``) have 0.
 
-    Parameters
-    ----------
-    points : (n, 4) float32
-        x, y, z [m] in the sensor frame, remission.
-    pixel : (n,) int32
-        Flat pixel of each point; -1 for points out of view.
-    index : (H, W) int32
-        Row of ``points`` at each pixel of a range image; -1 without a return.
-    labels : (H, W) uint8
-        Class of every pixel; 0 is the background.
-    full_turn : bool
-        The image's left and right edges meet.
+    A point that won its pixel (``index``) has the pixel's label. The others are hidden behind a nearer point. They take
+    the majority label of 5 pixels: those nearest in range among the 5 x 5 around the point and within 1 m of its range;
+    0 if there is none. On ties between labels, the label of the nearest pixel wins; on ties in range, the pixel above,
+    then left.
 
-    Returns
-    -------
-    (n,) uint8
-        A point that won its pixel has the pixel's label. The others are hidden behind a nearer point. They take the
-        majority label of 5 pixels: those nearest in range among the 5 x 5 around the point and within 1 m of its range;
-        0 if there is none. On ties between labels, the label of the nearest pixel wins; on ties in range, the pixel
-        above, then left. Points out of view have 0.
-
-    Raises
-    ------
-    PointsError
-        Arrays disagree in shape, or ``pixel`` or ``index`` is out of range.
-
-    Notes
-    -----
     The vote is that of RangeNet++, restricted to hidden points. On 90 labeled KITTI frames with correct masks, it
-    raises point IoU of car, pedestrian and cyclist from 0.946, 0.894, 0.881 to 0.994, 0.988, 0.997; windows of
-    3 x 3 to 5 x 5, 1 to 5 votes, 0.5 to 1 m, Gaussian weights and distances in space were within 0.003 of that.
+    raises point IoU of car, pedestrian and cyclist from 0.946, 0.894, 0.881 to 0.994, 0.988, 0.997; windows of 3 x 3 to
+    5 x 5, 1 to 5 votes, 0.5 to 1 m, Gaussian weights and distances in space were within 0.003 of that.
     """
     rows, behind, classes = _check(points, index, labels)
     if pixel.shape != (len(points),) or (pixel.size and int(pixel.max()) >= labels.size):
@@ -150,9 +97,7 @@ def label_points(
     return point_labels
 
 
-def _check(
-    points: Points, index: NDArray[np.int32], labels: Labels
-) -> tuple[NDArray[np.float32], NDArray[np.int32], NDArray[np.uint8]]:
+def _check(points: Points, index: Ints, labels: Labels) -> tuple[Floats32, Ints, Bytes]:
     if points.ndim != 2 or points.shape[1] < 3:
         raise PointsError(f"got points of shape {points.shape}; expected (n, 4): x, y, z, remission")
     if labels.ndim != 2 or labels.shape != index.shape:
@@ -170,20 +115,11 @@ def _check(
 
 @njit(cache=True, nogil=True)
 def fill_without_outliers(
-    points: Points,
-    index: NDArray[np.int32],
-    labels: Labels,
-    radii: NDArray[np.float64],
-    full_turn: bool,
-    cleaned: NDArray[np.uint8],
+    points: Points, index: Ints, labels: Labels, radii: Floats, full_turn: bool, cleaned: Bytes
 ) -> None:
     """Write ``labels`` without outliers; see `remove_outliers`.
 
-    points : (n, 4) float32
-    index : (H, W) int32
-    labels : (H, W) uint8
     radii : (classes,) float64; classes with 0 are not changed.
-    cleaned : (H, W) uint8, overwritten
     """
     height, width = labels.shape
     # Element by element: to copy an array, numba compiles a broadcast with its error messages, for 3 s.
@@ -246,14 +182,7 @@ def fill_without_outliers(
 
 @njit(cache=True, nogil=True)
 def collect_component(
-    labels: Labels,
-    index: NDArray[np.int32],
-    first_row: int,
-    first_col: int,
-    full_turn: bool,
-    seen: Mask,
-    rows: Rows,
-    cols: NDArray[np.int32],
+    labels: Labels, index: Ints, first_row: int, first_col: int, full_turn: bool, seen: Mask, rows: Rows, cols: Ints
 ) -> int:
     """Write the pixels of a component that hold a point into ``rows`` and ``cols``, and return how many there are."""
     height, width = labels.shape
@@ -285,9 +214,7 @@ def collect_component(
 
 
 @njit(cache=True, nogil=True)
-def find_consensus(
-    ground: NDArray[np.float64], n: int, squared_radius: float, draw: int, center: NDArray[np.float64]
-) -> int:
+def find_consensus(ground: Floats, n: int, squared_radius: float, draw: int, center: Floats) -> int:
     """Write x, y of the best hypothesis into ``center`` (2,); return the state of the random draws."""
     step = (n + MAX_TESTED - 1) // MAX_TESTED
     n_tested = (n + step - 1) // step
@@ -318,7 +245,7 @@ def find_consensus(
 
 
 @njit(cache=True, nogil=True)
-def is_near(ground: NDArray[np.float64], k: int, x: float, y: float, squared_radius: float) -> bool:
+def is_near(ground: Floats, k: int, x: float, y: float, squared_radius: float) -> bool:
     """Whether a point lies within the radius of x, y, seen from above; False where either is not finite."""
     dx = ground[k, 0] - x
     dy = ground[k, 1] - y
@@ -327,21 +254,9 @@ def is_near(ground: NDArray[np.float64], k: int, x: float, y: float, squared_rad
 
 @njit(cache=True, nogil=True)
 def fill_point_labels(
-    points: Points,
-    pixel: NDArray[np.int32],
-    index: NDArray[np.int32],
-    labels: Labels,
-    full_turn: bool,
-    point_labels: NDArray[np.uint8],
+    points: Points, pixel: Ints, index: Ints, labels: Labels, full_turn: bool, point_labels: Bytes
 ) -> None:
-    """Write every point's label; see `label_points`.
-
-    points : (n, 4) float32
-    pixel : (n,) int32
-    index : (H, W) int32
-    labels : (H, W) uint8
-    point_labels : (n,) uint8, overwritten
-    """
+    """Write every point's label; see `label_points`."""
     height, width = labels.shape
     ranges = np.empty((height, width))  # of each pixel's point [m], computed when needed
     # Most hidden points have only background around them and need no vote: 0.5 ms a scan instead of 1.0.

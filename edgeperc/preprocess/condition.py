@@ -11,43 +11,30 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from ..errors import PointsError, SensorError
 from ..system.kernels import njit
-from ..types.points import Points, as_points, read_only
+from ..types.points import Floats, Floats32, Points, as_points, read_only
 from ..types.sensor import SensorProfile
 from .returns import returns
 
 KIND_CODES = {"linear": 0, "polynomial": 1, "logarithm": 2, "power": 3}
 
 
-def condition(points: ArrayLike, sensor: SensorProfile, *, rendered: bool = True) -> tuple[NDArray[np.float32], int]:
-    """Prepare a scan for every stage: projection, fitness check, refinement, ground and clusters.
+def condition(points: ArrayLike, sensor: SensorProfile, *, rendered: bool = True) -> tuple[Floats32, int]:
+    """Prepare a scan for every stage: returns of the world alone (`returns.returns`), remission in 0..1 (`scale`), by
+    ``sensor.remission`` if ``rendered``; dropped rows are NaN. Also returns how many these are.
 
-    points : array_like; a scan, as for `edgeperc.types.points.as_points`; remission in the sensor's raw unit. Not
-        modified.
-    sensor : rows that are not returns of the world are dropped (`returns.returns`), and remission is scaled to 0..1
-        (`scale`).
-    rendered : convert the remission with ``sensor.remission`` (`render`), if the profile has a function.
-    Returns scan ((n, 4) float32, C-contiguous, read-only): x, y, z [m], remission in 0..1, in input order. Dropped
-        rows are NaN in all four columns. A view of ``points`` if nothing had to be changed.
-    Returns n_dropped: Number of dropped rows, those whose scaled remission is not finite included.
-    Raises PointsError.
+    The scan is read-only, and a view of ``points`` if nothing had to be changed.
     """
     scan, dropped = returns(as_points(points), sensor)
     scan, n_overflowed = scale(scan, sensor, rendered=rendered)
     return scan, dropped.total + n_overflowed
 
 
-def scale(points: Points, sensor: SensorProfile, *, rendered: bool = True) -> tuple[NDArray[np.float32], int]:
-    """Scale the remission of a scan, whose rows are finite or NaN, to 0..1.
-
-    points : (n, 4) float32; from `edgeperc.preprocess.returns.returns`. Not modified.
-    rendered : as in `condition`.
-    Returns scan ((n, 4) float32, C-contiguous, read-only): A view of ``points`` if nothing had to be changed.
-    Returns n_overflowed: Number of rows that became NaN because their scaled remission is not finite.
-    """
+def scale(points: Points, sensor: SensorProfile, *, rendered: bool = True) -> tuple[Floats32, int]:
+    """The scan with remission scaled to 0..1, read-only; and how many rows became NaN, as theirs is not finite."""
     if rendered and sensor.remission is not None:
         return read_only(render(points, sensor)), 0
     offset, factor = np.float32(sensor.remission_offset), np.float32(sensor.remission_scale)
@@ -63,7 +50,7 @@ def scale(points: Points, sensor: SensorProfile, *, rendered: bool = True) -> tu
     return read_only(scan), n_overflowed
 
 
-def render(points: Points, sensor: SensorProfile) -> NDArray[np.float32]:
+def render(points: Points, sensor: SensorProfile) -> Floats32:
     """Convert the remission to that of the sensor that the models were trained on, 0..1 (KUL-Seg 5).
 
     points : (n, 4) float32; x, y, z [m], remission in the sensor's raw unit. Not modified. Non-finite values stay
@@ -93,21 +80,13 @@ def render(points: Points, sensor: SensorProfile) -> NDArray[np.float32]:
 
 @njit(cache=True, nogil=True)
 def fill_rendered(
-    points: Points,
-    kind: int,
-    coefficients: NDArray[np.float64],
-    offset: float,
-    scale: float,
-    rendered: NDArray[np.float32],
+    points: Points, kind: int, coefficients: Floats, offset: float, scale: float, rendered: Floats32
 ) -> None:
-    """Write the points with rendered remission into ``rendered``.
+    """Write the points with rendered remission, NaN if it is not finite.
 
-    points : (n, 4) float32, C-contiguous
     kind : a value of ``KIND_CODES``.
-    coefficients : (3,) float64
-    offset, scale : the argument x of `RemissionFunction` is ``(raw + offset) * scale``; logarithm and power clip it
-        to 0 from below.
-    rendered : (n, 4) float32, overwritten; a remission that is not finite becomes NaN.
+    offset, scale : the argument x of `RemissionFunction` is ``(raw + offset) * scale``; logarithm and power clip it to
+        0 from below.
     """
     # Most sensors report whole numbers up to 255. A table of their 256 results takes 0.3 instead of 2 ms.
     whole = np.empty(256)
@@ -128,7 +107,7 @@ def fill_rendered(
 
 
 @njit(cache=True, nogil=True)
-def rendered_at(x: float, kind: int, coefficients: NDArray[np.float64]) -> float:
+def rendered_at(x: float, kind: int, coefficients: Floats) -> float:
     """Value of a `RemissionFunction` at a finite x."""
     a, b, c = coefficients[0], coefficients[1], coefficients[2]
     if kind == 3:

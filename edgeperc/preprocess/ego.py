@@ -10,12 +10,11 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..errors import SensorError
 from ..types.frame import ModelFrame
 from ..types.mounting import MODEL_HEIGHT_M, Mounting
-from ..types.points import Points
+from ..types.points import Floats, Floats32, Points
 from ..types.sensor import EgoBox, SensorProfile
 from .returns import returns
 
@@ -36,36 +35,23 @@ _AROUND_M, _HEIGHTS_M = (4.0, 25.0), (0.5, 2.5)
 
 @dataclass(frozen=True)
 class EgoSuggestion:
-    """The box of the own vehicle, as scans suggest it.
+    """The box of the own vehicle, as scans suggest it."""
 
-    Attributes
-    ----------
-    box : tuple of 3 tuples of 2 float, or None
-        For `SensorProfile.ego_box` [m]; None if nothing near the sensor stays where it is.
-    n_places : int
-        Different places of the vehicle.
-    n_directions : int
-        Directions, of 2 by 1 degrees, in which the nearest return stayed.
-    """
-
-    box: EgoBox | None
-    n_places: int
-    n_directions: int
+    box: EgoBox | None  # for `SensorProfile.ego_box` [m]; None if nothing near the sensor stays where it is
+    n_places: int  # different places of the vehicle
+    n_directions: int  # directions, of 2 by 1 degrees, in which the nearest return stayed
 
 
-def suggest_ego_box(scans: Iterable[NDArray[np.float32]], sensor: SensorProfile, mounting: Mounting) -> EgoSuggestion:
+def suggest_ego_box(scans: Iterable[Floats32], sensor: SensorProfile, mounting: Mounting) -> EgoSuggestion:
     """Find returns within 3 m of the sensor that never move with respect to it, while the street does.
 
-    scans : iterable of (n, 4) float32; of one sensor on one vehicle, from at least ten places a few meters apart,
-        better from several streets.
-    sensor : its ``ego_box`` is not used.
+    scans : of one sensor on one vehicle, from at least ten places a few meters apart, better from several streets.
     mounting : a known one, for the height of the road.
-    Raises SensorError.
     """
     frame, plain = ModelFrame(mounting), replace(sensor, ego_box=None)
     x, y = mounting.origin_m
     places: list[frozenset[tuple[int, int]]] = []
-    ranges: list[NDArray[np.float64]] = []
+    ranges: list[Floats] = []
     n_scans = 0
     for scan in scans:
         n_scans += 1
@@ -101,7 +87,7 @@ def suggest_ego_box(scans: Iterable[NDArray[np.float32]], sensor: SensorProfile,
     return EgoSuggestion(((x0, x1), (y0, y1), (z0, z1)), len(places), int(np.count_nonzero(still)))
 
 
-def _place(moved: Points, above_m: NDArray[np.float32]) -> frozenset[tuple[int, int]]:
+def _place(moved: Points, above_m: Floats32) -> frozenset[tuple[int, int]]:
     """Square meters around the vehicle on which something stands."""
     flat_m = np.hypot(moved[:, 0], moved[:, 1])
     standing = (flat_m > _AROUND_M[0]) & (flat_m < _AROUND_M[1])
@@ -109,7 +95,7 @@ def _place(moved: Points, above_m: NDArray[np.float32]) -> frozenset[tuple[int, 
     return frozenset(map(tuple, np.unique(np.floor(moved[standing, :2]).astype(int), axis=0).tolist()))
 
 
-def _nearest(points: NDArray[np.float64]) -> NDArray[np.float64]:
+def _nearest(points: Floats) -> Floats:
     """Nearest range [m] in each direction, (180, 180): elevation by azimuth; infinite without a return."""
     x, y, z = points.T
     flat = np.hypot(x, y)

@@ -7,26 +7,19 @@ from collections.abc import Callable, Iterable
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..types.frame import ModelFrame
 from ..types.mounting import MODEL_HEIGHT_M, Mounting
 from ..types.perception import DroppedPoints
-from ..types.points import Points
+from ..types.points import Floats, Points
 from ..types.sensor import SensorProfile
 from .fitness import FitnessProfile, Measures, Range, measure
 
 
 class Finding(str):
-    """A sentence about how a scan differs from the training scans.
+    """A sentence about how a scan differs from the training scans."""
 
-    Attributes
-    ----------
-    gross : bool
-        The scan is so different that results would be meaningless; a `Perceiver` refuses it by default.
-    """
-
-    gross: bool
+    gross: bool  # the scan is so different that results would be meaningless; a `Perceiver` refuses it by default
 
     def __new__(cls, text: str, gross: bool = False) -> Finding:
         """Make a finding from its sentence."""
@@ -38,24 +31,16 @@ class Finding(str):
 def check_fitness(
     points: Points, profile: FitnessProfile, sensor: SensorProfile, frame: ModelFrame | None = None
 ) -> tuple[Finding, ...]:
-    """Describe how a scan differs from the scans that a model was trained on, and what to do about it.
+    """Describe how a scan differs from those of the training, and what to do about it (docs/concepts/fitness.md).
 
     Margins are wide: the check finds gross mistakes (axes, units, remission scale, another sensor) and accepts ordinary
     scans of the right sensor, including scans cropped to the model's view. It does not find scans turned by 180 degrees
     or mirrored left to right, and misses one of nine scans turned by 90 degrees (measured on KITTI).
 
-    points : (n, 4) float32; x, y, z [m], remission scaled to 0..1 by ``sensor``. Points that are not finite are
-        skipped.
-    sensor : the sensor that the caller says recorded the scan. If its remission function is constant, because the
-        scan has no remission, remission is not checked.
+    sensor : that the caller says recorded the scan. If its remission function is constant, because the scan has no
+        remission, remission is not checked.
     frame : what moved the scan into the frame of the models. A sensor that is high, or leans, sees points that are
         higher there than its beams.
-    Returns: One sentence for each difference; empty if there is none. Gross are: another unit; a vertical axis that
-        is not z, or points down; ground more than 1.3 m from where it lay in training; no points below the horizon;
-        points far above the sensor's field of view; points in less than a quarter of the model's view; half of the
-        points as near as in a room; less than 1/20 of the fewest or more than 20 times the most points in training;
-        fewer than eight rows of points; remission that is constant, missing or off the sensor's range.
-    Raises PointsError.
     """
     return check_profiles(points, [profile], sensor, frame)
 
@@ -67,13 +52,7 @@ def check_profiles(
     frame: ModelFrame | None = None,
     ceiling_m: float | None = None,
 ) -> tuple[Finding, ...]:
-    """Describe how a scan differs from the training scans of several models, each difference once.
-
-    points, sensor, frame : as in `check_fitness`.
-    profiles : the scan is measured once for all profiles of the same view.
-    ceiling_m : `ground.ceiling.find_ceiling`.
-    Raises PointsError.
-    """
+    """Describe how a scan, measured once for each view, differs from the training scans of several models."""
     measured: dict[Range, Measures | None] = {}
     found: dict[Finding, None] = {}
     for profile in profiles:
@@ -87,10 +66,8 @@ def check_profiles(
 
 
 def _seen_again(scan: Measures, points: Points, sensor: SensorProfile, frame: ModelFrame | None) -> Measures:
-    """The measures with the ground as the lowest points show it, if it is not where most points are, and with
-    elevations as the sensor sees them, if these are lower.
-
-    Most points may be on a ceiling or on walls; and a high sensor sees little of the ground near by.
+    """The measures with the ground as the lowest points show it, if it is not where most points are (on a ceiling, on
+    walls, or around a high sensor), and with elevations as the sensor sees them, if these are lower.
     """
     raised_m = 0.0 if frame is None else float(frame.eye[2])
     sample = points[:: len(points) // _SAMPLE + 1, :3].astype(np.float64)
@@ -111,7 +88,7 @@ def _seen_again(scan: Measures, points: Points, sensor: SensorProfile, frame: Mo
     return scan
 
 
-def _is_road_below(sample: NDArray[np.float64]) -> bool:
+def _is_road_below(sample: Floats) -> bool:
     """Whether the lowest points of many cells near by are as high as the road, and those of few are lower."""
     lowest = _lowest_in_cells(sample, *_NEAR_AROUND_M)
     on_road = np.abs(lowest + MODEL_HEIGHT_M) <= _LEVEL_OFF_M
@@ -136,7 +113,7 @@ def _is_bay(points: Points) -> bool:
     return min(ends_m) >= _BUMPER_M and (deep_m <= _GARAGE_M or deep_m >= _HALL_LENGTH_M)
 
 
-def _lowest_in_cells(sample: NDArray[np.float64], reach_m: float, cell_m: float) -> NDArray[np.float64]:
+def _lowest_in_cells(sample: Floats, reach_m: float, cell_m: float) -> Floats:
     """The lowest z in each square of ``cell_m`` with points up to ``reach_m`` away."""
     x, y, z = sample[np.hypot(sample[:, 0], sample[:, 1]) < reach_m].T
     _, cell = np.unique(np.floor([x / cell_m, y / cell_m]).astype(np.int64), axis=1, return_inverse=True)
@@ -145,7 +122,7 @@ def _lowest_in_cells(sample: NDArray[np.float64], reach_m: float, cell_m: float)
     return lowest
 
 
-def _ground_far_around(sample: NDArray[np.float64]) -> float | None:
+def _ground_far_around(sample: Floats) -> float | None:
     """The height that many of the lowest points in cells up to 60 m away have [m]: that nearest to the road's.
 
     None if no height has many. Land beside a road may be higher or lower, and wider.
@@ -182,11 +159,7 @@ _USUAL_M = 9.0  # median distance in a street
 
 
 def check_dropped(points: Points, dropped: DroppedPoints, sensor: SensorProfile) -> tuple[Finding, ...]:
-    """Describe a scan of which nearly all is nearer than the sensor measures: a street in another unit, or no returns.
-
-    points : (n, 4) float32; the scan before anything was dropped.
-    dropped : what `edgeperc.preprocess.returns.returns` dropped of it.
-    """
+    """Describe a scan of which nearly all was dropped as too near: a street in another unit, or no returns."""
     n_left = len(points) - dropped.total
     if dropped.too_near <= _NEARLY_ALL * n_left:
         return ()
@@ -440,8 +413,7 @@ def check_ground(
 ) -> tuple[Finding, ...]:
     """Describe a scan that shows a plane above, as it should show the ground below, and little of a plane below.
 
-    points : (n, 4) float32; returns in the frame of the scan, before a mounting moves them.
-    support_of, below_of : `ground.leveling.near_support` and `ground.leveling.share_below`.
+    points : returns in the frame of the scan, before a mounting moves them.
     sensor : if its beams look up more than down, and so do the points, it is the right way up: it sees a roof above and
         little ground.
     """

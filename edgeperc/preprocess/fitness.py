@@ -8,12 +8,11 @@ from dataclasses import asdict, dataclass, fields
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..errors import CardError, PointsError
 from ..system.fields import Fields
 from ..system.kernels import njit
-from ..types.points import Points, read_only
+from ..types.points import Floats, Floats32, Ints64, Points, Records, read_only
 
 # About 6,000 points are enough. Steps are prime, so that they do not align with the rows of an organized scan.
 _STEPS = np.array([1, 2, 3, 5, 7, 11, 13, 17, 19, 23, 29, 31, 37, 41, 43, 53, 61, 71, 83, 97, 127, 167, 223, 307, 401])
@@ -51,39 +50,19 @@ SUMS = np.dtype(
 
 
 class Histograms(NamedTuple):
-    """Numbers of points.
+    """Numbers of points."""
 
-    Attributes
-    ----------
-    remissions : (258,) int64
-        Remission <= 0, 256 even bins in 0..1, above 1.
-    elevations : (360,) int64
-        Bins of half a degree from -90, of the points farther than 3 m.
-    ranges : (200,) int64
-        Horizontal distance, 20 bins a decade from 1 mm.
-    heights : (3, 100) int64
-        x, y and z of the points 3 to 25 m away, bins of 0.2 m from -10 m.
-    """
-
-    remissions: NDArray[np.int64]
-    elevations: NDArray[np.int64]
-    ranges: NDArray[np.int64]
-    heights: NDArray[np.int64]
+    remissions: Ints64  # (258,) remission <= 0, 256 even bins in 0..1, above 1
+    elevations: Ints64  # (360,) bins of half a degree from -90, of the points farther than 3 m
+    ranges: Ints64  # (200,) horizontal distance, 20 bins a decade from 1 mm
+    heights: Ints64  # (3, 100) x, y and z of the points 3 to 25 m away, bins of 0.2 m from -10 m
 
 
 class Rows(NamedTuple):
-    """Elevations in the eight directions ahead, left, behind, right and halfway between.
+    """Elevations in the eight directions ahead, left, behind, right and halfway between."""
 
-    Attributes
-    ----------
-    elevations : (8, 1024) float64
-        [deg]
-    counts : (8,) int64
-        How many of them each direction has.
-    """
-
-    elevations: NDArray[np.float64]
-    counts: NDArray[np.int64]
+    elevations: Floats  # (8, 1024) [deg]
+    counts: Ints64  # (8,) how many of them each direction has
 
 
 @njit(cache=True, nogil=True)
@@ -94,15 +73,10 @@ def fill_scan_sums(
     view: tuple[float, float],
     histograms: Histograms,
     rows: Rows,
-    sums: NDArray[np.void],
+    sums: Records,
 ) -> None:
-    """Measure every ``step``-th point, for `check_fitness`. Points that are not finite are skipped.
-
-    points : (n, 4) float32; x, y, z [m], remission.
-    beam_step : for ``rows``, every ``beam_step``-th point is used.
-    view : right and left edge of the model's view as pseudo-azimuth.
-    histograms, rows : overwritten
-    sums : (1,) `SUMS`, overwritten
+    """Measure every ``step``-th point, and for ``rows`` every ``beam_step``-th, for `check_fitness`; not finite ones
+    are skipped. ``view``: right and left edge of the model's view as pseudo-azimuth.
     """
     seen, far = np.zeros(N_SECTORS), np.zeros(N_SECTORS)  # 1 with points; points farther than 3 m
     fill_histograms(points, step, view, histograms, seen, far, sums)
@@ -122,9 +96,9 @@ def fill_histograms(
     step: int,
     view: tuple[float, float],
     histograms: Histograms,
-    seen: NDArray[np.float64],
-    far: NDArray[np.float64],
-    sums: NDArray[np.void],
+    seen: Floats,
+    far: Floats,
+    sums: Records,
 ) -> None:
     """Count the points; see `Histograms`.
 
@@ -177,9 +151,7 @@ def fill_histograms(
 
 
 @njit(cache=True, nogil=True)
-def measure_sectors(
-    view: tuple[float, float], seen: NDArray[np.float64], far: NDArray[np.float64], sums: NDArray[np.void]
-) -> None:
+def measure_sectors(view: tuple[float, float], seen: Floats, far: Floats, sums: Records) -> None:
     """Write how many sectors have points, the share of the view that has, and how uneven they are."""
     right, left = view
     n_seen, n_view, n_view_seen, n_far, n_sectors, fullest = 0.0, 0, 0.0, 0.0, 0.0, 0.0
@@ -250,21 +222,13 @@ def fill_rows(points: Points, step: int, rows: Rows) -> None:
 
 
 class Walls(NamedTuple):
-    """Where a scan ends, in `N_SECTORS` directions.
+    """Where a scan ends, in `N_SECTORS` directions."""
 
-    Attributes
-    ----------
-    enclosed : float
-        Share of the directions with points that end at a wall: the farthest points lie above one another.
-    mostly_enclosed : float
-        The same for the nearest three quarters of the points of each: the others may be seen through windows.
-    through_m : float
-        How far two opposite directions are seen [m], each by a tenth of its points.
-    """
-
+    # share of the directions with points that end at a wall: the farthest points lie above one another
     enclosed: float = 0.0
+    # the same for the nearest three quarters of the points of each: the others may be seen through windows
     mostly_enclosed: float = 0.0
-    through_m: float = math.inf
+    through_m: float = math.inf  # how far two opposite directions are seen [m], each by a tenth of its points
 
 
 @dataclass(frozen=True)
@@ -309,7 +273,7 @@ def _pseudo_azimuth(azimuth_deg: float) -> float:
     return across if x >= 0.0 else math.copysign(2.0, azimuth_deg) - across
 
 
-def _quantile(histogram: NDArray[np.int64], share: float) -> float:
+def _quantile(histogram: Ints64, share: float) -> float:
     """Place in a histogram, in bins, below which ``share`` of it lies."""
     total = np.cumsum(histogram)
     return float(np.searchsorted(total, share * total[-1], side="right")) + 0.5
@@ -385,7 +349,7 @@ def _walls(points: Points) -> Walls:
     count = np.bincount(sector, minlength=N_SECTORS)
     first = np.cumsum(count) - count
 
-    def ends(share: float) -> NDArray[np.float64]:
+    def ends(share: float) -> Floats:
         """The range below which this share of a direction's points lies; 0 if it has too few."""
         row = np.minimum(first + np.floor(share * (count - 1.0)).astype(np.int64), len(across) - 1)
         return np.where(count > 0, across[row], 0.0)
@@ -412,55 +376,30 @@ class FitnessProfile:
     """Lowest and highest value of each statistic over the training scans.
 
     The model's card holds it; `check_fitness` compares scans with it.
-
-    Attributes
-    ----------
-    n_scans : int
-    azimuth_deg : tuple of 2 float
-        Left and right edge of the model's view [deg].
-    points_in_view : tuple of 2 float
-        Points in that view.
-    view_covered : tuple of 2 float
-        Share of the view with returns, in steps of 1/64 turn.
-    remission_median, remission_p99, remission_zeros : tuple of 2 float
-        Median, 99th percentile and share of zeros of the remission, scaled to 0..1.
-    elevation_p01_deg, elevation_p99_deg : tuple of 2 float
-        1st and 99th percentile of the elevation of points farther than 3 m [deg].
-    beams, beams_per_deg : tuple of 2 float
-        Rows of points above one another, and their number per degree of elevation.
-    range_median_m : tuple of 2 float
-        Median horizontal distance [m].
-    ground_m : tuple of 2 float, or None
-        Height of the ground in the sensor frame [m]; None if no scan shows the ground.
-    road_ahead : tuple of 2 float, or None
-        Logarithm of the ratio of obstacles at the sides to those ahead and behind; None if no scan is a full turn.
     """
 
     n_scans: int
-    azimuth_deg: Range
-    points_in_view: Range
-    view_covered: Range
+    azimuth_deg: Range  # left and right edge of the model's view [deg]
+    points_in_view: Range  # points in that view
+    view_covered: Range  # share of the view with returns, in steps of 1/64 turn
+    # median, 99th percentile and share of zeros of the remission, scaled to 0..1
     remission_median: Range
     remission_p99: Range
     remission_zeros: Range
+    # 1st and 99th percentile of the elevation of points farther than 3 m [deg]
     elevation_p01_deg: Range
     elevation_p99_deg: Range
+    # rows of points above one another, and their number per degree of elevation
     beams: Range
     beams_per_deg: Range
-    range_median_m: Range
-    ground_m: Range | None
+    range_median_m: Range  # median horizontal distance [m]
+    ground_m: Range | None  # height of the ground in the sensor frame [m]; None if no scan shows the ground
+    # logarithm of the ratio of obstacles at the sides to those ahead and behind; None if no scan is a full turn
     road_ahead: Range | None
 
     @classmethod
-    def from_scans(
-        cls, scans: Iterable[NDArray[np.float32]], azimuth_deg: tuple[float, float] = (45.0, -45.0)
-    ) -> FitnessProfile:
-        """Measure training scans.
-
-        scans : iterable of (n, 4) float32; x, y, z [m], remission scaled to 0..1.
-        azimuth_deg : tuple of 2 float; left and right edge of the model's view [deg], between 180 and -180.
-        Raises PointsError.
-        """
+    def from_scans(cls, scans: Iterable[Floats32], azimuth_deg: tuple[float, float] = (45.0, -45.0)) -> FitnessProfile:
+        """Measure training scans with remission in 0..1, for a view between a left and a right edge [deg]."""
         measures = [measured for scan in scans if (measured := measure(scan, azimuth_deg)) is not None]
         if not measures:
             raise PointsError("no scan with a finite point was given; a profile needs the training scans")
@@ -476,10 +415,7 @@ class FitnessProfile:
 
     @classmethod
     def from_dict(cls, document: Mapping[str, Any]) -> FitnessProfile:
-        """Read what `to_dict` wrote.
-
-        Raises CardError.
-        """
+        """Read what `to_dict` wrote."""
         profile = _FIELDS.read(cls, document, "fitness")
         _FIELDS.whole("fitness.n_scans", profile.n_scans, 1, 10**9)
         for name, (low, high) in _BOUNDS.items():

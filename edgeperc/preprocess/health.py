@@ -14,12 +14,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from ..system.kernels import njit
 from ..types.mounting import MODEL_HEIGHT_M
 from ..types.perception import SensorHealth
-from ..types.points import Mask, Points, read_only
+from ..types.points import Floats, Floats32, Ints, Ints64, Mask, Points, read_only
 from ..types.sensor import SensorProfile
 
 N_SECTORS = 72
@@ -45,17 +45,9 @@ _RANGE_SHARE, _SHRUNK, _FEWER_RETURNS = 0.95, 0.6, 0.85
 
 @dataclass(frozen=True)
 class Normal:
-    """What the first scans of a sensor showed.
+    """What a sensor's first scans showed: least counts of `fill_sectors`; high ranges [m] and returns of each scan."""
 
-    Attributes
-    ----------
-    fewest : (N_SECTORS, 4) float64, or None
-        Least counts of `fill_sectors`; None before the first scan.
-    ranges_m, returns : tuple of float
-        High quantile of the ranges [m] and number of returns, one a scan.
-    """
-
-    fewest: NDArray[np.float64] | None = None
+    fewest: Floats | None = None
     ranges_m: tuple[float, ...] = ()
     returns: tuple[float, ...] = ()
 
@@ -64,7 +56,7 @@ class Normal:
         """Whether further scans change nothing."""
         return len(self.returns) >= NORMAL_SCANS
 
-    def add(self, counts: NDArray[np.float64], range_m: float, n_returns: float) -> Normal:
+    def add(self, counts: Floats, range_m: float, n_returns: float) -> Normal:
         """With one more scan, unless it is complete."""
         if self.is_complete:
             return self
@@ -75,11 +67,8 @@ class Normal:
 def check_health(
     points: Points, sensor: SensorProfile, normal: Normal, eye_m: ArrayLike = (0.0, 0.0, 0.0)
 ) -> tuple[SensorHealth, Normal]:
-    """Measure what window and weather do to a scan, and compare it with the first scans.
-
-    points : (n, 4) float32; x, y, z [m] in the frame of the models, remission. Rows that are not finite are skipped.
-    eye_m : place of the sensor there.
-    Returns the health, and ``normal`` with this scan if that is not complete.
+    """Measure what window and weather do to a scan in the frame of the models, and compare it with the first scans;
+    returns the health, and ``normal`` with this scan if that is not complete.
     """
     eye, points = np.array(eye_m, np.float64), read_only(points)
     step = next((step for step in _STEPS if len(points) <= step * _SAMPLE), len(points) // _SAMPLE | 1)
@@ -115,9 +104,7 @@ def check_health(
     return health, normal.add(counts, range_m, float(n_sampled * step))
 
 
-def without_drops(
-    points: Points, sensor: SensorProfile, eye_m: ArrayLike = (0.0, 0.0, 0.0)
-) -> tuple[NDArray[np.float32], int]:
+def without_drops(points: Points, sensor: SensorProfile, eye_m: ArrayLike = (0.0, 0.0, 0.0)) -> tuple[Floats32, int]:
     """A scan (n, 4) in which near points with at most one neighbor, or four if they are dim, are NaN, and their number.
 
     Only for scans of which `check_health` says that there are drops: leaves and wires are as lonely.
@@ -186,13 +173,13 @@ def _side(azimuth_deg: float) -> str:
     return f"{abs(azimuth_deg):g} degrees {'left' if azimuth_deg > 0.0 else 'right'}"
 
 
-def _everywhere(near: NDArray[np.int64], lonely: NDArray[np.int64]) -> float:
+def _everywhere(near: Ints64, lonely: Ints64) -> float:
     """Share of the near points that is lonely on nearly all sides; leaves and wires are on one side."""
     of_sides = np.sort(lonely / np.maximum(near[:, 0], 1))[near[:, 0] >= _FEWEST_NEAR // 4]
     return float(of_sides[(len(of_sides) - 1) // 3]) if len(of_sides) else 0.0
 
 
-def _has_drops(near: NDArray[np.int64], has_remission: bool) -> tuple[bool, bool]:
+def _has_drops(near: Ints64, has_remission: bool) -> tuple[bool, bool]:
     """Whether there are drops on nearly all sides, and a cloud of them on one, by counts of `mark_isolated`."""
     if not has_remission:
         return _everywhere(near, near[:, 1]) > _ISOLATED, False
@@ -210,7 +197,7 @@ def _has_fog(health: SensorHealth, is_hazy: bool) -> bool:
     return is_dimmed and health.range_m < _SHRUNK * health.normal_range_m
 
 
-def _blocked(counts: NDArray[np.float64], normal: Normal) -> NDArray[np.bool_]:
+def _blocked(counts: Floats, normal: Normal) -> Mask:
     """Which sectors are blocked in the bands that meet the ground, (N_SECTORS, 2) bool."""
     lacks, blocked = np.empty(counts.shape, np.bool_), np.zeros((N_SECTORS, 2), np.bool_)
     fill_lacking(counts, np.full(counts.shape, np.inf) if normal.fewest is None else normal.fewest, lacks)
@@ -229,7 +216,7 @@ def _blocked(counts: NDArray[np.float64], normal: Normal) -> NDArray[np.bool_]:
     return blocked
 
 
-def _runs(marks: NDArray[np.bool_]) -> list[tuple[int, int]]:
+def _runs(marks: Mask) -> list[tuple[int, int]]:
     """First sector and length of each run of marked ones; the last sector is beside the first."""
     if marks.all():
         return [(0, len(marks))]
@@ -238,7 +225,7 @@ def _runs(marks: NDArray[np.bool_]) -> list[tuple[int, int]]:
     return [(int(first), int(min((ends - first) % len(marks)))) for first in firsts]
 
 
-def _arcs(marks: NDArray[np.bool_]) -> tuple[tuple[float, float], ...]:
+def _arcs(marks: Mask) -> tuple[tuple[float, float], ...]:
     """Left and right edge of each run of sectors [deg], -180..180, left positive."""
     if not marks.any():
         return ()
@@ -251,13 +238,8 @@ def _arcs(marks: NDArray[np.bool_]) -> tuple[tuple[float, float], ...]:
 
 
 def _isolated(
-    points: Points,
-    eye: NDArray[np.float64],
-    sensor: SensorProfile,
-    wedge: float,
-    most: tuple[int, int],
-    mark: Mask | None,
-) -> tuple[NDArray[np.int64], bool]:
+    points: Points, eye: Floats, sensor: SensorProfile, wedge: float, most: tuple[int, int], mark: Mask | None
+) -> tuple[Ints64, bool]:
     """What `mark_isolated` counts, and whether the scan has a remission."""
     per_m = _RADIUS_COLUMNS * math.radians(sensor.azimuth_resolution_deg)
     radius = np.array([per_m, _LEAST_RADIUS_M, max(_LEAST_RADIUS_M, per_m * NEAR_M)])
@@ -275,20 +257,11 @@ def _isolated(
 
 
 @njit(cache=True, nogil=True)
-def fill_sectors(
-    points: Points,
-    eye: NDArray[np.float64],
-    step: int,
-    tans: NDArray[np.float64],
-    counts: NDArray[np.float64],
-    ranges: NDArray[np.float64],
-) -> int:
+def fill_sectors(points: Points, eye: Floats, step: int, tans: Floats, counts: Floats, ranges: Floats) -> int:
     """Count every ``step``-th point by sector and band, and by range in meters; returns the number of them.
 
-    tans : (2,) tangents of the elevations below which beams are in the first, or else in the second band; others are
-        in the third.
-    counts : (N_SECTORS, 4), overwritten; sectors counter-clockwise from x; the last column is the sum of the bands.
-    ranges : (256,), overwritten
+    tans : tangents of the elevations below which beams are in the first, or else in the second band of three.
+    counts : (N_SECTORS, 4) sectors counter-clockwise from x; the last column is the sum of the bands.
     """
     for k in range(counts.shape[0]):
         counts[k, 0] = counts[k, 1] = counts[k, 2] = counts[k, 3] = 0.0
@@ -319,11 +292,10 @@ def fill_sectors(
 
 
 @njit(cache=True, nogil=True)
-def fill_lacking(counts: NDArray[np.float64], fewest: NDArray[np.float64], lacks: Mask) -> None:
+def fill_lacking(counts: Floats, fewest: Floats, lacks: Mask) -> None:
     """Write where returns are missing: fewer than in other sectors, and than the fewest before.
 
     counts, fewest : (N_SECTORS, 4) of `fill_sectors`; infinite before the first scan.
-    lacks : (N_SECTORS, 4) bool, overwritten
     """
     ordered = np.empty(counts.shape[0])
     for column in range(counts.shape[1]):
@@ -346,23 +318,22 @@ def fill_lacking(counts: NDArray[np.float64], fewest: NDArray[np.float64], lacks
 @njit(cache=True, nogil=True)
 def mark_isolated(
     points: Points,
-    eye: NDArray[np.float64],
+    eye: Floats,
     of: tuple[float, int, int, float],
-    radius: NDArray[np.float64],
-    heads: NDArray[np.int32],
-    buffers: NDArray[np.int32],
+    radius: Floats,
+    heads: Ints,
+    buffers: Ints,
     mark: Mask,
-    counts: NDArray[np.int64],
+    counts: Ints64,
 ) -> None:
     """Count points within `NEAR_M`, and those with few others around them, which are marked.
 
-    of : only points whose smaller horizontal coordinate is at most this share of the larger one; how many others;
-        how many if it is dim; the remission below which it is.
-    radius : (3,); around a point, per meter of its range, at least, and at most [m].
-    heads : (a power of two,), buffers : (2, most near points that are looked at); overwritten.
-    mark : (n,) or (0,) bool, modified.
-    counts : (4, 3), overwritten; of each side, with a larger x, y, -x and -y, the near points, those with few others
-        around, and of these the dim ones.
+    of : only points whose smaller horizontal coordinate is at most this share of the larger one; how many others; how
+        many if it is dim; the remission below which it is.
+    radius : (3,) around a point, per meter of its range, at least, and at most [m].
+    heads, buffers : scratch: a power of two, and 2 x the most near points that are looked at.
+    counts : (4, 3) of each side, with a larger x, y, -x and -y, the near points, those with few others around, and of
+        these the dim ones.
     """
     wedge, most_bright, most_dim, dim = of
     n, full = 0, np.float64(NEAR_M * NEAR_M)
@@ -420,13 +391,7 @@ def bucket(a: int, b: int, c: int, last: int) -> int:
 
 @njit(cache=True, nogil=True)
 def is_isolated(
-    points: Points,
-    eye: NDArray[np.float64],
-    k: int,
-    most: int,
-    radius: tuple[float, float],
-    heads: NDArray[np.int32],
-    buffers: NDArray[np.int32],
+    points: Points, eye: Floats, k: int, most: int, radius: tuple[float, float], heads: Ints, buffers: Ints
 ) -> bool:
     """Whether at most ``most`` of the other near points are around the k-th; its own cell is looked at first.
 

@@ -6,12 +6,11 @@ import math
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..errors import PointsError
 from ..system.kernels import njit
 from ..types.mounting import MODEL_HEIGHT_M
-from ..types.points import Points
+from ..types.points import Floats, Floats32, Ints, Ints64, Points
 from ..types.sensor import SensorProfile
 from ..types.views import RangeImageGeometry
 
@@ -33,21 +32,8 @@ _SCATTER = 4.0
 
 
 class Interpolator:
-    """Fills the pixels of a range image between neighboring beams and columns of a coarser sensor (KUL-Seg 5).
-
-    Parameters
-    ----------
-    view : RangeImageGeometry
-        The model's view.
-    sensor : SensorProfile
-        The sensor that takes the scans. The ground is where it is in the frame of the models.
-
-    Attributes
-    ----------
-    shape : tuple of 2 int
-        Height and width of the range image.
-    needed : bool
-        Whether the sensor is coarser than some part of the view.
+    """Fills the pixels of a range image between neighboring beams and columns of a coarser sensor (KUL-Seg 5), if it is
+    coarser than some part of the view (``needed``).
     """
 
     def __init__(self, view: RangeImageGeometry, sensor: SensorProfile) -> None:
@@ -73,16 +59,9 @@ class Interpolator:
         self.shape = (view.height, view.width)
         self.needed = bool(self._row_reach.any() or self._col_reach)
 
-    def fill(self, points: Points, index: NDArray[np.int32]) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
-        """Interpolate points in the gaps of a range image.
-
-        points : (n, 4) float32
-        index : (H, W) int32; row of ``points`` at each pixel; -1 without a return.
-        Returns points ((n + m, 4) float32): The given points, then the interpolated ones: each on the line between
-            two neighbors, in the middle of its pixel.
-        Returns index ((H, W) int32): Row of the returned points at each pixel, -1 if empty. Rows from n on are
-            interpolated points.
-        Raises PointsError.
+    def fill(self, points: Points, index: Ints) -> tuple[Floats32, Ints]:
+        """The points with interpolated ones behind them, each on the line between two neighbors in the middle of its
+        pixel, and their rows at each pixel.
         """
         if points.ndim != 2 or points.shape[1] != 4 or points.dtype != np.float32:
             raise PointsError(f"got points of shape {points.shape} and {points.dtype}; expected (n, 4) float32")
@@ -124,23 +103,20 @@ def on_one_surface(points: Points, i: int, j: int, ground_z: float) -> bool:
 def fill_between(
     points: Points,
     n: int,
-    index: NDArray[np.int32],
-    row_slopes: NDArray[np.float64],
-    directions: NDArray[np.float64],
-    row_reach: NDArray[np.int64],
+    index: Ints,
+    row_slopes: Floats,
+    directions: Floats,
+    row_reach: Ints64,
     col_reach: int,
     ground_z: float,
 ) -> int:
-    """Fill the empty pixels between two returns of one surface, first along rows, then along columns.
+    """Fill empty pixels between two returns of one surface, along rows, then columns; returns the number of points.
 
-    points : (n + H * W, 4) float32; the first ``n`` rows are the input; the rows after them are overwritten.
-    index : (H, W) int32; row of points, -1 if empty; empty pixels are overwritten.
-    row_slopes : (H,) float64; tangent of each row's elevation.
-    directions : (2, W) float64; cosine and sine of each column's azimuth.
-    row_reach : (H,) int64; how many rows below each row the next beam's return may be.
-    col_reach : how many columns to the right the next return may be.
+    points : (n + H * W, 4) the first ``n`` rows are the input, those after them are overwritten.
+    row_slopes, directions : tangent of each row's elevation; cosine and sine of each column's azimuth.
+    row_reach, col_reach : how many rows below each row the next beam's return may be, and how many columns to the
+        right.
     ground_z : height of the ground in the sensor frame [m].
-    Returns: Number of points, with the interpolated ones.
     """
     height, width = index.shape
     for row in range(height if col_reach > 1 else 0):

@@ -11,12 +11,12 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from ..errors import EdgepercError, OptionError, PointsError, SensorError, StampError, TrackingError
 from ..system.kernels import njit
 from ..types.frame import fill_moved, poses_of
-from ..types.points import Points, as_points, read_only
+from ..types.points import Floats, Floats32, Points, as_points, read_only
 from ..types.rigid import rigid
 from .returns import blank_too_near
 
@@ -122,8 +122,8 @@ class Trajectory:
         Fewer than two times, or they do not rise.
     """
 
-    times_s: NDArray[np.float64]
-    T_world_sensor: NDArray[np.float64]
+    times_s: Floats
+    T_world_sensor: Floats
 
     def __post_init__(self) -> None:
         try:
@@ -254,7 +254,7 @@ class Trajectory:
 
 def deskew(
     points: ArrayLike, times: ArrayLike, motion: Motion, *, at_s: float | None = None, min_range_m: float = 0.0
-) -> NDArray[np.float32]:
+) -> Floats32:
     """Move each point of a scan to where a sensor that stands still would have seen it.
 
     A spinning sensor takes about 0.1 s for a scan. At 20 m/s it moves by 2 m in this time.
@@ -296,7 +296,7 @@ def deskew(
     rows = as_points(points)
     seen = blank_too_near(rows, _meters(min_range_m))
     try:
-        moments: NDArray[np.float64] = np.array(times, np.float64)
+        moments: Floats = np.array(times, np.float64)
     except (OverflowError, TypeError, ValueError) as exc:
         raise PointsError(f"got times that are not numbers ({exc}); expected ({len(rows)},) seconds") from exc
     if moments.shape != (len(rows),):
@@ -323,7 +323,7 @@ def deskew(
 
 def merge(
     scans: Sequence[ArrayLike], T_vehicle_sensor: Sequence[ArrayLike], *, min_range_m: float | Sequence[float] = 0.0
-) -> NDArray[np.float32]:
+) -> Floats32:
     """Join the scans of several sensors to one scan in the frame of the vehicle.
 
     Parameters
@@ -378,7 +378,7 @@ def _meters(min_range_m: float) -> float:
     return meters
 
 
-def _rows(content: bytes) -> NDArray[np.float64]:
+def _rows(content: bytes) -> Floats:
     """The numbers in a file of poses, (n, 8); ValueError says what else it holds."""
     first = next((line for line in content.splitlines() if line.partition(b"#")[0].strip()), b"")
     if not first:
@@ -398,7 +398,7 @@ def _line(content: bytes, k: int) -> int:
     return rows[k] if k < len(rows) else k + 1
 
 
-def _inverse(poses: NDArray[np.float64]) -> NDArray[np.float64]:
+def _inverse(poses: Floats) -> Floats:
     inverse = poses.copy()
     inverse[:, :3, :3] = poses[:, :3, :3].transpose(0, 2, 1)
     with np.errstate(all="ignore"):
@@ -410,13 +410,13 @@ def _reading(quaternion: str, maps_from: str) -> str:
     return f"{', '.join(quaternion)}{' and from the world to the sensor' if maps_from == 'world' else ''}"
 
 
-def _speed(poses: NDArray[np.float64], times_s: NDArray[np.float64]) -> float:
+def _speed(poses: Floats, times_s: Floats) -> float:
     with np.errstate(all="ignore"):
         speeds = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1) / np.diff(times_s)
     return float(np.median(speeds)) if len(speeds) else 0.0
 
 
-def _fits_better(other: NDArray[np.float64], poses: NDArray[np.float64], times_s: NDArray[np.float64]) -> bool:
+def _fits_better(other: Floats, poses: Floats, times_s: Floats) -> bool:
     """Whether one reading of the same poses is that of a vehicle, and the second is not.
 
     What is too fast is none. Where neither is, as for a camera's axes, or both, a way that keeps its direction in the
@@ -431,7 +431,7 @@ def _fits_better(other: NDArray[np.float64], poses: NDArray[np.float64], times_s
     return other_keeps > SAME_WAY > keeps and (is_vehicle or up < UPRIGHT)
 
 
-def _likeness(poses: NDArray[np.float64]) -> tuple[bool, float, float]:
+def _likeness(poses: Floats) -> tuple[bool, float, float]:
     """Whether the poses are those of a vehicle, how well its way keeps its direction in the sensor, 0 to 1, and how
     upright it is.
     """
@@ -440,12 +440,12 @@ def _likeness(poses: NDArray[np.float64]) -> tuple[bool, float, float]:
     return is_vehicle, SAME_WAY if way is None else float(np.linalg.norm(way)), up
 
 
-def _rank(poses: NDArray[np.float64]) -> tuple[bool, float]:
+def _rank(poses: Floats) -> tuple[bool, float]:
     is_vehicle, keeps, up = _likeness(poses)
     return is_vehicle, round(keeps + up, 2)
 
 
-def _up_and_way(poses: NDArray[np.float64]) -> tuple[float, NDArray[np.float64] | None]:
+def _up_and_way(poses: Floats) -> tuple[float, Floats | None]:
     """The mean of the z axes along z of the world, and of the directions of travel in the sensor; None if it stands."""
     up = float(poses[:, 2, 2].mean())
     kept = [0]
@@ -461,26 +461,16 @@ def _up_and_way(poses: NDArray[np.float64]) -> tuple[float, NDArray[np.float64] 
     return up, (ways / np.linalg.norm(ways, axis=1, keepdims=True).clip(1e-9)).mean(axis=0)
 
 
-def _directions(poses: NDArray[np.float64]) -> str:
+def _directions(poses: Floats) -> str:
     up, way = _up_and_way(poses)
     tilt = f"{math.degrees(math.acos(min(1.0, max(-1.0, up)))):.0f} deg from up"
     return tilt if way is None else f"{tilt} and that travels along {np.round(way, 1).tolist()}"
 
 
 @njit(cache=True, nogil=True)
-def fill_deskewed(
-    points: Points,
-    after_s: NDArray[np.float64],
-    velocity: NDArray[np.float64],
-    rate: NDArray[np.float64],
-    moved: Points,
-) -> None:
-    """Move points by the motion of the sensor (Rodrigues' formula for the turn and for its integral).
-
-    points : (n, 4) float32, C-contiguous
-    after_s : (n,) float64; time of each point after the pose of the result [s].
-    velocity, rate : (3,) float64; of the sensor, in its own frame [m/s, rad/s].
-    moved : (n, 4) float32, overwritten
+def fill_deskewed(points: Points, after_s: Floats, velocity: Floats, rate: Floats, moved: Points) -> None:
+    """Move points by the motion of the sensor in its own frame (Rodrigues' formula for the turn and for its integral),
+    of the time of each after the pose of the result [s].
     """
     wx, wy, wz = rate[0], rate[1], rate[2]
     squared = wx * wx + wy * wy + wz * wz

@@ -5,10 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..errors import SensorError
-from ..types.points import Points
+from ..types.points import Floats, Floats32, Ints64, Points
 from ..types.sensor import RemissionFunction, SensorProfile
 from .condition import scale
 from .findings import Finding
@@ -84,7 +83,7 @@ class RemissionMatcher:
         self.sensor = sensor
         self.matched: RemissionFunction | None = None
         # None for a scan of the training sensor whose remission is usual: then nothing is matched.
-        self._samples: tuple[tuple[NDArray[np.int64], NDArray[np.float64]] | None, ...] = ()
+        self._samples: tuple[tuple[Ints64, Floats] | None, ...] = ()
         self._reported: frozenset[str] = frozenset()
 
     @property
@@ -196,7 +195,7 @@ class RemissionMatcher:
         return best if quantile_difference(raw, wanted, replace(self.sensor, remission=best)) < off else None
 
 
-def quantile_difference(raw: NDArray[np.float64], wanted: NDArray[np.float64], sensor: SensorProfile) -> float:
+def quantile_difference(raw: Floats, wanted: Floats, sensor: SensorProfile) -> float:
     """Mean difference between converted quantiles and the training sensor's."""
     points = np.zeros((len(raw), 4), np.float32)
     points[:, 3] = raw
@@ -218,7 +217,7 @@ def is_missing(points: Points) -> bool:
     return _n_values(raw) == 1 and int(np.count_nonzero(np.isfinite(raw))) >= _FEWEST
 
 
-def _n_values(raw: NDArray[np.float32]) -> int:
+def _n_values(raw: Floats32) -> int:
     """0, 1, or 2 for more finite values."""
     finite = raw[np.isfinite(raw)]
     return 0 if not len(finite) else 1 if finite.min() == finite.max() else 2

@@ -9,11 +9,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..system.kernels import njit
 from ..types.perception import DroppedPoints
-from ..types.points import Points, read_only
+from ..types.points import Floats, Floats32, Points, read_only
 from ..types.sensor import SensorProfile
 
 # A coordinate of float32 is off by at most 6e-8 of its size: a point at exactly the nearest range counts as near.
@@ -22,19 +21,14 @@ ROUNDING = 1e-6
 
 def returns(
     points: Points, sensor: SensorProfile, origin_m: tuple[float, float] | None = None
-) -> tuple[NDArray[np.float32], DroppedPoints]:
-    """Blank the rows of a scan that are not returns of the world.
+) -> tuple[Floats32, DroppedPoints]:
+    """Blank the rows of a scan that are not returns of the world with NaN: not finite, too near, of the own vehicle. A
+    remission that is not finite becomes the median of the others, 0 if there are none.
 
-    points : (n, 4) float32; x, y, z [m] in the frame of the scan, before its mounting moves it; remission. Not
-        modified.
-    sensor : rows at most ``min_range_m`` from the sensor are too near; with ``min_range_m=0``, those of the sensor's
-        own place. Rows inside ``ego_box`` are of the own vehicle.
-    origin_m : tuple of 2 float; x, y of the sensor in the frame of the scan [m]; by default as the profile's mounting
-        says.
-    Returns scan ((n, 4) float32, C-contiguous, read-only): In input order. Blanked rows are NaN in all four columns. A
-        remission that is not finite is missing: it becomes the median of the others, 0 if there are none. A view of
-        ``points`` if nothing changes.
-    Returns dropped: A row of several kinds counts once, as the first of them.
+    points : in the frame of the scan, before its mounting moves it. The result is read-only, a view of them if nothing
+        changes.
+    sensor : rows at most ``min_range_m`` from the sensor are too near; with 0, those of the sensor's own place.
+    origin_m : x, y of the sensor in the frame of the scan [m]; by default as the profile's mounting says.
     """
     x, y = sensor.mounting.origin_m if origin_m is None else origin_m
     box = None if sensor.ego_box is None else np.array(sensor.ego_box)
@@ -42,7 +36,7 @@ def returns(
     return _with_remission(scan) if n_unknown else scan, dropped
 
 
-def blank_too_near(points: Points, min_range_m: float) -> NDArray[np.float32]:
+def blank_too_near(points: Points, min_range_m: float) -> Floats32:
     """A scan (n, 4) in which rows at most ``min_range_m`` from its origin are NaN, read-only; see `returns`."""
     return _blanked(points, np.zeros(3), min_range_m, None)[0]
 
@@ -58,7 +52,7 @@ def about_too_near(dropped: DroppedPoints, n_points: int, sensor: SensorProfile)
     )
 
 
-def _with_remission(scan: Points) -> NDArray[np.float32]:
+def _with_remission(scan: Points) -> Floats32:
     """A copy whose rows with coordinates have a remission."""
     filled, known = scan.copy(), np.isfinite(scan[:, 3])
     median = np.median(scan[known, 3].astype(np.float64)) if known.any() else 0.0  # a mean of two may overflow
@@ -67,8 +61,8 @@ def _with_remission(scan: Points) -> NDArray[np.float32]:
 
 
 def _blanked(
-    points: Points, origin: NDArray[np.float64], min_range_m: float, box: NDArray[np.float64] | None
-) -> tuple[NDArray[np.float32], DroppedPoints, int]:
+    points: Points, origin: Floats, min_range_m: float, box: Floats | None
+) -> tuple[Floats32, DroppedPoints, int]:
     """The scan, what was dropped, and the number of other rows whose remission is not finite."""
     points = read_only(points)
     limit = min_range_m * (1.0 + ROUNDING)
@@ -85,7 +79,7 @@ def _blanked(
 
 
 @njit(cache=True, nogil=True)
-def has_returns_only(values: NDArray[np.float32], square: np.float32) -> bool:
+def has_returns_only(values: Floats32, square: np.float32) -> bool:
     """Whether all points (4 n,) are surely finite and farther from the origin than the root of ``square``.
 
     In float32, with one index and a 32-bit count, LLVM computes eight points at a time: 0.04 in place of 0.19 ms.
@@ -102,18 +96,11 @@ def has_returns_only(values: NDArray[np.float32], square: np.float32) -> bool:
 
 @njit(cache=True, nogil=True)
 def fill_returns(
-    points: Points,
-    origin: NDArray[np.float64],
-    square: float,
-    box: NDArray[np.float64],
-    cleaned: NDArray[np.float32],
+    points: Points, origin: Floats, square: float, box: Floats, cleaned: Floats32
 ) -> tuple[int, int, int, int]:
-    """Copy the points (n, 4) that are returns, NaN in place of others.
-
-    Returns the numbers of rows that are not finite, too near and of the ego, and of others without remission.
-
-    ``square`` is that of the nearest range [m2] about ``origin`` (3,); ``box`` (3, 2) has lowest and highest x, y, z
-    about it.
+    """Copy the points that are returns, NaN in place of others; returns the numbers of rows that are not finite, too
+    near and of the ego, and of others without remission. ``square`` is that of the nearest range [m2] about ``origin``,
+    as the ``box``.
     """
     n_not_finite, n_too_near, n_ego, n_unknown = 0, 0, 0, 0
     for i in range(points.shape[0]):

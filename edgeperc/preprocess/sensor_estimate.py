@@ -13,11 +13,10 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..errors import SensorError
 from ..system.kernels import njit
-from ..types.points import Points
+from ..types.points import Floats, Floats32, Ints64, Points
 from ..types.sensor import SAY_PATTERN, SENSORS, SensorProfile
 from .findings import BEYOND, FEET_PER_M, check_coordinates, in_feet
 
@@ -39,8 +38,8 @@ _FEWEST_OF_LINE, _SPREAD = 30, 0.2  # points, and the spread of their inverse di
 _FEWEST_LINES, _RADIUS_M, _RIDGE = 4, 0.05, 0.01
 
 # Votes: heights of the origin about that of the scan [m], bins of elevations [deg].
-_OFFSETS_M: NDArray[np.float64] = np.arange(-20, 21) * np.float64(0.02)
-_FINE_M: NDArray[np.float64] = np.arange(-5, 6) * np.float64(0.004)
+_OFFSETS_M: Floats = np.arange(-20, 21) * np.float64(0.02)
+_FINE_M: Floats = np.arange(-5, 6) * np.float64(0.004)
 _BIN_DEG, _UP_DEG, _BAND_DEG = 0.02, 60.0, 1.0
 _TWO_BLOCKS = 1.08  # how much more two heights must explain than one
 _VALLEY = 0.5  # of a peak: lower ones part two beams
@@ -81,51 +80,27 @@ _ADVICE = (
 
 
 class Polar(NamedTuple):
-    """Points of a scan about the sensor's axis.
+    """Points of a scan about the sensor's axis."""
 
-    Attributes
-    ----------
-    flat, z : (n,) float64
-        Horizontal distance and height [m].
-    azimuth : (n,) float64
-        [deg].
-    time : (n,) float64
-        When a point was taken, in turns from the middle of the scan, if the points come in turn.
-    rows : tuple of (k,) int64
-        The points of each beam, if they come beam by beam.
-    """
-
-    flat: NDArray[np.float64]
-    z: NDArray[np.float64]
-    azimuth: NDArray[np.float64]
-    time: NDArray[np.float64]
-    rows: tuple[NDArray[np.int64], ...]
+    # (n,) horizontal distance and height [m]
+    flat: Floats
+    z: Floats
+    azimuth: Floats  # (n,) [deg]
+    time: Floats  # (n,) when a point was taken, in turns from the middle of the scan, if the points come in turn
+    rows: tuple[Ints64, ...]  # the points of each beam, if they come beam by beam
 
 
 class Beams(NamedTuple):
-    """Beams from the top down.
+    """Beams from the top down."""
 
-    Attributes
-    ----------
-    elevations_deg, slopes, offsets_m : (n,) float64
-        A beam's points have z = offset + slope * horizontal distance; the elevation is the angle of that slope.
-    seen_deg : (n,) float64
-        Median elevation of its points as seen from the origin of the scan.
-    counts : (n,) float64
-        The number of its points.
-    pure : (n,) float64
-        Share of these on its line.
-    flat_m : (n,) float64
-        Their median distance.
-    """
-
-    elevations_deg: NDArray[np.float64]
-    slopes: NDArray[np.float64]
-    offsets_m: NDArray[np.float64]
-    seen_deg: NDArray[np.float64]
-    counts: NDArray[np.float64]
-    pure: NDArray[np.float64]
-    flat_m: NDArray[np.float64]
+    # (n,) a beam's points have z = offset + slope * horizontal distance; the elevation is the angle of that slope
+    elevations_deg: Floats
+    slopes: Floats
+    offsets_m: Floats
+    seen_deg: Floats  # (n,) median elevation of its points as seen from the origin of the scan
+    counts: Floats  # (n,) the number of its points
+    pure: Floats  # (n,) share of these on its line
+    flat_m: Floats  # (n,) their median distance
 
 
 class Match(NamedTuple):
@@ -303,7 +278,7 @@ def _polar(scan: Points) -> Polar:
     flat = np.hypot(x, y)
     used = flat > _NEAREST_M[-1]
     azimuth = np.degrees(np.arctan2(y[used], x[used]))
-    rows: tuple[NDArray[np.int64], ...] = ()
+    rows: tuple[Ints64, ...] = ()
     time = np.linspace(-0.5, 0.5, len(azimuth))
     steps = (np.diff(azimuth) + 180.0) % 360.0 - 180.0
     near = np.abs(steps) < _STEP_DEG
@@ -366,7 +341,7 @@ def _is_hdl_64e(beams: Beams, split: int) -> bool:
     )
 
 
-def _fitted(flat: NDArray[np.float64], z: NDArray[np.float64], rows: Sequence[NDArray[np.int64]]) -> Beams:
+def _fitted(flat: Floats, z: Floats, rows: Sequence[Ints64]) -> Beams:
     """A line through the points of each beam, from the top down; all start on a circle about the axis."""
     if not rows:
         return _NO_BEAMS
@@ -391,7 +366,7 @@ def _fitted(flat: NDArray[np.float64], z: NDArray[np.float64], rows: Sequence[ND
     return Beams(elevations, slopes, offsets, seen, np.array([*map(len, rows)], np.float64), np.array(pure), distances)
 
 
-def _offset(flat: NDArray[np.float64], z: NDArray[np.float64], slope: float) -> float:
+def _offset(flat: Floats, z: Floats, slope: float) -> float:
     """Where a line through points starts: least squares in angle, twice without what is off; NaN if it is not shown."""
     inverse, seen, offset = 1.0 / flat, z / flat, 0.0
     for limit_deg in (1.0, 0.2, 0.1):
@@ -413,7 +388,7 @@ def _voted(polar: Sequence[Polar], offset_m: float, split: int, is_upper: bool) 
     votes = _votes(flat, z, np.array([offset_m]))[0]
     votes[slice(0, split) if is_upper else slice(split, None)] = 0.0
     order = np.argsort(elevation)
-    rows: list[NDArray[np.int64]] = []
+    rows: list[Ints64] = []
     for peak_deg, half_deg in _peaks(votes):
         low, high = np.searchsorted(elevation, (peak_deg - half_deg, peak_deg + half_deg), sorter=order)
         rows.append(order[low:high])
@@ -428,10 +403,10 @@ def _voted(polar: Sequence[Polar], offset_m: float, split: int, is_upper: bool) 
     return _fitted(flat, z, [np.concatenate([rows[k] for k in group]) for group in groups])
 
 
-def _merged(rows: Sequence[NDArray[np.int64]], column: NDArray[np.int64]) -> list[NDArray[np.int64]]:
+def _merged(rows: Sequence[Ints64], column: Ints64) -> list[Ints64]:
     """Rows of beams, from the bottom up, without those that are parts of one: it has one point in each direction."""
-    merged: list[NDArray[np.int64]] = []
-    taken: list[NDArray[np.int64]] = []
+    merged: list[Ints64] = []
+    taken: list[Ints64] = []
     for row in rows:
         columns = np.unique(column[row])
         if merged:
@@ -444,14 +419,14 @@ def _merged(rows: Sequence[NDArray[np.int64]], column: NDArray[np.int64]) -> lis
     return merged
 
 
-def _far(flat: NDArray[np.float64], z: NDArray[np.float64], n: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _far(flat: Floats, z: Floats, n: int) -> tuple[Floats, Floats]:
     """Some of the points that show elevations well, if there are enough; every k-th may be of one beam."""
     nearest = next((least for least in _NEAREST_M if np.count_nonzero(flat > least) >= _ENOUGH), _NEAREST_M[-1])
     chosen = np.random.default_rng(0).permutation(np.flatnonzero(flat > nearest))[:n]
     return flat[chosen], z[chosen]
 
 
-def _blocks(flat: NDArray[np.float64], z: NDArray[np.float64]) -> tuple[tuple[float, float], int]:
+def _blocks(flat: Floats, z: Floats) -> tuple[tuple[float, float], int]:
     """Heights of the origin of the lower and the upper beams [m], and the bin of elevation that parts them; 0: none.
 
     Rings on the road show no height, so that two are sought only where the lasers of an HDL-64E are.
@@ -470,11 +445,11 @@ def _blocks(flat: NDArray[np.float64], z: NDArray[np.float64]) -> tuple[tuple[fl
 
 
 def _straightened(polar: Polar) -> Polar:
-    """The points as seen from where the sensor was, about its axis.
+    """The points as seen from where the sensor was, about its axis. Data sets move points to one time, and turn them
+    level.
 
-    Data sets move points to one time, and turn them level. The place, the way of the sensor during the scan and its
-    tilt are fitted so that the points of each beam have one elevation: first of far points, which hardly depend on it,
-    and then of nearer ones.
+    The place, the way of the sensor during the scan and its tilt are fitted so that the points of each beam have one
+    elevation: first of far points, which hardly depend on it, and then of nearer ones.
     """
     flat, z, azimuth, time, rows = polar
     ahead, left = np.cos(np.radians(azimuth)), np.sin(np.radians(azimuth))
@@ -494,21 +469,13 @@ def _straightened(polar: Polar) -> Polar:
     return Polar(np.maximum(flat, 0.1), z, azimuth, time, rows)
 
 
-def _moved(
-    flat: NDArray[np.float64], z: NDArray[np.float64], moves: NDArray[np.float64], values: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _moved(flat: Floats, z: Floats, moves: Floats, values: Floats) -> tuple[Floats, Floats]:
     """Distances and heights after a move [m] and a small tilt [rad]."""
     lean = values[4:] @ moves[:2]
     return flat - values[:4] @ moves + lean * z, z - lean * flat
 
 
-def _step(
-    flat: NDArray[np.float64],
-    z: NDArray[np.float64],
-    moves: NDArray[np.float64],
-    numbers: NDArray[np.int64] | None,
-    n_smooth: int,
-) -> NDArray[np.float64]:
+def _step(flat: Floats, z: Floats, moves: Floats, numbers: Ints64 | None, n_smooth: int) -> Floats:
     """A Gauss-Newton step of the move and the tilt towards one elevation for each beam, or for each peak of votes."""
     elevation = np.degrees(np.arctan2(z, flat))
     if numbers is None:
@@ -538,7 +505,7 @@ def _step(
     return np.asarray(-np.linalg.solve((slopes * weights) @ slopes.T + np.diag(_DAMPING), slopes * weights @ off_deg))
 
 
-def _votes(flat: NDArray[np.float64], z: NDArray[np.float64], offsets_m: NDArray[np.float64]) -> NDArray[np.float64]:
+def _votes(flat: Floats, z: Floats, offsets_m: Floats) -> Floats:
     votes = np.empty((len(offsets_m), round(2.0 * _UP_DEG / _BIN_DEG)))
     fill_votes(flat, z, offsets_m, math.radians(_UP_DEG), votes)
     return votes
@@ -550,13 +517,7 @@ def compile_votes() -> None:
 
 
 @njit(cache=True, nogil=True)
-def fill_votes(
-    flat: NDArray[np.float64],
-    z: NDArray[np.float64],
-    offsets_m: NDArray[np.float64],
-    up: float,
-    votes: NDArray[np.float64],
-) -> None:
+def fill_votes(flat: Floats, z: Floats, offsets_m: Floats, up: float, votes: Floats) -> None:
     """Count the points in bins of elevation, from -``up`` to ``up`` [rad], seen from each height of the origin."""
     n_bins = votes.shape[1]
     for k in range(votes.shape[0]):
@@ -570,7 +531,7 @@ def fill_votes(
                 votes[k, int(place)] += 1.0
 
 
-def _contrast(votes: NDArray[np.float64]) -> NDArray[np.float64]:
+def _contrast(votes: Floats) -> Floats:
     """How much each bin stands out from the band around it; random counts do by their own number."""
     half = round(_BAND_DEG / _BIN_DEG / 2.0)
     total = np.cumsum(np.pad(votes, ((0, 0), (half + 1, half))), axis=1)
@@ -578,7 +539,7 @@ def _contrast(votes: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(votes * (votes - 1.0) / (band + 1.0))
 
 
-def _peaks(votes: NDArray[np.float64]) -> list[tuple[float, float]]:
+def _peaks(votes: Floats) -> list[tuple[float, float]]:
     """Elevation and half width [deg] of each beam: maxima with valleys on both sides."""
     smooth = np.convolve(votes, [0.5, 1.0, 0.5], "same")
     found: list[int] = []
@@ -610,7 +571,7 @@ def _on_beams(polar: Polar, beams: Beams) -> float:
     return (share - by_chance) / (1.0 - by_chance) if by_chance < 1.0 else 0.0
 
 
-def _nearest_beams(flat: NDArray[np.float64], z: NDArray[np.float64], beams: Beams) -> NDArray[np.int64]:
+def _nearest_beams(flat: Floats, z: Floats, beams: Beams) -> Ints64:
     """The beam that each point is on; -1 if none is near."""
     off = z[:, None] - beams.offsets_m - beams.slopes * flat[:, None]
     off_deg = np.degrees(np.abs(off) / (flat[:, None] * (1.0 + beams.slopes**2)))
@@ -659,7 +620,7 @@ def _columns(polar: Polar, beams: Beams) -> int:
     return round(360.0 / float(steps[usual].mean())) if usual.any() else 1
 
 
-def _blind(azimuth: NDArray[np.float64]) -> tuple[tuple[float, float], ...]:
+def _blind(azimuth: Floats) -> tuple[tuple[float, float], ...]:
     """Sectors without a point, of at least 10 degrees."""
     n = 360 // _SECTOR_DEG
     seen = np.bincount(((azimuth + 180.0) / _SECTOR_DEG).astype(np.int64) % n, minlength=n) > 0
@@ -673,7 +634,7 @@ def _blind(azimuth: NDArray[np.float64]) -> tuple[tuple[float, float], ...]:
     )
 
 
-def _remission_range(raw: NDArray[np.float32]) -> tuple[float, float] | None:
+def _remission_range(raw: Floats32) -> tuple[float, float] | None:
     """The range of remission that the values are of; None if all are the same."""
     low, high = float(raw.min()), float(raw.max())
     if low == high:

@@ -8,10 +8,10 @@ from dataclasses import replace
 from types import MappingProxyType
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from ..errors import PointsError, SensorError
-from ..types.points import Points
+from ..types.points import Floats, Floats32, Ints64, Points
 from ..types.sensor import REMISSION_KINDS, RemissionFunction, SensorProfile
 from .returns import returns
 
@@ -53,7 +53,7 @@ REFERENCES: Mapping[str, tuple[tuple[float, tuple[float, ...]], ...]] = MappingP
 """For each training sensor: share of the points, and quantiles of remission (0..1), in every stratum."""
 
 
-def _terms(kind: str, x: NDArray[np.float64]) -> NDArray[np.float64]:
+def _terms(kind: str, x: Floats) -> Floats:
     if kind == "linear":
         return np.stack([np.ones_like(x), x], axis=1)
     if kind == "polynomial":
@@ -64,7 +64,7 @@ def _terms(kind: str, x: NDArray[np.float64]) -> NDArray[np.float64]:
 _EXPONENTS = np.exp(np.linspace(math.log(0.1), math.log(4.0), 60))
 
 
-def _best_power(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
+def _best_power(x: Floats, y: Floats) -> Floats:
     size = max(float(x.max()), 1e-30)
     terms = np.maximum(x[:, None] / size, 0.0) ** _EXPONENTS
     factors = (terms * y[:, None]).sum(axis=0) / ((terms**2).sum(axis=0) + 1e-30)
@@ -72,18 +72,18 @@ def _best_power(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.fl
     return np.array([factors[best] / size ** _EXPONENTS[best], _EXPONENTS[best]])
 
 
-def _fitted(kind: str, x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
+def _fitted(kind: str, x: Floats, y: Floats) -> Floats:
     """Coefficients of a function of this kind with the least squares."""
     return _best_power(x, y) if kind == "power" else _least_squares(kind, x, y)
 
 
-def _values(kind: str, x: NDArray[np.float64], coefficients: NDArray[np.float64]) -> NDArray[np.float64]:
+def _values(kind: str, x: Floats, coefficients: Floats) -> Floats:
     if kind == "power":
         return np.asarray(coefficients[0] * np.maximum(x, 0.0) ** coefficients[1], np.float64)
     return np.asarray(_terms(kind, x) @ coefficients, np.float64)
 
 
-def _least_squares(kind: str, x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
+def _least_squares(kind: str, x: Floats, y: Floats) -> Floats:
     terms = _terms(kind, x)
     size = np.abs(terms).max(axis=0) + 1e-30  # columns of very different size would lose digits
     return np.asarray(np.linalg.lstsq(terms / size, y, rcond=None)[0] / size, np.float64)
@@ -97,15 +97,13 @@ def fit_functions(
     to: str,
     source: str,
 ) -> tuple[RemissionFunction, ...]:
-    """Fit a line, a parabola, a logarithm and a power to pairs of remissions, the best first.
+    """Fit a line, a parabola, a logarithm and a power to pairs of remissions, the best in cross-validation first.
 
-    raw : (n,) array_like; remission of the sensor to adapt, from 0 (the lower end of its ``remission_range``).
-    wanted : (n,) array_like; remission of the other sensor at the same places, 0..1.
-    full_scale : width of the raw range, e.g. 255.
-    to, source : entries of `RemissionFunction`.
-    Returns: Lowest ``rmse`` in ten-fold cross-validation first. A parabola is never worse than a line on the pairs it
-        is fitted to, but it is the worst on held-back pairs, as in the paper (KUL-Seg, Table 5).
-    Raises SensorError.
+    A parabola is never worse than a line on the pairs it is fitted to, but it is the worst on held-back pairs, as in
+    the paper (KUL-Seg, Table 5).
+
+    raw, wanted : of the sensor to adapt, from 0 on with a range of ``full_scale``, and of the other at the same places,
+        0..1.
     """
     x, y = np.asarray(raw, np.float64).ravel(), np.asarray(wanted, np.float64).ravel()
     if len(x) != len(y):
@@ -129,13 +127,9 @@ def fit_functions(
     return tuple(sorted(found, key=lambda function: function.rmse))
 
 
-def incidences(points: Points, cell_m: float = 0.8) -> NDArray[np.float64]:
-    """Compute the cosine of the incidence, between each ray and the normal of the surface around its point.
-
-    points : (n, 3 or more) float32; x, y, z [m] in the sensor frame.
-    cell_m : edge of the cubic cells in which surfaces are fitted [m].
-    Returns (n,) float64: 0..1. NaN if the point's cell has fewer than six returns, or if these are not on a surface
-        (leaves).
+def incidences(points: Points, cell_m: float = 0.8) -> Floats:
+    """Compute the cosine of the incidence, between each ray and the normal of the surface around its point in cubes of
+    ``cell_m``; NaN if these have fewer than six returns, or no surface (leaves).
     """
     # Column by column: over rows of three values, numpy takes several times as long.
     x, y, z = np.ascontiguousarray(points[:, :3].T, np.float64)
@@ -165,19 +159,10 @@ def incidences(points: Points, cell_m: float = 0.8) -> NDArray[np.float64]:
     return cosines
 
 
-def stratify(
-    scan: Points, n_points: int | None = None, cell_m: float = 0.8
-) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Find the stratum of each point, by range and incidence.
+def stratify(scan: Points, n_points: int | None = None, cell_m: float = 0.8) -> tuple[Ints64, Floats]:
+    """Find the stratum of each point, by range and incidence, and its remission; without points out of `RANGE_EDGES_M`.
 
-    scan : (n, 4) float32; x, y, z [m] in the sensor frame, remission. Points that are not finite or out of
-        `RANGE_EDGES_M` are left out.
-    n_points : use about so many points: all returns in some of the cells in which `incidences` fits surfaces. None:
-        use all.
-    cell_m : edge of the cells [m].
-    Returns strata ((k,) int64): 0 to `N_STRATA` - 1.
-    Returns remissions: (k,) float64.
-    Raises PointsError.
+    n_points : use about so many points: all returns in some of the cells in which `incidences` fits surfaces.
     """
     if scan.ndim != 2 or scan.shape[1] != 4:
         raise PointsError(f"got an array of shape {scan.shape}; expected (n, 4): x, y, z, remission")
@@ -201,21 +186,14 @@ def stratify(
     return by_range * len(COSINE_EDGES) + by_cosine, kept[:, 3].astype(np.float64)
 
 
-def remission_strata(scans: Iterable[NDArray[np.float32]]) -> list[tuple[float, tuple[float, ...]]]:
-    """Compute the share of the points and `N_SHARES` quantiles of their remission in each stratum, as in `REFERENCES`.
-
-    A stratum of fewer than 200 points has a share of 0 and no quantiles.
-
-    scans : iterable of (n, 4) float32; x, y, z [m] in the sensor frame, remission.
-    Returns list of (share, quantiles): One entry per stratum.
-    Raises PointsError.
+def remission_strata(scans: Iterable[Floats32]) -> list[tuple[float, tuple[float, ...]]]:
+    """Compute the share of the points and `N_SHARES` quantiles of their remission in each stratum, as in `REFERENCES`;
+    one of fewer than 200 points has a share of 0 and no quantiles.
     """
     return quantiles_by_stratum([stratify(scan) for scan in scans])
 
 
-def quantiles_by_stratum(
-    samples: Sequence[tuple[NDArray[np.int64], NDArray[np.float64]]],
-) -> list[tuple[float, tuple[float, ...]]]:
+def quantiles_by_stratum(samples: Sequence[tuple[Ints64, Floats]]) -> list[tuple[float, tuple[float, ...]]]:
     """Compute what `remission_strata` does, from what `stratify` returned for each scan."""
     stratum = np.concatenate([np.empty(0, np.int64), *(strata for strata, _ in samples)])
     remission = np.concatenate([np.empty(0), *(remissions for _, remissions in samples)])
@@ -227,7 +205,7 @@ def quantiles_by_stratum(
     return found
 
 
-def quantiles(values: NDArray[np.float64]) -> NDArray[np.float64]:
+def quantiles(values: Floats) -> Floats:
     """`N_SHARES` quantiles of values, at least one, at the middles of equal shares, (N_SHARES,)."""
     ordered = np.sort(values)  # with this, a third of the time of np.quantile
     shares = (np.arange(N_SHARES) + 0.5) / N_SHARES
@@ -236,16 +214,12 @@ def quantiles(values: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def match_quantiles(
     strata: Sequence[tuple[float, Sequence[float]]], reference: Sequence[tuple[float, Sequence[float]]]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Match remissions of two sensors by quantile; no common scene is needed.
+) -> tuple[Floats, Floats]:
+    """Match remissions of two sensors in similar streets by quantile (`remission_strata`); no common scene is needed.
 
     Each stratum is weighted by the smaller of its two shares, so that a wider road or a sensor that looks higher up has
     no influence. Matching within each stratum was worse: the least-squares curve through all strata is too flat, and
     car IoU on PandaSet was 0.44 instead of 0.56.
-
-    strata, reference : sequence of (share, quantiles); from `remission_strata`: one of the sensor's scans, one of
-        another sensor in similar streets.
-    Returns raw, wanted ((k,) float64): Increasing; empty if no stratum is known for both.
     """
     both = [
         (min(share, other_share), own, other)
@@ -259,7 +233,7 @@ def match_quantiles(
     return raw, wanted
 
 
-def _weighted_quantiles(values: NDArray[np.float64], weights: NDArray[np.float64]) -> NDArray[np.float64]:
+def _weighted_quantiles(values: Floats, weights: Floats) -> Floats:
     """Quantiles of weighted values at the middles of equal shares."""
     order = np.argsort(values, kind="stable")
     total = np.cumsum(weights[order])
@@ -268,17 +242,14 @@ def _weighted_quantiles(values: NDArray[np.float64], weights: NDArray[np.float64
 
 
 def fit_sensor(
-    scans: Sequence[NDArray[np.float32]], sensor: SensorProfile, to: str = "hdl-64e", *, source: str = ""
+    scans: Sequence[Floats32], sensor: SensorProfile, to: str = "hdl-64e", *, source: str = ""
 ) -> tuple[SensorProfile, tuple[RemissionFunction, ...]]:
-    """Fit the remission function of a sensor to scans of any street.
+    """Fit remission functions of a sensor to scans of any street: ``sensor`` with the best one, and all of them.
 
-    scans : sequence of (n, 4) float32; with raw remissions.
-    sensor : the sensor that took them. What it drops (`edgeperc.preprocess.returns.returns`) is not used.
+    A parabola that decreases before full scale is not used.
+
     to : a key of `REFERENCES`.
     source : description of the scans; by default their number.
-    Returns profile: ``sensor`` with the best function; a parabola that decreases before full scale is not used.
-    Returns functions: All kinds, best first.
-    Raises SensorError, PointsError.
     """
     if to not in REFERENCES:
         raise SensorError(f"no reference remissions of {to!r}; known are {', '.join(REFERENCES)}")
@@ -289,7 +260,7 @@ def fit_sensor(
     return replace(sensor, remission=increasing(functions)), functions
 
 
-def _returns_of(scans: Iterable[NDArray[np.float32]], sensor: SensorProfile) -> Iterator[NDArray[np.float32]]:
+def _returns_of(scans: Iterable[Floats32], sensor: SensorProfile) -> Iterator[Floats32]:
     for scan in scans:
         if scan.ndim != 2 or scan.shape[1] != 4:
             raise PointsError(f"got an array of shape {scan.shape}; expected (n, 4): x, y, z, remission")

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from ..errors import MissingExtraError, PointsError
 from ..system.clock import Stamp
 from ..system.interpreter import interpreter_flags
-from ..types.points import Points
+from ..types.points import Floats, Points
 from .tables import MAX_BYTES, MAX_SCAN_BYTES
 from .times import TimedScan
 from .worker import ALIVE, END, ERROR, FOUND, HEADER, MISSING, READY, SCAN, TIMES, WARNING
@@ -43,18 +43,13 @@ def decode_apart(
     """Like `decoders.decode`, in a process of its own; without ``times``, those of the points are None.
 
     The process runs ahead by one scan and waits then, so the memory stays flat. It ends with the iterator.
-
-    Raises PointsError.
     """
     request = {"path": str(path), "kind": kind, "topic": topic, "remission_field": remission_field, "times": times}
     return _serve(request, path, [])
 
 
 def describe_apart(path: Path, kind: str, topic: str | None) -> dict[str, Any]:
-    """Like `decoders.describe`, in a process of its own.
-
-    Raises PointsError.
-    """
+    """Like `decoders.describe`, in a process of its own."""
     descriptions: list[Any] = []
     for _ in _serve({"path": str(path), "kind": kind, "topic": topic}, path, descriptions):
         break  # a scan was not asked for
@@ -100,11 +95,8 @@ def start_process(folder: str) -> subprocess.Popen[bytes]:
 
 
 class _Watch:
-    """A thread that ends the process when a reply takes too long; not every system can wait for a pipe with a limit.
-
-    since_s : float or None; since when a reply is awaited, on the monotonic clock; None while the reader of the scans
-        takes its time.
-    expired : bool
+    """A thread that ends the process when a reply, awaited since ``since_s`` on the monotonic clock, takes too long;
+    not every system can wait for a pipe with a limit.
     """
 
     def __init__(self, process: subprocess.Popen[bytes]) -> None:
@@ -134,7 +126,7 @@ def _replies(
     process: subprocess.Popen[bytes], replies: IO[bytes], path: Path, watch: _Watch, found: list[Any]
 ) -> Iterator[TimedScan]:
     n_scans, ready = 0, False
-    times_s: NDArray[np.float64] | None = None
+    times_s: Floats | None = None
     while True:
         watch.since_s = time.monotonic()
         header = replies.read(HEADER.size)

@@ -54,7 +54,6 @@ def open_bag(path: Path, folder: Path, alive: Callable[[], None]) -> list[BagFil
     """Open the files of a bag: its folder, or one file.
 
     folder : for files that are compressed as a whole, which are unpacked there within the limits of `inflate`.
-    Raises PointsError.
     """
     files = bag_files(path) if path.is_dir() else [path]
     left = min(most_bytes(sum(file.stat().st_size for file in files)), shutil.disk_usage(folder).free // 2)

@@ -8,10 +8,8 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Literal, NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
-
 from ..errors import PointsError, SensorError
+from ..types.points import Floats32
 from ..types.sensor import SensorProfile
 from .apart import decode_apart, describe_apart
 from .bags import bag_files
@@ -43,7 +41,7 @@ def read_scans(
     columns: int | Sequence[str] | None = None,
     origin_m: Sequence[float] | Literal["auto"] | None = None,
     accumulate_s: float | None = None,
-) -> Iterator[tuple[float | None, NDArray[np.float32]]]:
+) -> Iterator[tuple[float | None, Floats32]]:
     """Read the scans of a recording, one after another; `read_timed_scans` gives the times of their points too.
 
     Captures are decoded in a process of their own, because a damaged one can make the libraries that decode them end

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import PointsError
-from ..types.points import as_float64, as_points
+from ..types.points import Floats32, as_float64, as_points
 
 # PointField.datatype, from 1.
 _CLOUD_TYPES = ("i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8")
@@ -192,10 +192,7 @@ CLOUD_READERS: MappingProxyType[tuple[str, str], Callable[[memoryview], Cloud]] 
 
 
 def describe_cloud(topic: str, message: Any) -> dict[str, Any]:
-    """What a point cloud message says about its sensor; see `decoders.describe`.
-
-    Raises PointsError.
-    """
+    """What a point cloud message says about its sensor; see `decoders.describe`."""
     return {
         "topic": topic,
         "frame": str(message.header.frame_id),
@@ -204,7 +201,7 @@ def describe_cloud(topic: str, message: Any) -> dict[str, Any]:
     }
 
 
-def cloud_points(message: Any, *, remission_field: str | None = None) -> NDArray[np.float32]:
+def cloud_points(message: Any, *, remission_field: str | None = None) -> Floats32:
     """Convert a ROS ``sensor_msgs/PointCloud2`` message, from any library, to points.
 
     message : object; with the message's attributes: height, width, fields, is_bigendian, point_step, row_step, data.

@@ -63,13 +63,8 @@ def decode(
     *,
     times: bool = True,
 ) -> Iterator[TimedScan]:
-    """The scans of a capture, decoded in this process.
-
-    topic, remission_field : as in `edgeperc.read_scans`.
-    warn : called with a sentence about what was left out.
-    alive : called now and then while a large file is checked before its first scan.
-    times : false leaves out the times of points.
-    Raises PointsError, MissingExtraError.
+    """The scans of a capture, decoded in this process; ``warn`` gets a sentence about what was left out, ``alive`` is
+    called now and then while a large file is checked.
     """
     scans = (
         _packet_scans(path, kind, topic, remission_field, warn, alive)
@@ -86,12 +81,9 @@ def decode(
 def describe(path: Path, kind: str, topic: str | None, alive: Callable[[], None]) -> dict[str, Any]:
     """What a capture says about its sensor, as JSON types; `identify` draws the conclusion.
 
-    topic : as in `edgeperc.read_scans`.
-    alive : as in `decode`.
     Returns: ``metadata`` of an Ouster, as text; ``velodyne``, the names in its packets; or ``topic``, ``frame``,
         ``fields`` and ``elevations_deg`` of a point cloud: the median elevation of each ring or, without rings, of each
         row of an organized cloud [deg], None where a ring has no return; empty without both.
-    Raises PointsError, MissingExtraError.
     """
 
     def found() -> Iterator[dict[str, Any]]:
@@ -154,7 +146,6 @@ def _packet_scans(
     warn: Callable[[str], None],
     alive: Callable[[], None],
 ) -> Iterator[TimedScan]:
-    scans: Iterator[TimedScan] = iter(())
     if kind == ".osf":
         scans = _ouster_scans(_open_osf(path), topic, remission_field)
     elif kind == ".lvx2":
@@ -162,26 +153,7 @@ def _packet_scans(
 
         scans = lvx2_scans(path, _choose("LiDAR", lvx2_sensors(path), topic), alive)
     else:
-        is_velodyne = next(velodyne_packets(path), None) is not None
-        senders = velodyne_senders(path) if is_velodyne else []
-        lidar, ousters = None, list[str]()
-        if not is_velodyne or has_other_lidars(path, whole=topic is not None):
-            from .lidars import lidar_of, turns_of  # numba
-
-            lidar = lidar_of(path, topic)
-            ousters = _ousters_in(path, whole=topic is not None) if is_velodyne or lidar is not None else []
-        others = [] if lidar is None else lidar.senders
-        known = [*senders, *others, *ousters]
-        chosen = known[_choose("LiDAR", known, topic)] if len(known) > 1 or (known and topic is not None) else None
-        sender = chosen if len(known) > 1 else None
-        if sender in ousters:
-            scans = _ouster_turns(path, sender, remission_field, warn, alive)
-        elif lidar is not None and (not is_velodyne or sender in others):
-            scans = turns_of(path, lidar, sender, alive)
-        elif is_velodyne:
-            scans = _velodyne_scans(_decodable(path, alive, sender))
-        else:
-            scans = _ouster_turns(path, topic, remission_field, warn, alive)
+        scans = _pcap_scans(path, topic, remission_field, warn, alive)
     n_scans = 0
     for scan in scans:
         n_scans += 1
@@ -193,6 +165,29 @@ def _packet_scans(
     if not n_scans:
         content = f"has {n_packets} packets, none from a supported LiDAR" if kind == ".pcap" else "holds no scan"
         raise PointsError(f"the capture {content}; expected a capture of a LiDAR, an Ouster's with its metadata")
+
+
+def _pcap_scans(
+    path: Path, topic: str | None, remission_field: str | None, warn: Callable[[str], None], alive: Callable[[], None]
+) -> Iterator[TimedScan]:
+    """The scans of the sensor that a topic names, for which the whole file is searched, or of the only one."""
+    readers: list[tuple[Sequence[str], Callable[[str | None], Iterator[TimedScan]]]] = []
+    ousters: list[str] = []
+    is_velodyne = next(velodyne_packets(path), None) is not None
+    if is_velodyne:
+        readers.append((velodyne_senders(path), lambda sender: _velodyne_scans(_decodable(path, alive, sender))))
+    if not is_velodyne or has_other_lidars(path, whole=topic is not None):
+        from .lidars import lidar_of, turns_of  # numba
+
+        if lidar := lidar_of(path, topic):
+            readers.append((lidar.senders, lambda sender: turns_of(path, lidar, sender, alive)))
+        ousters = _ousters_in(path, whole=topic is not None) if readers else []
+    readers.append((ousters, lambda sender: _ouster_turns(path, sender or topic, remission_field, warn, alive)))
+    known = [name for names, _ in readers for name in names]
+    chosen = known[_choose("LiDAR", known, topic)] if len(known) > 1 or (known and topic is not None) else None
+    if len(known) < 2:
+        return readers[0][1](None)
+    return next(read for names, read in reversed(readers) if chosen in names)(chosen)
 
 
 def _ousters_in(path: Path, *, whole: bool) -> list[str]:

@@ -16,7 +16,18 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import PointsError
-from ..types.points import as_float64, as_points, assemble, is_remission_name, plain_name, remission_name, table_columns
+from ..types.points import (
+    Bytes,
+    Floats32,
+    Points,
+    as_float64,
+    as_points,
+    assemble,
+    is_remission_name,
+    plain_name,
+    remission_name,
+    table_columns,
+)
 from .inflate import inflate, most_bytes
 from .origin import find_place
 from .pcd import begins_like_pcd, parse_pcd
@@ -34,7 +45,7 @@ def read_points(
     columns: int | Sequence[str] | None = None,
     remission_field: str | None = None,
     origin_m: Sequence[float] | Literal["auto"] | None = None,
-) -> NDArray[np.float32]:
+) -> Floats32:
     """Read the points of one scan from a file or an array.
 
     The first bytes of a file decide its format: a PCD header, ``ply``, NumPy's or zip's magic. Raw float32 files have
@@ -122,7 +133,7 @@ class FileOptions(NamedTuple):
     origin_m: Sequence[float] | Literal["auto"] | None
 
 
-def parse_points(content: bytes, name: str) -> NDArray[np.float32]:
+def parse_points(content: bytes, name: str) -> Floats32:
     """Read the points in the content of a file of this name; errors as `read_points`, and for one that is cut short."""
     read = _parse_named(np.frombuffer(content, np.uint8), Path(name), FileOptions(None, None, None))
     if read.n_missing:
@@ -141,7 +152,7 @@ class _Read(NamedTuple):
     file that was cut short lacks.
     """
 
-    points: NDArray[np.float32]
+    points: Points
     fields: Mapping[str, NDArray[Any]]
     origin_m: Sequence[float] | None
     n_missing: int = 0
@@ -174,7 +185,7 @@ def _read(path: Path, options: FileOptions) -> _Read:
     return read
 
 
-def _parse_named(data: NDArray[np.uint8], path: Path, options: FileOptions) -> _Read:
+def _parse_named(data: Bytes, path: Path, options: FileOptions) -> _Read:
     try:
         return _parse(data, path.name.lower(), options)
     except PointsError as exc:
@@ -183,7 +194,7 @@ def _parse_named(data: NDArray[np.uint8], path: Path, options: FileOptions) -> _
         raise PointsError(f"{path}: reading {data.size:,} bytes takes more memory than there is") from exc
 
 
-def _parse(data: NDArray[np.uint8], name: str, options: FileOptions) -> _Read:
+def _parse(data: Bytes, name: str, options: FileOptions) -> _Read:
     if data.size == 0:
         raise PointsError(
             "the file is empty (0 bytes), as an interrupted recording leaves it; "
@@ -276,7 +287,7 @@ def _origin(fields: Mapping[str, NDArray[Any]], options: FileOptions) -> Sequenc
     return find_place(np.column_stack([as_float64(fields[axis]) for axis in "xyz"]))
 
 
-def _parse_npy(data: NDArray[np.uint8]) -> NDArray[Any]:
+def _parse_npy(data: Bytes) -> NDArray[Any]:
     stream = io.BytesIO(data[:MAX_HEADER_BYTES].tobytes())
     try:
         # numpy's header parser evaluates a literal and raises many things on a bad one.
@@ -306,7 +317,7 @@ def _parse_npy(data: NDArray[np.uint8]) -> NDArray[Any]:
         raise PointsError(f"the .npy array of {dtype} cannot be read: {exc}") from exc
 
 
-def _parse_npz(data: NDArray[np.uint8]) -> NDArray[Any]:
+def _parse_npz(data: Bytes) -> NDArray[Any]:
     try:
         # zipfile raises BadZipFile, RuntimeError (encrypted), NotImplementedError, zlib.error, EOFError and others.
         with zipfile.ZipFile(io.BytesIO(data.tobytes())) as archive:
@@ -332,7 +343,7 @@ def _parse_npz(data: NDArray[np.uint8]) -> NDArray[Any]:
         raise PointsError(f"the .npz archive cannot be read: {exc}") from exc
 
 
-def _parse_member(data: NDArray[np.uint8], member: zipfile.ZipInfo) -> NDArray[Any]:
+def _parse_member(data: Bytes, member: zipfile.ZipInfo) -> NDArray[Any]:
     if member.file_size > most_bytes(data.size):
         raise PointsError(
             f"{data.size} bytes claim to unpack to {member.file_size}; no scan packs so well, so it is not "
@@ -344,7 +355,7 @@ def _parse_member(data: NDArray[np.uint8], member: zipfile.ZipInfo) -> NDArray[A
     return _parse_npy(np.frombuffer(content, dtype=np.uint8))
 
 
-def _unpack_member(data: NDArray[np.uint8], member: zipfile.ZipInfo) -> bytes:
+def _unpack_member(data: Bytes, member: zipfile.ZipInfo) -> bytes:
     """A member of a zip archive, without unpacking more than it claims: `zipfile` has no such limit for bzip2."""
     methods = {zipfile.ZIP_STORED: "", zipfile.ZIP_DEFLATED: "deflate", zipfile.ZIP_BZIP2: "bz2"}
     if member.compress_type not in methods or member.flag_bits & 1:

@@ -53,7 +53,6 @@ def of_packets(path: Path, topic: str | None = None) -> KnownSensor:
     """The sensor of a pcap file.
 
     topic : the serial number, if there is metadata of several Ouster sensors; the address of a Velodyne.
-    Raises PointsError, SensorError.
     """
     sender = topic if topic is not None and topic in velodyne_senders(path) else None  # reads the whole file
     names = {velodyne_name(packet) for packet in velodyne_packets(path, sender)}
@@ -119,10 +118,7 @@ def _of_lidar(path: Path, topic: str | None, *, beside: bool = False) -> KnownSe
 
 
 def of_velodyne(names: Collection[str | None]) -> KnownSensor:
-    """The sensor of a Velodyne's packets, by the names in them (`packets.velodyne_name`).
-
-    Raises SensorError.
-    """
+    """The sensor of a Velodyne's packets, by the names in them (`packets.velodyne_name`)."""
     name = ", ".join(sorted(map(str, names)))
     if name in SENSORS:
         return KnownSensor(SENSORS[name], "named by the packets")
@@ -132,11 +128,8 @@ def of_velodyne(names: Collection[str | None]) -> KnownSensor:
 
 
 def of_metadata(content: Any, source: str) -> KnownSensor:
-    """The sensor that an Ouster's metadata describes, with its own beam angles and columns.
-
-    content : object; the metadata as `json.loads` returns it.
-    source : what to call it in messages.
-    Raises PointsError, SensorError.
+    """The sensor that an Ouster's metadata, as `json.loads` returns it, describes, with its own beam angles and
+    columns; errors name the ``source``.
     """
     try:
         check_metadata(content)
@@ -172,7 +165,6 @@ def of_cloud(cloud: Mapping[str, Any]) -> KnownSensor:
     """The sensor of a point cloud of ROS: its maker by fields, frame and topic, its model by the angles of its rings.
 
     cloud : ``topic``, ``frame``, ``fields`` and ``elevations_deg``, from `decoders.describe`.
-    Raises SensorError.
     """
     topic, frame, fields = str(cloud["topic"]), str(cloud["frame"]), [str(name) for name in cloud["fields"]]
     rings = [np.nan if angle is None else float(angle) for angle in cloud["elevations_deg"]]

@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..camera.image import check_size
 from ..errors import ImageError
 from ..system.extras import require
+from ..types.points import Bytes
 
 IMAGE_SUFFIXES = (".bmp", ".jpeg", ".jpg", ".png", ".ppm", ".webp")
 # Only these decoders: others of Pillow start programs (EPS), print what is damaged (TIFF) or are of no camera.
@@ -22,7 +22,7 @@ MAX_FILE_BYTES = 256 * 2**20
 CONVERTED = {"RGB", "L", "P", "RGBA", "LA", "PA"}
 
 
-def read_image(path: str | os.PathLike[str]) -> NDArray[np.uint8]:
+def read_image(path: str | os.PathLike[str]) -> Bytes:
     """Read the image of a file; needs the extra ``camera``.
 
     The content decides the format. The image is turned as its EXIF orientation says. Gray gets three equal channels, a
@@ -86,7 +86,7 @@ def _check(image: Any) -> None:
         raise ImageError(f"the image is of mode {image.mode}; expected colors or gray of 8 bits: convert it to RGB")
 
 
-def _rgb(image: Any) -> NDArray[np.uint8]:
+def _rgb(image: Any) -> Bytes:
     """Red, green and blue of a decoded image."""
     if image.mode in ("RGBA", "LA", "PA") or "transparency" in image.info:
         values = np.asarray(image.convert("RGBA"))

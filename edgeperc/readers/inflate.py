@@ -23,12 +23,7 @@ def most_bytes(n_packed: int) -> int:
 
 
 def inflate(packed: bytes, method: str, limit: int | None = None) -> bytes:
-    """Decompress bytes, but no more than a limit.
-
-    method : ``""``: not compressed. ``"lz4"`` is LZ4's frame format.
-    limit : most bytes of the result; by default 2 GiB, and never more than `most_bytes`.
-    Raises PointsError.
-    """
+    """Decompress bytes (``"lz4"``: the frame format; ``""``: plain) up to a limit, and never more than `most_bytes`."""
     limit = min(MAX_BYTES if limit is None else limit, most_bytes(len(packed)) if method else MAX_BYTES)
     if method == "":
         content = packed
@@ -47,10 +42,7 @@ def inflate(packed: bytes, method: str, limit: int | None = None) -> bytes:
 
 
 def inflate_file(packed: Path, target: Path, limit: int, alive: Callable[[], None]) -> int:
-    """Decompress a zstd file into another one, but no more bytes than a limit; their number.
-
-    Raises PointsError.
-    """
+    """Decompress a zstd file into another one, but no more bytes than a limit; their number."""
     zstd = require("zstandard", "bags", "Reading zstd data")
     n = 0
     with packed.open("rb") as source, target.open("wb") as out:

@@ -42,16 +42,11 @@ _ALIKE = {"helios-32", "helios-16"}  # by their packets; the angles tell them ap
 
 
 class Lidar(NamedTuple):
-    """What sends most of the first packets.
+    """What sends most of the first packets."""
 
-    row : the format of a spinning sensor; None: Livox.
-    senders : of these makers, as `packets.sender_names` calls them.
-    first : address and port of the one with the most packets.
-    """
-
-    row: Format | None
-    senders: list[str]
-    first: str
+    row: Format | None  # the format of a spinning sensor; None: Livox
+    senders: list[str]  # of these makers, as `packets.sender_names` calls them
+    first: str  # address and port of the one with the most packets
 
 
 def lidar_of(path: Path, topic: str | None = None) -> Lidar | None:
@@ -145,11 +140,7 @@ def _name_of(payload: memoryview) -> str | None:
 
 
 def open_spinning(path: Path, row: Format, sender: str | None, alive: Callable[[], None]) -> tuple[Format, Angles]:
-    """The format and the angles of a spinning sensor.
-
-    sender : None: any.
-    Raises PointsError: Neither the capture nor a file beside it has the angles.
-    """
+    """The format and angles of a spinning sensor; PointsError if neither the capture nor a file beside it has them."""
     files = sorted(path.absolute().parent.glob("*.csv"))
     file = next((each for each in files if each.stem.startswith(path.stem)), None)
     said = Angles(np.array([[each, 0.0] for each in row.elevations_deg])) if row.elevations_deg else None

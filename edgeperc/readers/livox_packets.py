@@ -10,10 +10,10 @@ from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..errors import PointsError
 from ..system.kernels import njit
+from ..types.points import Bytes, Floats32, Ints64
 from .packets import LVX_MAGIC
 from .times import TimedScan
 
@@ -85,16 +85,10 @@ def _old_time(kind: int, stamp: bytes) -> float:
 
 
 @njit(cache=True, nogil=True)
-def fill_points(
-    content: NDArray[np.uint8], stride: int, layout: int, points: NDArray[np.float32], which: NDArray[np.int64]
-) -> int:
-    """Put the points that returned into an array.
+def fill_points(content: Bytes, stride: int, layout: int, points: Floats32, which: Ints64) -> int:
+    """Put the points that returned into an array, and their numbers in the content into ``which``; returns how many.
 
-    content : (>= n * stride,) uint8.
     layout : 4: x, y, z in mm of 4 bytes; 2: in cm of 2 bytes; 3: mm of 4 bytes, zenith angle and azimuth of 2 bytes.
-    points : (n, 4) float32; filled.
-    which : (n,) int64; filled with the number of each in the content.
-    Returns int: how many.
     """
     n = 0
     for k in range(len(which)):
@@ -167,10 +161,7 @@ class LivoxStream:
 
 
 def lvx2_sensors(path: Path) -> list[str]:
-    """The serial numbers of the sensors in an .lvx2 file.
-
-    Raises PointsError.
-    """
+    """The serial numbers of the sensors in an .lvx2 file."""
     return [serial for serial, _ in _devices(np.memmap(path, np.uint8, "r").data)]
 
 
@@ -192,11 +183,7 @@ def _devices(data: memoryview) -> list[tuple[str, int]]:
 
 
 def lvx2_scans(path: Path, chosen: int, alive: Callable[[], None]) -> Iterator[TimedScan]:
-    """The scans of one sensor of an .lvx2 file.
-
-    chosen : its place among `lvx2_sensors`.
-    Raises PointsError: The file is cut short or damaged; the scans before come first.
-    """
+    """The scans of one sensor, by its place among `lvx2_sensors`; PointsError comes after those before a damage."""
     data = np.memmap(path, np.uint8, "r").data
     devices, stream = _devices(data), LivoxStream()
     only = devices[chosen][1] if len(devices) > 1 else None

@@ -35,9 +35,7 @@ class Message(NamedTuple):
 class McapFile:
     """One .mcap file, read from front to back; an index is not needed.
 
-    path : Path
     channels : dict of int to Channel; those of the summary, or those among the messages.
-
     Raises PointsError: it does not begin as an MCAP file, or is damaged before its first channel.
     """
 

@@ -9,9 +9,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..errors import PointsError
+from ..types.points import Floats, Ints64
 
 _N_POINTS = 16_000  # that are looked at
 _N_SECTORS = 90  # of a turn, which has as many points everywhere around the sensor
@@ -32,12 +32,11 @@ _FINE = ((0.2, 0.5, 8.0), (0.1, 0.2, 6.0), (0.05, 0.1, 4.0), (0.025, 0.05, 3.0),
 _LEAST_CONTRAST, _LEAST_GAIN = 0.5, 2.7
 
 
-def find_place(xyz: NDArray[np.float64]) -> tuple[float, float, float]:
-    """Find where the sensor was when it took a scan; axes of the map, z up, the sensor nearly upright.
+def find_place(xyz: Floats) -> tuple[float, float, float]:
+    """Find where the sensor, nearly upright, was in the map when it took a scan, mostly to a centimeter.
 
-    xyz : (n, 3) float64; at least 2000 finite points of one turn, from one place: not moved point by point.
-    Returns x, y, z [m], mostly to a centimeter; of a sensor whose lasers are apart, the middle of most.
-    Raises PointsError: The elevations stand out nowhere, as in most scans of a sensor that leans by half a degree.
+    xyz : (n, 3) at least 2000 finite points of one turn, from one place: not moved point by point. Raises PointsError:
+        The elevations stand out nowhere, as in most scans of a sensor that leans by half a degree.
     """
     finite = xyz[np.isfinite(xyz).all(axis=1)]
     if len(finite) < _FEWEST:
@@ -64,7 +63,7 @@ def _unknown(reason: str) -> PointsError:
     )
 
 
-def _rough_place(sample: NDArray[np.float64]) -> tuple[float, float]:
+def _rough_place(sample: Floats) -> tuple[float, float]:
     """x, y around which the points are spread most evenly over azimuths."""
     x = y = 0.0
     for reach_m, step_m in _ROUGH_STEPS_M:
@@ -74,17 +73,17 @@ def _rough_place(sample: NDArray[np.float64]) -> tuple[float, float]:
     return x, y
 
 
-def _unevenness(sample: NDArray[np.float64], x: float, y: float) -> float:
+def _unevenness(sample: Floats, x: float, y: float) -> float:
     counts = np.bincount(_sectors(sample, x, y, _N_SECTORS), minlength=_N_SECTORS)
     return float(counts.std())
 
 
-def _sectors(sample: NDArray[np.float64], x: float, y: float, n: int) -> NDArray[np.int64]:
+def _sectors(sample: Floats, x: float, y: float, n: int) -> Ints64:
     turn = np.arctan2(sample[:, 1] - y, sample[:, 0] - x) / (2.0 * np.pi) + 0.5
     return np.asarray(np.minimum(turn * n, n - 1.0), np.int64)
 
 
-def _far_place(sample: NDArray[np.float64], x: float, y: float) -> NDArray[np.float64]:
+def _far_place(sample: Floats, x: float, y: float) -> Floats:
     """The place near x, y from which the elevations of far points stand out most in each sector."""
     across = np.hypot(sample[:, 0] - x, sample[:, 1] - y)
     near_z = sample[across < 15.0, 2]
@@ -106,9 +105,7 @@ def _far_place(sample: NDArray[np.float64], x: float, y: float) -> NDArray[np.fl
     return place
 
 
-def _contrasts(
-    elevation: NDArray[np.float64], row: NDArray[np.int64], n_rows: int, width_deg: float
-) -> NDArray[np.float64]:
+def _contrasts(elevation: Floats, row: Ints64, n_rows: int, width_deg: float) -> Floats:
     """How much the bins of the elevations of each row stand out from the band around them, (n_rows,)."""
     n_bins = int(2.0 * _UP_DEG / width_deg)
     bins = np.floor((elevation + _UP_DEG) / width_deg)
@@ -124,7 +121,7 @@ def _contrasts(
     )
 
 
-def _contrast(sample: NDArray[np.float64], place: NDArray[np.float64], tilt: NDArray[np.float64]) -> float:
+def _contrast(sample: Floats, place: Floats, tilt: Floats) -> float:
     """The contrast of the elevations about an axis that leans by ``tilt`` (2,) [deg] towards x and y."""
     x, y, z = (sample - place).T
     lean_x, lean_y = np.radians(tilt)
@@ -132,7 +129,7 @@ def _contrast(sample: NDArray[np.float64], place: NDArray[np.float64], tilt: NDA
     return float(_contrasts(elevation, np.zeros(1, np.int64), 1, _WIDTH_DEG / 2.0)[0])
 
 
-def _tilt(sample: NDArray[np.float64], place: NDArray[np.float64]) -> NDArray[np.float64]:
+def _tilt(sample: Floats, place: Floats) -> Floats:
     """The tilt [deg] from which the elevations stand out most."""
     far = sample[np.hypot(*(sample - place)[:, :2].T) > _FAR_M][:_N_FAR]
     best = np.zeros(2)
@@ -143,9 +140,7 @@ def _tilt(sample: NDArray[np.float64], place: NDArray[np.float64]) -> NDArray[np
     return best
 
 
-def _fine_place(
-    sample: NDArray[np.float64], place: NDArray[np.float64], tilt: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
+def _fine_place(sample: Floats, place: Floats, tilt: Floats) -> tuple[Floats, Floats, float]:
     """The place and tilt from which the elevations stand out most, and by how much; NaN if not enough."""
     steps = np.array([-1.0, 0.0, 1.0])
     shifts = np.stack(np.meshgrid(steps, steps, steps), axis=-1).reshape(-1, 3)

@@ -19,10 +19,7 @@ _MOST_JSON_BYTES = 1 << 24
 
 
 def metadata_beside(path: Path) -> list[Path]:
-    """The .json files whose names have the longest beginning in common with the capture's, as ouster-sdk chooses.
-
-    Raises PointsError.
-    """
+    """The .json files whose names have the longest beginning in common with the capture's, as ouster-sdk chooses."""
     files = sorted(file for file in path.absolute().parent.iterdir() if file.suffix.lower() == ".json")
     alike = {
         file: len(os.path.commonprefix([file.name, path.name]))  # noqa: RUF071 - of the characters
@@ -55,11 +52,7 @@ def read_metadata(path: Path) -> str:
 
 
 def check_metadata(content: Any) -> None:
-    """Raise `PointsError` unless the numbers that arrays are made by are possible and agree.
-
-    content : object; the sensor's metadata as `json.loads` returns it, of any firmware. Fields that are absent are
-        not checked.
-    """
+    """Raise `PointsError` unless the numbers that arrays are made by, as far as they are there, are possible."""
     if not isinstance(content, dict):
         raise PointsError(f"expected an object, got {type(content).__name__}")
     layout = content.get("lidar_data_format", content.get("data_format", {}))

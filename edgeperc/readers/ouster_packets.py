@@ -12,10 +12,9 @@ from numpy.typing import NDArray
 
 from ..errors import PointsError
 from ..system.kernels import njit
+from ..types.points import Bytes, Floats, Ints64
 from .ouster import check_metadata
 from .times import TimedScan
-
-Bytes = NDArray[np.uint8]
 
 
 class Field(NamedTuple):
@@ -67,44 +66,32 @@ _MOST_AHEAD = 4
 
 
 class Layout(NamedTuple):
-    """What the metadata says of packets and beams.
+    """What the metadata says of packets and beams."""
 
-    name : the serial number, as the metadata has it; "0" if it has none.
-    serial, init_id : that packets carry; 0 where they do not, or the metadata does not say.
-    port : that packets are sent to; 0 if the metadata does not say.
-    other_bytes : sizes of the packets with motion and zones.
-    frame_id : first byte and number of bytes of a packet's turn.
-    places : header, columns of a packet, bytes of a column, its status, its first pixel, bytes of a pixel.
-    shape : beams, columns of a turn.
-    packets_of_turn : fewer if the sensor looks to one side only.
-    altitude, azimuth : of each beam [rad].
-    to_lidar, to_sensor : (4, 4); from the beams' origin to the axis, and from there to the sensor [mm].
-    """
-
-    name: str
+    name: str  # the serial number, as the metadata has it; "0" if it has none
+    # that packets carry; 0 where they do not, or the metadata does not say
     serial: int
     init_id: int
-    port: int
+    port: int  # that packets are sent to; 0 if the metadata does not say
     fields: Mapping[str, Field]
     packet_bytes: int
-    other_bytes: frozenset[int]
-    frame_id: tuple[int, int]
+    other_bytes: frozenset[int]  # sizes of the packets with motion and zones
+    frame_id: tuple[int, int]  # first byte and number of bytes of a packet's turn
     is_fusa: bool
+    # header, columns of a packet, bytes of a column, its status, its first pixel, bytes of a pixel
     places: tuple[int, ...]
-    shape: tuple[int, int]
-    packets_of_turn: int
-    altitude: NDArray[np.float64]
-    azimuth: NDArray[np.float64]
-    to_lidar: NDArray[np.float64]
-    to_sensor: NDArray[np.float64]
+    shape: tuple[int, int]  # beams, columns of a turn
+    packets_of_turn: int  # fewer if the sensor looks to one side only
+    # of each beam [rad]
+    altitude: Floats
+    azimuth: Floats
+    # (4, 4) from the beams' origin to the axis, and from there to the sensor [mm]
+    to_lidar: Floats
+    to_sensor: Floats
 
 
 def layout_of(content: Any) -> Layout:
-    """The layout of the packets of a sensor, of any firmware.
-
-    content : object; the metadata as `json.loads` returns it.
-    Raises PointsError: Something is missing or impossible.
-    """
+    """The layout of the packets of a sensor, of any firmware; PointsError if something is missing or impossible."""
     check_metadata(content)
     if "beam_intrinsics" in content and (missing := [name for name in _LATER if not _object(content, name)]):
         raise PointsError(f"it lacks {', '.join(missing)}, which come with beam_intrinsics")
@@ -177,7 +164,7 @@ def _number(content: Mapping[str, Any], name: str, default: float) -> float:
     return value
 
 
-def _angles(content: Mapping[str, Any], name: str) -> NDArray[np.float64]:
+def _angles(content: Mapping[str, Any], name: str) -> Floats:
     values = content.get(name)
     if not isinstance(values, list) or any(isinstance(value, list) for value in values):
         raise PointsError(f"{name}: expected a list of numbers, one for each beam")
@@ -186,7 +173,7 @@ def _angles(content: Mapping[str, Any], name: str) -> NDArray[np.float64]:
     return np.radians(np.array(values, np.float64))
 
 
-def _transform(content: Mapping[str, Any], name: str, default: NDArray[np.float64]) -> NDArray[np.float64]:
+def _transform(content: Mapping[str, Any], name: str, default: Floats) -> Floats:
     values = content.get(name)
     if values is None:
         return default
@@ -198,19 +185,10 @@ def _transform(content: Mapping[str, Any], name: str, default: NDArray[np.float6
 
 @njit(cache=True, nogil=True)
 def fill_turn(
-    packets: Bytes,
-    places: NDArray[np.int64],
-    fields: NDArray[np.int64],
-    values: NDArray[np.uint32],
-    stamps_ns: NDArray[np.uint64],
+    packets: Bytes, places: Ints64, fields: Ints64, values: NDArray[np.uint32], stamps_ns: NDArray[np.uint64]
 ) -> None:
-    """Put the valid columns of packets where they belong in a turn; later ones replace earlier ones.
-
-    packets : (n, bytes of a packet) uint8.
-    places : as `Layout.places`.
-    fields : (k, 3) int64; bit, bits and shift of each.
-    values : (k, beams, columns) uint32; filled.
-    stamps_ns : (columns,) uint64; filled.
+    """Put the valid columns of packets where they belong in a turn; later ones replace earlier ones. ``fields`` (k, 3)
+    are bit, bits and shift of each, places as `Layout.places`.
     """
     header, per_packet, column_bytes, status, first, pixel_bytes = places
     for packet in range(packets.shape[0]):
@@ -236,12 +214,7 @@ def fill_turn(
 
 
 class OusterStream:
-    """Turns from an Ouster's packets; a packet may come a little late.
-
-    layout : what the metadata says.
-    remission_field : None: the reflectivity.
-    Raises PointsError: There is no such field.
-    """
+    """Turns from an Ouster's packets, with the reflectivity or the given field; a packet may come a little late."""
 
     def __init__(self, layout: Layout, remission_field: str | None) -> None:
         name = (remission_field or "reflectivity").upper()

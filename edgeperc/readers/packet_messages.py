@@ -103,12 +103,7 @@ def read_text(channel: Channel, content: memoryview) -> str:
 
 
 class OusterMessages:
-    """Turns of an Ouster from messages, on the clock of the computer that recorded the bag.
-
-    metadata : of the sensor.
-    remission_field : None: the reflectivity.
-    Raises PointsError: The metadata is not one, or there is no such field.
-    """
+    """Turns of an Ouster from messages, on the clock of the computer that recorded the bag."""
 
     def __init__(self, metadata: str, remission_field: str | None) -> None:
         from .ouster_packets import OusterStream, layout_of  # numba, which other messages do without
@@ -136,10 +131,7 @@ class OusterMessages:
 
 
 class VelodyneStream:
-    """Turns of a Velodyne from messages, which need not begin and end where a turn does.
-
-    Raises MissingExtraError.
-    """
+    """Turns of a Velodyne from messages, which need not begin and end where a turn does."""
 
     def __init__(self) -> None:
         self._velodyne = require(
@@ -148,10 +140,7 @@ class VelodyneStream:
         self._decoder = self._velodyne.StreamDecoder(self._velodyne.Config())
 
     def add(self, message: VelodyneScan) -> Iterator[TimedScan]:
-        """The turns that end in a message.
-
-        Raises PointsError.
-        """
+        """The turns that end in a message."""
         if any(velodyne_name(packet) == "hdl-64e" for _, packet in message.packets[:1]):
             raise PointsError(
                 "the packets are of an HDL-64E, and each has a calibration of its own: play the bag through "

@@ -49,16 +49,11 @@ _PENDING = 256
 
 
 class Datagram(NamedTuple):
-    """What a UDP datagram carries.
+    """What a UDP datagram carries."""
 
-    sender : the IPv4 or IPv6 address.
-    port : that it was sent to.
-    stamp_s : when its last part was captured.
-    """
-
-    sender: str
-    port: int
-    stamp_s: float
+    sender: str  # the IPv4 or IPv6 address
+    port: int  # that it was sent to
+    stamp_s: float  # when its last part was captured
     payload: memoryview
 
     def is_from(self, sender: str | None) -> bool:
@@ -81,8 +76,6 @@ class _Fragment(NamedTuple):
 class Datagrams:
     """The whole UDP datagrams of a pcap file, put together from fragments, each once; other packets are left out.
 
-    path : a pcap file; one that is cut short is read up to the cut.
-    alive : called now and then, for large files.
     most : packets of the file that are looked at; None: all.
     n_bad : so far, those that are empty, incomplete, or contradict themselves.
     n_cut : packets of them that end early.

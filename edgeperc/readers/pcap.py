@@ -30,16 +30,11 @@ _RESOLUTION, _OFFSET = 9, 14
 
 
 class Captured(NamedTuple):
-    """A captured packet.
+    """A captured packet."""
 
-    link : link type of the interface.
-    stamp_s : when it was captured; 0 if the file does not say.
-    data : the packet with its network headers.
-    """
-
-    link: int
-    stamp_s: float
-    data: memoryview
+    link: int  # link type of the interface
+    stamp_s: float  # when it was captured; 0 if the file does not say
+    data: memoryview  # the packet with its network headers
 
 
 class _Interface(NamedTuple):
@@ -58,11 +53,7 @@ class _DamageError(Exception):
 
 
 def pcap_packets(path: Path, whole: bool = True) -> Iterator[Captured]:
-    """The packets of a file.
-
-    whole : raise `CutShortError` at a packet where the file ends or is damaged; otherwise stop there, if others came.
-    Raises PointsError: It is no such file.
-    """
+    """The packets of a file, up to where it is damaged or ends, which is a `CutShortError` if ``whole``."""
     size = path.stat().st_size
     if size < 24:
         raise PointsError(f"cut short: {size} bytes; expected a pcap file of 24 bytes and more")

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ..errors import PointsError
 from ..system.kernels import njit
-from ..types.points import plain_name
+from ..types.points import Bytes, plain_name
 from .tables import (
     MAX_HEADER_BYTES,
     MAX_SCAN_BYTES,
@@ -79,14 +79,8 @@ def _parse_pcd_header(head: bytes) -> _PcdHeader:
     return _PcdHeader(tuple(names), tuple(types), tuple(counts), n_points, encoding, n_bytes)
 
 
-def parse_pcd(data: NDArray[np.uint8], head: bytes, remission_field: str | None) -> Columns:
-    """Parse a PCD file: ascii, binary or binary_compressed.
-
-    data : (n_bytes,) uint8; the whole file.
-    head : its beginning, with the whole header.
-    remission_field : as in `edgeperc.read_points`.
-    Raises PointsError.
-    """
+def parse_pcd(data: Bytes, head: bytes, remission_field: str | None) -> Columns:
+    """Parse a PCD file: ascii, binary or binary_compressed; ``head`` is its beginning, with the whole header."""
     header = _parse_pcd_header(head)
     n = header.n_points
     widths = [int(np.dtype(kind).itemsize) * count for kind, count in zip(header.types, header.counts, strict=True)]
@@ -114,7 +108,7 @@ def parse_pcd(data: NDArray[np.uint8], head: bytes, remission_field: str | None)
     return Columns(n, fields, header.names, header.n_points - n)
 
 
-def _unpack_pcd(body: NDArray[np.uint8], n_bytes: int) -> NDArray[np.uint8]:
+def _unpack_pcd(body: Bytes, n_bytes: int) -> Bytes:
     if n_bytes == 0:
         return np.empty(0, dtype=np.uint8)
     if body.size < 8:
@@ -134,11 +128,9 @@ def _unpack_pcd(body: NDArray[np.uint8], n_bytes: int) -> NDArray[np.uint8]:
 
 
 @njit(cache=True, nogil=True)
-def fill_unpacked_lzf(packed: NDArray[np.uint8], unpacked: NDArray[np.uint8]) -> int:
+def fill_unpacked_lzf(packed: Bytes, unpacked: Bytes) -> int:
     """Decompress LZF data into ``unpacked``.
 
-    packed : (m,) uint8
-    unpacked : (size,) uint8, overwritten
     Returns: Bytes written; -1 if a reference leaves the data or the output.
     """
     n_in = packed.shape[0]

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import PointsError
-from ..types.points import plain_name
+from ..types.points import Bytes, Ints64, plain_name
 from .tables import Columns, column, cut_short, header_lines, parse_table, whole_number, whole_points
 
 _PLY_TYPES = {
@@ -58,14 +58,8 @@ def _parse_ply_header(head: bytes) -> tuple[str, list[_PlyElement], int]:
     return encoding, elements, n_bytes
 
 
-def parse_ply(data: NDArray[np.uint8], head: bytes, remission_field: str | None) -> Columns:
-    """Parse the vertices of a PLY file: ascii, or binary in either byte order.
-
-    data : (n_bytes,) uint8; the whole file.
-    head : its beginning, with the whole header.
-    remission_field : as in `edgeperc.read_points`.
-    Raises PointsError.
-    """
+def parse_ply(data: Bytes, head: bytes, remission_field: str | None) -> Columns:
+    """Parse the vertices of a PLY file, ascii or binary; ``head`` is its beginning, with the whole header."""
     encoding, elements, start = _parse_ply_header(head)
     before: list[_PlyElement] = []
     for vertex in elements:
@@ -109,9 +103,7 @@ def parse_ply(data: NDArray[np.uint8], head: bytes, remission_field: str | None)
     return Columns(n, fields, names, vertex.count - n)
 
 
-def _row_starts(
-    body: NDArray[np.uint8], offset: int, element: _PlyElement, order: str
-) -> tuple[NDArray[np.int64] | None, int]:
+def _row_starts(body: Bytes, offset: int, element: _PlyElement, order: str) -> tuple[Ints64 | None, int]:
     """Start of each property of each row, None if all rows have one length; and the end of the element."""
     if not element.has_lists:
         record = sum(int(np.dtype(kind).itemsize) for _, kind, _ in element.properties)

@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..errors import PointsError
-from ..types.points import as_float64
+from ..types.points import Bytes, Floats32, as_float64
 from .tables import Columns
 
 TEXT_BYTES = np.zeros(256, dtype=np.bool_)
@@ -25,11 +24,10 @@ _ALIKE, _UNLIKE = 1.15, 1.2
 _ODD_SHARE = 0.2  # of points with odd coordinates, above which the values are of another format
 
 
-def parse_raw(data: NDArray[np.uint8], columns: int | Sequence[str] | None, usual: int) -> Columns:
+def parse_raw(data: Bytes, columns: int | Sequence[str] | None, usual: int) -> Columns:
     """The columns of a raw float32 file.
 
     columns : number of values of a point, or their names; None: ``usual``, unless the values show another number.
-    Raises PointsError.
     """
     names = column_names(columns)
     if TEXT_BYTES[data[:4096]].all():
@@ -75,7 +73,7 @@ def column_names(columns: int | Sequence[str] | None) -> tuple[str, ...]:
     return (*_KNOWN[: int(columns)], *(f"column {k}" for k in range(5, int(columns) + 1)))
 
 
-def _width(values: NDArray[np.float32], usual: int) -> int:
+def _width(values: Floats32, usual: int) -> int:
     """How many values a point has: those at this distance are most alike, for they are of the same column.
 
     usual : stays, where the values do not clearly say otherwise.
@@ -89,14 +87,14 @@ def _width(values: NDArray[np.float32], usual: int) -> int:
     return width if differences[usual - _WIDTHS[0]] > _UNLIKE * best else usual
 
 
-def _are_halves(data: NDArray[np.uint8]) -> bool:
+def _are_halves(data: Bytes) -> bool:
     """Whether the bytes read as float16 are values of points; a third of the lower halves of float32 are not."""
     middle = data.size // 4 * 2
     values = np.abs(data[middle : middle + 4 * _BLOCK].view("<f2").astype(np.float64))
     return bool(((values == 0.0) | ((values > 1e-3) & (values < 1e3))).mean() > 0.98 and (values > 0.0).mean() > 0.6)
 
 
-def _difference(values: NDArray[np.float32], distance: int) -> float:
+def _difference(values: Floats32, distance: int) -> float:
     """The mean relative difference, 0 to 1, between values at a distance."""
     starts = np.linspace(0, max(0, len(values) - _BLOCK - distance), _BLOCKS).astype(np.int64)
     total = n = 0.0

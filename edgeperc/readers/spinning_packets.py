@@ -13,13 +13,11 @@ from pathlib import Path
 from typing import Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..errors import PointsError
 from ..system.kernels import njit
+from ..types.points import Bytes, Floats, Ints64, Points
 from .times import TimedScan
-
-Bytes = NDArray[np.uint8]
 
 
 class Clock(NamedTuple):
@@ -32,44 +30,29 @@ class Clock(NamedTuple):
 
 
 class Format(NamedTuple):
-    """One row of the table.
+    """One row of the table."""
 
-    name : the model, as its profile is called.
-    title : the model, as its maker calls it.
-    header, n_blocks, n_channels, channel_bytes : of a packet.
-    sizes : bytes that a packet may have.
-    flag : the bytes that a block begins with.
-    first : from there to the first channel; the azimuth is in the two bytes in front of it.
-    fires_us : when each channel fires, after its block.
-    clock : how and where the time is written.
-    reference : the block that the time is of, 0 or -1.
-    late_us : how much later the block fires.
-    unit_m, mask : of a distance.
-    mm_at : the byte of a packet that says how many mm the unit is; 0: none does.
-    lens_m : distance of the lasers from the axis, and height.
-    lasers : 16: channels beyond are a second firing or return; 96: every second block has those beyond 48.
-    elevations_deg : of every unit; empty: each unit has its own angles.
-    """
-
-    name: str
-    title: str
+    name: str  # the model, as its profile is called
+    title: str  # the model, as its maker calls it
+    # of a packet
     header: int
     n_blocks: int
     n_channels: int
     channel_bytes: int
-    sizes: tuple[int, ...]
-    flag: bytes
-    first: int
-    fires_us: tuple[float, ...]
-    clock: Clock
-    reference: int = 0
-    late_us: float = 0.0
+    sizes: tuple[int, ...]  # bytes that a packet may have
+    flag: bytes  # the bytes that a block begins with
+    first: int  # from there to the first channel; the azimuth is in the two bytes in front of it
+    fires_us: tuple[float, ...]  # when each channel fires, after its block
+    clock: Clock  # how and where the time is written
+    reference: int = 0  # the block that the time is of, 0 or -1
+    late_us: float = 0.0  # how much later the block fires
+    # of a distance
     unit_m: float = 0.004
     mask: int = 0xFFFF
-    mm_at: int = 0
-    lens_m: tuple[float, float] = (0.0, 0.0)
-    lasers: int = 0
-    elevations_deg: tuple[float, ...] = ()
+    mm_at: int = 0  # the byte of a packet that says how many mm the unit is; 0: none does
+    lens_m: tuple[float, float] = (0.0, 0.0)  # distance of the lasers from the axis, and height
+    lasers: int = 0  # 16: channels beyond are a second firing or return; 96: every second block has those beyond 48
+    elevations_deg: tuple[float, ...] = ()  # of every unit; empty: each unit has its own angles
 
     @property
     def is_hesai(self) -> bool:
@@ -85,7 +68,7 @@ class Format(NamedTuple):
 class Angles(NamedTuple):
     """What is known of a unit: (lasers, 2) elevation and azimuth of each laser [deg], its speed, and returns."""
 
-    lasers_deg: NDArray[np.float64]
+    lasers_deg: Floats
     rpm: float = 600.0
     is_dual: bool = False
 
@@ -265,10 +248,7 @@ def has_16_lasers(payload: memoryview) -> bool:
 
 
 def read_angles(path: Path, row: Format) -> Angles:
-    """The angles of a calibration file: ``channel,elevation,azimuth`` as Hesai's, or without channel, as RoboSense's.
-
-    Raises PointsError.
-    """
+    """The angles of a calibration file: ``channel,elevation,azimuth`` as Hesai's, or, without channel, RoboSense's."""
     n = row.lasers or row.n_channels
     rows = []
     for line in path.read_bytes()[: 1 << 20].decode("utf-8", "replace").splitlines():
@@ -287,25 +267,15 @@ def read_angles(path: Path, row: Format) -> Angles:
 
 @njit(cache=True, nogil=True)
 def fill_returns(
-    packets: Bytes,
-    places: NDArray[np.int64],
-    blocks: NDArray[np.float64],
-    beams: NDArray[np.float64],
-    lens: NDArray[np.float64],
-    points: NDArray[np.float32],
-    times_s: NDArray[np.float64],
+    packets: Bytes, places: Ints64, blocks: Floats, beams: Floats, lens: Floats, points: Points, times_s: Floats
 ) -> int:
-    """Put the returns of packets into points; a second return at the distance of the first is left out.
+    """Put the returns of packets into points, without second ones at the distance of the first; returns how many.
 
-    packets : (n, bytes of a packet) uint8.
     places : header, bytes of a block, its first channel, bytes of a channel, whether numbers are big-endian, mask of a
         distance, and from a second return back to the first: blocks (of the same azimuth) or channels.
-    blocks : (n, blocks, 3) float64; azimuth [deg], time [s] and speed [deg/s]; not finite: left out.
-    beams : (blocks, channels, 3) float64; elevation [rad], azimuth [deg] and time [us] of each channel.
+    blocks : (n, blocks, 3) azimuth [deg], time [s] and speed [deg/s]; not finite: left out.
+    beams : (blocks, channels, 3) elevation [rad], azimuth [deg] and time [us] of each channel.
     lens : unit [m], direction of azimuth 0 [deg], distance of the lasers from the axis, height [m].
-    points : (>= n * blocks * channels, 4) float32; filled.
-    times_s : likewise.
-    Returns int: how many.
     """
     header, block_bytes, first, channel_bytes, is_big, mask, back_blocks, back_channels = places
     n = 0
@@ -348,15 +318,11 @@ class _Packet(NamedTuple):
     content: bytes
     time_s: float
     rpm: float
-    azimuths: NDArray[np.float64]  # of the blocks; NaN where one is left out
+    azimuths: Floats  # of the blocks; NaN where one is left out
 
 
 class SpinningStream:
-    """Turns from the packets of a sensor.
-
-    row : the format of the packets.
-    angles : of the unit.
-    """
+    """Turns from the packets of a sensor, by their format and the angles of the unit."""
 
     def __init__(self, row: Format, angles: Angles) -> None:
         self._row, self._angles = row, angles
@@ -430,7 +396,7 @@ def _part(packet: _Packet, begin: int, end: int) -> _Packet:
     return packet._replace(azimuths=azimuths)
 
 
-def _blocks(row: Format, packets: Sequence[_Packet]) -> NDArray[np.float64]:
+def _blocks(row: Format, packets: Sequence[_Packet]) -> Floats:
     """Azimuth, time and speed of each block: the blocks of a packet are as far apart in time as the sensor turns."""
     azimuths = np.array([packet.azimuths for packet in packets])
     speeds = 6.0 * np.array([packet.rpm for packet in packets])
@@ -444,7 +410,7 @@ def _blocks(row: Format, packets: Sequence[_Packet]) -> NDArray[np.float64]:
     )
 
 
-def _beams(row: Format, angles: Angles, is_dual: bool) -> NDArray[np.float64]:
+def _beams(row: Format, angles: Angles, is_dual: bool) -> Floats:
     """Elevation [rad], azimuth [deg] and time [us] of each channel of each block."""
     block, channel = np.mgrid[: row.n_blocks, : row.n_channels]
     laser = channel % 16 if row.lasers == 16 else channel + 48 * (block % 2) if row.lasers == 96 else channel

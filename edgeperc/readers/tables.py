@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import PointsError
-from ..types.points import remission_name
+from ..types.points import Bytes, remission_name
 from .times import time_name
 
 MAX_HEADER_BYTES = 65536
@@ -26,21 +26,15 @@ _LEAST_ROW_BYTES = 6  # of text: three digits, two blanks and the end
 
 
 class Columns(NamedTuple):
-    """The fields of a scan, for `edgeperc.types.points.assemble`.
+    """The fields of a scan, for `edgeperc.types.points.assemble`."""
 
-    n : number of points.
-    fields : mapping of str to (n,) array; columns by `edgeperc.types.points.plain_name`.
-    names : all fields of the source.
-    n_missing : points that the header declares, and that a file that was cut short lacks.
-    """
-
-    n: int
-    fields: Mapping[str, NDArray[Any]]
-    names: Sequence[str]
-    n_missing: int = 0
+    n: int  # number of points
+    fields: Mapping[str, NDArray[Any]]  # columns by `edgeperc.types.points.plain_name`
+    names: Sequence[str]  # all fields of the source
+    n_missing: int = 0  # points that the header declares, and that a file that was cut short lacks
 
 
-def column(data: NDArray[np.uint8], kind: str, n: int, offset: int, stride: int) -> NDArray[Any]:
+def column(data: Bytes, kind: str, n: int, offset: int, stride: int) -> NDArray[Any]:
     """View of one field of binary records, (n,); ``offset`` and ``stride`` in bytes."""
     if n == 0:
         return np.empty(0, dtype=kind)
@@ -49,10 +43,7 @@ def column(data: NDArray[np.uint8], kind: str, n: int, offset: int, stride: int)
 
 
 def header_lines(head: bytes, last: str, kind: str) -> tuple[list[list[str]], int]:
-    """Words of each line of a header that ends with the line ``last``, and its length in bytes.
-
-    Raises PointsError.
-    """
+    """Words of each line of a header that ends with the line ``last``, and its length in bytes."""
     lines: list[list[str]] = []
     start = 0
     while not lines or lines[-1][:1] != [last]:
@@ -92,12 +83,7 @@ def cut_short(n: int, record: int, size: int) -> PointsError:
 
 
 def parse_table(
-    body: NDArray[np.uint8],
-    skipped_rows: int,
-    n: int,
-    places: Mapping[str, int],
-    names: Sequence[str],
-    remission_field: str | None,
+    body: Bytes, skipped_rows: int, n: int, places: Mapping[str, int], names: Sequence[str], remission_field: str | None
 ) -> Columns:
     """Parse coordinates, remission and time from rows of text; ``places`` has each field's position in a row."""
     wanted = {name: places[name] for name in "xyz" if name in places}

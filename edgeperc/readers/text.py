@@ -9,10 +9,9 @@ from contextlib import suppress
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..errors import PointsError
-from ..types.points import plain_name
+from ..types.points import Bytes, Floats, plain_name
 from .raw import TEXT_BYTES
 from .tables import Columns
 
@@ -39,12 +38,9 @@ def begins_like_text(head: bytes) -> bool:
 
 
 class _Style(NamedTuple):
-    """How the rows of a table are written.
+    """How the rows of a table are written."""
 
-    separator : of the values; None: blanks.
-    """
-
-    separator: str | None
+    separator: str | None  # of the values; None: blanks
     decimal_comma: bool
 
     def values(self, row: str) -> list[str]:
@@ -52,14 +48,13 @@ class _Style(NamedTuple):
         return [word.strip() for word in row.split(self.separator)]
 
 
-def parse_text(data: NDArray[np.uint8], columns: Sequence[str] | int | None) -> Columns:
+def parse_text(data: Bytes, columns: Sequence[str] | int | None) -> Columns:
     """The columns of a table: separated by blanks, commas or semicolons, below comments (``#``, ``//``).
 
     A first line of one whole number is the number of points, as in ``.pts``. Names are those of a line of words, with
     or without units; columns of words, such as classes, are left out. What is empty, or null, is NaN.
 
     columns : names of the columns, in place of those in the file.
-    Raises PointsError.
     """
     lines = data.tobytes().decode("utf-8-sig", "replace").replace('"', "").splitlines()
     given = columns if columns is None or not isinstance(columns, int | np.integer) else None
@@ -159,7 +154,7 @@ def _is_number(word: str, style: _Style) -> bool:
     return True
 
 
-def _table(rows: Sequence[str], style: _Style, used: Sequence[int], n: int) -> NDArray[np.float64]:
+def _table(rows: Sequence[str], style: _Style, used: Sequence[int], n: int) -> Floats:
     """The numbers in some of ``n`` columns."""
     mark = style.separator
     for k, row in enumerate(rows):
@@ -184,5 +179,5 @@ def _table(rows: Sequence[str], style: _Style, used: Sequence[int], n: int) -> N
     raise error
 
 
-def _loaded(text: str, used: Sequence[int], mark: str | None) -> NDArray[np.float64]:
+def _loaded(text: str, used: Sequence[int], mark: str | None) -> Floats:
     return np.loadtxt(io.StringIO(text), np.float64, comments=None, ndmin=2, usecols=used, delimiter=mark)

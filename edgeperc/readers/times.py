@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import OptionError, PointsError, StampError
-from ..types.points import Points
+from ..types.points import Floats, Mask, Points
 from ..types.sensor import MAX_ACCUMULATE_S, MIN_ACCUMULATE_S
 
 if TYPE_CHECKING:
@@ -59,7 +59,7 @@ class TimedScan(NamedTuple):
 
     stamp_s: float | None
     points: Points
-    times_s: NDArray[np.float64] | None
+    times_s: Floats | None
 
 
 def time_name(names: Iterable[str]) -> str | None:
@@ -68,22 +68,16 @@ def time_name(names: Iterable[str]) -> str | None:
     return next((name for name in _NAMES if name in present), None)
 
 
-def point_times(
-    fields: Mapping[str, NDArray[Any]], points: Points, stamp_s: float | None
-) -> NDArray[np.float64] | None:
-    """Find the times of points in a scan's fields.
+def point_times(fields: Mapping[str, NDArray[Any]], points: Points, stamp_s: float | None) -> Floats | None:
+    """Find the times of points in a scan's fields [s]; NaN where one is missing, or damaged and far from all others.
 
     Drivers store seconds, milli-, micro- or nanoseconds, and no field says which. A scan takes 2 ms to 2 s, so the
-    difference between its first and its last time shows the unit. Times of less than 2 s count from ``stamp_s``.
+    difference between its first and its last time shows the unit. Times of less than 2 s count from ``stamp_s``, or 0.
+    None without such a field, or if no unit gives such a duration, as where all times are 0. Points without a return,
+    which are not finite or lie in the origin, do not show the unit.
 
-    fields : mapping of str to (n,) array; columns by `edgeperc.types.points.plain_name`.
-    points : (n, 4) float32; times of points without a return, which are not finite or lie in the origin, do not show
-        the unit.
-    stamp_s : None counts from 0.
-    Returns (n,) float64 or None: [s]; NaN where a time is damaged and lies far from all others, or is missing; None
-        without such a field, or if no unit gives a duration of 2 ms to 2 s, as where all times are 0.
-    Raises PointsError: By these times and the azimuths, the sensor takes less than 33 or more than 350 ms for
-        a turn.
+    Raises PointsError if, by these times and the azimuths, the sensor takes less than 33 or more than 350 ms for a
+    turn.
     """
     name = time_name(fields)
     if name is None:
@@ -109,7 +103,7 @@ def point_times(
     return None
 
 
-def _carry_on(moments: NDArray[np.float64], shows: NDArray[np.bool_]) -> None:
+def _carry_on(moments: Floats, shows: Mask) -> None:
     """Carry on the times after their clock began anew, and remove a value that stands for no time."""
     first, last = _range(moments[shows])
     early = shows & (moments < 0.5 * (first + last))
@@ -131,7 +125,7 @@ def _carry_on(moments: NDArray[np.float64], shows: NDArray[np.bool_]) -> None:
         moments[moments <= ended if is_one[0] else moments >= began] = np.nan
 
 
-def _range(moments: NDArray[np.float64]) -> tuple[float, float]:
+def _range(moments: Floats) -> tuple[float, float]:
     """First and last of the times, without damaged ones far outside of the others."""
     n_damaged = int(_DAMAGED_SHARE * len(moments))
     ends = [0, n_damaged, len(moments) - 1 - n_damaged, len(moments) - 1]
@@ -143,7 +137,7 @@ def _range(moments: NDArray[np.float64]) -> tuple[float, float]:
     return float(first), float(last)
 
 
-def _check_turn(xyz: Points, shares: NDArray[np.float64], duration_s: float, name: str) -> None:
+def _check_turn(xyz: Points, shares: Floats, duration_s: float, name: str) -> None:
     """Raise PointsError if the azimuth turns once in these times, in a time that no LiDAR takes for a turn.
 
     shares : (n,); of the duration, 0 to 1.
@@ -243,7 +237,7 @@ def accumulate(
             points = deskew(points, times_s, constant, at_s=end_s, min_range_m=min_range_m)
         return TimedScan(stamp_s, points, times_s)
 
-    kept = deque[tuple[Points, NDArray[np.float64], float]]()
+    kept = deque[tuple[Points, Floats, float]]()
     begin_s = end_s = 0.0
     last: float | None = None
     is_waiting = False

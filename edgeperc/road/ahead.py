@@ -13,13 +13,13 @@ from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..errors import OptionError, PointsError
 from ..system.kernels import njit
 from ..types.frame import ModelFrame
 from ..types.geometry import draw_footprints
 from ..types.perception import Box, TopView
+from ..types.points import Floats, Ints64, Mask
 from .outline import outline_of
 
 FreeEnd = Literal["obstacle", "edge of the road", "unknown", "end of view"]
@@ -105,17 +105,17 @@ class RoadAhead:
         no row has both edges in view.
     """
 
-    outline: NDArray[np.float64]
-    holes: tuple[NDArray[np.float64], ...]
+    outline: Floats
+    holes: tuple[Floats, ...]
     tolerance_m: float
-    y_m: NDArray[np.float64]
-    free_m: NDArray[np.float64]
-    obstacle_m: NDArray[np.float64]
-    edge_m: NDArray[np.float64]
-    unknown_m: NDArray[np.float64]
-    x_m: NDArray[np.float64]
-    left_m: NDArray[np.float64]
-    right_m: NDArray[np.float64]
+    y_m: Floats
+    free_m: Floats
+    obstacle_m: Floats
+    edge_m: Floats
+    unknown_m: Floats
+    x_m: Floats
+    left_m: Floats
+    right_m: Floats
     lane_width_m: float
     view_m: float
 
@@ -126,7 +126,7 @@ class RoadAhead:
         return tuple(_end_of(first, self.view_m) for first in firsts.T)
 
     @property
-    def width_m(self) -> NDArray[np.float64]:
+    def width_m(self) -> Floats:
         """Width of the corridor along y in every row, (rows,); NaN where there is none."""
         return self.left_m - self.right_m
 
@@ -255,7 +255,7 @@ def free_ahead(top_view: TopView, boxes: Iterable[Box] = (), *, half_width_m: fl
     return _strip_ahead(_columns_m(top_view), firsts, float(top_view.x_range_m[1]), half_width_m)
 
 
-def _objects(top_view: TopView, boxes: Iterable[Box]) -> NDArray[np.bool_]:
+def _objects(top_view: TopView, boxes: Iterable[Box]) -> Mask:
     """Cells with an object's label or in the footprint of a box, (rows, columns) bool."""
     objects = np.ones(top_view.labels.shape, np.bool_)
     for k, name in enumerate(top_view.classes):
@@ -269,13 +269,13 @@ def _objects(top_view: TopView, boxes: Iterable[Box]) -> NDArray[np.bool_]:
     return objects
 
 
-def _columns_m(top_view: TopView) -> NDArray[np.float64]:
+def _columns_m(top_view: TopView) -> Floats:
     """Middles of the columns, (columns,) y [m]."""
     columns = np.arange(top_view.labels.shape[1], dtype=np.float64)
     return top_view.y_range_m[1] - (columns + 0.5) * np.float64(top_view.cell_m)
 
 
-def _first_m(top_view: TopView, objects: NDArray[np.bool_]) -> NDArray[np.float64]:
+def _first_m(top_view: TopView, objects: Mask) -> Floats:
     """x of each column's first obstacle, edge and unknown cell, (3, columns) [m]; infinite without one."""
     known, road = top_view.observed, top_view.road
     if top_view.between_beams is not None:
@@ -285,9 +285,7 @@ def _first_m(top_view: TopView, objects: NDArray[np.bool_]) -> NDArray[np.float6
     return np.where(firsts == len(objects), math.inf, top_view.x_range_m[0] + firsts * top_view.cell_m)
 
 
-def _strip_ahead(
-    y_m: NDArray[np.float64], firsts: NDArray[np.float64], view_m: float, half_width_m: float
-) -> FreeAhead:
+def _strip_ahead(y_m: Floats, firsts: Floats, view_m: float, half_width_m: float) -> FreeAhead:
     """The nearest of each kind within ``half_width_m`` of the axis."""
     near = np.abs(y_m) <= half_width_m
     if not near.any():
@@ -297,7 +295,7 @@ def _strip_ahead(
     return FreeAhead(min(*first.tolist(), view_m), _end_of(first, view_m), obstacle_m, edge_m, unknown_m, view_m)
 
 
-def _end_of(first: NDArray[np.float64], view_m: float) -> FreeEnd:
+def _end_of(first: Floats, view_m: float) -> FreeEnd:
     """Which of the first obstacle, edge and unknown cell, or the far edge of the view, ends the free distance."""
     distances = [*first.tolist(), view_m]
     least = min(distances)
@@ -314,7 +312,7 @@ def compile_kernels() -> None:
     outline_of(cells, (0.0, 0.0), ~cells, ~cells, tolerance=1.0, max_corners=4)
 
 
-def _lane_width(x: NDArray[np.float64], left: NDArray[np.float64], right: NDArray[np.float64]) -> float:
+def _lane_width(x: Floats, left: Floats, right: Floats) -> float:
     if len(x) == 0:
         return math.nan
     # A road at an angle is narrower than its width along y. The median slope is robust against vehicles on the road.
@@ -326,14 +324,9 @@ def _lane_width(x: NDArray[np.float64], left: NDArray[np.float64], right: NDArra
 
 
 @njit(cache=True, nogil=True)
-def fill_first_cells(
-    objects: NDArray[np.bool_], known: NDArray[np.bool_], road: NDArray[np.bool_], firsts: NDArray[np.int64]
-) -> None:
-    """Count the cells of each column, from the last row up, before the first of each kind.
-
-    objects, known, road : (rows, columns) bool, C-contiguous
-    firsts : (3, columns) int64, overwritten; cells before the first that is an object; that is known and neither road
-        nor an object; that is neither known nor an object. The number of rows if there is none.
+def fill_first_cells(objects: Mask, known: Mask, road: Mask, firsts: Ints64) -> None:
+    """Count the cells of each column, from the last row up, before the first that is an object; that is known and
+    neither road nor an object; that is neither known nor an object. The number of rows if there is none.
     """
     height, width = objects.shape
     for kind in range(3):
@@ -350,19 +343,9 @@ def fill_first_cells(
 
 
 @njit(cache=True, nogil=True)
-def fill_corridor(drivable: NDArray[np.bool_], first: float, last: float, bounds: NDArray[np.int64]) -> None:
-    """Follow the drivable cells ahead, row by row from the last one up.
+def fill_corridor(drivable: Mask, first: float, last: float, bounds: Ints64) -> None:
+    """Follow the drivable cells ahead, from the last row up: first column of the corridor, one past its last, or -1.
 
-    Parameters
-    ----------
-    drivable : (rows, columns) bool
-    first, last : float
-        Columns between which the corridor has to begin.
-    bounds : (rows, 2) int64, overwritten
-        First column of the corridor in each row, and one past its last; -1, -1 in rows without a corridor.
-
-    Notes
-    -----
     The corridor begins in the last row that has a run of drivable cells between ``first`` and ``last``. It continues
     with the run that shares most columns with the row before, the left one on ties, and ends where no run shares one.
     """

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..types.perception import ROADS, PointLabels
-from ..types.points import Heights, Points
+from ..types.points import Heights, Mask, Points
 from ..types.views import TopViewGeometry
 
 OTHER_GROUND = ("sidewalk", "terrain")
@@ -24,12 +24,8 @@ def knows_road(labels: PointLabels | None) -> bool:
     return labels is not None and not set(ROADS).isdisjoint(labels.classes)
 
 
-def nearest_is_road(points: Points, labels: PointLabels, height_m: Heights, view: TopViewGeometry) -> NDArray[np.bool_]:
-    """Whether the return of the ground nearest to each cell, along its azimuth, is of the road, (rows, columns) bool.
-
-    points : (n, 4) float32; in the frame of the view.
-    height_m : (n,) float32; above the ground.
-    """
+def nearest_is_road(points: Points, labels: PointLabels, height_m: Heights, view: TopViewGeometry) -> Mask:
+    """Whether the return of the ground nearest to each cell, along its azimuth, is of the road."""
     of_class = [1 if name in ROADS else -1 if name in OTHER_GROUND else 0 for name in labels.classes]
     side = np.array(of_class)[labels.labels]
     known = np.flatnonzero((side != 0) & labels.in_view & (np.abs(height_m) <= ON_GROUND_M))

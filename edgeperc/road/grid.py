@@ -24,7 +24,7 @@ from ..types.frame import ModelFrame, quaternion
 from ..types.geometry import draw_footprints
 from ..types.mounting import MODEL_HEIGHT_M, MODEL_MOUNTING, Mounting
 from ..types.perception import Perception, TopView
-from ..types.points import Heights, Mask, Points, as_points, read_only
+from ..types.points import Floats, Floats32, Heights, Ints, Mask, Points, as_points, read_only
 from ..types.sensor import SensorProfile, get_sensor
 from ..types.views import TopViewGeometry
 from .around import knows_road, nearest_is_road
@@ -62,10 +62,10 @@ class OccupancyGrid:
         the frame of the cells.
     """
 
-    drivable: NDArray[np.bool_]
-    obstacle: NDArray[np.bool_]
+    drivable: Mask
+    obstacle: Mask
     height_m: Heights
-    observed: NDArray[np.bool_]
+    observed: Mask
     cell_m: float
     x_range_m: tuple[float, float]
     y_range_m: tuple[float, float]
@@ -73,7 +73,7 @@ class OccupancyGrid:
     mounting: Mounting = MODEL_MOUNTING
 
     @property
-    def unknown(self) -> NDArray[np.bool_]:
+    def unknown(self) -> Mask:
         """Cells that no ray observed and no obstacle is known in, (rows, columns) bool."""
         return ~self.observed & ~self.obstacle
 
@@ -182,12 +182,7 @@ def grid_message(
     corner_m: Sequence[float],
     orientation: Sequence[float] = (0.0, 0.0, 0.0, 1.0),
 ) -> dict[str, Any]:
-    """The fields of a nav_msgs/OccupancyGrid.
-
-    values : (cells along y, cells along x) int8.
-    corner_m, orientation : x, y, z of the corner with the lowest x and y [m], and quaternion x, y, z, w of the cells,
-        in the frame ``frame_id``.
-    """
+    """The fields of a nav_msgs/OccupancyGrid, by corner with the lowest x and y [m] and quaternion of the cells."""
     nanoseconds = nanoseconds_of(stamp_s or 0.0)
     stamp = {"sec": nanoseconds // 10**9, "nanosec": nanoseconds % 10**9}
     return {
@@ -316,9 +311,8 @@ def split_points(perception: Perception, points: ArrayLike, *, sensor: SensorPro
     """Separate the ground from what stands on it, by the ground that was perceived; parameters as `occupancy_grid`.
 
     Ground is at most 0.125 m above and 0.5 m below it; an obstacle is anything higher, crowns and bridges, too. In
-    neither are points that are not returns (not finite, too near, of the own vehicle), drops, and reflections from more
-    than 0.5 m below the ground. A scan without ground has obstacles only.
-    Raises PointsError.
+    neither are points that are not returns, drops, and reflections from more than 0.5 m below the ground. A scan
+    without ground has obstacles only.
     """
     moved = _returns_of(perception, points, sensor, ModelFrame(perception.mounting))
     found = heights_above(perception.ground, moved)
@@ -336,7 +330,7 @@ def _returns_of(perception: Perception, points: ArrayLike, profile: SensorProfil
     return read_only(without_drops(moved, profile, frame.eye)[0]) if perception.health.has_drops else moved
 
 
-def _drivable(top_view: TopView | None, view: TopViewGeometry) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+def _drivable(top_view: TopView | None, view: TopViewGeometry) -> tuple[Mask, Mask]:
     """Cells of ``view`` of which more than half is drivable, and those of which more than half is in the top view."""
     shape = (view.height, view.width)
     if top_view is None:
@@ -355,23 +349,13 @@ def _drivable(top_view: TopView | None, view: TopViewGeometry) -> tuple[NDArray[
 
 @njit(cache=True, nogil=True)
 def fill_standing(
-    points: Points,
-    height_m: Heights,
-    corner: NDArray[np.float64],
-    lowest: float,
-    overhead: float,
-    highest: NDArray[np.int32],
-    tallest: NDArray[np.float32],
+    points: Points, height_m: Heights, corner: Floats, lowest: float, overhead: float, highest: Ints, tallest: Floats32
 ) -> None:
-    """Find what stands in each cell of a grid. Points higher than ``overhead`` above the ground are ignored.
+    """Find what stands in each cell of a grid, between the heights ``lowest`` and ``overhead`` above the ground [m].
 
-    points : (n, 4) float32, C-contiguous
-    height_m : (n,) float32; height of each point above the ground [m].
-    corner : (3,) float64; x and y of the upper left corner of the grid, edge of a cell [m].
-    lowest, overhead : heights between which something stands on the ground [m].
-    highest : (rows, columns) int32, overwritten; the point with the largest height, the first of equals; -1 without
-        one.
-    tallest : (rows, columns) float32, overwritten; largest height above ``lowest`` [m]; NaN without one.
+    corner : x and y of the upper left corner of the grid, edge of a cell [m].
+    highest, tallest : the point with the largest height, the first of equals, or -1; its height above ``lowest`` [m],
+        or NaN.
     """
     n_rows, n_cols = highest.shape
     for r in range(n_rows):

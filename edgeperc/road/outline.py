@@ -12,10 +12,9 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..system.kernels import njit
-from ..types.points import Mask
+from ..types.points import Ints, Ints64, Mask
 
 REACHES = (1.0, 1.25, 1.5, 2.0, 4.0, 8.0)
 """Factors of the tolerance that are tried in turn if the outline has too many corners."""
@@ -25,29 +24,18 @@ FARTHEST = 8
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Outline:
-    """The outline of connected cells. A cell's upper left corner has the cell's row and column.
+    """The outline of connected cells. A cell's upper left corner has the cell's row and column."""
 
-    outer : (k, 2) int64; row and column of the corners, with the cells on the left. Shape (0, 2) if there are no
-        cells.
-    holes : tuple of (k, 2) int64; likewise.
-    factor : no cell that is left out is farther than this many times the tolerance from the edges of the cells.
-    """
-
-    outer: NDArray[np.int64]
-    holes: tuple[NDArray[np.int64], ...]
-    factor: float
+    # (k, 2) row and column of the corners, with the cells on the left. Shape (0, 2) if there are no cells.
+    outer: Ints64
+    holes: tuple[Ints64, ...]
+    factor: float  # no cell that is left out is farther than this many times the tolerance from the edges of the cells
 
 
 def outline_of(
-    cells: NDArray[np.bool_],
-    origin: tuple[float, float],
-    obstacles: NDArray[np.bool_],
-    in_holes: NDArray[np.bool_],
-    *,
-    tolerance: float,
-    max_corners: int,
+    cells: Mask, origin: tuple[float, float], obstacles: Mask, in_holes: Mask, *, tolerance: float, max_corners: int
 ) -> Outline:
-    """Outline the connected cells that are nearest to a place.
+    """Outline the connected cells that are nearest to a place: a valid polygon, with holes that touch nothing.
 
     Closing by a disc fills gaps narrower than twice the tolerance, opening removes what is as narrow. So cells that are
     connected only over a narrower passage are left out. Where two cells share only a corner, a cell between them is
@@ -56,16 +44,12 @@ def outline_of(
     than ``max_corners`` remain, pairs of neighbors are replaced by one corner that may be anywhere on the grid, by
     growing area between the old edges and the new ones, under the same condition.
 
-    cells : (rows, columns) bool
-    origin : tuple of 2 float; row and column of the place, where a cell's middle has the cell's row and column. It
-        may be outside the grid.
-    obstacles : (rows, columns) bool; cells that are never included.
-    in_holes : (rows, columns) bool; a hole without such a cell is filled.
-    tolerance : largest distance between the outline and the edges of the cells, in cells. 0 keeps all corners,
-        however many.
-    max_corners : largest number of corners of the outer ring, at least 4. If they do not suffice, cells are left out
-        that are farther from the edges, at last all between holes and the first row; no more are added.
-    Returns: A valid polygon: its rings neither touch nor cross themselves or one another, and the holes are inside.
+    origin : row and column of the place, where a cell's middle has the cell's row and column; perhaps outside the grid.
+    obstacles : cells that are never included.
+    in_holes : a hole without such a cell is filled.
+    tolerance : largest distance between the outline and the edges of the cells, in cells. 0 keeps all corners.
+    max_corners : of the outer ring, at least 4. If they do not suffice, cells are left out that are farther from the
+        edges, at last all between holes and the first row; no more are added.
     """
     # A kernel is compiled for arrays in C order.
     cells, obstacles, in_holes = (np.ascontiguousarray(mask, np.bool_) for mask in (cells, obstacles, in_holes))
@@ -109,7 +93,7 @@ def outline_of(
     return Outline(found[outer], tuple(ring for k, ring in enumerate(found) if k != outer), factor)
 
 
-def nearest_part(cells: NDArray[np.bool_], origin: tuple[float, float]) -> NDArray[np.bool_]:
+def nearest_part(cells: Mask, origin: tuple[float, float]) -> Mask:
     """The connected cells (rows, columns) around the one nearest to ``origin``; cells share sides."""
     part = np.zeros(cells.shape, np.bool_)
     rows, cols = np.nonzero(cells)
@@ -119,9 +103,7 @@ def nearest_part(cells: NDArray[np.bool_], origin: tuple[float, float]) -> NDArr
     return part
 
 
-def without_gaps(
-    cells: NDArray[np.bool_], addable: NDArray[np.bool_], origin: tuple[float, float], wanted: NDArray[np.bool_]
-) -> NDArray[np.bool_]:
+def without_gaps(cells: Mask, addable: Mask, origin: tuple[float, float], wanted: Mask) -> Mask:
     """The nearest part, without cells that touch only at a corner, and without holes that contain no wanted cell."""
     part = cells.copy()
     resolve_contacts(part, addable.copy())
@@ -136,20 +118,20 @@ def without_gaps(
     return part | holes
 
 
-def filled(cells: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def filled(cells: Mask) -> Mask:
     """The cells and their holes, in a grid whose border is not marked."""
     outside = np.empty_like(cells)
     mark_connected(~cells, 0, 0, outside)
     return ~outside
 
 
-def _grown(cells: NDArray[np.bool_], radius: float) -> NDArray[np.bool_]:
+def _grown(cells: Mask, radius: float) -> Mask:
     grown = np.empty_like(cells)
     fill_grown(cells, radius, grown)
     return grown
 
 
-def _opened(cells: NDArray[np.bool_], beside: NDArray[np.bool_], radius: float) -> NDArray[np.bool_]:
+def _opened(cells: Mask, beside: Mask, radius: float) -> Mask:
     """The cells without parts that no disc fits into. Without the second growth, corners would be round.
 
     ``beside`` are the other cells, grown by the radius.
@@ -157,7 +139,7 @@ def _opened(cells: NDArray[np.bool_], beside: NDArray[np.bool_], radius: float) 
     return cells & _grown(_grown(~beside, radius), radius)
 
 
-def rings_of(cells: NDArray[np.bool_]) -> list[NDArray[np.int64]]:
+def rings_of(cells: Mask) -> list[Ints64]:
     """Rings of corners (row, column) around cells of a grid whose border is not marked."""
     n_sides = sum(int(np.count_nonzero(cells & ~np.roll(cells, shift, axis))) for axis in (0, 1) for shift in (1, -1))
     corners, ends = np.empty((n_sides, 2), np.int64), np.empty(n_sides // 4 + 1, np.int64)
@@ -165,13 +147,7 @@ def rings_of(cells: NDArray[np.bool_]) -> list[NDArray[np.int64]]:
     return np.split(corners, ends[:n_rings])[:n_rings]
 
 
-def _needed(
-    rings: list[NDArray[np.int64]],
-    not_addable: NDArray[np.int32],
-    not_removable: NDArray[np.int32],
-    outer: int,
-    enough: int,
-) -> list[NDArray[np.int64]]:
+def _needed(rings: list[Ints64], not_addable: Ints, not_removable: Ints, outer: int, enough: int) -> list[Ints64]:
     """The rings with the corners that `mark_needed` keeps."""
     corners, ends = np.concatenate(rings), np.cumsum([len(ring) for ring in rings], dtype=np.int64)
     kept = np.ones(len(corners), np.bool_)
@@ -179,12 +155,12 @@ def _needed(
     return [ring[few] for ring, few in zip(rings, np.split(kept, ends[:-1]), strict=True)]
 
 
-def _area(ring: NDArray[np.int64]) -> int:
+def _area(ring: Ints64) -> int:
     row, col = ring.T
     return int(row @ np.roll(col, -1) - col @ np.roll(row, -1))
 
 
-def row_sums(cells: NDArray[np.bool_]) -> NDArray[np.int32]:
+def row_sums(cells: Mask) -> Ints:
     """Number of cells of each row before each column that are not marked, (rows, columns + 1)."""
     sums = np.zeros((cells.shape[0], cells.shape[1] + 1), np.int32)
     np.cumsum(~cells, axis=1, out=sums[:, 1:])
@@ -192,12 +168,10 @@ def row_sums(cells: NDArray[np.bool_]) -> NDArray[np.int32]:
 
 
 @njit(cache=True, nogil=True)
-def fill_grown(cells: NDArray[np.bool_], radius: float, grown: NDArray[np.bool_]) -> None:
+def fill_grown(cells: Mask, radius: float, grown: Mask) -> None:
     """Mark the cells whose middle is within a distance of the middle of a marked cell.
 
-    cells : (rows, columns) bool
     radius : in cells, 0 or more and finite.
-    grown : (rows, columns) bool, overwritten
     """
     height, width = cells.shape
     for row in range(height):
@@ -222,13 +196,10 @@ def fill_grown(cells: NDArray[np.bool_], radius: float, grown: NDArray[np.bool_]
 
 
 @njit(cache=True, nogil=True)
-def resolve_contacts(cells: NDArray[np.bool_], addable: NDArray[np.bool_]) -> None:
-    """Add or remove cells until no two marked cells share only a corner.
-
-    cells : (rows, columns) bool, modified
-    addable : (rows, columns) bool, modified; cells that may be added: of the two between such a pair, the one with
-        the larger row if possible. If neither may be, the one of the pair with the smaller row is removed, and not
-        added again.
+def resolve_contacts(cells: Mask, addable: Mask) -> None:
+    """Add or remove cells until no two marked cells share only a corner. Of the two between such a pair, the one with
+    the larger row is added, if possible; if none is addable, the one of the pair with the smaller row is removed for
+    good.
     """
     height, width = cells.shape
     changed = True
@@ -251,12 +222,10 @@ def resolve_contacts(cells: NDArray[np.bool_], addable: NDArray[np.bool_]) -> No
 
 
 @njit(cache=True, nogil=True)
-def mark_connected(cells: NDArray[np.bool_], row: int, col: int, part: NDArray[np.bool_]) -> None:
+def mark_connected(cells: Mask, row: int, col: int, part: Mask) -> None:
     """Mark the cells that are connected to a start cell over shared sides.
 
-    cells : (rows, columns) bool
     row, col : a marked cell of ``cells``, where the search begins.
-    part : (rows, columns) bool, overwritten
     """
     height, width = cells.shape
     part[:] = False
@@ -277,14 +246,12 @@ def mark_connected(cells: NDArray[np.bool_], row: int, col: int, part: NDArray[n
 
 
 @njit(cache=True, nogil=True)
-def fill_rings(cells: NDArray[np.bool_], corners: NDArray[np.int64], ends: NDArray[np.int64]) -> int:
-    """Trace the edges of marked cells, with the cells on the left.
+def fill_rings(cells: Mask, corners: Ints64, ends: Ints64) -> int:
+    """Trace the edges of marked cells, none of them along the border, with the cells on the left.
 
-    cells : (rows, columns) bool; none marked along the border.
-    corners : (n, 2) int64, overwritten; row and column of the corners where the trace turns, ring after ring; a
-        cell's upper left corner has its row and column. ``n`` is at least the number of sides between a marked and an
-        unmarked cell.
-    ends : (m,) int64, overwritten; where each ring ends in ``corners``; ``m`` at least a quarter of ``n``.
+    corners : (n, 2) corners where the trace turns, ring after ring; a cell's upper left corner has its row and column.
+        ``n`` is at least the number of sides between a marked and an unmarked cell.
+    ends : (m,) where each ring ends in ``corners``; ``m`` at least a quarter of ``n``.
     """
     height, width = cells.shape
     walked = np.empty((height, width), np.bool_)  # lower sides
@@ -322,12 +289,8 @@ def fill_rings(cells: NDArray[np.bool_], corners: NDArray[np.int64], ends: NDArr
 
 
 @njit(cache=True, nogil=True)
-def may_change(ar: int, ac: int, br: int, bc: int, cr: int, cc: int, fixed: NDArray[np.int32]) -> bool:
-    """Whether all cells that a triangle touches may change sides.
-
-    ar, ac, br, bc, cr, cc : row and column of its corners.
-    fixed : (rows, columns + 1) int32; number of cells of each row before each column that may not.
-    """
+def may_change(ar: int, ac: int, br: int, bc: int, cr: int, cc: int, fixed: Ints) -> bool:
+    """Whether all cells that a triangle touches may change sides; ``fixed`` counts those before each that may not."""
     # In the strip of a row, its columns are bounded by its corners there and by the crossings of its edges with the
     # strip's two lines.
     for row in range(min(ar, br, cr), max(ar, br, cr)):
@@ -370,7 +333,7 @@ def meet(ar: int, ac: int, br: int, bc: int, cr: int, cc: int, dr: int, dc: int)
 
 
 @njit(cache=True, nogil=True)
-def is_apart(ring: NDArray[np.int64], edges: NDArray[np.int64], k: int, pr: int, pc: int) -> bool:
+def is_apart(ring: Ints64, edges: Ints64, k: int, pr: int, pc: int) -> bool:
     """Whether a ring stays valid with a corner p in place of its corners k and k + 1 (`merge_corners`)."""
     n = ring.shape[0]
     before, following, behind = (k - 1) % n, (k + 1) % n, (k + 2) % n
@@ -398,21 +361,17 @@ def is_apart(ring: NDArray[np.int64], edges: NDArray[np.int64], k: int, pr: int,
 
 
 @njit(cache=True, nogil=True)
-def merge_corners(
-    ring: NDArray[np.int64], edges: NDArray[np.int64], fixed: NDArray[np.int32], around: int, enough: int
-) -> int:
-    """Replace two neighboring corners of a ring by one; smallest changes first.
+def merge_corners(ring: Ints64, edges: Ints64, fixed: Ints, around: int, enough: int) -> int:
+    """Replace two neighboring corners of a valid ring by one, smallest changes first; returns how many are left.
 
     Between the neighbors a and d, the corner p replaces b and c. What changes sides lies in the triangles pab, pbc and
     pcd. No cell that they touch may be fixed, and of all such p, that with the smallest sum of their areas is taken.
     The new edges may meet no other edge, so the ring stays valid. Holes stay inside if none of their cells may change.
 
-    ring : (n, 2) int64, modified; row and column of the corners of a ring that neither touches nor crosses itself.
-    edges : (m, 4) int64; row and column of the two ends of other edges, which the ring may not touch.
-    fixed : (rows, columns + 1) int32; number of cells of each row before each column that may not change sides.
+    edges : (m, 4) row and column of the two ends of other edges, which the ring may not touch.
+    fixed : (rows, columns + 1) number of cells of each row before each column that may not change sides.
     around : how far the new corner may lie from the rectangle around the two [cells].
     enough : the ring keeps at least so many corners, and at least 4.
-    Returns n_corners: The first so many rows of ``ring`` are the corners.
     """
     n, height, width = ring.shape[0], fixed.shape[0], fixed.shape[1] - 1
     tried = np.empty(n, np.int64)  # the limit at which a corner and the next one were tried in vain
@@ -473,23 +432,14 @@ def merge_corners(
 
 @njit(cache=True, nogil=True)
 def mark_needed(
-    corners: NDArray[np.int64],
-    ends: NDArray[np.int64],
-    not_addable: NDArray[np.int32],
-    not_removable: NDArray[np.int32],
-    outer: int,
-    enough: int,
-    kept: Mask,
+    corners: Ints64, ends: Ints64, not_addable: Ints, not_removable: Ints, outer: int, enough: int, kept: Mask
 ) -> None:
-    """Remove corners of rings that neither touch nor cross; smallest triangles first.
+    """Mark the corners of rings, with the region on the left, that are left when those of the smallest triangles are
+    removed; at least three of each ring, and ``enough`` of the ``outer`` one.
 
-    corners : (n, 2) int64; row and column, ring after ring, with the region on the left.
-    ends : (m,) int64; where each ring ends in ``corners``.
-    not_addable, not_removable : (rows, columns + 1) int32; number of cells of each row before each column that may
-        not be added to the region, or removed from it.
-    outer : number of the outer ring.
-    enough : nothing more is removed once the outer ring has so few corners.
-    kept : (n,) bool, modified; the corners that are not removed; at least three of each ring.
+    ends : where each ring ends in ``corners``.
+    not_addable, not_removable : (rows, columns + 1) number of cells of each row before each column that may not be
+        added to the region, or removed from it.
     """
     n = corners.shape[0]
     before, after, ring_of = np.empty(n, np.int64), np.empty(n, np.int64), np.empty(n, np.int64)

@@ -19,7 +19,7 @@ from ..types.frame import ModelFrame
 from ..types.geometry import draw_footprints
 from ..types.mounting import MODEL_HEIGHT_M
 from ..types.perception import Box, Perception
-from ..types.points import as_points
+from ..types.points import Bytes, Floats, Mask, as_points
 from ..types.rigid import rigid
 from ..types.sensor import SensorProfile
 from ..types.views import TopViewGeometry
@@ -107,7 +107,7 @@ class RollingGrid:
         self._stamp_s: float | None = None
         self._forget(np.ones(self._kind.shape, np.bool_))
 
-    def _forget(self, where: NDArray[np.bool_]) -> None:
+    def _forget(self, where: Mask) -> None:
         self._kind[where], self._seen_s[where], self._fleeting[where] = _NOTHING, -math.inf, False
 
     @property
@@ -180,7 +180,7 @@ class RollingGrid:
         self._forget(self._fleeting | (self._seen_s < stamp_s - self._remember_s))
         self._observe(kinds, movable & (kinds == _OBSTACLE), to_odom, stamp_s)
 
-    def _kinds_of(self, grid: OccupancyGrid, perception: Perception) -> NDArray[np.uint8]:
+    def _kinds_of(self, grid: OccupancyGrid, perception: Perception) -> Bytes:
         """What the scan shows of its own cells."""
         judged = np.full(grid.observed.shape, knows_road(perception.points))
         if perception.top_view is not None:
@@ -191,7 +191,7 @@ class RollingGrid:
         kinds[grid.unknown] = _NOTHING
         return kinds
 
-    def _movable(self, perception: Perception, points: ArrayLike, tracks: Iterable[Track]) -> NDArray[np.bool_]:
+    def _movable(self, perception: Perception, points: ArrayLike, tracks: Iterable[Track]) -> Mask:
         """The scan's own cells in which something is that could move."""
         frame = ModelFrame(perception.mounting)
         boxes = [box for box in (*perception.boxes, *(track.box for track in tracks)) if box.label in self._classes]
@@ -222,9 +222,7 @@ class RollingGrid:
         new[:, n - dx if dx > 0 else 0 : n if dx > 0 else -dx] = True
         self._forget(new)
 
-    def _observe(
-        self, kinds: NDArray[np.uint8], fleeting: NDArray[np.bool_], to_odom: NDArray[np.float64], stamp_s: float
-    ) -> None:
+    def _observe(self, kinds: Bytes, fleeting: Mask, to_odom: Floats, stamp_s: float) -> None:
         """Write what a scan shows of its own cells into those of the window."""
         # Every cell of the window asks the scan's cell at its middle, so that none is left out between two of them.
         n = len(self._kind)
@@ -275,7 +273,7 @@ class RollingGrid:
         found = (UNKNOWN, FREE, check_value("off_road", off_road), OCCUPIED, check_value("unjudged", unjudged))
         return np.array(found, np.int8)[self._kind]
 
-    def ages_s(self) -> NDArray[np.float64]:
+    def ages_s(self) -> Floats:
         """Time since each cell was last observed, as of the newest scan [s]; infinite where nothing is known.
 
         Returns
@@ -312,7 +310,7 @@ class RollingGrid:
         return grid_message(self.values(off_road, unjudged), self._cell_m, self._stamp_s, frame_id, corner_m)
 
 
-def _road_in(pose: NDArray[np.float64], perception: Perception) -> tuple[NDArray[np.float64], float]:
+def _road_in(pose: Floats, perception: Perception) -> tuple[Floats, float]:
     """What takes x, y, 1 of the road in the frame of the models to x, y of the odometry, and the road's z there [m]."""
     frame = ModelFrame(perception.mounting)
     R = pose[:3, :3] @ frame.R.T

@@ -38,12 +38,9 @@ class Output(Protocol):
 
 
 class Graph(Protocol):
-    """A node in a ROS graph; one for each middleware.
+    """A node in a ROS graph; one for each middleware."""
 
-    name : fully qualified name of the node.
-    """
-
-    name: str
+    name: str  # fully qualified name of the node
 
     def parameter(self, name: str, default: Any) -> Any:
         """Declare a parameter that does not change later. Returns its value: the default, unless the user set it."""
@@ -65,12 +62,7 @@ class Graph(Protocol):
 
 
 def full_name(name: str, namespace: str = "/") -> str:
-    """Resolve the name of a topic or a node.
-
-    name : absolute (``"/points"``), or relative to the namespace.
-    Returns: With a leading slash.
-    Raises OptionError.
-    """
+    """The absolute name of a topic or a node: of ``"/points"``, itself; others are relative to the namespace."""
     full = name if name.startswith("/") else f"{namespace.rstrip('/')}/{name}"
     full = full if full.startswith("/") else f"/{full}"
     if not re.fullmatch(r"(/[A-Za-z_][A-Za-z0-9_]*)+", full) or "__" in full:

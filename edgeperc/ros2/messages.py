@@ -13,7 +13,6 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..errors import OptionError, PointsError
 from ..readers.clouds import cloud_table
@@ -22,7 +21,7 @@ from ..system.clock import nanoseconds_of
 from ..system.extras import require
 from ..system.names import check_text
 from ..tracking.moving import moving_tracks
-from ..types.points import as_points
+from ..types.points import Floats, Mask, as_points
 from ..view.colors import color_of, rgb
 from ..view.content import EDGES, box_corners
 
@@ -311,7 +310,7 @@ class RosMessages:
         )
         return self._make("nav_msgs/msg/OccupancyGrid", header=header, info=info, data=fields["data"])
 
-    def part(self, scan: PerceivedScan, cloud: Any, mask: NDArray[np.bool_], stamp_ns: int | None = None) -> Any:
+    def part(self, scan: PerceivedScan, cloud: Any, mask: Mask, stamp_ns: int | None = None) -> Any:
         """Some points of a cloud, byte by byte, with all its fields: a sensor_msgs/PointCloud2 of one row.
 
         Parameters
@@ -450,7 +449,7 @@ class RosMessages:
     def _twist(self, linear: tuple[float, float, float] = (0.0, 0.0, 0.0), turn: float = 0.0) -> Any:
         return self._make("geometry_msgs/msg/Twist", linear=self._xyz(linear), angular=self._xyz((0.0, 0.0, turn)))
 
-    def _with(self, kind: str, value: Any, covariance: NDArray[np.float64] | None = None) -> Any:
+    def _with(self, kind: str, value: Any, covariance: Floats | None = None) -> Any:
         matrix = np.zeros(36) if covariance is None else covariance.ravel()
         return self._make(f"geometry_msgs/msg/{kind}WithCovariance", **{kind.lower(): value}, covariance=matrix)
 
@@ -554,7 +553,7 @@ class RosMessages:
         pose: Any = None,
         scale: Any = (0.0, 0.0, 0.0),
         color: tuple[str, float] = ("", 0.0),
-        points: NDArray[np.float64] | None = None,
+        points: Floats | None = None,
         text: str = "",
     ) -> Any:
         (red, green, blue), alpha = rgb([color_of(color[0])])[0].tolist(), color[1]

@@ -35,12 +35,11 @@ from .messages import (
 from .odometry import ODOMETRY, Poses, Rolling
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from ..live import Answer
     from ..perceiver import Perceiver
     from ..tracking.tracker import Tracker
     from ..types.perception import Perception
+    from ..types.points import Floats32
 
 __all__ = ["PerceptionNode"]
 
@@ -133,7 +132,7 @@ class PerceptionNode:
         self._perceiver: Perceiver | None = None
         self._cloud: Any = None
         self._stamp_ns: int | None = None
-        self._points: NDArray[np.float32] | None = None
+        self._points: Floats32 | None = None
         self._newest: PerceivedScan | None = None
         self._n_failed = self._n_unplaced = 0
         self._rates = _Rates()

@@ -10,12 +10,12 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..errors import OptionError, PointsError, TrackingError
 from ..road.rolling import RollingGrid
 from ..types.frame import poses_of
 from ..types.mounting import Mounting
+from ..types.points import Floats
 from ..types.rigid import rigid
 from .graph import full_name
 from .messages import RosMessages
@@ -28,25 +28,12 @@ _MOST = 1000  # poses that are kept; 5 s at 200 Hz
 
 @dataclass(frozen=True, eq=False)
 class Rolling:
-    """What a node needs for a grid with memory.
+    """What a node needs for a grid with memory."""
 
-    Attributes
-    ----------
-    topic : str
-        Of nav_msgs/Odometry.
-    sensor_pose : sequence of 6 float, optional
-        Pose of the frame of the clouds in the child frame of the odometry: x, y, z [m], roll, pitch, yaw [deg]. By
-        default the two frames are one if they have one name; otherwise the sensor is above the child frame's origin,
-        mounted as the perceiver says.
-    grid : RollingGrid
-
-    Raises
-    ------
-    OptionError
-        The name or the pose is not valid.
-    """
-
-    topic: str = "/odom"
+    topic: str = "/odom"  # of nav_msgs/Odometry
+    # pose of the frame of the clouds in the child frame of the odometry: x, y, z [m], roll, pitch, yaw [deg]. By
+    # default the two frames are one if they have one name; otherwise the sensor is above the child frame's origin,
+    # mounted as the perceiver says.
     sensor_pose: Sequence[float] | None = None
     grid: RollingGrid = field(default_factory=RollingGrid)
 
@@ -62,7 +49,7 @@ class Rolling:
                 f"sensor_pose is {given!r} ({exc}); expected x, y, z in meters, roll, pitch, yaw in degrees"
             ) from exc
 
-    def base_from_sensor(self, child_frame: str, cloud_frame: str, mounting: Mounting) -> NDArray[np.float64]:
+    def base_from_sensor(self, child_frame: str, cloud_frame: str, mounting: Mounting) -> Floats:
         """Pose (4, 4) of the frame of the clouds in the child frame of the odometry."""
         pose = np.eye(4)
         if self.sensor_pose is not None:
@@ -76,18 +63,12 @@ class Rolling:
 
 
 class Poses:
-    """The poses that came of late; received in a thread of the middleware, asked for in another.
-
-    Attributes
-    ----------
-    frame_id, child_frame_id : of the newest pose.
-    n_failed : number of messages that were no poses.
-    """
+    """The poses that came of late; received in a thread of the middleware, asked for in another."""
 
     def __init__(self, messages: RosMessages) -> None:
         self._messages, self._lock = messages, threading.Lock()
         self._times: list[int] = []
-        self._poses: list[tuple[NDArray[np.float64], NDArray[np.float64]]] = []
+        self._poses: list[tuple[Floats, Floats]] = []
         self.frame_id = self.child_frame_id = ""
         self.n_failed = 0
 
@@ -110,11 +91,8 @@ class Poses:
             del self._times[:-_MOST], self._poses[:-_MOST]
             self.frame_id, self.child_frame_id = message.header.frame_id, message.child_frame_id
 
-    def at(self, stamp_ns: int) -> NDArray[np.float64] | None:
-        """Pose (4, 4) of the child frame at a time, between the two around it; None if there is none.
-
-        Raises TrackingError.
-        """
+    def at(self, stamp_ns: int) -> Floats | None:
+        """Pose (4, 4) of the child frame at a time, between the two around it; None if there is none."""
         with self._lock:
             k = bisect.bisect_right(self._times, stamp_ns)  # the first that is later
             if k == 0 or (k == len(self._times) and stamp_ns - self._times[-1] > TOLERANCE_S * 1e9):
@@ -130,7 +108,7 @@ class Poses:
         return rigid("the odometry's pose", pose, TrackingError)
 
 
-def _parts(pose: Any) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _parts(pose: Any) -> tuple[Floats, Floats]:
     """Position (3,) and unit quaternion x, y, z, w of a geometry_msgs/Pose. Raises TrackingError."""
     place = np.array([pose.position.x, pose.position.y, pose.position.z])
     turn = np.array([getattr(pose.orientation, axis) for axis in "xyzw"])
@@ -139,5 +117,5 @@ def _parts(pose: Any) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     return place, _unit(turn)
 
 
-def _unit(turn: NDArray[np.float64]) -> NDArray[np.float64]:
+def _unit(turn: Floats) -> Floats:
     return np.asarray(turn / np.linalg.norm(turn), np.float64)

@@ -12,14 +12,11 @@ from .graph import PUBLISHED_DEPTH, RECEIVED_DEPTH, TRANSITIONS
 
 
 class RclpyGraph:
-    """A node by rclpy; see `Graph`.
+    """A node by rclpy; see `Graph`. By default, its ROS_DOMAIN_ID is that of the environment.
 
-    name : name of the node.
-    domain : ROS_DOMAIN_ID; by default that of the environment.
     ros_args : what follows ``--ros-args``: remappings (``-r points:=/os/points``), parameters (``-p sensor:=os1-64``)
         and files of parameters.
     managed : whether it is a lifecycle node: `manage` says what its transitions do.
-    Raises OptionError.
     """
 
     def __init__(

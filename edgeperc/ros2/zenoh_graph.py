@@ -52,14 +52,11 @@ def attachment(number: int, stamp_ns: int, publisher_id: bytes) -> bytes:
 
 
 class ZenohGraph:
-    """A node over Zenoh; see `Graph`.
+    """A node over Zenoh; see `Graph`. By default, its ROS_DOMAIN_ID is that of the environment, or 0.
 
-    name : name of the node.
-    domain : ROS_DOMAIN_ID; by default that of the environment, or 0.
     connect : zenoh endpoint of a router or a peer. By default the session is configured by the file that the variable
         ZENOH_SESSION_CONFIG_URI names or, without it, connects to `ROUTER`.
     messages : for the hashes of types.
-    Raises MissingExtraError, OptionError.
     """
 
     def __init__(

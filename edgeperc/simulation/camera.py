@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..camera.calibration import Calibration
 from ..errors import CalibrationError
 from ..types.choices import VEHICLES
-from ..types.points import Labels
+from ..types.points import Bytes, Floats, Floats32, Labels
 from .raycast import FACADE, GLASS, LEAVES, PAINT, RETRO, Hits, Rays, fill_cast
 from .scene import Scene, SimulatedScan, place_shapes
 from .street import CAMERA_CLASSES
@@ -49,9 +49,9 @@ class CameraImage:
         Distance along the optical axis [m]; infinite for the sky.
     """
 
-    rgb: NDArray[np.uint8]
+    rgb: Bytes
     labels: Labels
-    depth_m: NDArray[np.float32]
+    depth_m: Floats32
 
 
 def forward_camera(
@@ -159,7 +159,7 @@ def render(
     return CameraImage(np.clip(color, 0.0, 255.0).astype(np.uint8), labels, depth.astype(np.float32))
 
 
-def true_classes(scan: SimulatedScan) -> NDArray[np.uint8]:
+def true_classes(scan: SimulatedScan) -> Bytes:
     """Class of the surface that returned each point: index into `CAMERA_CLASSES`, `VOID` for none, (n,) uint8."""
     labels = np.append(surface_classes(scan.scene), np.uint8(0))[scan.surfaces]
     ground = scan.surfaces == -1
@@ -168,14 +168,12 @@ def true_classes(scan: SimulatedScan) -> NDArray[np.uint8]:
     return labels
 
 
-def _ground_at(
-    scene: Scene, places: NDArray[Any], T_world_frame: NDArray[np.float64]
-) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
+def _ground_at(scene: Scene, places: NDArray[Any], T_world_frame: Floats) -> tuple[Bytes, Floats]:
     """Kind and remission of the ground at places (n, 3) of a frame."""
     return scene.surface((places.astype(np.float64) @ T_world_frame[:3, :3].T + T_world_frame[:3, 3])[:, :2])
 
 
-def surface_classes(scene: Scene) -> NDArray[np.uint8]:
+def surface_classes(scene: Scene) -> Bytes:
     """Class of each of ``scene.primitives`` in an image: index into `CAMERA_CLASSES`, `VOID` for none, (n,) uint8."""
     of_object = [
         CAMERA_CLASSES.index("Bicyclist") if each.label == "misc" and each.size[0] < 2.7 else _OF_OBJECT[each.label]
@@ -187,7 +185,7 @@ def surface_classes(scene: Scene) -> NDArray[np.uint8]:
     return np.where(number >= 0, lookup[np.maximum(number, -1)], static).astype(np.uint8)
 
 
-def _surface_colors(scene: Scene, rng: np.random.Generator) -> NDArray[np.float64]:
+def _surface_colors(scene: Scene, rng: np.random.Generator) -> Floats:
     """A color (n, 3) for each of ``scene.primitives``: of its material, and of its object where that is painted."""
     primitives = scene.primitives
     n = len(primitives)
@@ -215,5 +213,5 @@ def _surface_colors(scene: Scene, rng: np.random.Generator) -> NDArray[np.float6
     return np.asarray(np.clip(colors, 5.0, 250.0))
 
 
-def _mixed(low: tuple[int, ...], high: tuple[int, ...], share: NDArray[np.float64]) -> NDArray[np.float64]:
+def _mixed(low: tuple[int, ...], high: tuple[int, ...], share: Floats) -> Floats:
     return np.asarray(np.array(low) + share[:, None] * (np.array(high) - np.array(low)))

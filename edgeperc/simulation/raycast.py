@@ -6,10 +6,9 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..system.kernels import njit
-from ..types.points import Points, Rows
+from ..types.points import Bytes, Floats, Ints, Ints64, Points, Rows
 
 # A primitive is a row of float64: kind, material, remission, density, center (3), rows of the matrix that maps an
 # offset from the center into the unit shape (9), taper of the front, rear and sides (3), object. Below 0, the last is a
@@ -35,17 +34,17 @@ _GROUND, _NOTHING = -1, -2  # hits that are not rows of primitives
 class Ground(NamedTuple):
     """The ground of a scene (`Scene`)."""
 
-    strips: NDArray[np.float64]  # (k, 10)
-    terrain: NDArray[np.float64]  # (27,)
-    tile: NDArray[np.float64]  # (256, 256)
+    strips: Floats  # (k, 10)
+    terrain: Floats  # (27,)
+    tile: Floats  # (256, 256)
 
 
 class Shapes(NamedTuple):
     """Primitives in the sensor frame, nearest first, and those that the rays of each sector of the turn may hit."""
 
-    primitives: NDArray[np.float64]  # (n, 20)
-    bounds: NDArray[np.float64]  # (n, 5), from `fill_bounds`
-    starts: NDArray[np.int64]  # (sectors + 1,), where each sector's list begins in `rows`
+    primitives: Floats  # (n, 20)
+    bounds: Floats  # (n, 5), from `fill_bounds`
+    starts: Ints64  # (sectors + 1,), where each sector's list begins in `rows`
     rows: Rows  # rows of `primitives`
 
 
@@ -53,8 +52,8 @@ class Rays(NamedTuple):
     """The rays of a sensor at the origin: one for each beam and column."""
 
     # (beams, 1), or (beams, columns) where those of a beam differ; in each column from top to bottom [rad].
-    elevations: NDArray[np.float64]
-    azimuths: NDArray[np.float64]  # (columns,) [rad]
+    elevations: Floats
+    azimuths: Floats  # (columns,) [rad]
     reach: float  # length [m]
     key: np.uint64  # seed of all draws
 
@@ -62,17 +61,17 @@ class Rays(NamedTuple):
 class Hits(NamedTuple):
     """The first hit of each ray, (beams, columns)."""
 
-    ranges: NDArray[np.float64]  # [m]; not finite: no return
+    ranges: Floats  # [m]; not finite: no return
     rows: Rows  # of the primitives, -1 for the ground, -2 for no hit
-    exits: NDArray[np.float64]  # range at which the ray leaves the primitive [m]
-    cosines: NDArray[np.float64]  # of the angle of incidence
+    exits: Floats  # range at which the ray leaves the primitive [m]
+    cosines: Floats  # of the angle of incidence
 
 
 class Receiver(NamedTuple):
     """What a sensor makes of hits."""
 
-    range_offsets: NDArray[np.float64]  # (beams,), calibration errors [m]
-    remission_offsets: NDArray[np.float64]  # (beams,), calibration errors
+    range_offsets: Floats  # (beams,), calibration errors [m]
+    remission_offsets: Floats  # (beams,), calibration errors
     min_range: float  # [m]
     noise: bool  # noise and drop-out
     ego_shadow: bool  # the ego vehicle hides the directions that KITTI's car hides
@@ -114,7 +113,7 @@ def normal_draw(bits: np.uint64) -> float:
 
 
 @njit(cache=True, nogil=True)
-def _tile_at(tile: NDArray[np.float64], x: float, y: float, cell_m: float) -> float:
+def _tile_at(tile: Floats, x: float, y: float, cell_m: float) -> float:
     column, row = x / cell_m, y / cell_m
     left, below = math.floor(column), math.floor(row)
     a, b = column - left, row - below
@@ -125,10 +124,8 @@ def _tile_at(tile: NDArray[np.float64], x: float, y: float, cell_m: float) -> fl
 
 @njit(cache=True, nogil=True)
 def ground_at(ground: Ground, x: float, y: float) -> tuple[float, float, float, float, float]:
-    """Evaluate the ground at x, y [m], world frame.
-
-    Returns height, distance outside the roads, distance outside the bays, and u and s in the first road's frame [m].
-    Both distances are negative inside; an island is outside. s is along the axis of the road, u to its left.
+    """Evaluate the ground at x, y [m], world frame: height, distance outside the roads and the bays (negative inside;
+    an island is outside), and u and s in the first road's frame [m], s along its axis, u to its left.
     """
     strips, terrain = ground.strips, ground.terrain
     outside, outside_bays, outside_islands, u_first, s_first = 1e9, 1e9, 1e9, 0.0, 0.0
@@ -177,9 +174,7 @@ def ground_at(ground: Ground, x: float, y: float) -> tuple[float, float, float, 
 
 
 @np.errstate(invalid="ignore")
-def placed(
-    primitives: NDArray[np.float64], poses: NDArray[np.float64], T_world_sensor: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def placed(primitives: Floats, poses: Floats, T_world_sensor: Floats) -> Floats:
     """Primitives (n, 20), of the frame of their object or of the world, in the sensor frame.
 
     poses : (m, 4) float64; x, y, z [m], yaw [rad] of the objects.
@@ -200,12 +195,9 @@ def placed(
 
 
 @njit(cache=True, nogil=True)
-def fill_bounds(primitives: NDArray[np.float64], bounds: NDArray[np.float64]) -> None:
-    """Compute bounds of the rays from the origin that can hit each primitive.
-
-    primitives : (n, 20) float64; in the sensor frame.
-    bounds : (n, 5) float64, overwritten; first azimuth, width in azimuth [rad], lowest and highest tangent of the
-        elevation, horizontal distance [m]. Primitives that are not finite get an infinite distance.
+def fill_bounds(primitives: Floats, bounds: Floats) -> None:
+    """Compute bounds of the rays from the origin that can hit each primitive: first azimuth, width in azimuth [rad],
+    lowest and highest tangent of the elevation, horizontal distance [m], infinite if the primitive is not finite.
     """
     corners = np.empty((8, 3))
     for k in range(primitives.shape[0]):
@@ -257,7 +249,7 @@ def fill_bounds(primitives: NDArray[np.float64], bounds: NDArray[np.float64]) ->
         bounds[k, 4] = near
 
 
-def columns_of(bounds: NDArray[np.float64], n_columns: int, reach: float) -> tuple[NDArray[np.int64], Rows]:
+def columns_of(bounds: Floats, n_columns: int, reach: float) -> tuple[Ints64, Rows]:
     """Primitives that rays of each column may hit, in the order of ``bounds``: starts (n_columns + 1,) and rows."""
     near = np.flatnonzero(bounds[:, 4] < reach)
     step = 2.0 * math.pi / n_columns
@@ -273,7 +265,7 @@ def columns_of(bounds: NDArray[np.float64], n_columns: int, reach: float) -> tup
 
 
 @njit(cache=True, nogil=True)
-def crossing(p: NDArray[np.float64], dx: float, dy: float, dz: float) -> tuple[float, float, int]:
+def crossing(p: Floats, dx: float, dy: float, dz: float) -> tuple[float, float, int]:
     """Intersect a ray from the origin with a primitive: ranges of entry and exit [m], and face. entry > exit: miss."""
     ox = -(p[7] * p[4] + p[8] * p[5] + p[9] * p[6])
     oy = -(p[10] * p[4] + p[11] * p[5] + p[12] * p[6])
@@ -337,7 +329,7 @@ def crossing(p: NDArray[np.float64], dx: float, dy: float, dz: float) -> tuple[f
 
 
 @njit(cache=True, nogil=True)
-def _cosine(p: NDArray[np.float64], face: int, t: float, dx: float, dy: float, dz: float) -> float:
+def _cosine(p: Floats, face: int, t: float, dx: float, dy: float, dz: float) -> float:
     """Cosine of the angle between ray and surface normal."""
     nx, ny, nz = 0.0, 0.0, 0.0
     if face == 6:
@@ -365,7 +357,7 @@ def _cosine(p: NDArray[np.float64], face: int, t: float, dx: float, dy: float, d
 
 # Inlined, as calls from the loops of rays take an eighth longer in all.
 @njit(cache=True, nogil=True, inline="always")
-def _height_above(ground: Ground, T: NDArray[np.float64], x: float, y: float, z: float) -> float:
+def _height_above(ground: Ground, T: Floats, x: float, y: float, z: float) -> float:
     """Height above the ground [m] of a point in the sensor frame."""
     xw = T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3]
     yw = T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3]
@@ -374,7 +366,7 @@ def _height_above(ground: Ground, T: NDArray[np.float64], x: float, y: float, z:
 
 
 @njit(cache=True, nogil=True)
-def fill_cast(shapes: Shapes, ground: Ground, T_world_sensor: NDArray[np.float64], rays: Rays, hits: Hits) -> None:
+def fill_cast(shapes: Shapes, ground: Ground, T_world_sensor: Floats, rays: Rays, hits: Hits) -> None:
     """Find the first hit of each ray; ``hits`` are overwritten."""
     T = T_world_sensor
     n_beams, n_columns = rays.elevations.shape[0], rays.azimuths.shape[0]
@@ -423,13 +415,7 @@ def fill_cast(shapes: Shapes, ground: Ground, T_world_sensor: NDArray[np.float64
 
 
 @njit(cache=True, nogil=True)
-def _fill_profile(
-    ground: Ground,
-    T: NDArray[np.float64],
-    level: tuple[float, float],
-    radii: NDArray[np.float64],
-    heights: NDArray[np.float64],
-) -> None:
+def _fill_profile(ground: Ground, T: Floats, level: tuple[float, float], radii: Floats, heights: Floats) -> None:
     """Heights (n,) of the ground in the sensor frame at radii (n,) along an azimuth, overwritten [m].
 
     level : cosine and sine of the azimuth.
@@ -447,13 +433,7 @@ def _fill_profile(
 
 @njit(cache=True, nogil=True)
 def _ground_radius(
-    ground: Ground,
-    T: NDArray[np.float64],
-    level: tuple[float, float],
-    tan: float,
-    radii: NDArray[np.float64],
-    heights: NDArray[np.float64],
-    i: int,
+    ground: Ground, T: Floats, level: tuple[float, float], tan: float, radii: Floats, heights: Floats, i: int
 ) -> float:
     """Horizontal distance [m] at which a ray of slope ``tan`` meets the ground, between samples i - 1 and i."""
     low = 0.0 if i == 0 else radii[i - 1]
@@ -481,7 +461,7 @@ def _ground_radius(
 
 
 @njit(cache=True, nogil=True)
-def _ground_rise(ground: Ground, T: NDArray[np.float64], level: tuple[float, float], tan: float, r: float) -> float:
+def _ground_rise(ground: Ground, T: Floats, level: tuple[float, float], tan: float, r: float) -> float:
     """Slope of the ground along a ray of slope ``tan`` that meets it at ``r`` [m], over 4 cm."""
     rise = _height_above(ground, T, (r - 0.02) * level[0], (r - 0.02) * level[1], r * tan)
     rise -= _height_above(ground, T, (r + 0.02) * level[0], (r + 0.02) * level[1], r * tan)
@@ -543,12 +523,7 @@ def _ground_remission(ground: Ground, x: float, y: float) -> float:
 
 
 @njit(cache=True, nogil=True)
-def fill_ground_kinds(
-    ground: Ground,
-    xy: NDArray[np.float64],
-    kinds: NDArray[np.uint8],
-    remissions: NDArray[np.float64],
-) -> None:
+def fill_ground_kinds(ground: Ground, xy: Floats, kinds: Bytes, remissions: Floats) -> None:
     """Write the ground's kind (n,) at x, y [m], world frame, (n, 2), and its remission.
 
     Kinds are 0 for a road, 1 for a bay or a pavement, 2 for grass and for places that are not finite.
@@ -584,21 +559,16 @@ def _in_ego_shadow(azimuth: float, elevation: float) -> bool:
 
 @njit(cache=True, nogil=True)
 def fill_points(
-    primitives: NDArray[np.float64],
+    primitives: Floats,
     ground: Ground,
-    T_world_sensor: NDArray[np.float64],
+    T_world_sensor: Floats,
     rays: Rays,
     hits: Hits,
     receiver: Receiver,
     points: Points,
-    objects: NDArray[np.int32],
+    objects: Ints,
 ) -> int:
-    """Convert hits to returns, beam by beam.
-
-    points : (beams * columns, 4) float32, first rows overwritten
-    objects : (beams * columns,) int32, first rows overwritten; object of each point, -1 for none.
-    Returns n: Number of returns.
-    """
+    """Convert hits to returns, beam by beam, with the object of each, -1 for none; returns their number."""
     n_beams, n_columns = hits.rows.shape
     differ = 1 if rays.elevations.shape[1] > 1 else 0
     n = 0
@@ -647,9 +617,7 @@ def fill_points(
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _ground_echo(
-    ground: Ground, T: NDArray[np.float64], direction: tuple[float, float, float], t: float, cosine: float
-) -> Echo:
+def _ground_echo(ground: Ground, T: Floats, direction: tuple[float, float, float], t: float, cosine: float) -> Echo:
     """Echo of the ground at the range ``t`` [m]."""
     x, y, z = t * direction[0], t * direction[1], t * direction[2]
     xw = T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3]
@@ -661,13 +629,7 @@ def _ground_echo(
 
 @njit(cache=True, nogil=True, inline="always")
 def _shape_echo(
-    p: NDArray[np.float64],
-    T: NDArray[np.float64],
-    direction: tuple[float, float, float],
-    t: float,
-    leave: float,
-    cosine: float,
-    draw: float,
+    p: Floats, T: Floats, direction: tuple[float, float, float], t: float, leave: float, cosine: float, draw: float
 ) -> Echo:
     """Echo of a primitive (20,) between the ranges ``t`` and ``leave`` [m]; ``draw`` is uniform in 0..1."""
     material, value, lost, jitter = int(p[1]), p[2], 0.006, 1.0
@@ -700,7 +662,7 @@ def _shape_echo(
 
 
 @njit(cache=True, nogil=True)
-def _in_window(p: NDArray[np.float64], T: NDArray[np.float64], direction: tuple[float, float, float], t: float) -> bool:
+def _in_window(p: Floats, T: Floats, direction: tuple[float, float, float], t: float) -> bool:
     """Whether a ray meets a facade in one of its recessed windows, most of which reflect it away from the sensor."""
     dx, dy, dz = direction
     qx, qy, qz = t * dx, t * dy, t * dz

@@ -7,11 +7,11 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..types.geometry import inside
 from ..types.mounting import Mounting
 from ..types.perception import Box
+from ..types.points import Bytes
 from ..types.sensor import SensorProfile
 from .camera import CAMERA_CLASSES, true_classes
 from .drawn import random_scene
@@ -41,10 +41,9 @@ def simulated_scan(
 ) -> SimulatedScan:
     """Simulate one scan of a new scene. The vehicle is slightly pitched and rolled, beside the middle of its lane.
 
-    seed : seed of the scene, the pose and the noise.
     boxes : a real layout to build the scene around (`layouts.scene_from_boxes`); by default the scene is random.
-    mounting : how the sensor is mounted: height, and tilt relative to the vehicle. Default: at the height of the
-        sensor's own mounting, upright. Points and boxes are in the frame of the tilted sensor.
+    mounting : height, and tilt relative to the vehicle; by default the sensor's height, upright. Points and boxes are
+        in the frame of the tilted sensor.
     indoors : in a hall, without a layout (`halls.hall`); a sensor that is as high as the ceiling hangs below it.
     """
     rng = np.random.default_rng((seed, 1))
@@ -93,11 +92,11 @@ def _is_free(scene: Scene, x: float, y: float, yaw: float) -> bool:
     return True
 
 
-def labels_by_boxes(scan: SimulatedScan) -> NDArray[np.uint8]:
-    """Label the points of a simulated scan by its boxes, as in KITTI: (n,) uint8, index into `POINT_CLASSES`.
+def labels_by_boxes(scan: SimulatedScan) -> Bytes:
+    """Label the points of a simulated scan by its boxes, as in KITTI: index into `POINT_CLASSES`.
 
-    Every point in a box gets the class of the object, including ground points, if the object itself has returns.
-    Points of objects without a class (trams and "misc" objects) get `IGNORE`.
+    Every point in a box gets the class of the object, including ground points, if the object itself has returns. Points
+    of objects without a class (trams and "misc" objects) get `IGNORE`.
     """
     labels = scan.labels.copy()
     for box, returns in zip(scan.boxes, scan.box_points, strict=True):
@@ -107,7 +106,7 @@ def labels_by_boxes(scan: SimulatedScan) -> NDArray[np.uint8]:
     return labels
 
 
-def labels_of_scene(scan: SimulatedScan) -> NDArray[np.uint8]:
+def labels_of_scene(scan: SimulatedScan) -> Bytes:
     """As `labels_by_boxes`, with the background told apart by its surfaces: index into `SCENE_CLASSES`."""
     labels, surface = labels_by_boxes(scan), true_classes(scan)
     lawn = (surface == _TREE) & (scan.surfaces == -1)

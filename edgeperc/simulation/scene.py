@@ -7,13 +7,13 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from ..errors import PointsError
 from ..types.choices import STATIC, VEHICLES
 from ..types.geometry import draw_footprints, wrapped
 from ..types.perception import Box
-from ..types.points import Labels, Points
+from ..types.points import Bytes, Floats, Ints, Labels, Points
 from ..types.sensor import ScanPattern, SensorProfile, get_sensor
 from ..types.views import TopViewGeometry
 from .raycast import (
@@ -90,10 +90,10 @@ class Scene:
     """
 
     objects: tuple[SceneObject, ...]
-    primitives: NDArray[np.float64]
-    strips: NDArray[np.float64]
-    terrain: NDArray[np.float64]
-    tile: NDArray[np.float64]
+    primitives: Floats
+    strips: Floats
+    terrain: Floats
+    tile: Floats
 
     @property
     def ground(self) -> Ground:
@@ -121,7 +121,7 @@ class Scene:
         """Whether x, y [m], world frame, is on a road surface; parking bays are not."""
         return bool(ground_at(self.ground, float(x), float(y))[1] < 0.0)
 
-    def surface(self, xy: NDArray[np.float64]) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
+    def surface(self, xy: Floats) -> tuple[Bytes, Floats]:
         """Kind of the ground (0 road, 1 bay or pavement, 2 grass) and remission at places (..., 2), world frame."""
         kinds, remissions = np.empty(xy.shape[:-1], np.uint8), np.empty(xy.shape[:-1])
         fill_ground_kinds(
@@ -157,15 +157,15 @@ class SimulatedScan:
 
     points: Points
     labels: Labels
-    objects: NDArray[np.int32]
-    surfaces: NDArray[np.int32]
+    objects: Ints
+    surfaces: Ints
     boxes: tuple[Box, ...]
     box_ids: tuple[int, ...]
     box_points: tuple[int, ...]
-    T_world_sensor: NDArray[np.float64]
+    T_world_sensor: Floats
     scene: Scene
 
-    def top_view_labels(self, geometry: TopViewGeometry | None = None) -> NDArray[np.uint8]:
+    def top_view_labels(self, geometry: TopViewGeometry | None = None) -> Bytes:
         """True class of each cell of a top view, including hidden cells.
 
         Parameters
@@ -198,11 +198,9 @@ def sensor_pose(
     yaw: float = 0.0,
     pitch: float = 0.0,
     roll: float = 0.0,
-) -> NDArray[np.float64]:
-    """Make ``T_world_sensor`` for a sensor at its mounting height above the ground at x, y [m], world frame.
-
-    Returns (4, 4) float64: Rotated by roll about x, then by pitch about y (nose down is positive), then by yaw about
-        z [rad].
+) -> Floats:
+    """Make ``T_world_sensor`` for a sensor at its mounting height above the ground at x, y [m], world frame: rotated by
+    roll about x, then by pitch about y (nose down is positive), then by yaw about z [rad].
     """
     T_world_sensor = np.eye(4)
     cy, sy, cp, sp = math.cos(yaw), math.sin(yaw), math.cos(pitch), math.sin(pitch)
@@ -312,11 +310,9 @@ def simulate(
 
 def _pattern_rays(
     profile: SensorProfile, pattern: ScanPattern, start_s: float, duration_s: float | None
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Azimuths (n,) and elevations (1, n) of a pattern [rad], in the order of time.
-
-    A sensor that sees all around turns while its beam goes up and down. Others look through two prisms that turn at
-    different rates, so that the beam draws a rosette.
+) -> tuple[Floats, Floats]:
+    """Azimuths (n,) and elevations (1, n) of a pattern [rad], in the order of time: of a turn while the beam goes up
+    and down, or of two prisms that turn at different rates, so that the beam draws a rosette.
     """
     duration_s = pattern.accumulate_s if duration_s is None else duration_s
     first = round(start_s * pattern.points_per_s)
@@ -329,12 +325,9 @@ def _pattern_rays(
     return math.radians(pattern.width_deg) / 2.0 * across, (middle + half * up)[None]
 
 
-def place_shapes(scene: Scene, T_world_sensor: NDArray[np.float64], n_columns: int, reach_m: float) -> Shapes:
-    """Sort the shapes of a scene by the directions in which rays from a sensor may hit them.
-
-    T_world_sensor : (4, 4) float64
-    n_columns : number of sectors of a turn, counter-clockwise from +x.
-    The last column of the returned primitives is their row of ``scene.primitives``.
+def place_shapes(scene: Scene, T_world_sensor: Floats, n_columns: int, reach_m: float) -> Shapes:
+    """Sort the shapes of a scene by the directions, ``n_columns`` counter-clockwise from +x, in which rays from a
+    sensor may hit them. The last column of the returned primitives is their row of ``scene.primitives``.
     """
     poses = np.array([(*o.center[:2], o.center[2] - o.size[2] / 2.0, o.yaw) for o in scene.objects]).reshape(-1, 4)
     primitives = placed(scene.primitives, poses, T_world_sensor)
@@ -353,7 +346,7 @@ def simulate_sequence(
     rate_hz: float = 10.0,
     ego_speed_mps: float = 0.0,
     seed: int = 0,
-) -> Iterator[tuple[float, NDArray[np.float64], SimulatedScan]]:
+) -> Iterator[tuple[float, Floats, SimulatedScan]]:
     """Simulate scans of a sensor that moves along the scene's first road, from the origin.
 
     Each is taken from one place. That of a sensor with a pattern lasts until the next one, so a high rate shows how
@@ -375,7 +368,7 @@ def simulate_sequence(
         yield stamp_s, T_world_sensor, scan
 
 
-def _box_in_sensor(each: SceneObject, T_world_sensor: NDArray[np.float64]) -> Box:
+def _box_in_sensor(each: SceneObject, T_world_sensor: Floats) -> Box:
     rotation = T_world_sensor[:3, :3]
     x, y, z = rotation.T @ (np.asarray(each.center) - T_world_sensor[:3, 3])
     ahead = rotation.T @ np.array([math.cos(each.yaw), math.sin(each.yaw), 0.0])

@@ -6,10 +6,10 @@ import math
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..types.choices import VEHICLES
 from ..types.geometry import wrapped
+from ..types.points import Floats
 from . import raycast
 from .people import cyclist, pedestrian, person_sitting
 from .raycast import Ground, ground_at
@@ -61,7 +61,7 @@ _SIGN = -2.0 - CAMERA_CLASSES.index("SignSymbol")
 class Street:
     """Builds a scene: places objects on its roads and static shapes beside them, where the ground is free."""
 
-    def __init__(self, rng: np.random.Generator, strips: list[Row], terrain: NDArray[np.float64]) -> None:
+    def __init__(self, rng: np.random.Generator, strips: list[Row], terrain: Floats) -> None:
         self.rng = rng
         self.strips = np.array(strips, dtype=np.float64).reshape(-1, raycast.STRIP)
         self.terrain = terrain
@@ -161,11 +161,10 @@ class Street:
         *,
         of: str = "",
     ) -> bool:
-        """Place static shapes if the ground is free and off the roads. Return whether they were placed.
+        """Place static shapes if the ground is free and off the roads; return whether they were placed.
 
-        ``rows`` are primitives in a frame at x, y on the ground, turned by ``yaw``. They stand on the lowest ground
-        below them. ``of`` is their class in a camera's image (`CAMERA_CLASSES`), empty for none; retroreflectors on
-        poles are signs.
+        ``rows`` are primitives in a frame at x, y on the lowest ground below them, turned by ``yaw``. ``of`` is their
+        class in a camera's image (`CAMERA_CLASSES`), empty for none; retroreflectors on poles are signs.
         """
         number = -2.0 - CAMERA_CLASSES.index(of) if of else -1.0
         cos, sin = math.cos(yaw), math.sin(yaw)
@@ -194,7 +193,7 @@ class Street:
         return True
 
 
-def _noise_tile(rng: np.random.Generator) -> NDArray[np.float64]:
+def _noise_tile(rng: np.random.Generator) -> Floats:
     # Three periodic octaves: full, half and eighth resolution.
     tile = rng.uniform(-1.0, 1.0, (raycast.TILE, raycast.TILE))
     for scale in (2, 8):
@@ -206,7 +205,7 @@ def _noise_tile(rng: np.random.Generator) -> NDArray[np.float64]:
     return np.ascontiguousarray(np.clip(tile / 2.2, -1.0, 1.0))
 
 
-def random_terrain(rng: np.random.Generator, environment: str) -> NDArray[np.float64]:
+def random_terrain(rng: np.random.Generator, environment: str) -> Floats:
     """Draw the terrain of an environment: slopes, waves, kerbs, banks, remissions."""
     terrain = np.zeros(raycast.TERRAIN)
     open_land = environment in ("rural", "highway")

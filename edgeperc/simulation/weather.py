@@ -17,9 +17,9 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from ..types.points import Points
+from ..types.points import Floats, Floats32, Points
 
-Scan = NDArray[np.float32]
+Scan = Floats32
 
 DIVERGENCE_RAD = 3e-3  # of the beam
 DROP_REMISSION = 0.02  # of water and ice at normal incidence
@@ -83,17 +83,16 @@ def fog(points: Points, visibility_m: float, *, max_range_m: float = 120.0, seed
     return foggy[is_soft | ~is_lost]
 
 
-def _beams(points: Points, seed: int) -> tuple[np.random.Generator, NDArray[np.float64], NDArray[np.float64]]:
+def _beams(points: Points, seed: int) -> tuple[np.random.Generator, Floats, Floats]:
     """Random numbers, the ranges of the returns (n,), and the directions of their beams (n, 3)."""
     ranges = np.linalg.norm(points[:, :3].astype(np.float64), axis=1)
     return np.random.default_rng(seed), ranges, points[:, :3] / np.maximum(ranges, 1e-9)[:, None]
 
 
 def _fallen(points: Points, sizes: tuple[float, float, float], max_range_m: float, seed: int) -> Scan:
-    """Returns of drops that are nearer than the target and bright enough; targets that are too dim are lost.
-
-    sizes : number of drops per m3 and mm of diameter that the exponential begins with, its slope [1/mm], and the
+    """sizes : number of drops per m3 and mm of diameter that the exponential begins with, its slope [1/mm], and the
         attenuation [1/m].
+    Returns of drops that are nearer than the target and bright enough; targets that are too dim are lost.
     """
     n0, slope, per_m = sizes
     rng, ranges, rays = _beams(points, seed)
@@ -111,9 +110,7 @@ def _fallen(points: Points, sizes: tuple[float, float, float], max_range_m: floa
     return wet[(at < ranges) | (power >= least)]
 
 
-def _with_drops(
-    points: Points, rays: NDArray[np.floating], ranges: NDArray[np.floating], at: NDArray[np.float64]
-) -> Scan:
+def _with_drops(points: Points, rays: NDArray[np.floating], ranges: NDArray[np.floating], at: Floats) -> Scan:
     """Points whose beams meet a drop before their target are at the drop, with its low remission."""
     wet = points.astype(np.float32)
     nearer = at < ranges

@@ -25,7 +25,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..errors import OptionError
 from ..records import PerceivedScan
@@ -35,6 +34,7 @@ from ..system.printable import printable
 from ..types.frame import quaternion
 from ..types.mounting import MODEL_HEIGHT_M
 from ..types.perception import Box, TopView
+from ..types.points import Floats
 from ..view.content import EDGES, box_corners, box_text, track_text
 from .relay import MAX_VIEWERS, Relay
 from .run_file import RunFile
@@ -276,7 +276,7 @@ class _Channels:
             pose=pose, shaft_length=length, shaft_diameter=0.1, head_length=0.4, head_diameter=0.3, color=color
         )
 
-    def _line(self, kind: str, corners: NDArray[np.float64], color: Any) -> Any:
+    def _line(self, kind: str, corners: Floats, color: Any) -> Any:
         make = self._messages
         return make.LinePrimitive(
             type=getattr(make.LinePrimitiveLineType, kind),

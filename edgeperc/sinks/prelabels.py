@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..camera.calibration import read_kitti_calibration
 from ..errors import OptionError
@@ -20,6 +19,7 @@ from ..system.atomic import part_of, write_atomic
 from ..types.choices import VEHICLES
 from ..types.geometry import wrapped
 from ..types.perception import Box
+from ..types.points import Floats
 from .run_file import RunFile, ScanFiles, stem_of, warn_of
 
 __all__ = ["KINDS", "PrelabelSink", "cvat_cuboid"]
@@ -213,7 +213,7 @@ def cvat_cuboid(box: Box) -> dict[str, list[float]]:
     }
 
 
-def _kitti_line(box: Box, T_cam_sensor: NDArray[np.float64], P2: NDArray[np.float64]) -> str:
+def _kitti_line(box: Box, T_cam_sensor: Floats, P2: Floats) -> str:
     R, t = T_cam_sensor[:3, :3], T_cam_sensor[:3, 3]
     length, width, height = box.size
     center = R @ np.array(box.center) + t

@@ -16,6 +16,7 @@ from ..system.extras import require
 from ..system.printable import printable
 from ..types.mounting import MODEL_HEIGHT_M
 from ..types.perception import Box, TopView
+from ..types.points import Floats
 from ..view.content import box_text, drivable_strips, track_text
 from .run_file import Pipe, RunFile
 from .scene import Trails, base_pose, byte_colors, checked_target, colored_points, nanoseconds
@@ -163,7 +164,7 @@ class RerunSink:
             show_labels=show,
         )
 
-    def _drivable(self, view: TopView, R: NDArray[np.float64], t: NDArray[np.float64]) -> Any:
+    def _drivable(self, view: TopView, R: Floats, t: Floats) -> Any:
         """Two triangles for each run of drivable cells along a row."""
         row, first, last = drivable_strips(view).T
         far, left = view.x_range_m[1] - view.cell_m * row, view.y_range_m[1] - view.cell_m * first

@@ -12,14 +12,13 @@ from collections import deque
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..errors import PointsError
 from ..records import PerceivedScan
 from ..system.clock import nanoseconds_of
 from ..tracking.tracks import Tracks
 from ..types.frame import ModelFrame
-from ..types.points import as_points
+from ..types.points import Bytes, Floats, Floats32, as_points
 from ..view.colors import color_of, rgb
 from ..view.content import check_points, in_model_frame, paint_points
 
@@ -36,14 +35,12 @@ def checked_target(path: str | os.PathLike[str]) -> Path:
     return target
 
 
-def byte_colors(names: list[str]) -> NDArray[np.uint8]:
+def byte_colors(names: list[str]) -> Bytes:
     """Colors of classes, (n, 3) uint8 red, green, blue."""
     return np.asarray((rgb([color_of(name) for name in names]) * 255.0).round().astype(np.uint8))
 
 
-def colored_points(
-    scan: PerceivedScan,
-) -> tuple[NDArray[np.float32], NDArray[np.uint8], tuple[str, ...], NDArray[np.uint8]]:
+def colored_points(scan: PerceivedScan) -> tuple[Floats32, Bytes, tuple[str, ...], Bytes]:
     """All points of a scan in its order, their labels (0 without a network of points), the classes, and their colors:
     of a background point on the road, that of its cell of the top view. Raises PointsError.
     """
@@ -56,7 +53,7 @@ def colored_points(
     return points, labels, classes, byte_colors(names)[painted]
 
 
-def base_pose(scan: PerceivedScan) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def base_pose(scan: PerceivedScan) -> tuple[Floats, Floats]:
     """Rotation (3, 3) and translation (3,) [m] of `LIDAR` in `BASE`."""
     frame = ModelFrame(scan.perception.mounting)
     return frame.R, frame.t
@@ -68,7 +65,7 @@ class Trails:
     def __init__(self) -> None:
         self._ways: dict[int, deque[tuple[float, float, float]]] = {}
 
-    def update(self, tracks: Tracks) -> dict[int, NDArray[np.float64]]:
+    def update(self, tracks: Tracks) -> dict[int, Floats]:
         """Add a scan's tracks; return the trail of each, (k, 3) float64 [m], oldest first. Others are forgotten."""
         ways = {}
         for track in tracks:

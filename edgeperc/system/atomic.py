@@ -15,13 +15,8 @@ def open_atomic(path: str | Path, mode: str = "wb", permissions: int = 0o666) ->
     """Open a temporary file in the target's folder; it replaces the target when the block ends without an error.
 
     A link is followed. A target that is not a regular file, such as ``/dev/stdout`` or a named pipe, is written
-    directly. What was written is on the disk before it has its name.
-
-    path : the target.
-    mode : ``"w"`` writes text as UTF-8.
-    permissions : of a new file, reduced by the process's umask.
-    Yields file: The temporary file, open for writing.
-    Raises OSError.
+    directly. What was written is on the disk before it has its name. ``permissions`` of a new file are reduced by the
+    umask.
     """
     path = Path(os.path.realpath(path))
     if path.exists() and not path.is_file():
@@ -56,10 +51,7 @@ def beside(path: Path) -> Path:
 
 
 def name_whole(temporary: Path, path: Path) -> None:
-    """Give a file or folder that was written `beside` its name, once it is on the disk.
-
-    Raises OSError.
-    """
+    """Give a file or folder that was written `beside` its name, once it is on the disk."""
     for file in (temporary, *temporary.rglob("*")):
         if file.is_file():
             with file.open("rb+") as written:
@@ -68,10 +60,7 @@ def name_whole(temporary: Path, path: Path) -> None:
 
 
 def name_part(temporary: Path, path: Path) -> Path:
-    """Give what was written `beside` and is not whole the name ``NAME.part``; return it. An older folder stays.
-
-    Raises OSError.
-    """
+    """Give what was written `beside` and is not whole the name ``NAME.part``; return it. An older folder stays."""
     part, n = part_of(path), 1
     while part.is_dir():
         n += 1

@@ -18,10 +18,7 @@ Step = Literal["next", "late", "jump", "return"]
 
 
 class Stamp(float):
-    """A time [s] that knows the whole nanoseconds it was recorded with; a float holds times of today to 0.2 us.
-
-    ns : int
-    """
+    """A time [s] that knows the whole nanoseconds it was recorded with; a float holds times of today to 0.2 us."""
 
     ns: int
 
@@ -71,17 +68,12 @@ class Clock:
     session, the jump was the wrong stamp of a single scan, and the step is a ``"return"``. After `MOST_LATE` late scans
     in a row, one that is earlier than the last tracked scan is a jump, so a clock that steps back by less than `LATE_S`
     stops tracking for a few scans only.
-
-    last_s : time of the last scan of the session [s]; None before the first.
-    former_s : the same of the session before the last jump, until the next scan confirms the jump.
-    n_late : number of late scans since the last scan of the session.
-    gap_s : longest step forward within a session [s].
     """
 
-    last_s: float | None = None
-    former_s: float | None = None
-    n_late: int = 0
-    gap_s: float = GAP_S
+    last_s: float | None = None  # time of the last scan of the session [s]; None before the first
+    former_s: float | None = None  # the same of the session before the last jump, until the next scan confirms the jump
+    n_late: int = 0  # number of late scans since the last scan of the session
+    gap_s: float = GAP_S  # longest step forward within a session [s]
 
     def after(self, stamp_s: float) -> tuple[Step, Clock]:
         """What a scan at a finite time is, and the clock after it."""

@@ -78,10 +78,8 @@ PRIOR = 10  # kernels that the estimate counts for, in addition to those that ar
 
 
 class Compilation:
-    """Say that kernels are compiled, for use in a ``with`` statement around what compiles them.
-
-    kernels : returns the kernels that are needed; called when one is missing.
-    n_processes : that compile at the same time.
+    """Say that kernels are compiled, by so many processes, for use in a ``with`` statement around what compiles them;
+    ``kernels`` is asked for those that are needed when one is missing.
     """
 
     def __init__(self, kernels: Callable[[], Iterable[Any]], n_processes: int = 1) -> None:

@@ -11,14 +11,10 @@ from ..errors import MissingExtraError
 
 
 def require(module: str, extra: str, purpose: str, *, package: str | None = None) -> Any:
-    """Import a module of an optional package.
+    """Import a module of an optional package; the error names the extra that installs it, and what needs it.
 
-    module : dotted name, e.g. ``"matplotlib"``.
-    extra : the extra of edgeperc that installs the package.
-    purpose : what needs the package; the beginning of the error message.
+    purpose : the beginning of the error message.
     package : name on PyPI if it is not the module's top-level name.
-    Returns module.
-    Raises MissingExtraError.
     """
     try:
         return import_module(module)

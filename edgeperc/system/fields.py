@@ -18,20 +18,14 @@ _NAMES = {str: "text", float: "number", int: "whole number", bool: "truth value"
 
 @dataclass(frozen=True)
 class Fields:
-    """How documents of one kind are read: as dataclasses, whose annotations are the types of the entries.
+    """How documents of one kind are read: as dataclasses, whose annotations are the types of the entries."""
 
-    what : the document, for messages.
-    error : type of the errors.
-    advice : what to do with a document that cannot be read as a whole.
-    optional : entries that may be missing, if the dataclass has a default; ``"*"`` stands for all that have one.
-    exact : unknown entries are errors; otherwise they are ignored.
-    """
-
-    what: str
-    error: type[Exception]
-    advice: str = "write it again"
+    what: str  # the document, for messages
+    error: type[Exception]  # type of the errors
+    advice: str = "write it again"  # what to do with a document that cannot be read as a whole
+    # entries that may be missing, if the dataclass has a default; ``"*"`` stands for all that have one
     optional: Collection[str] = ()
-    exact: bool = False
+    exact: bool = False  # unknown entries are errors; otherwise they are ignored
 
     def document(self, text: str, schema: int) -> dict[str, Any]:
         """Parse an object whose entry ``schema`` is the one that this version reads."""

@@ -20,10 +20,8 @@ _with_threads: weakref.WeakSet[object] = weakref.WeakSet()
 
 
 class _Calls:
-    """Calls into a library of C++ that run now.
-
-    A daemon thread that returns from one while the interpreter ends is unwound through its frames, which ends the
-    process with SIGABRT.
+    """Calls into a library of C++ that run now. A daemon thread that returns from one while the interpreter ends is
+    unwound through its frames, which ends the process with SIGABRT.
     """
 
     def __init__(self) -> None:

@@ -46,11 +46,8 @@ reported: set[str] = set()
 
 
 def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
-    """`numba.njit`, whose cache is a `KernelCache`.
-
-    **options : as `numba.njit`. With ``cache=True`` the compiled function is kept on disk, unless it is defined
-        inside another function and uses its variables.
-    Returns: The decorator.
+    """`numba.njit`, whose cache is a `KernelCache`: with ``cache=True`` the compiled function is kept on disk, unless
+    it is defined inside another function and uses its variables.
     """
 
     kept = options.pop("cache", False)
@@ -108,10 +105,8 @@ class KernelCache:
     """The compiled forms of one kernel on disk, in place of `numba.core.caching.FunctionCache`.
 
     One file holds the machine code for one signature, processor, version of Python and setting of numba. It begins with
-    a SHA-256 of the rest and a stamp of what the machine code depends on (`system.kernel_stamp`). With another stamp
-    it is compiled again and replaced.
-
-    kernel : what `numba.njit` returns.
+    a SHA-256 of the rest and a stamp of what the machine code depends on (`system.kernel_stamp`). With another stamp it
+    is compiled again and replaced.
     """
 
     def __init__(self, kernel: Any) -> None:
@@ -165,12 +160,7 @@ class KernelCache:
         """Nothing: files of another stamp are replaced when they are met."""
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
-        """Load a compiled form.
-
-        sig : tuple of types, Signature or str
-        target_context : numba's description of the processor.
-        Returns: None if there is none that can be used.
-        """
+        """Load a compiled form; None if there is none that can be used."""
         result = self._load(sig, target_context)
         if result is None:
             tell_watchers()

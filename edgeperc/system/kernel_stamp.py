@@ -48,13 +48,8 @@ def code_of(kernel: Any) -> bytes:
 
 
 def stamp_of(kernel: Any, passes: Any = None, *, anew: bool = False) -> bytes:
-    """Digest of all that the machine code of a kernel depends on, except types, processor and `settings`.
-
-    kernel : Dispatcher or function; what `numba.njit` returns.
-    passes : function; what chooses numba's passes.
-    anew : look at the values as they are now, not as they were when this was first asked of a kernel.
-    Returns: 32 bytes, the same in every process.
-    Raises TypeError.
+    """Digest of all that the machine code of a kernel depends on, except types, processor and `settings`: 32 bytes, the
+    same in every process. ``anew`` looks at the values as they are now, not when this was first asked.
     """
     return _digest(kernel, [versions(), "" if passes is None else repr(_fields(passes.__code__))], anew)
 

@@ -69,11 +69,7 @@ def is_ahead() -> bool:
 
 
 class Kernel:
-    """A kernel in a library, with what the package uses of numba's dispatchers.
-
-    library : its functions by name, and what they were compiled from.
-    options : of `njit`.
-    """
+    """A kernel in a library, with what the package uses of numba's dispatchers."""
 
     __name__: str
     __qualname__: str
@@ -115,11 +111,7 @@ class Kernel:
 
 
 class Library:
-    """A library of compiled kernels and its index.
-
-    module : the extension module.
-    index : by kernel, the digest of its code, and the name of the function for each list of types.
-    """
+    """A library of compiled kernels and its index: digest of each one's code, and its functions by types."""
 
     def __init__(self, module: Any, index: Mapping[str, Any]) -> None:
         self._module, self._index = module, index

@@ -34,10 +34,8 @@ class Stopwatch:
 
 
 class Once(Generic[_Value]):
-    """A value that is computed when it is first asked for; another thread that asks waits for it, or gets its error.
-
-    *arguments, **options : its arguments. Of one that is a `Once`, the function gets the value.
-    stage : its time counts for this stage of the stopwatch.
+    """A value that is computed when it is first asked for; another thread that asks waits for it, or gets its error. Of
+    an argument that is a `Once`, the function gets the value; the time counts for a stage of the stopwatch.
     """
 
     __slots__ = ("_arguments", "_error", "_function", "_is_known", "_lock", "_options", "_stage", "_value", "_watch")

@@ -29,10 +29,7 @@ MAX_THREADS = 4096
 
 
 def cache_folder() -> Path:
-    """``$EDGEPERC_CACHE_DIR``, or ``edgeperc`` in the system's cache folder; not created by this call.
-
-    Raises SettingsError.
-    """
+    """``$EDGEPERC_CACHE_DIR``, or ``edgeperc`` in the system's cache folder; not created by this call."""
     given = os.environ.get("EDGEPERC_CACHE_DIR")
     if given:
         return Path(given)
@@ -48,10 +45,8 @@ def cache_folder() -> Path:
 
 
 def unsafe_because(status: os.stat_result) -> str | None:
-    """Why compiled code in a file or folder may come from another user; None if only this user or root can write it.
-
-    status : os.stat_result; of the file or folder.
-    Returns: The reason. Always None on Windows, where the user's folders have access lists.
+    """Why compiled code in a file or folder may come from another user; None if only this user or root can write it,
+    and on Windows, where the user's folders have access lists.
     """
     if not hasattr(os, "geteuid"):
         return None
@@ -63,12 +58,10 @@ def unsafe_because(status: os.stat_result) -> str | None:
 
 
 def compiled_folder(engine: str, sha256: str, precision: str) -> Path | None:
-    """Create the folder for the compiled form of a model, separate for each engine, file and precision.
+    """Create the folder for the compiled form of a model, separate for each engine, its version, file and precision.
 
-    engine : name and versions; another version does not find the folder.
-    sha256 : of the model file.
-    Returns: None if there is no folder that this user can write and other users cannot. The engine then compiles at
-        every start, and a warning in the log says so.
+    None if there is no folder that this user can write and other users cannot. The engine then compiles at every start,
+    and a warning in the log says so.
     """
     name = hashlib.sha256(f"{engine} {fingerprint()} {precision}".encode()).hexdigest()[:16]
     try:
@@ -160,10 +153,8 @@ def write_settings(path: Path, machine: str, entries: Mapping[str, Mapping[str, 
     """Add settings to a file. They replace older ones of the same computer and model; others stay.
 
     path : JSON: ``{"schema": 2, "machines": {fingerprint: {digest: entry}}}``; created if it does not exist.
-    machine : `fingerprint` of the computer that they were measured on.
     entries : a network's digest (`edgeperc.zoo.digest`) to ``provider``, ``precision`` and ``n_threads``, as
         `edgeperc.Perceiver` takes them, and any further keys.
-    Raises SettingsError, OSError.
     """
     document = _read(path) or {"schema": SCHEMA, "machines": {}}
     document["machines"].setdefault(machine, {}).update({sha: dict(entry) for sha, entry in entries.items()})
@@ -179,7 +170,6 @@ def read_setting(path: Path, machine: str, digest: str) -> dict[str, Any] | None
     """Read the setting for a computer (`fingerprint`) and a network (`edgeperc.zoo.digest`).
 
     Returns: ``provider``, ``precision``, ``n_threads`` and further keys; None if nothing was measured.
-    Raises SettingsError.
     """
     document = _read(path)
     entry = None if document is None else document["machines"].get(machine, {}).get(digest)

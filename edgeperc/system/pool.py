@@ -36,14 +36,10 @@ LAST_S = 5.0  # for a process to end by itself
 
 @dataclass(frozen=True)
 class Lost:
-    """In place of a result.
+    """In place of a result."""
 
-    reason : the traceback of an exception, or that the worker process died.
-    error : the exception, if it is one of edgeperc's.
-    """
-
-    reason: str
-    error: EdgepercError | None = None
+    reason: str  # the traceback of an exception, or that the worker process died
+    error: EdgepercError | None = None  # the exception, if it is one of edgeperc's
 
 
 def taken(answer: Any, what: str) -> Any:
@@ -71,17 +67,14 @@ def map_in_processes(
     workers: int | None = None,
     n_threads: int = 1,
 ) -> Iterator[Any]:
-    """Map items to results in processes of this computer, which share nothing.
+    """Map items to results, in their order, in processes of this computer, which share nothing.
 
-    Processes are spawned: a fork of a process that runs onnxruntime may hang. They end when this one does.
+    Processes are spawned: a fork of a process that runs onnxruntime may hang. They end when this one does. `Lost`
+    stands for a result if the function raised an exception, or if its process died twice; other items of a process that
+    dies are done in the next one.
 
     make : called with ``arguments`` once in each process; returns a function from an item to its result.
-    items : anything that can be pickled, as ``make``, ``arguments`` and the results.
     workers : number of processes; None: the number of usable cores divided by ``n_threads``.
-    n_threads : that each process uses.
-    Yields result (object or Lost): In the order of the items. `Lost` if the function raised an exception, or if its
-        process died twice; other items of a process that dies are done in the next one.
-    Raises EdgepercError: ``make`` failed, or processes die at their start.
     """
     start = pickle.dumps((make, arguments))
     n = min(workers or max(1, usable_cores() // n_threads), len(items))

@@ -9,16 +9,8 @@ def printable(text: object) -> str:
     These are control characters and escape sequences of terminals, line breaks, marks that reorder text (a file name
     can look like another one), zero-width characters, and bytes of a file name that are not UTF-8 (``\udcXX``).
 
-    Parameters
-    ----------
-    text : object
-        Converted with `str`.
-
-    Returns
-    -------
-    str
-        One line, for which `str.isprintable` is true. JSON text stays the same JSON: where it may hold such a character
-        (DEL, in a string), ``\uXXXX`` is the character's escape.
+    Returns one line, for which `str.isprintable` is true. JSON text stays the same JSON: where it may hold such a
+    character (DEL, in a string), ``\uXXXX`` is the character's escape.
     """
     shown = str(text)
     if shown.isprintable():

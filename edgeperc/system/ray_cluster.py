@@ -31,18 +31,11 @@ def map_on_ray(
     workers: int | None = None,
     n_threads: int = 1,
 ) -> Iterator[Any]:
-    """Map items to results on the cluster named by the environment variable ``RAY_ADDRESS``, else on a local one.
+    """Map items to results as `pool.map_in_processes`, on the cluster named by the environment variable
+    ``RAY_ADDRESS``, else on a local one.
 
     Items wait until a worker is free, and workers wait until the results are taken, so memory use does not grow with
-    the number of items. Ray's dashboard and usage statistics are off.
-
-    make : called with ``arguments`` once in each worker process; returns a function from an item to its result.
-    items : anything that can be pickled, as the results.
-    workers : number of worker processes. None: the cluster's number of CPUs divided by ``n_threads``.
-    n_threads : CPUs that Ray reserves for each worker.
-    Yields result (object or Lost): In the order of the items. `Lost` if the function raised an exception, or if its
-        process died twice.
-    Raises MissingExtraError.
+    the number of items. Ray's dashboard and usage statistics are off. ``n_threads`` CPUs are reserved for each worker.
     """
     if not items:
         return

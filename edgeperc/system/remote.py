@@ -26,20 +26,11 @@ def location(text: str) -> Path | Remote:
 
 @dataclass(frozen=True)
 class Remote:
-    """A file or folder at a URL; names and ``/`` work as for a `pathlib.Path`.
-
-    Parameters
-    ----------
-    url : str
-        As fsspec has it. Its package for the protocol must be installed, e.g. s3fs for ``s3://``.
-
-    Notes
-    -----
-    Every method may raise `OSError`, with the URL in the message; `MissingExtraError` without fsspec; `OptionError`
-    for a protocol that is unknown or whose package is not installed.
+    """A file or folder at a URL; names and ``/`` work as for a `pathlib.Path`. Every method may raise `OSError`, with
+    the URL in the message, `MissingExtraError` without fsspec, and `OptionError` for an unknown protocol.
     """
 
-    url: str
+    url: str  # as fsspec has it. Its package for the protocol must be installed, e.g. s3fs for ``s3://``.
 
     def __str__(self) -> str:
         return self.url
@@ -109,10 +100,7 @@ class Remote:
                 system.pipe_file(path, content)
 
     def fetch(self, folder: Path) -> Path:
-        """Copy the file into a local folder.
-
-        Raises PointsError.
-        """
+        """Copy the file into a local folder."""
         stamp = self.stamp()
         if stamp is None:
             raise PointsError(f"{self}: there is no such file; expected a scan or a capture")

@@ -9,9 +9,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..system.kernels import njit
+from ..types.points import Floats
 from .ukf import fill_inverse
 
 MAX_ROUNDS = 12
@@ -20,28 +20,18 @@ MAX_PROPOSALS = 256
 
 @njit(cache=True, nogil=True)
 def fit_motion(
-    landmarks: NDArray[np.float64],
-    detections: NDArray[np.float64],
-    prior: NDArray[np.float64],
-    prior_variances: NDArray[np.float64],
-    motion: NDArray[np.float64],
-    covariance: NDArray[np.float64],
+    landmarks: Floats, detections: Floats, prior: Floats, prior_variances: Floats, motion: Floats, covariance: Floats
 ) -> int:
-    """Fit the rigid motion that moves detections to the predicted positions of tracks.
+    """Fit the rigid motion that moves detections to the predicted positions of tracks; returns how many were matched.
 
     Each pair of track and detection proposes a shift and a turn that move the detection to the track. Proposals within
     three standard deviations of the prior are tried, at most 256. A Gauss-Newton iteration starts from the proposal
-    with the largest `support`. It matches each track to its nearest detection, with Geman and McClure's weight
-    1 / (1 + r2 / 9)^2, where r is the distance in standard deviations.
+    with the largest `support`. It matches each track to its nearest detection, with Geman and McClure's weight 1 / (1 +
+    r2 / 9)^2, where r is the distance in standard deviations.
 
-    landmarks : (n, 4) float64; predicted x, y [m] of tracks in the previous sensor frame, the variance of each
+    landmarks, detections : (n, 4) x, y [m] in the previous and the current sensor frame, the variance of each
         coordinate [m2], and the group of classes that may be confused.
-    detections : (m, 4) float64; the same columns, in the current sensor frame.
-    prior : (3,) float64; expected motion: x, y [m] and turn [rad] of the sensor in its previous frame.
-    prior_variances : (3,) float64; [m2, m2, rad2]
-    motion : (3,) float64, overwritten; the fitted motion; the prior if no detection fits a track.
-    covariance : (3, 3) float64, overwritten; covariance of ``motion``.
-    Returns n_pairs: Tracks that were matched to a detection.
+    prior, motion : x, y [m] and turn [rad] of the sensor in its previous frame; the prior if no detection fits a track.
     """
     # Element by element: to copy an array, numba compiles a broadcast with its error messages, for 3 s.
     for a in range(3):
@@ -121,17 +111,11 @@ def fit_motion(
 
 
 @njit(cache=True, nogil=True)
-def support(
-    landmarks: NDArray[np.float64],
-    detections: NDArray[np.float64],
-    prior: NDArray[np.float64],
-    prior_variances: NDArray[np.float64],
-    motion: NDArray[np.float64],
-) -> float:
+def support(landmarks: Floats, detections: Floats, prior: Floats, prior_variances: Floats, motion: Floats) -> float:
     """Score a motion: minus its distance from the prior, minus the robust distances of all tracks; at most 0.
 
     The robust distance is Geman and McClure's r2 / (1 + r2 / 9) / 2. It is below 4.5, the cost of a track without a
-    detection. Parameters as in `fit_motion`; ``motion`` is not changed.
+    detection.
     """
     total = 0.0
     for a in range(3):
@@ -143,9 +127,7 @@ def support(
 
 
 @njit(cache=True, nogil=True)
-def nearest_detection(
-    landmark: NDArray[np.float64], detections: NDArray[np.float64], motion: NDArray[np.float64]
-) -> tuple[int, float]:
+def nearest_detection(landmark: Floats, detections: Floats, motion: Floats) -> tuple[int, float]:
     """Find the detection nearest to a landmark (4,) under a motion (3,).
 
     Returns its index, -1 if there is none of the same group, and the squared distance in variances.

@@ -2,32 +2,26 @@
 
 from __future__ import annotations
 
-import numpy as np
-from numpy.typing import NDArray
-
 from ..system.kernels import njit
+from ..types.points import Floats
 
 
 @njit(cache=True, nogil=True)
 def fill_interaction(
-    states: NDArray[np.float64],
-    covariances: NDArray[np.float64],
-    probabilities: NDArray[np.float64],
-    stay: NDArray[np.float64],
-    mixed: NDArray[np.float64],
-    mixed_covariances: NDArray[np.float64],
-    prior: NDArray[np.float64],
+    states: Floats,
+    covariances: Floats,
+    probabilities: Floats,
+    stay: Floats,
+    mixed: Floats,
+    mixed_covariances: Floats,
+    prior: Floats,
 ) -> None:
-    """Mix the estimates of the motion models by a Markov chain (KUL-Seg's "interaction").
+    """Mix the estimates of n tracks by k motion models by a Markov chain (KUL-Seg's "interaction"); a track keeps its
+    model with probability ``stay``, and the others share the rest.
 
-    states : (n, k, s) float64; state for each of k motion models.
-    covariances : (n, k, s, s) float64
-    probabilities : (n, k) float64; probability of each motion model after the last update.
-    stay : (n,) float64; probability that a track keeps its motion model; the others share the rest.
-    mixed : (n, k, s) float64, overwritten; initial state of each filter: x0_j = sum_i w_ij x_i with w_ij = p_ij mu_i
-        / prior_j.
-    mixed_covariances : (n, k, s, s) float64, overwritten; sum_i w_ij (P_i + (x_i - x0_j)(x_i - x0_j)')
-    prior : (n, k) float64, overwritten; prior_j = sum_i p_ij mu_i
+    mixed : initial state of each filter: x0_j = sum_i w_ij x_i with w_ij = p_ij mu_i / prior_j.
+    mixed_covariances : sum_i w_ij (P_i + (x_i - x0_j)(x_i - x0_j)')
+    prior : prior_j = sum_i p_ij mu_i
     """
     n, k, s = states.shape
     for t in range(n):
@@ -52,23 +46,15 @@ def fill_interaction(
 
 @njit(cache=True, nogil=True)
 def fill_mode_probabilities(
-    prior: NDArray[np.float64],
-    likelihoods: NDArray[np.float64],
-    beta: NDArray[np.float64],
-    shares: NDArray[np.float64],
-    probabilities: NDArray[np.float64],
+    prior: Floats, likelihoods: Floats, beta: Floats, shares: Floats, probabilities: Floats
 ) -> None:
     """Update the probability of each motion model by the association (KUL-Seg's "mode probability update").
 
     Bayes' rule for motion model j and detection d: P(j, d) = beta_d prior_j L_jd / sum_i prior_i L_id. The sum over d
     is the probability of model j. P(j, d) divided by that sum is the association that the filter of model j uses.
 
-    prior : (n, k) float64; from `fill_interaction`.
-    likelihoods : (n, k, m) float64; likelihood of each detection under each motion model; 0 outside the gate.
-    beta : (n, m + 1) float64; column 0: probability that the track was not detected. Others: that the detection
-        belongs to it.
-    shares : (n, k, m + 1) float64, overwritten; association for each motion model; sums to 1 over the last axis.
-    probabilities : (n, k) float64, overwritten; probability of each motion model after the update.
+    likelihoods : (n, k, m) of each detection under each motion model; 0 outside the gate.
+    shares : (n, k, m + 1) association for each motion model; sums to 1 over the last axis.
     """
     n, k, m = likelihoods.shape
     for t in range(n):
@@ -105,19 +91,10 @@ def fill_mode_probabilities(
 
 @njit(cache=True, nogil=True)
 def fill_combined(
-    states: NDArray[np.float64],
-    covariances: NDArray[np.float64],
-    probabilities: NDArray[np.float64],
-    state: NDArray[np.float64],
-    covariance: NDArray[np.float64],
+    states: Floats, covariances: Floats, probabilities: Floats, state: Floats, covariance: Floats
 ) -> None:
-    """Combine the estimates of the motion models into one for each track (KUL-Seg's "combination").
-
-    states : (n, k, s) float64
-    covariances : (n, k, s, s) float64
-    probabilities : (n, k) float64
-    state : (n, s) float64, overwritten; x = sum_j mu_j x_j
-    covariance : (n, s, s) float64, overwritten; sum_j mu_j (P_j + (x_j - x)(x_j - x)')
+    """Combine the estimates of the motion models into one for each track (KUL-Seg's "combination"): x = sum_j mu_j x_j,
+    and sum_j mu_j (P_j + (x_j - x)(x_j - x)').
     """
     n, k, s = states.shape
     state[:] = 0.0

@@ -12,9 +12,9 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..system.kernels import njit
+from ..types.points import Floats, Ints64
 
 MAX_EVENTS = 4096
 MAX_ROUNDS = 200
@@ -25,46 +25,39 @@ LARGEST_WEIGHT = 1e15  # keeps the products of a cluster finite
 class Predictions(NamedTuple):
     """Tracks as they are expected at the time of a scan."""
 
-    means: NDArray[np.float64]  # (n, 3, 5); x, y [m], v [m/s], heading [rad], turn rate [rad/s] by motion model
-    covariances: NDArray[np.float64]  # (n, 3, 5, 5)
-    prior: NDArray[np.float64]  # (n, 3), probability of each motion model
+    means: Floats  # (n, 3, 5); x, y [m], v [m/s], heading [rad], turn rate [rad/s] by motion model
+    covariances: Floats  # (n, 3, 5, 5)
+    prior: Floats  # (n, 3), probability of each motion model
 
 
 class Gates(NamedTuple):
     """Which detections may belong to each track."""
 
-    sigmas: NDArray[np.float64]  # (n, 3), along and across the heading of a detection [m] and of its heading [rad]
-    odds: NDArray[np.float64]  # (n,), P_D / ((1 - P_D) lambda) [m2 rad]: probability of detection, density of clutter
-    groups: NDArray[np.int64]  # (n,), classes that may be confused; detections of other groups are never associated
-    limits: NDArray[np.float64]  # (n,), largest Mahalanobis distance of a position from the nearest motion model
+    sigmas: Floats  # (n, 3), along and across the heading of a detection [m] and of its heading [rad]
+    odds: Floats  # (n,), P_D / ((1 - P_D) lambda) [m2 rad]: probability of detection, density of clutter
+    groups: Ints64  # (n,), classes that may be confused; detections of other groups are never associated
+    limits: Floats  # (n,), largest Mahalanobis distance of a position from the nearest motion model
 
 
 class Detections(NamedTuple):
     """The boxes of one scan."""
 
-    places: NDArray[np.float64]  # (m, 3); x, y [m], heading [rad] in the frame of the tracks
-    shapes: NDArray[np.float64]  # (m, 4); height of the center, length, width, height [m]
-    logits: NDArray[np.float64]  # (m,), log odds of the scores
-    fronts: NDArray[np.float64]  # (m,), log odds that the heading points to the front; 0 if that is unknown
-    kinds: NDArray[np.int64]  # (m,), class
-    groups: NDArray[np.int64]  # (m,), group of classes
-    ranges: NDArray[np.float64]  # (m,), distance from the sensor [m]
-    sources: NDArray[np.int64]  # (m,), index in the scan
+    places: Floats  # (m, 3); x, y [m], heading [rad] in the frame of the tracks
+    shapes: Floats  # (m, 4); height of the center, length, width, height [m]
+    logits: Floats  # (m,), log odds of the scores
+    fronts: Floats  # (m,), log odds that the heading points to the front; 0 if that is unknown
+    kinds: Ints64  # (m,), class
+    groups: Ints64  # (m,), group of classes
+    ranges: Floats  # (m,), distance from the sensor [m]
+    sources: Ints64  # (m,), index in the scan
 
 
 @njit(cache=True, nogil=True)
 def fill_likelihoods(
-    tracks: Predictions,
-    gates: Gates,
-    detections: Detections,
-    likelihoods: NDArray[np.float64],
-    weights: NDArray[np.float64],
+    tracks: Predictions, gates: Gates, detections: Detections, likelihoods: Floats, weights: Floats
 ) -> None:
-    """Compute the likelihood of each detection under each motion model of each track, and the association weights.
-
-    likelihoods : (n, 3, m) float64, overwritten; [1/(m2 rad)]; 0 for all motion models if the detection is outside the
-        gate.
-    weights : (n, m) float64, overwritten; odds_t sum_k prior_tk L_tkj, the input of `fill_association`.
+    """Compute the likelihood of each detection under each motion model of each track (n, 3, m) [1/(m2 rad)], 0 outside
+    the gate, and the association weights odds_t sum_k prior_tk L_tkj.
 
     Headings are compared modulo pi, because a box looks the same from behind. Detectors are sometimes wrong by 90
     degrees, so deviations are limited to three standard deviations.
@@ -129,18 +122,17 @@ def fill_likelihoods(
 
 
 @njit(cache=True, nogil=True)
-def fill_association(weights: NDArray[np.float64], max_events: int, beta: NDArray[np.float64]) -> int:
-    """Compute the marginal association probabilities.
+def fill_association(weights: Floats, max_events: int, beta: Floats) -> int:
+    """Compute the marginal association probabilities; returns how many tracks were solved by belief propagation.
 
     A joint event assigns at most one detection to each track and at most one track to each detection. Its probability
     is proportional to the product of the weights of its pairs.
 
-    weights : (n, m) float64; likelihood ratio of "the detection belongs to the track" to "the track was missed and
-        the detection is clutter"; 0 outside the gate.
+    weights : (n, m) likelihood ratio of "the detection belongs to the track" to "the track was missed and the detection
+        is clutter"; 0 outside the gate.
     max_events : clusters with a higher bound on the number of joint events are solved by belief propagation.
-    beta : (n, m + 1) float64, overwritten; column 0: probability that the track was not detected. Others: that the
-        detection belongs to it. Rows sum to 1.
-    Returns n_approximated: Tracks solved by belief propagation.
+    beta : (n, m + 1) column 0: probability that the track was not detected. Others: that the detection belongs to it.
+        Rows sum to 1.
     """
     n, m = weights.shape
     beta[:] = 0.0
@@ -183,15 +175,8 @@ def fill_association(weights: NDArray[np.float64], max_events: int, beta: NDArra
 
 
 @njit(cache=True, nogil=True)
-def fill_by_events(
-    weights: NDArray[np.float64], rows: NDArray[np.int64], columns: NDArray[np.int64], beta: NDArray[np.float64]
-) -> None:
-    """Solve one cluster exactly: enumerate its joint events, depth first.
-
-    weights : (n, m) float64
-    rows, columns : (r,), (c,) int64; tracks and detections of the cluster.
-    beta : (n, m + 1) float64; the rows of the cluster are overwritten.
-    """
+def fill_by_events(weights: Floats, rows: Ints64, columns: Ints64, beta: Floats) -> None:
+    """Solve one cluster of tracks (rows) and detections (columns) exactly: enumerate its joint events, depth first."""
     n = len(rows)
     choice = np.full(n, -2, np.int64)  # -2: not begun; -1: missed; else an index into columns
     used = np.zeros(len(columns), np.bool_)
@@ -228,16 +213,12 @@ def fill_by_events(
 
 
 @njit(cache=True, nogil=True)
-def fill_by_propagation(
-    weights: NDArray[np.float64], rows: NDArray[np.int64], columns: NDArray[np.int64], beta: NDArray[np.float64]
-) -> None:
+def fill_by_propagation(weights: Floats, rows: Ints64, columns: Ints64, beta: Floats) -> None:
     """Approximate the marginals of one cluster by messages between tracks and detections.
 
     Messages: mu_ij = w_ij / (1 + sum_j' w_ij' nu_j'i) over the other detections j', and nu_ji = 1 / (1 + sum_i' mu_i'j)
     over the other tracks i'. Rounds end when no nu changes by more than 1e-6, or after 200. beta_ij is proportional to
     w_ij nu_ji.
-
-    weights, rows, columns, beta : as in `fill_by_events`.
     """
     # Only gated pairs, which are few in a large cluster.
     n_pairs = 0

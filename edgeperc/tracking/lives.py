@@ -5,10 +5,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..system.kernels import njit
-from ..types.points import Mask
+from ..types.points import Floats, Ints64, Mask, Records
 from .jpda import Detections
 
 # Complete state of a track. The tracker replaces it as a whole, so a scan that raises an error changes nothing.
@@ -84,13 +83,8 @@ MOST_HIDDEN = 0.9
 
 
 @njit(cache=True, nogil=True)
-def fill_newborn(first_id: int, detections: Detections, classes: NDArray[np.void], tracks: NDArray[np.void]) -> None:
-    """Begin a track at each detection, with speed 0.
-
-    first_id : id of the first new track.
-    classes : (n,) record; parameters of each detection's class.
-    tracks : (n,) record, overwritten; all fields 0 beforehand.
-    """
+def fill_newborn(first_id: int, detections: Detections, classes: Records, tracks: Records) -> None:
+    """Begin a track at each detection, from ``first_id`` on, with speed 0; ``tracks`` are all 0 beforehand."""
     places, shapes, logits, fronts = detections.places, detections.shapes, detections.logits, detections.fronts
     for i in range(len(tracks)):
         track, of = tracks[i], classes[i]
@@ -123,15 +117,9 @@ def fill_newborn(first_id: int, detections: Detections, classes: NDArray[np.void
 
 
 @njit(cache=True, nogil=True)
-def mark_out_of_view(
-    tracks: NDArray[np.void], pose: NDArray[np.float64], left: float, right: float, reported: NDArray[np.bool_]
-) -> None:
-    """Exclude undetected tracks from the report if a corner of the footprint is outside the field of view.
-
-    tracks : (n,) record
-    pose : (4, 4) float64; T_world_sensor.
-    left, right : azimuths of the edges of the view [rad].
-    reported : (n,) bool; set to False for these tracks.
+def mark_out_of_view(tracks: Records, pose: Floats, left: float, right: float, reported: Mask) -> None:
+    """Exclude undetected tracks from the report if a corner of the footprint is outside the field of view, between
+    azimuths [rad] of the sensor at ``pose``.
     """
     for i in range(len(tracks)):
         if not reported[i] or tracks[i]["misses"] == 0:
@@ -149,21 +137,9 @@ def mark_out_of_view(
 
 
 @njit(cache=True, nogil=True)
-def fill_hidden(
-    state: NDArray[np.float64],
-    shape: NDArray[np.float64],
-    seen: Mask,
-    sensor: NDArray[np.float64],
-    hidden: NDArray[np.float64],
-) -> None:
-    """Compute the share of each track that other tracks hide from the sensor.
-
-    state : (n, 5) float64; x, y [m], v [m/s], heading [rad], turn rate [rad/s].
-    shape : (n, 4) float64; height of the center, length, width, height [m].
-    seen : (n,) bool; tracks detected in this scan. They can hide others, and are not hidden.
-    sensor : (2,) float64; x, y [m].
-    hidden : (n,) float64, overwritten; share of nine rays over the width of the footprint that meet a nearer track,
-        in 0..1.
+def fill_hidden(state: Floats, shape: Floats, seen: Mask, sensor: Floats, hidden: Floats) -> None:
+    """Compute the share of each track that other tracks hide from the sensor: of nine rays over the width of the
+    footprint, those that meet a nearer track. Tracks that were ``seen`` can hide others, and are not hidden.
     """
     n = len(hidden)
     azimuth, half, distance = np.empty(n), np.empty(n), np.empty(n)
@@ -188,17 +164,10 @@ def fill_hidden(
 
 
 @njit(cache=True, nogil=True)
-def mark_rivals(
-    state: NDArray[np.float64], shape: NDArray[np.float64], order: NDArray[np.int64], reported: NDArray[np.bool_]
-) -> None:
-    """Exclude a track from the report if its center lies in the footprint of a stronger track, or vice versa.
+def mark_rivals(state: Floats, shape: Floats, order: Ints64, reported: Mask) -> None:
+    """Exclude a track from the report if its center lies in the footprint of one before it in ``order``, or vice versa.
 
     Two objects cannot occupy one place. A cyclist, for example, is often detected as a pedestrian too.
-
-    state : (n, 5) float64; x, y [m], v [m/s], heading [rad], turn rate [rad/s].
-    shape : (n, 4) float64; height of the center, length, width, height [m].
-    order : (n,) int64; rows of the tracks, strongest first (`edgeperc.tracking.tracks.strength_of`).
-    reported : (n,) bool; set to False for these tracks.
     """
     # Strongest first, so the flags of all stronger tracks are final.
     for b in range(len(order)):
@@ -220,21 +189,9 @@ def mark_rivals(
 
 
 @njit(cache=True, nogil=True)
-def update_shapes(
-    beta: NDArray[np.float64],
-    shapes: NDArray[np.float64],
-    sigmas: NDArray[np.float64],
-    walk: NDArray[np.float64],
-    shape: NDArray[np.float64],
-    variance: NDArray[np.float64],
-) -> None:
-    """Smooth the height of the center and the size by Kalman filters; in place.
-
-    beta : (n, m + 1) float64; as in `edgeperc.tracking.jpda.fill_association`.
-    shapes : (m, 4) float64; height of the center, length, width, height [m].
-    sigmas : (n, 4) float64; standard deviations of ``shapes`` [m].
-    walk : (4,) float64; standard deviations of their random walks between the scans [m].
-    shape, variance : (n, 4) float64; estimates of ``shapes`` and their variances [m, m2].
+def update_shapes(beta: Floats, shapes: Floats, sigmas: Floats, walk: Floats, shape: Floats, variance: Floats) -> None:
+    """Smooth the height of the center and the size by Kalman filters, in place; ``walk`` has the standard deviations of
+    their random walks between the scans [m].
     """
     for i in range(len(shape)):
         seen = np.zeros(4)
@@ -253,25 +210,20 @@ def update_shapes(
 
 @njit(cache=True, nogil=True)
 def update_fronts(
-    state: NDArray[np.float64],
-    speed_sigma: NDArray[np.float64],
-    moving_mps: NDArray[np.float64],
-    beta: NDArray[np.float64],
-    detections: NDArray[np.float64],
-    told: NDArray[np.float64],
-    fronts: NDArray[np.float64],
+    state: Floats,
+    speed_sigma: Floats,
+    moving_mps: Floats,
+    beta: Floats,
+    detections: Floats,
+    told: Floats,
+    fronts: Floats,
 ) -> None:
     """Collect evidence that the heading of each track points to its front and not to its rear; in place.
 
-    state : (n, 5) float64; x, y, v, heading, turn rate after the update.
-    speed_sigma : (n,) float64; standard deviation of v [m/s].
-    moving_mps : (n,) float64; a track moves if its speed is higher than this, and than three standard deviations.
-    beta : (n, m + 1) float64; as in `edgeperc.tracking.jpda.fill_association`.
-    detections : (m, 3) float64; x, y [m], heading [rad].
-    told : (m,) float64; log odds that the heading of the detection points to the front; 0 if that is unknown.
-    fronts : (n, 3) float64; log odds from motion, in -4..4: objects move forward. Log odds from the detections, in
-        -8..8. Balance of the detections' headings, in -10..10, for detections that do not say whether they know the
-        front.
+    moving_mps : a track moves if its speed is higher than this, and than three standard deviations.
+    told : log odds that the heading of the detection points to the front; 0 if that is unknown.
+    fronts : (n, 3) log odds from motion, in -4..4: objects move forward. Log odds from the detections, in -8..8.
+        Balance of the detections' headings, in -10..10, for detections that do not say whether they know the front.
     """
     for i in range(len(fronts)):
         speed = abs(state[i, 2])
@@ -290,23 +242,10 @@ def update_fronts(
 
 @njit(cache=True, nogil=True)
 def update_lives(
-    tracks: NDArray[np.void],
-    classes: NDArray[np.void],
-    beta: NDArray[np.float64],
-    hidden: NDArray[np.float64],
-    logits: NDArray[np.float64],
-    kinds: NDArray[np.int64],
-    dt: float,
+    tracks: Records, classes: Records, beta: Floats, hidden: Floats, logits: Floats, kinds: Ints64, dt: float
 ) -> None:
-    """Update hits, misses and detection of each track, its label by majority, and its existence; in place.
-
-    tracks : (n,) record
-    classes : (n,) record; parameters of each track's class.
-    beta : (n, m + 1) float64; as in `edgeperc.tracking.jpda.fill_association`.
-    hidden : (n,) float64; from `fill_hidden`.
-    logits : (m,) float64; log odds of the detections' scores.
-    kinds : (m,) int64; classes of the detections.
-    dt : time since the last scan [s].
+    """Update hits, misses and detection of each track, its label by majority, and its existence; in place. ``logits``
+    and ``kinds`` are the log odds of the detections' scores, and their classes.
     """
     for i in range(len(tracks)):
         track, of = tracks[i], classes[i]

@@ -6,13 +6,13 @@ import math
 from collections.abc import Collection, Iterable
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from ..errors import OptionError, PointsError
 from ..system.kernels import njit
 from ..types.choices import VEHICLES
 from ..types.perception import Box, Perception
-from ..types.points import Mask, Points, as_points, read_only
+from ..types.points import Floats, Mask, Points, as_points, read_only
 from . import Track
 from .tracks import PARAMETERS
 
@@ -29,15 +29,10 @@ MOVABLE = frozenset(
 def moving_tracks(
     tracks: Iterable[Track], *, min_speed_mps: float | None = None, n_sigmas: float = 3.0
 ) -> tuple[Track, ...]:
-    """The tracks that move over ground, in their order.
+    """The tracks that move over ground, in their order, faster than ``min_speed_mps`` (by default
+    `ClassParameters.moving_mps`) and than ``n_sigmas`` standard deviations of their speed.
 
-    tracks : `Tracks` of one scan.
-    min_speed_mps : lowest speed over ground [m/s]. Default: `ClassParameters.moving_mps` of the class, 0.7 m/s for
-        pedestrians and 1 m/s for others.
-    n_sigmas : the speed must also exceed its standard deviation by this factor.
-    Returns: A new track has no certain speed, so it does not count as moving in its first scans. Tracks that coast
-        count.
-    Raises OptionError.
+    A new track has no certain speed, so it does not count as moving in its first scans. Tracks that coast count.
     """
     for name, value in (("min_speed_mps", min_speed_mps), ("n_sigmas", n_sigmas)):
         if value is not None and not 0.0 <= value < math.inf:
@@ -58,7 +53,7 @@ def moving_points(
     margin_m: float = 0.2,
     min_speed_mps: float | None = None,
     n_sigmas: float = 3.0,
-) -> NDArray[np.bool_]:
+) -> Mask:
     """Mark the points inside the boxes of tracks that move over ground.
 
     Parameters
@@ -89,12 +84,8 @@ def moving_points(
 
 
 def movable_points(
-    perception: Perception,
-    points: ArrayLike,
-    *,
-    classes: Collection[str] = MOVABLE,
-    margin_m: float = 0.2,
-) -> NDArray[np.bool_]:
+    perception: Perception, points: ArrayLike, *, classes: Collection[str] = MOVABLE, margin_m: float = 0.2
+) -> Mask:
     """Mark the points on things that could move, whether they move or not: by the classes of points and by boxes.
 
     Parameters
@@ -132,7 +123,7 @@ def movable_points(
     return found
 
 
-def _inside_any(boxes: list[Box], points: Points, margin_m: float) -> NDArray[np.bool_]:
+def _inside_any(boxes: list[Box], points: Points, margin_m: float) -> Mask:
     if not 0.0 <= margin_m < math.inf:
         raise OptionError(f"margin_m is {margin_m}; expected 0 or more meters")
     rows = [
@@ -145,14 +136,8 @@ def _inside_any(boxes: list[Box], points: Points, margin_m: float) -> NDArray[np
 
 
 @njit(cache=True, nogil=True)
-def mark_in_boxes(boxes: NDArray[np.float64], points: Points, inside: Mask) -> None:
-    """Mark the points inside at least one box.
-
-    boxes : (m, 8) float64, C-contiguous, read-only; x, y, z of the center, half length, half width, half height [m],
-        cosine and sine of the yaw.
-    points : (n, 3 or more) float32, C-contiguous, read-only
-    inside : (n,) bool, overwritten
-    """
+def mark_in_boxes(boxes: Floats, points: Points, inside: Mask) -> None:
+    """Mark the points inside at least one box: center, half length, width and height [m], cosine and sine of yaw."""
     for i in range(points.shape[0]):
         inside[i] = False
         x, y, z = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])

@@ -12,11 +12,12 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from ..errors import StampError, TrackingError
 from ..system.clock import GAP_S, LATEST_S, Clock, Step
 from ..types.perception import Box, Perception
+from ..types.points import Floats, Ints64, Records
 from ..types.rigid import rigid
 from .egomotion import fit_motion
 from .imm import fill_combined, fill_interaction, fill_mode_probabilities
@@ -65,11 +66,11 @@ class _Session:
     number: int = 0
     stamp_s: float = 0.0
     posed: bool | None = None  # None before the first scan
-    tracks: NDArray[np.void] = field(default_factory=lambda: np.zeros(0, TRACK))
-    T_world_sensor: NDArray[np.float64] = field(default_factory=lambda: np.eye(4))
+    tracks: Records = field(default_factory=lambda: np.zeros(0, TRACK))
+    T_world_sensor: Floats = field(default_factory=lambda: np.eye(4))
     # Without poses: the sensor's speed along x and y, turn rate, and their variances.
-    twist: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
-    twist_variances: NDArray[np.float64] = field(default_factory=lambda: FIRST_TWIST**2)
+    twist: Floats = field(default_factory=lambda: np.zeros(3))
+    twist_variances: Floats = field(default_factory=lambda: FIRST_TWIST**2)
 
 
 class Tracker:
@@ -275,7 +276,7 @@ class Tracker:
         last_s = self._clock.last_s
         warnings.warn(f"got a scan at {stamp_s} s after one at {last_s} s: {meaning} (said once)", stacklevel=3)
 
-    def kinds_of(self, names: Sequence[str]) -> NDArray[np.int64]:
+    def kinds_of(self, names: Sequence[str]) -> Ints64:
         """Row in the table of classes for each label; new classes are added."""
         for name in names:
             if name in self._labels:
@@ -300,13 +301,13 @@ class Tracker:
     def _estimated_pose(
         self,
         session: _Session,
-        tracks: NDArray[np.void],
-        state: NDArray[np.float64],
-        covariance: NDArray[np.float64],
-        given: NDArray[np.float64],
-        classes: NDArray[np.void],
+        tracks: Records,
+        state: Floats,
+        covariance: Floats,
+        given: Floats,
+        classes: Records,
         dt: float,
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    ) -> tuple[Floats, Floats, Floats]:
         """Estimate the sensor's pose (4, 4), its motion (3,) [m/s, m/s, rad/s] and the variances of the motion."""
         if dt == 0.0:
             return session.T_world_sensor, session.twist, session.twist_variances
@@ -331,13 +332,7 @@ class Tracker:
         step = np.array([[cos, -sin, 0, motion[0]], [sin, cos, 0, motion[1]], [0, 0, 1, 0], [0, 0, 0, 1]])
         return session.T_world_sensor @ step, motion / dt, np.minimum(np.diag(spread) / dt**2, FIRST_TWIST**2)
 
-    def _with_newborn(
-        self,
-        tracks: NDArray[np.void],
-        detections: Detections,
-        classes: NDArray[np.void],
-        beta: NDArray[np.float64],
-    ) -> NDArray[np.void]:
+    def _with_newborn(self, tracks: Records, detections: Detections, classes: Records, beta: Floats) -> Records:
         """Begin tracks at the detections that probably belong to none; ``classes`` are those of the detections."""
         own = np.flatnonzero((beta[:, 1:].sum(axis=0) < 0.5) & (detections.logits >= classes["birth_logit"]))
         if not len(own):
@@ -348,7 +343,7 @@ class Tracker:
         fill_newborn(self._next_id, born, classes[own], joined[len(tracks) :])
         return joined
 
-    def _living(self, tracks: NDArray[np.void]) -> NDArray[np.void]:
+    def _living(self, tracks: Records) -> Records:
         """Tracks to keep: above `LEAST_EXISTENCE`, and at most ``max_tracks`` of them."""
         stays = tracks["existence"] > LEAST_EXISTENCE
         if not stays.all():
@@ -363,7 +358,7 @@ class Tracker:
 # would compile a kernel for each layout in memory.
 
 
-def _predictions(tracks: NDArray[np.void], classes: NDArray[np.void], dt: float) -> Predictions:
+def _predictions(tracks: Records, classes: Records, dt: float) -> Predictions:
     """Interaction and prediction of each motion model."""
     n = len(tracks)
     mixed, mixed_covariances, prior = np.empty((n, 3, 5)), np.empty((n, 3, 5, 5)), np.empty((n, 3))
@@ -375,22 +370,14 @@ def _predictions(tracks: NDArray[np.void], classes: NDArray[np.void], dt: float)
     return Predictions(means, predicted, prior)
 
 
-def _combined(
-    states: NDArray[np.float64], covariances: NDArray[np.float64], modes: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _combined(states: Floats, covariances: Floats, modes: Floats) -> tuple[Floats, Floats]:
     """Combination: state (n, 5) and covariance (n, 5, 5) of tracks over their motion models."""
     state, covariance = np.empty((len(states), 5)), np.empty((len(states), 5, 5))
     fill_combined(states, covariances, modes, state, covariance)
     return state, covariance
 
 
-def _detections(
-    given: NDArray[np.float64],
-    fronts: NDArray[np.float64],
-    kinds: NDArray[np.int64],
-    groups: NDArray[np.int64],
-    pose: NDArray[np.float64],
-) -> Detections:
+def _detections(given: Floats, fronts: Floats, kinds: Ints64, groups: Ints64, pose: Floats) -> Detections:
     """The checked boxes (m, 8) in the world frame."""
     places, heights = _in_world(given, pose)
     shapes = given[:, 2:6].copy()
@@ -399,14 +386,12 @@ def _detections(
     return Detections(places, shapes, _logit(given[:, 7]), fronts, kinds, groups, ranges, np.arange(len(given)))
 
 
-def _farther(state: NDArray[np.float64], classes: NDArray[np.void], pose: NDArray[np.float64]) -> NDArray[np.float64]:
+def _farther(state: Floats, classes: Records, pose: Floats) -> Floats:
     """Factor of the standard deviations of detections at the distance of each track, (n,)."""
     return np.asarray(1.0 + np.hypot(state[:, 0] - pose[0, 3], state[:, 1] - pose[1, 3]) / classes["range_m"])
 
 
-def _associated(
-    predictions: Predictions, gates: Gates, detections: Detections
-) -> tuple[NDArray[np.float64], NDArray[np.float64], int]:
+def _associated(predictions: Predictions, gates: Gates, detections: Detections) -> tuple[Floats, Floats, int]:
     """Data association: likelihoods (n, 3, m), probabilities (n, m + 1), number of approximated tracks."""
     n, m = len(predictions.means), len(detections.places)
     likelihoods, weights, beta = np.empty((n, 3, m)), np.empty((n, m)), np.empty((n, m + 1))
@@ -415,12 +400,7 @@ def _associated(
 
 
 def _update_motion(
-    tracks: NDArray[np.void],
-    predictions: Predictions,
-    sigmas: NDArray[np.float64],
-    places: NDArray[np.float64],
-    likelihoods: NDArray[np.float64],
-    beta: NDArray[np.float64],
+    tracks: Records, predictions: Predictions, sigmas: Floats, places: Floats, likelihoods: Floats, beta: Floats
 ) -> None:
     """Mode probability update with the update of each motion, and combination."""
     means, predicted, prior = predictions
@@ -432,13 +412,7 @@ def _update_motion(
     tracks["state"], tracks["covariance"] = _combined(states, covariances, modes)
 
 
-def _update_shapes(
-    tracks: NDArray[np.void],
-    detections: Detections,
-    beta: NDArray[np.float64],
-    sigmas: NDArray[np.float64],
-    dt: float,
-) -> None:
+def _update_shapes(tracks: Records, detections: Detections, beta: Floats, sigmas: Floats, dt: float) -> None:
     """Smooth the heights and sizes; ``sigmas`` (n, 4) are those of a detection [m]."""
     shape, variance = tracks["shape"].copy(), tracks["shape_variance"].copy()
     update_shapes(beta, detections.shapes, sigmas, SHAPE_WALK_M * math.sqrt(dt), shape, variance)
@@ -446,12 +420,7 @@ def _update_shapes(
 
 
 def _update_evidence(
-    tracks: NDArray[np.void],
-    classes: NDArray[np.void],
-    detections: Detections,
-    beta: NDArray[np.float64],
-    pose: NDArray[np.float64],
-    dt: float,
+    tracks: Records, classes: Records, detections: Detections, beta: Floats, pose: Floats, dt: float
 ) -> None:
     """Collect what the scan says of fronts, labels and existence."""
     state, fronts = tracks["state"].copy(), tracks["fronts"].copy()
@@ -464,16 +433,14 @@ def _update_evidence(
     update_lives(tracks, classes, beta, hidden, detections.logits, detections.kinds, dt)
 
 
-def _scores(
-    tracks: NDArray[np.void], strength: NDArray[np.float64], classes: NDArray[np.void], pose: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _scores(tracks: Records, strength: Floats, classes: Records, pose: Floats) -> Floats:
     """Log odds (n,) of the reported scores."""
     away = np.hypot(tracks["state"][:, 0] - pose[0, 3], tracks["state"][:, 1] - pose[1, 3]) / classes["range_m"]
     scores = strength + classes["latest"] * (tracks["last_logit"] - strength)
     return np.asarray(scores + (classes["far_logit"] * away - classes["coasting_logit"] * tracks["misses"]))
 
 
-def _checked_boxes(boxes: Iterable[Box]) -> tuple[NDArray[np.float64], NDArray[np.float64], list[str]]:
+def _checked_boxes(boxes: Iterable[Box]) -> tuple[Floats, Floats, list[str]]:
     """Check boxes; return rows (m, 8) of x, y, z, length, width, height, yaw, score, log odds of fronts, and labels."""
     try:
         given = list(boxes)
@@ -497,14 +464,14 @@ def _checked_boxes(boxes: Iterable[Box]) -> tuple[NDArray[np.float64], NDArray[n
     return rows, _logit(fronts), names
 
 
-def _checked_pose(given: ArrayLike) -> NDArray[np.float64]:
+def _checked_pose(given: ArrayLike) -> Floats:
     pose = rigid("T_world_sensor", given, TrackingError)
     if np.abs(pose).max() > FARTHEST_M:
         raise TrackingError(f"T_world_sensor has {np.abs(pose).max():g}; expected at most {FARTHEST_M:g} m")
     return pose
 
 
-def _in_world(given: NDArray[np.float64], pose: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _in_world(given: Floats, pose: Floats) -> tuple[Floats, Floats]:
     """Transform boxes to the world frame: x, y, heading (m, 3), and heights of the centers (m,)."""
     placed = given[:, :3] @ pose[:3, :3].T + pose[:3, 3]
     cos, sin = np.cos(given[:, 6]), np.sin(given[:, 6])
@@ -513,6 +480,6 @@ def _in_world(given: NDArray[np.float64], pose: NDArray[np.float64]) -> tuple[ND
     return placed, heights
 
 
-def _logit(scores: NDArray[np.float64] | float) -> NDArray[np.float64]:
+def _logit(scores: Floats | float) -> Floats:
     inside = np.clip(scores, SMALLEST_SHARE, 1.0 - SMALLEST_SHARE)
     return np.log(inside) - np.log1p(-inside)

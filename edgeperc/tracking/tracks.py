@@ -8,10 +8,10 @@ from dataclasses import dataclass
 from typing import Any, overload
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..types.geometry import wrapped
 from ..types.perception import Box
+from ..types.points import Floats, Ints64, Records
 from .lives import MOVED
 from .ukf import MODES
 
@@ -170,9 +170,9 @@ class Track:
     score: float
     box: Box
     world_box: Box
-    velocity: NDArray[np.float64]
-    state: NDArray[np.float64]
-    covariance: NDArray[np.float64]
+    velocity: Floats
+    state: Floats
+    covariance: Floats
     modes: Mapping[str, float]
     age_s: float
     hits: int
@@ -254,10 +254,10 @@ class Tracks(Sequence[Track]):
 
     def __init__(
         self,
-        rows: NDArray[np.void],
+        rows: Records,
         labels: Sequence[str],
         stamp_s: float,
-        T_world_sensor: NDArray[np.float64],
+        T_world_sensor: Floats,
         n_tentative: int = 0,
         n_approximated: int = 0,
         session: int = 0,
@@ -268,19 +268,19 @@ class Tracks(Sequence[Track]):
         self.stamp_s, self.T_world_sensor = stamp_s, T_world_sensor
         self.n_tentative, self.n_approximated = n_tentative, n_approximated
         self.session, self.is_late = session, is_late
-        self.ids: NDArray[np.int64] = rows["id"]
-        self.sources: NDArray[np.int64] = rows["source"]
-        self.scores: NDArray[np.float64] = 1.0 / (1.0 + np.exp(-rows["score"]))
+        self.ids: Ints64 = rows["id"]
+        self.sources: Ints64 = rows["source"]
+        self.scores: Floats = 1.0 / (1.0 + np.exp(-rows["score"]))
         odds = np.abs(_front_odds(rows))
-        self.fronts: NDArray[np.float64] = np.where(odds > 0.0, 1.0 / (1.0 + np.exp(-odds)), math.nan)
+        self.fronts: Floats = np.where(odds > 0.0, 1.0 / (1.0 + np.exp(-odds)), math.nan)
         R, t = T_world_sensor[:3, :3], T_world_sensor[:3, 3]
         world = self._world_boxes()
-        self.boxes: NDArray[np.float64] = world.copy()
+        self.boxes: Floats = world.copy()
         self.boxes[:, :3] = (world[:, :3] - t) @ R
         cos, sin = np.cos(world[:, 6]), np.sin(world[:, 6])
         self.boxes[:, 6] = np.arctan2(R[0, 1] * cos + R[1, 1] * sin, R[0, 0] * cos + R[1, 0] * sin)
 
-    def _world_boxes(self) -> NDArray[np.float64]:
+    def _world_boxes(self) -> Floats:
         state, shape = self._rows["state"], self._rows["shape"]
         boxes = np.empty((len(state), 7))
         boxes[:, :2], boxes[:, 2:6] = state[:, :2], shape
@@ -328,12 +328,12 @@ class Tracks(Sequence[Track]):
         return (self[k] for k in range(len(self)))
 
 
-def _box(label: str, score: float, row: NDArray[np.float64], front: float | None) -> Box:
+def _box(label: str, score: float, row: Floats, front: float | None) -> Box:
     x, y, z, length, width, height, yaw = row.tolist()
     return Box(label, score, (x, y, z), (length, width, height), yaw, front)
 
 
-def strength_of(tracks: NDArray[np.void]) -> NDArray[np.float64]:
+def strength_of(tracks: Records) -> Floats:
     """Log odds of tracks (n,) float64: mean log odds of their detections, with 0 for a scan without one.
 
     `DOUBT` scans with log odds 0 are added. If other tracks hide a track, the scan counts by its visible share.
@@ -341,7 +341,7 @@ def strength_of(tracks: NDArray[np.void]) -> NDArray[np.float64]:
     return np.asarray(tracks["logit_sum"] / (tracks["chances"] + DOUBT))
 
 
-def _front_odds(tracks: NDArray[np.void]) -> NDArray[np.float64]:
+def _front_odds(tracks: Records) -> Floats:
     """Log odds (n,) that the heading points to the front; motion counts from the second scan in which a track moves."""
     moved = tracks["fronts"][:, 0]
     return np.asarray(np.where(np.abs(moved) >= 2.0 * MOVED, moved, 0.0) + tracks["fronts"][:, 1])

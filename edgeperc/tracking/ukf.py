@@ -10,9 +10,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..system.kernels import njit
+from ..types.points import Floats
 
 CONSTANT_VELOCITY, CTRV, RANDOM_MOTION = 0, 1, 2
 MODES = ("constant_velocity", "constant_turn", "random_motion")
@@ -24,25 +24,17 @@ STRAIGHT_RAD_S = 1e-4  # below this turn rate, arc and chord differ by less than
 
 @njit(cache=True, nogil=True)
 def fill_predictions(
-    states: NDArray[np.float64],
-    covariances: NDArray[np.float64],
-    noise: NDArray[np.float64],
-    dt: float,
-    means: NDArray[np.float64],
-    predicted: NDArray[np.float64],
+    states: Floats, covariances: Floats, noise: Floats, dt: float, means: Floats, predicted: Floats
 ) -> None:
-    """Predict each motion model of each track with sigma points (KUL-Seg's "prediction").
+    """Predict each motion model of each track with sigma points (KUL-Seg's "prediction"): constant velocity, CTRV,
+    random motion.
 
     The sigma points are x, and x plus and minus each column of the Cholesky root of (n + kappa) P. Their weights are
     kappa / (n + kappa) and 1 / (2 (n + kappa)), with n = 5 and kappa = 1.
 
-    states : (n, 3, 5) float64; state for each motion model: constant velocity, CTRV, random motion.
-    covariances : (n, 3, 5, 5) float64
-    noise : (n, 5) float64; standard deviations: acceleration [m/s2], turn acceleration [rad/s2], random walk of the
-        place [m/s^0.5], of the heading [rad/s^0.5], and speed of random motion [m/s].
-    dt : time step [s], not negative.
-    means : (n, 3, 5) float64, overwritten
-    predicted : (n, 3, 5, 5) float64, overwritten; covariances, with additive process noise.
+    noise : (n, 5) standard deviations: acceleration [m/s2], turn acceleration [rad/s2], random walk of the place
+        [m/s^0.5], of the heading [rad/s^0.5], and speed of random motion [m/s].
+    predicted : covariances, with additive process noise.
     """
     points = np.empty((11, 5))
     root = np.empty((5, 5))
@@ -73,7 +65,7 @@ def fill_predictions(
 
 
 @njit(cache=True, nogil=True)
-def move(mode: int, state: NDArray[np.float64], dt: float) -> None:
+def move(mode: int, state: Floats, dt: float) -> None:
     """Predict one state (5,) by ``dt`` [s], in place; the turn rate becomes 0 except with CTRV."""
     v, heading, turn = state[2], state[3], state[4]
     if mode == CONSTANT_VELOCITY:
@@ -96,16 +88,8 @@ def move(mode: int, state: NDArray[np.float64], dt: float) -> None:
 
 
 @njit(cache=True, nogil=True)
-def fill_process_noise(
-    mode: int, heading: float, noise: NDArray[np.float64], dt: float, process: NDArray[np.float64]
-) -> None:
-    """Compute the process noise of one motion model: white accelerations, random walks of position and heading.
-
-    heading : heading before the prediction [rad].
-    noise : (5,) float64; as in `fill_predictions`.
-    dt : time step [s].
-    process : (5, 5) float64, overwritten
-    """
+def fill_process_noise(mode: int, heading: float, noise: Floats, dt: float, process: Floats) -> None:
+    """Compute the process noise of one motion model: white accelerations, random walks of position and heading."""
     process[:] = 0.0
     acceleration, turn, walk, wander, speed = noise[0], noise[1], noise[2], noise[3], noise[4]
     process[3, 3] = wander * wander * dt
@@ -132,27 +116,22 @@ def fill_process_noise(
 
 @njit(cache=True, nogil=True)
 def fill_updates(
-    means: NDArray[np.float64],
-    predicted: NDArray[np.float64],
-    detections: NDArray[np.float64],
-    sigmas: NDArray[np.float64],
-    beta: NDArray[np.float64],
-    states: NDArray[np.float64],
-    covariances: NDArray[np.float64],
+    means: Floats,
+    predicted: Floats,
+    detections: Floats,
+    sigmas: Floats,
+    beta: Floats,
+    states: Floats,
+    covariances: Floats,
 ) -> None:
     """Update each motion model of each track with all detections, weighted by their association (PDA filter).
 
     The measurement is part of the state, so the unscented cross-covariance and innovation covariance are exactly
-    columns and a block of the predicted covariance. Headings are compared modulo pi, and deviations are
-    limited to three standard deviations, as in `edgeperc.tracking.jpda.fill_likelihoods`.
+    columns and a block of the predicted covariance. Headings are compared modulo pi, and deviations are limited to
+    three standard deviations, as in `edgeperc.tracking.jpda.fill_likelihoods`.
 
-    means, predicted : from `fill_predictions`.
-    detections : (m, 3) float64; x, y [m], heading [rad], in the frame of the states.
-    sigmas : (n, 3) float64; standard deviations of a detection along and across its heading [m] and of its heading
-        [rad].
-    beta : (n, 3, m + 1) float64; for each motion model, as in `edgeperc.tracking.jpda.fill_association`.
-    states : (n, 3, 5) float64, overwritten
-    covariances : (n, 3, 5, 5) float64, overwritten
+    sigmas : (n, 3) standard deviations of a detection along and across its heading [m] and of its heading [rad].
+    beta : (n, 3, m + 1) for each motion model, as in `edgeperc.tracking.jpda.fill_association`.
     """
     innovation = np.empty((3, 3))
     inverse = np.empty((3, 3))
@@ -207,9 +186,7 @@ def fill_updates(
 
 
 @njit(cache=True, nogil=True)
-def fill_innovation(
-    heading: float, cov: NDArray[np.float64], sigmas: NDArray[np.float64], innovation: NDArray[np.float64]
-) -> None:
+def fill_innovation(heading: float, cov: Floats, sigmas: Floats, innovation: Floats) -> None:
     """Compute the innovation covariance (3, 3); the noise of a detection is along and across the heading."""
     cos, sin = math.cos(heading), math.sin(heading)
     along, across, turn = sigmas[0] * sigmas[0], sigmas[1] * sigmas[1], sigmas[2] * sigmas[2]
@@ -222,7 +199,7 @@ def fill_innovation(
 
 
 @njit(cache=True, nogil=True)
-def fill_inverse(matrix: NDArray[np.float64], inverse: NDArray[np.float64]) -> None:
+def fill_inverse(matrix: Floats, inverse: Floats) -> None:
     """Invert a symmetric positive definite (3, 3) matrix into ``inverse``, by cofactors."""
     a, b, c = matrix[0, 0], matrix[0, 1], matrix[0, 2]
     d, e, f = matrix[1, 1], matrix[1, 2], matrix[2, 2]
@@ -236,7 +213,7 @@ def fill_inverse(matrix: NDArray[np.float64], inverse: NDArray[np.float64]) -> N
 
 
 @njit(cache=True, nogil=True)
-def fill_cholesky(matrix: NDArray[np.float64], root: NDArray[np.float64]) -> None:
+def fill_cholesky(matrix: Floats, root: Floats) -> None:
     """Compute the lower Cholesky root (5, 5); a pivot that is negative by rounding counts as 0."""
     root[:] = 0.0
     for a in range(5):

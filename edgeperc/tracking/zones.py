@@ -8,13 +8,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from ..errors import OptionError, PointsError
 from ..system.clock import elapsed_s
 from ..system.kernels import njit
 from ..types.perception import Box
-from ..types.points import Mask, read_only
+from ..types.points import Floats, Mask, read_only
 from . import Track, Tracks
 
 FARTHEST_M = 1e8
@@ -52,7 +52,7 @@ class Zone:
             raise OptionError(f"a zone has {len(corners)} corners; expected at least three")
         self.polygon = corners
 
-    def mark(self, points: ArrayLike) -> NDArray[np.bool_]:
+    def mark(self, points: ArrayLike) -> Mask:
         """Mark the points that are inside, seen from above.
 
         Parameters
@@ -167,7 +167,7 @@ class Line:
         # The time that has passed so far without jumps of the clock, and the stamp of the last scan.
         self._now_s, self._stamp_s = 0.0, math.inf
         # Of each track: the last place beyond the margin, the directions counted so far, and the time it was seen.
-        self.known: dict[int, tuple[NDArray[np.float64], frozenset[bool], float]] = {}
+        self.known: dict[int, tuple[Floats, frozenset[bool], float]] = {}
 
     def count(self, tracks: Tracks) -> tuple[Crossing, ...]:
         """Count the tracks that crossed the line since the last scan.
@@ -207,12 +207,12 @@ class Line:
         self.to_right += len(found) - n_left
         return tuple(found)
 
-    def _left_of(self, place: NDArray[np.float64]) -> float:
+    def _left_of(self, place: Floats) -> float:
         """Distance to the left of the line, looking along it [m]."""
         (x, y), (px, py) = self.end - self.start, place - self.start
         return float(x * py - y * px) / math.hypot(x, y)
 
-    def _between(self, last: NDArray[np.float64], place: NDArray[np.float64]) -> bool:
+    def _between(self, last: Floats, place: Floats) -> bool:
         """Whether the way between two places on different sides passes between the ends of the line."""
         before, after = self._left_of(last), self._left_of(place)
         way = last + (place - last) * (before / (before - after)) - self.start
@@ -220,9 +220,9 @@ class Line:
         return bool(0.0 <= way @ along <= along @ along)
 
 
-def _places(name: str, given: Any) -> NDArray[np.float64]:
+def _places(name: str, given: Any) -> Floats:
     try:
-        places: NDArray[np.float64] = np.array(given, np.float64, order="C")
+        places: Floats = np.array(given, np.float64, order="C")
     except (OverflowError, TypeError, ValueError) as exc:
         raise OptionError(f"{name} has corners that are not numbers ({exc}); expected (k, 2): x, y") from exc
     if places.ndim != 2 or places.shape[1] != 2 or not (np.abs(places) <= FARTHEST_M).all():
@@ -232,13 +232,8 @@ def _places(name: str, given: Any) -> NDArray[np.float64]:
 
 
 @njit(cache=True, nogil=True)
-def mark_inside(polygon: NDArray[np.float64], points: NDArray[np.float64], inside: Mask) -> None:
-    """Mark the points from which a ray along y crosses the polygon an odd number of times.
-
-    polygon : (k, 2) float64, C-contiguous, read-only
-    points : (n, 2) float64, C-contiguous, read-only
-    inside : (n,) bool, overwritten
-    """
+def mark_inside(polygon: Floats, points: Floats, inside: Mask) -> None:
+    """Mark the points from which a ray along y crosses the polygon an odd number of times."""
     n_corners = polygon.shape[0]
     for i in range(points.shape[0]):
         x, y = points[i, 0], points[i, 1]

@@ -66,13 +66,11 @@ class InputSpec:
     """The network's input: ``(raw - mean) / std`` per channel; 0 in every channel of a pixel without a return.
 
     The raw values of a camera are 0..255 in ``"red"``, ``"green"`` and ``"blue"``, in the order that the network takes.
-
-    name : name of the input in the graph.
-    mean, std : one value per channel, in the channel's unit.
     """
 
-    name: str
+    name: str  # name of the input in the graph
     channels: tuple[str, ...]
+    # one value per channel, in the channel's unit
     mean: tuple[float, ...]
     std: tuple[float, ...]
 
@@ -95,20 +93,16 @@ class InputSpec:
 
 @dataclass(frozen=True, slots=True)
 class OutputSpec:
-    """One output of the graph; ``kind`` picks the function in ``decode.py`` that reads it.
+    """One output of the graph; ``kind`` picks the function in ``decode.py`` that reads it."""
 
-    name : name of the output in the graph.
-    kind : one of ``OUTPUT_KINDS``.
-    front : of kind ``"box_dense"``: it has two more channels, a vector towards the front of a box. Its component along
-        a heading is the logit that the front is there.
-    block : (int, int); of a class output: rows and columns of the pixels whose values are channels of one position.
-        Value of class c in pixel (row, column): channel ``(c * rows + row % rows) * columns + column % columns``, at
-        position ``(row // rows, column // columns)``.
-    """
-
-    name: str
-    kind: str
+    name: str  # name of the output in the graph
+    kind: str  # one of ``OUTPUT_KINDS``
+    # of kind ``"box_dense"``: it has two more channels, a vector towards the front of a box. Its component along a
+    # heading is the logit that the front is there.
     front: bool = False
+    # of a class output: rows and columns of the pixels whose values are channels of one position. Value of class c in
+    # pixel (row, column): channel ``(c * rows + row % rows) * columns + column % columns``, at position ``(row // rows,
+    # column // columns)``.
     block: tuple[int, int] = (1, 1)
 
     def __post_init__(self) -> None:
@@ -135,13 +129,11 @@ class Golden:
     The input is uniform noise in -1..1 from ``numpy.random.PCG64(seed)``. Each output is stored at sampled flat
     positions, so that any runtime can be compared with the exporter's: at 16 or more different positions, or at all
     positions of a smaller output.
-
-    input_sha256 : SHA-256 of the input as float32 bytes in C order.
-    outputs : output name to ``{"sha256": str, "std": float, "positions": [int], "values": [float]}``.
     """
 
     seed: int
-    input_sha256: str
+    input_sha256: str  # SHA-256 of the input as float32 bytes in C order
+    # output name to ``{"sha256": str, "std": float, "positions": [int], "values": [float]}``
     outputs: Mapping[str, Mapping[str, Any]]
 
     def __post_init__(self) -> None:
@@ -163,10 +155,7 @@ class Golden:
                 FIELDS.number(f"{field}.values[{index}]", value, -1e30, 1e30)
 
     def check_output(self, name: str, size: int) -> None:
-        """Check the record of an output against the number of its values.
-
-        Raises CardError.
-        """
+        """Check the record of an output against the number of its values."""
         positions = self.outputs[name]["positions"]
         field, fewest = f"golden.outputs[{reprlib.repr(name)}]", min(MIN_GOLDEN_VALUES, size)
         if max(positions) >= size:

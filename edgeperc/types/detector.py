@@ -28,27 +28,21 @@ class PillarGeometry:
     """Pillars: the points of a grid of cells, seen from above (Lang et al., 2019, section 2.1).
 
     Row 0 is the rightmost (lowest y), column 0 the nearest (lowest x) one.
-
-    x_range_m, y_range_m, z_range_m : bounds [m] in the frame of the training points, lower first; points outside are
-        left out.
-    cell_m : edge of a pillar [m].
-    max_points : points of a pillar that the network sees: the first ones of the scan.
-    max_pillars : pillars that it sees: those with the first points of the scan.
-    pitch_deg, yaw_deg : how the frame of the training points lies on the vehicle [deg], as in
-        `edgeperc.Mounting`; its height above the road is the card's ``mount_height_m``. 0.66 and 0 for KITTI; a yaw of
-        -90 where x is to the right (nuScenes).
-    num_points, coords : names of the graph's inputs for the number of points in each pillar, (pillars,), and for its
-        place, (pillars, 4): batch, z, row, column. ``num_points`` is empty if the graph does not take it.
     """
 
+    # bounds [m] in the frame of the training points, lower first; points outside are left out
     x_range_m: tuple[float, float]
     y_range_m: tuple[float, float]
     z_range_m: tuple[float, float]
-    cell_m: float
-    max_points: int
-    max_pillars: int
+    cell_m: float  # edge of a pillar [m]
+    max_points: int  # points of a pillar that the network sees: the first ones of the scan
+    max_pillars: int  # pillars that it sees: those with the first points of the scan
+    # how the frame of the training points lies on the vehicle [deg], as in `edgeperc.Mounting`; its height above the
+    # road is the card's ``mount_height_m``. 0.66 and 0 for KITTI; a yaw of -90 where x is to the right (nuScenes).
     pitch_deg: float
     yaw_deg: float
+    # names of the graph's inputs for the number of points in each pillar, (pillars,), and for its place, (pillars, 4):
+    # batch, z, row, column. ``num_points`` is empty if the graph does not take it.
     num_points: str
     coords: str
 
@@ -93,16 +87,11 @@ class PillarGeometry:
 
 @dataclass(frozen=True, slots=True)
 class Anchor:
-    """A box from which those of an anchor head start, at each position and in each direction.
+    """A box from which those of an anchor head start, at each position and in each direction."""
 
-    size_m : length, width, height [m].
-    bottom_m : z of its bottom in the frame of the training points [m].
-    yaws_rad : its directions [rad].
-    """
-
-    size_m: tuple[float, float, float]
-    bottom_m: float
-    yaws_rad: tuple[float, ...]
+    size_m: tuple[float, float, float]  # length, width, height [m]
+    bottom_m: float  # z of its bottom in the frame of the training points [m]
+    yaws_rad: tuple[float, ...]  # its directions [rad]
 
     def __post_init__(self) -> None:
         _FIELDS.numbers("head.anchors: size_m", self.size_m, 3, 0.01, 100.0)
@@ -112,30 +101,20 @@ class Anchor:
 
 @dataclass(frozen=True, slots=True)
 class AnchorHead:
-    """Boxes relative to anchors, as of SECOND and PointPillars (OpenPCDet's AnchorHeadSingle, mmdet3d's Anchor3DHead).
+    """Boxes relative to anchors: SECOND, PointPillars (OpenPCDet's AnchorHeadSingle, mmdet3d's Anchor3DHead)."""
 
-    classes : the network's names of its classes, in its order.
-    stride : cells of the view behind a position of the outputs, along each axis.
-    scores : what ``cls_preds`` holds.
-    max_candidates : the best ones are decoded, before boxes that overlap are dropped.
-    across_classes : whether a box is also dropped if it overlaps a better one of another class.
-    anchors : all at a position, in the order of the channels: anchors, then their yaws.
-    centered : anchors stand in the middle of the positions' cells; else the outermost ones on the bounds of the view.
-    channels_last : whether the outputs are (1, rows, columns, channels) and not (1, channels, rows, columns).
-    box_values : values of a box; those after the seventh (velocities) are ignored.
-    direction_bins, direction_offset_rad, direction_limit_offset : of ``dir_cls_preds``: the angle within a bin is
-        ``yaw - offset`` wrapped to ``-limit_offset..1 - limit_offset`` of a bin.
-    """
-
-    classes: tuple[str, ...]
-    stride: int
-    scores: Scores
-    max_candidates: int
-    across_classes: bool
-    anchors: tuple[Anchor, ...]
+    classes: tuple[str, ...]  # the network's names of its classes, in its order
+    stride: int  # cells of the view behind a position of the outputs, along each axis
+    scores: Scores  # what ``cls_preds`` holds
+    max_candidates: int  # the best ones are decoded, before boxes that overlap are dropped
+    across_classes: bool  # whether a box is also dropped if it overlaps a better one of another class
+    anchors: tuple[Anchor, ...]  # all at a position, in the order of the channels: anchors, then their yaws
+    # anchors stand in the middle of the positions' cells; else the outermost ones on the bounds of the view
     centered: bool
-    channels_last: bool
-    box_values: int
+    channels_last: bool  # whether the outputs are (1, rows, columns, channels) and not (1, channels, rows, columns)
+    box_values: int  # values of a box; those after the seventh (velocities) are ignored
+    # of ``dir_cls_preds``: the angle within a bin is ``yaw - offset`` wrapped to ``-limit_offset..1 - limit_offset`` of
+    # a bin
     direction_bins: int
     direction_offset_rad: float
     direction_limit_offset: float
@@ -178,12 +157,15 @@ class CenterHead:
     rotation : order of the channels of ``rot``: ``"sin_cos"`` of mmdet3d, ``"cos_sin"`` of OpenPCDet.
     """
 
+    # as of `AnchorHead`; ``scores`` is of ``heatmap``
     classes: tuple[str, ...]
     stride: int
     scores: Scores
     max_candidates: int
     across_classes: bool
+    # numbers of classes that share one box at each position, in the order of the classes; they add up to all classes
     groups: tuple[int, ...]
+    # order of the channels of ``rot``: ``"sin_cos"`` of mmdet3d, ``"cos_sin"`` of OpenPCDet
     rotation: Literal["sin_cos", "cos_sin"]
 
     def __post_init__(self) -> None:

@@ -11,12 +11,11 @@ from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..system.kernels import njit
 from .mounting import MODEL_HEIGHT_M, MODEL_MOUNTING, Mounting
 from .perception import Box
-from .points import Points, read_only
+from .points import Floats, Floats32, Points, read_only
 
 
 class ModelFrame:
@@ -41,17 +40,17 @@ class ModelFrame:
     def __init__(self, mounting: Mounting) -> None:
         assert mounting.height_m is not None
         from_vehicle = MODEL_MOUNTING.rotation().T
-        self.R: NDArray[np.float64] = from_vehicle @ mounting.rotation()
+        self.R: Floats = from_vehicle @ mounting.rotation()
         raised = from_vehicle @ np.array([0.0, 0.0, mounting.height_m - MODEL_HEIGHT_M])
-        self.eye: NDArray[np.float64] = raised
-        self.t: NDArray[np.float64] = raised - self.R @ np.array([*mounting.origin_m, 0.0])
+        self.eye: Floats = raised
+        self.t: Floats = raised - self.R @ np.array([*mounting.origin_m, 0.0])
         self.is_identity = bool(np.allclose(self.R, np.eye(3), atol=1e-9) and np.allclose(self.t, 0.0, atol=1e-6))
 
-    def move(self, points: Points) -> NDArray[np.float32]:
+    def move(self, points: Points) -> Floats32:
         """Scan (n, 4) float32 in the models' frame, read-only; the same array if nothing moves."""
         return points if self.is_identity else _moved_points(points, self.R, self.t)
 
-    def move_back(self, points: Points) -> NDArray[np.float32]:
+    def move_back(self, points: Points) -> Floats32:
         """Points (n, 4) float32 of the models' frame as a sensor of this mounting sees them, read-only."""
         return points if self.is_identity else _moved_points(points, self.R.T.copy(), -self.R.T @ self.t)
 
@@ -64,14 +63,14 @@ class ModelFrame:
         return tuple(boxes) if self.is_identity else _moved(boxes, self.R.T, -self.R.T @ self.t)
 
 
-def turned(points: Points, angle_rad: float) -> NDArray[np.float32]:
+def turned(points: Points, angle_rad: float) -> Floats32:
     """Scan (n, 4) float32 as a sensor that is turned to the left by an angle sees it, read-only."""
     result = np.empty(points.shape, np.float32)
     fill_turned(read_only(points), np.float32(math.cos(angle_rad)), np.float32(math.sin(angle_rad)), result)
     return read_only(result)
 
 
-def quaternion(R: NDArray[np.float64]) -> tuple[float, float, float, float]:
+def quaternion(R: Floats) -> tuple[float, float, float, float]:
     """x, y, z, w of a rotation matrix (3, 3); w >= 0."""
     # Of these four rows, each the quaternion times four of its entries, the longest is the most exact.
     rows = np.array(
@@ -87,7 +86,7 @@ def quaternion(R: NDArray[np.float64]) -> tuple[float, float, float, float]:
     return x, y, z, w
 
 
-def poses_of(positions: NDArray[np.float64], quaternions: NDArray[np.float64]) -> NDArray[np.float64]:
+def poses_of(positions: Floats, quaternions: Floats) -> Floats:
     """Matrices (n, 4, 4) of positions (n, 3) and unit quaternions x, y, z, w (n, 4)."""
     x, y, z, w = quaternions.T
     poses = np.zeros((len(positions), 4, 4))
@@ -98,13 +97,13 @@ def poses_of(positions: NDArray[np.float64], quaternions: NDArray[np.float64]) -
     return poses
 
 
-def _moved_points(points: Points, R: NDArray[np.float64], t: NDArray[np.float64]) -> NDArray[np.float32]:
+def _moved_points(points: Points, R: Floats, t: Floats) -> Floats32:
     moved = np.empty(points.shape, np.float32)
     fill_moved(read_only(points), R, t, moved)
     return read_only(moved)
 
 
-def _moved(boxes: Iterable[Box], R: NDArray[np.float64], t: NDArray[np.float64]) -> tuple[Box, ...]:
+def _moved(boxes: Iterable[Box], R: Floats, t: Floats) -> tuple[Box, ...]:
     moved = []
     for box in boxes:
         x, y, z = (R @ np.array(box.center) + t).tolist()
@@ -114,12 +113,9 @@ def _moved(boxes: Iterable[Box], R: NDArray[np.float64], t: NDArray[np.float64])
 
 
 @njit(cache=True, nogil=True)
-def fill_moved(points: Points, R: NDArray[np.float64], t: NDArray[np.float64], moved: Points) -> None:
+def fill_moved(points: Points, R: Floats, t: Floats, moved: Points) -> None:
     """Write ``R p + t`` of every point into ``moved`` (n, 4) float32, with its remission.
 
-    points : (n, 4) float32, C-contiguous
-    R : (3, 3) float64
-    t : (3,) float64
     moved : (n, 4) float32, overwritten; a coordinate beyond the range of float32 becomes infinite.
     """
     for i in range(points.shape[0]):
@@ -130,13 +126,8 @@ def fill_moved(points: Points, R: NDArray[np.float64], t: NDArray[np.float64], m
 
 
 @njit(cache=True, nogil=True)
-def fill_turned(points: Points, cos: np.float32, sin: np.float32, turned: NDArray[np.float32]) -> None:
-    """Write the points, turned about the z axis in float32.
-
-    points : (n, 4) float32, C-contiguous
-    cos, sin : float32; of the angle by which the sensor is turned to the left.
-    turned : (n, 4) float32, overwritten; a coordinate beyond the range of float32 becomes infinite.
-    """
+def fill_turned(points: Points, cos: np.float32, sin: np.float32, turned: Floats32) -> None:
+    """Write the points, turned about the z axis in float32 to the right, as the sensor is turned to the left."""
     for i in range(points.shape[0]):
         x, y = points[i, 0], points[i, 1]
         turned[i, 0] = cos * x + sin * y

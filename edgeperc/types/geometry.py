@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..errors import PointsError
 from ..system.kernels import njit
 from .perception import Box
-from .points import Labels, Mask, read_only
+from .points import Floats, Ints64, Labels, Mask, Records, read_only
 from .views import TopViewGeometry
 
 # A box as kernels take it.
@@ -36,22 +36,15 @@ BOX = np.dtype(
 
 
 class Grid(NamedTuple):
-    """The cells of a top view as kernels take them.
+    """The cells of a top view as kernels take them."""
 
-    Attributes
-    ----------
-    far, left : float
-        x of the far edge and y of the left edge [m].
-    cell : float
-        Edge of a cell [m].
-    """
-
+    # x of the far edge and y of the left edge [m]
     far: float
     left: float
-    cell: float
+    cell: float  # edge of a cell [m]
 
 
-Angle = TypeVar("Angle", float, NDArray[np.float64])
+Angle = TypeVar("Angle", float, Floats)
 
 
 def wrapped(angle: Angle) -> Angle:
@@ -60,13 +53,9 @@ def wrapped(angle: Angle) -> Angle:
 
 
 def draw_footprints(labels: Labels, boxes: Iterable[Box], view: TopViewGeometry, classes: Sequence[str]) -> None:
-    """Draw the footprints of boxes over top-view labels, in place (SSADNet 3.1.2).
+    """Draw the footprints of boxes of the classes over top-view labels, in place (SSADNet 3.1.2).
 
-    A cell belongs to a box if its center lies in the footprint; the nearer of two boxes wins. Boxes of other classes
-    are not drawn.
-
-    labels : (rows, columns) uint8, modified
-    classes : names of the labels; a footprint gets the number of its box's class.
+    A cell belongs to a box if its center lies in the footprint; the nearer of two boxes wins.
     """
     number = {name: k for k, name in enumerate(classes)}
     known = [box for box in boxes if box.label in number]
@@ -78,9 +67,7 @@ def draw_footprints(labels: Labels, boxes: Iterable[Box], view: TopViewGeometry,
         labels[:] = drawn
 
 
-def box_records(
-    boxes: Sequence[Box], labels: Sequence[int], margin_m: float = 0.0, above_m: float = 0.0
-) -> NDArray[np.void]:
+def box_records(boxes: Sequence[Box], labels: Sequence[int], margin_m: float = 0.0, above_m: float = 0.0) -> Records:
     """Boxes as kernels take them, (m,) `BOX`.
 
     margin_m, above_m : by which footprints grow on every side, and tops upwards [m].
@@ -101,19 +88,15 @@ def box_records(
     return np.array(rows, BOX)
 
 
-def rectangles(boxes: Iterable[Box]) -> NDArray[np.float64]:
+def rectangles(boxes: Iterable[Box]) -> Floats:
     """Footprints of boxes, (n, 5): x, y, length, width [m], yaw [rad]."""
     rows = [(*box.center[:2], *box.size[:2], box.yaw) for box in boxes]
     return np.array(rows, dtype=np.float64).reshape(-1, 5)
 
 
-def oriented_iou(a: ArrayLike, b: ArrayLike) -> NDArray[np.float64]:
-    """Intersection over union of every rectangle of ``a`` with every rectangle of ``b`` (SSADNet equation A1).
-
-    a : (n, 5) array_like; x, y, length, width [m], yaw [rad].
-    b : (m, 5) array_like; as ``a``.
-    Returns (n, m) float64: In 0..1. A rectangle that is not finite or has no area overlaps nothing, not even itself.
-    Raises PointsError.
+def oriented_iou(a: ArrayLike, b: ArrayLike) -> Floats:
+    """Intersection over union (n, m) of rectangles ``a`` (n, 5) with ``b`` (m, 5): x, y, length, width [m], yaw [rad]
+    (SSADNet equation A1). One that is not finite or has no area overlaps nothing, not even itself.
     """
     first, second = _as_rectangles(a), _as_rectangles(b)
     iou = np.empty((len(first), len(second)))
@@ -121,32 +104,22 @@ def oriented_iou(a: ArrayLike, b: ArrayLike) -> NDArray[np.float64]:
     return iou
 
 
-def shared_area(iou: NDArray[np.float64], a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Area [m2] that rectangles share, from their overlap: ``iou = shared / (area of a + area of b - shared)``.
-
-    iou : (n, m) float64; `oriented_iou` of ``a`` and ``b``.
-    a : (n, 5) float64
-    b : (m, 5) float64
-    Returns (n, m) float64.
-    """
+def shared_area(iou: Floats, a: Floats, b: Floats) -> Floats:
+    """Area [m2] that rectangles share, from their overlap: ``iou = shared / (area of a + area of b - shared)``."""
     areas = np.add.outer(a[:, 2] * a[:, 3], b[:, 2] * b[:, 3])
     return np.asarray(iou / (1.0 + iou) * areas, np.float64)
 
 
 def suppress_overlaps(
     rectangles: ArrayLike, scores: ArrayLike, iou_threshold: ArrayLike, *, max_inside: float = math.inf
-) -> NDArray[np.int64]:
-    """Greedy non-maximum suppression of oriented rectangles.
+) -> Ints64:
+    """Greedy non-maximum suppression of oriented rectangles: rows kept, best score first, the earlier row on ties. Rows
+    that are not finite overlap nothing, so they are kept.
 
-    rectangles : (n, 5) array_like; x, y, length, width [m], yaw [rad].
-    scores : (n,) array_like
-    iou_threshold : float or (n,) array_like; a rectangle is dropped if it overlaps a kept one with a better score by
-        more than this; with one threshold a rectangle, by more than the lower one of the two.
+    iou_threshold : a rectangle is dropped if it overlaps a kept one with a better score by more than this; with one
+        threshold a rectangle, by more than the lower one of the two.
     max_inside : it is also dropped if the area shared with a better one is more than this share of the smaller one's
         area.
-    Returns (k,) int64: Rows kept, best score first, the earlier row on ties. Rows that are not finite overlap
-        nothing, so they are kept.
-    Raises PointsError.
     """
     rows = _as_rectangles(rectangles)
     values = np.asarray(scores, dtype=np.float64)
@@ -162,13 +135,8 @@ def suppress_overlaps(
     return order[keep]
 
 
-def bounding_rectangles(rectangles: ArrayLike) -> NDArray[np.float64]:
-    """Axis-aligned bounds of rectangles, as rectangles of yaw 0.
-
-    rectangles : (n, 5) array_like; x, y, length, width [m], yaw [rad].
-    Returns (n, 5) float64: Same centers; extent along x, extent along y; yaw 0.
-    Raises PointsError.
-    """
+def bounding_rectangles(rectangles: ArrayLike) -> Floats:
+    """Axis-aligned bounds of rectangles (n, 5), as rectangles of yaw 0."""
     rows = _as_rectangles(rectangles)
     cos, sin = np.abs(np.cos(rows[:, 4])), np.abs(np.sin(rows[:, 4]))
     bounds = np.zeros_like(rows)
@@ -178,7 +146,7 @@ def bounding_rectangles(rectangles: ArrayLike) -> NDArray[np.float64]:
     return bounds
 
 
-def _as_rectangles(given: ArrayLike) -> NDArray[np.float64]:
+def _as_rectangles(given: ArrayLike) -> Floats:
     rows = read_only(given, np.float64)
     if rows.size == 0:
         rows = rows.reshape(0, 5)
@@ -188,11 +156,8 @@ def _as_rectangles(given: ArrayLike) -> NDArray[np.float64]:
 
 
 @njit(cache=True, nogil=True)
-def fill_footprints(boxes: NDArray[np.void], grid: Grid, labels: Labels) -> None:
-    """Write the label of each `BOX`, (m,), into the cells whose centers lie in its footprint, one after the other.
-
-    labels : (rows, columns) uint8, modified
-    """
+def fill_footprints(boxes: Records, grid: Grid, labels: Labels) -> None:
+    """Write the label of each `BOX`, (m,), into the cells whose centers lie in its footprint, one after the other."""
     x_far, y_left, cell_m = grid
     n_rows, n_cols = labels.shape
     for k in range(boxes.shape[0]):
@@ -229,12 +194,10 @@ def cell_at(grid: Grid, shape: tuple[int, int], x: float, y: float) -> tuple[int
 
 
 @njit(cache=True, nogil=True)
-def fill_oriented_iou(a: NDArray[np.float64], b: NDArray[np.float64], iou: NDArray[np.float64]) -> None:
+def fill_oriented_iou(a: Floats, b: Floats, iou: Floats) -> None:
     """Compute the overlap (IoU) of every pair.
 
-    a : (n, 5) float64, C-contiguous
     b : (m, 5) float64, C-contiguous; x, y, length, width [m], yaw [rad].
-    iou : (n, m) float64, overwritten
     """
     for i in range(a.shape[0]):
         for j in range(b.shape[0]):
@@ -242,13 +205,9 @@ def fill_oriented_iou(a: NDArray[np.float64], b: NDArray[np.float64], iou: NDArr
 
 
 @njit(cache=True, nogil=True)
-def mark_nms(rectangles: NDArray[np.float64], limits: NDArray[np.float64], max_inside: float, keep: Mask) -> None:
-    """Mark the rectangles that overlap no better kept rectangle too much.
-
-    rectangles : (n, 5) float64, C-contiguous; best first.
-    limits : (n,) float64, C-contiguous; two may overlap by the lower one of their limits (IoU).
-    max_inside : of the smaller area of two.
-    keep : (n,) bool, overwritten
+def mark_nms(rectangles: Floats, limits: Floats, max_inside: float, keep: Mask) -> None:
+    """Mark the rectangles, best first, that overlap no better kept rectangle by more than the lower of their limits
+    (IoU), or than ``max_inside`` of the smaller area of two.
     """
     for i in range(rectangles.shape[0]):
         keep[i] = True
@@ -265,7 +224,7 @@ def mark_nms(rectangles: NDArray[np.float64], limits: NDArray[np.float64], max_i
 
 
 @njit(cache=True, nogil=True)
-def pair_iou(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
+def pair_iou(a: Floats, b: Floats) -> float:
     """IoU of two rectangles (5,); the second is clipped by the first in the frame of the first."""
     area_a = a[2] * a[3]
     area_b = b[2] * b[3]
@@ -321,13 +280,8 @@ def pair_iou(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
     return float(shared / (area_a + area_b - shared))
 
 
-def inside(box: Box, points: NDArray[Any], margin_m: float = 0.0) -> NDArray[np.bool_]:
-    """Find the points inside a box.
-
-    points : (n, 3 or more) array; x, y, z [m] in the frame of the box.
-    margin_m : the box is grown by this on every side [m].
-    Returns (n,) bool: False for points that are not finite.
-    """
+def inside(box: Box, points: NDArray[Any], margin_m: float = 0.0) -> Mask:
+    """Find the points inside a box that is grown by a margin on every side [m]; not finite ones are outside."""
     offset = points[:, :3] - np.asarray(box.center, np.float32)
     cos, sin = np.cos(box.yaw), np.sin(box.yaw)
     along = offset[:, 0] * cos + offset[:, 1] * sin

@@ -10,10 +10,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from ..errors import SensorError
 from ..system.fields import Fields
+from .points import Floats
 from .rigid import rigid
 
 FIELDS = Fields("mounting", SensorError, exact=True)
@@ -64,7 +65,7 @@ class Mounting:
         """Whether nothing is left to be estimated."""
         return None not in (self.height_m, self.roll_deg, self.pitch_deg, self.yaw_deg)
 
-    def rotation(self) -> NDArray[np.float64]:
+    def rotation(self) -> Floats:
         """R, (3, 3), from the scan's axes to the vehicle's; angles that are not known count as 0."""
         roll, pitch, yaw = (math.radians(a or 0.0) for a in (self.roll_deg, self.pitch_deg, self.yaw_deg))
         (cr, sr), (cp, sp), (cy, sy) = ((math.cos(a), math.sin(a)) for a in (roll, pitch, yaw))

@@ -58,10 +58,7 @@ DEFERRED = frozenset(
 
 
 def open_model(path: str | os.PathLike[str]) -> BinaryIO:
-    """Open a model's file, which has to be a regular file of at most 2 GB.
-
-    Raises ModelFileError.
-    """
+    """Open a model's file, which has to be a regular file of at most 2 GB."""
     try:
         # A pipe would be waited for if it were not opened without blocking.
         flags = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
@@ -78,10 +75,7 @@ def open_model(path: str | os.PathLike[str]) -> BinaryIO:
 
 
 def read_model(path: str | os.PathLike[str]) -> bytes:
-    """The bytes of a model's file.
-
-    Raises ModelFileError.
-    """
+    """The bytes of a model's file."""
     with open_model(path) as file:
         try:
             # A read of a size allocates it, however small the file is; one that grows meanwhile is no model.
@@ -91,12 +85,7 @@ def read_model(path: str | os.PathLike[str]) -> bytes:
 
 
 def read_metadata(path: str | os.PathLike[str], key: str) -> str | None:
-    """Read the text of a metadata entry.
-
-    path : an .onnx file.
-    Returns: The last value if the key occurs several times, as in onnxruntime. None if the key is absent.
-    Raises ModelFileError, CardError.
-    """
+    """Read the text of a metadata entry: the last one if the key occurs several times, as in onnxruntime, or None."""
     wanted, value = key.encode(), None
     with open_model(path) as file:
         reader = _Reader(file, MAX_TOP_FIELDS)
@@ -199,14 +188,11 @@ class _Reader:
 
 
 def check_graph(blob: bytes, path: str | os.PathLike[str], *, trusted: bool = False) -> bool:
-    """Refuse a graph that could read other files, run without end or take all memory while it is opened.
+    """Refuse a graph that could read other files, run without end or take all memory while it is opened; if
+    ``trusted``, only one that is damaged or reads other files.
 
-    blob : the content of an .onnx file.
-    path : named in messages.
-    trusted : only refuse what is damaged or reads other files.
-    Returns: Whether what depends on constants alone may be computed while the file is opened; else it has to wait for
+    Returns whether what depends on constants alone may be computed while the file is opened; else it has to wait for
         the first run, which can be stopped.
-    Raises ModelFileError.
     """
     if blob[4:8] == b"ORTM":  # onnxruntime would read it in its own format, which is not checked here
         raise ModelFileError(f"{os.fspath(path)} is in onnxruntime's own format; expected an .onnx file")

@@ -14,7 +14,7 @@ from ..errors import ModelError, PointsError
 from ..system.fields import Fields
 from .choices import STATIC
 from .mounting import MODEL_MOUNTING, Mounting
-from .points import Labels, Mask
+from .points import Floats, Floats32, Ints, Labels, Mask
 from .sensor import RemissionFunction
 from .views import TopViewGeometry
 
@@ -52,7 +52,7 @@ class Box:
     yaw: float
     front: float | None = None
 
-    def corners(self) -> NDArray[np.float64]:
+    def corners(self) -> Floats:
         """Corners of the footprint, (4, 2) x, y [m]: front-left, rear-left, rear-right, front-right."""
         along, across = self.size[0] / 2.0, self.size[1] / 2.0
         local = np.array([[along, across], [-along, across], [-along, -across], [along, -across]])
@@ -117,9 +117,9 @@ class TopView:
     cell_m: float
     x_range_m: tuple[float, float]
     y_range_m: tuple[float, float]
-    observed: NDArray[np.bool_]
+    observed: Mask
     mounting: Mounting = MODEL_MOUNTING
-    between_beams: NDArray[np.bool_] | None = None
+    between_beams: Mask | None = None
 
     @property
     def geometry(self) -> TopViewGeometry:
@@ -127,14 +127,14 @@ class TopView:
         return TopViewGeometry(self.x_range_m, self.y_range_m, cell_m=self.cell_m)
 
     @property
-    def road(self) -> NDArray[np.bool_]:
+    def road(self) -> Mask:
         """Cells labeled drivable, observed or not, (rows, columns) bool; all False if the model has no such class."""
         if "drivable" not in self.classes:
             return np.zeros(self.labels.shape, dtype=np.bool_)
         return self.labels == self.classes.index("drivable")
 
     @property
-    def drivable(self) -> NDArray[np.bool_]:
+    def drivable(self) -> Mask:
         """Cells labeled drivable that the scan observed, (rows, columns) bool. An empty scan has none."""
         return self.road & self.observed
 
@@ -226,7 +226,7 @@ class ImageLabels:
     classes: tuple[str, ...]
 
     @property
-    def drivable(self) -> NDArray[np.bool_]:
+    def drivable(self) -> Mask:
         """Pixels of the road, (H, W) bool: of a class called road or drivable; all False if there is none."""
         roads = [k for k, name in enumerate(self.classes) if name.casefold() in ROADS]
         is_road = np.zeros(self.labels.shape, np.bool_)
@@ -280,9 +280,9 @@ class GroundSurface:
 
     plane: tuple[float, float, float] | None
     expected: tuple[float, float, float]
-    planes: NDArray[np.float64] | None
-    cells: NDArray[np.int32]
-    lowest: NDArray[np.float32]
+    planes: Floats | None
+    cells: Ints
+    lowest: Floats32
 
 
 @dataclass(frozen=True, slots=True)
@@ -433,7 +433,7 @@ class Perception:
         """``ground``; `ModelError`, which names the model to add, if it is None."""
         return _required(self.ground, "no ground", "pointseg", "and leave agree=True")
 
-    def to_map(self, points: NDArray[Any]) -> NDArray[np.float64]:
+    def to_map(self, points: NDArray[Any]) -> Floats:
         """Coordinates of points of the scan in the map, x, y, z [m], (n, 3) float64; exact, unlike float32.
 
         Parameters

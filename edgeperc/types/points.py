@@ -12,7 +12,13 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from ..errors import OptionError, PointsError
 
-# Arrays by what they hold; n points.
+# Arrays by the type of their numbers, and by what they hold; n points.
+Floats = NDArray[np.float64]
+Floats32 = NDArray[np.float32]
+Ints = NDArray[np.int32]
+Ints64 = NDArray[np.int64]
+Bytes = NDArray[np.uint8]
+Records = NDArray[np.void]
 Points = NDArray[np.float32]  # (n, 4): x, y, z [m], remission
 Heights = NDArray[np.float32]  # (n,): above the ground below [m]; NaN for points that are not finite
 Labels = NDArray[np.uint8]  # (n,) or (rows, columns): index of a class
@@ -33,48 +39,29 @@ class MapError(PointsError):
 
 
 class Cloud(NamedTuple):
-    """Points as kernels take them.
+    """Points as kernels take them."""
 
-    Attributes
-    ----------
-    points : (n, 3 or more) float32, C-contiguous, read-only
-        x, y, z [m].
-    height : (n,) float32, read-only
-        Above the ground [m].
-    """
-
-    points: NDArray[np.float32]
-    height: NDArray[np.float32]
+    points: NDArray[np.float32]  # (n, 3 or more) x, y, z [m]
+    height: NDArray[np.float32]  # (n,) above the ground [m]
 
 
 class Labeled(NamedTuple):
-    """Labels of points as kernels take them.
+    """Labels of points as kernels take them."""
 
-    Attributes
-    ----------
-    labels : (n,) uint8
-    roles : (classes,) uint8
-        What each label is for the kernel; 0 for what it does not treat.
-    """
-
-    labels: NDArray[np.uint8]
-    roles: NDArray[np.uint8]
+    labels: NDArray[np.uint8]  # (n,)
+    roles: NDArray[np.uint8]  # (classes,) what each label is for the kernel; 0 for what it does not treat
 
 
 def as_points(
     array: ArrayLike, *, remission_field: str | None = None, origin_m: Sequence[float] | None = None
 ) -> NDArray[np.float32]:
-    """Convert an array to points.
+    """Convert an array to points, (n, 4) float32 C-contiguous: itself if it has this form.
 
-    array : (n, 4) or (n, 3) array of numbers, or a structured array; any float or integer dtype, byte order and
-        memory layout. The columns are x, y, z [m], remission; without the fourth, remission is 0. A structured array
-        (any shape, e.g. that of a PointCloud2 message) needs the fields x, y and z; other fields and padding are
-        skipped. So does a data frame with such names (pandas, polars).
-    remission_field : as in `read_points`; structured arrays only.
-    origin_m : subtracted from x, y, z [m] before they become float32.
-    Returns (n, 4) float32, C-contiguous: The given array itself if it already has this form. Values beyond the range
-        of float32 become infinite.
-    Raises PointsError: Also for coordinates of a map, which float32 would round by more than 5 mm.
+    array : (n, 4) or (n, 3), of any float or integer dtype, byte order and memory layout: x, y, z [m], remission, 0
+        without it. A structured array (any shape, e.g. that of a PointCloud2 message) needs the fields x, y and z;
+        other fields and padding are skipped. So does a data frame with such names (pandas, polars).
+    origin_m : subtracted from x, y, z [m] before they become float32. Raises PointsError: Also for coordinates of a
+        map, which float32 would round by more than 5 mm.
     """
     if isinstance(array, np.ma.MaskedArray):
         raise PointsError("got a masked array; fill it first, e.g. with array.filled(np.nan)")
@@ -198,10 +185,7 @@ def as_float64(values: NDArray[Any]) -> NDArray[np.float64]:
 
 
 def remission_name(names: Iterable[str], wanted: str | None) -> str | None:
-    """Name of the remission field: the wanted one, or the first known name that is present; None if there is none.
-
-    Raises PointsError.
-    """
+    """Name of the remission field: the wanted one, or the first known name that is present; None if there is none."""
     present = list(names)
     if wanted is None:
         return next((name for name in _REMISSION_NAMES if name in present), None)
@@ -222,15 +206,7 @@ def assemble(
     remission_field: str | None,
     origin_m: Sequence[float] | None = None,
 ) -> NDArray[np.float32]:
-    """Build points from named columns.
-
-    n : number of points.
-    fields : mapping of str to (n,) array; columns by `plain_name`.
-    names : all fields of the source, for the error message.
-    remission_field, origin_m : as in `as_points`.
-    Returns (n, 4) float32: x, y, z [m], remission; 0 without a remission field.
-    Raises PointsError.
-    """
+    """Build points (n, 4) from columns by `plain_name`; errors list ``names``. Remission is 0 without such a field."""
     missing = [axis for axis in "xyz" if axis not in fields]
     if missing:
         raise PointsError(
@@ -258,10 +234,7 @@ def assemble(
 
 
 def as_origin(given: Sequence[float]) -> tuple[float, float, float]:
-    """A place in a map, x, y, z [m].
-
-    Raises OptionError.
-    """
+    """A place in a map, x, y, z [m]."""
     try:
         x, y, z = (float(value) for value in given)
     except (OverflowError, TypeError, ValueError) as exc:

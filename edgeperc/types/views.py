@@ -8,10 +8,11 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from ..errors import CardError
 from ..system.fields import Fields
+from .points import Floats, Ints64, Mask
 
 MAX_ROWS, MAX_COLUMNS, MAX_PIXELS = 4096, 65_536, 16 * 10**6
 MIN_SECTOR_DEG = 1.0
@@ -31,16 +32,13 @@ def check_size(rows: int, columns: int) -> None:
 
 @dataclass(frozen=True, slots=True)
 class TopViewGeometry:
-    """The ground ahead as an image (SSADNet 2.1.2). Row 0 is farthest ahead, column 0 leftmost.
+    """The ground ahead as an image (SSADNet 2.1.2). Row 0 is farthest ahead, column 0 leftmost."""
 
-    x_range_m, y_range_m, z_range_m : bounds of the view [m] in the sensor frame, lower first.
-    cell_m : edge of a cell [m].
-    """
-
+    # bounds of the view [m] in the sensor frame, lower first
     x_range_m: tuple[float, float] = (6.0, 46.0)
     y_range_m: tuple[float, float] = (-10.0, 10.0)
     z_range_m: tuple[float, float] = (-2.5, 2.5)
-    cell_m: float = 0.1
+    cell_m: float = 0.1  # edge of a cell [m]
 
     def __post_init__(self) -> None:
         for name in ("x_range_m", "y_range_m", "z_range_m"):
@@ -69,13 +67,9 @@ class TopViewGeometry:
         (near, far), (right, left) = self.x_range_m, self.y_range_m
         return near <= x < far and right <= y < left
 
-    def cells(self, x: ArrayLike, y: ArrayLike) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]:
-        """Find the cells that contain some positions.
-
-        x, y : array_like; positions in the sensor frame [m]; their shapes must broadcast.
-        Returns rows, cols: ndarray of int64.
-        Returns in_view (ndarray of bool): False if a position is out of view or not finite; its row and column are
-            then not valid.
+    def cells(self, x: ArrayLike, y: ArrayLike) -> tuple[Ints64, Ints64, Mask]:
+        """Find the rows and columns of the cells that contain some positions [m], and whether they are in view and
+        finite; otherwise, row and column are not valid.
         """
         row = np.floor((self.x_range_m[1] - np.asarray(x)) / self.cell_m)
         col = np.floor((self.y_range_m[1] - np.asarray(y)) / self.cell_m)
@@ -83,7 +77,7 @@ class TopViewGeometry:
         with np.errstate(invalid="ignore"):  # NaN and what int64 cannot hold are out of view
             return row.astype(np.int64), col.astype(np.int64), in_view
 
-    def cell_centers(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def cell_centers(self) -> tuple[Floats, Floats]:
         """Centers of the cells in the sensor frame [m]: x (rows, 1) and y (1, columns)."""
         # np.float64, because older type stubs of numpy widen the type of a product with a Python float
         cell_m = np.float64(self.cell_m)
@@ -94,17 +88,12 @@ class TopViewGeometry:
 
 @dataclass(frozen=True, slots=True)
 class RangeImageGeometry:
-    """The scan as seen from the sensor (PointSeg 3.1). Row 0 is the top beam, column 0 leftmost.
+    """The scan as seen from the sensor (PointSeg 3.1). Row 0 is the top beam, column 0 leftmost."""
 
-    row_elevations_deg : elevation of every row [deg], top to bottom, strictly decreasing, not necessarily evenly
-        spaced.
-    width : columns, evenly spread over the azimuths.
-    azimuth_left_deg, azimuth_right_deg : azimuths of the image's left and right edges [deg], counter-clockwise from +x;
-        180 and -180 for a full turn.
-    """
-
+    # elevation of every row [deg], top to bottom, strictly decreasing, not necessarily evenly spaced
     row_elevations_deg: tuple[float, ...]
-    width: int = 512
+    width: int = 512  # columns, evenly spread over the azimuths
+    # azimuths of the image's left and right edges [deg], counter-clockwise from +x; 180 and -180 for a full turn
     azimuth_left_deg: float = 45.0
     azimuth_right_deg: float = -45.0
 
@@ -137,16 +126,13 @@ class RangeImageGeometry:
 
 @dataclass(frozen=True, slots=True)
 class CameraGeometry:
-    """The image of a camera, scaled to the network's input. Row 0 is the top, column 0 leftmost.
+    """The image of a camera, scaled to the network's input. Row 0 is the top, column 0 leftmost."""
 
-    width, height : columns and rows of the input.
-    fit : {"stretch"}; how an image of another size gets there: all of it is scaled to ``width`` and ``height``,
-        bilinearly with half-pixel centers (`edgeperc.camera.image.ImageScaler`), whatever its aspect; nothing is
-        cropped or padded.
-    """
-
+    # columns and rows of the input
     width: int
     height: int
+    # {"stretch"}; how an image of another size gets there: all of it is scaled to ``width`` and ``height``, bilinearly
+    # with half-pixel centers (`edgeperc.camera.image.ImageScaler`), whatever its aspect; nothing is cropped or padded
     fit: Literal["stretch"] = "stretch"
 
     def __post_init__(self) -> None:
@@ -161,16 +147,11 @@ class CameraGeometry:
 
 @dataclass(frozen=True, slots=True)
 class ObjectGeometry:
-    """The points of each place where an object may be, one row of the batch each (`edgeperc.objects.crops`).
+    """The points of each place where an object may be, one row of the batch each (`edgeperc.objects.crops`)."""
 
-    n_points : points of a candidate that the network sees.
-    margin_m : they lie in the candidate's rectangle, grown by this on every side [m].
-    height_range_m : lowest and greatest height above the ground of these points [m].
-    """
-
-    n_points: int = 64
-    margin_m: float = 0.8
-    height_range_m: tuple[float, float] = (0.1, 4.2)
+    n_points: int = 64  # points of a candidate that the network sees
+    margin_m: float = 0.8  # they lie in the candidate's rectangle, grown by this on every side [m]
+    height_range_m: tuple[float, float] = (0.1, 4.2)  # lowest and greatest height above the ground of these points [m]
 
     def __post_init__(self) -> None:
         _FIELDS.whole("view.n_points", self.n_points, 1, MAX_COLUMNS)

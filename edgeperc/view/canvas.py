@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..system.atomic import write_atomic
 from ..system.extras import require
+from ..types.points import Floats
 from .colors import FAINT, FRAME, GROUND, INK, PANEL, color_of
 
 _DPI = 100.0
@@ -187,8 +187,8 @@ def place_labels(
 
 
 def free_place(
-    area: Sequence[float], half: NDArray[np.float64], taken: NDArray[np.float64], panel: Sequence[float]
-) -> tuple[NDArray[np.float64], float] | None:
+    area: Sequence[float], half: Floats, taken: Floats, panel: Sequence[float]
+) -> tuple[Floats, float] | None:
     """Middle of the free place [px] nearest to a named area, for a label of ``half`` a width and height, and their
     distance; inside the panel, on nothing that is taken (k, 4). None if there is none within 150 pixels.
     """

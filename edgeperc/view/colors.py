@@ -7,6 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..types.points import Floats
+
 # CIELAB distance of at least 21 for normal, deuteranope, protanope and tritanope vision (Machado et al. 2009). With the
 # palette of Okabe and Ito it is 5: a deuteranope sees pedestrians in the gray of the background.
 CLASS_COLORS = {
@@ -48,12 +50,12 @@ def color_of(name: str) -> str:
     return CLASS_COLORS.get(lower) or SCENE_COLORS.get(lower, _OTHER_COLOR)
 
 
-def rgb(colors: list[str]) -> NDArray[np.float64]:
+def rgb(colors: list[str]) -> Floats:
     """Colors "#rrggbb" as (n, 3) float64 in 0..1."""
     return np.array([[int(c[k : k + 2], 16) / 255.0 for k in (1, 3, 5)] for c in colors]).reshape(-1, 3)
 
 
-def ramp(value: NDArray[Any], low: float, high: float) -> NDArray[np.float64]:
+def ramp(value: NDArray[Any], low: float, high: float) -> Floats:
     """Interpolate from LOW (at ``low``) to HIGH (at ``high``): colors (n, 3) float64 in 0..1."""
     share = np.clip((value - low) / (high - low), 0.0, 1.0)[..., None]
     dim, bright = rgb([LOW, HIGH])

@@ -17,7 +17,7 @@ from ..system.printable import printable
 from ..types.frame import ModelFrame
 from ..types.mounting import MODEL_HEIGHT_M, MODEL_MOUNTING
 from ..types.perception import Box, ImageLabels, Perception, TopView
-from ..types.points import Points
+from ..types.points import Bytes, Floats, Floats32, Mask, Points
 from .colors import CLASS_COLORS
 
 if TYPE_CHECKING:
@@ -49,7 +49,7 @@ def drivable_strips(view: TopView) -> NDArray[np.intp]:
     return np.column_stack([row, first, last])
 
 
-def perceived_image(image: ArrayLike, perception: Perception) -> tuple[NDArray[np.uint8], ImageLabels]:
+def perceived_image(image: ArrayLike, perception: Perception) -> tuple[Bytes, ImageLabels]:
     """The image that was perceived, checked, and its labels; `ImageError` if it is another."""
     image, labels = as_image(image), perception.image
     if labels is None or labels.labels.shape != image.shape[:2]:
@@ -58,7 +58,7 @@ def perceived_image(image: ArrayLike, perception: Perception) -> tuple[NDArray[n
     return image, labels
 
 
-def in_model_frame(perception: Perception, points: Points) -> tuple[Perception, NDArray[np.float32]]:
+def in_model_frame(perception: Perception, points: Points) -> tuple[Perception, Floats32]:
     """The perception with its boxes, and its scan, in the frame of the models, where the top view lies."""
     frame = ModelFrame(perception.mounting)
     if frame.is_identity:
@@ -70,7 +70,7 @@ def in_model_frame(perception: Perception, points: Points) -> tuple[Perception, 
     return replace(perception, boxes=boxes, top_view=top_view, mounting=MODEL_MOUNTING), frame.move(points)
 
 
-def drawable_points(points: Points) -> NDArray[np.bool_]:
+def drawable_points(points: Points) -> Mask:
     """Which points are finite and within 1 km, (n,) bool."""
     return np.asarray(np.isfinite(points).all(axis=1) & (np.abs(points[:, :3]) < _REACH_M).all(axis=1))
 
@@ -86,7 +86,7 @@ def drawable_boxes(boxes: Iterable[Box]) -> list[Box]:
     ]
 
 
-def paint_points(points: Points, perception: Perception) -> tuple[list[str], NDArray[np.uint8]]:
+def paint_points(points: Points, perception: Perception) -> tuple[list[str], Bytes]:
     """Classes of both views, and the one to show for every point: its own or that of its cell for background."""
     names = list(perception.points.classes if perception.points is not None else ("background",))
     painted = np.zeros(len(points), dtype=np.uint8)
@@ -113,7 +113,7 @@ def paint_points(points: Points, perception: Perception) -> tuple[list[str], NDA
     return names, painted
 
 
-def paint_vehicles(names: list[str], painted: NDArray[np.uint8], points: Points, boxes: Iterable[Box]) -> None:
+def paint_vehicles(names: list[str], painted: Bytes, points: Points, boxes: Iterable[Box]) -> None:
     """Give points of cars in the box of a van or a truck its class; networks of points have one class for all three."""
     cars = np.flatnonzero(painted == names.index("car")) if "car" in names else np.empty(0, np.intp)
     cars = cars[drawable_points(points[cars])]
@@ -135,7 +135,7 @@ def ground_plane(perception: Perception, points: Points) -> tuple[float, float, 
     return level, slope_x, slope_y
 
 
-def box_corners(box: Box) -> NDArray[np.float64]:
+def box_corners(box: Box) -> Floats:
     """The eight corners, (8, 3) float64 [m]: the four of `Box.corners` at the bottom, then at the top."""
     z = box.center[2] + np.repeat([-0.5, 0.5], 4) * box.size[2]
     return np.column_stack([np.tile(box.corners(), (2, 1)), z])

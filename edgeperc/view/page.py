@@ -20,7 +20,7 @@ from ..system.atomic import open_atomic
 from ..system.printable import printable
 from ..types.frame import ModelFrame
 from ..types.perception import Box, Perception, TopView
-from ..types.points import Points
+from ..types.points import Bytes, Floats32, Points
 from .colors import HIGH, LOW, color_of
 from .content import (
     box_corners,
@@ -120,13 +120,7 @@ class DrivePage:
         return len(self._scans)
 
     def add(
-        self,
-        perception: Perception,
-        points: Points,
-        stamp_s: float,
-        tracks: Tracks | None = None,
-        *,
-        name: str = "",
+        self, perception: Perception, points: Points, stamp_s: float, tracks: Tracks | None = None, *, name: str = ""
     ) -> None:
         """Add the next scan of the drive.
 
@@ -204,8 +198,8 @@ class _Thin:
     text: str
     stamp_s: float
     xyz: NDArray[np.int16]
-    remission: NDArray[np.uint8]
-    label: NDArray[np.uint8]
+    remission: Bytes
+    label: Bytes
 
     @property
     def n_bytes(self) -> int:
@@ -221,7 +215,7 @@ class _Thin:
         return self.text[:-1] + "".join(f', "{key}": "{_base64(part)}"' for key, part in parts.items()) + "}"
 
 
-def _sample(xyz: Points, label: NDArray[np.uint8], names: list[str], n: int) -> NDArray[np.intp]:
+def _sample(xyz: Points, label: Bytes, names: list[str], n: int) -> NDArray[np.intp]:
     """Indices of at most ``n`` points, drawn without replacement; the first k of them are such a sample of k points."""
     objects = np.array([name not in ("background", "drivable") for name in names])
     # A scan is denser near the sensor, by about the square of the distance.
@@ -234,7 +228,7 @@ def _sample(xyz: Points, label: NDArray[np.uint8], names: list[str], n: int) -> 
 
 def _scan(
     perception: Perception, points: Points, classes: dict[str, int], tracks: Tracks | None = None
-) -> tuple[dict[str, Any], NDArray[np.float32], NDArray[np.uint8], NDArray[np.uint8]]:
+) -> tuple[dict[str, Any], Floats32, Bytes, Bytes]:
     """What the page shows of a scan, and its points: x, y, z, remission and class; new classes get the next numbers."""
     facts = class_facts(perception)
     boxes, texts = _boxes(perception, tracks)

@@ -7,13 +7,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..camera.calibration import Calibration
 from ..camera.painting import UNSEEN, camera_road, paint
 from ..types.frame import ModelFrame
 from ..types.perception import Box, Perception, TopView
-from ..types.points import Labels, Points
+from ..types.points import Bytes, Floats, Labels, Points
 from ..types.sensor import SensorProfile
 from .canvas import add_axes, as_png, height_of_legend, new_figure, write_heading
 from .colors import FAINT, INK, color_of, rgb
@@ -28,7 +27,7 @@ _BESIDE_M, _BEHIND_M, _BEYOND_M = 4.0, 8.0, 2.0  # of the panel from above, outs
 
 def draw_painted(
     perception: Perception,
-    image: NDArray[np.uint8],
+    image: Bytes,
     points: Points,
     calibration: Calibration,
     path: str | Path | None = None,
@@ -104,13 +103,7 @@ def draw_painted(
 
 
 def _draw_points(
-    figure: Any,
-    place: Place,
-    image: NDArray[np.uint8],
-    points: Points,
-    calibration: Calibration,
-    colors: NDArray[np.float64],
-    painted: Labels,
+    figure: Any, place: Place, image: Bytes, points: Points, calibration: Calibration, colors: Floats, painted: Labels
 ) -> None:
     more = "in the colors of their pixels; black: hidden or no class"
     write_heading(figure, place[0], place[1] - 20, "the points in the image", more)
@@ -128,13 +121,7 @@ def _draw_points(
 
 
 def _draw_from_above(
-    figure: Any,
-    room: Place,
-    points: Points,
-    road: TopView,
-    boxes: tuple[Box, ...],
-    colors: NDArray[np.float64],
-    painted: Labels,
+    figure: Any, room: Place, points: Points, road: TopView, boxes: tuple[Box, ...], colors: Floats, painted: Labels
 ) -> None:
     from matplotlib.patches import Polygon
 

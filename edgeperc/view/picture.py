@@ -8,12 +8,11 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..road.ahead import FreeAhead, RoadAhead, road_ahead
 from ..types.choices import STATIC
 from ..types.perception import Box, Perception, TopView
-from ..types.points import Labels, Points
+from ..types.points import Bytes, Floats, Labels, Points
 from .canvas import (
     Label,
     add_axes,
@@ -69,14 +68,14 @@ class _Drawn(NamedTuple):
     ground: tuple[float, float, float]  # `ground_plane`
 
     @property
-    def above_m(self) -> NDArray[np.float64]:
+    def above_m(self) -> Floats:
         """Heights of the points above the ground."""
         a, b, c = self.ground
         x, y, z = self.points[:, :3].astype(np.float64).T
         return z - (a + b * x + c * y)
 
     @property
-    def colors(self) -> NDArray[np.float64]:
+    def colors(self) -> Floats:
         """Colors of the points' classes."""
         return rgb([color_of(name) for name in self.names])[self.painted]
 
@@ -148,9 +147,7 @@ def draw(perception: Perception, points: Points, path: str | Path | None = None,
     return as_png(figure, path)
 
 
-def draw_image(
-    perception: Perception, image: NDArray[np.uint8], path: str | Path | None = None, *, title: str = ""
-) -> bytes:
+def draw_image(perception: Perception, image: Bytes, path: str | Path | None = None, *, title: str = "") -> bytes:
     """Draw a camera's image under the classes of its pixels.
 
     Parameters
@@ -211,7 +208,7 @@ def write_frame(
     write_at(figure, _MARGIN, tops[1], ran, fontsize=12.0, color=FAINT)
 
 
-def _draw_arrow(axes: Any, corners: NDArray[np.float64], zorder: int) -> None:
+def _draw_arrow(axes: Any, corners: Floats, zorder: int) -> None:
     """Draw the outline of what is free ahead, filled with a veil."""
     from matplotlib.patches import Polygon
 
@@ -219,7 +216,7 @@ def _draw_arrow(axes: Any, corners: NDArray[np.float64], zorder: int) -> None:
     axes.add_patch(Polygon(corners, closed=True, fill=False, edgecolor=INK, linewidth=1.5, zorder=zorder))
 
 
-def _strip(ahead: FreeAhead, x_near: float) -> tuple[str, NDArray[np.float64] | None]:
+def _strip(ahead: FreeAhead, x_near: float) -> tuple[str, Floats | None]:
     """The free distance ahead as text, and the corners x, y [m] of an arrow of that length; None for no arrow."""
     free_m = ahead.free_m
     if ahead.end is None:
@@ -437,7 +434,7 @@ def _draw_from_behind(figure: Any, place: Place, drawn: _Drawn) -> None:
     write_heading(figure, place[0], place[1] - 20, "from behind", _omitted(more, n_omitted))
 
 
-def _clipped(start: NDArray[np.float64], end: NDArray[np.float64]) -> NDArray[np.float64] | None:
+def _clipped(start: Floats, end: Floats) -> Floats | None:
     """The part of an edge in front of the camera, (2, 3); None if all of it is behind."""
     if start[2] > end[2]:
         start, end = end, start
@@ -449,13 +446,8 @@ def _clipped(start: NDArray[np.float64], end: NDArray[np.float64]) -> NDArray[np
 
 
 def _ground_layer(
-    top_view: TopView,
-    ground: tuple[float, float, float],
-    eye: NDArray[np.float64],
-    turn: NDArray[np.float64],
-    wide: float,
-    tall: float,
-) -> NDArray[np.float64]:
+    top_view: TopView, ground: tuple[float, float, float], eye: Floats, turn: Floats, wide: float, tall: float
+) -> Floats:
     """The drivable cells on the ground as seen by the camera: RGBA, (rows, columns, 4) float64 in 0..1."""
     columns = 1200
     rows = max(1, round(columns * tall / wide))

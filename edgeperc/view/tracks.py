@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..errors import TrackingError
 from ..ground.planes import find_ground, heights_above
@@ -20,7 +19,7 @@ from ..system.clock import elapsed_s
 from ..system.extras import require
 from ..types.frame import ModelFrame
 from ..types.perception import Perception
-from ..types.points import Points
+from ..types.points import Bytes, Floats, Points
 from .canvas import free_place
 from .colors import CLASS_COLORS, FAINT, FRAME, GROUND, HIGH, INK, LOW, PANEL, color_of, rgb
 from .content import drawable_boxes, drawable_points, paint_points
@@ -186,7 +185,7 @@ def draw_tracks(
     return stream.getvalue()
 
 
-def _layer_colors() -> NDArray[np.uint8]:
+def _layer_colors() -> Bytes:
     """Color of each value of a flattened scan, (values, 3) uint8."""
     panel, low, high, drivable = rgb([PANEL, LOW, HIGH, CLASS_COLORS["drivable"]])
     points = [panel + share * (color - panel) for color, share in ((low, 0.5), (low, 0.95), (high, 0.6))]
@@ -206,7 +205,7 @@ def _palette(Image: Any) -> Any:
     return picture
 
 
-def _pixels(places: NDArray[np.float64]) -> list[tuple[float, float]]:
+def _pixels(places: Floats) -> list[tuple[float, float]]:
     """x, y [m] in the sensor frame -> pixels of the picture before it is reduced."""
     places = places[:, :2].clip(-1e3, 1e3)
     return [
@@ -228,7 +227,7 @@ def _draw_rings(pen: Any, font: Any) -> None:
     pen.polygon(_pixels(np.array([[2.2, 0.0], [-1.4, 0.9], [-1.4, -0.9]])), fill=INK)
 
 
-def _draw_track(pen: Any, track: Track, trail: NDArray[np.float64]) -> None:
+def _draw_track(pen: Any, track: Track, trail: Floats) -> None:
     """Draw trail, box and velocity."""
     color = color_of(track.label)
     if len(trail) > 1:

@@ -9,7 +9,6 @@ from functools import partial
 from itertools import chain
 
 import numpy as np
-from numpy.typing import NDArray
 
 from edgeperc.datasets.layout import class_number
 from edgeperc.ground.planes import find_ground
@@ -20,6 +19,7 @@ from edgeperc.simulation.scene import POINT_CLASSES
 from edgeperc.types.geometry import inside
 from edgeperc.types.mounting import MODEL_HEIGHT_M
 from edgeperc.types.perception import Box
+from edgeperc.types.points import Floats32, Ints64, Points
 from edgeperc.types.sensor import SensorProfile
 
 from .beams import taken_by
@@ -46,14 +46,10 @@ AHEAD_SLOPE, AHEAD_MARGIN_M = 1.43, 2.0
 
 @dataclass(frozen=True)
 class ObjectBank:
-    """Objects cut out of labeled scans, to paste into others (ground-truth sampling of SECOND; Yan et al., 2018).
+    """Objects cut out of labeled scans, to paste into others (ground-truth sampling of SECOND; Yan et al., 2018)."""
 
-    objects : dict of str to list of (Box, (n, 4) float32); label -> boxes and the points in them.
-    classes : classes of points that pasted objects get, the background first.
-    """
-
-    objects: dict[str, list[tuple[Box, NDArray[np.float32]]]]
-    classes: tuple[str, ...] = POINT_CLASSES
+    objects: dict[str, list[tuple[Box, Floats32]]]  # label -> boxes and the points in them
+    classes: tuple[str, ...] = POINT_CLASSES  # classes of points that pasted objects get, the background first
 
     @classmethod
     def of(
@@ -67,16 +63,14 @@ class ObjectBank:
 
         ``n_workers`` processes look for them; 0: this one. The bank is the same.
         """
-        objects: dict[str, list[tuple[Box, NDArray[np.float32]]]] = {}
+        objects: dict[str, list[tuple[Box, Floats32]]] = {}
         with mapped(partial(_cut_out, fewest=fewest, classes=classes), scans, n_workers) as found:
             for name, piece in chain.from_iterable(found):
                 objects.setdefault(name, []).append(piece)
         return cls(objects, classes)
 
 
-def _cut_out(
-    scan: LabeledScan, *, fewest: int, classes: tuple[str, ...]
-) -> list[tuple[str, tuple[Box, NDArray[np.float32]]]]:
+def _cut_out(scan: LabeledScan, *, fewest: int, classes: tuple[str, ...]) -> list[tuple[str, tuple[Box, Floats32]]]:
     """The objects of one scan and pieces of its background, each with its kind."""
     found = []
     for box, count in zip(scan.boxes, scan.counts, strict=True):
@@ -90,15 +84,12 @@ def _cut_out(
     return found + [(box.label, (box, points)) for box, points in background_pieces(scan, fewest)]
 
 
-def background_pieces(scan: LabeledScan, fewest: int = 8) -> Iterator[tuple[Box, NDArray[np.float32]]]:
-    """Poles, trunks and signs, and pieces of walls, hedges and banks, cut out of what is known to be background.
+def background_pieces(scan: LabeledScan, fewest: int = 8) -> Iterator[tuple[Box, Floats32]]:
+    """Poles, trunks and signs, and pieces of walls, hedges and banks of at least ``fewest`` points, cut out of what is
+    known to be background; each with a box on the ground, a ``"pole"`` or a ``"wall"``.
 
     A pole is a cluster at most 0.9 m wide, between 0.4 and 1.8 m above the ground, that goes on above 2 m. A wall is a
     cluster longer than 4 m; each gives the piece around its nearest point and the one around its middle.
-
-    fewest : fewest points of a piece.
-    Yields box: Around the piece, standing on the ground, with the label ``"pole"`` or ``"wall"``.
-    Yields points: (n, 4) float32.
     """
     points = scan.points
     if not len(points):
@@ -207,7 +198,7 @@ def pasted(
     )
 
 
-def resized(box: Box, points: NDArray[np.float32], rng: np.random.Generator) -> tuple[Box, NDArray[np.float32]]:
+def resized(box: Box, points: Points, rng: np.random.Generator) -> tuple[Box, Floats32]:
     """An object 15 % smaller or larger and farther away by up to `MAX_STRETCH`, with one return in each ray."""
     x, y, z = box.center
     farthest = max(1.0, MAX_PERSON_RANGE_M / max(np.hypot(x, y), 1.0))
@@ -231,7 +222,7 @@ def _close(box: Box, other: Box) -> bool:
     return bool(apart < 0.45 * (np.hypot(*box.size[:2]) + np.hypot(*other.size[:2])))
 
 
-def _rays(points: NDArray[np.float32]) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+def _rays(points: Points) -> tuple[Ints64, Floats32]:
     """The ray number of each point, and its range [m]."""
     # The beams of an HDL-64E are 0.4 degrees apart, its columns 0.17.
     flat = np.hypot(points[:, 0], points[:, 1])
@@ -308,28 +299,18 @@ def facing(scan: LabeledScan, rng: np.random.Generator) -> float:
 
 @dataclass(frozen=True, slots=True)
 class Augmentation:
-    """How scans are changed at random.
+    """How scans are changed at random."""
 
-    n_pasted : mean number of objects to paste.
-    odds : how often each kind is pasted; None: equally often.
-    turn_to_rare : share of the scans labeled on all sides that are turned to a pedestrian or cyclist.
-    turn_anywhere : share of the remaining ones that are turned by any angle.
-    weather : share of scans in bad weather.
-    n_negatives : mean number of pieces of background to paste.
-    negatives : how often each kind is pasted.
-    tilt_deg : standard deviation of the errors of roll and pitch [deg]; the errors are at most twice as large.
-    no_remission : share of scans whose remission is the constant that stands for a missing one.
-    """
-
-    n_pasted: float = 0.0
-    odds: Mapping[str, float] | None = None
-    turn_to_rare: float = 0.0
-    turn_anywhere: float = 0.0
-    weather: float = 0.0
-    n_negatives: float = 0.0
-    negatives: Mapping[str, float] = field(default_factory=lambda: NEGATIVES)
+    n_pasted: float = 0.0  # mean number of objects to paste
+    odds: Mapping[str, float] | None = None  # how often each kind is pasted; None: equally often
+    turn_to_rare: float = 0.0  # share of the scans labeled on all sides that are turned to a pedestrian or cyclist
+    turn_anywhere: float = 0.0  # share of the remaining ones that are turned by any angle
+    weather: float = 0.0  # share of scans in bad weather
+    n_negatives: float = 0.0  # mean number of pieces of background to paste
+    negatives: Mapping[str, float] = field(default_factory=lambda: NEGATIVES)  # how often each kind is pasted
+    # standard deviation of the errors of roll and pitch [deg]; the errors are at most twice as large
     tilt_deg: float = 0.0
-    no_remission: float = 0.0
+    no_remission: float = 0.0  # share of scans whose remission is the constant that stands for a missing one
 
 
 def augmented(
@@ -342,10 +323,7 @@ def augmented(
     """The scan turned, mirrored, thinned, shifted in height and scaled in remission, all at random.
 
     A scan that is labeled on all sides (simulation) faces forwards or backwards along the street. Other scans are
-    turned by a few degrees only.
-
-    bank : objects to paste.
-    sensor : takes a scan of the training sensor (`beams.taken_by`); None: that one.
+    turned by a few degrees only. ``sensor`` takes a scan of the training sensor (`beams.taken_by`).
     """
     full = scan.azimuths[1] - scan.azimuths[0] >= 2.0 * np.pi
     angle = rng.normal(0.0, np.radians(5.0))

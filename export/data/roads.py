@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from edgeperc.errors import EdgepercError, MissingExtraError
 from edgeperc.simulation.samples import IGNORE
 from edgeperc.types.choices import VEHICLES
+from edgeperc.types.points import Bytes, Floats, Points
 from edgeperc.types.views import TopViewGeometry
 
 from .scans import SURFACE
@@ -29,13 +30,9 @@ LANE_RANGE_M = (3.0, 25.0)
 BRIGHTER = 0.15
 
 
-def ground_plane(points: NDArray[np.float32], seed: int = 0) -> NDArray[np.float64] | None:
-    """The ground plane near the vehicle (RANSAC, then least squares).
-
-    points : (n, 4) float32; x, y, z [m] in the frame of a sensor 1.73 m above the road, remission.
-    seed : of the random samples.
-    Returns (3,) float64 or None: a, b, c of z = a x + b y + c; None if there are fewer than 500 low points or no
-        plausible plane.
+def ground_plane(points: Points, seed: int = 0) -> Floats | None:
+    """The ground plane near the vehicle, z = a x + b y + c (RANSAC, then least squares), of a sensor 1.73 m above the
+    road; None with fewer than 500 low points or without a plausible plane.
     """
     # Not `edgeperc.ground.planes.find_ground`, which fits the lowest returns of cells: that plane is 0.3 to 12 cm lower
     # on 22 KITTI scans (median 4 cm). With it, the share of correct cells changes: of "no road" from 0.938 to
@@ -67,13 +64,10 @@ def ground_plane(points: NDArray[np.float32], seed: int = 0) -> NDArray[np.float
     return np.linalg.lstsq(np.c_[p[support, :2], np.ones(support.sum())], p[support, 2], rcond=None)[0]
 
 
-def sure_surface(points: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """Ground truth of the cells of `SURFACE` that a scan makes certain.
+def sure_surface(points: Points) -> Bytes:
+    """Ground truth of the cells of `SURFACE` that a scan makes certain: 1 road, 0 no road, `IGNORE` elsewhere.
 
     Low points in the lane ahead are road. Points above the ground, and areas brighter than the lane, are no road.
-
-    points : (n, 4) float32; x, y, z [m] in the sensor frame, remission in 0..1.
-    Returns (500, 500) uint8: 1 road, 0 no road, `IGNORE` elsewhere.
     """
     surface = np.full((SURFACE.height, SURFACE.width), IGNORE, np.uint8)
     plane = ground_plane(points)
@@ -106,12 +100,10 @@ def sure_surface(points: NDArray[np.float32]) -> NDArray[np.uint8]:
     return surface
 
 
-def drawn_roads(path: Path = DRAWN) -> dict[str, NDArray[np.uint8]]:
+def drawn_roads(path: Path = DRAWN) -> dict[str, Bytes]:
     """Hand-drawn roads: hash of the scan (`edgeperc.datasets.kitti.scan_hash`) -> mask (400, 200) uint8, 1 road.
 
     The file keeps the hash as ``scan`` of each image, because names of scans differ between copies of KITTI.
-
-    Raises DatabaseError, MissingExtraError.
     """
     try:
         drawn = read_coco([path])
@@ -121,13 +113,8 @@ def drawn_roads(path: Path = DRAWN) -> dict[str, NDArray[np.uint8]]:
     return {hashes[name]: mask_of(polygons, f"{path}: {name}") for name, polygons in drawn.items()}
 
 
-def with_road(surface: NDArray[np.uint8], road: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Ground truth with a drawn road.
-
-    surface : (500, 500) uint8; ground truth over `SURFACE`.
-    road : (400, 200) uint8; the drawn road over `VIEW`, from `mask_of`.
-    Returns (500, 500) uint8: ``road`` in its view, ``surface`` elsewhere.
-    """
+def with_road(surface: Bytes, road: Bytes) -> Bytes:
+    """Ground truth over `SURFACE` with a drawn road over `VIEW`, from `mask_of`."""
     x, y = SURFACE.cell_centers()
     row, col, drawn = VIEW.cells(x, y)
     return np.where(drawn, road[row % VIEW.height, col % VIEW.width], surface).astype(np.uint8)
@@ -151,8 +138,6 @@ def read_coco(paths: Iterable[Path]) -> dict[str, list[Any]]:
 
     Annotations of a category "road" or "drivable" are road. Scenes have the names of their image files. A scene with
     annotations but none of road has an empty list.
-
-    Raises DatabaseError.
     """
     roads: dict[str, list[Any]] = {}
     for path in paths:
@@ -187,12 +172,10 @@ def read_coco(paths: Iterable[Path]) -> dict[str, list[Any]]:
     return roads
 
 
-def mask_of(segmentations: Sequence[Any], source: str = "a polygon") -> NDArray[np.uint8]:
+def mask_of(segmentations: Sequence[Any], source: str = "a polygon") -> Bytes:
     """The union of COCO segmentations, (400, 200) uint8: 1 inside, 0 outside (section 3.3).
 
     ``source`` starts the error message.
-
-    Raises DatabaseError.
     """
     from faster_coco_eval.core import mask as coco
 
@@ -221,11 +204,8 @@ def mask_of(segmentations: Sequence[Any], source: str = "a polygon") -> NDArray[
 
 
 def write_coco(roads: Mapping[str, Sequence[Sequence[Sequence[float]]]], scans: Mapping[str, str] | None = None) -> str:
-    """The text of a COCO file.
-
-    roads : mapping of str to sequence; scene -> polygons -> corners (x, y) in pixels.
-    scans : mapping of str to str; scene -> `edgeperc.datasets.kitti.scan_hash`, because names differ between copies
-        of KITTI.
+    """The text of a COCO file of roads, by scene, polygons of corners (x, y) in pixels; and of the hash of each scene's
+    scan, because names differ between copies of KITTI.
     """
     images: list[dict[str, Any]] = []
     annotations: list[dict[str, Any]] = []

@@ -14,7 +14,6 @@ from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 from tqdm import tqdm
 
 from edgeperc.datasets.kitti import scan_hash
@@ -32,6 +31,7 @@ from edgeperc.simulation.scene import POINT_CLASSES
 from edgeperc.types.frame import ModelFrame
 from edgeperc.types.geometry import draw_footprints
 from edgeperc.types.mounting import Mounting
+from edgeperc.types.points import Bytes, Ints, Labels, Points
 from edgeperc.types.sensor import SensorProfile
 from edgeperc.types.views import RangeImageGeometry
 
@@ -44,16 +44,13 @@ NEAR_M = 0.5
 def read_scan_set(
     folder: ScanFolder, split: str, fold: int | None = None, *, classes: Sequence[str] = POINT_CLASSES
 ) -> tuple[list[LabeledScan], list[float], dict[str, str]]:
-    """Read the labeled scans of a split.
+    """Read the labeled scans of a split; objects of other classes than those of points are unknown (`IGNORE`).
 
     As in a `Perceiver`, what the description does not say of the mounting is estimated from the first scans of each
     drive, and the remission is matched to that of the training sensor.
 
-    split, fold : as in `ScanFolder.names`.
-    classes : classes of points, the background first; objects of other classes are unknown (`IGNORE`).
     Returns weights: How often to draw each scan: all scans of a drive together as the square root of their number.
-    Returns hashes (dict of str to str): ``SET/NAME`` of each scan -> its `edgeperc.datasets.kitti.scan_hash`.
-    Raises PointsError, MountingError.
+    Returns hashes: ``SET/NAME`` of each scan -> its `edgeperc.datasets.kitti.scan_hash`.
     """
     layout, names = folder.layout, folder.names(split, fold=fold)
     n_scans = Counter(folder.drives[name] for name in names)
@@ -85,14 +82,9 @@ def read_scan_set(
 
 
 def labeled_scan(
-    frame: ScanFrame, points: NDArray[np.float32], mounting: Mounting, classes: Sequence[str] = POINT_CLASSES
+    frame: ScanFrame, points: Points, mounting: Mounting, classes: Sequence[str] = POINT_CLASSES
 ) -> LabeledScan:
-    """A scan with its truth in the frame of the models.
-
-    points : (n, 4) float32; its points, with the remission as `edgeperc.preprocess.condition.condition` returns it.
-    mounting : a known one.
-    classes : as in `read_scan_set`.
-    """
+    """A scan, its remission as of `condition.condition`, with its truth in the frame of the models."""
     model = ModelFrame(mounting)
     boxes = model.move_boxes(frame.boxes or ())
     surface = np.full((SURFACE.height, SURFACE.width), IGNORE, np.uint8)
@@ -121,10 +113,9 @@ def labeled_scan(
     )
 
 
-def _filled(cells: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Cells of `ROAD_CLASSES`, with road also between the returns.
-
-    An unknown cell becomes road if three cells in the 1.4 m around it are road and no other one is known.
+def _filled(cells: Bytes) -> Bytes:
+    """Cells of `ROAD_CLASSES`, with road also between the returns: where three cells in the 1.4 m around an unknown one
+    are road and no other one is known.
 
     In 16 simulated scans of two sensors, this makes the known road 2.5 and 4 times as large, and 99.6 % of what is
     added is road.
@@ -166,9 +157,7 @@ def _interpolator(view: RangeImageGeometry, sensor: SensorProfile) -> Interpolat
     return Interpolator(view, sensor)
 
 
-def _nearest_labels(
-    points: NDArray[np.float32], filled: NDArray[np.int32], index: NDArray[np.int32], labels: NDArray[np.uint8]
-) -> NDArray[np.uint8]:
+def _nearest_labels(points: Points, filled: Ints, index: Ints, labels: Labels) -> Bytes:
     """Label of the nearest of the next measured points left, right, above and below, (H, W) uint8.
 
     `IGNORE` without such a point, and where it is farther away than `NEAR_M` unless all are background: on the road,

@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from edgeperc.datasets.kitti import Frame
 from edgeperc.simulation.samples import IGNORE, labels_of_scene
@@ -15,6 +14,7 @@ from edgeperc.simulation.scene import TOP_VIEW_CLASSES, SimulatedScan
 from edgeperc.system.atomic import open_atomic
 from edgeperc.types.geometry import draw_footprints, inside
 from edgeperc.types.perception import Box
+from edgeperc.types.points import Bytes, Floats32, Labels, Mask, Points
 from edgeperc.types.sensor import SensorProfile
 from edgeperc.types.views import TopViewGeometry
 
@@ -25,35 +25,24 @@ CAMERA_AZIMUTHS = (-0.70, 0.69)  # KITTI's left color camera sees 41.2 degrees t
 
 @dataclass(frozen=True)
 class LabeledScan:
-    """A scan and its ground truth.
+    """A scan and its ground truth."""
 
-    points : (n, 4) float32; x, y, z [m] in the frame of the models, remission in 0..1.
-    labels : (n,) uint8; the network's classes (PointSeg's, unless others are asked for), `IGNORE` where unknown.
-    counts : number of returns from each box.
-    surface : (500, 500) uint8; 0 background, 1 drivable, `IGNORE` unknown, over `SURFACE`, as it was before ``turn``
-        and ``mirrored``.
-    azimuths : tuple of 2 float; smallest and largest azimuth of the labeled sector [rad], counterclockwise from +x.
-    turn : angle by which the points were turned about +z [rad].
-    mirrored : whether left and right were swapped after that turn.
-    sensor : the sensor of the scan; None: the one that the models are trained for.
-    boxes_known : whether the objects in the labeled sector have boxes; False if only points are labeled.
-    """
-
-    points: NDArray[np.float32]
-    labels: NDArray[np.uint8]
+    points: Points  # (n, 4) x, y, z [m] in the frame of the models, remission in 0..1
+    # (n,) the network's classes (PointSeg's, unless others are asked for), `IGNORE` where unknown
+    labels: Labels
     boxes: tuple[Box, ...]
-    counts: tuple[int, ...]
-    surface: NDArray[np.uint8]
+    counts: tuple[int, ...]  # number of returns from each box
+    # (500, 500) 0 background, 1 drivable, `IGNORE` unknown, over `SURFACE`, as it was before ``turn`` and ``mirrored``
+    surface: Bytes
+    # smallest and largest azimuth of the labeled sector [rad], counterclockwise from +x
     azimuths: tuple[float, float] = (-np.pi, np.pi)
-    turn: float = 0.0
-    mirrored: bool = False
-    sensor: SensorProfile | None = None
-    boxes_known: bool = True
+    turn: float = 0.0  # angle by which the points were turned about +z [rad]
+    mirrored: bool = False  # whether left and right were swapped after that turn
+    sensor: SensorProfile | None = None  # the sensor of the scan; None: the one that the models are trained for
+    boxes_known: bool = True  # whether the objects in the labeled sector have boxes; False if only points are labeled
 
     @classmethod
-    def from_frame(
-        cls, frame: Frame, road: Callable[[NDArray[np.float32]], NDArray[np.uint8]] | None = None
-    ) -> LabeledScan:
+    def from_frame(cls, frame: Frame, road: Callable[[Floats32], Bytes] | None = None) -> LabeledScan:
         """A KITTI frame; ``road`` computes its surface from the points. Without it the surface is unknown."""
         points = frame.points[np.isfinite(frame.points).all(axis=1)]
         frame = replace(frame, points=points)
@@ -108,17 +97,17 @@ class LabeledScan:
                 boxes_known=bool(data["boxes_known"]) if "boxes_known" in data else True,
             )
 
-    def labeled(self, geometry: TopViewGeometry) -> NDArray[np.bool_]:
+    def labeled(self, geometry: TopViewGeometry) -> Mask:
         """Whether each cell is in the labeled sector, (rows, cols) bool."""
         x, y = geometry.cell_centers()
         azimuth = np.arctan2(y, x)
         return (azimuth >= self.azimuths[0]) & (azimuth <= self.azimuths[1])
 
-    def boxed(self, geometry: TopViewGeometry) -> NDArray[np.bool_]:
+    def boxed(self, geometry: TopViewGeometry) -> Mask:
         """Whether all objects of each cell have boxes, (rows, cols) bool."""
         return self.labeled(geometry) & self.boxes_known
 
-    def top_view_truth(self, geometry: TopViewGeometry) -> NDArray[np.uint8]:
+    def top_view_truth(self, geometry: TopViewGeometry) -> Bytes:
         """SSADNet's segmentation truth (3.1.2), (rows, cols) uint8: the surface with the vehicles drawn over it.
 
         `IGNORE` where it is unknown.

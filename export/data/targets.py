@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from edgeperc.types.card import N_DENSE_CHANNELS, N_FRONT_CHANNELS
+from edgeperc.types.points import Floats, Floats32, Mask
 from edgeperc.types.views import TopViewGeometry
 
 STRIDE = 4
@@ -19,20 +20,12 @@ the true one, so the neighbors' geometry must be correct too."""
 
 
 def slot_targets(
-    boxes: ArrayLike,
-    view: TopViewGeometry,
-    *,
-    labeled: NDArray[np.bool_] | None = None,
-    unsure: ArrayLike | None = None,
-) -> NDArray[np.float32]:
-    """Targets of head "slots": each slot has a square of the view, and the upright box of the object centered there.
+    boxes: ArrayLike, view: TopViewGeometry, *, labeled: Mask | None = None, unsure: ArrayLike | None = None
+) -> Floats32:
+    """Targets of head "slots": each has a square of the view, and the upright box of the nearest object in it.
 
-    boxes, labeled, unsure : as for `dense_targets`.
-    view : height and width at least `SLOT_CELLS`.
-    Returns (rows * columns, 5) float32: By rows from the far left square: center column, center row, width and height
-        as in `paper_slot_targets`, and the presence: 1 with an object, 0 without one, -1 if it is not learned. A slot
-        without an object has zeros. Of several objects in one square, the slot gets the nearest.
-    Raises ValueError.
+    Returns (rows * columns, 5): By rows from the far left square: center column, center row, width and height as in
+        `paper_slot_targets`, and the presence: 1 with an object, 0 and zeros without one, -1 if it is not learned.
     """
     n_rows, n_cols = view.height // SLOT_CELLS, view.width // SLOT_CELLS
     target = np.zeros((n_rows, n_cols, 5), np.float32)
@@ -57,14 +50,9 @@ def slot_targets(
     return target.reshape(-1, 5)
 
 
-def paper_slot_targets(boxes: ArrayLike, view: TopViewGeometry, n_slots: int) -> NDArray[np.float32]:
-    """Targets of head "slots-paper": upright boxes around rotated footprints, nearest first (SSADNet 3.1.1).
-
-    boxes : as for `dense_targets`.
-    n_slots : number of boxes to keep, nearest first.
-    Returns (n_slots, 4) float32: Center column, center row, width and height as shares of the image's width and
-        height; zeros in empty slots. Boxes whose center is outside the view are left out.
-    Raises ValueError.
+def paper_slot_targets(boxes: ArrayLike, view: TopViewGeometry, n_slots: int) -> Floats32:
+    """Targets of head "slots-paper": upright boxes around rotated footprints with their center in view, nearest first
+    (SSADNet 3.1.1): center column, center row, width and height as shares of the image; zeros in empty slots.
     """
     boxes, rows, cols = _boxes_in_view(boxes, view)
     found = _upright(boxes, rows, cols, view)
@@ -75,24 +63,17 @@ def paper_slot_targets(boxes: ArrayLike, view: TopViewGeometry, n_slots: int) ->
 
 
 def dense_targets(
-    boxes: ArrayLike,
-    view: TopViewGeometry,
-    *,
-    labeled: NDArray[np.bool_] | None = None,
-    unsure: ArrayLike | None = None,
-) -> NDArray[np.float32]:
+    boxes: ArrayLike, view: TopViewGeometry, *, labeled: Mask | None = None, unsure: ArrayLike | None = None
+) -> Floats32:
     """Heat map and geometry for head "dense".
 
-    boxes : (m, 7) array_like; x, y, z of the center, length, width, height [m], yaw [rad], in the sensor frame.
-    view : height and width divisible by 4.
-    labeled : (height, width) bool; False in cells where boxes are not labeled, such as outside the camera's view.
-    unsure : (k, 7) array_like; boxes that count neither as found nor as missed, such as those without returns. Cells
-        near them are not learned.
-    Returns (11, height/4, width/4) float32: Channel 0, the heat: 1 in the output cell that holds a box's center; around
-        it a Gaussian shaped like the box, whose edges are three standard deviations away; -1 in cells that are not
-        learned. Channels 1 to 8: the geometry of the box with the highest heat, in the format of box_dense, where that
-        heat is at least `REGRESSED_FROM`; else 0. Channels 9 and 10: x and y of the unit vector towards its front.
-    Raises ValueError: A length, width or height is not positive.
+    boxes, unsure : (m, 7) x, y, z of the center, length, width, height [m], yaw [rad]; unsure ones, such as those
+        without returns, count neither as found nor as missed: cells near them are not learned.
+    labeled : False in cells where boxes are not labeled, such as outside the camera's view.
+    Returns (11, height/4, width/4): Channel 0, the heat: 1 in the output cell that holds a box's center; around it a
+        Gaussian shaped like the box, whose edges are three standard deviations away; -1 in cells that are not learned.
+        Channels 1 to 8: the geometry of the box with the highest heat, in the format of box_dense, where that heat is
+        at least `REGRESSED_FROM`; else 0. Channels 9 and 10: x and y of the unit vector towards its front.
     """
     height, width = view.height // STRIDE, view.width // STRIDE
     target = np.zeros((N_DENSE_CHANNELS + N_FRONT_CHANNELS, height, width), np.float32)
@@ -121,9 +102,7 @@ def dense_targets(
     return target
 
 
-def _boxes_in_view(
-    boxes: ArrayLike, view: TopViewGeometry
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+def _boxes_in_view(boxes: ArrayLike, view: TopViewGeometry) -> tuple[Floats, Floats, Floats]:
     """Boxes whose center is in the view, and the rows and columns of the centers [cells from the far left corner]."""
     boxes = np.asarray(boxes, np.float64).reshape(-1, 7)
     if not (boxes[:, 3:6] > 0.0).all():
@@ -134,9 +113,7 @@ def _boxes_in_view(
     return boxes[inside], rows[inside], cols[inside]
 
 
-def _upright(
-    boxes: NDArray[np.float64], rows: NDArray[np.float64], cols: NDArray[np.float64], view: TopViewGeometry
-) -> NDArray[np.float64]:
+def _upright(boxes: Floats, rows: Floats, cols: Floats, view: TopViewGeometry) -> Floats:
     """Center column, center row, width and height of the upright boxes, (m, 4), as shares of the image's."""
     length, width, yaw = boxes[:, 3], boxes[:, 4], boxes[:, 6]
     across = np.abs(length * np.sin(yaw)) + np.abs(width * np.cos(yaw))
@@ -147,9 +124,7 @@ def _upright(
     )
 
 
-def _gaussian(
-    box: NDArray[np.float64], row: float, col: float, shape: tuple[int, int], cell_m: float
-) -> NDArray[np.float32]:
+def _gaussian(box: Floats, row: float, col: float, shape: tuple[int, int], cell_m: float) -> Floats32:
     """A bump of height 1 in the output cell that holds (row, col), as long and wide as the box."""
     forward = int(row) - np.arange(shape[0])[:, None]  # rows grow backwards, columns to the right
     left = int(col) - np.arange(shape[1])[None, :]

@@ -11,9 +11,9 @@ from collections.abc import Iterator
 from typing import IO
 
 import numpy as np
-from numpy.typing import NDArray
 
 from edgeperc.simulation.samples import IGNORE
+from edgeperc.types.points import Bytes, Labels
 
 from ..data.roads import CLASSES, HEIGHT, VIEW, WIDTH
 from .files import TopViewDatabase, road_and_vehicles
@@ -23,7 +23,7 @@ SMALLEST_M2 = 2.0
 SMOOTH_CELLS, SIMPLIFIED_CELLS = 5.0, 1.5
 
 
-def draft(labels: NDArray[np.uint8]) -> list[list[list[float]]]:
+def draft(labels: Labels) -> list[list[list[float]]]:
     """Polygons around the road of a map [px], for a person to correct, without holes and details below 1 m."""
     from shapely import box, union_all
 
@@ -45,9 +45,7 @@ def draft(labels: NDArray[np.uint8]) -> list[list[list[float]]]:
     return polygons
 
 
-def varied(
-    image: NDArray[np.uint8], mask: NDArray[np.uint8], name: str, k: int
-) -> tuple[NDArray[np.uint8], NDArray[np.uint8], float, bool]:
+def varied(image: Bytes, mask: Bytes, name: str, k: int) -> tuple[Bytes, Bytes, float, bool]:
     """Variation ``k`` of a drawn scene (section 3.4), always the same by its name; 0 is itself. Image and mask are
     turned about the sensor and perhaps mirrored, without interpolation, 0 and `IGNORE` outside the scene.
     """

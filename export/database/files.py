@@ -35,6 +35,7 @@ from edgeperc.system.names import check_file
 from edgeperc.types.choices import VEHICLES
 from edgeperc.types.geometry import draw_footprints, rectangles
 from edgeperc.types.perception import Box
+from edgeperc.types.points import Bytes, Floats, Points
 
 from ..data.roads import CELL_M, CLASSES, HEIGHT, VIEW, WIDTH, X_RANGE_M, Y_RANGE_M, Z_RANGE_M, DatabaseError
 
@@ -43,7 +44,7 @@ N_FOLDS = 5
 FARTHEST_M = float(np.hypot(X_RANGE_M[1], Y_RANGE_M[1]))
 
 
-def picture(points: NDArray[np.float32]) -> NDArray[np.uint8]:
+def picture(points: Points) -> Bytes:
     """A scan seen from above (section 3.1): distance, height and remission (0..1) of each pixel's highest point, the
     first of equally high ones, scaled to 0..255. The first channel is 0 in exactly the pixels without a return.
     """
@@ -82,7 +83,7 @@ def vehicles(boxes: Iterable[Box]) -> tuple[Box, ...]:
     return tuple(kept)
 
 
-def road_and_vehicles(road: NDArray[Any], boxes: Iterable[Box]) -> NDArray[np.uint8]:
+def road_and_vehicles(road: NDArray[Any], boxes: Iterable[Box]) -> Bytes:
     """The map of a scene (section 3.8), indices into `CLASSES`: the road, 1, with the vehicles over it, the nearer one
     where two overlap; a cell is a vehicle's if its center is. It has no holes left by rotating whole pixels.
     """
@@ -112,14 +113,14 @@ def read_labels(path: Path) -> tuple[Box, ...]:
     return tuple(boxes)
 
 
-def png(array: NDArray[np.uint8]) -> bytes:
+def png(array: Bytes) -> bytes:
     """The bytes of a PNG file of an image (rows, cols) or (rows, cols, 3)."""
     buffer = io.BytesIO()
     Image.fromarray(array).save(buffer, "PNG")
     return buffer.getvalue()
 
 
-def read_png(path: Path) -> NDArray[np.uint8]:
+def read_png(path: Path) -> Bytes:
     """Read an image that `png` wrote."""
     try:
         with Image.open(path) as image:
@@ -136,12 +137,12 @@ class TopViewScene:
     drive: str
     split: str
     fold: int | None  # None for test scenes
-    image: NDArray[np.uint8]
+    image: Bytes
     boxes: tuple[Box, ...]  # their z and height are 0
-    map: NDArray[np.uint8]  # index into `CLASSES`
+    map: Bytes  # index into `CLASSES`
 
     @property
-    def rectangles(self) -> NDArray[np.float64]:
+    def rectangles(self) -> Floats:
         """The vehicles as `edgeperc.types.geometry` takes them, (k, 5) float64: x, y, length, width [m], yaw [rad]."""
         return rectangles(self.boxes)
 

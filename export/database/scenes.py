@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from edgeperc import Perceiver
 from edgeperc.datasets.kitti import KittiObjects, scan_hash
@@ -21,6 +20,7 @@ from edgeperc.preprocess.condition import condition
 from edgeperc.system.atomic import write_atomic
 from edgeperc.types.choices import VEHICLES
 from edgeperc.types.mounting import MODEL_MOUNTING
+from edgeperc.types.points import Bytes, Mask, Points
 from edgeperc.types.sensor import get_sensor
 from edgeperc.types.views import TopViewGeometry
 from edgeperc.zoo import model_path
@@ -106,7 +106,7 @@ class RoadModel:
             "provider": self.perceive.providers[card.name],
         }
 
-    def __call__(self, points: NDArray[np.float32]) -> NDArray[np.bool_]:
+    def __call__(self, points: Points) -> Mask:
         """Road of a scan, (400, 200) bool."""
         # The scan is moved by the offset between the views, so that its points are in the same cells of both.
         return self.perceive(points + self._shift.astype(np.float32)).require_top_view().road
@@ -178,7 +178,7 @@ class SceneBuilder:
         self._write(self.record_path(job.name), json.dumps(record, sort_keys=True).encode())
         return ""
 
-    def _vary(self, job: Job, image: NDArray[np.uint8], road: NDArray[np.bool_]) -> Iterator[dict[str, Any]]:
+    def _vary(self, job: Job, image: Bytes, road: Mask) -> Iterator[dict[str, Any]]:
         # Test scenes are separated before augmentation (section 3.4, Figure 12), so they are not varied.
         for k in range(1 + (self.plan.variations if job.split == "train" else 0)):
             moved, mask, turn_deg, mirrored = varied(image, road.astype(np.uint8), job.name, k)

@@ -44,14 +44,10 @@ class Bottleneck(nn.Module):
 
 
 class CamSeg(nn.Module):
-    """Labels an image at a quarter of its resolution.
+    """Labels an image (B, n_channels, H, W), H and W divisible by 4, at a quarter of its resolution: logits.
 
-    In: (B, n_channels, H, W) float32; H and W divisible by 4. Out: logits (B, n_classes, H/4, W/4) float32.
-
-    n_channels, n_classes : channels of the input; classes of the output.
-    dropout : probability of dropping a channel before the last convolution.
-    deep_supervision : in training, also return early logits from the encoder, (B, n_classes, H/8, W/8) and (B,
-        n_classes, H/16, W/16).
+    dropout : of a channel before the last convolution.
+    deep_supervision : in training, also return early logits from the encoder, at 1/8 and 1/16 of the resolution.
     """
 
     def __init__(

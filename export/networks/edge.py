@@ -40,11 +40,8 @@ class Residual(nn.Module):
 
 
 class Trunk(nn.Module):
-    """Encoder, context and decoder, on blocks of pixels: a convolution with the stride of a block makes its features.
-
-    n_channels : channels of the input.
-    block : (int, int); rows and columns of a block.
-    fine, coarse : channels at the resolution of the blocks, and at half of it.
+    """Encoder, context and decoder, on blocks of pixels: a convolution with the stride of a block (rows, columns) makes
+    its features, ``fine`` channels at their resolution and ``coarse`` ones at half of it.
     """
 
     def __init__(self, n_channels: int, block: tuple[int, int], fine: int, coarse: int) -> None:
@@ -81,13 +78,8 @@ def spread(x: Tensor, block: tuple[int, int]) -> Tensor:
 
 
 class PointSegEdge(nn.Module):
-    """Labels every pixel of a range image, like `PointSeg`, with 1.0 instead of 7.2 GMAC.
-
-    In: (B, n_channels, 64, 512) float32; any height divisible by 4 and width divisible by 8.
-    Out: logits (B, 4, 64, 512) float32.
-
-    n_channels, n_classes : channels of the input; classes of the output.
-    width : factor of the numbers of channels in between.
+    """Labels every pixel of a range image, like `PointSeg`, with 1.0 instead of 7.2 GMAC; any height divisible by 4 and
+    width divisible by 8. ``width``: factor of the numbers of channels in between.
     """
 
     block = EDGE_BLOCKS["pointseg"]
@@ -109,14 +101,9 @@ class PointSegEdge(nn.Module):
 
 
 class SSADNetEdge(nn.Module):
-    """Labels every cell of a top view and detects the vehicles, like `SSADNet` with head "dense".
+    """Labels every cell of a top view and detects the vehicles, like `SSADNet` with head "dense", in the format of
+    `DenseHead`, with 1.4 instead of 8.9 GMAC; any height and width divisible by 8.
 
-    It takes 1.4 instead of 8.9 GMAC.
-
-    In: (B, 3, 400, 200) float32; any height and width divisible by 8.
-    Out: segmentation logits (B, 5, 400, 200) and boxes (B, 9 or 11, 100, 50), in the format of `DenseHead`, float32.
-
-    n_channels, n_classes : channels of the input; classes of the segmentation map.
     front : also predict which end of a vehicle is its front.
     width : factor of the numbers of channels in between.
     """

@@ -35,14 +35,10 @@ def bilinear(n_channels: int, factor: int) -> Tensor:
 
 
 class FCN(nn.Module):
-    """Labels every pixel of an image.
+    """Labels every pixel of an image of any size.
 
-    In: (B, n_channels, H, W) float32 of any size. Out: logits (B, n_classes, H, W) float32.
-
-    n_channels, n_classes : channels of the input; classes of the output.
-    stride : stride of the last upsampling: FCN-16s adds the scores of the fourth pooling, FCN-8s also those of the
-        third.
-    dropout : probability of dropping a value after each fully connected layer.
+    stride : of the last upsampling: FCN-16s adds the scores of the fourth pooling, FCN-8s also those of the third.
+    dropout : of a value after each fully connected layer.
     """
 
     def __init__(self, *, n_channels: int = 3, n_classes: int = 11, stride: int = 8, dropout: float = 0.0) -> None:

@@ -31,16 +31,12 @@ EDGE_DILATIONS = CONTEXT_DILATIONS[:-1]
 
 
 class LoDNN(nn.Module):
-    """Labels every cell of a top view as road or not.
-
-    In: (B, n_channels, 400, 200) float32; any even height and width.
-    Out: logits (B, n_classes, 400, 200) float32.
+    """Labels every cell of a top view of any even height and width as road or not.
 
     n_channels : 3 for LoDNN-I, 6 for LoDNN.
-    n_classes : classes of the output.
     context_width : channels inside the context module; 128 in the papers, where the module takes 18.5 of 20.1 GMAC.
-    dropout : probability of the spatial dropout in the context module.
-    batch_norm : add batch norm after every convolution but the last.
+    dropout : spatial, in the context module.
+    batch_norm : after every convolution but the last.
     """
 
     def __init__(
@@ -83,13 +79,7 @@ class LoDNN(nn.Module):
 
 class LoDNNEdge(nn.Module):
     """LoDNN at a quarter of the resolution: two strided convolutions, the context module, and channels moved to pixels.
-
-    It takes 0.73 instead of 20.1 GMAC.
-
-    In: (B, n_channels, 400, 200) float32; any height and width divisible by 4.
-    Out: logits (B, n_classes, 400, 200) float32.
-
-    n_channels, n_classes : channels of the input; classes of the output.
+    It takes 0.73 instead of 20.1 GMAC. Height and width are divisible by 4.
     """
 
     def __init__(self, *, n_channels: int = 3, n_classes: int = 2) -> None:

@@ -19,22 +19,15 @@ SURE = 12.0
 
 
 class Parts(NamedTuple):
-    """Outputs of the network by their meaning; c: classes of objects, without the background.
+    """Outputs of the network by their meaning; c: classes of objects, without the background."""
 
-    classes : (B, 1 + c), logits, the background first.
-    place : (B, 3), x, y of the middle in the candidate's frame, and of the bottom above the ground [m].
-    sizes : (B, c, 3), of each class: logarithm of length, width and height, each divided by the usual one.
-    axis : (B, 2), cosine and sine of twice the yaw in the candidate's frame.
-    front : (B, 2), vector in the candidate's frame; its component along a heading is the logit that the front is there.
-    iou : (B,), logit of the overlap in space with the object.
-    """
-
-    classes: Tensor
-    place: Tensor
-    sizes: Tensor
-    axis: Tensor
+    classes: Tensor  # (B, 1 + c) logits, the background first
+    place: Tensor  # (B, 3) x, y of the middle in the candidate's frame, and of the bottom above the ground [m]
+    sizes: Tensor  # (B, c, 3) of each class: logarithm of length, width and height, each divided by the usual one
+    axis: Tensor  # (B, 2) cosine and sine of twice the yaw in the candidate's frame
+    # (B, 2) vector in the candidate's frame; its component along a heading is the logit that the front is there
     front: Tensor
-    iou: Tensor
+    iou: Tensor  # (B,) logit of the overlap in space with the object
 
 
 def parts_of(outputs: Tensor, n_classes: int) -> Parts:
@@ -69,8 +62,7 @@ class FirstLook(nn.Module):
 class ObjectNet(nn.Module):
     """Layers for each point, with the largest value of each channel over the points, and layers for the candidate.
 
-    n_channels : of the input; the first `objects.crops.N_POINT_FEATURES` differ from point to point.
-    n_classes : with the background.
+    n_channels : the first `objects.crops.N_POINT_FEATURES` differ from point to point.
     look : the exported network looks at a candidate closely only if this gives it a probability of `LEAST` or more.
     """
 

@@ -20,11 +20,7 @@ ANCHOR_VALUES = (1, 7, 2)
 
 
 class PointPillars(nn.Module):
-    """Scores, boxes and directions of anchors.
-
-    In: (B, 64, 496, 432) float32, features of pillars; any height and width divisible by 8.
-    Out: scores (B, 2, 248, 216), boxes (B, 14, 248, 216) and directions (B, 4, 248, 216), float32.
-    """
+    """Scores (B, 2, H/2, W/2), boxes (B, 14, ...) and directions (B, 4, ...) from features of pillars (B, 64, H, W)."""
 
     def __init__(self) -> None:
         super().__init__()

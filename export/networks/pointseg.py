@@ -102,15 +102,10 @@ class Enlargement(nn.Module):
 
 
 class PointSeg(nn.Module):
-    """Labels every pixel of a range image.
+    """Labels every pixel of a range image of any height, and any width divisible by 16 (a full turn: 2048).
 
-    In: (B, 5, 64, 512) float32; any height, and any width divisible by 16 (a full turn: 2048).
-    Out: logits (B, 4, 64, 512) float32.
-
-    n_channels, n_classes : channels of the input; classes of the output.
-    dropout : probability of dropping a channel before the last convolution, as in SqueezeSeg.
-    deep_supervision : in training, also return early logits (B, n_classes, H, W/4), from the decoder at a quarter of
-        the width.
+    dropout : of a channel before the last convolution, as in SqueezeSeg.
+    deep_supervision : in training, also return early logits from the decoder at a quarter of the width.
     """
 
     def __init__(

@@ -73,13 +73,7 @@ class Decoder(nn.Module):
 
 
 class SalsaNext(nn.Module):
-    """Labels every pixel of a range image.
-
-    In: (B, 5, 64, 2048) float32; any height and width divisible by 16.
-    Out: logits (B, 20, 64, 2048) float32.
-
-    n_channels, n_classes : channels of the input; classes of the output.
-    """
+    """Labels every pixel of a range image (B, 5, H, W), H and W divisible by 16, as one of 20 classes."""
 
     def __init__(self, *, n_channels: int = 5, n_classes: int = 20) -> None:
         super().__init__()

@@ -26,26 +26,14 @@ N_DROPPED = 3
 
 
 def unpool(x: Tensor, positions: Tensor, size: tuple[int, int]) -> Tensor:
-    """Put pooled values back where they were the maximum; all other values are 0.
-
-    x : (B, C, H, W) float
-    positions : (B, C, H, W) int64; row x width + column of each value, as `torch.nn.functional.max_pool2d` returns
-        them.
-    size : (int, int); rows and columns of the result.
-    """
+    """Put pooled values back at the positions of `torch.nn.functional.max_pool2d`; all other values are 0."""
     batch, channels = x.shape[:2]
     flat = x.new_zeros((batch, channels, size[0] * size[1]))
     return flat.scatter(2, positions.flatten(2), x.flatten(2)).view(batch, channels, *size)
 
 
 class SegNet(nn.Module):
-    """Labels every pixel of an image.
-
-    In: (B, n_channels, H, W) float32 of any size. Out: logits (B, n_classes, H, W) float32.
-
-    n_channels, n_classes : channels of the input; classes of the output.
-    dropout : probability of dropping a value.
-    """
+    """Labels every pixel of an image of any size; ``dropout`` is of a value."""
 
     def __init__(self, *, n_channels: int = 3, n_classes: int = 11, dropout: float = 0.0) -> None:
         super().__init__()

@@ -45,14 +45,8 @@ class ContextAggregation(nn.Module):
 
 
 class SqueezeSegV2(nn.Module):
-    """Labels every pixel of a range image.
-
-    In: (B, 5, 64, 512) float32; any height, and any width divisible by 16. Pixels without a return are 0 in every
-    channel.
-    Out: logits (B, 4, 64, 512) float32.
-
-    n_channels, n_classes : channels of the input; classes of the output.
-    dropout : probability of dropping a channel before the last convolution.
+    """Labels every pixel of a range image of any height, and any width divisible by 16. Pixels without a return are 0
+    in every channel. ``dropout`` is of a channel before the last convolution.
     """
 
     def __init__(self, *, n_channels: int = 5, n_classes: int = 4, dropout: float = 0.25) -> None:

@@ -49,16 +49,11 @@ ELU_GAIN = 1.55
 
 
 def max_pool_with_mask(x: Tensor) -> tuple[Tensor, Tensor]:
-    """2x2 max-pooling with stride 2, and the positions of the maxima.
+    """2x2 max-pooling with stride 2 of even height and width, and a mask of the maxima, one in each window: of equal
+    ones the first, like the indices of `torch.nn.MaxPool2d`. Ties are common, because empty cells are equal.
 
     `torch.nn.MaxUnpool2d` exports as a scatter, which few engines run fast. Pooling, comparing and multiplying run
     everywhere.
-
-    x : (B, C, H, W) float; H and W even.
-    Returns pooled: (B, C, H/2, W/2) float.
-    Returns mask ((B, C, H, W) bool): True at exactly one pixel of each window: its maximum. If several are equal, it
-        is the first in reading order, like the indices of `torch.nn.MaxPool2d`. Ties are common, because empty cells
-        are equal.
     """
     pooled = F.max_pool2d(x, 2)
     with torch.no_grad():
@@ -244,20 +239,14 @@ class DenseHead(nn.Module):
 
 
 class SSADNet(nn.Module):
-    """Labels every cell of a top view and detects the vehicles in it.
+    """Labels every cell of a top view and detects the vehicles in it; height and width divisible by 8 (slots: 32).
 
-    In: (B, 3, 400, 200) float32; any height and width divisible by 8 (slots: at least 32).
-    Out: segmentation logits (B, 5, 400, 200), and boxes (B, 72, 5), (B, n_slots, 4) or (B, 9 or 11, 100, 50), float32.
-
-    n_channels, n_classes : channels of the input; classes of the segmentation map.
     head : ``"slots"`` is the paper's regressor with one slot for each square of 32 cells, ``"slots-paper"`` the same as
-        published, ``"dense"`` one prediction every four cells.
-    n_slots : number of boxes of head "slots-paper".
+        published with ``n_slots``, ``"dense"`` one prediction every four cells.
     context_width : channels inside the context module, which takes most of the time: 18.5 of 22.6 GMAC at 128.
-    dropout : probability of the spatial dropout in the context module and of the dropout in the B.B.R. blocks.
+    dropout : spatial in the context module, of values in the B.B.R. blocks.
     batch_norm : use batch norm in the segmentation branch too.
     front : head "dense" also predicts which end of a vehicle is its front.
-    Raises ValueError.
     """
 
     def __init__(

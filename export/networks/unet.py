@@ -29,16 +29,12 @@ WIDEST = 16
 
 
 class UNet(nn.Module):
-    """Labels every pixel of an image.
+    """Labels every pixel of an image of any size.
 
-    In: (B, n_channels, H, W) float32 of any size. Out: logits (B, n_classes, H, W) float32.
-
-    n_channels, n_classes : channels of the input; classes of the output.
     width : channels of the first level; each level has twice as many as the one above, at most `WIDEST` times
         ``width``.
     n_levels : levels of resolution: 5 in the original, 7 in the long U-Net.
-    leaky : LeakyReLU instead of ReLU.
-    dropout : probability of dropping a value at the end of the two deepest levels of the contracting path.
+    dropout : of a value at the end of the two deepest levels of the contracting path.
     """
 
     def __init__(

@@ -15,7 +15,6 @@ from typing import Any, TypeVar
 import numpy as np
 import onnx
 import onnxruntime
-from numpy.typing import NDArray
 
 from edgeperc.datasets.images import LabeledImages
 from edgeperc.datasets.kitti import KittiLabels, KittiObjects, SemanticKitti
@@ -30,6 +29,7 @@ from edgeperc.objects.candidate_boxes import LEAST_SCORE
 from edgeperc.perceiver import Perceiver
 from edgeperc.system.machine import cpu_features, cpu_model
 from edgeperc.types.mounting import MODEL_MOUNTING
+from edgeperc.types.points import Bytes, Floats32
 from edgeperc.zoo import BF16_FEATURES, Variant, resolve
 
 from .object_parity import TOP_VIEW, candidate_inputs, objects_of
@@ -43,7 +43,7 @@ NO_LABELS = KittiLabels((), np.empty((0, 14)))
 class Measured:
     """Labels and accuracy of one precision over all scans; ``by`` is the engine, provider and processor."""
 
-    labels: list[NDArray[np.uint8]]
+    labels: list[Bytes]
     mean_iou: float
     ap: float | None
     by: str
@@ -234,7 +234,7 @@ def _engine(session: Session, precision: str) -> str:
     request = compiled.create_infer_request()
     request.set_input_tensor(openvino.Tensor(session.input[None], shared_memory=True))
 
-    def run(n_rows: int = 1) -> Mapping[str, NDArray[np.float32]]:
+    def run(n_rows: int = 1) -> Mapping[str, Floats32]:
         request.infer()
         for output in session.card.outputs:
             session.raw[output.kind][...] = request.get_tensor(output.name).data[0]

@@ -8,15 +8,16 @@ from typing import Any
 
 import numpy as np
 import onnx
-from numpy.typing import NDArray
 from onnx import numpy_helper
+
+from edgeperc.types.points import Floats
 
 # f(s x) = s f(x) for each channel and s > 0.
 HOMOGENEOUS = ("Add", "MaxPool", "Relu", "Resize")
 NEAREST = {b"mode": b"nearest", b"coordinate_transformation_mode": b"asymmetric", b"nearest_mode": b"floor"}
 
 
-def equalize(model: onnx.ModelProto, sizes: Mapping[str, NDArray[np.float64]]) -> None:
+def equalize(model: onnx.ModelProto, sizes: Mapping[str, Floats]) -> None:
     """Give the channels of each tensor between convolutions of a folded graph the same size, given by tensor: one range
     serves them all in int8 (cross-layer equalization; Nagel et al., 2019, section 4.1, with sizes of activations).
     """
@@ -34,7 +35,7 @@ def equalize(model: onnx.ModelProto, sizes: Mapping[str, NDArray[np.float64]]) -
                 _multiply(weights[node.input[1]], 1.0 / factor, axis=1)
 
 
-def _multiply(weight: onnx.TensorProto, factor: NDArray[np.float64], axis: int) -> None:
+def _multiply(weight: onnx.TensorProto, factor: Floats, axis: int) -> None:
     """Multiply a weight by a factor for each row of an axis."""
     values = numpy_helper.to_array(weight)
     along = factor.reshape([-1 if k == axis else 1 for k in range(values.ndim)])

@@ -12,11 +12,11 @@ from typing import Any
 
 import numpy as np
 import onnx
-from numpy.typing import NDArray
 
 from edgeperc.errors import PointsError
 from edgeperc.inference.session import Session
 from edgeperc.types.card import ModelCard
+from edgeperc.types.points import Floats32
 
 from .int8_graph import sort
 from .object_parity import candidate_inputs, objects_of
@@ -70,14 +70,14 @@ def quantize_objects(
     return write_int8(path, out, model, card, calibration, made, compared)
 
 
-def _agreement(one: Path, other: Path, batches: Sequence[NDArray[np.float32]], n_classes: int) -> float:
+def _agreement(one: Path, other: Path, batches: Sequence[Floats32], n_classes: int) -> float:
     """Share of the candidates to which two networks give the same class."""
     sessions = [Session(path, "cpu") for path in (one, other)]
     classes = [[objects_of(session, batch)[:, :n_classes].argmax(axis=1) for batch in batches] for session in sessions]
     return float((np.concatenate(classes[0]) == np.concatenate(classes[1])).mean())
 
 
-def candidate_batches(card: ModelCard, scans: Sequence[NDArray[np.float32]]) -> Iterator[NDArray[np.float32]]:
+def candidate_batches(card: ModelCard, scans: Sequence[Floats32]) -> Iterator[Floats32]:
     """Inputs of the clusters of scans, (n, points, channels), at most `BATCH` of each."""
     for scan in scans:
         features, _, _ = candidate_inputs(card, scan)
@@ -86,7 +86,7 @@ def candidate_batches(card: ModelCard, scans: Sequence[NDArray[np.float32]]) -> 
 
 
 def rounded(
-    model: onnx.ModelProto, card: ModelCard, batches: Sequence[NDArray[np.float32]], *, seven_bits: bool = False
+    model: onnx.ModelProto, card: ModelCard, batches: Sequence[Floats32], *, seven_bits: bool = False
 ) -> onnx.ModelProto:
     """A folded graph of `with_first_look` with the products of `ROUNDED` in int8, inputs by their range in batches."""
     products = [node for node in model.graph.node if node.op_type == "Gemm" and node.input[1] in ROUNDED]
@@ -100,10 +100,10 @@ def rounded(
 
 
 def _ranges(
-    model: onnx.ModelProto, card: ModelCard, batches: Sequence[NDArray[np.float32]], names: Sequence[str]
+    model: onnx.ModelProto, card: ModelCard, batches: Sequence[Floats32], names: Sequence[str]
 ) -> dict[str, tuple[float, float]]:
     """Smallest and largest value of inner tensors that count; 0 is between them."""
-    values: Mapping[str, list[NDArray[np.float32]]] = {name: [] for name in names}
+    values: Mapping[str, list[Floats32]] = {name: [] for name in names}
     for tensors in inner_tensors(model, card, batches, names):
         for name, value in tensors.items():
             flat = value.reshape(-1)

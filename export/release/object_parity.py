@@ -16,7 +16,7 @@ from edgeperc.objects.candidate_boxes import LABEL, SCORE, decode_objects
 from edgeperc.objects.candidates import find_candidates, sort_into_cells
 from edgeperc.objects.crops import crop_candidates, fill_features, with_points
 from edgeperc.types.card import ModelCard
-from edgeperc.types.points import read_only
+from edgeperc.types.points import Floats, Floats32, Points, read_only
 from edgeperc.types.views import ObjectGeometry
 
 from ..networks.objects import ObjectNet
@@ -25,9 +25,7 @@ TOP_VIEW = "ssadnet"
 """Model whose boxes are candidates of the object network."""
 
 
-def candidate_inputs(
-    card: ModelCard, points: NDArray[np.float32]
-) -> tuple[NDArray[np.float32], NDArray[np.float64], NDArray[np.float64]]:
+def candidate_inputs(card: ModelCard, points: Points) -> tuple[Floats32, Floats, Floats]:
     """The network's input for the clusters of a scan, their rectangles, and z of the ground at each [m]."""
     view = card.view
     assert isinstance(view, ObjectGeometry)
@@ -39,7 +37,7 @@ def candidate_inputs(
     return features, places, crops.level
 
 
-def objects_of(session: Session, inputs: NDArray[np.float32]) -> NDArray[np.float32]:
+def objects_of(session: Session, inputs: Floats32) -> Floats32:
     """Outputs of the network for candidates, at most `MAX_ROWS`."""
     n = min(len(inputs), MAX_ROWS)
     session.input[:n] = inputs[:n]

@@ -51,6 +51,7 @@ from edgeperc.simulation import samples
 from edgeperc.simulation.samples import simulated_scan
 from edgeperc.system.machine import cpu_features
 from edgeperc.types.card import ModelCard
+from edgeperc.types.points import Floats, Floats32, Ints64
 from edgeperc.zoo import INT8_FEATURES
 
 from ..data.simulate import parity_samples
@@ -81,7 +82,7 @@ DRIVE = re.compile(r"\d{4}_\d\d_\d\d_drive_\d{4}")
 
 Ranges = Mapping[str, tuple[float, float]]
 """Smallest and largest value of tensors, by name."""
-Race = Callable[[Path, Path, "int | None"], tuple[NDArray[np.float64], NDArray[np.float64]]]
+Race = Callable[[Path, Path, "int | None"], tuple[Floats, Floats]]
 
 
 class RefusedError(EdgepercError):
@@ -181,10 +182,10 @@ class Calibrated:
     card: ModelCard
     model: onnx.ModelProto
     ranges: Ranges
-    images: Sequence[NDArray[np.float32]]
-    means: Mapping[str, NDArray[np.float64]]
-    probes: Sequence[NDArray[np.float32]]
-    outputs: Sequence[Mapping[str, NDArray[np.float32]]]
+    images: Sequence[Floats32]
+    means: Mapping[str, Floats]
+    probes: Sequence[Floats32]
+    outputs: Sequence[Mapping[str, Floats32]]
     seven_bits: bool
 
     @classmethod
@@ -234,7 +235,7 @@ class Calibrated:
         return _noise(_outputs(self.rounded(convolutions), self.card, self.probes), self.outputs)
 
 
-def _ranges(model: onnx.ModelProto, card: ModelCard, images: Sequence[NDArray[np.float32]]) -> Ranges:
+def _ranges(model: onnx.ModelProto, card: ModelCard, images: Sequence[Floats32]) -> Ranges:
     """The range of every tensor of a network, from a histogram of its values over all images."""
     names = [card.input.name, *(name for node in model.graph.node for name in node.output if name)]
     counts = {name: np.zeros(1 << BIN_BITS, np.int64) for name in names}
@@ -268,7 +269,7 @@ def in_int8(
 
 
 def inner_tensors(
-    model: onnx.ModelProto, card: ModelCard, images: Sequence[NDArray[np.float32]], names: Sequence[str]
+    model: onnx.ModelProto, card: ModelCard, images: Sequence[Floats32], names: Sequence[str]
 ) -> Iterator[dict[str, NDArray[Any]]]:
     """Inner tensors of a network by their names, for one image after the other."""
     augmented = copy.deepcopy(model)
@@ -289,17 +290,17 @@ def _by_channel(values: NDArray[Any]) -> NDArray[Any]:
 
 
 def channel_means(
-    model: onnx.ModelProto, card: ModelCard, images: Sequence[NDArray[np.float32]], names: Sequence[str]
-) -> dict[str, NDArray[np.float64]]:
+    model: onnx.ModelProto, card: ModelCard, images: Sequence[Floats32], names: Sequence[str]
+) -> dict[str, Floats]:
     """Mean of each channel of some tensors (1, C, ...) over all images."""
-    sums: dict[str, NDArray[np.float64]] = {}
+    sums: dict[str, Floats] = {}
     for tensors in inner_tensors(model, card, images, names):
         for name, values in tensors.items():
             sums[name] = sums.get(name, 0.0) + _by_channel(values).mean(axis=1, dtype=np.float64) / len(images)
     return sums
 
 
-def range_of(counts: NDArray[np.int64]) -> tuple[float, float]:
+def range_of(counts: Ints64) -> tuple[float, float]:
     """The range that makes least noise in 8 bits: squares of what is clipped, and of what is rounded inside."""
     taken = np.flatnonzero(counts)
     middle = (taken.astype(np.uint32) << np.uint32(32 - BIN_BITS)) + np.uint32(1 << (31 - BIN_BITS))
@@ -345,17 +346,13 @@ def _unround(graph: onnx.GraphProto, rounded: Collection[str]) -> None:
             node.input[:] = [origin.get(name, name) for name in node.input]
 
 
-def _outputs(
-    model: onnx.ModelProto, card: ModelCard, images: Sequence[NDArray[np.float32]]
-) -> list[dict[str, NDArray[np.float32]]]:
+def _outputs(model: onnx.ModelProto, card: ModelCard, images: Sequence[Floats32]) -> list[dict[str, Floats32]]:
     """Raw outputs by kind, without the batch axis."""
     runs = inner_tensors(model, card, images, [o.name for o in card.outputs])
     return [{o.kind: run[o.name][0] for o in card.outputs} for run in runs]
 
 
-def _noise(
-    outputs: Sequence[Mapping[str, NDArray[np.float32]]], expected: Sequence[Mapping[str, NDArray[np.float32]]]
-) -> float:
+def _noise(outputs: Sequence[Mapping[str, Floats32]], expected: Sequence[Mapping[str, Floats32]]) -> float:
     """Squared error as a share of the squares, of the worst output; it hardly depends on single labels or boxes."""
     shares = []
     for kind in expected[0]:
@@ -423,12 +420,8 @@ def _choose(fp32: Calibrated, candidates: Sequence[str], limit: float, noise: fl
 
 
 def race(
-    one: Path,
-    other: Path,
-    n_threads: int | None,
-    n_runs: int = N_RUNS,
-    batches: Sequence[NDArray[np.float32]] = (),
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    one: Path, other: Path, n_threads: int | None, n_runs: int = N_RUNS, batches: Sequence[Floats32] = ()
+) -> tuple[Floats, Floats]:
     """Times of runs of two networks [ms], in turn, for one batch of rows after the other; the first is a warm-up."""
     sessions = [Session(path, "cpu", n_threads=n_threads) for path in (one, other)]
     times = np.empty((2, n_runs))
@@ -443,7 +436,7 @@ def race(
     return times[0], times[1]
 
 
-def paired_ratio(one: NDArray[np.float64], other: NDArray[np.float64]) -> tuple[float, float, float]:
+def paired_ratio(one: Floats, other: Floats) -> tuple[float, float, float]:
     """The median of paired ratios, and its 95 % interval by order statistics."""
     ratios = np.sort(other / one)
     half = int(np.ceil(0.98 * np.sqrt(len(ratios))))
@@ -624,7 +617,7 @@ def _rounded(
     return model, chosen, kept, noise
 
 
-def speed_of(path: Path, share: str, times: tuple[NDArray[np.float64], NDArray[np.float64]]) -> str:
+def speed_of(path: Path, share: str, times: tuple[Floats, Floats]) -> str:
     """The times of both models in words. Raises RefusedError if int8 is not faster."""
     one, other = times
     ratio, least, most = paired_ratio(one, other)

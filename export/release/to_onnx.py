@@ -30,6 +30,7 @@ from edgeperc.preprocess.fitness import FitnessProfile
 from edgeperc.system.atomic import open_atomic
 from edgeperc.types.card import CARD_KEY, Golden, ModelCard
 from edgeperc.types.perception import Box
+from edgeperc.types.points import Bytes, Floats32, Mask
 from edgeperc.types.views import CameraGeometry, RangeImageGeometry, TopViewGeometry
 
 from ..cards import card_of
@@ -260,7 +261,7 @@ def with_golden(model: onnx.ModelProto, card: ModelCard) -> ModelCard:
     return replace(card, golden=Golden(0, hashlib.sha256(x.tobytes()).hexdigest(), records))
 
 
-def views(card: ModelCard, samples: Sequence[NDArray[Any]]) -> Iterator[tuple[NDArray[np.float32], NDArray[np.bool_]]]:
+def views(card: ModelCard, samples: Sequence[NDArray[Any]]) -> Iterator[tuple[Floats32, Mask]]:
     """The network's input of each scan or image, (C, H, W) float32, and the pixels with a return, (H, W) bool."""
     if isinstance(card.view, CameraGeometry):
         scaler = ImageScaler(card.view, card.input)
@@ -276,7 +277,7 @@ def views(card: ModelCard, samples: Sequence[NDArray[Any]]) -> Iterator[tuple[ND
         yield projected.image.copy(), projected.index >= 0
 
 
-def pixel_labels(raw: NDArray[np.float32], kind: str) -> NDArray[np.uint8]:
+def pixel_labels(raw: Floats32, kind: str) -> Bytes:
     """Labels (h, w) of raw outputs (C, h, w) of a kind of classes, at the outputs' own resolution."""
     return raw.argmax(0).astype(np.uint8) if kind == "camera_logits" else decode_classes(raw, kind)[0]
 

@@ -20,6 +20,7 @@ from edgeperc import Perceiver
 from edgeperc.errors import EdgepercError, InferenceError
 from edgeperc.inference.session import Session
 from edgeperc.records import scan_record
+from edgeperc.types.points import Floats32
 
 
 class TritonPythonModel:
@@ -35,7 +36,7 @@ class TritonPythonModel:
         for session in self._perceive.sessions:
             session.run = partial(self._run, session)  # type: ignore[method-assign]
 
-    def _run(self, session: Session, n_rows: int = 1) -> Mapping[str, NDArray[np.float32]]:
+    def _run(self, session: Session, n_rows: int = 1) -> Mapping[str, Floats32]:
         """`Session.run`, by Triton."""
         triton, card = self._triton, session.card
         of_rows = card.input_shape[0] is None

@@ -19,11 +19,11 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from edgeperc.evaluation.camvid import image_figures
 from edgeperc.evaluation.metrics import Confusion
 from edgeperc.system.atomic import open_atomic
+from edgeperc.types.points import Bytes, Ints64
 
 from ..recipe import PAPER
 from .camera import Camera
@@ -59,7 +59,7 @@ FAMILIES = {"unet": "#0072b2", "segn": "#d55e00", "fcn1": "#009e73", "fcn8": "#5
 RESULTS, PREDICTIONS = "camvid.json", "camvid.npz"
 
 
-def figures_of(counts: NDArray[np.int64]) -> dict[str, float]:
+def figures_of(counts: Ints64) -> dict[str, float]:
     """Accuracy, mean IoU, F1 and Dice by the paper's equations 1 to 6, of pixels (C, C) by truth and prediction,
     without absent classes. Dice, of all classes' masks together, equals the accuracy; by class, it would be F1.
     """
@@ -235,7 +235,7 @@ def show_camvid(predictions: Path, path: Path, camvid: Path | None = None) -> No
     from matplotlib.figure import Figure
 
     kept = np.load(predictions)
-    shown: dict[str, NDArray[np.uint8]] = {}
+    shown: dict[str, Bytes] = {}
     colors = np.array([*COLORS, *[(0, 0, 0)] * (256 - len(COLORS))], np.uint8)
     if camvid is not None:
         images = read_camvid(camvid, "validation")

@@ -14,7 +14,6 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 import torch
 import torch.nn.functional as F
-from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from edgeperc.datasets.images import LabeledImages, image_hash
@@ -23,6 +22,7 @@ from edgeperc.evaluation.metrics import Confusion
 from edgeperc.simulation.samples import IGNORE
 from edgeperc.simulation.street import CAMERA_CLASSES
 from edgeperc.types.card import InputSpec
+from edgeperc.types.points import Floats, Ints64
 
 from .camera import Camera, upsampled
 from .losses import cross_entropy
@@ -132,7 +132,7 @@ def _in_other_light(images: Tensor, rng: np.random.Generator) -> Tensor:
     """
     n, device = len(images), images.device
 
-    def drawn(values: NDArray[np.float64], *shape: int) -> Tensor:
+    def drawn(values: Floats, *shape: int) -> Tensor:
         return torch.from_numpy(values.astype(np.float32)).view(n, *shape).to(device, non_blocking=True)
 
     gain, gamma = np.exp(rng.normal(0.0, GAIN, (n, 3))), np.exp(rng.normal(0.0, GAMMA, n))
@@ -158,7 +158,7 @@ class ImageSamples:
 
     def __init__(self, task: Camera, images: ImageSet) -> None:
         self.task, self.recipe, self.images = task, task.recipe, images
-        self.odds: dict[str, NDArray[np.float64]] = {}
+        self.odds: dict[str, Floats] = {}
 
     def batch(self, step: int) -> tuple[Tensor, Tensor]:
         """Inputs (B, 3, H, W) float32 and labels (B, H, W) uint8 of one step, always the same for the same step."""
@@ -178,9 +178,7 @@ class ImageSamples:
 
 
 @torch.no_grad()
-def confusions(
-    network: nn.Module, images: ImageSet, truth: Tensor, spec: InputSpec
-) -> tuple[NDArray[np.int64], float, Tensor]:
+def confusions(network: nn.Module, images: ImageSet, truth: Tensor, spec: InputSpec) -> tuple[Ints64, float, Tensor]:
     """Confusion (n, C, C) of each image at the truth's size, mean cross-entropy, and the labels on the device."""
     counts, losses, predicted = [], [], []
     for first in range(0, len(images.hashes), VALIDATION_BATCH):

@@ -13,6 +13,7 @@ from torch import Tensor, nn
 
 from edgeperc.objects.crops import fill_features
 from edgeperc.preprocess.remission import NO_REMISSION
+from edgeperc.types.points import Floats, Floats32, Ints64, Mask, Points
 
 from ..cards import OBJECT_CLASSES
 from ..networks.objects import LEAST, Parts, parts_of
@@ -43,17 +44,17 @@ WATCHED_BATCH = 512
 class Drawn:
     """Samples of a batch; fields as in `ObjectSamples`, with ``valid`` points (B, N_STORED)."""
 
-    points: NDArray[np.float32]
-    valid: NDArray[np.bool_]
-    counts: NDArray[np.float64]
-    rectangles: NDArray[np.float64]
-    level: NDArray[np.float64]
+    points: Points
+    valid: Mask
+    counts: Floats
+    rectangles: Floats
+    level: Floats
     origin: NDArray[np.int8]
     classes: NDArray[np.int8]
-    truth: NDArray[np.float64]
+    truth: Floats
 
     @classmethod
-    def of(cls, samples: ObjectSamples, chosen: NDArray[np.int64]) -> Drawn:
+    def of(cls, samples: ObjectSamples, chosen: Ints64) -> Drawn:
         counts = samples.counts[chosen]
         return cls(
             samples.points[chosen].astype(np.float32),
@@ -66,7 +67,7 @@ class Drawn:
             samples.truth[chosen].astype(np.float64),
         )
 
-    def box_targets(self) -> NDArray[np.float32]:
+    def box_targets(self) -> Floats32:
         """x, y in the candidate's frame, bottom above its ground, length, width, height, yaw, (B, 7)."""
         turn = self.rectangles[:, 4]
         cos, sin = np.cos(turn), np.sin(turn)
@@ -86,7 +87,7 @@ class ObjectBatches:
         self.task, self.recipe, self.samples = task, task.recipe, samples
         of_simulation = (samples.classes == BACKGROUND) & (samples.sources == [*names, SIMULATED].index(SIMULATED))
         self.simulated = range(len(np.unique(samples.objects[of_simulation])))
-        self.odds: dict[str, NDArray[np.float64]] = {}
+        self.odds: dict[str, Floats] = {}
         self._sums = np.cumsum(_weights(samples, names))
 
     def batch(self, step: int) -> tuple[Tensor, Tensor, Tensor]:
@@ -110,7 +111,7 @@ def _of_source(name: str) -> float:
     return PASTED_WEIGHT if name.endswith(f"-{PASTED}") and not name.startswith("kitti") else 1.0
 
 
-def _weights(samples: ObjectSamples, names: Sequence[str]) -> NDArray[np.float64]:
+def _weights(samples: ObjectSamples, names: Sequence[str]) -> Floats:
     """How often each sample is drawn: by class; within it by object, once each, and by source."""
     of_source = np.array([_of_source(name) for name in names])
     of_background = np.where(np.array(names) == SIMULATED, SIMULATED_BACKGROUND, of_source)

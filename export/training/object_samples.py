@@ -27,7 +27,7 @@ from edgeperc.system.atomic import open_atomic
 from edgeperc.types.geometry import oriented_iou, rectangles
 from edgeperc.types.mounting import MODEL_HEIGHT_M, MODEL_MOUNTING
 from edgeperc.types.perception import Box
-from edgeperc.types.points import read_only
+from edgeperc.types.points import Floats, Floats32, Ints, Ints64, Labels, Mask, read_only
 from edgeperc.types.sensor import get_sensor
 
 from ..cards import OBJECT_CLASSES, OBJECT_VIEW, box_sizes
@@ -64,13 +64,13 @@ class ObjectSamples(NamedTuple):
     """Samples; all in the frame of the models."""
 
     points: NDArray[np.float16]  # (m, N_STORED, 4), as in `objects.crops.Crops`
-    counts: NDArray[np.int32]
-    rectangles: NDArray[np.float32]  # (m, 5), of the candidates
-    level: NDArray[np.float32]
+    counts: Ints
+    rectangles: Floats32  # (m, 5), of the candidates
+    level: Floats32
     origin: NDArray[np.int8]  # `GROUP`, `DETECTED` or `TRUE`
     classes: NDArray[np.int8]  # index into the classes of objects, or `VEHICLE`
-    truth: NDArray[np.float32]  # (m, 7), middle, length, width, height [m], yaw [rad]; 0 for background
-    objects: NDArray[np.int64]  # one number for all samples of an object; for background, of a scan
+    truth: Floats32  # (m, 7), middle, length, width, height [m], yaw [rad]; 0 for background
+    objects: Ints64  # one number for all samples of an object; for background, of a scan
     sources: NDArray[np.int8]  # numbers of the sources; `load_samples` knows them
 
 
@@ -186,7 +186,7 @@ def hash_of(drive: str, box: Box | None) -> int:
     return int.from_bytes(hashlib.sha256(repr(key).encode()).digest()[:8], "little", signed=True)
 
 
-def _pseudo_boxes(groups: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.float64]:
+def _pseudo_boxes(groups: Floats, rng: np.random.Generator) -> Floats:
     """Rectangles of usual sizes whose near corner is that of a group: what a detector that errs would find there."""
     sizes = box_sizes()
     places = groups[np.max(groups[:, 2:4], axis=1, initial=0.0) < 8.0].copy() if len(groups) else groups
@@ -204,9 +204,7 @@ def _pseudo_boxes(groups: NDArray[np.float64], rng: np.random.Generator) -> NDAr
     return places
 
 
-def _assigned(
-    scan: Scan, labels: NDArray[np.uint8], places: NDArray[np.float64], boxes: Sequence[Box]
-) -> NDArray[np.int64]:
+def _assigned(scan: Scan, labels: Labels, places: Floats, boxes: Sequence[Box]) -> Ints64:
     """The row of the object that each candidate covers: IoU above 0.4, or 0.6 of its points and 0.3 of the object's;
     -1: none, -2: unknown or a part of one, which shares less than that but more than a tenth or a quarter.
     """
@@ -235,10 +233,10 @@ def _assigned(
     return np.where(covers.any(axis=1), best, np.where(some.any(axis=1), -2, of_box))
 
 
-def _within(xy: NDArray[np.float64], rectangle: NDArray[np.float64], margin_m: float) -> NDArray[np.bool_]:
+def _within(xy: Floats, rectangle: Floats, margin_m: float) -> Mask:
     """Which points (n, 2) are in a rectangle grown by a margin."""
     x, y, length, width, yaw = rectangle.tolist()
     dx, dy, cos, sin = xy[:, 0] - x, xy[:, 1] - y, math.cos(yaw), math.sin(yaw)
     along, across = np.abs(cos * dx + sin * dy), np.abs(cos * dy - sin * dx)
-    found: NDArray[np.bool_] = (along < 0.5 * length + margin_m) & (across < 0.5 * width + margin_m)
+    found: Mask = (along < 0.5 * length + margin_m) & (across < 0.5 * width + margin_m)
     return found

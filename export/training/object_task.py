@@ -8,12 +8,12 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import binary_cross_entropy_with_logits, cross_entropy, smooth_l1_loss
 
 from edgeperc.system.kernel_cache import njit
 from edgeperc.types.geometry import pair_iou
+from edgeperc.types.points import Floats
 from edgeperc.types.views import ObjectGeometry
 
 from ..cards import Carded
@@ -101,7 +101,7 @@ def _huber(found: Tensor, right: Tensor, scale: Tensor | float, beta: float) -> 
 
 
 @njit(cache=True, nogil=True)
-def fill_box_ious(a: NDArray[np.float64], b: NDArray[np.float64], iou: NDArray[np.float64]) -> None:
+def fill_box_ious(a: Floats, b: Floats, iou: Floats) -> None:
     """Write the overlap in space of each box of ``a`` (n, 7: x, y, bottom, sizes, yaw) with that of ``b``."""
     first, second = np.empty(5), np.empty(5)
     for i in range(len(a)):

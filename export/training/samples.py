@@ -9,7 +9,6 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.utils.data import DataLoader
 from tqdm import tqdm
@@ -19,6 +18,7 @@ from edgeperc.datasets.layout import numbers_of_scene
 from edgeperc.inference.projection import make_projector
 from edgeperc.simulation.samples import IGNORE
 from edgeperc.simulation.scene import POINT_CLASSES
+from edgeperc.types.points import Bytes
 
 from ..data.augment import NEGATIVES, Augmentation, ObjectBank, augmented, swapped, with_ground_ahead
 from ..data.beams import drawn_sensor
@@ -246,7 +246,7 @@ def real_scans(
     weights: list[float] = []
     hashes: dict[str, str] = {}
     numbers = numbers_of_scene(classes or POINT_CLASSES)
-    roads: dict[str, NDArray[np.uint8]] = drawn_roads() if drawn else {}
+    roads: dict[str, Bytes] = drawn_roads() if drawn else {}
     frames = [kitti.frame(name) for name in tqdm(names, desc="reading real scans", leave=False)]
     drives = [frame.drive for frame in frames]
     for frame in frames:

@@ -12,7 +12,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 from tqdm import tqdm
 
@@ -22,6 +21,7 @@ from edgeperc.inference.session import Session
 from edgeperc.readers.files import read_points
 from edgeperc.simulation.samples import IGNORE
 from edgeperc.types.card import InputSpec, ModelCard
+from edgeperc.types.points import Bytes, Floats32
 
 from ..data.scan_sets import seen_by_network
 from ..data.scans import SURFACE, LabeledScan, mirrored, turned
@@ -58,7 +58,7 @@ def pseudo_labeled(
             projected = project(projector, np.ascontiguousarray(turned(scan, float(angle)).points))
             with torch.no_grad():
                 p = network(torch.from_numpy(projected.image[None])).float().softmax(1)[0].numpy()
-            best: NDArray[np.uint8] = p.argmax(0).astype(np.uint8)
+            best: Bytes = p.argmax(0).astype(np.uint8)
             trusted = (p.max(0) >= sure) & (projected.index >= 0)
             at = projected.index[trusted]
             labels[at] = np.where(labels[at] == IGNORE, best[trusted], labels[at])
@@ -86,7 +86,7 @@ class OnnxTeacher:
         self.projector = make_projector(self.card.view, self.card.input)
         self._session: Session | None = None
 
-    def __call__(self, scan: LabeledScan) -> tuple[NDArray[np.float32], ...]:
+    def __call__(self, scan: LabeledScan) -> tuple[Floats32, ...]:
         """Class probabilities (C, H, W) float32, and dense boxes if the network to train has them."""
         if self._session is None:  # made in the process that uses it
             self._session = Session(self.path, "cpu", n_threads=1)
@@ -95,7 +95,7 @@ class OnnxTeacher:
             p = 0.5 * (p + self._answer(self._session, mirrored(scan))[0][:, :, ::-1])
         return (p, boxes) if boxes is not None else (p,)
 
-    def _answer(self, session: Session, scan: LabeledScan) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
+    def _answer(self, session: Session, scan: LabeledScan) -> tuple[Floats32, Floats32 | None]:
         session.input[:] = seen_by_network(self.projector, scan)[1].image
         raw = session.run()
         p = np.array(raw["class_logits"] if "class_logits" in raw else raw["class_probabilities"])
