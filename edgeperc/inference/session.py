@@ -520,14 +520,16 @@ class Session:
 
     def with_constants(self, **constants: float) -> Session:
         """The same network with scalars of its graph in place of those in the file, and with buffers of its own."""
-        ort, twin = load_onnxruntime(), object.__new__(Session)
+        ort, blob, twin = load_onnxruntime(), read_model(self.path), object.__new__(Session)
+        if hashlib.sha256(blob).hexdigest() != self.sha256:
+            raise ModelFileError(f"{self.path} has changed since it was opened; construct the Perceiver again")
         vars(twin).update(vars(self))
         # onnxruntime does not own them.
         twin._constants = {
             name: ort.OrtValue.ortvalue_from_numpy(np.array(value, np.float32)) for name, value in constants.items()
         }
         with native_call():
-            twin.inference = kept_in_forks(twin._open(ort, read_model(self.path), *self._opened_with))
+            twin.inference = kept_in_forks(twin._open(ort, blob, *self._opened_with))
         with terminated(ort, None) as run_options:
             twin._bind(run_options)
         return twin

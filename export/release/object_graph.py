@@ -20,7 +20,7 @@ def with_first_look(look: onnx.ModelProto, close: onnx.ModelProto) -> onnx.Model
     look, close = compose.add_prefix(look, "look_"), compose.add_prefix(close, "close_")
     logits, inner, outer = look.graph.output[0].name, close.graph.input[0].name, close.graph.output[0].name
     constants: dict[str, NDArray[Any]] = {
-        "least": np.array(LEAST, np.float32),
+        "least": np.array(LEAST, np.float32),  # of -inf, all get a close look (`inference.object_network`)
         "zero": np.zeros(1, np.int64),
         "one": np.ones(1, np.int64),
         "last": rejected(output.type.tensor_type.shape.dim[1].dim_value).numpy()[np.newaxis],

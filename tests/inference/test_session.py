@@ -91,6 +91,15 @@ def test_a_graph_with_other_constants_has_its_own_answers_and_buffers() -> None:
     np.testing.assert_array_equal(all_closely.input[:40], batch)
 
 
+def test_a_file_that_changed_since_it_was_opened_is_not_opened_again(tmp_path: Path) -> None:
+    path = tmp_path / "objects.onnx"
+    path.write_bytes(model_path("objects").read_bytes())
+    session = Session(path, "cpu", n_threads=1)
+    path.write_bytes(model_path("ssadnet").read_bytes())
+    with pytest.raises(errors.ModelFileError, match="changed since it was opened"):
+        session.with_constants(least=0.0)
+
+
 def test_the_golden_input_never_changes() -> None:
     x = golden_input(0, (2, 3))
     assert x.dtype == np.float32
