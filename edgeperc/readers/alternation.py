@@ -7,9 +7,8 @@ from collections import deque
 from collections.abc import Callable, Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ..types.points import Points
+from ..types.points import Floats, Points
 from .times import TimedScan
 
 _SECTORS, _BANDS, _REACH_DEG = 24, 8, 30.0  # cells of azimuth and elevation
@@ -21,7 +20,7 @@ _ALIKE, _UNLIKE, _IN_A_ROW, _LOOKED_AT = 0.6, 0.03, 6, 300
 
 def told_apart(scans: Iterator[TimedScan], say: Callable[[str], None]) -> Iterator[TimedScan]:
     """The scans; ``say`` is called once if every second or third of them is alike, and those between are not."""
-    recent = deque[NDArray[np.float64]](maxlen=4)
+    recent = deque[Floats](maxlen=4)
     ratios = {n: deque[float](maxlen=_IN_A_ROW) for n in (2, 3)}
     is_said = False
     for k, scan in enumerate(scans):
@@ -40,7 +39,7 @@ def told_apart(scans: Iterator[TimedScan], say: Callable[[str], None]) -> Iterat
         yield scan
 
 
-def _sketch(points: Points) -> NDArray[np.float64]:
+def _sketch(points: Points) -> Floats:
     """The mean logarithm of the distance in each cell; NaN without points."""
     x, y, z = points[:: len(points) // _SAMPLE + 1, :3].T.astype(np.float64)
     with np.errstate(invalid="ignore", over="ignore"):
@@ -55,7 +54,7 @@ def _sketch(points: Points) -> NDArray[np.float64]:
     return np.where(count >= _FEWEST, total / np.maximum(count, 1), np.nan)
 
 
-def _ratio(sketches: list[NDArray[np.float64]]) -> float:
+def _ratio(sketches: list[Floats]) -> float:
     """How unlike the last one is to the first one, as a share of the least among the other pairs."""
     n = len(sketches) - 1
     pairs = [(j, k) for k in range(n + 1) for j in range(k) if (j, k) != (0, n)]
@@ -63,7 +62,7 @@ def _ratio(sketches: list[NDArray[np.float64]]) -> float:
     return _difference(sketches[0], sketches[n]) / least if least > _UNLIKE else 1.0
 
 
-def _difference(one: NDArray[np.float64], other: NDArray[np.float64]) -> float:
+def _difference(one: Floats, other: Floats) -> float:
     there = ~(np.isnan(one) & np.isnan(other))
     off = np.nan_to_num(np.minimum(np.abs(one - other), 1.0), nan=1.0)  # points in one alone
     return float(off[there].mean()) if there.any() else 0.0
