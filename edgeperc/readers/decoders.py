@@ -50,6 +50,7 @@ from .tables import MAX_BYTES
 from .times import TimedScan, of_plausible_duration, point_times
 
 _Item = TypeVar("_Item")
+_FEWEST_ALIKE = 16  # packets of another Ouster; damaged ones are each unlike
 _READERS: Mapping[tuple[str, str], Callable[[memoryview], Cloud | Packets]] = {**CLOUD_READERS, **PACKET_READERS}
 
 
@@ -255,7 +256,7 @@ def _ouster_turns(
     chosen = layouts[_choose("LiDAR", [layout.name for layout in layouts], topic)]
     stream = OusterStream(chosen, remission_field)
     sizes = {size for layout in layouts for size in (layout.packet_bytes, *layout.other_bytes)}
-    ports, n_other_sizes, n_others, n_used = set[int](), Counter[int](), 0, 0
+    ports, n_other_sizes, n_used, others = set[int](), Counter[int](), 0, Counter[tuple[int, int]]()
     senders = Counter[tuple[str, int]]()
     datagrams = Datagrams(path, alive)
     for datagram in datagrams:
@@ -267,7 +268,7 @@ def _ouster_turns(
         if size != chosen.packet_bytes:
             continue
         if not stream.is_of_sensor(datagram.payload) or (len(layouts) > 1 and chosen.port not in (0, datagram.port)):
-            n_others += 1
+            others[stream.numbers_of(datagram.payload)] += 1
             continue
         if not (chosen.serial or chosen.init_id):  # the packets of old firmware do not say whose they are
             senders[datagram.sender, datagram.port] += 1
@@ -276,12 +277,13 @@ def _ouster_turns(
         n_used += 1
         yield from stream.add(bytes(datagram.payload))
     yield from stream.end()
-    if n_others and not n_used:
+    if others and not n_used:
         raise PointsError(
             f"the metadata is of the sensor {chosen.name} (initialization_id {chosen.init_id}), and none of the "
-            f"{n_others:,} packets is; expected the metadata that was saved with the capture"
+            f"{others.total():,} packets is; expected the metadata that was saved with the capture"
         )
-    if n_others and n_used and topic is None and len(layouts) == 1:
+    n_others = sum(n for n in others.values() if n >= _FEWEST_ALIKE or len(layouts) > 1)
+    if n_others and topic is None and len(layouts) == 1:
         warn(
             f"{path}: left out {n_others:,} packets of another Ouster, or of this one after it had started anew: their "
             "serial number or initialization_id is not that of the metadata. Put that of each beside the capture"
@@ -292,11 +294,11 @@ def _ouster_turns(
             f"{path}: the scans are those of the first of several sensors, {', '.join(names)}, whose packets carry no "
             "serial number: save those of each in a file of its own, with its metadata"
         )
-    n_bad = datagrams.n_bad + sum(n_other_sizes[port] for port in ports)
+    n_bad = datagrams.n_bad + sum(n_other_sizes[port] for port in ports) + others.total() - n_others
     if n_bad and n_used:
         warn(
-            f"{path}: dropped {n_bad} damaged packets of the capture: empty, incomplete, or of another length than "
-            "the metadata says"
+            f"{path}: dropped {n_bad} damaged packets of the capture: empty, incomplete, or of another length or "
+            "number than the metadata says"
         )
 
 

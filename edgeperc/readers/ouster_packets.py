@@ -229,11 +229,15 @@ class OusterStream:
         self._there: set[int] = set()  # their places in it
         self._ahead: list[tuple[int, bytes]] = []  # of later turns
 
-    def is_of_sensor(self, packet: bytes | memoryview) -> bool:
-        """Whether a packet of the right size carries the numbers that the metadata says, where both have them."""
+    def numbers_of(self, packet: bytes | memoryview) -> tuple[int, int]:
+        """Serial number and initialization_id that a packet of the right size carries."""
         serial_at, init_at = (11, 1) if self._layout.is_fusa else (7, 4)
         serial = int.from_bytes(packet[serial_at : serial_at + 5], "little")
-        init_id = int.from_bytes(packet[init_at : init_at + 3], "little")
+        return serial, int.from_bytes(packet[init_at : init_at + 3], "little")
+
+    def is_of_sensor(self, packet: bytes | memoryview) -> bool:
+        """Whether these are the numbers that the metadata says, where both have them."""
+        serial, init_id = self.numbers_of(packet)
         return self._layout.serial in (0, serial) and self._layout.init_id in (0, init_id)
 
     def add(self, packet: bytes) -> Iterator[TimedScan]:

@@ -330,6 +330,7 @@ def test_real_captures_that_are_damaged(data_root: Callable[[str], Path], tmp_pa
         read_whole(tmp_path / "copy.pcap")
 
 
+@pytest.mark.filterwarnings("ignore:.*damaged packets:UserWarning")
 def test_packets_of_the_right_size_with_damaged_headers(ouster: Path, tmp_path: Path) -> None:
     """Packet type, frame, measurement and status are anything; the process that decodes may end, this one does not."""
     content = (ouster / "sphere.pcap").read_bytes()

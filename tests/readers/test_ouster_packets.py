@@ -301,6 +301,16 @@ def test_an_ouster_that_starts_anew_or_another_one_is_warned_of(tmp_path: Path, 
         assert len(list(read_timed_scans(path))) == 2
 
 
+@pytest.mark.parametrize("n", [1, 3, 15])
+def test_damaged_numbers_are_no_other_ouster(tmp_path: Path, n: int) -> None:
+    ousters = [bytes(packet.buf) for turn in random_packets(METADATA, 2, 1) for packet in turn]
+    damaged = [packet[:7] + bytes([k + 1]) + packet[8:] if k < n else packet for k, packet in enumerate(ousters)]
+    path = joined(tmp_path, [(damaged, "10.0.0.1")])
+    with pytest.warns(UserWarning, match=f"dropped {n} damaged packets") as said:
+        list(read_timed_scans(path))
+    assert not any("another Ouster" in str(each.message) for each in said)
+
+
 def other_packets(name: str) -> list[bytes]:
     """Of a sensor of another maker."""
     if name == "Hesai AT128":
