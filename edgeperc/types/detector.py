@@ -123,6 +123,9 @@ class AnchorHead:
         _check_common(self)
         _FIELDS.whole("the number of head.anchors", self.n_anchors, 1, MAX_ANCHORS)
         _FIELDS.whole("head.box_values", self.box_values, 7, 16)
+        if self.box_values in (8, 10):
+            expected = "7, or 9 with velocities; angles of two values (OpenPCDet's encode_angle_by_sincos) are not read"
+            _FIELDS.refuse("head.box_values", self.box_values, expected)
         _FIELDS.whole("head.direction_bins", self.direction_bins, 1, 64)
         _FIELDS.number("head.direction_offset_rad", self.direction_offset_rad, -10.0, 10.0)
         _FIELDS.number("head.direction_limit_offset", self.direction_limit_offset, -1.0, 1.0)

@@ -110,6 +110,8 @@ WRONG = [
     ("head", {"anchors": [{"size_m": [4, 2], "bottom_m": 0, "yaws_rad": [0]}]}, r"anchors\[0\]\.size_m is \[4, 2\]"),
     ("head", {"anchors": [{"size_m": [4, 2, 0], "bottom_m": 0, "yaws_rad": [0]}]}, r"size_m\[2\] is 0"),
     ("head", {"box_values": 6}, r"head\.box_values is 6; expected a whole number from 7"),
+    ("head", {"box_values": 8}, r"head\.box_values is 8; expected 7, or 9 with velocities; angles of two values"),
+    ("head", {"box_values": 10}, r"head\.box_values is 10; expected 7, or 9"),
     ("head", {"direction_bins": 0}, r"head\.direction_bins is 0"),
     ("head", {"across_classes": 1}, r"head\.across_classes is 1; expected true or false"),
     ("input", {"channels": ["x", "y", "z", "ring"]}, "'ring'.* are unknown to a pillars; expected some of x, y, z"),
