@@ -178,7 +178,7 @@ class Perceiver:
         part.
         A model of objects replaces both, at candidates from the top view, from clusters of points of any class, or from
         both. Boxes of labeled people stay, with the mean of both scores; people without labels, if points are labeled,
-        keep half of their scores.
+        keep half of their scores. A vehicle that the others show stays only where it sees one, or has too few points.
         Boxes of a detector on pillars stay as they are; with ``"clusters"`` it does not run. Other boxes are dropped
         where it has one. In its range, those of its classes keep half of their score, as it has not found them.
     full_turn : bool
