@@ -280,8 +280,10 @@ def check_sensor(arguments: argparse.Namespace) -> None:
 
     get_sensor(with_mounting(stated_sensor(arguments), arguments))
     file, given = getattr(arguments, "extrinsic", None), _given(arguments)
-    said = None if file is None or not given else Mounting.from_file(file)
-    for name, value in given.items() if said is not None else ():
+    if file is None or not given:
+        return
+    said = Mounting.from_file(file)
+    for name, value in given.items():
         of_file = getattr(said, name)
         if value is None or abs((value - of_file + 180.0) % 360.0 - 180.0) > _ROUNDED:
             option, taken = _MOUNTING[name].replace("_", "-"), "street" if value is None else f"{value:g}"

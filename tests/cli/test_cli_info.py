@@ -355,6 +355,13 @@ def drive(tmp_path: Path) -> Path:
     return folder
 
 
+@pytest.fixture
+def in_a_turned_drive(drive: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In its folder, with the extrinsic of a sensor that looks to the right, 1.9 m high."""
+    monkeypatch.chdir(drive)
+    (drive / "T.json").write_text("[[0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 1, 1.9], [0, 0, 0, 1]]")
+
+
 def test_info_prints_the_mounting_and_writes_a_profile(
     drive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -412,15 +419,10 @@ def test_no_profile_is_written_without_ground_or_of_two_sensors(
     ],
 )
 @pytest.mark.filterwarnings("ignore:.*which is taken:UserWarning")
+@pytest.mark.usefixtures("in_a_turned_drive")
 def test_run_uses_the_given_mounting(
-    options: list[str],
-    mounting: dict[str, float],
-    drive: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    options: list[str], mounting: dict[str, float], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.chdir(drive)
-    (drive / "T.json").write_text("[[0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 1, 1.9], [0, 0, 0, 1]]")
     arguments = ["0.bin", "--json", "--model", "pointseg", "--provider", "cpu", "--on-mismatch", "ignore"]
     assert run("run", *arguments, *options) == 0
     used = json.loads(capsys.readouterr().out)["mounting"]
@@ -438,16 +440,10 @@ def test_run_uses_the_given_mounting(
 )
 @pytest.mark.parametrize("command", ["run", "info"])
 @pytest.mark.filterwarnings("always::UserWarning")
+@pytest.mark.usefixtures("in_a_turned_drive")
 def test_options_that_contradict_an_extrinsic_are_said_once(
-    command: str,
-    options: list[str],
-    said: str,
-    drive: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    command: str, options: list[str], said: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.chdir(drive)
-    (drive / "T.json").write_text("[[0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 1, 1.9], [0, 0, 0, 1]]")
     run(command, "0.bin", "1.bin", "--sensor", "hdl-64e", "--extrinsic", "T.json", *options)
     warned = [line for line in capsys.readouterr().err.splitlines() if "which is taken" in line]
     assert warned == ([f"edgeperc: warning: {said}"] if said else [])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import random
 import struct
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -25,6 +25,12 @@ pytestmark = pytest.mark.usefixtures("in_this_process")
 POINTS = np.array(
     [[12.5, -3.25, -1.75, 0.25], [40.0, 8.5, 2.0, 99.0], [np.nan, 1.0, 1.0, 0.5], [5.0, np.inf, 0.0, 255.0]], np.float32
 )
+
+
+def join(path: Path, parts: Iterable[Path]) -> Path:
+    """Write a capture of the packets of others, one after the other."""
+    path.write_bytes(b"".join(part.read_bytes()[24 * (k > 0) :] for k, part in enumerate(parts)))
+    return path
 
 
 def check_told_apart(both: Path, alone: Mapping[str, Path]) -> None:

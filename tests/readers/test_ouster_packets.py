@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from lidar_writers import MODELS, blocks_of, livox_packets, packets_of, ranges
-from test_captures import check_told_apart, error_of, vlp16_packets, write_pcap
+from test_captures import check_told_apart, error_of, join, vlp16_packets, write_pcap
 from test_packets import write_link
 
 import twins.packets
@@ -258,12 +258,10 @@ def test_an_ouster_beside_another_makers_sensor_is_told_apart(tmp_path: Path, ot
         payloads = packets_of(model, blocks_of(model, *ranges(model, 1024)))
     ousters = [bytes(packet.buf) for turn in random_packets(METADATA, 2, 1) for packet in turn]
     parts = [
-        write_link(tmp_path / "alone.pcap", 1, payloads, one="10.0.0.9").read_bytes(),
-        write_link(tmp_path / "ouster.pcap", 1, ousters, one="10.0.0.1:7502").read_bytes(),
+        write_link(tmp_path / "alone.pcap", 1, payloads, one="10.0.0.9"),
+        write_link(tmp_path / "ouster.pcap", 1, ousters, one="10.0.0.1:7502"),
     ]
-    both = tmp_path / "both.pcap"
-    first, second = parts if is_first else parts[::-1]
-    both.write_bytes(first + second[24:])
+    both = join(tmp_path / "both.pcap", parts if is_first else parts[::-1])
     for name in ("both", "ouster"):
         (tmp_path / f"{name}.json").write_text(json.dumps(METADATA))
     assert "expected one LiDAR, there are 10.0.0.9, 122246000293; choose one" in error_of(both)
@@ -323,9 +321,9 @@ def other_packets(name: str) -> list[bytes]:
 
 def joined(folder: Path, parts: Sequence[tuple[Sequence[bytes], str]]) -> Path:
     """A capture of packets and their sender, one after the other, with an Ouster's metadata beside it."""
-    path = folder / "both.pcap"
-    written = [write_link(path, 1, packets, one=sender).read_bytes() for packets, sender in parts]
-    path.write_bytes(b"".join(each[24 * (k > 0) :] for k, each in enumerate(written)))
+    names = (folder / f"part{k}" for k in range(len(parts)))
+    written = [write_link(name, 1, packets, one=sender) for name, (packets, sender) in zip(names, parts, strict=True)]
+    path = join(folder / "both.pcap", written)
     path.with_suffix(".json").write_text(json.dumps(METADATA))
     return path
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from lidar_writers import MODELS, blocks_of, packets_of, ranges
-from test_captures import error_of, vlp16_packets, write_pcap
+from test_captures import error_of, join, vlp16_packets, write_pcap
 from test_captures import ouster as ouster
 
 from edgeperc import PointsError
@@ -136,10 +136,7 @@ def test_packets_of_ipv6(tmp_path: Path, kind: str, most: int) -> None:
         pytest.importorskip("velodyne_decoder")
     expected = list(read_scans(write_link(tmp_path / "4.pcap", 1, payloads_of(kind))))
     one = write_6(tmp_path / "6.pcap", payloads_of(kind), "fe80::1", most)
-    two = tmp_path / "two.pcap"
-    two.write_bytes(
-        one.read_bytes() + write_6(tmp_path / "b.pcap", payloads_of(kind), "fe80::2", most).read_bytes()[24:]
-    )
+    two = join(tmp_path / "two.pcap", [one, write_6(tmp_path / "b.pcap", payloads_of(kind), "fe80::2", most)])
     assert "there are fe80::1, fe80::2; choose one" in error_of(two)
     assert sensor_of(one) == sensor_of(tmp_path / "4.pcap")
     for path, topic in ((one, None), (two, "fe80::2")):

@@ -23,7 +23,7 @@ from lidar_writers import (
     unit_angles,
 )
 from numpy.typing import NDArray
-from test_captures import check_told_apart, error_of, vlp16_packets, write_pcap
+from test_captures import check_told_apart, error_of, join, vlp16_packets, write_pcap
 from test_packets import write_link
 
 import twins.packets
@@ -223,12 +223,10 @@ def test_a_velodyne_beside_another_sensor_is_told_apart(tmp_path: Path, name: st
         packets = [difop(model, angles), *packets]
     velodyne = vlp16_packets(2.0)[:110]
     parts = [
-        write_link(tmp_path / "velodyne.pcap", 1, velodyne, one="10.0.0.9").read_bytes(),
-        write_link(tmp_path / "other.pcap", 1, packets, one="10.0.0.1").read_bytes(),
+        write_link(tmp_path / "velodyne.pcap", 1, velodyne, one="10.0.0.9"),
+        write_link(tmp_path / "other.pcap", 1, packets, one="10.0.0.1"),
     ]
-    both = tmp_path / "both.pcap"
-    first, second = parts if is_first else parts[::-1]
-    both.write_bytes(first + second[24:])
+    both = join(tmp_path / "both.pcap", parts if is_first else parts[::-1])
     assert "expected one LiDAR, there are 10.0.0.9, 10.0.0.1; choose one" in error_of(both)
     check_told_apart(both, {"10.0.0.9": tmp_path / "velodyne.pcap", "10.0.0.1": tmp_path / "other.pcap"})
 
