@@ -21,7 +21,7 @@ from .agreement.rules import (
     without_poles,
 )
 from .agreement.votes import VEHICLE, Sight
-from .ground.ceiling import without_impossible
+from .ground.ceiling import find_hall, without_impossible
 from .ground.observed import Observer
 from .ground.planes import FIRST_REACH_HEIGHTS, FIRST_REACH_M, GroundFit, fit_ground
 from .ground.scan import Scan
@@ -201,7 +201,7 @@ class Pipeline:
 
         absent = value("check", _absent)
         near = value("project", self._select, points)
-        planes = scan = surface = absent
+        planes = scan = surface = hall = absent
         if self.needs_ground:
             planes = value("cluster", _fit_ground, points, mounting)
             scan = value("cluster", _on_ground, near, planes)
@@ -227,12 +227,13 @@ class Pipeline:
         seen, labels = labels, value("refine", PointLabels.objects, labels) if self.ranged else absent
 
         # Objects of a detector, and by the points of their candidates
-        detections, objects, candidates = nothing, nothing, absent
+        detections, objects, places = nothing, nothing, absent
         if (detector := self.pillars if options.boxes_from != "clusters" else None) is not None:
             detections = value("infer", detector.find_boxes, points)
         if self.objects is not None:
-            candidates = value("cluster", self.objects.crop, scan, detected, options.boxes_from, per_m)
-            objects = value("infer", self.objects.find_boxes, scan, candidates, options.object_score)
+            places = value("cluster", self.objects.cluster, scan, options.boxes_from, per_m)
+            detected = detected if options.boxes_from != "clusters" else nothing
+            objects = value("infer", self.objects.find_boxes, scan, places, detected, options.object_score)
 
         # Objects, and what the parts say of one another (KUL-Seg 5.2)
         strips = clusters = upright = support = marks = absent
@@ -255,22 +256,23 @@ class Pipeline:
             standing = value("agree", stand_boxes, joined, scan, agreed, rules, per_m)
         if self.objects is not None:
             labeled, score = bool(self.ranged) and options.boxes_from != "network", options.cluster_score
-            standing = value("infer", self.objects.complete, scan, candidates, objects, standing, labeled, score)
+            standing = value("infer", self.objects.complete, scan, places, objects, standing, labeled, score)
         if detector is not None:
             standing = value("cluster", _detected, detections, standing, detector, options.cluster_score)
-        standing = value("agree", without_impossible, standing, points, mounting) if "ceiling" in rules else standing
+        if "ceiling" in rules:
+            hall = value("agree", find_hall, points, mounting)
+            standing = value("agree", without_impossible, standing, hall, mounting)
         joined = joined if self.objects is None and detector is None else standing
         if top is not None and rules:
             marks = value("agree", mark_cells, cells, scan, agreed, rules)
             view = value("agree", _agreed_cells, cells, agreed, joined, boxes, trusted, marks, rules)
 
-        # The second lane ends with the objects, and what needs them; the first one has what needs labels. The lane that
-        # finds no sector of a turn left makes the candidates, while the other one labels the last.
-        spare = [candidates, strips] if sectors else []
+        # The second lane runs the top view, and then finds objects, so the first one clusters for it. In a turn, the
+        # lane that finds no sector left makes the clusters, while the other one labels the last.
         whole = value("refine", _whole, seen, agreed, near, len(points))
-        last = [strips, cells, support, surface, marks, whole, standing]
+        last = [strips, cells, hall, support, surface, marks, whole, standing]
         self._lanes.run(
-            [near, projected, scan, *sectors, *spare, labels, upright, strips, clusters, cells, surface, joined, view],
+            [near, projected, scan, *sectors, places, strips, labels, upright, clusters, cells, surface, joined, view],
             [planes, boxes, *reversed(sectors), detections, objects, *last],
         )
         return Parts(whole(), view(), standing(), surface())

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -46,26 +47,43 @@ def find_ceiling(points: Points, eye_m: float = 0.0) -> float | None:
     return float(np.median(top[on_it])) + MODEL_HEIGHT_M
 
 
-def without_impossible(boxes: Sequence[Box], points: Points, mounting: Mounting) -> tuple[Box, ...]:
+class Hall(NamedTuple):
+    """What is above and around the sensor."""
+
+    ceiling_m: float | None  # above the road; None under the sky
+    outline: Floats  # how far the points reach in each of the `_DIRECTIONS` [m]
+
+
+def find_hall(points: Points, mounting: Mounting) -> Hall:
+    """The ceiling and the walls of a scan in the frame of the models."""
+    ceiling_m = find_ceiling(points, _eye_m(mounting))
+    return Hall(ceiling_m, np.empty(0) if ceiling_m is None else _outline(points))
+
+
+def _eye_m(mounting: Mounting) -> float:
+    return (mounting.height_m or MODEL_HEIGHT_M) - MODEL_HEIGHT_M
+
+
+def without_impossible(boxes: Sequence[Box], hall: Hall, mounting: Mounting) -> tuple[Box, ...]:
     """The boxes without vehicles around the sensor, unless it is on a pole, and without those that do not fit between a
     ceiling and walls: the own vehicle, a small garage, beams, pipes.
     """
-    eye_m = (mounting.height_m or MODEL_HEIGHT_M) - MODEL_HEIGHT_M
+    eye_m = _eye_m(mounting)
     tops_m = [box.center[2] + 0.5 * box.size[2] for box in boxes]
     kept = [
         (box, top_m)
         for box, top_m in zip(boxes, tops_m, strict=True)
         if box.label not in VEHICLES or top_m < eye_m - _ON_ROOF_M or not _is_around(box)
     ]
-    tall = [box.label in VEHICLES and top_m > _LEAST_M - _CLEAR_M - MODEL_HEIGHT_M for box, top_m in kept]
-    ceiling_m = find_ceiling(points, eye_m) if any(tall) else None
-    if ceiling_m is None:
+    if hall.ceiling_m is None:
         return tuple(box for box, _ in kept)
-    most_m, outline = ceiling_m - _CLEAR_M - MODEL_HEIGHT_M, _outline(points)
+    least_m, most_m = (level_m - _CLEAR_M - MODEL_HEIGHT_M for level_m in (_LEAST_M, hall.ceiling_m))
     return tuple(
         box
-        for (box, top_m), is_tall in zip(kept, tall, strict=True)
-        if not is_tall or (box.score > _SURE and top_m <= most_m and not _sticks_out(box, outline))
+        for box, top_m in kept
+        if box.label not in VEHICLES
+        or top_m <= least_m
+        or (box.score > _SURE and top_m <= most_m and not _sticks_out(box, hall.outline))
     )
 
 
@@ -79,7 +97,7 @@ _DIRECTIONS = np.stack([np.cos(np.arange(32) * np.pi / 16.0), np.sin(np.arange(3
 
 
 def _outline(points: Points) -> Floats:
-    """How far the points reach in each of the `_DIRECTIONS` [m]."""
+    """That of a `Hall`."""
     xy = points[:: (len(points) // _SAMPLE) | 1, :2].astype(np.float64)
     return (xy[np.isfinite(xy).all(axis=1)] @ _DIRECTIONS).max(axis=0)
 

@@ -13,7 +13,7 @@ from ..objects.boxes import join_boxes, not_among
 from ..objects.candidate_boxes import SCORE, boxes_of_objects, confirm_boxes, decode_objects, footprints, merge_boxes
 from ..objects.candidates import Candidates, CellBuffer, find_candidates
 from ..objects.cluster import PERSONS
-from ..objects.crops import MIN_COUNT, Crops, crop_candidates, fill_features, with_points
+from ..objects.crops import MIN_COUNT, Crops, crop_candidates, fill_features, joined, with_points
 from ..types.geometry import rectangles
 from ..types.perception import Box
 from ..types.points import Floats
@@ -42,23 +42,23 @@ class ObjectNetwork:
         self._cells = CellBuffer()
         self._scale = np.array([session.card.input.mean, session.card.input.std], np.float32)
 
-    def crop(
-        self, scan: Scan, boxes: Sequence[Box], boxes_from: BoxesFrom, distance_per_m: float
-    ) -> tuple[Candidates, Crops]:
-        """Where objects may be, with the points there: clusters, and boxes of the top view."""
+    def cluster(self, scan: Scan, boxes_from: BoxesFrom, distance_per_m: float) -> tuple[Candidates, Crops]:
+        """Where objects may be by the points alone, with the points there."""
         cells = self._cells.sort(scan, self.view.height_range_m)
-        detected = rectangles(boxes if boxes_from != "clusters" else ())
-        candidates = Candidates(detected, cells)
-        if boxes_from != "network":
-            candidates = find_candidates(scan, cells, detected, distance_per_m)
-        return with_points(candidates, self._crop(scan, candidates))
+        if boxes_from == "network":
+            return self._crop(scan, Candidates(np.empty((0, 5)), cells))
+        return self._crop(scan, find_candidates(scan, cells, distance_per_m))
 
-    def find_boxes(self, scan: Scan, candidates: tuple[Candidates, Crops], min_score: float) -> tuple[Box, ...]:
-        """Boxes of the candidates, and of a second look at each (Cai and Vasconcelos, 2018), from both of its ends.
+    def find_boxes(
+        self, scan: Scan, clusters: tuple[Candidates, Crops], detected: Sequence[Box], min_score: float
+    ) -> tuple[Box, ...]:
+        """Boxes of the clusters and of the top view's boxes, and of a second look at each of what was found (Cai and
+        Vasconcelos, 2018), from both of its ends.
 
         What the network makes of points depends a little on the end of the rectangle that they are given from.
         """
-        (places, cells), crops = candidates
+        cells = clusters[0].cells
+        (places, _), crops = joined(clusters, self._crop(scan, Candidates(rectangles(detected), cells)))
         found = merge_boxes(self._look(places, crops, self.session), self.card.classes)
         found = found[found[:, SCORE] >= AGAIN]
         flat = footprints(found)
@@ -69,7 +69,7 @@ class ObjectNetwork:
     def complete(
         self,
         scan: Scan,
-        candidates: tuple[Candidates, Crops],
+        clusters: tuple[Candidates, Crops],
         objects: Sequence[Box],
         others: Sequence[Box],
         by_labels: bool,
@@ -86,7 +86,7 @@ class ObjectNetwork:
         vehicles, people = _by_kind(objects)
         shown, labeled = _by_kind(others)
         shown = not_among(vehicles, shown)
-        looks = self._look_at(scan, candidates[0]._replace(rectangles=rectangles([*shown, *labeled])))
+        looks = self._look_at(scan, clusters[0]._replace(rectangles=rectangles([*shown, *labeled])))
         seen, looks = looks[:, SCORE].tolist(), looks[: len(shown)]
         doubted = [box for box, score in zip(shown, seen, strict=False) if score == 0.0]  # without a look
         looks[:, SCORE] = np.where(looks[:, SCORE] >= SEEN, 0.5 * (looks[:, SCORE] + [box.score for box in shown]), 0.0)
@@ -104,12 +104,15 @@ class ObjectNetwork:
 
     def _look_at(self, scan: Scan, candidates: Candidates) -> Floats:
         """What the network finds at places, (n, 10), with a score of 0 where there are too few points."""
-        crops = self._crop(scan, candidates)
+        crops = self._crops(scan, candidates)
         looks = self._look(candidates.rectangles, crops, self.closely)
         looks[crops.counts < MIN_COUNT] = 0.0
         return looks
 
-    def _crop(self, scan: Scan, candidates: Candidates) -> Crops:
+    def _crop(self, scan: Scan, candidates: Candidates) -> tuple[Candidates, Crops]:
+        return with_points(candidates, self._crops(scan, candidates))
+
+    def _crops(self, scan: Scan, candidates: Candidates) -> Crops:
         return crop_candidates(scan, candidates, self.view.n_points, self.view.margin_m)
 
     def _look(self, places: Floats, crops: Crops, session: Session) -> Floats:

@@ -50,7 +50,17 @@ from ..types.points import Floats32
 from ..types.views import CameraGeometry, ObjectGeometry
 from ..zoo import Variant, choose, digest, resolve
 from .decode import fill_pixels
-from .providers import AUTO, PLUGINS, PROVIDERS, SHARING, available_providers, load_onnxruntime, plugin_devices, version
+from .providers import (
+    AUTO,
+    PLUGINS,
+    PROVIDERS,
+    RECOMPILING,
+    SHARING,
+    available_providers,
+    load_onnxruntime,
+    plugin_devices,
+    version,
+)
 
 logger = logging.getLogger(__name__)
 
@@ -198,7 +208,8 @@ class Session:
         present, features = available_providers(), cpu_features()
         candidates = [(provider, precision, n_threads)]
         if provider == "auto":
-            candidates = [(short, precision, n_threads) for short in AUTO if short in present]
+            unfit = RECOMPILING if isinstance(variants[0].card.view, ObjectGeometry) else ()
+            candidates = [(short, precision, n_threads) for short in AUTO if short in present and short not in unfit]
             candidates = [*self._measured_best(variants[0].name, precision, n_threads, present), *candidates]
         elif provider not in present:
             raise ProviderError(

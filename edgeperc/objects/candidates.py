@@ -14,7 +14,7 @@ import numpy as np
 
 from ..errors import PointsError
 from ..system.kernels import njit
-from ..types.points import Bytes, Floats, Heights, Ints, Points, Rows, read_only
+from ..types.points import Bytes, Floats, Heights, Ints, Points, Rows
 from .rectangles import fit_rectangle
 
 if TYPE_CHECKING:
@@ -102,12 +102,10 @@ def sort_into_cells(scan: Scan, height_range_m: tuple[float, float], number: Int
     return Cells(number, flat[:n_cells], scales[:n_cells], starts[: n_cells + 1], rows[:n_rows])
 
 
-def find_candidates(scan: Scan, cells: Cells, boxes: Floats, distance_per_m: float = 0.015) -> Candidates:
-    """Find where an object may be: the groups at each of the `SCALES`, then ``boxes`` (k, 5) of other origin, such as a
-    detector's. ``distance_per_m`` is as in `objects.cluster.find_clusters`.
+def find_candidates(scan: Scan, cells: Cells, distance_per_m: float = 0.015) -> Candidates:
+    """Find where an object may be: the groups at each of the `SCALES`. ``distance_per_m`` is as in
+    `objects.cluster.find_clusters`.
     """
-    if boxes.ndim != 2 or boxes.shape[1] != 5:
-        raise PointsError(f"got boxes of shape {boxes.shape}; expected (k, 5): x, y, length, width, yaw")
     if not 0.0 <= distance_per_m <= 1.0:
         raise PointsError(f"got distance_per_m={distance_per_m}; expected radians in 0..1")
     n_cells = len(cells.flat)
@@ -126,7 +124,7 @@ def find_candidates(scan: Scan, cells: Cells, boxes: Floats, distance_per_m: flo
         if k == 0:
             around = group
             sizes = np.diff(first[: n_groups + 1])
-    return Candidates(np.concatenate([*found, read_only(boxes, np.float64)]), cells)
+    return Candidates(np.concatenate(found), cells)
 
 
 class Groups(NamedTuple):

@@ -30,7 +30,7 @@ def candidate_inputs(card: ModelCard, points: Points) -> tuple[Floats32, Floats,
     view = card.view
     assert isinstance(view, ObjectGeometry)
     scan = Scan.of(read_only(points), find_ground(points))
-    found = find_candidates(scan, sort_into_cells(scan, view.height_range_m), np.empty((0, 5)))
+    found = find_candidates(scan, sort_into_cells(scan, view.height_range_m))
     (places, _), crops = with_points(found, crop_candidates(scan, found, view.n_points, view.margin_m))
     features = np.empty((len(places), view.n_points, len(card.input.channels)), np.float32)
     fill_features(crops.points, crops.counts, places, np.array([card.input.mean, card.input.std], np.float32), features)

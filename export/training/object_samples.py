@@ -143,19 +143,18 @@ def samples_of(
     cells = sort_into_cells(scan, OBJECT_VIEW.height_range_m)
     detected = rectangles(perceive(points).boxes if perceive is not None else ())
     sensor = labeled.sensor or get_sensor(TRAINING_SENSOR)
-    found = find_candidates(scan, cells, detected, sensor.link_per_m)
+    groups = find_candidates(scan, cells, sensor.link_per_m).rectangles
     truths = [(box, n) for box, n in zip(labeled.boxes, labeled.counts, strict=True)]
     boxes = [box for box, _ in truths]
     known = np.array([n >= MIN_RETURNS and box.label in NAMES for box, n in truths], np.bool_)
-    n_groups = len(found.rectangles) - len(detected)
-    pseudo = _pseudo_boxes(found.rectangles[rng.permutation(n_groups)[: int(PSEUDO_BOXES * n_groups)]], rng)
+    pseudo = _pseudo_boxes(groups[rng.permutation(len(groups))[: int(PSEUDO_BOXES * len(groups))]], rng)
     true = rectangles(box for box, use in zip(boxes, known, strict=True) if use and NAMES[box.label] != BACKGROUND)
-    places = np.concatenate([found.rectangles, pseudo, true])
+    places = np.concatenate([groups, detected, pseudo, true])
     origin = np.repeat(
-        np.array([GROUP, DETECTED, DETECTED, TRUE], np.int8), [n_groups, len(detected), len(pseudo), len(true)]
+        np.array([GROUP, DETECTED, DETECTED, TRUE], np.int8), [len(groups), len(detected), len(pseudo), len(true)]
     )
     of_box = _assigned(scan, labeled.labels, places, boxes)
-    crops = crop_candidates(scan, found._replace(rectangles=places), N_STORED, STORED_MARGIN_M)
+    crops = crop_candidates(scan, Candidates(places, cells), N_STORED, STORED_MARGIN_M)
     labels = np.array([NAMES.get(box.label, UNKNOWN) if n >= MIN_RETURNS else UNKNOWN for box, n in truths], np.int8)
     classes = np.where(of_box >= 0, np.append(labels, np.int8(0))[of_box], np.where(of_box == -1, BACKGROUND, UNKNOWN))
     keep = (classes != UNKNOWN) & (crops.counts >= MIN_RETURNS)

@@ -75,7 +75,7 @@ def test_samples_are_what_the_runtime_sees(labeled: LabeledScan, samples: Object
     points = read_only(labeled.points)
     scan = Scan.of(points, find_ground(points))
     cells = sort_into_cells(scan, OBJECT_VIEW.height_range_m)
-    own = find_candidates(scan, cells, np.empty((0, 5)), get_sensor("hdl-64e").link_per_m)
+    own = find_candidates(scan, cells, get_sensor("hdl-64e").link_per_m)
     groups = np.flatnonzero(samples.origin == GROUP)
     assert len(groups) > 20
     for k in groups:

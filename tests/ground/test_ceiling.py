@@ -14,7 +14,7 @@ from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 
 from edgeperc import Box, Perceiver
-from edgeperc.ground.ceiling import find_ceiling, without_impossible
+from edgeperc.ground.ceiling import Hall, find_ceiling, find_hall, without_impossible
 from edgeperc.simulation.samples import simulated_scan
 from edgeperc.simulation.scene import SimulatedScan
 from edgeperc.types.mounting import MODEL_HEIGHT_M, MODEL_MOUNTING, Mounting
@@ -58,11 +58,15 @@ def below(height_m: float) -> NDArray[np.float32]:
     return np.column_stack([across * np.cos(azimuth), across * np.sin(azimuth), z, z]).astype(np.float32)
 
 
+def hall(height_m: float) -> Hall:
+    return find_hall(below(height_m), MODEL_MOUNTING)
+
+
 @pytest.mark.parametrize("label", ["car", "van", "truck"])
 def test_no_vehicle_is_around_the_sensor(label: str) -> None:
     around = box(1.0, 0.3, label, size=(6.0, 2.5, 2.0), z=-0.7, yaw=0.3)
     others = (box(8.0, 0.0, label), box(0.0, 0.0, "pedestrian", size=(0.8, 0.7, 1.7)))
-    road = below(0.0)
+    road = hall(0.0)
     assert without_impossible((around, *others), road, MODEL_MOUNTING) == others
     passing = (box(0.5, 0.2, label), *others)  # below a sensor on a pole
     assert without_impossible(passing, road, Mounting(4.0 + MODEL_HEIGHT_M)) == passing
@@ -76,8 +80,8 @@ def test_no_vehicle_reaches_the_ceiling(label: str, ceiling_m: float) -> None:
 
     person = box(5.0, 0.0, "pedestrian", size=(0.8, 0.7, ceiling_m), z=0.0)
     boxes = (tall(ceiling_m - 0.2), tall(ceiling_m), tall(ceiling_m + 0.5), person)
-    assert without_impossible(boxes, below(ceiling_m), MODEL_MOUNTING) == (boxes[0], person)
-    assert without_impossible(boxes, below(0.0), MODEL_MOUNTING) == boxes
+    assert without_impossible(boxes, hall(ceiling_m), MODEL_MOUNTING) == (boxes[0], person)
+    assert without_impossible(boxes, hall(0.0), MODEL_MOUNTING) == boxes
 
 
 # Of each, places in which walls, beams, pipes or the whole garage were taken for trucks.
@@ -126,5 +130,5 @@ def test_no_vehicle_stands_behind_the_walls(label: str) -> None:
 
     between = (tall(9.0, 0.0), tall(0.0, -10.0, 1.5), box(20.0, 0.0, "cyclist", size=(1.8, 0.6, 2.2), z=-0.6))
     behind = (tall(-15.0, 0.0), tall(0.0, 13.0, 1.5), tall(11.0, 8.0, 0.6))
-    assert without_impossible((*behind, *between), below(2.6), MODEL_MOUNTING) == between
-    assert without_impossible((*behind, *between), below(0.0), MODEL_MOUNTING) == (*behind, *between)
+    assert without_impossible((*behind, *between), hall(2.6), MODEL_MOUNTING) == between
+    assert without_impossible((*behind, *between), hall(0.0), MODEL_MOUNTING) == (*behind, *between)

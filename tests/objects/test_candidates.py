@@ -32,7 +32,7 @@ from edgeperc.objects.candidates import (
     find_candidates,
     sort_into_cells,
 )
-from edgeperc.objects.crops import FEATURES, Crops, crop_candidates, fill_features, with_points
+from edgeperc.objects.crops import FEATURES, Crops, crop_candidates, fill_features, joined, with_points
 from edgeperc.types.card import CHANNELS, InputSpec, ModelCard, OutputSpec
 from edgeperc.types.geometry import oriented_iou
 from edgeperc.types.views import ObjectGeometry
@@ -117,7 +117,7 @@ def test_cells_and_groups_agree_with_their_twins(scan: Scan, distance_per_m: flo
                 scan.points, scan.ground.height_m, rows, scale, len(own), outer if k else None
             )
         around = around if k else expected
-    assert len(find_candidates(scan, cells, np.empty((0, 5)), distance_per_m).rectangles) == n_found
+    assert len(find_candidates(scan, cells, distance_per_m).rectangles) == n_found
 
 
 @pytest.mark.kernel
@@ -130,7 +130,7 @@ def test_a_rectangle_holds_the_points_of_its_group() -> None:
         points[:, 0] = 10.0 + math.cos(yaw) * u - math.sin(yaw) * v
         points[:, 1] = 3.0 + math.sin(yaw) * u + math.cos(yaw) * v
         scan = scan_of(points, np.linspace(0.3, 1.5, 200, dtype=np.float32))
-        found = find_candidates(scan, sort_into_cells(scan, RANGE_M), np.empty((0, 5))).rectangles
+        found = find_candidates(scan, sort_into_cells(scan, RANGE_M)).rectangles
         assert len(found) >= 1
         x, y, length, width, turn = found[0]
         along = np.abs(math.cos(turn) * (points[:, 0] - x) + math.sin(turn) * (points[:, 1] - y))
@@ -145,7 +145,7 @@ def test_what_is_too_long_too_low_or_too_small_is_no_candidate() -> None:
         points = np.zeros((n, 4), np.float32)
         points[:, 0] = np.linspace(10.0, 10.0 + length, n)
         scan = scan_of(points, np.linspace(0.25, top, n, dtype=np.float32))
-        return len(find_candidates(scan, sort_into_cells(scan, RANGE_M), np.empty((0, 5))).rectangles)
+        return len(find_candidates(scan, sort_into_cells(scan, RANGE_M)).rectangles)
 
     assert n_found(4.0, 1.5, 80) >= 1
     assert n_found(MAX_LENGTH_M + 0.5, 1.5, 200) == 0
@@ -155,13 +155,15 @@ def test_what_is_too_long_too_low_or_too_small_is_no_candidate() -> None:
 
 def test_boxes_of_a_detector_are_the_last_candidates() -> None:
     scan = some_scan(np.random.default_rng(1), 500)
-    boxes = np.array([[10.0, 0.0, 4.0, 1.6, 0.1], [20.0, 5.0, 4.0, 1.6, -2.0]])
-    found = find_candidates(scan, sort_into_cells(scan, RANGE_M), boxes)
-    np.testing.assert_array_equal(found.rectangles[-2:], boxes)
-    with pytest.raises(PointsError, match="expected \\(k, 5\\)"):
-        find_candidates(scan, found.cells, boxes[:, :4])
+    found = find_candidates(scan, sort_into_cells(scan, RANGE_M))
+    boxes = Candidates(np.array([[10.0, 0.0, 4.0, 1.6, 0.1], [20.0, 5.0, 4.0, 1.6, -2.0]]), found.cells)
+    first, second = ((each, crop_candidates(scan, each, 8, 0.8)) for each in (found, boxes))
+    both, crops = joined(first, second)
+    np.testing.assert_array_equal(both.rectangles, np.concatenate([found.rectangles, boxes.rectangles]))
+    for every, once in zip(crops, crop_candidates(scan, both, 8, 0.8), strict=True):
+        np.testing.assert_array_equal(every, once)
     with pytest.raises(PointsError, match="distance_per_m=2"):
-        find_candidates(scan, found.cells, boxes, 2.0)
+        find_candidates(scan, found.cells, 2.0)
 
 
 def test_one_buffer_serves_one_scan_after_the_other() -> None:

@@ -97,9 +97,9 @@ def test_no_person_that_others_show_is_lost(
     """Where this network sees nothing, labels keep half of their score, and another network's box all of it."""
     network = ObjectNetwork(Session("objects", "cpu"))
     seen = Scan.of(scan.points, find_ground(scan.points))
-    candidates = network.crop(seen, (), "both", 0.0)
+    clusters = network.cluster(seen, "both", 0.0)
     person = Box("pedestrian", 0.9, (1.0, 60.0, -0.8), (0.8, 0.6, 1.8), 0.0)
-    (kept,) = network.complete(seen, candidates, (), [person], by_labels, min_score)
+    (kept,) = network.complete(seen, clusters, (), [person], by_labels, min_score)
     assert kept == replace(person, score=score)
 
 
@@ -107,16 +107,16 @@ def test_no_person_that_others_show_is_lost(
 def test_a_vehicle_that_others_show_and_a_close_look_does_not_see_is_dropped(scan: SimulatedScan, label: str) -> None:
     network = ObjectNetwork(Session("objects", "cpu"))
     seen = Scan.of(scan.points, find_ground(scan.points))
-    candidates = network.crop(seen, (), "both", 0.0)
+    clusters = network.cluster(seen, "both", 0.0)
     far_from_all = np.array([box.center[:2] for box in scan.boxes])
     above = scan.points[seen.ground.height_m > 1.0]
     walls = [p for p in above[::97] if np.hypot(*(far_from_all - p[:2]).T).min() > 8.0][:20]
     assert len(walls) == 20
     shown = [Box(label, 0.9, (float(p[0]), float(p[1]), -0.8), (4.2, 1.8, 1.6), 0.0) for p in walls]
-    answers = [network.complete(seen, candidates, (), [box], True, 0.3) for box in shown]
+    answers = [network.complete(seen, clusters, (), [box], True, 0.3) for box in shown]
     assert sum(not answer for answer in answers) >= 15
     nothing_there = Box(label, 0.9, (1.0, 60.0, 40.0), (4.2, 1.8, 1.6), 0.0)
-    assert network.complete(seen, candidates, (), [nothing_there], True, 0.3) == (replace(nothing_there, score=0.45),)
+    assert network.complete(seen, clusters, (), [nothing_there], True, 0.3) == (replace(nothing_there, score=0.45),)
 
 
 def test_the_answer_does_not_depend_on_the_threads(scan: SimulatedScan) -> None:
