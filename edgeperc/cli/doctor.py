@@ -366,7 +366,7 @@ def find_extras() -> Iterator[Finding]:
         elif extra == "gpu" and "onnxruntime" in versions:
             yield Finding("extra gpu", "note", "in place of cpu", "'edgeperc providers' says how to install it")
         elif extra not in _FOR_DEVELOPERS:
-            missing = ", ".join(fault for _, fault in faults)
+            missing = ", ".join(dict.fromkeys(fault for _, fault in faults))
             yield Finding(f"extra {extra}", "note", missing, f"pip install 'edgeperc[{extra}]'")
     yield Finding("extras", "ok", ", ".join(present) or "none is complete")
 
