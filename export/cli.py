@@ -377,7 +377,7 @@ def _quantize(args: argparse.Namespace) -> int:
     if of_objects:
         from .release.object_int8 import quantize_objects
 
-        card = quantize_objects(args.model, args.out, calibration, **how)
+        card = quantize_objects(args.model, args.out, calibration, kitti=args.kitti, **how)
         print_line(f"{args.out}: {card.name} {card.version}: {card.parity['speed']}")
         return 0
     labeled = LabeledSets(args.kitti, args.semantickitti, args.camvid, args.evaluate_on)

@@ -11,11 +11,11 @@ from typing import Any
 import onnx
 
 from edgeperc.evaluation.camvid import evaluate_images
-from edgeperc.evaluation.evaluate import NETWORK_ALONE, Perceiving, evaluate
+from edgeperc.evaluation.evaluate import NETWORK_ALONE, evaluate
 
 from .data.simulate import fitness_of, parity_samples, simulate
 from .recipe import MODELS
-from .release.object_parity import TOP_VIEW
+from .release.object_parity import object_figures
 from .release.to_onnx import export, write_card
 from .training.train import Data, Run, train
 
@@ -25,9 +25,7 @@ MORE_SCANS: Mapping[str, tuple[int, Mapping[str, int], dict[str, bool]]] = {
     "halls": (600_000, dict.fromkeys(("hdl-64e", "pandar64", "vlp-16", "os1-64"), 90), {"indoors": True}),
 }
 """Simulated scans beside those of the training sensor: the first seed, how many of each sensor, and which."""
-SOURCES = {"real", "semantickitti", "simulated"}
 # What a card holds of the figures of a source; `edgeperc eval` prints the rest, which is four times as long.
-OBJECT_FIGURES = ("n_frames", "n_drives", "kitti")
 CARD_FIGURES = ("n_frames", "n_drives", "points", "boxes", "segmentation", "road")
 ROAD_TRUTH = "ssadnet-sim"
 """Model whose road is the ground truth of KITTI's scans, which have no road labels."""
@@ -120,7 +118,6 @@ def finish(
     """
     stage, kitti, fold = MODELS[name], data.kitti, data.fold
     task, fitness = stage.recipe.task, None
-    kept: Sequence[str] = CARD_FIGURES
     if task not in ("camera", "objects"):
         fitness = fitness_of(None if stage.is_open or stage.recipe.simulated_share == 1.0 else kitti)
     card = export(checkpoint, path, scans=parity_samples(task), fitness=fitness, name=name, version=version)
@@ -132,10 +129,7 @@ def finish(
     elif task == "objects":
         if kitti is None:
             return
-        figures, _ = evaluate([kitti], [TOP_VIEW, path], Perceiving(rules=()), fold=fold)
-        kept = OBJECT_FIGURES
-        command = f"edgeperc eval KITTI --model {TOP_VIEW} --model {name}:fp32 --no-agreement"
-        command += f" --fold {fold}" if fold is not None else ""
+        figures, command = object_figures(kitti, path, f"{name}:fp32", fold)
     else:
         datasets: dict[str, str | Path] = {"KITTI": kitti} if kitti is not None else {}
         if semantickitti is not None and fold is None:
@@ -149,8 +143,8 @@ def finish(
         figures, _ = evaluate([*datasets.values()], [path], NETWORK_ALONE, fold=fold, road_by=road_by)
         options = [f"--road-by {ROAD_TRUTH}"] * learned_road + [f"--fold {fold}"] * (fold is not None)
         command = " ".join(["edgeperc eval", *datasets, f"--model {name}", *options, "--no-agreement"])
-    for source in SOURCES & figures.keys():
-        figures[source] = {name: of for name, of in figures[source].items() if name in kept}
+        for source in {"real", "semantickitti", "simulated"} & figures.keys():
+            figures[source] = {name: of for name, of in figures[source].items() if name in CARD_FIGURES}
     figures |= {"command": command}
     path.with_suffix(".json").write_text(json.dumps(figures, indent=1, sort_keys=True) + "\n")
     write_card(onnx.load(path), replace(card, metrics=figures), path)

@@ -19,7 +19,7 @@ from edgeperc.types.card import ModelCard
 from edgeperc.types.points import Floats32
 
 from .int8_graph import sort
-from .object_parity import candidate_inputs, objects_of
+from .object_parity import candidate_inputs, object_figures, objects_of
 from .quantize import (
     Calibration,
     check_fp32,
@@ -43,10 +43,13 @@ def quantize_objects(
     out: Path,
     calibration: Calibration,
     *,
+    kitti: Path | None = None,
     seven_bits: bool | None = None,
     n_threads: int | None = None,
 ) -> ModelCard:
-    """Write an object network in int8, if it is faster here; parameters and errors as of `quantize`."""
+    """Write an object network in int8, if it is faster here; parameters and errors as of `quantize`. Its card has
+    figures only with ``kitti``.
+    """
     card = ModelCard.read(path)
     check_fp32(path, card)
     batches = list(candidate_batches(card, calibration.scans))
@@ -62,7 +65,10 @@ def quantize_objects(
             "label_agreement": _agreement(path, trial, batches, len(card.classes)),
             "speed": f"{speed}, {len(batches[0])} candidates",
         }
-        return {"parity": parity}
+        if kitti is None:
+            return {"parity": parity, "metrics": {}}
+        figures, command = object_figures(kitti, trial, f"{card.name}:int8")
+        return {"parity": parity, "metrics": figures | {"command": command}}
 
     model = rounded(folded(path), card, batches, seven_bits=seven_bits)
     left_alone = ["the first layer of points", "the first look", "the layers of a candidate"]

@@ -1,14 +1,16 @@
-"""Comparison of an exported object network with its torch network."""
+"""An exported object network compared with its torch network, and with the truth."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from edgeperc.evaluation.evaluate import Perceiving, evaluate
 from edgeperc.ground.planes import find_ground
 from edgeperc.ground.scan import Scan
 from edgeperc.inference.session import MAX_ROWS, Session
@@ -42,6 +44,14 @@ def objects_of(session: Session, inputs: Floats32) -> Floats32:
     n = min(len(inputs), MAX_ROWS)
     session.input[:n] = inputs[:n]
     return session.run(n)["objects"][:n]
+
+
+def object_figures(kitti: Path, path: Path, name: str, fold: int | None = None) -> tuple[dict[str, Any], str]:
+    """What a card holds of a KITTI set's boxes, with those of the top view as candidates, and the command for it."""
+    figures, _ = evaluate([kitti], [TOP_VIEW, path], Perceiving(rules=()), fold=fold)
+    figures["real"] = {key: figures["real"][key] for key in ("n_frames", "n_drives", "kitti")}
+    of_fold = f" --fold {fold}" if fold is not None else ""
+    return figures, f"edgeperc eval KITTI --model {TOP_VIEW} --model {name} --no-agreement{of_fold}"
 
 
 def compare_objects(network: ObjectNet, session: Session, scans: Sequence[NDArray[Any]]) -> tuple[float, float, float]:

@@ -34,6 +34,7 @@ from edgeperc_export.data.scans import LabeledScan
 from edgeperc_export.networks import build
 from edgeperc_export.networks.objects import ObjectNet, parts_of, rejected
 from edgeperc_export.recipe import MODELS
+from edgeperc_export.release import object_int8
 from edgeperc_export.release.object_int8 import candidate_batches, quantize_objects, rounded
 from edgeperc_export.release.quantize import Calibration, folded
 from edgeperc_export.release.to_onnx import load, to_graph, verify, with_golden, write_card
@@ -281,6 +282,22 @@ def test_only_fp32_and_scans_with_clusters_are_quantized(tmp_path: Path) -> None
         quantize_objects(model_path("objects:fp32"), tmp_path / "int8.onnx", nothing)
     with pytest.raises(ModelError, match="quantize the model in fp32"):
         quantize_objects(model_path("objects:int8"), tmp_path / "int8.onnx", nothing)
+
+
+def test_the_card_of_int8_has_figures_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The card of the network in fp32 has some, which are not those of int8."""
+    faster = np.full(40, 2.0), np.full(40, 1.0)
+    monkeypatch.setattr(object_int8, "race", lambda *_, **__: faster)
+    monkeypatch.setattr(
+        object_int8,
+        "object_figures",
+        lambda kitti, path, name: ({"of": ModelCard.read(path).precision}, f"{kitti} {name}"),
+    )
+    path, calibration = model_path("objects:fp32"), Calibration([simulated_scan(SEED).points], [])
+    assert ModelCard.read(path).metrics
+    assert quantize_objects(path, tmp_path / "int8.onnx", calibration).metrics == {}
+    measured = quantize_objects(path, tmp_path / "int8.onnx", calibration, kitti=Path("KITTI")).metrics
+    assert measured == {"of": "int8", "command": "KITTI objects:int8"}
 
 
 def test_other_processes_paste_the_same_objects(labeled: LabeledScan, tmp_path: Path) -> None:
