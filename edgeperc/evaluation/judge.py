@@ -152,13 +152,12 @@ class Judge:
 
     def record(self, truth: Truth) -> tuple[Record, Mistakes | None]:
         """Evaluate one scan; there are no mistakes of scans whose objects are not labeled."""
-        perception = self._perceive(truth.points)
-        return self._compare(truth, perception, perception.boxes)
+        return self.compare(truth, self._perceive(truth.points))
 
     def record_scan(self, frame: ScanFrame) -> tuple[Record, Mistakes | None]:
         """Evaluate a scan of a `ScanFolder` as a user's: its mounting is that of its drive. Raises SplitError."""
         truth, perception, scan_boxes = self._perceive_frame(frame)
-        return self._compare(truth, perception, scan_boxes)
+        return self.compare(truth, perception, scan_boxes)
 
     def record_boxes(self, frame: ScanFrame) -> Record:
         """As `record_scan`, of the boxes alone: `kitti_ap` and `center_ap`."""
@@ -179,9 +178,11 @@ class Judge:
         truth = folder_truth(frame, perception.mounting, self.view, self.point_classes)
         return truth, replace(perception, boxes=boxes), perception.boxes
 
-    def _compare(
-        self, truth: Truth, perception: Perception, scan_boxes: Sequence[Box]
+    def compare(
+        self, truth: Truth, perception: Perception, scan_boxes: Sequence[Box] | None = None
     ) -> tuple[Record, Mistakes | None]:
+        """Evaluate the perception of a scan, the last one; ``scan_boxes``: its boxes in the frame of the scan."""
+        scan_boxes = perception.boxes if scan_boxes is None else scan_boxes
         tallies: dict[tuple[str, ...], Any] = {}
         mistakes = None
         if truth.labels is not None:

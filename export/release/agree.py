@@ -152,8 +152,8 @@ def _measure(
     records: dict[str, list[Record]] = {}
     labels = []
     for block, truth in truths():
-        records.setdefault(block, []).append(judge.record(truth)[0])
         found = judge.perceive(truth.points)
+        records.setdefault(block, []).append(judge.compare(truth, found)[0])
         labels.append(found.points.labels if found.points is not None else found.require_top_view().labels.ravel())
     if not labels:
         raise PointsError(f"no labeled scan of {split} drives in {kitti}, {semantickitti}; name a KITTI object set")
