@@ -55,7 +55,7 @@ class Contender:
     """One row of a table."""
 
     name: str
-    kind: str  # as `turns.make_calls` takes it
+    kind: str  # a key of `turns.KINDS`, or "peak"
     engine: str = ""  # a provider for edgeperc's own kinds, else as `open_engine` or `matrix_product` take it
     precision: str = ""  # as the provider or the engine takes it; empty if it has no choice
     paths: tuple[Path, ...] = ()

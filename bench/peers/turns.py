@@ -8,7 +8,7 @@ import os
 import signal
 import time
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace
 from functools import partial
 from importlib import import_module
@@ -40,6 +40,8 @@ from .tables import floor_table, latency_table, methods_table
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 PAUSE_S = 0.02  # threads of the previous contender spin for some milliseconds
 Calls = list[Callable[[], object]]
+Prepare = Callable[[Any], Callable[[], object]]
+"""What makes the call that is timed of a scan, or an image."""
 
 
 # What runs in a contender's process
@@ -64,40 +66,79 @@ def make_perceiver(contender: Contender, sensor: str, n_threads: int) -> Perceiv
     )
 
 
+def prepare_edgeperc(contender: Contender, sensor: str, n_threads: int) -> Prepare:
+    """edgeperc's pipeline."""
+    perceive = make_perceiver(contender, sensor, n_threads)
+    return (lambda image: partial(perceive, image=image)) if contender.inputs else partial(partial, perceive)
+
+
+def open_networks(contender: Contender, n_threads: int) -> list[Any]:
+    """A contender's networks in its engine."""
+    how = contender.engine, contender.precision
+    if contender.kind == "session":
+        return [Session(path, how[0], precision=how[1], n_threads=n_threads) for path in contender.paths]
+    return [open_engine(*how, path, n_threads) for path in contender.paths]
+
+
+def prepare_networks(contender: Contender, sensor: str, n_threads: int) -> Prepare:
+    """Networks alone, one after the other, with their input already written."""
+    assert contender.image is not None
+    networks = open_networks(contender, n_threads)
+    for network in networks:
+        network.input[:] = np.load(contender.image)
+    return lambda scan: lambda: [network.run() for network in networks]
+
+
+def prepare_pillars(contender: Contender, sensor: str, n_threads: int) -> Prepare:
+    """PointPillars from scan to the outputs of its network, which mean nothing."""
+    (network,), weights = open_networks(contender, n_threads), random_weights()
+    return lambda scan: lambda: (fill_pillars(scan, weights, network.input), network.run())
+
+
+def prepare_pipeline(contender: Contender, sensor: str, n_threads: int) -> Prepare:
+    """The pipeline in numpy around another engine."""
+    cards, networks = [ModelCard.from_json(card) for card in contender.cards], open_networks(contender, n_threads)
+    camera = contender.inputs
+    return partial(
+        partial, NumpyCamera(cards[0], *networks) if camera else NumpyPipeline(cards, networks, get_sensor(sensor))
+    )
+
+
+def prepare_unet(contender: Contender, sensor: str, n_threads: int) -> Prepare:
+    """The small U-Net in torch, from image to labels, which mean nothing and are not compared."""
+    return partial(partial, small_unet(ModelCard.from_json(contender.cards[0]), contender.precision, n_threads))
+
+
+def prepare_clusters(contender: Contender, sensor: str, n_threads: int) -> Prepare:
+    """Patchwork++, and a k-d tree's clusters of what it leaves; both know one thread only."""
+    find_ground = ground_finders({"pypatchworkpp": import_module("pypatchworkpp")}, get_sensor(sensor))["Patchwork++"]
+    return lambda scan: partial(lambda ground: tree_clusters(scan[~ground()]), find_ground(scan))
+
+
+def prepare_projection(contender: Contender, sensor: str, n_threads: int) -> Prepare:
+    """One projection of a scan."""
+    return lambda scan: projection.contenders(np.ascontiguousarray(scan))[contender.engine]
+
+
+KINDS: Mapping[str, Callable[[Contender, str, int], Prepare]] = {
+    **dict.fromkeys(("edgeperc", "default", *ANSWERS), prepare_edgeperc),
+    **dict.fromkeys(("network", "session"), prepare_networks),
+    "clusters": prepare_clusters,
+    "pillars": prepare_pillars,
+    "pipeline": prepare_pipeline,
+    "projection": prepare_projection,
+    "unet": prepare_unet,
+}
+
+
 def make_calls(contender: Contender, scans: Sequence[NDArray[Any]], sensor: str, n_threads: int) -> Calls:
     """What a contender does in a turn: one call per scan, or a peak of the machine."""
-    kind, how = contender.kind, (contender.engine, contender.precision)
-    if kind == "peak":
-        return [memory_copy(n_threads)] if contender.engine == "copy" else [matrix_product(*how, n_threads)] * 2
-    if kind == "projection":
-        return [projection.contenders(np.ascontiguousarray(scan))[contender.engine] for scan in scans]
-    if kind == "clusters":  # Patchwork++, and a k-d tree's clusters of what it leaves; both know one thread only
-        libraries = {"pypatchworkpp": import_module("pypatchworkpp")}
-        find_ground = ground_finders(libraries, get_sensor(sensor))["Patchwork++"]
-        return [partial(lambda scan, ground: tree_clusters(scan[~ground()]), scan, find_ground(scan)) for scan in scans]
-    call: Callable[[Any], object]
-    cards, networks = [ModelCard.from_json(card) for card in contender.cards], list[Any]()
-    if kind == "session":
-        networks = [Session(path, how[0], precision=how[1], n_threads=n_threads) for path in contender.paths]
-    elif kind in ("network", "pillars", "pipeline"):
-        networks = [open_engine(*how, path, n_threads) for path in contender.paths]
-    if contender.image is not None:  # networks alone, one after the other, with their input already written
-        for network in networks:
-            network.input[:] = np.load(contender.image)
-        return [lambda: [network.run() for network in networks]] * len(scans)
-    if kind == "pillars":  # from scan to the outputs of the network, which mean nothing
-        fill, (network,) = partial(fill_pillars, weights=random_weights(), image=networks[0].input), networks
-        return [partial(lambda scan: (fill(scan), network.run()), scan) for scan in scans]
-    if kind == "pipeline" and contender.inputs:
-        call = NumpyCamera(cards[0], *networks)
-    elif kind == "pipeline":
-        call = NumpyPipeline(cards, networks, get_sensor(sensor))
-    elif kind == "unet":  # from image to labels, which mean nothing and are not compared
-        call = small_unet(cards[0], contender.precision, n_threads)
-    else:
-        perceive = make_perceiver(contender, sensor, n_threads)
-        call = (lambda image: perceive(image=image)) if contender.inputs else perceive
-    return [partial(call, scan) for scan in scans]
+    if contender.kind == "peak" and contender.engine == "copy":
+        return [memory_copy(n_threads)]
+    if contender.kind == "peak":
+        return [matrix_product(contender.engine, contender.precision, n_threads)] * 2
+    prepare = KINDS[contender.kind](contender, sensor, n_threads)
+    return [prepare(scan) for scan in scans]
 
 
 def serve(connection: Any, contender: Contender, files: Sequence[Path], sensor: str, n_threads: int) -> None:
