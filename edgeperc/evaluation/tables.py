@@ -73,39 +73,32 @@ def banded(
 def figures(records: Iterable[Record], n_resamples: int = 1000) -> dict[str, Any]:
     """Compute all figures of the records, and count their scans and drives.
 
-    Parameters
-    ----------
-    records : iterable of Record
-    n_resamples : int
-        Number of bootstrap resamples of the drives, for the 95 % intervals (``"iou_interval"`` for ``"iou"``). An
-        interval is None if fewer than two drives have data for the figure.
+    n_resamples : bootstrap resamples of the drives, for the 95 % intervals (``"iou_interval"`` for ``"iou"``), which
+        are None if fewer than two drives have data for the figure.
 
-    Returns
-    -------
-    dict
-        For JSON: numbers with four decimals, None for NaN. Rows of objects have their number of labels in all scans
-        (``"n_boxes"`` or ``"n_truth"``), of distinct objects (``"n_objects"``, `metrics.object_key`) and of drives, and
-        ``"few": True`` if there are fewer than `FEWEST_OBJECTS`.
+    Numbers have four decimals, None for NaN. Rows of objects have their number of labels in all scans (``"n_boxes"`` or
+    ``"n_truth"``), of distinct objects (``"n_objects"``, `metrics.object_key`) and of drives, and ``"few": True`` if
+    there are fewer than `FEWEST_OBJECTS`.
 
-        - ``"labeled"``: the labeled objects with at least three returns, by class.
-        - ``"points"``, ``"pixels"``: by band and class. ``"iou_by_drive"``: the IoU if each drive counts as one scan,
-          its mean scan, so that a long drive does not count for more than a single scan of another street.
-        - ``"sure"``: as ``"points"``, without points of which boxes say little: the ground in the boxes of objects
-          (`edgeperc.ground.planes.find_ground`), and people who sit, whom KITTI's own evaluation leaves out.
-        - ``"boxes"``: by kind (``"upright"``, ``"oriented"``), band and class, of the classes and in the view that the
-          models detect.
-        - ``"all_round"``: by band and class, oriented boxes of vehicles (AP50) and people (AP25) wherever the truth is
-          known, detected or not.
-        - ``"kitti"``: by class, overlap and level or range: AP as KITTI's benchmark computes it (`kitti_ap`), in its
-          image, or all round where all objects are labeled.
-        - ``"centers"``: by class: AP by the distance of centers, and errors of matches (`center_ap`).
-        - ``"heading"``: of the matched boxes of ``"boxes"`` and ``"all_round"``, by band and class, those whose heading
-          is right within 45 degrees.
-        - ``"errors"``: by error and cause (`causes.CAUSES`). ``"all"`` is a share of the true (missed) or predicted
-          (false) points of the class, a cause a share of the error; ``"n_of"`` is the whole.
-        - ``"bumper"``: points at the own bumper that are labeled car: all, and those on the ground. Where the truth is
-          unknown they may be of a real car next to the ego vehicle.
-        - ``"segmentation"``: by table and band. ``"road"``: by band.
+    - ``"labeled"``: the labeled objects with at least three returns, by class.
+    - ``"points"``, ``"pixels"``: by band and class. ``"iou_by_drive"``: the IoU if each drive counts as one scan,
+      its mean scan, so that a long drive does not count for more than a single scan of another street.
+    - ``"sure"``: as ``"points"``, without points of which boxes say little: the ground in the boxes of objects
+      (`edgeperc.ground.planes.find_ground`), and people who sit, whom KITTI's own evaluation leaves out.
+    - ``"boxes"``: by kind (``"upright"``, ``"oriented"``), band and class, of the classes and in the view that the
+      models detect.
+    - ``"all_round"``: by band and class, oriented boxes of vehicles (AP50) and people (AP25) wherever the truth is
+      known, detected or not.
+    - ``"kitti"``: by class, overlap and level or range: AP as KITTI's benchmark computes it (`kitti_ap`), in its
+      image, or all round where all objects are labeled.
+    - ``"centers"``: by class: AP by the distance of centers, and errors of matches (`center_ap`).
+    - ``"heading"``: of the matched boxes of ``"boxes"`` and ``"all_round"``, by band and class, those whose heading
+      is right within 45 degrees.
+    - ``"errors"``: by error and cause (`causes.CAUSES`). ``"all"`` is a share of the true (missed) or predicted
+      (false) points of the class, a cause a share of the error; ``"n_of"`` is the whole.
+    - ``"bumper"``: points at the own bumper that are labeled car: all, and those on the ground. Where the truth is
+      unknown they may be of a real car next to the ego vehicle.
+    - ``"segmentation"``: by table and band. ``"road"``: by band.
     """
     by_drive: dict[str, list[Tallies]] = {}
     for record in records:

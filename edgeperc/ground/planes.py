@@ -63,21 +63,12 @@ LOW_WORD = np.int64(0xFFFF_FFFF)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Ground:
-    """Result of `find_ground`.
+    """Result of `find_ground`."""
 
-    Attributes
-    ----------
-    mask : (n,) bool
-        Points on the ground, in input order.
-    height_m : (n,) float32
-        Height of every point above the ground below it [m]; NaN for points that are not finite.
-    plane : tuple of 3 float, or None
-        a, b, c of z = a x + b y + c [m] around the vehicle. None if no ground was found: then no point is ground, and
-        heights are above a level plane at the mounting height.
-    """
-
-    mask: Mask
-    height_m: Heights
+    mask: Mask  # points on the ground, in input order
+    height_m: Heights  # of every point above the ground below it; NaN for points that are not finite
+    # a, b, c of z = a x + b y + c [m] around the vehicle. None if no ground was found: then no point is ground, and
+    # heights are above a level plane at the mounting height.
     plane: tuple[float, float, float] | None
 
 
@@ -89,47 +80,13 @@ def find_ground(
     regions: bool = True,
     rows: Rows | None = None,
 ) -> Ground:
-    """Separate the ground from what stands on it (KUL-Seg 5.2).
+    """Separate the ground from what stands on it (KUL-Seg 5.2), by planes of regions (docs/concepts/clusters.md);
+    deterministic. Raises PointsError.
 
-    Parameters
-    ----------
-    points : (n, 3 or more) float32
-        x, y, z [m] in the sensor frame.
-    mount_height_m : float
-        Height of the sensor above the ground [m] (`SensorProfile.mount_height_m`); may be wrong by 0.5 m.
-    max_height_m : float
-        A point is ground if it is at most this far above the ground [m] and at most 0.5 m below it.
-    regions : bool
-        False fits only the plane around the vehicle.
-    rows : (m,) int32, optional
-        Rows of the points whose height is wanted, all by default. The ground is found with all points.
-
-    Returns
-    -------
-    Ground
-        Of the wanted points. Deterministic. ``plane`` is None for an empty scan, or a scan without ground, such as that
-        of a wall.
-
-    Raises
-    ------
-    PointsError
-        ``points`` has another shape, or a height is not above 0.
-
-    Notes
-    -----
-    KUL-Seg (section 5.2) removes the ground by RANSAC without details; this method is our own. A hypothesis is the
-    plane through the lowest returns of three cells. A cell whose lowest return is within 0.1 m of the plane votes for
-    it; a cell whose lowest return is lower votes against it. There are no returns from below the ground, so a plane
-    through hedges or a row of car roofs wins only if they hide more than two thirds of the cells. The first plane is
-    searched within 20 m of the sensor, near the mounting height. The four regions of 8 x 8 m around the vehicle start
-    from it; each of the others starts from the mean of its solved neighbors, may differ in slope by 0.12, and is
-    refined by least squares with the neighbors' slope as a weak prior, because a far region may hold a single ring of
-    returns. Heights are interpolated between the middles of regions. Last, the ground moves to the mean of the lowest
-    returns within 0.3 m in 5 x 5 cells, so that it follows kerbs and banks.
-
-    Parameters were chosen on simulated HDL-64E and VLP-16 scans and on HDL-32E scans of nuScenes. On 16 scans of
-    SemanticKITTI (ground: road, parking, pavement, other ground, terrain, lane marking; vegetation is left out, because
-    its grass may be either) recall is 0.998 and precision 0.983; Patchwork++ has 0.996 and 0.977.
+    mount_height_m : of the sensor above the ground (`SensorProfile.mount_height_m`); may be wrong by 0.5 m.
+    max_height_m : a point is ground if it is at most this far above the ground and at most 0.5 m below it.
+    regions : False fits only the plane around the vehicle.
+    rows : of the points whose height is wanted. The ground is found with all points.
     """
     return fit_ground(points, mount_height_m=mount_height_m, regions=regions).heights(rows, max_height_m=max_height_m)
 

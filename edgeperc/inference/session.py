@@ -101,74 +101,25 @@ def _check_names(provider: str, precision: str) -> None:
 class Session:
     """One network, loaded, checked against its card and warmed up, with buffers of its own.
 
-    Parameters
-    ----------
-    model : str or Path
-        A name, a name with a variant, or the path of an .onnx file with a card (`edgeperc.zoo.resolve`).
-    provider : str
-        ``"auto"``, or a key of `PROVIDERS`.
-    precision : {"auto", "fp32", "bf16", "int8"}
-        ``"auto"`` takes a reduced precision if the processor computes it natively and the card shows a small loss
-        (`edgeperc.zoo.choose`). Any other value is required.
-    n_threads : int or None
-        Threads inside one run, at most 4096; None leaves it to the provider.
-    at_once : int
-        Number of sessions that run at the same time. If it is above 1 and ``n_threads`` is None, the providers ``cpu``
-        and ``openvino`` get as large a part of the usable cores.
-    trusted : bool
-        Open graphs that are otherwise refused, because they could run without end or take all memory: with operators
-        that are not in `onnx_file.OPERATORS`, functions, subgraphs or sizes beyond the limits. The first run
-        is then not stopped after 30 s. Weights in other files are always refused.
+    model, provider, precision, n_threads, trusted : as in `edgeperc.Perceiver`, for one network.
+    at_once : number of sessions that run at the same time. If it is above 1 and ``n_threads`` is None, the providers
+        ``cpu`` and ``openvino`` get as large a part of the usable cores.
 
-    Attributes
-    ----------
-    path : Path
-        The file that runs.
-    card : ModelCard
-    sha256 : str
-        Of the file.
-    digest : str
-        Key of this network's measured settings (`edgeperc.zoo.digest`).
-    short, provider : str
-        The active provider as a key of `PROVIDERS` and as onnxruntime calls it: ``"cpu"``, ``"CPUExecutionProvider"``.
-    precision : str
-        The active precision: ``"fp32"``, ``"bf16"`` or ``"int8"``.
-    options : dict of str to str
-        Settings of onnxruntime's session and of the provider, for reports.
-    input : (C, H, W) float32
-        Write the network's input here, then `run`. Of an object network: (`MAX_ROWS`, points, channels), a row for
-        each candidate. Of a detector: (pillars, points, channels).
-    inputs : mapping of str to ndarray
-        All inputs of a detector by name, of the types that the graph takes, a row for each pillar.
-    outputs : mapping of str to ndarray
-        Outputs by output *kind*, of a detector by name, without the batch axis; overwritten by every `run`. Values of
-        blocks are written to their pixels (`edgeperc.card.OutputSpec`).
-    raw : mapping of str to ndarray
-        The same as the graph gives them.
-    shares_cores : bool
-        Whether the session has a part of the cores (``at_once``).
-    golden_deviation : float
-        Deviation of the outputs for the card's golden input from the exporter's, in standard deviations of the output
-        (90th percentile). NaN if the card has no golden record, which is logged as a warning.
+    Raises OptionError, ModelFileError, CardError, CardMismatchError, ProviderError, MissingExtraError, and
+    InferenceError if the first run failed.
 
-    Raises
-    ------
-    OptionError
-        ``n_threads`` is below 1 or above 4096.
-    ModelFileError, CardError, CardMismatchError
-        The model cannot be read, or its graph or outputs do not agree with its card.
-    ProviderError
-        The provider or the precision is unknown or not available, or the provider cannot run the model.
-    InferenceError
-        The first run failed.
-    MissingExtraError
-        onnxruntime is not installed.
-
-    Notes
-    -----
-    A session belongs to its process. A forked child may drop it and end. It runs there only with ``provider="cpu"`` and
+    It belongs to its process. A forked child may drop it and end. It runs there only with ``provider="cpu"`` and
     ``n_threads=1``: the threads of a provider do not exist there, and waiting for them would never end. It cannot be
     pickled.
+
+    ``input`` takes the network's input before `run`: (C, H, W); of an object network (`MAX_ROWS`, points, channels), a
+    row for each candidate; of a detector (pillars, points, channels), whose inputs by name are ``inputs``. ``outputs``
+    are by output kind, of a detector by name, without the batch axis, and overwritten by every `run`; values of blocks
+    are written to their pixels (`OutputSpec`), ``raw`` has them as the graph gives them. ``short`` and ``provider`` are
+    the active one as a key of `PROVIDERS` and as onnxruntime calls it, ``precision`` is the active one, ``digest`` the
+    key of the network's measured settings (`edgeperc.zoo.digest`), ``options`` are for reports. ``golden_deviation`` is
+    that of the outputs for the card's golden input from the exporter's, in standard deviations (90th percentile); NaN
+    if the card has none, which is logged as a warning.
     """
 
     def __init__(

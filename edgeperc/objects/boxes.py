@@ -71,81 +71,16 @@ def objects_from_points(
     min_points: int = 5,
     min_score: float = MIN_SCORE,
 ) -> tuple[Box, ...]:
-    """Fit boxes to the clusters that have one dominant class (KUL-Seg 5.2).
+    """Fit boxes to the clusters that have one dominant class (KUL-Seg 5.2), and to persons (docs/concepts/clusters.md);
+    the best score comes first. Raises PointsError.
 
-    Parameters
-    ----------
-    points : (n, 3 or more) float32
-        x, y, z [m] in the sensor frame.
-    labels : (n,) uint8
-        Index into ``classes`` of every point; 0 is the background.
-    classes : sequence of str
-    among : (n,) bool, optional
-        Points to cluster, all by default. Leave out the ground (`Ground.mask`), which would join everything on it.
-    height_m : (n,) float32, optional
-        Height of every point above the ground (`Ground.height_m`). A box then reaches down to the ground, otherwise
-        to its lowest point.
-    clusters : (n,) int32, optional
-        Cluster of every point, -1 for none, if they are known (`find_clusters` with labeled points as seeds). Otherwise
-        they are found among ``among``.
-    in_view : (n,) bool, optional
-        Points in the network's view, all by default. The others have no label.
-    others : sequence of Box
-        Boxes that are known, such as a network's. Points inside of them are no further object.
-    min_share : float
-        A cluster is kept if more than this share of its points in view has one class (KUL-Seg 5.2), however many are
-        out of view. Persons need no share.
-    distance_per_m, min_points
-        As in `find_clusters`.
-    min_score : float
-        Boxes with a lower score are dropped.
-
-    Returns
-    -------
-    tuple of Box
-        Best score first. The score is a product of four factors: the share of the class; n / (n + 10) for n points in
-        view; the square of height / usual height, at most 1; and longer side / usual width, at most 1. To the height
-        and the side, range * ``distance_per_m`` is added, the gap that two returns of an object may have. Of persons:
-        the share of persons' points; n / (n + m), with m from 10 to 80, more for near persons; the square of height /
-        usual height, inverted if too tall; and the square of the greatest width of heads / width of the heads, at most
-        1. The heading is known up to a half turn: yaw is in -pi/2..pi/2.
-
-    Raises
-    ------
-    PointsError
-        Arrays disagree in shape, or a label is not in ``classes``.
-
-    Notes
-    -----
-    The heading of cars, vans and trucks comes from an L-shape fit: most points lie near the sides of the rectangle
-    (Zhang et al. 2017, closeness). Other classes get the heading of the smallest rectangle. The longer side is the
-    length. If both sides may be a front or a rear (at most 1.4 usual widths), the length is the side that points
-    towards the sensor, because a flank that faces the sensor is seen as a longer side. Of the boxes of vehicles on the
-    training drives, 710 of 911 on KITTI and 738 of 837 on PandaSet then have an IoU above 0.5; if it is the side that
-    differs more from the usual width, 674 and 679. A side that is shorter than usual was seen only in part: it is
-    extended to the usual length, away from the sensor, or at both ends if the sensor is beside it. The height is
-    extended upwards in the same way. Longer sides are kept, but a cluster in which a vehicle would be wider than 3 m
-    holds something else too: the rectangle is fitted to the 3 m with the most points.
-
-    If the labels know neither vans nor trucks, a car is a van from a height of 1.8 m on, and a truck from a height of
-    2.4 m or a length of 7 m on. Both are completed to the size of a van.
-
-    Two boxes are pieces of one object if they overlap by more than 0.1, or if more than half of one footprint lies in
-    the other; the box with the higher score is kept. What lies with more than half of the rectangle around its points
-    in a better box, of a cluster or of ``others``, is a part of that object. Boxes are fitted to at most 1000 clusters,
-    those with the highest product of the first two factors, and to 1000 persons: no real scan has as many, and the time
-    stays bounded.
-
-    Persons get boxes of their own, wherever they stand. A cluster that is no larger than a cyclist, and of which a
-    fifth of the points has a person's label, is one group; of other clusters, labeled points that are linked are one
-    group. A group whose upper quarter is wider than 0.8 m is cut where the fewest points are: people side by side. A
-    person is a cyclist if a quarter of the persons' points is cyclist. The box has the principal axis of the points and
-    their middle: its sides are extended to the usual ones at both ends, because a person is thin enough to be seen from
-    side to side. Two persons are one if their boxes overlap by more than 0.3, or 0.1 if either rides, or if more than
-    half of one footprint lies in the other.
-
-    Parameters were chosen on KITTI's training drives (`edgeperc.datasets.splits.FOLDS`), with labels of networks that
-    were not trained on them. ``bench/RESULTS.md`` has the results on the test drives.
+    labels : index into ``classes`` of every point; 0 is the background.
+    among : points to cluster. Leave out the ground (`Ground.mask`), which would join everything on it.
+    height_m : `Ground.height_m`; a box then reaches down to the ground, otherwise to its lowest point.
+    clusters : of `find_clusters` with labeled points as seeds; by default they are found among ``among``.
+    in_view : points in the network's view, all by default. The others have no label.
+    others : boxes that are known, such as a network's. Points inside of them are no further object.
+    min_share : a cluster needs more than this share of its points in view with one class. Persons need no share.
     """
     if labels.shape != (len(points),):
         raise PointsError(f"got labels of shape {labels.shape} for {len(points)} points; expected one a point")

@@ -41,65 +41,22 @@ def find_clusters(
     min_points: int = 5,
     strips: Strips | None = None,
 ) -> Ints:
-    """Number the groups of linked points.
+    """Number the groups of linked points by their first points, -1 for none (docs/concepts/clusters.md). With
+    ``votes``, all seeds of dropped clusters have -2, and some of their other points. Raises PointsError; warns where
+    the tests of links were not enough.
 
-    Parameters
-    ----------
-    points : (n, 3 or more) float32
-        x, y, z [m] in the sensor frame.
-    among : (n,) bool, optional
-        The points to cluster, such as those above the ground; all by default.
-    seeds : (n,) bool, optional
-        Points that a cluster must hold, such as those labeled as an object; all by default. Only the parts of the scan
-        that are linked with seeds are searched.
-    votes : (n,) uint8, optional
-        What every point counts for. Bit 0: the point counts; without it there are no other bits. Bit k + 1: it may
+    among : the points to cluster, such as those above the ground.
+    seeds : points that a cluster must hold, such as those labeled as an object. Only the parts of the scan that are
+        linked with seeds are searched.
+    votes : what every point counts for. Bit 0: the point counts; without it there are no other bits. Bit k + 1: it may
         count for the share ``min_share[k]``. By default every point counts, and the seeds count for one share.
-    min_share : float or sequence of float
-        Clusters are dropped unless more than this share of their points are seeds; with ``votes``, unless one of the
-        shares is larger than its limit. A cluster that cannot reach that is not searched further.
-    min_distance_m, distance_per_m : float
-        Two points are linked if their distance is at most ``max(min_distance_m, distance_per_m * range)``, with the
-        range of the nearer one. ``distance_per_m`` is twice the angle [rad] between neighboring beams, so that points
-        of neighboring beams are linked at any range: 0.015 for an HDL-64E, 0.07 for a VLP-16. 0: one distance
-        for all ranges.
-    max_range_m : float
-        Points with a larger x, y or z are in no cluster.
-    min_points : int
-        Smaller clusters are dropped.
-    strips : Strips, optional
-        From `sort_points` with the same arguments, so that the points are sorted once. They cannot be used again.
-
-    Returns
-    -------
-    (n,) int32
-        Cluster of every point, -1 for none. Clusters are numbered by their first points, in input order. Points that
-        are not finite have -1. With ``votes``, all seeds of dropped clusters have -2, and some of their other points.
-
-    Raises
-    ------
-    PointsError
-        Arrays disagree in shape, a number is out of its range, or ``min_distance_m`` is so small that ``max_range_m``
-        needs more than 2^26 columns.
-
-    Notes
-    -----
-    With ``distance_per_m=0`` and ``min_points=1``, the result is exactly that of DBSCAN with ``min_samples=1``. Points
-    are sorted into columns that are half the distance wide, wider where the distance is longer. Consecutive points of
-    a column that are close in height are linked without a test and form a run. Clusters grow from run to run: a run of
-    a neighboring column is joined if its bounds, and one pair of points, are near enough. Runs of many points are
-    halved again and again, and only halves whose bounds are near enough are tested. Columns beyond the reach of all
-    clusters are not even sorted.
-
-    The time is bounded for any scan: a run has a bounded number of neighbors, and 64 tests a point decide which are
-    linked. Real scans need up to 6. More are needed if thousands of points lie just beyond the distance from thousands
-    of others. From then on, only the nearest parts of two runs are tested, and the runs are not linked if that finds
-    no link: clusters may be split there. A warning gives the number of these pairs of runs.
-
-    Warns
-    -----
-    UserWarning
-        The 64 tests a point were not enough.
+    min_share : clusters are dropped unless more than this share of their points are seeds; with ``votes``, unless one
+        of the shares is larger than its limit. A cluster that cannot reach that is not searched further.
+    min_distance_m, distance_per_m : two points are linked if their distance is at most ``max(min_distance_m,
+        distance_per_m * range)``, with the range of the nearer one. ``distance_per_m`` is twice the angle [rad] between
+        neighboring beams: 0.015 for an HDL-64E, 0.07 for a VLP-16.
+    max_range_m : points with a larger x, y or z are in no cluster.
+    strips : from `sort_points` with the same arguments; they cannot be used again.
     """
     if strips is None:
         strips = sort_points(

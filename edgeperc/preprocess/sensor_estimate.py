@@ -113,39 +113,18 @@ class Match(NamedTuple):
 
 @dataclass(frozen=True)
 class SensorEstimate:
-    """The sensor of one to three scans.
+    """The sensor of one to three scans."""
 
-    Attributes
-    ----------
-    profile : SensorProfile
-        A built-in one, as it is or with the range of remission and the columns of the scans, or one of its own.
-    is_built_in : bool
-        Whether the beams are those of the built-in profile of this name.
-    offsets_m : tuple of float
-        Height at which each beam that was seen starts, above the origin of the scan [m].
-    n_beams : int
-        Beams that were seen; of a built-in profile, others may have had no return.
-    off_deg : float
-        Largest difference between the beams that were seen and those of the profile [deg].
-    on_beams : float
-        Share of the points that lie on the beams, beyond that of random points.
-    columns : int
-        Steps in a turn.
-    nearest_m : float
-        Range below which one point in a thousand lies [m].
-    blind_deg : tuple of pair of float
-        Sectors of azimuth without a point, of at least 10 degrees.
-    """
-
+    # A built-in one, as it is or with the range of remission and the columns of the scans, or one of its own.
     profile: SensorProfile
-    is_built_in: bool
-    offsets_m: tuple[float, ...]
-    n_beams: int
-    off_deg: float
-    on_beams: float
-    columns: int
-    nearest_m: float
-    blind_deg: tuple[tuple[float, float], ...]
+    is_built_in: bool  # the beams are those of the built-in profile of this name
+    offsets_m: tuple[float, ...]  # height at which each beam that was seen starts, above the origin of the scan
+    n_beams: int  # beams that were seen; of a built-in profile, others may have had no return
+    off_deg: float  # largest difference between the beams that were seen and those of the profile
+    on_beams: float  # share of the points that lie on the beams, beyond that of random points
+    columns: int  # steps in a turn
+    nearest_m: float  # range below which one point in a thousand lies
+    blind_deg: tuple[tuple[float, float], ...]  # sectors of azimuth without a point, of at least 10 degrees
 
     def __str__(self) -> str:
         up, down = self.profile.fov_up_deg, self.profile.fov_down_deg

@@ -18,76 +18,39 @@ from .ukf import MODES
 
 @dataclass(frozen=True, slots=True)
 class ClassParameters:
-    """Parameters of motion, detection and life of tracks for one class of objects.
+    """Parameters of motion, detection and life of tracks for one class of objects; without a unit, of one scan."""
 
-    Attributes
-    ----------
-    group : str
-        Classes of one group may be confused. The label of a track changes only within its group.
-    acceleration_mps2, turn_acceleration_rps2 : float
-        Constant velocity and CTRV: standard deviations of acceleration [m/s2] and turn acceleration [rad/s2].
-    walk_m, wander_rad : float
-        Random motion: standard deviations of the random walks of position and heading after one second.
-    still_mps : float
-        Random motion: standard deviation of the speed.
-    birth_speed_mps, birth_turn_rps : float
-        Standard deviations of speed and turn rate of a new track.
-    keep_motion_s : float
-        Mean time for which a track keeps its motion model.
-    along_m, across_m, heading_rad : float
-        Standard deviations of a detection near the sensor: along and across the heading, and of the heading. They grow
-        linearly with the distance.
-    shape_m : tuple of 4 float
-        The same for the height of the center, length, width and height.
-    range_m : float
-        Distance at which these standard deviations are doubled.
-    detection : float
-        Probability that a visible object is detected in a scan.
-    clutter : float
-        Density of false detections and new objects [1/(m2 rad)].
-    gate : float
-        Largest Mahalanobis distance between a track and its detection.
-    birth_score : float
-        Lowest score of a detection that begins a track.
-    sure_score : float
-        A detection with this score confirms a track immediately.
-    memory_s : float
-        Longest time without detections before a track is deleted.
-    moving_mps : float
-        Above this speed the motion of a track shows where its front is.
-    latest : float
-        Weight of the last detection's log odds in the score of a track; the others count by their mean.
-    far_logit : float
-        Log odds added to the score of a track for each ``range_m`` of distance. A detector gives lower scores to far
-        objects, so at the same score a near object is more often false. 0 for a detector with calibrated scores.
-    coasting_logit : float
-        Log odds subtracted from the score of a track for each scan since its last detection.
-    """
-
-    group: str
+    group: str  # classes of one group may be confused: the label of a track changes only within its group
+    # Constant velocity and CTRV: standard deviations of acceleration and turn acceleration.
     acceleration_mps2: float = 3.0
     turn_acceleration_rps2: float = 0.5
+    # Random motion: standard deviations of the walks of position and heading after one second, and of the speed.
     walk_m: float = 0.3
     wander_rad: float = 0.1
     still_mps: float = 0.1
+    # Standard deviations of speed and turn rate of a new track.
     birth_speed_mps: float = 8.0
     birth_turn_rps: float = 0.2
-    keep_motion_s: float = 3.0
+    keep_motion_s: float = 3.0  # mean time for which a track keeps its motion model
+    # Standard deviations of a detection near the sensor: along and across the heading, of the heading, and of the
+    # height of the center, length, width and height. They grow linearly with the distance, and are doubled at range_m.
     along_m: float = 0.15
     across_m: float = 0.10
     heading_rad: float = 0.06
     shape_m: tuple[float, float, float, float] = (0.06, 0.25, 0.10, 0.10)
     range_m: float = 30.0
-    detection: float = 0.8
-    clutter: float = 1e-3
-    gate: float = 5.0
-    birth_score: float = 0.0
-    sure_score: float = 0.95
-    memory_s: float = 1.5
-    moving_mps: float = 1.0
-    latest: float = 0.3
+    detection: float = 0.8  # probability that a visible object is detected
+    clutter: float = 1e-3  # density of false detections and new objects [1/(m2 rad)]
+    gate: float = 5.0  # largest Mahalanobis distance between a track and its detection
+    birth_score: float = 0.0  # lowest score of a detection that begins a track
+    sure_score: float = 0.95  # a detection with this score confirms a track immediately
+    memory_s: float = 1.5  # longest time without detections before a track is deleted
+    moving_mps: float = 1.0  # above this speed the motion of a track shows where its front is
+    latest: float = 0.3  # weight of the last detection's log odds in the score; the others count by their mean
+    # Log odds added to the score of a track for each range_m of distance. A detector gives lower scores to far objects,
+    # so at the same score a near object is more often false. 0 for a detector with calibrated scores.
     far_logit: float = 0.0
-    coasting_logit: float = 0.0
+    coasting_logit: float = 0.0  # log odds subtracted from the score for each scan since the last detection
 
 
 # The weights of scores were chosen on ten KITTI sequences. Only far_logit was fixed on one half and confirmed on the
