@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -16,8 +17,10 @@ from edgeperc import read_scans
 from edgeperc.readers.alternation import told_apart
 from edgeperc.readers.times import TimedScan
 from edgeperc.simulation import random_scene, simulate
+from edgeperc.types.sensor import get_sensor
 
 Mount = tuple[float, float, float, float]  # x, y, z, yaw
+SENSOR = replace(get_sensor("vlp-16"), columns=600)  # as many points as are looked at of a scan of 1800 columns
 LEFT, RIGHT, FRONT, REAR, LOW = (
     (0.0, 0.7, 1.8, 0.0),
     (0.0, -0.7, 1.8, 0.0),
@@ -36,7 +39,7 @@ def drive(mounts: tuple[Mount, ...], speed_mps: float, seed: int, n: int = 12) -
         T = np.eye(4)
         T[:2, :2] = [[math.cos(yaw), -math.sin(yaw)], [math.sin(yaw), math.cos(yaw)]]
         T[:3, 3] = x + speed_mps * 0.1 * k / len(mounts), y, z
-        scans.append(simulate(scene, "vlp-16", seed=k, T_world_sensor=T).points)
+        scans.append(simulate(scene, SENSOR, seed=k, T_world_sensor=T).points)
     return scans
 
 
