@@ -108,10 +108,10 @@ def _far_place(sample: Floats, x: float, y: float) -> Floats:
 def _contrasts(elevation: Floats, row: Ints64, n_rows: int, width_deg: float) -> Floats:
     """How much the bins of the elevations of each row stand out from the band around them, (n_rows,)."""
     n_bins = int(2.0 * _UP_DEG / width_deg)
-    bins = np.floor((elevation + _UP_DEG) / width_deg)
-    used = (bins >= 0.0) & (bins < n_bins)
-    flat = np.broadcast_to(row, elevation.shape)[used] * n_bins + bins[used].astype(np.int64)
-    counts = np.bincount(flat, minlength=n_rows * n_bins).reshape(n_rows, n_bins).astype(np.float64)
+    place = (elevation + _UP_DEG) / width_deg
+    bins = np.where((place >= 0.0) & (place < n_bins), place, n_bins).astype(np.int64)  # the last is left out
+    counts = np.bincount((row * (n_bins + 1) + bins).ravel(), minlength=n_rows * (n_bins + 1))
+    counts = counts.reshape(n_rows, n_bins + 1)[:, :-1].astype(np.float64)
     half = int(_BAND_DEG / width_deg / 2.0)
     total = np.cumsum(np.pad(counts, ((0, 0), (half + 1, half))), axis=1)
     band = (total[:, 2 * half + 1 :] - total[:, : -2 * half - 1]) / (2 * half + 1)
