@@ -67,7 +67,9 @@ def with_points(candidates: Candidates, crops: Crops) -> tuple[Candidates, Crops
 def joined(first: tuple[Candidates, Crops], second: tuple[Candidates, Crops]) -> tuple[Candidates, Crops]:
     """Candidates in the same cells, and then others, with their crops."""
     candidates = Candidates(np.concatenate([first[0].rectangles, second[0].rectangles]), first[0].cells)
-    return candidates, Crops(*map(np.concatenate, zip(first[1], second[1], strict=True)))
+    (points, counts, level), (more, more_counts, more_level) = first[1], second[1]
+    merged = np.concatenate([points, more]), np.concatenate([counts, more_counts]), np.concatenate([level, more_level])
+    return candidates, Crops(*merged)
 
 
 @njit(cache=True, nogil=True)
