@@ -201,15 +201,14 @@ class Pipeline:
 
         absent = value("check", _absent)
         near = value("project", self._select, points)
-        planes = scan = surface = hall = absent
+        planes = scan = surface = hall = projected = cells = labels = places = absent
         if self.needs_ground:
             planes = value("cluster", _fit_ground, points, mounting)
             scan = value("cluster", _on_ground, near, planes)
             surface = value("cluster", GroundFit.surface, planes)
 
         # The top view (SSADNet)
-        projected = cells = labels = absent
-        boxes = detected = nothing = value("check", tuple)
+        boxes = detected = detections = objects = nothing = value("check", tuple)
         if top is not None:
             projected = value("project", top.project, near)
             detected = value("infer", top.find_boxes, projected, self._least_score, options.network_score)
@@ -227,7 +226,6 @@ class Pipeline:
         seen, labels = labels, value("refine", PointLabels.objects, labels) if self.ranged else absent
 
         # Objects of a detector, and by the points of their candidates
-        detections, objects, places = nothing, nothing, absent
         if (detector := self.pillars if options.boxes_from != "clusters" else None) is not None:
             detections = value("infer", detector.find_boxes, points)
         if self.objects is not None:
