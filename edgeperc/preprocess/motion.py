@@ -23,6 +23,8 @@ from .returns import blank_too_near
 MAX_RATE = 1e4  # of m/s and rad/s
 MAX_TURN = 3.1  # rad; the axis of half a turn has no sign
 MAX_BYTES = 1 << 28  # of a file of poses; a line has about 100
+STRAIGHTER, STRAIGHT = 4.0, 0.0005  # how much more one way keeps its direction than another, of 1
+IDENTITY = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)  # x, y, z and the quaternion of a pose
 MIN_STEP_M, MIN_WAY_M = 1.0, 5.0  # of a trajectory, until its directions of travel count
 FASTEST_MPS = 150.0  # of a trajectory; trains are slower
 UPRIGHT, FORWARD, SAME_WAY = 0.7, 0.7, 0.95  # cosines: z is up, x is ahead; the way keeps its direction in the sensor
@@ -197,6 +199,8 @@ class Trajectory:
         if not rises.all():
             line = _line(content, int(np.argmin(rises)) + 1)
             raise StampError(f"{path}: the time of line {line} is not later than that before; expected times that rise")
+        if quaternion is None and np.abs(rows[0, 1:] - IDENTITY).max() < 1e-9:  # w first, it would look back
+            quaternion = "xyzw"
         units, read_as = rows[:, 4:] / norm[:, None], (quaternion or "xyzw", maps_from or "sensor")
         readings = {("xyzw", "sensor"): poses_of(rows[:, 1:4], units)}
         readings["wxyz", "sensor"] = poses_of(rows[:, 1:4], np.roll(units, -1, axis=1))
@@ -425,7 +429,11 @@ def _fits_better(other: Floats, poses: Floats, times_s: Floats) -> bool:
     too_fast = [_speed(each, times_s) > FASTEST_MPS for each in (other, poses)]
     if any(too_fast):
         return too_fast == [False, True]
-    (is_other, other_keeps, _), (is_vehicle, keeps, up) = _likeness(other), _likeness(poses)
+    (is_other, other_keeps, other_up), (is_vehicle, keeps, up) = _likeness(other), _likeness(poses)
+    if min(up, other_up) > UPRIGHT:  # a sensor may look back; the inverse of bends and of noise is less straight
+        for one, another, answer in ((other_keeps, keeps, True), (keeps, other_keeps, False)):
+            if one > SAME_WAY and 1.0 - another > STRAIGHTER * (1.0 - one) + STRAIGHT:
+                return answer
     if is_other != is_vehicle:
         return is_other and not keeps > SAME_WAY > other_keeps
     return other_keeps > SAME_WAY > keeps and (is_vehicle or up < UPRIGHT)

@@ -308,6 +308,28 @@ def test_inverse_poses_of_a_straight_drive(heading: float, tmp_path: Path) -> No
 BACKWARD = np.diag([-1.0, -1.0, 1.0, 1.0])
 
 
+@pytest.mark.parametrize("T_vehicle_sensor", [BACKWARD, np.eye(4)], ids=["back", "ahead"])
+@pytest.mark.parametrize(("bend", "noise_m"), [(0.03, 0.0), (0.3, 0.0), (1.2, 0.03), (0.0, 0.03)])
+def test_poses_that_begin_at_identity_may_be_those_of_a_sensor_that_looks_back(
+    T_vehicle_sensor: Any, bend: float, noise_m: float, tmp_path: Path
+) -> None:
+    """The inverse of a straight way, and of one that bends evenly, is such a way: how straight it is differs."""
+    rng = np.random.default_rng(1)
+    t = 0.1 * np.arange(100)
+    yaw = bend * np.sin(2.0 * np.pi * t / t[-1])
+    poses = np.tile(np.eye(4), (len(t), 1, 1))
+    poses[:, 0, 3], poses[:, 1, 3] = np.cumsum(np.cos(yaw)), np.cumsum(np.sin(yaw))
+    poses[:, :2, 3] += rng.normal(0.0, noise_m, (len(t), 2))
+    yaw = yaw + rng.normal(0.0, 0.1 * noise_m, len(t))
+    poses[:, 0, 0], poses[:, 1, 1], poses[:, 1, 0], poses[:, 0, 1] = np.cos(yaw), np.cos(yaw), np.sin(yaw), -np.sin(yaw)
+    poses = poses @ T_vehicle_sensor
+    poses = np.linalg.inv(poses[0]) @ poses
+    found = Trajectory.from_tum(write_tum(tmp_path / "poses.txt", t, poses))
+    np.testing.assert_allclose(found.T_world_sensor, poses, atol=1e-6)
+    with pytest.raises(TrackingError, match=r"read as .* and from the world to the sensor, .* --poses-from"):
+        Trajectory.from_tum(write_tum(tmp_path / "inverse.txt", t, np.linalg.inv(poses)))
+
+
 @pytest.mark.parametrize("T_vehicle_sensor", [BACKWARD, np.eye(4), HANGING @ CAMERA])
 @pytest.mark.parametrize("heading", [0.1, 1.5, 3.1])
 def test_sensors_that_look_elsewhere_are_told_by_turns(heading: float, T_vehicle_sensor: Any, tmp_path: Path) -> None:
