@@ -7,7 +7,6 @@ import shutil
 import tempfile
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence, Set
-from itertools import islice
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -16,7 +15,7 @@ import numpy as np
 from ..errors import MissingExtraError, PointsError
 from ..system.clock import Stamp
 from ..system.extras import require
-from ..types.points import MapError, as_points, table_columns
+from ..types.points import MapError, as_points, is_remission_name, table_columns
 from .alternation import told_apart
 from .bags import BagFile, open_bag
 from .clouds import CLOUD_READERS, Cloud, cloud_points, cloud_table, describe_cloud
@@ -38,14 +37,12 @@ from .packets import (
     SNIFFED_PACKETS,
     Datagrams,
     copy_as_ethernet,
-    has_other_lidars,
     is_plain,
     sender_names,
     velodyne_name,
     velodyne_packets,
-    velodyne_senders,
 )
-from .pcap import pcap_packets
+from .senders import Senders
 from .tables import MAX_BYTES
 from .times import TimedScan, of_plausible_duration, point_times
 
@@ -152,6 +149,7 @@ def _packet_scans(
     elif kind == ".lvx2":
         from .livox_packets import lvx2_scans, lvx2_sensors  # numba, which bags do without
 
+        _check_unnamed(remission_field)
         scans = lvx2_scans(path, _choose("LiDAR", lvx2_sensors(path), topic), alive)
     else:
         scans = _pcap_scans(path, topic, remission_field, warn, alive)
@@ -159,58 +157,74 @@ def _packet_scans(
     for scan in scans:
         n_scans += 1
         yield scan
-    # So far, there was no error if the file ends inside a packet, or has no packets of such a sensor.
-    n_packets = sum(1 for _ in pcap_packets(path)) if kind == ".pcap" else 0
-    if n_scans and kind == ".pcap" and topic is None:
-        _warn_of_others(path, alive, warn)
     if not n_scans:
-        content = f"has {n_packets} packets, none from a supported LiDAR" if kind == ".pcap" else "holds no scan"
-        raise PointsError(f"the capture {content}; expected a capture of a LiDAR, an Ouster's with its metadata")
+        raise PointsError("the capture holds no scan; expected a capture of a LiDAR, an Ouster's with its metadata")
 
 
 def _pcap_scans(
     path: Path, topic: str | None, remission_field: str | None, warn: Callable[[str], None], alive: Callable[[], None]
 ) -> Iterator[TimedScan]:
-    """The scans of the sensor that a topic names, for which the whole file is searched, or of the only one."""
-    readers: list[tuple[Sequence[str], Callable[[str | None], Iterator[TimedScan]]]] = []
-    ousters: list[str] = []
-    is_velodyne = next(velodyne_packets(path), None) is not None
-    if is_velodyne:
-        readers.append((velodyne_senders(path), lambda sender: _velodyne_scans(_decodable(path, alive, sender))))
-    if not is_velodyne or has_other_lidars(path, whole=topic is not None):
-        from .lidars import lidar_of, turns_of  # numba
+    """The scans of the sensor that a topic names, or of the only one.
 
-        if lidar := lidar_of(path, topic):
-            readers.append((lidar.senders, lambda sender: turns_of(path, lidar, sender, alive)))
-        ousters = _ousters_in(path, whole=topic is not None) if readers else []
+    Packets are counted to the end of the file before the first scan if a topic is given, or if there are a Velodyne's,
+    whose library would mix sensors; otherwise behind the last scan.
+    """
+    is_velodyne = next(velodyne_packets(path), None) is not None
+    is_whole = is_velodyne or topic is not None
+    senders = Senders(path, alive, None if is_whole else SNIFFED_PACKETS)
+    n_scans = 0
+    for scan in _chosen_reader(path, senders, is_velodyne, topic, remission_field, warn, alive):
+        n_scans += 1
+        yield scan
+    senders = senders if is_whole else Senders(path, alive)
+    if senders.cut is not None:  # the decoders end there without a word
+        raise senders.cut
+    if not n_scans:
+        raise PointsError(
+            f"the capture has {senders.n_packets} packets, none from a supported LiDAR; expected a capture of a LiDAR, "
+            "an Ouster's with its metadata"
+        )
+    if topic is None and len(senders.names) > 1:
+        warn(
+            f"{path}: the scans are those of the first sensor alone; there are packets of several, "
+            f"{', '.join(senders.names)}: choose one by topic (--topic)"
+        )
+
+
+def _chosen_reader(
+    path: Path,
+    senders: Senders,
+    is_velodyne: bool,
+    topic: str | None,
+    remission_field: str | None,
+    warn: Callable[[str], None],
+    alive: Callable[[], None],
+) -> Iterator[TimedScan]:
+    """The scans of the sensor that a topic names, or of the only one among those that sent packets."""
+    readers: list[tuple[Sequence[str], Callable[[str | None], Iterator[TimedScan]]]] = []
+    if is_velodyne:
+        readers.append((senders.velodynes, lambda sender: _velodyne_scans(_decodable(path, alive, sender))))
+    if lidar := senders.lidar(topic):
+        from .lidars import turns_of  # numba
+
+        readers.append((lidar.senders, lambda sender: turns_of(path, lidar, sender, alive)))
+    ousters = senders.ousters if readers else []
     readers.append((ousters, lambda sender: _ouster_turns(path, sender or topic, remission_field, warn, alive)))
     known = [name for names, _ in readers for name in names]
     chosen = known[_choose("LiDAR", known, topic)] if len(known) > 1 or (known and topic is not None) else None
-    if len(known) < 2:
-        return readers[0][1](None)
-    return next(read for names, read in reversed(readers) if chosen in names)(chosen)
+    read = readers[0][1] if len(known) < 2 else next(read for names, read in reversed(readers) if chosen in names)
+    if read is not readers[-1][1]:
+        _check_unnamed(remission_field)
+    return read(chosen if len(known) > 1 else None)
 
 
-def _ousters_in(path: Path, *, whole: bool) -> list[str]:
-    """Serial numbers in metadata beside a capture whose packets are among the first, or in the whole file."""
-    from .lidars import ousters_beside
-
-    layouts = ousters_beside(path)
-    looked_at = islice(Datagrams(path, lambda: None), (None if whole else SNIFFED_PACKETS) if layouts else 0)
-    sizes = {len(datagram.payload) for datagram in looked_at}
-    return [layout.name for layout in layouts if layout.packet_bytes in sizes]
-
-
-def _warn_of_others(path: Path, alive: Callable[[], None], warn: Callable[[str], None]) -> None:
-    """Say which sensors a capture has where only one was among its first packets."""
-    if has_other_lidars(path, whole=True):
-        from .lidars import all_senders
-
-        if len(names := all_senders(path, alive)) > 1:
-            warn(
-                f"{path}: the scans are those of the first sensor alone; there are packets of several, "
-                f"{', '.join(names)}: choose one by topic (--topic)"
-            )
+def _check_unnamed(remission_field: str | None) -> None:
+    """Refuse a name of the remission that packets without names of their own do not hold."""
+    if remission_field is not None and not is_remission_name(remission_field):
+        raise PointsError(
+            f"there is no field {remission_field!r} for the remission: the packets of this LiDAR hold one remission, "
+            "without a name; leave out remission_field (--remission-field)"
+        )
 
 
 def _decodable(path: Path, alive: Callable[[], None], sender: str | None) -> Path:
@@ -332,6 +346,7 @@ def _bag_scans(
     try:
         for _, message, stamp_s in _clouds(path, topic, alive):
             if isinstance(message, VelodyneScan):
+                _check_unnamed(remission_field)
                 turns = turns if isinstance(turns, VelodyneStream) else VelodyneStream()
                 yield from turns.add(message)
                 continue

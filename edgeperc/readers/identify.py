@@ -16,7 +16,8 @@ from ..errors import PointsError, SensorError
 from ..types.sensor import SAY_PATTERN, SENSORS, SensorProfile
 from .clouds import is_ouster_cloud
 from .ouster import check_metadata, metadata_beside, read_metadata
-from .packets import has_other_lidars, velodyne_name, velodyne_packets, velodyne_senders
+from .packets import SNIFFED_PACKETS, velodyne_name, velodyne_packets
+from .senders import Senders
 
 _CHOICES = f"Pass its name, sensor= or --sensor: {', '.join(SENSORS)}; or a profile of your own, a .json file."
 
@@ -54,11 +55,13 @@ def of_packets(path: Path, topic: str | None = None) -> KnownSensor:
 
     topic : the serial number, if there is metadata of several Ouster sensors; the address of a Velodyne.
     """
-    sender = topic if topic is not None and topic in velodyne_senders(path) else None  # reads the whole file
+    senders = None if topic is None else Senders(path, lambda: None)
+    sender = topic if senders is not None and topic in senders.velodynes else None
     names = {velodyne_name(packet) for packet in velodyne_packets(path, sender)}
-    is_other = not names or (topic is not None and sender is None and has_other_lidars(path, whole=True))
+    is_other = not names or (topic is not None and sender is None)
     by_serial = topic is not None and topic in _serials_beside(path)
-    known = _of_lidar(path, topic, beside=bool(names)) if is_other and not by_serial else None
+    senders = senders or Senders(path, lambda: None, SNIFFED_PACKETS) if is_other and not by_serial else None
+    known = None if senders is None else _of_lidar(path, senders, topic, beside=bool(names))
     if known is not None:
         return known
     if names and not by_serial:
@@ -92,18 +95,18 @@ def of_livox() -> NotSpinningError:
     )
 
 
-def _of_lidar(path: Path, topic: str | None, *, beside: bool = False) -> KnownSensor | None:
+def _of_lidar(path: Path, senders: Senders, topic: str | None, *, beside: bool) -> KnownSensor | None:
     """The sensor of Hesai's or RoboSense's packets, with the angles of the unit; None if they are not theirs.
 
     beside : there are a Velodyne's, too, so that the topic must name it.
     """
-    from .lidars import columns_of, lidar_of, open_spinning  # numba
-
-    lidar = lidar_of(path, topic)
+    lidar = senders.lidar(topic)
     if lidar is None or (beside and topic not in lidar.senders):
         return None
     if lidar.row is None:
         raise of_livox()
+    from .lidars import columns_of, open_spinning  # numba
+
     sender = topic if topic in lidar.senders and len(lidar.senders) > 1 else None
     row, angles = open_spinning(path, lidar.row, sender, lambda: None)
     elevations = _distinct(angles.lasers_deg[:, 0].tolist())

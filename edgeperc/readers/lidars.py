@@ -1,24 +1,18 @@
-"""Which LiDAR of Hesai, RoboSense or Livox sent the packets of a capture, and the angles of a spinning one."""
+"""The turns of a LiDAR by Hesai, RoboSense or Livox in a capture, and the angles of a spinning one."""
 
 from __future__ import annotations
 
-import json
-from collections import Counter
 from collections.abc import Callable, Iterator
-from contextlib import suppress
 from itertools import islice
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
 from ..errors import PointsError
 from .livox_packets import LivoxStream, points_of
-from .ouster import metadata_beside, read_metadata
-from .ouster_packets import Layout, layout_of
-from .packets import SNIFFED_PACKETS, Datagrams, is_of_velodyne, sender_names
+from .packets import Datagrams
+from .senders import Lidar
 from .spinning_packets import (
-    DIFOP,
     FORMATS,
     Angles,
     Format,
@@ -26,117 +20,12 @@ from .spinning_packets import (
     angles_of_difop,
     format_of,
     has_16_lasers,
-    name_of,
     read_angles,
 )
 from .times import TimedScan
 
-_OTHER_BYTES = 600  # what LiDARs send of their GPS is shorter
-_LIVOX, _VELODYNE, _OUSTER = "livox", "Velodyne", "Ouster"
-_OTHERS = {_VELODYNE, _OUSTER}  # that are decoded elsewhere
-_Source = tuple[str | None, tuple[str, int]]  # kind, address and port
-_LIVOX_SIZES = (1380, 804, 996)
-_BY_CHANCE = 20  # packets of other sensors that may begin like these
 _STEPS = 200  # packets that show how far apart columns are
 _ALIKE = {"helios-32", "helios-16"}  # by their packets; the angles tell them apart
-
-
-class Lidar(NamedTuple):
-    """What sends most of the first packets."""
-
-    row: Format | None  # the format of a spinning sensor; None: Livox
-    senders: list[str]  # of these makers, as `packets.sender_names` calls them
-    first: str  # address and port of the one with the most packets
-
-
-def lidar_of(path: Path, topic: str | None = None) -> Lidar | None:
-    """The LiDAR of a pcap file, beside a Velodyne's or an Ouster's packets or without; None if it is none of these
-    makers'.
-
-    topic : if it is a sender, that one; a whole file is searched for it.
-    Raises PointsError: It is one that is not decoded.
-    """
-    counts, rows = _counted(path, lambda: None, SNIFFED_PACKETS if topic is None else None)
-    is_beside = any(kind in _OTHERS for kind, _ in counts)
-    counts = Counter({key: n for key, n in counts.items() if key[0] not in _OTHERS})
-    names = _names(counts)
-    kinds, sources = Counter[str | None](), dict[str | None, Counter[tuple[str, int]]]()
-    for (kind, source), n in counts.items():
-        if topic not in names or topic in (source[0], f"{source[0]}:{source[1]}"):
-            kinds[kind] += n
-            sources.setdefault(kind, Counter())[source] += n
-    n_unknown = kinds.pop(None, 0)
-    kind, n = max(kinds.items(), key=lambda item: item[1], default=(None, 0))
-    if kind is None or n <= min(n_unknown, _BY_CHANCE):
-        return None
-    if kind in rows or kind == _LIVOX:
-        (address, port), _ = sources[kind].most_common(1)[0]
-        return Lidar(rows.get(kind), names, f"{address}:{port}")
-    if is_beside:
-        return None
-    raise PointsError(
-        f"a capture of a {kind}, which cannot be decoded; the documentation lists those that are. Convert it with "
-        f"{kind.split()[0]}'s driver, to a ROS bag or to .pcd files"
-    )
-
-
-def all_senders(path: Path, alive: Callable[[], None]) -> list[str]:
-    """What sends a LiDAR's packets in a whole pcap file, with one name for all Ousters."""
-    return _names(_counted(path, alive, None)[0])
-
-
-def _names(counts: Counter[_Source]) -> list[str]:
-    known = Counter[tuple[str, int]]()
-    for (kind, source), n in counts.items():
-        if kind is not None:
-            known[(_OUSTER, 0) if kind == _OUSTER else source] += n
-    return sender_names(known)
-
-
-def _counted(path: Path, alive: Callable[[], None], most: int | None) -> tuple[Counter[_Source], dict[str, Format]]:
-    """How many packets each address and port has of each kind, None for unknown ones, and the formats of the kinds."""
-    ouster_bytes = {layout.packet_bytes for layout in ousters_beside(path)}
-    counts, rows = Counter[_Source](), dict[str, Format]()
-    datagrams = Datagrams(path, alive, most)
-    for datagram in datagrams:
-        size = len(datagram.payload)
-        if bytes(datagram.payload[:8]) == DIFOP:
-            continue
-        if is_of_velodyne(datagram):
-            kind: str | None = _VELODYNE
-        elif size in ouster_bytes:
-            kind = _OUSTER
-        elif (row := format_of(datagram.payload)) is not None:
-            kind = row.name
-            rows.setdefault(kind, row)
-        else:
-            kind = _name_of(datagram.payload)
-        if kind is not None or size > _OTHER_BYTES:
-            counts[kind, (datagram.sender, datagram.port)] += 1
-    if not counts and datagrams.n_cut > _BY_CHANCE:
-        raise PointsError(
-            f"{datagrams.n_cut:,} packets of the capture were not kept to their end, as with a limit of tcpdump or "
-            "Wireshark: capture whole packets (tcpdump -s 0)"
-        )
-    return counts, rows
-
-
-def ousters_beside(path: Path) -> list[Layout]:
-    """What the metadata beside a capture says of Ousters; empty if there is none, or one cannot be read."""
-    with suppress(PointsError):
-        return [layout_of(json.loads(read_metadata(file))) for file in metadata_beside(path)]
-    return []
-
-
-def _name_of(payload: memoryview) -> str | None:
-    """`_LIVOX`, or what a LiDAR that is not decoded is called."""
-    if points_of(payload) is not None:
-        return _LIVOX
-    # Version 0, length of the packet; 96 points and more.
-    length = int.from_bytes(payload[1:3], "little")
-    if len(payload) in _LIVOX_SIZES and payload[0] == 0 and length in (0, len(payload)):
-        return "Livox sensor"
-    return name_of(payload)
 
 
 def open_spinning(path: Path, row: Format, sender: str | None, alive: Callable[[], None]) -> tuple[Format, Angles]:

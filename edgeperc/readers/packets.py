@@ -7,6 +7,7 @@ import struct
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
+from functools import lru_cache
 from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
@@ -22,7 +23,9 @@ _FRAGMENT = 44  # header of IPv6
 _LOOPBACK_LINKS, _RAW_LINKS = (0, 108), (12, 14, 101, 228)  # four bytes in front of the IP header, none
 
 VELODYNE_BYTES = 1206
-_GPS_BYTES = 512  # of a Velodyne's packet with its position
+GPS_BYTES = 512  # of a Velodyne's packet with its position
+DIFOP = bytes.fromhex("a5ff005a11115555")
+"""The first bytes of what RoboSense's sensors say of themselves."""
 _FLAG = b"\xff\xee"  # 0xEEFF, with which the first of twelve blocks begins
 _MOST_COPIED = 2048  # bytes of a datagram; a Velodyne's are shorter
 
@@ -79,19 +82,22 @@ class Datagrams:
     most : packets of the file that are looked at; None: all.
     n_bad : so far, those that are empty, incomplete, or contradict themselves.
     n_cut : packets of them that end early.
+    n_packets, cut : of the file so far, and what is wrong where it ends early.
     """
 
     def __init__(self, path: Path, alive: Callable[[], None], most: int | None = None) -> None:
         self._path, self._alive, self._most = path, alive, most
-        self.n_bad = self.n_cut = 0
+        self.n_bad = self.n_cut = self.n_packets = 0
+        self.cut: CutShortError | None = None
         self._pending: dict[bytes, list[memoryview]] = {}  # by source: fragments so far
 
     def __iter__(self) -> Iterator[Datagram]:
-        with suppress(CutShortError):  # a cut file says so itself
-            before: tuple[memoryview, ...] = ()
-            for k, (link, stamp_s, packet) in enumerate(islice(pcap_packets(self._path), self._most)):
-                if k % 10_000 == 0:
+        before: tuple[memoryview, ...] = ()
+        try:
+            for link, stamp_s, packet in islice(pcap_packets(self._path), self._most):
+                if self.n_packets % 10_000 == 0:
                     self._alive()
+                self.n_packets += 1
                 try:
                     part = _fragment(packet, link)
                     payload = None if part is None else self._whole(part)
@@ -104,11 +110,13 @@ class Datagrams:
                     if length != len(payload) or length == 8:
                         self.n_bad += 1
                         continue
-                    if length > _GPS_BYTES and (part.sender, payload) == before:  # on two interfaces, or mirrored
+                    if length > GPS_BYTES and (part.sender, payload) == before:  # on two interfaces, or mirrored
                         continue
                     before = part.sender, payload
-                    yield Datagram(_address(part.sender), port, stamp_s, payload[8:])
+                    yield Datagram(_address(bytes(part.sender)), port, stamp_s, payload[8:])
             self.n_bad += len(self._pending)
+        except CutShortError as exc:  # whoever reads the whole file says it
+            self.cut = exc
 
     def _whole(self, part: _Fragment) -> memoryview | None:
         """The datagram that ends with a fragment, None if it is not there yet; ValueError if a part is missing."""
@@ -160,30 +168,9 @@ def velodyne_name(packet: memoryview) -> str | None:
     return _PRODUCTS.get(packet[-1]) if packet[-2] in _RETURN_MODES else None
 
 
-def velodyne_senders(path: Path) -> list[str]:
-    """What `sender_names` calls the senders of a Velodyne's packets in a whole pcap file: a second may begin late."""
-    counts = Counter[tuple[str, int]]()
-    for datagram in _velodyne_datagrams(path, SNIFFED_PACKETS):
-        counts[datagram.sender, datagram.port] += 1
-    for link, _, packet in islice(pcap_packets(path, whole=False), SNIFFED_PACKETS, None):
-        with suppress(ValueError):
-            at = _ip_at(packet, link) if len(packet) > VELODYNE_BYTES else None
-            header, address = (40, slice(8, 24)) if at is not None and packet[at] >> 4 == 6 else (20, slice(12, 16))
-            content = None if at is None else packet[at:]
-            if content is not None and bytes(content[header + 8 : header + 10]) == _FLAG:
-                counts[_address(content[address]), int.from_bytes(content[header + 2 : header + 4], "big")] += 1
-    return sender_names(counts)
-
-
 def is_of_velodyne(datagram: Datagram) -> bool:
     """Whether it is a Velodyne's by its size and its first bytes."""
     return len(datagram.payload) == VELODYNE_BYTES and bytes(datagram.payload[:2]) == _FLAG
-
-
-def has_other_lidars(path: Path, *, whole: bool = False) -> bool:
-    """Whether the first datagrams of a pcap file, or any, may be those of other LiDARs than Velodyne's."""
-    looked_at = Datagrams(path, lambda: None, None if whole else SNIFFED_PACKETS)
-    return any(len(datagram.payload) > _GPS_BYTES and not is_of_velodyne(datagram) for datagram in looked_at)
 
 
 def _velodyne_datagrams(path: Path, most: int | None) -> Iterator[Datagram]:
@@ -266,7 +253,7 @@ def is_plain(path: Path) -> bool:
             if part is not None:
                 if part.more or part.start or len(part.sender) != 4:
                     return False
-                if len(part.payload) > _GPS_BYTES and (part.sender, part.payload) == before:
+                if len(part.payload) > GPS_BYTES and (part.sender, part.payload) == before:
                     return False
                 before = part.sender, part.payload
     return is_ethernet(path)
@@ -291,5 +278,6 @@ def copy_as_ethernet(path: Path, target: Path, alive: Callable[[], None], sender
             out.write(struct.pack("<IIII", seconds & 0xFFFFFFFF, microseconds, len(content), len(content)) + content)
 
 
-def _address(packed: memoryview) -> str:
-    return str(ipaddress.ip_address(bytes(packed)))
+@lru_cache(maxsize=256)
+def _address(packed: bytes) -> str:
+    return str(ipaddress.ip_address(packed))

@@ -17,6 +17,7 @@ import numpy as np
 from ..errors import PointsError
 from ..system.kernels import njit
 from ..types.points import Bytes, Floats, Ints64, Points
+from .packets import DIFOP
 from .times import TimedScan
 
 
@@ -132,8 +133,6 @@ FORMATS = {row.name: row for row in _FORMATS}
 """The formats that are decoded, by name."""
 
 _MSOP, _MSOP_NEW = bytes.fromhex("55aa050a5aa550a0"), bytes.fromhex("55aa055a")
-DIFOP = bytes.fromhex("a5ff005a11115555")
-"""The first bytes of what RoboSense's sensors say of themselves."""
 
 _OLD_MODELS = {1: "rs-16", 2: "rs-32", 3: "rs-bpearl"}
 _OTHER_MODELS = {4: "RS-Ruby", 5: "RS-Ruby Lite"}
@@ -214,7 +213,7 @@ def _with_options(row: Format, options: int, size: int) -> Format:
 
 def _has_flags(payload: memoryview, row: Format) -> bool:
     places = range(row.header, row.header + row.n_blocks * row.block_bytes, row.block_bytes)
-    return all(bytes(payload[at : at + len(row.flag)]) == row.flag for at in places)
+    return not row.flag or all(bytes(payload[at : at + len(row.flag)]) == row.flag for at in places)
 
 
 def angles_of_difop(row: Format, payload: memoryview) -> Angles | None:

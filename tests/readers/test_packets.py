@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import socket
 import struct
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,8 +15,10 @@ from test_captures import error_of, join, vlp16_packets, write_pcap
 from test_captures import ouster as ouster
 
 from edgeperc import PointsError
+from edgeperc.readers import packets
 from edgeperc.readers.captures import read_scans, sensor_of
-from edgeperc.readers.packets import velodyne_senders
+from edgeperc.readers.pcap import pcap_packets
+from edgeperc.readers.senders import Senders
 
 pytestmark = pytest.mark.usefixtures("in_this_process")
 
@@ -174,7 +177,7 @@ def test_a_velodyne_in_fragments_or_with_bytes_behind(
     for (stamp, points), (other_stamp, other_points) in zip(scans, expected, strict=True):
         assert stamp == other_stamp
         np.testing.assert_array_equal(points, other_points)
-    assert velodyne_senders(path) == ["192.168.1.201"]
+    assert Senders(path, lambda: None).velodynes == ["192.168.1.201"]
 
 
 @pytest.mark.parametrize("link", [113, 276, 101])
@@ -208,7 +211,7 @@ def test_several_velodynes_are_told_apart(tmp_path: Path, link: int, senders: tu
     pytest.importorskip("velodyne_decoder")
     packets = vlp16_packets(1.2)
     path = write_link(tmp_path / "two.pcap", link, packets, **{f"sender_{k}": s for k, s in enumerate(senders)})
-    assert velodyne_senders(path) == sorted(senders)
+    assert Senders(path, lambda: None).velodynes == sorted(senders)
     expected = [len(points) for _, points in read_scans(write_pcap(tmp_path / "one.pcap", packets))]
     error = error_of(path)
     assert f"expected one LiDAR, there are {', '.join(sorted(senders))}; choose one" in error
@@ -223,7 +226,7 @@ def test_a_velodyne_that_begins_late_is_told_apart(tmp_path: Path, link: int, ot
     pytest.importorskip("velodyne_decoder")
     packets = vlp16_packets(30.0)
     path = write_link(tmp_path / "two.pcap", link, packets, begin=2100, one="10.0.0.1:2368", two=other)
-    first, second = velodyne_senders(path)
+    first, second = Senders(path, lambda: None).velodynes
     assert "expected one LiDAR, there are 10.0.0.1" in error_of(path)
     expected = [len(points) for _, points in read_scans(write_pcap(tmp_path / "one.pcap", packets))]
     assert [len(points) for _, points in read_scans(path, topic=first)] == expected
@@ -233,7 +236,7 @@ def test_a_velodyne_that_begins_late_is_told_apart(tmp_path: Path, link: int, ot
 
 def test_a_few_damaged_addresses_are_no_sensors(tmp_path: Path) -> None:
     path = write_link(tmp_path / "a.pcap", 1, vlp16_packets(30.0), begin=2200, one="10.0.0.1", two="74.0.0.1")
-    assert velodyne_senders(path) == ["10.0.0.1"]
+    assert Senders(path, lambda: None).velodynes == ["10.0.0.1"]
 
 
 @pytest.mark.parametrize(
@@ -250,3 +253,31 @@ def test_lidars_that_are_not_decoded_are_named(tmp_path: Path, payload: bytes, n
     error = error_of(write_pcap(tmp_path / "other.pcap", [payload] * 20))
     assert f"a capture of a {name} sensor, which cannot be decoded" in error
     assert f"Convert it with {name}'s driver" in error
+
+
+@pytest.mark.parametrize("name", ["velodyne", "pandarxt-32"])
+def test_a_capture_is_counted_once(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever a topic is: before the first scan, packets are read once, but for the first ones and a sender's copy."""
+    if name == "velodyne":
+        pytest.importorskip("velodyne_decoder")
+        payloads = vlp16_packets(4.0) * 4
+    else:
+        payloads = packets_of(MODELS[name], blocks_of(MODELS[name], *ranges(MODELS[name], 1800))) * 5
+    path = write_link(tmp_path / "two.pcap", 1, payloads, one="10.0.0.1", two="10.0.0.2")
+    n_read = 0
+
+    def counted(*arguments: Any, **options: Any) -> Iterator[Any]:
+        nonlocal n_read
+        for packet in pcap_packets(*arguments, **options):
+            n_read += 1
+            yield packet
+
+    monkeypatch.setattr(packets, "pcap_packets", counted)
+    monkeypatch.setattr(packets, "SNIFFED_PACKETS", 50)
+    n, n_first = 2 * len(payloads), 1100  # what shows the model, and is in the first turn
+    scans = read_scans(path, topic="10.0.0.2")
+    next(scans)
+    n_passes = 2 if name == "velodyne" else 1
+    assert n < n_read < n_passes * n + n_first
+    assert len(list(scans)) > 3
+    assert n_read < 2 * n + n_first
