@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import argparse
 import math
+import shlex
 import textwrap
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -143,7 +144,7 @@ def with_whole_options(given: Sequence[str]) -> list[str]:
 
 
 def add_capture(group: Options) -> None:
-    """Add the sensor, its mounting, and how scans are read; `reading_options` takes those."""
+    """Add the sensor, its mounting, and how scans are read; `edgeperc.cli.scans.reading_options` takes those."""
     add_sensor(group, of_capture=True)
     add_mounting(group)
     group(
@@ -175,11 +176,6 @@ def add_capture(group: Options) -> None:
     )
 
 
-def reading_options(arguments: argparse.Namespace) -> dict[str, Any]:
-    """Options of `edgeperc.read_scans` from those of `add_capture`."""
-    return {"topic": arguments.topic, **file_options(arguments)}
-
-
 def file_options(arguments: argparse.Namespace) -> dict[str, Any]:
     """Options of `edgeperc.read_points` from those of `add_capture`."""
     origin = arguments.origin
@@ -188,6 +184,30 @@ def file_options(arguments: argparse.Namespace) -> dict[str, Any]:
             arguments.usage_error(f"--origin {' '.join(map(str, origin))}: expected X Y Z, or auto")
         origin = "auto"
     return {"columns": arguments.columns, "remission_field": arguments.remission_field, "origin_m": origin}
+
+
+_OF_RECORDINGS = ("--topic", "--accumulate")
+_OF_SCAN_FILES = ("--columns", "--origin")
+_OF_SCANS = (
+    *("--sensor", "--mount-height", "--roll", "--pitch", "--turn", "--extrinsic", "--ego-box", "--remission-field"),
+    *("--remission-range", "--on-mismatch", "--anyway", "--score-threshold", "--boxes-from", "--no-agreement"),
+    *("--full-turn", "--adapt", *_OF_RECORDINGS, *_OF_SCAN_FILES),
+)
+
+
+def check_inputs(arguments: argparse.Namespace, kinds: Collection[str], example: object) -> None:
+    """Check that each option of reading is for one of the inputs: it would change nothing, without a word.
+
+    kinds : ``"recording"`` and ``"scan file"``; neither if there are no scans. Others end early.
+    """
+    given = {word.partition("=")[0] for word in shlex.split(arguments.typed)}
+    if not kinds:
+        for option in given.intersection(_OF_SCANS):
+            arguments.usage_error(f"{option} is for scans, and {example} is none; leave it out")
+    for kind, named in (("recording", _OF_RECORDINGS), ("scan file", _OF_SCAN_FILES)):
+        for option in given.intersection(named) if kind not in kinds else ():
+            (other,) = kinds
+            arguments.usage_error(f"{option} is for {kind}s, and {example} is a {other}; leave it out")
 
 
 def add_model(group: Options) -> None:

@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING, Any
 from ..errors import EdgepercError, MissingExtraError, MountingError, PointsError
 from ..system.atomic import write_atomic
 from ..types.choices import DEFAULT_MODELS
-from .arguments import Commands, add_capture, add_command, options, reading_options
+from .arguments import Commands, add_capture, add_command, check_inputs, options
 from .output import in_options, many, print_error, print_line, print_rows
-from .scans import Sensors, check_sensor
+from .scans import Sensors, check_scans, check_sensor, reading_options
 
 if TYPE_CHECKING:
     from ..ground.leveling import MountingEstimator
@@ -82,6 +82,12 @@ def info_command(arguments: argparse.Namespace) -> int:
     check_sensor(arguments)
     if arguments.write is not None and arguments.write.suffix != ".json":
         arguments.usage_error(f"--write {arguments.write}: expected a name that ends in .json")
+    read = [Path(thing) for thing in arguments.things if not _is_model(thing)]
+    read = [path for path in read if path.suffix.lower() not in IMAGE_SUFFIXES]
+    if read:
+        check_scans(arguments, read)
+    else:
+        check_inputs(arguments, (), arguments.things[0])
     estimators: dict[SensorProfile, MountingEstimator] = {}
     sensors = Sensors(arguments, [Path(thing) for thing in arguments.things])
     scans: list[Path] = []
@@ -151,7 +157,7 @@ def _suggest_ego_box(
         print_error(f"--suggest-ego-box: the scans are of {len(estimators)} sensors; expected scans of one")
         return True
     ((sensor, estimator),) = estimators.items()
-    scans = (points for path in paths for _, points in read_scans(path, **reading_options(arguments)))
+    scans = (points for path in paths for _, points in read_scans(path, **reading_options(path, arguments)))
     try:
         suggestion = suggest_ego_box(islice(scans, _MOST_SCANS), sensor, estimator.mounting())
     except EdgepercError as exc:
@@ -345,7 +351,7 @@ def _scan_rows(
 
     named, because = sensors.of(path)
     sensor = get_sensor(named)
-    scans, damage = _first_scans(path, reading_options(arguments))
+    scans, damage = _first_scans(path, reading_options(path, arguments))
     cleaned, (dropped, *_) = zip(*(returns(scan, sensor) for scan in scans), strict=True)
     document: dict[str, Any] = {
         "scan": str(path),

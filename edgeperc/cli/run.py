@@ -23,21 +23,23 @@ from .arguments import (
     add_capture,
     add_command,
     add_networks,
+    check_inputs,
     chosen_models,
     file_options,
     options,
     positive_number,
-    reading_options,
 )
 from .output import many, print_error, print_line, progress
 from .report import Report
 from .scans import (
     Scans,
     Sensors,
+    check_scans,
     check_sensor,
     find_images,
     find_scans,
     output_names,
+    reading_options,
     scan_folders,
     scan_namer,
     stated_sensor,
@@ -208,6 +210,10 @@ def run_command(arguments: argparse.Namespace) -> int:
     else:
         found = Scans([_live_source(arguments)], [], False) if arguments.live else find_scans(arguments.paths)
     scans = found.paths
+    if images and not arguments.scan:
+        check_inputs(arguments, (), scans[0])
+    elif scans:
+        check_scans(arguments, [*filter(None, images.values())] or scans, images=bool(images))
     check_scan_files(arguments, scans)
     names = output_names(scans, keep_folder=found.of_data_set) if kinds else []
     targets = [arguments.out / name for name in names] if kinds else [Path()] * len(scans)
@@ -278,6 +284,8 @@ def _check_usage(arguments: argparse.Namespace, kinds: Sequence[str]) -> None:
         arguments.usage_error("--static needs --track, or --movable to leave out all that could move")
     if arguments.movable and arguments.static is None:
         arguments.usage_error("--movable needs --static DIR")
+    if arguments.bag is None and (arguments.bag_storage or arguments.bag_frame) is not None:
+        arguments.usage_error("--bag-storage and --bag-frame need --bag DIR")
     if arguments.gif and not arguments.track:
         arguments.usage_error("--gif needs --track")
     if arguments.deskew and (arguments.live or not (arguments.track or arguments.poses)):
@@ -468,7 +476,7 @@ class _Run:
             perceive = self._perceivers.of(sensor)
             numbered = is_capture(path)
             read: Callable[..., Iterator[tuple[Any, ...]]] = read_timed_scans if self._straightener else read_scans
-            how = reading_options(self._arguments) | {"accumulate_s": _gathered_s(path, sensor)}
+            how = reading_options(path, self._arguments) | {"accumulate_s": _gathered_s(path, sensor)}
             if how["accumulate_s"] is not None and self._straightener is None:
                 warnings.warn(
                     f"{shown}: the points of the last {how['accumulate_s']:g} s are taken as seen from one place; "

@@ -7,7 +7,7 @@ import os
 import re
 import tempfile
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from itertools import islice
@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from ..errors import EdgepercError, ImageError, SensorError
 from ..system.remote import Remote
 from ..types.choices import AUTO_SENSOR, DEFAULT_SENSOR
-from .arguments import reading_options
+from .arguments import check_inputs, file_options
 
 if TYPE_CHECKING:
     from ..preprocess.sensor_estimate import SensorEstimate
@@ -76,6 +76,38 @@ def find_scans(paths: Sequence[Path]) -> Scans:
     return Scans(list(scans.values()), empty, of_data_set)
 
 
+def check_scans(arguments: argparse.Namespace, scans: Sequence[Path | Remote], *, images: bool = False) -> None:
+    """Check that each option of reading is for one of the scans; see `check_inputs`.
+
+    images : the scans are those of images, which are scan files.
+    """
+    from ..readers.captures import CAPTURE_SUFFIXES, is_capture, scan_files
+
+    kinds = set[str]()
+    for scan in scans:
+        if isinstance(scan, Remote):
+            kinds.add("recording" if scan.suffix.lower() in CAPTURE_SUFFIXES else "scan file")
+            continue
+        if not scan.exists():  # reported when its turn comes
+            return
+        is_folder = scan.is_dir() and not is_capture(scan)
+        files = scan_files(scan) if is_folder else [scan]
+        kinds.update("recording" if not images and is_capture(file) else "scan file" for file in files)
+        if len(kinds) > 1:
+            break
+    check_inputs(arguments, kinds, scans[0])
+
+
+def reading_options(path: Path, arguments: argparse.Namespace) -> dict[str, Any]:
+    """Options of `edgeperc.read_scans` that are for this of several inputs, from those of `add_capture`."""
+    from ..readers.captures import is_capture
+
+    how = {"topic": arguments.topic, **file_options(arguments)}
+    if is_capture(path):
+        return how | {"columns": None}  # an origin is refused even if it is for others
+    return how if path.is_dir() else how | {"topic": None}
+
+
 def find_images(paths: Sequence[Path]) -> list[Path]:
     """Image files in the order of ``paths``, those of folders sorted; ImageError for a mixture with scans."""
     from ..readers.captures import is_capture
@@ -122,16 +154,16 @@ def stated_sensor(arguments: argparse.Namespace) -> str:
     return DEFAULT_SENSOR if arguments.sensor in (None, AUTO_SENSOR) else arguments.sensor
 
 
-def find_sensor(paths: Iterable[Path], options: Mapping[str, Any]) -> SensorEstimate | None:
+def find_sensor(paths: Iterable[Path], arguments: argparse.Namespace) -> SensorEstimate | None:
     """The sensor that the first scans show; None if none that can be read has enough points. Raises SensorError."""
     from ..preprocess.sensor_estimate import MOST_SCANS, estimate_sensor, has_enough_points
     from ..readers.captures import is_capture, read_scans
 
     scans: list[Floats32] = []
     for path in islice(paths, _LOOKED_AT):
-        of_file = {} if is_capture(path) else {"origin_m": options.get("origin_m")}
         with suppress(EdgepercError, OSError):  # reported when the scan's turn comes
-            read = islice(read_scans(path, **{**options, "origin_m": None, **of_file}), MOST_SCANS)
+            how = reading_options(path, arguments) | ({"origin_m": None} if is_capture(path) else {})
+            read = islice(read_scans(path, **how), MOST_SCANS)
             scans.extend(points for _, points in read if has_enough_points(points))
         if len(scans) >= MOST_SCANS:
             break
@@ -179,7 +211,7 @@ def scan_sensor(
                 return with_mounting(known.profile, arguments), known.because
             files = scan_files(path) if path.is_dir() and not is_capture(path) else beside or [path]
         try:
-            found = find_sensor(files, reading_options(arguments))
+            found = find_sensor(files, arguments)
         except SensorError as exc:
             raise exc if unnamed is None else unnamed from exc
         if found is None and (unnamed is not None or arguments.sensor == AUTO_SENSOR):
@@ -196,7 +228,7 @@ def scan_sensor(
     is_own = given.name not in PUBLIC_SENSORS and given.pattern is None
     if known is None and is_own and isinstance(path, Path) and not is_capture(path):
         with suppress(SensorError):
-            found = find_sensor([next(iter(beside), path)], reading_options(arguments))
+            found = find_sensor([next(iter(beside), path)], arguments)
             if found is not None and found.is_built_in:
                 known, what = KnownSensor(found.profile, str(found)), "the points"
                 is_other = _has_other_beams(given, found.profile)

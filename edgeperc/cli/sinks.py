@@ -6,7 +6,7 @@ import argparse
 import sys
 from contextlib import ExitStack
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from ..errors import EdgepercError
 from .arguments import options
@@ -62,11 +62,10 @@ def add_sinks(parser: argparse.ArgumentParser) -> None:
     )
     group(
         "--bag-storage",
-        "format of the file in --bag; mcap needs rosbags 0.10 (default: %(default)s)",
+        "format of the file in --bag; mcap needs rosbags 0.10 (default: sqlite3)",
         choices=("sqlite3", "mcap"),
-        default="sqlite3",
     )
-    group("--bag-frame NAME", "frame of the messages in --bag (default: %(default)s)", default="lidar")
+    group("--bag-frame NAME", "frame of the messages in --bag (default: lidar)")
 
 
 def _address(text: str) -> tuple[str, int]:
@@ -143,7 +142,8 @@ class Sinks:
         if arguments.labels_for is not None:
             self._add(PrelabelSink(arguments.out, arguments.labels_for, calib=arguments.calib))
         if arguments.bag is not None:
-            self._add(BagSink(arguments.bag, storage=arguments.bag_storage, frame_id=arguments.bag_frame))
+            storage: Literal["sqlite3", "mcap"] = arguments.bag_storage or "sqlite3"
+            self._add(BagSink(arguments.bag, storage=storage, frame_id=arguments.bag_frame or "lidar"))
 
     def _add(self, sink: Sink) -> None:
         """The first is closed last: files are finished before what is served ends, whatever viewers do."""

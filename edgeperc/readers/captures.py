@@ -64,7 +64,7 @@ def read_scans(
     remission_field : str, optional
         Name of the remission field, as in `edgeperc.read_points`; ``reflectivity`` by default for an Ouster capture.
     columns : int or sequence of str, optional
-        What scan files without a header hold, as in `edgeperc.read_points`.
+        What scan files without a header hold, as in `edgeperc.read_points`; not of recordings.
     origin_m : sequence of 3 float or "auto", optional
         Place of the sensor in the map of scan files, as in `edgeperc.read_points`.
     accumulate_s : float, optional
@@ -158,12 +158,22 @@ def _scans(path: Path, options: _Options) -> Iterator[TimedScan]:
     if kind == "folder":
         return _folder(path, options)
     if kind == "scan":
+        if options.topic is not None:
+            raise PointsError(
+                f"{path}: a scan file, which has no topic {options.topic!r}: topic (--topic) chooses among the sensors "
+                "of a recording; leave it out"
+            )
         if options.times:
             return iter([read_timed_file(path, options.of_files)])
         return iter([TimedScan(None, read_points(path, **options.of_files._asdict()), None)])
     if options.of_files.origin_m is not None:
         raise PointsError(
             f"{path}: a recording, whose scans are in the sensor's frame; the origin is that of scan files"
+        )
+    if options.of_files.columns is not None:
+        raise PointsError(
+            f"{path}: a recording, which names its values; columns (--columns) are those of scan files without a "
+            "header; leave them out"
         )
     return decode_apart(path, kind, options.topic, options.of_files.remission_field, options.times)
 

@@ -8,7 +8,7 @@ import os
 import warnings
 import zipfile
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -65,7 +65,8 @@ def read_points(
     columns : int or sequence of str, optional
         What a raw file, an array or a text without names holds for each point: the names of the values in order, such
         as ``("x", "y", "z", "intensity", "ring")``; or, of a raw file or an array, the number of values, at least 3, of
-        which the first are x, y, z and remission. Ignored for files that have names, and if ``source`` is an array.
+        which the first are x, y, z and remission. Not used for files that have names, with a warning, and if ``source``
+        is an array.
     remission_field : str, optional
         Name of the remission field, for formats with named fields. By default the first existing one of remission,
         intensity, i, reflectivity, reflectance.
@@ -206,9 +207,9 @@ def _parse(data: Bytes, name: str, options: FileOptions) -> _Read:
     if head.startswith(b"PK\x03\x04"):
         return _of_stored(_parse_npz(data), options)
     if head.startswith((b"ply\n", b"ply\r")):
-        return _of_columns(parse_ply(data, head, options.remission_field), options)
+        return _of_named(parse_ply(data, head, options.remission_field), options)
     if begins_like_pcd(head):
-        return _of_columns(parse_pcd(data, head, options.remission_field), options)
+        return _of_named(parse_pcd(data, head, options.remission_field), options)
     # The first bytes of float32 values may be any, but thousands of them are no text.
     may_be_raw = options.columns is not None or (name.endswith(".bin") and not begins_like_text(head))
     advice = None if may_be_raw else advice_for(head)
@@ -227,6 +228,22 @@ def _parse(data: Bytes, name: str, options: FileOptions) -> _Read:
         advice = advice_for(head)
         raise exc if advice is None else PointsError(f"{exc}; its first bytes are those of {advice}") from exc
     return _of_values(raw, options)
+
+
+def _of_named(columns: Columns, options: FileOptions) -> _Read:
+    """Of a file that names its values."""
+    _check_unused(columns.fields, options)
+    return _of_columns(columns, options)
+
+
+def _check_unused(names: Iterable[str], options: FileOptions) -> None:
+    """Say that names of columns are not taken; without the path, so that it is said once for a folder."""
+    if options.columns is not None:
+        warnings.warn(
+            f"columns= (--columns) is not used: the file names its values, {', '.join(names)}",
+            UserWarning,
+            stacklevel=2,
+        )
 
 
 def _of_values(columns: Columns, options: FileOptions) -> _Read:
@@ -249,6 +266,8 @@ def _unnamed(options: FileOptions) -> FileOptions:
 def _of_stored(array: NDArray[Any], options: FileOptions) -> _Read:
     """Of the array of a file."""
     usual = array.ndim == 2 and (array.shape[1] <= 4 or array.shape[0] in (3, 4))
+    if array.dtype.names:
+        _check_unused(array.dtype.names, options)
     if array.dtype.kind not in "fiu" or array.ndim != 2 or (options.columns is None and usual):
         return _of_array(array, options)
     if options.columns is None:

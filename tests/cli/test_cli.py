@@ -373,8 +373,8 @@ def test_an_origin_is_three_numbers_or_auto(
 def test_an_origin_is_not_for_recordings(tmp_path: Path, capsys: pytest.CaptureFixture[str], origin: list[str]) -> None:
     pytest.importorskip("velodyne_decoder")
     path = write_pcap(tmp_path / "a.pcap", vlp16_packets(1.5))
-    assert run("run", path, "--origin", *origin) == 1
-    assert "a recording, whose scans are in the sensor's frame" in capsys.readouterr().err
+    assert usage_code("run", path, "--origin", *origin) == 2
+    assert f"--origin is for scan files, and {path} is a recording" in capsys.readouterr().err
     with pytest.raises(PointsError, match="the origin is that of scan files"):
         next(captures.read_scans(path, origin_m=(1.0, 2.0, 3.0)))
 

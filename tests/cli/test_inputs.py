@@ -1,0 +1,107 @@
+"""Options of reading that are for another kind of input than the given one are refused, never ignored."""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+from test_captures import vlp16_packets, write_pcap
+
+from cli_helpers import run, write_scan
+from edgeperc import PointsError, read_points, read_scans
+
+OF_RECORDINGS = ("--topic 10.0.0.1",)
+OF_SCAN_FILES = ("--columns x y z i", "--columns=x", "--origin 1 2 3", "--origin auto")
+OF_SCANS = (
+    *("--sensor vlp-16", "--mount-height 1.8", "--roll 0", "--pitch=1", "--turn street", "--ego-box 0 1 0 1 0 1"),
+    *("--remission-field i", "--remission-range 0 1"),
+)
+OF_PERCEIVING = (
+    *("--on-mismatch raise", "--anyway", "--score-threshold 0.5", "--boxes-from both", "--no-agreement"),
+    *("--full-turn", "--adapt none"),
+)
+GATHERED = "--sensor mid-360 --accumulate 0.2"
+
+
+def write_inputs(folder: Path) -> dict[str, Path]:
+    (folder / "scans").mkdir()
+    (folder / "a.png").write_bytes(b"\x89PNG")
+    return {
+        "scan file": write_scan(folder / "a.bin"),
+        "folder": write_scan(folder / "scans" / "a.bin").parent,
+        "recording": write_pcap(folder / "a.pcap", vlp16_packets(0.1)),
+        "image": folder / "a.png",
+    }
+
+
+@pytest.mark.parametrize(
+    ("command", "kind", "options", "said"),
+    [
+        *(
+            (command, kind, options, said)
+            for command in ("run", "info")
+            for kind, of_others, said in (
+                ("scan file", OF_RECORDINGS, " is for recordings, and "),
+                ("folder", OF_RECORDINGS, " is for recordings, and "),
+                ("recording", OF_SCAN_FILES, " is for scan files, and "),
+                ("image", (*OF_SCANS, *OF_RECORDINGS, *OF_SCAN_FILES), " is for scans, and "),
+            )
+            for options in of_others
+        ),
+        *(("run", "image", options, " is for scans, and ") for options in OF_PERCEIVING),
+        *(("run", kind, GATHERED, "--accumulate is for recordings, and ") for kind in ("scan file", "folder")),
+        *(("run", "recording", options, "need --bag DIR") for options in ("--bag-storage mcap", "--bag-frame a")),
+    ],
+)
+def test_an_option_of_no_use_is_refused(
+    command: str, kind: str, options: str, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    if kind == "image":
+        pytest.importorskip("PIL")
+    path = write_inputs(tmp_path)[kind]
+    with pytest.raises(SystemExit, match="2"):
+        run(command, path, *options.split())
+    shown = " ".join(capsys.readouterr().err.split())
+    assert (f"{said}{path}" if said.endswith("and ") else said) in shown
+    assert options.split()[0].partition("=")[0] in shown
+
+
+@pytest.mark.parametrize(
+    ("kind", "options"),
+    [
+        ("scan file", {"topic": "10.0.0.1"}),
+        ("folder", {"topic": "/points"}),
+        ("recording", {"columns": ["x", "y", "z"]}),
+    ],
+)
+def test_so_does_the_library(kind: str, options: dict[str, str], tmp_path: Path) -> None:
+    with pytest.raises(PointsError, match=r"topic \(--topic\) chooses|columns \(--columns\) are those of scan files"):
+        next(iter(read_scans(write_inputs(tmp_path)[kind], **options)))  # type: ignore[arg-type]
+
+
+def test_packets_have_one_remission(tmp_path: Path) -> None:
+    pytest.importorskip("velodyne_decoder")
+    path = write_pcap(tmp_path / "a.pcap", vlp16_packets(1.2))
+    with pytest.raises(PointsError, match=r"no field 'ambient' .* hold one remission"):
+        next(read_scans(path, remission_field="ambient"))
+    assert len(next(read_scans(path, remission_field="intensity"))[1])
+
+
+@pytest.mark.parametrize("suffix", ["npy", "ply", "pcd"])
+def test_names_of_columns_that_a_file_has_itself_are_not_taken_without_a_word(suffix: str, tmp_path: Path) -> None:
+    path = tmp_path / f"a.{suffix}"
+    if suffix == "npy":
+        np.save(path, np.zeros(3, [(name, "f4") for name in ("x", "y", "z", "i")]))
+    elif suffix == "ply":
+        names = "".join(f"property float {name}\n" for name in ("x", "y", "z", "i"))
+        path.write_text(f"ply\nformat ascii 1.0\nelement vertex 3\n{names}end_header\n" + "0 0 0 0\n" * 3)
+    else:
+        head = "VERSION .7\nFIELDS x y z i\nSIZE 4 4 4 4\nTYPE F F F F\nCOUNT 1 1 1 1\nWIDTH 3\nHEIGHT 1\nPOINTS 3\n"
+        path.write_text(f"{head}DATA ascii\n" + "0 0 0 0\n" * 3)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        read_points(path)
+    with pytest.warns(UserWarning, match=r"columns= \(--columns\) is not used: the file names its values, x, y, z, i"):
+        read_points(path, columns=("x", "y", "z", "ring"))
