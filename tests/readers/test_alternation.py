@@ -57,6 +57,17 @@ def test_two_sensors_are_said_once(mounts: tuple[Mount, ...], speed_mps: float) 
     assert text.startswith("every second scan is alike, and those between are not: 2 sensors share the topic")
 
 
+@pytest.mark.parametrize(("mounts", "speed_mps"), [((LEFT, RIGHT), 15.0), ((FRONT, REAR), 25.0), ((FRONT, LOW), 20.0)])
+def test_two_sensors_at_speed_are_said_by_many_scans(mounts: tuple[Mount, ...], speed_mps: float) -> None:
+    (text,) = said(drive(mounts, speed_mps, 1, 24))
+    assert text.startswith("every second scan is alike")
+
+
+@pytest.mark.parametrize("speed_mps", [3.0, 25.0])
+def test_many_scans_of_one_sensor_are_not(speed_mps: float) -> None:
+    assert said(drive((FRONT,), speed_mps, 2, 24)) == []
+
+
 def test_three_sensors_are_said() -> None:
     (text,) = said(drive((LEFT, REAR, LOW), 2.0, 2))
     assert text.startswith("every third scan is alike, and those between are not: 3 sensors")
