@@ -203,7 +203,7 @@ def _chosen_reader(
     """The scans of the sensor that a topic names, or of the only one among those that sent packets."""
     readers: list[tuple[Sequence[str], Callable[[str | None], Iterator[TimedScan]]]] = []
     if is_velodyne:
-        readers.append((senders.velodynes, lambda sender: _velodyne_scans(_decodable(path, alive, sender))))
+        readers.append((senders.velodynes, lambda sender: _velodyne_scans(_decodable(path, alive, sender, senders))))
     if lidar := senders.lidar(topic):
         from .lidars import turns_of  # numba
 
@@ -227,9 +227,9 @@ def _check_unnamed(remission_field: str | None) -> None:
         )
 
 
-def _decodable(path: Path, alive: Callable[[], None], sender: str | None) -> Path:
-    """The capture, or a copy of one sender's packets, whole and behind Ethernet's header."""
-    if sender is None and is_plain(path):
+def _decodable(path: Path, alive: Callable[[], None], sender: str | None, senders: Senders) -> Path:
+    """The capture, or a copy of one sender's packets, whole, in their order and behind Ethernet's header."""
+    if sender is None and not senders.n_overtaken and is_plain(path):
         return path
     if shutil.disk_usage(tempfile.gettempdir()).free < path.stat().st_size:
         raise PointsError("the temporary folder has no room for a copy whose packets begin with Ethernet's header")

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import heapq
 import ipaddress
 import struct
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
 from functools import lru_cache
 from itertools import islice
@@ -40,6 +41,10 @@ _PRODUCTS = {
     0xA1: "VLS-128",
 }
 _RETURN_MODES = (0x37, 0x38, 0x39, 0x3A, 0x3B)
+
+# A packet that comes later than the next ones is at most so late, and so many wait for it.
+OVERTAKEN_S, _OVERTAKING = 0.05, 32
+_HOUR_S = 3600.0
 
 # Enough to find a LiDAR's packet among those of a GPS, and quick to read.
 SNIFFED_PACKETS = 2000
@@ -158,6 +163,31 @@ def velodyne_packets(path: Path, sender: str | None = None) -> Iterator[memoryvi
     yield from _bare_velodyne_packets(path)
 
 
+def turned_s(datagram: Datagram, before_s: float) -> float:
+    """The time of a Velodyne's packet, which begins anew each hour, as near to that of one before as it can be [s]."""
+    now_s = 1e-6 * int.from_bytes(datagram.payload[1200:1204], "little")
+    return before_s + (now_s - before_s + 0.5 * _HOUR_S) % _HOUR_S - 0.5 * _HOUR_S
+
+
+def in_order(datagrams: Iterable[Datagram]) -> Iterator[Datagram]:
+    """A Velodyne's packets in the order of its clock, where a network or a capture let them overtake one another."""
+    waiting, latest_s = list[tuple[float, int, Datagram]](), 0.0
+    for k, datagram in enumerate(datagrams):
+        if not is_of_velodyne(datagram):
+            yield datagram
+            continue
+        now_s = turned_s(datagram, latest_s)
+        if abs(now_s - latest_s) > OVERTAKEN_S:  # the clock was set
+            yield from (each for *_, each in sorted(waiting))
+            waiting = []
+            latest_s = now_s
+        latest_s = max(latest_s, now_s)
+        heapq.heappush(waiting, (now_s, k, datagram))
+        if len(waiting) > _OVERTAKING:
+            yield heapq.heappop(waiting)[-1]
+    yield from (each for *_, each in sorted(waiting))
+
+
 def velodyne_name(packet: memoryview) -> str | None:
     """The model of a Velodyne, None if the packet does not name it."""
     blocks = {bytes(packet[k : k + 2]) for k in range(0, 1200, 100)}
@@ -260,15 +290,16 @@ def is_plain(path: Path) -> bool:
 
 
 def copy_as_ethernet(path: Path, target: Path, alive: Callable[[], None], sender: str | None = None) -> None:
-    """Copy the datagrams of a pcap file, of one sender or all, each as one packet behind Ethernet's header.
+    """Copy a Velodyne's datagrams in a pcap file, of one sender or all, in their order, each as one packet behind
+    Ethernet's header.
 
     ``tcpdump -i any`` writes Linux's cooked headers; tunnels and phones write raw IP; a narrow link sends fragments.
     """
     with target.open("wb") as out:
         out.write(struct.pack("<IHHiIII", 0xA1B2C3D4, 2, 4, 0, 0, 65535, 1))
-        for datagram in Datagrams(path, alive):
+        for datagram in in_order(each for each in Datagrams(path, alive) if each.is_from(sender)):
             size = len(datagram.payload)
-            if size > _MOST_COPIED or not datagram.is_from(sender):
+            if size > _MOST_COPIED:
                 continue
             seconds, microseconds = divmod(round(1e6 * datagram.stamp_s), 10**6)
             addresses = ipaddress.ip_address(datagram.sender).packed[-4:] + b"\xff" * 4

@@ -281,3 +281,31 @@ def test_a_capture_is_counted_once(name: str, tmp_path: Path, monkeypatch: pytes
     assert n < n_read < n_passes * n + n_first
     assert len(list(scans)) > 3
     assert n_read < 2 * n + n_first
+
+
+@pytest.mark.parametrize("begin_us", [0, 3_599_700_000], ids=["hour", "turn of the hour"])
+@pytest.mark.parametrize("shift", [1, 3, 20])
+def test_packets_that_overtake_one_another_split_no_scan(tmp_path: Path, begin_us: int, shift: int) -> None:
+    pytest.importorskip("velodyne_decoder")
+    content = [bytearray(packet) for packet in vlp16_packets(4.0)]
+    for packet in content:
+        (time_us,) = struct.unpack_from("<I", packet, 1200)
+        struct.pack_into("<I", packet, 1200, (time_us - 1_000_000 + begin_us) % 3_600_000_000)
+    ordered = [bytes(packet) for packet in content]
+    expected = list(read_scans(write_pcap(tmp_path / "ordered.pcap", ordered)))
+    late = ordered.copy()
+    for k in range(5, len(late) - shift, 41):
+        late.insert(k + shift, late.pop(k))
+    found = list(read_scans(write_pcap(tmp_path / "late.pcap", late)))
+    assert [len(points) for _, points in found] == [len(points) for _, points in expected]
+    for (_, points), (_, other_points) in zip(found, expected, strict=True):
+        np.testing.assert_array_equal(points, other_points)
+
+
+def test_packets_behind_a_step_of_the_clock_stay_behind() -> None:
+    times_us = [*range(0, 30_000, 1000), *range(3_000_000, 3_030_000, 1000), *range(500_000, 530_000, 1000)]
+    payloads = [b"\xff\xee" + bytes(1198) + struct.pack("<I", time_us) + b"\x37\x22" for time_us in times_us]
+    sent = [packets.Datagram("10.0.0.1", 2368, 1.0 + k, memoryview(each)) for k, each in enumerate(payloads)]
+    assert list(packets.in_order(sent)) == sent
+    gps = packets.Datagram("10.0.0.1", 8308, 0.5, memoryview(bytes(512)))
+    assert sorted(packets.in_order([*sent[:3], gps]), key=lambda each: each.stamp_s) == [gps, *sent[:3]]
