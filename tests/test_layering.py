@@ -72,8 +72,8 @@ FLOORS = {
         road.ahead road.grid
         road.rolling
         pipeline
-        readers.__init__ readers.images readers.origin readers.pcap readers.times readers.unknown
-        readers.clouds readers.ouster readers.packets readers.tables
+        readers.__init__ readers.origin readers.pcap readers.times readers.unknown
+        readers.clouds readers.images readers.ouster readers.packets readers.tables
         readers.alternation readers.livox_packets readers.ouster_packets readers.spinning_packets
         readers.inflate readers.pcd readers.ply readers.raw readers.senders
         readers.lidars readers.mcap readers.text

@@ -18,7 +18,7 @@ from .identify import KnownSensor, of_cloud, of_livox, of_metadata, of_packets, 
 from .packets import LVX_MAGIC
 from .pcap import PCAP_MAGIC
 from .times import TimedScan, accumulate
-from .unknown import advice_for
+from .unknown import advice_for, missing
 
 SCAN_SUFFIXES = (".bin", ".npy", ".npz", ".pcd", ".ply")
 CAPTURE_SUFFIXES = (".bag", ".db3", ".lvx2", ".mcap", ".osf", ".pcap", ".pcapng")
@@ -217,7 +217,7 @@ def known_sensor(path: Path, topic: str | None = None) -> KnownSensor | None:
     """Like `sensor_of`, with how it is known."""
     kind = _readable_kind(path)
     if kind == "folder":
-        sensors = {file: known_sensor(file, topic) for file in scan_files(path)}
+        sensors = {file: known_sensor(file, topic) for file in scan_files(path) if file.exists()}
         profiles = {None if known is None else known.profile for known in sensors.values()}
         if len(profiles) > 1:
             names = sorted({"scan files" if profile is None else profile.name for profile in profiles})
@@ -245,20 +245,23 @@ def known_sensor(path: Path, topic: str | None = None) -> KnownSensor | None:
 
 
 def scan_files(folder: Path) -> list[Path]:
-    """The scans and captures in a folder, by name, without hidden files."""
+    """The scans and captures in a folder, by name, without hidden files; and links to what is not there, which reading
+    reports: a scan that was not fetched is missing, too.
+    """
     return sorted(
         entry
         for entry in folder.iterdir()
-        if entry.suffix.lower() in SCAN_SUFFIXES + CAPTURE_SUFFIXES and entry.name[0] != "." and entry.is_file()
+        if entry.suffix.lower() in SCAN_SUFFIXES + CAPTURE_SUFFIXES
+        and entry.name[0] != "."
+        and (entry.is_file() or (entry.is_symlink() and not entry.exists()))
     )
 
 
 def _readable_kind(path: Path) -> str:
     """`_kind`, if `read_scans` reads it; PointsError otherwise."""
     if not path.exists():
-        raise PointsError(
-            f"{path}: there is no such file or folder; expected a scan, a folder of scans, a .pcap, .osf, .bag or .mcap"
-        )
+        expected = "a scan, a folder of scans, a .pcap, .osf, .bag or .mcap"
+        raise PointsError(f"{path}: {missing(path, 'file or folder', expected)}")
     kind = _kind(path)
     if kind in CAPTURE_SUFFIXES and _kind_of(head := _head(path)) is None and (advice := advice_for(head)):
         raise PointsError(f"{path}: this is {advice}")

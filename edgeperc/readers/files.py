@@ -36,7 +36,7 @@ from .raw import column_names, parse_raw
 from .tables import MAX_HEADER_BYTES, MAX_SCAN_BYTES, Columns
 from .text import begins_like_text, parse_text
 from .times import TimedScan, point_times
-from .unknown import advice_for
+from .unknown import advice_for, missing
 
 
 def read_points(
@@ -179,7 +179,7 @@ def _read(path: Path, options: FileOptions) -> _Read:
     if data is None:
         if path.is_dir():
             raise PointsError(f"{path}: a folder; expected one scan file. edgeperc.read_scans reads those in a folder")
-        raise PointsError(f"{path}: there is no such file; expected a scan as .bin, .npy, .npz, .pcd or .ply")
+        raise PointsError(f"{path}: {missing(path, 'file', 'a scan as .bin, .npy, .npz, .pcd or .ply')}")
     read = _parse_named(data, path, options)
     if read.n_missing:
         warnings.warn(f"{path}: {read.missing()}", UserWarning, stacklevel=3)

@@ -13,6 +13,7 @@ from ..camera.image import check_size
 from ..errors import ImageError
 from ..system.extras import require
 from ..types.points import Bytes
+from .unknown import missing
 
 IMAGE_SUFFIXES = (".bmp", ".jpeg", ".jpg", ".png", ".ppm", ".webp")
 # Only these decoders: others of Pillow start programs (EPS), print what is damaged (TIFF) or are of no camera.
@@ -52,7 +53,7 @@ def read_image(path: str | os.PathLike[str]) -> Bytes:
     path = Path(path)
     try:
         if not path.is_file():
-            raise ImageError("there is no such file; expected an image as .jpg, .png, .webp, .bmp or .ppm")
+            raise ImageError(missing(path, "file", "an image as .jpg, .png, .webp, .bmp or .ppm"))
         size = path.stat().st_size
         if not 0 < size <= MAX_FILE_BYTES:
             raise ImageError(f"the file has {size:,} bytes; expected 1 to {MAX_FILE_BYTES:,}")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 _ARCHIVE = "an archive; unpack it first"
 _FILM = "a film; edgeperc reads images (.jpg, .png), for a camera model"
 _IMAGE = "an image; pass it with a camera model: --model camseg"
@@ -50,3 +52,15 @@ def advice_for(head: bytes) -> str | None:
     if head.lstrip()[:1] in (b"{", b"["):
         return "JSON; save the points as .npy or .pcd"
     return next((advice for first, advice in _KNOWN.items() if head.startswith(first)), None)
+
+
+def missing(path: Path, what: str, expected: str) -> str:
+    """What to say of a path at which nothing is."""
+    if path.is_symlink():
+        return (
+            f"a link to {path.readlink()}, which is not there: fetch its file (git annex get, dvc pull), or mount its "
+            "disk"
+        )
+    if str(path) == "-":
+        return "standard input is not read; write it into a file, and pass that"
+    return f"there is no such {what}; expected {expected}"

@@ -125,6 +125,8 @@ class Remote:
             raise OptionError(f"{self}: fsspec has no package for {protocol}:// ({exc}); install it with pip") from exc
         except ValueError as exc:
             raise OptionError(f"{self}: {exc}; expected a path, or a URL such as s3://bucket/scans") from exc
+        except OSError as exc:  # ftp:// connects here
+            raise OSError(f"{self}: {type(exc).__name__}: {exc}") from exc
         try:
             yield system, path
         except EdgepercError:

@@ -105,3 +105,9 @@ def test_names_of_columns_that_a_file_has_itself_are_not_taken_without_a_word(su
         read_points(path)
     with pytest.warns(UserWarning, match=r"columns= \(--columns\) is not used: the file names its values, x, y, z, i"):
         read_points(path, columns=("x", "y", "z", "ring"))
+
+
+def test_a_url_that_cannot_be_reached_is_named(capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("fsspec")
+    assert run("run", "ftp://127.0.0.1:1/a.bin") == 2
+    assert "ftp://127.0.0.1:1/a.bin: " in capsys.readouterr().err

@@ -615,6 +615,23 @@ def test_a_folder_is_read_by_name(tmp_path: Path) -> None:
         next(read_scans(tmp_path / "folder.bin"))
 
 
+def test_a_link_to_nowhere_is_a_scan_that_is_missing(tmp_path: Path) -> None:
+    """As in a data set of git-annex of which only some files were fetched."""
+    np.save(tmp_path / "a.npy", np.ones((3, 4), np.float32))
+    for name, target in (("b.npy", "annex/b"), ("c.pcap", "c.pcap")):
+        (tmp_path / name).symlink_to(target)
+    assert [file.name for file in scan_files(tmp_path)] == ["a.npy", "b.npy", "c.pcap"]
+    scans, error = read_until_error(tmp_path)
+    assert len(scans) == 1
+    assert "b.npy: a link to annex/b, which is not there: fetch its file (git annex get" in error
+    assert edgeperc.sensor_of(tmp_path) is None
+    for read in (edgeperc.read_points, read_scans):
+        with pytest.raises(PointsError, match=r"c\.pcap: a link to c\.pcap, which is not there"):
+            read(tmp_path / "c.pcap")
+        with pytest.raises(PointsError, match="standard input is not read"):
+            read("-")
+
+
 def test_first_bytes_decide_the_format(tmp_path: Path) -> None:
     path = write_bag1(tmp_path / "drive.bag").rename(tmp_path / "drive.bag.1")
     assert is_capture(path)
