@@ -13,7 +13,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from ..errors import EdgepercError, ImageError, ModelError, PointsError
+from ..errors import EdgepercError, ImageError, ModelError, OptionError, PointsError
 from ..records import PerceivedScan
 from ..system.extras import require
 from ..system.remote import Remote, location
@@ -221,8 +221,8 @@ def run_command(arguments: argparse.Namespace) -> int:
     perceivers = _Perceivers(arguments)
     local = [scan for scan in scans if isinstance(scan, Path)]
     perceivers.check([*filter(None, images.values())] if images else scans, of_images=bool(images))
-    for target in targets if kinds and isinstance(arguments.out, Path) else ():
-        target.parent.mkdir(parents=True, exist_ok=True)
+    if kinds and isinstance(arguments.out, Path):
+        _make_folders(arguments.out, targets)
     report = Report(arguments, images)
     for folder in found.empty:
         has_tables = isinstance(folder, Path) and any(folder.glob("*.csv"))
@@ -338,6 +338,17 @@ def _check_outputs(
             arguments.usage_error(f"{other} and {option} both write {file}; choose another name for one of them")
 
 
+def _make_folders(out: Path, targets: Sequence[Path]) -> None:
+    for folder in {target.parent for target in targets}:
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as exc:
+            raise OptionError(
+                f"--out {out}: the folder {folder} cannot be made ({exc.strerror}); expected a folder, or a name that "
+                "is free in one that can be written"
+            ) from exc
+
+
 def _images(arguments: argparse.Namespace, kinds: Sequence[str]) -> dict[Path, Path | None]:
     """The images, each with its scan of ``--scan`` if that is passed; empty if the paths are scans."""
     images = find_images(arguments.paths)
@@ -428,6 +439,16 @@ class _Perceivers:
             )
         if of_images and not scans and kinds != {"camera"}:
             raise ModelError("images alone need a camera model alone; leave out the others, or add --scan")
+        for is_given, needed, option in (
+            (
+                self._arguments.full_turn,
+                {"range_image", "objects", "pillars"},
+                "--full-turn needs a model of all sides",
+            ),
+            (self._arguments.boxes_from == "network", {"top_view", "pillars"}, "--boxes-from network needs a detector"),
+        ):
+            if is_given and not kinds & needed:
+                raise ModelError(f"{option}, and {', '.join(c.name for c in cards)} is none; leave it out")
 
     def sensor_of(self, path: Path | Remote, url: Remote | None = None) -> str | SensorProfile:
         """The sensor of ``--sensor``, of the capture, or the one that is found in the points."""

@@ -111,3 +111,27 @@ def test_a_url_that_cannot_be_reached_is_named(capsys: pytest.CaptureFixture[str
     pytest.importorskip("fsspec")
     assert run("run", "ftp://127.0.0.1:1/a.bin") == 2
     assert "ftp://127.0.0.1:1/a.bin: " in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("out", ["a.bin", "a.bin/below"])
+def test_a_folder_that_cannot_be_made_is_named_with_its_option(
+    out: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scan = write_scan(tmp_path / "a.bin")
+    assert run("run", scan, "--labels", "--out", tmp_path / out) == 2
+    assert f"--out {tmp_path / out}: the folder {tmp_path / out} cannot be made" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("model", "options", "said"),
+    [
+        ("ssadnet", "--full-turn", "--full-turn needs a model of all sides, and ssadnet is none"),
+        ("pointseg", "--boxes-from network", "--boxes-from network needs a detector, and pointseg is none"),
+    ],
+)
+def test_options_of_another_model_are_refused(
+    model: str, options: str, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = ("--model", model, "--provider", "cpu", *options.split())
+    assert run("run", write_scan(tmp_path / "a.bin"), *arguments) == 2
+    assert said in capsys.readouterr().err
