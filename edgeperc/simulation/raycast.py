@@ -384,20 +384,24 @@ def fill_cast(shapes: Shapes, ground: Ground, T_world_sensor: Floats, rays: Rays
     radii, heights = np.empty(n_radii), np.empty(n_radii)
     for i in range(n_radii):
         radii[i] = innermost * 1.03**i
+    extent, n_met = _extent(ground), n_radii
     for column in range(n_columns):
         level = math.cos(rays.azimuths[column]), math.sin(rays.azimuths[column])
         sector = math.floor(rays.azimuths[column] * (n_sectors / (2.0 * math.pi))) % n_sectors
-        _fill_profile(ground, T, level, radii, heights)
+        if n_beams == 1 and T[2, 2] > 0.9:  # a pattern: most of its rays are soon above all ground, or below it
+            farthest = min(_farthest(ground, extent, T, level, tangents[0, differ * column]), rays.reach)
+            n_met = min(int(math.log(max(farthest / innermost, 1.0)) / math.log(1.03)) + 2, n_radii)
+        _fill_profile(ground, T, level, radii[:n_met], heights)
         # Higher beams meet the ground no nearer than lower ones, so one pass over the radii is enough for all beams.
         i = 0
         for b in range(n_beams - 1, -1, -1):
             tan, elevation = tangents[b, differ * column], rays.elevations[b, differ * column]
-            while i < n_radii and heights[i] < radii[i] * tan:
+            while i < n_met and heights[i] < radii[i] * tan:
                 i += 1
             ce = math.cos(elevation)
             direction = ce * level[0], ce * level[1], math.sin(elevation)
             best, row, leave, cosine = rays.reach, _NOTHING, rays.reach, 0.0
-            if i < n_radii:
+            if i < n_met:
                 r = _ground_radius(ground, T, level, tan, radii, heights, i)
                 if r / ce < best:
                     best = leave = r / ce
@@ -412,6 +416,28 @@ def fill_cast(shapes: Shapes, ground: Ground, T_world_sensor: Floats, rays: Rays
             hits.rows[b, column] = row
             hits.exits[b, column] = leave
             hits.cosines[b, column] = cosine
+
+
+@njit(cache=True, nogil=True)
+def _extent(ground: Ground) -> float:
+    """The most by which the ground is above or below the slopes of its terrain, and half a meter [m]."""
+    t = ground.terrain
+    if t[BANK_SLOPE] < 0.0 or t[BANK_SLOPE_LEFT] < 0.0:
+        return math.inf
+    road = 4.0 * abs(t[CROWN]) + abs(t[LIP]) + max(abs(t[KERB]), 0.08) + 0.02 * abs(t[PAVEMENT])
+    land = max(abs(t[BANK_RISE]), abs(t[BANK_RISE_LEFT])) + abs(t[DITCH]) + 2.0 * abs(t[ROUGH])
+    return abs(t[WAVE_X]) + abs(t[WAVE_Y]) + road + land + 0.5
+
+
+@njit(cache=True, nogil=True)
+def _farthest(ground: Ground, extent: float, T: Floats, level: tuple[float, float], tan: float) -> float:
+    """Horizontal distance [m] beyond which a ray of slope ``tan`` is above all ground, or below it."""
+    x_slope, y_slope = ground.terrain[SLOPE_X], ground.terrain[SLOPE_Y]
+    above, rate = T[2, 3] - x_slope * T[0, 3] - y_slope * T[1, 3], 0.0
+    for k in range(3):
+        way = level[0] if k == 0 else level[1] if k == 1 else tan
+        rate += way * (T[2, k] - x_slope * T[0, k] - y_slope * T[1, k])
+    return (extent - (above if rate > 0.0 else -above)) / max(abs(rate), 1e-9)
 
 
 @njit(cache=True, nogil=True)
