@@ -282,9 +282,14 @@ def pair_iou(a: Floats, b: Floats) -> float:
 
 def inside(box: Box, points: NDArray[Any], margin_m: float = 0.0) -> Mask:
     """Find the points inside a box that is grown by a margin on every side [m]; not finite ones are outside."""
-    offset = points[:, :3] - np.asarray(box.center, np.float32)
+    half = np.asarray(box.size) / 2.0 + margin_m
+    # Most points are out of reach along x already: a scan and a box take 0.1 in place of 0.5 ms.
+    center = np.asarray(box.center, np.float32)
+    near = np.flatnonzero(np.abs(points[:, 0] - center[0]) <= 1.001 * np.hypot(half[0], half[1]) + 0.001)
+    offset = points[near, :3] - center
     cos, sin = np.cos(box.yaw), np.sin(box.yaw)
     along = offset[:, 0] * cos + offset[:, 1] * sin
     across = offset[:, 1] * cos - offset[:, 0] * sin
-    half = np.asarray(box.size) / 2.0 + margin_m
-    return (np.abs(along) <= half[0]) & (np.abs(across) <= half[1]) & (np.abs(offset[:, 2]) <= half[2])
+    found = np.zeros(len(points), np.bool_)
+    found[near] = (np.abs(along) <= half[0]) & (np.abs(across) <= half[1]) & (np.abs(offset[:, 2]) <= half[2])
+    return found
