@@ -83,8 +83,9 @@ def _open_mnn(path: Path, folder: Path, n_threads: int) -> Engine:
     import MNN.nn
 
     made = folder / "model.mnn"
-    convert = [sys.executable, "-m", "MNN.tools.mnnconvert", "-f", "ONNX", "--bizCode", "edgeperc"]
-    _convert([*convert, "--modelFile", str(path), "--MNNModel", str(made)], path, made)
+    # Not MNN.tools.mnnconvert, which calls this, but installs a package by pip and sends the computer's id to a server.
+    convert = [sys.executable, "-c", "import _tools, sys; _tools.mnnconvert(sys.argv)", "-f", "ONNX"]
+    _convert([*convert, "--bizCode", "edgeperc", "--modelFile", str(path), "--MNNModel", str(made)], path, made)
     name, shape, names = _signature(path)
     runtime = MNN.nn.create_runtime_manager(({"backend": 0, "numThread": n_threads, "precision": "high"},))
     network = MNN.nn.load_module_from_file(str(made), [name], names, runtime_manager=runtime)

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import json
 import multiprocessing
+import os
+import shlex
+import sys
 from collections.abc import Iterable
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
@@ -161,6 +164,18 @@ def test_every_library_multiplies_the_same_matrices(
 def test_the_pipeline_in_numpy_agrees(engine: str, scan: np.ndarray, right: Prediction) -> None:
     need(peers.NEEDS.get(engine, (engine,)))
     assert_agrees(right, predict(engine, "fp32", scan))
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="a command is a file with a mode")
+def test_a_model_is_converted_to_mnn_without_installing_a_package(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    need(peers.NEEDS["mnn"])
+    (tmp_path / "pip").write_text(f"#!/bin/sh\ntouch {shlex.quote(str(tmp_path / 'called'))}\n")
+    (tmp_path / "pip").chmod(0o755)
+    monkeypatch.setenv("PATH", str(tmp_path), prepend=os.pathsep)
+    open_engine("mnn", "fp32", model_path("ssadnet"), 1)
+    assert not (tmp_path / "called").exists()
 
 
 @pytest.mark.parametrize("name", NAMES)
