@@ -207,15 +207,15 @@ def test_axis_and_origin_are_out_of_view() -> None:
             assert (check(points, view).pixel == -1).all(), name
 
 
-@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
-@pytest.mark.parametrize("column", range(4))
-def test_points_not_finite_are_out_of_view(bad: float, column: int) -> None:
-    points = np.float32([[10.0, 1.0, -1.0, 0.5]] * 2)
-    points[0, column] = bad
+def test_points_not_finite_are_out_of_view() -> None:
+    bad = [(column, value) for column in range(4) for value in (math.nan, math.inf, -math.inf)]
+    points = np.float32([[10.0, 1.0, -1.0, 0.5]] * (len(bad) + 1))
+    for row, (column, value) in enumerate(bad):
+        points[row, column] = value
     for view in VIEWS.values():
         seen = check(points, view)
-        assert seen.pixel[0] == -1
-        assert not (seen.index == 0).any()
+        assert (seen.pixel[:-1] == -1).all()
+        assert {*np.unique(seen.index)} <= {-1, len(bad)}
 
 
 def test_the_best_point_wins_and_the_earlier_of_two() -> None:
