@@ -589,7 +589,7 @@ def write_int8(
     frames = {**dict(zip(hashes, hashes, strict=True)), **(frames if isinstance(frames, Mapping) else {})}
     training = dict(card.training) | {"frames": frames, "quantized": quantized}
     model.producer_name, model.producer_version = "edgeperc", ""
-    halve(model.graph, exactly=True)
+    halve(model.graph)
     int8 = replace(card, precision="int8", precisions={}, training=training, parity={})
     return write_checked(model, int8, out, compared)
 

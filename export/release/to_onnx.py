@@ -160,8 +160,8 @@ def traced(network: nn.Module, method: str, example: Tensor, input_name: str, na
     return model
 
 
-def halve(graph: onnx.GraphProto, *, exactly: bool = False) -> None:
-    """Store large weights (``exactly``: those that lose nothing) in half precision; engines convert them on loading."""
+def halve(graph: onnx.GraphProto) -> None:
+    """Store large weights in half precision; engines convert them on loading."""
     casts = []
     for weight in graph.initializer:
         values = onnx.numpy_helper.to_array(weight)
@@ -169,8 +169,6 @@ def halve(graph: onnx.GraphProto, *, exactly: bool = False) -> None:
             continue
         with np.errstate(over="ignore"):
             half = values.astype(np.float16)
-        if exactly and not np.array_equal(half.astype(np.float32), values):
-            continue
         name = weight.name
         weight.CopyFrom(onnx.numpy_helper.from_array(half, f"{name}_half"))
         casts.append(onnx.helper.make_node("Cast", [weight.name], [name], to=onnx.TensorProto.FLOAT))
