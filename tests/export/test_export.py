@@ -1008,25 +1008,25 @@ def test_a_network_has_one_task(network: str, simulated: Path) -> None:
     assert losses[0] + 5.0 < losses[1]
 
 
-def test_what_half_precision_holds_is_stored_so_and_loses_nothing(tmp_path: Path) -> None:
+def test_large_weights_are_stored_in_half_precision_and_what_it_holds_loses_nothing(tmp_path: Path) -> None:
     shipped, path, again = REPOSITORY / "models" / "pointseg.onnx", tmp_path / "model.onnx", tmp_path / "again.onnx"
     model, card = onnx.load(shipped), replace(ModelCard.read(shipped), golden=None)
     large = [tensor for tensor in model.graph.initializer if onnx.numpy_helper.to_array(tensor).size >= 1024]
-    for tensor in large[::2]:
+    assert large
+    for tensor in large:
         values = onnx.numpy_helper.to_array(tensor).astype(np.float16).astype(np.float32)
         tensor.CopyFrom(onnx.numpy_helper.from_array(values, tensor.name))
     write_card(model, card, path)
-    halve(model.graph, exactly=True)
+    halve(model.graph)
     write_card(model, card, again)
-    assert again.stat().st_size < 0.8 * path.stat().st_size
+    assert again.stat().st_size < 0.6 * path.stat().st_size
     before, after = Session(path, "cpu"), Session(again, "cpu")
     for session in (before, after):
         session.input[:] = np.random.default_rng(0).normal(size=session.input.shape)
     first, second = before.run(), after.run()
     assert all(np.array_equal(first[name], second[name]) for name in first)
     weights = [onnx.numpy_helper.to_array(tensor) for tensor in onnx.load(again).graph.initializer]
-    large = [values for values in weights if values.dtype == np.float32 and values.size >= 1024]
-    assert not any(np.array_equal(values.astype(np.float16).astype(np.float32), values) for values in large)
+    assert not [values for values in weights if values.dtype == np.float32 and values.size >= 1024]
 
 
 def test_the_models_page_matches_the_cards() -> None:
