@@ -22,6 +22,7 @@ from .training.train import Data, Run, train
 N_SIMULATED = 2400
 MORE_SCANS: Mapping[str, tuple[int, Mapping[str, int], dict[str, bool]]] = {
     "sensors": (10_000, dict.fromkeys(("pandar64", "vlp-32c", "vlp-16"), 200), {}),
+    "six-sensors": (20_000, dict.fromkeys(("vlp-16", "vlp-32c", "hdl-32e", "os1-64", "pandar64", "mid-360"), 200), {}),
     "halls": (600_000, dict.fromkeys(("hdl-64e", "pandar64", "vlp-16", "os1-64"), 90), {"indoors": True}),
 }
 """Simulated scans beside those of the training sensor: the first seed, how many of each sensor, and which."""

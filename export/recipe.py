@@ -337,7 +337,7 @@ OPEN = replace(EDGE, steps=3500, batch=8, reuse=1, ema=0.998, redraw_every=2000,
 # Ten times as many samples, a third of the simulated scans by other sensors: on KITTI's drives kept back, IoU of the
 # network alone rises from 21.6 to 29.3 % for pedestrians and from 16.5 to 35.5 % for cyclists. With KITTI's scans, more
 # samples only made people of other drives worse (docs/concepts/training.md).
-OPEN_POINTS = replace(OPEN, steps=9150, batch=32, reuse=8, ema=0.999, beams=0.4, cooldown=0.5, redraw_every=4000)
+OPEN_POINTS = replace(EDGE, steps=9150, reuse=8, beams=0.4, cooldown=0.5, simulated_share=0.8, width=0.75)
 
 # Poles and walls are classes here, and are not pasted as what is none.
 SCENE = replace(
@@ -400,7 +400,7 @@ MODELS = {
     # The object network sees points, not beams: with scans of other sensors it learns how sparse an object may be.
     # Without halls it took walls, beams and pipes for trucks.
     "objects": Stage(OBJECTS, also=("sensors", "halls")),
-    "pointseg-open": Stage(OPEN_POINTS, is_open=True, also=("sensors",)),
+    "pointseg-open": Stage(OPEN_POINTS, is_open=True, also=("six-sensors",)),
     "ssadnet-open": Stage(
         replace(OPEN, network="ssadnet", height_above_ground=False, front=True, n_pasted=3.0),
         is_open=True,
@@ -412,7 +412,7 @@ MODELS = {
         replace(SCENE, steps=10_800, batch=32, reuse=8, ema=0.999, beams=0.3, cooldown=0.5, redraw_every=4000),
         after="sceneseg-start",
         is_open=True,
-        also=("sensors",),
+        also=("six-sensors",),
     ),
 }
 """The training run of every model, by name; names that end in ``-start`` are intermediate results."""
