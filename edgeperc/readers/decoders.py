@@ -119,6 +119,10 @@ def _with_typed_errors(path: Path, items: Iterator[_Item]) -> Iterator[_Item]:
         after = f"after {n_scans} scans " if n_scans else ""
         reason = " ".join(str(exc).split()) or type(exc).__name__
         raise PointsError(f"{path}: {after}the capture cannot be read ({reason}); it is damaged or cut short") from exc
+    if not n_scans:
+        raise PointsError(
+            f"{path}: the capture holds no scan; expected a capture of a LiDAR, an Ouster's with its metadata"
+        )
 
 
 def _choose(what: str, names: Sequence[str], wanted: str | None, others: str = "") -> int:
@@ -145,20 +149,14 @@ def _packet_scans(
     alive: Callable[[], None],
 ) -> Iterator[TimedScan]:
     if kind == ".osf":
-        scans = _ouster_scans(_open_osf(path), topic, remission_field)
+        yield from _ouster_scans(_open_osf(path), topic, remission_field)
     elif kind == ".lvx2":
         from .livox_packets import lvx2_scans, lvx2_sensors  # numba, which bags do without
 
         _check_unnamed(remission_field)
-        scans = lvx2_scans(path, _choose("LiDAR", lvx2_sensors(path), topic), alive)
+        yield from lvx2_scans(path, _choose("LiDAR", lvx2_sensors(path), topic), alive)
     else:
-        scans = _pcap_scans(path, topic, remission_field, warn, alive)
-    n_scans = 0
-    for scan in scans:
-        n_scans += 1
-        yield scan
-    if not n_scans:
-        raise PointsError("the capture holds no scan; expected a capture of a LiDAR, an Ouster's with its metadata")
+        yield from _pcap_scans(path, topic, remission_field, warn, alive)
 
 
 def _pcap_scans(
