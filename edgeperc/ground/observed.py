@@ -18,7 +18,7 @@ import numpy as np
 from ..errors import PointsError
 from ..system.kernels import njit
 from ..types.frame import ModelFrame
-from ..types.mounting import MODEL_MOUNTING, Mounting
+from ..types.mounting import MIN_MOUNT_HEIGHT_M, MODEL_MOUNTING, Mounting
 from ..types.points import Bytes, Floats, Floats32, Ints, Mask, Points, read_only
 from ..types.sensor import SensorProfile
 from ..types.views import TopViewGeometry
@@ -51,7 +51,6 @@ OVERHEAD_M = 2.0
 """A return higher above the ground [m], such as a tree's crown or a ceiling, does not observe the cell below it."""
 
 ROAD_Z_M = -1.73  # the road below the sensor
-MIN_MOUNT_HEIGHT_M = 0.5
 SECTOR_RAD = math.radians(0.4)
 MAX_RINGS = 4096
 STEEPEST_DEG = 80.0

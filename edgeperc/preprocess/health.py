@@ -1,7 +1,7 @@
 """What the window of a sensor and the weather do to its scans: blocked sectors, drops in the air, a range that shrank.
 
 Three signs are measured in each scan. Beams that point down must meet the ground: a sector without their returns is
-blocked. Rain, snow, dust and spray show as near points without a neighbor (the dynamic radius of Charron, Phillips and
+blocked, and a scan without those of the lowest ones is a part of one. Rain, snow, dust and spray show as near points without a neighbor (the dynamic radius of Charron, Phillips and
 Waslander, "De-noising of Lidar Point Clouds Corrupted by Snowfall", 2018). Fog takes far returns away, while walls near
 by, which shorten the range too, add returns. The first scans of a perceiver show what is normal; what is judged of a
 later one depends on these and on itself.
@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..system.kernels import njit
-from ..types.mounting import MODEL_HEIGHT_M
+from ..types.mounting import MIN_MOUNT_HEIGHT_M, MODEL_HEIGHT_M
 from ..types.perception import SensorHealth
 from ..types.points import Floats, Floats32, Ints, Ints64, Mask, Points, read_only
 from ..types.sensor import SensorProfile
@@ -41,6 +41,8 @@ _ISOLATED, _ISOLATED_DIM, _CLOUD, _HAZE, _MOSTLY_DIM = 0.05, 0.02, 0.04, 0.03, 0
 _OF_REMISSION = 1024  # points
 _DIM = 0.15  # of the usual remission, which drops are below
 _RANGE_SHARE, _SHRUNK, _FEWER_RETURNS = 0.95, 0.6, 0.85
+# Of the sensor's beams, and how many of their returns must be sampled to judge them: the vehicle hides less.
+_LOWEST, _FEWEST_OF_LOWEST = 0.1, 50.0
 
 
 @dataclass(frozen=True)
@@ -73,22 +75,28 @@ def check_health(
     eye, points = np.array(eye_m, np.float64), read_only(points)
     step = next((step for step in _STEPS if len(points) <= step * _SAMPLE), len(points) // _SAMPLE | 1)
     # Beams of a higher sensor meet the ground farther away at the same elevation.
-    tans = -max(MODEL_HEIGHT_M + float(eye[2]), 0.1) / np.array(GROUND_M)
+    height_m = max(MODEL_HEIGHT_M + float(eye[2]), 0.1)
+    beams = np.tan(np.radians(sensor.elevations_deg))
+    lowest = beams[-max(2, math.ceil(_LOWEST * len(beams))) :]
+    tans = np.array([*(-height_m / np.array(GROUND_M)), lowest[0]])
     counts, ranges = np.empty((N_SECTORS, 4)), np.empty(256)
-    n_sampled = fill_sectors(points, eye, step, tans, counts, ranges)
+    n_sampled, n_low = fill_sectors(points, eye, step, tans, counts, ranges)
     if n_sampled == 0:
         return SensorHealth(), normal
     wedge = _WEDGE * min(1.0, _USUAL_POINTS / len(points))  # of as many points
     near, has_remission = _isolated(points, eye, sensor, wedge, (0, 0), None)
     n_near = int(near[:, 0].sum())
     range_m = float(np.cumsum(ranges).searchsorted(_RANGE_SHARE * n_sampled)) + 0.5
-    beams = np.tan(np.radians(sensor.elevations_deg))
     is_judged = np.array([(beams < tans[0]).sum(), ((beams >= tans[0]) & (beams < tans[1])).sum()]) >= 2
     blocked = np.logical_and(_blocked(counts, normal), is_judged)
     isolated = float(near[:, 1].sum()) / n_near if n_near >= _FEWEST_NEAR else 0.0
     known = bool(normal.ranges_m)
     has_drops, has_cloud = _has_drops(near, has_remission) if n_near >= _FEWEST_NEAR else (False, False)
+    n_expected = n_sampled * len(lowest) / len(beams)
+    are_judged = lowest[0] < tans[1] and height_m >= MIN_MOUNT_HEIGHT_M and n_expected > _FEWEST_OF_LOWEST
+    is_cut = are_judged and n_low <= _BLOCKED * n_expected
     health = SensorHealth(
+        beams_missing=_beams_missing(points[::step], eye, beams) if is_cut else 0,
         blocked=float(blocked.sum() / max(1, N_SECTORS * is_judged.sum())),
         blocked_deg=_arcs(np.asarray(blocked.any(axis=1))),
         isolated=isolated,
@@ -122,14 +130,24 @@ def without_drops(points: Points, sensor: SensorProfile, eye_m: ArrayLike = (0.0
 def findings_of(health: SensorHealth) -> tuple[tuple[str, str], ...]:
     """What to tell the user: kind and sentence of each sign."""
     found = []
+    if health.beams_missing:
+        found.append(
+            (
+                "beams",
+                f"The lowest {health.beams_missing} of the sensor's beams have no returns, though they point to the "
+                "ground near by: the scan is cut short or cropped, the vehicle hides them, the sensor is another "
+                "one, or the origin of the points is not at the sensor. What is nearer than the nearest returns is "
+                "missing in the results: read the whole scan, or pass the sensor's own profile and the mounting.",
+            )
+        )
     if health.blocked_deg:
         arcs = " and ".join(f"from {_side(right)} to {_side(left)}" for left, right in health.blocked_deg)
         found.append(
             (
                 "blocked",
                 f"The window of the sensor is blocked {arcs}: beams that point to the ground there return nothing, or "
-                "at most a tenth of what they should. Clean the window; if it is a part of the vehicle that hides the "
-                "view, results are missing there.",
+                "at most a tenth of what they should. Clean the window; if a part of the vehicle hides the view, or the "
+                "scan is not a whole turn, results are missing there.",
             )
         )
     if health.has_drops:
@@ -225,6 +243,15 @@ def _runs(marks: Mask) -> list[tuple[int, int]]:
     return [(int(first), int(min((ends - first) % len(marks)))) for first in firsts]
 
 
+def _beams_missing(points: Points, eye: Floats, beams: Floats) -> int:
+    """How many of the beams, by their tangents from the top, are below what is nearly the lowest point."""
+    xyz = points[np.isfinite(points[:, :3]).all(axis=1), :3] - eye
+    flat = np.hypot(xyz[:, 0], xyz[:, 1])
+    steep = xyz[flat > WINDOW_M, 2] / flat[flat > WINDOW_M]
+    seen = np.partition(steep, len(steep) // 200)[len(steep) // 200] if len(steep) else 0.0
+    return int(len(beams) - 1 - np.abs(beams - seen).argmin())
+
+
 def _arcs(marks: Mask) -> tuple[tuple[float, float], ...]:
     """Left and right edge of each run of sectors [deg], -180..180, left positive."""
     if not marks.any():
@@ -257,17 +284,21 @@ def _isolated(
 
 
 @njit(cache=True, nogil=True)
-def fill_sectors(points: Points, eye: Floats, step: int, tans: Floats, counts: Floats, ranges: Floats) -> int:
-    """Count every ``step``-th point by sector and band, and by range in meters; returns the number of them.
+def fill_sectors(
+    points: Points, eye: Floats, step: int, tans: Floats, counts: Floats, ranges: Floats
+) -> tuple[int, int]:
+    """Count every ``step``-th point by sector and band, and by range in meters; returns the number of them, and of
+    those on the lowest beams.
 
-    tans : tangents of the elevations below which beams are in the first, or else in the second band of three.
+    tans : tangents of the elevations below which beams are in the first, or else in the second band of three, and at
+        most at which they are the lowest.
     counts : (N_SECTORS, 4) sectors counter-clockwise from x; the last column is the sum of the bands.
     """
     for k in range(counts.shape[0]):
         counts[k, 0] = counts[k, 1] = counts[k, 2] = counts[k, 3] = 0.0
     for k in range(ranges.shape[0]):
         ranges[k] = 0.0
-    n, per_rad = 0, counts.shape[0] / (2.0 * math.pi)
+    n, n_low, per_rad = 0, 0, counts.shape[0] / (2.0 * math.pi)
     for i in range(0, points.shape[0], step):
         x, y, z = points[i, 0] - eye[0], points[i, 1] - eye[1], points[i, 2] - eye[2]
         flat = x * x + y * y
@@ -276,7 +307,9 @@ def fill_sectors(points: Points, eye: Floats, step: int, tans: Floats, counts: F
             continue
         n += 1
         ranges[int(min(r, ranges.shape[0] - 1.0))] += 1.0
-        steep = tans[1] * math.sqrt(flat)
+        flat = math.sqrt(flat)
+        n_low += z <= tans[2] * flat
+        steep = tans[1] * flat
         # tan(azimuth - 45 deg) in the first quadrant; the arc tangent is at most 0.22 deg off.
         ax, ay = abs(x), abs(y)
         v = (ay - ax) / (ay + ax) if ax + ay > 0.0 else 0.0
@@ -288,7 +321,7 @@ def fill_sectors(points: Points, eye: Floats, step: int, tans: Floats, counts: F
         sector = min(int(angle * per_rad), counts.shape[0] - 1)
         counts[sector, 2 if z >= steep else 0 if z * tans[1] > steep * tans[0] else 1] += 1.0
         counts[sector, 3] += 1.0
-    return n
+    return n, n_low
 
 
 @njit(cache=True, nogil=True)

@@ -156,5 +156,7 @@ class Mounting:
 # are, 68.1 in scans that were leveled one by one, and 71.4 in scans leveled but for this pitch.
 MODEL_HEIGHT_M = 1.73
 MODEL_MOUNTING = Mounting(MODEL_HEIGHT_M, 0.0, 0.66, 0.0)
+# An origin of the points that is lower is hardly at the beams, but on the road or at an axle.
+MIN_MOUNT_HEIGHT_M = 0.5
 
 UNKNOWN_MOUNTING = Mounting()

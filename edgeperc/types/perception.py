@@ -332,6 +332,8 @@ class SensorHealth:
         shrank, with returns that are isolated or missing.
     n_drops : int
         Points that were left out as drops; 0 without ``has_drops``. They are labeled 0, and not in view.
+    beams_missing : int
+        The lowest beams of the sensor's profile, if they should show the ground and none of them returns anything.
     findings : tuple of str
         One sentence for each sign: what came, what was expected, and what to do.
     """
@@ -346,6 +348,7 @@ class SensorHealth:
     has_cloud: bool = False
     has_fog: bool = False
     n_drops: int = 0
+    beams_missing: int = 0
     findings: tuple[str, ...] = ()
 
     def to_dict(self) -> dict[str, Any]:

@@ -89,12 +89,12 @@ def test_crowds_and_lonely_points_are_told_apart(seed: int, most: int) -> None:
 @settings(max_examples=120, deadline=None)
 @given(scans, st.sampled_from(EYES), st.sampled_from([1, 3]))
 def test_sectors_are_those_of_the_slow_twin(points: Points, eye: tuple[float, float, float], step: int) -> None:
-    counts, ranges, tans = np.empty((72, 4)), np.empty(256), np.array([-0.3, -0.1])
+    counts, ranges, tans = np.empty((72, 4)), np.empty(256), np.array([-0.3, -0.1, -0.35])
     given_points = points.copy()
     given_points.flags.writeable = False
     n = fill_sectors(given_points, np.array(eye), step, tans, counts, ranges)
-    wanted, wanted_ranges, wanted_n = twins.health.sectors(points, np.array(eye), step, tans)
-    assert n == wanted_n
+    wanted, wanted_ranges, *wanted_n = twins.health.sectors(points, np.array(eye), step, tans)
+    assert n == tuple(wanted_n)
     np.testing.assert_array_equal(ranges, wanted_ranges)
     # The kernel's arc tangent is up to 0.22 deg off: a point at an edge may count beside it.
     np.testing.assert_array_equal(counts[:, :3].sum(axis=1), counts[:, 3])
@@ -198,6 +198,29 @@ def test_a_scan_cropped_to_a_view_is_not_blocked(half_deg: float) -> None:
     ahead = scan[np.abs(np.degrees(np.arctan2(scan[:, 1], scan[:, 0]))) < half_deg]
     assert check_health(ahead, HDL, Normal())[0].findings == ()
     assert check_health(ahead, HDL, usual())[0].blocked_deg == ()
+
+
+@pytest.mark.parametrize("share", [0.3, 0.6, 0.85])
+@pytest.mark.parametrize("sensor", ["hdl-64e", "vlp-16", "os1-64", "hdl-32e", "pandar64"])
+def test_a_scan_without_its_lowest_beams_is_a_part_of_one(sensor: str, share: float) -> None:
+    scan, profile = clear(3, sensor), get_sensor(sensor)
+    elevations = np.array(profile.elevations_deg)
+    first = min(round(share * len(elevations)), len(elevations) - 2)  # a file of beams from the top that is cut
+    lowest = (elevations[first - 1] + elevations[first]) / 2.0
+    steep = np.degrees(np.arctan2(scan[:, 2], np.hypot(scan[:, 0], scan[:, 1])))
+    health, _ = check_health(scan[steep > lowest], profile, usual(sensor))
+    assert abs(health.beams_missing - (len(elevations) - first)) <= 1
+    assert f"lowest {health.beams_missing} of the sensor's beams" in health.findings[0]
+    assert "cut short" in health.findings[0]
+    assert check_health(scan, profile, Normal())[0].beams_missing == 0
+
+
+@pytest.mark.parametrize("height_m", [0.0, 0.3])
+def test_beams_are_not_missing_where_the_origin_is_not_at_the_sensor(height_m: float) -> None:
+    scan = clear(3)
+    raised = scan + np.array([0.0, 0.0, 1.73 - height_m, 0.0], np.float32)
+    frame = ModelFrame(Mounting(height_m, 0.0, 0.0, 0.0))
+    assert check_health(frame.move(raised), HDL, Normal(), frame.eye)[0].beams_missing == 0
 
 
 WEATHER: dict[str, Callable[[Points], Points]] = {

@@ -7,9 +7,9 @@ import math
 import numpy as np
 
 
-def sectors(points: np.ndarray, eye: np.ndarray, step: int, tans: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:
-    """Twin of `health.fill_sectors`, with the true arc tangent: counts (72, 4), ranges (256,) and the number."""
-    counts, ranges, n = np.zeros((72, 4)), np.zeros(256), 0
+def sectors(points: np.ndarray, eye: np.ndarray, step: int, tans: np.ndarray) -> tuple[np.ndarray, np.ndarray, int, int]:
+    """Twin of `health.fill_sectors`, with the true arc tangent: counts (72, 4), ranges (256,) and the numbers."""
+    counts, ranges, n, n_low = np.zeros((72, 4)), np.zeros(256), 0, 0
     for point in points[::step].astype(np.float64):
         x, y, z = point[:3] - eye
         r = math.sqrt(x * x + y * y + z * z) if np.isfinite([x, y, z]).all() else math.nan
@@ -19,10 +19,11 @@ def sectors(points: np.ndarray, eye: np.ndarray, step: int, tans: np.ndarray) ->
         ranges[int(min(r, 255.0))] += 1
         tan = z / math.hypot(x, y) if math.hypot(x, y) > 0.0 else math.copysign(math.inf, z)
         band = 0 if tan < tans[0] else 1 if tan < tans[1] else 2
+        n_low += z <= tans[2] * math.hypot(x, y)
         sector = min(int((math.atan2(y, x) % (2.0 * math.pi)) * 72 / (2.0 * math.pi)), 71)
         counts[sector, band] += 1
         counts[sector, 3] += 1
-    return counts, ranges, n
+    return counts, ranges, n, n_low
 
 
 def isolated(
