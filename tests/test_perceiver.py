@@ -11,6 +11,7 @@ import threading
 import time
 import warnings
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -451,9 +452,14 @@ FAULTS = {
 @pytest.mark.parametrize("fault", FAULTS)
 def test_a_warning_or_an_error_names_the_fault(scan: SimulatedScan, fault: str) -> None:
     perceive = Perceiver("pointseg", provider="cpu", on_mismatch="warn")
-    with pytest.warns(UserWarning, match=FAULTS[fault]) as caught:
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
         answer = perceive(faulty(scan.points, fault))
-    assert answer.fitness == tuple(str(w.message) for w in caught)
+    assert answer.health is not None
+    told = [str(w.message) for w in caught]
+    assert told == [*answer.fitness, *answer.health.findings]
+    assert re.search(FAULTS[fault], " ".join(answer.fitness))
+    assert bool(answer.health.beams_missing) == (fault == "upside down")
     with pytest.raises(FitnessError, match=FAULTS[fault]):
         Perceiver("pointseg", provider="cpu", on_mismatch="raise")(faulty(scan.points, fault))
 
@@ -474,7 +480,10 @@ def test_gross_differences_are_refused_before_a_network_runs(
 
 def test_other_differences_are_warned_of(scan: SimulatedScan) -> None:
     raised = scan.points + np.float32([0, 0, 1.0, 0])
-    with pytest.warns(UserWarning, match=r"The ground lies at z = -0\.7 m"):
+    with (
+        pytest.warns(UserWarning, match=r"The ground lies at z = -0\.7 m"),
+        pytest.warns(UserWarning, match="origin of the points is not at the sensor"),
+    ):
         assert Perceiver("pointseg", mounting=MODEL_MOUNTING, provider="cpu")(raised).fitness
     with pytest.raises(FitnessError, match=r"The ground lies at z = -0\.7 m"):
         Perceiver("pointseg", mounting=MODEL_MOUNTING, provider="cpu", on_mismatch="raise")(raised)
@@ -488,7 +497,10 @@ def test_the_scans_of_another_vehicle_are_checked_as_the_first(
     perceive = Perceiver("pointseg", provider="cpu", on_mismatch=on_mismatch)
     for _ in range(5):
         assert perceive(scan.points).fitness == ()
-    assert perceive(faulty(scan.points, fault)).fitness == ()  # not checked any more
+    lowest = "The lowest 48 of the sensor's beams have no returns"
+    is_told = fault == "upside down" and on_mismatch == "refuse"
+    with pytest.warns(UserWarning, match=lowest) if is_told else nullcontext():
+        assert perceive(faulty(scan.points, fault)).fitness == ()  # not checked any more
     perceive.reset_mounting()
     if on_mismatch == "ignore":
         assert perceive(faulty(scan.points, fault)).fitness == ()

@@ -1,10 +1,10 @@
 """What the window of a sensor and the weather do to its scans: blocked sectors, drops in the air, a range that shrank.
 
 Three signs are measured in each scan. Beams that point down must meet the ground: a sector without their returns is
-blocked, and a scan without those of the lowest ones is a part of one. Rain, snow, dust and spray show as near points without a neighbor (the dynamic radius of Charron, Phillips and
-Waslander, "De-noising of Lidar Point Clouds Corrupted by Snowfall", 2018). Fog takes far returns away, while walls near
-by, which shorten the range too, add returns. The first scans of a perceiver show what is normal; what is judged of a
-later one depends on these and on itself.
+blocked, and a scan without those of the lowest ones is a part of one. Rain, snow, dust and spray show as near points
+without a neighbor (the dynamic radius of Charron, Phillips and Waslander, "De-noising of Lidar Point Clouds Corrupted
+by Snowfall", 2018). Fog takes far returns away, while walls near by, which shorten the range too, add returns. The
+first scans of a perceiver show what is normal; what is judged of a later one depends on these and on itself.
 """
 
 from __future__ import annotations
@@ -146,8 +146,8 @@ def findings_of(health: SensorHealth) -> tuple[tuple[str, str], ...]:
             (
                 "blocked",
                 f"The window of the sensor is blocked {arcs}: beams that point to the ground there return nothing, or "
-                "at most a tenth of what they should. Clean the window; if a part of the vehicle hides the view, or the "
-                "scan is not a whole turn, results are missing there.",
+                "at most a tenth of what they should. Clean the window; if a part of the vehicle hides the view, or "
+                "the scan is not a whole turn, results are missing there.",
             )
         )
     if health.has_drops:

@@ -7,7 +7,9 @@ import math
 import numpy as np
 
 
-def sectors(points: np.ndarray, eye: np.ndarray, step: int, tans: np.ndarray) -> tuple[np.ndarray, np.ndarray, int, int]:
+def sectors(
+    points: np.ndarray, eye: np.ndarray, step: int, tans: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, int, int]:
     """Twin of `health.fill_sectors`, with the true arc tangent: counts (72, 4), ranges (256,) and the numbers."""
     counts, ranges, n, n_low = np.zeros((72, 4)), np.zeros(256), 0, 0
     for point in points[::step].astype(np.float64):
