@@ -27,11 +27,17 @@ _DELICATE = ("llvmlite.", "numba.core.serialize", "importlib._bootstrap", "edgep
 
 
 class Parser(argparse.ArgumentParser):
-    """A parser whose errors name the nearest option, command or choice, and may quote any argument from elsewhere."""
+    """A parser that takes its last list of paths before, between and after options, and whose errors are two lines,
+    name the nearest option, command or choice, and may quote any argument from elsewhere.
+    """
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> tuple[Any, list[str]]:
-        """Parse; an unknown option of a command is that command's error, with its usage."""
+        """Parse; an unknown option of a command is that command's error."""
         known, unknown = super().parse_known_args(args, namespace)
+        lists = [a for a in self._get_positional_actions() if a.nargs in ("+", "*")]
+        if lists and all(Path(argument).exists() for argument in unknown):
+            setattr(known, lists[-1].dest, [*getattr(known, lists[-1].dest), *self._get_values(lists[-1], unknown)])
+            unknown = []
         if unknown:
             options = [argument.partition("=")[0] for argument in unknown if argument.startswith("--")]
             close = "".join(nearest(option, self._option_string_actions) for option in options)
@@ -47,8 +53,8 @@ class Parser(argparse.ArgumentParser):
             ) from exc
 
     def error(self, message: str) -> NoReturn:
-        """Print the usage and the message, and exit with code 2."""
-        super().error(printable(message))
+        """Print the message and where the usage stands, and exit with code 2."""
+        self.exit(2, f"{self.prog}: error: {printable(message)}\nSee {self.prog} --help\n")
 
 
 class _TerminatedError(SystemExit):

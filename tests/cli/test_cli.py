@@ -121,6 +121,15 @@ def usage_code(*arguments: object) -> int:
     return left.value.code
 
 
+def test_scans_may_stand_between_and_after_options(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    first, second = write_scan(tmp_path / "a.bin"), write_scan(tmp_path / "b.bin")
+    assert run("run", first, "--json", second, "--threads", 1) == 0
+    assert len(capsys.readouterr().out.splitlines()) == 2
+    assert usage_code("run", first, "--json", tmp_path / "c.bin") == 2
+    error = f"edgeperc run: error: unrecognized arguments: {tmp_path / 'c.bin'}"
+    assert capsys.readouterr().err.splitlines() == [error, "See edgeperc run --help"]
+
+
 def test_version_and_usage(capsys: pytest.CaptureFixture[str]) -> None:
     assert usage_code("--version") == 0
     assert capsys.readouterr().out == f"edgeperc {__version__}\n"
