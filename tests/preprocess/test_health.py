@@ -208,7 +208,7 @@ def test_a_scan_without_its_lowest_beams_is_a_part_of_one(sensor: str, share: fl
     first = min(round(share * len(elevations)), len(elevations) - 2)  # a file of beams from the top that is cut
     lowest = (elevations[first - 1] + elevations[first]) / 2.0
     steep = np.degrees(np.arctan2(scan[:, 2], np.hypot(scan[:, 0], scan[:, 1])))
-    health, _ = check_health(scan[steep > lowest], profile, usual(sensor))
+    health, _ = check_health(scan[steep > lowest], profile, Normal())
     assert abs(health.beams_missing - (len(elevations) - first)) <= 1
     assert f"lowest {health.beams_missing} of the sensor's beams" in health.findings[0]
     assert "cut short" in health.findings[0]
