@@ -795,6 +795,24 @@ def test_a_scan_that_does_not_tell_the_sensor_is_refused_and_the_next_one_may() 
     assert finds.sensor is get_sensor("hdl-64e")
 
 
+def test_a_dense_scan_about_the_vehicle_is_perceived_and_the_doubt_is_told() -> None:
+    """Two sensors, moved to one time: no beams."""
+    ahead = np.array([1.4, 0.3, -0.2, 0.0], np.float32)
+    scan = np.concatenate([urban(8, "os1-64").points, urban(8, "os1-64").points + ahead])
+    finds = Perceiver(sensor="auto", provider="cpu")
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        answer = finds(scan)
+    assert sum("no beams stand out" in str(w.message) for w in caught) == 1
+    assert finds.sensor.name == "beamless"
+    named = Perceiver(sensor=replace(get_sensor("os1-64"), remission_range=(0.0, 1.0)), on_mismatch="ignore")(scan)
+    assert answer.points is not None
+    assert named.points is not None
+    assert np.mean(answer.points.labels == named.points.labels) > 0.97
+    with pytest.raises(SensorError, match="no beams stand out"):
+        Perceiver(sensor="auto", provider="cpu", on_mismatch="raise")(scan)
+
+
 def test_a_refused_scan_does_not_settle_the_sensor() -> None:
     finds = Perceiver("pointseg", sensor="auto", provider="cpu")
     scan = urban(8, "vlp-16").points

@@ -169,21 +169,26 @@ def find_sensor(paths: Iterable[Path], arguments: argparse.Namespace) -> SensorE
             break
     if not scans:
         return None
-    try:
-        return estimate_sensor(scans[:MOST_SCANS])
-    except SensorError:  # one of them may not tell
-        found = []
-        for scan in scans[:MOST_SCANS]:
-            with suppress(SensorError):
-                found.append(estimate_sensor([scan]))
-        names = sorted({each.profile.name for each in found})
-        if len(names) > 1:
-            raise SensorError(
-                f"the first scans are of several sensors: {', '.join(names)}; read those of each on their own"
-            ) from None
-        if not names:
-            raise
-        return found[0]
+    scans = scans[:MOST_SCANS]
+    found: list[SensorEstimate] = []
+    unknown: list[SensorError] = []
+    # One of them may not tell, and hide what the others tell.
+    for some in (scans, *([scan] for scan in scans if len(scans) > 1)):
+        try:
+            found.append(estimate_sensor(some))
+        except SensorError as exc:
+            unknown.append(exc)
+        if some is scans and found and not found[0].doubt:
+            return found[0]
+    sure = [each for each in found if not each.doubt]
+    names = sorted({each.profile.name for each in sure})
+    if len(names) > 1:
+        raise SensorError(
+            f"the first scans are of several sensors: {', '.join(names)}; read those of each on their own"
+        )
+    if not found:
+        raise unknown[0]
+    return (sure or found)[0]
 
 
 def scan_sensor(
@@ -218,6 +223,8 @@ def scan_sensor(
             raise unnamed or SensorError("the sensor cannot be told: no scan has enough points; pass --sensor NAME")
         if found is None:  # so few points are refused, or warned of, when they are perceived
             return with_mounting(DEFAULT_SENSOR, arguments), "the default: too few points to tell"
+        if found.doubt:
+            warnings.warn(f"{path}: {found.doubt}", stacklevel=2)
         return with_mounting(found.profile, arguments), str(found)
     given = get_sensor(arguments.sensor)
     try:

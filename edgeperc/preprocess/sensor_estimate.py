@@ -70,6 +70,10 @@ _HDL_64E_PARTED_DEG, _HDL_64E_DEG, _HDL_64E_OFF_DEG = -8.3, (2.0, -24.8), 1.6
 _COLUMNS_OFF = 0.25  # another rate of turning
 _DENSEST, _LEAST_STEP_DEG = 8, 0.02  # beams whose azimuths are looked at; two returns of one ray are nearer
 
+# Points without beams: how many a degree are dense, and the beams of a profile for them.
+_DENSE, _BEAMLESS_COLUMNS, _BEAMLESS_LOW_DEG = 100, 1800, -10.0
+_BEAMLESS_DEG: Floats = np.linspace(15.0, -25.0, 65)
+
 _SECTOR_DEG = 5
 _OUTSIDE, _LEAST_SEEN = 0.002, 0.6  # share of points outside of a field of view; of its width that has points
 _FEWEST_SECTORS = 54  # of 72, of a sensor that is not known
@@ -125,8 +129,11 @@ class SensorEstimate:
     columns: int  # steps in a turn
     nearest_m: float  # range below which one point in a thousand lies
     blind_deg: tuple[tuple[float, float], ...]  # sectors of azimuth without a point, of at least 10 degrees
+    doubt: str = ""  # why the beams cannot be told, and what is assumed; the profile is then one for dense scans
 
     def __str__(self) -> str:
+        if self.doubt:
+            return "no beams found in the points"
         up, down = self.profile.fov_up_deg, self.profile.fov_down_deg
         what = f"{self.n_beams} beams from {up:.1f} to {down:.1f} deg, {self.columns} columns, found in the points"
         if self.is_built_in:
@@ -143,9 +150,10 @@ def estimate_sensor(scans: Sequence[Points]) -> SensorEstimate:
 
     scans : (n, 4) float32 each, of one sensor; x, y, z [m] about it, z along its axis, raw remission. The first three
         are used. Points need no order, but if they have that of their time, the motion of the sensor is found too.
-    Returns: The built-in profile whose beams the scans have; otherwise one of their own beams.
-    Raises SensorError: The points do not tell: too few, not about the sensor, of several sensors, without beams
-        (solid-state sensors, scans thinned to voxels), or a part of a turn of a sensor that is not built in.
+    Returns: The built-in profile whose beams the scans have; otherwise one of their own beams; or one for points
+        without beams (`_beamless`), with the ``doubt``, which a caller tells.
+    Raises SensorError: The points do not tell: too few, or without beams (solid-state sensors, scans thinned to voxels)
+        and sparse, or a part of a turn of a sensor that is not built in.
     """
     clean = [scan[np.isfinite(scan).all(axis=1)] for scan in scans[:MOST_SCANS]]
     polar = [_polar(scan) for scan in clean]
@@ -164,11 +172,8 @@ def estimate_sensor(scans: Sequence[Points]) -> SensorEstimate:
         mistake = check_coordinates(max(clean, key=len))
         if mistake is not None:
             raise SensorError(f"the sensor cannot be told from the scan. {mistake}")
-        raise _unknown(
-            f"no beams stand out in its {n_points:,} points: {len(beams.slopes)} explain {max(on_beams, 0.0):.0%} of "
-            f"them. {_patterns_of(polar)}Points of several sensors, about another place than the sensor or along other "
-            "axes, and thinned ones have no beams"
-        )
+        explained = f"{len(beams.slopes)} explain {max(on_beams, 0.0):.0%} of them"
+        return _beamless(polar, _remission_range(np.concatenate([scan[:, 3] for scan in clean])), explained)
     if match.part_of:
         raise _unknown(
             f"it has {len(beams.slopes)} of the {SENSORS[match.part_of].n_beams} beams of the {match.part_of}: a part "
@@ -202,6 +207,44 @@ def estimate_sensor(scans: Sequence[Points]) -> SensorEstimate:
     )
 
 
+def _beamless(polar: Sequence[Polar], remission_range: tuple[float, float] | None, explained: str) -> SensorEstimate:
+    """A profile for whole turns without beams that are so dense that it hardly counts where the beams are (measured in
+    docs/howto/sensor.md). Raises SensorError for parts of a turn and sparse scans.
+    """
+    largest = max(polar, key=lambda each: len(each.flat))
+    blind = _blind(largest.azimuth)
+    covered = 360.0 - sum(end - start for start, end in blind)
+    without = (
+        "Points of several sensors, about another place than the sensor or along other axes, moved to one time, and "
+        "thinned ones have no beams"
+    )
+    fitting = _fitting_patterns(polar)
+    explained = f"no beams stand out in its {len(largest.flat):,} points: {explained}"
+    if covered < _FEWEST_SECTORS * _SECTOR_DEG or len(largest.flat) < _DENSE * covered:
+        which = f", by the field of view {fitting}" if fitting else ""
+        raise _unknown(
+            f"{explained}. They may be of a solid-state or non-repeating sensor{which}. {SAY_PATTERN}. {without}"
+        )
+    low_deg = math.degrees(math.atan(float(np.quantile(largest.z / largest.flat, _OUTSIDE))))
+    beams = _BEAMLESS_DEG[min(low_deg, _BEAMLESS_LOW_DEG) <= _BEAMLESS_DEG]
+    profile = SensorProfile("beamless", tuple(beams.tolist()), _BEAMLESS_COLUMNS, remission_range or (0.0, 1.0))
+    ranges = np.hypot(largest.flat, largest.z)
+    return SensorEstimate(
+        profile=profile,
+        is_built_in=False,
+        offsets_m=(),
+        n_beams=0,
+        off_deg=0.0,
+        on_beams=0.0,
+        columns=_BEAMLESS_COLUMNS,
+        nearest_m=round(float(np.quantile(ranges, 0.001)), 2),
+        blind_deg=blind,
+        doubt=f"The sensor cannot be told from the scan: {explained}. {without}. It is taken as a dense sensor that "
+        f"spins, with remission from 0 to {profile.remission_range[1]:g}. If you know the sensor"
+        f"{f', by the field of view perhaps {fitting}' if fitting else ''}, {_ADVICE}.",
+    )
+
+
 def _least_on_beams(match: Match) -> float:
     return _ON_MOVED if match.name == "hdl-64e" else _ON_KNOWN if match.name else _ON_BEAM
 
@@ -215,20 +258,18 @@ def _in_feet(polar: Sequence[Polar]) -> str:
     return match.name if is_found and farthest > BEYOND * SENSORS[match.name].max_range_m else ""
 
 
-def _patterns_of(polar: Sequence[Polar]) -> str:
-    """What to say of points without beams: which sensors that do not spin have such a field of view."""
+def _fitting_patterns(polar: Sequence[Polar]) -> str:
+    """Which sensors that do not spin have such a field of view."""
     elevation = np.degrees(np.concatenate([np.arctan2(each.z, each.flat) for each in polar]))
     low, high = np.quantile(elevation, (_OUTSIDE, 1.0 - _OUTSIDE))
     seen_deg = 360.0 - sum(end - start for start, end in _blind(np.concatenate([each.azimuth for each in polar])))
-    fitting = [
+    return " or ".join(
         name
         for name, profile in SENSORS.items()
         if profile.pattern is not None
         and _LEAST_SEEN * profile.pattern.width_deg <= seen_deg <= profile.pattern.width_deg + 2.0 * _SECTOR_DEG
         and any(bottom - 1.0 <= low and high <= top + 1.0 for bottom, top in _both_ways(profile))
-    ]
-    which = f", by the field of view {' or '.join(fitting)}" if fitting else ""
-    return f"They may be of a solid-state or non-repeating sensor{which}. {SAY_PATTERN}. "
+    )
 
 
 def _both_ways(profile: SensorProfile) -> tuple[tuple[float, float], ...]:
