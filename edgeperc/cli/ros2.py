@@ -6,6 +6,8 @@ import argparse
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
+from ..errors import SensorError
+from ..types.choices import AUTO_SENSOR
 from .arguments import Commands, add_command, add_mounting, add_networks, options, positive, positive_number
 from .output import many, print_error, print_line
 from .run import make_perceiver
@@ -129,7 +131,15 @@ def ros2_command(arguments: argparse.Namespace) -> int:
 
             if perceiver is not None:
                 return perceiver
-            known = of_cloud(cloud)
+            try:
+                known = of_cloud(cloud)
+            except SensorError as unnamed:
+                try:
+                    found = _perceiver(arguments, AUTO_SENSOR)
+                except SensorError:
+                    raise unnamed from None
+                print_line("the clouds do not name their sensor: it is found in the points")
+                return found
             print_line(f"{known.profile.name}, by {known.because}")
             return _perceiver(arguments, known.profile)
 

@@ -24,7 +24,7 @@ pytest.importorskip("rosbags")
 
 from ros2_helpers import MESSAGES, Perceive, cloud, odometry, scans
 
-from edgeperc import MissingExtraError, OptionError, Perceiver, Tracker
+from edgeperc import MissingExtraError, OptionError, Perceiver, SensorError, Tracker
 from edgeperc.cli.main import main
 from edgeperc.records import PerceivedScan
 from edgeperc.road.grid import split_points
@@ -34,6 +34,7 @@ from edgeperc.ros2.odometry import ODOMETRY, Rolling
 from edgeperc.ros2.rclpy_graph import RclpyGraph
 from edgeperc.ros2.zenoh_graph import CONFIG_VARIABLE, ZenohGraph, attachment, type_key
 from edgeperc.types.sensor import get_sensor
+from scenes import urban
 from waiting import TIMEOUT_S, until
 
 TESTS = Path(__file__).resolve().parent.parent
@@ -517,6 +518,28 @@ def test_parameters_make_the_grid_with_memory(bus: Bus, monkeypatch: pytest.Monk
     assert isinstance(rolling, Rolling)
     assert (rolling.topic, rolling.sensor_pose) == ("/odometry/filtered", [1.0, 0.0, 1.5, 0.0, 0.0, 90.0])
     assert rolling.grid.values().shape == (100, 100)
+
+
+@pytest.mark.filterwarnings("ignore::UserWarning")
+def test_clouds_that_do_not_name_their_sensor_show_it(
+    bus: Bus, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    made: list[Callable[[dict[str, Any]], Perceiver]] = []
+
+    def node(_: Any, perceiver_for: Callable[[dict[str, Any]], Perceiver], **options: Any) -> Any:
+        made.append(perceiver_for)
+        raise OptionError("no node")
+
+    monkeypatch.setattr("edgeperc.ros2.node.PerceptionNode", node)
+    for words in ([], ["--mount-height", "1.7"]):
+        assert main(["ros2", *words, "--rclpy"]) == 2
+    cloud = {"topic": "/points", "frame": "lidar", "fields": ["x", "y", "z", "intensity"], "elevations_deg": []}
+    perceive = made[0](cloud)
+    assert "found in the points" in capsys.readouterr().out
+    perceive(urban(3, "vlp-32c").points)
+    assert perceive.sensor.name == "vlp-32c"
+    with pytest.raises(SensorError, match="do not name their sensor"):  # the mounting is a part of the profile
+        made[1](cloud)
 
 
 def test_the_grid_with_memory_over_zenoh(router: str, watch: Watch) -> None:
