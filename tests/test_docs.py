@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from string import Template
 
+import numpy as np
 import pytest
 
 from checkout import REPOSITORY, files
@@ -73,6 +74,8 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
         seed = 4 + len(name)
         (folder / name).parent.mkdir(exist_ok=True)
         urban(seed).points.tofile(folder / name)
+    # What a page's Python writes is there for its commands, which may run in another process.
+    np.save(folder / "utm.npy", urban(12).points + np.array([512345.25, 5412345.5, 113.0, 0.0]))
     (folder / "calib.txt").write_text(
         "P2: 831 0 480 0 0 831 360 0 0 0 1 0\nR0_rect: 1 0 0 0 1 0 0 0 1\n"
         "Tr_velo_to_cam: 0 -1 0 0 0 0 -1 -0.08 1 0 0 -0.27\n"
