@@ -548,6 +548,28 @@ def test_a_profile_of_other_beams_is_warned_of(
     assert ("it is read as" in capsys.readouterr().err) == is_warned
 
 
+@pytest.mark.parametrize(
+    ("on_mismatch", "code", "said"),
+    [
+        ("refuse", 0, "warning: {}: The sensor cannot be told"),
+        ("raise", 1, "The sensor cannot be told"),
+        ("ignore", 0, ""),
+    ],
+)
+@pytest.mark.filterwarnings("always::UserWarning")
+def test_dense_files_without_beams_are_read_with_a_warning(
+    on_mismatch: str, code: int, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Of two sensors at once, about one of them."""
+    points = urban(8, "os1-64").points
+    path = tmp_path / "a.bin"
+    np.concatenate([points, points + np.array([1.4, 0.3, -0.2, 0.0], np.float32)]).tofile(path)
+    assert run("run", path, "--on-mismatch", on_mismatch) == code
+    error = capsys.readouterr().err
+    assert said.format(path) in error
+    assert error.count("no beams stand out") == bool(said)
+
+
 @pytest.mark.parametrize("sensors", [("hdl-64e", "vlp-16"), ("pandar64", "os1-64", "os1-64"), ("vlp-16", "vlp-32c")])
 def test_a_folder_of_several_sensors_is_said_to_be_one(
     sensors: Sequence[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
