@@ -570,14 +570,15 @@ def _triton(args: argparse.Namespace) -> int:
 
 
 def _add_models(command: Command) -> None:
-    add = options(command("models", "write MODELS.md from the cards of a folder's models", _models))
+    add = options(command("models", "write MODELS.md from the cards of a folder's models, and SHA256SUMS", _models))
     add("folder", "folder of .onnx models", type=Path)
 
 
 def _models(args: argparse.Namespace) -> int:
-    from .release.models_page import models_page
+    from .release.models_page import models_page, sums_of
 
     (args.folder / "MODELS.md").write_text(models_page(args.folder))
+    (args.folder / "SHA256SUMS").write_text(sums_of(args.folder))
     return 0
 
 

@@ -301,10 +301,10 @@ def _models() -> Iterator[Finding]:
     from ..types.card import ModelCard
 
     folder = resources.files("edgeperc.zoo")
-    page = folder / "MODELS.md"
-    listed = page.read_text("utf-8") if page.is_file() else ""
+    sums = folder / "SHA256SUMS"
+    listed = sums.read_text("utf-8").split() if sums.is_file() else []
     if not listed:
-        yield Finding("MODELS.md", "note", "missing, so that the models' hashes are not compared", _REINSTALL)
+        yield Finding("SHA256SUMS", "note", "missing, so that the models' hashes are not compared", _REINSTALL)
     names = set()
     for entry in sorted(folder.iterdir(), key=lambda entry: entry.name):
         if not entry.name.endswith(".onnx"):
@@ -318,10 +318,10 @@ def _models() -> Iterator[Finding]:
         sha256 = hashlib.sha256(path.read_bytes()).hexdigest()
         names.add(card.name)
         if listed and sha256 not in listed:
-            other = f"SHA-256 {sha256} is not in MODELS.md, so it is not the file of this release"
+            other = f"SHA-256 {sha256} is not in SHA256SUMS, so it is not the file of this release"
             yield Finding(f"model {path.name}", "broken", other, _REINSTALL)
         else:
-            checked = "as in MODELS.md" if listed else "not compared"
+            checked = "as in SHA256SUMS" if listed else "not compared"
             yield Finding(f"model {path.name}", "ok", f"{card.name} {card.version}, SHA-256 {sha256[:16]}... {checked}")
     for name in DEFAULT_MODELS:
         if name not in names:

@@ -1,7 +1,8 @@
-"""Writes models/MODELS.md from the cards, and from validation.json, ablation.json and folds.json beside them."""
+"""Writes models/MODELS.md and SHA256SUMS from the cards, and from validation.json, ablation.json and folds.json."""
 
 from __future__ import annotations
 
+import hashlib
 import json
 import textwrap
 from collections.abc import Iterable, Mapping, Sequence
@@ -27,6 +28,12 @@ TASKS = {
 }
 SOURCES = {"real": "real", "semantickitti": "SemanticKITTI", "simulated": "simulated"}
 ALL_RANGES = ("all",)
+
+
+def sums_of(folder: Path) -> str:
+    """The SHA-256 of each model of a folder, as ``sha256sum --check`` reads them."""
+    paths = sorted(folder.glob("*.onnx"))
+    return "".join(f"{hashlib.sha256(path.read_bytes()).hexdigest()}  {path.name}\n" for path in paths)
 
 
 def models_page(folder: Path) -> str:

@@ -56,7 +56,7 @@ def test_an_installation_that_works(capsys: pytest.CaptureFixture[str], monkeypa
     assert "cpu" in found["providers"]["found"]
     assert found["telemetry"]["state"] == "ok"
     for name in zoo.DEFAULT:
-        assert found[f"model {name}.onnx"]["found"].endswith("as in MODELS.md")
+        assert found[f"model {name}.onnx"]["found"].endswith("as in SHA256SUMS")
         assert name in found[f"runs {name}"]["found"]
     assert run("doctor") == 0
     lines = capsys.readouterr().out.splitlines()
@@ -188,7 +188,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     folder = tmp_path / "zoo"
     folder.mkdir()
     source = Path(zoo.__file__).parent
-    for file in (*source.glob("*.onnx"), source / "MODELS.md"):
+    for file in (*source.glob("*.onnx"), source / "SHA256SUMS"):
         shutil.copy(file, folder)
     monkeypatch.setattr(doctor.resources, "files", lambda package: folder)
     return folder
@@ -210,10 +210,10 @@ def test_damaged_and_missing_models(folder: Path, capsys: pytest.CaptureFixture[
     assert "pip install" in found["model pointseg.onnx"]["advice"]
 
 
-def test_without_the_page_hashes_are_not_compared(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (folder / "MODELS.md").unlink()
+def test_without_the_sums_hashes_are_not_compared(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (folder / "SHA256SUMS").unlink()
     _, found = report(capsys)
-    assert found["MODELS.md"]["state"] == "note"
+    assert found["SHA256SUMS"]["state"] == "note"
     assert found["model lodnn.onnx"]["found"].endswith("not compared")
 
 

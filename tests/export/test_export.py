@@ -47,7 +47,7 @@ from edgeperc_export.data.simulate import parity_samples, simulate
 from edgeperc_export.networks import build
 from edgeperc_export.recipe import MODELS, PAPER, SCAN_NETWORKS, TASKS, Recipe, Stage
 from edgeperc_export.release import to_onnx
-from edgeperc_export.release.models_page import models_page
+from edgeperc_export.release.models_page import models_page, sums_of
 from edgeperc_export.release.to_onnx import ParityError, export, halve, load, terms_of, to_graph, verify, write_card
 from edgeperc_export.training.ablation import PAPERS, SHIPPED, VARIANTS, plot
 from edgeperc_export.training.curve import curve_table
@@ -1032,6 +1032,7 @@ def test_large_weights_are_stored_in_half_precision_and_what_it_holds_loses_noth
 def test_the_models_page_matches_the_cards() -> None:
     folder = REPOSITORY / "models"
     assert (folder / "MODELS.md").read_text() == models_page(folder), "run: edgeperc-export models models"
+    assert (folder / "SHA256SUMS").read_text() == sums_of(folder), "run: edgeperc-export models models"
 
 
 def test_parity_scans_are_no_training_scans(monkeypatch: pytest.MonkeyPatch) -> None:
