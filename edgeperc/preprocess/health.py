@@ -135,9 +135,10 @@ def findings_of(health: SensorHealth) -> tuple[tuple[str, str], ...]:
             (
                 "beams",
                 f"The lowest {health.beams_missing} of the sensor's beams have no returns, though they point to the "
-                "ground near by: the scan is cut short or cropped, the vehicle hides them, the sensor is another "
-                "one, or the origin of the points is not at the sensor. What is nearer than the nearest returns is "
-                "missing in the results: read the whole scan, or pass the sensor's own profile and the mounting.",
+                "ground near by: the scan is cut short or cropped, its ground was taken out, the vehicle hides them, "
+                "the sensor is another one, or the origin of the points is not at the sensor. What is nearer than the "
+                "nearest returns is missing in the results: read the whole scan, or pass the sensor's own profile and "
+                "the mounting.",
             )
         )
     if health.blocked_deg:
