@@ -289,12 +289,15 @@ def _of_one(sensor: SensorProfile, scans: Iterator[Points]) -> dict[str, Any]:
     counts, off_deg = {"right": 0, "cannot_tell": 0, "wrong": 0}, list[float]()
     for some in ([[scan] for scan in taken] + [taken])[: len(taken) + (len(taken) > 1)]:
         try:
-            profile = estimate_sensor(some).profile
+            estimate = estimate_sensor(some)
         except SensorError:
             counts["cannot_tell"] += 1
             continue
-        found[profile.name] = None
-        error_deg, is_whole = compare_beams(profile, sensor)
+        found[estimate.profile.name] = None
+        if estimate.doubt:
+            counts["cannot_tell"] += 1
+            continue
+        error_deg, is_whole = compare_beams(estimate.profile, sensor)
         off_deg.append(error_deg)
         counts["right" if error_deg <= RIGHT_DEG and is_whole else "wrong"] += 1
     most_deg = round(max(off_deg), 3) if off_deg else None

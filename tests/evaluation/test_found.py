@@ -38,15 +38,19 @@ def test_beams_are_compared_with_those_next_to_them(
 def test_right_wrong_and_cannot_tell(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     urban(3, "vlp-16").points.tofile(tmp_path / "0.bin")
     np.random.default_rng(0).uniform(-20.0, 20.0, (5000, 4)).astype(np.float32).tofile(tmp_path / "1.bin")
+    two = urban(3, "os1-64").points
+    np.concatenate([two, two + np.array([1.4, 0.3, -0.2, 0.0], np.float32)]).tofile(tmp_path / "2.bin")
     file = tmp_path / "other.json"
     file.write_text(SensorProfile.uniform("other", 16, 14.0, -14.0).to_json())
     datasets = [f"vlp-16={tmp_path / '0.bin'}", f"{file}={tmp_path / '0.bin'}", f"vlp-16={tmp_path / '1.bin'}"]
+    datasets.append(f"os1-64={tmp_path / '2.bin'}")
     figures = tmp_path / "figures.json"
     assert run("eval-sensors", "--find", *datasets, "--json", figures) == 1
-    right, wrong, neither = (json.loads(figures.read_text())[name] for name in datasets)
+    right, wrong, neither, dense = (json.loads(figures.read_text())[name] for name in datasets)
     assert (right["right"], right["found"], right["off_deg"]) == (1, ["vlp-16"], 0.0)
     assert (wrong["wrong"], wrong["off_deg"]) == (1, pytest.approx(1.0, abs=0.1))
     assert (neither["cannot_tell"], neither["found"], neither["off_deg"]) == (1, [], None)
+    assert (dense["cannot_tell"], dense["wrong"], dense["found"], dense["off_deg"]) == (1, 0, ["beamless"], None)
     assert "found none; 0 right, 1 cannot tell, 0 wrong" in capsys.readouterr().out
 
 
