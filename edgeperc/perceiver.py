@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 
 from .agreement.rules import RULES
 from .camera.image import ImageScaler, as_image, label_pixels
-from .errors import EdgepercError, FitnessError, ImageError, MountingError, OptionError, PointsError, SensorError
+from .errors import EdgepercError, FitnessError, ImageError, MountingError, OptionError, PointsError
 from .ground.ceiling import find_ceiling
 from .ground.leveling import MountingEstimate, MountingEstimator, near_support, share_below
 from .inference.object_network import BoxesFrom, ObjectNetwork
@@ -495,10 +495,7 @@ class Perceiver:
     def _find_sensor(self, scan: Points) -> None:
         """Use the sensor whose beams the scan has; SensorError if it does not tell."""
         found = estimate_sensor([scan])
-        if found.doubt and self.on_mismatch == "raise":
-            raise SensorError(found.doubt)
-        if found.doubt and self.on_mismatch != "ignore":
-            warnings.warn(found.doubt, stacklevel=3)
+        found.tell_doubt(self.on_mismatch)
         self._sensor_estimate = found
         self._use(found.profile)
 

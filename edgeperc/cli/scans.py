@@ -223,11 +223,7 @@ def scan_sensor(
             raise unnamed or SensorError("the sensor cannot be told: no scan has enough points; pass --sensor NAME")
         if found is None:  # so few points are refused, or warned of, when they are perceived
             return with_mounting(DEFAULT_SENSOR, arguments), "the default: too few points to tell"
-        on_mismatch = getattr(arguments, "on_mismatch", None)
-        if found.doubt and on_mismatch == "raise":
-            raise SensorError(found.doubt)
-        if found.doubt and on_mismatch != "ignore":
-            warnings.warn(f"{path}: {found.doubt}", stacklevel=2)
+        found.tell_doubt(getattr(arguments, "on_mismatch", None), f"{path}: ")
         return with_mounting(found.profile, arguments), str(found)
     given = get_sensor(arguments.sensor)
     try:

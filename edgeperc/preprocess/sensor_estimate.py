@@ -8,6 +8,7 @@ beam, as in KITTI, each turn of their azimuths is a beam. Otherwise points vote 
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -143,6 +144,13 @@ class SensorEstimate:
             f"{what}; {self.on_beams:.0%} of the points are on beams"
             f"{f'; none at azimuths {blind} deg' if blind else ''}"
         )
+
+    def tell_doubt(self, on_mismatch: str | None, of: str = "") -> None:
+        """Warn of the ``doubt``, unless ``on_mismatch`` is "ignore"; SensorError if it is "raise"."""
+        if self.doubt and on_mismatch == "raise":
+            raise SensorError(self.doubt)
+        if self.doubt and on_mismatch != "ignore":
+            warnings.warn(f"{of}{self.doubt}", stacklevel=4)
 
 
 def estimate_sensor(scans: Sequence[Points]) -> SensorEstimate:
