@@ -35,8 +35,11 @@ _STEP_DEG, _BACK_DEG = 2.0, 20.0  # between neighbors in a beam, and back to the
 _IN_STEP, _ONE_WAY = 0.96, 0.97  # share of the neighbors that are so near, and that go one way around
 _FEWEST_OF_RING = 12
 _FEWEST_OF_LINE, _SPREAD = 30, 0.2  # points, and the spread of their inverse distances, that show where a beam starts
-# Beams that show the circle from which all start, its largest radius, and the weight of none: (3 mm / 3 cm) squared.
-_FEWEST_LINES, _RADIUS_M, _RIDGE = 4, 0.05, 0.01
+# Beams that show the circle from which all start, its largest radius, and the weight of none: (1 mm / 3 cm) squared.
+_FEWEST_LINES, _RADIUS_M, _RIDGE = 4, 0.05, 0.001
+# Least error of where a beam starts, and how many errors show a circle: level beams that are a little off would put
+# steep ones 0.2 degrees off.
+_START_M, _SHOWN = 0.0005, 4.0
 
 # Votes: heights of the origin about that of the scan [m], bins of elevations [deg].
 _OFFSETS_M: Floats = np.arange(-20, 21) * np.float64(0.02)
@@ -385,6 +388,9 @@ def _fitted(flat: Floats, z: Floats, rows: Sequence[Ints64]) -> Beams:
             break
         lean, mean = middles[used] - middles[used].mean(), own[used].mean()
         radius = np.clip(lean @ own[used] / (lean @ lean + _RIDGE), -_RADIUS_M, _RADIUS_M)
+        error_m = max(float((own[used] - mean - radius * lean).std(ddof=2)), _START_M)
+        if abs(radius) * math.sqrt(lean @ lean) < _SHOWN * error_m:
+            radius = 0.0
         offsets = mean + radius * (middles - middles[used].mean())
     slopes = np.array([np.median((z[row] - h) / flat[row]) for row, h in zip(rows, offsets, strict=True)])
     elevations, seen = np.degrees(np.arctan([slopes, middles]))

@@ -125,6 +125,17 @@ def test_beams_of_an_unknown_sensor_are_its_profile(n: int, up_deg: float, down_
     assert SensorProfile.from_json(found.profile.to_json()) == found.profile
 
 
+@pytest.mark.parametrize("radius_m", [0.0, 0.04])
+@pytest.mark.parametrize("seed", [9, 25, 32])
+def test_beams_may_start_on_a_circle(radius_m: float, seed: int) -> None:
+    """Only beams that meet walls show it: with few of them, noise is no circle."""
+    top = [2.0, -1.0, -3.0, -4.0, -7.0] if radius_m == 0.0 else np.arange(2.0, -7.5, -0.5)
+    elevations_deg = np.append(top, np.arange(-9.0, -50.0, -3.0))
+    scan = spinning(elevations_deg, 900, seed, 0.03 if radius_m == 0.0 else 0.0).astype(np.float64)
+    scan[:, :2] *= 1.0 + radius_m / np.hypot(scan[:, 0], scan[:, 1])[:, None]
+    assert off_deg(estimate_sensor([scan.astype(np.float32)]), elevations_deg) <= 0.1
+
+
 @pytest.mark.parametrize("offset_m", [-0.1, 0.05, 0.2])
 def test_beams_may_start_above_the_origin(offset_m: float) -> None:
     elevations_deg = np.linspace(9.0, -18.0, 32)
