@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from itertools import chain
 
 import numpy as np
 import pytest
@@ -61,12 +62,22 @@ def across(kind: str, x: float, yaw: float) -> Iterator[Place]:
         yield kind, x, y, yaw
 
 
-AHEAD = [radial(kind, *way) for kind in SIZES for way in ((0.0, 0.0), (-20.0, 0.2), (45.0, 0.0), (-50.0, 0.0))]
-AHEAD += [radial(kind, 8.0, math.pi / 2) for kind in ("car", "truck")]
-AHEAD += [across(kind, x, 0.1) for kind in SIZES for x in (7.0, 20.0)]
+def together(walks: list[Iterator[Place]], apart: int) -> Iterator[tuple[Place, ...]]:
+    """Several walks at a time, each ``apart`` steps ahead of the one before, so that no object stands in another."""
+    return zip(*(np.roll(np.array([*walk], object), k * apart, 0) for k, walk in enumerate(walks)), strict=True)
+
+
+KINDS = [*SIZES, *SIZES]
+AHEAD = [
+    together([radial(KINDS[first + k], bearing, 0.0) for k, bearing in enumerate((0.0, 45.0, -50.0))], 4)
+    for first in range(3)
+]
+AHEAD += [together([radial(kind, -20.0, 0.2)], 0) for kind in SIZES]
+AHEAD += [together([radial(kind, 8.0, math.pi / 2)], 0) for kind in ("car", "truck")]
+AHEAD += [together([across(KINDS[first + k], x, 0.1) for k, x in enumerate((7.0, 20.0))], 5) for first in range(3)]
 # Beside and behind, and through the seams of the sectors: a car, a truck and a person on three sides at a time.
 AROUND = [
-    zip(*(radial(kind, bearing + 120.0 * k, yaw) for k, kind in enumerate(SIZES)), strict=True)
+    together([radial(kind, bearing + 120.0 * k, yaw) for k, kind in enumerate(SIZES)], 0)
     for bearing, yaw in ((90.0, 0.0), (180.0, 0.0), (-90.0, math.pi / 2), (-60.0, 0.0), (135.0, 0.4))
 ]
 
@@ -88,9 +99,8 @@ def test_no_object_that_points_show_is_without_a_box(full_turn: bool) -> None:
     )
     assert (top_view.x_range_m, top_view.y_range_m) == ((6.0, 46.0), (-10.0, 10.0))  # the walks go through these edges
     assert (sector.azimuth_left_deg, sector.azimuth_right_deg) == (45.0, -45.0)
-    scenes = [[*places] for way in AROUND for places in way] if full_turn else [[place] for w in AHEAD for place in w]
     n_seen, lost = 0, []
-    for seed, given in enumerate(scenes):
+    for seed, given in enumerate(chain(*(AROUND if full_turn else AHEAD))):
         places = [place for place in given if not hits_own_vehicle(place)]
         if not places:
             continue
