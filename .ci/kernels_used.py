@@ -32,10 +32,11 @@ def decode_packets() -> None:
 
 
 def run() -> None:
-    """Perceive, track and map simulated scans in every usual set-up, run the demo, and find a sensor."""
+    """Perceive, track and map simulated scans in every usual set-up, run the demo, find a sensor and its place."""
     with tempfile.TemporaryDirectory() as folder:
         main(["demo", "--out", folder])
     decode_packets()
+    edgeperc.find_origin(simulated_scan(1, "hdl-64e").points[:, :3] + [0.0, 5e6, 0.0])
     view = PillarGeometry((0.0, 64.0), (-32.0, 32.0), (-3.0, 1.0), 0.5, 8, 100, 0.0, 0.0, "num_points", "coors")
     Pillarizer(view, InputSpec("voxels", ("x", "range"), (0.0, 0.0), (1.0, 1.0))).fill(simulated_scan(1).points)
     with tempfile.TemporaryDirectory() as folder:  # a sensor that is found

@@ -7,10 +7,13 @@ place is searched whose elevations stand out most, first roughly by how evenly t
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..errors import PointsError
+from ..system.kernels import njit
 from ..types.points import Floats, Ints64
 
 _N_POINTS = 16_000  # that are looked at
@@ -22,14 +25,32 @@ _REACH_M = 1000.0  # of any LiDAR; damaged coordinates lie farther from the othe
 _ASIDE_M, _ASIDE_STEP_M = 2.0, 0.4
 _HEIGHTS_M = np.arange(0.4, 9.1, 0.1)
 _FAR_M, _N_FAR = 12.0, 6000  # points that show the height, while the place is not known well
-_WIDTH_DEG, _BAND_DEG = 0.1, 1.2  # of a bin of elevations, and of the band in which it should stand out
-_UP_DEG = 45.0
+_UP_DEG, _BAND_DEG = 45.0, 1.2  # of the elevations, and of the band in which a bin should stand out
 _TILTS = ((1.5, 0.1), (0.1, 0.02))  # reach and step [deg]
 # Steps of the last search in place [m] and tilt [deg], with the nearest points that it uses [m].
-_FINE = ((0.2, 0.5, 8.0), (0.1, 0.2, 6.0), (0.05, 0.1, 4.0), (0.025, 0.05, 3.0), (0.0125, 0.025, 3.0))
+_STEPS = ((0.2, 0.5, 8.0), (0.1, 0.2, 6.0), (0.05, 0.1, 4.0), (0.025, 0.05, 3.0), (0.0125, 0.025, 3.0))
 # Contrast of the elevations, and how much more it is than half a meter aside. In 130 scans of 11 sensors, level and
 # leaning, 83 places were found so, all within 0.25 m; of the others, refused, most were wrong.
 _LEAST_CONTRAST, _LEAST_GAIN = 0.5, 2.7
+
+
+class Bins(NamedTuple):
+    """Bins of elevations, from -45 to 45 degrees."""
+
+    tangents: Floats  # (n + 1,), of their edges
+    first: NDArray[np.uint16]  # the bin of a slope from -1 to 1, in equal steps
+    half: int  # bins on each side of the band around one
+
+
+def bins_of(width_deg: float) -> Bins:
+    """Bins of this width."""
+    tangents = np.tan(np.radians(np.linspace(-_UP_DEG, _UP_DEG, round(2.0 * _UP_DEG / width_deg) + 1)))
+    slopes = np.linspace(-1.0, 1.0, 16 * len(tangents), endpoint=False)
+    first = np.maximum(np.searchsorted(tangents, slopes, "right") - 1, 0).astype(np.uint16)
+    return Bins(tangents, first, int(_BAND_DEG / width_deg / 2.0))
+
+
+_COARSE, _FINE = bins_of(0.1), bins_of(0.05)
 
 
 def find_place(xyz: Floats) -> tuple[float, float, float]:
@@ -91,42 +112,65 @@ def _far_place(sample: Floats, x: float, y: float) -> Floats:
         raise _unknown("it shows no ground around one")
     counts, edges = np.histogram(near_z, np.arange(near_z.min(), near_z.max() + 0.4, 0.2))
     heights = float(edges[counts.argmax()]) + 0.1 + _HEIGHTS_M
-    far = sample[across > _FAR_M][:_N_FAR]
     offsets = np.arange(-_ASIDE_M, _ASIDE_M + 0.1, _ASIDE_STEP_M)
-    best, place = -1.0, np.zeros(3)
-    rows = np.arange(len(heights))[:, None]
-    for dx in offsets.tolist():
-        for dy in offsets.tolist():
-            flat = np.hypot(far[:, 0] - x - dx, far[:, 1] - y - dy)
-            elevation = np.degrees(np.arctan2(far[None, :, 2] - heights[:, None], flat[None]))
-            contrasts = _contrasts(elevation, rows, len(heights), _WIDTH_DEG)
-            if contrasts.max() > best:
-                best, place = float(contrasts.max()), np.array([x + dx, y + dy, heights[int(contrasts.argmax())]])
-    return place
+    places = _grid(x + offsets, y + offsets, heights)
+    contrasts = _contrasts(sample[across > _FAR_M][:_N_FAR], places, np.zeros(2), _COARSE)
+    return places[contrasts.argmax()] if contrasts.max() > -1.0 else np.zeros(3)
 
 
-def _contrasts(elevation: Floats, row: Ints64, n_rows: int, width_deg: float) -> Floats:
-    """How much the bins of the elevations of each row stand out from the band around them, (n_rows,)."""
-    n_bins = int(2.0 * _UP_DEG / width_deg)
-    place = (elevation + _UP_DEG) / width_deg
-    bins = np.where((place >= 0.0) & (place < n_bins), place, n_bins).astype(np.int64)  # the last is left out
-    counts = np.bincount((row * (n_bins + 1) + bins).ravel(), minlength=n_rows * (n_bins + 1))
-    counts = counts.reshape(n_rows, n_bins + 1)[:, :-1].astype(np.float64)
-    half = int(_BAND_DEG / width_deg / 2.0)
-    total = np.cumsum(np.pad(counts, ((0, 0), (half + 1, half))), axis=1)
-    band = (total[:, 2 * half + 1 :] - total[:, : -2 * half - 1]) / (2 * half + 1)
-    # Random counts stand out by their own number.
-    return np.asarray(
-        (((counts - band) ** 2).sum(axis=1) - counts.sum(axis=1)) / np.maximum((band**2).sum(axis=1), 1.0)
-    )
+def _grid(*axes: Floats) -> Floats:
+    """All combinations of values, the last axis fastest."""
+    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(axes))
 
 
-def _contrast(sample: Floats, place: Floats, tilt: Floats) -> float:
-    """The contrast of the elevations about an axis that leans by ``tilt`` (2,) [deg] towards x and y."""
-    x, y, z = (sample - place).T
-    lean_x, lean_y = np.radians(tilt)
-    elevation = np.degrees(np.arctan2(z + lean_x * x + lean_y * y, np.hypot(x - lean_x * z, y - lean_y * z)))
-    return float(_contrasts(elevation, np.zeros(1, np.int64), 1, _WIDTH_DEG / 2.0)[0])
+def _contrasts(sample: Floats, places: Floats, tilts_deg: Floats, bins: Bins) -> Floats:
+    """The contrast of the elevations seen from places (n, 3), about axes that lean by tilts (n, 2) or (2,)."""
+    places = np.atleast_2d(places)
+    leans = np.radians(np.atleast_2d(tilts_deg))
+    seen_from = np.empty((max(len(places), len(leans)), 5))
+    seen_from[:, :3], seen_from[:, 3:] = places, leans
+    contrasts = np.empty(len(seen_from))
+    fill_contrasts(sample, seen_from, bins, contrasts)
+    return contrasts
+
+
+@njit(cache=True, nogil=True)
+def fill_contrasts(points: Floats, seen_from: Floats, bins: Bins, contrasts: Floats) -> None:
+    """How much the bins of the elevations of points (n, 3) stand out from the band around them.
+
+    seen_from : (m, 5), x, y, z [m], and the lean of the axis towards x and y [rad].
+    """
+    tangents, first, half = bins
+    n_points, n_bins, scale = points.shape[0], tangents.shape[0] - 1, 0.5 * first.shape[0]
+    counts, inverse = np.empty(n_bins, np.int64), np.empty(n_points)
+    for m in range(seen_from.shape[0]):
+        x, y, z, lean_x, lean_y = seen_from[m]
+        is_new = m == 0 or lean_x != 0.0 or lean_y != 0.0 or x != seen_from[m - 1, 0] or y != seen_from[m - 1, 1]
+        counts[:] = 0
+        for i in range(n_points):
+            dx, dy, dz = points[i, 0] - x, points[i, 1] - y, points[i, 2] - z
+            if is_new:
+                flat_x, flat_y = dx - lean_x * dz, dy - lean_y * dz
+                inverse[i] = 1.0 / max(math.sqrt(flat_x * flat_x + flat_y * flat_y), 1e-9)
+            slope = (dz + lean_x * dx + lean_y * dy) * inverse[i]
+            if tangents[0] <= slope < tangents[n_bins]:
+                k = int(first[int((slope + 1.0) * scale)])
+                while slope >= tangents[k + 1]:
+                    k += 1
+                counts[k] += 1
+        total, within, differences, squares = 0, 0, 0.0, 0.0
+        for k in range(-half, n_bins):
+            if k + half < n_bins:
+                within += counts[k + half]
+            if k > half:
+                within -= counts[k - half - 1]
+            if k >= 0:
+                band = within / (2 * half + 1)
+                total += counts[k]
+                differences += (counts[k] - band) ** 2
+                squares += band * band
+        # Random counts stand out by their own number.
+        contrasts[m] = (differences - total) / max(squares, 1.0)
 
 
 def _tilt(sample: Floats, place: Floats) -> Floats:
@@ -135,22 +179,23 @@ def _tilt(sample: Floats, place: Floats) -> Floats:
     best = np.zeros(2)
     for reach_deg, step_deg in _TILTS:
         offsets = np.arange(-reach_deg, reach_deg + step_deg / 2.0, step_deg)
-        tilts = [best + np.array([along, across]) for along in offsets for across in offsets]
-        best = max(tilts, key=lambda tilt: _contrast(far, place, tilt))
+        tilts = best + _grid(offsets, offsets)
+        best = tilts[_contrasts(far, place, tilts, _FINE).argmax()]
     return best
 
 
 def _fine_place(sample: Floats, place: Floats, tilt: Floats) -> tuple[Floats, Floats, float]:
     """The place and tilt from which the elevations stand out most, and by how much; NaN if not enough."""
     steps = np.array([-1.0, 0.0, 1.0])
-    shifts = np.stack(np.meshgrid(steps, steps, steps), axis=-1).reshape(-1, 3)
-    leans = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
-    for step_m, step_deg, near_m in _FINE:
+    shifts, leans = _grid(steps, steps, steps), _grid(steps, steps)
+    for step_m, step_deg, near_m in _STEPS:
         used = sample[np.hypot(*(sample - place)[:, :2].T) > near_m]
         for _ in range(3):
-            place = max(place + step_m * shifts, key=lambda each: _contrast(used, each, tilt))
-            tilt = max(tilt + step_deg * leans, key=lambda each: _contrast(used, place, each))
-    contrast = _contrast(used, place, tilt)
-    beside = max(_contrast(used, place + shift, tilt) for shift in 0.5 * shifts if np.abs(shift).sum() == 0.5)
+            places = place + step_m * shifts
+            place = places[_contrasts(used, places, tilt, _FINE).argmax()]
+            tilts = tilt + step_deg * leans
+            tilt = tilts[_contrasts(used, place, tilts, _FINE).argmax()]
+    contrast = float(_contrasts(used, place, tilt, _FINE)[0])
+    beside = _contrasts(used, place + 0.5 * shifts[np.abs(shifts).sum(axis=1) == 1.0], tilt, _FINE).max()
     is_sure = contrast >= _LEAST_CONTRAST and contrast >= _LEAST_GAIN * beside
     return place, tilt, contrast if is_sure else math.nan

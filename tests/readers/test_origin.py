@@ -11,9 +11,29 @@ from numpy.typing import NDArray
 
 from edgeperc.errors import PointsError
 from edgeperc.readers.files import read_points
-from edgeperc.readers.origin import find_place
+from edgeperc.readers.origin import bins_of, fill_contrasts, find_place
 from edgeperc.simulation.samples import simulated_scan
 from edgeperc.types.mounting import Mounting
+from twins.origin import contrast
+
+
+@pytest.mark.kernel
+@pytest.mark.filterwarnings("ignore:.*encountered")
+@pytest.mark.parametrize("n", [0, 1, 2, 300])
+@pytest.mark.parametrize("width_deg", [0.05, 0.1])
+def test_contrasts_are_those_of_the_twin(n: int, width_deg: float) -> None:
+    rng, bins = np.random.default_rng(n), bins_of(width_deg)
+    points = rng.normal(0.0, (20.0, 20.0, 2.0), (n, 3))
+    for place, value in enumerate((np.nan, np.inf, -np.inf, 1e308)):
+        points[place * n // 5 : place * n // 5 + 1, place % 3] = value
+    leans = np.array([[0.0, 0.0], [0.0, 0.0], [0.0, 0.0], [0.02, -0.01], [0.02, 0.0]])
+    places = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 1.0], [1.0, 0.0, 1.0], [1.0, -2.0, 1.0]])
+    if n:
+        places[2] = points[-1]  # a point in the place itself
+    seen_from, found = np.column_stack([places, leans]), np.full(len(places), np.nan)
+    fill_contrasts(points, seen_from, bins, found)
+    np.testing.assert_allclose(found, [contrast(points, each, bins) for each in seen_from], rtol=1e-9)
+
 
 PLACES = {"UTM": (512345.25, 5412345.5, 113.0), "local": (-35.5, 20.25, 7.0), "ECEF": (4.1e6, 6.2e5, 4.8e6)}
 
