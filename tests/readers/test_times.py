@@ -38,7 +38,7 @@ def seen_from(times: NDArray[np.float64], at_s: float, directions: NDArray[np.fl
     room's. ``directions`` (n, 3) and the rays' origins ``offsets`` are in the sensor's frame at the time of each."""
     screw = twins.motion.screw(MOTION.velocity_mps, MOTION.rate_radps)
     moments, inverse = np.unique(times, return_inverse=True)
-    poses = np.array([twins.motion.exponential(screw * (t - at_s)) for t in moments])[inverse.ravel()]
+    poses = twins.motion.exponential(screw * (moments - at_s)[:, None, None])[inverse.ravel()]
     way = np.einsum("nij,nj->ni", poses[:, :3, :3], directions)
     start = np.einsum("nij,nj->ni", poses[:, :3, :3], np.broadcast_to(offsets, directions.shape)) + poses[:, :3, 3]
     with np.errstate(divide="ignore"):

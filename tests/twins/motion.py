@@ -8,9 +8,9 @@ import numpy as np
 
 
 def exponential(matrix: np.ndarray) -> np.ndarray:
-    """The matrix exponential, by its series of a small part of the matrix, squared as often as needed."""
-    n = max(0, int(np.ceil(np.log2(np.abs(matrix).max() + 1e-300)))) + 4
-    term = total = np.eye(len(matrix))
+    """Exponentials of matrices (..., n, n), by the series of a small part of each, squared as often as needed."""
+    n = max(0, int(np.ceil(np.log2(np.abs(matrix).max(initial=0.0) + 1e-300)))) + 4
+    term = total = np.eye(matrix.shape[-1])
     for k in range(1, 20):
         term = term @ matrix / (k * 2.0**n)
         total = total + term
