@@ -86,10 +86,14 @@ def simulated(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def small_views(monkeypatch: pytest.MonkeyPatch) -> None:
+    make_views_small(monkeypatch)
+
+
+def make_views_small(patch: pytest.MonkeyPatch) -> None:
     """Views with a quarter of the beams and columns, or with the 16 x 8 m ahead: a sixteenth of the arithmetic."""
     beams = RANGE_IMAGE.row_elevations_deg[::4]
-    monkeypatch.setattr(cards, "RANGE_IMAGE", replace(RANGE_IMAGE, row_elevations_deg=beams, width=128))
-    monkeypatch.setattr(cards, "TOP_VIEW", TopViewGeometry((6.0, 22.0), (-4.0, 4.0)))
+    patch.setattr(cards, "RANGE_IMAGE", replace(RANGE_IMAGE, row_elevations_deg=beams, width=128))
+    patch.setattr(cards, "TOP_VIEW", TopViewGeometry((6.0, 22.0), (-4.0, 4.0)))
 
 
 def small(network: str, **changes: object) -> Recipe:
@@ -116,18 +120,23 @@ def weights(path: Path) -> dict[str, Tensor]:
 
 @pytest.mark.usefixtures("small_views")
 @pytest.mark.parametrize(
-    ("network", "head", "n_workers"),
+    ("network", "changes", "n_workers"),
     [
-        ("lodnn", "dense", 0),
-        ("pointseg", "dense", 1),
-        ("ssadnet", "dense", 2),
-        ("ssadnet", "slots", 0),
+        ("lodnn", {}, 0),
+        ("pointseg", {"edge": True}, 1),
+        ("ssadnet", {}, 2),
+        ("ssadnet", {"head": "slots"}, 0),
     ],
 )
 def test_a_resumed_run_equals_an_uninterrupted_one(
-    tmp_path: Path, simulated: Path, network: str, head: str, n_workers: int, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path,
+    simulated: Path,
+    network: str,
+    changes: dict[str, object],
+    n_workers: int,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    recipe = small(network, head=head, redraw_every=1)
+    recipe = small(network, redraw_every=1, **changes)
     arguments = {"kitti": None, "simulated": simulated, "n_threads": 1, "checkpoint_every": 2}
     whole = train(recipe, tmp_path / "whole", **arguments)  # without workers: they change nothing
     arguments["n_workers"] = n_workers
@@ -156,21 +165,22 @@ def test_a_resumed_run_equals_an_uninterrupted_one(
 
 @pytest.mark.usefixtures("small_views")
 def test_a_run_may_keep_a_share_of_the_weights_that_it_starts_from(tmp_path: Path, simulated: Path) -> None:
-    begun = untrained("ssadnet", tmp_path)
+    begun = untrained("pointseg", tmp_path, edge=True)
     arguments = {"kitti": None, "simulated": simulated, "n_threads": 1, "start_from": begun}
-    made = [weights(train(small("ssadnet", kept=k, steps=2), tmp_path / f"{k}", **arguments)) for k in (0.0, 0.25, 1.0)]
+    recipes = [small("pointseg", edge=True, kept=kept, steps=2) for kept in (0.0, 0.25, 1.0)]
+    made = [weights(train(recipe, tmp_path / f"{recipe.kept}", **arguments)) for recipe in recipes]
     for name, before in weights(begun).items():
         if before.dtype.is_floating_point:
             own, mixed, same = (each[name] for each in made)
             assert torch.allclose(same, before, atol=1e-6), name
             assert torch.allclose(mixed, 0.75 * own + 0.25 * before, atol=1e-5), name
     with pytest.raises(ValueError, match="give --start-from"):
-        train(small("ssadnet", kept=0.5), tmp_path / "none", **{**arguments, "start_from": None})
+        train(replace(recipes[0], kept=0.5), tmp_path / "none", **{**arguments, "start_from": None})
 
 
 @pytest.mark.usefixtures("small_views")
 def test_reused_samples_are_drawn_from_the_newest(tmp_path: Path, simulated: Path) -> None:
-    recipe = small("pointseg", steps=7, batch=2, reuse=3, redraw_every=0)
+    recipe = small("pointseg", edge=True, steps=7, batch=2, reuse=3, redraw_every=0)
     samples = Samples(recipe, [], [], sorted(simulated.glob("*.npz")))
     batches = [[part.clone() for part in batch] for batch in loaded(samples, 0, recipe.steps, 0)]
     assert len(batches) == recipe.steps
@@ -212,16 +222,16 @@ def test_workers_simulate_the_same_scans_and_cut_out_the_same_objects(tmp_path: 
 
 @pytest.mark.usefixtures("small_views")
 def test_another_recipe_does_not_resume(tmp_path: Path, simulated: Path) -> None:
-    train(small("pointseg", steps=1), tmp_path, kitti=None, simulated=simulated, n_threads=1)
+    train(small("pointseg", edge=True, steps=1), tmp_path, kitti=None, simulated=simulated, n_threads=1)
     with pytest.raises(ValueError, match="of another recipe"):
-        train(small("pointseg", steps=2), tmp_path, kitti=None, simulated=simulated, n_threads=1)
+        train(small("pointseg", edge=True, steps=2), tmp_path, kitti=None, simulated=simulated, n_threads=1)
 
 
 @pytest.mark.usefixtures("small_views")
 def test_a_longer_run_starts_like_a_shorter_one(tmp_path: Path, simulated: Path) -> None:
     arguments = {"kitti": None, "simulated": simulated, "n_threads": 1, "checkpoint_every": 2}
-    train(small("pointseg", steps=4, cooldown=0.5), tmp_path / "short", **arguments)
-    train(small("pointseg", steps=10, cooldown=0.5), tmp_path / "long", **arguments)
+    for run, steps in (("short", 4), ("long", 10)):
+        train(small("pointseg", edge=True, steps=steps, cooldown=0.5), tmp_path / run, **arguments)
     one, other = (
         [json.loads(line)["loss"] for line in (tmp_path / run / "log.jsonl").read_text().splitlines()]
         for run in ("short", "long")
@@ -450,7 +460,7 @@ def test_lodnn_learns_only_road(simulated: Path) -> None:
 
 @pytest.mark.usefixtures("small_views")
 def test_a_simulated_share_of_1_uses_no_real_frame(tmp_path: Path, kitti: Path, simulated: Path) -> None:
-    recipe = small("pointseg", steps=1, simulated_share=1.0, n_pasted=0.0)
+    recipe = small("pointseg", edge=True, steps=1, simulated_share=1.0, n_pasted=0.0)
     checkpoint = train(recipe, tmp_path, kitti=kitti, simulated=simulated, n_threads=1)
     assert load(checkpoint)[2]["frames"] == {}
     assert json.loads(torch.load(checkpoint, weights_only=True)["curve"])[0]["validation"].keys() >= {"car"}
@@ -461,7 +471,7 @@ def test_the_learning_rate_is_halved_after_epochs_without_improvement(
     tmp_path: Path, kitti: Path, simulated: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(Watch, "validate", lambda self, network: (0.5, 1.0, {"car": 0.5}))
-    recipe = small("pointseg", steps=4, halve_after=2, n_pasted=0.0)
+    recipe = small("pointseg", edge=True, steps=4, halve_after=2, n_pasted=0.0)
     checkpoint = train(recipe, tmp_path, kitti=kitti, simulated=simulated, fold=1, n_threads=1, checkpoint_every=1)
     state = torch.load(checkpoint, weights_only=True)
     assert state["watched"][-1] == 1  # at step 3, two epochs of one step after the first and best
@@ -632,7 +642,8 @@ def test_scans_with_false_objects_are_drawn_more_often(kitti: Path, simulated: P
 
 @pytest.mark.usefixtures("small_views")
 def test_the_curve_of_a_run_is_a_table(tmp_path: Path, kitti: Path, simulated: Path) -> None:
-    train(small("pointseg"), tmp_path, kitti=kitti, simulated=simulated, fold=1, n_threads=1, checkpoint_every=1)
+    arguments = {"kitti": kitti, "simulated": simulated, "fold": 1, "n_threads": 1, "checkpoint_every": 1}
+    train(small("pointseg", edge=True), tmp_path, **arguments)
     with (tmp_path / "log.jsonl").open("a") as log:  # as after a stop
         log.write((tmp_path / "log.jsonl").read_text().splitlines()[-1] + "\n")
     head, names, *rows, gain = curve_table(tmp_path, 2)
@@ -676,13 +687,13 @@ def test_make_also_makes_the_models_that_it_starts_from(
     shutil.copytree(kitti / "training", layouts)
     rows = (kitti / "frames.csv").read_text().splitlines()
     (layouts / "frames.csv").write_text("\n".join(row for row in rows if "000002" not in row))  # it has no labels
-    base = Stage(small("pointseg", simulated_share=1.0, steps=1, n_pasted=1.0))
-    full = small("pointseg", steps=3, n_pasted=1.0)
+    full = small("pointseg", edge=True, steps=3, n_pasted=1.0)  # a network for small computers is exported faster
+    base = Stage(replace(full, simulated_share=1.0, steps=1))
     stages = {
         "pointseg-sim": base,
         "pointseg-full": Stage(full, after="pointseg-sim"),
-        "pointseg": Stage(replace(full, edge=True, distil=1.0, steps=1), teacher="pointseg-full"),
-        "pointseg-open": Stage(replace(full, edge=True, steps=1), is_open=True, also=("halls",)),
+        "pointseg": Stage(replace(full, width=0.5, distil=1.0, steps=1), teacher="pointseg-full"),
+        "pointseg-open": Stage(replace(full, steps=1), is_open=True, also=("halls",)),
     }
     evaluated = []
 
@@ -781,9 +792,11 @@ def exported(tmp_path_factory: pytest.TempPathFactory, scans: Sequence[np.ndarra
     @functools.cache
     def of(network: str, head: str = "dense") -> tuple[Path, Path, ModelCard]:
         folder = tmp_path_factory.mktemp(network)
-        checkpoint, path = untrained(network, folder, head=head), folder / "model.onnx"
-        fitness = FitnessProfile.from_scans(scans)
-        return checkpoint, path, export(checkpoint, path, scans=scans, fitness=fitness, version="0.0.1")
+        with pytest.MonkeyPatch.context() as patch:
+            make_views_small(patch)
+            checkpoint, path = untrained(network, folder, head=head), folder / "model.onnx"
+            fitness = FitnessProfile.from_scans(scans)
+            return checkpoint, path, export(checkpoint, path, scans=scans, fitness=fitness, version="0.0.1")
 
     return of
 
@@ -821,6 +834,7 @@ def test_an_export_is_verified(exported: Exported, scans: Sequence[np.ndarray], 
     assert sorted(p.name for p in path.parent.iterdir()) == sorted([checkpoint.name, "model.onnx"])
 
 
+@pytest.mark.usefixtures("small_views")
 def test_a_graph_that_disagrees_is_not_written(
     tmp_path: Path, exported: Exported, scans: Sequence[np.ndarray], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -976,7 +990,7 @@ def test_a_card_replaces_an_existing_one(tmp_path: Path, third_party: tuple[Path
 def test_the_command_line_from_scans_to_a_model(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     data, run, model = tmp_path / "data", tmp_path / "run", tmp_path / "pointseg.onnx"
     assert main(["simulate", str(data), "-n", "2"]) == 0
-    arguments = ["--steps", "1", "--batch", "1", "--threads", "1"]
+    arguments = ["--steps", "1", "--batch", "1", "--threads", "1", "--edge"]
     assert main(["train", "pointseg", str(run), "--simulated", str(data), *arguments]) == 0
     assert main(["export", str(run / "checkpoint.pt"), str(model)]) == 0
     assert main(["verify", str(run / "checkpoint.pt"), str(model)]) == 0
