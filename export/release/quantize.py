@@ -308,15 +308,25 @@ def range_of(counts: Ints64) -> tuple[float, float]:
     usual = np.isfinite(values) & (np.abs(values) > 1e-30)  # the rest are zeros
     values, weights = values[usual], weights[usual]
     least, most = min(values.min(initial=0.0), 0.0), max(values.max(initial=0.0), 0.0)
-    best, chosen = np.inf, (least, most)
-    for low in np.multiply(least, CLIPPED_TO if least < 0.0 else (1.0,)):
-        for high in np.multiply(most, CLIPPED_TO if most > 0.0 else (1.0,)):
-            step = (high - low) / 255.0
-            clipped = np.maximum(values - high, 0.0) + np.maximum(low - values, 0.0)
-            noise = float(weights @ np.where(clipped > 0.0, clipped**2, np.minimum(values**2, step**2 / 12.0)))
-            if noise < best:
-                best, chosen = noise, (float(low), float(high))
-    return chosen
+    lows = np.multiply(least, CLIPPED_TO if least < 0.0 else (1.0,))[:, None]
+    highs = np.multiply(most, CLIPPED_TO if most > 0.0 else (1.0,))
+    steps, below, above = (highs - lows) / 255.0, values < 0.0, values > 0.0
+    noise = _noise_of_side(-values[below], weights[below], -lows, steps)
+    noise = noise + _noise_of_side(values[above], weights[above], highs, steps)
+    low, high = np.unravel_index(noise.argmin(), noise.shape)
+    return float(lows[low, 0]), float(highs[high])
+
+
+def _noise_of_side(sizes: Floats, weights: Ints64, bounds: Floats, steps: Floats) -> Floats:
+    """Noise of the values on one side of zero, by their sizes, if a bound clips them and a step rounds them."""
+    order = np.argsort(sizes)
+    sizes, weights = sizes[order], weights[order]
+    squares, n = (np.concatenate(([0], np.cumsum(each))) for each in (weights * sizes**2, weights))
+    inside = np.searchsorted(sizes, bounds, "right")
+    kept = np.minimum(inside, np.searchsorted(sizes, steps / 12.0**0.5))  # smaller than their rounding
+    clipped = [weights[k:] @ (sizes[k:] - bound) ** 2 for k, bound in zip(inside.flat, bounds.flat, strict=True)]
+    noise: Floats = np.reshape(clipped, bounds.shape) + squares[kept] + steps**2 / 12.0 * (n[inside] - n[kept])
+    return noise
 
 
 def _between(graph: onnx.GraphProto, convolutions: Collection[str]) -> set[str]:
