@@ -145,7 +145,9 @@ def fill_contrasts(points: Floats, seen_from: Floats, bins: Bins, contrasts: Flo
     counts, inverse = np.empty(n_bins, np.int64), np.empty(n_points)
     for m in range(seen_from.shape[0]):
         x, y, z, lean_x, lean_y = seen_from[m]
-        is_new = m == 0 or lean_x != 0.0 or lean_y != 0.0 or x != seen_from[m - 1, 0] or y != seen_from[m - 1, 1]
+        is_new = m == 0 or lean_x != 0.0 or lean_y != 0.0
+        for k in (0, 1, 3, 4):  # distances along a level axis are those from another height, too
+            is_new = is_new or seen_from[m, k] != seen_from[m - 1, k]
         counts[:] = 0
         for i in range(n_points):
             dx, dy, dz = points[i, 0] - x, points[i, 1] - y, points[i, 2] - z

@@ -26,11 +26,12 @@ def test_contrasts_are_those_of_the_twin(n: int, width_deg: float) -> None:
     points = rng.normal(0.0, (20.0, 20.0, 2.0), (n, 3))
     for place, value in enumerate((np.nan, np.inf, -np.inf, 1e308)):
         points[place * n // 5 : place * n // 5 + 1, place % 3] = value
-    leans = np.array([[0.0, 0.0], [0.0, 0.0], [0.0, 0.0], [0.02, -0.01], [0.02, 0.0]])
-    places = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 1.0], [1.0, 0.0, 1.0], [1.0, -2.0, 1.0]])
+    level = [[0.0, 0.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0, 0.0], [1.0, 0.0, 1.0, 0.0, 0.0]]
+    leaning = [[1.0, 0.0, 1.0, 0.2, -0.1], [1.0, -2.0, 1.0, 0.2, 0.0]]
+    seen_from = np.array([*level, *leaning, [1.0, -2.0, 1.0, 0.0, 0.0]])
     if n:
-        places[2] = points[-1]  # a point in the place itself
-    seen_from, found = np.column_stack([places, leans]), np.full(len(places), np.nan)
+        seen_from[2, :3] = points[-1]  # a point in the place itself
+    found = np.full(len(seen_from), np.nan)
     fill_contrasts(points, seen_from, bins, found)
     np.testing.assert_allclose(found, [contrast(points, each, bins) for each in seen_from], rtol=1e-9)
 
