@@ -7,6 +7,7 @@ place is searched whose elevations stand out most, first roughly by how evenly t
 from __future__ import annotations
 
 import math
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -26,6 +27,7 @@ _ASIDE_M, _ASIDE_STEP_M = 2.0, 0.4
 _HEIGHTS_M = np.arange(0.4, 9.1, 0.1)
 _FAR_M, _N_FAR = 12.0, 6000  # points that show the height, while the place is not known well
 _UP_DEG, _BAND_DEG = 45.0, 1.2  # of the elevations, and of the band in which a bin should stand out
+_COARSE_DEG, _FINE_DEG = 0.1, 0.05  # widths of a bin
 _TILTS = ((1.5, 0.1), (0.1, 0.02))  # reach and step [deg]
 # Steps of the last search in place [m] and tilt [deg], with the nearest points that it uses [m].
 _STEPS = ((0.2, 0.5, 8.0), (0.1, 0.2, 6.0), (0.05, 0.1, 4.0), (0.025, 0.05, 3.0), (0.0125, 0.025, 3.0))
@@ -42,15 +44,13 @@ class Bins(NamedTuple):
     half: int  # bins on each side of the band around one
 
 
+@cache
 def bins_of(width_deg: float) -> Bins:
     """Bins of this width."""
     tangents = np.tan(np.radians(np.linspace(-_UP_DEG, _UP_DEG, round(2.0 * _UP_DEG / width_deg) + 1)))
     slopes = np.linspace(-1.0, 1.0, 16 * len(tangents), endpoint=False)
     first = np.maximum(np.searchsorted(tangents, slopes, "right") - 1, 0).astype(np.uint16)
     return Bins(tangents, first, int(_BAND_DEG / width_deg / 2.0))
-
-
-_COARSE, _FINE = bins_of(0.1), bins_of(0.05)
 
 
 def find_place(xyz: Floats) -> tuple[float, float, float]:
@@ -114,8 +114,8 @@ def _far_place(sample: Floats, x: float, y: float) -> Floats:
     heights = float(edges[counts.argmax()]) + 0.1 + _HEIGHTS_M
     offsets = np.arange(-_ASIDE_M, _ASIDE_M + 0.1, _ASIDE_STEP_M)
     places = _grid(x + offsets, y + offsets, heights)
-    contrasts = _contrasts(sample[across > _FAR_M][:_N_FAR], places, np.zeros(2), _COARSE)
-    return places[contrasts.argmax()] if contrasts.max() > -1.0 else np.zeros(3)
+    contrasts = _contrasts(sample[across > _FAR_M][:_N_FAR], places, np.zeros(2), _COARSE_DEG)
+    return places[contrasts.argmax()]
 
 
 def _grid(*axes: Floats) -> Floats:
@@ -123,14 +123,14 @@ def _grid(*axes: Floats) -> Floats:
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(axes))
 
 
-def _contrasts(sample: Floats, places: Floats, tilts_deg: Floats, bins: Bins) -> Floats:
+def _contrasts(sample: Floats, places: Floats, tilts_deg: Floats, width_deg: float) -> Floats:
     """The contrast of the elevations seen from places (n, 3), about axes that lean by tilts (n, 2) or (2,)."""
     places = np.atleast_2d(places)
     leans = np.radians(np.atleast_2d(tilts_deg))
     seen_from = np.empty((max(len(places), len(leans)), 5))
     seen_from[:, :3], seen_from[:, 3:] = places, leans
     contrasts = np.empty(len(seen_from))
-    fill_contrasts(sample, seen_from, bins, contrasts)
+    fill_contrasts(sample, seen_from, bins_of(width_deg), contrasts)
     return contrasts
 
 
@@ -142,19 +142,15 @@ def fill_contrasts(points: Floats, seen_from: Floats, bins: Bins, contrasts: Flo
     """
     tangents, first, half = bins
     n_points, n_bins, scale = points.shape[0], tangents.shape[0] - 1, 0.5 * first.shape[0]
-    counts, inverse = np.empty(n_bins, np.int64), np.empty(n_points)
+    counts = np.empty(n_bins, np.int64)
     for m in range(seen_from.shape[0]):
         x, y, z, lean_x, lean_y = seen_from[m]
-        is_new = m == 0 or lean_x != 0.0 or lean_y != 0.0
-        for k in (0, 1, 3, 4):  # distances along a level axis are those from another height, too
-            is_new = is_new or seen_from[m, k] != seen_from[m - 1, k]
         counts[:] = 0
         for i in range(n_points):
             dx, dy, dz = points[i, 0] - x, points[i, 1] - y, points[i, 2] - z
-            if is_new:
-                flat_x, flat_y = dx - lean_x * dz, dy - lean_y * dz
-                inverse[i] = 1.0 / max(math.sqrt(flat_x * flat_x + flat_y * flat_y), 1e-9)
-            slope = (dz + lean_x * dx + lean_y * dy) * inverse[i]
+            flat_x, flat_y = dx - lean_x * dz, dy - lean_y * dz
+            flat = max(math.sqrt(flat_x * flat_x + flat_y * flat_y), 1e-9)
+            slope = (dz + lean_x * dx + lean_y * dy) / flat
             if tangents[0] <= slope < tangents[n_bins]:
                 k = int(first[int((slope + 1.0) * scale)])
                 while slope >= tangents[k + 1]:
@@ -182,7 +178,7 @@ def _tilt(sample: Floats, place: Floats) -> Floats:
     for reach_deg, step_deg in _TILTS:
         offsets = np.arange(-reach_deg, reach_deg + step_deg / 2.0, step_deg)
         tilts = best + _grid(offsets, offsets)
-        best = tilts[_contrasts(far, place, tilts, _FINE).argmax()]
+        best = tilts[_contrasts(far, place, tilts, _FINE_DEG).argmax()]
     return best
 
 
@@ -194,10 +190,10 @@ def _fine_place(sample: Floats, place: Floats, tilt: Floats) -> tuple[Floats, Fl
         used = sample[np.hypot(*(sample - place)[:, :2].T) > near_m]
         for _ in range(3):
             places = place + step_m * shifts
-            place = places[_contrasts(used, places, tilt, _FINE).argmax()]
+            place = places[_contrasts(used, places, tilt, _FINE_DEG).argmax()]
             tilts = tilt + step_deg * leans
-            tilt = tilts[_contrasts(used, place, tilts, _FINE).argmax()]
-    contrast = float(_contrasts(used, place, tilt, _FINE)[0])
-    beside = _contrasts(used, place + 0.5 * shifts[np.abs(shifts).sum(axis=1) == 1.0], tilt, _FINE).max()
+            tilt = tilts[_contrasts(used, place, tilts, _FINE_DEG).argmax()]
+    contrast = float(_contrasts(used, place, tilt, _FINE_DEG)[0])
+    beside = _contrasts(used, place + 0.5 * shifts[np.abs(shifts).sum(axis=1) == 1.0], tilt, _FINE_DEG).max()
     is_sure = contrast >= _LEAST_CONTRAST and contrast >= _LEAST_GAIN * beside
     return place, tilt, contrast if is_sure else math.nan

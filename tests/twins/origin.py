@@ -15,7 +15,7 @@ def contrast(points: np.ndarray, seen_from: Iterable[float], bins: Bins) -> floa
     counts = [0] * (len(bins.tangents) - 1)
     for dx, dy, dz in (points - [x, y, z]).tolist():
         flat = np.sqrt((dx - lean_x * dz) ** 2 + (dy - lean_y * dz) ** 2)
-        slope = (dz + lean_x * dx + lean_y * dy) * (1.0 / np.maximum(flat, 1e-9))
+        slope = (dz + lean_x * dx + lean_y * dy) / np.maximum(flat, 1e-9)
         k = int(np.searchsorted(bins.tangents, slope, "right")) - 1  # NaN is beyond the last
         if 0 <= k < len(counts):
             counts[k] += 1
