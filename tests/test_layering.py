@@ -83,6 +83,7 @@ FLOORS = {
         readers.apart
         readers.captures
         records
+        simulation.ray_draws
         simulation.raycast simulation.weather
         simulation.scene simulation.shapes
         simulation.vehicles

@@ -9,6 +9,7 @@ import numpy as np
 
 from ..system.kernels import njit
 from ..types.points import Bytes, Floats, Ints, Ints64, Points, Rows
+from .ray_draws import clumped_path, mixed_bits, normal_draw, uniform_draw
 
 # A primitive is a row of float64: kind, material, remission, density, center (3), rows of the matrix that maps an
 # offset from the center into the unit shape (9), taper of the front, rear and sides (3), object. Below 0, the last is a
@@ -56,6 +57,7 @@ class Rays(NamedTuple):
     azimuths: Floats  # (columns,) [rad]
     reach: float  # length [m]
     key: np.uint64  # seed of all draws
+    clumped: bool = False  # whether neighboring rays meet the same leaves (`ray_draws.clumped_path`)
 
 
 class Hits(NamedTuple):
@@ -85,31 +87,6 @@ class Echo(NamedTuple):
     lost: float  # probability of no return
     jitter: float  # factor of the noise
     least: float  # the remission reads no less
-
-
-@njit(cache=True, nogil=True)
-def mixed_bits(value: np.uint64) -> np.uint64:
-    """SplitMix64: a draw depends on its ray and purpose only, not on the order of the rays."""
-    value = np.uint64(value + np.uint64(0x9E3779B97F4A7C15))
-    value = np.uint64((value ^ (value >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9))
-    value = np.uint64((value ^ (value >> np.uint64(27))) * np.uint64(0x94D049BB133111EB))
-    return np.uint64(value ^ (value >> np.uint64(31)))
-
-
-@njit(cache=True, nogil=True)
-def uniform_draw(bits: np.uint64) -> float:
-    """Convert random bits to a uniform number in (0, 1)."""
-    return (float(bits >> np.uint64(11)) + 0.5) * (1.0 / 9007199254740992.0)
-
-
-@njit(cache=True, nogil=True)
-def normal_draw(bits: np.uint64) -> float:
-    """Convert random bits to a number of the normal distribution."""
-    # Sum of four 16-bit uniforms, scaled to variance 1: within 3.5 sigma, from one hash.
-    total = 0.0
-    for k in range(4):
-        total += float((bits >> np.uint64(16 * k)) & np.uint64(0xFFFF))
-    return (total / 65536.0 - 2.0) * 1.7320508075688772
 
 
 @njit(cache=True, nogil=True)
@@ -405,7 +382,7 @@ def fill_cast(shapes: Shapes, ground: Ground, T_world_sensor: Floats, rays: Rays
             if i < n_met:
                 nearest, limit = (0.999999 * radii[i - 1] / ce if i else 0.0), min(1.000001 * radii[i] / ce, limit)
             ray = mixed_bits(np.uint64(rays.key + np.uint64(b * n_columns + column)))
-            best, row, leave, face = _first_shape(shapes, sector, direction, tan, ray, limit)
+            best, row, leave, face = _first_shape(shapes, sector, direction, tan, ray, limit, rays.clumped)
             cosine = 0.0
             if row >= 0:
                 cosine = 0.7 if face < 0 else _cosine(shapes.primitives[row], face, best, *direction)
@@ -499,7 +476,13 @@ def _ground_rise(ground: Ground, T: Floats, level: tuple[float, float], tan: flo
 
 @njit(cache=True, nogil=True)
 def _first_shape(
-    shapes: Shapes, sector: int, direction: tuple[float, float, float], tan: float, ray: np.uint64, reach: float
+    shapes: Shapes,
+    sector: int,
+    direction: tuple[float, float, float],
+    tan: float,
+    ray: np.uint64,
+    reach: float,
+    clumped: bool,
 ) -> tuple[float, int, float, int]:
     """Find the first primitive that a ray hits within ``reach`` [m]: range, row (-2: none), exit [m], face."""
     best, row, leave_best, face_best = reach, _NOTHING, reach, -1
@@ -516,8 +499,9 @@ def _first_shape(
         material = int(p[1])
         if material == LEAVES:
             # Random free path through the leaves.
-            draw = uniform_draw(mixed_bits(np.uint64(ray ^ np.uint64(k + 1))))
-            t = max(enter, 0.0) - math.log(draw) / p[3]
+            path = -math.log(uniform_draw(mixed_bits(np.uint64(ray ^ np.uint64(k + 1)))))
+            enter = max(enter, 0.0)
+            t = enter + (clumped_path(p, enter, direction, path) if clumped else path) / p[3]
             if t < leave and t < best:
                 best, row, leave_best, face_best = t, k, leave, -1
         elif enter > 0.0 and enter < best:

@@ -38,12 +38,14 @@ def simulated_scan(
     *,
     mounting: Mounting | None = None,
     indoors: bool = False,
+    clumped_leaves: bool = False,
 ) -> SimulatedScan:
     """Simulate one scan of a new scene. The vehicle is slightly pitched and rolled, beside the middle of its lane.
 
     boxes : a real layout to build the scene around (`layouts.scene_from_boxes`); by default the scene is random.
     mounting : height, and tilt relative to the vehicle; by default the sensor's height, upright. Points and boxes are
         in the frame of the tilted sensor.
+    clumped_leaves : as of `scene.simulate`.
     indoors : in a hall, without a layout (`halls.hall`); a sensor that is as high as the ceiling hangs below it.
     """
     rng = np.random.default_rng((seed, 1))
@@ -70,7 +72,7 @@ def simulated_scan(
             pose[2, 3] = scene.ground_height(x, y) + mounting.height_m
     pose[2, 3] = min(pose[2, 3], scene.ground_height(x, y) + highest_m - CLEAR_M)
     # Vehicles differ in what they hide. KITTI's car is one of them.
-    return simulate(scene, sensor, seed, pose, ego_shadow=bool(rng.random() < 0.85))
+    return simulate(scene, sensor, seed, pose, ego_shadow=bool(rng.random() < 0.85), clumped_leaves=clumped_leaves)
 
 
 def _is_free(scene: Scene, x: float, y: float, yaw: float) -> bool:

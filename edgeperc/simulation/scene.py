@@ -225,6 +225,7 @@ def simulate(
     ego_shadow: bool = True,
     start_s: float = 0.0,
     duration_s: float | None = None,
+    clumped_leaves: bool = False,
 ) -> SimulatedScan:
     """Simulate one scan.
 
@@ -248,6 +249,9 @@ def simulate(
         Of a sensor with a `ScanPattern`: when the scan begins, which decides its directions, and how long it is
         gathered from this one place [s]; by default as long as its profile says. A moving sensor gathers several short
         scans (`simulate_sequence`).
+    clumped_leaves : bool
+        Whether neighboring rays meet the same leaves, as on real plants: so are training scans. Else each ray has its
+        own free path, and plants are three times as rough; so are the streets that figures are measured on.
 
     Returns
     -------
@@ -283,7 +287,7 @@ def simulate(
     shapes = place_shapes(scene, pose, _SECTORS if profile.pattern else n_columns, reach)
     shape = (n_beams, n_columns)
     hits = Hits(np.empty(shape), np.empty(shape, np.int32), np.empty(shape), np.empty(shape))
-    rays = Rays(elevations, azimuths, reach, np.uint64(rng.integers(0, 2**63)))
+    rays = Rays(elevations, azimuths, reach, np.uint64(rng.integers(0, 2**63)), clumped_leaves)
     fill_cast(shapes, scene.ground, pose, rays, hits)
     receiver = Receiver(range_offsets, remission_offsets, profile.min_range_m, noise, noise and ego_shadow)
     points = np.empty((n_beams * n_columns, 4), dtype=np.float32)

@@ -60,7 +60,7 @@ def _path(out: Path, seed: int) -> Path:
 def _simulate(seed: int, *, out: Path, layouts: Sequence[Sequence[Box]], sensor: str, indoors: bool) -> None:
     # 4,973 is prime: neighboring seeds take layouts of different drives.
     boxes = layouts[seed * 4973 % len(layouts)] if layouts and seed % 2 and not indoors else None
-    scan = LabeledScan.from_simulation(simulated_scan(seed, sensor, boxes, indoors=indoors))
+    scan = LabeledScan.from_simulation(simulated_scan(seed, sensor, boxes, indoors=indoors, clumped_leaves=True))
     if sensor != TRAINING_SENSOR:
         scan = replace(scan, sensor=get_sensor(sensor))
     scan.save(_path(out, seed))

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 import twins.simulation
 from edgeperc.errors import PointsError
-from edgeperc.simulation import drawn, raycast
+from edgeperc.simulation import drawn, ray_draws, raycast
 from edgeperc.simulation.drawn import ENVIRONMENTS, random_scene
 from edgeperc.simulation.layouts import scene_from_boxes
 from edgeperc.simulation.raycast import (
@@ -129,14 +129,14 @@ def near_scene(seed: int, environment: str | None = None) -> Scene:
     return scene
 
 
-@pytest.mark.parametrize(("seed", "tilt"), [(0, 0.0), (1, 0.03), (2, 0.03)])
-def test_cast_is_its_twin(seed: int, tilt: float) -> None:
+@pytest.mark.parametrize(("seed", "tilt", "clumped"), [(0, 0.0, False), (1, 0.03, True), (2, 0.03, True)])
+def test_cast_is_its_twin(seed: int, tilt: float, clumped: bool) -> None:
     scene = near_scene(seed)
     rng = np.random.default_rng(seed)
     azimuths = np.arange(20) * 2 * np.pi / 20
     elevations = np.sort(np.radians(rng.uniform(-24, 8, 6)))[::-1].copy()
     pose = sensor_pose(scene, SMALL, 1.0, 0.3, yaw=0.2, pitch=tilt, roll=-tilt)
-    rays = Rays(elevations[:, None], azimuths, 40.0, KEY)
+    rays = Rays(elevations[:, None], azimuths, 40.0, KEY, clumped)
     placed, (ranges, hits, exits, cosines) = cast(scene, pose, rays)
     slow_ranges, slow_hits = twins.simulation.cast(placed, scene, pose, *rays)
     # Where a ray all but grazes the ground, a kerb between two samples may be missed too.
@@ -225,6 +225,27 @@ def test_drivable_cells_are_those_of_the_twin() -> None:
             np.testing.assert_array_equal(scan.top_view_labels(view), twins.simulation.drivable(scene, pose, x, y))
 
 
+def test_neighbors_meet_the_same_leaves_where_they_are_clumped() -> None:
+    """A hedge then bends less than half as much from ray to ray, and is entered as deep."""
+    hedges = np.array([block(LEAVES, 0.4, (10.0, 0.0, 100.0), (4.0, 3.0, 3.0), density=3.0 + k) for k in range(30)])
+    azimuths = np.linspace(-0.1, 0.1, 129)
+    bends, depths = {}, {}
+    for clumped in (False, True):
+        found = []
+        for hedge in hedges:
+            scene = replace(random_scene(1), primitives=hedge[None], objects=())
+            pose = np.eye(4)
+            pose[2, 3] = 100.0  # the ground is out of reach
+            _, hits = cast(scene, pose, Rays(np.zeros((1, 1)), azimuths, 40.0, KEY, clumped))
+            found.append(hits.ranges[0] * np.cos(azimuths) - 8.0)
+        depth = np.array(found)
+        assert (depth > 0.0).all()
+        bends[clumped] = np.median(np.abs(np.diff(depth, 2)))
+        depths[clumped] = (depth.mean(axis=1) * hedges[:, 3]).mean()
+    assert bends[True] < 0.4 * bends[False]
+    assert depths[True] == pytest.approx(depths[False], rel=0.15)
+
+
 @pytest.mark.parametrize(("seed", "noise"), [(3, False), (4, True)])
 def test_points_are_those_of_the_twin(seed: int, noise: bool) -> None:
     scene = random_scene(seed, ("urban", "residential")[seed % 2])
@@ -285,11 +306,11 @@ def test_ground_equals_twin() -> None:
 
 def test_draws_equal_twin() -> None:
     for value in (0, 1, 2**63, 2**64 - 1):
-        bits = np.uint64(raycast.mixed_bits(np.uint64(value)))
+        bits = np.uint64(ray_draws.mixed_bits(np.uint64(value)))
         assert int(bits) == twins.simulation.mixed(value)
-        assert raycast.uniform_draw(bits) == pytest.approx(twins.simulation.uniform_draw(int(bits)), abs=1e-15)
-        assert raycast.normal_draw(bits) == pytest.approx(twins.simulation.normal_draw(int(bits)), abs=1e-12)
-    normals = [raycast.normal_draw(np.uint64(raycast.mixed_bits(np.uint64(k)))) for k in range(4000)]
+        assert ray_draws.uniform_draw(bits) == pytest.approx(twins.simulation.uniform_draw(int(bits)), abs=1e-15)
+        assert ray_draws.normal_draw(bits) == pytest.approx(twins.simulation.normal_draw(int(bits)), abs=1e-12)
+    normals = [ray_draws.normal_draw(np.uint64(ray_draws.mixed_bits(np.uint64(k)))) for k in range(4000)]
     assert abs(np.mean(normals)) < 0.06
     assert abs(np.std(normals) - 1.0) < 0.05
 

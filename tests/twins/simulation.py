@@ -9,6 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from edgeperc.simulation.ray_draws import CLUMPS
+
 
 def mixed(value: int) -> int:
     """splitmix64."""
@@ -194,8 +196,36 @@ def ground(scene: Any, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.nda
     )
 
 
+def path_at(plant: int, place: np.ndarray) -> float:
+    """Twin of `_path_at`."""
+    cell = np.floor(place).astype(int)
+    path = 0.0
+    for corner in itertools.product((0, 1), repeat=3):
+        i, j, k = (int(each) + 4096 for each in cell + corner)
+        share = np.prod(np.where(corner, place - cell, 1.0 - (place - cell)))
+        path -= share * math.log(uniform_draw(mixed(plant ^ (i << 32 | j << 16) ^ k)))
+    return path
+
+
+def clumped_path(primitive: np.ndarray, place: np.ndarray, path: float) -> float:
+    """Twin of `_clumped_path`; ``place``: where the ray meets the plant."""
+    matrix = primitive[7:16].reshape(3, 3)
+    local = matrix @ (place - primitive[4:7]) / np.linalg.norm(matrix, axis=1)
+    plant = mixed(int(primitive[3] * 1e12))
+    own = 0.03 + 0.8 * uniform_draw(mixed(plant)) ** 2
+    clump = sum(weight * path_at(plant, local / length) for weight, length in CLUMPS)
+    return (1.0 - own) * clump + own * path
+
+
 def cast(
-    primitives: np.ndarray, scene: Any, pose: Any, elevations: np.ndarray, azimuths: np.ndarray, reach: float, key: int
+    primitives: np.ndarray,
+    scene: Any,
+    pose: Any,
+    elevations: np.ndarray,
+    azimuths: np.ndarray,
+    reach: float,
+    key: int,
+    clumped: bool,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Twin of `fill_cast`: tries every primitive near the ray, and walks over the ground in steps of 5 mm."""
     shape = (len(elevations), len(azimuths))
@@ -220,7 +250,8 @@ def cast(
                     continue
                 t, draw = found[0], uniform_draw(mixed(ray ^ (int(k) + 1)))
                 if primitive[1] == 4:  # leaves: a free path
-                    t = max(t, 0.0) - np.log(draw) / primitive[3]
+                    t, path = max(t, 0.0), -np.log(draw)
+                    t += (clumped_path(primitive, t * direction, path) if clumped else path) / primitive[3]
                     if t >= found[1]:
                         continue
                 elif t <= 0 or (primitive[1] == 5 and draw > primitive[3]):  # inside it, or through a gap
@@ -286,7 +317,7 @@ def points(
     primitives: np.ndarray, scene: Any, pose: Any, rays: np.ndarray, found: np.ndarray, receiver: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Twin of `fill_points`: the returns (n, 4) float32 and the object of each, all rays at once."""
-    elevations, azimuths, reach, key = rays
+    elevations, azimuths, reach, key, _ = rays
     ranges, hits, exits, cosines = found
     range_offsets, remission_offsets, min_range, noise, ego_shadow = receiver
     beam, column = np.nonzero((hits > -2) & np.isfinite(ranges))
