@@ -308,6 +308,7 @@ class Perceiver:
             "scans": bool(scans),
             "views": points or top_view,
             "fitness": self.on_mismatch != "ignore" and any(card.fitness is not None for card in scans),
+            "curvature": any("curvature" in card.input.channels for card in scans),
             "crop": (points or top_view) and (self._finds_sensor or not gaps),
             "gaps": gaps,
             "turn": points and self.full_turn,

@@ -40,6 +40,13 @@ HEIGHT_INPUT = InputSpec(
     (*RANGE_IMAGE_INPUT.mean, 0.41),
     (*RANGE_IMAGE_INPUT.std, 0.72),
 )
+# With the curvature: of the same returns.
+CURVED_INPUT = InputSpec(
+    "range_image",
+    (*HEIGHT_INPUT.channels, "curvature"),
+    (*HEIGHT_INPUT.mean, 0.2),
+    (*HEIGHT_INPUT.std, 0.24),
+)
 
 # Means and standard deviations, rounded, of the features of 30,000 training samples.
 OBJECT_INPUT = InputSpec(
@@ -73,6 +80,7 @@ def card_of(recipe: Recipe, **facts: Any) -> ModelCard:
         outputs, classes = [OutputSpec("logits", "camera_logits")], CAMERA_CLASSES
     elif recipe.task == "points":
         view, input = RANGE_IMAGE, HEIGHT_INPUT if recipe.height_above_ground else RANGE_IMAGE_INPUT
+        input = CURVED_INPUT if recipe.curvature else input
         outputs, classes = [OutputSpec("logits", "class_logits", block=block)], recipe.classes or POINT_CLASSES
     elif recipe.task == "road":
         outputs, classes = [OutputSpec("segmentation", "class_logits")], ROAD_CLASSES

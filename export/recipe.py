@@ -69,6 +69,9 @@ class Recipe:
         False, "the box head also predicts which end of a vehicle is its front; only with head dense"
     )
     height_above_ground: bool = _points(False, "the input has a channel with the height of each point above the ground")
+    curvature: bool = _points(
+        False, "the input has the height above the ground, and a channel with how much the range bends along a row"
+    )
     classes: tuple[str, ...] = _points(
         (), "classes of points, the background first, separated by commas; empty: those of edgeperc"
     )
@@ -125,6 +128,9 @@ class Recipe:
     )
     no_remission: float = _scans(
         0.05, "share of scans whose remission is the constant that stands for a missing one at run time"
+    )
+    range_noise_m: float = _points(
+        0.0, "half of the scans get noise along the rays, of a standard deviation of up to this many meters"
     )
     redraw_every: int = _scans(
         1000, "after this many steps, label some training scans and draw those with false objects more often; 0: never"

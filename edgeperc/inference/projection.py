@@ -18,7 +18,7 @@ import numpy as np
 from ..errors import CardError, PointsError
 from ..ground.planes import find_ground
 from ..system.kernels import njit
-from ..types.card import InputSpec
+from ..types.card import CHANNELS, InputSpec
 from ..types.mounting import MODEL_HEIGHT_M
 from ..types.points import Floats32, Heights, Ints, Ints64, Points, read_only
 from ..types.views import RangeImageGeometry, TopViewGeometry
@@ -26,6 +26,7 @@ from ..types.views import RangeImageGeometry, TopViewGeometry
 # Number of each channel in the kernels. "height" is z; "distance" is the range in the x-y plane.
 CHANNEL_CODES = {"x": 0, "y": 1, "z": 2, "height": 2, "remission": 3, "distance": 4, "range": 5}
 CHANNEL_CODES["height_above_ground"] = 6
+CURVATURE = CHANNEL_CODES["curvature"] = 7  # of pixels and their neighbors, not of points: by `fill_curvature`
 HEIGHT_RANGE_M = (-1.0, 5.0)  # heights above the ground are clipped to it; what is farther off is seldom an object
 
 # The nearest point of a pixel is the smallest of `rank << 32 | row of points`: the better rank wins, then the earlier
@@ -35,7 +36,7 @@ EMPTY = np.int64(0x7F80_0000 << 32)
 LOW_WORD = np.int64(0xFFFF_FFFF)
 
 ZERO = np.float32(0.0)
-TWO = np.float32(2.0)
+ONE, TWO = np.float32(1.0), np.float32(2.0)
 INFINITY = np.float32(math.inf)
 LOWEST, HIGHEST = np.float32(HEIGHT_RANGE_M[0]), np.float32(HEIGHT_RANGE_M[1])
 
@@ -275,12 +276,44 @@ def fill_image(
                 height = height if height > LOWEST else LOWEST
                 planes[6, p] = height if height < HIGHEST else HIGHEST
         for c in range(channels.shape[0]):
+            if channels[c] == CURVATURE:
+                continue
             raw = planes[channels[c]]
             channel_mean = mean[c]
             channel_std = std[c]
             out = image[c, start : start + PIXEL_BLOCK]
             for p in range(size):
                 out[p] = (raw[p] - channel_mean) / channel_std if row_of[p] >= 0 else ZERO
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def fill_curvature(points: Points, index: Ints, mean: np.float32, std: np.float32, plane: Floats32) -> None:
+    """Write into a channel how the range bends along each row of ``index``: sqrt(|before - 2 here + after|), at most 1.
+
+    The root tells leaves, which bend by centimeters, from walls and still holds the edges of objects.
+    """
+    values = points.reshape(-1)
+    height, width = index.shape
+    for row in range(height):
+        before, here = np.float32(math.nan), _range_at(values, index[row, 0])
+        for column in range(width):
+            after = np.float32(math.nan)
+            if column + 1 < width:
+                after = _range_at(values, index[row, column + 1])
+            bend = np.abs(before - TWO * here + after)
+            raw = np.sqrt(min(bend, ONE)) if bend >= ZERO else ZERO  # NaN: a neighbor is empty
+            plane[row, column] = (raw - mean) / std if index[row, column] >= 0 else ZERO
+            before, here = here, after
+
+
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _range_at(values: Floats32, row: np.int32) -> np.float32:
+    """Range of the point in a row of the points, NaN of none."""
+    if row < 0:
+        return np.float32(math.nan)
+    at = np.uint64(row) * np.uint64(4)
+    x, y, z = values[at], values[at + np.uint64(1)], values[at + np.uint64(2)]
+    return np.sqrt(x * x + y * y + z * z)
 
 
 class TopViewProjector:
@@ -331,8 +364,9 @@ class RangeImageProjector:
     out. Its column follows from its azimuth, atan2(y, x). Pixels are half-open: a pixel includes its upper and left
     edges. The point nearest to the sensor wins a pixel (by squared range in float32), the earlier one on ties. Points
     on the sensor's vertical axis have no azimuth and are out of view. Channels, in any order: ``"x"``, ``"y"``,
-    ``"z"``, ``"remission"``, ``"range"`` and ``"height_above_ground"`` [m], the last clipped to -1..5 m. One instance
-    per thread.
+    ``"z"``, ``"remission"``, ``"range"`` and ``"height_above_ground"`` [m], clipped to -1..5 m, and ``"curvature"``,
+    how much the range bends along a row (`fill_curvature`; LOAM, equation 1, with one neighbor on each side). One
+    instance per thread.
 
     PointSeg's equation 2 uses arcsin(y / sqrt(x^2 + y^2 + z^2)) as azimuth. That is arcsin(sin(azimuth) *
     cos(elevation)), which is smaller than the azimuth, and the error grows as the beam points farther down. At azimuth
@@ -348,8 +382,7 @@ class RangeImageProjector:
         self.view = view
         self.shape = (len(input.channels), view.height, view.width)
         self.needs_ground = input.needs_ground
-        known = ("x", "y", "z", "remission", "range", "height_above_ground")
-        self._channels, self._mean, self._std = _channels(input, known)
+        self._channels, self._mean, self._std = _channels(input, CHANNELS["range_image"])
         self._wedge = wedge(view)
         self._rows = tabulate(row_edges(view), "rows")
         self._cols = tabulate(column_edges(view), "columns")
@@ -369,6 +402,8 @@ class RangeImageProjector:
         heights = _heights(self.needs_ground, len(points), height_m)
         flat_image = image.reshape(self.shape[0], -1)
         fill_image(points, heights, index.reshape(-1), self._channels, self._mean, self._std, flat_image)
+        for c in np.flatnonzero(self._channels == CURVATURE):
+            fill_curvature(points, index, self._mean[c], self._std[c], image[c])
 
     def project(self, points: Points, height_m: Heights | None = None) -> Projection:
         """Project into fresh buffers; arguments and errors as in `TopViewProjector.fill`."""

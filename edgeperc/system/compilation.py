@@ -33,6 +33,7 @@ KERNELS: Mapping[str, str] = MappingProxyType(
         "preprocess.health.fill_lacking preprocess.health.fill_sectors preprocess.health.mark_isolated "
         "preprocess.returns.fill_returns preprocess.returns.has_returns_only types.frame.fill_moved",
         "views": "inference.decode.fill_labels inference.projection.fill_image",
+        "curvature": "inference.projection.fill_curvature",
         "fitness": "preprocess.fitness.fill_scan_sums",
         "crop": "inference.crop.fill_rows",
         "gaps": "preprocess.interpolation.fill_between",

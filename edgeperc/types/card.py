@@ -36,7 +36,7 @@ OUTPUT_KINDS = (
 CHANNELS = {
     "camera": ("red", "green", "blue"),
     "top_view": ("distance", "remission", "height"),
-    "range_image": ("x", "y", "z", "remission", "range", "height_above_ground"),
+    "range_image": ("x", "y", "z", "remission", "range", "height_above_ground", "curvature"),
     "objects": (
         *("x", "y", "height_above_ground", "remission", "beyond_length", "beyond_width"),
         *("length", "width", "top", "sensor_ahead", "sensor_left", "range", "n_points"),

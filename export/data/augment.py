@@ -268,6 +268,15 @@ def weathered(scan: LabeledScan, rng: np.random.Generator) -> LabeledScan:
     return replace(scan, points=points, labels=labels)
 
 
+def noisy(scan: LabeledScan, rng: np.random.Generator, most_m: float) -> LabeledScan:
+    """The scan by a sensor whose ranges have a standard deviation of up to ``most_m`` more."""
+    noise_m = rng.normal(0.0, rng.uniform(0.0, most_m), len(scan.points))
+    stretch = 1.0 + noise_m / np.maximum(np.linalg.norm(scan.points[:, :3], axis=1), 1.0)
+    points = scan.points.copy()
+    points[:, :3] *= stretch.astype(np.float32)[:, None]
+    return replace(scan, points=points)
+
+
 def with_ground_ahead(scan: LabeledScan) -> LabeledScan:
     """The scan with the unlabeled ground at the own bumper as background.
 
@@ -318,6 +327,7 @@ class Augmentation:
     # standard deviation of the errors of roll and pitch [deg]; the errors are at most twice as large
     tilt_deg: float = 0.0
     no_remission: float = 0.0  # share of scans whose remission is the constant that stands for a missing one
+    range_noise_m: float = 0.0  # half of the scans get noise along the rays, of a standard deviation up to this
 
 
 def augmented(
@@ -358,6 +368,8 @@ def augmented(
         scan = weathered(scan, rng)
     if sensor is not None:
         scan = taken_by(sensor, scan, rng)
+    if how.range_noise_m > 0.0 and rng.random() < 0.5:
+        scan = noisy(scan, rng, how.range_noise_m)
     points, labels = scan.points, scan.labels
     if rng.random() < 0.3:
         kept = rng.random(len(points)) < rng.uniform(0.75, 1.0)

@@ -295,6 +295,21 @@ def test_a_tilted_scan_keeps_its_objects(scan: LabeledScan) -> None:
     )
 
 
+def test_noise_moves_points_along_their_rays(scan: LabeledScan) -> None:
+    far = np.linalg.norm(scan.points[:, :3], axis=1) > 2.0
+    spreads = []
+    for seed in range(20):
+        other = augment.noisy(scan, np.random.default_rng(seed), 0.03)
+        moved = (other.points[:, :3] - scan.points[:, :3])[far]
+        ray = scan.points[far, :3] / np.linalg.norm(scan.points[far, :3], axis=1)[:, None]
+        along = (moved * ray).sum(axis=1)
+        np.testing.assert_allclose(moved, along[:, None] * ray, atol=1e-4)
+        assert abs(along.mean()) < 1e-3
+        spreads.append(along.std())
+        np.testing.assert_array_equal(other.points[:, 3], scan.points[:, 3])
+    assert 0.0 <= min(spreads) < 0.01 < 0.02 < max(spreads) <= 0.031
+
+
 def test_scans_without_remission_have_the_constant_of_the_runtime(scan: LabeledScan) -> None:
     rng = np.random.default_rng(0)
     missing = augment.augmented(scan, rng, augment.Augmentation(no_remission=1.0))

@@ -72,7 +72,7 @@ def exported(
     return of
 
 
-HEIGHTS = Recipe("pointseg", edge=True, height_above_ground=True)
+HEIGHTS = Recipe("pointseg", edge=True, curvature=True)
 
 
 @pytest.mark.parametrize(

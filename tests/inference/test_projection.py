@@ -302,6 +302,19 @@ def test_heights_above_the_ground_are_clipped_and_normalized() -> None:
     assert not seen.image[:, seen.index < 0].any()
 
 
+def test_curvature_is_the_root_of_the_bend_between_neighbors() -> None:
+    """A wall is straight, leaves are not; ends of rows and neighbors of gaps have none."""
+    view = RangeImageGeometry((0.0, -1.0), 8, 4.0, -4.0)
+    spec = InputSpec("input", ("range", "curvature"), (0.0, 0.5), (1.0, 2.0))
+    ranges = np.float32([10.0, 11.0, 12.0, 12.09, 12.18, 50.0, math.nan, 20.0])
+    azimuth = np.deg2rad(3.5 - np.arange(8))
+    points = np.float32([ranges * np.cos(azimuth), ranges * np.sin(azimuth), 0.0 * ranges, 0.0 * ranges]).T.copy()
+    seen = make_projector(view, spec).project(points)
+    np.testing.assert_allclose(seen.image[0, 0], np.nan_to_num(ranges), rtol=1e-6)
+    bends = [0.0, 0.0, 0.91, 0.0, 1.0, 0.0, math.nan, 0.0]
+    np.testing.assert_allclose(seen.image[1, 0], np.nan_to_num((np.sqrt(bends) - 0.5) / 2.0), atol=2e-3)
+
+
 def test_missing_or_wrong_heights_are_refused() -> None:
     projector = make_projector(VIEWS["front"], spec_of(VIEWS["front"]))
     points = np.ones((5, 4), np.float32)
@@ -319,7 +332,7 @@ def test_five_channels_do_not_depend_on_heights() -> None:
     points = random_points(np.random.default_rng(4), 3000)
     names = CHANNELS["range_image"][:5]
     without = make_projector(VIEWS["front"], InputSpec("input", names, (0.5,) * 5, (2.0,) * 5)).project(points)
-    six = InputSpec("input", CHANNELS["range_image"], (0.5,) * 6, (2.0,) * 6)
+    six = InputSpec("input", CHANNELS["range_image"][:6], (0.5,) * 6, (2.0,) * 6)
     seen = make_projector(VIEWS["front"], six).project(points, heights_of(points))
     np.testing.assert_array_equal(seen.image[:5], without.image)
 

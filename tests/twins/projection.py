@@ -43,6 +43,15 @@ def range_image_pixel(point: np.ndarray, view: Any, row_edges: np.ndarray, col_e
     return row * view.width + col, squared_range
 
 
+def curvature(points: np.ndarray, index: np.ndarray, flat: int, width: int) -> np.float32:
+    """Root of how much the range bends at a pixel, at most 1; 0 at an end of a row and beside an empty pixel."""
+    if flat % width in (0, width - 1) or min(index[flat - 1], index[flat + 1]) < 0:
+        return np.float32(0.0)
+    x, y, z, _ = points[index[flat - 1 : flat + 2]].T
+    before, here, after = np.sqrt(x * x + y * y + z * z)
+    return np.float32(np.sqrt(min(abs(before - np.float32(2.0) * here + after), np.float32(1.0))))
+
+
 def project(
     points: np.ndarray, view: Any, edges: Any, spec: InputSpec, height_m: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -67,7 +76,11 @@ def project(
             above = -1.0 if height_m is None or np.isnan(height_m[i]) else min(max(height_m[i], -1.0), 5.0)
             raw = {
                 "x": x, "y": y, "z": z, "height": z, "distance": distance, "range": np.sqrt(x * x + y * y + z * z),
-                "remission": remission, "height_above_ground": above,
+                "remission": remission, "height_above_ground": above, "curvature": np.float32(0.0),
             }  # fmt: skip
             image[:, flat] = (np.array([raw[name] for name in spec.channels], np.float32) - mean) / std
+        for c in [c for c, name in enumerate(spec.channels) if name == "curvature"]:
+            for flat in best:
+                raw = curvature(points, index, flat, view.width)
+                image[c, flat] = (raw - mean[c]) / std[c]
     return image.reshape(-1, view.height, view.width), index.reshape(view.height, view.width), pixel
