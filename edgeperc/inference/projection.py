@@ -294,26 +294,23 @@ def fill_curvature(points: Points, index: Ints, mean: np.float32, std: np.float3
     """
     values = points.reshape(-1)
     height, width = index.shape
+    if values.shape[0] == 0:
+        plane[:] = ZERO
+        return
+    ranges = np.empty(width + 2, np.float32)  # of a row, between pixels without a return: NaN, as its bends
+    ranges[0] = ranges[width + 1] = np.float32(math.nan)
     for row in range(height):
-        before, here = np.float32(math.nan), _range_at(values, index[row, 0])
+        row_of, out = index[row], plane[row]
         for column in range(width):
-            after = np.float32(math.nan)
-            if column + 1 < width:
-                after = _range_at(values, index[row, column + 1])
-            bend = np.abs(before - TWO * here + after)
-            raw = np.sqrt(min(bend, ONE)) if bend >= ZERO else ZERO  # NaN: a neighbor is empty
-            plane[row, column] = (raw - mean) / std if index[row, column] >= 0 else ZERO
-            before, here = here, after
-
-
-@njit(cache=True, nogil=True, error_model="numpy", inline="always")
-def _range_at(values: Floats32, row: np.int32) -> np.float32:
-    """Range of the point in a row of the points, NaN of none."""
-    if row < 0:
-        return np.float32(math.nan)
-    at = np.uint64(row) * np.uint64(4)
-    x, y, z = values[at], values[at + np.uint64(1)], values[at + np.uint64(2)]
-    return np.sqrt(x * x + y * y + z * z)
+            at = np.uint64(max(row_of[column], np.int32(0))) * np.uint64(4)
+            x, y, z = values[at], values[at + np.uint64(1)], values[at + np.uint64(2)]
+            ranges[column + 1] = x * x + y * y + z * z if row_of[column] >= 0 else np.float32(math.nan)
+        for column in range(1, width + 1):
+            ranges[column] = np.sqrt(ranges[column])
+        for column in range(width):
+            bend = np.abs(ranges[column] - TWO * ranges[column + 1] + ranges[column + 2])
+            raw = np.sqrt(min(bend, ONE)) if bend >= ZERO else ZERO
+            out[column] = (raw - mean) / std if row_of[column] >= 0 else ZERO
 
 
 class TopViewProjector:
