@@ -364,7 +364,7 @@ SCENE = replace(
 CURVED = replace(
     SCENE,
     curvature=True,
-    range_noise_m=0.03,
+    range_noise_m=0.01,
     beams=0.3,
     steps=1500,
     batch=16,
