@@ -17,7 +17,10 @@ from edgeperc.simulation.samples import simulated_scan
 from edgeperc.types.card import InputSpec
 from edgeperc.types.detector import PillarGeometry
 
-SET_UPS = ({}, {"full_turn": True}, {"models": "lodnn"}, {"boxes_from": "clusters"}, {"agree": False, "precision": "fp32"})
+SET_UPS = (
+    *({}, {"full_turn": True}, {"models": "lodnn"}, {"models": "sceneseg"}),
+    *({"boxes_from": "clusters"}, {"agree": False, "precision": "fp32"}),
+)
 
 
 def decode_packets() -> None:
