@@ -297,7 +297,7 @@ def fill_curvature(points: Points, index: Ints, mean: np.float32, std: np.float3
     if values.shape[0] == 0:
         plane[:] = ZERO
         return
-    ranges = np.empty(width + 2, np.float32)  # of a row, between pixels without a return: NaN, as its bends
+    ranges = np.empty(width + 2, np.float32)  # of a row and beyond its ends; NaN without a return
     ranges[0] = ranges[width + 1] = np.float32(math.nan)
     for row in range(height):
         row_of, out = index[row], plane[row]
