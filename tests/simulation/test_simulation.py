@@ -129,7 +129,9 @@ def near_scene(seed: int, environment: str | None = None) -> Scene:
     return scene
 
 
-@pytest.mark.parametrize(("seed", "tilt", "clumped"), [(0, 0.0, False), (1, 0.03, True), (2, 0.03, True)])
+@pytest.mark.parametrize(
+    ("seed", "tilt", "clumped"), [(0, 0.0, False), (0, 0.0, True), (1, 0.03, False), (2, 0.03, True)]
+)
 def test_cast_is_its_twin(seed: int, tilt: float, clumped: bool) -> None:
     scene = near_scene(seed)
     rng = np.random.default_rng(seed)
@@ -223,6 +225,18 @@ def test_drivable_cells_are_those_of_the_twin() -> None:
         ):
             x, y = (centers.ravel() for centers in view.cell_centers())
             np.testing.assert_array_equal(scan.top_view_labels(view), twins.simulation.drivable(scene, pose, x, y))
+
+
+def test_clumped_paths_are_those_of_the_twin() -> None:
+    rng = np.random.default_rng(5)
+    for _ in range(40):
+        size, center = tuple(rng.uniform(0.5, 8.0, 3)), tuple(rng.uniform(-20.0, 20.0, 3))
+        plant = np.array(block(LEAVES, 0.4, center, size, yaw=rng.uniform(-3, 3), density=rng.uniform(0.3, 12.0)))
+        direction = rng.normal(size=3)
+        direction /= np.linalg.norm(direction)
+        t, path = rng.uniform(0.0, 40.0), rng.exponential()
+        expected = twins.simulation.clumped_path(plant, t * direction, path)
+        assert ray_draws.clumped_path(plant, t, tuple(direction.tolist()), path) == pytest.approx(expected, abs=1e-9)
 
 
 def test_neighbors_meet_the_same_leaves_where_they_are_clumped() -> None:
