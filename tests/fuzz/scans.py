@@ -44,9 +44,9 @@ VEHICLES = {"car": (4.0, 1.8, 1.6), "van": (5.0, 2.0, 2.2)}
 
 
 def card_of(view: TopViewGeometry | RangeImageGeometry, *outputs: OutputSpec, above: bool = False) -> ModelCard:
-    """A card; ``above``: with the height above the ground as an input channel."""
+    """A card; ``above``: with the height above the ground and the curvature as input channels."""
     top = isinstance(view, TopViewGeometry)
-    channels = (*VIEWS[view.kind], *(["height_above_ground"] if above else []))
+    channels = (*VIEWS[view.kind], *(["height_above_ground", "curvature"] if above else []))
     return ModelCard(
         name=f"made-up-{view.kind}",
         version="1",

@@ -36,12 +36,13 @@ def boxed_card() -> ModelCard:
 
 
 def image_card() -> ModelCard:
-    """Of a range image with heights above the ground."""
+    """Of a range image with every channel."""
+    names = CHANNELS["range_image"]
     return replace(
         CARD,
         golden=None,
         view=RangeImageGeometry(tuple(2.0 - 1.7 * k for k in range(16)), 64),
-        input=InputSpec("x", CHANNELS["range_image"], (0.0,) * 6, (10.0,) * 6),
+        input=InputSpec("x", names, (0.0,) * len(names), (10.0,) * len(names)),
         classes=("background", "car", "pedestrian", "cyclist"),
         fitness=resolve("pointseg")[0].card.fitness,
     )
