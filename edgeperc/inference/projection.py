@@ -325,7 +325,7 @@ class TopViewProjector:
         self.view = view
         self.shape = (len(input.channels), view.height, view.width)
         self.needs_ground = input.needs_ground
-        self._channels, self._mean, self._std = _channels(input, ("distance", "remission", "height"))
+        self._channels, self._mean, self._std = _channels(input, CHANNELS["top_view"])
         self._bounds = Bounds(
             np.float32(view.x_range_m[0]),
             np.float32(view.x_range_m[1]),
