@@ -421,14 +421,14 @@ MODELS = {
     # The object network sees points, not beams: with scans of other sensors it learns how sparse an object may be.
     # Without halls it took walls, beams and pipes for trucks.
     "objects": Stage(OBJECTS, also=("sensors", "halls")),
-    "pointseg-open": Stage(OPEN_POINTS, is_open=True, also=("six-sensors",)),
     "ssadnet-open": Stage(
         replace(OPEN, network="ssadnet", height_above_ground=False, front=True, n_pasted=3.0),
         is_open=True,
         also=("sensors",),
     ),
     "objects-open": Stage(replace(OBJECTS, steps=16_000, detector=False), is_open=True, also=("sensors", "halls")),
-    "scene-start": Stage(SCENE, after="pointseg-open", is_open=True, also=("sensors",)),
+    "four-classes-start": Stage(OPEN_POINTS, is_open=True, also=("six-sensors",)),
+    "scene-start": Stage(SCENE, after="four-classes-start", is_open=True, also=("sensors",)),
     "sceneseg-start": Stage(
         replace(SCENE, steps=10_800, batch=32, reuse=8, ema=0.999, beams=0.3, cooldown=0.5, redraw_every=4000),
         after="scene-start",

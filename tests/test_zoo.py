@@ -35,7 +35,6 @@ def test_every_name_has_one_file_per_variant() -> None:
             "objects",
             "objects-open",
             "pointseg",
-            "pointseg-open",
             "sceneseg",
             "ssadnet",
             "ssadnet-open",
@@ -73,7 +72,7 @@ def test_the_wheels_models_are_small() -> None:
         (
             "pointnet",
             "no model is called 'pointnet' \\(did you mean pointseg\\?\\). Shipped: camseg, lodnn, objects, "
-            "objects-open, pointseg, pointseg-open, sceneseg, ssadnet, ssadnet-open",
+            "objects-open, pointseg, sceneseg, ssadnet, ssadnet-open",
         ),
         ("", "no model is called ''"),
         ("nowhere.onnx", "nowhere.onnx"),
@@ -88,7 +87,7 @@ def test_research_models_lie_where_the_message_says() -> None:
     research = files(".onnx", "models/research")
     if not research:
         pytest.skip("tests of an installed package")
-    assert {path.stem for path in research} == {*zoo.RESEARCH, *OPEN, "sceneseg"}  # of the last ones, fp32
+    assert {path.stem for path in research} == {*zoo.RESEARCH, *OPEN}  # of the last ones, fp32
     for path in research:
         (variant,) = resolve(path)
         assert (variant.name, variant.precision) == (path.stem, "fp32")

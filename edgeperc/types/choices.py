@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 DEFAULT_MODELS = ("ssadnet", "pointseg", "objects")
-OPEN_MODELS = ("ssadnet-open", "pointseg-open", "objects-open")
+OPEN_MODELS = ("ssadnet-open", "sceneseg", "objects-open")
 WEIGHTS = {"default": DEFAULT_MODELS, "open": OPEN_MODELS}
 CAMERA = "camseg"
 DEFAULT_SENSOR = "hdl-64e"

@@ -693,7 +693,7 @@ def test_make_also_makes_the_models_that_it_starts_from(
         "pointseg-sim": base,
         "pointseg-full": Stage(full, after="pointseg-sim"),
         "pointseg": Stage(replace(full, width=0.5, distil=1.0, steps=1), teacher="pointseg-full"),
-        "pointseg-open": Stage(replace(full, steps=1), is_open=True, also=("halls",)),
+        "sceneseg": Stage(replace(full, steps=1), is_open=True, also=("halls",)),
     }
     evaluated = []
 
@@ -726,7 +726,7 @@ def test_make_also_makes_the_models_that_it_starts_from(
     assert len(evaluated) == 3  # the teacher of this fold was made already
     assert taught.stat().st_size < 0.6 * made.stat().st_size
     # An open one reads KITTI for its figures alone.
-    training = Session(make("pointseg-open", out, **arguments), "cpu").card.training
+    training = Session(make("sceneseg", out, **arguments), "cpu").card.training
     assert (training["frames"], training["licence"], training["started_from"]) == ({}, "Apache-2.0", [])
     assert len(evaluated) == 4
     with pytest.raises(ValueError, match="trained on real scans too; give --kitti and --layouts"):
