@@ -112,7 +112,7 @@ def test_the_recipe_says_how_often(tmp_path_factory: pytest.TempPathFactory, sca
     scan.save(path)
     empty = []
     for beams in (0.0, 0.5, 1.0):
-        recipe = Recipe("pointseg", edge=True, n_pasted=0.0, n_negatives=0.0, beams=beams, batch=24, swap=1.0)
+        recipe = Recipe("pointseg", edge=True, n_pasted=0.0, n_negatives=0.0, beams=beams, batch=12, swap=1.0)
         samples = Samples(recipe, [], [], [path])
         _, labels = samples.batch(0)
         empty.append(float(np.mean(labels == IGNORE)))

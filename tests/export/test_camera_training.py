@@ -105,7 +105,8 @@ def unet_weights(widths: list[int], n_channels: int, n_classes: int) -> int:
     ],
 )
 def test_unet_has_the_described_layers(sizes: dict[str, Any], widths: list[int], layers: int) -> None:
-    network = UNet(**sizes)
+    with torch.device("meta"):  # no weights are drawn
+        network = UNet(**sizes)
     assert convolutions(network) == layers
     assert weights(network) == unet_weights(widths, 3, 11)
     assert not any(isinstance(module, nn.BatchNorm2d) for module in network.modules())
@@ -113,7 +114,8 @@ def test_unet_has_the_described_layers(sizes: dict[str, Any], widths: list[int],
 
 
 def test_segnet_has_13_and_13_convolutions() -> None:
-    network = SegNet()
+    with torch.device("meta"):
+        network = SegNet()
     assert convolutions(network.encoders) == 13
     assert convolutions(network.decoders) + 1 == 13
     # Badrinarayanan et al., section 3: 14.7 million parameters in the encoder; table 6: 29.5 million in all.

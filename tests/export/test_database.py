@@ -386,7 +386,7 @@ def test_the_road_model_of_a_fold_is_not_trained_on_it(kitti: Path, tmp_path: Pa
     from edgeperc_export.recipe import Recipe
 
     torch.set_num_threads(1)
-    recipe = Recipe("lodnn", edge=True, steps=1, batch=1, augment=False, n_pasted=0.0, weather=0.0)
+    recipe = Recipe("ssadnet", edge=True, width=0.25, steps=1, batch=1, augment=False, n_pasted=0.0, weather=0.0)
     path = tmp_path / "road.json"
     path.write_text(write_coco({"000000": [TRAPEZIUM], "000003": [TRAPEZIUM], "000007": [TRAPEZIUM]}))
     plan = plan_of(kitti, tmp_path / "out", "train", variations=0)
@@ -397,7 +397,7 @@ def test_the_road_model_of_a_fold_is_not_trained_on_it(kitti: Path, tmp_path: Pa
     assert fold_of["000000"] != fold_of["000003"]
     for fold in range(5):
         card = ModelCard.read(plan.out / f"road/models/fold-{fold}.onnx")
-        assert card.name == f"lodnn-fold-{fold}"
+        assert card.name == f"ssadnet-fold-{fold}"
         assert {*card.training["frames"]} == {n for n in ("000000", "000003") if fold_of[n] != str(fold)}
     first = contents(plan.out)
     again = build(plan, polygons=[path], recipe=recipe, workers=1)
