@@ -195,7 +195,7 @@ class Perceiver:
         (`edgeperc.inference.session.Session`). Only for files whose origin you know.
     weights : {"default", "open"}
         The models of None: the most accurate ones, whose weights have the terms of KITTI, or `edgeperc.zoo.OPEN`, whose
-        weights anyone may use, commercially too.
+        weights anyone may use, commercially too, and whose points have classes for the surroundings as well.
 
     Attributes
     ----------
