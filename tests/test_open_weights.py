@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -24,19 +25,24 @@ def test_no_frame_of_kitti_was_trained_on(name: str) -> None:
         assert all(frame.startswith("pandaset/") for frame in training["frames"])
         assert "CC BY 4.0" in training["licence"]
         assert "KITTI" not in training["licence"]
-    stage: Stage | None = MODELS[name]
-    while stage is not None:  # nor by the networks that it was started from
-        assert stage.is_open
-        stage = MODELS[stage.after] if stage.after else None
+    stages: list[Stage] = [MODELS[name]]
+    while (before := stages[-1].after) is not None:
+        stages.append(MODELS[before])
+    assert all(stage.is_open for stage in stages)  # nor the networks that it was started from
+    for variant in resolve(name):
+        assert len(variant.card.training["started_from"]) == len(stages) - 1
 
 
 def test_they_see_what_the_default_models_see() -> None:
+    """The network of points has the curvature as well, and classes of the surroundings."""
     for name, other in zip(OPEN, DEFAULT, strict=True):
         open_card, card = (resolve(each)[0].card for each in (name, other))
         assert open_card.view == card.view
-        assert set(open_card.classes) - set(card.classes) <= set(STATIC)
-        assert set(card.classes) <= set(open_card.classes)
-        assert open_card.input.channels[: len(card.input.channels)] == card.input.channels
+        is_scene = name == "sceneseg"
+        assert open_card.classes == (*card.classes, *(STATIC if is_scene else ()))
+        inputs, n = open_card.input, len(card.input.channels)
+        assert inputs.channels[n:] == (("curvature",) if is_scene else ())
+        assert replace(inputs, channels=inputs.channels[:n], mean=inputs.mean[:n], std=inputs.std[:n]) == card.input
 
 
 def test_a_perceiver_takes_them() -> None:

@@ -163,8 +163,8 @@ def _open(variants: Sequence[Variant]) -> Iterable[str]:
     yield from _prose(
         "The default models were trained on KITTI's scans, whose terms exclude commercial use. "
         f"{', '.join(f'`{name}`' for name in OPEN)} were trained without any scan, box or network of KITTI: on drawn "
-        "streets and 28 scans of PandaSet. Their terms are in the table above. They take the same time, tell road, "
-        "buildings and plants apart, too, and are less accurate on KITTI's roads:"
+        "streets and 28 scans of PandaSet. Their terms are in the table above. They take up to a fifth longer, tell "
+        "road, buildings and plants apart, too, and are less accurate on KITTI's roads:"
     )
     yield from ("", "    edgeperc run PATH --weights open", '    edgeperc.Perceiver(weights="open")', "")
     yield from _prose(
