@@ -88,12 +88,12 @@ test-wheel: .venv-test/installed
 
 # Packages with a module that loads an extra (tests/test_layering.py holds the others to loading none), and the whole: all other
 # tests would run the same code again, and so would those of ALIKE, whose modules load none, and of the worker processes here.
-test-minimal: WHOLE = live perceiver public_api silence zoo
+test-minimal: WHOLE = live public_api silence zoo
 test-minimal: LOADING = bench cli datasets readers ros2 sinks system view
-test-minimal: ALIKE = cli/test_programs readers/test_alternation readers/test_livox_packets readers/test_origin readers/test_times
-test-minimal: ALIKE += sinks/test_run_file system/test_atomic system/test_clock system/test_compilation system/test_fields
-test-minimal: ALIKE += system/test_interpreter system/test_kernel_cache system/test_kernels system/test_lanes system/test_machine
-test-minimal: ALIKE += system/test_pool
+test-minimal: ALIKE = cli/test_cli_info cli/test_programs readers/test_alternation readers/test_livox_packets
+test-minimal: ALIKE += readers/test_origin readers/test_times sinks/test_run_file system/test_atomic system/test_clock
+test-minimal: ALIKE += system/test_compilation system/test_fields system/test_interpreter system/test_kernel_cache
+test-minimal: ALIKE += system/test_kernels system/test_lanes system/test_machine system/test_pool
 test-minimal: .venv-minimal/installed
 	$(MINIMAL)/python -c "import importlib.util as u; assert not any(map(u.find_spec, ['torch', 'onnx', 'matplotlib']))"
 	$(MINIMAL)/pytest -q -n $(WORKERS) --dist worksteal -m 'not kernel and not compiled' $(WHOLE:%=tests/test_%.py) $(LOADING:%=tests/%) \

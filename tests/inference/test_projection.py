@@ -26,7 +26,7 @@ VIEWS = {
     "coarse top view": TopViewGeometry((-3.0, 4.0), (-2.0, 5.0), (-1.0, 1.0), 0.7),
     "front": RangeImageGeometry(HDL_64E),
     "front, uneven": RangeImageGeometry(UNEVEN, 40),
-    "full turn": RangeImageGeometry(HDL_64E, 2048, 180.0, -180.0),
+    "full turn": RangeImageGeometry(HDL_64E, 256, 180.0, -180.0),
     "full turn, uneven": RangeImageGeometry(UNEVEN, 36, 180.0, -180.0),
     "left half": RangeImageGeometry((80.0, 20.0, -20.0, -80.0), 7, 180.0, 0.0),
     "right rear": RangeImageGeometry((5.0, -5.0), 1, -95.0, -180.0),
