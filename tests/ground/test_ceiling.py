@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,9 +15,11 @@ from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 
 from edgeperc import Box, Perceiver
+from edgeperc.datasets.scan_folder import ScanFolder
 from edgeperc.ground.ceiling import Hall, find_ceiling, find_hall, without_impossible
 from edgeperc.simulation.samples import simulated_scan
 from edgeperc.simulation.scene import SimulatedScan
+from edgeperc.types.choices import VEHICLES
 from edgeperc.types.mounting import MODEL_HEIGHT_M, MODEL_MOUNTING, Mounting
 from edgeperc.types.sensor import get_sensor
 from scenes import box
@@ -39,6 +42,31 @@ def test_a_street_has_no_ceiling(sensor: str) -> None:
         assert find_ceiling(simulated_scan(seed, sensor).points) is None
     high = simulated_scan(1, sensor, mounting=Mounting(6.0, 0.0, 0.0, 0.0)).points + np.float32([0, 0, 4.27, 0])
     assert find_ceiling(high, 4.27) is None
+
+
+def test_walls_that_end_where_the_rays_do_are_no_ceiling() -> None:
+    """Rays that hardly rise meet bushes 3 to 8 m away at one height; behind a gap, a house stands above it."""
+    rng = np.random.default_rng(5)
+    azimuth, across = rng.uniform(-np.pi, np.pi, 6000), rng.uniform(3.0, 8.0, 6000)
+    z = np.where(np.arange(6000) % 2, rng.uniform(0.3, 0.5, 6000), -1.73)
+    far = np.abs(azimuth) < 0.05
+    across, z = np.where(far, 30.0, across), np.where(far, 1.4, z)
+    points = np.column_stack([across * np.cos(azimuth), across * np.sin(azimuth), z, z]).astype(np.float32)
+    assert find_ceiling(points[~far]) == pytest.approx(2.13, abs=0.1)
+    assert find_ceiling(points) is None
+
+
+def test_a_real_street_has_no_ceiling(data_root: Callable[[str], Path]) -> None:
+    """Below one of 2.1 m there would be no van."""
+    streets = ScanFolder.parse(f"{data_root('other_roads')}/vod:vod")
+    points = streets.frame("01047").points
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        found = Perceiver(sensor=streets.layout.sensor, full_turn=True)(points)
+    assert not [sentence for sentence in found.fitness if "ceiling" in sentence]
+    assert [
+        box for box in found.boxes if box.label in VEHICLES and np.hypot(box.center[0] - 8.3, box.center[1] + 3.9) < 1
+    ]
 
 
 any_points = arrays(np.float32, st.tuples(st.integers(0, 60), st.just(4)), elements=st.floats(width=32))
