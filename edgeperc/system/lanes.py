@@ -52,13 +52,16 @@ class Once(Generic[_Value]):
 
     def __call__(self) -> _Value:
         """The value."""
+        self._finish()
+        if self._error is not None:
+            raise self._error
+        return self._value
+
+    def _finish(self) -> None:
         if not self._is_known:
             with self._lock:
                 self._compute()
             self._watch.lap(self._stage)
-        if self._error is not None:
-            raise self._error
-        return self._value
 
     def start(self) -> None:
         """Compute the value, unless it is known or another thread computes it."""
@@ -72,18 +75,25 @@ class Once(Generic[_Value]):
     def _compute(self) -> None:
         if self._is_known:  # another thread had the lock
             return
-        try:
-            self._value = self._function(
-                *(_value_of(argument) for argument in self._arguments),
-                **{name: _value_of(option) for name, option in self._options.items()},
-            )
-        except Exception as exc:
-            self._error = exc
+        for given in (*self._arguments, *self._options.values()):
+            if isinstance(given, Once):
+                given._finish()
+                self._error = given._error  # not raised by each in turn: the traceback would have a hundred lines
+                if self._error is not None:
+                    break
+        if self._error is None:
+            try:
+                self._value = self._function(
+                    *(_value_of(argument) for argument in self._arguments),
+                    **{name: _value_of(option) for name, option in self._options.items()},
+                )
+            except Exception as exc:
+                self._error = exc
         self._is_known = True
 
 
-def _value_of(argument: object) -> object:
-    return argument() if isinstance(argument, Once) else argument
+def _value_of(given: object) -> object:
+    return given._value if isinstance(given, Once) else given
 
 
 class Lanes:

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import os
 import threading
+import traceback
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -62,6 +63,26 @@ def test_an_error_gives_the_cores_back(cores: set[int]) -> None:
         with pytest.raises(ValueError, match="no"):
             met(*functions)
         assert own_cores() == cores
+
+
+@pytest.mark.parametrize("n", [1, 2])
+def test_an_error_is_told_where_it_happened(n: int) -> None:
+    """Not by each of the values that need the one that failed; and what comes after it is not computed."""
+    watch, computed = Stopwatch(), []
+
+    def fail() -> None:
+        raise ValueError("no")
+
+    value: Once[object] = Once(fail, stage="check", watch=watch)
+    for k in range(30):
+        other = Once(computed.append, k, stage="check", watch=watch)
+        value = Once(lambda *given: given, value, other, stage="check", watch=watch)
+    with pytest.raises(ValueError, match="no") as raised:
+        Lanes(n).run([value], [])
+    frames = [frame.name for frame in traceback.extract_tb(raised.value.__traceback__)]
+    assert frames[-1] == "fail"
+    assert len(frames) < 8
+    assert computed == []
 
 
 def test_a_caller_on_one_core_stays_there(cores: set[int]) -> None:
