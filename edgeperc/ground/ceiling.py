@@ -25,6 +25,9 @@ _BELOW_M, _ABOVE_M, _SHARE, _SECTORS = 0.3, 0.15, 0.3, 0.35
 # in those streets.
 _SURELY_ABOVE_M, _TILT, _OUTSIDE_M, _MOST_ABOVE = 0.35, 0.01, 60.0, 0.01
 _CLEAR_M, _ON_ROOF_M = 0.1, 0.5  # between a vehicle and the ceiling, and the sensor on it
+# A sensor so high above the road is on a vehicle, whose body is around it. The nearest of 3,316 vehicles labeled in
+# five sets is 1.9 m from the sensor; a box of the own roof began 0.8 m behind it.
+_ROOF_M, _BODY_M = 1.4, 1.0
 _SURE = 0.5  # half of the score has what the object network does not see: below a ceiling, a wall or a beam
 _BEHIND_M = 1.5  # how much of a vehicle may be estimated to lie behind a wall
 
@@ -76,11 +79,12 @@ def without_impossible(boxes: Sequence[Box], hall: Hall, mounting: Mounting) -> 
     ceiling and walls: the own vehicle, a small garage, beams, pipes.
     """
     eye_m = _eye_m(mounting)
+    body_m = _BODY_M if eye_m + MODEL_HEIGHT_M >= _ROOF_M else 0.0
     tops_m = [box.center[2] + 0.5 * box.size[2] for box in boxes]
     kept = [
         (box, top_m)
         for box, top_m in zip(boxes, tops_m, strict=True)
-        if box.label not in VEHICLES or top_m < eye_m - _ON_ROOF_M or not _is_around(box)
+        if box.label not in VEHICLES or top_m < eye_m - _ON_ROOF_M or not _is_around(box, body_m)
     ]
     if hall.ceiling_m is None:
         return tuple(box for box, _ in kept)
@@ -94,10 +98,11 @@ def without_impossible(boxes: Sequence[Box], hall: Hall, mounting: Mounting) -> 
     )
 
 
-def _is_around(box: Box) -> bool:
-    """Whether the footprint holds the sensor."""
+def _is_around(box: Box, body_m: float) -> bool:
+    """Whether the footprint holds the sensor, or is so near to it."""
     (x, y, _), cos, sin = box.center, math.cos(box.yaw), math.sin(box.yaw)
-    return abs(x * cos + y * sin) <= 0.5 * box.size[0] and abs(y * cos - x * sin) <= 0.5 * box.size[1]
+    along_m, across_m = abs(x * cos + y * sin) - 0.5 * box.size[0], abs(y * cos - x * sin) - 0.5 * box.size[1]
+    return math.hypot(max(along_m, 0.0), max(across_m, 0.0)) <= body_m
 
 
 _DIRECTIONS = np.stack([np.cos(np.arange(32) * np.pi / 16.0), np.sin(np.arange(32) * np.pi / 16.0)])

@@ -100,6 +100,13 @@ def test_no_vehicle_is_around_the_sensor(label: str) -> None:
     assert without_impossible(passing, road, Mounting(4.0 + MODEL_HEIGHT_M)) == passing
 
 
+@pytest.mark.parametrize(("place", "height_m", "is_own"), [(2.9, 1.73, True), (3.1, 1.73, False), (2.9, 0.9, False)])
+def test_the_body_of_the_own_vehicle_is_no_other_one(place: float, height_m: float, is_own: bool) -> None:
+    """A box that begins 0.9 m from a sensor on a roof is the own vehicle's; from one in a bumper, another's."""
+    for boxes in ((box(-place, 0.1, size=(4.0, 1.8, 1.6)),), (box(0.0, place, yaw=1.57, size=(4.0, 1.8, 1.6)),)):
+        assert without_impossible(boxes, hall(0.0), Mounting(height_m)) == (() if is_own else boxes)
+
+
 @pytest.mark.parametrize("label", ["car", "van", "truck"])
 @pytest.mark.parametrize("ceiling_m", [2.4, 3.1, 4.5])
 def test_no_vehicle_reaches_the_ceiling(label: str, ceiling_m: float) -> None:
