@@ -54,6 +54,7 @@ def test_walls_that_end_where_the_rays_do_are_no_ceiling() -> None:
     points = np.column_stack([across * np.cos(azimuth), across * np.sin(azimuth), z, z]).astype(np.float32)
     assert find_ceiling(points[~far]) == pytest.approx(2.13, abs=0.1)
     assert find_ceiling(points) is None
+    assert find_ceiling(points[~far & (across > 4.0)]) is None  # the rays rise by 7 degrees at most
 
 
 def test_a_real_street_has_no_ceiling(data_root: Callable[[str], Path]) -> None:
