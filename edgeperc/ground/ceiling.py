@@ -16,13 +16,13 @@ from ..types.points import Floats, Points
 _SAMPLE, _REACH_M, _LEAST_M = 8192, (1.5, 40.0), 2.0  # points; their range; their height above the road
 # A sensor whose rays rise less meets a ceiling too far away to tell it from walls and bushes near it, which end where
 # its rays do: the steepest ones rise by 0.18 and more in 144 drawn garages and depots, by at most 0.13 in 5 of 481
-# scans of KITTI and in 2 of 3 of View of Delft, where vans were dropped below a ceiling of 2.0 to 2.8 m.
+# scans of KITTI and in 1 of 3 of View of Delft, where vans were dropped below a ceiling of 2.0 to 2.2 m.
 _LEAST_SLOPE, _RISING, _UPPER_PART, _FEWEST = 0.15, 0.002, 0.4, 30
 # Such a share of the points of the upper rays lies at one height: 0.3 and more in most drawn garages and halls, at most
 # 0.06 in 29 real scans of four sensors of such beams, and 0.1 in 75 drawn streets.
 _BELOW_M, _ABOVE_M, _SHARE, _SECTORS = 0.3, 0.15, 0.3, 0.35
-# Nothing is above a ceiling, whatever of a tilt is left: no point in those garages, and 0.012 and more of those on it
-# in those streets.
+# Nothing is above a ceiling, whatever of a tilt is left: no point in those garages. In such streets, 0.012 and more of
+# those on it were.
 _SURELY_ABOVE_M, _TILT, _OUTSIDE_M, _MOST_ABOVE = 0.35, 0.01, 60.0, 0.01
 _CLEAR_M, _ON_ROOF_M = 0.1, 0.5  # between a vehicle and the ceiling, and the sensor on it
 # A sensor so high above the road is on a vehicle, whose body is around it. The nearest of 3,316 vehicles labeled in
@@ -33,7 +33,9 @@ _BEHIND_M = 1.5  # how much of a vehicle may be estimated to lie behind a wall
 
 
 def find_ceiling(points: Points, eye_m: float = 0.0) -> float | None:
-    """Height of a ceiling above the road [m]; None if most rays that rise do not end at one height all around."""
+    """Height of a ceiling above the road [m]; None if most rays that rise do not end at one height all around, or if
+    there are points above it.
+    """
     x, y, z = points[:: (len(points) // _SAMPLE) | 1, :3].astype(np.float64).T
     with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
         across_m = np.hypot(x, y)
@@ -75,8 +77,8 @@ def _eye_m(mounting: Mounting) -> float:
 
 
 def without_impossible(boxes: Sequence[Box], hall: Hall, mounting: Mounting) -> tuple[Box, ...]:
-    """The boxes without vehicles around the sensor, unless it is on a pole, and without those that do not fit between a
-    ceiling and walls: the own vehicle, a small garage, beams, pipes.
+    """The boxes without vehicles around the sensor, or next to it on a roof, unless it is on a pole, and without those
+    that do not fit between a ceiling and walls: the own vehicle, a small garage, beams, pipes.
     """
     eye_m = _eye_m(mounting)
     body_m = _BODY_M if eye_m + MODEL_HEIGHT_M >= _ROOF_M else 0.0

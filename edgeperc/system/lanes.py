@@ -52,16 +52,18 @@ class Once(Generic[_Value]):
 
     def __call__(self) -> _Value:
         """The value."""
-        self._finish()
-        if self._error is not None:
-            raise self._error
+        error = self._finish()
+        if error is not None:
+            raise error
         return self._value
 
-    def _finish(self) -> None:
+    def _finish(self) -> Exception | None:
+        """Compute the value, unless it is known; the error where there is none."""
         if not self._is_known:
             with self._lock:
                 self._compute()
             self._watch.lap(self._stage)
+        return self._error
 
     def start(self) -> None:
         """Compute the value, unless it is known or another thread computes it."""
@@ -75,12 +77,9 @@ class Once(Generic[_Value]):
     def _compute(self) -> None:
         if self._is_known:  # another thread had the lock
             return
-        for given in (*self._arguments, *self._options.values()):
-            if isinstance(given, Once):
-                given._finish()
-                self._error = given._error  # not raised by each in turn: the traceback would have a hundred lines
-                if self._error is not None:
-                    break
+        needed = (each for each in (*self._arguments, *self._options.values()) if isinstance(each, Once))
+        # An error is not raised by each value that needs the one that failed: the traceback would have a hundred lines.
+        self._error = next((error for each in needed if (error := each._finish()) is not None), None)
         if self._error is None:
             try:
                 self._value = self._function(
