@@ -136,8 +136,8 @@ FLOORS = {
         networks.segnet networks.squeezesegv2 networks.unet
         networks.fcn
         networks.__init__
-        training.__init__ training.checkpoint training.curve training.log training.losses training.object_task
-        training.ranks
+        training.__init__ training.bfloat16 training.checkpoint training.curve training.log training.losses
+        training.object_task training.ranks
         training.camera training.object_samples training.start training.task
         training.images training.object_sets training.teacher
         training.object_batches training.samples

@@ -25,6 +25,7 @@ from edgeperc.types.points import Bytes, Floats32
 
 from ..data.scan_sets import seen_by_network
 from ..data.scans import SURFACE, LabeledScan, mirrored, turned
+from .bfloat16 import in_bfloat16
 from .task import Task
 
 SURE = 0.9
@@ -110,7 +111,7 @@ def teach(network: nn.Module, image: Tensor, inputs: InputSpec, *, mirror: bool)
     """A network's class probabilities (B, C, H, W) for a batch of inputs, and its boxes or None. ``mirror`` averages
     them over each scene and its mirror image, in which the channel y changes its sign.
     """
-    with torch.autocast(image.device.type, torch.bfloat16):
+    with in_bfloat16(image.device.type):
         outputs = network(image)
         logits, boxes = outputs if isinstance(outputs, tuple) else (outputs, None)
         p = logits.float().softmax(1)

@@ -31,6 +31,7 @@ from ..data.scan_sets import read_scan_set
 from ..data.scans import LabeledScan
 from ..networks import build
 from ..recipe import Recipe
+from .bfloat16 import in_bfloat16
 from .camera import Camera
 from .checkpoint import build_network, read_checkpoint
 from .images import ImageSamples, ImageWatch, camvid_samples
@@ -243,7 +244,7 @@ class _Training:
             x = x.contiguous(memory_format=torch.channels_last if x.ndim == 4 else torch.contiguous_format)
             y = others[: source.samples.n_targets]
             taught: tuple[Any, ...] = tuple(others[source.samples.n_targets :])
-            with torch.autocast(ranks.device.type, torch.bfloat16):
+            with in_bfloat16(ranks.device.type):
                 outputs = ranks.whole(self.forward(x))
             loss = task.loss(outputs, y)
             if source.teacher is not None and recipe.distil > 0.0:

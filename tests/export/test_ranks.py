@@ -40,7 +40,7 @@ cards.RANGE_IMAGE = replace(
 cards.TOP_VIEW = TopViewGeometry((6.0, 22.0), (-4.0, 4.0))
 # Rounding is that of double precision: gradients of an untrained network have an error of 2 % in fp32.
 autocast, from_numpy, part = torch.autocast, torch.from_numpy, ranks.Ranks.part
-torch.autocast = lambda device, kind: autocast(device, kind, enabled=False)
+torch.autocast = lambda device, kind, enabled: autocast(device, kind, enabled=False)
 torch.set_default_dtype(torch.float64)
 torch.from_numpy = lambda array: from_numpy(array.astype("float64") if array.dtype == "float32" else array)
 ranks.Ranks.part = lambda self, batch: part(self, batch).double()
