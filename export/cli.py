@@ -354,9 +354,8 @@ def _add_quantize(command: Command) -> None:
     _add_shared(add, "--semantickitti SEMANTICKITTI")
     add("--camvid CAMVID", f"{CAMVID}; for a camera's model: calibrates on training images, not on scans", type=Path)
     add(
-        "--seven-bits",
-        "use 7-bit weights, which x86 without VNNI needs (default: if this computer needs them)",
-        default=None,
+        "--eight-bits",
+        "use 8-bit weights, which x86 without VNNI saturates, so precision auto takes fp32 there (default: 7 bits)",
     )
     add("--evaluate-on N", "simulated scans to evaluate both models on (default 48)", type=int, default=48)
     add("--exclude NODE", "graph nodes to keep in fp32", nargs="*", default=[])
@@ -369,7 +368,7 @@ def _quantize(args: argparse.Namespace) -> int:
     from .release.quantize import LabeledSets, calibration_images, calibration_scans, quantize
 
     of_objects = ModelCard.read(args.model).view.kind == "objects"
-    how = {"seven_bits": args.seven_bits, "n_threads": args.threads}
+    how = {"seven_bits": not args.eight_bits, "n_threads": args.threads}
     if args.camvid is not None and not of_objects:
         calibration = calibration_images(args.camvid)
     else:

@@ -27,6 +27,7 @@ __all__ = [
     "INT8_FEATURES",
     "MAX_LOSS",
     "OPEN",
+    "SEVEN_BIT_FEATURES",
     "Variant",
     "choose",
     "digest",
@@ -48,9 +49,10 @@ CAMERA = choices.CAMERA
 MAX_LOSS = 0.3
 """Largest loss of mean IoU or AP, in percentage points, that ``precision="auto"`` accepts for speed."""
 
-# Processor flags (`machine.cpu_features`). Without a dot product of bytes, x86 adds pairs of 8-bit products in
-# 16 bits, which saturates. int8 is then not faster than fp32.
+# Processor flags (`machine.cpu_features`). Without a dot product of bytes, x86 adds pairs of products in 16 bits, which
+# 8-bit weights saturate and 7-bit weights cannot.
 INT8_FEATURES = frozenset({"avx512_vnni", "avx_vnni", "amx_int8", "asimddp"})
+SEVEN_BIT_FEATURES = frozenset({"avx2"})
 BF16_FEATURES = frozenset({"amx_bf16", "avx512_bf16"})
 BF16_PROVIDERS = ("openvino",)
 # The reduced precisions of a provider, the fastest first. Measured on two cores with avx512_vnni and avx512_bf16, fp32
@@ -209,14 +211,22 @@ def choose(
         if precision not in runs:
             raise ProviderError(_not_in(variants[0].name, provider, precision, sorted(runs)))
         return runs[precision]
-    native = {
-        "int8": provider in NPU_PROVIDERS or bool(INT8_FEATURES & {*features}),
-        "bf16": bool(BF16_FEATURES & {*features}),
-    }
     for reduced in FASTEST.get(provider, ()):
-        if reduced in runs and native[reduced] and _loss(runs[reduced][0].card, reduced) <= MAX_LOSS:
-            return runs[reduced]
+        if reduced in runs:
+            card = runs[reduced][0].card
+            if _is_native(card, reduced, provider, features) and _loss(card, reduced) <= MAX_LOSS:
+                return runs[reduced]
     return runs.get("fp32") or runs["int8"]
+
+
+def _is_native(card: ModelCard, precision: str, provider: str, features: Collection[str]) -> bool:
+    """Whether a processor with these flags, or a provider's own device, computes the model in this precision fast."""
+    if precision == "bf16":
+        return not BF16_FEATURES.isdisjoint(features)
+    if provider in NPU_PROVIDERS or not INT8_FEATURES.isdisjoint(features):
+        return True
+    bits = card.precisions.get("int8", {}).get("weight_bits", 8)
+    return provider == "cpu" and bits <= 7 and not SEVEN_BIT_FEATURES.isdisjoint(features)
 
 
 def _loss(card: ModelCard, precision: str) -> float:

@@ -16,6 +16,7 @@ from edgeperc.zoo import DEFAULT, MAX_LOSS, OPEN, Variant, choose, digest, liste
 
 VNNI, BF16 = frozenset({"avx512_vnni"}), frozenset({"avx512_bf16"})
 BOTH = VNNI | BF16
+AVX2 = frozenset({"avx2"})
 
 
 def variants(**losses: float) -> tuple[Variant, Variant]:
@@ -106,7 +107,7 @@ def test_a_file_without_a_card_is_refused(tmp_path: Path) -> None:
         ("cpu", VNNI, {"int8": MAX_LOSS}, "int8"),
         ("cpu", VNNI, {"int8": MAX_LOSS + 0.01}, "fp32"),
         ("cpu", VNNI, {}, "fp32"),
-        ("cpu", frozenset({"avx2"}), {"int8": 0.0}, "fp32"),
+        ("cpu", AVX2, {"int8": 0.0}, "fp32"),
         ("cpu", frozenset(), {"int8": 0.0}, "fp32"),
         ("cpu", BF16, {"bf16": 0.0}, "fp32"),
         ("cuda", BOTH, {"int8": 0.0, "bf16": 0.0}, "fp32"),
@@ -121,6 +122,25 @@ def test_auto_takes_native_precisions_with_a_measured_loss(
     provider: str, features: frozenset[str], losses: dict[str, float], precision: str
 ) -> None:
     fp32, int8 = variants(**losses)
+    assert choose((fp32, int8), provider, "auto", features) == (int8 if precision == "int8" else fp32, precision)
+
+
+@pytest.mark.parametrize(
+    ("provider", "features", "weight_bits", "precision"),
+    [
+        ("cpu", AVX2, 7, "int8"),
+        ("cpu", AVX2, 8, "fp32"),
+        ("cpu", AVX2 | VNNI, 8, "int8"),
+        ("cpu", frozenset({"ssse3"}), 7, "fp32"),
+        ("openvino", AVX2, 7, "fp32"),
+    ],
+)
+def test_without_a_dot_product_of_bytes_auto_takes_seven_bits(
+    provider: str, features: frozenset[str], weight_bits: int, precision: str
+) -> None:
+    fp32, int8 = variants()
+    record = {"int8": {"loss": 0.0, "weight_bits": weight_bits}}
+    int8 = replace(int8, card=replace(int8.card, precisions=record))
     assert choose((fp32, int8), provider, "auto", features) == (int8 if precision == "int8" else fp32, precision)
 
 

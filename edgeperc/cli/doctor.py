@@ -149,10 +149,10 @@ def _processor() -> Iterator[Finding]:
     from ..system.machine import cpu_features, cpu_model, usable_cores
 
     yield Finding("processor", "ok", f"{cpu_model()}, {usable_cores()} of {os.cpu_count()} cores usable")
-    from ..zoo import BF16_FEATURES, INT8_FEATURES
+    from ..zoo import BF16_FEATURES, INT8_FEATURES, SEVEN_BIT_FEATURES
 
     present = cpu_features()
-    for precision, features in (("int8", INT8_FEATURES), ("bf16", BF16_FEATURES)):
+    for precision, features in (("int8", INT8_FEATURES | SEVEN_BIT_FEATURES), ("bf16", BF16_FEATURES)):
         present_here = ", ".join(sorted(features & present))
         yield Finding(
             precision,

@@ -93,6 +93,8 @@ def agree(
     records = {precision: record_of(each, measured["fp32"], command) for precision, each in measured.items()}
     for variant in variants.values():
         own = {precision: records[precision] for precision, each in runs.items() if each is variant}
+        if "int8" in own and "quantized" in variant.card.training:
+            own["int8"]["weight_bits"] = variant.card.training["quantized"]["weight_bits"]
         write_card(onnx.load(variant.path), replace(variant.card, precisions=own), variant.path)
     return records
 

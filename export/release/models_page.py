@@ -134,7 +134,8 @@ def _precisions(variants: Sequence[Variant]) -> Iterable[str]:
         "Agreement of each precision with fp32, after post-processing, on labeled real scans or images. "
         "`precision=auto` takes a reduced precision only if its loss (of mean IoU or of AP, whichever is larger) is "
         f"at most {MAX_LOSS} points and the processor has instructions for it: int8 on the CPU provider and OpenVINO "
-        "(VNNI, AMX, or Arm's dot product), bf16 on OpenVINO (AMX or AVX-512). `precision=fp32` forbids it. "
+        "(VNNI, AMX, or Arm's dot product; on the CPU provider also AVX2, for weights of 7 bits), bf16 on OpenVINO "
+        "(AMX or AVX-512). `precision=fp32` forbids it. "
         "`perception.providers` shows what ran."
     )
     yield from _head("model", ["equal labels", "mean IoU", "fp32", "AP50", "fp32", "loss", "scans", "measured with"])

@@ -27,7 +27,6 @@ from .quantize import (
     in_int8,
     inner_tensors,
     race,
-    saturates,
     speed_of,
     write_int8,
 )
@@ -44,7 +43,7 @@ def quantize_objects(
     calibration: Calibration,
     *,
     kitti: Path | None = None,
-    seven_bits: bool | None = None,
+    seven_bits: bool = True,
     n_threads: int | None = None,
 ) -> ModelCard:
     """Write an object network in int8, if it is faster here; parameters and errors as of `quantize`. Its card has
@@ -55,7 +54,6 @@ def quantize_objects(
     batches = list(candidate_batches(card, calibration.scans))
     if not batches:
         raise PointsError(f"no candidate in {len(calibration.scans)} scans to calibrate on; name scans with objects")
-    seven_bits = saturates() if seven_bits is None else seven_bits
 
     def compared(trial: Path) -> dict[str, Any]:
         share = f"{len(ROUNDED)} products in int8, {len(batches[0])} candidates"
@@ -92,7 +90,7 @@ def candidate_batches(card: ModelCard, scans: Sequence[Floats32]) -> Iterator[Fl
 
 
 def rounded(
-    model: onnx.ModelProto, card: ModelCard, batches: Sequence[Floats32], *, seven_bits: bool = False
+    model: onnx.ModelProto, card: ModelCard, batches: Sequence[Floats32], *, seven_bits: bool = True
 ) -> onnx.ModelProto:
     """A folded graph of `with_first_look` with the products of `ROUNDED` in int8, inputs by their range in batches."""
     products = [node for node in model.graph.node if node.op_type == "Gemm" and node.input[1] in ROUNDED]

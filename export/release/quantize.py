@@ -17,7 +17,6 @@ from __future__ import annotations
 
 import copy
 import hashlib
-import platform
 import re
 import tempfile
 import time
@@ -49,10 +48,8 @@ from edgeperc.inference.session import Session
 from edgeperc.readers.files import read_points
 from edgeperc.simulation import samples
 from edgeperc.simulation.samples import simulated_scan
-from edgeperc.system.machine import cpu_features
 from edgeperc.types.card import ModelCard
 from edgeperc.types.points import Floats, Floats32, Ints64
-from edgeperc.zoo import INT8_FEATURES
 
 from ..data.simulate import parity_samples
 from .int8_graph import equalize, repeat_pixels
@@ -152,11 +149,6 @@ def _drive(file: Path) -> str | None:
     return KittiObjects(root).drives.get(file.stem) if (root / "frames.csv").exists() else None
 
 
-def saturates() -> bool:
-    """Whether this computer adds pairs of 8-bit products in 16 bits, which may saturate: x86 without VNNI."""
-    return platform.machine() in ("x86_64", "AMD64") and INT8_FEATURES.isdisjoint(cpu_features())
-
-
 def folded(path: Path) -> onnx.ModelProto:
     """The graph with folded constants (half-precision weights become fp32), and a name for every node."""
     with tempfile.TemporaryDirectory() as folder:
@@ -194,7 +186,7 @@ class Calibrated:
         path: Path,
         card: ModelCard,
         scans: Sequence[NDArray[Any]],
-        seven_bits: bool = False,
+        seven_bits: bool = True,
         strength: float | None = None,
     ) -> Calibrated:
         """Calibrate the model of a file on scans, or images, with one of `STRENGTHS`."""
@@ -536,7 +528,7 @@ def quantize(
     labeled: LabeledSets,
     *,
     exclude: Sequence[str] = (),
-    seven_bits: bool | None = None,
+    seven_bits: bool = True,
     n_threads: int | None = None,
     max_noise: float = MAX_NOISE,
     race: Race = race,
@@ -551,7 +543,6 @@ def quantize(
     if camera and labeled.camvid is None:
         raise OptionError(f"{path} is of a camera; give --camvid to calibrate and evaluate it on")
     check_fp32(path, card)
-    seven_bits = saturates() if seven_bits is None else seven_bits
     model, chosen, kept, noise = _rounded(path, card, calibration.scans, exclude, seven_bits, max_noise)
 
     def compared(trial: Path) -> dict[str, Any]:

@@ -25,6 +25,7 @@ from edgeperc.simulation.samples import simulated_scan
 from edgeperc.simulation.scene import POINT_CLASSES
 from edgeperc.types.card import InputSpec, ModelCard, OutputSpec
 from edgeperc.types.views import RangeImageGeometry
+from edgeperc.zoo import model_path
 from edgeperc_export import cli
 from edgeperc_export.release import quantize as module
 from edgeperc_export.release.quantize import Calibration, LabeledSets, RefusedError, calibration_scans, quantize
@@ -142,7 +143,7 @@ def test_inner_layers_become_int8_and_the_card_says_so(tmp_path: Path, small: Pa
     assert card.training["licence"] == "Apache-2.0"
     assert set(card.training["frames"].values()) == {"f" * 16, "0123456789abcdef"}
     assert len(card.training["quantized"]["left_alone"]) == 2
-    assert (largest_weight(out), card.training["quantized"]["weight_bits"]) == (127, 8)
+    assert (largest_weight(out), card.training["quantized"]["weight_bits"]) == (64, 7)
     with pytest.raises(ModelError, match="quantize the model in fp32"):
         quantize(out, out, Calibration(scans), LabeledSets())
     assert card.parity["label_agreement"] > 0.9
@@ -155,10 +156,19 @@ def largest_weight(path: Path) -> int:
     return max(int(abs(w.astype(int)).max()) for w in weights if w.dtype == np.int8)
 
 
-def test_weights_have_seven_bits_on_request(tmp_path: Path, small: Path, scans: list[np.ndarray]) -> None:
+def test_weights_have_eight_bits_on_request(tmp_path: Path, small: Path, scans: list[np.ndarray]) -> None:
     out = tmp_path / "int8.onnx"
-    card = quantize(small, out, Calibration(scans), ONE, max_noise=9.0, seven_bits=True, race=FASTER)
-    assert (largest_weight(out), card.training["quantized"]["weight_bits"]) == (64, 7)
+    card = quantize(small, out, Calibration(scans), ONE, max_noise=9.0, seven_bits=False, race=FASTER)
+    assert (largest_weight(out), card.training["quantized"]["weight_bits"]) == (127, 8)
+
+
+@pytest.mark.parametrize("name", ["objects", "objects-open", "pointseg", "sceneseg", "ssadnet", "ssadnet-open"])
+def test_no_processor_saturates_the_shipped_models(name: str) -> None:
+    """Two products of 8-bit activations and 7-bit weights have a sum of at most 16 bits."""
+    path = model_path(f"{name}:int8")
+    assert 2 * 255 * largest_weight(path) < 2**15
+    record = ModelCard.read(path).precisions.get("int8", {"weight_bits": 7})  # open models have no fp32 to compare with
+    assert record["weight_bits"] == 7
 
 
 @pytest.mark.parametrize("equalized", [False, True])
