@@ -244,6 +244,8 @@ def test_auto_takes_int8_where_it_is_native(monkeypatch: pytest.MonkeyPatch) -> 
     assert Session("pointseg", "cpu").description == "pointseg int8, CPUExecutionProvider"
     assert Session("pointseg", "cpu", precision="fp32").description == "pointseg fp32, CPUExecutionProvider"
     monkeypatch.setattr(session_module, "cpu_features", lambda: frozenset({"avx2"}))
+    assert Session("pointseg", "cpu").description == "pointseg int8, CPUExecutionProvider"  # its weights have 7 bits
+    monkeypatch.setattr(session_module, "cpu_features", lambda: frozenset({"sse4_2"}))
     assert Session("pointseg", "cpu").description == "pointseg fp32, CPUExecutionProvider"
 
 
