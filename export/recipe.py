@@ -435,6 +435,26 @@ MODELS = {
         is_open=True,
         also=("six-sensors",),
     ),
-    "sceneseg": Stage(CURVED, after="sceneseg-start", is_open=True, also=("six-sensors",)),
+    "curved-start": Stage(CURVED, after="sceneseg-start", is_open=True, also=("six-sensors",)),
+    # 400,000 samples with the curvature, in eight minutes on a GPU, and then some on a processor in float32: cars, which
+    # had fallen from 89 to 79 % on SemanticKITTI, have 87 again.
+    "long-start": Stage(
+        replace(
+            CURVED,
+            simulated_share=0.8,
+            steps=12_426,
+            batch=32,
+            reuse=6,
+            learning_rate=2e-3,
+            ema=0.999,
+            redraw_every=4000,
+        ),
+        after="curved-start",
+        is_open=True,
+        also=("six-sensors",),
+    ),
+    "sceneseg": Stage(
+        replace(CURVED, simulated_share=0.8, steps=1000), after="long-start", is_open=True, also=("six-sensors",)
+    ),
 }
 """The training run of every model, by name; names that end in ``-start`` are intermediate results."""

@@ -318,6 +318,25 @@ def test_curvature_is_the_root_of_the_bend_between_neighbors() -> None:
     np.testing.assert_allclose(seen.image[1, 0], np.nan_to_num((np.sqrt(bends) - 0.5) / 2.0), atol=2e-3)
 
 
+@pytest.mark.parametrize(("noise_m", "bend_m"), [(0.0, 0.0), (0.01, 0.016), (0.02, 0.028), (0.1, 0.0)])
+def test_noise_of_the_ranges_is_no_curvature(noise_m: float, bend_m: float) -> None:
+    """Beyond a median of 4 cm on the ground, the rest is taken off: little of a rough ground then bends."""
+    view = RangeImageGeometry(tuple(np.linspace(-5.0, -20.0, 41).tolist()), 20, 20.0, -20.0)
+    spec = InputSpec("input", ("height_above_ground", "curvature"), (0.0, 0.0), (1.0, 1.0))
+    azimuth, elevation = np.radians(np.meshgrid(np.arange(20) + 0.5 - 10.0, -5.19 - 0.375 * np.arange(40)))
+    azimuth, elevation = (angle.ravel() for angle in (2.0 * azimuth, elevation))
+    noise = noise_m * np.random.default_rng(0).standard_normal(azimuth.shape)
+    ranges = 2.0 / -np.sin(elevation) + noise
+    ahead = ranges * np.cos(elevation)
+    points = np.float32([ahead * np.cos(azimuth), ahead * np.sin(azimuth), ranges * np.sin(elevation), noise]).T.copy()
+    height_m = np.zeros(len(points), np.float32)
+    seen = make_projector(view, spec).project(points, height_m)
+    edges = row_edges(view), column_edges(view)
+    assert_same(seen, twins.projection.project(points, view, edges, spec, height_m))
+    assert np.count_nonzero(seen.index >= 0) > 700
+    assert np.median(seen.image[1][seen.index >= 0] ** 2) == pytest.approx(bend_m, abs=0.004)
+
+
 def test_missing_or_wrong_heights_are_refused() -> None:
     projector = make_projector(VIEWS["front"], spec_of(VIEWS["front"]))
     points = np.ones((5, 4), np.float32)

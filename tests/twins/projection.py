@@ -43,13 +43,26 @@ def range_image_pixel(point: np.ndarray, view: Any, row_edges: np.ndarray, col_e
     return row * view.width + col, squared_range
 
 
-def curvature(points: np.ndarray, index: np.ndarray, flat: int, width: int) -> np.float32:
-    """Root of how much the range bends at a pixel, at most 1; 0 at an end of a row and beside an empty pixel."""
+def bend(points: np.ndarray, index: np.ndarray, flat: int, width: int) -> np.float32:
+    """How much the range bends at a pixel; 0 at an end of a row and beside an empty pixel."""
     if flat % width in (0, width - 1) or min(index[flat - 1], index[flat + 1]) < 0:
         return np.float32(0.0)
     x, y, z, _ = points[index[flat - 1 : flat + 2]].T
     before, here, after = np.sqrt(x * x + y * y + z * z)
-    return np.float32(np.sqrt(min(abs(before - np.float32(2.0) * here + after), np.float32(1.0))))
+    return np.float32(abs(before - np.float32(2.0) * here + after))
+
+
+def curvatures(points: np.ndarray, heights: np.ndarray | None, index: np.ndarray, width: int) -> dict[int, np.float32]:
+    """The root of the bend of each pixel with a point, at most 1, less what noise beyond 4 cm of the ground's adds."""
+    bends = {flat: bend(points, index, flat, width) for flat in np.flatnonzero(index >= 0).tolist()}
+    level = [
+        value for flat, value in bends.items() if heights is not None and value > 0 and abs(heights[index[flat]]) < 0.15
+    ]
+    typical = np.float32(np.median(level)) if len(level) >= 500 else np.float32(0.0)
+    noise = (typical * typical - np.float32(0.04) * np.float32(0.04)) * np.float32(0.6745**-2)
+    if noise > 0:
+        bends = {flat: np.sqrt(np.maximum(value * value - noise, np.float32(0.0))) for flat, value in bends.items()}
+    return {flat: np.sqrt(np.minimum(value, np.float32(1.0))) for flat, value in bends.items()}
 
 
 def project(
@@ -80,7 +93,7 @@ def project(
             }  # fmt: skip
             image[:, flat] = (np.array([raw[name] for name in spec.channels], np.float32) - mean) / std
         for c in [c for c, name in enumerate(spec.channels) if name == "curvature"]:
-            for flat in best:
-                raw = curvature(points, index, flat, view.width)
+            heights = height_m if "height_above_ground" in spec.channels else None
+            for flat, raw in curvatures(points, heights, index, view.width).items():
                 image[c, flat] = (raw - mean[c]) / std[c]
     return image.reshape(-1, view.height, view.width), index.reshape(view.height, view.width), pixel
