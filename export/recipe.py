@@ -436,8 +436,8 @@ MODELS = {
         also=("six-sensors",),
     ),
     "curved-start": Stage(CURVED, after="sceneseg-start", is_open=True, also=("six-sensors",)),
-    # 400,000 samples with the curvature, in eight minutes on a GPU, and then some on a processor in float32: cars, which
-    # had fallen from 89 to 79 % on SemanticKITTI, have 87 again.
+    # 400,000 samples with the curvature, in eight minutes on a GPU, and then some on a processor in float32: cars, with
+    # 79 % on SemanticKITTI, have 87 again, of 89 before.
     "long-start": Stage(
         replace(
             CURVED,
