@@ -10,7 +10,7 @@ import numpy as np
 from ..errors import InferenceError
 from ..system.kernels import njit
 from ..types.card import ModelCard
-from ..types.geometry import oriented_iou, suppress_overlaps
+from ..types.geometry import oriented_iou, rectangles, suppress_overlaps
 from ..types.perception import Box
 from ..types.points import Floats, Floats32, read_only
 
@@ -74,6 +74,19 @@ def confirm_boxes(found: Floats, again: Floats) -> Floats:
     fill_merged(every, np.where(np.tile(np.eye(len(found), dtype=np.bool_), len(looks)), overlap, 0.0), confirmed)
     confirmed[:, SCORE] = 0.5 * (scores[0] + scores[1:].mean(axis=0))
     return confirmed
+
+
+def with_footprints(boxes: Floats, others: Sequence[Box]) -> Floats:
+    """Boxes (k, 10) of `merge_boxes`, with footprints averaged, by scores, with those of another network that overlap
+    them by more than 0.5: its errors are other errors. Heights, which it does not know, scores and fronts stay.
+    """
+    theirs = np.zeros((len(others), 10))
+    theirs[:, [X, Y, LENGTH, WIDTH, YAW]] = rectangles(others)
+    theirs[:, SCORE] = [box.score for box in others]
+    every, averaged = np.concatenate([boxes, theirs]), boxes.copy()
+    fill_merged(every, oriented_iou(footprints(boxes), footprints(every)), averaged)
+    averaged[:, [Z, HEIGHT]] = boxes[:, [Z, HEIGHT]]
+    return averaged
 
 
 def boxes_of_objects(boxes: Floats, classes: Sequence[str], min_score: float) -> list[Box]:

@@ -21,6 +21,7 @@ from edgeperc.objects.candidate_boxes import (
     fill_merged,
     footprints,
     merge_boxes,
+    with_footprints,
 )
 from edgeperc.objects.candidates import (
     MAX_LENGTH_M,
@@ -35,6 +36,7 @@ from edgeperc.objects.candidates import (
 from edgeperc.objects.crops import FEATURES, Crops, crop_candidates, fill_features, joined, with_points
 from edgeperc.types.card import CHANNELS, InputSpec, ModelCard, OutputSpec
 from edgeperc.types.geometry import oriented_iou
+from edgeperc.types.perception import Box
 from edgeperc.types.views import ObjectGeometry
 
 RANGE_M = (0.1, 4.2)
@@ -311,6 +313,28 @@ def test_more_looks_confirm_a_box_or_lower_its_score(n: int, n_looks: int) -> No
     nothing = confirm_boxes(found, np.zeros((n_looks, n, 10)))
     np.testing.assert_allclose(nothing[:, :6], found[:, :6])
     np.testing.assert_allclose(nothing[:, SCORE], found[:, SCORE] / 2)
+
+
+@pytest.mark.parametrize("n", [0, 1, 30])
+def test_footprints_are_averaged_with_those_of_another_network(n: int) -> None:
+    """Of those that overlap, by scores, whichever end they call the front; the rest of a box stays."""
+    rng = np.random.default_rng(n)
+    boxes = np.column_stack([np.arange(n) * 10.0, rng.uniform(-0.5, 0.5, (n, 9))])
+    boxes[:, 3:6] = (4.0, 1.7, 1.5)
+    boxes[:, SCORE] = rng.uniform(0.3, 1.0, n)
+    shown = []
+    for k, (x, y, _, length, width, _, yaw, *_) in enumerate(boxes[: 2 * n // 3].tolist()):
+        away = 0.2 if k % 2 else 3.0  # the same place, or another one
+        turned = yaw + 0.1 + math.pi * (k % 4 == 1)
+        shown.append(Box("car", 0.1 + 0.8 * rng.random(), (x + away, y, 9.0), (length + 0.3, width, 5.0), turned))
+    averaged = with_footprints(boxes, shown)
+    for k, (own, box) in enumerate(zip(averaged, boxes, strict=True)):
+        expected = box.copy()
+        if k < len(shown) and k % 2:
+            weight = shown[k].score / (shown[k].score + box[SCORE])
+            expected[[0, 3, 6]] += weight * np.array([0.2, 0.3, 0.1])
+        np.testing.assert_allclose(own, expected, atol=1e-12)
+    np.testing.assert_allclose(with_footprints(boxes, ()), boxes, atol=1e-12)
 
 
 def test_the_card_describes_candidates() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import Any
 
@@ -15,7 +16,6 @@ from edgeperc.ground.scan import Scan
 from edgeperc.inference.object_network import ObjectNetwork
 from edgeperc.inference.session import Session
 from edgeperc.objects.boxes import MIN_SCORE
-from edgeperc.objects.cluster import PERSONS
 from edgeperc.simulation.samples import FIRST_SEED, simulated_scan
 from edgeperc.simulation.scene import SimulatedScan
 from edgeperc.types.geometry import inside
@@ -72,10 +72,10 @@ def test_people_are_the_networks_where_no_labels_box_them() -> None:
 
 @pytest.mark.parametrize("seed", [6, 8, SEED])
 def test_people_are_those_of_the_labels_and_of_the_network(seed: int) -> None:
-    """A labeled person keeps the box; one that the network alone sees keeps half of a score of 0.6 or more."""
+    """A labeled pedestrian keeps the box; one that the network alone sees keeps half of a score of 0.6 or more."""
     points = simulated_scan(seed).points
     labeled, alone, both = (
-        {box.center: box for box in Perceiver(models, n_threads=1)(points).boxes if box.label in PERSONS}
+        {box.center: box for box in Perceiver(models, n_threads=1)(points).boxes if box.label == "pedestrian"}
         for models in ("pointseg", "objects", ["pointseg", "objects"])
     )
     assert labeled.keys() <= both.keys()
@@ -88,6 +88,31 @@ def test_people_are_those_of_the_labels_and_of_the_network(seed: int) -> None:
             assert all(np.hypot(center[0] - x, center[1] - y) > 0.3 for x, y, _ in labeled)
     least = {6: 1, 8: 0, SEED: 1}[seed]
     assert len(both) >= len(labeled) + least
+
+
+def test_a_riders_box_is_the_mean_of_that_of_the_labels_and_of_the_networks(scan: SimulatedScan) -> None:
+    """It has the network's heading, whose front is known; where the network sees no rider, it stays."""
+    network = ObjectNetwork(Session("objects", "cpu"))
+    seen = Scan.of(scan.points, find_ground(scan.points))
+    clusters = network.cluster(seen, "both", 0.0)
+    boxes = zip(scan.boxes, scan.box_points, strict=True)
+    true = next(box for box, n in boxes if box.label == "cyclist" and n > 100)
+    x, y, z = true.center
+    labeled = replace(true, score=0.9, center=(x + 0.2, y - 0.1, z), yaw=true.yaw + math.pi, front=None)
+    higher = replace(labeled, center=(x + 0.2, y - 0.1, z + 0.1), size=(*true.size[:2], true.size[2] + 0.2))
+    (rider,), (other,) = (network.complete(seen, clusters, (), [box], True, 0.3) for box in (labeled, higher))
+    look, same = (
+        2.0 * np.array([box.center, box.size]) - [given.center, given.size]
+        for box, given in ((rider, labeled), (other, higher))
+    )
+    np.testing.assert_allclose(look, same, atol=1e-9)
+    np.testing.assert_allclose(look, [true.center, true.size], atol=0.4)
+    assert math.cos(rider.yaw - true.yaw) > 0.9
+    assert rider.front is not None
+    assert rider.front > 0.5
+    assert math.dist(rider.center[:2], (x, y)) < math.hypot(0.2, 0.1)
+    nobody = replace(labeled, center=(1.0, 60.0, -0.8))
+    assert network.complete(seen, clusters, (), [nobody], True, 0.3) == (replace(nobody, score=0.45),)
 
 
 @pytest.mark.parametrize(("by_labels", "min_score", "score"), [(False, 0.3, 0.9), (True, 0.3, 0.45), (True, 0.6, 0.6)])
