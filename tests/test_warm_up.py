@@ -100,9 +100,16 @@ def start(folder: Path, n_cores: int, **environment: str) -> tuple[list[str], li
 
 @pytest.fixture(scope="module")
 def first(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, tuple[list[str], list[str], str, list[str]]]:
-    """The folder of a first start with a helper, which takes long, and what it said."""
-    folder = tmp_path_factory.mktemp("first") / "helped"
-    return folder, start(folder, 2, NUMBA_CACHE_DIR=str(folder / "cache"))
+    """The folder of a first start with a helper, and what it said. It takes long: all processes of a run share it."""
+    from filelock import FileLock
+
+    folder = tmp_path_factory.getbasetemp()
+    folder = (folder.parent if "PYTEST_XDIST_WORKER" in os.environ else folder) / "first-start"
+    with FileLock(folder.with_suffix(".lock")):
+        if not (folder / "said.json").exists():
+            said = start(folder, 2, NUMBA_CACHE_DIR=str(folder / "cache"))
+            (folder / "said.json").write_text(json.dumps(said))
+    return folder, tuple(json.loads((folder / "said.json").read_text()))
 
 
 def test_what_is_counted_is_what_is_compiled_once(first: tuple[Path, Any]) -> None:
