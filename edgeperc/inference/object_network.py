@@ -144,7 +144,7 @@ def _seen_person(box: Box, look: Sequence[float], classes: Sequence[str], min_sc
     """
     x, y, z, length, width, height, yaw, score, label, front = look
     seen = replace(box, score=max(0.5 * (box.score + score), min_score))
-    if PERSONS[box.label] != RIDES or score == 0.0 or classes[int(label)] != box.label:
+    if PERSONS[box.label] != RIDES or score < SEEN or classes[int(label)] != box.label:
         return seen
     both = 0.5 * np.add([box.center, box.size], [(x, y, z), (length, width, height)])
     (x, y, z), (length, width, height) = both.tolist()

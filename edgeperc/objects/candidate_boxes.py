@@ -16,6 +16,7 @@ from ..types.points import Floats, Floats32, read_only
 
 # Columns of decoded boxes.
 X, Y, Z, LENGTH, WIDTH, HEIGHT, YAW, SCORE, LABEL, FRONT = range(10)
+FOOTPRINT = [X, Y, LENGTH, WIDTH, YAW]
 MAX_LOG_SIDE = 1.0  # of a side, divided by the usual one
 # IoU of two objects; the lower limit of the two counts. People stand closer than vehicles.
 MAX_OVERLAP = {"pedestrian": 0.3}
@@ -46,7 +47,7 @@ def decode_objects(card: ModelCard, outputs: Floats32, rectangles: Floats, level
 
 def footprints(boxes: Floats) -> Floats:
     """x, y, length, width, yaw of boxes (m, 10), (m, 5)."""
-    return boxes.take([X, Y, LENGTH, WIDTH, YAW], axis=1)
+    return boxes.take(FOOTPRINT, axis=1)
 
 
 def merge_boxes(boxes: Floats, classes: Sequence[str]) -> Floats:
@@ -81,7 +82,7 @@ def with_footprints(boxes: Floats, others: Sequence[Box]) -> Floats:
     them by more than 0.5: its errors are other errors. Heights, which it does not know, scores and fronts stay.
     """
     theirs = np.zeros((len(others), 10))
-    theirs[:, [X, Y, LENGTH, WIDTH, YAW]] = rectangles(others)
+    theirs[:, FOOTPRINT] = rectangles(others)
     theirs[:, SCORE] = [box.score for box in others]
     every, averaged = np.concatenate([boxes, theirs]), boxes.copy()
     fill_merged(every, oriented_iou(footprints(boxes), footprints(every)), averaged)
