@@ -60,7 +60,7 @@ def road_network(path: Path, view: TopViewGeometry, classes: tuple[str, ...] = (
         onnx.helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, [1, n, view.height, view.width])
         for name, n in shapes
     )
-    node = onnx.helper.make_node("Conv", ["top_view", "w", "b"], ["segmentation"])
+    node = onnx.helper.make_node("Conv", ["top_view", "w", "b"], ["segmentation"], kernel_shape=[1, 1])
     graph = onnx.helper.make_graph([node], "road", [given], [answer], tensors)
     model = onnx.helper.make_model(graph, opset_imports=[onnx.helper.make_opsetid("", 17)], ir_version=8)
     outputs = (OutputSpec("segmentation", "class_logits"),)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import tiny_model
-from tiny_model import field, node, number, shaped, tensor
+from tiny_model import field, integers, node, shaped, tensor
 
 from edgeperc.inference.session import golden_input
 from edgeperc.types.card import Golden, InputSpec, ModelCard, OutputSpec
@@ -18,12 +18,6 @@ __all__ = ["CLASSES", "camera_card", "camera_model", "write_camera"]
 CLASSES = ("Sky", "Road", "Tree")
 # A pixel is road if it is red, a tree if it is green, sky if it is blue.
 WEIGHTS = np.array([[-1.0, -1.0, 2.0], [2.0, -1.0, -1.0], [-1.0, 2.0, -1.0]], np.float32)
-
-
-def _ints(name: str, values: tuple[int, ...]) -> bytes:
-    """An attribute of a node: a list of whole numbers."""
-    content = b"".join(number(8, value) for value in values)
-    return field(5, field(1, name.encode()) + content + number(20, 7))
 
 
 def camera_card(width: int = 32, height: int = 24, stride: int = 4) -> ModelCard:
@@ -55,8 +49,8 @@ def camera_model(card: ModelCard | None = None, stride: int = 4) -> bytes:
     card = camera_card(stride=stride) if card is None else card
     height, width = card.view.height, card.view.width
     weights = np.repeat(np.repeat(WEIGHTS[:, :, None, None], stride, axis=2), stride, axis=3) / stride**2
-    strides = _ints("strides", (stride, stride))
-    graph = node("Conv", "x w", "y", strides) + field(
+    square = integers("kernel_shape", stride, stride) + integers("strides", stride, stride)
+    graph = node("Conv", "x w", "y", square) + field(
         5, tensor("w", (3, 3, stride, stride), weights.astype("<f4").tobytes())
     )
     graph += field(2, b"g") + field(11, shaped("x", (1, 3, height, width)))

@@ -18,6 +18,7 @@ __all__ = [
     "entry",
     "field",
     "graph",
+    "integers",
     "model",
     "node",
     "number",
@@ -71,7 +72,12 @@ def shaped(name: str, shape: tuple[int, ...]) -> bytes:
     return field(1, name.encode()) + field(2, field(1, number(1, 1) + field(2, dims)))
 
 
-CONVOLUTION = node("Conv", "x w", "y")
+def integers(name: str, *values: int) -> bytes:
+    """An attribute of a node."""
+    return field(5, field(1, name.encode()) + b"".join(number(8, value) for value in values) + number(20, 7))
+
+
+CONVOLUTION = node("Conv", "x w", "y", integers("kernel_shape", 1, 1))
 INITIALIZER = field(5, tensor("w", (2, 2, 1, 1), WEIGHTS.tobytes()))
 
 

@@ -24,6 +24,7 @@ MAX_DEPTH = 32  # messages within messages; a graph without subgraphs needs 5
 MAX_NODES = 20_000
 MAX_WEIGHT_BYTES = 10**9
 MAX_FOLDED = 2**28  # values that onnxruntime computes from constants while it opens a file
+N_TYPES = 28  # of TensorProto.DataType in ONNX 1.23, from 1 on; onnxruntime 1.23.2 looks others up past its table
 MAX_SMALL = 2**16  # values of one arithmetic result of constants: shapes and scales, not weights
 
 _OPERATORS = """
@@ -50,6 +51,9 @@ Abs Add And Ceil Clip Concat Div Equal Exp Floor Gather Greater GreaterOrEqual L
 Not Or Pow Reciprocal ReduceMax ReduceMean ReduceMin ReduceSum Sqrt Sub Sum Where
 """
 SMALL = frozenset(_SMALL.split())
+# onnxruntime takes the shape of a kernel from the weights if the node does not give it, and reads past the end of its
+# memory where the input has fewer axes: 1.23.2, the newest for Python 3.10, notices, and ends the process.
+WITH_KERNELS = frozenset({"Conv", "ConvInteger", "ConvTranspose", "QLinearConv"})
 # The size of these depends on values. A graph with one that takes few constants is opened without computing with
 # constants: a scatter of pillars has them.
 DEFERRED = frozenset(
@@ -278,10 +282,11 @@ class _GraphCheck:
         operator = domain = b""
         inputs: list[bytes] = []
         outputs: list[bytes] = []
-        n_values = 0
+        attributes: dict[bytes, int] = {}
         for number, _, first, last in self._messages(start, end, 1, 2, 4, 5, 7):
             if number == 5:
-                n_values += self._attribute(first, last, depth)
+                attribute, n_values = self._attribute(first, last, depth)
+                attributes[attribute] = attributes.get(attribute, 0) + n_values
                 continue
             text = self._reader.content(first, last)
             if number == 1:
@@ -299,9 +304,11 @@ class _GraphCheck:
             name = f"{domain.decode('ascii', 'backslashreplace')[:100]}.{name}"
         if name not in OPERATORS:
             self._refuse_unless_trusted(f"has a node {name!r}, which is not among the operators that are opened")
+        if name in WITH_KERNELS and b"kernel_shape" not in attributes:
+            self._refuse_unless_trusted(f"has a {name!r} without its kernel_shape, which every exporter writes")
         if len(self._nodes) >= MAX_NODES:
             self._refuse_unless_trusted(f"has more than {MAX_NODES} nodes")
-        self._nodes.append(_Node(name, frozenset(inputs) - {b""}, frozenset(outputs), n_values))
+        self._nodes.append(_Node(name, frozenset(inputs) - {b""}, frozenset(outputs), sum(attributes.values())))
 
     def _follow_constants(self) -> None:
         """Count what onnxruntime computes from constants alone while it opens the file."""
@@ -341,18 +348,20 @@ class _GraphCheck:
             self._refuse_unless_trusted(f"has a {node.operator!r} that computes with constants alone")
         return n_values
 
-    def _attribute(self, start: int, end: int, depth: int) -> int:
-        """Number of values, at most."""
-        n_values = end - start
-        for number, _, first, last in self._messages(start, end, 5, 6, 10, 11, 22, 23):
-            if number in (5, 10):
+    def _attribute(self, start: int, end: int, depth: int) -> tuple[bytes, int]:
+        """Name, and number of values, at most."""
+        name, n_values = b"", end - start
+        for number, _, first, last in self._messages(start, end, 1, 5, 6, 10, 11, 22, 23):
+            if number == 1:
+                name = self._reader.content(first, last)
+            elif number in (5, 10):
                 n_values += self._tensor(first, last)[1]
             elif number in (22, 23):
                 self._sparse_tensor(first, last)
             else:
                 self._refuse_unless_trusted("has a node that holds a graph")
                 self._graph(first, last, depth + 1)
-        return n_values
+        return name, n_values
 
     def _sparse_tensor(self, start: int, end: int) -> None:
         self._refuse_unless_trusted("holds a sparse tensor")
@@ -368,6 +377,8 @@ class _GraphCheck:
                 raise ModelFileError(f"{self._path} keeps weights in other files; export it with its weights inside")
             if number == 8 and value is None:
                 name = self._reader.content(first, last)
+            elif number == 2 and value is not None and not 1 <= value <= N_TYPES:
+                raise ModelFileError(f"{self._path} has a tensor of the type {value}, unknown to ONNX; export it again")
             elif number == 1:
                 shape.extend(self._reader.integers(value, first, last))
         n_values = math.prod(shape[:64])

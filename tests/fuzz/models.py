@@ -11,7 +11,7 @@ from typing import Any
 from unittest import mock
 
 import numpy as np
-from tiny_model import field, node, number, tensor
+from tiny_model import field, integers, node, number, tensor
 
 import edgeperc.perceiver as perceiver_module
 from edgeperc import Perceiver, SensorProfile
@@ -19,7 +19,7 @@ from edgeperc.inference.session import Session
 from edgeperc.records import read_boxes
 from edgeperc.system.machine import fingerprint, read_setting, write_settings
 from edgeperc.types.card import ModelCard
-from edgeperc.types.onnx_file import OPERATORS
+from edgeperc.types.onnx_file import OPERATORS, WITH_KERNELS
 from edgeperc.types.sensor import SENSORS, get_sensor
 from edgeperc.zoo import digest, model_path, resolve
 
@@ -43,6 +43,7 @@ HOSTILE = [
     *(field(5, tensor("w", dims, bytes(16))) for dims in [(1 << 40,), (-1, 2), (0,), (1 << 31, 1 << 31, 1 << 31), ()]),
     *(node(op, "x", "y", field(5, field(1, b"body") + field(6, BODY))) for op in ("Loop", "If", "Scan", "Conv")),
     *(node(op, "x w", "y") for op in sorted(OPERATORS)),
+    *(node(op, "x w", "y", integers("kernel_shape", *[1] * n)) for op in sorted(WITH_KERNELS) for n in range(4)),
     *(node(op, "w w", "y") for op in sorted(OPERATORS)[::5]),
     *(node(op, "x w", "y") for op in ("Loop", "NonZero", "RandomUniform", "StringNormalizer", "Optional", "Range")),
     node("ConstantOfShape", "w", "w"), node("Tile", "x w", "y"), node("Conv", "y w", "y"), node("Add", "x x", "w"),

@@ -12,6 +12,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
+import onnxruntime
 import pytest
 
 import edgeperc.inference.session as session_module
@@ -41,7 +42,9 @@ def test_shipped_model_reproduces_the_golden_outputs(variant: Variant) -> None:
     session = Session(str(variant), "cpu")
     assert (session.path, session.card.name, session.precision) == (variant.path, variant.name, variant.precision)
     assert session.description == f"{variant.name} {variant.precision}, CPUExecutionProvider"
-    assert session.golden_deviation < 0.01
+    # Before 1.28, onnxruntime rounds some int8 values between layers otherwise: 0.05 with AVX2.
+    is_recent = tuple(map(int, onnxruntime.__version__.split(".")[:2])) >= (1, 28)
+    assert session.golden_deviation < (0.01 if is_recent or variant.precision == "fp32" else 0.1)
     assert session.sha256 == session.digest == hashlib.sha256(variant.path.read_bytes()).hexdigest()
 
 
@@ -364,6 +367,7 @@ def test_the_webgpu_plugin_runs_fp32(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_auto_does_not_let_openvino_compile_each_number_of_candidates(monkeypatch: pytest.MonkeyPatch) -> None:
     FakePlugins(monkeypatch, [(PROVIDERS["openvino"], "CPU")])
+    monkeypatch.setattr(session_module, "version", lambda package: f"{package} 1.0")
     assert available_providers() == ("openvino", "cpu")
     assert [Session(name, "auto").short for name in ("pointseg", "objects")] == ["openvino", "cpu"]
     assert Session("objects", "openvino").short == "openvino"  # as it was asked for
@@ -376,7 +380,7 @@ def test_a_failing_run_is_an_inference_error() -> None:
         def run_with_iobinding(self, _: object) -> None:
             raise RuntimeError("no memory")
 
-    session.inference = Broken()
+    _network, session.inference = session.inference, Broken()  # before 1.24, a binding does not keep its network
     with pytest.raises(errors.InferenceError, match="no memory"):
         session.run()
 

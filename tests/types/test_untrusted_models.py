@@ -190,6 +190,8 @@ UNUSUAL = {
     r"has a node 'com\.microsoft\.Conv'": graph(node("Conv", "x w", "y", field(7, b"com.microsoft")), INITIALIZER),
     "has a node that holds a graph": graph(node("Conv", "x w", "y", field(5, field(6, b""))), INITIALIZER),
     "holds a sparse tensor": graph(CONVOLUTION, field(15, b"")),
+    "has a 'Conv' without its kernel_shape": graph(node("Conv", "x w", "y"), INITIALIZER),
+    "has a 'QLinearConv' without its kernel_shape": graph(node("QLinearConv", "x a b w a b a b", "y"), INITIALIZER),
     "'MatMul' that computes with constants alone": graph(BIG, node("MatMul", "big big", "y")),
     "'Expand' that computes with constants alone": graph(BIG, node("Expand", "big big", "y")),
     "'Mul' that computes with constants alone": graph(node("Mul", "c c", "y"), node("Identity", "big", "c"), BIG),
@@ -235,6 +237,14 @@ def test_weights_have_a_limit(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(ModelFileError, match="more than 1000 bytes of weights"):
         check_graph(blob, "model.onnx")
     check_graph(blob, "model.onnx", trusted=True)
+
+
+@pytest.mark.parametrize("kind", [0, 29, 2**31, -(2**31)])
+def test_a_tensor_has_a_type_that_onnx_knows(kind: int) -> None:
+    blob = model(graph(CONVOLUTION, field(5, tensor("w", (2, 2, 1, 1), bytes(16), kind))))
+    for trusted in (False, True):
+        with pytest.raises(ModelFileError, match=r"tensor of the type \d+, unknown to ONNX; export it again"):
+            check_graph(blob, "model.onnx", trusted=trusted)
 
 
 @pytest.mark.parametrize("shape", [(2**40,), (2**20, 2**20), (2**64 - 1,), (1,) * 65])
