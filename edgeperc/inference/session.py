@@ -255,6 +255,9 @@ class Session:
         for key, value in entries.items():
             options.add_session_config_entry(key, value)
         plugin = plugin_devices(ort, short) if short in PLUGINS else []
+        # If a provider fails, onnxruntime takes others and prints to stdout; before 1.23 no argument forbids it.
+        refuse = property(lambda _: False, lambda *_: None)
+        network = type("Network", (ort.InferenceSession,), {"_enable_fallback": refuse})
         settings: dict[str, str] = {}
         try:
             if plugin:
@@ -273,13 +276,10 @@ class Session:
                 elif short == "qnn":
                     settings["htp_performance_mode"] = "burst"  # its default clocks the NPU down between two scans
                 options.add_provider_for_devices(plugin[:1], settings)
-                session = ort.InferenceSession(blob, options, enable_fallback=0)
+                session = network(blob, options)
             else:
                 unused = [] if folds else ["ConstantFolding"]
-                session = ort.InferenceSession(
-                    blob, options, [PROVIDERS[short]], enable_fallback=0, disabled_optimizers=unused
-                )
-            session.disable_fallback()  # of runs; enable_fallback=0: of opening, which would print to stdout
+                session = network(blob, options, [PROVIDERS[short]], disabled_optimizers=unused)
             for each in (*session.get_inputs(), *session.get_outputs()):
                 _ = each.name, each.shape  # fails if one is not UTF-8
         except Exception as exc:  # onnxruntime's errors share no base but Exception

@@ -82,6 +82,7 @@ def test_spread_labels_match_the_slow_twin(parts: list[list[bool]], seed: int) -
 @patient
 @given(clouds, sectors)
 def test_a_sector_and_what_is_beside_it_are_kept(points: NDArray[np.float32], view: RangeImageGeometry) -> None:
+    points = points[~(np.abs(points[:, :2]) > 1e15).any(axis=1)]  # there, rounding of a sine is more than the margin
     x, y = points[:, :2].T.astype(np.float64)
     turned = np.degrees(np.arctan2(y, x))
     finite = np.isfinite(x) & np.isfinite(y)
