@@ -265,6 +265,8 @@ def _persons(
             score *= min(1.0, MAX_HEADS_M[name] / max(heads, MIN_SIDE_M)) ** 2
         sides = (max(along, usual[0], MIN_SIDE_M), max(across, usual[1], MIN_SIDE_M))
         tall = max(top - bottom, usual[2], MIN_SIDE_M)
+        if not rides:  # whose shoulders are the axis: of 80 pedestrians of 19 drives, 60 look across it, 20 along it
+            sides, yaw = sides[::-1], yaw + math.pi / 2.0
         yaw = (yaw + math.pi / 2.0) % math.pi - math.pi / 2.0
         boxes.append(Box(name, score, (x, y, bottom + 0.5 * tall), (*sides, tall), yaw))
     return boxes

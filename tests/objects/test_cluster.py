@@ -532,7 +532,7 @@ def test_every_class_has_boxes_and_better_ones_come_first() -> None:
     boxes = objects_from_points(points, labels, CLASSES)
     assert [box.label for box in boxes] == ["car", "pedestrian"]
     assert 1.0 > boxes[0].score > boxes[1].score > 0.0
-    np.testing.assert_allclose(boxes[1].size[:2], OBJECT_SIZE_M["pedestrian"][:2], atol=0.01)
+    np.testing.assert_allclose(boxes[1].size[1::-1], OBJECT_SIZE_M["pedestrian"][:2], atol=0.01)
     assert objects_from_points(points, labels, CLASSES) == boxes
 
 

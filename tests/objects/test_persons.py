@@ -82,13 +82,28 @@ def test_a_person_seen_from_one_side_gets_a_box_of_a_persons_size_around_the_poi
     xyz = person(*where)
     (box,) = boxes_of(xyz)
     assert box.label == "pedestrian"
-    np.testing.assert_allclose(box.size, OBJECT_SIZE_M["pedestrian"], atol=0.03)
+    length, width, height = OBJECT_SIZE_M["pedestrian"]  # the longer side is that of the shoulders
+    np.testing.assert_allclose(box.size, (width, length, height), atol=0.03)
     assert math.dist(box.center[:2], where) < 0.15
     cos, sin = math.cos(box.yaw), math.sin(box.yaw)
     offsets = (xyz[:, :2] - box.center[:2]) @ np.array([[cos, -sin], [sin, cos]])
     assert (np.abs(offsets) <= np.array(box.size[:2]) / 2 + 1e-6).all()
     assert box.center[2] - box.size[2] / 2 == pytest.approx(GROUND_Z, abs=1e-5)
     assert box.score > 0.7
+
+
+@pytest.mark.parametrize("turn", [-1.4, -0.5, 0.0, 0.3, 1.1, 1.5])
+@pytest.mark.parametrize("label", [2, 3])
+def test_pedestrians_look_across_their_longer_side_and_riders_along_it(turn: float, label: int) -> None:
+    rng = np.random.default_rng(5)
+    cos, sin = math.cos(turn), math.sin(turn)
+    xyz = rng.uniform((-0.35, -0.15, GROUND_Z), (0.35, 0.15, GROUND_Z + 1.75), (600, 3))
+    xyz[:, :2] = xyz[:, :2] @ np.array([[cos, sin], [-sin, cos]]) + (9.0, 1.0)
+    (box,) = boxes_of(xyz, labels=[label])
+    expected = turn + (math.pi / 2 if label == 2 else 0.0)
+    assert math.sin(2 * (box.yaw - expected)) == pytest.approx(0.0, abs=0.2)
+    assert math.cos(2 * (box.yaw - expected)) > 0.9
+    assert (box.size[0] > box.size[1]) == (label == 3)
 
 
 @pytest.mark.parametrize("away", [8.0, 15.0, 22.0])
