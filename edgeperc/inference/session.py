@@ -280,6 +280,7 @@ class Session:
             else:
                 unused = [] if folds else ["ConstantFolding"]
                 session = network(blob, options, [PROVIDERS[short]], disabled_optimizers=unused)
+            session.disable_fallback()  # of runs, if a newer version names its attribute otherwise
             for each in (*session.get_inputs(), *session.get_outputs()):
                 _ = each.name, each.shape  # fails if one is not UTF-8
         except Exception as exc:  # onnxruntime's errors share no base but Exception

@@ -282,11 +282,13 @@ class _GraphCheck:
         operator = domain = b""
         inputs: list[bytes] = []
         outputs: list[bytes] = []
-        attributes: dict[bytes, int] = {}
+        attributes: set[bytes] = set()
+        n_values = 0
         for number, _, first, last in self._messages(start, end, 1, 2, 4, 5, 7):
             if number == 5:
-                attribute, n_values = self._attribute(first, last, depth)
-                attributes[attribute] = attributes.get(attribute, 0) + n_values
+                attribute, n_inside = self._attribute(first, last, depth)
+                attributes.add(attribute)
+                n_values += n_inside
                 continue
             text = self._reader.content(first, last)
             if number == 1:
@@ -308,7 +310,7 @@ class _GraphCheck:
             self._refuse_unless_trusted(f"has a {name!r} without its kernel_shape, which every exporter writes")
         if len(self._nodes) >= MAX_NODES:
             self._refuse_unless_trusted(f"has more than {MAX_NODES} nodes")
-        self._nodes.append(_Node(name, frozenset(inputs) - {b""}, frozenset(outputs), sum(attributes.values())))
+        self._nodes.append(_Node(name, frozenset(inputs) - {b""}, frozenset(outputs), n_values))
 
     def _follow_constants(self) -> None:
         """Count what onnxruntime computes from constants alone while it opens the file."""
