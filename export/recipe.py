@@ -177,6 +177,11 @@ class Recipe:
     detector: bool = _option(
         True, "boxes of ssadnet, a network that was trained on KITTI, are candidates in training too", TASKS["objects"]
     )
+    found_again: float = _option(
+        0.0,
+        "share of the candidates that are boxes which the network itself finds, as at its second look",
+        TASKS["objects"],
+    )
     seed: int = _option(0, "seed of the initial weights, the samples and the dropout")
 
     @property
@@ -336,6 +341,9 @@ OBJECTS = Recipe(
     redraw_every=0,
 )
 
+# Continued with its own boxes among the candidates, for the second look gets such boxes. TBD
+SECOND_LOOK = replace(OBJECTS, found_again=0.45, steps=12_000, learning_rate=1e-3)
+
 # Without KITTI, the 28 real scans are of one street: most scans are simulated. Three quarters of the channels, and int8
 # alone, let three more models fit into the wheel.
 OPEN = replace(EDGE, steps=3500, batch=8, reuse=1, ema=0.998, redraw_every=2000, simulated_share=0.8, width=0.75)
@@ -420,13 +428,22 @@ MODELS = {
     "camseg": Stage(CAMSEG),
     # The object network sees points, not beams: with scans of other sensors it learns how sparse an object may be.
     # Without halls it took walls, beams and pipes for trucks.
-    "objects": Stage(OBJECTS, also=("sensors", "halls")),
+    "objects-start": Stage(OBJECTS, also=("sensors", "halls")),
+    "objects": Stage(SECOND_LOOK, after="objects-start", also=("sensors", "halls")),
     "ssadnet-open": Stage(
         replace(OPEN, network="ssadnet", height_above_ground=False, front=True, n_pasted=3.0),
         is_open=True,
         also=("sensors",),
     ),
-    "objects-open": Stage(replace(OBJECTS, steps=16_000, detector=False), is_open=True, also=("sensors", "halls")),
+    "objects-open-start": Stage(
+        replace(OBJECTS, steps=16_000, detector=False), is_open=True, also=("sensors", "halls")
+    ),
+    "objects-open": Stage(
+        replace(SECOND_LOOK, steps=10_000, detector=False),
+        after="objects-open-start",
+        is_open=True,
+        also=("sensors", "halls"),
+    ),
     "four-classes-start": Stage(OPEN_POINTS, is_open=True, also=("six-sensors",)),
     "scene-start": Stage(SCENE, after="four-classes-start", is_open=True, also=("sensors",)),
     "sceneseg-start": Stage(

@@ -16,6 +16,7 @@ LOOK_STRIDE = 4
 LEAST = math.log(0.4 / 0.6)
 """Logit of the least probability for a close look."""
 SURE = 12.0
+LOOK, CLOSE = "look_", "close_"  # before the names of the first look's and the other tensors of an exported network
 
 
 class Parts(NamedTuple):

@@ -9,7 +9,7 @@ import onnx
 from numpy.typing import NDArray
 from onnx import TensorProto, compose, helper, numpy_helper
 
-from ..networks.objects import LEAST, rejected
+from ..networks.objects import CLOSE, LEAST, LOOK, rejected
 
 
 def with_first_look(look: onnx.ModelProto, close: onnx.ModelProto) -> onnx.ModelProto:
@@ -17,7 +17,7 @@ def with_first_look(look: onnx.ModelProto, close: onnx.ModelProto) -> onnx.Model
     whose logit of ``look`` reaches `LEAST`; each then takes its row of the outputs, or that of `rejected`.
     """
     source, output = close.graph.input[0], close.graph.output[0]
-    look, close = compose.add_prefix(look, "look_"), compose.add_prefix(close, "close_")
+    look, close = compose.add_prefix(look, LOOK), compose.add_prefix(close, CLOSE)
     logits, inner, outer = look.graph.output[0].name, close.graph.input[0].name, close.graph.output[0].name
     constants: dict[str, NDArray[Any]] = {
         "least": np.array(LEAST, np.float32),  # of -inf, all get a close look (`inference.object_network`)

@@ -4,19 +4,21 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from edgeperc.inference.object_network import AGAIN
+from edgeperc.objects.candidate_boxes import SCORE, decode_objects, footprints
 from edgeperc.objects.crops import fill_features
 from edgeperc.preprocess.remission import NO_REMISSION
 from edgeperc.types.points import Floats, Floats32, Ints64, Mask, Points
 
 from ..cards import OBJECT_CLASSES
-from ..networks.objects import LEAST, Parts, parts_of
+from ..networks.objects import LEAST, ObjectNet, Parts, parts_of
 from .object_samples import BACKGROUND, DETECTED, GROUP, N_STORED, TRUE, ObjectSamples
 from .object_sets import PASTED
 from .object_task import VEHICLE, Objects
@@ -67,24 +69,45 @@ class Drawn:
             samples.truth[chosen].astype(np.float64),
         )
 
+    def rows(self, chosen: slice | Mask) -> Drawn:
+        """Some of the samples."""
+        return Drawn(*(getattr(self, field.name)[chosen] for field in fields(self)))
+
+    def move(self, ahead: Floats, left: Floats, turn: Floats) -> None:
+        """Move and turn each candidate by as much in its own frame; its points stay where they are."""
+        cos, sin = np.cos(turn)[:, None], np.sin(turn)[:, None]
+        dx, dy = self.points[:, :, 0] - ahead[:, None], self.points[:, :, 1] - left[:, None]
+        self.points[:, :, 0], self.points[:, :, 1] = cos * dx + sin * dy, cos * dy - sin * dx
+        yaw = self.rectangles[:, 4]
+        self.rectangles[:, 0] += np.cos(yaw) * ahead - np.sin(yaw) * left
+        self.rectangles[:, 1] += np.sin(yaw) * ahead + np.cos(yaw) * left
+        self.rectangles[:, 4] += turn
+
+    def in_frames(self, xy: Floats) -> Floats:
+        """Places (B, 2) of the scan in the candidates' frames."""
+        cos, sin = np.cos(self.rectangles[:, 4]), np.sin(self.rectangles[:, 4])
+        dx, dy = (xy - self.rectangles[:, :2]).T
+        return np.stack([cos * dx + sin * dy, cos * dy - sin * dx], axis=1)
+
     def box_targets(self) -> Floats32:
         """x, y in the candidate's frame, bottom above its ground, length, width, height, yaw, (B, 7)."""
-        turn = self.rectangles[:, 4]
-        cos, sin = np.cos(turn), np.sin(turn)
-        dx, dy = (self.truth[:, :2] - self.rectangles[:, :2]).T
         bottom = self.truth[:, 2] - 0.5 * self.truth[:, 5] - self.level
-        yaw = self.truth[:, 6] - turn
-        columns = [cos * dx + sin * dy, cos * dy - sin * dx, bottom, *self.truth[:, 3:6].T, yaw]
+        yaw = self.truth[:, 6] - self.rectangles[:, 4]
+        columns = [*self.in_frames(self.truth[:, :2]).T, bottom, *self.truth[:, 3:6].T, yaw]
         return np.stack(columns, axis=1).astype(np.float32)
 
 
 class ObjectBatches:
-    """Batches of samples of named sources; ``simulated`` has the length of simulated scans, ``odds`` is empty."""
+    """Batches of samples of named sources; ``simulated`` has the length of simulated scans, ``odds`` is empty.
+
+    network : finds the boxes that are candidates again, as at the second look; it changes while it is trained.
+    """
 
     n_targets = 2
 
     def __init__(self, task: Objects, samples: ObjectSamples, names: Sequence[str]) -> None:
         self.task, self.recipe, self.samples = task, task.recipe, samples
+        self.network: ObjectNet | None = None
         of_simulation = (samples.classes == BACKGROUND) & (samples.sources == [*names, SIMULATED].index(SIMULATED))
         self.simulated = range(len(np.unique(samples.objects[of_simulation])))
         self.odds: dict[str, Floats] = {}
@@ -93,11 +116,19 @@ class ObjectBatches:
     def batch(self, step: int) -> tuple[Tensor, Tensor, Tensor]:
         """Input (B, n_points, channels), classes (B,) and boxes (B, 7) of one step, the same for the same step."""
         rng = np.random.default_rng((self.recipe.seed, step))
+        drawn = self._draw(rng)
+        if self.network is not None and self.recipe.found_again > 0.0:
+            found = found_again(self.task, self.network, self._draw(rng), rng)
+            n = min(round(self.recipe.found_again * self.recipe.batch), len(found.counts))
+            drawn = joined(drawn.rows(slice(self.recipe.batch - n)), found.rows(slice(n)))
+        return tensors(self.task, drawn, rng)
+
+    def _draw(self, rng: np.random.Generator) -> Drawn:
         chosen = np.searchsorted(self._sums, rng.random(self.recipe.batch) * self._sums[-1], side="right")
         drawn = Drawn.of(self.samples, np.minimum(chosen, len(self._sums) - 1))
         if self.recipe.augment:
             _augment(drawn, rng)
-        return tensors(self.task, drawn, rng)
+        return drawn
 
     def batches(self, start: int, stop: int) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
         """The batches of the steps from ``start`` to ``stop``."""
@@ -148,13 +179,7 @@ def _augment(drawn: Drawn, rng: np.random.Generator) -> None:
     errors[(drawn.origin == TRUE) & np.isin(drawn.classes, PERSONS)] = PERSON_ERRORS
     ahead, left, turn = (errors[:, :3] * rng.standard_normal((n, 3))).T
     turn += np.where(rng.random(n) < 0.5, math.pi, 0.0)
-    cos, sin = np.cos(turn)[:, None], np.sin(turn)[:, None]
-    dx, dy = points[:, :, 0] - ahead[:, None], points[:, :, 1] - left[:, None]
-    points[:, :, 0], points[:, :, 1] = cos * dx + sin * dy, cos * dy - sin * dx
-    yaw = rectangles[:, 4]
-    rectangles[:, 0] += np.cos(yaw) * ahead - np.sin(yaw) * left
-    rectangles[:, 1] += np.sin(yaw) * ahead + np.cos(yaw) * left
-    rectangles[:, 4] += turn
+    drawn.move(ahead, left, turn)
     rectangles[:, 2:4] *= np.exp(errors[:, 3:] * rng.standard_normal((n, 2)))
     raised = 0.05 * rng.standard_normal(n)  # an error of the ground
     points[:, :, 2] += raised[:, None].astype(np.float32)
@@ -169,6 +194,28 @@ def _augment(drawn: Drawn, rng: np.random.Generator) -> None:
     gain = np.exp(0.3 * rng.standard_normal(n)).astype(np.float32)
     points[:, :, 3] = np.minimum(points[:, :, 3] * gain[:, None], 1.0)
     points[rng.random(n) < 0.1, :, 3] = NO_REMISSION.coefficients[0]
+
+
+@torch.no_grad()
+def found_again(task: Objects, network: ObjectNet, drawn: Drawn, rng: np.random.Generator) -> Drawn:
+    """The boxes that a network finds at candidates, seen from either end, as candidates of the second look: each stage
+    of a cascade learns from what the one before finds (Cai and Vasconcelos, 2018, section 4).
+    """
+    device = next(network.parameters()).device
+    outputs = network.closely(tensors(task, drawn, rng)[0].to(device)).float().cpu().numpy()
+    boxes = decode_objects(task.card, outputs, drawn.rectangles, drawn.level)
+    found = boxes[:, SCORE] >= AGAIN
+    drawn, places = drawn.rows(found), footprints(boxes[found])
+    ends = np.where(rng.random(len(places)) < 0.5, math.pi, 0.0)
+    ahead, left = drawn.in_frames(places[:, :2]).T
+    drawn.move(ahead, left, places[:, 4] - drawn.rectangles[:, 4] + ends)
+    drawn.rectangles[:, 2:4] = places[:, 2:4]
+    return drawn
+
+
+def joined(first: Drawn, second: Drawn) -> Drawn:
+    """Samples of two draws."""
+    return Drawn(*(np.concatenate([getattr(part, field.name) for part in (first, second)]) for field in fields(Drawn)))
 
 
 def tensors(task: Objects, drawn: Drawn, rng: np.random.Generator | None = None) -> tuple[Tensor, Tensor, Tensor]:

@@ -22,6 +22,7 @@ from edgeperc.inference.session import golden_input, golden_shape
 from edgeperc.types.card import ModelCard
 
 from ..cards import card_of
+from ..networks.objects import CLOSE, LOOK
 from ..recipe import Recipe
 from .checkpoint import read_checkpoint
 
@@ -70,7 +71,9 @@ def folded_weights(path: Path) -> dict[str, Tensor]:
     for tensor in onnx.load(path).graph.initializer:
         values = onnx.numpy_helper.to_array(tensor)
         if values.dtype in (np.float16, np.float32):
-            weights[tensor.name.removesuffix("_half")] = torch.from_numpy(values.astype(np.float32))
+            name = tensor.name.removesuffix("_half").removeprefix(CLOSE)
+            name = f"look.{name.removeprefix(LOOK)}" if name.startswith(LOOK) else name
+            weights[name] = torch.from_numpy(values.astype(np.float32))
     return weights
 
 

@@ -158,6 +158,8 @@ class _Training:
         # The compiled network shares its weights with the original, which is averaged and saved.
         self.forward: Any = torch.compile(self.network) if run.compiled else self.network
         self.averaged = copy.deepcopy(self.network).eval()
+        if isinstance(self.source.samples, ObjectBatches):
+            self.source.samples.network = self.averaged
         self.optimizer = make_optimizer(recipe, self.network)
         if self.checkpoint.exists():
             self._resume()

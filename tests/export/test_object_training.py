@@ -25,7 +25,7 @@ from edgeperc.perceiver import Perceiver
 from edgeperc.simulation.samples import simulated_scan
 from edgeperc.types.card import ModelCard
 from edgeperc.types.mounting import MODEL_MOUNTING
-from edgeperc.types.points import read_only
+from edgeperc.types.points import Floats, read_only
 from edgeperc.types.sensor import get_sensor
 from edgeperc.zoo import model_path
 from edgeperc_export.cards import OBJECT_CLASSES, OBJECT_VIEW
@@ -38,8 +38,9 @@ from edgeperc_export.release import object_int8
 from edgeperc_export.release.object_int8 import candidate_batches, quantize_objects, rounded
 from edgeperc_export.release.quantize import Calibration, folded
 from edgeperc_export.release.to_onnx import load, to_graph, verify, with_golden, write_card
+from edgeperc_export.training import object_batches
 from edgeperc_export.training.object_batches import Drawn as Drawn
-from edgeperc_export.training.object_batches import ObjectBatches, ObjectWatch, tensors
+from edgeperc_export.training.object_batches import ObjectBatches, ObjectWatch, found_again, tensors
 from edgeperc_export.training.object_samples import (
     GROUP,
     N_STORED,
@@ -51,6 +52,7 @@ from edgeperc_export.training.object_samples import (
 )
 from edgeperc_export.training.object_sets import variants
 from edgeperc_export.training.object_task import Objects, fill_box_ious
+from edgeperc_export.training.start import start
 from edgeperc_export.training.train import Data, Run, train
 
 SEED = 4 * 10**9
@@ -121,6 +123,63 @@ def test_batches_are_the_same_for_the_same_step(samples: ObjectSamples) -> None:
     assert torch.isfinite(x).all()
     assert torch.isfinite(boxes).all()
     assert (boxes[labels > 0][:, 3:6] > 0.0).all()
+
+
+class Finder(ObjectNet):
+    """Finds at each candidate a car 1 m ahead and 0.5 m to the left, turned by 0.2 rad; none among few points."""
+
+    def closely(self, x: Any) -> Any:
+        """Outputs (B, 29)."""
+        outputs = torch.zeros(len(x), 29)
+        outputs[:, 0], outputs[:, 1], outputs[:, -1] = torch.where(x[:, 0, -1] > 0.0, -9.0, 9.0), 0.0, 9.0
+        outputs[:, 6], outputs[:, 7] = 1.0, 0.5
+        outputs[:, 24], outputs[:, 25], outputs[:, 26] = math.cos(0.4), math.sin(0.4), 1.0
+        return outputs
+
+
+def in_scan(drawn: Drawn) -> Floats:
+    """x, y of the points (2, B, N_STORED) in the scan."""
+    cos, sin = np.cos(drawn.rectangles[:, 4])[:, None], np.sin(drawn.rectangles[:, 4])[:, None]
+    u, v = drawn.points[:, :, 0], drawn.points[:, :, 1]
+    return np.stack([cos * u - sin * v, sin * u + cos * v]) + drawn.rectangles[:, :2].T[:, :, None]
+
+
+def test_what_is_found_is_a_candidate_from_either_end(samples: ObjectSamples) -> None:
+    task = Objects.of(RECIPE)
+    network = Finder(len(task.input.channels), len(task.classes))
+    before = Drawn.of(samples, np.arange(len(samples.counts)))
+    many = tensors(task, before, np.random.default_rng(0))[0][:, 0, -1].numpy() > 0.0
+    old = before.rows(many)
+    found = found_again(task, network, Drawn.of(samples, np.arange(len(samples.counts))), np.random.default_rng(0))
+    assert 0 < len(found.counts) == many.sum() < len(many)
+
+    cos, sin = np.cos(old.rectangles[:, 4]), np.sin(old.rectangles[:, 4])
+    right = old.rectangles[:, :2] + np.stack([cos - 0.5 * sin, sin + 0.5 * cos], axis=1)
+    np.testing.assert_allclose(found.rectangles[:, :2], right, atol=1e-5)
+    np.testing.assert_allclose(found.rectangles[:, 2:4], np.tile(task.card.box_size_priors["car"][:2], (len(right), 1)))
+    turns = found.rectangles[:, 4] - old.rectangles[:, 4] - 0.2
+    np.testing.assert_allclose(np.cos(2.0 * turns), 1.0, atol=1e-5)
+    assert {*np.sign(np.cos(turns))} == {-1.0, 1.0}
+    # The points stay where they are in the scan, and so does the object.
+    np.testing.assert_allclose(in_scan(found), in_scan(old), atol=1e-4)
+    np.testing.assert_array_equal(found.truth, old.truth)
+
+
+def test_a_share_of_the_batch_is_found_again(samples: ObjectSamples) -> None:
+    task = Objects.of(replace(RECIPE, found_again=0.25))
+    batches = ObjectBatches(task, samples, ["simulated"])
+    plain = batches.batch(3)
+    batches.network = Finder(len(task.input.channels), len(task.classes))
+    mixed, again = batches.batch(3), batches.batch(3)
+    assert all(map(torch.equal, mixed, again))
+    same = (mixed[1] == plain[1]).numpy()
+    assert same[:12].all()
+    assert not torch.equal(mixed[2][12:], plain[2][12:])
+    # Candidates that were found have the sizes of a car; the others do not.
+    spec, (length, width, _) = task.input, task.card.box_size_priors["car"]
+    sides = mixed[0][:, 0, 6:8] * torch.tensor(spec.std[6:8]) + torch.tensor(spec.mean[6:8])
+    is_car = np.isclose(sides.numpy(), np.log([length, width]), atol=1e-4).all(axis=1)
+    assert is_car.tolist() == [False] * 12 + [True] * 4
 
 
 def test_boxes_of_the_training_are_those_of_the_runtime() -> None:
@@ -211,8 +270,11 @@ def test_training_resumes_bit_for_bit(labeled: LabeledScan, tmp_path: Path, monk
     scans.mkdir()
     labeled.save(scans / "000000.npz")
 
+    monkeypatch.setattr(object_batches, "AGAIN", 0.0)  # what random weights find is among the candidates, too
+    recipe = replace(RECIPE, found_again=0.5)
+
     def run(name: str) -> dict[str, torch.Tensor]:
-        checkpoint = train(RECIPE, tmp_path / name, Data(simulated=scans), Run(n_threads=1, checkpoint_every=2))
+        checkpoint = train(recipe, tmp_path / name, Data(simulated=scans), Run(n_threads=1, checkpoint_every=2))
         weights: dict[str, torch.Tensor] = load(checkpoint)[0].state_dict()
         return weights
 
@@ -232,6 +294,20 @@ def test_training_resumes_bit_for_bit(labeled: LabeledScan, tmp_path: Path, monk
     monkeypatch.setattr(Objects, "loss", loss)
     for name, weight in run("cut").items():
         assert torch.equal(weight, whole[name]), name
+
+
+def test_a_run_starts_from_the_shipped_model(samples: ObjectSamples) -> None:
+    task, network = Objects.of(RECIPE), build(RECIPE)
+    before, frames = start(network, RECIPE, model_path("objects"), [])
+    assert before[-1]["network"] == "objects"
+    assert frames
+    x, *_ = tensors(task, Drawn.of(samples, np.arange(len(samples.counts))))
+    session = Session("objects:fp32", "cpu", n_threads=1)
+    session.input[: len(x)] = x.numpy()
+    with torch.no_grad():
+        outputs = network.eval().detect(x).numpy()
+    np.testing.assert_allclose(session.run(len(x))["objects"][: len(x)], outputs, atol=1e-4)
+    assert (outputs[:, 0] < outputs[:, 1]).any()
 
 
 def test_without_a_detector_candidates_are_groups(
