@@ -11,6 +11,7 @@ import numpy as np
 from ..ground.scan import Scan
 from ..objects.boxes import join_boxes, not_among
 from ..objects.candidate_boxes import (
+    LABEL,
     SCORE,
     boxes_of_objects,
     confirm_boxes,
@@ -34,7 +35,8 @@ BoxesFrom = Literal["both", "network", "clusters"]
 # show and a close look sees are at a vehicle, and 1 of 13 that it does not see.
 SEEN = 0.1
 AGAIN = 0.15  # boxes with less are not looked at again: a second look confirmed none of them on PandaSet and Lyft
-HALF_TURN = np.array([0.0, 0.0, 0.0, 0.0, np.pi])  # of a rectangle
+# What the network makes of points depends a little on the end of the rectangle from which they are given.
+ENDS = np.array([[0.0, 0.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 0.0, np.pi]])  # added to rectangles
 
 
 class ObjectNetwork:
@@ -60,18 +62,19 @@ class ObjectNetwork:
     def find_boxes(
         self, scan: Scan, clusters: tuple[Candidates, Crops], detected: Sequence[Box], min_score: float
     ) -> tuple[Box, ...]:
-        """Boxes of the clusters and of the top view's boxes, and of a second look at each of what was found (Cai and
-        Vasconcelos, 2018), from both of its ends.
-
-        What the network makes of points depends a little on the end of the rectangle that they are given from.
+        """Boxes of the clusters and of the top view's boxes, each looked at again, and what that shows once more from
+        its other end: a cascade (Cai and Vasconcelos, 2018).
         """
         cells = clusters[0].cells
         (places, _), crops = joined(clusters, self._crop(scan, Candidates(rectangles(detected), cells)))
         found = merge_boxes(self._look(places, crops, self.session), self.card.classes)
         found = found[found[:, SCORE] >= AGAIN]
-        flat = footprints(found)
-        again = self._look_at(scan, Candidates(np.concatenate([flat, flat + HALF_TURN]), cells))
-        confirmed = confirm_boxes(found, again.reshape(2, *found.shape))
+        last, again = footprints(found), []
+        for end in ENDS:
+            look = self._look_at(scan, Candidates(last + end, cells))
+            last = np.where(look[:, SCORE:LABEL] > 0.0, footprints(look), last)
+            again.append(look)
+        confirmed = confirm_boxes(found, np.stack(again))
         merged = with_footprints(merge_boxes(confirmed, self.card.classes), detected)
         return tuple(boxes_of_objects(merged, self.card.classes, min_score))
 

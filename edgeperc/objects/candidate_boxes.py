@@ -65,15 +65,15 @@ def merge_boxes(boxes: Floats, classes: Sequence[str]) -> Floats:
 
 
 def confirm_boxes(found: Floats, again: Floats) -> Floats:
-    """Each box, (k, 10), and what further looks at its place show, (r, k, 10) with a score of 0 for nothing, as one
-    with the mean of the box's score and the looks' mean; class and front are those of the best one (`merge_boxes`).
+    """Each box, (k, 10), as the mean of what further looks at it show, (r, k, 10) with a score of 0 for nothing, with
+    the mean of the box's score and the looks' mean; class and front are those of the best look (`merge_boxes`).
     """
-    looks = np.concatenate([found[None], again])
-    scores, every = looks[:, :, SCORE], looks.reshape(-1, looks.shape[2])
-    confirmed = looks[scores.argmax(axis=0), np.arange(len(found))]
+    scores, every = again[:, :, SCORE], again.reshape(-1, again.shape[2])
+    best = again[scores.argmax(axis=0), np.arange(len(found))]
+    confirmed = np.where(scores.max(axis=0)[:, np.newaxis] > 0.0, best, found)
     overlap = oriented_iou(footprints(confirmed), footprints(every))
-    fill_merged(every, np.where(np.tile(np.eye(len(found), dtype=np.bool_), len(looks)), overlap, 0.0), confirmed)
-    confirmed[:, SCORE] = 0.5 * (scores[0] + scores[1:].mean(axis=0))
+    fill_merged(every, np.where(np.tile(np.eye(len(found), dtype=np.bool_), len(again)), overlap, 0.0), confirmed)
+    confirmed[:, SCORE] = 0.5 * (found[:, SCORE] + scores.mean(axis=0))
     return confirmed
 
 

@@ -13,13 +13,18 @@ from edgeperc import Perceiver
 from edgeperc.errors import OptionError
 from edgeperc.ground.planes import find_ground
 from edgeperc.ground.scan import Scan
+from edgeperc.inference import object_network
 from edgeperc.inference.object_network import ObjectNetwork
 from edgeperc.inference.session import Session
 from edgeperc.objects.boxes import MIN_SCORE
+from edgeperc.objects.candidate_boxes import LABEL, SCORE, confirm_boxes, footprints
+from edgeperc.objects.candidates import Candidates
+from edgeperc.objects.crops import Crops, crop_candidates
 from edgeperc.simulation.samples import FIRST_SEED, simulated_scan
 from edgeperc.simulation.scene import SimulatedScan
 from edgeperc.types.geometry import inside
 from edgeperc.types.perception import Box, Perception
+from edgeperc.types.points import Floats
 
 SEED = FIRST_SEED + 3
 
@@ -88,6 +93,36 @@ def test_people_are_those_of_the_labels_and_of_the_network(seed: int) -> None:
             assert all(np.hypot(center[0] - x, center[1] - y) > 0.3 for x, y, _ in labeled)
     least = {6: 1, 8: 0, SEED: 1}[seed]
     assert len(both) >= len(labeled) + least
+
+
+def test_what_a_look_shows_is_looked_at_from_its_other_end(
+    scan: SimulatedScan, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where a look sees nothing, the next one is at the same place."""
+    network = ObjectNetwork(Session("objects", "cpu"))
+    seen = Scan.of(scan.points, find_ground(scan.points))
+    clusters = network.cluster(seen, "both", 0.0)
+    places, looks = [], []
+
+    def few_points(scan: Scan, candidates: Candidates, n_points: int, margin_m: float) -> Crops:
+        crops = crop_candidates(scan, candidates, n_points, margin_m)
+        crops.counts[::4] = 0
+        places.append(candidates.rectangles)
+        return crops
+
+    def confirmed(found: Floats, again: Floats) -> Floats:
+        looks.extend([found, *again])
+        return confirm_boxes(found, again)
+
+    monkeypatch.setattr(object_network, "crop_candidates", few_points)
+    monkeypatch.setattr(object_network, "confirm_boxes", confirmed)
+    network.find_boxes(seen, clusters, (), 0.5)
+    (_, first, second), (found, shown, _) = places, looks
+    np.testing.assert_array_equal(first, footprints(found))
+    turned = np.where(shown[:, SCORE:LABEL] > 0.0, footprints(shown), first)
+    assert len(first) > 4
+    np.testing.assert_allclose(second[:, :4], turned[:, :4])
+    np.testing.assert_allclose(second[:, 4] - turned[:, 4], math.pi)
 
 
 def test_a_riders_box_is_the_mean_of_that_of_the_labels_and_of_the_networks(scan: SimulatedScan) -> None:
