@@ -341,7 +341,7 @@ OBJECTS = Recipe(
     redraw_every=0,
 )
 
-# Continued with its own boxes among the candidates, for the second look gets such boxes. TBD
+# Continued with its own boxes among the candidates, for the second look gets such boxes.
 SECOND_LOOK = replace(OBJECTS, found_again=0.45, steps=12_000, learning_rate=1e-3)
 
 # Without KITTI, the 28 real scans are of one street: most scans are simulated. Three quarters of the channels, and int8
