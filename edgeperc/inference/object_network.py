@@ -35,8 +35,8 @@ BoxesFrom = Literal["both", "network", "clusters"]
 # show and a close look sees are at a vehicle, and 1 of 13 that it does not see.
 SEEN = 0.1
 AGAIN = 0.15  # boxes with less are not looked at again: a second look confirmed none of them on PandaSet and Lyft
-# What the network makes of points depends a little on the end of the rectangle from which they are given.
-ENDS = np.array([[0.0, 0.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 0.0, np.pi]])  # added to rectangles
+# Of a rectangle: what the network makes of points depends a little on the end from which they are given.
+HALF_TURN = np.array([0.0, 0.0, 0.0, 0.0, np.pi])
 
 
 class ObjectNetwork:
@@ -70,8 +70,8 @@ class ObjectNetwork:
         found = merge_boxes(self._look(places, crops, self.session), self.card.classes)
         found = found[found[:, SCORE] >= AGAIN]
         last, again = footprints(found), []
-        for end in ENDS:
-            look = self._look_at(scan, Candidates(last + end, cells))
+        for turn in (0.0, HALF_TURN):
+            look = self._look_at(scan, Candidates(last + turn, cells))
             last = np.where(look[:, SCORE:LABEL] > 0.0, footprints(look), last)
             again.append(look)
         confirmed = confirm_boxes(found, np.stack(again))
