@@ -194,7 +194,7 @@ def submitted(boxes: list[Box]) -> list[twin.Object]:
     return found
 
 
-@settings(deadline=None, max_examples=60)
+@settings(deadline=None, max_examples=30)
 @given(st.lists(scans(), min_size=1, max_size=4))
 def test_the_development_kit_step_by_step_gives_the_same_numbers(given_scans: list[Scan]) -> None:
     table = table_of(*given_scans)

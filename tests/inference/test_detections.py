@@ -45,7 +45,7 @@ def points() -> NDArray[np.float32]:
 
 @pytest.fixture(scope="module")
 def trained() -> dict[str, PillarNet]:
-    return {kind: networks.trained(kind) for kind in HEADS}
+    return {kind: networks.trained(kind, n_steps=75, n_scans=1) for kind in HEADS}
 
 
 @pytest.fixture(scope="module")

@@ -32,13 +32,12 @@ from edgeperc_export.release.quantize import Calibration, LabeledSets, quantize
 from edgeperc_export.release.to_onnx import export
 from edgeperc_export.training.task import task_of
 
-N_SCANS = 2
 NOISE = np.random.default_rng(0).normal(0.0, 0.1, (2, 40))
 
 
 @pytest.fixture(scope="module")
 def scans() -> list[NDArray[np.float32]]:
-    return [simulated_scan(10**9 + k).points for k in range(N_SCANS)]
+    return [simulated_scan(10**9).points]
 
 
 def untrained(recipe: Recipe, path: Path) -> Path:
@@ -72,12 +71,11 @@ def exported(
     return of
 
 
-HEIGHTS = Recipe("pointseg", edge=True, curvature=True)
+HEIGHTS = Recipe("pointseg", edge=True, curvature=True, width=0.25)
+FRONTS = Recipe("ssadnet", edge=True, front=True)
 
 
-@pytest.mark.parametrize(
-    "recipe", [HEIGHTS, Recipe("ssadnet", edge=True, front=True)], ids=lambda recipe: recipe.network
-)
+@pytest.mark.parametrize("recipe", [HEIGHTS, FRONTS], ids=lambda recipe: recipe.network)
 def test_from_training_to_the_vehicle(
     exported: Callable[[Recipe], tuple[Path, ModelCard]],
     tmp_path: Path,
@@ -85,7 +83,7 @@ def test_from_training_to_the_vehicle(
     recipe: Recipe,
 ) -> None:
     (path, card), top = exported(recipe), recipe.network == "ssadnet"
-    assert card.parity["n_scans"] == N_SCANS
+    assert card.parity["n_scans"] == len(scans)
     assert card.input.needs_ground is not top
     assert card.output_shape("box_dense")[1] == (11 if top else 9)
 

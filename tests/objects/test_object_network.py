@@ -181,11 +181,11 @@ def test_a_vehicle_that_others_show_and_a_close_look_does_not_see_is_dropped(sca
 
 def test_the_answer_does_not_depend_on_the_threads(scan: SimulatedScan) -> None:
     models = ["ssadnet", "pointseg", "objects"]
-    one, two = (Perceiver(models, provider="cpu", **given)(scan.points) for given in ({"n_threads": 1}, {}))
-    assert one.boxes == two.boxes
-    again = Perceiver(models, provider="cpu", n_threads=1)
-    again(simulated_scan(SEED + 1).points)  # buffers hold another scan
-    assert again(scan.points).boxes == one.boxes
+    one, several = (Perceiver(models, provider="cpu", **given) for given in ({"n_threads": 1}, {}))
+    boxes = one(scan.points).boxes
+    assert several(scan.points).boxes == boxes
+    one(simulated_scan(SEED + 1).points)  # buffers hold another scan
+    assert one(scan.points).boxes == boxes
 
 
 def test_candidates_may_come_from_one_source_alone(scan: SimulatedScan) -> None:
@@ -224,8 +224,9 @@ def test_boxes_of_objects_keep_and_add_labels(scan: SimulatedScan) -> None:
     assert boxed[changed].all()
 
 
-@pytest.mark.parametrize("n", [0, 1, 7])
-def test_scans_without_objects_have_no_boxes(n: int) -> None:
-    points = np.zeros((n, 4), np.float32)
-    points[:, 0] = np.linspace(5.0, 30.0, n)
-    assert Perceiver(["ssadnet", "pointseg", "objects"], on_mismatch="ignore")(points).boxes == ()
+def test_scans_without_objects_have_no_boxes() -> None:
+    perceive = Perceiver(["ssadnet", "pointseg", "objects"], on_mismatch="ignore")
+    for n in (0, 1, 7):
+        points = np.zeros((n, 4), np.float32)
+        points[:, 0] = np.linspace(5.0, 30.0, n)
+        assert perceive(points).boxes == ()
