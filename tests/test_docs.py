@@ -9,6 +9,7 @@ import io
 import re
 import shlex
 import sys
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from string import Template
@@ -17,6 +18,7 @@ import numpy as np
 import pytest
 
 from checkout import REPOSITORY, files
+from cli_helpers import networks_opened_once, thinned
 from edgeperc import cli
 from edgeperc.cli.main import build_parser
 from edgeperc.simulation.camera import forward_camera, render
@@ -66,6 +68,13 @@ ONCE = [*{(line, block.excuse): (block, line) for block, line in COMMANDS}.value
 PYTHON_PAGES = [page for page in PAGES if blocks_of(page, "python")]
 
 
+@pytest.fixture(scope="module", autouse=True)
+def networks_are_opened_once() -> Iterator[None]:
+    """Each of a hundred commands asks for the same ones."""
+    with networks_opened_once():
+        yield
+
+
 @pytest.fixture(scope="module")
 def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with what the pages speak of: a scan, a drive, a stream, the research models."""
@@ -73,9 +82,9 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for name in ("scan.bin", "demo/scan.bin", "drive/0.bin", "drive/1.bin", "velodyne/0.bin", "velodyne/1.bin"):
         seed = 4 + len(name)
         (folder / name).parent.mkdir(exist_ok=True)
-        urban(seed).points.tofile(folder / name)
+        urban(seed, thinned()).points.tofile(folder / name)
     # What a page's Python writes is there for its commands, which may run in another process.
-    np.save(folder / "utm.npy", urban(12).points + np.array([512345.25, 5412345.5, 113.0, 0.0]))
+    np.save(folder / "utm.npy", urban(12, thinned()).points + np.array([512345.25, 5412345.5, 113.0, 0.0]))
     (folder / "calib.txt").write_text(
         "P2: 831 0 480 0 0 831 360 0 0 0 1 0\nR0_rect: 1 0 0 0 1 0 0 0 1\n"
         "Tr_velo_to_cam: 0 -1 0 0 0 0 -1 -0.08 1 0 0 -0.27\n"
@@ -84,7 +93,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
         from PIL import Image
 
         camera = forward_camera()
-        scan = urban(12)
+        scan = urban(12, thinned())
         Image.fromarray(render(scan.scene, camera, scan.T_world_sensor, 12).rgb).save(folder / "image.png")
         (folder / "demo/image.png").write_bytes((folder / "image.png").read_bytes())
     (folder / "T_vehicle_sensor.json").write_text("[[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 1.7], [0, 0, 0, 1]]")

@@ -561,13 +561,17 @@ def no_wait(psutil: None, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(context, "busiest", lambda: [])
 
 
-def test_a_full_turn_is_a_setting_of_its_own(no_wait: None, tmp_path: Path) -> None:
+def test_a_full_turn_is_a_setting_of_its_own(in_process: list[worker.Job], tmp_path: Path) -> None:
     simulated_scan(5).points[::10].tofile(tmp_path / "own.bin")
     command = ["run", *FEW, "--scenario", "single-stream", "--min-scans", "2", "--full-turn"]
     assert cli.main([*command, "--input", str(tmp_path / "own.bin"), "--json", str(tmp_path / "a.json")]) == 0
     (around,) = read_report(tmp_path / "a.json")["settings"]
     assert setting_label(around) == f"{setting_label(around | {'full_turn': False})}, full turn"
-    assert worker.make_perceiver(worker.Job(("pointseg",), "cpu", full_turn=around["full_turn"])).full_turn
+    assert [job.full_turn for job in in_process] == [True] * len(in_process) != []
+
+
+def test_a_job_for_a_full_turn_perceives_one() -> None:
+    assert worker.make_perceiver(worker.Job(("pointseg",), "cpu", full_turn=True)).full_turn
 
 
 def test_a_run_from_scans_to_files(no_wait: None, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

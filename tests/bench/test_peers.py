@@ -7,10 +7,14 @@ import multiprocessing
 import os
 import shlex
 import sys
-from collections.abc import Iterable
+import threading
+from collections.abc import Callable, Iterable
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -179,7 +183,7 @@ def test_a_model_is_converted_to_mnn_without_installing_a_package(
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_ncnn_computes_the_network_or_says_that_it_cannot(name: str) -> None:
+def test_ncnn_computes_the_network(name: str) -> None:
     need(peers.NEEDS["ncnn"])
     theirs, ours = (open_engine(engine, "fp32", model_path(name), 1) for engine in ("ncnn", "onnxruntime"))
     image = np.random.default_rng(0).normal(size=ours.input.shape)
@@ -187,8 +191,12 @@ def test_ncnn_computes_the_network_or_says_that_it_cannot(name: str) -> None:
     expected = ours.run()
     for each, output in theirs.run().items():
         np.testing.assert_allclose(output, expected[each], atol=1e-4 * np.abs(expected[each]).max())
+
+
+def test_ncnn_says_what_it_cannot_run() -> None:
+    need(peers.NEEDS["ncnn"])
     with pytest.raises(ModelError, match="ncnn cannot run kulseg"):
-        open_engine("ncnn", "fp32", model_path(name).parent / "research/kulseg.onnx", 1)
+        open_engine("ncnn", "fp32", model_path("pointseg").parent / "research/kulseg.onnx", 1)
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -236,23 +244,44 @@ def test_overlaps_are_those_of_the_reference() -> None:
 
 
 def make_shallow(patch: pytest.MonkeyPatch) -> None:
-    """Stages of one layer or block: torch traces a graph of a third of the nodes in a third of the time."""
-    from edgeperc_export.networks import pointpillars, resnets
+    """No layer, block or head after one of its kind: torch traces a graph of a third of the nodes in a third of the
+    time.
+    """
+    from torch import nn
+
+    from edgeperc_export.networks import pointpillars, resnets, salsanext, squeezesegv2
 
     deep = resnets.stages
     patch.setattr(resnets, "stages", lambda c_in, widths, depths, act: deep(c_in, widths, [1] * len(depths), act))
+    patch.setattr(resnets, "N_BOX_VALUES", dict([*resnets.N_BOX_VALUES.items()][:2]))
     patch.setattr(pointpillars, "BLOCKS", [(1, *block[1:]) for block in pointpillars.BLOCKS])
 
+    def changing(make: type[nn.Module]) -> Callable[..., nn.Module]:
+        return lambda c_in, c_out, *more: nn.Identity() if c_in == c_out else make(c_in, c_out, *more)
 
+    for module, name in ((squeezesegv2, "Fire"), (salsanext, "Context"), (salsanext, "Encoder")):
+        patch.setattr(module, name, changing(getattr(module, name)))
+
+
+def test_outputs_of_networks_of_others_are_named() -> None:
+    torch = pytest.importorskip("torch")
+    for where, outputs, shape in OTHERS.values():
+        module, _, made = where.partition(".")
+        with torch.device("meta"):
+            network = getattr(import_module(f"edgeperc_export.networks.{module}"), made)().eval()
+            answer = network(torch.empty(1, *shape))
+        assert outputs == ("logits",) if torch.is_tensor(answer) else len(outputs) == len(answer)
+    assert OTHERS["SFA3D 608x608"][1] == tuple(import_module("edgeperc_export.networks.resnets").N_BOX_VALUES)
+
+
+# FIDNet is CENet with other widths, and SalsaNext's activation.
 @pytest.mark.parametrize(
     ("name", "shape", "expected"),
     [
         ("SqueezeSegV2 64x512", (5, 8, 32), {"logits": (4, 8, 32)}),
         ("SalsaNext 64x2048", (5, 16, 32), {"logits": (20, 16, 32)}),
-        ("FIDNet 64x2048", (5, 16, 32), {"logits": (20, 16, 32)}),
         ("CENet 64x2048", (5, 8, 48), {"logits": (20, 8, 48)}),
-        ("SFA3D 608x608", (3, 64, 96), {"heat": (3, 16, 24), "offset": (2, 16, 24), "size": (3, 16, 24)}),
-        (POINTPILLARS, (64, 16, 24), {"scores": (2, 8, 12), "boxes": (14, 8, 12), "directions": (4, 8, 12)}),
+        ("SFA3D 608x608", (3, 64, 96), {"heat": (3, 16, 24), "offset": (2, 16, 24)}),
     ],
 )
 def test_networks_of_others_are_written_in_fp32_and_int8(
@@ -264,12 +293,17 @@ def test_networks_of_others_are_written_in_fp32_and_int8(
 ) -> None:
     need(("onnx", "onnxscript", "torch", "tqdm"))
     make_shallow(monkeypatch)
-    monkeypatch.setattr(networks, "OTHERS", {name: (*OTHERS[name][:2], shape)})
+    monkeypatch.setattr(networks, "OTHERS", {name: (OTHERS[name][0], tuple(expected), shape)})
     write_others(tmp_path)
+    assert_written(tmp_path, name, expected)
+
+
+def assert_written(folder: Path, name: str, expected: dict[str, tuple[int, ...]]) -> None:
+    """int8 answers nearly as fp32 does, in these shapes."""
     found = {}
     for kind in ("fp32", "int8"):
-        engine = open_engine("onnxruntime", kind, tmp_path / f"{name} {kind}.onnx", 1)
-        engine.input[:] = np.load(tmp_path / f"{name}.npy")
+        engine = open_engine("onnxruntime", kind, folder / f"{name} {kind}.onnx", 1)
+        engine.input[:] = np.load(folder / f"{name}.npy")
         found[kind] = engine.run()
     for output, size in expected.items():
         fp32, int8 = found["fp32"][output], found["int8"][output]
@@ -328,7 +362,7 @@ def test_ground_and_clusters_of_others_are_timed(tmp_path: Path, scan: np.ndarra
 
 
 def test_methods_of_others_are_rows_of_one_table(
-    tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
+    in_threads: None, tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     need(("onnx", "onnxscript", "psutil", "torch", "tqdm"))
     for name in {*OTHERS} - {POINTPILLARS}:
@@ -337,8 +371,10 @@ def test_methods_of_others_are_rows_of_one_table(
     make_shallow(monkeypatch)
 
     def some(folder: Path) -> list[peers.Contender]:
-        """Each kind of contender once, in either precision: every one costs a process."""
+        """Each kind of contender once, in either precision."""
         rows = peers.methods(folder)
+        shapes = {"scores": (2, 8, 12), "boxes": (14, 8, 12), "directions": (4, 8, 12)}
+        assert_written(folder, POINTPILLARS, shapes)
         assert [row.kind for row in rows[:-1]] == [*peers.ANSWERS, *peers.ANSWERS, *("network", "pillars") * 2]
         return [rows[0], rows[3], rows[4], rows[7], rows[-1]]
 
@@ -444,6 +480,19 @@ def test_the_floor_is_arithmetic_over_peak(variant: str) -> None:
 
 
 @pytest.fixture
+def in_threads(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Contenders in threads of this process, which has imported everything."""
+
+    def pipe() -> tuple[Any, Any]:
+        here, there = multiprocessing.Pipe()  # a process has an end of its own, which its parent does not close
+        return here, SimpleNamespace(send=there.send, recv=there.recv, close=lambda: None)
+
+    threads = SimpleNamespace(Pipe=pipe, Process=threading.Thread)
+    monkeypatch.setattr(turns, "multiprocessing", SimpleNamespace(get_context=lambda how: threads))
+    monkeypatch.setattr(turns, "signal", SimpleNamespace(SIGINT=0, SIG_IGN=0, signal=lambda number, handler: None))
+
+
+@pytest.fixture
 def alone(monkeypatch: pytest.MonkeyPatch) -> None:
     """Nothing but onnxruntime's CPU provider and numpy, on any computer."""
     monkeypatch.setattr(peers, "NEEDS", dict.fromkeys(peers.NEEDS, ("no_such_package",)))
@@ -502,7 +551,9 @@ def test_networks_are_measured_alone_and_in_pairs(alone: None, tmp_path: Path, s
     assert any(c.paths == full and c.engine == "torch" for c in both) == all(path.exists() for path in full)
 
 
-def test_camera_models_are_measured_with_images(alone: None, tmp_path: Path, scan: np.ndarray) -> None:
+def test_camera_models_are_measured_with_images(
+    alone: None, in_threads: None, tmp_path: Path, scan: np.ndarray
+) -> None:
     pytest.importorskip("psutil")
     path = tiny_camera.write_camera(tmp_path)
     ((title, contenders),) = made([str(path)], tmp_path, scan).items()
@@ -558,12 +609,12 @@ def test_edgeperc_runs_in_every_precision_of_a_provider(
 
 
 def test_what_is_missing_is_reported(
-    alone: None, tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
+    alone: None, in_threads: None, tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("psutil")
 
     def groups(*asked: object) -> dict[str, list[peers.Contender]]:
-        """Each kind of contender once: every one that is not missing costs a process."""
+        """Each kind of contender once."""
         tables = peers.groups(*asked)  # type: ignore[arg-type]
         del tables["Projection: range image"]
         return {title: [c for c in table if c.engine != "copy"] for title, table in tables.items()}

@@ -21,15 +21,12 @@ def brief(name: str) -> SensorProfile:
     return sensor if sensor.pattern is None else replace(sensor, pattern=replace(sensor.pattern, accumulate_s=0.02))
 
 
-@pytest.mark.parametrize(
-    ("title", "speed_mps", "least_iou"),
-    [("mid-360-hanging, 0.2 s", 0.0, 80.0), ("mid-360-hanging, 0.2 s", 10.0, 80.0), ("hap, 0.2 s", 10.0, 80.0)],
-)
-def test_cars_are_found(title: str, speed_mps: float, least_iou: float) -> None:
+@pytest.mark.parametrize(("title", "speed_mps"), [("mid-360-hanging, 0.2 s", 10.0), ("hap, 0.2 s", 0.0)])
+def test_cars_are_found(title: str, speed_mps: float) -> None:
     rows = solid_state.sensors_of([title.partition(",")[0]])
     sensor, accumulate_s = next((sensor, time_s) for name, sensor, time_s in rows if name == title)
     _, classes, _, _ = solid_state.row_of(sensor, accumulate_s, speed_mps, 2).split("|")
-    assert float(classes.split("/")[0]) >= least_iou
+    assert float(classes.split("/")[0]) >= 80.0
 
 
 def test_a_street_is_gathered_on_the_way() -> None:

@@ -120,13 +120,12 @@ def test_weights_are_a_triangle_around_each_center(n_in: int, n_out: int) -> Non
     start, weights = taps(n_in, n_out)
     assert start.min() >= 0
     assert start.max() + weights.shape[1] <= n_in
+    expected, got = np.zeros((2, n_out, n_in))
     for k in range(n_out):
-        expected = np.zeros(n_in)
         for j, weight in twins.taps(n_in, n_out, k).items():
-            expected[j] = weight
-        got = np.zeros(n_in)
-        got[start[k] : start[k] + weights.shape[1]] = weights[k]
-        np.testing.assert_allclose(got, expected, atol=1e-6)
+            expected[k, j] = weight
+        got[k, start[k] : start[k] + weights.shape[1]] = weights[k]
+    np.testing.assert_allclose(got, expected, atol=1e-6)
 
 
 def test_an_image_of_the_inputs_size_stays_as_it_is() -> None:

@@ -7,7 +7,7 @@ import functools
 import json
 import re
 import runpy
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 
@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from test_files import packed_pcd, pcd, text_rows
 
 from checkout import REPOSITORY
+from cli_helpers import networks_opened_once, thinned
 from edgeperc import Box, OptionError, Perceiver
 from edgeperc.cli.cvat import OPTIONS_VARIABLE, CvatFunction, handler, init_context
 from edgeperc.zoo import DEFAULT, OPEN, resolve
@@ -99,11 +100,21 @@ def post_by_sdk(payload: object) -> Reply:
     return Reply(sent["status_code"], sent["content_type"], json.loads(sent["body"]))
 
 
+@pytest.fixture(scope="module", autouse=True)
+def networks_are_opened_once() -> Iterator[None]:
+    with networks_opened_once():
+        yield
+
+
+def street(seed: int = 4, sensor: str = "hdl-64e") -> NDArray[np.float32]:
+    return urban(seed, thinned(sensor)).points
+
+
 @functools.cache
-def expected(seed: int, sensor: str, threshold: float | None = None) -> tuple[Box, ...]:
+def expected(seed: int = 4, sensor: str = "hdl-64e", threshold: float | None = None) -> tuple[Box, ...]:
     """Boxes of a perceiver that has seen no other scan."""
     options = json.loads(OPTIONS_TEXT) | ({} if threshold is None else {"score_threshold": threshold})
-    return Perceiver(**options)(urban(seed, sensor).points).boxes
+    return Perceiver(**options)(street(seed, sensor)).boxes
 
 
 def check(shapes: Any, boxes: tuple[Box, ...]) -> None:
@@ -121,37 +132,37 @@ def check(shapes: Any, boxes: tuple[Box, ...]) -> None:
         assert np.exp(1j * points[5]) == pytest.approx(np.exp(1j * box.yaw), abs=1e-4)
 
 
-@pytest.mark.parametrize("kind", FORMATS)
-@pytest.mark.parametrize(("seed", "sensor"), [(4, "hdl-64e"), (5, "hdl-64e"), (4, "os1-64")])
+@pytest.mark.parametrize(
+    ("kind", "seed", "sensor"),
+    [*((kind, 4, "hdl-64e") for kind in FORMATS), (".bin", 5, "hdl-64e"), (".bin", 4, "os1-64")],
+)
 def test_shapes_are_the_boxes_of_a_perceiver(kind: str, seed: int, sensor: str) -> None:
     boxes = expected(seed, sensor)
     assert len(boxes) >= 3
-    status, content_type, shapes = post(request(FORMATS[kind](urban(seed, sensor).points)))
+    status, content_type, shapes = post(request(FORMATS[kind](street(seed, sensor))))
     assert (status, content_type) == (200, "application/json")
     check(shapes, boxes)
 
 
 @pytest.mark.filterwarnings("ignore:datetime.datetime.utcfromtimestamp:DeprecationWarning")
 def test_nuclios_own_events_and_answers() -> None:
-    status, content_type, shapes = post_by_sdk(request(binary_pcd(urban(4).points), threshold=0.5))
+    status, content_type, shapes = post_by_sdk(request(binary_pcd(street()), threshold=0.5))
     assert (status, content_type) == (200, "application/json")
-    check(shapes, expected(4, "hdl-64e", 0.5))
+    check(shapes, expected(threshold=0.5))
     for body in (b"", b"{", b"[]"):
         assert post_by_sdk(body).status == 400
 
 
-@pytest.mark.parametrize("threshold", [0.1, 0.6, 0.9, 1])
+@pytest.mark.parametrize("threshold", [0.1, 0.9, 1])
 def test_the_threshold_of_a_request_is_the_perceivers(threshold: float) -> None:
-    reply = post(request(binary_pcd(urban(4).points), threshold=threshold))
-    check(reply.answer, expected(4, "hdl-64e", threshold))
+    reply = post(request(binary_pcd(street()), threshold=threshold))
+    check(reply.answer, expected(threshold=threshold))
     assert all(float(each["confidence"]) >= threshold - 1e-4 for each in reply.answer)
-    check(post(request(binary_pcd(urban(4).points))).answer, expected(4, "hdl-64e"))
+    check(post(request(binary_pcd(street()))).answer, expected())
 
 
 def test_thresholds_show_fewer_boxes() -> None:
-    counts = [len(expected(4, "hdl-64e", threshold)) for threshold in (0.1, 0.6, 0.9)]
-    assert counts == sorted(counts, reverse=True)
-    assert counts[0] > counts[-1]
+    assert len(expected(threshold=0.1)) > len(expected(threshold=0.9))
 
 
 def test_a_scan_without_points_has_no_boxes() -> None:
@@ -173,7 +184,7 @@ FAULTS: dict[str, tuple[object, int, str, str]] = {
     "threshold out of range": ({"image": "", "threshold": 50}, 400, "OptionError", "50.*0..1"),
     "an empty file": ({"image": ""}, 422, "PointsError", "empty"),
     "a JPEG": (request(IMAGE), 422, "PointsError", "an image"),
-    "a PCD cut short": (request(binary_pcd(urban(4).points)[:9999]), 422, "PointsError", "cut short|bytes"),
+    "a PCD cut short": (request(binary_pcd(street())[:9999]), 422, "PointsError", "cut short|bytes"),
     "too few points": (request(binary_pcd(np.ones((9, 4), np.float32))), 422, "SensorError", "9 points"),
 }
 
@@ -186,7 +197,7 @@ def test_a_wrong_request_is_answered_with_what_came_and_what_was_expected(fault:
     assert re.search(words, reply.answer["message"])
     assert started().logged[-1] == f"{kind}: {reply.answer['message']}"
     assert len(reply.answer["message"]) < 600
-    check(post(request(binary_pcd(urban(4).points))).answer, expected(4, "hdl-64e"))  # it goes on
+    check(post(request(binary_pcd(street()))).answer, expected())  # it goes on
 
 
 VALUES = st.recursive(
@@ -221,7 +232,7 @@ def test_wrong_options_are_told_at_the_start(text: str, words: str, monkeypatch:
 
 def test_options_without_a_threshold_of_the_request() -> None:
     function = CvatFunction(**json.loads(OPTIONS_TEXT), score_threshold=0.9)
-    check(function.annotate(request(binary_pcd(urban(4).points))), expected(4, "hdl-64e", 0.9))
+    check(function.annotate(request(binary_pcd(street()))), expected(threshold=0.9))
 
 
 def test_labels_are_the_classes_of_the_models() -> None:
@@ -241,7 +252,7 @@ def test_function_yaml_is_of_what_is_here() -> None:
     base = (REPOSITORY / "Containerfile").read_text("utf-8")
     assert set(re.findall(r"/(python:\d+\.\d+)\.\d+-slim", base)) == {spec["runtime"]}
     (trigger,) = spec["triggers"].values()
-    largest = len(json.dumps(request(bytes(2**22 * 16))))  # four million points
+    largest = 64 * len(json.dumps(request(bytes(2**22 // 4))))  # four million points
     assert trigger["kind"] == "http"
     assert trigger["attributes"]["maxRequestBodySize"] > largest
 

@@ -134,50 +134,39 @@ def test_telemetry(value: str, state: str, text: str, monkeypatch: pytest.Monkey
     assert text in found.found
 
 
-def test_a_plugin_that_does_not_load(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_plugin_that_does_not_load_and_kernels_that_are_not_kept(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     def broken() -> Any:
         raise ProviderError("the plugin for provider 'openvino' is installed but does not load: no symbol")
 
     monkeypatch.setattr(listing, "providers", broken)
+    monkeypatch.setattr(KernelCache, "cache_path", None)
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("EDGEPERC_CACHE_DIR", str(tmp_path / "file" / "cache"))
     code, found = report(capsys)
     assert code == 1
     assert "does not load" in found["providers"]["found"]
-
-
-def test_kernels_that_are_not_kept(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(KernelCache, "cache_path", None)
-    _, found = report(capsys)
     assert found["kernels"]["state"] == "note"
     assert "NUMBA_CACHE_DIR" in found["kernels"]["advice"]
-
-
-def test_a_cache_that_is_no_folder(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    (tmp_path / "file").write_text("")
-    monkeypatch.setenv("EDGEPERC_CACHE_DIR", str(tmp_path / "file" / "cache"))
-    _, found = report(capsys)
     assert found["cache folder"]["state"] == "note"
     assert "is not a folder" in found["cache folder"]["found"]
     assert "EDGEPERC_CACHE_DIR" in found["cache folder"]["advice"]
 
 
 @posix
-def test_a_cache_that_others_can_write(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_cache_that_others_can_write_with_settings_that_cannot_be_read(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     (tmp_path / "cache" / "compiled").mkdir(parents=True)
     (tmp_path / "cache" / "compiled" / "blob").write_bytes(bytes(2_000_000))
     (tmp_path / "cache" / "compiled").chmod(0o777)
-    _, found = report(capsys)
-    assert found["cache folder"]["state"] == "ok"
-    assert "2.0 MB in 1 file, writable" in found["cache folder"]["found"]
-    assert found["compiled models"]["state"] == "note"
-    assert "other users can write it" in found["compiled models"]["found"]
-
-
-def test_settings_that_cannot_be_read(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (tmp_path / "cache").mkdir()
     (tmp_path / "cache" / "settings.json").write_text("no json")
     _, found = report(capsys)
+    assert found["cache folder"]["state"] == "ok"
+    assert "2.0 MB in 2 files, writable" in found["cache folder"]["found"]
+    assert found["compiled models"]["state"] == "note"
+    assert "other users can write it" in found["compiled models"]["found"]
     assert found["settings"]["state"] == "note"
     assert "cannot be read as settings" in found["settings"]["found"]
 
@@ -194,13 +183,18 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return folder
 
 
-def test_damaged_and_missing_models(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_damaged_and_missing_models_and_sums(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     content = bytearray((folder / "pointseg.onnx").read_bytes())
     content[len(content) // 2] ^= 1  # among the weights: the card can still be read
     (folder / "pointseg.onnx").write_bytes(content)
     (folder / "pointseg-int8.onnx").write_bytes(b"no model")
     for file in folder.glob("ssadnet*"):
         file.unlink()
+    (folder / "SHA256SUMS").rename(folder / "sums")
+    _, found = report(capsys)
+    assert found["SHA256SUMS"]["state"] == "note"
+    assert found["model lodnn.onnx"]["found"].endswith("not compared")
+    (folder / "sums").rename(folder / "SHA256SUMS")
     code, found = report(capsys)
     assert code == 1
     assert "not the file of this release" in found["model pointseg.onnx"]["found"]
@@ -208,13 +202,6 @@ def test_damaged_and_missing_models(folder: Path, capsys: pytest.CaptureFixture[
     assert found["model ssadnet"]["found"] == "missing"
     assert found["model lodnn.onnx"]["state"] == "ok"
     assert "pip install" in found["model pointseg.onnx"]["advice"]
-
-
-def test_without_the_sums_hashes_are_not_compared(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (folder / "SHA256SUMS").unlink()
-    _, found = report(capsys)
-    assert found["SHA256SUMS"]["state"] == "note"
-    assert found["model lodnn.onnx"]["found"].endswith("not compared")
 
 
 REQUIRES = (

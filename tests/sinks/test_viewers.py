@@ -27,6 +27,7 @@ from hypothesis import strategies as st
 from test_pages import HOSTILE, perceived
 from test_pictures import CAR, VAN, a_perception, a_scan
 
+from cli_helpers import thinned
 from edgeperc import Mounting, Tracker, cli, read_scans
 from edgeperc.errors import MissingExtraError, OptionError, PointsError
 from edgeperc.records import PerceivedScan, Sink
@@ -812,7 +813,7 @@ def test_a_drive_on_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixtu
     drive.mkdir()
     counts = []
     for k, (_, _, scan) in enumerate(
-        simulate_sequence(random_scene(4, "urban"), "hdl-64e", 3, ego_speed_mps=5.0, seed=4)
+        simulate_sequence(random_scene(4, "urban"), thinned(), 3, ego_speed_mps=5.0, seed=4)
     ):
         scan.points.tofile(drive / f"{k}.bin")
         counts.append(len(scan.points))

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import base64
+import functools
 import io
 import itertools
 import json
@@ -87,11 +88,21 @@ def near(picture: np.ndarray, name: str, tolerance: int = 12) -> np.ndarray:
     return (np.abs(picture - wanted) <= tolerance).all(axis=2)
 
 
-@pytest.mark.usefixtures("matplotlib")
-def test_picture_shows_classes_where_they_are(scan: np.ndarray, perception: Perception) -> None:
-    picture = pixels(view.draw(perception, scan, title="a scan"))
+@pytest.fixture(scope="module")
+def drawn(matplotlib: None, tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    """The picture of the scan, which replaces a file."""
+    target = tmp_path_factory.mktemp("drawn") / "scan.png"
+    target.write_bytes(b"old")
+    png = view.draw(a_perception(a_scan()), a_scan(), target, title="a scan")
+    assert [*target.parent.iterdir()] == [target]
+    assert target.read_bytes() == png
+    return png
+
+
+def test_picture_shows_classes_where_they_are(drawn: bytes) -> None:
+    picture = pixels(drawn)
     assert picture.shape == (1106, 1600, 3)
-    assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 500
+    assert len(np.unique(picture @ [1 << 16, 1 << 8, 1])) > 500
     # The panel from above begins at pixel column 90 and row 128 with x = 48 and y = 14, 14.65 pixels a meter.
     for box in (CAR, VAN):
         row, col = 128 + (48.0 - box.center[0]) * 14.65, 90 + (14.0 - box.center[1]) * 14.65
@@ -108,7 +119,7 @@ def test_picture_shows_classes_where_they_are(scan: np.ndarray, perception: Perc
 
 
 @pytest.mark.usefixtures("matplotlib")
-@pytest.mark.parametrize("behind_m", [15.0, 30.0, 44.0])
+@pytest.mark.parametrize("behind_m", [15.0, 44.0])
 def test_a_full_turn_is_drawn_whole(behind_m: float, scan: np.ndarray, perception: Perception) -> None:
     """A box behind the sensor shows from above, and points behind it in the range image, at its ends."""
     labels, in_view = perception.require_points().labels.copy(), perception.require_points().in_view.copy()
@@ -140,8 +151,6 @@ def test_points_of_a_vehicle_have_the_color_of_its_box(label: str, scan: np.ndar
 
 @pytest.mark.usefixtures("matplotlib")
 def test_picture_grows_with_its_warnings(scan: np.ndarray, perception: Perception) -> None:
-    quiet = pixels(view.draw(replace(perception, fitness=()), scan))
-    assert quiet.shape == (1080, 1600, 3)
     many = pixels(view.draw(replace(perception, fitness=("a warning", "words " * 100)), scan))
     assert many.shape[0] > 1080 + 3 * 26
     amber = (np.abs(many - [0xFF, 0xC4, 0x6B]) <= 12).all(axis=2)
@@ -179,23 +188,25 @@ def test_road_that_was_not_observed_is_gray(scan: np.ndarray, perception: Percep
     assert 0 < strong[0] < 0.95 * strong[1]
 
 
-@pytest.mark.usefixtures("matplotlib")
-def test_picture_is_the_same_again_and_in_other_threads(scan: np.ndarray, perception: Perception) -> None:
-    wanted = view.draw(perception, scan)
+def test_picture_is_the_same_again_and_in_other_threads(drawn: bytes, scan: np.ndarray, perception: Perception) -> None:
+    """And pyplot, of which there is one a process, draws none."""
+    before = "matplotlib.pyplot" in sys.modules
     got: list[bytes] = []
-    threads = [threading.Thread(target=lambda: got.append(view.draw(perception, scan))) for _ in range(3)]
+    draw = functools.partial(view.draw, perception, scan, title="a scan")
+    threads = [threading.Thread(target=lambda: got.append(draw())) for _ in range(2)]
     for thread in threads:
         thread.start()
     for thread in threads:
         thread.join()
-    assert [png == wanted for png in got] == [True, True, True]
+    assert [png == drawn for png in got] == [True, True]
+    assert ("matplotlib.pyplot" in sys.modules) == before
 
 
-@pytest.mark.parametrize("n", [0, 1])
 @pytest.mark.usefixtures("matplotlib")
-def test_tiny_scans(n: int, tmp_path: Path, scan: np.ndarray) -> None:
+def test_tiny_scans(tmp_path: Path, scan: np.ndarray) -> None:
     whole = a_perception(scan)
-    for points in (scan[:n], np.full((n, 4), np.nan, dtype=np.float32)):
+    for points in (scan[:0], scan[:1], np.full((1, 4), np.nan, dtype=np.float32)):
+        n = len(points)
         labels = PointLabels(np.zeros(n, np.uint8), np.zeros(n, bool), POINT_CLASSES)
         perception = replace(whole, n_points=n, points=labels, stage_ms={}, providers={}, fitness=())
         assert pixels(view.draw(perception, points)).shape == (1080, 1600, 3)
@@ -222,18 +233,14 @@ def test_strange_titles_and_classes(scan: np.ndarray, perception: Perception, tm
 
 
 @pytest.mark.usefixtures("matplotlib")
-def test_file_is_replaced_whole(scan: np.ndarray, perception: Perception, tmp_path: Path) -> None:
-    target = tmp_path / "scan.png"
-    target.write_bytes(b"old")
-    png = view.draw(perception, scan, target)
-    assert target.read_bytes() == png
+def test_a_file_that_cannot_be_written_is_an_error(perception: Perception, tmp_path: Path) -> None:
     with pytest.raises(OSError, match="absent"):
-        view.draw(perception, scan, tmp_path / "absent" / "scan.png")
+        draw_mistakes([], tmp_path / "absent" / "scan.png")
     folder = tmp_path / "scan.label"
     folder.mkdir()
     with pytest.raises(OSError, match=r"scan\.label"):
         write_labels(perception, folder)
-    assert sorted(entry.name for entry in tmp_path.iterdir()) == ["scan.label", "scan.png"]
+    assert [entry.name for entry in tmp_path.iterdir()] == ["scan.label"]
 
 
 def test_html_holds_every_finite_point_and_no_address(scan: np.ndarray, perception: Perception, tmp_path: Path) -> None:
@@ -339,13 +346,6 @@ def test_import_loads_no_matplotlib() -> None:
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
-@pytest.mark.usefixtures("matplotlib")
-def test_drawing_uses_no_pyplot(scan: np.ndarray, perception: Perception) -> None:
-    before = "matplotlib.pyplot" in sys.modules
-    view.draw(perception, scan)
-    assert ("matplotlib.pyplot" in sys.modules) == before
-
-
 def some_mistakes(points: np.ndarray, **given: Any) -> Mistakes:
     return Mistakes("000123", "drive_0011", points, np.zeros(len(points), np.uint8), **given)
 
@@ -424,7 +424,7 @@ wild_points = st.lists(
 
 
 @pytest.mark.usefixtures("matplotlib")
-@settings(deadline=None, max_examples=10)
+@settings(deadline=None, max_examples=6)
 @given(wild_points, st.lists(wild_boxes, max_size=8))
 def test_anything_is_drawn(tmp_path_factory: pytest.TempPathFactory, points: np.ndarray, boxes: list[Box]) -> None:
     folder = tmp_path_factory.mktemp("drawn")
