@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import functools
 import graphlib
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -182,6 +183,8 @@ RIVALS = "edgeperc_bench.peers."
 TALK_TO_ONNXRUNTIME = {"edgeperc.inference.providers", "edgeperc.inference.session"}
 # Names with an underscore of argparse, named tuples, numba and ouster-sdk that tests use.
 OF_OTHERS = {"_512x10", "_actions", "_choices_actions", "_replace", "_cache", "_defined_symbols", "_engine"}
+# Where a name may begin with one underscore; without any, a file need not be parsed.
+PRIVATE = re.compile(r"(?<!\w)_(?!_)\w|\._\b")
 # Functions that are lists of options.
 LONG_BODIES = {"add_parser"}
 MANY_PARAMETERS = {("edgeperc.perceiver", "__init__")}
@@ -234,14 +237,16 @@ def last_name(node: ast.expr) -> str:
     return str(getattr(node, "attr", getattr(node, "id", "")))
 
 
-def nodes(tree: ast.AST, running: bool) -> Iterator[ast.AST]:
-    """Of a module; ``running``: without what only type checkers read."""
-    pending = [tree]
+@functools.cache
+def nodes(tree: ast.AST, running: bool = False) -> tuple[ast.AST, ...]:
+    """Of a module, kept, for most tests here look at each; ``running``: without what only type checkers read."""
+    found, pending = [], [tree]
     while pending:
         node = pending.pop()
         if not (running and isinstance(node, ast.If) and last_name(node.test) == "TYPE_CHECKING"):
-            yield node
+            found.append(node)
             pending.extend(ast.iter_child_nodes(node))
+    return tuple(found)
 
 
 def imported(name: str, tree: ast.AST, running: bool = False) -> Iterator[str]:
@@ -334,7 +339,7 @@ def test_only_tools_import_the_wings() -> None:
 
 def test_private_names_stay_in_their_module() -> None:
     for name in modules():
-        for node in ast.walk(tree_of(name)):
+        for node in nodes(tree_of(name)):
             if isinstance(node, ast.ImportFrom) and (node.level or str(node.module).startswith("edgeperc")):
                 private = [alias.name for alias in node.names if alias.name.startswith("_") and alias.name[1] != "_"]
                 assert not private, f"{name} imports {private} of {node.module}"
@@ -345,7 +350,8 @@ def test_tests_use_public_names() -> None:
     others = {"argparse", "core", "os", "sys", "self", "cls"}
     reached = []
     for path in files(".py", "tests"):
-        for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+        text = path.read_text("utf-8")
+        for node in ast.walk(ast.parse(text)) if PRIVATE.search(text) else ():
             names: list[str] = []
             if isinstance(node, ast.ImportFrom) and str(node.module).startswith("edgeperc"):
                 names = [alias.name for alias in node.names]
@@ -383,7 +389,7 @@ def test_files_have_at_most_750_lines() -> None:
 
 
 def functions(tree: ast.AST) -> Iterator[ast.FunctionDef | ast.AsyncFunctionDef]:
-    for node in ast.walk(tree):
+    for node in nodes(tree):
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
             yield node
 
@@ -450,7 +456,7 @@ def test_library_code_leaves_the_process_alone() -> None:
     others = {"signal.signal", "print", "exit", "quit", "sys.exit", "os._exit", "logging.basicConfig"}
     for name in RUNTIME:
         if not name.startswith("edgeperc.cli.") and name != "edgeperc.__main__":
-            calls = {ast.unparse(node.func) for node in ast.walk(tree_of(name)) if isinstance(node, ast.Call)}
+            calls = {ast.unparse(node.func) for node in nodes(tree_of(name)) if isinstance(node, ast.Call)}
             assert not (others - own.get(name, set())) & calls, name
 
 
@@ -470,7 +476,7 @@ def test_bench_imports_only_the_runtime() -> None:
 
 def kernels(tree: ast.Module) -> Iterator[tuple[ast.FunctionDef, ast.expr]]:
     """Functions under numba's decorator, each with it."""
-    for node in ast.walk(tree):
+    for node in nodes(tree):
         if isinstance(node, ast.FunctionDef):
             for decorator in node.decorator_list:
                 bare = decorator.func if isinstance(decorator, ast.Call) else decorator

@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import inspect
-import os
 import re
-import subprocess
-import sys
 import threading
 import time
 import warnings
@@ -67,6 +64,15 @@ def perception(perceive: Perceiver, scan: SimulatedScan) -> Perception:
     return perceive(scan.points, stamp_s=12.5)
 
 
+@pytest.fixture(scope="module")
+def full_turn(scan: SimulatedScan) -> Perception:
+    """By one thread."""
+    alone = Perceiver(["ssadnet", "pointseg"], provider="cpu", n_threads=1, on_mismatch="ignore", full_turn=True)
+    assert alone.pipeline is not None
+    assert len(alone.pipeline.ranged) == 1
+    return alone(scan.points)
+
+
 def assert_same(one: Perception, other: Perception) -> None:
     np.testing.assert_array_equal(one.require_points().labels, other.require_points().labels)
     np.testing.assert_array_equal(one.require_points().in_view, other.require_points().in_view)
@@ -122,15 +128,16 @@ def test_result_is_the_same_for_any_thread_count(perception: Perception, scan: S
     assert_same(perception, Perceiver(["pointseg", "ssadnet"], provider="cpu", n_threads=1)(scan.points))
 
 
-@pytest.mark.parametrize(("cores", "at_once"), [(1, False), (2, True), (5, True)])
+@pytest.mark.parametrize(("cores", "at_once"), [(1, False), (5, True)])
 def test_networks_at_once_give_the_results_of_one_after_the_other(
     monkeypatch: pytest.MonkeyPatch, perception: Perception, scan: SimulatedScan, cores: int, at_once: bool
 ) -> None:
     monkeypatch.setattr(session, "usable_cores", lambda: cores)
     both = Perceiver(["pointseg", "ssadnet"], provider="cpu", on_mismatch="ignore")
     assert [s.shares_cores for s in both.sessions] == [at_once] * 2
-    assert_same(perception, both(scan.points))
-    assert both(scan.points).stage_ms.keys() == perception.stage_ms.keys()
+    found = both(scan.points)
+    assert_same(perception, found)
+    assert found.stage_ms.keys() == perception.stage_ms.keys()
     assert not Perceiver("pointseg", provider="cpu").sessions[0].shares_cores
     assert not Perceiver(provider="cpu", n_threads=2).sessions[0].shares_cores
 
@@ -194,15 +201,15 @@ def test_a_call_that_fails_leaves_nothing_running(
     assert_same(perception, both(scan.points))
 
 
-@pytest.mark.parametrize("full_turn", [False, True])
+@pytest.mark.parametrize("alone", ["perception", "full_turn"])
 def test_networks_run_one_after_the_other_where_no_thread_can_be_started(
-    monkeypatch: pytest.MonkeyPatch, scan: SimulatedScan, full_turn: bool
+    monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest, scan: SimulatedScan, alone: str
 ) -> None:
+    known: Perception = request.getfixturevalue(alone)
     monkeypatch.setattr(session, "usable_cores", lambda: 2)
-    options: dict[str, Any] = {"provider": "cpu", "on_mismatch": "ignore", "full_turn": full_turn}
     n_lanes = sum(thread.name.startswith("edgeperc-lane") for thread in threading.enumerate())
-    alone, both = (Perceiver(["ssadnet", "pointseg"], **more, **options) for more in ({"n_threads": 1}, {}))
-    known = alone(scan.points)
+    options: dict[str, Any] = {"provider": "cpu", "on_mismatch": "ignore", "full_turn": alone == "full_turn"}
+    both = Perceiver(["ssadnet", "pointseg"], **options)
 
     def refuse(_: object) -> None:
         raise RuntimeError("can't start new thread")
@@ -211,44 +218,19 @@ def test_networks_run_one_after_the_other_where_no_thread_can_be_started(
         limited.setattr(threading.Thread, "start", refuse)
         for _ in range(2):
             assert_same(known, both(scan.points))
-    for _ in range(3):
+    for _ in range(2):
         assert_same(known, both(scan.points))
     lanes = [thread for thread in threading.enumerate() if thread.name.startswith("edgeperc-lane")]
     assert len(lanes) <= 1 + n_lanes
 
 
-@pytest.mark.skipif(os.name != "posix", reason="forks")
-def test_a_forked_child_runs_both_networks_at_once() -> None:
-    code = """
-import os, edgeperc, numpy as np
-from edgeperc.inference import session
-session.usable_cores = lambda: 2
-perceive = edgeperc.Perceiver(["ssadnet", "pointseg"], provider="cpu", on_mismatch="ignore")
-assert all(each.shares_cores for each in perceive.sessions)
-points = np.random.default_rng(0).uniform(-20, 20, (5000, 4)).astype(np.float32) * [1, 1, 0.1, 0]
-known = perceive(points)
-child = os.fork()
-if child == 0:
-    found = perceive(points)
-    equal = [(getattr(found, view).labels == getattr(known, view).labels).all() for view in ("points", "top_view")]
-    os._exit(0 if all(equal) else 1)
-print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
-"""
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=300.0)
-    assert done.stdout == "0\n", done.stderr
-
-
 @pytest.mark.parametrize("failing", ["aside", "top view", "sectors", None])
 def test_two_threads_share_the_sectors_of_a_full_turn(
-    monkeypatch: pytest.MonkeyPatch, scan: SimulatedScan, failing: str | None
+    monkeypatch: pytest.MonkeyPatch, full_turn: Perception, scan: SimulatedScan, failing: str | None
 ) -> None:
-    options: dict[str, Any] = {"provider": "cpu", "on_mismatch": "ignore", "full_turn": True}
-    alone = Perceiver(["ssadnet", "pointseg"], n_threads=1, **options)
     monkeypatch.setattr(session, "usable_cores", lambda: 2)
-    both = Perceiver(["ssadnet", "pointseg"], **options)
-    assert alone.pipeline is not None
+    both = Perceiver(["ssadnet", "pointseg"], provider="cpu", on_mismatch="ignore", full_turn=True)
     assert both.pipeline is not None
-    assert len(alone.pipeline.ranged) == 1
     top, (ranged, aside) = both.sessions[0], (network.session for network in both.pipeline.ranged)
     of = {"aside": aside, "top view": top, "sectors": ranged}
     runs = dict.fromkeys(of, 0)
@@ -267,14 +249,14 @@ def test_two_threads_share_the_sectors_of_a_full_turn(
         for name, each in of.items():
             counted.setattr(each, "run", partial(run, name, each.run))
         if failing is None:
-            assert_same(alone(scan.points), both(scan.points))
+            assert_same(full_turn, both(scan.points))
             assert runs["top view"] == 1
             assert min(runs["aside"], runs["sectors"]) >= 1
             assert runs["aside"] + runs["sectors"] == 4
         else:
             with pytest.raises(InferenceError, match="no memory left"):
                 both(scan.points)
-    assert_same(alone(scan.points), both(scan.points))
+    assert_same(full_turn, both(scan.points))
 
 
 def test_result_does_not_depend_on_earlier_scans(perceive: Perceiver, perception: Perception) -> None:
@@ -297,10 +279,10 @@ def test_perceivers_in_threads_give_the_same_result(perception: Perception, scan
 
     def work() -> None:
         one = Perceiver(["ssadnet", "pointseg"], provider="cpu", n_threads=1)
-        answers.extend(one(scan.points) for _ in range(3))
+        answers.extend(one(scan.points) for _ in range(2))
 
-    in_threads([work] * 3)
-    assert len(answers) == 9
+    in_threads([work] * 2)
+    assert len(answers) == 4
     for answer in answers:
         assert_same(perception, answer)
 
@@ -388,10 +370,10 @@ def test_points_without_remission_have_none(perceive: Perceiver, perception: Per
     assert (answer.require_points().labels != perception.require_points().labels).any()
 
 
-def test_ten_million_points(perceive: Perceiver, scan: SimulatedScan) -> None:
-    many = np.resize(scan.points, (10_000_000, 4))
+def test_three_million_points(perceive: Perceiver, scan: SimulatedScan) -> None:
+    many = np.resize(scan.points, (3_000_000, 4))
     answer = perceive(many)
-    assert answer.require_points().labels.shape == (10_000_000,)
+    assert answer.require_points().labels.shape == (3_000_000,)
     assert np.count_nonzero(answer.require_points().labels == 1) > 10_000
 
 
@@ -489,8 +471,10 @@ def test_other_differences_are_warned_of(scan: SimulatedScan) -> None:
         Perceiver("pointseg", mounting=MODEL_MOUNTING, provider="cpu", on_mismatch="raise")(raised)
 
 
-@pytest.mark.parametrize("fault", [fault for fault in FAULTS if fault != "no remission"])
-@pytest.mark.parametrize("on_mismatch", ["refuse", "ignore"])
+@pytest.mark.parametrize(
+    ("fault", "on_mismatch"),
+    [*((fault, "refuse") for fault in FAULTS if fault != "no remission"), ("upside down", "ignore")],
+)
 def test_the_scans_of_another_vehicle_are_checked_as_the_first(
     scan: SimulatedScan, fault: str, on_mismatch: Literal["refuse", "ignore"]
 ) -> None:
@@ -799,18 +783,19 @@ def test_a_dense_scan_about_the_vehicle_is_perceived_and_the_doubt_is_told() -> 
     """Two sensors, moved to one time: no beams."""
     ahead = np.array([1.4, 0.3, -0.2, 0.0], np.float32)
     scan = np.concatenate([urban(8, "os1-64").points, urban(8, "os1-64").points + ahead])
-    finds = Perceiver(sensor="auto", provider="cpu")
+    finds = Perceiver("pointseg", sensor="auto", provider="cpu")
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         answer = finds(scan)
     assert sum("no beams stand out" in str(w.message) for w in caught) == 1
     assert finds.sensor.name == "beamless"
-    named = Perceiver(sensor=replace(get_sensor("os1-64"), remission_range=(0.0, 1.0)), on_mismatch="ignore")(scan)
+    sensor = replace(get_sensor("os1-64"), remission_range=(0.0, 1.0))
+    named = Perceiver("pointseg", sensor=sensor, on_mismatch="ignore")(scan)
     assert answer.points is not None
     assert named.points is not None
     assert np.mean(answer.points.labels == named.points.labels) > 0.97
     with pytest.raises(SensorError, match="no beams stand out"):
-        Perceiver(sensor="auto", provider="cpu", on_mismatch="raise")(scan)
+        Perceiver("pointseg", sensor="auto", provider="cpu", on_mismatch="raise")(scan)
 
 
 def test_a_refused_scan_does_not_settle_the_sensor() -> None:

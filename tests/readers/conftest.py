@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,10 +13,12 @@ import pytest
 
 @pytest.fixture
 def in_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Captures are decoded here: a process takes a second to start. That it replies the same is for `test_apart`."""
+    """Captures are decoded here: a process takes a second to start. That it replies the same is for `test_apart`, and
+    of descriptions for a test in `test_identify`.
+    """
     # Here, because pytest imports this file before it counts the calls of kernels.
     from edgeperc.readers import captures
-    from edgeperc.readers.decoders import decode
+    from edgeperc.readers.decoders import decode, describe
     from edgeperc.readers.times import TimedScan
 
     def decoded(path: Path, kind: str, topic: str | None, remission_field: str | None, times: bool) -> Iterator[Any]:
@@ -25,4 +28,8 @@ def in_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
         for one in decode(path, kind, topic, remission_field, warn, lambda: None, times=times):
             yield TimedScan(one.stamp_s, one.points.copy(), one.times_s if times else None)
 
+    def described(path: Path, kind: str, topic: str | None) -> Any:
+        return json.loads(json.dumps(describe(path, kind, topic, lambda: None)))
+
     monkeypatch.setattr(captures, "decode_apart", decoded)
+    monkeypatch.setattr(captures, "describe_apart", described)

@@ -29,7 +29,6 @@ from test_captures import (
     read_until_error,
     record,
     sized,
-    vlp16_packets,
     write_bag2,
     write_pcap,
 )
@@ -116,13 +115,13 @@ def test_the_process_ends_with_the_iterator(ouster: Path, started: list[subproce
 def test_from_threads(ouster: Path) -> None:
     counts: list[int] = []
     threads = [
-        threading.Thread(target=lambda: counts.append(len(list(read_scans(ouster / "sphere.pcap"))))) for _ in range(3)
+        threading.Thread(target=lambda: counts.append(len(list(read_scans(ouster / "sphere.pcap"))))) for _ in range(2)
     ]
     for thread in threads:
         thread.start()
     for thread in threads:
         thread.join()
-    assert counts == [3, 3, 3]
+    assert counts == [3, 3]
 
 
 def test_a_program_without_a_guard(ouster: Path, tmp_path: Path) -> None:
@@ -169,6 +168,7 @@ BAD_PACKETS = {
 }
 
 
+@pytest.mark.usefixtures("in_this_process")
 def test_damaged_packets_of_an_ouster_are_dropped(ouster: Path, tmp_path: Path) -> None:
     """They may come anywhere, between the fragments of a good packet too; every scan is the same."""
     content = (ouster / "sphere.pcap").read_bytes()
@@ -186,6 +186,7 @@ def test_damaged_packets_of_an_ouster_are_dropped(ouster: Path, tmp_path: Path) 
         np.testing.assert_array_equal(points, true_points)
 
 
+@pytest.mark.usefixtures("in_this_process")
 def test_packets_of_others_are_no_damage(ouster: Path, tmp_path: Path, recwarn: pytest.WarningsRecorder) -> None:
     content = (ouster / "sphere.pcap").read_bytes()
     path = tmp_path / "shared.pcap"
@@ -209,6 +210,7 @@ def in_fragments(packet: bytes, identification: int) -> list[bytes]:
     return found
 
 
+@pytest.mark.usefixtures("in_this_process")
 def test_packets_in_fragments(ouster: Path, tmp_path: Path) -> None:
     content = (ouster / "sphere.pcap").read_bytes()
     records = [part for k, each in enumerate(records_of(content)) for part in in_fragments(each, k)]
@@ -266,6 +268,7 @@ def test_impossible_metadata_names_the_field(holder: str, name: str, value: Any)
         check_metadata({**METADATA, holder: {**METADATA[holder], name: value}})
 
 
+@pytest.mark.usefixtures("in_this_process")
 def test_metadata_that_would_end_the_process(ouster: Path, tmp_path: Path) -> None:
     path = tmp_path / "zero.pcap"
     path.write_bytes((ouster / "sphere.pcap").read_bytes())
@@ -300,18 +303,6 @@ def damage(content: bytes, chance: random.Random, near: int) -> bytes:
 
 
 @pytest.mark.filterwarnings("ignore:.*damaged packets:UserWarning")
-def test_damaged_packet_captures(ouster: Path, tmp_path: Path) -> None:
-    pytest.importorskip("velodyne_decoder")
-    chance = random.Random(5)
-    velodyne = write_pcap(tmp_path / "vlp16.pcap", vlp16_packets(1.2)).read_bytes()
-    (tmp_path / "sphere.json").write_bytes((ouster / "sphere.json").read_bytes())
-    for content, name in (((ouster / "sphere.pcap").read_bytes(), "sphere.pcap"), (velodyne, "vlp16.pcap")):
-        for _ in range(6):
-            (tmp_path / name).write_bytes(damage(content, chance, 120))
-            read_whole(tmp_path / name)
-
-
-@pytest.mark.filterwarnings("ignore:.*damaged packets:UserWarning")
 @pytest.mark.parametrize(
     "name",
     [
@@ -325,7 +316,7 @@ def test_real_captures_that_are_damaged(data_root: Callable[[str], Path], tmp_pa
     if source.with_name(f"{source.name}.json").is_file():
         (tmp_path / "copy.json").write_bytes(source.with_name(f"{source.name}.json").read_bytes())
     chance, content = random.Random(6), source.with_name(f"{source.name}.pcap").read_bytes()
-    for _ in range(6):
+    for _ in range(2):
         (tmp_path / "copy.pcap").write_bytes(damage(content, chance, 120))
         read_whole(tmp_path / "copy.pcap")
 
@@ -336,9 +327,9 @@ def test_packets_of_the_right_size_with_damaged_headers(ouster: Path, tmp_path: 
     content = (ouster / "sphere.pcap").read_bytes()
     (tmp_path / "sphere.json").write_bytes((ouster / "sphere.json").read_bytes())
     chance = random.Random(8)
-    for _ in range(10):
+    for n_damaged in (1, 8, None):
         records = [bytearray(each) for each in records_of(content)]
-        for each in chance.sample(records, chance.choice((1, 8, len(records)))):
+        for each in chance.sample(records, n_damaged or len(records)):
             packet = 16 + 42
             column = packet + 32 + chance.randrange(16) * ((len(each) - packet - 64) // 16)
             for _ in range(chance.choice((1, 6))):
@@ -346,23 +337,6 @@ def test_packets_of_the_right_size_with_damaged_headers(ouster: Path, tmp_path: 
                 each[place] = chance.choice((0, 255, chance.randrange(256)))
         (tmp_path / "sphere.pcap").write_bytes(content[:24] + b"".join(records))
         read_whole(tmp_path / "sphere.pcap")
-
-
-def test_osf_files_with_damage_and_right_checksums(ouster: Path, tmp_path: Path) -> None:
-    content = (ouster / "sphere.osf").read_bytes()
-    blocks, at = [], 0
-    while at < len(content):
-        end = at + 4 + struct.unpack_from("<I", content, at)[0]
-        blocks.append((at, end))
-        at = end + 4
-    chance = random.Random(7)
-    for _ in range(6):
-        damaged = bytearray(content)
-        at, end = chance.choice(blocks)
-        damaged[chance.randrange(at + 4, min(end, at + 400))] ^= chance.randrange(1, 256)
-        damaged[end : end + 4] = struct.pack("<I", zlib.crc32(damaged[at:end]))
-        (tmp_path / "damaged.osf").write_bytes(damaged)
-        read_whole(tmp_path / "damaged.osf")
 
 
 def pack(content: bytes, method: str) -> bytes:
@@ -466,6 +440,7 @@ def chunked_mcap(
     return path
 
 
+@pytest.mark.usefixtures("in_this_process")
 @pytest.mark.parametrize("summary", [True, False])
 @pytest.mark.parametrize("method", ["", "lz4", "zstd"])
 def test_mcap_chunks(tmp_path: Path, method: str, summary: bool) -> None:
@@ -479,6 +454,7 @@ def test_mcap_chunks(tmp_path: Path, method: str, summary: bool) -> None:
     assert "bad.mcap: after 2 scans a chunk is damaged: its CRC-32 is wrong" in error
 
 
+@pytest.mark.usefixtures("in_this_process")
 @pytest.mark.parametrize("method", ["lz4", "zstd"])
 @pytest.mark.parametrize("claim", [100, 1 << 33])
 def test_an_mcap_chunk_that_holds_more_than_it_says(tmp_path: Path, method: str, claim: int) -> None:
@@ -521,6 +497,7 @@ def compressed_bag(folder: Path, mode: str) -> Path:
     return folder
 
 
+@pytest.mark.usefixtures("in_this_process")
 @pytest.mark.parametrize("mode", ["message", "file"])
 def test_a_bag_of_ros_2_that_is_compressed(tmp_path: Path, mode: str) -> None:
     scans = list(read_scans(compressed_bag(tmp_path / "bag", mode)))
@@ -537,6 +514,7 @@ def zstd_zeros(n: int) -> bytes:
 ZSTD_CLAIM = b"\x28\xb5\x2f\xfd\xe0" + struct.pack("<Q", 8 << 30) + b"\x03\0\0\0"
 
 
+@pytest.mark.usefixtures("in_this_process")
 @pytest.mark.parametrize("bomb", ["zeros", "claim"])
 def test_messages_of_a_bag_stop_at_the_limit(tmp_path: Path, bomb: str) -> None:
     folder = compressed_bag(tmp_path / "bag", "message")
@@ -552,6 +530,7 @@ def test_messages_of_a_bag_stop_at_the_limit(tmp_path: Path, bomb: str) -> None:
     assert ("unpack to more than 67,108,864" if bomb == "zeros" else "damaged") in error
 
 
+@pytest.mark.usefixtures("in_this_process")
 def test_files_of_a_bag_stop_at_the_limit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """No more reaches the disk, and the temporary folder is deleted."""
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "temporary"))

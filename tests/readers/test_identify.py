@@ -25,6 +25,8 @@ from edgeperc.readers.clouds import cloud_points
 from edgeperc.readers.identify import KnownSensor, of_cloud, of_metadata
 from edgeperc.types.sensor import SENSORS, SensorProfile, get_sensor
 
+pytestmark = pytest.mark.usefixtures("in_this_process")
+
 
 def velodyne(product: int, mode: int = 0x37, flags: Sequence[bytes] = (b"\xff\xee",)) -> list[bytes]:
     """Packets of a Velodyne whose blocks have these flags in turn."""
@@ -178,7 +180,7 @@ JSON = st.recursive(
 KEYS = ("sensor_info", "prod_line", "beam_intrinsics", "beam_altitude_angles", "lidar_data_format", "lidar_mode")
 
 
-@settings(deadline=None, max_examples=300)
+@settings(deadline=None, max_examples=150)
 @given(st.dictionaries(st.sampled_from([*KEYS, "config_params", "pixels_per_column"]), JSON) | JSON)
 @example({"beam_altitude_angles": [-(2**63) - 1]})
 def test_any_metadata_is_known_or_a_typed_error(content: Any) -> None:

@@ -220,8 +220,7 @@ def test_several_velodynes_are_told_apart(tmp_path: Path, link: int, senders: tu
     assert "no LiDAR '10.1.1.1'" in error_of(path, topic="10.1.1.1")
 
 
-@pytest.mark.parametrize("link", [1, 113, 101])
-@pytest.mark.parametrize("other", ["10.0.0.2", "10.0.0.1:2369"])
+@pytest.mark.parametrize(("link", "other"), [(1, "10.0.0.2"), (113, "10.0.0.1:2369"), (101, "10.0.0.2")])
 def test_a_velodyne_that_begins_late_is_told_apart(tmp_path: Path, link: int, other: str) -> None:
     pytest.importorskip("velodyne_decoder")
     packets = vlp16_packets(30.0)

@@ -231,8 +231,7 @@ def test_a_velodyne_beside_another_sensor_is_told_apart(tmp_path: Path, name: st
     check_told_apart(both, {"10.0.0.9": tmp_path / "velodyne.pcap", "10.0.0.1": tmp_path / "other.pcap"})
 
 
-@pytest.mark.parametrize("other", ["10.0.0.2", "10.0.0.1:2369"])
-@pytest.mark.parametrize("name", ["pandarxt-16", "pandarxt-32"])
+@pytest.mark.parametrize(("name", "other"), [("pandarxt-16", "10.0.0.2"), ("pandarxt-32", "10.0.0.1:2369")])
 def test_a_sensor_that_begins_late_is_left_out_with_a_warning(tmp_path: Path, name: str, other: str) -> None:
     model = MODELS[name]
     packets = packets_of(model, blocks_of(model, *ranges(model, 64))) * 300

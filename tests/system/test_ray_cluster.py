@@ -18,6 +18,7 @@ import numpy as np
 import pytest
 
 from edgeperc import cli
+from edgeperc.cli import side_by_side
 from edgeperc.cli.main import build_parser
 from edgeperc.cli.scans import Sensors
 from edgeperc.errors import MissingExtraError, OptionError, PointsError
@@ -33,6 +34,8 @@ from scenes import urban
 pytestmark = pytest.mark.filterwarnings("ignore")  # of Ray, boto and aiohttp
 
 N_SCANS = 9
+OPTIONS = ("--model", "pointseg", "--json", "--threads", "1")
+FILES = ("--labels", "--ply")  # a page and a picture show times
 
 
 @pytest.fixture(scope="module")
@@ -63,7 +66,7 @@ def cluster() -> Iterator[None]:
 def run(*arguments: str | Path) -> tuple[int, list[dict[str, Any]], str]:
     """Exit code, records without times, and stderr of ``edgeperc run --json``."""
     with contextlib.redirect_stdout(io.StringIO()) as out, contextlib.redirect_stderr(io.StringIO()) as err:
-        code = cli.main(["run", *map(str, arguments), "--json", "--threads", "1"])
+        code = cli.main(["run", *map(str, arguments), *OPTIONS])
     records = [json.loads(line) for line in out.getvalue().splitlines()]
     for record in records:
         record.pop("stage_ms", None)
@@ -86,43 +89,67 @@ def workers(request: pytest.FixtureRequest) -> tuple[str, ...]:
     return ("--engine", request.param, "--workers", "2")
 
 
-def test_workers_give_the_same_bytes_and_resume(scans: Path, tmp_path: Path, workers: tuple[str, ...]) -> None:
-    files = ("--labels", "--ply")  # a page and a picture show times
-    code, records, said = run(scans, "--out", tmp_path / "local", *files)
+@pytest.fixture(scope="module")
+def alone(scans: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, bytes], list[dict[str, Any]]]:
+    """Files and records of one process."""
+    out = tmp_path_factory.mktemp("alone")
+    code, records, _ = run(scans, "--out", out, *FILES)
     assert code == 1
     assert [bool(record.get("error")) for record in records] == [k == 6 for k in range(N_SCANS)]
     assert "no remission" in " ".join(records[7]["fitness"])
     assert not records[8]["fitness"]  # said once
-    there = tmp_path / "workers"
-    assert run(scans, "--out", there, *files, *workers)[:2] == (code, records)
-    assert contents(there) == contents(tmp_path / "local")
-    assert len(contents(there)) == 2 * (N_SCANS - 1)
+    files = contents(out)
+    assert len(files) == 2 * (N_SCANS - 1)
+    return files, records
+
+
+def test_workers_give_the_same_bytes(scans: Path, alone: Any, tmp_path: Path, workers: tuple[str, ...]) -> None:
+    code, records, said = run(scans, "--out", tmp_path, *FILES, *workers)
+    assert code == 1
+    assert (contents(tmp_path), records) == alone
     assert "6.bin" in said
 
-    # What is complete is kept; what is missing, cut short, or of a scan that changed since is made again.
-    (there / "5.ply").unlink()
-    (there / "7.label").write_bytes(b"cut")
-    again = run(scans, "--out", there, *files, *workers)
-    assert again[:2] == (code, records)
-    assert "1 scan of an earlier run kept" in again[2]
-    assert contents(there) == contents(tmp_path / "local")
-    other = run(scans, "--out", there, *files, "--boxes-from", "network")
-    assert "kept" not in other[2]
-    assert other[1] != records
+
+def test_what_workers_have_made_is_kept(
+    scans: Path, alone: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What is missing, cut short, or of other options is made again. Workers of this process decide it as others do."""
+
+    def map_here(make: Callable[..., Any], arguments: tuple[Any, ...], items: list[Any], **_: Any) -> Iterator[Any]:
+        return map(make(*arguments), items)
+
+    monkeypatch.setattr(side_by_side, "ENGINES", {"local": map_here})
+    arguments = (scans, "--out", tmp_path, *FILES, "--workers", "2")
+    assert "kept" not in run(*arguments)[2]
+    (tmp_path / "5.ply").unlink()
+    (tmp_path / "7.label").write_bytes(b"cut")
+    code, records, said = run(*arguments)
+    assert code == 1
+    assert (contents(tmp_path), records) == alone
+    assert "1 scan of an earlier run kept" in said
+    _, others, said = run(*arguments, "--boxes-from", "network")
+    assert "kept" not in said
+    assert others != records
 
 
-def test_workers_give_the_same_figures(tmp_path: Path, workers: tuple[str, ...]) -> None:
-    found = {}
-    for name, options in (("one", ()), ("workers", workers)):
-        file = tmp_path / f"{name}.json"
-        with contextlib.redirect_stdout(io.StringIO()) as out:
-            assert cli.main(["eval", "simulation:4", *options, "--json", str(file)]) == 0
-        figures = json.loads(file.read_text())
-        del figures["command"]
-        # Ray itself prints that a process of its died, which a busy computer may bring about; the block is done again.
-        printed = [line for line in out.getvalue().splitlines() if "(raylet)" not in line]
-        found[name] = figures, printed
-    assert found["workers"] == found["one"]
+def figures(file: Path, *options: str) -> tuple[Any, list[str]]:
+    """What an evaluation writes and prints."""
+    with contextlib.redirect_stdout(io.StringIO()) as out:
+        assert cli.main(["eval", "simulation:3", *options, "--json", str(file)]) == 0
+    written = json.loads(file.read_text())
+    del written["command"]
+    # Ray itself prints that a process of its died, which a busy computer may bring about; the block is done again.
+    return written, [line for line in out.getvalue().splitlines() if "(raylet)" not in line]
+
+
+@pytest.fixture(scope="module")
+def figures_alone(tmp_path_factory: pytest.TempPathFactory) -> tuple[Any, list[str]]:
+    """Those of one process."""
+    return figures(tmp_path_factory.mktemp("figures") / "one.json")
+
+
+def test_workers_give_the_same_figures(tmp_path: Path, figures_alone: Any, workers: tuple[str, ...]) -> None:
+    assert figures(tmp_path / "workers.json", *workers) == figures_alone
 
 
 @pytest.mark.usefixtures("cluster")
@@ -301,18 +328,18 @@ def test_scans_at_s3(bucket: str, scans: Path, tmp_path: Path) -> None:
         Remote("s3://nobody/scan.bin").read_bytes()
 
 
-def test_ray_reads_from_and_writes_to_s3(bucket: str, scans: Path, tmp_path: Path) -> None:
+def test_ray_reads_from_and_writes_to_s3(bucket: str, scans: Path, alone: Any) -> None:
     pytest.importorskip("ray")
     pytest.importorskip("pyarrow")
     for path in scans.iterdir():
         Remote(f"{bucket}/scans/{path.name}").write_bytes(path.read_bytes())
-    code, records, _ = run(scans, "--out", tmp_path, "--labels", "--ply")
+    files, records = alone
     # Workers have the environment that the cluster was started with, so this one has its own.
-    arguments = [f"{bucket}/scans", "--out", f"{bucket}/out", "--labels", "--ply", "--json", "--threads", "1"]
+    arguments = [f"{bucket}/scans", "--out", f"{bucket}/out", *FILES, *OPTIONS]
     command = [sys.executable, "-m", "edgeperc", "run", *arguments, "--engine", "ray", "--workers", "2"]
     done = [subprocess.run(command, capture_output=True, text=True, timeout=300) for _ in range(2)]
     for each in done:
-        assert each.returncode == code == 1, each.stderr
+        assert each.returncode == 1, each.stderr
         there = [json.loads(line) for line in each.stdout.splitlines()]
         assert len(there) == len(records)
         for record, other in zip(there, records, strict=True):
@@ -323,9 +350,7 @@ def test_ray_reads_from_and_writes_to_s3(bucket: str, scans: Path, tmp_path: Pat
             assert {key: value for key, value in record.items() if key != "stage_ms"} == expected
     assert "kept" not in done[0].stderr
     assert "kept" in done[1].stderr
-    found = {name: Remote(f"{bucket}/out/{name}").read_bytes() for name in contents(tmp_path)}
-    assert found == contents(tmp_path)
-    assert len(found) == 2 * (N_SCANS - 1)
+    assert {name: Remote(f"{bucket}/out/{name}").read_bytes() for name in files} == files
 
 
 def test_large_files_are_not_fetched(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
