@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import json
 import math
 import warnings
@@ -38,16 +39,22 @@ mountings = st.builds(
 )
 
 
-@pytest.fixture(scope="module")
-def scans() -> list[NDArray[np.float32]]:
-    """Simulated scans, 1.73 m above a level road."""
-    return [simulate(flat(random_scene(seed, "urban")), "hdl-64e", seed=seed).points for seed in (1, 2, 3)]
-
-
-def flat(scene: Scene) -> Scene:
+@functools.cache
+def flat(seed: int) -> Scene:
+    """A level street."""
+    scene = random_scene(seed, "urban")
     terrain = np.zeros_like(scene.terrain)
     terrain[15:] = scene.terrain[15:]  # heights of kerbs and the like
     return replace(scene, terrain=terrain)
+
+
+@pytest.fixture(scope="module")
+def scans() -> list[NDArray[np.float32]]:
+    """Simulated scans, 1.73 m above a level road."""
+    scans = [simulate(flat(seed), "hdl-64e", seed=seed).points for seed in (1, 2, 3)]
+    for scan in scans:
+        scan.flags.writeable = False
+    return scans
 
 
 def seen_by(mounting: Mounting, points: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -400,14 +407,20 @@ def test_a_sensor_that_hangs_is_described(yaw_deg: float) -> None:
         Mounting(2.1, 181.0, 0.0)
 
 
-@pytest.mark.parametrize("height_m", [3.5, 5.0, 6.5, 8.0])
-@pytest.mark.parametrize("sensor", ["os1-64", "hdl-64e", "pandar64", "vlp-16", "os0-64"])
+@pytest.mark.parametrize(
+    ("sensor", "height_m"),
+    [
+        *product(("os1-64", "pandar64"), (3.5, 6.5)),
+        *product(("hdl-64e", "vlp-16"), (5.0, 8.0)),
+        *product(("os0-64",), (3.5, 8.0)),
+    ],
+)
 def test_high_sensors_are_found_from_the_ground(sensor: str, height_m: float) -> None:
     """On a truck, a pole or a crane: no ground may be seen within 12 m."""
     high = replace(get_sensor(sensor), mounting=Mounting(height_m, 0.0, 0.0, 0.0))
     errors = []
     for seed in (1, 2, 3):  # in the second, the land is half a meter lower than the road
-        points = simulate(flat(random_scene(seed, "urban")), high, seed=seed).points
+        points = simulate(flat(seed), high, seed=seed).points
         found = MountingEstimator(Mounting()).add(points)
         assert not found.doubtful()
         assert found.mounting().height_m == found.estimate().mounting.height_m
@@ -436,7 +449,7 @@ def test_a_height_that_is_found_from_afar_is_not_said_in_silence(sensor: str, he
 
 def test_heights_above_uneven_land_are_nearly_found() -> None:
     errors = []
-    for sensor, height_m, seed in product(("os1-64", "hdl-64e", "pandar64", "vlp-16"), (3.0, 5.0, 6.5), range(40, 43)):
+    for sensor, height_m, seed in product(("os1-64", "hdl-64e", "pandar64", "vlp-16"), (3.0, 5.0, 6.5), range(40, 42)):
         points = simulated_scan(seed, sensor, mounting=Mounting(height_m, 0.0, 0.0, 0.0)).points
         found = MountingEstimator(Mounting()).add(points).mounting().height_m
         errors.append(abs((found or 0.0) - height_m))
@@ -447,7 +460,7 @@ def test_heights_above_uneven_land_are_nearly_found() -> None:
 @pytest.mark.parametrize(("roll_deg", "pitch_deg"), [(4.0, -3.0), (0.0, 8.0), (-5.0, 5.0)])
 def test_high_sensors_that_lean_are_found(roll_deg: float, pitch_deg: float) -> None:
     high = replace(get_sensor("os1-64"), mounting=Mounting(6.0, 0.0, 0.0, 0.0))
-    level = simulate(flat(random_scene(3, "urban")), high, seed=3).points
+    level = simulate(flat(3), high, seed=3).points
     level[:, 2] += 6.0 - 1.73
     found = MountingEstimator(Mounting()).add(seen_by(Mounting(6.0, roll_deg, pitch_deg, 0.0), level)).mounting()
     assert found.height_m == pytest.approx(6.0, abs=0.2)
@@ -458,7 +471,7 @@ def test_high_sensors_that_lean_are_found(roll_deg: float, pitch_deg: float) -> 
 @pytest.mark.parametrize("seed", range(1, 7))
 def test_land_below_a_bridge_is_not_its_road(seed: int) -> None:
     """A road 8 m wide, and land 6 m lower; the deck hides what is near."""
-    points = simulate(flat(random_scene(seed, "urban")), "hdl-64e", seed=seed).points
+    points = simulate(flat(seed), "hdl-64e", seed=seed).points
     beside = np.abs(points[:, 1]) > 4.0
     points[beside, 2] -= 6.0
     seen = points[~beside | (np.abs(points[:, 1]) > 17.0)]
@@ -470,7 +483,7 @@ def test_land_below_a_bridge_is_not_its_road(seed: int) -> None:
 def test_a_sensor_that_hangs_needs_no_height(sensor: str, height_m: float) -> None:
     """Its ground is above it in the scan; the tilt that is given says so."""
     high = replace(get_sensor(sensor), mounting=Mounting(height_m, 0.0, 0.0, 0.0))
-    hanging = simulate(flat(random_scene(1, "urban")), high, seed=1).points * np.float32([1, -1, -1, 1])
+    hanging = simulate(flat(1), high, seed=1).points * np.float32([1, -1, -1, 1])
     for known in (Mounting(roll_deg=180.0), Mounting(roll_deg=180.0, pitch_deg=0.0), Mounting(roll_deg=-180.0)):
         found = MountingEstimator(known).add(hanging).estimate().mounting
         assert found.height_m == pytest.approx(height_m, abs=0.15)
@@ -493,7 +506,7 @@ def test_a_sensor_that_looks_up_is_found_from_the_road_far_away(
 ) -> None:
     """An upright Mid-360 sees the road from 14 m on."""
     looking_up = replace(get_sensor("mid-360").accumulated(0.2), mounting=Mounting(height_m, 0.0, 0.0, 0.0))
-    level = simulate(flat(random_scene(seed, "urban")), looking_up, seed=seed).points
+    level = simulate(flat(seed), looking_up, seed=seed).points
     level[:, 2] += height_m - 1.73
     scan = seen_by(Mounting(height_m, *mounting, 0.0), level)
     for known in (Mounting(), Mounting(height_m)):

@@ -433,10 +433,10 @@ def test_one_missing_return_is_not_a_gap_but_two_sectors_are() -> None:
 
 
 @pytest.mark.parametrize("sensor", ["vlp-16", "vlp-32c", "hdl-32e", "os1-64"])
-@pytest.mark.parametrize("height_m", [1.2, 1.73, 2.2])
+@pytest.mark.parametrize("height_m", [1.2, 2.2])
 def test_no_bridge_leads_over_anything_higher_than_its_rays(sensor: str, height_m: float) -> None:
     mounting = replace(MODEL_MOUNTING, height_m=height_m)
-    for x in np.arange(6.5, 45.0, 1.7):
+    for x in np.arange(6.5, 45.0, 2.3):
         scan = cast(get_sensor(sensor), (x, x + 0.4, -1.2, 1.2, BRIDGE_M + 0.05), height_m=height_m)
         view = top_view(scan, sensor, mounting)
         row, col, inside = VIEW.cells(scan[:, 0], scan[:, 1])

@@ -193,9 +193,10 @@ def test_strata_with_few_points_are_empty() -> None:
         sensor_fit.remission_strata([np.zeros((3, 3), np.float32)])
 
 
-@pytest.mark.parametrize("function", [*FUNCTIONS, POWER], ids=lambda f: f.kind)
-@settings(max_examples=60, deadline=None)
-@given(points=hnp.arrays(np.float32, st.tuples(st.integers(0, 20), st.just(4)), elements=st.floats(width=32)))
+@given(
+    function=st.sampled_from([*FUNCTIONS, POWER]),
+    points=hnp.arrays(np.float32, st.tuples(st.integers(0, 20), st.just(4)), elements=st.floats(width=32)),
+)
 def test_rendering_agrees_with_the_twin(function: RemissionFunction, points: np.ndarray) -> None:
     sensor = replace(get_sensor("vlp-16"), remission_range=(5.0, 105.0), remission=function)
     before = points.copy()
@@ -536,11 +537,11 @@ def test_eval_sensors_counts_test_drives_only(tmp_path: Path, monkeypatch: pytes
     names = {"car": "car", "*": "ignore"}
     description = {"schema": 1, "sensor": "hdl-64e", "boxes": names, "splits": {"train": ["a"], "test": ["b"]}}
     (tmp_path / "scans.json").write_text(json.dumps(description))
-    assert compare([str(tmp_path)])[str(tmp_path)]["n_scans"] == 1
+    assert compare([str(tmp_path)], "pointseg")[str(tmp_path)]["n_scans"] == 1
     seen = {"pointseg 1": {scan_hash(scan.points)}}
     monkeypatch.setattr("edgeperc.evaluation.transfer.training_scans_of", lambda cards: seen)
     with pytest.raises(SplitError, match="was trained on scan b"):
-        compare([str(tmp_path)])
+        compare([str(tmp_path)], "pointseg")
 
 
 def test_eval_sensors_measures_points_where_the_objects_network_was_trained(
@@ -552,7 +553,6 @@ def test_eval_sensors_measures_points_where_the_objects_network_was_trained(
     scan.points.tofile(tmp_path / "velodyne" / "a.bin")
     (tmp_path / "label" / "a.txt").write_text("")
     (tmp_path / "scans.json").write_text(json.dumps({"schema": 1, "sensor": "hdl-64e", "boxes": {"*": "ignore"}}))
-    assert "boxes" in compare([str(tmp_path)])[str(tmp_path)]
     seen = {"objects 1": {scan_hash(scan.points)}}
     monkeypatch.setattr("edgeperc.evaluation.judge.training_scans_of", lambda cards: seen)
     assert cli.main(["eval-sensors", str(tmp_path)]) == 0

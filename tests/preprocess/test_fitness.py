@@ -7,7 +7,7 @@ import pickle
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
-from itertools import permutations
+from itertools import permutations, product
 from pathlib import Path
 
 import numpy as np
@@ -29,10 +29,13 @@ from edgeperc.preprocess.findings import (
     with_raw_remission,
 )
 from edgeperc.preprocess.fitness import FitnessProfile
+from edgeperc.preprocess.returns import returns
 from edgeperc.readers.files import read_points
 from edgeperc.simulation.samples import simulated_scan
+from edgeperc.simulation.scene import SimulatedScan
 from edgeperc.types.frame import ModelFrame
 from edgeperc.types.mounting import MODEL_MOUNTING, Mounting
+from edgeperc.types.perception import DroppedPoints
 from edgeperc.types.sensor import SENSORS, get_sensor
 from edgeperc.zoo import listed
 
@@ -45,16 +48,31 @@ SEEDS = range(4)
 
 
 @cache
+def scanned(seed: int, sensor: str) -> Points:
+    points = simulated_scan(seed, sensor).points
+    points.flags.writeable = False
+    return points
+
+
+@cache
 def street(seed: int, sensor: str = "hdl-64e") -> Points:
     """A simulated scan, whose remission is in 0..1 for every sensor."""
     scaled = replace(get_sensor(sensor), remission_range=(0.0, 1.0), remission=None)
-    return condition(simulated_scan(seed, sensor).points, scaled)[0]
+    return condition(scanned(seed, sensor), scaled)[0]
+
+
+@cache
+def row_of(seed: int) -> NDArray[np.int64]:
+    """The beam of each point of a street, from the top."""
+    x, y, z, _ = street(seed).T
+    elevation = np.degrees(np.arctan2(z, np.hypot(x, y)))
+    return np.abs(elevation[:, None] - np.array(KITTI.elevations_deg)).argmin(axis=1)
 
 
 def gross(points: Points, sensor: str = "hdl-64e") -> list[str]:
     """The gross differences to the training scans of any shipped model."""
     scan = np.ascontiguousarray(points, np.float32)
-    return [f for profile in PROFILES for f in check_fitness(scan, profile, get_sensor(sensor)) if f.gross]
+    return [finding for finding in check_profiles(scan, PROFILES, get_sensor(sensor)) if finding.gross]
 
 
 def test_a_finding_is_its_sentence() -> None:
@@ -67,30 +85,29 @@ def test_a_finding_is_its_sentence() -> None:
 
 @pytest.mark.parametrize("sensor", SENSORS)
 def test_simulated_scans_of_every_built_in_sensor_are_accepted(sensor: str) -> None:
-    for seed in SEEDS[:2]:
-        assert gross(street(seed, sensor), sensor) == []
+    points = scanned(0, sensor)
+    assert gross(street(0, sensor), sensor) == []
+    found, dropped = returns(points, get_sensor(sensor))
+    assert dropped == DroppedPoints()
+    assert np.shares_memory(found, points)
 
 
-DIRECTIONS = st.sampled_from([-1.0, 1.0])
-
-
-@settings(deadline=None, max_examples=40)
+@settings(max_examples=15)
 @given(st.sampled_from(SEEDS), st.floats(500.0, 2000.0))
 def test_millimeters(seed: int, factor: float) -> None:
     found = gross(street(seed) * np.float32([factor, factor, factor, 1]))
     assert any("convert them to meters" in sentence for sentence in found)
 
 
-@settings(deadline=None, max_examples=60)
-@given(st.sampled_from(SEEDS), st.permutations(range(3)), DIRECTIONS, DIRECTIONS, DIRECTIONS)
-def test_swapped_axes(seed: int, order: list[int], a: float, b: float, c: float) -> None:
+@pytest.mark.parametrize("order", [*permutations(range(3))])
+def test_swapped_axes(order: tuple[int, ...]) -> None:
     """Unless z still points up: then the scan is only turned or mirrored."""
-    sign = np.float32([a, b, c, 1])
-    points = street(seed)[:, [*order, 3]] * sign
-    assert bool(gross(points)) == (order[2] != 2 or c < 0.0)
+    for seed, signs in enumerate(product([-1, 1], repeat=3)):
+        points = street(seed % len(SEEDS))[:, [*order, 3]] * np.float32([*signs, 1])
+        assert bool(gross(points)) == (order[2] != 2 or signs[2] < 0)
 
 
-@settings(deadline=None, max_examples=30)
+@settings(max_examples=15)
 @given(st.sampled_from(SEEDS), st.floats(0.0, 360.0))
 def test_upside_down(seed: int, turned_deg: float) -> None:
     cos, sin = np.cos(np.radians(turned_deg)), np.sin(np.radians(turned_deg))
@@ -98,12 +115,10 @@ def test_upside_down(seed: int, turned_deg: float) -> None:
     assert gross(np.column_stack([cos * x + sin * y, sin * x - cos * y, -z, remission]))
 
 
-@settings(deadline=None, max_examples=30)
+@settings(max_examples=15)
 @given(st.sampled_from(SEEDS), st.floats(0.05, 10.0), st.booleans())
 def test_z_as_the_number_of_a_row(seed: int, scale: float, from_top: bool) -> None:
-    points = street(seed).copy()
-    elevation = np.degrees(np.arctan2(points[:, 2], np.hypot(points[:, 0], points[:, 1])))
-    row = np.abs(elevation[:, None] - np.array(KITTI.elevations_deg)[None]).argmin(axis=1)
+    points, row = street(seed).copy(), row_of(seed)
     points[:, 2] = scale * (row if from_top else 63 - row)
     assert gross(points)
 
@@ -124,7 +139,7 @@ def test_decimeters(seed: int) -> None:
     assert any("decimeters" in finding for finding in gross(points))
 
 
-@settings(deadline=None, max_examples=30)
+@settings(max_examples=15)
 @given(st.sampled_from(SEEDS), st.floats(-1.0, 300.0))
 def test_constant_remission(seed: int, value: float) -> None:
     points = street(seed).copy()
@@ -143,7 +158,7 @@ def test_another_scale_of_remission(factor: float) -> None:
 def test_a_remission_of_another_unit_is_not_called_missing(sensor: str, brightest: float) -> None:
     """A profile's logarithm maps 0..1 to nothing where it expects 0..255."""
     profile = get_sensor(sensor)
-    raw = simulated_scan(1, sensor).points.copy()
+    raw = scanned(1, sensor).copy()
     raw[:, 3] *= brightest / raw[:, 3].max()
     scan = condition(raw, profile)[0]
     for fitness in PROFILES:
@@ -158,7 +173,7 @@ def test_a_remission_of_another_unit_is_not_called_missing(sensor: str, brightes
 @pytest.mark.parametrize("value", [0.0, np.nan, 7.0])
 def test_a_missing_remission_is_called_so(value: float) -> None:
     profile = get_sensor("hdl-32e")
-    raw = simulated_scan(1, "hdl-32e").points.copy()
+    raw = scanned(1, "hdl-32e").copy()
     raw[:, 3] = value
     zeros = (Finding("Remission is 0 for 100% of the points: the field is missing", True), Finding("another"))
     assert with_raw_remission(zeros, raw, profile) == zeros
@@ -168,7 +183,7 @@ def test_a_missing_remission_is_called_so(value: float) -> None:
 @pytest.mark.parametrize("sensor", ["vlp-16", "hdl-64e", "os1-128", "pandar64"])
 @pytest.mark.parametrize("what", ["beam", "time or azimuth", "height", "distance"])
 def test_a_remission_that_follows_from_the_place_is_refused(sensor: str, what: str) -> None:
-    profile, points = get_sensor(sensor), simulated_scan(1, sensor).points
+    profile, points = get_sensor(sensor), scanned(1, sensor)
     raw = points[np.isfinite(points).all(axis=1) & (np.linalg.norm(points[:, :3], axis=1) > 1.0)]
     assert with_raw_remission((), raw, profile) == ()
     x, y, z, _ = raw.T
@@ -189,7 +204,7 @@ def test_a_remission_that_follows_from_the_place_is_refused(sensor: str, what: s
 @pytest.mark.parametrize("sensor", ["vlp-16", "hdl-64e", "os1-128"])
 @pytest.mark.parametrize("per_m", [0.004, 0.02, 0.1])
 def test_a_remission_that_falls_with_the_distance_is_a_simulators(sensor: str, per_m: float) -> None:
-    profile, points = get_sensor(sensor), simulated_scan(1, sensor).points
+    profile, points = get_sensor(sensor), scanned(1, sensor)
     raw = points[np.isfinite(points).all(axis=1) & (np.linalg.norm(points[:, :3], axis=1) > 1.0)]
     raw[:, 3] = np.exp(-per_m * np.linalg.norm(raw[:, :3], axis=1))
     (found,) = with_raw_remission([], raw, profile)
@@ -197,6 +212,7 @@ def test_a_remission_that_falls_with_the_distance_is_a_simulators(sensor: str, p
     assert "from the distance: the field holds nothing else" in found
 
 
+@cache
 def rays(sensor: str) -> NDArray[np.float64]:
     """Directions around a sensor, one beam after the other."""
     elevations = get_sensor(sensor).elevations_deg
@@ -204,7 +220,9 @@ def rays(sensor: str) -> NDArray[np.float64]:
         2, -1
     )
     level = np.cos(elevation)
-    return np.column_stack([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)])
+    way = np.column_stack([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)])
+    way.flags.writeable = False
+    return way
 
 
 def room(half_m: float, height_m: float) -> Points:
@@ -271,6 +289,7 @@ def office(sensor: str, seed: int, window: float) -> Points:
     """
     rng = np.random.default_rng(seed)
     way = rays(sensor)
+    across = np.ascontiguousarray(way.T)
     size = np.array([8.5, 6.5, 2.6])
     high = np.array([*(rng.uniform(0.3, 0.7, 2) * size[:2]), 1.6])
     low = high - size
@@ -285,8 +304,8 @@ def office(sensor: str, seed: int, window: float) -> Points:
             corner, extent = rng.uniform(low, high), rng.uniform([0.3, 0.3, 0.4], [1.5, 1.2, 1.8])
             if np.hypot(*corner[:2]) > 2.0:
                 corner[2] = low[2]
-                sides = np.stack([corner / way, (corner + extent) / way])
-                near, far = sides.min(axis=0).max(axis=1), sides.max(axis=0).min(axis=1)
+                sides = corner[:, None] / across, (corner + extent)[:, None] / across
+                near, far = np.minimum(*sides).max(axis=0), np.maximum(*sides).min(axis=0)
                 distance = np.where((near < far) & (near > 0.0), np.minimum(distance, near), distance)
     remission = rng.uniform(0.1, 0.6, len(way))
     return np.column_stack([way * distance[:, None], remission]).astype(np.float32)
@@ -295,19 +314,17 @@ def office(sensor: str, seed: int, window: float) -> Points:
 @pytest.mark.parametrize("sensor", ["hdl-64e", "vlp-16", "os1-64", "pandar64", "os0-64", "hdl-32e"])
 @pytest.mark.parametrize("window", [0.0, 0.4])
 def test_rooms_with_furniture_windows_and_doors(sensor: str, window: float) -> None:
-    for seed in SEEDS:
+    for seed in SEEDS[:2]:
         assert any("a room" in finding for finding in leveled(office(sensor, seed, window), sensor) if finding.gross)
 
 
-@pytest.mark.parametrize("sensor", ["hdl-64e", "os1-64", "pandar64", "os0-64", "vlp-32c"])
-def test_a_garage_of_a_house_is_no_room(sensor: str) -> None:
+@pytest.mark.parametrize("place", [small_garage, furnished_room])
+@pytest.mark.parametrize("sensor", ["os1-64", "os0-64"])
+def test_a_garage_of_a_house_is_no_room(sensor: str, place: Callable[[int, str], SimulatedScan]) -> None:
     """A car fits around the sensor; what stands in a room would be inside it, or the sensor is lower."""
-    garages, rooms = (
-        [[f for f in leveled(place(seed, sensor).points, sensor) if "seems to be" in f] for seed in range(20, 32)]
-        for place in (small_garage, furnished_room)
-    )
-    assert sum(not any(finding.gross for finding in found) for found in garages) >= 11
-    assert sum(any(finding.gross for finding in found) for found in rooms) >= 11
+    for seed in range(20, 27):
+        found = [f for f in leveled(place(seed, sensor).points, sensor) if "seems to be" in f]
+        assert any(finding.gross for finding in found) == (place is furnished_room)
 
 
 @pytest.mark.parametrize(
@@ -375,7 +392,7 @@ def rows_of(points: Points, n: int) -> Points:
     return np.tile(points[row % (64 // n) == 0], (64 // n, 1))
 
 
-@settings(deadline=None, max_examples=40)
+@settings(max_examples=20)
 @given(st.sampled_from(SEEDS), st.floats(-0.5, 0.5), st.floats(-5.0, 5.0), st.floats(-5.0, 5.0))
 def test_ordinary_mountings_are_accepted(seed: int, raised_m: float, pitch_deg: float, roll_deg: float) -> None:
     """Before they are leveled, too."""
@@ -387,7 +404,7 @@ def test_ordinary_mountings_are_accepted(seed: int, raised_m: float, pitch_deg: 
     assert gross(np.column_stack([moved, points[:, 3]])) == []
 
 
-@settings(deadline=None, max_examples=30)
+@settings(max_examples=30)
 @given(st.sampled_from(SEEDS), st.floats(20.0, 60.0), st.integers(1, 3), st.randoms(use_true_random=False))
 def test_crops_and_thinned_scans_are_accepted(seed: int, half_deg: float, every: int, chance: object) -> None:
     points = street(seed)
@@ -417,7 +434,7 @@ def test_spoilt_real_scans_are_refused(kitti_root: Path, fault: str) -> None:
     assert [file.name for file in files if not gross(FAULTS[fault](read_points(file)))] == []
 
 
-@settings(deadline=None, max_examples=30)
+@settings(max_examples=30)
 @given(st.sampled_from(SEEDS), st.floats(0.0, 360.0), st.floats(60.0, 200.0))
 def test_the_frame_of_a_map(seed: int, direction_deg: float, distance_m: float) -> None:
     away = distance_m * np.array([np.cos(np.radians(direction_deg)), np.sin(np.radians(direction_deg)), 0.0, 0.0])
@@ -445,7 +462,7 @@ def test_the_coordinates_of_a_map_as_float32(place: tuple[float, float, float]) 
 def test_high_sensors_are_accepted_with_their_height(sensor: str, height_m: float) -> None:
     """They see little of the ground near by, and objects from above: as high as their beams, in their own frame."""
     profile = replace(get_sensor(sensor), remission_range=(0.0, 1.0), remission=None)
-    for seed in SEEDS:
+    for seed in SEEDS[:2]:
         points = condition(simulated_scan(seed, sensor, mounting=Mounting(height_m, 0.0, 0.0, 0.0)).points, profile)[0]
         frame = ModelFrame(Mounting(height_m, 0.0, 0.0, 0.0))
         assert not any(finding.gross for finding in check_profiles(frame.move(points), PROFILES, profile, frame))
@@ -459,7 +476,7 @@ def test_sensors_that_lean_are_accepted_with_their_tilt(roll_deg: float, pitch_d
     """A part of the beams points higher than that of a level sensor."""
     mounting = Mounting(6.0, roll_deg, pitch_deg, 0.0)
     profile, frame = replace(get_sensor("os1-64"), remission_range=(0.0, 1.0), remission=None), ModelFrame(mounting)
-    for seed in SEEDS:
+    for seed in SEEDS[:2]:
         points = condition(simulated_scan(seed, "os1-64", mounting=mounting).points, profile)[0]
         assert not any(finding.gross for finding in check_profiles(frame.move(points), PROFILES, profile, frame))
 
@@ -475,7 +492,7 @@ TURNED = {
 @pytest.mark.parametrize("sensor", ["vlp-16", "os1-64", "os0-64", "os2-64", "pandarxt-32", "vlp-32c", "pandar64"])
 def test_the_ground_tells_up_from_down(sensor: str, turn: str) -> None:
     """Beams that are as high as low do not."""
-    for seed in SEEDS:
+    for seed in SEEDS[:2]:
         points = street(seed, sensor)
         assert not check_ground(points, near_support, share_below)
         assert any("upside down" in finding for finding in leveled(points * TURNED[turn], sensor) if finding.gross)
@@ -499,7 +516,7 @@ def test_a_sensor_that_looks_up_is_the_right_way_up(seed: int) -> None:
 @pytest.mark.parametrize("sensor", ["pandar64", "os1-64", "vlp-16"])
 def test_an_origin_near_the_road_tells_up_from_down(sensor: str, turn: str) -> None:
     """It sees the road above and below as the same plane; on a bank, there is as much below it as above."""
-    streets = [simulated_scan(seed, sensor).points + np.float32([0.0, 0.0, 1.55, 0.0]) for seed in SEEDS]
+    streets = [scanned(seed, sensor) + np.float32([0.0, 0.0, 1.55, 0.0]) for seed in SEEDS]
     assert not any(check_ground(points, near_support, share_below) for points in streets)
     assert sum(bool(check_ground(points * TURNED[turn], near_support, share_below)) for points in streets) >= 3
 
@@ -510,15 +527,12 @@ def test_a_ceiling_that_shows_more_than_the_floor_is_not_the_ground(seed: int) -
         assert not check_ground(truck_depot(seed, sensor).points, near_support, share_below)
 
 
-@pytest.mark.parametrize("turn", TURNED)
-def test_real_scans_that_are_upside_down_are_refused(kitti_root: Path, turn: str) -> None:
-    files = sorted(kitti_root.glob("training/velodyne/*.bin"))[::12]
-    assert len(files) == 41
-    scans = {file.name: read_points(file) for file in files}
-    assert [name for name, scan in scans.items() if check_ground(scan, near_support, share_below)] == []
-    assert [
-        name for name, scan in scans.items() if not any(f.gross for f in leveled(scan * TURNED[turn], "hdl-64e"))
-    ] == []
+def test_real_scans_that_are_upside_down_are_refused(kitti_root: Path) -> None:
+    for file in sorted(kitti_root.glob("training/velodyne/*.bin"))[::24]:
+        scan = read_points(file)
+        assert not check_ground(scan, near_support, share_below), file.name
+        for turn in TURNED.values():
+            assert any(finding.gross for finding in leveled(scan * turn, "hdl-64e")), file.name
 
 
 @pytest.mark.parametrize("size", [(300.0, 8.0, 5.0), (60.0, 20.0, 4.5), (26.0, 24.0, 3.0), (400.0, 4.0, 6.0)])

@@ -27,7 +27,7 @@ from edgeperc.preprocess.sensor_fit import fit_sensor
 from edgeperc.simulation.samples import simulated_scan
 from edgeperc.types.mounting import MODEL_MOUNTING
 from edgeperc.types.perception import DroppedPoints, Perception
-from edgeperc.types.sensor import SENSORS, SensorProfile, get_sensor
+from edgeperc.types.sensor import SensorProfile, get_sensor
 from scenes import urban
 
 Points = NDArray[np.float32]
@@ -116,14 +116,6 @@ def test_dropped_rows_are_counted_with_those_whose_remission_overflows() -> None
     np.testing.assert_array_equal(scan[1], [5, 0, 0, 1])
 
 
-@pytest.mark.parametrize("sensor", SENSORS.values(), ids=lambda sensor: sensor.name)
-def test_simulated_scans_of_every_sensor_have_returns_only(sensor: SensorProfile) -> None:
-    points = simulated_scan(1, sensor.name).points
-    scan, dropped = returns(points, sensor)
-    assert dropped == DroppedPoints()
-    assert np.shares_memory(scan, points)
-
-
 @pytest.mark.parametrize(
     "box", [(1, 2, 3), "box", ((0, 1), (0, 1)), ((1, 0), (0, 1), (0, 1)), ((0, np.nan), (0, 1), (0, 1)),
             ((0, 101), (0, 1), (0, 1)), (("0", "1"), ("0", "1"), ("0", "1")), ((0, 1), (0,), (0, 1))]
@@ -161,11 +153,7 @@ def alone(street: Points) -> Perception:
 
 EMPTY: dict[str, Callable[[], Points]] = {
     "on one ray": lambda: on_a_ray(4400, 0.001, 0.45),
-    "zeros": lambda: np.zeros((20_000, 4), np.float32),
-    "negative zeros": lambda: np.full((20_000, 4), -0.0, np.float32),
     "zeros with a remission": lambda: np.float32([0, 0, 0, 200]) * np.ones((20_000, 1), np.float32),
-    "noise": lambda: np.random.default_rng(1).normal(0.0, 1e-6, (20_000, 4)).astype(np.float32),
-    "at the nearest range": lambda: on_a_ray(4400, 0.5, 0.5),
     "mixed": lambda: np.vstack([np.zeros((900, 4)), np.full((900, 4), np.nan), on_a_ray(900, 0.1, 0.4)]).astype("f4"),
 }
 
@@ -307,14 +295,14 @@ def beside(seed: int) -> Points:
 
 @pytest.fixture(scope="module")
 def drive() -> list[Points]:
-    """Twelve places."""
-    return [urban(seed).points for seed in range(12)]
+    """Ten places."""
+    return [urban(seed).points for seed in range(10)]
 
 
 def test_the_own_roof_is_suggested_and_nothing_else(drive: list[Points]) -> None:
     hdl = get_sensor("hdl-64e")
     none = suggest_ego_box(drive, hdl, MODEL_MOUNTING)
-    assert (none.box, none.n_places) == (None, 12)
+    assert (none.box, none.n_places) == (None, 10)
     found = suggest_ego_box([np.vstack([p, roof(k)]) for k, p in enumerate(drive)], hdl, MODEL_MOUNTING)
     assert found.box is not None
     wanted = ((-1.2, 1.5), (-1.2, 1.2), (-0.9, -0.4))
@@ -333,14 +321,14 @@ def test_a_traffic_jam_gives_no_suggestion(drive: list[Points]) -> None:
     rng = np.random.default_rng(0)
     standing = [
         np.vstack([drive[0] + rng.normal(0.0, 0.01, drive[0].shape).astype(np.float32), roof(k), beside(k)])
-        for k in range(40)
+        for k in range(15)
     ]
-    with pytest.raises(SensorError, match="in 1 different places in these 40 scans"):
+    with pytest.raises(SensorError, match="in 1 different places in these 15 scans"):
         suggest_ego_box(standing, get_sensor("hdl-64e"), MODEL_MOUNTING)
 
 
 @pytest.mark.parametrize(
-    ("first", "last", "step", "n_places"), [(176, 252, 1, None), (0, 152, 4, 10)], ids=["jam", "drive"]
+    ("first", "last", "step", "n_places"), [(176, 252, 4, None), (0, 152, 10, 10)], ids=["jam", "drive"]
 )
 def test_real_drives(kitti_root: Path, first: int, last: int, step: int, n_places: int | None) -> None:
     files = [kitti_root / "training" / "velodyne" / f"{k:06d}.bin" for k in range(first, last + 1, step)]

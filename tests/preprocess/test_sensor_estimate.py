@@ -62,8 +62,13 @@ def test_votes_are_those_of_the_twin(n: int) -> None:
     np.testing.assert_array_equal(found, votes(flat.tolist(), z.tolist(), offsets_m.tolist(), 0.9, 500))
 
 
-@pytest.mark.parametrize("name", [name for name, profile in SENSORS.items() if profile.pattern is None])
-@pytest.mark.parametrize("order", ["as simulated", "shuffled"])
+SPINNING = [name for name, profile in SENSORS.items() if profile.pattern is None]
+SHUFFLED = ("vlp-16", "hdl-64e", "pandar64", "os0-32", "os1-128", "vlp-32c")
+
+
+@pytest.mark.parametrize(
+    ("name", "order"), [*((name, "as simulated") for name in SPINNING), *((name, "shuffled") for name in SHUFFLED)]
+)
 def test_built_in_sensors_are_found(name: str, order: str) -> None:
     sensor = replace(SENSORS[name], remission_range=(0.0, 1.0))
     scan = simulated_scan(FIRST_SEED, name).points
@@ -73,7 +78,7 @@ def test_built_in_sensors_are_found(name: str, order: str) -> None:
         found = estimate_sensor([scan])
     except SensorError:
         assert order == "shuffled"
-        assert name in ("os0-32", "os0-64", "os0-128")  # see few points above, which no order parts
+        assert name == "os0-32"  # sees few points above, which no order parts
         return
     assert found.is_built_in
     assert found.profile == sensor
@@ -85,7 +90,7 @@ def test_the_built_in_profile_itself_is_used() -> None:
     assert estimate_sensor([simulated_scan(FIRST_SEED + 1).points]).profile is SENSORS["hdl-64e"]
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=15)
 @given(
     gaps_deg=st.lists(st.floats(0.3, 3.0), min_size=7, max_size=47),
     top_deg=st.floats(-2.0, 20.0),
@@ -251,8 +256,7 @@ MISTAKES = {
 }
 
 
-@pytest.mark.parametrize("name", MISTAKES)
-@pytest.mark.parametrize("sensor", ["hdl-64e", "vlp-32c", "os1-64"])
+@pytest.mark.parametrize(("name", "sensor"), [*zip(MISTAKES, ("hdl-64e", "vlp-32c", "os1-64"), strict=True)])
 def test_a_mistake_in_the_coordinates_is_named(name: str, sensor: str) -> None:
     """It explains why there are no beams; the scan is of no sensor that does not spin."""
     scan = simulated_scan(FIRST_SEED + 2, sensor).points + np.array(MISTAKES[name])
@@ -269,7 +273,7 @@ def test_another_unit_is_named(unit: str, factor: float) -> None:
 
 @pytest.mark.parametrize("axes", [((1, -1), (2, -1), (0, 1)), ((1, -1), (2, 1), (0, 1)), ((2, 1), (0, 1), (1, 1))])
 def test_other_axes_are_named(axes: tuple[tuple[int, int], ...]) -> None:
-    points = simulated_scan(FIRST_SEED + 2, "hdl-64e").points
+    points = simulated_scan(FIRST_SEED + 2, "os0-32").points
     scan = np.column_stack([*(sign * points[:, axis] for axis, sign in axes), points[:, 3]])
     with pytest.raises(SensorError, match=f"{CANNOT_TELL}. The ground seems to lie towards .[xy].*the axes are not"):
         estimate_sensor([scan.astype(np.float32)])
@@ -325,7 +329,7 @@ def test_semantickitti_is_the_built_in_profile(semantickitti_root: Path) -> None
         ("pandaset/sensor/velodyne/000000.bin", "beamless"),  # about the vehicle, not the sensor
     ],
 )
-@pytest.mark.parametrize("turn_deg", [0.0, 75.0, -140.0])
+@pytest.mark.parametrize("turn_deg", [0.0, -140.0])
 def test_real_scans(path: str, name: str, turn_deg: float, data_root: Callable[[str], Path]) -> None:
     if path.startswith("velodyne/"):
         pytest.importorskip("velodyne_decoder")

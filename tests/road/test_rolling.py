@@ -277,7 +277,7 @@ def footprint(at: NDArray[np.float64], box: Box, grid: RollingGrid, margin_m: fl
     return (np.abs(ahead[0] * dx + ahead[1] * dy) <= length) & (np.abs(ahead[0] * dy - ahead[1] * dx) <= width)
 
 
-@pytest.mark.parametrize("seed", [3, 7, 11])
+@pytest.mark.parametrize("seed", [3, 7])
 def test_a_drive_through_traffic(seed: int) -> None:
     """Simulated scans with the true boxes: the grid knows more than a scan, and keeps hardly anything of what moved."""
     grid, naive = rolling(size_m=40.0), rolling(size_m=40.0, classes=())

@@ -218,7 +218,7 @@ def test_drivable_cells_are_those_of_the_twin() -> None:
     for seed, tilt in ((0, 0.0), (5, 0.05)):
         scene = random_scene(seed)
         pose = sensor_pose(scene, SMALL, 2.0, -1.0, yaw=0.3, pitch=tilt, roll=tilt)
-        scan = replace(simulate(scene, SMALL, 0, pose), boxes=())
+        scan = replace(simulate(scene, SensorProfile("one", (-10.0,), 1), 0, pose), boxes=())
         for view in (
             TopViewGeometry(cell_m=0.4),
             TopViewGeometry(x_range_m=(0.0, 1.0), y_range_m=(-1.0, 1.0), cell_m=1.0),
@@ -264,7 +264,7 @@ def test_neighbors_meet_the_same_leaves_where_they_are_clumped() -> None:
 def test_points_are_those_of_the_twin(seed: int, noise: bool) -> None:
     scene = random_scene(seed, ("urban", "residential")[seed % 2])
     rng = np.random.default_rng(seed)
-    around = SensorProfile.uniform("around", 32, 15.0, -24.0, columns=120)
+    around = SensorProfile.uniform("around", 32, 15.0, -24.0, columns=60)
     pose = sensor_pose(scene, around, 1.0, 0.2, yaw=0.1, pitch=0.01, roll=-0.01)
     for sensor, reach in ((around, 80.0), (SensorProfile("one", (-10.0,), 1), 80.0), (SMALL, 1.0)):
         azimuths = np.arange(0.0, 2 * np.pi, 2 * np.pi / sensor.columns)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from shapely import LinearRing, LineString, Point, Polygon, box, union_all
+from shapely import LinearRing, LineString, Point, Polygon, box, coverage_union_all
 
 
 def grown(cells: np.ndarray, radius: float) -> np.ndarray:
@@ -94,11 +94,16 @@ def needed(rings: list[Any], addable: np.ndarray, removable: np.ndarray, outer: 
     return rings
 
 
+def doubled_area(a: Any, b: Any, c: Any) -> Any:
+    return abs((b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0]))
+
+
 def merged(ring: Any, edges: np.ndarray, changeable: np.ndarray, around: np.ndarray, enough: int) -> list[Any]:
     """Twin of `edgeperc.road.outline.merge_corners`: the same order, shapely's geometry; a ring of tuples."""
     ring, limit, tried = list(ring), 8, {}
     (height, width), others = changeable.shape, [LineString([edge[:2], edge[2:]]) for edge in edges]
-    fixed = union_all([box(row, col, row + 1, col + 1) for row, col in np.argwhere(~changeable).tolist()])
+    row, col = np.nonzero(~changeable)
+    fixed = coverage_union_all(box(row, col, row + 1, col + 1))
     while limit <= 8 * height * width:
         changed, k = False, 0
         while k < len(ring):
@@ -115,12 +120,12 @@ def merged(ring: Any, edges: np.ndarray, changeable: np.ndarray, around: np.ndar
                 for row in range(max(0, min(b[0], c[0]) - around), min(height, max(b[0], c[0]) + around) + 1)
                 for col in range(max(0, min(b[1], c[1]) - around), min(width, max(b[1], c[1]) + around) + 1)
             ]
-            areas = {p: sum(2.0 * Polygon([p, *side]).area for side in ((a, b), (b, c), (c, d))) for p in places}
+            areas = {p: sum(doubled_area(p, *side) for side in ((a, b), (b, c), (c, d))) for p in places}
             best = None
             for p in sorted((p for p in places if areas[p] <= limit), key=lambda p: (areas[p], p)):
                 triangles = [Polygon([p, *side]) for side in ((a, b), (b, c), (c, d))]
                 new = [LineString([a, p]), LineString([p, d])]
-                if Polygon([a, p, d]).area == 0 or any(each.intersection(fixed).area > 1e-9 for each in triangles):
+                if doubled_area(a, p, d) == 0 or any(each.intersection(fixed).area > 1e-9 for each in triangles):
                     continue
                 around_p = [
                     (row, col)

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
@@ -297,11 +297,10 @@ def check_against_twin(points: np.ndarray, step: int, beam_step: int, view: Any)
 
 @pytest.mark.parametrize(("step", "beam_step"), [(1, 1), (7, 2)])
 def test_scan_sums_agree_with_the_twin_on_a_street(step: int, beam_step: int) -> None:
-    tenth = replace(get_sensor("hdl-64e"), columns=180)  # interpreted, a whole scan takes half a minute to simulate
+    tenth = replace(get_sensor("vlp-16"), columns=180)  # interpreted, a whole scan takes long to simulate
     check_against_twin(urban(5, tenth).points.copy(), step, beam_step, (-0.5, 0.5))
 
 
-@settings(deadline=None, max_examples=200)
 @given(
     hnp.arrays(
         np.float32,
@@ -322,20 +321,20 @@ def test_scan_sums_agree_with_the_twin_on_random_scans(points: np.ndarray, step:
 @pytest.fixture(scope="module")
 def kitti_scans(kitti_root: Path) -> tuple[list[dict[str, Any]], list[np.ndarray]]:
     with (kitti_root / "frames.csv").open() as file:
-        frames = list(csv.DictReader(file))
+        frames = list(csv.DictReader(file))[::2]
     return frames, [read_points(kitti_root / "training" / "velodyne" / f"{frame['name']}.bin") for frame in frames]
 
 
 @pytest.fixture(scope="module")
 def kitti_profile(kitti_scans: tuple[list[dict[str, Any]], list[np.ndarray]]) -> FitnessProfile:
-    return FitnessProfile.from_scans(kitti_scans[1][:154:10] + kitti_scans[1][254:307:8])
+    return FitnessProfile.from_scans(kitti_scans[1][:77:5] + kitti_scans[1][127:154:4])
 
 
 def test_every_kitti_scan_passes(
     kitti_scans: tuple[list[dict[str, Any]], list[np.ndarray]], kitti_profile: FitnessProfile, semantickitti_root: Path
 ) -> None:
     frames, scans = kitti_scans
-    assert len(scans) == 314
+    assert len(scans) == 157
     found = {
         frame["name"]: findings
         for frame, scan in zip(frames, scans, strict=True)
@@ -373,7 +372,7 @@ def test_corrupted_kitti_scans_are_reported(
     kitti_scans: tuple[list[dict[str, Any]], list[np.ndarray]], kitti_profile: FitnessProfile, fault: str
 ) -> None:
     spoil, expected_text = FAULTS[fault]
-    for frame, scan in list(zip(*kitti_scans, strict=True))[:307:9]:
+    for frame, scan in list(zip(*kitti_scans, strict=True))[:154:5]:
         findings = check_fitness(np.ascontiguousarray(spoil(scan)), kitti_profile, SENSOR)
         expected = "another height|not the sensor" if fault == "ground at zero" else expected_text
         assert re.search(expected, " ".join(findings)), (frame["name"], findings)
