@@ -29,8 +29,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _run(typed: list[str]) -> int:
     command_line = shlex.join(["edgeperc-bench", *typed])
     arguments = build_parser().parse_args(typed, argparse.Namespace(command_line=command_line))
-    code: int = arguments.run(arguments)
-    return code
+    return arguments.run(arguments)
 
 
 def with_command(typed: Sequence[str]) -> list[str]:

@@ -58,14 +58,6 @@ def kitti(folder: Path, n: int) -> list[Scan]:
     return [read_points(path) for path in whole[:: max(1, len(whole) // n)][:n]]
 
 
-def normal_of(scans: Iterable[Scan], sensor: SensorProfile) -> Normal:
-    """What a perceiver has learned after scans of clear air."""
-    normal = Normal()
-    for scan in scans:
-        normal = check_health(condition(scan, sensor)[0], sensor, normal)[1]
-    return normal
-
-
 def warned(health: SensorHealth) -> tuple[bool, bool, bool, bool]:
     """Whether of a blocked window, of drops, of a cloud, of fog."""
     return bool(health.blocked_deg), health.has_drops, health.has_cloud, health.has_fog
@@ -79,11 +71,13 @@ def print_warnings(name: str, scans: Sequence[Scan], sensor: SensorProfile) -> N
         for strength in strengths:
             first, later = [], []
             for k, scan in enumerate(scans):
-                # What is normal, other places have shown.
-                others = [scans[(k + 7 * (1 + j)) % len(scans)] for j in range(NORMAL_SCANS)]
+                normal = Normal()
+                for j in range(NORMAL_SCANS):  # other places in clear air
+                    other = condition(scans[(k + 7 * (1 + j)) % len(scans)], sensor)[0]
+                    normal = check_health(other, sensor, normal)[1]
                 bad = condition(apply(scan, strength, k), sensor)[0]
                 first.append(warned(check_health(bad, sensor, Normal())[0]))
-                later.append(warned(check_health(bad, sensor, normal_of(others, sensor))[0]))
+                later.append(warned(check_health(bad, sensor, normal)[0]))
             shares = [np.any(first, axis=1).mean(), np.any(later, axis=1).mean(), *np.mean(later, axis=0)]
             print(_row(kind, strength, unit, [f"{share:.0%}" for share in shares]), flush=True)
 
@@ -146,7 +140,6 @@ def _row(kind: str, strength: float, unit: str, cells: Iterable[str]) -> str:
 
 
 def main() -> None:
-    """Print the tables."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n\n", 1)[0])
     parser.add_argument("kitti", type=Path, nargs="?")
     parser.add_argument("--scans", type=int, default=40)

@@ -17,9 +17,8 @@ BLUE = "#3b6ea8"
 
 def pictures(document: Mapping[str, Any]) -> list[str]:
     """A figure for each setting of a run, as ``<svg>``: histograms, stages, and the samples over time."""
-    return [
-        _picture(setting) for setting in document["settings"] if document["kind"] == "run" and scenario_names(setting)
-    ]
+    settings = document["settings"] if document["kind"] == "run" else []
+    return [_picture(setting) for setting in settings if scenario_names(setting)]
 
 
 def _picture(setting: Mapping[str, Any]) -> str:

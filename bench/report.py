@@ -57,13 +57,10 @@ def _setting(setting: Mapping[str, Any]) -> list[Section]:
     parts: list[Section] = []
     if names:
         head = ["scenario", "scans", *QUANTILES, "noise", "CPU s/scan", "cores", "RSS MB"]
-        rows = [
-            [
-                *(name, f"{t['n']:,}", *(number(t[q]) for q in QUANTILES), share(t["noise"])),
-                *(number(t["cpu_s_per_scan"], 4), number(t["cores"]), number(t["rss_mb"], 0)),
-            ]
-            for name, t in figures.items()
-        ]
+        rows = []
+        for name, t in figures.items():
+            costs = number(t["cpu_s_per_scan"], 4), number(t["cores"]), number(t["rss_mb"], 0)
+            rows.append([name, f"{t['n']:,}", *(number(t[q]) for q in QUANTILES), share(t["noise"]), *costs])
         n = len(setting["repeats"])
         sentences = [
             f"from scan to result in ms; {n} repeat{'s' * (n != 1)}, each in a fresh process; a dash: too few samples "
@@ -96,13 +93,10 @@ def _setting(setting: Mapping[str, Any]) -> list[Section]:
         parts += [_stages(setting, names), _starts(setting)]
     if setting.get("offline"):
         head = ["processes", "threads each", "scans/s", "seconds", "scans", "CPU s/scan"]
-        rows = [
-            [
-                *(str(o["processes"]), str(o["n_threads"]), number(o["scans_per_s"]), number(o["seconds"], 1)),
-                *(f"{o['n_scans']:,}", number(o["cpu_s_per_scan"], 4)),
-            ]
-            for o in setting["offline"]
-        ]
+        rows = []
+        for o in setting["offline"]:
+            rate = number(o["scans_per_s"]), number(o["seconds"], 1), f"{o['n_scans']:,}"
+            rows.append([str(o["processes"]), str(o["n_threads"]), *rate, number(o["cpu_s_per_scan"], 4)])
         sentences = ["several concurrent processes, each back to back; counted while all of them run"]
         parts.append(Section("Offline", sentences, [head, *rows]))
     if setting.get("cold_start"):
@@ -142,12 +136,9 @@ def _starts(setting: Mapping[str, Any]) -> Section:
     rows = [["repeat", "construct s", "first call ms", "warm-up scans", "warm-up p50 ms", "peak RSS MB", "scans MB"]]
     for k, repeat in enumerate(setting["repeats"], start=1):
         warm = [ms for scenario in repeat["scenarios"].values() for ms in scenario["warm_up_ms"]]
-        rows.append(
-            [
-                *(str(k), number(repeat["construct_s"], 3), number(repeat["first_call_ms"]), f"{len(warm):,}"),
-                *(number(percentile(warm, 50.0)), number(repeat["peak_rss_mb"], 0), number(repeat["scans_mb"], 0)),
-            ]
-        )
+        start = number(repeat["construct_s"], 3), number(repeat["first_call_ms"])
+        memory = number(repeat["peak_rss_mb"], 0), number(repeat["scans_mb"], 0)
+        rows.append([str(k), *start, f"{len(warm):,}", number(percentile(warm, 50.0)), *memory])
     return Section("Start and warm-up", ["not part of the figures above"], rows)
 
 
@@ -179,18 +170,11 @@ def _matrix(document: Mapping[str, Any]) -> Section:
     for setting in document["settings"]:
         for name in scenario_names(setting):
             t, accuracy = latency(setting, name), setting["accuracy"]
-            equal = [
-                accuracy["agreement"][kind]["equal"] for kind in ("points", "cells") if accuracy["agreement"][kind]
-            ]
+            same = [part["equal"] for kind in ("points", "cells") if (part := accuracy["agreement"][kind])]
             peaks = [repeat["peak_rss_mb"] or math.nan for repeat in setting["repeats"]]
-            rows.append(
-                [
-                    *("+".join(setting["models"]), setting_label(setting)),
-                    *(number(t["p50"]), number(t["p90"]), number(t["p99"]), share(t["noise"])),
-                    *(number(t["cpu_s_per_scan"], 4), number(max(peaks), 0), share(min(equal, default=None))),
-                    "yes" if accuracy["agrees"] else "no",
-                ]
-            )
+            times = *(number(t[q]) for q in ("p50", "p90", "p99")), share(t["noise"]), number(t["cpu_s_per_scan"], 4)
+            end = number(max(peaks), 0), share(min(same, default=None)), "yes" if accuracy["agrees"] else "no"
+            rows.append(["+".join(setting["models"]), setting_label(setting), *times, *end])
     sentences = [f"skipped: {sentence}" for sentence in document["skipped"]]
     sentences += [f"recommended for {sentence['name']}: {sentence['text']}" for sentence in document["recommended"]]
     return Section("Settings, back to back, ms", sentences, rows if len(rows) > 1 else [])

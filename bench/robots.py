@@ -60,11 +60,8 @@ def scan_of(seed: int, sensor: SensorProfile, height_m: float, place: str) -> Si
     if place == "slope":
         terrain, roll = scene.terrain.copy(), math.radians(SLOPE_DEG)
         terrain[SLOPE_Y] += math.tan(roll)
-        rise = [math.tan(roll) * each.center[1] for each in scene.objects]
-        objects = [
-            replace(each, center=(*each.center[:2], each.center[2] + z))
-            for each, z in zip(scene.objects, rise, strict=True)
-        ]
+        risen = [(x, y, z + math.tan(roll) * y) for x, y, z in (each.center for each in scene.objects)]
+        objects = [replace(each, center=center) for each, center in zip(scene.objects, risen, strict=True)]
         primitives, fixed = scene.primitives.copy(), scene.primitives[:, 19] < 0
         primitives[fixed, 6] += math.tan(roll) * primitives[fixed, 5]
         scene = replace(scene, terrain=terrain, objects=tuple(objects), primitives=primitives)
@@ -143,7 +140,6 @@ def rows_of(name: str, height_m: float, place: str, n_scans: int) -> list[str]:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Print a table."""
     parser = argparse.ArgumentParser("edgeperc_bench.robots", description=(__doc__ or "").partition("\n\n")[0])
     parser.add_argument("--scans", type=int, default=12, metavar="N", help="streets (default: 12)")
     parser.add_argument("--sensors", nargs="+", default=[*SENSORS], metavar="NAME")

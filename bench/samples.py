@@ -122,7 +122,7 @@ def trend(x: ArrayLike, y: ArrayLike) -> Trend:
     left = values - values.mean() - slope * centered
     squares = float(left @ left)
     correlation = min(max(float(left[1:] @ left[:-1]) / squares, 0.0), 0.99) if squares > 0.0 else 0.0
-    n_free = max(len(t) * (1.0 - correlation) / (1.0 + correlation) - 2.0, 1.0)
+    n_free = max(len(t) * (1.0 - correlation) / (1.0 + correlation) - 2.0, 1.0)  # neighbors are not independent
     error = 1.96 * math.sqrt(squares / n_free / spread)
     explained = 1.0 - squares / variance if variance > 0.0 else math.nan
     return Trend(slope, error, float(values.mean() - slope * t.mean()), explained)

@@ -131,7 +131,6 @@ def time_turn(name: str, n_turns: int) -> str:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Print a table."""
     parser = argparse.ArgumentParser("edgeperc_bench.solid_state", description=(__doc__ or "").partition("\n\n")[0])
     parser.add_argument("--scans", type=int, default=24, metavar="N", help="streets (default: 24)")
     parser.add_argument("--sensors", nargs="*", default=["mid-360", "mid-360-hanging"], metavar="NAME")

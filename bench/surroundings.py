@@ -64,16 +64,14 @@ def print_set(name: str, sensor: SensorProfile, scans: list[tuple[Points, Bytes]
             for place, where in places.items():
                 counted, road = where & grid.observed & (cells != IGNORE), cells == 1
                 found = grid.drivable
-                counts[place] += [
-                    np.count_nonzero(counted & part) for part in (found & road, found & ~road, road & ~found)
-                ]
+                parts = found & road, found & ~road, road & ~found
+                counts[place] += [np.count_nonzero(counted & part) for part in parts]
         for place, (hits, false, missed) in counts.items():
             shares = (hits / max(hits + false, 1), hits / max(hits + missed, 1), hits / max(hits + false + missed, 1))
             print(f"| {name} | {models} | {place} | " + " | ".join(f"{100.0 * share:.1f}" for share in shares) + " |")
 
 
 def main() -> None:
-    """Print the table."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n\n", 1)[0])
     parser.add_argument("sets", nargs="*", type=ScanFolder.parse, metavar="SET")
     sets = parser.parse_args().sets

@@ -7,6 +7,7 @@ parent.
 
 from __future__ import annotations
 
+import json
 import multiprocessing
 import signal
 import time
@@ -193,7 +194,7 @@ class _Watch:
         return {
             "rate_hz": self.scenario.rate_hz,
             "limits": asdict(self.scenario.limits),
-            **_rounded(asdict(timings)),
+            **json.loads(json.dumps(asdict(timings)), parse_float=lambda text: round(float(text), 6)),
             "wall_s": wall_s,
             "cpu_s": cpu_s,
             "rss_mb": [list(each) for each in self.rss],
@@ -202,14 +203,6 @@ class _Watch:
             "after": conditions(),
             "interrupted": self.stopped,
         }
-
-
-def _rounded(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _rounded(inner) for key, inner in value.items()}
-    if isinstance(value, list):
-        return [_rounded(inner) for inner in value]
-    return round(value, 6) if isinstance(value, float) else value
 
 
 @contextmanager

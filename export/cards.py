@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any, TypeVar
+from dataclasses import dataclass, replace
+from typing import Any, Generic, TypeVar, cast
 
 from edgeperc.objects.boxes import OBJECT_SIZE_M
 from edgeperc.objects.crops import FEATURES
@@ -16,10 +16,17 @@ from edgeperc.types.views import CameraGeometry, ObjectGeometry, RangeImageGeome
 
 from .recipe import EDGE_BLOCKS, Recipe
 
+
+def _with_channel(spec: InputSpec, name: str, mean: float, std: float) -> InputSpec:
+    return replace(spec, channels=(*spec.channels, name), mean=(*spec.mean, mean), std=(*spec.std, std))
+
+
 ROAD_CLASSES = TOP_VIEW_CLASSES[:2]
 """LoDNN's classes; the ground under a vehicle is background."""
 
 OBJECT_CLASSES = ("background", *VEHICLES, "pedestrian", "cyclist")
+BOX_SIZES = {name: OBJECT_SIZE_M[name] for name in OBJECT_CLASSES[1:]}
+"""Usual length, width and height [m] of objects, from which the object network's sizes start."""
 
 TOP_VIEW = TopViewGeometry()
 OBJECT_VIEW = ObjectGeometry(n_points=48)
@@ -34,19 +41,9 @@ RANGE_IMAGE_INPUT = InputSpec(
     (11.35, 7.86, 0.82, 0.148, 12.27),
 )
 # With the height above the ground: mean and standard deviation of 718,139 returns ahead in 26 training scans.
-HEIGHT_INPUT = InputSpec(
-    "range_image",
-    (*RANGE_IMAGE_INPUT.channels, "height_above_ground"),
-    (*RANGE_IMAGE_INPUT.mean, 0.41),
-    (*RANGE_IMAGE_INPUT.std, 0.72),
-)
+HEIGHT_INPUT = _with_channel(RANGE_IMAGE_INPUT, "height_above_ground", 0.41, 0.72)
 # With the curvature: rounded, of 789,768 returns ahead in training scans.
-CURVED_INPUT = InputSpec(
-    "range_image",
-    (*HEIGHT_INPUT.channels, "curvature"),
-    (*HEIGHT_INPUT.mean, 0.2),
-    (*HEIGHT_INPUT.std, 0.24),
-)
+CURVED_INPUT = _with_channel(HEIGHT_INPUT, "curvature", 0.2, 0.24)
 
 # Means and standard deviations, rounded, of the features of 30,000 training samples.
 OBJECT_INPUT = InputSpec(
@@ -73,7 +70,7 @@ def card_of(recipe: Recipe, **facts: Any) -> ModelCard:
         view, input, outputs = OBJECT_VIEW, OBJECT_INPUT, [OutputSpec("objects", "objects")]
         classes = OBJECT_CLASSES
         # On the folds, the F1 of cars is 0.79 with 0.5 and 0.65 with 0.3; AP is the same.
-        facts = {"score_threshold": 0.5, "box_classes": classes[1:], "box_size_priors": box_sizes(), **facts}
+        facts = {"score_threshold": 0.5, "box_classes": classes[1:], "box_size_priors": BOX_SIZES, **facts}
     elif recipe.task == "camera":
         view = CameraGeometry(recipe.image_width, recipe.image_height)
         input = CAMERA_INPUT if recipe.network == "camseg" else PLAIN_CAMERA_INPUT
@@ -101,16 +98,12 @@ def card_of(recipe: Recipe, **facts: Any) -> ModelCard:
     return ModelCard(view=view, input=input, outputs=tuple(outputs), classes=classes, **facts)
 
 
-def box_sizes() -> dict[str, tuple[float, float, float]]:
-    """Usual length, width and height [m] of the classes of objects, from which the object network's sizes start."""
-    return {name: OBJECT_SIZE_M[name] for name in OBJECT_CLASSES[1:]}
-
-
-_T = TypeVar("_T", bound="Carded")
+_View = TypeVar("_View")
+_T = TypeVar("_T", bound="Carded[Any]")
 
 
 @dataclass(frozen=True)
-class Carded:
+class Carded(Generic[_View]):
     """What the task of every network has."""
 
     recipe: Recipe
@@ -120,6 +113,11 @@ class Carded:
     def of(cls: type[_T], recipe: Recipe) -> _T:
         """The task of a recipe."""
         return cls(recipe, card_of(recipe, version="0"))
+
+    @property
+    def view(self) -> _View:
+        """What the network sees."""
+        return cast("_View", self.card.view)
 
     @property
     def input(self) -> InputSpec:

@@ -29,14 +29,6 @@ EDGE_BLOCKS: Mapping[str, tuple[int, int]] = {"pointseg": (2, 4), "ssadnet": (4,
 """Rows and columns of the blocks of pixels that they label at once."""
 
 
-def task_name(network: str) -> str:
-    """The key of `TASKS` that a network belongs to."""
-    for task, networks in TASKS.items():
-        if network in networks:
-            return task
-    raise ValueError(f"network is {network!r}; expected {', '.join(NETWORKS[:-1])} or {NETWORKS[-1]}")
-
-
 def _option(
     default: Any, text: str, networks: tuple[str, ...] = NETWORKS, *, edge: bool = True, choices: tuple[str, ...] = ()
 ) -> Any:
@@ -187,7 +179,10 @@ class Recipe:
     @property
     def task(self) -> str:
         """The key of `TASKS` that the network belongs to."""
-        return task_name(self.network)
+        for task, networks in TASKS.items():
+            if self.network in networks:
+                return task
+        raise ValueError(f"network is {self.network!r}; expected {', '.join(NETWORKS[:-1])} or {NETWORKS[-1]}")
 
 
 PLAIN: Mapping[str, Any] = {
@@ -382,6 +377,11 @@ CURVED = replace(
     redraw_every=0,
 )
 
+LAST = replace(CURVED, simulated_share=0.8, steps=1000)
+
+SENSORS_AND_HALLS = ("sensors", "halls")
+_open = partial(Stage, is_open=True, also=("six-sensors",))
+
 MODELS = {
     "pointseg-sim": Stage(Recipe("pointseg", simulated_share=1.0, steps=1000, learning_rate=2e-3, cooldown=0.3)),
     "pointseg-full": Stage(Recipe("pointseg", steps=3600, batch=4, learning_rate=1e-3), after="pointseg-sim"),
@@ -428,50 +428,28 @@ MODELS = {
     "camseg": Stage(CAMSEG),
     # The object network sees points, not beams: with scans of other sensors it learns how sparse an object may be.
     # Without halls it took walls, beams and pipes for trucks.
-    "objects-start": Stage(OBJECTS, also=("sensors", "halls")),
-    "objects": Stage(SECOND_LOOK, after="objects-start", also=("sensors", "halls")),
-    "ssadnet-open": Stage(
-        replace(OPEN, network="ssadnet", height_above_ground=False, front=True, n_pasted=3.0),
-        is_open=True,
-        also=("sensors",),
+    "objects-start": Stage(OBJECTS, also=SENSORS_AND_HALLS),
+    "objects": Stage(SECOND_LOOK, after="objects-start", also=SENSORS_AND_HALLS),
+    "ssadnet-open": _open(
+        replace(OPEN, network="ssadnet", height_above_ground=False, front=True, n_pasted=3.0), also=("sensors",)
     ),
-    "objects-open-start": Stage(
-        replace(OBJECTS, steps=16_000, detector=False), is_open=True, also=("sensors", "halls")
+    "objects-open-start": _open(replace(OBJECTS, steps=16_000, detector=False), also=SENSORS_AND_HALLS),
+    "objects-open": _open(
+        replace(SECOND_LOOK, steps=10_000, detector=False), after="objects-open-start", also=SENSORS_AND_HALLS
     ),
-    "objects-open": Stage(
-        replace(SECOND_LOOK, steps=10_000, detector=False),
-        after="objects-open-start",
-        is_open=True,
-        also=("sensors", "halls"),
-    ),
-    "four-classes-start": Stage(OPEN_POINTS, is_open=True, also=("six-sensors",)),
-    "scene-start": Stage(SCENE, after="four-classes-start", is_open=True, also=("sensors",)),
-    "sceneseg-start": Stage(
+    "four-classes-start": _open(OPEN_POINTS),
+    "scene-start": _open(SCENE, after="four-classes-start", also=("sensors",)),
+    "sceneseg-start": _open(
         replace(SCENE, steps=10_800, batch=32, reuse=8, ema=0.999, beams=0.3, cooldown=0.5, redraw_every=4000),
         after="scene-start",
-        is_open=True,
-        also=("six-sensors",),
     ),
-    "curved-start": Stage(CURVED, after="sceneseg-start", is_open=True, also=("six-sensors",)),
+    "curved-start": _open(CURVED, after="sceneseg-start"),
     # 400,000 samples with the curvature, in eight minutes on a GPU, and then some on a processor in float32: cars, with
     # 79 % on SemanticKITTI, have 87 again, of 89 before.
-    "long-start": Stage(
-        replace(
-            CURVED,
-            simulated_share=0.8,
-            steps=12_426,
-            batch=32,
-            reuse=6,
-            learning_rate=2e-3,
-            ema=0.999,
-            redraw_every=4000,
-        ),
+    "long-start": _open(
+        replace(LAST, steps=12_426, batch=32, reuse=6, learning_rate=2e-3, ema=0.999, redraw_every=4000),
         after="curved-start",
-        is_open=True,
-        also=("six-sensors",),
     ),
-    "sceneseg": Stage(
-        replace(CURVED, simulated_share=0.8, steps=1000), after="long-start", is_open=True, also=("six-sensors",)
-    ),
+    "sceneseg": _open(LAST, after="long-start"),
 }
 """The training run of every model, by name; names that end in ``-start`` are intermediate results."""

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator, Mapping
+import tempfile
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
 
 
 @contextmanager
-def new_document(kind: str, arguments: argparse.Namespace) -> Iterator[tuple[dict[str, Any], LiveTable]]:
+def new_document(kind: str, arguments: argparse.Namespace) -> Iterator[tuple[dict[str, Any], LiveTable, Path]]:
     """Start an empty report. Its content is printed and written at the end, even after an interruption."""
     html = getattr(arguments, "html", None)  # not every command has a page
     if html:
@@ -52,24 +53,20 @@ def new_document(kind: str, arguments: argparse.Namespace) -> Iterator[tuple[dic
     for disturbance in document["disturbances"]:
         live.note(disturbance)
     try:
-        yield document, live
+        with tempfile.TemporaryDirectory() as folder:
+            yield document, live, Path(folder)
         document["complete"] = True
     finally:
         live.clear()
         if any(setting["repeats"] for setting in document["settings"]) or document["tables"]:
-            _write(document, arguments.json, arguments.markdown, html)
-
-
-def _write(document: Mapping[str, Any], json: Path | None, md: Path | None, html: Path | None) -> None:
-    parts = sections(document)
-    title = f"edgeperc-bench {document['kind']}: {document['machine']['cpu']}"
-    print(text(parts))
-    if json:
-        write_report(document, json)
-    if md:
-        write_atomic(md, markdown(parts, title).encode())
-    if html:
-        write_atomic(html, html_page(parts, title, plots.pictures(document)).encode())
+            parts, title = sections(document), f"edgeperc-bench {kind}: {hardware['cpu']}"
+            print(text(parts))
+            if arguments.json:
+                write_report(document, arguments.json)
+            if arguments.markdown:
+                write_atomic(arguments.markdown, markdown(parts, title).encode())
+            if html:
+                write_atomic(html, html_page(parts, title, plots.pictures(document)).encode())
 
 
 def prepare_input(arguments: argparse.Namespace, folder: Path, document: dict[str, Any], live: LiveTable) -> Input:

@@ -15,7 +15,6 @@ from ..samples import compare
 
 
 def add_parser(subparsers: Any) -> None:
-    """Declare the command."""
     add = add_command(
         subparsers,
         "compare",
@@ -67,12 +66,8 @@ def _pairs(a: Sequence[dict[str, Any]], b: Sequence[dict[str, Any]]) -> list[tup
     """The settings to compare: equal ones, or, if each report has only one, two settings of the same models."""
     # Reports of older versions have no "full_turn"; without it, only the quarter ahead was measured.
     keys = ("models", "provider", "precision", "n_threads", "full_turn")
-    same = [
-        (one, other)
-        for one in a
-        for other in b
-        if all((one.get(key) or None) == (other.get(key) or None) for key in keys)
-    ]
+    asked_a, asked_b = ([[setting.get(key) or None for key in keys] for setting in settings] for settings in (a, b))
+    same = [(a[j], b[k]) for j, one in enumerate(asked_a) for k, other in enumerate(asked_b) if one == other]
     if same or len(a) != 1 or len(b) != 1:
         return same
     return [(a[0], b[0])] if a[0]["models"] == b[0]["models"] else []

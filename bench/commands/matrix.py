@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import argparse
 import os
-import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from edgeperc import EdgepercError
@@ -29,7 +27,6 @@ if TYPE_CHECKING:
 
 
 def add_parser(subparsers: Any) -> None:
-    """Declare the command."""
     add = add_command(
         subparsers,
         "matrix",
@@ -67,8 +64,8 @@ def run_command(arguments: argparse.Namespace) -> int:
 
     if arguments.recommend == "":
         arguments.recommend = settings_path()
-    with new_document("matrix", arguments) as (document, live), tempfile.TemporaryDirectory() as folder:
-        scans = prepare_input(arguments, Path(folder), document, live)
+    with new_document("matrix", arguments) as (document, live, folder):
+        scans = prepare_input(arguments, folder, document, live)
         scenario = Scenario(SINGLE_STREAM, scans.files, limits_of(arguments))
         for model in dict.fromkeys(arguments.model or DEFAULT):
             settings, skipped = settings_to_try(model, arguments.providers, arguments.precisions, available_providers())

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import tempfile
-from pathlib import Path
 from typing import Any
 
 from ..options import add_command, at_least, choices
@@ -12,7 +10,6 @@ from .common import new_document, prepare_input
 
 
 def add_parser(subparsers: Any) -> None:
-    """Declare the command."""
     add = add_command(
         subparsers,
         "peers",
@@ -43,7 +40,7 @@ def run_command(arguments: argparse.Namespace) -> int:
     """Measure every table, one after the other."""
     from ..peers.turns import run
 
-    with new_document("peers", arguments) as (document, live), tempfile.TemporaryDirectory() as folder:
-        scans = prepare_input(arguments, Path(folder), document, live)
-        run(document, scans.files, Path(folder), arguments, live.note)
+    with new_document("peers", arguments) as (document, live, folder):
+        scans = prepare_input(arguments, folder, document, live)
+        run(document, scans.files, folder, arguments, live.note)
     return 0

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import os
-import tempfile
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -21,7 +20,6 @@ DEFAULT_SCENARIOS = (SINGLE_STREAM, "paced:10", "paced:20", "offline", "cold-sta
 
 
 def add_parser(subparsers: Any) -> None:
-    """Declare the command."""
     add = add_command(
         subparsers,
         "run",
@@ -53,8 +51,8 @@ def run_command(arguments: argparse.Namespace) -> int:
         arguments.loadgen.mkdir(parents=True, exist_ok=True)
     names = list(dict.fromkeys(arguments.scenario or DEFAULT_SCENARIOS))
     limits = limits_of(arguments)
-    with new_document("run", arguments) as (document, live), tempfile.TemporaryDirectory() as folder:
-        scans = prepare_input(arguments, Path(folder), document, live)
+    with new_document("run", arguments) as (document, live, folder):
+        scans = prepare_input(arguments, folder, document, live)
         scenarios = tuple(
             Scenario(name, scans.files, limits, float(name.partition(":")[2]) if name != SINGLE_STREAM else None)
             for name in names

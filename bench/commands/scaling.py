@@ -6,7 +6,6 @@ import argparse
 import importlib.util
 import math
 import os
-import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -32,7 +31,6 @@ Curve = list[tuple[float, float]]
 
 
 def add_parser(subparsers: Any) -> None:
-    """Declare the command."""
     add = add_command(
         subparsers,
         "scaling",
@@ -69,12 +67,12 @@ def run_command(arguments: argparse.Namespace) -> int:
         arguments.plot.parent.mkdir(parents=True, exist_ok=True)
     limits = limits_of(arguments)
     limits = replace(limits, warm_up_scans=min(limits.warm_up_scans, 5))
-    with new_document("scaling", arguments) as (document, live), tempfile.TemporaryDirectory() as folder:
+    with new_document("scaling", arguments) as (document, live, folder):
         live.note("simulating scans")
         scenarios = {}
         for kind, counts, make in (("points", arguments.points, inputs.sized), ("cars", arguments.cars, inputs.crowd)):
             for n in counts:
-                file = inputs.store(Path(folder), f"{kind}{n}", make(n, arguments.sensor))
+                file = inputs.store(folder, f"{kind}{n}", make(n, arguments.sensor))
                 scenarios[kind, n] = Scenario(f"{n:,} {kind}", (file,), limits)
         job = job_of(arguments)
         setting = new_setting(job, document)
@@ -85,7 +83,7 @@ def run_command(arguments: argparse.Namespace) -> int:
             curves[kind] = _add_table(document, kind, settings, unit, per)
         middle = min(scenarios, key=lambda key: (key[0] != "points", abs(key[1] - 100_000)))
         scan = scenarios[middle].scans[0]
-        curves["pixels %"] = _growth_with_images(document, live, job, arguments, Path(folder), scan)
+        curves["pixels %"] = _growth_with_images(document, live, job, arguments, folder, scan)
         cores = document["machine"]["usable_cores"] or os.cpu_count() or 1
         for n in arguments.processes or sorted({*(2**k for k in range(cores.bit_length())), cores}):
             offline(setting, job, [scan], n, limits, document, live)

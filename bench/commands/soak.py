@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import argparse
 import math
-import tempfile
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -25,7 +23,6 @@ SETTLING_SHARE = 0.1
 
 
 def add_parser(subparsers: Any) -> None:
-    """Declare the command."""
     add = add_command(
         subparsers,
         "soak",
@@ -44,8 +41,8 @@ def run_command(arguments: argparse.Namespace) -> int:
     from ..measure import new_setting, repeat
 
     settling = round(SETTLING_SHARE * arguments.scans)
-    with new_document("soak", arguments) as (document, live), tempfile.TemporaryDirectory() as folder:
-        scans = inputs.simulated_input(Path(folder), 8, arguments.sensor)
+    with new_document("soak", arguments) as (document, live, folder):
+        scans = inputs.simulated_input(folder, 8, arguments.sensor)
         document["input"] = scans.record
         limits = Limits(arguments.scans - settling, 0.0, settling, max(1, arguments.scans // MEMORY_SAMPLES))
         scenario = Scenario("soak", scans.files, limits, application=arguments.application)

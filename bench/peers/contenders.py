@@ -22,7 +22,7 @@ from edgeperc.preprocess.condition import condition
 from edgeperc.types.card import ModelCard
 from edgeperc.types.sensor import get_sensor
 from edgeperc.types.views import CameraGeometry
-from edgeperc.zoo import DEFAULT, Variant, listed, resolve
+from edgeperc.zoo import Variant, resolve
 
 from ..samples import percentile
 from ..worker import Prediction
@@ -55,7 +55,7 @@ class Contender:
     """One row of a table."""
 
     name: str
-    kind: str  # a key of `turns.KINDS`, or "peak"
+    kind: str  # as `turns.make_calls` takes it
     engine: str = ""  # a provider for edgeperc's own kinds, else as `open_engine` or `matrix_product` take it
     precision: str = ""  # as the provider or the engine takes it; empty if it has no choice
     paths: tuple[Path, ...] = ()
@@ -95,11 +95,6 @@ def why_missing(contender: Contender) -> str:
     # The parts of a network exist only if onnx is installed.
     here = all(importlib.util.find_spec(name) for name in needed) and all(path.exists() for path in contender.paths)
     return "" if here else INSTALL_GEOMETRY if contender.engine == "patchwork" else INSTALL
-
-
-def default_models() -> list[str]:
-    """The shipped models that are measured by default: every variant of the default models."""
-    return [str(variant) for variant in listed() if variant.name in DEFAULT]
 
 
 def groups(

@@ -83,7 +83,6 @@ def draw(paths: Sequence[Path], figures: Sequence[float], ms: dict[str, float]) 
 
 
 def main() -> None:
-    """Run the command."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("kitti", type=Path, help="root of a KITTI object set")
     parser.add_argument("models", type=Path, nargs="+", help=".onnx files")

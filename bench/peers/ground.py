@@ -178,14 +178,12 @@ def table(title: str, ms: Mapping[str, Floats], reference: str) -> Section:
     rows = [["", "minimum, ms", "median, ms", "minimum x edgeperc", "median x edgeperc"]]
     for name, of_call in ms.items():
         figures = [(float(statistic(of_call)), float(statistic(ms[reference]))) for statistic in (np.min, np.median)]
-        rows.append(
-            [name, *(number(ours) for ours, _ in figures), *(number(ours / theirs, 1) for ours, theirs in figures)]
-        )
+        ratios = (number(ours / theirs, 1) for ours, theirs in figures)
+        rows.append([name, *(number(ours) for ours, _ in figures), *ratios])
     return Section(title, (), rows)
 
 
 def main() -> None:
-    """Run the command line."""
     parser, add = parser_of("ground", __doc__)
     add("scan", "a scan file (default: a simulated scan)", nargs="?", type=Path)
     add("--rounds N", "how often each is measured (default: %(default)s)", type=int, default=20)

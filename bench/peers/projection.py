@@ -101,7 +101,7 @@ class NumpyTopView(_NumpyProjector):
         self.cells_per_m = np.float32(1.0 / view.cell_m)
 
     def select(self, points: Floats32) -> Selection:
-        """See `_NumpyProjector.select`; the highest point wins."""
+        # The highest point wins.
         _, height, width = self.shape
         x, y, z, remission = points.T
         rows = np.flatnonzero((x >= self.low[0]) & (x < self.high[0]) & (y >= self.low[1]) & (y < self.high[1]))
@@ -114,7 +114,6 @@ class NumpyTopView(_NumpyProjector):
         return rows, flat, -z
 
     def planes(self, points: Floats32) -> Floats32:
-        """See `_NumpyProjector.planes`."""
         x, y, z, remission = points.T
         return np.stack((np.sqrt(x * x + y * y), remission, z))
 
@@ -127,7 +126,7 @@ class NumpyRangeImage(_NumpyProjector):
         self.rows, self.cols = tabulate(row_edges(view), "rows"), tabulate(column_edges(view), "columns")
 
     def select(self, points: Floats32) -> Selection:
-        """See `_NumpyProjector.select`; the nearest point wins."""
+        # The nearest point wins.
         rows = np.flatnonzero((points[:, 0] > 0.0) & (np.abs(points[:, 1]) <= points[:, 0]))
         x, y, z, remission = points[rows].T
         squared_distance = x * x + y * y
@@ -140,7 +139,6 @@ class NumpyRangeImage(_NumpyProjector):
         return rows[inside], flat, squared_range[inside]
 
     def planes(self, points: Floats32) -> Floats32:
-        """See `_NumpyProjector.planes`."""
         x, y, z, _ = points.T
         return np.stack((*points.T, np.sqrt(x * x + y * y + z * z)))
 
@@ -200,7 +198,6 @@ def table(ms: Mapping[str, Floats]) -> Section:
 
 
 def main() -> None:
-    """Run the command line."""
     parser, add = parser_of("projection", __doc__)
     add("scan", "a scan file (default: a simulated scan)", nargs="?", type=Path)
     add("--rounds N", "how often each is measured (default: %(default)s)", type=int, default=300)

@@ -140,14 +140,12 @@ def moving_boxes(labels: Sequence[Sequence[Box]], poses: Poses) -> list[list[Box
         numbers.append({int(source): int(each) for source, each in zip(tracks.sources, tracks.ids, strict=True)})
         for track in moving_tracks(tracks):
             moves.setdefault(track.id, []).append(k)
-    return [
-        [
-            box
-            for index, box in enumerate(boxes)
-            if any(abs(k - frame) <= MOVING_AROUND for frame in moves.get(numbers[k].get(index, -1), []))
-        ]
-        for k, boxes in enumerate(labels)
-    ]
+    found = []
+    for k, boxes in enumerate(labels):
+        around = [moves.get(numbers[k].get(index, -1), []) for index in range(len(boxes))]
+        moving = [any(abs(k - frame) <= MOVING_AROUND for frame in frames) for frames in around]
+        found.append([box for box, moves_now in zip(boxes, moving, strict=True) if moves_now])
+    return found
 
 
 def trajectory_error(true: Poses, found: Poses) -> float:
@@ -241,10 +239,8 @@ def compared(
         ms = 1e3 * (time.process_time() - started) / (2 * len(scans) - 1)
         first = poses if first is None else first  # of all points
         if moving is None:
-            moving = [
-                on_objects(points, boxes)
-                for points, boxes in zip(drive.scans, moving_boxes(drive.labels, poses), strict=True)
-            ]
+            boxes = moving_boxes(drive.labels, poses)
+            moving = [on_objects(*each) for each in zip(drive.scans, boxes, strict=True)]
         counted = [np.logical_and.reduce(masks) for masks in zip(staying, drive.known, drive.usable, strict=True)]
         still = [known & ~moves for known, moves in zip(drive.known, moving, strict=True)]
         n_still = int(np.count_nonzero(np.concatenate(still)))
@@ -315,7 +311,6 @@ def draw_maps(drive: Drive, seen: Seen, odometry: Odometry, path: Path) -> None:
 
 
 def main() -> None:
-    """Run the command line."""
     parser, add = parser_of("slam", __doc__)
     add("root", "a KITTI object set (default: drawn streets)", nargs="?", type=Path)
     add("--drive DRIVE...", "only drives that end so, such as 0001 or urban", default=[])

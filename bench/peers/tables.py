@@ -27,15 +27,11 @@ def latency_table(title: str, measured: Sequence[Measured], n_threads: int) -> d
         same = agreement(first.predictions, each.predictions) if first.predictions and each.predictions else {}
         equal = [same[kind]["equal"] for kind in ("points", "cells", "pixels") if same.get(kind)]
         boxes = same.get("boxes")
-        rows.append(
-            [
-                *(each.contender.name, f"{figures['n']:,}", *(number(figures[q]) for q in ("p50", "p90", "p99"))),
-                share(noise_floor([np.ravel(part) for part in np.array_split(np.array(each.rounds), 3)])),
-                *(number(each.p50 / first.p50), share(min(equal, default=None))),
-                f"{boxes['n_both']} of {boxes['n_reference']}" if boxes else "-",
-                *(number(each.rss_mb, 0), each.missing or "-"),
-            ]
-        )
+        times = f"{figures['n']:,}", *(number(figures[q]) for q in ("p50", "p90", "p99"))
+        noise = share(noise_floor([np.ravel(part) for part in np.array_split(np.array(each.rounds), 3)]))
+        found = f"{boxes['n_both']} of {boxes['n_reference']}" if boxes else "-"
+        compared = number(each.p50 / first.p50), share(min(equal, default=None)), found
+        rows.append([each.contender.name, *times, noise, *compared, number(each.rss_mb, 0), each.missing or "-"])
     sentences = [
         f"ms; {n_threads} threads for every library; ratios are to the first row; noise: spread of the medians of the "
         "three thirds; labels and boxes: those equal to the first row's"
@@ -44,15 +40,10 @@ def latency_table(title: str, measured: Sequence[Measured], n_threads: int) -> d
         sentences.append("images of simulated streets, at the size of the model's input")
     elif any(each.contender.kind == "pipeline" for each in shown):
         sentences.append("the numpy pipelines leave out PointSeg's removal of outliers, so they do less than edgeperc")
-    for alone in shown:
-        if alone.contender.kind != "network" or (alone.contender.engine, alone.contender.precision) not in OPENVINO:
-            continue
-        ratios = [
-            f"{each.contender.name} {number(each.p50 / alone.p50)}"
-            for each in shown
-            if each.contender.kind == "edgeperc" and each.ms and alone.ms
-        ]
-        if ratios:
+    whole = [each for each in shown if each.contender.kind == "edgeperc" and each.ms]
+    for alone in (each for each in shown if each.contender.kind == "network" and each.ms and whole):
+        if (alone.contender.engine, alone.contender.precision) in OPENVINO:
+            ratios = (f"{each.contender.name} {number(each.p50 / alone.p50)}" for each in whole)
             sentences.append(f"scan to result / {alone.contender.name}: {'; '.join(ratios)}")
     head = ["contender", "n", "p50", "p90", "p99", "noise", "x edgeperc", "labels equal", "boxes", "RSS MB", "note"]
     return {"title": title, "sentences": sentences, "head": head, "rows": rows}
@@ -90,6 +81,8 @@ def floor_table(title: str, measured: Sequence[Measured]) -> dict[str, Any]:
     else:
         work, stored = cost(path), "int8" if ModelCard.read(path).precision == "int8" else "fp32"
         as_stored = ("", "auto", "fp32", "bf16") if stored == "int8" else ("", "auto")
+        runs = [each for each in measured if each.contender.kind in ("network", "session") and each.ms]
+        computed_in = [stored if each.contender.precision in as_stored else each.contender.precision for each in runs]
         sentences.append(
             f"{work.macs / 1e9:.2f} GMAC, {work.padding_macs / 1e9:.2f} of them on padding, which the floor leaves "
             f"out; {work.weights / 1e6:.1f} M weights; {work.activations / 1e6:.1f} M activations"
@@ -99,22 +92,12 @@ def floor_table(title: str, measured: Sequence[Measured]) -> dict[str, Any]:
             library = min(of_precision, key=lambda engine: of_precision[engine], default="")
             rate = PRODUCT_SIZE**3 / of_precision[library] if library else math.nan
             floor = (work.macs - work.padding_macs) / rate
-            networks = [
-                each
-                for each in measured
-                if each.contender.kind in ("network", "session")
-                and each.ms
-                and (stored if each.contender.precision in as_stored else each.contender.precision) == precision
-            ]
+            networks = [each for each, kind in zip(runs, computed_in, strict=True) if kind == precision]
             fastest = min(networks, key=lambda each: each.p50, default=None)
             took = fastest.p50 if fastest else math.nan
-            rows.append(
-                [
-                    *(precision, number(rate / 1e6, 0), library or "-", number(floor)),
-                    *(number(n_bytes * (work.weights + work.activations) / bytes_per_ms), number(took)),
-                    *(fastest.contender.name if fastest else "-", share(floor / took)),
-                ]
-            )
+            peak, traffic = number(rate / 1e6, 0), number(n_bytes * (work.weights + work.activations) / bytes_per_ms)
+            fastest_is = number(took), fastest.contender.name if fastest else "-", share(floor / took)
+            rows.append([precision, peak, library or "-", number(floor), traffic, *fastest_is])
     head = ["precision", "peak GMAC/s", "by", "floor ms", "traffic ms", "network ms", "by", "share of peak"]
     sentences.append(
         "peak: the fastest matrix product; traffic: all values of every layer to and from memory once, less with caches"

@@ -48,9 +48,9 @@ from .rounds import parser_of, versions
 Scans = Sequence[Sequence[Box]]
 
 
-def drawn_street(n_scans: int = 400, seed: int = 0) -> list[list[Box]]:
+def drawn_street(n_scans: int = 400) -> list[list[Box]]:
     """Boxes of 30 parked and 6 driving cars around a sensor that drives at 10 m/s, with false alarms."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     parked = np.column_stack([rng.uniform(0.0, 450.0, 90), rng.choice([-6.0, 6.0, 9.0], 90)])
     driving, speed = rng.uniform(0.0, 200.0, 6), rng.uniform(5.0, 14.0, 6)
     scans = []
@@ -184,7 +184,6 @@ def stone_soup(scans: Scans, seconds: float) -> int:
 
 
 def main() -> None:
-    """Run the command line."""
     parser, add = parser_of("tracking", __doc__)
     add("root", "KITTI's tracking sequences (default: a drawn street)", nargs="?", type=Path)
     add("--sequence SEQ", "measured with both (default: %(default)s)", default="0004")

@@ -8,7 +8,7 @@ import os
 import signal
 import time
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
 from functools import partial
 from importlib import import_module
@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from edgeperc import ModelCard, Perceiver
 from edgeperc.inference.session import Session
 from edgeperc.types.sensor import get_sensor
+from edgeperc.zoo import DEFAULT, listed
 
 from ..context import conditions, disturbances, rss_mb, version_of
 from ..samples import elapsed_ms
@@ -29,7 +30,7 @@ from ..worker import Prediction
 from . import projection
 from .arithmetic import matrix_product, memory_copy
 from .camera import NumpyCamera, small_unet
-from .contenders import ANSWERS, METHODS, Contender, Measured, default_models, groups, methods, why_missing
+from .contenders import ANSWERS, METHODS, Contender, Measured, groups, methods, why_missing
 from .engines import open_engine
 from .ground import ground_finders, tree_clusters
 from .numpy_pipeline import NumpyPipeline
@@ -66,69 +67,36 @@ def make_perceiver(contender: Contender, sensor: str, n_threads: int) -> Perceiv
     )
 
 
-def prepare_edgeperc(contender: Contender, sensor: str, n_threads: int) -> Prepare:
-    """edgeperc's pipeline."""
-    perceive = make_perceiver(contender, sensor, n_threads)
-    return (lambda image: partial(perceive, image=image)) if contender.inputs else partial(partial, perceive)
-
-
-def open_networks(contender: Contender, n_threads: int) -> list[Any]:
-    """A contender's networks in its engine."""
-    how = contender.engine, contender.precision
-    if contender.kind == "session":
-        return [Session(path, how[0], precision=how[1], n_threads=n_threads) for path in contender.paths]
-    return [open_engine(*how, path, n_threads) for path in contender.paths]
-
-
-def prepare_networks(contender: Contender, sensor: str, n_threads: int) -> Prepare:
-    """Networks alone, one after the other, with their input already written."""
-    assert contender.image is not None
-    networks = open_networks(contender, n_threads)
+def prepare(contender: Contender, sensor: str, n_threads: int) -> Prepare:
+    """A contender's part in its own process; what an untrained network answers means nothing and is not compared."""
+    kind, how = contender.kind, (contender.engine, contender.precision)
+    if kind == "projection":
+        return lambda scan: projection.contenders(np.ascontiguousarray(scan))[contender.engine]
+    if kind == "clusters":  # of what Patchwork++ leaves; both know one thread only
+        finders = ground_finders({"pypatchworkpp": import_module("pypatchworkpp")}, get_sensor(sensor))
+        find_ground = finders["Patchwork++"]
+        return lambda scan: partial(lambda ground: tree_clusters(scan[~ground()]), find_ground(scan))
+    cards = [ModelCard.from_json(card) for card in contender.cards]
+    if kind == "unet":
+        return partial(partial, small_unet(cards[0], contender.precision, n_threads))
+    if kind in ("edgeperc", "default", *ANSWERS):
+        perceive = make_perceiver(contender, sensor, n_threads)
+        return (lambda image: partial(perceive, image=image)) if contender.inputs else partial(partial, perceive)
+    if kind == "session":
+        networks: list[Any] = [Session(p, how[0], precision=how[1], n_threads=n_threads) for p in contender.paths]
+    else:
+        networks = [open_engine(*how, path, n_threads) for path in contender.paths]
+    if kind == "pipeline":
+        if contender.inputs:
+            return partial(partial, NumpyCamera(cards[0], *networks))
+        return partial(partial, NumpyPipeline(cards, networks, get_sensor(sensor)))
+    if kind == "pillars":
+        (network,), weights = networks, random_weights()
+        return lambda scan: lambda: (fill_pillars(scan, weights, network.input), network.run())
+    assert contender.image is not None  # networks alone, one after the other
     for network in networks:
         network.input[:] = np.load(contender.image)
     return lambda scan: lambda: [network.run() for network in networks]
-
-
-def prepare_pillars(contender: Contender, sensor: str, n_threads: int) -> Prepare:
-    """PointPillars from scan to the outputs of its network, which mean nothing."""
-    (network,), weights = open_networks(contender, n_threads), random_weights()
-    return lambda scan: lambda: (fill_pillars(scan, weights, network.input), network.run())
-
-
-def prepare_pipeline(contender: Contender, sensor: str, n_threads: int) -> Prepare:
-    """The pipeline in numpy around another engine."""
-    cards, networks = [ModelCard.from_json(card) for card in contender.cards], open_networks(contender, n_threads)
-    camera = contender.inputs
-    return partial(
-        partial, NumpyCamera(cards[0], *networks) if camera else NumpyPipeline(cards, networks, get_sensor(sensor))
-    )
-
-
-def prepare_unet(contender: Contender, sensor: str, n_threads: int) -> Prepare:
-    """The small U-Net in torch, from image to labels, which mean nothing and are not compared."""
-    return partial(partial, small_unet(ModelCard.from_json(contender.cards[0]), contender.precision, n_threads))
-
-
-def prepare_clusters(contender: Contender, sensor: str, n_threads: int) -> Prepare:
-    """Patchwork++, and a k-d tree's clusters of what it leaves; both know one thread only."""
-    find_ground = ground_finders({"pypatchworkpp": import_module("pypatchworkpp")}, get_sensor(sensor))["Patchwork++"]
-    return lambda scan: partial(lambda ground: tree_clusters(scan[~ground()]), find_ground(scan))
-
-
-def prepare_projection(contender: Contender, sensor: str, n_threads: int) -> Prepare:
-    """One projection of a scan."""
-    return lambda scan: projection.contenders(np.ascontiguousarray(scan))[contender.engine]
-
-
-KINDS: Mapping[str, Callable[[Contender, str, int], Prepare]] = {
-    **dict.fromkeys(("edgeperc", "default", *ANSWERS), prepare_edgeperc),
-    **dict.fromkeys(("network", "session"), prepare_networks),
-    "clusters": prepare_clusters,
-    "pillars": prepare_pillars,
-    "pipeline": prepare_pipeline,
-    "projection": prepare_projection,
-    "unet": prepare_unet,
-}
 
 
 def make_calls(contender: Contender, scans: Sequence[NDArray[Any]], sensor: str, n_threads: int) -> Calls:
@@ -137,8 +105,8 @@ def make_calls(contender: Contender, scans: Sequence[NDArray[Any]], sensor: str,
         return [memory_copy(n_threads)]
     if contender.kind == "peak":
         return [matrix_product(contender.engine, contender.precision, n_threads)] * 2
-    prepare = KINDS[contender.kind](contender, sensor, n_threads)
-    return [prepare(scan) for scan in scans]
+    call_of = prepare(contender, sensor, n_threads)
+    return [call_of(scan) for scan in scans]
 
 
 def serve(connection: Any, contender: Contender, files: Sequence[Path], sensor: str, n_threads: int) -> None:
@@ -234,7 +202,7 @@ def run(
     """Measure the ``tables`` of the command's arguments ("engines": the same networks elsewhere; "methods": others),
     and record them in a document.
     """
-    models, sensor = arguments.model or default_models(), arguments.sensor
+    models = arguments.model or [str(variant) for variant in listed() if variant.name in DEFAULT]
     n_threads = arguments.threads or document["machine"]["usable_cores"] or os.cpu_count() or 1
     measuring: dict[str, list[Contender]] = {}
     document["peers"] = {}
@@ -242,7 +210,7 @@ def run(
         if version := version_of(package):
             document["software"][package] = version
     if "engines" in arguments.tables:
-        measuring = groups(models, arguments.provider, arguments.precision, folder, files[0], sensor)
+        measuring = groups(models, arguments.provider, arguments.precision, folder, files[0], arguments.sensor)
     if "methods" in arguments.tables:
         note("writing the networks of others with random weights")
         measuring[METHODS] = methods(folder)
@@ -253,7 +221,7 @@ def run(
             measure(
                 contenders,
                 files,
-                sensor=sensor,
+                sensor=arguments.sensor,
                 n_threads=n_threads,
                 n_rounds=arguments.rounds,
                 note=lambda name: note(f"  starting {name}"),

@@ -24,7 +24,7 @@ from edgeperc.types.sensor import SensorProfile
 
 from .beams import taken_by
 from .processes import mapped
-from .scans import LabeledScan, mirrored, turned, turned_box
+from .scans import LabeledScan, mirrored, turned, turned_box, turned_points
 
 RARE = ("pedestrian", "cyclist")
 PASTE_AZIMUTHS = (-0.65, 0.65)
@@ -170,9 +170,7 @@ def pasted(
         standing = inside(box, near, 0.1) & (near[:, 2] > ground + 0.25)
         if np.count_nonzero(standing) > 2 or any(_close(box, other) for other in boxes):
             continue
-        cos, sin = np.float32(np.cos(angle)), np.float32(np.sin(angle))
-        here = cut.copy()
-        here[:, 0], here[:, 1] = cos * cut[:, 0] - sin * cut[:, 1], sin * cut[:, 0] + cos * cut[:, 1]
+        here = turned_points(cut, angle)
         here[:, 2] += np.float32(ground - foot)
 
         own, own_range = _rays(here)
@@ -292,9 +290,7 @@ def with_ground_ahead(scan: LabeledScan) -> LabeledScan:
 
 def tilted(scan: LabeledScan, roll: float, pitch: float, lift: float) -> LabeledScan:
     """The scan as it is levelled with an error: rolled and pitched [rad], and lifted [m]. Boxes stay upright."""
-    turn = np.array(
-        [[1.0, roll * pitch, pitch], [0.0, 1.0, -roll], [-pitch, roll, 1.0]]  # small angles: exact to 1e-4
-    )
+    turn = np.array([[1.0, roll * pitch, pitch], [0.0, 1.0, -roll], [-pitch, roll, 1.0]])  # small: exact to 1e-4
     points = scan.points.copy()
     points[:, :3] = scan.points[:, :3] @ turn.T.astype(np.float32)
     points[:, 2] += np.float32(lift)

@@ -33,12 +33,12 @@ from edgeperc.types.geometry import draw_footprints
 from edgeperc.types.mounting import Mounting
 from edgeperc.types.points import Bytes, Ints, Labels, Points
 from edgeperc.types.sensor import SensorProfile
-from edgeperc.types.views import RangeImageGeometry
 
 from .roads import box_sums
 from .scans import SURFACE, LabeledScan
 
 NEAR_M = 0.5
+interpolator_of = lru_cache(maxsize=64)(Interpolator)
 
 
 def read_scan_set(
@@ -90,7 +90,9 @@ def labeled_scan(
     surface = np.full((SURFACE.height, SURFACE.width), IGNORE, np.uint8)
     cells = road_cells(frame, mounting, SURFACE)
     if cells is not None:
-        cells = _filled(cells)
+        # Road also where three known cells within 1.4 m are road and none is another: 99.6 % of what it adds is road.
+        road, other = (box_sums(known.astype(np.int64)) for known in (cells == 1, (cells != 1) & (cells != IGNORE)))
+        cells = np.where((cells == IGNORE) & (road >= 3) & (other == 0), np.uint8(1), cells)
         surface = np.where(cells <= 1, cells, IGNORE).astype(np.uint8)
         # Of the ground under an ignored object nothing is known; vehicles are drawn over the surface later.
         unclear = np.zeros_like(surface)
@@ -113,18 +115,6 @@ def labeled_scan(
     )
 
 
-def _filled(cells: Bytes) -> Bytes:
-    """Cells of `ROAD_CLASSES`, with road also between the returns: where three cells in the 1.4 m around an unknown one
-    are road and no other one is known.
-
-    In 16 simulated scans of two sensors, this makes the known road 2.5 and 4 times as large, and 99.6 % of what is
-    added is road.
-    """
-    road, other = (box_sums(known.astype(np.int64)) for known in (cells == 1, (cells != 1) & (cells != IGNORE)))
-    between = (cells == IGNORE) & (road >= 3) & (other == 0)
-    return np.where(between, np.uint8(1), cells)
-
-
 def seen_by_network(
     projector: TopViewProjector | RangeImageProjector, scan: LabeledScan
 ) -> tuple[LabeledScan, Projection]:
@@ -139,7 +129,7 @@ def seen_by_network(
     projected = project(projector, points)
     if scan.sensor is None or isinstance(projector, TopViewProjector):
         return scan, projected
-    interpolator = _interpolator(projector.view, scan.sensor)
+    interpolator = interpolator_of(projector.view, scan.sensor)
     if not interpolator.needed or not len(points):
         return scan, projected
     dense, filled = interpolator.fill(points, projected.index)
@@ -152,16 +142,10 @@ def seen_by_network(
     return replace(scan, points=dense, labels=labels), Projection(image, filled, projected.pixel)
 
 
-@lru_cache(maxsize=64)
-def _interpolator(view: RangeImageGeometry, sensor: SensorProfile) -> Interpolator:
-    return Interpolator(view, sensor)
-
-
 def _nearest_labels(points: Points, filled: Ints, index: Ints, labels: Labels) -> Bytes:
-    """Label of the nearest of the next measured points left, right, above and below, (H, W) uint8.
-
-    `IGNORE` without such a point, and where it is farther away than `NEAR_M` unless all are background: on the road,
-    points between two rings are interpolated over meters.
+    """Label of the nearest of the next measured points left, right, above and below, (H, W) uint8; `IGNORE` without
+    one, or beyond `NEAR_M` unless all are background: on the road, points between two rings are interpolated over
+    meters.
     """
     place = points[filled, :3]
     best, nearest = np.full(index.shape, np.inf, np.float32), np.full(index.shape, IGNORE, np.uint8)

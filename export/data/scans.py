@@ -125,15 +125,20 @@ class LabeledScan:
 
 def turned(scan: LabeledScan, angle: float) -> LabeledScan:
     """The scan turned by ``angle`` [rad] about +z."""
-    cos, sin = np.float32(np.cos(angle)), np.float32(np.sin(angle))
-    points = scan.points.copy()
-    points[:, 0] = cos * scan.points[:, 0] - sin * scan.points[:, 1]
-    points[:, 1] = sin * scan.points[:, 0] + cos * scan.points[:, 1]
     boxes = tuple(turned_box(b, angle) for b in scan.boxes)
     low, high = scan.azimuths
     full = high - low >= 2.0 * np.pi
     azimuths = (low, high) if full else (low + angle, high + angle)
+    points = turned_points(scan.points, angle)
     return replace(scan, points=points, boxes=boxes, azimuths=azimuths, turn=scan.turn + angle)
+
+
+def turned_points(points: Points, angle: float) -> Floats32:
+    """The points turned by ``angle`` [rad] about +z."""
+    cos, sin = np.float32(np.cos(angle)), np.float32(np.sin(angle))
+    moved = points.copy()
+    moved[:, 0], moved[:, 1] = cos * points[:, 0] - sin * points[:, 1], sin * points[:, 0] + cos * points[:, 1]
+    return moved
 
 
 def mirrored(scan: LabeledScan) -> LabeledScan:

@@ -20,7 +20,7 @@ the true one, so the neighbors' geometry must be correct too."""
 
 
 def slot_targets(
-    boxes: ArrayLike, view: TopViewGeometry, *, labeled: Mask | None = None, unsure: ArrayLike | None = None
+    boxes: ArrayLike, view: TopViewGeometry, *, labeled: Mask | None = None, unsure: ArrayLike = ()
 ) -> Floats32:
     """Targets of head "slots": each has a square of the view, and the upright box of the nearest object in it.
 
@@ -30,23 +30,18 @@ def slot_targets(
     n_rows, n_cols = view.height // SLOT_CELLS, view.width // SLOT_CELLS
     target = np.zeros((n_rows, n_cols, 5), np.float32)
     if labeled is not None:
-        every = (np.arange(n) * SLOT_CELLS for n in (n_rows, n_cols))
         known = labeled
-        for axis, starts in enumerate(every):
-            known = np.logical_and.reduceat(known, starts, axis=axis)
+        for axis, n in enumerate((n_rows, n_cols)):
+            known = np.logical_and.reduceat(known, np.arange(n) * SLOT_CELLS, axis=axis)
         target[~known, 4] = -1.0
-    for group, present in ((unsure, False), (boxes, True)):
-        if group is None:
-            continue
-        group, rows, cols = _boxes_in_view(group, view)
+    for given, presence in ((unsure, -1.0), (boxes, 1.0)):
+        group, rows, cols = _boxes_in_view(given, view)
         at_row = np.minimum(rows.astype(np.int64) // SLOT_CELLS, n_rows - 1)
         at_col = np.minimum(cols.astype(np.int64) // SLOT_CELLS, n_cols - 1)
-        if not present:
-            target[at_row, at_col, 4] = -1.0
-            continue
-        nearest_last = np.argsort(rows, kind="stable")
-        target[at_row[nearest_last], at_col[nearest_last], :4] = _upright(group, rows, cols, view)[nearest_last]
-        target[at_row, at_col, 4] = 1.0
+        target[at_row, at_col, 4] = presence
+        if presence > 0.0:
+            nearest_last = np.argsort(rows, kind="stable")
+            target[at_row[nearest_last], at_col[nearest_last], :4] = _upright(group, rows, cols, view)[nearest_last]
     return target.reshape(-1, 5)
 
 
@@ -63,7 +58,7 @@ def paper_slot_targets(boxes: ArrayLike, view: TopViewGeometry, n_slots: int) ->
 
 
 def dense_targets(
-    boxes: ArrayLike, view: TopViewGeometry, *, labeled: Mask | None = None, unsure: ArrayLike | None = None
+    boxes: ArrayLike, view: TopViewGeometry, *, labeled: Mask | None = None, unsure: ArrayLike = ()
 ) -> Floats32:
     """Heat map and geometry for head "dense".
 
@@ -94,10 +89,9 @@ def dense_targets(
     unlearned = np.zeros((height, width), bool)
     if labeled is not None:
         unlearned |= ~labeled.reshape(height, STRIDE, width, STRIDE).all((1, 3))
-    if unsure is not None:
-        boxes, rows, cols = _boxes_in_view(unsure, view)
-        for box, row, col in zip(boxes, rows / STRIDE, cols / STRIDE, strict=True):
-            unlearned |= _gaussian(box, row, col, (height, width), view.cell_m * STRIDE) > 0.1
+    boxes, rows, cols = _boxes_in_view(unsure, view)
+    for box, row, col in zip(boxes, rows / STRIDE, cols / STRIDE, strict=True):
+        unlearned |= _gaussian(box, row, col, (height, width), view.cell_m * STRIDE) > 0.1
     heat[unlearned & (heat < REGRESSED_FROM)] = -1.0
     return target
 

@@ -52,11 +52,8 @@ def train_folds(objects: KittiObjects, drawn: Mapping[str, DrawnScene], recipe: 
                 f"all {len(drawn)} drawn scenes are in fold {fold}, whose road model cannot be trained on them; draw "
                 "roads in two drives or more, or give a model with --road-by NAME"
             )
-        facts = [
-            asdict(recipe),
-            *({name: asdict(scene) for name, scene in part.items()} for part in (trained_on, held_out)),
-        ]
-        key = hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()
+        parts = [{name: asdict(scene) for name, scene in part.items()} for part in (trained_on, held_out)]
+        key = hashlib.sha256(json.dumps([asdict(recipe), *parts], sort_keys=True).encode()).hexdigest()
         model, made_of = out / f"fold-{fold}.onnx", work / f"fold-{fold}.sha256"
         if model.exists() and made_of.exists() and made_of.read_text() == key:
             made[key] = model

@@ -10,7 +10,7 @@ import torch
 from torch import nn
 
 from ..cards import card_of
-from ..recipe import Recipe, task_name
+from ..recipe import Recipe
 from .camseg import CamSeg
 from .edge import PointSegEdge, SSADNetEdge
 from .fcn import FCN
@@ -39,7 +39,6 @@ def build(recipe: Recipe) -> nn.Module:
 
     Raises ValueError.
     """
-    task_name(recipe.network)  # raises ValueError for an unknown network
     card = card_of(recipe, version="0")
     sizes: dict[str, Any] = {"n_channels": len(card.input.channels), "n_classes": len(card.classes)}
     if recipe.network == "ssadnet":

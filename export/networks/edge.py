@@ -57,8 +57,7 @@ class Trunk(nn.Module):
         """Features of each block, (B, fine, H / rows, W / columns)."""
         x = self.encoder(x)
         up = F.interpolate(self.up(self.context(self.down(x))), size=x.shape[-2:], mode="nearest")
-        features: Tensor = self.decoder(F.relu(up + x))
-        return features
+        return self.decoder(F.relu(up + x))
 
 
 def _channels(width: float) -> tuple[int, int]:
@@ -93,8 +92,7 @@ class PointSegEdge(nn.Module):
 
     def blocks(self, x: Tensor) -> Tensor:
         """Logits before `spread`: those of a block's pixels are channels."""
-        logits: Tensor = self.classifier(self.trunk(x))
-        return logits
+        return self.classifier(self.trunk(x))
 
     def forward(self, x: Tensor) -> Tensor:
         return spread(self.blocks(x), self.block)

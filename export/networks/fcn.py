@@ -52,14 +52,10 @@ class FCN(nn.Module):
                 nn.Sequential(*(layer for a, b in pairs for layer in (nn.Conv2d(a, b, 3, padding=1), nn.ReLU())))
             )
             c_in = widths[-1]
-        self.fully_connected = nn.Sequential(
-            nn.Conv2d(c_in, FULLY_CONNECTED, 7, padding=3),
-            nn.ReLU(),
-            nn.Dropout(dropout),
-            nn.Conv2d(FULLY_CONNECTED, FULLY_CONNECTED, 1),
-            nn.ReLU(),
-            nn.Dropout(dropout),
-        )
+        layers: list[nn.Module] = []
+        for c, kernel in ((c_in, 7), (FULLY_CONNECTED, 1)):
+            layers += [nn.Conv2d(c, FULLY_CONNECTED, kernel, padding=kernel // 2), nn.ReLU(), nn.Dropout(dropout)]
+        self.fully_connected = nn.Sequential(*layers)
         self.score = nn.Conv2d(FULLY_CONNECTED, n_classes, 1)
         self.score_skips = nn.ModuleList(nn.Conv2d(VGG_16[k][-1], n_classes, 1) for k in SKIPS[stride])
         self.upsamplings = nn.ModuleList(

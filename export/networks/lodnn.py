@@ -61,8 +61,7 @@ class LoDNN(nn.Module):
         x, mask = max_pool_with_mask(x)  # (B, 32, 200, 100)
         x = self.context(x)  # (B, 32, 200, 100)
         x = max_unpool(x, mask)  # (B, 32, 400, 200)
-        logits: Tensor = self.classifier(self.decoder(x))  # (B, 2, 400, 200)
-        return logits
+        return self.classifier(self.decoder(x))  # (B, 2, 400, 200)
 
     def _initialize(self, dropout: float) -> None:
         """As in SSADNet: preserve the variance of the signal through ELU and spatial dropout."""

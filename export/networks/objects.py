@@ -56,8 +56,7 @@ class FirstLook(nn.Module):
         few = x[:, ::LOOK_STRIDE]
         points = relu(self.point2(relu(self.point1(few.flatten(0, 1)))))
         hidden = relu(self.head1(torch.cat([_by_candidate(points, few).amax(1), x[:, 0, N_POINT_FEATURES:]], dim=1)))
-        found: Tensor = self.head2(hidden)[:, 0]
-        return found
+        return self.head2(hidden)[:, 0]
 
 
 class ObjectNet(nn.Module):
@@ -96,8 +95,7 @@ class ObjectNet(nn.Module):
         with torch.autocast(device, enabled=False):
             pooled = relu(self.norm(pooled.float()))
             hidden = self.dropout(relu(self.head1(torch.cat([pooled, candidate], dim=1))))
-            found: Tensor = self.head3(relu(self.head2(hidden)))
-        return found
+            return self.head3(relu(self.head2(hidden)))
 
     def detect(self, x: Tensor) -> Tensor:
         """Outputs (B, n) as the exported network gives them: `rejected` where the first look sees no object."""

@@ -41,8 +41,7 @@ class Residual(nn.Module):
         self.activation = activation()
 
     def forward(self, x: Tensor) -> Tensor:
-        y: Tensor = self.activation(self.layers(x) + self.shortcut(x))
-        return y
+        return self.activation(self.layers(x) + self.shortcut(x))
 
 
 def stages(c_in: int, widths: Sequence[int], depths: Sequence[int], activation: Activation) -> nn.ModuleList:
@@ -93,8 +92,7 @@ class FIDNet(nn.Module):
         seen = [self.stem(x)]
         for stage in self.stages:
             seen.append(stage(seen[-1]))
-        logits: Tensor = self.classifier(self.head(torch.cat([enlarged(each, x) for each in seen], dim=1)))
-        return logits
+        return self.classifier(self.head(torch.cat([enlarged(each, x) for each in seen], dim=1)))
 
 
 class CENet(FIDNet):

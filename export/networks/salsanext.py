@@ -95,5 +95,4 @@ class SalsaNext(nn.Module):
         x = skips.pop()  # (B, 256, 4, 128)
         for decoder in self.decoders:
             x = decoder(x, skips.pop())
-        logits: Tensor = self.classifier(x)  # (B, 20, 64, 2048)
-        return logits
+        return self.classifier(x)  # (B, 20, 64, 2048)

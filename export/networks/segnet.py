@@ -64,8 +64,7 @@ class SegNet(nn.Module):
             x = decoder(unpool(x, *pooled.pop()))
             if level < N_DROPPED:
                 x = self.dropout(x)
-        logits: Tensor = self.classifier(x)
-        return logits
+        return self.classifier(x)
 
 
 def _convolutions(widths: list[int]) -> nn.Sequential:

@@ -79,8 +79,7 @@ class SqueezeSegV2(nn.Module):
         x = self.deconv11(x) + half  # (B, 128, 64, 128)
         x = self.deconv12(x) + near  # (B, 64, 64, 256)
         x = self.deconv13(x) + skip1  # (B, 64, 64, 512)
-        logits: Tensor = self.classifier(self.dropout(x))  # (B, 4, 64, 512)
-        return logits
+        return self.classifier(self.dropout(x))  # (B, 4, 64, 512)
 
 
 class KULSeg(SqueezeSegV2):

@@ -95,12 +95,8 @@ class ContextModule(nn.Module):
         c_in = channels
         for across, along in CONTEXT_DILATIONS:
             dilation = (along, across)
-            layers += [
-                nn.Conv2d(c_in, width, 3, padding=dilation, dilation=dilation),
-                *norm(width, batch_norm),
-                nn.Dropout2d(dropout),
-                nn.ELU(),
-            ]
+            layers.append(nn.Conv2d(c_in, width, 3, padding=dilation, dilation=dilation))
+            layers += [*norm(width, batch_norm), nn.Dropout2d(dropout), nn.ELU()]
             c_in = width
         self.dilated = nn.Sequential(*layers)
         self.project = nn.Sequential(nn.Conv2d(width, channels, 1), *norm(channels, batch_norm), nn.ELU())
@@ -153,20 +149,13 @@ class BoxRegressor(nn.Module):
     def __init__(self, channels: int, n_slots: int | None, dropout: float) -> None:
         super().__init__()
         self.by_place = n_slots is None
-        self.layers = nn.Sequential(
-            nn.Conv2d(channels, channels, 1),
-            nn.ReLU(),
-            nn.Conv2d(channels, channels, 1),
-            nn.Dropout(dropout),
-            nn.ELU(),
-            nn.Conv2d(channels, channels, 1),
-            nn.Dropout(dropout),
-            nn.ELU(),
-            nn.Conv2d(channels, n_slots or 1, 1),
-        )
+        layers: list[nn.Module] = [nn.Conv2d(channels, channels, 1), nn.ReLU()]
+        for _ in range(2):
+            layers += [nn.Conv2d(channels, channels, 1), nn.Dropout(dropout), nn.ELU()]
+        self.layers = nn.Sequential(*layers, nn.Conv2d(channels, n_slots or 1, 1))
 
     def forward(self, x: Tensor) -> Tensor:
-        values: Tensor = self.layers(x)
+        values = self.layers(x)
         return values[:, 0] if self.by_place else values.mean((2, 3))  # (B, 12, 6) or (B, n_slots)
 
 

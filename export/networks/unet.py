@@ -76,5 +76,4 @@ class UNet(nn.Module):
             levels.append(x)
         for up, merge, finer in zip(self.up, self.merge, levels[-2::-1], strict=True):
             x = merge(torch.cat([finer, up(x)], dim=1))
-        logits: Tensor = self.classifier(x)[..., :height, :width]
-        return logits
+        return self.classifier(x)[..., :height, :width]

@@ -201,7 +201,7 @@ def _validation(path: Path) -> Iterable[str]:
     title = f"vehicles ({first['n_boxes']} boxes, {first['n_cells']:,} cells)"
     yield from _head(title, ["AP50", "precision", "recall", "IoU of cells", "relative time"])
     for row in of_vehicles:
-        cells = [_percent(row["vehicles"], name) for name in ("ap", "precision", "recall", "iou")]
+        cells = _rates(row["vehicles"], "ap", "precision", "recall", "iou")
         yield _row(f"`{row['file']}`", *cells, f"{row['relative_time']:.1f}")
     yield from ("", f"Made by `{_alone(table['command'])}`.")
 
@@ -258,8 +258,7 @@ def _image_figures(figures: Mapping[str, Any]) -> Iterable[str]:
     yield from _head(f"pixels, {n_images} validation images, intervals over images", head)
     yield _row("all, mean", "-", "-", _percent(figures["all"], "mean_iou"), f"{figures['all']['n_pixels']:,}")
     for name, row in figures["classes"].items():
-        rates = [_percent(row, key) for key in ("precision", "recall", "iou")]
-        yield _row(name, *rates, f"{row['n_pixels']:,}")
+        yield _row(name, *_rates(row, "precision", "recall", "iou"), f"{row['n_pixels']:,}")
 
 
 def _figures(figures: Mapping[str, Any], scans: str, bands: Sequence[str]) -> Iterable[str]:
@@ -267,8 +266,8 @@ def _figures(figures: Mapping[str, Any], scans: str, bands: Sequence[str]) -> It
         yield from _head(f"points, {scans}", ["range", "precision", "recall", "IoU", "points", "objects"])
         for band, rows in _by_band(figures["points"], bands):
             for name, row in rows.items():
-                rates = [_percent(row, key) for key in ("precision", "recall", "iou")]
-                yield _row(name, band, *rates, f"{row['n_points']:,}", row.get("n_objects") or "-")
+                counts = f"{row['n_points']:,}", row.get("n_objects") or "-"
+                yield _row(name, band, *_rates(row, "precision", "recall", "iou"), *counts)
     for kind, of_kind in figures.get("boxes", {}).items():
         head = ["range", "AP50", "precision", "recall", "mIoU@0.5", "mIoU@0.7", "boxes"]
         yield from _head(f"{kind} boxes, {scans}", head)
@@ -276,20 +275,20 @@ def _figures(figures: Mapping[str, Any], scans: str, bands: Sequence[str]) -> It
             yield _row("mean of classes (mAP50)", band, _percent(rows, "mean_ap"), *["-"] * 5)
             for name, row in rows.items():
                 if isinstance(row, Mapping):
-                    keys = ("ap", "precision", "recall", "mean_iou_50", "mean_iou_70")
-                    yield _row(name, band, *(_percent(row, key) for key in keys), row["n_truth"])
+                    rates = _rates(row, "ap", "precision", "recall", "mean_iou_50", "mean_iou_70")
+                    yield _row(name, band, *rates, row["n_truth"])
     for table, of_table in figures.get("segmentation", {}).items():
         classes = list(next(iter(of_table.values()))["iou"])
         yield from _head(
             f"segmentation, {table}, {scans}", ["ACC", "mAP", "mIoU", *(f"IoU {c}" for c in classes), "cells"]
         )
         for band, row in _by_band(of_table, bands):
-            rates = [_percent(row, key) for key in ("accuracy", "mean_ap", "mean_iou")]
+            rates = _rates(row, "accuracy", "mean_ap", "mean_iou")
             yield _row(band, *rates, *(_share(row["iou"][c]) for c in classes), f"{row['n_cells']:,}")
     if "road" in figures:
         yield from _head(f"road, {scans}", ["F1", "best F1", "AP", "ACC", "PRE", "REC", "IoU", "cells"])
         for band, row in _by_band(figures["road"], bands):
-            rates = [_percent(row, k) for k in ("f1", "max_f1", "ap", "accuracy", "precision", "recall", "iou")]
+            rates = _rates(row, "f1", "max_f1", "ap", "accuracy", "precision", "recall", "iou")
             yield _row(band, *rates, f"{row['n_cells']:,}")
 
 
@@ -345,6 +344,10 @@ def _share(value: float | None, digits: int = 1) -> str:
 def _percent(row: Mapping[str, Any], key: str) -> str:
     interval = row.get(f"{key}_interval")
     return _share(row[key]) + ("" if interval is None else f" ({' to '.join(map(_share, interval))})")
+
+
+def _rates(row: Mapping[str, Any], *keys: str) -> list[str]:
+    return [_percent(row, key) for key in keys]
 
 
 def _flat(values: Mapping[str, Any]) -> str:

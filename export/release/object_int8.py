@@ -20,16 +20,7 @@ from edgeperc.types.points import Floats32
 
 from .int8_graph import sort
 from .object_parity import candidate_inputs, object_figures, objects_of
-from .quantize import (
-    Calibration,
-    check_fp32,
-    folded,
-    in_int8,
-    inner_tensors,
-    race,
-    speed_of,
-    write_int8,
-)
+from .quantize import Calibration, check_fp32, folded, in_int8, inner_tensors, race, speed_of, write_int8
 
 ROUNDED = ("close_point2.weight", "close_point3.weight", "close_point4.weight")
 MOST = 0.99995  # quantile of a tensor's values that the largest 8-bit number stands for
@@ -58,9 +49,13 @@ def quantize_objects(
     def compared(trial: Path) -> dict[str, Any]:
         share = f"{len(ROUNDED)} products in int8, {len(batches[0])} candidates"
         speed = speed_of(path, share, race(path, trial, n_threads, batches=batches))
+        one, other = (
+            np.concatenate([objects_of(session, batch)[:, : len(card.classes)].argmax(axis=1) for batch in batches])
+            for session in (Session(each, "cpu") for each in (path, trial))
+        )
         parity = {
             "n_scans": len(calibration.scans),
-            "label_agreement": _agreement(path, trial, batches, len(card.classes)),
+            "label_agreement": float((one == other).mean()),
             "speed": f"{speed}, {len(batches[0])} candidates",
         }
         if kitti is None:
@@ -72,13 +67,6 @@ def quantize_objects(
     left_alone = ["the first layer of points", "the first look", "the layers of a candidate"]
     made = {"left_alone": left_alone, "weight_bits": 7 if seven_bits else 8}
     return write_int8(path, out, model, card, calibration, made, compared)
-
-
-def _agreement(one: Path, other: Path, batches: Sequence[Floats32], n_classes: int) -> float:
-    """Share of the candidates to which two networks give the same class."""
-    sessions = [Session(path, "cpu") for path in (one, other)]
-    classes = [[objects_of(session, batch)[:, :n_classes].argmax(axis=1) for batch in batches] for session in sessions]
-    return float((np.concatenate(classes[0]) == np.concatenate(classes[1])).mean())
 
 
 def candidate_batches(card: ModelCard, scans: Sequence[Floats32]) -> Iterator[Floats32]:

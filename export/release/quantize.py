@@ -20,9 +20,8 @@ import hashlib
 import re
 import tempfile
 import time
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -317,8 +316,7 @@ def _noise_of_side(sizes: Floats, weights: Ints64, bounds: Floats, steps: Floats
     inside = np.searchsorted(sizes, bounds, "right")
     kept = np.minimum(inside, np.searchsorted(sizes, steps / 12.0**0.5))  # smaller than their rounding
     clipped = [weights[k:] @ (sizes[k:] - bound) ** 2 for k, bound in zip(inside.flat, bounds.flat, strict=True)]
-    noise: Floats = np.reshape(clipped, bounds.shape) + squares[kept] + steps**2 / 12.0 * (n[inside] - n[kept])
-    return noise
+    return np.reshape(clipped, bounds.shape) + squares[kept] + steps**2 / 12.0 * (n[inside] - n[kept])
 
 
 def _between(graph: onnx.GraphProto, convolutions: Collection[str]) -> set[str]:
@@ -438,15 +436,6 @@ def race(
     return times[0], times[1]
 
 
-def paired_ratio(one: Floats, other: Floats) -> tuple[float, float, float]:
-    """The median of paired ratios, and its 95 % interval by order statistics."""
-    ratios = np.sort(other / one)
-    half = int(np.ceil(0.98 * np.sqrt(len(ratios))))
-    middle = len(ratios) // 2
-    least, most = ratios[max(0, middle - half)], ratios[min(len(ratios) - 1, middle + half)]
-    return float(np.median(ratios)), float(least), float(most)
-
-
 def _scores(figures: Mapping[str, Mapping[str, Any]]) -> dict[str, float]:
     """IoU of each class of points and cells, and F1 of boxes and road, over all ranges, by name."""
     scores = {}
@@ -471,23 +460,18 @@ def _compared(before: Path, after: Path, labeled: LabeledSets) -> list[dict[str,
     judges = [Judge([path], NETWORK_ALONE) for path in (before, after)]
     read = judges[1]  # it was also calibrated on scans, which must not be among these
 
-    def later(
-        block: str, truth_of: Callable[[Any], Truth], names: Iterable[Any]
-    ) -> list[tuple[str, Callable[[], Truth]]]:
-        return [(block, partial(truth_of, name)) for name in names]
-
-    first = samples.FIRST_SEED
-    truths = later("simulated", read.simulated, range(first, first + labeled.n_simulated))
+    truths: list[tuple[str, Callable[[Any], Truth], Any]]  # made one after the other
+    truths = [("simulated", read.simulated, samples.FIRST_SEED + k) for k in range(labeled.n_simulated)]
     if labeled.kitti is not None:
         objects = KittiObjects(labeled.kitti)
         names = objects.names("validation") or objects.names("test")  # a set of other drives has no validation drives
-        truths += later("real", lambda name: read.kitti(objects.frame(name)), names)
+        truths += [("real", lambda name: read.kitti(objects.frame(name)), name) for name in names]
     if labeled.semantickitti is not None and read.from_above is not None:
         roads = SemanticKitti(labeled.semantickitti)
-        truths += later("road", lambda name: read.semantickitti(roads.frame(name)), roads.names("all"))
+        truths += [("road", lambda name: read.semantickitti(roads.frame(name)), name) for name in roads.names("all")]
     records: list[dict[str, list[Record]]] = [{}, {}]
-    for block, make in tqdm(truths, desc="comparing", unit="scan"):
-        truth = make()
+    for block, truth_of, name in tqdm(truths, desc="comparing", unit="scan"):
+        truth = truth_of(name)
         for judge, of in zip(judges, records, strict=True):
             of.setdefault(block, []).append(judge.record(truth)[0])
     return records
@@ -621,10 +605,12 @@ def _rounded(
 def speed_of(path: Path, share: str, times: tuple[Floats, Floats]) -> str:
     """The times of both models in words. Raises RefusedError if int8 is not faster."""
     one, other = times
-    ratio, least, most = paired_ratio(one, other)
+    ratios = np.sort(other / one)
+    half, middle = int(np.ceil(0.98 * np.sqrt(len(ratios)))), len(ratios) // 2  # 95 % interval, by order statistics
+    least, most = ratios[max(0, middle - half)], ratios[min(len(ratios) - 1, middle + half)]
     speed = (
         f"{np.median(one):.1f} ms in fp32, {np.median(other):.1f} in int8, "
-        f"{ratio:.2f} times as long ({least:.2f} to {most:.2f})"
+        f"{np.median(ratios):.2f} times as long ({least:.2f} to {most:.2f})"
     )
     if most >= 1.0:
         raise RefusedError(f"{path}: not faster here with {share}: {speed}; expected an interval below 1")

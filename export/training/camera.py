@@ -28,14 +28,8 @@ COARSE_STRIDE, LOVASZ_STRIDE, EARLY_STRIDE = 2, 4, 4
 
 
 @dataclass(frozen=True)
-class Camera(Carded):
+class Camera(Carded[CameraGeometry]):
     """A class for every pixel of an image."""
-
-    @property
-    def view(self) -> CameraGeometry:
-        """The size of the network's input."""
-        assert isinstance(self.card.view, CameraGeometry)
-        return self.card.view
 
     def loss(self, outputs: ImageOutputs, targets: tuple[Tensor, ...] | list[Tensor]) -> Tensor:
         """Cross-entropy and, by the recipe, `lovasz_softmax`, of logits interpolated to the labels (every second row

@@ -6,7 +6,6 @@ As 8-bit integers they take 250 MB, so a training step reads no file and waits f
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from functools import cache, lru_cache
 from pathlib import Path
 from typing import ClassVar, NamedTuple
@@ -171,10 +170,6 @@ class ImageSamples:
         if self.recipe.augment:
             images, labels = augmented_images(images, labels, np.random.default_rng((seed, 3, step)))
         return normalized(images, self.task.input), labels
-
-    def batches(self, start: int, stop: int) -> Iterator[tuple[Tensor, Tensor]]:
-        """The batches of the steps from ``start`` to ``stop``."""
-        return map(self.batch, range(start, stop))
 
 
 @torch.no_grad()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
 import numpy as np
@@ -129,10 +129,6 @@ class ObjectBatches:
         if self.recipe.augment:
             _augment(drawn, rng)
         return drawn
-
-    def batches(self, start: int, stop: int) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
-        """The batches of the steps from ``start`` to ``stop``."""
-        return map(self.batch, range(start, stop))
 
 
 def _of_source(name: str) -> float:

@@ -30,7 +30,7 @@ from edgeperc.types.perception import Box
 from edgeperc.types.points import Floats, Floats32, Ints, Ints64, Labels, Mask, read_only
 from edgeperc.types.sensor import get_sensor
 
-from ..cards import OBJECT_CLASSES, OBJECT_VIEW, box_sizes
+from ..cards import BOX_SIZES, OBJECT_CLASSES, OBJECT_VIEW
 from ..data.processes import mapped
 from ..data.scans import LabeledScan
 from ..data.simulate import TRAINING_SENSOR
@@ -187,11 +187,10 @@ def hash_of(drive: str, box: Box | None) -> int:
 
 def _pseudo_boxes(groups: Floats, rng: np.random.Generator) -> Floats:
     """Rectangles of usual sizes whose near corner is that of a group: what a detector that errs would find there."""
-    sizes = box_sizes()
     places = groups[np.max(groups[:, 2:4], axis=1, initial=0.0) < 8.0].copy() if len(groups) else groups
     names = rng.choice([*PSEUDO_ODDS], len(places), p=[*PSEUDO_ODDS.values()])
     for place, name in zip(places, names, strict=True):
-        length, width, _ = np.array(sizes[str(name)]) * np.exp(rng.normal(0.0, 0.08, 3))
+        length, width, _ = np.array(BOX_SIZES[str(name)]) * np.exp(rng.normal(0.0, 0.08, 3))
         place[4] += rng.normal(0.0, 0.1) + (math.pi / 2.0 if rng.random() < 0.3 else 0.0)
         cos, sin = math.cos(place[4]), math.sin(place[4])
         ahead, left = cos * place[0] + sin * place[1], cos * place[1] - sin * place[0]
@@ -237,5 +236,4 @@ def _within(xy: Floats, rectangle: Floats, margin_m: float) -> Mask:
     x, y, length, width, yaw = rectangle.tolist()
     dx, dy, cos, sin = xy[:, 0] - x, xy[:, 1] - y, math.cos(yaw), math.sin(yaw)
     along, across = np.abs(cos * dx + sin * dy), np.abs(cos * dy - sin * dx)
-    found: Mask = (along < 0.5 * length + margin_m) & (across < 0.5 * width + margin_m)
-    return found
+    return (along < 0.5 * length + margin_m) & (across < 0.5 * width + margin_m)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property, partial
 from pathlib import Path
 
@@ -79,7 +79,7 @@ def write_samples(
 def variants(scans: Sequence[DriveScan]) -> list[DriveScan]:
     """The scans of drives, with objects of these scans alone pasted in: leaving them out leaves those out."""
     bank = _Bank([scan for _, scan in scans])
-    return [(drive, _Pasted(scan, bank, k)) for drive, scan in scans for k in range(N_VARIANTS)]
+    return [(drive, partial(_pasted, scan, bank, k)) for drive, scan in scans for k in range(N_VARIANTS)]
 
 
 class _Bank:
@@ -96,16 +96,9 @@ class _Bank:
         return {"objects": self.objects}
 
 
-@dataclass(frozen=True)
-class _Pasted:
-    """A scan that is made when it is needed, with objects of a bank among its own."""
-
-    scan: Callable[[], LabeledScan]
-    bank: _Bank
-    seed: int
-
-    def __call__(self) -> LabeledScan:
-        scan = self.scan()
-        rng = np.random.default_rng((self.seed, len(scan.points)))
-        sensor = drawn_sensor(rng) if rng.random() < BEAMS else None
-        return augmented(scan, rng, PASTING, self.bank.objects, sensor)
+def _pasted(make: Callable[[], LabeledScan], bank: _Bank, seed: int) -> LabeledScan:
+    """A scan with objects of a bank among its own."""
+    scan = make()
+    rng = np.random.default_rng((seed, len(scan.points)))
+    sensor = drawn_sensor(rng) if rng.random() < BEAMS else None
+    return augmented(scan, rng, PASTING, bank.objects, sensor)

@@ -33,14 +33,8 @@ VAN = 2  # a vehicle of unknown kind has the sizes of a van
 
 
 @dataclass(frozen=True)
-class Objects(Carded):
+class Objects(Carded[ObjectGeometry]):
     """Class, box and overlap of candidates."""
-
-    @property
-    def view(self) -> ObjectGeometry:
-        """Which points of a candidate the network sees."""
-        assert isinstance(self.card.view, ObjectGeometry)
-        return self.card.view
 
     def loss(self, outputs: tuple[Tensor, Tensor], targets: Sequence[Tensor]) -> Tensor:
         """The loss of a batch: outputs (B, n) and logits (B,) of the first look; classes (B,) or `VEHICLE`, and boxes

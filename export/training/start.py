@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -84,27 +85,21 @@ def _layers(network: nn.Module, image: Tensor) -> tuple[dict[str, str], set[str]
     pairs: dict[str, str] = {}
     first: set[str] = set()
 
-    def convolved(name: str) -> Any:
-        def hook(module: nn.Module, inputs: tuple[Tensor, ...], output: Tensor) -> None:
-            if torch.equal(inputs[0][:, : image.shape[1]], image):
-                first.add(f"{name}.weight")
-            made[id(output)] = (name, output)  # held, so that no other tensor gets its number
+    def convolved(name: str, module: nn.Module, inputs: tuple[Tensor, ...], output: Tensor) -> None:
+        if torch.equal(inputs[0][:, : image.shape[1]], image):
+            first.add(f"{name}.weight")
+        made[id(output)] = (name, output)  # held, so that no other tensor gets its number
 
-        return hook
-
-    def normed(name: str) -> Any:
-        def hook(module: nn.Module, inputs: tuple[Tensor, ...]) -> None:
-            if id(inputs[0]) in made:
-                pairs[made[id(inputs[0])][0]] = name
-
-        return hook
+    def normed(name: str, module: nn.Module, inputs: tuple[Tensor, ...]) -> None:
+        if id(inputs[0]) in made:
+            pairs[made[id(inputs[0])][0]] = name
 
     hooks = []
     for name, module in network.named_modules():
         if isinstance(module, nn.Conv2d | nn.ConvTranspose2d):
-            hooks.append(module.register_forward_hook(convolved(name)))
+            hooks.append(module.register_forward_hook(partial(convolved, name)))
         elif isinstance(module, nn.BatchNorm2d):
-            hooks.append(module.register_forward_pre_hook(normed(name)))
+            hooks.append(module.register_forward_pre_hook(partial(normed, name)))
     _run(network, [image], hooks)
     return pairs, first
 
@@ -162,30 +157,25 @@ def _by_class(given: Tensor, own: Tensor, classes: Sequence[str], own_classes: S
 @torch.no_grad()
 def _unfold(network: nn.Module, offsets: Mapping[str, Tensor | None], images: Sequence[Tensor]) -> None:
     """Give each batch norm its input's statistics and what cancels them; an offset that was folded may be None."""
-    norms = {name: network.get_submodule(name) for name, offset in offsets.items() if offset is not None}
+    norms: dict[str, Any] = {name: network.get_submodule(name) for name, of in offsets.items() if of is not None}
     sums: dict[str, list[Tensor]] = {name: [] for name in norms}
 
-    def watched(name: str) -> Any:
-        def hook(module: nn.Module, inputs: tuple[Tensor, ...]) -> None:
-            values = inputs[0].transpose(0, 1).flatten(1).double()
-            sums[name].append(torch.stack([values.mean(1), values.square().mean(1)]))
-
-        return hook
+    def watched(name: str, module: nn.Module, inputs: tuple[Tensor, ...]) -> None:
+        values = inputs[0].transpose(0, 1).flatten(1).double()
+        sums[name].append(torch.stack([values.mean(1), values.square().mean(1)]))
 
     hooks = []
     for name, norm in norms.items():
-        assert isinstance(norm, nn.BatchNorm2d)
         nn.init.ones_(norm.weight)
-        norm.bias.copy_(offsets[name])  # type: ignore[arg-type]  # not None
-        nn.init.zeros_(norm.running_mean)  # type: ignore[arg-type]  # it tracks them
-        norm.running_var.fill_(1.0 - norm.eps)  # type: ignore[union-attr]
-        hooks.append(norm.register_forward_pre_hook(watched(name)))
+        norm.bias.copy_(offsets[name])
+        nn.init.zeros_(norm.running_mean)
+        norm.running_var.fill_(1.0 - norm.eps)
+        hooks.append(norm.register_forward_pre_hook(partial(watched, name)))
     _run(network, images, hooks)
     for name, norm in norms.items():
-        assert isinstance(norm, nn.BatchNorm2d)
         mean, square = torch.stack(sums[name]).mean(0)
         variance = (square - mean.square()).clamp(min=0.0)
-        norm.running_mean.copy_(mean)  # type: ignore[union-attr]
-        norm.running_var.copy_(variance)  # type: ignore[union-attr]
+        norm.running_mean.copy_(mean)
+        norm.running_var.copy_(variance)
         norm.weight.copy_((variance + norm.eps).sqrt())
         norm.bias.copy_(offsets[name] + mean)

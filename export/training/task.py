@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, ClassVar, TypeAlias
@@ -26,7 +26,7 @@ from edgeperc.types.card import ModelCard
 from edgeperc.types.perception import Box
 from edgeperc.types.views import RangeImageGeometry, TopViewGeometry
 
-from ..cards import Carded, card_of
+from ..cards import Carded
 from ..data.scans import LabeledScan
 from ..data.targets import dense_targets, paper_slot_targets, slot_targets
 from ..recipe import Recipe
@@ -69,19 +69,13 @@ class Tally:
 
 
 @dataclass(frozen=True)
-class Task(Carded, ABC):
+class Task(Carded[RangeImageGeometry | TopViewGeometry], ABC):
     """The task of a recipe's network: its input, targets, loss and validation. Objects are pasted into scans by odds;
     swapped sectors replace points and their labels, but neither boxes nor the ground.
     """
 
     paste_odds: ClassVar[Mapping[str, float]]
     swaps_sectors: ClassVar[bool] = False
-
-    @property
-    def view(self) -> RangeImageGeometry | TopViewGeometry:
-        """The grid of the network's input."""
-        assert isinstance(self.card.view, RangeImageGeometry | TopViewGeometry)
-        return self.card.view
 
     @abstractmethod
     def target(self, scan: LabeledScan, projected: Projection) -> Targets:
@@ -215,8 +209,8 @@ class Road(Task):
 
 def task_of(recipe: Recipe) -> Task:
     """The task of a recipe's network."""
-    tasks: dict[str, Callable[[Recipe, ModelCard], Task]] = {"points": Points, "vehicles": Vehicles, "road": Road}
-    return tasks[recipe.task](recipe, card_of(recipe, version="0"))
+    tasks: dict[str, type[Task]] = {"points": Points, "vehicles": Vehicles, "road": Road}
+    return tasks[recipe.task].of(recipe)
 
 
 def _logits(outputs: Outputs) -> Tensor:

@@ -181,7 +181,7 @@ class _Training:
         batches: Iterator[Sequence[Tensor]] = (
             loaded(samples, state.step, recipe.steps, run.n_workers, ranks)
             if isinstance(samples, Samples)
-            else samples.batches(state.step, last_step(recipe, state.curve, self.epoch))
+            else map(samples.batch, range(state.step, last_step(recipe, state.curve, self.epoch)))
         )
         with TrainingLog(self.out if ranks.is_first else None, tensorboard=run.tensorboard) as log, progress:
             for arrays in batches:
@@ -288,7 +288,6 @@ class _Training:
             )
 
     def _resume(self) -> None:
-        """Load the checkpoint."""
         kept = read_checkpoint(self.checkpoint, self.ranks.device)
         if kept["recipe"] != self.recipe:
             raise ValueError(f"{self.checkpoint} is of another recipe: {kept['recipe']}; give an empty folder")
