@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from .tracking.tracks import Track, Tracks
+    from .tracking.tracks import Tracks
     from .types.perception import Box, Perception
     from .types.sensor import SensorProfile
 
@@ -52,16 +52,12 @@ def scan_record(perception: Perception, tracks: Tracks | None = None) -> dict[st
     Returns: With the keys of `SCAN_KEYS`; None for results of a kind of model that was not used.
     """
     record = perception.to_dict()
-    record["road"] = _road_record(perception)
-    record["tracks"] = [track.to_dict() for track in tracks or ()]
-    record["map_tracks"] = None if perception.origin_m is None else _map_tracks(perception, [*(tracks or ())])
+    listed = [*(tracks or ())]
+    record |= {"road": _road_record(perception), "tracks": [track.to_dict() for track in listed], "map_tracks": None}
+    if perception.origin_m is not None:
+        boxes = perception.in_map(track.box for track in listed)
+        record["map_tracks"] = [{"id": track.id, **box.to_dict()} for track, box in zip(listed, boxes, strict=True)]
     return {key: record[key] for key in SCAN_KEYS}
-
-
-def _map_tracks(perception: Perception, tracks: list[Track]) -> list[dict[str, Any]]:
-    """Boxes of the tracks in the map, each with the track's id."""
-    boxes = perception.in_map(track.box for track in tracks)
-    return [{"id": track.id, **box.to_dict()} for track, box in zip(tracks, boxes, strict=True)]
 
 
 def _road_record(perception: Perception) -> dict[str, Any] | None:

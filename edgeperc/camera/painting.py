@@ -220,8 +220,7 @@ def _hidden_by(
         scan[:, :3] = points[:, :3]
         rows, _ = returns(scan, sensor, known.origin_m)
         frame = ModelFrame(known)
-        moved = rows[:, :3].astype(np.float64) @ frame.R.T + frame.t
-        above = moved.astype(np.float32)
+        above = (rows[:, :3].astype(np.float64) @ frame.R.T + frame.t).astype(np.float32)
         surface = None
         if isinstance(image, Perception) and (image.n_points, image.mounting) == (len(points), known):
             surface = image.ground
@@ -266,7 +265,6 @@ def _road_of(image: Perception | ImageLabels | Mask, calibration: Calibration) -
 
 
 def _nearest(points: Points, calibration: Calibration, sensor: SensorProfile) -> DepthBuffer:
-    """The depth buffer of a scan."""
     elevations = np.radians(sensor.elevations_deg)
     step = 2.0 * math.pi / sensor.columns
     gaps = -np.diff(elevations) if len(elevations) > 1 else np.array([step])

@@ -138,8 +138,7 @@ def with_whole_options(given: Sequence[str]) -> list[str]:
     """Arguments in which ``--origin auto`` has the three values that argparse expects."""
     whole: list[str] = []
     for argument in given:
-        is_auto = argument == "auto" and whole[-1:] == ["--origin"]
-        whole += ["auto"] * 3 if is_auto else [argument]
+        whole += ["auto"] * 3 if argument == "auto" and whole[-1:] == ["--origin"] else [argument]
     return whole
 
 
@@ -267,8 +266,7 @@ def add_networks(parser: argparse.ArgumentParser, title: str = "models", *, adap
         "open models whose graphs have unusual operators, subgraphs or sizes; only for files whose "
         "origin you know (default: refuse them)",
     )
-    add_boxes_from(group)
-    add_agreement(group)
+    add_boxes(group)
     group(
         "--full-turn",
         "run the range-image model on all four quarters of the turn, so that every point around the vehicle gets "
@@ -285,8 +283,8 @@ def add_networks(parser: argparse.ArgumentParser, title: str = "models", *, adap
         )
 
 
-def add_boxes_from(group: Options) -> None:
-    """Add ``--score-threshold`` and ``--boxes-from``."""
+def add_boxes(group: Options) -> None:
+    """Add ``--score-threshold``, ``--boxes-from`` and ``--no-agreement``."""
     group(
         "--score-threshold S",
         "return boxes from this score on, 0 to 1; published figures of detectors are mostly from 0.1 on "
@@ -301,10 +299,6 @@ def add_boxes_from(group: Options) -> None:
         choices=("both", "network", "clusters"),
         default="both",
     )
-
-
-def add_agreement(group: Options) -> None:
-    """Add ``--no-agreement``."""
     group(
         "--no-agreement",
         "return the labels, boxes and cells of the networks as they are (default: correct them by one another, by "

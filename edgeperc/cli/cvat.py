@@ -91,7 +91,6 @@ class CvatFunction:
 
 
 def _read(request: object) -> tuple[bytes, float | None]:
-    """The file and the threshold of a request."""
     if not isinstance(request, dict):
         raise OptionError(
             f"the request is {type(request).__name__} {request!r:.40}; expected a JSON object with 'image', sent as "

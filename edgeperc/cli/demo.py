@@ -46,8 +46,7 @@ def add_parser(commands: Commands) -> None:
             "edgeperc demo --out /tmp/demo --model pointseg --full-turn",
         ],
     )
-    output = options(parser, "output")
-    output(
+    options(parser, "output")(
         "--out DIR",
         "folder for scan.bin, scene.png and scene.html, made if needed (default: %(default)s)",
         default=Path("edgeperc-demo"),
@@ -87,10 +86,9 @@ def demo_command(arguments: argparse.Namespace) -> int:
 
     rows = [("scene", f"{perception.n_points:,} points, a simulated hdl-64e in a street with known labels")]
     if perception.top_view is not None:
-        area_m2 = perception.top_view.drivable_area_m2
         (x_near, x_far), (y_right, y_left) = perception.top_view.x_range_m, perception.top_view.y_range_m
         extent = f"{x_far - x_near:.0f} x {y_left - y_right:.0f} m"
-        rows.append(("drivable", f"{area_m2:.0f} m2 of the {extent} ahead"))
+        rows.append(("drivable", f"{perception.top_view.drivable_area_m2:.0f} m2 of the {extent} ahead"))
     texts = [_box_text(box) for box in perception.boxes] or ["none"]
     rows += [("boxes" if k == 0 else "", text) for k, text in enumerate(texts)]
     if perception.points is not None:
@@ -125,7 +123,6 @@ def demo_command(arguments: argparse.Namespace) -> int:
 def _camera_rows(
     scan: SimulatedScan, drawn: CameraImage, calibration: Calibration, perception: Perception, picture: Path
 ) -> list[tuple[str, str]]:
-    """Paint the points, write the picture, and say what was painted."""
     import numpy as np
 
     from .. import view

@@ -246,8 +246,7 @@ def _providers() -> Iterator[Finding]:
         if short not in present and find_spec(package) is not None:
             yield Finding(f"plugin {short}", "note", "installed, but finds no device on this computer")
     yield Finding("providers", "ok", f"{', '.join(present)}; 'edgeperc providers' says how to install others")
-    names = devices()
-    yield Finding("devices", "ok", ", ".join(names) or "this version of onnxruntime does not list them")
+    yield Finding("devices", "ok", ", ".join(devices()) or "this version of onnxruntime does not list them")
 
 
 def _caches() -> Iterator[Finding]:
@@ -375,18 +374,16 @@ def _faults(needed: list[Any], extra: str, versions: dict[str, str]) -> list[tup
     """Requirements of an extra, or of edgeperc itself, that are not met: each with what is wrong."""
     faults = []
     for requirement in needed:
-        of_extra = requirement.marker is not None and "extra" in str(requirement.marker)
-        if of_extra != bool(extra) or (
-            requirement.marker is not None and not requirement.marker.evaluate({"extra": extra})
-        ):
+        marker, package = requirement.marker, str(requirement).partition(";")[0].strip()
+        of_extra = marker is not None and "extra" in str(marker)
+        if of_extra != bool(extra) or (marker is not None and not marker.evaluate({"extra": extra})):
             continue
         name = requirement.name.lower().replace("_", "-")
         if name == "edgeperc":  # an extra that consists of others
             for other in sorted(requirement.extras):
                 faults += _faults(needed, other, versions)
         elif name not in versions:
-            faults.append((str(requirement).partition(";")[0].strip(), f"{name} is missing"))
+            faults.append((package, f"{name} is missing"))
         elif not requirement.specifier.contains(versions[name], prereleases=True):
-            wanted = f"{name} is {versions[name]}, expected {requirement.specifier}"
-            faults.append((str(requirement).partition(";")[0].strip(), wanted))
+            faults.append((package, f"{name} is {versions[name]}, expected {requirement.specifier}"))
     return faults

@@ -36,8 +36,7 @@ def add_parser(commands: Commands) -> None:
         "the sensor to map to: the one that the models were trained on (default: %(default)s)",
         default="hdl-64e",
     )
-    output = options(parser, "output")
-    output("--out FILE", "the profile to write, a .json file (required)", required=True)
+    options(parser, "output")("--out FILE", "the profile to write, a .json file (required)", required=True)
 
 
 def fit_sensor_command(arguments: argparse.Namespace) -> int:

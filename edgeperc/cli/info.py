@@ -164,22 +164,15 @@ def _suggest_ego_box(
         print_error(f"--suggest-ego-box: {exc}")
         return True
     if arguments.json:
-        print_line(
-            json.dumps({"sensor": sensor.name, "suggested_ego_box": suggestion.box, "n_places": suggestion.n_places})
-        )
+        found = {"sensor": sensor.name, "suggested_ego_box": suggestion.box, "n_places": suggestion.n_places}
+        print_line(json.dumps(found))
     elif suggestion.box is None:
         print_rows([("own vehicle", f"in {suggestion.n_places} places, no return near the sensor stays where it is")])
     else:
         option = " ".join(f"{value:g}" for axis in suggestion.box for value in axis)
-        print_rows(
-            [
-                (
-                    "own vehicle",
-                    f"returns in {suggestion.n_directions} directions stay in {suggestion.n_places} places: if the box",
-                ),
-                ("", f"holds the own vehicle and nothing else, pass --ego-box {option}"),
-            ]
-        )
+        seen = f"returns in {suggestion.n_directions} directions stay in {suggestion.n_places} places: if the box"
+        then = f"holds the own vehicle and nothing else, pass --ego-box {option}"
+        print_rows([("own vehicle", seen), ("", then)])
     return False
 
 
@@ -229,10 +222,9 @@ def _model_rows(variants: Sequence[Variant]) -> list[tuple[str, str]]:
         up, down = card.view.row_elevations_deg[0], card.view.row_elevations_deg[-1]
         left, right = card.view.azimuth_left_deg, card.view.azimuth_right_deg
         seen = f"{card.view.height} beams from {up:g} to {down:g} deg, azimuths {left:g} to {right:g} deg"
-    channels = card.input.channels
     rows += [
         ("view", f"{card.view.kind}: {seen}"),
-        ("input", f"{' x '.join(map(str, card.input_shape[1:]))}: {', '.join(channels)}"),
+        ("input", f"{' x '.join(map(str, card.input_shape[1:]))}: {', '.join(card.input.channels)}"),
         ("outputs", ", ".join(f"{output.name} ({output.kind})" for output in card.outputs)),
         ("classes", ", ".join(card.classes)),
     ]
@@ -330,7 +322,6 @@ def _image_rows(path: Path) -> tuple[list[tuple[str, str]], dict[str, Any]]:
 
 
 def _dropped_text(dropped: DroppedPoints, sensor: SensorProfile) -> str:
-    """How many points are not returns, by kind."""
     parts = [f"{dropped.not_finite:,} are not finite"]
     if dropped.too_near:
         parts.append(f"{dropped.too_near:,} at most {sensor.min_range_m:g} m from the sensor, not returns")
@@ -379,7 +370,7 @@ def _scan_rows(
     conditioned, estimator, mounting_rows, mounting = _mounting_rows(cleaned, sensor, used, estimators)
     frame = ModelFrame(estimator.mounting())
     scan = frame.move(conditioned[0])
-    (n_beams, _) = FitnessProfile.from_scans([scan]).beams
+    n_beams, _ = FitnessProfile.from_scans([scan]).beams
     beams = ("beams", f"about {n_beams:.0f} rows of points ({sensor.name}: {sensor.n_beams})")
     turned = check_beams(conditioned[0], used) if sensor.mounting.roll_deg is None else ()
     model_rows, findings = _suiting_models(scan, scans[0], used, frame, [*unit, *turned], reported)
@@ -465,8 +456,7 @@ def _mounting_rows(
 
     conditioned = [scale(scan, used)[0] for scan in scans]
     estimator, reason = _estimated(MountingEstimator(sensor.mounting), conditioned)
-    known = sensor in estimators
-    estimators[sensor] = _estimated(estimators[sensor], conditioned)[0] if known else estimator
+    estimators[sensor] = _estimated(estimators[sensor], conditioned)[0] if sensor in estimators else estimator
     try:
         estimate = estimator.estimate()
     except MountingError:

@@ -38,8 +38,7 @@ def _run(given: list[str]) -> int:
         parser.error("an argument has a null character, which no file name and no value can have")
     known = argparse.Namespace(typed=shlex.join(["edgeperc", *given]), parser=parser)
     arguments = parser.parse_args(with_whole_options(given), known)
-    code: int = arguments.command(arguments)
-    return code
+    return arguments.command(arguments)
 
 
 def build_parser() -> argparse.ArgumentParser:

@@ -48,9 +48,8 @@ class Parser(argparse.ArgumentParser):
         try:
             super()._check_value(action, value)
         except argparse.ArgumentError as exc:
-            raise argparse.ArgumentError(
-                action, exc.message + nearest(str(value), map(str, action.choices or ()))
-            ) from exc
+            close = nearest(str(value), map(str, action.choices or ()))
+            raise argparse.ArgumentError(action, exc.message + close) from exc
 
     def error(self, message: str) -> NoReturn:
         """Print the message and where the usage stands, and exit with code 2."""

@@ -97,7 +97,6 @@ class Report:
 
 
 def _timing(answer: Answer) -> dict[str, Any]:
-    """Age, health and counts of an answer, which ``run --live`` prints."""
     return {
         "age_ms": round(1e3 * answer.age_s, 3),
         "health": answer.health,
@@ -107,7 +106,6 @@ def _timing(answer: Answer) -> dict[str, Any]:
 
 
 def _summary(perception: Perception) -> str:
-    """Summarize on one line: points, time, drivable area, boxes and points of each class."""
     parts = []
     if perception.image is not None:
         height, width = perception.image.labels.shape

@@ -7,7 +7,7 @@ import os
 import sys
 import time
 import warnings
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from functools import lru_cache
 from pathlib import Path
@@ -205,10 +205,8 @@ def run_command(arguments: argparse.Namespace) -> int:
     kinds = [kind for kind in _KINDS if getattr(arguments, kind)]
     _check_usage(arguments, kinds)
     images = _images(arguments, kinds)
-    if images:
-        found = Scans([*images], [], False)
-    else:
-        found = Scans([_live_source(arguments)], [], False) if arguments.live else find_scans(arguments.paths)
+    given = [*images] or ([_live_source(arguments)] if arguments.live else [])
+    found = Scans(given, [], False) if given else find_scans(arguments.paths)
     scans = found.paths
     if images and not arguments.scan:
         check_inputs(arguments, (), scans[0])
@@ -316,8 +314,8 @@ def _check_outputs(
     from ..readers.captures import is_capture
 
     sources = {_real(source) for source in (*scans, *images.values()) if source is not None}
-    pictures = _pictures_of(arguments, images)
-    outputs = [("--out", file) for target in targets for file in _files_of(target, kinds, **pictures).values()]
+    files = (_files_of(arguments, target, kinds, bool(images)) for target in targets)
+    outputs = [("--out", file) for of_target in files for file in of_target.values()]
     outputs += [("--gif", arguments.out / "tracks.gif")] if arguments.gif else []
     for name in wanted_sinks(arguments):
         value = getattr(arguments, name)
@@ -416,7 +414,8 @@ class _Perceivers:
 
     def check(self, scans: Sequence[Path | Remote], of_images: bool) -> None:
         """Make the first perceiver, so that errors of options and models come before any file is written."""
-        self._sensors = Sensors(self._arguments, scans)
+        arguments, of_turn = self._arguments, {"range_image", "objects", "pillars"}
+        self._sensors = Sensors(arguments, scans)
         scans = [scan for scan in scans if isinstance(scan, Path)]
         for scan in scans:
             try:
@@ -427,12 +426,12 @@ class _Perceivers:
         else:
             if scans:
                 return
-        cards = self.of(self.sensor_of(scan) if scans else stated_sensor(self._arguments)).cards
-        if (self._arguments.labels or self._arguments.ply) and not any(c.view.kind == "range_image" for c in cards):
+        cards = self.of(self.sensor_of(scan) if scans else stated_sensor(arguments)).cards
+        kinds = {c.view.kind for c in cards}
+        if (arguments.labels or arguments.ply) and "range_image" not in kinds:
             raise ModelError(
                 "--labels and --ply need a class for every point; add a range-image model: --model pointseg"
             )
-        kinds = {c.view.kind for c in cards}
         if ("camera" in kinds) != of_images:
             raise ModelError(
                 f"images need a camera model; add --model {CAMERA}" if of_images else _needs_no_camera(scans)
@@ -440,12 +439,8 @@ class _Perceivers:
         if of_images and not scans and kinds != {"camera"}:
             raise ModelError("images alone need a camera model alone; leave out the others, or add --scan")
         for is_given, needed, option in (
-            (
-                self._arguments.full_turn,
-                {"range_image", "objects", "pillars"},
-                "--full-turn needs a model of all sides",
-            ),
-            (self._arguments.boxes_from == "network", {"top_view", "pillars"}, "--boxes-from network needs a detector"),
+            (arguments.full_turn, of_turn, "--full-turn needs a model of all sides"),
+            (arguments.boxes_from == "network", {"top_view", "pillars"}, "--boxes-from network needs a detector"),
         ):
             if is_given and not kinds & needed:
                 raise ModelError(f"{option}, and {', '.join(c.name for c in cards)} is none; leave it out")
@@ -467,14 +462,11 @@ class _Run:
     """What a run does with every scan: perceive it, track its boxes, write its files and its part of the run's."""
 
     def __init__(
-        self, arguments: argparse.Namespace, perceivers: _Perceivers, kinds: Sequence[str], sinks: Sinks | None = None
+        self, arguments: argparse.Namespace, perceivers: _Perceivers, kinds: Sequence[str], sinks: Sinks
     ) -> None:
         from ..tracking.tracker import Tracker
 
-        self._arguments = arguments
-        self._perceivers = perceivers
-        self._kinds = kinds
-        self._sinks = sinks
+        self._arguments, self._perceivers, self._kinds, self._sinks = arguments, perceivers, kinds, sinks
         self._tracker = Tracker() if arguments.track else None
         self._straightener = None
         if arguments.deskew:
@@ -514,7 +506,7 @@ class _Run:
                     perception = perceive(points, stamp_s, origin_m=how["origin_m"])
                     if self._kinds and numbered:
                         target.mkdir(exist_ok=True)
-                    wanted = {kind: _file_of(file, kind) for kind in self._kinds}
+                    wanted = _files_of(self._arguments, file, self._kinds, False)
                     yield self._answered(name, points, perception, perceive.sensor, wanted)
                 except (EdgepercError, OSError) as exc:
                     yield name, exc, None, None
@@ -531,7 +523,6 @@ class _Run:
         return find_origin(scan, columns=self._arguments.columns) if isinstance(origin, str) else origin
 
     def image(self, path: Path, scan: Path | None, target: Path) -> Iterator[Outcome]:
-        """Perceive an image and its scan, if it has one."""
         from .. import view
         from ..camera.calibration import Calibration
         from ..readers.files import read_points
@@ -542,10 +533,9 @@ class _Run:
             image = read_image(path)
             perceive = perceivers.of(perceivers.sensor_of(scan) if scan else stated_sensor(arguments))
             origin = None if scan is None else self._origin(scan)
-            how = file_options(arguments) | {"origin_m": origin}
-            points = None if scan is None else read_points(scan, **how)
+            points = None if scan is None else read_points(scan, **file_options(arguments) | {"origin_m": origin})
             perception = perceive(points, image=image, origin_m=origin)
-            wanted = _files_of(target, self._kinds, **_pictures_of(arguments, [path]))
+            wanted = _files_of(arguments, target, self._kinds, True)
             if "image" in wanted:
                 view.draw_image(perception, image, wanted.pop("image"), title=path.name)
             if points is None:
@@ -582,22 +572,17 @@ class _Run:
                     yield path, exc, None, None  # newer scans may have arrived, so the failed scan's number is unknown
                     continue
                 assert answer is not None
-                name = name_of(answer.n_scans - 1)
+                name, tracks = name_of(answer.n_scans - 1), answer.tracks
+                points, perception = answer.points, answer.perception
                 scan = PerceivedScan(
-                    str(name),
-                    answer.stamp_s,
-                    answer.points,
-                    answer.perception,
-                    answer.tracks,
-                    perceiver.sensor,
-                    answer.health,
+                    str(name), answer.stamp_s, points, perception, tracks, perceiver.sensor, answer.health
                 )
                 try:
-                    self._sink(scan)
+                    self._sinks.write(scan)
                 except (EdgepercError, OSError) as exc:
                     yield name, exc, None, None
                 else:
-                    yield name, answer, answer.tracks, None
+                    yield name, answer, tracks, None
 
     def _answered(
         self,
@@ -620,7 +605,7 @@ class _Run:
         try:
             _write(points, perception, wanted, title=title or str(name))
         finally:  # a picture that cannot be written costs no sink its scan
-            self._sink(PerceivedScan(str(name), stamp_s, points, perception, tracks, sensor))
+            self._sinks.write(PerceivedScan(str(name), stamp_s, points, perception, tracks, sensor))
         return name, perception, tracks, view.flatten_scan(points, perception) if self._arguments.gif else None
 
     def _track(self, perception: Perception) -> Tracks:
@@ -640,10 +625,6 @@ class _Run:
         self._n += 1
         return self._n / self._arguments.rate if perception.stamp_s is None else perception.stamp_s
 
-    def _sink(self, scan: PerceivedScan) -> None:
-        if self._sinks is not None:
-            self._sinks.write(scan)
-
 
 def _alone(
     arguments: argparse.Namespace, perceivers: _Perceivers | None = None
@@ -652,8 +633,8 @@ def _alone(
     kinds = [kind for kind in _KINDS if getattr(arguments, kind)]
     perceivers = perceivers or _Perceivers(arguments)
     perceive = perceivers.of(with_mounting(stated_sensor(arguments), arguments))
-    run = _Run(arguments, perceivers, kinds)
-    return perceive, run.scans, lambda target: [_file_of(target, kind) for kind in kinds]
+    run = _Run(arguments, perceivers, kinds, Sinks(arguments))
+    return perceive, run.scans, lambda target: [*_files_of(arguments, target, kinds, False).values()]
 
 
 def _gathered_s(path: Path, sensor: str | SensorProfile) -> float | None:
@@ -669,26 +650,15 @@ def _real(path: Path) -> str:
     return str(path) if isinstance(path, Remote) else os.path.realpath(path)
 
 
-def _file_of(target: Path, kind: str) -> Path:
-    return target.with_name(f"{target.name}.{'label' if kind == 'labels' else kind}")
-
-
-def _pictures_of(arguments: argparse.Namespace, images: Collection[Path]) -> dict[str, bool]:
-    """Which pictures there are: of images, of scans, of both."""
-    of_scan = not images or bool(arguments.scan)
-    return {"of_image": bool(images), "of_scan": of_scan, "of_both": bool(images) and arguments.calib is not None}
-
-
-def _files_of(target: Path, kinds: Sequence[str], *, of_image: bool, of_scan: bool, of_both: bool) -> dict[str, Path]:
+def _files_of(arguments: argparse.Namespace, target: Path, kinds: Sequence[str], of_image: bool) -> dict[str, Path]:
     """The files to write by kind; ``"image"`` is the picture of an image, ``"both"`` that of an image and its scan."""
-    files = {kind: _file_of(target, kind) for kind in kinds}
+    files = {kind: target.with_name(f"{target.name}.{'label' if kind == 'labels' else kind}") for kind in kinds}
     if of_image and "png" in files:
-        picture = files.pop("png")
-        files["image"] = picture
-        if of_scan:
-            files["png"] = picture.with_name(f"{target.name}_scan.png")
-        if of_both:
-            files["both"] = picture.with_name(f"{target.name}_both.png")
+        files["image"] = files.pop("png")
+        if arguments.scan:
+            files["png"] = target.with_name(f"{target.name}_scan.png")
+        if arguments.calib is not None:
+            files["both"] = target.with_name(f"{target.name}_both.png")
     return files
 
 

@@ -90,8 +90,7 @@ def check_scans(arguments: argparse.Namespace, scans: Sequence[Path | Remote], *
             continue
         if not scan.exists():  # reported when its turn comes
             return
-        is_folder = scan.is_dir() and not is_capture(scan)
-        files = scan_files(scan) if is_folder else [scan]
+        files = scan_files(scan) if scan.is_dir() and not is_capture(scan) else [scan]
         kinds.update("recording" if not images and is_capture(file) else "scan file" for file in files)
         if len(kinds) > 1:
             break
@@ -276,8 +275,7 @@ class Sensors:
                 self._found[key] = exc
         found = self._found[key]
         if isinstance(found, SensorError):
-            reason = str(found).removeprefix(f"{path}: ")
-            raise SensorError(f"{path}: {reason}")
+            raise SensorError(f"{path}: {str(found).removeprefix(f'{path}: ')}")
         return found
 
     def _of(self, path: Path | Remote, beside: Sequence[Path | Remote]) -> tuple[str | SensorProfile, str]:
@@ -336,11 +334,10 @@ def with_mounting(sensor: str | SensorProfile, arguments: argparse.Namespace) ->
     from ..types.sensor import get_sensor
 
     values: dict[str, Any] = _given(arguments)
-    file, ego = getattr(arguments, "extrinsic", None), getattr(arguments, "ego_box", None)
-    remission = getattr(arguments, "remission_range", None)
-    accumulate_s = getattr(arguments, "accumulate", None)
-    if not values and file is None and ego is None and remission is None and accumulate_s is None:
+    others = [getattr(arguments, name, None) for name in ("extrinsic", "ego_box", "remission_range", "accumulate")]
+    if not values and others == [None] * 4:
         return sensor
+    file, ego, remission, accumulate_s = others
     if sensor == AUTO_SENSOR:
         raise SensorError(
             "--sensor auto and a mounting, --ego-box or --remission-range: write the sensor that is found, "

@@ -68,16 +68,13 @@ def has_workers(arguments: argparse.Namespace) -> bool:
 
 
 def _asked_by(arguments: argparse.Namespace) -> str:
-    """The option that asks for worker processes."""
     return "--engine ray" if arguments.engine == "ray" else f"--workers {arguments.workers}"
 
 
 def check_engine(arguments: argparse.Namespace, sinks: Sequence[str]) -> None:
     """Check for options that do not go with worker processes or with URLs."""
     in_order = [name for name in ("live", "track", "gif", "scan") if getattr(arguments, name)]
-    in_order = [f"--{name.replace('_', '-')}" for name in (*in_order, *sinks)]
-    if has_workers(arguments) and arguments.deskew:
-        in_order.append("--deskew")
+    in_order = [f"--{name.replace('_', '-')}" for name in (*in_order, *sinks, *["deskew"] * arguments.deskew)]
     if has_workers(arguments) and in_order:
         arguments.usage_error(
             f"{in_order[0]} needs the scans in their order, and {_asked_by(arguments)} perceives them side by side; "
@@ -140,13 +137,9 @@ def perceive_side_by_side(
         (scan, _absolute(scan), _absolute(target))
         for scan, target in zip(scans[n_first:], targets[n_first:], strict=True)
     ]
-    answers = ENGINES[arguments.engine](
-        _ScanWorker,
-        (alone, argparse.Namespace(**options), learned),
-        items,
-        workers=arguments.workers,
-        n_threads=n_threads,
-    )
+    made_of = alone, argparse.Namespace(**options), learned
+    perceived_by = ENGINES[arguments.engine]
+    answers = perceived_by(_ScanWorker, made_of, items, workers=arguments.workers, n_threads=n_threads)
     reported: set[str] = set()
     n_kept = 0
     for done, (scan, answer) in enumerate(zip(scans[n_first:], answers, strict=True), start=n_first + 1):
@@ -163,8 +156,6 @@ def perceive_side_by_side(
 
 @dataclass(frozen=True)
 class _Answer:
-    """What a worker returns of a scan."""
-
     text: str
     error: str | None
     fitness: tuple[str, ...]
@@ -210,10 +201,8 @@ class _ScanWorker:
         ((_, outcome, _, _),) = outcomes
         if isinstance(outcome, EdgepercError):  # it names the absolute path
             outcome.args = (str(outcome).replace(str(path), str(name)),)
-        text, warned = (
-            self._report.text(name, outcome),
-            tuple(dict.fromkeys(str(warning.message) for warning in caught)),
-        )
+        text = self._report.text(name, outcome)
+        warned = tuple(dict.fromkeys(str(warning.message) for warning in caught))
         if isinstance(outcome, Exception):
             return _Answer(text, str(outcome).removeprefix(f"{name}: "), (), warned)
         answer = _Answer(text, None, tuple(map(str, outcome.fitness)), warned)
@@ -260,7 +249,6 @@ def _absolute(path: Path | Remote) -> Path | Remote:
 
 
 def _absolute_if_there(value: Any) -> Any:
-    """A name or path, absolute if it is a path that exists."""
     return _absolute(Path(value)) if isinstance(value, str | Path) and Path(value).exists() else value
 
 

@@ -6,15 +6,12 @@ import argparse
 import sys
 from contextlib import ExitStack
 from functools import partial
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 from ..errors import EdgepercError
+from ..records import PerceivedScan, Sink
 from .arguments import options
 from .output import print_error, print_line
-
-if TYPE_CHECKING:
-    from ..records import PerceivedScan, Sink
-
 
 SINKS = ("mcap", "serve", "rrd", "play", "static", "labels_for", "bag")
 """Names of the options below as attributes of the arguments."""
@@ -69,7 +66,6 @@ def add_sinks(parser: argparse.ArgumentParser) -> None:
 
 
 def _address(text: str) -> tuple[str, int]:
-    """``HOST:PORT`` or ``PORT``."""
     host, _, port = text.rpartition(":")
     if not (port.isdecimal() and int(port) < 2**16):
         raise argparse.ArgumentTypeError(f"got {text!r}; expected HOST:PORT or PORT; write --serve after PATH")

@@ -4,19 +4,16 @@ from __future__ import annotations
 
 import warnings
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 
 from ..errors import PointsError
 from ..preprocess.motion import Motion, Trajectory, deskew
 from ..preprocess.returns import returns
-from ..types.points import Floats, Floats32
-
-if TYPE_CHECKING:
-    from ..tracking.tracks import Tracks
-    from ..types.points import Points
-    from ..types.sensor import SensorProfile
+from ..tracking.tracks import Tracks
+from ..types.points import Floats, Floats32, Points
+from ..types.sensor import SensorProfile
 
 
 class Straightener:

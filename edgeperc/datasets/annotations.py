@@ -14,12 +14,13 @@ from ..types.perception import Box
 
 LARGEST_TILT = math.radians(20.0)
 """Boxes have a yaw alone. A box that is tilted further is an error."""
+_PSR = ("position", "scale", "rotation")
 
 
 def read_labelcloud(path: Path) -> list[Box]:
     """Read ``labels/NAME.json`` of labelCloud, in the format that ``_classes.json`` names. Raises PointsError."""
     settings = path.with_name("_classes.json")
-    known = _read(settings).get("format", "centroid_rel") if settings.exists() else "centroid_rel"
+    known = read_json(settings).get("format", "centroid_rel") if settings.exists() else "centroid_rel"
     if known not in ("centroid_rel", "centroid_abs"):
         raise PointsError(f"{settings} has format {known!r:.40}; save the labels as centroid_rel or centroid_abs")
     with _holding(path, "labels of labelCloud"):
@@ -30,17 +31,16 @@ def read_labelcloud(path: Path) -> list[Box]:
                 [item["dimensions"][name] for name in ("length", "width", "height")],
                 [_angle(item["rotations"][axis], known) for axis in "xyz"],
             )
-            for item in _read(path)["objects"]
+            for item in read_json(path)["objects"]
         ]
 
 
 def read_sustechpoints(path: Path) -> list[Box]:
     """Read ``label/NAME.json`` of SUSTechPOINTS. Parameters, results and errors as in `read_labelcloud`."""
     with _holding(path, "labels of SUSTechPOINTS"):
-        parts = [(item["obj_type"], item["psr"]) for item in _read(path, list)]
         return [
-            _box(name, *([psr[part][axis] for axis in "xyz"] for part in ("position", "scale", "rotation")))
-            for name, psr in parts
+            _box(item["obj_type"], *([item["psr"][part][axis] for axis in "xyz"] for part in _PSR))
+            for item in read_json(path, list)
         ]
 
 
@@ -48,7 +48,7 @@ def read_datumaro(path: Path) -> dict[str, list[Box]]:
     """Read ``annotations/default.json`` of "Datumaro 3D 1.0", which CVAT exports, by the name of the scan without
     folders; boxes of tracks that are outside are left out. Raises PointsError.
     """
-    document, boxes = _read(path), dict[str, list[Box]]()
+    document, boxes = read_json(path), dict[str, list[Box]]()
     with _holding(path, "annotations of Datumaro"):
         names = [str(label["name"]) for label in document["categories"]["label"]["labels"]]
         for item in document["items"]:
@@ -74,11 +74,12 @@ def _holding(path: Path, what: str) -> Iterator[None]:
         raise PointsError(f"{path} holds no {what} ({type(exc).__name__}: {exc})") from exc
 
 
-def _read(path: Path, kind: type = dict) -> Any:
+def read_json(path: Path, kind: type = dict, expected: str = "the tool's JSON") -> Any:
+    """A document whose root is of this kind. Raises PointsError."""
     try:
         document = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, RecursionError, ValueError) as exc:
-        raise PointsError(f"{path} cannot be read ({exc}); expected the tool's JSON") from exc
+        raise PointsError(f"{path} cannot be read ({exc}); expected {expected}") from exc
     if not isinstance(document, kind):
         raise PointsError(f"{path} holds a {type(document).__name__}; expected a {kind.__name__}")
     return document

@@ -38,7 +38,6 @@ class LabeledImages:
 
     @staticmethod
     def is_one(root: Path) -> bool:
-        """Whether a folder has this layout."""
         annotated = any((root / f"{folder}annot").is_dir() for folder in FOLDERS.values())
         return annotated and (root / "classes.json").is_file()
 

@@ -115,7 +115,6 @@ class KittiLabels:
 
     @property
     def is_object(self) -> Mask:
-        """Which rows are not DontCare regions."""
         return np.array([kind != "dontcare" for kind in self.kinds], np.bool_)
 
     @property

@@ -149,10 +149,8 @@ def read_layout(layout: str | Path) -> ScanLayout:
         raise PointsError(f"{path}: the description cannot be read ({exc})") from exc
     try:
         return ScanLayout.from_json(text, path.parent)
-    except SensorError as exc:
-        raise SensorError(f"{path}: {exc}") from exc
-    except PointsError as exc:
-        raise PointsError(f"{path}: {exc}") from exc
+    except (PointsError, SensorError) as exc:
+        raise type(exc)(f"{path}: {exc}") from exc
 
 
 def point_class_names(layout: ScanLayout) -> tuple[str, ...]:

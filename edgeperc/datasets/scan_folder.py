@@ -36,7 +36,7 @@ from ..types.choices import VEHICLES
 from ..types.geometry import inside
 from ..types.perception import ROADS, Box
 from ..types.points import Bytes, Floats, Mask, Points
-from .annotations import read_datumaro, read_labelcloud, read_sustechpoints
+from .annotations import read_datumaro, read_json, read_labelcloud, read_sustechpoints
 from .kitti import IMAGE_SIZE, SEQUENCE_DRIVES, KittiCalibration, KittiLabels, label_objects, read_drives, read_labels
 from .layout import (
     BACKGROUND,
@@ -147,8 +147,7 @@ class ScanFrame:
             return np.full(len(self.points), IGNORE, np.uint8)
         by = by or ("boxes" if self.point_classes is None else "points")
         if by == "points" and self.point_classes is not None:
-            numbers = np.array([class_number(name, classes) for name in self.class_names], np.uint8)
-            return numbers[self.point_classes]
+            return np.array([class_number(name, classes) for name in self.class_names], np.uint8)[self.point_classes]
         if by != "boxes" or self.boxes is None:
             raise PointsError(f"scan {self.name} has no labels by {by}; expected points, or boxes, that it has")
         labels = np.where(self.known_at(self.points), 0, IGNORE).astype(np.uint8)
@@ -246,20 +245,11 @@ class ScanFolder:
             image_labels = KittiLabels(tuple(kinds), rows.numbers)
         elif path is not None:
             boxes = self._renamed(self._read_boxes(path, name), path)
-        classes = self._path("points", name)
-        area = self._path("drivable", name)
-        return ScanFrame(
-            name,
-            self.drives[name],
-            self.layout,
-            points,
-            boxes,
-            None if classes is None else self._read_classes(classes, len(points)),
-            None if area is None else _read_polygons(area),
-            calibration,
-            unlabeled,
-            image_labels,
-        )
+        classes, area = self._path("points", name), self._path("drivable", name)
+        point_classes = None if classes is None else self._read_classes(classes, len(points))
+        drivable = None if area is None else _read_polygons(area)
+        of_image = calibration, unlabeled, image_labels
+        return ScanFrame(name, self.drives[name], self.layout, points, boxes, point_classes, drivable, *of_image)
 
     def _path(self, kind: str, name: str) -> Path | None:
         """The label file of a scan: boxes, points or drivable; None if the scan has none."""
@@ -280,8 +270,7 @@ class ScanFolder:
     def _scans(self) -> dict[str, Path]:
         scans: dict[str, Path] = {}
         nested = self.layout.files == "semantickitti"
-        files = self.root.glob("sequences/*/velodyne/*" if nested else "velodyne/*")
-        for path in sorted(files):
+        for path in sorted(self.root.glob("sequences/*/velodyne/*" if nested else "velodyne/*")):
             if path.name.startswith("."):
                 continue
             suffix = next((end for end in SUFFIXES if path.name.lower().endswith(end)), None)
@@ -366,12 +355,7 @@ class ScanFolder:
         """Raw number of a class -> index into the description's classes, `IGNORE` if it has no name."""
         names, source = self.layout.point_names, self.root / "semseg_classes.json"
         if names is None:
-            try:
-                document = json.loads(source.read_text(encoding="utf-8"))
-            except (OSError, RecursionError, UnicodeDecodeError, ValueError) as exc:
-                raise PointsError(
-                    f"{source} cannot be read ({exc}); expected names by number, or point_names in the description"
-                ) from exc
+            document = read_json(source, object, "names by number, or point_names in the description")
             names = point_names_of(document, str(source))
         classes = point_class_names(self.layout)
         numbers = np.full(max(names, default=0) + 1, IGNORE, np.uint8)

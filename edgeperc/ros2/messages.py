@@ -10,26 +10,24 @@ import math
 import uuid
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from ..errors import OptionError, PointsError
 from ..readers.clouds import cloud_table
+from ..records import PerceivedScan
 from ..road.grid import OCCUPIED, occupancy_grid
+from ..road.rolling import RollingGrid
 from ..system.clock import nanoseconds_of
 from ..system.extras import require
 from ..system.names import check_text
+from ..tracking import Track
 from ..tracking.moving import moving_tracks
-from ..types.points import Floats, Mask, as_points
+from ..types.perception import Box
+from ..types.points import Bytes, Floats, Mask, as_points
 from ..view.colors import color_of, rgb
 from ..view.content import EDGES, box_corners
-
-if TYPE_CHECKING:
-    from ..records import PerceivedScan
-    from ..road.rolling import RollingGrid
-    from ..tracking import Track
-    from ..types.perception import Box
 
 __all__ = ["CLOUD", "LIVE_OUTPUTS", "OUTPUTS", "RosMessages", "nanoseconds"]
 
@@ -230,18 +228,14 @@ class RosMessages:
             )
             for name in _POINT.names or ()
         ]
-        return self._make(
-            CLOUD,
-            header=self._header(scan, stamp_ns),
-            height=1,
-            width=len(rows),
-            fields=fields,
-            is_bigendian=False,
-            point_step=_POINT.itemsize,
-            row_step=rows.nbytes,
-            data=rows.view(np.uint8),
-            is_dense=bool(np.isfinite(points[:, :3]).all()),
-        )
+        is_dense = bool(np.isfinite(points[:, :3]).all())
+        data = rows.view(np.uint8).reshape(-1, _POINT.itemsize)
+        return self._cloud(self._header(scan, stamp_ns), fields, data, is_bigendian=False, is_dense=is_dense)
+
+    def _cloud(self, header: Any, fields: Any, rows: Bytes, **kind: bool) -> Any:
+        step = rows.shape[1]
+        sizes = {"height": 1, "width": len(rows), "point_step": step, "row_step": rows.size}
+        return self._make(CLOUD, header=header, fields=fields, **sizes, data=rows.reshape(-1), **kind)
 
     def markers(self, scan: PerceivedScan, stamp_ns: int | None = None) -> Any:
         """Boxes and tracks for RViz: a visualization_msgs/MarkerArray.
@@ -252,26 +246,24 @@ class RosMessages:
         """
         header = self._header(scan, stamp_ns)
         markers = [self._marker(header, "", 0, _CUBE, action=_DELETE_ALL)]
+
+        def add(namespace: str, number: int, kind: int, **shown: Any) -> None:
+            markers.append(self._marker(header, namespace, number, kind, **shown))
+
         for k, box in enumerate(scan.perception.boxes):
-            cube: dict[str, Any] = {"pose": self._pose(box), "scale": box.size, "color": (box.label, 0.4)}
-            markers.append(self._marker(header, "boxes", k, _CUBE, **cube))
+            add("boxes", k, _CUBE, pose=self._pose(box), scale=box.size, color=(box.label, 0.4))
         for track in scan.tracks or ():
             box, color = track.box, (track.label, 0.4 if track.coasting else 1.0)
             number = track.id % 2**31
             edges = box_corners(replace(box, center=(0.0, 0.0, 0.0), yaw=0.0))[np.ravel(EDGES)]  # in the marker's pose
-            thin: dict[str, Any] = {"scale": (0.08, 0.0, 0.0), "color": color}
-            markers.append(
-                self._marker(header, "tracks", number, _LINE_LIST, pose=self._pose(box), points=edges, **thin)
-            )
+            add("tracks", number, _LINE_LIST, pose=self._pose(box), points=edges, scale=(0.08, 0.0, 0.0), color=color)
             speed_mps = math.hypot(*track.velocity)
             above = (*box.center[:2], box.center[2] + box.size[2] / 2.0 + 0.5)
-            text: dict[str, Any] = {"pose": self._pose(center=above), "scale": (0.0, 0.0, 0.6), "color": color}
-            text["text"] = f"{track.label} {track.id} {speed_mps:.1f} m/s"
-            markers.append(self._marker(header, "track_labels", number, _TEXT, **text))
+            pose, text = self._pose(center=above), f"{track.label} {track.id} {speed_mps:.1f} m/s"
+            add("track_labels", number, _TEXT, pose=pose, scale=(0.0, 0.0, 0.6), color=color, text=text)
             if speed_mps > _MOVING_MPS:
                 way = np.array([box.center, np.add(box.center, [*track.velocity, 0.0])])
-                arrow: dict[str, Any] = {"scale": (0.15, 0.3, 0.3), "color": color, "points": way}
-                markers.append(self._marker(header, "track_velocities", number, _ARROW, **arrow))
+                add("track_velocities", number, _ARROW, scale=(0.15, 0.3, 0.3), color=color, points=way)
         return self._make("visualization_msgs/msg/MarkerArray", markers=markers)
 
     def occupancy(self, scan: PerceivedScan, stamp_ns: int | None = None) -> Any:
@@ -326,18 +318,8 @@ class RosMessages:
         step = table.dtype.itemsize
         rows = np.ndarray((*table.shape, step), np.uint8, data, strides=(*table.strides, 1)) if table.size else data[:0]
         kept = rows.reshape(-1, step)[mask]
-        return self._make(
-            CLOUD,
-            header=self._header(scan, stamp_ns),
-            height=1,
-            width=len(kept),
-            fields=cloud.fields,
-            is_bigendian=cloud.is_bigendian,
-            point_step=step,
-            row_step=kept.size,
-            data=kept.reshape(-1),
-            is_dense=True,
-        )
+        header = self._header(scan, stamp_ns)
+        return self._cloud(header, cloud.fields, kept, is_bigendian=cloud.is_bigendian, is_dense=True)
 
     def detections(self, scan: PerceivedScan, stamp_ns: int | None = None) -> Any:
         """Tracks or, without a tracker, boxes: a vision_msgs/Detection3DArray of vision_msgs 4.

@@ -434,7 +434,6 @@ def _topics_of(outputs: Sequence[str], prefix: str, with_rolling: bool) -> dict[
             raise OptionError("the output rolling needs poses; pass rolling=, with a topic of nav_msgs/Odometry")
         topics[name] = topic or f"{prefix.rstrip('/')}/{name}"
     topics.pop("diagnostics", None)
-    return {
-        **topics,
-        **({ROLLING: f"{prefix.rstrip('/')}/{ROLLING}"} if with_rolling and ROLLING not in topics else {}),
-    }
+    if with_rolling:
+        topics.setdefault(ROLLING, f"{prefix.rstrip('/')}/{ROLLING}")
+    return topics

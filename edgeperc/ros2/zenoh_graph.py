@@ -103,12 +103,9 @@ class ZenohGraph:
     def _declare(self, kind: str, *more: str) -> str:
         """Show an entity to other nodes. Returns the key of its token."""
         above, _, plain = self.name.rpartition("/")
-        space = _mangled(above or "/")
-        number = str(self._n_entities)
+        name = [str(self._n_entities), kind, "%", _mangled(above or "/"), plain]
         self._n_entities += 1
-        key = "/".join(
-            ["@ros2_lv", str(self._domain), str(self._session.zid()), "0", number, kind, "%", space, plain, *more]
-        )
+        key = "/".join(["@ros2_lv", str(self._domain), str(self._session.zid()), "0", *name, *more])
         self._kept.append(self._session.liveliness().declare_token(key))
         return key
 
@@ -133,12 +130,9 @@ class ZenohGraph:
     def subscribe(self, topic: str, message_type: str, receive: Callable[[bytes], None]) -> None:
         """Receive messages; see `Graph.subscribe`."""
         full, kind, digest = self._topic(topic, message_type)
-
-        def on_sample(sample: Any) -> None:
-            receive(sample.payload.to_bytes())
-
         # Any hash: Humble writes none, and what the bytes are is checked when they are read.
-        self._kept.append(self._session.declare_subscriber(f"{self._domain}{full}/{kind}/*", on_sample))
+        key = f"{self._domain}{full}/{kind}/*"
+        self._kept.append(self._session.declare_subscriber(key, lambda sample: receive(sample.payload.to_bytes())))
         self._declare("MS", _mangled(full), kind, digest, _RECEIVED)
 
     def _topic(self, topic: str, message_type: str) -> tuple[str, str, str]:

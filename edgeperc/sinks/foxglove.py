@@ -36,19 +36,9 @@ from ..types.mounting import MODEL_HEIGHT_M
 from ..types.perception import Box, TopView
 from ..types.points import Floats
 from ..view.content import EDGES, box_corners, box_text, track_text
+from . import scene
 from .relay import MAX_VIEWERS, Relay
 from .run_file import RunFile
-from .scene import (
-    BASE,
-    LIDAR,
-    ODOM,
-    Trails,
-    base_pose,
-    byte_colors,
-    checked_target,
-    colored_points,
-    nanoseconds,
-)
 
 __all__ = ["STATUS_SCHEMA", "McapSink", "ServeSink"]
 
@@ -92,51 +82,49 @@ class _Channels:
         self._messages: Any = require("foxglove.messages", "foxglove", "Messages for Foxglove", package="foxglove-sdk")
         self._channels: Any = require("foxglove.channels", "foxglove", "Messages for Foxglove", package="foxglove-sdk")
         self._open: dict[str, Any] = {}
-        self._trails = Trails()
+        self._trails = scene.Trails()
 
-    def _channel(self, kind: str, topic: str, metadata: dict[str, str] | None = None) -> Any:
+    def _log(self, topic: str, kind: str, message: Any, metadata: dict[str, str] | None = None) -> None:
         if topic not in self._open:
             make = getattr(self._channels, f"{kind}Channel")
             self._open[topic] = make(topic, context=self._context, metadata=metadata)
-        return self._open[topic]
+        self._open[topic].log(message, log_time=self._now)
 
     def write(self, scan: PerceivedScan) -> None:
         """Log the messages of a scan."""
-        now = nanoseconds(scan)
-        stamp = self._messages.Timestamp(now // 10**9, now % 10**9)
-        self._write_frames(scan, now, stamp)
-        self._write_points(scan, now, stamp)
-        self._write_boxes(scan, now, stamp)
+        self._now = scene.nanoseconds(scan)
+        self._stamp = self._messages.Timestamp(self._now // 10**9, self._now % 10**9)
+        self._write_frames(scan)
+        self._write_points(scan)
+        self._write_boxes(scan)
         if scan.tracked is not None:
-            self._write_tracks(scan, now, stamp)
+            self._write_tracks(scan)
         if scan.perception.top_view is not None:
-            self._write_drivable(scan.perception.top_view, now, stamp)
-        self._write_status(scan, now)
+            self._write_drivable(scan.perception.top_view)
+        self._write_status(scan)
 
-    def _write_frames(self, scan: PerceivedScan, now: int, stamp: Any) -> None:
+    def _write_frames(self, scan: PerceivedScan) -> None:
         make = self._messages
-        R, t = base_pose(scan)
-        transforms = [(BASE, LIDAR, R, t)]
+        R, t = scene.base_pose(scan)
+        transforms = [(scene.BASE, scene.LIDAR, R, t)]
         if scan.tracks is not None:
             pose = scan.tracks.T_world_sensor
             turned = pose[:3, :3] @ R.T
-            transforms.append((ODOM, BASE, turned, pose[:3, 3] - turned @ t))
-        made = []
-        for parent, child, rotation, translation in transforms:
-            x, y, z, w = quaternion(rotation)
-            made.append(
-                make.FrameTransform(
-                    timestamp=stamp,
-                    parent_frame_id=parent,
-                    child_frame_id=child,
-                    translation=self._vector(translation),
-                    rotation=make.Quaternion(x=x, y=y, z=z, w=w),
-                )
+            transforms.append((scene.ODOM, scene.BASE, turned, pose[:3, 3] - turned @ t))
+        made = [
+            make.FrameTransform(
+                timestamp=self._stamp,
+                parent_frame_id=parent,
+                child_frame_id=child,
+                translation=self._vector(translation),
+                rotation=make.Quaternion(**dict(zip("xyzw", quaternion(rotation), strict=True))),
             )
-        self._channel("FrameTransforms", "/tf").log(make.FrameTransforms(transforms=made), log_time=now)
+            for parent, child, rotation, translation in transforms
+        ]
+        self._log("/tf", "FrameTransforms", make.FrameTransforms(transforms=made))
 
-    def _write_points(self, scan: PerceivedScan, now: int, stamp: Any) -> None:
-        points, labels, classes, colors = colored_points(scan)
+    def _write_points(self, scan: PerceivedScan) -> None:
+        points, labels, classes, colors = scene.colored_points(scan)
         rows = np.empty(len(points), _POINT)
         for k, name in enumerate(("x", "y", "z", "remission")):
             rows[name] = points[:, k]
@@ -145,16 +133,16 @@ class _Channels:
         rows["alpha"], rows["class"] = 255, labels
         names = json.dumps([printable(name) for name in classes])
         message = self._messages.PointCloud(
-            timestamp=stamp,
-            frame_id=LIDAR,
+            timestamp=self._stamp,
+            frame_id=scene.LIDAR,
             pose=self._pose((0.0, 0.0, 0.0), 0.0),
             point_stride=_POINT.itemsize,
             fields=self._fields(_POINT),
             data=rows.tobytes(),
         )
-        self._channel("PointCloud", "/points", {"classes": names}).log(message, log_time=now)
+        self._log("/points", "PointCloud", message, {"classes": names})
 
-    def _write_boxes(self, scan: PerceivedScan, now: int, stamp: Any) -> None:
+    def _write_boxes(self, scan: PerceivedScan) -> None:
         make, entities = self._messages, []
         sources = {} if scan.tracks is None else dict(zip(scan.tracks.sources.tolist(), scan.tracks.ids, strict=True))
         for k, box in enumerate(scan.perception.boxes):
@@ -162,8 +150,8 @@ class _Channels:
             cube = make.CubePrimitive(pose=pose, size=self._vector(box.size), color=self._color(box.label, 0.4))
             arrows = [] if box.front is None else [self._arrow(pose, box.size[0] / 2.0 + 1.0, color)]
             entity = make.SceneEntity(
-                timestamp=stamp,
-                frame_id=LIDAR,
+                timestamp=self._stamp,
+                frame_id=scene.LIDAR,
                 id=f"track {sources[k]}" if k in sources else f"box {k}",
                 metadata=self._pairs(label=printable(box.label), score=f"{box.score:.4f}"),
                 cubes=[cube],
@@ -171,9 +159,9 @@ class _Channels:
                 texts=[self._text(box, box_text(box), color)],
             )
             entities.append(entity)
-        self._update("/boxes", entities, now, stamp)
+        self._update("/boxes", entities)
 
-    def _write_tracks(self, scan: PerceivedScan, now: int, stamp: Any) -> None:
+    def _write_tracks(self, scan: PerceivedScan) -> None:
         assert scan.tracks is not None
         make, entities, trails = self._messages, [], self._trails.update(scan.tracks)
         R = scan.tracks.T_world_sensor[:3, :3]
@@ -185,8 +173,8 @@ class _Channels:
             lines.append(self._line("LineStrip", trails[track.id], color))
             ahead = self._pose(box.center, math.atan2(dy, dx))
             entity = make.SceneEntity(
-                timestamp=stamp,
-                frame_id=ODOM,
+                timestamp=self._stamp,
+                frame_id=scene.ODOM,
                 id=f"track {track.id}",
                 metadata=self._pairs(
                     label=printable(track.label), score=f"{track.score:.4f}", coasting=str(track.coasting).lower()
@@ -196,26 +184,26 @@ class _Channels:
                 texts=[self._text(box, track_text(track), color)],
             )
             entities.append(entity)
-        self._update("/tracks", entities, now, stamp)
+        self._update("/tracks", entities)
 
-    def _update(self, topic: str, entities: list[Any], now: int, stamp: Any) -> None:
+    def _update(self, topic: str, entities: list[Any]) -> None:
         # All older entities go, so that a viewer that missed a message shows no old box.
         make = self._messages
-        gone = make.SceneEntityDeletion(timestamp=stamp, type=make.SceneEntityDeletionType.All)
-        self._channel("SceneUpdate", topic).log(make.SceneUpdate(deletions=[gone], entities=entities), log_time=now)
+        gone = make.SceneEntityDeletion(timestamp=self._stamp, type=make.SceneEntityDeletionType.All)
+        self._log(topic, "SceneUpdate", make.SceneUpdate(deletions=[gone], entities=entities))
 
-    def _write_drivable(self, view: TopView, now: int, stamp: Any) -> None:
+    def _write_drivable(self, view: TopView) -> None:
         drivable = view.drivable
         cells = np.zeros(view.labels.shape, _CELL)
-        colors = byte_colors(list(view.classes))[view.labels]
+        colors = scene.byte_colors(list(view.classes))[view.labels]
         for k, name in enumerate(("red", "green", "blue")):
             cells[name] = colors[..., k]
         # Only the drivable cells are opaque. Foxglove's rows begin at the lowest x and y.
         cells["alpha"], cells["class"], cells["drivable"] = np.where(drivable, 160, 0), view.labels, drivable
         cells = np.ascontiguousarray(cells[::-1, ::-1].T)
         message = self._messages.Grid(
-            timestamp=stamp,
-            frame_id=BASE,
+            timestamp=self._stamp,
+            frame_id=scene.BASE,
             pose=self._pose((view.x_range_m[0], view.y_range_m[0], -MODEL_HEIGHT_M), 0.0),
             column_count=view.labels.shape[0],
             cell_size=self._messages.Vector2(x=view.cell_m, y=view.cell_m),
@@ -225,9 +213,9 @@ class _Channels:
             data=cells.tobytes(),
         )
         names = json.dumps([printable(name) for name in view.classes])
-        self._channel("Grid", "/drivable", {"classes": names}).log(message, log_time=now)
+        self._log("/drivable", "Grid", message, {"classes": names})
 
-    def _write_status(self, scan: PerceivedScan, now: int) -> None:
+    def _write_status(self, scan: PerceivedScan) -> None:
         if "/status" not in self._open:
             sdk = require("foxglove", "foxglove", "Messages for Foxglove", package="foxglove-sdk")
             self._open["/status"] = sdk.Channel("/status", schema=STATUS_SCHEMA, context=self._context)
@@ -245,8 +233,7 @@ class _Channels:
             "providers": {printable(name): printable(text) for name, text in perception.providers.items()},
             "fitness": [printable(line) for line in perception.fitness],
         }
-        known = {name: value for name, value in status.items() if value is not None}
-        self._open["/status"].log(known, log_time=now)
+        self._log("/status", "", {name: value for name, value in status.items() if value is not None})
 
     def _fields(self, dtype: np.dtype[Any]) -> list[Any]:
         make, fields, offset = self._messages, [], 0
@@ -265,7 +252,7 @@ class _Channels:
         return self._messages.Pose(position=self._vector(center), orientation=turned)
 
     def _color(self, label: str, alpha: float) -> Any:
-        r, g, b = (byte_colors([label])[0] / 255.0).tolist()
+        r, g, b = (scene.byte_colors([label])[0] / 255.0).tolist()
         return self._messages.Color(r=r, g=g, b=b, a=alpha)
 
     def _pairs(self, **texts: str) -> list[Any]:
@@ -312,7 +299,7 @@ class McapSink:
 
     def __init__(self, path: str | Path) -> None:
         require("foxglove.mcap", "foxglove", "Writing an MCAP file", package="foxglove-sdk")
-        self._path = checked_target(path)
+        self._path = scene.checked_target(path)
         self._channels: _Channels | None = None
 
     def _start(self) -> _Channels:

@@ -150,8 +150,7 @@ class RerunSink:
     def _ids(self, boxes: Any) -> NDArray[np.uint16]:
         return np.array([self._classes[box.label] for box in boxes], np.uint16)
 
-    def _boxes(self, boxes: Any, texts: list[str], *, show: bool) -> Any:
-        listed: list[Box] = list(boxes)
+    def _boxes(self, listed: list[Box], texts: list[str], *, show: bool) -> Any:
         yaws = np.array([box.yaw for box in listed]) / 2.0
         turns = np.column_stack([np.zeros((len(listed), 2)), np.sin(yaws), np.cos(yaws)])
         return self._rr.Boxes3D(

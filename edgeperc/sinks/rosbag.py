@@ -8,16 +8,14 @@ import os
 import sqlite3
 from contextlib import closing, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 from ..errors import OptionError
+from ..records import PerceivedScan
 from ..ros2.messages import OUTPUTS, RosMessages, nanoseconds
 from ..system.atomic import beside
 from ..system.extras import require
 from .run_file import settle
-
-if TYPE_CHECKING:
-    from ..records import PerceivedScan
 
 __all__ = ["TOPICS", "BagSink"]
 
@@ -101,8 +99,7 @@ class BagSink:
     @property
     def _database(self) -> sqlite3.Connection | None:
         storage = getattr(self._writer, "storage", self._writer)  # at first, rosbags' writer itself
-        found: sqlite3.Connection | None = getattr(storage, "conn", None)
-        return found
+        return getattr(storage, "conn", None)
 
     def _typed(self, error: OSError | sqlite3.Error) -> OSError:
         number = error.errno if isinstance(error, OSError) else errno.ENOSPC if "full" in str(error) else errno.EIO

@@ -21,22 +21,8 @@ from ..system.printable import printable
 from ..types.frame import ModelFrame
 from ..types.perception import Box, Perception, TopView
 from ..types.points import Bytes, Floats32, Points
+from . import content
 from .colors import HIGH, LOW, color_of
-from .content import (
-    box_corners,
-    box_text,
-    check_points,
-    class_facts,
-    drawable_boxes,
-    drawable_points,
-    drivable_strips,
-    ground_plane,
-    in_model_frame,
-    paint_points,
-    provider_lines,
-    timing_line,
-    track_text,
-)
 
 if TYPE_CHECKING:
     from ..tracking.tracks import Tracks
@@ -69,21 +55,14 @@ def write_html(perception: Perception, points: Points, path: str | Path, *, titl
     OSError
         The file cannot be written.
     """
-    check_points(points, perception)
+    content.check_points(points, perception)
     classes: dict[str, int] = {}
     scan, xyz, remission, label = _scan(perception, points, classes)
     scan |= {"xyz": _base64(xyz), "remission": _base64(remission), "label": _base64(label)}
-    facts = f"{perception.n_points:,} points · {_escaped(timing_line(perception))}"
-    facts += "".join(f"<br>{_escaped(line)}" for line in provider_lines(perception))
-    _fill_page(
-        path,
-        title or "A scan",
-        facts,
-        perception.fitness,
-        classes,
-        [_in_script(json.dumps(scan, allow_nan=False))],
-        [0.0],
-    )
+    facts = f"{perception.n_points:,} points · {_escaped(content.timing_line(perception))}"
+    facts += "".join(f"<br>{_escaped(line)}" for line in content.provider_lines(perception))
+    text = _in_script(json.dumps(scan, allow_nan=False))
+    _fill_page(path, title or "A scan", facts, perception.fitness, classes, [text], [0.0])
 
 
 class DrivePage:
@@ -141,7 +120,7 @@ class DrivePage:
         PointsError
             ``points`` is not the scan that was perceived.
         """
-        check_points(points, perception)
+        content.check_points(points, perception)
         self._n += 1
         if (self._n - 1) % self.every:
             return
@@ -230,24 +209,24 @@ def _scan(
     perception: Perception, points: Points, classes: dict[str, int], tracks: Tracks | None = None
 ) -> tuple[dict[str, Any], Floats32, Bytes, Bytes]:
     """What the page shows of a scan, and its points: x, y, z, remission and class; new classes get the next numbers."""
-    facts = class_facts(perception)
+    facts = content.class_facts(perception)
     boxes, texts = _boxes(perception, tracks)
     frame = ModelFrame(perception.mounting)
-    perception, points = in_model_frame(replace(perception, boxes=tuple(boxes)), points)
-    names, painted = paint_points(points, perception)
-    seen = drawable_points(points)
+    perception, points = content.in_model_frame(replace(perception, boxes=tuple(boxes)), points)
+    names, painted = content.paint_points(points, perception)
+    seen = content.drawable_points(points)
     points, painted = points[seen], painted[seen]
     for name in (*names, *facts, *(box.label for box in perception.boxes)):
         classes.setdefault(name, len(classes))
     # Some sensors give remission up to 255 or 65535.
     remission = np.maximum(points[:, 3], 0.0) / max(1.0, float(points[:, 3].max(initial=0.0)))
     scan: dict[str, Any] = {
-        "ground": [round(value, 5) for value in ground_plane(perception, points)],
+        "ground": [round(value, 5) for value in content.ground_plane(perception, points)],
         "road": None if perception.top_view is None else _road(perception.top_view),
         "boxes": [
             {
                 "name": printable(box.label),
-                "corners": np.round(box_corners(box), 3).tolist(),
+                "corners": np.round(content.box_corners(box), 3).tolist(),
                 "color": color_of(box.label),
                 "text": text,
             }
@@ -266,12 +245,12 @@ def _scan(
 
 def _boxes(perception: Perception, tracks: Tracks | None) -> tuple[list[Box], list[str]]:
     """Drawable boxes with their texts: those of tracks in place of the boxes that belong to them."""
-    shown = {-1 - k: (box, box_text(box)) for k, box in enumerate(perception.boxes)}
+    shown = {-1 - k: (box, content.box_text(box)) for k, box in enumerate(perception.boxes)}
     for k, track in enumerate(tracks or ()):
         assert tracks is not None
         source = int(tracks.sources[k])
-        shown[-1 - source if source >= 0 else k] = track.box, track_text(track)
-    pairs = [(box, text) for box, text in shown.values() if drawable_boxes([box])]
+        shown[-1 - source if source >= 0 else k] = track.box, content.track_text(track)
+    pairs = [(box, text) for box, text in shown.values() if content.drawable_boxes([box])]
     return [box for box, _ in pairs], [text for _, text in pairs]
 
 
@@ -314,7 +293,6 @@ def _in_script(data: str) -> str:
 
 
 def _escaped(text: str) -> str:
-    """A text from outside, as HTML."""
     return html.escape(printable(text))
 
 
@@ -322,19 +300,18 @@ def _policy(template: str) -> str:
     """The content security policy: the page loads nothing, and runs no script but its own, named by its hash."""
     allowed = ["default-src 'none'", "base-uri 'none'", "form-action 'none'"]
     for element in ("script", "style"):
-        (content,) = re.findall(f"<{element}>(.*?)</{element}>", template, flags=re.DOTALL)
-        digest = hashlib.sha256(content.encode()).digest()
+        (text,) = re.findall(f"<{element}>(.*?)</{element}>", template, flags=re.DOTALL)
+        digest = hashlib.sha256(text.encode()).digest()
         allowed.append(f"{element}-src 'sha256-{base64.b64encode(digest).decode()}'")
     return "; ".join(allowed)
 
 
 def _road(top_view: TopView) -> dict[str, Any]:
-    """The drivable cells, as the page draws them."""
     return {
         "cell": top_view.cell_m,
         "x": top_view.x_range_m[1],
         "y": top_view.y_range_m[1],
-        "strips": drivable_strips(top_view).tolist(),
+        "strips": content.drivable_strips(top_view).tolist(),
     }
 
 

@@ -13,36 +13,8 @@ from ..road.ahead import FreeAhead, RoadAhead, road_ahead
 from ..types.choices import STATIC
 from ..types.perception import Box, Perception, TopView
 from ..types.points import Bytes, Floats, Labels, Points
-from .canvas import (
-    Label,
-    add_axes,
-    area_of,
-    as_png,
-    draw_legend,
-    height_of_legend,
-    new_figure,
-    place_labels,
-    shorten,
-    wrap,
-    write_at,
-    write_heading,
-)
+from . import canvas, content
 from .colors import AMBER, FAINT, INK, PANEL, color_of, ramp, rgb
-from .content import (
-    EDGES,
-    box_corners,
-    check_points,
-    class_facts,
-    drawable_boxes,
-    drawable_points,
-    ground_plane,
-    in_model_frame,
-    paint_points,
-    paint_vehicles,
-    perceived_image,
-    provider_lines,
-    timing_line,
-)
 
 _PARTS = {90.0: "90° ahead", 360.0: "all around"}
 # Sizes in pixels. A page that shows the picture 1000 pixels wide reduces text of 13 points to 8.
@@ -110,26 +82,28 @@ def draw(perception: Perception, points: Points, path: str | Path | None = None,
     OSError
         The file cannot be written.
     """
-    check_points(points, perception)
-    perception, points = in_model_frame(perception, points)
-    names, painted = paint_points(points, perception)
-    seen = drawable_points(points)
+    content.check_points(points, perception)
+    perception, points = content.in_model_frame(perception, points)
+    names, painted = content.paint_points(points, perception)
+    seen = content.drawable_points(points)
     points, painted = points[seen], painted[seen]
-    ground = ground_plane(perception, points)
-    boxes = drawable_boxes(perception.boxes)
-    paint_vehicles(names, painted, points, boxes)
+    ground = content.ground_plane(perception, points)
+    boxes = content.drawable_boxes(perception.boxes)
+    content.paint_vehicles(names, painted, points, boxes)
     top_view = perception.top_view
     road = None if top_view is None else road_ahead(top_view, boxes)
     # The part of the turn in which points have a class: the quarter ahead, or all of it.
     found = perception.points
     turn_deg = 360.0 if found is not None and (points[found.in_view[seen], 0] < 0.0).any() else 90.0
 
-    facts = class_facts(perception)
-    ruler = new_figure(_WIDTH, 100)
-    warnings = [line for text in perception.fitness for line in wrap(ruler, text, _WIDTH - 2 * _MARGIN, fontsize=13.0)]
+    facts = content.class_facts(perception)
+    ruler = canvas.new_figure(_WIDTH, 100)
+    warnings = [
+        line for text in perception.fitness for line in canvas.wrap(ruler, text, _WIDTH - 2 * _MARGIN, fontsize=13.0)
+    ]
     legend_top = _BOTTOM + 40
-    notes_top = legend_top + height_of_legend(facts) + 30
-    figure = new_figure(_WIDTH, notes_top + 38 + 26 * len(warnings))
+    notes_top = legend_top + canvas.height_of_legend(facts) + 30
+    figure = canvas.new_figure(_WIDTH, notes_top + 38 + 26 * len(warnings))
 
     drawn, left = _Drawn(points, names, painted, top_view, road, boxes, ground), float(_MARGIN)
     if top_view is not None and road is not None:
@@ -143,8 +117,8 @@ def draw(perception: Perception, points: Points, path: str | Path | None = None,
         count += f" in {sum(perception.stage_ms.values()):.0f} ms"
     write_frame(figure, perception, (title, 1100), count, facts, (legend_top, notes_top))
     for k, line in enumerate(warnings):
-        write_at(figure, _MARGIN, notes_top + 32 + 26 * k, line, fontsize=13.0, color=AMBER)
-    return as_png(figure, path)
+        canvas.write_at(figure, _MARGIN, notes_top + 32 + 26 * k, line, fontsize=13.0, color=AMBER)
+    return canvas.as_png(figure, path)
 
 
 def draw_image(perception: Perception, image: Bytes, path: str | Path | None = None, *, title: str = "") -> bytes:
@@ -175,18 +149,18 @@ def draw_image(perception: Perception, image: Bytes, path: str | Path | None = N
     OSError
         The file cannot be written.
     """
-    image, labels = perceived_image(image, perception)
+    image, labels = content.perceived_image(image, perception)
     counts = sorted(labels.counts().items(), key=lambda item: -item[1])
     facts = {name: [f"{100.0 * n / labels.labels.size:.1f} %"] for name, n in counts if n}
     height = min(_WIDTH * image.shape[0] // image.shape[1], _WIDTH) + 1
-    legend_top, legend_height = 80 + height + 24, height_of_legend(facts)
-    figure = new_figure(_WIDTH, legend_top + legend_height + 68)
-    axes = add_axes(figure, _MARGIN, 80, _WIDTH - 2 * _MARGIN, height)
+    legend_top, legend_height = 80 + height + 24, canvas.height_of_legend(facts)
+    figure = canvas.new_figure(_WIDTH, legend_top + legend_height + 68)
+    axes = canvas.add_axes(figure, _MARGIN, 80, _WIDTH - 2 * _MARGIN, height)
     colors = rgb([color_of(name) for name in labels.classes]).astype(np.float32)[labels.labels]
     axes.imshow(0.55 * image.astype(np.float32) / 255.0 + 0.45 * colors, aspect="equal", interpolation="antialiased")
     size = f"{image.shape[1]} x {image.shape[0]} pixels, {100.0 * labels.drivable_share:.1f} % road"
     write_frame(figure, perception, (title, 1000), size, facts, (legend_top, legend_top + legend_height + 34))
-    return as_png(figure, path)
+    return canvas.as_png(figure, path)
 
 
 def write_frame(
@@ -200,12 +174,12 @@ def write_frame(
     """Write what stands around panels: title of at most so many pixels and what is shown, below legend and timing."""
     text, room = title
     style = {"fontsize": 23.0, "fontweight": "bold"}
-    write_at(figure, _MARGIN, 46, shorten(figure, text, room, **style), **style)
-    write_at(figure, _WIDTH - _MARGIN, 46, about, fontsize=18.0, ha="right", color=FAINT)
-    draw_legend(figure, _MARGIN, tops[0], _WIDTH - 2 * _MARGIN, facts)
-    ran = " · ".join([timing_line(perception), *provider_lines(perception)])
-    ran = shorten(figure, ran, _WIDTH - 2 * _MARGIN, fontsize=12.0)
-    write_at(figure, _MARGIN, tops[1], ran, fontsize=12.0, color=FAINT)
+    canvas.write_at(figure, _MARGIN, 46, canvas.shorten(figure, text, room, **style), **style)
+    canvas.write_at(figure, _WIDTH - _MARGIN, 46, about, fontsize=18.0, ha="right", color=FAINT)
+    canvas.draw_legend(figure, _MARGIN, tops[0], _WIDTH - 2 * _MARGIN, facts)
+    ran = " · ".join([content.timing_line(perception), *content.provider_lines(perception)])
+    ran = canvas.shorten(figure, ran, _WIDTH - 2 * _MARGIN, fontsize=12.0)
+    canvas.write_at(figure, _MARGIN, tops[1], ran, fontsize=12.0, color=FAINT)
 
 
 def _draw_arrow(axes: Any, corners: Floats, zorder: int) -> None:
@@ -226,9 +200,7 @@ def _strip(ahead: FreeAhead, x_near: float) -> tuple[str, Floats | None]:
     text = f"free ahead: {'at least ' if ahead.end == 'end of view' else ''}{free_m:.0f} m"
     half = _HALF_STRIP_M
     neck = max(x_near, free_m - 2.0 * half)
-    return text, np.array(
-        [[x_near, half], [neck, half], [free_m, 0.0], [neck, -half], [x_near, -half]], dtype=np.float64
-    )
+    return text, np.array([[x_near, half], [neck, half], [free_m, 0.0], [neck, -half], [x_near, -half]])
 
 
 def _draw_top_view(figure: Any, drawn: _Drawn, top_view: TopView, road: RoadAhead) -> float:
@@ -244,7 +216,7 @@ def _draw_top_view(figure: Any, drawn: _Drawn, top_view: TopView, road: RoadAhea
         low, high, right, left = min(low, -along), max(high, along), min(right, -across), max(left, across)
     px_per_m = min((_BOTTOM - _TOP) / (high - low), 560.0 / (left - right))
     width = px_per_m * (left - right)
-    axes = add_axes(figure, _MARGIN + _AXIS, _TOP, width, px_per_m * (high - low))
+    axes = canvas.add_axes(figure, _MARGIN + _AXIS, _TOP, width, px_per_m * (high - low))
     axes.set_xlim(left, right)  # y grows to the left
     axes.set_ylim(low, high)
 
@@ -281,33 +253,32 @@ def _draw_top_view(figure: Any, drawn: _Drawn, top_view: TopView, road: RoadAhea
     sensor = Polygon([[0.0, 1.2], [0.9, -1.2], [-0.9, -1.2]], closed=True, facecolor=INK, zorder=5)
     axes.add_patch(sensor)
 
-    avoid = [area_of(axes, sensor.get_xy())]
+    avoid = [canvas.area_of(axes, sensor.get_xy())]
     strip = road.free_ahead(_HALF_STRIP_M)
     text, arrow = _strip(strip, x_near)
     if arrow is not None:
         _draw_arrow(axes, arrow[:, ::-1], 4)
-    labels: list[Label] = []
-    beside_arrow = area_of(axes, [[0.0, x_near]] if arrow is None else arrow[:, ::-1])
+    labels: list[canvas.Label] = []
+    beside_arrow = canvas.area_of(axes, [[0.0, x_near]] if arrow is None else arrow[:, ::-1])
     avoid.append(beside_arrow)
     for box in sorted(boxes, key=lambda box: math.hypot(*box.center[:2])):
         color, footprint = color_of(box.label), box.corners()
-        shape = Polygon(footprint[:, ::-1], closed=True, fill=False, edgecolor=color, linewidth=2.4, zorder=5)
-        axes.add_patch(shape)
+        axes.add_patch(Polygon(footprint[:, ::-1], closed=True, fill=False, edgecolor=color, linewidth=2.4, zorder=5))
         front = footprint[[0, 3]].mean(axis=0)
         axes.plot([box.center[1], front[1]], [box.center[0], front[0]], color=color, linewidth=2.4, zorder=5)
         if low <= box.center[0] <= high and right <= box.center[1] <= left:
-            area = area_of(axes, footprint[:, ::-1])
-            labels.append(Label(area, f"{box.label} {box.score:.2f}", color))
+            area = canvas.area_of(axes, footprint[:, ::-1])
+            labels.append(canvas.Label(area, f"{box.label} {box.score:.2f}", color))
     for kind, x_m in (("obstacle", strip.obstacle_m), ("edge", strip.edge_m), ("unknown", strip.unknown_m)):
         if math.isfinite(x_m):
             axes.plot([-_HALF_STRIP_M, _HALF_STRIP_M], [x_m, x_m], color=INK, linewidth=1.5, zorder=4)
-            line = area_of(axes, [[-_HALF_STRIP_M, x_m], [_HALF_STRIP_M, x_m]])
-            labels.append(Label(line, f"{kind} {x_m:.1f} m", FAINT))
+            line = canvas.area_of(axes, [[-_HALF_STRIP_M, x_m], [_HALF_STRIP_M, x_m]])
+            labels.append(canvas.Label(line, f"{kind} {x_m:.1f} m", FAINT))
     if text:
-        labels.append(Label(beside_arrow, text, AMBER if arrow is None else INK))
-    n_omitted = place_labels(axes, labels, avoid)
+        labels.append(canvas.Label(beside_arrow, text, AMBER if arrow is None else INK))
+    n_omitted = canvas.place_labels(axes, labels, avoid)
     seen = _omitted("scores", n_omitted) if n_omitted else "scores; gray: not observed"  # both are wider than the panel
-    write_heading(figure, _MARGIN + _AXIS, _TOP - 20, "from above", seen)
+    canvas.write_heading(figure, _MARGIN + _AXIS, _TOP - 20, "from above", seen)
     return width
 
 
@@ -317,10 +288,9 @@ def _omitted(text: str, n_omitted: int) -> str:
 
 def _draw_range_image(figure: Any, place: Place, drawn: _Drawn, turn_deg: float) -> None:
     """Draw a part of the turn as a range image. It is only a picture, not the projection of a network."""
-    axes = add_axes(figure, *place)
-    write_heading(
-        figure, place[0], place[1] - 20, "as the sensor sees it", f"{_PARTS[turn_deg]}, a class for every point"
-    )
+    axes = canvas.add_axes(figure, *place)
+    more = f"{_PARTS[turn_deg]}, a class for every point"
+    canvas.write_heading(figure, place[0], place[1] - 20, "as the sensor sees it", more)
     names, painted = drawn.names, drawn.painted
     x, y, z = drawn.points[:, :3].astype(np.float64).T
     range_m = np.sqrt(x * x + y * y + z * z)
@@ -365,7 +335,7 @@ def _draw_from_behind(figure: Any, place: Place, drawn: _Drawn) -> None:
     from matplotlib.patches import Polygon
 
     points, names, painted, top_view, road, boxes, ground = drawn
-    axes = add_axes(figure, *place)
+    axes = canvas.add_axes(figure, *place)
     panel = axes.get_window_extent()
     tall = 0.27
     wide = tall * panel.width / panel.height
@@ -380,13 +350,8 @@ def _draw_from_behind(figure: Any, place: Place, drawn: _Drawn) -> None:
     turn = np.stack([right, np.cross(right, forward), forward])  # sensor -> camera: right, up, forward
 
     if top_view is not None:
-        axes.imshow(
-            _ground_layer(top_view, ground, eye, turn, wide, tall),
-            extent=(-wide, wide, -tall, tall),
-            aspect="auto",
-            interpolation="bilinear",
-            zorder=1,
-        )
+        layer, extent = _ground_layer(top_view, ground, eye, turn, wide, tall), (-wide, wide, -tall, tall)
+        axes.imshow(layer, extent=extent, aspect="auto", interpolation="bilinear", zorder=1)
     seen = (points[:, :3].astype(np.float64) - eye) @ turn.T
     shown = (seen[:, 2] > 2.0) & (seen[:, 2] < 90.0)
     shown &= (np.abs(seen[:, 0]) < wide * seen[:, 2]) & (np.abs(seen[:, 1]) < tall * seen[:, 2])
@@ -402,7 +367,7 @@ def _draw_from_behind(figure: Any, place: Place, drawn: _Drawn) -> None:
         seen[order, 0] / depth, seen[order, 1] / depth, s=size, c=colors.clip(0.0, 1.0), linewidths=0, zorder=2
     )
 
-    labels: list[Label] = []
+    labels: list[canvas.Label] = []
     if top_view is not None and road is not None:
         strip = road.free_ahead(_HALF_STRIP_M)
         text, arrow = _strip(strip, top_view.x_range_m[0])
@@ -411,11 +376,11 @@ def _draw_from_behind(figure: Any, place: Place, drawn: _Drawn) -> None:
             flat = (np.column_stack([arrow, a + arrow @ [b, c] + 0.02]) - eye) @ turn.T
             flat = flat[:, :2] / np.maximum(flat[:, 2:], _NEAR_M)
             _draw_arrow(axes, flat, 3)
-            labels.append(Label(area_of(axes, flat), text, INK))
+            labels.append(canvas.Label(canvas.area_of(axes, flat), text, INK))
     # The nearest boxes last, because they occlude the others.
     for box in sorted(boxes, key=lambda box: -box.center[0]):
-        corners = (box_corners(box) - eye) @ turn.T
-        ends = [end for k, m in EDGES if (end := _clipped(corners[k], corners[m])) is not None]
+        corners = (content.box_corners(box) - eye) @ turn.T
+        ends = [end for k, m in content.EDGES if (end := _clipped(corners[k], corners[m])) is not None]
         if not ends:
             continue
         flat = np.array(ends)[:, :, :2] / np.array(ends)[:, :, 2:]
@@ -424,14 +389,14 @@ def _draw_from_behind(figure: Any, place: Place, drawn: _Drawn) -> None:
         if corners[:, 2].min() > _NEAR_M:
             front = corners[[0, 3, 7, 4]]
             axes.add_patch(Polygon(front[:, :2] / front[:, 2:], closed=True, facecolor=color, alpha=0.25, zorder=4))
-        area = np.array(area_of(axes, flat.reshape(-1, 2)))
+        area = np.array(canvas.area_of(axes, flat.reshape(-1, 2)))
         low, high = area[:2].clip(panel.min, panel.max), area[2:].clip(panel.min, panel.max)
         if (high - low).min() > 1.0:
             distance_m = math.hypot(*box.center[:2])
-            labels.append(Label((*low.tolist(), *high.tolist()), f"{box.label} {distance_m:.0f} m", color))
-    n_omitted = place_labels(axes, labels[::-1])
+            labels.append(canvas.Label((*low.tolist(), *high.tolist()), f"{box.label} {distance_m:.0f} m", color))
+    n_omitted = canvas.place_labels(axes, labels[::-1])
     more = "drivable area, boxes and their distance"
-    write_heading(figure, place[0], place[1] - 20, "from behind", _omitted(more, n_omitted))
+    canvas.write_heading(figure, place[0], place[1] - 20, "from behind", _omitted(more, n_omitted))
 
 
 def _clipped(start: Floats, end: Floats) -> Floats | None:

@@ -65,10 +65,8 @@ def flatten_scan(points: Points, perception: Perception | None = None) -> bytes:
             if not frame.is_identity:
                 road_z = -(perception.mounting.height_m or 0.0)
                 x, y = np.einsum("ij,jhw->ihw", frame.R[:2], [x, y, np.full_like(x, road_z)]) + frame.t[:2, None, None]
-            row = np.floor((view.x_range_m[1] - x) / view.cell_m)
-            col = np.floor((view.y_range_m[1] - y) / view.cell_m)
-            inside = (row >= 0) & (row < view.labels.shape[0]) & (col >= 0) & (col < view.labels.shape[1])
-            image[inside] = _ROAD * view.drivable[row[inside].astype(np.intp), col[inside].astype(np.intp)]
+            row, col, inside = view.geometry.cells(x, y)
+            image[inside] = _ROAD * view.drivable[row[inside], col[inside]]
     seen = drawable_points(points)
     points, painted = points[seen], painted[seen]
     x, y = points[:, :2].astype(np.float64).T
@@ -137,7 +135,7 @@ def draw_tracks(
     if under and len(under) != len(scans):
         raise TrackingError(f"got {len(under)} flattened scans with tracks of {len(scans)}; expected one for each")
     fonts = {size: ImageFont.load_default(_FINE * size) for size in (13, 14, 17)}
-    palette = _palette(Image)
+    palette, labels = _palette(Image), {label for scan in scans for label in scan.labels}
     trails: dict[int, list[tuple[float, float, float, float]]] = {}
     pictures: list[Any] = []
     times_s = [0.0]
@@ -147,10 +145,8 @@ def draw_tracks(
         flat = np.frombuffer(zlib.decompress(under[k]), np.uint8).reshape(_HEIGHT, _WIDTH) if under else None
         layer = _layer_colors()[np.zeros((_HEIGHT, _WIDTH), np.uint8) if flat is None else flat]
         picture = Image.new("RGB", (_FINE * _WIDTH, _FINE * (_HEAD + _HEIGHT + _FOOT)), GROUND)
-        picture.paste(
-            Image.fromarray(layer).resize((_FINE * _WIDTH, _FINE * _HEIGHT), Image.Resampling.NEAREST),
-            (0, _FINE * _HEAD),
-        )
+        fine = Image.fromarray(layer).resize((_FINE * _WIDTH, _FINE * _HEIGHT), Image.Resampling.NEAREST)
+        picture.paste(fine, (0, _FINE * _HEAD))
         pen = ImageDraw.Draw(picture)
         _draw_rings(pen, fonts[13])
         here = {track.id for track in tracks}
@@ -165,21 +161,11 @@ def draw_tracks(
             _draw_track(pen, track, (np.array(trails[track.id])[:, :3] - t) @ R)
         _write_names(pen, drawn, fonts[14])
         facts = f"{time_s:.1f} s · {len(tracks)} track{'s' * (len(tracks) != 1)}"
-        _write_frame(
-            pen, title or "Tracks", facts, sorted({label for scan in scans for label in scan.labels}), fonts, tail_s
-        )
+        _write_frame(pen, title or "Tracks", facts, labels, fonts, tail_s)
         pictures.append(picture.reduce(_FINE).quantize(palette=palette, dither=Image.Dither.NONE))
-    lasted = [round(1e3 * (after - before)) for before, after in pairwise([*times_s, times_s[-1] + 1.0])]
+    lasted = [max(20, round(1e3 * (after - before))) for before, after in pairwise([*times_s, times_s[-1] + 1.0])]
     stream = io.BytesIO()
-    pictures[0].save(
-        stream,
-        "GIF",
-        save_all=True,
-        append_images=pictures[1:],
-        duration=[max(20, ms) for ms in lasted],
-        loop=0,
-        optimize=False,
-    )
+    pictures[0].save(stream, "GIF", save_all=True, append_images=pictures[1:], duration=lasted, loop=0, optimize=False)
     if path is not None:
         write_atomic(path, stream.getvalue())
     return stream.getvalue()
@@ -214,13 +200,11 @@ def _pixels(places: Floats) -> list[tuple[float, float]]:
 
 
 def _draw_rings(pen: Any, font: Any) -> None:
-    (middle,) = _pixels(np.zeros((1, 2)))
+    ((across, down),) = _pixels(np.zeros((1, 2)))
     for ring_m in (20, 40, 60):
         reach = ring_m * _PX_PER_M * _FINE
         # Header and footer are drawn over the rest of the circle.
-        pen.arc(
-            [middle[0] - reach, middle[1] - reach, middle[0] + reach, middle[1] + reach], -90, 90, FRAME, width=_FINE
-        )
+        pen.arc([across - reach, down - reach, across + reach, down + reach], -90, 90, FRAME, width=_FINE)
         y = min(24.0, 0.8 * ring_m)  # next to the road, where there are few labels
         (place,) = _pixels(np.array([[math.sqrt(ring_m**2 - y**2), y]]))
         pen.text(place, f" {ring_m} m", fill=FAINT, font=font)
@@ -228,7 +212,6 @@ def _draw_rings(pen: Any, font: Any) -> None:
 
 
 def _draw_track(pen: Any, track: Track, trail: Floats) -> None:
-    """Draw trail, box and velocity."""
     color = color_of(track.label)
     if len(trail) > 1:
         pen.line(_pixels(trail), fill=color, width=_FINE + 1, joint="curve")
@@ -263,7 +246,7 @@ def _write_names(pen: Any, tracks: Sequence[Track], font: Any) -> None:
             pen.text(tuple(middle.tolist()), text, fill=color_of(track.label), font=font, anchor="mm")
 
 
-def _write_frame(pen: Any, title: str, facts: str, labels: Sequence[str], fonts: dict[int, Any], tail_s: float) -> None:
+def _write_frame(pen: Any, title: str, facts: str, labels: set[str], fonts: dict[int, Any], tail_s: float) -> None:
     """Write header and footer: title, time, classes and a legend."""
     width, head, foot = _FINE * _WIDTH, _FINE * _HEAD, _FINE * (_HEAD + _HEIGHT)
     pen.rectangle([0, 0, width, head], fill=GROUND)

@@ -43,8 +43,7 @@ def box_table_lines(figures: Mapping[str, Any]) -> list[str]:
         if isinstance(row, Mapping) and row["n_truth"]
     ]
     if rows:
-        means = {"ap": centers["mean_ap"], "ap_interval": centers.get("mean_ap_interval")}
-        rows.append((("mean", ""), means))
+        rows.append((("mean", ""), {"ap": centers["mean_ap"], "ap_interval": centers.get("mean_ap_interval")}))
     title = "boxes as nuScenes measures them: AP by the distance of centers; errors of matches within 2 m"
     return [*lines, *table_lines(title, _CENTER_COLUMNS, rows)]
 

@@ -11,8 +11,7 @@ from ...system.extras import require
 from ...types.choices import CAMERA, RULES
 from ..arguments import (
     Commands,
-    add_agreement,
-    add_boxes_from,
+    add_boxes,
     add_command,
     add_figures_file,
     add_model,
@@ -72,8 +71,7 @@ def add_parser(commands: Commands) -> None:
     models = options(parser, "models")
     add_model(models)
     add_provider(models, provider="cpu")
-    add_boxes_from(models)
-    add_agreement(models)
+    add_boxes(models)
     models(
         "--without-rule RULE",
         "leave out one rule of the agreement, to measure what it is worth; may be repeated: "
@@ -115,18 +113,15 @@ def eval_command(arguments: argparse.Namespace) -> int:
     from ...evaluation.judge import Perceiving
     from ...types.mounting import Mounting
 
-    rules = () if arguments.no_agreement else {*RULES} - {*arguments.without_rule}
+    rules = frozenset(() if arguments.no_agreement else {*RULES} - {*arguments.without_rule})
+    perceiving = Perceiving(
+        arguments.provider, arguments.precision, arguments.boxes_from, rules, arguments.score_threshold
+    )
     with progress() as show:
         figures, mistakes = evaluate(
             arguments.datasets,
             chosen_models(arguments),
-            Perceiving(
-                arguments.provider,
-                arguments.precision,
-                arguments.boxes_from,
-                frozenset(rules),
-                arguments.score_threshold,
-            ),
+            perceiving,
             split=arguments.split,
             fold=arguments.fold,
             road_by=arguments.road_by,
@@ -147,7 +142,6 @@ def eval_command(arguments: argparse.Namespace) -> int:
 
 
 def _eval_images(arguments: argparse.Namespace, roots: Sequence[Path]) -> int:
-    """Compare a camera model with labeled images."""
     from ...evaluation.camvid import evaluate_images
 
     if len(roots) < len(arguments.datasets):
@@ -278,11 +272,8 @@ def box_lines(of_block: Mapping[str, Any]) -> list[str]:
         rows = [*_class_rows(of_kind, "n_truth"), *_class_rows(means, "ap")]
         order = sorted(rows, key=lambda row: [*of_kind].index(row[0][0]))
         lines += table_lines(f"boxes where they can be detected, {kind}", _BOX_COLUMNS, order)
-    lines += table_lines(
-        "boxes wherever the truth is known, oriented: AP50 of vehicles, AP25 of pedestrians and cyclists",
-        _ALL_ROUND_COLUMNS,
-        _class_rows(of_block.get("all_round", {}), "n_truth"),
-    )
+    title = "boxes wherever the truth is known, oriented: AP50 of vehicles, AP25 of pedestrians and cyclists"
+    lines += table_lines(title, _ALL_ROUND_COLUMNS, _class_rows(of_block.get("all_round", {}), "n_truth"))
     for kind, where in (("boxes", "where they can be detected"), ("all_round", "wherever the truth is known")):
         rows = _class_rows(of_block.get("heading", {}).get(kind, {}), "n_hits")
         lines += table_lines(f"heading of boxes {where}, within 45 degrees of the true one", _HEADING_COLUMNS, rows)
@@ -298,11 +289,8 @@ def error_lines(of_block: Mapping[str, Any]) -> list[str]:
         if causes["all"]["n_points"]
     ]
     rows += [(("car at the own bumper", cause), row) for cause, row in of_block.get("bumper", {}).items()]
-    return table_lines(
-        "errors: wrong points by cause; a cause is a share of its error, and a point may have several",
-        _ERROR_COLUMNS,
-        rows,
-    )
+    title = "errors: wrong points by cause; a cause is a share of its error, and a point may have several"
+    return table_lines(title, _ERROR_COLUMNS, rows)
 
 
 def _cell_lines(of_block: Mapping[str, Any]) -> list[str]:

@@ -51,8 +51,7 @@ def add_parser(commands: Commands) -> None:
         "process alone)",
         type=positive,
     )
-    output = options(parser, "output")
-    add_figures_file(output)
+    add_figures_file(options(parser, "output"))
 
 
 def eval_sensors_command(arguments: argparse.Namespace) -> int:
@@ -92,7 +91,6 @@ def eval_sensors_command(arguments: argparse.Namespace) -> int:
 
 
 def _find(arguments: argparse.Namespace) -> int:
-    """Print which sensors are found in the points."""
     from ...evaluation.transfer import find_sensors
 
     figures = find_sensors(arguments.datasets)

@@ -175,30 +175,19 @@ def _tracking_lines(figures: Mapping[str, Any]) -> list[str]:
         methods = {"edgeperc": figures["classes"], "AB3DMOT's method": figures["rival"]}
     every = [((method, name), of) for method, by in methods.items() for name, of in by.items()]
     rows = [(name, without_nan({**of, **of["best"], **of["hota"]})) for name, of in every]
-    headings = [
-        (
-            (kind, name),
-            counts
-            | {"right": _share(counts, "n_right", "n_resolved")}
-            | {"right_of_all": _share(counts, "n_right_of_all", "n_boxes")},
-        )
-        for kind in ("moving", "stopped", "parked")
-        for name, of in figures["headings"].items()
-        if (counts := of[kind])["n_boxes"]
-    ]
+    of_all = [(name, without_nan({**of, **of["all_tracks"]})) for name, of in every]
+    headings = []
+    for kind in ("moving", "stopped", "parked"):
+        for name, of in figures["headings"].items():
+            if (counts := of[kind])["n_boxes"]:
+                right = counts["n_right"] / counts["n_resolved"] if counts["n_resolved"] else None
+                shares = {"right": right, "right_of_all": counts["n_right_of_all"] / counts["n_boxes"]}
+                headings.append(((kind, name), counts | shares))
     return [
         f"{many(len(figures['sequences']), 'sequence')}, {figures['of']}, 3-D IoU {figures['iou_threshold']}, rules "
         f"{figures['rules']}; {figures['frames_per_s']:,.0f} scans a second in the tracker; shares in per cent",
         *table_lines("over forty recalls; at the best MOTA", _AVERAGE_COLUMNS, rows),
         *table_lines("counts at the best MOTA", _COUNT_COLUMNS, rows),
-        *table_lines(
-            "counts of all tracks, with any score",
-            _COUNT_COLUMNS,
-            [(name, without_nan({**of, **of["all_tracks"]})) for name, of in every],
-        ),
-        *(table_lines("headings within a quarter turn of the label's", _HEADING_COLUMNS, headings) if headings else ()),
+        *table_lines("counts of all tracks, with any score", _COUNT_COLUMNS, of_all),
+        *table_lines("headings within a quarter turn of the label's", _HEADING_COLUMNS, headings),
     ]
-
-
-def _share(counts: Mapping[str, int], part: str, whole: str) -> float | None:
-    return counts[part] / counts[whole] if counts[whole] else None
