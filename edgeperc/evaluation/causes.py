@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from functools import cached_property
 from typing import Any
 
 import numpy as np
 
-from ..ground.planes import Ground, find_ground
+from ..ground.planes import find_ground
 from ..objects.cluster import find_clusters
 from ..simulation.scene import POINT_CLASS_OF, POINT_CLASSES
 from ..types.geometry import inside
@@ -46,24 +45,24 @@ def count_causes(
     """Count one scan's wrong points by (error, cause), and 1 by drive and by missed object. The cause "all" has all of
     an error, "of" what it is a share of. Where the truth is unknown, `BUMPER` may be a car.
     """
-    scan, (x, y, z) = _Scan(points), points[:, :3].T
+    ground, (x, y, z) = find_ground(points), points[:, :3].T
     at_bumper = (x < BUMPER_X_M) & (np.abs(y) < BUMPER_Y_M) & (z < BUMPER_Z_M)
     at_bumper &= in_view & (labels == 1) & ~((right > 0) & (right < len(POINT_CLASSES)))
-    chosen = {(BUMPER, "all"): at_bumper, (BUMPER, FLOOR): at_bumper & scan.ground.mask}
+    chosen = {(BUMPER, "all"): at_bumper, (BUMPER, FLOOR): at_bumper & ground.mask}
     for number, name in enumerate(POINT_CLASSES[1:], start=1):
         true, predicted = known & (right == number), known & (labels == number)
         missed, false = true & ~predicted, predicted & ~true
         background = false & (right == 0)
         of_missed = {"of": true, "all": missed, FAR: missed & (np.hypot(x, y) >= FAR_M)}
-        near = scan.within(background, boxes, NEAR_M)
+        near = _within(points, background, boxes, NEAR_M)
         of_false = {"of": predicted, "all": false, OTHER: false & ~background, NEAR: near}
         if name == "car":
-            of_missed[VANS] = scan.within(missed, [box for box in boxes if box.label in ("van", "truck")])
-            of_missed[FLOOR] = missed & scan.ground.mask  # KITTI's boxes hold the road below a car
-            of_false |= {LARGE: scan.on_large_structures(background), FLOOR: background & scan.ground.mask}
+            of_missed[VANS] = _within(points, missed, [box for box in boxes if box.label in ("van", "truck")])
+            of_missed[FLOOR] = missed & ground.mask  # KITTI's boxes hold the road below a car
+            of_false |= {LARGE: _large(points, background, ~ground.mask), FLOOR: background & ground.mask}
         else:
             of_missed[OTHER] = missed & (labels > 0)
-            of_false[POLE] = scan.on_poles(background)
+            of_false[POLE] = _on_poles(points, background, ground.height_m > POLE_HEIGHT_M)
         chosen |= {(f"missed {name}", cause): mask for cause, mask in of_missed.items()}
         chosen |= {(f"false {name}", cause): mask for cause, mask in of_false.items()}
     counts: Counts = {("errors", name): Counter() for name in ("points", "scans", "objects")}
@@ -79,45 +78,37 @@ def count_causes(
     return counts
 
 
-class _Scan:
-    """Where points lie: each method takes and returns a mask (n,) bool."""
+def _within(points: Points, mask: Mask, boxes: Sequence[Box], margin_m: float = 0.0) -> Mask:
+    """Points of a mask in one of the boxes."""
+    rows, is_near = np.flatnonzero(mask), np.zeros(len(mask), np.bool_)
+    for box in boxes:
+        is_near[rows] |= inside(box, points[rows], margin_m)
+    return is_near
 
-    def __init__(self, points: Points) -> None:
-        self.points = points
 
-    @cached_property
-    def ground(self) -> Ground:
-        return find_ground(self.points)
+def _large(points: Points, mask: Mask, above: Mask) -> Mask:
+    """Points of a mask above the ground, in a cluster that is too large for a car."""
+    above = above & np.isfinite(points).all(axis=1)
+    clusters = find_clusters(points, among=above, seeds=mask & above, min_points=1)
+    rows = np.flatnonzero(clusters >= 0)
+    rows = rows[np.argsort(clusters[rows], kind="stable")]
+    large = np.zeros(len(mask), np.bool_)
+    if rows.size:
+        first = np.flatnonzero(np.diff(clusters[rows], prepend=-1))
+        members = points[rows, :3]
+        size = np.maximum.reduceat(members, first) - np.minimum.reduceat(members, first)
+        is_large = (np.hypot(size[:, 0], size[:, 1]) > LARGE_LENGTH_M) | (size[:, 2] > LARGE_HEIGHT_M)
+        large[rows] = is_large[clusters[rows]]
+    return mask & large
 
-    def within(self, mask: Mask, boxes: Sequence[Box], margin_m: float = 0.0) -> Mask:
-        """Points in one of the boxes."""
-        rows, is_near = np.flatnonzero(mask), np.zeros(len(mask), np.bool_)
-        for box in boxes:
-            is_near[rows] |= inside(box, self.points[rows], margin_m)
-        return is_near
 
-    def on_large_structures(self, mask: Mask) -> Mask:
-        """Points above the ground, in a cluster that is too large for a car."""
-        above = ~self.ground.mask & np.isfinite(self.points).all(axis=1)
-        clusters = find_clusters(self.points, among=above, seeds=mask & above, min_points=1)
-        rows = np.flatnonzero(clusters >= 0)
-        rows = rows[np.argsort(clusters[rows], kind="stable")]
-        large = np.zeros(len(mask), np.bool_)
-        if rows.size:
-            first = np.flatnonzero(np.diff(clusters[rows], prepend=-1))
-            members = self.points[rows, :3]
-            size = np.maximum.reduceat(members, first) - np.minimum.reduceat(members, first)
-            is_large = (np.hypot(size[:, 0], size[:, 1]) > LARGE_LENGTH_M) | (size[:, 2] > LARGE_HEIGHT_M)
-            large[rows] = is_large[clusters[rows]]
-        return mask & large
-
-    def on_poles(self, mask: Mask) -> Mask:
-        """Points with a point higher than people above or below them, at most 0.3 m aside."""
-        is_pole = np.zeros(len(mask), np.bool_)
-        tall = self.points[self.ground.height_m > POLE_HEIGHT_M, :2]
-        tall = tall[np.argsort(tall[:, 1])]
-        for row in np.flatnonzero(mask):
-            x, y = self.points[row, :2]
-            first, end = np.searchsorted(tall[:, 1], (y - POLE_RADIUS_M, y + POLE_RADIUS_M))
-            is_pole[row] = (np.hypot(*(tall[first:end] - (x, y)).T) <= POLE_RADIUS_M).any()
-        return is_pole
+def _on_poles(points: Points, mask: Mask, is_tall: Mask) -> Mask:
+    """Points of a mask with a tall point, higher than people, above or below them, at most 0.3 m aside."""
+    is_pole = np.zeros(len(mask), np.bool_)
+    tall = points[is_tall, :2]
+    tall = tall[np.argsort(tall[:, 1])]
+    for row in np.flatnonzero(mask):
+        x, y = points[row, :2]
+        first, end = np.searchsorted(tall[:, 1], (y - POLE_RADIUS_M, y + POLE_RADIUS_M))
+        is_pole[row] = (np.hypot(*(tall[first:end] - (x, y)).T) <= POLE_RADIUS_M).any()
+    return is_pole

@@ -347,10 +347,8 @@ def evaluate_kitti(
         raise TrackingError(f"got rules {rules!r}; expected one of {', '.join(RULES)}")
     root = Path(root)
     names = list(sequences or sequence_names(root))
-    # By tracker, class and sequence.
-    pairs: dict[str, dict[str, list[tuple[Sequence[FrameTruth], Sequence[FrameTracks]]]]] = {
-        name: {label: [] for label in classes} for name in ("edgeperc", *(("ab3dmot",) if rival else ()))
-    }
+    # By tracker and class, of each sequence.
+    pairs: dict[tuple[str, str], list[tuple[Sequence[FrameTruth], Sequence[FrameTracks]]]] = {}
     headings = {label: Headings() for label in classes}
     n_frames, seconds = 0, 0.0
     for done, name in enumerate(names, start=1):
@@ -361,27 +359,23 @@ def evaluate_kitti(
         if rival:
             results["ab3dmot"] = ab3dmot_sequence(sequence, classes)
         for label in classes:
+            true = _frame_truth(sequence, label, rules)
             for method, reported in results.items():
-                pairs[method][label].append(
-                    (_frame_truth(sequence, label, rules), _frame_tracks(sequence, reported, label, rules))
-                )
+                pair = true, _frame_tracks(sequence, reported, label, rules)
+                pairs.setdefault((method, label), []).append(pair)
             headings[label] += count_headings(sequence.truth[label], tracks, KINDS[label], iou_threshold)
         if on_sequence is not None:
             on_sequence(done, len(names))
-    scores = {
-        method: {
-            label: asdict(evaluate_tracks(frames, iou_threshold, as_ab3dmot=rules == "ab3dmot"))
-            for label, frames in by.items()
-        }
-        for method, by in pairs.items()
-    }
+    scores: dict[str, dict[str, Any]] = {"edgeperc": {}, "ab3dmot": {}}
+    for (method, label), frames in pairs.items():
+        scores[method][label] = asdict(evaluate_tracks(frames, iou_threshold, as_ab3dmot=rules == "ab3dmot"))
     return {
         "sequences": names,
         "iou_threshold": iou_threshold,
         "rules": rules,
         "frames_per_s": n_frames / seconds,
         "classes": scores["edgeperc"],
-        "headings": {label: asdict(frames) for label, frames in headings.items()},
+        "headings": {label: asdict(counts) for label, counts in headings.items()},
         **({"rival": scores["ab3dmot"]} if rival else {}),
     }
 

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -82,7 +83,7 @@ def compare(
     total, done = sum(sizes.values()), 0
     result: dict[str, Any] = {}
     if (workers or 1) > 1:
-        answers = map_in_processes(_OfOne, (model, provider, precision), [*sizes], workers=workers)
+        answers = map_in_processes(partial, (_named, model, provider, precision), [*sizes], workers=workers)
         for name, answer in zip(sizes, answers, strict=True):
             result[name] = taken(answer, name)
             done += sizes[name]
@@ -99,22 +100,13 @@ def compare(
     return result
 
 
-class _OfOne:
-    """Compares a data set in a worker process."""
-
-    def __init__(self, model: str | Path, provider: str, precision: str) -> None:
-        self._arguments = model, provider, precision
-
-    def __call__(self, name: str) -> dict[str, Any]:
-        return _compare_one(*self._arguments, _dataset(name), lambda: None)
+def _named(model: str | Path, provider: str, precision: str, name: str) -> dict[str, Any]:
+    """The figures of a data set in a worker process."""
+    return _compare_one(model, provider, precision, _dataset(name), lambda: None)
 
 
 def _compare_one(
-    model: str | Path,
-    provider: str,
-    precision: str,
-    dataset: _DataSet,
-    count: Callable[[], None],
+    model: str | Path, provider: str, precision: str, dataset: _DataSet, count: Callable[[], None]
 ) -> dict[str, Any]:
     """The figures of a data set; ``count`` is called after each scan."""
     sensor, n_scans, read, folder = dataset

@@ -12,30 +12,18 @@ import sqlite3
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from pathlib import Path, PurePosixPath
-from typing import Any, BinaryIO, Protocol
+from typing import Any
 from urllib.parse import quote
 
+import numpy as np
+
 from ..errors import PointsError
-from .inflate import inflate, inflate_file, most_bytes
-from .mcap import MCAP_MAGIC, Channel, McapFile, unpack
+from .inflate import inflate, inflate_file, inflated_message, most_bytes
+from .mcap import MCAP_MAGIC, BagFile, Channel, McapFile, unpack
 from .tables import MAX_BYTES
 
 BAG_SUFFIXES = (".db3", ".mcap")
-_ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 _ROS1_MAGIC = b"#ROSBAG V"
-
-
-class BagFile(Protocol):
-    """One file of a bag."""
-
-    def topics(self) -> set[Channel]:
-        """Its topics, as far as it is whole; PointsError if it is damaged before the first."""
-
-    def messages_of(self, channel: Channel) -> Iterator[tuple[int, memoryview]]:
-        """Time of recording [ns] and bytes of each message, in the file's order.
-
-        Raises PointsError after the messages before the damage.
-        """
 
 
 def bag_files(folder: Path) -> list[Path]:
@@ -96,70 +84,49 @@ def _open_file(path: Path) -> BagFile:
     if head.startswith(b"SQLite format 3\0"):
         return SqliteBag(path)
     if head.startswith(MCAP_MAGIC):
-        return McapBag(path)
+        return McapFile(path)
     raise PointsError(
         f"the file is damaged or cut short: it begins with {head!r}; expected a bag of ROS 1, a database of ROS 2 or "
         "MCAP"
     )
 
 
-class Unreadable:
+class Unreadable(BagFile):
     """A `BagFile` that is damaged at its beginning."""
 
     def __init__(self, error: PointsError) -> None:
         self._error = error
 
     def topics(self) -> set[Channel]:
-        """As `BagFile.topics`."""
         raise self._error
 
     def messages_of(self, channel: Channel) -> Iterator[tuple[int, memoryview]]:
-        """As `BagFile.messages_of`."""
         raise self._error
 
 
-class McapBag:
-    """An .mcap file as `BagFile`."""
-
-    def __init__(self, path: Path) -> None:
-        self._file = McapFile(path)
-
-    def topics(self) -> set[Channel]:
-        """As `BagFile.topics`."""
-        return set(self._file.channels.values())
-
-    def messages_of(self, channel: Channel) -> Iterator[tuple[int, memoryview]]:
-        """As `BagFile.messages_of`."""
-        for number, stamp_ns, data in self._file.messages():
-            if self._file.channels.get(number) == channel:
-                yield stamp_ns, _plain(data)
-
-
-class SqliteBag:
+class SqliteBag(BagFile):
     """A .db3 file of rosbag2 as `BagFile`."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
 
     def topics(self) -> set[Channel]:
-        """As `BagFile.topics`."""
         with closing(self._open()) as database:
             rows = self._rows(database, "SELECT name, type, serialization_format FROM topics")
             return {Channel(str(name), str(kind), str(encoding)) for name, kind, encoding in rows}
 
     def messages_of(self, channel: Channel) -> Iterator[tuple[int, memoryview]]:
-        """As `BagFile.messages_of`."""
         of_topic = "FROM messages WHERE topic_id IN (SELECT id FROM topics WHERE name = ?) ORDER BY"
         with closing(self._open()) as database:
             try:
                 rows = list(self._rows(database, f"SELECT id {of_topic} timestamp", channel.topic))
             except PointsError:  # the index, or the end; as recorded then, up to the damage
                 for stamp_ns, data in self._rows(database, f"SELECT timestamp, data {of_topic} id", channel.topic):
-                    yield int(stamp_ns), _plain(memoryview(data))
+                    yield int(stamp_ns), inflated_message(memoryview(data))
                 raise
             for row in rows:
                 for stamp_ns, data in self._rows(database, "SELECT timestamp, data FROM messages WHERE id = ?", *row):
-                    yield int(stamp_ns), _plain(memoryview(data))
+                    yield int(stamp_ns), inflated_message(memoryview(data))
 
     def _open(self) -> sqlite3.Connection:
         # Nothing is written beside the file. What a recorder had not yet copied from its log is read if it can be.
@@ -175,27 +142,24 @@ class SqliteBag:
             raise PointsError(f"the file is damaged or cut short: {exc}") from exc
 
 
-class Ros1Bag:
+class Ros1Bag(BagFile):
     """A .bag file (format 2.0) as `BagFile`."""
 
     def __init__(self, path: Path) -> None:
-        self._path = path
-        with path.open("rb") as file:
-            line = file.readline(64)
-        if not line.endswith(b"\n"):
+        self._data = np.memmap(path, np.uint8, "r").data
+        line, ended, _ = bytes(self._data[:64]).partition(b"\n")
+        if not ended:
             raise PointsError("the file is damaged or cut short: it ends inside its first line")
-        if line != b"#ROSBAG V2.0\n":
+        if line != b"#ROSBAG V2.0":
             version = line[len(_ROS1_MAGIC) :].strip().decode("ascii", "replace")
             raise PointsError(f"a bag of version {version!r}; expected 2.0. Run: rosbag migrate")
         self._connections: dict[int, Channel] = {}
         self._whole = False
 
     def topics(self) -> set[Channel]:
-        """As `BagFile.topics`."""
         if not self._whole:
             try:
-                with self._path.open("rb") as file:
-                    self._learn_from_index(file)
+                self._learn_from_index()
             except PointsError:  # no index, or a damaged one: the connections stand among the messages, too
                 try:
                     for _ in self._messages():
@@ -203,53 +167,48 @@ class Ros1Bag:
                 except PointsError:
                     if not self._connections:
                         raise
-            if not self._connections and self._path.stat().st_size <= 13:
+            if not self._connections and len(self._data) <= 13:
                 raise PointsError("the file is damaged or cut short: it ends behind its first line")
             self._whole = True
         return set(self._connections.values())
 
     def messages_of(self, channel: Channel) -> Iterator[tuple[int, memoryview]]:
-        """As `BagFile.messages_of`."""
         for number, stamp_ns, data in self._messages():
             if self._connections.get(number) == channel:
                 yield stamp_ns, data
 
-    def _learn_from_index(self, file: BinaryIO) -> None:
-        for fields, content in _ros1_records(file, self._index(file), self._path.stat().st_size):
+    def _learn_from_index(self) -> None:
+        for fields, content in _ros1_records(self._data, self._index()):
             self._learn(fields, content)
         if not self._connections:
             raise PointsError("the index of the bag names no topic")
 
-    def _index(self, file: BinaryIO) -> int:
+    def _index(self) -> int:
         """Where the index begins, which is behind all messages; PointsError if the file ends before."""
-        size = self._path.stat().st_size
-        head, _ = next(_ros1_records(file, 13, size), ({}, None))
+        head, _ = next(_ros1_records(self._data, 13), ({}, None))
         (index,) = unpack("<Q", head.get("index_pos", bytes(8)))
-        if not 13 < index <= size:
+        if not 13 < index <= len(self._data):
             raise PointsError("the file is damaged or cut short: it ends before its index, as if recording broke off")
         return int(index)
 
     def _messages(self) -> Iterator[tuple[int, int, memoryview]]:
-        size = self._path.stat().st_size
-        with self._path.open("rb") as file:
-            for fields, content in _ros1_records(file, 13, size):
-                kind = fields.get("op")
-                if kind == b"\x05":
-                    method = fields.get("compression", b"").decode("ascii", "replace")
-                    (n_bytes,) = unpack("<I", fields.get("size", b""))
-                    chunk = inflate(bytes(content), "" if method == "none" else method, n_bytes)
-                    if len(chunk) != n_bytes:
-                        raise PointsError(f"a chunk is damaged: it unpacks to {len(chunk):,} bytes, not to {n_bytes:,}")
-                    yield from self._of_chunk(memoryview(chunk))
-                else:
-                    yield from self._message(fields, content)
-            self._index(file)
+        for fields, content in _ros1_records(self._data, 13):
+            if fields["op"] == b"\x05":
+                method = fields.get("compression", b"").decode("ascii", "replace")
+                (n_bytes,) = unpack("<I", fields.get("size", b""))
+                chunk = inflate(bytes(content), "" if method == "none" else method, n_bytes)
+                if len(chunk) != n_bytes:
+                    raise PointsError(f"a chunk is damaged: it unpacks to {len(chunk):,} bytes, not to {n_bytes:,}")
+                yield from self._of_chunk(memoryview(chunk))
+            else:
+                yield from self._message(fields, content)
+        self._index()
 
     def _of_chunk(self, chunk: memoryview) -> Iterator[tuple[int, int, memoryview]]:
         """Its messages in the order of time; damage is raised after those before it."""
         found, damage = list[tuple[int, int, memoryview]](), None
         try:
-            for fields, content in _ros1_split(chunk):
+            for fields, content in _ros1_records(chunk, 0, is_chunk=True):
                 found.extend(self._message(fields, content))
         except PointsError as exc:
             damage = exc
@@ -272,46 +231,27 @@ class Ros1Bag:
             self._connections[number] = Channel(fields.get("topic", b"").decode("utf-8", "replace"), kind, "ros1")
 
 
-def _plain(data: memoryview) -> memoryview:
-    """A message that rosbag2 may have compressed by itself."""
-    return memoryview(inflate(bytes(data), "zstd")) if bytes(data[:4]) == _ZSTD_MAGIC else data
-
-
-def _ros1_records(file: BinaryIO, at: int, end: int) -> Iterator[tuple[dict[str, bytes], memoryview]]:
-    """Fields of the header and content of each record."""
-    while at < end:
-        start = at
-        file.seek(at)
-        fields = _ros1_fields(_piece(file, at, end))
-        at = file.tell()
-        content = _piece(file, at, end)
-        if "op" not in fields:  # zeros, as a file system leaves them when power is lost, among others
-            raise PointsError(f"the file is damaged or cut short: there is no record at byte {start:,}")
-        at = file.tell()
-        yield fields, content
-
-
-def _piece(file: BinaryIO, at: int, end: int) -> memoryview:
-    size = file.read(4)
-    length = unpack("<I", size)[0] if len(size) == 4 else end
-    if at + 4 + length > end:
-        raise PointsError(f"the file is damaged or cut short: the record at byte {at:,} is not whole")
-    if length > MAX_BYTES:
-        raise PointsError(f"the record at byte {at:,} has {length:,} bytes; expected at most {MAX_BYTES:,}")
-    return memoryview(file.read(length))
-
-
-def _ros1_split(view: memoryview) -> Iterator[tuple[dict[str, bytes], memoryview]]:
-    at = 0
-    while at < len(view):
-        parts = []
+def _ros1_records(
+    data: memoryview, at: int, *, is_chunk: bool = False
+) -> Iterator[tuple[dict[str, bytes], memoryview]]:
+    """Fields of the header and content of each record of a file or a chunk."""
+    while at < len(data):
+        start, parts = at, []
         for _ in range(2):
-            length = unpack("<I", view, at)[0] if at + 4 <= len(view) else len(view)
-            if at + 4 + length > len(view):
-                raise PointsError("a chunk is damaged: it ends inside a record")
-            parts.append(view[at + 4 : at + 4 + length])
+            length = unpack("<I", data, at)[0] if at + 4 <= len(data) else len(data)
+            if at + 4 + length > len(data):
+                what = "a chunk is damaged: it ends inside a record"
+                if not is_chunk:
+                    what = f"the file is damaged or cut short: the record at byte {at:,} is not whole"
+                raise PointsError(what)
+            if length > MAX_BYTES:
+                raise PointsError(f"the record at byte {at:,} has {length:,} bytes; expected at most {MAX_BYTES:,}")
+            parts.append(data[at + 4 : at + 4 + length])
             at += 4 + length
-        yield _ros1_fields(parts[0]), parts[1]
+        fields = _ros1_fields(parts[0])
+        if "op" not in fields and not is_chunk:  # zeros, as a file system leaves them when power is lost, among others
+            raise PointsError(f"the file is damaged or cut short: there is no record at byte {start:,}")
+        yield fields, parts[1]
 
 
 def _ros1_fields(view: memoryview) -> dict[str, bytes]:

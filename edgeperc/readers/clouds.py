@@ -146,10 +146,9 @@ def _protobuf(content: memoryview) -> Iterator[tuple[int, Any]]:
         if key & 7 == 0:
             yield key >> 3, varint()
             continue
-        sizes = {1: 8, 5: 4}
         if key & 7 not in (1, 2, 5):
             raise PointsError(f"a message is damaged: protobuf has no wire type {key & 7}")
-        size = varint() if key & 7 == 2 else sizes[key & 7]
+        size = varint() if key & 7 == 2 else {1: 8, 5: 4}[key & 7]
         if at + size > len(content):
             raise PointsError("a message is damaged: a field of protobuf ends past it")
         part = content[at : at + size]
@@ -267,7 +266,7 @@ def _ring_elevations(message: Any) -> list[float | None]:
     names = cloud.dtype.names or ()
     if "ring" in names:
         ring = as_float64(cloud["ring"].ravel())
-    elif cloud.ndim == 2 and 1 < len(cloud) <= _MOST_RINGS:
+    elif 1 < len(cloud) <= _MOST_RINGS:
         ring = np.repeat(np.arange(len(cloud), dtype=np.float64), cloud.shape[1])
     else:
         return []

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 import tempfile
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence, Set
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -17,10 +16,10 @@ from ..system.clock import Stamp
 from ..system.extras import require
 from ..types.points import MapError, as_points, is_remission_name, table_columns
 from .alternation import told_apart
-from .bags import BagFile, open_bag
+from .bags import open_bag
 from .clouds import CLOUD_READERS, Cloud, cloud_points, cloud_table, describe_cloud
-from .mcap import Channel
-from .ouster import check_osf, metadata_beside, read_metadata
+from .mcap import BagFile, Channel
+from .ouster import check_osf
 from .packet_messages import (
     PACKET_READERS,
     OusterMessages,
@@ -42,7 +41,7 @@ from .packets import (
     velodyne_name,
     velodyne_packets,
 )
-from .senders import Senders
+from .senders import Senders, layouts_beside
 from .tables import MAX_BYTES
 from .times import TimedScan, of_plausible_duration, point_times
 
@@ -64,16 +63,23 @@ def decode(
     """The scans of a capture, decoded in this process; ``warn`` gets a sentence about what was left out, ``alive`` is
     called now and then while a large file is checked.
     """
-    scans = (
-        _packet_scans(path, kind, topic, remission_field, warn, alive)
-        if kind in (".lvx2", ".osf", ".pcap")
-        else told_apart(
-            of_plausible_duration(_bag_scans(path, topic, remission_field, alive, times)),
-            lambda text: warn(f"{path}: {text}"),
-        )
-    )
+    job = _Job(path, topic, remission_field, lambda text: warn(f"{path}: {text}"), alive)
+    if kind in (".lvx2", ".osf", ".pcap"):
+        scans = _packet_scans(kind, job)
+    else:
+        scans = told_apart(of_plausible_duration(_bag_scans(job, times)), job.say)
     for stamp_s, points, times_s in _with_typed_errors(path, scans):
         yield TimedScan(stamp_s, points, times_s if times else None)
+
+
+class _Job(NamedTuple):
+    """What is decoded, with the options and callbacks of `decode`."""
+
+    path: Path
+    topic: str | None
+    remission_field: str | None
+    say: Callable[[str], None]  # ``warn``, with the path in front
+    alive: Callable[[], None]
 
 
 def describe(path: Path, kind: str, topic: str | None, alive: Callable[[], None]) -> dict[str, Any]:
@@ -86,9 +92,8 @@ def describe(path: Path, kind: str, topic: str | None, alive: Callable[[], None]
 
     def found() -> Iterator[dict[str, Any]]:
         if kind == ".osf":
-            frames = _open_osf(path)
-            chosen = frames.sensor_info[_choose("LiDAR", [str(info.sn) for info in frames.sensor_info], topic)]
-            yield {"metadata": chosen.to_json_string()}
+            frames, chosen = _open_osf(path, topic)
+            yield {"metadata": frames.sensor_info[chosen].to_json_string()}
         else:
             for name, message, _ in _clouds(path, topic, alive):
                 if isinstance(message, VelodyneScan):
@@ -140,41 +145,32 @@ def _choose(what: str, names: Sequence[str], wanted: str | None, others: str = "
 # --- packets ---------------------------------------------------------------------------------------------------------
 
 
-def _packet_scans(
-    path: Path,
-    kind: str,
-    topic: str | None,
-    remission_field: str | None,
-    warn: Callable[[str], None],
-    alive: Callable[[], None],
-) -> Iterator[TimedScan]:
+def _packet_scans(kind: str, job: _Job) -> Iterator[TimedScan]:
     if kind == ".osf":
-        yield from _ouster_scans(_open_osf(path), topic, remission_field)
+        yield from _osf_scans(job)
     elif kind == ".lvx2":
         from .livox_packets import lvx2_scans, lvx2_sensors  # numba, which bags do without
 
-        _check_unnamed(remission_field)
-        yield from lvx2_scans(path, _choose("LiDAR", lvx2_sensors(path), topic), alive)
+        _check_unnamed(job.remission_field)
+        yield from lvx2_scans(job.path, _choose("LiDAR", lvx2_sensors(job.path), job.topic), job.alive)
     else:
-        yield from _pcap_scans(path, topic, remission_field, warn, alive)
+        yield from _pcap_scans(job)
 
 
-def _pcap_scans(
-    path: Path, topic: str | None, remission_field: str | None, warn: Callable[[str], None], alive: Callable[[], None]
-) -> Iterator[TimedScan]:
+def _pcap_scans(job: _Job) -> Iterator[TimedScan]:
     """The scans of the sensor that a topic names, or of the only one.
 
     Packets are counted to the end of the file before the first scan if a topic is given, or if there are a Velodyne's,
     whose library would mix sensors; otherwise behind the last scan.
     """
-    is_velodyne = next(velodyne_packets(path), None) is not None
-    is_whole = is_velodyne or topic is not None
-    senders = Senders(path, alive, None if is_whole else SNIFFED_PACKETS)
+    is_velodyne = next(velodyne_packets(job.path), None) is not None
+    is_whole = is_velodyne or job.topic is not None
+    senders = Senders(job.path, job.alive, None if is_whole else SNIFFED_PACKETS)
     n_scans = 0
-    for scan in _chosen_reader(path, senders, is_velodyne, topic, remission_field, warn, alive):
+    for scan in _chosen_reader(job, senders, is_velodyne):
         n_scans += 1
         yield scan
-    senders = senders if is_whole else Senders(path, alive)
+    senders = senders if is_whole else Senders(job.path, job.alive)
     if senders.cut is not None:  # the decoders end there without a word
         raise senders.cut
     if not n_scans:
@@ -182,37 +178,30 @@ def _pcap_scans(
             f"the capture has {senders.n_packets} packets, none from a supported LiDAR; expected a capture of a LiDAR, "
             "an Ouster's with its metadata"
         )
-    if topic is None and len(senders.names) > 1:
-        warn(
-            f"{path}: the scans are those of the first sensor alone; there are packets of several, "
+    if job.topic is None and len(senders.names) > 1:
+        job.say(
+            "the scans are those of the first sensor alone; there are packets of several, "
             f"{', '.join(senders.names)}: choose one by topic (--topic)"
         )
 
 
-def _chosen_reader(
-    path: Path,
-    senders: Senders,
-    is_velodyne: bool,
-    topic: str | None,
-    remission_field: str | None,
-    warn: Callable[[str], None],
-    alive: Callable[[], None],
-) -> Iterator[TimedScan]:
+def _chosen_reader(job: _Job, senders: Senders, is_velodyne: bool) -> Iterator[TimedScan]:
     """The scans of the sensor that a topic names, or of the only one among those that sent packets."""
+    topic = job.topic
     readers: list[tuple[Sequence[str], Callable[[str | None], Iterator[TimedScan]]]] = []
     if is_velodyne:
-        readers.append((senders.velodynes, lambda sender: _velodyne_scans(_decodable(path, alive, sender, senders))))
+        readers.append((senders.velodynes, lambda sender: _velodyne_scans(_decodable(job, sender, senders))))
     if lidar := senders.lidar(topic):
         from .lidars import turns_of  # numba
 
-        readers.append((lidar.senders, lambda sender: turns_of(path, lidar, sender, alive)))
+        readers.append((lidar.senders, lambda sender: turns_of(job.path, lidar, sender, job.alive)))
     ousters = senders.ousters if readers else []
-    readers.append((ousters, lambda sender: _ouster_turns(path, sender or topic, remission_field, warn, alive)))
+    readers.append((ousters, lambda sender: _ouster_turns(job._replace(topic=sender or topic))))
     known = [name for names, _ in readers for name in names]
     chosen = known[_choose("LiDAR", known, topic)] if len(known) > 1 or (known and topic is not None) else None
     read = readers[0][1] if len(known) < 2 else next(read for names, read in reversed(readers) if chosen in names)
     if read is not readers[-1][1]:
-        _check_unnamed(remission_field)
+        _check_unnamed(job.remission_field)
     return read(chosen if len(known) > 1 else None)
 
 
@@ -225,21 +214,24 @@ def _check_unnamed(remission_field: str | None) -> None:
         )
 
 
-def _decodable(path: Path, alive: Callable[[], None], sender: str | None, senders: Senders) -> Path:
+def _decodable(job: _Job, sender: str | None, senders: Senders) -> Path:
     """The capture, or a copy of one sender's packets, whole, in their order and behind Ethernet's header."""
+    path = job.path
     if sender is None and not senders.n_overtaken and is_plain(path):
         return path
     if shutil.disk_usage(tempfile.gettempdir()).free < path.stat().st_size:
         raise PointsError("the temporary folder has no room for a copy whose packets begin with Ethernet's header")
     target = Path(tempfile.mkdtemp()) / path.name
-    copy_as_ethernet(path, target, alive, sender)
+    copy_as_ethernet(path, target, job.alive, sender)
     return target
 
 
-def _open_osf(path: Path) -> Any:
+def _open_osf(path: Path, topic: str | None) -> tuple[Any, int]:
+    """The turns of all sensors in an .osf file, and which of the sensors a topic names."""
     osf = require("ouster.sdk.osf", "ouster", "Reading an Ouster capture", package="ouster-sdk")
     check_osf(path)
-    return osf.OsfFrameSetSource(str(path))
+    frames = osf.OsfFrameSetSource(str(path))
+    return frames, _choose("LiDAR", [str(info.sn) for info in frames.sensor_info], topic)
 
 
 def _velodyne_scans(path: Path) -> Iterator[TimedScan]:
@@ -253,24 +245,17 @@ def _velodyne_scans(path: Path) -> Iterator[TimedScan]:
         yield TimedScan(stamp.device, scan, stamp.device + points[:, 4].astype(np.float64))
 
 
-def _ouster_turns(
-    path: Path, topic: str | None, remission_field: str | None, warn: Callable[[str], None], alive: Callable[[], None]
-) -> Iterator[TimedScan]:
+def _ouster_turns(job: _Job) -> Iterator[TimedScan]:
     """The turns of an Ouster; damaged packets are left out, and at the end said."""
-    from .ouster_packets import OusterStream, layout_of
+    from .ouster_packets import OusterStream
 
-    layouts = []
-    for file in metadata_beside(path):
-        try:
-            layouts.append(layout_of(json.loads(read_metadata(file))))
-        except PointsError as exc:
-            raise PointsError(f"the metadata {file.name} cannot be read: {exc}") from exc
-    chosen = layouts[_choose("LiDAR", [layout.name for layout in layouts], topic)]
-    stream = OusterStream(chosen, remission_field)
+    layouts = layouts_beside(job.path)
+    chosen = layouts[_choose("LiDAR", [layout.name for layout in layouts], job.topic)]
+    stream = OusterStream(chosen, job.remission_field)
     sizes = {size for layout in layouts for size in (layout.packet_bytes, *layout.other_bytes)}
     ports, n_other_sizes, n_used, others = set[int](), Counter[int](), 0, Counter[tuple[int, int]]()
     senders = Counter[tuple[str, int]]()
-    datagrams = Datagrams(path, alive)
+    datagrams = Datagrams(job.path, job.alive)
     for datagram in datagrams:
         size = len(datagram.payload)
         if size not in sizes:
@@ -295,31 +280,30 @@ def _ouster_turns(
             f"{others.total():,} packets is; expected the metadata that was saved with the capture"
         )
     n_others = sum(n for n in others.values() if n >= _FEWEST_ALIKE or len(layouts) > 1)
-    if n_others and topic is None and len(layouts) == 1:
-        warn(
-            f"{path}: left out {n_others:,} packets of another Ouster, or of this one after it had started anew: their "
+    if n_others and job.topic is None and len(layouts) == 1:
+        job.say(
+            f"left out {n_others:,} packets of another Ouster, or of this one after it had started anew: their "
             "serial number or initialization_id is not that of the metadata. Put that of each beside the capture"
         )
     names = sender_names(senders)
     if len(names) > 1:
-        warn(
-            f"{path}: the scans are those of the first of several sensors, {', '.join(names)}, whose packets carry no "
+        job.say(
+            f"the scans are those of the first of several sensors, {', '.join(names)}, whose packets carry no "
             "serial number: save those of each in a file of its own, with its metadata"
         )
     n_bad = datagrams.n_bad + sum(n_other_sizes[port] for port in ports) + others.total() - n_others
     if n_bad and n_used:
-        warn(
-            f"{path}: dropped {n_bad} damaged packets of the capture: empty, incomplete, or of another length or "
+        job.say(
+            f"dropped {n_bad} damaged packets of the capture: empty, incomplete, or of another length or "
             "number than the metadata says"
         )
 
 
-def _ouster_scans(frames: Any, topic: str | None, remission_field: str | None) -> Iterator[TimedScan]:
+def _osf_scans(job: _Job) -> Iterator[TimedScan]:
     core = require("ouster.sdk.core", "ouster", "Reading an Ouster capture", package="ouster-sdk")
-    serials = [str(info.sn) for info in frames.sensor_info]
-    chosen = _choose("LiDAR", serials, topic)
+    frames, chosen = _open_osf(job.path, job.topic)
     to_xyz = core.XYZLut(frames.sensor_info[chosen], False)  # in the sensor's frame, not the vehicle's
-    name = (remission_field or "reflectivity").upper()
+    name = (job.remission_field or "reflectivity").upper()
     for frame_set in frames:
         frame = frame_set[chosen]
         if frame is None:  # no packet of this sensor in this turn
@@ -337,25 +321,22 @@ def _ouster_scans(frames: Any, topic: str | None, remission_field: str | None) -
 # --- bags ------------------------------------------------------------------------------------------------------------
 
 
-def _bag_scans(
-    path: Path, topic: str | None, remission_field: str | None, alive: Callable[[], None], times: bool
-) -> Iterator[TimedScan]:
+def _bag_scans(job: _Job, times: bool) -> Iterator[TimedScan]:
     turns: VelodyneStream | OusterMessages | None = None
     try:
-        for _, message, stamp_s in _clouds(path, topic, alive):
+        for _, message, stamp_s in _clouds(job.path, job.topic, job.alive):
             if isinstance(message, VelodyneScan):
-                _check_unnamed(remission_field)
+                _check_unnamed(job.remission_field)
                 turns = turns if isinstance(turns, VelodyneStream) else VelodyneStream()
                 yield from turns.add(message)
                 continue
             if isinstance(message, OusterPacket):
-                turns = (
-                    turns if isinstance(turns, OusterMessages) else OusterMessages(message.metadata, remission_field)
-                )
+                if not isinstance(turns, OusterMessages):
+                    turns = OusterMessages(message.metadata, job.remission_field)
                 yield from turns.add(message, stamp_s)
                 continue
             try:
-                points = cloud_points(message, remission_field=remission_field)
+                points = cloud_points(message, remission_field=job.remission_field)
             except MapError as exc:
                 raise PointsError(
                     f"the clouds have coordinates of a map (frame {message.header.frame_id!r}), which float32 would "

@@ -166,20 +166,20 @@ class _Read(NamedTuple):
 
 def _read(path: Path, options: FileOptions) -> _Read:
     try:
-        size = path.stat().st_size if path.is_file() else 0
+        if path.is_dir():
+            raise PointsError(f"{path}: a folder; expected one scan file. edgeperc.read_scans reads those in a folder")
+        if not path.exists():
+            raise PointsError(f"{path}: {missing(path, 'file', 'a scan as .bin, .npy, .npz, .pcd or .ply')}")
+        if not path.is_file():
+            raise PointsError(f"{path}: a pipe or a device, not a file; write what it gives into a file, and pass that")
+        size = path.stat().st_size
         if size > MAX_SCAN_BYTES:
             raise PointsError(f"{path}: {size:,} bytes are too much for one scan; expected at most {MAX_SCAN_BYTES:,}")
-        data = np.fromfile(path, dtype=np.uint8) if path.is_file() else None
+        data = np.fromfile(path, dtype=np.uint8)
     except PointsError:
         raise
     except (MemoryError, OSError, ValueError) as exc:  # ValueError: a NUL in the name
         raise PointsError(f"{path}: the file cannot be read ({exc})") from exc
-    if data is None and path.exists() and not path.is_dir():
-        raise PointsError(f"{path}: a pipe or a device, not a file; write what it gives into a file, and pass that")
-    if data is None:
-        if path.is_dir():
-            raise PointsError(f"{path}: a folder; expected one scan file. edgeperc.read_scans reads those in a folder")
-        raise PointsError(f"{path}: {missing(path, 'file', 'a scan as .bin, .npy, .npz, .pcd or .ply')}")
     read = _parse_named(data, path, options)
     if read.n_missing:
         warnings.warn(f"{path}: {read.missing()}", UserWarning, stacklevel=3)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
@@ -15,7 +14,7 @@ import numpy as np
 from ..errors import PointsError, SensorError
 from ..types.sensor import SAY_PATTERN, SENSORS, SensorProfile
 from .clouds import is_ouster_cloud
-from .ouster import check_metadata, metadata_beside, read_metadata
+from .ouster import check_metadata, metadata_beside, object_in, read_metadata
 from .packets import SNIFFED_PACKETS, velodyne_name, velodyne_packets
 from .senders import Senders
 
@@ -66,8 +65,7 @@ def of_packets(path: Path, topic: str | None = None) -> KnownSensor:
         return known
     if names and not by_serial:
         return of_velodyne(names)
-    files = metadata_beside(path)
-    contents = [(file.name, json.loads(read_metadata(file))) for file in files]
+    contents = [(file.name, read_metadata(file)) for file in metadata_beside(path)]
     chosen = [entry for entry in contents if topic is None or _serial(entry[1]) == topic] or contents
     sensors = [of_metadata(content, f"the metadata {name}") for name, content in chosen]
     if len({entry.profile for entry in sensors}) > 1:
@@ -80,7 +78,7 @@ def of_packets(path: Path, topic: str | None = None) -> KnownSensor:
 
 def _serials_beside(path: Path) -> list[str]:
     with suppress(PointsError):
-        return [_serial(json.loads(read_metadata(file))) for file in metadata_beside(path)]
+        return [_serial(read_metadata(file)) for file in metadata_beside(path)]
     return []
 
 
@@ -96,9 +94,8 @@ def of_livox() -> NotSpinningError:
 
 
 def _of_lidar(path: Path, senders: Senders, topic: str | None, *, beside: bool) -> KnownSensor | None:
-    """The sensor of Hesai's or RoboSense's packets, with the angles of the unit; None if they are not theirs.
-
-    beside : there are a Velodyne's, too, so that the topic must name it.
+    """The sensor of Hesai's or RoboSense's packets, with the angles of the unit; None if they are not theirs, or if it
+    is ``beside`` a Velodyne and the topic does not name it.
     """
     lidar = senders.lidar(topic)
     if lidar is None or (beside and topic not in lidar.senders):
@@ -138,10 +135,10 @@ def of_metadata(content: Any, source: str) -> KnownSensor:
         check_metadata(content)
     except PointsError as exc:
         raise PointsError(f"{source} cannot be read: {exc}") from exc
-    layout = _object(content, "lidar_data_format") or _object(content, "data_format")
-    angles = _object(content, "beam_intrinsics").get("beam_altitude_angles", content.get("beam_altitude_angles"))
+    layout = object_in(content, "lidar_data_format") or object_in(content, "data_format")
+    angles = object_in(content, "beam_intrinsics").get("beam_altitude_angles", content.get("beam_altitude_angles"))
     elevations = _distinct(angles)
-    line = str(_object(content, "sensor_info").get("prod_line", content.get("prod_line", "")))
+    line = str(object_in(content, "sensor_info").get("prod_line", content.get("prod_line", "")))
     family = re.match(r"OS-?([012])(?!\d)", line)
     if family:
         model, because = f"os{family[1]}", f"{source} (prod_line {line})"
@@ -159,7 +156,9 @@ def of_metadata(content: Any, source: str) -> KnownSensor:
         because += ", with its beam angles" if family else ""
     elif profile is None:
         raise SensorError(f"{source} names a sensor {line!r} and no usable beam angles. {_CHOICES}")
-    mode = re.match(r"(\d{3,4})x", str(content.get("lidar_mode", _object(content, "config_params").get("lidar_mode"))))
+    mode = re.match(
+        r"(\d{3,4})x", str(content.get("lidar_mode", object_in(content, "config_params").get("lidar_mode")))
+    )
     columns = layout.get("columns_per_frame") or (int(mode[1]) if mode else profile.columns)
     return KnownSensor(replace(profile, columns=columns), because)
 
@@ -244,10 +243,5 @@ def _distinct(angles: Any) -> tuple[float, ...]:
     return tuple(distinct) if usable else ()
 
 
-def _object(content: Mapping[str, Any], name: str) -> Mapping[str, Any]:
-    value = content.get(name)
-    return value if isinstance(value, dict) else {}
-
-
 def _serial(content: Mapping[str, Any]) -> str:
-    return str(_object(content, "sensor_info").get("prod_sn", content.get("prod_sn", "")))
+    return str(object_in(content, "sensor_info").get("prod_sn", content.get("prod_sn", "")))

@@ -16,6 +16,8 @@ from .tables import MAX_BYTES
 # Scans pack less than 20 to 1. Clouds without a return pack better, but are smaller than 64 MiB.
 _MOST_RATIO, _ALWAYS_BYTES = 100, 1 << 26
 
+_ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
+
 
 def most_bytes(n_packed: int) -> int:
     """Most bytes that so many compressed bytes may unpack to."""
@@ -39,6 +41,11 @@ def inflate(packed: bytes, method: str, limit: int | None = None) -> bytes:
     if len(content) > limit:
         raise PointsError(f"{len(packed):,} compressed bytes unpack to more than {limit:,}, so they are not unpacked")
     return content
+
+
+def inflated_message(data: memoryview) -> memoryview:
+    """A message of a bag, which rosbag2 may have compressed by itself."""
+    return memoryview(inflate(bytes(data), "zstd")) if bytes(data[:4]) == _ZSTD_MAGIC else data
 
 
 def inflate_file(packed: Path, target: Path, limit: int, alive: Callable[[], None]) -> int:

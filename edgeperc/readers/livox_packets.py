@@ -21,16 +21,11 @@ SCAN_S = 0.1  # the sensors turn or sweep ten times a second
 
 
 class _Kind(NamedTuple):
-    """How points are written.
+    """How points are written."""
 
-    stride : bytes from one to the next.
-    returns : points of one moment.
-    places : of x, y and z or distance and angles: 4 or 2 bytes; 3: distance, zenith angle and azimuth.
-    """
-
-    stride: int
-    returns: int
-    layout: int
+    stride: int  # bytes from one to the next
+    returns: int  # points of one moment
+    layout: int  # bytes of x, y and z: 4 or 2; 3: distance, zenith angle and azimuth
 
 
 _WIDE, _NARROW, _POLAR = 4, 2, 3

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import struct
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
 
 from ..errors import PointsError
-from .inflate import inflate
+from .inflate import inflate, inflated_message
 from .tables import MAX_BYTES
 
 MCAP_MAGIC = b"\x89MCAP0\r\n"
@@ -24,15 +26,17 @@ class Channel(NamedTuple):
     encoding: str
 
 
-class Message(NamedTuple):
-    """A message as recorded: channel's number, time of recording [ns], bytes."""
+class BagFile(Protocol):
+    """One file of a bag."""
 
-    channel: int
-    stamp_ns: int
-    data: memoryview
+    def topics(self) -> set[Channel]:
+        """Its topics, as far as it is whole; PointsError if it is damaged before the first."""
+
+    def messages_of(self, channel: Channel) -> Iterator[tuple[int, memoryview]]:
+        """Time of recording [ns] and bytes of each message, in the file's order; PointsError where it is damaged."""
 
 
-class McapFile:
+class McapFile(BagFile):
     """One .mcap file, read from front to back; an index is not needed.
 
     channels : dict of int to Channel; those of the summary, or those among the messages.
@@ -40,56 +44,58 @@ class McapFile:
     """
 
     def __init__(self, path: Path) -> None:
-        self._path = path
         self._schemas: dict[int, str] = {}
-        self.channels: dict[int, Channel] = {}
-        with path.open("rb") as file:
-            size = path.stat().st_size
-            if size < 45 or file.read(8) != MCAP_MAGIC:
-                raise PointsError("the file is damaged or cut short: it does not begin as an MCAP file")
-            kind, _ = next(_records(file, 8, size), (0, None))
-            if kind != _HEADER:
-                raise PointsError("the file is damaged: it does not begin with the header of an MCAP file")
-            file.seek(-37, 2)
-            footer = file.read()
-            self._is_whole = footer[:9] == struct.pack("<BQ", _FOOTER, 20) and footer[29:] == MCAP_MAGIC
-            self._end = size - 37 if self._is_whole else size
-            (summary,) = unpack("<Q", footer, 9) if self._is_whole else (0,)
-            if summary > self._end:
-                raise PointsError(f"the file is damaged: its summary is said to begin at byte {summary:,} of {size:,}")
-            if summary:
-                for kind, content in _records(file, summary, self._end):
-                    self._learn(kind, content)
-        if not self.channels:  # no summary: the channels stand among the messages
+        self._channels: dict[int, Channel] = {}  # those of the summary, or those among the messages
+        size = path.stat().st_size
+        self._data = np.memmap(path, np.uint8, "r").data if size >= 45 else memoryview(b"")
+        if self._data[:8] != MCAP_MAGIC:
+            raise PointsError("the file is damaged or cut short: it does not begin as an MCAP file")
+        kind, _ = next(_records(self._data, 8), (0, None))
+        if kind != _HEADER:
+            raise PointsError("the file is damaged: it does not begin with the header of an MCAP file")
+        footer = bytes(self._data[-37:])
+        self._is_whole = footer[:9] == struct.pack("<BQ", _FOOTER, 20) and footer[29:] == MCAP_MAGIC
+        (summary,) = unpack("<Q", footer, 9) if self._is_whole else (0,)
+        self._data = self._data[:-37] if self._is_whole else self._data
+        if summary > len(self._data):
+            raise PointsError(f"the file is damaged: its summary is said to begin at byte {summary:,} of {size:,}")
+        if summary:
+            for kind, content in _records(self._data, summary):
+                self._learn(kind, content)
+        if not self._channels:  # no summary: the channels stand among the messages
             try:
-                for _ in self.messages():
+                for _ in self._messages():
                     pass
             except PointsError:  # raised again when the messages are read
-                if not self.channels:
+                if not self._channels:
                     raise
 
-    def messages(self) -> Iterator[Message]:
-        """Every message: chunk by chunk, within a chunk in the order of time.
+    def topics(self) -> set[Channel]:
+        return set(self._channels.values())
 
-        Raises PointsError at the damage; what stands before it came. A recorder that lost power wrote no end.
-        """
-        with self._path.open("rb") as file:
-            for kind, content in _records(file, 8, self._end):
-                if kind == _CHUNK:
-                    records = list(self._of_records(_split(_unpacked(content))))
-                    yield from sorted(records, key=lambda message: message.stamp_ns)
-                elif kind == _DATA_END:
-                    return
-                else:
-                    yield from self._of_records(iter([(kind, content)]))
-        if not self._is_whole:
+    def messages_of(self, channel: Channel) -> Iterator[tuple[int, memoryview]]:
+        for number, stamp_ns, data in self._messages():
+            if self._channels.get(number) == channel:
+                yield stamp_ns, inflated_message(data)
+
+    def _messages(self) -> Iterator[tuple[int, int, memoryview]]:
+        """Channel's number, time of recording [ns] and bytes: chunk by chunk, within a chunk in the order of time."""
+        for kind, content in _records(self._data, 8):
+            if kind == _CHUNK:
+                records = list(self._of_records(_records(memoryview(_unpacked(content)), 0, is_chunk=True)))
+                yield from sorted(records, key=lambda message: message[1])
+            elif kind == _DATA_END:
+                return
+            else:
+                yield from self._of_records([(kind, content)])
+        if not self._is_whole:  # as by a recorder that lost power
             raise PointsError("the file is damaged or cut short: it does not end as an MCAP file")
 
-    def _of_records(self, records: Iterator[tuple[int, memoryview]]) -> Iterator[Message]:
+    def _of_records(self, records: Iterable[tuple[int, memoryview]]) -> Iterator[tuple[int, int, memoryview]]:
         for kind, content in records:
             if kind == _MESSAGE:
                 channel, _, stamp_ns, _ = unpack("<HIQQ", content)
-                yield Message(channel, stamp_ns, content[22:])
+                yield channel, stamp_ns, content[22:]
             else:
                 self._learn(kind, content)
 
@@ -99,35 +105,26 @@ class McapFile:
         elif kind == _CHANNEL:
             number, schema = unpack("<HH", content)
             topic, offset = _text(content, 4)
-            self.channels[number] = Channel(topic, self._schemas.get(schema, ""), _text(content, offset)[0])
+            self._channels[number] = Channel(topic, self._schemas.get(schema, ""), _text(content, offset)[0])
 
 
-def _records(file: BinaryIO, offset: int, end: int) -> Iterator[tuple[int, memoryview]]:
-    """The kind and content of each record; those that are not needed are skipped."""
-    while offset < end:
-        file.seek(offset)
-        head = file.read(9)
-        kind, length = struct.unpack("<BQ", head) if len(head) == 9 else (0, end)
-        if offset + 9 + length > end:
-            raise PointsError(f"the file is damaged or cut short: the record at byte {offset:,} is not whole")
-        if kind == 0:  # a file system fills with zeros what was not written when power was lost
+def _records(data: memoryview, offset: int, *, is_chunk: bool = False) -> Iterator[tuple[int, memoryview]]:
+    """The kind and content of each record of a file or a chunk; those that are not needed are skipped."""
+    while offset < len(data):
+        kind, length = struct.unpack_from("<BQ", data, offset) if offset + 9 <= len(data) else (0, len(data))
+        end = offset + 9 + length
+        if end > len(data):
+            what = "a chunk is damaged: it ends inside a record"
+            if not is_chunk:
+                what = f"the file is damaged or cut short: the record at byte {offset:,} is not whole"
+            raise PointsError(what)
+        if kind == 0 and not is_chunk:  # a file system fills with zeros what was not written when power was lost
             raise PointsError(f"the file is damaged or cut short: there are zeros in place of a record at {offset:,}")
         if kind in (_HEADER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _DATA_END):
             if length > MAX_BYTES:
                 raise PointsError(f"the record at byte {offset:,} has {length:,} bytes; expected at most {MAX_BYTES:,}")
-            yield kind, memoryview(file.read(length))
-        offset += 9 + length
-
-
-def _split(content: bytes) -> Iterator[tuple[int, memoryview]]:
-    """The records of a chunk."""
-    view, offset = memoryview(content), 0
-    while offset < len(view):
-        kind, length = struct.unpack_from("<BQ", view, offset) if offset + 9 <= len(view) else (0, len(view))
-        if offset + 9 + length > len(view):
-            raise PointsError("a chunk is damaged: it ends inside a record")
-        yield kind, view[offset + 9 : offset + 9 + length]
-        offset += 9 + length
+            yield kind, data[offset + 9 : end]
+        offset = end
 
 
 def _unpacked(chunk: memoryview) -> bytes:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ..errors import PointsError
 from ..system.kernels import njit
-from ..types.points import Floats, Ints64
+from ..types.points import Floats
 
 _N_POINTS = 16_000  # that are looked at
 _N_SECTORS = 90  # of a turn, which has as many points everywhere around the sensor
@@ -95,13 +95,9 @@ def _rough_place(sample: Floats) -> tuple[float, float]:
 
 
 def _unevenness(sample: Floats, x: float, y: float) -> float:
-    counts = np.bincount(_sectors(sample, x, y, _N_SECTORS), minlength=_N_SECTORS)
-    return float(counts.std())
-
-
-def _sectors(sample: Floats, x: float, y: float, n: int) -> Ints64:
     turn = np.arctan2(sample[:, 1] - y, sample[:, 0] - x) / (2.0 * np.pi) + 0.5
-    return np.asarray(np.minimum(turn * n, n - 1.0), np.int64)
+    sectors = np.minimum(turn * _N_SECTORS, _N_SECTORS - 1.0).astype(np.int64)
+    return float(np.bincount(sectors, minlength=_N_SECTORS).std())
 
 
 def _far_place(sample: Floats, x: float, y: float) -> Floats:

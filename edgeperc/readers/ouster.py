@@ -6,6 +6,7 @@ import json
 import os
 import struct
 import zlib
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -35,20 +36,25 @@ def metadata_beside(path: Path) -> list[Path]:
     return [file for file, n in alike.items() if n == longest]
 
 
-def read_metadata(path: Path) -> str:
+def read_metadata(path: Path) -> dict[str, Any]:
     """The text of a sensor's metadata, once it is checked."""
     if path.stat().st_size > _MOST_JSON_BYTES:
         raise PointsError(f"the metadata {path.name} is larger than {_MOST_JSON_BYTES:,} bytes")
-    text = path.read_bytes().decode("utf-8", "replace")
     try:
-        content = json.loads(text)
+        content = json.loads(path.read_bytes().decode("utf-8", "replace"))
     except (ValueError, RecursionError) as exc:
         raise PointsError(f"the metadata {path.name} cannot be read: it is not JSON ({exc})") from exc
     try:
         check_metadata(content)
     except PointsError as exc:
         raise PointsError(f"the metadata {path.name} cannot be read: {exc}") from exc
-    return text
+    return content
+
+
+def object_in(content: Mapping[str, Any], name: str) -> Mapping[str, Any]:
+    """An object in metadata, empty where there is none."""
+    value = content.get(name)
+    return value if isinstance(value, dict) else {}
 
 
 def check_metadata(content: Any) -> None:

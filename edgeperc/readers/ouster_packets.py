@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ..errors import PointsError
 from ..system.kernels import njit
 from ..types.points import Bytes, Floats, Ints64
-from .ouster import check_metadata
+from .ouster import check_metadata, object_in
 from .times import TimedScan
 
 
@@ -93,11 +93,11 @@ class Layout(NamedTuple):
 def layout_of(content: Any) -> Layout:
     """The layout of the packets of a sensor, of any firmware; PointsError if something is missing or impossible."""
     check_metadata(content)
-    if "beam_intrinsics" in content and (missing := [name for name in _LATER if not _object(content, name)]):
+    if "beam_intrinsics" in content and (missing := [name for name in _LATER if not object_in(content, name)]):
         raise PointsError(f"it lacks {', '.join(missing)}, which come with beam_intrinsics")
-    form = _object(content, "lidar_data_format") or _object(content, "data_format")
-    info, config = (_object(content, name) or content for name in ("sensor_info", "config_params"))
-    beams = _object(content, "beam_intrinsics") or content
+    form = object_in(content, "lidar_data_format") or object_in(content, "data_format")
+    info, config = (object_in(content, name) or content for name in ("sensor_info", "config_params"))
+    beams = object_in(content, "beam_intrinsics") or content
     altitude, azimuth = (_angles(beams, f"beam_{name}_angles") for name in ("altitude", "azimuth"))
     mode = re.match(r"(\d{3,4})x\d", str(config.get("lidar_mode", content.get("lidar_mode"))))
     n_columns = form.get("columns_per_frame") or (int(mode[1]) if mode else 0)
@@ -121,11 +121,11 @@ def layout_of(content: Any) -> Layout:
     in_beam = _TO_BEAM_MM[line[1]] if line else _TO_BEAM_OF_FIRST_MM
     to_beam = np.eye(4)
     to_beam[0, 3] = _number(beams, "lidar_origin_to_beam_origin_mm", in_beam)
-    lidar = _object(content, "lidar_intrinsics") or content
+    lidar = object_in(content, "lidar_intrinsics") or content
     packet_bytes = 2 * header + per_packet * column_bytes
     if packet_bytes > _MOST_PACKET_BYTES:
         raise PointsError(f"packets of {packet_bytes:,} bytes; expected at most {_MOST_PACKET_BYTES:,}")
-    n_motions = int(_number(_object(content, "imu_data_format"), "imu_measurements_per_packet", 8))
+    n_motions = int(_number(object_in(content, "imu_data_format"), "imu_measurements_per_packet", 8))
     return Layout(
         name=str(info.get("prod_sn") or 0),
         serial=0 if is_legacy else _digits(info.get("prod_sn")),
@@ -144,11 +144,6 @@ def layout_of(content: Any) -> Layout:
         to_lidar=_transform(beams, "beam_to_lidar_transform", to_beam),
         to_sensor=_transform(lidar, "lidar_to_sensor_transform", np.reshape(_LIDAR_TO_SENSOR, (4, 4))),
     )
-
-
-def _object(content: Mapping[str, Any], name: str) -> Mapping[str, Any]:
-    value = content.get(name)
-    return value if isinstance(value, dict) else {}
 
 
 def _digits(value: Any) -> int:

@@ -146,6 +146,7 @@ def sender_names(counts: Mapping[tuple[str, int], int]) -> list[str]:
 
     counts : packets by address and port; few are damaged, unless they are as many as in a tenth of a second.
     """
+    # Those of a damaged address are few, unless they are as many as in a tenth of a second.
     fewest = min(_FEWEST_PACKETS, _LEAST_SHARE * max(counts.values(), default=0))
     known = [source for source, n in counts.items() if n >= fewest]
     ports = Counter(address for address, _ in known)
@@ -157,8 +158,8 @@ def velodyne_packets(path: Path, sender: str | None = None) -> Iterator[memoryvi
 
     sender : one of `velodyne_senders`; None: all.
     """
-    most = SNIFFED_PACKETS if sender is None else None
-    known = (datagram.payload for datagram in _velodyne_datagrams(path, most) if datagram.is_from(sender))
+    datagrams = Datagrams(path, lambda: None, SNIFFED_PACKETS if sender is None else None)
+    known = (each.payload for each in datagrams if is_of_velodyne(each) and each.is_from(sender))
     yield from islice(known, SNIFFED_PACKETS)
     yield from _bare_velodyne_packets(path)
 
@@ -201,10 +202,6 @@ def velodyne_name(packet: memoryview) -> str | None:
 def is_of_velodyne(datagram: Datagram) -> bool:
     """Whether it is a Velodyne's by its size and its first bytes."""
     return len(datagram.payload) == VELODYNE_BYTES and bytes(datagram.payload[:2]) == _FLAG
-
-
-def _velodyne_datagrams(path: Path, most: int | None) -> Iterator[Datagram]:
-    return filter(is_of_velodyne, Datagrams(path, lambda: None, most))
 
 
 def _bare_velodyne_packets(path: Path) -> Iterator[memoryview]:
@@ -289,12 +286,13 @@ def is_plain(path: Path) -> bool:
     return is_ethernet(path)
 
 
-def copy_as_ethernet(path: Path, target: Path, alive: Callable[[], None], sender: str | None = None) -> None:
+def copy_as_ethernet(path: Path, target: Path, alive: Callable[[], None], sender: str | None) -> None:
     """Copy a Velodyne's datagrams in a pcap file, of one sender or all, in their order, each as one packet behind
     Ethernet's header.
 
     ``tcpdump -i any`` writes Linux's cooked headers; tunnels and phones write raw IP; a narrow link sends fragments.
     """
+    # ``tcpdump -i any`` writes Linux's cooked headers; tunnels and phones write raw IP; a narrow link sends fragments.
     with target.open("wb") as out:
         out.write(struct.pack("<IHHiIII", 0xA1B2C3D4, 2, 4, 0, 0, 65535, 1))
         for datagram in in_order(each for each in Datagrams(path, alive) if each.is_from(sender)):

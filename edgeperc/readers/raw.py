@@ -33,8 +33,7 @@ def parse_raw(data: Bytes, columns: int | Sequence[str] | None, usual: int) -> C
     if TEXT_BYTES[data[:4096]].all():
         raise PointsError("the file holds text, not float32 values; expected x, y, z, remission as raw float32")
     if columns is None:
-        width = _width(data[: data.size // 4 * 4].view("<f4"), usual)
-        names = (*_KNOWN[:width], *(f"column {k}" for k in range(5, width + 1)))
+        names = column_names(_width(data[: data.size // 4 * 4].view("<f4"), usual))
     record = 4 * len(names)
     if data.size % record:
         raise PointsError(
@@ -74,10 +73,7 @@ def column_names(columns: int | Sequence[str] | None) -> tuple[str, ...]:
 
 
 def _width(values: Floats32, usual: int) -> int:
-    """How many values a point has: those at this distance are most alike, for they are of the same column.
-
-    usual : stays, where the values do not clearly say otherwise.
-    """
+    """How many values a point has, if not the usual number: those at this distance are most alike, of one column."""
     if len(values) < _FEWEST_POINTS * usual:
         return usual
     with np.errstate(all="ignore"):

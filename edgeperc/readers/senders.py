@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections import Counter
 from collections.abc import Callable
 from contextlib import suppress
@@ -46,7 +45,10 @@ class Senders:
     def __init__(self, path: Path, alive: Callable[[], None], most: int | None = None) -> None:
         self._counts = Counter[tuple[str | None, tuple[str, int]]]()  # by kind, None: not known, address and port
         self._rows: dict[str, Format] = {}  # of the kinds that spin
-        layouts, sizes = ousters_beside(path), set[int]()
+        layouts: list[Layout] = []
+        with suppress(PointsError):  # no metadata, or some that cannot be read
+            layouts = layouts_beside(path)
+        sizes = set[int]()
         ouster_bytes = {layout.packet_bytes for layout in layouts}
         self.n_overtaken, latest_s = 0, dict[tuple[str, int], float]()
         datagrams = Datagrams(path, alive, most)
@@ -133,11 +135,16 @@ def _recognizers() -> tuple[Callable[[memoryview], Any], ...]:
     return format_of, name_of, points_of
 
 
-def ousters_beside(path: Path) -> list[Layout]:
-    """What the metadata beside a capture says of Ousters; empty if there is none, or one cannot be read."""
-    with suppress(PointsError):
-        files = metadata_beside(path)
-        from .ouster_packets import layout_of  # numba
+def layouts_beside(path: Path) -> list[Layout]:
+    """What the metadata beside a capture says of Ousters' packets. Raises PointsError."""
+    files = metadata_beside(path)
+    from .ouster_packets import layout_of  # numba
 
-        return [layout_of(json.loads(read_metadata(file))) for file in files]
-    return []
+    layouts = []
+    for file in files:
+        content = read_metadata(file)
+        try:
+            layouts.append(layout_of(content))
+        except PointsError as exc:
+            raise PointsError(f"the metadata {file.name} cannot be read: {exc}") from exc
+    return layouts

@@ -86,10 +86,7 @@ _EXPECTED = "expected x, y, z and remission in each row, or a first line of name
 
 
 def _head(lines: Sequence[str], is_named: bool) -> tuple[str, list[int], list[str]]:
-    """The line of names, whole numbers that stand alone, and the rows below.
-
-    is_named : the names are given.
-    """
+    """The line of names, whole numbers that stand alone, and the rows below; ``is_named``: the names are given."""
     header, counts = "", list[int]()
     for k, line in enumerate(lines):
         style = _style(line)

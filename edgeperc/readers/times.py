@@ -79,6 +79,8 @@ def point_times(fields: Mapping[str, NDArray[Any]], points: Points, stamp_s: flo
     Raises PointsError if, by these times and the azimuths, the sensor takes less than 33 or more than 350 ms for a
     turn.
     """
+    # Drivers store seconds, milli-, micro- or nanoseconds, and no field says which. A scan takes 2 ms to 2 s, so the
+    # difference between its first and its last time shows the unit, but not where all times are 0.
     name = time_name(fields)
     if name is None:
         return None
@@ -138,10 +140,7 @@ def _range(moments: Floats) -> tuple[float, float]:
 
 
 def _check_turn(xyz: Points, shares: Floats, duration_s: float, name: str) -> None:
-    """Raise PointsError if the azimuth turns once in these times, in a time that no LiDAR takes for a turn.
-
-    shares : (n,); of the duration, 0 to 1.
-    """
+    """Raise PointsError if the azimuth turns once in a time that no LiDAR takes for it; shares are of it, 0 to 1."""
     azimuth = np.arctan2(xyz[:, 1], xyz[:, 0]).astype(np.float64)
     sectors = np.unique(np.floor((azimuth / (2 * np.pi) + 0.5) * _SECTORS).astype(np.int64) % _SECTORS)
     if len(sectors) < _TURN_SECTORS or _FASTEST_TURN_S <= duration_s <= _SLOWEST_TURN_S:

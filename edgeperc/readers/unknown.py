@@ -6,11 +6,10 @@ from pathlib import Path
 
 _ARCHIVE = "an archive; unpack it first"
 _FILM = "a film; edgeperc reads images (.jpg, .png), for a camera model"
-_IMAGE = "an image; pass it with a camera model: --model camseg"
 _TABLE = "read it with pandas, and pass a data frame of its columns x, y, z and intensity"
 
 # First bytes, and what to say of them.
-_KNOWN = {
+_KNOWN: dict[bytes | tuple[bytes, ...], str] = {
     b"version https://git-lfs": "a pointer of Git LFS; the file itself is not there yet. Run: git lfs pull",
     b"LASF": "a LAS or LAZ file; convert it, e.g.: pdal translate FILE scan.pcd, or read it with laspy",
     b"ARROW1": f"a Feather (Arrow) table, as of Argoverse 2; {_TABLE}",
@@ -18,24 +17,14 @@ _KNOWN = {
     b"ASTM-E57": "an E57 file; convert it with CloudCompare or pdal, to .pcd or .ply",
     b"\x89HDF": "an HDF5 file; read it with h5py, and pass x, y, z and intensity as an array of shape (n, 4)",
     b"MATLAB": "a MATLAB file; save the points as .npy or .pcd",
-    b"\x80\x02": "a pickle, which is never unpickled; save the points as .npy",
-    b"\x80\x03": "a pickle, which is never unpickled; save the points as .npy",
-    b"\x80\x04": "a pickle, which is never unpickled; save the points as .npy",
-    b"\x80\x05": "a pickle, which is never unpickled; save the points as .npy",
+    (b"\x80\x02", b"\x80\x03", b"\x80\x04", b"\x80\x05"): "a pickle, which is never unpickled; save the points as .npy",
     b"DRACO": "a Draco file; decode it to .ply",
-    b"\x1f\x8b": _ARCHIVE,
-    b"BZh": _ARCHIVE,
+    (b"\x1f\x8b", b"BZh", b"\xfd7zXZ", b"7z\xbc\xaf", b"\x28\xb5\x2f\xfd", b"Rar!"): _ARCHIVE,
     b"\xff\xfe": "text in UTF-16, if text at all; save it as UTF-8",
-    b"\xfd7zXZ": _ARCHIVE,
-    b"7z\xbc\xaf": _ARCHIVE,
-    b"\x28\xb5\x2f\xfd": _ARCHIVE,
-    b"Rar!": _ARCHIVE,
     b"\x1a\x45\xdf\xa3": _FILM,
     b"RIFF": "a film or an image (RIFF); edgeperc reads .jpg and .png, for a camera model",
-    b"\x89PNG": _IMAGE,
-    b"\xff\xd8\xff": _IMAGE,
-    b"II*\0": "a TIFF image; convert it to .png, for a camera model",
-    b"MM\0*": "a TIFF image; convert it to .png, for a camera model",
+    (b"\x89PNG", b"\xff\xd8\xff"): "an image; pass it with a camera model: --model camseg",
+    (b"II*\0", b"MM\0*"): "a TIFF image; convert it to .png, for a camera model",
     b"%PDF": "a PDF document",
     b"\x7fELF": "a program",
 }

@@ -91,7 +91,7 @@ def random_scene(seed: int, environment: str | None = None) -> Scene:
         x, y, yaw = street.on_strip((s0 + s1) / 2, (u0 + u1) / 2, k)
         street.take(x, y, s1 - s0, u1 - u0, yaw)
     add_islands_poles(street)
-    _add_traffic(street, place, lane, same, oncoming, ego_lane, sway, crossings)
+    _add_traffic(street, place, lane, same, oncoming, ego_lane, sway)
     _add_parked(street, park_right > 0.0, park_left > 0.0, crossings, place)
     _add_people(street, place)
     add_cafe(street, 0.15 if place in ("urban", "residential", "junction") else 0.0)
@@ -136,7 +136,6 @@ def _add_traffic(
     oncoming: int,
     ego_lane: int,
     sway: float,
-    crossings: Sequence[float],
 ) -> None:
     rng = street.rng
     density = {"urban": 0.022, "residential": 0.008, "junction": 0.022, "rural": 0.008, "highway": 0.016}[place]

@@ -53,6 +53,6 @@ def rod(remission: float, start: Vector, end: Vector, radius: float, material: i
     )  # fmt: skip
 
 
-def post(remission: float, x: float, y: float, height: float, radius: float, material: int = MATTE) -> Row:
+def post(remission: float, x: float, y: float, height: float, radius: float) -> Row:
     """Make an upright cylinder that stands 0.2 m in the ground."""
-    return rod(remission, (x, y, -0.2), (x, y, height), radius, material)
+    return rod(remission, (x, y, -0.2), (x, y, height), radius)

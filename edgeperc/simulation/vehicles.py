@@ -10,7 +10,7 @@ from .raycast import GLASS, MATTE, PAINT, POROUS, RETRO
 from .shapes import Row, Vector, block, rod
 
 
-def _wheels(length: float, width: float, xs: Sequence[float], radius: float) -> list[Row]:
+def _wheels(width: float, xs: Sequence[float], radius: float) -> list[Row]:
     side = width / 2.0 - 0.14
     return [rod(0.03, (x, y - 0.11, radius), (x, y + 0.11, radius), radius) for x in xs for y in (-side, side)]
 
@@ -76,7 +76,7 @@ def car(size: Vector, rng: np.random.Generator) -> list[Row]:
             high = (x_high, s * (width * 0.465 * (1 - sides) - 0.02), roof)
             rows.append(rod(paint * 0.7, low, high, 0.045))
     radius = min(0.36, max(0.27, 0.075 * length))
-    rows += _wheels(length, width, (-0.3 * length, 0.32 * length), radius)
+    rows += _wheels(width, (-0.3 * length, 0.32 * length), radius)
     return rows + _lights(length, width, 0.62 * belt + 0.1, rng)
 
 
@@ -117,7 +117,7 @@ def van(size: Vector, rng: np.random.Generator) -> list[Row]:
             rod(paint * 0.7, (x, s * (width * 0.475 - 0.02), belt), (x, s * (width * 0.44 - 0.02), height - 0.1), 0.05)
             for s in (-1.0, 1.0)
         ]
-    return rows + _wheels(length, width, (-0.3 * length, 0.34 * length), 0.34) + _lights(length, width, 0.9, rng)
+    return rows + _wheels(width, (-0.3 * length, 0.34 * length), 0.34) + _lights(length, width, 0.9, rng)
 
 
 def truck(size: Vector, rng: np.random.Generator) -> list[Row]:
@@ -150,7 +150,7 @@ def truck(size: Vector, rng: np.random.Generator) -> list[Row]:
         rows.append(block(MATTE, cargo, (box_end - 0.05, 0, (1.0 + height) / 2), (0.1, width, height - 1.0)))
     axles = [front - min(1.3, 0.2 * length), -front + 0.2 * length]
     axles += [-front + 0.2 * length + 1.2] if length > 7.5 else []
-    return rows + _wheels(length, width, axles, 0.48) + _lights(length, width, 0.95, rng)
+    return rows + _wheels(width, axles, 0.48) + _lights(length, width, 0.95, rng)
 
 
 def bus(size: Vector, rng: np.random.Generator) -> list[Row]:
@@ -172,7 +172,7 @@ def bus(size: Vector, rng: np.random.Generator) -> list[Row]:
             for s in (-1.0, 1.0)
         ]
     axles = (-length / 2 + min(2.6, 0.25 * length), length / 2 - min(2.4, 0.2 * length))
-    return rows + _wheels(length, width, axles, 0.45) + _lights(length, width, 0.8, rng)
+    return rows + _wheels(width, axles, 0.45) + _lights(length, width, 0.8, rng)
 
 
 def misc(size: Vector, rng: np.random.Generator) -> list[Row]:
@@ -197,9 +197,8 @@ def misc(size: Vector, rng: np.random.Generator) -> list[Row]:
         rows.append(block(MATTE, rng.uniform(0.1, 0.6), (rear, 0, low + load / 2), (0.6 * body, 0.7 * width, load)))
     if body < length:
         rows.append(rod(0.25, (rear + body / 2 - 0.1, 0, 0.45), (length / 2 - 0.05, 0, 0.45), 0.05))
-    return rows + _wheels(
-        body, width, (rear - 0.1, *(() if body < 4.0 else (rear + 0.7,))), min(0.33, 0.5 * floor + 0.1)
-    )
+    axles = (rear - 0.1, *(() if body < 4.0 else (rear + 0.7,)))
+    return rows + _wheels(width, axles, min(0.33, 0.5 * floor + 0.1))
 
 
 def motorcycle(length: float, width: float, height: float, rng: np.random.Generator) -> list[Row]:

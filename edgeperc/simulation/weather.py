@@ -22,6 +22,7 @@ from ..types.points import Floats, Floats32, Points
 Scan = Floats32
 
 DIVERGENCE_RAD = 3e-3  # of the beam
+MAX_RANGE_M = 120.0  # of the sensor
 DROP_REMISSION = 0.02  # of water and ice at normal incidence
 LEAST_REMISSION, LEAST_OF_DROP = 0.05, 0.9  # of what a sensor sees at its longest range; after LISA for drops
 _TARGET = 1e-6 / math.pi  # differential reflectivity of a hard target (Hahner et al.)
@@ -36,18 +37,18 @@ def dirty(points: Points, left_deg: float, right_deg: float, lost: float = 1.0, 
     return points[~(behind & (np.random.default_rng(seed).random(len(points)) < lost))].astype(np.float32)
 
 
-def rain(points: Points, rate_mm_h: float, *, max_range_m: float = 120.0, seed: int = 0) -> Scan:
+def rain(points: Points, rate_mm_h: float, *, seed: int = 0) -> Scan:
     """Rain: drops in the beams, and lost returns."""
     slope, per_m = 4.1 * rate_mm_h**-0.21, 0.01 * rate_mm_h**0.6
-    return _fallen(points, (8000.0, slope, per_m), max_range_m, seed)
+    return _fallen(points, (8000.0, slope, per_m), seed)
 
 
-def snow(points: Points, rate_mm_h: float, *, max_range_m: float = 120.0, seed: int = 0) -> Scan:
+def snow(points: Points, rate_mm_h: float, *, seed: int = 0) -> Scan:
     """Snow, by its rate as water: flakes in the beams, and lost returns."""
     n0, slope = 7.6e3 * rate_mm_h**-0.87, 2.55 * rate_mm_h**-0.48
     # The cross-sections of all flakes take from the beam: pi/4 times the second moment of their sizes.
     per_m = math.pi / 4.0 * 2.0 * n0 / slope**3 * 1e-6
-    return _fallen(points, (n0, slope, per_m), max_range_m, seed)
+    return _fallen(points, (n0, slope, per_m), seed)
 
 
 def cloud(
@@ -62,7 +63,7 @@ def cloud(
     return _with_drops(points, rays, ranges, np.where((half > 0.0) & (at < along + half), at, np.inf))
 
 
-def fog(points: Points, visibility_m: float, *, max_range_m: float = 120.0, seed: int = 0) -> Scan:
+def fog(points: Points, visibility_m: float, *, seed: int = 0) -> Scan:
     """Fog by its visibility (meteorological optical range): attenuated returns, and those of the fog itself."""
     rng, ranges, rays = _beams(points, seed)
     per_m, backscatter = math.log(20.0) / visibility_m, 0.046 / visibility_m
@@ -77,7 +78,7 @@ def fog(points: Points, visibility_m: float, *, max_range_m: float = 120.0, seed
     soft = remission * ranges**2 * backscatter / _TARGET * response.max()
     is_soft = (soft > hard) & (ranges > at)
     scattered = at * rng.uniform(0.5, 1.5, len(points))
-    is_lost = hard / np.maximum(ranges, 1e-9) ** 2 < LEAST_REMISSION / max_range_m**2
+    is_lost = hard / np.maximum(ranges, 1e-9) ** 2 < LEAST_REMISSION / MAX_RANGE_M**2
     foggy = _with_drops(points, rays, ranges, np.where(is_soft, scattered, np.inf))
     foggy[:, 3] = np.where(is_soft, np.minimum(soft, 1.0), points[:, 3] * np.exp(-2.0 * per_m * ranges))
     return foggy[is_soft | ~is_lost]
@@ -89,18 +90,18 @@ def _beams(points: Points, seed: int) -> tuple[np.random.Generator, Floats, Floa
     return np.random.default_rng(seed), ranges, points[:, :3] / np.maximum(ranges, 1e-9)[:, None]
 
 
-def _fallen(points: Points, sizes: tuple[float, float, float], max_range_m: float, seed: int) -> Scan:
+def _fallen(points: Points, sizes: tuple[float, float, float], seed: int) -> Scan:
     """sizes : number of drops per m3 and mm of diameter that the exponential begins with, its slope [1/mm], and the
         attenuation [1/m].
     Returns of drops that are nearer than the target and bright enough; targets that are too dim are lost.
     """
     n0, slope, per_m = sizes
     rng, ranges, rays = _beams(points, seed)
-    least = LEAST_REMISSION / max_range_m**2
+    least = LEAST_REMISSION / MAX_RANGE_M**2
     reach = np.arange(0.5, 40.0, 0.05)
     width_mm = 1e3 * DIVERGENCE_RAD * reach
     # The smallest that is seen; one larger than the beam returns no more than all of it.
-    seen_mm = width_mm * reach * np.sqrt(LEAST_OF_DROP / max_range_m**2 / DROP_REMISSION) * np.exp(per_m * reach)
+    seen_mm = width_mm * reach * np.sqrt(LEAST_OF_DROP / MAX_RANGE_M**2 / DROP_REMISSION) * np.exp(per_m * reach)
     seen_mm = np.where(seen_mm <= width_mm, seen_mm, np.inf)
     per_beam = n0 / slope * np.exp(-slope * seen_mm) * math.pi / 4.0 * (1e-3 * width_mm) ** 2
     expected = np.cumsum(per_beam) * 0.05

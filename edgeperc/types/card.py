@@ -10,7 +10,7 @@ import math
 import os
 import reprlib
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
 from ..errors import CardError
@@ -394,21 +394,12 @@ class ModelCard:
 
     def to_json(self) -> str:
         """Canonical JSON: sorted keys, no blanks, no NaN."""
-        view: dict[str, Any] = {"kind": self.view.kind, **_entries(self.view)}
-        document = _entries(self)
+        document: dict[str, Any] = {"schema": SCHEMA, **asdict(self)}
+        document["view"]["kind"] = self.view.kind
         if self.head is None:
             del document["head"]
         else:
-            document["head"] = {"kind": self.head.kind, **_entries(self.head)}
-            if isinstance(self.head, AnchorHead):
-                document["head"]["anchors"] = [_entries(anchor) for anchor in self.head.anchors]
-        document |= {
-            "schema": SCHEMA,
-            "view": view,
-            "input": _entries(self.input),
-            "outputs": [_entries(output) for output in self.outputs],
-            "golden": self.golden and _entries(self.golden),
-        }
+            document["head"]["kind"] = self.head.kind
         return json.dumps(document, sort_keys=True, separators=(",", ":"), ensure_ascii=False, allow_nan=False)
 
     @classmethod
@@ -457,10 +448,6 @@ class ModelCard:
                 FIELDS.refuse("head.kind", kind, "anchors or centers")
             head = FIELDS.entry(HEADS[kind], head, "head")
         return FIELDS.read(cls, {**document, "view": geometry, "head": head})
-
-
-def _entries(record: Any) -> dict[str, Any]:
-    return {name: getattr(record, name) for name in type(record).__dataclass_fields__}
 
 
 def _check_tree(document: Any) -> None:

@@ -46,6 +46,8 @@ class PillarGeometry:
     num_points: str
     coords: str
 
+    kind = "pillars"
+
     def __post_init__(self) -> None:
         _FIELDS.number("view.cell_m", self.cell_m, 1e-3, 100.0)
         for name in ("x_range_m", "y_range_m", "z_range_m"):
@@ -63,10 +65,6 @@ class PillarGeometry:
         check_text("view.coords", self.coords, CardError)
         if self.num_points:
             check_text("view.num_points", self.num_points, CardError)
-
-    @property
-    def kind(self) -> str:
-        return "pillars"
 
     @property
     def height(self) -> int:
@@ -119,6 +117,8 @@ class AnchorHead:
     direction_offset_rad: float
     direction_limit_offset: float
 
+    kind = "anchors"
+
     def __post_init__(self) -> None:
         _check_common(self)
         _FIELDS.whole("the number of head.anchors", self.n_anchors, 1, MAX_ANCHORS)
@@ -129,10 +129,6 @@ class AnchorHead:
         _FIELDS.whole("head.direction_bins", self.direction_bins, 1, 64)
         _FIELDS.number("head.direction_offset_rad", self.direction_offset_rad, -10.0, 10.0)
         _FIELDS.number("head.direction_limit_offset", self.direction_limit_offset, -1.0, 1.0)
-
-    @property
-    def kind(self) -> str:
-        return "anchors"
 
     @property
     def n_anchors(self) -> int:
@@ -166,10 +162,14 @@ class CenterHead:
     scores: Scores
     max_candidates: int
     across_classes: bool
-    # numbers of classes that share one box at each position, in the order of the classes; they add up to all classes
+    # numbers of classes that share one box at each position, in the order of the classes; they add up to all classes.
+    # Of a group's boxes that overlap, only the best one stays, whatever their classes.
     groups: tuple[int, ...]
     # order of the channels of ``rot``: ``"sin_cos"`` of mmdet3d, ``"cos_sin"`` of OpenPCDet
     rotation: Literal["sin_cos", "cos_sin"]
+
+    kind = "centers"
+    channels_last = False
 
     def __post_init__(self) -> None:
         _check_common(self)
@@ -180,14 +180,6 @@ class CenterHead:
             )
         if self.rotation not in ("sin_cos", "cos_sin"):
             _FIELDS.refuse("head.rotation", self.rotation, "sin_cos or cos_sin")
-
-    @property
-    def kind(self) -> str:
-        return "centers"
-
-    @property
-    def channels_last(self) -> bool:
-        return False
 
     def n_channels(self, kind: str, nth: int = 0, n: int = 1) -> int:
         """Channels of the ``nth`` of ``n`` outputs of a kind: one for each group, or one for all."""

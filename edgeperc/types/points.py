@@ -98,11 +98,7 @@ def as_points(
 def _frame_columns(thing: Any) -> dict[str, NDArray[Any]]:
     """The numeric columns of a data frame (pandas, polars) by `plain_name`; empty if none are called x, y and z."""
     names = getattr(thing, "columns", None) if hasattr(thing, "__array__") else None
-    columns: dict[str, NDArray[Any]] = {}
-    for name in () if names is None else names:
-        values = np.asarray(thing[name])
-        if isinstance(name, str) and values.ndim == 1 and values.dtype.kind in "fiu":
-            columns.setdefault(plain_name(name), values)
+    columns = _numeric((name, np.asarray(thing[name])) for name in (() if names is None else names))
     return columns if {"x", "y", "z"} <= columns.keys() else {}
 
 
@@ -149,11 +145,15 @@ def _to_convert(thing: Any) -> tuple[str, str] | None:
 def table_columns(table: NDArray[Any]) -> dict[str, NDArray[Any]]:
     """The numeric fields of a structured array of any shape, each (n,), by `plain_name`."""
     flat = table.reshape(-1)
+    return _numeric((name, flat[name]) for name in table.dtype.names or ())
+
+
+def _numeric(fields: Iterable[tuple[Any, NDArray[Any]]]) -> dict[str, NDArray[Any]]:
+    """The first of the columns of numbers with each `plain_name`."""
     columns: dict[str, NDArray[Any]] = {}
-    for name in table.dtype.names or ():
-        field = flat[name]
-        if field.ndim == 1 and field.dtype.kind in "fiu":
-            columns.setdefault(plain_name(name), field)
+    for name, values in fields:
+        if isinstance(name, str) and values.ndim == 1 and values.dtype.kind in "fiu":
+            columns.setdefault(plain_name(name), values)
     return columns
 
 
@@ -253,3 +253,10 @@ def _is_rounded(values: NDArray[Any]) -> bool:
         # Half the distance of float32 numbers there; larger ones are no map's. What float32 holds is not rounded.
         off = (np.abs(exact) >= MAX_ROUNDING_M * 2**24) & (np.abs(exact) < MAX_MAP_M) & (exact != exact.astype("f4"))
     return bool((off.mean(axis=0) > 0.5).any())
+
+
+def check_each(n: int, **arrays: NDArray[Any] | None) -> None:
+    """Raise PointsError for an array, named by its keyword, that has not one value for each of n points."""
+    for name, array in arrays.items():
+        if array is not None and array.shape != (n,):
+            raise PointsError(f"got {name} of shape {array.shape} for {n} points; expected one value a point")

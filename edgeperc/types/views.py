@@ -40,6 +40,8 @@ class TopViewGeometry:
     z_range_m: tuple[float, float] = (-2.5, 2.5)
     cell_m: float = 0.1  # edge of a cell [m]
 
+    kind = "top_view"
+
     def __post_init__(self) -> None:
         for name in ("x_range_m", "y_range_m", "z_range_m"):
             low, high = _FIELDS.pair(f"view.{name}", getattr(self, name), -1e4, 1e4)
@@ -47,10 +49,6 @@ class TopViewGeometry:
                 raise CardError(f"view.{name} is {(low, high)}; expected two finite numbers, the lower first")
         _FIELDS.number("view.cell_m", self.cell_m, 1e-3, 100.0)
         check_size(self.height, self.width)
-
-    @property
-    def kind(self) -> str:
-        return "top_view"
 
     @property
     def height(self) -> int:
@@ -97,6 +95,8 @@ class RangeImageGeometry:
     azimuth_left_deg: float = 45.0
     azimuth_right_deg: float = -45.0
 
+    kind = "range_image"
+
     def __post_init__(self) -> None:
         rows = self.row_elevations_deg
         falling = all(a > b for a, b in itertools.pairwise(rows))
@@ -115,10 +115,6 @@ class RangeImageGeometry:
             )
 
     @property
-    def kind(self) -> str:
-        return "range_image"
-
-    @property
     def height(self) -> int:
         """Rows, one per beam."""
         return len(self.row_elevations_deg)
@@ -135,14 +131,12 @@ class CameraGeometry:
     # with half-pixel centers (`edgeperc.camera.image.ImageScaler`), whatever its aspect; nothing is cropped or padded
     fit: Literal["stretch"] = "stretch"
 
+    kind = "camera"
+
     def __post_init__(self) -> None:
         if self.fit != "stretch":
             raise CardError(f"view.fit is {reprlib.repr(self.fit)}; expected stretch")
         check_size(self.height, self.width)
-
-    @property
-    def kind(self) -> str:
-        return "camera"
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,13 +147,11 @@ class ObjectGeometry:
     margin_m: float = 0.8  # they lie in the candidate's rectangle, grown by this on every side [m]
     height_range_m: tuple[float, float] = (0.1, 4.2)  # lowest and greatest height above the ground of these points [m]
 
+    kind = "objects"
+
     def __post_init__(self) -> None:
         _FIELDS.whole("view.n_points", self.n_points, 1, MAX_COLUMNS)
         _FIELDS.number("view.margin_m", self.margin_m, 0.0, 10.0)
         low, high = _FIELDS.pair("view.height_range_m", self.height_range_m, -100.0, 100.0)
         if not low < high:
             raise CardError(f"view.height_range_m is {(low, high)}; expected two numbers, the lower first")
-
-    @property
-    def kind(self) -> str:
-        return "objects"
