@@ -351,14 +351,10 @@ class Perceiver:
         views = [card.view.kind for card in self.cards]
         if len(views) != len(set(views)):
             raise OptionError(f"models {[str(m) for m in wanted]} have views {views}; expected at most one a view")
-        self._camera = next(
-            (
-                _Camera(s, ImageScaler(s.card.view, s.card.input))
-                for s in self.sessions
-                if isinstance(s.card.view, CameraGeometry)
-            ),
-            None,
-        )
+        self._camera: _Camera | None = None
+        for session in self.sessions:
+            if isinstance(session.card.view, CameraGeometry):
+                self._camera = _Camera(session, ImageScaler(session.card.view, session.card.input))
         if self.boxes_from == "clusters" and not {"range_image", "objects"} & {*views}:
             raise OptionError(
                 "boxes_from is 'clusters', which needs a class for every point or for every cluster; add a range-image "
@@ -562,7 +558,7 @@ class Perceiver:
         with self._lock:
             watch = Stopwatch()
             if scan is None:
-                perception = self._nothing(stamp_s, watch)
+                perception = Perception(0, 0, None, None, (), MappingProxyType(watch.ms), self.providers, (), stamp_s)
             else:
                 if not self._is_sensor_known and len(scan):
                     self._find_sensor(scan)
@@ -605,13 +601,9 @@ class Perceiver:
                 f"got an image, and none of the models is of a camera ({loaded}); add one such as {CAMERA} to models="
             )
 
-    def _nothing(self, stamp_s: float | None, watch: Stopwatch) -> Perception:
-        """The perception of no scan."""
-        return Perception(0, 0, None, None, (), MappingProxyType(watch.ms), self.providers, (), stamp_s)
-
     def _perceive(self, scan: Points, stamp_s: float | None, watch: Stopwatch, check: bool) -> Perception:
         given, before, matcher, profile = scan, self._estimator, self._remission, self.sensor
-        hidden: tuple[Finding, ...] = ()
+        hidden: tuple[Finding | None, ...] = ()
         turned: tuple[Finding, ...] = ()
         matched: tuple[Finding, ...] = ()
         scan, dropped = returns(given, profile, before.known.origin_m)
@@ -628,9 +620,9 @@ class Perceiver:
                 turned = check_beams(scan, profile) or check_ground(scan, near_support, share_below, profile)
             try:
                 self._set_mounting(before.add(scan))
-                hidden = (*self._about_height(), *self._about_tilt())
+                hidden = self._about_height(), self._about_tilt()
             except MountingError as exc:
-                hidden = self._without_ground(exc)
+                hidden = (self._without_ground(exc),)
             watch.lap("check")
         if not self._frame.is_identity:
             scan = self._frame.move(scan)
@@ -641,7 +633,7 @@ class Perceiver:
             fitness = turned or check_profiles(scan, self._fitness, profile, self._frame, ceiling_m)
             fitness = with_raw_remission(fitness, given, profile)
         if check and not any(finding.gross for finding in fitness):
-            fitness = (*fitness, *hidden)
+            fitness = (*fitness, *filter(None, hidden))
         if self.on_mismatch != "ignore":
             fitness = (*fitness, *matched)
         if check:
@@ -676,47 +668,41 @@ class Perceiver:
             health=health,
         )
 
-    def _without_ground(self, reason: MountingError) -> tuple[Finding, ...]:
+    def _without_ground(self, reason: MountingError) -> Finding | None:
         """What to say of a scan that does not show how the sensor is mounted, if no other scan has."""
         if self.mounting is not None:
-            return ()
-        return (
-            Finding(
-                f"The mounting of the sensor cannot be estimated ({reason}); it is taken as "
-                f"{self._mounting.height_m:g} m above the road and level: pass mounting= (on the command line "
-                "--mount-height or --extrinsic)."
-            ),
+            return None
+        return Finding(
+            f"The mounting of the sensor cannot be estimated ({reason}); it is taken as "
+            f"{self._mounting.height_m:g} m above the road and level: pass mounting= (on the command line "
+            "--mount-height or --extrinsic)."
         )
 
-    def _about_height(self) -> tuple[Finding, ...]:
+    def _about_height(self) -> Finding | None:
         """What to say of a height that was found from little ground: that of a sensor that is high, or looks up."""
         if not self._estimator.is_height_unsure():
-            return ()
+            return None
         found = self._estimator.estimate()
-        return (
-            Finding(
-                f"The sensor seems to be {found.mounting.height_m:.1f} +- {found.height_sd_m:.1f} m above the road. It "
-                "sees little of the road near by, and its height may be off by a meter: pass mounting= (on the command "
-                "line --mount-height)."
-            ),
+        return Finding(
+            f"The sensor seems to be {found.mounting.height_m:.1f} +- {found.height_sd_m:.1f} m above the road. It "
+            "sees little of the road near by, and its height may be off by a meter: pass mounting= (on the command "
+            "line --mount-height)."
         )
 
-    def _about_tilt(self) -> tuple[Finding, ...]:
+    def _about_tilt(self) -> Finding | None:
         """What to say if the scans suggest a tilt, and their ground is too uneven to be sure."""
         doubtful = self._estimator.doubtful()
         if not doubtful:
-            return ()
+            return None
         found = self._estimator.estimate()
         shown = " and ".join(
             f"{name} of {getattr(found.mounting, f'{name}_deg'):.1f} +- {getattr(found, f'{name}_sd_deg'):.1f} deg"
             for name in (name.removesuffix("_deg") for name in doubtful)
         )
-        return (
-            Finding(
-                f"The ground suggests a {shown}, but it is too uneven to tell a tilt of the sensor from its own slope: "
-                "the sensor is taken as level until scans of other places agree. If you know its tilt, pass mounting= "
-                "(on the command line --roll, --pitch or --extrinsic)."
-            ),
+        return Finding(
+            f"The ground suggests a {shown}, but it is too uneven to tell a tilt of the sensor from its own slope: "
+            "the sensor is taken as level until scans of other places agree. If you know its tilt, pass mounting= "
+            "(on the command line --roll, --pitch or --extrinsic)."
         )
 
     def _refuse(self, fitness: tuple[Finding, ...]) -> None:

@@ -29,7 +29,7 @@ from .inference.crop import Crop, sectors_of_turn, spread
 from .inference.decode import decode_boxes, decode_cells, decode_labels
 from .inference.object_network import BoxesFrom, ObjectNetwork
 from .inference.pillar_network import PillarNetwork
-from .inference.projection import RangeImageProjector, input_heights, make_projector
+from .inference.projection import input_heights, make_projector
 from .inference.session import Session
 from .objects.boxes import join_boxes, objects_from_points, weigh
 from .objects.candidates import MIN_DETECTOR_SCORE
@@ -143,7 +143,6 @@ class RangeImageNetwork:
         self.projector.fill(points, self.session.input, self.index, pixel, height_m)
         watch.lap("project")
         if self.interpolator is not None:
-            assert isinstance(self.projector, RangeImageProjector)
             # Interpolated points are in the image only; refinement uses the points of the scan.
             dense, filled = self.interpolator.fill(points, self.index)
             self.projector.fill_image(dense, filled, self.session.input, input_heights(self.projector, dense))
@@ -368,10 +367,7 @@ def _joined(near: View, *sectors: tuple[PointLabels, Ints | None]) -> PointLabel
 def _objects(
     scan: Scan, labels: PointLabels, clusters: Ids | None, boxes: Sequence[Box], options: Options
 ) -> tuple[Box, ...]:
-    """Boxes around clusters of points above the ground.
-
-    An object cut by the edge of the range image gets a box of the whole object.
-    """
+    """Boxes around clusters above the ground; one cut by the edge of the range image gets a box of the whole object."""
     return objects_from_points(
         scan.points,
         labels.labels,

@@ -322,12 +322,9 @@ def main(parts: str) -> None:
         os.read(0, 1)  # returns when the process that started this one closes it, or has ended
         _kill()
 
-    def stop() -> None:
-        time.sleep(MAX_S)
-        _kill()
-
-    for task in (watch, stop):
-        threading.Thread(target=task, daemon=True).start()
+    for thread in (threading.Thread(target=watch), threading.Timer(MAX_S, _kill)):
+        thread.daemon = True
+        thread.start()
     gc.disable()  # 0.1 GB more for a few seconds
     compile_parts(parts.split(","))
 

@@ -308,11 +308,11 @@ class _Plane(NamedTuple):
         if self.lever(low) <= _ONE_SIDED:
             return False
         far = low[np.hypot(low[:, 0], low[:, 1]) > _BESIDE_M]
-        return _n_sectors(self._on(far)) < _MOST_SECTORS * _n_sectors(far)
+        return _n_sectors(self.those_on(far)) < _MOST_SECTORS * _n_sectors(far)
 
     def lever(self, low: Floats) -> float:
         """By how much an error of the lowest returns (n, 3) on it grows towards the sensor: 1 if they surround it."""
-        on = self._on(low)[:, :2]
+        on = self.those_on(low)[:, :2]
         middle, spread = on.mean(axis=0), np.cov(on.T) + CELL_M**2 / 12.0 * np.eye(2)
         return float(math.sqrt(1.0 + middle @ np.linalg.solve(spread, middle)))
 
@@ -325,7 +325,7 @@ class _Plane(NamedTuple):
             down = (x * self.abc[0] + y * self.abc[1] - z)[is_far] / range_m[is_far]
         return bool(len(down)) and float(np.percentile(down, _LOWEST_BEAM)) * _VOTING_M > -self.abc[2]
 
-    def _on(self, low: Floats) -> Floats:
+    def those_on(self, low: Floats) -> Floats:
         """Those of the lowest returns (n, 3) that are on it."""
         above = low[:, 2] - low[:, :2] @ self.abc[:2] - self.abc[2]
         return low[(np.hypot(low[:, 0], low[:, 1]) < self.reach_m) & (np.abs(above) <= TOLERANCE_M)]
@@ -451,9 +451,8 @@ def _refined(scan: Points, cell: Ints, plane: Floats) -> Floats:
 
 
 def _uncertainty(scan: Points, lowest: Ints, low: Floats, plane: _Plane) -> Floats:
-    """Standard errors of height [m], roll and pitch [deg], (3,), by how the quarters of the ground differ in slope.
-
-    Left and right show one pitch, ahead and behind one roll: of the quarters, two are independent.
+    """Standard errors of height [m], roll and pitch [deg], (3,), by how the quarters of the ground differ in slope; of
+    them, two are independent, as left and right show one pitch, ahead and behind one roll.
     """
     half = N_CELLS // 2
     slopes = []
@@ -468,9 +467,7 @@ def _uncertainty(scan: Points, lowest: Ints, low: Floats, plane: _Plane) -> Floa
     )
     if plane.reach_m == _VOTING_M:
         return np.array([0.0, roll, pitch])
-    range_m = np.hypot(low[:, 0], low[:, 1])
-    on_plane = np.abs(low[:, 2] - low[:, :2] @ plane.abc[:2] - plane.abc[2]) <= TOLERANCE_M
-    nearest_m = float(np.percentile(range_m[on_plane & (range_m < plane.reach_m)], 5.0))
+    nearest_m = float(np.percentile(np.hypot(*plane.those_on(low)[:, :2].T), 5.0))
     return np.array([nearest_m * math.tan(math.radians(math.hypot(pitch, roll))), roll, pitch])
 
 

@@ -78,17 +78,15 @@ def find_ground(
     mount_height_m: float = 1.73,
     max_height_m: float = 0.125,
     regions: bool = True,
-    rows: Rows | None = None,
 ) -> Ground:
     """Separate the ground from what stands on it (KUL-Seg 5.2), by planes of regions (docs/concepts/clusters.md);
     deterministic. Raises PointsError.
 
-    mount_height_m : of the sensor above the ground (`SensorProfile.mount_height_m`); may be wrong by 0.5 m.
+    mount_height_m : of the sensor above the ground; may be wrong by 0.5 m.
     max_height_m : a point is ground if it is at most this far above the ground and at most 0.5 m below it.
     regions : False fits only the plane around the vehicle.
-    rows : of the points whose height is wanted. The ground is found with all points.
     """
-    return fit_ground(points, mount_height_m=mount_height_m, regions=regions).heights(rows, max_height_m=max_height_m)
+    return fit_ground(points, mount_height_m=mount_height_m, regions=regions).heights(max_height_m=max_height_m)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -130,26 +128,20 @@ class GroundFit:
         return GroundSurface(self._plane if self.found else None, self._plane, self.planes, cells, lowest)
 
 
-def heights_above(ground: GroundSurface | None, points: Points, *, max_height_m: float = 0.125) -> Ground:
-    """Heights of any points above the ground that a scan showed.
-
-    ground : `edgeperc.Perception.ground`. None: the points are a scan, and show the ground themselves.
-    points : (n, 3 or more) float32; x, y, z [m] in the frame of the models (`edgeperc.ModelFrame`). For the scan's own
-        points, the heights are those of `find_ground`.
-    """
+def heights_above(ground: GroundSurface | None, points: Points) -> Ground:
+    """Heights of points in the frame of the models above the ground that a scan showed; None: that they show."""
     if ground is None:
-        return find_ground(points, max_height_m=max_height_m)
-    fit = _sorted_into_cells(points)
-    n, k = len(fit.points), len(ground.lowest)
+        return find_ground(points)
+    scan, cell, own_lowest = _sorted_into_cells(points)
+    n, k = len(scan), len(ground.lowest)
     # In a cell that only these points are in, the ground follows the planes, as below a return far above it.
     far_above = np.array([[0.0, 0.0, FAR_ABOVE_M, 0.0]], np.float32)
-    lowest = np.where(fit.lowest.reshape(-1) >= 0, np.int32(n + k), np.int32(-1))
+    lowest = np.where(own_lowest.reshape(-1) >= 0, np.int32(n + k), np.int32(-1))
     lowest[ground.cells] = np.arange(n, n + k, dtype=np.int32)
     rows = np.arange(n, dtype=np.int32)
-    scan = np.concatenate([fit.points, ground.lowest, far_above])
+    every = np.concatenate([scan, ground.lowest, far_above])
     plane, found = np.array(ground.expected), ground.plane is not None
-    whole = GroundFit(scan, fit.cell, lowest.reshape(N_CELLS, N_CELLS), plane, ground.planes, found)
-    return whole.heights(rows, max_height_m=max_height_m)
+    return GroundFit(every, cell, lowest.reshape(N_CELLS, N_CELLS), plane, ground.planes, found).heights(rows)
 
 
 def fit_ground(
@@ -179,14 +171,6 @@ def fit_ground(
     return GroundFit(scan, cell, lowest, plane, planes, found)
 
 
-class Sorted(NamedTuple):
-    """A scan, the cell of each of its points, and the row of the lowest point in each cell."""
-
-    points: Points
-    cell: Ints
-    lowest: Ints
-
-
 def _settle_ties(points: Points, cell: Ints, lowest: Ints) -> None:
     """Of a cell's equally low points, take the one with the smallest x, then y."""
     flat = lowest.reshape(-1)
@@ -197,13 +181,14 @@ def _settle_ties(points: Points, cell: Ints, lowest: Ints) -> None:
     flat[cell[tied]] = tied
 
 
-def _sorted_into_cells(points: Points) -> Sorted:
+def _sorted_into_cells(points: Points) -> tuple[Points, Ints, Ints]:
+    """A scan, the cell of each of its points, and the row of the lowest point in each cell."""
     if points.ndim != 2 or points.shape[1] < 3:
         raise PointsError(f"got points of shape {points.shape}; expected (n, 4): x, y, z, remission")
     scan = read_only(points if points.shape[1] == 4 else np.pad(points[:, :3], ((0, 0), (0, 1))))
-    found = Sorted(scan, np.empty(len(scan), np.int32), np.empty((N_CELLS, N_CELLS), np.int32))
-    fill_lowest(*found)
-    return found
+    cell, lowest = np.empty(len(scan), np.int32), np.empty((N_CELLS, N_CELLS), np.int32)
+    fill_lowest(scan, cell, lowest)
+    return scan, cell, lowest
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -8,7 +8,7 @@ import numpy as np
 
 from ..errors import PointsError
 from ..types.perception import PointLabels
-from ..types.points import Cloud, Points, read_only
+from ..types.points import Cloud, Points, check_each, read_only
 from .planes import Ground
 
 
@@ -29,16 +29,12 @@ class Scan:
         """A scan of given arrays, which are checked and not copied."""
         if points.ndim != 2 or points.shape[1] < 3:
             raise PointsError(f"got points of shape {points.shape}; expected (n, 4): x, y, z, remission")
-        n = len(points)
-        arrays = {"ground.height_m": ground.height_m, "ground.mask": ground.mask}
         if labels is not None:
-            arrays |= {"labels.labels": labels.labels, "labels.in_view": labels.in_view}
             if labels.labels.size and int(labels.labels.max()) >= len(labels.classes):
                 raise PointsError(
                     f"got label {int(labels.labels.max())} for {len(labels.classes)} classes; expected lower numbers"
                 )
-        for name, array in arrays.items():
-            if array.shape != (n,):
-                raise PointsError(f"got {name} of shape {array.shape} for {n} points; expected one value a point")
+            check_each(len(points), **{"labels.labels": labels.labels, "labels.in_view": labels.in_view})
+        check_each(len(points), **{"ground.height_m": ground.height_m, "ground.mask": ground.mask})
         heights = Ground(read_only(ground.mask, np.bool_), read_only(ground.height_m), ground.plane)
         return cls(read_only(points), heights)

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import CardMismatchError, InferenceError
 from ..system.kernels import njit
-from ..types.card import N_DENSE_CHANNELS, N_FRONT_CHANNELS
+from ..types.card import N_DENSE_CHANNELS, N_FRONT_CHANNELS, ModelCard
 from ..types.geometry import suppress_overlaps
 from ..types.perception import Box
 from ..types.points import Floats, Floats32, Labels, Mask
@@ -24,122 +24,96 @@ SIZE_RANGE_M = (0.2, 40.0)  # boxes are clipped to these sizes
 MAX_PROBABILITY = 1.02  # rounded to bfloat16, probabilities add up to a little more than 1
 
 
-def decode_slots(
-    slots: Floats32,
-    labels: Labels,
-    scores: Floats32,
-    geometry: TopViewGeometry,
-    classes: Sequence[str],
-    box_classes: Sequence[str],
-    box_size_priors: Mapping[str, tuple[float, float, float]],
-    mount_height_m: float,
-    *,
-    model: str = "the model",
-) -> list[Box]:
-    """Decode axis-aligned boxes, best score first, with the class of the segmentation at their centers (SSADNet 2.2.1
-    B).
+def decode_slots(card: ModelCard, slots: Floats32, labels: Labels, scores: Floats32) -> list[Box]:
+    """Decode axis-aligned boxes on the road, best score first, with the class of the segmentation at their centers
+    (SSADNet 2.2.1 B).
 
     slots : (K, 4), perhaps with the batch's axis; center column, center row, extent across columns and along rows, as
-        shares of the image from its far left corner.
+        shares of the image from its far left corner. One is empty if an extent is below 0.5 m, or if there is no box
+        class at its center.
     labels, scores : from `decode_classes`; the score of a box is that of its center's class.
-    Returns boxes on the road, with the height of their class's prior. A slot is empty if an extent is below 0.5 m, if
-        its center is out of view, or if the class there is not a box class. The yaw is 0 if the longer side points
-        ahead, else pi/2.
     """
-    values = _slot_rows(slots, 4, box_classes, box_size_priors, model)
-    height, width = geometry.height, geometry.width
+    view = _view_of(card)
+    values = _slot_rows(card, slots, 4)
+    height, width = view.height, view.width
     if labels.shape != (height, width) or scores.shape != (height, width):
         raise CardMismatchError(
-            f"{model}: labels {labels.shape} and scores {scores.shape} for a view of {(height, width)}; check the card"
+            f"{card.name}: labels {labels.shape} and scores {scores.shape} for a view of {(height, width)}; check the "
+            "card"
         )
-    smaller = np.minimum(values[:, 3] * height * geometry.cell_m, values[:, 2] * width * geometry.cell_m)
+    smaller = np.minimum(values[:, 3] * height * view.cell_m, values[:, 2] * width * view.cell_m)
     values = values[((values[:, :2] >= 0.0) & (values[:, :2] < 1.0)).all(axis=1) & (smaller >= MIN_EXTENT_M)]
     at_row, at_col = (values[:, 1] * height).astype(np.int64), (values[:, 0] * width).astype(np.int64)
-    is_box = np.array([name in box_classes for name in classes])[labels[at_row, at_col]]
+    is_box = np.array([name in card.box_classes for name in card.classes])[labels[at_row, at_col]]
     values, score = values[is_box], np.minimum(scores[at_row, at_col][is_box], 1.0)
     best = np.argsort(-score, kind="stable")[:MAX_BOXES]
-    names = [classes[k] for k in labels[at_row[is_box], at_col[is_box]][best]]
-    return _standing(_slot_rectangles(values[best], geometry), score[best], names, box_size_priors, mount_height_m)
+    names = [card.classes[k] for k in labels[at_row[is_box], at_col[is_box]][best]]
+    return _standing(card, _slot_rectangles(values[best], view), score[best], names)
 
 
 def decode_scored_slots(
-    slots: Floats32,
-    class_output: Floats32,
-    class_kind: str,
-    geometry: TopViewGeometry,
-    classes: Sequence[str],
-    box_classes: Sequence[str],
-    box_size_priors: Mapping[str, tuple[float, float, float]],
-    mount_height_m: float,
-    *,
-    score_threshold: float = 0.3,
-    iou_threshold: float = 0.2,
-    model: str = "the model",
+    card: ModelCard, slots: Floats32, class_output: Floats32, class_kind: str, score_threshold: float
 ) -> list[Box]:
-    """Decode axis-aligned boxes with scores of their own, best first; those that overlap a better one are dropped.
-
-    slots : as for `decode_slots`, and the logit that there is an object. Extents are clipped to 0.2 to 40 m.
-    class_output, class_kind, classes, box_classes : as for `decode_dense`; the class of a box is the one with the
-        largest sum of probabilities in its footprint.
+    """Decode axis-aligned boxes with scores of their own, best first, without those that overlap a better one;
+    ``slots`` have a logit, too. The class is the one with the largest sum of probabilities in the footprint.
     """
-    rows = _slot_rows(slots, 5, box_classes, box_size_priors, model)
-    values = _cell_values(class_output, class_kind, geometry, classes, model)
-    _check_finite(values, class_kind, model)
-    if not box_classes:
+    view = _view_of(card)
+    rows = _slot_rows(card, slots, 5)
+    values = _cell_values(card, class_output, class_kind)
+    _check_finite(values, class_kind, card.name)
+    if not card.box_classes:
         return []
     inside = ((rows[:, :2] >= 0.0) & (rows[:, :2] < 1.0)).all(axis=1)
-    rows = rows[inside & (rows[:, 4] >= _logit(score_threshold))]
+    rows = rows[inside & (rows[:, 4] >= logit(score_threshold))]
     rows = rows[np.argsort(-rows[:, 4], kind="stable")[:MAX_BOXES]]
-    rectangles = _slot_rectangles(rows, geometry)
+    rectangles = _slot_rectangles(rows, view)
     rectangles[:, 2:4] = np.clip(rectangles[:, 2:4], *SIZE_RANGE_M)
-    with np.errstate(over="ignore"):  # a score of 0
-        scores = 1.0 / (1.0 + np.exp(-rows[:, 4]))
-    keep = suppress_overlaps(rectangles, scores, iou_threshold)
-    evidence = _footprint_evidence(values, class_kind, rectangles[keep], geometry, classes, box_classes)
-    names = [box_classes[k] for k in np.argmax(evidence, axis=1)]
-    return _standing(rectangles[keep], scores[keep], names, box_size_priors, mount_height_m)
+    scores = sigmoid(rows[:, 4])
+    keep = suppress_overlaps(rectangles, scores, card.nms_iou)
+    evidence = _footprint_evidence(card, values, class_kind, rectangles[keep])
+    names = [card.box_classes[k] for k in np.argmax(evidence, axis=1)]
+    return _standing(card, rectangles[keep], scores[keep], names)
 
 
-def _cell_values(
-    class_output: Floats32, class_kind: str, geometry: TopViewGeometry, classes: Sequence[str], model: str
-) -> Floats32:
+def _view_of(card: ModelCard) -> TopViewGeometry:
+    assert isinstance(card.view, TopViewGeometry)
+    return card.view
+
+
+def _cell_values(card: ModelCard, class_output: Floats32, class_kind: str) -> Floats32:
     """The values of all classes in all cells of a view, (classes, height, width) float32."""
-    values = class_values(class_output, class_kind, model)
-    expected = (len(classes), geometry.height, geometry.width)
+    values, view = class_values(class_output, class_kind, card.name), _view_of(card)
+    expected = (len(card.classes), view.height, view.width)
     if values.shape != expected:
         raise CardMismatchError(
-            f"{model}: {class_kind} has shape {class_output.shape}; expected {(1, *expected)}; check the card"
+            f"{card.name}: {class_kind} has shape {class_output.shape}; expected {(1, *expected)}; check the card"
         )
     return values
 
 
-def _slot_rows(
-    slots: Floats32,
-    n_columns: int,
-    box_classes: Sequence[str],
-    box_size_priors: Mapping[str, tuple[float, float, float]],
-    model: str,
-) -> Floats:
+def _slot_rows(card: ModelCard, slots: Floats32, n_columns: int) -> Floats:
     """The slots of one scan (K, n_columns), checked."""
     rows = slots[0] if slots.ndim == 3 and slots.shape[0] == 1 else slots
     if rows.ndim != 2 or rows.shape[1] != n_columns:
         raise CardMismatchError(
-            f"{model}: box_slots has shape {slots.shape}; expected (1, K, 4) or (1, K, 5); check the export"
+            f"{card.name}: box_slots has shape {slots.shape}; expected (1, K, 4) or (1, K, 5); check the export"
         )
-    missing = [name for name in box_classes if name not in box_size_priors]
+    missing = [name for name in card.box_classes if name not in card.box_size_priors]
     if missing:
-        raise CardMismatchError(f"{model}: no box_size_priors for {missing}; box_slots needs one for each box class")
-    _check_finite(rows, "box_slots", model)
+        raise CardMismatchError(
+            f"{card.name}: no box_size_priors for {missing}; box_slots needs one for each box class"
+        )
+    _check_finite(rows, "box_slots", card.name)
     return rows.astype(np.float64)
 
 
-def _slot_rectangles(slots: Floats, geometry: TopViewGeometry) -> Floats:
+def _slot_rectangles(slots: Floats, view: TopViewGeometry) -> Floats:
     """x, y, length, width [m] and yaw [rad] of slots: the length is the longer side."""
-    along, across = slots[:, 3] * geometry.height * geometry.cell_m, slots[:, 2] * geometry.width * geometry.cell_m
+    along, across = slots[:, 3] * view.height * view.cell_m, slots[:, 2] * view.width * view.cell_m
     return np.stack(
         [
-            geometry.x_range_m[1] - slots[:, 1] * geometry.height * geometry.cell_m,
-            geometry.y_range_m[1] - slots[:, 0] * geometry.width * geometry.cell_m,
+            view.x_range_m[1] - slots[:, 1] * view.height * view.cell_m,
+            view.y_range_m[1] - slots[:, 0] * view.width * view.cell_m,
             np.maximum(along, across),
             np.minimum(along, across),
             np.where(along >= across, 0.0, math.pi / 2.0),
@@ -148,82 +122,64 @@ def _slot_rectangles(slots: Floats, geometry: TopViewGeometry) -> Floats:
     )
 
 
-def _standing(
-    rectangles: Floats,
-    scores: NDArray[np.floating],
-    names: Sequence[str],
-    box_size_priors: Mapping[str, tuple[float, float, float]],
-    mount_height_m: float,
-) -> list[Box]:
+def _standing(card: ModelCard, rectangles: Floats, scores: NDArray[np.floating], names: Sequence[str]) -> list[Box]:
     """Boxes that stand on the road, as tall as is usual for their class."""
     boxes = []
     for (x, y, length, width, yaw), score, name in zip(rectangles.tolist(), scores.tolist(), names, strict=True):
-        tall = float(box_size_priors[name][2])
-        boxes.append(Box(name, score, (x, y, tall / 2.0 - mount_height_m), (length, width, tall), yaw))
+        tall = float(card.box_size_priors[name][2])
+        boxes.append(Box(name, score, (x, y, tall / 2.0 - card.mount_height_m), (length, width, tall), yaw))
     return boxes
 
 
 def decode_dense(
+    card: ModelCard,
     dense: Floats32,
     class_output: Floats32,
     class_kind: str,
-    geometry: TopViewGeometry,
-    classes: Sequence[str],
-    box_classes: Sequence[str],
-    *,
-    box_size_priors: Mapping[str, tuple[float, float, float]] | None = None,
-    box_size_spreads: Mapping[str, tuple[float, float, float]] | None = None,
-    score_threshold: float = 0.3,
+    score_threshold: float,
     named_from: float = 0.0,
-    iou_threshold: float = 0.2,
-    model: str = "the model",
 ) -> list[Box]:
     """Decode oriented boxes from a heat map of centers, best score first, and a box regressed at every cell.
 
     dense : (C, H / 4, W / 4), perhaps with the batch's axis; C is 9 or 11. Heat-map logit; center's offset from the
         cell's center in rows and columns [cells of this map]; logarithms of length and width [m]; sine and cosine of
-        twice the yaw; center's z [m]; logarithm of the height [m]. The last two are a vector (x, y) towards the front,
-        whose component along a heading is the logit that the front is there; without them the yaw is in -pi/2..pi/2 and
-        ``front`` is None.
-    box_size_priors, box_size_spreads : usual length, width and height [m] of each box class, and the standard
-        deviations of their logarithms. Without spreads only the segmentation decides the class.
+        twice the yaw; center's z [m]; logarithm of the height [m]; a vector (x, y) whose component along a heading is
+        the logit that the front is there, or nothing: then the yaw is in -pi/2..pi/2 and ``front`` is None.
     named_from : boxes with a lower score are places only: their label is empty, which saves most of the time.
-    iou_threshold : if two boxes overlap by more, the one with the lower score is dropped, even if their classes differ.
 
-    The paper reads a box's class at its center pixel of the segmentation map. Here the probabilities of the box classes
-    are summed over all pixels of the footprint and the largest sum wins (the earlier box class on ties), so that one
-    pixel, such as a hole in the roof or an edge between two classes, does not decide. With spreads, each sum is
-    multiplied by the likelihood of the measured size (log-normal): from above, vans and cars differ only in size.
+    The paper reads a box's class at its center pixel, which may be a hole in the roof. Here the class with the largest
+    sum of probabilities over the footprint wins, times the likelihood of the measured size (log-normal), if the card
+    has ``box_size_spreads``: from above, vans and cars differ only in size.
     """
+    view = _view_of(card)
     maps = dense[0] if dense.ndim == 4 and dense.shape[0] == 1 else dense
-    height, width = geometry.height, geometry.width
+    height, width = view.height, view.width
     expected = [(n, height // STRIDE, width // STRIDE) for n in (N_DENSE_CHANNELS, N_DENSE_CHANNELS + N_FRONT_CHANNELS)]
     if maps.shape not in expected:
         raise CardMismatchError(
-            f"{model}: box_dense has shape {dense.shape}; expected {(1, *expected[0])} or {(1, *expected[1])} "
+            f"{card.name}: box_dense has shape {dense.shape}; expected {(1, *expected[0])} or {(1, *expected[1])} "
             f"for a view of {(height, width)}; check the card"
         )
-    values = _cell_values(class_output, class_kind, geometry, classes, model)
+    values = _cell_values(card, class_output, class_kind)
     maps = np.ascontiguousarray(maps, dtype=np.float32)
-    _check_finite(maps, "box_dense", model)
-    _check_finite(values, class_kind, model)
-    if not box_classes:
+    _check_finite(maps, "box_dense", card.name)
+    _check_finite(values, class_kind, card.name)
+    if not card.box_classes:
         return []
 
     peak = np.empty(maps.shape[1:], np.bool_)
-    mark_peaks(maps[0], _logit(score_threshold), peak)
+    mark_peaks(maps[0], logit(score_threshold), peak)
     rows, cols = np.nonzero(peak)
     best = np.argsort(-maps[0, rows, cols], kind="stable")[:MAX_BOXES]
     rows, cols = rows[best], cols[best]
     heat, d_row, d_col, log_l, log_w, sin, cos, z, log_h, *front = maps[:, rows, cols].astype(np.float64)
-    with np.errstate(over="ignore"):  # a score of 0
-        scores = 1.0 / (1.0 + np.exp(-heat))
-    shrink = STRIDE * geometry.cell_m
+    scores = sigmoid(heat)
+    shrink = STRIDE * view.cell_m
     low, high = np.log(SIZE_RANGE_M)
     rectangles = np.stack(
         [
-            geometry.x_range_m[1] - (rows + 0.5 + d_row) * shrink,
-            geometry.y_range_m[1] - (cols + 0.5 + d_col) * shrink,
+            view.x_range_m[1] - (rows + 0.5 + d_row) * shrink,
+            view.y_range_m[1] - (cols + 0.5 + d_col) * shrink,
             np.exp(np.clip(log_l, low, high)),
             np.exp(np.clip(log_w, low, high)),
             0.5 * np.arctan2(sin, cos),
@@ -232,18 +188,17 @@ def decode_dense(
     )
     tall = np.exp(np.clip(log_h, low, high))
     yaws, fronts = _facing(rectangles[:, 4], *front) if front else (rectangles[:, 4], None)
-    keep = suppress_overlaps(rectangles, scores, iou_threshold)
+    keep = suppress_overlaps(rectangles, scores, card.nms_iou)
     named = keep[: int(np.count_nonzero(scores[keep] >= named_from))]  # the best scores come first
-    evidence = _footprint_evidence(values, class_kind, rectangles[named], geometry, classes, box_classes)
-    if box_size_spreads:
-        assert box_size_priors is not None
+    evidence = _footprint_evidence(card, values, class_kind, rectangles[named])
+    if card.box_size_spreads:
         sizes = np.log(np.stack([rectangles[named, 2], rectangles[named, 3], tall[named]], axis=1))
-        usual = np.log([box_size_priors[name] for name in box_classes])
-        spread = np.array([box_size_spreads[name] for name in box_classes])
+        usual = np.log([card.box_size_priors[name] for name in card.box_classes])
+        spread = np.array([card.box_size_spreads[name] for name in card.box_classes])
         off = (sizes[:, None] - usual) / spread
         likelihood = -0.5 * (off**2).sum(axis=2) - np.log(spread).sum(axis=1)
         evidence = np.log(np.maximum(evidence, np.finfo(np.float64).tiny)) + likelihood
-    labels = [box_classes[k] for k in evidence.argmax(axis=1).tolist()] + [""] * (len(keep) - len(named))
+    labels = [card.box_classes[k] for k in evidence.argmax(axis=1).tolist()] + [""] * (len(keep) - len(named))
     return [
         Box(
             label=label,
@@ -257,19 +212,12 @@ def decode_dense(
     ]
 
 
-def _footprint_evidence(
-    values: Floats32,
-    class_kind: str,
-    rectangles: Floats,
-    geometry: TopViewGeometry,
-    classes: Sequence[str],
-    box_classes: Sequence[str],
-) -> Floats:
+def _footprint_evidence(card: ModelCard, values: Floats32, class_kind: str, rectangles: Floats) -> Floats:
     """Sums of the probabilities of each box class in each rectangle, (n, box classes)."""
-    sums = np.empty((len(rectangles), len(classes)))
-    x_far, y_left = geometry.x_range_m[1], geometry.y_range_m[1]
-    fill_footprint_sums(values, class_kind == "class_logits", rectangles, x_far, y_left, geometry.cell_m, sums)
-    return sums[:, [list(classes).index(name) for name in box_classes]]
+    sums, view = np.empty((len(rectangles), len(card.classes))), _view_of(card)
+    x_far, y_left = view.x_range_m[1], view.y_range_m[1]
+    fill_footprint_sums(values, class_kind == "class_logits", rectangles, x_far, y_left, view.cell_m, sums)
+    return sums[:, [card.classes.index(name) for name in card.box_classes]]
 
 
 def _facing(yaws: Floats, x: Floats, y: Floats) -> tuple[Floats, Floats]:
@@ -303,12 +251,17 @@ def raise_not_finite(n_bad: int, n: int, kind: str, model: str) -> None:
     )
 
 
-def _logit(probability: float) -> float:
-    if probability <= 0.0:
-        return -math.inf
-    if probability >= 1.0:
-        return math.inf
-    return math.log(probability / (1.0 - probability))
+def logit(probability: float) -> float:
+    """Log odds; infinite from 0 and 1 on."""
+    if 0.0 < probability < 1.0:
+        return math.log(probability / (1.0 - probability))
+    return math.copysign(math.inf, probability - 0.5)
+
+
+def sigmoid(logits: Floats) -> Floats:
+    """Probabilities."""
+    with np.errstate(over="ignore"):  # a probability of 0
+        return 1.0 / (1.0 + np.exp(-logits))
 
 
 @njit(cache=True, nogil=True)

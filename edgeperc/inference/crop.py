@@ -46,7 +46,10 @@ class Crop:
         self._lines: Floats | None = None
         self._rows, self._kept = np.empty(0, np.int32), np.empty((0, 4), np.float32)
         ahead = [_ahead(view) for view in views if isinstance(view, TopViewGeometry)]
-        sectors = [_sector(view) for view in views if isinstance(view, RangeImageGeometry)] or ahead
+        ranged = [view for view in views if isinstance(view, RangeImageGeometry)]
+        sectors = [
+            (math.radians(view.azimuth_left_deg), math.radians(view.azimuth_right_deg)) for view in ranged
+        ] or ahead
         left = max((sector[0] for sector in sectors), default=math.inf)
         right = min((sector[1] for sector in sectors), default=0.0)
         if left - right <= math.pi:
@@ -90,11 +93,6 @@ def spread(parts: Sequence[tuple[PointLabels, Ints | None]], n: int) -> PointLab
         every = np.arange(n, dtype=np.int32) if rows is None else rows
         fill_spread(every, read_only(part.labels, np.uint8), read_only(part.in_view, np.bool_), labels, in_view)
     return PointLabels(labels, in_view, first.classes)
-
-
-def _sector(view: RangeImageGeometry) -> tuple[float, float]:
-    """Azimuths of the left and right edge [rad]."""
-    return math.radians(view.azimuth_left_deg), math.radians(view.azimuth_right_deg)
 
 
 def _ahead(view: TopViewGeometry) -> tuple[float, float]:

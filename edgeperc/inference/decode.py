@@ -109,49 +109,14 @@ def decode_boxes(
     """Decode the boxes of a top-view network (SSADNet 2.2.1 B, 3.1.2), best score first, from its raw outputs by kind;
     of a dense head, those below ``named_from`` have an empty label.
     """
-    assert isinstance(card.view, TopViewGeometry)
     kind = _class_kind(outputs)
     if "box_dense" in outputs:
-        return decode_dense(
-            outputs["box_dense"],
-            outputs[kind],
-            kind,
-            card.view,
-            card.classes,
-            card.box_classes,
-            box_size_priors=card.box_size_priors,
-            box_size_spreads=card.box_size_spreads,
-            score_threshold=score_threshold,
-            named_from=named_from,
-            iou_threshold=card.nms_iou,
-            model=card.name,
-        )
+        return decode_dense(card, outputs["box_dense"], outputs[kind], kind, score_threshold, named_from)
     if "box_slots" not in outputs:
         return []
     if outputs["box_slots"].shape[-1] == 5:
-        return decode_scored_slots(
-            outputs["box_slots"],
-            outputs[kind],
-            kind,
-            card.view,
-            card.classes,
-            card.box_classes,
-            card.box_size_priors,
-            card.mount_height_m,
-            score_threshold=score_threshold,
-            iou_threshold=card.nms_iou,
-            model=card.name,
-        )
-    found = decode_slots(
-        outputs["box_slots"],
-        *decode_classes(outputs[kind], kind, model=card.name),
-        card.view,
-        card.classes,
-        card.box_classes,
-        card.box_size_priors,
-        card.mount_height_m,
-        model=card.name,
-    )
+        return decode_scored_slots(card, outputs["box_slots"], outputs[kind], kind, score_threshold)
+    found = decode_slots(card, outputs["box_slots"], *decode_classes(outputs[kind], kind, model=card.name))
     return [box for box in found if box.score >= score_threshold]
 
 

@@ -13,7 +13,7 @@ from ..types.detector import CENTER_VALUES, AnchorHead, CenterHead, PillarGeomet
 from ..types.geometry import suppress_overlaps, wrapped
 from ..types.perception import Box
 from ..types.points import Floats, Floats32, Ints64
-from .box_heads import SIZE_RANGE_M, count_not_finite, raise_not_finite
+from .box_heads import SIZE_RANGE_M, count_not_finite, logit, raise_not_finite, sigmoid
 
 BEYOND_M = 5.0
 """A box whose center is farther out of the view is dropped."""
@@ -169,17 +169,13 @@ def _best(
     best = raw[..., 0].copy()
     for k in range(1, raw.shape[3]):  # a third of the time of a maximum along the short axis
         np.maximum(best, raw[..., k], out=best)
-    least = score_threshold
-    if head.scores == "logits":
-        least = math.log(least / (1.0 - least)) if 0.0 < least < 1.0 else math.copysign(math.inf, least - 0.5)
+    are_logits = head.scores == "logits"
+    least = logit(score_threshold) if are_logits else score_threshold
     at = np.flatnonzero(best.reshape(-1) >= least)
     values = best.reshape(-1)[at]
     order = np.argsort(-values, kind="stable")[: head.max_candidates]
     place = np.unravel_index(at[order], best.shape)
-    scores = values[order].astype(np.float64)
-    if head.scores == "logits":
-        with np.errstate(over="ignore"):  # a score of 0
-            scores = 1.0 / (1.0 + np.exp(-scores))
+    scores = sigmoid(values[order].astype(np.float64)) if are_logits else values[order].astype(np.float64)
     return place, raw[place].argmax(axis=1), np.clip(scores, 0.0, 1.0)
 
 

@@ -141,9 +141,8 @@ class ObjectNetwork:
 def _seen_person(box: Box, look: Sequence[float], classes: Sequence[str], min_score: float) -> Box:
     """A person by the labels of points, with the mean of its score and that of a look, (10,).
 
-    A rider's box that the network sees, too, is the mean of both, with the network's heading. Labels miss the far side
-    and parts of the bicycle, and do not tell the front. A pedestrian's is that of the labels: its sides are nearly
-    the same, and the network places it no better.
+    A rider's box that the network sees, too, is the mean of both, with the network's heading: labels miss the far side
+    and parts of the bicycle. The network places pedestrians no better.
     """
     x, y, z, length, width, height, yaw, score, label, front = look
     seen = replace(box, score=max(0.5 * (box.score + score), min_score))

@@ -338,7 +338,50 @@ def fill_curvature(
             out[column] = (np.sqrt(min(bend, ONE)) - mean) / std if row_of[column] >= 0 else ZERO
 
 
-class TopViewProjector:
+class Projector:
+    """Projects points to the images of a view: `mark` finds the pixels of the points."""
+
+    def __init__(self, view: TopViewGeometry | RangeImageGeometry, input: InputSpec) -> None:
+        self.view = view
+        self.shape = (len(input.channels), view.height, view.width)
+        self.needs_ground = input.needs_ground
+        self._channels, self._mean, self._std = _channels(input, CHANNELS[view.kind])
+        self._curved = np.flatnonzero(self._channels == CURVATURE)
+
+    def mark(self, points: Points, index: Ints, pixel: Ints) -> None:
+        """Write the row of the point of each pixel (H * W,), and the flat pixel of each point (n,); -1 for none."""
+        raise NotImplementedError
+
+    def fill(self, points: Points, image: Floats32, index: Ints, pixel: Ints, height_m: Heights | None = None) -> None:
+        """Project into the caller's buffers; ``height_m`` is for the channel ``"height_above_ground"`` alone."""
+        points = _checked(self.shape, points, image, index, pixel)
+        self.mark(points, index.reshape(-1), pixel)
+        self._write(points, index, image, height_m)
+
+    def fill_image(self, points: Points, index: Ints, image: Floats32, height_m: Heights | None = None) -> None:
+        """Write the image for a given ``index``; arguments and errors as in `fill`."""
+        self._write(_checked(self.shape, points, image, index), index, image, height_m)
+
+    def _write(self, points: Points, index: Ints, image: Floats32, height_m: Heights | None) -> None:
+        heights = _heights(self.needs_ground, len(points), height_m)
+        flat_image = image.reshape(self.shape[0], -1)
+        fill_image(points, heights, index.reshape(-1), self._channels, self._mean, self._std, flat_image)
+        for c in self._curved:
+            fill_curvature(points, heights, index, self._mean[c], self._std[c], image[c])
+
+    def project(self, points: Points, height_m: Heights | None = None) -> Projection:
+        """Project into fresh buffers; arguments and errors as in `fill`."""
+        _check_points(points)
+        projection = Projection(
+            image=np.empty(self.shape, np.float32),
+            index=np.empty(self.shape[1:], np.int32),
+            pixel=np.empty(points.shape[0], np.int32),
+        )
+        self.fill(points, projection.image, projection.index, projection.pixel, height_m)
+        return projection
+
+
+class TopViewProjector(Projector):
     """Project points to an image of the ground ahead (SSADNet 2.1.2). Row 0 is farthest ahead, column 0 leftmost.
 
     Cells are half-open: a cell includes its near and right edges. The view is ``x_min <= x < x_max``, ``y_min <= y <
@@ -346,40 +389,19 @@ class TopViewProjector:
     ``"distance"``, sqrt(x^2 + y^2) [m] (SSADNet equation 1), ``"remission"`` and ``"height"``, z [m].
     """
 
+    view: TopViewGeometry
+
     def __init__(self, view: TopViewGeometry, input: InputSpec) -> None:
-        self.view = view
-        self.shape = (len(input.channels), view.height, view.width)
-        self.needs_ground = input.needs_ground
-        self._channels, self._mean, self._std = _channels(input, CHANNELS["top_view"])
-        self._bounds = Bounds(
-            np.float32(view.x_range_m[0]),
-            np.float32(view.x_range_m[1]),
-            np.float32(view.y_range_m[0]),
-            np.float32(view.y_range_m[1]),
-            np.float32(view.z_range_m[0]),
-            np.float32(view.z_range_m[1]),
-            np.float32(1.0 / view.cell_m),
-            np.int32(view.height),
-            np.int32(view.width),
-        )
+        super().__init__(view, input)
+        limits = map(np.float32, (*view.x_range_m, *view.y_range_m, *view.z_range_m, 1.0 / view.cell_m))
+        self._bounds = Bounds._make((*limits, np.int32(view.height), np.int32(view.width)))
 
-    def fill(self, points: Points, image: Floats32, index: Ints, pixel: Ints, height_m: Heights | None = None) -> None:
-        """Project into the caller's buffers, C-contiguous as the points of `condition.condition`; ``height_m`` above
-        the ground is for the channel ``"height_above_ground"`` alone.
-        """
-        points = _checked(self.shape, points, image, index, pixel)
-        flat_index = index.reshape(-1)
-        mark_top_view(points, self._bounds, flat_index, pixel)
-        heights = _heights(self.needs_ground, len(points), height_m)
-        flat_image = image.reshape(self.shape[0], -1)
-        fill_image(points, heights, flat_index, self._channels, self._mean, self._std, flat_image)
-
-    def project(self, points: Points, height_m: Heights | None = None) -> Projection:
-        """Project into fresh buffers; arguments and errors as in `fill`."""
-        return _project(self, points, height_m)
+    def mark(self, points: Points, index: Ints, pixel: Ints) -> None:
+        """See `Projector`."""
+        mark_top_view(points, self._bounds, index, pixel)
 
 
-class RangeImageProjector:
+class RangeImageProjector(Projector):
     """Project points to a range image (PointSeg 3.1). Row 0 is the top beam, column 0 leftmost.
 
     A point's row is the beam with the nearest elevation; the top and the bottom row reach half a beam spacing farther
@@ -400,45 +422,23 @@ class RangeImageProjector:
     same quantities.
     """
 
+    view: RangeImageGeometry
+
     def __init__(self, view: RangeImageGeometry, input: InputSpec) -> None:
-        self.view = view
-        self.shape = (len(input.channels), view.height, view.width)
-        self.needs_ground = input.needs_ground
-        self._channels, self._mean, self._std = _channels(input, CHANNELS["range_image"])
-        self._wedge = wedge(view)
-        self._rows = tabulate(row_edges(view), "rows")
-        self._cols = tabulate(column_edges(view), "columns")
+        super().__init__(view, input)
+        self._tables = wedge(view), tabulate(row_edges(view), "rows"), tabulate(column_edges(view), "columns")
         self._winner = np.empty(view.height * view.width, np.int64)
 
-    def fill(self, points: Points, image: Floats32, index: Ints, pixel: Ints, height_m: Heights | None = None) -> None:
-        """Project into the caller's buffers; arguments and errors as in `TopViewProjector.fill`."""
-        points = _checked(self.shape, points, image, index, pixel)
-        flat_index = index.reshape(-1)
-        width = np.int32(self.shape[2])
-        mark_range_image(points, self._wedge, self._rows, self._cols, width, self._winner, flat_index, pixel)
-        self.fill_image(points, index, image, height_m)
-
-    def fill_image(self, points: Points, index: Ints, image: Floats32, height_m: Heights | None = None) -> None:
-        """Write the image for a given ``index``; arguments and errors as in `TopViewProjector.fill`."""
-        points = _checked(self.shape, points, image, index)
-        heights = _heights(self.needs_ground, len(points), height_m)
-        flat_image = image.reshape(self.shape[0], -1)
-        fill_image(points, heights, index.reshape(-1), self._channels, self._mean, self._std, flat_image)
-        for c in np.flatnonzero(self._channels == CURVATURE):
-            fill_curvature(points, heights, index, self._mean[c], self._std[c], image[c])
-
-    def project(self, points: Points, height_m: Heights | None = None) -> Projection:
-        """Project into fresh buffers; arguments and errors as in `TopViewProjector.fill`."""
-        return _project(self, points, height_m)
+    def mark(self, points: Points, index: Ints, pixel: Ints) -> None:
+        """See `Projector`."""
+        mark_range_image(points, *self._tables, np.int32(self.shape[2]), self._winner, index, pixel)
 
 
 def make_projector(
     view: TopViewGeometry | RangeImageGeometry, input: InputSpec
 ) -> TopViewProjector | RangeImageProjector:
     """Make the projector for a model's view and input."""
-    if isinstance(view, TopViewGeometry):
-        return TopViewProjector(view, input)
-    return RangeImageProjector(view, input)
+    return TopViewProjector(view, input) if isinstance(view, TopViewGeometry) else RangeImageProjector(view, input)
 
 
 def row_edges(view: RangeImageGeometry) -> Floats32:
@@ -542,23 +542,12 @@ def _check_points(points: Points) -> None:
         )
 
 
-def _project(projector: TopViewProjector | RangeImageProjector, points: Points, height_m: Heights | None) -> Projection:
-    _check_points(points)
-    projection = Projection(
-        image=np.empty(projector.shape, np.float32),
-        index=np.empty(projector.shape[1:], np.int32),
-        pixel=np.empty(points.shape[0], np.int32),
-    )
-    projector.fill(points, projection.image, projection.index, projection.pixel, height_m)
-    return projection
-
-
-def input_heights(projector: TopViewProjector | RangeImageProjector, points: Points) -> Floats32 | None:
+def input_heights(projector: Projector, points: Points) -> Floats32 | None:
     """Heights of points of the models' frame above the ground, (n,) float32 [m]; None if the projector needs none."""
     return find_ground(points, mount_height_m=MODEL_HEIGHT_M).height_m if projector.needs_ground else None
 
 
-def project(projector: TopViewProjector | RangeImageProjector, points: Points) -> Projection:
+def project(projector: Projector, points: Points) -> Projection:
     """Project a scan and, if the projector needs it, find the ground first, as a `Perceiver` does.
 
     points : (n, 4) float32, C-contiguous; x, y, z [m] in the frame of the models, remission in 0..1.

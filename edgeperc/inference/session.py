@@ -15,6 +15,7 @@ import os
 import threading
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from types import MappingProxyType
 from typing import Any, NoReturn
 
 import numpy as np
@@ -137,7 +138,6 @@ class Session:
         _check_names(provider, precision)
         self._trusted, self._at_once = trusted, at_once
         self._made_in, self._running_in = os.getpid(), 0
-        self._constants: dict[str, Any] = {}
         ort = load_onnxruntime()
         variants = resolve(model)
         self.digest = digest(variants)
@@ -232,10 +232,17 @@ class Session:
         return f"{self.card.name} {self.precision}, {self.provider}"
 
     def _open(
-        self, ort: Any, blob: bytes, short: str, precision: str, n_threads: int | None, folds: bool = True
+        self,
+        ort: Any,
+        blob: bytes,
+        short: str,
+        precision: str,
+        n_threads: int | None,
+        folds: bool,
+        constants: Mapping[str, Any] = MappingProxyType({}),
     ) -> Any:
         options = ort.SessionOptions()
-        for name, value in self._constants.items():
+        for name, value in constants.items():
             options.add_initializer(name, value)
         options.log_severity_level = 4
         options.inter_op_num_threads = 1
@@ -245,10 +252,9 @@ class Session:
         # The memory pattern would be allocated in addition to the blocks of the first run: 38 and 54 MB more, not
         # faster.
         options.enable_mem_pattern = False
-        entries = {}
         # Threads that spin between two runs occupy the cores that the Perceiver's other network needs: both networks in
         # turn took 357 ms with spinning and 290 ms without. Within a run, threads may spin.
-        entries["session.force_spinning_stop"] = "1"
+        entries = {"session.force_spinning_stop": "1"}
         if short != "cpu":
             # Running part of the graph on the CPU provider would be a silent fallback.
             entries["session.disable_cpu_ep_fallback"] = "1"
@@ -339,22 +345,19 @@ class Session:
         if self._pillars:
             self._bind_pillars(run_options)
             return
+        self.input: Floats32 = batch if self._has_rows else batch[0]
         if self._has_rows:
-            self.input: Floats32 = batch
             for output in card.outputs:
                 shape = card.output_shape(output.kind)
                 self.raw[output.kind] = self.outputs[output.kind] = np.zeros((MAX_ROWS, *shape[1:]), np.float32)
             return
-        self.input = batch[0]
         for output, shape in zip(card.outputs, self._shapes({card.input.name: batch}, run_options), strict=True):
             if isinstance(card.view, CameraGeometry) and (card.view.height % shape[2] or card.view.width % shape[3]):
                 raise CardMismatchError(
                     f"{self.path}: {output.name!r} has shape {shape}; expected rows and columns that divide the view's "
                     f"{card.view.height} and {card.view.width}"
                 )
-            buffer = np.zeros(shape, np.float32)
-            self.binding.bind_output(output.name, "cpu", 0, np.float32, buffer.shape, buffer.ctypes.data)
-            self.raw[output.kind] = self.outputs[output.kind] = buffer[0]
+            self._bind_output(output.name, output.kind, shape)
             if output.block != (1, 1):
                 assert not isinstance(card.view, ObjectGeometry)  # whose outputs have no blocks
                 pixels = (len(card.classes), card.view.height, card.view.width)
@@ -380,9 +383,12 @@ class Session:
         n_rows = len(self._batch) if self._all_rows else 2
         feed = {name: array[:n_rows] for name, array in self.inputs.items()}
         for output, shape in zip(card.outputs, self._shapes(feed, run_options), strict=True):
-            buffer = np.zeros(shape, np.float32)
-            self.binding.bind_output(output.name, "cpu", 0, np.float32, buffer.shape, buffer.ctypes.data)
-            self.raw[output.name] = self.outputs[output.name] = buffer[0]
+            self._bind_output(output.name, output.name, shape)
+
+    def _bind_output(self, name: str, key: str, shape: tuple[int, ...]) -> None:
+        buffer = np.zeros(shape, np.float32)
+        self.binding.bind_output(name, "cpu", 0, np.float32, buffer.shape, buffer.ctypes.data)
+        self.raw[key] = self.outputs[key] = buffer[0]
 
     def _shapes(self, feed: Mapping[str, NDArray[Any]], run_options: Any) -> list[tuple[int, ...]]:
         """Shapes of the outputs, from the graph, or from a run if the graph leaves dimensions open."""
@@ -475,24 +481,25 @@ class Session:
         if self.short != "cpu":  # the others run one graph in one thread at a time
             at_once, trusted = self._at_once, self._trusted
             return Session(self.path, self.short, precision=self.precision, at_once=at_once, trusted=trusted)
-        twin = object.__new__(Session)
-        vars(twin).update(vars(self))
-        with terminated(load_onnxruntime(), None) as run_options:
-            twin._bind(run_options)
-        return twin
+        return self._twin(load_onnxruntime(), self.inference)
 
     def with_constants(self, **constants: float) -> Session:
         """The same network with scalars of its graph in place of those in the file, and with buffers of its own."""
-        ort, blob, twin = load_onnxruntime(), read_model(self.path), object.__new__(Session)
+        ort, blob = load_onnxruntime(), read_model(self.path)
         if hashlib.sha256(blob).hexdigest() != self.sha256:
             raise ModelFileError(f"{self.path} has changed since it was opened; construct the Perceiver again")
-        vars(twin).update(vars(self))
         # onnxruntime does not own them.
-        twin._constants = {
-            name: ort.OrtValue.ortvalue_from_numpy(np.array(value, np.float32)) for name, value in constants.items()
+        values = {
+            name: ort.OrtValue.ortvalue_from_numpy(np.array(each, np.float32)) for name, each in constants.items()
         }
         with native_call():
-            twin.inference = kept_in_forks(twin._open(ort, blob, *self._opened_with))
+            inference = kept_in_forks(self._open(ort, blob, *self._opened_with, constants=values))
+        return self._twin(ort, inference, _constants=values)
+
+    def _twin(self, ort: Any, inference: Any, **others: Any) -> Session:
+        """The same with another graph, and buffers of its own."""
+        twin = object.__new__(Session)
+        vars(twin).update(vars(self), inference=inference, **others)
         with terminated(ort, None) as run_options:
             twin._bind(run_options)
         return twin
@@ -538,14 +545,10 @@ def terminated(ort: Any, after_s: float | None) -> Iterator[Any]:
     """Run options with which onnxruntime stops between two operators after ``after_s`` seconds; None: never."""
     options = ort.RunOptions()
     options.log_severity_level = 4
-
-    def give_up() -> None:
-        options.terminate = True
-
     if after_s is None:
         yield options
         return
-    timer = threading.Timer(after_s, give_up)
+    timer = threading.Timer(after_s, setattr, (options, "terminate", True))
     timer.daemon = True
     timer.start()
     try:

@@ -14,7 +14,7 @@ from ..system.kernels import njit
 from ..types.choices import VEHICLES
 from ..types.geometry import oriented_iou, rectangles, shared_area, suppress_overlaps
 from ..types.perception import Box
-from ..types.points import Bytes, Cloud, Floats, Heights, Ids, Ints, Labeled, Labels, Mask, Points, read_only
+from ..types.points import Cloud, Floats, Heights, Ids, Ints, Labeled, Labels, Mask, Points, check_each, read_only
 from ..types.views import TopViewGeometry
 from .cluster import MIN_PERSON_SHARE, PERSONS, Groups, find_clusters, group_points, labels_of_groups
 from .persons import PERSON, UNSEEN, fill_person_groups, fill_persons
@@ -82,17 +82,11 @@ def objects_from_points(
     others : boxes that are known, such as a network's. Points inside of them are no further object.
     min_share : a cluster needs more than this share of its points in view with one class. Persons need no share.
     """
-    if labels.shape != (len(points),):
-        raise PointsError(f"got labels of shape {labels.shape} for {len(points)} points; expected one a point")
+    check_each(len(points), labels=labels, height_m=height_m, in_view=in_view, clusters=clusters)
     if labels.size and int(labels.max()) >= len(classes):
         raise PointsError(f"got label {int(labels.max())} for {len(classes)} classes; pass the classes of the labels")
-    if height_m is not None and height_m.shape != labels.shape:
-        raise PointsError(
-            f"got height_m of shape {height_m.shape} for {len(points)} points; expected one value a point"
-        )
-    if in_view is not None and in_view.shape != labels.shape:
-        raise PointsError(f"got in_view of shape {in_view.shape} for {len(points)} points; expected one value a point")
-    roles = _roles(classes)
+    roles = np.zeros(256, np.uint8)  # `WALKS` or `RIDES` for persons' labels
+    roles[: len(classes)] = [PERSONS.get(name, 0) for name in classes[:256]]
     if clusters is None:
         clusters = find_clusters(
             points,
@@ -103,8 +97,6 @@ def objects_from_points(
             distance_per_m=distance_per_m,
             min_points=min_points,
         )
-    if clusters.shape != labels.shape:
-        raise PointsError(f"got clusters of shape {clusters.shape} for {len(points)} points; expected one a point")
     labels, clusters = read_only(labels, np.uint8), read_only(clusters, np.int32)
     cloud = Cloud(read_only(points), read_only(np.zeros(len(points)) if height_m is None else height_m))
     groups = group_points(clusters)
@@ -115,7 +107,7 @@ def objects_from_points(
     standing = cloud if height_m is not None else _above_lowest(cloud, clusters, groups)
     persons = _persons(standing, Labeled(numbers, roles), classes, clusters, groups, distance_per_m, max(min_points, 1))
     sizes = np.diff(groups.starts)
-    found, shares = labels_of_groups(groups, labels, 0.0, {})
+    found, shares = labels_of_groups(groups, labels)
     seen = sizes
     if in_view is not None and len(sizes):
         seen = np.add.reduceat(in_view[groups.order], groups.starts[:-1], dtype=np.int64)
@@ -158,10 +150,7 @@ def objects_from_points(
 
 
 def _not_inside(boxes: list[Box], spans: Sequence[Floats], others: Sequence[Box]) -> list[Box]:
-    """The boxes without those whose points lie mostly in a better one: glass, a mirror, the inside of a bus.
-
-    ``spans`` has the rectangle around the points of each box, which is smaller than the box.
-    """
+    """The boxes whose points, with rectangles ``spans``, do not lie mostly in a better one, such as inside of a bus."""
     if not boxes:
         return boxes
     every = [*boxes, *others]
@@ -206,13 +195,6 @@ def _distinct(boxes: Sequence[Box], max_overlap: Sequence[float]) -> list[Box]:
         return [*boxes]
     best = suppress_overlaps(rectangles(boxes), [box.score for box in boxes], max_overlap, max_inside=MAX_INSIDE)
     return [boxes[row] for row in best]
-
-
-def _roles(classes: Sequence[str]) -> Bytes:
-    """For each label: `WALKS` or `RIDES` for persons, 0 for others, (256,)."""
-    roles = np.zeros(256, np.uint8)
-    roles[: len(classes)] = [PERSONS.get(name, 0) for name in classes[:256]]
-    return roles
 
 
 def _above_lowest(cloud: Cloud, clusters: Ids, groups: Groups) -> Cloud:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from types import MappingProxyType
 from typing import NamedTuple
 
@@ -17,7 +17,7 @@ import numpy as np
 
 from ..errors import PointsError
 from ..system.kernels import njit
-from ..types.points import Bytes, Floats, Ids, Ints, Ints64, Labels, Mask, Points, read_only
+from ..types.points import Bytes, Floats, Ids, Ints, Ints64, Labels, Mask, Points, check_each, read_only
 from .linkage import COLUMN_EDGE, MAX_COLUMNS, TESTS_PER_POINT, WORK, Strips, chain_points, fill_clusters, levels_of
 
 WALKS, RIDES = 1, 2  # roles of labels
@@ -62,9 +62,7 @@ def find_clusters(
         strips = sort_points(
             points, among, min_distance_m=min_distance_m, distance_per_m=distance_per_m, max_range_m=max_range_m
         )
-    for name, mask in (("seeds", seeds), ("votes", votes), ("strips", strips.chain)):
-        if mask is not None and mask.shape != points.shape[:1]:
-            raise PointsError(f"got {name} of shape {mask.shape} for {len(points)} points; expected one value a point")
+    check_each(len(points), seeds=seeds, votes=votes, strips=strips.chain)
     seeded = read_only(np.ones(len(points), np.bool_) if seeds is None else seeds, np.bool_)
     counted = read_only(seeded.view(np.uint8) * 2 + 1 if votes is None else votes, np.uint8)
     clusters, work = np.empty(len(points), np.int32), np.empty(1, WORK)
@@ -92,8 +90,7 @@ def sort_points(
     if points.ndim != 2 or points.shape[1] < 3:
         raise PointsError(f"got points of shape {points.shape}; expected (n, 4): x, y, z, remission")
     n = len(points)
-    if among is not None and among.shape != (n,):
-        raise PointsError(f"got among of shape {among.shape} for {n} points; expected one value a point")
+    check_each(n, among=among)
     if not (
         0.0 < min_distance_m < math.inf
         and 0.0 <= distance_per_m <= 1.0
@@ -112,22 +109,6 @@ def sort_points(
     return Strips(scan, rows[:m], heads, chain, levels, float(distance_per_m), float(max_range_m))
 
 
-def cluster_labels(
-    clusters: Ids, labels: Labels, *, min_share: float = 0.7, part_of: Mapping[int, int] = MappingProxyType({})
-) -> tuple[Bytes, Floats]:
-    """The class that more than ``min_share`` of a cluster's points have (KUL-Seg 5.2), 0 if none has, and the share of
-    its most frequent class of objects.
-
-    part_of : class to the class that it may be a part of. If at least a quarter of the points of these two classes have
-        the second class, all of them count as the second class.
-    """
-    if clusters.ndim != 1 or labels.shape != clusters.shape:
-        raise PointsError(
-            f"got labels of shape {labels.shape} for clusters of shape {clusters.shape}; expected the same"
-        )
-    return labels_of_groups(group_points(clusters), labels, min_share, part_of)
-
-
 class Groups(NamedTuple):
     """Points by the groups that they belong to."""
 
@@ -136,14 +117,11 @@ class Groups(NamedTuple):
     starts: Ints64  # (k + 1,) where each of the k groups begins in ``order``; last, where they end
 
 
-def labels_of_groups(
-    groups: Groups, labels: Labels, min_share: float, part_of: Mapping[int, int]
-) -> tuple[Bytes, Floats]:
-    """`cluster_labels` of groups."""
+def labels_of_groups(groups: Groups, labels: Labels) -> tuple[Bytes, Floats]:
+    """The most frequent class of objects of each group's points, 0 without any, and its share (KUL-Seg 5.2)."""
     classes = np.empty(len(groups.starts) - 1, np.uint8)
     shares = np.empty(len(groups.starts) - 1)
-    parts = np.array([*part_of.items()], np.int64).reshape(-1, 2)
-    fill_cluster_labels(labels, groups, parts, float(min_share), classes, shares)
+    fill_cluster_labels(labels, groups, classes, shares)
     return classes, shares
 
 
@@ -174,27 +152,17 @@ def fill_groups(clusters: Ids, groups: Groups) -> None:
 
 
 @njit(cache=True, nogil=True)
-def fill_cluster_labels(
-    labels: Labels, groups: Groups, parts: Ints64, min_share: float, classes: Bytes, shares: Floats
-) -> None:
-    """Write the class of every cluster; see `cluster_labels`.
-
-    parts : (p, 2) int64; class, and the class that it may be a part of; below 256.
-    """
+def fill_cluster_labels(labels: Labels, groups: Groups, classes: Bytes, shares: Floats) -> None:
+    """Write the class of every group, and its share; see `labels_of_groups`."""
     order, starts = groups.order, groups.starts
     counts = np.zeros(256, np.int64)
     for k in range(len(classes)):
         for place in range(starts[k], starts[k + 1]):
             counts[labels[order[place]]] += 1
-        for at in range(parts.shape[0]):
-            part, whole = parts[at]
-            if counts[whole] > 0 and counts[whole] >= MIN_OF_WHOLE * (counts[part] + counts[whole]):
-                counts[whole] += counts[part]
-                counts[part] = 0
         best = 0
         for c in range(1, 256):
             if counts[c] > 0 and (best == 0 or counts[c] > counts[best]):
                 best = c
         shares[k] = (counts[best] if best > 0 else 0) / max(starts[k + 1] - starts[k], 1)
-        classes[k] = best if shares[k] > min_share else 0
+        classes[k] = best
         counts[:] = 0

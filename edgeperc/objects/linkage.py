@@ -206,11 +206,12 @@ def fill_clusters(
     clusters[:] = FREE
     points, rows, levels, heads = strips.points, strips.rows, strips.levels, strips.heads
     search = new_search(len(points), len(rows), min_shares, work)
-    n_seeds = 0
+    n_seeds, left = 0, search.votes_left
     for k in range(len(rows)):  # compiles faster than `for i in rows`
         n_seeds += 1 if seeds[rows[k]] else 0
         if votes[rows[k]] > 1:
-            add_votes(votes[rows[k]], search.votes_left)
+            for share in range(len(left)):
+                left[share] += (votes[rows[k]] >> share) & 1
     is_kept = np.empty(n_seeds, np.bool_)  # of every cluster that was not dropped
     n_clusters = 0
     for k in range(len(rows) if n_seeds > 0 else 0):
@@ -396,13 +397,6 @@ def renumber(is_kept: Mask, clusters: Ids) -> None:
             numbers[cluster] = n
             n += 1
         clusters[i] = numbers[cluster]
-
-
-@njit(cache=True, nogil=True)
-def add_votes(vote: np.uint8, counts: Ints64) -> None:
-    """Add a point's votes to ``counts``: one for every bit."""
-    for k in range(len(counts)):
-        counts[k] += (vote >> k) & 1
 
 
 @njit(cache=True, nogil=True)

@@ -22,7 +22,6 @@ class Finding(str):
     gross: bool  # the scan is so different that results would be meaningless; a `Perceiver` refuses it by default
 
     def __new__(cls, text: str, gross: bool = False) -> Finding:
-        """Make a finding from its sentence."""
         finding = super().__new__(cls, text)
         finding.gross = gross
         return finding
@@ -96,10 +95,7 @@ def _is_road_below(sample: Floats) -> bool:
 
 
 def _is_bay(points: Points) -> bool:
-    """Whether a car around the sensor touches nothing, and what is before and behind it is as far away as in a garage.
-
-    points : in the frame of the models.
-    """
+    """Whether a car around the sensor touches nothing, with as much room before and behind it as in a garage."""
     x, y, z = points[np.isfinite(points).all(axis=1), :3].astype(np.float64).T
     height = z + MODEL_HEIGHT_M
     is_beside = (height > _BODY_M[0]) & (height < _BODY_M[1]) & (np.abs(y) < _HALF_CAR_M[1])
@@ -123,10 +119,7 @@ def _lowest_in_cells(sample: Floats, reach_m: float, cell_m: float) -> Floats:
 
 
 def _ground_far_around(sample: Floats) -> float | None:
-    """The height that many of the lowest points in cells up to 60 m away have [m]: that nearest to the road's.
-
-    None if no height has many. Land beside a road may be higher or lower, and wider.
-    """
+    """The height that many of the lowest points in cells up to 60 m away have [m], nearest to the road's; or None."""
     steps, counts = np.unique(np.floor(_lowest_in_cells(sample, *_FAR_AROUND_M) / _STEP_M), return_counts=True)
     levels_m = (steps[counts >= _MANY * counts.sum()] + 0.5) * _STEP_M
     return round(float(levels_m[np.abs(levels_m + MODEL_HEIGHT_M).argmin()]), 1) if len(levels_m) else None
@@ -139,8 +132,8 @@ def _findings(scan: Measures | None, profile: FitnessProfile, sensor: SensorProf
         return (_too_few(scan, profile, sensor),)  # too few points for the other checks
     findings = _geometry_findings(scan, profile, sensor)
     if sensor.remission is None or any(sensor.remission.coefficients[1:]):
-        findings += _remission_findings(scan, profile, sensor)
-    return tuple(findings)
+        findings.append(_other_remission(scan, profile, sensor))
+    return tuple(finding for finding in findings if finding is not None)
 
 
 def _too_few(scan: Measures, profile: FitnessProfile, sensor: SensorProfile) -> Finding:
@@ -237,7 +230,7 @@ _LOWER_M = -0.3  # than the sensor of the models, on a car
 _FEWEST_ROWS, _FEWEST_FROM_ABOVE = 8.0, 4.0  # half of the beams of a high sensor may meet nothing
 
 
-def _geometry_findings(scan: Measures, profile: FitnessProfile, sensor: SensorProfile) -> list[Finding]:
+def _geometry_findings(scan: Measures, profile: FitnessProfile, sensor: SensorProfile) -> list[Finding | None]:
     """What differs in the coordinates; a mistake in their frame or unit alone, because it explains the rest."""
     walls = _walls(scan)
     room = walls if walls is not None and walls.gross else None  # its ceiling may count as ground
@@ -247,21 +240,20 @@ def _geometry_findings(scan: Measures, profile: FitnessProfile, sensor: SensorPr
         or _feet(scan, sensor)
         or (axes if scan.flat_axis in (0, 1) else room or axes)
         or _other_origin(scan)
+        or _upside_down(scan, profile)
     )
-    mistake = mistake or _upside_down(scan, profile)
     if mistake is not None:
         return [mistake]
     other_height = _other_height(scan, profile)
     has_ground = scan.ground_m is not None and profile.ground_m is not None and other_height is None
-    found = (
+    return [
         other_height,
         _other_field_of_view(scan, profile, sensor),
         _cropped(scan, profile) or _turned(scan, profile),
         _room(scan, profile) or walls,
         _few_rows(scan, profile, sensor, has_ground),
         _other_number(scan, profile, sensor),
-    )
-    return [finding for finding in found if finding is not None]
+    ]
 
 
 def check_coordinates(points: Points) -> Finding | None:
@@ -587,10 +579,7 @@ _FEWEST_PLACED = 300
 
 
 def _place_as_remission(points: Points) -> Finding | None:
-    """What the remission is, if it follows from where the points are.
-
-    points : (n, 4) float32; as recorded.
-    """
+    """What the remission, as recorded, is, if it follows from where the points are."""
     sample = points[:: len(points) // (4 * _SAMPLE) + 1].astype(np.float64)
     x, y, z, remission = sample[np.isfinite(sample).all(axis=1) & (np.hypot(sample[:, 0], sample[:, 1]) > 3.0)].T
     if len(x) < _FEWEST_PLACED:
@@ -622,9 +611,8 @@ def with_raw_remission(findings: Iterable[Finding], points: Points, sensor: Sens
     points : (n, 4) float32; as recorded.
     """
     found = tuple(findings)
-    placed = (
-        None if any(finding.gross and "emission" not in finding for finding in found) else _place_as_remission(points)
-    )
+    is_mistaken = any(finding.gross and "emission" not in finding for finding in found)
+    placed = None if is_mistaken else _place_as_remission(points)
     if placed is not None:
         return placed, *(finding for finding in found if "emission" not in finding)
     remission = points[:, 3]
@@ -648,7 +636,7 @@ def _likely_range(low: float, high: float) -> str:
     return next((f"(0, {top})" for top in (1, 255, 65535) if low >= 0.0 and high <= top), f"({low:g}, {high:g})")
 
 
-def _remission_findings(scan: Measures, profile: FitnessProfile, sensor: SensorProfile) -> list[Finding]:
+def _other_remission(scan: Measures, profile: FitnessProfile, sensor: SensorProfile) -> Finding | None:
     # Without remission, 36 % of the car points and 74 % of the road cells remain (intersection over union with the
     # results with remission, 20 KITTI scans, default models); with a constant one, 15 % and 32 %.
     low, high = sensor.remission_range
@@ -658,45 +646,35 @@ def _remission_findings(scan: Measures, profile: FitnessProfile, sensor: SensorP
     stated = f"the profile {sensor.name} has {low:g} to {high:g}"
     useless = max(0.9, profile.remission_zeros[1] + 0.05)
     if scan.remission_beyond > 0.01 or scan.remission_low < -0.05:
-        return [
-            Finding(
-                f"Remission runs from {raw_low:g} to {raw_high:g}, but {stated}: pass sensor= a profile whose "
-                f"remission_range is {_likely_range(raw_low, raw_high)}.",
-                True,
-            )
-        ]
+        return Finding(
+            f"Remission runs from {raw_low:g} to {raw_high:g}, but {stated}: pass sensor= a profile whose "
+            f"remission_range is {_likely_range(raw_low, raw_high)}.",
+            True,
+        )
     if scan.remission_zeros > useless:
-        return [
-            Finding(
-                f"{_ALL_ZERO} {scan.remission_zeros:.0%} of the points: the field is missing or was not read; "
-                "the model needs it.",
-                True,
-            )
-        ]
+        return Finding(
+            f"{_ALL_ZERO} {scan.remission_zeros:.0%} of the points: the field is missing or was not read; "
+            "the model needs it.",
+            True,
+        )
     # Data in 0..1 has 0.004 of a full scale of 255, which is one bin too.
     in_one_bin = scan.remission_p99 < 0.02 and scan.remission_low < scan.remission_high
     if scan.remission_alike > useless and not in_one_bin:
-        return [
-            Finding(
-                f"Remission is the same for {scan.remission_alike:.0%} of the points ({raw_high:g}): the field holds "
-                "something else; the model needs it.",
-                True,
-            )
-        ]
+        return Finding(
+            f"Remission is the same for {scan.remission_alike:.0%} of the points ({raw_high:g}): the field holds "
+            "something else; the model needs it.",
+            True,
+        )
     if scan.remission_p99 < 0.2 * profile.remission_p99[0]:
-        return [
-            Finding(
-                f"Remission hardly exceeds {raw_p99:.2g}, but {stated}: pass sensor= a profile with the "
-                "remission_range of this data, (0, 1) if it is scaled already.",
-                scan.remission_p99 < 0.02,
-            )
-        ]
+        return Finding(
+            f"Remission hardly exceeds {raw_p99:.2g}, but {stated}: pass sensor= a profile with the "
+            "remission_range of this data, (0, 1) if it is scaled already.",
+            scan.remission_p99 < 0.02,
+        )
     darkest, brightest = profile.remission_median
     if not darkest / 4.0 <= scan.remission_median <= brightest * 2.5:
-        return [
-            Finding(
-                f"The median remission is {scan.remission_median:.2f} of full scale, in training it was {darkest:.2f} "
-                f"to {brightest:.2f}: sensors differ in remission; fit a profile with edgeperc fit-sensor."
-            )
-        ]
-    return []
+        return Finding(
+            f"The median remission is {scan.remission_median:.2f} of full scale, in training it was {darkest:.2f} "
+            f"to {brightest:.2f}: sensors differ in remission; fit a profile with edgeperc fit-sensor."
+        )
+    return None

@@ -10,7 +10,7 @@ first scans of a perceiver show what is normal; what is judged of a later one de
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -127,59 +127,47 @@ def without_drops(points: Points, sensor: SensorProfile, eye_m: ArrayLike = (0.0
     return read_only(kept), n
 
 
-def findings_of(health: SensorHealth) -> tuple[tuple[str, str], ...]:
+def findings_of(health: SensorHealth) -> Iterator[tuple[str, str]]:
     """What to tell the user: kind and sentence of each sign."""
-    found = []
     if health.beams_missing:
-        found.append(
-            (
-                "beams",
-                f"The lowest {health.beams_missing} of the sensor's beams have no returns, though they point to the "
-                "ground near by: the scan is cut short or cropped, its ground was taken out, the vehicle hides them, "
-                "the sensor is another one, or the origin of the points is not at the sensor. What is nearer than the "
-                "nearest returns is missing in the results: read the whole scan, or pass the sensor's own profile and "
-                "the mounting.",
-            )
+        yield (
+            "beams",
+            f"The lowest {health.beams_missing} of the sensor's beams have no returns, though they point to the "
+            "ground near by: the scan is cut short or cropped, its ground was taken out, the vehicle hides them, "
+            "the sensor is another one, or the origin of the points is not at the sensor. What is nearer than the "
+            "nearest returns is missing in the results: read the whole scan, or pass the sensor's own profile and "
+            "the mounting.",
         )
     if health.blocked_deg:
         arcs = " and ".join(f"from {_side(right)} to {_side(left)}" for left, right in health.blocked_deg)
-        found.append(
-            (
-                "blocked",
-                f"The window of the sensor is blocked {arcs}: beams that point to the ground there return nothing, or "
-                "at most a tenth of what they should. Clean the window; if a part of the vehicle hides the view, or "
-                "the scan is not a whole turn, results are missing there.",
-            )
+        yield (
+            "blocked",
+            f"The window of the sensor is blocked {arcs}: beams that point to the ground there return nothing, or "
+            "at most a tenth of what they should. Clean the window; if a part of the vehicle hides the view, or "
+            "the scan is not a whole turn, results are missing there.",
         )
     if health.has_drops:
-        found.append(
-            (
-                "drops",
-                f"{health.isolated:.0%} of the points within {NEAR_M:g} m have no neighbor, and most of them "
-                "are dim; in clear air hardly any are: rain, snow, or dust all round. Such points are left out of "
-                "boxes, labels and cells. Expect a shorter range, and drive slower.",
-            )
+        yield (
+            "drops",
+            f"{health.isolated:.0%} of the points within {NEAR_M:g} m have no neighbor, and most of them "
+            "are dim; in clear air hardly any are: rain, snow, or dust all round. Such points are left out of "
+            "boxes, labels and cells. Expect a shorter range, and drive slower.",
         )
     if health.has_cloud:
-        found.append(
-            (
-                "cloud",
-                f"{health.isolated:.0%} of the points within {NEAR_M:g} m have no neighbor, and most of them "
-                "are dim, on one side; in clear air hardly any are: spray, dust or exhaust. It hides what is behind "
-                "it, and may get a box; keep more distance from the vehicle ahead.",
-            )
+        yield (
+            "cloud",
+            f"{health.isolated:.0%} of the points within {NEAR_M:g} m have no neighbor, and most of them "
+            "are dim, on one side; in clear air hardly any are: spray, dust or exhaust. It hides what is behind "
+            "it, and may get a box; keep more distance from the vehicle ahead.",
         )
     if health.has_fog:
-        found.append(
-            (
-                "fog",
-                f"{_RANGE_SHARE:.0%} of the returns are nearer than {health.range_m:.0f} m, and "
-                f"{health.returns_share:.0%} as many came as in the first scans, when it was "
-                f"{health.normal_range_m:.0f} m: fog, or a film on the whole window. Objects farther away are not "
-                "seen; drive slower, and clean the window if the air is clear.",
-            )
+        yield (
+            "fog",
+            f"{_RANGE_SHARE:.0%} of the returns are nearer than {health.range_m:.0f} m, and "
+            f"{health.returns_share:.0%} as many came as in the first scans, when it was "
+            f"{health.normal_range_m:.0f} m: fog, or a film on the whole window. Objects farther away are not "
+            "seen; drive slower, and clean the window if the air is clear.",
         )
-    return tuple(found)
 
 
 def _middle(values: Sequence[float]) -> float:

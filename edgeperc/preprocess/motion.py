@@ -421,10 +421,8 @@ def _speed(poses: Floats, times_s: Floats) -> float:
 
 
 def _fits_better(other: Floats, poses: Floats, times_s: Floats) -> bool:
-    """Whether one reading of the same poses is that of a vehicle, and the second is not.
-
-    What is too fast is none. Where neither is, as for a camera's axes, or both, a way that keeps its direction in the
-    sensor decides; an upright robot may go to and fro.
+    """Whether one reading of the same poses is that of a vehicle, and the second is not; what is too fast is none.
+    Where neither is, as for a camera's axes, or both, a way that keeps its direction in the sensor decides.
     """
     too_fast = [_speed(each, times_s) > FASTEST_MPS for each in (other, poses)]
     if any(too_fast):

@@ -125,14 +125,14 @@ class SensorEstimate:
 
     # A built-in one, as it is or with the range of remission and the columns of the scans, or one of its own.
     profile: SensorProfile
-    is_built_in: bool  # the beams are those of the built-in profile of this name
-    offsets_m: tuple[float, ...]  # height at which each beam that was seen starts, above the origin of the scan
-    n_beams: int  # beams that were seen; of a built-in profile, others may have had no return
-    off_deg: float  # largest difference between the beams that were seen and those of the profile
-    on_beams: float  # share of the points that lie on the beams, beyond that of random points
     columns: int  # steps in a turn
     nearest_m: float  # range below which one point in a thousand lies
     blind_deg: tuple[tuple[float, float], ...]  # sectors of azimuth without a point, of at least 10 degrees
+    is_built_in: bool = False  # the beams are those of the built-in profile of this name
+    offsets_m: tuple[float, ...] = ()  # height at which each beam that was seen starts, above the origin of the scan
+    n_beams: int = 0  # beams that were seen; of a built-in profile, others may have had no return
+    off_deg: float = 0.0  # largest difference between the beams that were seen and those of the profile
+    on_beams: float = 0.0  # share of the points that lie on the beams, beyond that of random points
     doubt: str = ""  # why the beams cannot be told, and what is assumed; the profile is then one for dense scans
 
     def __str__(self) -> str:
@@ -242,11 +242,6 @@ def _beamless(polar: Sequence[Polar], remission_range: tuple[float, float] | Non
     ranges = np.hypot(largest.flat, largest.z)
     return SensorEstimate(
         profile=profile,
-        is_built_in=False,
-        offsets_m=(),
-        n_beams=0,
-        off_deg=0.0,
-        on_beams=0.0,
         columns=_BEAMLESS_COLUMNS,
         nearest_m=round(float(np.quantile(ranges, 0.001)), 2),
         blind_deg=blind,
@@ -279,14 +274,15 @@ def _fitting_patterns(polar: Sequence[Polar]) -> str:
         for name, profile in SENSORS.items()
         if profile.pattern is not None
         and _LEAST_SEEN * profile.pattern.width_deg <= seen_deg <= profile.pattern.width_deg + 2.0 * _SECTOR_DEG
-        and any(bottom - 1.0 <= low and high <= top + 1.0 for bottom, top in _both_ways(profile))
+        # upright, or upside down
+        and any(
+            bottom - 1.0 <= low and high <= top + 1.0
+            for bottom, top in (
+                (profile.fov_down_deg, profile.fov_up_deg),
+                (-profile.fov_up_deg, -profile.fov_down_deg),
+            )
+        )
     )
-
-
-def _both_ways(profile: SensorProfile) -> tuple[tuple[float, float], ...]:
-    """Lowest and highest elevation [deg], upright and upside down."""
-    bottom, top = profile.fov_down_deg, profile.fov_up_deg
-    return (bottom, top), (-top, -bottom)
 
 
 def has_enough_points(scan: Points) -> bool:
@@ -298,9 +294,6 @@ def has_enough_points(scan: Points) -> bool:
 
 def _unknown(reason: str) -> SensorError:
     return SensorError(f"the sensor cannot be told from the scan: {reason}; {_ADVICE}")
-
-
-_NO_BEAMS = Beams(np.empty(0), np.empty(0), np.empty(0), np.empty(0), np.empty(0), np.empty(0), np.empty(0))
 
 
 def _polar(scan: Points) -> Polar:
@@ -375,7 +368,7 @@ def _is_hdl_64e(beams: Beams, split: int) -> bool:
 def _fitted(flat: Floats, z: Floats, rows: Sequence[Ints64]) -> Beams:
     """A line through the points of each beam, from the top down; all start on a circle about the axis."""
     if not rows:
-        return _NO_BEAMS
+        return Beams(*[np.empty(0)] * 7)
     middles = np.array([np.median(z[row] / flat[row]) for row in rows])
     order = np.argsort(-middles)
     rows, middles = [rows[k] for k in order], middles[order]
@@ -461,9 +454,8 @@ def _far(flat: Floats, z: Floats, n: int) -> tuple[Floats, Floats]:
 
 
 def _blocks(flat: Floats, z: Floats) -> tuple[tuple[float, float], int]:
-    """Heights of the origin of the lower and the upper beams [m], and the bin of elevation that parts them; 0: none.
-
-    Rings on the road show no height, so that two are sought only where the lasers of an HDL-64E are.
+    """Heights of the origin of the lower and the upper beams [m], and the bin of elevation that parts them, or 0: two
+    are sought only where the lasers of an HDL-64E are, as rings on the road show no height.
     """
     gains = np.cumsum(_contrast(_votes(flat, z, _OFFSETS_M)), axis=1)
     above = gains[:, -1:] - gains
@@ -480,10 +472,8 @@ def _blocks(flat: Floats, z: Floats) -> tuple[tuple[float, float], int]:
 
 def _straightened(polar: Polar) -> Polar:
     """The points as seen from where the sensor was, about its axis. Data sets move points to one time, and turn them
-    level.
-
-    The place, the way of the sensor during the scan and its tilt are fitted so that the points of each beam have one
-    elevation: first of far points, which hardly depend on it, and then of nearer ones.
+    level. The place, the way of the sensor during the scan and its tilt are fitted so that the points of each beam have
+    one elevation: first of far points, which hardly depend on it, and then of nearer ones.
     """
     flat, z, azimuth, time, rows = polar
     ahead, left = np.cos(np.radians(azimuth)), np.sin(np.radians(azimuth))

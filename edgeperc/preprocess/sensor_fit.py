@@ -23,6 +23,7 @@ N_STRATA = (len(RANGE_EDGES_M) - 1) * len(COSINE_EDGES)
 N_SHARES = 20
 MIN_POINTS = 200  # points in a stratum
 FOLDS = 10
+CELL_M = 0.8  # cubes in which surfaces are fitted
 
 # fmt: off
 REFERENCES: Mapping[str, tuple[tuple[float, tuple[float, ...]], ...]] = MappingProxyType(
@@ -64,17 +65,17 @@ def _terms(kind: str, x: Floats) -> Floats:
 _EXPONENTS = np.exp(np.linspace(math.log(0.1), math.log(4.0), 60))
 
 
-def _best_power(x: Floats, y: Floats) -> Floats:
-    size = max(float(x.max()), 1e-30)
-    terms = np.maximum(x[:, None] / size, 0.0) ** _EXPONENTS
-    factors = (terms * y[:, None]).sum(axis=0) / ((terms**2).sum(axis=0) + 1e-30)
-    best = int(((factors * terms - y[:, None]) ** 2).mean(axis=0).argmin())
-    return np.array([factors[best] / size ** _EXPONENTS[best], _EXPONENTS[best]])
-
-
 def _fitted(kind: str, x: Floats, y: Floats) -> Floats:
     """Coefficients of a function of this kind with the least squares."""
-    return _best_power(x, y) if kind == "power" else _least_squares(kind, x, y)
+    if kind != "power":
+        terms = _terms(kind, x)
+        size = np.abs(terms).max(axis=0) + 1e-30  # columns of very different size would lose digits
+        return np.asarray(np.linalg.lstsq(terms / size, y, rcond=None)[0] / size, np.float64)
+    most = max(float(x.max()), 1e-30)
+    terms = np.maximum(x[:, None] / most, 0.0) ** _EXPONENTS
+    factors = (terms * y[:, None]).sum(axis=0) / ((terms**2).sum(axis=0) + 1e-30)
+    best = int(((factors * terms - y[:, None]) ** 2).mean(axis=0).argmin())
+    return np.array([factors[best] / most ** _EXPONENTS[best], _EXPONENTS[best]])
 
 
 def _values(kind: str, x: Floats, coefficients: Floats) -> Floats:
@@ -83,19 +84,8 @@ def _values(kind: str, x: Floats, coefficients: Floats) -> Floats:
     return np.asarray(_terms(kind, x) @ coefficients, np.float64)
 
 
-def _least_squares(kind: str, x: Floats, y: Floats) -> Floats:
-    terms = _terms(kind, x)
-    size = np.abs(terms).max(axis=0) + 1e-30  # columns of very different size would lose digits
-    return np.asarray(np.linalg.lstsq(terms / size, y, rcond=None)[0] / size, np.float64)
-
-
 def fit_functions(
-    raw: ArrayLike,
-    wanted: ArrayLike,
-    *,
-    full_scale: float,
-    to: str,
-    source: str,
+    raw: ArrayLike, wanted: ArrayLike, *, full_scale: float, to: str, source: str
 ) -> tuple[RemissionFunction, ...]:
     """Fit a line, a parabola, a logarithm and a power to pairs of remissions, the best in cross-validation first.
 
@@ -127,9 +117,9 @@ def fit_functions(
     return tuple(sorted(found, key=lambda function: function.rmse))
 
 
-def incidences(points: Points, cell_m: float = 0.8) -> Floats:
+def incidences(points: Points) -> Floats:
     """Compute the cosine of the incidence, between each ray and the normal of the surface around its point in cubes of
-    ``cell_m``; NaN if these have fewer than six returns, or no surface (leaves).
+    `CELL_M`; NaN if these have fewer than six returns, or no surface (leaves).
     """
     # Column by column: over rows of three values, numpy takes several times as long.
     x, y, z = np.ascontiguousarray(points[:, :3].T, np.float64)
@@ -138,7 +128,7 @@ def incidences(points: Points, cell_m: float = 0.8) -> Floats:
     if not len(finite):
         return cosines
     p = [axis[finite] for axis in (x, y, z)]
-    row, col, level = (np.floor(axis / cell_m).astype(np.int64) for axis in p)
+    row, col, level = (np.floor(axis / CELL_M).astype(np.int64) for axis in p)
     _, cell = np.unique((row << 40) + (col << 20) + level, return_inverse=True)
     cell = cell.ravel()
     count = np.bincount(cell).astype(np.float64)
@@ -159,11 +149,8 @@ def incidences(points: Points, cell_m: float = 0.8) -> Floats:
     return cosines
 
 
-def stratify(scan: Points, n_points: int | None = None, cell_m: float = 0.8) -> tuple[Ints64, Floats]:
-    """Find the stratum of each point, by range and incidence, and its remission; without points out of `RANGE_EDGES_M`.
-
-    n_points : use about so many points: all returns in some of the cells in which `incidences` fits surfaces.
-    """
+def stratify(scan: Points, n_points: int | None = None) -> tuple[Ints64, Floats]:
+    """Stratum by range and incidence, and remission of points; of about ``n_points``: all in some of the cubes."""
     if scan.ndim != 2 or scan.shape[1] != 4:
         raise PointsError(f"got an array of shape {scan.shape}; expected (n, 4): x, y, z, remission")
     with np.errstate(over="ignore", invalid="ignore"):
@@ -175,12 +162,12 @@ def stratify(scan: Points, n_points: int | None = None, cell_m: float = 0.8) -> 
             # Consecutive products of odd numbers, in int32 with overflow, spread neighboring cells evenly.
             spread = np.zeros(len(scan), np.int32)
             for axis, factor in ((x, 73856093), (y, 19349663), (z, 83492791)):
-                spread += np.floor(axis / np.float32(cell_m)).astype(np.int32) * np.int32(factor)
+                spread += np.floor(axis / np.float32(CELL_M)).astype(np.int32) * np.int32(factor)
             used &= (spread >> 8) % every == 0
     kept = scan[used]
     x, y, z = kept[:, :3].T.astype(np.float64)
     range_m = np.sqrt(x * x + y * y + z * z)
-    cosine = np.nan_to_num(incidences(kept, cell_m), nan=np.inf)
+    cosine = np.nan_to_num(incidences(kept), nan=np.inf)
     by_range = sum((range_m >= edge).astype(np.int64) for edge in RANGE_EDGES_M[1:-1])
     by_cosine = sum((cosine > edge).astype(np.int64) for edge in COSINE_EDGES[1:])
     return by_range * len(COSINE_EDGES) + by_cosine, kept[:, 3].astype(np.float64)
@@ -242,21 +229,15 @@ def _weighted_quantiles(values: Floats, weights: Floats) -> Floats:
 
 
 def fit_sensor(
-    scans: Sequence[Floats32], sensor: SensorProfile, to: str = "hdl-64e", *, source: str = ""
+    scans: Sequence[Floats32], sensor: SensorProfile, to: str = "hdl-64e"
 ) -> tuple[SensorProfile, tuple[RemissionFunction, ...]]:
-    """Fit remission functions of a sensor to scans of any street: ``sensor`` with the best one, and all of them.
-
-    A parabola that decreases before full scale is not used.
-
-    to : a key of `REFERENCES`.
-    source : description of the scans; by default their number.
-    """
+    """Fit remission functions to scans of any street: ``sensor`` with the best that does not decrease, and all."""
     if to not in REFERENCES:
         raise SensorError(f"no reference remissions of {to!r}; known are {', '.join(REFERENCES)}")
     low, high = sensor.remission_range
     raw, wanted = match_quantiles(remission_strata(_returns_of(scans, sensor)), REFERENCES[to])
-    described = source or f"quantiles by range and incidence of {len(scans)} scans"
-    functions = fit_functions(raw - low, wanted, full_scale=high - low, to=to, source=described)
+    source = f"quantiles by range and incidence of {len(scans)} scans"
+    functions = fit_functions(raw - low, wanted, full_scale=high - low, to=to, source=source)
     return replace(sensor, remission=increasing(functions)), functions
 
 
@@ -269,10 +250,11 @@ def _returns_of(scans: Iterable[Floats32], sensor: SensorProfile) -> Iterator[Fl
 
 def increasing(functions: Sequence[RemissionFunction]) -> RemissionFunction:
     """The first function that does not decrease up to full scale; all but parabolas, fitted to quantiles, do not."""
-    return next(f for f in functions if f.kind != "polynomial" or _increases(f))
 
+    def increases(function: RemissionFunction) -> bool:
+        if function.kind != "polynomial":
+            return True
+        _, b, c = function.coefficients
+        return b >= 0.0 and b + 2.0 * c * function.full_scale >= 0.0
 
-def _increases(parabola: RemissionFunction) -> bool:
-    """Whether the parabola increases up to full scale; it may turn down beyond the samples."""
-    _, b, c = parabola.coefficients
-    return b >= 0.0 and b + 2.0 * c * parabola.full_scale >= 0.0
+    return next(filter(increases, functions))

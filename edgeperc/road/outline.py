@@ -132,10 +132,7 @@ def _grown(cells: Mask, radius: float) -> Mask:
 
 
 def _opened(cells: Mask, beside: Mask, radius: float) -> Mask:
-    """The cells without parts that no disc fits into. Without the second growth, corners would be round.
-
-    ``beside`` are the other cells, grown by the radius.
-    """
+    """The cells without parts that no disc fits into; ``beside`` are the other cells, grown by the radius."""
     return cells & _grown(_grown(~beside, radius), radius)
 
 

@@ -15,7 +15,6 @@ import hashlib
 import logging
 import os
 import pickle
-import stat
 import sys
 from collections.abc import Callable, Iterable, Iterator
 from functools import cache
@@ -35,7 +34,7 @@ from ..errors import SettingsError
 from .atomic import write_atomic
 from .compiling import tell_watchers
 from .kernel_stamp import settings, stamp_of
-from .machine import cache_folder, unsafe_because
+from .machine import cache_folder, make_folder, unsafe_because, unusable_because
 
 logger = logging.getLogger(__name__)
 
@@ -49,15 +48,13 @@ def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     """`numba.njit`, whose cache is a `KernelCache`: with ``cache=True`` the compiled function is kept on disk, unless
     it is defined inside another function and uses its variables.
     """
-
     kept = options.pop("cache", False)
 
     def decorate(function: Callable[..., Any]) -> Any:
         # Kernels are never called from C: without that wrapper, they compile faster.
         kernel = numba.njit(**{"no_cfunc_wrapper": True, "pipeline_class": Compiler, **options})(function)
-        if (
-            kept and function.__closure__ is None and hasattr(kernel, "_cache")
-        ):  # with NUMBA_DISABLE_JIT, the kernel is the function itself
+        is_compiled = hasattr(kernel, "_cache")  # with NUMBA_DISABLE_JIT, the kernel is the function itself
+        if kept and function.__closure__ is None and is_compiled:
             kernel._cache = KernelCache(kernel)
         return kernel
 
@@ -84,7 +81,7 @@ def missing(kernels: Iterable[Any]) -> list[Any]:
     """Those of some kernels that no folder and no memory holds in compiled form, for any types."""
     left = {kernel._cache.name: kernel for kernel in kernels if _is_cached(kernel) and not kernel.signatures}
     for folder in dict.fromkeys(folder for kernel in left.values() for folder in kernel._cache.folders()):
-        for file in folder.glob("*.kernel") if left and _unusable(folder) is None else ():
+        for file in folder.glob("*.kernel") if left and unusable_because(folder) is None else ():
             kernel = left.get(file.name.rpartition("-")[0])
             if kernel is not None and _stamp_of(file) == kernel._cache.stamp():
                 del left[kernel._cache.name]
@@ -94,7 +91,7 @@ def missing(kernels: Iterable[Any]) -> list[Any]:
 def are_kept(kernels: Iterable[Any]) -> bool:
     """Whether compiled kernels are put into a cache, from which the next start loads them."""
     caches = [kernel._cache for kernel in kernels if _is_cached(kernel)]
-    return bool(caches) and any(_can_be_written(each) and not _unusable(each) for each in caches[0].folders())
+    return bool(caches) and any(_can_be_written(each) and not unusable_because(each) for each in caches[0].folders())
 
 
 def _is_cached(kernel: Any) -> bool:
@@ -114,7 +111,6 @@ class KernelCache:
         # In a frozen application there are no source files.
         is_frozen = getattr(sys, "frozen", False)
         self._source = Path(sys.executable if is_frozen else self._function.__code__.co_filename).absolute()
-        self._enabled = True
 
     def stamp(self, *, anew: bool = False) -> bytes | None:
         """Changes with everything that the machine code depends on; None, after a report, if that is not known."""
@@ -128,15 +124,15 @@ class KernelCache:
     @property
     def cache_path(self) -> str | None:
         """The first folder that can be written, or holds this kernel already; None if there is none."""
-        usable = [folder for folder in self.folders() if _unusable(folder) is None]
+        usable = [folder for folder in self.folders() if unusable_because(folder) is None]
         writable = (folder for folder in usable if _can_be_written(folder) or self._is_in(folder))
         return next(map(str, writable), None)
 
     def is_missing(self) -> bool:
         """Whether no folder holds a compiled form of this kernel, for any types, and one of them can be written."""
         can_write = False
-        for folder in self.folders() if self._enabled and self.stamp() is not None else ():
-            if _unusable(folder) is not None:
+        for folder in self.folders() if self.stamp() is not None else ():
+            if unusable_because(folder) is not None:
                 continue
             if self._is_in(folder):
                 return False
@@ -147,14 +143,6 @@ class KernelCache:
         """Whether a folder holds a compiled form of this kernel, for any types."""
         stamp = self.stamp()
         return any(_stamp_of(file) == stamp for file in folder.glob(f"{self.name}-*.kernel"))
-
-    def enable(self) -> None:
-        """Load and save from now on."""
-        self._enabled = True
-
-    def disable(self) -> None:
-        """Neither load nor save from now on."""
-        self._enabled = False
 
     def flush(self) -> None:
         """Nothing: files of another stamp are replaced when they are met."""
@@ -167,7 +155,7 @@ class KernelCache:
         return result
 
     def _load(self, sig: Any, target_context: Any) -> Any:
-        if not self._enabled or (stamp := self.stamp()) is None:
+        if (stamp := self.stamp()) is None:
             return None
         try:
             # Machine code needs numba's memory allocator, but neither its compiler's tables of types and functions nor
@@ -180,7 +168,7 @@ class KernelCache:
         for folder in self.folders():
             file = folder / name
             try:
-                if _unusable(folder) is None and (content := _read(file)) is not None and content[0] == stamp:
+                if unusable_because(folder) is None and (content := _read(file)) is not None and content[0] == stamp:
                     found, defined, payload = pickle.loads(content[1])
                     if found == known:
                         return _rebuilt(target_context, defined, *payload)
@@ -198,7 +186,7 @@ class KernelCache:
         tell_watchers()
 
     def _save(self, sig: Any, result: Any) -> None:
-        if not self._enabled or (stamp := self.stamp()) is None:
+        if (stamp := self.stamp()) is None:
             return
         if self.stamp(anew=True) != stamp:
             _report("unknown", "the compiled kernel %s is not kept: a value that it reads was set anew", self.name)
@@ -225,10 +213,8 @@ class KernelCache:
         reasons = []
         for folder in self.folders():
             try:
-                # mkdir's mode, lessened by the umask, is that of the last folder only.
-                folder.parent.mkdir(0o755, parents=True, exist_ok=True)
-                folder.mkdir(0o755, exist_ok=True)
-                reason = _unusable(folder)
+                make_folder(folder)
+                reason = unusable_because(folder)
                 if reason is None:
                     write_atomic(folder / name, hashlib.sha256(content).digest() + content, 0o644)
                     return None
@@ -330,19 +316,6 @@ def _can_be_written(folder: Path) -> bool:
         return os.access(next(parent for parent in (folder, *folder.parents) if parent.exists()), os.W_OK)
     except OSError:
         return False
-
-
-def _unusable(folder: Path) -> str | None:
-    """Why a folder for kernels is not used: other users could write it, or replace it; None if it may be used."""
-    for each in (folder, folder.parent):
-        try:
-            status = each.stat()
-        except OSError:
-            continue  # it does not exist, so it holds nothing
-        reason = unsafe_because(status) if stat.S_ISDIR(status.st_mode) else "it is not a folder"
-        if reason is not None:
-            return reason if each == folder else f"in {each}, {reason}"
-    return None
 
 
 def _text(exc: Exception) -> str:

@@ -57,6 +57,25 @@ def unsafe_because(status: os.stat_result) -> str | None:
     return None
 
 
+def unusable_because(folder: Path) -> str | None:
+    """Why a folder of compiled code is not used: other users could write it, or replace it; None if it may be used."""
+    for each in (folder, folder.parent):
+        try:
+            status = each.stat()
+        except OSError:
+            continue  # it does not exist, so it holds nothing
+        reason = unsafe_because(status) if stat.S_ISDIR(status.st_mode) else "it is not a folder"
+        if reason is not None:
+            return reason if each == folder else f"in {each}, {reason}"
+    return None
+
+
+def make_folder(folder: Path) -> None:
+    """Create a folder of compiled code, and the one it is in, which only this user can write."""
+    folder.parent.mkdir(0o755, parents=True, exist_ok=True)  # the mode, lessened by the umask, is of the last one only
+    folder.mkdir(0o755, exist_ok=True)
+
+
 def compiled_folder(engine: str, sha256: str, precision: str) -> Path | None:
     """Create the folder for the compiled form of a model, separate for each engine, its version, file and precision.
 
@@ -66,10 +85,8 @@ def compiled_folder(engine: str, sha256: str, precision: str) -> Path | None:
     name = hashlib.sha256(f"{engine} {fingerprint()} {precision}".encode()).hexdigest()[:16]
     try:
         folder = cache_folder() / "compiled" / f"{sha256[:16]}-{name}"
-        # mkdir's mode, lessened by the umask, is that of the last folder only.
-        folder.parent.mkdir(0o755, parents=True, exist_ok=True)
-        folder.mkdir(0o755, exist_ok=True)
-        reason = unsafe_because(folder.parent.stat()) or unsafe_because(folder.stat())
+        make_folder(folder)
+        reason = unusable_because(folder)
         if reason is None and os.access(folder, os.W_OK):
             return folder
         message = f"{folder}: {reason or 'it cannot be written'}"

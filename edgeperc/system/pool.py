@@ -176,10 +176,7 @@ def _work(end: Connection, start: bytes) -> None:
 
 
 def _take(end: Connection, items: SimpleQueue[bytes]) -> None:
-    """Take items as they come, so that neither end waits for the other to read; without a driver, end the process.
-
-    It does not finish its item: another run may write the same files.
-    """
+    """Take items, so that no end waits for the other; without a driver, end at once: others may write its files."""
     with contextlib.suppress(EOFError, OSError):
         while True:
             items.put(end.recv_bytes())

@@ -13,10 +13,9 @@ from .jpda import Detections
 # Complete state of a track. The tracker replaces it as a whole, so a scan that raises an error changes nothing.
 TRACK = np.dtype(
     [
-        ("id", np.int64),
-        ("label", np.int64),
-        ("group", np.int64),
-        ("label_weight", np.float64),
+        *((name, np.int64) for name in ("id", "label", "group", "source", "hits", "misses")),
+        *((name, np.float64) for name in ("label_weight", "score", "logit_sum", "last_logit", "chances")),
+        *((name, np.float64) for name in ("age_s", "missed_s", "existence")),
         ("states", np.float64, (3, 5)),
         ("covariances", np.float64, (3, 5, 5)),
         ("modes", np.float64, 3),
@@ -25,17 +24,13 @@ TRACK = np.dtype(
         ("shape", np.float64, 4),
         ("shape_variance", np.float64, 4),
         ("fronts", np.float64, 3),
-        ("source", np.int64),
-        ("score", np.float64),
-        ("logit_sum", np.float64),
-        ("last_logit", np.float64),
-        ("chances", np.float64),
-        ("age_s", np.float64),
-        ("missed_s", np.float64),
-        ("hits", np.int64),
-        ("misses", np.int64),
-        ("existence", np.float64),
     ]
+)
+
+# Fields that `ClassParameters` and CLASS have in common.
+SCALARS = (
+    *("still_mps", "keep_motion_s", "range_m", "detection", "gate", "memory_s"),
+    *("moving_mps", "latest", "far_logit", "coasting_logit"),
 )
 
 # Parameters of a class, as the kernels use them.
@@ -46,24 +41,7 @@ CLASS = np.dtype(
         ("sigmas", np.float64, 3),
         ("shape", np.float64, 4),
         ("birth", np.float64, 2),
-        *(
-            (name, np.float64)
-            for name in (
-                "still_mps",
-                "keep_motion_s",
-                "range_m",
-                "detection",
-                "odds",
-                "gate",
-                "birth_logit",
-                "sure_logit",
-                "moving_mps",
-                "latest",
-                "far_logit",
-                "coasting_logit",
-            )
-        ),
-        ("memory_s", np.float64),
+        *((name, np.float64) for name in ("odds", "birth_logit", "sure_logit", *SCALARS)),
     ]
 )
 

@@ -25,6 +25,7 @@ from .jpda import MAX_EVENTS, Detections, Gates, Predictions, fill_association, 
 from .lives import (
     CLASS,
     LEAST_EXISTENCE,
+    SCALARS,
     TRACK,
     fill_hidden,
     fill_newborn,
@@ -47,12 +48,6 @@ FIRST_TWIST = np.array([15.0, 1.0, 0.3])
 TWIST_WALK = np.array([4.0, 0.5, 0.5])
 TURN_MEMORY_S = 2.0  # without evidence, the estimated turn rate decays with this time constant
 MAX_LANDMARKS = 48
-
-# Fields that ClassParameters and CLASS have in common.
-_SCALARS = (
-    *("still_mps", "keep_motion_s", "range_m", "detection", "gate", "memory_s"),
-    *("moving_mps", "latest", "far_logit", "coasting_logit"),
-)
 
 # Beyond these limits squares and differences of numbers lose their meaning, or overflow.
 FARTHEST_M = 1e8  # coordinates of boxes and poses; projected map coordinates are up to 1e7
@@ -122,14 +117,11 @@ class Tracker:
         self._max_tracks = max_tracks
         self._clock = Clock()
         self.reset()
-        self._compile()
-        self._parameters = {**PARAMETERS, **(parameters or {})}
-        self._clock = Clock(gap_s=max(GAP_S, *(of.memory_s for of in self._parameters.values())))
-
-    def _compile(self) -> None:
-        """Compile every kernel here, not in the first updates: a track begins, and is found again."""
+        # Compile every kernel here, not in the first updates: a track begins, and is found again.
         for stamp_s in (0.0, 0.1):
             self.update([Box("car", 0.9, (10.0, 2.0, -0.9), (4.2, 1.8, 1.5), 0.0)], stamp_s)
+        self._parameters = {**PARAMETERS, **(parameters or {})}
+        self._clock = Clock(gap_s=max(GAP_S, *(of.memory_s for of in self._parameters.values())))
         self.reset()
 
     def reset(self) -> None:
@@ -219,7 +211,9 @@ class Tracker:
                 "scans or with none, or call reset() before a new recording"
             )
         given, fronts, names = _checked_boxes(boxes)
-        pose = None if T_world_sensor is None else _checked_pose(T_world_sensor)
+        pose = None if T_world_sensor is None else rigid("T_world_sensor", T_world_sensor, TrackingError)
+        if pose is not None and np.abs(pose).max() > FARTHEST_M:
+            raise TrackingError(f"T_world_sensor has {np.abs(pose).max():g}; expected at most {FARTHEST_M:g} m")
         self._warn_of(step, stamp_s)
         if step == "late":
             self._clock = clock
@@ -239,7 +233,7 @@ class Tracker:
             estimate = self._estimated_pose(session, tracks, state, covariance, given, classes, dt)
             pose, twist, twist_variances = estimate
         detections = _detections(given, fronts, kinds, classes["group"].copy(), pose)
-        farther = _farther(state, of, pose)
+        farther = 1.0 + _away(state, of, pose)  # the standard deviations of detections grow
         gates = Gates(of["sigmas"] * farther[:, None], of["odds"].copy(), tracks["group"].copy(), of["gate"].copy())
         likelihoods, beta, n_approximated = _associated(predictions, gates, detections)
         _update_motion(tracks, predictions, gates.sigmas, detections.places, likelihoods, beta)
@@ -286,7 +280,7 @@ class Tracker:
                 self._groups.append(of.group)
             row = np.zeros(1, CLASS)
             row["group"] = self._groups.index(of.group)
-            for scalar in _SCALARS:
+            for scalar in SCALARS:
                 row[scalar] = getattr(of, scalar)
             row["noise"] = of.acceleration_mps2, of.turn_acceleration_rps2, of.walk_m, of.wander_rad, of.still_mps
             row["sigmas"] = of.along_m, of.across_m, of.heading_rad
@@ -379,16 +373,18 @@ def _combined(states: Floats, covariances: Floats, modes: Floats) -> tuple[Float
 
 def _detections(given: Floats, fronts: Floats, kinds: Ints64, groups: Ints64, pose: Floats) -> Detections:
     """The checked boxes (m, 8) in the world frame."""
-    places, heights = _in_world(given, pose)
+    places = given[:, :3] @ pose[:3, :3].T + pose[:3, 3]
     shapes = given[:, 2:6].copy()
-    shapes[:, 0] = heights
+    shapes[:, 0] = places[:, 2]
+    cos, sin = np.cos(given[:, 6]), np.sin(given[:, 6])
+    places[:, 2] = np.arctan2(pose[1, 0] * cos + pose[1, 1] * sin, pose[0, 0] * cos + pose[0, 1] * sin)
     ranges = np.hypot(given[:, 0], given[:, 1])
     return Detections(places, shapes, _logit(given[:, 7]), fronts, kinds, groups, ranges, np.arange(len(given)))
 
 
-def _farther(state: Floats, classes: Records, pose: Floats) -> Floats:
-    """Factor of the standard deviations of detections at the distance of each track, (n,)."""
-    return np.asarray(1.0 + np.hypot(state[:, 0] - pose[0, 3], state[:, 1] - pose[1, 3]) / classes["range_m"])
+def _away(state: Floats, classes: Records, pose: Floats) -> Floats:
+    """Distances of tracks from the sensor in units of ``range_m``, (n,)."""
+    return np.asarray(np.hypot(state[:, 0] - pose[0, 3], state[:, 1] - pose[1, 3]) / classes["range_m"])
 
 
 def _associated(predictions: Predictions, gates: Gates, detections: Detections) -> tuple[Floats, Floats, int]:
@@ -435,7 +431,7 @@ def _update_evidence(
 
 def _scores(tracks: Records, strength: Floats, classes: Records, pose: Floats) -> Floats:
     """Log odds (n,) of the reported scores."""
-    away = np.hypot(tracks["state"][:, 0] - pose[0, 3], tracks["state"][:, 1] - pose[1, 3]) / classes["range_m"]
+    away = _away(tracks["state"], classes, pose)
     scores = strength + classes["latest"] * (tracks["last_logit"] - strength)
     return np.asarray(scores + (classes["far_logit"] * away - classes["coasting_logit"] * tracks["misses"]))
 
@@ -462,22 +458,6 @@ def _checked_boxes(boxes: Iterable[Box]) -> tuple[Floats, Floats, list[str]]:
             f"{SIZES_M[1]:g} m, a score and a front in 0..1: drop such boxes before tracking"
         )
     return rows, _logit(fronts), names
-
-
-def _checked_pose(given: ArrayLike) -> Floats:
-    pose = rigid("T_world_sensor", given, TrackingError)
-    if np.abs(pose).max() > FARTHEST_M:
-        raise TrackingError(f"T_world_sensor has {np.abs(pose).max():g}; expected at most {FARTHEST_M:g} m")
-    return pose
-
-
-def _in_world(given: Floats, pose: Floats) -> tuple[Floats, Floats]:
-    """Transform boxes to the world frame: x, y, heading (m, 3), and heights of the centers (m,)."""
-    placed = given[:, :3] @ pose[:3, :3].T + pose[:3, 3]
-    cos, sin = np.cos(given[:, 6]), np.sin(given[:, 6])
-    heights = placed[:, 2].copy()
-    placed[:, 2] = np.arctan2(pose[1, 0] * cos + pose[1, 1] * sin, pose[0, 0] * cos + pose[0, 1] * sin)
-    return placed, heights
 
 
 def _logit(scores: Floats | float) -> Floats:

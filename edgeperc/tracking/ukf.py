@@ -17,7 +17,9 @@ from ..types.points import Floats
 CONSTANT_VELOCITY, CTRV, RANDOM_MOTION = 0, 1, 2
 MODES = ("constant_velocity", "constant_turn", "random_motion")
 
-# n + kappa of the unscented transform. With kappa = 1 all weights are positive, so covariances stay positive definite.
+# n + kappa of the unscented transform: the sigma points are x, with weight kappa / (n + kappa), and x plus and minus
+# each column of the Cholesky root of (n + kappa) P. With kappa = 1 all weights are positive, so covariances stay
+# positive definite.
 SPREAD = 6.0
 STRAIGHT_RAD_S = 1e-4  # below this turn rate, arc and chord differ by less than rounding errors
 

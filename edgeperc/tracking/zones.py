@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
+from itertools import compress
 from typing import Any
 
 import numpy as np
@@ -83,8 +84,10 @@ class Zone:
     def boxes(self, boxes: Iterable[Box]) -> tuple[Box, ...]:
         """The boxes whose center is inside, in their order."""
         given = tuple(boxes)
-        inside = self.mark(np.array([box.center[:2] for box in given], np.float64).reshape(-1, 2))
-        return tuple(box for box, there in zip(given, inside.tolist(), strict=True) if there)
+        return tuple(compress(given, self._hold(given)))
+
+    def _hold(self, boxes: Iterable[Box]) -> list[bool]:
+        return self.mark(np.array([box.center[:2] for box in boxes], np.float64).reshape(-1, 2)).tolist()
 
     def tracks(self, tracks: Iterable[Track], *, world: bool = False) -> tuple[Track, ...]:
         """The tracks whose center is inside, in their order.
@@ -100,9 +103,7 @@ class Zone:
         tuple of Track
         """
         given = tuple(tracks)
-        centers = [(track.world_box if world else track.box).center[:2] for track in given]
-        inside = self.mark(np.array(centers, np.float64).reshape(-1, 2))
-        return tuple(track for track, there in zip(given, inside.tolist(), strict=True) if there)
+        return tuple(compress(given, self._hold(track.world_box if world else track.box for track in given)))
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Sequence
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -22,6 +23,12 @@ from edgeperc_export.training import losses
 
 VIEW = TopViewGeometry()  # x 6..46 m, y -10..10 m, 0.1 m cells
 CAR = (26.0, 2.0, -1.0, 4.0, 1.6, 1.5, 0.0)
+
+
+def card_like(**fields: Any) -> Any:
+    """What the decoding of boxes asks of a card."""
+    usual = {"name": "the model", "view": VIEW, "classes": CLASSES, "box_classes": CLASSES[2:], "mount_height_m": 1.73}
+    return SimpleNamespace(**usual | {"box_size_priors": {}, "box_size_spreads": None, "nms_iou": 0.2} | fields)
 
 
 @pytest.fixture
@@ -146,7 +153,8 @@ def test_the_front_that_is_learned_is_decoded(degrees: float) -> None:
     np.testing.assert_allclose(target[9] ** 2 + target[10] ** 2, learned, atol=1e-6)
     dense = np.concatenate([np.where(target[:1] == 1.0, 5.0, -5.0), target[1:9], 9.0 * target[9:]])[None]
     classes = np.zeros((1, len(TOP_VIEW_CLASSES), VIEW.height, VIEW.width), np.float32)
-    (box,) = decode_dense(dense.astype(np.float32), classes, "class_logits", VIEW, TOP_VIEW_CLASSES, ("car",))
+    card = card_like(classes=TOP_VIEW_CLASSES, box_classes=("car",))
+    (box,) = decode_dense(card, dense.astype(np.float32), classes, "class_logits", 0.3)
     assert np.cos(box.yaw - np.radians(degrees)) == pytest.approx(1.0, abs=1e-6)
     assert box.front == pytest.approx(1.0, abs=1e-3)
 
@@ -250,7 +258,7 @@ def test_slots_survive_the_round_trip() -> None:
     priors = {label: box[3:6] for label, box in ROUND_TRIP.items()}
     slots = paper_slot_targets(list(ROUND_TRIP.values()), VIEW, 8)[None]
     scores = np.full((400, 200), 0.5, np.float32)
-    found = decode_slots(slots, painted(ROUND_TRIP), scores, VIEW, CLASSES, CLASSES[2:], priors, 1.73)
+    found = decode_slots(card_like(box_size_priors=priors), slots, painted(ROUND_TRIP), scores)
     standing = {label: (*box[:2], box[5] / 2 - 1.73, *box[3:]) for label, box in ROUND_TRIP.items()}
     same_boxes(found, standing, atol=1e-4)
 
@@ -260,9 +268,8 @@ def test_scored_slots_survive_the_round_trip() -> None:
     slots = slot_targets(list(ROUND_TRIP.values()), VIEW)
     slots[:, 4] = 8.0 * slots[:, 4] - 4.0  # logits
     probabilities = np.eye(5, dtype=np.float32)[painted(ROUND_TRIP)].transpose(2, 0, 1)
-    found = decode_scored_slots(
-        slots[None], probabilities, "class_probabilities", VIEW, CLASSES, CLASSES[2:], priors, 1.73
-    )
+    card = card_like(box_size_priors=priors)
+    found = decode_scored_slots(card, slots[None], probabilities, "class_probabilities", 0.3)
     standing = {label: (*box[:2], box[5] / 2 - 1.73, *box[3:]) for label, box in ROUND_TRIP.items()}
     same_boxes(found, standing, atol=1e-4)
 
@@ -274,7 +281,7 @@ def test_dense_boxes_survive_the_round_trip(turn: float) -> None:
     heat = dense[0].clip(1e-6, 1.0 - 1e-6)
     dense[0] = np.log(heat) - np.log1p(-heat)
     probabilities = np.eye(5, dtype=np.float32)[painted(boxes)].transpose(2, 0, 1)
-    found = decode_dense(dense, probabilities, "class_probabilities", VIEW, CLASSES, CLASSES[2:])
+    found = decode_dense(card_like(), dense, probabilities, "class_probabilities", 0.3)
     same_boxes(found, boxes, atol=1e-4)
     assert all(box.score > 0.999 for box in found)
 

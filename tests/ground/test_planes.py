@@ -170,11 +170,11 @@ def test_heights_of_some_points_are_those_of_all(regions: bool) -> None:
     for wanted in (np.arange(len(points)) % 7 == 3, (x > 10.0) & (x < 25.0), (x > 0.0) & (abs(y) < x), x < -5.0):
         rows = np.flatnonzero(wanted).astype(np.int32)
         assert len(rows) > 100
-        some = find_ground(points, regions=regions, rows=rows)
+        some = fit_ground(points, regions=regions).heights(rows)
         np.testing.assert_array_equal(some.height_m, every.height_m[rows])
         np.testing.assert_array_equal(some.mask, every.mask[rows])
         assert some.plane == every.plane
-    none = find_ground(points, regions=regions, rows=rows[:0])
+    none = fit_ground(points, regions=regions).heights(rows[:0])
     assert none.plane == every.plane
     assert none.mask.shape == none.height_m.shape == (0,)
 

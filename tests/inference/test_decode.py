@@ -3,6 +3,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -24,6 +25,12 @@ VEHICLES = CLASSES[2:]
 PRIORS = {"car": (3.9, 1.6, 1.5), "van": (5.1, 1.9, 2.2), "truck": (10.0, 2.6, 3.3)}
 VIEW = TopViewGeometry()
 SHAPE = (VIEW.height, VIEW.width)
+
+
+def card_like(**fields: Any) -> Any:
+    """What the decoding of boxes asks of a card."""
+    usual = {"name": "the model", "view": VIEW, "classes": CLASSES, "box_classes": VEHICLES, "box_size_priors": PRIORS}
+    return SimpleNamespace(**usual | {"box_size_spreads": None, "mount_height_m": 1.73, "nms_iou": 0.2} | fields)
 
 
 def pixel_of(x: float, y: float) -> tuple[int, int]:
@@ -95,9 +102,7 @@ def test_classes_of_another_shape_or_kind_raise() -> None:
 def slots_for(slots: Any, labels: np.ndarray | None = None, scores: np.ndarray | None = None) -> list[Any]:
     labels = np.zeros(SHAPE, dtype=np.uint8) if labels is None else labels
     scores = np.ones(SHAPE, dtype=np.float32) if scores is None else scores
-    return decode_slots(
-        np.asarray(slots, dtype=np.float32), labels, scores, VIEW, CLASSES, VEHICLES, PRIORS, 1.73, model="ssadnet"
-    )
+    return decode_slots(card_like(name="ssadnet"), np.asarray(slots, dtype=np.float32), labels, scores)
 
 
 def test_slots_become_boxes_in_meters() -> None:
@@ -148,23 +153,20 @@ def test_malformed_slots_are_refused() -> None:
         slots_for([[0.5, 0.5, 0.1, 0.1]], labels=np.zeros((3, 3), dtype=np.uint8))
     with pytest.raises(CardMismatchError, match="truck"):
         decode_slots(
+            card_like(box_size_priors={"car": PRIORS["car"], "van": PRIORS["van"]}),
             np.zeros((1, 4), dtype=np.float32),
             np.zeros(SHAPE, dtype=np.uint8),
             np.zeros(SHAPE, dtype=np.float32),
-            VIEW,
-            CLASSES,
-            VEHICLES,
-            {"car": PRIORS["car"], "van": PRIORS["van"]},
-            1.73,
         )
     assert slots_for(np.zeros((0, 4))) == []
 
 
-def scored_slots_for(slots: Any, class_output: np.ndarray | None = None, **options: Any) -> list[Any]:
+def scored_slots_for(
+    slots: Any, class_output: np.ndarray | None = None, score_threshold: float = 0.3, iou_threshold: float = 0.2
+) -> list[Any]:
     class_output = np.zeros((len(CLASSES), *SHAPE), np.float32) if class_output is None else class_output
-    return decode_scored_slots(
-        np.asarray(slots, np.float32), class_output, "class_logits", VIEW, CLASSES, VEHICLES, PRIORS, 1.73, **options
-    )
+    card = card_like(nms_iou=iou_threshold)
+    return decode_scored_slots(card, np.asarray(slots, np.float32), class_output, "class_logits", score_threshold)
 
 
 def twin_of_scored_slots(slots: Any, logits: np.ndarray, score_threshold: float, iou_threshold: float) -> list[Any]:
@@ -271,9 +273,16 @@ def class_logits(*patches: Any) -> np.ndarray:
     return logits
 
 
-def dense_boxes(dense: np.ndarray, logits: np.ndarray | None = None, **options: Any) -> list[Any]:
-    logits = class_logits() if logits is None else logits
-    return decode_dense(dense, logits, "class_logits", VIEW, CLASSES, VEHICLES, **options)
+def dense_boxes(
+    dense: np.ndarray,
+    logits: np.ndarray | None = None,
+    score_threshold: float = 0.3,
+    named_from: float = 0.0,
+    iou_threshold: float = 0.2,
+    **fields: Any,
+) -> list[Any]:
+    logits, card = class_logits() if logits is None else logits, card_like(nms_iou=iou_threshold, **fields)
+    return decode_dense(card, dense, logits, "class_logits", score_threshold, named_from)
 
 
 def test_dense_boxes_are_decoded_exactly() -> None:
@@ -293,7 +302,7 @@ def test_dense_boxes_are_decoded_exactly() -> None:
         assert box.yaw == pytest.approx(yaw, abs=1e-5)
         assert box.score == pytest.approx(1.0 / (1.0 + math.exp(-logit)), abs=1e-6)
     probabilities = twins.decode.softmax(logits[0])[None].astype(np.float32)
-    assert decode_dense(dense_of(b, a), probabilities, "class_probabilities", VIEW, CLASSES, VEHICLES) == boxes
+    assert decode_dense(card_like(), dense_of(b, a), probabilities, "class_probabilities", 0.3) == boxes
 
 
 def with_front(dense: np.ndarray, x: float, y: float) -> np.ndarray:
@@ -393,7 +402,7 @@ def test_score_thresholds_0_and_1() -> None:
     # A flat heat map has one peak a plateau, and the plateau of -10 touches the real one.
     everything = dense_boxes(dense, score_threshold=0.0)
     assert 1 <= len(everything) <= 2
-    assert decode_dense(dense, class_logits(), "class_logits", VIEW, CLASSES, ()) == []
+    assert decode_dense(card_like(box_classes=()), dense, class_logits(), "class_logits", 0.3) == []
 
 
 def test_dense_clips_extreme_sizes_and_refuses_non_finite_values() -> None:
@@ -403,7 +412,7 @@ def test_dense_clips_extreme_sizes_and_refuses_non_finite_values() -> None:
     assert np.allclose(box.size, (40.0, 0.2, 40.0))
     dense[0, 7, 3, 3] = np.nan
     with pytest.raises(InferenceError, match="ssadnet: 1 of 45000 values of box_dense"):
-        dense_boxes(dense, model="ssadnet")
+        dense_boxes(dense, name="ssadnet")
     logits = class_logits()
     logits[0, 1, 2, 3] = np.inf
     with pytest.raises(InferenceError, match="1 of 400000 values of class_logits"):

@@ -14,7 +14,7 @@ from edgeperc.errors import PointsError
 from edgeperc.objects import boxes as object_boxes
 from edgeperc.objects import linkage
 from edgeperc.objects.boxes import OBJECT_SIZE_M, classes_of_boxes, join_boxes, objects_from_points
-from edgeperc.objects.cluster import cluster_labels, find_clusters, sort_points
+from edgeperc.objects.cluster import find_clusters, group_points, labels_of_groups, sort_points
 from edgeperc.types.geometry import oriented_iou, rectangles
 from edgeperc.types.perception import Box
 from edgeperc.types.points import Cloud, read_only
@@ -289,37 +289,30 @@ def test_a_wrong_shape_is_refused() -> None:
         find_clusters(np.zeros((2, 2), np.float32))
 
 
-def test_cluster_is_kept_if_more_than_min_share_has_one_class() -> None:
+def test_clusters_have_their_most_frequent_class() -> None:
     clusters = np.repeat(np.array([0, 1, 2, 3, -1], np.int32), 10)
     labels = np.array([1] * 8 + [0] * 2 + [1] * 7 + [0] * 3 + [2] * 5 + [3] * 5 + [0] * 10 + [1] * 10, np.uint8)
-    classes, shares = cluster_labels(clusters, labels)
-    assert classes.tolist() == [1, 0, 0, 0]
+    classes, shares = labels_of_groups(group_points(clusters), labels)
+    assert classes.tolist() == [1, 1, 2, 0]
     np.testing.assert_allclose(shares, [0.8, 0.7, 0.5, 0.0])
-    assert cluster_labels(clusters, labels, min_share=0.4)[0].tolist() == [1, 1, 2, 0]
 
 
 @settings(max_examples=60, deadline=None)
-@given(st.integers(0, 2**31), st.integers(1, 400), st.sampled_from([2, 4, 256]), st.floats(0.0, 1.0))
-def test_votes_agree_with_the_twin(seed: int, n: int, n_labels: int, min_share: float) -> None:
+@given(st.integers(0, 2**31), st.integers(1, 400), st.sampled_from([2, 4, 256]))
+def test_votes_agree_with_the_twin(seed: int, n: int, n_labels: int) -> None:
     rng = np.random.default_rng(seed)
     clusters = rng.integers(-1, max(n // 10, 1), n).astype(np.int32)
     labels = rng.integers(0, n_labels, n).astype(np.uint8)
-    part_of = {2: 3, 5: 2}
-    classes, shares = cluster_labels(clusters, labels, min_share=min_share, part_of=part_of)
-    expected, expected_shares = twins.cluster.votes(clusters, labels, min_share, part_of)
+    classes, shares = labels_of_groups(group_points(clusters), labels)
+    expected, expected_shares = twins.cluster.votes(clusters, labels)
     np.testing.assert_array_equal(classes, expected)
     np.testing.assert_array_equal(shares, expected_shares)
 
 
 def test_no_cluster_has_no_class() -> None:
     for clusters in (np.zeros(0, np.int32), np.full(4, -1, np.int32)):
-        classes, shares = cluster_labels(clusters, np.zeros(len(clusters), np.uint8))
+        classes, shares = labels_of_groups(group_points(clusters), np.zeros(len(clusters), np.uint8))
         assert classes.shape == shares.shape == (0,)
-
-
-def test_labels_of_another_scan_are_refused() -> None:
-    with pytest.raises(PointsError, match="expected the same"):
-        cluster_labels(np.zeros(3, np.int32), np.zeros(4, np.uint8))
 
 
 @settings(max_examples=60, deadline=None)
@@ -573,7 +566,7 @@ def test_class_without_usual_size_has_the_size_of_its_points() -> None:
 @pytest.mark.parametrize(
     ("labels", "options", "message"),
     [
-        (np.zeros(3, np.uint8), {}, "one a point"),
+        (np.zeros(3, np.uint8), {}, "one value a point"),
         (np.full(4, 9, np.uint8), {}, "label 9 for 4 classes"),
         (np.zeros(4, np.uint8), {"in_view": np.ones(3, bool)}, "in_view of shape"),
         (np.zeros(4, np.uint8), {"among": np.zeros(3, bool)}, "among"),

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 import numpy as np
 
 
@@ -33,18 +31,12 @@ def clusters(
     return found
 
 
-def votes(
-    clusters: np.ndarray, labels: np.ndarray, min_share: float, part_of: Mapping[int, int]
-) -> tuple[np.ndarray, np.ndarray]:
-    """Twin of `edgeperc.objects.cluster.cluster_labels`: a table of all clusters and labels."""
+def votes(clusters: np.ndarray, labels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Twin of `edgeperc.objects.cluster.labels_of_groups`: a table of all clusters and labels."""
     counts = np.zeros((clusters.max(initial=-1) + 1, 256), int)
     np.add.at(counts, (clusters[clusters >= 0], labels[clusters >= 0]), 1)
-    for part, whole in part_of.items():
-        moved = np.where(counts[:, whole] >= 0.25 * (counts[:, whole] + counts[:, part]), counts[:, part], 0)
-        counts[:, part] -= moved
-        counts[:, whole] += moved
     shares = counts[:, 1:].max(axis=1) / np.maximum(counts.sum(axis=1), 1)
-    return np.where(shares > min_share, counts[:, 1:].argmax(axis=1) + 1, 0), shares
+    return np.where(shares > 0.0, counts[:, 1:].argmax(axis=1) + 1, 0), shares
 
 
 def rectangle(members: np.ndarray, l_shaped: bool) -> np.ndarray:
