@@ -10,7 +10,6 @@ from collections import Counter
 from collections.abc import Callable
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
 
 from ..camera.calibration import Calibration
 from ..camera.painting import UNSEEN, camera_road, paint
@@ -106,8 +105,12 @@ def count_painting(
 
 def beside_edges(labels: Labels) -> Mask:
     """Pixels with another class within `EDGE_PX` rows and columns."""
-    least = most = np.pad(labels, EDGE_PX, mode="edge")
+    least, most = labels.copy(), labels.copy()
     for axis in (0, 1):
-        least = sliding_window_view(least, 2 * EDGE_PX + 1, axis).min(axis=-1)
-        most = sliding_window_view(most, 2 * EDGE_PX + 1, axis).max(axis=-1)
-    return np.asarray(least != most)
+        for extreme, pick in ((least, np.minimum), (most, np.maximum)):
+            before = extreme.swapaxes(0, axis).copy()
+            now = extreme.swapaxes(0, axis)
+            for k in range(1, EDGE_PX + 1):
+                pick(now[k:], before[:-k], out=now[k:])
+                pick(now[:-k], before[k:], out=now[:-k])
+    return np.asarray((least != labels) | (most != labels))
