@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-pytest.importorskip("tqdm")
+pytest.importorskip("torch")
 
 from edgeperc.inference.projection import make_projector
 from edgeperc.simulation.samples import IGNORE, simulated_scan
