@@ -20,12 +20,18 @@ from .release.to_onnx import export, write_card
 from .training.train import Data, Run, train
 
 N_SIMULATED = 2400
-MORE_SCANS: Mapping[str, tuple[int, Mapping[str, int], dict[str, bool]]] = {
-    "sensors": (10_000, dict.fromkeys(("pandar64", "vlp-32c", "vlp-16"), 200), {}),
-    "six-sensors": (20_000, dict.fromkeys(("vlp-16", "vlp-32c", "hdl-32e", "os1-64", "pandar64", "mid-360"), 200), {}),
-    "halls": (600_000, dict.fromkeys(("hdl-64e", "pandar64", "vlp-16", "os1-64"), 90), {"indoors": True}),
+OBJECT_SENSORS = ("hdl-64e", "pandar64", "vlp-16", "os1-64")
+MORE_SCANS: Mapping[str, tuple[int, Mapping[str, int], str]] = {
+    "sensors": (10_000, dict.fromkeys(("pandar64", "vlp-32c", "vlp-16"), 200), "street"),
+    "six-sensors": (
+        20_000,
+        dict.fromkeys(("vlp-16", "vlp-32c", "hdl-32e", "os1-64", "pandar64", "mid-360"), 200),
+        "street",
+    ),
+    "halls": (600_000, dict.fromkeys(OBJECT_SENSORS, 90), "hall"),
+    "yards": (700_000, dict.fromkeys(OBJECT_SENSORS, 120), "yard"),
 }
-"""Simulated scans beside those of the training sensor: the first seed, how many of each sensor, and which."""
+"""Simulated scans beside those of the training sensor: the first seed, how many of each sensor, and where."""
 # What a card holds of the figures of a source; `edgeperc eval` prints the rest, which is four times as long.
 CARD_FIGURES = ("n_frames", "n_drives", "points", "boxes", "segmentation", "road")
 ROAD_TRUTH = "ssadnet-sim"
@@ -90,11 +96,10 @@ def _with_more(out: Path, scans: Path, layouts: Path | None, also: Sequence[str]
     every = out / "-and-".join([scans.name, *also])
     every.mkdir(parents=True, exist_ok=True)
     for name in also:
-        first, sensors, options = MORE_SCANS[name]
+        first, sensors, where = MORE_SCANS[name]
         for k, (sensor, n) in enumerate(sensors.items()):
-            simulate(
-                every, n, first=first + 1000 * k, layouts_root=layouts, sensor=sensor, n_workers=n_workers, **options
-            )
+            first_of = first + 1000 * k
+            simulate(every, n, first=first_of, layouts_root=layouts, sensor=sensor, where=where, n_workers=n_workers)
     for file in scans.glob("*.npz"):
         if not (every / file.name).exists():
             (every / file.name).symlink_to(file.resolve())

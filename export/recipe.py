@@ -379,7 +379,7 @@ CURVED = replace(
 
 LAST = replace(CURVED, simulated_share=0.8, steps=1000)
 
-SENSORS_AND_HALLS = ("sensors", "halls")
+OBJECT_SCANS = ("sensors", "halls", "yards")
 _open = partial(Stage, is_open=True, also=("six-sensors",))
 
 MODELS = {
@@ -427,15 +427,15 @@ MODELS = {
     ),
     "camseg": Stage(CAMSEG),
     # The object network sees points, not beams: with scans of other sensors it learns how sparse an object may be.
-    # Without halls it took walls, beams and pipes for trucks.
-    "objects-start": Stage(OBJECTS, also=SENSORS_AND_HALLS),
-    "objects": Stage(SECOND_LOOK, after="objects-start", also=SENSORS_AND_HALLS),
+    # Without halls it took walls, beams and pipes for trucks; without yards, trucks across the way for walls.
+    "objects-start": Stage(OBJECTS, also=OBJECT_SCANS),
+    "objects": Stage(SECOND_LOOK, after="objects-start", also=OBJECT_SCANS),
     "ssadnet-open": _open(
         replace(OPEN, network="ssadnet", height_above_ground=False, front=True, n_pasted=3.0), also=("sensors",)
     ),
-    "objects-open-start": _open(replace(OBJECTS, steps=16_000, detector=False), also=SENSORS_AND_HALLS),
+    "objects-open-start": _open(replace(OBJECTS, steps=16_000, detector=False), also=OBJECT_SCANS),
     "objects-open": _open(
-        replace(SECOND_LOOK, steps=10_000, detector=False), after="objects-open-start", also=SENSORS_AND_HALLS
+        replace(SECOND_LOOK, steps=10_000, detector=False), after="objects-open-start", also=OBJECT_SCANS
     ),
     "four-classes-start": _open(OPEN_POINTS),
     "scene-start": _open(SCENE, after="four-classes-start", also=("sensors",)),

@@ -91,7 +91,7 @@ FLOORS = {
         simulation.people
         simulation.street
         simulation.camera simulation.roadside
-        simulation.drawn simulation.halls simulation.layouts
+        simulation.drawn simulation.halls simulation.layouts simulation.yards
         simulation.__init__ simulation.samples
         view.colors
         view.canvas view.content

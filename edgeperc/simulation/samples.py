@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from ..errors import PointsError
 from ..types.geometry import inside
 from ..types.mounting import Mounting
 from ..types.perception import Box
@@ -18,8 +19,11 @@ from .drawn import random_scene
 from .halls import CLEAR_M, hall
 from .layouts import scene_from_boxes
 from .scene import POINT_CLASS_OF, SCENE_CLASSES, Scene, SimulatedScan, sensor_pose, simulate
+from .yards import yard
 
 IGNORE = 255
+
+PLACES = ("street", "hall", "yard")
 
 # Measured: height of the bottom of KITTI's boxes above the ground around them (median of 720 boxes).
 BOX_ABOVE_GROUND_M = 0.03
@@ -37,7 +41,7 @@ def simulated_scan(
     boxes: Sequence[Box] | None = None,
     *,
     mounting: Mounting | None = None,
-    indoors: bool = False,
+    where: str = "street",
     clumped_leaves: bool = False,
 ) -> SimulatedScan:
     """Simulate one scan of a new scene. The vehicle is slightly pitched and rolled, beside the middle of its lane.
@@ -45,13 +49,19 @@ def simulated_scan(
     boxes : a real layout to build the scene around (`layouts.scene_from_boxes`); by default the scene is random.
     mounting : height, and tilt relative to the vehicle; by default the sensor's height, upright. Points and boxes are
         in the frame of the tilted sensor.
+    where : one of `PLACES`; a sensor that is as high as the ceiling of a hall hangs below it.
     clumped_leaves : as of `scene.simulate`.
-    indoors : in a hall, without a layout (`halls.hall`); a sensor that is as high as the ceiling hangs below it.
     """
+    if where not in PLACES:
+        raise PointsError(f"got where={where!r}; expected one of {', '.join(PLACES)}")
+    if boxes is not None and where != "street":
+        raise PointsError(f"got boxes and where={where!r}; a layout is that of a street")
     rng = np.random.default_rng((seed, 1))
     highest_m = math.inf
-    if indoors:
+    if where == "hall":
         scene, (x, y, yaw), highest_m = hall(seed)
+    elif where == "yard":
+        scene, (x, y, yaw) = yard(seed)
     elif boxes is None:
         scene = random_scene(seed)
         x = y = 0.0

@@ -33,7 +33,7 @@ def simulate(
     first: int = 0,
     layouts_root: Path | None = None,
     sensor: str = "hdl-64e",
-    indoors: bool = False,
+    where: str = "street",
     n_workers: int = 0,
 ) -> None:
     """Write ``n`` labeled scans into ``out``. Existing files are kept, so a stopped run resumes.
@@ -41,13 +41,13 @@ def simulate(
     first : number and seed of the first scan.
     layouts_root : folder of KITTI's labels; every other scene gets the boxes of one of its scans.
     sensor : name of the sensor to simulate.
-    indoors : in halls, without layouts.
+    where : kind of place, one of `samples.PLACES`; only streets have layouts.
     n_workers : number of processes that simulate; 0: this one. The scans are the same.
     """
     out.mkdir(parents=True, exist_ok=True)
     real = list(layouts(layouts_root)) if layouts_root else []
     missing = [seed for seed in range(first, first + n) if not _path(out, seed).exists()]
-    write = partial(_simulate, out=out, layouts=real, sensor=sensor, indoors=indoors)
+    write = partial(_simulate, out=out, layouts=real, sensor=sensor, where=where)
     with mapped(write, missing, n_workers) as done:
         for _ in tqdm(done, desc="simulating", unit="scan", total=len(missing)):
             pass
@@ -57,10 +57,10 @@ def _path(out: Path, seed: int) -> Path:
     return out / f"{seed:06d}.npz"
 
 
-def _simulate(seed: int, *, out: Path, layouts: Sequence[Sequence[Box]], sensor: str, indoors: bool) -> None:
+def _simulate(seed: int, *, out: Path, layouts: Sequence[Sequence[Box]], sensor: str, where: str) -> None:
     # 4,973 is prime: neighboring seeds take layouts of different drives.
-    boxes = layouts[seed * 4973 % len(layouts)] if layouts and seed % 2 and not indoors else None
-    scan = LabeledScan.from_simulation(simulated_scan(seed, sensor, boxes, indoors=indoors, clumped_leaves=True))
+    boxes = layouts[seed * 4973 % len(layouts)] if layouts and seed % 2 and where == "street" else None
+    scan = LabeledScan.from_simulation(simulated_scan(seed, sensor, boxes, where=where, clumped_leaves=True))
     if sensor != TRAINING_SENSOR:
         scan = replace(scan, sensor=get_sensor(sensor))
     scan.save(_path(out, seed))

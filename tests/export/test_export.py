@@ -710,7 +710,7 @@ def test_make_also_makes_the_models_that_it_starts_from(
 
     monkeypatch.setattr(make_module, "MODELS", stages)
     monkeypatch.setattr(make_module, "N_SIMULATED", 2)
-    monkeypatch.setattr(make_module, "MORE_SCANS", {"halls": (600_000, {"vlp-16": 1}, {"indoors": True})})
+    monkeypatch.setattr(make_module, "MORE_SCANS", {"halls": (600_000, {"vlp-16": 1}, "hall")})
     monkeypatch.setattr(make_module, "evaluate", recorded_evaluate)
     monkeypatch.setattr(to_onnx, "MIN_AGREEMENT", 0.99)  # after so few steps, the logits of many pixels are close
     out = tmp_path / "out"

@@ -31,7 +31,7 @@ def test_vehicles_fit_into_a_hall(seed: int) -> None:
 def test_a_sensor_hangs_below_the_ceiling_and_sees_no_farther_than_the_walls(sensor: str) -> None:
     found = []
     for seed in range(8):
-        scan, (_, _, height_m) = simulated_scan(seed, sensor, indoors=True), hall(seed)
+        scan, (_, _, height_m) = simulated_scan(seed, sensor, where="hall"), hall(seed)
         above_m = float(scan.T_world_sensor[2, 3] - scan.scene.ground_height(*scan.T_world_sensor[:2, 3]))
         assert above_m <= height_m - CLEAR_M + 1e-6
         assert scan.points[:, 2].max() < height_m - above_m + 1.5  # the sensor is tilted
