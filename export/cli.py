@@ -15,6 +15,7 @@ from edgeperc.cli.arguments import Options, options
 from edgeperc.cli.output import print_error, print_line
 from edgeperc.cli.program import Parser, run_program
 from edgeperc.errors import EdgepercError, MissingExtraError, ModelError
+from edgeperc.types.choices import PLACES
 
 from .database.cli import add_database_commands
 from .recipe import MODELS, NETWORKS, PAPER, TASKS, Recipe
@@ -180,13 +181,22 @@ def _add_simulate(command: Command) -> None:
     add("--first FIRST", "number of the first scan, and its seed (default 0)", type=int, default=0)
     _add_shared(add, "--layouts LAYOUTS")
     add("--sensor SENSOR", "sensor to simulate (default hdl-64e)", default="hdl-64e")
+    add("--where WHERE", "kind of place (default street); only streets have layouts", choices=PLACES, default="street")
     add("--workers WORKERS", "number of processes that simulate (default: this one)", type=int, default=0)
 
 
 def _simulate(args: argparse.Namespace) -> int:
     from .data.simulate import simulate
 
-    simulate(args.out, args.n, first=args.first, layouts_root=args.layouts, sensor=args.sensor, n_workers=args.workers)
+    simulate(
+        args.out,
+        args.n,
+        first=args.first,
+        layouts_root=args.layouts,
+        sensor=args.sensor,
+        where=args.where,
+        n_workers=args.workers,
+    )
     return 0
 
 

@@ -174,6 +174,12 @@ class Recipe:
         "share of the candidates that are boxes which the network itself finds, as at its second look",
         TASKS["objects"],
     )
+    runs: int = _option(
+        1,
+        "runs, with one seed after the other; the mean of their weights is exported, which holds less of what chance "
+        "gave each (model soup; Wortsman et al., 2022)",
+        TASKS["objects"],
+    )
     seed: int = _option(0, "seed of the initial weights, the samples and the dropout")
 
     @property
@@ -338,6 +344,7 @@ OBJECTS = Recipe(
 
 # Continued with its own boxes among the candidates, for the second look gets such boxes.
 SECOND_LOOK = replace(OBJECTS, found_again=0.45, steps=12_000, learning_rate=1e-3)
+OPEN_SECOND_LOOK = replace(SECOND_LOOK, steps=10_000, detector=False)
 
 # Without KITTI, the 28 real scans are of one street: most scans are simulated. Three quarters of the channels, and int8
 # alone, let three more models fit into the wheel.
@@ -379,7 +386,7 @@ CURVED = replace(
 
 LAST = replace(CURVED, simulated_share=0.8, steps=1000)
 
-OBJECT_SCANS = ("sensors", "halls", "yards")
+OBJECT_SCANS = ("sensors", "halls")
 _open = partial(Stage, is_open=True, also=("six-sensors",))
 
 MODELS = {
@@ -429,13 +436,15 @@ MODELS = {
     # The object network sees points, not beams: with scans of other sensors it learns how sparse an object may be.
     # Without halls it took walls, beams and pipes for trucks; without yards, trucks across the way for walls.
     "objects-start": Stage(OBJECTS, also=OBJECT_SCANS),
-    "objects": Stage(SECOND_LOOK, after="objects-start", also=OBJECT_SCANS),
+    "objects-again-start": Stage(SECOND_LOOK, after="objects-start", also=OBJECT_SCANS),
+    "objects": Stage(replace(SECOND_LOOK, runs=2), after="objects-again-start", also=(*OBJECT_SCANS, "yards")),
     "ssadnet-open": _open(
         replace(OPEN, network="ssadnet", height_above_ground=False, front=True, n_pasted=3.0), also=("sensors",)
     ),
     "objects-open-start": _open(replace(OBJECTS, steps=16_000, detector=False), also=OBJECT_SCANS),
+    "objects-open-again-start": _open(OPEN_SECOND_LOOK, after="objects-open-start", also=OBJECT_SCANS),
     "objects-open": _open(
-        replace(SECOND_LOOK, steps=10_000, detector=False), after="objects-open-start", also=OBJECT_SCANS
+        replace(OPEN_SECOND_LOOK, runs=2), after="objects-open-again-start", also=(*OBJECT_SCANS, "yards")
     ),
     "four-classes-start": _open(OPEN_POINTS),
     "scene-start": _open(SCENE, after="four-classes-start", also=("sensors",)),

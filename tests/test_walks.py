@@ -125,3 +125,15 @@ def test_no_object_that_points_show_is_without_a_box(full_turn: bool) -> None:
                 lost.append((kind, x, y, int(np.count_nonzero(seen)), round(float(recognized), 2), perception.boxes))
     assert n_seen > (85 if full_turn else 120)
     assert not lost
+
+
+@pytest.mark.parametrize("yaw", [0.0, math.pi / 4, math.pi / 2], ids=["along", "askew", "across"])
+def test_a_truck_has_its_box_whichever_way_it_stands(yaw: float) -> None:
+    """`objects` 1.3.0 took the flat side of a truck across the way for a wall, in 35 of 60 such scans."""
+    perceive = Perceiver(mounting=MODEL_MOUNTING, on_mismatch="ignore", provider="cpu", n_threads=1)
+    overlaps = []
+    for seed, x in enumerate(np.linspace(12.0, 55.0, 12)):
+        scan = scan_of([("truck", x, 3.0 * math.sin(2.4 * seed), yaw)], seed)
+        boxes = [box for box in perceive(scan.points).boxes if box.label in BOXES_OF["truck"]]
+        overlaps.append(oriented_iou(rectangles(boxes), rectangles(scan.boxes)).max(initial=0.0))
+    assert np.count_nonzero(np.array(overlaps) > 0.5) >= 11

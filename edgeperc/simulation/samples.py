@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from ..errors import PointsError
+from ..types.choices import PLACES
 from ..types.geometry import inside
 from ..types.mounting import Mounting
 from ..types.perception import Box
@@ -22,8 +23,6 @@ from .scene import POINT_CLASS_OF, SCENE_CLASSES, Scene, SimulatedScan, sensor_p
 from .yards import yard
 
 IGNORE = 255
-
-PLACES = ("street", "hall", "yard")
 
 # Measured: height of the bottom of KITTI's boxes above the ground around them (median of 720 boxes).
 BOX_ABOVE_GROUND_M = 0.03
@@ -49,7 +48,7 @@ def simulated_scan(
     boxes : a real layout to build the scene around (`layouts.scene_from_boxes`); by default the scene is random.
     mounting : height, and tilt relative to the vehicle; by default the sensor's height, upright. Points and boxes are
         in the frame of the tilted sensor.
-    where : one of `PLACES`; a sensor that is as high as the ceiling of a hall hangs below it.
+    where : one of `edgeperc.types.choices.PLACES`; a sensor that is as high as the ceiling of a hall hangs below it.
     clumped_leaves : as of `scene.simulate`.
     """
     if where not in PLACES:

@@ -9,6 +9,8 @@ CAMERA = "camseg"
 DEFAULT_SENSOR = "hdl-64e"
 AUTO_SENSOR = "auto"  # found in the points
 PRECISIONS = ("fp32", "bf16", "int8")
+PLACES = ("street", "hall", "yard")
+"""Kinds of places that are simulated."""
 RULES = (
     "boxes",
     "ceiling",

@@ -41,7 +41,7 @@ def simulate(
     first : number and seed of the first scan.
     layouts_root : folder of KITTI's labels; every other scene gets the boxes of one of its scans.
     sensor : name of the sensor to simulate.
-    where : kind of place, one of `samples.PLACES`; only streets have layouts.
+    where : kind of place, one of `edgeperc.types.choices.PLACES`; only streets have layouts.
     n_workers : number of processes that simulate; 0: this one. The scans are the same.
     """
     out.mkdir(parents=True, exist_ok=True)

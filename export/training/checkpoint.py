@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -12,12 +13,14 @@ from torch import nn
 
 from edgeperc.errors import CardError, ModelError
 from edgeperc.preprocess.fitness import FitnessProfile
+from edgeperc.system.atomic import open_atomic
 from edgeperc.system.fields import Fields
 
 from ..networks import build
 from ..recipe import Recipe
 
 MAX_WIDTH = 4096
+MAX_RUNS = 1000
 _FIELDS = Fields("the checkpoint", ValueError, "train again", optional=("*",), exact=True)
 _TEXTS = {"before": list, "curve": list, "frames": dict}  # entries that are JSON
 
@@ -58,9 +61,19 @@ def build_network(state: Mapping[str, Any], path: Path) -> nn.Module:
     return network
 
 
+def write_mean(paths: Sequence[Path], recipe: Recipe, out: Path) -> None:
+    """Write a checkpoint of ``recipe`` with the mean of the averaged weights of runs, and all else of the first one."""
+    state = torch.load(paths[0], weights_only=True, map_location="cpu")
+    weights = [build_network(read_checkpoint(path), path).state_dict() for path in paths]
+    mean = {name: torch.stack([of[name] for of in weights]).mean(dim=0) for name in weights[0]}
+    with open_atomic(out) as file:
+        torch.save(state | {"recipe": json.dumps(asdict(recipe)), "averaged": mean, "best": None}, file)
+
+
 def _recipe(text: str) -> Recipe:
     recipe = _FIELDS.read(Recipe, json.loads(text), "recipe")
     _FIELDS.whole("recipe.context_width", recipe.context_width, 1, MAX_WIDTH)
+    _FIELDS.whole("recipe.runs", recipe.runs, 1, MAX_RUNS)
     _FIELDS.whole("recipe.seed", recipe.seed, 0, 2**63 - 1)
     _FIELDS.number("recipe.width", recipe.width, 1e-3, 8.0)
     _FIELDS.number("recipe.dropout", recipe.dropout, 0.0, 0.999)

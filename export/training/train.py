@@ -12,7 +12,7 @@ import math
 import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -33,7 +33,7 @@ from ..networks import build
 from ..recipe import Recipe
 from .bfloat16 import in_bfloat16
 from .camera import Camera
-from .checkpoint import build_network, read_checkpoint
+from .checkpoint import build_network, read_checkpoint, write_mean
 from .images import ImageSamples, ImageWatch, camvid_samples
 from .log import TrainingLog
 from .object_batches import ObjectBatches, ObjectWatch
@@ -89,13 +89,25 @@ class Run:
 
 def train(recipe: Recipe, out: Path, data: Data, run: Run | None = None) -> Path:
     """Train the network of a recipe in a folder, or resume it; returns the checkpoint. ``torchrun``'s processes share
-    each batch: weights equal those of one up to rounding. Raises ValueError, FloatingPointError, RankError.
+    each batch: weights equal those of one up to rounding. Several runs have folders of their own beside ``out``, which
+    gets their mean. Raises ValueError, FloatingPointError, RankError.
     """
     run = run or Run()
+    if recipe.runs < 1:
+        raise ValueError(f"the recipe has {recipe.runs} runs; expected one or more")
     ranks = Ranks()
     ranks.check(recipe.batch, recipe.accumulate, run.compiled)
     with ranks.together():
-        return _Training(recipe, out, data, run, ranks).finish()
+        if recipe.runs == 1:
+            return _Training(recipe, out, data, run, ranks).finish()
+        checkpoints = []
+        for k in range(recipe.runs):
+            of_run, folder = replace(recipe, runs=1, seed=recipe.seed + k), out.with_name(f"{out.name}-run-{k}")
+            checkpoints.append(_Training(of_run, folder, data, run, ranks).finish())
+        if ranks.is_first:
+            out.mkdir(parents=True, exist_ok=True)
+            write_mean(checkpoints, recipe, out / checkpoints[0].name)
+        return out / checkpoints[0].name
 
 
 class _Source(NamedTuple):

@@ -992,6 +992,9 @@ def test_a_card_replaces_an_existing_one(tmp_path: Path, third_party: tuple[Path
 def test_the_command_line_from_scans_to_a_model(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     data, run, model = tmp_path / "data", tmp_path / "run", tmp_path / "pointseg.onnx"
     assert main(["simulate", str(data), "-n", "2"]) == 0
+    assert main(["simulate", str(tmp_path), "-n", "1", "--sensor", "vlp-16", "--where", "yard"]) == 0
+    yard = simulated_scan(0, "vlp-16", where="yard", clumped_leaves=True)
+    np.testing.assert_array_equal(LabeledScan.load(tmp_path / "000000.npz").points, yard.points)
     arguments = ["--steps", "1", "--batch", "1", "--threads", "1", "--edge"]
     assert main(["train", "pointseg", str(run), "--simulated", str(data), *arguments]) == 0
     assert main(["export", str(run / "checkpoint.pt"), str(model)]) == 0

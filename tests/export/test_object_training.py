@@ -296,6 +296,22 @@ def test_training_resumes_bit_for_bit(labeled: LabeledScan, tmp_path: Path, monk
         assert torch.equal(weight, whole[name]), name
 
 
+def test_two_runs_leave_the_mean_of_their_weights(labeled: LabeledScan, tmp_path: Path) -> None:
+    scans = tmp_path / "scans"
+    scans.mkdir()
+    labeled.save(scans / "000000.npz")
+    recipe = replace(RECIPE, steps=2, runs=2, seed=7)
+    data = Data(simulated=scans)
+    mean, of_mean, _ = load(train(recipe, tmp_path / "both", data, Run(n_threads=1)))
+    one, other = (load(tmp_path / f"both-run-{k}" / "checkpoint.pt")[0].state_dict() for k in range(2))
+    alone = load(train(replace(recipe, runs=1, seed=8), tmp_path / "alone", data, Run(n_threads=1)))[0].state_dict()
+    assert of_mean == recipe
+    for name, weight in mean.state_dict().items():
+        assert torch.equal(other[name], alone[name])
+        torch.testing.assert_close(weight, 0.5 * (one[name] + other[name]))
+    assert any(not torch.equal(weight, one[name]) for name, weight in mean.state_dict().items())
+
+
 def test_a_run_starts_from_the_shipped_model(samples: ObjectSamples) -> None:
     task, network = Objects.of(RECIPE), build(RECIPE)
     before, frames = start(network, RECIPE, model_path("objects"), [])
