@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -97,9 +98,9 @@ def _with_more(out: Path, scans: Path, layouts: Path | None, also: Sequence[str]
     every.mkdir(parents=True, exist_ok=True)
     for name in also:
         first, sensors, where = MORE_SCANS[name]
+        write = partial(simulate, every, where=where, n_workers=n_workers)
         for k, (sensor, n) in enumerate(sensors.items()):
-            first_of = first + 1000 * k
-            simulate(every, n, first=first_of, layouts_root=layouts, sensor=sensor, where=where, n_workers=n_workers)
+            write(n, first=first + 1000 * k, sensor=sensor, layouts_root=layouts if where == "street" else None)
     for file in scans.glob("*.npz"):
         if not (every / file.name).exists():
             (every / file.name).symlink_to(file.resolve())

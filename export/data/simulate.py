@@ -39,11 +39,13 @@ def simulate(
     """Write ``n`` labeled scans into ``out``. Existing files are kept, so a stopped run resumes.
 
     first : number and seed of the first scan.
-    layouts_root : folder of KITTI's labels; every other scene gets the boxes of one of its scans.
+    layouts_root : folder of KITTI's labels; every other street gets the boxes of one of its scans.
     sensor : name of the sensor to simulate.
-    where : kind of place, one of `edgeperc.types.choices.PLACES`; only streets have layouts.
+    where : kind of place, one of `edgeperc.types.choices.PLACES`; only streets have layouts, ValueError otherwise.
     n_workers : number of processes that simulate; 0: this one. The scans are the same.
     """
+    if layouts_root is not None and where != "street":
+        raise ValueError(f"layouts are those of streets, and the place is a {where}; leave them out")
     out.mkdir(parents=True, exist_ok=True)
     real = list(layouts(layouts_root)) if layouts_root else []
     missing = [seed for seed in range(first, first + n) if not _path(out, seed).exists()]
@@ -59,7 +61,7 @@ def _path(out: Path, seed: int) -> Path:
 
 def _simulate(seed: int, *, out: Path, layouts: Sequence[Sequence[Box]], sensor: str, where: str) -> None:
     # 4,973 is prime: neighboring seeds take layouts of different drives.
-    boxes = layouts[seed * 4973 % len(layouts)] if layouts and seed % 2 and where == "street" else None
+    boxes = layouts[seed * 4973 % len(layouts)] if layouts and seed % 2 else None
     scan = LabeledScan.from_simulation(simulated_scan(seed, sensor, boxes, where=where, clumped_leaves=True))
     if sensor != TRAINING_SENSOR:
         scan = replace(scan, sensor=get_sensor(sensor))

@@ -996,6 +996,8 @@ def test_the_command_line_from_scans_to_a_model(tmp_path: Path, capsys: pytest.C
     assert main(["simulate", str(tmp_path), "-n", "1", "--sensor", "vlp-16", "--where", "yard"]) == 0
     yard = simulated_scan(0, "vlp-16", where="yard", clumped_leaves=True)
     np.testing.assert_array_equal(LabeledScan.load(tmp_path / "000000.npz").points, yard.points)
+    assert main(["simulate", str(tmp_path), "-n", "1", "--layouts", str(tmp_path), "--where", "yard"]) == 2
+    assert "layouts are those of streets, and the place is a yard; leave them out" in capsys.readouterr().err
     arguments = ["--steps", "1", "--batch", "1", "--threads", "1", "--edge"]
     assert main(["train", "pointseg", str(run), "--simulated", str(data), *arguments]) == 0
     assert main(["export", str(run / "checkpoint.pt"), str(model)]) == 0
