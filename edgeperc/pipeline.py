@@ -27,7 +27,7 @@ from .ground.planes import FIRST_REACH_HEIGHTS, FIRST_REACH_M, GroundFit, fit_gr
 from .ground.scan import Scan
 from .inference.crop import Crop, sectors_of_turn, spread
 from .inference.decode import decode_boxes, decode_cells, decode_labels
-from .inference.object_network import BoxesFrom, ObjectNetwork
+from .inference.object_network import PARTS, BoxesFrom, ObjectNetwork
 from .inference.pillar_network import PillarNetwork
 from .inference.projection import input_heights, make_projector
 from .inference.session import Session
@@ -37,7 +37,7 @@ from .objects.cluster import sort_points
 from .objects.linkage import Strips
 from .objects.refine import label_points, remove_outliers
 from .preprocess.interpolation import Interpolator
-from .system.lanes import Lanes, Once, Stopwatch
+from .system.lanes import Lanes, Stopwatch, Values
 from .types.frame import turned
 from .types.mounting import MODEL_HEIGHT_M, Mounting
 from .types.perception import Box, GroundSurface, PointLabels, TopView
@@ -52,12 +52,15 @@ LESS_SURE = 0.2
 
 
 class Parts(NamedTuple):
-    """The answer to a scan, in the frame of the models; None without such a network, or where no ground is needed."""
+    """The answer to a scan, in the frame of the models; None without such a network, or where no ground is needed.
+    ``beside`` is what was computed beside it.
+    """
 
     points: PointLabels | None
     top_view: TopView | None
     boxes: Sequence[Box]
     ground: GroundSurface | None
+    beside: Any
 
 
 @dataclass(frozen=True)
@@ -191,28 +194,32 @@ class Pipeline:
         views = [network.view for network in (top, *ranged[:1]) if network is not None]
         self.crop = Crop([] if options.full_turn or interpolates else views)
 
-    def __call__(self, points: Points, mounting: Mounting, watch: Stopwatch) -> Parts:
-        """Perceive points in the frame of the models, (n, 4) float32, read-only, finite or NaN."""
+    def __call__(
+        self, points: Points, mounting: Mounting, watch: Stopwatch, beside: Callable[[Points], object] | None = None
+    ) -> Parts:
+        """Perceive points in the frame of the models, (n, 4) float32, read-only, finite or NaN; ``beside`` is computed
+        of them when a lane has nothing else to do.
+        """
         top, options, rules, per_m = self.top, self.options, self.options.rules, self.options.distance_per_m
 
-        def value(stage: str, function: Callable[..., Any], *arguments: object, **named: object) -> Once[Any]:
-            return Once(function, *arguments, stage=stage, watch=watch, **named)
-
-        absent = value("check", _absent)
+        # A value stands after those that it needs, and before those that are less urgent.
+        value = Values(watch)
+        absent, nothing = value("check", _absent), value("check", tuple)
         near = value("project", self._select, points)
-        planes = scan = surface = hall = projected = cells = labels = places = absent
+        planes = scan = surface = cells = labels = places = absent
+        boxes = detected = detections = objects = nothing
         if self.needs_ground:
             planes = value("cluster", _fit_ground, points, mounting)
             scan = value("cluster", _on_ground, near, planes)
             surface = value("cluster", GroundFit.surface, planes)
 
         # The top view (SSADNet)
-        boxes = detected = detections = objects = nothing = value("check", tuple)
         if top is not None:
             projected = value("project", top.project, near)
             detected = value("infer", top.find_boxes, projected, self._least_score, options.network_score)
             boxes = value("decode", _at_least, detected, options.network_score)
-            cells = value("decode", top.label_cells, near, boxes, mounting)
+        if self.objects is not None:
+            places = value("cluster", self.objects.cluster, scan, options.boxes_from, per_m)
 
         # The range image (PointSeg), once or for each sector of a turn
         sectors = [value("refine", self._label_sector, k, near, scan, watch) for k in range(len(self.sectors))]
@@ -221,25 +228,29 @@ class Pipeline:
         elif self.ranged:
             labels = value("refine", self._label_ahead, near, scan, watch)
 
-        # Objects alone: classes such as road and building are background to the stages below
-        seen, labels = labels, value("refine", PointLabels.objects, labels) if self.ranged else absent
-
         # Objects of a detector, and by the points of their candidates
         if (detector := self.pillars if options.boxes_from != "clusters" else None) is not None:
             detections = value("infer", detector.find_boxes, points)
         if self.objects is not None:
-            places = value("cluster", self.objects.cluster, scan, options.boxes_from, per_m)
             detected = detected if options.boxes_from != "clusters" else nothing
-            objects = value("infer", self.objects.find_boxes, scan, places, detected, options.object_score)
+            shown = [nothing] * (PARTS - 1) + [detected]
+            looks = [value("infer", self.objects.look, k, scan, places, shown[k]) for k in range(PARTS)]
+            objects = value("infer", self.objects.find_boxes, scan, places, detected, options.object_score, *looks)
+
+        # Objects alone: classes such as road and building are background to the stages below
+        seen, labels = labels, value("refine", PointLabels.objects, labels) if self.ranged else absent
 
         # Objects, and what the parts say of one another (KUL-Seg 5.2)
-        strips = clusters = upright = support = marks = absent
-        agreed, trusted, joined, view = labels, boxes, boxes, cells
+        clusters = upright = support = absent
+        agreed, trusted, joined = labels, boxes, boxes
         if self.ranged and rules:
             strips = value("cluster", _sorted, scan, per_m)
             upright = value("agree", without_poles, scan, labels, rules)
             support = value("cluster", find_support, scan, labels, boxes, rules)
             clusters = value("cluster", find_voters, scan, labels, support, strips, distance_per_m=per_m, rules=rules)
+        if top is not None:
+            cells = value("decode", top.label_cells, near, boxes, mounting)
+        if self.ranged and rules:
             if self.objects is not None or detector is not None:  # boxes outvote clusters
                 support = value("cluster", _support, scan, labels, rules, boxes, objects, detections)
             agreed = value("agree", self._agreed, scan, labels, clusters, support, upright, cells, mounting)
@@ -259,20 +270,14 @@ class Pipeline:
         if "ceiling" in rules:
             hall = value("agree", find_hall, points, mounting)
             standing = value("agree", without_impossible, standing, hall, mounting)
-        joined = joined if self.objects is None and detector is None else standing
+        joined, view = joined if self.objects is None and detector is None else standing, cells
         if top is not None and rules:
             marks = value("agree", mark_cells, cells, scan, agreed, rules)
             view = value("agree", _agreed_cells, cells, agreed, joined, boxes, trusted, marks, rules)
-
-        # The second lane runs the top view, and then finds objects, so the first one clusters for it. In a turn, the
-        # lane that finds no sector left makes the clusters, while the other one labels the last.
         whole = value("refine", _whole, seen, agreed, near, len(points))
-        last = [strips, cells, hall, support, surface, marks, whole, standing]
-        self._lanes.run(
-            [near, projected, scan, *sectors, places, strips, labels, upright, clusters, cells, surface, joined, view],
-            [planes, boxes, *reversed(sectors), detections, objects, *last],
-        )
-        return Parts(whole(), view(), standing(), surface())
+        extra = absent if beside is None else value("check", beside, points)
+        self._lanes.run(value)
+        return Parts(whole(), view(), standing(), surface(), extra())
 
     def _select(self, points: Points) -> View:
         return View(*self.crop.select(points))

@@ -172,7 +172,8 @@ def warm_up(
         # Objects and agreement
         floor[:, 3] = labels.labels
         if objects is not None:
-            objects.session = objects.closely = Rehearsed(objects.session)
+            objects.closely = Rehearsed(objects.closely)
+            objects.sessions = [objects.closely] * len(objects.sessions)
         if pillars is not None:
             pillars.session = Rehearsed(pillars.session)
             pillars.find_boxes(read_only(floor))

@@ -64,14 +64,6 @@ def with_points(candidates: Candidates, crops: Crops) -> tuple[Candidates, Crops
     return candidates._replace(rectangles=candidates.rectangles[enough]), kept
 
 
-def joined(first: tuple[Candidates, Crops], second: tuple[Candidates, Crops]) -> tuple[Candidates, Crops]:
-    """Candidates in the same cells, and then others, with their crops."""
-    candidates = Candidates(np.concatenate([first[0].rectangles, second[0].rectangles]), first[0].cells)
-    (points, counts, level), (more, more_counts, more_level) = first[1], second[1]
-    merged = np.concatenate([points, more]), np.concatenate([counts, more_counts]), np.concatenate([level, more_level])
-    return candidates, Crops(*merged)
-
-
 @njit(cache=True, nogil=True)
 def fill_crops(
     points: Points, height: Heights, cells: Cells, rectangles: Floats, margin_m: float, crops: Crops

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import heapq
 import os
 import threading
 import time
 from collections.abc import Callable, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import suppress
 from typing import Any, Generic, TypeVar
 
@@ -34,65 +35,47 @@ class Stopwatch:
 
 
 class Once(Generic[_Value]):
-    """A value that is computed when it is first asked for; another thread that asks waits for it, or gets its error. Of
-    an argument that is a `Once`, the function gets the value; the time counts for a stage of the stopwatch.
+    """A value that `Lanes` compute once, after the values that it needs: of an argument that is a `Once`, the function
+    gets the value. The time counts for a stage of the stopwatch. Calling it gives the value.
     """
 
-    __slots__ = ("_arguments", "_error", "_function", "_is_known", "_lock", "_options", "_stage", "_value", "_watch")
+    __slots__ = ("_arguments", "_function", "_options", "_value", "_watch", "needed", "stage")
 
     def __init__(
         self, function: Callable[..., _Value], *arguments: object, stage: str, watch: Stopwatch, **options: object
     ) -> None:
         self._function, self._arguments, self._options = function, arguments, options
-        self._stage, self._watch = stage, watch
-        self._lock = threading.Lock()
-        self._is_known = False
-        self._error: Exception | None = None
+        self.stage, self._watch = stage, watch
+        self.needed = [each for each in (*arguments, *options.values()) if isinstance(each, Once)]
         self._value: Any = None
 
     def __call__(self) -> _Value:
-        """The value."""
-        error = self._finish()
-        if error is not None:
-            raise error
         return self._value
 
-    def _finish(self) -> Exception | None:
-        """Compute the value, unless it is known; the error where there is none."""
-        if not self._is_known:
-            with self._lock:
-                self._compute()
-            self._watch.lap(self._stage)
-        return self._error
-
-    def start(self) -> None:
-        """Compute the value, unless it is known or another thread computes it."""
-        if not self._is_known and self._lock.acquire(blocking=False):
-            try:
-                self._compute()
-            finally:
-                self._lock.release()
-            self._watch.lap(self._stage)
-
-    def _compute(self) -> None:
-        if self._is_known:  # another thread had the lock
-            return
-        needed = (each for each in (*self._arguments, *self._options.values()) if isinstance(each, Once))
-        # An error is not raised by each value that needs the one that failed: the traceback would have a hundred lines.
-        self._error = next((error for each in needed if (error := each._finish()) is not None), None)
-        if self._error is None:
-            try:
-                self._value = self._function(
-                    *(_value_of(argument) for argument in self._arguments),
-                    **{name: _value_of(option) for name, option in self._options.items()},
-                )
-            except Exception as exc:
-                self._error = exc
-        self._is_known = True
+    def compute(self) -> None:
+        """Compute the value from those that it needs."""
+        self._value = self._function(
+            *(_value_of(argument) for argument in self._arguments),
+            **{name: _value_of(option) for name, option in self._options.items()},
+        )
+        self._watch.lap(self.stage)
 
 
 def _value_of(given: object) -> object:
     return given._value if isinstance(given, Once) else given
+
+
+class Values(list[Once[Any]]):
+    """The values of a scan: each after those that it needs, and before those that are less urgent."""
+
+    def __init__(self, watch: Stopwatch) -> None:
+        super().__init__()
+        self.watch = watch
+
+    def __call__(self, stage: str, function: Callable[..., Any], *arguments: object, **options: object) -> Once[Any]:
+        """One more value, which counts for a stage of the stopwatch."""
+        self.append(Once(function, *arguments, stage=stage, watch=self.watch, **options))
+        return self[-1]
 
 
 class Lanes:
@@ -106,41 +89,79 @@ class Lanes:
         self.n = min(n, 2)
         self._threads: dict[int, _Beside] = {}
 
-    def run(self, first: Sequence[Once[Any]], second: Sequence[Once[Any]]) -> None:
-        """Compute all values: each lane its own, in order, and the calling thread what is left of the second's.
+    def run(self, values: Values) -> None:
+        """Compute all values, each after those that it needs, which stand before it; after an error no other one.
 
+        Two lanes take the first one that is ready whenever they have finished one, so what takes long stands first.
         The second lane is done when this returns or raises, so buffers may be overwritten afterwards.
         """
-        stopped = threading.Event()
-        process = os.getpid()
-
-        def compute(values: Sequence[Once[Any]]) -> None:
-            for value in values:
-                if stopped.is_set():
-                    return
-                value.start()
-
+        schedule = _Schedule(values)
         beside = waiting = None
+        process = os.getpid()
         try:
             if self.n == 2:
                 try:
                     beside = self._threads.get(process) or self._threads.setdefault(process, _Beside())
-                    waiting = beside.submit(compute, second)
+                    waiting = beside.submit(schedule.compute)
                 except RuntimeError:  # no thread can be started, as while the interpreter ends
                     self._threads.pop(process, None)  # it would compute them later, too
-            compute(first)
-            if waiting is None:
-                compute(second)
-        except BaseException:
-            stopped.set()
-            raise
+            schedule.compute(values.watch)
         finally:
+            schedule.stop()
             if waiting is not None:
-                waiting.result()
+                wait([waiting])
             if beside is not None:
                 beside.give_back()
-        for value in (*first, *second):
-            value()
+        if waiting is not None:
+            waiting.result()
+
+
+class _Schedule:
+    """Which of some values is next, for threads that compute them together."""
+
+    def __init__(self, values: Sequence[Once[Any]]) -> None:
+        self._values, self._left, self._last = values, len(values), ""
+        self._changed = threading.Condition()
+        places = {value: place for place, value in enumerate(values)}
+        self._users: list[list[int]] = [[] for _ in values]
+        for place, value in enumerate(values):
+            for each in value.needed:
+                self._users[places[each]].append(place)
+        self._missing = [len(value.needed) for value in values]
+        self._ready = [place for place, missing in enumerate(self._missing) if missing == 0]  # a heap
+
+    def compute(self, watch: Stopwatch | None = None) -> None:
+        """Compute values until none is left; the time without one that is ready counts for what is waited for."""
+        place = self._next(watch)
+        while place is not None:
+            try:
+                self._values[place].compute()
+            except BaseException:
+                self.stop()
+                raise
+            with self._changed:
+                for user in self._users[place]:
+                    self._missing[user] -= 1
+                    if self._missing[user] == 0:
+                        heapq.heappush(self._ready, user)
+                self._left -= 1
+                self._last = self._values[place].stage
+                self._changed.notify()
+            place = self._next(watch)
+
+    def _next(self, watch: Stopwatch | None) -> int | None:
+        with self._changed:
+            while self._left > 0 and not self._ready:
+                self._changed.wait()
+                if watch is not None:
+                    watch.lap(self._last)
+            return heapq.heappop(self._ready) if self._left > 0 else None
+
+    def stop(self) -> None:
+        """No thread computes another value."""
+        with self._changed:
+            self._left = 0
+            self._changed.notify()
 
 
 class _Beside:
@@ -157,13 +178,13 @@ class _Beside:
         self._cores: set[int] = set()  # of the caller
         self._lent: set[int] = set()  # those of them that it keeps while the thread works; none if all of them
 
-    def submit(self, compute: Callable[[Sequence[Once[Any]]], None], values: Sequence[Once[Any]]) -> Future[None]:
-        """Let the thread compute values; then `give_back`."""
+    def submit(self, compute: Callable[[], None]) -> Future[None]:
+        """Let the thread compute; then `give_back`."""
         try:
             self._part(os.sched_getaffinity(0))
         except (AttributeError, OSError):  # not Linux; a sandbox may refuse it
             self._lent = set()
-        return self._executor.submit(compute, values)
+        return self._executor.submit(compute)
 
     def _part(self, cores: set[int]) -> None:
         if cores != self._cores:

@@ -33,7 +33,7 @@ from edgeperc.objects.candidates import (
     find_candidates,
     sort_into_cells,
 )
-from edgeperc.objects.crops import FEATURES, Crops, crop_candidates, fill_features, joined, with_points
+from edgeperc.objects.crops import FEATURES, Crops, crop_candidates, fill_features, with_points
 from edgeperc.types.card import CHANNELS, InputSpec, ModelCard, OutputSpec
 from edgeperc.types.geometry import oriented_iou
 from edgeperc.types.perception import Box
@@ -155,17 +155,10 @@ def test_what_is_too_long_too_low_or_too_small_is_no_candidate() -> None:
     assert n_found(0.1, 1.5, 3) == 0
 
 
-def test_boxes_of_a_detector_are_the_last_candidates() -> None:
+def test_a_distance_is_in_radians() -> None:
     scan = some_scan(np.random.default_rng(1), 500)
-    found = find_candidates(scan, sort_into_cells(scan, RANGE_M))
-    boxes = Candidates(np.array([[10.0, 0.0, 4.0, 1.6, 0.1], [20.0, 5.0, 4.0, 1.6, -2.0]]), found.cells)
-    first, second = ((each, crop_candidates(scan, each, 8, 0.8)) for each in (found, boxes))
-    both, crops = joined(first, second)
-    np.testing.assert_array_equal(both.rectangles, np.concatenate([found.rectangles, boxes.rectangles]))
-    for every, once in zip(crops, crop_candidates(scan, both, 8, 0.8), strict=True):
-        np.testing.assert_array_equal(every, once)
     with pytest.raises(PointsError, match="distance_per_m=2"):
-        find_candidates(scan, found.cells, 2.0)
+        find_candidates(scan, sort_into_cells(scan, RANGE_M), 2.0)
 
 
 def test_one_buffer_serves_one_scan_after_the_other() -> None:

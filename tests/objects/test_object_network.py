@@ -14,15 +14,15 @@ from edgeperc.errors import OptionError
 from edgeperc.ground.planes import find_ground
 from edgeperc.ground.scan import Scan
 from edgeperc.inference import object_network
-from edgeperc.inference.object_network import ObjectNetwork
+from edgeperc.inference.object_network import PARTS, ObjectNetwork
 from edgeperc.inference.session import Session
 from edgeperc.objects.boxes import MIN_SCORE
 from edgeperc.objects.candidate_boxes import LABEL, SCORE, confirm_boxes, footprints
 from edgeperc.objects.candidates import Candidates
-from edgeperc.objects.crops import Crops, crop_candidates
+from edgeperc.objects.crops import Crops, crop_candidates, with_points
 from edgeperc.simulation.samples import FIRST_SEED, simulated_scan
 from edgeperc.simulation.scene import SimulatedScan
-from edgeperc.types.geometry import inside
+from edgeperc.types.geometry import inside, rectangles
 from edgeperc.types.perception import Box, Perception
 from edgeperc.types.points import Floats
 
@@ -95,6 +95,27 @@ def test_people_are_those_of_the_labels_and_of_the_network(seed: int) -> None:
     assert len(both) >= len(labeled) + least
 
 
+def test_the_parts_are_all_clusters_and_the_last_one_has_the_boxes_of_a_detector(scan: SimulatedScan) -> None:
+    """Each as the network sees it alone; clusters and boxes of few points have no look."""
+    network = ObjectNetwork(Session("objects", "cpu"))
+    seen = Scan.of(scan.points, find_ground(scan.points))
+    clusters = network.cluster(seen, "both", 0.0)
+    nobody = replace(scan.boxes[0], center=(1.0, 60.0, -0.8))
+    parts = [network.look(part, seen, clusters, [*scan.boxes, nobody] if part else ()) for part in range(PARTS)]
+    every = clusters._replace(rectangles=np.concatenate([clusters.rectangles, rectangles(scan.boxes)]))
+    places, crops = with_points(every, crop_candidates(seen, every, network.view.n_points, network.view.margin_m))
+    alone = [
+        network.look(0, seen, clusters._replace(rectangles=np.stack([place, place])), ())
+        for place in places.rectangles[:: len(places.rectangles) // 20]
+    ]
+    assert len(crops.counts) < len(every.rectangles)
+    together = np.concatenate(parts)
+    assert len(together) == len(crops.counts)
+    np.testing.assert_allclose(
+        together[:: len(places.rectangles) // 20], [look[0] for look in alone], rtol=1e-5, atol=1e-5
+    )
+
+
 def test_what_a_look_shows_is_looked_at_from_its_other_end(
     scan: SimulatedScan, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -102,6 +123,7 @@ def test_what_a_look_shows_is_looked_at_from_its_other_end(
     network = ObjectNetwork(Session("objects", "cpu"))
     seen = Scan.of(scan.points, find_ground(scan.points))
     clusters = network.cluster(seen, "both", 0.0)
+    first_looks = [network.look(part, seen, clusters, ()) for part in range(PARTS)]
     places, looks = [], []
 
     def few_points(scan: Scan, candidates: Candidates, n_points: int, margin_m: float) -> Crops:
@@ -116,8 +138,8 @@ def test_what_a_look_shows_is_looked_at_from_its_other_end(
 
     monkeypatch.setattr(object_network, "crop_candidates", few_points)
     monkeypatch.setattr(object_network, "confirm_boxes", confirmed)
-    network.find_boxes(seen, clusters, (), 0.5)
-    (_, first, second), (found, shown, _) = places, looks
+    network.find_boxes(seen, clusters, (), 0.5, *first_looks)
+    (first, second), (found, shown, _) = places, looks
     np.testing.assert_array_equal(first, footprints(found))
     turned = np.where(shown[:, SCORE:LABEL] > 0.0, footprints(shown), first)
     assert len(first) > 4

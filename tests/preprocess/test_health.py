@@ -303,6 +303,8 @@ def test_a_perceiver_tells_of_each_kind_once_and_leaves_drops_out() -> None:
         warnings.simplefilter("error")
         again = perceive(bad)
     assert again.health == snowy.health
+    assert again.boxes == snowy.boxes
+    np.testing.assert_array_equal(again.require_points().labels, snowy.require_points().labels)
     assert snowy.health.n_drops > 100
     record = scan_record(snowy)["sensor_health"]
     assert record["has_drops"]

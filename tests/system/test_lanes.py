@@ -2,13 +2,16 @@ from __future__ import annotations
 
 import os
 import threading
+import time
 import traceback
 from collections.abc import Callable, Iterator
 from typing import Any
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from edgeperc.system.lanes import Lanes, Once, Stopwatch
+from edgeperc.system.lanes import Lanes, Stopwatch, Values
 
 if not hasattr(os, "sched_getaffinity"):
     pytest.skip("cores are chosen on Linux", allow_module_level=True)
@@ -32,13 +35,14 @@ def met(first: Callable[[], Any], second: Callable[[], Any]) -> tuple[Any, Any]:
         barrier.wait()
         return function()
 
-    watch = Stopwatch()
-    one, two = (Once(together, function, stage="check", watch=watch) for function in (first, second))
-    LANES.run([one], [two])
+    value = Values(Stopwatch())
+    one, two = (value("check", together, function) for function in (first, second))
+    LANES.run(value)
     return one(), two()
 
 
 LANES = Lanes(2)
+ALL_LANES = {1: Lanes(1), 2: LANES}
 
 
 def own_cores() -> set[int]:
@@ -68,21 +72,87 @@ def test_an_error_gives_the_cores_back(cores: set[int]) -> None:
 @pytest.mark.parametrize("n", [1, 2])
 def test_an_error_is_told_where_it_happened(n: int) -> None:
     """Not by each of the values that need the one that failed; and what comes after it is not computed."""
-    watch, computed = Stopwatch(), []
+    value, computed = Values(Stopwatch()), []
 
     def fail() -> None:
         raise ValueError("no")
 
-    value: Once[object] = Once(fail, stage="check", watch=watch)
+    last = value("check", fail)
     for k in range(30):
-        other = Once(computed.append, k, stage="check", watch=watch)
-        value = Once(lambda *given: given, value, other, stage="check", watch=watch)
+        last = value("check", lambda k, _: computed.append(k), k, last)
     with pytest.raises(ValueError, match="no") as raised:
-        Lanes(n).run([value], [])
+        Lanes(n).run(value)
     frames = [frame.name for frame in traceback.extract_tb(raised.value.__traceback__)]
     assert frames[-1] == "fail"
-    assert len(frames) < 8
+    assert len(frames) < 9
     assert computed == []
+
+
+@pytest.mark.parametrize("n", [1, 2])
+def test_an_interrupt_ends_both_lanes(n: int) -> None:
+    """Signals come to the thread that calls; the other one ends the value that it computes, and no more."""
+    ended = threading.Event()
+    meet = threading.Barrier(n, timeout=20.0)
+    caller = threading.get_ident()
+
+    def work(k: int) -> None:
+        if k < n:
+            meet.wait()
+        if threading.get_ident() == caller:
+            raise KeyboardInterrupt
+        time.sleep(0.05)
+        assert not ended.is_set()
+        ended.set()
+
+    lanes, value, more = Lanes(n), Values(Stopwatch()), Values(Stopwatch())
+    for k in range(50):
+        value("check", work, k)
+    with pytest.raises(KeyboardInterrupt):
+        lanes.run(value)
+    assert ended.is_set() == (n == 2)
+    again = more("check", int, "7")
+    lanes.run(more)
+    assert again() == 7
+
+
+@given(st.lists(st.sets(st.integers(0, 11), max_size=4), max_size=12), st.integers(1, 2))
+def test_each_value_is_computed_once_after_those_that_it_needs(needs: list[set[int]], n: int) -> None:
+    value, order = Values(Stopwatch()), []
+
+    def total(k: int, *needed: int) -> int:
+        order.append(k)
+        return 1 + sum(needed)
+
+    expected: list[int] = []
+    for k, places in enumerate(needs):
+        needed = sorted(place for place in places if place < k)
+        value("infer", total, k, *(value[place] for place in needed))
+        expected.append(1 + sum(expected[place] for place in needed))
+    ALL_LANES[n].run(value)
+    assert [each() for each in value] == expected
+    assert sorted(order) == [*range(len(needs))]
+    assert n == 2 or order == sorted(order)
+
+
+def test_an_earlier_value_is_more_urgent_and_no_lane_waits_for_what_another_one_computes() -> None:
+    value, released = Values(Stopwatch()), threading.Event()
+    order: list[str] = []
+
+    def long() -> None:
+        released.wait(20.0)
+        order.append("long")
+
+    def short(name: str) -> None:
+        order.append(name)
+        if name == "last":
+            released.set()
+
+    first = value("infer", long)
+    value("decode", lambda _: order.append("needs it"), first)
+    for name in ("a", "b", "last"):
+        value("check", short, name)
+    LANES.run(value)
+    assert order == ["a", "b", "last", "long", "needs it"]
 
 
 def test_a_caller_on_one_core_stays_there(cores: set[int]) -> None:
@@ -106,3 +176,15 @@ def test_cores_that_may_not_be_chosen(monkeypatch: pytest.MonkeyPatch, cores: se
     assert met(lambda: 1, lambda: 2) == (1, 2)
     monkeypatch.undo()
     assert own_cores() == cores
+
+
+@pytest.mark.parametrize("n", [1, 2])
+def test_waiting_counts_for_what_is_waited_for(n: int) -> None:
+    """Whichever lane computes it, the answer takes its time."""
+    watch = Stopwatch()
+    value = Values(watch)
+    slow = value("infer", time.sleep, 0.1)
+    value("check", int)
+    value("agree", lambda _: None, slow)
+    ALL_LANES[n].run(value)
+    assert watch.ms["infer"] > 90.0 > watch.ms["check"] + watch.ms["agree"]
