@@ -16,7 +16,7 @@ from typing import Any
 
 from edgeperc import __version__
 from edgeperc.system.extras import require
-from edgeperc.system.machine import board, cpu_model, cpu_quota, has_hypervisor, read_text
+from edgeperc.system.machine import board, cpu_model, cpu_quota, has_hypervisor, read_text, usable_cores
 
 PACKAGES = (
     *("numpy", "numba", "onnxruntime", "onnxruntime-gpu", "onnxruntime-ep-openvino", "onnxruntime-ep-nv-tensorrt-rtx"),
@@ -53,10 +53,9 @@ def _number(path: Path) -> int | None:
 def machine() -> dict[str, Any]:
     """The hardware and how it is set up."""
     psutil = _psutil()
-    affinity = psutil.Process().cpu_affinity() if hasattr(psutil.Process, "cpu_affinity") else None
     governors = {text for path in CPU.glob("cpu[0-9]*/cpufreq/scaling_governor") if (text := read_text(path))}
     no_turbo, boost = _number(CPU / "intel_pstate/no_turbo"), _number(CPU / "cpufreq/boost")
-    quota, model = cpu_quota(), board()
+    model = board()
     frequency = _measured("cpu_freq")
     return {
         "cpu": cpu_model(),
@@ -64,11 +63,11 @@ def machine() -> dict[str, Any]:
         "architecture": platform.machine(),
         "cores": psutil.cpu_count(logical=False),
         "logical_cores": psutil.cpu_count(),
-        "usable_cores": len(affinity) if affinity else None,
+        "usable_cores": usable_cores(),
         "max_mhz": frequency.max or None if frequency else None,
         "governor": ", ".join(sorted(governors)) or None,
         "turbo": (no_turbo == 0) if no_turbo is not None else (boost == 1) if boost is not None else None,
-        "cpu_quota": None if quota is None or quota.startswith("max") else quota,
+        "cpu_quota": cpu_quota(),
         "memory_mb": round(psutil.virtual_memory().total / 1e6),
         "swap_mb": round(psutil.swap_memory().total / 1e6),
         "hypervisor": has_hypervisor(),
@@ -182,7 +181,7 @@ def lasting_disturbances(hardware: Mapping[str, Any], busy: list[dict[str, Any]]
     if hardware["turbo"]:
         sentences.append("turbo is on: the clock depends on heat and on the other cores")
     if hardware["cpu_quota"]:
-        sentences.append(f"a container's CPU quota applies ({hardware['cpu_quota']})")
+        sentences.append(f"a container gives the time of {hardware['cpu_quota']:g} cores")
     if busy:
         sentences.append("busy before the start: " + ", ".join(f"{p['name']} ({p['cores']:g} cores)" for p in busy))
     if hardware["hypervisor"]:

@@ -67,7 +67,7 @@ def run_command(arguments: argparse.Namespace) -> int:
         for name in names:
             kind, _, value = name.partition(":")
             if kind == "offline":
-                n = int(value or document["machine"]["usable_cores"] or os.cpu_count() or 1)
+                n = int(value or document["machine"]["usable_cores"])
                 offline(setting, job, scans.files, n, limits, document, live)
             elif kind == "cold-start":
                 live.note("cold starts")

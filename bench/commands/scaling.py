@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import importlib.util
 import math
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -84,7 +83,7 @@ def run_command(arguments: argparse.Namespace) -> int:
         middle = min(scenarios, key=lambda key: (key[0] != "points", abs(key[1] - 100_000)))
         scan = scenarios[middle].scans[0]
         curves["pixels %"] = _growth_with_images(document, live, job, arguments, folder, scan)
-        cores = document["machine"]["usable_cores"] or os.cpu_count() or 1
+        cores = document["machine"]["usable_cores"]
         for n in arguments.processes or sorted({*(2**k for k in range(cores.bit_length())), cores}):
             offline(setting, job, [scan], n, limits, document, live)
         curves["processes"] = [(each["processes"], each["scans_per_s"] or math.nan) for each in setting["offline"]]

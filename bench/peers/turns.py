@@ -203,7 +203,7 @@ def run(
     and record them in a document.
     """
     models = arguments.model or [str(variant) for variant in listed() if variant.name in DEFAULT]
-    n_threads = arguments.threads or document["machine"]["usable_cores"] or os.cpu_count() or 1
+    n_threads = arguments.threads or document["machine"]["usable_cores"]
     measuring: dict[str, list[Contender]] = {}
     document["peers"] = {}
     for package in ("mnn", "ncnn", "onnx", "openvino", "pypatchworkpp", "scipy", "torch"):

@@ -15,7 +15,7 @@ import reprlib
 import stat
 import sys
 from collections.abc import Mapping
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 from ..errors import SettingsError
@@ -26,6 +26,7 @@ logger = logging.getLogger(__name__)
 SCHEMA = 2
 MAX_BYTES = 1 << 24  # of a settings file; an entry has about 200
 MAX_THREADS = 4096
+CONTROL_GROUPS, OWN_GROUPS = Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")
 
 
 def cache_folder() -> Path:
@@ -109,8 +110,12 @@ def cpu_features() -> frozenset[str]:
 
 
 def usable_cores() -> int:
-    """Number of processor cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    """Number of processor cores that this process may use: that it may run on, and whose time its container gives it.
+
+    With more threads than that, all of them stand still for the rest of each period in which the limit is reached.
+    """
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return max(1, min(cores, math.ceil(cpu_quota() or cores)))
 
 
 def has_hypervisor() -> bool | None:
@@ -124,9 +129,22 @@ def board() -> str | None:
     return read_text(Path("/sys/firmware/devicetree/base/model"))
 
 
-def cpu_quota() -> str | None:
-    """The container's limit of CPU time, as Linux writes it; None without control groups."""
-    return read_text(Path("/sys/fs/cgroup/cpu.max"))
+def cpu_quota() -> float | None:
+    """The strictest limit of CPU time of this process' control groups, in cores; None without a limit."""
+    limits = []
+    for line in (read_text(OWN_GROUPS) or "").splitlines():
+        _, _, rest = line.partition(":")
+        controllers, _, group = rest.partition(":")
+        if controllers and "cpu" not in controllers.split(","):
+            continue
+        # A container may see its own group as the root; a group is limited by those around it, too.
+        for place in (PurePosixPath(group), *PurePosixPath(group).parents):
+            folder = CONTROL_GROUPS / controllers / str(place).lstrip("/")
+            files = ("cpu.cfs_quota_us", "cpu.cfs_period_us") if controllers else ("cpu.max",)
+            words = " ".join(read_text(folder / name) or "" for name in files).split()
+            if len(words) == 2 and all(word.isdecimal() and int(word) > 0 for word in words):  # else "max", or -1
+                limits.append(int(words[0]) / int(words[1]))
+    return min(limits, default=None)
 
 
 def _cpuinfo(*keys: str) -> str:

@@ -259,7 +259,7 @@ def test_every_disturbance_is_reported() -> None:
 def test_what_lasts_is_reported_too() -> None:
     calm = {"governor": "performance", "turbo": False, "cpu_quota": None, "hypervisor": False}
     assert context.lasting_disturbances(calm, []) == []
-    wild = {"governor": "powersave", "turbo": True, "cpu_quota": "1 2", "hypervisor": True}
+    wild = {"governor": "powersave", "turbo": True, "cpu_quota": 0.5, "hypervisor": True}
     assert len(context.lasting_disturbances(wild, [{"name": "cc", "cores": 1.0}])) == 5
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import sys
 from pathlib import Path
@@ -13,6 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from edgeperc import SettingsError
+from edgeperc.inference import session
 from edgeperc.inference.session import Session
 from edgeperc.system import machine
 from edgeperc.system import machine as settings
@@ -35,6 +37,62 @@ def test_file_holds_settings_of_several_computers_and_models(tmp_path: Path) -> 
     assert machine.read_setting(path, "m", "t") == OPENVINO
     assert machine.read_setting(path, "n", "t") is None
     assert [*path.parent.iterdir()] == [path]
+
+
+@pytest.mark.parametrize(
+    ("own", "files", "quota"),
+    [
+        ("0::/\n", {"cpu.max": "150000 100000\n"}, 1.5),  # of a container, version 2
+        ("0::/a/b\n", {"a/b/cpu.max": "max 100000", "a/cpu.max": "50000 100000", "cpu.max": "90000 100000"}, 0.5),
+        ("0::/a/b\n", {"a/b/cpu.max": "max 100000"}, None),
+        ("0::/../c\n", {"cpu.max": "300000 100000"}, 3.0),
+        (  # version 1: other controllers have files of other names, and -1 is no limit
+            "4:memory:/m\n3:cpuset:/s\n2:cpu,cpuacct:/d/e\n0::/\n",
+            {
+                "cpu,cpuacct/d/e/cpu.cfs_quota_us": "-1",
+                "cpu,cpuacct/d/e/cpu.cfs_period_us": "100000",
+                "cpu,cpuacct/d/cpu.cfs_quota_us": "400000",
+                "cpu,cpuacct/d/cpu.cfs_period_us": "200000",
+                "cpuset/s/cpu.cfs_quota_us": "1",
+                "cpuset/s/cpu.cfs_period_us": "1",
+            },
+            2.0,
+        ),
+        ("0::/\n", {"cpu.max": "1 0"}, None),
+        ("nonsense", {"cpu.max": "many few"}, None),
+        (None, {"cpu.max": "100000 100000"}, None),  # not Linux
+    ],
+)
+def test_a_container_has_as_many_cores_as_its_limit_of_time(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, own: str | None, files: dict[str, str], quota: float | None
+) -> None:
+    for name, text in files.items():
+        path = tmp_path / "groups" / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)
+    if own is not None:
+        (tmp_path / "own").write_text(own)
+    monkeypatch.setattr(machine, "CONTROL_GROUPS", tmp_path / "groups")
+    monkeypatch.setattr(machine, "OWN_GROUPS", tmp_path / "own")
+    assert machine.cpu_quota() == quota
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {*range(64)}, raising=False)
+    assert machine.usable_cores() == (64 if quota is None else max(1, math.ceil(quota)))
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {3}, raising=False)
+    assert machine.usable_cores() == 1
+
+
+@pytest.mark.parametrize(("cores", "of"), [(1, 8), (3, 8), (8, 8)])
+def test_a_network_alone_has_no_more_threads_than_cores_that_are_usable(
+    monkeypatch: pytest.MonkeyPatch, cores: int, of: int
+) -> None:
+    """A provider's own choice is made by the cores of the computer."""
+    monkeypatch.setattr(session, "usable_cores", lambda: cores)
+    monkeypatch.setattr(os, "cpu_count", lambda: of)
+    for at_once in (1, 16):
+        alone = Session("pointseg", "cpu", at_once=at_once)
+        assert not alone.shares_cores
+        assert alone.options["threads"] == ("the provider's choice" if cores == of else str(cores))
+    assert Session("pointseg", "cpu", n_threads=5).options["threads"] == "5"
 
 
 @pytest.mark.parametrize(
