@@ -38,7 +38,7 @@ PARTS = 2  # of the clusters, each with a run of the network of its own
 SEEN = 0.1
 AGAIN = 0.15  # boxes with less are not looked at again: a second look confirmed none of them on PandaSet and Lyft
 # Nor are boxes that have less than the least score by more than this: of 1,755 boxes between 0.15 and 0.3 on KITTI and
-# PandaSet, no one reached 0.5 by looking again. This leaves a quarter of the boxes.
+# PandaSet, none reached 0.5 by looking again. This leaves out a quarter of the looks.
 GAINED = 0.2
 # Of a rectangle: what the network makes of points depends a little on the end from which they are given.
 HALF_TURN = np.array([0.0, 0.0, 0.0, 0.0, np.pi])
