@@ -60,6 +60,7 @@ class Scan:
     labels: Labels  # index into `POINT_CLASSES`, `IGNORE` where unknown
     # labeled ones within 50 m by class; None if only points or pixels are labeled
     objects: frozenset[tuple[str, ObjectKey]] | None
+    drive: str = ""  # the scans of one follow one another, and have one mounting
 
 
 _DataSet = tuple[SensorProfile, int, Callable[[], Iterator[Scan]], "ScanFolder | None"]
@@ -126,9 +127,13 @@ def _compare_one(
     counts = {adaptation: Confusion(POINT_CLASSES) for adaptation in ADAPTATIONS}
     trained_on = training_scans_of(perceivers["none"].cards)
     objects: set[tuple[str, ObjectKey]] | None = set()
+    drive: str | None = None
     for scan in read():
-        check_unseen(trained_on, scan.name, scan.name, scan.points)
+        check_unseen(trained_on, scan.name, scan.drive or scan.name, scan.points)
+        is_other, drive = drive not in (None, scan.drive), scan.drive
         for adaptation, perceive in perceivers.items():
+            if is_other:
+                perceive.reset_mounting()
             _count(counts[adaptation], perceive, scan)
             count()
         objects = None if objects is None or scan.objects is None else objects | scan.objects
@@ -221,9 +226,9 @@ def _frames(folder: ScanFolder) -> Iterator[ScanFrame]:
 
 def _of_frame(frame: ScanFrame) -> Scan:
     if frame.boxes is None:
-        return Scan(frame.name, frame.points, frame.labels(), None)
+        return Scan(frame.name, frame.points, frame.labels(), None, frame.drive)
     objects = _objects(frame.drive, zip(frame.boxes, frame.returns, strict=True))
-    return Scan(frame.name, frame.points, frame.labels(by="boxes"), objects)
+    return Scan(frame.name, frame.points, frame.labels(by="boxes"), objects, frame.drive)
 
 
 def _objects(drive: str, boxes: Iterable[tuple[Box, int]]) -> frozenset[tuple[str, ObjectKey]]:

@@ -544,6 +544,30 @@ def test_eval_sensors_counts_test_drives_only(tmp_path: Path, monkeypatch: pytes
         compare([str(tmp_path)], "pointseg")
 
 
+def test_eval_sensors_finds_the_mounting_of_each_drive(tmp_path: Path) -> None:
+    """An empty road that a low and tilted sensor sees changes nothing in the figures of another vehicle."""
+    scan = urban(4)
+    cos, sin = np.cos(np.radians(5.0)), np.sin(np.radians(5.0))
+    road = scan.points[scan.points[:, 2] < -1.5].copy()
+    road[:, :3] = (road[:, :3] + [0.0, 0.0, 0.9]) @ np.array([[cos, 0.0, sin], [0.0, 1.0, 0.0], [-sin, 0.0, cos]]).T
+    boxes = [" ".join(map(str, (box.label, *box.center, *box.size, box.yaw))) for box in scan.boxes]
+    description = {"schema": 1, "sensor": "hdl-64e", "boxes": {"car": "car", "*": "ignore"}}
+    for name, drives in (("alone", "b"), ("both", "aaaaab")):
+        for folder in ("velodyne", "label"):
+            (tmp_path / name / folder).mkdir(parents=True)
+        (tmp_path / name / "scans.json").write_text(json.dumps(description))
+        (tmp_path / name / "frames.csv").write_text(
+            "\n".join(["name,drive", *(f"{k},{drive}" for k, drive in enumerate(drives))])
+        )
+        for k, drive in enumerate(drives):
+            (road if drive == "a" else scan.points).tofile(tmp_path / name / f"velodyne/{k}.bin")
+            (tmp_path / name / f"label/{k}.txt").write_text("\n".join(boxes) if drive == "b" else "")
+    alone, both = (compare([str(tmp_path / name)])[str(tmp_path / name)] for name in ("alone", "both"))
+    assert both["n_scans"] == 6
+    for adaptation in ("none", "both"):
+        assert both[adaptation]["iou"]["car"] == alone[adaptation]["iou"]["car"]
+
+
 def test_eval_sensors_measures_points_where_the_objects_network_was_trained(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
