@@ -82,15 +82,39 @@ def build_samples(
     real: bool,
     detector: bool = True,
     n_workers: int = 0,
-) -> None:
-    """Write the samples of scans of drives into ``folder``, in parts; finished ones are kept."""
+    made_of: str = "",
+) -> str:
+    """Write the samples of scans of drives into ``folder``, in parts; finished ones of the same scans and labels are
+    kept. ``made_of`` says which these are, `digest_of` the scans by default; returns it.
+    """
     folder.mkdir(parents=True, exist_ok=True)
+    made_of, note = made_of or digest_of(scans), folder / f"{name}.sha256"
+    if not note.exists() or note.read_text() != made_of:
+        for stale in _parts(folder, name):
+            stale.unlink()
+        with open_atomic(note) as text:
+            text.write(made_of.encode())
     parts = [scans[first : first + PART] for first in range(0, len(scans), PART)]
     missing = [(k, part) for k, part in enumerate(parts) if not (folder / f"{name}-{k:03d}.npz").exists()]
     write = partial(_write_part, folder=folder, name=name, real=real, detector=detector)
     with mapped(write, missing, n_workers) as done:
         for _ in tqdm(done, desc=f"candidates of {name}", unit="part", total=len(missing)):
             pass
+    return made_of
+
+
+def digest_of(scans: Sequence[DriveScan]) -> str:
+    """The SHA-256 of scans, their drives and their labels, in hexadecimal digits."""
+    digest = hashlib.sha256()
+    for drive, make in scans:
+        scan = make()
+        digest.update(repr((drive, len(scan.points), scan.boxes, scan.counts, scan.sensor)).encode())
+        digest.update(scan.points.tobytes() + scan.labels.tobytes())
+    return digest.hexdigest()
+
+
+def _parts(folder: Path, name: str) -> list[Path]:
+    return sorted(folder.glob(f"{name}-[0-9][0-9][0-9].npz"))
 
 
 def _write_part(part: tuple[int, Sequence[DriveScan]], *, folder: Path, name: str, real: bool, detector: bool) -> None:
@@ -119,7 +143,7 @@ def load_samples(folder: Path, names: Sequence[str]) -> ObjectSamples:
     """Read the samples of sources; their numbers are the places of their names. Raises ValueError."""
     read = []
     for source, name in enumerate(names):
-        files = sorted(folder.glob(f"{name}-[0-9][0-9][0-9].npz"))
+        files = _parts(folder, name)
         if not files:
             raise ValueError(f"{folder} has no samples of {name}; write them first")
         for file in files:

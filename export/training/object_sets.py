@@ -20,6 +20,7 @@ from ..data.scans import LabeledScan
 from .object_samples import DriveScan, build_samples
 
 VALIDATION = "validation"
+SIMULATED = "simulated"
 PASTED = "pasted"
 """Suffix of a source: the scans of another one with objects of its scans pasted in."""
 BEAMS = 0.1  # share of the variants that another sensor takes
@@ -38,8 +39,10 @@ def write_samples(
     detector: bool = True,
 ) -> tuple[list[str], dict[str, dict[str, str]]]:
     """Write the samples of all scans, each fold of KITTI's training drives and its validation drives a source of its
-    own; those in ``out`` are kept. Returns the sources, and the hashes of real scans of each. Test drives are not read.
+    own; those in ``out`` of the same scans are kept. Returns the sources, and the hashes of real scans of each. Test
+    drives are not read. Raises ValueError for sets that cannot be told apart by their names.
     """
+    _check_names(scan_sets)
     names: list[str] = []
     hashes: dict[str, dict[str, str]] = {}
     build = partial(build_samples, out, detector=detector, n_workers=n_workers)
@@ -54,26 +57,38 @@ def write_samples(
                 frames = [objects.frame(scan) for scan in scans]
                 labeled = [(frame.drive, partial(LabeledScan.from_frame, frame)) for frame in frames]
                 hashes[name] = {frame.name: scan_hash(frame.points) for frame in frames}
-                build(name, labeled, real=True)
+                made_of = build(name, labeled, real=True)
                 names.append(name)
                 if name != VALIDATION:
-                    build(f"{name}-{PASTED}", variants(labeled), real=True)
+                    build(f"{name}-{PASTED}", variants(labeled), real=True, made_of=made_of)
                     names.append(f"{name}-{PASTED}")
                     hashes[names[-1]] = {}
     for folder in scan_sets:
         of_set, _, hashes[folder.layout.name] = read_scan_set(folder, "train")
         drives = [folder.drives[name.partition("/")[2]] for name in hashes[folder.layout.name]]
         labeled = [(drive, partial(replace, scan)) for drive, scan in zip(drives, of_set, strict=True)]
-        build(folder.layout.name, labeled, real=True)
-        build(f"{folder.layout.name}-{PASTED}", variants(labeled), real=True)
+        made_of = build(folder.layout.name, labeled, real=True)
+        build(f"{folder.layout.name}-{PASTED}", variants(labeled), real=True, made_of=made_of)
         names += [folder.layout.name, f"{folder.layout.name}-{PASTED}"]
         hashes[names[-1]] = {}
     if simulated is not None:
         files = sorted(simulated.glob("*.npz"))
-        build("simulated", [(file.stem, partial(LabeledScan.load, file)) for file in files], real=False)
-        names.append("simulated")
-        hashes["simulated"] = {}
+        build(SIMULATED, [(file.stem, partial(LabeledScan.load, file)) for file in files], real=False)
+        names.append(SIMULATED)
+        hashes[SIMULATED] = {}
     return names, hashes
+
+
+def _check_names(scan_sets: Sequence[ScanFolder]) -> None:
+    """Raise ValueError if a set has the name of another source, whose samples would be taken for its own."""
+    of_sets = [folder.layout.name for folder in scan_sets]
+    names = [VALIDATION, SIMULATED, *(f"kitti-{k}" for k in (*range(len(FOLDS)), "other")), *of_sets]
+    names += [f"{name}-{PASTED}" for name in names]
+    if twice := next((folder for folder in scan_sets if names.count(folder.layout.name) > 1), None):
+        raise ValueError(
+            f"{twice.root}: another source of samples is called {twice.layout.name!r}, too; change the name in its "
+            "description"
+        )
 
 
 def variants(scans: Sequence[DriveScan]) -> list[DriveScan]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from dataclasses import replace
 from functools import partial
@@ -14,6 +15,7 @@ import pytest
 torch = pytest.importorskip("torch")
 onnx = pytest.importorskip("onnx")
 
+from edgeperc.datasets.scan_folder import ScanFolder
 from edgeperc.errors import ModelError, PointsError
 from edgeperc.ground.planes import find_ground
 from edgeperc.ground.scan import Scan
@@ -50,7 +52,7 @@ from edgeperc_export.training.object_samples import (
     load_samples,
     samples_of,
 )
-from edgeperc_export.training.object_sets import variants
+from edgeperc_export.training.object_sets import variants, write_samples
 from edgeperc_export.training.object_task import Objects, fill_box_ious
 from edgeperc_export.training.start import start
 from edgeperc_export.training.train import Data, Run, train
@@ -351,6 +353,37 @@ def test_a_missing_source_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="no scans to train objects on"):
         train(RECIPE, tmp_path / "run", Data())
     build_samples(tmp_path, "nothing", [], real=True)
+
+
+def test_samples_are_of_the_scans_and_labels_that_are_there(labeled: LabeledScan, tmp_path: Path) -> None:
+    def samples(*scans: LabeledScan) -> list[bytes]:
+        of_drives = [(f"drive {k}", partial(replace, scan)) for k, scan in enumerate(scans)]
+        build_samples(tmp_path, "mine", of_drives, real=True, detector=False)
+        return [array.tobytes() for array in load_samples(tmp_path, ["mine"])]
+
+    first = samples(labeled)
+    (made,) = tmp_path.glob("*.npz")
+    written = made.stat().st_mtime_ns
+    assert samples(labeled) == first
+    assert made.stat().st_mtime_ns == written  # kept
+    corrected = replace(labeled, boxes=labeled.boxes[1:], counts=labeled.counts[1:])
+    assert samples(corrected) != first
+    made.with_name("mine-001.npz").write_bytes(made.read_bytes())  # of a hundred scans that are gone
+    assert samples(labeled, labeled) != first
+    assert samples(labeled) == first
+
+
+@pytest.mark.parametrize("name", ["validation", "simulated", "kitti-0", "kitti-0-pasted"])
+def test_a_set_has_a_name_of_its_own(tmp_path: Path, name: str) -> None:
+    (tmp_path / "velodyne").mkdir()
+    (tmp_path / "label").mkdir()
+    np.zeros((4, 4), np.float32).tofile(tmp_path / "velodyne/a.bin")
+    (tmp_path / "label/a.txt").write_text("")
+    (tmp_path / "scans.json").write_text(
+        json.dumps({"schema": 1, "name": name, "sensor": "hdl-64e", "boxes": {"*": "ignore"}})
+    )
+    with pytest.raises(ValueError, match="another source of samples is called"):
+        write_samples(tmp_path / "samples", scan_sets=[ScanFolder(tmp_path)])
 
 
 def test_int8_agrees_with_fp32(tmp_path: Path) -> None:
