@@ -39,6 +39,7 @@ from ..types.points import Bytes, Floats, Mask, Points
 from .annotations import read_datumaro, read_json, read_labelcloud, read_sustechpoints
 from .kitti import IMAGE_SIZE, SEQUENCE_DRIVES, KittiCalibration, KittiLabels, label_objects, read_drives, read_labels
 from .layout import (
+    ANY,
     BACKGROUND,
     BOX_COLUMNS,
     BOX_FILES,
@@ -206,6 +207,8 @@ class ScanFolder:
         self.scans = self._scans()
         self._annotated = read_datumaro(self.root / BOX_FILES["cvat"]) if self.layout.box_format == "cvat" else {}
         self.drives = self._drives()
+        if isinstance(layout, Path) and layout == self.root / "scans.json":
+            self._check_splits()
         self._point_numbers: Bytes | None = None
 
     @classmethod
@@ -312,6 +315,17 @@ class ScanFolder:
             listed = ", ".join(missing[:5])
             raise PointsError(f"{table} has no drive of {listed}; add a row, both filled in, for every labeled scan")
         return {name: drives[name] for name in labeled}
+
+    def _check_splits(self) -> None:
+        """A drive that ``splits`` misspells would be listed nowhere, which is for training and testing."""
+        listed, drives = {d for of_split in self.layout.splits.values() for d in of_split}, {*self.drives.values()}
+        absent, unlisted = sorted(listed - drives - {ANY}), sorted(drives - listed)
+        if absent and unlisted and ANY not in listed:
+            raise PointsError(
+                f"{self.root}: splits lists the drive {absent[0]!r:.60}, which has no labeled scan, and not the drive "
+                f"{unlisted[0]!r:.60}, which has some; correct the names (those of frames.csv; without it, of the "
+                "scans), or say with '*' where all others belong"
+            )
 
     def _read_boxes(self, path: Path, name: str) -> list[Box]:
         """Boxes of a scan with the classes of its label file."""

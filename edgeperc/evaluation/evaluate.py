@@ -142,6 +142,7 @@ class _Job:
         folders = {str(dataset): folder for dataset in self.datasets if (folder := _folder(dataset)) is not None}
         if folders and (self.mounted is not None or self.road_by is not None):
             raise OptionError(f"{next(iter(folders))} is of another sensor; mounted and road_by are for KITTI's scans")
+        _check_names([*folders.values()])
         judges: list[Judge] = []
         scans: list[_Scan] = []
         for folder in folders.values():
@@ -206,6 +207,19 @@ def _folder(dataset: str | Path) -> ScanFolder | None:
             f"FOLDER:LAYOUT with a layout of {', '.join(known_layouts())}, or the word simulation"
         )
     return ScanFolder.parse(dataset)
+
+
+def _check_names(folders: Sequence[ScanFolder]) -> None:
+    """Raise `PointsError` for drives of two folders that would count as one."""
+    of_drive: dict[tuple[str, str], ScanFolder] = {}
+    for folder in folders:
+        for drive in sorted({*folder.drives.values()}):
+            other = of_drive.setdefault((folder.layout.name, drive), folder)
+            if other is not folder:
+                raise PointsError(
+                    f"{other.root} and {folder.root} are both called {folder.layout.name!r}, and both have a drive "
+                    f"{drive!r:.60}; change the name in a description, or evaluate them one by one"
+                )
 
 
 def _folder_scans(judge: Judge, folder: ScanFolder, split: str, fold: int | None) -> list[_Scan]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import lru_cache
@@ -79,6 +79,14 @@ def read_scan_set(
         scans.append(labeled_scan(frame, points, estimator.mounting(), classes))
     weights = [n_scans[frame.drive] ** -0.5 for frame in frames]
     return scans, weights, {f"{layout.name}/{frame.name}": scan_hash(frame.points) for frame in frames}
+
+
+def joined_hashes(earlier: Mapping[str, str], own: Mapping[str, str]) -> dict[str, str]:
+    """The hashes of both by name; an earlier scan keeps its hash if another one now has its name."""
+    others = {
+        name if own.get(name, digest) == digest else f"{name} {digest}": digest for name, digest in earlier.items()
+    }
+    return others | {**own}
 
 
 def labeled_scan(

@@ -100,8 +100,8 @@ class LabeledScan:
     def labeled(self, geometry: TopViewGeometry) -> Mask:
         """Whether each cell is in the labeled sector, (rows, cols) bool."""
         x, y = geometry.cell_centers()
-        azimuth = np.arctan2(y, x)
-        return (azimuth >= self.azimuths[0]) & (azimuth <= self.azimuths[1])
+        low, high = self.azimuths  # of a scan that was turned, or looks back, beyond half a turn
+        return np.asarray((np.arctan2(y, x) - low) % (2.0 * np.pi) <= high - low, np.bool_)
 
     def boxed(self, geometry: TopViewGeometry) -> Mask:
         """Whether all objects of each cell have boxes, (rows, cols) bool."""

@@ -11,7 +11,7 @@ import json
 import math
 import time
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -27,7 +27,7 @@ from edgeperc.preprocess.fitness import FitnessProfile
 from edgeperc.simulation.scene import POINT_CLASSES
 from edgeperc.system.atomic import open_atomic
 
-from ..data.scan_sets import read_scan_set
+from ..data.scan_sets import joined_hashes, read_scan_set
 from ..data.scans import LabeledScan
 from ..networks import build
 from ..recipe import Recipe
@@ -164,7 +164,7 @@ class _Training:
             raise ValueError(f"the recipe keeps weights ({recipe.kept:g}) but there are none; give --start-from")
         if run.start_from is not None and not self.checkpoint.exists():
             self.state.before, frames = self._start(network, run.start_from)
-            self.state.hashes = frames | self.state.hashes
+            self.state.hashes = joined_hashes(frames, self.state.hashes)
         self.network: Any = network.to(ranks.device, memory_format=torch.channels_last)  # type: ignore[call-overload]  # not in its stubs
         ranks.share(self.network)
         # The compiled network shares its weights with the original, which is averaged and saved.
@@ -303,11 +303,24 @@ class _Training:
         kept = read_checkpoint(self.checkpoint, self.ranks.device)
         if kept["recipe"] != self.recipe:
             raise ValueError(f"{self.checkpoint} is of another recipe: {kept['recipe']}; give an empty folder")
+        self._check_data(kept)
         self.network.load_state_dict(kept["network"])
         self.averaged.load_state_dict(kept["averaged"])
         self.optimizer.load_state_dict(kept["optimizer"])
         self.source.samples.odds = {name: odds.cpu().numpy() for name, odds in kept["odds"].items()}
         self.state = _State(kept["frames"], kept["before"], kept["curve"], kept["step"], kept["best"], *kept["watched"])
+
+    def _check_data(self, kept: Mapping[str, Any]) -> None:
+        """Raise ValueError if a checkpoint's run was trained on other scans or images than this one."""
+        frames, own, fold = kept["frames"], self.source.hashes, -1 if self.fold is None else self.fold
+        alike = own.items() <= frames.items() if kept["before"] else own == frames
+        n_simulated = len(self.source.samples.simulated)
+        if not alike or (kept["fold"], kept["n_simulated"]) != (fold, n_simulated):
+            raise ValueError(
+                f"{self.checkpoint} is of a run on other data: {len(frames)} real scans or images (with those of the "
+                f"runs before), {kept['n_simulated']} simulated ones, fold {kept['fold']}; got {len(own)}, "
+                f"{n_simulated}, fold {fold}. Give the same ones, or an empty folder"
+            )
 
 
 def _image_source(recipe: Recipe, data: Data, device: torch.device) -> _Source:
@@ -386,7 +399,7 @@ def _real(
     for folder in scan_sets:
         if not only_simulated:
             more, more_weights, more_hashes = read_scan_set(folder, "train", fold, classes=classes)
-            scans, weights, hashes = scans + more, weights + more_weights, hashes | more_hashes
+            scans, weights, hashes = scans + more, weights + more_weights, joined_hashes(hashes, more_hashes)
         watched += read_scan_set(folder, "validation", fold, classes=classes)[0]
     return scans, weights, hashes, watched
 

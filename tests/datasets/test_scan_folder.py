@@ -34,7 +34,7 @@ from edgeperc.types.mounting import MODEL_MOUNTING, Mounting
 from edgeperc.types.perception import Box
 from edgeperc.types.sensor import get_sensor
 from edgeperc.types.views import TopViewGeometry
-from edgeperc_export.data.scan_sets import read_scan_set, seen_by_network
+from edgeperc_export.data.scan_sets import joined_hashes, read_scan_set, seen_by_network
 from edgeperc_export.data.scans import SURFACE, LabeledScan
 
 BOXES = {"Car": "car", "Van": "van", "Rider": "ignore", "Cyclist": "cyclist", "Digger": "digger", "Cone": "background"}
@@ -295,6 +295,38 @@ def test_drives_and_splits(tmp_path: Path) -> None:
     assert ScanFolder(root).drives == {name: name for name in "abcd"}
     with pytest.raises(ValueError, match="expected train, validation, test or all"):
         folder.names("both")
+
+
+def test_a_drive_that_splits_misspells_is_not_for_training(tmp_path: Path) -> None:
+    root = folder_of(tmp_path, label__a_dot_txt="", label__b_dot_txt="")
+    np.save(root / "velodyne/b.npy", PLACES)
+    description = {**DESCRIPTION, "splits": {"train": ["monday"], "test": ["tuesday"]}}
+    folder_of(root, description)
+    with pytest.raises(PointsError, match=r"the drive 'monday', which has no labeled scan, and not the drive 'a'"):
+        ScanFolder(root)  # nobody wrote frames.csv
+    (root / "frames.csv").write_text("name,drive\na,monday\nb, tuesday\n")
+    with pytest.raises(
+        PointsError, match="the drive 'tuesday', which has no labeled scan, and not the drive ' tuesday'"
+    ):
+        ScanFolder(root)
+    (root / "frames.csv").write_text("name,drive\na,tuesday\nb,tuesday\n")
+    assert ScanFolder(root).names("train") == []  # the scans of Monday lie elsewhere
+    (root / "frames.csv").write_text("name,drive\na,tuesday\nb,friday\n")
+    folder_of(root, {**description, "splits": {"train": ["monday"], "test": ["*"]}})
+    assert ScanFolder(root).names("test") == ["b", "a"]
+
+
+def test_sets_of_one_name_are_told_apart(tmp_path: Path) -> None:
+    """A card knows the scans of both; figures of drives that would count as one are refused."""
+    folders = [ScanFolder(street(tmp_path / str(k))[0]) for k in range(2)]
+    (file,) = (folders[1].root / "velodyne").iterdir()
+    np.fromfile(file, np.float32).reshape(-1, 4)[::-1].tofile(file)
+    one, other = (read_scan_set(folder, "train")[2] for folder in folders)
+    assert one.keys() == other.keys()
+    assert {*joined_hashes(one, other).values()} == {*one.values(), *other.values()}
+    assert joined_hashes(one, one) == one
+    with pytest.raises(PointsError, match="both called 'street', and both have a drive 'street'"):
+        evaluate([folder.root for folder in folders], ["pointseg"])
 
 
 @pytest.mark.parametrize(
@@ -594,6 +626,20 @@ def test_a_drive_without_ground_needs_a_mounting(tmp_path: Path) -> None:
     np.testing.assert_allclose(scan.points, PLACES, atol=1e-6)
     assert scan.azimuths == pytest.approx((-math.pi / 6, math.pi / 6))
     assert (scan.surface == IGNORE).all()
+
+
+def test_a_sector_may_lie_behind(tmp_path: Path) -> None:
+    """A sensor that looks back: its labels teach what lies behind the vehicle, on both sides."""
+    root = folder_of(tmp_path, label__a_dot_txt=LINES)
+    mounting = {**MODEL_MOUNTING.to_dict(), "yaw_deg": 180.0}
+    folder_of(root, {**DESCRIPTION, "mounting": mounting, "labeled_deg": [-30, 30]})
+    (scan,), _, _ = read_scan_set(ScanFolder(root), "all")
+    geometry = TopViewGeometry(x_range_m=(-10.0, 10.0), y_range_m=(-10.0, 10.0))
+    x, y = np.broadcast_arrays(*geometry.cell_centers())
+    labeled = scan.labeled(geometry)
+    np.testing.assert_array_equal(labeled, (x < 0.0) & (np.abs(y) < -x * math.tan(math.pi / 6)))
+    assert labeled[y > 0.0].any()
+    assert labeled[y < 0.0].any()
 
 
 def test_training_sees_what_the_vehicle_sees(tmp_path: Path) -> None:

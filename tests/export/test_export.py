@@ -52,7 +52,7 @@ from edgeperc_export.release.to_onnx import ParityError, export, halve, load, te
 from edgeperc_export.training import ablation
 from edgeperc_export.training.ablation import PAPERS, SHIPPED, VARIANTS, plot
 from edgeperc_export.training.curve import curve_table
-from edgeperc_export.training.samples import Recent, Samples, Watch, loaded, real_scans
+from edgeperc_export.training.samples import RealScans, Recent, Samples, Watch, loaded, real_scans
 from edgeperc_export.training.start import start
 from edgeperc_export.training.task import Task, task_of
 from edgeperc_export.training.teacher import OnnxTeacher, pseudo_labeled, teach, unlabeled_scans
@@ -230,6 +230,34 @@ def test_another_recipe_does_not_resume(tmp_path: Path, simulated: Path) -> None
     train(recipe, tmp_path, kitti=None, simulated=simulated, n_threads=1)
     with pytest.raises(ValueError, match="of another recipe"):
         train(replace(recipe, steps=2), tmp_path, kitti=None, simulated=simulated, n_threads=1)
+
+
+@pytest.mark.usefixtures("small_views")
+def test_other_data_do_not_resume(tmp_path: Path, simulated: Path) -> None:
+    """The card would not know the scans of the second run, and the fold was trained on."""
+    recipe = small("pointseg", edge=True, steps=1, n_pasted=0.0)
+    scan = LabeledScan.load(sorted(simulated.glob("*.npz"))[0])
+    scan = replace(scan, labels=np.zeros_like(scan.labels))
+    given = RealScans([scan], {"a": "1"}, [])
+
+    def run(folder: str, **changes: Any) -> Path:
+        arguments = {"kitti": None, "simulated": simulated, "n_threads": 1, "given": given, **changes}
+        return train(recipe, tmp_path / folder, **arguments)
+
+    first = run("own")
+    assert run("own") == first
+    fewer = tmp_path / "fewer"
+    fewer.mkdir()
+    shutil.copy(sorted(simulated.glob("*.npz"))[0], fewer)
+    for changes in ({"given": RealScans([scan], {"b": "2"}, [])}, {"fold": 0}, {"simulated": fewer}):
+        with pytest.raises(ValueError, match="of a run on other data"):
+            run("own", **changes)
+    # Another scan of the same name: the card knows both.
+    run("after", start_from=first, given=RealScans([scan], {"a": "2"}, []))
+    frames = load(tmp_path / "after/checkpoint.pt")[2]["frames"]
+    assert sorted(frames.values()) == ["1", "2"]
+    with pytest.raises(ValueError, match="of a run on other data"):
+        run("after", start_from=first, given=RealScans([scan], {"a": "3"}, []))
 
 
 @pytest.mark.usefixtures("small_views")
