@@ -17,6 +17,7 @@ import numpy as np
 from ..datasets.images import FOLDERS, IGNORE, LEVEL, LabeledImages, image_hash
 from ..errors import CardMismatchError, OptionError, SplitError
 from ..perceiver import Perceiver
+from ..types.card import ModelCard
 from ..types.points import Floats, Ints64
 from .judge import training_scans_of
 from .metrics import Confusion
@@ -42,8 +43,7 @@ def evaluate_images(
     if split is None:
         split = "test" if any((each.root / FOLDERS["test"]).is_dir() for each in data) else "validation"
     for each in data:
-        if [name.casefold() for name in each.classes] != [name.casefold() for name in card.classes]:
-            raise CardMismatchError(f"{card.name} has classes {card.classes}; those of {each.root} are {each.classes}")
+        check_classes(each, card)
     files = [(each, file) for each in data for file in each.files(split)]
     trained_on = {} if split == "train" else training_scans_of(perceive.cards)
     counts = []
@@ -65,6 +65,12 @@ def evaluate_images(
         "fold": None,
         "images": image_figures(card.classes, np.stack(counts)),
     }
+
+
+def check_classes(data: LabeledImages, card: ModelCard) -> None:
+    """Raise `CardMismatchError` if the classes of images are not those of a model, in their order."""
+    if [name.casefold() for name in data.classes] != [name.casefold() for name in card.classes]:
+        raise CardMismatchError(f"{card.name} has classes {card.classes}; those of {data.root} are {data.classes}")
 
 
 def image_figures(classes: Sequence[str], counts: Ints64, n_resamples: int = 1000) -> dict[str, Any]:

@@ -13,7 +13,7 @@ import numpy as np
 
 from ..agreement.rules import RULES
 from ..datasets.kitti import Frame, RoadFrame, scan_hash
-from ..datasets.layout import IGNORED, box_label, class_number
+from ..datasets.layout import COARSE, IGNORED, box_label, class_number
 from ..datasets.scan_folder import ScanFrame
 from ..errors import ModelError, SplitError
 from ..ground.planes import find_ground
@@ -378,11 +378,13 @@ def _without_vehicles(classes: tuple[str, ...], right: Bytes) -> tuple[tuple[str
 
 
 def renamed(labels: Labels, names: Sequence[str], classes: Sequence[str]) -> Bytes:
-    """A model's labels as those of a table, whose first class stands for what it lacks; `IGNORE` stays as it is."""
-    coarse = {"drivable": "road", **dict.fromkeys(VEHICLES, "vehicle")}
-    renamed = [name if name in classes else coarse.get(name, "") for name in names]
+    """A model's labels as those of a table: of a coarser class if it lacks one, as in `class_number`, else of its first
+    class; `IGNORE` stays as it is.
+    """
     numbers = np.full(IGNORE + 1, IGNORE, np.uint8)
-    numbers[: len(names)] = [classes.index(name) if name in classes else 0 for name in renamed]
+    for k, name in enumerate(names):
+        others = (name, "vehicle" if name in VEHICLES else "", COARSE.get(name, ""))
+        numbers[k] = next((classes.index(other) for other in others if other in classes), 0)
     return numbers[labels]
 
 

@@ -18,7 +18,9 @@ import onnxruntime
 
 from edgeperc.datasets.images import LabeledImages
 from edgeperc.datasets.kitti import KittiLabels, KittiObjects, SemanticKitti
+from edgeperc.datasets.layout import class_number
 from edgeperc.errors import ModelError, PointsError
+from edgeperc.evaluation.camvid import check_classes
 from edgeperc.evaluation.judge import Judge, Perceiving
 from edgeperc.evaluation.kitti_ap import FrontTruth, average_precisions, best_candidates, count_in_image, image_size_of
 from edgeperc.evaluation.metrics import Confusion, Listed
@@ -27,6 +29,7 @@ from edgeperc.evaluation.truth import Truth
 from edgeperc.inference.session import Session
 from edgeperc.objects.candidate_boxes import LEAST_SCORE
 from edgeperc.perceiver import Perceiver
+from edgeperc.simulation.samples import IGNORE
 from edgeperc.system.machine import cpu_features, cpu_model
 from edgeperc.types.mounting import MODEL_MOUNTING
 from edgeperc.types.points import Bytes, Floats32
@@ -84,6 +87,11 @@ def agree(
             raise PointsError("objects are compared on KITTI's boxes; name a KITTI object set")
         measure = partial(_measure_objects, objects=KittiObjects(kitti))
     else:
+        if lacking := [name for name in fp32.card.classes[1:] if class_number(name) == IGNORE]:
+            raise ModelError(
+                f"{fp32.name} has classes that no labels of KITTI show: {', '.join(lacking)}. What they lose cannot be "
+                "measured; ask for the precision by name where its results are good enough"
+            )
         measure = partial(_measure, kitti=kitti, semantickitti=semantickitti)
     measured = {precision: measure(variant, precision, split, n_scans) for precision, variant in runs.items()}
     options = [f"--kitti KITTI --split {split}"] * (kitti is not None)
@@ -197,6 +205,7 @@ def _measure_objects(
 def _measure_images(
     variant: Variant, precision: str, split: str, n_images: int | None, *, data: LabeledImages
 ) -> Measured:
+    check_classes(data, variant.card)
     perceive = Perceiver([variant.path])
     by = _engine(perceive.sessions[0], precision)
     labels, confusion = [], Confusion(variant.card.classes)

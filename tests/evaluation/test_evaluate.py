@@ -29,10 +29,11 @@ from edgeperc.datasets import kitti
 from edgeperc.errors import ModelError, PointsError, SplitError
 from edgeperc.evaluation import evaluate
 from edgeperc.evaluation.causes import count_causes
-from edgeperc.evaluation.judge import Judge, Perceiving, training_scans_of
+from edgeperc.evaluation.judge import Judge, Perceiving, renamed, training_scans_of
 from edgeperc.evaluation.metrics import BoxEvaluator, Confusion
 from edgeperc.evaluation.tables import BANDS, FEWEST_OBJECTS, Record, banded, figures
 from edgeperc.simulation.samples import FIRST_SEED, IGNORE
+from edgeperc.simulation.scene import POINT_CLASSES
 from edgeperc.types.card import InputSpec, ModelCard, OutputSpec
 from edgeperc.types.perception import Box, Perception, PointLabels, TopView
 from edgeperc.types.views import RangeImageGeometry, TopViewGeometry
@@ -309,6 +310,15 @@ def test_the_ground_in_boxes_and_people_who_sit_are_left_out_of_a_second_figure(
     assert row["recall"] < 0.5 < sure["recall"] == 1.0
     assert (row["n_points"] > 9, sure["n_points"]) == (True, 3)
     assert result["sure"]["15-30 m"]["pedestrian"]["recall"] == 0.75
+
+
+def test_finer_classes_count_as_those_of_the_labels() -> None:
+    """A network of one's own may tell vans and trucks from cars; KITTI's labels of points do not."""
+    names = ("background", "van", "truck", "car", "digger", "person_sitting", "cyclist", "drivable", "building")
+    labels = np.array([*range(len(names)), IGNORE], np.uint8)
+    assert renamed(labels, names, POINT_CLASSES).tolist() == [0, 1, 1, 1, 0, 2, 3, 0, 0, IGNORE]
+    assert renamed(labels, names, ("other", "road", "vehicle")).tolist() == [0, 2, 2, 2, 0, 0, 0, 1, 0, IGNORE]
+    assert renamed(labels, names, ("background", "car", "van")).tolist() == [0, 2, 1, 1, 0, 0, 0, 0, 0, IGNORE]
 
 
 def test_boxes_at_unknown_places_do_not_count(world: World) -> None:

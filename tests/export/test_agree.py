@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import importlib.util
+import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,12 +14,14 @@ import pytest
 torch = pytest.importorskip("torch")
 onnx = pytest.importorskip("onnx")
 
-from edgeperc.errors import ModelError, PointsError
+from edgeperc.errors import CardMismatchError, ModelError, PointsError
 from edgeperc.inference.session import Session
 from edgeperc.system.machine import cpu_features
+from edgeperc.types.card import ModelCard
 from edgeperc.zoo import BF16_FEATURES, model_path, resolve
 from edgeperc_export.release import agree as module
 from edgeperc_export.release.agree import agree, summary
+from edgeperc_export.release.to_onnx import write_card
 
 
 def measured(labels: list[int], mean_iou: float, ap: float | None) -> module.Measured:
@@ -55,6 +59,23 @@ def test_labeled_scans_are_required(tmp_path: Path) -> None:
     with pytest.raises(PointsError, match="name a KITTI object set"):
         agree([path], kitti=None)
     assert path.read_bytes() == model_path("pointseg").read_bytes()
+
+
+def test_classes_that_no_label_shows_are_not_called_accurate(tmp_path: Path) -> None:
+    path, card = tmp_path / "own.onnx", ModelCard.read(model_path("pointseg"))
+    classes = ("background", "car", "pedestrian", "motorcycle")
+    write_card(onnx.load(model_path("pointseg")), replace(card, classes=classes, golden=None), path)
+    with pytest.raises(ModelError, match="classes that no labels of KITTI show: motorcycle"):
+        agree([path], kitti=tmp_path)
+
+
+def test_images_have_the_classes_of_the_model_in_its_order(tmp_path: Path) -> None:
+    card = ModelCard.read(model_path("camseg"))
+    (tmp_path / "val").mkdir()
+    (tmp_path / "valannot").mkdir()
+    (tmp_path / "classes.json").write_text(json.dumps(dict(enumerate(card.classes[::-1]))))
+    with pytest.raises(CardMismatchError, match="camseg has classes"):
+        agree(["camseg"], kitti=None, camvid=tmp_path)
 
 
 def test_every_precision_is_measured_and_recorded(kitti_root: Path, tmp_path: Path) -> None:
