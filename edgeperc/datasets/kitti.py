@@ -96,11 +96,11 @@ class KittiCalibration:
         high = np.where(ahead[..., None], pixel, -np.inf).max(axis=1).clip(0.0, image_size)
         return np.hstack([low, np.maximum(high, low)])
 
-    def labeled_at(self, places: NDArray[Any], unlabeled: Floats) -> Mask:
+    def labeled_at(self, places: NDArray[Any], unlabeled: Floats, image_size: tuple[int, int] = IMAGE_SIZE) -> Mask:
         """Which places (n, 3+) in the sensor frame are in the image and in no ``unlabeled`` (k, 4) rectangle [px]."""
         pixel, depth = self.to_image(places)
         column, row = pixel.T
-        labeled = (depth > 0.1) & (pixel >= 0).all(axis=1) & (column < IMAGE_SIZE[0]) & (row < IMAGE_SIZE[1])
+        labeled = (depth > 0.1) & (pixel >= 0).all(axis=1) & (column < image_size[0]) & (row < image_size[1])
         for left, top, right, bottom in unlabeled:
             labeled &= ~((column >= left) & (column <= right) & (row >= top) & (row <= bottom))
         return labeled
@@ -192,10 +192,22 @@ def wrong_in_label(kind: str, numbers: Sequence[float]) -> str:
             f"expected a height, width and length above 0 m, got {', '.join(f'{each:g}' for each in size)}; an object "
             "without a box in 3-D is a DontCare"
         )
-    return "" if abs(turn) <= _WHOLE_TURN else f"expected a direction in radians, got {turn:g}, as if in degrees"
+    return "" if abs(turn) <= WHOLE_TURN else f"expected a direction in radians, got {turn:g}, as if in degrees"
 
 
-_LARGEST_M, _WHOLE_TURN = 100.0, 6.3  # of KITTI's objects, a tram is the longest, 35 m
+def check_in_image(labels: KittiLabels, size: tuple[int, int], path: Path) -> None:
+    """Raise `PointsError` for rectangles beyond an image of this size: objects would count as not labeled there."""
+    right, bottom = (float(column.max(initial=0.0)) for column in labels.numbers[:, 5:7].T)
+    if right > size[0] + _BEYOND_PX or bottom > size[1] + _BEYOND_PX:
+        raise PointsError(
+            f"{path}: a rectangle reaches to pixel {right:g}, {bottom:g}, beyond an image of {size[0]} x {size[1]}; "
+            'describe it in scans.json, with "box_format": "kitti" and the "image_size": [width, height] of its '
+            "camera"
+        )
+
+
+_LARGEST_M, WHOLE_TURN = 100.0, 6.3  # of KITTI's objects, a tram is the longest, 35 m
+_BEYOND_PX = 2.0  # KITTI's images differ by the day
 
 
 def label_objects(labels: KittiLabels, calibration: KittiCalibration) -> tuple[tuple[Box, ...], Floats]:
@@ -244,7 +256,9 @@ class KittiObjects:
         """Read a labeled scan with its labels and calibration."""
         row = next(row for row in self.rows if row["name"] == name)
         calibration = KittiCalibration.read(self.root / "training/calib" / f"{name}.txt")
-        labels = read_labels(self.root / "training/label_2" / f"{name}.txt")
+        path = self.root / "training/label_2" / f"{name}.txt"
+        labels = read_labels(path)
+        check_in_image(labels, IMAGE_SIZE, path)
         boxes, unlabeled = label_objects(labels, calibration)
         points = read_points(self.root / "training/velodyne" / f"{name}.bin")
         return Frame(name, row["drive"], row.get("grade", "A"), points, boxes, unlabeled, calibration, labels)

@@ -73,6 +73,7 @@ class ScanLayout:
     files: Literal["plain", "semantickitti"] = "plain"  # "semantickitti": its tree; scans are called SEQ/NAME
     # "plain": label/NAME.txt; others: `BOX_FILES`
     box_format: Literal["plain", "kitti", "labelcloud", "sustechpoints", "cvat"] = "plain"
+    image_size: tuple[int, int] | None = None  # width and height [px], of "kitti" boxes; None: those of KITTI's images
     # of ``label/NAME.txt``; others than `BOX_COLUMNS`, and those after them, are skipped
     box_columns: tuple[str, ...] = BOX_COLUMNS
     point_names: Mapping[int, str] | None = None  # of the numbers in ``semseg``; None: semseg_classes.json has them
@@ -107,6 +108,8 @@ class ScanLayout:
         if not self.labeled_m > 0.0:
             _FIELDS.refuse("labeled_m", self.labeled_m, "a distance above 0")
         _FIELDS.whole("min_points", self.min_points, 0, 10**6)
+        if self.image_size is not None and not all(0 < pixels <= 2**15 for pixels in self.image_size):
+            _FIELDS.refuse("image_size", self.image_size, "width and height in pixels, 1 to 32768")
         if not self.splits.keys() <= {"train", "validation", "test"}:
             _FIELDS.refuse("splits", [*self.splits], "train, validation and test")
         drives = [drive for listed in self.splits.values() for drive in listed]

@@ -37,7 +37,17 @@ from ..types.geometry import inside
 from ..types.perception import ROADS, Box
 from ..types.points import Bytes, Floats, Mask, Points
 from .annotations import read_datumaro, read_json, read_labelcloud, read_sustechpoints
-from .kitti import IMAGE_SIZE, SEQUENCE_DRIVES, KittiCalibration, KittiLabels, label_objects, read_drives, read_labels
+from .kitti import (
+    IMAGE_SIZE,
+    SEQUENCE_DRIVES,
+    WHOLE_TURN,
+    KittiCalibration,
+    KittiLabels,
+    check_in_image,
+    label_objects,
+    read_drives,
+    read_labels,
+)
 from .layout import (
     ANY,
     BACKGROUND,
@@ -113,7 +123,7 @@ class ScanFrame:
             low, high = self.layout.labeled_deg
             return math.radians(low), math.radians(high)
         focal, middle = self.calibration.P2[0, 0], self.calibration.P2[0, 2]
-        return -math.atan2(IMAGE_SIZE[0] - middle, focal), math.atan2(middle, focal)
+        return -math.atan2((self.layout.image_size or IMAGE_SIZE)[0] - middle, focal), math.atan2(middle, focal)
 
     def known_at(self, places: NDArray[Any]) -> Mask:
         """Whether all objects at places (n, 3+) [m] have boxes, (n,) bool."""
@@ -125,7 +135,7 @@ class ScanFrame:
             known = np.asarray((azimuth - low) % 360.0 <= high - low, np.bool_)
             known &= np.hypot(places[:, 0], places[:, 1]) <= self.layout.labeled_m
         if self.calibration is not None and self.unlabeled is not None:
-            known &= self.calibration.labeled_at(places, self.unlabeled)
+            known &= self.calibration.labeled_at(places, self.unlabeled, self.layout.image_size or IMAGE_SIZE)
         return known
 
     def labels(self, classes: Sequence[str] = POINT_CLASSES, *, by: str | None = None) -> Bytes:
@@ -242,6 +252,7 @@ class ScanFolder:
         if path is not None and self.layout.box_format == "kitti":
             calibration = KittiCalibration.read(self.root / "calib" / f"{name}.txt")
             rows = read_labels(path)
+            check_in_image(rows, self.layout.image_size or IMAGE_SIZE, path)
             found, unlabeled = label_objects(rows, calibration)
             boxes = self._renamed(found, path)
             kinds = [k if k == "dontcare" else class_of_name(k, self.layout.boxes, path, "boxes") for k in rows.kinds]
@@ -397,6 +408,8 @@ def _read_boxes(path: Path, columns: Sequence[str]) -> list[Box]:
             raise PointsError(f"{path}, line {number}: {line[:100]!r}; expected {' '.join(columns)}") from exc
         if not all(map(math.isfinite, (x, y, z, length, width, height, yaw))) or min(length, width, height) <= 0.0:
             raise PointsError(f"{path}, line {number}: {line[:100]!r}; expected finite numbers and sizes above 0")
+        if abs(yaw) > WHOLE_TURN:
+            raise PointsError(f"{path}, line {number}: a yaw of {yaw:g}, as if in degrees; expected radians")
         boxes.append(Box(values[place["class"]], 1.0, (x, y, z), (length, width, height), yaw))
     return boxes
 

@@ -71,7 +71,7 @@ def kitti_truth(frame: Frame, view: TopViewGeometry | None, road: tuple[str, Mas
             surface = np.where(vehicles > 0, vehicles, drivable)
             cells[title] = TOP_VIEW_CLASSES, np.where(known, surface, IGNORE).astype(np.uint8)
     returns = tuple(int(np.count_nonzero(inside(box, frame.points, 0.1))) for box in frame.boxes)
-    labels, front = frame.point_labels(), _front(frame.labels, frame.calibration, frame.drive)
+    labels, front = frame.point_labels(), _front(frame.labels, frame.calibration, image_size_of(frame.drive))
     return Truth(
         frame.name, frame.drive, frame.points, labels, frame.boxes, returns, frame.known_at, cells, front=front
     )
@@ -105,7 +105,8 @@ def folder_truth(
         surface = road_cells(frame, mounting, view)
         if surface is not None:
             cells[OBSERVED], road = (ROAD_CLASSES, surface), (OBSERVED, "road")
-    points, front = model.move(frame.points), _front(frame.image_labels, frame.calibration, frame.drive)
+    size = frame.layout.image_size or image_size_of(frame.drive)
+    points, front = model.move(frame.points), _front(frame.image_labels, frame.calibration, size)
     box_labels = frozenset(frame.layout.boxes.values())
     of_boxes = boxes, frame.returns, known
     return Truth(
@@ -172,8 +173,10 @@ def simulated_truth(seed: int, view: TopViewGeometry | None, classes: tuple[str,
     return Truth(name, name, scan.points, labels, *boxes, cells, road, classes=classes)
 
 
-def _front(labels: KittiLabels | None, calibration: KittiCalibration | None, drive: str) -> FrontTruth | None:
-    return None if labels is None or calibration is None else FrontTruth(labels, calibration, image_size_of(drive))
+def _front(
+    labels: KittiLabels | None, calibration: KittiCalibration | None, size: tuple[int, int]
+) -> FrontTruth | None:
+    return None if labels is None or calibration is None else FrontTruth(labels, calibration, size)
 
 
 def _by_boxes(vehicles: Bytes, known: Mask) -> tuple[tuple[str, ...], Bytes]:

@@ -19,7 +19,7 @@ pytest.importorskip("tqdm")
 
 from checkout import REPOSITORY
 from edgeperc import Perceiver, cli
-from edgeperc.datasets.kitti import scan_hash
+from edgeperc.datasets.kitti import KittiObjects, scan_hash
 from edgeperc.datasets.layout import ScanLayout, class_number, known_layouts, read_layout
 from edgeperc.datasets.scan_folder import ScanFolder
 from edgeperc.errors import MountingError, OptionError, PointsError, SensorError
@@ -176,7 +176,14 @@ def test_label_files_of_half_a_number_and_names_that_are_none(tmp_path: Path) ->
 
 @pytest.mark.parametrize(
     "line",
-    ["Car 1 2 3", "Car 1 2 3 4 5 six 0", "Car 1 2 3 4 5 inf 0", "Car 1 2 3 4 0 1 0", "Car nan 2 3 4 1 1 0"],
+    [
+        "Car 1 2 3",
+        "Car 1 2 3 4 5 six 0",
+        "Car 1 2 3 4 5 inf 0",
+        "Car 1 2 3 4 0 1 0",
+        "Car nan 2 3 4 1 1 0",
+        "Car 1 2 3 4 2 1 90",
+    ],
 )
 def test_lines_that_are_no_boxes(tmp_path: Path, line: str) -> None:
     folder = ScanFolder(folder_of(tmp_path, label__a_dot_txt=f"Car 10 0 -1 4 2 1.6 0\n{line}\n"))
@@ -210,6 +217,34 @@ def test_kittis_own_labels(tmp_path: Path) -> None:
     assert frame.labels().tolist() == [1, 0, IGNORE, 0]  # behind the camera nothing is labeled
     assert frame.azimuths == pytest.approx((-0.7196, 0.7012), abs=1e-3)
     assert ScanFolder(root).frame("a").boxes is not None
+
+
+def test_kitti_labels_of_another_camera(tmp_path: Path) -> None:
+    """Its image is wider than KITTI's: what lies on its right is labeled, too."""
+    calibration = (
+        "P2: 1000 0 960 0 0 1000 540 0 0 0 1 0\nR0_rect: 1 0 0 0 1 0 0 0 1\nTr_velo_to_cam: 0 -1 0 0 0 0 -1 0 1 0 0 0\n"
+    )
+    label = "Car 0 0 0 1400 500 1700 700 1.6 2 4 6 1 10 -1.5708\n"
+    own = {**DESCRIPTION, "box_format": "kitti"}
+    points = np.array([[10, -6, -0.5, 0], [10, 6, 0, 0], [10, 0, -5, 0], [10, -12, 0, 0]], np.float32)
+    files = {"label_2__a_dot_txt": label, "calib__a_dot_txt": calibration}
+    root = folder_of(tmp_path, own, points=points, **files)
+    with pytest.raises(PointsError, match=r'to pixel 1700, 700, beyond an image of 1242 x 375; .*"image_size"'):
+        ScanFolder(root).frame("a")
+    for wrong in ([1920], [0, 1080], [1920.5, 1080], "1920x1080"):
+        with pytest.raises(PointsError, match="image_size"):
+            ScanFolder(folder_of(tmp_path, {**own, "image_size": wrong}, points=points, **files))
+    frame = ScanFolder(folder_of(tmp_path, {**own, "image_size": [1920, 1080]}, points=points, **files)).frame("a")
+    assert frame.labels().tolist() == [1, 0, 0, IGNORE]
+    assert frame.azimuths == pytest.approx((-math.atan(0.96), math.atan(0.96)))
+    front = folder_truth(frame, MODEL_MOUNTING, None).front
+    assert front is not None
+    assert front.image_size == (1920, 1080)
+    (own_kitti := tmp_path / "set/training").mkdir(parents=True)
+    for folder in ("label_2", "calib", "velodyne"):
+        (root / folder).rename(own_kitti / folder)
+    with pytest.raises(PointsError, match="beyond an image of 1242 x 375"):
+        KittiObjects(own_kitti.parent).frame("a")
 
 
 def test_scans_of_any_format(tmp_path: Path) -> None:
