@@ -268,6 +268,7 @@ def _frame_rows(root: Path) -> list[dict[str, str]]:
     """Rows of ``frames.csv`` and ``frames-*.csv``; an empty list without a table."""
     tables = (root / "frames.csv", *sorted(root.glob("frames-*.csv")))
     rows = [row for table in tables if table.exists() for row in read_drives(table)]
+    _check_once(rows, root / "frames*.csv")
     for row in rows:
         check_file(f"{root}: a scan in frames.csv is called", row["name"], PointsError)
     return rows
@@ -283,7 +284,18 @@ def read_drives(table: Path) -> list[dict[str, str]]:
     nowhere = next((row for row in rows if not (row.get("name") and row.get("drive"))), None)
     if nowhere is not None:
         raise PointsError(f"{table}: got {nowhere}; expected columns name and drive, both filled in every row")
+    _check_once(rows, table)
     return rows
+
+
+def _check_once(rows: Sequence[dict[str, str]], table: Path) -> None:
+    """Raise `PointsError` for a scan with two rows, which would be of two drives or count twice."""
+    seen: dict[str, str] = {}
+    for row in rows:
+        if row["name"] in seen:
+            both = f"{seen[row['name']]} and {row['drive']}"
+            raise PointsError(f"{table}: scan {row['name']!r:.60} has two rows, of drives {both:.80}; expected one")
+        seen[row["name"]] = row["drive"]
 
 
 def layouts(root: Path | str) -> Iterator[tuple[Box, ...]]:

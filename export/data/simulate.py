@@ -8,6 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
@@ -18,7 +19,7 @@ from edgeperc.readers.images import read_image
 from edgeperc.simulation.camera import forward_camera, render
 from edgeperc.simulation.samples import simulated_scan
 from edgeperc.types.perception import Box
-from edgeperc.types.sensor import get_sensor
+from edgeperc.types.sensor import SensorProfile, get_sensor
 
 from .processes import mapped
 from .scans import LabeledScan
@@ -36,7 +37,8 @@ def simulate(
     where: str = "street",
     n_workers: int = 0,
 ) -> None:
-    """Write ``n`` labeled scans into ``out``. Existing files are kept, so a stopped run resumes.
+    """Write ``n`` labeled scans into ``out``. Existing files are kept, so a stopped run resumes; ValueError if they are
+    of another sensor.
 
     first : number and seed of the first scan.
     layouts_root : folder of KITTI's labels; every other street gets the boxes of one of its scans.
@@ -48,6 +50,7 @@ def simulate(
         raise ValueError(f"layouts are those of streets, and the place is a {where}; leave them out")
     out.mkdir(parents=True, exist_ok=True)
     real = list(layouts(layouts_root)) if layouts_root else []
+    _check_kept(out, range(first, first + n), get_sensor(sensor).name)
     missing = [seed for seed in range(first, first + n) if not _path(out, seed).exists()]
     write = partial(_simulate, out=out, layouts=real, sensor=sensor, where=where)
     with mapped(write, missing, n_workers) as done:
@@ -57,6 +60,15 @@ def simulate(
 
 def _path(out: Path, seed: int) -> Path:
     return out / f"{seed:06d}.npz"
+
+
+def _check_kept(out: Path, seeds: range, sensor: str) -> None:
+    for path in filter(Path.exists, (_path(out, seed) for seed in seeds)):
+        with np.load(path, allow_pickle=False) as data:
+            profile = str(data["sensor"]) if "sensor" in data else ""
+        kept = SensorProfile.from_json(profile).name if profile else TRAINING_SENSOR
+        if kept != sensor:
+            raise ValueError(f"{path} is a scan of {kept}, and would be kept; take another folder for {sensor}")
 
 
 def _simulate(seed: int, *, out: Path, layouts: Sequence[Sequence[Box]], sensor: str, where: str) -> None:

@@ -332,6 +332,13 @@ def test_drives_and_splits(tmp_path: Path) -> None:
         folder.names("both")
 
 
+def test_a_scan_is_of_one_drive(tmp_path: Path) -> None:
+    root = folder_of(tmp_path, label__a_dot_txt="")
+    (root / "frames.csv").write_text("name,drive\na,monday\na,tuesday\n")
+    with pytest.raises(PointsError, match="scan 'a' has two rows, of drives monday and tuesday"):
+        ScanFolder(root)
+
+
 def test_a_drive_that_splits_misspells_is_not_for_training(tmp_path: Path) -> None:
     root = folder_of(tmp_path, label__a_dot_txt="", label__b_dot_txt="")
     np.save(root / "velodyne/b.npy", PLACES)

@@ -816,6 +816,14 @@ def test_a_stopped_simulation_resumes(tmp_path: Path) -> None:
     assert len(LabeledScan.load(tmp_path / "000001.npz").points) > 50_000
 
 
+def test_simulated_scans_of_another_sensor_are_not_taken_for_those_asked_for(tmp_path: Path) -> None:
+    for first, (kept, asked) in enumerate((("hdl-64e", "vlp-16"), ("vlp-16", "hdl-64e"))):
+        simulate(tmp_path, 1, first=first, sensor=kept)
+        with pytest.raises(ValueError, match=f"is a scan of {kept}, and would be kept; .* for {asked}"):
+            simulate(tmp_path, 4, first=first, sensor=asked)
+    assert len([*tmp_path.iterdir()]) == 2
+
+
 @pytest.fixture(scope="module")
 def exported(tmp_path_factory: pytest.TempPathFactory, scans: Sequence[np.ndarray]) -> Exported:
     """Export an untrained network, once: its checkpoint, the model, and the card."""
