@@ -81,6 +81,15 @@ def read_scan_set(
     return scans, weights, {f"{layout.name}/{frame.name}": scan_hash(frame.points) for frame in frames}
 
 
+def check_trains(folder: ScanFolder, *splits: str, fold: int | None = None) -> None:
+    """Raise ValueError for a set without a scan of any of these splits, which would be left out in silence."""
+    if not any(folder.names(split, fold=fold) for split in splits):
+        raise ValueError(
+            f"{folder.root} has {len(folder.drives)} labeled scans, and none is for {' or '.join(splits)}: its "
+            "description keeps their drives for testing; leave the set out, or change splits"
+        )
+
+
 def joined_hashes(earlier: Mapping[str, str], own: Mapping[str, str]) -> dict[str, str]:
     """The hashes of both by name; an earlier scan keeps its hash if another one now has its name."""
     others = {

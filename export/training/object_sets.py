@@ -15,7 +15,7 @@ from edgeperc.datasets.splits import FOLDS, fold_of
 
 from ..data.augment import Augmentation, ObjectBank, augmented
 from ..data.beams import drawn_sensor
-from ..data.scan_sets import read_scan_set
+from ..data.scan_sets import check_trains, read_scan_set
 from ..data.scans import LabeledScan
 from .object_samples import DriveScan, build_samples
 
@@ -64,6 +64,7 @@ def write_samples(
                     names.append(f"{name}-{PASTED}")
                     hashes[names[-1]] = {}
     for folder in scan_sets:
+        check_trains(folder, "train")
         of_set, _, hashes[folder.layout.name] = read_scan_set(folder, "train")
         drives = [folder.drives[name.partition("/")[2]] for name in hashes[folder.layout.name]]
         labeled = [(drive, partial(replace, scan)) for drive, scan in zip(drives, of_set, strict=True)]

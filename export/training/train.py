@@ -27,7 +27,7 @@ from edgeperc.preprocess.fitness import FitnessProfile
 from edgeperc.simulation.scene import POINT_CLASSES
 from edgeperc.system.atomic import open_atomic
 
-from ..data.scan_sets import joined_hashes, read_scan_set
+from ..data.scan_sets import check_trains, joined_hashes, read_scan_set
 from ..data.scans import LabeledScan
 from ..networks import build
 from ..recipe import Recipe
@@ -398,6 +398,7 @@ def _real(
     classes = recipe.classes or POINT_CLASSES
     for folder in scan_sets:
         if not only_simulated:
+            check_trains(folder, "train", "validation", fold=fold)
             more, more_weights, more_hashes = read_scan_set(folder, "train", fold, classes=classes)
             scans, weights, hashes = scans + more, weights + more_weights, joined_hashes(hashes, more_hashes)
         watched += read_scan_set(folder, "validation", fold, classes=classes)[0]

@@ -332,6 +332,19 @@ def test_drives_and_splits(tmp_path: Path) -> None:
         folder.names("both")
 
 
+@pytest.mark.parametrize("network", ["pointseg", "objects"])
+def test_a_set_that_is_kept_for_testing_is_not_left_out_of_training_in_silence(
+    tmp_path: Path, network: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("torch")
+    pytest.importorskip("onnx")
+    from edgeperc_export.cli import main
+
+    root = folder_of(tmp_path, {**DESCRIPTION, "splits": {"test": ["*"]}}, label__a_dot_txt=LINES)
+    assert main(["train", network, str(tmp_path / "run"), "--scans", str(root), "--steps", "1"]) == 2
+    assert "has 1 labeled scans, and none is for train" in capsys.readouterr().err
+
+
 def test_a_scan_is_of_one_drive(tmp_path: Path) -> None:
     root = folder_of(tmp_path, label__a_dot_txt="")
     (root / "frames.csv").write_text("name,drive\na,monday\na,tuesday\n")
