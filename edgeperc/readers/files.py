@@ -205,7 +205,8 @@ def _parse(data: Bytes, name: str, options: FileOptions) -> _Read:
     if head.startswith(b"\x93NUMPY"):
         return _of_stored(_parse_npy(data), options)
     if head.startswith(b"PK\x03\x04"):
-        return _of_stored(_parse_npz(data), options)
+        array, is_joined = _parse_npz(data, options)
+        return _of_stored(array, options._replace(remission_field=None) if is_joined else options)
     if head.startswith((b"ply\n", b"ply\r")):
         return _of_named(parse_ply(data, head, options.remission_field), options)
     if begins_like_pcd(head):
@@ -249,16 +250,17 @@ def _check_unused(names: Iterable[str], options: FileOptions) -> None:
 def _of_values(columns: Columns, options: FileOptions) -> _Read:
     """Of a file whose columns have the names of the options, or none."""
     if options.columns is None or isinstance(options.columns, int | np.integer):
-        return _of_columns(columns, _unnamed(options))._replace(fields={})
+        return _of_columns(columns, _unnamed(options, len(columns.names)))._replace(fields={})
     return _of_columns(columns, options)
 
 
-def _unnamed(options: FileOptions) -> FileOptions:
-    """Options for values without names, of which the fourth is the remission. Raises PointsError."""
-    if options.remission_field is not None and not is_remission_name(options.remission_field):
+def _unnamed(options: FileOptions, n: int) -> FileOptions:
+    """Options for ``n`` values a point without names, of which the fourth is the remission. Raises PointsError."""
+    if options.remission_field is not None and (n < 4 or not is_remission_name(options.remission_field)):
         raise PointsError(
-            f"there is no field {options.remission_field!r} for the remission: the values have no names. Say what they "
-            "are: columns=, or --columns x y z intensity ring"
+            f"there is no field {options.remission_field!r} for the remission: the values have no names"
+            f"{' and are three a point' if n < 4 else ''}. Say what they are: columns=, or --columns x y z intensity "
+            "ring"
         )
     return options._replace(remission_field=None)
 
@@ -285,7 +287,7 @@ def _of_stored(array: NDArray[Any], options: FileOptions) -> _Read:
 
 def _of_array(array: NDArray[Any], options: FileOptions) -> _Read:
     fields = table_columns(array)
-    options = options if fields else _unnamed(options)
+    options = options if fields else _unnamed(options, array.shape[1] if array.ndim == 2 else 4)
     xyz = fields if fields or array.ndim != 2 else dict(zip("xyz", array.T, strict=False))
     origin = _origin(xyz, options)
     return _Read(as_points(array, remission_field=options.remission_field, origin_m=origin), fields, origin)
@@ -336,7 +338,8 @@ def _parse_npy(data: Bytes) -> NDArray[Any]:
         raise PointsError(f"the .npy array of {dtype} cannot be read: {exc}") from exc
 
 
-def _parse_npz(data: Bytes) -> NDArray[Any]:
+def _parse_npz(data: Bytes, options: FileOptions) -> tuple[NDArray[Any], bool]:
+    """The points of an archive, and whether the remission beside them, by its name or the usual ones, is among them."""
     try:
         # zipfile raises BadZipFile, RuntimeError (encrypted), NotImplementedError, zlib.error, EOFError and others.
         with zipfile.ZipFile(io.BytesIO(data.tobytes())) as archive:
@@ -348,14 +351,19 @@ def _parse_npz(data: Bytes) -> NDArray[Any]:
                     "and remission, as points"
                 )
             points = _parse_member(data, members[name])
-            remission = remission_name(map(plain_name, members), None)
-            if remission is None or points.dtype.names or points.shape[1:] != (3,):
-                return points
-            beside = next(member for other, member in members.items() if plain_name(other) == remission)
+            others = {plain_name(other): other for other in members if other != name}
+            wanted = options.remission_field
+            replaces = wanted is not None and plain_name(wanted) in others and options.columns is None
+            if points.dtype.names or points.shape[1:] not in ((3,), (4,) if replaces else (3,)):
+                return points, False
+            remission = remission_name(others, wanted) if others else None
+            if remission is None:
+                return points, False
+            beside = members[others[remission]]
             values = _parse_member(data, beside).reshape(-1, 1)
             if len(values) != len(points) or not {points.dtype.kind, values.dtype.kind} <= {*"fiu"}:
                 raise PointsError(f"{beside.filename!r} in the archive is not one number for each of the points")
-            return np.hstack([points, values])
+            return np.hstack([points[:, :3], values]), True
     except PointsError:
         raise
     except Exception as exc:

@@ -336,6 +336,25 @@ def test_the_remission_beside_the_points_of_an_archive(tmp_path: Path, name: str
     np.testing.assert_array_equal(read_points(save(tmp_path, "b.npz", content.getvalue())), POINTS)
 
 
+@pytest.mark.parametrize("n", [3, 4])
+def test_an_archive_gives_the_remission_that_is_asked_for(tmp_path: Path, n: int) -> None:
+    beside = {name: np.arange(4.0) + k for k, name in enumerate(("intensity", "Reflectivity", "signal"))}
+    path = save(tmp_path, "a.npz", npz(points=POINTS[:, :n], **beside))
+    for name, values in beside.items():
+        expected = np.column_stack([POINTS[:, :3], values])
+        np.testing.assert_array_equal(read_points(path, remission_field=name), expected)
+    with pytest.raises(PointsError, match=r"no (numeric )?field 'ring' for the remission"):
+        read_points(path, remission_field="ring")
+
+
+@pytest.mark.parametrize("name", ["a.npy", "a.npz", "a.bin"])
+def test_three_values_a_point_hold_no_remission(tmp_path: Path, name: str) -> None:
+    points = np.random.default_rng(1).normal(0.0, [20.0, 10.0, 1.0], (2000, 3)).astype(np.float32)
+    content = {"a.npy": npy, "a.npz": lambda array: npz(points=array), "a.bin": np.ndarray.tobytes}[name](points)
+    with pytest.raises(PointsError, match=r"no field 'intensity' for the remission: .* three a point"):
+        read_points(save(tmp_path, name, content), remission_field="intensity", columns=3)
+
+
 @pytest.mark.parametrize("beside", [np.arange(5.0), np.zeros((4, 2)), np.array(["a"] * 4), np.zeros(4, complex)])
 def test_what_is_no_remission_of_the_points_is_refused(tmp_path: Path, beside: Any) -> None:
     content = io.BytesIO()
