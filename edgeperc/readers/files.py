@@ -217,7 +217,8 @@ def _parse(data: Bytes, name: str, options: FileOptions) -> _Read:
     if advice is not None:
         raise PointsError(f"this is {advice}")
     if begins_like_text(head) and not name.endswith(".bin"):
-        return _of_columns(parse_text(data, options.columns), options)
+        table, is_named = parse_text(data, options.columns)
+        return _of_named(table, options) if is_named else _of_columns(table, options)
     if options.columns is None and not name.endswith(".bin"):
         raise PointsError(
             f"neither PCD, PLY, .npy, .npz nor text by its first bytes, {head[:8]!r}; if they are raw float32 values, "

@@ -48,30 +48,31 @@ class _Style(NamedTuple):
         return [word.strip() for word in row.split(self.separator)]
 
 
-def parse_text(data: Bytes, columns: Sequence[str] | int | None) -> Columns:
-    """The columns of a table: separated by blanks, commas or semicolons, below comments (``#``, ``//``).
+def parse_text(data: Bytes, columns: Sequence[str] | int | None) -> tuple[Columns, bool]:
+    """The columns of a table, and whether it names them: separated by blanks, commas or semicolons, below comments
+    (``#``, ``//``).
 
     A first line of one whole number is the number of points, as in ``.pts``. Names are those of a line of words, with
     or without units; columns of words, such as classes, are left out. What is empty, or null, is NaN.
 
-    columns : names of the columns, in place of those in the file.
+    columns : names of the columns, where no line has one for each.
     """
     lines = data.tobytes().decode("utf-8-sig", "replace").replace('"', "").splitlines()
-    given = columns if columns is None or not isinstance(columns, int | np.integer) else None
-    header, counts, rows = _head([line for line in lines if line.strip()], given is not None)
+    given = (
+        None if columns is None or isinstance(columns, int | np.integer) else [str(name).lower() for name in columns]
+    )
+    header, counts, rows = _head([line for line in lines if line.strip()], bool(given))
     if not rows:
         raise PointsError(f"the text has no row of three numbers; {_EXPECTED}")
     if len(counts) == 2:
         raise PointsError("this is a PTX file by its first lines; convert it with CloudCompare, to .pts, .pcd or .ply")
-    style = _style(rows[0])
+    style = _style_of(rows)
     words = style.values(rows[0])
     n = len(words) - (words[-1] == "")  # a separator behind the last
-    if given is not None:
-        names = tuple(str(name).lower() for name in given)
-        n = len(words) if len(names) == len(words) else n
-    else:
-        names = _names(header, style, len(words)) or (_UNNAMED_PTS if counts else _UNNAMED).get(n, ())
-        n = len(words) if header and len(names) == len(words) else n
+    own: Sequence[str] = _names(header, style, len(words))
+    is_named = bool(own) and len(own) in (n, len(words))
+    names = own if is_named else given or own or (_UNNAMED_PTS if counts else _UNNAMED).get(n, ())
+    n = len(words) if (header or given) and len(names) == len(words) else n
     if len(names) != n:
         got = f"{len(names)} names" if names else "no names"
         raise PointsError(f"a row has {n} numbers, and there are {got}: pass columns= (--columns) with their names")
@@ -79,7 +80,7 @@ def parse_text(data: Bytes, columns: Sequence[str] | int | None) -> Columns:
     table = _table(rows, style, used, len(words)) if used else np.empty((len(rows), 0))
     if counts and counts[0] != len(table):
         raise PointsError(f"cut short: the first line declares {counts[0]:,} points, {len(table):,} rows follow")
-    return Columns(len(table), dict(zip((names[k] for k in used), table.T, strict=True)), names)
+    return Columns(len(table), dict(zip((names[k] for k in used), table.T, strict=True)), names), is_named
 
 
 _EXPECTED = "expected x, y, z and remission in each row, or a first line of names"
@@ -115,6 +116,15 @@ def _style(row: str) -> _Style:
     if not has_commas or (len(words) > 1 and all(map(_COMMA_NUMBER.fullmatch, words))):
         return _Style(None, has_commas)
     return _Style(",", False)
+
+
+def _style_of(rows: Sequence[str]) -> _Style:
+    """That of the first row with a comma, if it is separated as the first row is: 0;0;0 may stand above 1,5;2,5;3,5."""
+    first = _style(rows[0])
+    if "," in rows[0] or first.separator == ",":
+        return first
+    style = _style(next((row for row in rows if "," in row), rows[0]))
+    return style if style.separator == first.separator else first
 
 
 def _names(header: str, style: _Style, n: int) -> tuple[str, ...]:

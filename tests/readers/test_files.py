@@ -878,6 +878,27 @@ def test_a_comma_in_place_of_the_point(separator: Any, head: Any, n: int, decima
     np.testing.assert_array_equal(points[:, :n], values.astype("f4"))
 
 
+@pytest.mark.parametrize("separator", [";", " "])
+def test_whole_numbers_above_those_with_commas(tmp_path: Path, separator: str) -> None:
+    """As a first point without a return is: 0;0;0;0."""
+    rows = [separator.join(row) for row in (("0", "0", "0", "0"), ("1,5", "-2", "3,25", "0,5"))]
+    points = read_points(save(tmp_path, "scan.csv", "\n".join(rows).encode()))
+    np.testing.assert_array_equal(points, [[0, 0, 0, 0], [1.5, -2, 3.25, 0.5]])
+
+
+@pytest.mark.parametrize("columns", [("x", "y", "z", "intensity", "ring"), 4])
+def test_names_in_a_table_are_taken_before_those_of_columns(tmp_path: Path, columns: Any) -> None:
+    path = save(tmp_path, "scan.csv", b"x,y,z,ring,intensity\n1,2,3,7,0.5\n")
+    with pytest.warns(UserWarning, match="is not used: the file names its values, x, y, z, ring, intensity"):
+        np.testing.assert_array_equal(read_points(path, columns=columns), [[1, 2, 3, 0.5]])
+
+
+def test_columns_name_the_values_of_a_table_that_has_other_names(tmp_path: Path) -> None:
+    path = save(tmp_path, "scan.csv", b"x,y,z,ring\n1,2,3,7,0.5\n")
+    points = read_points(path, columns=("x", "y", "z", "ring", "intensity"))
+    np.testing.assert_array_equal(points, [[1, 2, 3, 0.5]])
+
+
 @pytest.mark.parametrize("gap", ["", " ", "null", "NaN", "N/A", "-", "none"])
 @pytest.mark.parametrize("separator", [",", ";"])
 def test_what_a_table_lacks_is_nan(tmp_path: Path, gap: str, separator: str) -> None:
