@@ -46,7 +46,9 @@ class PrelabelSink:
     """Writes the boxes of each scan as a tool's own labels.
 
     With tracks, these are the reported tracks that were detected in the scan, with their ids; otherwise the boxes of
-    the perception. Boxes are in the frame of the scan (KITTI: of the camera). A scan without boxes gets an empty file.
+    the perception. Boxes are where the scan's file has its points: in the frame of the scan, or in its map, if its
+    place there is known (``origin_m``); KITTI's are in the frame of the camera. A scan without boxes gets an empty
+    file.
 
     - ``"labelcloud"``: ``labels/NAME.json`` (labelCloud's ``centroid_rel``) and ``labels/_classes.json``
     - ``"cvat"``: ``annotations.zip`` for a 3-D task of CVAT, format "Datumaro 3D 1.0". With tracks, each object is one
@@ -103,6 +105,9 @@ class PrelabelSink:
         boxes: list[Named] = [(box, None) for box in scan.perception.boxes]
         if scan.tracked is not None:
             boxes = [(track.box, track.id) for track in scan.tracked if not track.coasting]
+        if scan.perception.origin_m is not None and self._kind != "kitti":
+            placed = scan.perception.in_map(box for box, _ in boxes)
+            boxes = [(box, number) for box, (_, number) in zip(placed, boxes, strict=True)]
         for box, _ in boxes:
             if box.label not in self._classes:
                 self._classes.append(box.label)

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import io
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..errors import OptionError, PointsError
 from ..records import PerceivedScan
 from ..system.atomic import write_atomic
 from ..tracking.moving import movable_points, moving_points
-from ..types.points import Mask, Points, as_points
+from ..types.points import Floats32, Mask, as_points
 from .run_file import ScanFiles, stem_of
 
 __all__ = ["StaticSink"]
@@ -25,7 +26,8 @@ class StaticSink:
 
     A file has the name and the format of the scan's file: ``.bin``, ``.npy``, ``.npz``, ``.pcd`` or ``.ply`` with x, y,
     z and remission of the remaining points, in their order; ``.pcd.bin`` with the ring, too. Scans of captures and
-    bags become ``NUMBER.bin``, float32 x, y, z, remission. Files are replaced atomically.
+    bags become ``NUMBER.bin``, float32 x, y, z, remission. Points whose place in a map is known (``origin_m``) stay in
+    the map, as doubles; those of ``.bin`` are float32. Files are replaced atomically.
 
     Parameters
     ----------
@@ -72,7 +74,10 @@ class StaticSink:
         stem, suffix = stem_of(scan.name)
         name = Path(scan.name).name if suffix else f"{stem}.bin"
         target = self._files.checked(self._folder / name, scan.name)
-        write_atomic(target, _content(points, ~gone, suffix, scan.name))
+        xyz: NDArray[Any] = points[:, :3]
+        if scan.perception.origin_m is not None:
+            xyz = scan.perception.to_map(points)
+        write_atomic(target, _content(xyz, points[:, 3], ~gone, suffix, scan.name))
         self.n_points += len(points)
         self.n_removed += int(np.count_nonzero(gone))
 
@@ -80,15 +85,16 @@ class StaticSink:
         """Do nothing; every file is complete."""
 
 
-def _content(points: Points, kept: Mask, suffix: str, source: str) -> bytes:
-    rows = np.ascontiguousarray(points[kept], "<f4")
+def _content(xyz: NDArray[Any], remission: Floats32, kept: Mask, suffix: str, source: str) -> bytes:
+    """The file of the points that are kept; their coordinates have the type of ``xyz``."""
     if suffix == ".pcd.bin":
         whole = np.fromfile(source, "<f4")
-        if whole.size != 5 * len(points):
+        if whole.size != 5 * len(xyz):
             raise PointsError(
-                f"{source} holds {whole.size} values for a scan of {len(points):,} points; expected 5 for each point"
+                f"{source} holds {whole.size} values for a scan of {len(xyz):,} points; expected 5 for each point"
             )
         return whole.reshape(-1, 5)[kept].tobytes()
+    rows = np.column_stack([xyz[kept], remission[kept]])
     if suffix in (".npy", ".npz"):
         file = io.BytesIO()
         if suffix == ".npy":
@@ -96,14 +102,17 @@ def _content(points: Points, kept: Mask, suffix: str, source: str) -> bytes:
         else:
             np.savez(file, points=rows)
         return file.getvalue()
-    header = ""
+    if suffix not in (".pcd", ".ply"):
+        return rows.astype("<f4").tobytes()
+    size = rows.itemsize
     if suffix == ".pcd":
         header = (
-            f"# .PCD v0.7 - Point Cloud Data file format\nVERSION 0.7\nFIELDS {' '.join(_FIELDS)}\nSIZE 4 4 4 4\n"
-            f"TYPE F F F F\nCOUNT 1 1 1 1\nWIDTH {len(rows)}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {len(rows)}\n"
-            "DATA binary\n"
+            f"# .PCD v0.7 - Point Cloud Data file format\nVERSION 0.7\nFIELDS {' '.join(_FIELDS)}\n"
+            f"SIZE {size} {size} {size} {size}\nTYPE F F F F\nCOUNT 1 1 1 1\nWIDTH {len(rows)}\nHEIGHT 1\n"
+            f"VIEWPOINT 0 0 0 1 0 0 0\nPOINTS {len(rows)}\nDATA binary\n"
         )
-    elif suffix == ".ply":
-        properties = "".join(f"property float {name}\n" for name in _FIELDS)
+    else:
+        kind = {4: "float", 8: "double"}[size]
+        properties = "".join(f"property {kind} {name}\n" for name in _FIELDS)
         header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(rows)}\n{properties}end_header\n"
-    return header.encode("ascii") + rows.tobytes()
+    return header.encode("ascii") + rows.astype(f"<f{size}").tobytes()

@@ -6,6 +6,7 @@ import json
 import math
 import sys
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -169,6 +170,15 @@ def test_labels_are_read_as_the_tools_read_them(tmp_path: Path, kind: str) -> No
     check_rows(READERS[kind](folder, "000003"), expected)
     assert READERS[kind](folder, "000004") == []
     check_rows(READERS[kind](folder, "000005"), expected)
+
+
+@pytest.mark.parametrize("kind", [kind for kind in KINDS if kind != "kitti"])
+def test_labels_of_a_scan_in_a_map_lie_in_the_map(tmp_path: Path, kind: str) -> None:
+    scan, origin = perceived("utm.pcd"), (512345.25, 5412345.5, 113.0)
+    perception = replace(scan.perception, origin_m=origin)
+    folder = written(tmp_path, kind, replace(scan, perception=perception))
+    rows = zip(NAMES[kind], rows_of(perception.map_boxes), strict=True)
+    check_rows(READERS[kind](folder, "utm"), [(name, values) for name, (_, values) in rows])
 
 
 def test_datumaro_reads_cvats_labels(tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import sys
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -74,6 +75,15 @@ def test_a_file_has_the_name_and_the_format_of_the_scans(tmp_path: Path, name: s
     np.testing.assert_array_equal(read_points(file), expected(AHEAD))
     assert (sink.n_points, sink.n_removed) == (261, 261 - len(expected(AHEAD)))
     assert sink.n_removed >= 30
+
+
+@pytest.mark.parametrize("name", ["7.npy", "7.npz", "7.pcd", "7.ply", "7.bin"])
+def test_points_of_a_map_stay_in_the_map(tmp_path: Path, name: str) -> None:
+    origin = (512345.25, 5412345.5, 113.0) if name != "7.bin" else (100.0, -50.0, 2.0)
+    scan = perceived(name)
+    sink = StaticSink(tmp_path)
+    sink.write(replace(scan, perception=replace(scan.perception, origin_m=origin)))
+    np.testing.assert_allclose(read_points(tmp_path / name, origin_m=origin), expected(AHEAD), atol=1e-5)
 
 
 def test_what_could_move_goes_too_if_it_is_wished(tmp_path: Path) -> None:
