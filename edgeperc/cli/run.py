@@ -310,19 +310,27 @@ def _check_outputs(
     scans: Sequence[Path],
     targets: Sequence[Path],
 ) -> None:
-    """Check that no file is a scan, and none is written twice."""
-    from ..readers.captures import is_capture
+    """Check that no file is a scan, or would be one of its folder for the next run, and none is written twice."""
+    from ..readers.captures import CAPTURE_SUFFIXES, SCAN_SUFFIXES
+    from ..readers.images import IMAGE_SUFFIXES
 
-    sources = {_real(source) for source in (*scans, *images.values()) if source is not None}
-    files = (_files_of(arguments, target, kinds, bool(images)) for target in targets)
-    outputs = [("--out", file) for of_target in files for file in of_target.values()]
+    read = [source for source in (*scans, *images.values()) if source is not None]
+    sources = {_real(source) for source in read}
+    listed = {_real(source.parent) for source in read if source not in (*arguments.paths, *arguments.scan)}
+    suffixes = (*SCAN_SUFFIXES, *CAPTURE_SUFFIXES, *(IMAGE_SUFFIXES if images else ()))
+    outputs: list[tuple[str, Path]] = []
+    captures = {scan for scan in scans if not images and _is_capture(scan)}
+    for scan, target in zip(scans, targets, strict=True):
+        first = target / "000000" if scan in captures else target
+        outputs += [("--out", file) for file in _files_of(arguments, first, kinds, bool(images)).values()]
     outputs += [("--gif", arguments.out / "tracks.gif")] if arguments.gif else []
     for name in wanted_sinks(arguments):
         value = getattr(arguments, name)
         outputs += [(f"--{name}", value)] if isinstance(value, Path) else []
     if arguments.static is not None:  # scans of a capture get numbers
-        named = [scan for scan in (images.values() if images else scans) if scan is not None and not is_capture(scan)]
-        outputs += [("--static", arguments.static / scan.name) for scan in named]
+        written_of = [scan for scan in (images.values() if images else scans) if scan is not None]
+        names = {"000000.bin" if scan in captures else scan.name for scan in written_of}
+        outputs += [("--static", arguments.static / name) for name in sorted(names)]
     if arguments.labels_for == "cvat":
         outputs.append(("--labels-for", arguments.out / "annotations.zip"))
     written: dict[str, str] = {}
@@ -331,9 +339,20 @@ def _check_outputs(
             arguments.usage_error(
                 f"{file} is one of the {'images' if images else 'scans'} and would be overwritten; choose another --out"
             )
+        if file.suffix.lower() in suffixes and _real(file.parent) in listed and _real(file) not in sources:
+            arguments.usage_error(
+                f"{option}: {file} would be read with the {'images' if images else 'scans'} of its folder by the next "
+                "run; choose another folder"
+            )
         other = written.setdefault(_real(file), option)
         if other != option:
             arguments.usage_error(f"{other} and {option} both write {file}; choose another name for one of them")
+
+
+def _is_capture(scan: Path | Remote) -> bool:
+    from ..readers.captures import CAPTURE_SUFFIXES, is_capture
+
+    return scan.suffix.lower() in CAPTURE_SUFFIXES if isinstance(scan, Remote) else is_capture(scan)
 
 
 def _make_folders(out: Path, targets: Sequence[Path]) -> None:

@@ -179,8 +179,13 @@ def _scans(path: Path, options: _Options) -> Iterator[TimedScan]:
 
 
 def is_capture(path: Path) -> bool:
-    """Whether a path is a recording of many scans: a bag's folder, or a file with the first bytes of a capture."""
-    return _kind(path) not in ("scan", "folder")
+    """Whether a path is a recording of many scans: a bag's folder, or a file with the first bytes of a capture; by its
+    name if it cannot be read, which reading reports.
+    """
+    try:
+        return _kind(path) not in ("scan", "folder")
+    except PointsError:
+        return path.suffix.lower() in CAPTURE_SUFFIXES
 
 
 def sensor_of(source: str | os.PathLike[str], *, topic: str | None = None) -> SensorProfile | None:

@@ -698,6 +698,32 @@ def test_a_scan_is_never_overwritten(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert ply.read_bytes() == before
 
 
+@pytest.mark.skipif(not Path("/proc/self/mem").exists(), reason="needs a file that opens and cannot be read")
+def test_a_scan_that_cannot_be_read_costs_no_other_scan(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for name in ("a.bin", "c.bin"):
+        write_scan(tmp_path / name)
+    (tmp_path / "b.bin").symlink_to("/proc/self/mem")
+    assert run("run", tmp_path) == 1
+    out, err = capsys.readouterr()
+    assert [Path(line.split()[0]).name for line in out.splitlines()] == ["a.bin", "c.bin"]
+    assert f"{tmp_path / 'b.bin'}: the file cannot be read" in err
+
+
+def test_nothing_is_written_that_the_next_run_of_the_folder_would_read(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A second run perceived each scan twice: the .bin, and the .ply of the first run."""
+    drive = tmp_path / "drive"
+    drive.mkdir()
+    scan = write_scan(drive / "scan.bin")
+    for options in (("--ply", "--out", drive), ("--mcap", drive / "run.mcap")):
+        assert usage_code("run", drive, *options) == 2
+        assert "would be read with the scans of its folder by the next run" in capsys.readouterr().err
+    assert [*drive.iterdir()] == [scan]
+    assert run("run", drive, "--labels", "--out", drive) == 0
+    assert run("run", scan, "--ply", "--out", tmp_path) == 0
+
+
 @pytest.mark.parametrize(
     ("options", "both"),
     [

@@ -107,7 +107,9 @@ def test_wrong_usage(tmp_path: Path, model: Path, capsys: pytest.CaptureFixture[
     film, tiff, las = (tmp_path / name for name in others)
     for name, head in others.items():
         (tmp_path / name).write_bytes(head + bytes(400))
-    out = ("--out", tmp_path / "out")
+    out, photos = ("--out", tmp_path / "out"), tmp_path / "photos"
+    photos.mkdir()
+    write_image(photos / "b.jpg")
     for arguments, said in (
         ((image, "--scan", scan, scan.with_name("c.bin"), "--model", model), "--scan: 2 scans for 1 image"),
         ((scan, "--scan", scan), "--scan: 1 scan for 0 images"),
@@ -116,6 +118,7 @@ def test_wrong_usage(tmp_path: Path, model: Path, capsys: pytest.CaptureFixture[
         ((image, "--live"), f"--live needs scans, and {image} is an image"),
         ((image, "--deskew", "--track"), "--deskew needs scans"),
         ((image, "--png", "--out", tmp_path, "--model", model), "is one of the images and would be overwritten"),
+        ((photos, "--png", "--out", photos, "--model", model), "would be read with the images of its folder"),
     ):
         with pytest.raises(SystemExit, match="2"):
             run("run", *arguments)
