@@ -9,7 +9,7 @@ from ..errors import PointsError, SensorError
 from ..system.atomic import write_atomic
 from .arguments import Commands, add_command, add_ego_box, add_sensor, options
 from .output import print_rows
-from .scans import find_scans, with_mounting
+from .scans import check_profile_place, find_scans, with_mounting
 
 
 def add_parser(commands: Commands) -> None:
@@ -52,6 +52,7 @@ def fit_sensor_command(arguments: argparse.Namespace) -> int:
         raise SensorError(
             f"{arguments.out}: expected a name that ends in .json: --sensor reads other names as built-in sensors"
         )
+    check_profile_place(arguments.out)
     scans = [points for path in files.paths for _, points in read_scans(path)]
     profile, functions = fit_sensor(scans, get_sensor(with_mounting(arguments.sensor, arguments)), arguments.to)
     assert profile.remission is not None

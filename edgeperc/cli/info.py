@@ -17,7 +17,7 @@ from ..system.atomic import write_atomic
 from ..types.choices import DEFAULT_MODELS
 from .arguments import Commands, add_capture, add_command, check_inputs, options
 from .output import in_options, many, print_error, print_line, print_rows
-from .scans import Sensors, check_scans, check_sensor, reading_options
+from .scans import Sensors, check_profile_place, check_scans, check_sensor, reading_options
 
 if TYPE_CHECKING:
     from ..ground.leveling import MountingEstimator
@@ -82,6 +82,8 @@ def info_command(arguments: argparse.Namespace) -> int:
     check_sensor(arguments)
     if arguments.write is not None and arguments.write.suffix != ".json":
         arguments.usage_error(f"--write {arguments.write}: expected a name that ends in .json")
+    if arguments.write is not None:
+        check_profile_place(arguments.write)
     read = [Path(thing) for thing in arguments.things if not _is_model(thing)]
     read = [path for path in read if path.suffix.lower() not in IMAGE_SUFFIXES]
     if read:

@@ -143,6 +143,20 @@ def scan_namer(path: Path) -> Callable[[int], Path]:
     return lambda k: path / f"{k:06d}"
 
 
+def check_profile_place(file: Path) -> None:
+    """Check that a sensor profile to write replaces nothing but another one. Raises SensorError."""
+    from ..types.sensor import get_sensor
+
+    try:
+        if file.exists():
+            get_sensor(file)
+    except SensorError as exc:
+        raise SensorError(
+            f"{file} is there, and is no sensor profile; an Ouster's metadata, without which its capture cannot be "
+            "read, may have such a name. Choose another one, or remove it"
+        ) from exc
+
+
 _UNITS_DEG = 2.0  # between the beams of two units of a model
 # Files that are read for three scans with points.
 _LOOKED_AT = 10

@@ -20,20 +20,26 @@ _MOST_JSON_BYTES = 1 << 24
 
 
 def metadata_beside(path: Path) -> list[Path]:
-    """The .json files whose names have the longest beginning in common with the capture's, as ouster-sdk chooses."""
-    files = sorted(file for file in path.absolute().parent.iterdir() if file.suffix.lower() == ".json")
-    alike = {
-        file: len(os.path.commonprefix([file.name, path.name]))  # noqa: RUF071 - of the characters
-        for file in files
-        if file.is_file()
-    }
-    longest = max(alike.values(), default=0)
-    if not longest:
-        raise PointsError(
-            "not a Velodyne capture (packets of 1206 bytes), and cannot be read as Ouster's: there is no "
-            "metadata next to it. Expected a .json file whose name has the same beginning"
-        )
-    return [file for file, n in alike.items() if n == longest]
+    """The .json files whose names have the longest beginning in common with the capture's, as ouster-sdk chooses, but
+    for sensor profiles, which `edgeperc info --write` may have put there.
+    """
+    alike: dict[int, list[Path]] = {}
+    for file in sorted(path.absolute().parent.iterdir()):
+        n = len(os.path.commonprefix([file.name, path.name]))  # noqa: RUF071 - of the characters
+        if n and file.suffix.lower() == ".json" and file.is_file():
+            alike.setdefault(n, []).append(file)
+    for n in sorted(alike, reverse=True):
+        if files := [file for file in alike[n] if not _is_profile(file)]:
+            return files
+    raise PointsError(
+        "not a Velodyne capture (packets of 1206 bytes), and cannot be read as Ouster's: there is no "
+        "metadata next to it. Expected a .json file whose name has the same beginning"
+    )
+
+
+def _is_profile(file: Path) -> bool:
+    """Whether a .json file is a sensor profile of edgeperc."""
+    return file.stat().st_size <= _MOST_JSON_BYTES and b'"elevations_deg"' in file.read_bytes()
 
 
 def read_metadata(path: Path) -> dict[str, Any]:

@@ -388,6 +388,17 @@ def test_info_prints_the_mounting_and_writes_a_profile(
     assert estimate["roll_sd_deg"] > 0.0
 
 
+def test_a_profile_replaces_no_other_file(drive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    metadata, fit = tmp_path / "drive.json", ("--sensor", "hdl-64e", "--out")
+    metadata.write_text('{"beam_altitude_angles": [1, 2]}')
+    for arguments in (("info", drive / "0.bin", "--write", metadata), ("fit-sensor", drive / "0.bin", *fit, metadata)):
+        assert run(*arguments) == 2
+        assert f"{metadata} is there, and is no sensor profile" in capsys.readouterr().err
+    assert metadata.read_text() == '{"beam_altitude_angles": [1, 2]}'
+    for _ in range(2):  # a profile replaces another
+        assert run("info", drive / "0.bin", "--write", tmp_path / "mine.json") == 0
+
+
 def test_scans_of_a_recording_that_show_no_ground_are_left_out(drive: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run("info", drive, "--json") == 0
     estimate = json.loads(capsys.readouterr().out)["mounting"]

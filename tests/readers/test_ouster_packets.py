@@ -17,9 +17,10 @@ from test_captures import check_told_apart, error_of, join, vlp16_packets, write
 from test_packets import write_link
 
 import twins.packets
-from edgeperc import PointsError, read_timed_scans
+from edgeperc import PointsError, read_scans, read_timed_scans
 from edgeperc.readers.ouster_packets import PROFILES, OusterStream, fill_turn, layout_of
 from edgeperc.readers.times import TimedScan
+from edgeperc.types.sensor import get_sensor
 
 pytestmark = pytest.mark.usefixtures("in_this_process")
 
@@ -326,6 +327,20 @@ def joined(folder: Path, parts: Sequence[tuple[Sequence[bytes], str]]) -> Path:
     path = join(folder / "both.pcap", written)
     path.with_suffix(".json").write_text(json.dumps(METADATA))
     return path
+
+
+def test_a_sensor_profile_beside_a_capture_is_no_metadata(tmp_path: Path) -> None:
+    """As edgeperc info drive.pcap --write drive-mine.json puts it there."""
+    payloads = [bytes(packet.buf) for turn in random_packets(METADATA, 2, 1) for packet in turn]
+    capture = write_link(tmp_path / "drive.pcap", 1, payloads)
+    (tmp_path / "drive_metadata.json").write_text(json.dumps(METADATA))
+    alone = [points for _, points in read_scans(capture)]
+    for name in ("drive-mine.json", "drive.pcap.json", "drive.json"):
+        (tmp_path / name).write_text(get_sensor("os1-64").to_json())
+    for points, expected in zip(read_scans(capture), alone, strict=True):
+        np.testing.assert_array_equal(points[1], expected)
+    (tmp_path / "drive_metadata.json").unlink()
+    assert "there is no metadata next to it" in error_of(capture)
 
 
 @pytest.mark.parametrize("other", ["10.0.0.2", "10.0.0.1:7503", "10.0.0.9:7502"])
