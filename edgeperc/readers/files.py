@@ -135,7 +135,9 @@ class FileOptions(NamedTuple):
 
 
 def parse_points(content: bytes, name: str) -> Floats32:
-    """Read the points in the content of a file of this name; errors as `read_points`, and for one that is cut short."""
+    """Read the points in the content of a file of this name; errors as `read_points`, and for one that is cut short or
+    holds more than it declares.
+    """
     read = _parse_named(np.frombuffer(content, np.uint8), Path(name), FileOptions(None, None, None))
     if read.n_missing:
         raise PointsError(f"{name}: {read.missing()}")
@@ -150,7 +152,7 @@ def read_timed_file(path: Path, options: FileOptions) -> TimedScan:
 
 class _Read(NamedTuple):
     """Points, the fields of the file if they have names, the place in a map that was subtracted, and how many points a
-    file that was cut short lacks.
+    file that was cut short lacks; below 0: how many it holds beyond those that its header declares.
     """
 
     points: Points
@@ -159,7 +161,11 @@ class _Read(NamedTuple):
     n_missing: int = 0
 
     def missing(self) -> str:
-        """What a file that was cut short lacks, as a sentence."""
+        """What a file that was cut short lacks, or what of a longer one is not read, as a sentence."""
+        if self.n_missing < 0:
+            return (
+                f"{-self.n_missing:,} points follow the {len(self.points):,} that the header declares, and are not read"
+            )
         there = f"the first {len(self.points):,} of {len(self.points) + self.n_missing:,} points are there"
         return f"cut short: {there}, so a part of the surroundings is missing"
 
@@ -328,6 +334,8 @@ def _parse_npy(data: Bytes) -> NDArray[Any]:
         raise PointsError(f"the .npy header declares {shape} values of {dtype}, more than the file can hold")
     start = stream.tell()
     n_bytes = math.prod(shape) * dtype.itemsize
+    if data[start + n_bytes : start + n_bytes + 6].tobytes() == b"\x93NUMPY":
+        raise PointsError("several arrays one after another, as np.save appends them; save each in a file of its own")
     if n_bytes > data.size - start:
         raise PointsError(
             f"cut short: the .npy header declares {n_bytes} bytes of values, the file holds {data.size - start}"

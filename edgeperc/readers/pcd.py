@@ -91,11 +91,13 @@ def parse_pcd(data: Bytes, head: bytes, remission_field: str | None) -> Columns:
         if header.counts[k] == 1:
             single.setdefault(plain_name(name), k)
     fields: dict[str, NDArray[Any]]
+    n_missing = 0
     if header.encoding == "ascii":
         return parse_table(
             body, 0, n, {name: sum(header.counts[:k]) for name, k in single.items()}, header.names, remission_field
         )
     if header.encoding == "binary":
+        n_missing = n - body.size // record
         n = whole_points(n, record, body.size)
         fields = {name: column(body, header.types[k], n, sum(widths[:k]), record) for name, k in single.items()}
     elif header.encoding == "binary_compressed":
@@ -105,7 +107,7 @@ def parse_pcd(data: Bytes, head: bytes, remission_field: str | None) -> Columns:
         }
     else:
         raise PointsError(f"PCD data is ascii, binary or binary_compressed, got {header.encoding!r}")
-    return Columns(n, fields, header.names, header.n_points - n)
+    return Columns(n, fields, header.names, n_missing)
 
 
 def _unpack_pcd(body: Bytes, n_bytes: int) -> Bytes:

@@ -68,7 +68,7 @@ def parse_ply(data: Bytes, head: bytes, remission_field: str | None) -> Columns:
         before.append(vertex)
     else:
         raise PointsError("the PLY file has no vertex element")
-    body = data[start:]
+    body, is_last = data[start:], not any(element.count for element in elements[len(before) + 1 :])
     names = [name for name, _, _ in vertex.properties]
     places: dict[str, int] = {}
     for k, (name, _, length_type) in enumerate(vertex.properties):
@@ -77,19 +77,21 @@ def parse_ply(data: Bytes, head: bytes, remission_field: str | None) -> Columns:
     if encoding == "ascii":
         if vertex.has_lists:
             raise PointsError("a PLY text file with lists among a vertex' properties; save it as binary")
-        return parse_table(body, sum(e.count for e in before), vertex.count, places, names, remission_field)
+        n_before = sum(e.count for e in before)
+        return parse_table(body, n_before, vertex.count, places, names, remission_field, is_last=is_last)
     if encoding not in ("binary_little_endian", "binary_big_endian"):
         raise PointsError(f"PLY data is ascii, binary_little_endian or binary_big_endian, got {encoding!r}")
     order = "<" if encoding == "binary_little_endian" else ">"
     offset = 0
     for element in before:
         offset = _row_starts(body, offset, element, order)[1]
-    n = vertex.count
+    n, n_missing = vertex.count, 0
     fields: dict[str, NDArray[Any]] = {}
     if not vertex.has_lists:
         widths = [int(np.dtype(kind).itemsize) for _, kind, _ in vertex.properties]
         record = sum(widths)
         n = whole_points(n, record, body.size - offset)
+        n_missing = vertex.count - ((body.size - offset) // record if is_last and record else n)
         for name, k in places.items():
             kind = order + vertex.properties[k][1]
             fields[name] = column(body, kind, n, offset + sum(widths[:k]), record)
@@ -100,7 +102,7 @@ def parse_ply(data: Bytes, head: bytes, remission_field: str | None) -> Columns:
             kind = order + vertex.properties[k][1]
             octets = starts[:, k, None] + np.arange(np.dtype(kind).itemsize)
             fields[name] = body[octets].reshape(-1).view(kind)
-    return Columns(n, fields, names, vertex.count - n)
+    return Columns(n, fields, names, n_missing)
 
 
 def _row_starts(body: Bytes, offset: int, element: _PlyElement, order: str) -> tuple[Ints64 | None, int]:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from ..errors import PointsError
-from ..types.points import Bytes, Floats32, as_float64
+from ..types.points import Bytes, Floats32, as_float64, plain_name
 from .tables import Columns
 
 TEXT_BYTES = np.zeros(256, dtype=np.bool_)
@@ -63,7 +63,7 @@ def column_names(columns: int | Sequence[str] | None) -> tuple[str, ...]:
     if columns is None:
         return ()
     if isinstance(columns, Sequence) and not isinstance(columns, str):
-        names = tuple(str(name).lower() for name in columns)
+        names = tuple(plain_name(str(name)) for name in columns)
         if not 3 <= len(names) <= 64 or len({*names}) < len(names):
             raise PointsError(f"columns are 3 to 64 different names, among them x, y and z, got {list(columns)!r:.200}")
         return names

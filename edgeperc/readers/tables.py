@@ -31,7 +31,8 @@ class Columns(NamedTuple):
     n: int  # number of points
     fields: Mapping[str, NDArray[Any]]  # columns by `edgeperc.types.points.plain_name`
     names: Sequence[str]  # all fields of the source
-    n_missing: int = 0  # points that the header declares, and that a file that was cut short lacks
+    # Points that the header declares, and that a file that was cut short lacks; below 0, those that it holds more.
+    n_missing: int = 0
 
 
 def column(data: Bytes, kind: str, n: int, offset: int, stride: int) -> NDArray[Any]:
@@ -83,17 +84,30 @@ def cut_short(n: int, record: int, size: int) -> PointsError:
 
 
 def parse_table(
-    body: Bytes, skipped_rows: int, n: int, places: Mapping[str, int], names: Sequence[str], remission_field: str | None
+    body: Bytes,
+    skipped_rows: int,
+    n: int,
+    places: Mapping[str, int],
+    names: Sequence[str],
+    remission_field: str | None,
+    *,
+    is_last: bool = True,
 ) -> Columns:
-    """Parse coordinates, remission and time from rows of text; ``places`` has each field's position in a row."""
+    """Parse coordinates, remission and time from rows of text; ``places`` has each field's position in a row, and no
+    row of something else follows those that are the last.
+    """
     wanted = {name: places[name] for name in "xyz" if name in places}
     for name in (remission_name(places, remission_field), time_name(places)):
         if name is not None:
             wanted[name] = places[name]
-    if not {"x", "y", "z"} <= wanted.keys() or n == 0:
-        return Columns(0, {name: np.empty(0) for name in wanted}, names)
     ends = np.flatnonzero(body == 10) + 1
     n_ended = len(ends)
+    n_more = 0
+    if is_last and skipped_rows + n <= n_ended:
+        behind = body[ends[skipped_rows + n - 1] if skipped_rows + n else 0 :]
+        n_more = sum(bool(row.strip()) for row in behind.tobytes().splitlines())
+    if not {"x", "y", "z"} <= wanted.keys() or n == 0:
+        return Columns(0, {name: np.empty(0) for name in wanted}, names, -n_more)
     if len(body[ends[-1] if n_ended else 0 :].tobytes().split()) > max(wanted.values()):
         ends = np.append(ends, body.size)  # the last row needs no end, but after a cut it may be half a number
     n_there = n if skipped_rows + n <= len(ends) else n_ended - skipped_rows
@@ -110,4 +124,4 @@ def parse_table(
         raise PointsError(f"a row of text does not hold numbers: {exc}") from exc
     if len(rows) != n_there:
         raise PointsError(f"cut short: {n} rows declared, {len(rows)} of numbers are there")
-    return Columns(n_there, dict(zip(wanted, rows.T, strict=True)), names, n - n_there)
+    return Columns(n_there, dict(zip(wanted, rows.T, strict=True)), names, n - n_there if n_there < n else -n_more)

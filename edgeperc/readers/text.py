@@ -58,9 +58,7 @@ def parse_text(data: Bytes, columns: Sequence[str] | int | None) -> tuple[Column
     columns : names of the columns, where no line has one for each.
     """
     lines = data.tobytes().decode("utf-8-sig", "replace").replace('"', "").splitlines()
-    given = (
-        None if columns is None or isinstance(columns, int | np.integer) else [str(name).lower() for name in columns]
-    )
+    given = [] if columns is None or isinstance(columns, int | np.integer) else [plain_name(str(n)) for n in columns]
     header, counts, rows = _head([line for line in lines if line.strip()], bool(given))
     if not rows:
         raise PointsError(f"the text has no row of three numbers; {_EXPECTED}")

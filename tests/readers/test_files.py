@@ -117,7 +117,12 @@ FILES = {
     "no_hash.pcd": pcd("x y z i", "F F F F", "4 4 4 4", "1 1 1 1", 4, "binary", POINTS.tobytes()).split(b"\n", 1)[1],
     "little.ply": ply("binary_little_endian", POINTS.tobytes()),
     "big.ply": ply("binary_big_endian", BIG.tobytes()),
-    "ascii.ply": ply("ascii", text_rows(POINTS) + b"3 0 1 2\n"),
+    "ascii.ply": ply(
+        "ascii",
+        text_rows(POINTS) + b"3 0 1 2\n",
+        properties="property float x\nproperty float y\nproperty float z\nproperty float intensity\n"
+        "element face 1\nproperty list uchar int vertex_indices\n",
+    ),
     "cloud_compare.ply": ply(
         "binary_little_endian",
         POINTS.tobytes(),
@@ -334,6 +339,44 @@ def test_the_remission_beside_the_points_of_an_archive(tmp_path: Path, name: str
     content = io.BytesIO()
     np.savez(content, points=POINTS, **{name: remission})
     np.testing.assert_array_equal(read_points(save(tmp_path, "b.npz", content.getvalue())), POINTS)
+
+
+@pytest.mark.parametrize("n", [0, 2])
+@pytest.mark.parametrize("kind", ["ascii", "binary", "faces"])
+@pytest.mark.parametrize("suffix", [".pcd", ".ply"])
+def test_points_that_the_header_does_not_declare_are_warned_of(tmp_path: Path, suffix: str, kind: str, n: int) -> None:
+    """As a recorder leaves them that ends before it has written their number."""
+    body = POINTS.tobytes() if kind == "binary" else text_rows(POINTS) + b"\n"
+    if suffix == ".pcd":
+        head = f"FIELDS x y z i\nSIZE 4 4 4 4\nTYPE F F F F\nWIDTH {n}\nHEIGHT 1\nPOINTS {n}\n"
+        content = f"{head}DATA {'binary' if kind == 'binary' else 'ascii'}\n".encode() + body
+    else:
+        form = "binary_little_endian" if kind == "binary" else "ascii"
+        properties = "".join(f"property float {name}\n" for name in "xyzi")
+        faces = f"element face {len(POINTS) - n}\n" if kind == "faces" else "element face 0\n"
+        head = f"ply\nformat {form} 1.0\nelement vertex {n}\n{properties}{faces}property list uchar int k\nend_header\n"
+        content = head.encode() + body
+    path = save(tmp_path, f"a{suffix}", content)
+    if (suffix, kind) == (".ply", "faces"):
+        assert len(read_points(path)) == n
+        return
+    with pytest.warns(UserWarning, match=f"{len(POINTS) - n} points follow the {n} that the header declares"):
+        np.testing.assert_array_equal(read_points(path), POINTS[:n])
+
+
+def test_arrays_one_after_another_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(PointsError, match="several arrays one after another"):
+        read_points(save(tmp_path, "a.npy", npy(POINTS) + npy(POINTS)))
+
+
+@pytest.mark.parametrize("name", ["a.bin", "a.txt"])
+def test_columns_may_have_the_names_of_cloudcompare(tmp_path: Path, name: str) -> None:
+    rows = np.column_stack([POINTS, np.arange(len(POINTS))]).astype("<f4")
+    path = save(tmp_path, name, text_rows(rows) if name == "a.txt" else rows.tobytes())
+    columns = ("X", "Y", "Z", "scalar_Intensity", "scalar_Ring")
+    np.testing.assert_array_equal(read_points(path, columns=columns), POINTS)
+    ringed = read_points(path, columns=columns, remission_field="scalar_Ring")
+    np.testing.assert_array_equal(ringed[:, 3], rows[:, 4])
 
 
 @pytest.mark.parametrize("n", [3, 4])
