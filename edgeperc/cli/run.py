@@ -500,13 +500,14 @@ class _Run:
         from ..readers.captures import is_capture, read_scans, read_timed_scans
 
         if isinstance(path, Remote) or isinstance(target, Remote):
+            n_after = self._n + 1  # one that cannot be fetched takes its time, too
             yield from through_temporary(self.scans, path, target)
+            self._n = max(self._n, n_after)
             return
-        shown = shown or path
+        shown, numbered = shown or path, is_capture(path)
         try:
             sensor = self._perceivers.sensor_of(path, shown if isinstance(shown, Remote) else None)
             perceive = self._perceivers.of(sensor)
-            numbered = is_capture(path)
             read: Callable[..., Iterator[tuple[Any, ...]]] = read_timed_scans if self._straightener else read_scans
             how = reading_options(path, self._arguments) | {"accumulate_s": _gathered_s(path, sensor)}
             if how["accumulate_s"] is not None and self._straightener is None:
@@ -519,6 +520,7 @@ class _Run:
                 how["origin_m"] = self._origin(path)
             for k, (stamp_s, points, *times_s) in enumerate(read(path, **how)):
                 name, file = (shown / f"{k:06d}", target / f"{k:06d}") if numbered else (shown, target)
+                at_s = self._at_s(stamp_s)
                 try:
                     if self._straightener is not None:
                         points = self._straightener.straighten(stamp_s, points, times_s[0], perceive.sensor)
@@ -526,12 +528,13 @@ class _Run:
                     if self._kinds and numbered:
                         target.mkdir(exist_ok=True)
                     wanted = _files_of(self._arguments, file, self._kinds, False)
-                    yield self._answered(name, points, perception, perceive.sensor, wanted)
+                    yield self._answered(name, points, perception, perceive.sensor, wanted, at_s)
                 except (EdgepercError, OSError) as exc:
                     yield name, exc, None, None
                 except MemoryError:
                     yield name, PointsError(f"{len(points):,} points take more memory than there is"), None, None
         except (EdgepercError, OSError) as exc:
+            self._n += not numbered  # a scan that cannot be read takes its time, too
             yield shown, exc, None, None
 
     def _origin(self, scan: Path) -> Sequence[float] | None:
@@ -547,7 +550,7 @@ class _Run:
         from ..readers.files import read_points
         from ..readers.images import read_image
 
-        arguments, perceivers = self._arguments, self._perceivers
+        arguments, perceivers, at_s = self._arguments, self._perceivers, self._at_s(None)
         try:
             image = read_image(path)
             perceive = perceivers.of(perceivers.sensor_of(scan) if scan else stated_sensor(arguments))
@@ -564,7 +567,7 @@ class _Run:
                 calibration = Calibration.from_kitti(arguments.calib, image.shape[1], image.shape[0])
                 both, sensor = wanted.pop("both"), perceive.sensor
                 view.draw_painted(perception, image, points, calibration, both, sensor=sensor, title=path.name)
-            yield self._answered(path, points, perception, perceive.sensor, wanted, title=str(scan))
+            yield self._answered(path, points, perception, perceive.sensor, wanted, at_s, title=str(scan))
         except (EdgepercError, OSError) as exc:
             yield path, exc, None, None
         except MemoryError:
@@ -610,12 +613,12 @@ class _Run:
         perception: Perception,
         sensor: SensorProfile,
         wanted: Mapping[str, Path],
+        stamp_s: float,
         title: str | None = None,
     ) -> Outcome:
         """Track the boxes and write everything about a scan."""
         from .. import view
 
-        stamp_s = self._stamp_s(perception)
         tracks = None
         if self._tracker is not None:
             tracks = self._tracker.update(perception.boxes, stamp_s, self._pose(perception))
@@ -629,7 +632,7 @@ class _Run:
 
     def _track(self, perception: Perception) -> Tracks:
         assert self._tracker is not None
-        return self._tracker.update(perception.boxes, self._stamp_s(perception))
+        return self._tracker.update(perception.boxes, self._at_s(perception.stamp_s))
 
     def _pose(self, perception: Perception) -> list[list[float]] | None:
         """Pose of a sensor whose place in a map is known, seen from that of the first scan; its axes are the map's."""
@@ -639,10 +642,10 @@ class _Run:
         x, y, z = (a - b for a, b in zip(perception.origin_m, self._first_place, strict=True))
         return [[1.0, 0.0, 0.0, x], [0.0, 1.0, 0.0, y], [0.0, 0.0, 1.0, z], [0.0, 0.0, 0.0, 1.0]]
 
-    def _stamp_s(self, perception: Perception) -> float:
-        """Time of the next scan; scans without time stamps are 1 / ``--rate`` apart."""
+    def _at_s(self, stamp_s: float | None) -> float:
+        """Time of the next scan; scans without time stamps are 1 / ``--rate`` apart, whether or not they fail."""
         self._n += 1
-        return self._n / self._arguments.rate if perception.stamp_s is None else perception.stamp_s
+        return self._n / self._arguments.rate if stamp_s is None else stamp_s
 
 
 def _alone(
