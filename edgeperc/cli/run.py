@@ -7,6 +7,7 @@ import os
 import sys
 import time
 import warnings
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from functools import lru_cache
@@ -323,6 +324,9 @@ def _check_outputs(
     for scan, target in zip(scans, targets, strict=True):
         first = target / "000000" if scan in captures else target
         outputs += [("--out", file) for file in _files_of(arguments, first, kinds, bool(images)).values()]
+    for (_, file), n in Counter(outputs).items():
+        if n > 1:  # of a.png and a_scan.png
+            arguments.usage_error(f"the pictures of two images would both be {file}; rename one of the images")
     outputs += [("--gif", arguments.out / "tracks.gif")] if arguments.gif else []
     for name in wanted_sinks(arguments):
         value = getattr(arguments, name)

@@ -110,6 +110,7 @@ def test_wrong_usage(tmp_path: Path, model: Path, capsys: pytest.CaptureFixture[
     out, photos = ("--out", tmp_path / "out"), tmp_path / "photos"
     photos.mkdir()
     write_image(photos / "b.jpg")
+    twin = write_image(tmp_path / "a_scan.png")
     for arguments, said in (
         ((image, "--scan", scan, scan.with_name("c.bin"), "--model", model), "--scan: 2 scans for 1 image"),
         ((scan, "--scan", scan), "--scan: 1 scan for 0 images"),
@@ -118,6 +119,7 @@ def test_wrong_usage(tmp_path: Path, model: Path, capsys: pytest.CaptureFixture[
         ((image, "--live"), f"--live needs scans, and {image} is an image"),
         ((image, "--deskew", "--track"), "--deskew needs scans"),
         ((image, "--png", "--out", tmp_path, "--model", model), "is one of the images and would be overwritten"),
+        ((image, twin, "--scan", scan, las, "--png", *out, "--model", model), f"would both be {out[1] / 'a_scan.png'}"),
         ((photos, "--png", "--out", photos, "--model", model), "would be read with the images of its folder"),
     ):
         with pytest.raises(SystemExit, match="2"):
