@@ -15,22 +15,12 @@ from .apart import decode_apart, describe_apart
 from .bags import bag_files
 from .files import FileOptions, read_points, read_timed_file
 from .identify import KnownSensor, of_cloud, of_livox, of_metadata, of_packets, of_velodyne
-from .packets import LVX_MAGIC
-from .pcap import PCAP_MAGIC
+from .packets import capture_kind
 from .times import TimedScan, accumulate
 from .unknown import advice_for, missing
 
 SCAN_SUFFIXES = (".bin", ".npy", ".npz", ".pcd", ".ply")
 CAPTURE_SUFFIXES = (".bag", ".db3", ".lvx2", ".mcap", ".osf", ".pcap", ".pcapng")
-
-# First bytes of captures.
-_MAGIC = {
-    **dict.fromkeys(PCAP_MAGIC, ".pcap"),
-    b"#ROSBAG V": ".bag",
-    b"\x89MCAP0\r\n": ".mcap",
-    b"SQLite format 3\0": ".db3",
-    LVX_MAGIC: ".lvx2",
-}
 
 
 def read_scans(
@@ -268,7 +258,7 @@ def _readable_kind(path: Path) -> str:
         expected = "a scan, a folder of scans, a .pcap, .osf, .bag or .mcap"
         raise PointsError(f"{path}: {missing(path, 'file or folder', expected)}")
     kind = _kind(path)
-    if kind in CAPTURE_SUFFIXES and _kind_of(head := _head(path)) is None and (advice := advice_for(head)):
+    if kind in CAPTURE_SUFFIXES and capture_kind(head := _head(path)) is None and (advice := advice_for(head)):
         raise PointsError(f"{path}: this is {advice}")
     return kind
 
@@ -281,14 +271,7 @@ def _kind(path: Path) -> str:
     if not path.is_file():  # opening a pipe would block
         return "scan"
     by_name = path.suffix.lower() if path.suffix.lower() in CAPTURE_SUFFIXES else "scan"
-    return _kind_of(_head(path)) or by_name.replace("pcapng", "pcap")
-
-
-def _kind_of(head: bytes) -> str | None:
-    """The kind of a capture with these first bytes, if they are of one."""
-    if head[8:11] == b"OSF":
-        return ".osf"
-    return next((kind for magic, kind in _MAGIC.items() if head.startswith(magic)), None)
+    return capture_kind(_head(path)) or by_name.replace("pcapng", "pcap")
 
 
 def _head(path: Path) -> bytes:

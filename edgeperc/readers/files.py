@@ -30,6 +30,7 @@ from ..types.points import (
 )
 from .inflate import inflate, most_bytes
 from .origin import find_place
+from .packets import capture_kind
 from .pcd import begins_like_pcd, parse_pcd
 from .ply import parse_ply
 from .raw import column_names, parse_raw
@@ -226,6 +227,8 @@ def _parse(data: Bytes, name: str, options: FileOptions) -> _Read:
         table, is_named = parse_text(data, options.columns)
         return _of_named(table, options) if is_named else _of_columns(table, options)
     if options.columns is None and not name.endswith(".bin"):
+        if capture_kind(head) is not None:
+            raise PointsError("this is a recording of many scans; expected one scan file. edgeperc.read_scans reads it")
         raise PointsError(
             f"neither PCD, PLY, .npy, .npz nor text by its first bytes, {head[:8]!r}; if they are raw float32 values, "
             "name it .bin, or pass columns= (--columns) x y z remission"

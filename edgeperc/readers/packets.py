@@ -13,10 +13,19 @@ from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
 
-from .pcap import CutShortError, is_ethernet, pcap_packets
+from .pcap import PCAP_MAGIC, CutShortError, is_ethernet, pcap_packets
 
 LVX_MAGIC = b"livox_tech"
 """First bytes of Livox' own files."""
+
+# First bytes of captures.
+_MAGIC = {
+    **dict.fromkeys(PCAP_MAGIC, ".pcap"),
+    b"#ROSBAG V": ".bag",
+    b"\x89MCAP0\r\n": ".mcap",
+    b"SQLite format 3\0": ".db3",
+    LVX_MAGIC: ".lvx2",
+}
 
 # Bytes in front of the IP header and the place of the EtherType, by the link type: Ethernet, Linux cooked 1 and 2.
 _LINKS = {1: (14, 12), 113: (16, 14), 276: (20, 0)}
@@ -54,6 +63,13 @@ _LEAST_SHARE, _FEWEST_PACKETS = 0.05, 60
 
 # Datagrams of which fragments are awaited; more than a few at the same time are damage.
 _PENDING = 256
+
+
+def capture_kind(head: bytes) -> str | None:
+    """The kind of a capture with these first bytes, by its suffix; None if they are of none."""
+    if head[8:11] == b"OSF":
+        return ".osf"
+    return next((kind for magic, kind in _MAGIC.items() if head.startswith(magic)), None)
 
 
 class Datagram(NamedTuple):

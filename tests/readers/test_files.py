@@ -364,6 +364,22 @@ def test_points_that_the_header_does_not_declare_are_warned_of(tmp_path: Path, s
         np.testing.assert_array_equal(read_points(path), POINTS[:n])
 
 
+RECORDINGS = (
+    b"\xd4\xc3\xb2\xa1",
+    b"\n\r\r\n",
+    b"#ROSBAG V2.0\n\0",
+    b"\x89MCAP0\r\n",
+    b"SQLite format 3\0",
+    bytes(8) + b"OSF",
+)
+
+
+@pytest.mark.parametrize("head", RECORDINGS)
+def test_a_recording_is_no_scan_file(tmp_path: Path, head: bytes) -> None:
+    with pytest.raises(PointsError, match=r"a recording of many scans; .*edgeperc\.read_scans reads it"):
+        read_points(save(tmp_path, "drive.recorded", head + bytes(range(256))))
+
+
 def test_arrays_one_after_another_are_refused(tmp_path: Path) -> None:
     with pytest.raises(PointsError, match="several arrays one after another"):
         read_points(save(tmp_path, "a.npy", npy(POINTS) + npy(POINTS)))
