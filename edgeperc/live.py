@@ -292,31 +292,33 @@ class _Inbox:
     def __init__(self) -> None:
         self.stopped = threading.Event()
         self.n_scans = self.n_dropped = 0
-        self._changed = threading.Condition()
+        # Entered as a lock: a signal while a condition is entered leaves it locked.
+        self._lock = threading.RLock()
+        self._changed = threading.Condition(self._lock)
         self._scan: tuple[Any, float, float] | None = None
         self._ended = False
         self._error: BaseException | None = None
 
     def put(self, points: Any, stamp_s: float | None) -> None:
         arrived_s = time.monotonic()
-        with self._changed:
+        with self._lock:
             self.n_scans += 1
             self.n_dropped += self._scan is not None
             self._scan = points, arrived_s if stamp_s is None else stamp_s, arrived_s
             self._changed.notify()
 
     def end(self, error: BaseException | None) -> None:
-        with self._changed:
+        with self._lock:
             self._ended, self._error = True, error
             self._changed.notify_all()
 
     def stop(self) -> None:
-        with self._changed:
+        with self._lock:
             self.stopped.set()
             self._changed.notify_all()
 
     def take(self, timeout_s: float | None) -> tuple[tuple[Any, float, float], int, int] | None:
-        with self._changed:
+        with self._lock:
             if not self._changed.wait_for(lambda: self._scan or self._ended or self.stopped.is_set(), timeout_s):
                 return None
             if self.stopped.is_set():

@@ -177,7 +177,6 @@ class Pipeline:
     ) -> None:
         self.top, self.ranged, self.options, self._lanes = top, ranged, options, lanes
         self.objects, self.pillars = objects, pillars
-        self._free = deque(ranged)
         self._least_score = options.network_score if objects is None else min(options.network_score, MIN_DETECTOR_SCORE)
         projectors = [network.projector for network in (top, *ranged) if network is not None]
         self.needs_ground = (
@@ -222,7 +221,8 @@ class Pipeline:
             places = value("cluster", self.objects.cluster, scan, options.boxes_from, per_m)
 
         # The range image (PointSeg), once or for each sector of a turn
-        sectors = [value("refine", self._label_sector, k, near, scan, watch) for k in range(len(self.sectors))]
+        free = deque(self.ranged)  # of this call: an interrupt would lose one that a lane has taken
+        sectors = [value("refine", self._label_sector, k, near, scan, watch, free) for k in range(len(self.sectors))]
         if sectors:
             labels = value("refine", _joined, near, *sectors)
         elif self.ranged:
@@ -285,7 +285,9 @@ class Pipeline:
     def _label_ahead(self, near: View, scan: Scan | None, watch: Stopwatch) -> PointLabels:
         return self.ranged[0].label(near.points, None if scan is None else scan.ground.height_m, watch)
 
-    def _label_sector(self, k: int, near: View, scan: Scan | None, watch: Stopwatch) -> tuple[PointLabels, Ints | None]:
+    def _label_sector(
+        self, k: int, near: View, scan: Scan | None, watch: Stopwatch, free: deque[RangeImageNetwork]
+    ) -> tuple[PointLabels, Ints | None]:
         """Labels of the points in a sector of the turn, by a network that is free, and their rows."""
         turn_rad, crop = self.sectors[k]
         points, rows = crop.select(near.points)
@@ -293,11 +295,11 @@ class Pipeline:
         if heights is not None and rows is not None:
             heights = heights[rows]
         # What float32 cannot hold after the turn is not in view.
-        network = self._free.pop()
+        network = free.pop()
         try:
             return network.label(turned(points, turn_rad) if k else points, heights, watch), rows
         finally:
-            self._free.append(network)
+            free.append(network)
 
     def _agreed(
         self,

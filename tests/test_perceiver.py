@@ -7,6 +7,7 @@ import re
 import threading
 import time
 import warnings
+from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import replace
@@ -272,6 +273,27 @@ def in_threads(work: Sequence[Callable[[], None]]) -> None:
         thread.start()
     for thread in threads:
         thread.join()
+
+
+def test_an_interrupt_loses_no_network_of_a_full_turn(
+    monkeypatch: pytest.MonkeyPatch, full_turn: Perception, scan: SimulatedScan
+) -> None:
+    """A signal may come when a network has been taken, before anything else."""
+    signals: list[type[BaseException]] = []
+
+    class Taken(deque[Any]):
+        def pop(self) -> Any:
+            network = super().pop()
+            if signals:
+                raise signals.pop()
+            return network
+
+    monkeypatch.setattr(pipeline, "deque", Taken)
+    alone = Perceiver(["ssadnet", "pointseg"], provider="cpu", n_threads=1, on_mismatch="ignore", full_turn=True)
+    signals.append(KeyboardInterrupt)
+    with pytest.raises(KeyboardInterrupt):
+        alone(scan.points)
+    assert_same(full_turn, alone(scan.points))
 
 
 def test_perceivers_in_threads_give_the_same_result(perception: Perception, scan: SimulatedScan) -> None:

@@ -26,18 +26,23 @@ class _Calls:
 
     def __init__(self) -> None:
         self._changed = threading.Condition()
-        self._n, self._is_over = 0, False
+        self._n, self.is_over = 0, False
         self._is_watched = False
 
     @contextmanager
     def one(self) -> Iterator[None]:
-        """Surround a call into a library of C++, such as onnxruntime: the interpreter ends after it. Not nested."""
+        """Surround a call into a library of C++, such as onnxruntime: the interpreter ends after it. Not nested.
+
+        The main thread ends the interpreter itself, and signals may interrupt it here: it takes no lock, and no part.
+        """
+        if threading.current_thread() is threading.main_thread():
+            yield
+            return
         with self._changed:
             if not self._is_watched:
                 self._is_watched = True
                 atexit.register(self._end)
-            # A call from the main thread is one of another function that runs at the end.
-            is_late = self._is_over and threading.current_thread() is not threading.main_thread()
+            is_late = self.is_over
             self._n += not is_late
         if is_late:
             threading.Event().wait()  # until the interpreter has ended, and this thread with it
@@ -54,12 +59,17 @@ class _Calls:
 
     def _end(self) -> None:
         with self._changed:
-            self._is_over = True
+            self.is_over = True
             self._changed.wait_for(lambda: self._n == 0, LONGEST_CALL_S)
 
 
 _calls = _Calls()
 native_call = _calls.one
+
+
+def is_ending() -> bool:
+    """Whether the interpreter ends, and no other thread than the main one returns from a `native_call`."""
+    return _calls.is_over
 
 
 def kept_in_forks(thing: Thing) -> Thing:

@@ -6,10 +6,13 @@ import heapq
 import os
 import threading
 import time
+import weakref
 from collections.abc import Callable, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import suppress
+from queue import SimpleQueue
 from typing import Any, Generic, TypeVar
+
+from .interpreter import is_ending
 
 STAGES = ("check", "project", "infer", "decode", "refine", "cluster", "agree")
 
@@ -95,33 +98,47 @@ class Lanes:
         Two lanes take the first one that is ready whenever they have finished one, so what takes long stands first.
         The second lane is done when this returns or raises, so buffers may be overwritten afterwards.
         """
-        schedule = _Schedule(values)
-        beside = waiting = None
-        process = os.getpid()
+        schedule, beside = _Schedule(values), None
+        interrupt: BaseException | None = None  # of a signal, which comes to the caller alone
         try:
-            if self.n == 2:
-                try:
-                    beside = self._threads.get(process) or self._threads.setdefault(process, _Beside())
-                    waiting = beside.submit(schedule.compute)
-                except RuntimeError:  # no thread can be started, as while the interpreter ends
-                    self._threads.pop(process, None)  # it would compute them later, too
+            if self.n == 2 and (beside := self._beside()) is not None:
+                beside.submit(schedule)
             schedule.compute(values.watch)
         finally:
-            schedule.stop()
-            if waiting is not None:
-                wait([waiting])
-            if beside is not None:
-                beside.give_back()
-        if waiting is not None:
-            waiting.result()
+            while beside is not None:
+                try:
+                    beside.end(schedule)
+                    beside = None
+                except BaseException as exc:
+                    interrupt = exc
+            if interrupt is not None:
+                raise interrupt
+        schedule.tell()
+
+    def _beside(self) -> _Beside | None:
+        """The second thread of this process; None if it cannot be started, or while the interpreter ends."""
+        if is_ending():
+            return None
+        process = os.getpid()
+        try:
+            return self._threads.get(process) or self._threads.setdefault(process, _Beside())
+        except RuntimeError:
+            return None
 
 
 class _Schedule:
-    """Which of some values is next, for threads that compute them together."""
+    """Which of some values is next, for threads that compute them together.
+
+    A signal may interrupt the caller anywhere. One that comes while it enters a `Condition`, a method of Python, leaves
+    that locked for ever; one that comes while it enters the lock itself does not.
+    """
 
     def __init__(self, values: Sequence[Once[Any]]) -> None:
         self._values, self._left, self._last = values, len(values), ""
-        self._changed = threading.Condition()
+        self._lock = threading.RLock()
+        self._changed = threading.Condition(self._lock)
+        self._error: BaseException | None = None  # of the second thread
+        self.is_left = False  # by the second thread
         places = {value: place for place, value in enumerate(values)}
         self._users: list[list[int]] = [[] for _ in values]
         for place, value in enumerate(values):
@@ -139,7 +156,7 @@ class _Schedule:
             except BaseException:
                 self.stop()
                 raise
-            with self._changed:
+            with self._lock:
                 for user in self._users[place]:
                     self._missing[user] -= 1
                     if self._missing[user] == 0:
@@ -149,8 +166,22 @@ class _Schedule:
                 self._changed.notify()
             place = self._next(watch)
 
+    def compute_beside(self) -> None:
+        """The same in the second thread; `tell` raises its error."""
+        try:
+            self.compute()
+        except BaseException as exc:
+            self._error = exc
+        self.is_left = True
+
+    def tell(self) -> None:
+        """Raise the error of the second thread, if it had one."""
+        error, self._error = self._error, None
+        if error is not None:
+            raise error
+
     def _next(self, watch: Stopwatch | None) -> int | None:
-        with self._changed:
+        with self._lock:
             while self._left > 0 and not self._ready:
                 self._changed.wait()
                 if watch is not None:
@@ -159,9 +190,9 @@ class _Schedule:
 
     def stop(self) -> None:
         """No thread computes another value."""
-        with self._changed:
+        with self._lock:
             self._left = 0
-            self._changed.notify()
+            self._changed.notify_all()
 
 
 class _Beside:
@@ -173,18 +204,36 @@ class _Beside:
     """
 
     def __init__(self) -> None:
-        self._executor = ThreadPoolExecutor(1, thread_name_prefix="edgeperc-lane")
-        self._id = self._executor.submit(threading.get_native_id).result()
+        # Not an executor: a signal to the caller within its locks, which are conditions, would block the thread.
+        self._tasks = SimpleQueue[Callable[[], None] | None]()
+        thread = threading.Thread(target=_work, args=(self._tasks,), name="edgeperc-lane", daemon=True)
+        thread.start()
+        assert thread.native_id is not None
+        self._id = thread.native_id
         self._cores: set[int] = set()  # of the caller
         self._lent: set[int] = set()  # those of them that it keeps while the thread works; none if all of them
+        weakref.finalize(self, self._tasks.put, None).atexit = False
 
-    def submit(self, compute: Callable[[], None]) -> Future[None]:
-        """Let the thread compute; then `give_back`."""
+    def submit(self, schedule: _Schedule) -> None:
+        """Let the thread compute, too; then `end`, also if this was interrupted."""
         try:
             self._part(os.sched_getaffinity(0))
         except (AttributeError, OSError):  # not Linux; a sandbox may refuse it
             self._lent = set()
-        return self._executor.submit(compute)
+        self._tasks.put(schedule.compute_beside)
+
+    def end(self, schedule: _Schedule) -> None:
+        """Wait until the thread has left the schedule, and run on all cores again. Again, if it was interrupted."""
+        schedule.stop()
+        if not schedule.is_left:
+            reached = threading.Lock()
+            reached.acquire()
+            self._tasks.put(reached.release)
+            with reached:
+                pass
+        if self._lent:
+            with suppress(OSError):
+                os.sched_setaffinity(0, self._cores)
 
     def _part(self, cores: set[int]) -> None:
         if cores != self._cores:
@@ -195,11 +244,12 @@ class _Beside:
         if self._lent:
             os.sched_setaffinity(0, self._lent)
 
-    def give_back(self) -> None:
-        """Let the caller run on all of its cores again."""
-        if self._lent:
-            with suppress(OSError):
-                os.sched_setaffinity(0, self._cores)
+
+def _work(tasks: SimpleQueue[Callable[[], None] | None]) -> None:
+    """Do tasks until there is a None; the last one is not kept, nor its scan."""
+    for task in iter(tasks.get, None):
+        task()
+        del task
 
 
 def returns(call: Callable[[], object], limit_s: float) -> bool:

@@ -1,16 +1,20 @@
 from __future__ import annotations
 
 import os
+import subprocess
+import sys
 import threading
 import time
 import traceback
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+import edgeperc
 from edgeperc.system.lanes import Lanes, Stopwatch, Values
 
 if not hasattr(os, "sched_getaffinity"):
@@ -188,3 +192,48 @@ def test_waiting_counts_for_what_is_waited_for(n: int) -> None:
     value("agree", lambda _: None, slow)
     ALL_LANES[n].run(value)
     assert watch.ms["infer"] > 90.0 > watch.ms["check"] + watch.ms["agree"]
+
+
+INTERRUPTED = """
+import os, random, signal, sys
+sys.path.insert(0, {root!r})
+from edgeperc.system.interpreter import native_call
+from edgeperc.system.lanes import Lanes, Stopwatch, Values
+
+class Stop(Exception):
+    pass
+
+def stop(*_):
+    raise Stop
+
+def work(*needed):
+    with native_call():
+        return 1 + sum(sum(range(200)) * 0 + each for each in needed)
+
+cores, lanes, draw, n = os.sched_getaffinity(0), Lanes(2), random.Random(7), 0
+lanes.run(Values(Stopwatch()))
+signal.signal(signal.SIGALRM, stop)
+for k in range(4000):
+    value = Values(Stopwatch())
+    for _ in range(20):
+        value("check", work, *value[-3::2])
+    try:
+        try:
+            signal.setitimer(signal.ITIMER_REAL, draw.uniform(1e-5, 1e-3))
+            lanes.run(value)
+        finally:
+            signal.setitimer(signal.ITIMER_REAL, 0.0)
+    except Stop:
+        n += 1
+    signal.setitimer(signal.ITIMER_REAL, 0.0)
+    assert os.sched_getaffinity(0) == cores, k
+assert n > 100, n
+print("ends")
+"""
+
+
+def test_signals_neither_block_the_second_lane_nor_keep_cores() -> None:
+    """Wherever they come; nor does the end of the process wait for a call that they ended."""
+    code = INTERRUPTED.format(root=str(Path(edgeperc.__file__).parent.parent))
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=50.0)
+    assert done.stdout == "ends\n", done.stderr
