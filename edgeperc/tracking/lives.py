@@ -95,9 +95,9 @@ def fill_newborn(first_id: int, detections: Detections, classes: Records, tracks
 
 
 @njit(cache=True, nogil=True)
-def mark_out_of_view(tracks: Records, pose: Floats, left: float, right: float, reported: Mask) -> None:
-    """Exclude undetected tracks from the report if a corner of the footprint is outside the field of view, between
-    azimuths [rad] of the sensor at ``pose``.
+def mark_out_of_view(tracks: Records, pose: Floats, right: float, width: float, reported: Mask) -> None:
+    """Exclude undetected tracks from the report if a corner of the footprint is outside the field of view of the sensor
+    at ``pose``: that begins at the azimuth ``right`` and is so wide [rad].
     """
     for i in range(len(tracks)):
         if not reported[i] or tracks[i]["misses"] == 0:
@@ -110,7 +110,8 @@ def mark_out_of_view(tracks: Records, pose: Floats, left: float, right: float, r
             x = state[0] + along * cos - across * sin - pose[0, 3]
             y = state[1] + along * sin + across * cos - pose[1, 3]
             azimuth = math.atan2(x * pose[0, 1] + y * pose[1, 1], x * pose[0, 0] + y * pose[1, 0])
-            if not right <= azimuth <= left:
+            turns = (azimuth - right) / (2.0 * math.pi)
+            if not (turns - np.floor(turns)) * 2.0 * math.pi <= width:  # math.floor raises on NaN
                 reported[i] = False
 
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..errors import StampError, TrackingError
+from ..errors import OptionError, StampError, TrackingError
 from ..system.clock import GAP_S, LATEST_S, Clock, Step
 from ..types.perception import Box, Perception
 from ..types.points import Floats, Ints64, Records
@@ -90,11 +90,16 @@ class Tracker:
     parameters : mapping of str to ClassParameters, optional
         Parameters by class, in place of the defaults. A class without defaults gets those of cars, in its own group.
     field_of_view_deg : tuple of 2 float
-        Azimuths of the left and right edge of the detector's view [deg], counter-clockwise from +x. A track that leaves
-        it is no longer reported. Default: the full turn.
+        Azimuths of the left and right edge of the detector's view [deg], counter-clockwise from +x, the left one
+        higher: (220, 140) looks back. A track that leaves it is no longer reported. Default: the full turn.
     max_tracks : int
         Largest number of tracks, including tentative ones. Beyond it, the least likely tracks are deleted. This bounds
         memory and time.
+
+    Raises
+    ------
+    OptionError
+        The left edge is not to the left of the right one, or ``max_tracks`` is no whole number, or below 0.
 
     Examples
     --------
@@ -113,8 +118,10 @@ class Tracker:
         max_tracks: int = 1024,
     ) -> None:
         self._parameters: Mapping[str, ClassParameters] = PARAMETERS
-        self._left, self._right = np.radians(field_of_view_deg)
-        self._max_tracks = max_tracks
+        self._right, self._width = _checked_view(field_of_view_deg)
+        if not isinstance(max_tracks, int | np.integer) or max_tracks < 0:
+            raise OptionError(f"max_tracks is {max_tracks!r}; expected a whole number, 0 or more")
+        self._max_tracks = int(max_tracks)
         self._clock = Clock()
         self.reset()
         # Compile every kernel here, not in the first updates: a track begins, and is found again.
@@ -251,7 +258,7 @@ class Tracker:
         self._n_sessions += step == "jump"
         self._next_id += n_born
         reported = tracks["existence"] > 0.0
-        mark_out_of_view(tracks, pose, self._left, self._right, reported)
+        mark_out_of_view(tracks, pose, self._right, self._width, reported)
         strongest_first = np.argsort(-strength, kind="stable")
         mark_rivals(tracks["state"].copy(), tracks["shape"].copy(), strongest_first, reported)
         n_tentative = int(len(tracks) - np.count_nonzero(reported))
@@ -434,6 +441,20 @@ def _scores(tracks: Records, strength: Floats, classes: Records, pose: Floats) -
     away = _away(tracks["state"], classes, pose)
     scores = strength + classes["latest"] * (tracks["last_logit"] - strength)
     return np.asarray(scores + (classes["far_logit"] * away - classes["coasting_logit"] * tracks["misses"]))
+
+
+def _checked_view(field_of_view_deg: tuple[float, float]) -> tuple[float, float]:
+    """Azimuth of the right edge, and the width [rad]."""
+    try:
+        left, right = map(float, field_of_view_deg)
+    except (TypeError, ValueError):
+        left = right = math.nan
+    if not 0.0 < left - right < math.inf:
+        raise OptionError(
+            f"field_of_view_deg is {field_of_view_deg!r}; expected the azimuths of the left and the right edge, the "
+            "left one higher: (40, -40) looks ahead, (220, 140) back"
+        )
+    return math.radians(right), math.radians(left - right)
 
 
 def _checked_boxes(boxes: Iterable[Box]) -> tuple[Floats, Floats, list[str]]:

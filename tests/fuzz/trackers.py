@@ -35,7 +35,7 @@ class Trackers:
     def run(self, case: Case) -> str:
         rng = case.rng
         tracker = Tracker(
-            field_of_view_deg=case.pick([(180.0, -180.0), (45.0, -45.0), (0.0, 0.0), (-90.0, 90.0)]),
+            field_of_view_deg=case.pick([(180.0, -180.0), (45.0, -45.0), (1e-9, 0.0), (270.0, 90.0)]),
             max_tracks=int(case.pick([1024, 1024, 1, 0, 10])),
         )
         posed = bool(rng.random() < 0.3)

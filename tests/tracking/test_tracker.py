@@ -6,6 +6,7 @@ import math
 import tracemalloc
 from collections.abc import Iterator
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from hypothesis import strategies as st
 
 import edgeperc
 import twins.tracking
-from edgeperc import Box, StampError, Tracker, TrackingError
+from edgeperc import Box, OptionError, StampError, Tracker, TrackingError
 from edgeperc.tracking import lives
 from edgeperc.tracking.egomotion import fit_motion, nearest_detection, support
 from edgeperc.tracking.jpda import Detections
@@ -340,6 +341,28 @@ def test_a_track_that_leaves_the_field_of_view_is_no_longer_reported() -> None:
     assert len(reported) == 1
 
 
+@pytest.mark.parametrize("edges", [(220.0, 140.0), (-140.0, -220.0), (225.0, 135.0), (360.0, 0.0), (540.0, 180.0)])
+def test_a_view_to_the_rear_reports_what_coasts_on_either_side(edges: tuple[float, float]) -> None:
+    tracker, all_around = Tracker(field_of_view_deg=edges), Tracker()
+    for k in range(8):
+        boxes = [box("car", -20.0, y) for y in (-8.0, 0.0, 8.0)] if k < 7 else []
+        seen, reported = tracker.update(boxes, 0.1 * k, STANDING), all_around.update(boxes, 0.1 * k, STANDING)
+    assert seen.ids.tolist() == reported.ids.tolist() == [1, 2, 3]
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        *({"field_of_view_deg": edges} for edges in [(-140.0, 140.0), (0.0, 0.0), (math.nan, 0.0), (40.0,), None]),
+        *({"max_tracks": n} for n in [-1, 1.5, "9"]),
+    ],
+    ids=str,
+)
+def test_options_that_would_lose_tracks_are_refused(options: dict[str, Any]) -> None:
+    with pytest.raises(OptionError, match=f"{next(iter(options))} is "):
+        Tracker(**options)
+
+
 def test_crossing_pedestrians_keep_their_identities() -> None:
     tracker, rng, owners = Tracker(), np.random.default_rng(2), [set(), set()]
     for k in range(60):
@@ -550,7 +573,7 @@ def test_births_lives_and_views_are_those_of_the_twins(n: int, m: int) -> None:
     pose = np.array([[0.8, -0.6, 0, 3.0], [0.6, 0.8, 0, -4.0], [0, 0, 1, 0], [0, 0, 0, 1]])
     reported = rng.random(n) < 0.8
     stays = reported & ((tracks["misses"] == 0) | twins.tracking.in_view(tracks, pose, 0.9, -0.7))
-    lives.mark_out_of_view(tracks, pose, 0.9, -0.7, reported)
+    lives.mark_out_of_view(tracks, pose, -0.7, 0.9 + 0.7, reported)
     assert reported.tolist() == stays.tolist()
 
 
