@@ -169,9 +169,9 @@ class OccupancyGrid:
 
 def check_value(name: str, value: int) -> int:
     """A value of nav_msgs/OccupancyGrid, -1..100. Raises OptionError."""
-    if isinstance(value, bool) or not (isinstance(value, int) and UNKNOWN <= value <= OCCUPIED):
+    if isinstance(value, bool) or not (isinstance(value, int | np.integer) and UNKNOWN <= value <= OCCUPIED):
         raise OptionError(f"{name} is {value!r}; expected a whole number from -1 to 100")
-    return value
+    return int(value)
 
 
 def grid_message(

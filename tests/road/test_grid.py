@@ -85,6 +85,7 @@ def test_a_street_with_a_wall(cell_m: float) -> None:
 def test_values_of_a_message() -> None:
     points = street()
     grid = occupancy_grid(perceived(points), points)
+    assert (grid.values(np.int64(50)) == grid.values(50)).all()
     message = grid.to_occupancy_grid("velodyne", off_road=50)
     info, data = message["info"], message["data"]
     assert message["header"] == {"stamp": {"sec": 12, "nanosec": 250_000_000}, "frame_id": "velodyne"}
