@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..errors import OptionError, StampError, TrackingError
-from ..system.clock import GAP_S, LATEST_S, Clock, Step
+from ..system.clock import GAP_S, LATEST_S, Clock, Step, check_seconds
 from ..types.perception import Box, Perception
 from ..types.points import Floats, Ints64, Records
 from ..types.rigid import rigid
@@ -198,10 +198,8 @@ class Tracker:
         UserWarning
             A scan was late or doubled, or the clock jumped; once each.
         """
-        try:
-            stamp_s = float(stamp_s)
-        except (OverflowError, TypeError, ValueError) as exc:
-            raise StampError(f"got a stamp_s that is no number ({exc}); expected the time of the scan [s]") from exc
+        check_seconds(stamp_s)
+        stamp_s = float(stamp_s)
         if not abs(stamp_s) <= LATEST_S:
             raise StampError(f"got a scan at {stamp_s} s; expected a finite time in seconds, up to {LATEST_S:g}")
         step, clock = self._clock.after(stamp_s)

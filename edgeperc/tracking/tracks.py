@@ -4,21 +4,35 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any, overload
 
 import numpy as np
 
+from ..errors import OptionError
+from ..system.fields import Fields
 from ..types.geometry import wrapped
 from ..types.perception import Box
 from ..types.points import Floats, Ints64, Records
 from .lives import MOVED
 from .ukf import MODES
 
+_FIELDS = Fields("parameters", OptionError)
+# Lowest and highest value of those that may be 0 or below, and of shares: tracks would be lost without a word.
+_BOUNDS = {
+    **dict.fromkeys(("birth_score", "sure_score", "latest"), (0.0, 1.0)),
+    **dict.fromkeys(("far_logit", "coasting_logit"), (-1e6, 1e6)),
+    **dict.fromkeys(("memory_s", "moving_mps", "still_mps"), (0.0, 1e6)),
+    "detection": (1e-3, 0.999),
+    "clutter": (1e-12, 1e6),
+}
+
 
 @dataclass(frozen=True, slots=True)
 class ClassParameters:
-    """Parameters of motion, detection and life of tracks for one class of objects; without a unit, of one scan."""
+    """Parameters of motion, detection and life of tracks for one class of objects; without a unit, of one scan.
+    OptionError for one that is no number, or out of its bounds.
+    """
 
     group: str  # classes of one group may be confused: the label of a track changes only within its group
     # Constant velocity and CTRV: standard deviations of acceleration and turn acceleration.
@@ -51,6 +65,14 @@ class ClassParameters:
     # so at the same score a near object is more often false. 0 for a detector with calibrated scores.
     far_logit: float = 0.0
     coasting_logit: float = 0.0  # log odds subtracted from the score for each scan since the last detection
+
+    def __post_init__(self) -> None:
+        for each in fields(self):
+            value, bounds = getattr(self, each.name), _BOUNDS.get(each.name, (1e-6, 1e6))
+            if each.name == "shape_m":
+                _FIELDS.numbers(each.name, value, 4, *bounds)
+            elif each.name != "group":
+                _FIELDS.number(each.name, value, *bounds)
 
 
 # The weights of scores were chosen on ten KITTI sequences. Only far_logit was fixed on one half and confirmed on the

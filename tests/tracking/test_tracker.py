@@ -580,3 +580,24 @@ def test_births_lives_and_views_are_those_of_the_twins(n: int, m: int) -> None:
 def assert_same_tracks(tracks: np.ndarray, wanted: np.ndarray) -> None:
     for name in tracks.dtype.names:
         np.testing.assert_allclose(tracks[name], wanted[name], atol=1e-9, err_msg=name)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        *({"detection": value} for value in (1.0, 0.0, math.nan, "0.8")),
+        *({"memory_s": value} for value in (math.nan, -1.0, math.inf)),
+        *({"birth_score": 2.0}, {"along_m": 0.0}, {"gate": -1.0}, {"range_m": 0.0}, {"clutter": 0.0}),
+        *({"shape_m": value} for value in ((0.1, 0.1, 0.1), (0.1, 0.1, 0.1, math.nan), 0.1)),
+    ],
+    ids=str,
+)
+def test_parameters_that_would_lose_tracks_are_refused(changes: dict[str, Any]) -> None:
+    with pytest.raises(OptionError, match=rf"{next(iter(changes))}.* is .*; expected"):
+        replace(PARAMETERS["car"], **changes)
+
+
+@pytest.mark.parametrize("stamp_s", ["3", b"3", None, 1j, [0.1]])
+def test_a_stamp_is_a_number_of_seconds(stamp_s: Any) -> None:
+    with pytest.raises(StampError, match=r"stamp_s is .*; expected the time of the scan"):
+        Tracker().update([], stamp_s)
