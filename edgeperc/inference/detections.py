@@ -8,12 +8,13 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
+from ..errors import InferenceError
 from ..types.card import ModelCard
 from ..types.detector import CENTER_VALUES, AnchorHead, CenterHead, PillarGeometry
 from ..types.geometry import suppress_overlaps, wrapped
 from ..types.perception import Box
 from ..types.points import Floats, Floats32, Ints64
-from .box_heads import SIZE_RANGE_M, count_not_finite, logit, raise_not_finite, sigmoid
+from .box_heads import MAX_PROBABILITY, SIZE_RANGE_M, count_not_finite, logit, raise_not_finite, sigmoid
 
 BEYOND_M = 5.0
 """A box whose center is farther out of the view is dropped."""
@@ -176,6 +177,11 @@ def _best(
     order = np.argsort(-values, kind="stable")[: head.max_candidates]
     place = np.unravel_index(at[order], best.shape)
     scores = sigmoid(values[order].astype(np.float64)) if are_logits else values[order].astype(np.float64)
+    if not are_logits and best.size and not (best.min() >= 0.0 and best.max() <= MAX_PROBABILITY):
+        raise InferenceError(
+            f"the best scores of the head's positions are {best.min():g} to {best.max():g}; expected probabilities, 0 "
+            "to 1. Check the card: an output without sigmoid or softmax has head.scores logits"
+        )
     return place, raw[place].argmax(axis=1), np.clip(scores, 0.0, 1.0)
 
 

@@ -427,6 +427,13 @@ def test_order_of_sine_and_cosine_and_probabilities(seed: int) -> None:
     assert [box.score for box in found] == pytest.approx([box.score for box in one], abs=1e-6)
 
 
+def test_logits_that_a_card_calls_probabilities_are_refused() -> None:
+    """They were clipped: each above 1 was a box with a score of 1."""
+    maps = random_maps(0)
+    with pytest.raises(InferenceError, match=r"best scores of the head's positions are -.* has head\.scores logits"):
+        decoded({kind: (kind, values) for kind, values in maps.items()}, replace(GROUPS, scores="probabilities"))
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_boxes_of_a_group_do_not_overlap(seed: int) -> None:
     """Whatever their classes, as in OpenPCDet and mmdetection3d; those of two groups may."""
