@@ -77,7 +77,11 @@ def _check(image: Any) -> None:
     check_size(*image.size)
     if getattr(image, "n_frames", 1) != 1:
         raise ImageError(f"the file holds {image.n_frames} images; expected one")
-    deep = any(";16" in str(tile[3]) for tile in image.tile)
+    # A PPM file says its largest value, up to 65535, which Pillow would scale to 255.
+    deep = any(
+        ";16" in str(tile[3]) or (isinstance(tile[3], tuple) and str(tile[0]).startswith("ppm") and tile[3][1] > 255)
+        for tile in image.tile
+    )
     if deep or image.mode in ("I", "F") or image.mode.startswith("I;"):
         raise ImageError(
             f"the image has more than 8 bits a channel (mode {image.mode}); which of them to keep depends on the "

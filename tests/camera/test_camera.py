@@ -324,6 +324,8 @@ def test_files_that_are_not_images(tmp_path: Path, image: NDArray[np.uint8]) -> 
         "postscript": (b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 9 9\n%%EndComments\n", "another format than BMP"),
         "16 bits of gray": (saved(pillow.fromarray(np.zeros((4, 5), np.uint16)), "PNG"), "more than 8 bits a channel"),
         "16 bits of color": (png(5, 4, 16, 2, rows), "more than 8 bits a channel"),
+        "16 bits of color as PPM": (b"P6\n2 1\n65535\n" + bytes(12), "more than 8 bits a channel"),
+        "12 bits of color as text": (b"P3\n1 1\n4095\n0 900 4095\n", "more than 8 bits a channel"),
         "bits": (saved(picture.convert("1"), "PNG"), "of mode 1; expected colors"),
         "cmyk": (saved(picture.convert("CMYK"), "JPEG"), "of mode CMYK; expected colors"),
         "tiff": (saved(picture, "TIFF"), "another format than BMP"),
