@@ -280,6 +280,11 @@ class ModelCard:
         unlisted = [c for c in (*self.box_classes, *self.box_size_priors) if c not in self.classes]
         if unlisted:
             raise CardError(f"box classes {reprlib.repr(unlisted)} are not among the classes {self.classes}")
+        if self.classes[0] in self.box_classes:
+            raise CardError(
+                f"box_classes {reprlib.repr(self.box_classes)} hold {reprlib.repr(self.classes[0])}, the first of the "
+                "classes, which is the background; list the background first in classes, and no box has it"
+            )
         if (
             self.box_size_spreads
             and not set(self.box_classes) <= self.box_size_spreads.keys() & self.box_size_priors.keys()

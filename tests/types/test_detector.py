@@ -174,3 +174,13 @@ def test_a_head_is_of_pillars_alone() -> None:
     for kind in ("cls_preds", "heatmap"):
         with pytest.raises(CardError, match="expected one class output"):
             replace(card, **ahead, head=None, outputs=(OutputSpec("y", kind),))  # type: ignore[arg-type]
+
+
+def test_a_class_of_boxes_is_not_the_background() -> None:
+    """The network's own classes, which have no background, as the classes of the card: the first was the background."""
+    given = document()
+    given["classes"] = given["box_classes"]
+    with pytest.raises(
+        CardError, match=r"box_classes .* hold 'car', the first of the classes, which is the background"
+    ):
+        ModelCard.from_json(json.dumps(given))
