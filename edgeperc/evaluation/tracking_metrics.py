@@ -168,6 +168,11 @@ class _Packed:
         if as_ab3dmot:  # np.round is off by one in the last digit for some numbers, which moves a threshold
             scores = np.array([float(f"{score:f}") for score in scores.tolist()], np.float64)
         self.mean_score = self.averaged(scores)
+        if not as_ab3dmot:  # rounding would order tracks of one score by their lengths, and split them at thresholds
+            lowest, highest = np.full(self.n_tracks, math.inf), np.full(self.n_tracks, -math.inf)
+            np.minimum.at(lowest, self.track, scores)
+            np.maximum.at(highest, self.track, scores)
+            self.mean_score = np.clip(self.mean_score, lowest, highest)
         self.once_matched = np.zeros(len(self.track), np.bool_)
 
     def averaged(self, scores: Floats) -> Floats:

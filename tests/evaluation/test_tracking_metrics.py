@@ -270,3 +270,11 @@ def test_clear_agrees_with_motmetrics() -> None:
     assert ours.n_missed == wanted["num_misses"]["all"]
     assert wanted["num_switches"]["all"] == 1
     assert ours.motp == pytest.approx(1.0 - wanted["motp"]["all"])
+
+
+@pytest.mark.parametrize("score", [0.1, 0.7, 0.9, 0.95])
+def test_tracks_of_one_score_stay_together(score: float) -> None:
+    """The mean of 0.9 over three frames is rounded above it: tracks were ordered by their lengths."""
+    frames = [[(name, 10.0 * name) for name in range(12) if frame < 3 + name] for frame in range(20)]
+    tracks = [tracks_of(*objects, score=score) for objects in frames]
+    assert evaluate_tracks([([truth_of(*objects) for objects in frames], tracks)]).amota == pytest.approx(1.0)
