@@ -14,7 +14,7 @@ from edgeperc import __version__
 from edgeperc.cli.arguments import Options, options
 from edgeperc.cli.output import print_error, print_line
 from edgeperc.cli.program import Parser, run_program
-from edgeperc.errors import EdgepercError, MissingExtraError, ModelError
+from edgeperc.errors import CardError, EdgepercError, MissingExtraError, ModelError
 from edgeperc.types.choices import PLACES
 
 from .database.cli import add_database_commands
@@ -294,7 +294,7 @@ def _export(args: argparse.Namespace) -> int:
     from .release.to_onnx import export
     from .training.checkpoint import read_checkpoint
 
-    metrics = json.loads(args.metrics.read_text()) if args.metrics else None
+    metrics = json.loads(_json_text(args.metrics)) if args.metrics else None
     trained = read_checkpoint(args.checkpoint)
     task = trained["recipe"].task
     card = export(
@@ -335,6 +335,12 @@ def _add_card(command: Command) -> None:
     add("out", ".onnx file to write", type=Path)
 
 
+def _json_text(path: Path) -> str:
+    """A file's text in the encoding that JSON was written in: that of a redirection on Windows is UTF-16."""
+    content = path.read_bytes()
+    return content.decode(json.detect_encoding(content))
+
+
 def _card(args: argparse.Namespace) -> int:
     import onnx
     from google.protobuf.message import DecodeError  # type: ignore[import-untyped]
@@ -347,7 +353,17 @@ def _card(args: argparse.Namespace) -> int:
         model = onnx.load(args.model)
     except DecodeError as exc:
         raise ModelError(f"{args.model} is not an ONNX model: {exc}") from exc
-    card = with_golden(model, ModelCard.from_json(args.card.read_text()))
+    except onnx.checker.ValidationError as exc:  # of weights outside, which PyTorch writes beside a graph
+        raise ModelError(
+            f"{args.model} keeps weights in another file, which cannot be read: {exc}. Keep both files in one folder, "
+            "or export the network with external_data=False"
+        ) from exc
+    try:
+        text = _json_text(args.card)
+        card = ModelCard.from_json(text)
+    except (CardError, UnicodeDecodeError) as exc:
+        raise CardError(f"{args.card}: {exc}") from exc
+    card = with_golden(model, card)
     write_card(model, card, args.out)
     print_line(f"{args.out}: {card.name} {card.version}")
     return 0

@@ -248,6 +248,11 @@ def with_golden(model: onnx.ModelProto, card: ModelCard) -> ModelCard:
             raise CardMismatchError(
                 f"{spec.name!r} has shape {output.shape} in the graph; its card declares {expected}"
             )
+        if not np.isfinite(output).all():
+            raise CardMismatchError(
+                f"the graph gives values of {spec.name!r} that are not finite for an input of noise in -1 to 1; look "
+                "for NaN among its weights, and for logarithms, roots and divisions"
+            )
         few = output.size <= N_GOLDEN_VALUES
         at = np.arange(output.size) if few else np.random.default_rng(0).integers(output.size, size=N_GOLDEN_VALUES)
         records[spec.name] = {

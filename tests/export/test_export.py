@@ -988,7 +988,15 @@ def _of_two_scans(model: onnx.ModelProto) -> None:
     model.graph.input[0].type.tensor_type.shape.dim[0].dim_value = 2
 
 
+def _not_finite(model: onnx.ModelProto) -> None:
+    weights = next(each for each in model.graph.initializer if len(each.dims) == 4)
+    values = onnx.numpy_helper.to_array(weights).copy()
+    values[0] = np.nan
+    weights.CopyFrom(onnx.numpy_helper.from_array(values, weights.name))
+
+
 FOREIGN = {
+    "the graph gives values of 'probabilities' that are not finite": _not_finite,
     r"card names outputs \['probabilities'\], the graph has \['scores'\]": _renamed,
     "cannot open the graph: .*PPScatterPlugin": _of_a_plugin,
     r"does not run on inputs as the card declares them, \{'scan': \(1, 2, 32, 1024\)\}: .*Expected: 2": _of_two_scans,
@@ -1007,6 +1015,38 @@ def test_a_graph_that_does_not_fit_is_told_of(
     (tmp_path / "card.json").write_text(card.to_json())
     assert main(["card", *(str(tmp_path / name) for name in ("wrong.onnx", "card.json", "out.onnx"))]) == 2
     assert re.search(message, capsys.readouterr().err)
+
+
+def test_weights_that_stayed_elsewhere_are_told_of(
+    tmp_path: Path, third_party: tuple[Path, ModelCard], capsys: pytest.CaptureFixture[str]
+) -> None:
+    """PyTorch writes them beside the graph, in a file that is easily left behind; that was a traceback."""
+    path, card = third_party
+    model = onnx.load(path)
+    onnx.save(model, tmp_path / "network.onnx", save_as_external_data=True, location="weights", size_threshold=0)
+    (tmp_path / "card.json").write_text(card.to_json())
+    command = ["card", *(str(tmp_path / name) for name in ("network.onnx", "card.json", "out.onnx"))]
+    assert main(command) == 0
+    (tmp_path / "weights").unlink()
+    assert main(command) == 2
+    assert "network.onnx keeps weights in another file, which cannot be read" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16"])
+def test_a_card_in_an_encoding_of_windows(encoding: str, tmp_path: Path, third_party: tuple[Path, ModelCard]) -> None:
+    """Its shell and editors write these, such as for ``edgeperc info pointseg --json > card.json``."""
+    path, card = third_party
+    (tmp_path / "card.json").write_text(replace(card, version="2é").to_json(), encoding=encoding)
+    assert main(["card", str(path), str(tmp_path / "card.json"), str(tmp_path / "out.onnx")]) == 0
+    assert ModelCard.read(tmp_path / "out.onnx").version == "2é"
+
+
+def test_a_card_that_is_no_text_is_named(
+    tmp_path: Path, third_party: tuple[Path, ModelCard], capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "card.json").write_bytes('{"name": "é"}'.encode("latin-1"))
+    assert main(["card", str(third_party[0]), str(tmp_path / "card.json"), str(tmp_path / "out.onnx")]) == 2
+    assert "card.json: 'utf-8' codec can't decode byte 0xe9" in capsys.readouterr().err
 
 
 def test_weights_have_the_terms_of_their_scans() -> None:
