@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import argparse
 import os
+import re
 import sys
 import time
 import warnings
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from functools import lru_cache
 from pathlib import Path
@@ -66,6 +67,7 @@ if TYPE_CHECKING:
 
 
 _KINDS = ("png", "html", "labels", "ply")
+_NUMBERED = re.compile(r"\d{6,}\.bin")  # the file of ``--static`` of a scan in a capture
 
 
 def add_parser(commands: Commands) -> None:
@@ -333,6 +335,7 @@ def _check_outputs(
         outputs += [(f"--{name}", value)] if isinstance(value, Path) else []
     if arguments.static is not None:  # scans of a capture get numbers
         written_of = [scan for scan in (images.values() if images else scans) if scan is not None]
+        _check_static(arguments, written_of, captures)
         names = {"000000.bin" if scan in captures else scan.name for scan in written_of}
         outputs += [("--static", arguments.static / name) for name in sorted(names)]
     if arguments.labels_for == "cvat":
@@ -351,6 +354,25 @@ def _check_outputs(
         other = written.setdefault(_real(file), option)
         if other != option:
             arguments.usage_error(f"{other} and {option} both write {file}; choose another name for one of them")
+
+
+def _check_static(arguments: argparse.Namespace, scans: Sequence[Path], captures: Collection[Path]) -> None:
+    """Check that no file of ``--static`` replaces another scan of the run, which may not even have been read yet."""
+    sources = {_real(scan) for scan in scans}
+    replaced = {
+        file
+        for scan in scans
+        if scan not in captures and (file := _real(arguments.static / scan.name)) in sources - {_real(scan)}
+    }
+    if captures:  # their scans get numbers, and nobody knows yet how many there are
+        folder = Path(_real(arguments.static))
+        beside = {source for source in sources if Path(source).parent == folder}
+        replaced |= {source for source in beside if _NUMBERED.fullmatch(Path(source).name)}
+    if replaced:
+        arguments.usage_error(
+            f"{min(replaced)} is one of the scans and would be overwritten by --static with another one; choose "
+            "another folder"
+        )
 
 
 def _is_capture(scan: Path | Remote) -> bool:
@@ -571,7 +593,7 @@ class _Run:
                 calibration = Calibration.from_kitti(arguments.calib, image.shape[1], image.shape[0])
                 both, sensor = wanted.pop("both"), perceive.sensor
                 view.draw_painted(perception, image, points, calibration, both, sensor=sensor, title=path.name)
-            yield self._answered(path, points, perception, perceive.sensor, wanted, at_s, title=str(scan))
+            yield self._answered(path, points, perception, perceive.sensor, wanted, at_s, scan)
         except (EdgepercError, OSError) as exc:
             yield path, exc, None, None
         except MemoryError:
@@ -618,20 +640,21 @@ class _Run:
         sensor: SensorProfile,
         wanted: Mapping[str, Path],
         stamp_s: float,
-        title: str | None = None,
+        scan: Path | None = None,
     ) -> Outcome:
-        """Track the boxes and write everything about a scan."""
+        """Track the boxes and write everything about a scan; ``scan`` is its file if ``name`` is its image."""
         from .. import view
 
+        source = str(scan or name)
         tracks = None
         if self._tracker is not None:
             tracks = self._tracker.update(perception.boxes, stamp_s, self._pose(perception))
         if self._straightener is not None and tracks is not None:
             self._straightener.follow(tracks)
         try:
-            _write(points, perception, wanted, title=title or str(name))
+            _write(points, perception, wanted, title=source)
         finally:  # a picture that cannot be written costs no sink its scan
-            self._sinks.write(PerceivedScan(str(name), stamp_s, points, perception, tracks, sensor))
+            self._sinks.write(PerceivedScan(source, stamp_s, points, perception, tracks, sensor))
         return name, perception, tracks, view.flatten_scan(points, perception) if self._arguments.gif else None
 
     def _track(self, perception: Perception) -> Tracks:

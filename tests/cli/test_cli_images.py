@@ -88,6 +88,21 @@ def test_an_image_with_its_scan(tmp_path: Path, model: Path, capsys: pytest.Capt
     assert "40 x 30 pixels: Road 100.0 %  40 points" in line
 
 
+def test_what_is_written_of_a_scan_with_its_image_is_of_the_scan(
+    tmp_path: Path, model: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    image, scan = write_image(tmp_path / "image_2/0.png"), write_scan(tmp_path / "0.bin")
+    before, out = scan.read_bytes(), tmp_path / "out"
+    options = ("--model", model, "--model", "pointseg", *CPU, "--on-mismatch", "ignore")
+    labels = ("--labels-for", "labelcloud", "--out", out)
+    assert run("run", image, "--scan", scan, *options, "--movable", "--static", out, *labels) == 0
+    assert json.loads((out / "labels/0.json").read_text())["path"] == str(scan)
+    assert (out / "0.bin").stat().st_size
+    assert run("run", image, "--scan", scan, *options, "--movable", "--static", tmp_path) == 1
+    assert "is the scan itself" in capsys.readouterr().err
+    assert scan.read_bytes() == before
+
+
 def test_an_image_that_fails_leaves_the_others(tmp_path: Path, model: Path, capsys: pytest.CaptureFixture[str]) -> None:
     bad, good = tmp_path / "bad.jpg", write_image(tmp_path / "good.png")
     bad.write_bytes(b"\xff\xd8\xff")

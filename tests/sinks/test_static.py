@@ -175,6 +175,21 @@ def test_the_command_writes_every_scan(tmp_path: Path, monkeypatch: pytest.Monke
         assert left.value.code == 2
 
 
+@pytest.mark.parametrize("paths", [("a", "b"), ("b", "a"), ("a", "drive.pcap")])
+def test_no_scan_is_replaced_by_another_one(
+    paths: tuple[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, "edgeperc.perceiver", SimpleNamespace(Perceiver=Standing))
+    for folder in "ab":
+        (tmp_path / folder).mkdir()
+        POINTS.tofile(tmp_path / folder / "000001.bin")
+    (tmp_path / "drive.pcap").write_bytes(bytes(24))
+    with pytest.raises(SystemExit):
+        run("run", *(tmp_path / path for path in paths), "--movable", "--static", tmp_path / "a")
+    assert "would be overwritten by --static with another one" in capsys.readouterr().err
+    assert (tmp_path / "a/000001.bin").read_bytes() == POINTS.tobytes()
+
+
 def test_a_sink_made_before_one_that_cannot_be_is_closed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     closed = []
     monkeypatch.setattr("edgeperc.sinks.page.PageSink.close", lambda self, whole: closed.append(self))
