@@ -130,6 +130,12 @@ def nanoseconds(stamp_s: float) -> int:
     return nanoseconds_of(stamp_s)
 
 
+def _velocity(scan: PerceivedScan, track: Track) -> Floats:
+    """Velocity of a track over ground along x, y, z of the scan's frame, which may be tilted (3,) [m/s]."""
+    assert scan.tracks is not None
+    return np.asarray(track.world_velocity @ scan.tracks.T_world_sensor[:3, :3])
+
+
 class RosMessages:
     """Makes messages of perceived scans, serializes them and reads clouds.
 
@@ -257,12 +263,12 @@ class RosMessages:
             number = track.id % 2**31
             edges = box_corners(replace(box, center=(0.0, 0.0, 0.0), yaw=0.0))[np.ravel(EDGES)]  # in the marker's pose
             add("tracks", number, _LINE_LIST, pose=self._pose(box), points=edges, scale=(0.08, 0.0, 0.0), color=color)
-            speed_mps = math.hypot(*track.velocity)
+            speed_mps = math.hypot(*track.world_velocity)
             above = (*box.center[:2], box.center[2] + box.size[2] / 2.0 + 0.5)
             pose, text = self._pose(center=above), f"{track.label} {track.id} {speed_mps:.1f} m/s"
             add("track_labels", number, _TEXT, pose=pose, scale=(0.0, 0.0, 0.6), color=color, text=text)
             if speed_mps > _MOVING_MPS:
-                way = np.array([box.center, np.add(box.center, [*track.velocity, 0.0])])
+                way = np.array([box.center, np.add(box.center, _velocity(scan, track))])
                 add("track_velocities", number, _ARROW, scale=(0.15, 0.3, 0.3), color=color, points=way)
         return self._make("visualization_msgs/msg/MarkerArray", markers=markers)
 
@@ -381,7 +387,7 @@ class RosMessages:
         step = self._duration(_PATH_STEP_S)
         objects = []
         for track in scan.tracked or ():
-            way = np.array([*track.velocity, 0.0]) * _PATH_STEP_S
+            way = _velocity(scan, track) * _PATH_STEP_S
             places = [np.add(track.box.center, k * way).tolist() for k in range(_PATH_STEPS + 1)]
             path = self._make(
                 "autoware_perception_msgs/msg/PredictedPath",
@@ -414,12 +420,14 @@ class RosMessages:
         """Pose, twist and acceleration of a track; ``before`` their names."""
         assert scan.tracks is not None
         cos, sin = math.cos(track.box.yaw), math.sin(track.box.yaw)
-        vx, vy = track.velocity
+        vx, vy, vz = _velocity(scan, track)
         pose, twist = np.zeros((6, 6)), np.zeros((6, 6))
-        R = scan.tracks.T_world_sensor[:2, :2]
-        pose[:2, :2], pose[5, 5], twist[0, 0] = R.T @ track.covariance[:2, :2] @ R, *track.covariance[[3, 2], [3, 2]]
+        R = scan.tracks.T_world_sensor[:3, :3]
+        pose[:2, :2] = R[:2, :2].T @ track.covariance[:2, :2] @ R[:2, :2]
+        pose[5, 5], twist[0, 0] = track.covariance[[3, 2], [3, 2]]
         zero = self._xyz((0.0, 0.0, 0.0))
-        along = self._twist((cos * vx + sin * vy, cos * vy - sin * vx, 0.0), float(track.state[4]))
+        # The turn is about z of the tracker's frame: of a sensor that hangs upside down, the other way round.
+        along = self._twist((cos * vx + sin * vy, cos * vy - sin * vx, vz), float(R[2, 2] * track.state[4]))
         return {
             f"{before}pose_with_covariance": self._with("Pose", self._pose(track.box), pose),
             f"{before}twist_with_covariance": self._with("Twist", along, twist),

@@ -164,10 +164,9 @@ class _Channels:
     def _write_tracks(self, scan: PerceivedScan) -> None:
         assert scan.tracks is not None
         make, entities, trails = self._messages, [], self._trails.update(scan.tracks)
-        R = scan.tracks.T_world_sensor[:3, :3]
         for track in scan.tracks:
             box, color = track.world_box, self._color(track.label, 1.0)
-            dx, dy, _ = R @ [*track.velocity, 0.0]
+            dx, dy, _ = track.world_velocity
             speed = math.hypot(dx, dy)
             lines = [self._line("LineList", box_corners(box)[np.ravel(EDGES)], color)]
             lines.append(self._line("LineStrip", trails[track.id], color))

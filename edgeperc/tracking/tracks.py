@@ -164,6 +164,11 @@ class Track:
     coasting: bool
 
     @property
+    def world_velocity(self) -> Floats:
+        """Velocity over ground along x, y, z of the frame of ``world_box``, (3,) float64 [m/s]."""
+        return float(self.state[2]) * np.array([math.cos(self.state[3]), math.sin(self.state[3]), 0.0])
+
+    @property
     def center(self) -> tuple[float, float, float]:
         """Center of ``box``, x, y, z [m]."""
         return self.box.center

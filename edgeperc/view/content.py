@@ -148,7 +148,7 @@ def box_text(box: Box) -> str:
 
 def track_text(track: Track) -> str:
     """Id, label and speed of a track."""
-    return f"#{track.id} {printable(track.label)} {math.hypot(*track.velocity):.1f} m/s"
+    return f"#{track.id} {printable(track.label)} {math.hypot(*track.world_velocity):.1f} m/s"
 
 
 def class_facts(perception: Perception) -> dict[str, list[str]]:

@@ -234,7 +234,7 @@ def _write_names(pen: Any, tracks: Sequence[Track], font: Any) -> None:
     for track, area in zip(tracks, list(taken), strict=True):
         if area[2] < panel[0] or area[0] > panel[2] or area[3] < panel[1] or area[1] > panel[3]:
             continue
-        speed = math.hypot(*track.velocity)
+        speed = math.hypot(*track.world_velocity)
         text = f"{track.id}" + (f" · {3.6 * speed:.0f} km/h" if speed > 0.5 else "")
         left, top, right, bottom = pen.textbbox((0, 0), text, font=font, anchor="mm")
         half = np.array([(right - left) / 2.0 + 6.0, (bottom - top) / 2.0 + 6.0])

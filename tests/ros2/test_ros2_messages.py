@@ -330,6 +330,30 @@ def test_objects_of_autoware() -> None:
         np.testing.assert_allclose(gone, [*np.multiply(track.velocity, 5), 0], atol=1e-9)
 
 
+@pytest.mark.parametrize(("roll_deg", "pitch_deg"), [(180.0, 0.0), (0.0, 30.0), (170.0, 20.0)])
+def test_motion_seen_by_a_sensor_that_is_tilted_or_upside_down(roll_deg: float, pitch_deg: float) -> None:
+    T, tracker, step_s, turn_rps = np.eye(4), Tracker(), 0.1, 0.3
+    T[:3, :3] = R = Mounting(None, roll_deg, pitch_deg).rotation()
+    at = np.array([10.0, 0.0, -1.0])
+    for k in range(40):
+        heading = -0.9 + k * step_s * turn_rps
+        ahead = np.array([math.cos(heading), math.sin(heading), 0.0])
+        seen = R.T @ ahead
+        car = Box("car", 0.97, tuple((R.T @ at).tolist()), (4.0, 1.8, 1.5), math.atan2(seen[1], seen[0]), 0.99)
+        tracks = tracker.update([car], k * step_s, T)
+        at = at + step_s * 10.0 * ahead
+    scan = perceived(tracks=tracks)
+    (each,), (path,) = (make(scan).objects for make in (MESSAGES.tracked_objects, MESSAGES.predicted_objects))
+    twist = each.kinematics.twist_with_covariance.twist
+    along = rotation(each.kinematics.pose_with_covariance.pose) @ [twist.linear.x, twist.linear.y, twist.linear.z]
+    np.testing.assert_allclose(R @ along, 10.0 * ahead, atol=0.6)
+    assert twist.angular.z == pytest.approx(turn_rps * R[2, 2], abs=0.06)
+    first, last = (np.array(position(path.kinematics.predicted_paths[0].path[k])) for k in (0, 10))
+    np.testing.assert_allclose(R @ (last - first), 50.0 * ahead, atol=3.0)
+    texts = [marker.text for marker in MESSAGES.markers(scan).markers if marker.ns == "track_labels"]
+    assert float(texts[0].split()[2]) == pytest.approx(10.0, abs=0.3)
+
+
 @pytest.mark.parametrize(
     ("label", "number"),
     [("car", 1), ("van", 1), ("truck", 2), ("bus", 3), ("cyclist", 6), ("pedestrian", 7), ("tram", 0), ("sofa", 0)],

@@ -290,6 +290,21 @@ def test_mcap_of_other_answers(tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("foxglove")
+def test_arrows_of_tracks_seen_by_a_tilted_sensor_are_as_long_as_their_way(tmp_path: Path) -> None:
+    from edgeperc.sinks.foxglove import McapSink
+
+    tracker, R, pose = Tracker(), Mounting(None, 0.0, 30.0).rotation(), np.eye(4)
+    pose[:3, :3] = R
+    for k in range(20):
+        car = replace(CAR, center=tuple((R.T @ [5.0 + k, 2.0, -1.0]).tolist()), yaw=0.0, front=0.99)
+        tracks = tracker.update([car], 10.0 + 0.1 * k, pose)
+    write(McapSink(tmp_path / "run.mcap"), [replace(a_run()[0], tracks=tracks)])
+    ((_, message, _),) = read_mcap(tmp_path / "run.mcap")["/tracks"]
+    assert message.entities[0].arrows[0].shaft_length == pytest.approx(10.0, abs=0.3)
+    assert " 10.0 m/s" in message.entities[0].texts[0].text
+
+
+@pytest.mark.usefixtures("foxglove")
 def test_names_are_only_text_in_mcap(tmp_path: Path) -> None:
     from edgeperc.sinks.foxglove import McapSink
 
