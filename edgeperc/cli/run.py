@@ -322,7 +322,9 @@ def _check_outputs(
     listed = {_real(source.parent) for source in read if source not in (*arguments.paths, *arguments.scan)}
     suffixes = (*SCAN_SUFFIXES, *CAPTURE_SUFFIXES, *(IMAGE_SUFFIXES if images else ()))
     outputs: list[tuple[str, Path]] = []
-    captures = {scan for scan in scans if not images and _is_capture(scan)}
+    # Files are opened for it, so only where their scans have files of their own.
+    has_own = not images and bool(kinds or arguments.static is not None)
+    captures = {scan for scan in scans if has_own and _is_capture(scan)}
     for scan, target in zip(scans, targets, strict=True):
         first = target / "000000" if scan in captures else target
         outputs += [("--out", file) for file in _files_of(arguments, first, kinds, bool(images)).values()]

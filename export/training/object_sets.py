@@ -17,7 +17,7 @@ from ..data.augment import Augmentation, ObjectBank, augmented
 from ..data.beams import drawn_sensor
 from ..data.scan_sets import check_trains, read_scan_set
 from ..data.scans import LabeledScan
-from .object_samples import DriveScan, build_samples
+from .object_samples import DriveScan, build_samples, digest_of_files
 
 VALIDATION = "validation"
 SIMULATED = "simulated"
@@ -74,7 +74,8 @@ def write_samples(
         hashes[names[-1]] = {}
     if simulated is not None:
         files = sorted(simulated.glob("*.npz"))
-        build(SIMULATED, [(file.stem, partial(LabeledScan.load, file)) for file in files], real=False)
+        drawn = [(file.stem, partial(LabeledScan.load, file)) for file in files]
+        build(SIMULATED, drawn, real=False, made_of=digest_of_files(files))
         names.append(SIMULATED)
         hashes[SIMULATED] = {}
     return names, hashes
