@@ -29,7 +29,7 @@ from .inference.crop import Crop, sectors_of_turn, spread
 from .inference.decode import decode_boxes, decode_cells, decode_labels
 from .inference.object_network import PARTS, BoxesFrom, ObjectNetwork
 from .inference.pillar_network import PillarNetwork
-from .inference.projection import input_heights, make_projector
+from .inference.projection import make_projector
 from .inference.session import Session
 from .objects.boxes import join_boxes, objects_from_points, weigh
 from .objects.candidates import MIN_DETECTOR_SCORE
@@ -143,12 +143,15 @@ class RangeImageNetwork:
     def label(self, points: Points, height_m: Heights | None, watch: Stopwatch) -> PointLabels:
         """Project points, run the network, decode pixels, remove outliers and label the points (PointSeg 3.1, 3.4)."""
         pixel = np.empty(len(points), np.int32)
-        self.projector.fill(points, self.session.input, self.index, pixel, height_m)
-        watch.lap("project")
-        if self.interpolator is not None:
+        if self.interpolator is None:
+            self.projector.fill(points, self.session.input, self.index, pixel, height_m)
+            watch.lap("project")
+        else:
+            self.projector.mark(points, self.index.reshape(-1), pixel)
+            watch.lap("project")
             # Interpolated points are in the image only; refinement uses the points of the scan.
-            dense, filled = self.interpolator.fill(points, self.index)
-            self.projector.fill_image(dense, filled, self.session.input, input_heights(self.projector, dense))
+            dense, filled, heights = self.interpolator.fill(points, self.index, height_m)
+            self.projector.fill_image(dense, filled, self.session.input, heights)
             watch.lap("adapt")
         ((kind, raw),) = self.session.run().items()
         watch.lap("infer")
@@ -185,13 +188,10 @@ class Pipeline:
             or any(projector.needs_ground for projector in projectors)
             or (options.boxes_from != "network" and bool(ranged))
         )
-        # Between points, the ground is found anew, with all points.
-        interpolates = any(network.interpolator is not None for network in ranged)
-        turns = bool(ranged) and options.full_turn
-        self.sectors = sectors_of_turn(ranged[0].view, whole=interpolates) if turns else []
+        self.sectors = sectors_of_turn(ranged[0].view) if ranged and options.full_turn else []
         # Half of the points of a scan are near no view that looks ahead: 16.1 in place of 17.5 ms.
         views = [network.view for network in (top, *ranged[:1]) if network is not None]
-        self.crop = Crop([] if options.full_turn or interpolates else views)
+        self.crop = Crop([] if options.full_turn else views)
 
     def __call__(
         self, points: Points, mounting: Mounting, watch: Stopwatch, beside: Callable[[Points], object] | None = None

@@ -72,12 +72,11 @@ class Crop:
         return read_only(self._kept[:n]), self._rows[:n]
 
 
-def sectors_of_turn(view: RangeImageGeometry, *, whole: bool) -> list[tuple[float, Crop]]:
-    """The sectors of a full turn: angle of each to the left of the first [rad], and what selects its points, or all."""
+def sectors_of_turn(view: RangeImageGeometry) -> list[tuple[float, Crop]]:
+    """The sectors of a full turn: angle of each to the left of the first [rad], and what selects its points."""
     width_deg = view.azimuth_left_deg - view.azimuth_right_deg
     turns_rad = [math.radians(k * width_deg) for k in range(math.ceil(360.0 / width_deg))]
-    seen = [] if whole else [view]
-    return [(turn_rad, Crop(seen, margin_m=ROUNDING_M, turn_rad=turn_rad)) for turn_rad in turns_rad]
+    return [(turn_rad, Crop([view], margin_m=ROUNDING_M, turn_rad=turn_rad)) for turn_rad in turns_rad]
 
 
 def spread(parts: Sequence[tuple[PointLabels, Ints | None]], n: int) -> PointLabels:

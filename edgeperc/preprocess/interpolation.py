@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 
 from ..errors import PointsError
 from ..system.kernels import njit
 from ..types.mounting import MODEL_HEIGHT_M
-from ..types.points import Floats, Floats32, Ints, Ints64, Points
+from ..types.points import Floats, Floats32, Heights, Ints, Ints64, Points
 from ..types.sensor import SensorProfile
 from ..types.views import RangeImageGeometry
 
@@ -31,6 +32,16 @@ NO_GAP = 1.1
 _SCATTER = 4.0
 
 
+class Gaps(NamedTuple):
+    """Where a view has gaps between the beams of a sensor."""
+
+    row_slopes: Floats  # tangent of each row's elevation
+    directions: Floats  # (2, W) cosine and sine of each column's azimuth
+    row_reach: Ints64  # how many rows below each row the next beam's return may be
+    col_reach: int  # how many columns to the right the next return may be
+    ground_z: float  # of the ground in the frame of the points [m]
+
+
 class Interpolator:
     """Fills the pixels of a range image between neighboring beams and columns of a coarser sensor (KUL-Seg 5), if it is
     coarser than some part of the view (``needed``).
@@ -40,28 +51,29 @@ class Interpolator:
         rows = np.array(view.row_elevations_deg)
         column_deg = (view.azimuth_left_deg - view.azimuth_right_deg) / view.width
         azimuths = np.radians(view.azimuth_left_deg - (np.arange(view.width) + 0.5) * column_deg)
-        self._row_slopes = np.tan(np.radians(rows))
-        self._directions = np.stack([np.cos(azimuths), np.sin(azimuths)])
-        self._ground_z = -MODEL_HEIGHT_M
-        # Row coordinates of the beams; then, for each row, how many rows below it the next beam's return may be.
+        # Row coordinates of the beams; then the reach of each row.
         beams = np.array(sensor.elevations_deg)
         if sensor.pattern is not None:  # such beams may be anywhere, however it is mounted
             step_deg = (sensor.fov_up_deg - sensor.fov_down_deg) / (sensor.n_beams - 1)
             beams = step_deg * np.arange(math.floor(90.0 / step_deg), -math.ceil(90.0 / step_deg), -1)
         places = np.interp(-beams, -rows, np.arange(len(rows)), left=-1.0, right=len(rows))
-        self._row_reach = np.zeros(len(rows), np.int64)
+        row_reach = np.zeros(len(rows), np.int64)
         for upper, lower in pairwise(places.tolist()):
             if lower - upper > NO_GAP and upper >= 0.0 and lower < len(rows):
-                between = self._row_reach[math.floor(upper) : math.ceil(lower) + 1]
+                between = row_reach[math.floor(upper) : math.ceil(lower) + 1]
                 between[:] = np.maximum(between, math.ceil(lower - upper) + 1)
         step = (1.0 if sensor.pattern is None else _SCATTER) * sensor.azimuth_resolution_deg / column_deg
-        self._col_reach = math.floor(step) + 1 if step > NO_GAP else 0
+        col_reach = math.floor(step) + 1 if step > NO_GAP else 0
+        directions = np.stack([np.cos(azimuths), np.sin(azimuths)])
+        self._gaps = Gaps(np.tan(np.radians(rows)), directions, row_reach, col_reach, -MODEL_HEIGHT_M)
         self.shape = (view.height, view.width)
-        self.needed = bool(self._row_reach.any() or self._col_reach)
+        self.needed = bool(row_reach.any() or col_reach)
 
-    def fill(self, points: Points, index: Ints) -> tuple[Floats32, Ints]:
+    def fill(
+        self, points: Points, index: Ints, height_m: Heights | None = None
+    ) -> tuple[Floats32, Ints, Floats32 | None]:
         """The points with interpolated ones behind them, each on the line between two neighbors in the middle of its
-        pixel, and their rows at each pixel.
+        pixel; their rows at each pixel; and their heights above the ground, if those of the points are given.
         """
         if points.ndim != 2 or points.shape[1] != 4 or points.dtype != np.float32:
             raise PointsError(f"got points of shape {points.shape} and {points.dtype}; expected (n, 4) float32")
@@ -70,14 +82,15 @@ class Interpolator:
                 f"got index of shape {index.shape} for {len(points)} points; expected {self.shape}, "
                 "rows of these points"
             )
-        dense = np.empty((len(points) + index.size, 4), np.float32)
-        dense[: len(points)] = points
+        n = len(points)
+        dense = np.empty((n + np.count_nonzero(index < 0), 4), np.float32)
+        dense[:n] = points
+        heights = np.empty(0 if height_m is None else len(dense), np.float32)
+        if height_m is not None:
+            heights[:n] = height_m
         filled = np.array(index, np.int32, order="C")
-        n = fill_between(
-            dense, len(points), filled, self._row_slopes, self._directions, self._row_reach, self._col_reach,
-            self._ground_z,
-        )  # fmt: skip
-        return dense[:n], filled
+        n = fill_between(dense, heights, n, filled, self._gaps)
+        return dense[:n], filled, None if height_m is None else heights[:n]
 
 
 @njit(cache=True, nogil=True)
@@ -100,71 +113,59 @@ def on_one_surface(points: Points, i: int, j: int, ground_z: float) -> bool:
 
 
 @njit(cache=True, nogil=True)
-def fill_between(
-    points: Points,
-    n: int,
-    index: Ints,
-    row_slopes: Floats,
-    directions: Floats,
-    row_reach: Ints64,
-    col_reach: int,
-    ground_z: float,
-) -> int:
+def fill_between(points: Points, heights: Heights, n: int, index: Ints, gaps: Gaps) -> int:
     """Fill empty pixels between two returns of one surface, along rows, then columns; returns the number of points.
 
-    points : (n + H * W, 4) the first ``n`` rows are the input, those after them are overwritten.
-    row_slopes, directions : tangent of each row's elevation; cosine and sine of each column's azimuth.
-    row_reach, col_reach : how many rows below each row the next beam's return may be, and how many columns to the
-        right.
-    ground_z : height of the ground in the sensor frame [m].
+    points, heights : the first ``n`` rows are the input, those after them are overwritten; there may be no heights.
     """
+    row_slopes, directions, row_reach, col_reach, ground_z = gaps
     height, width = index.shape
     for row in range(height if col_reach > 1 else 0):
         last = -1
         for col in range(width):
             if index[row, col] < 0:
                 continue
-            if (
-                last >= 0
-                and 1 < col - last <= col_reach
-                and on_one_surface(points, index[row, last], index[row, col], ground_z)
-            ):
+            if last >= 0 and 1 < col - last <= col_reach:
                 i, j = index[row, last], index[row, col]
-                for k in range(last + 1, col):
-                    cos, sin = directions[0, k], directions[1, k]
-                    # Signed distances of the two returns from the vertical plane through the middle of the column.
-                    side_i = np.float64(points[i, 0]) * sin - np.float64(points[i, 1]) * cos
-                    side_j = np.float64(points[j, 0]) * sin - np.float64(points[j, 1]) * cos
-                    if side_i * side_j < 0.0:
-                        share = side_i / (side_i - side_j)
-                        for c in range(4):
-                            start = np.float64(points[i, c])
-                            points[n, c] = start + share * (np.float64(points[j, c]) - start)
-                        index[row, k] = n
-                        n += 1
+                if on_one_surface(points, i, j, ground_z):
+                    for k in range(last + 1, col):
+                        cos, sin = directions[0, k], directions[1, k]
+                        # Signed distances of the two returns from the vertical plane through the middle of the column.
+                        side_i = np.float64(points[i, 0]) * sin - np.float64(points[i, 1]) * cos
+                        side_j = np.float64(points[j, 0]) * sin - np.float64(points[j, 1]) * cos
+                        if side_i * side_j < 0.0:
+                            put_between(points, heights, n, i, j, side_i / (side_i - side_j))
+                            index[row, k] = n
+                            n += 1
             last = col
-    for col in range(width):
-        last = -1
-        for row in range(height):
+    lasts = np.full(width, -1, np.int64)  # row by row, because the pixels of a row lie beside each other
+    for row in range(height):
+        for col in range(width):
             if index[row, col] < 0:
                 continue
-            if (
-                last >= 0
-                and 1 < row - last <= row_reach[last]
-                and on_one_surface(points, index[last, col], index[row, col], ground_z)
-            ):
-                i, j = index[last, col], index[row, col]
+            last, lasts[col] = lasts[col], row
+            if last < 0 or not 1 < row - last <= row_reach[last]:
+                continue
+            i, j = index[last, col], index[row, col]
+            if on_one_surface(points, i, j, ground_z):
                 flat_i = math.hypot(np.float64(points[i, 0]), np.float64(points[i, 1]))
                 flat_j = math.hypot(np.float64(points[j, 0]), np.float64(points[j, 1]))
                 for k in range(last + 1, row):
                     above_i = np.float64(points[i, 2]) - row_slopes[k] * flat_i
                     above_j = np.float64(points[j, 2]) - row_slopes[k] * flat_j
                     if above_i * above_j < 0.0:
-                        share = above_i / (above_i - above_j)
-                        for c in range(4):
-                            start = np.float64(points[i, c])
-                            points[n, c] = start + share * (np.float64(points[j, c]) - start)
+                        put_between(points, heights, n, i, j, above_i / (above_i - above_j))
                         index[k, col] = n
                         n += 1
-            last = row
     return n
+
+
+@njit(cache=True, nogil=True)
+def put_between(points: Points, heights: Heights, n: int, i: int, j: int, share: float) -> None:
+    """Write point ``n``, at a share of the way from one point to another, and its height, if there are any."""
+    for axis in range(4):
+        start = np.float64(points[i, axis])
+        points[n, axis] = start + share * (np.float64(points[j, axis]) - start)
+    if heights.shape[0] > 0:
+        start = np.float64(heights[i])
+        heights[n] = start + share * (np.float64(heights[j]) - start)

@@ -146,52 +146,47 @@ def pipeline_of(perceive: Perceiver) -> Pipeline:
     return perceive.pipeline
 
 
+SENSORS = pytest.mark.parametrize("sensor", ["hdl-64e", "vlp-16"])  # the second one's gaps are filled
+
+
+@SENSORS
 @pytest.mark.parametrize("models", [["ssadnet", "pointseg"], ["pointseg"], ["ssadnet"]])
-def test_answers_are_those_with_all_points(models: list[str]) -> None:
-    cropping, whole = (Perceiver(models, provider="cpu", n_threads=1, on_mismatch="ignore") for _ in range(2))
+def test_answers_are_those_with_all_points(models: list[str], sensor: str) -> None:
+    options: dict[str, Any] = {"provider": "cpu", "n_threads": 1, "on_mismatch": "ignore", "sensor": sensor}
+    cropping, whole = (Perceiver(models, **options) for _ in range(2))
     pipeline_of(whole).crop = Crop([])
     for seed in range(3):
-        points = simulated_scan(FIRST_SEED + seed).points
+        points = simulated_scan(FIRST_SEED + seed, sensor).points
         assert 0.2 < len(rows_of(pipeline_of(cropping).crop, points)) / len(points) < 0.8
         seen, expected = cropping(points), whole(points)
-        assert seen.boxes == expected.boxes
         assert seen.n_points == expected.n_points
+        # Between few beams, points are linked from afar: a truck beside the view may reach beyond what is kept.
+        assert sensor != "hdl-64e" or seen.boxes == expected.boxes
         if seen.points is not None and expected.points is not None:
-            np.testing.assert_array_equal(seen.points.labels, expected.points.labels)
+            same = seen.points.labels == expected.points.labels
+            assert same.all() if sensor == "hdl-64e" else same.mean() > 0.999
             np.testing.assert_array_equal(seen.points.in_view, expected.points.in_view)
         if seen.top_view is not None and expected.top_view is not None:
             np.testing.assert_array_equal(seen.top_view.labels, expected.top_view.labels)
             np.testing.assert_array_equal(seen.top_view.observed, expected.top_view.observed)
 
 
-def test_answers_of_a_full_turn_are_those_of_sectors_with_all_points() -> None:
-    options: dict[str, Any] = {"provider": "cpu", "n_threads": 1, "on_mismatch": "ignore", "full_turn": True}
+@SENSORS
+def test_answers_of_a_full_turn_are_those_of_sectors_with_all_points(sensor: str) -> None:
+    options: dict[str, Any] = {"provider": "cpu", "n_threads": 1, "on_mismatch": "ignore", "sensor": sensor}
+    options["full_turn"] = True
     cropping, whole = Perceiver("pointseg", **options), Perceiver("pointseg", **options)
     everything = Crop([])
     sectors = [(turn_rad, everything) for turn_rad, _ in pipeline_of(whole).sectors]
     pipeline_of(whole).sectors = sectors
     sectors[0][1].select = lambda points: (points, np.arange(len(points), dtype=np.int32))  # type: ignore[method-assign]
     for seed in range(2):
-        points = simulated_scan(FIRST_SEED + seed).points
+        points = simulated_scan(FIRST_SEED + seed, sensor).points
         seen, expected = cropping(points), whole(points)
         assert seen.boxes == expected.boxes
-        assert seen.require_points().in_view.mean() > 0.9
+        assert seen.require_points().in_view.mean() > (0.9 if sensor == "hdl-64e" else 0.7)  # beams above the image
         np.testing.assert_array_equal(seen.require_points().labels, expected.require_points().labels)
         np.testing.assert_array_equal(seen.require_points().in_view, expected.require_points().in_view)
-
-
-@pytest.mark.parametrize("full_turn", [False, True])
-def test_between_points_the_ground_is_found_with_all_of_them(full_turn: bool) -> None:
-    options: dict[str, Any] = {"provider": "cpu", "sensor": "vlp-16", "on_mismatch": "ignore"}
-    perceive = Perceiver("pointseg", adapt="interpolation", full_turn=full_turn, **options)
-    points = np.ones((3, 4), np.float32)
-    for crop in (pipeline_of(perceive).crop, *(crop for _, crop in pipeline_of(perceive).sectors)):
-        assert crop.select(points)[1] is None
-    points = simulated_scan(FIRST_SEED, "vlp-16").points
-    seen = perceive(points).points
-    assert seen is not None
-    assert seen.labels.shape == (len(points),)
-    assert seen.in_view.mean() > (0.5 if full_turn else 0.1)
 
 
 def test_every_point_that_a_network_sees_is_kept() -> None:
