@@ -214,7 +214,7 @@ class Judge:
         self, tallies: dict[tuple[str, ...], Any], truth: Truth, perception: Perception, mistakes: Mistakes
     ) -> Mistakes:
         """Match boxes where the truth is known, of detected classes in the view, and of the three kinds all round."""
-        predicted = [box for box in perception.boxes if truth.knows(box)]
+        predicted = _comparable(truth, perception.boxes)
         returns = truth.counted
         classes, view = self.box_classes, self.detected_in
         detected = [b for b in predicted if b.label in classes and (view is None or view.holds(*b.center[:2]))]
@@ -240,9 +240,7 @@ class Judge:
         self, tallies: dict[tuple[str, ...], Any], truth: Truth, boxes: Sequence[Box], scan_boxes: Sequence[Box]
     ) -> None:
         """Match all boxes as KITTI's benchmark does, in its image or all round, and as nuScenes does, all round."""
-        predicted = [box for box in boxes if truth.knows(box)]
-        if truth.box_labels is not None:
-            predicted = [replace(box, label=box_label(box.label, truth.box_labels)) for box in predicted]
+        predicted = _comparable(truth, boxes)
         labels = {box.label for box in truth.boxes} - {IGNORED}
         to_find, ignored = boxes_to_find(truth.counted, None, labels, known=truth.knows)
         if truth.front is not None:
@@ -274,10 +272,9 @@ class Judge:
             pixels = renamed(self.from_sensor.point_labels(truth.points), predicted.classes, truth.classes)
             tallies |= banded(("pixels",), truth.classes, pixels, right, range_m)
         counted = right != IGNORE
-        if truth.classes == POINT_CLASSES:
-            tallies |= count_causes(
-                truth.points, labels, truth.labels, counted, predicted.in_view, truth.boxes, truth.drive
-            )
+        if set(truth.classes) <= {*POINT_CLASSES}:
+            of_causes = (renamed(each, truth.classes, POINT_CLASSES) for each in (labels, truth.labels))
+            tallies |= count_causes(truth.points, *of_causes, counted, predicted.in_view, truth.boxes, truth.drive)
         tallies |= {("objects", band): Counter() for band in BANDS}
         by_box = {id(box) for box in (*mistakes.found, *(box for box, _ in mistakes.missed))}
         hit, missed = [*mistakes.found], [*mistakes.missed]
@@ -367,6 +364,15 @@ def _perceiver(
         boxes_from=perceiving.boxes_from,
         agree=perceiving.rules,
     )
+
+
+def _comparable(truth: Truth, boxes: Sequence[Box]) -> list[Box]:
+    """Boxes where the truth is known, with the classes that the set tells apart; of others nothing is known."""
+    known = [box for box in boxes if truth.knows(box)]
+    if truth.box_labels is None:
+        return known
+    named = (replace(box, label=box_label(box.label, truth.box_labels)) for box in known)
+    return [box for box in named if box.label in truth.box_labels]
 
 
 def _without_vehicles(classes: tuple[str, ...], right: Bytes) -> tuple[tuple[str, ...], Bytes]:

@@ -275,9 +275,9 @@ def _map_row(confusion: Confusion) -> dict[str, Any]:
     classes = confusion.classes
     iou = dict(zip(classes, confusion.iou().tolist(), strict=True))
     n_cells = dict(zip(classes, confusion.counts.sum(axis=1).tolist(), strict=True))
-    if set(VEHICLES) <= {*classes}:
+    if vehicles := [name for name in classes if name in VEHICLES]:
         rest = [name for name in classes if name not in VEHICLES]
-        vehicle = confusion.merged({"rest": rest, "vehicle": VEHICLES})
+        vehicle = confusion.merged({"rest": rest, "vehicle": vehicles})
         iou["vehicle"], n_cells["vehicle"] = float(vehicle.iou()[1]), int(vehicle.counts[1].sum())
     return {
         "accuracy": confusion.accuracy(),
@@ -322,9 +322,13 @@ def _add_intervals(
     for key, value in list(whole.items()):
         of_drives, of_samples = [record.get(key, {}) for record in drives], [record.get(key, {}) for record in samples]
         if key == "iou" and isinstance(value, dict):
-            counts = {name: [record["n_cells_of"][name] for record in drives] for name in value}
+            # A drive without the labels of a table has no row of it.
+            cells = [record.get("n_cells_of", {}) for record in drives]
             whole["iou_interval"] = {
-                name: _interval(counts[name], [record[name] for record in of_samples], times) for name in value
+                name: _interval(
+                    [n_cells.get(name, 0) for n_cells in cells], [row.get(name, math.nan) for row in of_samples], times
+                )
+                for name in value
             }
         elif isinstance(value, dict):
             _add_intervals(value, of_drives, of_samples, times)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..datasets.kitti import ROAD_CLASSES, Frame, KittiCalibration, KittiLabels, RoadFrame
-from ..datasets.layout import numbers_of_scene
+from ..datasets.layout import class_number, numbers_of_scene
 from ..datasets.scan_folder import ScanFrame
 from ..errors import PointsError
 from ..ground.observed import Observer
@@ -89,9 +89,14 @@ def folder_truth(
     view: TopViewGeometry | None,
     classes: Sequence[str] = POINT_CLASSES,
 ) -> Truth:
-    """Ground truth of a scan of a `ScanFolder`, in the frame of the models with the mounting that the runtime used."""
+    """Ground truth of a scan of a `ScanFolder`, in the frame of the models with the mounting that the runtime used, in
+    those of the classes that labels of the set tell apart: its cyclists are no mistakes where none are labeled.
+    """
     model = ModelFrame(mounting)
     boxes = model.move_boxes(frame.boxes or ())
+    box_labels = frozenset(frame.layout.boxes.values())
+    numbers = {0, *(class_number(name, classes) for name in (*box_labels, *frame.layout.points.values()))}
+    classes = tuple(name for k, name in enumerate(classes) if k in numbers)
     labels = None if frame.boxes is None and frame.point_classes is None else frame.labels(classes)
 
     def known(places: Floats) -> Mask:
@@ -101,17 +106,14 @@ def folder_truth(
     road = None
     if view is not None:
         if frame.boxes is not None:
-            cells[BY_BOXES] = _by_boxes(*_drawn(boxes, view, known))
+            cells[BY_BOXES] = _by_boxes(*_drawn(boxes, view, known), [name for name in VEHICLES if name in box_labels])
         surface = road_cells(frame, mounting, view)
         if surface is not None:
             cells[OBSERVED], road = (ROAD_CLASSES, surface), (OBSERVED, "road")
     size = frame.layout.image_size or image_size_of(frame.drive)
     points, front = model.move(frame.points), _front(frame.image_labels, frame.calibration, size)
-    box_labels = frozenset(frame.layout.boxes.values())
     of_boxes = boxes, frame.returns, known
-    return Truth(
-        frame.name, frame.drive, points, labels, *of_boxes, cells, road, front, box_labels, classes=tuple(classes)
-    )
+    return Truth(frame.name, frame.drive, points, labels, *of_boxes, cells, road, front, box_labels, classes=classes)
 
 
 def road_cells(frame: ScanFrame, mounting: Mounting, view: TopViewGeometry) -> Bytes | None:
@@ -179,9 +181,10 @@ def _front(
     return None if labels is None or calibration is None else FrontTruth(labels, calibration, size)
 
 
-def _by_boxes(vehicles: Bytes, known: Mask) -> tuple[tuple[str, ...], Bytes]:
-    cells = np.where(known, np.where(vehicles > 0, vehicles - 1, 0), IGNORE)
-    return ("background", *VEHICLES), cells.astype(np.uint8)
+def _by_boxes(vehicles: Bytes, known: Mask, told: Sequence[str] = VEHICLES) -> tuple[tuple[str, ...], Bytes]:
+    classes = "background", *told
+    numbers = [classes.index(name) if name in classes else 0 for name in TOP_VIEW_CLASSES]
+    return classes, np.where(known, np.array(numbers)[vehicles], IGNORE).astype(np.uint8)
 
 
 def _drawn(

@@ -26,16 +26,21 @@ from edgeperc.cli import output
 from edgeperc.cli.evaluation import scans as eval_scans
 from edgeperc.cli.output import print_line
 from edgeperc.datasets import kitti
+from edgeperc.datasets.layout import ScanLayout
+from edgeperc.datasets.scan_folder import ScanFrame
 from edgeperc.errors import ModelError, PointsError, SplitError
 from edgeperc.evaluation import evaluate
 from edgeperc.evaluation.causes import count_causes
 from edgeperc.evaluation.judge import Judge, Perceiving, renamed, training_scans_of
 from edgeperc.evaluation.metrics import BoxEvaluator, Confusion
 from edgeperc.evaluation.tables import BANDS, FEWEST_OBJECTS, Record, banded, figures
+from edgeperc.evaluation.truth import folder_truth
 from edgeperc.simulation.samples import FIRST_SEED, IGNORE
 from edgeperc.simulation.scene import POINT_CLASSES
 from edgeperc.types.card import InputSpec, ModelCard, OutputSpec
+from edgeperc.types.mounting import MODEL_MOUNTING
 from edgeperc.types.perception import Box, Perception, PointLabels, TopView
+from edgeperc.types.sensor import get_sensor
 from edgeperc.types.views import RangeImageGeometry, TopViewGeometry
 from edgeperc.zoo import DEFAULT, shipped_models
 from edgeperc_export.recipe import MODELS
@@ -319,6 +324,31 @@ def test_finer_classes_count_as_those_of_the_labels() -> None:
     assert renamed(labels, names, POINT_CLASSES).tolist() == [0, 1, 1, 1, 0, 2, 3, 0, 0, IGNORE]
     assert renamed(labels, names, ("other", "road", "vehicle")).tolist() == [0, 2, 2, 2, 0, 0, 0, 1, 0, IGNORE]
     assert renamed(labels, names, ("background", "car", "van")).tolist() == [0, 2, 1, 1, 0, 0, 0, 0, 0, IGNORE]
+
+
+def test_classes_that_a_set_does_not_label_are_no_mistakes(world: World) -> None:
+    """Of cars alone, as one class with vans: people on foot and vans that are found there may well be right."""
+    car, van = box(20, 0), box(30, 5, "van")
+    person = replace(box(20, -5, "pedestrian"), size=(0.8, 0.6, 1.7))
+    points = np.array([*hits(car, 3), *hits(van, 3), *hits(person, 4, 2), [12.0, 6.0, -1.7, 0]], np.float32)
+    world.boxes = (car, van, person)
+    world.cells["ssadnet"] = np.zeros((400, 200), np.uint8)
+    world.cells["ssadnet"][240:280, 90:110], world.cells["ssadnet"][140:180, 40:60] = 2, 3
+    layout = ScanLayout("cars", get_sensor("hdl-64e"), boxes={"car": "car"}, points={})
+    labeled = ScanFrame("1", "a", layout, points, (car, replace(van, label="car")), None, None)
+    judge = Judge(["pointseg", "ssadnet"])
+    record, mistakes = judge.compare(folder_truth(labeled, MODEL_MOUNTING, VIEW), judge.perceive(points))
+    assert mistakes is not None
+    assert mistakes.n_errors == 0
+    result = figures([record])
+    cells = result["segmentation"]["vehicles from 3-D boxes"]["all"]["iou"]
+    assert cells == {"background": 1.0, "car": 1.0, "vehicle": 1.0}
+    rows = result["points"]["all"]
+    assert {name: row["iou"] for name, row in rows.items()} == {"background": 1.0, "car": 1.0}
+    assert {error: rows["all"]["n_points"] for error, rows in result["errors"].items() if rows["all"]["n_points"]} == {}
+    every = {**result["boxes"]["oriented"]["all"], **result["all_round"]["all"]}
+    counts = {name: row["n_predicted"] for name, row in every.items() if isinstance(row, dict)}
+    assert counts == {"car": 2, "vehicle": 2, "person": 0}
 
 
 def test_boxes_at_unknown_places_do_not_count(world: World) -> None:
@@ -617,6 +647,13 @@ def test_a_mean_over_classes_needs_them_all_in_two_drives(world: World) -> None:
     assert row["iou_interval"]["van"] is None
     assert row["iou_interval"]["car"] == [1.0, 1.0]
     assert row["iou_interval"]["vehicle"] == [0.5, 1.0]
+
+
+def test_a_drive_may_lack_the_labels_of_a_table() -> None:
+    counts = banded(("segmentation", "t"), POINTS, *np.array([[0, 1, 1], [0, 1, 0]], np.uint8), np.array([1.0] * 3))
+    row = figures([Record("", drive, tallies) for drive, tallies in zip("abc", (counts, {}, counts), strict=True)])
+    of_all = row["segmentation"]["t"]["all"]
+    assert (of_all["n_cells"], of_all["iou"]["car"], of_all["iou_interval"]["car"]) == (6, 0.5, [0.5, 0.5])
 
 
 LABELS = st.lists(st.tuples(st.integers(0, 3), st.sampled_from([0, 1, 2, 3, 255]), st.floats(0, 60)), max_size=12)
