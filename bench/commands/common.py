@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from edgeperc.cli.output import lines_last
 from edgeperc.system.atomic import write_atomic
 from edgeperc.system.extras import require
 from edgeperc.system.machine import fingerprint
@@ -60,13 +61,13 @@ def new_document(kind: str, arguments: argparse.Namespace) -> Iterator[tuple[dic
         live.clear()
         if any(setting["repeats"] for setting in document["settings"]) or document["tables"]:
             parts, title = sections(document), f"edgeperc-bench {kind}: {hardware['cpu']}"
-            print(text(parts))
-            if arguments.json:
-                write_report(document, arguments.json)
-            if arguments.markdown:
-                write_atomic(arguments.markdown, markdown(parts, title).encode())
-            if html:
-                write_atomic(html, html_page(parts, title, plots.pictures(document)).encode())
+            with lines_last(text(parts).splitlines()):
+                if arguments.json:
+                    write_report(document, arguments.json)
+                if arguments.markdown:
+                    write_atomic(arguments.markdown, markdown(parts, title).encode())
+                if html:
+                    write_atomic(html, html_page(parts, title, plots.pictures(document)).encode())
 
 
 def prepare_input(arguments: argparse.Namespace, folder: Path, document: dict[str, Any], live: LiveTable) -> Input:

@@ -145,6 +145,18 @@ def print_columns(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> Non
         print_line("  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip())
 
 
+@contextlib.contextmanager
+def lines_last(lines: Sequence[str], *, gray: bool = False) -> Iterator[None]:
+    """Print lines after what is written to files, done or not: what reads them, such as ``head``, may close stdout.
+    ``gray``: those with `FEW` are gray.
+    """
+    try:
+        yield
+    finally:
+        for line in lines:
+            print_line(line, gray=gray and FEW in line)
+
+
 def write_figures(arguments: argparse.Namespace, figures: Mapping[str, Any]) -> None:
     """Write all figures, and the command line that produced them, to the file of ``--json``, if it was passed."""
     path: Path | None = arguments.json

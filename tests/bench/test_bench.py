@@ -17,6 +17,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -533,6 +534,15 @@ def test_a_soak_reports_memory(
     assert (timings["n"], len(timings["warm_up_ms"]), len(timings["ms"])) == (900, 100, 450)
     assert measured["soak"] == memory_growth(timings["rss_mb"], 100)
     assert "Memory over a long run" in capsys.readouterr().out
+
+
+def test_a_report_is_written_though_nobody_reads_it(
+    in_process: list[worker.Job], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("edgeperc.cli.output.print_line", Mock(side_effect=OSError("nobody reads")))
+    with pytest.raises(OSError, match="nobody reads"):
+        cli.main(["soak", "--scans", "1000", "--json", str(tmp_path / "s.json")])
+    assert read_report(tmp_path / "s.json")["soak"]
 
 
 def test_an_application_uses_every_answer(matplotlib: None) -> None:

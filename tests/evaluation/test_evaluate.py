@@ -12,6 +12,7 @@ from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import hypothesis
 import numpy as np
@@ -862,6 +863,19 @@ def test_the_command_on_simulated_scans(tmp_path: Path, capsys: pytest.CaptureFi
     assert low <= simulated["road"]["all"]["f1"] <= high
     assert picture.read_bytes().startswith(b"\x89PNG")
     assert f"{100 * simulated['road']['all']['ap']:.1f}" in printed.out
+
+
+def test_figures_are_written_though_nobody_reads_the_table(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """``edgeperc eval --json figures.json | head -1`` closes stdout after hours of work."""
+    pytest.importorskip("matplotlib")
+    figures = {"models": {}, "providers": {}, "split": "test", "fold": None}
+    monkeypatch.setattr("edgeperc.evaluation.evaluate.evaluate", lambda *_, **__: (figures, []))
+    monkeypatch.setattr(output, "print_line", Mock(side_effect=OSError("nobody reads")))
+    out, picture = tmp_path / "figures.json", tmp_path / "worst.png"
+    with pytest.raises(OSError, match="nobody reads"):
+        cli.main(["eval", "simulation:1", "--json", str(out), "--worst", str(picture)])
+    assert json.loads(out.read_text())["split"] == "test"
+    assert picture.exists()
 
 
 def test_figures_of_few_objects_are_gray_on_a_terminal(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 
 from ..arguments import Commands, add_command, add_figures_file, options
-from ..output import many, print_line, progress, table_lines, write_figures
+from ..output import lines_last, many, progress, table_lines, write_figures
 
 # Places of the camera in the LiDAR's frame: as on KITTI's car, and behind a windscreen below a LiDAR on the roof.
 _PLACES = {"0.3 m": (0.27, 0.0, -0.08), "0.9 m": (0.5, 0.5, -0.6)}
@@ -59,7 +59,6 @@ def eval_painting_command(arguments: argparse.Namespace) -> int:
                 figures[f"{sensor}, {name}"] = found
                 rows.append(((sensor, name), found))
     title = f"{many(arguments.scenes, 'simulated street')}; camera 0.3 and 0.9 m from the LiDAR; per cent"
-    for line in table_lines(title, _COLUMNS, rows):
-        print_line(line)
-    write_figures(arguments, figures)
+    with lines_last(table_lines(title, _COLUMNS, rows)):
+        write_figures(arguments, figures)
     return 0

@@ -20,7 +20,7 @@ from ..arguments import (
     finite_number,
     options,
 )
-from ..output import FEW, many, print_line, progress, table_lines, write_figures
+from ..output import FEW, lines_last, many, progress, table_lines, write_figures
 from ..side_by_side import add_engine, has_workers
 from .box_tables import box_table_lines, interval_columns
 
@@ -130,14 +130,13 @@ def eval_command(arguments: argparse.Namespace) -> int:
             workers=arguments.workers,
             on_scan=show,
         )
-    for line in figure_lines(figures):
-        print_line(line, gray=FEW in line)
-    write_figures(arguments, figures)
-    if arguments.worst is not None:
-        from ...evaluation.mistakes import draw_mistakes
+    with lines_last(figure_lines(figures), gray=True):
+        write_figures(arguments, figures)
+        if arguments.worst is not None:
+            from ...evaluation.mistakes import draw_mistakes
 
-        models = ", ".join(f"{name} {version}" for name, version in figures["models"].items())
-        draw_mistakes(mistakes, arguments.worst, title=models)
+            models = ", ".join(f"{name} {version}" for name, version in figures["models"].items())
+            draw_mistakes(mistakes, arguments.worst, title=models)
     return 0
 
 
@@ -164,9 +163,8 @@ def _eval_images(arguments: argparse.Namespace, roots: Sequence[Path]) -> int:
             precision=arguments.precision,
             on_image=show,
         )
-    for line in _image_lines(figures):
-        print_line(line)
-    write_figures(arguments, figures)
+    with lines_last(_image_lines(figures)):
+        write_figures(arguments, figures)
     return 0
 
 

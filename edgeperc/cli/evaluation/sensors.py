@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 
 from ..arguments import Commands, add_command, add_figures_file, add_provider, options, positive
-from ..output import FEW, many, print_line, progress, table_lines, write_figures
+from ..output import FEW, lines_last, many, progress, table_lines, write_figures
 from .box_tables import box_table_lines
 
 
@@ -84,21 +84,21 @@ def eval_sensors_command(arguments: argparse.Namespace) -> int:
         lines += box_table_lines(result.get("boxes", {}))
         if "no_boxes" in result:
             lines.append(f"  no boxes: {result['no_boxes']}")
-    for line in lines:
-        print_line(line)
-    write_figures(arguments, figures)
+    with lines_last(lines):
+        write_figures(arguments, figures)
     return 0
 
 
 def _find(arguments: argparse.Namespace) -> int:
     from ...evaluation.transfer import find_sensors
 
-    figures = find_sensors(arguments.datasets)
+    figures, lines = find_sensors(arguments.datasets), []
     for name, result in figures.items():
         off = "" if result["off_deg"] is None else f", off by at most {result['off_deg']:.2f} deg"
-        print_line(
+        lines.append(
             f"{name} ({result['sensor']}): found {', '.join(result['found']) or 'none'}; {result['right']} right, "
             f"{result['cannot_tell']} cannot tell, {result['wrong']} wrong{off}"
         )
-    write_figures(arguments, figures)
+    with lines_last(lines):
+        write_figures(arguments, figures)
     return 1 if any(result["wrong"] for result in figures.values()) else 0

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from ...errors import PointsError
 from ...system.extras import require
 from ..arguments import Commands, add_command, add_figures_file, add_networks, add_sensor, options, positive_number
-from ..output import many, print_line, progress, table_lines, without_nan, write_figures
+from ..output import lines_last, many, progress, table_lines, without_nan, write_figures
 from ..run import make_perceiver
 
 if TYPE_CHECKING:
@@ -93,7 +93,7 @@ def eval_tracking_command(arguments: argparse.Namespace) -> int:
         arguments.usage_error("--boxes holds the boxes of one sequence; name it with --sequences SEQ")
     for file in filter(None, (arguments.json, arguments.gif)):
         file.parent.mkdir(parents=True, exist_ok=True)
-    from ...evaluation.tracking import evaluate_kitti, read_sequence, sequence_names, track_sequence
+    from ...evaluation.tracking import evaluate_kitti, sequence_names
     from ...records import read_boxes
 
     names = arguments.sequences or sequence_names(arguments.root)
@@ -114,25 +114,28 @@ def eval_tracking_command(arguments: argparse.Namespace) -> int:
             rival=arguments.rival is not None,
             on_sequence=show,
         )
-    for line in _tracking_lines(figures):
-        print_line(line)
-    write_figures(arguments, without_nan(figures))
-    if arguments.gif is not None:
-        import numpy as np
-
-        from ...evaluation.tracking import sequence_scans
-        from ...readers.files import read_points
-        from ...view.tracks import draw_tracks, flatten_scan
-
-        name = figures["sequences"][0]
-        sequence = read_sequence(arguments.root, name, arguments.classes, boxes.get(name))
-        tracks, scans = track_sequence(sequence)[0], sequence_scans(arguments.root, name)
-        under = [
-            flatten_scan(read_points(scans[k]) if k in scans else np.empty((0, 4), np.float32))
-            for k in range(len(tracks) if scans else 0)
-        ]
-        draw_tracks(tracks, arguments.gif, under=under, title=f"sequence {sequence.name}")
+    with lines_last(_tracking_lines(figures)):
+        write_figures(arguments, without_nan(figures))
+        if arguments.gif is not None:
+            _draw(arguments, figures["sequences"][0], boxes)
     return 0
+
+
+def _draw(arguments: argparse.Namespace, name: str, boxes: Mapping[str, list[list[Box]]]) -> None:
+    """Draw the tracks of a sequence, above its scans if there are any."""
+    import numpy as np
+
+    from ...evaluation.tracking import read_sequence, sequence_scans, track_sequence
+    from ...readers.files import read_points
+    from ...view.tracks import draw_tracks, flatten_scan
+
+    sequence = read_sequence(arguments.root, name, arguments.classes, boxes.get(name))
+    tracks, scans = track_sequence(sequence)[0], sequence_scans(arguments.root, name)
+    under = [
+        flatten_scan(read_points(scans[k]) if k in scans else np.empty((0, 4), np.float32))
+        for k in range(len(tracks) if scans else 0)
+    ]
+    draw_tracks(tracks, arguments.gif, under=under, title=f"sequence {sequence.name}")
 
 
 def _perceived(arguments: argparse.Namespace, names: Sequence[str]) -> tuple[dict[str, list[list[Box]]], str]:
