@@ -41,7 +41,9 @@ def agreement(reference: Sequence[Prediction], found: Sequence[Prediction]) -> d
                 seen = right.in_view if name == "points" else ...
                 confusion.update(guess.labels[seen], right.labels[seen])
             result[name] = {"equal": _rounded(confusion.accuracy()), "mean_iou": _rounded(confusion.mean_iou())}
-    if result["cells"] is not None:
+    if result["cells"] is not None or not (
+        result["points"] or result["pixels"]
+    ):  # also where boxes are the only answer
         boxes = BoxEvaluator()
         for right, guess in zip(reference, found, strict=True):
             boxes.update(guess.boxes, right.boxes)
@@ -64,12 +66,13 @@ def correctness(predictions: Sequence[Prediction], truth: Sequence[SimulatedScan
     for predicted, scan in zip(predictions, truth, strict=True):
         if predicted.points is not None and predicted.points.classes == POINT_CLASSES:
             points.update(predicted.points.labels, np.where(predicted.points.in_view, labels_by_boxes(scan), IGNORE))
-        view = predicted.top_view
-        if view is None:
+        view, geometry = predicted.top_view, None
+        if view is not None:
+            geometry = TopViewGeometry(view.x_range_m, view.y_range_m, cell_m=view.cell_m)
+            if view.classes == TOP_VIEW_CLASSES:
+                cells.update(view.labels, scan.top_view_labels(geometry))
+        elif predicted.points is not None:
             continue
-        geometry = TopViewGeometry(view.x_range_m, view.y_range_m, cell_m=view.cell_m)
-        if view.classes == TOP_VIEW_CLASSES:
-            cells.update(view.labels, scan.top_view_labels(geometry))
         to_find, ignored = boxes_to_find(zip(scan.boxes, scan.box_points, strict=True), geometry, VEHICLES)
         boxes.update(predicted.boxes, to_find, ignored=ignored)
     return {

@@ -147,7 +147,8 @@ def recommend(document: Mapping[str, Any]) -> list[dict[str, Any]]:
         sentence = f"Perceiver({call}), median {median_ms(best):.2f} ms"
         if len(ranked) > 1:
             verdict = compare(repeats_ms(best, SINGLE_STREAM), repeats_ms(ranked[1], SINGLE_STREAM))
-            result = "is slower" if verdict.word == "slower" else "is not slower within the noise"
+            words = {"slower": "is slower", "unusable": "was measured once, so that the noise is unknown"}
+            result = words.get(verdict.word, "is not slower within the noise")
             sentence += f"; the next, {setting_label(ranked[1])}, {result}"
         entry = chosen | {
             "name": engine["name"],

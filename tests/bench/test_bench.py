@@ -65,6 +65,17 @@ def test_agreement_counts_labels_and_boxes() -> None:
     )
 
 
+def test_boxes_are_compared_where_they_are_all_that_a_model_answers() -> None:
+    cars = [Box("car", 0.9, (x, 0.0, -1.0), (4.0, 2.0, 1.5), 0.0) for x in (20.0, 30.0)]
+    right, guess = ([worker.Prediction(None, None, tuple(boxes))] for boxes in (cars, cars[:1]))
+    for found, agrees in ((right, True), (guess, False)):
+        compared = {"agreement": accuracy.agreement(right, found), "truth": None, "reference_truth": None}
+        assert compared["agreement"]["boxes"]["n_both"] == len(found[0].boxes)
+        assert accuracy.agrees(compared) == agrees
+        sentence, _ = report.accuracy_sentences(compared | {"reference": ["objects fp32"]})
+        assert "common boxes" in sentence
+
+
 def test_correctness_of_the_truth_itself_is_full() -> None:
     scan = simulated_scan(3)
     cells = scan.top_view_labels()
@@ -76,8 +87,9 @@ def test_correctness_of_the_truth_itself_is_full() -> None:
     ]
     inside = [box for box in boxes if 6.0 <= box.center[0] < 46.0 and abs(box.center[1]) < 10.0]
     assert inside
-    figures = accuracy.correctness([worker.Prediction(None, geometry, tuple(inside))], [scan])
-    assert figures == {"points_mean_iou": None, "cells_mean_iou": 1.0, "vehicle_ap50": 1.0}
+    for view, found, cells in ((geometry, inside, 1.0), (None, boxes, None)):
+        figures = accuracy.correctness([worker.Prediction(None, view, tuple(found))], [scan])
+        assert figures == {"points_mean_iou": None, "cells_mean_iou": cells, "vehicle_ap50": 1.0}
 
 
 # reports
@@ -415,6 +427,10 @@ def test_the_matrix_recommends_the_fastest_that_agrees() -> None:
     assert best["digest"] == "d" * 64
     assert "Perceiver('pointseg', provider='openvino', precision='fp32', n_threads=1)" in best["text"]
     assert "is slower" in best["text"]
+    once = [setting | {"repeats": setting["repeats"][:1]} for setting in settings]
+    assert recommend(measured | {"settings": once})[0]["text"].endswith(
+        "was measured once, so that the noise is unknown"
+    )
     for setting in settings:
         setting["accuracy"] = {"agrees": False}
     assert recommend(measured) == []
