@@ -21,6 +21,7 @@ from ..types.card import ModelCard
 from ..types.points import Floats, Ints64
 from .judge import training_scans_of
 from .metrics import Confusion
+from .truth import check_different
 
 
 def evaluate_images(
@@ -33,8 +34,10 @@ def evaluate_images(
     on_image: Callable[[int, int], None] = lambda done, total: None,
 ) -> dict[str, Any]:
     """Compute the figures of a camera model on labeled images; ``split`` None is that of the test images if there are
-    any, else of the validation images. Raises ImageError, CardMismatchError, OptionError, SplitError.
+    any, else of the validation images. Raises ImageError, CardMismatchError, OptionError, PointsError,
+    SplitError.
     """
+    check_different(roots)
     perceive = Perceiver([model], provider=provider, precision=precision)
     (card,) = perceive.cards
     if card.view.kind != "camera":

@@ -26,7 +26,7 @@ from ..zoo import DEFAULT
 from .judge import BY_DEFAULT, NETWORK_ALONE, Judge, Perceiving
 from .mistakes import Mistakes
 from .tables import Record, figures
-from .truth import Truth, seeds_of
+from .truth import Truth, check_different, seeds_of
 
 __all__ = ["NETWORK_ALONE", "Perceiving", "evaluate"]
 
@@ -93,12 +93,13 @@ def evaluate(
     Raises
     ------
     PointsError
-        A dataset is of an unknown kind, or has no scans of the split.
+        A dataset is of an unknown kind, has no scans of the split, or is given twice.
     OptionError
         ``mounted`` with scans of another sensor.
     SplitError
         A model was trained on a scan, and ``split`` is not ``"train"``.
     """
+    check_different(datasets)
     split = split or ("test" if fold is None else "validation")
     job = _Job(tuple(datasets), tuple(models), perceiving, split, fold, road_by, mounted)
     perceive, scans = job.scans()

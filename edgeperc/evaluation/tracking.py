@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -140,6 +141,10 @@ def _values(labels: Sequence[Sequence[str]], path: Path) -> Floats:
             wrong = f"expected the numbers of a frame and of a track, got {columns[0]}, {columns[1]}"
         if wrong:
             raise TrackingError(f"{path}, label {number}: {wrong}")
+    objects = [(*columns[:2],) for columns in labels if columns[2].lower() != "dontcare"]
+    if len({*objects}) < len(objects):
+        frame, track = Counter(objects).most_common(1)[0][0]
+        raise TrackingError(f"{path} has track {track} twice in frame {frame}; expected a label of each object")
     return values
 
 
@@ -341,12 +346,15 @@ def evaluate_kitti(
     Raises
     ------
     TrackingError
-        There is no such data, or a file is malformed, or there are no such rules.
+        There is no such data, or a file is malformed, or there are no such rules, or ``iou_threshold`` is not in 0..1.
     """
     if rules not in RULES:
         raise TrackingError(f"got rules {rules!r}; expected one of {', '.join(RULES)}")
-    root = Path(root)
-    names = list(sequences or sequence_names(root))
+    if not 0.0 < iou_threshold <= 1.0:
+        raise TrackingError(f"got an iou_threshold of {iou_threshold}; expected a number above 0 and up to 1")
+    # What is named twice counts once.
+    root, classes = Path(root), [*dict.fromkeys(classes)]
+    names = [*dict.fromkeys(sequences or sequence_names(root))]
     # By tracker and class, of each sequence.
     pairs: dict[tuple[str, str], list[tuple[Sequence[FrameTruth], Sequence[FrameTracks]]]] = {}
     headings = {label: Headings() for label in classes}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
@@ -156,6 +157,16 @@ def cells_inside(polygons: Iterable[Floats], view: TopViewGeometry) -> Mask:
                 odd[rows] ^= y[None, :] < crossing[:, None]
         inside_any |= odd
     return inside_any
+
+
+def check_different(datasets: Sequence[str | Path]) -> None:
+    """Raise `PointsError` for a set that is given twice, whose scans would count twice; all simulated ones are one."""
+    given: dict[str | Path, str | Path] = {}
+    for dataset in datasets:
+        kind = str(dataset).partition(":")[0]
+        other = given.setdefault(kind if kind == "simulation" else Path(dataset).resolve(), dataset)
+        if other is not dataset:
+            raise PointsError(f"{other} and {dataset} have the same scans, which would count twice; leave out one")
 
 
 def seeds_of(source: str) -> range:

@@ -165,6 +165,9 @@ def test_the_table_of_images(tmp_path: Path, model: Path, capsys: pytest.Capture
         ((root, "simulation:1"), "different figures"),
         ((root, "--fold", "0"), "--fold needs scans"),
         ((root, "--worst", tmp_path / "w.png"), "--worst needs scans"),
+        ((root, "--weights", "open"), "--weights needs scans"),
+        ((root, "--boxes-from", "clusters"), "--boxes-from needs scans"),
+        ((root, "--without-rule", "boxes"), "--without-rule needs scans"),
         ((root, "--model", model, "--model", model), "got 2 models"),
     ):
         with pytest.raises(SystemExit, match="2"):

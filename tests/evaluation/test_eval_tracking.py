@@ -76,6 +76,17 @@ def test_kitti_is_evaluated_by_its_rules(kitti: Path) -> None:
     assert (seen, figures["sequences"]) == ([(1, 1)], ["0000"])
 
 
+def test_what_is_named_twice_counts_once(kitti: Path) -> None:
+    once, twice = (tracking.evaluate_kitti(kitti, sequences=n * ["0000"], classes=n * ["car"]) for n in (1, 2))
+    assert once | {"frames_per_s": 0} == twice | {"frames_per_s": 0}
+    with pytest.raises(TrackingError, match="iou_threshold of 25"):
+        tracking.evaluate_kitti(kitti, iou_threshold=25.0)
+    labels = kitti / "label_02/0000.txt"
+    labels.write_text(2 * labels.read_text())
+    with pytest.raises(TrackingError, match=r"0000\.txt has track 1 twice in frame 0"):
+        tracking.evaluate_kitti(kitti)
+
+
 def test_the_rules_decide_which_box_is_small_and_who_sits(kitti: Path) -> None:
     """A false car whose detection is 20 pixels high in the image, although its box is higher; a person who sits."""
     detections = kitti / "detections/pointrcnn_Car/0000.txt"

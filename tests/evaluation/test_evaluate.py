@@ -762,6 +762,13 @@ def test_training_scans_are_refused_unless_asked_for(world: World, tmp_path: Pat
     assert evaluate.evaluate([root], models, road_by="lodnn", split="all")[0]["real"]["n_frames"] == 2
 
 
+def test_scans_count_once(world: World, tmp_path: Path) -> None:
+    root = kitti_set(tmp_path / "set")
+    for datasets in ((root, tmp_path / "set" / ".." / "set"), ("simulation:1", "simulation:2"), (root, str(root))):
+        with pytest.raises(PointsError, match="have the same scans, which would count twice"):
+            evaluate.evaluate(datasets, ["pointseg"])
+
+
 @pytest.mark.parametrize("dataset", ["nowhere", "simulation:0", "simulation:-1", "simulation:many"])
 def test_what_is_no_dataset(world: World, dataset: str) -> None:
     with pytest.raises(PointsError, match="expected"):

@@ -140,6 +140,9 @@ def eval_command(arguments: argparse.Namespace) -> int:
     return 0
 
 
+_OF_SCANS = ("fold", "mounted", "road_by", "worst", "score_threshold")
+
+
 def _eval_images(arguments: argparse.Namespace, roots: Sequence[Path]) -> int:
     from ...evaluation.camvid import evaluate_images
 
@@ -147,10 +150,15 @@ def _eval_images(arguments: argparse.Namespace, roots: Sequence[Path]) -> int:
         arguments.usage_error("labeled images and labeled scans have different figures; evaluate them one by one")
     if has_workers(arguments):
         arguments.usage_error("--workers and --engine ray need scans, and these are images; leave them out")
-    used = {"--fold": arguments.fold, "--mounted": arguments.mounted, "--road-by": arguments.road_by}
-    for option, value in (used | {"--worst": arguments.worst}).items():
-        if value is not None:
-            arguments.usage_error(f"{option} needs scans, and these are images; leave it out")
+    given = {
+        **{f"--{name.replace('_', '-')}": getattr(arguments, name) is not None for name in _OF_SCANS},
+        "--weights": arguments.weights != "default",
+        "--boxes-from": arguments.boxes_from != "both",
+        "--no-agreement": arguments.no_agreement,
+        "--without-rule": bool(arguments.without_rule),
+    }
+    for option in (option for option, is_given in given.items() if is_given):
+        arguments.usage_error(f"{option} needs scans, and these are images; leave it out")
     models = arguments.model or [CAMERA]
     if len(models) > 1:
         arguments.usage_error(f"got {len(models)} models; images are evaluated with one --model")

@@ -91,6 +91,7 @@ def eval_tracking_command(arguments: argparse.Namespace) -> int:
         require("PIL", "view", "Drawing an animation", package="pillow")
     if arguments.boxes is not None and len(arguments.sequences or ()) != 1:
         arguments.usage_error("--boxes holds the boxes of one sequence; name it with --sequences SEQ")
+    arguments.classes = [*dict.fromkeys(arguments.classes)]
     for file in filter(None, (arguments.json, arguments.gif)):
         file.parent.mkdir(parents=True, exist_ok=True)
     from ...evaluation.tracking import evaluate_kitti, sequence_names
