@@ -1,27 +1,14 @@
-"""Time the projection of a scan to the networks' inputs, in edgeperc's kernels and in numpy.
-
-This module is a command of its own: ``python -m edgeperc_bench.peers.projection [SCAN]``.
-
-Every round handles the same scan once with each of these, in a new random order:
-
-- a compiled loop that copies the points, (n, 4) to (n, 4), for scale
-- `TopViewProjector.fill`, and `RangeImageProjector.fill` for the front quarter (64 x 512) and the full turn
-  (64 x 2048), with the checks of their arguments, into existing buffers: what `Perceiver` does
-- the same top view and front quarter in vectorized numpy; their results are first compared with the kernels', bit by
-  bit
-
-The kernels compile before the first round that counts. The table shows minimum and median in milliseconds, both as
-multiples of the copy loop's, and numpy's time as a multiple of the kernel's. On a busy computer compare the minima.
+"""The projection of a scan to the networks' inputs in edgeperc's kernels and in numpy, whose pixels are the same bit by
+bit: what ``edgeperc-bench peers`` times.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from functools import partial
-from pathlib import Path
+from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from edgeperc.inference.projection import (
@@ -33,34 +20,18 @@ from edgeperc.inference.projection import (
     row_edges,
     tabulate,
 )
-from edgeperc.readers.files import read_points
-from edgeperc.simulation.drawn import random_scene
-from edgeperc.simulation.scene import simulate
 from edgeperc.types.card import InputSpec
-from edgeperc.types.points import Floats, Floats32, Heights, Ints, Points
+from edgeperc.types.points import Floats32, Heights, Ints, Points
 from edgeperc.types.sensor import get_sensor
 from edgeperc.types.views import RangeImageGeometry, TopViewGeometry
 
-from ..render import Section, number, text
-from .rounds import measure, parser_of, versions
-
-SENSOR = "hdl-64e"
 TOP_VIEW = TopViewGeometry()
-RANGE_IMAGE = RangeImageGeometry(get_sensor(SENSOR).elevations_deg)
-FULL_TURN = RangeImageGeometry(get_sensor(SENSOR).elevations_deg, 2048, 180.0, -180.0)
+RANGE_IMAGE = RangeImageGeometry(get_sensor("hdl-64e").elevations_deg)
 TOP_VIEW_INPUT = InputSpec("top_view", ("distance", "remission", "height"), (0.0, 0.0, -2.5), (47.07, 1.0, 5.0))
 RANGE_IMAGE_INPUT = InputSpec(
     "range_image", ("x", "y", "z", "remission", "range"), (13.0, 0.0, -1.3, 0.23, 14.5), (11.4, 7.9, 0.8, 0.15, 12.3)
 )
 Selection = tuple[NDArray[np.intp], Ints, Floats32]
-
-
-@njit(cache=True, nogil=True)
-def fill_copy(points: Points, copy: Floats32) -> None:
-    """Copy the points (n, 4), number by number."""
-    for i in range(points.shape[0]):
-        for k in range(4):
-            copy[i, k] = points[i, k]
 
 
 class _NumpyProjector:
@@ -163,53 +134,19 @@ def winners(flat: Ints, rank: Floats32, index: Ints, rows: NDArray[np.intp]) -> 
 
 
 def contenders(points: Points) -> dict[str, Callable[[], object]]:
-    """The calls to measure by their names in the table, each with its own buffers; AssertionError if results differ."""
-    copy = np.empty_like(points)
-    calls: dict[str, Callable[[], object]] = {"copy loop": lambda: fill_copy(points, copy)}
-
-    def add(name: str, *projectors: TopViewProjector | RangeImageProjector | _NumpyProjector) -> None:
+    """The calls to measure by their names, each with its own buffers; AssertionError if results differ."""
+    calls: dict[str, Callable[[], object]] = {}
+    for name, (of_kernels, by_numpy), view, input in (
+        ("top view", (TopViewProjector, NumpyTopView), TOP_VIEW, TOP_VIEW_INPUT),
+        ("range image", (RangeImageProjector, NumpyRangeImage), RANGE_IMAGE, RANGE_IMAGE_INPUT),
+    ):
         results = []
-        for suffix, projector in zip(("", ", numpy"), projectors, strict=False):
+        for title, made in ((name, of_kernels), (f"{name}, numpy", by_numpy)):
+            projector: Any = made(view, input)  # type: ignore[arg-type]
             image, index = np.empty(projector.shape, np.float32), np.empty(projector.shape[1:], np.int32)
-            buffers = image, index, np.empty(len(points), np.int32)
-            results.append(buffers)
-            calls[name + suffix] = partial(projector.fill, points, *buffers)
-            calls[name + suffix]()
-        if not all(np.array_equal(of[0], each) for of in zip(*results, strict=True) for each in of):
+            results.append((image, index, np.empty(len(points), np.int32)))
+            calls[title] = partial(projector.fill, points, *results[-1])
+            calls[title]()
+        if not all(np.array_equal(own, other) for own, other in zip(*results, strict=True)):
             raise AssertionError(f"{name}: numpy gives other pixels than the kernels")
-
-    add("top view", TopViewProjector(TOP_VIEW, TOP_VIEW_INPUT), NumpyTopView(TOP_VIEW, TOP_VIEW_INPUT))
-    kernels, by_numpy = (of(RANGE_IMAGE, RANGE_IMAGE_INPUT) for of in (RangeImageProjector, NumpyRangeImage))
-    add("range image", kernels, by_numpy)
-    add("range image 360", RangeImageProjector(FULL_TURN, RANGE_IMAGE_INPUT))
     return calls
-
-
-def table(ms: Mapping[str, Floats]) -> Section:
-    """Minimum and median of each call, and their ratios."""
-    rows = [["", *(f"{name}{of}" for name in ("minimum", "median") for of in (", ms", " x copy", " numpy /"))]]
-    for name, of_call in ms.items():
-        row, by_numpy = [name], ms.get(f"{name}, numpy")
-        for middle in (np.min, np.median):
-            row += [number(middle(of_call), 3), number(middle(of_call) / middle(ms["copy loop"]))]
-            row.append("-" if by_numpy is None else number(middle(by_numpy) / middle(of_call), 1))
-        rows.append(row)
-    return Section("Projection", (), rows)
-
-
-def main() -> None:
-    parser, add = parser_of("projection", __doc__)
-    add("scan", "a scan file (default: a simulated scan)", nargs="?", type=Path)
-    add("--rounds N", "how often each is measured (default: %(default)s)", type=int, default=300)
-    arguments = parser.parse_args()
-    if arguments.scan is None:
-        name, points = "a simulated scan", simulate(random_scene(3), get_sensor(SENSOR), 0).points
-    else:
-        name, points = str(arguments.scan), read_points(arguments.scan)
-    ms = measure(contenders(points), arguments.rounds)
-    print(f"{len(points):,} points of {name}; {arguments.rounds} rounds; {versions()}")
-    print(text([table(ms)]))
-
-
-if __name__ == "__main__":
-    main()
