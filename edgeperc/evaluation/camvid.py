@@ -14,13 +14,13 @@ from typing import Any
 
 import numpy as np
 
-from ..datasets.images import FOLDERS, IGNORE, LEVEL, LabeledImages, image_hash
+from ..datasets.images import FOLDERS, LEVEL, LabeledImages, image_hash
 from ..errors import CardMismatchError, OptionError, SplitError
 from ..perceiver import Perceiver
 from ..types.card import ModelCard
 from ..types.points import Floats, Ints64
 from .judge import training_scans_of
-from .metrics import Confusion
+from .metrics import Confusion, mean
 from .truth import check_different
 
 
@@ -57,7 +57,7 @@ def evaluate_images(
                 raise SplitError(f"{name} was trained on {file}; evaluate other images, or ask for split 'train'")
         labels = perceive(image=image).image
         assert labels is not None
-        confusion = Confusion(card.classes, ignore=IGNORE)
+        confusion = Confusion(card.classes)
         confusion.update(labels.labels, truth)
         counts.append(confusion.counts)
         on_image(done, len(files))
@@ -83,42 +83,33 @@ def image_figures(classes: Sequence[str], counts: Ints64, n_resamples: int = 100
     n, n_classes, _ = counts.shape
     rng = np.random.default_rng(0)
     weights = rng.multinomial(n, np.full(n, 1.0 / n), n_resamples) if n > 1 else np.zeros((0, n), np.int64)
-    whole = _rates(counts.sum(axis=0)[None])
-    samples = _rates((weights @ counts.reshape(n, -1)).reshape(-1, n_classes, n_classes))
-    rows: dict[str, dict[str, Any]] = {"all": {}, **{name: {} for name in classes}}
-    for key, values in whole.items():
-        of_samples = samples[key]
-        if values.ndim == 1:
-            rows["all"] |= _with_interval(key, values[0], of_samples)
-        else:
-            for k, name in enumerate(classes):
-                rows[name] |= _with_interval(key, values[0, k], of_samples[:, k])
+    summed = [counts.sum(axis=0), *(weights @ counts.reshape(n, -1)).reshape(-1, n_classes, n_classes)]
+    of_all, of_classes = zip(*(_rates(classes, each) for each in summed), strict=True)
     n_pixels = counts.sum(axis=2)
-    for k, name in enumerate(classes):
-        rows[name] |= {"n_pixels": int(n_pixels[:, k].sum()), "n_images": int((n_pixels[:, k] > 0).sum())}
-    return {"n_images": n, "all": rows.pop("all") | {"n_pixels": int(n_pixels.sum())}, "classes": rows}
+    rows = {
+        name: _with_intervals([{key: values[k] for key, values in each.items()} for each in of_classes])
+        | {"n_pixels": int(n_pixels[:, k].sum()), "n_images": int((n_pixels[:, k] > 0).sum())}
+        for k, name in enumerate(classes)
+    }
+    return {"n_images": n, "all": _with_intervals(of_all) | {"n_pixels": int(n_pixels.sum())}, "classes": rows}
 
 
-def _rates(counts: Ints64) -> Mapping[str, Floats]:
-    """Rates of confusion matrices (m, C, C): per class (m, C), and over all (m,); NaN without pixels."""
-    hits, truth, predicted = np.diagonal(counts, axis1=1, axis2=2), counts.sum(axis=2), counts.sum(axis=1)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        rates = {"iou": hits / (truth + predicted - hits), "precision": hits / predicted, "recall": hits / truth}
-        accuracy = hits.sum(axis=1) / truth.sum(axis=1)
-    means = {"mean_iou": _means(rates["iou"]), "mean_accuracy": _means(rates["recall"]), "accuracy": accuracy}
-    return {**rates, **means}
+def _rates(classes: Sequence[str], counts: Ints64) -> tuple[dict[str, float], dict[str, Floats]]:
+    """Rates of a confusion matrix over all pixels, and of each class."""
+    confusion = Confusion(classes)
+    confusion.counts = counts
+    iou, recall = confusion.iou(), confusion.recall()
+    of_all = {"mean_iou": mean(iou), "mean_accuracy": mean(recall), "accuracy": confusion.accuracy()}
+    return of_all, {"iou": iou, "precision": confusion.precision(), "recall": recall}
 
 
-def _means(rates: Floats) -> Floats:
-    """Mean of each row without NaN; NaN for a row of NaN."""
-    known = ~np.isnan(rates)
-    with np.errstate(invalid="ignore"):
-        return np.asarray(np.where(known, rates, 0.0).sum(axis=1) / known.sum(axis=1))
-
-
-def _with_interval(key: str, value: float, samples: Floats) -> dict[str, Any]:
-    known = samples[~np.isnan(samples)]
-    bounds = None
-    if known.size:
-        bounds = [round(float(v), 4) for v in np.quantile(known, [(1.0 - LEVEL) / 2.0, (1.0 + LEVEL) / 2.0])]
-    return {key: None if math.isnan(value) else round(float(value), 4), f"{key}_interval": bounds}
+def _with_intervals(rates: Sequence[Mapping[str, float]]) -> dict[str, Any]:
+    """The first rates, each with the interval of the others."""
+    row: dict[str, Any] = {}
+    for key, value in rates[0].items():
+        samples = np.array([each[key] for each in rates[1:]])
+        known, bounds = samples[~np.isnan(samples)], None
+        if known.size:
+            bounds = [round(float(v), 4) for v in np.quantile(known, [(1.0 - LEVEL) / 2.0, (1.0 + LEVEL) / 2.0])]
+        row |= {key: None if math.isnan(value) else round(float(value), 4), f"{key}_interval": bounds}
+    return row

@@ -303,7 +303,8 @@ class Judge:
         assert self.from_above is not None
         for table, (classes, right) in truth.cells.items():
             if not self.from_above.card.box_classes:
-                classes, right = _without_vehicles(classes, right)
+                every, classes = classes, tuple(name for name in classes if name not in (*VEHICLES, "vehicle"))
+                right = renamed(right, every, classes)  # cells of vehicles become those of the first class
             if len(classes) < 2:
                 continue
             labels = renamed(view.labels, view.classes, classes)
@@ -373,14 +374,6 @@ def _comparable(truth: Truth, boxes: Sequence[Box]) -> list[Box]:
         return known
     named = (replace(box, label=box_label(box.label, truth.box_labels)) for box in known)
     return [box for box in named if box.label in truth.box_labels]
-
-
-def _without_vehicles(classes: tuple[str, ...], right: Bytes) -> tuple[tuple[str, ...], Bytes]:
-    """Remove vehicles from a table, for a model without vehicle classes: their cells become the first class."""
-    others = tuple(name for name in classes if name not in (*VEHICLES, "vehicle"))
-    number = np.full(256, IGNORE, np.uint8)
-    number[: len(classes)] = [others.index(name) if name in others else 0 for name in classes]
-    return others, number[right]
 
 
 def renamed(labels: Labels, names: Sequence[str], classes: Sequence[str]) -> Bytes:

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..errors import PointsError
+from ..simulation.samples import IGNORE
 from ..types.geometry import bounding_rectangles, oriented_iou, rectangles, shared_area
 from ..types.perception import Box
 from ..types.points import Floats, Ints64, Mask
@@ -32,13 +33,12 @@ class Listed(dict[Any, tuple[Any, ...]]):
 
 
 class Confusion:
-    """Counts (C, C) of predicted (columns) against true labels (rows), over scans or images; the true label ``ignore``
+    """Counts (C, C) of predicted (columns) against true labels (rows), over scans or images; the true label `IGNORE`
     is not counted. A class without true and predicted labels has NaN scores.
     """
 
-    def __init__(self, classes: Sequence[str], *, ignore: int = 255) -> None:
+    def __init__(self, classes: Sequence[str]) -> None:
         self.classes = tuple(classes)
-        self.ignore = ignore
         self.counts = np.zeros((len(self.classes), len(self.classes)), dtype=np.int64)
 
     def update(self, predicted: ArrayLike, truth: ArrayLike) -> None:
@@ -46,7 +46,7 @@ class Confusion:
         guess, right = np.asarray(predicted), np.asarray(truth)
         if guess.shape != right.shape:
             raise PointsError(f"got predicted {guess.shape} and truth {right.shape}; expected the same shape")
-        counted = right != self.ignore
+        counted = right != IGNORE
         guess, right = guess[counted].astype(np.int64), right[counted].astype(np.int64)
         n = len(self.classes)
         for name, labels in (("predicted", guess), ("truth", right)):
@@ -58,16 +58,16 @@ class Confusion:
 
     def __add__(self, other: Confusion) -> Confusion:
         """Add the counts of both; raise `PointsError` if their classes differ."""
-        if (self.classes, self.ignore) != (other.classes, other.ignore):
+        if self.classes != other.classes:
             raise PointsError(f"got counts of {self.classes} and of {other.classes}; expected the same classes")
-        both = Confusion(self.classes, ignore=self.ignore)
+        both = Confusion(self.classes)
         both.counts = self.counts + other.counts
         return both
 
     def merged(self, groups: Mapping[str, Sequence[str]]) -> Confusion:
         """Join classes: ``groups`` maps a new class to the classes that it joins. Classes in no group are dropped."""
         member = np.array([[name in group for name in self.classes] for group in groups.values()], dtype=np.int64)
-        coarse = Confusion(tuple(groups), ignore=self.ignore)
+        coarse = Confusion(tuple(groups))
         coarse.counts = member @ self.counts @ member.T
         return coarse
 

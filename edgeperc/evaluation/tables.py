@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..simulation.samples import IGNORE
 from ..types.choices import STATIC, VEHICLES
 from ..types.points import Bytes, Labels
 from .causes import BUMPER, CAUSES, FLOOR
@@ -58,8 +59,8 @@ def within(range_m: Any, within_m: tuple[float, float]) -> Any:
 def banded(
     table: tuple[str, ...], classes: tuple[str, ...], labels: Labels, right: Bytes, range_m: NDArray[Any]
 ) -> dict[tuple[str, ...], Confusion]:
-    """A confusion matrix for each band of distance, by ``(*table, band)``; a true class of 255 is not counted."""
-    known = right != 255
+    """A confusion matrix for each band of distance, by ``(*table, band)``; the true class `IGNORE` is not counted."""
+    known = right != IGNORE
     labels, right, range_m = labels[known], right[known], range_m[known]
     confusions: dict[tuple[str, ...], Confusion] = {}
     for band, within_m in BANDS.items():
@@ -119,7 +120,7 @@ def _one_drive(scans: Sequence[Tallies]) -> Tallies:
     means: dict[tuple[str, ...], Any] = {}
     for key, tally in tallies.items():
         if key[0] == "points":
-            mean_scan = means["mean_scan", key[1]] = Confusion(tally.classes, ignore=tally.ignore)
+            mean_scan = means["mean_scan", key[1]] = Confusion(tally.classes)
             mean_scan.counts = tally.counts / len(scans)
     return {**tallies, **means}
 

@@ -20,7 +20,7 @@ from ..errors import TrackingError
 from ..perceiver import Perceiver
 from ..readers.files import read_points
 from ..tracking.tracker import Tracker
-from ..tracking.tracks import ClassParameters, Tracks
+from ..tracking.tracks import Tracks
 from ..types.choices import VEHICLES
 from ..types.perception import Box
 from ..types.points import Floats, Ints64, Mask
@@ -228,14 +228,12 @@ def _read_detections(
     return detections, [np.array(of_frame).reshape(-1, 4) for of_frame in image_boxes]
 
 
-def track_sequence(
-    sequence: TrackingSequence, parameters: Mapping[str, ClassParameters] | None = None
-) -> tuple[list[Tracks], float]:
+def track_sequence(sequence: TrackingSequence) -> tuple[list[Tracks], float]:
     """Run a new `edgeperc.Tracker` over a sequence, without poses: the tracks by frame, and the seconds it took."""
     # Labels and detections cover the field of view of the left color camera.
     (fx, _, cx), width_px = sequence.calibration.P2[0, :3], IMAGE_SIZE[0]
     edges = math.degrees(math.atan(cx / fx)), -math.degrees(math.atan((width_px - cx) / fx))
-    tracker = Tracker(parameters, field_of_view_deg=edges)  # its construction compiles the kernels
+    tracker = Tracker(field_of_view_deg=edges)  # its construction compiles the kernels
     tracks = []
     start = time.perf_counter()
     for k, boxes in enumerate(sequence.detections):
@@ -306,7 +304,6 @@ def evaluate_kitti(
     *,
     sequences: Sequence[str] | None = None,
     classes: Sequence[str] = CLASSES,
-    parameters: Mapping[str, ClassParameters] | None = None,
     boxes: Mapping[str, Sequence[Sequence[Box]]] | None = None,
     iou_threshold: float = 0.25,
     rules: str = RULES[0],
@@ -324,7 +321,6 @@ def evaluate_kitti(
     sequences : sequence of str, optional
         Default: all labeled sequences.
     classes : sequence of str
-    parameters : mapping of str to ClassParameters, optional
     boxes : mapping of str to sequence of sequence of Box, optional
         Detections by sequence and frame, instead of the files.
     iou_threshold : float
@@ -361,7 +357,7 @@ def evaluate_kitti(
     n_frames, seconds = 0, 0.0
     for done, name in enumerate(names, start=1):
         sequence = read_sequence(root, name, classes, (boxes or {}).get(name), rules=rules)
-        tracks, took = track_sequence(sequence, parameters)
+        tracks, took = track_sequence(sequence)
         n_frames, seconds = n_frames + len(tracks), seconds + took
         results = {"edgeperc": [FrameResult.of(in_frame) for in_frame in tracks]}
         if rival:

@@ -33,13 +33,13 @@ def test_scores_of_a_table_made_by_hand() -> None:
 
 
 def test_updates_add_up_and_nothing_has_no_score() -> None:
-    confusion = metrics.Confusion(("a", "b"), ignore=7)
+    confusion = metrics.Confusion(("a", "b"))
     assert math.isnan(confusion.accuracy())
     assert np.isnan(confusion.iou()).all()
     assert math.isnan(confusion.mean_iou())
     assert math.isnan(confusion.weighted_precision())
     confusion.update(np.zeros(0, dtype=np.uint8), np.zeros(0, dtype=np.uint8))
-    confusion.update(np.uint8([1, 1, 0]), np.uint8([1, 0, 7]))
+    confusion.update(np.uint8([1, 1, 0]), np.uint8([1, 0, 255]))
     confusion.update(np.int64([1]), np.uint8([1]))
     assert confusion.counts.tolist() == [[0, 1], [0, 2]]
     # "a" occurs and was never predicted: no precision, but a recall and an IoU of 0.
