@@ -22,6 +22,7 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 
+import scenes
 from edgeperc import Perceiver
 from edgeperc.errors import ModelFileError, PointsError, ProviderError
 from edgeperc.simulation.samples import simulated_scan
@@ -108,44 +109,21 @@ def samples_document(ms: Sequence[float], rate_hz: float | None = None) -> dict[
 def document(*medians: float, sha256: str = "s", spread: float = 0.2) -> dict[str, Any]:
     engine = {"name": "pointseg", "variant": "fp32", "version": "1", "sha256": "f" * 64, "digest": "d" * 64}
     engine |= {"precision": "fp32", "provider": "CPU", "options": {"threads": "1"}}  # type: ignore[dict-item]
+    start = {"engines": [engine], "construct_s": 0.5, "first_call_ms": 30.0, "rss_mb": 300.0, "peak_rss_mb": 310.0}
+    start |= {"scans_mb": 5.0, "warnings": ["<script>alert(1)</script> & more"], "interrupted": False}
     rng = np.random.default_rng(3)
     drawn = [median + rng.gamma(2.0, spread, 120) for median in medians]
-    setting = {
-        **{"models": ["pointseg"], "provider": "cpu", "precision": "fp32", "n_threads": 1, "sensor": "hdl-64e"},
-        **{"offline": [], "cold_start": []},
-        "accuracy": None,
-        "loadgen": None,
-        "repeats": [
-            {
-                **{
-                    "engines": [engine],
-                    "construct_s": 0.5,
-                    "first_call_ms": 30.0,
-                    "rss_mb": 300.0,
-                    "peak_rss_mb": 310.0,
-                },
-                **{"scans_mb": 5.0, "warnings": ["<script>alert(1)</script> & more"], "interrupted": False},
-                "scenarios": {"single-stream": samples_document(ms), "paced:10": samples_document(ms, 10.0)},
-            }
-            for ms in drawn
-        ],
-    }
+    repeats = [
+        start | {"scenarios": {"single-stream": samples_document(ms), "paced:10": samples_document(ms, 10.0)}}
+        for ms in drawn
+    ]
+    setting = {"models": ["pointseg"], "provider": "cpu", "precision": "fp32", "n_threads": 1, "sensor": "hdl-64e"}
+    setting |= {"offline": [], "cold_start": [], "accuracy": None, "loadgen": None, "repeats": repeats}
     given = {"source": "two <b>scans</b>", "sensor": "hdl-64e", "n_points": [5, 6], "sha256": sha256}
-    return {
-        **{"schema": 2, "kind": "run", "command": "edgeperc-bench run", "complete": True, "input": given},
-        **{
-            "machine": {"cpu": "A <fast> & quiet CPU", "fingerprint": "m"},
-            "software": {"numpy": "2", "environment": {}},
-        },
-        **{
-            "disturbances": ["others | are busy"],
-            "settings": [setting],
-            "skipped": [],
-            "recommended": [],
-            "tables": [],
-        },
-        "soak": None,
-    }
+    machine, software = {"cpu": "A <fast> & quiet CPU", "fingerprint": "m"}, {"numpy": "2", "environment": {}}
+    whole = {"schema": 2, "kind": "run", "command": "edgeperc-bench run", "complete": True, "input": given}
+    whole |= {"machine": machine, "software": software, "disturbances": ["others | are busy"], "settings": [setting]}
+    return whole | {"skipped": [], "recommended": [], "tables": [], "soak": None}
 
 
 def plain(value: Any) -> Any:
@@ -237,11 +215,7 @@ def test_the_verdict_is_one_sentence(
 
 
 def test_a_live_table_replaces_itself_on_a_terminal_only() -> None:
-    class Terminal(io.StringIO):
-        def isatty(self) -> bool:
-            return True
-
-    live, file = LiveTable(Terminal()), LiveTable(io.StringIO())
+    live, file = LiveTable(scenes.Terminal()), LiveTable(io.StringIO())
     for table in (live, file):
         table("single-stream", [3.0] * 30)
         table.note("next")
@@ -660,18 +634,9 @@ def test_errors_of_a_process_arrive_as_they_were() -> None:
 
 
 def test_a_dead_process_is_an_error() -> None:
-    class Dead:
-        exitcode = -9
-
-        def join(self) -> None:
-            pass
-
-    class Silent:
-        def recv(self) -> Any:
-            raise EOFError
-
+    dead, silent = SimpleNamespace(exitcode=-9, join=lambda: None), SimpleNamespace(recv=Mock(side_effect=EOFError))
     with pytest.raises(worker.WorkerError, match="exit code -9"):
-        worker.receive(Silent(), Dead())
+        worker.receive(silent, dead)
 
 
 def test_a_cold_start_is_measured_step_by_step(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -71,23 +71,6 @@ def test_labels_that_cannot_be_counted_raise() -> None:
     assert confusion.counts.sum() == 0
 
 
-PAIRS = st.lists(st.tuples(st.integers(0, 3), st.sampled_from([0, 1, 2, 3, 255])), max_size=20)
-
-
-@given(PAIRS, PAIRS)
-def test_counts_of_two_are_counts_of_both(one: list[tuple[int, int]], other: list[tuple[int, int]]) -> None:
-    together = metrics.Confusion("abcd")
-    apart = []
-    for pairs in (one, other):
-        predicted, truth = np.array(pairs, dtype=np.uint8).reshape(-1, 2).T
-        together.update(predicted, truth)
-        apart.append(metrics.Confusion("abcd"))
-        apart[-1].update(predicted, truth)
-    before = apart[0].counts.copy()
-    np.testing.assert_array_equal((apart[0] + apart[1]).counts, together.counts)
-    np.testing.assert_array_equal(apart[0].counts, before)
-
-
 def test_coarser_classes() -> None:
     confusion = metrics.Confusion(("other", "road", "car", "van"))
     confusion.update([0, 1, 2, 3, 2, 3, 1], [0, 0, 2, 2, 3, 1, 1])

@@ -13,6 +13,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import twins.kitti_ap
 import twins.tracking
 from edgeperc import TrackingError
 from edgeperc.evaluation.tracking_metrics import (
@@ -131,21 +132,10 @@ def test_breaks_by_hand() -> None:
 @settings(max_examples=100, deadline=None)
 @given(st.lists(st.floats(-5.0, 5.0), max_size=120), st.integers(0, 40))
 def test_recall_thresholds_are_those_of_kittis_walk(scores: list[float], n_missed: int) -> None:
-    n_truth = 8 * math.ceil((len(scores) + n_missed) / 8)  # no recall is halfway between two ranks
-    thresholds, recalls = recall_thresholds(scores, n_truth)
-    wanted, wanted_recalls = twins.tracking.thresholds_by_walking(scores, n_truth)
-    assert thresholds.tolist() == wanted
-    np.testing.assert_allclose(recalls, wanted_recalls)
-
-
-def test_rounding_decides_between_two_ranks_at_the_same_distance() -> None:
-    """As in KITTI's program, which adds up recalls in float64; the ranks are one apart at most."""
-    for n_truth in (22, 50, 130):
-        ranks = n_truth - 1 - recall_thresholds(np.arange(n_truth), n_truth)[0]
-        wanted, _ = twins.tracking.thresholds_by_walking(range(n_truth), n_truth)
-        later = ranks - (n_truth - 1 - np.array(wanted))
-        assert later.min() == 0
-        assert later.max() == (n_truth > 22)  # of 22, each rank is a threshold
+    """Rounding decides between two ranks at the same distance, as in KITTI's program, which adds up recalls."""
+    thresholds, recalls = recall_thresholds(scores, len(scores) + n_missed)
+    assert thresholds.tolist() == twins.kitti_ap.get_thresholds(scores, len(scores) + n_missed)[1:]
+    np.testing.assert_allclose(recalls, np.arange(1, len(thresholds) + 1) / 40)
 
 
 def test_a_perfect_tracker_has_full_marks() -> None:

@@ -1,4 +1,4 @@
-"""Slow twin of `edgeperc.evaluation.kitti_ap`: KITTI's development kit, step by step, with polygons clipped by hand.
+"""Slow twin of `edgeperc.evaluation.kitti_ap`: KITTI's development kit, step by step.
 
 Numbers follow ``evaluate_object.cpp``: `clean_data`, `compute_statistics`, `get_thresholds`, `eval_class`. Boxes are in
 KITTI's camera frame.
@@ -6,9 +6,10 @@ KITTI's camera frame.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Any
+
+from twins.decode import clip_polygon, polygon_area, rectangle_corners
 
 MIN_HEIGHT = {"easy": 40, "moderate": 25, "hard": 25}
 MAX_OCCLUSION = {"easy": 0, "moderate": 1, "hard": 2}
@@ -38,45 +39,11 @@ class Object:
     thresh: float = 0.0
 
 
-Polygon = list[tuple[float, float]]
-
-
-def polygon(g: Object) -> Polygon:
-    cos, sin = math.cos(g.ry), math.sin(g.ry)
-    local = [(g.l / 2, g.w / 2), (g.l / 2, -g.w / 2), (-g.l / 2, -g.w / 2), (-g.l / 2, g.w / 2)]
-    return [(cos * a + sin * b + g.t1, -sin * a + cos * b + g.t3) for a, b in local]
-
-
-def area(points: Polygon) -> float:
-    pairs = zip(points, points[1:] + points[:1], strict=True)
-    return abs(sum(x0 * y1 - x1 * y0 for (x0, y0), (x1, y1) in pairs)) / 2
-
-
-def intersection(a: Polygon, b: Polygon) -> float:
-    turn = sum(x0 * y1 - x1 * y0 for (x0, y0), (x1, y1) in zip(b, b[1:] + b[:1], strict=True))
-    edges = b if turn > 0 else b[::-1]
-    shape = a
-    for (x0, y0), (x1, y1) in zip(edges, edges[1:] + edges[:1], strict=True):
-        sides = [(x1 - x0) * (y - y0) - (y1 - y0) * (x - x0) for x, y in shape]
-        clipped: Polygon = []
-        for k, (x, y) in enumerate(shape):
-            before, last = sides[k - 1], shape[k - 1]
-            if (sides[k] >= 0) != (before >= 0):
-                share = before / (before - sides[k])
-                clipped.append((last[0] + share * (x - last[0]), last[1] + share * (y - last[1])))
-            if sides[k] >= 0:
-                clipped.append((x, y))
-        shape = clipped
-        if not shape:
-            return 0.0
-    return area(shape)
-
-
 def overlap(metric: str, d: Object, g: Object, criterion: int = -1) -> float:
-    gp, dp = polygon(g), polygon(d)
-    inter = intersection(gp, dp)
+    gp, dp = (rectangle_corners((each.t1, each.t3, each.l, each.w, -each.ry)) for each in (g, d))
+    inter = polygon_area(clip_polygon(list(gp), dp))
     if metric == "bird's eye":
-        return inter / ((area(gp) + area(dp) - inter) if criterion == -1 else area(dp))
+        return inter / ((polygon_area(gp) + polygon_area(dp) - inter) if criterion == -1 else polygon_area(dp))
     low, high = max(d.t2 - d.h, g.t2 - g.h), min(d.t2, g.t2)
     volume = inter * max(0.0, high - low)
     det_vol, gt_vol = d.h * d.l * d.w, g.h * g.l * g.w

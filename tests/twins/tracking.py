@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import math
-from fractions import Fraction
 from typing import Any
 
 import numpy as np
@@ -385,18 +384,3 @@ def best_gain(gain: np.ndarray) -> float:
         (sum(padded[i, j] for i, j in enumerate(event)) for event in itertools.permutations(range(n + m), n)),
         default=0.0,
     )
-
-
-def thresholds_by_walking(scores: np.ndarray, n_truth: int) -> tuple[list[float], list[float]]:
-    """Twin of `tracking_metrics.recall_thresholds`: KITTI's walk down the scores, in fractions for ties."""
-    found, wanted = [], Fraction(0)
-    scores = sorted(scores, reverse=True)
-    for k, score in enumerate(scores):
-        here, following = Fraction(k + 1, n_truth), Fraction(k + 2, n_truth)
-        if k < len(scores) - 1 and following - wanted < wanted - here:
-            continue
-        found.append((score, wanted))
-        wanted += Fraction(1, 40)
-        if wanted > 1:
-            break
-    return [score for score, _ in found[1:]], [float(recall) for _, recall in found[1:]]
