@@ -18,14 +18,15 @@ def sections(document: Mapping[str, Any]) -> list[Section]:
     parts = [Section("Reliability", sentences or ["no disturbance was seen"])]
     if document["kind"] == "matrix":
         parts.append(_matrix(document))
-    for setting in document.get("settings", ()) if document["kind"] == "run" else ():
+    runs = document["settings"] if document["kind"] == "run" else []
+    for setting in runs:
         parts += _setting(setting)
-    for table in document.get("tables", ()):
+    for table in document["tables"]:
         parts.append(Section(table["title"], table["sentences"], [table["head"], *table["rows"]]))
-    if document.get("soak"):
+    if document["soak"]:
         parts.append(Section("Memory over a long run", document["soak"]["sentences"]))
-    verdicts = [verdict(setting) for setting in document.get("settings", ()) if document["kind"] == "run"]
-    return [*parts, *_context(document), *(Section("Verdict", [sentence]) for sentence in verdicts if sentence)]
+    verdicts = filter(None, map(verdict, runs))
+    return [*parts, *_context(document), *(Section("Verdict", [sentence]) for sentence in verdicts)]
 
 
 def verdict(setting: Mapping[str, Any]) -> str:
@@ -91,7 +92,7 @@ def _setting(setting: Mapping[str, Any]) -> list[Section]:
         parts.append(Section("Paced", sentences, [head, *rows]))
     if names:
         parts += [_stages(setting, names), _starts(setting)]
-    if setting.get("offline"):
+    if setting["offline"]:
         head = ["processes", "threads each", "scans/s", "seconds", "scans", "CPU s/scan"]
         rows = []
         for o in setting["offline"]:
@@ -99,7 +100,7 @@ def _setting(setting: Mapping[str, Any]) -> list[Section]:
             rows.append([str(o["processes"]), str(o["n_threads"]), *rate, number(o["cpu_s_per_scan"], 4)])
         sentences = ["several concurrent processes, each back to back; counted while all of them run"]
         parts.append(Section("Offline", sentences, [head, *rows]))
-    if setting.get("cold_start"):
+    if setting["cold_start"]:
         steps = ("interpreter_s", "import_s", "read_s", "construct_s", "first_call_s", "total_s")
         head = ["start", *(step.removesuffix("_s").replace("_", " ") for step in steps), "peak RSS MB"]
         rows = [
@@ -111,11 +112,11 @@ def _setting(setting: Mapping[str, Any]) -> list[Section]:
             "RSS is without the helper processes that compile a part of them"
         ]
         parts.append(Section("Cold start", sentences, [head, *rows]))
-    if setting.get("loadgen"):
+    if setting["loadgen"]:
         summary = setting["loadgen"]
         quantiles = ", ".join(f"{key} {value:.2f} ms" for key, value in summary.items() if key.startswith("p"))
         parts.append(Section("MLPerf LoadGen, single stream", [f"result {summary['result']}: {quantiles}"]))
-    if setting.get("accuracy"):
+    if setting["accuracy"]:
         parts.append(Section("Accuracy of these results", accuracy_sentences(setting["accuracy"])))
     return parts
 
@@ -184,7 +185,7 @@ def _context(document: Mapping[str, Any]) -> list[Section]:
     rows = [["what", "how"]]
     engines = {
         (e["sha256"], e["precision"], e["provider"], str(e["options"])): e
-        for setting in document.get("settings", ())
+        for setting in document["settings"]
         for repeat in setting["repeats"]
         for e in repeat["engines"]
     }
@@ -200,7 +201,7 @@ def _context(document: Mapping[str, Any]) -> list[Section]:
     for group in ("machine", "software"):
         rows += [[key.replace("_", " "), _shown(value)] for key, value in document[group].items()]
     rows.append(["command", document["command"]])
-    warned = [text for setting in document.get("settings", ()) for r in setting["repeats"] for text in r["warnings"]]
+    warned = [text for setting in document["settings"] for r in setting["repeats"] for text in r["warnings"]]
     return [Section("Context", list(dict.fromkeys(warned)), rows)]
 
 

@@ -15,6 +15,7 @@ import numpy as np
 
 from edgeperc import Perceiver, occupancy_grid
 from edgeperc.datasets.scan_folder import ScanFolder
+from edgeperc.evaluation.metrics import Confusion
 from edgeperc.evaluation.truth import road_cells
 from edgeperc.road.grid import ALL_AROUND
 from edgeperc.simulation.samples import FIRST_SEED, IGNORE, simulated_scan
@@ -57,17 +58,15 @@ def print_set(name: str, sensor: SensorProfile, scans: list[tuple[Points, Bytes]
     places = {"ahead": ahead, "elsewhere": ~ahead}
     for models, chosen in MODELS.items():
         perceive = Perceiver(chosen, sensor=sensor, full_turn=True, on_mismatch="ignore")
-        counts = {place: np.zeros(3, np.int64) for place in places}
+        confusions = {place: Confusion(("other", "road")) for place in places}
         for points, cells in scans:
             perception = perceive(points)
             grid = occupancy_grid(perception, points, sensor=sensor, **EXTENT)
             for place, where in places.items():
-                counted, road = where & grid.observed & (cells != IGNORE), cells == 1
-                found = grid.drivable
-                parts = found & road, found & ~road, road & ~found
-                counts[place] += [np.count_nonzero(counted & part) for part in parts]
-        for place, (hits, false, missed) in counts.items():
-            shares = (hits / max(hits + false, 1), hits / max(hits + missed, 1), hits / max(hits + false + missed, 1))
+                counted = where & grid.observed & (cells != IGNORE)
+                confusions[place].update(grid.drivable[counted], cells[counted] == 1)
+        for place, of in confusions.items():
+            shares = np.nan_to_num([each[1] for each in (of.precision(), of.recall(), of.iou())])
             print(f"| {name} | {models} | {place} | " + " | ".join(f"{100.0 * share:.1f}" for share in shares) + " |")
 
 
