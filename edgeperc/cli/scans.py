@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from ..errors import EdgepercError, ImageError, SensorError
+from ..system.names import by_number
 from ..system.remote import Remote
 from ..types.choices import AUTO_SENSOR, DEFAULT_SENSOR
 from .arguments import check_inputs, file_options
@@ -122,7 +123,7 @@ def find_images(paths: Sequence[Path]) -> list[Path]:
             others.append(path)
             continue
         if path.is_dir() and not is_capture(path) and not scan_folders(path):
-            files = sorted(file for file in path.iterdir() if file.suffix.lower() in IMAGE_SUFFIXES)
+            files = sorted((f for f in path.iterdir() if f.suffix.lower() in IMAGE_SUFFIXES), key=by_number)
         images |= {_absolute(image): image for image in files}
         others += [] if files else [path]
     if images and others:

@@ -18,6 +18,7 @@ from urllib.parse import quote
 import numpy as np
 
 from ..errors import PointsError
+from ..system.names import by_number
 from .inflate import inflate, inflate_file, inflated_message, most_bytes
 from .mcap import MCAP_MAGIC, BagFile, Channel, McapFile, unpack
 from .tables import MAX_BYTES
@@ -30,12 +31,7 @@ def bag_files(folder: Path) -> list[Path]:
     """The files of a ROS 2 bag's folder, in the order of recording: part 10 after part 9; empty if it is no bag."""
     files = [file for file in folder.iterdir() if set(file.suffixes[-2:]) & set(BAG_SUFFIXES) and file.is_file()]
     kept = [file for file in files if file.suffix in BAG_SUFFIXES or file.suffix == ".zstd"]
-    return sorted(kept, key=lambda file: _numbered(file.name))
-
-
-def _numbered(name: str) -> list[str | int]:
-    """Its texts and numbers by turns, for sorting: numbers stand at odd places."""
-    return [int(part) if k % 2 else part for k, part in enumerate(re.split(r"(\d+)", name))]
+    return sorted(kept, key=by_number)
 
 
 def open_bag(path: Path, folder: Path, alive: Callable[[], None]) -> list[BagFile]:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Literal, NamedTuple
 
 from ..errors import PointsError, SensorError
+from ..system.names import by_number
 from ..types.points import Floats32
 from ..types.sensor import SensorProfile
 from .apart import decode_apart, describe_apart
@@ -41,13 +42,14 @@ def read_scans(
     Parameters
     ----------
     source : str or path
-        A scan file (`edgeperc.read_points`); a folder of scan files and captures, read in the order of their names; a
-        Velodyne ``.pcap``; an Ouster ``.osf``, or ``.pcap`` with its metadata next to it in a ``.json`` file whose name
-        has the same beginning; a ``.pcap`` of Hesai's, RoboSense's or Livox' sensors, or an ``.lvx2``; each ``.pcap``
-        may be a ``.pcapng``; a ROS 1 ``.bag``, a ROS 2 bag's folder or one file of it, or an ``.mcap`` file. Bags are
-        read for messages of type ``sensor_msgs/PointCloud2``, MCAP files for ``foxglove.PointCloud`` (protobuf), too;
-        without such, for packets of a Velodyne, ``velodyne_msgs/VelodyneScan``, or an Ouster, ``PacketMsg``. The first
-        bytes of a file decide its format, not its name.
+        A scan file (`edgeperc.read_points`); a folder of scan files and captures, read in the order of their names,
+        10.bin after 9.bin; a Velodyne ``.pcap``; an Ouster ``.osf``, or ``.pcap`` with its metadata next to it in a
+        ``.json`` file whose name has the same beginning; a ``.pcap`` of Hesai's, RoboSense's or Livox' sensors, or an
+        ``.lvx2``; each ``.pcap`` may be a ``.pcapng``; a ROS 1 ``.bag``, a ROS 2 bag's folder or one file of it, or an
+        ``.mcap`` file. Bags are read for messages of type ``sensor_msgs/PointCloud2``, MCAP files for
+        ``foxglove.PointCloud`` (protobuf), too; without such, for packets of a Velodyne,
+        ``velodyne_msgs/VelodyneScan``, or an Ouster, ``PacketMsg``. The first bytes of a file decide its format, not
+        its name.
     topic : str, optional
         What to read if there are several sensors: the topic of point clouds; ``TOPIC@FRAME`` for those of one frame;
         the serial number of an Ouster or in an ``.lvx2``; the IP address of another sensor, or ``ADDRESS:PORT``.
@@ -240,16 +242,17 @@ def known_sensor(path: Path, topic: str | None = None) -> KnownSensor | None:
 
 
 def scan_files(folder: Path) -> list[Path]:
-    """The scans and captures in a folder, by name, without hidden files; and links to what is not there, which reading
-    reports: a scan that was not fetched is missing, too.
+    """The scans and captures in a folder, by name and number, without hidden files; and links to what is not there,
+    which reading reports: a scan that was not fetched is missing, too.
     """
-    return sorted(
+    entries = (
         entry
         for entry in folder.iterdir()
         if entry.suffix.lower() in SCAN_SUFFIXES + CAPTURE_SUFFIXES
         and entry.name[0] != "."
         and (entry.is_file() or (entry.is_symlink() and not entry.exists()))
     )
+    return sorted(entries, key=by_number)
 
 
 def _readable_kind(path: Path) -> str:

@@ -5,11 +5,13 @@ from __future__ import annotations
 import re
 import reprlib
 from collections.abc import Iterable
-from pathlib import PureWindowsPath
+from pathlib import PurePath, PureWindowsPath
 
 MAX_NAME = 200
 _MAX_COMPARED = 60
 _NAME = re.compile(r"[A-Za-z0-9_]([A-Za-z0-9._+-]*[A-Za-z0-9_+-])?")
+# Digits but those behind a decimal point: 1700.5 comes after 1700.25.
+_WHOLE = re.compile(r"(?<![0-9])(?<![0-9]\.)([0-9]+)")
 _DEVICES = re.compile(r"(con|prn|aux|nul|com\d|lpt\d)(\..*)?", re.IGNORECASE)  # Windows opens them, whatever the suffix
 
 
@@ -19,6 +21,12 @@ def nearest(name: str, known: Iterable[str]) -> str:
 
     match = difflib.get_close_matches(name[:_MAX_COMPARED], [*known], 1)
     return f" (did you mean {match[0]}?)" if match else ""
+
+
+def by_number(path: PurePath | str) -> tuple[list[str | int], str]:
+    """Key that sorts the files of a folder as people number them: 10.bin after 9.bin."""
+    parts = _WHOLE.split(str(path))  # texts and numbers by turns: numbers stand at odd places
+    return [int(part) if k % 2 else part for k, part in enumerate(parts)], str(path)
 
 
 def check_text(field: str, text: str, error: type[Exception]) -> None:

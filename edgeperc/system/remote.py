@@ -12,6 +12,7 @@ from urllib.parse import unquote, urlsplit
 
 from ..errors import EdgepercError, OptionError, PointsError
 from .extras import require
+from .names import by_number
 
 MOST_BYTES = 4 * 2**30
 """Largest file that is fetched: a scan or a capture."""
@@ -66,7 +67,7 @@ class Remote:
     def files(self, suffixes: Collection[str]) -> list[Remote]:
         """This file, or the files with these suffixes anywhere below this folder, sorted, without hidden ones."""
         with self._system() as (system, path):
-            names = [file.removeprefix(path) for file in sorted(system.find(path))]
+            names = [file.removeprefix(path) for file in sorted(system.find(path), key=by_number)]
         return [
             Remote(self.url + inside)
             for inside in names

@@ -615,6 +615,15 @@ def test_a_folder_is_read_by_name(tmp_path: Path) -> None:
         next(read_scans(tmp_path / "folder.bin"))
 
 
+@pytest.mark.parametrize(
+    "names", [("1", "2", "10"), ("scan_9", "scan_010", "scan_10"), ("3.25", "3.5", "20.125"), ("1_9", "1_10", "a")]
+)
+def test_a_drive_is_read_in_the_order_of_its_numbers(tmp_path: Path, names: Sequence[str]) -> None:
+    for k, name in enumerate(names):
+        np.save(tmp_path / f"{name}.npy", np.full((1, 4), k, np.float32))
+    assert [points[0, 0] for _, points in read_scans(tmp_path)] == [0, 1, 2]
+
+
 def test_a_link_to_nowhere_is_a_scan_that_is_missing(tmp_path: Path) -> None:
     """As in a data set of git-annex of which only some files were fetched."""
     np.save(tmp_path / "a.npy", np.ones((3, 4), np.float32))
