@@ -123,7 +123,8 @@ def find_images(paths: Sequence[Path]) -> list[Path]:
             others.append(path)
             continue
         if path.is_dir() and not is_capture(path) and not scan_folders(path):
-            files = sorted((f for f in path.iterdir() if f.suffix.lower() in IMAGE_SUFFIXES), key=by_number)
+            entries = (file for file in path.glob("[!.]*") if file.suffix.lower() in IMAGE_SUFFIXES)
+            files = sorted(entries, key=by_number)
         images |= {_absolute(image): image for image in files}
         others += [] if files else [path]
     if images and others:

@@ -49,7 +49,7 @@ class LabeledImages:
             file
             for folder in folders
             if folder.is_dir()
-            for file in sorted(folder.iterdir())
+            for file in sorted(folder.glob("[!.]*"))
             if file.suffix.lower() in IMAGE_SUFFIXES
         ]
         if not files:

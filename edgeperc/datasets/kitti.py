@@ -235,7 +235,7 @@ class KittiObjects:
         self.root = Path(root)
         labels = self.root / "training/label_2"
         rows = _frame_rows(self.root) or [
-            {"name": path.stem, "drive": path.stem} for path in sorted(labels.glob("*.txt"))
+            {"name": path.stem, "drive": path.stem} for path in sorted(labels.glob("[!.]*.txt"))
         ]
         self.drives = {row["name"]: row["drive"] for row in rows}
         self.rows = [row for row in rows if (labels / f"{row['name']}.txt").exists()]
@@ -358,7 +358,7 @@ class SemanticKitti:
 
     def __init__(self, root: Path | str) -> None:
         self.root = Path(root)
-        files = sorted(self.root.glob("sequences/*/labels/*.label"))
+        files = sorted(self.root.glob("sequences/[!.]*/labels/[!.]*.label"))
         if not files:
             raise PointsError(
                 f"{self.root} has no sequences/*/labels/*.label; expected the root of a SemanticKITTI set"

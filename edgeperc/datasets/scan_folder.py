@@ -284,9 +284,7 @@ class ScanFolder:
     def _scans(self) -> dict[str, Path]:
         scans: dict[str, Path] = {}
         nested = self.layout.files == "semantickitti"
-        for path in sorted(self.root.glob("sequences/*/velodyne/*" if nested else "velodyne/*")):
-            if path.name.startswith("."):
-                continue
+        for path in sorted(self.root.glob("sequences/[!.]*/velodyne/[!.]*" if nested else "velodyne/[!.]*")):
             suffix = next((end for end in SUFFIXES if path.name.lower().endswith(end)), None)
             if suffix is None:
                 raise PointsError(f"{path}: no scan by its name; expected {', '.join(SUFFIXES)} in velodyne/")

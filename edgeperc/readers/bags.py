@@ -28,9 +28,12 @@ _ROS1_MAGIC = b"#ROSBAG V"
 
 
 def bag_files(folder: Path) -> list[Path]:
-    """The files of a ROS 2 bag's folder, in the order of recording: part 10 after part 9; empty if it is no bag."""
-    files = [file for file in folder.iterdir() if set(file.suffixes[-2:]) & set(BAG_SUFFIXES) and file.is_file()]
-    kept = [file for file in files if file.suffix in BAG_SUFFIXES or file.suffix == ".zstd"]
+    """The files of a ROS 2 bag's folder, in the order of recording: part 10 after part 9; empty if it is no bag.
+
+    Hidden ones are left out: macOS writes ``._NAME`` beside each file on disks of other systems.
+    """
+    files = (file for file in folder.iterdir() if not file.name.startswith(".") and file.is_file())
+    kept = (file for file in files if file.name.removesuffix(".zstd").endswith(BAG_SUFFIXES))
     return sorted(kept, key=by_number)
 
 

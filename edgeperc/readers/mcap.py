@@ -45,6 +45,7 @@ class McapFile(BagFile):
 
     def __init__(self, path: Path) -> None:
         self._schemas: dict[int, str] = {}
+        self._is_named = True  # whether the schema of each channel was known when the channel was
         self._channels: dict[int, Channel] = {}  # those of the summary, or those among the messages
         size = path.stat().st_size
         self._data = np.memmap(path, np.uint8, "r").data if size >= 45 else memoryview(b"")
@@ -62,7 +63,7 @@ class McapFile(BagFile):
         if summary:
             for kind, content in _records(self._data, summary):
                 self._learn(kind, content)
-        if not self._channels:  # no summary: the channels stand among the messages
+        if not (self._channels and self._is_named):  # summaries need not repeat what stands among the messages
             try:
                 for _ in self._messages():
                     pass
@@ -104,6 +105,7 @@ class McapFile(BagFile):
             self._schemas[unpack("<H", content)[0]] = _text(content, 2)[0]
         elif kind == _CHANNEL:
             number, schema = unpack("<HH", content)
+            self._is_named &= schema == 0 or schema in self._schemas  # 0: there is none
             topic, offset = _text(content, 4)
             self._channels[number] = Channel(topic, self._schemas.get(schema, ""), _text(content, offset)[0])
 

@@ -161,6 +161,7 @@ def test_semantickitti_files(tmp_path: Path) -> None:
             (tmp_path / "sequences" / sequence / part).mkdir(parents=True)
         np.zeros((15, 4), np.float32).tofile(tmp_path / "sequences" / sequence / "velodyne" / f"{stem}.bin")
         raw.tofile(tmp_path / "sequences" / sequence / "labels" / f"{stem}.label")
+    (tmp_path / "sequences/00/labels/._000003.label").touch()
     sequences = SemanticKitti(tmp_path)
     assert sequences.names("all") == ["00/000003", "08/000001", "77/000000"]
     assert sequences.names("test") == sequences.names("all")  # one is a test drive, the others nobody's
@@ -255,7 +256,7 @@ def test_no_ground_no_claim() -> None:
 
 def test_every_table_of_frames_is_read_and_unknown_drives_are_left_out(tmp_path: Path) -> None:
     (tmp_path / "training/label_2").mkdir(parents=True)
-    for name in ("000000", "000001", "000002"):
+    for name in ("000000", "000001", "000002", "._000000"):  # the last one of macOS, on a disk of another system
         (tmp_path / f"training/label_2/{name}.txt").touch()
     assert KittiObjects(tmp_path).names("test") == ["000000", "000001", "000002"]  # no table: drives of their own
     (tmp_path / "frames.csv").write_text("name,drive,grade\n000000,2011_09_26_drive_0011,A\n")

@@ -104,6 +104,7 @@ def test_classes_that_do_not_occur_have_no_figures() -> None:
 def test_splits(tmp_path: Path, model: Path) -> None:
     right = labels(0, 1, 2, 0)
     root = write_set(tmp_path / "set", {"train/a": right, "val/b": right, "val/c": right})
+    (root / "val/._b.webp").touch()
     data = LabeledImages(root)
     assert [[file.stem for file in data.files(split)] for split in ("train", "validation", "held-back", "all")] == [
         *(["a"], ["b", "c"], ["b", "c"], ["a", "b", "c"])

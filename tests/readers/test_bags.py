@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from test_apart import chunked_mcap
 from test_captures import BAGS, LIDAR, OTHER, POINTS, error_of, record, sized, write_bag1, write_bag2, write_mcap
 
 import edgeperc
@@ -53,8 +54,6 @@ def recording(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathF
         write_bag2(folder / "bag")
         return next((folder / "bag").glob("*.db3")).rename(folder / name)
     if name == "chunks.mcap":
-        from test_apart import chunked_mcap
-
         return chunked_mcap(folder / name, "lz4")
     return write_bag1(folder / name, compression="BZ2") if name == "packed.bag" else BAGS[name](folder / name)
 
@@ -137,7 +136,7 @@ def test_a_damaged_part_costs_no_other(tmp_path: Path, damaged: int) -> None:
 
 def test_parts_are_sorted_by_number(tmp_path: Path) -> None:
     names = ["x_1.db3", "x_2.db3", "x_10.db3", "x_10.db3.zstd", "x².mcap"]
-    for name in [*reversed(names), "metadata.yaml", "x_3.db3-wal", "notes.txt"]:
+    for name in [*reversed(names), "metadata.yaml", "x_3.db3-wal", "notes.txt", "._x_1.db3", "y.zstd"]:
         (tmp_path / name).touch()
     assert [file.name for file in bag_files(tmp_path)] == names
 
@@ -224,6 +223,17 @@ def test_no_other_library_is_needed(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 @pytest.mark.parametrize("profile", [b"", b"ros2", b"protobuf", b"ros1", b"my recorder", b"\xff\xfe"])
 def test_the_profile_of_an_mcap_file_does_not_matter(tmp_path: Path, profile: bytes) -> None:
     assert whole_scans(write_mcap(tmp_path / "drive.mcap", profile)) == (3, "")
+
+
+@pytest.mark.parametrize("method", ["", "zstd"])
+def test_a_summary_need_not_repeat_the_schemas(tmp_path: Path, method: str) -> None:
+    """As of a recorder of ROS 2 with noRepeatedSchemas."""
+    path = chunked_mcap(tmp_path / "drive.mcap", method)
+    content = path.read_bytes()
+    (summary,) = struct.unpack_from("<Q", content, len(content) - 28)
+    (length,) = struct.unpack_from("<Q", content, summary + 1)
+    path.write_bytes(content[:summary] + content[summary + 9 + length :])
+    assert whole_scans(path) == (3, "")
 
 
 @pytest.mark.parametrize(
