@@ -190,6 +190,9 @@ def test_which_angles_are_used(tmp_path: Path) -> None:
     sensor = sensor_of(path)
     assert sensor is not None
     assert sensor.elevations_deg[0] == 15.25
+    for other in ("drive-2.csv", "drive+2.csv", "drive2.csv"):  # of other captures
+        (tmp_path / other).write_text(calibration(unit_angles(model)))
+    assert sensor_of(path) == sensor
 
 
 @pytest.mark.parametrize(
