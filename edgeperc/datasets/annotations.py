@@ -77,7 +77,7 @@ def _holding(path: Path, what: str) -> Iterator[None]:
 def read_json(path: Path, kind: type = dict, expected: str = "the tool's JSON") -> Any:
     """A document whose root is of this kind. Raises PointsError."""
     try:
-        document = json.loads(path.read_text(encoding="utf-8"))
+        document = json.loads(path.read_text(encoding="utf-8-sig"))
     except (OSError, RecursionError, ValueError) as exc:
         raise PointsError(f"{path} cannot be read ({exc}); expected {expected}") from exc
     if not isinstance(document, kind):

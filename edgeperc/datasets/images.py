@@ -25,7 +25,7 @@ class LabeledImages:
     def __init__(self, root: Path) -> None:
         self.root = root
         try:
-            document = json.loads((root / "classes.json").read_text("utf-8"))
+            document = json.loads((root / "classes.json").read_text("utf-8-sig"))
             names = [str(document[str(k)]) for k in range(len(document))]
         except (KeyError, OSError, RecursionError, TypeError, ValueError) as exc:
             raise ImageError(

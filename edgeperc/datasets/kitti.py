@@ -238,13 +238,14 @@ class KittiObjects:
             {"name": path.stem, "drive": path.stem} for path in sorted(labels.glob("[!.]*.txt"))
         ]
         self.drives = {row["name"]: row["drive"] for row in rows}
-        self.rows = [row for row in rows if (labels / f"{row['name']}.txt").exists()]
+        rows = [row for row in rows if (labels / f"{row['name']}.txt").exists()]
+        self.rows = [{**row, "grade": row.get("grade") or "A"} for row in rows]
         if not self.rows:
             raise PointsError(f"{self.root} has no training/label_2/*.txt; expected the root of a KITTI object set")
 
     def names(self, split: str, *, fold: int | None = None, grades: str = "A") -> list[str]:
         """Names of the labeled scans of a split (`splits.in_split`) that have one of the ``grades``."""
-        return [r["name"] for r in self.rows if in_split(r["drive"], split, fold) and r.get("grade", "A") in grades]
+        return [r["name"] for r in self.rows if in_split(r["drive"], split, fold) and r["grade"] in grades]
 
     def unlabeled(self, split: str, *, fold: int | None = None) -> list[str]:
         """Names of the scans of a split that have no label file."""
@@ -261,7 +262,7 @@ class KittiObjects:
         check_in_image(labels, IMAGE_SIZE, path)
         boxes, unlabeled = label_objects(labels, calibration)
         points = read_points(self.root / "training/velodyne" / f"{name}.bin")
-        return Frame(name, row["drive"], row.get("grade", "A"), points, boxes, unlabeled, calibration, labels)
+        return Frame(name, row["drive"], row["grade"], points, boxes, unlabeled, calibration, labels)
 
 
 def _frame_rows(root: Path) -> list[dict[str, str]]:
@@ -277,7 +278,7 @@ def _frame_rows(root: Path) -> list[dict[str, str]]:
 def read_drives(table: Path) -> list[dict[str, str]]:
     """Rows of a table of scans, each with at least its ``name`` and its ``drive``. Raises PointsError."""
     try:
-        with table.open(newline="", encoding="utf-8") as file:
+        with table.open(newline="", encoding="utf-8-sig") as file:
             rows = [*csv.DictReader(file)]
     except (OSError, UnicodeDecodeError, csv.Error) as exc:
         raise PointsError(f"{table} cannot be read ({exc}); expected columns name and drive") from exc

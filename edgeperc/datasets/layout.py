@@ -147,7 +147,7 @@ def read_layout(layout: str | Path) -> ScanLayout:
         layout = LAYOUTS / f"{layout}.json"
     path = Path(layout)
     try:
-        text = path.read_text(encoding="utf-8")
+        text = path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as exc:
         raise PointsError(f"{path}: the description cannot be read ({exc})") from exc
     try:

@@ -393,7 +393,7 @@ def _read_boxes(path: Path, columns: Sequence[str]) -> list[Box]:
     boxes: list[Box] = []
     place = {column: columns.index(column) for column in BOX_COLUMNS}
     try:
-        lines = path.read_text(encoding="utf-8").splitlines()
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
     except (OSError, UnicodeDecodeError) as exc:
         raise PointsError(f"{path}: the labels cannot be read ({exc})") from exc
     for number, line in enumerate(lines, 1):
@@ -414,7 +414,7 @@ def _read_boxes(path: Path, columns: Sequence[str]) -> list[Box]:
 
 def _read_polygons(path: Path) -> tuple[Floats, ...]:
     try:
-        polygons = [np.array(ring, np.float64) for ring in json.loads(path.read_text(encoding="utf-8"))]
+        polygons = [np.array(ring, np.float64) for ring in json.loads(path.read_text(encoding="utf-8-sig"))]
     except (OSError, RecursionError, TypeError, UnicodeDecodeError, ValueError) as exc:
         raise PointsError(f"{path}: no polygons ({exc}); expected a list of lists of corners [x, y]") from exc
     for ring in polygons:

@@ -47,7 +47,7 @@ def read_metadata(path: Path) -> dict[str, Any]:
     if path.stat().st_size > _MOST_JSON_BYTES:
         raise PointsError(f"the metadata {path.name} is larger than {_MOST_JSON_BYTES:,} bytes")
     try:
-        content = json.loads(path.read_bytes().decode("utf-8", "replace"))
+        content = json.loads(path.read_bytes().decode("utf-8-sig", "replace"))
     except (ValueError, RecursionError) as exc:
         raise PointsError(f"the metadata {path.name} cannot be read: it is not JSON ({exc})") from exc
     try:

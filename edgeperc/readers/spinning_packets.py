@@ -250,7 +250,7 @@ def read_angles(path: Path, row: Format) -> Angles:
     """The angles of a calibration file: ``channel,elevation,azimuth`` as Hesai's, or, without channel, RoboSense's."""
     n = row.lasers or row.n_channels
     rows = []
-    for line in path.read_bytes()[: 1 << 20].decode("utf-8", "replace").splitlines():
+    for line in path.read_bytes()[: 1 << 20].decode("utf-8-sig", "replace").splitlines():
         try:
             rows.append([float(value) for value in line.split(",")])
         except ValueError:

@@ -82,6 +82,23 @@ def test_boxes_and_the_labels_of_points_by_them(tmp_path: Path) -> None:
         folder.frame("b")
 
 
+def test_files_that_begin_with_a_byte_order_mark(tmp_path: Path) -> None:
+    """As editors of Windows save them: the first box had a class of its own, which ``*`` takes."""
+    root = folder_of(tmp_path, {**DESCRIPTION, "boxes": {"Car": "car", "*": "ignore"}}, label__a_dot_txt=LINES)
+    with_classes(root, [1, 2, 3, 0], boxes={"Car": "car", "*": "ignore"})
+    (root / "frames.csv").write_text("name,drive\r\na,monday\r\n")
+    (root / "drivable").mkdir()
+    (root / "drivable/a.json").write_text("[[[0, 0], [1, 1], [0, 1]]]")
+    plain = ScanFolder(root).frame("a")
+    for name in ("scans.json", "label/a.txt", "semseg_classes.json", "frames.csv", "drivable/a.json"):
+        (root / name).write_bytes(b"\xef\xbb\xbf" + (root / name).read_bytes())
+    frame = ScanFolder(root).frame("a")
+    assert frame.boxes == plain.boxes
+    assert frame.boxes[0].label == "car"
+    np.testing.assert_array_equal(frame.labels(), plain.labels())
+    assert (frame.drive, len(frame.drivable or ())) == ("monday", 1)
+
+
 def test_class_numbers() -> None:
     names = ["background", "drivable", "car", "van", "person_sitting", "digger", "ignore"]
     assert [class_number(name) for name in names] == [0, 0, 1, 1, 2, IGNORE, IGNORE]
