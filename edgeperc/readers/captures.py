@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -176,7 +177,7 @@ def is_capture(path: Path) -> bool:
     """
     try:
         return _kind(path) not in ("scan", "folder")
-    except PointsError:
+    except OSError:
         return path.suffix.lower() in CAPTURE_SUFFIXES
 
 
@@ -245,25 +246,37 @@ def scan_files(folder: Path) -> list[Path]:
     """The scans and captures in a folder, by name and number, without hidden files; and links to what is not there,
     which reading reports: a scan that was not fetched is missing, too.
     """
-    entries = (
-        entry
-        for entry in folder.iterdir()
-        if entry.suffix.lower() in SCAN_SUFFIXES + CAPTURE_SUFFIXES
-        and entry.name[0] != "."
-        and (entry.is_file() or (entry.is_symlink() and not entry.exists()))
-    )
-    return sorted(entries, key=by_number)
+    with _reading(folder):
+        entries = (
+            entry
+            for entry in folder.iterdir()
+            if entry.suffix.lower() in SCAN_SUFFIXES + CAPTURE_SUFFIXES
+            and entry.name[0] != "."
+            and (entry.is_file() or (entry.is_symlink() and not entry.exists()))
+        )
+        return sorted(entries, key=by_number)
+
+
+@contextmanager
+def _reading(path: Path) -> Iterator[None]:
+    """Raise `PointsError` where the system refuses: a file or folder of others, or a name that is too long."""
+    try:
+        yield
+    except OSError as exc:
+        what = "folder" if os.path.isdir(path) else "file"  # noqa: PTH112 - Path.is_dir would raise again
+        raise PointsError(f"{path}: the {what} cannot be read ({exc})") from exc
 
 
 def _readable_kind(path: Path) -> str:
     """`_kind`, if `read_scans` reads it; PointsError otherwise."""
-    if not path.exists():
-        expected = "a scan, a folder of scans, a .pcap, .osf, .bag or .mcap"
-        raise PointsError(f"{path}: {missing(path, 'file or folder', expected)}")
-    kind = _kind(path)
-    if kind in CAPTURE_SUFFIXES and capture_kind(head := _head(path)) is None and (advice := advice_for(head)):
-        raise PointsError(f"{path}: this is {advice}")
-    return kind
+    with _reading(path):
+        if not path.exists():
+            expected = "a scan, a folder of scans, a .pcap, .osf, .bag or .mcap"
+            raise PointsError(f"{path}: {missing(path, 'file or folder', expected)}")
+        kind = _kind(path)
+        if kind in CAPTURE_SUFFIXES and capture_kind(head := _head(path)) is None and (advice := advice_for(head)):
+            raise PointsError(f"{path}: this is {advice}")
+        return kind
 
 
 def _kind(path: Path) -> str:
@@ -278,11 +291,8 @@ def _kind(path: Path) -> str:
 
 
 def _head(path: Path) -> bytes:
-    try:
-        with path.open("rb") as file:
-            return file.read(300)
-    except OSError as exc:
-        raise PointsError(f"{path}: the file cannot be read ({exc})") from exc
+    with path.open("rb") as file:
+        return file.read(300)
 
 
 def _folder(folder: Path, options: _Options) -> Iterator[TimedScan]:

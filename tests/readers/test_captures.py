@@ -615,6 +615,24 @@ def test_a_folder_is_read_by_name(tmp_path: Path) -> None:
         next(read_scans(tmp_path / "folder.bin"))
 
 
+@pytest.mark.parametrize("read", [read_scans, edgeperc.sensor_of, scan_files])
+def test_what_the_system_refuses_is_a_typed_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, read: Callable[[Path], Any]
+) -> None:
+    """The folders of others, and names that are too long."""
+    assert not is_capture(tmp_path / ("a" * 300))
+    with pytest.raises(PointsError, match=r"a: (the file cannot be read|there is no such file)"):
+        read(tmp_path / ("a" * 300))
+
+    def refuse(self: Path) -> bool:
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(Path, "is_file", refuse)
+    (tmp_path / "b.bin").touch()
+    with pytest.raises(PointsError, match=r"the folder cannot be read \(.*Permission denied"):
+        read(tmp_path)
+
+
 @pytest.mark.parametrize(
     "names", [("1", "2", "10"), ("scan_9", "scan_010", "scan_10"), ("3.25", "3.5", "20.125"), ("1_9", "1_10", "a")]
 )
