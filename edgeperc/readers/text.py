@@ -11,9 +11,10 @@ from typing import NamedTuple
 import numpy as np
 
 from ..errors import PointsError
-from ..types.points import Bytes, Floats, plain_name
+from ..types.points import Bytes, Floats, plain_name, remission_name
 from .raw import TEXT_BYTES
 from .tables import Columns
+from .times import time_name
 
 _UNNAMED = {3: ("x", "y", "z"), 4: ("x", "y", "z", "remission")}
 # Of .pts, whose first line is the number of points.
@@ -27,6 +28,7 @@ _UNIT = re.compile(r"\s*[\[(]\s*([^\])]*?)\s*[\])]\s*$")  # as in "x [m]"
 _METERS = ("m", "meter", "meters", "metre", "metres")
 _PARAVIEW = re.compile(r"points(?:_m_xyz)?[:_]([012])$")  # "Points_m_XYZ:0" of VeloView, "Points:0"
 _COMMA_NUMBER = re.compile(r"[+-]?\d+(,\d+)?(e[+-]?\d+)?", re.IGNORECASE)
+_LOOKED_AT = 1000  # rows that show whether a column holds numbers
 _NO_NUMBER = ("", "nan", "null", "none", "na", "n/a", "-")
 
 
@@ -75,10 +77,22 @@ def parse_text(data: Bytes, columns: Sequence[str] | int | None) -> tuple[Column
         got = f"{len(names)} names" if names else "no names"
         raise PointsError(f"a row has {n} numbers, and there are {got}: pass columns= (--columns) with their names")
     used = [k for k in range(n) if names[k] and names[k] not in names[:k] and _is_number(words[k], style)]
+    _check_first(rows, names, used, style)
     table = _table(rows, style, used, len(words)) if used else np.empty((len(rows), 0))
     if counts and counts[0] != len(table):
         raise PointsError(f"cut short: the first line declares {counts[0]:,} points, {len(table):,} rows follow")
     return Columns(len(table), dict(zip((names[k] for k in used), table.T, strict=True)), names), is_named
+
+
+def _check_first(rows: Sequence[str], names: Sequence[str], used: Sequence[int], style: _Style) -> None:
+    """Refuse a first row with a word in a column of remissions or times, which would be left out with its numbers."""
+    for k in {names.index(name) for name in (remission_name(names, None), time_name(names)) if name} - {*used}:
+        below = [word for row in rows[1:_LOOKED_AT] for word in style.values(row)[k : k + 1]]
+        if any(_is_number(word, style) and word.lower() not in _NO_NUMBER for word in below):
+            raise PointsError(
+                f"the first row has {style.values(rows[0])[k]!r:.60} in the column {names[k]}, and others have numbers "
+                "there; write what is not known as nan"
+            )
 
 
 _EXPECTED = "expected x, y, z and remission in each row, or a first line of names"

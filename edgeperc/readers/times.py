@@ -166,7 +166,7 @@ def of_plausible_duration(scans: Iterable[TimedScan]) -> Iterator[TimedScan]:
         if stamp_s is not None and scan.stamp_s is not None and scan.stamp_s > stamp_s:
             intervals_s.append(scan.stamp_s - stamp_s)
         stamp_s = scan.stamp_s
-        if scan.times_s is not None and len(intervals_s) > 1:
+        if scan.times_s is not None and np.isfinite(scan.times_s).any() and len(intervals_s) > 1:
             duration_s = float(np.nanmax(scan.times_s) - np.nanmin(scan.times_s))
             interval_s = statistics.median(intervals_s)
             if duration_s > _LONGEST_OF_INTERVAL * interval_s:

@@ -902,6 +902,7 @@ TABLES = {
     "a name of two words": ("//X,Y,Z,Scalar field,Intensity", "{x},{y},{z},0,{i}"),
     "classes": ("x,y,z,intensity,class", "{x},{y},{z},{i},car"),
     "dates": ("time,x,y,z,intensity", "2025-05-01T10:00:00.1,{x},{y},{z},{i}"),
+    "a remission in words": ("x,y,z,intensity,reflectivity", "{x},{y},{z},{i},high"),
     "empty": ("x,y,z,label,intensity", "{x},{y},{z},,{i}"),
     "a separator behind": ("x,y,z,intensity,", "{x},{y},{z},{i},"),
     "the same, without one above": ("x,y,z,intensity", "{x},{y},{z},{i},"),
@@ -983,6 +984,8 @@ def test_what_a_table_lacks_is_nan(tmp_path: Path, gap: str, separator: str) -> 
         (b"x,y,z,i\n1,2,3,4\n1,2\n1,2,3,4\n", "row 2 of 3 has 2, '1,2'$"),
         (b"x,y,z,i\n1,far,3,4\n1,2,3,4\n", "no numeric field y among x, y, z, i"),
         (b"x,y,z,i\n1,2,3,4\n1,far,3,4\n", "does not hold 4 numbers"),
+        (b"x,y,z,i\n1,2,3,-nan(ind)\n1,2,3,4\n", "first row has '-nan\\(ind\\)' in the column i, and others"),
+        (b"x y z Time\n1 2 3 ?\n1 2 3 0.5\n", "first row has '[?]' in the column time, and others"),
     ],
 )
 def test_tables_of_other_units_and_with_damage_are_refused(tmp_path: Path, content: bytes, error: str) -> None:

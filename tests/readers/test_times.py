@@ -194,6 +194,8 @@ def test_scans_that_last_longer_than_their_interval_are_refused(duration_s: floa
     assert len(list(of_plausible_duration(scans(interval_s, stamps_s)))) == 6
     late = [*stamps_s[:3], stamps_s[3] - 0.9 * interval_s, *stamps_s[4:], 49.0]  # one message early, a clock set back
     assert len(list(of_plausible_duration(scans(interval_s, late)))) == 7
+    nothing = [edgeperc.TimedScan(s, np.empty((0, 4), np.float32), np.empty(0)) for s in stamps_s]  # a covered sensor
+    assert list(of_plausible_duration(nothing)) == nothing
 
 
 def test_the_best_known_field_counts() -> None:
