@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 import shutil
 import sqlite3
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import closing
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -20,7 +20,7 @@ import numpy as np
 from ..errors import PointsError
 from ..system.names import by_number
 from .inflate import inflate, inflate_file, inflated_message, most_bytes
-from .mcap import MCAP_MAGIC, BagFile, Channel, McapFile, unpack
+from .mcap import MCAP_MAGIC, BagFile, Channel, McapFile, Message, by_time, unpack
 from .tables import MAX_BYTES
 
 BAG_SUFFIXES = (".db3", ".mcap")
@@ -190,7 +190,7 @@ class Ros1Bag(BagFile):
             raise PointsError("the file is damaged or cut short: it ends before its index, as if recording broke off")
         return int(index)
 
-    def _messages(self) -> Iterator[tuple[int, int, memoryview]]:
+    def _messages(self) -> Iterator[Message]:
         for fields, content in _ros1_records(self._data, 13):
             if fields["op"] == b"\x05":
                 method = fields.get("compression", b"").decode("ascii", "replace")
@@ -198,30 +198,19 @@ class Ros1Bag(BagFile):
                 chunk = inflate(bytes(content), "" if method == "none" else method, n_bytes)
                 if len(chunk) != n_bytes:
                     raise PointsError(f"a chunk is damaged: it unpacks to {len(chunk):,} bytes, not to {n_bytes:,}")
-                yield from self._of_chunk(memoryview(chunk))
+                yield from by_time(self._of_records(_ros1_records(memoryview(chunk), 0, is_chunk=True)))
             else:
-                yield from self._message(fields, content)
+                yield from self._of_records([(fields, content)])
         self._index()
 
-    def _of_chunk(self, chunk: memoryview) -> Iterator[tuple[int, int, memoryview]]:
-        """Its messages in the order of time; damage is raised after those before it."""
-        found, damage = list[tuple[int, int, memoryview]](), None
-        try:
-            for fields, content in _ros1_records(chunk, 0, is_chunk=True):
-                found.extend(self._message(fields, content))
-        except PointsError as exc:
-            damage = exc
-        yield from sorted(found, key=lambda message: message[1])
-        if damage is not None:
-            raise damage
-
-    def _message(self, fields: dict[str, bytes], content: memoryview) -> Iterator[tuple[int, int, memoryview]]:
-        if fields.get("op") == b"\x02":
-            (number,) = unpack("<I", fields.get("conn", b""))
-            seconds, nanoseconds = unpack("<II", fields.get("time", b""))
-            yield number, 10**9 * seconds + nanoseconds, content
-        else:
-            self._learn(fields, content)
+    def _of_records(self, records: Iterable[tuple[dict[str, bytes], memoryview]]) -> Iterator[Message]:
+        for fields, content in records:
+            if fields.get("op") == b"\x02":
+                (number,) = unpack("<I", fields.get("conn", b""))
+                seconds, nanoseconds = unpack("<II", fields.get("time", b""))
+                yield number, 10**9 * seconds + nanoseconds, content
+            else:
+                self._learn(fields, content)
 
     def _learn(self, fields: dict[str, bytes], content: memoryview) -> None:
         if fields.get("op") == b"\x07":

@@ -14,7 +14,7 @@ import numpy as np
 from ..errors import PointsError, SensorError
 from ..types.sensor import SAY_PATTERN, SENSORS, SensorProfile
 from .clouds import is_ouster_cloud
-from .ouster import check_metadata, metadata_beside, object_in, read_metadata
+from .ouster import check_metadata, metadata_beside, object_in, read_metadata, reading
 from .packets import SNIFFED_PACKETS, velodyne_name, velodyne_packets
 from .senders import Senders
 
@@ -131,10 +131,8 @@ def of_metadata(content: Any, source: str) -> KnownSensor:
     """The sensor that an Ouster's metadata, as `json.loads` returns it, describes, with its own beam angles and
     columns; errors name the ``source``.
     """
-    try:
+    with reading(source):
         check_metadata(content)
-    except PointsError as exc:
-        raise PointsError(f"{source} cannot be read: {exc}") from exc
     layout = object_in(content, "lidar_data_format") or object_in(content, "data_format")
     angles = object_in(content, "beam_intrinsics").get("beam_altitude_angles", content.get("beam_altitude_angles"))
     elevations = _distinct(angles)

@@ -18,6 +18,9 @@ MCAP_MAGIC = b"\x89MCAP0\r\n"
 _HEADER, _FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _DATA_END = 1, 2, 3, 4, 5, 6, 15
 
 
+Message = tuple[int, int, memoryview]  # number of the channel, time of recording [ns], bytes
+
+
 class Channel(NamedTuple):
     """A topic and the type of its messages."""
 
@@ -79,12 +82,11 @@ class McapFile(BagFile):
             if self._channels.get(number) == channel:
                 yield stamp_ns, inflated_message(data)
 
-    def _messages(self) -> Iterator[tuple[int, int, memoryview]]:
+    def _messages(self) -> Iterator[Message]:
         """Channel's number, time of recording [ns] and bytes: chunk by chunk, within a chunk in the order of time."""
         for kind, content in _records(self._data, 8):
             if kind == _CHUNK:
-                records = list(self._of_records(_records(memoryview(_unpacked(content)), 0, is_chunk=True)))
-                yield from sorted(records, key=lambda message: message[1])
+                yield from by_time(self._of_records(_records(memoryview(_unpacked(content)), 0, is_chunk=True)))
             elif kind == _DATA_END:
                 return
             else:
@@ -92,7 +94,7 @@ class McapFile(BagFile):
         if not self._is_whole:  # as by a recorder that lost power
             raise PointsError("the file is damaged or cut short: it does not end as an MCAP file")
 
-    def _of_records(self, records: Iterable[tuple[int, memoryview]]) -> Iterator[tuple[int, int, memoryview]]:
+    def _of_records(self, records: Iterable[tuple[int, memoryview]]) -> Iterator[Message]:
         for kind, content in records:
             if kind == _MESSAGE:
                 channel, _, stamp_ns, _ = unpack("<HIQQ", content)
@@ -108,6 +110,18 @@ class McapFile(BagFile):
             self._is_named &= schema == 0 or schema in self._schemas  # 0: there is none
             topic, offset = _text(content, 4)
             self._channels[number] = Channel(topic, self._schemas.get(schema, ""), _text(content, offset)[0])
+
+
+def by_time(messages: Iterator[Message]) -> Iterator[Message]:
+    """The messages of a chunk in the order of time; damage is raised after those before it."""
+    whole, damage = list[Message](), None
+    try:
+        whole.extend(messages)
+    except PointsError as exc:
+        damage = exc
+    yield from sorted(whole, key=lambda message: message[1])
+    if damage is not None:
+        raise damage
 
 
 def _records(data: memoryview, offset: int, *, is_chunk: bool = False) -> Iterator[tuple[int, memoryview]]:

@@ -6,7 +6,8 @@ import json
 import os
 import struct
 import zlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -46,15 +47,22 @@ def read_metadata(path: Path) -> dict[str, Any]:
     """The text of a sensor's metadata, once it is checked."""
     if path.stat().st_size > _MOST_JSON_BYTES:
         raise PointsError(f"the metadata {path.name} is larger than {_MOST_JSON_BYTES:,} bytes")
-    try:
-        content = json.loads(path.read_bytes().decode("utf-8-sig", "replace"))
-    except (ValueError, RecursionError) as exc:
-        raise PointsError(f"the metadata {path.name} cannot be read: it is not JSON ({exc})") from exc
-    try:
+    with reading(f"the metadata {path.name}"):
+        try:
+            content = json.loads(path.read_bytes().decode("utf-8-sig", "replace"))
+        except (ValueError, RecursionError) as exc:
+            raise PointsError(f"it is not JSON ({exc})") from exc
         check_metadata(content)
+        return content
+
+
+@contextmanager
+def reading(source: str) -> Iterator[None]:
+    """Name the metadata in errors."""
+    try:
+        yield
     except PointsError as exc:
-        raise PointsError(f"the metadata {path.name} cannot be read: {exc}") from exc
-    return content
+        raise PointsError(f"{source} cannot be read: {exc}") from exc
 
 
 def object_in(content: Mapping[str, Any], name: str) -> Mapping[str, Any]:

@@ -162,7 +162,6 @@ def sender_names(counts: Mapping[tuple[str, int], int]) -> list[str]:
 
     counts : packets by address and port; few are damaged, unless they are as many as in a tenth of a second.
     """
-    # Those of a damaged address are few, unless they are as many as in a tenth of a second.
     fewest = min(_FEWEST_PACKETS, _LEAST_SHARE * max(counts.values(), default=0))
     known = [source for source, n in counts.items() if n >= fewest]
     ports = Counter(address for address, _ in known)
@@ -308,7 +307,6 @@ def copy_as_ethernet(path: Path, target: Path, alive: Callable[[], None], sender
 
     ``tcpdump -i any`` writes Linux's cooked headers; tunnels and phones write raw IP; a narrow link sends fragments.
     """
-    # ``tcpdump -i any`` writes Linux's cooked headers; tunnels and phones write raw IP; a narrow link sends fragments.
     with target.open("wb") as out:
         out.write(struct.pack("<IHHiIII", 0xA1B2C3D4, 2, 4, 0, 0, 65535, 1))
         for datagram in in_order(each for each in Datagrams(path, alive) if each.is_from(sender)):

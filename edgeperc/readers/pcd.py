@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..errors import PointsError
 from ..system.kernels import njit
@@ -17,9 +15,9 @@ from .tables import (
     Columns,
     column,
     header_lines,
+    parse_records,
     parse_table,
     whole_number,
-    whole_points,
 )
 
 _PCD_TYPES = {f"{kind}{size}": f"<{kind.lower()}{size}" for kind in "IU" for size in (1, 2, 4, 8)} | {
@@ -39,8 +37,7 @@ def begins_like_pcd(head: bytes) -> bool:
     return False
 
 
-@dataclass(frozen=True)
-class _PcdHeader:
+class _PcdHeader(NamedTuple):
     names: tuple[str, ...]
     types: tuple[str, ...]
     counts: tuple[int, ...]
@@ -82,32 +79,24 @@ def _parse_pcd_header(head: bytes) -> _PcdHeader:
 def parse_pcd(data: Bytes, head: bytes, remission_field: str | None) -> Columns:
     """Parse a PCD file: ascii, binary or binary_compressed; ``head`` is its beginning, with the whole header."""
     header = _parse_pcd_header(head)
-    n = header.n_points
-    widths = [int(np.dtype(kind).itemsize) * count for kind, count in zip(header.types, header.counts, strict=True)]
-    record = sum(widths)
-    body = data[header.n_bytes :]
-    single: dict[str, int] = {}  # place of each field of one value; padding fields are all called "_"
-    for k, name in enumerate(header.names):
-        if header.counts[k] == 1:
-            single.setdefault(plain_name(name), k)
-    fields: dict[str, NDArray[Any]]
-    n_missing = 0
+    n, body, record, n_values = header.n_points, data[header.n_bytes :], 0, 0
+    # Of each field of one value: its type and first byte in a record, and its place among the values of a row.
+    places: dict[str, tuple[str, int]] = {}
+    ranks: dict[str, int] = {}
+    for name, kind, count in zip(map(plain_name, header.names), header.types, header.counts, strict=True):
+        if count == 1 and name not in places:  # padding fields are all called "_"
+            places[name], ranks[name] = (kind, record), n_values
+        record += np.dtype(kind).itemsize * count
+        n_values += count
     if header.encoding == "ascii":
-        return parse_table(
-            body, 0, n, {name: sum(header.counts[:k]) for name, k in single.items()}, header.names, remission_field
-        )
+        return parse_table(body, 0, n, ranks, header.names, remission_field)
     if header.encoding == "binary":
-        n_missing = n - body.size // record
-        n = whole_points(n, record, body.size)
-        fields = {name: column(body, header.types[k], n, sum(widths[:k]), record) for name, k in single.items()}
-    elif header.encoding == "binary_compressed":
-        unpacked = _unpack_pcd(body, n * record)
-        fields = {
-            name: column(unpacked, header.types[k], n, n * sum(widths[:k]), widths[k]) for name, k in single.items()
-        }
-    else:
+        return parse_records(body, n, places, record, header.names)
+    if header.encoding != "binary_compressed":
         raise PointsError(f"PCD data is ascii, binary or binary_compressed, got {header.encoding!r}")
-    return Columns(n, fields, header.names, n_missing)
+    unpacked = _unpack_pcd(body, n * record)  # field by field
+    fields = {k: column(unpacked, kind, n, n * at, np.dtype(kind).itemsize) for k, (kind, at) in places.items()}
+    return Columns(n, fields, header.names)
 
 
 def _unpack_pcd(body: Bytes, n_bytes: int) -> Bytes:

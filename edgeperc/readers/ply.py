@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any, Literal
+from itertools import accumulate
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import PointsError
 from ..types.points import Bytes, Ints64, plain_name
-from .tables import Columns, column, cut_short, header_lines, parse_table, whole_number, whole_points
+from .tables import Columns, cut_short, header_lines, parse_records, parse_table, whole_number
 
 _PLY_TYPES = {
     **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"},
@@ -19,8 +19,7 @@ _PLY_TYPES = {
 }
 
 
-@dataclass(frozen=True)
-class _PlyElement:
+class _PlyElement(NamedTuple):
     name: str
     count: int
     properties: list[tuple[str, str, str]]  # name, type, type of a list's length or ""
@@ -85,24 +84,18 @@ def parse_ply(data: Bytes, head: bytes, remission_field: str | None) -> Columns:
     offset = 0
     for element in before:
         offset = _row_starts(body, offset, element, order)[1]
-    n, n_missing = vertex.count, 0
-    fields: dict[str, NDArray[Any]] = {}
+    kinds = [order + kind for _, kind, _ in vertex.properties]
     if not vertex.has_lists:
-        widths = [int(np.dtype(kind).itemsize) for _, kind, _ in vertex.properties]
-        record = sum(widths)
-        n = whole_points(n, record, body.size - offset)
-        n_missing = vertex.count - ((body.size - offset) // record if is_last and record else n)
-        for name, k in places.items():
-            kind = order + vertex.properties[k][1]
-            fields[name] = column(body, kind, n, offset + sum(widths[:k]), record)
-    else:
-        starts, _ = _row_starts(body, offset, vertex, order)
-        assert starts is not None
-        for name, k in places.items():
-            kind = order + vertex.properties[k][1]
-            octets = starts[:, k, None] + np.arange(np.dtype(kind).itemsize)
-            fields[name] = body[octets].reshape(-1).view(kind)
-    return Columns(n, fields, names, n_missing)
+        *firsts, record = accumulate((np.dtype(kind).itemsize for kind in kinds), initial=0)
+        of_record = {name: (kinds[k], firsts[k]) for name, k in places.items()}
+        return parse_records(body[offset:], vertex.count, of_record, record, names, is_last=is_last)
+    starts, _ = _row_starts(body, offset, vertex, order)
+    assert starts is not None
+    fields: dict[str, NDArray[Any]] = {}
+    for name, k in places.items():
+        octets = starts[:, k, None] + np.arange(np.dtype(kinds[k]).itemsize)
+        fields[name] = body[octets].reshape(-1).view(kinds[k])
+    return Columns(vertex.count, fields, names)
 
 
 def _row_starts(body: Bytes, offset: int, element: _PlyElement, order: str) -> tuple[Ints64 | None, int]:

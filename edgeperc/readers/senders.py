@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from ..errors import PointsError
-from .ouster import metadata_beside, read_metadata
+from .ouster import metadata_beside, read_metadata, reading
 from .packets import DIFOP, GPS_BYTES, OVERTAKEN_S, Datagrams, is_of_velodyne, sender_names, turned_s
 
 if TYPE_CHECKING:
@@ -143,8 +143,6 @@ def layouts_beside(path: Path) -> list[Layout]:
     layouts = []
     for file in files:
         content = read_metadata(file)
-        try:
+        with reading(f"the metadata {file.name}"):
             layouts.append(layout_of(content))
-        except PointsError as exc:
-            raise PointsError(f"the metadata {file.name} cannot be read: {exc}") from exc
     return layouts

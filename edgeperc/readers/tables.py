@@ -64,15 +64,26 @@ def whole_number(text: str) -> int:
     return value
 
 
-def whole_points(n: int, record: int, size: int) -> int:
-    """How many of the declared points of ``record`` bytes are whole in ``size`` bytes; PointsError for none, and for a
-    number that no scan has.
+def parse_records(
+    body: Bytes,
+    n: int,
+    places: Mapping[str, tuple[str, int]],
+    record: int,
+    names: Sequence[str],
+    *,
+    is_last: bool = True,
+) -> Columns:
+    """Parse n records of ``record`` bytes, as far as they are whole; ``places`` has each field's type and first byte.
+
+    Raises PointsError: None is whole, or more are declared than a scan has.
     """
-    if n * record <= size:
-        return n
-    if size < record or n * record > MAX_SCAN_BYTES:
-        raise cut_short(n, record, size)
-    return size // record
+    n_there = n
+    if n * record > body.size:
+        n_there = body.size // record
+        if not n_there or n * record > MAX_SCAN_BYTES:
+            raise cut_short(n, record, body.size)
+    fields = {name: column(body, kind, n_there, first, record) for name, (kind, first) in places.items()}
+    return Columns(n_there, fields, names, n - (body.size // record if is_last and record else n_there))
 
 
 def cut_short(n: int, record: int, size: int) -> PointsError:

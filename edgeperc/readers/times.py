@@ -79,8 +79,6 @@ def point_times(fields: Mapping[str, NDArray[Any]], points: Points, stamp_s: flo
     Raises PointsError if, by these times and the azimuths, the sensor takes less than 33 or more than 350 ms for a
     turn.
     """
-    # Drivers store seconds, milli-, micro- or nanoseconds, and no field says which. A scan takes 2 ms to 2 s, so the
-    # difference between its first and its last time shows the unit, but not where all times are 0.
     name = time_name(fields)
     if name is None:
         return None
