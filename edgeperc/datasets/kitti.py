@@ -221,6 +221,30 @@ def label_objects(labels: KittiLabels, calibration: KittiCalibration) -> tuple[t
     return boxes, labels.numbers[~labels.is_object, 3:7]
 
 
+def read_labeled(
+    root: Path, name: str, image_size: tuple[int, int] = IMAGE_SIZE
+) -> tuple[tuple[Box, ...], Floats, KittiCalibration, KittiLabels]:
+    """`label_objects` of a scan by ``label_2`` and ``calib``, and what they come from, checked to be of that image."""
+    calibration, path = KittiCalibration.read(root / "calib" / f"{name}.txt"), root / "label_2" / f"{name}.txt"
+    labels = read_labels(path)
+    check_in_image(labels, image_size, path)
+    return *label_objects(labels, calibration), calibration, labels
+
+
+def read_numbers(path: Path, n_points: int) -> NDArray[Any]:
+    """Number of each point's class: uint32 in a ``.label``, with the instance above, else uint8. Raises PointsError."""
+    numbers: NDArray[Any] = np.fromfile(path, np.uint8)
+    if path.suffix == ".label":
+        if numbers.size % 4:
+            raise PointsError(f"{path}: {numbers.size} bytes are not uint32 labels; expected 4 bytes for each point")
+        numbers = numbers.view("<u4") & 0xFFFF
+    if len(numbers) != n_points:
+        raise PointsError(
+            f"{path} has {len(numbers)} labels for a scan of {n_points} points; expected one for each point"
+        )
+    return numbers
+
+
 def scan_hash(points: Points) -> str:
     """Identify a scan in a model's card: the first 16 hexadecimal digits of the SHA-256 of its points."""
     return hashlib.sha256(points.tobytes()).hexdigest()[:16]
@@ -256,13 +280,9 @@ class KittiObjects:
     def frame(self, name: str) -> Frame:
         """Read a labeled scan with its labels and calibration."""
         row = next(row for row in self.rows if row["name"] == name)
-        calibration = KittiCalibration.read(self.root / "training/calib" / f"{name}.txt")
-        path = self.root / "training/label_2" / f"{name}.txt"
-        labels = read_labels(path)
-        check_in_image(labels, IMAGE_SIZE, path)
-        boxes, unlabeled = label_objects(labels, calibration)
+        labeled = read_labeled(self.root / "training", name)
         points = read_points(self.root / "training/velodyne" / f"{name}.bin")
-        return Frame(name, row["drive"], row["grade"], points, boxes, unlabeled, calibration, labels)
+        return Frame(name, row["drive"], row["grade"], points, *labeled)
 
 
 def _frame_rows(root: Path) -> list[dict[str, str]]:
@@ -375,12 +395,8 @@ class SemanticKitti:
     def frame(self, name: str) -> RoadFrame:
         """Read one scan and its labels; raise `PointsError` if their numbers differ."""
         sequence, stem = name.split("/")
-        points = read_points(self.root / "sequences" / sequence / "velodyne" / f"{stem}.bin")
-        path = self.root / "sequences" / sequence / "labels" / f"{stem}.label"
-        raw = np.fromfile(path, np.uint32) & 0xFFFF  # the upper 16 bits are the instance
-        if len(raw) != len(points):
-            raise PointsError(
-                f"{path} has {len(raw)} labels for a scan of {len(points)} points; expected one for each point"
-            )
+        folder = self.root / "sequences" / sequence
+        points = read_points(folder / "velodyne" / f"{stem}.bin")
+        raw = read_numbers(folder / "labels" / f"{stem}.label", len(points))
         labels = np.where(np.isin(raw, ROAD_IDS), 1, np.where(np.isin(raw, VEHICLE_IDS), 2, 0))
         return RoadFrame(name, self.drives[name], points, np.where(raw == 0, IGNORE, labels).astype(np.uint8))

@@ -43,10 +43,9 @@ from .kitti import (
     WHOLE_TURN,
     KittiCalibration,
     KittiLabels,
-    check_in_image,
-    label_objects,
     read_drives,
-    read_labels,
+    read_labeled,
+    read_numbers,
 )
 from .layout import (
     ANY,
@@ -250,10 +249,7 @@ class ScanFolder:
         calibration = unlabeled = boxes = image_labels = None
         path = self._path("boxes", name)
         if path is not None and self.layout.box_format == "kitti":
-            calibration = KittiCalibration.read(self.root / "calib" / f"{name}.txt")
-            rows = read_labels(path)
-            check_in_image(rows, self.layout.image_size or IMAGE_SIZE, path)
-            found, unlabeled = label_objects(rows, calibration)
+            found, unlabeled, calibration, rows = read_labeled(self.root, name, self.layout.image_size or IMAGE_SIZE)
             boxes = self._renamed(found, path)
             kinds = [k if k == "dontcare" else class_of_name(k, self.layout.boxes, path, "boxes") for k in rows.kinds]
             image_labels = KittiLabels(tuple(kinds), rows.numbers)
@@ -352,16 +348,7 @@ class ScanFolder:
         return tuple(box for box in renamed if box.label != BACKGROUND)
 
     def _read_classes(self, path: Path, n_points: int) -> Bytes:
-        data = np.fromfile(path, np.uint8)
-        raw: NDArray[Any] = data
-        if path.suffix == ".label":
-            if data.size % 4:
-                raise PointsError(f"{path}: {data.size} bytes are not uint32 labels; expected 4 bytes for each point")
-            raw = data.view("<u4") & 0xFFFF  # the upper 16 bits are the instance
-        if len(raw) != n_points:
-            raise PointsError(
-                f"{path} has {len(raw)} labels for a scan of {n_points} points; expected one for each point"
-            )
+        raw = read_numbers(path, n_points)
         if self._point_numbers is None:
             self._point_numbers = self._numbers()
         numbers = np.unique(raw)
