@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator
 from itertools import islice
 from pathlib import Path
@@ -31,7 +32,9 @@ _ALIKE = {"helios-32", "helios-16"}  # by their packets; the angles tell them ap
 def open_spinning(path: Path, row: Format, sender: str | None, alive: Callable[[], None]) -> tuple[Format, Angles]:
     """The format and angles of a spinning sensor; PointsError if neither the capture nor a file beside it has them."""
     files = sorted(path.absolute().parent.glob("*.csv"))
-    file = next((each for each in files if each.stem.startswith(path.stem)), None)
+    # Of drive.pcap drive.csv, else drive_angles.csv; drive2.csv is of another capture.
+    own = [file for file in files if re.fullmatch(re.escape(path.stem) + r"([\W_].*)?", file.stem)]
+    file = min(own, key=lambda each: len(each.stem), default=None)
     said = Angles(np.array([[each, 0.0] for each in row.elevations_deg])) if row.elevations_deg else None
     for datagram in () if row.is_hesai else Datagrams(path, alive):
         if not datagram.is_from(sender):
