@@ -31,6 +31,7 @@ from unittest import mock
 
 import numpy as np
 import test_pcap as pcap_tests
+from capture_writers import records_of
 
 from edgeperc.errors import PointsError
 from edgeperc.readers import apart, worker
@@ -40,7 +41,7 @@ from edgeperc.readers.files import read_points
 
 from .mutate import mutated_bytes, mutated_json, noise
 from .running import Case, check, peak_mb, reset_peak
-from .seeds import Seed, data_root, pcap_records, real_seeds, scan_files, synthetic_seeds
+from .seeds import Seed, data_root, real_seeds, scan_files, synthetic_seeds
 
 __all__ = ["LIMIT_MB", "LIMIT_S", "Captures", "make"]
 
@@ -274,7 +275,7 @@ Files = dict[str, bytes]
 
 
 def _pcap(content: bytes, case: Case) -> bytes:
-    rng, records = case.rng, pcap_records(content)
+    rng, records = case.rng, records_of(content)
     head = content[:24]
     if rng.random() < 0.1:
         head = mutated_bytes(head, case, 2)

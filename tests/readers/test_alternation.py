@@ -7,10 +7,10 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
+from capture_writers import write_clouds
 from numpy.typing import NDArray
 
 from edgeperc import read_scans
@@ -90,20 +90,8 @@ def test_scans_that_are_the_same_or_empty_are_not(n_points: int) -> None:
 
 @pytest.mark.usefixtures("in_this_process")
 def test_a_bag_of_two_sensors_is_warned_of(tmp_path: Path) -> None:
-    rosbag2, typesys = pytest.importorskip("rosbags.rosbag2"), pytest.importorskip("rosbags.typesys")
-    store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
-    kinds: Any = store.types
-    newer = {"version": 8} if hasattr(rosbag2, "StoragePlugin") else {}
-    with rosbag2.Writer(tmp_path / "bag", **newer) as bag:
-        topic = bag.add_connection("/points", "sensor_msgs/msg/PointCloud2", typestore=store)
-        for k, points in enumerate(drive((FRONT, REAR), 3.0, 1)):
-            header = kinds["std_msgs/msg/Header"](kinds["builtin_interfaces/msg/Time"](k, 1), "lidar")
-            fields = [
-                kinds["sensor_msgs/msg/PointField"](name, 4 * at, 7, 1) for at, name in enumerate(("x", "y", "z", "i"))
-            ]
-            message = kinds["sensor_msgs/msg/PointCloud2"](
-                header, 1, len(points), fields, False, 16, 16 * len(points), points.view(np.uint8).ravel(), True
-            )
-            bag.write(topic, 10**9 * k, store.serialize_cdr(message, "sensor_msgs/msg/PointCloud2"))
+    kind = [(name, "f4") for name in "xyzi"]
+    scans = ((float(k), points.view(kind)[:, 0]) for k, points in enumerate(drive((FRONT, REAR), 3.0, 1)))
+    path = write_clouds(tmp_path / "drive.bag", scans)
     with pytest.warns(UserWarning, match="bag: every second scan is alike"):
-        assert len([*read_scans(tmp_path / "bag")]) == 12
+        assert len([*read_scans(path)]) == 12

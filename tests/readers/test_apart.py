@@ -17,21 +17,14 @@ import zipfile
 import zlib
 from collections.abc import Callable
 from contextlib import suppress
+from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from test_captures import (
-    LIDAR,
-    POINTS,
-    messages,
-    read_until_error,
-    record,
-    sized,
-    write_bag2,
-    write_pcap,
-)
+from capture_writers import check_same, mcap_channel, mcap_message, record, records_of, sized, write_pcap, write_records
+from test_captures import LIDAR, POINTS, messages, read_until_error, write_bag2
 from test_captures import ouster as ouster
 
 from edgeperc.errors import PointsError
@@ -138,16 +131,6 @@ def test_a_program_without_a_guard(ouster: Path, tmp_path: Path) -> None:
     assert (done.returncode, done.stdout) == (0, "3\n"), done.stderr
 
 
-def records_of(content: bytes) -> list[bytes]:
-    """The records of a pcap file, each with its header."""
-    at, found = 24, []
-    while at < len(content):
-        end = at + 16 + struct.unpack_from("<I", content, at + 8)[0]
-        found.append(content[at:end])
-        at = end
-    return found
-
-
 def datagram(payload: bytes, *, port: int = 7502, length: int | None = None, total: int | None = None) -> bytes:
     """A record of a UDP packet; lengths in its headers may be false."""
     udp = struct.pack(">HHHH", port, port, 8 + len(payload) if length is None else length, 0) + payload
@@ -181,9 +164,7 @@ def test_damaged_packets_of_an_ouster_are_dropped(ouster: Path, tmp_path: Path) 
     with pytest.warns(UserWarning, match=f"dropped {3 * len(BAD_PACKETS)} damaged packets") as caught:
         scans = list(read_scans(path))
     assert len(caught) == 1
-    for (stamp, points), (true_stamp, true_points) in zip(scans, read_scans(ouster / "sphere.pcap"), strict=True):
-        assert stamp == true_stamp
-        np.testing.assert_array_equal(points, true_points)
+    check_same(scans, read_scans(ouster / "sphere.pcap"))
 
 
 @pytest.mark.usefixtures("in_this_process")
@@ -291,10 +272,7 @@ def read_whole(path: Path) -> None:
 def damage(content: bytes, chance: random.Random, near: int) -> bytes:
     """Change some bytes; most of them among the first ``near`` of a record, where headers are."""
     damaged = bytearray(content)
-    places, at = [], 24
-    while at < len(content):
-        places.append(at)
-        at += 16 + struct.unpack_from("<I", content, at + 8)[0]
+    places = [*accumulate(map(len, records_of(content)), initial=24)][:-1]
     for _ in range(chance.choice((1, 4, 30))):
         start = chance.choice(places) + chance.choice((8, 16, 16, 16))
         place = min(start + chance.randrange(near), len(damaged) - 1)
@@ -418,26 +396,19 @@ def chunked_mcap(
     typesys = pytest.importorskip("rosbags.typesys")
     store, sent = messages(typesys, 2)
     kind = "sensor_msgs/msg/PointCloud2"
-    magic = b"\x89MCAP0\r\n"
     definition = store.generate_msgdef(kind, ros_version=2)[0].encode()
-    meta = record(3, struct.pack("<H", 1) + sized(kind.encode()) + sized(b"ros2msg") + sized(definition))
-    meta += record(4, struct.pack("<HH", 1, 1) + sized(LIDAR.encode()) + sized(b"cdr") + sized(b""))
-    content = magic + record(1, sized(b"ros2") + sized(b"test"))
+    meta, content = mcap_channel(1, LIDAR, kind, definition=definition), b""
     clouds = [(stamp_ns, message) for topic, _, stamp_ns, message in sent if topic == LIDAR]
     for k, (stamp_ns, message) in enumerate(clouds):
-        data = struct.pack("<HIQQ", 1, k, stamp_ns, stamp_ns) + bytes(store.serialize_cdr(message, kind))
-        records = (meta if k == 0 else b"") + record(5, data)
+        records = meta if k == 0 else b""
+        records += mcap_message(1, k, stamp_ns, bytes(store.serialize_cdr(message, kind)))
         checksum = zlib.crc32(records) if crc else 0
         if k == damaged:
             records = records[:-9] + bytes([records[-9] ^ 1]) + records[-8:]
         packed = pack(records, method)
         head = struct.pack("<QQQI", stamp_ns, stamp_ns, len(records), checksum)
         content += record(6, head + sized(method.encode()) + struct.pack("<Q", len(packed)) + packed)
-    content += record(15, bytes(4))
-    place = len(content) if summary else 0
-    content += (meta if summary else b"") + record(2, struct.pack("<QQI", place, 0, 0)) + magic
-    path.write_bytes(content)
-    return path
+    return write_records(path, content, b"ros2", meta if summary else b"")
 
 
 @pytest.mark.usefixtures("in_this_process")

@@ -13,10 +13,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from capture_writers import mcap_channel, write_records
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from test_apart import chunked_mcap
-from test_captures import BAGS, LIDAR, OTHER, POINTS, error_of, record, sized, write_bag1, write_bag2, write_mcap
+from test_captures import BAGS, LIDAR, OTHER, POINTS, error_of, write_bag1, write_bag2, write_mcap
 
 import edgeperc
 from edgeperc.errors import MissingExtraError, PointsError
@@ -241,15 +242,7 @@ def test_a_summary_need_not_repeat_the_schemas(tmp_path: Path, method: str) -> N
     [("sensor_msgs/msg/PointCloud2", "json"), ("sensor_msgs/PointCloud2", "cdr"), ("foxglove.PointCloud", "json")],
 )
 def test_other_encodings_are_listed(tmp_path: Path, kind: str, encoding: str) -> None:
-    path = tmp_path / "drive.mcap"
-    magic = b"\x89MCAP0\r\n"
-    path.write_bytes(
-        magic
-        + record(1, sized(b"") + sized(b""))
-        + record(3, struct.pack("<H", 1) + sized(kind.encode()) + sized(b"") + sized(b""))
-        + record(4, struct.pack("<HH", 1, 1) + sized(b"/points") + sized(encoding.encode()) + sized(b""))
-        + record(15, bytes(4)) + record(2, bytes(20)) + magic
-    )  # fmt: skip
+    path = write_records(tmp_path / "drive.mcap", mcap_channel(1, "/points", kind, encoding))
     assert f"of other types /points ({kind})" in error_of(path)
 
 

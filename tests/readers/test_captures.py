@@ -5,13 +5,30 @@ from __future__ import annotations
 import random
 import struct
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+from capture_writers import (
+    CLOUD,
+    TYPES,
+    check_same,
+    field,
+    join,
+    mcap_channel,
+    mcap_message,
+    ouster_frame,
+    ouster_info,
+    ros_cloud,
+    vlp16_packets,
+    write_link,
+    write_ouster,
+    write_pcap,
+    write_records,
+)
 
 import edgeperc
 from edgeperc.errors import MissingExtraError, PointsError
@@ -27,20 +44,26 @@ POINTS = np.array(
 )
 
 
-def join(path: Path, parts: Iterable[Path]) -> Path:
-    """Write a capture of the packets of others, one after the other."""
-    path.write_bytes(b"".join(part.read_bytes()[24 * (k > 0) :] for k, part in enumerate(parts)))
-    return path
-
-
 def check_told_apart(both: Path, alone: Mapping[str, Path]) -> None:
     """By its name, each sensor of a capture of several gives the points and the profile of its capture alone."""
     for topic, path in alone.items():
-        found, expected = list(read_scans(both, topic=topic)), list(read_scans(path))
-        assert len(found) == len(expected) > 0
-        for (_, points), (_, other_points) in zip(found, expected, strict=True):
-            np.testing.assert_array_equal(points, other_points)
+        check_same(read_scans(both, topic=topic), read_scans(path), clock=False)
         assert edgeperc.sensor_of(both, topic=topic) == edgeperc.sensor_of(path)
+
+
+def check_beside(folder: Path, sent: Mapping[str, tuple[str, Sequence[bytes]]], metadata: str = "") -> None:
+    """Sensors in one capture are told apart, whichever comes first: sender and packets by topic, an Ouster's last."""
+    alone = {
+        topic: write_link(folder / f"{k}.pcap", 1, packets, one=sender)
+        for k, (topic, (sender, packets)) in enumerate(sent.items())
+    }
+    if metadata:
+        for path in (folder / "both.pcap", [*alone.values()][-1]):
+            path.with_suffix(".json").write_text(metadata)
+    for parts in (alone.values(), reversed(alone.values())):
+        both = join(folder / "both.pcap", parts)
+        assert f"expected one LiDAR, there are {', '.join(alone)}; choose one" in error_of(both)
+        check_told_apart(both, alone)
 
 
 def error_of(path: Path, **options: Any) -> str:
@@ -64,11 +87,6 @@ def read_until_error(path: Path) -> tuple[list[Any], str]:
 
 
 FLOATS = (("x", "f4"), ("y", "f4"), ("z", "f4"), ("intensity", "f4"))
-TYPES = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
-
-
-def field(name: str, offset: int, kind: str, count: int = 1) -> SimpleNamespace:
-    return SimpleNamespace(name=name, offset=offset, datatype=TYPES[kind], count=count)
 
 
 def cloud(
@@ -206,25 +224,8 @@ def messages(typesys: Any, ros: int) -> tuple[Any, list[tuple[str, str, int, Any
     sent = []
     for k in range(3):
         source = cloud(POINTS + np.float32(k), LAYOUT, order="<>"[k % 2], padding=2)
-        stamp = (
-            types["builtin_interfaces/msg/Time"](100 + k, 500_000_000)
-            if k < 2
-            else types["builtin_interfaces/msg/Time"](0, 0)
-        )
-        header = types["std_msgs/msg/Header"](*([k] if ros == 1 else []), stamp, "lidar")
-        fields = [types["sensor_msgs/msg/PointField"](f.name, f.offset, f.datatype, f.count) for f in source.fields]
-        message = types["sensor_msgs/msg/PointCloud2"](
-            header,
-            source.height,
-            source.width,
-            fields,
-            source.is_bigendian,
-            source.point_step,
-            source.row_step,
-            np.frombuffer(source.data, np.uint8),
-            False,
-        )
-        sent.append((LIDAR, "sensor_msgs/msg/PointCloud2", (200 + k) * 10**9, message))
+        message = ros_cloud(types, source, (100 + k, 500_000_000) if k < 2 else (0, 0), k if ros == 1 else None)
+        sent.append((LIDAR, CLOUD, (200 + k) * 10**9, message))
         sent.append((OTHER, "std_msgs/msg/String", (200 + k) * 10**9 + 1, types["std_msgs/msg/String"]("word")))
     return store, sent
 
@@ -261,57 +262,24 @@ def write_bag2(folder: Path) -> Path:
     return folder
 
 
-def sized(content: bytes) -> bytes:
-    return struct.pack("<I", len(content)) + content
-
-
-def record(opcode: int, content: bytes) -> bytes:
-    return bytes([opcode]) + struct.pack("<Q", len(content)) + content
-
-
 def write_mcap(path: Path, profile: bytes = b"ros2") -> Path:
     """MCAP by its specification: header, schemas, channels and messages, without chunks or an index."""
     typesys = pytest.importorskip("rosbags.typesys")
     store, sent = messages(typesys, 2)
-    magic = b"\x89MCAP0\r\n"
-    content = magic + record(1, sized(profile) + sized(b"test"))
-    channels = [*dict.fromkeys((topic, kind) for topic, kind, _, _ in sent)]
+    content, channels = b"", [*dict.fromkeys((topic, kind) for topic, kind, _, _ in sent)]
     for k, (topic, kind) in enumerate(channels, start=1):
         definition, _ = store.generate_msgdef(kind, ros_version=2)
-        content += record(
-            3, struct.pack("<H", k) + sized(kind.encode()) + sized(b"ros2msg") + sized(definition.encode())
-        )
-        content += record(4, struct.pack("<HH", k, k) + sized(topic.encode()) + sized(b"cdr") + sized(b""))
+        content += mcap_channel(k, topic, kind, definition=definition.encode())
     for n, (topic, kind, stamp_ns, message) in enumerate(sent):
-        header = struct.pack("<HIQQ", channels.index((topic, kind)) + 1, n, stamp_ns, stamp_ns)
-        content += record(5, header + bytes(store.serialize_cdr(message, kind)))
-    content += record(15, bytes(4)) + record(2, bytes(20)) + magic
-    path.write_bytes(content)
-    return path
+        number = channels.index((topic, kind)) + 1
+        content += mcap_message(number, n, stamp_ns, bytes(store.serialize_cdr(message, kind)))
+    return write_records(path, content, profile)
 
 
 def write_mcap_folder(folder: Path) -> Path:
     folder.mkdir()
     write_mcap(folder / "bag_0.mcap")
-    topics = "".join(
-        f"""
-  - message_count: 3
-    topic_metadata: {{name: {topic}, type: {kind}, serialization_format: cdr, offered_qos_profiles: ''}}"""
-        for topic, kind in ((LIDAR, "sensor_msgs/msg/PointCloud2"), (OTHER, "std_msgs/msg/String"))
-    )
-    (folder / "metadata.yaml").write_text(
-        f"""rosbag2_bagfile_information:
-  version: 5
-  storage_identifier: mcap
-  duration: {{nanoseconds: 2000000001}}
-  starting_time: {{nanoseconds_since_epoch: 200000000000}}
-  message_count: 6
-  compression_format: ''
-  compression_mode: ''
-  relative_file_paths: [bag_0.mcap]
-  topics_with_message_count:{topics}
-"""
-    )
+    (folder / "metadata.yaml").write_text("rosbag2_bagfile_information:\n  relative_file_paths: [bag_0.mcap]\n")
     return folder
 
 
@@ -357,29 +325,6 @@ def test_bag_without_lidar_lists_its_topics(tmp_path: Path) -> None:
     with rosbag1.Writer(empty) as bag:
         bag.add_connection(LIDAR, "sensor_msgs/msg/PointCloud2", typestore=store)
     assert "damaged" in (error := error_of(empty)) or "no message" in error
-
-
-def write_pcap(path: Path, payloads: Sequence[bytes], endian: str = "<") -> Path:
-    """UDP in IPv4 in Ethernet, 1 ms apart."""
-    content = struct.pack(endian + "IHHIIII", 0xA1B2C3D4, 2, 4, 0, 0, 65535, 1)
-    for k, payload in enumerate(payloads):
-        udp = struct.pack(">HHHH", 2368, 2368, 8 + len(payload), 0) + payload
-        ip = struct.pack(">BBHHHBBHII", 0x45, 0, 20 + len(udp), k % 65536, 0, 64, 17, 0, 0xC0A80001, 0xFFFFFFFF) + udp
-        frame = bytes(12) + b"\x08\x00" + ip
-        content += struct.pack(endian + "IIII", 1000 + k // 1000, 1000 * (k % 1000), len(frame), len(frame)) + frame
-    path.write_bytes(content)
-    return path
-
-
-def vlp16_packets(n_turns: float, meters: float = 10.0, intensity: int = 77) -> list[bytes]:
-    """A VLP-16 in a sphere: 12 blocks of two firings of 16 lasers a packet, 0.4 degrees from block to block."""
-    hundredths = np.arange(int(n_turns * 900)) * 40
-    returns = struct.pack("<HB", round(meters / 0.002), intensity) * 32
-    packets = []
-    for k in range(0, len(hundredths) - 11, 12):
-        blocks = b"".join(b"\xff\xee" + struct.pack("<H", h % 36000) + returns for h in hundredths[k : k + 12])
-        packets.append(blocks + struct.pack("<IBB", 1_000_000 + 1327 * (k // 12), 0x37, 0x22))
-    return packets
 
 
 @pytest.mark.parametrize("endian", ["<", ">"])
@@ -439,32 +384,9 @@ def test_a_velodyne_capture_that_is_cut_short(tmp_path: Path) -> None:
 @pytest.fixture(scope="module")
 def ouster(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with sphere.pcap, its metadata and sphere.osf: three turns of 64 x 512, every other column empty."""
-    core, pcap = pytest.importorskip("ouster.sdk.core"), pytest.importorskip("ouster.sdk.pcap")
-    osf = pytest.importorskip("ouster.sdk.osf")
-    folder = tmp_path_factory.mktemp("ouster")
-    info = core.SensorInfo.from_default(core.LidarMode._512x10)
-    info.sn = 991
-    info.format.udp_profile_lidar = core.UDPProfileLidar.RNG19_RFL8_SIG16_NIR16
-    info.config.udp_port_lidar, info.config.udp_port_imu = 7502, 7503
-    frames = []
-    for k in range(3):
-        frame = core.LidarFrame(info)
-        frame.frame_id = k + 1
-        frame.field("RANGE")[:, 1::2] = 10_000  # mm
-        frame.field("REFLECTIVITY")[:] = 40 + k
-        frame.field("SIGNAL")[:] = 4000 + k
-        frame.timestamp[:] = np.arange(512) * 195_312 + (5 + k) * 10**9
-        frame.measurement_id[:] = np.arange(512)
-        frame.packet_timestamp[:] = 10**18
-        frame.status[:] = 1
-        frames.append(frame)
-    layout = core.PacketFormat(info)
-    packets = [p for frame in frames for p in core.frame_to_packets(frame, layout, info.init_id, info.sn)]
-    assert pcap.record(packets, str(folder / "sphere.pcap")) == len(packets)
-    (folder / "sphere.json").write_text(info.to_json_string())
-    with osf.Writer(str(folder / "sphere.osf"), info) as writer:
-        for frame in frames:
-            writer.save(0, frame)
+    folder, info = tmp_path_factory.mktemp("ouster"), ouster_info()
+    for name in ("sphere.pcap", "sphere.osf"):
+        write_ouster(folder / name, info, [ouster_frame(info, k) for k in range(3)])
     return folder
 
 
@@ -551,6 +473,7 @@ def test_packets_without_a_lidar_are_refused(tmp_path: Path, ouster: Path) -> No
         ("text.mcap", b"no capture at all", "damaged"),
         ("text.osf", b"no capture at all", "damaged"),
         ("empty.osf", b"", "damaged"),
+        ("empty.lvx2", b"", "cut short"),
         ("lfs.pcap", b"version https://git-lfs.github.com/spec/v1\n", "git lfs pull"),
         ("lfs.mcap", b"version https://git-lfs.github.com/spec/v1\n", "git lfs pull"),
         ("packed.bag", b"\x1f\x8b\x08" + bytes(40), "this is an archive"),

@@ -5,14 +5,14 @@ from __future__ import annotations
 import contextlib
 import struct
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+from capture_writers import mcap_channel, mcap_message, write_records
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from test_captures import FLOATS, POINTS, cloud, messages, record, sized
+from test_captures import FLOATS, POINTS, cloud, messages
 
 from edgeperc.errors import PointsError
 from edgeperc.readers.captures import read_scans
@@ -108,14 +108,10 @@ def foxglove(points: np.ndarray, stamp: tuple[int, int] = (5, 7)) -> bytes:
 
 
 def write_foxglove(path: Path) -> Path:
-    magic = b"\x89MCAP0\r\n"
-    content = magic + record(1, sized(b"") + sized(b""))
-    content += record(3, struct.pack("<H", 9) + sized(FOXGLOVE[0].encode()) + sized(b"protobuf") + sized(b""))
-    content += record(4, struct.pack("<HH", 4, 9) + sized(b"/points") + sized(b"protobuf") + sized(b""))
+    content = mcap_channel(4, "/points", *FOXGLOVE, schema=9)
     for k in range(3):
-        content += record(5, struct.pack("<HIQQ", 4, k, k, k) + foxglove(POINTS + np.float32(k), (100 + k, 5 * 10**8)))
-    path.write_bytes(content + record(15, bytes(4)) + record(2, bytes(20)) + magic)
-    return path
+        content += mcap_message(4, k, k, foxglove(POINTS + np.float32(k), (100 + k, 5 * 10**8)))
+    return write_records(path, content)
 
 
 def test_clouds_of_foxglove(tmp_path: Path) -> None:
@@ -140,8 +136,3 @@ def test_cut_clouds_of_foxglove_are_refused() -> None:
 def test_a_number_in_place_of_a_text(number: int, value: int) -> None:
     with pytest.raises(PointsError, match=r"it is not a foxglove\.PointCloud"):
         CLOUD_READERS[FOXGLOVE](memoryview(foxglove(POINTS) + part(number, value)))
-
-
-def test_messages_of_any_library() -> None:
-    message = SimpleNamespace(**vars(cloud(POINTS)))
-    np.testing.assert_array_equal(cloud_points(message), POINTS)

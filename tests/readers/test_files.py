@@ -37,6 +37,9 @@ def save(folder: Path, name: str, content: bytes) -> Path:
     return path
 
 
+XYZ, XYZI = ("x y z", "F F F", "4 4 4", "1 1 1"), ("x y z intensity", "F F F F", "4 4 4 4", "1 1 1 1")
+
+
 def pcd(
     fields: str, types: str, sizes: str, counts: str, n: int, encoding: str, body: bytes, width: int | None = None
 ) -> bytes:
@@ -48,6 +51,21 @@ def pcd(
     return header.encode() + body
 
 
+def pcd_of(rows: np.ndarray, encoding: str = "binary") -> bytes:
+    """Of a structured array."""
+    kinds = [rows.dtype[name] for name in rows.dtype.names or ()]
+    text = "\n".join(" ".join(repr(value.item()) for value in row) for row in rows) + "\n"
+    return pcd(
+        " ".join(rows.dtype.names or ()),
+        " ".join(kind.kind.upper() for kind in kinds),
+        " ".join(str(kind.itemsize) for kind in kinds),
+        " ".join("1" for _ in kinds),
+        len(rows),
+        encoding,
+        text.encode() if encoding == "ascii" else rows.tobytes(),
+    )
+
+
 def lzf_literals(data: bytes) -> bytes:
     return b"".join(bytes([len(data[i : i + 32]) - 1]) + data[i : i + 32] for i in range(0, len(data), 32))
 
@@ -56,14 +74,24 @@ def packed_pcd(points: np.ndarray, packed: bytes | None = None, size: tuple[int,
     plain = points.T.astype("<f4").tobytes()
     packed = lzf_literals(plain) if packed is None else packed
     sizes = struct.pack("<II", len(packed), len(plain) if size is None else size)
-    return pcd("x y z intensity", "F F F F", "4 4 4 4", "1 1 1 1", len(points), "binary_compressed", sizes + packed)
+    return pcd(*XYZI, len(points), "binary_compressed", sizes + packed)
 
 
-def ply(encoding: str, body: bytes, n: int = 4, before: str = "", properties: str | None = None) -> bytes:
-    properties = properties or "".join(f"property float {name}\n" for name in ("x", "y", "z", "intensity"))
-    return (
-        f"ply\nformat {encoding} 1.0\ncomment c\n{before}element vertex {n}\n{properties}end_header\n".encode() + body
-    )
+def properties(*names: str, kind: str = "float") -> str:
+    return "".join(f"property {kind} {name}\n" for name in names)
+
+
+def ply(encoding: str, body: bytes, n: int = 4, before: str = "", of: str = "") -> bytes:
+    """``before`` and ``of``: other elements, and the vertex' properties in place of x, y, z and intensity."""
+    of = of or properties("x", "y", "z", "intensity")
+    return f"ply\nformat {encoding} 1.0\ncomment c\n{before}element vertex {n}\n{of}end_header\n".encode() + body
+
+
+def ply_of(rows: np.ndarray) -> bytes:
+    """Of a structured array."""
+    kinds = {"f4": "float", "f8": "double", "u4": "uint"}
+    of = "".join(properties(name, kind=kinds[rows.dtype[name].str[1:]]) for name in rows.dtype.names or ())
+    return ply("binary_little_endian", rows.tobytes(), len(rows), of=of)
 
 
 def text_rows(points: np.ndarray) -> bytes:
@@ -99,18 +127,13 @@ FILES = {
     "packed.npz": npz(scan=POINTS),
     "named.npz": npz(points=POINTS, labels=np.zeros(4)),
     "plain.npz": npz(compressed=False, scan=POINTS),
-    "binary.pcd": pcd("x y z intensity", "F F F F", "4 4 4 4", "1 1 1 1", 4, "binary", POINTS.tobytes()),
+    "binary.pcd": pcd(*XYZI, 4, "binary", POINTS.tobytes()),
     "padded.pcd": pcd(
         "intensity y _ ring z _ x", "F F U U F I F", "4 8 1 2 4 4 4", "1 1 3 1 1 1 1", 4, "binary", PADDED.tobytes()
     ),
     "ascii.pcd": pcd("x y z i", "F F F F", "4 4 4 4", "1 1 1 1", 4, "ascii", text_rows(POINTS)),
     "ascii_histogram.pcd": pcd(
-        "h x y z i",
-        "F F F F F",
-        "4 4 4 4 4",
-        "2 1 1 1 1",
-        4,
-        "ascii",
+        *("h x y z i", "F F F F F", "4 4 4 4 4", "2 1 1 1 1", 4, "ascii"),
         b"".join(b"8 9 " + row + b"\n" for row in text_rows(POINTS).splitlines()),
     ),
     "compressed.pcd": packed_pcd(POINTS),
@@ -120,13 +143,10 @@ FILES = {
     "ascii.ply": ply(
         "ascii",
         text_rows(POINTS) + b"3 0 1 2\n",
-        properties="property float x\nproperty float y\nproperty float z\nproperty float intensity\n"
-        "element face 1\nproperty list uchar int vertex_indices\n",
+        of=properties("x", "y", "z", "intensity") + "element face 1\nproperty list uchar int vertex_indices\n",
     ),
     "cloud_compare.ply": ply(
-        "binary_little_endian",
-        POINTS.tobytes(),
-        properties="property float x\nproperty float y\nproperty float z\nproperty float scalar_Intensity\n",
+        "binary_little_endian", POINTS.tobytes(), of=properties("x", "y", "z", "scalar_Intensity")
     ),
     "element_before.ply": ply(
         "binary_little_endian",
@@ -142,8 +162,7 @@ FILES = {
     "list_in_vertex.ply": ply(
         "binary_little_endian",
         b"".join(row[:2].tobytes() + bytes([k, *([9] * k)]) + row[2:].tobytes() for k, row in enumerate(POINTS)),
-        properties="property float x\nproperty float y\nproperty list uchar uchar l\nproperty float z\n"
-        "property float remission\n",
+        of=properties("x", "y") + "property list uchar uchar l\n" + properties("z", "remission"),
     ),
 }
 
@@ -201,8 +220,8 @@ def test_remission_is_not_scaled_and_missing_remission_is_zero(tmp_path: Path) -
     np.testing.assert_array_equal(read_points(raw)[:, 3], [255, 0])
     body = POINTS[:, :3].tobytes()
     for name, content in {
-        "a.pcd": pcd("x y z", "F F F", "4 4 4", "1 1 1", 4, "binary", body),
-        "a.ply": ply("binary_little_endian", body, properties="property float x\nproperty float y\nproperty float z\n"),
+        "a.pcd": pcd(*XYZ, 4, "binary", body),
+        "a.ply": ply("binary_little_endian", body, of=properties(*"xyz")),
         "a.npy": npy(POINTS[:, :3]),
     }.items():
         points = read_points(save(tmp_path, name, content))
@@ -220,14 +239,13 @@ def test_remission_field_chooses(tmp_path: Path) -> None:
 
 
 def test_scan_without_points_is_valid_if_its_header_says_so(tmp_path: Path) -> None:
-    fields = ("x y z intensity", "F F F F", "4 4 4 4", "1 1 1 1", 0)
     for name, content in {
         "a.npy": npy(POINTS[:0]),
         "a.ply": ply("binary_little_endian", b"", n=0),
         "b.ply": ply("ascii", b"", n=0),
-        "a.pcd": pcd(*fields, "binary", b""),
-        "b.pcd": pcd(*fields, "ascii", b""),
-        "c.pcd": pcd(*fields, "binary_compressed", b""),
+        "a.pcd": pcd(*XYZI, 0, "binary", b""),
+        "b.pcd": pcd(*XYZI, 0, "ascii", b""),
+        "c.pcd": pcd(*XYZI, 0, "binary_compressed", b""),
     }.items():
         assert read_points(save(tmp_path, name, content)).shape == (0, 4)
     assert as_points(np.zeros((0, 4))).shape == (0, 4)
@@ -271,25 +289,17 @@ BAD_FILES = {
     "half.pcd": (pcd("x y z", "F F F", "2 4 4", "1 1 1", 1, "ascii", b"1 2 3\n"), "TYPE and SIZE"),
     "counts.pcd": (pcd("x y z", "F F F", "4 4", "1 1 1", 1, "ascii", b"1 2 3\n"), "equal length"),
     "zero.pcd": (pcd("x y z", "F F F", "4 4 4", "1 1 0", 1, "ascii", b"1 2 3\n"), "COUNT"),
-    "text.pcd": (pcd("x y z", "F F F", "4 4 4", "1 1 1", 1, "ascii", b"1 two 3\n"), "row"),
-    "ragged.pcd": (pcd("x y z", "F F F", "4 4 4", "1 1 1", 2, "ascii", b"1 2 3\n1 2\n"), "row"),
-    "blank.pcd": (pcd("x y z", "F F F", "4 4 4", "1 1 1", 2, "ascii", b"\n\n\n"), "none are there"),
-    "disagree.pcd": (pcd("x y z", "F F F", "4 4 4", "1 1 1", 2, "ascii", b"1 2 3\n", width=3), "must agree"),
-    "declared.pcd": (pcd("x y z", "F F F", "4 4 4", "1 1 1", 1 << 60, "binary", b"\0" * 24), "cut short"),
-    "declared_ascii.pcd": (pcd("x y z", "F F F", "4 4 4", "1 1 1", 1 << 60, "ascii", b"1 2 3\n"), "cut short"),
-    "beyond.pcd": (pcd("x y z", "F F F", "4 4 4", "1 1 1", 1 << 80, "binary", b""), "64 bits"),
-    "encoding.pcd": (pcd("x y z", "F F F", "4 4 4", "1 1 1", 1, "zstd", b"\0" * 24), "zstd"),
+    "text.pcd": (pcd(*XYZ, 1, "ascii", b"1 two 3\n"), "row"),
+    "ragged.pcd": (pcd(*XYZ, 2, "ascii", b"1 2 3\n1 2\n"), "row"),
+    "blank.pcd": (pcd(*XYZ, 2, "ascii", b"\n\n\n"), "none are there"),
+    "disagree.pcd": (pcd(*XYZ, 2, "ascii", b"1 2 3\n", width=3), "must agree"),
+    "declared.pcd": (pcd(*XYZ, 1 << 60, "binary", b"\0" * 24), "cut short"),
+    "declared_ascii.pcd": (pcd(*XYZ, 1 << 60, "ascii", b"1 2 3\n"), "cut short"),
+    "beyond.pcd": (pcd(*XYZ, 1 << 80, "binary", b""), "64 bits"),
+    "encoding.pcd": (pcd(*XYZ, 1, "zstd", b"\0" * 24), "zstd"),
     "header.pcd": (b"# .PCD v0.7\nVERSION 0.7\nFIELDS x y z\n", "DATA line"),
     "bomb.pcd": (
-        pcd(
-            "x y z",
-            "F F F",
-            "4 4 4",
-            "1 1 1",
-            10**8,
-            "binary_compressed",
-            struct.pack("<II", 8, 12 * 10**8) + b"12345678",
-        ),
+        pcd(*XYZ, 10**8, "binary_compressed", struct.pack("<II", 8, 12 * 10**8) + b"12345678"),
         "claim to unpack",
     ),
     "lzf.pcd": (packed_pcd(POINTS, packed=b"\xff" * 40), "damaged"),
@@ -307,12 +317,7 @@ BAD_FILES = {
         "past the file",
     ),
     "ascii_list.ply": (
-        ply(
-            "ascii",
-            b"1 2 3 0\n",
-            n=1,
-            properties="property float x\nproperty float y\nproperty float z\nproperty list uchar int l\n",
-        ),
+        ply("ascii", b"1 2 3 0\n", n=1, of=properties(*"xyz") + "property list uchar int l\n"),
         "save it as binary",
     ),
     "picture.pcd": (b"\x89PNG\r\n\x1a\n" + b"\0" * 64, "this is an image"),
@@ -332,13 +337,11 @@ def test_bad_file_names_the_fault(tmp_path: Path, name: str) -> None:
 @pytest.mark.parametrize("name", ["intensity", "remission", "Reflectivity"])
 @pytest.mark.parametrize(("kind", "shape"), [("f4", (4,)), ("f8", (4, 1)), ("u1", (1, 4))])
 def test_the_remission_beside_the_points_of_an_archive(tmp_path: Path, name: str, kind: str, shape: Any) -> None:
-    content, remission = io.BytesIO(), np.array([3, 0, 255, 7], kind)
-    np.savez(content, points=POINTS[:, :3], labels=np.arange(4), **{name: remission.reshape(shape)})
+    remission = np.array([3, 0, 255, 7], kind)
+    content = npz(points=POINTS[:, :3], labels=np.arange(4), **{name: remission.reshape(shape)})
     expected = np.column_stack([POINTS[:, :3], remission]).astype("f4")
-    np.testing.assert_array_equal(read_points(save(tmp_path, "a.npz", content.getvalue())), expected)
-    content = io.BytesIO()
-    np.savez(content, points=POINTS, **{name: remission})
-    np.testing.assert_array_equal(read_points(save(tmp_path, "b.npz", content.getvalue())), POINTS)
+    np.testing.assert_array_equal(read_points(save(tmp_path, "a.npz", content)), expected)
+    np.testing.assert_array_equal(read_points(save(tmp_path, "b.npz", npz(points=POINTS, **{name: remission}))), POINTS)
 
 
 @pytest.mark.parametrize("n", [0, 2])
@@ -348,14 +351,10 @@ def test_points_that_the_header_does_not_declare_are_warned_of(tmp_path: Path, s
     """As a recorder leaves them that ends before it has written their number."""
     body = POINTS.tobytes() if kind == "binary" else text_rows(POINTS) + b"\n"
     if suffix == ".pcd":
-        head = f"FIELDS x y z i\nSIZE 4 4 4 4\nTYPE F F F F\nWIDTH {n}\nHEIGHT 1\nPOINTS {n}\n"
-        content = f"{head}DATA {'binary' if kind == 'binary' else 'ascii'}\n".encode() + body
+        content = pcd(*XYZI, n, "binary" if kind == "binary" else "ascii", body)
     else:
-        form = "binary_little_endian" if kind == "binary" else "ascii"
-        properties = "".join(f"property float {name}\n" for name in "xyzi")
-        faces = f"element face {len(POINTS) - n}\n" if kind == "faces" else "element face 0\n"
-        head = f"ply\nformat {form} 1.0\nelement vertex {n}\n{properties}{faces}property list uchar int k\nend_header\n"
-        content = head.encode() + body
+        faces = f"element face {len(POINTS) - n if kind == 'faces' else 0}\nproperty list uchar int k\n"
+        content = ply("binary_little_endian" if kind == "binary" else "ascii", body, n, of=properties(*"xyzi") + faces)
     path = save(tmp_path, f"a{suffix}", content)
     if (suffix, kind) == (".ply", "faces"):
         assert len(read_points(path)) == n
@@ -416,10 +415,9 @@ def test_three_values_a_point_hold_no_remission(tmp_path: Path, name: str) -> No
 
 @pytest.mark.parametrize("beside", [np.arange(5.0), np.zeros((4, 2)), np.array(["a"] * 4), np.zeros(4, complex)])
 def test_what_is_no_remission_of_the_points_is_refused(tmp_path: Path, beside: Any) -> None:
-    content = io.BytesIO()
-    np.savez(content, points=POINTS[:, :3], intensity=beside)
+    path = save(tmp_path, "a.npz", npz(points=POINTS[:, :3], intensity=beside))
     with pytest.raises(PointsError, match=r"'intensity\.npy' in the archive is not one number for each of the points"):
-        read_points(save(tmp_path, "a.npz", content.getvalue()))
+        read_points(path)
 
 
 def test_a_zip_bomb_is_not_unpacked(tmp_path: Path) -> None:
@@ -767,37 +765,27 @@ MAPS = {
 }
 
 
+def in_map(folder: Path, kind: str, points: np.ndarray, origin: Any) -> Any:
+    """A scan with coordinates of a map: an array, or a file."""
+    placed = np.column_stack([points[:, :3].astype("f8") + np.array(origin), points[:, 3]])
+    named = np.rec.fromarrays(placed.T, names="x,y,z,intensity")
+    if kind in ("array", "named"):
+        return placed if kind == "array" else named
+    write = {"pcd": pcd_of, "ply": ply_of, "npy": lambda _: npy(placed)}[kind]
+    return save(folder, f"a.{kind}", write(named))
+
+
 @pytest.mark.parametrize("place", MAPS)
 @pytest.mark.parametrize("kind", ["pcd", "ply", "array", "named", "npy"])
 def test_coordinates_of_a_map_are_not_rounded(tmp_path: Path, kind: str, place: Any) -> None:
     """A scan whose coordinates float32 would round is refused, and exact if the place of the sensor is subtracted."""
     points, origin = street(4), np.array(MAPS[place])
-    placed = np.column_stack([points[:, :3].astype("f8") + origin, points[:, 3]])
-    named = np.rec.fromarrays(placed.T, names="x,y,z,intensity")
-    n = len(points)
-    source = {
-        "pcd": lambda: save(
-            tmp_path, "a.pcd", pcd("x y z intensity", "F F F F", "8 8 8 8", "1 1 1 1", n, "binary", placed.tobytes())
-        ),
-        "ply": lambda: save(
-            tmp_path,
-            "a.ply",
-            ply(
-                "binary_little_endian",
-                placed.tobytes(),
-                n=n,
-                properties="".join(f"property double {name}\n" for name in ("x", "y", "z", "intensity")),
-            ),
-        ),
-        "array": lambda: placed,
-        "named": lambda: named,
-        "npy": lambda: save(tmp_path, "a.npy", npy(placed)),
-    }[kind]()
+    source = in_map(tmp_path, kind, points, origin)
     with pytest.raises(PointsError, match=r"those of a map, about \(.*--origin X Y Z"):
         read_points(source)
     read = read_points(source, origin_m=origin)
     np.testing.assert_allclose(read, points, atol=1e-5)
-    if kind != "array" and kind != "named":
+    if isinstance(source, Path):
         ((_, read),) = edgeperc.read_scans(source, origin_m=origin.tolist())
         np.testing.assert_allclose(read, points, atol=1e-5)
 
@@ -810,18 +798,8 @@ def test_an_origin_is_three_numbers(origin: Any) -> None:
 
 @pytest.mark.parametrize("kind", ["pcd", "npy", "array", "named"])
 def test_the_origin_of_a_level_sensor_is_found(tmp_path: Path, kind: str) -> None:
-    points, origin = simulated_scan(3, "os1-64").points, np.array(MAPS["UTM"])
-    placed = np.column_stack([points[:, :3].astype("f8") + origin, points[:, 3]])
-    source = {
-        "pcd": lambda: save(
-            tmp_path,
-            "a.pcd",
-            pcd("x y z intensity", "F F F F", "8 8 8 8", "1 1 1 1", len(placed), "binary", placed.tobytes()),
-        ),
-        "npy": lambda: save(tmp_path, "a.npy", npy(placed)),
-        "array": lambda: placed,
-        "named": lambda: np.rec.fromarrays(placed.T, names="x,y,z,intensity"),
-    }[kind]()
+    points, origin = simulated_scan(3, "os1-64").points, MAPS["UTM"]
+    source = in_map(tmp_path, kind, points, origin)
     read = read_points(source, origin_m="auto")
     np.testing.assert_allclose(read, points, atol=0.05)
     found = edgeperc.find_origin(source)
@@ -1010,7 +988,7 @@ def test_signalling_nan_is_nan(tmp_path: Path, name: str) -> None:
     points = POINTS.copy()
     points[1, :1] = SIGNALLING
     content = {
-        "a.pcd": pcd("x y z i", "F F F F", "4 4 4 4", "1 1 1 1", 4, "binary", points.tobytes()),
+        "a.pcd": pcd(*XYZI, 4, "binary", points.tobytes()),
         "a.ply": ply("binary_little_endian", points.tobytes()), "a.npy": npy(points), "a.bin": points.tobytes(),
     }[name]  # fmt: skip
     for origin in (None, (1.0, 0.0, 0.0)):

@@ -12,16 +12,16 @@ from typing import Any
 
 import numpy as np
 import pytest
+from capture_writers import vlp16_packets, write_clouds, write_pcap
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
-from test_captures import POINTS, TYPES, vlp16_packets, write_bag1, write_bag2, write_mcap, write_pcap
+from test_captures import POINTS, write_bag1, write_bag2, write_mcap
 from test_captures import ouster as ouster
 
 from cli_helpers import run
 from edgeperc.errors import EdgepercError, PointsError, SensorError
 from edgeperc.live import stream
 from edgeperc.readers.captures import known_sensor, read_scans, sensor_of
-from edgeperc.readers.clouds import cloud_points
 from edgeperc.readers.identify import KnownSensor, of_cloud, of_metadata
 from edgeperc.types.sensor import SENSORS, SensorProfile, get_sensor
 
@@ -74,25 +74,6 @@ def test_a_velodyne_that_is_unknown(tmp_path: Path, packets: list[bytes], error:
         sensor_of(path)
     assert all(name in str(caught.value) for name in SENSORS)
     assert "--sensor" in str(caught.value)
-
-
-def hesai(head: bytes, size: int) -> bytes:
-    return head + np.random.default_rng(0).bytes(size - len(head))
-
-
-@pytest.mark.parametrize(
-    ("packet", "name"),
-    [
-        (hesai(b"\xee\xff\x14\x14\0\x04", 1270), "Hesai Pandar20"),
-        (hesai(b"\xee\xff\x09\x01\0\0\x20\x08", 1080), r"Hesai sensor of 32 lasers \(version 9\.1 "),
-        (hesai(b"\xee\xff\x04\x03\0\0\x80\x02", 1118), "Hesai AT128"),
-    ],
-)
-def test_a_hesai_is_named_though_it_cannot_be_decoded(tmp_path: Path, packet: bytes, name: str) -> None:
-    path = write_pcap(tmp_path / "hesai.pcap", [b"gps".ljust(512), *[packet] * 20])
-    for read in (sensor_of, lambda file: next(read_scans(file))):
-        with pytest.raises(PointsError, match=rf"hesai\.pcap: a capture of a {name}.*, which cannot be decoded"):
-            read(path)
 
 
 def test_packets_that_begin_like_a_hesais_by_chance(ouster: Path, tmp_path: Path) -> None:
@@ -306,28 +287,12 @@ LAYOUTS = {
 @pytest.mark.parametrize("name", LAYOUTS)
 def test_bags(tmp_path: Path, name: str) -> None:
     """And an Ouster's remission is its reflectivity, its intensity is a number of photons."""
-    typesys, rosbag1 = pytest.importorskip("rosbags.typesys"), pytest.importorskip("rosbags.rosbag1")
-    points = rings_of(name, LAYOUTS[name])
-    store = typesys.get_typestore(typesys.Stores.ROS1_NOETIC)
-    types = store.types
-    header = types["std_msgs/msg/Header"](0, types["builtin_interfaces/msg/Time"](5, 0), "lidar")
-    fields = [
-        types["sensor_msgs/msg/PointField"](field, points.dtype.fields[field][1], TYPES[kind], 1)
-        for field, kind in LAYOUTS[name]
-    ]
-    height, width = points.shape
-    step = points.dtype.itemsize
-    message = types["sensor_msgs/msg/PointCloud2"](
-        header, height, width, fields, False, step, step * width, np.frombuffer(points.tobytes(), np.uint8), True
-    )
-    path = tmp_path / "drive.bag"
-    with rosbag1.Writer(path) as bag:
-        connection = bag.add_connection("/points", "sensor_msgs/msg/PointCloud2", typestore=store)
-        bag.write(connection, 1, store.serialize_ros1(message, "sensor_msgs/msg/PointCloud2"))
+    path = write_clouds(tmp_path / "drive.bag", [(5.0, rings_of(name, LAYOUTS[name]))])
     assert sensor_of(path) == get_sensor(name)
     ((_, read),) = read_scans(path)
     assert {*read[:, 3].tolist()} == {900.0 if name == "vlp-32c" else 30.0}
-    assert cloud_points(message, remission_field="intensity")[0, 3] == 900.0
+    ((_, read),) = read_scans(path, remission_field="intensity")
+    assert read[0, 3] == 900.0
 
 
 @pytest.mark.parametrize("write", [write_bag1, write_bag2, write_mcap])

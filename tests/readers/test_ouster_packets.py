@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from capture_writers import check_same, join, pcap_head, records_of, vlp16_packets, write_link
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from lidar_writers import MODELS, blocks_of, livox_packets, packets_of, ranges
-from test_captures import check_told_apart, error_of, join, vlp16_packets, write_pcap
-from test_packets import write_link
+from test_captures import check_beside, error_of
 
 import twins.packets
 from edgeperc import PointsError, read_scans, read_timed_scans
@@ -249,24 +249,13 @@ def test_several_sensors_in_one_capture(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("other", ["velodyne", "pandarxt-16", "pandarxt-32"])
-@pytest.mark.parametrize("is_first", [True, False])
-def test_an_ouster_beside_another_makers_sensor_is_told_apart(tmp_path: Path, other: str, is_first: bool) -> None:
+def test_an_ouster_beside_another_makers_sensor_is_told_apart(tmp_path: Path, other: str) -> None:
     if other == "velodyne":
         pytest.importorskip("velodyne_decoder")
-        payloads = vlp16_packets(2.0)[:110]
-    else:
-        model = MODELS[other]
-        payloads = packets_of(model, blocks_of(model, *ranges(model, 1024)))
+    payloads = vlp16_packets(2.0)[:110] if other == "velodyne" else other_packets(other)
     ousters = [bytes(packet.buf) for turn in random_packets(METADATA, 2, 1) for packet in turn]
-    parts = [
-        write_link(tmp_path / "alone.pcap", 1, payloads, one="10.0.0.9"),
-        write_link(tmp_path / "ouster.pcap", 1, ousters, one="10.0.0.1:7502"),
-    ]
-    both = join(tmp_path / "both.pcap", parts if is_first else parts[::-1])
-    for name in ("both", "ouster"):
-        (tmp_path / f"{name}.json").write_text(json.dumps(METADATA))
-    assert "expected one LiDAR, there are 10.0.0.9, 122246000293; choose one" in error_of(both)
-    check_told_apart(both, {"10.0.0.9": tmp_path / "alone.pcap", "122246000293": tmp_path / "ouster.pcap"})
+    sent = {"10.0.0.9": ("10.0.0.9", payloads), "122246000293": ("10.0.0.1:7502", ousters)}
+    check_beside(tmp_path, sent, json.dumps(METADATA))
 
 
 @pytest.mark.parametrize("share", [0.1, 0.5, 2.0])
@@ -334,11 +323,10 @@ def test_a_sensor_profile_beside_a_capture_is_no_metadata(tmp_path: Path) -> Non
     payloads = [bytes(packet.buf) for turn in random_packets(METADATA, 2, 1) for packet in turn]
     capture = write_link(tmp_path / "drive.pcap", 1, payloads)
     (tmp_path / "drive_metadata.json").write_text(json.dumps(METADATA))
-    alone = [points for _, points in read_scans(capture)]
+    alone = list(read_scans(capture))
     for name in ("drive-mine.json", "drive.pcap.json", "drive.json"):
         (tmp_path / name).write_text(get_sensor("os1-64").to_json())
-    for points, expected in zip(read_scans(capture), alone, strict=True):
-        np.testing.assert_array_equal(points[1], expected)
+    check_same(read_scans(capture), alone)
     (tmp_path / "drive_metadata.json").unlink()
     assert "there is no metadata next to it" in error_of(capture)
 
@@ -350,19 +338,14 @@ def test_a_second_sensor_of_old_firmware_is_left_out_with_a_warning(tmp_path: Pa
     records = []
     for seed, sender in ((1, "10.0.0.1:7502"), (2, other)):
         payloads = [bytes(packet.buf) for turn in random_packets(content, 2, seed) for packet in turn]
-        data = write_link(tmp_path / f"{seed}.pcap", 1, payloads, one=sender).read_bytes()
-        size = len(data[24:]) // len(payloads)
-        records.append([data[24 + k * size : 24 + (k + 1) * size] for k in range(len(payloads))])
+        records.append(records_of(write_link(tmp_path / f"{seed}.pcap", 1, payloads, one=sender).read_bytes()))
     both = tmp_path / "both.pcap"
-    both.write_bytes(data[:24] + b"".join(one + two for one, two in zip(*records, strict=True)))
+    both.write_bytes(pcap_head() + b"".join(one + two for one, two in zip(*records, strict=True)))
     for name in ("1", "both"):
         (tmp_path / f"{name}.json").write_text(json.dumps(content))
     with pytest.warns(UserWarning, match=r"the first of several sensors, 10\.0\.0\..*whose packets carry no serial"):
         found = [*read_timed_scans(both)]
-    expected = [*read_timed_scans(tmp_path / "1.pcap")]
-    assert len(found) == len(expected) == 2
-    for one, two in zip(found, expected, strict=True):
-        np.testing.assert_array_equal(one.points, two.points)
+    assert check_same(found, read_timed_scans(tmp_path / "1.pcap"), clock=False) == 2
 
 
 @settings(max_examples=60, deadline=None)
@@ -408,9 +391,3 @@ def test_any_order_of_turns_ends(turns: list[int], seed: int) -> None:
     assert len(scans) <= len(turns)
     assert (len(scans) > 0) == (len(turns) > 0)
     assert sum(len(scan.points) for scan in scans) <= 8 * len(turns)
-
-
-def test_without_packets_of_the_sensor(tmp_path: Path) -> None:
-    path = write_pcap(tmp_path / "a.pcap", [bytes(100)] * 3)
-    path.with_suffix(".json").write_text(json.dumps(METADATA))
-    assert "has 3 packets, none from a supported LiDAR" in error_of(path)

@@ -11,9 +11,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from capture_writers import mcap_channel, mcap_message, sized, vlp16_packets, write_pcap, write_records
 from hypothesis import given
 from hypothesis import strategies as st
-from test_captures import LIDAR, messages, record, sized, vlp16_packets, write_pcap
+from test_captures import LIDAR, messages
 from test_identify import velodyne
 from test_ouster_packets import METADATA, random_packets
 from test_ouster_packets import record as write_capture
@@ -47,15 +48,11 @@ def ros1_message(packets: Sequence[bytes], first: int) -> bytes:
 
 def mcap_of(path: Path, topics: Sequence[tuple[str, str, str, Sequence[bytes]]], step_ns: int = 1) -> Path:
     """MCAP without an index: topic, type, encoding and messages."""
-    magic = b"\x89MCAP0\r\n"
-    content = magic + record(1, sized(b"") + sized(b"test"))
+    content = b""
     for k, (topic, kind, encoding, sent) in enumerate(topics, start=1):
-        content += record(3, struct.pack("<H", k) + sized(kind.encode()) + sized(b"") + sized(b""))
-        content += record(4, struct.pack("<HH", k, k) + sized(topic.encode()) + sized(encoding.encode()) + sized(b""))
-        for n, message in enumerate(sent):
-            content += record(5, struct.pack("<HIQQ", k, n, 10**12 + step_ns * n, 10**12 + step_ns * n) + message)
-    path.write_bytes(content + record(15, bytes(4)) + record(2, bytes(20)) + magic)
-    return path
+        content += mcap_channel(k, topic, kind, encoding)
+        content += b"".join(mcap_message(k, n, 10**12 + step_ns * n, message) for n, message in enumerate(sent))
+    return write_records(path, content)
 
 
 def ros1_bag(path: Path, topics: Sequence[tuple[str, str, str, Sequence[bytes]]], step_ns: int = 1) -> Path:

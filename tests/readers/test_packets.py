@@ -8,10 +8,21 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
+from capture_writers import (
+    LINKS,
+    check_same,
+    in_ip,
+    join,
+    pcap_head,
+    pcap_record,
+    records_of,
+    vlp16_packets,
+    write_link,
+    write_pcap,
+)
 from lidar_writers import MODELS, blocks_of, packets_of, ranges
-from test_captures import error_of, join, vlp16_packets, write_pcap
+from test_captures import error_of
 from test_captures import ouster as ouster
 
 from edgeperc import PointsError
@@ -22,49 +33,14 @@ from edgeperc.readers.senders import Senders
 
 pytestmark = pytest.mark.usefixtures("in_this_process")
 
-# Headers in front of the IP header, by the link type.
-LINKS = {
-    1: bytes(12) + b"\x08\x00",
-    113: bytes(14) + b"\x08\x00",
-    276: b"\x08\x00" + bytes(18),
-    0: struct.pack("<I", 2),
-    108: struct.pack(">I", 2),
-    12: b"", 14: b"", 101: b"", 228: b"",
-}  # fmt: skip
 VLAN = bytes(12) + b"\x81\x00\x00\x05\x08\x00"
-
-
-def write_link(
-    path: Path, link: int, payloads: Sequence[bytes], head: bytes | None = None, begin: int = 0, **sent: str
-) -> Path:
-    """UDP in IPv4 behind a link's header, 1 ms apart; by turns from each of several addresses, ``ADDRESS[:PORT]``.
-
-    begin : how many packets the first sends alone.
-    """
-    senders = [*sent.values()] or ["192.168.1.201"]
-    content = struct.pack("<IHHIIII", 0xA1B2C3D4, 2, 4, 0, 0, 65535, link)
-    for k, payload in enumerate(payloads):
-        for sender in senders if k >= begin else senders[:1]:
-            address, _, port = sender.partition(":")
-            udp = struct.pack(">HHHH", 2368, int(port or 2368), 8 + len(payload), 0) + payload
-            addresses = socket.inet_aton(address) + b"\xff" * 4
-            ip = struct.pack(">BBHHHBBH", 0x45, 0, 20 + len(udp), k % 65536, 0, 64, 17, 0) + addresses + udp
-            frame = (LINKS[link] if head is None else head) + ip
-            content += struct.pack("<IIII", 1000 + k // 1000, 1000 * (k % 1000), len(frame), len(frame)) + frame
-    path.write_bytes(content)
-    return path
 
 
 @pytest.mark.parametrize(("link", "head"), [*LINKS.items(), (1, VLAN)])
 def test_a_velodyne_behind_any_link(tmp_path: Path, link: int, head: bytes) -> None:
     pytest.importorskip("velodyne_decoder")
-    expected = list(read_scans(write_pcap(tmp_path / "ethernet.pcap", vlp16_packets(1.2))))
     path = write_link(tmp_path / "link.pcap", link, vlp16_packets(1.2), head)
-    scans = list(read_scans(path))
-    assert len(scans) == len(expected) == 2
-    for (stamp, points), (other_stamp, other_points) in zip(scans, expected, strict=True):
-        assert stamp == other_stamp
-        np.testing.assert_array_equal(points, other_points)
+    assert check_same(read_scans(path), read_scans(write_pcap(tmp_path / "a.pcap", vlp16_packets(1.2)))) == 2
     sensor = sensor_of(path)
     assert sensor is not None
     assert sensor.name == "vlp-16"
@@ -80,15 +56,9 @@ def payloads_of(kind: str) -> list[bytes]:
 @pytest.mark.parametrize("kind", ["velodyne", "hesai"])
 def test_packets_that_were_not_kept_to_their_end_are_named(tmp_path: Path, kind: str, most: int) -> None:
     path = write_link(tmp_path / "a.pcap", 1, payloads_of(kind))
-    whole, content = path.read_bytes(), path.read_bytes()[:24]
-    at = 24
-    while at < len(whole):
-        seconds, microseconds, size, _ = struct.unpack_from("<IIII", whole, at)
-        content += (
-            struct.pack("<IIII", seconds, microseconds, min(size, most), size) + whole[at + 16 :][: min(size, most)]
-        )
-        at += 16 + size
-    path.write_bytes(content)
+    records = records_of(path.read_bytes())
+    cut = (each[:8] + struct.pack("<I", min(len(each) - 16, most)) + each[12 : 16 + most] for each in records)
+    path.write_bytes(pcap_head() + b"".join(cut))
     assert "packets of the capture were not kept to their end" in error_of(path)
     with pytest.raises(PointsError, match="tcpdump -s 0"):
         sensor_of(path)
@@ -102,22 +72,13 @@ def test_packets_that_were_captured_twice_count_once(tmp_path: Path, kind: str, 
         pytest.importorskip("velodyne_decoder")
     path = write_link(tmp_path / "once.pcap", link, payloads_of(kind))
     expected = list(read_scans(path))
-    whole, content = path.read_bytes(), path.read_bytes()[:24]
-    at = 24
-    while at < len(whole):
-        record = whole[at : at + 16 + struct.unpack_from("<8xI", whole, at)[0]]
-        content += record + record
-        at += len(record)
-    path.write_bytes(content)
-    found = list(read_scans(path))
-    assert len(found) == len(expected) > 0
-    for (_, points), (_, other) in zip(found, expected, strict=True):
-        np.testing.assert_array_equal(points, other)
+    path.write_bytes(pcap_head(link) + b"".join(each + each for each in records_of(path.read_bytes())))
+    check_same(read_scans(path), expected, clock=False)
 
 
 def write_6(path: Path, payloads: Sequence[bytes], sender: str, most: int = 10_000) -> Path:
     """UDP in IPv6 in fragments of at most so many bytes."""
-    content = struct.pack("<IHHIIII", 0xA1B2C3D4, 2, 4, 0, 0, 65535, 1)
+    content = pcap_head()
     addresses = socket.inet_pton(socket.AF_INET6, sender) + socket.inet_pton(socket.AF_INET6, "ff02::1")
     for k, payload in enumerate(payloads):
         udp = struct.pack(">HHHH", 2368, 2368, 8 + len(payload), 0) + payload
@@ -127,7 +88,7 @@ def write_6(path: Path, payloads: Sequence[bytes], sender: str, most: int = 10_0
             if begin or more:
                 kind, part = 44, struct.pack(">BBHI", 17, 0, begin | more, k) + part
             frame = bytes(12) + b"\x86\xdd" + struct.pack(">IHBB", 6 << 28, len(part), kind, 64) + addresses + part
-            content += struct.pack("<IIII", 1000 + k // 1000, 1000 * (k % 1000), len(frame), len(frame)) + frame
+            content += pcap_record(k, frame)
     path.write_bytes(content)
     return path
 
@@ -143,10 +104,7 @@ def test_packets_of_ipv6(tmp_path: Path, kind: str, most: int) -> None:
     assert "there are fe80::1, fe80::2; choose one" in error_of(two)
     assert sensor_of(one) == sensor_of(tmp_path / "4.pcap")
     for path, topic in ((one, None), (two, "fe80::2")):
-        found = list(read_scans(path, topic=topic))
-        assert len(found) == len(expected) > 0
-        for (_, points), (_, other) in zip(found, expected, strict=True):
-            np.testing.assert_array_equal(points, other)
+        check_same(read_scans(path, topic=topic), expected, clock=False)
 
 
 @pytest.mark.parametrize(
@@ -160,41 +118,26 @@ def test_a_velodyne_in_fragments_or_with_bytes_behind(
     """A narrow link divides packets after so many bytes; some cards capture the checksum of a frame, or padding."""
     pytest.importorskip("velodyne_decoder")
     packets = vlp16_packets(1.2)
-    expected = list(read_scans(write_link(tmp_path / "whole.pcap", 1, packets)))
-    content = struct.pack("<IHHIIII", 0xA1B2C3D4, 2, 4, 0, 0, 65535, link)
+    content = pcap_head(link)
     for k, payload in enumerate(packets):
-        udp = struct.pack(">HHHH", 2368, 2368, 8 + len(payload), 0) + payload
+        ip, udp = in_ip(payload, k)[:20], in_ip(payload, k)[20:]
         for start, end in ((0, first), (first, len(udp))) if first else ((0, len(udp)),):
             place = start // 8 | (0x2000 if end < len(udp) else 0)
-            addresses = socket.inet_aton("192.168.1.201") + b"\xff" * 4
-            ip = struct.pack(">BBHHHBBH", 0x45, 0, 20 + end - start, k, place, 64, 17, 0) + addresses
-            frame = head + ip + udp[start:end] + behind
-            content += struct.pack("<IIII", 1000 + k // 1000, 1000 * (k % 1000), len(frame), len(frame)) + frame
+            part = ip[:2] + struct.pack(">HHH", 20 + end - start, k, place) + ip[8:] + udp[start:end]
+            content += pcap_record(k, head + part + behind)
     path = tmp_path / "other.pcap"
     path.write_bytes(content)
-    scans = list(read_scans(path))
-    assert len(scans) == len(expected) == 2
-    for (stamp, points), (other_stamp, other_points) in zip(scans, expected, strict=True):
-        assert stamp == other_stamp
-        np.testing.assert_array_equal(points, other_points)
+    assert check_same(read_scans(path), read_scans(write_link(tmp_path / "whole.pcap", 1, packets))) == 2
     assert Senders(path, lambda: None).velodynes == ["192.168.1.201"]
 
 
 @pytest.mark.parametrize("link", [113, 276, 101])
 def test_an_ouster_behind_any_link(ouster: Path, tmp_path: Path, link: int) -> None:
-    content, at, records = (ouster / "sphere.pcap").read_bytes(), 24, b""
-    while at < len(content):
-        (length,) = struct.unpack_from("<I", content, at + 8)
-        packet = LINKS[link] + content[at + 30 : at + 16 + length]
-        records += content[at : at + 8] + struct.pack("<II", len(packet), len(packet)) + packet
-        at += 16 + length
+    records = records_of((ouster / "sphere.pcap").read_bytes())
     path = tmp_path / "link.pcap"
-    path.write_bytes(content[:20] + struct.pack("<I", link) + records)
+    path.write_bytes(pcap_head(link) + b"".join(pcap_record(0, LINKS[link] + each[30:]) for each in records))
     path.with_suffix(".json").write_text((ouster / "sphere.json").read_text())
-    scans, expected = list(read_scans(path)), list(read_scans(ouster / "sphere.pcap"))
-    assert len(scans) == len(expected)
-    for (_, points), (_, other_points) in zip(scans, expected, strict=True):
-        np.testing.assert_array_equal(points, other_points)
+    check_same(read_scans(path), read_scans(ouster / "sphere.pcap"), clock=False)
 
 
 @pytest.mark.parametrize(
@@ -238,22 +181,6 @@ def test_a_few_damaged_addresses_are_no_sensors(tmp_path: Path) -> None:
     assert Senders(path, lambda: None).velodynes == ["10.0.0.1"]
 
 
-@pytest.mark.parametrize(
-    ("payload", "name"),
-    [
-        (bytes.fromhex("55aa050a5aa550a0") + bytes(1240), "RoboSense"),  # MSOP of the RS-16 and RS-32
-        (bytes.fromhex("55aa055a") + bytes(1206), "RoboSense"),  # of the M1
-        (bytes(1380), "Livox"),
-        (b"\0" + struct.pack("<H", 1380) + bytes(1377), "Livox"),  # 96 points of 14 bytes behind 36
-        (b"\0" + struct.pack("<H", 804) + bytes(801), "Livox"),  # 96 points of 8 bytes
-    ],
-)
-def test_lidars_that_are_not_decoded_are_named(tmp_path: Path, payload: bytes, name: str) -> None:
-    error = error_of(write_pcap(tmp_path / "other.pcap", [payload] * 20))
-    assert f"a capture of a {name} sensor, which cannot be decoded" in error
-    assert f"Convert it with {name}'s driver" in error
-
-
 @pytest.mark.parametrize("name", ["velodyne", "pandarxt-32"])
 def test_a_capture_is_counted_once(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Whatever a topic is: before the first scan, packets are read once, but for the first ones and a sender's copy."""
@@ -295,10 +222,7 @@ def test_packets_that_overtake_one_another_split_no_scan(tmp_path: Path, begin_u
     late = ordered.copy()
     for k in range(5, len(late) - shift, 41):
         late.insert(k + shift, late.pop(k))
-    found = list(read_scans(write_pcap(tmp_path / "late.pcap", late)))
-    assert [len(points) for _, points in found] == [len(points) for _, points in expected]
-    for (_, points), (_, other_points) in zip(found, expected, strict=True):
-        np.testing.assert_array_equal(points, other_points)
+    check_same(read_scans(write_pcap(tmp_path / "late.pcap", late)), expected, clock=False)
 
 
 def test_packets_behind_a_step_of_the_clock_stay_behind() -> None:

@@ -10,12 +10,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from capture_writers import check_same, records_of, vlp16_packets, write_link, write_pcap
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from lidar_writers import MODELS, blocks_of, calibration, difop, packets_of, ranges, unit_angles
-from test_captures import error_of, read_until_error, vlp16_packets, write_pcap
+from test_captures import error_of, read_until_error
 from test_captures import ouster as ouster
-from test_packets import write_link
 
 from edgeperc.errors import PointsError
 from edgeperc.readers.captures import read_scans, read_timed_scans, scan_files, sensor_of
@@ -59,13 +59,8 @@ def packet_block(
 
 def packets_in(content: bytes) -> list[Packet]:
     """The packets of a pcap file with microseconds."""
-    order, at, found = "<" if content[:1] == b"\xd4" else ">", 24, []
-    (link,) = struct.unpack_from(f"{order}I", content, 20)
-    while at < len(content):
-        seconds, micros, length = struct.unpack_from(f"{order}III", content, at)
-        found.append((link, seconds, micros, content[at + 16 : at + 16 + length]))
-        at += 16 + length
-    return found
+    (link,) = struct.unpack_from("<I", content, 20)
+    return [(link, *struct.unpack_from("<II", each), each[16:]) for each in records_of(content)]
 
 
 def as_pcapng(
@@ -306,11 +301,7 @@ def test_real_captures(data_root: Callable[[str], Path], tmp_path: Path, capture
 
 def assert_same(path: Path, source: Path) -> None:
     """Both give the same scans, to the bit, and the same sensor."""
-    found, expected = [*read_timed_scans(path)], [*read_timed_scans(source)]
-    assert len(found) == len(expected) > 0
-    for one, other in zip(found, expected, strict=True):
-        assert one.stamp_s == other.stamp_s
-        np.testing.assert_array_equal(one.points, other.points)
-        np.testing.assert_array_equal(one.times_s, other.times_s)
+    expected = [*read_timed_scans(source)]
+    check_same(read_timed_scans(path), expected)
     assert [len(points) for _, points in read_scans(path)] == [len(scan.points) for scan in expected]
     assert sensor_of(path) == sensor_of(source)

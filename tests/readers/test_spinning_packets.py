@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import re
 import struct
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from capture_writers import check_same, vlp16_packets, write_link, write_pcap
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from lidar_writers import (
@@ -23,8 +25,7 @@ from lidar_writers import (
     unit_angles,
 )
 from numpy.typing import NDArray
-from test_captures import check_told_apart, error_of, join, vlp16_packets, write_pcap
-from test_packets import write_link
+from test_captures import check_beside, error_of
 
 import twins.packets
 from edgeperc import PointsError, read_timed_scans, sensor_of
@@ -180,10 +181,9 @@ def test_without_angles_it_says_what_is_missing(tmp_path: Path, name: str) -> No
 def test_which_angles_are_used(tmp_path: Path) -> None:
     """RoboSense's own, whatever lies beside; of a PandarXT those of the file, if there is one."""
     path, _ = capture(tmp_path, MODELS["rs-32"], 24)
-    expected_scans = [scan.points for scan in read_timed_scans(path)]
+    own = [*read_timed_scans(path)]
     path.with_suffix(".csv").write_text("x,y,z\n1,2,3\n")
-    for scan, points in zip(read_timed_scans(path), expected_scans, strict=True):
-        np.testing.assert_array_equal(scan.points, points)
+    check_same(read_timed_scans(path), own)
     model = MODELS["pandarxt-16"]
     path, _ = capture(tmp_path, model, 24)
     (tmp_path / "drive.csv").write_text(calibration(unit_angles(model) + np.array([0.25, 1.0])))
@@ -217,21 +217,13 @@ def test_several_sensors_are_told_apart(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["pandarxt-16", "pandarxt-32", "rs-16", "helios-32"])
-@pytest.mark.parametrize("is_first", [True, False])
-def test_a_velodyne_beside_another_sensor_is_told_apart(tmp_path: Path, name: str, is_first: bool) -> None:
+def test_a_velodyne_beside_another_sensor_is_told_apart(tmp_path: Path, name: str) -> None:
     pytest.importorskip("velodyne_decoder")
     model, angles = MODELS[name], unit_angles(MODELS[name])
     packets = packets_of(model, blocks_of(model, *ranges(model, 128)))
     if not name.startswith("pandar"):
         packets = [difop(model, angles), *packets]
-    velodyne = vlp16_packets(2.0)[:110]
-    parts = [
-        write_link(tmp_path / "velodyne.pcap", 1, velodyne, one="10.0.0.9"),
-        write_link(tmp_path / "other.pcap", 1, packets, one="10.0.0.1"),
-    ]
-    both = join(tmp_path / "both.pcap", parts if is_first else parts[::-1])
-    assert "expected one LiDAR, there are 10.0.0.9, 10.0.0.1; choose one" in error_of(both)
-    check_told_apart(both, {"10.0.0.9": tmp_path / "velodyne.pcap", "10.0.0.1": tmp_path / "other.pcap"})
+    check_beside(tmp_path, {"10.0.0.9": ("10.0.0.9", vlp16_packets(2.0)[:110]), "10.0.0.1": ("10.0.0.1", packets)})
 
 
 @pytest.mark.parametrize(("name", "other"), [("pandarxt-16", "10.0.0.2"), ("pandarxt-32", "10.0.0.1:2369")])
@@ -241,30 +233,35 @@ def test_a_sensor_that_begins_late_is_left_out_with_a_warning(tmp_path: Path, na
     path = write_link(tmp_path / "two.pcap", 1, packets, begin=2100, one="10.0.0.1:2368", two=other)
     with pytest.warns(UserWarning, match=r"those of the first sensor alone; .* several, 10.*, 10.*--topic"):
         scans = list(read_timed_scans(path))
-    expected = list(read_timed_scans(write_link(tmp_path / "one.pcap", 1, packets)))
-    for scan, alone in zip(scans, expected, strict=True):
-        np.testing.assert_array_equal(scan.points, alone.points)
+    check_same(scans, read_timed_scans(write_link(tmp_path / "one.pcap", 1, packets)), clock=False)
 
 
-OTHERS = {
-    "Hesai AT128": bytes.fromhex("eeff0403000080020004017f") + bytes(1106),
-    "Hesai QT128": bytes.fromhex("eeff03020000800200040107") + bytes(1115),
-    "Hesai XT32M": bytes.fromhex("eeff06010000200600040101") + bytes(808),
-    "Hesai sensor of 99 lasers (version 9.9": bytes.fromhex("eeff09090000630200040101") + bytes(808),
-    "RoboSense RS-Ruby": bytes.fromhex("55aa050a5aa550a0") + bytes(22) + b"\x04" + bytes(1217),
-    "RoboSense RS-Ruby Plus": bytes.fromhex("55aa055a") + bytes(27) + b"\x05" + bytes(48)
-    + b"\xfe".ljust(388, b"\0") * 3 + bytes(4),
-    "RoboSense sensor": bytes.fromhex("55aa055a") + bytes(1206),
-}  # fmt: skip
+OTHERS = [
+    ("Hesai AT128", bytes.fromhex("eeff0403000080020004017f") + bytes(1106)),
+    ("Hesai QT128", bytes.fromhex("eeff03020000800200040107") + bytes(1115)),
+    ("Hesai XT32M", bytes.fromhex("eeff06010000200600040101") + bytes(808)),
+    ("Hesai Pandar20", b"\xee\xff\x14\x14\0\x04" + bytes(1264)),
+    ("Hesai sensor of 99 lasers (version 9.9", bytes.fromhex("eeff09090000630200040101") + bytes(808)),
+    ("RoboSense RS-Ruby", bytes.fromhex("55aa050a5aa550a0") + bytes(22) + b"\x04" + bytes(1217)),
+    ("RoboSense RS-Ruby Plus", bytes.fromhex("55aa055a") + bytes(27) + b"\x05" + bytes(48)
+     + b"\xfe".ljust(388, b"\0") * 3 + bytes(4)),
+    ("RoboSense sensor", bytes.fromhex("55aa050a5aa550a0") + bytes(1240)),  # MSOP of the RS-16 and RS-32
+    ("RoboSense sensor", bytes.fromhex("55aa055a") + bytes(1206)),  # of the M1
+    ("Livox sensor", bytes(1380)),
+    ("Livox sensor", b"\0" + struct.pack("<H", 1380) + bytes(1377)),  # 96 points of 14 bytes behind 36
+    ("Livox sensor", b"\0" + struct.pack("<H", 804) + bytes(801)),  # 96 points of 8 bytes
+    ("Livox sensor", b"\0" + struct.pack("<H", 1380) + bytes(7) + b"\x09" + bytes(1369)),  # of another type
+]  # fmt: skip
 
 
-@pytest.mark.parametrize("name", OTHERS)
-def test_models_that_are_not_decoded_are_named(tmp_path: Path, name: str) -> None:
-    path = write_pcap(tmp_path / "other.pcap", [OTHERS[name]] * 20)
-    assert f"a capture of a {name}" in (error := error_of(path))
-    assert "which cannot be decoded" in error
-    with pytest.raises(PointsError, match="which cannot be decoded"):
-        sensor_of(path)
+@pytest.mark.parametrize(("name", "packet"), OTHERS)
+def test_models_that_are_not_decoded_are_named(tmp_path: Path, name: str, packet: bytes) -> None:
+    path = write_pcap(tmp_path / "other.pcap", [b"gps".ljust(512), *[packet] * 20])
+    for read in (sensor_of, lambda file: next(read_timed_scans(file))):
+        with pytest.raises(PointsError, match=rf"other\.pcap: a capture of a {re.escape(name)}") as caught:
+            read(path)
+        assert ", which cannot be decoded" in str(caught.value)
+        assert f"Convert it with {name.split()[0]}'s driver" in str(caught.value)
 
 
 @pytest.mark.parametrize("model", MODELS.values(), ids=[*MODELS])

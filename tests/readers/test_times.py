@@ -12,11 +12,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from capture_writers import ouster_frame, ouster_info, write_clouds, write_ouster, write_pcap
 from hypothesis import given
 from hypothesis import strategies as st
 from lidar_writers import T0_S, livox_packets
 from numpy.typing import NDArray
-from test_captures import write_pcap
+from test_files import npy, pcd_of, ply_of, save
 from test_motion import write_tum
 
 import edgeperc
@@ -214,26 +215,6 @@ def table(times: NDArray[Any], points: NDArray[np.float64], name: str, kind: str
     return rows
 
 
-def write_pcd(path: Path, rows: NDArray[Any], encoding: str) -> Path:
-    kinds = [rows.dtype[name] for name in rows.dtype.names or ()]
-    header = (
-        f"VERSION 0.7\nFIELDS {' '.join(rows.dtype.names or ())}\nSIZE {' '.join(str(k.itemsize) for k in kinds)}\n"
-        f"TYPE {' '.join(k.kind.upper() for k in kinds)}\nCOUNT{' 1' * len(kinds)}\nWIDTH {len(rows)}\nHEIGHT 1\n"
-        f"POINTS {len(rows)}\nDATA {encoding}\n"
-    )
-    text = "\n".join(" ".join(repr(value.item()) for value in row) for row in rows) + "\n"
-    path.write_bytes(header.encode() + (text.encode() if encoding == "ascii" else rows.tobytes()))
-    return path
-
-
-def write_ply(path: Path, rows: NDArray[Any]) -> Path:
-    kinds = {"f4": "float", "f8": "double", "u4": "uint"}
-    properties = [f"property {kinds[rows.dtype[name].str[1:]]} {name}" for name in rows.dtype.names or ()]
-    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}", *properties, "end_header", ""]
-    path.write_bytes("\n".join(header).encode() + rows.tobytes())
-    return path
-
-
 @pytest.mark.parametrize(
     ("name", "kind", "count"),
     [("t", "<u4", 1e9), ("time", "<f4", 1.0), ("timestamp", "<f8", 1.0), ("Time", "<f8", 1e3)],
@@ -242,13 +223,10 @@ def write_ply(path: Path, rows: NDArray[Any]) -> Path:
 def test_scan_files(tmp_path: Path, name: str, kind: str, count: float, suffix: str) -> None:
     points, times = turn(0.1)
     rows = table(np.round(times * count, 6), points, name, kind)
-    path = tmp_path / f"scan.{suffix}"
-    if suffix == "npy":
-        np.save(path, rows)
-    elif suffix == "ply":
-        write_ply(path, rows)
-    else:
-        write_pcd(path, rows, suffix.partition(".")[0])
+    content = {
+        "npy": npy(rows), "ply": ply_of(rows), "ascii.pcd": pcd_of(rows, "ascii"), "binary.pcd": pcd_of(rows)
+    }  # fmt: skip
+    path = save(tmp_path, f"scan.{suffix}", content[suffix])
     (found,) = list(read_timed_scans(path))
     assert found.stamp_s is None
     np.testing.assert_array_equal(found.points, points.astype(np.float32))
@@ -261,42 +239,11 @@ def test_files_without_times(tmp_path: Path) -> None:
     points = turn(0.1)[0].astype(np.float32)
     points.tofile(tmp_path / "a.bin")
     np.save(tmp_path / "b.npy", points)
-    write_pcd(tmp_path / "c.pcd", table(np.zeros(len(points)), points.astype(float), "ring", "<u4"), "binary")
+    save(tmp_path, "c.pcd", pcd_of(table(np.zeros(len(points)), points.astype(float), "ring", "<u4")))
     scans = list(read_timed_scans(tmp_path))
     assert [scan.times_s for scan in scans] == [None] * 3
     for scan in scans:
         np.testing.assert_array_equal(scan.points, points)
-
-
-def write_bag(path: Path, scans: Sequence[tuple[float, NDArray[Any]]]) -> Path:
-    """A ROS 1 bag of clouds with these stamps."""
-    typesys, rosbag1 = pytest.importorskip("rosbags.typesys"), pytest.importorskip("rosbags.rosbag1")
-    store = typesys.get_typestore(typesys.Stores.ROS1_NOETIC)
-    codes = {"f4": 7, "f8": 8, "u4": 6}
-    with rosbag1.Writer(path) as bag:
-        connection = bag.add_connection("/points", "sensor_msgs/msg/PointCloud2", typestore=store)
-        for k, (stamp_s, rows) in enumerate(scans):
-            stamp = store.types["builtin_interfaces/msg/Time"](int(stamp_s), round(stamp_s % 1 * 1e9))
-            names = rows.dtype.names or ()
-            message = store.types["sensor_msgs/msg/PointCloud2"](
-                store.types["std_msgs/msg/Header"](k, stamp, "lidar"),
-                1,
-                len(rows),
-                [
-                    store.types["sensor_msgs/msg/PointField"](
-                        n, rows.dtype.fields[n][1], codes[rows.dtype[n].str[1:]], 1
-                    )
-                    for n in names
-                ],
-                False,
-                rows.dtype.itemsize,
-                rows.nbytes,
-                np.frombuffer(rows.tobytes(), np.uint8),
-                True,
-            )
-            kind = "sensor_msgs/msg/PointCloud2"
-            bag.write(connection, round(stamp_s * 1e9), store.serialize_ros1(message, kind))
-    return path
 
 
 @pytest.mark.parametrize(
@@ -315,7 +262,7 @@ def test_bags(tmp_path: Path, name: str, kind: str, stored: Callable[[Any, float
     ends = [1700.0, 1700.1]
     turns = [turn(end) for end in ends]
     stamps = [float(times[0]) for _, times in turns]
-    path = write_bag(
+    path = write_clouds(
         tmp_path / "drive.bag",
         [(s, table(stored(times, s), points, name, kind)) for s, (points, times) in zip(stamps, turns, strict=True)],
     )
@@ -370,35 +317,18 @@ def test_a_velodyne_that_moves(tmp_path: Path) -> None:
 @pytest.mark.compiled
 @pytest.mark.parametrize("name", ["room.pcap", "room.osf"])
 def test_an_ouster_that_moves(tmp_path: Path, name: str) -> None:
-    core, pcap = pytest.importorskip("ouster.sdk.core"), pytest.importorskip("ouster.sdk.pcap")
-    osf = pytest.importorskip("ouster.sdk.osf")
-    info = core.SensorInfo.from_default(core.LidarMode._512x10)
-    info.sn = 991
-    info.format.udp_profile_lidar = core.UDPProfileLidar.RNG19_RFL8_SIG16_NIR16
-    info.config.udp_port_lidar, info.config.udp_port_imu = 7502, 7503
-    frame = core.LidarFrame(info)
-    frame.frame_id = 1
-    columns_ns = 5 * 10**9 + np.arange(512) * 195_312
-    frame.timestamp[:], frame.measurement_id[:] = columns_ns, np.arange(512)
-    frame.packet_timestamp[:], frame.status[:] = 10**18, 1
-    lut = core.XYZLut(info, False)
+    info = ouster_info()
+    frame = ouster_frame(info)
+    lut = pytest.importorskip("ouster.sdk.core").XYZLut(info, False)
     near, far = (lut(np.full((64, 512), mm, np.uint32)).reshape(-1, 3) for mm in (10_000, 20_000))
     at_s = 5.05
-    times = np.broadcast_to(columns_ns * 1e-9, (64, 512)).ravel()
+    times = np.broadcast_to(frame.timestamp * 1e-9, (64, 512)).ravel()
     # At range r [mm] a point lies at near + (r - 10,000) * step.
     step = (far - near) / 10_000
     ranges = seen_from(times, at_s, step, near - 10_000 * step)
     frame.field("RANGE")[:] = np.round(ranges).reshape(64, 512)
     frame.field("RANGE")[:, 1::7] = 0
-    path = tmp_path / name
-    if path.suffix == ".osf":
-        with osf.Writer(str(path), info) as writer:
-            writer.save(0, frame)
-    else:
-        packets = core.frame_to_packets(frame, core.PacketFormat(info), info.init_id, info.sn)
-        pcap.record(packets, str(path))
-        path.with_suffix(".json").write_text(info.to_json_string())
-    (found,) = list(read_timed_scans(path))
+    (found,) = list(read_timed_scans(write_ouster(tmp_path / name, info, [frame])))
     assert found.times_s is not None
     assert found.stamp_s == found.times_s.max()
     assert len(found.points) == 64 * (512 - 73)
@@ -422,7 +352,7 @@ def drive(path: Path, ends: Sequence[float], name: str = "time") -> Path:
     for end in ends:
         points, times = turn(end)
         scans.append((end, table(times - end, points, name, "<f4")))
-    return write_bag(path, scans)
+    return write_clouds(path, scans)
 
 
 def pose_at(t: float) -> NDArray[np.float64]:
