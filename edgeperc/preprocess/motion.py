@@ -18,6 +18,7 @@ from ..system.kernels import njit
 from ..types.frame import fill_moved, poses_of
 from ..types.points import Floats, Floats32, Points, as_points, read_only
 from ..types.rigid import rigid
+from ..types.sensor import MAX_ACCUMULATE_S
 from .returns import blank_too_near
 
 MAX_RATE = 1e4  # of m/s and rad/s
@@ -288,7 +289,7 @@ def deskew(
     PointsError
         ``points`` is not a scan, or there is not one time for each point.
     StampError
-        ``at_s`` is not finite.
+        ``at_s`` is not finite, or half of the times are more than 10 s from it: in another unit, or on another clock.
     OptionError
         ``motion`` is not a `Motion`, or ``min_range_m`` is not a number of meters from 0.
 
@@ -311,6 +312,11 @@ def deskew(
     at = (float(known.max()) if len(known) else 0.0) if at_s is None else at_s
     if not math.isfinite(at):
         raise StampError(f"at_s is {at_s}; expected finite seconds")
+    if len(known) and np.median(np.abs(known - at)) > MAX_ACCUMULATE_S:
+        raise StampError(
+            f"got times of {known.min():.6g} to {known.max():.6g} for the pose at {at:.6g}; expected seconds on one "
+            f"clock, and those of a scan, up to {MAX_ACCUMULATE_S:g} s"
+        )
     moved = np.empty(rows.shape, np.float32)
     fill_deskewed(
         seen,
