@@ -33,7 +33,7 @@ def returns(
     x, y = sensor.mounting.origin_m if origin_m is None else origin_m
     box = None if sensor.ego_box is None else np.array(sensor.ego_box)
     scan, dropped, n_unknown = _blanked(points, np.array([x, y, 0.0]), sensor.min_range_m, box)
-    return _with_remission(scan) if n_unknown else scan, dropped
+    return with_remission(scan) if n_unknown else scan, dropped
 
 
 def blank_too_near(points: Points, min_range_m: float) -> Floats32:
@@ -52,8 +52,8 @@ def about_too_near(dropped: DroppedPoints, n_points: int, sensor: SensorProfile)
     )
 
 
-def _with_remission(scan: Points) -> Floats32:
-    """A copy whose rows with coordinates have a remission."""
+def with_remission(scan: Points) -> Floats32:
+    """A copy whose rows with coordinates have a remission: where it is not finite, the median of the others, or 0."""
     filled, known = scan.copy(), np.isfinite(scan[:, 3])
     median = np.median(scan[known, 3].astype(np.float64)) if known.any() else 0.0  # a mean of two may overflow
     filled[~known & np.isfinite(scan[:, 0]), 3] = median

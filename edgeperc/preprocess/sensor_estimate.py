@@ -20,6 +20,7 @@ from ..system.kernels import njit
 from ..types.points import Floats, Floats32, Ints64, Points
 from ..types.sensor import SAY_PATTERN, SENSORS, SensorProfile
 from .findings import BEYOND, FEET_PER_M, check_coordinates, in_feet
+from .returns import with_remission
 
 __all__ = ["MOST_SCANS", "SensorEstimate", "compile_votes", "estimate_sensor", "fill_votes", "has_enough_points"]
 
@@ -166,7 +167,7 @@ def estimate_sensor(scans: Sequence[Points]) -> SensorEstimate:
     Raises SensorError: The points do not tell: too few, or without beams (solid-state sensors, scans thinned to voxels)
         and sparse, or a part of a turn of a sensor that is not built in.
     """
-    clean = [scan[np.isfinite(scan).all(axis=1)] for scan in scans[:MOST_SCANS]]
+    clean = [with_remission(scan[np.isfinite(scan[:, :3]).all(axis=1)]) for scan in scans[:MOST_SCANS]]
     polar = [_polar(scan) for scan in clean]
     n_points = max((len(each.flat) for each in polar), default=0)
     if n_points < FEWEST_POINTS:
@@ -289,7 +290,7 @@ def has_enough_points(scan: Points) -> bool:
     """Whether a scan has so many points that it may tell; empty beams are none."""
     with np.errstate(over="ignore", invalid="ignore"):
         flat = np.hypot(scan[:, 0], scan[:, 1])
-    return int(np.count_nonzero((flat > _NEAREST_M[-1]) & np.isfinite(scan).all(axis=1))) >= FEWEST_POINTS
+    return int(np.count_nonzero((flat > _NEAREST_M[-1]) & np.isfinite(scan[:, :3]).all(axis=1))) >= FEWEST_POINTS
 
 
 def _unknown(reason: str) -> SensorError:

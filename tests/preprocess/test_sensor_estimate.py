@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from edgeperc import read_points, read_scans
 from edgeperc.errors import SensorError
-from edgeperc.preprocess.sensor_estimate import SensorEstimate, estimate_sensor, fill_votes
+from edgeperc.preprocess.sensor_estimate import SensorEstimate, estimate_sensor, fill_votes, has_enough_points
 from edgeperc.simulation.samples import FIRST_SEED, simulated_scan
 from edgeperc.types.points import Points
 from edgeperc.types.sensor import SENSORS, SensorProfile
@@ -304,6 +304,14 @@ def test_range_of_remission(scale: float, most: float) -> None:
     scan = spinning(np.linspace(9, -18, 40))
     scan[:, 3] *= scale
     assert estimate_sensor([scan]).profile.remission_range == (0.0, most)
+
+
+def test_a_scan_without_remission_shows_its_sensor() -> None:
+    """Drivers that have no intensity write NaN."""
+    scan = simulated_scan(FIRST_SEED, "vlp-16").points.copy()
+    scan[:, 3] = np.nan
+    assert has_enough_points(scan)
+    assert estimate_sensor([scan]).profile is SENSORS["vlp-16"]
 
 
 @pytest.mark.parametrize("kind", ["whole", "cropped", "cut short"])
