@@ -18,6 +18,7 @@ from .points import Floats
 from .rigid import rigid
 
 FIELDS = Fields("mounting", SensorError, exact=True)
+_STEEP = 0.01  # cosine of a pitch; matrices in files have four digits and more
 
 
 @dataclass(frozen=True)
@@ -89,12 +90,12 @@ class Mounting:
         matrix = rigid("the extrinsic matrix", T_vehicle_sensor, SensorError)
         R = matrix[:3, :3]
         pitch = math.asin(min(1.0, max(-1.0, -float(R[2, 0]))))
-        return cls(
-            height_m=float(matrix[2, 3]),
-            roll_deg=math.degrees(math.atan2(R[2, 1], R[2, 2])),
-            pitch_deg=math.degrees(pitch),
-            yaw_deg=math.degrees(math.atan2(R[1, 0], R[0, 0])),
-        )
+        roll, yaw = math.atan2(R[2, 1], R[2, 2]), math.atan2(R[1, 0], R[0, 0])
+        if math.hypot(R[2, 1], R[2, 2]) < _STEEP:
+            # x points up or down, so that both turn about it, and what shows one is rounded away: y shows their sum.
+            x, y = R[:2] @ [0.0, math.cos(roll), -math.sin(roll)]
+            yaw = math.atan2(-x, y)
+        return cls(float(matrix[2, 3]), math.degrees(roll), math.degrees(pitch), math.degrees(yaw))
 
     @classmethod
     def from_file(cls, path: str | os.PathLike[str]) -> Mounting:
@@ -110,7 +111,7 @@ class Mounting:
         name = os.fspath(path)
         try:
             with Path(path).open("rb") as file:
-                text = file.read(100_001).decode("utf-8")
+                text = file.read(100_001).decode("utf-8-sig")
         except (OSError, UnicodeDecodeError) as exc:
             raise SensorError(f"{name}: the extrinsic calibration cannot be read ({exc})") from exc
         if len(text) > 100_000:

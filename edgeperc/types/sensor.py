@@ -512,7 +512,7 @@ def get_sensor(sensor: str | os.PathLike[str] | SensorProfile) -> SensorProfile:
         return sensor
     if isinstance(sensor, os.PathLike) or (isinstance(sensor, str) and sensor.endswith(".json")):
         try:
-            return SensorProfile.from_json(Path(sensor).read_text(encoding="utf-8"))
+            return SensorProfile.from_json(Path(sensor).read_text(encoding="utf-8-sig"))
         except (OSError, UnicodeDecodeError) as exc:
             raise SensorError(f"{os.fspath(sensor)}: the sensor profile cannot be read ({exc})") from exc
         except SensorError as exc:

@@ -77,6 +77,15 @@ def test_matrix_and_dict_give_the_mounting_back(mounting: Mounting) -> None:
     assert Mounting.from_dict(json.loads(json.dumps(mounting.to_dict()))) == mounting
 
 
+@pytest.mark.parametrize("pitch_deg", [90.0, -90.0, 89.99])
+@pytest.mark.parametrize(("roll_deg", "yaw_deg"), [(0.0, 90.0), (45.0, 0.0), (180.0, -30.0)])
+def test_a_matrix_with_x_up_or_down_gives_its_turn_back(roll_deg: float, pitch_deg: float, yaw_deg: float) -> None:
+    """Rounded, as files have it: roll and yaw are turns about one axis."""
+    matrix = np.eye(4)
+    matrix[:3, :3] = Mounting(0.0, roll_deg, pitch_deg, yaw_deg).rotation().round(4)
+    np.testing.assert_allclose(Mounting.from_matrix(matrix).rotation(), matrix[:3, :3], atol=1e-3)
+
+
 def test_directions_of_the_angles() -> None:
     down, left_up, right = (Mounting(1.0, *a).rotation() for a in ((0, 10, 0), (10, 0, 0), (0, 0, -90)))
     assert down[2, 0] < 0.0  # pitch: x points down
@@ -91,11 +100,12 @@ def test_directions_of_the_angles() -> None:
         ("[[1,0,0,9],[0,1,0,9],[0,0,1,2.5],[0,0,0,1]]", Mounting(2.5, 0.0, 0.0, 0.0)),
         ('{"T_vehicle_sensor": [[0,1,0,0],[-1,0,0,0],[0,0,1,2],[0,0,0,1]]}', Mounting(2.0, 0.0, 0.0, -90.0)),
         ("1 0 0 0\n0 1 0 0\n0 0 1 1.2\n0 0 0 1\n", Mounting(1.2, 0.0, 0.0, 0.0)),
+        ("\ufeff[[1,0,0,0],[0,1,0,0],[0,0,1,2],[0,0,0,1]]", Mounting(2.0, 0.0, 0.0, 0.0)),  # Windows begins it so
         ("1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 1.2", Mounting(1.2, 0.0, 0.0, 0.0)),
     ],
 )
 def test_extrinsic_files(tmp_path: Path, text: str, mounting: Mounting) -> None:
-    (tmp_path / "extrinsic").write_text(text)
+    (tmp_path / "extrinsic").write_text(text, "utf-8")
     assert Mounting.from_file(tmp_path / "extrinsic") == mounting
 
 

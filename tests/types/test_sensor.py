@@ -115,6 +115,12 @@ def test_own_and_changed_profiles() -> None:
         own.columns = 3
 
 
+def test_a_profile_may_begin_with_a_byte_order_mark(tmp_path: Path) -> None:
+    """Editors of Windows write one."""
+    (tmp_path / "own.json").write_text(SENSORS["vlp-16"].to_json(), "utf-8-sig")
+    assert get_sensor(tmp_path / "own.json") == SENSORS["vlp-16"]
+
+
 @pytest.mark.parametrize("name", ["hdl64", "HDL-64E", "", None, ["vlp-16"]])
 def test_an_unknown_sensor_lists_the_known(name: Any) -> None:
     with pytest.raises(SensorError, match=r"hdl-64e.*pandarxt-32"):
