@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -70,9 +71,30 @@ def cast(
     return scan_of(np.column_stack([ahead[hit] * reach[hit, None], reach[hit] * gradient[hit] + height_m + ROAD_Z]))
 
 
+def highest(points: NDArray[np.float32], view: TopViewGeometry) -> NDArray[np.int32]:
+    """The highest point of each cell."""
+    return TopViewProjector(view, InputSpec("image", ("height",), (0.0,), (1.0,))).project(points).index
+
+
 def observe(points: NDArray[np.float32], sensor: str = "hdl-64e", view: TopViewGeometry = VIEW) -> NDArray[np.bool_]:
-    projector = TopViewProjector(view, InputSpec("image", ("height",), (0.0,), (1.0,)))
-    return Observer(view, get_sensor(sensor)).observe(points, projector.project(points).index).observed
+    return Observer(view, get_sensor(sensor)).observe(points, highest(points, view)).observed
+
+
+def follow(lowest: NDArray[np.float32], *rays: Any) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+    """The levels and states of the kernel, which are the twin's."""
+    level, state = np.full(lowest.shape, 7.0, np.float32), np.ones(lowest.shape, np.uint8)
+    follow_rays(lowest, *rays, level, state)
+    right_level, right_state = twins.observed.rays(lowest, *rays)
+    np.testing.assert_array_equal(state, right_state)
+    np.testing.assert_array_equal(level, right_level)
+    return level, state
+
+
+def check_cells(points: NDArray[np.float32], index: NDArray[np.int32], *bins: Any) -> None:
+    """Whether the kernel marks the cells that the twin does."""
+    observed, between = np.ones((2, *index.shape), np.bool_)
+    mark_cells(points, index, *bins, observed, between)
+    np.testing.assert_array_equal([observed, between], twins.observed.cells(points, index, *bins))
 
 
 def at(mask: NDArray[np.bool_], x: tuple[float, float], y: tuple[float, float]) -> NDArray[np.bool_]:
@@ -90,18 +112,9 @@ def test_the_kernels_agree_with_their_twins(points: NDArray[np.float32], view: T
     fill_lowest_returns(points, observer.bounds, observer.grid, lowest)
     np.testing.assert_array_equal(lowest, twins.observed.lowest_returns(points, observer.bounds, observer.grid, shape))
     for z_beams in (0.0, 0.4, -1.2):
-        level, state = np.full(shape, 7.0, np.float32), np.ones(shape, np.uint8)
         rays, tilt = np.array([1.0, z_beams, *observer.beams]), 0.03 * observer.ahead[1]
-        follow_rays(lowest, rays, observer.steps, tilt, level, state)
-        right_level, right_state = twins.observed.rays(lowest, rays, observer.steps, tilt)
-        np.testing.assert_array_equal(state, right_state)
-        np.testing.assert_array_equal(level, right_level)
-    projector = TopViewProjector(view, InputSpec("image", ("height",), (0.0,), (1.0,)))
-    index = projector.project(points).index
-    observed, between = np.ones((2, *index.shape), np.bool_)
-    mark_cells(points, index, observer.bin_of_cell, level, state, observed, between)
-    right = twins.observed.cells(points, index, observer.bin_of_cell, level, state)
-    np.testing.assert_array_equal([observed, between], right)
+        level, state = follow(lowest, rays, observer.steps, tilt)
+    check_cells(points, highest(points, view), observer.bin_of_cell, level, state)
 
 
 @patient
@@ -110,13 +123,7 @@ def test_rays_over_uneven_ground_agree_with_the_twin(seed: int, missing: float) 
     rng = np.random.default_rng(seed)
     lowest = (ROAD_Z + np.cumsum(rng.normal(0.0, 0.15, (6, 80)), axis=1)).astype(np.float32)
     lowest[rng.random(lowest.shape) < 0.7 + missing] = np.inf
-    level, state = np.empty_like(lowest), np.empty(lowest.shape, np.uint8)
-    rays = np.array([0.2, 0.1, -0.44, 0.02 + missing])
-    steps, tilt = rng.uniform(0.0, 0.1, 90), rng.normal(0.0, 0.05, 6)
-    follow_rays(lowest, rays, steps, tilt, level, state)
-    right_level, right_state = twins.observed.rays(lowest, rays, steps, tilt)
-    np.testing.assert_array_equal(state, right_state)
-    np.testing.assert_array_equal(level, right_level)
+    follow(lowest, np.array([0.2, 0.1, -0.44, 0.02 + missing]), rng.uniform(0.0, 0.1, 90), rng.normal(0.0, 0.05, 6))
 
 
 @patient
@@ -126,10 +133,7 @@ def test_cells_of_any_states_agree_with_the_twin(seed: int) -> None:
     observer, index = Observer(SMALL, get_sensor("vlp-16")), np.full((16, 12), -1, np.int32)
     state = rng.integers(0, 4, observer.state.shape).astype(np.uint8)
     level, points = np.zeros(state.shape, np.float32), np.empty((0, 4), np.float32)
-    observed, between = np.ones((2, *index.shape), np.bool_)
-    mark_cells(points, index, observer.bin_of_cell, level, state, observed, between)
-    right = twins.observed.cells(points, index, observer.bin_of_cell, level, state)
-    np.testing.assert_array_equal([observed, between], right)
+    check_cells(points, index, observer.bin_of_cell, level, state)
 
 
 @patient
@@ -140,9 +144,9 @@ def test_low_returns_observe_their_cells_and_order_does_not_matter(points: NDArr
     finite = points[np.isfinite(points).all(axis=1)]
     np.testing.assert_array_equal(observed, observe(finite, view=SMALL))
     # No return is below -2.5 m, so the ground is not, and returns up to -0.5 m are at most 2 m above it.
-    index = TopViewProjector(SMALL, InputSpec("image", ("height",), (0.0,), (1.0,))).project(finite).index
-    highest = np.where(index >= 0, finite[index, 2] if len(finite) else np.inf, np.inf)
-    assert observed[highest <= -0.5].all()
+    index = highest(finite, SMALL)
+    top = np.where(index >= 0, finite[index, 2] if len(finite) else np.inf, np.inf)
+    assert observed[top <= -0.5].all()
 
 
 @patient
@@ -349,9 +353,7 @@ def test_an_empty_scan_has_no_road() -> None:
 
 def top_view(points: NDArray[np.float32], sensor: str, mounting: Mounting = MODEL_MOUNTING) -> TopView:
     """The view of a network that takes everything for road."""
-    projector = TopViewProjector(VIEW, InputSpec("image", ("height",), (0.0,), (1.0,)))
-    index = projector.project(points).index
-    observed, between_beams = Observer(VIEW, get_sensor(sensor)).observe(points, index, mounting)
+    observed, between_beams = Observer(VIEW, get_sensor(sensor)).observe(points, highest(points, VIEW), mounting)
     return TopView(
         np.ones((400, 200), np.uint8),
         ("background", "drivable"),
@@ -464,8 +466,7 @@ def test_a_tilted_sensor_is_read_with_its_tilt(pitch_deg: float, roll_deg: float
 @patient
 @given(clouds, st.integers(0, 2**32))
 def test_the_free_distance_is_the_least_of_the_distances_to_its_ends(points: NDArray[np.float32], seed: int) -> None:
-    projector = TopViewProjector(SMALL, InputSpec("image", ("height",), (0.0,), (1.0,)))
-    seen = Observer(SMALL, get_sensor("vlp-16")).observe(points, projector.project(points).index)
+    seen = Observer(SMALL, get_sensor("vlp-16")).observe(points, highest(points, SMALL))
     labels = np.random.default_rng(seed).integers(0, 3, (16, 12)).astype(np.uint8)
     view = TopView(
         labels, ("background", "drivable", "car"), 0.5, (2.0, 10.0), (-3.0, 3.0), seen[0], between_beams=seen[1]

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 import twins.planes
 from edgeperc.errors import PointsError
-from edgeperc.ground.planes import find_ground, fit_ground, heights_above
+from edgeperc.ground.planes import Ground, find_ground, fit_ground, heights_above
 from edgeperc.simulation.drawn import random_scene
 from edgeperc.simulation.samples import simulated_scan
 from edgeperc.simulation.scene import simulate
@@ -31,14 +31,26 @@ def street(
     return points, on
 
 
+def check_same(found: Ground, expected: Ground, rows: np.ndarray | slice = np.s_[:]) -> None:
+    """Whether a ground is that of some rows of another one."""
+    np.testing.assert_array_equal(found.height_m, expected.height_m[rows])
+    np.testing.assert_array_equal(found.mask, expected.mask[rows])
+    assert found.plane == expected.plane
+
+
+def check_against_twin(points: np.ndarray, regions: bool, atol: float) -> None:
+    heights, plane = twins.planes.ground_heights(points, 1.73, regions)
+    ground = find_ground(points, regions=regions)
+    np.testing.assert_allclose(ground.plane, plane, atol=1e-9)
+    np.testing.assert_allclose(ground.height_m, heights, atol=atol, rtol=1e-6)
+
+
 @pytest.mark.parametrize("columns", [3, 5])
 def test_other_columns_do_not_matter(columns: int) -> None:
     points, _ = street(np.random.default_rng(0))
     other = np.full((len(points), columns), np.nan, np.float32)
     other[:, :3] = points[:, :3]
-    ground, expected = find_ground(other), find_ground(points)
-    np.testing.assert_array_equal(ground.height_m, expected.height_m)
-    assert ground.plane == expected.plane
+    check_same(find_ground(other), find_ground(points))
 
 
 @pytest.mark.parametrize("regions", [True, False])
@@ -132,10 +144,7 @@ def test_heights_agree_with_the_twin(seed: int, regions: bool) -> None:
     points, _ = street(rng, n=1500, slope_x=0.05, kerb=0.12 * seed, reach=[20.0, 45.0, 70.0, 90.0][seed])
     points[rng.random(len(points)) < 0.02] *= np.float32(3.0)
     points[rng.integers(0, len(points), 5), rng.integers(0, 3, 5)] = np.nan
-    heights, plane = twins.planes.ground_heights(points, 1.73, regions)
-    ground = find_ground(points, regions=regions)
-    np.testing.assert_allclose(ground.plane, plane, atol=1e-9)
-    np.testing.assert_allclose(ground.height_m, heights, atol=1e-5, rtol=1e-6)
+    check_against_twin(points, regions, 1e-5)
 
 
 # Few distinct values, so that points share cells, rows and heights.
@@ -149,17 +158,12 @@ def test_random_scans_match_the_twin(rows: list[tuple[float, float, float]], reg
     x, y = np.meshgrid(np.arange(-10.0, 10.0, 2.5), np.arange(-10.0, 10.0, 2.5))
     floor = np.column_stack([x.ravel(), y.ravel(), 0.03 * x.ravel() - 1.7])
     points = np.concatenate([np.array(rows).reshape(-1, 3), floor]).astype(np.float32)
-    heights, plane = twins.planes.ground_heights(points, 1.73, regions)
-    ground = find_ground(points, regions=regions)
-    np.testing.assert_allclose(ground.plane, plane, atol=1e-9)
-    np.testing.assert_allclose(ground.height_m, heights, atol=1e-4, rtol=1e-6)
+    check_against_twin(points, regions, 1e-4)
 
 
 def test_ground_is_deterministic() -> None:
     points, _ = street(np.random.default_rng(8))
-    first, second = find_ground(points), find_ground(points.copy())
-    np.testing.assert_array_equal(first.height_m, second.height_m)
-    assert first.plane == second.plane
+    check_same(find_ground(points), find_ground(points.copy()))
 
 
 @pytest.mark.parametrize("regions", [False, True])
@@ -170,13 +174,8 @@ def test_heights_of_some_points_are_those_of_all(regions: bool) -> None:
     for wanted in (np.arange(len(points)) % 7 == 3, (x > 10.0) & (x < 25.0), (x > 0.0) & (abs(y) < x), x < -5.0):
         rows = np.flatnonzero(wanted).astype(np.int32)
         assert len(rows) > 100
-        some = fit_ground(points, regions=regions).heights(rows)
-        np.testing.assert_array_equal(some.height_m, every.height_m[rows])
-        np.testing.assert_array_equal(some.mask, every.mask[rows])
-        assert some.plane == every.plane
-    none = fit_ground(points, regions=regions).heights(rows[:0])
-    assert none.plane == every.plane
-    assert none.mask.shape == none.height_m.shape == (0,)
+        check_same(fit_ground(points, regions=regions).heights(rows), every, rows)
+    check_same(fit_ground(points, regions=regions).heights(rows[:0]), every, rows[:0])
 
 
 @pytest.mark.parametrize("mount", [1.73, 4.0])  # the second is so wrong that no ground is found
@@ -185,10 +184,7 @@ def test_the_surface_gives_the_heights_of_the_scan(mount: float, regions: bool) 
     points, _ = street(np.random.default_rng(7), n=3000, kerb=0.15, reach=80.0)
     points[:5, 2] = np.nan
     fit = fit_ground(points, mount_height_m=mount, regions=regions)
-    found, whole = heights_above(fit.surface(), points), fit.heights()
-    np.testing.assert_array_equal(found.height_m, whole.height_m)
-    np.testing.assert_array_equal(found.mask, whole.mask)
-    assert found.plane == whole.plane
+    check_same(heights_above(fit.surface(), points), fit.heights())
 
 
 @pytest.mark.kernel
