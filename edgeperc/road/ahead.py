@@ -138,7 +138,13 @@ class RoadAhead:
         return self.free_ahead(half_width_m).free_m
 
     def free_ahead(self, half_width_m: float = 1.0) -> FreeAhead:
-        """As `free_ahead_m`, with what ends it: the nearest of each kind within ``half_width_m`` of the axis."""
+        """As `free_ahead_m`, with what ends it: the nearest of each kind within ``half_width_m`` of the axis.
+
+        Raises
+        ------
+        OptionError
+            ``half_width_m`` is negative or NaN.
+        """
         firsts = np.stack([self.obstacle_m, self.edge_m, self.unknown_m])
         return _strip_ahead(self.y_m, firsts, self.view_m, half_width_m)
 
@@ -246,6 +252,11 @@ def free_ahead(top_view: TopView, boxes: Iterable[Box] = (), *, half_width_m: fl
     -------
     FreeAhead
 
+    Raises
+    ------
+    OptionError
+        ``half_width_m`` is negative or NaN.
+
     Examples
     --------
     >>> free_ahead(found.top_view, found.boxes)             # doctest: +SKIP
@@ -282,11 +293,15 @@ def _first_m(top_view: TopView, objects: Mask) -> Floats:
         known = known | top_view.between_beams
     firsts = np.empty((3, objects.shape[1]), np.int64)
     fill_first_cells(objects, np.ascontiguousarray(known), np.ascontiguousarray(road), firsts)
-    return np.where(firsts == len(objects), math.inf, top_view.x_range_m[0] + firsts * top_view.cell_m)
+    near, far = top_view.x_range_m
+    near += (far - near) - len(objects) * top_view.cell_m  # rows are counted from the far edge, and are whole
+    return np.where(firsts == len(objects), math.inf, near + firsts * top_view.cell_m)
 
 
 def _strip_ahead(y_m: Floats, firsts: Floats, view_m: float, half_width_m: float) -> FreeAhead:
     """The nearest of each kind within ``half_width_m`` of the axis."""
+    if not half_width_m >= 0.0:
+        raise OptionError(f"half_width_m is {half_width_m}; expected 0 or more meters")
     near = np.abs(y_m) <= half_width_m
     if not near.any():
         return FreeAhead(math.nan, None, math.inf, math.inf, math.inf, view_m)

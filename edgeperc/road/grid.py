@@ -54,7 +54,7 @@ class OccupancyGrid:
     cell_m : float
         Edge of a cell [m].
     x_range_m, y_range_m : tuple of 2 float
-        Nearest and farthest x, rightmost and leftmost y [m].
+        Nearest and farthest x, rightmost and leftmost y of the cells [m].
     stamp_s : float or None
         That of the perception.
     mounting : Mounting
@@ -174,6 +174,12 @@ def check_value(name: str, value: int) -> int:
     return int(value)
 
 
+def check_height(min_height_m: float) -> None:
+    """Up to where returns are no obstacles. Raises OptionError."""
+    if not 0.0 <= min_height_m < OVERHEAD_M:
+        raise OptionError(f"min_height_m is {min_height_m}; expected meters from 0 to below {OVERHEAD_M:g}")
+
+
 def grid_message(
     values: NDArray[np.int8],
     cell_m: float,
@@ -224,7 +230,7 @@ def occupancy_grid(
         Edge of a cell [m].
     x_range_m, y_range_m : tuple of 2 float, optional
         Bounds of the grid [m], lower first; by default 40 m on all sides if points know the road, else those of the top
-        view.
+        view. The lower one is moved by up to half a cell, so that whole cells lie between them.
     min_height_m : float
         Returns up to this height above the ground are no obstacles [m]. A kerb is 0.1 to 0.2 m high.
     sensor : str, Path or SensorProfile
@@ -257,8 +263,7 @@ def occupancy_grid(
     >>> grid.save_map("map")                                # doctest: +SKIP
     PosixPath('map/map.yaml')
     """
-    if not 0.0 <= min_height_m < OVERHEAD_M:
-        raise OptionError(f"min_height_m is {min_height_m}; expected meters from 0 to below {OVERHEAD_M:g}")
+    check_height(min_height_m)
     top_view = perception.top_view
     usual = TopViewGeometry() if top_view is None else top_view.geometry
     if knows_road(perception.points):
@@ -293,11 +298,17 @@ def occupancy_grid(
         height_m=tallest,
         observed=observed,
         cell_m=view.cell_m,
-        x_range_m=view.x_range_m,
-        y_range_m=view.y_range_m,
+        x_range_m=_covered(view.x_range_m, view.height, view.cell_m),
+        y_range_m=_covered(view.y_range_m, view.width, view.cell_m),
         stamp_s=perception.stamp_s,
         mounting=perception.mounting,
     )
+
+
+def _covered(bounds_m: tuple[float, float], n_cells: int, cell_m: float) -> tuple[float, float]:
+    """What the cells cover, counted from the upper bound [m]: other bounds where these are no multiple of a cell."""
+    low, high = bounds_m
+    return low + ((high - low) - n_cells * cell_m), high
 
 
 class Split(NamedTuple):

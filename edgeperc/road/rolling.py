@@ -24,7 +24,7 @@ from ..types.rigid import rigid
 from ..types.sensor import SensorProfile
 from ..types.views import TopViewGeometry
 from .around import knows_road
-from .grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, check_value, grid_message, occupancy_grid
+from .grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, check_height, check_value, grid_message, occupancy_grid
 
 # What a cell holds.
 _NOTHING, _ROAD, _OFF_ROAD, _OBSTACLE, _GROUND = range(5)
@@ -59,7 +59,7 @@ class RollingGrid:
     Raises
     ------
     OptionError
-        A number is out of its range, or the grid has too many cells.
+        A number is out of its range, the grid has too many cells, or ``classes`` is a single name.
 
     Examples
     --------
@@ -85,6 +85,9 @@ class RollingGrid:
             raise OptionError(
                 f"got margin_m={margin_m}, cell_m={cell_m}, size_m={size_m}; expected cells in the window"
             )
+        check_height(min_height_m)
+        if isinstance(classes, str):  # its letters would be the classes
+            raise OptionError(f"classes is {classes!r}; expected a collection of names, such as {{{classes!r}}}")
         self._cell_m, self._remember_s, self._min_height_m = float(cell_m), float(remember_s), min_height_m
         self._classes, self._margin_m = frozenset(classes), float(margin_m)
         n = round(size_m / cell_m)

@@ -199,7 +199,9 @@ def test_lanes_of_a_slanting_road(slope: float, width: float, lanes: int) -> Non
 def test_no_drivable_cell() -> None:
     for road in (
         road_ahead(view(blank())),
-        road_ahead(TopView(np.ones((4, 2), np.uint8), CLASSES[::2], 0.1, (6, 7), (0, 1), np.ones((4, 2), np.bool_))),
+        road_ahead(
+            TopView(np.ones((4, 2), np.uint8), CLASSES[::2], 0.1, (6, 6.4), (0, 0.2), np.ones((4, 2), np.bool_))
+        ),
     ):
         assert road.outline.shape == (0, 2)
         assert (road.free_m == 6.0).all()
@@ -266,6 +268,15 @@ def test_all_cells_drivable() -> None:
     np.testing.assert_allclose(road.width_m, 20.0)
 
 
+def test_rows_that_do_not_fill_the_view_are_counted_from_its_far_edge() -> None:
+    cells = np.ones((14, 6), np.bool_)  # 21 m of 20 m
+    cells[:2] = False
+    top_view = TopView(cells.astype(np.uint8), CLASSES[:2], 1.5, (6.0, 26.0), (-4.5, 4.5), cells | True)
+    road = road_ahead(top_view)
+    assert road.outline[:, 0].min() == 5.0
+    assert road.free_ahead_m() == road.outline[:, 0].max() == 23.0
+
+
 def test_road_that_begins_farther_ahead_has_no_free_distance() -> None:
     cells = blank()
     cells[:300, 80:120] = True
@@ -285,6 +296,9 @@ def test_results_are_immutable_and_errors_name_the_reason() -> None:
     for tolerance_m in (-0.1, math.nan):
         with pytest.raises(PointsError, match=f"tolerance_m is {tolerance_m}; expected 0 or more"):
             road_ahead(view(blank()), tolerance_m=tolerance_m)
+    for half_width_m in (-0.1, math.nan):
+        with pytest.raises(OptionError, match=f"half_width_m is {half_width_m}; expected 0 or more"):
+            free_ahead(view(blank()), half_width_m=half_width_m)
     with pytest.raises(OptionError, match="max_corners is 3; expected at least 4"):
         road_ahead(view(blank()), max_corners=3)
     assert math.isnan(road.free_ahead_m(0.01))

@@ -105,6 +105,18 @@ def test_values_of_a_message() -> None:
             grid.values(wrong)  # type: ignore[arg-type]
 
 
+def test_cells_that_do_not_fill_the_bounds_lie_where_the_message_says(tmp_path: Path) -> None:
+    points = street()
+    grid = occupancy_grid(perceived(points), points, cell_m=1.5)  # 27 rows and 13 columns: 40.5 m of 40, 19.5 of 20
+    fields = grid.to_occupancy_grid()
+    origin, cells = fields["info"]["origin"]["position"], fields["data"].reshape(13, 27)
+    assert (origin["x"], origin["y"]) == (grid.x_range_m[0], grid.y_range_m[0]) == (5.5, -9.5)
+    column, row = int((20.05 - origin["x"]) / 1.5), int((3.0 - origin["y"]) / 1.5)
+    assert (np.flatnonzero(cells[row] == 100) == column).all()
+    assert cells[row, column] == 100
+    assert "origin: [5.5, -9.5, 0.0]" in grid.save_map(tmp_path).read_text("utf-8")
+
+
 def test_a_map_is_read_back(tmp_path: Path) -> None:
     image, yaml = pytest.importorskip("PIL.Image"), pytest.importorskip("yaml")
     points = street()
