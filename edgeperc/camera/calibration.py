@@ -162,7 +162,7 @@ def read_kitti_calibration(path: str | os.PathLike[str]) -> tuple[Floats, Floats
     values: dict[str, Floats] = {}
     try:
         for file in [folder / name for name in _RAW_FILES] if is_raw else [Path(path)]:
-            for line in file.read_text("utf-8").splitlines():
+            for line in file.read_text("utf-8-sig").splitlines():
                 key, _, numbers = line.replace(":", " ", 1).partition(" ")
                 if numbers.strip() and key not in _NO_NUMBERS:
                     values[key] = np.array([float(v) for v in numbers.split()])

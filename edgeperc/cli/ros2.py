@@ -150,7 +150,7 @@ def ros2_command(arguments: argparse.Namespace) -> int:
             tracker=None if arguments.no_track else Tracker(),
             frame_id=arguments.frame,
             grid_frame_id=arguments.grid_frame,
-            prefix=arguments.prefix,
+            prefix=arguments.prefix or "",
             rate_hz=arguments.rate,
             outputs=arguments.publish or USUAL_OUTPUTS,
             rolling=_rolling(arguments),
@@ -160,7 +160,7 @@ def ros2_command(arguments: argparse.Namespace) -> int:
         graph.close()
         raise
     waiting = "unconfigured, waiting for its manager; clouds on" if node.is_managed else "waiting for clouds on"
-    print_line(f"{graph.name}: {waiting} {arguments.topic}, publishing {arguments.prefix}/*")
+    print_line(f"{graph.name}: {waiting} {arguments.topic}, publishing {arguments.prefix or ''}/*")
     n_answers, reported = 0, ""
     with node:
         try:

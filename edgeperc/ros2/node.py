@@ -97,7 +97,7 @@ class PerceptionNode:
     MissingExtraError
         rosbags is not installed.
     OptionError
-        A name is not valid.
+        A name is not valid, or two topics are one.
 
     Examples
     --------
@@ -143,6 +143,7 @@ class PerceptionNode:
         self._forgets = False  # the next cloud begins anew
 
         self._topics = _topics_of(outputs, prefix, rolling is not None)
+        _check_distinct(topic, self._topics, graph.name.rpartition("/")[0])
         self._outputs: dict[str, Output] = {}
         self._diagnostics = graph.advertise("/diagnostics", DIAGNOSTICS) if "diagnostics" in outputs else None
         # The queue is empty nearly always: the stream's thread takes what comes, and keeps the newest.
@@ -437,3 +438,13 @@ def _topics_of(outputs: Sequence[str], prefix: str, with_rolling: bool) -> dict[
     if with_rolling:
         topics.setdefault(ROLLING, f"{prefix.rstrip('/')}/{ROLLING}")
     return topics
+
+
+def _check_distinct(topic: str, outputs: Mapping[str, str], namespace: str) -> None:
+    """Refuse outputs on one topic, and one on that of the clouds: the node would answer itself. Raises OptionError."""
+    full = [name if name.startswith("/") else f"{namespace}/{name}" for name in (topic, *outputs.values())]
+    if twice := sorted({name for name in full if full.count(name) > 1}):
+        raise OptionError(
+            f"the clouds and the outputs share the topic {', '.join(twice)}; expected one for each: another prefix, or "
+            "NAME=TOPIC"
+        )

@@ -14,6 +14,7 @@ from ..types.choices import STATIC, VEHICLES
 from ..types.geometry import draw_footprints, wrapped
 from ..types.perception import Box
 from ..types.points import Bytes, Floats, Ints, Labels, Points
+from ..types.rigid import rigid
 from ..types.sensor import ScanPattern, SensorProfile, get_sensor
 from ..types.views import TopViewGeometry
 from .raycast import (
@@ -260,12 +261,12 @@ def simulate(
     Raises
     ------
     PointsError
-        ``T_world_sensor`` is not a finite (4, 4) matrix.
+        ``T_world_sensor`` is not a rotation and a translation.
     """
     profile = get_sensor(sensor)
-    pose = sensor_pose(scene, profile) if T_world_sensor is None else np.array(T_world_sensor, dtype=np.float64)
-    if pose.shape != (4, 4) or not np.isfinite(pose).all():
-        raise PointsError(f"T_world_sensor has shape {pose.shape}; expected a finite (4, 4) matrix")
+    pose = sensor_pose(scene, profile)
+    if T_world_sensor is not None:
+        pose = rigid("T_world_sensor", T_world_sensor, PointsError)
     rng = np.random.default_rng((int(seed) & 0x7FFFFFFFFFFFFFFF, 7919))
     if profile.pattern is None:
         n_beams, n_columns = profile.n_beams, profile.columns

@@ -157,7 +157,8 @@ def test_a_file_of_kitti(tmp_path: Path) -> None:
     np.testing.assert_allclose([u, v, depth], [x / z, y / z, z], rtol=1e-9)
     # The files of the odometry data have the product of both matrices.
     (tmp_path / "calib.txt").write_text(
-        f"{KITTI.splitlines()[1]}\nTr: {' '.join(str(each) for each in T[:3].ravel().tolist())}\n"
+        f"{KITTI.splitlines()[1]}\nTr: {' '.join(str(each) for each in T[:3].ravel().tolist())}\n",
+        "utf-8-sig",  # as editors of Windows write it
     )
     np.testing.assert_allclose(
         Calibration.from_kitti(tmp_path / "calib.txt", 1242, 375).T_camera_sensor, made.T_camera_sensor

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import pytest
@@ -28,7 +29,6 @@ from edgeperc.simulation.raycast import (
     Hits,
     Rays,
     Receiver,
-    Shapes,
     ground_at,
 )
 from edgeperc.simulation.roadside import add_cafe
@@ -40,6 +40,7 @@ from edgeperc.simulation.scene import (
     Scene,
     SceneObject,
     SimulatedScan,
+    place_shapes,
     sensor_pose,
     simulate,
     simulate_sequence,
@@ -93,30 +94,16 @@ def in_box(points: np.ndarray, each: Box, grown: float) -> np.ndarray:
     return np.all(np.abs(local) <= np.array(each.size) / 2 + grown, axis=1)
 
 
-def placed_primitives(scene: Scene, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Primitives of a scene in the sensor frame, nearest first, and their bounds."""
-    placed = raycast.placed(scene.primitives, poses_of(scene), pose)
-    bounds = np.empty((len(placed), 5))
-    raycast.fill_bounds(placed, bounds)
-    order = np.argsort(bounds[:, 4], kind="stable")
-    return placed[order].copy(), bounds[order].copy()
-
-
-def poses_of(scene: Scene) -> np.ndarray:
-    return np.array([(*o.center[:2], o.center[2] - o.size[2] / 2, o.yaw) for o in scene.objects]).reshape(-1, 4)
-
-
 KEY = np.uint64(99)
 
 
-def cast(scene: Scene, pose: np.ndarray, rays: Rays) -> tuple[np.ndarray, Hits]:
+def cast(scene: Scene, pose: np.ndarray, rays: Rays, n_sectors: int = 0) -> tuple[np.ndarray, Hits]:
     """Primitives in the sensor frame, nearest first; what the rays hit."""
-    placed, bounds = placed_primitives(scene, pose)
-    shapes = Shapes(placed, bounds, *raycast.columns_of(bounds, len(rays.azimuths), rays.reach))
+    shapes = place_shapes(scene, pose, n_sectors or len(rays.azimuths), rays.reach)
     shape = (len(rays.elevations), len(rays.azimuths))
     hits = Hits(np.empty(shape), np.empty(shape, np.int32), np.empty(shape), np.empty(shape))
     raycast.fill_cast(shapes, scene.ground, pose, rays, hits)
-    return placed, hits
+    return shapes.primitives, hits
 
 
 def near_scene(seed: int, environment: str | None = None) -> Scene:
@@ -201,7 +188,7 @@ def test_placing_is_its_twin(n: int) -> None:
 def test_bounds_and_columns_are_their_twins() -> None:
     scene = near_scene(4, "urban")
     pose = sensor_pose(scene, SMALL, yaw=0.3, pitch=0.02, roll=0.01)
-    placed, _ = placed_primitives(scene, pose)
+    placed = place_shapes(scene, pose, 1, 80.0).primitives
     around = np.array(block(0, 0.4, (0.1, 0.2, 0.0), (2.0, 2.0, 2.0)))  # the sensor stands in it
     placed = np.vstack([placed[::4], around, np.full(20, np.nan)])
     for primitives in (placed, placed[:1], placed[:0]):
@@ -482,8 +469,8 @@ def test_poses_move_points_and_boxes_alike() -> None:
     np.testing.assert_allclose(world[scan.objects < 0, 2], 0.0, atol=5e-3)
 
 
-@pytest.mark.parametrize("pose", [np.eye(3), np.full((4, 4), np.nan), np.zeros(4)])
-def test_a_pose_that_is_none_is_refused(pose: np.ndarray) -> None:
+@pytest.mark.parametrize("pose", [np.eye(3), np.full((4, 4), np.nan), np.diag([2.0, 2.0, 2.0, 1.0]), "here"])
+def test_a_pose_that_is_none_is_refused(pose: Any) -> None:
     with pytest.raises(PointsError, match="T_world_sensor"):
         simulate(street(), SMALL, 0, pose)
 
@@ -773,11 +760,8 @@ def test_rays_of_their_own_elevations_are_cast_as_by_the_twins(seed: int, n: int
     rng = np.random.default_rng(seed)
     pose = sensor_pose(scene, SMALL, 1.0, 0.3, yaw=0.2)
     rays = Rays(rng.uniform(-0.4, 0.2, (1, n)), np.sort(rng.uniform(0.0, 2 * np.pi, n)), 40.0, KEY)
-    placed, bounds = placed_primitives(scene, pose)
     for n_sectors in (1, 36):
-        shapes = Shapes(placed, bounds, *raycast.columns_of(bounds, n_sectors, rays.reach))
-        hits = Hits(np.empty((1, n)), np.empty((1, n), np.int32), np.empty((1, n)), np.empty((1, n)))
-        raycast.fill_cast(shapes, scene.ground, pose, rays, hits)
+        placed, hits = cast(scene, pose, rays, n_sectors)
         slow_ranges, slow_hits = twins.simulation.cast(placed, scene, pose, *rays)
         sure = (slow_ranges < 18.0) & (np.abs(hits.ranges - slow_ranges) < 0.5)
         np.testing.assert_array_equal(hits.rows[sure], slow_hits[sure])
