@@ -66,7 +66,7 @@ def outline_of(
     if not rings:
         return Outline(np.empty((0, 2), np.int64), (), 1.0)
 
-    outer = int(np.argmax([_area(ring) for ring in rings]))  # the only ring with a positive area
+    outer = _outer(rings)
     added = addable | closed
     found = _needed(rings, row_sums(added), row_sums(beside), outer, 3)
     factor = 1.0
@@ -87,7 +87,7 @@ def outline_of(
             if len(found[outer]) > max_corners:  # a ring without holes loses any corners; these are in the way
                 behind = np.logical_or.accumulate((filled(smooth) & ~smooth)[::-1])[::-1]
                 rings = rings_of(without_gaps(smooth & ~behind, np.zeros_like(smooth), place, ~smooth))
-                outer = int(np.argmax([_area(ring) for ring in rings]))
+                outer = _outer(rings)
                 found = _needed(rings, row_sums(added), anywhere, outer, max_corners)
     found = [ring - 1 for ring in found]
     return Outline(found[outer], tuple(ring for k, ring in enumerate(found) if k != outer), factor)
@@ -147,14 +147,14 @@ def rings_of(cells: Mask) -> list[Ints64]:
 def _needed(rings: list[Ints64], not_addable: Ints, not_removable: Ints, outer: int, enough: int) -> list[Ints64]:
     """The rings with the corners that `mark_needed` keeps."""
     corners, ends = np.concatenate(rings), np.cumsum([len(ring) for ring in rings], dtype=np.int64)
-    kept = np.ones(len(corners), np.bool_)
+    kept = np.empty(len(corners), np.bool_)
     mark_needed(corners, ends, not_addable, not_removable, outer, enough, kept)
     return [ring[few] for ring, few in zip(rings, np.split(kept, ends[:-1]), strict=True)]
 
 
-def _area(ring: Ints64) -> int:
-    row, col = ring.T
-    return int(row @ np.roll(col, -1) - col @ np.roll(row, -1))
+def _outer(rings: list[Ints64]) -> int:
+    """Which of the rings has a positive area: only the outer one."""
+    return int(np.argmax([row @ np.roll(col, -1) - col @ np.roll(row, -1) for row, col in (r.T for r in rings)]))
 
 
 def row_sums(cells: Mask) -> Ints:
@@ -259,9 +259,7 @@ def fill_rings(cells: Mask, corners: Ints64, ends: Ints64) -> int:
             if not cells[top, left] or cells[top + 1, left] or walked[top, left]:
                 continue
             row, col, heading = top + 1, left, 0  # to the right along the lower side of the cell
-            begun = False
-            while not begun or row != top + 1 or col != left or heading != 0:
-                begun = True
+            while True:
                 if heading == 0:
                     walked[row - 1, col] = True
                     col += 1
@@ -280,6 +278,8 @@ def fill_rings(cells: Mask, corners: Ints64, ends: Ints64) -> int:
                     corners[n_corners, 0], corners[n_corners, 1] = row, col
                     n_corners += 1
                     heading = (heading + turn) % 4
+                if row == top + 1 and col == left and heading == 0:
+                    break
             ends[n_rings] = n_corners
             n_rings += 1
     return n_rings
@@ -441,26 +441,15 @@ def mark_needed(
     n = corners.shape[0]
     before, after, ring_of = np.empty(n, np.int64), np.empty(n, np.int64), np.empty(n, np.int64)
     size = np.empty(ends.shape[0], np.int64)
-    size[:] = 0
     largest = 1
     begin = 0
     for ring in range(ends.shape[0]):
-        last = -1
-        first = -1
+        size[ring] = ends[ring] - begin
         for k in range(begin, ends[ring]):
-            if not kept[k]:
-                continue
-            ring_of[k] = ring
-            size[ring] += 1
-            if last < 0:
-                first = k
-            else:
-                before[k], after[last] = last, k
-            last = k
-        before[first], after[last] = last, first
+            kept[k], ring_of[k], before[k], after[k] = True, ring, k - 1, k + 1
+            largest = max(largest, 2 * (corners[k, 0] + 2) * (corners[k, 1] + 2))
+        before[begin], after[ends[ring] - 1] = ends[ring] - 1, begin
         begin = ends[ring]
-    for k in range(n):
-        largest = max(largest, 2 * (corners[k, 0] + 2) * (corners[k, 1] + 2))
 
     limit = 0  # of twice the area of a triangle
     while limit <= 2 * largest:
@@ -473,16 +462,16 @@ def mark_needed(
             a, c = before[k], after[k]
             ar, ac, br, bc = corners[a, 0], corners[a, 1], corners[k, 0], corners[k, 1]
             cr, cc = corners[c, 0], corners[c, 1]
-            twice = (br - ar) * (cc - ac) - (bc - ac) * (cr - ar)  # positive: the region is inside the corner
+            twice = turn(ar, ac, br, bc, cr, cc)  # positive: the region is inside the corner
             if abs(twice) > limit:
                 continue
             if size[ring_of[k]] == 4:  # the three corners that stay must not lie on a line
                 d = after[c]
-                if (cr - ar) * (corners[d, 1] - ac) == (cc - ac) * (corners[d, 0] - ar):
+                if turn(ar, ac, cr, cc, corners[d, 0], corners[d, 1]) == 0:
                     continue
-            allowed = twice == 0 or may_change(ar, ac, br, bc, cr, cc, not_removable if twice > 0 else not_addable)
-            if not allowed:
+            if twice != 0 and not may_change(ar, ac, br, bc, cr, cc, not_removable if twice > 0 else not_addable):
                 continue
+            allowed = True
             low_r, high_r, low_c, high_c = min(ar, br, cr), max(ar, br, cr), min(ac, bc, cc), max(ac, bc, cc)
             sign = 1 if twice > 0 else -1
             for v in range(n):
@@ -492,9 +481,9 @@ def mark_needed(
                 if v in (a, k, c):
                     continue
                 if (
-                    sign * ((br - ar) * (vc - ac) - (bc - ac) * (vr - ar)) >= 0
-                    and sign * ((cr - br) * (vc - bc) - (cc - bc) * (vr - br)) >= 0
-                    and sign * ((ar - cr) * (vc - cc) - (ac - cc) * (vr - cr)) >= 0
+                    sign * turn(ar, ac, br, bc, vr, vc) >= 0
+                    and sign * turn(br, bc, cr, cc, vr, vc) >= 0
+                    and sign * turn(cr, cc, ar, ac, vr, vc) >= 0
                 ):
                     allowed = False
                     break

@@ -212,18 +212,13 @@ class RollingGrid:
         """Move the window to another corner; what comes into it is unknown."""
         dx, dy = x - self._corner[0], y - self._corner[1]
         self._corner = x, y
-        n = len(self._kind)
         if not (dx or dy):
-            return
-        if abs(dx) >= n or abs(dy) >= n:
-            self._forget(np.ones((n, n), np.bool_))
             return
         for array in (self._kind, self._seen_s, self._fleeting):
             array[:] = np.roll(array, (-dy, -dx), (0, 1))
-        new = np.zeros((n, n), np.bool_)
-        new[n - dy if dy > 0 else 0 : n if dy > 0 else -dy] = True
-        new[:, n - dx if dx > 0 else 0 : n if dx > 0 else -dx] = True
-        self._forget(new)
+        n = len(self._kind)
+        was_in = [(np.arange(n) + d >= 0) & (np.arange(n) + d < n) for d in (dy, dx)]
+        self._forget(~(was_in[0][:, None] & was_in[1]))
 
     def _observe(self, kinds: Bytes, fleeting: Mask, to_odom: Floats, stamp_s: float) -> None:
         """Write what a scan shows of its own cells into those of the window."""

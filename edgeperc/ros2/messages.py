@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import uuid
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -276,13 +276,10 @@ class RosMessages:
         """The grid of `edgeperc.occupancy_grid`: a nav_msgs/OccupancyGrid, 0 drivable, 100 obstacle, -1 unknown."""
         grid = occupancy_grid(scan.perception, scan.points, cell_m=self._cell_m, sensor=scan.sensor)
         fields = grid.to_occupancy_grid(off_road=self._off_road)
-        header = self._header(scan, stamp_ns, self.grid_frame_id)
-        if self.grid_frame_id is None:
-            placed = fields["info"]["origin"]
-            pose = self._pose(center=[*placed["position"].values()], turned=tuple(placed["orientation"].values()))
-        else:
+        pose = None
+        if self.grid_frame_id is not None:
             pose = self._pose(center=(grid.x_range_m[0], grid.y_range_m[0], 0.0))
-        return self._grid(header, fields, pose)
+        return self._grid(self._header(scan, stamp_ns, self.grid_frame_id), fields, pose)
 
     def rolling(self, grid: RollingGrid, frame_id: str, stamp_ns: int) -> Any:
         """A grid with memory: a nav_msgs/OccupancyGrid in the frame of the odometry.
@@ -296,15 +293,14 @@ class RosMessages:
             Stamp of the header [ns].
         """
         fields = grid.to_occupancy_grid(frame_id, self._off_road)
-        center = [*fields["info"]["origin"]["position"].values()]
-        return self._grid(self._header(None, stamp_ns, frame_id), fields, self._pose(center=center))
+        return self._grid(self._header(None, stamp_ns, frame_id), fields)
 
-    def _grid(self, header: Any, fields: Mapping[str, Any], origin: Any) -> Any:
+    def _grid(self, header: Any, fields: Mapping[str, Any], pose: Any = None) -> Any:
+        """A grid; ``pose`` of its origin is by default that of the fields."""
+        at = fields["info"]["origin"]
+        pose = pose or self._pose(center=at["position"].values(), turned=at["orientation"].values())
         info = self._make(
-            "nav_msgs/msg/MapMetaData",
-            map_load_time=header.stamp,
-            **{name: fields["info"][name] for name in ("resolution", "width", "height")},
-            origin=origin,
+            "nav_msgs/msg/MapMetaData", **{**fields["info"], "map_load_time": header.stamp, "origin": pose}
         )
         return self._make("nav_msgs/msg/OccupancyGrid", header=header, info=info, data=fields["data"])
 
@@ -580,7 +576,7 @@ class RosMessages:
         box: Box | None = None,
         *,
         center: Any = (0.0, 0.0, 0.0),
-        turned: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.0),
+        turned: Iterable[float] = (0.0, 0.0, 0.0, 1.0),
     ) -> Any:
         if box is not None:
             center, turned = box.center, (0.0, 0.0, math.sin(box.yaw / 2.0), math.cos(box.yaw / 2.0))

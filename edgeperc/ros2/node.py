@@ -187,23 +187,20 @@ class PerceptionNode:
             There is no such transition from the present state; or a topic's name is not valid, or its package missing.
         """
         with self._changing:
-            return self._changed(transition)
-
-    def _changed(self, transition: str) -> State:
-        known = TRANSITIONS.get(transition)
-        if known is None or self._state not in known[0]:
-            possible = [name for name, (before, _) in TRANSITIONS.items() if self._state in before]
-            raise OptionError(
-                f"the transition {transition!r} does not begin at {self._state}; expected one of {', '.join(possible)}"
-            )
-        if transition == "configure":
-            self._connect()
-        elif transition == "cleanup":
-            self._perceiver, self._newest, self._error, self._forgets = None, None, None, True
-        self._state = known[1]
-        if transition == "shutdown":
-            self._waiting.put(None)
-        return self._state
+            possible = {name: after for name, (before, after) in TRANSITIONS.items() if self._state in before}
+            if transition not in possible:
+                raise OptionError(
+                    f"the transition {transition!r} does not begin at {self._state}; expected one of "
+                    f"{', '.join(possible)}"
+                )
+            if transition == "configure":
+                self._connect()
+            elif transition == "cleanup":
+                self._perceiver, self._newest, self._error, self._forgets = None, None, None, True
+            self._state = possible[transition]
+            if transition == "shutdown":
+                self._waiting.put(None)
+            return self._state
 
     def _connect(self) -> None:
         """Advertise and subscribe, once."""
@@ -215,7 +212,7 @@ class PerceptionNode:
             except OptionError as exc:
                 if name != "detections":
                     raise
-                warnings.warn(f"no detections are published: {exc}", stacklevel=5)
+                warnings.warn(f"no detections are published: {exc}", stacklevel=4)
         if self._rolling is not None:
             self._graph.subscribe(self._rolling.topic, ODOMETRY, self._poses.receive)
         self._graph.subscribe(self._topic, CLOUD, self._receive)
