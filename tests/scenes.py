@@ -32,6 +32,17 @@ def box(
     return Box(label, score, (float(x), float(y), z), size, float(yaw))
 
 
+def rotation_of(x: float, y: float, z: float, w: float) -> NDArray[np.float64]:
+    """Matrix of a unit quaternion."""
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
 @functools.cache
 def urban(seed: int, sensor: str | SensorProfile = "hdl-64e") -> SimulatedScan:
     """A street of a town."""

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from arm import __main__ as program
 from arm import answers
 from arm.compare import COLUMNS, MAX_UNLIKE, compare, read, unlike_boxes, unlike_values
 from arm.environment import CPUS, cpuinfo
@@ -119,6 +120,10 @@ def test_answers_of_one_computer_agree_and_changed_ones_do_not(tmp_path: Path) -
     empty: Any = {}, {"boxes": {}, "auto": auto}
     assert len(compare("x", seen, empty, "scans", auto)[1]) == 6
     assert len(compare("x", empty, empty, "scans", auto)[1]) == 6  # nothing was compared
+
+
+def test_the_tests_that_run_on_arm_are_there() -> None:
+    assert [path for path in program.TESTS if not path.is_file()] == []
 
 
 def test_without_qemu_it_is_skipped_with_the_line_that_installs_it(tmp_path: Path) -> None:

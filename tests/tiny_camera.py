@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import hashlib
+import struct
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +15,7 @@ from edgeperc.inference.session import golden_input
 from edgeperc.types.card import Golden, InputSpec, ModelCard, OutputSpec
 from edgeperc.types.views import CameraGeometry
 
-__all__ = ["CLASSES", "camera_card", "camera_model", "write_camera"]
+__all__ = ["CLASSES", "PNG", "camera_card", "camera_model", "png_chunk", "png_file", "write_camera"]
 
 CLASSES = ("Sky", "Road", "Tree")
 # A pixel is road if it is red, a tree if it is green, sky if it is blue.
@@ -63,3 +65,16 @@ def write_camera(folder: Path) -> Path:
     path = folder / "tinycam.onnx"
     path.write_bytes(camera_model())
     return path
+
+
+PNG = b"\x89PNG\r\n\x1a\n"
+
+
+def png_chunk(kind: bytes, content: bytes) -> bytes:
+    return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
+
+
+def png_file(width: int, height: int, depth: int, color: int, rows: bytes) -> bytes:
+    """A PNG file made by hand, for what Pillow does not write."""
+    header = png_chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, depth, color, 0, 0, 0))
+    return PNG + header + png_chunk(b"IDAT", zlib.compress(rows)) + png_chunk(b"IEND", b"")

@@ -22,10 +22,15 @@ from .environment import CPUS, ONE_THREAD, REPOSITORY, Environment, missing_tool
 FIRST_SEED = 5 * 10**9  # no other part of the project uses these seeds
 PERCEIVED_ON = "neoverse-n1"
 # Tests of the kernels behind a perception, which compare them with their slow twins.
-TESTS = (
-    *("adapt", "agreement", "blocks", "cluster", "decode", "drivable", "geometry", "ground", "level", "observed"),
-    *("outline", "projection", "refine", "sensor"),
-)
+TESTS = [
+    Path(__file__).resolve().parent.parent / folder / f"test_{name}.py"
+    for folder, names in (
+        ("agreement", "rules"), ("ground", "leveling observed planes"), ("inference", "blocks decode projection"),
+        ("objects", "cluster refine"), ("preprocess", "condition"), ("road", "ahead outline"),
+        ("types", "geometry sensor"),
+    )
+    for name in names.split()
+]  # fmt: skip
 
 
 def main() -> int:
@@ -76,9 +81,8 @@ def main() -> int:
             more, wrong = compare(cpu, read(inputs if kind == "networks" else here), read(target), kind, auto)
             rows, faults = rows + more, faults + wrong
     if not arguments.no_tests:
-        tests = [str(REPOSITORY / f"tests/test_{name}.py") for name in TESTS]
-        started = cpu_s()
-        if environment.run(PERCEIVED_ON, ["-m", "pytest", "-q", "-p", "no:cacheprovider", "-m", "kernel", *tests]):
+        started, pytest = cpu_s(), ["-m", "pytest", "-q", "-p", "no:cacheprovider", "-m", "kernel"]
+        if environment.run(PERCEIVED_ON, [*pytest, *map(str, TESTS)]):
             faults.append("tests failed")
         print(f"{PERCEIVED_ON}, tests: {cpu_s() - started:.0f} s of one core", flush=True)
     print(table(rows))

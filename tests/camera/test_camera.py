@@ -6,10 +6,8 @@ import concurrent.futures
 import io
 import json
 import os
-import struct
 import subprocess
 import sys
-import zlib
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -18,6 +16,7 @@ import numpy as np
 import pytest
 import tiny_camera
 from numpy.typing import NDArray
+from tiny_camera import png_file
 
 import edgeperc
 from edgeperc import (
@@ -58,16 +57,16 @@ def image() -> NDArray[np.uint8]:
 
 def test_each_pixel_has_a_class(perceive: Perceiver, image: NDArray[np.uint8]) -> None:
     perception = perceive(image=image, stamp_s=3.5)
-    assert perception.image is not None
-    assert perception.image.labels.shape == (48, 64)
-    assert perception.image.labels.dtype == np.uint8
-    assert perception.image.classes == ("Sky", "Road", "Tree")
-    np.testing.assert_array_equal(perception.image.labels[:20], 0)
-    np.testing.assert_array_equal(perception.image.labels[28:, :44], 1)
-    np.testing.assert_array_equal(perception.image.labels[28:, 52:], 2)
-    np.testing.assert_array_equal(perception.image.drivable, perception.image.labels == 1)
-    assert perception.image.drivable_share == pytest.approx(24 * 48 / (48 * 64), abs=0.02)
-    assert sum(perception.image.counts().values()) == 48 * 64
+    found = perception.require_image()
+    assert found.labels.shape == (48, 64)
+    assert found.labels.dtype == np.uint8
+    assert found.classes == ("Sky", "Road", "Tree")
+    np.testing.assert_array_equal(found.labels[:20], 0)
+    np.testing.assert_array_equal(found.labels[28:, :44], 1)
+    np.testing.assert_array_equal(found.labels[28:, 52:], 2)
+    np.testing.assert_array_equal(found.drivable, found.labels == 1)
+    assert found.drivable_share == pytest.approx(24 * 48 / (48 * 64), abs=0.02)
+    assert sum(found.counts().values()) == 48 * 64
     assert (perception.points, perception.top_view, perception.boxes) == (None, None, ())
     assert (perception.n_points, perception.stamp_s, perception.fitness) == (0, 3.5, ())
     assert perception.providers == {"tinycam": "tinycam fp32, CPUExecutionProvider"}
@@ -77,8 +76,7 @@ def test_each_pixel_has_a_class(perceive: Perceiver, image: NDArray[np.uint8]) -
 
 def test_a_perception_of_an_image_is_written_as_json(perceive: Perceiver, image: NDArray[np.uint8]) -> None:
     record = json.loads(json.dumps(perceive(image=image).to_dict(), allow_nan=False))
-    labels = perceive(image=image).image
-    assert labels is not None
+    labels = perceive(image=image).require_image()
     assert record["image"] == {
         "width": 64,
         "height": 48,
@@ -101,37 +99,32 @@ def test_pixels_are_counted_in_parts() -> None:
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 900), (24, 32), (25, 31), (700, 1)])
 def test_any_size_of_image(perceive: Perceiver, size: tuple[int, int]) -> None:
-    found = perceive(image=np.broadcast_to(np.uint8(RED), (*size, 3))).image
-    assert found is not None
+    found = perceive(image=np.broadcast_to(np.uint8(RED), (*size, 3))).require_image()
     np.testing.assert_array_equal(found.labels, np.ones(size, np.uint8))
 
 
 def test_a_gigantic_image(perceive: Perceiver) -> None:
     """As large as is allowed along an edge; one pixel more is refused before anything is allocated."""
-    found = perceive(image=np.broadcast_to(np.uint8(GREEN), (64, MAX_EDGE, 3))).image
-    assert found is not None
+    found = perceive(image=np.broadcast_to(np.uint8(GREEN), (64, MAX_EDGE, 3))).require_image()
     assert (found.labels == 2).all()
     with pytest.raises(ImageError, match="Scale it down"):
         perceive(image=np.broadcast_to(np.uint8(GREEN), (MAX_EDGE, MAX_EDGE, 3)))
 
 
 def test_results_own_their_arrays(perceive: Perceiver, image: NDArray[np.uint8]) -> None:
-    first = perceive(image=image).image
-    assert first is not None
+    first = perceive(image=image).require_image()
     kept = first.labels.copy()
     perceive(image=255 - image)
     np.testing.assert_array_equal(first.labels, kept)
 
 
 def test_memory_layout_does_not_matter(perceive: Perceiver, image: NDArray[np.uint8]) -> None:
-    known = perceive(image=image).image
-    assert known is not None
+    known = perceive(image=image).require_image()
     frozen = image.copy()
     frozen.flags.writeable = False
     others: list[Any] = [np.asfortranarray(image), frozen, image[:, :, ::-1][:, :, ::-1], memoryview(image)]
     for other in others:
-        found = perceive(image=other).image
-        assert found is not None
+        found = perceive(image=other).require_image()
         np.testing.assert_array_equal(found.labels, known.labels)
 
 
@@ -139,9 +132,7 @@ def test_one_perceiver_in_threads_gives_the_same_result(perceive: Perceiver, ima
     images = [image, image[::-1], image[:, ::-1], image[::2, ::2]]
 
     def labels(k: int) -> bytes:
-        found = perceive(image=images[k % 4]).image
-        assert found is not None
-        return found.labels.tobytes()
+        return perceive(image=images[k % 4]).require_image().labels.tobytes()
 
     known = [labels(k) for k in range(4)]
     with concurrent.futures.ThreadPoolExecutor(4) as pool:
@@ -220,10 +211,8 @@ def test_the_card_decides_the_order_of_colors(tmp_path: Path, image: NDArray[np.
     turned = replace(card, name="bgr", input=replace(card.input, channels=("blue", "green", "red")))
     path = tmp_path / "bgr.onnx"
     path.write_bytes(tiny_camera.camera_model(turned))
-    found, known = Perceiver(path, provider="cpu")(image=image[:, :, ::-1]).image, perceive(image=image).image
-    assert found is not None
-    assert known is not None
-    np.testing.assert_array_equal(found.labels, known.labels)
+    found, known = Perceiver(path, provider="cpu")(image=image[:, :, ::-1]), perceive(image=image)
+    np.testing.assert_array_equal(found.require_image().labels, known.require_image().labels)
 
 
 @pytest.mark.skipif(os.name != "posix", reason="forks")
@@ -254,16 +243,6 @@ def saved(image: Any, kind: str, **options: Any) -> bytes:
     stream = io.BytesIO()
     image.save(stream, kind, **options)
     return stream.getvalue()
-
-
-def png(width: int, height: int, depth: int, color: int, rows: bytes) -> bytes:
-    """A PNG file made by hand, for what Pillow does not write."""
-
-    def chunk(kind: bytes, content: bytes) -> bytes:
-        return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
-
-    header = chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, depth, color, 0, 0, 0))
-    return b"\x89PNG\r\n\x1a\n" + header + chunk(b"IDAT", zlib.compress(rows)) + chunk(b"IEND", b"")
 
 
 @pytest.mark.parametrize("kind", ["PNG", "BMP", "PPM", "JPEG", "WEBP"])
@@ -323,17 +302,17 @@ def test_files_that_are_not_images(tmp_path: Path, image: NDArray[np.uint8]) -> 
         "gif": (saved(picture.quantize(8), "GIF"), "another format than BMP"),
         "postscript": (b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 9 9\n%%EndComments\n", "another format than BMP"),
         "16 bits of gray": (saved(pillow.fromarray(np.zeros((4, 5), np.uint16)), "PNG"), "more than 8 bits a channel"),
-        "16 bits of color": (png(5, 4, 16, 2, rows), "more than 8 bits a channel"),
+        "16 bits of color": (png_file(5, 4, 16, 2, rows), "more than 8 bits a channel"),
         "16 bits of color as PPM": (b"P6\n2 1\n65535\n" + bytes(12), "more than 8 bits a channel"),
         "12 bits of color as text": (b"P3\n1 1\n4095\n0 900 4095\n", "more than 8 bits a channel"),
         "bits": (saved(picture.convert("1"), "PNG"), "of mode 1; expected colors"),
         "cmyk": (saved(picture.convert("CMYK"), "JPEG"), "of mode CMYK; expected colors"),
         "tiff": (saved(picture, "TIFF"), "another format than BMP"),
         "two": (saved(picture, "PNG", save_all=True, append_images=[picture.rotate(9)]), "the file holds 2 images"),
-        "gigantic": (png(9000, 9000, 8, 2, b""), "9000 x 9000; expected at most 67,108,864 pixels"),
-        "more than Pillow opens": (png(60_000, 60_000, 8, 2, b""), "3600000000 pixels"),
-        "long": (png(MAX_EDGE + 1, 1, 8, 2, b""), "expected at most 67,108,864 pixels and 32,768 along an edge"),
-        "no pixels": (png(0, 5, 8, 2, b""), "cannot be read"),
+        "gigantic": (png_file(9000, 9000, 8, 2, b""), "9000 x 9000; expected at most 67,108,864 pixels"),
+        "more than Pillow opens": (png_file(60_000, 60_000, 8, 2, b""), "3600000000 pixels"),
+        "long": (png_file(MAX_EDGE + 1, 1, 8, 2, b""), "expected at most 67,108,864 pixels and 32,768 along an edge"),
+        "no pixels": (png_file(0, 5, 8, 2, b""), "cannot be read"),
     }
     for name, (content, message) in files.items():
         path = tmp_path / name

@@ -26,6 +26,7 @@ from edgeperc.camera.image import (
 )
 from edgeperc.errors import CardMismatchError, ImageError, InferenceError
 from edgeperc.types.card import InputSpec
+from edgeperc.types.points import read_only
 from edgeperc.types.views import CameraGeometry
 
 SPEC = InputSpec("x", ("red", "green", "blue"), (120.0, 110.0, 100.0), (60.0, 61.0, 62.0))
@@ -239,15 +240,9 @@ def test_logits_that_are_not_finite_are_an_error(value: float) -> None:
     logits = logits_of(3, 4, 5, "noise")
     logits[1, 2, 3] = logits[2, 0, 0] = value
     tables = (*between(4, 8), *between(5, 10))
-    assert fill_image_labels(as_read_only(logits), *tables, np.empty((8, 10), np.uint8)) == 2
+    assert fill_image_labels(read_only(logits), *tables, np.empty((8, 10), np.uint8)) == 2
     with pytest.raises(InferenceError, match="m: 2 of 60 values of camera_logits are not finite"):
         label_pixels(logits, 8, 10, model="m")
-
-
-def as_read_only(array: NDArray[np.float32]) -> NDArray[np.float32]:
-    view = array.view()
-    view.flags.writeable = False
-    return view
 
 
 @pytest.mark.parametrize("shape", [(4, 5), (1, 3, 4, 5), (0, 4, 5), (3, 0, 5), (256, 1, 1)])

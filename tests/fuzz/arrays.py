@@ -81,26 +81,10 @@ def other_shape(scan: Points, case: Case) -> Points:
 
 def other_dtype(scan: Points, case: Case) -> Points:
     kinds = [
-        "f2",
-        "f8",
-        "f4",
-        "i1",
-        "i2",
-        "i4",
-        "i8",
-        "u1",
-        "u2",
-        "u4",
-        "u8",
-        ">f4",
-        ">f8",
-        ">i2",
-        "?",
-        "c8",
-        "O",
-        "U8",
-    ]
-    kind = case.pick([*kinds, "M8[s]", "g", "S4", "V4"])
+        "f2", "f8", "f4", "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8", ">f4", ">f8", ">i2", "?", "c8", "O", "U8",
+        "M8[s]", "g", "S4", "V4",
+    ]  # fmt: skip
+    kind = case.pick(kinds)
     try:
         return scan.astype(kind)
     except (TypeError, ValueError):

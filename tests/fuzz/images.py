@@ -16,6 +16,7 @@ from unittest import mock
 import numpy as np
 import tiny_camera
 from numpy.typing import NDArray
+from tiny_camera import PNG, png_chunk, png_file
 
 import edgeperc.perceiver as perceiver_module
 from edgeperc import Perceiver, Perception
@@ -136,15 +137,6 @@ def check_image(perception: Perception, height: int, width: int, n_classes: int)
     json.dumps(perception.to_dict(), allow_nan=False)
 
 
-def png_chunk(kind: bytes, content: bytes) -> bytes:
-    return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
-
-
-def png_file(width: int, height: int, color: int, rows: bytes) -> bytes:
-    header = png_chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, 8, color, 0, 0, 0))
-    return b"\x89PNG\r\n\x1a\n" + header + png_chunk(b"IDAT", zlib.compress(rows)) + png_chunk(b"IEND", b"")
-
-
 class Images:
     """The kind ``images``."""
 
@@ -162,7 +154,7 @@ class Images:
         if importlib.util.find_spec("PIL"):
             ways += [(10, self.file_bytes), (6, self.png_header), (2, self.data_set), (3, self.whole_file)]
             self.files = list(self._files())
-            self.labels = png_file(31, 20, 0, bytes(20 * 32))
+            self.labels = png_file(31, 20, 8, 0, bytes(20 * 32))
         self.ways = [way for weight, way in ways for _ in range(weight)]
 
     def _files(self) -> Any:
@@ -244,7 +236,7 @@ class Images:
             struct.pack(">I", 2**31) + b"IDAT",
         ]  # fmt: skip
         picked = b"".join(case.pick(chunks) for _ in range(int(rng.integers(1, 6))))
-        return self.read(case, b"\x89PNG\r\n\x1a\n" + png_chunk(b"IHDR", header) + picked + png_chunk(b"IEND", b""))
+        return self.read(case, PNG + png_chunk(b"IHDR", header) + picked + png_chunk(b"IEND", b""))
 
     def data_set(self, case: Case) -> str:
         root = case.folder / "set"

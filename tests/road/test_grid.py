@@ -20,6 +20,7 @@ from edgeperc import Box, Mounting, OccupancyGrid, OptionError, Perception, Poin
 from edgeperc.road.grid import fill_standing
 from edgeperc.types.frame import ModelFrame
 from edgeperc.types.mounting import MODEL_MOUNTING
+from scenes import rotation_of
 
 NUMBERS = st.one_of(st.floats(-3, 3, width=32), st.sampled_from([math.nan, math.inf, -math.inf]))
 
@@ -196,13 +197,6 @@ def test_the_message_lies_in_the_frame_of_the_scan(mounting: Mounting) -> None:
     height_m = np.zeros((60, 40), np.float32)
     grid = OccupancyGrid(empty, empty, height_m, ~empty, 0.5, (0.0, 30.0), (-10.0, 10.0), mounting=mounting)
     origin = grid.to_occupancy_grid("lidar")["info"]["origin"]
-    x, y, z, w = (origin["orientation"][axis] for axis in "xyzw")
-    R = np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    R = rotation_of(**origin["orientation"])
     corner = np.array([origin["position"][axis] for axis in "xyz"])
     np.testing.assert_allclose(R.T @ (place - corner), [20.05, 16.05, 0.73], atol=1e-9)  # column, row and height

@@ -41,6 +41,7 @@ from edgeperc.records import PerceivedScan
 from edgeperc.ros2.messages import CLOUD, OUTPUTS, RosMessages, nanoseconds
 from edgeperc.sinks.rosbag import TOPICS, BagSink
 from edgeperc.types.sensor import get_sensor
+from scenes import rotation_of
 
 # Published hashes: what ROS 2 Kilted's own packages answer (Node.get_publishers_info_by_topic of rclpy 9.1.2).
 HASHES = {
@@ -116,16 +117,9 @@ def position(pose: Any) -> tuple[float, float, float]:
 
 def rotation(pose: Any) -> np.ndarray:
     """Matrix of a pose's quaternion."""
-    q = pose.orientation
-    x, y, z, w = q.x, q.y, q.z, q.w
-    assert x * x + y * y + z * z + w * w == pytest.approx(1.0)
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    turn = [getattr(pose.orientation, axis) for axis in "xyzw"]
+    assert np.dot(turn, turn) == pytest.approx(1.0)
+    return rotation_of(*turn)
 
 
 @pytest.mark.parametrize("name", HASHES)
