@@ -16,12 +16,12 @@ from arm import answers
 from arm.compare import COLUMNS, MAX_UNLIKE, compare, read, unlike_boxes, unlike_values
 from arm.environment import CPUS, cpuinfo
 
+from checkout import REPOSITORY
 from edgeperc.inference.session import golden_input
 from edgeperc.simulation.samples import simulated_scan
 from edgeperc.system import machine
 from edgeperc.zoo import DEFAULT, choose, model_path, resolve
 
-REPOSITORY = Path(__file__).resolve().parent.parent
 BOX = {"label": "car", "score": 0.9, "center": [10.0, 2.0, -1.0], "size": [4.0, 1.6, 1.5], "yaw": 3.14, "front": None}
 
 

@@ -7,18 +7,17 @@ import importlib.metadata
 import inspect
 import pkgutil
 import re
-from pathlib import Path
 
 import pytest
 
 import edgeperc
 import edgeperc.errors
 import edgeperc.zoo
+from checkout import REPOSITORY
 from edgeperc.errors import ModelFileError
 from edgeperc.inference import listing, providers
 from edgeperc.types.sensor import SENSORS
 
-REPOSITORY = Path(__file__).resolve().parent.parent
 MODULES = sorted(
     found.name for found in pkgutil.walk_packages(edgeperc.__path__, "edgeperc.") if not found.name.endswith("__main__")
 )

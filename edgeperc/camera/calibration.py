@@ -48,7 +48,13 @@ class Calibration:
     height: int
 
     def __post_init__(self) -> None:
-        K, T = _matrix("K", self.K, 3), rigid("T_camera_sensor", self.T_camera_sensor, CalibrationError)
+        try:
+            K = np.array(self.K, dtype=np.float64)
+        except (OverflowError, TypeError, ValueError) as exc:
+            raise CalibrationError(f"K is not an array of numbers ({exc}); expected (3, 3)") from exc
+        if K.shape != (3, 3) or not np.isfinite(K).all():
+            raise CalibrationError(f"K has shape {K.shape}; expected a finite (3, 3) matrix, got {self.K!r:.200}")
+        T = rigid("T_camera_sensor", self.T_camera_sensor, CalibrationError)
         if max(abs(K[0, 1]), abs(K[1, 0]), *np.abs(K[2] - [0.0, 0.0, 1.0])) > ROW_TOLERANCE:
             raise CalibrationError(
                 f"K is {K.tolist()}; expected [[f_x, 0, c_x], [0, f_y, c_y], [0, 0, 1]], without skew. "
@@ -208,18 +214,6 @@ def _pixels(name: str, given: object) -> int:
     if isinstance(given, bool) or not isinstance(given, int | np.integer) or not 1 <= given <= MAX_EDGE:
         raise CalibrationError(f"{name} is {given!r:.80}; expected a whole number of pixels from 1 to {MAX_EDGE}")
     return int(given)
-
-
-def _matrix(name: str, given: ArrayLike, n: int) -> Floats:
-    try:
-        matrix: Floats = np.array(given, dtype=np.float64)
-    except (OverflowError, TypeError, ValueError) as exc:
-        raise CalibrationError(f"{name} is not an array of numbers ({exc}); expected ({n}, {n})") from exc
-    if matrix.shape != (n, n) or not np.isfinite(matrix).all():
-        raise CalibrationError(
-            f"{name} has shape {matrix.shape}; expected a finite ({n}, {n}) matrix, got {given!r:.200}"
-        )
-    return matrix
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

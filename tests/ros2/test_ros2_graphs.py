@@ -451,25 +451,21 @@ def test_a_lifecycle_manager_leads_the_node(bus: Bus) -> None:
 
 
 @pytest.mark.parametrize(
-    "options", [{"prefix": "/a b"}, {"topic": "/a b"}, {"outputs": ("points=~/points",)}, {"outputs": ("points=1/x",)}]
+    ("options", "said"),
+    [
+        ({"prefix": "/a b"}, r"rclpy does not publish on '/a b/points'"),
+        ({"topic": "/a b"}, "rclpy does not subscribe to '/a b'"),
+        ({"outputs": ("points=~/points",)}, "not a name of ROS 2"),
+        ({"outputs": ("points=1/x",)}, "not a name of ROS 2"),
+        ({"outputs": ("tracked_objects",)}, "ros-DISTRIBUTION-autoware-perception-msgs"),
+    ],
 )
-def test_names_that_rclpy_refuses(bus: Bus, options: dict[str, Any]) -> None:
-    graph = RclpyGraph("top")
-    try:
-        with pytest.raises(OptionError, match=r"rclpy does not|not a name of ROS 2"):
-            PerceptionNode(graph, lambda _: Perceive(), **{"outputs": ("points",), **options})  # type: ignore[arg-type, return-value]
-    finally:
-        graph.close()
-
-
-def test_what_autoware_is_asked_for_must_be_there(bus: Bus, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_rclpy_refuses(bus: Bus, options: dict[str, Any], said: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "autoware_perception_msgs.msg", None)
     graph = RclpyGraph("top")
-    try:
-        with pytest.raises(OptionError, match="ros-DISTRIBUTION-autoware-perception-msgs"):
-            PerceptionNode(graph, lambda _: Perceive(), outputs=("tracked_objects",))  # type: ignore[arg-type, return-value]
-    finally:
-        graph.close()
+    with pytest.raises(OptionError, match=said):
+        PerceptionNode(graph, lambda _: Perceive(), **{"outputs": ("points",), **options})  # type: ignore[arg-type, return-value]
+    graph.close()
 
 
 @pytest.mark.parametrize(
@@ -485,6 +481,8 @@ def test_what_autoware_is_asked_for_must_be_there(bus: Bus, monkeypatch: pytest.
         ({"odometry": "an odometry"}, "not a name of ROS 2"),
         ({"rate": -1.0}, "--rate is -1"),
         ({"topic": "a topic"}, "rclpy does not subscribe to 'a topic'"),
+        ({"topic": "/other", "rate": 20.0, "sensor": "no such sensor"}, "no such sensor"),
+        ({"rate": 20}, "the parameter rate is not of type float"),
     ],
 )
 @pytest.mark.filterwarnings("ignore:no detections are published")
@@ -492,19 +490,25 @@ def test_parameters_are_validated(
     overrides: dict[str, Any], said: str, bus: Bus, capsys: pytest.CaptureFixture[str]
 ) -> None:
     bus.overrides = overrides
-    assert main(["ros2", "--rclpy"]) == 2
+    assert main(["ros2", "--rclpy", "--ros-args", "-p", "sensor:=x"]) == 2
     assert said in capsys.readouterr().err
     assert bus.ended == ["/edgeperc"]
 
 
-def test_parameters_make_the_grid_with_memory(bus: Bus, monkeypatch: pytest.MonkeyPatch) -> None:
-    made: list[dict[str, Any]] = []
+@pytest.fixture
+def made(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Callable[[dict[str, Any]], Perceiver], dict[str, Any]]]:
+    """In place of nodes: what makes the perceiver of each, and its options."""
+    found = []
 
-    def node(*_: Any, **options: Any) -> Any:
-        made.append(options)
+    def node(_: Any, perceiver_for: Callable[[dict[str, Any]], Perceiver], **options: Any) -> Any:
+        found.append((perceiver_for, options))
         raise OptionError("no node")
 
     monkeypatch.setattr("edgeperc.ros2.node.PerceptionNode", node)
+    return found
+
+
+def test_parameters_make_the_grid_with_memory(bus: Bus, made: list[Any]) -> None:
     bus.overrides = {
         "odometry": "/odometry/filtered",
         "sensor_pose": [1.0, 0.0, 1.5, 0.0, 0.0, 90.0],
@@ -512,7 +516,7 @@ def test_parameters_make_the_grid_with_memory(bus: Bus, monkeypatch: pytest.Monk
         "publish": ["rolling=/grid", "ground_points"],
     }
     assert main(["ros2", "--rclpy", "--lifecycle"]) == 2
-    (options,) = made
+    ((_, options),) = made
     assert (options["outputs"], options["lifecycle"]) == (["rolling=/grid", "ground_points"], True)
     rolling = options["rolling"]
     assert isinstance(rolling, Rolling)
@@ -522,24 +526,17 @@ def test_parameters_make_the_grid_with_memory(bus: Bus, monkeypatch: pytest.Monk
 
 @pytest.mark.filterwarnings("ignore::UserWarning")
 def test_clouds_that_do_not_name_their_sensor_show_it(
-    bus: Bus, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    bus: Bus, made: list[Any], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    made: list[Callable[[dict[str, Any]], Perceiver]] = []
-
-    def node(_: Any, perceiver_for: Callable[[dict[str, Any]], Perceiver], **options: Any) -> Any:
-        made.append(perceiver_for)
-        raise OptionError("no node")
-
-    monkeypatch.setattr("edgeperc.ros2.node.PerceptionNode", node)
     for words in ([], ["--mount-height", "1.7"]):
         assert main(["ros2", *words, "--rclpy"]) == 2
     cloud = {"topic": "/points", "frame": "lidar", "fields": ["x", "y", "z", "intensity"], "elevations_deg": []}
-    perceive = made[0](cloud)
+    perceive = made[0][0](cloud)
     assert "found in the points" in capsys.readouterr().out
     perceive(urban(3, "vlp-32c").points)
     assert perceive.sensor.name == "vlp-32c"
     with pytest.raises(SensorError, match="do not name their sensor"):  # the mounting is a part of the profile
-        made[1](cloud)
+        made[1][0](cloud)
 
 
 def test_the_grid_with_memory_over_zenoh(router: str, watch: Watch) -> None:
@@ -564,16 +561,6 @@ def test_the_grid_with_memory_over_zenoh(router: str, watch: Watch) -> None:
         assert (grid.info.origin.position.x, grid.info.origin.position.y) == pytest.approx((-17.0, -16.0), abs=0.21)
         assert 100 in grid.data
     talker.close()
-
-
-def test_parameters_take_the_place_of_options(bus: Bus, capsys: pytest.CaptureFixture[str]) -> None:
-    bus.overrides = {"topic": "/other", "rate": 20.0, "sensor": "no such sensor"}
-    assert main(["ros2", "--rclpy", "--ros-args", "-p", "sensor:=x"]) == 2
-    assert "no such sensor" in capsys.readouterr().err
-    assert bus.ended == ["/edgeperc"]
-    bus.overrides = {"rate": 20}
-    assert main(["ros2", "--rclpy"]) == 2
-    assert "the parameter rate is not of type float" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
