@@ -12,7 +12,6 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
-from unittest import mock
 
 import numpy as np
 import pytest
@@ -24,11 +23,10 @@ if not hasattr(os, "fork"):
     pytest.skip("this system has no fork", allow_module_level=True)
 
 from fuzz.running import Case, State, attempt, new_case, run_job
-from fuzz.scans import DENSE, ELEVATIONS, SLOTS, MadeUp, card_of
+from fuzz.scans import DENSE, ELEVATIONS, SLOTS, MadeUp, card_of, perceiver_of
 from fuzz.tiny import GRAPH, model
 from tiny_model import field
 
-import edgeperc.perceiver as perceiver_module
 from edgeperc import Box, Perceiver, SensorProfile, Tracker, Trajectory
 from edgeperc.camera.calibration import read_kitti_calibration
 from edgeperc.errors import EdgepercError, InferenceError, ModelFileError, PointsError, TrackingError
@@ -208,8 +206,7 @@ def test_stamps_beyond_the_limits(stamp_s: float) -> None:
 
 def made_up(*cards: ModelCard, values: float = 0.0, **options: Any) -> Perceiver:
     sessions = [MadeUp(card) for card in cards]
-    with mock.patch.object(perceiver_module, "Session", side_effect=sessions):
-        perceive = Perceiver([card.name for card in cards], on_mismatch="ignore", **options)
+    perceive = perceiver_of(*sessions, on_mismatch="ignore", **options)
     for session in sessions:
         for output in session.outputs.values():
             output.fill(values)

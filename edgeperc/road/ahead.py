@@ -306,7 +306,8 @@ def _strip_ahead(y_m: Floats, firsts: Floats, view_m: float, half_width_m: float
     if not near.any():
         return FreeAhead(math.nan, None, math.inf, math.inf, math.inf, view_m)
     first = firsts[:, near].min(axis=1)
-    return FreeAhead(min(*first.tolist(), view_m), _end_of(first, view_m), *first.tolist(), view_m)
+    obstacle_m, edge_m, unknown_m = first.tolist()
+    return FreeAhead(min(*first.tolist(), view_m), _end_of(first, view_m), obstacle_m, edge_m, unknown_m, view_m)
 
 
 def _end_of(first: Floats, view_m: float) -> FreeEnd:

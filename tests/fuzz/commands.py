@@ -26,7 +26,6 @@ from unittest import mock
 import numpy as np
 
 import edgeperc.perceiver as perceiver_module
-from edgeperc import Perceiver
 from edgeperc.cli import main
 from edgeperc.inference.session import Session
 from edgeperc.readers import apart
@@ -36,7 +35,7 @@ from .arrays import base_scan
 from .captures import LIBRARIES, Forked
 from .mutate import mutated_bytes, mutated_json, noise
 from .running import Case, check, peak_mb, reset_peak
-from .scans import MadeUp, cards
+from .scans import MadeUp, cards, perceiver_of
 from .tiny import GRAPH, model
 
 __all__ = ["LIMIT_MB", "LIMIT_S", "Commands", "make"]
@@ -239,9 +238,7 @@ def make(seed: int) -> Commands:
             import_module(name)
     # The kernels are compiled once, not in each process; a network's threads would not survive the fork.
     for each in cards()[:8:5]:
-        made_up = [MadeUp(card) for card in each]
-        with mock.patch.object(perceiver_module, "Session", side_effect=made_up):
-            Perceiver([card.name for card in each], on_mismatch="ignore")(np.zeros((3, 4), np.float32))
+        perceiver_of(*map(MadeUp, each), on_mismatch="ignore")(np.zeros((3, 4), np.float32))
     made_once = functools.cache(Session)
 
     def session(model: str, *arguments: Any, **options: Any) -> Session:

@@ -11,15 +11,13 @@ import zlib
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
-from unittest import mock
 
 import numpy as np
 import tiny_camera
 from numpy.typing import NDArray
 from tiny_camera import PNG, png_chunk, png_file
 
-import edgeperc.perceiver as perceiver_module
-from edgeperc import Perceiver, Perception
+from edgeperc import Perception
 from edgeperc.camera.image import MAX_EDGE, MAX_PIXELS
 from edgeperc.datasets.images import LabeledImages
 from edgeperc.readers.images import read_image
@@ -27,7 +25,7 @@ from edgeperc.types.views import CameraGeometry
 
 from .mutate import mutated_bytes, mutated_document
 from .running import Case, check, one_of
-from .scans import MadeUp
+from .scans import MadeUp, perceiver_of
 
 __all__ = ["LIMIT_MB", "LIMIT_S", "Images", "make"]
 
@@ -148,8 +146,7 @@ class Images:
             card = tiny_camera.camera_card()
             card = replace(card, golden=None, view=CameraGeometry(width, height))
             session = MadeUp(card)
-            with mock.patch.object(perceiver_module, "Session", return_value=session):
-                self.perceivers.append((Perceiver("made-up"), session))
+            self.perceivers.append((perceiver_of(session), session))
         ways: list[tuple[int, Callable[[Case], str]]] = [(12, self.array)]
         if importlib.util.find_spec("PIL"):
             ways += [(10, self.file_bytes), (6, self.png_header), (2, self.data_set), (3, self.whole_file)]

@@ -13,7 +13,6 @@ from unittest import mock
 import numpy as np
 from tiny_model import field, integers, node, number, tensor
 
-import edgeperc.perceiver as perceiver_module
 from edgeperc import Perceiver, SensorProfile
 from edgeperc.inference.session import Session
 from edgeperc.records import read_boxes
@@ -25,7 +24,7 @@ from edgeperc.zoo import digest, model_path, resolve
 
 from .mutate import mutated_bytes, mutated_document, mutated_json, mutated_message, noise, parse
 from .running import Case, check, one_of
-from .scans import MadeUp, check_perception
+from .scans import MadeUp, check_perception, perceiver_of
 from .tiny import CARD, GRAPH, boxed_card, image_card, model
 
 __all__ = ["LIMIT_MB", "LIMIT_S", "Models", "make"]
@@ -136,9 +135,7 @@ class Models:
             "sensor": case.pick([*SENSORS]),
             "full_turn": case.chance(0.2),
         }
-        with mock.patch.object(perceiver_module, "Session", return_value=made_up):
-            perceive = Perceiver(card.name, **options)
-        check_perception(perceive(POINTS), POINTS)
+        check_perception(perceiver_of(made_up, **options)(POINTS), POINTS)
         return "answer"
 
     def settings(self, case: Case) -> str:
@@ -166,8 +163,7 @@ class Models:
         check(SensorProfile.from_json(sensor.to_json()) == sensor, "a profile read back differs")
         made_up = MadeUp(image_card())
         made_up.case = case
-        with mock.patch.object(perceiver_module, "Session", return_value=made_up):
-            perceive = Perceiver("any", sensor=sensor, on_mismatch=case.pick(["ignore", "warn", "refuse"]))
+        perceive = perceiver_of(made_up, sensor=sensor, on_mismatch=case.pick(["ignore", "warn", "refuse"]))
         check_perception(perceive(POINTS), POINTS)
         return "answer"
 

@@ -28,7 +28,7 @@ from edgeperc.zoo import resolve
 from .arrays import hostile_scan, save
 from .running import Case, check
 
-__all__ = ["LIMIT_MB", "LIMIT_S", "check_perception", "check_tracks", "make"]
+__all__ = ["LIMIT_MB", "LIMIT_S", "check_perception", "check_tracks", "make", "perceiver_of"]
 
 LIMIT_S, LIMIT_MB = 10.0, 1500.0
 BLOCK = 100  # cases with one perceiver
@@ -144,6 +144,12 @@ class MadeUp:
             values.ravel()[:] = np.frombuffer(rng.bytes(4 * values.size), np.float32)
 
 
+def perceiver_of(*sessions: MadeUp, **options: Any) -> Perceiver:
+    """A perceiver whose networks are made up."""
+    with mock.patch.object(perceiver_module, "Session", side_effect=sessions):
+        return Perceiver([each.card.name for each in sessions], **options)
+
+
 def any_sensor(case: Case) -> SensorProfile | str:
     """A built-in profile, or one that is only just possible."""
     rng = case.rng
@@ -206,12 +212,10 @@ class Scans:
             self.made_up = []
             self.perceive = Perceiver(provider="cpu", n_threads=1, **options)
         else:
-            chosen = [MadeUp(card) for card in made.pick(self.cards)]
-            views = {m.card.view.kind for m in chosen}
+            self.made_up = [MadeUp(card) for card in made.pick(self.cards)]
+            views = {m.card.view.kind for m in self.made_up}
             options["boxes_from"] = made.pick(["both", "network", *(["clusters"] if "range_image" in views else [])])
-            with mock.patch.object(perceiver_module, "Session", side_effect=chosen):
-                self.perceive = Perceiver([m.card.name for m in chosen], **options)
-            self.made_up = chosen
+            self.perceive = perceiver_of(*self.made_up, **options)
         self.made = block, is_honest
         return self.perceive, self.made_up
 
@@ -292,8 +296,7 @@ def check_perception(p: Perception, points: NDArray[np.float32]) -> None:
         if "drivable" in view.classes:
             road = view.labels == view.classes.index("drivable")
             check(not (view.drivable & ~road).any(), "a drivable cell without the label")
-        observed = getattr(view, "observed", None)
-        check(observed is None or observed.shape == view.labels.shape, "shape of observed")
+        check(view.observed.shape == view.labels.shape, "shape of observed")
         check(math.isfinite(view.drivable_area_m2), "area")
     for box in p.boxes:
         check_box(box)

@@ -43,15 +43,11 @@ def synthetic_seeds(folder: Path) -> list[Seed]:
     seeds += [Seed("bag1", {"cap.bag": capture_tests.write_bag1(folder / "one.bag").read_bytes()}, "cap.bag")]
     seeds += [Seed("bag1", {"cap.bag": _packed_bag(folder, m)}, "cap.bag") for m in ("BZ2", "LZ4")]
     bag2 = capture_tests.write_bag2(folder / "bag2")
-    seeds.append(Seed("bag2", {f"cap/{f.name}": f.read_bytes() for f in sorted(bag2.iterdir())}, "cap"))
     mcap = capture_tests.write_mcap_folder(folder / "mcap")
-    seeds.append(Seed("bag2", {f"cap/{f.name}": f.read_bytes() for f in sorted(mcap.iterdir())}, "cap"))
-    alone = {f"cap/{f.name}": f.read_bytes() for f in bag2.glob("*.db3")}
-    seeds.append(Seed("bag2", alone, "cap"))
-    foxglove = cloud_tests.write_foxglove(folder / "foxglove.mcap").read_bytes()
-    seeds += [Seed("mcap", {"cap.mcap": foxglove}, "cap.mcap")] * 3
-    plain = capture_tests.write_mcap(folder / "plain.mcap").read_bytes()
-    seeds += [Seed("mcap", {"cap.mcap": plain}, "cap.mcap")] * 3
+    for files in (sorted(bag2.iterdir()), sorted(mcap.iterdir()), bag2.glob("*.db3")):
+        seeds.append(Seed("bag2", {f"cap/{f.name}": f.read_bytes() for f in files}, "cap"))
+    for path in (cloud_tests.write_foxglove(folder / "foxglove.mcap"), capture_tests.write_mcap(folder / "plain.mcap")):
+        seeds += [Seed("mcap", {"cap.mcap": path.read_bytes()}, "cap.mcap")] * 3
     for kind, writer in (("bag1", "ROS 1"), ("mcap", "ROS 2"), ("mcap", "big-endian")):
         path = message_tests.WRITERS[writer](folder, capture_writers.vlp16_packets(0.12), 4)
         seeds.append(Seed(kind, {f"cap{path.suffix}": path.read_bytes()}, f"cap{path.suffix}"))
