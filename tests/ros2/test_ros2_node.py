@@ -7,6 +7,7 @@ import re
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -77,6 +78,14 @@ class FakeGraph:
         self.closed += 1
 
 
+@contextmanager
+def running(perceive: Any = None, **options: Any) -> Iterator[tuple[FakeGraph, PerceptionNode, Iterator[Any]]]:
+    """A graph, a node in it, and what comes of its clouds."""
+    graph = FakeGraph()
+    with PerceptionNode(graph, lambda _: perceive or Perceive(), **{"rate_hz": SLOW_HZ, **options}) as node:
+        yield graph, node, iter(node)
+
+
 @pytest.fixture
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """Diagnostics come often, so that no test waits a second."""
@@ -129,22 +138,20 @@ def test_a_cloud_is_answered_with_its_stamp_and_frame() -> None:
 
 
 def test_frames_and_names_of_ones_own() -> None:
-    graph = FakeGraph()
     options: dict[str, Any] = {"frame_id": "base", "grid_frame_id": "ground", "prefix": "/a/", "outputs": ["occupancy"]}
-    with PerceptionNode(graph, lambda _: Perceive(), **options) as node:
+    with running(**options) as (graph, _, outcomes):
         graph.give(cloud(POINTS))
-        next(iter(node))
+        next(outcomes)
     assert graph.types.keys() == {"/a/occupancy"}
     (grid,) = (MESSAGES.decode(raw, OUTPUTS["occupancy"]) for raw in graph.published["/a/occupancy"])
     assert grid.header.frame_id == "ground"
 
 
 def test_nothing_is_made_that_nobody_wants() -> None:
-    graph = FakeGraph()
-    graph.wanted = False
-    with PerceptionNode(graph, lambda _: Perceive(), rate_hz=SLOW_HZ) as node:
+    with running() as (graph, _, outcomes):
+        graph.wanted = False
         graph.give(cloud(POINTS))
-        next(iter(node))
+        next(outcomes)
     assert not any(kept for topic, kept in graph.published.items() if topic != "/diagnostics")
 
 
@@ -165,9 +172,7 @@ HOSTILE = {
 @pytest.mark.parametrize("name", HOSTILE)
 def test_a_bad_cloud_is_an_error_and_the_next_is_perceived(name: str, quick: None) -> None:
     data, said = HOSTILE[name]
-    graph = FakeGraph()
-    with PerceptionNode(graph, lambda _: Perceive(), rate_hz=SLOW_HZ) as node:
-        outcomes = iter(node)
+    with running() as (graph, node, outcomes):
         graph.give(data)
         error = next(outcomes)
         assert isinstance(error, PointsError)
@@ -187,9 +192,7 @@ def test_a_cloud_of_16_million_points_in_few_bytes_is_refused(monkeypatch: pytes
     monkeypatch.setattr(node_module, "MAX_SCAN_BYTES", 1600)
     one = MESSAGES.types["sensor_msgs/msg/PointField"]
     fields = [one(name=axis, offset=0, datatype=1, count=1) for axis in "xyz"]
-    graph = FakeGraph()
-    with PerceptionNode(graph, lambda _: Perceive(), rate_hz=SLOW_HZ) as node:
-        outcomes = iter(node)
+    with running() as (graph, _, outcomes):
         graph.give(cloud(POINTS, fields=fields, width=101, point_step=1, data=np.zeros(101, np.uint8)))
         assert "expected at most 100" in str(next(outcomes))
         graph.give(cloud(np.zeros((101, 4))))
@@ -197,9 +200,7 @@ def test_a_cloud_of_16_million_points_in_few_bytes_is_refused(monkeypatch: pytes
 
 
 def test_big_endian_empty_and_nan_clouds_are_clouds() -> None:
-    graph = FakeGraph()
-    with PerceptionNode(graph, lambda _: Perceive(), rate_hz=SLOW_HZ) as node:
-        outcomes = iter(node)
+    with running() as (graph, _, outcomes):
         for data, expected in (
             (cloud(POINTS, is_bigendian=True), POINTS),
             (cloud(POINTS[:0]), POINTS[:0]),
@@ -212,9 +213,7 @@ def test_big_endian_empty_and_nan_clouds_are_clouds() -> None:
 
 
 def test_damaged_bytes_never_end_the_node() -> None:
-    graph = FakeGraph()
-    with PerceptionNode(graph, lambda _: Perceive(), rate_hz=SLOW_HZ, outputs=("points", "markers")) as node:
-        outcomes = iter(node)
+    with running(outputs=("points", "markers")) as (graph, _, outcomes):
 
         @given(st.data())
         def check(data: st.DataObject) -> None:
@@ -258,10 +257,10 @@ def test_the_newest_cloud_wins() -> None:
 
 @pytest.mark.filterwarnings("ignore:got a scan at")
 def test_stamps_that_repeat_or_jump_are_answered_and_tracked_anew() -> None:
-    graph, poison_ns = FakeGraph(), (2**31 - 1) * 10**9 + 4 * 10**9
+    poison_ns = (2**31 - 1) * 10**9 + 4 * 10**9
     stamps_ns = [s * 10**9 for s in (100, 101, 101, 50, 51)] + [poison_ns, 52 * 10**9, -(10**9), 53 * 10**9]
-    with PerceptionNode(graph, lambda _: Perceive(), tracker=Tracker()) as node:
-        outcomes, answers = iter(node), []
+    answers = []
+    with running(tracker=Tracker()) as (graph, _, outcomes):
         for stamp_ns in stamps_ns:
             graph.give(cloud(POINTS, stamp_ns))
             answers.append(next(outcomes))
@@ -283,9 +282,7 @@ def test_of_a_cloud_that_comes_twice_the_boxes_are_published() -> None:
             box = Box("car", 0.9, (10.0, 2.0, -0.9), (4.2, 1.8, 1.5), 0.0)
             return replace(super().__call__(points, stamp_s=stamp_s), boxes=(box,))
 
-    graph = FakeGraph()
-    with PerceptionNode(graph, lambda _: Car(), tracker=Tracker()) as node:
-        outcomes = iter(node)
+    with running(Car(), tracker=Tracker()) as (graph, _, outcomes):
         for stamp_ns in (10**9, 11 * 10**8, 11 * 10**8):
             graph.give(cloud(POINTS, stamp_ns))
             next(outcomes)
@@ -297,11 +294,10 @@ def test_of_a_cloud_that_comes_twice_the_boxes_are_published() -> None:
 
 
 def test_a_cloud_without_a_stamp_has_that_of_its_arrival() -> None:
-    graph, perceive = FakeGraph(), Perceive()
-    before = time.time()
-    with PerceptionNode(graph, lambda _: perceive) as node:
+    perceive, before = Perceive(), time.time()
+    with running(perceive) as (graph, _, outcomes):
         graph.give(cloud(POINTS, 0))
-        next(iter(node))
+        next(outcomes)
     assert before - 1e-3 <= perceive.stamps[0] <= time.time() + 1e-3
 
 
@@ -328,12 +324,11 @@ def test_closing_ends_the_iteration() -> None:
 
 
 def test_diagnostics_tell_of_silence(quick: None, monkeypatch: pytest.MonkeyPatch) -> None:
-    graph = FakeGraph()
-    with PerceptionNode(graph, lambda _: Perceive(), rate_hz=100.0) as node:
+    with running(rate_hz=100.0) as (graph, _, outcomes):
         until(lambda: graph.published["/diagnostics"])
         assert (last_status(graph).level, last_status(graph).message) == (3, "no scan yet")
         graph.give(cloud(POINTS))
-        next(iter(node))
+        next(outcomes)
         until(lambda: last_status(graph).level == 3 and last_status(graph).message != "no scan yet")
         status = last_status(graph)
         assert (status.name, status.message) == ("edgeperc: perception", "STALE: no answer of late")
@@ -366,12 +361,11 @@ def test_a_point_is_ground_or_obstacle_or_dropped(kind: str, height: int) -> Non
     step, width = table.dtype.itemsize, len(points) // height
     rows = table.view(np.uint8).reshape(height, -1)
     padded = np.hstack([rows, np.full((height, 5 * (height - 1)), 255, np.uint8)])
-    graph = FakeGraph()
-    with PerceptionNode(graph, lambda _: Perceive(), rate_hz=SLOW_HZ) as node:
+    with running() as (graph, _, outcomes):
         shape = {"height": height, "width": width, "point_step": step, "row_step": padded.shape[1]}
         data = cloud(points, 77, is_bigendian=kind == ">f4", fields=described, data=padded.ravel(), **shape)
         graph.give(data)
-        scan = next(iter(node))
+        scan = next(outcomes)
         assert isinstance(scan, PerceivedScan), scan
     parts = []
     for name in ("ground_points", "obstacle_points"):
@@ -406,10 +400,9 @@ def test_topics_have_names_of_ones_own() -> None:
 
 def test_the_grid_with_memory_follows_the_odometry() -> None:
     """A sensor 1 m ahead of the vehicle's middle, turned to the left, on a vehicle that turns as it drives."""
-    graph, points, n = FakeGraph(), street(), 4
+    points, n = street(), 4
     rolling = Rolling(sensor_pose=(1.0, 0.0, 1.73, 0.0, 0.0, 90.0), grid=RollingGrid(size_m=60.0, cell_m=0.5))
-    with PerceptionNode(graph, lambda _: Perceive(), rolling=rolling, rate_hz=SLOW_HZ) as node:
-        outcomes = iter(node)
+    with running(rolling=rolling) as (graph, _, outcomes):
         for k in range(n):
             stamp_ns = 10**9 + k * 10**8
             graph.odometry(odometry(stamp_ns - 5 * 10**7, 10.0 + k - 0.5, 20.0, 0.0))
@@ -493,9 +486,7 @@ def test_transitions_that_there_are_not(way: list[str], wrong: str) -> None:
 
 
 def test_diagnostics_tell_rates_and_latencies(quick: None, monkeypatch: pytest.MonkeyPatch) -> None:
-    graph = FakeGraph()
-    with PerceptionNode(graph, lambda _: Perceive(), rate_hz=SLOW_HZ) as node:
-        outcomes = iter(node)
+    with running() as (graph, _, outcomes):
         monkeypatch.setattr(node_module, "REPORT_EVERY_S", 0.3)
         until(lambda: graph.published["/diagnostics"])
         for k in range(20):
