@@ -38,6 +38,7 @@ SLACK_M, SLACK_SHARE = 0.5, 0.05  # a point up to this far behind may be of the 
 MAX_HALF_RAD = math.radians(1.5)  # 2.5 degrees for a VLP-16 would leave 86 % of what its camera sees, not 99 %
 # Windows are measured in cells of the depth buffer, which are so large that most windows reach 6 cells to each side.
 USUAL_CELLS, MAX_CELLS = 6, 24
+_NOWHERE = np.empty((0, 2))
 
 
 class Pixels(NamedTuple):
@@ -209,7 +210,7 @@ def _hidden_by(
     calibration: Calibration,
     sensor: SensorProfile,
     mounting: Mounting | None,
-    places: Floats | None = None,
+    places: Floats = _NOWHERE,
 ) -> tuple[Floats32, DepthBuffer, Floats]:
     """The points, the depth buffer of those above the ground, and ``places`` on the ground, NaN without ground."""
     if not isinstance(points, np.ndarray) or points.ndim != 2 or points.shape[1] < 3 or points.dtype.kind not in "fiu":
@@ -226,11 +227,8 @@ def _hidden_by(
             surface = image.ground
         surface = surface or fit_ground(above, mount_height_m=MODEL_HEIGHT_M, any_order=True).surface()
         is_ground = heights_above(surface, above).mask
-        cells = np.zeros((0 if places is None else len(places), 3))
-        if places is not None:
-            cells[:, :2] = places
-            is_known = surface.plane is not None
-            cells[:, 2] -= heights_above(surface, cells.astype(np.float32)).height_m if is_known else np.nan
+        cells = np.column_stack([places, np.zeros(len(places))])
+        cells[:, 2] -= heights_above(surface, cells.astype(np.float32)).height_m if surface.plane else np.nan
     return rows, _nearest(read_only(rows[~is_ground]), calibration, sensor), (cells - frame.t) @ frame.R
 
 

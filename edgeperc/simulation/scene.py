@@ -269,13 +269,12 @@ def simulate(
         pose = rigid("T_world_sensor", T_world_sensor, PointsError)
     rng = np.random.default_rng((int(seed) & 0x7FFFFFFFFFFFFFFF, 7919))
     if profile.pattern is None:
-        n_beams, n_columns = profile.n_beams, profile.columns
-        step = 2.0 * math.pi / n_columns
-        azimuths = np.arange(n_columns, dtype=np.float64) * np.float64(step)
+        step = 2.0 * math.pi / profile.columns
+        azimuths = np.arange(profile.columns, dtype=np.float64) * np.float64(step)
         elevations = np.radians(np.asarray(profile.elevations_deg))[:, None]
     else:
         azimuths, elevations = _pattern_rays(profile, profile.pattern, start_s, duration_s)
-        n_beams, n_columns = elevations.shape
+    n_beams, n_columns = len(elevations), len(azimuths)
     range_offsets, remission_offsets = np.zeros(n_beams), np.zeros(n_beams)
     if noise and profile.pattern is None:
         azimuths += rng.normal(0.0, 0.08, n_columns) * step
