@@ -17,7 +17,7 @@ from .errors import EdgepercError, OptionError, PointsError, StampError
 from .readers.captures import read_scans, sensor_of
 from .readers.identify import contradicts
 from .readers.times import TimedScan, accumulate
-from .system.clock import LATEST_S, Clock
+from .system.clock import LATEST_S, Clock, check_seconds
 from .types.perception import Perception
 from .types.points import as_points
 from .types.sensor import SensorProfile
@@ -318,6 +318,8 @@ class _Inbox:
             self._changed.notify_all()
 
     def take(self, timeout_s: float | None) -> tuple[tuple[Any, float, float], int, int] | None:
+        if timeout_s is not None and timeout_s > threading.TIMEOUT_MAX:
+            timeout_s = None
         with self._lock:
             if not self._changed.wait_for(lambda: self._scan or self._ended or self.stopped.is_set(), timeout_s):
                 return None
@@ -350,6 +352,8 @@ def _stamped(scan: Any) -> tuple[Any, float | None]:
         return scan, None
     try:
         stamp_s, points = scan
+        if stamp_s is not None:
+            check_seconds(stamp_s)
         return points, stamp_s if stamp_s is None or isinstance(stamp_s, float) else float(stamp_s)
     except (TypeError, ValueError) as exc:
         raise PointsError(f"got a tuple that is not a scan ({exc}); expected points or (stamp_s, points)") from exc

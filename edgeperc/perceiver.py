@@ -264,7 +264,9 @@ class Perceiver:
         _check_choice("on_mismatch", on_mismatch, ("refuse", "warn", "raise", "ignore"))
         _check_choice("boxes_from", boxes_from, ("both", "network", "clusters"))
         _check_choice("full_turn", full_turn, (True, False))
-        if not isinstance(agree, bool) and (isinstance(agree, str) or not {*agree} <= RULES):
+        _check_choice("trusted", trusted, (True, False))
+        rules = agree if isinstance(agree, Collection) and not isinstance(agree, str) else None
+        if agree not in (True, False) if rules is None else any(name not in [*RULES] for name in rules):
             raise OptionError(f"agree is {agree!r}; expected True, False or some of {', '.join(sorted(RULES))}")
         if score_threshold is not None and not (isinstance(score_threshold, Real) and 0.0 <= score_threshold <= 1.0):
             raise OptionError(f"score_threshold is {score_threshold!r}; expected a number in 0..1, or None")
@@ -289,7 +291,7 @@ class Perceiver:
         self._renders = adapt in ("both", "remission")
         self.boxes_from = boxes_from
         self.full_turn = full_turn
-        self.agree = agree if isinstance(agree, bool) else frozenset(agree)
+        self.agree = bool(agree) if rules is None else frozenset(rules)
         cards = [card for card in map(_card_of, wanted) if card is not None]
         with Compilation(lambda: kernels_of(self._kernel_needs(cards)), n_processes()):
             self._construct(wanted, provider, precision, n_threads, trusted)

@@ -191,6 +191,11 @@ def test_waiting_no_longer_than_told(source: Source) -> None:
         answer = answers.take(timeout_s=TIMEOUT_S)
         assert answer is not None
         assert answer.perception.n_points == 3
+        later = threading.Timer(0.05, source.give, [scan(4)])
+        later.start()
+        answer = answers.take(timeout_s=math.inf)
+        assert answer is not None
+        assert answer.perception.n_points == 4
         assert answers.take(timeout_s=0.001) is None
 
 
@@ -231,7 +236,7 @@ def test_an_error_of_perceiver_or_tracker_leaves_the_stream_open(source: Source)
         assert next(answers).tracks == 7
 
 
-@pytest.mark.parametrize("item", [(1.0, scan(1), "more"), ("noon", scan(1)), ([], scan(1)), ()])
+@pytest.mark.parametrize("item", [(1.0, scan(1), "more"), ("5.0", scan(1)), ([], scan(1)), (10**400, scan(1)), ()])
 def test_a_tuple_that_is_no_scan(item: Any) -> None:
     with (
         stream([item], perceive) as answers,

@@ -33,6 +33,9 @@ PLUGINS = {
 }
 # Providers that run on the processor's cores and take a number of threads.
 SHARING = ("cpu", "openvino")
+# What C++ raises, and warnings that are errors, become one of these, or one of onnxruntime's own classes, which share
+# no base but Exception.
+_OF_CPP = (RuntimeError, ValueError, TypeError, LookupError, ArithmeticError, MemoryError, Warning)
 
 
 def load_onnxruntime() -> Any:
@@ -41,6 +44,11 @@ def load_onnxruntime() -> Any:
     ort = require("onnxruntime", "cpu", "Running a model")
     ort.set_default_logger_severity(4)  # its exceptions contain the messages, and ours repeat them
     return ort
+
+
+def is_of_engine(exc: Exception) -> bool:
+    """Whether onnxruntime raised an error: the handler of a signal may raise one of its own during a call."""
+    return isinstance(exc, _OF_CPP) or type(exc).__module__.startswith("onnxruntime")
 
 
 def version(package: str) -> str:

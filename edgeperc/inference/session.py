@@ -58,6 +58,7 @@ from .providers import (
     RECOMPILING,
     SHARING,
     available_providers,
+    is_of_engine,
     load_onnxruntime,
     plugin_devices,
     version,
@@ -291,7 +292,9 @@ class Session:
             session.disable_fallback()  # of runs, if a newer version names its attribute otherwise
             for each in (*session.get_inputs(), *session.get_outputs()):
                 _ = each.name, each.shape  # fails if one is not UTF-8
-        except Exception as exc:  # onnxruntime's errors share no base but Exception
+        except Exception as exc:
+            if not is_of_engine(exc):
+                raise
             if short == "cpu":
                 raise ModelFileError(f"{self.path}: onnxruntime {ort.__version__} cannot open it: {exc}") from exc
             raise ProviderError(f"{self.path}: provider {short!r} cannot run this model: {exc}") from exc
@@ -401,7 +404,9 @@ class Session:
         try:
             with native_call():
                 answers = self.inference.run([o.name for o in self.card.outputs], feed, run_options)
-        except Exception as exc:  # onnxruntime's errors share no base but Exception
+        except Exception as exc:
+            if not is_of_engine(exc):
+                raise
             raise InferenceError(f"{self.path}: the first run on {self.provider} failed: {exc}") from exc
         for output, answer in zip(self.card.outputs, answers, strict=True):
             expected = self.card.shape_of(output)
@@ -537,7 +542,9 @@ class Session:
                 self.binding.bind_input(*self._bound_input)
             with native_call():
                 self.inference.run_with_iobinding(self.binding, *run_options)
-        except Exception as exc:  # onnxruntime's errors share no base but Exception
+        except Exception as exc:
+            if not is_of_engine(exc):
+                raise
             raise InferenceError(f"{self.path}: a run on {self.provider} failed: {exc}") from exc
         self.spread()
 

@@ -6,6 +6,8 @@ import math
 from dataclasses import dataclass, replace
 from typing import Literal, SupportsFloat
 
+import numpy as np
+
 from ..errors import StampError
 
 SHORTEST_STEP_S = 1e-6  # a stamp that is less than this later than the last one is of a doubled scan
@@ -34,7 +36,8 @@ class Stamp(float):
 def check_seconds(stamp_s: object) -> None:
     """Raise StampError for a date, a text or whatever else is no number of seconds."""
     try:
-        if not isinstance(stamp_s, SupportsFloat):  # a text can be converted, too
+        # A text can be converted, too, and numpy's times, but to their own units.
+        if not isinstance(stamp_s, SupportsFloat) or isinstance(stamp_s, np.datetime64 | np.timedelta64):
             raise TypeError
         float(stamp_s)
     except (OverflowError, TypeError, ValueError):

@@ -373,16 +373,23 @@ def test_auto_does_not_let_openvino_compile_each_number_of_candidates(monkeypatc
     assert Session("objects", "openvino").short == "openvino"  # as it was asked for
 
 
-def test_a_failing_run_is_an_inference_error() -> None:
+def test_a_failing_run_is_an_inference_error_unless_a_signals_handler_raised() -> None:
     session = Session(model_path("pointseg"), "cpu")
 
     class Broken:
-        def run_with_iobinding(self, _: object) -> None:
-            raise RuntimeError("no memory")
+        def __init__(self, error: Exception) -> None:
+            self.error = error
 
-    _network, session.inference = session.inference, Broken()  # before 1.24, a binding does not keep its network
-    with pytest.raises(errors.InferenceError, match="no memory"):
-        session.run()
+        def run_with_iobinding(self, _: object) -> None:
+            raise self.error
+
+    _network = session.inference  # before 1.24, a binding does not keep its network
+    late = TimeoutError("of signal.alarm")
+    engines = type("Fail", (Exception,), {"__module__": "onnxruntime.capi.onnxruntime_pybind11_state"})
+    for error in (RuntimeError("no memory"), engines("no memory"), late):
+        session.inference = Broken(error)
+        with pytest.raises(TimeoutError if error is late else errors.InferenceError, match=str(error)):
+            session.run()
 
 
 def test_the_input_is_bound_for_every_run(monkeypatch: pytest.MonkeyPatch) -> None:
