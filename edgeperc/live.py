@@ -17,7 +17,7 @@ from .errors import EdgepercError, OptionError, PointsError, StampError
 from .readers.captures import read_scans, sensor_of
 from .readers.identify import contradicts
 from .readers.times import TimedScan, accumulate
-from .system.clock import LATEST_S, Clock, check_seconds
+from .system.clock import LATEST_S, Clock, as_seconds
 from .types.perception import Perception
 from .types.points import as_points
 from .types.sensor import SensorProfile
@@ -352,9 +352,7 @@ def _stamped(scan: Any) -> tuple[Any, float | None]:
         return scan, None
     try:
         stamp_s, points = scan
-        if stamp_s is not None:
-            check_seconds(stamp_s)
-        return points, stamp_s if stamp_s is None or isinstance(stamp_s, float) else float(stamp_s)
+        return points, None if stamp_s is None else as_seconds(stamp_s)
     except (TypeError, ValueError) as exc:
         raise PointsError(f"got a tuple that is not a scan ({exc}); expected points or (stamp_s, points)") from exc
 

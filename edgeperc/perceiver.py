@@ -42,7 +42,7 @@ from .preprocess.interpolation import Interpolator
 from .preprocess.remission import RemissionMatcher
 from .preprocess.returns import about_too_near, returns
 from .preprocess.sensor_estimate import SensorEstimate, compile_votes, estimate_sensor
-from .system.clock import check_seconds
+from .system.clock import as_seconds
 from .system.compilation import Compilation, kernels_of
 from .system.lanes import Lanes, Stopwatch
 from .system.names import nearest
@@ -279,11 +279,7 @@ class Perceiver:
         if mounting is not None and not isinstance(mounting, Mounting):
             raise OptionError(f"mounting is {mounting!r:.80}; expected a Mounting, or None")
         self._finds_sensor = isinstance(sensor, str) and sensor == AUTO_SENSOR
-        self._sensor_estimate: SensorEstimate | None = None
         self.sensor = get_sensor(DEFAULT_SENSOR if self._finds_sensor else sensor)
-        self._set_mounting(MountingEstimator(self.sensor.mounting if mounting is None else mounting))
-        self._remission, self._normal = RemissionMatcher(self.sensor), Normal()
-        self._has_drops = False  # of the last scan
         self.on_mismatch = on_mismatch
         self.score_threshold = score_threshold
         self.adapt = adapt
@@ -292,6 +288,7 @@ class Perceiver:
         self.boxes_from = boxes_from
         self.full_turn = full_turn
         self.agree = bool(agree) if rules is None else frozenset(rules)
+        self._begin(self.sensor.mounting if mounting is None else mounting)
         cards = [card for card in map(_card_of, wanted) if card is not None]
         with Compilation(lambda: kernels_of(self._kernel_needs(cards)), n_processes()):
             self._construct(wanted, provider, precision, n_threads, trusted)
@@ -366,9 +363,6 @@ class Perceiver:
             )
         self.providers = MappingProxyType({s.card.name: s.description for s in self.sessions})
         self._fitness = [FitnessProfile.from_dict(card.fitness) for card in self.cards if card.fitness is not None]
-        self._to_check = self._n_to_check
-        self._told_of_near = False
-        self._told_of: set[str] = set()
         self._locks = {os.getpid(): threading.Lock()}
         self._lanes = Lanes(2 if at_once == 2 and all(session.shares_cores for session in self.sessions) else 1)
         self._pipeline = self._assemble(self.sensor)
@@ -457,18 +451,20 @@ class Perceiver:
     def reset_mounting(self) -> None:
         """Estimate mounting and remission anew, for scans of another vehicle; the next five scans settle both.
 
-        The next scans are checked as the first ones are (``on_mismatch``). With ``sensor="auto"``, the next one tells
-        the sensor.
+        The next scans are checked as the first ones are (``on_mismatch``), and what was warned of once is warned of
+        anew. With ``sensor="auto"``, the next one tells the sensor.
         """
         with self._lock:
-            self._sensor_estimate = None
-            self._to_check = self._n_to_check
-            self._remission, self._normal = RemissionMatcher(self.sensor), Normal()
-            self._set_mounting(MountingEstimator(self._estimator.known))
+            self._begin(self._estimator.known)
 
-    @property
-    def _n_to_check(self) -> int:
-        return 0 if self.on_mismatch == "ignore" else CHECKED_SCANS
+    def _begin(self, known: Mounting) -> None:
+        """Be as before the first scan, of a sensor whose mounting is known as far as this says."""
+        self._sensor_estimate: SensorEstimate | None = None
+        self._to_check = 0 if self.on_mismatch == "ignore" else CHECKED_SCANS
+        self._remission, self._normal = RemissionMatcher(self.sensor), Normal()
+        self._has_drops = False  # of the last scan
+        self._told_of: set[str] = set()  # kinds of findings
+        self._set_mounting(MountingEstimator(known))
 
     @property
     def learned(self) -> Learned:
@@ -555,7 +551,7 @@ class Perceiver:
         """
         self._check_given(points, image)
         if stamp_s is not None:
-            check_seconds(stamp_s)
+            stamp_s = as_seconds(stamp_s)
         place = None if origin_m is None else as_origin(origin_m)
         scan = None if points is None else as_points(points)
         pixels = None if image is None else as_image(image)
@@ -574,15 +570,14 @@ class Perceiver:
                 perception = replace(perception, image=self._camera.label(pixels, watch))
             if place is not None:
                 perception = replace(perception, origin_m=place)
-            sentences = perception.fitness
-            if perception.dropped.too_near and not self._told_of_near:
-                self._told_of_near = True
-                sentences = (*sentences, about_too_near(perception.dropped, perception.n_points, self.sensor))
+            found: dict[str, str] = {}
+            if perception.dropped.too_near:
+                found["too near"] = about_too_near(perception.dropped, perception.n_points, self.sensor)
             if perception.health is not None and self.on_mismatch != "ignore":
-                found = {kind: text for kind, text in findings_of(perception.health) if kind not in self._told_of}
-                self._told_of |= {*found}
-                sentences = (*sentences, *found.values())
-        for sentence in sentences:
+                found |= findings_of(perception.health)
+            news = [text for kind, text in found.items() if kind not in self._told_of]
+            self._told_of |= {*found}
+        for sentence in (*perception.fitness, *news):
             warnings.warn(sentence, stacklevel=2)
         return perception
 

@@ -33,13 +33,15 @@ class Stamp(float):
         return Stamp, (float(self), self.ns)
 
 
-def check_seconds(stamp_s: object) -> None:
-    """Raise StampError for a date, a text or whatever else is no number of seconds."""
+def as_seconds(stamp_s: object) -> float:
+    """A time [s] as a float; raises StampError for a date, a text or whatever else is no number of seconds."""
+    if isinstance(stamp_s, float):  # a `Stamp` stays one
+        return stamp_s
     try:
         # A text can be converted, too, and numpy's times, but to their own units.
         if not isinstance(stamp_s, SupportsFloat) or isinstance(stamp_s, np.datetime64 | np.timedelta64):
             raise TypeError
-        float(stamp_s)
+        return float(stamp_s)
     except (OverflowError, TypeError, ValueError):
         raise StampError(
             f"stamp_s is {stamp_s!r:.80}, a {type(stamp_s).__name__}; expected the time of the scan [s]"

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..errors import OptionError, StampError, TrackingError
-from ..system.clock import GAP_S, LATEST_S, Clock, Step, check_seconds
+from ..system.clock import GAP_S, LATEST_S, Clock, Step, as_seconds
 from ..types.perception import Box, Perception
 from ..types.points import Floats, Ints64, Records
 from ..types.rigid import rigid
@@ -198,8 +198,7 @@ class Tracker:
         UserWarning
             A scan was late or doubled, or the clock jumped; once each.
         """
-        check_seconds(stamp_s)
-        stamp_s = float(stamp_s)
+        stamp_s = float(as_seconds(stamp_s))
         if not abs(stamp_s) <= LATEST_S:
             raise StampError(f"got a scan at {stamp_s} s; expected a finite time in seconds, up to {LATEST_S:g}")
         step, clock = self._clock.after(stamp_s)

@@ -303,6 +303,11 @@ def test_a_perceiver_tells_of_each_kind_once_and_leaves_drops_out() -> None:
         warnings.simplefilter("error")
         again = perceive(bad)
     assert again.health == snowy.health
+    perceive.reset_mounting()
+    with warnings.catch_warnings(record=True) as anew:
+        warnings.simplefilter("always")
+        perceive(bad)
+    assert any("window of the sensor is blocked" in str(each.message) for each in anew)
     assert again.boxes == snowy.boxes
     np.testing.assert_array_equal(again.require_points().labels, snowy.require_points().labels)
     assert snowy.health.n_drops > 100
