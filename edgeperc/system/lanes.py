@@ -153,8 +153,10 @@ class _Schedule:
         while place is not None:
             try:
                 self._values[place].compute()
-            except BaseException:
+            except BaseException as exc:
                 self.stop()
+                if isinstance(exc, SystemError) and exc.__cause__ is not None:
+                    raise _first_cause(exc) from None
                 raise
             with self._lock:
                 for user in self._users[place]:
@@ -193,6 +195,15 @@ class _Schedule:
         with self._lock:
             self._left = 0
             self._changed.notify_all()
+
+
+def _first_cause(error: BaseException) -> BaseException:
+    """What a signal's handler raised while numba made objects of Python from what a kernel returns: it then raises
+    SystemError from that.
+    """
+    while error.__cause__ is not None:
+        error = error.__cause__
+    return error
 
 
 class _Beside:

@@ -92,6 +92,19 @@ def test_an_error_is_told_where_it_happened(n: int) -> None:
     assert computed == []
 
 
+def test_an_interrupt_within_numba_stays_one() -> None:
+    def interrupted() -> None:
+        try:
+            raise SystemError("unpickle returned a result with an exception set") from KeyboardInterrupt("Ctrl-C")
+        except SystemError as exc:
+            raise SystemError("the kernel returned a result with an exception set") from exc
+
+    value = Values(Stopwatch())
+    value("check", interrupted)
+    with pytest.raises(KeyboardInterrupt, match="Ctrl-C"):
+        Lanes(1).run(value)
+
+
 @pytest.mark.parametrize("n", [1, 2])
 def test_an_interrupt_ends_both_lanes(n: int) -> None:
     """Signals come to the thread that calls; the other one ends the value that it computes, and no more."""
