@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
@@ -60,7 +61,7 @@ def decode_scored_slots(
     view = _view_of(card)
     rows = _slot_rows(card, slots, 5)
     values = _cell_values(card, class_output, class_kind)
-    _check_finite(values, class_kind, card.name)
+    check_finite(values, class_kind, card.name)
     if not card.box_classes:
         return []
     inside = ((rows[:, :2] >= 0.0) & (rows[:, :2] < 1.0)).all(axis=1)
@@ -103,7 +104,7 @@ def _slot_rows(card: ModelCard, slots: Floats32, n_columns: int) -> Floats:
         raise CardMismatchError(
             f"{card.name}: no box_size_priors for {missing}; box_slots needs one for each box class"
         )
-    _check_finite(rows, "box_slots", card.name)
+    check_finite(rows, "box_slots", card.name)
     return rows.astype(np.float64)
 
 
@@ -162,8 +163,8 @@ def decode_dense(
         )
     values = _cell_values(card, class_output, class_kind)
     maps = np.ascontiguousarray(maps, dtype=np.float32)
-    _check_finite(maps, "box_dense", card.name)
-    _check_finite(values, class_kind, card.name)
+    check_finite(maps, "box_dense", card.name)
+    check_finite(values, class_kind, card.name)
     if not card.box_classes:
         return []
 
@@ -237,14 +238,15 @@ def class_values(output: Floats32, kind: str, model: str) -> Floats32:
     return np.ascontiguousarray(values, dtype=np.float32)
 
 
-def _check_finite(values: Floats32, kind: str, model: str) -> None:
+def check_finite(values: Floats32, kind: str, model: str) -> None:
+    """Raise `InferenceError` for an output with values that are not finite."""
     n_bad = count_not_finite(values.reshape(-1))
     if n_bad:
         raise_not_finite(n_bad, values.size, kind, model)
 
 
-def raise_not_finite(n_bad: int, n: int, kind: str, model: str) -> None:
-    """Raise `InferenceError` for an output with values that are not finite."""
+def raise_not_finite(n_bad: int, n: int, kind: str, model: str) -> NoReturn:
+    """Say that so many of n values of an output are not finite."""
     raise InferenceError(
         f"{model}: {n_bad} of {n} values of {kind} are not finite; expected numbers. "
         "Check the scan's units, or run the model with provider='cpu' and precision='fp32'"

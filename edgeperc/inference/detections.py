@@ -14,7 +14,7 @@ from ..types.detector import CENTER_VALUES, AnchorHead, CenterHead, PillarGeomet
 from ..types.geometry import suppress_overlaps, wrapped
 from ..types.perception import Box
 from ..types.points import Floats, Floats32, Ints64
-from .box_heads import MAX_PROBABILITY, SIZE_RANGE_M, count_not_finite, logit, raise_not_finite, sigmoid
+from .box_heads import MAX_PROBABILITY, SIZE_RANGE_M, check_finite, logit, sigmoid
 
 BEYOND_M = 5.0
 """A box whose center is farther out of the view is dropped."""
@@ -22,9 +22,7 @@ Values = Mapping[str, Floats32]
 
 
 def decode_detections(card: ModelCard, outputs: Values, score_threshold: float) -> list[Box]:
-    """Decode the boxes of a detector on pillars from its outputs by name, in the frame of the training points, best
-    score first; of boxes that overlap by more than the card's ``nms_iou``, of one class or ``across_classes``, the
-    best.
+    """Decode the boxes of a detector on pillars.
 
     outputs : by their names, with the batch's axis or without.
     Returns: In the frame of the training points, best score first; of boxes of one class, or of one group of a center
@@ -38,9 +36,7 @@ def decode_detections(card: ModelCard, outputs: Values, score_threshold: float) 
     maps: dict[str, list[Floats32]] = {}
     for spec in card.outputs:
         values = outputs[spec.name].reshape(card.shape_of(spec)[1:])
-        n_bad = count_not_finite(values.reshape(-1))
-        if n_bad:
-            raise_not_finite(n_bad, values.size, spec.name, card.name)
+        check_finite(values, spec.name, card.name)
         maps.setdefault(spec.kind, []).append(values)
     if isinstance(head, AnchorHead):
         rows, scores, labels, fronts = _anchor_boxes({k: v for k, (v,) in maps.items()}, view, head, score_threshold)

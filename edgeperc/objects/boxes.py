@@ -325,10 +325,7 @@ def _completed(
         size = max(extent, typical, MIN_SIDE_M)
         # The sensor is at 0 and saw the near end, unless it is beside the object.
         away = x * axis_x + y * axis_y
-        if abs(away) > 0.5 * extent:
-            sides.append((size, math.copysign(0.5 * (size - extent), away)))
-        else:
-            sides.append((size, 0.0))
+        sides.append((size, math.copysign(0.5 * (size - extent), away) if abs(away) > 0.5 * extent else 0.0))
     (length, shift), (width, slide) = sides
     x += shift * cos - slide * sin
     y += shift * sin + slide * cos

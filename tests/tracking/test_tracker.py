@@ -454,8 +454,8 @@ def test_errors_leave_the_tracker_as_it_was(posed: bool) -> None:
     for no_boxes in (None, 1, [None], "box"):
         with pytest.raises(TrackingError, match=r"pass edgeperc\.Box objects"):
             Tracker().update(no_boxes, 0.0)  # type: ignore[arg-type]
-    for no_time in (None, "now", [], 10**400):
-        with pytest.raises(StampError, match="expected the time of the scan"):
+    for no_time in (None, "3", [], 10**400):
+        with pytest.raises(StampError, match=r"stamp_s is .*; expected the time of the scan"):
             Tracker().update([], no_time)  # type: ignore[arg-type]
 
 
@@ -595,9 +595,3 @@ def assert_same_tracks(tracks: np.ndarray, wanted: np.ndarray) -> None:
 def test_parameters_that_would_lose_tracks_are_refused(changes: dict[str, Any]) -> None:
     with pytest.raises(OptionError, match=rf"{next(iter(changes))}.* is .*; expected"):
         replace(PARAMETERS["car"], **changes)
-
-
-@pytest.mark.parametrize("stamp_s", ["3", b"3", None, 1j, [0.1]])
-def test_a_stamp_is_a_number_of_seconds(stamp_s: Any) -> None:
-    with pytest.raises(StampError, match=r"stamp_s is .*; expected the time of the scan"):
-        Tracker().update([], stamp_s)
