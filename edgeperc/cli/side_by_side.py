@@ -183,7 +183,10 @@ class _ScanWorker:
         self._report = Report(arguments, {})
         state = (learned.mounting.mounting(), learned.mounting.n_scans, learned.remission.matched, learned.to_check)
         options = {name: value for name, value in sorted(vars(arguments).items()) if name not in _OTHERS}
-        self._made_of = repr((__version__, self._perceive.cards, dict(self._perceive.providers), state, options))
+        perceiver = self._perceive
+        # The sensor as it is: its file, or that of its mounting, may have changed since an earlier run.
+        named = perceiver.cards, perceiver.sensor, dict(perceiver.providers)
+        self._made_of = repr((__version__, *named, state, options))
 
     def __call__(self, item: tuple[Path | Remote, Path | Remote, Path | Remote]) -> _Answer:
         name, path, target = item

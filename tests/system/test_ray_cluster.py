@@ -10,6 +10,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from urllib.request import Request, urlopen
@@ -28,7 +29,7 @@ from edgeperc.simulation.scene import simulate
 from edgeperc.system.pool import Lost
 from edgeperc.system.ray_cluster import map_on_ray, signals_kept
 from edgeperc.system.remote import Remote, location
-from edgeperc.types.sensor import SensorProfile
+from edgeperc.types.sensor import SensorProfile, get_sensor
 from scenes import urban
 
 pytestmark = pytest.mark.filterwarnings("ignore")  # of Ray, boto and aiohttp
@@ -130,6 +131,10 @@ def test_what_workers_have_made_is_kept(
     _, others, said = run(*arguments, "--boxes-from", "network")
     assert "kept" not in said
     assert others != records
+    profile = tmp_path / "sensor.json"
+    for ego_box in (None, ((-9.0, 9.0), (-9.0, 9.0), (-1.0, 2.0))):
+        profile.write_text(replace(get_sensor("hdl-64e"), ego_box=ego_box).to_json())
+        assert "kept" not in run(*arguments, "--sensor", profile)[2]
 
 
 def figures(file: Path, *options: str) -> tuple[Any, list[str]]:
