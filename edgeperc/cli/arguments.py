@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from ..inference import providers
+from ..system.remote import Remote, location
 from ..types import choices
 from ..types.choices import DEFAULT_MODELS, DEFAULT_SENSOR, WEIGHTS
 
@@ -18,7 +19,6 @@ Commands = Any  # what ArgumentParser.add_subparsers returns; argparse keeps its
 _WIDTH = 78
 
 Options = Callable[..., None]  # of `options`
-_PATHS = {"FILE": Path, "DIR": Path}
 
 PROVIDERS = ("auto", *sorted(providers.PROVIDERS))
 PRECISIONS = ("auto", *choices.PRECISIONS)
@@ -61,12 +61,19 @@ def options(parser: argparse.ArgumentParser, title: str | None = None, **default
             settings["nargs"] = len(values)
         if values:
             metavar = values[0] if len(values) == 1 else tuple(values)
-            settings = {"metavar": metavar, "type": _PATHS.get(values[0])} | settings
+            settings = {"metavar": metavar, "type": _local if values[0] in ("FILE", "DIR") else None} | settings
         elif name.startswith("-") and "choices" not in settings:
             settings.setdefault("action", "store_true")
         group.add_argument(name, help=help, **settings)
 
     return add
+
+
+def _local(text: str) -> Path:
+    path = location(text)
+    if isinstance(path, Remote):  # as a path it would be a folder with the name of the protocol
+        raise argparse.ArgumentTypeError(f"{text} is a URL; expected a path of this computer")
+    return path
 
 
 def add_sensor(group: Options, *, required: bool = False, of_capture: bool = False) -> None:

@@ -113,6 +113,13 @@ def test_a_url_that_cannot_be_reached_is_named(capsys: pytest.CaptureFixture[str
     assert "ftp://127.0.0.1:1/a.bin: " in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("option", ["--mcap", "--static", "--bag"])
+def test_a_url_is_no_place_for_a_file_of_this_computer(option: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit, match="2"):
+        run("run", "a.bin", option, "s3://bucket/a")
+    assert f"{option}: s3://bucket/a is a URL; expected a path of this computer" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("out", ["a.bin", "a.bin/below"])
 def test_a_folder_that_cannot_be_made_is_named_with_its_option(
     out: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
