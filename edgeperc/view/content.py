@@ -71,8 +71,8 @@ def in_model_frame(perception: Perception, points: Points) -> tuple[Perception, 
 
 
 def drawable_points(points: Points) -> Mask:
-    """Which points are finite and within 1 km, (n,) bool."""
-    return np.asarray(np.isfinite(points).all(axis=1) & (np.abs(points[:, :3]) < _REACH_M).all(axis=1))
+    """Which points have a finite place within 1 km, (n,) bool; their remission may be unknown."""
+    return np.asarray((np.abs(points[:, :3]) < _REACH_M).all(axis=1))
 
 
 def drawable_boxes(boxes: Iterable[Box]) -> list[Box]:

@@ -218,8 +218,8 @@ def _scan(
     points, painted = points[seen], painted[seen]
     for name in (*names, *facts, *(box.label for box in perception.boxes)):
         classes.setdefault(name, len(classes))
-    # Some sensors give remission up to 255 or 65535.
-    remission = np.maximum(points[:, 3], 0.0) / max(1.0, float(points[:, 3].max(initial=0.0)))
+    remission = np.where(np.isfinite(points[:, 3]), np.maximum(points[:, 3], 0.0), 0.0)
+    remission /= max(1.0, float(remission.max(initial=0.0)))  # some sensors give it up to 255 or 65535
     scan: dict[str, Any] = {
         "ground": [round(value, 5) for value in content.ground_plane(perception, points)],
         "road": None if perception.top_view is None else _road(perception.top_view),

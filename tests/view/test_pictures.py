@@ -217,6 +217,19 @@ def test_tiny_scans(tmp_path: Path, scan: np.ndarray) -> None:
 
 
 @pytest.mark.usefixtures("matplotlib")
+def test_points_of_unknown_remission_are_drawn(scan: np.ndarray, perception: Perception, tmp_path: Path) -> None:
+    known, unknown = scan.copy(), scan.copy()
+    known[:, 3], unknown[:, 3] = 0.0, np.nan
+    pages = []
+    for points in (known, unknown):
+        write_html(perception, points, tmp_path / "page.html")
+        pages.append((tmp_path / "page.html").read_bytes())
+    assert pages[0] == pages[1]
+    assert view.draw(perception, known) == view.draw(perception, unknown)
+    assert flatten_scan(known, perception) == flatten_scan(unknown, perception)
+
+
+@pytest.mark.usefixtures("matplotlib")
 def test_strange_titles_and_classes(scan: np.ndarray, perception: Perception, tmp_path: Path) -> None:
     strange = "$\\frac{ <script>alert(1)</script> 走 \n \udcff @@SCENE@@" + "x" * 200
     classes = (*POINT_CLASSES[:3], "</script> & tram\nelement vertex 3")
