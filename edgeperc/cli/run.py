@@ -109,8 +109,9 @@ def add_parser(commands: Commands) -> None:
     )
     reading(
         "--calib FILE",
-        "KITTI's calibration of camera and LiDAR, the same for all images; with --scan and --png, NAME_both.png "
-        "shows the classes of the image on the points, and its road from above (default: no such picture)",
+        "KITTI's calibration of camera and LiDAR: a file for all images, or a folder with NAME.txt of each scan; with "
+        "--scan and --png, NAME_both.png shows the classes of the image on the points, and its road from above "
+        "(default: no such picture)",
     )
     add_capture(reading)
     reading(
@@ -336,9 +337,11 @@ def _check_outputs(
         value = getattr(arguments, name)
         outputs += [(f"--{name}", value)] if isinstance(value, Path) else []
     if arguments.static is not None:  # scans of a capture get numbers
+        from ..sinks.static import file_name
+
         written_of = [scan for scan in (images.values() if images else scans) if scan is not None]
         _check_static(arguments, written_of, captures)
-        names = {"000000.bin" if scan in captures else scan.name for scan in written_of}
+        names = {"000000.bin" if scan in captures else file_name(scan.name) for scan in written_of}
         outputs += [("--static", arguments.static / name) for name in sorted(names)]
     if arguments.labels_for == "cvat":
         outputs.append(("--labels-for", arguments.out / "annotations.zip"))
@@ -360,11 +363,13 @@ def _check_outputs(
 
 def _check_static(arguments: argparse.Namespace, scans: Sequence[Path], captures: Collection[Path]) -> None:
     """Check that no file of ``--static`` replaces another scan of the run, which may not even have been read yet."""
+    from ..sinks.static import file_name
+
     sources = {_real(scan) for scan in scans}
     replaced = {
         file
         for scan in scans
-        if scan not in captures and (file := _real(arguments.static / scan.name)) in sources - {_real(scan)}
+        if scan not in captures and (file := _real(arguments.static / file_name(scan.name))) in sources - {_real(scan)}
     }
     if captures:  # their scans get numbers, and nobody knows yet how many there are
         folder = Path(_real(arguments.static))
@@ -405,7 +410,9 @@ def _images(arguments: argparse.Namespace, kinds: Sequence[str]) -> dict[Path, P
 
         if not (images and scans and arguments.png):
             arguments.usage_error("--calib needs images with --scan and --png")
-        read_kitti_calibration(arguments.calib)  # errors of the file come before the first image
+        from ..sinks.prelabels import calibration_of
+
+        read_kitti_calibration(calibration_of(arguments.calib, scans[0].name))  # errors come before the first image
     if not images:
         return {}
     if arguments.live or arguments.deskew:
@@ -577,6 +584,7 @@ class _Run:
         from ..camera.calibration import Calibration
         from ..readers.files import read_points
         from ..readers.images import read_image
+        from ..sinks.prelabels import calibration_of
 
         arguments, perceivers, at_s = self._arguments, self._perceivers, self._at_s(None)
         try:
@@ -592,7 +600,8 @@ class _Run:
                 yield path, perception, None, None
                 return
             if "both" in wanted:
-                calibration = Calibration.from_kitti(arguments.calib, image.shape[1], image.shape[0])
+                calib = calibration_of(arguments.calib, str(scan))
+                calibration = Calibration.from_kitti(calib, image.shape[1], image.shape[0])
                 both, sensor = wanted.pop("both"), perceive.sensor
                 view.draw_painted(perception, image, points, calibration, both, sensor=sensor, title=path.name)
             yield self._answered(path, points, perception, perceive.sensor, wanted, at_s, scan)

@@ -64,9 +64,9 @@ class PrelabelSink:
     kind : str
         One of `KINDS`.
     calib : str or Path, optional
-        Calibration of ``"kitti"``: a file of `read_kitti_calibration` for all scans, or a folder with ``NAME.txt`` for
-        each. Default: a nominal camera in the place of the sensor that looks ahead, so that the boxes come back
-        exactly, but fit no image.
+        Calibration of ``"kitti"``: a file of `read_kitti_calibration` or the folder of a raw drive's day for all scans,
+        or a folder with ``NAME.txt`` for each. Default: a nominal camera in the place of the sensor that looks ahead,
+        so that the boxes come back exactly, but fit no image.
 
     Raises
     ------
@@ -187,12 +187,12 @@ class PrelabelSink:
         self._file.check()
 
     def _kitti(self, name: str, scan: PerceivedScan, boxes: Sequence[Named]) -> None:
-        T_cam_sensor, P2, text = _NOMINAL_TR, _NOMINAL_P2, None
+        T_cam_sensor, P2, text = _NOMINAL_TR, _NOMINAL_P2, ""
         if self._calib is not None:
-            path = self._calib / f"{name}.txt" if self._calib.is_dir() else self._calib
+            path = calibration_of(self._calib, scan.name)
             T_cam_sensor, P2 = read_kitti_calibration(path)
-            text = path.read_text("utf-8")
-        if text is None:
+            text = path.read_text("utf-8") if path.is_file() else ""
+        if not ("R0_rect" in text and "Tr_velo_to_cam" in text):  # readers of objects know no other names
             rows = {f"P{k}": P2 for k in range(4)} | {"R0_rect": np.eye(3), "Tr_velo_to_cam": T_cam_sensor[:3]}
             rows["Tr_imu_to_velo"] = np.eye(4)[:3]
             text = "".join(f"{key}: {' '.join(f'{v:.6e}' for v in row.ravel())}\n" for key, row in rows.items())
@@ -207,6 +207,12 @@ class PrelabelSink:
         target = self._files.checked(self._folder / name, scan)
         target.parent.mkdir(exist_ok=True)
         write_atomic(target, content)
+
+
+def calibration_of(calib: Path, scan: str) -> Path:
+    """KITTI's calibration of a scan: a file or a raw drive's folder for all, or a folder with one for each."""
+    of_day = (calib / "calib_cam_to_cam.txt").exists()
+    return calib / f"{stem_of(scan)[0]}.txt" if calib.is_dir() and not of_day else calib
 
 
 def cvat_cuboid(box: Box) -> dict[str, list[float]]:

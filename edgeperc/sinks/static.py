@@ -71,13 +71,11 @@ class StaticSink:
             raise OptionError("there are no tracks, so nothing is known to move; track the boxes (--track)")
         if self._without == "movable" or (scan.tracks is not None and scan.tracks.is_late):
             gone |= movable_points(scan.perception, points)
-        stem, suffix = stem_of(scan.name)
-        name = Path(scan.name).name if suffix else f"{stem}.bin"
-        target = self._files.checked(self._folder / name, scan.name)
+        target = self._files.checked(self._folder / file_name(scan.name), scan.name)
         xyz: NDArray[Any] = points[:, :3]
         if scan.perception.origin_m is not None:
             xyz = scan.perception.to_map(points)
-        write_atomic(target, _content(xyz, points[:, 3], ~gone, suffix, scan.name))
+        write_atomic(target, _content(xyz, points[:, 3], ~gone, scan.name))
         self.n_points += len(points)
         self.n_removed += int(np.count_nonzero(gone))
 
@@ -85,8 +83,15 @@ class StaticSink:
         """Do nothing; every file is complete."""
 
 
-def _content(xyz: NDArray[Any], remission: Floats32, kept: Mask, suffix: str, source: str) -> bytes:
+def file_name(scan: str) -> str:
+    """Name of the file that a scan becomes: its own, or a raw one's if it has another format."""
+    stem, suffix = stem_of(scan)
+    return Path(scan).name if suffix else f"{stem}.bin"
+
+
+def _content(xyz: NDArray[Any], remission: Floats32, kept: Mask, source: str) -> bytes:
     """The file of the points that are kept; their coordinates have the type of ``xyz``."""
+    suffix = stem_of(source)[1]
     if suffix == ".pcd.bin":
         whole = np.fromfile(source, "<f4")
         if whole.size != 5 * len(xyz):

@@ -103,6 +103,21 @@ def test_what_is_written_of_a_scan_with_its_image_is_of_the_scan(
     assert scan.read_bytes() == before
 
 
+def test_each_image_may_have_its_calibration(tmp_path: Path, model: Path) -> None:
+    pytest.importorskip("matplotlib")
+    image, scan = write_image(tmp_path / "a.png"), write_scan(tmp_path / "0.bin", 4000)
+    (tmp_path / "calib").mkdir()
+    calibration = "P2: 30 0 20 0 0 30 15 0 0 0 1 0\nR0_rect: 1 0 0 0 1 0 0 0 1\n"
+    calibration += "Tr_velo_to_cam: 0 -1 0 0 0 0 -1 0 1 0 0 0\n"
+    (tmp_path / "calib/0.txt").write_text(calibration)
+    out = tmp_path / "out"
+    wanted = ("--calib", tmp_path / "calib", "--png", "--labels-for", "kitti", "--out", out)
+    options = ("--model", model, "--model", "pointseg", *CPU, "--on-mismatch", "ignore", "--sensor", "hdl-64e")
+    assert run("run", image, "--scan", scan, *options, *wanted) == 0
+    assert (out / "a_both.png").exists()
+    assert (out / "calib/0.txt").read_text() == calibration
+
+
 def test_an_image_that_fails_leaves_the_others(tmp_path: Path, model: Path, capsys: pytest.CaptureFixture[str]) -> None:
     bad, good = tmp_path / "bad.jpg", write_image(tmp_path / "good.png")
     bad.write_bytes(b"\xff\xd8\xff")

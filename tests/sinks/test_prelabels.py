@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from cli_helpers import POINTSEG, run, thinned
 from edgeperc import Box, CalibrationError, OptionError, Perception, PointsError, Tracker, Tracks
+from edgeperc.camera.calibration import read_kitti_calibration
 from edgeperc.cli.main import build_parser
 from edgeperc.datasets.annotations import read_labelcloud, read_sustechpoints
 from edgeperc.datasets.scan_folder import ScanFolder
@@ -285,6 +286,14 @@ def test_kitti_labels_lie_in_the_image_of_their_camera(tmp_path: Path) -> None:
     assert (one / "calib/b.txt").read_text() == CALIBRATION
     with pytest.raises(FileNotFoundError):
         written(tmp_path / "none", "kitti", perceived("c.bin"), calib=calibs)
+    values = dict(line.split(": ") for line in CALIBRATION.splitlines())
+    (calibs / "calib_cam_to_cam.txt").write_text(f"R_rect_00: {values['R0_rect']}\nP_rect_02: {values['P2']}\n")
+    from_velo = np.array(values["Tr_velo_to_cam"].split()).reshape(3, 4)
+    lines = [f"{key}: {' '.join(part.ravel())}" for key, part in (("R", from_velo[:, :3]), ("T", from_velo[:, 3]))]
+    (calibs / "calib_velo_to_cam.txt").write_text("\n".join(lines))
+    day = written(tmp_path / "day", "kitti", perceived("a.bin"), calib=calibs)
+    for found, expected in zip(*map(read_kitti_calibration, (day / "calib/a.txt", calib)), strict=True):
+        np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-6)
     calib.write_text("P2: 1")
     with pytest.raises(CalibrationError, match="expected P2, R0_rect"):
         written(tmp_path / "wrong", "kitti", perceived("a.bin"), calib=calib)

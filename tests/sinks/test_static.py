@@ -175,7 +175,7 @@ def test_the_command_writes_every_scan(tmp_path: Path, monkeypatch: pytest.Monke
         assert left.value.code == 2
 
 
-@pytest.mark.parametrize("paths", [("a", "b"), ("b", "a"), ("a", "drive.pcap")])
+@pytest.mark.parametrize("paths", [("a", "b"), ("b", "a"), ("a", "drive.pcap"), ("000001.csv", "a")])
 def test_no_scan_is_replaced_by_another_one(
     paths: tuple[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -184,6 +184,7 @@ def test_no_scan_is_replaced_by_another_one(
         (tmp_path / folder).mkdir()
         POINTS.tofile(tmp_path / folder / "000001.bin")
     (tmp_path / "drive.pcap").write_bytes(bytes(24))
+    (tmp_path / "000001.csv").write_text("x,y,z,intensity\n1,2,3,0.5\n")  # becomes 000001.bin
     with pytest.raises(SystemExit):
         run("run", *(tmp_path / path for path in paths), "--movable", "--static", tmp_path / "a")
     assert "would be overwritten by --static with another one" in capsys.readouterr().err
