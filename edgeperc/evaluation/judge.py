@@ -273,8 +273,8 @@ class Judge:
             tallies |= banded(("pixels",), truth.classes, pixels, right, range_m)
         counted = right != IGNORE
         if set(truth.classes) <= {*POINT_CLASSES}:
-            of_causes = (renamed(each, truth.classes, POINT_CLASSES) for each in (labels, truth.labels))
-            tallies |= count_causes(truth.points, *of_causes, counted, predicted.in_view, truth.boxes, truth.drive)
+            said, known = (renamed(each, truth.classes, POINT_CLASSES) for each in (labels, truth.labels))
+            tallies |= count_causes(truth.points, said, known, counted, predicted.in_view, truth.boxes, truth.drive)
         tallies |= {("objects", band): Counter() for band in BANDS}
         by_box = {id(box) for box in (*mistakes.found, *(box for box, _ in mistakes.missed))}
         hit, missed = [*mistakes.found], [*mistakes.missed]
