@@ -240,16 +240,8 @@ def test_every_disturbance_is_reported() -> None:
     hardware = {"logical_cores": 4}
     fine = quiet(at_s=10.0, busy_s=8.5)
     assert context.disturbances(hardware, quiet(), fine, 8.0) == []
-    loud = quiet(
-        at_s=10.0,
-        busy_s=28.0,
-        stolen_s=2.0,
-        throttle_count=9,
-        quota_throttled=3,
-        mhz=2000.0,
-        temperature_c=95.0,
-        on_battery=True,
-    )
+    counts = {"throttle_count": 9, "quota_throttled": 3, "on_battery": True}
+    loud = quiet(at_s=10.0, busy_s=28.0, stolen_s=2.0, mhz=2000.0, temperature_c=95.0, **counts)
     found = "\n".join(context.disturbances(hardware, quiet(), loud, 8.0))
     for part in ("2.0 of 4 cores", "5% of the CPU time", "heat 2 times", "quota paused it 3 times", "95 C", "2000 MHz"):
         assert part in found
@@ -292,11 +284,8 @@ def test_loadgen_absent_says_what_to_install(monkeypatch: pytest.MonkeyPatch, tm
 
 
 def test_loadgens_summary_is_read(tmp_path: Path) -> None:
-    lines = [
-        "Result is : VALID",
-        "50.00 percentile latency (ns)   : 1500000",
-        "99.90 percentile latency (ns)   : 2500000",
-    ]
+    lines = ["Result is : VALID"]
+    lines += [f"{p} percentile latency (ns)   : {ns}" for p, ns in (("50.00", 1500000), ("99.90", 2500000))]
     (tmp_path / loadgen.SUMMARY).write_text("\n".join(lines))
     summary = loadgen.read_summary(tmp_path)
     assert (summary["p50"], summary["p99.9"], summary["result"]) == (1.5, 2.5, "VALID")

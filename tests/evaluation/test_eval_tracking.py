@@ -281,17 +281,8 @@ def test_a_models_boxes_are_evaluated(kitti: Path, capsys: pytest.CaptureFixture
         (kitti / f"detections/pointrcnn_{of}/0000.txt").unlink()
     boxes = kitti / "boxes.jsonl"
     boxes.write_text("\n".join(map(json.dumps, lines)))
-    arguments = [
-        "eval-tracking",
-        str(kitti),
-        "--sequences",
-        "0000",
-        "--boxes",
-        str(boxes),
-        "--classes",
-        "vehicle",
-        "car",
-    ]
+    of_boxes = ["--sequences", "0000", "--boxes", str(boxes), "--classes", "vehicle", "car"]
+    arguments = ["eval-tracking", str(kitti), *of_boxes]
     assert cli.main([*arguments, "--json", str(kitti / "figures.json")]) == 0
     figures = json.loads((kitti / "figures.json").read_text())["classes"]
     assert figures["vehicle"]["best"]["mota"] > 0.9  # the car and the van

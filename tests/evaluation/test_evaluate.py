@@ -71,6 +71,7 @@ def card(name: str, **given: Any) -> ModelCard:
 
 
 box = partial(scenes.box, size=(4.0, 2.0, 1.6), z=-1.0)
+someone = partial(scenes.box, size=(0.8, 0.6, 1.7), z=-1.0)
 
 
 class World:
@@ -223,7 +224,7 @@ def test_labels_of_kitti_are_measured_by_levels_and_other_boxes_all_round(world:
 
 def test_boxes_of_clusters_by_hand(world: World) -> None:
     car, van, beside, far = box(10, 0), box(20, 4, "van"), box(30, -13), box(60, 0)
-    person = replace(box(20, -5, "pedestrian"), size=(0.8, 0.6, 1.7))
+    person = someone(20, -5, "pedestrian")
     points = [p for each in (car, van, person, beside, far) for p in hits(each, 3)]
     frame_of_all = frame(car, van, person, beside, far, points=points)
     world.boxes = (
@@ -253,9 +254,7 @@ def test_boxes_of_clusters_by_hand(world: World) -> None:
 
 def test_boxes_all_round_by_hand(world: World) -> None:
     car, van, beside, hidden = box(10, 0), box(20, 4, "van"), box(30, -13), box(36, 0)
-    person, rider = (
-        replace(box(20, y, name), size=(0.8, 0.6, 1.7)) for y, name in ((-5, "pedestrian"), (-9, "cyclist"))
-    )
+    person, rider = someone(20, -5, "pedestrian"), someone(20, -9, "cyclist")
     seated = replace(person, label="person_sitting", center=(24.0, -5.0, -1.0))
     every = (car, van, beside, person, rider, seated)
     one = frame(*every, hidden, points=[p for each in every for p in hits(each, 3)] + hits(hidden, 2))
@@ -301,9 +300,7 @@ def test_boxes_all_round_by_hand(world: World) -> None:
 
 def test_the_ground_in_boxes_and_people_who_sit_are_left_out_of_a_second_figure(world: World) -> None:
     car = box(10, 0)
-    person, seated = (
-        replace(box(20, y, name), size=(0.8, 0.6, 1.7)) for y, name in ((-5, "pedestrian"), (5, "person_sitting"))
-    )
+    person, seated = someone(20, -5, "pedestrian"), someone(20, 5, "person_sitting")
     lot = [[x, y, -1.73, 0.0] for x in np.arange(-20.0, 40.0, 0.5) for y in np.arange(-15.0, 15.0, 0.5)]
     below = [[10.0 + 0.1 * k, 0.0, -1.73, 1.0 if k < 4 else 0.0] for k in range(6)]
     given = hits(person, 3, 2) + hits(person, 1, label=0) + hits(seated, 1, 2) + hits(seated, 5, label=0)
@@ -330,7 +327,7 @@ def test_finer_classes_count_as_those_of_the_labels() -> None:
 def test_classes_that_a_set_does_not_label_are_no_mistakes(world: World) -> None:
     """Of cars alone, as one class with vans: people on foot and vans that are found there may well be right."""
     car, van = box(20, 0), box(30, 5, "van")
-    person = replace(box(20, -5, "pedestrian"), size=(0.8, 0.6, 1.7))
+    person = someone(20, -5, "pedestrian")
     points = np.array([*hits(car, 3), *hits(van, 3), *hits(person, 4, 2), [12.0, 6.0, -1.7, 0]], np.float32)
     world.boxes = (car, van, person)
     world.cells["ssadnet"] = np.zeros((400, 200), np.uint8)
@@ -846,22 +843,9 @@ def test_the_command_on_simulated_scans(tmp_path: Path, capsys: pytest.CaptureFi
     assert set(result["models"]) == {*DEFAULT}
     assert (result["split"], result["fold"]) == ("test", None)
     simulated = result["simulated"]
-    groups = {
-        "labeled",
-        "points",
-        "sure",
-        "pixels",
-        "boxes",
-        "all_round",
-        "kitti",
-        "centers",
-        "heading",
-        "errors",
-        "bumper",
-        "segmentation",
-        "road",
-    }
-    assert set(simulated) == groups | {"n_frames", "n_drives"}
+    of_points, of_boxes = {"points", "sure", "pixels", "errors", "bumper"}, {"boxes", "all_round", "kitti", "centers"}
+    others = {"labeled", "heading", "segmentation", "road", "n_frames", "n_drives"}
+    assert set(simulated) == of_points | of_boxes | others
     assert simulated["all_round"]["all"]["car"]["n_truth"] >= simulated["boxes"]["oriented"]["all"]["car"]["n_truth"]
     assert simulated["segmentation"]["every cell"]["all"]["n_cells"] == 160_000
     assert 0.5 < simulated["points"]["all"]["car"]["iou"] <= 1.0
