@@ -174,9 +174,7 @@ def _figures(tallies: Tallies) -> dict[str, Any]:
 
 
 def _labeled_rows(labeled: Counter[ObjectKey]) -> dict[str, Any]:
-    n_boxes: Counter[str] = Counter()
-    for key, n in labeled.items():
-        n_boxes[key[1]] += n
+    n_boxes = Counter(key[1] for key in labeled.elements())
     return {
         name: {"n_boxes": n} | _distinct(key for key in labeled if key[1] == name) for name, n in n_boxes.most_common()
     }
