@@ -34,6 +34,8 @@ def inflate(packed: bytes, method: str, limit: int | None = None) -> bytes:
             content = _decompressor(method)(packed, limit + 1)
         except (PointsError, ImportError, MemoryError):
             raise
+        except EOFError as exc:
+            raise PointsError(f"the {method} data is cut short") from exc
         except Exception as exc:  # each library has its own errors
             raise PointsError(f"the {method} data is damaged: {exc}") from exc
     else:
@@ -72,8 +74,8 @@ def _decompressor(method: str) -> Any:
     """A function from the compressed bytes and a number to at most so many bytes."""
     if method == "deflate":
         return zlib.decompressobj(-15).decompress
-    if method == "bz2":
-        return _each_bz2
+    if method == "bz2":  # several streams may follow one another, as parallel compressors write them
+        return lambda packed, most: _in_pieces(bz2.BZ2File(io.BytesIO(packed)).read, most)
     if method == "lz4":
         lz4 = require("lz4.frame", "bags", "Reading lz4 data")
         return lambda packed, most: _in_pieces(lz4.LZ4FrameFile(io.BytesIO(packed)).read, most)
@@ -88,15 +90,3 @@ def _in_pieces(read: Callable[[int], bytes], most: int) -> bytes:
         pieces.append(piece)
         n += len(piece)
     return b"".join(pieces)
-
-
-def _each_bz2(packed: bytes, most: int) -> bytes:
-    """Several streams may follow one another, as parallel compressors write them."""
-    content = b""
-    while packed and len(content) < most:
-        stream = bz2.BZ2Decompressor()
-        content += stream.decompress(packed, most - len(content))
-        if not stream.eof and len(content) < most:
-            raise PointsError("the bz2 data is cut short")
-        packed = stream.unused_data
-    return content

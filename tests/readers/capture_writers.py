@@ -189,6 +189,16 @@ def field(name: str, offset: int, kind: str, count: int = 1) -> SimpleNamespace:
     return SimpleNamespace(name=name, offset=offset, datatype=TYPES[kind], count=count)
 
 
+def cloud_of(
+    fields: Sequence[Any], shape: tuple[int, int], step: int, data: bytes, row_padding: int = 0, order: str = "<"
+) -> SimpleNamespace:
+    """The attributes of a message of rows and columns of points."""
+    return SimpleNamespace(
+        height=shape[0], width=shape[1], fields=fields, is_bigendian=order == ">", point_step=step,
+        row_step=shape[1] * step + row_padding, data=data, is_dense=False,
+    )  # fmt: skip
+
+
 def ros_cloud(types: Any, cloud: Any, stamp: tuple[int, int], seq: int | None = None) -> Any:
     """A cloud's attributes as a message of rosbags; ``seq``: of ROS 1."""
     header = types["std_msgs/msg/Header"](
@@ -209,15 +219,8 @@ def write_clouds(path: Path, scans: Iterable[tuple[float, NDArray[Any]]]) -> Pat
         connection = bag.add_connection("/points", CLOUD, typestore=store)
         for k, (stamp_s, given) in enumerate(scans):
             rows, kind = np.atleast_2d(given), given.dtype
-            cloud = SimpleNamespace(
-                height=rows.shape[0],
-                width=rows.shape[1],
-                fields=[field(name, kind.fields[name][1], kind[name].str[1:]) for name in kind.names],
-                is_bigendian=False,
-                point_step=kind.itemsize,
-                row_step=kind.itemsize * rows.shape[1],
-                data=rows.tobytes(),
-            )
+            fields = [field(name, kind.fields[name][1], kind[name].str[1:]) for name in kind.names]
+            cloud = cloud_of(fields, rows.shape, kind.itemsize, rows.tobytes())
             message = ros_cloud(store.types, cloud, (int(stamp_s), round(stamp_s % 1 * 1e9)), k)
             bag.write(connection, round(stamp_s * 1e9), store.serialize_ros1(message, CLOUD))
     return path

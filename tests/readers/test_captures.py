@@ -16,6 +16,7 @@ from capture_writers import (
     CLOUD,
     TYPES,
     check_same,
+    cloud_of,
     field,
     join,
     mcap_channel,
@@ -115,16 +116,7 @@ def cloud(
         data += b"\xab" * padding
         if (k + 1) % width == 0:
             data += b"\xcd" * row_padding
-    return SimpleNamespace(
-        height=height,
-        width=width,
-        fields=fields,
-        is_bigendian=order == ">",
-        point_step=step,
-        row_step=width * step + row_padding,
-        data=bytes(data),
-        is_dense=False,
-    )
+    return cloud_of(fields, (height, width), step, bytes(data), row_padding, order)
 
 
 @pytest.mark.parametrize("order", ["<", ">"])

@@ -436,17 +436,8 @@ def test_run_with_deskew(by: str, tmp_path: Path, capsys: pytest.CaptureFixture[
     times = 1699.5 + 0.1 * np.arange(10)
     write_tum(tmp_path / "poses.txt", times, [pose_at(t - 1699.5) for t in times])
     options = ["--poses", tmp_path / "poses.txt"] if by == "--poses" else ["--track"]
-    options += [
-        "--model",
-        "pointseg",
-        "--sensor",
-        "hdl-64e",
-        "--on-mismatch",
-        "ignore",
-        "--ply",
-        "--out",
-        tmp_path / "out",
-    ]
+    options += ["--model", "pointseg", "--sensor", "hdl-64e", "--on-mismatch", "ignore"]
+    options += ["--ply", "--out", tmp_path / "out"]
     assert run("run", path, "--deskew", *options) == 0
     assert ("first two scans" in capsys.readouterr().err) == (by == "--track")
     off = [off_the_walls(edgeperc.read_points(file)) for file in sorted((tmp_path / "out").rglob("*.ply"))]
