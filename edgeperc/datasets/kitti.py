@@ -153,17 +153,20 @@ class Frame:
         return labels
 
 
-def read_labels(path: Path) -> KittiLabels:
-    """Read the rows of a KITTI label file. Raises PointsError, which names the line."""
+def label_lines(path: Path) -> list[tuple[int, str]]:
+    """Number and text of each line of a label file that is not blank. Raises PointsError."""
     try:
         text = path.read_bytes().decode("utf-8-sig")
     except (OSError, UnicodeDecodeError) as exc:
         raise PointsError(f"{path}: the labels cannot be read ({exc})") from exc
+    return [(number, line) for number, line in enumerate(text.splitlines(), start=1) if line.strip()]
+
+
+def read_labels(path: Path) -> KittiLabels:
+    """Read the rows of a KITTI label file. Raises PointsError, which names the line."""
     rows = []
-    for number, line in enumerate(text.splitlines(), start=1):
+    for number, line in label_lines(path):
         words = line.split()
-        if not words:
-            continue
         try:
             values = [float(word) for word in words[1:15]]
         except ValueError as exc:

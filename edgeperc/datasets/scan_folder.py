@@ -43,6 +43,7 @@ from .kitti import (
     WHOLE_TURN,
     KittiCalibration,
     KittiLabels,
+    label_lines,
     read_drives,
     read_labeled,
     read_numbers,
@@ -379,14 +380,8 @@ def _read_boxes(path: Path, columns: Sequence[str]) -> list[Box]:
     """Boxes of a label file, with the classes in it."""
     boxes: list[Box] = []
     place = {column: columns.index(column) for column in BOX_COLUMNS}
-    try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
-    except (OSError, UnicodeDecodeError) as exc:
-        raise PointsError(f"{path}: the labels cannot be read ({exc})") from exc
-    for number, line in enumerate(lines, 1):
+    for number, line in label_lines(path):
         values = line.split()
-        if not values:
-            continue
         try:
             x, y, z, length, width, height, yaw = (float(values[place[column]]) for column in BOX_COLUMNS[1:])
         except (IndexError, ValueError) as exc:

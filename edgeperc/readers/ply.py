@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from itertools import accumulate
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +20,8 @@ _PLY_TYPES = {
 }
 
 
-class _PlyElement(NamedTuple):
+@dataclass(frozen=True)
+class _PlyElement:
     name: str
     count: int
     properties: list[tuple[str, str, str]]  # name, type, type of a list's length or ""
