@@ -446,6 +446,8 @@ def test_damaged_osf_is_refused_before_the_sdk_opens_it(ouster: Path, tmp_path: 
 def test_packets_without_a_lidar_are_refused(tmp_path: Path, ouster: Path) -> None:
     path = write_pcap(tmp_path / "other.pcap", [b"name server" * 9] * 7)
     assert "not a Velodyne capture" in error_of(path)
+    with pytest.raises(PointsError, match=r"other\.pcap: not a Velodyne capture"):
+        edgeperc.sensor_of(path)
     path.with_suffix(".json").write_text((ouster / "sphere.json").read_text())
     assert "has 7 packets, none from a supported LiDAR" in error_of(path)
 
