@@ -20,11 +20,12 @@ import numpy as np
 from ..errors import PointsError
 from ..system.names import by_number
 from .inflate import inflate, inflate_file, inflated_message, most_bytes
-from .mcap import MCAP_MAGIC, BagFile, Channel, McapFile, Message, by_time, unpack
+from .mcap import ALIVE_EVERY, MCAP_MAGIC, BagFile, Channel, McapFile, Message, by_time, unpack
 from .tables import MAX_BYTES
 
 BAG_SUFFIXES = (".db3", ".mcap")
 _ROS1_MAGIC = b"#ROSBAG V"
+_STEPS = 100_000  # of sqlite's machine, about a millisecond, after which it is said to be alive
 
 
 def bag_files(folder: Path) -> list[Path]:
@@ -51,7 +52,7 @@ def open_bag(path: Path, folder: Path, alive: Callable[[], None]) -> list[BagFil
             if file.suffix == ".zstd":
                 plain = folder / file.stem
                 left -= inflate_file(file, plain, left, alive)
-            opened.append(_open_file(plain))
+            opened.append(_open_file(plain, alive))
         except PointsError as exc:
             opened.append(Unreadable(PointsError(f"{file.name}: {exc}") if path.is_dir() else exc))
     missing = sorted(_declared(path) - {file.name for file in files}) if path.is_dir() else []
@@ -75,15 +76,15 @@ def _declared(folder: Path) -> set[str]:
     return {PurePosixPath(name.strip().strip("\"'")).name for name in names} - {""}
 
 
-def _open_file(path: Path) -> BagFile:
+def _open_file(path: Path, alive: Callable[[], None]) -> BagFile:
     with path.open("rb") as content:
         head = content.read(16)
     if head.startswith(_ROS1_MAGIC):
-        return Ros1Bag(path)
+        return Ros1Bag(path, alive)
     if head.startswith(b"SQLite format 3\0"):
-        return SqliteBag(path)
+        return SqliteBag(path, alive)
     if head.startswith(MCAP_MAGIC):
-        return McapFile(path)
+        return McapFile(path, alive)
     raise PointsError(
         f"the file is damaged or cut short: it begins with {head!r}; expected a bag of ROS 1, a database of ROS 2 or "
         "MCAP"
@@ -106,8 +107,8 @@ class Unreadable(BagFile):
 class SqliteBag(BagFile):
     """A .db3 file of rosbag2 as `BagFile`."""
 
-    def __init__(self, path: Path) -> None:
-        self._path = path
+    def __init__(self, path: Path, alive: Callable[[], None]) -> None:
+        self._path, self._alive = path, alive
 
     def topics(self) -> set[Channel]:
         with closing(self._open()) as database:
@@ -131,7 +132,9 @@ class SqliteBag(BagFile):
         # Nothing is written beside the file. What a recorder had not yet copied from its log is read if it can be.
         has_log = self._path.with_name(self._path.name + "-wal").exists()
         mode = "mode=ro" if has_log else "mode=ro&immutable=1"
-        return sqlite3.connect(f"file:{quote(str(self._path.absolute()))}?{mode}", uri=True)
+        database = sqlite3.connect(f"file:{quote(str(self._path.absolute()))}?{mode}", uri=True)
+        database.set_progress_handler(self._alive, _STEPS)
+        return database
 
     @staticmethod
     def _rows(database: sqlite3.Connection, query: str, *values: object) -> Iterator[tuple[Any, ...]]:
@@ -144,7 +147,8 @@ class SqliteBag(BagFile):
 class Ros1Bag(BagFile):
     """A .bag file (format 2.0) as `BagFile`."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, alive: Callable[[], None]) -> None:
+        self._alive = alive
         self._data = np.memmap(path, np.uint8, "r").data
         line, ended, _ = bytes(self._data[:64]).partition(b"\n")
         if not ended:
@@ -191,7 +195,9 @@ class Ros1Bag(BagFile):
         return int(index)
 
     def _messages(self) -> Iterator[Message]:
-        for fields, content in _ros1_records(self._data, 13):
+        for k, (fields, content) in enumerate(_ros1_records(self._data, 13)):
+            if fields["op"] == b"\x05" or k % ALIVE_EVERY == 0:
+                self._alive()
             if fields["op"] == b"\x05":
                 method = fields.get("compression", b"").decode("ascii", "replace")
                 (n_bytes,) = unpack("<I", fields.get("size", b""))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import struct
 import zlib
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
@@ -18,6 +18,7 @@ MCAP_MAGIC = b"\x89MCAP0\r\n"
 _HEADER, _FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _DATA_END = 1, 2, 3, 4, 5, 6, 15
 
 
+ALIVE_EVERY = 64  # records
 Message = tuple[int, int, memoryview]  # number of the channel, time of recording [ns], bytes
 
 
@@ -42,11 +43,12 @@ class BagFile(Protocol):
 class McapFile(BagFile):
     """One .mcap file, read from front to back; an index is not needed.
 
-    channels : dict of int to Channel; those of the summary, or those among the messages.
+    alive : called for each chunk and now and then between, as the next message of a topic may be far.
     Raises PointsError: it does not begin as an MCAP file, or is damaged before its first channel.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, alive: Callable[[], None]) -> None:
+        self._alive = alive
         self._schemas: dict[int, str] = {}
         self._is_named = True  # whether the schema of each channel was known when the channel was
         self._channels: dict[int, Channel] = {}  # those of the summary, or those among the messages
@@ -84,7 +86,9 @@ class McapFile(BagFile):
 
     def _messages(self) -> Iterator[Message]:
         """Channel's number, time of recording [ns] and bytes: chunk by chunk, within a chunk in the order of time."""
-        for kind, content in _records(self._data, 8):
+        for k, (kind, content) in enumerate(_records(self._data, 8)):
+            if kind == _CHUNK or k % ALIVE_EVERY == 0:
+                self._alive()
             if kind == _CHUNK:
                 yield from by_time(self._of_records(_records(memoryview(_unpacked(content)), 0, is_chunk=True)))
             elif kind == _DATA_END:

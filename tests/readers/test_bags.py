@@ -79,6 +79,13 @@ def test_cuts_at_every_byte(recording: Path, tmp_path: Path) -> None:
     assert most == 3 or recording.suffix == ".db3"
 
 
+def test_a_long_search_for_the_next_message_is_no_standstill(recording: Path) -> None:
+    """The process that reads a bag without an index, or of other topics, says now and then that it is alive."""
+    said: list[bool] = []
+    list(decode(recording, recording.suffix, None, None, lambda text: None, lambda: said.append(True)))
+    assert said or recording.suffix == ".db3"  # a small database takes too few steps
+
+
 @settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(place=st.floats(0.0, 1.0), damage=st.binary(min_size=1, max_size=40))
 def test_damaged_bytes_are_typed_errors(recording: Path, tmp_path: Path, place: float, damage: bytes) -> None:
