@@ -118,16 +118,6 @@ def test_results_own_their_arrays(perceive: Perceiver, image: NDArray[np.uint8])
     np.testing.assert_array_equal(first.labels, kept)
 
 
-def test_memory_layout_does_not_matter(perceive: Perceiver, image: NDArray[np.uint8]) -> None:
-    known = perceive(image=image).require_image()
-    frozen = image.copy()
-    frozen.flags.writeable = False
-    others: list[Any] = [np.asfortranarray(image), frozen, image[:, :, ::-1][:, :, ::-1], memoryview(image)]
-    for other in others:
-        found = perceive(image=other).require_image()
-        np.testing.assert_array_equal(found.labels, known.labels)
-
-
 def test_one_perceiver_in_threads_gives_the_same_result(perceive: Perceiver, image: NDArray[np.uint8]) -> None:
     images = [image, image[::-1], image[:, ::-1], image[::2, ::2]]
 

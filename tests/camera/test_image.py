@@ -38,7 +38,7 @@ def noise(height: int, width: int, seed: int = 0) -> NDArray[np.uint8]:
     return np.random.default_rng(seed).integers(0, 256, (height, width, 3), dtype=np.uint8)
 
 
-def scaled(image: NDArray[np.uint8], width: int, height: int, spec: InputSpec = PLAIN) -> NDArray[np.float32]:
+def scaled(image: Any, width: int, height: int, spec: InputSpec = PLAIN) -> NDArray[np.float32]:
     view = CameraGeometry(width, height)
     out = np.full((len(spec.channels), height, width), np.nan, np.float32)
     ImageScaler(view, spec).fill(as_image(image), out)
@@ -168,8 +168,9 @@ def test_memory_layout_and_threads_do_not_matter() -> None:
     known = scaled(image, 32, 24, SPEC).tobytes()
     wide = np.zeros((154, 182, 6), np.uint8)
     wide[::2, ::2, ::2] = image
-    read_only = np.frombuffer(image.tobytes(), np.uint8).reshape(image.shape)
-    for other in (np.asfortranarray(image), wide[::2, ::2, ::2], read_only, image[:, ::-1][:, ::-1]):
+    frozen = np.frombuffer(image.tobytes(), np.uint8).reshape(image.shape)
+    others: list[Any] = [np.asfortranarray(image), wide[::2, ::2, ::2], frozen, memoryview(image)]
+    for other in (*others, image[:, ::-1][:, ::-1], image[:, :, ::-1][:, :, ::-1]):
         assert scaled(other, 32, 24, SPEC).tobytes() == known
     with concurrent.futures.ThreadPoolExecutor(4) as pool:
         found = pool.map(lambda _: scaled(image, 32, 24, SPEC).tobytes(), range(16))

@@ -247,6 +247,19 @@ def test_neighbors_meet_the_same_leaves_where_they_are_clumped() -> None:
     assert depths[True] == pytest.approx(depths[False], rel=0.15)
 
 
+def check_points(
+    placed: np.ndarray, scene: Scene, pose: np.ndarray, rays: Rays, hits: Hits, receiver: Receiver
+) -> None:
+    """Hold `fill_points` against its twin."""
+    points, objects = np.empty((hits.rows.size, 4), np.float32), np.empty(hits.rows.size, np.int32)
+    n = raycast.fill_points(placed, scene.ground, pose, rays, hits, receiver, points, objects)
+    slow_points, slow_objects = twins.simulation.points(placed, scene, pose, rays, hits, receiver)
+    assert n == len(slow_points)
+    np.testing.assert_array_equal(objects[:n], slow_objects)
+    np.testing.assert_allclose(points[:n], slow_points, rtol=0, atol=2e-5)
+    assert np.isfinite(points[:n]).all()
+
+
 @pytest.mark.parametrize(("seed", "noise"), [(3, False), (4, True)])
 def test_points_are_those_of_the_twin(seed: int, noise: bool) -> None:
     scene = random_scene(seed, ("urban", "residential")[seed % 2])
@@ -259,13 +272,7 @@ def test_points_are_those_of_the_twin(seed: int, noise: bool) -> None:
         placed, hits = cast(scene, pose, rays)
         hits.ranges[:1, ::7] = np.nan  # no return, whatever it hit
         receiver = Receiver(*rng.normal(0.0, 0.02, (2, sensor.n_beams)), 0.9, noise, noise)
-        points, objects = np.empty((hits.rows.size, 4), np.float32), np.empty(hits.rows.size, np.int32)
-        n = raycast.fill_points(placed, scene.ground, pose, rays, hits, receiver, points, objects)
-        slow_points, slow_objects = twins.simulation.points(placed, scene, pose, rays, hits, receiver)
-        assert n == len(slow_points)
-        np.testing.assert_array_equal(objects[:n], slow_objects)
-        np.testing.assert_allclose(points[:n], slow_points, rtol=0, atol=2e-5)
-        assert np.isfinite(points[:n]).all()
+        check_points(placed, scene, pose, rays, hits, receiver)
         if sensor is around:
             materials = placed[hits.rows[hits.rows >= 0], 1].astype(int)
             assert {*materials.tolist()} >= {MATTE, PAINT, GLASS, LEAVES, FACADE}
@@ -767,9 +774,4 @@ def test_rays_of_their_own_elevations_are_cast_as_by_the_twins(seed: int, n: int
         np.testing.assert_array_equal(hits.rows[sure], slow_hits[sure])
         np.testing.assert_allclose(hits.ranges[sure], slow_ranges[sure], rtol=0, atol=0.03)
         assert sure.sum() >= 0.9 * (slow_ranges < 18.0).sum()
-        receiver = Receiver(np.zeros(1), np.zeros(1), 0.5, True, True)
-        points, objects = np.empty((n, 4), np.float32), np.empty(n, np.int32)
-        count = raycast.fill_points(placed, scene.ground, pose, rays, hits, receiver, points, objects)
-        slow_points, slow_objects = twins.simulation.points(placed, scene, pose, rays, hits, receiver)
-        np.testing.assert_array_equal(objects[:count], slow_objects)
-        np.testing.assert_allclose(points[:count], slow_points, rtol=0, atol=2e-5)
+        check_points(placed, scene, pose, rays, hits, Receiver(np.zeros(1), np.zeros(1), 0.5, True, True))
