@@ -146,7 +146,7 @@ def ros2_command(arguments: argparse.Namespace) -> int:
         node = PerceptionNode(
             graph,
             perceiver_for,
-            topic=arguments.topic,
+            topic=arguments.topic or "",
             tracker=None if arguments.no_track else Tracker(),
             frame_id=arguments.frame,
             grid_frame_id=arguments.grid_frame,

@@ -333,7 +333,7 @@ class Bus:
             def create_subscription(self, kind: type, topic: str, receive: Any, profile: Any, *, raw: bool) -> None:
                 assert raw
                 assert kind.__name__ in ("PointCloud2", "Odometry")
-                if " " in topic:
+                if " " in topic or not topic:
                     raise ValueError("topic name is invalid")
                 bus.profiles[topic] = profile
                 bus.subscriptions.setdefault(topic, []).append(receive)
@@ -481,6 +481,8 @@ def test_what_rclpy_refuses(bus: Bus, options: dict[str, Any], said: str, monkey
         ({"odometry": "an odometry"}, "not a name of ROS 2"),
         ({"rate": -1.0}, "--rate is -1"),
         ({"topic": "a topic"}, "rclpy does not subscribe to 'a topic'"),
+        ({"topic": ""}, "rclpy does not subscribe to ''"),
+        ({"prefix": ""}, "share the topic /points"),
         ({"topic": "/other", "rate": 20.0, "sensor": "no such sensor"}, "no such sensor"),
         ({"rate": 20}, "the parameter rate is not of type float"),
     ],
