@@ -421,7 +421,7 @@ class _Rates:
 
 def _topics_of(outputs: Sequence[str], prefix: str, with_rolling: bool) -> dict[str, str]:
     """The topic of each output. Raises OptionError."""
-    topics = {}
+    topics: dict[str, str] = {}
     for text in outputs:
         name, _, topic = text.partition("=")
         if name not in LIVE_OUTPUTS or (topic and name == "diagnostics"):
@@ -430,7 +430,9 @@ def _topics_of(outputs: Sequence[str], prefix: str, with_rolling: bool) -> dict[
             full_name(topic)
         if name == ROLLING and not with_rolling:
             raise OptionError("the output rolling needs poses; pass rolling=, with a topic of nav_msgs/Odometry")
-        topics[name] = topic or f"{prefix.rstrip('/')}/{name}"
+        full = topic or f"{prefix.rstrip('/')}/{name}"
+        if topics.setdefault(name, full) != full:
+            raise OptionError(f"outputs has {name} with two topics, {topics[name]} and {full}; expected one")
     topics.pop("diagnostics", None)
     if with_rolling:
         topics.setdefault(ROLLING, f"{prefix.rstrip('/')}/{ROLLING}")

@@ -556,6 +556,7 @@ def test_without_vision_msgs_there_are_no_detections_and_a_warning() -> None:
         ({"outputs": ("points=a b",)}, "not a name of ROS 2"),
         ({"outputs": ("diagnostics=/mine",)}, "outputs has 'diagnostics=/mine'"),
         ({"outputs": ("rolling",)}, "needs poses"),
+        ({"outputs": ("points", "points=/a")}, "two topics, /edgeperc/points and /a"),
         ({"prefix": "/"}, "share the topic /points;"),
         ({"outputs": ("points=/a", "markers=/a")}, "share the topic /a;"),
         ({"topic": "mine", "outputs": ("points=/here/mine",)}, "share the topic /here/mine;"),
