@@ -22,6 +22,7 @@ pytest.importorskip("resource")
 if not hasattr(os, "fork"):
     pytest.skip("this system has no fork", allow_module_level=True)
 
+from fuzz.models import checkpoint_of
 from fuzz.running import Case, State, attempt, new_case, run_job
 from fuzz.scans import DENSE, ELEVATIONS, SLOTS, MadeUp, card_of, perceiver_of
 from fuzz.tiny import GRAPH, model
@@ -271,14 +272,12 @@ CHANGES: list[Callable[[dict[str, Any]], Any]] = [
 def test_damaged_checkpoints(tmp_path: Path, change: int) -> None:
     torch = pytest.importorskip("torch")
     pytest.importorskip("onnx")
-    from edgeperc_export.networks import build
     from edgeperc_export.recipe import Recipe
     from edgeperc_export.release.to_onnx import load
     from edgeperc_export.training.checkpoint import CheckpointError
 
     recipe = Recipe("lodnn", edge=True)
-    texts = {"recipe": json.dumps(vars(recipe)), "frames": "{}", "before": "[]", "curve": "[]"}
-    state = {**texts, "n_simulated": 1, "step": 1, "best": None, "averaged": build(recipe).state_dict()}
+    state = checkpoint_of(recipe)
     path = tmp_path / "checkpoint.pt"
     torch.save(state, path)
     assert load(path)[1] == recipe

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from pathlib import Path
 
@@ -15,6 +14,7 @@ import twins.painting
 from edgeperc import Calibration, CalibrationError, PointsError
 from edgeperc.camera.calibration import fill_projected, read_kitti_calibration
 from edgeperc.datasets.kitti import KittiObjects
+from scenes import rotation_of
 
 K = np.array([[700.0, 0.0, 319.5], [0.0, 710.0, 239.5], [0.0, 0.0, 1.0]])
 AHEAD = np.array([[0.0, -1.0, 0.0, 0.1], [0.0, 0.0, -1.0, -0.1], [1.0, 0.0, 0.0, -0.3], [0.0, 0.0, 0.0, 1.0]])
@@ -24,13 +24,6 @@ R0_rect: 0.99992 0.009838 -0.007445 -0.00987 0.999942 -0.004278 0.007403 0.00435
 Tr_velo_to_cam: 0.007534 -0.999971 -0.000617 -0.004 0.014802 0.000728 -0.99989 -0.076 0.999862 0.007524 0.014808 -0.27
 
 """
-
-
-def rotation(axis: np.ndarray, turn: float) -> np.ndarray:
-    """Rodrigues' formula."""
-    x, y, z = axis / np.linalg.norm(axis)
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    return np.eye(3) + math.sin(turn) * cross + (1.0 - math.cos(turn)) * cross @ cross
 
 
 def test_matrices_are_kept_and_cannot_be_changed() -> None:
@@ -100,8 +93,8 @@ def test_projection_by_hand() -> None:
 def test_a_projected_point_comes_back(seed: int) -> None:
     """From a pixel and a depth to the point and back, for any pose."""
     rng = np.random.default_rng(seed)
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = rotation(rng.normal(size=3), rng.uniform(-4.0, 4.0)), rng.uniform(-3.0, 3.0, 3)
+    T, turn = np.eye(4), rng.normal(size=4)
+    T[:3, :3], T[:3, 3] = rotation_of(*turn / np.linalg.norm(turn)), rng.uniform(-3.0, 3.0, 3)
     focal = rng.uniform(100.0, 3000.0, 2)
     made = Calibration([[focal[0], 0, 400.0], [0, focal[1], 300.0], [0, 0, 1]], T, 800, 600)  # type: ignore[arg-type]
     pixels, depth = rng.uniform(-100.0, 900.0, (50, 2)), rng.uniform(0.5, 80.0, 50)

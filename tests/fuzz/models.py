@@ -205,12 +205,7 @@ class Models:
         from edgeperc_export.release.to_onnx import load
 
         if self.checkpoint is None:
-            from edgeperc_export.networks import build
-
-            recipe = Recipe("lodnn")
-            weights = build(recipe).state_dict()
-            texts = {"recipe": json.dumps(vars(recipe), default=str), "frames": "{}", "before": "[]", "curve": "[]"}
-            self.checkpoint = {**texts, "n_simulated": 1, "step": 1, "best": None, "averaged": weights}
+            self.checkpoint = checkpoint_of(Recipe("lodnn"))
         state = dict(self.checkpoint)
         if case.chance(0.6):
             key = case.pick([*state])
@@ -231,6 +226,14 @@ class Models:
         path.write_bytes(blob)
         load(path)
         return "answer"
+
+
+def checkpoint_of(recipe: Any) -> dict[str, Any]:
+    """What a training writes."""
+    from edgeperc_export.networks import build
+
+    texts = {"recipe": json.dumps(vars(recipe), default=str), "frames": "{}", "before": "[]", "curve": "[]"}
+    return {**texts, "n_simulated": 1, "step": 1, "best": None, "averaged": build(recipe).state_dict()}
 
 
 def make(seed: int) -> Models:

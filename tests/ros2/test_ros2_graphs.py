@@ -14,7 +14,7 @@ import threading
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from types import ModuleType, SimpleNamespace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -272,7 +272,7 @@ class Bus:
         self.transitions: dict[str, Callable[[], str]] = {}
         self.logged: list[str] = []
 
-    def modules(self) -> dict[str, ModuleType]:
+    def modules(self) -> dict[str, SimpleNamespace]:
         bus = self
 
         class Context:
@@ -361,38 +361,31 @@ class Bus:
             assert context.ok()
             return Node(name, namespace)
 
-        def module(name: str, **contents: Any) -> ModuleType:
-            made = ModuleType(name)
-            vars(made).update(contents)
-            return made
-
-        def messages(*names: str) -> dict[str, type]:
-            return {name: type(name, (), {}) for name in names}
-
+        messages = {
+            "sensor_msgs": ("PointCloud2",),
+            "visualization_msgs": ("MarkerArray",),
+            "nav_msgs": ("OccupancyGrid", "Odometry"),
+            "diagnostic_msgs": ("DiagnosticArray",),
+        }
         return {
-            each.__name__: each
-            for each in (
-                module("rclpy", Context=Context, init=init, shutdown=shutdown, create_node=create_node),
-                module("rclpy.executors", SingleThreadedExecutor=Executor),
-                module(
-                    "rclpy.qos",
-                    QoSProfile=lambda **fields: fields,
-                    ReliabilityPolicy=SimpleNamespace(RELIABLE="reliable", BEST_EFFORT="best effort"),
-                    DurabilityPolicy=SimpleNamespace(VOLATILE="volatile"),
-                    HistoryPolicy=SimpleNamespace(KEEP_LAST="keep last"),
-                ),
-                module(
-                    "rclpy.lifecycle",
-                    LifecycleNode=LifecycleNode,
-                    TransitionCallbackReturn=SimpleNamespace(SUCCESS="success", FAILURE="failure"),
-                ),
-                module("rclpy.signals", SignalHandlerOptions=SimpleNamespace(NO="none")),
-                module("rcl_interfaces.msg", ParameterDescriptor=SimpleNamespace),
-                module("sensor_msgs.msg", **messages("PointCloud2")),
-                module("visualization_msgs.msg", **messages("MarkerArray")),
-                module("nav_msgs.msg", **messages("OccupancyGrid", "Odometry")),
-                module("diagnostic_msgs.msg", **messages("DiagnosticArray")),
-            )
+            "rclpy": SimpleNamespace(Context=Context, init=init, shutdown=shutdown, create_node=create_node),
+            "rclpy.executors": SimpleNamespace(SingleThreadedExecutor=Executor),
+            "rclpy.qos": SimpleNamespace(
+                QoSProfile=lambda **fields: fields,
+                ReliabilityPolicy=SimpleNamespace(RELIABLE="reliable", BEST_EFFORT="best effort"),
+                DurabilityPolicy=SimpleNamespace(VOLATILE="volatile"),
+                HistoryPolicy=SimpleNamespace(KEEP_LAST="keep last"),
+            ),
+            "rclpy.lifecycle": SimpleNamespace(
+                LifecycleNode=LifecycleNode,
+                TransitionCallbackReturn=SimpleNamespace(SUCCESS="success", FAILURE="failure"),
+            ),
+            "rclpy.signals": SimpleNamespace(SignalHandlerOptions=SimpleNamespace(NO="none")),
+            "rcl_interfaces.msg": SimpleNamespace(ParameterDescriptor=SimpleNamespace),
+            **{
+                f"{package}.msg": SimpleNamespace(**{name: type(name, (), {}) for name in names})
+                for package, names in messages.items()
+            },
         }
 
 
