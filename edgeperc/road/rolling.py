@@ -204,7 +204,8 @@ class RollingGrid:
         scan = as_points(points)
         mark = movable_points(perception, scan, classes=self._classes, margin_m=self._margin_m)
         moved = frame.move(scan)[mark]
-        row, col, in_view = self._view.cells(moved[:, 0], moved[:, 1])
+        with np.errstate(over="ignore"):  # sensors that mark what did not return with the largest float
+            row, col, in_view = self._view.cells(moved[:, 0], moved[:, 1])
         drawn[row[in_view], col[in_view]] = 1
         return drawn.astype(np.bool_)
 
