@@ -64,8 +64,8 @@ def add_parser(commands: Commands) -> None:
 def doctor_command(arguments: argparse.Namespace) -> int:
     """Print what `examine` finds; 1 if something is broken. With ``--clean``, delete what is kept."""
     if arguments.clean:
-        files = [*kept_files(package_folders())]
-        n_bytes = sum(file.stat().st_size for file in files)
+        files = [*dict.fromkeys(kept_files(package_folders()))]  # NUMBA_CACHE_DIR may be the folder of kernels itself
+        n_bytes = sum(file.lstat().st_size for file in files)
         for file in files:
             file.unlink()
         for folder in sorted({parent for file in files for parent in [*file.parents][:3]}, reverse=True):

@@ -260,7 +260,7 @@ def test_a_package_that_pip_did_not_install(monkeypatch: pytest.MonkeyPatch) -> 
     assert (found.name, found.state) == ("extras", "note")
 
 
-@pytest.mark.parametrize("kept", ["beside", "cache", "numba", "nothing"])
+@pytest.mark.parametrize("kept", ["beside", "cache", "numba", "one folder", "nothing"])
 def test_clean_leaves_nothing_of_edgeperc_and_all_of_others(
     kept: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -269,13 +269,14 @@ def test_clean_leaves_nothing_of_edgeperc_and_all_of_others(
         "beside": [package / "ground/__pycache__/planes.f-0123456789abcdef.kernel"],
         "cache": [cache / "kernels/ground-0/a.kernel", cache / "compiled/b/c/blob", cache / "settings.json"],
         "numba": [tmp_path / "numba/ground-0/a.kernel"],
+        "one folder": [cache / "kernels/ground-0/a.kernel"],
         "nothing": [],
     }[kept]
     others = [package / "ground/planes.py", package / "ground/__pycache__/planes.pyc", tmp_path / "numba/x/y.nbc"]
     for file in (*own, *others):
         file.parent.mkdir(parents=True, exist_ok=True)
         file.write_bytes(b"123")
-    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "numba"))
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(cache / "kernels" if kept == "one folder" else tmp_path / "numba"))
     monkeypatch.setattr(doctor, "package_folders", lambda: [package])
     assert run("doctor", "--clean") == 0
     assert f"deleted {len(own)} file" in capsys.readouterr().out
