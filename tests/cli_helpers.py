@@ -86,3 +86,11 @@ def write_scan(path: Path, n: int = 40, first_remission: float = 0.0) -> Path:
 
 def run(*arguments: object) -> int:
     return cli.main([str(a) for a in arguments])
+
+
+def usage_code(*arguments: object) -> int:
+    """The exit code of a command line that is not run."""
+    with pytest.raises(SystemExit) as left:
+        run(*arguments)
+    assert isinstance(left.value.code, int)
+    return left.value.code

@@ -112,7 +112,7 @@ def add_mounting(group: Options) -> None:
         "--turn DEG",
         "direction of the scan's x axis, counter-clockwise from straight ahead [deg]: -90 for x right, y forward; "
         "or 'street': the direction of the street, found from the scans (default: 0)",
-        type=_yaw,
+        type=_number_or("street"),
     )
     group(
         "--extrinsic FILE",
@@ -133,12 +133,8 @@ def add_ego_box(group: Options) -> None:
     )
 
 
-def _yaw(text: str) -> float | str:
-    return text if text == "street" else finite_number(text)
-
-
-def _place(text: str) -> float | str:
-    return text if text == "auto" else finite_number(text)
+def _number_or(word: str) -> Callable[[str], float | str]:
+    return lambda text: text if text == word else finite_number(text)
 
 
 def with_whole_options(given: Sequence[str]) -> list[str]:
@@ -178,7 +174,7 @@ def add_capture(group: Options) -> None:
         "place of the sensor in the map [m], for scan files with coordinates of a map: it is subtracted, and "
         "--json and --ply give boxes and points in the map; or 'auto', for a level sensor: where its beams meet "
         "(default: 0 0 0)",
-        type=_place,
+        type=_number_or("auto"),
     )
 
 
@@ -313,9 +309,16 @@ def add_boxes(group: Options) -> None:
     )
 
 
+def _parsed(kind: Callable[[str], Any], text: str) -> Any:
+    try:
+        return kind(text)
+    except ValueError as exc:  # of which argparse would name this program's function
+        raise argparse.ArgumentTypeError(f"{text!r} is no {'whole ' * (kind is int)}number") from exc
+
+
 def positive(text: str) -> int:
     """Parse a count of at least 1."""
-    value = int(text)
+    value = _parsed(int, text)
     if value < 1:
         raise argparse.ArgumentTypeError(f"{value} is too small; expected 1 or more")
     return value
@@ -323,7 +326,7 @@ def positive(text: str) -> int:
 
 def positive_number(text: str) -> float:
     """Parse a finite number above 0."""
-    value = float(text)
+    value = _parsed(float, text)
     if not 0.0 < value < math.inf:
         raise argparse.ArgumentTypeError(f"{value} is out of range; expected a number above 0")
     return value
@@ -331,7 +334,7 @@ def positive_number(text: str) -> float:
 
 def finite_number(text: str) -> float:
     """Parse a finite number."""
-    value = float(text)
+    value = _parsed(float, text)
     if not math.isfinite(value):
         raise argparse.ArgumentTypeError(f"{value} is not finite; expected a number")
     return value
