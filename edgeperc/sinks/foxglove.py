@@ -35,6 +35,7 @@ from ..types.frame import quaternion
 from ..types.mounting import MODEL_HEIGHT_M
 from ..types.perception import Box, TopView
 from ..types.points import Floats
+from ..view.colors import byte_colors
 from ..view.content import EDGES, box_corners, box_text, track_text
 from . import scene
 from .relay import MAX_VIEWERS, Relay
@@ -74,13 +75,17 @@ STATUS_SCHEMA: dict[str, Any] = {
 """JSON schema of ``/status``; a key without a value is left out."""
 
 
+def _sdk(part: str = "", purpose: str = "Messages for Foxglove") -> Any:
+    """Foxglove's SDK, or a module in it."""
+    return require(f"foxglove{part}", "foxglove", purpose, package="foxglove-sdk")
+
+
 class _Channels:
     """The topics of one run, and the messages of a scan."""
 
     def __init__(self, context: Any) -> None:
         self._context = context
-        self._messages: Any = require("foxglove.messages", "foxglove", "Messages for Foxglove", package="foxglove-sdk")
-        self._channels: Any = require("foxglove.channels", "foxglove", "Messages for Foxglove", package="foxglove-sdk")
+        self._messages, self._channels = _sdk(".messages"), _sdk(".channels")
         self._open: dict[str, Any] = {}
         self._trails = scene.Trails()
 
@@ -194,7 +199,7 @@ class _Channels:
     def _write_drivable(self, view: TopView) -> None:
         drivable = view.drivable
         cells = np.zeros(view.labels.shape, _CELL)
-        colors = scene.byte_colors(list(view.classes))[view.labels]
+        colors = byte_colors(view.classes)[view.labels]
         for k, name in enumerate(("red", "green", "blue")):
             cells[name] = colors[..., k]
         # Only the drivable cells are opaque. Foxglove's rows begin at the lowest x and y.
@@ -216,8 +221,7 @@ class _Channels:
 
     def _write_status(self, scan: PerceivedScan) -> None:
         if "/status" not in self._open:
-            sdk = require("foxglove", "foxglove", "Messages for Foxglove", package="foxglove-sdk")
-            self._open["/status"] = sdk.Channel("/status", schema=STATUS_SCHEMA, context=self._context)
+            self._open["/status"] = _sdk().Channel("/status", schema=STATUS_SCHEMA, context=self._context)
         perception = scan.perception
         status: dict[str, Any] = {
             "scan": printable(scan.name),
@@ -251,7 +255,7 @@ class _Channels:
         return self._messages.Pose(position=self._vector(center), orientation=turned)
 
     def _color(self, label: str, alpha: float) -> Any:
-        r, g, b = (scene.byte_colors([label])[0] / 255.0).tolist()
+        r, g, b = (byte_colors([label])[0] / 255.0).tolist()
         return self._messages.Color(r=r, g=g, b=b, a=alpha)
 
     def _pairs(self, **texts: str) -> list[Any]:
@@ -297,19 +301,17 @@ class McapSink:
     """
 
     def __init__(self, path: str | Path) -> None:
-        require("foxglove.mcap", "foxglove", "Writing an MCAP file", package="foxglove-sdk")
+        _sdk(".mcap", "Writing an MCAP file")
         self._path = scene.checked_target(path)
         self._channels: _Channels | None = None
 
     def _start(self) -> _Channels:
         """Open the file: with the first scan, so that a run without answers replaces no file."""
-        sdk = require("foxglove", "foxglove", "Writing an MCAP file", package="foxglove-sdk")
-        mcap = require("foxglove.mcap", "foxglove", "Writing an MCAP file", package="foxglove-sdk")
         self._file = RunFile(self._path)
         # Of a scan of 113,000 points, zstd's level 1 takes 10 ms and its default 30 ms for the same size.
-        options = mcap.MCAPWriteOptions(compression_level=1, compression_threads=0)
-        context = sdk.Context()
-        self._writer = sdk.open_mcap(self._file, context=context, writer_options=options)
+        options = _sdk(".mcap").MCAPWriteOptions(compression_level=1, compression_threads=0)
+        context = _sdk().Context()
+        self._writer = _sdk().open_mcap(self._file, context=context, writer_options=options)
         return _Channels(context)
 
     def write(self, scan: PerceivedScan) -> None:
@@ -356,7 +358,7 @@ class ServeSink:
     """
 
     def __init__(self, host: str = "127.0.0.1", port: int = 8765) -> None:
-        sdk = require("foxglove", "foxglove", "Streaming to Foxglove", package="foxglove-sdk")
+        sdk = _sdk(purpose="Streaming to Foxglove")
         context = sdk.Context()
         self._channels = _Channels(context)
         try:

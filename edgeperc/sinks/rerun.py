@@ -17,9 +17,10 @@ from ..system.printable import printable
 from ..types.mounting import MODEL_HEIGHT_M
 from ..types.perception import Box, TopView
 from ..types.points import Floats
+from ..view.colors import byte_colors
 from ..view.content import box_text, drivable_strips, track_text
 from .run_file import Pipe, RunFile
-from .scene import Trails, base_pose, byte_colors, checked_target, colored_points, nanoseconds
+from .scene import Trails, base_pose, checked_target, colored_points, nanoseconds
 
 __all__ = ["RerunSink"]
 
@@ -143,7 +144,7 @@ class RerunSink:
         for name in names:
             self._classes.setdefault(name, len(self._classes))
         if len(self._classes) > known:
-            colors = byte_colors(list(self._classes)).tolist()
+            colors = byte_colors(self._classes).tolist()
             context = [(k, printable(name), tuple(colors[k])) for name, k in self._classes.items()]
             self._recording.log("world", self._rr.AnnotationContext(context), static=True)
 

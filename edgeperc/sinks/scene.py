@@ -19,7 +19,7 @@ from ..system.clock import nanoseconds_of
 from ..tracking.tracks import Tracks
 from ..types.frame import ModelFrame
 from ..types.points import Bytes, Floats, Floats32, as_points
-from ..view.colors import color_of, rgb
+from ..view.colors import byte_colors
 from ..view.content import check_points, in_model_frame, paint_points
 
 BASE, LIDAR, ODOM = "base_link", "lidar", "odom"
@@ -33,11 +33,6 @@ def checked_target(path: str | os.PathLike[str]) -> Path:
     if not target.parent.is_dir():
         raise FileNotFoundError(errno.ENOENT, "the file's folder is missing", str(target.parent))
     return target
-
-
-def byte_colors(names: list[str]) -> Bytes:
-    """Colors of classes, (n, 3) uint8 red, green, blue."""
-    return np.asarray((rgb([color_of(name) for name in names]) * 255.0).round().astype(np.uint8))
 
 
 def colored_points(scan: PerceivedScan) -> tuple[Floats32, Bytes, tuple[str, ...], Bytes]:

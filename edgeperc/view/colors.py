@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..types.points import Floats
+from ..types.points import Bytes, Floats
 
 # CIELAB distance of at least 21 for normal, deuteranope, protanope and tritanope vision (Machado et al. 2009). With the
 # palette of Okabe and Ito it is 5: a deuteranope sees pedestrians in the gray of the background.
@@ -53,6 +54,11 @@ def color_of(name: str) -> str:
 def rgb(colors: list[str]) -> Floats:
     """Colors "#rrggbb" as (n, 3) float64 in 0..1."""
     return np.array([[int(c[k : k + 2], 16) / 255.0 for k in (1, 3, 5)] for c in colors]).reshape(-1, 3)
+
+
+def byte_colors(names: Iterable[str]) -> Bytes:
+    """Colors of classes, (n, 3) uint8 red, green, blue."""
+    return np.asarray((rgb([color_of(name) for name in names]) * 255.0).round().astype(np.uint8))
 
 
 def ramp(value: NDArray[Any], low: float, high: float) -> Floats:

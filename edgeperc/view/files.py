@@ -10,7 +10,7 @@ from ..errors import PointsError
 from ..system.atomic import write_atomic
 from ..types.perception import Perception
 from ..types.points import Points
-from .colors import color_of, rgb
+from .colors import byte_colors
 from .content import check_points
 
 # The raw ids of SemanticKITTI's .label files. It counts vans as cars; 99 is its "other-object".
@@ -61,7 +61,7 @@ def write_ply(perception: Perception, points: Points, path: str | Path) -> None:
     fields = [*((name, "<f8" if in_map else "<f4") for name in "xyz"), ("remission", "<f4")]
     fields += [(name, "|u1") for name in ("label", "red", "green", "blue")]
     rows = np.empty(len(points), dtype=fields)
-    colors = (rgb([color_of(name) for name in perception.points.classes]) * 255.0).round().astype(np.uint8)
+    colors = byte_colors(perception.points.classes)
     xyz = perception.to_map(points) if in_map else points
     for k, name in enumerate("xyz"):
         rows[name] = xyz[:, k]

@@ -19,6 +19,7 @@ import pytest
 from edgeperc.cli.program import run_program
 from edgeperc.cli.sinks import SINKS, Sinks
 from edgeperc.sinks import relay as relay_module
+from edgeperc.sinks.foxglove import McapSink, ServeSink
 from edgeperc.sinks.relay import MAX_VIEWERS, Relay
 from edgeperc.sinks.run_file import RunFile
 from edgeperc.system.lanes import returns
@@ -158,8 +159,6 @@ def test_a_relay_closes_with_viewers_connected(relayed: Opener, answer: Callable
 
 def test_a_server_stops_while_a_viewer_is_silent() -> None:
     pytest.importorskip("foxglove")
-    from edgeperc.sinks.foxglove import ServeSink
-
     sink = ServeSink(port=0)
     port = int(sink.url.rpartition(":")[2])
     with socket.create_connection(("127.0.0.1", port), timeout=PATIENCE_S) as silent:
@@ -178,8 +177,6 @@ def test_calls_that_wait_for_ever_are_left_behind() -> None:
 
 def test_files_are_finished_before_what_is_served(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("foxglove")
-    from edgeperc.sinks.foxglove import McapSink, ServeSink
-
     closed: list[str] = []
     ended = ServeSink.close
 

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from cli_helpers import POINTSEG, run
+from cli_helpers import POINTSEG, run, usage_code
 from edgeperc import Box, OptionError, Perception, PointLabels, PointsError, Tracker, Tracks, read_points
 from edgeperc.cli.main import build_parser
 from edgeperc.cli.sinks import Sinks
@@ -170,9 +170,7 @@ def test_the_command_writes_every_scan(tmp_path: Path, monkeypatch: pytest.Monke
     assert run("run", tmp_path / "drive", "--movable", "--static", tmp_path / "drive") == 1
     assert (tmp_path / "drive/000003.bin").read_bytes() == POINTS.tobytes()
     for wrong in (["--static", tmp_path / "out"], ["--movable"]):
-        with pytest.raises(SystemExit) as left:
-            run("run", tmp_path / "drive", *wrong)
-        assert left.value.code == 2
+        assert usage_code("run", tmp_path / "drive", *wrong) == 2
 
 
 @pytest.mark.parametrize("paths", [("a", "b"), ("b", "a"), ("a", "drive.pcap"), ("000001.csv", "a")])
@@ -185,32 +183,30 @@ def test_no_scan_is_replaced_by_another_one(
         POINTS.tofile(tmp_path / folder / "000001.bin")
     (tmp_path / "drive.pcap").write_bytes(bytes(24))
     (tmp_path / "000001.csv").write_text("x,y,z,intensity\n1,2,3,0.5\n")  # becomes 000001.bin
-    with pytest.raises(SystemExit):
-        run("run", *(tmp_path / path for path in paths), "--movable", "--static", tmp_path / "a")
+    assert usage_code("run", *(tmp_path / path for path in paths), "--movable", "--static", tmp_path / "a") == 2
     assert "would be overwritten by --static with another one" in capsys.readouterr().err
     assert (tmp_path / "a/000001.bin").read_bytes() == POINTS.tobytes()
+
+
+def sinks_of(folder: Path, *options: object) -> Sinks:
+    return Sinks(build_parser().parse_args(["run", str(folder), *map(str, options)]))
 
 
 def test_a_sink_made_before_one_that_cannot_be_is_closed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     closed = []
     monkeypatch.setattr("edgeperc.sinks.page.PageSink.close", lambda self, whole: closed.append(self))
     (tmp_path / "file").write_bytes(b"")
-    options = ["--play", str(tmp_path / "play.html"), "--static", str(tmp_path / "file"), "--movable"]
-    arguments = build_parser().parse_args(["run", str(tmp_path), *options])
     with pytest.raises(OSError, match="file"):
-        Sinks(arguments)
+        sinks_of(tmp_path, "--play", tmp_path / "play.html", "--static", tmp_path / "file", "--movable")
     assert len(closed) == 1
 
 
 def test_a_sink_that_fails_costs_the_others_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Each gets every scan and is closed; the run is told the first error of a scan, and how many files failed."""
-    options = ["--play", str(tmp_path / "play.html"), "--static", str(tmp_path / "static"), "--movable"]
-    arguments = build_parser().parse_args(["run", str(tmp_path), *options])
-    perception = Perception(2, 0, None, None, (AHEAD,), {}, {}, (), None)
-    points = np.zeros((2, 4), np.float32)
-    with Sinks(arguments) as sinks:
+    options = ["--play", tmp_path / "play.html", "--static", tmp_path / "static", "--movable"]
+    with sinks_of(tmp_path, *options) as sinks:
         for k in range(3):
-            scan = PerceivedScan(f"{k}.bin", float(k), points, perception, None, get_sensor("hdl-64e"))
+            scan = perceived(f"{k}.bin", None)
             if k == 1:
                 (tmp_path / "static").rename(tmp_path / "away")
                 with pytest.raises(FileNotFoundError, match="static"):
@@ -239,11 +235,9 @@ def test_a_sink_that_fails_costs_the_others_nothing(tmp_path: Path, capsys: pyte
 def test_only_a_live_source_is_whole_when_it_is_interrupted(
     tmp_path: Path, live: bool, error: type[BaseException] | None, names: set[str]
 ) -> None:
-    options = ["--play", str(tmp_path / "play.html"), *(["--live"] if live else [])]
-    arguments = build_parser().parse_args(["run", str(tmp_path), *options])
-    perception = Perception(2, 0, None, None, (AHEAD,), {}, {}, (), None)
-    with suppress(*(() if error is None else (error,))), Sinks(arguments) as sinks:
-        sinks.write(PerceivedScan("0.bin", 0.0, np.zeros((2, 4), np.float32), perception, None, get_sensor("hdl-64e")))
+    options = ["--play", tmp_path / "play.html", *(["--live"] if live else [])]
+    with suppress(*(() if error is None else (error,))), sinks_of(tmp_path, *options) as sinks:
+        sinks.write(perceived("0.bin", None))
         if error is not None:
             raise error
     assert {file.name for file in tmp_path.iterdir()} == names

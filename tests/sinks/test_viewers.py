@@ -8,13 +8,13 @@ import math
 import os
 import socket
 import struct
+import sys
 import threading
 import time
 import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from dataclasses import replace
-from importlib import import_module
 from importlib.util import find_spec
 from itertools import pairwise
 from pathlib import Path
@@ -33,8 +33,11 @@ from edgeperc.errors import MissingExtraError, OptionError, PointsError
 from edgeperc.records import PerceivedScan, Sink
 from edgeperc.simulation.drawn import random_scene
 from edgeperc.simulation.scene import simulate_sequence
+from edgeperc.sinks.foxglove import McapSink, ServeSink
 from edgeperc.sinks.page import PageSink
 from edgeperc.sinks.prelabels import PrelabelSink
+from edgeperc.sinks.rerun import RerunSink
+from edgeperc.sinks.rosbag import BagSink
 from edgeperc.sinks.scene import colored_points, nanoseconds
 from edgeperc.types.frame import ModelFrame, quaternion
 from edgeperc.types.perception import Box
@@ -142,8 +145,6 @@ def foxglove() -> None:
 @pytest.mark.usefixtures("foxglove")
 @pytest.mark.parametrize("mounting", [None, TILTED])
 def test_mcap_holds_what_went_in(tmp_path: Path, mounting: Mounting | None) -> None:
-    from edgeperc.sinks.foxglove import McapSink
-
     scans = a_run(mounting=mounting)
     write(McapSink(tmp_path / "run.mcap"), scans)
     topics = read_mcap(tmp_path / "run.mcap")
@@ -269,8 +270,6 @@ def test_quaternion_of_any_rotation(numbers: list[float]) -> None:
 @pytest.mark.usefixtures("foxglove")
 def test_mcap_of_other_answers(tmp_path: Path) -> None:
     """Without a tracker, without classes of points, without a top view, without points; points of three columns."""
-    from edgeperc.sinks.foxglove import McapSink
-
     (scan,) = a_run(8)[-1:]
     whole = replace(scan.perception, fitness=(), boxes=())
     scans = [
@@ -291,8 +290,6 @@ def test_mcap_of_other_answers(tmp_path: Path) -> None:
 
 @pytest.mark.usefixtures("foxglove")
 def test_arrows_of_tracks_seen_by_a_tilted_sensor_are_as_long_as_their_way(tmp_path: Path) -> None:
-    from edgeperc.sinks.foxglove import McapSink
-
     tracker, R, pose = Tracker(), Mounting(None, 0.0, 30.0).rotation(), np.eye(4)
     pose[:3, :3] = R
     for k in range(20):
@@ -306,8 +303,6 @@ def test_arrows_of_tracks_seen_by_a_tilted_sensor_are_as_long_as_their_way(tmp_p
 
 @pytest.mark.usefixtures("foxglove")
 def test_names_are_only_text_in_mcap(tmp_path: Path) -> None:
-    from edgeperc.sinks.foxglove import McapSink
-
     points = a_scan()
     scan = PerceivedScan(HOSTILE[13], 0.0, points, perceived(points, ("plain", *HOSTILE)), None, SENSOR)
     write(McapSink(tmp_path / "run.mcap"), [scan])
@@ -318,8 +313,6 @@ def test_names_are_only_text_in_mcap(tmp_path: Path) -> None:
 
 @pytest.mark.usefixtures("foxglove")
 def test_mcap_refuses_and_keeps_the_old_file(tmp_path: Path) -> None:
-    from edgeperc.sinks.foxglove import McapSink
-
     target, (scan,) = tmp_path / "run.mcap", a_run(8)[-1:]
     target.write_bytes(b"old")
     McapSink(target).close()
@@ -384,8 +377,6 @@ class Viewer:
 @pytest.fixture
 def served() -> Iterator[Any]:
     pytest.importorskip("foxglove")
-    from edgeperc.sinks.foxglove import ServeSink
-
     sink = ServeSink(port=0)
     yield sink
     sink.close()
@@ -440,8 +431,6 @@ def test_a_viewer_receives_a_run(served: Any) -> None:
 
 
 def test_serving_is_local_and_a_taken_port_is_an_error(served: Any) -> None:
-    from edgeperc.sinks.foxglove import ServeSink
-
     host, _, port = served.url.removeprefix("ws://").rpartition(":")
     assert host == "127.0.0.1"
     with pytest.raises(OptionError, match=rf"{port}.*a free port"):
@@ -476,8 +465,6 @@ def component(entity: dict[str, list[Any]], name: str) -> list[Any]:
 @pytest.mark.parametrize("mounting", [None, TILTED])
 def test_rrd_holds_what_went_in(tmp_path: Path, mounting: Mounting | None) -> None:
     pytest.importorskip("rerun")
-    from edgeperc.sinks.rerun import RerunSink
-
     scans = a_run(mounting=mounting)
     write(RerunSink(tmp_path / "run.rrd"), scans)
     assert [p.name for p in tmp_path.iterdir()] == ["run.rrd"]
@@ -526,8 +513,8 @@ def test_rrd_holds_what_went_in(tmp_path: Path, mounting: Mounting | None) -> No
 
 @pytest.mark.parametrize(("name", "size_kib"), [("run.mcap", 512), ("run.rrd", 1024)])
 def test_a_full_disk_is_an_error(name: str, size_kib: int, small_disk: Any) -> None:
-    module = pytest.importorskip("foxglove" if name == "run.mcap" else "rerun").__name__
-    make = getattr(import_module(f"edgeperc.sinks.{module}"), {"foxglove": "McapSink", "rerun": "RerunSink"}[module])
+    pytest.importorskip("foxglove" if name == "run.mcap" else "rerun")
+    make = McapSink if name == "run.mcap" else RerunSink
     folder, scans = small_disk(size_kib), a_run()
     (folder / name).write_bytes(b"old")
     sink = make(folder / name)
@@ -562,16 +549,10 @@ def sinks_of_a_run(folder: Path) -> Iterator[tuple[Sink, str, Callable[[Path], l
     yield PageSink(folder / "run.html"), "run.html", read_page
     yield PrelabelSink(folder, "cvat"), "annotations.zip", read_cvat
     if find_spec("foxglove"):
-        from edgeperc.sinks.foxglove import McapSink
-
         yield McapSink(folder / "run.mcap"), "run.mcap", lambda path: read_mcap(path)["/points"]
     if find_spec("rerun"):
-        from edgeperc.sinks.rerun import RerunSink
-
         yield RerunSink(folder / "run.rrd"), "run.rrd", lambda path: read_rrd(path)["/world/lidar/points"]["stamp"]
     if find_spec("rosbags"):
-        from edgeperc.sinks.rosbag import BagSink
-
         yield BagSink(folder / "bag"), "bag", lambda path: [*read_scans(path)]
 
 
@@ -853,18 +834,13 @@ def test_addresses_are_checked(value: str, tmp_path: Path, capsys: pytest.Captur
     assert "expected HOST:PORT" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(("module", "extra"), [("foxglove", "foxglove"), ("rerun", "rerun")])
-def test_missing_extras_are_named(module: str, extra: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    import sys
-
-    from edgeperc.sinks.foxglove import McapSink, ServeSink
-    from edgeperc.sinks.rerun import RerunSink
-
+@pytest.mark.parametrize("module", ["foxglove", "rerun"])
+def test_missing_extras_are_named(module: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for name in [module, *(name for name in sys.modules if name.startswith(f"{module}."))]:
         monkeypatch.setitem(sys.modules, name, None)
     makers = {"foxglove": (lambda: McapSink(tmp_path / "a"), ServeSink), "rerun": (lambda: RerunSink(tmp_path / "a"),)}
     for make in makers[module]:
-        with pytest.raises(MissingExtraError, match=rf"edgeperc\[{extra}\]"):
+        with pytest.raises(MissingExtraError, match=rf"edgeperc\[{module}\]"):
             make()
     assert not [*tmp_path.iterdir()]
 
