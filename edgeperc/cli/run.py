@@ -40,6 +40,8 @@ from .scans import (
     check_sensor,
     find_images,
     find_scans,
+    is_folder,
+    is_recording,
     output_names,
     reading_options,
     scan_folders,
@@ -325,7 +327,7 @@ def _check_outputs(
     outputs: list[tuple[str, Path]] = []
     # Files are opened for it, so only where their scans have files of their own.
     has_own = not images and bool(kinds or arguments.static is not None)
-    captures = {scan for scan in scans if has_own and _is_capture(scan)}
+    captures = {scan for scan in scans if has_own and is_recording(scan)}
     for scan, target in zip(scans, targets, strict=True):
         first = target / "000000" if scan in captures else target
         outputs += [("--out", file) for file in _files_of(arguments, first, kinds, bool(images)).values()]
@@ -382,12 +384,6 @@ def _check_static(arguments: argparse.Namespace, scans: Sequence[Path], captures
         )
 
 
-def _is_capture(scan: Path | Remote) -> bool:
-    from ..readers.captures import CAPTURE_SUFFIXES, is_capture
-
-    return scan.suffix.lower() in CAPTURE_SUFFIXES if isinstance(scan, Remote) else is_capture(scan)
-
-
 def _make_folders(out: Path, targets: Sequence[Path]) -> None:
     for folder in {target.parent for target in targets}:
         try:
@@ -432,10 +428,8 @@ def _images(arguments: argparse.Namespace, kinds: Sequence[str]) -> dict[Path, P
 
 def _live_source(arguments: argparse.Namespace) -> Path:
     """The path to replay: a scan, a capture, or one folder of scans."""
-    from ..readers.captures import is_capture
-
     path: Path = arguments.paths[0]
-    folders = scan_folders(path) if path.is_dir() and not is_capture(path) else []
+    folders = scan_folders(path) if is_folder(path) else []
     if len(folders) > 1:
         arguments.usage_error(f"--live replays one folder of scans; {path} has {len(folders)}, such as {folders[0]}")
     return folders[0] if folders else path

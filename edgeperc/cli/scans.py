@@ -56,7 +56,7 @@ def scan_folders(root: Path) -> list[Path]:
 
 def find_scans(paths: Sequence[Path]) -> Scans:
     """Scan files and captures in the order of ``paths``; those of a folder, data set or URL's folders are sorted."""
-    from ..readers.captures import CAPTURE_SUFFIXES, SCAN_SUFFIXES, is_capture, scan_files
+    from ..readers.captures import CAPTURE_SUFFIXES, SCAN_SUFFIXES, scan_files
 
     scans: dict[str, Path] = {}
     empty, of_data_set = [], False
@@ -66,7 +66,7 @@ def find_scans(paths: Sequence[Path]) -> Scans:
             files = path.files(SCAN_SUFFIXES + CAPTURE_SUFFIXES)
             of_data_set |= any(scan.parent != path for scan in files if scan != path)
             empty += [] if files else [path]
-        elif path.is_dir() and not is_capture(path):
+        elif is_folder(path):
             folders = scan_folders(path)
             files = [scan for folder in folders for scan in scan_files(folder)]
             of_data_set |= folders not in ([], [path])
@@ -77,22 +77,31 @@ def find_scans(paths: Sequence[Path]) -> Scans:
     return Scans(list(scans.values()), empty, of_data_set)
 
 
+def is_recording(scan: Path | Remote) -> bool:
+    """Whether a path is a capture; what is at a URL is one by its name."""
+    from ..readers.captures import CAPTURE_SUFFIXES, is_capture
+
+    return scan.suffix.lower() in CAPTURE_SUFFIXES if isinstance(scan, Remote) else is_capture(scan)
+
+
+def is_folder(path: Path) -> bool:
+    """Whether a path is a folder of scans, not the one of a bag."""
+    return path.is_dir() and not is_recording(path)
+
+
 def check_scans(arguments: argparse.Namespace, scans: Sequence[Path | Remote], *, images: bool = False) -> None:
     """Check that each option of reading is for one of the scans; see `check_inputs`.
 
     images : the scans are those of images, which are scan files.
     """
-    from ..readers.captures import CAPTURE_SUFFIXES, is_capture, scan_files
+    from ..readers.captures import scan_files
 
     kinds = set[str]()
     for scan in scans:
-        if isinstance(scan, Remote):
-            kinds.add("recording" if scan.suffix.lower() in CAPTURE_SUFFIXES else "scan file")
-            continue
-        if not scan.exists():  # reported when its turn comes
+        if isinstance(scan, Path) and not scan.exists():  # reported when its turn comes
             return
-        files = scan_files(scan) if scan.is_dir() and not is_capture(scan) else [scan]
-        kinds.update("recording" if not images and is_capture(file) else "scan file" for file in files)
+        files = scan_files(scan) if isinstance(scan, Path) and is_folder(scan) else [scan]
+        kinds.update("recording" if not images and is_recording(file) else "scan file" for file in files)
         if len(kinds) > 1:
             break
     check_inputs(arguments, kinds, scans[0])
@@ -110,7 +119,6 @@ def reading_options(path: Path, arguments: argparse.Namespace) -> dict[str, Any]
 
 def find_images(paths: Sequence[Path]) -> list[Path]:
     """Image files in the order of ``paths``, those of folders sorted; ImageError for a mixture with scans."""
-    from ..readers.captures import is_capture
     from ..readers.images import IMAGE_SUFFIXES
 
     images: dict[str, Path] = {}
@@ -122,7 +130,7 @@ def find_images(paths: Sequence[Path]) -> list[Path]:
                 raise ImageError(f"{path}: images are read from this computer; copy it, and pass its path")
             others.append(path)
             continue
-        if path.is_dir() and not is_capture(path) and not scan_folders(path):
+        if is_folder(path) and not scan_folders(path):
             entries = (file for file in path.glob("[!.]*") if file.suffix.lower() in IMAGE_SUFFIXES)
             files = sorted(entries, key=by_number)
         images |= {_absolute(image): image for image in files}
@@ -136,7 +144,7 @@ def scan_namer(path: Path) -> Callable[[int], Path]:
     """Make a function from the index of a scan in a source to a name: its file, or the capture and the index."""
     from ..readers.captures import is_capture, scan_files
 
-    if path.is_dir() and not is_capture(path):
+    if is_folder(path):
         files = scan_files(path)
         if not any(map(is_capture, files)):
             return files.__getitem__
@@ -229,7 +237,7 @@ def scan_sensor(
                 unnamed = exc
             if known is not None:
                 return with_mounting(known.profile, arguments), known.because
-            files = scan_files(path) if path.is_dir() and not is_capture(path) else beside or [path]
+            files = scan_files(path) if is_folder(path) else beside or [path]
         try:
             found = find_sensor(files, arguments)
         except SensorError as exc:
@@ -295,11 +303,9 @@ class Sensors:
         return found
 
     def _of(self, path: Path | Remote, beside: Sequence[Path | Remote]) -> tuple[str | SensorProfile, str]:
-        from ..readers.captures import CAPTURE_SUFFIXES, is_capture
-
-        urls = [scan for scan in beside if isinstance(scan, Remote) and scan.suffix.lower() not in CAPTURE_SUFFIXES]
+        urls = [scan for scan in beside if isinstance(scan, Remote) and not is_recording(scan)]
         if not urls or self._arguments.sensor not in (None, AUTO_SENSOR):
-            files = [scan for scan in beside if isinstance(scan, Path) and not is_capture(scan)]
+            files = [scan for scan in beside if isinstance(scan, Path) and not is_recording(scan)]
             return scan_sensor(path, self._arguments, files)
         with tempfile.TemporaryDirectory(prefix="edgeperc-") as folder:
             return scan_sensor(path, self._arguments, _fetched(urls, Path(folder)))

@@ -28,6 +28,7 @@ from ..system.remote import Remote
 from .arguments import options, positive
 from .output import many, one_line, print_line
 from .report import Report
+from .scans import is_recording
 
 if TYPE_CHECKING:
     from ..perceiver import Learned, Perceiver
@@ -92,10 +93,8 @@ def check_engine(arguments: argparse.Namespace, sinks: Sequence[str]) -> None:
 
 def check_scan_files(arguments: argparse.Namespace, scans: Sequence[Path | Remote]) -> None:
     """Check that worker processes, if any, get scan files alone."""
-    from ..readers.captures import CAPTURE_SUFFIXES
-
     for scan in scans if has_workers(arguments) else ():
-        if scan.suffix.lower() in CAPTURE_SUFFIXES or (isinstance(scan, Path) and scan.is_dir()):
+        if is_recording(scan) or (isinstance(scan, Path) and scan.is_dir()):
             arguments.usage_error(
                 f"{_asked_by(arguments)} takes scan files; {scan} is a capture, which is decoded in its order"
             )

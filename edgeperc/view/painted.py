@@ -17,7 +17,7 @@ from ..types.sensor import SensorProfile
 from .canvas import add_axes, as_png, height_of_legend, new_figure, write_heading
 from .colors import FAINT, INK, color_of, rgb
 from .content import check_points, drawable_boxes, drawable_points, perceived_image
-from .picture import Place, write_frame
+from .picture import SENSOR, Place, write_frame
 
 # Sizes in pixels.
 _WIDTH, _MARGIN, _TOP, _GAP, _AXIS = 1600, 28, 128, 44, 62
@@ -150,4 +150,4 @@ def _draw_from_above(
     axes.set_yticks(ahead, labels=[f"{tick:.0f} m" for tick in ahead])
     axes.grid(color=INK, alpha=0.12, linewidth=0.8)
     axes.set_axisbelow(True)
-    axes.add_patch(Polygon([[0.0, 1.2], [0.9, -1.2], [-0.9, -1.2]], closed=True, facecolor=INK, zorder=4))
+    axes.add_patch(Polygon(SENSOR, closed=True, facecolor=INK, zorder=4))

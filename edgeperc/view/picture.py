@@ -24,6 +24,9 @@ _NEAR_M = 1.0
 _HALF_STRIP_M = 1.0
 _AROUND_M = (48.0, 36.0)  # ahead and behind, to each side
 
+SENSOR = [[0.0, 1.2], [0.9, -1.2], [-0.9, -1.2]]
+"""The arrowhead that stands for the sensor in panels from above: y, x [m]."""
+
 Place = tuple[float, float, float, float]
 """Left, top, width and height of a panel [px]."""
 
@@ -250,7 +253,7 @@ def _draw_top_view(figure: Any, drawn: _Drawn, top_view: TopView, road: RoadAhea
     )
     axes.grid(color=INK, alpha=0.12, linewidth=0.8)
     axes.set_axisbelow(True)
-    sensor = Polygon([[0.0, 1.2], [0.9, -1.2], [-0.9, -1.2]], closed=True, facecolor=INK, zorder=5)
+    sensor = Polygon(SENSOR, closed=True, facecolor=INK, zorder=5)
     axes.add_patch(sensor)
 
     avoid = [canvas.area_of(axes, sensor.get_xy())]

@@ -24,7 +24,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from test_pages import HOSTILE, perceived
+from test_pages import HOSTILE, opened, perceived
 from test_pictures import CAR, VAN, a_perception, a_scan
 
 from cli_helpers import thinned
@@ -675,13 +675,7 @@ def test_names_are_only_text_on_the_page_of_a_drive(browser: Any, tmp_path: Path
         assert pages[-1].count("<script") == 2
         if names is HOSTILE:
             (tmp_path / "hostile.html").write_text(pages[-1])
-    wrong: list[str] = []
-    shown = browser.new_page()
-    shown.on("pageerror", lambda error: wrong.append(str(error)))
-    shown.on("console", lambda message: wrong.append(message.text))
-    url = (tmp_path / "hostile.html").as_uri()
-    shown.on("request", lambda request: request.url == url or wrong.append(request.url))
-    shown.goto(url)
+    shown, wrong = opened(browser, tmp_path / "hostile.html")
     if shown.evaluate("!!document.createElement('canvas').getContext('webgl')"):
         for _ in HOSTILE:
             shown.keyboard.press(".")
