@@ -25,7 +25,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from test_pages import HOSTILE, opened, perceived
-from test_pictures import CAR, VAN, a_perception, a_scan
+from test_pictures import CAR, VAN, a_perception, a_scan, scene_of, unpacked
 
 from cli_helpers import thinned
 from edgeperc import Mounting, Tracker, cli, read_scans
@@ -583,12 +583,6 @@ def test_classes_of_a_run_that_ends_early_replace_no_list(tmp_path: Path) -> Non
     assert json.loads((tmp_path / "labels/_classes.json.part").read_text())["classes"]
 
 
-def scene_of(path: Path) -> dict[str, Any]:
-    (data,) = [part.split("</script>")[0] for part in path.read_text().split('type="application/json">')[1:]]
-    scene: dict[str, Any] = json.loads(data)
-    return scene
-
-
 def test_a_page_plays_the_drive(tmp_path: Path) -> None:
     scans = a_run(mounting=TILTED)
     write(PageSink(tmp_path / "drive.html"), scans)
@@ -597,8 +591,7 @@ def test_a_page_plays_the_drive(tmp_path: Path) -> None:
     names = [one["name"] for one in scene["classes"]]
     for scan, shown in zip(scans, scene["scans"], strict=True):
         frame = ModelFrame(scan.perception.mounting)
-        xyz = np.frombuffer(base64.b64decode(shown["xyz"]), "<i2").reshape(-1, 3) * shown["scale"]
-        label = np.frombuffer(base64.b64decode(shown["label"]), np.uint8)
+        xyz, label = unpacked(shown)
         moved = frame.move(scan.points)
         moved = moved[np.isfinite(moved).all(axis=1)]
         assert len(xyz) == len(label) == len(moved)  # all are kept
@@ -638,11 +631,10 @@ def test_a_long_drive_stays_within_its_limit(tmp_path: Path) -> None:
     assert (tmp_path / "drive.html").stat().st_size <= limit + 40_000  # and the page itself
     scene = scene_of(tmp_path / "drive.html")
     assert [scan["name"] for scan in scene["scans"]] == [str(k) for k in range(0, 40, 4)]
-    label = np.frombuffer(base64.b64decode(scene["scans"][0]["label"]), np.uint8)
+    xyz, label = unpacked(scene["scans"][0])
     assert len(label) == 3000
     car = [one["name"] for one in scene["classes"]].index("car")
     assert (label == car).mean() > 1.5 * (labels == 1).mean()
-    xyz = np.frombuffer(base64.b64decode(scene["scans"][0]["xyz"]), "<i2").reshape(-1, 3) * 0.01
     assert np.median(np.hypot(*xyz[label == 0, :2].T)) > np.median(np.hypot(*points[labels == 0, :2].T)) + 3.0
 
 

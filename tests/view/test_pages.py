@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import json
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
@@ -13,7 +12,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from test_pictures import a_perception, a_scan
+from test_pictures import a_perception, a_scan, scene_of
 
 from edgeperc import Tracker
 from edgeperc.evaluation.mistakes import Mistakes, draw_mistakes
@@ -103,11 +102,10 @@ def test_names_are_only_text_on_the_page(tmp_path: Path) -> None:
 def test_the_data_of_the_page_is_complete(tmp_path: Path) -> None:
     scan = a_scan()
     write_html(perceived(scan, ("plain", *HOSTILE)), scan, tmp_path / "page.html")
-    page = (tmp_path / "page.html").read_text()
-    (data,) = [part.split("</script>")[0] for part in page.split('<script id="scene" type="application/json">')[1:]]
-    names = [one["name"] for one in json.loads(data)["classes"]]
-    assert set(map(printable, HOSTILE)) < set(names)
-    assert {box["name"] for box in json.loads(data)["scans"][0]["boxes"]} <= set(names)
+    scene = scene_of(tmp_path / "page.html")
+    names = {one["name"] for one in scene["classes"]}
+    assert set(map(printable, HOSTILE)) < names
+    assert {box["name"] for box in scene["scans"][0]["boxes"]} <= names
 
 
 # Any character, lone surrogates too.

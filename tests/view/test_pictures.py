@@ -83,9 +83,24 @@ def pixels(png: bytes) -> np.ndarray:
         return np.asarray(opened.convert("RGB")).astype(np.int16)
 
 
-def near(picture: np.ndarray, name: str, tolerance: int = 12) -> np.ndarray:
-    wanted = [int(CLASS_COLORS[name][k : k + 2], 16) for k in (1, 3, 5)]
-    return (np.abs(picture - wanted) <= tolerance).all(axis=2)
+def near(picture: np.ndarray, color: str) -> np.ndarray:
+    """Pixels of about a color, or of that of a class."""
+    color = CLASS_COLORS.get(color, color)
+    wanted = [int(color[k : k + 2], 16) for k in (1, 3, 5)]
+    return (np.abs(picture - wanted) <= 12).all(axis=2)
+
+
+def scene_of(path: Path) -> dict[str, Any]:
+    """The data of a page."""
+    (data,) = re.findall('type="application/json">(.*?)</script>', path.read_text(encoding="utf-8"), re.DOTALL)
+    scene: dict[str, Any] = json.loads(data)
+    return scene
+
+
+def unpacked(shown: dict[str, Any], kind: str = "<i2") -> tuple[np.ndarray, np.ndarray]:
+    """Points of a scan on a page, in steps of its scale, and their labels."""
+    xyz = np.frombuffer(base64.b64decode(shown["xyz"]), kind).reshape(-1, 3)
+    return xyz * shown.get("scale", 1), np.frombuffer(base64.b64decode(shown["label"]), np.uint8)
 
 
 @pytest.fixture(scope="module")
@@ -261,10 +276,9 @@ def test_html_holds_every_finite_point_and_no_address(scan: np.ndarray, percepti
     write_html(perception, bright, tmp_path / "page.html", title="a scan")
     text = (tmp_path / "page.html").read_text(encoding="utf-8")
     assert not re.search(r"https?:|src=|@@", text)
-    scene = json.loads(re.search(r'type="application/json">(.*?)</script>', text, re.DOTALL).group(1))
+    scene = scene_of(tmp_path / "page.html")
     (shown,) = scene["scans"]
-    xyz = np.frombuffer(base64.b64decode(shown["xyz"]), dtype="<f4").reshape(-1, 3)
-    label = np.frombuffer(base64.b64decode(shown["label"]), dtype=np.uint8)
+    xyz, label = unpacked(shown, "<f4")
     remission = np.frombuffer(base64.b64decode(shown["remission"]), dtype=np.uint8)
     np.testing.assert_array_equal(xyz, scan[:-1, :3])
     assert len(remission) == len(label) == len(xyz)
@@ -350,8 +364,9 @@ def test_missing_matplotlib_names_the_line(
 ) -> None:
     for name in ("matplotlib", "matplotlib.figure", "matplotlib.backends.backend_agg"):
         monkeypatch.setitem(sys.modules, name, None)
-    with pytest.raises(MissingExtraError, match=r"pip install 'edgeperc\[view\]'"):
-        view.draw(perception, scan)
+    for drawing in (lambda: view.draw(perception, scan), lambda: draw_mistakes([some_mistakes(scan)])):
+        with pytest.raises(MissingExtraError, match=r"pip install 'edgeperc\[view\]'"):
+            drawing()
 
 
 def test_import_loads_no_matplotlib() -> None:
@@ -361,11 +376,6 @@ def test_import_loads_no_matplotlib() -> None:
 
 def some_mistakes(points: np.ndarray, **given: Any) -> Mistakes:
     return Mistakes("000123", "drive_0011", points, np.zeros(len(points), np.uint8), **given)
-
-
-def amount(picture: np.ndarray, color: str) -> int:
-    wanted = [int(color[k : k + 2], 16) for k in (1, 3, 5)]
-    return int((np.abs(picture - wanted) <= 12).all(axis=2).sum())
 
 
 def test_mistakes_are_summed_up(scan: np.ndarray) -> None:
@@ -394,7 +404,7 @@ def test_mistakes_alone_are_drawn(scan: np.ndarray, tmp_path: Path) -> None:
     panels = [
         picture[248 + 880 * k : 248 + 880 * k + 776, 28 + 782 * m : 28 + 782 * m + 762] for k in (0, 1) for m in (0, 1)
     ]
-    red, yellow, faint = ([amount(panel, color) for panel in panels] for color in (MISSED, FALSE, FOUND))
+    red, yellow, faint = ([near(panel, color).sum() for panel in panels] for color in (MISSED, FALSE, FOUND))
     assert red[0] > 100
     assert red[1] == red[3] == 0
     blended = panels[2][..., 0] - panels[2][..., 1] > 100  # points are about as large as pixels
@@ -413,13 +423,6 @@ def test_no_mistakes_to_draw(scan: np.ndarray) -> None:
         picture = pixels(draw_mistakes(scans, title="none"))
         assert picture.shape == (258, 1600, 3)
         assert (picture[180:230] > 200).any()  # the sentence that says so
-
-
-def test_mistakes_need_matplotlib(monkeypatch: pytest.MonkeyPatch, scan: np.ndarray) -> None:
-    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
-    monkeypatch.setitem(sys.modules, "matplotlib.backends.backend_agg", None)
-    with pytest.raises(MissingExtraError, match=r"edgeperc\[view\]"):
-        draw_mistakes([some_mistakes(scan)])
 
 
 wild = st.floats(allow_nan=True, allow_infinity=True) | st.sampled_from([0.0, -0.0, 1e30, -1e308, 1e-300, 5.0, 20.0])
