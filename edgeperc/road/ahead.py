@@ -293,9 +293,8 @@ def _first_m(top_view: TopView, objects: Mask) -> Floats:
         known = known | top_view.between_beams
     firsts = np.empty((3, objects.shape[1]), np.int64)
     fill_first_cells(objects, np.ascontiguousarray(known), np.ascontiguousarray(road), firsts)
-    near, far = top_view.x_range_m
-    near += (far - near) - len(objects) * top_view.cell_m  # rows are counted from the far edge, and are whole
-    return np.where(firsts == len(objects), math.inf, near + firsts * top_view.cell_m)
+    near_m = top_view.geometry.corner_m[0]
+    return np.where(firsts == len(objects), math.inf, near_m + firsts * top_view.cell_m)
 
 
 def _strip_ahead(y_m: Floats, firsts: Floats, view_m: float, half_width_m: float) -> FreeAhead:

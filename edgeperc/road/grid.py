@@ -298,17 +298,11 @@ def occupancy_grid(
         height_m=tallest,
         observed=observed,
         cell_m=view.cell_m,
-        x_range_m=_covered(view.x_range_m, view.height, view.cell_m),
-        y_range_m=_covered(view.y_range_m, view.width, view.cell_m),
+        x_range_m=(view.corner_m[0], view.x_range_m[1]),
+        y_range_m=(view.corner_m[1], view.y_range_m[1]),
         stamp_s=perception.stamp_s,
         mounting=perception.mounting,
     )
-
-
-def _covered(bounds_m: tuple[float, float], n_cells: int, cell_m: float) -> tuple[float, float]:
-    """What the cells cover, counted from the upper bound [m]: other bounds where these are no multiple of a cell."""
-    low, high = bounds_m
-    return low + ((high - low) - n_cells * cell_m), high
 
 
 class Split(NamedTuple):

@@ -208,7 +208,7 @@ class _Channels:
         message = self._messages.Grid(
             timestamp=self._stamp,
             frame_id=scene.BASE,
-            pose=self._pose((view.x_range_m[0], view.y_range_m[0], -MODEL_HEIGHT_M), 0.0),
+            pose=self._pose((*view.geometry.corner_m, -MODEL_HEIGHT_M), 0.0),
             column_count=view.labels.shape[0],
             cell_size=self._messages.Vector2(x=view.cell_m, y=view.cell_m),
             row_stride=view.labels.shape[0] * _CELL.itemsize,

@@ -60,6 +60,15 @@ class TopViewGeometry:
         """Columns, along y."""
         return round((self.y_range_m[1] - self.y_range_m[0]) / self.cell_m)
 
+    @property
+    def corner_m(self) -> tuple[float, float]:
+        """x and y of the nearest, rightmost corner of the cells [m]: whole cells, counted from the other corner, may not
+        fill the bounds.
+        """
+        (near, far), (right, left) = self.x_range_m, self.y_range_m
+        # In this order, because a difference of 0 must leave the bound as it is.
+        return near + ((far - near) - self.height * self.cell_m), right + ((left - right) - self.width * self.cell_m)
+
     def holds(self, x: float, y: float) -> bool:
         """Whether a position x, y [m] in the sensor frame is in view."""
         (near, far), (right, left) = self.x_range_m, self.y_range_m

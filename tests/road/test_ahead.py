@@ -269,11 +269,11 @@ def test_all_cells_drivable() -> None:
 
 
 def test_rows_that_do_not_fill_the_view_are_counted_from_its_far_edge() -> None:
-    cells = np.ones((14, 6), np.bool_)  # 21 m of 20 m
+    cells = np.ones((13, 6), np.bool_)  # 19.5 m of 20 m
     cells[:2] = False
     top_view = TopView(cells.astype(np.uint8), CLASSES[:2], 1.5, (6.0, 26.0), (-4.5, 4.5), cells | True)
     road = road_ahead(top_view)
-    assert road.outline[:, 0].min() == 5.0
+    assert road.outline[:, 0].min() == 6.5
     assert road.free_ahead_m() == road.outline[:, 0].max() == 23.0
 
 
