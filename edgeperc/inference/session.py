@@ -485,10 +485,11 @@ class Session:
 
     def second(self) -> Session:
         """The same network with buffers of its own: two threads may run both sessions at the same time."""
-        if self.short != "cpu":  # the others run one graph in one thread at a time
-            at_once, trusted = self._at_once, self._trusted
-            return Session(self.path, self.short, precision=self.precision, at_once=at_once, trusted=trusted)
-        return self._twin(load_onnxruntime(), self.inference)
+        if self.short == "cpu":
+            return self._twin(load_onnxruntime(), self.inference)
+        second = self.with_constants()  # the others run one graph in one thread at a time
+        second.run_bound(1)  # the first run takes longer
+        return second
 
     def with_constants(self, **constants: float) -> Session:
         """The same network with scalars of its graph in place of those in the file, and with buffers of its own."""

@@ -366,11 +366,16 @@ def test_the_webgpu_plugin_runs_fp32(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_auto_does_not_let_openvino_compile_each_number_of_candidates(monkeypatch: pytest.MonkeyPatch) -> None:
-    FakePlugins(monkeypatch, [(PROVIDERS["openvino"], "CPU")])
+    fake = FakePlugins(monkeypatch, [(PROVIDERS["openvino"], "CPU")])
     monkeypatch.setattr(session_module, "version", lambda package: f"{package} 1.0")
     assert available_providers() == ("openvino", "cpu")
     assert [Session(name, "auto").short for name in ("pointseg", "objects")] == ["openvino", "cpu"]
-    assert Session("objects", "openvino").short == "openvino"  # as it was asked for
+    fake.chosen.clear()
+    session = Session("objects", "openvino", n_threads=1)  # as it was asked for
+    assert (session.short, session.second().short) == ("openvino", "openvino")
+    one, other = fake.chosen
+    assert one == other
+    assert '"INFERENCE_NUM_THREADS": "1"' in json.dumps(json.loads(one[1]["load_config"]))
 
 
 def test_a_failing_run_is_an_inference_error_unless_a_signals_handler_raised() -> None:
