@@ -281,7 +281,7 @@ class Tracker:
                 continue
             of = self._parameters.get(name) or replace(PARAMETERS["car"], group=name)
             if of.group not in self._groups:
-                self._groups.append(of.group)
+                self._groups = [*self._groups, of.group]  # new ones: a copy of the tracker has the former
             row = np.zeros(1, CLASS)
             row["group"] = self._groups.index(of.group)
             for scalar in SCALARS:
@@ -292,7 +292,7 @@ class Tracker:
             row["birth"] = of.birth_speed_mps, of.birth_turn_rps
             row["odds"] = of.detection / ((1.0 - of.detection) * of.clutter)
             row["birth_logit"], row["sure_logit"] = _logit(of.birth_score), _logit(of.sure_score)
-            self._labels.append(name)
+            self._labels = [*self._labels, name]
             self.class_table = np.concatenate([self.class_table, row])
         return np.array([self._labels.index(name) for name in names], np.int64)
 

@@ -22,7 +22,8 @@ _FIELDS = Fields("parameters", OptionError)
 _BOUNDS = {
     **dict.fromkeys(("birth_score", "sure_score", "latest"), (0.0, 1.0)),
     **dict.fromkeys(("far_logit", "coasting_logit"), (-1e6, 1e6)),
-    **dict.fromkeys(("memory_s", "moving_mps", "still_mps"), (0.0, 1e6)),
+    **dict.fromkeys(("moving_mps", "still_mps"), (0.0, 1e6)),
+    "memory_s": (0.0, 3600.0),  # after 15,000 s, a covariance is no longer positive definite in float64
     "detection": (1e-3, 0.999),
     "clutter": (1e-12, 1e6),
 }

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 import tracemalloc
 from collections.abc import Iterator
@@ -283,6 +284,12 @@ def test_fronts_are_those_of_the_twin(n: int, m: int) -> None:
         lives.update_fronts(state, sigma, limit, beta, detections, told, fronts)
         lives.update_fronts(state[1:], sigma[1:], limit[1:], beta[1:], detections, told, before[1:])
         np.testing.assert_array_equal(fronts[1:], before[1:])
+
+
+def test_a_copy_of_a_tracker_goes_its_own_way() -> None:
+    tracker = Tracker()
+    for each, label in ((copy.copy(tracker), "tram"), (tracker, "bus"), (copy.deepcopy(tracker), "tram")):
+        assert each.update([box(label, 10.0, 0.0, score=0.99)], 0.0, STANDING).labels == [label]
 
 
 def test_tracks_name_their_detections() -> None:
@@ -586,7 +593,7 @@ def assert_same_tracks(tracks: np.ndarray, wanted: np.ndarray) -> None:
     "changes",
     [
         *({"detection": value} for value in (1.0, 0.0, math.nan, "0.8")),
-        *({"memory_s": value} for value in (math.nan, -1.0, math.inf)),
+        *({"memory_s": value} for value in (math.nan, -1.0, 86_400.0, math.inf)),
         *({"birth_score": 2.0}, {"along_m": 0.0}, {"gate": -1.0}, {"range_m": 0.0}, {"clutter": 0.0}),
         *({"shape_m": value} for value in ((0.1, 0.1, 0.1), (0.1, 0.1, 0.1, math.nan), 0.1)),
     ],
