@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from edgeperc.readers.origin import find_place
 from edgeperc.simulation import random_scene, simulate
 from edgeperc.simulation.scene import Scene, SimulatedScan
-from edgeperc.types.perception import Box
+from edgeperc.types.perception import Box, Perception
 from edgeperc.types.sensor import SensorProfile
 
 
@@ -49,6 +49,17 @@ def urban(seed: int, sensor: str | SensorProfile = "hdl-64e") -> SimulatedScan:
     scan = simulate(random_scene(seed, "urban"), sensor, seed=seed)
     scan.points.flags.writeable = False
     return scan
+
+
+def assert_same(one: Perception, other: Perception) -> None:
+    """Of two answers to one scan: labels, cells and boxes are the same to the bit."""
+    assert one.n_points == other.n_points
+    assert one.boxes == other.boxes
+    for part, arrays in (("points", ("labels", "in_view")), ("top_view", ("labels", "observed"))):
+        found, expected = getattr(one, part), getattr(other, part)
+        assert (found is None) == (expected is None)
+        for array in arrays if found is not None else ():
+            np.testing.assert_array_equal(getattr(found, array), getattr(expected, array))
 
 
 class Once:

@@ -47,7 +47,7 @@ from edgeperc.types.perception import PointLabels
 from edgeperc.types.sensor import get_sensor
 from edgeperc.types.views import RangeImageGeometry, TopViewGeometry
 from edgeperc.zoo import model_path, shipped_models
-from scenes import urban
+from scenes import assert_same, urban
 
 
 @pytest.fixture(scope="module")
@@ -84,13 +84,6 @@ def full_turn(scan: SimulatedScan) -> Perception:
     assert alone.pipeline is not None
     assert len(alone.pipeline.ranged) == 1
     return alone(scan.points)
-
-
-def assert_same(one: Perception, other: Perception) -> None:
-    np.testing.assert_array_equal(one.require_points().labels, other.require_points().labels)
-    np.testing.assert_array_equal(one.require_points().in_view, other.require_points().in_view)
-    np.testing.assert_array_equal(one.require_top_view().labels, other.require_top_view().labels)
-    assert one.boxes == other.boxes  # bit for bit: tuples of floats
 
 
 def test_every_point_has_a_label(perception: Perception, scan: SimulatedScan) -> None:

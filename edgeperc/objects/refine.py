@@ -18,9 +18,10 @@ from ..system.draws import drawn_of, next_draw
 from ..system.kernels import njit
 from ..types.points import Bytes, Floats, Floats32, Ints, Labels, Mask, Points, Rows, read_only
 
-# Half of an object's diagonal seen from above, and a margin because the mean of the visible side is not its middle. On
-# 90 labeled KITTI frames, car IoU was 0.888, 0.884, 0.878 and 0.872 for 2.5, 3, 3.5 and 4.5 m for masks
-# dilated by a pixel, and 0.990, 0.991, 0.993 and 0.993 for correct masks: below 3.5 m vans and trucks lose points.
+# Radius [m] around an object's middle, seen from above, that holds its visible points: half of its diagonal, and a
+# margin because the mean of the visible side is not its middle. On 90 labeled KITTI frames, car IoU was 0.888, 0.884,
+# 0.878 and 0.872 for 2.5, 3, 3.5 and 4.5 m for masks dilated by a pixel, and 0.990, 0.991, 0.993 and 0.993 for correct
+# masks: below 3.5 m vans and trucks lose points. Other classes are not changed.
 OBJECT_RADIUS_M: Mapping[str, float] = MappingProxyType({"car": 3.5, "pedestrian": 0.7, "cyclist": 1.2})
 
 N_HYPOTHESES = 16  # 8 to 64 differ by less than 0.002 in car IoU
@@ -37,28 +38,20 @@ MAX_RANGE_GAP_M = 1.0
 
 
 def remove_outliers(
-    points: Points,
-    index: Ints,
-    labels: Labels,
-    classes: Sequence[str],
-    *,
-    radius_m: Mapping[str, float] = OBJECT_RADIUS_M,
-    full_turn: bool = False,
+    points: Points, index: Ints, labels: Labels, classes: Sequence[str], *, full_turn: bool = False
 ) -> Bytes:
     """Set to background the pixels whose points lie away from the object they were labeled with; deterministic.
 
     index : (H, W) row of ``points`` at each pixel of a range image; -1 without a return.
-    radius_m : class to the radius [m] around an object's middle, seen from above, that holds its visible points. Other
-        classes are not changed.
     full_turn : the image's left and right edges meet.
 
     PointSeg 5.2 refines its back projection by RANSAC but does not name a model; this one is our own. Connected pixels
     of one label (8 neighbors), at any range, are a component, so that bleeding pixels stay with their object. A
-    hypothesis is a sampled point. Its center is the mean of the component's points within the class's radius of the
-    sample, seen from above. Its consensus is the points within that radius of the center. The largest consensus is an
-    object. The rest is searched in the same way: it is another object (the next car of a row) if its consensus has 5
-    points and a tenth of them are more than 2 pixels from the objects found before. Otherwise all of the rest becomes
-    background. At least one object of every component stays.
+    hypothesis is a sampled point. Its center is the mean of the component's points within the class's radius
+    (`OBJECT_RADIUS_M`) of the sample. Its consensus is the points within that radius of the center. The largest
+    consensus is an object. The rest is searched in the same way: it is another object (the next car of a row) if its
+    consensus has 5 points and a tenth of them are more than 2 pixels from the objects found before. Otherwise all of
+    the rest becomes background. At least one object of every component stays.
 
     On 90 labeled KITTI frames, followed by `label_points`, point IoU of car, pedestrian and cyclist rises from 0.81,
     0.63, 0.66 to 0.88, 0.86, 0.87 for masks dilated by one pixel, from 0.71, 0.47, 0.54 to 0.80, 0.74, 0.81 for two. It
@@ -66,7 +59,7 @@ def remove_outliers(
     objects' feet than of the ground.
     """
     arrays = _check(points, index, labels)
-    radii = np.array([radius_m.get(name, 0.0) for name in classes])
+    radii = np.array([OBJECT_RADIUS_M.get(name, 0.0) for name in classes])
     if labels.size and int(labels.max()) >= len(radii):
         raise PointsError(f"got label {int(labels.max())} for {len(radii)} classes; pass the classes of the labels")
     cleaned = np.empty(labels.shape, np.uint8)
@@ -106,11 +99,7 @@ def _check(points: Points, index: Ints, labels: Labels) -> tuple[Floats32, Ints,
         raise PointsError(
             f"index holds {int(index.max())} for {len(points)} points; pass the points of the same projection"
         )
-    return (
-        read_only(points),
-        read_only(index, np.int32),
-        read_only(labels, np.uint8),
-    )
+    return read_only(points), read_only(index, np.int32), read_only(labels, np.uint8)
 
 
 @njit(cache=True, nogil=True)

@@ -87,16 +87,16 @@ def test_pedestrian_in_front_of_a_car_loses_the_cars_points() -> None:
     assert (cleaned[labels == 1] == 1).all()
 
 
-def test_classes_without_a_radius_and_pixels_without_a_point_stay() -> None:
+def test_classes_without_a_radius_and_pixels_without_a_point_stay(monkeypatch: pytest.MonkeyPatch) -> None:
     ranges = np.full((6, 30), 10.0)
     ranges[:, 15:] = 40.0
     ranges[2, 3] = 0.0
     points, index, _ = scene(ranges)
     labels = np.full(ranges.shape, 1, dtype=np.uint8)
     np.testing.assert_array_equal(remove_outliers(points, index, labels, ("background", "drivable")), labels)
-    np.testing.assert_array_equal(
-        remove_outliers(points, index, labels, ("background", "car"), radius_m={"car": 100.0}), labels
-    )
+    with monkeypatch.context() as patch:
+        patch.setattr(refine, "OBJECT_RADIUS_M", {"car": 100.0})
+        np.testing.assert_array_equal(remove_outliers(points, index, labels, CLASSES), labels)
     assert not remove_outliers(points, index, 0 * labels, CLASSES).any()
 
 
