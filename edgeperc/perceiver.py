@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from numbers import Integral, Real
 from types import MappingProxyType
-from typing import Literal, NamedTuple, NoReturn
+from typing import Literal, NamedTuple, NoReturn, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -261,8 +261,8 @@ class Perceiver:
         weights: str = "default",
     ) -> None:
         _check_choice("adapt", adapt, ADAPTATIONS)
-        _check_choice("on_mismatch", on_mismatch, ("refuse", "warn", "raise", "ignore"))
-        _check_choice("boxes_from", boxes_from, ("both", "network", "clusters"))
+        _check_choice("on_mismatch", on_mismatch, get_args(OnMismatch))
+        _check_choice("boxes_from", boxes_from, get_args(BoxesFrom))
         _check_choice("full_turn", full_turn, (True, False))
         _check_choice("trusted", trusted, (True, False))
         rules = agree if isinstance(agree, Collection) and not isinstance(agree, str) else None

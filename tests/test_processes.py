@@ -133,20 +133,21 @@ def test_a_fork_works_without_threads_and_is_refused_at_once_where_it_cannot_wor
     assert [why in answer for answer in answers[len(works) :]] == [True] * len(refused)
 
 
-END = """
-import gc, multiprocessing, os, sys, warnings
+MADE = """
+import gc, multiprocessing, os, sys, threading, time, warnings
 import numpy as np
 import edgeperc
 
 warnings.simplefilter("ignore")
-scan = np.random.default_rng(0).normal(0.0, 10.0, (2000, 4)).astype(np.float32)
+scan = np.random.default_rng(0).normal(0.0, 10.0, (20_000, 4)).astype(np.float32)
 
-def make():
-    perceive = edgeperc.Perceiver("pointseg", provider="cpu", n_threads=2, on_mismatch="ignore")
+def make(n_threads):
+    perceive = edgeperc.Perceiver("pointseg", provider="cpu", n_threads=n_threads, on_mismatch="ignore")
     perceive(scan)
     return perceive
-
-perceive = make()
+"""
+END = f"""{MADE}
+perceive = make(2)
 for how in ("exit", "dropped", "forked again", "with its own", "cyclic"):
     child = os.fork()
     if child == 0:
@@ -156,7 +157,7 @@ for how in ("exit", "dropped", "forked again", "with its own", "cyclic"):
         elif how == "forked again" and os.fork():
             os.wait()
         elif how == "with its own":
-            perceive = make()
+            perceive = make(2)
         elif how == "cyclic":
             cycle = [perceive]
             cycle.append(cycle)
@@ -182,21 +183,9 @@ def test_a_fork_ends() -> None:
     assert done.stdout.splitlines() == hows
 
 
-DAEMON = """
-import os, sys, threading, time, warnings
-import numpy as np
-import edgeperc
-
-warnings.simplefilter("ignore")
-scan = np.random.default_rng(0).normal(0.0, 10.0, (20_000, 4)).astype(np.float32)
-
-def make():
-    perceive = edgeperc.Perceiver("pointseg", provider="cpu", n_threads=1, on_mismatch="ignore")
-    perceive(scan)
-    return perceive
-
+DAEMON = f"""{MADE}
 def perceive_until_the_end():
-    perceive = make()
+    perceive = make(1)
     begun = threading.Event()
 
     def work():
@@ -207,7 +196,7 @@ def perceive_until_the_end():
     threading.Thread(target=work, daemon=True).start()
     begun.wait()
 
-make()  # imports what is needed, and is gone
+make(1)  # imports what is needed, and is gone
 *others_s, wait_s = 0.0, 0.007, 0.017
 for other_s in others_s if hasattr(os, "fork") else ():
     child = os.fork()
