@@ -62,8 +62,8 @@ class TopViewGeometry:
 
     @property
     def corner_m(self) -> tuple[float, float]:
-        """x and y of the nearest, rightmost corner of the cells [m]: whole cells, counted from the other corner, may not
-        fill the bounds.
+        """x and y of the nearest, rightmost corner of the cells [m]: counted from the other one, they may not fill the
+        bounds.
         """
         (near, far), (right, left) = self.x_range_m, self.y_range_m
         # In this order, because a difference of 0 must leave the bound as it is.
