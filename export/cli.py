@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 from edgeperc import __version__
-from edgeperc.cli.arguments import Options, options
+from edgeperc.cli.arguments import Options, options, positive, positive_number
 from edgeperc.cli.output import print_error, print_line
 from edgeperc.cli.program import Parser, run_program
 from edgeperc.errors import CardError, EdgepercError, MissingExtraError, ModelError
@@ -19,6 +19,15 @@ from edgeperc.types.choices import PLACES
 
 from .database.cli import add_database_commands
 from .recipe import MODELS, NETWORKS, PAPER, TASKS, Recipe
+
+
+def count(text: str) -> int:
+    """Parse a count of at least 0."""
+    value = int(text)
+    if value < 0:
+        raise argparse.ArgumentTypeError(f"{value} is too small; expected 0 or more")
+    return value
+
 
 Command: TypeAlias = "Callable[..., argparse.ArgumentParser]"
 KITTI = "KITTI object set: a folder of training/velodyne, label_2, calib and of frames.csv"
@@ -46,9 +55,9 @@ SHARED: Mapping[str, Mapping[str, Any]] = {
         "default": [],
         "help": "more real scans: FOLDER with a scans.json, or FOLDER:LAYOUT; may be repeated",
     },
-    "--threads THREADS": {"type": int, "help": "number of CPU threads (default: one for each core)"},
+    "--threads THREADS": {"type": positive, "help": "number of CPU threads (default: one for each core)"},
     "--workers WORKERS": {
-        "type": int,
+        "type": count,
         "default": 1,
         "help": "number of processes that make the training samples (default 1)",
     },
@@ -73,7 +82,7 @@ def _run(given: list[str]) -> int:
         return int(args.run(args))
     except ModuleNotFoundError as exc:
         raise MissingExtraError(exc.name or "a package", args.extra, "edgeperc-export") from exc
-    except (EdgepercError, ValueError) as exc:
+    except (EdgepercError, FloatingPointError, ValueError) as exc:
         print_error(exc, "edgeperc-export")
         return 1 if type(exc).__name__ in ("ParityError", "RefusedError") else 2
 
@@ -177,12 +186,12 @@ def recipe_of(args: argparse.Namespace) -> Recipe:
 def _add_simulate(command: Command) -> None:
     add = options(command("simulate", "write simulated, labeled scans to train on", _simulate))
     add("out", "folder for the scans; existing scans in it are kept", type=Path)
-    add("-n N", "number of scans (default 1000)", type=int, default=1000)
-    add("--first FIRST", "number of the first scan, and its seed (default 0)", type=int, default=0)
+    add("-n N", "number of scans (default 1000)", type=positive, default=1000)
+    add("--first FIRST", "number of the first scan, and its seed (default 0)", type=count, default=0)
     _add_shared(add, "--layouts LAYOUTS")
     add("--sensor SENSOR", "sensor to simulate (default hdl-64e)", default="hdl-64e")
     add("--where WHERE", "kind of place (default street); only streets have layouts", choices=PLACES, default="street")
-    add("--workers WORKERS", "number of processes that simulate (default: this one)", type=int, default=0)
+    add("--workers WORKERS", "number of processes that simulate (default: this one)", type=count, default=0)
 
 
 def _simulate(args: argparse.Namespace) -> int:
@@ -230,7 +239,7 @@ def _add_train(command: Command) -> None:
     add(
         "--checkpoint-every STEPS",
         "steps between checkpoints, and between lines of log.jsonl (default 100)",
-        type=int,
+        type=positive,
         default=100,
     )
     add("--tensorboard", "also write the log for TensorBoard; see it with: tensorboard --logdir OUT")
@@ -256,11 +265,11 @@ def _train(args: argparse.Namespace) -> int:
 def _add_curve(command: Command) -> None:
     add = options(command("curve", "show the validation figures of training runs over the samples seen", _curve))
     add("runs OUT...", "folder of a training run, with its log.jsonl", type=Path)
-    add("--lines LINES", "at most this many lines for each run (default 12)", type=int, default=12)
+    add("--lines LINES", "at most this many lines for each run (default 12)", type=positive, default=12)
 
 
 def _curve(args: argparse.Namespace) -> int:
-    from .training.curve import curve_table
+    from .training.log import curve_table
 
     for run in args.runs:
         for line in curve_table(run, args.lines):
@@ -376,16 +385,16 @@ def _add_quantize(command: Command) -> None:
     add("out", ".onnx file to write", type=Path)
     add("--scans SCANS", "scans, or folders of .bin, to calibrate on", type=Path, nargs="*", default=[])
     add("--kitti KITTI", f"{KITTI}; calibrates on training drives, compares on validation drives", type=Path)
-    add("--simulated N", "simulated scans to calibrate on (default 64)", type=int, default=64)
+    add("--simulated N", "simulated scans to calibrate on (default 64)", type=count, default=64)
     _add_shared(add, "--semantickitti SEMANTICKITTI")
     add("--camvid CAMVID", f"{CAMVID}; for a camera's model: calibrates on training images, not on scans", type=Path)
     add(
         "--eight-bits",
         "use 8-bit weights, which x86 without VNNI saturates, so precision auto takes fp32 there (default: 7 bits)",
     )
-    add("--evaluate-on N", "simulated scans to evaluate both models on (default 48)", type=int, default=48)
+    add("--evaluate-on N", "simulated scans to evaluate both models on (default 48)", type=count, default=48)
     add("--exclude NODE", "graph nodes to keep in fp32", nargs="*", default=[])
-    add("--threads THREADS", "number of CPU threads for timing (default: onnxruntime's choice)", type=int)
+    add("--threads THREADS", "number of CPU threads for timing (default: onnxruntime's choice)", type=positive)
 
 
 def _quantize(args: argparse.Namespace) -> int:
@@ -425,7 +434,7 @@ def _add_agree(command: Command) -> None:
     add("--semantickitti SEMANTICKITTI", "root of SemanticKITTI, for the road", type=Path)
     add("--camvid CAMVID", f"{CAMVID}; for a network of a camera", type=Path)
     add("--split SPLIT", "drives of the KITTI set, or images (default: validation)", default="validation")
-    add("--scans N", "at most N scans of each set (default: all)", type=int)
+    add("--scans N", "at most N scans of each set (default: all)", type=positive)
 
 
 def _agree(args: argparse.Namespace) -> int:
@@ -454,7 +463,7 @@ def _add_make(command: Command) -> None:
     _add_shared(add, "--kitti KITTI", "--layouts LAYOUTS", "--semantickitti SEMANTICKITTI")
     add("--camvid CAMVID", f"{CAMVID}; for camseg", type=Path)
     _add_shared(add, "--fold FOLD", "--scans FOLDER[:LAYOUT]")
-    add("--steps STEPS", "training steps (default: as many as for the shipped model)", type=int)
+    add("--steps STEPS", "training steps (default: as many as for the shipped model)", type=positive)
     _add_shared(add, "--threads THREADS", "--workers WORKERS", "--compile", "--model-version MODEL_VERSION")
 
 
@@ -498,14 +507,14 @@ def _add_ablate(command: Command) -> None:
         type=_model_file,
     )
     scans("--fold FOLD", "fold of the training drives to evaluate on (default 0)", type=int, default=0)
-    scans("--steps STEPS", "training steps of each run (default 150)", type=int, default=150)
+    scans("--steps STEPS", "training steps of each run (default 150)", type=positive, default=150)
     scans("--plot PNG", "also draw the results (lodnn only)", type=Path)
     images = options(ablate, "networks on CamVid")
     _add_shared(images, "--camvid CAMVID")
     images("--size WxH", "size of the images (default 120x90)", type=_size, default=(120, 90))
-    images("--epochs EPOCHS", "how often each image is trained on (default 10)", type=int, default=10)
-    images("--batch BATCH", "images in each step (default 8)", type=int, default=8)
-    images("--learning-rate LEARNING_RATE", "learning rate (default 3e-4)", type=float)
+    images("--epochs EPOCHS", "how often each image is trained on (default 10)", type=positive, default=10)
+    images("--batch BATCH", "images in each step (default 8)", type=positive, default=8)
+    images("--learning-rate LEARNING_RATE", "learning rate (default 3e-4)", type=positive_number)
     images("--no-plots", "write the table alone, without matplotlib")
     _add_shared(images, "--compile")
     add("--variant VARIANT", "run this variant, or network, only; may be repeated", action="append", default=[])
@@ -540,7 +549,7 @@ def _ablate(args: argparse.Namespace) -> int:
 def _size(text: str) -> tuple[int, int]:
     width, _, height = text.partition("x")
     try:
-        return int(width), int(height)
+        return positive(width), positive(height)
     except ValueError:
         raise argparse.ArgumentTypeError(f"{text!r}; expected WIDTHxHEIGHT, for instance 240x180") from None
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -27,6 +28,20 @@ EDGE_NETWORKS = ("lodnn", "pointseg", "ssadnet")
 """Networks with a version for small computers (`edgeperc_export.networks.edge`)."""
 EDGE_BLOCKS: Mapping[str, tuple[int, int]] = {"pointseg": (2, 4), "ssadnet": (4, 4)}
 """Rows and columns of the blocks of pixels that they label at once."""
+
+# Smallest and largest value of the numbers of a recipe; that of others is any from 0.
+LIMITS: Mapping[str, tuple[float, float]] = {
+    **dict.fromkeys(("steps", "batch", "accumulate", "reuse", "image_width", "image_height"), (1, math.inf)),
+    **dict.fromkeys(("cooldown", "simulated_share", "swap", "paste_cars", "turn_to_rare", "turn_anywhere"), (0, 1)),
+    **dict.fromkeys(("weather", "beams", "no_remission", "ema", "kept", "found_again"), (0, 1)),
+    **{
+        "context_width": (1, 4096),
+        "dropout": (0, 0.999),
+        "width": (1e-3, 8),
+        "runs": (1, 1000),
+        "seed": (0, 2**31 - 1),
+    },
+}
 
 
 def _option(
@@ -189,6 +204,14 @@ class Recipe:
             if self.network in networks:
                 return task
         raise ValueError(f"network is {self.network!r}; expected {', '.join(NETWORKS[:-1])} or {NETWORKS[-1]}")
+
+    def check(self) -> None:
+        """Raise ValueError for a number that no run can be made with."""
+        for name, value in vars(self).items():
+            low, high = LIMITS.get(name, (0, math.inf))
+            if isinstance(value, int | float) and not (low <= value <= high and value < math.inf):
+                most = f" to {high}" if high < math.inf else " or more"
+                raise ValueError(f"--{name.replace('_', '-')} is {value}; expected {low}{most}")
 
 
 PLAIN: Mapping[str, Any] = {

@@ -137,7 +137,7 @@ FLOORS = {
         networks.segnet networks.squeezesegv2 networks.unet
         networks.fcn
         networks.__init__
-        training.__init__ training.bfloat16 training.checkpoint training.curve training.log training.losses
+        training.__init__ training.bfloat16 training.checkpoint training.log training.losses
         training.object_task training.ranks
         training.camera training.object_samples training.start training.task
         training.images training.object_sets training.teacher

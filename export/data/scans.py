@@ -57,8 +57,8 @@ class LabeledScan:
         surface = np.where(surface == 1, 1, np.where(surface >= 2, IGNORE, 0)).astype(np.uint8)
         return cls(scan.points, labels_of_scene(scan), scan.boxes, scan.box_points, surface)
 
-    def save(self, path: Path) -> None:
-        """Write an .npz file, without pickles."""
+    def save(self, path: Path, place: str = "") -> None:
+        """Write an .npz file, without pickles; ``place`` says where a simulated scan was taken."""
         boxes = np.array([[*b.center, *b.size, b.yaw] for b in self.boxes], np.float32).reshape(-1, 7)
         names = np.array([b.label for b in self.boxes], dtype="U32")
         with open_atomic(path) as file:
@@ -73,6 +73,7 @@ class LabeledScan:
                 azimuths=np.array(self.azimuths),
                 sensor=np.array("" if self.sensor is None else self.sensor.to_json()),
                 boxes_known=np.array(self.boxes_known),
+                place=np.array(place),
             )
 
     @classmethod

@@ -38,7 +38,7 @@ def simulate(
     n_workers: int = 0,
 ) -> None:
     """Write ``n`` labeled scans into ``out``. Existing files are kept, so a stopped run resumes; ValueError if they are
-    of another sensor.
+    of another sensor or place, or with layouts and now without, or the other way round.
 
     first : number and seed of the first scan.
     layouts_root : folder of KITTI's labels; every other street gets the boxes of one of its scans.
@@ -50,34 +50,45 @@ def simulate(
         raise ValueError(f"layouts are those of streets, and the place is a {where}; leave them out")
     out.mkdir(parents=True, exist_ok=True)
     real = list(layouts(layouts_root)) if layouts_root else []
-    _check_kept(out, range(first, first + n), get_sensor(sensor).name)
+    place = f"{where} with layouts" if real else where
+    _check_kept(out, range(first, first + n), get_sensor(sensor).name, place)
     missing = [seed for seed in range(first, first + n) if not _path(out, seed).exists()]
-    write = partial(_simulate, out=out, layouts=real, sensor=sensor, where=where)
+    write = partial(_simulate, out=out, layouts=real, sensor=sensor, where=where, place=place)
     with mapped(write, missing, n_workers) as done:
         for _ in tqdm(done, desc="simulating", unit="scan", total=len(missing)):
             pass
+
+
+def simulated_files(folder: Path) -> list[Path]:
+    """The scans that `simulate` wrote into a folder; ValueError without one, which a mistyped name has not either."""
+    files = sorted(folder.glob("*.npz"))
+    if not files:
+        raise ValueError(f"{folder} holds no simulated scan; expected a folder written by edgeperc-export simulate")
+    return files
 
 
 def _path(out: Path, seed: int) -> Path:
     return out / f"{seed:06d}.npz"
 
 
-def _check_kept(out: Path, seeds: range, sensor: str) -> None:
+def _check_kept(out: Path, seeds: range, sensor: str, place: str) -> None:
     for path in filter(Path.exists, (_path(out, seed) for seed in seeds)):
         with np.load(path, allow_pickle=False) as data:
-            profile = str(data["sensor"]) if "sensor" in data else ""
+            profile, taken_at = (str(data[name]) if name in data else "" for name in ("sensor", "place"))
         kept = SensorProfile.from_json(profile).name if profile else TRAINING_SENSOR
         if kept != sensor:
             raise ValueError(f"{path} is a scan of {kept}, and would be kept; take another folder for {sensor}")
+        if taken_at not in (place, ""):  # earlier versions did not write it
+            raise ValueError(f"{path} is a scan of a {taken_at}, and would be kept; take another folder for a {place}")
 
 
-def _simulate(seed: int, *, out: Path, layouts: Sequence[Sequence[Box]], sensor: str, where: str) -> None:
+def _simulate(seed: int, *, out: Path, layouts: Sequence[Sequence[Box]], sensor: str, where: str, place: str) -> None:
     # 4,973 is prime: neighboring seeds take layouts of different drives.
     boxes = layouts[seed * 4973 % len(layouts)] if layouts and seed % 2 else None
     scan = LabeledScan.from_simulation(simulated_scan(seed, sensor, boxes, where=where, clumped_leaves=True))
     if sensor != TRAINING_SENSOR:
         scan = replace(scan, sensor=get_sensor(sensor))
-    scan.save(_path(out, seed))
+    scan.save(_path(out, seed), place)
 
 
 def parity_samples(task: str, paths: Sequence[Path] = ()) -> list[NDArray[Any]]:

@@ -124,6 +124,11 @@ def record_of(own: Measured, fp32: Measured, command: str) -> dict[str, Any]:
     losses = [fp32.mean_iou - own.mean_iou, 0.0]
     if own.ap is not None and fp32.ap is not None:
         losses.append(fp32.ap - own.ap)
+    if not np.isfinite(losses).all():  # no loss would be seen
+        raise PointsError(
+            f"{len(own.labels)} labeled scans or images show no class of the network, so that no accuracy is measured; "
+            "name a set with labels of its classes"
+        )
     return {
         "n_scans": len(own.labels),
         "label_agreement": round(same / max(sum(labels.size for labels in own.labels), 1), 6),

@@ -13,7 +13,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from edgeperc.system.atomic import write_atomic
+
 from ..recipe import MODELS, PAPER, Recipe
+from .log import whole_lines
 from .train import Data, Run, train
 
 VARIANTS: Mapping[str, Mapping[str, Mapping[str, Any]]] = {
@@ -99,7 +102,9 @@ def ablate(
         recipe = replace(recipe, steps=max(1, int(n_scans) // recipe.batch))  # the same number of scans
         folder = out / f"{network}-{data.fold}-{steps}-{'-'.join(variant.split())}"
         train(recipe, folder, data, replace(run, start_from=start, teacher=teacher, checkpoint_every=recipe.steps))
-        last = json.loads((folder / "log.jsonl").read_text().splitlines()[-1])
+        last = whole_lines(folder / "log.jsonl")[-1]
+        if "validation" not in last:
+            raise ValueError(f"{data.kitti} has no scan of fold {data.fold} to evaluate on; give another --fold")
         rows.append(
             {
                 "network": network,
@@ -110,7 +115,7 @@ def ablate(
                 "figures": last["validation"],
             }
         )
-        path.write_text(json.dumps(rows, indent=1) + "\n")
+        write_atomic(path, (json.dumps(rows, indent=1) + "\n").encode())
     return rows
 
 

@@ -22,7 +22,7 @@ import torch
 
 from edgeperc.evaluation.camvid import image_figures
 from edgeperc.evaluation.metrics import Confusion
-from edgeperc.system.atomic import open_atomic
+from edgeperc.system.atomic import open_atomic, write_atomic
 from edgeperc.types.points import Bytes, Ints64
 
 from ..recipe import PAPER
@@ -148,7 +148,7 @@ def ablate_camvid(
             }
         )
         _keep(out / PREDICTIONS, name, [*watch.images.hashes], watch.truth, labels)
-        path.write_text(json.dumps(rows, indent=1) + "\n")
+        write_atomic(path, (json.dumps(rows, indent=1) + "\n").encode())
         checkpoint.unlink()
         del trained, state
     order = [*ELEVEN]

@@ -19,8 +19,6 @@ from edgeperc.system.fields import Fields
 from ..networks import build
 from ..recipe import Recipe
 
-MAX_WIDTH = 4096
-MAX_RUNS = 1000
 _FIELDS = Fields("the checkpoint", ValueError, "train again", optional=("*",), exact=True)
 _TEXTS = {"before": list, "curve": list, "frames": dict}  # entries that are JSON
 
@@ -72,11 +70,7 @@ def write_mean(paths: Sequence[Path], recipe: Recipe, out: Path) -> None:
 
 def _recipe(text: str) -> Recipe:
     recipe = _FIELDS.read(Recipe, json.loads(text), "recipe")
-    _FIELDS.whole("recipe.context_width", recipe.context_width, 1, MAX_WIDTH)
-    _FIELDS.whole("recipe.runs", recipe.runs, 1, MAX_RUNS)
-    _FIELDS.whole("recipe.seed", recipe.seed, 0, 2**63 - 1)
-    _FIELDS.number("recipe.width", recipe.width, 1e-3, 8.0)
-    _FIELDS.number("recipe.dropout", recipe.dropout, 0.0, 0.999)
+    recipe.check()
     return recipe
 
 

@@ -1,36 +1,54 @@
-"""The log of a training run: a line for each checkpoint, as JSON, as CSV and as TensorBoard's scalars."""
+"""The log of a training run, a line for each checkpoint: JSON, CSV and scalars of TensorBoard; and its curve."""
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+from edgeperc.system.atomic import write_atomic
 from edgeperc.system.extras import require
 
 
 class TrainingLog:
     """Writes ``log.jsonl``, ``log.csv`` (names as of TensorBoard, ``validation/car``) and, if asked, event files into a
-    run's folder, where a resumed run goes on; nothing without a folder. Raises MissingExtraError.
+    run's folder, where a run that is resumed after ``step`` goes on: lines of later steps, which it makes again, are
+    removed. Nothing without a folder. Raises MissingExtraError.
     """
 
-    def __init__(self, folder: Path | None, *, tensorboard: bool = False) -> None:
+    def __init__(self, folder: Path | None, step: int = 0, *, tensorboard: bool = False) -> None:
         self._events: Any = None
         if tensorboard and folder is not None:
             require("tensorboard", "tensorboard", "--tensorboard")
-            self._events = require("torch.utils.tensorboard", "tensorboard", "--tensorboard").SummaryWriter(str(folder))
+            writer = require("torch.utils.tensorboard", "tensorboard", "--tensorboard").SummaryWriter
+            self._events = writer(str(folder), purge_step=step + 1 if step else None)
         path = Path(os.devnull) if folder is None else folder / "log.jsonl"
-        self._lines = path.open("a", encoding="utf-8")
         self._table = None if folder is None else folder / "log.csv"
+        if folder is not None and path.exists():
+            kept = [line for line in whole_lines(path) if not step or line["step"] <= step]
+            write_atomic(path, "".join(json.dumps(line) + "\n" for line in kept).encode())
+            (folder / "log.csv").unlink(missing_ok=True)
+            for line in kept:
+                self._add_row(flat(line))
+        self._lines = path.open("a", encoding="utf-8")
 
     def write(self, line: Mapping[str, Any]) -> None:
         """Add the figures of a checkpoint; ``line["step"]`` is its step."""
         self._lines.write(json.dumps(line) + "\n")
         self._lines.flush()
         row = flat(line)
+        self._add_row(row)
+        if self._events is not None:
+            for name, value in row.items():
+                if value is not None:
+                    self._events.add_scalar(name, value, line["step"])
+            self._events.flush()
+
+    def _add_row(self, row: Mapping[str, Any]) -> None:
         if self._table is not None:
             is_new = not self._table.exists()
             with self._table.open("a", encoding="utf-8", newline="") as file:
@@ -38,11 +56,6 @@ class TrainingLog:
                 if is_new:
                     table.writerow(row)
                 table.writerow(row.values())
-        if self._events is not None:
-            for name, value in row.items():
-                if value is not None:
-                    self._events.add_scalar(name, value, line["step"])
-            self._events.flush()
 
     def __enter__(self) -> TrainingLog:
         return self
@@ -53,9 +66,55 @@ class TrainingLog:
             self._events.close()
 
 
+def whole_lines(path: Path) -> list[dict[str, Any]]:
+    """The lines of ``log.jsonl``; of the last one, a kill or a full disk may have left a part, which is none."""
+    lines = []
+    for text in path.read_text(encoding="utf-8").splitlines():
+        with contextlib.suppress(json.JSONDecodeError):
+            lines.append(json.loads(text))
+    return lines
+
+
 def flat(figures: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     """Nested figures under names with slashes."""
     row: dict[str, Any] = {}
     for name, value in figures.items():
         row |= flat(value, f"{prefix}{name}/") if isinstance(value, Mapping) else {prefix + name: value}
     return row
+
+
+def curve_table(run: Path, n_lines: int = 12) -> Iterator[str]:
+    """Lines of a table of a run's ``log.jsonl``, at most so many, means of neighboring ones: samples, loss, validation
+    figures in percent, and what the last quarter brought. Raises ValueError.
+    """
+    path = run / "log.jsonl"
+    rows = whole_lines(path) if path.is_file() else []
+    if not rows:
+        raise ValueError(f"{path} has no line; expected the folder of a training run")
+    # A run that began anew in its folder repeats steps.
+    rows = list({row["step"]: row for row in rows}.values())
+    names = [name for name in rows[-1].get("validation", {}) if name != "background"]
+    size = -(-len(rows) // max(1, n_lines))
+    yield f"{run}: {len(rows)} lines of the log, means of {size}"
+    yield "".join(f"{name:>12}" for name in ("samples", "loss", *names))
+
+    def mean(part: list[dict[str, object]], name: str) -> float | None:
+        found = [row.get("validation", {}).get(name) for row in part]  # type: ignore[attr-defined]  # a dict
+        known = [value for value in found if value is not None]
+        return 100.0 * sum(known) / len(known) if known else None
+
+    for first in range(0, len(rows), size):
+        part = rows[first : first + size]
+        cells = [
+            f"{part[-1].get('samples', part[-1]['step']):>12,}",
+            f"{sum(r['loss'] for r in part) / len(part):>12.4f}",
+        ]
+        cells += [f"{value:>12.1f}" if (value := mean(part, name)) is not None else f"{'-':>12}" for name in names]
+        yield "".join(cells)
+    quarter = len(rows) // 4
+    if quarter and names:
+        gains = []
+        for name in names:
+            before, after = mean(rows[-2 * quarter : -quarter], name), mean(rows[-quarter:], name)
+            gains.append("-".rjust(12) if before is None or after is None else f"{after - before:>+12.1f}")
+        yield f"{'last quarter':>24}" + "".join(gains)

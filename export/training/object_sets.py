@@ -17,6 +17,7 @@ from ..data.augment import Augmentation, ObjectBank, augmented
 from ..data.beams import drawn_sensor
 from ..data.scan_sets import check_trains, read_scan_set
 from ..data.scans import LabeledScan
+from ..data.simulate import simulated_files
 from .object_samples import DriveScan, build_samples, digest_of_files
 
 VALIDATION = "validation"
@@ -73,7 +74,7 @@ def write_samples(
         names += [folder.layout.name, f"{folder.layout.name}-{PASTED}"]
         hashes[names[-1]] = {}
     if simulated is not None:
-        files = sorted(simulated.glob("*.npz"))
+        files = simulated_files(simulated)
         drawn = [(file.stem, partial(LabeledScan.load, file)) for file in files]
         build(SIMULATED, drawn, real=False, made_of=digest_of_files(files))
         names.append(SIMULATED)

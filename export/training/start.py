@@ -19,6 +19,7 @@ import torch
 from torch import Tensor, nn
 from torch.utils.hooks import RemovableHandle
 
+from edgeperc.errors import ModelError
 from edgeperc.inference.session import golden_input, golden_shape
 from edgeperc.types.card import ModelCard
 
@@ -26,6 +27,9 @@ from ..cards import card_of
 from ..networks.objects import CLOSE, LOOK
 from ..recipe import Recipe
 from .checkpoint import read_checkpoint
+
+OUTPUT_LAYERS = {"classifier", "early", "predict"}
+"""Layers that may lack classes or box channels, or have them in another order; of others, all or nothing is shared."""
 
 
 def start(
@@ -37,6 +41,8 @@ def start(
     own_card = card_of(recipe, version="0")
     if path.suffix == ".onnx":
         card = ModelCard.read(path)
+        if card.precision != "fp32":
+            raise ModelError(f"{path} is in {card.precision}, without most weights in fp32; give the model in fp32")
         given, folded = folded_weights(path), True
         training = card.training or {}
         before, frames = list(training.get("started_from", ())), dict(training.get("frames", {}))
@@ -53,7 +59,7 @@ def start(
         value: Tensor | None = weight
         if name in own and name in first:
             value = _by_channel(weight, own[name], card, own_card, path)
-        elif name in own and weight.shape != own[name].shape:
+        elif name in own and not OUTPUT_LAYERS.isdisjoint(name.split(".")):
             value = _by_class(weight, own[name], card.classes, own_card.classes)
         if name in own and value is not None and value.shape == own[name].shape:
             common[name] = value

@@ -7,9 +7,11 @@ checkpoint therefore ends with the same weights, bit for bit, as an uninterrupte
 from __future__ import annotations
 
 import copy
+import hashlib
 import json
 import math
 import time
+import warnings
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
@@ -18,17 +20,20 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from filelock import FileLock  # torch needs it, too
 from torch import Tensor, nn
 from tqdm import tqdm
 
 from edgeperc.datasets.kitti import KittiObjects
+from edgeperc.datasets.layout import BACKGROUND, numbers_of_scene
 from edgeperc.datasets.scan_folder import ScanFolder
 from edgeperc.preprocess.fitness import FitnessProfile
-from edgeperc.simulation.scene import POINT_CLASSES
+from edgeperc.simulation.scene import POINT_CLASSES, SCENE_CLASSES
 from edgeperc.system.atomic import open_atomic
 
 from ..data.scan_sets import check_trains, joined_hashes, read_scan_set
 from ..data.scans import LabeledScan
+from ..data.simulate import simulated_files
 from ..networks import build
 from ..recipe import Recipe
 from .bfloat16 import in_bfloat16
@@ -93,8 +98,9 @@ def train(recipe: Recipe, out: Path, data: Data, run: Run | None = None) -> Path
     gets their mean. Raises ValueError, FloatingPointError, RankError.
     """
     run = run or Run()
-    if recipe.runs < 1:
-        raise ValueError(f"the recipe has {recipe.runs} runs; expected one or more")
+    recipe.check()
+    if recipe.classes and recipe.classes[0] != BACKGROUND:
+        raise ValueError(f"--classes begins with {recipe.classes[0]}; expected {BACKGROUND}, which is not looked for")
     ranks = Ranks()
     ranks.check(recipe.batch, recipe.accumulate, run.compiled)
     with ranks.together():
@@ -118,6 +124,7 @@ class _Source(NamedTuple):
     watch: Watch | ImageWatch | ObjectWatch | None
     hashes: dict[str, str]
     n_real: int
+    truth: str  # a digest of the labels, which a user may have corrected
     teacher: nn.Module | None = None
     fitness: dict[str, Any] | None = None
 
@@ -195,7 +202,8 @@ class _Training:
             if isinstance(samples, Samples)
             else map(samples.batch, range(state.step, last_step(recipe, state.curve, self.epoch)))
         )
-        with TrainingLog(self.out if ranks.is_first else None, tensorboard=run.tensorboard) as log, progress:
+        folder = self.out if ranks.is_first else None
+        with TrainingLog(folder, state.step, tensorboard=run.tensorboard) as log, progress:
             for arrays in batches:
                 losses.append(self._step([array.to(ranks.device, non_blocking=True) for array in arrays]))
                 state.step += 1
@@ -291,6 +299,7 @@ class _Training:
                     "optimizer": self.optimizer.state_dict(),
                     "curve": json.dumps(state.curve),
                     "frames": json.dumps(state.hashes),
+                    "truth": self.source.truth,
                     "fitness": json.dumps(self.source.fitness),
                     "fold": -1 if self.fold is None else self.fold,
                     "n_simulated": len(samples.simulated),
@@ -321,6 +330,11 @@ class _Training:
                 f"runs before), {kept['n_simulated']} simulated ones, fold {kept['fold']}; got {len(own)}, "
                 f"{n_simulated}, fold {fold}. Give the same ones, or an empty folder"
             )
+        if kept.get("truth", self.source.truth) != self.source.truth:  # earlier versions did not write it
+            raise ValueError(
+                f"{self.checkpoint} is of a run on other labels of the same scans or images, or on other simulated "
+                "scans; give the same ones, or an empty folder"
+            )
 
 
 def _image_source(recipe: Recipe, data: Data, device: torch.device) -> _Source:
@@ -329,7 +343,8 @@ def _image_source(recipe: Recipe, data: Data, device: torch.device) -> _Source:
         raise ValueError(f"no images to train {recipe.network} on; give --camvid")
     task = Camera.of(recipe)
     samples, watch = camvid_samples(task, data.camvid, device)
-    return _Source(task, samples, watch, samples.images.hashes, len(samples.images.hashes))
+    truth = hashlib.sha256(samples.images.labels.cpu().numpy().tobytes()).hexdigest()
+    return _Source(task, samples, watch, samples.images.hashes, len(samples.images.hashes), truth)
 
 
 def _object_source(recipe: Recipe, folder: Path, data: Data, run: Run) -> _Source:
@@ -337,16 +352,20 @@ def _object_source(recipe: Recipe, folder: Path, data: Data, run: Run) -> _Sourc
     task = Objects.of(recipe)
     if not recipe.detector:
         folder = folder.with_name(f"{folder.name}-of-groups")
-    names, hashes = write_samples(
-        folder, data.kitti, data.simulated, data.scan_sets, run.n_workers, detector=recipe.detector
-    )
-    watched = [VALIDATION if data.fold is None else f"kitti-{data.fold}"]
-    trained = [name for name in names if name != VALIDATION and name.removesuffix(f"-{PASTED}") not in watched]
-    if not trained:
-        raise ValueError("no scans to train objects on; give --kitti, --scans, --simulated or several of them")
-    seen = {name: of for source in trained for name, of in hashes[source].items()}
-    watch = ObjectWatch(task, load_samples(folder, watched)) if watched[0] in names else None
-    return _Source(task, ObjectBatches(task, load_samples(folder, trained), trained), watch, seen, len(seen))
+    folder.mkdir(parents=True, exist_ok=True)
+    with FileLock(folder / ".lock"):  # a run on other scans replaces the samples
+        names, hashes = write_samples(
+            folder, data.kitti, data.simulated, data.scan_sets, run.n_workers, detector=recipe.detector
+        )
+        watched = [VALIDATION if data.fold is None else f"kitti-{data.fold}"]
+        trained = [name for name in names if name != VALIDATION and name.removesuffix(f"-{PASTED}") not in watched]
+        if not trained:
+            raise ValueError("no scans to train objects on; give --kitti, --scans, --simulated or several of them")
+        seen = {name: of for source in trained for name, of in hashes[source].items()}
+        watch = ObjectWatch(task, load_samples(folder, watched)) if watched[0] in names else None
+        truth = " ".join((folder / f"{name}.sha256").read_text() for name in trained)
+        batches = ObjectBatches(task, load_samples(folder, trained), trained)
+    return _Source(task, batches, watch, seen, len(seen), truth)
 
 
 def _scan_source(recipe: Recipe, data: Data, run: Run, device: torch.device) -> _Source:
@@ -358,6 +377,8 @@ def _scan_source(recipe: Recipe, data: Data, run: Run, device: torch.device) -> 
         if given is None
         else (given.scans, [1.0] * len(given.scans), given.hashes, given.watched)
     )
+    paths = simulated_files(data.simulated) if data.simulated else []
+    truth = _digest_of_truth(real, paths)
     if recipe.distil > 0.0 and teacher is None:
         raise ValueError(f"the recipe distils ({recipe.distil:g}) but there is no teacher; give --teacher")
     if teacher is not None and recipe.distil == 0.0 and (objects is None or recipe.task != "points"):
@@ -370,13 +391,32 @@ def _scan_source(recipe: Recipe, data: Data, run: Run, device: torch.device) -> 
         extra = unlabeled_scans(objects, data.fold)
         real = pseudo_labeled(teacher_network.cpu(), task, [*real, *extra])
         weights += [len(extra) ** -0.5] * len(extra)
-    paths = sorted(data.simulated.glob("*.npz")) if data.simulated else []
     samples = Samples(recipe, real, weights, paths, onnx_teacher, run.n_workers)
+    _warn_of_unseen(recipe.classes, real, simulated=bool(paths))
     watch = Watch(samples, watched) if watched else None
     # Every set in its share: the scans of a set follow one another.
     few = [scan.points for scan in real[:: max(1, len(real) // FITNESS_SCANS)]]
     fitness = FitnessProfile.from_scans(few).to_dict() if few else None
-    return _Source(task, samples, watch, hashes, len(real), teacher_network, fitness)
+    return _Source(task, samples, watch, hashes, len(real), truth, teacher_network, fitness)
+
+
+def _warn_of_unseen(classes: Sequence[str], real: Sequence[LabeledScan], *, simulated: bool) -> None:
+    """Warn of classes of one's own that no scan shows, as those of a mistyped name."""
+    seen = {int(label) for scan in real for label in np.unique(scan.labels)}
+    seen |= {*numbers_of_scene(classes)[: len(SCENE_CLASSES)].tolist()} if simulated and classes else set()
+    if lacking := [name for k, name in enumerate(classes) if k not in seen]:
+        text = f"no scan to train on has points of {', '.join(lacking)}; see the names in --classes and in scans.json"
+        warnings.warn(text, stacklevel=2)
+
+
+def _digest_of_truth(real: Sequence[LabeledScan], simulated: Sequence[Path]) -> str:
+    """The SHA-256 of real scans' labels, and of simulated scans' names and sizes, in hexadecimal digits."""
+    digest = hashlib.sha256(repr([(path.name, path.stat().st_size) for path in simulated]).encode())
+    for scan in real:
+        # To the centimeter, as processors differ in the last digits of what a box was moved by.
+        boxes = [(box.label, np.round((*box.center, *box.size, box.yaw), 2).tolist()) for box in scan.boxes]
+        digest.update(repr((boxes, scan.counts)).encode() + scan.labels.tobytes() + scan.surface.tobytes())
+    return digest.hexdigest()
 
 
 def _real(

@@ -47,6 +47,13 @@ def test_a_network_without_boxes_has_no_ap() -> None:
     assert "AP" not in summary({"int8": record})[0]
 
 
+def test_a_loss_that_is_not_measured_is_none() -> None:
+    """`auto` took a model of which no accuracy was measured: the larger one of 0 and NaN is 0."""
+    for own in (measured([0], np.nan, None), measured([0], 0.5, np.nan)):
+        with pytest.raises(PointsError, match="show no class of the network"):
+            module.record_of(own, own, "a command")
+
+
 @pytest.mark.parametrize("models", [["pointseg:fp32", "ssadnet:int8"], ["pointseg:int8"]])
 def test_files_must_be_of_one_network_and_one_in_fp32(models: list[str]) -> None:
     with pytest.raises(ModelError, match="expected files of one network, one of them in fp32"):

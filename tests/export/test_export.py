@@ -26,7 +26,7 @@ from checkout import REPOSITORY
 from edgeperc import Perceiver
 from edgeperc.datasets.kitti import KittiObjects, scan_hash
 from edgeperc.datasets.splits import fold_of
-from edgeperc.errors import CardMismatchError
+from edgeperc.errors import CardMismatchError, ModelError
 from edgeperc.evaluation.evaluate import evaluate
 from edgeperc.inference.projection import make_projector, project
 from edgeperc.inference.session import Session
@@ -51,10 +51,10 @@ from edgeperc_export.release.models_page import models_page, sums_of
 from edgeperc_export.release.to_onnx import ParityError, export, halve, load, terms_of, to_graph, verify, write_card
 from edgeperc_export.training import ablation
 from edgeperc_export.training.ablation import PAPERS, SHIPPED, VARIANTS, plot
-from edgeperc_export.training.curve import curve_table
+from edgeperc_export.training.log import curve_table
 from edgeperc_export.training.samples import RealScans, Recent, Samples, Watch, loaded, real_scans
 from edgeperc_export.training.start import start
-from edgeperc_export.training.task import Task, task_of
+from edgeperc_export.training.task import Points, Task, task_of
 from edgeperc_export.training.teacher import OnnxTeacher, pseudo_labeled, teach, unlabeled_scans
 from edgeperc_export.training.train import make_optimizer, make_schedule
 
@@ -252,6 +252,9 @@ def test_other_data_do_not_resume(tmp_path: Path, simulated: Path) -> None:
     for changes in ({"given": RealScans([scan], {"b": "2"}, [])}, {"fold": 0}, {"simulated": fewer}):
         with pytest.raises(ValueError, match="of a run on other data"):
             run("own", **changes)
+    corrected = replace(scan, labels=np.ones_like(scan.labels))
+    with pytest.raises(ValueError, match="of a run on other labels of the same scans"):
+        run("own", given=RealScans([corrected], given.hashes, []))
     # Another scan of the same name: the card knows both.
     run("after", start_from=first, given=RealScans([scan], {"a": "2"}, []))
     frames = load(tmp_path / "after/checkpoint.pt")[2]["frames"]
@@ -345,11 +348,15 @@ def as_tuple(outputs: Tensor | tuple[Tensor, ...]) -> tuple[Tensor, ...]:
     return outputs if isinstance(outputs, tuple) else (outputs,)
 
 
-def test_classes_of_a_start_keep_their_weights(simulated: Path) -> None:
+@pytest.mark.parametrize(
+    "classes", [("background", "cone", "pedestrian"), ("background", "cone", "pedestrian", "cyclist")]
+)
+def test_classes_of_a_start_keep_their_weights(simulated: Path, classes: tuple[str, ...]) -> None:
+    """As many classes, or in another order, as well: they took the weights in the place of theirs."""
     path = SHIPPED_MODELS / "pointseg.onnx"
-    recipe = Recipe("pointseg", edge=True, batch=1, classes=("background", "cone", "pedestrian"))
+    recipe = Recipe("pointseg", edge=True, batch=1, classes=classes)
     samples = Samples(recipe, [], [], sorted(simulated.glob("*.npz")))
-    assert set(np.unique(samples.batch(0)[1])) <= {0, 2, IGNORE}  # cars are of no class of this network
+    assert set(np.unique(samples.batch(0)[1])) <= {0, 2, len(classes) - 1, IGNORE}  # cars are of no class of this one
     image = torch.from_numpy(samples.batch(0)[0])
     own, shipped = build(recipe), build(replace(recipe, classes=()))
     start(own, recipe, path, [image])
@@ -358,6 +365,20 @@ def test_classes_of_a_start_keep_their_weights(simulated: Path) -> None:
         ours, theirs = own.eval()(image), shipped.eval()(image)
     assert torch.equal(ours[:, [0, 2]], theirs[:, [0, 2]])
     assert not ours[:, 1].any()
+    moved = replace(recipe, classes=("background", "pedestrian", "car", "cyclist"))
+    start(own := build(moved), moved, path, [image])
+    with torch.no_grad():
+        assert torch.equal(own.eval()(image), theirs[:, [0, 2, 1, 3]])
+
+
+@pytest.mark.usefixtures("small_views")
+def test_a_start_shares_whole_layers_or_none(tmp_path: Path) -> None:
+    """Of a narrower network, batch norm got zeros for the channels that it lacks, which then stayed zero."""
+    network, recipe = build(small("pointseg", edge=True)), small("pointseg", edge=True)
+    start(network, recipe, untrained("pointseg", tmp_path, edge=True, width=0.5), [])
+    assert all(module.running_var.all() for module in network.modules() if isinstance(module, nn.BatchNorm2d))
+    with pytest.raises(ModelError, match="is in int8, without most weights in fp32; give the model in fp32"):
+        start(network, recipe, SHIPPED_MODELS / "pointseg-int8.onnx", [])
 
 
 @pytest.mark.usefixtures("small_views")
@@ -675,8 +696,8 @@ def test_scans_with_false_objects_are_drawn_more_often(kitti: Path, simulated: P
 def test_the_curve_of_a_run_is_a_table(tmp_path: Path, kitti: Path, simulated: Path) -> None:
     arguments = {"kitti": kitti, "simulated": simulated, "fold": 1, "n_threads": 1, "checkpoint_every": 1}
     train(small("pointseg", edge=True), tmp_path, **arguments)
-    with (tmp_path / "log.jsonl").open("a") as log:  # as after a stop
-        log.write((tmp_path / "log.jsonl").read_text().splitlines()[-1] + "\n")
+    with (tmp_path / "log.jsonl").open("a") as log:  # as after a second run, which was killed
+        log.write((tmp_path / "log.jsonl").read_text().splitlines()[-1] + '\n{"step": 5, ')
     head, names, *rows, gain = curve_table(tmp_path, 2)
     assert head == f"{tmp_path}: 4 lines of the log, means of 2"
     assert names.split() == ["samples", "loss", "car", "pedestrian", "cyclist"]
@@ -821,7 +842,22 @@ def test_simulated_scans_of_another_sensor_are_not_taken_for_those_asked_for(tmp
         simulate(tmp_path, 1, first=first, sensor=kept)
         with pytest.raises(ValueError, match=f"is a scan of {kept}, and would be kept; .* for {asked}"):
             simulate(tmp_path, 4, first=first, sensor=asked)
+    with pytest.raises(ValueError, match=r"is a scan of a street, and would be kept; .* for a hall"):
+        simulate(tmp_path, 1, where="hall")
     assert len([*tmp_path.iterdir()]) == 2
+
+
+@pytest.mark.usefixtures("small_views")
+@pytest.mark.filterwarnings("default:no scan to train on")
+def test_a_run_tells_of_what_it_cannot_learn(
+    tmp_path: Path, simulated: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["train", "pointseg", str(tmp_path), "--edge", "--simulated", str(simulated), "--n-pasted", "0"]
+    monkeypatch.setattr(Points, "loss", lambda *_: torch.tensor(np.nan, requires_grad=True))
+    assert main([*words, "--batch", "1", "--threads", "1", "--classes", "background,car,pedestrain"]) == 2
+    shown = capsys.readouterr().err
+    assert "no scan to train on has points of pedestrain; see the names" in shown
+    assert "the loss is nan at step 0; lower --learning-rate" in shown
 
 
 @pytest.fixture(scope="module")

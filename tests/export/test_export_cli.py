@@ -116,6 +116,12 @@ def test_every_field_of_a_recipe_is_an_option() -> None:
         ),
         (["kulseg", "--recipe", "paper"], "--recipe paper is for ssadnet, pointseg, lodnn, fcn16,"),
         (["pointseg"], "no scans to train on"),
+        (["pointseg", "--simulated", "scanz"], "scanz holds no simulated scan; expected a folder written by"),
+        (["pointseg", "--classes", "car,pedestrian"], "--classes begins with car; expected background"),
+        (["pointseg", "--steps", "0"], "--steps is 0; expected 1 or more"),
+        (["pointseg", "--swap", "nan"], "--swap is nan; expected 0 to 1"),
+        (["pointseg", "--learning-rate", "inf"], "--learning-rate is inf; expected 0 or more"),
+        (["kulseg", "--dropout", "1"], "--dropout is 1.0; expected 0 to 0.999"),
     ],
 )
 def test_an_option_without_effect_is_refused(
@@ -137,6 +143,23 @@ def test_wrong_usage_is_reported_in_one_line(tmp_path: Path, capsys: pytest.Capt
     arguments = {"kitti": tmp_path, "simulated": tmp_path, "start_from": None, "fold": 0, "steps": 1}
     with pytest.raises(ValueError, match="pointseg has no variant 'half'; expected one of: as shipped; nothing pasted"):
         ablate("pointseg", tmp_path, **arguments, variants=["half"])
+
+
+@pytest.mark.parametrize(
+    ("words", "least"),
+    [
+        (["train", "pointseg", "out", "--checkpoint-every", "0"], 1),
+        (["train", "pointseg", "out", "--threads", "0"], 1),
+        (["train", "pointseg", "out", "--workers", "-1"], 0),
+        (["agree", "pointseg", "--scans", "0"], 1),
+        (["simulate", "out", "-n", "0"], 1),
+        (["ablate", "camvid", "out", "--size", "0x90"], 1),
+    ],
+)
+def test_counts_have_a_least_value(words: list[str], least: int, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(words)
+    assert f"{words[-1].partition('x')[0]} is too small; expected {least} or more" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

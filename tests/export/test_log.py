@@ -30,6 +30,10 @@ def test_a_resumed_run_goes_on_in_its_files(tmp_path: Path) -> None:
     for line in LINES:
         with TrainingLog(tmp_path) as log:
             log.write(line)
+    with (tmp_path / "log.jsonl").open("a") as file:  # what a kill leaves behind a checkpoint of step 200
+        file.write('{"step": 300, "loss": 0.5, "validation": {}}\n{"step": 40')
+    with TrainingLog(tmp_path, 200):
+        pass
     assert [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()] == LINES
     with (tmp_path / "log.csv").open(newline="") as file:
         rows = [*csv.reader(file)]
@@ -49,9 +53,10 @@ def test_without_a_folder_nothing_is_written(tmp_path: Path, monkeypatch: pytest
 
 def test_tensorboard_reads_the_same_figures(tmp_path: Path) -> None:
     reading = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
-    with TrainingLog(tmp_path, tensorboard=True) as log:
-        for line in LINES:
-            log.write(line)
+    for step, lines in ((0, [*LINES, {"step": 300, "loss": 9.0}]), (100, LINES[1:])):
+        with TrainingLog(tmp_path, step, tensorboard=True) as log:
+            for line in lines:
+                log.write(line)
     events = reading.EventAccumulator(str(tmp_path))
     events.Reload()
     scalars = {tag: [(event.step, event.value) for event in events.Scalars(tag)] for tag in events.Tags()["scalars"]}

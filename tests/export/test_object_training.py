@@ -15,6 +15,8 @@ import pytest
 torch = pytest.importorskip("torch")
 onnx = pytest.importorskip("onnx")
 
+from filelock import FileLock, Timeout
+
 from edgeperc.datasets.scan_folder import ScanFolder
 from edgeperc.errors import ModelError, PointsError
 from edgeperc.ground.planes import find_ground
@@ -434,3 +436,16 @@ def test_other_processes_paste_the_same_objects(labeled: LabeledScan, tmp_path: 
     ours, theirs = (load_samples(tmp_path / folder, ["pasted"]) for folder in ("0", "1"))
     for one, other in zip(ours, theirs, strict=True):
         np.testing.assert_array_equal(one, other)
+
+
+def test_runs_on_other_scans_wait_for_one_another(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """They share the folder of samples, whose parts were then of both."""
+
+    def written(folder: Path, *_: object, **__: object) -> None:
+        with pytest.raises(Timeout):
+            FileLock(folder / ".lock").acquire(timeout=0)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("edgeperc_export.training.train.write_samples", written)
+    with pytest.raises(KeyboardInterrupt):
+        train(RECIPE, tmp_path / "run", Data())
