@@ -392,7 +392,7 @@ def _add_quantize(command: Command) -> None:
         "--eight-bits",
         "use 8-bit weights, which x86 without VNNI saturates, so precision auto takes fp32 there (default: 7 bits)",
     )
-    add("--evaluate-on N", "simulated scans to evaluate both models on (default 48)", type=count, default=48)
+    add("--evaluate-on N", "simulated scans to evaluate both models on (default 48)", type=positive, default=48)
     add("--exclude NODE", "graph nodes to keep in fp32", nargs="*", default=[])
     add("--threads THREADS", "number of CPU threads for timing (default: onnxruntime's choice)", type=positive)
 

@@ -3,27 +3,30 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import onnx
-from PIL import Image
 
 from edgeperc.simulation.samples import simulated_scan
 from edgeperc.types.card import CARD_KEY, InputSpec, ModelCard, OutputSpec
 from edgeperc.types.perception import Box
 from edgeperc.types.views import TopViewGeometry
-from edgeperc_export.database.scenes import Plan
+
+if TYPE_CHECKING:
+    from edgeperc_export.database.scenes import Plan
 
 DRIVES = ("0005", "0005", "0005", "0048", "0029", "0013", "0014", "0011")
 TRAPEZIUM = [[40.0, 399.5], [90.0, 10.0], [120.0, 10.0], [160.0, 399.5]]
 INPUT = InputSpec("top_view", ("distance", "remission", "height"), (0.0, 0.0, -2.5), (47.07, 1.0, 5.0))
 
 
-def simulated_kitti(root: Path) -> Path:
-    """A simulated KITTI object set: seven scenes of training drives and one of a test drive."""
-    for part in ("velodyne", "label_2", "calib", "image_2"):
+def simulated_kitti(root: Path, drives: Sequence[str] = DRIVES, seeds: Sequence[int] = range(10, 18)) -> Path:
+    """A simulated KITTI object set, by default with seven scenes of training drives and one of a test drive."""
+    for part in ("velodyne", "label_2", "calib"):
         (root / "training" / part).mkdir(parents=True)
     # The camera is tilted a little, like KITTI's.
     calibration = "P2: 700 0 620 0 0 700 180 0 0 0 1 0\nR0_rect: 1 0 0 0 0.99995 -0.01 0 0.01 0.99995\n"
@@ -32,8 +35,8 @@ def simulated_kitti(root: Path) -> Path:
     T = np.eye(4)
     T[:3, :3] = [[1, 0, 0], [0, 0.99995, -0.01], [0, 0.01, 0.99995]]
     T_cam_velo = T @ [[0, -1, 0, 0.1], [0, 0, -1, -0.08], [1, 0, 0, -0.27], [0, 0, 0, 1]]
-    for k, drive in enumerate(DRIVES):
-        scan = simulated_scan(10**9 + 10 + k)
+    for k, (drive, seed) in enumerate(zip(drives, seeds, strict=True)):
+        scan = simulated_scan(10**9 + seed)
         scan.points.tofile(root / "training/velodyne" / f"{k:06d}.bin")
         rows.append(f"{k:06d},2011_09_26_drive_{drive}")
         lines = ["DontCare -1 -1 -10 500 170 590 190 -1 -1 -1 -1000 -1000 -1000 -10"]
@@ -45,7 +48,6 @@ def simulated_kitti(root: Path) -> Path:
                 lines.append(f"{box.label.capitalize()} 0 0 0 0 0 0 0 {shape}")
         (root / "training/label_2" / f"{k:06d}.txt").write_text("\n".join(lines) + "\n")
         (root / "training/calib" / f"{k:06d}.txt").write_text(calibration)
-    Image.new("RGB", (1242, 375), (90, 120, 160)).save(root / "training/image_2/000000.png")
     (root / "frames.csv").write_text("\n".join(rows) + "\n")
     return root
 
@@ -71,6 +73,8 @@ def road_network(path: Path, view: TopViewGeometry, classes: tuple[str, ...] = (
 
 
 def plan_of(kitti: Path, out: Path, model: str, **changes: object) -> Plan:
+    from edgeperc_export.database.scenes import Plan  # here, as it needs the packages of the database
+
     return replace(Plan(kitti, out, model, provider="cpu", variations=3), **changes)  # type: ignore[arg-type]
 
 

@@ -2,15 +2,36 @@
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
+
+import pytest
 
 from edgeperc_export import make as make_module
 from edgeperc_export.recipe import Recipe
 from edgeperc_export.training import ablation
 from edgeperc_export.training import train as training
 from edgeperc_export.training.train import Data, Run
+
+
+@contextmanager
+def interrupted_in_step(step: int, task: type) -> Iterator[None]:
+    """A training of a task is interrupted in this step, counted from 1."""
+    loss, steps = task.loss, itertools.count(1)  # type: ignore[attr-defined]  # every task has one
+
+    def interrupted(*given: Any) -> Any:
+        if next(steps) == step:
+            raise KeyboardInterrupt
+        return loss(*given)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(task, "loss", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            yield
 
 
 def of_train(settings: dict[str, Any]) -> tuple[Data, Run, dict[str, Any]]:

@@ -38,15 +38,21 @@ def write_samples(
     n_workers: int = 0,
     *,
     detector: bool = True,
-) -> tuple[list[str], dict[str, dict[str, str]]]:
+) -> dict[str, dict[str, str]]:
     """Write the samples of all scans, each fold of KITTI's training drives and its validation drives a source of its
-    own; those in ``out`` of the same scans are kept. Returns the sources, and the hashes of real scans of each. Test
-    drives are not read. Raises ValueError for sets that cannot be told apart by their names.
+    own; those in ``out`` of the same scans are kept. Returns the sources, with the hashes of the real scans of each.
+    Test drives are not read. Raises ValueError for sets that cannot be told apart by their names.
     """
     _check_names(scan_sets)
-    names: list[str] = []
     hashes: dict[str, dict[str, str]] = {}
     build = partial(build_samples, out, detector=detector, n_workers=n_workers)
+
+    def write(name: str, labeled: Sequence[DriveScan], own: dict[str, str]) -> None:
+        made_of, hashes[name] = build(name, labeled, real=True), own
+        if name != VALIDATION:
+            build(f"{name}-{PASTED}", variants(labeled), real=True, made_of=made_of)
+            hashes[f"{name}-{PASTED}"] = {}
+
     if kitti is not None:
         objects = KittiObjects(kitti)
         train = objects.names("train")
@@ -54,32 +60,24 @@ def write_samples(
         groups |= {"kitti-other": [n for n in train if fold_of(objects.drives[n]) is None]}
         groups |= {VALIDATION: objects.names("validation")}
         for name, scans in groups.items():
-            if scans:
-                frames = [objects.frame(scan) for scan in scans]
+            if frames := [objects.frame(scan) for scan in scans]:
                 labeled = [(frame.drive, partial(LabeledScan.from_frame, frame)) for frame in frames]
-                hashes[name] = {frame.name: scan_hash(frame.points) for frame in frames}
-                made_of = build(name, labeled, real=True)
-                names.append(name)
-                if name != VALIDATION:
-                    build(f"{name}-{PASTED}", variants(labeled), real=True, made_of=made_of)
-                    names.append(f"{name}-{PASTED}")
-                    hashes[names[-1]] = {}
+                write(name, labeled, {frame.name: scan_hash(frame.points) for frame in frames})
     for folder in scan_sets:
         check_trains(folder, "train")
-        of_set, _, hashes[folder.layout.name] = read_scan_set(folder, "train")
-        drives = [folder.drives[name.partition("/")[2]] for name in hashes[folder.layout.name]]
-        labeled = [(drive, partial(replace, scan)) for drive, scan in zip(drives, of_set, strict=True)]
-        made_of = build(folder.layout.name, labeled, real=True)
-        build(f"{folder.layout.name}-{PASTED}", variants(labeled), real=True, made_of=made_of)
-        names += [folder.layout.name, f"{folder.layout.name}-{PASTED}"]
-        hashes[names[-1]] = {}
+        of_set, _, own = read_scan_set(folder, "train")
+        drives = [folder.drives[name.partition("/")[2]] for name in own]
+        write(
+            folder.layout.name,
+            [(drive, partial(replace, scan)) for drive, scan in zip(drives, of_set, strict=True)],
+            own,
+        )
     if simulated is not None:
         files = simulated_files(simulated)
         drawn = [(file.stem, partial(LabeledScan.load, file)) for file in files]
         build(SIMULATED, drawn, real=False, made_of=digest_of_files(files))
-        names.append(SIMULATED)
         hashes[SIMULATED] = {}
-    return names, hashes
+    return hashes
 
 
 def _check_names(scan_sets: Sequence[ScanFolder]) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -76,11 +76,9 @@ class Samples:
         self.paste_odds |= {name: OWN_ODDS for name in recipe.classes[1:] if name not in POINT_CLASSES}
         # A top view's road goes on under a pole, but not through a wall.
         self.negatives = NEGATIVES if recipe.task == "points" else {"pole": 1.0}
-        alike = (
-            *("n_pasted", "turn_to_rare", "turn_anywhere", "weather", "n_negatives", "tilt_deg", "no_remission"),
-            "range_noise_m",
-        )
-        settings = {name: getattr(recipe, name) for name in alike}
+        settings = {
+            field.name: getattr(recipe, field.name) for field in fields(Augmentation) if hasattr(recipe, field.name)
+        }
         self.augmentation = Augmentation(odds=self.paste_odds, negatives=self.negatives, **settings)
         self.bank: ObjectBank | None = None
         if max(recipe.n_pasted, recipe.n_negatives) > 0.0:

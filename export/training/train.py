@@ -354,15 +354,15 @@ def _object_source(recipe: Recipe, folder: Path, data: Data, run: Run) -> _Sourc
         folder = folder.with_name(f"{folder.name}-of-groups")
     folder.mkdir(parents=True, exist_ok=True)
     with FileLock(folder / ".lock"):  # a run on other scans replaces the samples
-        names, hashes = write_samples(
+        hashes = write_samples(
             folder, data.kitti, data.simulated, data.scan_sets, run.n_workers, detector=recipe.detector
         )
         watched = [VALIDATION if data.fold is None else f"kitti-{data.fold}"]
-        trained = [name for name in names if name != VALIDATION and name.removesuffix(f"-{PASTED}") not in watched]
+        trained = [name for name in hashes if name != VALIDATION and name.removesuffix(f"-{PASTED}") not in watched]
         if not trained:
             raise ValueError("no scans to train objects on; give --kitti, --scans, --simulated or several of them")
         seen = {name: of for source in trained for name, of in hashes[source].items()}
-        watch = ObjectWatch(task, load_samples(folder, watched)) if watched[0] in names else None
+        watch = ObjectWatch(task, load_samples(folder, watched)) if watched[0] in hashes else None
         truth = " ".join((folder / f"{name}.sha256").read_text() for name in trained)
         batches = ObjectBatches(task, load_samples(folder, trained), trained)
     return _Source(task, batches, watch, seen, len(seen), truth)

@@ -11,5 +11,9 @@ import pytest
 def kitti(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The root of simulated frames in KITTI's files."""
     from database_helpers import simulated_kitti
+    from PIL import Image
 
-    return simulated_kitti(tmp_path_factory.mktemp("kitti"))
+    root = simulated_kitti(tmp_path_factory.mktemp("kitti"))
+    (root / "training/image_2").mkdir()
+    Image.new("RGB", (1242, 375), (90, 120, 160)).save(root / "training/image_2/000000.png")
+    return root

@@ -23,12 +23,13 @@ from edgeperc_export.data.scans import SURFACE, LabeledScan, turned
 GROUND_M = -1.73
 
 
-def flat_street(boxes: tuple[Box, ...] = ()) -> LabeledScan:
-    """Ground points every 10 cm ahead, and nothing else."""
+def flat_street(*others: np.ndarray, label: int = 0) -> LabeledScan:
+    """Ground points every 10 cm ahead, and others of a label."""
     x, y = np.meshgrid(np.arange(3.0, 40.0, 0.1), np.arange(-12.0, 12.0, 0.1))
     points = np.stack([x.ravel(), y.ravel(), np.full(x.size, GROUND_M), np.full(x.size, 0.3)], 1).astype(np.float32)
     unknown = np.full((SURFACE.height, SURFACE.width), IGNORE, np.uint8)
-    return LabeledScan(points, np.zeros(len(points), np.uint8), boxes, (0,) * len(boxes), unknown)
+    labels = np.repeat(np.uint8([0, label]), [len(points), sum(map(len, others))])
+    return LabeledScan(np.concatenate([points, *others]), labels, (), (), unknown)
 
 
 def post(x: float, y: float, label: str = "pedestrian") -> tuple[Box, np.ndarray]:
@@ -53,11 +54,8 @@ def test_points_in_a_simulated_box_belong_to_the_object(scan: LabeledScan) -> No
 
 def test_a_bank_holds_each_object_with_its_points() -> None:
     box, points = post(10.0, 0.0)
-    street = flat_street()
     held = replace(
-        street,
-        points=np.concatenate([street.points, points]),
-        labels=np.append(street.labels, np.full(len(points), 2, np.uint8)),
+        flat_street(points, label=2),
         boxes=(box, replace(box, center=(20.0, 5.0, -0.88)), replace(box, label="tram")),
         counts=(len(points), 3, 50),  # enough returns, too few returns, an unknown class
     )
@@ -92,10 +90,7 @@ def test_a_pasted_object_hides_only_what_is_behind_it() -> None:
 def test_an_object_behind_a_wall_is_not_pasted() -> None:
     y, z = np.meshgrid(np.arange(-12.0, 12.0, 0.01), np.arange(GROUND_M, 2.0, 0.03))
     wall = np.stack([np.full(y.size, 5.0), y.ravel(), z.ravel(), np.full(y.size, 0.2)], 1).astype(np.float32)
-    street = flat_street()
-    hidden = replace(
-        street, points=np.concatenate([street.points, wall]), labels=np.zeros(len(street.points) + len(wall), np.uint8)
-    )
+    hidden = flat_street(wall)
     bank = augment.ObjectBank({"pedestrian": [post(10.0, 0.0)]})
     for seed in range(5):
         assert augment.pasted(hidden, bank, np.random.default_rng(seed), 1, {"pedestrian": 1.0}) is hidden
@@ -208,15 +203,10 @@ def pole_and_wall() -> LabeledScan:
     up, along = np.meshgrid(np.arange(0.05, 2.5, 0.1), np.arange(0.0, 8.0, 0.1))
     wall = np.stack([15.0 + along.ravel(), np.full(up.size, -6.0), GROUND_M + up.ravel()], 1)
     box, person = post(20.0, 2.0)
-    street = flat_street((box,))
     parts = [np.column_stack([part, np.full(len(part), 0.3)]).astype(np.float32) for part in (pole, wall)]
-    labels = [np.zeros(len(parts[0]) + len(parts[1]), np.uint8), np.full(len(person), 2, np.uint8)]
-    return replace(
-        street,
-        points=np.concatenate([street.points, *parts, person]),
-        labels=np.concatenate([street.labels, *labels]),
-        counts=(len(person),),
-    )
+    street = flat_street(*parts, person)
+    street.labels[-len(person) :] = 2
+    return replace(street, boxes=(box,), counts=(len(person),))
 
 
 def test_poles_and_walls_are_cut_out_of_the_background() -> None:
@@ -268,9 +258,9 @@ def test_a_resized_person_stands_on_the_same_ground(seed: int, distance: float) 
 
 def test_the_ground_at_the_bumper_is_background() -> None:
     box, points = post(4.0, 1.0)
-    street = flat_street((box,))
-    unknown = np.full(len(street.points) + len(points), IGNORE, np.uint8)
-    scan = replace(street, points=np.concatenate([street.points, points]), labels=unknown, counts=(len(points),))
+    street = flat_street()
+    scan = replace(flat_street(points, label=IGNORE), boxes=(box,), counts=(len(points),))
+    scan.labels[:] = IGNORE
     out = augment.with_ground_ahead(scan)
     known = out.labels == 0
     near = (scan.points[:, 0] < 6.0) & (np.abs(scan.points[:, 1]) < 3.0) & (scan.points[:, 2] < GROUND_M + 0.2)

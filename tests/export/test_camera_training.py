@@ -17,7 +17,7 @@ Image = pytest.importorskip("PIL.Image")
 
 import torch.nn.functional as F
 from torch import nn
-from training_helpers import train
+from training_helpers import interrupted_in_step, train
 
 from edgeperc.errors import ImageError, PointsError, SplitError
 from edgeperc.evaluation.camvid import evaluate_images
@@ -47,7 +47,6 @@ from edgeperc_export.training.camvid import (
 )
 from edgeperc_export.training.checkpoint import read_checkpoint
 from edgeperc_export.training.images import (
-    ImageSamples,
     augmented_images,
     camvid_samples,
     confusions,
@@ -372,24 +371,9 @@ def test_one_step_of_each_network(network: str, drawn: Path, tmp_path: Path) -> 
 def test_a_resumed_run_ends_with_the_same_weights(drawn: Path, tmp_path: Path) -> None:
     recipe = replace(Recipe("camseg"), **{**SMALL, "deep_supervision": 0.4, "dropout": 0.1})
     given: dict[str, Any] = {"kitti": None, "simulated": None, "camvid": drawn, "n_threads": 1, "checkpoint_every": 2}
-
-    class StoppedError(Exception):
-        pass
-
     whole = read_checkpoint(train(recipe, tmp_path / "whole", **given))
-    taken, batch = 0, ImageSamples.batch
-
-    def stops(self: ImageSamples, step: int) -> Any:
-        nonlocal taken
-        taken += 1
-        if taken > 3:
-            raise StoppedError
-        return batch(self, step)
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(ImageSamples, "batch", stops)
-        with pytest.raises(StoppedError):
-            train(recipe, tmp_path / "parts", **given)
+    with interrupted_in_step(4, Camera):
+        train(recipe, tmp_path / "parts", **given)
     parts = read_checkpoint(train(recipe, tmp_path / "parts", **given))
     assert all(torch.equal(whole["averaged"][name], parts["averaged"][name]) for name in whole["averaged"])
 

@@ -19,8 +19,9 @@ import pytest
 torch = pytest.importorskip("torch")
 onnx = pytest.importorskip("onnx")
 
+from database_helpers import simulated_kitti
 from torch import Tensor, nn
-from training_helpers import ablate, make, train
+from training_helpers import ablate, interrupted_in_step, make, train
 
 from checkout import REPOSITORY
 from edgeperc import Perceiver
@@ -54,7 +55,7 @@ from edgeperc_export.training.ablation import PAPERS, SHIPPED, VARIANTS, plot
 from edgeperc_export.training.log import curve_table
 from edgeperc_export.training.samples import RealScans, Recent, Samples, Watch, loaded, real_scans
 from edgeperc_export.training.start import start
-from edgeperc_export.training.task import Points, Task, task_of
+from edgeperc_export.training.task import Points, task_of
 from edgeperc_export.training.teacher import OnnxTeacher, pseudo_labeled, teach, unlabeled_scans
 from edgeperc_export.training.train import make_optimizer, make_schedule
 
@@ -140,28 +141,14 @@ def test_a_resumed_run_equals_an_uninterrupted_one(
     network: str,
     changes: dict[str, object],
     n_workers: int,
-    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     recipe = small(network, steps=3, redraw_every=1, **changes)
     arguments = {"kitti": None, "simulated": simulated, "n_threads": 1, "checkpoint_every": 2}
     whole = train(recipe, tmp_path / "whole", **arguments)  # without workers: they change nothing
     arguments["n_workers"] = n_workers
 
-    # Killed in the third step, when there is a checkpoint of the second.
-    kind = type(task_of(recipe))
-    loss, calls = kind.loss, 0
-
-    def dying(task: Task, *given: object) -> Tensor:
-        nonlocal calls
-        calls += 1
-        if calls == 3:
-            raise KeyboardInterrupt
-        return loss(task, *given)  # type: ignore[arg-type]
-
-    monkeypatch.setattr(kind, "loss", dying)
-    with pytest.raises(KeyboardInterrupt):
+    with interrupted_in_step(3, type(task_of(recipe))):  # when there is a checkpoint of the second
         train(recipe, tmp_path / "cut", **arguments)
-    monkeypatch.setattr(kind, "loss", loss)
     resumed = weights(train(recipe, tmp_path / "cut", **arguments))
     for name, value in weights(whole).items():
         assert torch.equal(value, resumed[name]), name
@@ -419,30 +406,12 @@ def test_the_papers_recipes_match_the_papers() -> None:
 
 
 @pytest.fixture(scope="module")
-def kitti(tmp_path_factory: pytest.TempPathFactory, scans: list[np.ndarray]) -> Path:
+def kitti(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A simulated KITTI object set: labeled frames of fold 0, of fold 1 and of a test drive, and an unlabeled frame."""
-    root = tmp_path_factory.mktemp("kitti")
-    for part in ("velodyne", "label_2", "calib"):
-        (root / "training" / part).mkdir(parents=True)
-    calibration = "P2: 700 0 620 0 0 700 180 0 0 0 1 0\nR0_rect: 1 0 0 0 1 0 0 0 1\n"
-    calibration += "Tr_velo_to_cam: 0 -1 0 0 0 0 -1 0 1 0 0 0\n"
-    rows = ["name,drive"]
-    for k, drive in enumerate(["0005", "0048", "0048", "0011"]):
-        scan = simulated_scan(10**9 + (0, 1, 0, 3)[k])
-        scan.points.tofile(root / "training/velodyne" / f"{k:06d}.bin")
-        rows.append(f"{k:06d},2011_09_26_drive_{drive}")
-        if k == 2:
-            continue
-        lines = []
-        for box, count in zip(scan.boxes, scan.box_points, strict=True):
-            (x, y, z), (length, width, height) = box.center, box.size
-            if count and x > 1.0:
-                turn = -box.yaw - np.pi / 2
-                shape = f"{height} {width} {length} {-y} {-z + height / 2} {x} {turn}"
-                lines.append(f"{box.label.capitalize()} 0 0 0 0 0 0 0 {shape}")
-        (root / "training/label_2" / f"{k:06d}.txt").write_text("\n".join(lines) + "\n")
-        (root / "training/calib" / f"{k:06d}.txt").write_text(calibration)
-    (root / "frames.csv").write_text("\n".join(rows) + "\n")
+    drives = ("0005", "0048", "0048", "0011")
+    root = simulated_kitti(tmp_path_factory.mktemp("kitti"), drives, seeds=(0, 1, 0, 3))
+    for part in ("label_2", "calib"):
+        (root / "training" / part / "000002.txt").unlink()
     return root
 
 

@@ -254,22 +254,18 @@ def same_boxes(found: Sequence[Any], boxes: dict[str, tuple[float, ...]], *, ato
         assert abs(np.sin(box.yaw - yaw)) < 1e-4  # front and rear look alike
 
 
-def test_slots_survive_the_round_trip() -> None:
-    priors = {label: box[3:6] for label, box in ROUND_TRIP.items()}
-    slots = paper_slot_targets(list(ROUND_TRIP.values()), VIEW, 8)[None]
-    scores = np.full((400, 200), 0.5, np.float32)
-    found = decode_slots(card_like(box_size_priors=priors), slots, painted(ROUND_TRIP), scores)
-    standing = {label: (*box[:2], box[5] / 2 - 1.73, *box[3:]) for label, box in ROUND_TRIP.items()}
-    same_boxes(found, standing, atol=1e-4)
-
-
-def test_scored_slots_survive_the_round_trip() -> None:
-    priors = {label: box[3:6] for label, box in ROUND_TRIP.items()}
-    slots = slot_targets(list(ROUND_TRIP.values()), VIEW)
-    slots[:, 4] = 8.0 * slots[:, 4] - 4.0  # logits
-    probabilities = np.eye(5, dtype=np.float32)[painted(ROUND_TRIP)].transpose(2, 0, 1)
-    card = card_like(box_size_priors=priors)
-    found = decode_scored_slots(card, slots[None], probabilities, "class_probabilities", 0.3)
+@pytest.mark.parametrize("scored", [False, True])
+def test_slots_survive_the_round_trip(scored: bool) -> None:
+    boxes, labels = list(ROUND_TRIP.values()), painted(ROUND_TRIP)
+    card = card_like(box_size_priors={label: box[3:6] for label, box in ROUND_TRIP.items()})
+    if scored:
+        slots = slot_targets(boxes, VIEW)
+        slots[:, 4] = 8.0 * slots[:, 4] - 4.0  # logits
+        probabilities = np.eye(5, dtype=np.float32)[labels].transpose(2, 0, 1)
+        found = decode_scored_slots(card, slots[None], probabilities, "class_probabilities", 0.3)
+    else:
+        scores = np.full((400, 200), 0.5, np.float32)
+        found = decode_slots(card, paper_slot_targets(boxes, VIEW, 8)[None], labels, scores)
     standing = {label: (*box[:2], box[5] / 2 - 1.73, *box[3:]) for label, box in ROUND_TRIP.items()}
     same_boxes(found, standing, atol=1e-4)
 

@@ -16,6 +16,7 @@ torch = pytest.importorskip("torch")
 onnx = pytest.importorskip("onnx")
 
 from filelock import FileLock, Timeout
+from training_helpers import interrupted_in_step
 
 from edgeperc.datasets.scan_folder import ScanFolder
 from edgeperc.errors import ModelError, PointsError
@@ -66,6 +67,14 @@ RECIPE = replace(MODELS["objects"].recipe, steps=4, batch=16)
 @pytest.fixture(scope="module")
 def labeled() -> LabeledScan:
     return LabeledScan.from_simulation(simulated_scan(SEED))
+
+
+@pytest.fixture(scope="module")
+def scans(labeled: LabeledScan, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the scan."""
+    folder = tmp_path_factory.mktemp("scans")
+    labeled.save(folder / "000000.npz")
+    return folder
 
 
 @pytest.fixture(scope="module")
@@ -269,10 +278,7 @@ def test_the_graph_looks_closely_where_the_first_look_says_so(tmp_path: Path) ->
     assert verify(network, path, [simulated_scan(SEED).points])["label_agreement"] >= 0.999
 
 
-def test_training_resumes_bit_for_bit(labeled: LabeledScan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    scans = tmp_path / "scans"
-    scans.mkdir()
-    labeled.save(scans / "000000.npz")
+def test_training_resumes_bit_for_bit(scans: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr(object_batches, "AGAIN", 0.0)  # what random weights find is among the candidates, too
     recipe = replace(RECIPE, found_again=0.5)
@@ -283,27 +289,13 @@ def test_training_resumes_bit_for_bit(labeled: LabeledScan, tmp_path: Path, monk
         return weights
 
     whole = run("whole")
-    loss, calls = Objects.loss, 0
-
-    def dying(task: Objects, *given: Any) -> torch.Tensor:
-        nonlocal calls
-        calls += 1
-        if calls == 3:  # there is a checkpoint of the second step
-            raise KeyboardInterrupt
-        return loss(task, *given)
-
-    monkeypatch.setattr(Objects, "loss", dying)
-    with pytest.raises(KeyboardInterrupt):
+    with interrupted_in_step(3, Objects):  # there is a checkpoint of the second
         run("cut")
-    monkeypatch.setattr(Objects, "loss", loss)
     for name, weight in run("cut").items():
         assert torch.equal(weight, whole[name]), name
 
 
-def test_two_runs_leave_the_mean_of_their_weights(labeled: LabeledScan, tmp_path: Path) -> None:
-    scans = tmp_path / "scans"
-    scans.mkdir()
-    labeled.save(scans / "000000.npz")
+def test_two_runs_leave_the_mean_of_their_weights(scans: Path, tmp_path: Path) -> None:
     recipe = replace(RECIPE, steps=2, runs=2, seed=7)
     data = Data(simulated=scans)
     mean, of_mean, _ = load(train(recipe, tmp_path / "both", data, Run(n_threads=1)))
@@ -331,12 +323,9 @@ def test_a_run_starts_from_the_shipped_model(samples: ObjectSamples) -> None:
 
 
 def test_without_a_detector_candidates_are_groups(
-    labeled: LabeledScan, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    labeled: LabeledScan, scans: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The network is exported by the command line, too; what the networks of others found is no part of it."""
-    scans = tmp_path / "scans"
-    scans.mkdir()
-    labeled.save(scans / "000000.npz")
     recipe = replace(RECIPE, steps=1, detector=False)
     checkpoint = train(recipe, tmp_path / "run", Data(simulated=scans), Run(n_threads=1))
     found = load_samples(tmp_path / "object-samples-of-groups", ["simulated"])

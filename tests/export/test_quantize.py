@@ -300,16 +300,8 @@ def test_no_scans_is_an_error(tmp_path: Path, small: Path, capsys: pytest.Captur
     with pytest.raises(PointsError, match="no scan to calibrate on"):
         calibration_scans([])
     (tmp_path / "empty").mkdir()
-    arguments = [
-        "quantize",
-        str(small),
-        str(tmp_path / "o.onnx"),
-        "--scans",
-        str(tmp_path / "empty"),
-        "--simulated",
-        "0",
-    ]
-    assert cli.main(arguments) == 2
+    words = ["quantize", str(small), str(tmp_path / "o.onnx"), "--scans", str(tmp_path / "empty"), "--simulated", "0"]
+    assert cli.main(words) == 2
     assert "no scan to calibrate on in 1 paths" in capsys.readouterr().err
     with pytest.raises(PointsError, match="expected at least one"):
         quantize(small, tmp_path / "o.onnx", Calibration([]), LabeledSets())
