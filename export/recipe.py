@@ -212,6 +212,11 @@ class Recipe:
             if isinstance(value, int | float) and not (low <= value <= high and value < math.inf):
                 most = f" to {high}" if high < math.inf else " or more"
                 raise ValueError(f"--{name.replace('_', '-')} is {value}; expected {low}{most}")
+        if self.network == "camseg" and (self.image_width % 4 or self.image_height % 4):  # it could not be exported
+            raise ValueError(
+                f"images are scaled to {self.image_width} x {self.image_height} pixels, and camseg labels every "
+                "fourth; expected multiples of 4 as --image-width and --image-height"
+            )
 
 
 PLAIN: Mapping[str, Any] = {

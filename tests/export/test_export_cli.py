@@ -121,6 +121,7 @@ def test_every_field_of_a_recipe_is_an_option() -> None:
         (["pointseg", "--steps", "0"], "--steps is 0; expected 1 or more"),
         (["pointseg", "--swap", "nan"], "--swap is nan; expected 0 to 1"),
         (["pointseg", "--learning-rate", "inf"], "--learning-rate is inf; expected 0 or more"),
+        (["camseg", "--image-width", "50"], "expected multiples of 4 as --image-width and --image-height"),
         (["kulseg", "--dropout", "1"], "--dropout is 1.0; expected 0 to 0.999"),
     ],
 )
