@@ -69,7 +69,10 @@ class Hall(NamedTuple):
 def find_hall(points: Points, mounting: Mounting) -> Hall:
     """The ceiling and the walls of a scan in the frame of the models."""
     ceiling_m = find_ceiling(points, _eye_m(mounting))
-    return Hall(ceiling_m, np.empty(0) if ceiling_m is None else _outline(points))
+    if ceiling_m is None:
+        return Hall(None, np.empty(0))
+    xy = points[:: (len(points) // _SAMPLE) | 1, :2].astype(np.float64)
+    return Hall(ceiling_m, (xy[np.isfinite(xy).all(axis=1)] @ _DIRECTIONS).max(axis=0))
 
 
 def _eye_m(mounting: Mounting) -> float:
@@ -108,12 +111,6 @@ def _is_around(box: Box, body_m: float) -> bool:
 
 
 _DIRECTIONS = np.stack([np.cos(np.arange(32) * np.pi / 16.0), np.sin(np.arange(32) * np.pi / 16.0)])
-
-
-def _outline(points: Points) -> Floats:
-    """That of a `Hall`."""
-    xy = points[:: (len(points) // _SAMPLE) | 1, :2].astype(np.float64)
-    return (xy[np.isfinite(xy).all(axis=1)] @ _DIRECTIONS).max(axis=0)
 
 
 def _sticks_out(box: Box, outline: Floats) -> bool:

@@ -217,7 +217,7 @@ _ENCLOSED = 0.71
 # 11.6 m in real streets. Half of the points are nearer than in streets (3.6 m) and in garages, where the sensor is on a
 # car. Two opposite directions of an alley are both seen farther than 17 m. Of streets that were cropped to 8 and 12 m,
 # at most 0.88 of the directions end at a wall.
-_OF_ROOM_M, _BESIDE_CAR_M = (4.5, 9.0), (2.6, 9.0)  # the ranges below which half and 90 % of the points are
+_HALF_OF_ROOM_M, _HALF_BESIDE_CAR_M, _MOST_OF_ROOM_M = 4.5, 2.6, 9.0  # the ranges below which half and 90 % are
 _MOST_OF_HALL_M, _THROUGH_M, _ENCLOSED_HALL = 11.0, 12.0, 0.9
 # Two opposite directions of 780 real streets are both seen 21 m far and farther.
 _THROUGH_HALL_M = 18.0
@@ -234,11 +234,11 @@ def _geometry_findings(scan: Measures, profile: FitnessProfile, sensor: SensorPr
     """What differs in the coordinates; a mistake in their frame or unit alone, because it explains the rest."""
     walls = _walls(scan)
     room = walls if walls is not None and walls.gross else None  # its ceiling may count as ground
-    axes = _other_axes(scan)
     mistake = (
         _other_unit(scan, profile.range_median_m)
         or _feet(scan, sensor)
-        or (axes if scan.flat_axis in (0, 1) else room or axes)
+        or _other_axes(scan)
+        or room
         or _other_origin(scan)
         or _upside_down(scan, profile)
     )
@@ -509,18 +509,19 @@ _COVERED = (
 
 
 def _walls(scan: Measures) -> Finding | None:
-    half_m, most_m = _BESIDE_CAR_M if scan.is_on_car else _OF_ROOM_M
-    is_closed = scan.walls.through_m < _THROUGH_M and scan.walls.mostly_enclosed >= _ENCLOSED
-    is_small = scan.far_m < _ROOM_M and scan.walls.enclosed >= _ENCLOSED
-    is_small = is_small and (scan.range_median_m < _HALF_OF_SMALL_M or scan.walls.mostly_enclosed >= _ENCLOSED_HALL)
-    is_room = is_small or (is_closed and scan.most_m < most_m and scan.range_median_m < half_m)
-    is_hall = (scan.far_m < _HALL_M and scan.walls.enclosed >= _ENCLOSED) or (
-        is_closed and scan.most_m < _MOST_OF_HALL_M and scan.walls.mostly_enclosed >= _ENCLOSED_HALL
-    )
-    is_room, is_hall = is_room and not scan.is_in_bay, is_hall or (is_room and scan.is_in_bay)
-    is_hall |= scan.walls.mostly_enclosed >= _ENCLOSED_HALL and 0.0 < scan.walls.through_m < _THROUGH_HALL_M
-    if not (is_room or is_hall):
+    walls, half_m = scan.walls, _HALF_BESIDE_CAR_M if scan.is_on_car else _HALF_OF_ROOM_M
+    is_walled = walls.mostly_enclosed >= _ENCLOSED_HALL
+    is_small = scan.far_m < _ROOM_M and walls.enclosed >= _ENCLOSED
+    is_small = is_small and (scan.range_median_m < _HALF_OF_SMALL_M or is_walled)
+    is_closed = walls.through_m < _THROUGH_M and walls.mostly_enclosed >= _ENCLOSED
+    is_small |= is_closed and scan.most_m < _MOST_OF_ROOM_M and scan.range_median_m < half_m
+    is_hall = scan.far_m < _HALL_M and walls.enclosed >= _ENCLOSED
+    # Of a part of a turn, no two opposite directions have points.
+    is_seen = walls.through_m > 0.0 or scan.most_m < _MOST_OF_HALL_M
+    is_hall |= is_walled and is_seen and walls.through_m < _THROUGH_HALL_M
+    if not (is_small or is_hall):
         return None if scan.ceiling_m is None else Finding(_COVERED.format(scan.ceiling_m))
+    is_room = is_small and not scan.is_in_bay
     return Finding(
         f"Half of the points are nearer than {scan.range_median_m:.1f} m, nine tenths nearer than {scan.most_m:.0f} m, "
         f"and there are walls on all sides: this seems to be a {'room' if is_room else 'garage or a hall'}; the models "

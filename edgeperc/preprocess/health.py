@@ -10,8 +10,9 @@ first scans of a perceiver show what is normal; what is judged of a later one de
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from statistics import median_high
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -101,8 +102,8 @@ def check_health(
         blocked_deg=_arcs(np.asarray(blocked.any(axis=1))),
         isolated=isolated,
         range_m=range_m,
-        normal_range_m=_middle(normal.ranges_m) if known else None,
-        returns_share=n_sampled * step / _middle(normal.returns) if known else None,
+        normal_range_m=median_high(normal.ranges_m) if known else None,
+        returns_share=n_sampled * step / median_high(normal.returns) if known else None,
         has_drops=has_drops,
         has_cloud=has_cloud,
     )
@@ -168,10 +169,6 @@ def findings_of(health: SensorHealth) -> Iterator[tuple[str, str]]:
             f"{health.normal_range_m:.0f} m: fog, or a film on the whole window. Objects farther away are not "
             "seen; drive slower, and clean the window if the air is clear.",
         )
-
-
-def _middle(values: Sequence[float]) -> float:
-    return sorted(values)[len(values) // 2]
 
 
 def _side(azimuth_deg: float) -> str:

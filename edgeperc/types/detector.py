@@ -10,7 +10,7 @@ from typing import Literal
 from ..errors import CardError
 from ..system.fields import Fields
 from ..system.names import check_text
-from .views import check_size
+from .views import check_bounds, check_size
 
 MAX_VALUES = 2**27  # of all points of all pillars
 MAX_GROUPS, MAX_ANCHORS, MAX_CANDIDATES = 64, 64, 100_000
@@ -50,10 +50,7 @@ class PillarGeometry:
 
     def __post_init__(self) -> None:
         _FIELDS.number("view.cell_m", self.cell_m, 1e-3, 100.0)
-        for name in ("x_range_m", "y_range_m", "z_range_m"):
-            low, high = _FIELDS.pair(f"view.{name}", getattr(self, name), -1e4, 1e4)
-            if not high - low >= 1e-3:
-                raise CardError(f"view.{name} is {(low, high)}; expected two finite numbers, the lower first")
+        for name, (low, high) in check_bounds(self).items():
             cells = (high - low) / self.cell_m
             if name != "z_range_m" and abs(cells - round(cells)) > 0.01:
                 raise CardError(f"view.{name} is {(low, high)}; expected a multiple of view.cell_m, {self.cell_m:g} m")
@@ -148,13 +145,7 @@ class AnchorHead:
 
 @dataclass(frozen=True, slots=True)
 class CenterHead:
-    """Boxes at the peaks of heat maps (CenterPoint; OpenPCDet's and mmdet3d's CenterHead).
-
-    classes, stride, scores, max_candidates, across_classes : as of `AnchorHead`; ``scores`` is of ``heatmap``.
-    groups : numbers of classes that share one box at each position, in the order of the classes; they add up to
-        all classes. Of a group's boxes that overlap, only the best one stays, whatever their classes.
-    rotation : order of the channels of ``rot``: ``"sin_cos"`` of mmdet3d, ``"cos_sin"`` of OpenPCDet.
-    """
+    """Boxes at the peaks of heat maps (CenterPoint; OpenPCDet's and mmdet3d's CenterHead)."""
 
     # as of `AnchorHead`; ``scores`` is of ``heatmap``
     classes: tuple[str, ...]

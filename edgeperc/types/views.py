@@ -30,6 +30,16 @@ def check_size(rows: int, columns: int) -> None:
         )
 
 
+def check_bounds(view: object) -> dict[str, tuple[float, float]]:
+    """The bounds of a view along each axis by their names; refuses those that hold nothing."""
+    names = ("x_range_m", "y_range_m", "z_range_m")
+    bounds = {name: _FIELDS.pair(f"view.{name}", getattr(view, name), -1e4, 1e4) for name in names}
+    for name, (low, high) in bounds.items():
+        if not high - low >= 1e-3:
+            raise CardError(f"view.{name} is {(low, high)}; expected two finite numbers, the lower first")
+    return bounds
+
+
 @dataclass(frozen=True, slots=True)
 class TopViewGeometry:
     """The ground ahead as an image (SSADNet 2.1.2). Row 0 is farthest ahead, column 0 leftmost."""
@@ -43,10 +53,7 @@ class TopViewGeometry:
     kind = "top_view"
 
     def __post_init__(self) -> None:
-        for name in ("x_range_m", "y_range_m", "z_range_m"):
-            low, high = _FIELDS.pair(f"view.{name}", getattr(self, name), -1e4, 1e4)
-            if not high - low >= 1e-3:
-                raise CardError(f"view.{name} is {(low, high)}; expected two finite numbers, the lower first")
+        check_bounds(self)
         _FIELDS.number("view.cell_m", self.cell_m, 1e-3, 100.0)
         check_size(self.height, self.width)
 

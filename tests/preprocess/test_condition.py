@@ -695,14 +695,6 @@ def test_a_scan_that_is_ready_is_not_copied() -> None:
     assert np.shares_memory(again, points)
 
 
-def test_a_remission_that_overflows_is_not_finite() -> None:
-    points = np.array([[1, 2, 3, 3e38], [1, 2, 3, 0.5]], np.float32)
-    scan, n_dropped = condition(points, replace(RAW, remission_range=(0.0, 0.5)))
-    assert n_dropped == 1
-    assert np.isnan(scan[0]).all()
-    assert scan[1, 3] == 1.0
-
-
 @pytest.mark.parametrize("bad", [np.zeros((5, 2)), "scan", None, np.zeros((2, 5, 4))])
 def test_arrays_that_are_not_scans_are_refused(bad: Any) -> None:
     with pytest.raises(PointsError):

@@ -9,6 +9,7 @@ from dataclasses import replace
 from typing import Any
 
 import pytest
+from test_card import refuse
 
 from checkout import REPOSITORY
 from edgeperc.errors import CardError
@@ -84,8 +85,7 @@ def test_missing_entries_are_named(part: str) -> None:
         for name in given[part]:
             less = copy.deepcopy(given)
             del less[part][name]
-            with pytest.raises(CardError, match=rf"{part}.*(lacks {name}|kind is None)"):
-                ModelCard.from_json(json.dumps(less))
+            refuse(less, rf"{part}.*(lacks {name}|kind is None)")
 
 
 WRONG = [
@@ -122,8 +122,7 @@ WRONG = [
 def test_each_wrong_entry_is_named(part: str, change: dict[str, Any], message: str) -> None:
     given = document()
     given[part] |= change
-    with pytest.raises(CardError, match=message):
-        ModelCard.from_json(json.dumps(given))
+    refuse(given, message)
 
 
 @pytest.mark.parametrize(
@@ -139,8 +138,7 @@ def test_each_wrong_entry_is_named(part: str, change: dict[str, Any], message: s
 def test_each_wrong_entry_of_a_center_head_is_named(change: dict[str, Any], message: str) -> None:
     given = centers()
     given["head"] |= change
-    with pytest.raises(CardError, match=message):
-        ModelCard.from_json(json.dumps(given))
+    refuse(given, message)
 
 
 @pytest.mark.parametrize(
@@ -154,19 +152,16 @@ def test_each_wrong_entry_of_a_center_head_is_named(change: dict[str, Any], mess
 )
 def test_outputs_are_those_of_the_head(outputs: list[str], message: str) -> None:
     given = document() | {"outputs": [{"name": f"{k}", "kind": kind} for k, kind in enumerate(outputs)]}
-    with pytest.raises(CardError, match=message):
-        ModelCard.from_json(json.dumps(given))
+    refuse(given, message)
     for kinds in (["heatmap"], ["heatmap", "reg", "height", "dim"], ["heatmap", "reg", "reg_height_dim", "rot"]):
         other = centers() | {"outputs": [{"name": kind, "kind": kind} for kind in kinds]}
-        with pytest.raises(CardError, match="of a center head; expected heatmap, reg, height, dim and rot"):
-            ModelCard.from_json(json.dumps(other))
+        refuse(other, "of a center head; expected heatmap, reg, height, dim and rot")
 
 
 def test_a_head_is_of_pillars_alone() -> None:
     given = document()
     del given["head"]
-    with pytest.raises(CardError, match="head is missing in a card of pillars"):
-        ModelCard.from_json(json.dumps(given))
+    refuse(given, "head is missing in a card of pillars")
     card = ModelCard.from_json(KITTI)
     ahead = {"view": TopViewGeometry(), "input": InputSpec("x", ("height",), (0.0,), (1.0,))}
     with pytest.raises(CardError, match="head is given in a card of top_view"):
@@ -180,7 +175,4 @@ def test_a_class_of_boxes_is_not_the_background() -> None:
     """The network's own classes, which have no background, as the classes of the card: the first was the background."""
     given = document()
     given["classes"] = given["box_classes"]
-    with pytest.raises(
-        CardError, match=r"box_classes .* hold 'car', the first of the classes, which is the background"
-    ):
-        ModelCard.from_json(json.dumps(given))
+    refuse(given, r"box_classes .* hold 'car', the first of the classes, which is the background")

@@ -17,7 +17,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from edgeperc import Box, ModelError, Perception, PointLabels, PointsError, TopView, Tracker, TrackingError
+from edgeperc import Box, ModelError, Perception, PointLabels, PointsError, TopView, Tracker, TrackingError, Tracks
 from edgeperc.records import SCAN_KEYS, read_boxes, scan_record
 
 CAR = Box("car", 0.87654321, (12.34567, -1.5, -0.9), (4.1, 1.7, 1.5), 0.1234567)
@@ -144,10 +144,14 @@ def test_only_observed_road_is_in_the_json() -> None:
     assert nothing["road"]["outline"] == []
 
 
-def test_a_record_adds_road_and_tracks() -> None:
+def followed() -> Tracks:
+    """The track of a car that stands."""
     tracker = Tracker()
-    for k in range(5):
-        tracks = tracker.update([CAR], 0.1 * k, np.eye(4))
+    return [tracker.update([CAR], 0.1 * k, np.eye(4)) for k in range(5)][-1]
+
+
+def test_a_record_adds_road_and_tracks() -> None:
+    tracks = followed()
     record = scan_record(perception_of(CAR), tracks)
     assert tuple(record) == SCAN_KEYS
     assert record["road"]["free_ahead_m"] == pytest.approx(10.34, abs=0.5)  # up to the car's rear
@@ -162,10 +166,7 @@ def test_a_record_adds_road_and_tracks() -> None:
 
 
 def test_a_track_is_used_like_a_box() -> None:
-    tracker = Tracker()
-    for k in range(5):
-        tracks = tracker.update([CAR], 0.1 * k, np.eye(4))
-    (track,) = tracks
+    (track,) = followed()
     for name in ("label", "score", "center", "size", "yaw"):
         assert getattr(track, name) == getattr(track.box, name)
     assert math.hypot(track.center[0] - CAR.center[0], track.center[1] - CAR.center[1]) < 0.1
@@ -226,14 +227,10 @@ def test_without_an_origin_nothing_is_in_a_map() -> None:
 PARTS = {"points": "pointseg", "top_view": "ssadnet", "image": "camseg", "ground": "pointseg"}
 
 
-@pytest.mark.parametrize("name", PARTS)
-def test_a_part_that_is_there_is_required_as_it_is(name: str) -> None:
-    part = object()
-    assert getattr(replace(perception_of(), **{name: part}), f"require_{name}")() is part  # type: ignore[arg-type]
-
-
 @pytest.mark.parametrize(("name", "model"), PARTS.items())
-def test_a_part_that_is_missing_names_the_model_to_add(name: str, model: str) -> None:
-    without = replace(perception_of(), **{name: None})  # type: ignore[arg-type]
+def test_a_part_is_required_as_it_is_or_names_the_model_to_add(name: str, model: str) -> None:
+    part = object()
+    there, without = (replace(perception_of(), **{name: each}) for each in (part, None))  # type: ignore[arg-type]
+    assert getattr(there, f"require_{name}")() is part
     with pytest.raises(ModelError, match=f"add '{model}' to the models"):
         getattr(without, f"require_{name}")()
