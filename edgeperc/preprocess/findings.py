@@ -147,13 +147,22 @@ def _too_few(scan: Measures, profile: FitnessProfile, sensor: SensorProfile) -> 
 
 
 _PULSES = 130_000  # of a turn of the training sensor; a scan that is gathered for a short time has fewer
-_NEARLY_ALL = 10  # near points for each that is left; also empty beams may be more than the returns
+_NEARLY_ALL = 10  # dropped points for each that is left; also empty beams may be more than the returns
 _USUAL_M = 9.0  # median distance in a street
 
 
 def check_dropped(points: Points, dropped: DroppedPoints, sensor: SensorProfile) -> tuple[Finding, ...]:
-    """Describe a scan of which nearly all was dropped as too near: a street in another unit, or no returns."""
+    """Describe a scan of which nearly all was dropped: too near, in another unit or no returns; or in the ego box."""
     n_left = len(points) - dropped.total
+    if dropped.ego > _NEARLY_ALL * max(n_left, dropped.too_near):
+        return (
+            Finding(
+                f"{dropped.ego:,} of the {len(points):,} points of the scan lie inside the ego_box of the profile "
+                f"{sensor.name}, {sensor.ego_box}, and are dropped as the own vehicle: expected its lowest and highest "
+                "x, y and z about the sensor, along the axes of the scan, in meters.",
+                True,
+            ),
+        )
     if dropped.too_near <= _NEARLY_ALL * n_left:
         return ()
     with np.errstate(over="ignore", invalid="ignore"):

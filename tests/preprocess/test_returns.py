@@ -199,6 +199,13 @@ def test_a_scan_without_returns_is_empty() -> None:
         assert not answer.require_points().in_view.any()
 
 
+def test_a_box_around_the_street_is_named(street: Points) -> None:
+    """As one in centimeters; the scan is not called empty."""
+    sensor = replace(VLP, ego_box=((-100.0, 100.0),) * 3)
+    with pytest.raises(FitnessError, match=r"scan lie inside the ego_box of the profile vlp-16.*in meters"):
+        perceived(street, sensor)
+
+
 def test_a_street_in_kilometers_is_still_another_unit(street: Points) -> None:
     for size in (1e-3, 1.0 / 120.0):
         with pytest.raises(FitnessError, match="another unit"):
