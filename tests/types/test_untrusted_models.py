@@ -181,7 +181,7 @@ def test_a_deep_graph_is_refused() -> None:
 
 
 BIG = field(5, tensor("big", (512, 512), bytes(512 * 512 * 4)))
-UNUSUAL = {
+UNUSUAL_GRAPHS = {
     "has a node 'Loop'": graph(node("Loop", "x", "y")),
     "has a node 'If'": graph(node("If", "x", "y")),
     "has a node 'Scan'": graph(node("Scan", "x", "y")),
@@ -201,6 +201,11 @@ UNUSUAL = {
     ),
     "more than 20000 nodes": graph(*[node("Relu", "x", "y")] * 20_001),
 }
+UNUSUAL = {
+    "defines functions of its own": model(graph(CONVOLUTION, INITIALIZER), field(25, b"")),
+    "holds graphs for training": model(graph(CONVOLUTION, INITIALIZER), field(20, b"")),
+    **{message: model(each) for message, each in UNUSUAL_GRAPHS.items()},
+}
 
 
 SMALL_SHAPE = field(5, tensor("shape", (2,), np.array([2**20, 2**20]).astype("<i8").tobytes(), 7))
@@ -219,16 +224,8 @@ def test_sizes_by_constants_wait_for_a_run(operator: str) -> None:
 @pytest.mark.parametrize("message", UNUSUAL)
 def test_an_unusual_graph_is_opened_only_if_it_is_trusted(message: str) -> None:
     with pytest.raises(ModelFileError, match=rf"model\.onnx .*{message}.*pass trusted=True"):
-        check_graph(model(UNUSUAL[message]), "model.onnx")
-    check_graph(model(UNUSUAL[message]), "model.onnx", trusted=True)
-
-
-def test_functions_and_training_are_opened_only_if_they_are_trusted() -> None:
-    for more, message in ((field(25, b""), "functions of its own"), (field(20, b""), "graphs for training")):
-        blob = model(graph(CONVOLUTION, INITIALIZER), more)
-        with pytest.raises(ModelFileError, match=message):
-            check_graph(blob, "model.onnx")
-        check_graph(blob, "model.onnx", trusted=True)
+        check_graph(UNUSUAL[message], "model.onnx")
+    check_graph(UNUSUAL[message], "model.onnx", trusted=True)
 
 
 def test_weights_have_a_limit(monkeypatch: pytest.MonkeyPatch) -> None:
