@@ -83,7 +83,7 @@ def draw_painted(
         for k, (name, n) in enumerate(labels.counts().items())
         if n
     }
-    figure = new_figure(_WIDTH, int(bottom) + 40 + height_of_legend(facts) + 68)
+    figure = new_figure(_WIDTH, int(bottom) + 40 + height_of_legend(facts) + 84)
     colors = rgb([color_of(name) for name in labels.classes])
     write_heading(figure, _MARGIN, _TOP - 20, "the camera", "a class for every pixel")
     known = labels.labels < len(colors)

@@ -106,7 +106,7 @@ def draw(perception: Perception, points: Points, path: str | Path | None = None,
     ]
     legend_top = _BOTTOM + 40
     notes_top = legend_top + canvas.height_of_legend(facts) + 30
-    figure = canvas.new_figure(_WIDTH, notes_top + 38 + 26 * len(warnings))
+    figure = canvas.new_figure(_WIDTH, notes_top + 52 + 26 * len(warnings))
 
     drawn, left = _Drawn(points, names, painted, top_view, road, boxes, ground), float(_MARGIN)
     if top_view is not None and road is not None:
@@ -120,7 +120,7 @@ def draw(perception: Perception, points: Points, path: str | Path | None = None,
         count += f" in {sum(perception.stage_ms.values()):.0f} ms"
     write_frame(figure, perception, (title, 1100), count, facts, (legend_top, notes_top))
     for k, line in enumerate(warnings):
-        canvas.write_at(figure, _MARGIN, notes_top + 32 + 26 * k, line, fontsize=13.0, color=AMBER)
+        canvas.write_at(figure, _MARGIN, notes_top + 48 + 26 * k, line, fontsize=13.0, color=AMBER)
     return canvas.as_png(figure, path)
 
 
@@ -157,7 +157,7 @@ def draw_image(perception: Perception, image: Bytes, path: str | Path | None = N
     facts = {name: [f"{100.0 * n / labels.labels.size:.1f} %"] for name, n in counts if n}
     height = min(_WIDTH * image.shape[0] // image.shape[1], _WIDTH) + 1
     legend_top, legend_height = 80 + height + 24, canvas.height_of_legend(facts)
-    figure = canvas.new_figure(_WIDTH, legend_top + legend_height + 68)
+    figure = canvas.new_figure(_WIDTH, legend_top + legend_height + 72)
     axes = canvas.add_axes(figure, _MARGIN, 80, _WIDTH - 2 * _MARGIN, height)
     colors = rgb([color_of(name) for name in labels.classes]).astype(np.float32)[labels.labels]
     axes.imshow(0.55 * image.astype(np.float32) / 255.0 + 0.45 * colors, aspect="equal", interpolation="antialiased")
@@ -180,9 +180,9 @@ def write_frame(
     canvas.write_at(figure, _MARGIN, 46, canvas.shorten(figure, text, room, **style), **style)
     canvas.write_at(figure, _WIDTH - _MARGIN, 46, about, fontsize=18.0, ha="right", color=FAINT)
     canvas.draw_legend(figure, _MARGIN, tops[0], _WIDTH - 2 * _MARGIN, facts)
-    ran = " · ".join([content.timing_line(perception), *content.provider_lines(perception)])
-    ran = canvas.shorten(figure, ran, _WIDTH - 2 * _MARGIN, fontsize=12.0)
-    canvas.write_at(figure, _MARGIN, tops[1], ran, fontsize=12.0, color=FAINT)
+    for k, ran in enumerate((content.timing_line(perception), " · ".join(content.provider_lines(perception)))):
+        ran = canvas.shorten(figure, ran, _WIDTH - 2 * _MARGIN, fontsize=12.0)
+        canvas.write_at(figure, _MARGIN, tops[1] + 20 * k, ran, fontsize=12.0, color=FAINT)
 
 
 def _draw_arrow(axes: Any, corners: Floats, zorder: int) -> None:

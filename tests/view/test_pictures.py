@@ -116,7 +116,7 @@ def drawn(matplotlib: None, tmp_path_factory: pytest.TempPathFactory) -> bytes:
 
 def test_picture_shows_classes_where_they_are(drawn: bytes) -> None:
     picture = pixels(drawn)
-    assert picture.shape == (1106, 1600, 3)
+    assert picture.shape == (1120, 1600, 3)
     assert len(np.unique(picture @ [1 << 16, 1 << 8, 1])) > 500
     # The panel from above begins at pixel column 90 and row 128 with x = 48 and y = 14, 14.65 pixels a meter.
     for box in (CAR, VAN):
@@ -224,7 +224,7 @@ def test_tiny_scans(tmp_path: Path, scan: np.ndarray) -> None:
         n = len(points)
         labels = PointLabels(np.zeros(n, np.uint8), np.zeros(n, bool), POINT_CLASSES)
         perception = replace(whole, n_points=n, points=labels, stage_ms={}, providers={}, fitness=())
-        assert pixels(view.draw(perception, points)).shape == (1080, 1600, 3)
+        assert pixels(view.draw(perception, points)).shape == (1094, 1600, 3)
         write_html(perception, points, tmp_path / "page.html")
         write_ply(perception, points, tmp_path / "points.ply")
         write_labels(perception, tmp_path / "points.label")
