@@ -41,9 +41,8 @@ KERNELS: Mapping[str, str] = MappingProxyType(
         "turn": "types.frame.fill_turned",
         "ground": "ground.planes.fill_heights ground.planes.fill_heights_above_plane ground.planes.fill_levels "
         "ground.planes.fill_planes ground.planes.taken_cells",
-        "points": "inference.projection.mark_range_image objects.refine.fill_point_labels "
-        "objects.refine.fill_without_outliers",
-        "points outside": "inference.crop.fill_spread",
+        "points": "inference.crop.fill_spread inference.projection.mark_range_image "
+        "objects.refine.fill_point_labels objects.refine.fill_without_outliers",
         "clusters": "objects.linkage.chain_points objects.linkage.fill_clusters",
         "boxes": "objects.boxes.fill_rectangle objects.cluster.fill_cluster_labels objects.cluster.fill_groups "
         "objects.persons.fill_person_groups objects.persons.fill_persons types.geometry.fill_oriented_iou "

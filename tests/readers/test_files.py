@@ -541,7 +541,7 @@ PREFIXES = [
 def check_points_or_error(path: Path) -> None:
     try:
         with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", "(?s).*cut short: the first", UserWarning)
+            warnings.filterwarnings("ignore", "(?s).*(cut short: the first|points follow the)", UserWarning)
             points = read_points(path)
     except PointsError:
         return
