@@ -29,7 +29,7 @@ from .inference.crop import Crop, sectors_of_turn, spread
 from .inference.decode import decode_boxes, decode_cells, decode_labels
 from .inference.object_network import PARTS, BoxesFrom, ObjectNetwork
 from .inference.pillar_network import PillarNetwork
-from .inference.projection import make_projector
+from .inference.projection import input_heights, make_projector
 from .inference.session import Session
 from .objects.boxes import join_boxes, objects_from_points, weigh
 from .objects.candidates import MIN_DETECTOR_SCORE
@@ -149,9 +149,10 @@ class RangeImageNetwork:
         else:
             self.projector.mark(points, self.index.reshape(-1), pixel)
             watch.lap("project")
-            # Interpolated points are in the image only; refinement uses the points of the scan.
-            dense, filled, heights = self.interpolator.fill(points, self.index, height_m)
-            self.projector.fill_image(dense, filled, self.session.input, heights)
+            # Interpolated points are in the image only; refinement uses the points of the scan. The ground is found anew;
+            # with heights between those of the neighbors, IoU of cars is up to 1.9 points lower.
+            dense, filled = self.interpolator.fill(points, self.index)
+            self.projector.fill_image(dense, filled, self.session.input, input_heights(self.projector, dense))
             watch.lap("adapt")
         ((kind, raw),) = self.session.run().items()
         watch.lap("infer")

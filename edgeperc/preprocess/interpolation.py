@@ -11,7 +11,7 @@ import numpy as np
 from ..errors import PointsError
 from ..system.kernels import njit
 from ..types.mounting import MODEL_HEIGHT_M
-from ..types.points import Floats, Floats32, Heights, Ints, Ints64, Points
+from ..types.points import Floats, Floats32, Ints, Ints64, Points
 from ..types.sensor import SensorProfile
 from ..types.views import RangeImageGeometry
 
@@ -69,11 +69,9 @@ class Interpolator:
         self.shape = (view.height, view.width)
         self.needed = bool(row_reach.any() or col_reach)
 
-    def fill(
-        self, points: Points, index: Ints, height_m: Heights | None = None
-    ) -> tuple[Floats32, Ints, Floats32 | None]:
+    def fill(self, points: Points, index: Ints) -> tuple[Floats32, Ints]:
         """The points with interpolated ones behind them, each on the line between two neighbors in the middle of its
-        pixel; their rows at each pixel; and their heights above the ground, if those of the points are given.
+        pixel, and their rows at each pixel.
         """
         if points.ndim != 2 or points.shape[1] != 4 or points.dtype != np.float32:
             raise PointsError(f"got points of shape {points.shape} and {points.dtype}; expected (n, 4) float32")
@@ -85,12 +83,8 @@ class Interpolator:
         n = len(points)
         dense = np.empty((n + np.count_nonzero(index < 0), 4), np.float32)
         dense[:n] = points
-        heights = np.empty(0 if height_m is None else len(dense), np.float32)
-        if height_m is not None:
-            heights[:n] = height_m
         filled = np.array(index, np.int32, order="C")
-        n = fill_between(dense, heights, n, filled, self._gaps)
-        return dense[:n], filled, None if height_m is None else heights[:n]
+        return dense[: fill_between(dense, n, filled, self._gaps)], filled
 
 
 @njit(cache=True, nogil=True)
@@ -113,10 +107,10 @@ def on_one_surface(points: Points, i: int, j: int, ground_z: float) -> bool:
 
 
 @njit(cache=True, nogil=True)
-def fill_between(points: Points, heights: Heights, n: int, index: Ints, gaps: Gaps) -> int:
+def fill_between(points: Points, n: int, index: Ints, gaps: Gaps) -> int:
     """Fill empty pixels between two returns of one surface, along rows, then columns; returns the number of points.
 
-    points, heights : the first ``n`` rows are the input, those after them are overwritten; there may be no heights.
+    points : the first ``n`` rows are the input, those after them are overwritten.
     """
     row_slopes, directions, row_reach, col_reach, ground_z = gaps
     height, width = index.shape
@@ -134,7 +128,7 @@ def fill_between(points: Points, heights: Heights, n: int, index: Ints, gaps: Ga
                         side_i = np.float64(points[i, 0]) * sin - np.float64(points[i, 1]) * cos
                         side_j = np.float64(points[j, 0]) * sin - np.float64(points[j, 1]) * cos
                         if side_i * side_j < 0.0:
-                            put_between(points, heights, n, i, j, side_i / (side_i - side_j))
+                            put_between(points, n, i, j, side_i / (side_i - side_j))
                             index[row, k] = n
                             n += 1
             last = col
@@ -154,18 +148,15 @@ def fill_between(points: Points, heights: Heights, n: int, index: Ints, gaps: Ga
                     above_i = np.float64(points[i, 2]) - row_slopes[k] * flat_i
                     above_j = np.float64(points[j, 2]) - row_slopes[k] * flat_j
                     if above_i * above_j < 0.0:
-                        put_between(points, heights, n, i, j, above_i / (above_i - above_j))
+                        put_between(points, n, i, j, above_i / (above_i - above_j))
                         index[k, col] = n
                         n += 1
     return n
 
 
 @njit(cache=True, nogil=True)
-def put_between(points: Points, heights: Heights, n: int, i: int, j: int, share: float) -> None:
-    """Write point ``n``, at a share of the way from one point to another, and its height, if there are any."""
+def put_between(points: Points, n: int, i: int, j: int, share: float) -> None:
+    """Write point ``n``, at a share of the way from one point to another."""
     for axis in range(4):
         start = np.float64(points[i, axis])
         points[n, axis] = start + share * (np.float64(points[j, axis]) - start)
-    if heights.shape[0] > 0:
-        start = np.float64(heights[i])
-        heights[n] = start + share * (np.float64(heights[j]) - start)

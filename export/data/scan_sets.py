@@ -22,7 +22,7 @@ from edgeperc.datasets.scan_folder import ScanFolder, ScanFrame
 from edgeperc.errors import MountingError
 from edgeperc.evaluation.truth import road_cells
 from edgeperc.ground.leveling import MountingEstimator
-from edgeperc.inference.projection import Projection, RangeImageProjector, TopViewProjector, input_heights
+from edgeperc.inference.projection import Projection, RangeImageProjector, TopViewProjector, input_heights, project
 from edgeperc.preprocess.condition import condition
 from edgeperc.preprocess.interpolation import Interpolator
 from edgeperc.preprocess.remission import NO_REMISSION, RemissionMatcher, is_missing
@@ -143,16 +143,15 @@ def seen_by_network(
     Returns projected: Its ``index`` refers to the points of the returned scan; ``pixel`` to the given ones.
     """
     points = np.ascontiguousarray(scan.points, np.float32)
-    heights = input_heights(projector, points)
-    projected = projector.project(points, heights)
+    projected = project(projector, points)
     if scan.sensor is None or isinstance(projector, TopViewProjector):
         return scan, projected
     interpolator = interpolator_of(projector.view, scan.sensor)
     if not interpolator.needed or not len(points):
         return scan, projected
-    dense, filled, heights = interpolator.fill(points, projected.index, heights)
+    dense, filled = interpolator.fill(points, projected.index)
     image = np.empty(projector.shape, np.float32)
-    projector.fill_image(dense, filled, image, heights)
+    projector.fill_image(dense, filled, image, input_heights(projector, dense))
     labels = np.full(len(dense), IGNORE, np.uint8)
     labels[: len(points)] = scan.labels
     new = filled >= len(points)

@@ -47,10 +47,7 @@ def between(
     col_reach: Callable[..., Any],
     ground_z: float,
 ) -> tuple[np.ndarray, np.ndarray, list[tuple[Any, Any]]]:
-    """Twin of `Interpolator.fill`, of points with any columns behind the fourth: points, index, and the two neighbors
-    of every new point.
-    """
-    width_of = points.shape[1]
+    """Twin of `Interpolator.fill`: points, index, and the two neighbors of every new point."""
     points, index, parents = [p.astype(np.float64) for p in points], index.copy(), []
     height, width = index.shape
 
@@ -81,4 +78,4 @@ def between(
             lambda at: row_reach[at[0]],
             lambda p, at: p[2] - np.tan(elevations[at[0]]) * np.hypot(p[0], p[1]),
         )
-    return np.array(points, np.float32).reshape(-1, width_of), index, parents
+    return np.array(points, np.float32).reshape(-1, 4), index, parents
