@@ -41,9 +41,8 @@ def agreement(reference: Sequence[Prediction], found: Sequence[Prediction]) -> d
                 seen = right.in_view if name == "points" else ...
                 confusion.update(guess.labels[seen], right.labels[seen])
             result[name] = {"equal": _rounded(confusion.accuracy()), "mean_iou": _rounded(confusion.mean_iou())}
-    if result["cells"] is not None or not (
-        result["points"] or result["pixels"]
-    ):  # also where boxes are the only answer
+    boxes_alone = not (result["points"] or result["pixels"])
+    if result["cells"] is not None or boxes_alone:
         boxes = BoxEvaluator()
         for right, guess in zip(reference, found, strict=True):
             boxes.update(guess.boxes, right.boxes)

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 from edgeperc import __version__
-from edgeperc.cli.arguments import Options, options, positive, positive_number
+from edgeperc.cli.arguments import Options, count, options, positive, positive_number
 from edgeperc.cli.output import print_error, print_line
 from edgeperc.cli.program import Parser, run_program
 from edgeperc.errors import CardError, EdgepercError, MissingExtraError, ModelError
@@ -19,15 +19,6 @@ from edgeperc.types.choices import PLACES
 
 from .database.cli import add_database_commands
 from .recipe import MODELS, NETWORKS, PAPER, TASKS, Recipe
-
-
-def count(text: str) -> int:
-    """Parse a count of at least 0."""
-    value = int(text)
-    if value < 0:
-        raise argparse.ArgumentTypeError(f"{value} is too small; expected 0 or more")
-    return value
-
 
 Command: TypeAlias = "Callable[..., argparse.ArgumentParser]"
 KITTI = "KITTI object set: a folder of training/velodyne, label_2, calib and of frames.csv"
@@ -550,7 +541,7 @@ def _size(text: str) -> tuple[int, int]:
     width, _, height = text.partition("x")
     try:
         return positive(width), positive(height)
-    except ValueError:
+    except argparse.ArgumentTypeError:
         raise argparse.ArgumentTypeError(f"{text!r}; expected WIDTHxHEIGHT, for instance 240x180") from None
 
 

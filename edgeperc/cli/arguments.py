@@ -316,12 +316,17 @@ def _parsed(kind: Callable[[str], Any], text: str) -> Any:
         raise argparse.ArgumentTypeError(f"{text!r} is no {'whole ' * (kind is int)}number") from exc
 
 
+def count(text: str, least: int = 0) -> int:
+    """Parse a count of at least 0."""
+    value: int = _parsed(int, text)
+    if value < least:
+        raise argparse.ArgumentTypeError(f"{value} is too small; expected {least} or more")
+    return value
+
+
 def positive(text: str) -> int:
     """Parse a count of at least 1."""
-    value = _parsed(int, text)
-    if value < 1:
-        raise argparse.ArgumentTypeError(f"{value} is too small; expected 1 or more")
-    return value
+    return count(text, 1)
 
 
 def positive_number(text: str) -> float:
