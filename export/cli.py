@@ -539,10 +539,9 @@ def _ablate(args: argparse.Namespace) -> int:
 
 def _size(text: str) -> tuple[int, int]:
     width, _, height = text.partition("x")
-    try:
-        return positive(width), positive(height)
-    except argparse.ArgumentTypeError:
-        raise argparse.ArgumentTypeError(f"{text!r}; expected WIDTHxHEIGHT, for instance 240x180") from None
+    if not (width.isdecimal() and height.isdecimal()):
+        raise argparse.ArgumentTypeError(f"{text!r}; expected WIDTHxHEIGHT, for instance 240x180")
+    return positive(width), positive(height)
 
 
 def _ablate_camvid(args: argparse.Namespace) -> int:
