@@ -22,6 +22,7 @@ from edgeperc.datasets.scan_folder import ScanFolder, ScanFrame
 from edgeperc.errors import MountingError
 from edgeperc.evaluation.truth import road_cells
 from edgeperc.ground.leveling import MountingEstimator
+from edgeperc.inference.crop import Crop
 from edgeperc.inference.projection import Projection, RangeImageProjector, TopViewProjector, input_heights, project
 from edgeperc.preprocess.condition import condition
 from edgeperc.preprocess.interpolation import Interpolator
@@ -31,7 +32,7 @@ from edgeperc.simulation.scene import POINT_CLASSES
 from edgeperc.types.frame import ModelFrame
 from edgeperc.types.geometry import draw_footprints
 from edgeperc.types.mounting import Mounting
-from edgeperc.types.points import Bytes, Ints, Labels, Points
+from edgeperc.types.points import Bytes, Heights, Ints, Labels, Points
 from edgeperc.types.sensor import SensorProfile
 
 from .roads import box_sums
@@ -151,12 +152,26 @@ def seen_by_network(
         return scan, projected
     dense, filled = interpolator.fill(points, projected.index)
     image = np.empty(projector.shape, np.float32)
-    projector.fill_image(dense, filled, image, input_heights(projector, dense))
+    projector.fill_image(dense, filled, image, _heights_of_view(projector, dense, len(points)))
     labels = np.full(len(dense), IGNORE, np.uint8)
     labels[: len(points)] = scan.labels
     new = filled >= len(points)
     labels[filled[new]] = _nearest_labels(dense, filled, projected.index, labels)[new]
     return replace(scan, points=dense, labels=labels), Projection(image, filled, projected.pixel)
+
+
+def _heights_of_view(projector: RangeImageProjector, dense: Points, n: int) -> Heights | None:
+    """Heights of ``n`` points, and of interpolated ones behind them, above the ground that is found with those which
+    the runtime keeps for the view; NaN for others.
+    """
+    rows = Crop([projector.view]).select(dense[:n])[1]
+    kept = np.arange(len(dense)) if rows is None else np.concatenate([rows, np.arange(n, len(dense))])
+    found = input_heights(projector, np.ascontiguousarray(dense[kept]))
+    if found is None:
+        return None
+    heights = np.full(len(dense), np.nan, np.float32)
+    heights[kept] = found
+    return heights
 
 
 def _nearest_labels(points: Points, filled: Ints, index: Ints, labels: Labels) -> Bytes:
