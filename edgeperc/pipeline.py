@@ -21,7 +21,7 @@ from .agreement.rules import (
     without_poles,
 )
 from .agreement.votes import VEHICLE, Sight
-from .ground.ceiling import find_hall, without_impossible
+from .ground.ceiling import find_hall, without_impossible, without_own
 from .ground.observed import Observer
 from .ground.planes import FIRST_REACH_HEIGHTS, FIRST_REACH_M, GroundFit, fit_ground
 from .ground.scan import Scan
@@ -253,7 +253,7 @@ class Pipeline:
             cells = value("decode", top.label_cells, near, boxes, mounting)
         if self.ranged and rules:
             if self.objects is not None or detector is not None:  # boxes outvote clusters
-                support = value("cluster", _support, scan, labels, rules, boxes, objects, detections)
+                support = value("cluster", _support, scan, labels, rules, mounting, boxes, objects, detections)
             agreed = value("agree", self._agreed, scan, labels, clusters, support, upright, cells, mounting)
             trusted = joined = value("agree", agree_on_boxes, boxes, scan, agreed, rules)
         if self.ranged and options.boxes_from != "network":
@@ -328,11 +328,16 @@ def _absent() -> None:
     """The value of a part without a network, or that no option asks for."""
 
 
-def _support(scan: Scan, labels: PointLabels, rules: frozenset[str], *found: Sequence[Box]) -> Support:
-    """Boxes that keep and add labels of points: of the top view, of the object network, and of a detector."""
+def _support(
+    scan: Scan, labels: PointLabels, rules: frozenset[str], mounting: Mounting, *found: Sequence[Box]
+) -> Support:
+    """Boxes that keep and add labels of points: of the top view, of the object network, and of a detector. Those around
+    the sensor take the labels of vehicles away: it is on what they show.
+    """
     boxes, objects, detections = found
     sure = [*boxes, *detections, *(replace(box, score=box.score - LESS_SURE) for box in objects)]
-    return find_support(scan, labels, sure, rules)
+    others = without_own(sure, mounting) if "ceiling" in rules else sure
+    return find_support(scan, labels, others, rules, own=[box for box in sure if box not in others])
 
 
 def _unboxed(labels: PointLabels, support: Support) -> PointLabels:

@@ -38,7 +38,7 @@ def hits_own_vehicle(place: Place) -> bool:
     return bool(((np.abs(px) < OWN_LENGTH_M / 2) & (np.abs(py) < OWN_WIDTH_M / 2)).any())
 
 
-def scan_of(places: list[Place], seed: int) -> SimulatedScan:
+def scan_of(places: list[Place], seed: int, sensor: str = "hdl-64e") -> SimulatedScan:
     """A scan of objects on a level road without an end."""
     rng = np.random.default_rng(1)
     terrain = random_terrain(rng, "urban")
@@ -46,7 +46,7 @@ def scan_of(places: list[Place], seed: int) -> SimulatedScan:
     street = Street(rng, [strip_row(0.0, 0.0, 0.0, 0.0, -90.0, 90.0)], terrain)
     for kind, x, y, yaw in places:
         street.add_object(kind, x, y, yaw, SIZES[kind], force=True)
-    return simulate(street.scene(), "hdl-64e", seed, ego_shadow=False)
+    return simulate(street.scene(), sensor, seed, ego_shadow=False)
 
 
 def radial(kind: str, bearing_deg: float, yaw: float) -> Iterator[Place]:
@@ -137,3 +137,15 @@ def test_a_truck_has_its_box_whichever_way_it_stands(yaw: float) -> None:
         boxes = [box for box in perceive(scan.points).boxes if box.label in BOXES_OF["truck"]]
         overlaps.append(oriented_iou(rectangles(boxes), rectangles(scan.boxes)).max(initial=0.0))
     assert np.count_nonzero(np.array(overlaps) > 0.5) >= 11
+
+
+def test_the_own_vehicle_is_background() -> None:
+    """Of a car below the sensor on its roof, all points were called car."""
+    scan = scan_of([("car", -0.3, 0.0, 0.0), ("car", 8.0, 4.0, 0.0)], 0, "os1-64")
+    options = {"mounting": MODEL_MOUNTING, "on_mismatch": "ignore", "full_turn": True, "n_threads": 1}
+    found = Perceiver(sensor="os1-64", provider="cpu", **options)(scan.points)
+    own, other = (found.require_points().labels[scan.objects == k] for k in range(2))
+    assert len(own) > 3000
+    assert not own.any()
+    assert (other == 1).mean() > 0.9
+    assert [box.label for box in found.boxes] == ["car"]

@@ -284,13 +284,19 @@ def as_rows(boxes: Sequence[Box], labels: Sequence[int] | None = None) -> Record
     return box_records(boxes, labels or [0] * len(boxes), MARGIN_M, ABOVE_BOX_M)
 
 
-def find_support(scan: Scan, labels: PointLabels, boxes: Sequence[Box], rules: Collection[str] = RULES) -> Support:
-    """The best vehicle's box around each point; boxes that the labels contradict (`MIN_BOX_SHARE`) do not count."""
+def find_support(
+    scan: Scan, labels: PointLabels, boxes: Sequence[Box], rules: Collection[str] = RULES, own: Sequence[Box] = ()
+) -> Support:
+    """The best vehicle's box around each point; boxes that the labels contradict (`MIN_BOX_SHARE`) do not count. Points
+    in boxes of the ``own`` vehicle are background.
+    """
     known = {name: labels.classes.index(name) for name in VEHICLES if name in labels.classes}
     usable = [box for box in boxes if box.label in VEHICLES] if "car" in known and "support" in rules else []
     support = Support(np.empty(len(scan.points), np.float32), np.empty(len(scan.points), np.uint8))
     among, labeled = labels.in_view & ~scan.ground.mask, Labeled(labels.labels, roles_of(labels.classes))
-    rows = as_rows(usable, [known.get(box.label, known["car"]) for box in usable])
+    numbers = [known.get(box.label, known["car"]) for box in usable]
+    mine = [replace(box, score=1.0) for box in own]
+    rows = as_rows([*usable, *mine], [*numbers, *(0 for _ in mine)])
     fill_support(scan.cloud, among, labeled, rows, support)
     return support
 
