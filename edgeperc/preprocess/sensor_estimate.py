@@ -17,6 +17,7 @@ import numpy as np
 
 from ..errors import SensorError
 from ..system.kernels import njit
+from ..types.mounting import MIN_MOUNT_HEIGHT_M, MODEL_HEIGHT_M
 from ..types.points import Floats, Floats32, Ints64, Points
 from ..types.sensor import SAY_PATTERN, SENSORS, SensorProfile
 from .findings import BEYOND, FEET_PER_M, check_coordinates, in_feet
@@ -78,6 +79,10 @@ _DENSEST, _LEAST_STEP_DEG = 8, 0.02  # beams whose azimuths are looked at; two r
 # Points without beams: how many a degree are dense, and the beams of a profile for them.
 _DENSE, _BEAMLESS_COLUMNS, _BEAMLESS_LOW_DEG = 100, 1800, -10.0
 _BEAMLESS_DEG: Floats = np.linspace(15.0, -25.0, 65)
+# Rings on the ground: distances [m], heights of the road in the scan and around it, width of a direction, how many of
+# them show a gap, the number of places where gaps are measured, and the least one [deg].
+_RINGS_M, _ROADS_M, _ROAD_M, _ROAD_SLOPE = (2.0, 40.0), (-6.0, 0.5), 0.15, 0.03
+_DIRECTION_DEG, _FEWEST_DIRECTIONS, _RING_PLACES, _LEAST_GAP_DEG = 1.0, 20, 400, 0.1
 
 _SECTOR_DEG = 5
 _OUTSIDE, _LEAST_SEEN = 0.002, 0.6  # share of points outside of a field of view; of its width that has points
@@ -237,19 +242,61 @@ def _beamless(polar: Sequence[Polar], remission_range: tuple[float, float] | Non
         raise _unknown(
             f"{explained}. They may be of a solid-state or non-repeating sensor{which}. {SAY_PATTERN}. {without}"
         )
+    beams, columns = _ground_beams(polar)
     low_deg = math.degrees(math.atan(float(np.quantile(largest.z / largest.flat, _OUTSIDE))))
-    beams = _BEAMLESS_DEG[min(low_deg, _BEAMLESS_LOW_DEG) <= _BEAMLESS_DEG]
-    profile = SensorProfile("beamless", tuple(beams.tolist()), _BEAMLESS_COLUMNS, remission_range or (0.0, 1.0))
+    last_deg = beams[0] + _LEAST_GAP_DEG if beams.size else min(low_deg, _BEAMLESS_LOW_DEG)
+    beams = np.concatenate([_BEAMLESS_DEG[last_deg <= _BEAMLESS_DEG], beams])
+    profile = SensorProfile("beamless", tuple(beams.tolist()), columns, remission_range or (0.0, 1.0))
     ranges = np.hypot(largest.flat, largest.z)
     return SensorEstimate(
         profile=profile,
-        columns=_BEAMLESS_COLUMNS,
+        columns=columns,
         nearest_m=round(float(np.quantile(ranges, 0.001)), 2),
         blind_deg=blind,
         doubt=f"The sensor cannot be told from the scan: {explained}. {without}. It is taken as a dense sensor that "
         f"spins, with remission from 0 to {profile.remission_range[1]:g}. If you know the sensor"
         f"{f', by the field of view perhaps {fitting}' if fitting else ''}, {_ADVICE}.",
     )
+
+
+def _ground_beams(polar: Sequence[Polar]) -> tuple[Floats, int]:
+    """Elevations [deg] of beams, from the top down, that leave the gaps between rings on the ground around the scan, as
+    the median of all directions, and the columns that give as many points a ring; no beams if no ground is seen. The
+    eye is in the scan's origin, or, where that is near the road, at the height of the models.
+    """
+    flat, z = (np.concatenate([each[k] for each in polar]) for k in range(2))
+    near = (flat > _RINGS_M[0]) & (flat < 12.0)
+    counts, edges = np.histogram(z[near], np.arange(*_ROADS_M, 0.05))
+    road_m = edges[counts.argmax()] + 0.025
+    eye_m = -road_m if road_m <= -MIN_MOUNT_HEIGHT_M else MODEL_HEIGHT_M
+    gaps = []
+    for each in polar:
+        used = (each.flat > _RINGS_M[0]) & (each.flat < _RINGS_M[1])
+        far, high = each.flat[used], each.z[used]
+        direction = np.floor(each.azimuth[used] / _DIRECTION_DEG)
+        order = np.lexsort((far, direction))
+        far, direction = far[order], direction[order]
+        on_road = np.abs(high[order] - road_m) < _ROAD_M + _ROAD_SLOPE * far
+        free = on_road[1:] & on_road[:-1] & (np.diff(direction) == 0.0)  # nothing stands between the two
+        gaps.append(1.0 / np.stack([far[1:][free], far[:-1][free]]))
+    beyond, before = np.concatenate(gaps, axis=1)
+    places = np.linspace(1.0 / _RINGS_M[1], 1.0 / _RINGS_M[0], _RING_PLACES)
+    spacing = np.zeros(len(places))
+    for k, place in enumerate(places):
+        around = (beyond <= place) & (before > place)
+        if np.count_nonzero(around) >= _FEWEST_DIRECTIONS:
+            spacing[k] = np.median((before - beyond)[around])
+    seen = np.flatnonzero(spacing)
+    if not seen.size:
+        return np.empty(0), _BEAMLESS_COLUMNS
+    # A gap is one beam wide: beams are where the number of gaps up to a place is whole.
+    spacing = np.interp(places, places[seen], np.maximum(spacing[seen], math.radians(_LEAST_GAP_DEG) / eye_m))
+    number = np.concatenate([[0.0], np.cumsum(np.diff(places) / spacing[1:])])
+    whole = np.arange(math.ceil(number[seen[0]]), number[seen[-1]] + 0.5)
+    n_rings = float((np.interp(before, places, number) - np.interp(beyond, places, number)).sum())
+    columns = len(before) / n_rings * 360.0 / _DIRECTION_DEG
+    elevations = -np.degrees(np.arctan(eye_m * np.interp(whole, number, places))).round(2)
+    return elevations, min(round(columns), _BEAMLESS_COLUMNS)
 
 
 def _least_on_beams(match: Match) -> float:

@@ -239,6 +239,27 @@ def test_a_dense_turn_without_beams_has_a_profile_for_such_and_its_doubt_is_told
         estimate_sensor([scan[:: len(scan) // 20_000]])
 
 
+@pytest.mark.parametrize("is_whole", [True, False], ids=["road", "trench ahead"])
+@pytest.mark.parametrize(("name", "seed"), [("pandar64", 2), ("vlp-32c", 3), ("os1-64", 2)])
+def test_without_beams_the_gaps_are_those_of_the_rings_on_the_ground(name: str, seed: int, is_whole: bool) -> None:
+    """Beams that shake by 0.12 degrees; ground that is missing on one side is no gap between two beams."""
+    points = simulated_scan(FIRST_SEED + seed, name).points
+    flat, ahead = np.hypot(points[:, 0], points[:, 1]), np.abs(np.arctan2(points[:, 1], points[:, 0])) < 1.0
+    elevation = np.arctan2(points[:, 2], flat) + np.radians(np.random.default_rng(0).normal(0.0, 0.12, len(flat)))
+    shaken = np.column_stack([points[:, :2], flat * np.tan(elevation), points[:, 3]]).astype(np.float32)
+    found = estimate_sensor([shaken[is_whole | ~(ahead & (flat > 7.0) & (flat < 12.0))]]).profile
+    assert found.name == "beamless"
+    right, beams = (-np.array(profile.elevations_deg) for profile in (SENSORS[name], found))
+    beams = beams[(beams > 3.0) & (beams < 16.0)]
+    places = 0.5 * (beams[1:] + beams[:-1])
+    above = np.searchsorted(right, places)
+    share = np.diff(beams) / (right[above] - right[above - 1])
+    low, middle, high = np.quantile(share, (0.1, 0.5, 0.9))
+    assert low > 0.4
+    assert 0.7 < middle < 1.1
+    assert high < 1.4
+
+
 @pytest.mark.parametrize("way", [1.0, -1.0], ids=["upright", "upside down"])
 @pytest.mark.parametrize("name", [name for name, profile in SENSORS.items() if profile.pattern is not None])
 def test_sensors_without_beams_are_named_by_their_field_of_view(name: str, way: float) -> None:
