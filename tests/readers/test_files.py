@@ -639,17 +639,20 @@ OTHERS = {
     seed=st.integers(0, 9),
     others=st.lists(st.sampled_from([*OTHERS]), max_size=5),
     remission=st.sampled_from([None, 0.0, 1.0, 255.0]),
-    shuffled=st.booleans(),
+    order=st.sampled_from(["rings", "shuffled", "fired"]),
 )
 @settings(max_examples=60, deadline=None)
-def test_raw_files_show_how_many_values_a_point_has(seed: int, others: Any, remission: Any, shuffled: Any) -> None:
+def test_raw_files_show_how_many_values_a_point_has(seed: int, others: Any, remission: Any, order: str) -> None:
     rng = np.random.default_rng(seed)
     points = street(seed)
     points[:, 3] *= remission or 0.0
     if remission is None and not others:
         points = points[:, :3]
-    if shuffled:
+    if order == "shuffled":
         points = rng.permutation(points)
+    if order == "fired":  # as a Velodyne's lasers: up and down in turn
+        lasers = np.arange(20).reshape(2, 10).T.ravel()
+        points = points.reshape(20, 300, -1)[lasers].swapaxes(0, 1).reshape(6000, -1)
     rows = np.column_stack([points, *(OTHERS[name](len(points), rng) for name in others)]).astype("<f4")
     with tempfile.TemporaryDirectory() as folder:
         for name in ("scan.bin", "scan.pcd.bin"):
