@@ -44,27 +44,35 @@ _DIM = 0.15  # of the usual remission, which drops are below
 _RANGE_SHARE, _SHRUNK, _FEWER_RETURNS = 0.95, 0.6, 0.85
 # Of the sensor's beams, and how many of their returns must be sampled to judge them: the vehicle hides less.
 _LOWEST, _FEWEST_OF_LOWEST = 0.1, 50.0
+# Of another sensor: this many times more or fewer returns than in the first scans, and so far beyond the elevations of
+# these and of the profile [deg]. A drive does not change both.
+_OTHER_RETURNS, _OTHER_DEG = 1.5, 2.0
 
 
 @dataclass(frozen=True)
 class Normal:
-    """What a sensor's first scans showed: least counts of `fill_sectors`; high ranges [m] and returns of each scan."""
+    """What a sensor's first scans showed: least counts of `fill_sectors`; high ranges [m] and returns of each scan;
+    lowest and highest elevation [deg].
+    """
 
     fewest: Floats | None = None
     ranges_m: tuple[float, ...] = ()
     returns: tuple[float, ...] = ()
+    reach_deg: tuple[float, float] = (math.inf, -math.inf)
 
     @property
     def is_complete(self) -> bool:
         """Whether further scans change nothing."""
         return len(self.returns) >= NORMAL_SCANS
 
-    def add(self, counts: Floats, range_m: float, n_returns: float) -> Normal:
+    def add(self, counts: Floats, range_m: float, n_returns: float, steep: Floats) -> Normal:
         """With one more scan, unless it is complete."""
         if self.is_complete:
             return self
         fewest = counts if self.fewest is None else np.minimum(counts, self.fewest)
-        return Normal(fewest, (*self.ranges_m, range_m), (*self.returns, n_returns))
+        low, high = _reach_deg(steep)
+        reach_deg = min(low, self.reach_deg[0]), max(high, self.reach_deg[1])
+        return Normal(fewest, (*self.ranges_m, range_m), (*self.returns, n_returns), reach_deg)
 
 
 def check_health(
@@ -96,21 +104,25 @@ def check_health(
     n_expected = n_sampled * len(lowest) / len(beams)
     are_judged = lowest[0] < tans[1] and height_m >= MIN_MOUNT_HEIGHT_M and n_expected > _FEWEST_OF_LOWEST
     is_cut = are_judged and n_low <= _BLOCKED * n_expected
+    share = n_sampled * step / median_high(normal.returns) if known else 1.0
+    is_other = not 1.0 / _OTHER_RETURNS < share < _OTHER_RETURNS
+    steep = _steepness(points[::step], eye) if is_cut or is_other or not normal.is_complete else np.empty(0)
     health = SensorHealth(
-        beams_missing=_beams_missing(points[::step], eye, beams) if is_cut else 0,
+        beams_missing=_beams_missing(steep, beams) if is_cut else 0,
+        other_sensor_deg=_beyond(steep, sensor, normal) if is_other else None,
         blocked=float(blocked.sum() / max(1, N_SECTORS * is_judged.sum())),
         blocked_deg=_arcs(np.asarray(blocked.any(axis=1))),
         isolated=isolated,
         range_m=range_m,
         normal_range_m=median_high(normal.ranges_m) if known else None,
-        returns_share=n_sampled * step / median_high(normal.returns) if known else None,
+        returns_share=share if known else None,
         has_drops=has_drops,
         has_cloud=has_cloud,
     )
     is_hazy = n_near >= _FEWEST_NEAR and _everywhere(near, near[:, 1]) > _HAZE
     health = replace(health, has_fog=_has_fog(health, is_hazy))
     health = replace(health, findings=tuple(text for _, text in findings_of(health)))
-    return health, normal.add(counts, range_m, float(n_sampled * step))
+    return health, normal.add(counts, range_m, float(n_sampled * step), steep)
 
 
 def without_drops(points: Points, sensor: SensorProfile, eye_m: ArrayLike = (0.0, 0.0, 0.0)) -> tuple[Floats32, int]:
@@ -130,6 +142,15 @@ def without_drops(points: Points, sensor: SensorProfile, eye_m: ArrayLike = (0.0
 
 def findings_of(health: SensorHealth) -> Iterator[tuple[str, str]]:
     """What to tell the user: kind and sentence of each sign."""
+    if health.other_sensor_deg is not None:
+        low, high = health.other_sensor_deg
+        yield (
+            "sensor",
+            f"The scan has {health.returns_share:.0%} as many returns as the first scans, and they lie between "
+            f"{low:.0f} and {high:.0f} deg of elevation, as none did before: it seems to be of another sensor, and is "
+            "taken as one of the same. Perceive the scans of each sensor apart, with a Perceiver or a run of their own.",
+        )
+        return  # what its beams lack says nothing of the window
     if health.beams_missing:
         yield (
             "beams",
@@ -229,13 +250,36 @@ def _runs(marks: Mask) -> list[tuple[int, int]]:
     return [(int(first), int(min((ends - first) % len(marks)))) for first in firsts]
 
 
-def _beams_missing(points: Points, eye: Floats, beams: Floats) -> int:
-    """How many of the beams, by their tangents from the top, are below what is nearly the lowest point."""
+def _steepness(points: Points, eye: Floats) -> Floats:
+    """Tangents of the elevations of the points beyond the window."""
     xyz = points[np.isfinite(points[:, :3]).all(axis=1), :3] - eye
     flat = np.hypot(xyz[:, 0], xyz[:, 1])
-    steep = xyz[flat > WINDOW_M, 2] / flat[flat > WINDOW_M]
-    seen = np.partition(steep, len(steep) // 200)[len(steep) // 200] if len(steep) else 0.0
-    return int(len(beams) - 1 - np.abs(beams - seen).argmin())
+    steep: Floats = xyz[flat > WINDOW_M, 2] / flat[flat > WINDOW_M]
+    return steep
+
+
+def _quantile(steep: Floats, k: int) -> float:
+    return float(np.partition(steep, k)[k]) if len(steep) else 0.0
+
+
+def _beams_missing(steep: Floats, beams: Floats) -> int:
+    """How many of the beams, by their tangents from the top, are below what is nearly the lowest point."""
+    return int(len(beams) - 1 - np.abs(beams - _quantile(steep, len(steep) // 200)).argmin())
+
+
+def _reach_deg(steep: Floats) -> tuple[float, float]:
+    """Elevations between which nearly all points are [deg]."""
+    few = len(steep) // 100
+    low, high = (math.degrees(math.atan(_quantile(steep, k))) for k in (few, len(steep) - 1 - few))
+    return low, high
+
+
+def _beyond(steep: Floats, sensor: SensorProfile, normal: Normal) -> tuple[float, float] | None:
+    """The elevations of a scan, if they are beyond those of the first scans and of the sensor; None otherwise."""
+    low, high = _reach_deg(steep)
+    usual_low, usual_high = normal.reach_deg
+    is_lower = low < min(usual_low, sensor.elevations_deg[-1]) - _OTHER_DEG
+    return (low, high) if is_lower or high > max(usual_high, sensor.elevations_deg[0]) + _OTHER_DEG else None
 
 
 def _arcs(marks: Mask) -> tuple[tuple[float, float], ...]:

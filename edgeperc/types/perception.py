@@ -334,6 +334,8 @@ class SensorHealth:
         Points that were left out as drops; 0 without ``has_drops``. They are labeled 0, and not in view.
     beams_missing : int
         The lowest beams of the sensor's profile, if they should show the ground and none of them returns anything.
+    other_sensor_deg : tuple of 2 float, or None
+        Lowest and highest elevation of the returns [deg], if they are those of another sensor than the first scans'.
     findings : tuple of str
         One sentence for each sign: what came, what was expected, and what to do.
     """
@@ -349,12 +351,15 @@ class SensorHealth:
     has_fog: bool = False
     n_drops: int = 0
     beams_missing: int = 0
+    other_sensor_deg: tuple[float, float] | None = None
     findings: tuple[str, ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
         """Convert to a dict for JSON, shares rounded to 0.0001 and ranges to 0.1 m."""
         rounded = {"blocked": 4, "isolated": 4, "returns_share": 4, "range_m": 1, "normal_range_m": 1}
         record = asdict(self) | {"blocked_deg": [[*arc] for arc in self.blocked_deg], "findings": [*self.findings]}
+        if self.other_sensor_deg is not None:
+            record["other_sensor_deg"] = [round(angle, 1) for angle in self.other_sensor_deg]
         return record | {k: round(record[k], n) for k, n in rounded.items() if record[k] is not None}
 
 

@@ -198,7 +198,8 @@ def test_a_scan_cropped_to_a_view_is_not_blocked(half_deg: float) -> None:
     scan = clear(4)
     ahead = scan[np.abs(np.degrees(np.arctan2(scan[:, 1], scan[:, 0]))) < half_deg]
     assert check_health(ahead, HDL, Normal())[0].findings == ()
-    assert check_health(ahead, HDL, usual())[0].blocked_deg == ()
+    later, _ = check_health(ahead, HDL, usual())
+    assert (later.blocked_deg, later.other_sensor_deg) == ((), None)
 
 
 @pytest.mark.parametrize("share", [0.3, 0.6, 0.85])
@@ -214,6 +215,14 @@ def test_a_scan_without_its_lowest_beams_is_a_part_of_one(sensor: str, share: fl
     assert f"lowest {health.beams_missing} of the sensor's beams" in health.findings[0]
     assert "cut short" in health.findings[0]
     assert check_health(scan, profile, Normal())[0].beams_missing == 0
+
+
+@pytest.mark.parametrize(("sensor", "later"), [("hdl-64e", "os1-64"), ("hdl-64e", "vlp-16"), ("vlp-16", "hdl-64e")])
+def test_another_sensor_after_the_first_scans_is_told(sensor: str, later: str) -> None:
+    health, _ = check_health(clear(4, later), get_sensor(sensor), usual(sensor))
+    (text,) = health.findings
+    assert "seems to be of another sensor" in text
+    np.testing.assert_allclose(health.to_dict()["other_sensor_deg"][0], get_sensor(later).elevations_deg[-1], atol=2.0)
 
 
 @pytest.mark.parametrize("height_m", [0.0, 0.3])
