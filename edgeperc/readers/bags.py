@@ -6,6 +6,7 @@ version changes with every release of ROS.
 
 from __future__ import annotations
 
+import os
 import re
 import shutil
 import sqlite3
@@ -132,7 +133,7 @@ class SqliteBag(BagFile):
         # Nothing is written beside the file. What a recorder had not yet copied from its log is read if it can be.
         has_log = self._path.with_name(self._path.name + "-wal").exists()
         mode = "mode=ro" if has_log else "mode=ro&immutable=1"
-        database = sqlite3.connect(f"file:{quote(str(self._path.absolute()))}?{mode}", uri=True)
+        database = sqlite3.connect(f"file:{quote(os.fsencode(self._path.absolute()))}?{mode}", uri=True)
         database.set_progress_handler(self._alive, _STEPS)
         return database
 

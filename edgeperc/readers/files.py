@@ -39,6 +39,8 @@ from .text import begins_like_text, parse_text
 from .times import TimedScan, point_times
 from .unknown import advice_for, missing
 
+_PLY = (b"ply\n", b"ply\r")
+
 
 def read_points(
     source: str | os.PathLike[str] | ArrayLike,
@@ -209,12 +211,15 @@ def _parse(data: Bytes, name: str, options: FileOptions) -> _Read:
             "for a scan of no points pass an array of shape (0, 4)"
         )
     head = data[:MAX_HEADER_BYTES].tobytes()
+    unmarked = head.removeprefix(b"\xef\xbb\xbf")  # of a text that was saved by an editor of Windows
+    if head is not unmarked and (unmarked.startswith(_PLY) or begins_like_pcd(unmarked)):
+        data, head = data[3:], unmarked
     if head.startswith(b"\x93NUMPY"):
         return _of_stored(_parse_npy(data), options)
     if head.startswith(b"PK\x03\x04"):
         array, is_joined = _parse_npz(data, options)
         return _of_stored(array, options._replace(remission_field=None) if is_joined else options)
-    if head.startswith((b"ply\n", b"ply\r")):
+    if head.startswith(_PLY):
         return _of_named(parse_ply(data, head, options.remission_field), options)
     if begins_like_pcd(head):
         return _of_named(parse_pcd(data, head, options.remission_field), options)
@@ -356,6 +361,8 @@ def _parse_npz(data: Bytes, options: FileOptions) -> tuple[NDArray[Any], bool]:
         # zipfile raises BadZipFile, RuntimeError (encrypted), NotImplementedError, zlib.error, EOFError and others.
         with zipfile.ZipFile(io.BytesIO(data.tobytes())) as archive:
             members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
+            if members and not any(info.filename.endswith(".npy") for info in members.values()):
+                raise PointsError("this is an archive; unpack it first")
             name = "points" if "points" in members else next(iter(members), "")
             if len(members) != 1 and name != "points":
                 raise PointsError(

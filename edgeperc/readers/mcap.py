@@ -61,14 +61,16 @@ class McapFile(BagFile):
             raise PointsError("the file is damaged: it does not begin with the header of an MCAP file")
         footer = bytes(self._data[-37:])
         self._is_whole = footer[:9] == struct.pack("<BQ", _FOOTER, 20) and footer[29:] == MCAP_MAGIC
-        (summary,) = unpack("<Q", footer, 9) if self._is_whole else (0,)
+        summary, _, crc = unpack("<QQI", footer, 9) if self._is_whole else (0, 0, 0)
         self._data = self._data[:-37] if self._is_whole else self._data
-        if summary > len(self._data):
-            raise PointsError(f"the file is damaged: its summary is said to begin at byte {summary:,} of {size:,}")
-        if summary:
-            for kind, content in _records(self._data, summary):
-                self._learn(kind, content)
-        if not (self._channels and self._is_named):  # summaries need not repeat what stands among the messages
+        has_summary = 0 < summary <= len(self._data)
+        if has_summary and (not crc or zlib.crc32(footer[:25], zlib.crc32(self._data[summary:])) == crc):
+            try:
+                for kind, content in _records(self._data, summary):
+                    self._learn(kind, content)
+            except PointsError:
+                self._is_named = False
+        if not (self._channels and self._is_named):  # a summary may be damaged, or not repeat all that stands before it
             try:
                 for _ in self._messages():
                     pass

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import shutil
 import sqlite3
@@ -242,6 +243,31 @@ def test_a_summary_need_not_repeat_the_schemas(tmp_path: Path, method: str) -> N
     (length,) = struct.unpack_from("<Q", content, summary + 1)
     path.write_bytes(content[:summary] + content[summary + 9 + length :])
     assert whole_scans(path) == (3, "")
+
+
+@pytest.mark.parametrize("damage", ["place", "record", "checksum"])
+def test_a_damaged_summary_costs_no_scan(tmp_path: Path, damage: str) -> None:
+    path = chunked_mcap(tmp_path / "drive.mcap", "")
+    content = bytearray(path.read_bytes())
+    (summary,) = struct.unpack_from("<Q", content, len(content) - 28)
+    if damage == "place":
+        struct.pack_into("<Q", content, len(content) - 28, 1 << 40)
+    elif damage == "record":
+        content[summary] = 0
+    else:
+        struct.pack_into("<I", content, len(content) - 12, 1)
+        content[content.index(LIDAR.encode(), summary)] ^= 2  # another topic
+    path.write_bytes(content)
+    assert whole_scans(path) == (3, "")
+
+
+def test_a_folder_may_have_a_name_that_is_no_text(tmp_path: Path) -> None:
+    folder = write_bag2(tmp_path / "bag")
+    try:
+        folder = folder.rename(tmp_path / os.fsdecode(b"drive \xe9"))
+    except OSError:
+        pytest.skip("this system names files in UTF-8 alone")
+    assert whole_scans(folder) == (3, "")
 
 
 @pytest.mark.parametrize(

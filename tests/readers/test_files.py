@@ -110,6 +110,13 @@ def npz(compressed: bool = True, **arrays: Any) -> bytes:
     return stream.getvalue()
 
 
+def zipped(name: str, content: bytes) -> bytes:
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr(name, content)
+    return stream.getvalue()
+
+
 RINGS = np.arange(len(POINTS), dtype=np.float32)[:, None]
 PADDED = np.zeros(len(POINTS), dtype="<f4, <f8, V3, <u2, <f4, <i4, <f4")
 for _k, _name in enumerate(("f6", "f1", "f4", "f0")):
@@ -165,6 +172,7 @@ FILES = {
         of=properties("x", "y") + "property list uchar uchar l\n" + properties("z", "remission"),
     ),
 }
+FILES |= {f"marked_{name}": b"\xef\xbb\xbf" + FILES[name] for name in ("ascii.pcd", "ascii.ply")}
 
 
 @pytest.mark.parametrize("name", FILES)
@@ -283,6 +291,7 @@ BAD_FILES = {
     "huge.npy": (npy(POINTS).replace(b"(4, 4)", b"(10**9, 4)"[:6]), "header"),
     "many.npy": (npy(POINTS).replace(b"(4, 4), }    ", b"(4000000000, 4), }"[:13]), "header"),
     "two.npz": (npz(a=POINTS, b=POINTS), "none called points"),
+    "scans.zip": (zipped("a.bin", POINTS.tobytes()), "an archive; unpack it first"),
     "zip.npz": (b"PK\3\4" + b"\0" * 60, "cannot be read"),
     "names.pcd": (pcd("a b c", "F F F", "4 4 4", "1 1 1", 1, "ascii", b"1 2 3\n"), "x, y, z"),
     "vector.pcd": (pcd("x y z", "F F F", "4 4 4", "2 1 1", 1, "ascii", b"1 2 3 4\n"), "no numeric field x"),
