@@ -10,6 +10,7 @@ import warnings
 import weakref
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from numbers import Real
 from pathlib import Path
 from typing import Any, Literal
 
@@ -123,8 +124,7 @@ def stream(
     ...     for answer in live:
     ...         print(answer.age_s, answer.health, answer.n_dropped, answer.perception.boxes)
     """
-    if not 0.0 < rate_hz < math.inf:
-        raise OptionError(f"rate_hz is {rate_hz}; expected scans a second, above 0")
+    check_rate(rate_hz)
     late_s = 2.0 / rate_hz if late_after_s is None else late_after_s
     stale_s = max(5.0 / rate_hz, late_s) if stale_after_s is None else stale_after_s
     if not 0.0 < late_s <= stale_s:
@@ -143,6 +143,12 @@ def stream(
             timed = (TimedScan(stamp_s, as_points(points), None) for points, stamp_s in map(_stamped, scans))
             scans = ((stamp_s, points) for stamp_s, points, _ in accumulate(timed, accumulate_s))
     return Stream(inbox, scans, perceiver, tracker, late_s, stale_s)
+
+
+def check_rate(rate_hz: object) -> None:
+    """Refuse a rate that is none. Raises OptionError."""
+    if not (isinstance(rate_hz, Real) and 0.0 < rate_hz < math.inf):
+        raise OptionError(f"rate_hz is {rate_hz!r}; expected scans a second, above 0")
 
 
 def _warn_of_another_sensor(source: str | os.PathLike[str], perceiver: object, topic: str | None) -> None:

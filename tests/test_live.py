@@ -255,6 +255,7 @@ def test_a_source_that_is_none(source: Any) -> None:
     "given",
     [
         {"rate_hz": 0.0},
+        {"rate_hz": "10"},
         {"rate_hz": np.nan},
         {"rate_hz": np.inf},
         {"late_after_s": 0.0},
@@ -262,7 +263,7 @@ def test_a_source_that_is_none(source: Any) -> None:
         {"late_after_s": 0.3, "stale_after_s": 0.2},
     ],
 )
-def test_ages_and_rates_that_are_none(given: dict[str, float]) -> None:
+def test_ages_and_rates_that_are_none(given: dict[str, Any]) -> None:
     with pytest.raises(ValueError, match="expected"):
         stream([], perceive, **given)
 

@@ -6,7 +6,7 @@ import argparse
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
-from ..errors import SensorError
+from ..errors import OptionError, SensorError
 from ..types.choices import AUTO_SENSOR
 from .arguments import Commands, add_command, add_mounting, add_networks, options, positive, positive_number
 from .output import many, print_error, print_line
@@ -17,6 +17,9 @@ if TYPE_CHECKING:
     from ..perceiver import Perceiver
     from ..ros2.graph import Graph
     from ..ros2.odometry import Rolling
+
+
+_REMEMBER_S, _SIZE_M = 10.0, 40.0
 
 
 def add_parser(commands: Commands) -> None:
@@ -88,9 +91,9 @@ def add_parser(commands: Commands) -> None:
         "--remember SECONDS",
         "a cell that was not observed for longer is unknown again (default: 10)",
         type=positive_number,
-        default=10.0,
+        default=_REMEMBER_S,
     )
-    memory("--grid-size METERS", "edge of the window (default: 40)", type=positive_number, default=40.0)
+    memory("--grid-size METERS", "edge of the window (default: 40)", type=positive_number, default=_SIZE_M)
     graph = options(parser, "graph")
     graph("--name NAME", "name of the node (default: %(default)s)", default="edgeperc")
     graph("--namespace NAME", "namespace of the node (default: %(default)s)", default="/")
@@ -218,6 +221,10 @@ def _rolling(arguments: argparse.Namespace) -> Rolling | None:
     from ..ros2.odometry import Rolling
 
     if arguments.odometry is None:
+        if arguments.sensor_pose is not None or (arguments.remember, arguments.grid_size) != (_REMEMBER_S, _SIZE_M):
+            raise OptionError(
+                "sensor_pose, remember and grid_size are of the grid with memory: pass --odometry NAME, too"
+            )
         return None
     grid = RollingGrid(size_m=arguments.grid_size, remember_s=arguments.remember)
     return Rolling(arguments.odometry, arguments.sensor_pose, grid)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import queue
 import threading
 import time
@@ -14,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..errors import MissingExtraError, ModelError, OptionError, PointsError, ProviderError, TrackingError
-from ..live import stream
+from ..live import check_rate, stream
 from ..readers.clouds import cloud_points, describe_cloud
 from ..readers.tables import MAX_SCAN_BYTES
 from ..records import PerceivedScan
@@ -124,13 +123,13 @@ class PerceptionNode:
     ) -> None:
         if frame_id is not None:
             check_text("the frame is", frame_id, OptionError)
-        if not 0.0 < rate_hz < math.inf:
-            raise OptionError(f"rate_hz is {rate_hz}; expected scans a second, above 0")
+        check_rate(rate_hz)
         self._graph, self._perceiver_for = graph, perceiver_for
         self._topic, self._frame_id = topic, frame_id
         self._messages = RosMessages(grid_frame_id=grid_frame_id, lifetime_s=5.0 / rate_hz)
         self._perceiver: Perceiver | None = None
         self._cloud: Any = None
+        self._cloud_frame = ""  # of the cloud that the perceiver was made for
         self._stamp_ns: int | None = None
         self._points: Floats32 | None = None
         self._newest: PerceivedScan | None = None
@@ -289,6 +288,13 @@ class PerceptionNode:
         perceiver = self._perceiver
         if perceiver is None:
             perceiver = self._perceiver = self._perceiver_for(describe_cloud(self._topic, cloud))
+            self._cloud_frame = cloud.header.frame_id
+        if cloud.header.frame_id != self._cloud_frame:
+            raise PointsError(
+                f"the cloud has the frame {cloud.header.frame_id!r}, and the first one {self._cloud_frame!r}: it is of "
+                "another sensor, or its driver was configured anew. Give each sensor a topic and a node of its own, or "
+                "start this one again"
+            )
         stamp_ns = cloud.header.stamp.sec * 10**9 + cloud.header.stamp.nanosec or time.time_ns()
         self._messages.frame_id = self._frame_id or cloud.header.frame_id or "lidar"
         perception = perceiver(points, stamp_s=Stamp(stamp_ns * 1e-9, stamp_ns))

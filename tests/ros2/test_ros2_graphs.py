@@ -466,6 +466,8 @@ def test_what_rclpy_refuses(bus: Bus, options: dict[str, Any], said: str, monkey
     [
         ({"publish": ["points", "boxes"]}, "outputs has 'boxes'"),
         ({"publish": ["rolling"]}, "needs poses"),
+        ({"sensor_pose": [1.0, 0.0, 1.5, 0.0, 0.0, 90.0]}, "pass --odometry"),
+        ({"grid_size": 20.0}, "pass --odometry"),
         ({"publish": "points"}, "the parameter publish is not of type list"),
         ({"odometry": "/odom", "sensor_pose": [1.0, 2.0]}, "sensor_pose is"),
         ({"odometry": "/odom", "remember": -1.0}, "remember_s is -1"),

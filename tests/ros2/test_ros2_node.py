@@ -293,6 +293,16 @@ def test_of_a_cloud_that_comes_twice_the_boxes_are_published() -> None:
     assert [found[0].id for found in (tracked, twice)] == ["1", ""]
 
 
+def test_a_cloud_of_another_frame_is_an_error_and_the_first_sensor_goes_on() -> None:
+    with running() as (graph, _, outcomes):
+        answers = []
+        for frame in ("front", "rear", "front"):
+            graph.give(cloud(POINTS, frame_id=frame))
+            answers.append(next(outcomes))
+    assert [isinstance(answer, PerceivedScan) for answer in answers] == [True, False, True]
+    assert "frame 'rear', and the first one 'front'" in str(answers[1])
+
+
 def test_a_cloud_without_a_stamp_has_that_of_its_arrival() -> None:
     perceive, before = Perceive(), time.time()
     with running(perceive) as (graph, _, outcomes):
