@@ -148,7 +148,7 @@ def findings_of(health: SensorHealth) -> Iterator[tuple[str, str]]:
             "sensor",
             f"The scan has {health.returns_share:.0%} as many returns as the first scans, and they lie between "
             f"{low:.0f} and {high:.0f} deg of elevation, as none did before: it seems to be of another sensor, and is "
-            "taken as one of the same. Perceive the scans of each sensor apart, with a Perceiver or a run of their own.",
+            "taken as one of the same. Perceive the scans of each sensor apart, by a Perceiver or a run of their own.",
         )
         return  # what its beams lack says nothing of the window
     if health.beams_missing:

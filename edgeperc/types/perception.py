@@ -493,7 +493,7 @@ class Perception:
             None if no model of that kind ran, if remission was only scaled, or if the place in a map was not given.
         """
         return {
-            "stamp_s": self.stamp_s,
+            "stamp_s": None if self.stamp_s is None or not np.isfinite(self.stamp_s) else self.stamp_s,
             "n_points": self.n_points,
             "n_dropped": self.n_dropped,
             "dropped": asdict(self.dropped),

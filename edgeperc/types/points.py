@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -96,10 +97,10 @@ def as_points(
 
 
 def _frame_columns(thing: Any) -> dict[str, NDArray[Any]]:
-    """The numeric columns of a data frame (pandas, polars) by `plain_name`; empty if none are called x, y and z."""
+    """The numeric columns of a data frame (pandas, polars) by `plain_name`; empty if their names are numbers alone."""
     names = getattr(thing, "columns", None) if hasattr(thing, "__array__") else None
     columns = _numeric((name, np.asarray(thing[name])) for name in (() if names is None else names))
-    return columns if {"x", "y", "z"} <= columns.keys() else {}
+    return {} if all(re.fullmatch(r"(column_)?\d+", name) for name in columns) else columns
 
 
 def _to_convert(thing: Any) -> tuple[str, str] | None:

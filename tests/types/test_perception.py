@@ -99,6 +99,7 @@ def test_perception_as_json_counts_points_by_class() -> None:
     assert document["n_in_view"] == sum(document["point_counts"].values()) == 3
     assert document["drivable_area_m2"] == 320.0
     assert document["boxes"] == [CAR.to_dict()]
+    assert perception_of(CAR, stamp_s=float("nan")).to_dict()["stamp_s"] is None  # JSON has no such number
     assert document["stage_ms"] == {"infer": 1.235}
     empty = perception_of(labels=False).to_dict()
     assert empty.keys() == document.keys()

@@ -89,7 +89,10 @@ def test_the_columns_of_a_data_frame_have_names(order: tuple[str, ...]) -> None:
     expected = POINTS if len(order) > 3 else POINTS * np.float32([1, 1, 1, 0])
     np.testing.assert_array_equal(as_points(frame), expected)
     np.testing.assert_array_equal(as_points(frame, remission_field="X")[:, 3], POINTS[:, 0])
-    np.testing.assert_array_equal(as_points(pandas.DataFrame(POINTS)), POINTS)
+    for unnamed in (pandas.DataFrame(POINTS), pandas.DataFrame(POINTS).rename(columns=str)):
+        np.testing.assert_array_equal(as_points(unnamed), POINTS)
+    with pytest.raises(PointsError, match="no numeric field x, y, z among range, azimuth"):
+        as_points(pandas.DataFrame(POINTS, columns=["range", "azimuth", "elevation", "intensity"]))
 
 
 @pytest.mark.parametrize("source", [None, 5, POINTS, ["a.bin", "b.bin"], b"a.bin"])
