@@ -6,7 +6,7 @@ import gc
 import math
 import threading
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -78,11 +78,6 @@ def source() -> Iterator[Source]:
     source.given.set()
 
 
-def test_it_is_found_in_the_package() -> None:
-    assert edgeperc.stream is stream
-    assert edgeperc.Answer is live.Answer
-
-
 def test_every_scan_of_a_slow_source_is_answered(source: Source) -> None:
     with stream(source, perceive, lambda perception: ("tracks", perception.n_points)) as answers:
         for k in (1, 2, 3):
@@ -152,18 +147,14 @@ def test_a_scan_is_held_no_longer_than_it_is_wanted() -> None:
 
 
 def test_health_goes_by_age(source: Source, monkeypatch: pytest.MonkeyPatch) -> None:
-    now = [100.0]
+    now, ages = [100.0], iter([0.05, 0.25, 0.75])
     monkeypatch.setattr(live, "time", SimpleNamespace(monotonic=lambda: now[0]))
 
-    def take(seconds: float) -> Callable[..., Any]:
-        def slowly(points: Any, stamp_s: float | None = None) -> Any:
-            now[0] += seconds
-            return perceive(points, stamp_s)
+    def slowly(points: Any, stamp_s: float | None = None) -> Any:
+        now[0] += next(ages)
+        return perceive(points, stamp_s)
 
-        return slowly
-
-    ages = iter([0.05, 0.25, 0.75])
-    with stream(source, lambda *a, **k: take(next(ages))(*a, **k), rate_hz=10.0) as answers:
+    with stream(source, slowly, rate_hz=10.0) as answers:
         assert (answers.late_after_s, answers.stale_after_s) == (0.2, 0.5)
         assert (answers.age_s, answers.health) == (np.inf, "STALE")
         answered = []

@@ -218,7 +218,7 @@ def test_str_path_and_columns(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read_points(path, columns=3)[1], [3, 4, 5, 0])
     with pytest.raises(PointsError, match=r"six\.raw.*columns= \(--columns\) x y z remission"):
         read_points(path)
-    for columns in (2, 65, 4.0, True):
+    for columns in (2, 65, 4.0, True, ("x", "y"), ("x", "y", "z", "z", "a", "b"), ["x"] * 65):
         with pytest.raises(PointsError, match="3 to 64"):
             read_points(path, columns=columns)
 
@@ -258,12 +258,6 @@ def test_scan_without_points_is_valid_if_its_header_says_so(tmp_path: Path) -> N
         assert read_points(save(tmp_path, name, content)).shape == (0, 4)
     assert as_points(np.zeros((0, 4))).shape == (0, 4)
     assert as_points(np.zeros((0, 3), np.int8)).shape == (0, 4)
-
-
-@pytest.mark.parametrize("suffix", FORMATS)
-def test_empty_file_is_an_error(tmp_path: Path, suffix: str) -> None:
-    with pytest.raises(PointsError, match="empty"):
-        read_points(save(tmp_path, f"scan{suffix}", b""))
 
 
 def test_unreadable_paths(tmp_path: Path) -> None:
@@ -330,6 +324,8 @@ BAD_FILES = {
         "save it as binary",
     ),
     "picture.pcd": (b"\x89PNG\r\n\x1a\n" + b"\0" * 64, "this is an image"),
+    "twice.npy": (npy(POINTS) + npy(POINTS), "several arrays one after another"),
+    **{f"empty{suffix}": (b"", "empty") for suffix in FORMATS},
 }
 
 
@@ -388,11 +384,6 @@ def test_a_recording_is_no_scan_file(tmp_path: Path, head: bytes) -> None:
         read_points(save(tmp_path, "drive.recorded", head + bytes(range(256))))
 
 
-def test_arrays_one_after_another_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(PointsError, match="several arrays one after another"):
-        read_points(save(tmp_path, "a.npy", npy(POINTS) + npy(POINTS)))
-
-
 @pytest.mark.parametrize("name", ["a.bin", "a.txt"])
 def test_columns_may_have_the_names_of_cloudcompare(tmp_path: Path, name: str) -> None:
     rows = np.column_stack([POINTS, np.arange(len(POINTS))]).astype("<f4")
@@ -430,11 +421,9 @@ def test_what_is_no_remission_of_the_points_is_refused(tmp_path: Path, beside: A
 
 
 def test_a_zip_bomb_is_not_unpacked(tmp_path: Path) -> None:
-    stream = io.BytesIO()
-    with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive:
-        archive.writestr("points.npy", npy(np.zeros((5_000_000, 4), np.float32)))
+    bomb = zipped("points.npy", npy(np.zeros((5_000_000, 4), np.float32)))
     with pytest.raises(PointsError, match="not unpacked"):
-        read_points(save(tmp_path, "bomb.npz", stream.getvalue()))
+        read_points(save(tmp_path, "bomb.npz", bomb))
 
 
 def test_pickles_do_not_run(tmp_path: Path) -> None:
@@ -688,9 +677,6 @@ def test_columns_have_names(tmp_path: Path) -> None:
         read_points(path, columns=names, remission_field="signal")
     with pytest.raises(PointsError, match="no numeric field y, z"):
         read_points(path, columns=("x", "a", "b", "c", "d", "e"))
-    for columns in (("x", "y"), ("x", "y", "z", "z", "a", "b"), ["x"] * 65):
-        with pytest.raises(PointsError, match="3 to 64 different names"):
-            read_points(path, columns=columns)
     with pytest.raises(PointsError, match="whole number of points of 4 float32"):
         read_points(path, columns=("x", "y", "z", "i"))
 
@@ -725,8 +711,6 @@ def test_stored_arrays_take_columns(tmp_path: Path, name: str, width: int, kind:
             read_points(path)
     with pytest.raises(PointsError, match=rf"shape \(600, {width}\), and columns= \(--columns\) names 13 values"):
         read_points(path, columns=13)
-    with pytest.raises(PointsError, match="3 to 64"):
-        read_points(path, columns=2)
 
 
 def test_columns_of_a_stored_array_have_times_and_places(tmp_path: Path) -> None:
@@ -976,9 +960,19 @@ def test_what_a_table_lacks_is_nan(tmp_path: Path, gap: str, separator: str) -> 
         (b"x,y,z,i\n1,2,3,4\n1,far,3,4\n", "does not hold 4 numbers"),
         (b"x,y,z,i\n1,2,3,-nan(ind)\n1,2,3,4\n", "first row has '-nan\\(ind\\)' in the column i, and others"),
         (b"x y z Time\n1 2 3 ?\n1 2 3 0.5\n", "first row has '[?]' in the column time, and others"),
+        (b"1 2 3 4 5 6\n" * 9, "a row has 6 numbers, and there are no names: pass columns="),
+        (b"x y z i\n1 2 3 4 5\n", "a row has 5 numbers, and there are 4 names"),
+        (b"1 2 3 4\n1 2 3\n", "does not hold 4 numbers"),
+        (b"1 2 3 4\nfar 2 3 1\n", "does not hold 4 numbers"),
+        (b"Dear reader,\nno points here\n", "no table of points: it has a line 'Dear reader,'"),
+        (b"# x y z\n", "no row of three numbers"),
+        (b"300\n200\n0 0 0\n1 0 0\n0 1 0\n0 0 1\n1 0 0 0\n", "this is a PTX file"),
+        (b"3\n1 2 3 4\n4 5 6 7\n", "cut short: the first line declares 3 points, 2 rows follow"),
+        (b"1\n1 2 3\n4 5 6\n", "the first line declares 1 points, 2 rows follow"),
+        (b"9" * 5000 + b"\n1 2 3\n4 5 6\n", "no table of points"),
     ],
 )
-def test_tables_of_other_units_and_with_damage_are_refused(tmp_path: Path, content: bytes, error: str) -> None:
+def test_text_that_is_no_table_or_of_other_units_is_refused(tmp_path: Path, content: bytes, error: str) -> None:
     with pytest.raises(PointsError, match=error):
         read_points(save(tmp_path, "scan.csv", content))
 
@@ -1006,26 +1000,6 @@ def test_signalling_nan_is_nan(tmp_path: Path, name: str) -> None:
     for origin in (None, (1.0, 0.0, 0.0)):
         read = read_points(save(tmp_path, name, content), origin_m=origin)
         assert np.isnan(read[:, 0]).tolist() == [False, True, True, False]
-
-
-@pytest.mark.parametrize(
-    ("content", "error"),
-    [
-        (b"1 2 3 4 5 6\n" * 9, "a row has 6 numbers, and there are no names: pass columns="),
-        (b"x y z i\n1 2 3 4 5\n", "a row has 5 numbers, and there are 4 names"),
-        (b"1 2 3 4\n1 2 3\n", "does not hold 4 numbers"),
-        (b"1 2 3 4\nfar 2 3 1\n", "does not hold 4 numbers"),
-        (b"Dear reader,\nno points here\n", "no table of points: it has a line 'Dear reader,'"),
-        (b"# x y z\n", "no row of three numbers"),
-        (b"300\n200\n0 0 0\n1 0 0\n0 1 0\n0 0 1\n1 0 0 0\n", "this is a PTX file"),
-        (b"3\n1 2 3 4\n4 5 6 7\n", "cut short: the first line declares 3 points, 2 rows follow"),
-        (b"1\n1 2 3\n4 5 6\n", "the first line declares 1 points, 2 rows follow"),
-        (b"9" * 5000 + b"\n1 2 3\n4 5 6\n", "no table of points"),
-    ],
-)
-def test_text_that_is_no_table(tmp_path: Path, content: bytes, error: str) -> None:
-    with pytest.raises(PointsError, match=error):
-        read_points(save(tmp_path, "scan.txt", content))
 
 
 @pytest.mark.parametrize(
