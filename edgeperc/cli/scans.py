@@ -260,7 +260,9 @@ def scan_sensor(
             found = find_sensor([next(iter(beside), path)], arguments)
             if found is not None and found.is_built_in:
                 known, what = KnownSensor(found.profile, str(found)), "the points"
-                is_other = _has_other_beams(given, found.profile)
+                pairs = zip(given.elevations_deg, found.profile.elevations_deg, strict=False)
+                off_deg = max(abs(one - other) for one, other in pairs)
+                is_other = given.n_beams != found.profile.n_beams or off_deg > _UNITS_DEG
     if known is not None and is_other:
         warnings.warn(
             f"{path}: --sensor says {given.name}, {what} {known.profile.name} ({known.because}); it is read as "
@@ -268,11 +270,6 @@ def scan_sensor(
             stacklevel=2,
         )
     return with_mounting(arguments.sensor, arguments), "as --sensor says"
-
-
-def _has_other_beams(given: SensorProfile, found: SensorProfile) -> bool:
-    pairs = zip(given.elevations_deg, found.elevations_deg, strict=False)
-    return given.n_beams != found.n_beams or max(abs(one - other) for one, other in pairs) > _UNITS_DEG
 
 
 class Sensors:

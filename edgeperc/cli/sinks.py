@@ -127,12 +127,10 @@ class Sinks:
             served = ServeSink(*arguments.serve)
             self._add(served)
             print_line(f"open {served.url} in Foxglove", sys.stderr)
-        if arguments.mcap is not None:
-            self._add(McapSink(arguments.mcap))
-        if arguments.rrd is not None:
-            self._add(RerunSink(arguments.rrd))
-        if arguments.play is not None:
-            self._add(PageSink(arguments.play))
+        files = ((McapSink, arguments.mcap), (RerunSink, arguments.rrd), (PageSink, arguments.play))
+        for make, path in files:
+            if path is not None:
+                self._add(make(path))
         if arguments.static is not None:
             self._add(StaticSink(arguments.static, without="movable" if arguments.movable else "moving"))
         if arguments.labels_for is not None:

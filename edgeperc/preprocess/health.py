@@ -251,27 +251,21 @@ def _runs(marks: Mask) -> list[tuple[int, int]]:
 
 
 def _steepness(points: Points, eye: Floats) -> Floats:
-    """Tangents of the elevations of the points beyond the window."""
+    """Tangents of the elevations of the points beyond the window, in order."""
     xyz = points[np.isfinite(points[:, :3]).all(axis=1), :3] - eye
     flat = np.hypot(xyz[:, 0], xyz[:, 1])
-    steep: Floats = xyz[flat > WINDOW_M, 2] / flat[flat > WINDOW_M]
-    return steep
-
-
-def _quantile(steep: Floats, k: int) -> float:
-    return float(np.partition(steep, k)[k]) if len(steep) else 0.0
+    return np.sort(xyz[flat > WINDOW_M, 2] / flat[flat > WINDOW_M]) if (flat > WINDOW_M).any() else np.zeros(1)
 
 
 def _beams_missing(steep: Floats, beams: Floats) -> int:
     """How many of the beams, by their tangents from the top, are below what is nearly the lowest point."""
-    return int(len(beams) - 1 - np.abs(beams - _quantile(steep, len(steep) // 200)).argmin())
+    return int(len(beams) - 1 - np.abs(beams - steep[len(steep) // 200]).argmin())
 
 
 def _reach_deg(steep: Floats) -> tuple[float, float]:
     """Elevations between which nearly all points are [deg]."""
     few = len(steep) // 100
-    low, high = (math.degrees(math.atan(_quantile(steep, k))) for k in (few, len(steep) - 1 - few))
-    return low, high
+    return math.degrees(math.atan(steep[few])), math.degrees(math.atan(steep[-1 - few]))
 
 
 def _beyond(steep: Floats, sensor: SensorProfile, normal: Normal) -> tuple[float, float] | None:

@@ -21,7 +21,7 @@ import numpy as np
 from ..errors import PointsError
 from ..system.names import by_number
 from .inflate import inflate, inflate_file, inflated_message, most_bytes
-from .mcap import ALIVE_EVERY, MCAP_MAGIC, BagFile, Channel, McapFile, Message, by_time, unpack
+from .mcap import ALIVE_EVERY, MCAP_MAGIC, BagFile, Channel, McapFile, Message, by_time, read_through, unpack
 from .tables import MAX_BYTES
 
 BAG_SUFFIXES = (".db3", ".mcap")
@@ -39,14 +39,14 @@ def bag_files(folder: Path) -> list[Path]:
     return sorted(kept, key=by_number)
 
 
-def open_bag(path: Path, folder: Path, alive: Callable[[], None]) -> list[BagFile]:
-    """Open the files of a bag: its folder, or one file.
+def open_bag(path: Path, folder: Path, alive: Callable[[], None]) -> tuple[list[BagFile], PointsError | None]:
+    """Open the files of a bag: its folder, or one file. With them, what is wrong with the first that cannot be opened.
 
     folder : for files that are compressed as a whole, which are unpacked there within the limits of `inflate`.
     """
     files = bag_files(path) if path.is_dir() else [path]
     left = min(most_bytes(sum(file.stat().st_size for file in files)), shutil.disk_usage(folder).free // 2)
-    opened: list[BagFile] = []
+    opened, damage = list[BagFile](), None
     for file in files:
         plain = file
         try:
@@ -55,12 +55,12 @@ def open_bag(path: Path, folder: Path, alive: Callable[[], None]) -> list[BagFil
                 left -= inflate_file(file, plain, left, alive)
             opened.append(_open_file(plain, alive))
         except PointsError as exc:
-            opened.append(Unreadable(PointsError(f"{file.name}: {exc}") if path.is_dir() else exc))
+            damage = damage or (PointsError(f"{file.name}: {exc}") if path.is_dir() else exc)
     missing = sorted(_declared(path) - {file.name for file in files}) if path.is_dir() else []
     if missing:
         names = ", ".join(missing)
-        opened.append(Unreadable(PointsError(f"the bag is not whole: {names} of its metadata.yaml is missing")))
-    return opened
+        damage = damage or PointsError(f"the bag is not whole: {names} of its metadata.yaml is missing")
+    return opened, damage
 
 
 def _declared(folder: Path) -> set[str]:
@@ -90,19 +90,6 @@ def _open_file(path: Path, alive: Callable[[], None]) -> BagFile:
         f"the file is damaged or cut short: it begins with {head!r}; expected a bag of ROS 1, a database of ROS 2 or "
         "MCAP"
     )
-
-
-class Unreadable(BagFile):
-    """A `BagFile` that is damaged at its beginning."""
-
-    def __init__(self, error: PointsError) -> None:
-        self._error = error
-
-    def topics(self) -> set[Channel]:
-        raise self._error
-
-    def messages_of(self, channel: Channel) -> Iterator[tuple[int, memoryview]]:
-        raise self._error
 
 
 class SqliteBag(BagFile):
@@ -163,14 +150,12 @@ class Ros1Bag(BagFile):
     def topics(self) -> set[Channel]:
         if not self._whole:
             try:
-                self._learn_from_index()
+                for fields, content in _ros1_records(self._data, self._index()):
+                    self._learn(fields, content)
+                if not self._connections:
+                    raise PointsError("the index of the bag names no topic")
             except PointsError:  # no index, or a damaged one: the connections stand among the messages, too
-                try:
-                    for _ in self._messages():
-                        pass
-                except PointsError:
-                    if not self._connections:
-                        raise
+                read_through(self._messages(), self._connections)
             if not self._connections and len(self._data) <= 13:
                 raise PointsError("the file is damaged or cut short: it ends behind its first line")
             self._whole = True
@@ -180,12 +165,6 @@ class Ros1Bag(BagFile):
         for number, stamp_ns, data in self._messages():
             if self._connections.get(number) == channel:
                 yield stamp_ns, data
-
-    def _learn_from_index(self) -> None:
-        for fields, content in _ros1_records(self._data, self._index()):
-            self._learn(fields, content)
-        if not self._connections:
-            raise PointsError("the index of the bag names no topic")
 
     def _index(self) -> int:
         """Where the index begins, which is behind all messages; PointsError if the file ends before."""

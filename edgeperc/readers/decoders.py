@@ -359,8 +359,9 @@ def _clouds(path: Path, topic: str | None, alive: Callable[[], None]) -> Iterato
     What is damaged in one file of a bag is reported after the clouds of all.
     """
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
-        files = open_bag(path, Path(folder), alive)
+        files, unread = open_bag(path, Path(folder), alive)
         topics, damage = _topics(files)
+        damage = unread or damage
         clouds = {channel for channel in topics if channel[1:] in CLOUD_READERS}
         packets = {channel for channel in topics if has_points(channel)}
         if not clouds or (topic or "").partition("@")[0] in {channel.topic for channel in packets}:
@@ -377,7 +378,7 @@ def _clouds(path: Path, topic: str | None, alive: Callable[[], None]) -> Iterato
         chosen = names[_choose("topic of type sensor_msgs/PointCloud2", names, name or None, more)]
         n_scans, frames = 0, dict[str, None]()
         metadata: str | None = None
-        for message, recorded_ns in _messages(files, clouds, chosen):
+        for message, recorded_ns in _messages(files, clouds, chosen, unread):
             frames.setdefault(message.header.frame_id)
             if frame and message.header.frame_id != frame:
                 continue
@@ -423,9 +424,11 @@ def _topics(files: Sequence[BagFile]) -> tuple[set[Channel], PointsError | None]
     return topics, damage
 
 
-def _messages(files: Sequence[BagFile], clouds: Set[Channel], topic: str) -> Iterator[tuple[Cloud | Packets, int]]:
-    """Clouds of a topic and when they were recorded [ns]; damage in one file is raised after those of all files."""
-    n, damage = 0, None
+def _messages(
+    files: Sequence[BagFile], clouds: Set[Channel], topic: str, damage: PointsError | None
+) -> Iterator[tuple[Cloud | Packets, int]]:
+    """Clouds of a topic and when they were recorded [ns]; damage, or that of a file, is raised after those of all."""
+    n = 0
     for file in files:
         try:
             for channel in sorted(channel for channel in file.topics() & clouds if channel.topic == topic):

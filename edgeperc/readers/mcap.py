@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import struct
 import zlib
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
 from ..errors import PointsError
+from .clouds import ros1_reader
 from .inflate import inflate, inflated_message
 from .tables import MAX_BYTES
 
@@ -71,12 +72,7 @@ class McapFile(BagFile):
             except PointsError:
                 self._is_named = False
         if not (self._channels and self._is_named):  # a summary may be damaged, or not repeat all that stands before it
-            try:
-                for _ in self._messages():
-                    pass
-            except PointsError:  # raised again when the messages are read
-                if not self._channels:
-                    raise
+            read_through(self._messages(), self._channels)
 
     def topics(self) -> set[Channel]:
         return set(self._channels.values())
@@ -109,13 +105,26 @@ class McapFile(BagFile):
                 self._learn(kind, content)
 
     def _learn(self, kind: int, content: memoryview) -> None:
+        if kind not in (_SCHEMA, _CHANNEL):
+            return
+        read = ros1_reader(content)  # texts have their lengths in front, as in messages of ROS 1
+        number = read.value("H")
         if kind == _SCHEMA:
-            self._schemas[unpack("<H", content)[0]] = _text(content, 2)[0]
-        elif kind == _CHANNEL:
-            number, schema = unpack("<HH", content)
+            self._schemas[number] = read.text()
+        else:
+            schema = read.value("H")
             self._is_named &= schema == 0 or schema in self._schemas  # 0: there is none
-            topic, offset = _text(content, 4)
-            self._channels[number] = Channel(topic, self._schemas.get(schema, ""), _text(content, offset)[0])
+            self._channels[number] = Channel(read.text(), self._schemas.get(schema, ""), read.text())
+
+
+def read_through(messages: Iterator[Message], channels: Mapping[int, Channel]) -> None:
+    """Read messages for the channels among them; damage is raised behind the first channel when they are read again."""
+    try:
+        for _ in messages:
+            pass
+    except PointsError:
+        if not channels:
+            raise
 
 
 def by_time(messages: Iterator[Message]) -> Iterator[Message]:
@@ -151,16 +160,13 @@ def _records(data: memoryview, offset: int, *, is_chunk: bool = False) -> Iterat
 
 def _unpacked(chunk: memoryview) -> bytes:
     """The records of a chunk as bytes, once length and CRC-32 are right."""
-    size, crc = unpack("<16xQI", chunk)
-    method, offset = _text(chunk, 28)
-    (packed_size,) = unpack("<Q", chunk, offset)
+    read = ros1_reader(chunk[16:])
+    size, crc, method, packed_size = read.value("Q"), read.value("I"), read.text(), read.value("Q")
     if size > MAX_BYTES:
         raise PointsError(f"a chunk claims to unpack to {size:,} bytes; expected at most {MAX_BYTES:,}")
-    if packed_size != len(chunk) - offset - 8:
-        raise PointsError(
-            f"a chunk is damaged: it declares {packed_size:,} bytes and holds {len(chunk) - offset - 8:,}"
-        )
-    content = inflate(bytes(chunk[offset + 8 :]), method, size)
+    if packed_size != read.left:
+        raise PointsError(f"a chunk is damaged: it declares {packed_size:,} bytes and holds {read.left:,}")
+    content = inflate(bytes(read.take(packed_size)), method, size)
     if len(content) != size:
         raise PointsError(f"a chunk is damaged: it unpacks to {len(content):,} bytes and declares {size:,}")
     if crc and zlib.crc32(content) != crc:
@@ -174,12 +180,3 @@ def unpack(code: str, content: memoryview | bytes, offset: int = 0) -> tuple[Any
         return struct.unpack_from(code, content, offset)
     except struct.error as exc:
         raise PointsError(f"a record is damaged: {exc}") from exc
-
-
-def _text(content: memoryview, offset: int) -> tuple[str, int]:
-    """A string with its length in front, and the place behind it."""
-    (length,) = unpack("<I", content, offset)
-    end = offset + 4 + length
-    if end > len(content):
-        raise PointsError("a record is damaged: a text ends past it")
-    return bytes(content[offset + 4 : end]).decode("utf-8", "replace"), end
