@@ -145,7 +145,7 @@ def stream(
     return Stream(inbox, scans, perceiver, tracker, late_s, stale_s)
 
 
-def check_rate(rate_hz: object) -> None:
+def check_rate(rate_hz: float) -> None:
     """Refuse a rate that is none. Raises OptionError."""
     if not (isinstance(rate_hz, Real) and 0.0 < rate_hz < math.inf):
         raise OptionError(f"rate_hz is {rate_hz!r}; expected scans a second, above 0")

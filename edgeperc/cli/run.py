@@ -274,13 +274,12 @@ def _check_usage(arguments: argparse.Namespace, kinds: Sequence[str]) -> None:
         arguments.usage_error(f"--live replays one path, got {len(arguments.paths)}: {shown}")
     if arguments.live and (kinds or arguments.gif):
         arguments.usage_error(f"--live writes no files; leave out --{[*kinds, 'gif'][0]}")
-    if (kinds or arguments.gif) and arguments.out is None:
-        arguments.usage_error(f"--{[*kinds, 'gif'][0]} needs --out DIR")
-    if arguments.labels_for is not None and arguments.out is None:
-        arguments.usage_error("--labels-for needs --out DIR")
+    files = [*kinds, *["gif"] * arguments.gif, *["labels-for"] * (arguments.labels_for is not None)]
+    if files and arguments.out is None:
+        arguments.usage_error(f"--{files[0]} needs --out DIR")
     if arguments.labels_for is not None and isinstance(arguments.out, Remote):
         arguments.usage_error(f"--labels-for writes to a folder of this computer, not to {arguments.out}")
-    if arguments.out is not None and not kinds and not arguments.gif and arguments.labels_for is None:
+    if arguments.out is not None and not files:
         arguments.usage_error(
             "--out DIR has nothing to write; add --png, --html, --labels, --ply, --gif or --labels-for"
         )
@@ -625,17 +624,14 @@ class _Run:
                     yield path, exc, None, None  # newer scans may have arrived, so the failed scan's number is unknown
                     continue
                 assert answer is not None
-                name, tracks = name_of(answer.n_scans - 1), answer.tracks
-                points, perception = answer.points, answer.perception
-                scan = PerceivedScan(
-                    str(name), answer.stamp_s, points, perception, tracks, perceiver.sensor, answer.health
-                )
+                name, of_scan = name_of(answer.n_scans - 1), (answer.points, answer.perception, answer.tracks)
+                scan = PerceivedScan(str(name), answer.stamp_s, *of_scan, perceiver.sensor, answer.health)
                 try:
                     self._sinks.write(scan)
                 except (EdgepercError, OSError) as exc:
                     yield name, exc, None, None
                 else:
-                    yield name, answer, tracks, None
+                    yield name, answer, answer.tracks, None
 
     def _answered(
         self,

@@ -27,6 +27,11 @@ class Finding(str):
         return finding
 
 
+def _gross(text: str) -> Finding:
+    """A finding for which a scan is refused."""
+    return Finding(text, True)
+
+
 def check_fitness(
     points: Points, profile: FitnessProfile, sensor: SensorProfile, frame: ModelFrame | None = None
 ) -> tuple[Finding, ...]:
@@ -127,7 +132,7 @@ def _ground_far_around(sample: Floats) -> float | None:
 
 def _findings(scan: Measures | None, profile: FitnessProfile, sensor: SensorProfile) -> tuple[Finding, ...]:
     if scan is None:
-        return (Finding("The scan holds no finite point: is the sensor connected and its driver running?", True),)
+        return (_gross("The scan holds no finite point: is the sensor connected and its driver running?"),)
     if scan.n_sampled < 300.0 and scan.points_in_view < 0.2 * profile.points_in_view[0]:
         return (_too_few(scan, profile, sensor),)  # too few points for the other checks
     findings = _geometry_findings(scan, profile, sensor)
@@ -156,11 +161,10 @@ def check_dropped(points: Points, dropped: DroppedPoints, sensor: SensorProfile)
     n_left = len(points) - dropped.total
     if dropped.ego > _NEARLY_ALL * max(n_left, dropped.too_near):
         return (
-            Finding(
+            _gross(
                 f"{dropped.ego:,} of the {len(points):,} points of the scan lie inside the ego_box of the profile "
                 f"{sensor.name}, {sensor.ego_box}, and are dropped as the own vehicle: expected its lowest and highest "
-                "x, y and z about the sensor, along the axes of the scan, in meters.",
-                True,
+                "x, y and z about the sensor, along the axes of the scan, in meters."
             ),
         )
     if dropped.too_near <= _NEARLY_ALL * n_left:
@@ -174,21 +178,19 @@ def check_dropped(points: Points, dropped: DroppedPoints, sensor: SensorProfile)
     # Empty beams are on one ray, or at ranges that show no ground.
     if street is not None and street.ground_m is not None and street.beams >= min(_FEWEST_ROWS, sensor.n_beams):
         return (
-            Finding(
+            _gross(
                 f"The median distance is {median_m:.3g}, and {dropped.too_near / len(points):.0%} of the points are "
                 f"nearer than the {sensor.name} measures ({sensor.min_range_m:g} m): the coordinates seem to be in "
-                "another unit; convert them to meters.",
-                True,
+                "another unit; convert them to meters."
             ),
         )
     if n_left:
         return ()
     return (
-        Finding(
+        _gross(
             f"The scan holds no return: {dropped.too_near:,} of its {len(points):,} points are at most "
             f"{sensor.min_range_m:g} m from the sensor, beams without a return. Is the sensor covered, or the profile "
-            f"{sensor.name} another sensor's?",
-            True,
+            f"{sensor.name} another sensor's?"
         ),
     )
 
@@ -281,18 +283,16 @@ def _other_unit(scan: Measures, usual_m: Range) -> Finding | None:
     if _AWAY * scan.range_median_m < scan.nearest_m < _FARTHEST_M:
         steps = float(np.spacing(np.float32(scan.range_median_m)))
         rounded = f" As float32, they are rounded to {steps:.2g} m: subtract it in double." if steps > _STEPS_M else ""
-        return Finding(
+        return _gross(
             f"The points are about {scan.range_median_m:,.0f} m away, all in one direction: the sensor is not at the "
             f"origin, as in the frame of a map; subtract the sensor's position from the points: origin_m= or --origin "
-            f"X Y Z.{rounded}",
-            True,
+            f"X Y Z.{rounded}"
         )
     factor = scan.range_median_m / math.sqrt(near * far)
     unit = next((name for name, size in _UNITS if 0.2 * size < factor < 5.0 * size), "another unit")
-    return Finding(
+    return _gross(
         f"The median distance is {scan.range_median_m:.3g}, in training it was {near:.0f} to {far:.0f} m: "
-        f"the coordinates seem to be in {unit}; convert them to meters.",
-        True,
+        f"the coordinates seem to be in {unit}; convert them to meters."
     )
 
 
@@ -310,17 +310,16 @@ def _feet(scan: Measures, sensor: SensorProfile) -> Finding | None:
 
 def in_feet(sensor: SensorProfile) -> Finding:
     """What to say of points beyond the range of a sensor."""
-    return Finding(
+    return _gross(
         f"Points are farther away than the {sensor.name} measures ({sensor.max_range_m:g} m): the coordinates seem to "
         f"be in feet; multiply them by {1.0 / FEET_PER_M:.4f}. If they are in meters, pass sensor= a profile with the "
-        "max_range_m of the sensor.",
-        True,
+        "max_range_m of the sensor."
     )
 
 
 _DECIMETERS = 4.3  # times the range of a sensor
-_IN_DECIMETERS = Finding(
-    "Points are too far away, on all sides: the coordinates seem to be in decimeters; multiply them by 0.1.", True
+_IN_DECIMETERS = _gross(
+    "Points are too far away, on all sides: the coordinates seem to be in decimeters; multiply them by 0.1."
 )
 
 
@@ -329,10 +328,9 @@ def _other_axes(scan: Measures) -> Finding | None:
         return None
     towards = ("+" if scan.flat_m > 0.0 else "-") + "xyz"[scan.flat_axis]
     advice = "" if towards != "+y" else " They may be a camera's (x right, y down, z forward): pass z, -x, -y."
-    return Finding(
+    return _gross(
         f"The ground seems to lie towards {towards}, where the model expects it towards -z: the axes are not "
-        f"x forward, y left, z up.{advice}",
-        True,
+        f"x forward, y left, z up.{advice}"
     )
 
 
@@ -342,21 +340,19 @@ def _other_origin(scan: Measures) -> Finding | None:
             return None
     elif scan.unevenness <= _EVEN and scan.view_covered > _ALL_AROUND:
         return _IN_DECIMETERS
-    return Finding(
+    return _gross(
         f"One direction holds {scan.unevenness:.1f} times as many points as the mean one, and the nearest "
         f"points are {scan.nearest_m:.0f} m away: the sensor is not at the origin, as in the frame of a map; "
-        "subtract the sensor's position from the points.",
-        True,
+        "subtract the sensor's position from the points."
     )
 
 
 def _upside_down(scan: Measures, profile: FitnessProfile) -> Finding | None:
     if scan.ground_m is None or profile.ground_m is None or scan.ground_m <= 0.5 or profile.ground_m[1] >= 0.0:
         return None
-    return Finding(
+    return _gross(
         f"The ground lies {scan.ground_m:.1f} m above the sensor: it is mounted upside down, or z points "
-        f"down: {_TURN_OVER}",
-        True,
+        f"down: {_TURN_OVER}"
     )
 
 
@@ -389,10 +385,9 @@ def check_beams(points: Points, sensor: SensorProfile) -> tuple[Finding, ...]:
     if as_is <= _ASYMMETRIC_DEG or turned >= 0.5 * as_is:
         return ()
     return (
-        Finding(
+        _gross(
             f"The points lie between {lowest:.0f} and {highest:.0f} deg of elevation, and the beams of the "
-            f"{sensor.name} between {down:.0f} and {up:.0f}: it is mounted upside down, or z points down: {_TURN_OVER}",
-            True,
+            f"{sensor.name} between {down:.0f} and {up:.0f}: it is mounted upside down, or z points down: {_TURN_OVER}"
         ),
     )
 
@@ -431,10 +426,9 @@ def check_ground(
         if sensor.fov_up_deg + sensor.fov_down_deg > _ASYMMETRIC_DEG and turned - as_is > _ASYMMETRIC_DEG:
             return ()
     return (
-        Finding(
+        _gross(
             "The ground seems to lie above the sensor, and there is none below: it is mounted upside down, or z points "
-            f"down: {_TURN_OVER}",
-            True,
+            f"down: {_TURN_OVER}"
         ),
     )
 
@@ -453,10 +447,9 @@ def check_hanging(
     if not check_ground(turned, support_of, below_of):
         return ()
     return (
-        Finding(
+        _gross(
             f"With the given roll of {known.roll_deg:g} deg, the ground lies above the sensor, and none below: it "
-            "does not hang upside down, or the points are turned already: leave out the roll (--roll, --extrinsic).",
-            True,
+            "does not hang upside down, or the points are turned already: leave out the roll (--roll, --extrinsic)."
         ),
     )
 
@@ -546,11 +539,10 @@ def _room(scan: Measures, profile: FitnessProfile) -> Finding | None:
         return None
     if scan.far_m >= _HALL_M and scan.range_median_m > _COVERED_M:  # a narrow alley
         return None
-    return Finding(
+    return _gross(
         f"Half of the points are nearer than {scan.range_median_m:.1f} m, in training {near:.0f} to "
         f"{far:.0f} m, and no ground was found: this seems to be a room, or the sensor is covered; the models "
-        "know roads.",
-        True,
+        "know roads."
     )
 
 
@@ -634,10 +626,9 @@ def with_raw_remission(findings: Iterable[Finding], points: Points, sensor: Sens
     low, high = sensor.remission_range
     brightest = float(np.percentile(known, 99))
     likely, own = _likely_range(float(known.min()), float(known.max())), f"({low:g}, {high:g})"
-    there = Finding(
+    there = _gross(
         f"Remission hardly exceeds {brightest:.2g}, but the profile {sensor.name} has {low:g} to {high:g}: pass "
-        f"sensor= a profile with the remission_range of this data{'' if likely == own else f', {likely}'}.",
-        True,
+        f"sensor= a profile with the remission_range of this data{'' if likely == own else f', {likely}'}."
     )
     return tuple(there if finding.startswith(_ALL_ZERO) else finding for finding in found)
 
@@ -656,24 +647,21 @@ def _other_remission(scan: Measures, profile: FitnessProfile, sensor: SensorProf
     stated = f"the profile {sensor.name} has {low:g} to {high:g}"
     useless = max(0.9, profile.remission_zeros[1] + 0.05)
     if scan.remission_beyond > 0.01 or scan.remission_low < -0.05:
-        return Finding(
+        return _gross(
             f"Remission runs from {raw_low:g} to {raw_high:g}, but {stated}: pass sensor= a profile whose "
-            f"remission_range is {_likely_range(raw_low, raw_high)}.",
-            True,
+            f"remission_range is {_likely_range(raw_low, raw_high)}."
         )
     if scan.remission_zeros > useless:
-        return Finding(
+        return _gross(
             f"{_ALL_ZERO} {scan.remission_zeros:.0%} of the points: the field is missing or was not read; "
-            "the model needs it.",
-            True,
+            "the model needs it."
         )
     # Data in 0..1 has 0.004 of a full scale of 255, which is one bin too.
     in_one_bin = scan.remission_p99 < 0.02 and scan.remission_low < scan.remission_high
     if scan.remission_alike > useless and not in_one_bin:
-        return Finding(
+        return _gross(
             f"Remission is the same for {scan.remission_alike:.0%} of the points ({raw_high:g}): the field holds "
-            "something else; the model needs it.",
-            True,
+            "something else; the model needs it."
         )
     if scan.remission_p99 < 0.2 * profile.remission_p99[0]:
         return Finding(

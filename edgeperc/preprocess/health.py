@@ -265,15 +265,16 @@ def _beams_missing(steep: Floats, beams: Floats) -> int:
 def _reach_deg(steep: Floats) -> tuple[float, float]:
     """Elevations between which nearly all points are [deg]."""
     few = len(steep) // 100
-    return math.degrees(math.atan(steep[few])), math.degrees(math.atan(steep[-1 - few]))
+    low, high = np.degrees(np.arctan(steep[[few, -1 - few]])).round(1).tolist()
+    return low, high
 
 
 def _beyond(steep: Floats, sensor: SensorProfile, normal: Normal) -> tuple[float, float] | None:
     """The elevations of a scan, if they are beyond those of the first scans and of the sensor; None otherwise."""
     low, high = _reach_deg(steep)
-    usual_low, usual_high = normal.reach_deg
-    is_lower = low < min(usual_low, sensor.elevations_deg[-1]) - _OTHER_DEG
-    return (low, high) if is_lower or high > max(usual_high, sensor.elevations_deg[0]) + _OTHER_DEG else None
+    lowest, highest = normal.reach_deg
+    is_lower = low < min(lowest, sensor.elevations_deg[-1]) - _OTHER_DEG
+    return (low, high) if is_lower or high > max(highest, sensor.elevations_deg[0]) + _OTHER_DEG else None
 
 
 def _arcs(marks: Mask) -> tuple[tuple[float, float], ...]:

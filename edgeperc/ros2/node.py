@@ -292,8 +292,7 @@ class PerceptionNode:
         if cloud.header.frame_id != self._cloud_frame:
             raise PointsError(
                 f"the cloud has the frame {cloud.header.frame_id!r}, and the first one {self._cloud_frame!r}: it is of "
-                "another sensor, or its driver was configured anew. Give each sensor a topic and a node of its own, or "
-                "start this one again"
+                "another sensor. Give each sensor a topic and a node of its own, or start this one anew"
             )
         stamp_ns = cloud.header.stamp.sec * 10**9 + cloud.header.stamp.nanosec or time.time_ns()
         self._messages.frame_id = self._frame_id or cloud.header.frame_id or "lidar"

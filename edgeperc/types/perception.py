@@ -358,8 +358,6 @@ class SensorHealth:
         """Convert to a dict for JSON, shares rounded to 0.0001 and ranges to 0.1 m."""
         rounded = {"blocked": 4, "isolated": 4, "returns_share": 4, "range_m": 1, "normal_range_m": 1}
         record = asdict(self) | {"blocked_deg": [[*arc] for arc in self.blocked_deg], "findings": [*self.findings]}
-        if self.other_sensor_deg is not None:
-            record["other_sensor_deg"] = [round(angle, 1) for angle in self.other_sensor_deg]
         return record | {k: round(record[k], n) for k, n in rounded.items() if record[k] is not None}
 
 
