@@ -6,7 +6,7 @@ import math
 import re
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -86,6 +86,16 @@ def running(perceive: Any = None, **options: Any) -> Iterator[tuple[FakeGraph, P
         yield graph, node, iter(node)
 
 
+def answered(clouds: Iterable[bytes], perceive: Any = None, **options: Any) -> tuple[FakeGraph, list[Any]]:
+    """The graph, and what comes of each of some clouds."""
+    answers = []
+    with running(perceive, **options) as (graph, _, outcomes):
+        for each in clouds:
+            graph.give(each)
+            answers.append(next(outcomes))
+    return graph, answers
+
+
 @pytest.fixture
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """Diagnostics come often, so that no test waits a second."""
@@ -139,9 +149,7 @@ def test_a_cloud_is_answered_with_its_stamp_and_frame() -> None:
 
 def test_frames_and_names_of_ones_own() -> None:
     options: dict[str, Any] = {"frame_id": "base", "grid_frame_id": "ground", "prefix": "/a/", "outputs": ["occupancy"]}
-    with running(**options) as (graph, _, outcomes):
-        graph.give(cloud(POINTS))
-        next(outcomes)
+    graph, _ = answered([cloud(POINTS)], **options)
     assert graph.types.keys() == {"/a/occupancy"}
     (grid,) = (MESSAGES.decode(raw, OUTPUTS["occupancy"]) for raw in graph.published["/a/occupancy"])
     assert grid.header.frame_id == "ground"
@@ -200,16 +208,11 @@ def test_a_cloud_of_16_million_points_in_few_bytes_is_refused(monkeypatch: pytes
 
 
 def test_big_endian_empty_and_nan_clouds_are_clouds() -> None:
-    with running() as (graph, _, outcomes):
-        for data, expected in (
-            (cloud(POINTS, is_bigendian=True), POINTS),
-            (cloud(POINTS[:0]), POINTS[:0]),
-            (cloud(np.full((4, 4), np.nan)), np.full((4, 4), np.nan, np.float32)),
-        ):
-            graph.give(data)
-            scan = next(outcomes)
-            assert isinstance(scan, PerceivedScan), scan
-            np.testing.assert_array_equal(scan.points, expected)
+    nothing = np.full((4, 4), np.nan, np.float32)
+    _, answers = answered([cloud(POINTS, is_bigendian=True), cloud(POINTS[:0]), cloud(nothing)])
+    for scan, expected in zip(answers, (POINTS, POINTS[:0], nothing), strict=True):
+        assert isinstance(scan, PerceivedScan), scan
+        np.testing.assert_array_equal(scan.points, expected)
 
 
 def test_damaged_bytes_never_end_the_node() -> None:
@@ -259,11 +262,7 @@ def test_the_newest_cloud_wins() -> None:
 def test_stamps_that_repeat_or_jump_are_answered_and_tracked_anew() -> None:
     poison_ns = (2**31 - 1) * 10**9 + 4 * 10**9
     stamps_ns = [s * 10**9 for s in (100, 101, 101, 50, 51)] + [poison_ns, 52 * 10**9, -(10**9), 53 * 10**9]
-    answers = []
-    with running(tracker=Tracker()) as (graph, _, outcomes):
-        for stamp_ns in stamps_ns:
-            graph.give(cloud(POINTS, stamp_ns))
-            answers.append(next(outcomes))
+    graph, answers = answered((cloud(POINTS, stamp_ns) for stamp_ns in stamps_ns), tracker=Tracker())
     sessions = []
     for answer in answers:
         assert isinstance(answer, PerceivedScan)
@@ -282,10 +281,8 @@ def test_of_a_cloud_that_comes_twice_the_boxes_are_published() -> None:
             box = Box("car", 0.9, (10.0, 2.0, -0.9), (4.2, 1.8, 1.5), 0.0)
             return replace(super().__call__(points, stamp_s=stamp_s), boxes=(box,))
 
-    with running(Car(), tracker=Tracker()) as (graph, _, outcomes):
-        for stamp_ns in (10**9, 11 * 10**8, 11 * 10**8):
-            graph.give(cloud(POINTS, stamp_ns))
-            next(outcomes)
+    stamps_ns = (10**9, 11 * 10**8, 11 * 10**8)
+    graph, _ = answered((cloud(POINTS, stamp_ns) for stamp_ns in stamps_ns), Car(), tracker=Tracker())
     first, tracked, twice = (
         MESSAGES.decode(raw, OUTPUTS["detections"]).detections for raw in graph.published["/edgeperc/detections"]
     )
@@ -294,20 +291,14 @@ def test_of_a_cloud_that_comes_twice_the_boxes_are_published() -> None:
 
 
 def test_a_cloud_of_another_frame_is_an_error_and_the_first_sensor_goes_on() -> None:
-    with running() as (graph, _, outcomes):
-        answers = []
-        for frame in ("front", "rear", "front"):
-            graph.give(cloud(POINTS, frame_id=frame))
-            answers.append(next(outcomes))
+    _, answers = answered(cloud(POINTS, frame_id=frame) for frame in ("front", "rear", "front"))
     assert [isinstance(answer, PerceivedScan) for answer in answers] == [True, False, True]
     assert "frame 'rear', and the first one 'front'" in str(answers[1])
 
 
 def test_a_cloud_without_a_stamp_has_that_of_its_arrival() -> None:
     perceive, before = Perceive(), time.time()
-    with running(perceive) as (graph, _, outcomes):
-        graph.give(cloud(POINTS, 0))
-        next(outcomes)
+    answered([cloud(POINTS, 0)], perceive)
     assert before - 1e-3 <= perceive.stamps[0] <= time.time() + 1e-3
 
 
