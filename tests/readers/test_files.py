@@ -8,6 +8,7 @@ import struct
 import tempfile
 import warnings
 import zipfile
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -405,14 +406,6 @@ def test_an_archive_gives_the_remission_that_is_asked_for(tmp_path: Path, n: int
         read_points(path, remission_field="ring")
 
 
-@pytest.mark.parametrize("name", ["a.npy", "a.npz", "a.bin"])
-def test_three_values_a_point_hold_no_remission(tmp_path: Path, name: str) -> None:
-    points = np.random.default_rng(1).normal(0.0, [20.0, 10.0, 1.0], (2000, 3)).astype(np.float32)
-    content = {"a.npy": npy, "a.npz": lambda array: npz(points=array), "a.bin": np.ndarray.tobytes}[name](points)
-    with pytest.raises(PointsError, match=r"no field 'intensity' for the remission: .* three a point"):
-        read_points(save(tmp_path, name, content), remission_field="intensity", columns=3)
-
-
 @pytest.mark.parametrize("beside", [np.arange(5.0), np.zeros((4, 2)), np.array(["a"] * 4), np.zeros(4, complex)])
 def test_what_is_no_remission_of_the_points_is_refused(tmp_path: Path, beside: Any) -> None:
     path = save(tmp_path, "a.npz", npz(points=POINTS[:, :3], intensity=beside))
@@ -633,6 +626,19 @@ OTHERS = {
 }
 
 
+def raw_rows(seed: int, others: Sequence[str], remission: float | None, order: str) -> np.ndarray:
+    """Points in an order, with other values behind them; without a remission if there are none."""
+    rng, points = np.random.default_rng(seed), street(seed)
+    points[:, 3] *= remission or 0.0
+    points = points[:, : 4 if others or remission is not None else 3]
+    if order == "shuffled":
+        points = rng.permutation(points)
+    if order == "fired":  # as a Velodyne's lasers: up and down in turn
+        lasers = np.arange(20).reshape(2, 10).T.ravel()
+        points = points.reshape(20, 300, -1)[lasers].swapaxes(0, 1).reshape(6000, -1)
+    return np.column_stack([points, *(OTHERS[name](len(points), rng) for name in others)]).astype("<f4")
+
+
 @given(
     seed=st.integers(0, 9),
     others=st.lists(st.sampled_from([*OTHERS]), max_size=5),
@@ -641,22 +647,13 @@ OTHERS = {
 )
 @settings(max_examples=60, deadline=None)
 def test_raw_files_show_how_many_values_a_point_has(seed: int, others: Any, remission: Any, order: str) -> None:
-    rng = np.random.default_rng(seed)
-    points = street(seed)
-    points[:, 3] *= remission or 0.0
-    if remission is None and not others:
-        points = points[:, :3]
-    if order == "shuffled":
-        points = rng.permutation(points)
-    if order == "fired":  # as a Velodyne's lasers: up and down in turn
-        lasers = np.arange(20).reshape(2, 10).T.ravel()
-        points = points.reshape(20, 300, -1)[lasers].swapaxes(0, 1).reshape(6000, -1)
-    rows = np.column_stack([points, *(OTHERS[name](len(points), rng) for name in others)]).astype("<f4")
+    rows = raw_rows(seed, others, remission, order)
+    points = rows[:, :4]
     with tempfile.TemporaryDirectory() as folder:
         for name in ("scan.bin", "scan.pcd.bin"):
             path = save(Path(folder), name, rows.tobytes())
-            np.testing.assert_array_equal(read_points(path)[:, : points.shape[1]], points)
-            np.testing.assert_array_equal(read_points(path, columns=rows.shape[1])[:, : points.shape[1]], points)
+            for columns in (None, rows.shape[1]):
+                np.testing.assert_array_equal(read_points(path, columns=columns)[:, : points.shape[1]], points)
 
 
 @pytest.mark.parametrize("n", [1, 3, 40, 249])
@@ -729,17 +726,13 @@ def test_columns_of_a_stored_array_have_times_and_places(tmp_path: Path) -> None
     seed=st.integers(0, 9),
     others=st.lists(st.sampled_from(["time", "ring", "unknown", "elongation"]), max_size=3),
     remission=st.sampled_from([0.0, 1.0, 255.0]),
-    shuffled=st.booleans(),
+    order=st.sampled_from(["rings", "shuffled", "fired"]),
 )
 @settings(max_examples=60, deadline=None)
 def test_raw_float16_is_refused_and_stored_float16_is_exact(
-    seed: int, others: list[str], remission: float, shuffled: bool
+    seed: int, others: list[str], remission: float, order: str
 ) -> None:
-    rng = np.random.default_rng(seed)
-    points = street(seed)
-    points[:, 3] *= remission
-    rows = np.column_stack([points, *(OTHERS[name](len(points), rng) for name in others)]).astype("<f2")
-    rows = rng.permutation(rows) if shuffled else rows
+    rows = raw_rows(seed, others, remission, order).astype("<f2")
     with tempfile.TemporaryDirectory() as folder:
         path = save(Path(folder), "scan.bin", rows.tobytes())
         for columns in (None, 4, 3):
@@ -1037,22 +1030,17 @@ def test_raw_values_may_begin_like_another_format(tmp_path: Path, first: Any) ->
     assert len(read_points(save(tmp_path, "scan.raw", content), columns=4)) == 6000
 
 
-@pytest.mark.parametrize("name", ["a.bin", "a.pcd.bin", "a.npy"])
-@pytest.mark.parametrize(("wanted", "is_there"), [("ring", False), ("time", False), ("intensity", True)])
-def test_values_without_names_have_no_field_of_another_name(
-    tmp_path: Path, name: str, wanted: str, is_there: bool
-) -> None:
-    points = np.random.default_rng(1).normal(0.0, [20.0, 10.0, 1.0, 0.1], (2000, 4)).astype(np.float32)
-    path = tmp_path / name
-    if name == "a.npy":
-        np.save(path, points)
-    else:
-        stored = points if name == "a.bin" else np.hstack([points, np.arange(2000, dtype=np.float32)[:, None] % 32])
-        stored.tofile(path)
-    if is_there:
-        np.testing.assert_array_equal(read_points(path, remission_field=wanted), points)
+@pytest.mark.parametrize(
+    ("name", "n"), [("a.bin", 3), ("a.bin", 4), ("a.pcd.bin", 5), ("a.npy", 3), ("a.npy", 4), ("a.npz", 3)]
+)
+@pytest.mark.parametrize("wanted", ["ring", "time", "intensity"])
+def test_values_without_names_have_no_field_of_another_name(tmp_path: Path, name: str, n: int, wanted: str) -> None:
+    rows = np.random.default_rng(1).normal(0.0, [20.0, 10.0, 1.0, 0.1, 9.0], (2000, 5)).astype(np.float32)[:, :n]
+    write = {"a.npy": npy, "a.npz": lambda array: npz(points=array)}.get(name, np.ndarray.tobytes)
+    path = save(tmp_path, name, write(rows))
+    if wanted == "intensity" and n > 3:
+        np.testing.assert_array_equal(read_points(path, remission_field=wanted, columns=n), rows[:, :4])
         return
-    with pytest.raises(
-        PointsError, match=rf"no field '{wanted}' for the remission: the values have no names.*--columns"
-    ):
-        read_points(path, remission_field=wanted)
+    three = " and are three a point" if n == 3 else ""
+    with pytest.raises(PointsError, match=f"no field '{wanted}' for the remission: the values have no names{three}. "):
+        read_points(path, remission_field=wanted, columns=n)
