@@ -145,20 +145,17 @@ class Ros1Bag(BagFile):
             version = line[len(_ROS1_MAGIC) :].strip().decode("ascii", "replace")
             raise PointsError(f"a bag of version {version!r}; expected 2.0. Run: rosbag migrate")
         self._connections: dict[int, Channel] = {}
-        self._whole = False
+        try:
+            for fields, content in _ros1_records(self._data, self._index()):
+                self._learn(fields, content)
+            if not self._connections:
+                raise PointsError("the index of the bag names no topic")
+        except PointsError:  # no index, or a damaged one: the connections stand among the messages, too
+            read_through(self._messages(), self._connections)
+        if not self._connections and len(self._data) <= 13:
+            raise PointsError("the file is damaged or cut short: it ends behind its first line")
 
     def topics(self) -> set[Channel]:
-        if not self._whole:
-            try:
-                for fields, content in _ros1_records(self._data, self._index()):
-                    self._learn(fields, content)
-                if not self._connections:
-                    raise PointsError("the index of the bag names no topic")
-            except PointsError:  # no index, or a damaged one: the connections stand among the messages, too
-                read_through(self._messages(), self._connections)
-            if not self._connections and len(self._data) <= 13:
-                raise PointsError("the file is damaged or cut short: it ends behind its first line")
-            self._whole = True
         return set(self._connections.values())
 
     def messages_of(self, channel: Channel) -> Iterator[tuple[int, memoryview]]:

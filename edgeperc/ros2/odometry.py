@@ -7,6 +7,7 @@ import math
 import threading
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from operator import itemgetter
 from typing import Any
 
 import numpy as np
@@ -67,8 +68,7 @@ class Poses:
 
     def __init__(self, messages: RosMessages) -> None:
         self._messages, self._lock = messages, threading.Lock()
-        self._times: list[int] = []
-        self._poses: list[tuple[Floats, Floats]] = []
+        self._poses: list[tuple[int, Floats, Floats]] = []
         self.frame_id = self.child_frame_id = ""
         self.n_failed = 0
 
@@ -82,29 +82,23 @@ class Poses:
             return
         ns = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
         with self._lock:
-            if self._times and ns <= self._times[-1]:
-                # As when a recording begins again. A pose that came twice is taken once.
-                keep = bisect.bisect_left(self._times, ns)
-                del self._times[keep:], self._poses[keep:]
-            self._times.append(ns)
-            self._poses.append((place, turn))
-            del self._times[:-_MOST], self._poses[:-_MOST]
+            # Later ones are of before a recording began again. A pose that came twice is taken once.
+            del self._poses[bisect.bisect_left(self._poses, ns, key=itemgetter(0)) :]
+            self._poses.append((ns, place, turn))
+            del self._poses[:-_MOST]
             self.frame_id, self.child_frame_id = message.header.frame_id, message.child_frame_id
 
     def at(self, stamp_ns: int) -> Floats | None:
         """Pose (4, 4) of the child frame at a time, between the two around it; None if there is none."""
         with self._lock:
-            k = bisect.bisect_right(self._times, stamp_ns)  # the first that is later
-            if k == 0 or (k == len(self._times) and stamp_ns - self._times[-1] > TOLERANCE_S * 1e9):
+            k = bisect.bisect_right(self._poses, stamp_ns, key=itemgetter(0))  # the first that is later
+            if k == 0 or (k == len(self._poses) and stamp_ns - self._poses[-1][0] > TOLERANCE_S * 1e9):
                 return None
-            (place, turn), share = self._poses[k - 1], 0.0
-            other = place, turn
-            if k < len(self._times):
-                other = self._poses[k]
-                share = (stamp_ns - self._times[k - 1]) / (self._times[k] - self._times[k - 1])
-        near = other[1] if turn @ other[1] >= 0.0 else -other[1]
+            (ns, place, turn), (later_ns, later_place, later_turn) = (*self._poses[k - 1 : k + 1], self._poses[-1])[:2]
+        share = (stamp_ns - ns) / (later_ns - ns) if later_ns > ns else 0.0
+        near = later_turn if turn @ later_turn >= 0.0 else -later_turn
         turned = _unit((1.0 - share) * turn + share * near)
-        (pose,) = poses_of(((1.0 - share) * place + share * other[0])[None], turned[None])
+        (pose,) = poses_of(((1.0 - share) * place + share * later_place)[None], turned[None])
         return rigid("the odometry's pose", pose, TrackingError)
 
 

@@ -21,7 +21,6 @@ import os
 import struct
 import threading
 import time
-import warnings
 from collections.abc import Callable
 from typing import Any
 
@@ -142,12 +141,7 @@ class ZenohGraph:
         """Undeclare everything and close the session; more calls have no effect."""
         with self._closing:
             entities, self._kept = self._kept, []
-            if not returns(lambda: self._undeclare(entities), _CLOSING_S):
-                warnings.warn(
-                    f"the Zenoh session did not close within {_CLOSING_S:.0f} s and was left behind",
-                    RuntimeWarning,
-                    stacklevel=2,
-                )
+            returns(lambda: self._undeclare(entities), _CLOSING_S, "the Zenoh session did not close")
 
     def _undeclare(self, kept: list[Any]) -> None:
         for each in reversed(kept):

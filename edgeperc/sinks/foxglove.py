@@ -397,12 +397,6 @@ class ServeSink:
         """Close all connections, within a few seconds whatever viewers do."""
         try:
             self._relay.end(_GRACE_S)
-            stopped = returns(self._server.stop, 2.0 * _GRACE_S)
+            returns(self._server.stop, 2.0 * _GRACE_S, f"the server of {self.url} did not stop")
         finally:
             self._relay.close()
-        if not stopped:
-            warnings.warn(
-                f"the server of {self.url} did not stop within {2.0 * _GRACE_S:.0f} s and was left behind",
-                RuntimeWarning,
-                stacklevel=2,
-            )

@@ -6,6 +6,7 @@ import heapq
 import os
 import threading
 import time
+import warnings
 import weakref
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -263,10 +264,9 @@ def _work(tasks: SimpleQueue[Callable[[], None] | None]) -> None:
         del task
 
 
-def returns(call: Callable[[], object], limit_s: float) -> bool:
-    """Whether a call of a library, which may wait for others for ever, returns in time; else it is left behind.
-
-    Signals act while it runs. What it raises is raised here.
+def returns(call: Callable[[], object], limit_s: float, failure: str = "") -> bool:
+    """Whether a call of a library, which may wait for others for ever, returns in time; else it is left behind, and a
+    warning says so, if there are words for the ``failure``. Signals act while it runs. What it raises is raised here.
     """
     errors: list[BaseException] = []
 
@@ -281,4 +281,6 @@ def returns(call: Callable[[], object], limit_s: float) -> bool:
     thread.join(limit_s)
     if errors:
         raise errors[0]
+    if failure and thread.is_alive():
+        warnings.warn(f"{failure} within {limit_s:.0f} s and was left behind", RuntimeWarning, stacklevel=3)
     return not thread.is_alive()
