@@ -71,7 +71,10 @@ class Report:
         if isinstance(outcome, Exception):
             return json.dumps({**self._names(source), "error": one_line(outcome)}) if self._json else ""
         answer, perception = (None, outcome) if isinstance(outcome, Perception) else (outcome, outcome.perception)
-        timing = None if answer is None else _timing(answer)
+        timing: dict[str, Any] | None = None
+        if answer is not None:
+            timing = {"age_ms": round(1e3 * answer.age_s, 3), "health": answer.health}
+            timing |= {"scans": answer.n_scans, "dropped": answer.n_dropped}
         if self._json:
             from ..records import scan_record
 
@@ -94,15 +97,6 @@ class Report:
             return {"scan": str(source)}
         scan = self._images[source]
         return {"scan": None if scan is None else str(scan), "image": {"file": str(source)}}
-
-
-def _timing(answer: Answer) -> dict[str, Any]:
-    return {
-        "age_ms": round(1e3 * answer.age_s, 3),
-        "health": answer.health,
-        "scans": answer.n_scans,
-        "dropped": answer.n_dropped,
-    }
 
 
 def _summary(perception: Perception) -> str:

@@ -127,8 +127,7 @@ class Sinks:
             served = ServeSink(*arguments.serve)
             self._add(served)
             print_line(f"open {served.url} in Foxglove", sys.stderr)
-        files = ((McapSink, arguments.mcap), (RerunSink, arguments.rrd), (PageSink, arguments.play))
-        for make, path in files:
+        for make, path in ((McapSink, arguments.mcap), (RerunSink, arguments.rrd), (PageSink, arguments.play)):
             if path is not None:
                 self._add(make(path))
         if arguments.static is not None:

@@ -97,11 +97,12 @@ class SqliteBag(BagFile):
 
     def __init__(self, path: Path, alive: Callable[[], None]) -> None:
         self._path, self._alive = path, alive
-
-    def topics(self) -> set[Channel]:
         with closing(self._open()) as database:
             rows = self._rows(database, "SELECT name, type, serialization_format FROM topics")
-            return {Channel(str(name), str(kind), str(encoding)) for name, kind, encoding in rows}
+            self._topics = {Channel(str(name), str(kind), str(encoding)) for name, kind, encoding in rows}
+
+    def topics(self) -> set[Channel]:
+        return self._topics
 
     def messages_of(self, channel: Channel) -> Iterator[tuple[int, memoryview]]:
         of_topic = "FROM messages WHERE topic_id IN (SELECT id FROM topics WHERE name = ?) ORDER BY"

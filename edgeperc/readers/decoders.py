@@ -359,9 +359,8 @@ def _clouds(path: Path, topic: str | None, alive: Callable[[], None]) -> Iterato
     What is damaged in one file of a bag is reported after the clouds of all.
     """
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
-        files, unread = open_bag(path, Path(folder), alive)
-        topics, damage = _topics(files)
-        damage = unread or damage
+        files, damage = open_bag(path, Path(folder), alive)
+        topics = {channel for file in files for channel in file.topics()}
         clouds = {channel for channel in topics if channel[1:] in CLOUD_READERS}
         packets = {channel for channel in topics if has_points(channel)}
         if not clouds or (topic or "").partition("@")[0] in {channel.topic for channel in packets}:
@@ -378,7 +377,7 @@ def _clouds(path: Path, topic: str | None, alive: Callable[[], None]) -> Iterato
         chosen = names[_choose("topic of type sensor_msgs/PointCloud2", names, name or None, more)]
         n_scans, frames = 0, dict[str, None]()
         metadata: str | None = None
-        for message, recorded_ns in _messages(files, clouds, chosen, unread):
+        for message, recorded_ns in _messages(files, clouds, chosen, damage):
             frames.setdefault(message.header.frame_id)
             if frame and message.header.frame_id != frame:
                 continue
@@ -411,17 +410,6 @@ def _ouster_metadata(files: Sequence[BagFile], topics: Set[Channel], topic: str)
         f"topic {topic.rpartition('/')[0]}/metadata. Play the bag through Ouster's driver (ouster-ros) with its "
         "metadata, and record its sensor_msgs/PointCloud2"
     )
-
-
-def _topics(files: Sequence[BagFile]) -> tuple[set[Channel], PointsError | None]:
-    """The topics of all files, and the damage of the first that has none for it."""
-    topics, damage = set[Channel](), None
-    for file in files:
-        try:
-            topics |= file.topics()
-        except PointsError as exc:
-            damage = damage or exc
-    return topics, damage
 
 
 def _messages(

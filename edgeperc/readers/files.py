@@ -39,8 +39,6 @@ from .text import begins_like_text, parse_text
 from .times import TimedScan, point_times
 from .unknown import advice_for, missing
 
-_PLY = (b"ply\n", b"ply\r")
-
 
 def read_points(
     source: str | os.PathLike[str] | ArrayLike,
@@ -211,15 +209,14 @@ def _parse(data: Bytes, name: str, options: FileOptions) -> _Read:
             "for a scan of no points pass an array of shape (0, 4)"
         )
     head = data[:MAX_HEADER_BYTES].tobytes()
-    unmarked = head.removeprefix(b"\xef\xbb\xbf")  # of a text that was saved by an editor of Windows
-    if head is not unmarked and (unmarked.startswith(_PLY) or begins_like_pcd(unmarked)):
-        data, head = data[3:], unmarked
+    if head.startswith(b"\xef\xbb\xbf") and not name.endswith(".bin"):  # as editors of Windows begin a text
+        data, head = data[3:], head[3:]
     if head.startswith(b"\x93NUMPY"):
         return _of_stored(_parse_npy(data), options)
     if head.startswith(b"PK\x03\x04"):
         array, is_joined = _parse_npz(data, options)
         return _of_stored(array, options._replace(remission_field=None) if is_joined else options)
-    if head.startswith(_PLY):
+    if head.startswith((b"ply\n", b"ply\r")):
         return _of_named(parse_ply(data, head, options.remission_field), options)
     if begins_like_pcd(head):
         return _of_named(parse_pcd(data, head, options.remission_field), options)

@@ -58,7 +58,9 @@ def of_packets(path: Path, topic: str | None = None) -> KnownSensor:
     sender = topic if senders is not None and topic in senders.velodynes else None
     names = {velodyne_name(packet) for packet in velodyne_packets(path, sender)}
     is_other = not names or (topic is not None and sender is None)
-    by_serial = topic is not None and topic in _serials_beside(path)
+    by_serial = False
+    with suppress(PointsError):
+        by_serial = topic is not None and topic in [_serial(read_metadata(file)) for file in metadata_beside(path)]
     senders = senders or Senders(path, lambda: None, SNIFFED_PACKETS) if is_other and not by_serial else None
     known = None if senders is None else _of_lidar(path, senders, topic, beside=bool(names))
     if known is not None:
@@ -74,12 +76,6 @@ def of_packets(path: Path, topic: str | None = None) -> KnownSensor:
             "(--topic)"
         )
     return sensors[0]
-
-
-def _serials_beside(path: Path) -> list[str]:
-    with suppress(PointsError):
-        return [_serial(read_metadata(file)) for file in metadata_beside(path)]
-    return []
 
 
 class NotSpinningError(SensorError):

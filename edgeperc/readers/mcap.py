@@ -35,7 +35,7 @@ class BagFile(Protocol):
     """One file of a bag."""
 
     def topics(self) -> set[Channel]:
-        """Its topics, as far as it is whole; PointsError if it is damaged before the first."""
+        """Its topics, as far as it is whole."""
 
     def messages_of(self, channel: Channel) -> Iterator[tuple[int, memoryview]]:
         """Time of recording [ns] and bytes of each message, in the file's order; PointsError where it is damaged."""
@@ -53,8 +53,7 @@ class McapFile(BagFile):
         self._schemas: dict[int, str] = {}
         self._is_named = True  # whether the schema of each channel was known when the channel was
         self._channels: dict[int, Channel] = {}  # those of the summary, or those among the messages
-        size = path.stat().st_size
-        self._data = np.memmap(path, np.uint8, "r").data if size >= 45 else memoryview(b"")
+        self._data = np.memmap(path, np.uint8, "r").data if path.stat().st_size >= 45 else memoryview(b"")
         if self._data[:8] != MCAP_MAGIC:
             raise PointsError("the file is damaged or cut short: it does not begin as an MCAP file")
         kind, _ = next(_records(self._data, 8), (0, None))
@@ -64,8 +63,7 @@ class McapFile(BagFile):
         self._is_whole = footer[:9] == struct.pack("<BQ", _FOOTER, 20) and footer[29:] == MCAP_MAGIC
         summary, _, crc = unpack("<QQI", footer, 9) if self._is_whole else (0, 0, 0)
         self._data = self._data[:-37] if self._is_whole else self._data
-        has_summary = 0 < summary <= len(self._data)
-        if has_summary and (not crc or zlib.crc32(footer[:25], zlib.crc32(self._data[summary:])) == crc):
+        if 0 < summary <= len(self._data) and crc in (0, zlib.crc32(footer[:25], zlib.crc32(self._data[summary:]))):
             try:
                 for kind, content in _records(self._data, summary):
                     self._learn(kind, content)
