@@ -613,8 +613,7 @@ class _Run:
         perceive = perceiver.__call__  # without a sensor, of which `stream` would warn again
         rate_hz, topic = self._arguments.rate, self._arguments.topic
         gathered_s = _gathered_s(path, sensor)
-        tracker = None if self._tracker is None else self._track
-        with stream(path, perceive, tracker, rate_hz=rate_hz, topic=topic, accumulate_s=gathered_s) as answers:
+        with stream(path, perceive, self._tracker, rate_hz=rate_hz, topic=topic, accumulate_s=gathered_s) as answers:
             while True:
                 try:
                     answer = answers.take()
@@ -649,7 +648,8 @@ class _Run:
         source = str(scan or name)
         tracks = None
         if self._tracker is not None:
-            tracks = self._tracker.update(perception.boxes, stamp_s, self._pose(perception))
+            pose = self._pose(perception)
+            tracks = self._tracker.update(perception.boxes, stamp_s, pose, mounting=perception.mounting)
         if self._straightener is not None and tracks is not None:
             self._straightener.follow(tracks)
         try:
@@ -657,10 +657,6 @@ class _Run:
         finally:  # a picture that cannot be written costs no sink its scan
             self._sinks.write(PerceivedScan(source, stamp_s, points, perception, tracks, sensor))
         return name, perception, tracks, view.flatten_scan(points, perception) if self._arguments.gif else None
-
-    def _track(self, perception: Perception) -> Tracks:
-        assert self._tracker is not None
-        return self._tracker.update(perception.boxes, self._at_s(perception.stamp_s))
 
     def _pose(self, perception: Perception) -> list[list[float]] | None:
         """Pose of a sensor whose place in a map is known, seen from that of the first scan; its axes are the map's."""

@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike
 
 from ..errors import OptionError, StampError, TrackingError
 from ..system.clock import GAP_S, LATEST_S, Clock, Step, as_seconds
+from ..types.mounting import MODEL_MOUNTING, Mounting
 from ..types.perception import Box, Perception
 from ..types.points import Floats, Ints64, Records
 from ..types.rigid import rigid
@@ -42,8 +43,8 @@ SMALLEST_SHARE = 1e-13  # scores are clipped to this distance from 0 and 1
 # Standard deviations of random walks of center height, length, width and height after one second.
 SHAPE_WALK_M = np.array([0.5, 0.1, 0.05, 0.05])
 
-# Standard deviations of the sensor's speed along x and y [m/s] and of its turn rate [rad/s]: at the start, allowing for
-# motorway speed ahead, and of their random walks after one second.
+# Standard deviations of the vehicle's speed ahead and to the left [m/s] and of its turn rate [rad/s]: at the start,
+# allowing for motorway speed ahead, and of their random walks after one second.
 FIRST_TWIST = np.array([15.0, 1.0, 0.3])
 TWIST_WALK = np.array([4.0, 0.5, 0.5])
 TURN_MEMORY_S = 2.0  # without evidence, the estimated turn rate decays with this time constant
@@ -63,7 +64,7 @@ class _Session:
     posed: bool | None = None  # None before the first scan
     tracks: Records = field(default_factory=lambda: np.zeros(0, TRACK))
     T_world_sensor: Floats = field(default_factory=lambda: np.eye(4))
-    # Without poses: the sensor's speed along x and y, turn rate, and their variances.
+    # Without poses: the vehicle's speed ahead and to the left, its turn rate, and their variances.
     twist: Floats = field(default_factory=lambda: np.zeros(3))
     twist_variances: Floats = field(default_factory=lambda: FIRST_TWIST**2)
 
@@ -164,9 +165,16 @@ class Tracker:
         """
         if perception.stamp_s is None:
             raise StampError("the perception has no stamp_s; call perceive(points, stamp_s=...) with the scan's time")
-        return self.update(perception.boxes, perception.stamp_s, T_world_sensor)
+        return self.update(perception.boxes, perception.stamp_s, T_world_sensor, mounting=perception.mounting)
 
-    def update(self, boxes: Iterable[Box], stamp_s: float, T_world_sensor: ArrayLike | None = None) -> Tracks:
+    def update(
+        self,
+        boxes: Iterable[Box],
+        stamp_s: float,
+        T_world_sensor: ArrayLike | None = None,
+        *,
+        mounting: Mounting = MODEL_MOUNTING,
+    ) -> Tracks:
         """Track the boxes of one scan.
 
         Parameters
@@ -179,6 +187,9 @@ class Tracker:
             Rigid pose of the sensor. Pass it with every scan or with none. Without poses, the sensor's motion on the
             ground is estimated from the static objects. With only one or two objects in view, their motion cannot be
             separated from the sensor's: tracks keep their identity, but speeds over ground are unreliable.
+        mounting : Mounting
+            Of the sensor (`Perception.mounting`): without poses, its yaw says which way the vehicle drives, which moves
+            fast ahead and hardly aside.
 
         Returns
         -------
@@ -234,7 +245,8 @@ class Tracker:
         state, covariance = _combined(*predictions)
         twist, twist_variances = session.twist, session.twist_variances
         if pose is None:
-            estimate = self._estimated_pose(session, tracks, state, covariance, given, classes, dt)
+            ahead = _ahead_in(mounting)
+            estimate = self._estimated_pose(session, tracks, state, covariance, given, classes, ahead, dt)
             pose, twist, twist_variances = estimate
         detections = _detections(given, fronts, kinds, classes["group"].copy(), pose)
         farther = 1.0 + _away(state, of, pose)  # the standard deviations of detections grow
@@ -304,20 +316,23 @@ class Tracker:
         covariance: Floats,
         given: Floats,
         classes: Records,
+        ahead: Floats,
         dt: float,
     ) -> tuple[Floats, Floats, Floats]:
-        """Estimate the sensor's pose (4, 4), its motion (3,) [m/s, m/s, rad/s] and the variances of the motion."""
+        """Estimate the sensor's pose (4, 4), its motion ahead, to the left and about z (3,) [m/s, m/s, rad/s], and the
+        variances of the motion. ``ahead`` (2, 2) turns what lies ahead into the sensor's frame.
+        """
         if dt == 0.0:
             return session.T_world_sensor, session.twist, session.twist_variances
         seen = np.flatnonzero(tracks["misses"] == 0)
         landmarks = np.empty((len(seen), 4))
-        landmarks[:, :2] = (state[seen, :2] - session.T_world_sensor[:2, 3]) @ session.T_world_sensor[:2, :2]
+        landmarks[:, :2] = (state[seen, :2] - session.T_world_sensor[:2, 3]) @ session.T_world_sensor[:2, :2] @ ahead
         landmarks[:, 2] = 0.5 * (covariance[seen, 0, 0] + covariance[seen, 1, 1])
         landmarks[:, 3] = tracks["group"][seen]
         if len(landmarks) > MAX_LANDMARKS:
             landmarks = landmarks[np.argsort(landmarks[:, 2], kind="stable")[:MAX_LANDMARKS]]
         detections = np.empty((len(given), 4))
-        detections[:, :2], detections[:, 3] = given[:, :2], classes["group"]
+        detections[:, :2], detections[:, 3] = given[:, :2] @ ahead, classes["group"]
         farther = 1.0 + np.hypot(given[:, 0], given[:, 1]) / classes["range_m"]
         detections[:, 2] = (classes["sigmas"][:, 0] * farther) ** 2
         if len(detections) > 2 * MAX_LANDMARKS:
@@ -326,8 +341,8 @@ class Tracker:
         prior_variances = (session.twist_variances * kept**2 + TWIST_WALK**2 * dt) * dt**2
         motion, spread = np.empty(3), np.empty((3, 3))
         fit_motion(landmarks, detections, session.twist * kept * dt, prior_variances, motion, spread)
-        cos, sin = math.cos(motion[2]), math.sin(motion[2])
-        step = np.array([[cos, -sin, 0, motion[0]], [sin, cos, 0, motion[1]], [0, 0, 1, 0], [0, 0, 0, 1]])
+        step = np.eye(4)
+        step[:2, :2], step[:2, 3] = _turn(motion[2]), ahead @ motion[:2]
         return session.T_world_sensor @ step, motion / dt, np.minimum(np.diag(spread) / dt**2, FIRST_TWIST**2)
 
     def _with_newborn(self, tracks: Records, detections: Detections, classes: Records, beta: Floats) -> Records:
@@ -354,6 +369,17 @@ class Tracker:
 
 # Fields of records go to kernels as copies: of a single record a field is contiguous, of several it is not, and numba
 # would compile a kernel for each layout in memory.
+
+
+def _ahead_in(mounting: Mounting) -> Floats:
+    """The turn (2, 2) from the vehicle's axes on the ground to those of a sensor, upright or upside down."""
+    roll, yaw = (math.radians(angle or 0.0) for angle in (mounting.roll_deg, mounting.yaw_deg))
+    return _turn(math.atan2(-math.sin(yaw) * math.cos(roll), math.cos(yaw)))
+
+
+def _turn(angle: float) -> Floats:
+    cos, sin = math.cos(angle), math.sin(angle)
+    return np.array([[cos, -sin], [sin, cos]])
 
 
 def _predictions(tracks: Records, classes: Records, dt: float) -> Predictions:
