@@ -16,6 +16,7 @@ from .output import in_options, many, one_line, print_error, print_result
 if TYPE_CHECKING:
     from ..live import Answer
     from ..tracking.tracks import Tracks
+    from ..types.mounting import Mounting
     from ..types.perception import Perception
 
 
@@ -26,7 +27,7 @@ class Report:
         self.n = self.n_failed = 0
         self._images = images
         self.tracks: list[Tracks] = []
-        self.under: list[bytes] = []
+        self.under: list[tuple[bytes, Mounting]] = []
         self._json = arguments.json
         self._reported: dict[str, Path | Remote] = {}
 
@@ -35,7 +36,7 @@ class Report:
         source: Path,
         outcome: Perception | Answer | Exception,
         tracks: Tracks | None = None,
-        under: bytes | None = None,
+        under: tuple[bytes, Mounting] | None = None,
     ) -> None:
         """Print one scan's line or JSON object; print an error on stderr as well."""
         if isinstance(outcome, MissingExtraError):

@@ -63,6 +63,7 @@ if TYPE_CHECKING:
     from ..live import Answer
     from ..perceiver import Perceiver
     from ..tracking.tracks import Tracks
+    from ..types.mounting import Mounting
     from ..types.perception import Perception
     from ..types.points import Points
     from ..types.sensor import SensorProfile
@@ -254,7 +255,8 @@ def run_command(arguments: argparse.Namespace) -> int:
 
         try:
             arguments.out.mkdir(parents=True, exist_ok=True)
-            draw_tracks(report.tracks, arguments.out / "tracks.gif", under=report.under)
+            under, mountings = zip(*report.under, strict=True)
+            draw_tracks(report.tracks, arguments.out / "tracks.gif", under=under, mountings=mountings)
         except OSError as exc:
             n_failed += 1
             print_error(f"{arguments.out / 'tracks.gif'}: {exc}")
@@ -501,8 +503,8 @@ class _Perceivers:
         return make_perceiver(arguments, sensor=sensor, on_mismatch=arguments.on_mismatch, adapt=arguments.adapt)
 
 
-Outcome = tuple[Path, "Perception | Answer | Exception", "Tracks | None", "bytes | None"]
-"""Name, answer or error, tracks and flattened scan (`edgeperc.view.flatten_scan`) of a scan or image."""
+Outcome = tuple[Path, "Perception | Answer | Exception", "Tracks | None", "tuple[bytes, Mounting] | None"]
+"""Of a scan or image: name, answer or error, tracks, flattened scan (`edgeperc.view.flatten_scan`) and its mounting."""
 
 
 class _Run:
@@ -656,7 +658,8 @@ class _Run:
             _write(points, perception, wanted, title=source)
         finally:  # a picture that cannot be written costs no sink its scan
             self._sinks.write(PerceivedScan(source, stamp_s, points, perception, tracks, sensor))
-        return name, perception, tracks, view.flatten_scan(points, perception) if self._arguments.gif else None
+        under = (view.flatten_scan(points, perception), perception.mounting) if self._arguments.gif else None
+        return name, perception, tracks, under
 
     def _pose(self, perception: Perception) -> list[list[float]] | None:
         """Pose of a sensor whose place in a map is known, seen from that of the first scan; its axes are the map's."""

@@ -6,6 +6,7 @@ import io
 import math
 import zlib
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,11 +19,12 @@ from ..system.atomic import write_atomic
 from ..system.clock import elapsed_s
 from ..system.extras import require
 from ..types.frame import ModelFrame
+from ..types.mounting import MODEL_MOUNTING, Mounting
 from ..types.perception import Perception
 from ..types.points import Bytes, Floats, Points
 from .canvas import free_place
 from .colors import CLASS_COLORS, FAINT, FRAME, GROUND, HIGH, INK, LOW, PANEL, color_of, rgb
-from .content import drawable_boxes, drawable_points, paint_points
+from .content import drawable_boxes, drawable_points, in_model_frame, paint_points
 
 if TYPE_CHECKING:
     from ..tracking.tracks import Track, Tracks
@@ -45,7 +47,8 @@ def flatten_scan(points: Points, perception: Perception | None = None) -> bytes:
     points : (n, 4) float32
         x, y, z [m] in the sensor frame, remission.
     perception : Perception, optional
-        Perception of these points; without it, points have no class and no road is shown.
+        Perception of these points, whose mounting turns them forward; without it, points have no class and no road is
+        shown.
 
     Returns
     -------
@@ -55,26 +58,19 @@ def flatten_scan(points: Points, perception: Perception | None = None) -> bytes:
     image = np.zeros((_HEIGHT, _WIDTH), np.uint8)
     names, painted = ["background"], np.zeros(len(points), np.uint8)
     if perception is not None:
+        perception, points = in_model_frame(perception, points)
         names, painted = paint_points(points, perception)
         if perception.top_view is not None:
             view = perception.top_view
             x = (np.arange(_WIDTH) + 0.5) / _PX_PER_M - _BEHIND_M
             y = _BESIDE_M - (np.arange(_HEIGHT) + 0.5) / _PX_PER_M
-            x, y = np.broadcast_arrays(x, y[:, None])
-            frame = ModelFrame(perception.mounting)
-            if not frame.is_identity:
-                road_z = -(perception.mounting.height_m or 0.0)
-                x, y = np.einsum("ij,jhw->ihw", frame.R[:2], [x, y, np.full_like(x, road_z)]) + frame.t[:2, None, None]
-            row, col, inside = view.geometry.cells(x, y)
+            row, col, inside = view.geometry.cells(*np.broadcast_arrays(x, y[:, None]))
             image[inside] = _ROAD * view.drivable[row[inside], col[inside]]
     seen = drawable_points(points)
     points, painted = points[seen], painted[seen]
     x, y = points[:, :2].astype(np.float64).T
-    if perception is None:
-        height_m = find_ground(points).height_m
-    else:
-        height_m = heights_above(perception.ground, ModelFrame(perception.mounting).move(points)).height_m
-    level = np.clip(np.floor(height_m / 1.2 + 0.75), 0, 2)
+    ground = find_ground(points) if perception is None else heights_above(perception.ground, points)
+    level = np.clip(np.floor(ground.height_m / 1.2 + 0.75), 0, 2)
     order = [*CLASS_COLORS]
     as_pixel = np.array([_CLASS + order.index(name) if name in order else _OTHER for name in names], np.uint8)
     value = np.where(painted == 0, _POINT + level.astype(np.uint8), as_pixel[painted])
@@ -92,6 +88,7 @@ def draw_tracks(
     path: str | Path | None = None,
     *,
     under: Sequence[bytes] = (),
+    mountings: Sequence[Mounting] = (),
     title: str = "",
     tail_s: float = 2.0,
 ) -> bytes:
@@ -106,6 +103,8 @@ def draw_tracks(
         File to write as well; an existing file is replaced atomically.
     under : sequence of bytes
         `flatten_scan` of each scan, to show under the tracks. Empty: only the tracks.
+    mountings : sequence of Mounting
+        That of each scan (`Perception.mounting`), to draw the tracks as the vehicle sees them. Empty: x is forward.
     title : str
     tail_s : float
         Length of the trail behind a track [s].
@@ -120,7 +119,7 @@ def draw_tracks(
     MissingExtraError
         pillow is not installed.
     TrackingError
-        There are fewer than two scans, or ``under`` has another number of scans.
+        There are fewer than two scans, or ``under`` or ``mountings`` are of another number of scans.
     OSError
         The file cannot be written.
     """
@@ -132,8 +131,9 @@ def draw_tracks(
             f"got {len(scans)} scan{'s' * (len(scans) != 1)} for an animation; expected two or more of a drive. "
             "A single scan is drawn by edgeperc.draw, or run --png"
         )
-    if under and len(under) != len(scans):
-        raise TrackingError(f"got {len(under)} flattened scans with tracks of {len(scans)}; expected one for each")
+    for given, what in ((under, "flattened scans"), (mountings, "mountings")):
+        if given and len(given) != len(scans):
+            raise TrackingError(f"got {len(given)} {what} with tracks of {len(scans)}; expected one for each")
     fonts = {size: ImageFont.load_default(_FINE * size) for size in (13, 14, 17)}
     palette, labels = _palette(Image), {label for scan in scans for label in scan.labels}
     trails: dict[int, list[tuple[float, float, float, float]]] = {}
@@ -156,9 +156,10 @@ def draw_tracks(
             trail = [*trails.get(track.id, ()), (*track.world_box.center, time_s)]
             trails[track.id] = [place for place in trail if place[3] > begin_s]
         R, t = tracks.T_world_sensor[:3, :3], tracks.T_world_sensor[:3, 3]
-        drawn = [track for track in tracks if drawable_boxes([track.box])]
+        frame = ModelFrame(mountings[k] if mountings else MODEL_MOUNTING)
+        drawn = [_as_the_vehicle_sees(track, frame) for track in tracks if drawable_boxes([track.box])]
         for track in drawn:
-            _draw_track(pen, track, (np.array(trails[track.id])[:, :3] - t) @ R)
+            _draw_track(pen, track, (np.array(trails[track.id])[:, :3] - t) @ R @ frame.R.T + frame.t)
         _write_names(pen, drawn, fonts[14])
         facts = f"{time_s:.1f} s · {len(tracks)} track{'s' * (len(tracks) != 1)}"
         _write_frame(pen, title or "Tracks", facts, labels, fonts, tail_s)
@@ -169,6 +170,10 @@ def draw_tracks(
     if path is not None:
         write_atomic(path, stream.getvalue())
     return stream.getvalue()
+
+
+def _as_the_vehicle_sees(track: Track, frame: ModelFrame) -> Track:
+    return replace(track, box=frame.move_boxes([track.box])[0], velocity=frame.R[:2, :2] @ track.velocity)
 
 
 def _layer_colors() -> Bytes:
@@ -192,7 +197,7 @@ def _palette(Image: Any) -> Any:
 
 
 def _pixels(places: Floats) -> list[tuple[float, float]]:
-    """x, y [m] in the sensor frame -> pixels of the picture before it is reduced."""
+    """x, y [m] in the frame of the models -> pixels of the picture before it is reduced."""
     places = places[:, :2].clip(-1e3, 1e3)
     return [
         (_FINE * _PX_PER_M * (x + _BEHIND_M), _FINE * (_HEAD + _PX_PER_M * (_BESIDE_M - y))) for x, y in places.tolist()

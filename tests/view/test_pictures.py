@@ -23,6 +23,8 @@ from edgeperc.errors import MissingExtraError, PointsError, TrackingError
 from edgeperc.evaluation.mistakes import Mistakes, draw_mistakes
 from edgeperc.ground.planes import fit_ground
 from edgeperc.readers.files import read_points
+from edgeperc.types.frame import ModelFrame
+from edgeperc.types.mounting import MODEL_MOUNTING, Mounting
 from edgeperc.types.perception import Box, Perception, PointLabels, TopView
 from edgeperc.view import draw_tracks, flatten_scan, write_html, write_labels, write_ply
 from edgeperc.view.canvas import Label, add_axes, free_place, new_figure, place_labels, shorten, wrap
@@ -582,15 +584,17 @@ def test_page_shows_and_hides(scan: np.ndarray, perception: Perception, browser:
     assert not wrong
 
 
-def test_tracks_lie_on_the_scan(scan: np.ndarray, perception: Perception, tmp_path: Path) -> None:
+@pytest.mark.parametrize("mounting", [MODEL_MOUNTING, Mounting(2.1, 180.0, 3.0, -90.0)])
+def test_tracks_lie_on_the_scan(scan: np.ndarray, perception: Perception, tmp_path: Path, mounting: Mounting) -> None:
     image = pytest.importorskip("PIL.Image")
-    tracker = Tracker()
-    cars = [replace(CAR, center=(20.0 + 0.8 * k, 3.0, -0.9), yaw=0.0) for k in range(6)]
-    tracks = [tracker.update([car], 0.1 * (k + 1)) for k, car in enumerate(cars)]
-    flat = flatten_scan(scan, perception)
-    content = draw_tracks(tracks, tmp_path / "tracks.gif", under=[flat] * 6, title="a drive \udcff")
-    bare = draw_tracks(tracks, title="a drive")
-    assert (tmp_path / "tracks.gif").read_bytes() == content
+    tracker, frame = Tracker(), ModelFrame(mounting)
+    cars = frame.boxes_back(replace(CAR, center=(20.0 + 0.8 * k, 3.0, -0.9), yaw=0.0) for k in range(6))
+    tracks = [tracker.update([car], 0.1 * (k + 1), mounting=mounting) for k, car in enumerate(cars)]
+    flat, mountings = flatten_scan(frame.move_back(scan), replace(perception, mounting=mounting)), [mounting] * 6
+    path = tmp_path / "tracks.gif"
+    content = draw_tracks(tracks, path, under=[flat] * 6, mountings=mountings, title="a drive \udcff")
+    bare = draw_tracks(tracks, mountings=mountings, title="a drive")
+    assert path.read_bytes() == content
 
     def last(gif: bytes) -> np.ndarray:
         with image.open(io.BytesIO(gif)) as animation:
