@@ -622,6 +622,9 @@ class Perceiver:
             except MountingError as exc:
                 hidden = (self._without_ground(exc),)
             watch.lap("check")
+        if check and (roll_deg, before.known.pitch_deg) != (None, None):
+            hidden = (*hidden, self._about_given_tilt(before.contradicted_by(scan)))
+            watch.lap("check")
         if not self._frame.is_identity:
             scan = self._frame.move(scan)
             watch.lap("adapt")
@@ -714,6 +717,18 @@ class Perceiver:
             f"The ground suggests a {shown}, but it is too uneven to tell a tilt of the sensor from its own slope: "
             "the sensor is taken as level until scans of other places agree. If you know its tilt, pass mounting= "
             "(on the command line --roll, --pitch or --extrinsic)."
+        )
+
+    def _about_given_tilt(self, shown: Mounting | None) -> Finding | None:
+        """What to say if the ground shows another tilt than was given, as where a sign is wrong."""
+        if shown is None:
+            return None
+        used = self._mounting
+        return Finding(
+            f"The ground shows a roll of {shown.roll_deg:.1f} and a pitch of {shown.pitch_deg:.1f} deg, and the "
+            f"mounting has {used.roll_deg:.1f} and {used.pitch_deg:.1f}: roll is positive if the left side is up, "
+            "pitch if x points down. Correct them (mounting=, --roll, --pitch, --extrinsic), or leave them out to have "
+            "them found. If the vehicle stands before a ramp, ignore this."
         )
 
     def _refuse(self, fitness: tuple[Finding, ...]) -> None:

@@ -605,6 +605,32 @@ def test_a_doubtful_tilt_is_told_of(scans: list[NDArray[np.float32]], known: Mou
     assert found.mounting.pitch_deg == (0.66 if doubtful else 0.5)
 
 
+@pytest.mark.parametrize(
+    ("known", "is_told"),
+    [
+        (Mounting(1.73, 0.0, 8.0), False),
+        (Mounting(1.73, 0.0, -8.0), True),  # the other direction
+        (Mounting(pitch_deg=-8.0), True),
+        (Mounting(roll_deg=0.0), False),
+        (Mounting(1.73, 30.0, 8.0), True),  # so far off that there is no ground
+    ],
+)
+def test_a_given_tilt_that_is_not_the_grounds_is_told_of(
+    scans: list[NDArray[np.float32]], known: Mounting, is_told: bool
+) -> None:
+    scan = seen_by(Mounting(1.73, 0.0, 8.0, 0.0), scans[0])
+    perceive = Perceiver("pointseg", mounting=known, provider="cpu", on_mismatch="warn")
+    with (
+        pytest.warns(UserWarning, match="ground shows a roll of .* and a pitch of 8.* Correct")
+        if is_told
+        else (contextlib.nullcontext())
+    ):
+        found = perceive(scan)
+    assert any("ground shows a roll" in sentence for sentence in found.fitness) == is_told
+    hanging = seen_by(Mounting(1.73, 178.0, 0.0, 0.0), scans[0])  # a roll of -179 is near
+    assert MountingEstimator(Mounting(1.73, -179.0, 0.0)).contradicted_by(hanging) is None
+
+
 def test_the_ground_around_a_bridge_is_no_tilt(data_root: Callable[[str], Path]) -> None:
     """A crowd on a bridge over a canal; the sensor is level."""
     scan = np.fromfile(data_root("other_roads") / "vod" / "velodyne" / "01201.bin", np.float32).reshape(-1, 4)
