@@ -661,6 +661,7 @@ class Perceiver:
             dropped=dropped,
             ground=parts.ground,
             health=health,
+            sensor=self.sensor,
         )
 
     def _without_drops(

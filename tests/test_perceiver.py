@@ -770,7 +770,7 @@ def test_a_sensor_that_is_found_gives_the_answers_of_the_named_one(name: str) ->
     assert finds.sensor_estimate is None
     answer = finds(scan)
     assert_same(answer, Perceiver(["ssadnet", "pointseg"], sensor=sensor, **options)(scan))
-    assert finds.sensor == sensor
+    assert answer.sensor == finds.sensor == sensor
     assert (finds.sensor is get_sensor("hdl-64e")) == (name == "hdl-64e")
     assert finds.sensor_estimate is not None
     elsewhere = Perceiver(["ssadnet", "pointseg"], sensor="auto", **options)

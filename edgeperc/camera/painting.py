@@ -20,9 +20,9 @@ from ..preprocess.returns import returns
 from ..system.kernels import njit
 from ..types.frame import ModelFrame
 from ..types.mounting import MODEL_HEIGHT_M, MODEL_MOUNTING, Mounting
-from ..types.perception import ImageLabels, Perception, TopView
+from ..types.perception import ImageLabels, Perception, TopView, sensor_behind
 from ..types.points import Bytes, Floats, Floats32, Labels, Mask, Points, read_only
-from ..types.sensor import SensorProfile, get_sensor
+from ..types.sensor import SensorProfile
 from ..types.views import TopViewGeometry
 from .calibration import Calibration
 
@@ -71,7 +71,7 @@ def paint(
     points: Points,
     calibration: Calibration,
     *,
-    sensor: str | os.PathLike[str] | SensorProfile = "hdl-64e",
+    sensor: str | os.PathLike[str] | SensorProfile | None = None,
     mounting: Mounting | None = None,
 ) -> Bytes:
     """Give each point the class of the pixel that it falls on, if the camera sees it.
@@ -83,8 +83,9 @@ def paint(
     points : (n, 3 or more) float32
         x, y, z [m] in the frame of the sensor, taken at the time of the image.
     calibration : Calibration
-    sensor : str, Path or SensorProfile
-        As for `Perceiver`; the spacing of its beams and columns sets the size of the windows.
+    sensor : str, Path or SensorProfile, optional
+        The spacing of its beams and columns sets the size of the windows. By default that of the perception or, without
+        one, that of the training vehicle.
     mounting : Mounting, optional
         How the sensor is mounted, to find the ground; a known one. None: that of the perception or, without one, that
         of the training vehicle. An error of 0.5 m in height does no harm.
@@ -125,7 +126,7 @@ def paint(
 
     found = image.image if isinstance(image, Perception) else image
     labels = _labels_of(found.labels if isinstance(found, ImageLabels) else found, np.uint8, calibration)
-    rows, buffer, _ = _hidden_by(image, points, calibration, get_sensor(sensor), mounting)
+    rows, buffer, _ = _hidden_by(image, points, calibration, sensor, mounting)
     painted = np.empty(len(rows), np.uint8)
     fill_painted(labels, Pixels(*calibration.project(rows)), buffer, SLACK_M, SLACK_SHARE, painted)
     return painted
@@ -136,7 +137,7 @@ def camera_road(
     points: Points,
     calibration: Calibration,
     *,
-    sensor: str | os.PathLike[str] | SensorProfile = "hdl-64e",
+    sensor: str | os.PathLike[str] | SensorProfile | None = None,
     mounting: Mounting | None = None,
     view: TopViewGeometry | None = None,
 ) -> TopView:
@@ -180,7 +181,7 @@ def camera_road(
     geometry = TopViewGeometry() if view is None else view
     road = _road_of(image, calibration)
     x, y = (each.ravel() for each in np.broadcast_arrays(*geometry.cell_centers()))
-    _, buffer, cells = _hidden_by(image, points, calibration, get_sensor(sensor), mounting, np.column_stack([x, y]))
+    _, buffer, cells = _hidden_by(image, points, calibration, sensor, mounting, np.column_stack([x, y]))
     labels = np.empty(x.size, np.uint8)
     fill_painted(road, Pixels(*calibration.project(cells)), buffer, SLACK_M, SLACK_SHARE, labels)
     found = labels.reshape(geometry.height, geometry.width)
@@ -208,7 +209,7 @@ def _hidden_by(
     image: object,
     points: Points,
     calibration: Calibration,
-    sensor: SensorProfile,
+    sensor: str | os.PathLike[str] | SensorProfile | None,
     mounting: Mounting | None,
     places: Floats = _NOWHERE,
 ) -> tuple[Floats32, DepthBuffer, Floats]:
@@ -219,7 +220,8 @@ def _hidden_by(
         known = _mounting_of(image, mounting)
         scan = np.zeros((len(points), 4), np.float32)
         scan[:, :3] = points[:, :3]
-        rows, _ = returns(scan, sensor, known.origin_m)
+        profile = sensor_behind(image, sensor)
+        rows, _ = returns(scan, profile, known.origin_m)
         frame = ModelFrame(known)
         above = (rows[:, :3].astype(np.float64) @ frame.R.T + frame.t).astype(np.float32)
         surface = None
@@ -229,7 +231,7 @@ def _hidden_by(
         is_ground = heights_above(surface, above).mask
         cells = np.column_stack([places, np.zeros(len(places))])
         cells[:, 2] -= heights_above(surface, cells.astype(np.float32)).height_m if surface.plane else np.nan
-    return rows, _nearest(read_only(rows[~is_ground]), calibration, sensor), (cells - frame.t) @ frame.R
+    return rows, _nearest(read_only(rows[~is_ground]), calibration, profile), (cells - frame.t) @ frame.R
 
 
 def _labels_of(image: object, dtype: type, calibration: Calibration) -> NDArray[Any]:

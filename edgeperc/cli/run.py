@@ -597,8 +597,7 @@ class _Run:
             if "both" in wanted:
                 calib = calibration_of(arguments.calib, str(scan))
                 calibration = Calibration.from_kitti(calib, image.shape[1], image.shape[0])
-                both, sensor = wanted.pop("both"), perceive.sensor
-                view.draw_painted(perception, image, points, calibration, both, sensor=sensor, title=path.name)
+                view.draw_painted(perception, image, points, calibration, wanted.pop("both"), title=path.name)
             yield self._answered(path, points, perception, perceive.sensor, wanted, at_s, scan)
         except (EdgepercError, OSError) as exc:
             yield path, exc, None, None

@@ -23,9 +23,9 @@ from ..system.kernels import njit
 from ..types.frame import ModelFrame, quaternion
 from ..types.geometry import draw_footprints
 from ..types.mounting import MODEL_HEIGHT_M, MODEL_MOUNTING, Mounting
-from ..types.perception import Perception, TopView
+from ..types.perception import Perception, TopView, sensor_behind
 from ..types.points import Floats, Floats32, Heights, Ints, Mask, Points, as_points, read_only
-from ..types.sensor import SensorProfile, get_sensor
+from ..types.sensor import SensorProfile
 from ..types.views import TopViewGeometry
 from .around import knows_road, nearest_is_road
 
@@ -215,7 +215,7 @@ def occupancy_grid(
     x_range_m: tuple[float, float] | None = None,
     y_range_m: tuple[float, float] | None = None,
     min_height_m: float = 0.2,
-    sensor: str | os.PathLike[str] | SensorProfile = "hdl-64e",
+    sensor: str | os.PathLike[str] | SensorProfile | None = None,
 ) -> OccupancyGrid:
     """Build a grid for navigation from a perception and its scan.
 
@@ -233,9 +233,9 @@ def occupancy_grid(
         view. The lower one is moved by up to half a cell, so that whole cells lie between them.
     min_height_m : float
         Returns up to this height above the ground are no obstacles [m]. A kerb is 0.1 to 0.2 m high.
-    sensor : str, Path or SensorProfile
-        As passed to `Perceiver`: its beams tell which ground was observed between two returns, and its nearest range
-        and ``ego_box`` which points are not returns.
+    sensor : str, Path or SensorProfile, optional
+        Its beams tell which ground was observed between two returns, and its nearest range and ``ego_box`` which points
+        are not returns. By default that of the perception.
 
     Returns
     -------
@@ -274,7 +274,7 @@ def occupancy_grid(
         raise OptionError(
             f"got cell_m={cell_m!r}, x_range_m={x_range_m!r}, y_range_m={y_range_m!r}: no grid ({exc})"
         ) from exc
-    profile, frame = get_sensor(sensor), ModelFrame(perception.mounting)
+    profile, frame = sensor_behind(perception, sensor), ModelFrame(perception.mounting)
     moved = _returns_of(perception, points, profile, frame)
     ground = heights_above(perception.ground, moved)
 

@@ -130,7 +130,7 @@ class RollingGrid:
         T_odom_sensor: ArrayLike,
         *,
         tracks: Iterable[Track] = (),
-        sensor: str | os.PathLike[str] | SensorProfile = "hdl-64e",
+        sensor: str | os.PathLike[str] | SensorProfile | None = None,
     ) -> None:
         """Take in a scan. A late or doubled one changes nothing; where the clock jumps, everything is forgotten.
 
@@ -144,8 +144,8 @@ class RollingGrid:
             Pose of the frame of the scan in that of the odometry, at the time of the scan.
         tracks : iterable of Track
             `Tracks` of this scan: objects that coast are not remembered, either.
-        sensor : str, Path or SensorProfile
-            As passed to `Perceiver`.
+        sensor : str, Path or SensorProfile, optional
+            As for `edgeperc.occupancy_grid`.
 
         Raises
         ------

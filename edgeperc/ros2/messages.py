@@ -274,7 +274,7 @@ class RosMessages:
 
     def occupancy(self, scan: PerceivedScan, stamp_ns: int | None = None) -> Any:
         """The grid of `edgeperc.occupancy_grid`: a nav_msgs/OccupancyGrid, 0 drivable, 100 obstacle, -1 unknown."""
-        grid = occupancy_grid(scan.perception, scan.points, cell_m=self._cell_m, sensor=scan.sensor)
+        grid = occupancy_grid(scan.perception, scan.points, cell_m=self._cell_m)
         fields = grid.to_occupancy_grid(off_road=self._off_road)
         pose = None
         if self.grid_frame_id is not None:

@@ -340,7 +340,7 @@ class PerceptionNode:
             frames = self._poses.child_frame_id, str(self._cloud.header.frame_id)
             pose = pose @ self._rolling.base_from_sensor(*frames, scan.perception.mounting)
             tracks = scan.tracked or ()
-            self._rolling.grid.update(scan.perception, scan.points, pose, tracks=tracks, sensor=scan.sensor)
+            self._rolling.grid.update(scan.perception, scan.points, pose, tracks=tracks)
         except TrackingError:
             self._n_unplaced += 1
             return

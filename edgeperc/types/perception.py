@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, fields, replace
 from types import MappingProxyType
@@ -12,10 +13,10 @@ from numpy.typing import NDArray
 
 from ..errors import ModelError, PointsError
 from ..system.fields import Fields
-from .choices import STATIC
+from .choices import DEFAULT_SENSOR, STATIC
 from .mounting import MODEL_MOUNTING, Mounting
 from .points import Floats, Floats32, Ints, Labels, Mask
-from .sensor import RemissionFunction
+from .sensor import RemissionFunction, SensorProfile, get_sensor
 from .views import TopViewGeometry
 
 _FIELDS = Fields("box", PointsError, "write it with Box.to_dict", optional=("front",))
@@ -404,6 +405,9 @@ class Perception:
         (`edgeperc.read_points`). The axes are the map's.
     health : SensorHealth
         What the sensor's window and the weather did to the scan; nothing without a scan.
+    sensor : SensorProfile or None
+        The sensor that the perceiver took the scan for: its beams and what is no return matter to grids and to `paint`,
+        too. None: not known.
     """
 
     n_points: int
@@ -422,6 +426,7 @@ class Perception:
     ground: GroundSurface | None = None
     origin_m: tuple[float, float, float] | None = None
     health: SensorHealth = SensorHealth()
+    sensor: SensorProfile | None = None
 
     def require_points(self) -> PointLabels:
         """``points``; `ModelError`, which names the model to add, if it is None."""
@@ -517,6 +522,13 @@ class Perception:
 
 
 _VIEWS = ("stage_ms", "providers")
+
+
+def sensor_behind(image: object, given: str | os.PathLike[str] | SensorProfile | None) -> SensorProfile:
+    """The sensor that is given, else that of a perception, else the training sensor."""
+    if given is None and isinstance(image, Perception):
+        given = image.sensor
+    return get_sensor(DEFAULT_SENSOR if given is None else given)
 
 
 def _required(part: _Part | None, lacks: str, model: str, also: str = "") -> _Part:

@@ -32,7 +32,7 @@ def draw_painted(
     calibration: Calibration,
     path: str | Path | None = None,
     *,
-    sensor: str | os.PathLike[str] | SensorProfile = "hdl-64e",
+    sensor: str | os.PathLike[str] | SensorProfile | None = None,
     title: str = "",
 ) -> bytes:
     """Draw what a camera and a LiDAR see of the same street.
@@ -48,7 +48,7 @@ def draw_painted(
     calibration : Calibration
     path : str or Path, optional
         File to write as well; an existing file is replaced atomically.
-    sensor : str, Path or SensorProfile
+    sensor : str, Path or SensorProfile, optional
         As for `edgeperc.paint`.
     title : str
 

@@ -20,6 +20,7 @@ from edgeperc import Box, Mounting, OccupancyGrid, OptionError, Perception, Poin
 from edgeperc.road.grid import fill_standing
 from edgeperc.types.frame import ModelFrame
 from edgeperc.types.mounting import MODEL_MOUNTING
+from edgeperc.types.sensor import get_sensor
 from scenes import rotation_of
 
 NUMBERS = st.one_of(st.floats(-3, 3, width=32), st.sampled_from([math.nan, math.inf, -math.inf]))
@@ -147,6 +148,18 @@ def test_another_mounting_moves_the_scan() -> None:
     assert (grid.obstacle == level.obstacle).mean() > 0.999
     assert grid.mounting == mounting
     assert level.obstacle.any()
+
+
+def test_the_grid_is_of_the_sensor_of_the_perception() -> None:
+    points = np.vstack([street(), [[3.1, 0.1, -0.3, 0.3]]]).astype(np.float32)  # of the own hood
+    sensor = dataclasses.replace(get_sensor("vlp-16"), ego_box=((-2.0, 3.5), (-1.0, 1.0), (-1.0, 0.5)))
+    whole = {"x_range_m": (-10.0, 40.0)}
+    own, other = (occupancy_grid(perceived(points, sensor=each), points, **whole) for each in (sensor, None))
+    assert not own.obstacle[at(own, 3.1, 0.1)]
+    assert other.obstacle[at(other, 3.1, 0.1)]
+    given = occupancy_grid(perceived(points), points, **whole, sensor=sensor)
+    np.testing.assert_array_equal(given.observed, own.observed)
+    assert (own.observed != other.observed).any()
 
 
 def test_no_points_and_no_top_view() -> None:
