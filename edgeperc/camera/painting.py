@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 import os
+import warnings
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -223,6 +224,7 @@ def _hidden_by(
         profile = sensor_behind(image, sensor)
         rows, _ = returns(scan, profile, known.origin_m)
         frame = ModelFrame(known)
+        _check_upright(calibration.T_camera_sensor[:3, :3], frame.R[2])
         above = (rows[:, :3].astype(np.float64) @ frame.R.T + frame.t).astype(np.float32)
         surface = None
         if isinstance(image, Perception) and (image.n_points, image.mounting) == (len(points), known):
@@ -232,6 +234,16 @@ def _hidden_by(
         cells = np.column_stack([places, np.zeros(len(places))])
         cells[:, 2] -= heights_above(surface, cells.astype(np.float32)).height_m if surface.plane else np.nan
     return rows, _nearest(read_only(rows[~is_ground]), calibration, profile), (cells - frame.t) @ frame.R
+
+
+def _check_upright(R: Floats, up: Floats) -> None:
+    """Warn of a pose whose inverse is an upright camera's, or that looks along ``up``, as with the axes of the scan."""
+    if R[1] @ up > -0.5 and (R[:, 1] @ up < -0.8 or R[2] @ up > 0.8):
+        warnings.warn(
+            "by T_camera_sensor, the camera lies on its side or looks up: expected the pose that moves points of the "
+            "scan into the camera's frame, x right, y down, z ahead. Is it the inverse of that, or in another frame?",
+            stacklevel=4,
+        )
 
 
 def _labels_of(image: object, dtype: type, calibration: Calibration) -> NDArray[Any]:

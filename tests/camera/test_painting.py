@@ -279,6 +279,9 @@ def test_a_sensor_that_is_mounted_otherwise() -> None:
     assert same.mean() > 0.99
     with pytest.raises(OptionError, match="without None"):
         paint(image.labels, points, other, mounting=Mounting())
+    for wrong in (np.linalg.inv(other.T_camera_sensor), np.eye(4)):
+        with pytest.warns(UserWarning, match="lies on its side or looks up.*the inverse"):
+            paint(image.labels, points, Calibration(NEAR.K, wrong, NEAR.width, NEAR.height), mounting=mounting)
 
 
 def test_the_road_of_an_image_lies_on_the_roads_of_the_scene() -> None:
