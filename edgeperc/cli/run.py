@@ -519,9 +519,11 @@ class _Run:
         self._tracker = Tracker() if arguments.track else None
         self._straightener = None
         if arguments.deskew:
+            from ..types.sensor import get_sensor
             from .straighten import Straightener
 
-            self._straightener = Straightener(arguments.poses, arguments.quaternion, arguments.poses_from)
+            mounting = get_sensor(with_mounting(stated_sensor(arguments), arguments)).mounting
+            self._straightener = Straightener(arguments.poses, arguments.quaternion, arguments.poses_from, mounting)
         self._n = 0
         self._first_place: tuple[float, float, float] | None = None
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -12,6 +12,7 @@ from ..errors import PointsError
 from ..preprocess.motion import Motion, Trajectory, deskew
 from ..preprocess.returns import returns
 from ..tracking.tracks import Tracks
+from ..types.mounting import UNKNOWN_MOUNTING, Mounting
 from ..types.points import Floats, Floats32, Points
 from ..types.sensor import SensorProfile
 
@@ -24,9 +25,10 @@ class Straightener:
         poses: Path | None,
         quaternion: Literal["xyzw", "wxyz"] | None = None,
         maps_from: Literal["sensor", "world"] | None = None,
+        mounting: Mounting = UNKNOWN_MOUNTING,
     ) -> None:
-        given = None if poses is None else Trajectory.from_tum(poses, quaternion=quaternion, maps_from=maps_from)
-        self._trajectory = given
+        how: dict[str, Any] = {"quaternion": quaternion, "maps_from": maps_from, "mounting": mounting}
+        self._trajectory = None if poses is None else Trajectory.from_tum(poses, **how)
         self._tracked: list[Tracks] = []
 
     def straighten(

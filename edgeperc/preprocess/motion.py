@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike
 from ..errors import EdgepercError, OptionError, PointsError, SensorError, StampError, TrackingError
 from ..system.kernels import njit
 from ..types.frame import fill_moved, poses_of
+from ..types.mounting import UNKNOWN_MOUNTING, Mounting
 from ..types.points import Floats, Floats32, Points, as_points, read_only
 from ..types.rigid import rigid
 from ..types.sensor import MAX_ACCUMULATE_S
@@ -155,6 +156,7 @@ class Trajectory:
         *,
         quaternion: Literal["xyzw", "wxyz"] | None = None,
         maps_from: Literal["sensor", "world"] | None = None,
+        mounting: Mounting = UNKNOWN_MOUNTING,
     ) -> Trajectory:
         """Read a file in TUM's format, as kiss-icp, evo and others write it.
 
@@ -168,13 +170,16 @@ class Trajectory:
         maps_from : str, optional
             ``"sensor"``: the poses are T_world_sensor (TUM); ``"world"``: they are its inverse (COLMAP, OpenCV). By
             default they are T_world_sensor, unless they contradict that.
+        mounting : Mounting
+            Of the sensor, whose axes are then told from those of the vehicle: one that looks aside or hangs drives, as
+            any, along the vehicle's x axis with z up.
 
         Raises
         ------
         TrackingError
             The file cannot be read, a line is not such eight numbers, or the sensor moves at more than 150 m/s. Or
-            order and direction are not given, and only with others does the z axis of the sensor point up and its x
-            axis along its way.
+            order and direction are not given, and only with others does the vehicle's z axis point up and its x axis
+            along its way.
         StampError
             Fewer than two lines, or their times do not rise.
         OptionError
@@ -209,12 +214,16 @@ class Trajectory:
         poses = readings[read_as]
         others = [key for key in readings if quaternion in (None, key[0]) and maps_from in (None, key[1])]
         if np.isfinite(rows).all():
-            others = [key for key in others if _fits_better(readings[key], poses, rows[:, 0])]
+            axes = np.eye(4)
+            axes[:3, :3] = mounting.rotation().T
+            of_vehicle = {key: each @ axes for key, each in readings.items()}
+            usual = of_vehicle[read_as]
+            others = [key for key in others if _fits_better(of_vehicle[key], usual, rows[:, 0])]
             if others:
-                best = max(others, key=lambda key: _rank(readings[key]))
+                best = max(others, key=lambda key: _rank(of_vehicle[key]))
                 raise TrackingError(
-                    f"{path}: read as {_reading(*read_as)}, the poses are those of a sensor whose z axis points "
-                    f"{_directions(poses)}; read as {_reading(*best)}, {_directions(readings[best])}. Say which is "
+                    f"{path}: read as {_reading(*read_as)}, the poses are those of a vehicle whose z axis points "
+                    f"{_directions(usual)}; read as {_reading(*best)}, {_directions(of_vehicle[best])}. Say which is "
                     "right: quaternion= or --quaternion, xyzw or wxyz; maps_from= or --poses-from, sensor or world"
                 )
         speed = _speed(poses, rows[:, 0])

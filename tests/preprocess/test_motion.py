@@ -17,8 +17,20 @@ from numpy.typing import NDArray
 
 import edgeperc
 import twins.motion
-from edgeperc import Motion, OptionError, PointsError, SensorError, StampError, TrackingError, Trajectory, deskew, merge
+from edgeperc import (
+    Motion,
+    Mounting,
+    OptionError,
+    PointsError,
+    SensorError,
+    StampError,
+    TrackingError,
+    Trajectory,
+    deskew,
+    merge,
+)
 from edgeperc.preprocess.motion import fill_deskewed
+from edgeperc.types.frame import quaternion
 
 RATES = st.tuples(*3 * [st.floats(-4.0, 4.0)])
 NUMBERS = st.one_of(st.floats(-90, 90, width=32), st.sampled_from([math.nan, math.inf, -math.inf]))
@@ -131,13 +143,6 @@ def test_errors_name_the_reason() -> None:
     with pytest.raises(SensorError, match="1 poses for 2 scans"):
         merge([world, world], [eye])
     assert edgeperc.deskew is deskew
-
-
-def quaternion(R: NDArray[np.float64]) -> tuple[float, ...]:
-    """x, y, z, w of a rotation by less than half a turn."""
-    w = math.sqrt(1.0 + np.trace(R)) / 2.0
-    x, y, z = R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]
-    return x / (4 * w), y / (4 * w), z / (4 * w), w
 
 
 def write_tum(path: Path, times: Any, poses: Any) -> Path:
@@ -341,6 +346,22 @@ def test_sensors_that_look_elsewhere_are_told_by_turns(heading: float, T_vehicle
     np.testing.assert_allclose(read.T_world_sensor, poses, atol=1e-9)
     with pytest.raises(OptionError, match="expected 'sensor' or 'world'"):
         Trajectory.from_tum(tmp_path / "poses.txt", maps_from="vehicle")  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("turn", [0.0, 0.4])
+@pytest.mark.parametrize(
+    "mounting", [Mounting(yaw_deg=-90.0), Mounting(roll_deg=180.0), Mounting(1.7, 180.0, 3.0, 130.0)]
+)
+def test_a_mounting_tells_which_way_is_ahead(mounting: Mounting, turn: float, tmp_path: Path) -> None:
+    """Both ways of an even bend keep their direction in the sensor."""
+    T_vehicle_sensor = np.eye(4)
+    T_vehicle_sensor[:3, :3] = mounting.rotation()
+    times, poses = drive(turn, 10.0, 0.7, T_vehicle_sensor)
+    path = write_tum(tmp_path / "poses.txt", times, poses)
+    np.testing.assert_allclose(Trajectory.from_tum(path, mounting=mounting).T_world_sensor, poses, atol=1e-9)
+    path = write_tum(tmp_path / "inverse.txt", times, np.linalg.inv(poses))
+    with pytest.raises(TrackingError, match=r"and from the world to the sensor, 0 deg from up .* --poses-from"):
+        Trajectory.from_tum(path, mounting=mounting)
 
 
 @pytest.mark.parametrize("T_vehicle_sensor", [CAMERA, HANGING @ CAMERA], ids=["camera", "camera upside down"])
