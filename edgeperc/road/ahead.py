@@ -1,6 +1,6 @@
 """The road in a top view for a planner: its outline as a polygon, the free distance, the lane width.
 
-Everything is in the sensor frame [m]: x forward, y left. Only cells that the scan observed are drivable
+Everything is in the frame of the models [m]: x forward, y left. Only cells that the scan observed are drivable
 (`TopView.observed`): where the sensor saw nothing, and outside the view, nothing is known. The free distance passes
 the gaps that the spacing of the beams explains (`TopView.between_beams`), and no others.
 """

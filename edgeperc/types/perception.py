@@ -145,7 +145,7 @@ class TopView:
         return float(np.count_nonzero(self.drivable)) * self.cell_m**2
 
     def to_meters(self, row: float, col: float) -> tuple[float, float]:
-        """Center of a cell as x, y [m] in the sensor frame."""
+        """Center of a cell as x, y [m] in the frame of the cells."""
         return self.x_range_m[1] - (row + 0.5) * self.cell_m, self.y_range_m[1] - (col + 0.5) * self.cell_m
 
 
