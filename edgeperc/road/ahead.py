@@ -8,7 +8,7 @@ the gaps that the spacing of the beams explains (`TopView.between_beams`), and n
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
@@ -20,6 +20,7 @@ from ..types.frame import ModelFrame
 from ..types.geometry import draw_footprints
 from ..types.perception import Box, TopView
 from ..types.points import Floats, Ints64, Mask
+from ..types.views import TopViewGeometry
 from .outline import outline_of
 
 FreeEnd = Literal["obstacle", "edge of the road", "unknown", "end of view"]
@@ -51,7 +52,8 @@ class FreeAhead(NamedTuple):
         What ends it: ``"obstacle"``, ``"edge of the road"``, ``"unknown"`` or ``"end of view"``. It is an obstacle,
         too, if one begins at most 1.5 m farther. None if the view has no column there.
     obstacle_m : float
-        First cell of an obstacle: the footprint of a box, or a cell with an object's label. Infinite if there is none.
+        First cell of an obstacle: the footprint of a box, also nearer than the view, or a cell with an object's label.
+        Infinite if there is none.
     edge_m : float
         First cell that is known and neither road nor an obstacle: a kerb, a hedge, a wall. Infinite if there is none.
     unknown_m : float
@@ -89,7 +91,7 @@ class RoadAhead:
         Middles of the top view's columns, leftmost first.
     free_m : (columns,) float64
         x up to which each column is free, from the near edge of the view: the least of the three distances below and
-        of the far edge. It is the near edge if the nearest cell is not free.
+        of the far edge. It is the near edge if the nearest cell is not free, and less if a box stands before it.
     obstacle_m, edge_m, unknown_m : (columns,) float64
         x of each column's first cell that is an obstacle, the edge of the road, or unknown, as in `FreeAhead`;
         infinite if there is none.
@@ -193,13 +195,14 @@ def road_ahead(
         raise PointsError(f"tolerance_m is {tolerance_m}; expected 0 or more meters")
     if not max_corners >= 4:
         raise OptionError(f"max_corners is {max_corners}; expected at least 4")
-    objects = _objects(top_view, boxes)
+    standing = ModelFrame(top_view.mounting).move_boxes(boxes)
+    objects = _objects(top_view, standing)
     drivable = np.ascontiguousarray(top_view.drivable & ~objects)
     height, width = drivable.shape
     cell_m, (x_near, x_far), y_left = top_view.cell_m, top_view.x_range_m, top_view.y_range_m[1]
     y_m = _columns_m(top_view)
     x_m = x_far - (np.arange(height, dtype=np.float64)[::-1] + 0.5) * np.float64(cell_m)
-    firsts = _first_m(top_view, objects)
+    firsts = _first_m(top_view, objects, standing)
 
     bounds = np.empty((height, 2), np.int64)
     axis = y_left / cell_m  # the column where y is 0
@@ -262,22 +265,24 @@ def free_ahead(top_view: TopView, boxes: Iterable[Box] = (), *, half_width_m: fl
     >>> free_ahead(found.top_view, found.boxes)             # doctest: +SKIP
     FreeAhead(free_m=31.4, end='obstacle', obstacle_m=31.9, edge_m=31.4, unknown_m=33.0, view_m=46.0)
     """
-    firsts = _first_m(top_view, _objects(top_view, boxes))
+    standing = ModelFrame(top_view.mounting).move_boxes(boxes)
+    firsts = _first_m(top_view, _objects(top_view, standing), standing)
     return _strip_ahead(_columns_m(top_view), firsts, float(top_view.x_range_m[1]), half_width_m)
 
 
-def _objects(top_view: TopView, boxes: Iterable[Box]) -> Mask:
-    """Cells with an object's label or in the footprint of a box, (rows, columns) bool."""
+def _objects(top_view: TopView, standing: Sequence[Box]) -> Mask:
+    """Cells with an object's label or in the footprint of a box of their frame, (rows, columns) bool."""
     objects = np.ones(top_view.labels.shape, np.bool_)
     for k, name in enumerate(top_view.classes):
         if name in ("background", "drivable"):
             objects &= top_view.labels != k
-    standing = ModelFrame(top_view.mounting).move_boxes(boxes)
-    if standing:
-        footprints = np.zeros(objects.shape, np.uint8)
-        draw_footprints(footprints, standing, top_view.geometry, ("free", *{box.label for box in standing}))
-        objects |= footprints > 0
-    return objects
+    return objects | _footprints(standing, top_view.geometry) if standing else objects
+
+
+def _footprints(standing: Sequence[Box], view: TopViewGeometry) -> Mask:
+    drawn = np.zeros((view.height, view.width), np.uint8)
+    draw_footprints(drawn, standing, view, ("free", *{box.label for box in standing}))
+    return drawn > 0
 
 
 def _columns_m(top_view: TopView) -> Floats:
@@ -286,15 +291,26 @@ def _columns_m(top_view: TopView) -> Floats:
     return top_view.y_range_m[1] - (columns + 0.5) * np.float64(top_view.cell_m)
 
 
-def _first_m(top_view: TopView, objects: Mask) -> Floats:
-    """x of each column's first obstacle, edge and unknown cell, (3, columns) [m]; infinite without one."""
+def _first_m(top_view: TopView, objects: Mask, standing: Sequence[Box]) -> Floats:
+    """x of each column's first obstacle, edge and unknown cell, (3, columns) [m]; infinite without one. A box between
+    the sensor and the view is an obstacle, too, but not one that reaches beside the sensor: it is no road user ahead.
+    """
     known, road = top_view.observed, top_view.road
     if top_view.between_beams is not None:
         known = known | top_view.between_beams
     firsts = np.empty((3, objects.shape[1]), np.int64)
     fill_first_cells(objects, np.ascontiguousarray(known), np.ascontiguousarray(road), firsts)
     near_m = top_view.geometry.corner_m[0]
-    return np.where(firsts == len(objects), math.inf, near_m + firsts * top_view.cell_m)
+    first_m = np.where(firsts == len(objects), math.inf, near_m + firsts * top_view.cell_m)
+    n_before = math.floor(near_m / top_view.cell_m)
+    ahead = [box for box in standing if box.corners()[:, 0].min() > 0.0]
+    if ahead and n_before > 0:
+        begin_m = near_m - n_before * top_view.cell_m
+        before = TopViewGeometry((begin_m, near_m), top_view.y_range_m, cell_m=top_view.cell_m)
+        blocked = _footprints(ahead, before)[::-1]
+        nearer_m = begin_m + blocked.argmax(axis=0) * top_view.cell_m
+        first_m[0] = np.where(blocked.any(axis=0), nearer_m, first_m[0])
+    return first_m
 
 
 def _strip_ahead(y_m: Floats, firsts: Floats, view_m: float, half_width_m: float) -> FreeAhead:
