@@ -62,6 +62,7 @@ from .sinks import Sinks, add_sinks, wanted_sinks
 if TYPE_CHECKING:
     from ..live import Answer
     from ..perceiver import Perceiver
+    from ..preprocess.motion import Trajectory
     from ..tracking.tracks import Tracks
     from ..types.mounting import Mounting
     from ..types.perception import Perception
@@ -519,11 +520,9 @@ class _Run:
         self._tracker = Tracker() if arguments.track else None
         self._straightener = None
         if arguments.deskew:
-            from ..types.sensor import get_sensor
             from .straighten import Straightener
 
-            mounting = get_sensor(with_mounting(stated_sensor(arguments), arguments)).mounting
-            self._straightener = Straightener(arguments.poses, arguments.quaternion, arguments.poses_from, mounting)
+            self._straightener = Straightener(_trajectory(arguments))
         self._n = 0
         self._first_place: tuple[float, float, float] | None = None
 
@@ -674,6 +673,18 @@ class _Run:
         """Time of the next scan; scans without time stamps are 1 / ``--rate`` apart, whether or not they fail."""
         self._n += 1
         return self._n / self._arguments.rate if stamp_s is None else stamp_s
+
+
+def _trajectory(arguments: argparse.Namespace) -> Trajectory | None:
+    """The poses of ``--poses``, of a sensor that is mounted as the options say."""
+    from ..preprocess.motion import Trajectory
+    from ..types.sensor import get_sensor
+
+    if arguments.poses is None:
+        return None
+    mounting = get_sensor(with_mounting(stated_sensor(arguments), arguments)).mounting
+    how = {"quaternion": arguments.quaternion, "maps_from": arguments.poses_from}
+    return Trajectory.from_tum(arguments.poses, **how, mounting=mounting)
 
 
 def _alone(

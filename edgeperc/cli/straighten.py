@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import warnings
-from pathlib import Path
-from typing import Any, Literal
 
 import numpy as np
 
@@ -12,23 +10,15 @@ from ..errors import PointsError
 from ..preprocess.motion import Motion, Trajectory, deskew
 from ..preprocess.returns import returns
 from ..tracking.tracks import Tracks
-from ..types.mounting import UNKNOWN_MOUNTING, Mounting
 from ..types.points import Floats, Floats32, Points
 from ..types.sensor import SensorProfile
 
 
 class Straightener:
-    """Straightens scans by the poses of a file, or by the motion between tracked scans. Raises TrackingError."""
+    """Straightens scans by the poses of the sensor, or by the motion between tracked scans. Raises TrackingError."""
 
-    def __init__(
-        self,
-        poses: Path | None,
-        quaternion: Literal["xyzw", "wxyz"] | None = None,
-        maps_from: Literal["sensor", "world"] | None = None,
-        mounting: Mounting = UNKNOWN_MOUNTING,
-    ) -> None:
-        how: dict[str, Any] = {"quaternion": quaternion, "maps_from": maps_from, "mounting": mounting}
-        self._trajectory = None if poses is None else Trajectory.from_tum(poses, **how)
+    def __init__(self, trajectory: Trajectory | None) -> None:
+        self._trajectory = trajectory
         self._tracked: list[Tracks] = []
 
     def straighten(

@@ -220,7 +220,8 @@ class Trajectory:
             usual = of_vehicle[read_as]
             others = [key for key in others if _fits_better(of_vehicle[key], usual, rows[:, 0])]
             if others:
-                best = max(others, key=lambda key: _rank(of_vehicle[key]))
+                likeness = {key: _likeness(of_vehicle[key]) for key in others}
+                best = max(others, key=lambda key: (likeness[key][0], round(sum(likeness[key][1:]), 2)))
                 raise TrackingError(
                     f"{path}: read as {_reading(*read_as)}, the poses are those of a vehicle whose z axis points "
                     f"{_directions(usual)}; read as {_reading(*best)}, {_directions(of_vehicle[best])}. Say which is "
@@ -459,11 +460,6 @@ def _likeness(poses: Floats) -> tuple[bool, float, float]:
     up, way = _up_and_way(poses)
     is_vehicle = up > UPRIGHT and (way is None or way[0] > FORWARD)
     return is_vehicle, SAME_WAY if way is None else float(np.linalg.norm(way)), up
-
-
-def _rank(poses: Floats) -> tuple[bool, float]:
-    is_vehicle, keeps, up = _likeness(poses)
-    return is_vehicle, round(keeps + up, 2)
 
 
 def _up_and_way(poses: Floats) -> tuple[float, Floats | None]:

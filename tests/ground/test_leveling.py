@@ -309,19 +309,10 @@ def no_ground(kind: str) -> NDArray[np.float32]:
     scan = rng.normal(0.0, 10.0, (20_000, 4)).astype(np.float32)
     if kind == "wall":
         scan[:, 0] = 8.0
-    elif kind == "few":
-        scan = scan[:5]
-    elif kind == "one":
-        scan = scan[:1]
-    elif kind == "empty":
-        scan = scan[:0]
-    elif kind == "not finite":
-        scan[:] = np.nan
-    elif kind == "identical":
+    scan *= np.float32({"not finite": math.nan, "huge": 1e30}.get(kind, 1.0))
+    if kind == "identical":
         scan[:] = scan[0]
-    elif kind == "huge":
-        scan *= np.float32(1e30)
-    return scan
+    return scan[: {"few": 5, "one": 1, "empty": 0}.get(kind, len(scan))]
 
 
 @pytest.mark.parametrize("kind", ["cloud", "wall", "few", "one", "empty", "not finite", "identical", "huge"])

@@ -363,12 +363,12 @@ def test_scans_are_straightened_by_poses(tmp_path: Path) -> None:
     path = drive(tmp_path / "drive.bag", [1700.0, 1700.1])
     times = 1699.5 + 0.1 * np.arange(10)
     poses = write_tum(tmp_path / "poses.txt", times, [pose_at(t - 1699.5) for t in times])
-    straightener = Straightener(poses)
+    straightener = Straightener(Trajectory.from_tum(poses))
     for scan in read_timed_scans(path):
         assert off_the_walls(straightener.straighten(*scan)) < 1e-3
     write_tum(poses, times + 5.0, [pose_at(t) for t in 0.1 * np.arange(10)])
     with pytest.raises(edgeperc.StampError, match="poses around it"):
-        Straightener(poses).straighten(*scan)
+        Straightener(Trajectory.from_tum(poses)).straighten(*scan)
 
 
 @pytest.mark.compiled
