@@ -684,7 +684,7 @@ def test_a_scan_that_fails_takes_its_time(tmp_path: Path, monkeypatch: pytest.Mo
     """Without it, what moves had twice its speed behind the gap."""
     stamps_s = []
     update = Tracker.update
-    monkeypatch.setattr(Tracker, "update", lambda self, *args: (stamps_s.append(args[1]), update(self, *args))[1])
+    monkeypatch.setattr(Tracker, "update", lambda self, *a, **k: (stamps_s.append(a[1]), update(self, *a, **k))[1])
     for k in range(5):
         write_scan(tmp_path / f"{k}.bin")
     (tmp_path / "1.bin").write_bytes(b"\0" * 17)  # cannot be read
