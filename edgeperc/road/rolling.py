@@ -18,7 +18,7 @@ from ..tracking.moving import MOVABLE, movable_points
 from ..types.frame import ModelFrame
 from ..types.geometry import draw_footprints
 from ..types.mounting import MODEL_HEIGHT_M
-from ..types.perception import Box, Perception
+from ..types.perception import Perception
 from ..types.points import Bytes, Floats, Mask, as_points
 from ..types.rigid import rigid
 from ..types.sensor import SensorProfile
@@ -199,8 +199,9 @@ class RollingGrid:
         frame = ModelFrame(perception.mounting)
         boxes = [box for box in (*perception.boxes, *(track.box for track in tracks)) if box.label in self._classes]
         drawn = np.zeros((self._view.height, self._view.width), np.uint8)
-        grown = [_grown(box, self._margin_m) for box in frame.move_boxes(boxes)]
-        draw_footprints(drawn, grown, self._view, ("nothing", "movable"))
+        grow = np.array([2.0 * self._margin_m, 2.0 * self._margin_m, 0.0])
+        grown = [replace(box, size=tuple((box.size + grow).tolist())) for box in frame.move_boxes(boxes)]
+        draw_footprints(drawn, grown, self._view, ("nothing", *{box.label for box in grown}))
         scan = as_points(points)
         mark = movable_points(perception, scan, classes=self._classes, margin_m=self._margin_m)
         moved = frame.move(scan)[mark]
@@ -321,8 +322,3 @@ def _road_in(pose: Floats, perception: Perception) -> tuple[Floats, float]:
             f"{_FARTHEST_M:g} m, and a frame with z upwards"
         )
     return to_odom, float(t[2])
-
-
-def _grown(box: Box, margin_m: float) -> Box:
-    length, width, height = box.size
-    return replace(box, label="movable", size=(length + 2.0 * margin_m, width + 2.0 * margin_m, height))
