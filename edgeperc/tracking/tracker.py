@@ -188,8 +188,8 @@ class Tracker:
             ground is estimated from the static objects. With only one or two objects in view, their motion cannot be
             separated from the sensor's: tracks keep their identity, but speeds over ground are unreliable.
         mounting : Mounting
-            Of the sensor (`Perception.mounting`): without poses, its yaw says which way the vehicle drives, which moves
-            fast ahead and hardly aside.
+            Of the sensor (`Perception.mounting`): without poses, it says which way the vehicle drives, which moves fast
+            ahead, hardly aside and not up or down.
 
         Returns
         -------
@@ -245,8 +245,8 @@ class Tracker:
         state, covariance = _combined(*predictions)
         twist, twist_variances = session.twist, session.twist_variances
         if pose is None:
-            ahead = _ahead_in(mounting)
-            estimate = self._estimated_pose(session, tracks, state, covariance, given, classes, ahead, dt)
+            leveled = _leveled(mounting)
+            estimate = self._estimated_pose(session, tracks, state, covariance, given, classes, leveled, dt)
             pose, twist, twist_variances = estimate
         detections = _detections(given, fronts, kinds, classes["group"].copy(), pose)
         farther = 1.0 + _away(state, of, pose)  # the standard deviations of detections grow
@@ -316,23 +316,24 @@ class Tracker:
         covariance: Floats,
         given: Floats,
         classes: Records,
-        ahead: Floats,
+        leveled: Floats,
         dt: float,
     ) -> tuple[Floats, Floats, Floats]:
         """Estimate the sensor's pose (4, 4), its motion ahead, to the left and about z (3,) [m/s, m/s, rad/s], and the
-        variances of the motion. ``ahead`` (2, 2) turns what lies ahead into the sensor's frame.
+        variances of the motion. ``leveled`` (3, 3) turns the sensor's axes to those on the ground.
         """
         if dt == 0.0:
             return session.T_world_sensor, session.twist, session.twist_variances
         seen = np.flatnonzero(tracks["misses"] == 0)
         landmarks = np.empty((len(seen), 4))
-        landmarks[:, :2] = (state[seen, :2] - session.T_world_sensor[:2, 3]) @ session.T_world_sensor[:2, :2] @ ahead
+        places = np.column_stack([state[seen, :2], tracks["shape"][seen, 0]]) - session.T_world_sensor[:3, 3]
+        landmarks[:, :2] = (places @ session.T_world_sensor[:3, :3] @ leveled.T)[:, :2]
         landmarks[:, 2] = 0.5 * (covariance[seen, 0, 0] + covariance[seen, 1, 1])
         landmarks[:, 3] = tracks["group"][seen]
         if len(landmarks) > MAX_LANDMARKS:
             landmarks = landmarks[np.argsort(landmarks[:, 2], kind="stable")[:MAX_LANDMARKS]]
         detections = np.empty((len(given), 4))
-        detections[:, :2], detections[:, 3] = given[:, :2] @ ahead, classes["group"]
+        detections[:, :2], detections[:, 3] = (given[:, :3] @ leveled.T)[:, :2], classes["group"]
         farther = 1.0 + np.hypot(given[:, 0], given[:, 1]) / classes["range_m"]
         detections[:, 2] = (classes["sigmas"][:, 0] * farther) ** 2
         if len(detections) > 2 * MAX_LANDMARKS:
@@ -341,8 +342,10 @@ class Tracker:
         prior_variances = (session.twist_variances * kept**2 + TWIST_WALK**2 * dt) * dt**2
         motion, spread = np.empty(3), np.empty((3, 3))
         fit_motion(landmarks, detections, session.twist * kept * dt, prior_variances, motion, spread)
+        cos, sin = math.cos(motion[2]), math.sin(motion[2])
+        turn = np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]])
         step = np.eye(4)
-        step[:2, :2], step[:2, 3] = _turn(motion[2]), ahead @ motion[:2]
+        step[:3, :3], step[:3, 3] = leveled.T @ turn @ leveled, leveled.T[:, :2] @ motion[:2]
         return session.T_world_sensor @ step, motion / dt, np.minimum(np.diag(spread) / dt**2, FIRST_TWIST**2)
 
     def _with_newborn(self, tracks: Records, detections: Detections, classes: Records, beta: Floats) -> Records:
@@ -371,15 +374,10 @@ class Tracker:
 # would compile a kernel for each layout in memory.
 
 
-def _ahead_in(mounting: Mounting) -> Floats:
-    """The turn (2, 2) from the vehicle's axes on the ground to those of a sensor, upright or upside down."""
-    roll, yaw = (math.radians(angle or 0.0) for angle in (mounting.roll_deg, mounting.yaw_deg))
-    return _turn(math.atan2(-math.sin(yaw) * math.cos(roll), math.cos(yaw)))
-
-
-def _turn(angle: float) -> Floats:
-    cos, sin = math.cos(angle), math.sin(angle)
-    return np.array([[cos, -sin], [sin, cos]])
+def _leveled(mounting: Mounting) -> Floats:
+    """The rotation (3, 3) from a sensor's axes to those of the models, in which the vehicle moves on the ground."""
+    R = MODEL_MOUNTING.rotation().T @ mounting.rotation()
+    return np.eye(3) if np.allclose(R, np.eye(3), atol=1e-9) else R
 
 
 def _predictions(tracks: Records, classes: Records, dt: float) -> Predictions:

@@ -108,16 +108,17 @@ def box(label: str, x: float, y: float, *, yaw: float = 0.0, score: float = 0.9,
     return Box(label, score, (float(x), float(y), z), sizes.get(label, (4.2, 1.8, 1.5)), float(yaw))
 
 
-@pytest.mark.parametrize(("roll_deg", "yaw_deg"), [(0.0, 0.0), (0.0, -90.0), (180.0, 110.0)])
-def test_without_poses_the_sensors_motion_is_found(roll_deg: float, yaw_deg: float) -> None:
+@pytest.mark.parametrize("tilt_and_turn", [(0.0, 0.0, 0.0), (0.0, 15.0, -90.0), (180.0, 0.0, 110.0)])
+def test_without_poses_the_sensors_motion_is_found(tilt_and_turn: tuple[float, float, float]) -> None:
     tracker, posed = Tracker(), Tracker()
-    mounting = edgeperc.Mounting(1.73, roll_deg, 0.0, yaw_deg)
+    mounting = edgeperc.Mounting(1.73, *tilt_and_turn)
     frame, R = ModelFrame(mounting), mounting.rotation()
     for k, (boxes, pose) in enumerate(drive(100)):
         tracks = tracker.update(frame.boxes_back(boxes), 0.1 * k, mounting=mounting)
         known = posed.update(boxes, 0.1 * k, pose)
     way = R @ tracks.T_world_sensor[:3, 3]
     assert np.hypot(*(way[:2] - pose[:2, 3])) < 2.0  # of some 90 m driven
+    assert abs(way[2]) < 1.5
     turn = R @ tracks.T_world_sensor[:3, :3] @ R.T
     assert abs(math.atan2(turn[1, 0], turn[0, 0]) - math.atan2(pose[1, 0], pose[0, 0])) < 0.03
     assert len(known) > 3
