@@ -91,13 +91,11 @@ def sensors_of(names: Sequence[str]) -> Iterator[tuple[str, SensorProfile, float
 def around(seed: int, sensor: SensorProfile) -> tuple[list[Floats32], list[Floats]]:
     """Scans of four sensors at the sides of a vehicle in a street, and their poses on it."""
     scene = random_scene(seed)
-    places = [(2.2, 0.0, 1.7, 0.0), (0.0, 0.9, 1.7, 90.0), (-2.2, 0.0, 1.7, 180.0), (0.0, -0.9, 1.7, -90.0)]
     T_vehicle_sensor = []
-    for x, y, z, yaw_deg in places:
+    for x, y, yaw_deg in [(2.2, 0.0, 0.0), (0.0, 0.9, 90.0), (-2.2, 0.0, 180.0), (0.0, -0.9, -90.0)]:
         T_vehicle_sensor.append(np.eye(4))
-        cos, sin = np.cos(np.radians(yaw_deg)), np.sin(np.radians(yaw_deg))
-        T_vehicle_sensor[-1][:2] = (cos, -sin, 0.0, x), (sin, cos, 0.0, y)
-        T_vehicle_sensor[-1][2, 3] = z
+        T_vehicle_sensor[-1][:3, :3] = Mounting(yaw_deg=yaw_deg).rotation()
+        T_vehicle_sensor[-1][:3, 3] = x, y, 1.7
     T_world_vehicle = np.eye(4)
     T_world_vehicle[2, 3] = scene.ground_height(0.0, 0.0)
     scans = [simulate(scene, sensor, seed, T_world_vehicle @ pose) for pose in T_vehicle_sensor]
