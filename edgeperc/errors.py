@@ -128,3 +128,7 @@ class MissingExtraError(EdgepercError, ImportError):
     def __init__(self, package: str, extra: str, purpose: str) -> None:
         self.package, self.extra, self.purpose = package, extra, purpose
         super().__init__(f"{purpose} needs {package}, which is not installed. Run: pip install 'edgeperc[{extra}]'")
+
+    def __reduce__(self) -> tuple[type[MissingExtraError], tuple[str, str, str]]:
+        """For pickles: a pool of processes waits for ever for an error that its own process cannot read."""
+        return type(self), (self.package, self.extra, self.purpose)

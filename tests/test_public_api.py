@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import importlib.metadata
 import inspect
+import pickle
 import pkgutil
 import re
 
@@ -73,9 +74,11 @@ def test_exported_names_exist_and_are_documented() -> None:
                         assert inspect.getdoc(member), f"{module_name}.{name}.{attribute} has no docstring"
 
 
-def test_errors_have_one_root() -> None:
+def test_errors_have_one_root_and_come_out_of_other_processes() -> None:
     for name in edgeperc.errors.__all__:
-        assert issubclass(getattr(edgeperc, name), edgeperc.EdgepercError)
+        error = getattr(edgeperc, name)("onnxruntime", "cpu", "Running a model")
+        assert isinstance(error, edgeperc.EdgepercError)
+        assert repr(pickle.loads(pickle.dumps(error))) == repr(error)
 
 
 def test_the_version_is_the_changelogs_newest() -> None:
