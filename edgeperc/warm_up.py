@@ -27,7 +27,6 @@ from contextlib import suppress
 from copy import copy
 from dataclasses import replace
 from itertools import product
-from pathlib import Path
 from types import MappingProxyType, TracebackType
 from typing import Any, NamedTuple
 
@@ -62,7 +61,7 @@ from .preprocess.returns import returns
 from .road.ahead import compile_kernels
 from .road.outline import merge_corners
 from .system.compiling import fewer_collections, tell_watchers
-from .system.interpreter import interpreter_flags
+from .system.interpreter import interpreter, interpreter_flags
 from .system.kernels import is_ahead
 from .system.lanes import Lanes, Stopwatch
 from .system.machine import usable_cores
@@ -336,7 +335,7 @@ def _kill() -> None:
 
 def n_processes() -> int:
     """How many processes compile at a first start: this one, and one for each further core."""
-    return 1 + min(usable_cores() - 1, MAX_HELPERS) if _interpreter() is not None else 1
+    return 1 + min(usable_cores() - 1, MAX_HELPERS) if interpreter() is not None else 1
 
 
 def _shares(parts: Sequence[str]) -> list[list[str]]:
@@ -361,14 +360,6 @@ def is_cold(kernel: Any) -> bool:
     return is_missing is not None and bool(is_missing())
 
 
-def _interpreter() -> str | None:
-    """The Python interpreter that runs this process; None where that is unknown."""
-    # Where Python is embedded, `sys.executable` may be the application itself, which must not start twice.
-    if getattr(sys, "frozen", False) or not sys.executable or not Path(sys.executable).stem.startswith("python"):
-        return None
-    return sys.executable
-
-
 def _start(parts: Sequence[str]) -> subprocess.Popen[bytes]:
     """Start a helper. It inherits no files; its standard input is open until it is closed or this process ends."""
     paths = [path for path in sys.path if isinstance(path, str)]
@@ -379,7 +370,7 @@ def _start(parts: Sequence[str]) -> subprocess.Popen[bytes]:
     if config.CACHE_DIR:
         environment["NUMBA_CACHE_DIR"] = str(config.CACHE_DIR)
     return subprocess.Popen(
-        [str(_interpreter()), *interpreter_flags(), "-c", START, ",".join(parts), *paths],
+        [str(interpreter()), *interpreter_flags(), "-c", START, ",".join(parts), *paths],
         stdin=subprocess.PIPE,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,

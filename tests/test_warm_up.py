@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import gc
 import json
-import multiprocessing
+import multiprocessing.spawn
 import os
 import shutil
 import signal
@@ -238,6 +238,7 @@ def test_an_application_that_embeds_python_or_is_frozen_is_not_started_again(
     helpers: Callable[[str], Helpers], monkeypatch: pytest.MonkeyPatch, name: str, value: object
 ) -> None:
     monkeypatch.setattr(sys, name, value, raising=name != "frozen")
+    monkeypatch.setattr(multiprocessing.spawn, "get_executable", lambda: sys.executable)
     with helpers(HANGS) as running:
         assert not running.running
 

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from ..errors import MissingExtraError, PointsError
 from ..system.clock import Stamp
-from ..system.interpreter import interpreter_flags
+from ..system.interpreter import interpreter, interpreter_flags
 from ..types.points import Floats, Points
 from .tables import MAX_BYTES, MAX_SCAN_BYTES
 from .times import TimedScan
@@ -78,14 +78,20 @@ def _serve(request: dict[str, Any], path: Path, found: list[Any]) -> Iterator[Ti
 
 
 def start_process(folder: str) -> subprocess.Popen[bytes]:
-    """Start the process that decodes captures."""
+    """Start the process that decodes captures. Raises PointsError."""
+    python = interpreter()
+    if python is None:
+        raise PointsError(
+            f"captures are decoded by a Python of its own, and this application, {sys.executable!r}, is none; name one "
+            "of the same version with multiprocessing.set_executable(path)"
+        )
     # Threads of these libraries would each take part of the memory limit.
     one_thread = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
     # Here lies what libraries unpack, and it is deleted even if the process is killed.
     temporary = dict.fromkeys(("TMPDIR", "TEMP", "TMP"), folder)
     flags = getattr(subprocess, "CREATE_NO_WINDOW", 0) | getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0)
     return subprocess.Popen(
-        [sys.executable, *interpreter_flags(), "-W", "ignore", "-c", START, *sys.path],
+        [python, *interpreter_flags(), "-W", "ignore", "-c", START, *sys.path],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         env={**os.environ, **one_thread, **temporary},

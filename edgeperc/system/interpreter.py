@@ -10,6 +10,7 @@ import threading
 import weakref
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import TypeVar
 
 Thing = TypeVar("Thing")
@@ -89,6 +90,19 @@ def _begin_child() -> None:
 
 if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_begin_child)
+
+
+def interpreter() -> str | None:
+    """The Python with which other processes are started; None where that is unknown.
+
+    Where Python is embedded or frozen, `sys.executable` may be the application itself, which must not start again. Such
+    an application can name another with `multiprocessing.set_executable`.
+    """
+    from multiprocessing import spawn  # takes 20 ms
+
+    own, named = sys.executable or "", os.fsdecode(spawn.get_executable() or b"")
+    others = [path for path in (own, named) if not (getattr(sys, "frozen", False) and path == own)]
+    return next((path for path in others if Path(path).stem.startswith("python")), None)
 
 
 def interpreter_flags() -> list[str]:

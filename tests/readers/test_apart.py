@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import bz2
 import json
+import multiprocessing.spawn
 import os
 import random
 import signal
@@ -87,6 +88,20 @@ def test_a_process_that_does_not_start(tmp_path: Path, monkeypatch: pytest.Monke
     monkeypatch.setattr(apart, "START", "import sys; sys.exit(7)")
     with pytest.raises(PointsError, match=r"did not start \(exit code 7\)"):
         next(read_scans(write_pcap(tmp_path / "any.pcap", [])))
+
+
+@pytest.mark.parametrize(("name", "value"), [("executable", "/usr/bin/robot"), ("executable", None), ("frozen", True)])
+def test_an_application_that_embeds_python_or_is_frozen_is_not_started_again(
+    ouster: Path, monkeypatch: pytest.MonkeyPatch, name: str, value: object
+) -> None:
+    python = sys.executable
+    monkeypatch.setattr(sys, name, value, raising=name != "frozen")
+    monkeypatch.setattr(multiprocessing.spawn, "get_executable", lambda: sys.executable)
+    with pytest.raises(PointsError, match=r"application, .*, is none; name one .* multiprocessing\.set_executable"):
+        next(read_scans(ouster / "sphere.pcap"))
+    if name == "executable":
+        monkeypatch.setattr(multiprocessing.spawn, "get_executable", lambda: python)
+        assert len(list(read_scans(ouster / "sphere.pcap"))) == 3
 
 
 def test_a_scan_that_takes_too_long(ouster: Path, monkeypatch: pytest.MonkeyPatch) -> None:
