@@ -100,7 +100,8 @@ class Tracker:
     Raises
     ------
     OptionError
-        The left edge is not to the left of the right one, or ``max_tracks`` is no whole number, or below 0.
+        The left edge is not to the left of the right one, ``max_tracks`` is no whole number, or below 0, or
+        ``parameters`` are no `ClassParameters`.
 
     Examples
     --------
@@ -120,6 +121,9 @@ class Tracker:
     ) -> None:
         self._parameters: Mapping[str, ClassParameters] = PARAMETERS
         self._right, self._width = _checked_view(field_of_view_deg)
+        given = {} if parameters is None else parameters
+        if not isinstance(given, Mapping) or not all(isinstance(of, ClassParameters) for of in given.values()):
+            raise OptionError(f"parameters is {parameters!r:.200}; expected ClassParameters by class, or None")
         if not isinstance(max_tracks, int | np.integer) or max_tracks < 0:
             raise OptionError(f"max_tracks is {max_tracks!r}; expected a whole number, 0 or more")
         self._max_tracks = int(max_tracks)
@@ -128,7 +132,7 @@ class Tracker:
         # Compile every kernel here, not in the first updates: a track begins, and is found again.
         for stamp_s in (0.0, 0.1):
             self.update([Box("car", 0.9, (10.0, 2.0, -0.9), (4.2, 1.8, 1.5), 0.0)], stamp_s)
-        self._parameters = {**PARAMETERS, **(parameters or {})}
+        self._parameters = {**PARAMETERS, **given}
         self._clock = Clock(gap_s=max(GAP_S, *(of.memory_s for of in self._parameters.values())))
         self.reset()
 
@@ -231,9 +235,10 @@ class Tracker:
             raise TrackingError(f"T_world_sensor has {np.abs(pose).max():g}; expected at most {FARTHEST_M:g} m")
         self._warn_of(step, stamp_s)
         if step == "late":
-            self._clock = clock
             nothing, pose = np.zeros(0, TRACK), session.T_world_sensor.copy()
-            return Tracks(nothing, self._labels, stamp_s, pose, len(session.tracks), 0, session.number, is_late=True)
+            late = Tracks(nothing, self._labels, stamp_s, pose, len(session.tracks), 0, session.number, is_late=True)
+            self._clock = clock
+            return late
         kinds = self.kinds_of(names)
         classes = self.class_table[kinds]
 
@@ -262,16 +267,20 @@ class Tracker:
         strength = strength_of(tracks)
         tracks["score"] = _scores(tracks, strength, self.class_table[tracks["label"]], pose)
 
-        self._clock, self._former = clock, former if step == "jump" else None
-        self._session = _Session(session.number, stamp_s, posed, tracks, pose, twist, twist_variances)
-        self._n_sessions += step == "jump"
-        self._next_id += n_born
         reported = tracks["existence"] > 0.0
         mark_out_of_view(tracks, pose, self._right, self._width, reported)
         strongest_first = np.argsort(-strength, kind="stable")
         mark_rivals(tracks["state"].copy(), tracks["shape"].copy(), strongest_first, reported)
         n_tentative = int(len(tracks) - np.count_nonzero(reported))
-        return Tracks(tracks[reported], self._labels, stamp_s, pose.copy(), n_tentative, n_approximated, session.number)
+        shown, number = tracks[reported], session.number
+        answer = Tracks(shown, self._labels, stamp_s, pose.copy(), n_tentative, n_approximated, number)
+        session = _Session(number, stamp_s, posed, tracks, pose, twist, twist_variances)
+
+        # Last, and without a call in between, so that an update that a signal ends can be repeated.
+        self._clock, self._session, self._former = clock, session, former if step == "jump" else None
+        self._n_sessions += step == "jump"
+        self._next_id += n_born
+        return answer
 
     def _warn_of(self, step: Step, stamp_s: float) -> None:
         """Say once of each kind of step what it means."""

@@ -8,6 +8,7 @@ import pickle
 from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -367,6 +368,7 @@ def test_a_view_to_the_rear_reports_what_coasts_on_either_side(edges: tuple[floa
     [
         *({"field_of_view_deg": edges} for edges in [(-140.0, 140.0), (0.0, 0.0), (math.nan, 0.0), (40.0,), None]),
         *({"max_tracks": n} for n in [-1, 1.5, "9"]),
+        *({"parameters": given} for given in [{"car": {"gate": 4.0}}, PARAMETERS["car"]]),
     ],
     ids=str,
 )
@@ -444,6 +446,8 @@ def test_errors_leave_the_tracker_as_it_was(posed: bool) -> None:
     tracker, untroubled = Tracker(), Tracker()
     for k, (boxes, pose) in enumerate(drive(25)):
         given_pose = pose if posed else None
+        with patch("edgeperc.tracking.tracker.Tracks", side_effect=KeyboardInterrupt), pytest.raises(KeyboardInterrupt):
+            tracker.update(boxes, 0.1 * k, given_pose)
         reported = tracker.update(boxes, 0.1 * k, given_pose)
         assert same(reported, untroubled.update(boxes, 0.1 * k, given_pose))
         for bad in BAD_BOXES:
