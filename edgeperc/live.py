@@ -125,6 +125,9 @@ def stream(
     ...         print(answer.age_s, answer.health, answer.n_dropped, answer.perception.boxes)
     """
     check_rate(rate_hz)
+    for name, age_s in (("late_after_s", late_after_s), ("stale_after_s", stale_after_s)):
+        if not isinstance(age_s, Real | None):
+            raise OptionError(f"{name} is {age_s!r:.80}; expected seconds, or None")
     late_s = 2.0 / rate_hz if late_after_s is None else late_after_s
     stale_s = max(5.0 / rate_hz, late_s) if stale_after_s is None else stale_after_s
     if not 0.0 < late_s <= stale_s:
@@ -229,7 +232,8 @@ class Stream:
         Raises
         ------
         StopIteration
-            The source is at its end, or the stream is closed.
+            The source is at its end, or the stream is closed. asyncio cannot take it from a thread, and waits for
+            ever before Python 3.12: pass ``asyncio.to_thread`` the function ``next``, the stream and None.
         Exception
             Any error of the source, the perceiver or the tracker.
         """

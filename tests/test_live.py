@@ -16,7 +16,7 @@ import pytest
 
 import edgeperc
 from edgeperc import live
-from edgeperc.errors import InferenceError, PointsError, StampError
+from edgeperc.errors import InferenceError, OptionError, PointsError, StampError
 from edgeperc.live import stream
 from waiting import TIMEOUT_S, until
 
@@ -246,16 +246,17 @@ def test_a_source_that_is_none(source: Any) -> None:
     "given",
     [
         {"rate_hz": 0.0},
-        {"rate_hz": "10"},
         {"rate_hz": np.nan},
         {"rate_hz": np.inf},
+        {"rate_hz": "10"},
+        {"late_after_s": "1"},
         {"late_after_s": 0.0},
         {"late_after_s": np.nan},
         {"late_after_s": 0.3, "stale_after_s": 0.2},
     ],
 )
 def test_ages_and_rates_that_are_none(given: dict[str, Any]) -> None:
-    with pytest.raises(ValueError, match="expected"):
+    with pytest.raises(OptionError, match="expected"):
         stream([], perceive, **given)
 
 
