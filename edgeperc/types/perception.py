@@ -293,7 +293,7 @@ class DroppedPoints:
     Attributes
     ----------
     not_finite : int
-        A coordinate or the remission is not finite.
+        A coordinate is not finite, or the remission is not when scaled.
     too_near : int
         At most the profile's ``min_range_m`` from the sensor: beams without a return, such as (0, 0, 0).
     ego : int

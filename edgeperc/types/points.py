@@ -60,7 +60,7 @@ def as_points(
 
     array : (n, 4) or (n, 3), of any float or integer dtype, byte order and memory layout: x, y, z [m], remission, 0
         without it. A structured array (any shape, e.g. that of a PointCloud2 message) needs the fields x, y and z;
-        other fields and padding are skipped. So does a data frame with such names (pandas, polars).
+        other fields and padding are skipped. So does a data frame with such names (pandas, polars, Arrow).
     origin_m : subtracted from x, y, z [m] before they become float32. Raises PointsError: Also for coordinates of a
         map, which float32 would round by more than 5 mm.
     """
@@ -97,8 +97,10 @@ def as_points(
 
 
 def _frame_columns(thing: Any) -> dict[str, NDArray[Any]]:
-    """The numeric columns of a data frame (pandas, polars) by `plain_name`; empty if their names are numbers alone."""
-    names = getattr(thing, "columns", None) if hasattr(thing, "__array__") else None
+    """The numeric columns of a data frame (pandas, polars, Arrow) by `plain_name`; empty if their names are numbers
+    alone.
+    """
+    names = getattr(thing, "column_names", getattr(thing, "columns", None)) if hasattr(thing, "__array__") else None
     columns = _numeric((name, np.asarray(thing[name])) for name in (() if names is None else names))
     return {} if all(re.fullmatch(r"(column_)?\d+", name) for name in columns) else columns
 

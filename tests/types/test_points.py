@@ -95,6 +95,13 @@ def test_the_columns_of_a_data_frame_have_names(order: tuple[str, ...]) -> None:
         as_points(pandas.DataFrame(POINTS, columns=["range", "azimuth", "elevation", "intensity"]))
 
 
+def test_the_columns_of_an_arrow_table_have_names() -> None:
+    table = pytest.importorskip("pyarrow").table(
+        {"label": ["car"] * 50, **dict(zip("izyx", POINTS.T[::-1], strict=True))}
+    )
+    np.testing.assert_array_equal(as_points(table), POINTS)
+
+
 @pytest.mark.parametrize("source", [None, 5, POINTS, ["a.bin", "b.bin"], b"a.bin"])
 def test_what_is_no_path_is_no_recording(source: Any) -> None:
     for read in (read_scans, edgeperc.read_timed_scans, edgeperc.sensor_of):
