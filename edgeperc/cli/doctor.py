@@ -240,10 +240,10 @@ def _providers() -> Iterator[Finding]:
     present = [provider.name for provider in providers() if provider.available]
     if not present:
         return  # without onnxruntime, which `find_packages` reports
-    from ..inference.providers import PLUGINS, devices
+    from ..inference.providers import PLUGINS, devices, is_available
 
     for short, package in PLUGINS.items():
-        if short not in present and find_spec(package) is not None:
+        if short not in present and find_spec(package) is not None and not is_available(short):  # or does not load
             yield Finding(f"plugin {short}", "note", "installed, but finds no device on this computer")
     yield Finding("providers", "ok", f"{', '.join(present)}; 'edgeperc providers' says how to install others")
     yield Finding("devices", "ok", ", ".join(devices()) or "this version of onnxruntime does not list them")

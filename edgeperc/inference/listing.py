@@ -102,7 +102,8 @@ class ProviderInfo:
     name : str
         Name for ``Perceiver(provider=...)``.
     available : bool
-        Whether the installed onnxruntime offers it; False without onnxruntime.
+        Whether the installed onnxruntime offers it; False without onnxruntime, and if its plugin does not load, which
+        the log says.
     installed_by : str
         How to install it.
     """
@@ -175,13 +176,7 @@ def sensors() -> tuple[SensorInfo, ...]:
 
 
 def providers() -> tuple[ProviderInfo, ...]:
-    """List the execution providers that edgeperc supports, and which of them are available here.
-
-    Raises
-    ------
-    ProviderError
-        The plugin of a provider is installed but cannot be loaded.
-    """
+    """List the execution providers that edgeperc supports, and which of them are available here."""
     try:
         present = available_providers()
     except MissingExtraError:

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import importlib.metadata
+import logging
 from collections.abc import Mapping
+from functools import cache
 from typing import Any
 
 from ..errors import ProviderError
 from ..system.extras import require, without_telemetry
+
+logger = logging.getLogger(__name__)
 
 PROVIDERS: Mapping[str, str] = {
     "tensorrt-rtx": "NvTensorRTRTXExecutionProvider",
@@ -77,15 +81,33 @@ def plugin_devices(ort: Any, short: str) -> list[Any]:
             return []
         except Exception as exc:  # onnxruntime's errors share no base but Exception
             if "already registered" not in str(exc):
-                raise ProviderError(f"the plugin for provider {short!r} is installed but does not load: {exc}") from exc
+                raise ProviderError(
+                    f"the plugin for provider {short!r} is installed but does not load: {exc}; install a version of "
+                    f"{PLUGINS[short]} for onnxruntime {ort.__version__}, or uninstall it"
+                ) from exc
     return devices()
 
 
-def available_providers() -> tuple[str, ...]:
-    """The providers that ``Perceiver(provider=...)`` accepts on this computer, as keys of `PROVIDERS`."""
+def is_available(short: str) -> bool:
+    """Whether ``Perceiver(provider=...)`` accepts a key of `PROVIDERS` here. Raises ProviderError."""
     ort = load_onnxruntime()
-    stock = ort.get_available_providers()
-    return tuple(s for s, name in PROVIDERS.items() if name in stock or (s in PLUGINS and plugin_devices(ort, s)))
+    return PROVIDERS[short] in ort.get_available_providers() or (short in PLUGINS and bool(plugin_devices(ort, short)))
+
+
+def available_providers() -> tuple[str, ...]:
+    """The keys of `PROVIDERS` that are available; the log says once which plugins do not load."""
+    present = []
+    for short in PROVIDERS:
+        try:
+            present += [short] * is_available(short)
+        except ProviderError as exc:
+            _warn_once(str(exc))
+    return tuple(present)
+
+
+@cache
+def _warn_once(text: str) -> None:
+    logger.warning("%s", text)
 
 
 def runtime_version() -> str:

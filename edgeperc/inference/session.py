@@ -58,6 +58,7 @@ from .providers import (
     RECOMPILING,
     SHARING,
     available_providers,
+    is_available,
     is_of_engine,
     load_onnxruntime,
     plugin_devices,
@@ -157,15 +158,17 @@ class Session:
         self, variants: Sequence[Variant], provider: str, precision: str, n_threads: int | None
     ) -> list[_Attempt]:
         """The settings to try, in this order: one, or several if provider or precision is "auto"."""
-        present, features = available_providers(), cpu_features()
+        features = cpu_features()
         candidates = [(provider, precision, n_threads)]
         if provider == "auto":
+            present = available_providers()
             unfit = RECOMPILING if isinstance(variants[0].card.view, ObjectGeometry) else ()
             candidates = [(short, precision, n_threads) for short in AUTO if short in present and short not in unfit]
             candidates = [*self._measured_best(variants[0].name, precision, n_threads, present), *candidates]
-        elif provider not in present:
+        elif not is_available(provider):
             raise ProviderError(
-                f"provider {provider!r} is not available on this computer (present: {', '.join(present)}); "
+                f"provider {provider!r} is not available on this computer (present: "
+                f"{', '.join(available_providers())}); "
                 "install its onnxruntime build or plugin, or choose one that is present"
             )
         attempts: list[_Attempt] = []

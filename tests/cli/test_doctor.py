@@ -18,7 +18,7 @@ from cli_helpers import run
 from edgeperc import zoo
 from edgeperc.cli import doctor
 from edgeperc.errors import ProviderError
-from edgeperc.inference import listing, providers
+from edgeperc.inference import providers
 from edgeperc.system.kernel_cache import KernelCache
 
 posix = pytest.mark.skipif(os.name != "posix", reason="Windows' folders have access lists")
@@ -137,10 +137,11 @@ def test_telemetry(value: str, state: str, text: str, monkeypatch: pytest.Monkey
 def test_a_plugin_that_does_not_load_and_kernels_that_are_not_kept(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    def broken() -> Any:
-        raise ProviderError("the plugin for provider 'openvino' is installed but does not load: no symbol")
+    def broken(ort: object, short: str) -> Any:
+        raise ProviderError("the plugin for provider 'webgpu' is installed but does not load: no symbol")
 
-    monkeypatch.setattr(listing, "providers", broken)
+    monkeypatch.setattr(providers, "plugin_devices", broken)
+    monkeypatch.setattr(providers, "PLUGINS", {"webgpu": "numpy"})
     monkeypatch.setattr(KernelCache, "cache_path", None)
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("EDGEPERC_CACHE_DIR", str(tmp_path / "file" / "cache"))

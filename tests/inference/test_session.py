@@ -265,6 +265,7 @@ def test_auto_skips_a_provider_that_cannot_run_the_model(
     monkeypatch.setattr(session_module, "PROVIDERS", {"mirage": "MirageExecutionProvider", **PROVIDERS})
     monkeypatch.setattr(session_module, "AUTO", ("mirage", "cpu"))
     monkeypatch.setattr(session_module, "available_providers", lambda: ("mirage", "cpu"))
+    monkeypatch.setattr(session_module, "is_available", lambda _: True)
     assert Session(model_path("pointseg"), "auto").provider == "CPUExecutionProvider"
     assert "auto skips pointseg on mirage in fp32" in caplog.text
     with pytest.raises(errors.ProviderError):
@@ -363,6 +364,17 @@ def test_the_webgpu_plugin_runs_fp32(monkeypatch: pytest.MonkeyPatch) -> None:
     assert fake.chosen == [("GPU", {})]
     with pytest.raises(errors.ProviderError, match="provider 'qnn' is not available"):
         Session("pointseg", "qnn")
+
+
+def test_a_plugin_that_does_not_load_is_no_matter_of_other_providers(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    FakePlugins(monkeypatch, [(PROVIDERS["webgpu"], "GPU")])
+    monkeypatch.setattr(sys.modules["onnxruntime_ep_webgpu"], "get_library_path", lambda: 1 / 0)
+    assert [Session("pointseg", provider).short for provider in ("cpu", "auto")] == ["cpu", "cpu"]
+    assert caplog.text.count("'webgpu' is installed but does not load") == 1
+    with pytest.raises(errors.ProviderError, match=r"does not load: .* uninstall it"):
+        Session("pointseg", "webgpu")
 
 
 def test_auto_does_not_let_openvino_compile_each_number_of_candidates(monkeypatch: pytest.MonkeyPatch) -> None:
