@@ -20,7 +20,7 @@
     │   └── CardMismatchError         the card and the graph disagree
     ├── ProviderError                 the requested execution provider is not installed or not active
     ├── InferenceError                the session failed on a valid tensor
-    └── MissingExtraError (ImportError)   an optional package is not installed
+    └── MissingExtraError (ImportError)   an optional package is not installed, or damaged
 
 Each message says what was given, what was expected and what to do.
 """
@@ -123,12 +123,15 @@ class InferenceError(EdgepercError):
 
 
 class MissingExtraError(EdgepercError, ImportError):
-    """An optional package is not installed; the message gives the install command."""
+    """An optional package is not installed, and the message gives the install command; or it is ``damaged``."""
 
-    def __init__(self, package: str, extra: str, purpose: str) -> None:
-        self.package, self.extra, self.purpose = package, extra, purpose
-        super().__init__(f"{purpose} needs {package}, which is not installed. Run: pip install 'edgeperc[{extra}]'")
+    def __init__(self, package: str, extra: str, purpose: str, damaged: str = "") -> None:
+        self.package, self.extra, self.purpose, self.damaged = package, extra, purpose, damaged
+        state = f"not installed. Run: pip install 'edgeperc[{extra}]'"
+        if damaged:
+            state = f"installed, but cannot be imported: {damaged}. Install it anew; edgeperc doctor examines it"
+        super().__init__(f"{purpose} needs {package}, which is {state}")
 
-    def __reduce__(self) -> tuple[type[MissingExtraError], tuple[str, str, str]]:
+    def __reduce__(self) -> tuple[type[MissingExtraError], tuple[str, ...]]:
         """For pickles: a pool of processes waits for ever for an error that its own process cannot read."""
-        return type(self), (self.package, self.extra, self.purpose)
+        return type(self), (self.package, self.extra, self.purpose, self.damaged)

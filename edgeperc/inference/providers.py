@@ -77,7 +77,7 @@ def plugin_devices(ort: Any, short: str) -> list[Any]:
         try:
             library = importlib.import_module(PLUGINS[short]).get_library_path()
             ort.register_execution_provider_library(name, library)
-        except ImportError:
+        except ModuleNotFoundError:
             return []
         except Exception as exc:  # onnxruntime's errors share no base but Exception
             if "already registered" not in str(exc):

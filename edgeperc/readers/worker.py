@@ -64,7 +64,7 @@ def main() -> None:
                 content = np.ascontiguousarray(points, "<f4").data.cast("B") if points.size else b""
                 reply(SCAN, content, np.nan if stamp_s is None else stamp_s)
         except MissingExtraError as exc:
-            reply(MISSING, json.dumps([exc.package, exc.extra, exc.purpose]).encode())
+            reply(MISSING, json.dumps([exc.package, exc.extra, exc.purpose, exc.damaged]).encode())
         except PointsError as exc:
             reply(ERROR, str(exc).encode("utf-8", "replace"))
         else:

@@ -19,7 +19,8 @@ def require(module: str, extra: str, purpose: str, *, package: str | None = None
     try:
         return import_module(module)
     except ImportError as exc:
-        raise MissingExtraError(package or module.partition(".")[0], extra, purpose) from exc
+        damaged = "" if isinstance(exc, ModuleNotFoundError) else str(exc)
+        raise MissingExtraError(package or module.partition(".")[0], extra, purpose, damaged) from exc
 
 
 def without_telemetry() -> None:

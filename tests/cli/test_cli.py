@@ -548,15 +548,25 @@ def test_every_scan_is_answered_whatever_the_clock_does(
         assert answers[-2 if said.startswith("late") else -1].endswith("tracks: 1 object")
 
 
-def test_a_missing_reader_is_said_at_once(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("error", "text"),
+    [
+        (
+            "ModuleNotFoundError('not installed', name='ouster')",
+            "is not installed. Run: pip install 'edgeperc[ouster]'",
+        ),
+        ("ImportError('libfoo.so.3: no such file')", "is installed, but cannot be imported: libfoo.so.3: no such file"),
+    ],
+)
+def test_a_missing_or_damaged_reader_is_said_at_once(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, error: str, text: str
 ) -> None:
     (tmp_path / "frames.osf").write_bytes(bytes(8) + b"OSF#" + bytes(8))
     (tmp_path / "absent").mkdir()
-    (tmp_path / "absent" / "ouster.py").write_text("raise ImportError('not installed')\n")
+    (tmp_path / "absent" / "ouster.py").write_text(f"raise {error}\n")
     monkeypatch.syspath_prepend(tmp_path / "absent")  # the process that decodes captures has this process's path
     assert run("run", tmp_path / "frames.osf") == 2
-    assert "pip install 'edgeperc[ouster]'" in capsys.readouterr().err
+    assert text in capsys.readouterr().err
 
 
 def test_live(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
