@@ -1,29 +1,4 @@
-"""The exceptions of edgeperc.
-
-::
-
-    EdgepercError
-    ├── OptionError (ValueError)      an unknown option, or a value out of its range
-    ├── PointsError (ValueError)      an array or a sensor file that is not a scan
-    ├── ImageError (ValueError)       an array or a file that is not a camera's image, or an image that is missing
-    ├── SensorError (ValueError)      an unknown or impossible sensor profile
-    ├── CalibrationError (ValueError) values that describe no camera, or no pose of one
-    ├── SettingsError (ValueError)    this computer's settings file cannot be read
-    ├── SplitError (ValueError)       a model would be evaluated on a scan that it was trained on
-    ├── TrackingError (ValueError)    boxes or a pose that cannot be tracked
-    │   └── StampError                a time that is missing, not finite or out of its range
-    ├── MountingError (ValueError)    scans do not show how the sensor is mounted
-    ├── FitnessError                  a scan differs grossly from the training scans
-    ├── ModelError
-    │   ├── ModelFileError            missing, or onnxruntime cannot open it
-    │   ├── CardError                 the card is missing, unreadable or of a newer schema
-    │   └── CardMismatchError         the card and the graph disagree
-    ├── ProviderError                 the requested execution provider is not installed or not active
-    ├── InferenceError                the session failed on a valid tensor
-    └── MissingExtraError (ImportError)   an optional package is not installed, or damaged
-
-Each message says what was given, what was expected and what to do.
-"""
+"""The exceptions of edgeperc. Each message says what was given, what was expected and what to do."""
 
 from __future__ import annotations
 

@@ -366,22 +366,14 @@ def test_any_layout_in_memory(
     np.testing.assert_array_equal(given, before)
 
 
-@pytest.mark.parametrize("n", [0, 1, 2])
-def test_few_points(perceive: Perceiver, n: int) -> None:
-    points = np.array([[12.0, 1.0, -1.0, 0.3], [30.0, -2.0, -1.5, 0.1]], np.float32)[:n]
-    answer = perceive(points)
-    assert answer.n_points == n
-    assert answer.require_points().labels.shape == (n,)
-    assert answer.require_points().in_view.all()
+@pytest.mark.parametrize(("n", "factor"), [(0, 1.0), (1, 1.0), (2, 1.0), (2, np.nan)])
+def test_few_points(perceive: Perceiver, n: int, factor: float) -> None:
+    points = factor * np.array([[12.0, 1.0, -1.0, 0.3], [30.0, -2.0, -1.5, 0.1]], np.float32)[:n]
+    answer, is_dropped = perceive(points), np.isnan(factor)
+    assert (answer.n_points, answer.n_dropped) == (n, n * is_dropped)
+    assert answer.require_points().labels.tolist() == [0] * n
+    assert answer.require_points().in_view.tolist() == [not is_dropped] * n
     assert answer.require_top_view().labels.shape == (400, 200)
-    assert answer.boxes == ()
-
-
-def test_only_non_finite_points(perceive: Perceiver) -> None:
-    answer = perceive(np.full((10, 4), np.nan, np.float32))
-    assert answer.n_dropped == 10
-    assert not answer.require_points().in_view.any()
-    assert not answer.require_points().labels.any()
     assert answer.boxes == ()
 
 
@@ -556,7 +548,7 @@ def test_the_road_alone(scan: SimulatedScan) -> None:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "message"),
+    ("arguments", "expected"),
     [
         ({"on_mismatch": "panic"}, "on_mismatch is 'panic'; expected refuse, warn, raise or ignore"),
         ({"score_threshold": 2.0}, "score_threshold is 2.0"),
@@ -578,16 +570,6 @@ def test_the_road_alone(scan: SimulatedScan) -> None:
         ({"models": "ssadnet", "provider": "cpu", "boxes_from": "clusters"}, "range-image model"),
         ({"adapt": "some"}, "adapt is 'some'; expected none, remission, interpolation or both"),
         ({"adapt": "remision"}, r"adapt is 'remision' \(did you mean remission\?\); expected none"),
-    ],
-)
-def test_wrong_options_are_named(arguments: dict[str, object], message: str) -> None:
-    with pytest.raises(OptionError, match=message):
-        Perceiver(**({"models": "pointseg"} | arguments))  # type: ignore[arg-type]
-
-
-@pytest.mark.parametrize(
-    ("arguments", "error"),
-    [
         ({"sensor": "radar"}, SensorError),
         ({"sensor": 5}, SensorError),
         ({"models": "pointsegg"}, ModelFileError),
@@ -597,10 +579,9 @@ def test_wrong_options_are_named(arguments: dict[str, object], message: str) -> 
         ({"precision": "fp4"}, ProviderError),
     ],
 )
-def test_missing_models_sensors_and_providers_have_their_errors(
-    arguments: dict[str, object], error: type[Exception]
-) -> None:
-    with pytest.raises(error):
+def test_wrong_options_have_their_errors(arguments: dict[str, object], expected: str | type[Exception]) -> None:
+    error, message = (OptionError, expected) if isinstance(expected, str) else (expected, None)
+    with pytest.raises(error, match=message):
         Perceiver(**({"models": "pointseg"} | arguments))  # type: ignore[arg-type]
 
 

@@ -124,20 +124,16 @@ class KernelCache:
     @property
     def cache_path(self) -> str | None:
         """The first folder that can be written, or holds this kernel already; None if there is none."""
-        usable = [folder for folder in self.folders() if unusable_because(folder) is None]
-        writable = (folder for folder in usable if _can_be_written(folder) or self._is_in(folder))
+        writable = (folder for folder in self._usable() if _can_be_written(folder) or self._is_in(folder))
         return next(map(str, writable), None)
 
     def is_missing(self) -> bool:
         """Whether no folder holds a compiled form of this kernel, for any types, and one of them can be written."""
-        can_write = False
-        for folder in self.folders() if self.stamp() is not None else ():
-            if unusable_because(folder) is not None:
-                continue
-            if self._is_in(folder):
-                return False
-            can_write |= _can_be_written(folder)
-        return can_write
+        usable = self._usable() if self.stamp() is not None else []
+        return any(map(_can_be_written, usable)) and not any(map(self._is_in, usable))
+
+    def _usable(self) -> list[Path]:
+        return [folder for folder in self.folders() if unusable_because(folder) is None]
 
     def _is_in(self, folder: Path) -> bool:
         """Whether a folder holds a compiled form of this kernel, for any types."""
