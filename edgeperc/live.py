@@ -125,9 +125,8 @@ def stream(
     ...         print(answer.age_s, answer.health, answer.n_dropped, answer.perception.boxes)
     """
     check_rate(rate_hz)
-    for name, age_s in (("late_after_s", late_after_s), ("stale_after_s", stale_after_s)):
-        if not isinstance(age_s, Real | None):
-            raise OptionError(f"{name} is {age_s!r:.80}; expected seconds, or None")
+    if not all(isinstance(age_s, Real | None) for age_s in (late_after_s, stale_after_s)):
+        raise OptionError(f"late_after_s is {late_after_s!r} and stale_after_s {stale_after_s!r}; expected seconds")
     late_s = 2.0 / rate_hz if late_after_s is None else late_after_s
     stale_s = max(5.0 / rate_hz, late_s) if stale_after_s is None else stale_after_s
     if not 0.0 < late_s <= stale_s:

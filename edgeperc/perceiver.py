@@ -468,10 +468,8 @@ class Perceiver:
     @property
     def learned(self) -> Learned:
         """What the scans so far have shown, for a perceiver of the same options elsewhere (`start_from`)."""
-        is_settled = (
-            self._is_sensor_known and self._estimator.is_complete and (self._remission.is_complete or not self._renders)
-        )
-        is_settled = is_settled and self._to_check == 0 and (self._normal.is_complete or self._pipeline is None)
+        parts = [self._is_sensor_known, self._estimator.is_complete, self._remission.is_complete or not self._renders]
+        is_settled = all(parts) and self._to_check == 0 and (self._normal.is_complete or self._pipeline is None)
         estimate = self._sensor_estimate
         return Learned(self._estimator, self._remission, self._to_check, is_settled, estimate, self._normal)
 

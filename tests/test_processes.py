@@ -28,6 +28,7 @@ from edgeperc import EdgepercError, Perceiver
 from edgeperc.inference.providers import available_providers
 from edgeperc.inference.session import Session
 from edgeperc.simulation import random_scene, simulate
+from waiting import until
 
 posix = pytest.mark.skipif(os.name != "posix", reason="forks, signals and limits differ elsewhere")
 
@@ -279,10 +280,6 @@ if __name__ == "__main__":
     context = multiprocessing.get_context("spawn")
     with context.Pool(1) as pool:
         assert (pool.apply(work, (scan,)) == perceive(scan).points.labels).all()
-    try:
-        context.Process(target=perceive, args=(scan,)).start()
-    except edgeperc.EdgepercError as error:
-        print(error)
 """
 
 
@@ -291,7 +288,6 @@ def test_spawned_processes_construct_their_own(tmp_path: Path) -> None:
     script.write_text(SPAWN)
     done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr
-    assert "cannot be pickled or copied; construct it in the process that calls it" in done.stdout
 
 
 def test_a_failed_run_is_not_a_running_one(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -337,19 +333,15 @@ def test_a_signal_ends_the_process_that_decodes_a_capture(tmp_path: Path, number
 
     process = edgeperc_run(write_bag2(tmp_path / "bag"), "--live", "--model", "pointseg")
     try:
-        deadline = time.monotonic() + 100.0
-        while not (decoders := children(process.pid)):
-            assert process.poll() is None, process.communicate()
-            assert time.monotonic() < deadline, "no process decodes the capture"
-            time.sleep(0.01)
+        until(lambda: children(process.pid) or process.poll() is not None)
+        decoders = children(process.pid)
+        assert decoders, process.communicate()
     finally:
         process.send_signal(number)
         process.communicate(timeout=120)
     assert process.returncode == code
-    deadline = time.monotonic() + 60.0
-    while any(Path(f"/proc/{pid}/cmdline").exists() and Path(f"/proc/{pid}/cmdline").read_bytes() for pid in decoders):
-        assert time.monotonic() < deadline, "the process that decodes the capture still runs"
-        time.sleep(0.05)
+    lines = [Path(f"/proc/{pid}/cmdline") for pid in decoders]
+    until(lambda: not any(line.exists() and line.read_bytes() for line in lines))
 
 
 @contextmanager

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import importlib.metadata
 import logging
 from collections.abc import Mapping
 from functools import cache
+from importlib import import_module
 from typing import Any
 
 from ..errors import ProviderError
@@ -55,11 +55,6 @@ def is_of_engine(exc: Exception) -> bool:
     return isinstance(exc, _OF_CPP) or type(exc).__module__.startswith("onnxruntime")
 
 
-def version(package: str) -> str:
-    """Version of an installed package."""
-    return importlib.metadata.version(package.replace("_", "-"))
-
-
 def plugin_devices(ort: Any, short: str) -> list[Any]:
     """Devices of a plugin provider on this computer; empty if its package is not installed or finds none.
 
@@ -75,7 +70,7 @@ def plugin_devices(ort: Any, short: str) -> list[Any]:
 
     if not devices():
         try:
-            library = importlib.import_module(PLUGINS[short]).get_library_path()
+            library = import_module(PLUGINS[short]).get_library_path()
             ort.register_execution_provider_library(name, library)
         except ModuleNotFoundError:
             return []

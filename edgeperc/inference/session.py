@@ -15,6 +15,7 @@ import os
 import threading
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from importlib.metadata import version
 from types import MappingProxyType
 from typing import Any, NoReturn
 
@@ -62,7 +63,6 @@ from .providers import (
     is_of_engine,
     load_onnxruntime,
     plugin_devices,
-    version,
 )
 
 logger = logging.getLogger(__name__)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Any, overload
 
@@ -231,6 +231,7 @@ class Tracks(Sequence[Track]):
         "T_world_sensor",
         "_labels",
         "_rows",
+        "_world",
         "boxes",
         "fronts",
         "ids",
@@ -262,23 +263,16 @@ class Tracks(Sequence[Track]):
         self.ids: Ints64 = rows["id"]
         self.sources: Ints64 = rows["source"]
         self.scores: Floats = 1.0 / (1.0 + np.exp(-rows["score"]))
-        odds = np.abs(_front_odds(rows))
-        self.fronts: Floats = np.where(odds > 0.0, 1.0 / (1.0 + np.exp(-odds)), math.nan)
+        moved = rows["fronts"][:, 0]  # counts from the second scan in which a track moves
+        odds = np.where(np.abs(moved) >= 2.0 * MOVED, moved, 0.0) + rows["fronts"][:, 1]  # that the heading is right
+        self.fronts: Floats = np.where(odds != 0.0, 1.0 / (1.0 + np.exp(-np.abs(odds))), math.nan)
         R, t = T_world_sensor[:3, :3], T_world_sensor[:3, 3]
-        world = self._world_boxes()
-        self.boxes: Floats = world.copy()
+        state, turned = rows["state"], np.where(odds == 0.0, rows["fronts"][:, 2], odds) < 0.0
+        world = np.column_stack([state[:, :2], rows["shape"], wrapped(state[:, 3] + math.pi * turned)])
+        self._world, self.boxes = world, world.copy()
         self.boxes[:, :3] = (world[:, :3] - t) @ R
         cos, sin = np.cos(world[:, 6]), np.sin(world[:, 6])
         self.boxes[:, 6] = np.arctan2(R[0, 1] * cos + R[1, 1] * sin, R[0, 0] * cos + R[1, 0] * sin)
-
-    def _world_boxes(self) -> Floats:
-        state, shape = self._rows["state"], self._rows["shape"]
-        boxes = np.empty((len(state), 7))
-        boxes[:, :2], boxes[:, 2:6] = state[:, :2], shape
-        odds = _front_odds(self._rows)
-        turned = np.where(odds == 0.0, self._rows["fronts"][:, 2], odds) < 0.0
-        boxes[:, 6] = wrapped(state[:, 3] + math.pi * turned)
-        return boxes
 
     @property
     def labels(self) -> list[str]:
@@ -305,7 +299,7 @@ class Tracks(Sequence[Track]):
             label=label,
             score=score,
             box=_box(label, score, self.boxes[index], front),
-            world_box=_box(label, score, self._world_boxes()[index], front),
+            world_box=_box(label, score, self._world[index], front),
             velocity=(state[2] * heading @ self.T_world_sensor[:3, :3])[:2],
             state=state,
             covariance=row["covariance"].copy(),
@@ -314,9 +308,6 @@ class Tracks(Sequence[Track]):
             hits=int(row["hits"]),
             coasting=bool(row["misses"] > 0),
         )
-
-    def __iter__(self) -> Iterator[Track]:
-        return (self[k] for k in range(len(self)))
 
 
 def _box(label: str, score: float, row: Floats, front: float | None) -> Box:
@@ -330,9 +321,3 @@ def strength_of(tracks: Records) -> Floats:
     `DOUBT` scans with log odds 0 are added. If other tracks hide a track, the scan counts by its visible share.
     """
     return np.asarray(tracks["logit_sum"] / (tracks["chances"] + DOUBT))
-
-
-def _front_odds(tracks: Records) -> Floats:
-    """Log odds (n,) that the heading points to the front; motion counts from the second scan in which a track moves."""
-    moved = tracks["fronts"][:, 0]
-    return np.asarray(np.where(np.abs(moved) >= 2.0 * MOVED, moved, 0.0) + tracks["fronts"][:, 1])

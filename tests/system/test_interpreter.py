@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 import edgeperc
-from edgeperc.system.interpreter import interpreter_flags, kept_in_forks
+from edgeperc.system.interpreter import kept_in_forks
 
 ROOT = str(Path(edgeperc.__file__).parent.parent)
 SAYS = f"""
@@ -84,7 +84,3 @@ def test_what_is_kept_ends_in_its_own_process_alone() -> None:
     with os.fdopen(read, "rb") as pipe:
         ended = pipe.read().decode().splitlines()
     assert sorted(ended) == sorted([f"ended in {child}", *[f"ended in {os.getpid()}"] * 2])
-
-
-def test_this_process_has_flags_that_python_takes() -> None:
-    assert {*interpreter_flags()} <= {"-O", "-B", "-S", "-I", "-E", "-s", "-P"}
