@@ -124,8 +124,7 @@ class KernelCache:
     @property
     def cache_path(self) -> str | None:
         """The first folder that can be written, or holds this kernel already; None if there is none."""
-        writable = (folder for folder in self._usable() if _can_be_written(folder) or self._is_in(folder))
-        return next(map(str, writable), None)
+        return next((str(each) for each in self._usable() if _can_be_written(each) or self._is_in(each)), None)
 
     def is_missing(self) -> bool:
         """Whether no folder holds a compiled form of this kernel, for any types, and one of them can be written."""
