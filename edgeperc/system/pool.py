@@ -38,8 +38,8 @@ LAST_S = 5.0  # for a process to end by itself
 class Lost:
     """In place of a result."""
 
-    reason: str  # the traceback of an exception, or that the worker process died
-    error: EdgepercError | None = None  # the exception, if it is one of edgeperc's
+    reason: str  # what an exception says, with its traceback if nobody expected it; or that the worker process died
+    error: EdgepercError | OSError | None = None  # the exception, if it was expected
 
 
 def taken(answer: Any, what: str) -> Any:
@@ -53,8 +53,8 @@ def attempt(function: Callable[[Any], Any], item: bytes) -> bytes:
     """The pickled result, or `Lost`, of a pickled item."""
     try:
         return pickle.dumps(function(pickle.loads(item)))
-    except EdgepercError as exc:
-        return pickle.dumps(Lost(traceback.format_exc(), exc))
+    except (EdgepercError, OSError) as exc:
+        return pickle.dumps(Lost(str(exc), exc))
     except Exception:
         return pickle.dumps(Lost(traceback.format_exc()))
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import time
 from collections.abc import Callable
@@ -10,13 +11,15 @@ __all__ = ["dying", "failing", "scaled", "slowest_first", "without_pickle"]
 
 
 def scaled(factor: int, deadly: tuple[int, ...] = ()) -> Callable[[int], int]:
-    """What processes make: items times a factor; of some items a process dies, and seven cannot be scaled."""
+    """What processes make: items times a factor; of some items a process dies, seven cannot be scaled, eleven not be written."""
 
     def function(item: int) -> int:
         if item in deadly:
             os._exit(3)
         if item == 7:
             raise ValueError("seven")
+        if item == 11:
+            raise OSError(errno.ENOSPC, "disk full")
         return factor * item
 
     return function
