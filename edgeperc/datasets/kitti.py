@@ -265,27 +265,30 @@ class KittiObjects:
             {"name": path.stem, "drive": path.stem} for path in sorted(labels.glob("[!.]*.txt"))
         ]
         self.drives = {row["name"]: row["drive"] for row in rows}
-        rows = [row for row in rows if (labels / f"{row['name']}.txt").exists()]
-        self.rows = [{**row, "grade": row.get("grade") or "A"} for row in rows]
-        if not self.rows:
+        self._grades = {r["name"]: r.get("grade") or "A" for r in rows if (labels / f"{r['name']}.txt").exists()}
+        if not self._grades:
             raise PointsError(f"{self.root} has no training/label_2/*.txt; expected the root of a KITTI object set")
 
     def names(self, split: str, *, fold: int | None = None, grades: str = "A") -> list[str]:
         """Names of the labeled scans of a split (`splits.in_split`) that have one of the ``grades``."""
-        return [r["name"] for r in self.rows if in_split(r["drive"], split, fold) and r["grade"] in grades]
+        of_split = [name for name in self._grades if in_split(self.drives[name], split, fold)]
+        return [name for name in of_split if self._grades[name] in grades]
 
     def unlabeled(self, split: str, *, fold: int | None = None) -> list[str]:
         """Names of the scans of a split that have no label file."""
-        labeled, scans = {row["name"] for row in self.rows}, self.root / "training/velodyne"
-        names = [name for name, drive in self.drives.items() if name not in labeled and in_split(drive, split, fold)]
-        return [name for name in names if (scans / f"{name}.bin").exists()]
+        names = [name for name, drive in self.drives.items() if in_split(drive, split, fold)]
+        return [name for name in names if name not in self._grades and self.files(name)[0].exists()]
+
+    def files(self, name: str) -> tuple[Path, Path]:
+        """The scan of a name, and its calibration."""
+        return self.root / "training/velodyne" / f"{name}.bin", self.root / "training/calib" / f"{name}.txt"
 
     def frame(self, name: str) -> Frame:
-        """Read a labeled scan with its labels and calibration."""
-        row = next(row for row in self.rows if row["name"] == name)
+        """Read a labeled scan with its labels and calibration; raise `PointsError` if there is no such scan."""
+        if name not in self._grades:
+            raise PointsError(f"{self.root} has no labeled scan {name!r:.60}; its names are those of training/label_2")
         labeled = read_labeled(self.root / "training", name)
-        points = read_points(self.root / "training/velodyne" / f"{name}.bin")
-        return Frame(name, row["drive"], row["grade"], points, *labeled)
+        return Frame(name, self.drives[name], self._grades[name], read_points(self.files(name)[0]), *labeled)
 
 
 def _frame_rows(root: Path) -> list[dict[str, str]]:
@@ -302,7 +305,7 @@ def read_drives(table: Path) -> list[dict[str, str]]:
     """Rows of a table of scans, each with at least its ``name`` and its ``drive``. Raises PointsError."""
     try:
         with table.open(newline="", encoding="utf-8-sig") as file:
-            rows = [*csv.DictReader(file)]
+            rows = [*csv.DictReader(file, skipinitialspace=True)]
     except (OSError, UnicodeDecodeError, csv.Error) as exc:
         raise PointsError(f"{table} cannot be read ({exc}); expected columns name and drive") from exc
     nowhere = next((row for row in rows if not (row.get("name") and row.get("drive"))), None)
@@ -395,11 +398,16 @@ class SemanticKitti:
         """Names of the scans of a split (`splits.in_split`), such as ``"00/000123"``."""
         return [name for name, drive in self.drives.items() if in_split(drive, split, fold)]
 
-    def frame(self, name: str) -> RoadFrame:
-        """Read one scan and its labels; raise `PointsError` if their numbers differ."""
+    def files(self, name: str) -> tuple[Path, Path]:
+        """The scan of a name, and its labels."""
         sequence, stem = name.split("/")
         folder = self.root / "sequences" / sequence
-        points = read_points(folder / "velodyne" / f"{stem}.bin")
-        raw = read_numbers(folder / "labels" / f"{stem}.label", len(points))
+        return folder / "velodyne" / f"{stem}.bin", folder / "labels" / f"{stem}.label"
+
+    def frame(self, name: str) -> RoadFrame:
+        """Read one scan and its labels; raise `PointsError` if their numbers differ."""
+        scan, labels_of = self.files(name)
+        points = read_points(scan)
+        raw = read_numbers(labels_of, len(points))
         labels = np.where(np.isin(raw, ROAD_IDS), 1, np.where(np.isin(raw, VEHICLE_IDS), 2, 0))
         return RoadFrame(name, self.drives[name], points, np.where(raw == 0, IGNORE, labels).astype(np.uint8))

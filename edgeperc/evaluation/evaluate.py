@@ -7,6 +7,7 @@ over resampled drives.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -100,6 +101,13 @@ def evaluate(
         A model was trained on a scan, and ``split`` is not ``"train"``.
     """
     check_different(datasets)
+    for root in filter(_is_kitti, map(Path, datasets)):
+        if not any(root.glob("frames*.csv")):
+            warnings.warn(
+                f"{root} has no frames.csv, so each scan counts as a drive of its own: intervals are too narrow, and no "
+                "drive is held back. docs/concepts/measure.md shows how to write it",
+                stacklevel=2,
+            )
     split = split or ("test" if fold is None else "validation")
     job = _Job(tuple(datasets), tuple(models), perceiving, split, fold, road_by, mounted)
     perceive, scans = job.scans()
@@ -196,10 +204,14 @@ def _side_by_side(
     yield from (first[k] for k in range(done, len(scans)))
 
 
+def _is_kitti(root: Path) -> bool:
+    return (root / "training" / "label_2").is_dir()
+
+
 def _folder(dataset: str | Path) -> ScanFolder | None:
     """The labeled scans of any sensor of a dataset; None if it is of another kind."""
     root, (kind, colon, _) = Path(dataset), str(dataset).partition(":")
-    if kind == "simulation" or (root / "training" / "label_2").is_dir() or any(root.glob("sequences/*/labels")):
+    if kind == "simulation" or _is_kitti(root) or any(root.glob("sequences/*/labels")):
         return None
     if not colon and not (root / "scans.json").is_file():
         raise PointsError(
@@ -238,6 +250,12 @@ def _names(
     names = [name for part in parts for name in scans.names(part, fold=fold)]
     if not names:
         raise PointsError(f"{dataset} has no scans of the {split} drives (fold: {fold}); pass another split, or 'all'")
+    files = ((name, file) for name in names if not isinstance(scans, ScanFolder) for file in scans.files(name))
+    if lacking := {name: file for name, file in files if not file.exists()}:  # now, not after hours
+        raise PointsError(
+            f"{dataset}: of {len(names):,} labeled scans {len(lacking):,} lack a file, such as "
+            f"{next(iter(lacking.values()))}; add it, or take away the labels of these scans"
+        )
     return names
 
 
@@ -250,7 +268,7 @@ def _scans(judge: Judge, dataset: str | Path, split: str, fold: int | None) -> l
     if str(dataset).partition(":")[0] == "simulation":
         return later("simulated", judge.simulated, seeds_of(str(dataset)))
     root = Path(dataset)
-    if (root / "training" / "label_2").is_dir():
+    if _is_kitti(root):
         objects = KittiObjects(root)
         return later("real", lambda name: judge.kitti(objects.frame(name)), _names(dataset, objects, split, fold))
     roads = SemanticKitti(root)

@@ -259,7 +259,7 @@ def test_every_table_of_frames_is_read_and_unknown_drives_are_left_out(tmp_path:
     for name in ("000000", "000001", "000002", "._000000"):  # the last one of macOS, on a disk of another system
         (tmp_path / f"training/label_2/{name}.txt").touch()
     assert KittiObjects(tmp_path).names("test") == ["000000", "000001", "000002"]  # no table: drives of their own
-    (tmp_path / "frames.csv").write_text("name,drive,grade\n000000,2011_09_26_drive_0011,A\n")
+    (tmp_path / "frames.csv").write_text("name, drive, grade\n000000, 2011_09_26_drive_0011, A\n")
     (tmp_path / "frames-2.csv").write_text("name,drive,grade\n000001,2011_09_26_drive_0001,B\n")
     objects = KittiObjects(tmp_path)
     assert objects.drives == {"000000": "2011_09_26_drive_0011", "000001": "2011_09_26_drive_0001"}
@@ -268,6 +268,8 @@ def test_every_table_of_frames_is_read_and_unknown_drives_are_left_out(tmp_path:
     assert KittiObjects(tmp_path).names("validation") == ["000001"]  # not graded
     assert objects.names("validation", grades="AB") == ["000001"]
     assert objects.names("all", grades="AB") == ["000000", "000001"]  # nobody knows the drive of 000002
+    with pytest.raises(PointsError, match="no labeled scan '000002'"):
+        objects.frame("000002")
     for text in ("name,drive\n000002,\n", "name,day\n000002,26\n"):
         (tmp_path / "frames-2.csv").write_text(text)
         with pytest.raises(PointsError, match="expected columns name and drive"):
@@ -291,7 +293,7 @@ def test_every_named_drive_has_one_place() -> None:
 
 def test_drives_are_never_shared(kitti_root: Path) -> None:
     objects = KittiObjects(kitti_root)
-    drive = {r["name"]: r["drive"] for r in objects.rows}
+    drive = objects.drives
     train, test = (objects.names(s, grades="AB") for s in ("train", "test"))
     validation = objects.names("validation", grades="AB")
     assert sorted(train + validation + test) == sorted(objects.names("all", grades="AB"))

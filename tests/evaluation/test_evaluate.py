@@ -738,8 +738,16 @@ def test_scans_of_a_split(world: World, tmp_path: Path) -> None:
 
 
 def test_scans_of_drives_listed_nowhere_are_evaluated(world: World, tmp_path: Path) -> None:
-    result, _ = evaluate.evaluate([kitti_set(tmp_path)], ["pointseg"])
+    root = kitti_set(tmp_path)
+    with pytest.warns(UserWarning, match=r"no frames\.csv, so each scan counts as a drive"):
+        result, _ = evaluate.evaluate([root], ["pointseg"])
     assert result["real"]["n_drives"] == 2
+    (root / "training/calib/000001.txt").unlink()
+    with (
+        pytest.warns(UserWarning, match="no frames"),
+        pytest.raises(PointsError, match=r"of 2 labeled scans 1 lack a file, such as .*calib.000001\.txt"),
+    ):
+        evaluate.evaluate([root], ["pointseg"])
 
 
 @pytest.mark.parametrize("guilty", ["pointseg", "lodnn"])
