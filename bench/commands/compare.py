@@ -36,6 +36,8 @@ def run_command(arguments: argparse.Namespace) -> int:
         )
     if a["machine"]["fingerprint"] != b["machine"]["fingerprint"]:
         print_line(f"different machines: A on {a['machine']['cpu']}, B on {b['machine']['cpu']}")
+    if a["input"]["sensor"] != b["input"]["sensor"]:
+        print_line(f"different sensors: A as of {a['input']['sensor']}, B as of {b['input']['sensor']}")
     verdicts = []
     for one, other in _pairs(a["settings"], b["settings"]):
         for name in scenario_names(one):

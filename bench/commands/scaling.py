@@ -87,7 +87,7 @@ def run_command(arguments: argparse.Namespace) -> int:
         for n in arguments.processes or sorted({*(2**k for k in range(cores.bit_length())), cores}):
             offline(setting, job, [scan], n, limits, document, live)
         curves["processes"] = [(each["processes"], each["scans_per_s"] or math.nan) for each in setting["offline"]]
-        one = curves["processes"][0][1] / curves["processes"][0][0]
+        one = dict(curves["processes"]).get(1, math.nan)
         rows = [[f"{n}", number(rate), number(rate / one)] for n, rate in curves["processes"]]
         head = ["processes", "scans/s", "times one"]
         document["tables"].append({"title": "Growth with processes", "sentences": [], "head": head, "rows": rows})

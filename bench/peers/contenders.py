@@ -104,10 +104,10 @@ def groups(
     models are paired with top-view models in order. ``scan`` is the input of networks alone.
     """
     points, _ = condition(np.load(scan), get_sensor(sensor), rendered=False)
-    views: dict[str, list[Variant]] = {"range_image": [], "top_view": [], "camera": [], "objects": []}
+    views: dict[str, list[Variant]] = {"range_image": [], "top_view": [], "camera": []}
     for name in models:
         variant = resolve(name)[0]
-        views[variant.card.view.kind].append(variant)
+        views.setdefault(variant.card.view.kind, []).append(variant)
     tables: dict[str, list[Contender]] = {}
     for variant in (*views["range_image"], *views["top_view"], *views["camera"]):
         card, paths = variant.card, (variant.path,)

@@ -19,7 +19,7 @@ from unittest.mock import patch
 import numpy as np
 from numpy.typing import NDArray
 
-from edgeperc import ModelCard, Perceiver
+from edgeperc import ModelCard, ModelError, Perceiver
 from edgeperc.inference.session import Session
 from edgeperc.types.sensor import get_sensor
 from edgeperc.zoo import DEFAULT, listed
@@ -211,6 +211,11 @@ def run(
             document["software"][package] = version
     if "engines" in arguments.tables:
         measuring = groups(models, arguments.provider, arguments.precision, folder, files[0], arguments.sensor)
+        if arguments.model and not measuring:
+            raise ModelError(
+                f"other engines do not run {', '.join(models)} as it is; pass a range-image, top-view or camera model, "
+                "or --tables methods"
+            )
     if "methods" in arguments.tables:
         note("writing the networks of others with random weights")
         measuring[METHODS] = methods(folder)

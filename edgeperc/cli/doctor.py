@@ -71,7 +71,8 @@ def doctor_command(arguments: argparse.Namespace) -> int:
         for folder in sorted({parent for file in files for parent in [*file.parents][:3]}, reverse=True):
             if folder.is_dir() and not any(folder.iterdir()):
                 folder.rmdir()
-        print_line(f"deleted {many(len(files), 'file')}, {n_bytes / 1e6:.1f} MB; the next start compiles again")
+        said = f"deleted {many(len(files), 'file')}, {n_bytes / 1e6:.1f} MB; the next start compiles again"
+        print_line(json.dumps({"deleted": len(files), "bytes": n_bytes}) if arguments.json else said)
         return 0
     findings = [*examine()]
     broken = [finding for finding in findings if finding.state == "broken"]

@@ -104,8 +104,8 @@ def evaluate(
     for root in filter(_is_kitti, map(Path, datasets)):
         if not any(root.glob("frames*.csv")):
             warnings.warn(
-                f"{root} has no frames.csv, so each scan counts as a drive of its own: intervals are too narrow, and no "
-                "drive is held back. docs/concepts/measure.md shows how to write it",
+                f"{root} has no frames.csv, so each scan counts as a drive: intervals are too narrow, and none is held "
+                "back. docs/concepts/measure.md shows how to write it",
                 stacklevel=2,
             )
     split = split or ("test" if fold is None else "validation")

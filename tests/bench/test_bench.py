@@ -238,7 +238,7 @@ def reports(tmp_path: Path) -> Any:
     return written
 
 
-def test_compare_answers_by_its_exit_code(reports: Any, capsys: pytest.CaptureFixture[str]) -> None:
+def test_compare_answers_by_its_exit_code(reports: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     a = reports("a.json", 20.0, 20.1)
     assert cli.main(["compare", a, reports("same.json", 20.05, 19.95)]) == 0
     assert "no difference" in capsys.readouterr().out
@@ -250,6 +250,11 @@ def test_compare_answers_by_its_exit_code(reports: Any, capsys: pytest.CaptureFi
     assert "--repeats" in capsys.readouterr().out
     assert cli.main(["compare", a, reports("other.json", 20.0, 20.1, sha256="t")]) == 2
     assert "different scans" in capsys.readouterr().err
+    other = plain(document(20.0, 20.1))
+    other["input"]["sensor"] = "os1-64"
+    write_report(other, tmp_path / "b.json")
+    assert cli.main(["compare", a, str(tmp_path / "b.json")]) == 0
+    assert "different sensors: A as of hdl-64e, B as of os1-64" in capsys.readouterr().out
     assert cli.main(["compare", a, "nowhere.json"]) == 2
     assert "nowhere.json" in capsys.readouterr().err
 
@@ -497,7 +502,7 @@ def test_scaling_measures_points_cars_sizes_and_processes(
         monkeypatch.setattr(
             "edgeperc_bench.peers.networks.resized", lambda *asked: made.append(asked) or tmp_path / "n"
         )
-    options = ["scaling", "--points", "1000,2000,4000", "--cars", "0,2", "--sizes", "100", "--processes", "1,2"]
+    options = ["scaling", "--points", "1000,2000,4000", "--cars", "0,2", "--sizes", "100", "--processes", "2,1"]
     options += ["--min-scans", "20"]
     plot = tmp_path / "new" / "growth.svg"
     assert cli.main([*options, "--min-seconds", "0", "--plot", str(plot), "--json", str(tmp_path / "s.json")]) == 0
@@ -506,8 +511,9 @@ def test_scaling_measures_points_cars_sizes_and_processes(
         ["1,000", "2,000", "4,000"],
         ["0", "2"],
         ["100"] if HAS_EXPORT else [],
-        ["1", "2"],
+        ["2", "1"],
     ]
+    assert tables[3]["rows"][1][2] == "1.00"  # times one process, whatever the first count is
     assert HAS_EXPORT or "edgeperc[export]" in tables[2]["sentences"][0]
     assert [share for _, share, _ in made] == [1.0] * len(made)
     assert bool(made) == HAS_EXPORT

@@ -636,6 +636,12 @@ def test_what_is_missing_is_reported(
     assert "Floor: ssadnet:fp32" in printed
 
 
+def test_a_model_that_no_other_engine_runs_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("psutil")
+    assert cli.main(["peers", "--tables", "engines", "--model", "objects", "--scans", "1"]) == 2
+    assert "other engines do not run objects as it is" in capsys.readouterr().err
+
+
 def test_a_contender_that_fails_does_not_stop_the_others(tmp_path: Path) -> None:
     pytest.importorskip("psutil")
     (tmp_path / "broken.onnx").write_bytes(b"no model")

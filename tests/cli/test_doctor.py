@@ -284,6 +284,8 @@ def test_clean_leaves_nothing_of_edgeperc_and_all_of_others(
     left = {file for file in tmp_path.rglob("*") if file.is_file()}
     assert left == {*others}
     assert not cache.exists()
+    assert run("doctor", "--clean", "--json") == 0
+    assert json.loads(capsys.readouterr().out) == {"deleted": 0, "bytes": 0}
 
 
 def test_the_packages_are_where_they_are_imported_from() -> None:

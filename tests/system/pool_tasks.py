@@ -11,7 +11,7 @@ __all__ = ["dying", "failing", "scaled", "slowest_first", "without_pickle"]
 
 
 def scaled(factor: int, deadly: tuple[int, ...] = ()) -> Callable[[int], int]:
-    """What processes make: items times a factor; of some items a process dies, seven cannot be scaled, eleven not be written."""
+    """What processes make: items times a factor; of some items a process dies, and 7 and 11 cannot be scaled."""
 
     def function(item: int) -> int:
         if item in deadly:
