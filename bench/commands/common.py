@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from edgeperc.cli.output import lines_last
+from edgeperc.cli.output import lines_last, make_places
 from edgeperc.system.atomic import write_atomic
 from edgeperc.system.extras import require
 from edgeperc.system.machine import fingerprint
@@ -32,8 +32,7 @@ def new_document(kind: str, arguments: argparse.Namespace) -> Iterator[tuple[dic
     html = getattr(arguments, "html", None)  # not every command has a page
     if html:
         require("matplotlib", "view", "A page with plots")
-    for file in filter(None, (arguments.json, arguments.markdown, html)):
-        file.parent.mkdir(parents=True, exist_ok=True)
+    make_places(arguments.json, arguments.markdown, html)
     hardware = context.machine()
     document: dict[str, Any] = {
         "schema": SCHEMA,

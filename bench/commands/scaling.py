@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from edgeperc.cli.output import make_places
 from edgeperc.system.atomic import write_atomic
 from edgeperc.system.extras import require
 
@@ -63,7 +64,7 @@ def run_command(arguments: argparse.Namespace) -> int:
 
     if arguments.plot:
         require("matplotlib", "view", "Drawing the curves")
-        arguments.plot.parent.mkdir(parents=True, exist_ok=True)
+    make_places(arguments.plot)
     limits = limits_of(arguments)
     limits = replace(limits, warm_up_scans=min(limits.warm_up_scans, 5))
     with new_document("scaling", arguments) as (document, live, folder):

@@ -14,6 +14,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, TextIO
 
+from ..errors import OptionError
 from ..system.atomic import write_atomic
 from ..system.printable import printable
 
@@ -157,11 +158,22 @@ def lines_last(lines: Sequence[str], *, gray: bool = False) -> Iterator[None]:
             print_line(line, gray=gray and FEW in line)
 
 
+def make_places(*files: Path | None) -> None:
+    """Make the folders of files that are written at the end, and refuse what cannot be one: before the work, which may
+    take hours. Raises OptionError.
+    """
+    for file in filter(None, files):
+        file.parent.mkdir(parents=True, exist_ok=True)
+        if file.is_dir():
+            raise OptionError(f"{file} is a folder; expected the name of a file, which may be in it")
+        if not file.exists() and not os.access(file.parent, os.W_OK):
+            raise OptionError(f"{file} cannot be written: its folder is read-only; expected a file in another one")
+
+
 def write_figures(arguments: argparse.Namespace, figures: Mapping[str, Any]) -> None:
     """Write all figures, and the command line that produced them, to the file of ``--json``, if it was passed."""
     path: Path | None = arguments.json
     if path is not None:
-        path.parent.mkdir(parents=True, exist_ok=True)
         text = json.dumps({"command": arguments.typed, **figures}, indent=1, allow_nan=False)
         write_atomic(path, f"{text}\n".encode())
 

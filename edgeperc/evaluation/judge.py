@@ -399,6 +399,7 @@ def check_unseen(trained_on: Mapping[str, set[str]], name: str, drive: str, poin
     for model, hashes in trained_on.items():
         if digest in hashes:
             raise SplitError(
-                f"{model} was trained on scan {name} of drive {drive}, so figures on it are too good; evaluate the "
-                "test split, or models trained without this drive (--model), or ask for split 'train'"
+                f"{model} was trained on scan {name} of drive {drive}, so figures on it are too good; evaluate drives "
+                "that were held back, or models trained without this drive (--model), or, with 'edgeperc eval', split "
+                "'train'"
             )

@@ -877,6 +877,17 @@ def test_figures_are_written_though_nobody_reads_the_table(tmp_path: Path, monke
     assert picture.exists()
 
 
+def test_where_figures_cannot_be_written_is_said_before_the_work(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("edgeperc.evaluation.evaluate.evaluate", Mock(side_effect=AssertionError("hours of work")))
+    assert cli.main(["eval", "simulation:1", "--json", str(tmp_path)]) == 2
+    assert f"{tmp_path} is a folder; expected the name of a file" in capsys.readouterr().err
+    monkeypatch.setattr("os.access", lambda *_: False)
+    assert cli.main(["eval-painting", "--json", str(tmp_path / "a.json")]) == 2
+    assert "its folder is read-only" in capsys.readouterr().err
+
+
 def test_figures_of_few_objects_are_gray_on_a_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("NO_COLOR", raising=False)
     for stream, gray, expected in (

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 
 from ..arguments import Commands, add_command, add_figures_file, options
-from ..output import lines_last, many, progress, table_lines, write_figures
+from ..output import lines_last, make_places, many, progress, table_lines, write_figures
 
 # Places of the camera in the LiDAR's frame: as on KITTI's car, and behind a windscreen below a LiDAR on the roof.
 _PLACES = {"0.3 m": (0.27, 0.0, -0.08), "0.9 m": (0.5, 0.5, -0.6)}
@@ -51,6 +51,7 @@ def eval_painting_command(arguments: argparse.Namespace) -> int:
     """Print shares of points and cells."""
     from ...evaluation.painting import evaluate_painting
 
+    make_places(arguments.json)
     figures, rows = {}, []
     with progress() as show:
         for sensor in arguments.sensor or ("hdl-64e", "os1-64", "vlp-16"):

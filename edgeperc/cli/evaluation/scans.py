@@ -20,7 +20,7 @@ from ..arguments import (
     finite_number,
     options,
 )
-from ..output import FEW, lines_last, many, progress, table_lines, write_figures
+from ..output import FEW, lines_last, make_places, many, progress, table_lines, write_figures
 from ..side_by_side import add_engine, has_workers
 from .box_tables import box_table_lines, interval_columns
 
@@ -102,8 +102,7 @@ def eval_command(arguments: argparse.Namespace) -> int:
     """Compare models with labeled scans."""
     if arguments.worst is not None:
         require("matplotlib", "view", "Drawing a picture")
-    for file in filter(None, (arguments.json, arguments.worst)):
-        file.parent.mkdir(parents=True, exist_ok=True)
+    make_places(arguments.json, arguments.worst)
     from ...datasets.images import LabeledImages
 
     of_images = [Path(dataset) for dataset in arguments.datasets if LabeledImages.is_one(Path(dataset))]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 
 from ..arguments import Commands, add_command, add_figures_file, add_provider, options, positive
-from ..output import FEW, lines_last, many, progress, table_lines, write_figures
+from ..output import FEW, lines_last, make_places, many, progress, table_lines, write_figures
 from .box_tables import box_table_lines
 
 
@@ -56,6 +56,7 @@ def add_parser(commands: Commands) -> None:
 
 def eval_sensors_command(arguments: argparse.Namespace) -> int:
     """Print IoU of points on other sensors, or which sensors are found."""
+    make_places(arguments.json)
     if arguments.find:
         return _find(arguments)
     from ...evaluation.transfer import compare

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from ...errors import PointsError
 from ...system.extras import require
 from ..arguments import Commands, add_command, add_figures_file, add_networks, add_sensor, options, positive_number
-from ..output import lines_last, many, progress, table_lines, without_nan, write_figures
+from ..output import lines_last, make_places, many, progress, table_lines, without_nan, write_figures
 from ..run import make_perceiver
 
 if TYPE_CHECKING:
@@ -92,8 +92,7 @@ def eval_tracking_command(arguments: argparse.Namespace) -> int:
     if arguments.boxes is not None and len(arguments.sequences or ()) != 1:
         arguments.usage_error("--boxes holds the boxes of one sequence; name it with --sequences SEQ")
     arguments.classes = [*dict.fromkeys(arguments.classes)]
-    for file in filter(None, (arguments.json, arguments.gif)):
-        file.parent.mkdir(parents=True, exist_ok=True)
+    make_places(arguments.json, arguments.gif)
     from ...evaluation.tracking import evaluate_kitti, sequence_names
     from ...records import read_boxes
 
