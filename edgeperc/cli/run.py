@@ -225,7 +225,6 @@ def run_command(arguments: argparse.Namespace) -> int:
     targets = [arguments.out / name for name in names] if kinds else [Path()] * len(scans)
     _check_outputs(arguments, kinds, images, scans, targets)
     perceivers = _Perceivers(arguments)
-    local = [scan for scan in scans if isinstance(scan, Path)]
     perceivers.check([*filter(None, images.values())] if images else scans, of_images=bool(images))
     if kinds and isinstance(arguments.out, Path):
         _make_folders(arguments.out, targets)
@@ -239,8 +238,6 @@ def run_command(arguments: argparse.Namespace) -> int:
     with progress("file") as show, Sinks(arguments) as sinks:
         run = _Run(arguments, perceivers, kinds, sinks)
         if has_workers(arguments):
-            if arguments.sensor in (None, AUTO_SENSOR):  # of the first scans, for all workers
-                arguments.sensor = perceivers.sensor_of((local or scans)[0]) if scans else stated_sensor(arguments)
             perceive_side_by_side(arguments, _alone, perceivers, scans, targets, report, show)
         for done, (scan, target) in enumerate(() if has_workers(arguments) else zip(scans, targets, strict=True)):
             show(done, len(scans))

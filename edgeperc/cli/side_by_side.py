@@ -16,6 +16,8 @@ import tempfile
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import astuple, dataclass
+from functools import partial
+from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -25,6 +27,7 @@ from ..system.atomic import write_atomic
 from ..system.pool import MOST_FIRST, Lost
 from ..system.ray_cluster import ENGINES
 from ..system.remote import Remote
+from ..types.choices import AUTO_SENSOR
 from .arguments import options, positive
 from .output import many, one_line, print_line
 from .report import Report
@@ -109,9 +112,40 @@ def perceive_side_by_side(
     report: Report,
     show: Callable[[int, int], None],
 ) -> None:
-    """Perceive scan files in worker processes, and report them in their order. ``.run/NAME.json`` next to a scan's
-    files says what they were made of; a later run keeps those that are the same and complete, but the first scans.
+    """Perceive scan files in worker processes, and report them in their order, those of one sensor after
+    those of another. ``.run/NAME.json`` next to a scan's files says what they were made of; a later run keeps those
+    that are the same and complete, but the first scans.
     """
+
+    def sensor_of(pair: tuple[Path | Remote, Path | Remote]) -> Any:
+        if arguments.sensor not in (None, AUTO_SENSOR):
+            return arguments.sensor
+        try:
+            return perceivers.sensor_of(pair[0])
+        except (EdgepercError, OSError) as exc:
+            return exc
+
+    done = 0
+    for sensor, pairs in groupby(zip(scans, targets, strict=True), sensor_of):
+        own, places = zip(*pairs, strict=True)
+        if isinstance(sensor, Exception):
+            report.add(own[0], sensor)
+        else:
+            given = argparse.Namespace(**{**vars(arguments), "sensor": sensor})
+            shown = partial(lambda before, n, _: show(before + n, len(scans)), done)
+            _perceive_one_sensor(given, alone, perceivers, own, places, report, shown)
+        done += len(own)
+
+
+def _perceive_one_sensor(
+    arguments: argparse.Namespace,
+    alone: Alone,
+    perceivers: Any,
+    scans: Sequence[Path | Remote],
+    targets: Sequence[Path | Remote],
+    report: Report,
+    show: Callable[[int, int], None],
+) -> None:
     perceive, run, _ = alone(arguments, perceivers)
     n_first = 0
     while n_first < min(len(scans), MOST_FIRST) and not perceive.learned.is_settled:

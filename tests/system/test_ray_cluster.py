@@ -18,6 +18,7 @@ from urllib.request import Request, urlopen
 import numpy as np
 import pytest
 
+from cli_helpers import write_scan
 from edgeperc import cli
 from edgeperc.cli import side_by_side
 from edgeperc.cli.main import build_parser
@@ -111,15 +112,29 @@ def test_workers_give_the_same_bytes(scans: Path, alone: Any, tmp_path: Path, wo
     assert "6.bin" in said
 
 
-def test_what_workers_have_made_is_kept(
-    scans: Path, alone: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """What is missing, cut short, or of other options is made again. Workers of this process decide it as others do."""
+@pytest.fixture
+def here(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Workers are of this process, and decide as others do."""
 
     def map_here(make: Callable[..., Any], arguments: tuple[Any, ...], items: list[Any], **_: Any) -> Iterator[Any]:
         return map(make(*arguments), items)
 
     monkeypatch.setattr(side_by_side, "ENGINES", {"local": map_here})
+
+
+def test_workers_find_the_sensor_of_each_folder(here: None, tmp_path: Path) -> None:
+    folders = [tmp_path / name for name in ("os1-64", "unknown", "vlp-16")]
+    write_scan(folders[1] / "0.bin", 5000)
+    for folder in (folders[0], folders[2]):
+        folder.mkdir()
+        urban(3, folder.name).points.tofile(folder / "0.bin")
+    code, records, said = run(*folders)
+    assert ("sensor cannot be told" in said, code) == (True, 1)
+    assert run(*folders, "--workers", "2")[:2] == (code, records)
+
+
+def test_what_workers_have_made_is_kept(scans: Path, alone: Any, here: None, tmp_path: Path) -> None:
+    """What is missing, cut short, or of other options is made again."""
     arguments = (scans, "--out", tmp_path, *FILES, "--workers", "2")
     assert "kept" not in run(*arguments)[2]
     (tmp_path / "5.ply").unlink()
