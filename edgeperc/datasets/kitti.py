@@ -292,9 +292,9 @@ class KittiObjects:
 
 
 def _frame_rows(root: Path) -> list[dict[str, str]]:
-    """Rows of ``frames.csv`` and ``frames-*.csv``; an empty list without a table."""
-    tables = (root / "frames.csv", *sorted(root.glob("frames-*.csv")))
-    rows = [row for table in tables if table.exists() for row in read_drives(table)]
+    """Rows of ``frames.csv`` and ``frames-*.csv``; an empty list without a table. KITTI's kit adds _sync to drives."""
+    tables = (table for table in (root / "frames.csv", *sorted(root.glob("frames-*.csv"))) if table.exists())
+    rows = [row | {"drive": row["drive"].removesuffix("_sync")} for table in tables for row in read_drives(table)]
     _check_once(rows, root / "frames*.csv")
     for row in rows:
         check_file(f"{root}: a scan in frames.csv is called", row["name"], PointsError)

@@ -259,7 +259,7 @@ def test_every_table_of_frames_is_read_and_unknown_drives_are_left_out(tmp_path:
     for name in ("000000", "000001", "000002", "._000000"):  # the last one of macOS, on a disk of another system
         (tmp_path / f"training/label_2/{name}.txt").touch()
     assert KittiObjects(tmp_path).names("test") == ["000000", "000001", "000002"]  # no table: drives of their own
-    (tmp_path / "frames.csv").write_text("name, drive, grade\n000000, 2011_09_26_drive_0011, A\n")
+    (tmp_path / "frames.csv").write_text("name, drive, grade\n000000, 2011_09_26_drive_0011_sync, A\n")
     (tmp_path / "frames-2.csv").write_text("name,drive,grade\n000001,2011_09_26_drive_0001,B\n")
     objects = KittiObjects(tmp_path)
     assert objects.drives == {"000000": "2011_09_26_drive_0011", "000001": "2011_09_26_drive_0001"}
