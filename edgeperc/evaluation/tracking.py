@@ -207,8 +207,9 @@ def _read_detections(
     image_boxes: list[list[Floats]] = [[] for _ in range(n_frames)]
     for label in classes:
         folders = sorted((root / "detections").glob(f"*_{label.capitalize()}"))
-        if not folders:
-            raise TrackingError(f"{root}/detections has no folder *_{label.capitalize()}; expected one for each class")
+        if len(folders) != 1:
+            names = ", ".join(folder.name for folder in folders) or "none"
+            raise TrackingError(f"{root}/detections: expected one folder *_{label.capitalize()}, got {names}")
         path = folders[0] / f"{name}.txt"
         try:
             lines = [line.split(",") for line in path.read_text().splitlines() if line.strip()]

@@ -230,6 +230,9 @@ def test_kitti_errors(kitti: Path, tmp_path: Path) -> None:
     (kitti / "detections/pointrcnn_Car/0000.txt").write_text("0,2,100\n")
     with pytest.raises(TrackingError, match="15 comma-separated"):
         tracking.read_sequence(kitti, "0000")
+    (kitti / "detections/other_Car").mkdir()
+    with pytest.raises(TrackingError, match=r"one folder \*_Car, got other_Car, pointrcnn_Car"):
+        tracking.read_sequence(kitti, "0000")
     (kitti / "label_02/0000.txt").write_text("0 1 Car\n")
     with pytest.raises(TrackingError, match="17 columns"):
         tracking.read_sequence(kitti, "0000")
