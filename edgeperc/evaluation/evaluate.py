@@ -8,7 +8,7 @@ over resampled drives.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import groupby
@@ -27,7 +27,7 @@ from ..zoo import DEFAULT
 from .judge import BY_DEFAULT, NETWORK_ALONE, Judge, Perceiving
 from .mistakes import Mistakes
 from .tables import Record, figures
-from .truth import Truth, check_different, seeds_of
+from .truth import check_different, seeds_of
 
 __all__ = ["NETWORK_ALONE", "Perceiving", "evaluate"]
 
@@ -156,10 +156,11 @@ class _Job:
         scans: list[_Scan] = []
         for folder in folders.values():
             judges.append(judge_of(sensor=folder.layout.sensor))
-            scans += _folder_scans(judges[-1], folder, split, fold)
+            scans += _scans(judges[-1], folder.root, folder, split, fold)
         if len(folders) < len(self.datasets):
             judges.append(judge_of(road_by=self.road_by, mounted=self.mounted))
-            scans += [s for d in self.datasets if str(d) not in folders for s in _scans(judges[-1], d, split, fold)]
+            others = (dataset for dataset in self.datasets if str(dataset) not in folders)
+            scans += [scan for other in others for scan in _scans(judges[-1], other, None, split, fold)]
         return judges[-1].perceive, scans
 
 
@@ -235,42 +236,36 @@ def _check_names(folders: Sequence[ScanFolder]) -> None:
                 )
 
 
-def _folder_scans(judge: Judge, folder: ScanFolder, split: str, fold: int | None) -> list[_Scan]:
-    block = f"{OF_FOLDER}{folder.layout.name}"
-    return [
-        (block, folder.drives[name], partial(lambda name: judge.record_scan(folder.frame(name)), name))
-        for name in _names(folder.root, folder, split, fold)
-    ]
-
-
-def _names(
-    dataset: str | Path, scans: ScanFolder | KittiObjects | SemanticKitti, split: str, fold: int | None
-) -> list[str]:
+def _names(scans: ScanFolder | KittiObjects | SemanticKitti, split: str, fold: int | None) -> list[str]:
     parts = ("validation", "test") if split == "held-back" else (split,)
     names = [name for part in parts for name in scans.names(part, fold=fold)]
     if not names:
-        raise PointsError(f"{dataset} has no scans of the {split} drives (fold: {fold}); pass another split, or 'all'")
-    files = ((name, file) for name in names if not isinstance(scans, ScanFolder) for file in scans.files(name))
+        raise PointsError(
+            f"{scans.root} has no scans of the {split} drives (fold: {fold}); pass another split, or 'all'"
+        )
+    files = [] if isinstance(scans, ScanFolder) else [(name, file) for name in names for file in scans.files(name)]
     if lacking := {name: file for name, file in files if not file.exists()}:  # now, not after hours
         raise PointsError(
-            f"{dataset}: of {len(names):,} labeled scans {len(lacking):,} lack a file, such as "
+            f"{scans.root}: of {len(names):,} labeled scans {len(lacking):,} lack a file, such as "
             f"{next(iter(lacking.values()))}; add it, or take away the labels of these scans"
         )
     return names
 
 
-def _scans(judge: Judge, dataset: str | Path, split: str, fold: int | None) -> list[_Scan]:
-    """For each scan of the other kinds: its block of figures, and a function that evaluates it."""
-
-    def later(block: str, truth_of: Callable[[Any], Truth], names: Iterable[Any]) -> list[_Scan]:
-        return [(block, None, partial(lambda name: judge.record(truth_of(name)), name)) for name in names]
-
-    if str(dataset).partition(":")[0] == "simulation":
-        return later("simulated", judge.simulated, seeds_of(str(dataset)))
-    root = Path(dataset)
-    if _is_kitti(root):
-        objects = KittiObjects(root)
-        return later("real", lambda name: judge.kitti(objects.frame(name)), _names(dataset, objects, split, fold))
-    roads = SemanticKitti(root)
-    names = _names(dataset, roads, split, fold)
-    return later("semantickitti", lambda name: judge.semantickitti(roads.frame(name)), names)
+def _scans(judge: Judge, dataset: str | Path, folder: ScanFolder | None, split: str, fold: int | None) -> list[_Scan]:
+    """The scans of a data set, which may be a ``folder``."""
+    scans: ScanFolder | KittiObjects | SemanticKitti
+    record: Callable[[Any], _Figures]
+    if folder is not None:
+        block, scans, record = f"{OF_FOLDER}{folder.layout.name}", folder, judge.record_scan
+    elif str(dataset).partition(":")[0] == "simulation":
+        seeds = seeds_of(str(dataset))
+        return [("simulated", None, partial(lambda seed: judge.record(judge.simulated(seed)), seed)) for seed in seeds]
+    elif _is_kitti(Path(dataset)):
+        block, scans, record = "real", KittiObjects(dataset), lambda frame: judge.record(judge.kitti(frame))
+    else:
+        block, scans = "semantickitti", SemanticKitti(dataset)
+        record = lambda frame: judge.record(judge.semantickitti(frame))  # noqa: E731
+    drives = {} if folder is None else folder.drives
+    names = _names(scans, split, fold)
+    return [(block, drives.get(name), partial(lambda name: record(scans.frame(name)), name)) for name in names]

@@ -137,6 +137,18 @@ def evaluated(judge: Judge, *frames: kitti.Frame, n_resamples: int = 50) -> dict
     return figures([judge.record(judge.kitti(each))[0] for each in frames], n_resamples)
 
 
+def tally(rows: dict[str, Any], *names: str) -> dict[str, list[int]]:
+    """Boxes to find, boxes that were found, and hits, by class."""
+    return {name: [rows[name][k] for k in ("n_truth", "n_predicted", "n_hits")] for name in names or rows}
+
+
+def road_scan(*labels: int) -> tuple[kitti.RoadFrame, np.ndarray]:
+    """A row of labeled points 20 m ahead, and the columns of their cells."""
+    y = 5.05 - np.arange(len(labels))
+    points = np.array([(20.05, at, -1.7, 0.0) for at in y], np.float32)
+    return kitti.RoadFrame("00/000000", "b", points, np.array(labels, np.uint8)), np.floor((10.0 - y) / 0.1).astype(int)
+
+
 def test_points_by_hand(world: World) -> None:
     near, far, rider, van = box(10, 0), box(40, 4), box(20, -3, "cyclist"), box(60, 0, "van")
     points = [
@@ -192,19 +204,15 @@ def test_boxes_by_hand(world: World) -> None:
     for kind in ("upright", "oriented"):
         every = table[kind]["all"]
         assert {key for key in every if not key.startswith("mean")} == {"car", "van", "vehicle"}
-        assert [every["vehicle"][k] for k in ("n_truth", "n_predicted", "n_hits")] == [3, 4, 3]
-        assert [every["car"][k] for k in ("n_truth", "n_predicted", "n_hits")] == [2, 4, 2]
+        assert tally(every, "vehicle", "car") == {"vehicle": [3, 4, 3], "car": [2, 4, 2]}
         assert every["vehicle"]["ap"] == 1.0
         assert every["vehicle"]["precision"] == 0.75
         assert every["vehicle"]["mean_iou_50"] == pytest.approx((1 + 2.8 / 5.2 + 1) / 3, abs=1e-4)
         assert every["vehicle"]["mean_iou_70"] == 1.0
         assert (every["van"]["ap"], every["van"]["precision"], every["van"]["ap_interval"]) == (0.0, None, None)
         assert every["mean_ap"] == 0.5
-        counts = {
-            band: [rows["vehicle"][k] for k in ("n_truth", "n_hits", "n_predicted")]
-            for band, rows in table[kind].items()
-        }
-        assert counts == {"all": [3, 3, 4], "0-15 m": [1, 1, 1], "15-30 m": [1, 1, 1], "30-46 m": [1, 1, 2]}
+        counts = tally({band: rows["vehicle"] for band, rows in table[kind].items()})
+        assert counts == {"all": [3, 4, 3], "0-15 m": [1, 1, 1], "15-30 m": [1, 1, 1], "30-46 m": [1, 2, 1]}
 
 
 def test_labels_of_kitti_are_measured_by_levels_and_other_boxes_all_round(world: World) -> None:
@@ -235,18 +243,12 @@ def test_boxes_of_clusters_by_hand(world: World) -> None:
     )
     # Boxes around clusters are named by their size: a van that is called a car is a false car and a missed van.
     table = evaluated(Judge(["pointseg"], Perceiving(boxes_from="clusters")), frame_of_all)["boxes"]["oriented"]["all"]
-    counts = {
-        name: [table[name][k] for k in ("n_truth", "n_predicted", "n_hits")] for name in ("car", "van", "pedestrian")
-    }
-    assert counts == {"car": [3, 3, 2], "van": [1, 0, 0], "pedestrian": [1, 1, 1]}
-    assert [table["vehicle"][k] for k in ("n_truth", "n_predicted", "n_hits")] == [4, 3, 3]  # nobody on foot
+    counts = tally(table, "car", "van", "pedestrian", "vehicle")  # nobody on foot is a vehicle
+    assert counts == {"car": [3, 3, 2], "van": [1, 0, 0], "pedestrian": [1, 1, 1], "vehicle": [4, 3, 3]}
     # Beside a top-view model, only what it can detect: vehicles in its view. The others count wherever they are known.
     result = evaluated(Judge(["pointseg", "ssadnet"]), frame_of_all)
     table = result["boxes"]["oriented"]["all"]
-    counts = {
-        name: [table[name][k] for k in ("n_truth", "n_predicted", "n_hits")] for name in ("car", "van", "vehicle")
-    }
-    assert counts == {"car": [1, 2, 1], "van": [1, 0, 0], "vehicle": [2, 2, 2]}
+    assert tally(table, "car", "van", "vehicle") == {"car": [1, 2, 1], "van": [1, 0, 0], "vehicle": [2, 2, 2]}
     assert "pedestrian" not in table
     assert [result["all_round"]["all"][name]["n_hits"] for name in ("vehicle", "pedestrian")] == [3, 1]
     assert "boxes" not in evaluated(Judge(["pointseg"], Perceiving(boxes_from="network")), frame_of_all)
@@ -271,8 +273,7 @@ def test_boxes_all_round_by_hand(world: World) -> None:
     for models in (["ssadnet"], ["pointseg", "ssadnet"]):
         result = evaluated(Judge(models), one)
         rows = result["all_round"]["all"]
-        counts = {name: [row[k] for k in ("n_truth", "n_predicted", "n_hits")] for name, row in rows.items()}
-        assert counts == {
+        assert tally(rows) == {
             "car": [2, 3, 2],
             "van": [1, 0, 0],
             "vehicle": [3, 3, 3],
@@ -356,8 +357,8 @@ def test_boxes_at_unknown_places_do_not_count(world: World) -> None:
     # The center of the second is at column 621, row 187 + 621 / 20 of the image.
     one = frame(seen, dont_care, points=points, unlabeled=[[600, 210, 640, 225]])
     found = evaluated(Judge(["ssadnet"]), one)
-    for row in (found["all_round"]["all"]["car"], found["boxes"]["oriented"]["all"]["car"]):
-        assert [row[k] for k in ("n_truth", "n_predicted", "n_hits")] == [1, 1, 1]
+    for rows in (found["all_round"]["all"], found["boxes"]["oriented"]["all"]):
+        assert tally(rows, "car") == {"car": [1, 1, 1]}
 
 
 def test_few_objects_are_marked() -> None:
@@ -411,10 +412,8 @@ def test_causes_of_missed_points_by_hand() -> None:
     assert found["missed cyclist"] == {"all": 3, "of other objects": 2, "beyond 30 m": 0}
     assert found["missed pedestrian"] == {"all": 0, "of other objects": 0, "beyond 30 m": 0}
     rows = found["rows"]
-    assert (rows["missed car"]["all"]["share"], rows["missed car"]["all"]["n_of"]) == (
-        pytest.approx(15 / 17, abs=1e-4),
-        17,
-    )
+    of_all = rows["missed car"]["all"]
+    assert (of_all["share"], of_all["n_of"]) == (pytest.approx(15 / 17, abs=1e-4), 17)
     assert rows["missed car"]["beyond 30 m"]["share"] == pytest.approx(9 / 15, abs=1e-4)
     # Both cars have one size, so they are one object; the truck is another.
     assert [rows["missed car"][c]["n_objects"] for c in ("all", "in vans and trucks", "beyond 30 m")] == [2, 1, 2]
@@ -440,9 +439,8 @@ def test_causes_of_false_points_by_hand() -> None:
         "on the ground": 1,
     }
     person = [([20.0, 4.0, z], 2, 0) for z in (-1.0, -0.5, 0.0)]
-    sign = [([20.0, -4.0, z], 2, 0) for z in (-1.0, -0.5, 0.0)] + [
-        ([20.2, -4.1, 0.6], 0, 0)
-    ]  # 0.22 m aside, 2.3 m high
+    sign = [([20.0, -4.0, z], 2, 0) for z in (-1.0, -0.5, 0.0)]
+    sign += [([20.2, -4.1, 0.6], 0, 0)]  # 0.22 m aside, 2.3 m high
     crown = [([24.0, -4.0, -1.0], 3, 0), ([24.4, -4.0, 2.0], 0, 0)]  # 0.4 m aside
     found = counted([*person, *sign, *crown])
     assert found["false pedestrian"]["all"] == 6
@@ -507,13 +505,8 @@ def test_cells_under_boxes(world: World) -> None:
     result = evaluated(Judge(["ssadnet"]), frame(box(20, 0), box(40, 5, "van"), tram))["segmentation"]
     assert set(result) == {"vehicles from 3-D boxes"}
     row = result["vehicles from 3-D boxes"]["all"]
-    assert row["n_cells_of"] == {
-        "background": row["n_cells"] - 1600,
-        "car": 800,
-        "van": 800,
-        "truck": 0,
-        "vehicle": 1600,
-    }
+    vehicles = {"car": 800, "van": 800, "truck": 0, "vehicle": 1600}
+    assert row["n_cells_of"] == {"background": row["n_cells"] - 1600, **vehicles}
     assert 65_000 < row["n_cells"] < 80_000 - 800  # the camera does not see the nearest corners; trams are not counted
     assert row["iou"]["car"] == 1.0
     assert row["iou"]["van"] == row["iou"]["truck"] == 0.0
@@ -557,10 +550,7 @@ def test_road_drawn_by_another_model(world: World) -> None:
 
 def test_road_by_hand(world: World) -> None:
     # A row of cells 20 m ahead: four of road, a car, three of something else, and one that nobody labeled.
-    y = 5.05 - np.arange(9)
-    points = np.stack([np.full(9, 20.05), y, np.full(9, -1.7), np.zeros(9)], axis=1).astype(np.float32)
-    scan = kitti.RoadFrame("00/000000", "b", points, np.array([1, 1, 1, 1, 2, 0, 0, 0, IGNORE], np.uint8))
-    cols = np.floor((10.0 - y) / 0.1).astype(int)
+    scan, cols = road_scan(1, 1, 1, 1, 2, 0, 0, 0, IGNORE)
     said = np.zeros((400, 200), np.uint8)
     said[259, cols[[0, 1, 5, 8]]] = 1
     said[259, cols[[4, 6]]] = 3
@@ -592,11 +582,8 @@ def test_road_by_hand(world: World) -> None:
 
 
 def test_a_model_without_vehicles_is_evaluated_on_road_only(world: World) -> None:
-    y = 5.05 - np.arange(5)
-    points = np.stack([np.full(5, 20.05), y, np.full(5, -1.7), np.zeros(5)], axis=1).astype(np.float32)
-    scan = kitti.RoadFrame("00/000000", "b", points, np.array([1, 1, 2, 0, IGNORE], np.uint8))
+    scan, cols = road_scan(1, 1, 2, 0, IGNORE)
     world.cards["lodnn"] = card("lodnn", classes=CELLS[:2], box_classes=(), outputs=card("pointseg").outputs)
-    cols = np.floor((10.0 - y) / 0.1).astype(int)
     world.cells["lodnn"][259, cols[[0, 2]]] = 1
     judge = Judge(["lodnn"])
     record, _ = judge.record(judge.semantickitti(scan))
@@ -626,19 +613,16 @@ def test_intervals_are_over_drives(world: World) -> None:
     assert car["iou_by_drive"] == 0.75
     assert car["iou_by_drive_interval"] == [0.5, 1.0]
     assert "iou_by_drive" not in result["pixels"]["all"]["car"]
-    assert evaluated(Judge(["pointseg"]), half, right, n_resamples=1000) == evaluated(
-        Judge(["pointseg"]), half, right, n_resamples=1000
-    )
+    one, other = (evaluated(Judge(["pointseg"]), half, right, n_resamples=1000) for _ in range(2))
+    assert one == other
 
 
 def test_a_mean_over_classes_needs_them_all_in_two_drives(world: World) -> None:
     world.cells["ssadnet"][240:280, 90:110] = 2
     judge = Judge(["ssadnet"])
     car, other = frame(box(20, 0)), frame(box(20, 0), drive="b")
-    assert evaluated(judge, car, other)["segmentation"]["vehicles from 3-D boxes"]["all"]["mean_iou_interval"] == [
-        1.0,
-        1.0,
-    ]
+    row = evaluated(judge, car, other)["segmentation"]["vehicles from 3-D boxes"]["all"]
+    assert row["mean_iou_interval"] == [1.0, 1.0]
     van = frame(box(20, 0), box(30, 3, "van"), drive="b")
     row = evaluated(judge, car, van)["segmentation"]["vehicles from 3-D boxes"]["all"]
     assert row["mean_iou_interval"] is None
