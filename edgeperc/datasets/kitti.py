@@ -265,19 +265,19 @@ class KittiObjects:
             {"name": path.stem, "drive": path.stem} for path in sorted(labels.glob("[!.]*.txt"))
         ]
         self.drives = {row["name"]: row["drive"] for row in rows}
-        self._grades = {r["name"]: r.get("grade") or "A" for r in rows if (labels / f"{r['name']}.txt").exists()}
-        if not self._grades:
+        self.grades = {r["name"]: r.get("grade") or "A" for r in rows if (labels / f"{r['name']}.txt").exists()}
+        if not self.grades:
             raise PointsError(f"{self.root} has no training/label_2/*.txt; expected the root of a KITTI object set")
 
     def names(self, split: str, *, fold: int | None = None, grades: str = "A") -> list[str]:
         """Names of the labeled scans of a split (`splits.in_split`) that have one of the ``grades``."""
-        of_split = [name for name in self._grades if in_split(self.drives[name], split, fold)]
-        return [name for name in of_split if self._grades[name] in grades]
+        of_split = [name for name in self.grades if in_split(self.drives[name], split, fold)]
+        return [name for name in of_split if self.grades[name] in grades]
 
     def unlabeled(self, split: str, *, fold: int | None = None) -> list[str]:
         """Names of the scans of a split that have no label file."""
         names = [name for name, drive in self.drives.items() if in_split(drive, split, fold)]
-        return [name for name in names if name not in self._grades and self.files(name)[0].exists()]
+        return [name for name in names if name not in self.grades and self.files(name)[0].exists()]
 
     def files(self, name: str) -> tuple[Path, Path]:
         """The scan of a name, and its calibration."""
@@ -285,10 +285,10 @@ class KittiObjects:
 
     def frame(self, name: str) -> Frame:
         """Read a labeled scan with its labels and calibration; raise `PointsError` if there is no such scan."""
-        if name not in self._grades:
+        if name not in self.grades:
             raise PointsError(f"{self.root} has no labeled scan {name!r:.60}; its names are those of training/label_2")
         labeled = read_labeled(self.root / "training", name)
-        return Frame(name, self.drives[name], self._grades[name], read_points(self.files(name)[0]), *labeled)
+        return Frame(name, self.drives[name], self.grades[name], read_points(self.files(name)[0]), *labeled)
 
 
 def _frame_rows(root: Path) -> list[dict[str, str]]:

@@ -254,13 +254,13 @@ def _names(scans: ScanFolder | KittiObjects | SemanticKitti, split: str, fold: i
 
 def _scans(judge: Judge, dataset: str | Path, folder: ScanFolder | None, split: str, fold: int | None) -> list[_Scan]:
     """The scans of a data set, which may be a ``folder``."""
-    scans: ScanFolder | KittiObjects | SemanticKitti
+    if str(dataset).partition(":")[0] == "simulation":
+        seeds = seeds_of(str(dataset))
+        return [("simulated", None, partial(lambda seed: judge.record(judge.simulated(seed)), seed)) for seed in seeds]
+    scans: Any
     record: Callable[[Any], _Figures]
     if folder is not None:
         block, scans, record = f"{OF_FOLDER}{folder.layout.name}", folder, judge.record_scan
-    elif str(dataset).partition(":")[0] == "simulation":
-        seeds = seeds_of(str(dataset))
-        return [("simulated", None, partial(lambda seed: judge.record(judge.simulated(seed)), seed)) for seed in seeds]
     elif _is_kitti(Path(dataset)):
         block, scans, record = "real", KittiObjects(dataset), lambda frame: judge.record(judge.kitti(frame))
     else:

@@ -85,17 +85,12 @@ def build(
     objects = KittiObjects(plan.kitti)
     drawn = read_coco(polygons)
     held_back = TEST_DRIVES | set(test_drives)
-    fold_of = folds(r["drive"] for r in objects.rows if r["drive"] not in held_back)
+    labeled = {name: objects.drives[name] for name in objects.grades}
+    fold_of = folds(drive for drive in labeled.values() if drive not in held_back)
     jobs = [
-        Job(
-            r["name"],
-            r["drive"],
-            r.get("grade", "A"),
-            "train" if r["drive"] in fold_of else "test",
-            fold_of.get(r["drive"]),
-            drawn.pop(r["name"], None),
-        )
-        for r in sorted(objects.rows, key=lambda r: r["name"])
+        Job(name, drive, objects.grades[name], split, fold_of.get(drive), drawn.pop(name, None))
+        for name, drive in sorted(labeled.items())
+        for split in ["train" if drive in fold_of else "test"]
     ]
     notes = []
     if drawn:

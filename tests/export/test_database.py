@@ -182,7 +182,7 @@ def test_maps_show_the_boxes(kitti: Path, out: Path) -> None:
 def test_maps_of_real_scans_show_the_boxes(kitti_root: Path) -> None:
     """Vehicles only: the roads come from a model."""
     objects, compared = KittiObjects(kitti_root), 0
-    names = [row["name"] for row in objects.rows][::4]
+    names = [*objects.grades][::4]
     for name in names:
         boxes = vehicles(objects.frame(name).boxes)
         wrong, cells = disagreements(kitti_root, name, road_and_vehicles(np.zeros((400, 200)), boxes))
