@@ -154,12 +154,9 @@ def _processor() -> Iterator[Finding]:
 
     present = cpu_features()
     for precision, features in (("int8", INT8_FEATURES | SEVEN_BIT_FEATURES), ("bf16", BF16_FEATURES)):
-        present_here = ", ".join(sorted(features & present))
-        yield Finding(
-            precision,
-            "ok" if present_here else "note",
-            f"fast here ({present_here})" if present_here else "no instructions for it here; fp32 is used",
-        )
+        here = ", ".join(sorted(features & present))
+        found = f"fast here ({here})" if here else "no instructions for it here; fp32 is used"
+        yield Finding(precision, "ok" if here else "note", found)
 
 
 def installed(prefix: str = "") -> dict[str, str]:

@@ -81,23 +81,20 @@ def compare(
     """
     sets = {name: _dataset(name) for name in datasets}
     sizes = {name: (len(ADAPTATIONS) + (folder is not None)) * n for name, (_, n, _, folder) in sets.items()}
-    total, done = sum(sizes.values()), 0
-    result: dict[str, Any] = {}
-    if (workers or 1) > 1:
-        answers = map_in_processes(partial, (_named, model, provider, precision), [*sizes], workers=workers)
-        for name, answer in zip(sizes, answers, strict=True):
-            result[name] = taken(answer, name)
-            done += sizes[name]
-            on_scan(done, total)
-        return result
+    total, done, result = sum(sizes.values()), 0, dict[str, Any]()
 
-    def count() -> None:
+    def count(n: int = 1) -> None:
         nonlocal done
-        done += 1
+        done += n
         on_scan(done, total)
 
-    for name, dataset in sets.items():
-        result[name] = _compare_one(model, provider, precision, dataset, count)
+    answers: Iterator[Any] = (_compare_one(model, provider, precision, each, count) for each in sets.values())
+    if has_workers := (workers or 1) > 1:
+        answers = map_in_processes(partial, (_named, model, provider, precision), [*sets], workers=workers)
+    for name, answer in zip(sets, answers, strict=True):
+        result[name] = taken(answer, name)
+        if has_workers:
+            count(sizes[name])
     return result
 
 

@@ -192,8 +192,8 @@ def test_a_damaged_file_of_kitti_is_refused(tmp_path: Path, text: str) -> None:
 def test_real_files_of_kitti(kitti_root: Path) -> None:
     """As the labels of the data set are projected: the boxes of objects hold the points that they should."""
     data = KittiObjects(kitti_root)
-    for row in data.rows[:3]:
-        frame = data.frame(row["name"])
+    for name in [*data.grades][:3]:
+        frame = data.frame(name)
         made = Calibration.from_kitti(kitti_root / "training/calib" / f"{frame.name}.txt", 1242, 375)
         u, v, depth = made.project(frame.points)
         pixel, wanted = frame.calibration.to_image(frame.points)
