@@ -44,6 +44,8 @@ _OF_PARSER = ("command", "parser", "usage_error")
 
 Outcome = tuple[Any, Any, Any, Any]  # `edgeperc.cli.run.Outcome`
 Scan = Callable[..., Iterator[Outcome]]
+_Pair = tuple[Path | Remote, Path | Remote]
+_Show = Callable[[int, int], None]
 Alone = Callable[..., "tuple[Perceiver, Scan, Callable[[Any], list[Any]]]"]
 """From the arguments to a perceiver, what perceives and writes a scan file with it, and the files it writes."""
 
@@ -110,14 +112,14 @@ def perceive_side_by_side(
     scans: Sequence[Path | Remote],
     targets: Sequence[Path | Remote],
     report: Report,
-    show: Callable[[int, int], None],
+    show: _Show,
 ) -> None:
     """Perceive scan files in worker processes, and report them in their order, those of one sensor after
     those of another. ``.run/NAME.json`` next to a scan's files says what they were made of; a later run keeps those
     that are the same and complete, but the first scans.
     """
 
-    def sensor_of(pair: tuple[Path | Remote, Path | Remote]) -> Any:
+    def sensor_of(pair: _Pair) -> Any:
         if arguments.sensor not in (None, AUTO_SENSOR):
             return arguments.sensor
         try:
@@ -126,26 +128,21 @@ def perceive_side_by_side(
             return exc
 
     done = 0
-    for sensor, pairs in groupby(zip(scans, targets, strict=True), sensor_of):
-        own, places = zip(*pairs, strict=True)
+    for sensor, of_sensor in groupby(zip(scans, targets, strict=True), sensor_of):
+        pairs = [*of_sensor]
         if isinstance(sensor, Exception):
-            report.add(own[0], sensor)
+            report.add(pairs[0][0], sensor)
         else:
             given = argparse.Namespace(**{**vars(arguments), "sensor": sensor})
             shown = partial(lambda before, n, _: show(before + n, len(scans)), done)
-            _perceive_one_sensor(given, alone, perceivers, own, places, report, shown)
-        done += len(own)
+            _perceive_one_sensor(given, alone, perceivers, pairs, report, shown)
+        done += len(pairs)
 
 
 def _perceive_one_sensor(
-    arguments: argparse.Namespace,
-    alone: Alone,
-    perceivers: Any,
-    scans: Sequence[Path | Remote],
-    targets: Sequence[Path | Remote],
-    report: Report,
-    show: Callable[[int, int], None],
+    arguments: argparse.Namespace, alone: Alone, perceivers: Any, pairs: Sequence[_Pair], report: Report, show: _Show
 ) -> None:
+    scans, targets = zip(*pairs, strict=True)
     perceive, run, _ = alone(arguments, perceivers)
     n_first = 0
     while n_first < min(len(scans), MOST_FIRST) and not perceive.learned.is_settled:
