@@ -212,10 +212,7 @@ def run(
     if "engines" in arguments.tables:
         measuring = groups(models, arguments.provider, arguments.precision, folder, files[0], arguments.sensor)
         if arguments.model and not measuring:
-            raise ModelError(
-                f"other engines do not run {', '.join(models)} as it is; pass a range-image, top-view or camera model, "
-                "or --tables methods"
-            )
+            raise ModelError(f"no other engine runs {', '.join(models)}; pass a range-image, top-view or camera model")
     if "methods" in arguments.tables:
         note("writing the networks of others with random weights")
         measuring[METHODS] = methods(folder)

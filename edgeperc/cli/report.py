@@ -33,7 +33,7 @@ class Report:
 
     def add(
         self,
-        source: Path,
+        source: Path | Remote,
         outcome: Perception | Answer | Exception,
         tracks: Tracks | None = None,
         under: tuple[bytes, Mounting] | None = None,
