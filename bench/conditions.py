@@ -8,7 +8,6 @@ clear air in a folder of ``.bin`` files that are warned of. Prints tables of Mar
 from __future__ import annotations
 
 import argparse
-import csv
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -16,6 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from edgeperc import Perceiver
+from edgeperc.datasets.kitti import read_drives
 from edgeperc.preprocess.condition import condition
 from edgeperc.preprocess.health import NORMAL_SCANS, Normal, check_health, without_drops
 from edgeperc.readers.files import read_points
@@ -114,7 +114,9 @@ def print_answers(name: str, scans: Sequence[Scan], sensor: SensorProfile) -> No
 
 def print_clean(folder: Path, sensor: SensorProfile) -> None:
     """How many scans of clear air are warned of, each as the first one and as one of its drive."""
-    files, drives = sorted(folder.glob("*.bin")), _drives(folder)
+    files = sorted(folder.glob("*.bin"))
+    tables = [table for above in (folder.parent, folder.parent.parent) for table in sorted(above.glob("frames*.csv"))]
+    drives = {row["name"]: row["drive"] for table in tables for row in read_drives(table)}
     first, later, normals = [], [], dict[str, Normal]()
     for path in files:
         scan, drive = condition(read_points(path), sensor)[0], drives.get(path.stem, "")
@@ -122,17 +124,6 @@ def print_clean(folder: Path, sensor: SensorProfile) -> None:
         first.append(warned(check_health(scan, sensor, Normal())[0]))
         later.append(warned(health))
     print(f"| {folder} | {len(files)} | {np.any(first, axis=1).sum()} | {np.any(later, axis=1).sum()} |", flush=True)
-
-
-def _drives(folder: Path) -> dict[str, str]:
-    """The drive of each scan by its name, from the tables ``frames*.csv`` near by."""
-    found: dict[str, str] = {}
-    for path in [path for above in (folder.parent, folder.parent.parent) for path in sorted(above.glob("frames*.csv"))]:
-        with path.open(encoding="utf-8", newline="") as file:
-            for row in csv.DictReader(file):
-                name = row.get("name") or row.get("frame") or row.get("id") or ""
-                found[name] = row.get("drive", "")
-    return found
 
 
 def _row(kind: str, strength: float, unit: str, cells: Iterable[str]) -> str:

@@ -12,6 +12,7 @@ import math
 import warnings
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 
@@ -149,10 +150,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     print("| sensor | mounting | | accepted | wrong / in silence | height, m | roll, deg | pitch, deg |"
           " IoU car / pedestrian | AP50 vehicles / AP25 pedestrians | road |")  # fmt: skip
     print("|---|---|---|---|---|---|---|---|---|---|---|")
-    for name in given.sensors:
-        for height_m in given.heights:
-            for place in given.places:
-                print(*rows_of(name, height_m, place, given.scans), sep="\n", flush=True)
+    for name, height_m, place in product(given.sensors, given.heights, given.places):
+        print(*rows_of(name, height_m, place, given.scans), sep="\n", flush=True)
 
 
 if __name__ == "__main__":
