@@ -42,7 +42,7 @@ from typing import Any
 import numpy as np
 
 from edgeperc import Box, Perceiver, Perception, Tracker, movable_points, moving_points
-from edgeperc.datasets.kitti import KittiCalibration, KittiObjects, label_objects, read_labels
+from edgeperc.datasets.kitti import KittiObjects
 from edgeperc.errors import SplitError
 from edgeperc.evaluation.judge import check_unseen, training_scans_of
 from edgeperc.readers.files import read_points
@@ -108,21 +108,15 @@ def real_drives(
             continue
         scans, known, labels, trained = [], [], [], False
         for name in names:
-            points = read_points(root / "training/velodyne" / f"{name}.bin")
-            calibration = KittiCalibration.read(root / "training/calib" / f"{name}.txt")
-            path = root / "training/label_2" / f"{name}.txt"
-            boxes: Sequence[Box] = ()
-            seen = np.zeros(len(points), np.bool_)
-            if path.exists():
-                boxes, unlabeled = label_objects(read_labels(path), calibration)
-                seen = calibration.labeled_at(points, unlabeled)
+            labeled = data.frame(name) if name in data.grades else None
+            points = read_points(data.files(name)[0]) if labeled is None else labeled.points
             try:
                 check_unseen(trained_on, name, drive, points)
             except SplitError:
                 trained = True
             scans.append(points)
-            known.append(seen)
-            labels.append(list(boxes))
+            known.append(np.zeros(len(points), np.bool_) if labeled is None else labeled.known)
+            labels.append([] if labeled is None else [*labeled.boxes])
         usable = [np.asarray(np.isfinite(points).all(axis=1)) for points in scans]
         yield Drive(drive.removeprefix("2011_"), scans, None, None, usable, known, labels, trained)
 

@@ -39,7 +39,7 @@ def unlabeled_scans(objects: KittiObjects, fold: int | None) -> list[LabeledScan
     """The unlabeled scans of the training drives without those of ``fold``; every label is `IGNORE`."""
     scans = []
     for name in objects.unlabeled("train", fold=fold):
-        points = read_points(objects.root / "training/velodyne" / f"{name}.bin")
+        points = read_points(objects.files(name)[0])
         points = points[np.isfinite(points).all(axis=1)]
         unknown = np.full((SURFACE.height, SURFACE.width), IGNORE, np.uint8)
         scans.append(LabeledScan(points, np.full(len(points), IGNORE, np.uint8), (), (), unknown))
