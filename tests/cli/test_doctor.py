@@ -91,11 +91,8 @@ def test_no_onnxruntime(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.
     monkeypatch.setattr(doctor, "installed", lambda prefix="": {})
     code, found = report(capsys)
     assert code == 1
-    assert found["onnxruntime"] == {
-        "state": "broken",
-        "found": "not installed",
-        "advice": "pip install 'edgeperc[cpu]'",
-    }
+    missing = {"state": "broken", "found": "not installed", "advice": "pip install 'edgeperc[cpu]'"}
+    assert found["onnxruntime"] == missing
     assert run("doctor") == 1
     assert "BROKEN" in (out := capsys.readouterr().out)
     assert "onnxruntime" in out.splitlines()[-1]
@@ -116,9 +113,8 @@ def test_builds_of_onnxruntime(
     monkeypatch.setattr(providers, "runtime_version", lambda: versions["onnxruntime"])
     monkeypatch.setattr(doctor, "installed", lambda prefix="": versions)
     monkeypatch.setattr(doctor, "has_sme", lambda: "sme" in features)
-    found = {finding.name: finding for finding in doctor.find_packages()}
-    assert found["onnxruntime"].state == state
-    assert text in found["onnxruntime"].found
+    found = {finding.name: finding for finding in doctor.find_packages()}["onnxruntime"]
+    assert (found.state, text in found.found) == (state, True)
 
 
 @pytest.mark.parametrize(
@@ -233,12 +229,9 @@ def extras(monkeypatch: pytest.MonkeyPatch, versions: dict[str, str]) -> dict[st
 def test_missing_extras_come_with_the_line_that_installs_them(monkeypatch: pytest.MonkeyPatch) -> None:
     found = extras(monkeypatch, {"numpy": "2.1", "onnxruntime": "1.31", "matplotlib": "3.9"})
     assert found["extras"].found == "cpu, view"
-    assert (found["extra ros"].found, found["extra ros"].advice) == (
-        "rosbags is missing",
-        "pip install 'edgeperc[ros]'",
-    )
-    both = found["extra both"]
-    assert (both.found, both.advice) == ("rosbags is missing", "pip install 'edgeperc[both]'")
+    for extra in ("ros", "both"):
+        of_extra = found[f"extra {extra}"]
+        assert (of_extra.found, of_extra.advice) == ("rosbags is missing", f"pip install 'edgeperc[{extra}]'")
     assert "providers" in found["extra gpu"].advice
     assert {*found} == {"extra both", "extra gpu", "extra ros", "extras"}
 
