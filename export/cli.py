@@ -374,7 +374,13 @@ def _add_quantize(command: Command) -> None:
     add = options(command("quantize", does, _quantize))
     add("model", ".onnx file, or name, of the fp32 model", type=_model_file)
     add("out", ".onnx file to write", type=Path)
-    add("--scans SCANS", "scans, or folders of .bin, to calibrate on", type=Path, nargs="*", default=[])
+    add(
+        "--scans SCANS",
+        "scans to calibrate on: labeled sets of any sensor, FOLDER[:LAYOUT], of which those for training are taken as "
+        "train sees them; or files, or folders of files, with points in the frame of the models and remission in 0..1",
+        nargs="*",
+        default=[],
+    )
     add("--kitti KITTI", f"{KITTI}; calibrates on training drives, compares on validation drives", type=Path)
     add("--simulated N", "simulated scans to calibrate on (default 64)", type=count, default=64)
     _add_shared(add, "--semantickitti SEMANTICKITTI")
@@ -389,16 +395,30 @@ def _add_quantize(command: Command) -> None:
 
 
 def _quantize(args: argparse.Namespace) -> int:
+    from edgeperc.datasets.scan_folder import ScanFolder
+    from edgeperc.preprocess.fitness import FitnessProfile
     from edgeperc.types.card import ModelCard
 
     from .release.quantize import LabeledSets, calibration_images, calibration_scans, quantize
 
-    of_objects = ModelCard.read(args.model).view.kind == "objects"
+    card = ModelCard.read(args.model)
+    of_objects = card.view.kind == "objects"
     how = {"seven_bits": not args.eight_bits, "n_threads": args.threads}
     if args.camvid is not None and not of_objects:
         calibration = calibration_images(args.camvid)
     else:
-        calibration = calibration_scans(args.scans, kitti=args.kitti, n_simulated=args.simulated)
+        sets = [
+            text
+            for text in args.scans
+            if (Path(text) / "scans.json").is_file() or (":" in text and not Path(text).exists())
+        ]
+        calibration = calibration_scans(
+            [Path(text) for text in args.scans if text not in sets],
+            [ScanFolder.parse(text) for text in sets],
+            kitti=args.kitti,
+            n_simulated=args.simulated,
+            fitness=None if card.fitness is None else FitnessProfile.from_dict(card.fitness),
+        )
     if of_objects:
         from .release.object_int8 import quantize_objects
 

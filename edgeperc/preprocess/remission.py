@@ -118,7 +118,7 @@ class RemissionMatcher:
         vars(more).update(vars(self))
         if is_missing(points):
             return more, replace(self.sensor, remission=NO_REMISSION), more._report(_MISSING)
-        if not self.is_complete and self._to in REFERENCES and self._is_in_range(points):
+        if not self.is_complete and self._to in REFERENCES and self.is_in_range(points):
             if self.matched is None and (None in self._samples or self._is_usual(points)):
                 more._samples = (*self._samples, None)
             elif len((sample := stratify(points, _STRATIFIED))[0]) >= _FEWEST_STRATIFIED:
@@ -145,7 +145,7 @@ class RemissionMatcher:
         """The sensor that the models were trained on."""
         return NO_REMISSION.to if self.sensor.remission is None else self.sensor.remission.to
 
-    def _is_in_range(self, points: Points) -> bool:
+    def is_in_range(self, points: Points) -> bool:
         """Whether the remission is in the profile's unit; `check_fitness` reports it if not."""
         with np.errstate(invalid="ignore"):  # a signaling NaN
             raw = points[:: max(1, len(points) // _SAMPLE), 3].astype(np.float64)

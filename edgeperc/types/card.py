@@ -16,6 +16,7 @@ from typing import Any, Literal
 from ..errors import CardError
 from ..system.fields import Fields
 from ..system.names import check_name, check_text
+from .choices import VEHICLES
 from .detector import ANCHOR_KINDS, CENTER_KINDS, HEADS, MAX_GROUPS, MAX_VALUES, AnchorHead, CenterHead, PillarGeometry
 from .onnx_file import read_metadata
 from .views import CameraGeometry, ObjectGeometry, RangeImageGeometry, TopViewGeometry
@@ -46,6 +47,7 @@ CHANNELS = {
         *("from_mean_x", "from_mean_y", "from_mean_z", "from_center_x", "from_center_y", "from_center_z", "range"),
     ),
 }
+KNOWN_CLASSES = ("background", "drivable", "road", *VEHICLES, "pedestrian", "cyclist")
 N_DENSE_CHANNELS, N_FRONT_CHANNELS = 9, 2
 N_OBJECT_VALUES = 8  # in addition to the classes and the sizes: place, axis, front, overlap
 FIELDS = Fields(
@@ -243,6 +245,8 @@ class ModelCard:
             )
         for name in self.classes:
             check_text("class", name, CardError)
+        if self.view.kind != "camera":
+            self._check_class_names()
         unknown = [c for c in self.input.channels if c not in CHANNELS[self.view.kind]]
         if unknown:
             raise CardError(
@@ -310,6 +314,22 @@ class ModelCard:
                 shape = self.shape_of(output)
                 if output.name in self.golden.outputs and None not in shape:
                     self.golden.check_output(output.name, math.prod(n for n in shape if n is not None))
+
+    def _check_class_names(self) -> None:
+        """Raise CardError for a name under which a class would be taken for another one, or for nothing known."""
+        if misspelt := next((c for c in self.classes if c not in KNOWN_CLASSES and c.lower() in KNOWN_CLASSES), None):
+            raise CardError(
+                f"class {misspelt!r} would be a class of its own; write {misspelt.lower()!r}, as edgeperc calls it, in "
+                "classes and box_classes"
+            )
+        begins_wrong = "background" in self.classes[1:] or self.classes[0] in {*KNOWN_CLASSES} - {"background"}
+        if begins_wrong and self.view.kind != "pillars":  # theirs are refused by their boxes
+            raise CardError(
+                f"classes {reprlib.repr(self.classes)} begin with {self.classes[0]!r}, which would be the background; "
+                "expected the background first, in the graph's outputs, too"
+            )
+        if self.view.kind == "top_view" and "road" in self.classes and "drivable" not in self.classes:
+            raise CardError("class 'road' of a top view would be no drivable area; write 'drivable'")
 
     def _check_camera(self, kinds: list[str]) -> None:
         if kinds != ["camera_logits"]:

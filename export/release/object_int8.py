@@ -12,12 +12,14 @@ from typing import Any
 
 import numpy as np
 import onnx
+from numpy.typing import NDArray
 
 from edgeperc.errors import PointsError
 from edgeperc.inference.session import Session
 from edgeperc.types.card import ModelCard
 from edgeperc.types.points import Floats32
 
+from ..data.scans import LabeledScan
 from .int8_graph import sort
 from .object_parity import candidate_inputs, object_figures, objects_of
 from .quantize import Calibration, check_fp32, folded, in_int8, inner_tensors, race, speed_of, write_int8
@@ -69,10 +71,10 @@ def quantize_objects(
     return write_int8(path, out, model, card, calibration, made, compared)
 
 
-def candidate_batches(card: ModelCard, scans: Sequence[Floats32]) -> Iterator[Floats32]:
+def candidate_batches(card: ModelCard, scans: Sequence[NDArray[Any] | LabeledScan]) -> Iterator[Floats32]:
     """Inputs of the clusters of scans, (n, points, channels), at most `BATCH` of each."""
     for scan in scans:
-        features, _, _ = candidate_inputs(card, scan)
+        features, _, _ = candidate_inputs(card, scan.points if isinstance(scan, LabeledScan) else scan)
         if len(features):
             yield features[:: max(1, len(features) // BATCH)][:BATCH]
 

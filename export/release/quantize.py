@@ -23,7 +23,7 @@ import time
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import onnx
@@ -35,6 +35,8 @@ from tqdm import tqdm
 
 from edgeperc.datasets.images import LabeledImages, image_hash
 from edgeperc.datasets.kitti import SEQUENCE_DRIVES, KittiObjects, SemanticKitti, scan_hash
+from edgeperc.datasets.layout import SUFFIXES
+from edgeperc.datasets.scan_folder import ScanFolder
 from edgeperc.datasets.splits import in_split
 from edgeperc.errors import EdgepercError, ModelError, OptionError, PointsError, SplitError
 from edgeperc.evaluation.camvid import evaluate_images
@@ -44,13 +46,18 @@ from edgeperc.evaluation.tables import Record
 from edgeperc.evaluation.tables import figures as figures_of
 from edgeperc.evaluation.truth import Truth
 from edgeperc.inference.session import Session
+from edgeperc.preprocess.findings import check_fitness
+from edgeperc.preprocess.fitness import FitnessProfile
 from edgeperc.readers.files import read_points
 from edgeperc.simulation import samples
 from edgeperc.simulation.samples import simulated_scan
 from edgeperc.types.card import ModelCard
 from edgeperc.types.points import Floats, Floats32, Ints64
+from edgeperc.types.sensor import get_sensor
 
-from ..data.simulate import parity_samples
+from ..data.scan_sets import check_trains, read_scan_set
+from ..data.scans import LabeledScan
+from ..data.simulate import TRAINING_SENSOR, parity_samples
 from .int8_graph import equalize, repeat_pixels
 from .to_onnx import halve, pixel_labels, views, write_checked
 
@@ -76,6 +83,7 @@ BIN_BITS = 13  # of a float32: sign, exponent and four bits of the mantissa
 N_RUNS = 40
 DRIVE = re.compile(r"\d{4}_\d\d_\d\d_drive_\d{4}")
 
+T = TypeVar("T")
 Ranges = Mapping[str, tuple[float, float]]
 """Smallest and largest value of tensors, by name."""
 Race = Callable[[Path, Path, "int | None"], tuple[Floats, Floats]]
@@ -88,8 +96,8 @@ class RefusedError(EdgepercError):
 class Calibration(NamedTuple):
     """What the ranges of tensors are measured on."""
 
-    scans: Sequence[NDArray[Any]]
-    """(n, 4) float32; of a camera's model images (H, W, 3) uint8."""
+    scans: Sequence[NDArray[Any] | LabeledScan]
+    """(n, 4) float32, or as a training sees them; of a camera's model images (H, W, 3) uint8."""
     hashes: Sequence[str] = ()
     """`scan_hash` or `image_hash` of the real ones, for the card: the model is never evaluated on them."""
 
@@ -108,25 +116,56 @@ Losses = Mapping[str, tuple[float, float, float, float]]
 """Name of a score -> the score in fp32 and in int8, and the 95 % interval of the loss."""
 
 
-def calibration_scans(paths: Sequence[Path] = (), *, kitti: Path | None = None, n_simulated: int = 0) -> Calibration:
-    """Scans to calibrate on: files or folders, 64 of KITTI's training drives, simulated. Raises SplitError,
-    PointsError.
+def calibration_scans(
+    paths: Sequence[Path] = (),
+    sets: Sequence[ScanFolder] = (),
+    *,
+    kitti: Path | None = None,
+    n_simulated: int = 0,
+    fitness: FitnessProfile | None = None,
+) -> Calibration:
+    """Scans to calibrate on: files or folders, like those of ``fitness``; 64 of the training drives of KITTI and of
+    each set; simulated. Raises SplitError, PointsError.
     """
-    files = [file for path in paths for file in (sorted(path.rglob("*.bin")) if path.is_dir() else [path])]
+    files = [file for path in paths for file in (_scans_in(path) if path.is_dir() else [path])]
     for file in files:
         drive = _drive(file)
         if drive is not None and not in_split(drive, "train"):
             raise SplitError(f"{file} is of drive {drive}, which is kept for evaluation; calibrate on other drives")
     real = [read_points(file) for file in files]
+    for file, points in zip(files, real, strict=True):
+        found = check_fitness(points, fitness, get_sensor(TRAINING_SENSOR)) if fitness is not None else ()
+        if gross := next((finding for finding in found if finding.gross), None):
+            raise PointsError(
+                f"{file} is not as the network sees scans ({gross}) Give scans of another sensor as --scans FOLDER, "
+                "with a scans.json that describes it (docs/howto/train.md)"
+            )
     if kitti is not None:
         objects = KittiObjects(kitti)
-        names = objects.names("train", grades="AB")
-        real += [objects.frame(name).points for name in names[:: max(1, len(names) // 64)][:64]]
-    scans = [*real, *(simulated_scan(FIRST_SEED + k).points for k in range(n_simulated))]
+        real += [objects.frame(name).points for name in _few(objects.names("train", grades="AB"))]
+    hashes = [scan_hash(points) for points in real]
+    scans: list[NDArray[Any] | LabeledScan] = [*real]
+    for folder in sets:
+        check_trains(folder, "train")
+        of_set, _, own = read_scan_set(folder, "train")
+        scans, hashes = scans + _few(of_set), hashes + _few([*own.values()])
+    scans += [simulated_scan(FIRST_SEED + k).points for k in range(n_simulated)]
     if not scans:
         asked = f"{len(paths)} paths, KITTI root {kitti}, {n_simulated} simulated scans"
         raise PointsError(f"no scan to calibrate on in {asked}; name scans, a root with training drives, or simulate")
-    return Calibration(scans, [scan_hash(points) for points in real])
+    return Calibration(scans, hashes)
+
+
+def _scans_in(folder: Path) -> list[Path]:
+    files = sorted(file for file in folder.rglob("*") if file.name.lower().endswith(SUFFIXES))
+    if not files:
+        raise PointsError(f"no scan to calibrate on in {folder}; expected files named {', '.join(SUFFIXES)}")
+    return files
+
+
+def _few(each: list[T]) -> list[T]:
+    """At most 64, evenly spread."""
+    return each[:: max(1, len(each) // 64)][:64]
 
 
 def calibration_images(camvid: Path) -> Calibration:
@@ -184,7 +223,7 @@ class Calibrated:
         cls,
         path: Path,
         card: ModelCard,
-        scans: Sequence[NDArray[Any]],
+        scans: Sequence[NDArray[Any] | LabeledScan],
         seven_bits: bool = True,
         strength: float | None = None,
     ) -> Calibrated:
@@ -580,7 +619,12 @@ def write_int8(
 
 
 def _rounded(
-    path: Path, card: ModelCard, scans: Sequence[NDArray[Any]], exclude: Sequence[str], seven_bits: bool, limit: float
+    path: Path,
+    card: ModelCard,
+    scans: Sequence[NDArray[Any] | LabeledScan],
+    exclude: Sequence[str],
+    seven_bits: bool,
+    limit: float,
 ) -> tuple[onnx.ModelProto, list[str], list[str], float]:
     """The model in int8, its convolutions in int8 and in fp32, and the noise of its outputs."""
     tried: list[tuple[float, Calibrated]] = []

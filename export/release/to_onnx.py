@@ -34,6 +34,8 @@ from edgeperc.types.points import Bytes, Floats32, Mask
 from edgeperc.types.views import CameraGeometry, RangeImageGeometry, TopViewGeometry
 
 from ..cards import card_of
+from ..data.scan_sets import seen_by_network
+from ..data.scans import LabeledScan
 from ..networks.lodnn import LoDNN
 from ..networks.objects import ObjectNet
 from ..networks.segnet import SegNet
@@ -264,7 +266,7 @@ def with_golden(model: onnx.ModelProto, card: ModelCard) -> ModelCard:
     return replace(card, golden=Golden(0, hashlib.sha256(x.tobytes()).hexdigest(), records))
 
 
-def views(card: ModelCard, samples: Sequence[NDArray[Any]]) -> Iterator[tuple[Floats32, Mask]]:
+def views(card: ModelCard, samples: Sequence[NDArray[Any] | LabeledScan]) -> Iterator[tuple[Floats32, Mask]]:
     """The network's input of each scan or image, (C, H, W) float32, and the pixels with a return, (H, W) bool."""
     if isinstance(card.view, CameraGeometry):
         scaler = ImageScaler(card.view, card.input)
@@ -276,7 +278,11 @@ def views(card: ModelCard, samples: Sequence[NDArray[Any]]) -> Iterator[tuple[Fl
     assert isinstance(card.view, RangeImageGeometry | TopViewGeometry)  # `compare_objects` makes inputs of objects
     projector = make_projector(card.view, card.input)
     for sample in samples:
-        projected = project(projector, np.ascontiguousarray(sample, np.float32))
+        projected = (
+            seen_by_network(projector, sample)[1]
+            if isinstance(sample, LabeledScan)
+            else project(projector, np.ascontiguousarray(sample, np.float32))
+        )
         yield projected.image.copy(), projected.index >= 0
 
 

@@ -14,13 +14,14 @@ import time
 import warnings
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from filelock import FileLock  # torch needs it, too
+from filelock import FileLock, Timeout  # torch needs it, too
 from torch import Tensor, nn
 from tqdm import tqdm
 
@@ -28,6 +29,7 @@ from edgeperc.datasets.kitti import KittiObjects
 from edgeperc.datasets.layout import BACKGROUND, numbers_of_scene
 from edgeperc.datasets.scan_folder import ScanFolder
 from edgeperc.preprocess.fitness import FitnessProfile
+from edgeperc.simulation.samples import IGNORE
 from edgeperc.simulation.scene import POINT_CLASSES, SCENE_CLASSES
 from edgeperc.system.atomic import open_atomic
 
@@ -105,15 +107,32 @@ def train(recipe: Recipe, out: Path, data: Data, run: Run | None = None) -> Path
     ranks.check(recipe.batch, recipe.accumulate, run.compiled)
     with ranks.together():
         if recipe.runs == 1:
-            return _Training(recipe, out, data, run, ranks).finish()
+            with _alone_in(out, ranks):
+                return _Training(recipe, out, data, run, ranks).finish()
         checkpoints = []
         for k in range(recipe.runs):
             of_run, folder = replace(recipe, runs=1, seed=recipe.seed + k), out.with_name(f"{out.name}-run-{k}")
-            checkpoints.append(_Training(of_run, folder, data, run, ranks).finish())
+            with _alone_in(folder, ranks):
+                checkpoints.append(_Training(of_run, folder, data, run, ranks).finish())
         if ranks.is_first:
             out.mkdir(parents=True, exist_ok=True)
             write_mean(checkpoints, recipe, out / checkpoints[0].name)
         return out / checkpoints[0].name
+
+
+@contextmanager
+def _alone_in(folder: Path, ranks: Ranks) -> Iterator[None]:
+    """Keep another training out of a folder, where both would write one checkpoint and one log. Raises ValueError."""
+    folder.mkdir(parents=True, exist_ok=True)
+    lock = FileLock(folder / ".lock", timeout=0)
+    try:
+        if ranks.is_first:
+            lock.acquire()
+        yield
+    except Timeout:
+        raise ValueError(f"another training runs in {folder}; wait for its end, or give another folder") from None
+    finally:
+        lock.release()
 
 
 class _Source(NamedTuple):
@@ -125,6 +144,7 @@ class _Source(NamedTuple):
     hashes: dict[str, str]
     n_real: int
     truth: str  # a digest of the labels, which a user may have corrected
+    described: str = ""  # a digest of how scans are seen: their sensors and labeled sectors
     teacher: nn.Module | None = None
     fitness: dict[str, Any] | None = None
 
@@ -150,7 +170,6 @@ class _Training:
     def __init__(self, recipe: Recipe, out: Path, data: Data, run: Run, ranks: Ranks) -> None:
         self.recipe, self.run, self.ranks, self.fold = recipe, run, ranks, data.fold
         self.out, self.checkpoint = out, out / "checkpoint.pt"
-        out.mkdir(parents=True, exist_ok=True)
         if run.n_threads is not None:
             torch.set_num_threads(run.n_threads)
         torch.backends.cudnn.benchmark = True  # inputs have one size
@@ -160,6 +179,13 @@ class _Training:
             self.source = _object_source(recipe, out.parent / OBJECT_SAMPLES, data, run)
         else:
             self.source = _scan_source(recipe, data, run, ranks.device)
+        self.given = {
+            "--teacher": _digest_of_file(run.teacher),
+            "sensor or labeled sector of the scans": self.source.described,
+        }
+        # Without weights that are kept, a resumed run does not read it.
+        if recipe.kept > 0.0 or (run.start_from is not None and run.start_from.exists()):
+            self.given["--start-from"] = _digest_of_file(run.start_from)
         self.epoch = max(1, self.source.n_real // recipe.batch)
         self.every = self.epoch if recipe.stop_after else run.checkpoint_every
         # Without a real scan or image, or with other scans, the validation decides which step is best.
@@ -300,6 +326,7 @@ class _Training:
                     "curve": json.dumps(state.curve),
                     "frames": json.dumps(state.hashes),
                     "truth": self.source.truth,
+                    "given": json.dumps(self.given),
                     "fitness": json.dumps(self.source.fitness),
                     "fold": -1 if self.fold is None else self.fold,
                     "n_simulated": len(samples.simulated),
@@ -311,7 +338,12 @@ class _Training:
     def _resume(self) -> None:
         kept = read_checkpoint(self.checkpoint, self.ranks.device)
         if kept["recipe"] != self.recipe:
-            raise ValueError(f"{self.checkpoint} is of another recipe: {kept['recipe']}; give an empty folder")
+            pairs = zip(asdict(kept["recipe"]).items(), asdict(self.recipe).values(), strict=True)
+            changed = (f"{name.replace('_', '-')} {old!r}, now {new!r}" for (name, old), new in pairs if old != new)
+            raise ValueError(
+                f"{self.checkpoint} is of another recipe: {'; '.join(changed)}; give the same options, or an empty "
+                "folder"
+            )
         self._check_data(kept)
         self.network.load_state_dict(kept["network"])
         self.averaged.load_state_dict(kept["averaged"])
@@ -335,6 +367,15 @@ class _Training:
                 f"{self.checkpoint} is of a run on other labels of the same scans or images, or on other simulated "
                 "scans; give the same ones, or an empty folder"
             )
+        for name, digest in json.loads(kept.get("given", "{}")).items():  # earlier versions did not write it
+            if self.given.get(name, digest) != digest:
+                raise ValueError(
+                    f"{self.checkpoint} is of a run with another {name}; give the same one, or an empty folder"
+                )
+
+
+def _digest_of_file(path: Path | None) -> str:
+    return "" if path is None else hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def _image_source(recipe: Recipe, data: Data, device: torch.device) -> _Source:
@@ -379,6 +420,9 @@ def _scan_source(recipe: Recipe, data: Data, run: Run, device: torch.device) -> 
     )
     paths = simulated_files(data.simulated) if data.simulated else []
     truth = _digest_of_truth(real, paths)
+    seen_as = [(s.sensor and s.sensor.to_json(), np.round(s.azimuths, 4).tolist(), s.boxes_known) for s in real]
+    described = hashlib.sha256(repr(seen_as).encode()).hexdigest()
+    _check_labels(task, real, simulated=bool(paths))
     if recipe.distil > 0.0 and teacher is None:
         raise ValueError(f"the recipe distils ({recipe.distil:g}) but there is no teacher; give --teacher")
     if teacher is not None and recipe.distil == 0.0 and (objects is None or recipe.task != "points"):
@@ -392,21 +436,27 @@ def _scan_source(recipe: Recipe, data: Data, run: Run, device: torch.device) -> 
         real = pseudo_labeled(teacher_network.cpu(), task, [*real, *extra])
         weights += [len(extra) ** -0.5] * len(extra)
     samples = Samples(recipe, real, weights, paths, onnx_teacher, run.n_workers)
-    _warn_of_unseen(recipe.classes, real, simulated=bool(paths))
     watch = Watch(samples, watched) if watched else None
     # Every set in its share: the scans of a set follow one another.
     few = [scan.points for scan in real[:: max(1, len(real) // FITNESS_SCANS)]]
     fitness = FitnessProfile.from_scans(few).to_dict() if few else None
-    return _Source(task, samples, watch, hashes, len(real), truth, teacher_network, fitness)
+    return _Source(task, samples, watch, hashes, len(real), truth, described, teacher_network, fitness)
 
 
-def _warn_of_unseen(classes: Sequence[str], real: Sequence[LabeledScan], *, simulated: bool) -> None:
-    """Warn of classes of one's own that no scan shows, as those of a mistyped name."""
-    seen = {int(label) for scan in real for label in np.unique(scan.labels)}
-    seen |= {*numbers_of_scene(classes)[: len(SCENE_CLASSES)].tolist()} if simulated and classes else set()
-    if lacking := [name for k, name in enumerate(classes) if k not in seen]:
-        text = f"no scan to train on has points of {', '.join(lacking)}; see the names in --classes and in scans.json"
-        warnings.warn(text, stacklevel=2)
+def _check_labels(task: Task, real: Sequence[LabeledScan], *, simulated: bool) -> None:
+    """Warn of classes that no scan shows, as those of a mistyped name; ValueError if none shows any."""
+    seen = {int(label) for scan in real for label in np.unique(task.labels(scan))} - {IGNORE}
+    if simulated:
+        own = task.recipe.classes
+        seen |= {*numbers_of_scene(own)[: len(SCENE_CLASSES)].tolist()} if own else {*range(len(task.classes))}
+    names = "see boxes and points in scans.json, and --classes"
+    if real and not seen:
+        raise ValueError(
+            f"no label of the {len(real)} scans to train on is of {', '.join(task.classes)}, so that nothing can be "
+            f"learned; {names}"
+        )
+    if lacking := [name for k, name in enumerate(task.classes) if k not in seen and seen]:
+        warnings.warn(f"no scan to train on has a label of {', '.join(lacking)}; {names}", stacklevel=2)
 
 
 def _digest_of_truth(real: Sequence[LabeledScan], simulated: Sequence[Path]) -> str:
@@ -427,11 +477,12 @@ def _real(
     weights: list[float] = []
     hashes: dict[str, str] = {}
     watched: list[LabeledScan] = []
+    watched_hashes: dict[str, str] = {}
     only_simulated = recipe.simulated_share == 1.0
     if kitti is not None:
         names = kitti.names("train") if only_simulated else kitti.names("validation", fold=fold)
         chosen = _few_of_each_drive(names, [kitti.drives[name] for name in names])
-        watched += real_scans(kitti, chosen, classes=recipe.classes)[0]
+        watched, _, watched_hashes = real_scans(kitti, chosen, classes=recipe.classes)
         if not only_simulated:
             names = kitti.names("train", fold=fold)
             scans, weights, hashes = real_scans(kitti, names, drawn=recipe.drawn_roads, classes=recipe.classes)
@@ -441,7 +492,14 @@ def _real(
             check_trains(folder, "train", "validation", fold=fold)
             more, more_weights, more_hashes = read_scan_set(folder, "train", fold, classes=classes)
             scans, weights, hashes = scans + more, weights + more_weights, joined_hashes(hashes, more_hashes)
-        watched += read_scan_set(folder, "validation", fold, classes=classes)[0]
+        more, _, more_hashes = read_scan_set(folder, "validation", fold, classes=classes)
+        watched, watched_hashes = watched + more, joined_hashes(watched_hashes, more_hashes)
+    trained = {digest: name for name, digest in hashes.items()}
+    if twice := next((name for name, digest in watched_hashes.items() if digest in trained), None):
+        raise ValueError(
+            f"the validation scan {twice} is the training scan {trained[watched_hashes[twice]]}, byte for byte; its "
+            "figures would be too good. Remove one, or put both drives into one split"
+        )
     return scans, weights, hashes, watched
 
 

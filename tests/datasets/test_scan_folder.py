@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import re
+import shutil
 from collections.abc import Callable
 from dataclasses import fields, replace
 from pathlib import Path
@@ -360,6 +361,25 @@ def test_a_set_that_is_kept_for_testing_is_not_left_out_of_training_in_silence(
     root = folder_of(tmp_path, {**DESCRIPTION, "splits": {"test": ["*"]}}, label__a_dot_txt=LINES)
     assert main(["train", network, str(tmp_path / "run"), "--scans", str(root), "--steps", "1"]) == 2
     assert "has 1 labeled scans, and none is for train" in capsys.readouterr().err
+
+
+def test_a_training_tells_of_remissions_and_of_scans_that_it_has_twice(tmp_path: Path) -> None:
+    pytest.importorskip("torch")
+    from edgeperc_export.recipe import Recipe
+    from edgeperc_export.training.train import Data, train
+
+    splits = {"train": ["3"], "validation": ["4"]}
+    root, _ = street(tmp_path, drives="scan", splits=splits, sensor="hdl-64e")
+    for file in (root / "velodyne/3.bin", root / "label/3.txt", root / "semseg/3.u8"):
+        shutil.copy(file, file.with_stem("4"))
+    description = json.loads((root / "scans.json").read_text())
+    description["sensor"]["remission_range"] = [0, 100]
+    (root / "scans.json").write_text(json.dumps(description))
+    with (
+        pytest.warns(UserWarning, match=r"of 1 of 1 scans, the remission does not fit the range 0 to 100 of hdl-64e"),
+        pytest.raises(ValueError, match="validation scan street/4 is the training scan street/3, byte for byte"),
+    ):
+        train(Recipe("pointseg", edge=True), tmp_path / "run", Data(scan_sets=[ScanFolder(root)]))
 
 
 def test_a_scan_is_of_one_drive(tmp_path: Path) -> None:
@@ -809,6 +829,7 @@ def test_public_sets(data_root: Callable[[str], Path]) -> None:
             assert (scans[0].labels == 3).sum() > 500
 
 
+@pytest.mark.filterwarnings("ignore:no scan to train on")
 @pytest.mark.parametrize("sensor", ["vlp-16", "hdl-32e"])
 def test_a_network_trained_on_a_sensor_does_not_call_it_foreign(tmp_path: Path, sensor: str) -> None:
     pytest.importorskip("torch")

@@ -20,6 +20,7 @@ torch = pytest.importorskip("torch")
 onnx = pytest.importorskip("onnx")
 
 from database_helpers import simulated_kitti
+from filelock import FileLock
 from torch import Tensor, nn
 from training_helpers import ablate, interrupted_in_step, make, train
 
@@ -167,6 +168,9 @@ def test_a_run_may_keep_a_share_of_the_weights_that_it_starts_from(tmp_path: Pat
             assert torch.allclose(mixed[name], 0.75 * own[name] + 0.25 * before, atol=1e-5), name
     with pytest.raises(ValueError, match="give --start-from"):
         train(replace(recipes[0], kept=0.5), tmp_path / "none", **{**arguments, "start_from": None})
+    other = {**arguments, "start_from": tmp_path / "0.0/checkpoint.pt"}
+    with pytest.raises(ValueError, match="of a run with another --start-from; give the same one"):
+        train(recipes[1], tmp_path / "0.25", **other)
 
 
 @pytest.mark.usefixtures("small_views")
@@ -215,8 +219,11 @@ def test_workers_simulate_the_same_scans_and_cut_out_the_same_objects(tmp_path: 
 def test_another_recipe_does_not_resume(tmp_path: Path, simulated: Path) -> None:
     recipe = small("pointseg", edge=True, steps=1, n_pasted=0.0)
     train(recipe, tmp_path, kitti=None, simulated=simulated, n_threads=1)
-    with pytest.raises(ValueError, match="of another recipe"):
+    with pytest.raises(ValueError, match="of another recipe: steps 1, now 2; give the same options"):
         train(replace(recipe, steps=2), tmp_path, kitti=None, simulated=simulated, n_threads=1)
+    lock = FileLock(tmp_path / ".lock")
+    with lock, pytest.raises(ValueError, match="another training runs in"):
+        train(recipe, tmp_path, kitti=None, simulated=simulated, n_threads=1)
 
 
 @pytest.mark.usefixtures("small_views")
@@ -242,6 +249,8 @@ def test_other_data_do_not_resume(tmp_path: Path, simulated: Path) -> None:
     corrected = replace(scan, labels=np.ones_like(scan.labels))
     with pytest.raises(ValueError, match="of a run on other labels of the same scans"):
         run("own", given=RealScans([corrected], given.hashes, []))
+    with pytest.raises(ValueError, match="of a run with another sensor or labeled sector"):
+        run("own", given=RealScans([replace(scan, azimuths=(-1.0, 1.0))], given.hashes, []))
     # Another scan of the same name: the card knows both.
     run("after", start_from=first, given=RealScans([scan], {"a": "2"}, []))
     frames = load(tmp_path / "after/checkpoint.pt")[2]["frames"]
@@ -825,8 +834,13 @@ def test_a_run_tells_of_what_it_cannot_learn(
     monkeypatch.setattr(Points, "loss", lambda *_: torch.tensor(np.nan, requires_grad=True))
     assert main([*words, "--batch", "1", "--threads", "1", "--classes", "background,car,pedestrain"]) == 2
     shown = capsys.readouterr().err
-    assert "no scan to train on has points of pedestrain; see the names" in shown
+    assert "no scan to train on has a label of pedestrain; see boxes and points" in shown
     assert "the loss is nan at step 0; lower --learning-rate" in shown
+    scan = LabeledScan.load(sorted(simulated.glob("*.npz"))[0])
+    for network in ("pointseg", "ssadnet", "lodnn"):
+        nothing = replace(scan, labels=np.full_like(scan.labels, IGNORE), azimuths=(3.0, 3.1))
+        with pytest.raises(ValueError, match=r"no label of the 1 scans to train on is of background, .*; see boxes"):
+            train(small(network, edge=True), tmp_path, kitti=None, given=RealScans([nothing], {"a": "1"}, []))
 
 
 @pytest.fixture(scope="module")
