@@ -70,7 +70,6 @@ N_PROBES = 8
 # Powers of the channels' sizes that are made equal before the shift is corrected; None: neither. The first that keeps
 # the noise below the limit is taken, else the one with least noise.
 STRENGTHS = (None, 0.0, 0.5, 1.0)
-N_IMAGES = 64
 # Limit of `_noise`, 33 dB below the outputs of the probes. ssadnet has 4.4e-4 with all inner convolutions in int8, and
 # loses 1 of 255 boxes on the validation drives.
 MAX_NOISE = 5e-4
@@ -148,7 +147,7 @@ def calibration_scans(
     for folder in sets:
         check_trains(folder, "train")
         of_set, _, own = read_scan_set(folder, "train")
-        scans, hashes = scans + _few(of_set), hashes + _few([*own.values()])
+        scans, hashes = [*scans, *_few(of_set)], [*hashes, *_few([*own.values()])]
     scans += [simulated_scan(FIRST_SEED + k).points for k in range(n_simulated)]
     if not scans:
         asked = f"{len(paths)} paths, KITTI root {kitti}, {n_simulated} simulated scans"
@@ -163,16 +162,16 @@ def _scans_in(folder: Path) -> list[Path]:
     return files
 
 
-def _few(each: list[T]) -> list[T]:
-    """At most 64, evenly spread."""
-    return each[:: max(1, len(each) // 64)][:64]
+def _few(each: list[T], most: int = 64) -> list[T]:
+    """At most so many, evenly spread."""
+    return each[:: max(1, len(each) // most)][:most]
 
 
 def calibration_images(camvid: Path) -> Calibration:
     """64 training images of CamVid, evenly spread."""
     data = LabeledImages(camvid)
     files = data.files("train")
-    images = [data.read(file)[0] for file in files[:: max(1, len(files) // N_IMAGES)][:N_IMAGES]]
+    images = [data.read(file)[0] for file in _few(files)]
     return Calibration(images, [image_hash(image) for image in images])
 
 
@@ -229,7 +228,7 @@ class Calibrated:
     ) -> Calibrated:
         """Calibrate the model of a file on scans, or images, with one of `STRENGTHS`."""
         model, images = folded(path), [image[None] for image, _ in views(card, scans)]
-        probes = images[:: max(1, len(images) // N_PROBES)][:N_PROBES]
+        probes = _few(images, N_PROBES)
         outputs = _outputs(model, card, probes)
         names = [name for node in model.graph.node for name in node.output if name]
         if strength:

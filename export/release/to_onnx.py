@@ -272,6 +272,7 @@ def views(card: ModelCard, samples: Sequence[NDArray[Any] | LabeledScan]) -> Ite
         scaler = ImageScaler(card.view, card.input)
         for sample in samples:
             image = np.empty(scaler.shape, np.float32)
+            assert not isinstance(sample, LabeledScan)
             scaler.fill(sample, image)
             yield image, np.ones(image.shape[1:], np.bool_)
         return

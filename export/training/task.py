@@ -24,7 +24,6 @@ from edgeperc.inference.projection import Projection
 from edgeperc.simulation.samples import IGNORE
 from edgeperc.types.card import ModelCard
 from edgeperc.types.perception import Box
-from edgeperc.types.points import Bytes
 from edgeperc.types.views import RangeImageGeometry, TopViewGeometry
 
 from ..cards import Carded
@@ -79,10 +78,6 @@ class Task(Carded[RangeImageGeometry | TopViewGeometry], ABC):
     swaps_sectors: ClassVar[bool] = False
 
     @abstractmethod
-    def labels(self, scan: LabeledScan) -> Bytes:
-        """All labels of a scan that the network may learn, `IGNORE` where unknown."""
-
-    @abstractmethod
     def target(self, scan: LabeledScan, projected: Projection) -> Targets:
         """The targets of a scan in `view`: labels (H, W) uint8, `IGNORE` where unknown, and box targets if any."""
 
@@ -108,10 +103,6 @@ class Points(Task):
 
     paste_odds: ClassVar[Mapping[str, float]] = {"pedestrian": 0.4, "cyclist": 0.35, "van": 0.15, "truck": 0.1}
     swaps_sectors = True
-
-    def labels(self, scan: LabeledScan) -> Bytes:
-        """Those of its points."""
-        return scan.labels
 
     def target(self, scan: LabeledScan, projected: Projection) -> Targets:
         """The label of the point in each pixel."""
@@ -139,10 +130,6 @@ class Vehicles(Task):
 
     paste_odds: ClassVar[Mapping[str, float]] = {"car": 0.3, "van": 0.4, "truck": 0.3}
 
-    def labels(self, scan: LabeledScan) -> Bytes:
-        """Those of the view's cells."""
-        return scan.top_view_truth(_top_view(self.card))
-
     def target(self, scan: LabeledScan, projected: Projection) -> Targets:
         """The class of each cell, and slots or dense maps of the vehicles."""
         view, kinds = _top_view(self.card), self.card.box_classes
@@ -156,7 +143,7 @@ class Vehicles(Task):
         else:
             targets = slot_targets if self.recipe.head == "slots" else dense_targets
             boxes = targets(to_find, view, labeled=scan.boxed(view), unsure=unclear)
-        return self.labels(scan), boxes
+        return scan.top_view_truth(view), boxes
 
     def loss(self, outputs: Outputs, targets: Sequence[Tensor]) -> Tensor:
         """`ssadnet_loss`."""
@@ -205,14 +192,10 @@ class Road(Task):
 
     paste_odds = Vehicles.paste_odds
 
-    def labels(self, scan: LabeledScan) -> Bytes:
+    def target(self, scan: LabeledScan, projected: Projection) -> Targets:
         """1 for drivable cells, 0 for others."""
         truth = scan.top_view_truth(_top_view(self.card))
-        return np.where(truth == IGNORE, IGNORE, truth == 1).astype(np.uint8)
-
-    def target(self, scan: LabeledScan, projected: Projection) -> Targets:
-        """The class of each cell."""
-        return (self.labels(scan),)
+        return (np.where(truth == IGNORE, IGNORE, truth == 1).astype(np.uint8),)
 
     def loss(self, outputs: Outputs, targets: Sequence[Tensor]) -> Tensor:
         """`pixel_loss`."""

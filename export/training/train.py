@@ -32,6 +32,7 @@ from edgeperc.preprocess.fitness import FitnessProfile
 from edgeperc.simulation.samples import IGNORE
 from edgeperc.simulation.scene import POINT_CLASSES, SCENE_CLASSES
 from edgeperc.system.atomic import open_atomic
+from edgeperc.types.views import TopViewGeometry
 
 from ..data.scan_sets import check_trains, joined_hashes, read_scan_set
 from ..data.scans import LabeledScan
@@ -54,6 +55,7 @@ from .task import Task, task_of
 from .teacher import OnnxTeacher, pseudo_labeled, teach, unlabeled_scans
 
 WARM_UP_STEPS = 100
+LABELS, SENSOR = "truth of its scans or images, or simulated scan", "sensor or labeled sector of the scans"
 OBJECT_SAMPLES = "object-samples"
 """Folder beside those of the runs, with the samples of the object network."""
 
@@ -143,8 +145,7 @@ class _Source(NamedTuple):
     watch: Watch | ImageWatch | ObjectWatch | None
     hashes: dict[str, str]
     n_real: int
-    truth: str  # a digest of the labels, which a user may have corrected
-    described: str = ""  # a digest of how scans are seen: their sensors and labeled sectors
+    made_of: dict[str, str]  # digests of what a user may have changed: `LABELS`, `SENSOR`
     teacher: nn.Module | None = None
     fitness: dict[str, Any] | None = None
 
@@ -179,13 +180,10 @@ class _Training:
             self.source = _object_source(recipe, out.parent / OBJECT_SAMPLES, data, run)
         else:
             self.source = _scan_source(recipe, data, run, ranks.device)
-        self.given = {
-            "--teacher": _digest_of_file(run.teacher),
-            "sensor or labeled sector of the scans": self.source.described,
-        }
+        self.made_of = {**self.source.made_of, "--teacher": _digest_of_file(run.teacher)}
         # Without weights that are kept, a resumed run does not read it.
         if recipe.kept > 0.0 or (run.start_from is not None and run.start_from.exists()):
-            self.given["--start-from"] = _digest_of_file(run.start_from)
+            self.made_of["--start-from"] = _digest_of_file(run.start_from)
         self.epoch = max(1, self.source.n_real // recipe.batch)
         self.every = self.epoch if recipe.stop_after else run.checkpoint_every
         # Without a real scan or image, or with other scans, the validation decides which step is best.
@@ -325,8 +323,7 @@ class _Training:
                     "optimizer": self.optimizer.state_dict(),
                     "curve": json.dumps(state.curve),
                     "frames": json.dumps(state.hashes),
-                    "truth": self.source.truth,
-                    "given": json.dumps(self.given),
+                    "made_of": json.dumps(self.made_of),
                     "fitness": json.dumps(self.source.fitness),
                     "fold": -1 if self.fold is None else self.fold,
                     "n_simulated": len(samples.simulated),
@@ -362,16 +359,9 @@ class _Training:
                 f"runs before), {kept['n_simulated']} simulated ones, fold {kept['fold']}; got {len(own)}, "
                 f"{n_simulated}, fold {fold}. Give the same ones, or an empty folder"
             )
-        if kept.get("truth", self.source.truth) != self.source.truth:  # earlier versions did not write it
-            raise ValueError(
-                f"{self.checkpoint} is of a run on other labels of the same scans or images, or on other simulated "
-                "scans; give the same ones, or an empty folder"
-            )
-        for name, digest in json.loads(kept.get("given", "{}")).items():  # earlier versions did not write it
-            if self.given.get(name, digest) != digest:
-                raise ValueError(
-                    f"{self.checkpoint} is of a run with another {name}; give the same one, or an empty folder"
-                )
+        for name, digest in json.loads(kept.get("made_of", "{}")).items():  # earlier versions did not write it
+            if self.made_of.get(name, digest) != digest:
+                raise ValueError(f"{self.checkpoint} is of a run with another {name}; give the same or an empty folder")
 
 
 def _digest_of_file(path: Path | None) -> str:
@@ -384,8 +374,8 @@ def _image_source(recipe: Recipe, data: Data, device: torch.device) -> _Source:
         raise ValueError(f"no images to train {recipe.network} on; give --camvid")
     task = Camera.of(recipe)
     samples, watch = camvid_samples(task, data.camvid, device)
-    truth = hashlib.sha256(samples.images.labels.cpu().numpy().tobytes()).hexdigest()
-    return _Source(task, samples, watch, samples.images.hashes, len(samples.images.hashes), truth)
+    labels = hashlib.sha256(samples.images.labels.cpu().numpy().tobytes()).hexdigest()
+    return _Source(task, samples, watch, samples.images.hashes, len(samples.images.hashes), {LABELS: labels})
 
 
 def _object_source(recipe: Recipe, folder: Path, data: Data, run: Run) -> _Source:
@@ -406,7 +396,7 @@ def _object_source(recipe: Recipe, folder: Path, data: Data, run: Run) -> _Sourc
         watch = ObjectWatch(task, load_samples(folder, watched)) if watched[0] in hashes else None
         truth = " ".join((folder / f"{name}.sha256").read_text() for name in trained)
         batches = ObjectBatches(task, load_samples(folder, trained), trained)
-    return _Source(task, batches, watch, seen, len(seen), truth)
+    return _Source(task, batches, watch, seen, len(seen), {LABELS: truth})
 
 
 def _scan_source(recipe: Recipe, data: Data, run: Run, device: torch.device) -> _Source:
@@ -419,9 +409,8 @@ def _scan_source(recipe: Recipe, data: Data, run: Run, device: torch.device) -> 
         else (given.scans, [1.0] * len(given.scans), given.hashes, given.watched)
     )
     paths = simulated_files(data.simulated) if data.simulated else []
-    truth = _digest_of_truth(real, paths)
     seen_as = [(s.sensor and s.sensor.to_json(), np.round(s.azimuths, 4).tolist(), s.boxes_known) for s in real]
-    described = hashlib.sha256(repr(seen_as).encode()).hexdigest()
+    made_of = {LABELS: _digest_of_truth(real, paths), SENSOR: hashlib.sha256(repr(seen_as).encode()).hexdigest()}
     _check_labels(task, real, simulated=bool(paths))
     if recipe.distil > 0.0 and teacher is None:
         raise ValueError(f"the recipe distils ({recipe.distil:g}) but there is no teacher; give --teacher")
@@ -440,12 +429,14 @@ def _scan_source(recipe: Recipe, data: Data, run: Run, device: torch.device) -> 
     # Every set in its share: the scans of a set follow one another.
     few = [scan.points for scan in real[:: max(1, len(real) // FITNESS_SCANS)]]
     fitness = FitnessProfile.from_scans(few).to_dict() if few else None
-    return _Source(task, samples, watch, hashes, len(real), truth, described, teacher_network, fitness)
+    return _Source(task, samples, watch, hashes, len(real), made_of, teacher_network, fitness)
 
 
 def _check_labels(task: Task, real: Sequence[LabeledScan], *, simulated: bool) -> None:
     """Warn of classes that no scan shows, as those of a mistyped name; ValueError if none shows any."""
-    seen = {int(label) for scan in real for label in np.unique(task.labels(scan))} - {IGNORE}
+    view = task.view
+    labels = (scan.top_view_truth(view) if isinstance(view, TopViewGeometry) else scan.labels for scan in real)
+    seen = {int(label) for each in labels for label in np.unique(each)} - {IGNORE}
     if simulated:
         own = task.recipe.classes
         seen |= {*numbers_of_scene(own)[: len(SCENE_CLASSES)].tolist()} if own else {*range(len(task.classes))}
