@@ -210,8 +210,6 @@ class SceneBuilder:
 
 
 def inputs_of(kitti: Path, name: str) -> str:
-    """A key of a scene's input files: hashes of label and calibration, and the size of the scan, which is large."""
-    training = kitti / "training"
-    small = [training / "label_2" / f"{name}.txt", training / "calib" / f"{name}.txt"]
-    facts = [hashlib.sha256(path.read_bytes()).hexdigest() for path in small]
-    return f"{' '.join(facts)} {(training / 'velodyne' / f'{name}.bin').stat().st_size}"
+    """A key of a scene's input files, label, calibration and scan: their hashes."""
+    files = (f"label_2/{name}.txt", f"calib/{name}.txt", f"velodyne/{name}.bin")
+    return " ".join(hashlib.sha256((kitti / "training" / file).read_bytes()).hexdigest() for file in files)

@@ -31,10 +31,12 @@ from edgeperc.preprocess.findings import check_fitness
 from edgeperc.preprocess.fitness import FitnessProfile
 from edgeperc.simulation.samples import IGNORE, simulated_scan
 from edgeperc.simulation.scene import SCENE_CLASSES
+from edgeperc.types.card import ModelCard
 from edgeperc.types.mounting import MODEL_MOUNTING, Mounting
 from edgeperc.types.perception import Box
 from edgeperc.types.sensor import get_sensor
 from edgeperc.types.views import TopViewGeometry
+from edgeperc.zoo import model_path
 from edgeperc_export.data.scan_sets import joined_hashes, read_scan_set, seen_by_network
 from edgeperc_export.data.scans import SURFACE, LabeledScan
 
@@ -763,6 +765,21 @@ def test_training_sees_what_the_vehicle_sees(tmp_path: Path) -> None:
         again, plain = seen_by_network(projector, other)
         assert again is other
         assert int(plain.index.max()) < n
+
+
+def test_int8_is_calibrated_on_what_training_sees(tmp_path: Path) -> None:
+    pytest.importorskip("torch")
+    from edgeperc_export.release.quantize import calibration_scans
+    from edgeperc_export.release.to_onnx import views
+
+    root, _ = street(tmp_path)
+    card = ModelCard.read(model_path("pointseg"))
+    with pytest.raises(PointsError, match=r"3.bin is not as the network sees scans .* --scans FOLDER"):
+        calibration_scans([root / "velodyne"], fitness=FitnessProfile.from_dict(card.fitness or {}))
+    ((image, _),) = views(card, calibration_scans(sets=[ScanFolder(root)]).scans)
+    (scan,), _, _ = read_scan_set(ScanFolder(root), "train")
+    projected = seen_by_network(make_projector(card.view, card.input), scan)[1]
+    np.testing.assert_array_equal(image, projected.image)
 
 
 def test_the_sensor_of_a_scan_is_stored(tmp_path: Path) -> None:

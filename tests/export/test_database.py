@@ -566,8 +566,10 @@ def test_changed_scenes_are_made_again_and_removed_ones_deleted(
     label.write_text("\n".join(label.read_text().splitlines()[:1]) + "\n")
     (root / "training/label_2/000006.txt").unlink()
     (plan.out / "maps/000000.png").unlink()
+    scan = root / "training/velodyne/000007.bin"
+    scan.write_bytes(np.fromfile(scan, np.float32).reshape(-1, 4)[::-1].tobytes())  # of the same size
     report = build(plan, polygons=[polygons], workers=1)
-    assert (report.scenes, report.made) == (7, 2)
+    assert (report.scenes, report.made) == (7, 3)
     database = TopViewDatabase(plan.out)
     assert not database.scene("000005").boxes
     assert not [*plan.out.rglob("*000006*")]
