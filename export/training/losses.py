@@ -181,13 +181,12 @@ def ssadnet_loss(
     labels: Tensor,
     box_targets: Tensor,
     *,
-    lw_seg: float = 1.0,
     lw_det: float = 0.1,
     class_weights: Tensor | None = None,
     lovasz_weight: float = 0.0,
 ) -> Tensor:
-    """lw_seg x segmentation + lw_det x detection (SSADNet equation 3; weights of Table 2), of targets of slots, the
-    paper's slots or dense maps. Class weights and `lovasz_softmax` are not in the paper.
+    """Segmentation + lw_det x detection (SSADNet equation 3; weights of Table 2), of targets of slots, the paper's
+    slots or dense maps. Class weights and `lovasz_softmax` are not in the paper.
     """
     seg = pixel_loss(logits, labels, class_weights, lovasz_weight=lovasz_weight, stride=2)
     if boxes.ndim == 4:
@@ -198,4 +197,4 @@ def ssadnet_loss(
         det = presence + geometry
     else:
         det = paper_slots_loss(boxes, box_targets)
-    return lw_seg * seg + lw_det * det
+    return seg + lw_det * det
