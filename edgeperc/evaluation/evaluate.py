@@ -27,7 +27,7 @@ from ..zoo import DEFAULT
 from .judge import BY_DEFAULT, NETWORK_ALONE, Judge, Perceiving
 from .mistakes import Mistakes
 from .tables import Record, figures
-from .truth import check_different, seeds_of
+from .truth import Truth, check_different, seeds_of
 
 __all__ = ["NETWORK_ALONE", "Perceiving", "evaluate"]
 
@@ -258,14 +258,17 @@ def _scans(judge: Judge, dataset: str | Path, folder: ScanFolder | None, split: 
         seeds = seeds_of(str(dataset))
         return [("simulated", None, partial(lambda seed: judge.record(judge.simulated(seed)), seed)) for seed in seeds]
     scans: Any
-    record: Callable[[Any], _Figures]
+    truth_of: Callable[[Any], Truth] | None = None
     if folder is not None:
-        block, scans, record = f"{OF_FOLDER}{folder.layout.name}", folder, judge.record_scan
+        block, scans = f"{OF_FOLDER}{folder.layout.name}", folder
     elif _is_kitti(Path(dataset)):
-        block, scans, record = "real", KittiObjects(dataset), lambda frame: judge.record(judge.kitti(frame))
+        block, scans, truth_of = "real", KittiObjects(dataset), judge.kitti
     else:
-        block, scans = "semantickitti", SemanticKitti(dataset)
-        record = lambda frame: judge.record(judge.semantickitti(frame))  # noqa: E731
+        block, scans, truth_of = "semantickitti", SemanticKitti(dataset), judge.semantickitti
+
+    def record(name: str) -> _Figures:
+        frame = scans.frame(name)
+        return judge.record_scan(frame) if truth_of is None else judge.record(truth_of(frame))
+
     drives = {} if folder is None else folder.drives
-    names = _names(scans, split, fold)
-    return [(block, drives.get(name), partial(lambda name: record(scans.frame(name)), name)) for name in names]
+    return [(block, drives.get(name), partial(record, name)) for name in _names(scans, split, fold)]
