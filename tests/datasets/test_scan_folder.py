@@ -398,9 +398,9 @@ def test_a_drive_that_splits_misspells_is_not_for_training(tmp_path: Path) -> No
     folder_of(root, description)
     with pytest.raises(PointsError, match=r"the drive 'monday', which has no labeled scan, and not the drive 'a'"):
         ScanFolder(root)  # nobody wrote frames.csv
-    (root / "frames.csv").write_text("name,drive\na,monday\nb, tuesday\n")
+    (root / "frames.csv").write_text("name,drive\na,monday\nb,tuesdays\n")
     with pytest.raises(
-        PointsError, match="the drive 'tuesday', which has no labeled scan, and not the drive ' tuesday'"
+        PointsError, match="the drive 'tuesday', which has no labeled scan, and not the drive 'tuesdays'"
     ):
         ScanFolder(root)
     (root / "frames.csv").write_text("name,drive\na,tuesday\nb,tuesday\n")

@@ -413,6 +413,7 @@ def test_the_command_writes_labels(tmp_path: Path, monkeypatch: pytest.MonkeyPat
         assert usage_code("run", tmp_path / "drive", "--labels-for", "kitti", *out) == 2
 
 
+@pytest.mark.filterwarnings("default:no scan to train on has a label of pedestrian, cyclist")
 def test_corrected_labels_train_a_network(tmp_path: Path) -> None:
     """From the scans of a drive: pre-labels, one correction, the description, and a step of a training."""
     pytest.importorskip("torch")
