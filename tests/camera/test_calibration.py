@@ -14,6 +14,7 @@ import twins.painting
 from edgeperc import Calibration, CalibrationError, PointsError
 from edgeperc.camera.calibration import fill_projected, read_kitti_calibration
 from edgeperc.datasets.kitti import KittiObjects
+from scenes import rotation_of
 
 K = np.array([[700.0, 0.0, 319.5], [0.0, 710.0, 239.5], [0.0, 0.0, 1.0]])
 AHEAD = np.array([[0.0, -1.0, 0.0, 0.1], [0.0, 0.0, -1.0, -0.1], [1.0, 0.0, 0.0, -0.3], [0.0, 0.0, 0.0, 1.0]])
@@ -86,6 +87,24 @@ def test_projection_by_hand() -> None:
     np.testing.assert_allclose(u[:2], [319.5, 319.5 - 700.0 * 2.0 / 20.0], atol=1e-4)
     np.testing.assert_allclose(v[:2], [239.5, 239.5 - 710.0 * 1.0 / 20.0], atol=1e-4)
     assert np.isnan([u[2:], v[2:]]).all()
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_a_projected_point_comes_back(seed: int) -> None:
+    """From a pixel and a depth to the point and back, for any pose."""
+    rng = np.random.default_rng(seed)
+    T, turn = np.eye(4), rng.normal(size=4)
+    T[:3, :3], T[:3, 3] = rotation_of(*turn / np.linalg.norm(turn)), rng.uniform(-3.0, 3.0, 3)
+    focal = rng.uniform(100.0, 3000.0, 2)
+    made = Calibration([[focal[0], 0, 400.0], [0, focal[1], 300.0], [0, 0, 1]], T, 800, 600)  # type: ignore[arg-type]
+    pixels, depth = rng.uniform(-100.0, 900.0, (50, 2)), rng.uniform(0.5, 80.0, 50)
+    camera = np.column_stack([(pixels - [400.0, 300.0]) / focal, np.ones(50)]) * depth[:, None]
+    points = (camera - T[:3, 3]) @ T[:3, :3]
+    u, v, back = made.project(points)
+    np.testing.assert_allclose(back, depth, atol=3e-5)
+    # The points are rounded to float32: 4 um at 64 m.
+    np.testing.assert_allclose(u, pixels[:, 0], atol=1e-4 * focal[0] / depth.min())
+    np.testing.assert_allclose(v, pixels[:, 1], atol=1e-4 * focal[1] / depth.min())
 
 
 @given(st.integers(0, 2**32 - 1), st.sampled_from([0, 1, 40]))

@@ -48,6 +48,15 @@ def test_points_are_moved_as_by_the_twin(n: int, velocity: Any, rate: Any, data:
     assert not np.isfinite(moved[~good, :3]).all(axis=1).any()
 
 
+@given(RATES, RATES, st.floats(0.05, 0.4))
+def test_the_motion_between_two_poses(velocity: Any, rate: Any, seconds: float) -> None:
+    start = twins.motion.exponential(twins.motion.screw((30.0, -7.0, 2.0), (0.3, -0.2, 1.4)))
+    end = start @ twins.motion.exponential(twins.motion.screw(velocity, rate) * seconds)
+    found = Motion.between(start, 5.0, end, 5.0 + seconds)
+    np.testing.assert_allclose(found.velocity_mps, velocity, atol=1e-6)
+    np.testing.assert_allclose(found.rate_radps, rate, atol=1e-6)
+
+
 def room(n: int = 3600) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Points on the walls of a room 40 x 30 m, in the order in which a spinning sensor meets them, and their times."""
     turn = np.linspace(math.pi, -math.pi, n, endpoint=False)
