@@ -21,7 +21,7 @@ from .agreement.rules import (
     without_poles,
 )
 from .agreement.votes import VEHICLE, Sight
-from .ground.ceiling import find_hall, without_impossible, without_own
+from .ground.ceiling import find_hall, part_own, without_impossible
 from .ground.observed import Observer
 from .ground.planes import FIRST_REACH_HEIGHTS, FIRST_REACH_M, GroundFit, fit_ground
 from .ground.scan import Scan
@@ -336,8 +336,8 @@ def _support(
     """
     boxes, objects, detections = found
     sure = [*boxes, *detections, *(replace(box, score=box.score - LESS_SURE) for box in objects)]
-    others = without_own(sure, mounting) if "ceiling" in rules else sure
-    return find_support(scan, labels, others, rules, own=[box for box in sure if box not in others])
+    others, own = part_own(sure, mounting) if "ceiling" in rules else (sure, [])
+    return find_support(scan, labels, others, rules, own=own)
 
 
 def _unboxed(labels: PointLabels, support: Support) -> PointLabels:

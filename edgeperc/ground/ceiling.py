@@ -79,35 +79,36 @@ def _eye_m(mounting: Mounting) -> float:
     return (mounting.height_m or MODEL_HEIGHT_M) - MODEL_HEIGHT_M
 
 
-def without_own(boxes: Sequence[Box], mounting: Mounting) -> tuple[Box, ...]:
-    """The boxes without the own vehicle: around the sensor, or next to it on a roof, unless it is on a pole."""
+def part_own(boxes: Sequence[Box], mounting: Mounting) -> tuple[list[Box], list[Box]]:
+    """Boxes of others, and of the own vehicle: around the sensor, or next to it on a roof, unless it is on a pole."""
     eye_m = _eye_m(mounting)
     body_m = _BODY_M if eye_m + MODEL_HEIGHT_M >= _ROOF_M else 0.0
-    return tuple(
-        box
-        for box in boxes
-        if box.label not in VEHICLES
-        or box.center[2] + 0.5 * box.size[2] < eye_m - _ON_ROOF_M
-        or not _is_around(box, body_m)
-    )
+    others, own = list[Box](), list[Box]()
+    for box in boxes:
+        is_own = box.label in VEHICLES and _top_m(box) >= eye_m - _ON_ROOF_M and _is_around(box, body_m)
+        (own if is_own else others).append(box)
+    return others, own
 
 
 def without_impossible(boxes: Sequence[Box], hall: Hall, mounting: Mounting) -> tuple[Box, ...]:
     """The boxes without the own vehicle, and without vehicles that do not fit between a ceiling and walls: a small
     garage, beams, pipes.
     """
-    kept = without_own(boxes, mounting)
+    kept, _ = part_own(boxes, mounting)
     if hall.ceiling_m is None:
-        return kept
+        return tuple(kept)
     least_m, most_m = (level_m - _CLEAR_M - MODEL_HEIGHT_M for level_m in (_LEAST_M, hall.ceiling_m))
-    tops_m = [box.center[2] + 0.5 * box.size[2] for box in kept]
     return tuple(
         box
-        for box, top_m in zip(kept, tops_m, strict=True)
+        for box in kept
         if box.label not in VEHICLES
-        or top_m <= least_m
-        or (box.score > _SURE and top_m <= most_m and not _sticks_out(box, hall.outline))
+        or _top_m(box) <= least_m
+        or (box.score > _SURE and _top_m(box) <= most_m and not _sticks_out(box, hall.outline))
     )
+
+
+def _top_m(box: Box) -> float:
+    return box.center[2] + 0.5 * box.size[2]
 
 
 def _is_around(box: Box, body_m: float) -> bool:
