@@ -18,6 +18,11 @@ from .perception import Box
 from .points import Floats, Floats32, Points, read_only
 
 
+def model_rotation(mounting: Mounting) -> Floats:
+    """R, (3, 3), from the scan's axes to those of the models; angles that are not known count as 0."""
+    return MODEL_MOUNTING.rotation().T @ mounting.rotation()
+
+
 class ModelFrame:
     """Moves scans into the frame of the models, and boxes back.
 
@@ -39,9 +44,8 @@ class ModelFrame:
 
     def __init__(self, mounting: Mounting) -> None:
         assert mounting.height_m is not None
-        from_vehicle = MODEL_MOUNTING.rotation().T
-        self.R: Floats = from_vehicle @ mounting.rotation()
-        raised = from_vehicle @ np.array([0.0, 0.0, mounting.height_m - MODEL_HEIGHT_M])
+        self.R: Floats = model_rotation(mounting)
+        raised = MODEL_MOUNTING.rotation().T @ np.array([0.0, 0.0, mounting.height_m - MODEL_HEIGHT_M])
         self.eye: Floats = raised
         self.t: Floats = raised - self.R @ np.array([*mounting.origin_m, 0.0])
         self.is_identity = bool(np.allclose(self.R, np.eye(3), atol=1e-9) and np.allclose(self.t, 0.0, atol=1e-6))
