@@ -303,7 +303,8 @@ def _first_m(top_view: TopView, objects: Mask, standing: Sequence[Box]) -> Float
     near_m = top_view.geometry.corner_m[0]
     first_m = np.where(firsts == len(objects), math.inf, near_m + firsts * top_view.cell_m)
     n_before = math.floor(near_m / top_view.cell_m)
-    ahead = [box for box in standing if box.corners()[:, 0].min() > 0.0]
+    near = [box for box in standing if 0.0 < box.center[0] < near_m + 0.5 * math.hypot(box.size[0], box.size[1])]
+    ahead = [box for box in near if box.corners()[:, 0].min() > 0.0]
     if ahead and n_before > 0:
         begin_m = near_m - n_before * top_view.cell_m
         before = TopViewGeometry((begin_m, near_m), top_view.y_range_m, cell_m=top_view.cell_m)
