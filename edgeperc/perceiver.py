@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import os
-import threading
 import warnings
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -44,7 +43,7 @@ from .preprocess.returns import about_too_near, returns
 from .preprocess.sensor_estimate import SensorEstimate, compile_votes, estimate_sensor
 from .system.clock import as_seconds
 from .system.compilation import Compilation, kernels_of
-from .system.lanes import Lanes, Stopwatch
+from .system.lanes import Calls, Lanes, Stopwatch
 from .system.names import nearest
 from .types.card import ModelCard
 from .types.choices import AUTO_SENSOR, DEFAULT_SENSOR, WEIGHTS
@@ -362,7 +361,7 @@ class Perceiver:
             )
         self.providers = MappingProxyType({s.card.name: s.description for s in self.sessions})
         self._fitness = [FitnessProfile.from_dict(card.fitness) for card in self.cards if card.fitness is not None]
-        self._locks = {os.getpid(): threading.Lock()}
+        self._calls = Calls("a Perceiver")
         self._lanes = Lanes(2 if at_once == 2 and all(session.shares_cores for session in self.sessions) else 1)
         self._pipeline = self._assemble(self.sensor)
         # Compile every kernel here, not in the first call. The networks have already run on their golden inputs.
@@ -417,7 +416,7 @@ class Perceiver:
         return MIN_SCORE if network is None else network.card.score_threshold
 
     def __setattr__(self, name: str, value: object) -> None:
-        if not name.startswith("_") and "_locks" in vars(self):  # the last attribute of construction
+        if not name.startswith("_") and "_calls" in vars(self):  # the last attribute of construction
             raise AttributeError(f"{name} of a Perceiver cannot be set after construction; make another Perceiver")
         super().__setattr__(name, value)
 
@@ -438,11 +437,6 @@ class Perceiver:
         return self._sensor_estimate
 
     @property
-    def _lock(self) -> threading.Lock:
-        """That of this process: after a fork, the one that held the parent's lock may be missing."""
-        return self._locks.setdefault(os.getpid(), threading.Lock())
-
-    @property
     def pipeline(self) -> Pipeline | None:
         """What computes a perception of a scan; None without a LiDAR model."""
         return self._pipeline
@@ -453,7 +447,7 @@ class Perceiver:
         The next scans are checked as the first ones are (``on_mismatch``), and what was warned of once is warned of
         anew. With ``sensor="auto"``, the next one tells the sensor.
         """
-        with self._lock:
+        with self._calls.one():
             self._begin(self._estimator.known)
 
     def _begin(self, known: Mounting) -> None:
@@ -475,7 +469,7 @@ class Perceiver:
 
     def start_from(self, learned: Learned) -> None:
         """Forget the scans so far, and continue from what another perceiver has learned."""
-        with self._lock:
+        with self._calls.one():
             if self._finds_sensor:
                 self._sensor_estimate = learned.sensor_estimate
                 self._use(learned.remission.sensor)
@@ -552,7 +546,7 @@ class Perceiver:
         place = None if origin_m is None else as_origin(origin_m)
         scan = None if points is None else as_points(points)
         pixels = None if image is None else as_image(image)
-        with self._lock:
+        with self._calls.one():
             watch = Stopwatch()
             if scan is None:
                 perception = Perception(0, 0, None, None, (), MappingProxyType(watch.ms), self.providers, (), stamp_s)

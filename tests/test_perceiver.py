@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 import edgeperc
 from edgeperc import (
     Box,
+    EdgepercError,
     FitnessError,
     InferenceError,
     ModelFileError,
@@ -293,6 +294,26 @@ def test_an_interrupt_loses_no_network_of_a_full_turn(
     with pytest.raises(KeyboardInterrupt):
         alone(scan.points)
     assert_same(full_turn, alone(scan.points))
+
+
+def test_a_call_inside_of_a_call_is_refused_and_the_outer_one_goes_on(
+    monkeypatch: pytest.MonkeyPatch, perceive: Perceiver, perception: Perception, scan: SimulatedScan
+) -> None:
+    """As of a signal handler: waiting for the call that it interrupts would never end."""
+    refused = []
+
+    def interrupted(ranged: Any) -> deque[Any]:
+        for call in (lambda: perceive(scan.points), perceive.reset_mounting):
+            with pytest.raises(EdgepercError, match="a Perceiver was called again inside of its own call"):
+                call()
+            refused.append(call)
+        return deque(ranged)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(pipeline, "deque", interrupted)
+        assert_same(perception, perceive(scan.points))
+    assert len(refused) == 2
+    assert_same(perception, perceive(scan.points))
 
 
 def test_perceivers_in_threads_give_the_same_result(perception: Perception, scan: SimulatedScan) -> None:

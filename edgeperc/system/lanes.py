@@ -8,11 +8,12 @@ import threading
 import time
 import warnings
 import weakref
-from collections.abc import Callable, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from queue import SimpleQueue
 from typing import Any, Generic, TypeVar
 
+from ..errors import EdgepercError
 from .interpreter import is_ending
 
 STAGES = ("check", "project", "infer", "decode", "refine", "cluster", "agree")
@@ -36,6 +37,33 @@ class Stopwatch:
             now = time.perf_counter()
             self.ms[stage] = self.ms.get(stage, 0.0) + 1e3 * (now - self._last)
             self._last = now
+
+
+class Calls:
+    """The calls of ``what``, of which one at a time may use its buffers."""
+
+    def __init__(self, what: str) -> None:
+        self._what = what
+        self._locks: dict[int, threading.RLock] = {}
+        self._process: int | None = None  # that of the call at work
+
+    @contextmanager
+    def one(self) -> Iterator[None]:
+        """Wait for the calls of other threads. EdgepercError inside of another one of this thread, which would be
+        waited for for ever.
+        """
+        process = os.getpid()  # after a fork, the thread that held the parent's lock may be missing
+        with self._locks.setdefault(process, threading.RLock()):
+            if self._process == process:
+                raise EdgepercError(
+                    f"{self._what} was called again inside of its own call, as by a signal handler or a finalizer; "
+                    "let these set a flag or fill a queue, and call it afterwards, or give them one of their own"
+                )
+            self._process = process
+            try:
+                yield
+            finally:
+                self._process = None
 
 
 class Once(Generic[_Value]):
