@@ -24,7 +24,7 @@ from ..system.pool import MOST_FIRST, taken
 from ..system.ray_cluster import ENGINES
 from ..types.mounting import Mounting
 from ..zoo import DEFAULT
-from .judge import BY_DEFAULT, NETWORK_ALONE, Judge, Perceiving
+from .judge import BY_DEFAULT, NETWORK_ALONE, Judge, Perceiving, check_unit
 from .mistakes import Mistakes
 from .tables import Record, figures
 from .truth import Truth, check_different, seeds_of
@@ -111,6 +111,8 @@ def evaluate(
     split = split or ("test" if fold is None else "validation")
     job = _Job(tuple(datasets), tuple(models), perceiving, split, fold, road_by, mounted)
     perceive, scans = job.scans()
+    for folder in filter(None, map(_folder, datasets)):
+        check_unit(folder, folder.layout.sensor, _names(folder, split, fold))
     records: dict[str, list[Record]] = {}
     worst: dict[str, list[Mistakes]] = {}
     evaluated: Iterator[_Figures] = (evaluate() for _, _, evaluate in scans)

@@ -14,7 +14,7 @@ import numpy as np
 from ..agreement.rules import RULES
 from ..datasets.kitti import Frame, RoadFrame, scan_hash
 from ..datasets.layout import COARSE, IGNORED, box_label, class_number
-from ..datasets.scan_folder import ScanFrame
+from ..datasets.scan_folder import ScanFolder, ScanFrame
 from ..errors import ModelError, SplitError
 from ..ground.planes import find_ground
 from ..inference.decode import decode_classes
@@ -23,6 +23,7 @@ from ..inference.projection import make_projector, project
 from ..inference.session import Session
 from ..objects.boxes import classes_of_boxes
 from ..perceiver import Perceiver
+from ..preprocess.remission import tell_beyond
 from ..simulation.samples import IGNORE
 from ..simulation.scene import POINT_CLASSES
 from ..types.card import ModelCard
@@ -385,6 +386,12 @@ def renamed(labels: Labels, names: Sequence[str], classes: Sequence[str]) -> Byt
         others = (name, "vehicle" if name in VEHICLES else "", COARSE.get(name, ""))
         numbers[k] = next((classes.index(other) for other in others if other in classes), 0)
     return numbers[labels]
+
+
+def check_unit(folder: ScanFolder, sensor: SensorProfile, names: Sequence[str]) -> None:
+    """Warn if the remission of a drive's first scan is in another unit than the sensor's: figures would be worse."""
+    first = {folder.drives[name]: name for name in reversed(names)}
+    tell_beyond(folder.root, sensor, ((name, folder.frame(name).points) for name in first.values()))
 
 
 def training_scans_of(cards: Sequence[ModelCard]) -> dict[str, set[str]]:

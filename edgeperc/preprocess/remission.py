@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import warnings
+from collections.abc import Iterable
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
@@ -22,7 +25,7 @@ from .sensor_fit import (
     stratify,
 )
 
-__all__ = ["FROZEN_AFTER", "NO_REMISSION", "RemissionMatcher", "is_missing"]
+__all__ = ["FROZEN_AFTER", "NO_REMISSION", "RemissionMatcher", "is_missing", "tell_beyond"]
 
 FROZEN_AFTER = 5  # scans
 
@@ -215,6 +218,24 @@ def is_missing(points: Points) -> bool:
     if _n_values(some) > 1:
         return False
     return _n_values(raw) == 1 and int(np.count_nonzero(np.isfinite(raw))) >= _FEWEST
+
+
+def tell_beyond(folder: Path, sensor: SensorProfile, scans: Iterable[tuple[str, Points]]) -> None:
+    """Warn if the remission of some of the scans, each with its name, is not in the unit that the profile states."""
+    matcher, (low, high) = RemissionMatcher(sensor), sensor.remission_range
+    n, beyond = 0, list[tuple[str, float]]()
+    for name, points in scans:
+        n += 1
+        if not (is_missing(points) or matcher.is_in_range(points)):
+            beyond.append((name, float(np.nanmax(points[:, 3], initial=low))))
+    if beyond:
+        name, most = beyond[0]
+        warnings.warn(
+            f"{folder}: of {len(beyond)} of {n} scans, the remission does not fit the range {low:g} to {high:g} of "
+            f"{sensor.name}: that of {name} is up to {most:g}. Give the sensor in scans.json the remission_range of "
+            "this data",
+            stacklevel=3,
+        )
 
 
 def _n_values(raw: Floats32) -> int:

@@ -7,7 +7,6 @@ beams of a coarser sensor it fills the range image as `edgeperc.Perceiver` does.
 from __future__ import annotations
 
 import math
-import warnings
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -27,7 +26,7 @@ from edgeperc.inference.crop import Crop
 from edgeperc.inference.projection import Projection, RangeImageProjector, TopViewProjector, input_heights, project
 from edgeperc.preprocess.condition import condition
 from edgeperc.preprocess.interpolation import Interpolator
-from edgeperc.preprocess.remission import NO_REMISSION, RemissionMatcher, is_missing
+from edgeperc.preprocess.remission import NO_REMISSION, RemissionMatcher, is_missing, tell_beyond
 from edgeperc.simulation.samples import IGNORE
 from edgeperc.simulation.scene import POINT_CLASSES
 from edgeperc.types.frame import ModelFrame
@@ -60,7 +59,6 @@ def read_scan_set(
     matchers: dict[str, RemissionMatcher] = {}
     sensors: dict[str, SensorProfile] = {}  # of each drive, with the function that all its scans have led to
     frames = [folder.frame(name) for name in tqdm(names, desc=f"reading {layout.name}", leave=False)]
-    beyond: list[ScanFrame] = []
     for frame in frames:
         estimator = estimators.setdefault(frame.drive, MountingEstimator(layout.sensor.mounting))
         with suppress(MountingError):  # perhaps another scan of the drive shows the ground
@@ -68,15 +66,7 @@ def read_scan_set(
         if not is_missing(frame.points):
             matcher = matchers.get(frame.drive, RemissionMatcher(layout.sensor))
             matchers[frame.drive], sensors[frame.drive], _ = matcher.add(frame.points)
-            beyond += [] if matcher.is_in_range(frame.points) else [frame]
-    if beyond:
-        raw, (low, high) = beyond[0].points[:, 3], layout.sensor.remission_range
-        warnings.warn(
-            f"{folder.root}: of {len(beyond)} of {len(frames)} scans, the remission does not fit the range {low:g} to "
-            f"{high:g} of {layout.sensor.name}: that of {beyond[0].name} is up to {np.nanmax(raw, initial=low):g}. "
-            "Give the sensor in scans.json the remission_range of this data",
-            stacklevel=2,
-        )
+    tell_beyond(folder.root, layout.sensor, ((frame.name, frame.points) for frame in frames))
     scans: list[LabeledScan] = []
     for frame in frames:
         estimator = estimators[frame.drive]

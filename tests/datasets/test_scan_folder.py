@@ -8,6 +8,7 @@ import re
 import shutil
 from collections.abc import Callable
 from dataclasses import fields, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +26,7 @@ from edgeperc.datasets.layout import ScanLayout, class_number, known_layouts, re
 from edgeperc.datasets.scan_folder import ScanFolder
 from edgeperc.errors import MountingError, OptionError, PointsError, SensorError
 from edgeperc.evaluation.evaluate import evaluate
+from edgeperc.evaluation.transfer import compare
 from edgeperc.evaluation.truth import cells_inside, folder_truth, road_cells
 from edgeperc.inference.projection import make_projector
 from edgeperc.preprocess.findings import check_fitness
@@ -382,6 +384,16 @@ def test_a_training_tells_of_remissions_and_of_scans_that_it_has_twice(tmp_path:
         pytest.raises(ValueError, match="validation scan street/4 is the training scan street/3, byte for byte"),
     ):
         train(Recipe("pointseg", edge=True), tmp_path / "run", Data(scan_sets=[ScanFolder(root)]))
+
+
+@pytest.mark.parametrize("measure", [partial(evaluate, models=["pointseg"]), compare])
+def test_an_evaluation_tells_of_remissions_in_another_unit(tmp_path: Path, measure: Callable[..., Any]) -> None:
+    root, _ = street(tmp_path, drives="scan", splits={"test": ["3"]}, sensor="hdl-64e")
+    description = json.loads((root / "scans.json").read_text())
+    description["sensor"]["remission_range"] = [0, 100]
+    (root / "scans.json").write_text(json.dumps(description))
+    with pytest.warns(UserWarning, match=r"of 1 of 1 scans, the remission does not fit the range 0 to 100 of hdl-64e"):
+        measure([str(root)])
 
 
 def test_a_scan_is_of_one_drive(tmp_path: Path) -> None:
@@ -810,15 +822,16 @@ def test_folders_are_evaluated(tmp_path: Path, capsys: pytest.CaptureFixture[str
         evaluate([root], ["pointseg"], mounted=Mounting(2.0, 0.0, 0.0))
 
 
+@pytest.mark.filterwarnings("default:.*the remission does not fit")
 def test_other_sensors_are_compared_by_the_same_reader(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     root, _ = street(tmp_path / "set", "hdl-64e")
     out = tmp_path / "figures.json"
     datasets = [str(root), f"hdl-64e={root}"]
     assert cli.main(["eval-sensors", *datasets, "--json", str(out)]) == 0
+    assert "does not fit the range 0 to 1 of hdl-64e: that of 3 is up to 25" in capsys.readouterr().err
     figures = json.loads(out.read_text())
     assert [figures[name]["n_scans"] for name in datasets] == [1, 1]
     assert figures[datasets[0]]["both"]["iou"]["car"] > 0.5
-    capsys.readouterr()
     for source in (str(tmp_path / "set/velodyne"), f"{root}:pandar"):
         assert cli.main(["eval-sensors", source]) == 2
         assert "SENSOR=simulation:N" in capsys.readouterr().err
