@@ -31,11 +31,12 @@ from .arguments import (
     options,
     positive_number,
 )
-from .output import many, print_error, print_line, progress
+from .output import print_error, print_line, progress
 from .report import Report
 from .scans import (
     Scans,
     Sensors,
+    check_pairs,
     check_scans,
     check_sensor,
     find_images,
@@ -398,8 +399,8 @@ def _images(arguments: argparse.Namespace, kinds: Sequence[str]) -> dict[Path, P
     """The images, each with its scan of ``--scan`` if that is passed; empty if the paths are scans."""
     images = find_images(arguments.paths)
     scans = find_scans(arguments.scan).paths
-    if arguments.scan and len(scans) != len(images):
-        arguments.usage_error(f"--scan: {many(len(scans), 'scan')} for {many(len(images), 'image')}; expected as many")
+    if arguments.scan:
+        check_pairs(arguments, images, scans)
     if arguments.calib is not None and arguments.labels_for != "kitti":
         from ..camera.calibration import read_kitti_calibration
 

@@ -19,6 +19,7 @@ from ..system.names import by_number
 from ..system.remote import Remote
 from ..types.choices import AUTO_SENSOR, DEFAULT_SENSOR
 from .arguments import check_inputs, file_options
+from .output import many
 
 if TYPE_CHECKING:
     from ..preprocess.sensor_estimate import SensorEstimate
@@ -138,6 +139,29 @@ def find_images(paths: Sequence[Path]) -> list[Path]:
     if images and others:
         raise ImageError(f"{others[0]} is not an image, and {next(iter(images.values()))} is; pass scans after --scan")
     return [*images.values()]
+
+
+def check_pairs(arguments: argparse.Namespace, images: Sequence[Path], scans: Sequence[Path | Remote]) -> None:
+    """Check that each image has its scan: as many, and none that of another one, as where a drive lacks an image here
+    and a scan there.
+    """
+    from ..sinks.run_file import stem_of
+
+    if len(scans) != len(images):
+        more = ", each once; run one camera at a time" if len(images) > len(scans) else ""
+        arguments.usage_error(
+            f"--scan: {many(len(scans), 'scan')} for {many(len(images), 'image')}; expected as many{more}"
+        )
+    own = {stem_of(scan.name)[0]: scan for scan in scans}
+    pairs = [*zip(images, scans, strict=True)]
+    # Images may be counted from 1 and scans from 0: then none has the name of its scan.
+    if len(own) == len(scans) and any(own.get(image.stem) == scan for image, scan in pairs):
+        for image, scan in pairs:
+            if own.get(image.stem, scan) != scan:
+                arguments.usage_error(
+                    f"--scan: {image} would get {scan}, and {own[image.stem]} has its name; expected the scan of each "
+                    "image in its place: is an image or a scan missing?"
+                )
 
 
 def scan_namer(path: Path) -> Callable[[int], Path]:

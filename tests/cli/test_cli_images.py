@@ -140,10 +140,14 @@ def test_wrong_usage(tmp_path: Path, model: Path, capsys: pytest.CaptureFixture[
     out, photos = ("--out", tmp_path / "out"), tmp_path / "photos"
     photos.mkdir()
     write_image(photos / "b.jpg")
+    lost = {write_image(tmp_path / f"image_2/{k}.png").parent for k in (0, 2, 10)}
+    there = [write_scan(tmp_path / f"velodyne/{k}.bin") for k in (0, 1, 2)]
     twin = write_image(tmp_path / "a_scan.png")
     for arguments, said in (
         ((image, "--scan", scan, scan.with_name("c.bin"), "--model", model), "--scan: 2 scans for 1 image"),
         ((scan, "--scan", scan), "--scan: 1 scan for 0 images"),
+        ((image, twin, "--scan", scan, scan), "1 scan for 2 images; expected as many, each once; run one camera"),
+        ((*lost, "--scan", there[0].parent), f"image_2/2.png would get {there[1]}, and {there[2]} has its name"),
         ((image, "--labels", *out), "--labels needs --scan for images"),
         ((image, "--track"), "--track needs --scan for images"),
         ((image, "--live"), f"--live needs scans, and {image} is an image"),
