@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,6 +18,7 @@ from ..types.rigid import ROW_TOLERANCE, rigid
 
 MAX_EDGE, MAX_PIXELS = 2**15, 2**26  # of an image, as in `edgeperc.camera.image`
 MAX_DISTANCE_M = 100.0  # between the sensors; more is probably a translation in millimeters
+MAX_OFF_CENTER = 0.1  # of the image, in both directions: the lenses of KITTI, nuScenes and Waymo are off by 0.06 in one
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -83,6 +85,12 @@ class Calibration:
             raise CalibrationError(
                 f"K has its center at {c_x:g}, {c_y:g}, outside the image of {self.width} x {self.height} pixels; "
                 "expected the size of the image that K is of. For a resized image, use calibration.resized(...)"
+            )
+        if min(abs(c_x / self.width - 0.5), abs(c_y / self.height - 0.5)) > MAX_OFF_CENTER:
+            warnings.warn(
+                f"K has its center at {c_x:g}, {c_y:g}, far from the middle of the image of {self.width} x "
+                f"{self.height} pixels; expected K, or P2, of this image. Was it resized, cropped or turned since?",
+                stacklevel=3,
             )
 
     @classmethod
