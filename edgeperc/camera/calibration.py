@@ -86,7 +86,7 @@ class Calibration:
                 f"K has its center at {c_x:g}, {c_y:g}, outside the image of {self.width} x {self.height} pixels; "
                 "expected the size of the image that K is of. For a resized image, use calibration.resized(...)"
             )
-        if min(abs(c_x / self.width - 0.5), abs(c_y / self.height - 0.5)) > MAX_OFF_CENTER:
+        if is_off_center(K, self.width, self.height):
             warnings.warn(
                 f"K has its center at {c_x:g}, {c_y:g}, far from the middle of the image of {self.width} x "
                 f"{self.height} pixels; expected K, or P2, of this image. Was it resized, cropped or turned since?",
@@ -216,6 +216,11 @@ def read_kitti_calibration(path: str | os.PathLike[str]) -> tuple[Floats, Floats
 
 _RAW_FILES = ("calib_velo_to_cam.txt", "calib_cam_to_cam.txt")  # of a day's drives
 _NO_NUMBERS = ("calib_time",)
+
+
+def is_off_center(K: Floats, width: int, height: int) -> bool:
+    """Whether the center of a camera matrix is far from the middle of the image in both directions."""
+    return min(abs(K[0, 2] / width - 0.5), abs(K[1, 2] / height - 0.5)) > MAX_OFF_CENTER
 
 
 def _pixels(name: str, given: object) -> int:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import warnings
 import zipfile
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
@@ -12,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from ..camera.calibration import read_kitti_calibration
+from ..camera.calibration import is_off_center, read_kitti_calibration
 from ..errors import OptionError
 from ..records import PerceivedScan
 from ..system.atomic import part_of, write_atomic
@@ -54,7 +55,8 @@ class PrelabelSink:
     - ``"cvat"``: ``annotations.zip`` for a 3-D task of CVAT, format "Datumaro 3D 1.0". With tracks, each object is one
       track; it ends where it is not detected
     - ``"kitti"``: ``label_2/NAME.txt``, KITTI's object labels in the rectified camera frame, and ``calib/NAME.txt``.
-      The image has KITTI's 1242 x 375 pixels; the 2-D box of an object outside it is 0 0 0 0. Occlusion is 3: unknown
+      The image is the perceived one, else of KITTI's 1242 x 375 pixels; the 2-D box of an object outside it is
+      0 0 0 0. Occlusion is 3: unknown
     - ``"sustechpoints"``: ``label/NAME.json``
 
     Parameters
@@ -187,16 +189,24 @@ class PrelabelSink:
         self._file.check()
 
     def _kitti(self, name: str, scan: PerceivedScan, boxes: Sequence[Named]) -> None:
-        T_cam_sensor, P2, text = _NOMINAL_TR, _NOMINAL_P2, ""
+        T_cam_sensor, P2, text, size = _NOMINAL_TR, _NOMINAL_P2, "", _IMAGE_SIZE
         if self._calib is not None:
-            path = calibration_of(self._calib, scan.name)
+            path, image = calibration_of(self._calib, scan.name), scan.perception.image
             T_cam_sensor, P2 = read_kitti_calibration(path)
+            size = size if image is None else (image.labels.shape[1], image.labels.shape[0])
+            if is_off_center(P2, *size):
+                warnings.warn(
+                    f"{path}: P2 has its center at {P2[0, 2]:g}, {P2[1, 2]:g}, far from the middle of an image of "
+                    f"{size[0]} x {size[1]} pixels, to which 2-D boxes are cut; pass the scans as --scan of their "
+                    "images, and the calibration of these",
+                    stacklevel=2,
+                )
             text = path.read_text("utf-8") if path.is_file() else ""
         if not ("R0_rect" in text and "Tr_velo_to_cam" in text):  # readers of objects know no other names
             rows = {f"P{k}": P2 for k in range(4)} | {"R0_rect": np.eye(3), "Tr_velo_to_cam": T_cam_sensor[:3]}
             rows["Tr_imu_to_velo"] = np.eye(4)[:3]
             text = "".join(f"{key}: {' '.join(f'{v:.6e}' for v in row.ravel())}\n" for key, row in rows.items())
-        lines = [_kitti_line(box, T_cam_sensor, P2) for box, _ in boxes]
+        lines = [_kitti_line(box, T_cam_sensor, P2, size) for box, _ in boxes]
         self._write(f"label_2/{name}.txt", scan.name, "".join(lines).encode())
         self._write(f"calib/{name}.txt", scan.name, text.encode())
 
@@ -224,7 +234,7 @@ def cvat_cuboid(box: Box) -> dict[str, list[float]]:
     }
 
 
-def _kitti_line(box: Box, T_cam_sensor: Floats, P2: Floats) -> str:
+def _kitti_line(box: Box, T_cam_sensor: Floats, P2: Floats, size: tuple[int, int]) -> str:
     R, t = T_cam_sensor[:3, :3], T_cam_sensor[:3, 3]
     length, width, height = box.size
     center = R @ np.array(box.center) + t
@@ -235,11 +245,16 @@ def _kitti_line(box: Box, T_cam_sensor: Floats, P2: Floats) -> str:
     cos, sin = math.cos(turn), math.sin(turn)
     corners = signs * [length, height, width] @ np.array([[cos, 0.0, -sin], [0.0, 1.0, 0.0], [sin, 0.0, cos]]) + center
     image = corners @ P2[:, :3].T + P2[:, 3]
+    # Of a box that the camera plane cuts, what is ahead of it: its corners there, and where its edges come out.
+    pairs = [(k, k + bit) for bit in (1, 2, 4) for k in range(8) if not k & bit]
+    ends = [(image[k], image[m]) for k, m in pairs if (image[k, 2] > _NEAREST_M) != (image[m, 2] > _NEAREST_M)]
+    cuts = [start + (end - start) * (_NEAREST_M - start[2]) / (end[2] - start[2]) for start, end in ends]
+    image = np.array([*image[image[:, 2] > _NEAREST_M], *cuts])
     rectangle, cut = np.zeros(4), 1.0
-    if (image[:, 2] > _NEAREST_M).all():
+    if len(image):
         pixels = image[:, :2] / image[:, 2:]
         whole = np.array([*pixels.min(axis=0), *pixels.max(axis=0)])
-        seen = np.clip(whole, 0.0, np.tile(np.array(_IMAGE_SIZE) - 1.0, 2))
+        seen = np.clip(whole, 0.0, np.tile(np.array(size) - 1.0, 2))
         if (seen[2:] > seen[:2]).all():
             rectangle = seen
             cut = 1.0 - float(np.prod(seen[2:] - seen[:2]) / np.prod(whole[2:] - whole[:2]))

@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from cli_helpers import POINTSEG, run, thinned, usage_code
-from edgeperc import Box, CalibrationError, OptionError, Perception, PointsError, Tracker, Tracks
+from edgeperc import Box, CalibrationError, ImageLabels, OptionError, Perception, PointsError, Tracker, Tracks
 from edgeperc.camera.calibration import read_kitti_calibration
 from edgeperc.datasets.annotations import read_labelcloud, read_sustechpoints
 from edgeperc.datasets.scan_folder import ScanFolder
@@ -278,6 +278,10 @@ def test_kitti_labels_lie_in_the_image_of_their_camera(tmp_path: Path) -> None:
     behind = lines[3].split()
     assert behind[:2] == ["Cyclist", "1.00"]
     assert behind[4:8] == ["0.00"] * 4
+    # Beside the camera: its far end, at x = 3.1 m and y = 1.6 m, is in the image.
+    beside = written(tmp_path / "beside", "kitti", perceived("a.bin", (box("car", 1.0, 2.5, 0.0),)), calib=calib)
+    left, _, right, _ = map(float, (beside / "label_2/a.txt").read_text().split()[4:8])
+    assert (left, right) == (0.0, pytest.approx(604.0 - 707.0 * 1.6 / 2.77, abs=20.0))
     calibs = tmp_path / "calibs"
     calibs.mkdir()
     (calibs / "b.txt").write_text(CALIBRATION)
@@ -296,6 +300,19 @@ def test_kitti_labels_lie_in_the_image_of_their_camera(tmp_path: Path) -> None:
     calib.write_text("P2: 1")
     with pytest.raises(CalibrationError, match="expected P2, R0_rect"):
         written(tmp_path / "wrong", "kitti", perceived("a.bin"), calib=calib)
+
+
+def test_boxes_of_kitti_are_cut_to_the_image_that_was_perceived(tmp_path: Path) -> None:
+    calib = tmp_path / "calib.txt"
+    calib.write_text(CALIBRATION.replace("604.0814", "960").replace("180.5066", "600"))
+    scan = perceived("a.bin", BOXES[:1])
+    image = ImageLabels(np.zeros((1200, 1920), np.uint8), ("road",))
+    seen = replace(scan, perception=replace(scan.perception, image=image))
+    folder = written(tmp_path, "kitti", seen, calib=calib)
+    _, top, _, bottom = map(float, (folder / "label_2/a.txt").read_text().split()[4:8])
+    assert top < 600.0 + 707.0 * 0.85 / 14.0 < bottom
+    with pytest.warns(UserWarning, match="center at 960, 600, far from the middle of an image of 1242 x 375"):
+        written(tmp_path, "kitti", scan, calib=calib)
 
 
 def test_errors_name_the_reason(tmp_path: Path) -> None:
