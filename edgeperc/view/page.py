@@ -90,6 +90,7 @@ class DrivePage:
         self.n_points, self.every = _MOST_POINTS, 1
         self._title, self._max_bytes = title, max_bytes
         self._n = self._most = self.n_bytes = 0
+        self._stamp_s = self._time_s = 0.0  # of the last scan, kept or not: its own time, and when it is played
         self._classes: dict[str, int] = {}
         self._scans: list[_Thin] = []
         self._fitness: dict[str, None] = {}
@@ -121,6 +122,9 @@ class DrivePage:
             ``points`` is not the scan that was perceived.
         """
         content.check_points(points, perception)
+        step_s = np.clip(np.nan_to_num(np.subtract(stamp_s, self._stamp_s)), _SHORTEST_S, _LONGEST_S)
+        self._time_s += float(step_s) if self._n else 0.0
+        self._stamp_s = stamp_s
         self._n += 1
         if (self._n - 1) % self.every:
             return
@@ -136,7 +140,7 @@ class DrivePage:
         scan |= {"name": printable(name), "scale": _STEP_M}
         text = _in_script(json.dumps(scan, allow_nan=False))
         cells = np.round(xyz[chosen] / _STEP_M).astype("<i2")
-        self._scans.append(_Thin(text, stamp_s, cells, remission[chosen], label[chosen]))
+        self._scans.append(_Thin(text, self._time_s, cells, remission[chosen], label[chosen]))
         self.n_bytes += self._scans[-1].n_bytes
         while self.n_bytes > self._max_bytes and (self.n_points > _FEWEST_POINTS or len(self._scans) > 1):
             if self.n_points > _FEWEST_POINTS:
@@ -160,14 +164,12 @@ class DrivePage:
         OSError
             The file cannot be written.
         """
-        stamps = np.array([scan.stamp_s for scan in self._scans], np.float64)
-        steps = np.clip(np.nan_to_num(np.diff(stamps)), _SHORTEST_S, _LONGEST_S)
-        times = np.concatenate([np.zeros(min(1, len(stamps))), np.cumsum(steps)])
         kept = f"every {self.every}. of {self._n:,}" if self.every > 1 else "all"
         thinned = f"thinned to {self.n_points:,} points" if self._most > self.n_points else "with all points"
         facts = f"{len(self._scans):,} scans ({kept}), {thinned}"
         texts = (scan.to_json() for scan in self._scans)
-        _fill_page(path, self._title or "A drive", facts, self._fitness, self._classes, texts, times.round(3).tolist())
+        times_s = [round(scan.time_s, 3) for scan in self._scans]
+        _fill_page(path, self._title or "A drive", facts, self._fitness, self._classes, texts, times_s)
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,7 +177,7 @@ class _Thin:
     """A scan of a drive, its points in the order in which they are kept."""
 
     text: str
-    stamp_s: float
+    time_s: float
     xyz: NDArray[np.int16]
     remission: Bytes
     label: Bytes

@@ -622,7 +622,7 @@ def test_a_long_drive_stays_within_its_limit(tmp_path: Path) -> None:
     page, limit = DrivePage(max_bytes=500_000), 500_000
     states = []
     for k in range(40):
-        page.add(perception, points, 0.1 * k, name=str(k))
+        page.add(perception, points, 0.4 * k, name=str(k))
         states.append((page.n_points, page.every))
         assert page.n_bytes <= limit
     assert states[0] == (192_000, 1)
@@ -631,6 +631,7 @@ def test_a_long_drive_stays_within_its_limit(tmp_path: Path) -> None:
     assert (tmp_path / "drive.html").stat().st_size <= limit + 40_000  # and the page itself
     scene = scene_of(tmp_path / "drive.html")
     assert [scan["name"] for scan in scene["scans"]] == [str(k) for k in range(0, 40, 4)]
+    assert scene["times"] == [round(0.4 * k, 3) for k in range(0, 40, 4)]
     xyz, label = unpacked(scene["scans"][0])
     assert len(label) == 3000
     car = [one["name"] for one in scene["classes"]].index("car")
