@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from pathlib import Path
 from typing import Any
@@ -17,11 +18,11 @@ from ..types.sensor import SensorProfile
 from .canvas import add_axes, as_png, height_of_legend, new_figure, write_heading
 from .colors import FAINT, INK, color_of, rgb
 from .content import check_points, drawable_boxes, drawable_points, perceived_image
-from .picture import SENSOR, Place, write_frame
+from .picture import AROUND_M, SENSOR, Place, write_frame
 
 # Sizes in pixels.
 _WIDTH, _MARGIN, _TOP, _GAP, _AXIS = 1600, 28, 128, 44, 62
-_WIDEST, _HIGHEST = 888, 560
+_NARROWEST, _WIDEST, _HIGHEST = 750, 888, 560  # of the panels of the image; headings need the width
 _BESIDE_M, _BEHIND_M, _BEYOND_M = 4.0, 8.0, 2.0  # of the panel from above, outside the view
 
 
@@ -92,7 +93,7 @@ def draw_painted(
     axes.imshow(0.5 * image / 255.0 + 0.5 * tint, aspect="auto", interpolation="antialiased")
     place = (_MARGIN, _TOP + height + _GAP, width, height)
     _draw_points(figure, place, image, points, calibration, colors, painted)
-    left = _MARGIN + width + 34.0 + _AXIS
+    left = _MARGIN + max(width, _NARROWEST) + 34.0 + _AXIS
     room = (left, _TOP, _WIDTH - _MARGIN - left, bottom - _TOP)
     _draw_from_above(figure, room, points, road, perception.boxes, colors, painted)
 
@@ -127,8 +128,14 @@ def _draw_from_above(
 
     (x_near, x_far), (y_right, y_left) = road.x_range_m, road.y_range_m
     low, high, right, left = x_near - _BEHIND_M, x_far + _BEYOND_M, y_right - _BESIDE_M, y_left + _BESIDE_M
+    frame = ModelFrame(road.mounting)
+    shown = np.flatnonzero(drawable_points(points) & (painted < len(colors)))
+    x, y, z = frame.move(points[shown])[:, :3].astype(np.float64).T
+    if (x < low).any():  # of a camera that looks aside or back
+        along, across = AROUND_M
+        low, high, right, left = min(low, -along), max(high, along), min(right, -across), max(left, across)
     px_per_m = min(room[2] / (left - right), room[3] / (high - low))
-    more = f"the image's road on the ground, {road.drivable_area_m2:.0f} m²; gray: not seen"
+    more = f"the image's road ahead, {road.drivable_area_m2:.0f} m²; gray: not seen"
     write_heading(figure, room[0], room[1] - 20, "from above", more)
     axes = add_axes(figure, room[0], room[1], px_per_m * (left - right), px_per_m * (high - low))
     axes.set_xlim(left, right)  # y grows to the left
@@ -137,17 +144,14 @@ def _draw_from_above(
     layer[road.drivable] = (*rgb([color_of("road")])[0], 0.62)
     layer[~road.observed] = (*rgb([FAINT])[0], 0.22)
     axes.imshow(layer, extent=(y_left, y_right, x_near, x_far), aspect="auto", interpolation="nearest", zorder=1)
-    frame = ModelFrame(road.mounting)
-    shown = np.flatnonzero(drawable_points(points) & (painted < len(colors)))
-    x, y, z = frame.move(points[shown])[:, :3].astype(np.float64).T
     order = np.argsort(z, kind="stable")
     axes.scatter(y[order], x[order], s=2.0, c=colors[painted[shown[order]]], linewidths=0, zorder=2)
     for box in drawable_boxes(frame.move_boxes(boxes)):
         outline = Polygon(box.corners()[:, ::-1], closed=True, fill=False, edgecolor=color_of(box.label), zorder=3)
         outline.set_linewidth(2.0)
         axes.add_patch(outline)
-    ahead = np.arange(0.0, high, 10.0)
-    axes.set_yticks(ahead, labels=[f"{tick:.0f} m" for tick in ahead])
+    ticks = np.arange(math.ceil(low / 10.0) * 10.0, high, 10.0)
+    axes.set_yticks(ticks, labels=[f"{tick:.0f} m" for tick in ticks])
     axes.grid(color=INK, alpha=0.12, linewidth=0.8)
     axes.set_axisbelow(True)
     axes.add_patch(Polygon(SENSOR, closed=True, facecolor=INK, zorder=4))

@@ -22,8 +22,9 @@ _WIDTH, _MARGIN, _TOP, _BOTTOM = 1600, 28, 128, 868
 _AXIS = 62
 _NEAR_M = 1.0
 _HALF_STRIP_M = 1.0
-_AROUND_M = (48.0, 36.0)  # ahead and behind, to each side
 
+AROUND_M = (48.0, 36.0)
+"""Reach of panels of the whole turn: ahead and behind, to each side."""
 SENSOR = [[0.0, 1.2], [0.9, -1.2], [-0.9, -1.2]]
 """The arrowhead that stands for the sensor in panels from above: y, x [m]."""
 
@@ -215,7 +216,7 @@ def _draw_top_view(figure: Any, drawn: _Drawn, top_view: TopView, road: RoadAhea
     low, high, right, left = min(-2.5, x_near - 2.5), x_far + 2.0, y_right - 4.0, y_left + 4.0
     of_scene = np.array([name in STATIC for name in drawn.names])[drawn.painted]
     if any(box.center[0] < low for box in boxes) or (points[of_scene, 0] < low).any():
-        along, across = _AROUND_M
+        along, across = AROUND_M
         low, high, right, left = min(low, -along), max(high, along), min(right, -across), max(left, across)
     px_per_m = min((_BOTTOM - _TOP) / (high - low), 560.0 / (left - right))
     width = px_per_m * (left - right)

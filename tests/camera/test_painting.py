@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import math
 import re
@@ -375,6 +376,12 @@ def test_draw_painted(tmp_path: Path) -> None:
     labels = ImageLabels(np.zeros((376, 1240), np.uint8), ("Sky",))
     few = scan.points[::50]
     draw_painted(replace(found, n_points=len(few), image=labels), np.zeros((376, 1240, 3), np.uint8), few, wide)
+    # The panel from above shows what a camera that looks back sees.
+    back = Calibration(NEAR.K, np.diag([-1.0, 1.0, -1.0, 1.0]) @ NEAR.T_camera_sensor, 640, 480)
+    cars = replace(found, image=ImageLabels(np.full_like(image.labels, CAMERA_CLASSES.index("Car")), CAMERA_CLASSES))
+    with pillow.open(io.BytesIO(draw_painted(cars, image.rgb, scan.points, back))) as picture:
+        above = np.asarray(picture.convert("RGB")).astype(np.int16)[120:860, 900:]
+    assert (np.abs(above - car).max(axis=2) < 12).sum() > 300
 
     with pytest.raises(ImageError, match="of a perception of an image of shape"):
         draw_painted(found, image.rgb[:-1], scan.points, NEAR)
