@@ -32,7 +32,7 @@ class LabeledImages:
                 f"{root / 'classes.json'}: expected an object of id and name, ids from 0 ({type(exc).__name__}: {exc})"
             ) from exc
         self.classes = tuple(name for name in names if name.casefold() not in UNLABELED)
-        self._of_id = np.full(256, IGNORE, np.uint8)
+        self._n_ids, self._of_id = len(names), np.full(256, IGNORE, np.uint8)
         for k, name in enumerate(names[:256]):
             self._of_id[k] = self.classes.index(name) if name in self.classes else IGNORE
 
@@ -69,6 +69,12 @@ class LabeledImages:
                         f"each of the {image.shape[1]} x {image.shape[0]} pixels of {file.name}"
                     )
                 ids = np.asarray(opened)
+            unnamed = ids[(ids >= self._n_ids) & (ids != IGNORE)]
+            if unnamed.size:
+                raise ImageError(
+                    f"{path}: {unnamed.size} pixels have ids up to {unnamed.max()}; expected the ids 0 to "
+                    f"{self._n_ids - 1} of {self.root / 'classes.json'}, or {IGNORE} for pixels without a class"
+                )
         except ImageError:
             raise
         except Exception as exc:  # on damaged files, Pillow's decoders raise nearly every kind of error

@@ -139,6 +139,11 @@ def test_what_cannot_be_evaluated(tmp_path: Path, model: Path) -> None:
     pillow.fromarray(right[:20]).save(annotation)
     with pytest.raises(ImageError, match="32 x 20 pixels of mode L; expected an id for each of the 32 x 24"):
         evaluate_images([root], model)
+    pillow.fromarray(labels(0, 1, 2, 255)).save(annotation)
+    assert evaluate_images([root], model)["images"]["all"]["n_pixels"] == 3 * 8 * HEIGHT
+    pillow.fromarray(labels(0, 1, 2, 4)).save(annotation)
+    with pytest.raises(ImageError, match="192 pixels have ids up to 4; expected the ids 0 to 3 of"):
+        evaluate_images([root], model)
     annotation.write_bytes(b"no image")
     with pytest.raises(ImageError, match="the labels cannot be read"):
         evaluate_images([root], model)
