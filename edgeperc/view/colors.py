@@ -56,6 +56,12 @@ def rgb(colors: list[str]) -> Floats:
     return np.array([[int(c[k : k + 2], 16) / 255.0 for k in (1, 3, 5)] for c in colors]).reshape(-1, 3)
 
 
+def pixel_colors(names: Iterable[str]) -> Floats:
+    """Color of each label of an image, (256, 3) float64 in 0..1; gray for those without a class."""
+    colors = rgb([color_of(name) for name in names])
+    return np.concatenate([colors, np.full((256 - len(colors), 3), 0.5)])
+
+
 def byte_colors(names: Iterable[str]) -> Bytes:
     """Colors of classes, (n, 3) uint8 red, green, blue."""
     return np.asarray((rgb([color_of(name) for name in names]) * 255.0).round().astype(np.uint8))

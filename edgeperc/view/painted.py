@@ -16,7 +16,7 @@ from ..types.perception import Box, Perception, TopView
 from ..types.points import Bytes, Floats, Labels, Points
 from ..types.sensor import SensorProfile
 from .canvas import add_axes, as_png, height_of_legend, new_figure, write_heading
-from .colors import FAINT, INK, color_of, rgb
+from .colors import FAINT, INK, color_of, pixel_colors, rgb
 from .content import check_points, drawable_boxes, drawable_points, perceived_image
 from .picture import AROUND_M, SENSOR, Place, write_frame
 
@@ -87,9 +87,8 @@ def draw_painted(
     figure = new_figure(_WIDTH, int(bottom) + 40 + height_of_legend(facts) + 84)
     colors = rgb([color_of(name) for name in labels.classes])
     write_heading(figure, _MARGIN, _TOP - 20, "the camera", "a class for every pixel")
-    known = labels.labels < len(colors)
-    tint = np.where(known[..., None], colors[np.where(known, labels.labels, 0)], 0.5)
     axes = add_axes(figure, _MARGIN, _TOP, width, height)
+    tint = pixel_colors(labels.classes)[labels.labels]
     axes.imshow(0.5 * image / 255.0 + 0.5 * tint, aspect="auto", interpolation="antialiased")
     place = (_MARGIN, _TOP + height + _GAP, width, height)
     _draw_points(figure, place, image, points, calibration, colors, painted)

@@ -14,7 +14,7 @@ from ..types.choices import STATIC
 from ..types.perception import Box, Perception, TopView
 from ..types.points import Bytes, Floats, Labels, Points
 from . import canvas, content
-from .colors import AMBER, FAINT, INK, PANEL, color_of, ramp, rgb
+from .colors import AMBER, FAINT, INK, PANEL, color_of, pixel_colors, ramp, rgb
 
 _PARTS = {90.0: "90° ahead", 360.0: "all around"}
 # Sizes in pixels. A page that shows the picture 1000 pixels wide reduces text of 13 points to 8.
@@ -160,7 +160,7 @@ def draw_image(perception: Perception, image: Bytes, path: str | Path | None = N
     legend_top, legend_height = 80 + height + 24, canvas.height_of_legend(facts)
     figure = canvas.new_figure(_WIDTH, legend_top + legend_height + 72)
     axes = canvas.add_axes(figure, _MARGIN, 80, _WIDTH - 2 * _MARGIN, height)
-    colors = rgb([color_of(name) for name in labels.classes]).astype(np.float32)[labels.labels]
+    colors = pixel_colors(labels.classes).astype(np.float32)[labels.labels]
     axes.imshow(0.55 * image.astype(np.float32) / 255.0 + 0.45 * colors, aspect="equal", interpolation="antialiased")
     size = f"{image.shape[1]} x {image.shape[0]} pixels, {100.0 * labels.drivable_share:.1f} % road"
     write_frame(figure, perception, (title, 1000), size, facts, (legend_top, legend_top + legend_height + 34))

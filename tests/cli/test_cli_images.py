@@ -188,6 +188,7 @@ def test_info_of_images_and_camera_models(tmp_path: Path, model: Path, capsys: p
 def test_pictures_of_images(tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
     labels = np.arange(12, dtype=np.uint8).reshape(3, 4) % 3
+    labels[0, 0] = 255  # of an image that somebody labeled
     perception = Perception(
         0, 0, None, None, (), {"infer": 1.0}, {"m": "m"}, (), None, image=ImageLabels(labels, tuple("abc"))
     )
