@@ -21,6 +21,7 @@ from ..types.choices import VEHICLES
 from ..types.geometry import wrapped
 from ..types.perception import Box
 from ..types.points import Floats
+from ..view.content import edges_ahead
 from .run_file import RunFile, ScanFiles, stem_of, warn_of
 
 __all__ = ["KINDS", "PrelabelSink", "cvat_cuboid"]
@@ -37,7 +38,7 @@ _SUSTECH_CLASSES = {"cyclist": "BicycleRider"}  # the others have their own name
 _NOMINAL_P2 = np.array([[721.5377, 0.0, 609.5593, 0.0], [0.0, 721.5377, 172.854, 0.0], [0.0, 0.0, 1.0, 0.0]])
 _NOMINAL_TR = np.array([[0.0, -1.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
 _IMAGE_SIZE = (1242, 375)
-_NEAREST_M = 0.1  # a corner nearer to the camera plane has no place in the image
+_NEAREST_M = 0.1  # what is nearer to the camera plane has no place in the image
 
 Named = tuple[Box, "int | None"]
 """A box and the id of its track."""
@@ -241,26 +242,22 @@ def _kitti_line(box: Box, T_cam_sensor: Floats, P2: Floats, size: tuple[int, int
     ahead = R @ np.array([math.cos(box.yaw), math.sin(box.yaw), 0.0])
     turn = math.atan2(-ahead[2], ahead[0])
     x, y, z = center[0], center[1] + height / 2.0, center[2]  # the middle of the bottom face; y points down
-    signs = np.array([[i, j, k] for i in (-0.5, 0.5) for j in (-0.5, 0.5) for k in (-0.5, 0.5)])
+    around = ((0.5, 0.5), (0.5, -0.5), (-0.5, -0.5), (-0.5, 0.5))
+    signs = np.array([[i, j, k] for j in (-0.5, 0.5) for i, k in around])  # in the order of `box_corners`
     cos, sin = math.cos(turn), math.sin(turn)
     corners = signs * [length, height, width] @ np.array([[cos, 0.0, -sin], [0.0, 1.0, 0.0], [sin, 0.0, cos]]) + center
     image = corners @ P2[:, :3].T + P2[:, 3]
-    # Of a box that the camera plane cuts, what is ahead of it: its corners there, and where its edges come out.
-    pairs = [(k, k + bit) for bit in (1, 2, 4) for k in range(8) if not k & bit]
-    ends = [(image[k], image[m]) for k, m in pairs if (image[k, 2] > _NEAREST_M) != (image[m, 2] > _NEAREST_M)]
-    cuts = [start + (end - start) * (_NEAREST_M - start[2]) / (end[2] - start[2]) for start, end in ends]
-    image = np.array([*image[image[:, 2] > _NEAREST_M], *cuts])
+    ends = edges_ahead(image, _NEAREST_M).reshape(-1, 3)
     rectangle, cut = np.zeros(4), 1.0
-    if len(image):
-        pixels = image[:, :2] / image[:, 2:]
+    if len(ends):
+        pixels = ends[:, :2] / ends[:, 2:]
         whole = np.array([*pixels.min(axis=0), *pixels.max(axis=0)])
         seen = np.clip(whole, 0.0, np.tile(np.array(size) - 1.0, 2))
         if (seen[2:] > seen[:2]).all():
             rectangle = seen
             cut = 1.0 - float(np.prod(seen[2:] - seen[:2]) / np.prod(whole[2:] - whole[:2]))
-    numbers = [*rectangle, height, width, length, x, y, z]
-    alpha = wrapped(turn - math.atan2(x, z))
-    texts = [f"{cut:.2f} 3 {alpha:.4f}", *(f"{v:.2f}" for v in rectangle), *(f"{v:.4f}" for v in numbers[4:])]
+    alpha, solid = wrapped(turn - math.atan2(x, z)), (height, width, length, x, y, z)
+    texts = [f"{cut:.2f} 3 {alpha:.4f}", *(f"{v:.2f}" for v in rectangle), *(f"{v:.4f}" for v in solid)]
     return f"{_capital(box.label)} {' '.join(texts)} {turn:.5f}\n"
 
 

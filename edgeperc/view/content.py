@@ -141,6 +141,20 @@ def box_corners(box: Box) -> Floats:
     return np.column_stack([np.tile(box.corners(), (2, 1)), z])
 
 
+def edges_ahead(corners: Floats, near_m: float) -> Floats:
+    """What of the edges of a box is more than ``near_m`` ahead, (k, 2, 3): the last coordinate of its `box_corners` is
+    the distance ahead.
+    """
+    ends = []
+    for pair in EDGES:
+        start, end = sorted(corners[[*pair]], key=lambda corner: float(corner[2]))
+        if end[2] > near_m:
+            if start[2] < near_m:
+                start = start + (end - start) * (near_m - start[2]) / (end[2] - start[2])
+            ends.append((start, end))
+    return np.array(ends).reshape(-1, 2, 3)
+
+
 def box_text(box: Box) -> str:
     """Label and score of a box."""
     return f"{printable(box.label)} {box.score:.2f}"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 from pathlib import Path
 from typing import Any
@@ -16,9 +15,9 @@ from ..types.perception import Box, Perception, TopView
 from ..types.points import Bytes, Floats, Labels, Points
 from ..types.sensor import SensorProfile
 from .canvas import add_axes, as_png, height_of_legend, new_figure, write_heading
-from .colors import FAINT, INK, color_of, pixel_colors, rgb
+from .colors import FAINT, color_of, pixel_colors, rgb
 from .content import check_points, drawable_boxes, drawable_points, perceived_image
-from .picture import AROUND_M, SENSOR, Place, write_frame
+from .picture import Place, axes_from_above, write_frame
 
 # Sizes in pixels.
 _WIDTH, _MARGIN, _TOP, _GAP, _AXIS = 1600, 28, 128, 44, 62
@@ -111,13 +110,12 @@ def _draw_points(
     gray = image.mean(axis=2, keepdims=True).repeat(3, axis=2) / 255.0
     axes.imshow(0.35 + 0.4 * gray, aspect="auto", interpolation="antialiased")
     axes.set_autoscale_on(False)
+    shades = np.concatenate([colors, np.zeros((256 - len(colors), 3))])
     u, v, depth = calibration.project(points)
     inside = (u >= 0.0) & (u < calibration.width) & (v >= 0.0) & (v < calibration.height)
     for shown, size in ((inside & (painted >= len(colors)), 1.0), (inside & (painted < len(colors)), 3.2)):
         far_first = np.flatnonzero(shown)[np.argsort(-depth[shown], kind="stable")]
-        known = painted[far_first] < len(colors)
-        color = np.where(known[:, None], colors[np.where(known, painted[far_first], 0)], 0.0)
-        axes.scatter(u[far_first], v[far_first], s=size, c=color, linewidths=0)
+        axes.scatter(u[far_first], v[far_first], s=size, c=shades[painted[far_first]], linewidths=0)
 
 
 def _draw_from_above(
@@ -130,15 +128,9 @@ def _draw_from_above(
     frame = ModelFrame(road.mounting)
     shown = np.flatnonzero(drawable_points(points) & (painted < len(colors)))
     x, y, z = frame.move(points[shown])[:, :3].astype(np.float64).T
-    if (x < low).any():  # of a camera that looks aside or back
-        along, across = AROUND_M
-        low, high, right, left = min(low, -along), max(high, along), min(right, -across), max(left, across)
-    px_per_m = min(room[2] / (left - right), room[3] / (high - low))
+    axes, _ = axes_from_above(figure, room, (low, high, right, left), bool((x < low).any()))
     more = f"the image's road ahead, {road.drivable_area_m2:.0f} m²; gray: not seen"
     write_heading(figure, room[0], room[1] - 20, "from above", more)
-    axes = add_axes(figure, room[0], room[1], px_per_m * (left - right), px_per_m * (high - low))
-    axes.set_xlim(left, right)  # y grows to the left
-    axes.set_ylim(low, high)
     layer = np.zeros((*road.labels.shape, 4))
     layer[road.drivable] = (*rgb([color_of("road")])[0], 0.62)
     layer[~road.observed] = (*rgb([FAINT])[0], 0.22)
@@ -149,8 +141,3 @@ def _draw_from_above(
         outline = Polygon(box.corners()[:, ::-1], closed=True, fill=False, edgecolor=color_of(box.label), zorder=3)
         outline.set_linewidth(2.0)
         axes.add_patch(outline)
-    ticks = np.arange(math.ceil(low / 10.0) * 10.0, high, 10.0)
-    axes.set_yticks(ticks, labels=[f"{tick:.0f} m" for tick in ticks])
-    axes.grid(color=INK, alpha=0.12, linewidth=0.8)
-    axes.set_axisbelow(True)
-    axes.add_patch(Polygon(SENSOR, closed=True, facecolor=INK, zorder=4))

@@ -22,11 +22,8 @@ _WIDTH, _MARGIN, _TOP, _BOTTOM = 1600, 28, 128, 868
 _AXIS = 62
 _NEAR_M = 1.0
 _HALF_STRIP_M = 1.0
-
-AROUND_M = (48.0, 36.0)
-"""Reach of panels of the whole turn: ahead and behind, to each side."""
-SENSOR = [[0.0, 1.2], [0.9, -1.2], [-0.9, -1.2]]
-"""The arrowhead that stands for the sensor in panels from above: y, x [m]."""
+_AROUND_M = (48.0, 36.0)  # ahead and behind, to each side
+_SENSOR = [[0.0, 1.2], [0.9, -1.2], [-0.9, -1.2]]  # the arrowhead that stands for it in panels from above: y, x [m]
 
 Place = tuple[float, float, float, float]
 """Left, top, width and height of a panel [px]."""
@@ -207,22 +204,46 @@ def _strip(ahead: FreeAhead, x_near: float) -> tuple[str, Floats | None]:
     return text, np.array([[x_near, half], [neck, half], [free_m, 0.0], [neck, -half], [x_near, -half]])
 
 
+def axes_from_above(figure: Any, room: Place, bounds: Place, all_around: bool) -> tuple[Any, Place]:
+    """Add the panel from above with its grid and the sensor; ``bounds`` [m] are the lowest and highest x and y that it
+    shows at least, widened if it shows the whole turn.
+    """
+    from matplotlib.patches import Polygon
+
+    low, high, right, left = bounds
+    if all_around:
+        along, across = _AROUND_M
+        low, high, right, left = min(low, -along), max(high, along), min(right, -across), max(left, across)
+    px_per_m = min(room[3] / (high - low), room[2] / (left - right))
+    axes = canvas.add_axes(figure, room[0], room[1], px_per_m * (left - right), px_per_m * (high - low))
+    axes.set_xlim(left, right)  # y grows to the left
+    axes.set_ylim(low, high)
+    step = 10.0 if high - low > 25.0 else 5.0
+    ticks = np.arange(math.ceil(low / step) * step, high, step)[:30]
+    step = step if left - right < 40.0 else 20.0
+    beside = np.arange(math.ceil(right / step) * step, left, step)[:30]
+    axes.set_yticks(ticks, labels=[f"{tick:.0f} m" for tick in ticks])
+    axes.set_xticks(
+        beside, labels=[f"{abs(tick):.0f} m{' left' * (tick > 0)}{' right' * (tick < 0)}" for tick in beside.tolist()]
+    )
+    axes.grid(color=INK, alpha=0.12, linewidth=0.8)
+    axes.set_axisbelow(True)
+    axes.add_patch(Polygon(_SENSOR, closed=True, facecolor=INK, zorder=5))
+    return axes, (low, high, right, left)
+
+
 def _draw_top_view(figure: Any, drawn: _Drawn, top_view: TopView, road: RoadAhead) -> float:
     """Draw the panel from above; return its width [px]. Points of the surroundings have the color of their class."""
     from matplotlib.patches import Polygon, Rectangle
 
     points, boxes = drawn.points, drawn.boxes
     (x_near, x_far), (y_right, y_left) = top_view.x_range_m, top_view.y_range_m
-    low, high, right, left = min(-2.5, x_near - 2.5), x_far + 2.0, y_right - 4.0, y_left + 4.0
+    low = min(-2.5, x_near - 2.5)
     of_scene = np.array([name in STATIC for name in drawn.names])[drawn.painted]
-    if any(box.center[0] < low for box in boxes) or (points[of_scene, 0] < low).any():
-        along, across = AROUND_M
-        low, high, right, left = min(low, -along), max(high, along), min(right, -across), max(left, across)
-    px_per_m = min((_BOTTOM - _TOP) / (high - low), 560.0 / (left - right))
-    width = px_per_m * (left - right)
-    axes = canvas.add_axes(figure, _MARGIN + _AXIS, _TOP, width, px_per_m * (high - low))
-    axes.set_xlim(left, right)  # y grows to the left
-    axes.set_ylim(low, high)
+    behind = any(box.center[0] < low for box in boxes) or bool((points[of_scene, 0] < low).any())
+    room = (_MARGIN + _AXIS, _TOP, 560.0, float(_BOTTOM - _TOP))
+    axes, bounds = axes_from_above(figure, room, (low, x_far + 2.0, y_right - 4.0, y_left + 4.0), behind)
+    low, high, right, left = bounds
 
     layer = np.zeros((*top_view.labels.shape, 4))
     for k, name in enumerate(top_view.classes):
@@ -241,23 +262,12 @@ def _draw_top_view(figure: Any, drawn: _Drawn, top_view: TopView, road: RoadAhea
     shade = ramp(drawn.above_m[inside], -0.2, 2.5)
     shade[of_scene[inside]] = drawn.colors[inside][of_scene[inside]]
     axes.scatter(y[inside], x[inside], s=1.8, c=shade, alpha=0.8, linewidths=0, zorder=2)
-    bounds = Rectangle((y_right, x_near), y_left - y_right, x_far - x_near, fill=False, edgecolor=FAINT, linestyle="--")
-    axes.add_patch(bounds)
-
-    step = 10.0 if high - low > 25.0 else 5.0
-    ticks = np.arange(math.ceil(low / step) * step, high, step)[:30]
-    step = step if left - right < 40.0 else 20.0
-    beside = np.arange(math.ceil(right / step) * step, left, step)[:30]
-    axes.set_yticks(ticks, labels=[f"{tick:.0f} m" for tick in ticks])
-    axes.set_xticks(
-        beside, labels=[f"{abs(tick):.0f} m{' left' * (tick > 0)}{' right' * (tick < 0)}" for tick in beside.tolist()]
+    outline = Rectangle(
+        (y_right, x_near), y_left - y_right, x_far - x_near, fill=False, edgecolor=FAINT, linestyle="--"
     )
-    axes.grid(color=INK, alpha=0.12, linewidth=0.8)
-    axes.set_axisbelow(True)
-    sensor = Polygon(SENSOR, closed=True, facecolor=INK, zorder=5)
-    axes.add_patch(sensor)
+    axes.add_patch(outline)
 
-    avoid = [canvas.area_of(axes, sensor.get_xy())]
+    avoid = [canvas.area_of(axes, _SENSOR)]
     strip = road.free_ahead(_HALF_STRIP_M)
     text, arrow = _strip(strip, x_near)
     if arrow is not None:
@@ -283,7 +293,7 @@ def _draw_top_view(figure: Any, drawn: _Drawn, top_view: TopView, road: RoadAhea
     n_omitted = canvas.place_labels(axes, labels, avoid)
     seen = _omitted("scores", n_omitted) if n_omitted else "scores; gray: not observed"  # both are wider than the panel
     canvas.write_heading(figure, _MARGIN + _AXIS, _TOP - 20, "from above", seen)
-    return width
+    return float(axes.get_window_extent().width)
 
 
 def _omitted(text: str, n_omitted: int) -> str:
@@ -384,10 +394,10 @@ def _draw_from_behind(figure: Any, place: Place, drawn: _Drawn) -> None:
     # The nearest boxes last, because they occlude the others.
     for box in sorted(boxes, key=lambda box: -box.center[0]):
         corners = (content.box_corners(box) - eye) @ turn.T
-        ends = [end for k, m in content.EDGES if (end := _clipped(corners[k], corners[m])) is not None]
-        if not ends:
+        ends = content.edges_ahead(corners, _NEAR_M)
+        if not len(ends):
             continue
-        flat = np.array(ends)[:, :, :2] / np.array(ends)[:, :, 2:]
+        flat = ends[:, :, :2] / ends[:, :, 2:]
         color = color_of(box.label)
         axes.add_collection(LineCollection(list(flat), colors=color, linewidths=1.8, zorder=4))
         if corners[:, 2].min() > _NEAR_M:
@@ -401,17 +411,6 @@ def _draw_from_behind(figure: Any, place: Place, drawn: _Drawn) -> None:
     n_omitted = canvas.place_labels(axes, labels[::-1])
     more = "drivable area, boxes and their distance"
     canvas.write_heading(figure, place[0], place[1] - 20, "from behind", _omitted(more, n_omitted))
-
-
-def _clipped(start: Floats, end: Floats) -> Floats | None:
-    """The part of an edge in front of the camera, (2, 3); None if all of it is behind."""
-    if start[2] > end[2]:
-        start, end = end, start
-    if end[2] <= _NEAR_M:
-        return None
-    if start[2] < _NEAR_M:
-        start = start + (end - start) * (_NEAR_M - start[2]) / (end[2] - start[2])
-    return np.stack([start, end])
 
 
 def _ground_layer(
