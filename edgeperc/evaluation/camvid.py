@@ -96,8 +96,7 @@ def image_figures(classes: Sequence[str], counts: Ints64, n_resamples: int = 100
 
 def _rates(classes: Sequence[str], counts: Ints64) -> tuple[dict[str, float], dict[str, Floats]]:
     """Rates of a confusion matrix over all pixels, and of each class."""
-    confusion = Confusion(classes)
-    confusion.counts = counts
+    confusion = Confusion(classes, counts)
     iou, recall = confusion.iou(), confusion.recall()
     of_all = {"mean_iou": mean(iou), "mean_accuracy": mean(recall), "accuracy": confusion.accuracy()}
     return of_all, {"iou": iou, "precision": confusion.precision(), "recall": recall}

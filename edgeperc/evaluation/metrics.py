@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from ..errors import PointsError
 from ..simulation.samples import IGNORE
@@ -37,9 +37,9 @@ class Confusion:
     is not counted. A class without true and predicted labels has NaN scores.
     """
 
-    def __init__(self, classes: Sequence[str]) -> None:
+    def __init__(self, classes: Sequence[str], counts: NDArray[Any] | None = None) -> None:
         self.classes = tuple(classes)
-        self.counts = np.zeros((len(self.classes), len(self.classes)), dtype=np.int64)
+        self.counts = np.zeros((len(classes), len(classes)), dtype=np.int64) if counts is None else counts
 
     def update(self, predicted: ArrayLike, truth: ArrayLike) -> None:
         """Count the labels of one scan or image, two arrays of one shape. Raises PointsError."""
@@ -60,16 +60,12 @@ class Confusion:
         """Add the counts of both; raise `PointsError` if their classes differ."""
         if self.classes != other.classes:
             raise PointsError(f"got counts of {self.classes} and of {other.classes}; expected the same classes")
-        both = Confusion(self.classes)
-        both.counts = self.counts + other.counts
-        return both
+        return Confusion(self.classes, self.counts + other.counts)
 
     def merged(self, groups: Mapping[str, Sequence[str]]) -> Confusion:
         """Join classes: ``groups`` maps a new class to the classes that it joins. Classes in no group are dropped."""
         member = np.array([[name in group for name in self.classes] for group in groups.values()], dtype=np.int64)
-        coarse = Confusion(tuple(groups))
-        coarse.counts = member @ self.counts @ member.T
-        return coarse
+        return Confusion(tuple(groups), member @ self.counts @ member.T)
 
     def precision(self) -> Floats:
         """Correct share of the predictions of each class, (C,) float64: P of PointSeg 5.1, equation A3 of SSADNet."""

@@ -120,8 +120,7 @@ def _one_drive(scans: Sequence[Tallies]) -> Tallies:
     means: dict[tuple[str, ...], Any] = {}
     for key, tally in tallies.items():
         if key[0] == "points":
-            mean_scan = means["mean_scan", key[1]] = Confusion(tally.classes)
-            mean_scan.counts = tally.counts / len(scans)
+            means["mean_scan", key[1]] = Confusion(tally.classes, tally.counts / len(scans))
     return {**tallies, **means}
 
 

@@ -63,8 +63,7 @@ def figures_of(counts: Ints64) -> dict[str, float]:
     """Accuracy, mean IoU, F1 and Dice by the paper's equations 1 to 6, of pixels (C, C) by truth and prediction,
     without absent classes. Dice, of all classes' masks together, equals the accuracy; by class, it would be F1.
     """
-    confusion = Confusion([str(k) for k in range(len(counts))])
-    confusion.counts = counts
+    confusion = Confusion([str(k) for k in range(len(counts))], counts)
     precision, recall = np.nan_to_num(confusion.precision()), np.nan_to_num(confusion.recall())
     present = ~np.isnan(confusion.iou())
     f1 = 2.0 * precision * recall / np.maximum(precision + recall, 1e-12)
@@ -111,9 +110,8 @@ def ablate_camvid(
             accumulate=1,
             steps=max(1, epochs * n_images // batch),
             stop_after=0,
+            learning_rate=PAPER[network].learning_rate if learning_rate is None else learning_rate,
         )
-        if learning_rate is not None:
-            recipe = replace(recipe, learning_rate=learning_rate)
         budget = {
             **{"width": width, "height": height, "epochs": epochs, "batch": batch, "steps": recipe.steps},
             **{"images": recipe.steps * batch, "learning_rate": recipe.learning_rate},
@@ -132,16 +130,16 @@ def ablate_camvid(
         trained = build_network(state, checkpoint).to(device, memory_format=torch.channels_last).eval()  # type: ignore[call-overload]  # not in its stubs
         watch = camvid_samples(task, camvid, device)[1]
         counts, loss, labels = confusions(trained, watch.images, watch.truth, task.input)
-        confusion = Confusion(task.classes)
-        confusion.counts = counts.sum(0)
+        total = counts.sum(0)
+        iou = np.nan_to_num(Confusion(task.classes, total).iou()).round(4).tolist()
         rows.append(
             {
                 "name": name,
                 "budget": budget,
                 "loss": round(loss, 4),
-                **{figure: round(value, 4) for figure, value in figures_of(counts.sum(0)).items()},
+                **{figure: round(value, 4) for figure, value in figures_of(total).items()},
                 "miou_interval": image_figures(task.classes, counts)["all"]["mean_iou_interval"],
-                "iou": dict(zip(task.classes, np.nan_to_num(confusion.iou()).round(4).tolist(), strict=True)),
+                "iou": dict(zip(task.classes, iou, strict=True)),
                 "parameters": sum(weight.numel() for weight in trained.parameters()),
                 "seconds": round(seconds, 1),
                 "curve": state["curve"],

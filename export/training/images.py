@@ -202,8 +202,7 @@ class ImageWatch:
     def validate(self, network: nn.Module) -> tuple[float, float, dict[str, float | None]]:
         """Validate a network: the mean IoU, the mean loss, and the IoU of each class and the mean by name."""
         counts, loss, _ = confusions(network, self.images, self.truth, self.task.input)
-        confusion = Confusion(self.task.classes)
-        confusion.counts = counts.sum(0)
+        confusion = Confusion(self.task.classes, counts.sum(0))
         iou = {"mean": confusion.mean_iou(), **dict(zip(self.task.classes, confusion.iou().tolist(), strict=True))}
         figures = {name: None if np.isnan(value) else round(float(value), 4) for name, value in iou.items()}
         return confusion.mean_iou(), loss, figures
