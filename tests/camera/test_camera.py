@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import concurrent.futures
 import io
-import json
 import os
 import subprocess
 import sys
@@ -27,7 +26,6 @@ from edgeperc import (
     MissingExtraError,
     OptionError,
     Perceiver,
-    Perception,
     PointsError,
 )
 from edgeperc.camera.image import MAX_EDGE
@@ -72,18 +70,6 @@ def test_each_pixel_has_a_class(perceive: Perceiver, image: NDArray[np.uint8]) -
     assert perception.providers == {"tinycam": "tinycam fp32, CPUExecutionProvider"}
     assert min(perception.stage_ms[stage] for stage in ("project", "infer", "decode")) > 0.0
     assert perception.stage_ms["refine"] == 0.0
-
-
-def test_a_perception_of_an_image_is_written_as_json(perceive: Perceiver, image: NDArray[np.uint8]) -> None:
-    record = json.loads(json.dumps(perceive(image=image).to_dict(), allow_nan=False))
-    labels = perceive(image=image).require_image()
-    assert record["image"] == {
-        "width": 64,
-        "height": 48,
-        "drivable_share": round(labels.drivable_share, 4),
-        "pixel_counts": labels.counts(),
-    }
-    assert (record["point_counts"], record["drivable_area_m2"], record["boxes"]) == (None, None, [])
 
 
 def test_classes_of_roads_are_drivable() -> None:
@@ -325,7 +311,3 @@ def test_without_pillow_the_error_names_the_extra(tmp_path: Path) -> None:
         "Reading an image needs pillow, which is not installed. Run: pip install 'edgeperc[camera]'"
     ), done.stderr
     assert issubclass(MissingExtraError, ImportError)
-
-
-def test_a_perception_without_a_camera_has_no_image() -> None:
-    assert Perception(0, 0, None, None, (), {}, {}, (), None).to_dict()["image"] is None

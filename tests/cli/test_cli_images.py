@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -195,14 +196,12 @@ def test_pictures_of_images(tmp_path: Path) -> None:
     image = np.zeros((3, 4, 3), np.uint8)
     png = draw_image(perception, image, tmp_path / "a.png", title="a street")
     assert (tmp_path / "a.png").read_bytes() == png
-    tall = Perception(
-        0, 0, None, None, (), {}, {}, (), None, image=ImageLabels(np.zeros((500, 2), np.uint8), ("a", "b"))
-    )
+    tall = replace(perception, image=ImageLabels(np.zeros((500, 2), np.uint8), ("a", "b")))
     assert draw_image(tall, np.zeros((500, 2, 3), np.uint8)).startswith(b"\x89PNG")
     with pytest.raises(ImageError, match="expected what was perceived"):
         draw_image(perception, np.zeros((3, 5, 3), np.uint8))
     with pytest.raises(ImageError, match="of a perception of no image"):
-        draw_image(Perception(0, 0, None, None, (), {}, {}, (), None), image)
+        draw_image(replace(perception, image=None), image)
 
 
 def test_classes_of_images_have_colors() -> None:

@@ -45,6 +45,7 @@ from edgeperc.types.sensor import get_sensor
 from edgeperc.view import DrivePage
 from edgeperc.view.colors import CLASS_COLORS
 from edgeperc.view.content import box_corners
+from scenes import rotation_of
 
 SENSOR = get_sensor("hdl-64e")
 TILTED = Mounting(2.1, 5.0, -3.0, 90.0)
@@ -123,14 +124,7 @@ def rows_of(packed: Any, stride: int) -> np.ndarray:
 
 def turned_by(rotation: Any) -> np.ndarray:
     """Matrix of a quaternion message."""
-    x, y, z, w = rotation.x, rotation.y, rotation.z, rotation.w
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    return rotation_of(rotation.x, rotation.y, rotation.z, rotation.w)
 
 
 def place(vector: Any) -> list[float]:
@@ -199,10 +193,8 @@ def check_boxes(scan: PerceivedScan, message: Any) -> None:
         np.testing.assert_allclose(turned_by(cube.pose.orientation)[:, 0], [math.cos(box.yaw), math.sin(box.yaw), 0])
         assert [text.text for text in entity.texts] == [f"{box.label} {box.score:.2f}"]
         assert len(entity.arrows) == (box.front is not None)
-        assert (
-            f"#{round(255 * cube.color.r):02x}{round(255 * cube.color.g):02x}{round(255 * cube.color.b):02x}"
-            == (CLASS_COLORS[box.label])
-        )
+        color = [round(255 * value) for value in (cube.color.r, cube.color.g, cube.color.b)]
+        assert f"#{bytes(color).hex()}" == CLASS_COLORS[box.label]
         sources = [int(id_) for id_, source in zip(scan.tracks.ids, scan.tracks.sources, strict=True) if source == k]
         assert entity.id == (f"track {sources[0]}" if sources else f"box {k}")
 
@@ -259,11 +251,9 @@ def check_frames(scan: PerceivedScan, message: Any) -> None:
 
 @given(st.lists(st.floats(-1.0, 1.0), min_size=4, max_size=4).filter(lambda q: sum(v * v for v in q) > 0.01))
 def test_quaternion_of_any_rotation(numbers: list[float]) -> None:
-    class Of:
-        x, y, z, w = np.array(numbers) / np.linalg.norm(numbers)
-
-    found = quaternion(turned_by(Of))
-    np.testing.assert_allclose(np.abs(np.dot(found, [Of.x, Of.y, Of.z, Of.w])), 1.0)
+    known = np.array(numbers) / np.linalg.norm(numbers)
+    found = quaternion(rotation_of(*known))
+    np.testing.assert_allclose(np.abs(np.dot(found, known)), 1.0)
     assert found[3] >= 0.0
 
 
