@@ -86,12 +86,7 @@ class Calibration:
                 f"K has its center at {c_x:g}, {c_y:g}, outside the image of {self.width} x {self.height} pixels; "
                 "expected the size of the image that K is of. For a resized image, use calibration.resized(...)"
             )
-        if is_off_center(K, self.width, self.height):
-            warnings.warn(
-                f"K has its center at {c_x:g}, {c_y:g}, far from the middle of the image of {self.width} x "
-                f"{self.height} pixels; expected K, or P2, of this image. Was it resized, cropped or turned since?",
-                stacklevel=3,
-            )
+        warn_off_center(K, self.width, self.height, "was it resized, cropped or turned since?")
 
     @classmethod
     def from_kitti(cls, path: str | os.PathLike[str], width: int, height: int) -> Calibration:
@@ -218,9 +213,15 @@ _RAW_FILES = ("calib_velo_to_cam.txt", "calib_cam_to_cam.txt")  # of a day's dri
 _NO_NUMBERS = ("calib_time",)
 
 
-def is_off_center(K: Floats, width: int, height: int) -> bool:
-    """Whether the center of a camera matrix is far from the middle of the image in both directions."""
-    return min(abs(K[0, 2] / width - 0.5), abs(K[1, 2] / height - 0.5)) > MAX_OFF_CENTER
+def warn_off_center(K: Floats, width: int, height: int, advice: str) -> None:
+    """Warn if the center of a camera matrix is far from the middle of the image in both directions."""
+    c_x, c_y = K[:2, 2].tolist()
+    if min(abs(c_x / width - 0.5), abs(c_y / height - 0.5)) > MAX_OFF_CENTER:
+        warnings.warn(
+            f"the camera matrix has its center at {c_x:g}, {c_y:g}, far from the middle of the image of {width} x "
+            f"{height} pixels; expected K, or P2, of this image: {advice}",
+            stacklevel=4,
+        )
 
 
 def _pixels(name: str, given: object) -> int:

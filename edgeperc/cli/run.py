@@ -368,11 +368,8 @@ def _check_static(arguments: argparse.Namespace, scans: Sequence[Path], captures
     from ..sinks.static import file_name
 
     sources = {_real(scan) for scan in scans}
-    replaced = {
-        file
-        for scan in scans
-        if scan not in captures and (file := _real(arguments.static / file_name(scan.name))) in sources - {_real(scan)}
-    }
+    files = ((scan, _real(arguments.static / file_name(scan.name))) for scan in scans if scan not in captures)
+    replaced = {file for scan, file in files if file in sources and file != _real(scan)}
     if captures:  # their scans get numbers, and nobody knows yet how many there are
         folder = Path(_real(arguments.static))
         beside = {source for source in sources if Path(source).parent == folder}

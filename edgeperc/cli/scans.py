@@ -148,10 +148,8 @@ def check_pairs(arguments: argparse.Namespace, images: Sequence[Path], scans: Se
     from ..sinks.run_file import stem_of
 
     if len(scans) != len(images):
-        more = ", each once; run one camera at a time" if len(images) > len(scans) else ""
-        arguments.usage_error(
-            f"--scan: {many(len(scans), 'scan')} for {many(len(images), 'image')}; expected as many{more}"
-        )
+        counts = f"{many(len(scans), 'scan')} for {many(len(images), 'image')}"
+        arguments.usage_error(f"--scan: {counts}; expected as many, each once: run one camera at a time")
     own = {stem_of(scan.name)[0]: scan for scan in scans}
     pairs = [*zip(images, scans, strict=True)]
     # Images may be counted from 1 and scans from 0: then none has the name of its scan.

@@ -147,7 +147,8 @@ def render(
     labels[ground] = _OF_GROUND[kinds]
 
     color = np.empty((*hits.shape, 3))
-    color[:] = _mixed((236, 240, 245), (120, 165, 220), np.clip(4.0 * slopes, 0.0, 1.0))[:, None]
+    horizon, zenith = np.array([236.0, 240.0, 245.0]), np.array([120.0, 165.0, 220.0])
+    color[:] = (horizon + np.clip(4.0 * slopes, 0.0, 1.0)[:, None] * (zenith - horizon))[:, None]
     shade = 0.55 + 0.45 * cosines
     color[solid] = _surface_colors(scene, rng)[surfaces[solid]] * shade[solid][:, None]
     gray, green = np.array([1.0, 1.0, 1.02]), np.array([0.62, 0.85, 0.4])
@@ -211,7 +212,3 @@ def _surface_colors(scene: Scene, rng: np.random.Generator) -> Floats:
         material == RETRO
     ]
     return np.asarray(np.clip(colors, 5.0, 250.0))
-
-
-def _mixed(low: tuple[int, ...], high: tuple[int, ...], share: Floats) -> Floats:
-    return np.asarray(np.array(low) + share[:, None] * (np.array(high) - np.array(low)))

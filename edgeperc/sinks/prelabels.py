@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import warnings
 import zipfile
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
@@ -13,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from ..camera.calibration import is_off_center, read_kitti_calibration
+from ..camera.calibration import read_kitti_calibration, warn_off_center
 from ..errors import OptionError
 from ..records import PerceivedScan
 from ..system.atomic import part_of, write_atomic
@@ -195,13 +194,7 @@ class PrelabelSink:
             path, image = calibration_of(self._calib, scan.name), scan.perception.image
             T_cam_sensor, P2 = read_kitti_calibration(path)
             size = size if image is None else (image.labels.shape[1], image.labels.shape[0])
-            if is_off_center(P2, *size):
-                warnings.warn(
-                    f"{path}: P2 has its center at {P2[0, 2]:g}, {P2[1, 2]:g}, far from the middle of an image of "
-                    f"{size[0]} x {size[1]} pixels, to which 2-D boxes are cut; pass the scans as --scan of their "
-                    "images, and the calibration of these",
-                    stacklevel=2,
-                )
+            warn_off_center(P2, *size, "2-D boxes are cut to it. Pass the scans as --scan of their images")
             text = path.read_text("utf-8") if path.is_file() else ""
         if not ("R0_rect" in text and "Tr_velo_to_cam" in text):  # readers of objects know no other names
             rows = {f"P{k}": P2 for k in range(4)} | {"R0_rect": np.eye(3), "Tr_velo_to_cam": T_cam_sensor[:3]}

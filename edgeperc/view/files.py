@@ -8,7 +8,7 @@ import numpy as np
 
 from ..errors import PointsError
 from ..system.atomic import write_atomic
-from ..types.perception import Perception
+from ..types.perception import Perception, PointLabels
 from ..types.points import Points
 from .colors import byte_colors
 from .content import check_points
@@ -55,23 +55,22 @@ def write_ply(perception: Perception, points: Points, path: str | Path) -> None:
         The file cannot be written.
     """
     check_points(points, perception)
-    if perception.points is None:
-        raise _no_labels("PLY file")
+    found = _labels_of(perception, "PLY file")
     in_map = perception.origin_m is not None
     fields = [*((name, "<f8" if in_map else "<f4") for name in "xyz"), ("remission", "<f4")]
     fields += [(name, "|u1") for name in ("label", "red", "green", "blue")]
     rows = np.empty(len(points), dtype=fields)
-    colors = byte_colors(perception.points.classes)
+    colors = byte_colors(found.classes)[found.labels]
     xyz = perception.to_map(points) if in_map else points
     for k, name in enumerate("xyz"):
         rows[name] = xyz[:, k]
     rows["remission"] = points[:, 3]
-    rows["label"] = perception.points.labels
+    rows["label"] = found.labels
     for k, name in enumerate(("red", "green", "blue")):
-        rows[name] = colors[perception.points.labels, k]
+        rows[name] = colors[:, k]
     kinds = {"<f4": "float", "<f8": "double", "|u1": "uchar"}
     header = ["ply", "format binary_little_endian 1.0"]
-    header += [f"comment label {k} {' '.join(name.split())}" for k, name in enumerate(perception.points.classes)]
+    header += [f"comment label {k} {' '.join(name.split())}" for k, name in enumerate(found.classes)]
     header += [f"element vertex {len(points)}", *(f"property {kinds[t]} {name}" for name, t in fields), "end_header\n"]
     write_atomic(path, "\n".join(header).encode("ascii", "replace") + rows.tobytes())
 
@@ -95,14 +94,15 @@ def write_labels(perception: Perception, path: str | Path) -> None:
     OSError
         The file cannot be written.
     """
+    found = _labels_of(perception, ".label file")
+    ids = np.array([SEMANTICKITTI_IDS.get(name, _OTHER_ID) for name in found.classes], dtype="<u4")
+    write_atomic(path, ids[found.labels].tobytes())
+
+
+def _labels_of(perception: Perception, what: str) -> PointLabels:
     if perception.points is None:
-        raise _no_labels(".label file")
-    ids = np.array([SEMANTICKITTI_IDS.get(name, _OTHER_ID) for name in perception.points.classes], dtype="<u4")
-    write_atomic(path, ids[perception.points.labels].tobytes())
-
-
-def _no_labels(what: str) -> PointsError:
-    return PointsError(
-        f"a {what} needs a class for every point, but no range-image model ran for this perception. "
-        "Add one, such as 'pointseg'"
-    )
+        raise PointsError(
+            f"a {what} needs a class for every point, but no range-image model ran for this perception. "
+            "Add one, such as 'pointseg'"
+        )
+    return perception.points

@@ -84,11 +84,10 @@ def draw_painted(
         if n
     }
     figure = new_figure(_WIDTH, int(bottom) + 40 + height_of_legend(facts) + 84)
-    colors = rgb([color_of(name) for name in labels.classes])
+    colors = pixel_colors(labels.classes)
     write_heading(figure, _MARGIN, _TOP - 20, "the camera", "a class for every pixel")
     axes = add_axes(figure, _MARGIN, _TOP, width, height)
-    tint = pixel_colors(labels.classes)[labels.labels]
-    axes.imshow(0.5 * image / 255.0 + 0.5 * tint, aspect="auto", interpolation="antialiased")
+    axes.imshow(0.5 * image / 255.0 + 0.5 * colors[labels.labels], aspect="auto", interpolation="antialiased")
     place = (_MARGIN, _TOP + height + _GAP, width, height)
     _draw_points(figure, place, image, points, calibration, colors, painted)
     left = _MARGIN + max(width, _NARROWEST) + 34.0 + _AXIS
@@ -110,10 +109,10 @@ def _draw_points(
     gray = image.mean(axis=2, keepdims=True).repeat(3, axis=2) / 255.0
     axes.imshow(0.35 + 0.4 * gray, aspect="auto", interpolation="antialiased")
     axes.set_autoscale_on(False)
-    shades = np.concatenate([colors, np.zeros((256 - len(colors), 3))])
     u, v, depth = calibration.project(points)
     inside = (u >= 0.0) & (u < calibration.width) & (v >= 0.0) & (v < calibration.height)
-    for shown, size in ((inside & (painted >= len(colors)), 1.0), (inside & (painted < len(colors)), 3.2)):
+    seen = painted != UNSEEN
+    for shown, size, shades in ((inside & ~seen, 1.0, np.zeros_like(colors)), (inside & seen, 3.2, colors)):
         far_first = np.flatnonzero(shown)[np.argsort(-depth[shown], kind="stable")]
         axes.scatter(u[far_first], v[far_first], s=size, c=shades[painted[far_first]], linewidths=0)
 
@@ -126,7 +125,7 @@ def _draw_from_above(
     (x_near, x_far), (y_right, y_left) = road.x_range_m, road.y_range_m
     low, high, right, left = x_near - _BEHIND_M, x_far + _BEYOND_M, y_right - _BESIDE_M, y_left + _BESIDE_M
     frame = ModelFrame(road.mounting)
-    shown = np.flatnonzero(drawable_points(points) & (painted < len(colors)))
+    shown = np.flatnonzero(drawable_points(points) & (painted != UNSEEN))
     x, y, z = frame.move(points[shown])[:, :3].astype(np.float64).T
     axes, _ = axes_from_above(figure, room, (low, high, right, left), bool((x < low).any()))
     more = f"the image's road ahead, {road.drivable_area_m2:.0f} m²; gray: not seen"

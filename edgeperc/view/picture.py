@@ -324,12 +324,9 @@ def _draw_range_image(figure: Any, place: Place, drawn: _Drawn, turn_deg: float)
     nearest_last = np.argsort(-range_m[ahead], kind="stable")
     index = np.full((rows, columns), -1, dtype=np.intp)
     index[row[nearest_last], col[nearest_last]] = ahead[nearest_last]
-    for axis, shift in ((0, 1), (0, -1), (1, 1), (1, -1)):
+    for top, left in ((0, 1), (2, 1), (1, 0), (1, 2)):
         # Beams are not evenly spaced, so a pixel without a return takes that of a neighbor.
-        neighbor = np.roll(index, shift, axis)
-        edge = [slice(None), slice(None)]
-        edge[axis] = slice(0, 1) if shift > 0 else slice(-1, None)
-        neighbor[tuple(edge)] = -1
+        neighbor = np.pad(index, 1, constant_values=-1)[top : top + rows, left : left + columns]
         index = np.where(index < 0, neighbor, index)
     picture = np.broadcast_to(rgb([PANEL])[0], (rows, columns, 3)).copy()
     hit = index >= 0
@@ -426,11 +423,9 @@ def _ground_layer(
     # eye + k ray lies on z = a + b x + c y
     with np.errstate(divide="ignore", invalid="ignore"):
         k = (a + b * eye[0] + c * eye[1] - eye[2]) / (ray[..., 2] - b * ray[..., 0] - c * ray[..., 1])
-        row = (top_view.x_range_m[1] - eye[0] - k * ray[..., 0]) / top_view.cell_m
-        col = (top_view.y_range_m[1] - eye[1] - k * ray[..., 1]) / top_view.cell_m
-    height, width = top_view.labels.shape
-    hit = (k > 0.0) & (row >= 0) & (row < height) & (col >= 0) & (col < width)
+        row, col, hit = top_view.geometry.cells(eye[0] + k * ray[..., 0], eye[1] + k * ray[..., 1])
+    hit &= k > 0.0
     layer = np.zeros((rows, columns, 4))
     layer[..., :3] = rgb([color_of("drivable")])[0]
-    layer[hit, 3] = 0.55 * top_view.drivable[row[hit].astype(np.intp), col[hit].astype(np.intp)]
+    layer[hit, 3] = 0.55 * top_view.drivable[row[hit], col[hit]]
     return layer

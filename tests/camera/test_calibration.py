@@ -137,7 +137,7 @@ def test_a_resized_image_shows_points_at_the_same_place() -> None:
     with pytest.raises(CalibrationError, match="height"):
         whole.resized(320, 0)
     for size in ((400, 300), (480, 640)):  # of an image that was resized or turned with the matrix of what it was
-        with pytest.warns(UserWarning, match=r"far from the middle of the image of .*Was it resized"):
+        with pytest.warns(UserWarning, match=r"far from the middle of the image of .*was it resized"):
             Calibration(K, AHEAD, *size)
 
 

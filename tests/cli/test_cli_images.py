@@ -147,7 +147,7 @@ def test_wrong_usage(tmp_path: Path, model: Path, capsys: pytest.CaptureFixture[
     for arguments, said in (
         ((image, "--scan", scan, scan.with_name("c.bin"), "--model", model), "--scan: 2 scans for 1 image"),
         ((scan, "--scan", scan), "--scan: 1 scan for 0 images"),
-        ((image, twin, "--scan", scan, scan), "1 scan for 2 images; expected as many, each once; run one camera"),
+        ((image, twin, "--scan", scan, scan), "1 scan for 2 images; expected as many, each once: run one camera"),
         ((*lost, "--scan", there[0].parent), f"image_2/2.png would get {there[1]}, and {there[2]} has its name"),
         ((image, "--labels", *out), "--labels needs --scan for images"),
         ((image, "--track"), "--track needs --scan for images"),

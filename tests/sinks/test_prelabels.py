@@ -311,7 +311,7 @@ def test_boxes_of_kitti_are_cut_to_the_image_that_was_perceived(tmp_path: Path) 
     folder = written(tmp_path, "kitti", seen, calib=calib)
     _, top, _, bottom = map(float, (folder / "label_2/a.txt").read_text().split()[4:8])
     assert top < 600.0 + 707.0 * 0.85 / 14.0 < bottom
-    with pytest.warns(UserWarning, match="center at 960, 600, far from the middle of an image of 1242 x 375"):
+    with pytest.warns(UserWarning, match="center at 960, 600, far from the middle of the image of 1242 x 375"):
         written(tmp_path, "kitti", scan, calib=calib)
 
 
