@@ -278,8 +278,6 @@ def _check_usage(arguments: argparse.Namespace, kinds: Sequence[str]) -> None:
     files = [*kinds, *["gif"] * arguments.gif, *["labels-for"] * (arguments.labels_for is not None)]
     if files and arguments.out is None:
         arguments.usage_error(f"--{files[0]} needs --out DIR")
-    if arguments.labels_for is not None and isinstance(arguments.out, Remote):
-        arguments.usage_error(f"--labels-for writes to a folder of this computer, not to {arguments.out}")
     if arguments.out is not None and not files:
         arguments.usage_error(
             "--out DIR has nothing to write; add --png, --html, --labels, --ply, --gif or --labels-for"

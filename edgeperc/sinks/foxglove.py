@@ -31,7 +31,7 @@ from ..records import PerceivedScan
 from ..system.extras import require
 from ..system.lanes import returns
 from ..system.printable import printable
-from ..types.frame import quaternion
+from ..types.frame import ModelFrame, quaternion
 from ..types.mounting import MODEL_HEIGHT_M
 from ..types.perception import Box, TopView
 from ..types.points import Floats
@@ -110,12 +110,12 @@ class _Channels:
 
     def _write_frames(self, scan: PerceivedScan) -> None:
         make = self._messages
-        R, t = scene.base_pose(scan)
-        transforms = [(scene.BASE, scene.LIDAR, R, t)]
+        frame = ModelFrame(scan.perception.mounting)
+        transforms = [(scene.BASE, scene.LIDAR, frame.R, frame.t)]
         if scan.tracks is not None:
             pose = scan.tracks.T_world_sensor
-            turned = pose[:3, :3] @ R.T
-            transforms.append((scene.ODOM, scene.BASE, turned, pose[:3, 3] - turned @ t))
+            turned = pose[:3, :3] @ frame.R.T
+            transforms.append((scene.ODOM, scene.BASE, turned, pose[:3, 3] - turned @ frame.t))
         made = [
             make.FrameTransform(
                 timestamp=self._stamp,

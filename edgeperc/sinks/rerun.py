@@ -14,13 +14,13 @@ from numpy.typing import NDArray
 from ..records import PerceivedScan
 from ..system.extras import require
 from ..system.printable import printable
+from ..types.frame import ModelFrame
 from ..types.mounting import MODEL_HEIGHT_M
 from ..types.perception import Box, TopView
-from ..types.points import Floats
 from ..view.colors import byte_colors
 from ..view.content import box_text, drivable_strips, track_text
 from .run_file import Pipe, RunFile
-from .scene import Trails, base_pose, checked_target, colored_points, nanoseconds
+from .scene import Trails, checked_target, colored_points, nanoseconds
 
 __all__ = ["RerunSink"]
 
@@ -121,7 +121,7 @@ class RerunSink:
             listed = [box for k, box in enumerate(scan.perception.boxes) if (k in of_tracks) == is_tracked]
             log(name, self._boxes(listed, [box_text(box) for box in listed], show=tracks is None))
         if view is not None:
-            log("world/lidar/drivable", self._drivable(view, *base_pose(scan)))
+            log("world/lidar/drivable", self._drivable(view, ModelFrame(scan.perception.mounting)))
         if tracks is not None:
             pose = tracks.T_world_sensor
             log("world/lidar", rr.Transform3D(translation=pose[:3, 3], mat3x3=pose[:3, :3]))
@@ -164,7 +164,7 @@ class RerunSink:
             show_labels=show,
         )
 
-    def _drivable(self, view: TopView, R: Floats, t: Floats) -> Any:
+    def _drivable(self, view: TopView, frame: ModelFrame) -> Any:
         """Two triangles for each run of drivable cells along a row."""
         row, first, last = drivable_strips(view).T
         far, left = view.x_range_m[1] - view.cell_m * row, view.y_range_m[1] - view.cell_m * first
@@ -174,7 +174,7 @@ class RerunSink:
         triangles = 4 * np.arange(len(row))[:, None] + np.array([0, 2, 1, 0, 3, 2])
         color = [*byte_colors(["drivable"])[0].tolist(), 160]
         return self._rr.Mesh3D(
-            vertex_positions=((corners - t) @ R).astype(np.float32),
+            vertex_positions=((corners - frame.t) @ frame.R).astype(np.float32),
             triangle_indices=triangles.reshape(-1, 3).astype(np.uint32),
             albedo_factor=color,
         )

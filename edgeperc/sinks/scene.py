@@ -17,7 +17,6 @@ from ..errors import PointsError
 from ..records import PerceivedScan
 from ..system.clock import nanoseconds_of
 from ..tracking.tracks import Tracks
-from ..types.frame import ModelFrame
 from ..types.points import Bytes, Floats, Floats32, as_points
 from ..view.colors import byte_colors
 from ..view.content import check_points, in_model_frame, paint_points
@@ -46,12 +45,6 @@ def colored_points(scan: PerceivedScan) -> tuple[Floats32, Bytes, tuple[str, ...
     labels = np.zeros(len(points), np.uint8) if point_labels is None else point_labels.labels
     names, painted = paint_points(in_model_frame(perception, points)[1], perception)
     return points, labels, classes, byte_colors(names)[painted]
-
-
-def base_pose(scan: PerceivedScan) -> tuple[Floats, Floats]:
-    """Rotation (3, 3) and translation (3,) [m] of `LIDAR` in `BASE`."""
-    frame = ModelFrame(scan.perception.mounting)
-    return frame.R, frame.t
 
 
 class Trails:

@@ -142,8 +142,8 @@ def draw_tracks(
     for before, after in pairwise(scans):
         times_s.append(times_s[-1] + elapsed_s(before.stamp_s, after.stamp_s))
     for k, (tracks, time_s) in enumerate(zip(scans, times_s, strict=True)):
-        flat = np.frombuffer(zlib.decompress(under[k]), np.uint8).reshape(_HEIGHT, _WIDTH) if under else None
-        layer = _layer_colors()[np.zeros((_HEIGHT, _WIDTH), np.uint8) if flat is None else flat]
+        flat = zlib.decompress(under[k]) if under else bytes(_HEIGHT * _WIDTH)
+        layer = _layer_colors()[np.frombuffer(flat, np.uint8).reshape(_HEIGHT, _WIDTH)]
         picture = Image.new("RGB", (_FINE * _WIDTH, _FINE * (_HEAD + _HEIGHT + _FOOT)), GROUND)
         fine = Image.fromarray(layer).resize((_FINE * _WIDTH, _FINE * _HEIGHT), Image.Resampling.NEAREST)
         picture.paste(fine, (0, _FINE * _HEAD))
