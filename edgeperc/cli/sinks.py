@@ -133,7 +133,8 @@ class Sinks:
         if arguments.static is not None:
             self._add(StaticSink(arguments.static, without="movable" if arguments.movable else "moving"))
         if arguments.labels_for is not None:
-            self._add(PrelabelSink(arguments.out, arguments.labels_for, calib=arguments.calib))
+            calib = arguments.calib if arguments.labels_for == "kitti" else None  # else it is of the pictures alone
+            self._add(PrelabelSink(arguments.out, arguments.labels_for, calib=calib))
         if arguments.bag is not None:
             storage: Literal["sqlite3", "mcap"] = arguments.bag_storage or "sqlite3"
             self._add(BagSink(arguments.bag, storage=storage, frame_id=arguments.bag_frame or "lidar"))
