@@ -398,11 +398,10 @@ def _images(arguments: argparse.Namespace, kinds: Sequence[str]) -> dict[Path, P
         check_pairs(arguments, images, scans)
     if arguments.calib is not None and arguments.labels_for != "kitti":
         from ..camera.calibration import read_kitti_calibration
+        from ..sinks.prelabels import calibration_of
 
         if not (images and scans and arguments.png):
             arguments.usage_error("--calib needs images with --scan and --png")
-        from ..sinks.prelabels import calibration_of
-
         read_kitti_calibration(calibration_of(arguments.calib, scans[0].name))  # errors come before the first image
     if not images:
         return {}

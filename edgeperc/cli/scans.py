@@ -126,12 +126,9 @@ def find_images(paths: Sequence[Path]) -> list[Path]:
     others = []
     for path in paths:
         files = [path] if path.suffix.lower() in IMAGE_SUFFIXES else []
-        if isinstance(path, Remote):
-            if files:
-                raise ImageError(f"{path}: images are read from this computer; copy it, and pass its path")
-            others.append(path)
-            continue
-        if is_folder(path) and not scan_folders(path):
+        if files and isinstance(path, Remote):
+            raise ImageError(f"{path}: images are read from this computer; copy it, and pass its path")
+        if isinstance(path, Path) and is_folder(path) and not scan_folders(path):
             entries = (file for file in path.glob("[!.]*") if file.suffix.lower() in IMAGE_SUFFIXES)
             files = sorted(entries, key=by_number)
         images |= {_absolute(image): image for image in files}
@@ -142,9 +139,7 @@ def find_images(paths: Sequence[Path]) -> list[Path]:
 
 
 def check_pairs(arguments: argparse.Namespace, images: Sequence[Path], scans: Sequence[Path | Remote]) -> None:
-    """Check that each image has its scan: as many, and none that of another one, as where a drive lacks an image here
-    and a scan there.
-    """
+    """Check that there are as many scans as images, and that no image gets the scan of another one."""
     from ..sinks.run_file import stem_of
 
     if len(scans) != len(images):

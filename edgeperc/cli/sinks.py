@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import sys
 from contextlib import ExitStack
-from functools import partial
 from typing import Literal
 
 from ..errors import EdgepercError
@@ -142,7 +141,7 @@ class Sinks:
     def _add(self, sink: Sink) -> None:
         """The first is closed last: files are finished before what is served ends, whatever viewers do."""
         self._sinks.append(sink)
-        self._stack.callback(partial(self._close, sink))
+        self._stack.callback(self._close, sink)
 
     def _close(self, sink: Sink) -> None:
         try:

@@ -55,10 +55,8 @@ def evaluate_images(
         for name, hashes in trained_on.items():
             if image_hash(image) in hashes:
                 raise SplitError(f"{name} was trained on {file}; evaluate other images, or ask for split 'train'")
-        labels = perceive(image=image).image
-        assert labels is not None
         confusion = Confusion(card.classes)
-        confusion.update(labels.labels, truth)
+        confusion.update(perceive(image=image).require_image().labels, truth)
         counts.append(confusion.counts)
         on_image(done, len(files))
     return {

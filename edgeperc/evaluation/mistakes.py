@@ -102,11 +102,8 @@ def draw_mistakes(
         write_at(figure, end + 8, 84 + 27 * k, name, fontsize=14.0, fontweight="bold")
         write_at(figure, _MARGIN + 128, 84 + 27 * k, meaning, fontsize=14.0, color=FAINT)
     if not wrong:
-        text = (
-            "No mistakes: every object was found, and there are no false detections."
-            if scans
-            else "No scans were given."
-        )
+        text = "No mistakes: every object was found, and there are no false detections."
+        text = text if scans else "No scans were given."
         write_at(figure, _MARGIN, _TOP + 36, text, fontsize=17.0)
     for k, scan in enumerate(wrong):
         left = _MARGIN + k % columns * (width + _GAP)

@@ -21,6 +21,7 @@ import json
 import math
 import socket
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -36,7 +37,7 @@ from ..types.mounting import MODEL_HEIGHT_M
 from ..types.perception import Box, TopView
 from ..types.points import Floats
 from ..view.colors import byte_colors
-from ..view.content import EDGES, box_corners, box_text, track_text
+from ..view.content import EDGES, box_corners, box_text, packed, track_text
 from . import scene
 from .relay import MAX_VIEWERS, Relay
 from .run_file import RunFile
@@ -89,8 +90,9 @@ class _Channels:
         self._open: dict[str, Any] = {}
         self._trails = scene.Trails()
 
-    def _log(self, topic: str, kind: str, message: Any, metadata: dict[str, str] | None = None) -> None:
+    def _log(self, topic: str, kind: str, message: Any, classes: Sequence[str] = ()) -> None:
         if topic not in self._open:
+            metadata = {"classes": json.dumps([printable(name) for name in classes])} if classes else None
             make = getattr(self._channels, f"{kind}Channel")
             self._open[topic] = make(topic, context=self._context, metadata=metadata)
         self._open[topic].log(message, log_time=self._now)
@@ -130,13 +132,7 @@ class _Channels:
 
     def _write_points(self, scan: PerceivedScan) -> None:
         points, labels, classes, colors = scene.colored_points(scan)
-        rows = np.empty(len(points), _POINT)
-        for k, name in enumerate(("x", "y", "z", "remission")):
-            rows[name] = points[:, k]
-        for k, name in enumerate(("red", "green", "blue")):
-            rows[name] = colors[:, k]
-        rows["alpha"], rows["class"] = 255, labels
-        names = json.dumps([printable(name) for name in classes])
+        rows = packed(_POINT, *points.T, *colors.T, 255, labels)
         message = self._messages.PointCloud(
             timestamp=self._stamp,
             frame_id=scene.LIDAR,
@@ -145,7 +141,7 @@ class _Channels:
             fields=self._fields(_POINT),
             data=rows.tobytes(),
         )
-        self._log("/points", "PointCloud", message, {"classes": names})
+        self._log("/points", "PointCloud", message, classes)
 
     def _write_boxes(self, scan: PerceivedScan) -> None:
         make, entities = self._messages, []
@@ -197,13 +193,9 @@ class _Channels:
         self._log(topic, "SceneUpdate", make.SceneUpdate(deletions=[gone], entities=entities))
 
     def _write_drivable(self, view: TopView) -> None:
-        drivable = view.drivable
-        cells = np.zeros(view.labels.shape, _CELL)
-        colors = byte_colors(view.classes)[view.labels]
-        for k, name in enumerate(("red", "green", "blue")):
-            cells[name] = colors[..., k]
+        colors = np.moveaxis(byte_colors(view.classes)[view.labels], -1, 0)
         # Only the drivable cells are opaque. Foxglove's rows begin at the lowest x and y.
-        cells["alpha"], cells["class"], cells["drivable"] = np.where(drivable, 160, 0), view.labels, drivable
+        cells = packed(_CELL, *colors, np.where(view.drivable, 160, 0), view.labels, view.drivable)
         cells = np.ascontiguousarray(cells[::-1, ::-1].T)
         message = self._messages.Grid(
             timestamp=self._stamp,
@@ -216,8 +208,7 @@ class _Channels:
             fields=self._fields(_CELL),
             data=cells.tobytes(),
         )
-        names = json.dumps([printable(name) for name in view.classes])
-        self._log("/drivable", "Grid", message, {"classes": names})
+        self._log("/drivable", "Grid", message, view.classes)
 
     def _write_status(self, scan: PerceivedScan) -> None:
         if "/status" not in self._open:

@@ -106,7 +106,11 @@ class RerunSink:
         stamp_ns = nanoseconds(scan)
         if self._recording is None:
             self._start()
-        self._check_room(len(points) * _POINT_BYTES)
+        self._file.check()
+        room_bytes = len(points) * _POINT_BYTES + _ROOM_BYTES
+        if not _HAS_PIPES and shutil.disk_usage(os.path.realpath(self._path.parent)).free < room_bytes:
+            self._file.fail(OSError(errno.ENOSPC, "the recording does not fit on the disk"))
+            self._file.check()
         rr, log = self._rr, self._recording.log
         self._recording.set_time("stamp", duration=np.timedelta64(stamp_ns, "ns"))
         view, tracks = scan.perception.top_view, scan.tracked
@@ -178,12 +182,6 @@ class RerunSink:
             triangle_indices=triangles.reshape(-1, 3).astype(np.uint32),
             albedo_factor=color,
         )
-
-    def _check_room(self, n_bytes: int) -> None:
-        self._file.check()
-        if not _HAS_PIPES and shutil.disk_usage(os.path.realpath(self._path.parent)).free < n_bytes + _ROOM_BYTES:
-            self._file.fail(OSError(errno.ENOSPC, "the recording does not fit on the disk"))
-            self._file.check()
 
     def _flush(self, recording: Any) -> None:
         try:

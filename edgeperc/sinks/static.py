@@ -72,9 +72,7 @@ class StaticSink:
         if self._without == "movable" or (scan.tracks is not None and scan.tracks.is_late):
             gone |= movable_points(scan.perception, points)
         target = self._files.checked(self._folder / file_name(scan.name), scan.name)
-        xyz: NDArray[Any] = points[:, :3]
-        if scan.perception.origin_m is not None:
-            xyz = scan.perception.to_map(points)
+        xyz: NDArray[Any] = points[:, :3] if scan.perception.origin_m is None else scan.perception.to_map(points)
         write_atomic(target, _content(xyz, points[:, 3], ~gone, scan.name))
         self.n_points += len(points)
         self.n_removed += int(np.count_nonzero(gone))

@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from ..camera.image import as_image
 from ..errors import ImageError, PointsError
@@ -39,6 +39,14 @@ def check_points(points: Points, perception: Perception) -> None:
         raise PointsError(
             f"{len(points)} points with a perception of {perception.n_points}; expected the scan that was perceived"
         )
+
+
+def packed(dtype: DTypeLike, *columns: ArrayLike) -> NDArray[Any]:
+    """Columns of one shape, or single values, as the fields of an array, in their order."""
+    rows = np.empty(np.shape(columns[0]), dtype)
+    for name, column in zip(rows.dtype.names or (), columns, strict=True):
+        rows[name] = column
+    return rows
 
 
 def drivable_strips(view: TopView) -> NDArray[np.intp]:
@@ -142,9 +150,7 @@ def box_corners(box: Box) -> Floats:
 
 
 def edges_ahead(corners: Floats, near_m: float) -> Floats:
-    """What of the edges of a box is more than ``near_m`` ahead, (k, 2, 3): the last coordinate of its `box_corners` is
-    the distance ahead.
-    """
+    """Edges of a box from ``near_m`` ahead on, (k, 2, 3): the last coordinate of its corners is the distance ahead."""
     ends = []
     for pair in EDGES:
         start, end = sorted(corners[[*pair]], key=lambda corner: float(corner[2]))

@@ -11,7 +11,7 @@ from ..system.atomic import write_atomic
 from ..types.perception import Perception, PointLabels
 from ..types.points import Points
 from .colors import byte_colors
-from .content import check_points
+from .content import check_points, packed
 
 # The raw ids of SemanticKITTI's .label files. It counts vans as cars; 99 is its "other-object".
 SEMANTICKITTI_IDS = {
@@ -59,15 +59,9 @@ def write_ply(perception: Perception, points: Points, path: str | Path) -> None:
     in_map = perception.origin_m is not None
     fields = [*((name, "<f8" if in_map else "<f4") for name in "xyz"), ("remission", "<f4")]
     fields += [(name, "|u1") for name in ("label", "red", "green", "blue")]
-    rows = np.empty(len(points), dtype=fields)
     colors = byte_colors(found.classes)[found.labels]
     xyz = perception.to_map(points) if in_map else points
-    for k, name in enumerate("xyz"):
-        rows[name] = xyz[:, k]
-    rows["remission"] = points[:, 3]
-    rows["label"] = found.labels
-    for k, name in enumerate(("red", "green", "blue")):
-        rows[name] = colors[:, k]
+    rows = packed(fields, *xyz[:, :3].T, points[:, 3], found.labels, *colors.T)
     kinds = {"<f4": "float", "<f8": "double", "|u1": "uchar"}
     header = ["ply", "format binary_little_endian 1.0"]
     header += [f"comment label {k} {' '.join(name.split())}" for k, name in enumerate(found.classes)]

@@ -88,8 +88,7 @@ def draw_painted(
     write_heading(figure, _MARGIN, _TOP - 20, "the camera", "a class for every pixel")
     axes = add_axes(figure, _MARGIN, _TOP, width, height)
     axes.imshow(0.5 * image / 255.0 + 0.5 * colors[labels.labels], aspect="auto", interpolation="antialiased")
-    place = (_MARGIN, _TOP + height + _GAP, width, height)
-    _draw_points(figure, place, image, points, calibration, colors, painted)
+    _draw_points(figure, (_MARGIN, _TOP + height + _GAP, width, height), image, points, calibration, colors, painted)
     left = _MARGIN + max(width, _NARROWEST) + 34.0 + _AXIS
     room = (left, _TOP, _WIDTH - _MARGIN - left, bottom - _TOP)
     _draw_from_above(figure, room, points, road, perception.boxes, colors, painted)
@@ -136,7 +135,6 @@ def _draw_from_above(
     axes.imshow(layer, extent=(y_left, y_right, x_near, x_far), aspect="auto", interpolation="nearest", zorder=1)
     order = np.argsort(z, kind="stable")
     axes.scatter(y[order], x[order], s=2.0, c=colors[painted[shown[order]]], linewidths=0, zorder=2)
+    style: dict[str, Any] = {"closed": True, "fill": False, "linewidth": 2.0, "zorder": 3}
     for box in drawable_boxes(frame.move_boxes(boxes)):
-        outline = Polygon(box.corners()[:, ::-1], closed=True, fill=False, edgecolor=color_of(box.label), zorder=3)
-        outline.set_linewidth(2.0)
-        axes.add_patch(outline)
+        axes.add_patch(Polygon(box.corners()[:, ::-1], edgecolor=color_of(box.label), **style))

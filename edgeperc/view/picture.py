@@ -16,7 +16,6 @@ from ..types.points import Bytes, Floats, Labels, Points
 from . import canvas, content
 from .colors import AMBER, FAINT, INK, PANEL, color_of, pixel_colors, ramp, rgb
 
-_PARTS = {90.0: "90° ahead", 360.0: "all around"}
 # Sizes in pixels. A page that shows the picture 1000 pixels wide reduces text of 13 points to 8.
 _WIDTH, _MARGIN, _TOP, _BOTTOM = 1600, 28, 128, 868
 _AXIS = 62
@@ -303,7 +302,8 @@ def _omitted(text: str, n_omitted: int) -> str:
 def _draw_range_image(figure: Any, place: Place, drawn: _Drawn, turn_deg: float) -> None:
     """Draw a part of the turn as a range image. It is only a picture, not the projection of a network."""
     axes = canvas.add_axes(figure, *place)
-    more = f"{_PARTS[turn_deg]}, a class for every point"
+    part, columns, outer, inner = ("90° ahead", 512, 40, 20) if turn_deg == 90.0 else ("all around", 1024, 150, 75)
+    more = f"{part}, a class for every point"
     canvas.write_heading(figure, place[0], place[1] - 20, "as the sensor sees it", more)
     names, painted = drawn.names, drawn.painted
     x, y, z = drawn.points[:, :3].astype(np.float64).T
@@ -315,7 +315,6 @@ def _draw_range_image(figure: Any, place: Place, drawn: _Drawn, turn_deg: float)
     # Percentiles, because stray reflections below the road would compress the image.
     low, high = np.percentile(elevation, [0.3, 99.9]) if len(ahead) else (-25.0, 3.0)
     low, high = low - 0.5, high + 0.5
-    columns = 512 if half == 45.0 else 1024
     rows = next((n for n in (16, 32, 64) if n >= len(ahead) / columns), 128)
     row = np.floor((high - elevation) / (high - low) * rows).astype(np.intp)
     col = np.floor((half - azimuth[ahead]) / turn_deg * columns).astype(np.intp)
@@ -336,7 +335,6 @@ def _draw_range_image(figure: Any, place: Place, drawn: _Drawn, turn_deg: float)
     share = share[painted[behind]][:, None]
     picture[hit] = (1.0 - share) * 0.72 * shade + share * drawn.colors[behind]
     axes.imshow(picture, extent=(half, -half, 0.0, 1.0), aspect="auto", interpolation="nearest")
-    outer, inner = (40, 20) if half == 45.0 else (150, 75)
     beside = [f"{outer}° left", f"{inner}° left", "straight ahead", f"{inner}° right", f"{outer}° right"]
     axes.set_xticks([outer, inner, 0, -inner, -outer], labels=beside)
 

@@ -239,9 +239,8 @@ def test_points_that_a_camera_cannot_see() -> None:
     assert paint(labels, np.full((3, 4), np.nan, np.float32), NEAR).tolist() == [painting.UNSEEN] * 3
     assert paint(labels, np.array([[10.0, 0.0, 0.0, 0.0]], np.float32), NEAR).tolist() == [0]
     assert paint(labels, np.array([[10, 0, 0]]), NEAR).tolist() == [0]
-    assert paint(np.full_like(labels, 255), np.array([[10.0, 0.0, 0.0]]), NEAR).tolist() == [
-        painting.UNSEEN
-    ]  # no class
+    no_class = np.full_like(labels, 255)
+    assert paint(no_class, np.array([[10.0, 0.0, 0.0]]), NEAR).tolist() == [painting.UNSEEN]
 
 
 def test_a_perception_and_its_labels_paint_alike() -> None:

@@ -91,8 +91,7 @@ def decoded(schema: Any, data: bytes) -> Any:
     pool = descriptor_pool.DescriptorPool()
     for file in files.file:
         pool.Add(file)
-    made = message_factory.GetMessageClass(pool.FindMessageTypeByName(schema.name)).FromString(data)
-    return made
+    return message_factory.GetMessageClass(pool.FindMessageTypeByName(schema.name)).FromString(data)
 
 
 def read_mcap(path: Path) -> dict[str, list[tuple[int, Any, dict[str, str]]]]:
