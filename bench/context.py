@@ -16,7 +16,7 @@ from typing import Any
 
 from edgeperc import __version__
 from edgeperc.system.extras import require
-from edgeperc.system.machine import board, cpu_model, cpu_quota, has_hypervisor, read_text, usable_cores
+from edgeperc.system.machine import board, cpu_model, cpu_quota, has_hypervisor, quota_pauses, read_text, usable_cores
 
 PACKAGES = (
     *("numpy", "numba", "onnxruntime", "onnxruntime-gpu", "onnxruntime-ep-openvino", "onnxruntime-ep-nv-tensorrt-rtx"),
@@ -102,7 +102,6 @@ def conditions() -> dict[str, Any]:
     frequency, sensors = _measured("cpu_freq"), _measured("sensors_temperatures") or {}
     sensors_read = [each for group in sensors.values() for each in group if each.current]
     throttles = [_number(path) for path in CPU.glob("cpu[0-9]*/thermal_throttle/*_throttle_count")]
-    quota = dict(line.split() for line in (read_text(Path("/sys/fs/cgroup/cpu.stat")) or "").splitlines())
     times = psutil.cpu_times()
     battery = _measured("sensors_battery")
     # Time of guests is part of user and nice.
@@ -115,7 +114,7 @@ def conditions() -> dict[str, Any]:
         "temperature_c": max((each.current for each in sensors_read), default=None),
         "critical_c": min((each.critical for each in sensors_read if each.critical), default=None),
         "throttle_count": sum(n or 0 for n in throttles) if throttles else None,
-        "quota_throttled": int(quota["nr_throttled"]) if "nr_throttled" in quota else None,
+        "quota_throttled": quota_pauses(),
         "load_average": psutil.getloadavg()[0],
         "busy_s": busy - stolen,
         "stolen_s": stolen,

@@ -5,16 +5,20 @@ from __future__ import annotations
 import json
 import math
 import os
+import shutil
 import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from edgeperc.errors import SettingsError
 from edgeperc.simulation.scene import SimulatedScan
+from edgeperc.system.machine import settings_path
 
 from .accuracy import agreement, agrees, correctness
 from .context import conditions, disturbances
@@ -126,13 +130,14 @@ def offline(
 
 
 def cold_starts(job: Job, scan: Path, n: int) -> list[dict[str, Any]]:
-    """Start processes that perceive one scan: the first finds empty caches (numba's, and the user's cache folder), the
-    others what it cached. The operating system keeps the files in memory.
+    """Start processes that perceive one scan: the first finds empty caches of kernels and compiled models, the others
+    what it cached, and all the settings that were measured here. The operating system keeps the files in memory.
     """
     starts = []
     with tempfile.TemporaryDirectory() as folder:
-        cache = {"NUMBA_CACHE_DIR": folder, "XDG_CACHE_HOME": folder, "LOCALAPPDATA": folder}
-        environment = os.environ | cache
+        with suppress(OSError, SettingsError):  # there is none
+            shutil.copy(settings_path(), folder)
+        environment = os.environ | {"NUMBA_CACHE_DIR": folder, "EDGEPERC_CACHE_DIR": folder}
         # An installed package has its byte code; to compile a checkout's sources at every start takes 0.2 s.
         environment.pop("PYTHONDONTWRITEBYTECODE", None)
         for k in range(n):

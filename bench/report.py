@@ -15,6 +15,8 @@ def sections(document: Mapping[str, Any]) -> list[Section]:
     """Every section of a document, in the order in which they are shown."""
     sentences = [] if document["complete"] else ["interrupted: only what was measured before is shown"]
     sentences += [f"disturbed: {sentence}" for sentence in document["disturbances"]]
+    warned = [text for setting in document["settings"] for r in setting["repeats"] for text in r["warnings"]]
+    sentences += [f"warning: {text}" for text in dict.fromkeys(warned)]
     parts = [Section("Reliability", sentences or ["no disturbance was seen"])]
     if document["kind"] == "matrix":
         parts.append(_matrix(document))
@@ -108,8 +110,8 @@ def _setting(setting: Mapping[str, Any]) -> list[Section]:
             for start in setting["cold_start"]
         ]
         sentences = [
-            "seconds from starting a process to its first result; the first start finds no compiled kernels; the peak "
-            "RSS is without the helper processes that compile a part of them"
+            "seconds from starting a process to its first result; the first start finds empty caches of kernels and "
+            "models; the peak RSS is without the helper processes that compile a part of the kernels"
         ]
         parts.append(Section("Cold start", sentences, [head, *rows]))
     if setting["loadgen"]:
@@ -201,8 +203,7 @@ def _context(document: Mapping[str, Any]) -> list[Section]:
     for group in ("machine", "software"):
         rows += [[key.replace("_", " "), _shown(value)] for key, value in document[group].items()]
     rows.append(["command", document["command"]])
-    warned = [text for setting in document["settings"] for r in setting["repeats"] for text in r["warnings"]]
-    return [Section("Context", list(dict.fromkeys(warned)), rows)]
+    return [Section("Context", rows=rows)]
 
 
 def _shown(value: Any) -> str:

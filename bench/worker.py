@@ -140,6 +140,7 @@ def work(connection: Any, job: Job) -> dict[str, Any]:
             stopped = watch.stopped
         result |= {"interrupted": stopped, "rss_mb": rss_mb(), "peak_rss_mb": peak_rss_mb()}
         if not stopped:
+            perceive.reset_mounting()  # as the reference, whose scans are its first
             found = [perceive(scans[path]) for path in job.predict]
             result["predictions"] = [Prediction(each.points, each.top_view, each.boxes) for each in found]
     result["warnings"] = list(dict.fromkeys(str(each.message) for each in caught))

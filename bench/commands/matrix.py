@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import argparse
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from edgeperc import EdgepercError
-from edgeperc.inference.providers import PROVIDERS, available_providers
-from edgeperc.system.machine import cpu_features, settings_path, write_settings
+from edgeperc.inference.providers import PROVIDERS, available_providers, recompiles
+from edgeperc.system.machine import cpu_features, settings_path, usable_cores, write_settings
 from edgeperc.types.choices import PRECISIONS
 from edgeperc.zoo import DEFAULT, choose, resolve
 
@@ -45,9 +44,9 @@ def add_parser(subparsers: Any) -> None:
         add(option, text, type=choices(known), default=list(known))
     add(
         "--threads 1,2,4",
-        "numbers of threads with commas between them (default: 1 and the number of cores)",
+        "numbers of threads with commas between them (default: 1 and the number of cores that may be used)",
         type=numbers(1),
-        default=list(dict.fromkeys([1, os.cpu_count() or 1])),
+        default=list(dict.fromkeys([1, usable_cores()])),
     )
     add(
         "--recommend FILE",
@@ -94,6 +93,9 @@ def settings_to_try(
     for provider in providers:
         if provider not in present:
             skipped.append(f"{model} on {provider}: not available on this computer (present: {', '.join(present)})")
+            continue
+        if recompiles(provider, variants[0].card.view):
+            skipped.append(f"{model} on {provider}: it compiles the network anew for each number of candidates")
             continue
         for precision in precisions:
             try:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import os
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -73,17 +72,23 @@ def run_command(arguments: argparse.Namespace) -> int:
                 live.note("cold starts")
                 setting["cold_start"] = cold_starts(job, scans.files[0], 1 + arguments.repeats)
         if arguments.loadgen:
-            _loadgen(setting, job, scans.files, limits, arguments.loadgen, live)
+            _loadgen(setting, job, scans.files, limits, arguments.loadgen, document, live)
     return 0
 
 
 def _loadgen(
-    setting: dict[str, Any], job: Job, files: Sequence[Path], limits: Limits, folder: Path, live: LiveTable
+    setting: dict[str, Any],
+    job: Job,
+    files: Sequence[Path],
+    limits: Limits,
+    folder: Path,
+    document: dict[str, Any],
+    live: LiveTable,
 ) -> None:
     from ..measure import new_setting, repeat
 
     live.note(f"MLPerf LoadGen, logs in {folder}")
     driven = replace(job, scenarios=(Scenario("loadgen", tuple(files), limits),), loadgen=folder)
     scratch = new_setting(driven)
-    repeat(scratch, driven, 1, {"machine": {"logical_cores": os.cpu_count()}, "disturbances": []}, live)
+    repeat(scratch, driven, 1, document, live)
     setting["loadgen"] = loadgen.read_summary(folder) | {"samples": scratch["repeats"][0]["scenarios"]["loadgen"]}

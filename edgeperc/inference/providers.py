@@ -10,6 +10,7 @@ from typing import Any
 
 from ..errors import ProviderError
 from ..system.extras import require, without_telemetry
+from ..types.views import ObjectGeometry
 
 logger = logging.getLogger(__name__)
 
@@ -25,9 +26,6 @@ PROVIDERS: Mapping[str, str] = {
     "cpu": "CPUExecutionProvider",
 }
 AUTO = ("cuda", "openvino", "cpu")
-# Providers that compile a network anew for each number of candidates, which differs from scan to scan: on 30 KITTI
-# scans, the object network takes 22 ms a scan on OpenVINO and 5 ms on `cpu` (two cores of an Intel Xeon).
-RECOMPILING = ("openvino",)
 # Providers that come as plugins in addition to stock onnxruntime: provider, then the package with its library.
 PLUGINS = {
     "openvino": "onnxruntime_ep_openvino",
@@ -48,6 +46,14 @@ def load_onnxruntime() -> Any:
     ort = require("onnxruntime", "cpu", "Running a model")
     ort.set_default_logger_severity(4)  # its exceptions contain the messages, and ours repeat them
     return ort
+
+
+def recompiles(short: str, view: object) -> bool:
+    """Whether a provider compiles a network of this view anew for each number of candidates, which differs from scan to
+    scan: on 30 KITTI scans, that of objects takes 22 ms a scan on OpenVINO and 5 ms on `cpu` (two cores of an Intel
+    Xeon). Scans in turn do not show it, because their numbers come again.
+    """
+    return short == "openvino" and isinstance(view, ObjectGeometry)
 
 
 def is_of_engine(exc: Exception) -> bool:

@@ -56,13 +56,13 @@ from .providers import (
     AUTO,
     PLUGINS,
     PROVIDERS,
-    RECOMPILING,
     SHARING,
     available_providers,
     is_available,
     is_of_engine,
     load_onnxruntime,
     plugin_devices,
+    recompiles,
 )
 
 logger = logging.getLogger(__name__)
@@ -106,7 +106,7 @@ class Session:
 
     model, provider, precision, n_threads, trusted : as in `edgeperc.Perceiver`, for one network.
     at_once : number of sessions that run at the same time. If it is above 1 and ``n_threads`` is None, the providers
-        ``cpu`` and ``openvino`` get as large a part of the usable cores.
+        ``cpu`` and ``openvino`` get as large a part of the usable cores, or fewer if fewer were measured.
 
     Raises OptionError, ModelFileError, CardError, CardMismatchError, ProviderError, MissingExtraError, and
     InferenceError if the first run failed.
@@ -138,7 +138,7 @@ class Session:
         if n_threads is not None and not 1 <= n_threads <= MAX_THREADS:
             raise OptionError(f"n_threads is {n_threads!r:.20}; expected 1 to {MAX_THREADS}, or None")
         _check_names(provider, precision)
-        self._trusted, self._at_once = trusted, at_once
+        self._trusted, self._at_once = trusted, at_once if n_threads is None else 1
         self._made_in, self._running_in = os.getpid(), 0
         ort = load_onnxruntime()
         variants = resolve(model)
@@ -161,10 +161,9 @@ class Session:
         features = cpu_features()
         candidates = [(provider, precision, n_threads)]
         if provider == "auto":
-            present = available_providers()
-            unfit = RECOMPILING if isinstance(variants[0].card.view, ObjectGeometry) else ()
-            candidates = [(short, precision, n_threads) for short in AUTO if short in present and short not in unfit]
-            candidates = [*self._measured_best(variants[0].name, precision, n_threads, present), *candidates]
+            fit = [short for short in available_providers() if not recompiles(short, variants[0].card.view)]
+            candidates = [(short, precision, n_threads) for short in AUTO if short in fit]
+            candidates = [*self._measured_best(variants[0].name, precision, n_threads, fit), *candidates]
         elif not is_available(provider):
             raise ProviderError(
                 f"provider {provider!r} is not available on this computer (present: "
@@ -187,7 +186,7 @@ class Session:
         return attempts
 
     def _measured_best(
-        self, name: str, precision: str, n_threads: int | None, present: Sequence[str]
+        self, name: str, precision: str, n_threads: int | None, fit: Sequence[str]
     ) -> list[tuple[str, str, int | None]]:
         """The fastest provider, precision and threads measured on this computer; empty if none was measured."""
         try:
@@ -197,9 +196,10 @@ class Session:
             return []
         if setting is None or precision not in ("auto", setting["precision"]):
             return []
-        if setting["provider"] not in present:
+        if setting["provider"] not in fit:
             logger.warning(
-                "provider auto skips %s on %s, which was measured as the fastest: it is no longer available",
+                "provider auto skips %s on %s, which was measured as the fastest: it is no longer available, or "
+                "compiles this network anew for many scans",
                 *(name, printable(setting["provider"][:80])),
             )
             return []
@@ -218,9 +218,9 @@ class Session:
             )
         self.sha256 = hashlib.sha256(blob).hexdigest()
         cores = usable_cores()
-        self.shares_cores = n_threads is None and short in SHARING and 1 < self._at_once <= cores
-        if self.shares_cores:
-            n_threads = cores // self._at_once
+        self.shares_cores = short in SHARING and 1 < self._at_once <= cores
+        if self.shares_cores:  # the most threads of a network that was measured alone would let the others wait
+            n_threads = min(n_threads or cores, cores // self._at_once)
         elif n_threads is None and short in SHARING and cores < (os.cpu_count() or 1):
             n_threads = cores  # a provider counts the computer's: two threads on one core took 57 in place of 39 ms
         self._has_threads = short != "cpu" or n_threads != 1

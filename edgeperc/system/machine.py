@@ -14,7 +14,7 @@ import platform
 import reprlib
 import stat
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -132,6 +132,22 @@ def board() -> str | None:
 def cpu_quota() -> float | None:
     """The strictest limit of CPU time of this process' control groups, in cores; None without a limit."""
     limits = []
+    for folder, files in _control_groups():
+        words = " ".join(read_text(folder / name) or "" for name in files).split()
+        if len(words) == 2 and all(word.isdecimal() and int(word) > 0 for word in words):  # else "max", or -1
+            limits.append(int(words[0]) / int(words[1]))
+    return min(limits, default=None)
+
+
+def quota_pauses() -> int | None:
+    """How often a limit of CPU time has paused this process' control groups; None where nothing counts it."""
+    stats = [(read_text(folder / "cpu.stat") or "").splitlines() for folder, _ in _control_groups()]
+    counts = [int(line.split()[1]) for lines in stats for line in lines if line.startswith("nr_throttled ")]
+    return sum(counts) if counts else None
+
+
+def _control_groups() -> Iterator[tuple[Path, Sequence[str]]]:
+    """The folders of this process' control groups for CPU time, and the names of their files with a limit."""
     for line in (read_text(OWN_GROUPS) or "").splitlines():
         _, _, rest = line.partition(":")
         controllers, _, group = rest.partition(":")
@@ -139,12 +155,8 @@ def cpu_quota() -> float | None:
             continue
         # A container may see its own group as the root; a group is limited by those around it, too.
         for place in (PurePosixPath(group), *PurePosixPath(group).parents):
-            folder = CONTROL_GROUPS / controllers / str(place).lstrip("/")
             files = ("cpu.cfs_quota_us", "cpu.cfs_period_us") if controllers else ("cpu.max",)
-            words = " ".join(read_text(folder / name) or "" for name in files).split()
-            if len(words) == 2 and all(word.isdecimal() and int(word) > 0 for word in words):  # else "max", or -1
-                limits.append(int(words[0]) / int(words[1]))
-    return min(limits, default=None)
+            yield CONTROL_GROUPS / controllers / str(place).lstrip("/"), files
 
 
 def _cpuinfo(*keys: str) -> str:

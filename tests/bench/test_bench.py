@@ -177,7 +177,7 @@ def test_a_page_is_well_formed_and_needs_nothing_from_elsewhere(matplotlib: None
 def test_text_and_tables_hold_what_was_measured() -> None:
     parts = report.sections(document(20.0, 20.1))
     shown = render.text(parts)
-    assert "disturbed: others | are busy" in shown
+    assert "disturbed: others | are busy\n  warning: <script>" in shown
     assert "single-stream" in shown
     assert "paced:10" in shown
     written = markdown(parts, "a | b")
@@ -374,6 +374,9 @@ def test_the_matrix_skips_nothing_silently(monkeypatch: pytest.MonkeyPatch) -> N
     assert "pointseg on cuda: not available" in skipped[0]
     assert "pointseg on cpu in bf16: " in skipped[1]
     assert settings_to_try("pointseg:int8", ["cpu"], ["fp32", "int8"], ("cpu",))[0] == [("cpu", "int8")]
+    settings, (skipped,) = settings_to_try("objects", ["openvino", "cpu"], ["fp32"], ("openvino", "cpu"))
+    assert settings == [("cpu", "fp32")]
+    assert "objects on openvino: it compiles the network anew" in skipped
     with pytest.raises(ModelFileError):
         settings_to_try("nobody", ["cpu"], ["fp32"], ("cpu",))
 
@@ -419,10 +422,17 @@ def test_simulated_scans_come_in_the_sensors_own_unit(tmp_path: Path) -> None:
 
 
 class Street:
-    """In place of a Perceiver: every result is the same."""
+    """In place of a Perceiver: every result is the same, but for the first scans."""
+
+    n_scans = 0
+
+    def reset_mounting(self) -> None:
+        self.n_scans = 0
 
     def __call__(self, scan: np.ndarray) -> Any:
-        points = PointLabels(np.zeros(len(scan), np.uint8), np.ones(len(scan), bool), ("background", "car"))
+        self.n_scans += 1
+        labels = np.full(len(scan), self.n_scans > 5, np.uint8)
+        points = PointLabels(labels, np.ones(len(scan), bool), ("background", "car"))
         return SimpleNamespace(points=points, top_view=None, boxes=(), stage_ms={"project": 0.0, "infer": 0.0})
 
 
@@ -635,12 +645,16 @@ def test_a_dead_process_is_an_error() -> None:
 def test_a_cold_start_is_measured_step_by_step(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     steps = {"interpreter_s": 0.1, "total_s": 1.0}
     caches = []
+    monkeypatch.setenv("EDGEPERC_CACHE_DIR", str(tmp_path))
+    machine.settings_path().write_text("{}")
 
     def start(command: list[str], env: dict[str, str], **_: Any) -> Any:
         request = json.loads(command[-1])
         assert request["models"] == ["pointseg"]
         assert request["precision"] == "int8"
         caches.append(env["NUMBA_CACHE_DIR"])
+        assert env["EDGEPERC_CACHE_DIR"] == caches[0] != str(tmp_path)
+        assert (Path(caches[0]) / "settings.json").read_text() == "{}"
         return SimpleNamespace(returncode=0, stdout=json.dumps(steps), stderr="")
 
     monkeypatch.setattr(measure.subprocess, "run", start)

@@ -450,6 +450,12 @@ def test_auto_takes_the_setting_that_was_measured_here(
     assert Session(path, "auto").options["threads"] == "1"
     assert Session(path, "auto", n_threads=2).options["threads"] == "2"
     assert Session(path, "cpu").options["threads"] == "the provider's choice"
+    with monkeypatch.context() as four:
+        four.setattr(session_module, "usable_cores", lambda: 4)
+        for measured, threads in ((1, "1"), (4, "2")):  # of a network alone
+            keep({sha: {"provider": "cpu", "precision": "fp32", "n_threads": measured}})
+            beside = Session(path, "auto", at_once=2)
+            assert (beside.shares_cores, beside.options["threads"]) == (True, threads)
     keep({sha: {"provider": "qnn", "precision": "fp32", "n_threads": 1}})
     assert Session(path, "auto").options["threads"] == "the provider's choice"
     assert "pointseg on qnn, which was measured as the fastest: it is no longer available" in caplog.text

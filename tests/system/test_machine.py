@@ -80,6 +80,20 @@ def test_a_container_has_as_many_cores_as_its_limit_of_time(
     assert machine.usable_cores() == 1
 
 
+@pytest.mark.parametrize(
+    ("own", "folder", "pauses"), [("0::/a/b", "a", 3), ("2:cpu,cpuacct:/d", "cpu,cpuacct/d", 3), ("0::/", "a", None)]
+)
+def test_the_pauses_of_a_limit_of_time_are_those_of_the_own_groups(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, own: str, folder: str, pauses: int | None
+) -> None:
+    (tmp_path / "own").write_text(own)
+    (tmp_path / folder).mkdir(parents=True)
+    (tmp_path / folder / "cpu.stat").write_text("nr_periods 9\nnr_throttled 3\nthrottled_time 1\n")
+    monkeypatch.setattr(machine, "CONTROL_GROUPS", tmp_path)
+    monkeypatch.setattr(machine, "OWN_GROUPS", tmp_path / "own")
+    assert machine.quota_pauses() == pauses
+
+
 @pytest.mark.parametrize(("cores", "of"), [(1, 8), (3, 8), (8, 8)])
 def test_a_network_alone_has_no_more_threads_than_cores_that_are_usable(
     monkeypatch: pytest.MonkeyPatch, cores: int, of: int
