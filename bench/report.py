@@ -8,7 +8,7 @@ from typing import Any
 
 from .document import latency, pooled, scenario_names, setting_label, stage_medians
 from .render import QUANTILES, Section, number, share
-from .samples import percentile
+from .samples import percentile, supported
 
 
 def sections(document: Mapping[str, Any]) -> list[Section]:
@@ -116,7 +116,9 @@ def _setting(setting: Mapping[str, Any]) -> list[Section]:
         parts.append(Section("Cold start", sentences, [head, *rows]))
     if setting["loadgen"]:
         summary = setting["loadgen"]
-        quantiles = ", ".join(f"{key} {value:.2f} ms" for key, value in summary.items() if key.startswith("p"))
+        n = summary["samples"]["n"]
+        shown = [key for key in summary if key.startswith("p") and supported(float(key[1:]), n)]
+        quantiles = ", ".join(f"{key} {summary[key]:.2f} ms" for key in shown)
         parts.append(Section("MLPerf LoadGen, single stream", [f"result {summary['result']}: {quantiles}"]))
     if setting["accuracy"]:
         parts.append(Section("Accuracy of these results", accuracy_sentences(setting["accuracy"])))

@@ -57,12 +57,13 @@ class Parser(argparse.ArgumentParser):
 
 
 class _TerminatedError(SystemExit):
-    """SIGTERM arrived. Like `KeyboardInterrupt` it runs every ``finally``, so that files and processes are closed."""
+    """SIGTERM or SIGHUP arrived. Like `KeyboardInterrupt` it runs every ``finally``: files and processes are closed."""
 
 
 def run_program(program: str, command: Callable[[], int], message: Callable[[Exception], str] = str) -> int:
     """Run a program's command line, its warnings and errors (as ``message`` says them) one line each on stderr; 2 after
-    an `EdgepercError` or `OSError`, 130 after SIGINT, 143 after SIGTERM, 141 in silence if what reads it closed it.
+    an `EdgepercError` or `OSError`, 130 after SIGINT, 143 after SIGTERM, 129 after SIGHUP, 141 in silence if what reads
+    it closed it.
     """
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")  # a file name may have characters that the terminal lacks
@@ -123,12 +124,13 @@ def _is_closed_pipe(stream: TextIO) -> bool:
 
 @contextlib.contextmanager
 def _signals_raise(raised: list[int]) -> Iterator[None]:
-    """Let SIGINT and SIGTERM raise, and collect those that did, unless the process has its own answer to them."""
+    """Let SIGINT, SIGTERM and SIGHUP raise, and collect those that did, unless the process has an answer to them."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
     owner, main_thread = os.getpid(), threading.get_ident()
     waiting: list[threading.Timer] = []
+    hang_up = getattr(signal, "SIGHUP", None)  # the terminal has gone; Windows has none
 
     def answer(number: int, frame: FrameType | None) -> None:
         if os.getpid() != owner:  # a fork inherits this function; it ends as any process does
@@ -138,12 +140,12 @@ def _signals_raise(raised: list[int]) -> Iterator[None]:
             waiting[:] = [threading.Timer(0.05, _send_again, (number, main_thread))]
             waiting[0].daemon = True
             waiting[0].start()
-        else:
+        elif number != hang_up or number not in raised:  # a shell sends it, and so does its end
             raised.append(number)
             raise KeyboardInterrupt if number == signal.SIGINT else _TerminatedError(128 + number)
 
-    defaults: dict[int, Any] = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: signal.SIG_DFL}
-    defaults = {number: handler for number, handler in defaults.items() if signal.getsignal(number) is handler}
+    answers = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: signal.SIG_DFL, hang_up: signal.SIG_DFL}
+    defaults: dict[int, Any] = {n: each for n, each in answers.items() if n and signal.getsignal(n) is each}
     for number in defaults:
         signal.signal(number, answer)
     try:

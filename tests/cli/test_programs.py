@@ -185,6 +185,26 @@ def test_a_signal_that_code_in_between_changes_is_still_its_end(
 
 
 @posix
+def test_a_terminal_that_goes_says_so_twice_and_what_is_open_is_closed() -> None:
+    done: list[str] = []
+
+    def command() -> int:
+        try:
+            signal.raise_signal(signal.SIGHUP)
+        finally:
+            signal.raise_signal(signal.SIGHUP)
+            done.append("closed")
+        return 0
+
+    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)  # nohup ignores it
+    try:
+        assert run_program("program", command) == 129
+    finally:
+        signal.signal(signal.SIGHUP, before)
+    assert done == ["closed"]
+
+
+@posix
 def test_a_host_keeps_its_own_handler() -> None:
     caught: list[int] = []
     before = signal.signal(signal.SIGTERM, lambda number, _: caught.append(number))
