@@ -58,9 +58,12 @@ def read_input(folder: Path, paths: Sequence[Path], sensor: str) -> Input:
 
 
 def store(folder: Path, name: str, points: Points) -> Path:
-    """Write points to a file in ``folder``."""
+    """Write points to a file in ``folder``, which is temporary."""
     file = folder / f"{name}.npy"
-    np.save(file, points)
+    try:
+        np.save(file, points)
+    except OSError as exc:  # of a full disk, numpy says two numbers
+        raise OSError(f"{file} cannot be written ({exc}); set TMPDIR to a folder with more space") from exc
     return file
 
 

@@ -5,11 +5,13 @@ from __future__ import annotations
 import argparse
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from edgeperc import EdgepercError
+from edgeperc.cli.output import make_places
 from edgeperc.inference.providers import PROVIDERS, available_providers, recompiles
-from edgeperc.system.machine import cpu_features, settings_path, usable_cores, write_settings
+from edgeperc.system.machine import cpu_features, read_setting, settings_path, usable_cores, write_settings
 from edgeperc.types.choices import PRECISIONS
 from edgeperc.zoo import DEFAULT, choose, resolve
 
@@ -61,8 +63,11 @@ def run_command(arguments: argparse.Namespace) -> int:
     """Measure all settings, one model at a time."""
     from ..measure import reference
 
-    if arguments.recommend == "":
+    if arguments.recommend == Path():
         arguments.recommend = settings_path()
+    if arguments.recommend is not None:
+        make_places(arguments.recommend)
+        read_setting(arguments.recommend, "", "")  # raises now what it would raise after the measurement
     with new_document("matrix", arguments) as (document, live, folder):
         scans = prepare_input(arguments, folder, document, live)
         scenario = Scenario(SINGLE_STREAM, scans.files, limits_of(arguments))
@@ -77,7 +82,7 @@ def run_command(arguments: argparse.Namespace) -> int:
                     job = replace(base, provider=provider, precision=precision, n_threads=n_threads)
                     _try(job, right, scans, arguments.repeats, document, live)
         document["recommended"] = recommend(document)
-        if arguments.recommend and document["recommended"]:
+        if arguments.recommend is not None and document["recommended"]:
             entries = {each["digest"]: each["entry"] for each in document["recommended"]}
             write_settings(arguments.recommend, document["machine"]["fingerprint"], entries)
             live.note(f"saved in {arguments.recommend}")

@@ -268,7 +268,7 @@ def _caches() -> Iterator[Finding]:
         if reason is None:
             yield Finding(name, "ok", f"{part}: {content}, writable")
         else:
-            again = "every start compiles again; set EDGEPERC_CACHE_DIR to a folder that only you can write"
+            again = "what is compiled anew is not kept; set EDGEPERC_CACHE_DIR to a folder that only you can write"
             yield Finding(name, "note", f"{part}: {content}, {reason}", again)
     try:
         measured = [read_setting(settings_path(), fingerprint(), digest(resolve(model))) for model in DEFAULT_MODELS]

@@ -413,6 +413,13 @@ def test_scans_are_sized_and_crowded(tmp_path: Path) -> None:
         inputs.read_input(tmp_path, [tmp_path], "hdl-64e")
 
 
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full")
+def test_a_full_disk_of_temporary_files_is_named(tmp_path: Path) -> None:
+    (tmp_path / "scan.npy").symlink_to("/dev/full")
+    with pytest.raises(OSError, match=r"scan\.npy cannot be written .*set TMPDIR"):
+        inputs.store(tmp_path, "scan", np.ones((50, 4), np.float32))
+
+
 def test_simulated_scans_come_in_the_sensors_own_unit(tmp_path: Path) -> None:
     scans = inputs.simulated_input(tmp_path, 1, "os1-64")
     raw = np.load(scans.files[0])
@@ -467,7 +474,8 @@ def test_a_matrix_measures_every_setting_and_keeps_the_best(
     np.save(tmp_path / "own.npy", np.ones((50, 4), np.float32))
     options = ["--model", "pointseg", "--providers", "all", "--precisions", "fp32,bf16", "--threads", "1,2"]
     options += ["--min-scans", "20", "--min-seconds", "0", "--input", str(tmp_path / "own.npy")]
-    assert cli.main([*options, "--recommend", str(tmp_path / "r.json"), "--json", str(tmp_path / "m.json")]) == 0
+    monkeypatch.setenv("EDGEPERC_CACHE_DIR", str(tmp_path / "cache"))
+    assert cli.main([*options, "--recommend", "--json", str(tmp_path / "m.json")]) == 0
     measured = read_report(tmp_path / "m.json")
     assert [(s["provider"], s["precision"], s["n_threads"]) for s in measured["settings"]] == [
         ("openvino", "fp32", 1),
@@ -480,11 +488,15 @@ def test_a_matrix_measures_every_setting_and_keeps_the_best(
     skipped = "\n".join(measured["skipped"])
     for part in ("cuda: not available", "cpu in bf16", "openvino in bf16, 1 threads: cannot run this model"):
         assert part in skipped
-    saved = machine.read_setting(tmp_path / "r.json", measured["machine"]["fingerprint"], "a" * 64)
+    saved = machine.read_setting(machine.settings_path(), measured["machine"]["fingerprint"], "a" * 64)
     assert saved is not None
     assert saved["provider"] in ("openvino", "cpu")
     assert saved["precision"] == "fp32"
     assert "recommended for n" in capsys.readouterr().out
+    in_process.clear()
+    (tmp_path / "bad.json").write_text("{")
+    assert cli.main([*options, "--recommend", str(tmp_path / "bad.json")]) == 2
+    assert in_process == []  # nothing was measured for nothing
 
 
 def test_scaling_measures_points_cars_sizes_and_processes(
