@@ -136,7 +136,8 @@ def _growth_with_images(
         live.note(f"making networks for {percent} % of the pixels")
         models = tuple(str(resized(name, percent / 100.0, folder)) for name in job.models)
         scenario = Scenario(f"{percent} % of the pixels", (scan,), limits)
-        own = replace(job, models=models, scenarios=(scenario,))
+        precision = "fp32" if job.precision == "int8" else job.precision  # their weights are new
+        own = replace(job, models=models, precision=precision, scenarios=(scenario,))
         setting = new_setting(own, document)
         repeat(setting, own, arguments.repeats, document, live)
         settings.append((percent, setting, scenario.name))

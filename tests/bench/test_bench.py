@@ -512,7 +512,7 @@ def test_scaling_measures_points_cars_sizes_and_processes(
             "edgeperc_bench.peers.networks.resized", lambda *asked: made.append(asked) or tmp_path / "n"
         )
     options = ["scaling", "--points", "1000,2000,4000", "--cars", "0,2", "--sizes", "100", "--processes", "2,1"]
-    options += ["--min-scans", "20"]
+    options += ["--min-scans", "20", "--precision", "int8"]
     plot = tmp_path / "new" / "growth.svg"
     assert cli.main([*options, "--min-seconds", "0", "--plot", str(plot), "--json", str(tmp_path / "s.json")]) == 0
     tables = read_report(tmp_path / "s.json")["tables"]
@@ -526,6 +526,7 @@ def test_scaling_measures_points_cars_sizes_and_processes(
     assert HAS_EXPORT or "edgeperc[export]" in tables[2]["sentences"][0]
     assert [share for _, share, _ in made] == [1.0] * len(made)
     assert bool(made) == HAS_EXPORT
+    assert {job.precision for job in in_process if job.models[0] == str(tmp_path / "n")} <= {"fp32"}
     assert "ms per 1,000 points" in capsys.readouterr().out
     ET.fromstring(plot.read_text())
 
