@@ -76,7 +76,6 @@ def _stored(
         "sensor": sensor,
         "n_points": [len(scan) for scan in scans],
         "sha256": hashlib.sha256(b"".join(hashlib.sha256(scan.tobytes()).digest() for scan in scans)).hexdigest(),
-        "scan_sha256": [hashlib.sha256(scan.tobytes()).hexdigest() for scan in scans],
     }
     return Input(files, truth, record)
 

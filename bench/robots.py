@@ -123,7 +123,7 @@ class Figures(NearFigures):
 
 def rows_of(name: str, height_m: float, place: str, n_scans: int) -> list[str]:
     """The figures of a sensor in some streets, with the mounting given and found."""
-    sensor, rows = sensor_of(name), []
+    sensor = sensor_of(name)
     if place == "box-given":
         sensor = replace(sensor, ego_box=((-2.0, 0.1 - BOX_BEHIND_M), (-HALF_BOX_M, HALF_BOX_M), (-2.0, 2.0)))
     known = {"given": Mounting(height_m, 0.0, 0.0), "found": Mounting()}
@@ -135,9 +135,7 @@ def rows_of(name: str, height_m: float, place: str, n_scans: int) -> list[str]:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
                 figures[word].add(perceive(scan.points), scan, height_m)
-    for word, each in figures.items():
-        rows.append(f"| {name} | {height_m:g} m, {place} | {word} | {each.row()} |")
-    return rows
+    return [f"| {name} | {height_m:g} m, {place} | {word} | {each.row()} |" for word, each in figures.items()]
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -3,16 +3,12 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 from .. import loadgen
 from ..options import SINGLE_STREAM, add_command, add_limits, scenario
-from ..render import LiveTable
-from ..scenarios import Limits
-from ..worker import Job, Scenario
+from ..worker import Scenario
 from .common import job_of, limits_of, new_document, prepare_input
 
 DEFAULT_SCENARIOS = (SINGLE_STREAM, "paced:10", "paced:20", "offline", "cold-start")
@@ -72,23 +68,11 @@ def run_command(arguments: argparse.Namespace) -> int:
                 live.note("cold starts")
                 setting["cold_start"] = cold_starts(job, scans.files[0], 1 + arguments.repeats)
         if arguments.loadgen:
-            _loadgen(setting, job, scans.files, limits, arguments.loadgen, document, live)
+            logs = arguments.loadgen
+            live.note(f"MLPerf LoadGen, logs in {logs}")
+            driven = replace(job, scenarios=(Scenario("loadgen", scans.files, limits),), loadgen=logs)
+            scratch = new_setting(driven)
+            repeat(scratch, driven, 1, document, live)
+            samples = scratch["repeats"][0]["scenarios"]["loadgen"]
+            setting["loadgen"] = loadgen.read_summary(logs) | {"samples": samples}
     return 0
-
-
-def _loadgen(
-    setting: dict[str, Any],
-    job: Job,
-    files: Sequence[Path],
-    limits: Limits,
-    folder: Path,
-    document: dict[str, Any],
-    live: LiveTable,
-) -> None:
-    from ..measure import new_setting, repeat
-
-    live.note(f"MLPerf LoadGen, logs in {folder}")
-    driven = replace(job, scenarios=(Scenario("loadgen", tuple(files), limits),), loadgen=folder)
-    scratch = new_setting(driven)
-    repeat(scratch, driven, 1, document, live)
-    setting["loadgen"] = loadgen.read_summary(folder) | {"samples": scratch["repeats"][0]["scenarios"]["loadgen"]}
