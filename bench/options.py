@@ -8,8 +8,10 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from edgeperc.cli.arguments import Options, options
-from edgeperc.inference.providers import PROVIDERS
+from edgeperc.cli.arguments import Options, count, options, positive
+from edgeperc.cli.output import in_options
+from edgeperc.errors import ProviderError
+from edgeperc.inference.providers import PROVIDERS, check_names
 from edgeperc.system.names import nearest
 from edgeperc.types.choices import DEFAULT_MODELS as DEFAULT
 from edgeperc.types.choices import PRECISIONS
@@ -40,7 +42,7 @@ def add_limits(add: Options, min_scans: int, min_seconds: float, repeats: int) -
     add(
         "--min-scans N",
         "measure at least this many scans in each scenario (default: %(default)s)",
-        type=at_least(1),
+        type=positive,
         default=min_scans,
     )
     add(
@@ -49,27 +51,16 @@ def add_limits(add: Options, min_scans: int, min_seconds: float, repeats: int) -
         type=seconds,
         default=min_seconds,
     )
-    add("--warm-up N", "scans before the first one that counts (default: %(default)s)", type=at_least(0), default=20)
+    add("--warm-up N", "scans before the first one that counts (default: %(default)s)", type=count, default=20)
     add(
         "--repeats N",
         "repeat the measurement in this many fresh processes; their spread is the noise (default: %(default)s)",
-        type=at_least(1),
+        type=positive,
         default=repeats,
     )
 
 
 # Types of values
-
-
-def at_least(least: int) -> Callable[[str], int]:
-    """The type of a whole number from ``least``."""
-
-    def number(text: str) -> int:
-        if not text.lstrip("-").isdigit() or int(text) < least:
-            raise argparse.ArgumentTypeError(f"got {text!r}; expected a whole number from {least}")
-        return int(text)
-
-    return number
 
 
 def seconds(text: str) -> float:
@@ -113,16 +104,11 @@ def choices(known: Sequence[str]) -> Callable[[str], list[str]]:
 
 def provider(text: str) -> str:
     """The type of ``--provider``."""
-    name, _, precision = text.partition(":")
-    if precision:
-        raise argparse.ArgumentTypeError(
-            f"got {text!r}; the precision is an option of its own: --provider {name} --precision {precision}"
-        )
-    if name not in ("auto", *PROVIDERS):
-        raise argparse.ArgumentTypeError(
-            f"got {text!r}{nearest(name, PROVIDERS)}; expected auto or one of {', '.join(PROVIDERS)}"
-        )
-    return name
+    try:
+        check_names(text, "auto")
+    except ProviderError as exc:
+        raise argparse.ArgumentTypeError(in_options(str(exc))) from exc
+    return text
 
 
 def scenario(text: str) -> str:
@@ -167,7 +153,7 @@ SHARED: Mapping[str, Sequence[tuple[str, str, Mapping[str, Any]]]] = {
         (
             "--scans N",
             "the number of simulated scans, used in turn (default: %(default)s)",
-            {"type": at_least(1), "default": 8},
+            {"type": positive, "default": 8},
         ),
     ),
     "engine": (
@@ -184,7 +170,7 @@ SHARED: Mapping[str, Sequence[tuple[str, str, Mapping[str, Any]]]] = {
         (
             "--threads N",
             "the number of threads inside a model (default: the provider's choice)",
-            {"type": at_least(1)},
+            {"type": positive},
         ),
     ),
     "output": (

@@ -5,7 +5,9 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from ..options import add_command, at_least, choices
+from edgeperc.cli.arguments import positive
+
+from ..options import add_command, choices
 from .common import new_document, prepare_input
 
 
@@ -24,7 +26,7 @@ def add_parser(subparsers: Any) -> None:
     add(
         "--rounds N",
         "how often each contender takes its turn with all scans (default: %(default)s)",
-        type=at_least(1),
+        type=positive,
         default=25,
     )
     add(

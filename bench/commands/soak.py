@@ -6,11 +6,14 @@ import argparse
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 
-from ..options import add_command, at_least
+from edgeperc.cli.arguments import count
+
+from ..options import add_command
 from ..samples import trend
 from ..scenarios import Limits
 from ..worker import MEMORY_SAMPLES, Scenario
@@ -31,7 +34,8 @@ def add_parser(subparsers: Any) -> None:
         help="tell whether memory grows over a long run",
         description="Run many simulated scans in one process and fit a line to its memory.",
     )
-    add("--scans N", "the number of scans, 1000 at least (default: %(default)s)", type=at_least(1000), default=20_000)
+    least = partial(count, least=1000)
+    add("--scans N", "the number of scans, 1000 at least (default: %(default)s)", type=least, default=20_000)
     add("--application", "also stream, track, write JSON and draw every 100th scan, as applications do (extra 'view')")
 
 

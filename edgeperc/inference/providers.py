@@ -10,6 +10,8 @@ from typing import Any
 
 from ..errors import ProviderError
 from ..system.extras import require, without_telemetry
+from ..system.names import nearest
+from ..types.choices import PRECISIONS
 from ..types.views import ObjectGeometry
 
 logger = logging.getLogger(__name__)
@@ -38,6 +40,23 @@ SHARING = ("cpu", "openvino")
 # What C++ raises, and warnings that are errors, become one of these, or one of onnxruntime's own classes, which share
 # no base but Exception.
 _OF_CPP = (RuntimeError, ValueError, TypeError, LookupError, ArithmeticError, MemoryError, Warning)
+
+
+def check_names(provider: str, precision: str) -> None:
+    """Refuse names that are none. Raises ProviderError."""
+    if precision not in ("auto", *PRECISIONS):
+        close = nearest(precision, PRECISIONS)
+        raise ProviderError(f"precision {precision!r} is unknown{close}; expected auto, {', '.join(PRECISIONS)}")
+    if provider == "auto" or provider in PROVIDERS:
+        return
+    short, _, suffix = provider.partition(":")
+    if short in PROVIDERS and suffix:
+        raise ProviderError(
+            f"provider {provider!r}: the precision is an option of its own; ask for provider {short!r} and "
+            f"precision {suffix!r}"
+        )
+    close = nearest(provider, PROVIDERS)
+    raise ProviderError(f"provider {provider!r} is unknown{close}; expected auto or one of {', '.join(PROVIDERS)}")
 
 
 def load_onnxruntime() -> Any:

@@ -42,10 +42,8 @@ from ..system.machine import (
     settings_path,
     usable_cores,
 )
-from ..system.names import nearest
 from ..system.printable import printable
 from ..types.card import ModelCard
-from ..types.choices import PRECISIONS
 from ..types.detector import PillarGeometry
 from ..types.onnx_file import check_graph, read_model
 from ..types.points import Floats32
@@ -58,6 +56,7 @@ from .providers import (
     PROVIDERS,
     SHARING,
     available_providers,
+    check_names,
     is_available,
     is_of_engine,
     load_onnxruntime,
@@ -83,22 +82,6 @@ MAX_FIRST_RUN_S = 30.0
 
 _Attempt = tuple[str, Variant, str, int | None]
 """Provider, variant, precision and number of threads."""
-
-
-def _check_names(provider: str, precision: str) -> None:
-    if precision not in ("auto", *PRECISIONS):
-        close = nearest(precision, PRECISIONS)
-        raise ProviderError(f"precision {precision!r} is unknown{close}; expected auto, {', '.join(PRECISIONS)}")
-    if provider == "auto" or provider in PROVIDERS:
-        return
-    short, _, suffix = provider.partition(":")
-    if short in PROVIDERS and suffix:
-        raise ProviderError(
-            f"provider {provider!r}: the precision is an option of its own; ask for provider {short!r} and "
-            f"precision {suffix!r}"
-        )
-    close = nearest(provider, PROVIDERS)
-    raise ProviderError(f"provider {provider!r} is unknown{close}; expected auto or one of {', '.join(PROVIDERS)}")
 
 
 class Session:
@@ -137,7 +120,7 @@ class Session:
     ) -> None:
         if n_threads is not None and not 1 <= n_threads <= MAX_THREADS:
             raise OptionError(f"n_threads is {n_threads!r:.20}; expected 1 to {MAX_THREADS}, or None")
-        _check_names(provider, precision)
+        check_names(provider, precision)
         self._trusted, self._at_once = trusted, at_once if n_threads is None else 1
         self._made_in, self._running_in = os.getpid(), 0
         ort = load_onnxruntime()

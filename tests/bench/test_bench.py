@@ -283,10 +283,10 @@ WRONG = (
     ("typed", "said"),
     [
         *((typed, "error: ") for typed in WRONG),
-        ("--provider openvino:bf16", "--provider openvino --precision bf16"),
+        ("--provider openvino:bf16", "ask for --provider 'openvino' and --precision 'bf16'"),
         ("compair a.json b.json", "(did you mean compare?)"),
         ("run --min-scan 2", "--min-scan 2 (did you mean --min-scans?)"),
-        ("--provider openvno", "got 'openvno' (did you mean openvino?)"),
+        ("--provider openvno", "'openvno' is unknown (did you mean openvino?)"),
         ("--precisions int", "got 'int' (did you mean int8?)"),
     ],
 )
