@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import functools
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -59,6 +60,13 @@ OBJECTS = ModelCard(
     box_classes=("car",),
     box_size_priors={"car": (3.9, 1.6, 1.5)},
 )
+
+
+def parsers(parser: argparse.ArgumentParser) -> dict[str, argparse.ArgumentParser]:
+    """The parser of each command of a program; each command has a line in the program's help."""
+    (commands,) = [action for action in parser._actions if isinstance(action, argparse._SubParsersAction)]
+    assert {*commands.choices} == {each.dest for each in commands._choices_actions}
+    return dict(commands.choices)
 
 
 def thinned(sensor: str = "hdl-64e") -> SensorProfile:

@@ -206,6 +206,16 @@ def own_signals() -> Iterator[None]:
     assert [signal.getsignal(number) for number in numbers] == before
 
 
+@pytest.fixture
+def foreground() -> Iterator[None]:
+    """Ctrl-C works, and the end of the terminal, even where a shell started the tests in the background."""
+    wanted = {signal.SIGINT: signal.default_int_handler, getattr(signal, "SIGHUP", signal.SIGTERM): signal.SIG_DFL}
+    before = {number: signal.signal(number, handler) for number, handler in wanted.items()}
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
 @pytest.fixture(scope="session")
 def matplotlib() -> None:
     """For tests that draw: skips them where only the runtime is installed."""

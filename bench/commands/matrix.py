@@ -99,7 +99,7 @@ def settings_to_try(
         if provider not in present:
             skipped.append(f"{model} on {provider}: not available on this computer (present: {', '.join(present)})")
             continue
-        if recompiles(provider, variants[0].card.view):
+        if recompiles(provider, variants[0].card.view.kind):
             skipped.append(f"{model} on {provider}: it compiles the network anew for each number of candidates")
             continue
         for precision in precisions:

@@ -12,7 +12,6 @@ from ..errors import ProviderError
 from ..system.extras import require, without_telemetry
 from ..system.names import nearest
 from ..types.choices import PRECISIONS
-from ..types.views import ObjectGeometry
 
 logger = logging.getLogger(__name__)
 
@@ -67,12 +66,13 @@ def load_onnxruntime() -> Any:
     return ort
 
 
-def recompiles(short: str, view: object) -> bool:
-    """Whether a provider compiles a network of this view anew for each number of candidates, which differs from scan to
-    scan: on 30 KITTI scans, that of objects takes 22 ms a scan on OpenVINO and 5 ms on `cpu` (two cores of an Intel
-    Xeon). Scans in turn do not show it, because their numbers come again.
+def recompiles(short: str, view_kind: str) -> bool:
+    """Whether a provider compiles a network anew for each number of candidates, which differs from scan to scan.
+
+    On 30 KITTI scans, that of objects takes 22 ms a scan on OpenVINO and 5 ms on `cpu` (two cores of an Intel Xeon).
+    A few scans in turn do not show it, because their numbers come again.
     """
-    return short == "openvino" and isinstance(view, ObjectGeometry)
+    return short == "openvino" and view_kind == "objects"
 
 
 def is_of_engine(exc: Exception) -> bool:

@@ -144,7 +144,7 @@ class Session:
         features = cpu_features()
         candidates = [(provider, precision, n_threads)]
         if provider == "auto":
-            fit = [short for short in available_providers() if not recompiles(short, variants[0].card.view)]
+            fit = [short for short in available_providers() if not recompiles(short, variants[0].card.view.kind)]
             candidates = [(short, precision, n_threads) for short in AUTO if short in fit]
             candidates = [*self._measured_best(variants[0].name, precision, n_threads, fit), *candidates]
         elif not is_available(provider):

@@ -13,7 +13,7 @@ import subprocess
 import sys
 import threading
 import xml.etree.ElementTree as ET
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -23,6 +23,7 @@ import numpy as np
 import pytest
 
 import scenes
+from cli_helpers import parsers
 from edgeperc import Perceiver
 from edgeperc.errors import ModelFileError, PointsError, ProviderError
 from edgeperc.simulation.samples import simulated_scan
@@ -301,25 +302,12 @@ def test_wrong_options_are_refused_and_name_the_nearest(
     assert said in message
 
 
-def parsers(parser: argparse.ArgumentParser) -> Iterator[argparse.ArgumentParser]:
-    yield parser
-    for action in parser._actions:
-        if isinstance(action, argparse._SubParsersAction):
-            assert set(action.choices) == {each.dest for each in action._choices_actions}, (
-                "a command without a help text"
-            )
-            for command in action.choices.values():
-                yield from parsers(command)
-
-
 def test_every_option_has_a_help_text() -> None:
-    every = list(parsers(cli.build_parser()))
-    assert len(every) == 1 + len(cli.COMMANDS)
-    for parser in every:
+    commands = parsers(cli.build_parser())
+    assert commands.keys() == cli.COMMANDS.keys()
+    for parser in commands.values():
         assert parser.description
         for action in parser._actions:
-            if isinstance(action, argparse._SubParsersAction):
-                continue
             assert action.help, f"{parser.prog} {action.dest}"
             takes_value = action.option_strings and action.nargs != 0
             assert "default" in action.help or not takes_value or action.default in (None, argparse.SUPPRESS)
@@ -603,14 +591,6 @@ def test_a_run_from_scans_to_files(no_wait: None, tmp_path: Path, capsys: pytest
     assert measured["input"]["source"] == "1 scan: own.bin"
     assert "pointseg:fp32" in capsys.readouterr().out
     assert "## Latency" in (tmp_path / "a.md").read_text()
-
-
-@pytest.fixture
-def foreground() -> Iterator[None]:
-    """Ctrl-C works, even where a shell started the tests in the background and so with SIGINT ignored."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    yield
-    signal.signal(signal.SIGINT, before)
 
 
 def test_an_interrupted_run_writes_what_it_has(

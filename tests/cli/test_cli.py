@@ -23,7 +23,7 @@ from hypothesis import strategies as st
 from test_captures import vlp16_packets, write_pcap
 from test_pcap import as_pcapng, packets_in
 
-from cli_helpers import OBJECTS, POINTSEG, SSADNET, run, thinned, usage_code, write_scan
+from cli_helpers import OBJECTS, POINTSEG, SSADNET, parsers, run, thinned, usage_code, write_scan
 from edgeperc import Tracker, __version__, live, zoo
 from edgeperc.cli.arguments import PRECISIONS, PROVIDERS
 from edgeperc.cli.evaluation.scans import figure_lines
@@ -33,7 +33,7 @@ from edgeperc.cli.report import Report
 from edgeperc.cli.scans import find_scans, output_names
 from edgeperc.errors import InferenceError, ModelFileError, OptionError, PointsError
 from edgeperc.evaluation.judge import Perceiving
-from edgeperc.inference import providers, session
+from edgeperc.inference import providers
 from edgeperc.readers import captures
 from edgeperc.readers.files import read_points
 from edgeperc.simulation.drawn import random_scene
@@ -984,13 +984,8 @@ COMMANDS = (
 )
 
 
-def parsers() -> dict[str, argparse.ArgumentParser]:
-    (commands,) = [action for action in build_parser()._actions if isinstance(action, argparse._SubParsersAction)]
-    return dict(commands.choices)
-
-
 def test_there_is_one_level_of_commands(capsys: pytest.CaptureFixture[str]) -> None:
-    assert tuple(parsers()) == COMMANDS
+    assert tuple(parsers(build_parser())) == COMMANDS
     assert usage_code("--help") == 0
     out = capsys.readouterr().out
     assert all(f"    {name}" in out for name in COMMANDS)
@@ -1005,7 +1000,7 @@ def test_every_help_page_fits_a_terminal_and_explains_every_option(
     page = capsys.readouterr().out
     assert max(map(len, page.splitlines())) <= 80
     assert f"examples:\n  edgeperc {name}" in page
-    for action in parsers()[name]._actions:
+    for action in parsers(build_parser())[name]._actions:
         if action.help is argparse.SUPPRESS:
             continue
         assert action.help, f"{action.option_strings or action.dest} has no help text"
@@ -1016,7 +1011,7 @@ def test_every_help_page_fits_a_terminal_and_explains_every_option(
 @pytest.mark.parametrize("name", COMMANDS)
 def test_the_examples_of_a_help_page_can_be_parsed(name: str) -> None:
     parser = build_parser()
-    epilog = parsers()[name].epilog or ""
+    epilog = parsers(build_parser())[name].epilog or ""
     examples = [line for line in epilog.splitlines() if line.startswith("  edgeperc ")]
     assert examples
     for line in examples:
@@ -1026,7 +1021,7 @@ def test_the_examples_of_a_help_page_can_be_parsed(name: str) -> None:
 
 def test_the_help_page_lists_what_there_is() -> None:
     assert {*PROVIDERS} == {"auto", *providers.PROVIDERS}
-    assert ("auto", *session.PRECISIONS) == PRECISIONS
+    assert ("auto", *providers.PRECISIONS) == PRECISIONS
 
 
 @pytest.mark.parametrize(

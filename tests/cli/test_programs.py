@@ -13,6 +13,7 @@ import sys
 import threading
 import time
 import warnings
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -124,7 +125,7 @@ def test_errors_and_warnings_are_one_line(capsys: pytest.CaptureFixture[str]) ->
 
 
 @posix
-def test_signals_raise_and_their_handlers_are_restored(capsys: pytest.CaptureFixture[str]) -> None:
+def test_signals_raise_and_their_handlers_are_restored(foreground: None, capsys: pytest.CaptureFixture[str]) -> None:
     done: list[str] = []
 
     def command(number: int) -> int:
@@ -136,16 +137,9 @@ def test_signals_raise_and_their_handlers_are_restored(capsys: pytest.CaptureFix
                 signal.raise_signal(number)
             done.append("closed")
 
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    ignored = signal.signal(signal.SIGHUP, signal.SIG_DFL)  # perhaps, by nohup
     assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
-    try:
-        assert run_program("program", lambda: command(signal.SIGINT)) == 130
-        assert run_program("program", lambda: command(signal.SIGTERM)) == 143
-        assert run_program("program", lambda: command(signal.SIGHUP)) == 129
-    finally:
-        signal.signal(signal.SIGINT, before)
-        signal.signal(signal.SIGHUP, ignored)
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        assert run_program("program", partial(command, number)) == 128 + number
     assert done == ["closed"] * 3
     assert capsys.readouterr().err == "program: interrupted\nprogram: terminated\nprogram: terminated\n"
     assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL

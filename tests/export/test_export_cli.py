@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -17,20 +15,11 @@ onnx = pytest.importorskip("onnx")
 
 from training_helpers import ablate
 
+from cli_helpers import parsers
 from edgeperc.zoo import model_path
 from edgeperc_export.cli import build_parser, main, recipe_of
 from edgeperc_export.networks import build
 from edgeperc_export.recipe import MODELS, NETWORKS, Recipe
-
-
-def parsers(parser: argparse.ArgumentParser | None = None, name: str = "") -> Iterator[tuple[str, object]]:
-    """Name and parser of every command, and of the program itself."""
-    parser = parser or build_parser()
-    yield name, parser
-    for action in parser._actions:
-        if isinstance(action, argparse._SubParsersAction):
-            for command, inner in action.choices.items():
-                yield from parsers(inner, f"{name} {command}".strip())
 
 
 def test_every_model_can_be_made() -> None:
@@ -40,13 +29,10 @@ def test_every_model_can_be_made() -> None:
 
 
 def test_every_option_has_a_help_text() -> None:
-    commands = dict(parsers())
-    assert all(name.count(" ") == 0 for name in commands)  # one level
-    for name, parser in commands.items():
-        for action in parser._actions:
-            if not isinstance(action, argparse._SubParsersAction):
-                assert action.help, f"{name} {action.option_strings or action.dest} has no help"
-                assert len(action.help.split()) > 1, f"{name} {action.option_strings}: {action.help}"
+    for name, parser in parsers(build_parser()).items():
+        for action in parser._actions:  # none of them has commands
+            assert action.help, f"{name} {action.option_strings or action.dest} has no help"
+            assert len(action.help.split()) > 1, f"{name} {action.option_strings}: {action.help}"
         parser.format_help()  # raises ValueError for a stray % in a help text
 
 
@@ -84,7 +70,7 @@ assert not {"torch", "numba", "onnx"} & {*sys.modules}, "--help"
 
 
 def test_every_field_of_a_recipe_is_an_option() -> None:
-    train = dict(parsers())["train"]
+    train = parsers(build_parser())["train"]
     options = {action.dest: action for action in train._actions}
     for field in dataclasses.fields(Recipe):
         if field.name != "network":
