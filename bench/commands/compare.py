@@ -55,6 +55,8 @@ def run_command(arguments: argparse.Namespace) -> int:
                 f"noise {100.0 * verdict.noise:.1f} %"
             )
     for letter, document in (("A", a), ("B", b)):
+        if not document["complete"]:
+            print_line(f"{letter} was interrupted: only what was measured before is compared")
         for disturbance in document["disturbances"][:5]:
             print_line(f"{letter} was disturbed: {disturbance}")
     if not verdicts:

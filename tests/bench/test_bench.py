@@ -253,9 +253,12 @@ def test_compare_answers_by_its_exit_code(reports: Any, tmp_path: Path, capsys: 
     assert "different scans" in capsys.readouterr().err
     other = plain(document(20.0, 20.1))
     other["input"]["sensor"] = "os1-64"
+    other["complete"] = False
     write_report(other, tmp_path / "b.json")
     assert cli.main(["compare", a, str(tmp_path / "b.json")]) == 0
-    assert "different sensors: A as of hdl-64e, B as of os1-64" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "different sensors: A as of hdl-64e, B as of os1-64" in said
+    assert "B was interrupted" in said
     assert cli.main(["compare", a, "nowhere.json"]) == 2
     assert "nowhere.json" in capsys.readouterr().err
 
