@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -28,13 +28,41 @@ def add_command(
     help: str,
     description: str,
 ) -> Options:
-    """Declare a command with the options that it shares with others, by `SHARED`; returns what adds its own."""
+    """Declare a command with the groups of options that it shares with others; returns what adds its own."""
     parser = subparsers.add_parser(name, help=help, description=description, allow_abbrev=False)
     parser.set_defaults(run=command)
     add = options(parser)
-    for shown, text, settings in (option for group in shared for option in SHARED[group]):
-        add(shown, text, **settings)
+    _add_shared(add, shared)
     return add
+
+
+def _add_shared(add: Options, groups: Sequence[str]) -> None:
+    """The options of some groups: "model", "scans", "engine", "output" and "page"."""
+    if "model" in groups:
+        add(
+            "--model NAME",
+            "a shipped model (ssadnet), one variant of it (ssadnet:int8) or the path of an .onnx file; may be "
+            f"repeated (default: {', '.join(DEFAULT)})",
+            action="append",
+        )
+        sensor = "a name that 'edgeperc sensors' lists, or a .json file (default: %(default)s)"
+        add("--sensor NAME", f"the sensor that recorded the scans: {sensor}", default="hdl-64e")
+    if "scans" in groups:
+        files = "measure with these scan files, or all scan files of these folders (default: simulated scans)"
+        add("--input SCANS...", files, type=Path)
+        simulated = "the number of simulated scans, used in turn (default: %(default)s)"
+        add("--scans N", simulated, type=positive, default=8)
+    if "engine" in groups:
+        runs = f"the execution provider that runs the models: auto, {', '.join(PROVIDERS)} (default: %(default)s)"
+        add("--provider P", runs, type=provider, default="auto")
+        computed = f"the precision in which the models run: auto, {', '.join(PRECISIONS)} (default: %(default)s)"
+        add("--precision P", computed, choices=("auto", *PRECISIONS), default="auto")
+        add("--threads N", "the number of threads inside a model (default: the provider's choice)", type=positive)
+    if "output" in groups:
+        add("--json FILE", "write the report, with every sample, to this file")
+        add("--markdown FILE", "write the tables as Markdown to this file")
+    if "page" in groups:
+        add("--html FILE", "write a page with plots to this file (needs the extra 'view')")
 
 
 def add_limits(add: Options, min_scans: int, min_seconds: float, repeats: int) -> None:
@@ -127,55 +155,3 @@ def scenario(text: str) -> str:
             f"got {text!r}; expected {SINGLE_STREAM}, paced:HZ, offline, offline:PROCESSES or cold-start"
         )
     return text
-
-
-SHARED: Mapping[str, Sequence[tuple[str, str, Mapping[str, Any]]]] = {
-    "model": (
-        (
-            "--model NAME",
-            "a shipped model (ssadnet), one variant of it (ssadnet:int8) or the path of an .onnx file; may be "
-            f"repeated (default: {', '.join(DEFAULT)})",
-            {"action": "append"},
-        ),
-        (
-            "--sensor NAME",
-            "the sensor that recorded the scans: a name that 'edgeperc sensors' lists, or a .json file "
-            "(default: %(default)s)",
-            {"default": "hdl-64e"},
-        ),
-    ),
-    "scans": (
-        (
-            "--input SCANS...",
-            "measure with these scan files, or all scan files of these folders (default: simulated scans)",
-            {"type": Path},
-        ),
-        (
-            "--scans N",
-            "the number of simulated scans, used in turn (default: %(default)s)",
-            {"type": positive, "default": 8},
-        ),
-    ),
-    "engine": (
-        (
-            "--provider P",
-            f"the execution provider that runs the models: auto, {', '.join(PROVIDERS)} (default: %(default)s)",
-            {"type": provider, "default": "auto"},
-        ),
-        (
-            "--precision P",
-            f"the precision in which the models run: auto, {', '.join(PRECISIONS)} (default: %(default)s)",
-            {"choices": ("auto", *PRECISIONS), "default": "auto"},
-        ),
-        (
-            "--threads N",
-            "the number of threads inside a model (default: the provider's choice)",
-            {"type": positive},
-        ),
-    ),
-    "output": (
-        ("--json FILE", "write the report, with every sample, to this file", {}),
-        ("--markdown FILE", "write the tables as Markdown to this file", {}),
-    ),
-    "page": (("--html FILE", "write a page with plots to this file (needs the extra 'view')", {}),),
-}
