@@ -25,7 +25,6 @@ from test_pcap import as_pcapng, packets_in
 
 from cli_helpers import OBJECTS, POINTSEG, SSADNET, parsers, run, thinned, usage_code, write_scan
 from edgeperc import Tracker, __version__, live, zoo
-from edgeperc.cli.arguments import PRECISIONS, PROVIDERS
 from edgeperc.cli.evaluation.scans import figure_lines
 from edgeperc.cli.main import build_parser, in_options
 from edgeperc.cli.output import print_line, progress
@@ -33,7 +32,6 @@ from edgeperc.cli.report import Report
 from edgeperc.cli.scans import find_scans, output_names
 from edgeperc.errors import InferenceError, ModelFileError, OptionError, PointsError
 from edgeperc.evaluation.judge import Perceiving
-from edgeperc.inference import providers
 from edgeperc.readers import captures
 from edgeperc.readers.files import read_points
 from edgeperc.simulation.drawn import random_scene
@@ -1017,11 +1015,6 @@ def test_the_examples_of_a_help_page_can_be_parsed(name: str) -> None:
     for line in examples:
         words = shlex.split(line.partition(" > ")[0].partition(" #")[0])
         assert callable(parser.parse_args(words[1:]).command)
-
-
-def test_the_help_page_lists_what_there_is() -> None:
-    assert {*PROVIDERS} == {"auto", *providers.PROVIDERS}
-    assert ("auto", *providers.PRECISIONS) == PRECISIONS
 
 
 @pytest.mark.parametrize(

@@ -246,10 +246,8 @@ WAITING = (
 )
 def test_every_program_ends_by_a_signal_in_one_line(program: str, number: int) -> None:
     code, word = {signal.SIGINT: (130, "interrupted"), signal.SIGTERM: (143, "terminated")}[number]
-
-    def with_signals() -> None:  # a shell starts programs in the background with SIGINT ignored
-        signal.signal(signal.SIGINT, signal.default_int_handler)
-
+    # A shell starts programs in the background with SIGINT ignored.
+    with_signals = partial(signal.signal, signal.SIGINT, signal.default_int_handler)
     with start(program, before=WAITING, preexec_fn=with_signals) as process:
         assert process.stdout is not None
         assert process.stdout.readline() == b"runs\n"
