@@ -76,7 +76,8 @@ def _road_record(perception: Perception) -> dict[str, Any] | None:
         "lane_width_m": road.lane_width_m,
     }
     return {
-        "outline": [[round(float(v), 2) for v in corner] for corner in road.outline],
+        "outline": road.outline.round(2).tolist(),
+        "holes": [hole.round(2).tolist() for hole in road.holes],
         "tolerance_m": round(road.tolerance_m, 2) if math.isfinite(road.tolerance_m) else None,
         "free_ahead_end": ahead.end,
         **{name: round(value, 2) if math.isfinite(value) else None for name, value in lengths.items()},

@@ -277,6 +277,7 @@ def test_json_is_one_object_a_scan_and_nothing_else(tmp_path: Path, capsys: pyte
         "drivable_area_m2": 100.0,
         "road": {
             "outline": [[36.0, 0.0], [46.0, 0.0], [46.0, 10.0], [36.0, 10.0]],
+            "holes": [],
             "tolerance_m": 0.2,
             "free_ahead_end": "edge of the road",
             "free_ahead_m": 6.0,

@@ -157,6 +157,7 @@ def test_a_record_adds_road_and_tracks() -> None:
     assert tuple(record) == SCAN_KEYS
     assert record["road"]["free_ahead_m"] == pytest.approx(10.34, abs=0.5)  # up to the car's rear
     assert record["road"]["free_ahead_end"] == "obstacle"
+    assert len(record["road"]["holes"]) == 1  # the car is not in the outline
     (track,) = tracks
     assert record["tracks"] == [track.to_dict()]
     assert Box.from_dict(track.to_dict()) == Box.from_dict(track.box.to_dict())
