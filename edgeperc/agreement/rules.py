@@ -27,7 +27,7 @@ from ..objects.persons import complete_persons
 from ..system.kernels import njit
 from ..types import choices
 from ..types.choices import VEHICLES
-from ..types.geometry import Grid, box_records, is_inside
+from ..types.geometry import Grid, box_records, grid_of, is_inside
 from ..types.mounting import MODEL_HEIGHT_M
 from ..types.perception import Box, PointLabels, TopView
 from ..types.points import (
@@ -275,8 +275,7 @@ def cells_of(view: TopView | None) -> Cells:
     is_vehicle = np.array([name in VEHICLES for name in classes] + [False] * (256 - len(classes)), np.bool_)
     if view is None:
         return Cells(np.empty((0, 0), np.uint8), is_vehicle, Grid(1.0, 1.0, 1.0))
-    grid = Grid(float(view.x_range_m[1]), float(view.y_range_m[1]), float(view.cell_m))
-    return Cells(np.ascontiguousarray(view.labels), is_vehicle, grid)
+    return Cells(np.ascontiguousarray(view.labels), is_vehicle, grid_of(view.geometry))
 
 
 def as_rows(boxes: Sequence[Box], labels: Sequence[int] | None = None) -> Records:

@@ -21,7 +21,7 @@ from ..system.atomic import write_atomic
 from ..system.clock import nanoseconds_of
 from ..system.kernels import njit
 from ..types.frame import ModelFrame, quaternion
-from ..types.geometry import draw_footprints
+from ..types.geometry import footprints
 from ..types.mounting import MODEL_HEIGHT_M, MODEL_MOUNTING, Mounting
 from ..types.perception import Perception, TopView, sensor_behind
 from ..types.points import Floats, Floats32, Heights, Ints, Mask, Points, as_points, read_only
@@ -42,7 +42,7 @@ class OccupancyGrid:
     Attributes
     ----------
     drivable : (rows, columns) bool
-        More than half of the cell is observed road, and no obstacle is in it: by the top view where it sees, elsewhere
+        Observed cells of which more than half is road, without an obstacle: by the top view where it sees, elsewhere
         by the points if they have a class ``road``. Row 0 is farthest ahead, column 0 leftmost. All False if there is
         neither.
     obstacle : (rows, columns) bool
@@ -284,16 +284,14 @@ def occupancy_grid(
     fill_standing(moved, read_only(ground.height_m), corner, float(min_height_m), OVERHEAD_M, highest, tallest)
     observed = Observer(view, profile).observe(moved, highest, perception.mounting).observed
     for box in frame.move_boxes(perception.boxes):
-        inside = np.zeros(shape, np.uint8)
-        draw_footprints(inside, [box], view, ("free", box.label))
-        np.fmax(tallest, np.float32(box.size[2]), out=tallest, where=inside > 0)
+        np.fmax(tallest, np.float32(box.size[2]), out=tallest, where=footprints([box], view))
     obstacle = ~np.isnan(tallest)
     drivable, seen = _drivable(top_view, view)
     if perception.points is not None and knows_road(perception.points):
         around = nearest_is_road(moved, perception.points, ground.height_m, view)
-        drivable = np.where(seen, drivable, around & observed)
+        drivable = np.where(seen, drivable, around)
     return OccupancyGrid(
-        drivable=drivable & ~obstacle,
+        drivable=drivable & observed & ~obstacle,  # cells of the top view may be smaller, and observed in part of these
         obstacle=obstacle,
         height_m=tallest,
         observed=observed,

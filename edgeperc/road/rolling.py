@@ -16,7 +16,7 @@ from ..system.clock import LATEST_S, Clock
 from ..tracking import Track
 from ..tracking.moving import MOVABLE, movable_points
 from ..types.frame import ModelFrame
-from ..types.geometry import draw_footprints
+from ..types.geometry import footprints
 from ..types.mounting import MODEL_HEIGHT_M
 from ..types.perception import Perception
 from ..types.points import Bytes, Floats, Mask, as_points
@@ -198,17 +198,16 @@ class RollingGrid:
         """The scan's own cells in which something is that could move."""
         frame = ModelFrame(perception.mounting)
         boxes = [box for box in (*perception.boxes, *(track.box for track in tracks)) if box.label in self._classes]
-        drawn = np.zeros((self._view.height, self._view.width), np.uint8)
         grow = np.array([2.0 * self._margin_m, 2.0 * self._margin_m, 0.0])
         grown = [replace(box, size=tuple((box.size + grow).tolist())) for box in frame.move_boxes(boxes)]
-        draw_footprints(drawn, grown, self._view, ("nothing", *{box.label for box in grown}))
+        movable = footprints(grown, self._view)
         scan = as_points(points)
         mark = movable_points(perception, scan, classes=self._classes, margin_m=self._margin_m)
         moved = frame.move(scan)[mark]
         with np.errstate(over="ignore"):  # sensors that mark what did not return with the largest float
             row, col, in_view = self._view.cells(moved[:, 0], moved[:, 1])
-        drawn[row[in_view], col[in_view]] = 1
-        return drawn.astype(np.bool_)
+        movable[row[in_view], col[in_view]] = True
+        return movable
 
     def _roll(self, x: int, y: int) -> None:
         """Move the window to another corner; what comes into it is unknown."""

@@ -61,10 +61,21 @@ def draw_footprints(labels: Labels, boxes: Iterable[Box], view: TopViewGeometry,
     known = [box for box in boxes if box.label in number]
     known.sort(key=lambda box: -math.hypot(box.center[0], box.center[1]))
     drawn = np.require(labels, np.uint8, ["C", "W"])
-    grid = Grid(float(view.x_range_m[1]), float(view.y_range_m[1]), float(view.cell_m))
-    fill_footprints(box_records(known, [number[box.label] for box in known]), grid, drawn)
+    fill_footprints(box_records(known, [number[box.label] for box in known]), grid_of(view), drawn)
     if drawn is not labels:
         labels[:] = drawn
+
+
+def footprints(boxes: Sequence[Box], view: TopViewGeometry) -> Mask:
+    """Cells of a top view whose centers lie in the footprint of a box, (rows, columns) bool."""
+    drawn = np.zeros((view.height, view.width), np.uint8)
+    fill_footprints(box_records(boxes, [1] * len(boxes)), grid_of(view), drawn)
+    return drawn.view(np.bool_)
+
+
+def grid_of(view: TopViewGeometry) -> Grid:
+    """The cells of a top view as kernels take them."""
+    return Grid(float(view.x_range_m[1]), float(view.y_range_m[1]), float(view.cell_m))
 
 
 def box_records(boxes: Sequence[Box], labels: Sequence[int], margin_m: float = 0.0, above_m: float = 0.0) -> Records:

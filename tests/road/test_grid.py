@@ -72,8 +72,8 @@ def test_a_street_with_a_wall(cell_m: float) -> None:
     assert grid.obstacle[wall]
     assert grid.height_m[wall] == pytest.approx(1.0, abs=0.06)
     assert not grid.drivable[wall]
-    assert grid.unknown[behind]
-    assert grid.unknown[far]
+    assert grid.unknown[behind] & grid.unknown[far]
+    assert not (grid.drivable & grid.unknown).any()
     assert grid.drivable[road]
     assert not grid.drivable[aside]
     assert grid.observed[aside]
