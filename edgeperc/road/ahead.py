@@ -10,18 +10,21 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
 
 from ..errors import OptionError, PointsError
 from ..system.kernels import njit
 from ..types.frame import ModelFrame
-from ..types.geometry import draw_footprints
+from ..types.geometry import footprints
 from ..types.perception import Box, TopView
 from ..types.points import Floats, Ints64, Mask
 from ..types.views import TopViewGeometry
 from .outline import outline_of
+
+if TYPE_CHECKING:
+    from ..tracking import Track
 
 FreeEnd = Literal["obstacle", "edge of the road", "unknown", "end of view"]
 """What ends a free distance."""
@@ -152,7 +155,7 @@ class RoadAhead:
 
 
 def road_ahead(
-    top_view: TopView, boxes: Iterable[Box] = (), *, tolerance_m: float = 0.2, max_corners: int = 40
+    top_view: TopView, boxes: Iterable[Box | Track] = (), *, tolerance_m: float = 0.2, max_corners: int = 40
 ) -> RoadAhead:
     """Measure the road in a top view: polygon, free distance and lane width.
 
@@ -160,9 +163,9 @@ def road_ahead(
     ----------
     top_view : TopView
         Cells that the scan did not observe are not free, whatever their label.
-    boxes : iterable of Box
+    boxes : iterable of Box or Track
         Obstacles that are not road, such as `Perception.boxes`, in the frame of the scan: the top view has no class for
-        pedestrians.
+        pedestrians. Of a track, its ``box``.
     tolerance_m : float
         Largest distance of the polygon from the edges of the cells [m], in both directions; 0 keeps all corners. Gaps
         in the road narrower than twice the tolerance are closed, and road that is connected only over a narrower
@@ -187,7 +190,7 @@ def road_ahead(
     Examples
     --------
     >>> found = perceive(points)                            # doctest: +SKIP
-    >>> road = road_ahead(found.top_view, found.boxes)      # doctest: +SKIP
+    >>> road = road_ahead(found.require_top_view(), found.boxes)       # doctest: +SKIP
     >>> road.free_ahead_m(), road.lane_width_m              # doctest: +SKIP
     (31.4, 3.1)
     """
@@ -195,7 +198,7 @@ def road_ahead(
         raise PointsError(f"tolerance_m is {tolerance_m}; expected 0 or more meters")
     if not max_corners >= 4:
         raise OptionError(f"max_corners is {max_corners}; expected at least 4")
-    standing = ModelFrame(top_view.mounting).move_boxes(boxes)
+    standing = _standing(top_view, boxes)
     objects = _objects(top_view, standing)
     drivable = np.ascontiguousarray(top_view.drivable & ~objects)
     height, width = drivable.shape
@@ -240,13 +243,13 @@ def road_ahead(
     )
 
 
-def free_ahead(top_view: TopView, boxes: Iterable[Box] = (), *, half_width_m: float = 1.0) -> FreeAhead:
+def free_ahead(top_view: TopView, boxes: Iterable[Box | Track] = (), *, half_width_m: float = 1.0) -> FreeAhead:
     """Measure the free distance ahead, without the rest of `road_ahead`, in a fraction of its time.
 
     Parameters
     ----------
     top_view : TopView
-    boxes : iterable of Box
+    boxes : iterable of Box or Track
         Obstacles, in the frame of the scan, as for `road_ahead`.
     half_width_m : float
         Half the width of the strip around the sensor's axis [m].
@@ -262,12 +265,17 @@ def free_ahead(top_view: TopView, boxes: Iterable[Box] = (), *, half_width_m: fl
 
     Examples
     --------
-    >>> free_ahead(found.top_view, found.boxes)             # doctest: +SKIP
+    >>> free_ahead(found.require_top_view(), found.boxes)       # doctest: +SKIP
     FreeAhead(free_m=31.4, end='obstacle', obstacle_m=31.9, edge_m=31.4, unknown_m=33.0, view_m=46.0)
     """
-    standing = ModelFrame(top_view.mounting).move_boxes(boxes)
+    standing = _standing(top_view, boxes)
     firsts = _first_m(top_view, _objects(top_view, standing), standing)
     return _strip_ahead(_columns_m(top_view), firsts, float(top_view.x_range_m[1]), half_width_m)
+
+
+def _standing(top_view: TopView, boxes: Iterable[Box | Track]) -> tuple[Box, ...]:
+    """Boxes and those of tracks in the frame of the cells."""
+    return ModelFrame(top_view.mounting).move_boxes(each if isinstance(each, Box) else each.box for each in boxes)
 
 
 def _objects(top_view: TopView, standing: Sequence[Box]) -> Mask:
@@ -276,13 +284,7 @@ def _objects(top_view: TopView, standing: Sequence[Box]) -> Mask:
     for k, name in enumerate(top_view.classes):
         if name in ("background", "drivable"):
             objects &= top_view.labels != k
-    return objects | _footprints(standing, top_view.geometry) if standing else objects
-
-
-def _footprints(standing: Sequence[Box], view: TopViewGeometry) -> Mask:
-    drawn = np.zeros((view.height, view.width), np.uint8)
-    draw_footprints(drawn, standing, view, ("free", *{box.label for box in standing}))
-    return drawn > 0
+    return objects | footprints(standing, top_view.geometry) if standing else objects
 
 
 def _columns_m(top_view: TopView) -> Floats:
@@ -308,7 +310,7 @@ def _first_m(top_view: TopView, objects: Mask, standing: Sequence[Box]) -> Float
     if ahead and n_before > 0:
         begin_m = near_m - n_before * top_view.cell_m
         before = TopViewGeometry((begin_m, near_m), top_view.y_range_m, cell_m=top_view.cell_m)
-        blocked = _footprints(ahead, before)[::-1]
+        blocked = footprints(ahead, before)[::-1]
         nearer_m = begin_m + blocked.argmax(axis=0) * top_view.cell_m
         first_m[0] = np.where(blocked.any(axis=0), nearer_m, first_m[0])
     return first_m

@@ -18,7 +18,7 @@ from shapely import Point, Polygon
 import edgeperc
 import twins.ahead
 import twins.outline
-from edgeperc import Box, OptionError, Perceiver, PointsError, TopView, read_points
+from edgeperc import Box, OptionError, Perceiver, PointsError, TopView, Tracker, read_points
 from edgeperc.road.ahead import fill_corridor, fill_first_cells, free_ahead, road_ahead
 from edgeperc.road.outline import resolve_contacts
 from edgeperc.types.frame import ModelFrame
@@ -227,11 +227,11 @@ def test_boxes_are_obstacles_on_the_road() -> None:
 @pytest.mark.parametrize(("x", "free_m"), [(4.0, 3.6), (6.0, 5.6), (0.3, 46.0), (-4.0, 46.0)])
 def test_a_box_before_the_view_ends_the_free_distance(x: float, free_m: float) -> None:
     """One that reaches beside the sensor is not ahead."""
-    pedestrian = Box("pedestrian", 0.9, (x, 0.0, -0.9), (0.8, 0.6, 1.8), 0.0)
+    pedestrian = Box("pedestrian", 0.99, (x, 0.0, -0.9), (0.8, 0.6, 1.8), 0.0)
     for mounting in (MODEL_MOUNTING, Mounting(2.1, 0.0, 0.66, -90.0)):
         top_view = dataclasses.replace(view(~blank()), mounting=mounting)
         boxes = ModelFrame(mounting).boxes_back([pedestrian])
-        ahead, road = free_ahead(top_view, boxes), road_ahead(top_view, boxes)
+        ahead, road = free_ahead(top_view, boxes), road_ahead(top_view, Tracker().update(boxes, 0.0))
         assert ahead.free_m == pytest.approx(free_m, abs=0.051)
         assert ahead.end == ("obstacle" if free_m < 46.0 else "end of view")
         assert road.free_ahead() == ahead
