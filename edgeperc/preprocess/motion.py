@@ -31,6 +31,7 @@ MIN_STEP_M, MIN_WAY_M = 1.0, 5.0  # of a trajectory, until its directions of tra
 FASTEST_MPS = 150.0  # of a trajectory; trains are slower
 UPRIGHT, FORWARD, SAME_WAY = 0.7, 0.7, 0.95  # cosines: z is up, x is ahead; the way keeps its direction in the sensor
 OUTSIDE_S = 0.2  # the motion at the ends of a trajectory holds for two scans of 10 Hz
+LONGEST_GAP_S = 2.0  # between poses of a moving sensor: whoever stands still may write none
 
 
 @dataclass(frozen=True, slots=True)
@@ -249,7 +250,8 @@ class Trajectory:
         Raises
         ------
         StampError
-            The times are not finite, or more than 0.2 s outside those of the poses.
+            The times are not finite, or more than 0.2 s outside those of the poses; or the poses around them are more
+            than 2 s and 1 m apart.
         """
         begin, end = float(self.times_s[0]), float(self.times_s[-1])
         if not begin - OUTSIDE_S <= first_s <= last_s <= end + OUTSIDE_S:
@@ -259,12 +261,15 @@ class Trajectory:
             )
         before = int(np.clip(np.searchsorted(self.times_s, first_s, "right") - 1, 0, len(self.times_s) - 2))
         after = int(np.clip(np.searchsorted(self.times_s, last_s, "left"), before + 1, len(self.times_s) - 1))
-        return Motion.between(
-            self.T_world_sensor[before],
-            float(self.times_s[before]),
-            self.T_world_sensor[after],
-            float(self.times_s[after]),
-        )
+        times_s, poses = self.times_s[before : after + 1], self.T_world_sensor[before : after + 1]
+        for k in np.flatnonzero(np.diff(times_s) > LONGEST_GAP_S):
+            if math.dist(poses[k, :3, 3], poses[k + 1, :3, 3]) > MIN_STEP_M:
+                raise StampError(
+                    f"there is no pose from {times_s[k]:.3f} to {times_s[k + 1]:.3f} s, and the sensor moved: its "
+                    f"motion in the scan of {first_s:.3f}..{last_s:.3f} s is not known; expected poses at most "
+                    f"{LONGEST_GAP_S:g} s apart, or leave the scan as it is"
+                )
+        return Motion.between(poses[0], float(times_s[0]), poses[-1], float(times_s[-1]))
 
 
 def deskew(

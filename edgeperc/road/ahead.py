@@ -50,7 +50,8 @@ class FreeAhead(NamedTuple):
     Attributes
     ----------
     free_m : float
-        Up to which the road is free: the least of the four distances below. NaN if the view has no column there.
+        Up to which the road is free: the least of the four distances below. NaN if the view has no column there. Nearer
+        than the view (6 m) only boxes end it: a wall there is not seen (`edgeperc.occupancy_grid` shows it).
     end : str or None
         What ends it: ``"obstacle"``, ``"edge of the road"``, ``"unknown"`` or ``"end of view"``. It is an obstacle,
         too, if one begins at most 1.5 m farther. None if the view has no column there.

@@ -169,6 +169,10 @@ def test_the_poses_around_a_scan_count() -> None:
     drive = Trajectory(np.arange(4.0), poses)
     assert [drive.motion(t, t + 0.1).velocity_mps[0] for t in (0.2, 1.0, 1.5, 1.9, 2.0)] == [0, 10, 10, 10, 0]
     assert drive.motion(0.95, 1.05).velocity_mps[0] == pytest.approx(5.0)
+    gaps = Trajectory(np.arange(4.0) * 3.0, poses)  # no pose for 3 s
+    assert gaps.motion(1.0, 1.1).velocity_mps[0] == 0.0
+    with pytest.raises(StampError, match=r"no pose from 3\.000 to 6\.000 s, and the sensor moved"):
+        gaps.motion(4.0, 4.1)
 
 
 @pytest.mark.parametrize(
