@@ -128,8 +128,8 @@ class RoadAhead:
     @property
     def free_end(self) -> tuple[FreeEnd, ...]:
         """What ends each column's free distance, as in `FreeAhead`."""
-        firsts = np.stack([self.obstacle_m, self.edge_m, self.unknown_m])
-        return tuple(_end_of(first, self.view_m) for first in firsts.T)
+        firsts = zip(self.obstacle_m.tolist(), self.edge_m.tolist(), self.unknown_m.tolist(), strict=True)
+        return tuple(_end_of((*first, self.view_m)) for first in firsts)
 
     @property
     def width_m(self) -> Floats:
@@ -324,14 +324,12 @@ def _strip_ahead(y_m: Floats, firsts: Floats, view_m: float, half_width_m: float
     near = np.abs(y_m) <= half_width_m
     if not near.any():
         return FreeAhead(math.nan, None, math.inf, math.inf, math.inf, view_m)
-    first = firsts[:, near].min(axis=1)
-    obstacle_m, edge_m, unknown_m = first.tolist()
-    return FreeAhead(min(*first.tolist(), view_m), _end_of(first, view_m), obstacle_m, edge_m, unknown_m, view_m)
+    distances = (*firsts[:, near].min(axis=1).tolist(), view_m)
+    return FreeAhead(min(distances), _end_of(distances), *distances)
 
 
-def _end_of(first: Floats, view_m: float) -> FreeEnd:
+def _end_of(distances: tuple[float, ...]) -> FreeEnd:
     """Which of the first obstacle, edge and unknown cell, or the far edge of the view, ends the free distance."""
-    distances = [*first.tolist(), view_m]
     least = min(distances)
     return "obstacle" if distances[0] <= least + BEFORE_OBSTACLE_M else FREE_ENDS[distances.index(least)]
 

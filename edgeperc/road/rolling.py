@@ -93,9 +93,8 @@ class RollingGrid:
         n = round(size_m / cell_m)
         # A scan's own cells lie around the sensor, turned; in their square, the window fits however it is turned.
         reach_m = (math.ceil(n * math.sqrt(0.5)) + 1) * self._cell_m
-        self._reach = (-reach_m, reach_m)
         try:
-            self._view = TopViewGeometry(self._reach, self._reach, cell_m=self._cell_m)
+            self._view = TopViewGeometry((-reach_m, reach_m), (-reach_m, reach_m), cell_m=self._cell_m)
         except CardError as exc:
             raise OptionError(f"got size_m={size_m} and cell_m={cell_m}: no grid ({exc})") from exc
         self._kind = np.zeros((n, n), np.uint8)
@@ -107,7 +106,6 @@ class RollingGrid:
         """Forget everything."""
         self._clock, self._z_m = Clock(), 0.0
         self._corner = (0, 0)  # cells from the odometry's origin to the window's corner with the lowest x and y
-        self._stamp_s: float | None = None
         self._forget(np.ones(self._kind.shape, np.bool_))
 
     def _forget(self, where: Mask) -> None:
@@ -116,7 +114,7 @@ class RollingGrid:
     @property
     def stamp_s(self) -> float | None:
         """Time of the newest scan [s]; None before the first."""
-        return self._stamp_s
+        return self._clock.last_s
 
     @property
     def origin_m(self) -> tuple[float, float]:
@@ -169,15 +167,15 @@ class RollingGrid:
             perception,
             points,
             cell_m=self._cell_m,
-            x_range_m=self._reach,
-            y_range_m=self._reach,
+            x_range_m=self._view.x_range_m,
+            y_range_m=self._view.y_range_m,
             min_height_m=self._min_height_m,
             sensor=sensor,
         )
         kinds, movable = self._kinds_of(grid, perception), self._movable(perception, points, tracks)
         if step != "next":
             self.reset()
-        self._clock, self._stamp_s, self._z_m = clock, stamp_s, z_m
+        self._clock, self._z_m = clock, z_m
         n = len(self._kind)
         self._roll(*(math.floor(along / self._cell_m) - n // 2 for along in pose[:2, 3]))
         self._forget(self._fleeting | (self._seen_s < stamp_s - self._remember_s))
@@ -280,7 +278,7 @@ class RollingGrid:
         ndarray
             In the order of `values`.
         """
-        return (0.0 if self._stamp_s is None else self._stamp_s) - self._seen_s
+        return (self.stamp_s or 0.0) - self._seen_s
 
     def to_occupancy_grid(
         self, frame_id: str = "odom", off_road: int = OCCUPIED, unjudged: int = FREE
@@ -306,7 +304,7 @@ class RollingGrid:
             A value is out of its range.
         """
         corner_m = (*self.origin_m, self._z_m)
-        return grid_message(self.values(off_road, unjudged), self._cell_m, self._stamp_s, frame_id, corner_m)
+        return grid_message(self.values(off_road, unjudged), self._cell_m, self.stamp_s, frame_id, corner_m)
 
 
 def _road_in(pose: Floats, perception: Perception) -> tuple[Floats, float]:

@@ -17,8 +17,8 @@ from ..system.kernels import njit
 from ..types.perception import Box
 from ..types.points import Floats, Mask, read_only
 from . import Track, Tracks
+from .tracker import FARTHEST_M
 
-FARTHEST_M = 1e8
 FORGET_S = 10.0
 """The last place of a track is kept for so long after its last report: a track that is hidden returns with its id."""
 
