@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..errors import EdgepercError, OptionError, PointsError, SensorError, StampError, TrackingError
+from ..system.fields import Fields
 from ..system.kernels import njit
 from ..types.frame import fill_moved, poses_of
 from ..types.mounting import UNKNOWN_MOUNTING, Mounting
@@ -22,6 +23,7 @@ from ..types.rigid import rigid
 from ..types.sensor import MAX_ACCUMULATE_S
 from .returns import blank_too_near
 
+_OPTIONS = Fields("the motion", OptionError)
 MAX_RATE = 1e4  # of m/s and rad/s
 MAX_TURN = 3.1  # rad; the axis of half a turn has no sign
 MAX_BYTES = 1 << 28  # of a file of poses; a line has about 100
@@ -56,14 +58,7 @@ class Motion:
 
     def __post_init__(self) -> None:
         for name in ("velocity_mps", "rate_radps"):
-            given = getattr(self, name)
-            try:
-                x, y, z = (float(value) for value in given)
-            except (OverflowError, TypeError, ValueError) as exc:
-                raise OptionError(f"{name} is {given!r:.200}; expected three numbers") from exc
-            if not all(abs(value) <= MAX_RATE for value in (x, y, z)):
-                raise OptionError(f"{name} is {(x, y, z)}; expected three numbers up to {MAX_RATE:g}")
-            object.__setattr__(self, name, (x, y, z))
+            object.__setattr__(self, name, _OPTIONS.numbers(name, getattr(self, name), 3, -MAX_RATE, MAX_RATE))
 
     @classmethod
     def between(cls, T_world_first: ArrayLike, first_s: float, T_world_second: ArrayLike, second_s: float) -> Motion:
@@ -265,9 +260,8 @@ class Trajectory:
         for k in np.flatnonzero(np.diff(times_s) > LONGEST_GAP_S):
             if math.dist(poses[k, :3, 3], poses[k + 1, :3, 3]) > MIN_STEP_M:
                 raise StampError(
-                    f"there is no pose from {times_s[k]:.3f} to {times_s[k + 1]:.3f} s, and the sensor moved: its "
-                    f"motion in the scan of {first_s:.3f}..{last_s:.3f} s is not known; expected poses at most "
-                    f"{LONGEST_GAP_S:g} s apart, or leave the scan as it is"
+                    f"there is no pose from {times_s[k]:.3f} to {times_s[k + 1]:.3f} s, and the sensor moved; expected "
+                    f"poses at most {LONGEST_GAP_S:g} s apart around the scan of {first_s:.3f}..{last_s:.3f} s"
                 )
         return Motion.between(poses[0], float(times_s[0]), poses[-1], float(times_s[-1]))
 
@@ -314,7 +308,7 @@ def deskew(
     the exponential of both times the time from ``at_s``. Objects that move themselves stay distorted.
     """
     rows = as_points(points)
-    seen = blank_too_near(rows, _meters(min_range_m))
+    seen = blank_too_near(rows, _OPTIONS.number("min_range_m", min_range_m, 0.0))
     try:
         moments: Floats = np.array(times, np.float64)
     except (OverflowError, TypeError, ValueError) as exc:
@@ -388,19 +382,10 @@ def merge(
     for k, (scan, given, range_m) in enumerate(zip(rows, T_vehicle_sensor, ranges_m, strict=True)):
         pose = rigid(f"T_vehicle_sensor[{k}]", given, SensorError)
         R, t = np.ascontiguousarray(pose[:3, :3]), pose[:3, 3].copy()
-        fill_moved(blank_too_near(scan, _meters(range_m)), R, t, merged[begin : begin + len(scan)])
+        seen = blank_too_near(scan, _OPTIONS.number("min_range_m", range_m, 0.0))
+        fill_moved(seen, R, t, merged[begin : begin + len(scan)])
         begin += len(scan)
     return merged
-
-
-def _meters(min_range_m: float) -> float:
-    try:
-        meters = float(min_range_m)
-    except (OverflowError, TypeError, ValueError):
-        meters = math.nan
-    if not 0.0 <= meters < math.inf:
-        raise OptionError(f"min_range_m is {min_range_m!r:.80}; expected meters from 0")
-    return meters
 
 
 def _rows(content: bytes) -> Floats:

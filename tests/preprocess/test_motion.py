@@ -117,7 +117,7 @@ def test_errors_name_the_reason() -> None:
     with pytest.raises(OptionError, match="expected a Motion"):
         deskew(world, times, (1, 0, 0))  # type: ignore[arg-type]
     for velocity in ((1, 2), "abc", (math.nan, 0, 0), (1e5, 0, 0), None):
-        with pytest.raises(OptionError, match=r"velocity_mps is .*expected three numbers"):
+        with pytest.raises(OptionError, match=r"velocity_mps.* is .*expected a .*number"):
             Motion(velocity)  # type: ignore[arg-type]
     with pytest.raises(dataclasses.FrozenInstanceError):
         still.velocity_mps = (1, 0, 0)  # type: ignore[misc]
