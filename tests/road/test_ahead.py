@@ -15,7 +15,6 @@ from hypothesis.extra import numpy as npst
 from numpy.typing import NDArray
 from shapely import Point, Polygon
 
-import edgeperc
 import twins.ahead
 import twins.outline
 from edgeperc import Box, OptionError, Perceiver, PointsError, TopView, Tracker, read_points
@@ -317,4 +316,3 @@ def test_results_are_immutable_and_errors_name_the_reason() -> None:
             free_ahead(view(blank()), half_width_m=half_width_m)
     with pytest.raises(OptionError, match="max_corners is 3; expected at least 4"):
         road_ahead(view(blank()), max_corners=3)
-    assert edgeperc.road_ahead is road_ahead

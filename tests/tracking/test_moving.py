@@ -14,7 +14,6 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 from numpy.typing import NDArray
 
-import edgeperc
 import twins.moving
 from edgeperc import Box, OptionError, Perception, PointLabels, PointsError, Tracker, Tracks
 from edgeperc.tracking.moving import mark_in_boxes, movable_points, moving_points, moving_tracks
@@ -124,5 +123,3 @@ def test_errors_name_the_reason() -> None:
         moving_points(tracks, np.zeros((3, 2)))
     with pytest.raises(PointsError, match="3 points and a perception of 4"):
         movable_points(perceived(4), points)
-    assert edgeperc.moving_points is moving_points
-    assert edgeperc.movable_points is movable_points

@@ -14,7 +14,6 @@ from hypothesis.extra import numpy as npst
 from numpy.typing import NDArray
 from shapely import Point, Polygon
 
-import edgeperc
 import twins.motion
 from edgeperc import Line, OptionError, PointsError, Tracker, Tracks, Zone
 from edgeperc.tracking.zones import mark_inside
@@ -116,23 +115,22 @@ def test_a_track_counts_once_for_each_direction() -> None:
 
 @pytest.mark.filterwarnings("ignore:got a scan at")
 @pytest.mark.parametrize(
-    ("wrong", "n_left"),
+    "wrong",
     [
-        (lambda k: 0.1 * k, 1),
-        (lambda k: 0.1 * (k - (k % 3 == 0)), 1),  # doubled
-        (lambda k: 1e9 if k % 7 == 3 else 0.1 * k, 1),  # wrong stamps of single scans
-        (lambda k: -5.0 if k % 7 == 3 else 0.1 * k, 1),
-        (lambda k: 0.1 * k - 50.0 * (k >= 5), 1),  # a jump before the line
-        (lambda k: 0.1 * k - 50.0 * (k >= 25), 1),  # and after it
+        lambda k: 0.1 * k,
+        lambda k: 0.1 * (k - (k % 3 == 0)),  # doubled
+        lambda k: 1e9 if k % 7 == 3 else 0.1 * k,  # wrong stamps of single scans
+        lambda k: -5.0 if k % 7 == 3 else 0.1 * k,
+        lambda k: 0.1 * k - 50.0 * (k >= 5),  # a jump before the line
+        lambda k: 0.1 * k - 50.0 * (k >= 25),  # and after it
     ],
 )
-def test_jumps_of_the_clock_count_no_track_twice(wrong: Any, n_left: int) -> None:
+def test_jumps_of_the_clock_count_no_track_twice(wrong: Any) -> None:
     tracker, line = Tracker(), Line((20, -10), (20, 10))
     crossings = []
     for k in range(30):
         crossings += line.count(tracker.update([car(30.0 - 0.8 * k, 0.0)], wrong(k), np.eye(4)))
-    assert (line.to_left, line.to_right, len(crossings)) == (n_left, 0, n_left)
-    assert len({crossing.id for crossing in crossings}) == n_left
+    assert (line.to_left, line.to_right, len(crossings)) == (1, 0, 1)
 
 
 @pytest.mark.filterwarnings("ignore:got a scan at")
@@ -167,4 +165,3 @@ def test_errors_name_the_reason() -> None:
     for margin_m in (-1.0, math.nan):
         with pytest.raises(OptionError, match="margin_m"):
             Line((0, 0), (1, 0), margin_m=margin_m)
-    assert edgeperc.Zone is Zone
