@@ -40,6 +40,8 @@ and 3 % in the next half meter.
 USUAL_LANE_M = 3.25
 """Lanes of towns and country roads are 2.75 to 3.75 m wide. A road is divided into lanes nearest to this width."""
 LANE_RANGE_M = 20.0
+OWN_PLACE = TopViewGeometry((-0.1, 0.0), (-1.0, 1.0), cell_m=0.1)
+"""Across the vehicle at its sensor; a truck that cuts in from the next lane has only its front before it."""
 BESIDE_M = 2.0
 """The corridor must begin within this distance of the sensor's axis."""
 
@@ -296,7 +298,7 @@ def _columns_m(top_view: TopView) -> Floats:
 
 def _first_m(top_view: TopView, objects: Mask, standing: Sequence[Box]) -> Floats:
     """x of each column's first obstacle, edge and unknown cell, (3, columns) [m]; infinite without one. A box between
-    the sensor and the view is an obstacle, too, but not one that reaches beside the sensor: it is no road user ahead.
+    the sensor and the view is an obstacle, too, but not one in `OWN_PLACE`: it is no road user ahead.
     """
     known, road = top_view.observed, top_view.road
     if top_view.between_beams is not None:
@@ -307,7 +309,7 @@ def _first_m(top_view: TopView, objects: Mask, standing: Sequence[Box]) -> Float
     first_m = np.where(firsts == len(objects), math.inf, near_m + firsts * top_view.cell_m)
     n_before = math.floor(near_m / top_view.cell_m)
     near = [box for box in standing if 0.0 < box.center[0] < near_m + 0.5 * math.hypot(box.size[0], box.size[1])]
-    ahead = [box for box in near if box.corners()[:, 0].min() > 0.0]
+    ahead = [box for box in near if not footprints([box], OWN_PLACE).any()]
     if ahead and n_before > 0:
         begin_m = near_m - n_before * top_view.cell_m
         before = TopViewGeometry((begin_m, near_m), top_view.y_range_m, cell_m=top_view.cell_m)
