@@ -308,7 +308,7 @@ def _first_m(top_view: TopView, objects: Mask, standing: Sequence[Box]) -> Float
     near_m = top_view.geometry.corner_m[0]
     first_m = np.where(firsts == len(objects), math.inf, near_m + firsts * top_view.cell_m)
     n_before = math.floor(near_m / top_view.cell_m)
-    near = [box for box in standing if 0.0 < box.center[0] < near_m + 0.5 * math.hypot(box.size[0], box.size[1])]
+    near = [box for box in standing if abs(2.0 * box.center[0] - near_m) < near_m + math.hypot(*box.size[:2])]
     ahead = [box for box in near if not footprints([box], OWN_PLACE).any()]
     if ahead and n_before > 0:
         begin_m = near_m - n_before * top_view.cell_m

@@ -237,9 +237,9 @@ def test_a_box_before_the_view_ends_the_free_distance(x: float, free_m: float) -
         assert (road.free_m[np.abs(road.y_m) > 0.4] == 46.0).all()
 
 
-@pytest.mark.parametrize(("yaw_deg", "free_m"), [(0.0, 46.0), (-12.0, 3.75)])
-def test_a_truck_that_cuts_in_ends_the_free_distance(yaw_deg: float, free_m: float) -> None:
-    truck = Box("truck", 0.9, (2.0, 2.6, -0.2), (12.0, 2.5, 3.0), math.radians(yaw_deg))
+@pytest.mark.parametrize(("x", "yaw_deg", "free_m"), [(2.0, 0.0, 46.0), (2.0, -12.0, 3.75), (-0.5, -20.0, 0.38)])
+def test_a_truck_that_cuts_in_ends_the_free_distance(x: float, yaw_deg: float, free_m: float) -> None:
+    truck = Box("truck", 0.9, (x, 2.6, -0.2), (12.0, 2.5, 3.0), math.radians(yaw_deg))
     assert free_ahead(view(~blank()), [truck]).free_m == pytest.approx(free_m, abs=0.1)
 
 
