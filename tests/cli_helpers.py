@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import argparse
 import functools
+import json
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -102,3 +104,29 @@ def usage_code(*arguments: object) -> int:
         run(*arguments)
     assert isinstance(left.value.code, int)
     return left.value.code
+
+
+class Shell:
+    """Command lines of a program: each ends with the code that is expected, and gives what was printed."""
+
+    def __init__(self, capsys: pytest.CaptureFixture[str], main: Any = cli.main) -> None:
+        self._capsys, self._main = capsys, main
+
+    def both(self, *arguments: object, code: int = 0) -> Any:
+        """What was printed since the last command, ``out`` and ``err``."""
+        try:
+            ended = self._main([str(a) for a in arguments])
+        except SystemExit as left:  # of argparse
+            ended = left.code
+        assert ended == code, arguments
+        return self._capsys.readouterr()
+
+    def out(self, *arguments: object, code: int = 0) -> str:
+        return self.both(*arguments, code=code).out
+
+    def err(self, *arguments: object, code: int = 2) -> str:
+        return self.both(*arguments, code=code).err
+
+    def records(self, command: str, *arguments: object, code: int = 0) -> list[dict[str, Any]]:
+        """The lines of ``--json``."""
+        return [json.loads(line) for line in self.out(command, "--json", *arguments, code=code).splitlines()]

@@ -228,6 +228,14 @@ def psutil() -> None:
     pytest.importorskip("psutil")
 
 
+@pytest.fixture
+def shell(capsys: pytest.CaptureFixture[str]) -> Any:
+    """The command line of edgeperc; `tests/export` and `tests/bench` have those of their programs."""
+    from cli_helpers import Shell
+
+    return Shell(capsys)
+
+
 @pytest.fixture(scope="session")
 def data_root() -> Callable[[str], Path]:
     """A function from the name of a group of real data to the folder that holds it unpacked.

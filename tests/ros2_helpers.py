@@ -18,8 +18,6 @@ from edgeperc.simulation.scene import simulate
 from edgeperc.types.sensor import get_sensor
 from waiting import TIMEOUT_S, until
 
-__all__ = ["FIELDS", "MESSAGES", "Perceive", "cloud", "odometry", "publish", "scans", "street", "street_kinds"]
-
 MESSAGES = RosMessages()
 FIELDS = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", "<f4")]
 

@@ -15,8 +15,6 @@ from edgeperc.inference.session import golden_input
 from edgeperc.types.card import Golden, InputSpec, ModelCard, OutputSpec
 from edgeperc.types.views import CameraGeometry
 
-__all__ = ["CLASSES", "PNG", "camera_card", "camera_model", "png_chunk", "png_file", "write_camera"]
-
 CLASSES = ("Sky", "Road", "Tree")
 # A pixel is road if it is red, a tree if it is green, sky if it is blue.
 WEIGHTS = np.array([[-1.0, -1.0, 2.0], [2.0, -1.0, -1.0], [-1.0, 2.0, -1.0]], np.float32)

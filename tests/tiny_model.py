@@ -10,24 +10,6 @@ from edgeperc.inference.session import golden_input
 from edgeperc.types.card import CARD_KEY, Golden, InputSpec, ModelCard, OutputSpec
 from edgeperc.types.views import TopViewGeometry
 
-__all__ = [
-    "CONVOLUTION",
-    "INITIALIZER",
-    "SHAPE",
-    "WEIGHTS",
-    "entry",
-    "field",
-    "graph",
-    "integers",
-    "model",
-    "node",
-    "number",
-    "shaped",
-    "tensor",
-    "tiny_card",
-    "varint",
-]
-
 SHAPE = (1, 2, 16, 16)
 WEIGHTS = np.array([[1.0, 2.0], [-1.0, 0.5]], np.float32)
 

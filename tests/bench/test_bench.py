@@ -23,7 +23,7 @@ import numpy as np
 import pytest
 
 import scenes
-from cli_helpers import parsers
+from cli_helpers import Shell, parsers
 from edgeperc import Perceiver
 from edgeperc.errors import ModelFileError, PointsError, ProviderError
 from edgeperc.simulation.samples import simulated_scan
@@ -233,6 +233,11 @@ def test_a_live_table_replaces_itself_on_a_terminal_only() -> None:
 
 
 @pytest.fixture
+def shell(capsys: pytest.CaptureFixture[str]) -> Shell:
+    return Shell(capsys, cli.main)
+
+
+@pytest.fixture
 def reports(tmp_path: Path) -> Any:
     def written(name: str, *medians: float, **changes: Any) -> str:
         write_report(plain(document(*medians, **changes)), tmp_path / name)
@@ -241,28 +246,21 @@ def reports(tmp_path: Path) -> Any:
     return written
 
 
-def test_compare_answers_by_its_exit_code(reports: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_compare_answers_by_its_exit_code(reports: Any, tmp_path: Path, shell: Shell) -> None:
     a = reports("a.json", 20.0, 20.1)
-    for medians, code, word in (
-        ((20.05, 19.95), 0, "no difference"),
-        ((17.0, 17.1), 0, "faster"),
-        ((23.0, 23.1), 1, "slower"),
-        ((23.0,), 2, "--repeats"),
-    ):
-        assert cli.main(["compare", a, reports("b.json", *medians)]) == code
-        assert word in capsys.readouterr().out
-    assert cli.main(["compare", a, reports("other.json", 20.0, 20.1, sha256="t")]) == 2
-    assert "different scans" in capsys.readouterr().err
+    assert "no difference" in shell.out("compare", a, reports("same.json", 20.05, 19.95))
+    assert "faster" in shell.out("compare", a, reports("fast.json", 17.0, 17.1))
+    assert "slower" in shell.out("compare", a, reports("slow.json", 23.0, 23.1), code=1)
+    assert "--repeats" in shell.out("compare", a, reports("once.json", 23.0), code=2)
+    assert "different scans" in shell.err("compare", a, reports("other.json", 20.0, 20.1, sha256="t"))
     other = plain(document(20.0, 20.1))
     other["input"]["sensor"] = "os1-64"
     other["complete"] = False
     write_report(other, tmp_path / "b.json")
-    assert cli.main(["compare", a, str(tmp_path / "b.json")]) == 0
-    said = capsys.readouterr().out
+    said = shell.out("compare", a, tmp_path / "b.json")
     assert "different sensors: A as of hdl-64e, B as of os1-64" in said
     assert "B was interrupted" in said
-    assert cli.main(["compare", a, "nowhere.json"]) == 2
-    assert "nowhere.json" in capsys.readouterr().err
+    assert "nowhere.json" in shell.err("compare", a, "nowhere.json")
 
 
 def test_compare_wants_the_same_setting_or_one_of_each(reports: Any, tmp_path: Path) -> None:
@@ -296,13 +294,8 @@ WRONG = (
         ("--precisions int", "got 'int' (did you mean int8?)"),
     ],
 )
-def test_wrong_options_are_refused_and_name_the_nearest(
-    typed: str, said: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    with pytest.raises(SystemExit) as left:
-        cli.main(typed.split())
-    assert left.value.code == 2
-    message = capsys.readouterr().err
+def test_wrong_options_are_refused_and_name_the_nearest(typed: str, said: str, shell: Shell) -> None:
+    message = shell.err(*typed.split())
     assert message.startswith("edgeperc-bench")
     assert said in message
 

@@ -21,6 +21,7 @@ from hypothesis import strategies as st
 
 import twins.painting
 import twins.returns
+from cli_helpers import Shell
 from edgeperc import (
     Calibration,
     CalibrationError,
@@ -32,7 +33,6 @@ from edgeperc import (
     PointsError,
     SensorError,
     camera_road,
-    cli,
     paint,
     road_ahead,
 )
@@ -152,15 +152,14 @@ def test_points_beside_edges_are_not_judged() -> None:
     np.testing.assert_array_equal(beside_edges(labels), wanted)
 
 
-def test_evaluate_painting(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(["eval-painting", "--sensor", "vlp-16", "--scenes", "1", "--json", str(tmp_path / "out.json")]) == 0
-    assert "1 simulated street;" in (out := capsys.readouterr().out)
+def test_evaluate_painting(tmp_path: Path, shell: Shell) -> None:
+    out = shell.out("eval-painting", "--sensor", "vlp-16", "--scenes", "1", "--json", tmp_path / "out.json")
+    assert "1 simulated street;" in out
     assert out.count("0.9 m") == 2
     figures = json.loads((tmp_path / "out.json").read_text("utf-8"))
     assert figures["vlp-16, 0.3 m"]["points_right"] > 0.99
     assert figures["vlp-16, 0.3 m"]["n_points"] > 500
-    assert cli.main(["eval-painting", "--scenes", "0"]) == 2
-    assert "n_scenes is 0; expected at least 1" in capsys.readouterr().err
+    assert "n_scenes is 0; expected at least 1" in shell.err("eval-painting", "--scenes", "0")
 
 
 def test_a_hidden_point_is_not_painted() -> None:
@@ -392,15 +391,14 @@ def test_draw_painted(tmp_path: Path) -> None:
         draw_painted(found, image.rgb, scan.points, wide)
 
 
-def test_the_demo_with_a_camera(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_demo_with_a_camera(tmp_path: Path, shell: Shell) -> None:
     pytest.importorskip("matplotlib")
     pytest.importorskip("onnxruntime")
     options = ("--out", str(tmp_path / "out"), "--model", "pointseg")
     with pytest.MonkeyPatch.context() as patch:  # the pictures are drawn once
         for name in ("matplotlib", "matplotlib.figure", "matplotlib.backends.backend_agg"):
             patch.setitem(sys.modules, name, None)
-        assert cli.main(["demo", "--camera", *options]) == 0
-    out = capsys.readouterr().out
+        out = shell.out("demo", "--camera", *options)
     assert "not a photograph" in out
     assert "no model of a camera's images ran" in out
     assert "the scene's true classes, not those of a network" in out
@@ -408,8 +406,7 @@ def test_the_demo_with_a_camera(tmp_path: Path, capsys: pytest.CaptureFixture[st
     assert float(re.search(r"(\d+) m2 of the image's road", out)[1]) > 100.0  # type: ignore[index]
     assert {file.name for file in (tmp_path / "out").iterdir()} == {"image.png", "scan.bin", "scene.html"}
     # A network that calls every pixel road, sky or tree.
-    assert cli.main(["demo", "--camera", *options, "--model", str(tiny_camera.write_camera(tmp_path))]) == 0
-    out = capsys.readouterr().out
+    out = shell.out("demo", "--camera", *options, "--model", tiny_camera.write_camera(tmp_path))
     assert re.search(r"camera +\d+ % of the pixels get their true class\n", out)
     assert "the scene's true classes, not those of a network" in out
     assert {file.name for file in (tmp_path / "out").iterdir()} == {
@@ -421,7 +418,7 @@ def test_the_demo_with_a_camera(tmp_path: Path, capsys: pytest.CaptureFixture[st
     }
 
 
-def test_run_draws_an_image_and_its_scan(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_run_draws_an_image_and_its_scan(tmp_path: Path, shell: Shell) -> None:
     pillow = pytest.importorskip("PIL.Image")
     pytest.importorskip("matplotlib")
     pytest.importorskip("onnxruntime")
@@ -436,15 +433,11 @@ def test_run_draws_an_image_and_its_scan(tmp_path: Path, capsys: pytest.CaptureF
     model, out = str(tiny_camera.write_camera(tmp_path)), tmp_path / "out"
     both = [str(tmp_path / "street.png"), "--scan", str(tmp_path / "street.bin"), "--calib", str(calib)]
     options = ["--model", model, "--model", "pointseg", "--on-mismatch", "ignore"]
-    assert cli.main(["run", *both, *options, "--png", "--out", str(out)]) == 0
+    shell.out("run", *both, *options, "--png", "--out", out)
     assert {file.name for file in out.iterdir()} == {"street.png", "street_both.png", "street_scan.png"}
     with pillow.open(out / "street_both.png") as picture:
         assert picture.size[0] == 1600
-    capsys.readouterr()
-    for wrong in ([*both, *options], [both[0], "--calib", str(calib), "--png", "--out", str(out)], both[2:]):
-        with pytest.raises(SystemExit):
-            cli.main(["run", *wrong])
-    assert "--calib needs images with --scan and --png" in capsys.readouterr().err
+    for wrong in ([*both, *options], [both[0], "--calib", calib, "--png", "--out", out], both[2:]):
+        assert "--calib needs images with --scan and --png" in shell.err("run", *wrong)
     calib.write_text("P2: 1 2 3\n")
-    assert cli.main(["run", *both, *options, "--png", "--out", str(out)]) == 2
-    assert "holds no KITTI calibration" in capsys.readouterr().err
+    assert "holds no KITTI calibration" in shell.err("run", *both, *options, "--png", "--out", out)

@@ -23,7 +23,7 @@ from hypothesis import strategies as st
 from test_captures import vlp16_packets, write_pcap
 from test_pcap import as_pcapng, packets_in
 
-from cli_helpers import OBJECTS, POINTSEG, SSADNET, parsers, run, thinned, usage_code, write_scan
+from cli_helpers import OBJECTS, POINTSEG, SSADNET, Shell, parsers, run, thinned, usage_code, write_scan
 from edgeperc import Tracker, __version__, live, zoo
 from edgeperc.cli.evaluation.scans import figure_lines
 from edgeperc.cli.main import build_parser, in_options
@@ -112,23 +112,20 @@ def fake(monkeypatch: pytest.MonkeyPatch) -> type[FakePerceiver]:
     return FakePerceiver
 
 
-def test_scans_may_stand_between_and_after_options(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_scans_may_stand_between_and_after_options(tmp_path: Path, shell: Shell) -> None:
     first, second = write_scan(tmp_path / "a.bin"), write_scan(tmp_path / "b.bin")
-    assert run("run", first, "--json", second, "--threads", 1) == 0
-    assert len(capsys.readouterr().out.splitlines()) == 2
-    assert usage_code("run", first, "--json", tmp_path / "c.bin") == 2
+    assert len(shell.out("run", first, "--json", second, "--threads", 1).splitlines()) == 2
     error = f"edgeperc run: error: unrecognized arguments: {tmp_path / 'c.bin'}"
-    assert capsys.readouterr().err.splitlines() == [error, "See edgeperc run --help"]
+    said = shell.err("run", first, "--json", tmp_path / "c.bin").splitlines()
+    assert said == [error, "See edgeperc run --help"]
 
 
-def test_version_and_usage(capsys: pytest.CaptureFixture[str]) -> None:
-    assert usage_code("--version") == 0
-    assert capsys.readouterr().out == f"edgeperc {__version__}\n"
+def test_version_and_usage(shell: Shell) -> None:
+    assert shell.out("--version") == f"edgeperc {__version__}\n"
     assert usage_code() == 2
     assert usage_code("run") == 2
     assert usage_code("run", "x.bin", "--threads", "0") == 2
-    assert usage_code("run", "\0") == 2
-    assert "1 or more" in capsys.readouterr().err
+    assert "1 or more" in shell.err("run", "\0")
 
 
 @pytest.mark.parametrize("sensor", ["os1-64", "av2", "vod", "lyft"])
@@ -154,20 +151,18 @@ def test_help_imports_nothing_heavy() -> None:
     assert "--on-mismatch" in done.stdout
 
 
-def test_help_of_eval_and_wrong_usage(capsys: pytest.CaptureFixture[str]) -> None:
-    assert usage_code("eval", "--help") == 0
-    assert "95 % intervals over drives" in " ".join(capsys.readouterr().out.split())
+def test_help_of_eval_and_wrong_usage(shell: Shell) -> None:
+    assert "95 % intervals over drives" in " ".join(shell.out("eval", "--help").split())
     assert usage_code("eval") == 2
-    assert usage_code("eval", "simulation:1", "--split", "some") == 2
-    assert "invalid choice: 'some'" in capsys.readouterr().err
+    assert "invalid choice: 'some'" in shell.err("eval", "simulation:1", "--split", "some")
 
 
 def test_eval_needs_matplotlib_for_a_picture_before_any_work(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, shell: Shell, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "matplotlib", None)
-    assert run("eval", "simulation:1", "--worst", tmp_path / "worst.png", "--json", tmp_path / "out" / "a.json") == 2
-    assert "pip install 'edgeperc[view]'" in capsys.readouterr().err
+    written = ("--worst", tmp_path / "worst.png", "--json", tmp_path / "out" / "a.json")
+    assert "pip install 'edgeperc[view]'" in shell.err("eval", "simulation:1", *written)
     assert not (tmp_path / "out").exists()
 
 
@@ -225,13 +220,10 @@ def test_tables_of_figures() -> None:
     assert not any("cyclist" in line for line in words)
 
 
-def test_run_prints_a_line_a_scan(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], fake: type[FakePerceiver]
-) -> None:
+def test_run_prints_a_line_a_scan(tmp_path: Path, shell: Shell, fake: type[FakePerceiver]) -> None:
     scans = [write_scan(tmp_path / f"{k}.bin", n) for k, n in enumerate((40, 1200, 0 + 3))]
     options = ("--sensor", "os1-64", "--provider", "cpu", "--threads", 2, "--on-mismatch", "ignore")
-    assert run("run", *scans, *options) == 0
-    lines = capsys.readouterr().out.splitlines()
+    lines = shell.out("run", *scans, *options).splitlines()
     assert [line.split("  ")[0] for line in lines] == [str(scan) for scan in scans]
     assert "1,200 points" in lines[1]
     assert "21.2 ms" in lines[1]
@@ -249,14 +241,13 @@ def test_run_prints_a_line_a_scan(
     ]
 
 
-def test_json_is_one_object_a_scan_and_nothing_else(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_json_is_one_object_a_scan_and_nothing_else(tmp_path: Path, shell: Shell) -> None:
     good, bad, short = tmp_path / "good.bin", tmp_path / "bad.bin", tmp_path / "short.bin"
     write_scan(good, 5)
     write_scan(bad, 40, first_remission=1.0)
     short.write_bytes(b"123")
     absent = tmp_path / "absent.bin"
-    assert run("run", bad, good, short, absent, "--json") == 1
-    captured = capsys.readouterr()
+    captured = shell.both("run", bad, good, short, absent, "--json", code=1)
     answers = [json.loads(line) for line in captured.out.splitlines()]
     assert [answer["scan"] for answer in answers] == [str(path) for path in (bad, good, short, absent)]
     assert ["error" in answer for answer in answers] == [True, False, True, True]
@@ -315,20 +306,19 @@ def test_json_is_one_object_a_scan_and_nothing_else(tmp_path: Path, capsys: pyte
     ],
 )
 def test_boxes_come_back_in_the_map(
-    words: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    words: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, shell: Shell
 ) -> None:
     monkeypatch.chdir(tmp_path)
     points, origin = simulated_scan(3, thinned("os1-64")).points, np.array([512345.25, 5412345.5, 113.0])
     np.save("scan.npy", np.column_stack([points[:, :3].astype(np.float64) + origin, points[:, 3]]))
-    assert run("run", *words, "--json", "--model", "ssadnet", "--model", "pointseg") == 0
-    answer = json.loads(capsys.readouterr().out)
+    (answer,) = shell.records("run", *words, "--model", "ssadnet", "--model", "pointseg")
     np.testing.assert_allclose(answer["origin_m"], origin, atol=0.05)
     (box,), (placed,) = answer["boxes"], answer["map_boxes"]
     np.testing.assert_allclose(np.subtract(placed["center"], answer["origin_m"]), box["center"], atol=1e-3)
     assert placed["yaw"] == box["yaw"]
 
 
-def test_tracks_are_placed_in_the_map(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_tracks_are_placed_in_the_map(tmp_path: Path, shell: Shell) -> None:
     """The places of the scans are the sensor's motion: a box that stays ahead of it moves as fast as it."""
     origin, files = np.array([512345.25, 5412345.5, 113.0]), []
     drive = simulate_sequence(random_scene(4, "urban"), thinned("vlp-16"), 4, ego_speed_mps=8.0, seed=4)
@@ -336,8 +326,7 @@ def test_tracks_are_placed_in_the_map(tmp_path: Path, capsys: pytest.CaptureFixt
         files.append(tmp_path / f"{k}.npy")
         in_map = scan.points[:, :3].astype(np.float64) @ pose[:3, :3].T + pose[:3, 3] + origin
         np.save(files[-1], np.column_stack([in_map, scan.points[:, 3]]))
-    assert run("run", *files, "--origin", "auto", "--track", "--json", "--model", "ssadnet", "--model", "pointseg") == 0
-    answers = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    answers = shell.records("run", *files, "--origin", "auto", "--track", "--model", "ssadnet", "--model", "pointseg")
     assert [len(answer["tracks"]) for answer in answers] == [0, 1, 1, 1]
     for answer in answers:
         for track, placed in zip(answer["tracks"], answer["map_tracks"], strict=True):
@@ -349,31 +338,26 @@ def test_tracks_are_placed_in_the_map(tmp_path: Path, capsys: pytest.CaptureFixt
 
 
 @pytest.mark.parametrize("origin", [["auto"], ["1", "2", "3"]], ids=" ".join)
-def test_an_origin_is_not_for_recordings(tmp_path: Path, capsys: pytest.CaptureFixture[str], origin: list[str]) -> None:
+def test_an_origin_is_not_for_recordings(tmp_path: Path, shell: Shell, origin: list[str]) -> None:
     pytest.importorskip("velodyne_decoder")
     path = write_pcap(tmp_path / "a.pcap", vlp16_packets(1.5))
-    assert usage_code("run", path, "--origin", *origin) == 2
-    assert f"--origin is for scan files, and {path} is a recording" in capsys.readouterr().err
+    assert f"--origin is for scan files, and {path} is a recording" in shell.err("run", path, "--origin", *origin)
     with pytest.raises(PointsError, match="the origin is that of scan files"):
         next(captures.read_scans(path, origin_m=(1.0, 2.0, 3.0)))
 
 
 @pytest.mark.parametrize("names", [("x", "y", "z", "intensity", "ring"), ("ring", "z", "y", "x", "remission", "time")])
-def test_an_array_of_more_columns_takes_their_names(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], names: tuple[str, ...]
-) -> None:
+def test_an_array_of_more_columns_takes_their_names(tmp_path: Path, shell: Shell, names: tuple[str, ...]) -> None:
     points = read_points(write_scan(tmp_path / "a.bin"))
     columns = {**dict(zip(("x", "y", "z", "remission"), points.T, strict=True)), "intensity": points[:, 3]}
     np.save(tmp_path / "a.npy", np.column_stack([columns.get(name, np.zeros(len(points))) for name in names]))
-    assert run("run", tmp_path / "a.bin", tmp_path / "a.npy", "--json") == 1
-    first, second = map(json.loads, capsys.readouterr().out.splitlines())
+    first, second = shell.records("run", tmp_path / "a.bin", tmp_path / "a.npy", code=1)
     assert "--columns x y z intensity ring" in second["error"]
-    assert run("run", tmp_path / "a.npy", "--json", "--columns", *names) == 0
-    answer = json.loads(capsys.readouterr().out)
+    (answer,) = shell.records("run", tmp_path / "a.npy", "--columns", *names)
     assert answer["point_counts"] == first["point_counts"]
 
 
-def test_a_pcapng_is_read_as_a_pcap(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_pcapng_is_read_as_a_pcap(tmp_path: Path, shell: Shell) -> None:
     pytest.importorskip("velodyne_decoder")
     path = write_pcap(tmp_path / "a.pcap", vlp16_packets(1.2))
     paths = [path, tmp_path / "little.pcapng", tmp_path / "big.pcapng"]
@@ -381,54 +365,45 @@ def test_a_pcapng_is_read_as_a_pcap(tmp_path: Path, capsys: pytest.CaptureFixtur
         each.write_bytes(as_pcapng(packets_in(path.read_bytes()), order, 9))
     answers = []
     for each in paths:
-        assert run("run", each, "--json") == 0
-        answers.append([json.loads(line)["point_counts"] for line in capsys.readouterr().out.splitlines()])
+        answers.append([json.loads(line)["point_counts"] for line in shell.out("run", each, "--json").splitlines()])
     assert answers[0] == answers[1] == answers[2] != []
-    assert run("info", paths[2]) == 0
-    assert "vlp-16" in capsys.readouterr().out
+    assert "vlp-16" in shell.out("info", paths[2])
 
 
-def test_an_origin_that_cannot_be_found_fails_the_scan(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run("run", write_scan(tmp_path / "a.bin"), "--origin", "auto") == 1
-    assert "place of the sensor cannot be told" in capsys.readouterr().err
+def test_an_origin_that_cannot_be_found_fails_the_scan(tmp_path: Path, shell: Shell) -> None:
+    said = shell.err("run", write_scan(tmp_path / "a.bin"), "--origin", "auto", code=1)
+    assert "place of the sensor cannot be told" in said
 
 
-def test_json_of_one_model_says_null_for_the_other(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_json_of_one_model_says_null_for_the_other(tmp_path: Path, shell: Shell) -> None:
     scan = write_scan(tmp_path / "a.bin")
-    assert run("run", scan, "--json", "--model", "pointseg") == 0
-    answer = json.loads(capsys.readouterr().out)
+    (answer,) = shell.records("run", scan, "--model", "pointseg")
     assert answer["drivable_area_m2"] is None
     assert answer["road"] is None
     assert answer["boxes"] == []
-    assert run("run", scan, "--json", "--model", "ssadnet") == 0
-    assert json.loads(capsys.readouterr().out)["point_counts"] is None
+    assert shell.records("run", scan, "--model", "ssadnet")[0]["point_counts"] is None
 
 
-def test_folders_are_opened_and_sorted(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_folders_are_opened_and_sorted(tmp_path: Path, shell: Shell) -> None:
     folder = tmp_path / "scans"
     for name in ("b.bin", "a.BIN", ".hidden.bin", "deeper/c.bin"):
         write_scan(folder / name)
     np.save(folder / "c.npy", np.zeros((3, 4), np.float32))
     (folder / "notes.txt").write_text("no scan")
     (folder / "folder.bin").mkdir()
-    assert run("run", folder, folder / "b.bin", "--json") == 0
-    answers = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    answers = shell.records("run", folder, folder / "b.bin")
     assert [Path(answer["scan"]).name for answer in answers] == ["a.BIN", "b.bin", "c.npy"]
     bare = tmp_path / "bare"
     bare.mkdir()
-    assert run("run", bare, folder / "b.bin", "--json") == 1
-    answers = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    answers = shell.records("run", bare, folder / "b.bin", code=1)
     assert answers[0]["scan"] == str(bare)
     assert "no scan in this folder" in answers[0]["error"]
     assert answers[1]["n_points"] == 40
     (bare / "0.csv").write_text("x,y,z\n1,2,3\n")
-    assert run("run", bare) == 1
-    assert f"pass tables of text by name: {bare}/*.csv" in capsys.readouterr().err
+    assert f"pass tables of text by name: {bare}/*.csv" in shell.err("run", bare, code=1)
 
 
-def test_huge_scans_fail_and_the_others_go_on(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_huge_scans_fail_and_the_others_go_on(tmp_path: Path, shell: Shell, monkeypatch: pytest.MonkeyPatch) -> None:
     def perceive(self: FakePerceiver, points: np.ndarray, stamp_s: float | None = None, **more: Any) -> Perception:
         if len(points) == 41:
             raise MemoryError
@@ -440,8 +415,7 @@ def test_huge_scans_fail_and_the_others_go_on(
         file.truncate(100 << 30)  # sparse
     write_scan(tmp_path / "b.bin", 41)
     write_scan(tmp_path / "c.bin")
-    assert run("run", tmp_path) == 1
-    done, errors = capsys.readouterr()
+    done, errors = shell.both("run", tmp_path, code=1)
     assert "c.bin" in done
     assert "a.bin: 107,374,182,400 bytes are too much for one scan; expected at most 268,435,456" in errors
     assert "b.bin: 41 points take more memory than there is" in errors
@@ -449,15 +423,12 @@ def test_huge_scans_fail_and_the_others_go_on(
 
 @pytest.mark.skipif(os.name == "nt", reason="file names cannot have these characters")
 @pytest.mark.parametrize("command", [("run",), ("run", "--json"), ("info",), ("info", "--json")])
-def test_names_of_files_do_not_reach_the_terminal_raw(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], command: tuple[str, ...]
-) -> None:
+def test_names_of_files_do_not_reach_the_terminal_raw(tmp_path: Path, shell: Shell, command: tuple[str, ...]) -> None:
     good = write_scan(tmp_path / "a\x1b]0;title\x07\n\u202eb.bin")
     bad, capture = tmp_path / "c\x1b[2J\r.bin", tmp_path / "d\x9b1m.pcap"
     bad.write_bytes(b"no scan")
     capture.write_bytes(b"no capture")
-    assert run(*command, good, bad, capture) == 1
-    shown = "".join(capsys.readouterr())
+    shown = "".join(shell.both(*command, good, bad, capture, code=1))
     assert all(name in shown for name in ("\\u001b]0;title", "\\u001b[2J", "1m.pcap"))
     assert all(line.isprintable() for line in shown.split("\n"))
 
@@ -488,11 +459,10 @@ def capture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return path
 
 
-def test_the_scans_of_a_capture_are_numbered(capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_scans_of_a_capture_are_numbered(capture: Path, tmp_path: Path, shell: Shell) -> None:
     scan = write_scan(tmp_path / "in" / "a.bin")
     out = tmp_path / "out"
-    assert run("run", capture, scan, "--json", "--labels", "--out", out, "--topic", "/left") == 1
-    captured = capsys.readouterr()
+    captured = shell.both("run", capture, scan, "--json", "--labels", "--out", out, "--topic", "/left", code=1)
     answers = [json.loads(line) for line in captured.out.splitlines()]
     names = [*(str(capture / f"{k:06d}") for k in range(3)), str(capture), str(scan)]
     assert [answer["scan"] for answer in answers] == names
@@ -503,8 +473,7 @@ def test_the_scans_of_a_capture_are_numbered(capture: Path, tmp_path: Path, caps
     assert "5 scans, 2 failed" in captured.err
     written = {file.relative_to(out).as_posix(): file.stat().st_size // 4 for file in out.rglob("*.label")}
     assert written == {"drive/000000.label": 10, "drive/000002.label": 12, "a.label": 40}
-    assert run("info", capture) == 1  # run refuses its ten points
-    assert "10, of which 0 are not finite" in capsys.readouterr().out
+    assert "10, of which 0 are not finite" in shell.out("info", capture, code=1)  # run refuses its ten points
 
 
 @pytest.mark.filterwarnings("always:got a scan at")
@@ -521,12 +490,7 @@ def test_the_scans_of_a_capture_are_numbered(capture: Path, tmp_path: Path, caps
     ],
 )
 def test_every_scan_is_answered_whatever_the_clock_does(
-    wrong: Callable[[int], float],
-    said: str,
-    live: bool,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
+    wrong: Callable[[int], float], said: str, live: bool, tmp_path: Path, shell: Shell, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = write_pcap(tmp_path / "drive.pcap", vlp16_packets(0.1))
 
@@ -536,8 +500,7 @@ def test_every_scan_is_answered_whatever_the_clock_does(
     for module in ("edgeperc.readers.captures", "edgeperc.live"):
         monkeypatch.setattr(f"{module}.read_scans", read)
     options = ["--live", "--rate", 20] if live else []
-    assert run("run", path, "--track", *options) == 0
-    captured = capsys.readouterr()
+    captured = shell.both("run", path, "--track", *options)
     answers = captured.out.splitlines()
     assert len(answers) == 10 or (live and answers)
     assert all("tracks: " in answer for answer in answers)
@@ -558,22 +521,20 @@ def test_every_scan_is_answered_whatever_the_clock_does(
     ],
 )
 def test_a_missing_or_damaged_reader_is_said_at_once(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, error: str, text: str
+    tmp_path: Path, shell: Shell, monkeypatch: pytest.MonkeyPatch, error: str, text: str
 ) -> None:
     (tmp_path / "frames.osf").write_bytes(bytes(8) + b"OSF#" + bytes(8))
     (tmp_path / "absent").mkdir()
     (tmp_path / "absent" / "ouster.py").write_text(f"raise {error}\n")
     monkeypatch.syspath_prepend(tmp_path / "absent")  # the process that decodes captures has this process's path
-    assert run("run", tmp_path / "frames.osf") == 2
-    assert text in capsys.readouterr().err
+    assert text in shell.err("run", tmp_path / "frames.osf")
 
 
-def test_live(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_live(tmp_path: Path, shell: Shell) -> None:
     folder = tmp_path / "scans"
     for k in range(4):
         write_scan(folder / f"{k}.bin", 10 + k)
-    assert run("run", folder, "--live", "--rate", 1000, "--json") == 0
-    answers = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    answers = shell.records("run", folder, "--live", "--rate", 1000)
     assert [answer["scan"] for answer in answers] == [str(folder / f"{a['n_points'] - 10}.bin") for a in answers]
     assert answers[-1]["n_points"] == 13
     assert answers[-1]["stamp_s"] == pytest.approx(0.003)
@@ -583,8 +544,7 @@ def test_live(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert last["health"] in {"OK", "LATE", "STALE"}
     assert last["age_ms"] >= 0.0
     (folder / "4.bin").write_bytes(b"123")
-    assert run("run", folder, "--live", "--rate", 1000) == 1
-    captured = capsys.readouterr()
+    captured = shell.both("run", folder, "--live", "--rate", 1000, code=1)
     assert "4.bin" in captured.err
     words = captured.out.splitlines()[-1].split("  ")
     assert words[0] == str(folder / "3.bin")
@@ -592,26 +552,24 @@ def test_live(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert words[5] == "13 points"
 
 
-def test_live_goes_on_after_a_scan_that_fails(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_live_goes_on_after_a_scan_that_fails(tmp_path: Path, shell: Shell) -> None:
     write_scan(tmp_path / "a.bin", 10, first_remission=1.0)
-    assert run("run", tmp_path, "--live", "--json") == 1
-    (answer,) = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    (answer,) = shell.records("run", tmp_path, "--live", code=1)
     assert answer == {"scan": str(tmp_path), "error": "pointseg answered with NaN"}
-    assert run("run", tmp_path / "absent", "--live") == 2
-    assert "there is no such file or folder" in capsys.readouterr().err
+    assert "there is no such file or folder" in shell.err("run", tmp_path / "absent", "--live")
 
 
 @pytest.mark.usefixtures("matplotlib")
-def test_files_are_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_files_are_written(tmp_path: Path, shell: Shell) -> None:
     scan = write_scan(tmp_path / "in" / "000123.bin", 40)
     out = tmp_path / "out"
-    assert run("run", scan, "--out", out, "--png", "--html", "--labels", "--ply", "--json") == 0
+    (answer,) = shell.records("run", scan, "--out", out, "--png", "--html", "--labels", "--ply")
     assert sorted(file.name for file in out.iterdir()) == ["000123.html", "000123.label", "000123.ply", "000123.png"]
     np.testing.assert_array_equal(np.fromfile(out / "000123.label", "<u4"), np.arange(40) % 2 * 10)
     assert (out / "000123.png").read_bytes().startswith(b"\x89PNG")
     assert b"element vertex 40\n" in (out / "000123.ply").read_bytes()
     assert "000123.bin" in (out / "000123.html").read_text(encoding="utf-8")
-    assert json.loads(capsys.readouterr().out)["n_points"] == 40
+    assert answer["n_points"] == 40
 
 
 def test_scans_of_one_name_do_not_overwrite_each_other(tmp_path: Path) -> None:
@@ -668,23 +626,21 @@ def test_output_names_never_collide(scans: list[tuple[list[str], str, str]], kee
         assert not name.is_absolute()
 
 
-def test_a_scan_is_never_overwritten(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_scan_is_never_overwritten(tmp_path: Path, shell: Shell) -> None:
     scan = write_scan(tmp_path / "scan.bin")
     ply = tmp_path / "scan.ply"
     assert run("run", scan, "--ply", "--out", tmp_path) == 0
     before = ply.read_bytes()
-    assert usage_code("run", ply, "--ply", "--out", tmp_path) == 2
-    assert "would be overwritten" in capsys.readouterr().err
+    assert "would be overwritten" in shell.err("run", ply, "--ply", "--out", tmp_path)
     assert ply.read_bytes() == before
 
 
 @pytest.mark.skipif(not Path("/proc/self/mem").exists(), reason="needs a file that opens and cannot be read")
-def test_a_scan_that_cannot_be_read_costs_no_other_scan(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_scan_that_cannot_be_read_costs_no_other_scan(tmp_path: Path, shell: Shell) -> None:
     for name in ("a.bin", "c.bin"):
         write_scan(tmp_path / name)
     (tmp_path / "b.bin").symlink_to("/proc/self/mem")
-    assert run("run", tmp_path) == 1
-    out, err = capsys.readouterr()
+    out, err = shell.both("run", tmp_path, code=1)
     assert [Path(line.split()[0]).name for line in out.splitlines()] == ["a.bin", "c.bin"]
     assert f"{tmp_path / 'b.bin'}: the file cannot be read" in err
 
@@ -703,16 +659,13 @@ def test_a_scan_that_fails_takes_its_time(tmp_path: Path, monkeypatch: pytest.Mo
     assert stamps_s[-3:] == pytest.approx([0.1, 0.3, 0.5])  # before them, those of a warm-up
 
 
-def test_nothing_is_written_that_the_next_run_of_the_folder_would_read(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_nothing_is_written_that_the_next_run_of_the_folder_would_read(tmp_path: Path, shell: Shell) -> None:
     """A second run perceived each scan twice: the .bin, and the .ply of the first run."""
     drive = tmp_path / "drive"
     drive.mkdir()
     scan = write_scan(drive / "scan.bin")
     for options in (("--ply", "--out", drive), ("--mcap", drive / "run.mcap")):
-        assert usage_code("run", drive, *options) == 2
-        assert "would be read with the scans of its folder by the next run" in capsys.readouterr().err
+        assert "would be read with the scans of its folder by the next run" in shell.err("run", drive, *options)
     assert [*drive.iterdir()] == [scan]
     assert run("run", drive, "--labels", "--out", drive) == 0
     assert run("run", scan, "--ply", "--out", tmp_path) == 0
@@ -731,7 +684,7 @@ def test_nothing_is_written_that_the_next_run_of_the_folder_would_read(
     ],
 )
 def test_no_file_is_written_twice(
-    options: str, both: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    options: str, both: str, tmp_path: Path, shell: Shell, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     if "--gif" in options:  # an extra is missed before what is written is compared
         pytest.importorskip("PIL")
@@ -739,12 +692,11 @@ def test_no_file_is_written_twice(
     (tmp_path / "out").mkdir()
     (tmp_path / "link").symlink_to(tmp_path / "out")
     write_scan(tmp_path / "0.bin")
-    assert usage_code("run", "0.bin", *options.split()) == 2
-    assert f"{both} both write" in capsys.readouterr().err
+    assert f"{both} both write" in shell.err("run", "0.bin", *options.split())
     assert not [*(tmp_path / "out").iterdir()]
 
 
-def test_wrong_usage(tmp_path: Path, capsys: pytest.CaptureFixture[str], fake: type[FakePerceiver]) -> None:
+def test_wrong_usage(tmp_path: Path, shell: Shell, fake: type[FakePerceiver]) -> None:
     scan = write_scan(tmp_path / "a.bin")
     for arguments, words in [
         (("--png",), "--png needs --out DIR"),
@@ -765,8 +717,7 @@ def test_wrong_usage(tmp_path: Path, capsys: pytest.CaptureFixture[str], fake: t
         (("--poses", scan), "--poses needs --deskew"),
         (("--deskew", "--track", "--live"), "and no --live"),
     ]:
-        assert usage_code("run", scan, *arguments) == 2
-        assert words in capsys.readouterr().err
+        assert words in shell.err("run", scan, *arguments)
     for arguments, words in [
         (("--model", "nonesuch"), "no model is called 'nonesuch'. Shipped: objects, pointseg, ssadnet."),
         (
@@ -775,39 +726,35 @@ def test_wrong_usage(tmp_path: Path, capsys: pytest.CaptureFixture[str], fake: t
         ),
         (("--model", "ssadnet", "--labels", "--out", tmp_path / "out"), "add a range-image model"),
     ]:
-        assert run("run", scan, *arguments) == 2
-        captured = capsys.readouterr()
+        captured = shell.both("run", scan, *arguments, code=2)
         assert captured.out == ""
         assert captured.err.startswith("edgeperc: ")
         assert captured.err.count("\n") == 1
         assert words in captured.err
     assert not (tmp_path / "out").exists()
     (tmp_path / "file").write_text("in the way")
-    assert run("run", scan, "--labels", "--out", tmp_path / "file") == 2
-    assert capsys.readouterr().err.count("\n") == 1
+    assert shell.err("run", scan, "--labels", "--out", tmp_path / "file").count("\n") == 1
 
 
-def test_a_file_that_cannot_be_written_fails_its_scan_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_file_that_cannot_be_written_fails_its_scan_alone(tmp_path: Path, shell: Shell) -> None:
     scans = [write_scan(tmp_path / name) for name in ("a.bin", "b.bin")]
     (tmp_path / "out" / "a.label").mkdir(parents=True)
-    assert run("run", *scans, "--labels", "--out", tmp_path / "out") == 1
-    assert "a.label" in capsys.readouterr().err
+    assert "a.label" in shell.err("run", *scans, "--labels", "--out", tmp_path / "out", code=1)
     assert (tmp_path / "out" / "b.label").stat().st_size == 160
 
 
 def test_missing_matplotlib_is_said_before_any_work(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, fake: type[FakePerceiver]
+    tmp_path: Path, shell: Shell, monkeypatch: pytest.MonkeyPatch, fake: type[FakePerceiver]
 ) -> None:
     monkeypatch.setitem(sys.modules, "matplotlib", None)
-    assert run("run", write_scan(tmp_path / "a.bin"), "--png", "--out", tmp_path / "out") == 2
-    assert "pip install 'edgeperc[view]'" in capsys.readouterr().err
+    scan = write_scan(tmp_path / "a.bin")
+    assert "pip install 'edgeperc[view]'" in shell.err("run", scan, "--png", "--out", tmp_path / "out")
     assert fake.made == []
 
 
-def test_interrupted(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_interrupted(tmp_path: Path, shell: Shell) -> None:
     scans = [write_scan(tmp_path / "a.bin"), write_scan(tmp_path / "b.bin", 40, first_remission=2.0)]
-    assert run("run", *scans, "--json") == 130
-    captured = capsys.readouterr()
+    captured = shell.both("run", *scans, "--json", code=130)
     assert len(captured.out.splitlines()) == 1
     assert captured.err == "edgeperc: interrupted\n"
 
@@ -847,11 +794,10 @@ def test_a_reader_that_goes_away_is_no_accident(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="elsewhere file names are Unicode")
-def test_names_that_are_no_text(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_names_that_are_no_text(tmp_path: Path, shell: Shell) -> None:
     scan = tmp_path / os.fsdecode(b"caf\xe9.bin")
     write_scan(scan)
-    assert run("run", scan) == 0
-    assert "\\udce9.bin" in capsys.readouterr().out
+    assert "\\udce9.bin" in shell.out("run", scan)
     assert run("run", scan, "--html", "--out", tmp_path / "out") == 0
     assert len(list((tmp_path / "out").iterdir())) == 1
 
@@ -884,15 +830,13 @@ def test_no_progress_bar(why: str, monkeypatch: pytest.MonkeyPatch) -> None:
     assert sys.stderr.getvalue() == ""  # type: ignore[attr-defined]
 
 
-def test_run_shows_progress_beside_its_lines(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_run_shows_progress_beside_its_lines(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, shell: Shell) -> None:
     pytest.importorskip("tqdm")
     scans = [write_scan(tmp_path / f"{k}.bin") for k in range(3)]
     monkeypatch.setattr(sys, "stderr", Terminal())
-    assert run("run", *scans) == 0
+    lines = shell.out("run", *scans).splitlines()
     assert "1/3" in sys.stderr.getvalue()  # type: ignore[attr-defined]
-    assert [line.split("  ")[0] for line in capsys.readouterr().out.splitlines()] == [str(scan) for scan in scans]
+    assert [line.split("  ")[0] for line in lines] == [str(scan) for scan in scans]
 
 
 @pytest.fixture
@@ -905,9 +849,8 @@ def fake_street(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("fake_street", "matplotlib")
-def test_demo(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run("demo", "--out", tmp_path / "demo") == 0
-    out = capsys.readouterr().out
+def test_demo(tmp_path: Path, shell: Shell) -> None:
+    out = shell.out("demo", "--out", tmp_path / "demo")
     assert "100 m2 of the 40 x 20 m ahead" in out
     assert "20.2 m away:  20.0 m ahead,  3.0 m right" in out
     assert "heading   17 deg" in out
@@ -920,13 +863,10 @@ def test_demo(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
 
 
 @pytest.mark.usefixtures("fake_street")
-def test_demo_without_matplotlib(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_demo_without_matplotlib(tmp_path: Path, shell: Shell, monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("matplotlib", "matplotlib.figure", "matplotlib.backends.backend_agg"):
         monkeypatch.setitem(sys.modules, name, None)
-    assert run("demo", "--out", tmp_path / "demo", "--model", "ssadnet") == 0
-    out = capsys.readouterr().out
+    out = shell.out("demo", "--out", tmp_path / "demo", "--model", "ssadnet")
     assert "pip install 'edgeperc[view]'" in out
     assert "drivable" in out
     assert sorted(file.name for file in (tmp_path / "demo").iterdir()) == ["scan.bin", "scene.html"]
@@ -957,21 +897,16 @@ def test_the_scans_of_a_data_set(files: list[str], names: list[str], tmp_path: P
     assert written == {f"{name}.label" for name in names}
 
 
-def test_live_replays_the_one_folder_of_a_data_set(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_live_replays_the_one_folder_of_a_data_set(tmp_path: Path, shell: Shell) -> None:
     scan = write_scan(tmp_path / "sequences" / "00" / "velodyne" / "000000.bin")
-    assert run("run", tmp_path, "--live", "--json") == 0
-    assert json.loads(capsys.readouterr().out)["scan"] == str(scan)
+    assert shell.records("run", tmp_path, "--live")[0]["scan"] == str(scan)
     write_scan(tmp_path / "sequences" / "01" / "velodyne" / "000000.bin")
-    assert usage_code("run", tmp_path, "--live") == 2
-    assert "--live replays one folder of scans" in capsys.readouterr().err
+    assert "--live replays one folder of scans" in shell.err("run", tmp_path, "--live")
 
 
-def test_live_names_the_scans_of_a_capture(
-    capture: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_live_names_the_scans_of_a_capture(capture: Path, shell: Shell, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(live, "read_scans", captures.read_scans)
-    assert run("run", capture, "--live", "--json") == 1
-    answers = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    answers = shell.records("run", capture, "--live", code=1)
     named = [answer["scan"] for answer in answers if "error" not in answer]
     assert named
     assert {*named} <= {str(capture / f"{k:06d}") for k in range(3)}
@@ -983,20 +918,18 @@ COMMANDS = (
 )
 
 
-def test_there_is_one_level_of_commands(capsys: pytest.CaptureFixture[str]) -> None:
+def test_there_is_one_level_of_commands(shell: Shell) -> None:
     assert tuple(parsers(build_parser())) == COMMANDS
-    assert usage_code("--help") == 0
-    out = capsys.readouterr().out
+    out = shell.out("--help")
     assert all(f"    {name}" in out for name in COMMANDS)
 
 
 @pytest.mark.parametrize("name", COMMANDS)
 def test_every_help_page_fits_a_terminal_and_explains_every_option(
-    name: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    name: str, shell: Shell, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("COLUMNS", "80")
-    assert usage_code(name, "--help") == 0
-    page = capsys.readouterr().out
+    page = shell.out(name, "--help")
     assert max(map(len, page.splitlines())) <= 80
     assert f"examples:\n  edgeperc {name}" in page
     for action in parsers(build_parser())[name]._actions:
@@ -1029,11 +962,10 @@ def test_the_examples_of_a_help_page_can_be_parsed(name: str) -> None:
         (["run", "a.bin", "--adapt", "remision"], "(did you mean remission?)"),
     ],
 )
-def test_mistyped_words_name_the_nearest(words: list[str], new: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert usage_code(*words) == 2
-    assert new in capsys.readouterr().err
-    assert run("info", "a.bin", "--sensor", "hdl64e") == 2
-    assert "no --sensor 'hdl64e' is built in (did you mean hdl-64e?)" in capsys.readouterr().err
+def test_mistyped_words_name_the_nearest(words: list[str], new: str, shell: Shell) -> None:
+    assert new in shell.err(*words)
+    said = shell.err("info", "a.bin", "--sensor", "hdl64e")
+    assert "no --sensor 'hdl64e' is built in (did you mean hdl-64e?)" in said
 
 
 @pytest.mark.parametrize(
@@ -1088,7 +1020,7 @@ def test_python_m_edgeperc() -> None:
 
 
 def test_the_sensor_of_scan_files_is_found_once_a_folder(
-    tmp_path: Path, fake: type[FakePerceiver], capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, fake: type[FakePerceiver], shell: Shell
 ) -> None:
     """Also of scans that do not tell it themselves; a folder whose scans do not tell fails alone."""
     for name in ("vlp-16", "os1-64"):
@@ -1096,23 +1028,21 @@ def test_the_sensor_of_scan_files_is_found_once_a_folder(
         urban(3, name).points.tofile(tmp_path / name / "0.bin")
         write_scan(tmp_path / name / "1.bin")
     unknown = write_scan(tmp_path / "unknown" / "0.bin", 5000)
-    assert run("run", tmp_path / "vlp-16", tmp_path / "os1-64", unknown) == 1
+    out, err = shell.both("run", tmp_path / "vlp-16", tmp_path / "os1-64", unknown, code=1)
     assert [made.sensor.name for made in fake.made] == ["vlp-16", "os1-64"]
-    out, err = capsys.readouterr()
     assert len(out.splitlines()) == 4
     assert f"{unknown}: the sensor cannot be told" in err
 
 
 @pytest.mark.parametrize("option", [[], ["--sensor", "auto"]])
 def test_files_with_few_points_are_the_defaults_unless_auto_asks(
-    option: list[str], tmp_path: Path, fake: type[FakePerceiver], capsys: pytest.CaptureFixture[str]
+    option: list[str], tmp_path: Path, fake: type[FakePerceiver], shell: Shell
 ) -> None:
-    assert run("run", write_scan(tmp_path / "0.bin"), *option) == len(option) / 2
+    said = shell.err("run", write_scan(tmp_path / "0.bin"), *option, code=len(option) // 2)
     assert [made.sensor for made in fake.made] == ["hdl-64e"][: 1 - len(option) // 2]
-    assert ("no scan has enough points" in capsys.readouterr().err) == bool(option)
+    assert ("no scan has enough points" in said) == bool(option)
 
 
-def test_auto_and_a_mounting_where_no_scan_is_read_first(capsys: pytest.CaptureFixture[str]) -> None:
+def test_auto_and_a_mounting_where_no_scan_is_read_first(shell: Shell) -> None:
     pytest.importorskip("zenoh")
-    assert run("ros2", "--sensor", "auto", "--mount-height", 2) == 2
-    assert "edgeperc info SCAN --write" in capsys.readouterr().err
+    assert "edgeperc info SCAN --write" in shell.err("ros2", "--sensor", "auto", "--mount-height", 2)

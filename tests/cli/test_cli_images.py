@@ -5,13 +5,12 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import tiny_camera
 
-from cli_helpers import run, usage_code, write_scan
+from cli_helpers import Shell, run, write_scan
 
 pillow = pytest.importorskip("PIL.Image")
 
@@ -36,33 +35,27 @@ def write_image(path: Path, color: tuple[int, int, int] = (200, 10, 20), width: 
     return path
 
 
-def records(capsys: pytest.CaptureFixture[str]) -> list[dict[str, Any]]:
-    return [json.loads(line) for line in capsys.readouterr().out.splitlines()]
-
-
-def test_run_prints_a_line_an_image(tmp_path: Path, model: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_run_prints_a_line_an_image(tmp_path: Path, model: Path, shell: Shell) -> None:
     red, green = write_image(tmp_path / "red.png"), write_image(tmp_path / "green.JPG", (10, 200, 20), 64, 48)
-    assert run("run", red, green, "--model", model, *CPU) == 0
-    first, second = capsys.readouterr().out.splitlines()
+    first, second = shell.out("run", red, green, "--model", model, *CPU).splitlines()
     assert first.startswith(f"{red}  40 x 30 pixels: Road 100.0 %  ")
     assert second.startswith(f"{green}  64 x 48 pixels: Tree 100.0 %  ")
     assert first.endswith(" ms")
 
 
-def test_a_folder_of_images_is_sorted(tmp_path: Path, model: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_folder_of_images_is_sorted(tmp_path: Path, model: Path, shell: Shell) -> None:
     for name in "cab":
         write_image(tmp_path / "images" / f"{name}.png")
     (tmp_path / "images" / "notes.txt").write_text("no image")
-    assert run("run", tmp_path / "images", "--model", model, *CPU, "--json") == 0
-    files = [record["image"]["file"] for record in records(capsys)]
+    records = shell.records("run", tmp_path / "images", "--model", model, *CPU)
+    files = [record["image"]["file"] for record in records]
     assert files == [str(tmp_path / "images" / f"{name}.png") for name in "abc"]
 
 
-def test_json_and_picture(tmp_path: Path, model: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_json_and_picture(tmp_path: Path, model: Path, shell: Shell) -> None:
     pytest.importorskip("matplotlib")
     image, out = write_image(tmp_path / "street.png"), tmp_path / "out"
-    assert run("run", image, "--model", model, *CPU, "--json", "--png", "--out", out) == 0
-    (record,) = records(capsys)
+    (record,) = shell.records("run", image, "--model", model, *CPU, "--png", "--out", out)
     counts = {"Sky": 0, "Road": 1200, "Tree": 0}
     seen = {"width": 40, "height": 30, "drivable_share": 1.0, "pixel_counts": counts}
     assert record["image"] == {"file": str(image), **seen}
@@ -72,26 +65,22 @@ def test_json_and_picture(tmp_path: Path, model: Path, capsys: pytest.CaptureFix
         assert picture.size[0] == 1600
 
 
-def test_an_image_with_its_scan(tmp_path: Path, model: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_image_with_its_scan(tmp_path: Path, model: Path, shell: Shell) -> None:
     pytest.importorskip("matplotlib")
     images = [write_image(tmp_path / f"{k}.png") for k in range(2)]
     scans = [write_scan(tmp_path / f"{k}.bin", 40 + k) for k in range(2)]
     options = ("--model", model, "--model", "pointseg", *CPU, "--on-mismatch", "ignore")
     out = tmp_path / "out"
-    assert run("run", *images, "--scan", *scans, *options, "--json", "--labels", "--out", out) == 0
-    first, second = records(capsys)
+    first, second = shell.records("run", *images, "--scan", *scans, *options, "--labels", "--out", out)
     assert (first["scan"], first["image"]["file"], first["n_points"]) == (str(scans[0]), str(images[0]), 40)
     assert (second["n_points"], second["image"]["drivable_share"]) == (41, 1.0)
     assert {file.name for file in out.iterdir()} == {"0.label", "1.label"}
-    assert run("run", images[0], "--scan", scans[0], *options, "--png", "--out", out) == 0
+    line = shell.out("run", images[0], "--scan", scans[0], *options, "--png", "--out", out)
     assert {file.name for file in out.iterdir()} == {"0.label", "1.label", "0.png", "0_scan.png"}
-    line = capsys.readouterr().out
     assert "40 x 30 pixels: Road 100.0 %  40 points" in line
 
 
-def test_what_is_written_of_a_scan_with_its_image_is_of_the_scan(
-    tmp_path: Path, model: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_is_written_of_a_scan_with_its_image_is_of_the_scan(tmp_path: Path, model: Path, shell: Shell) -> None:
     image, scan = write_image(tmp_path / "image_2/0.png"), write_scan(tmp_path / "0.bin")
     before, out = scan.read_bytes(), tmp_path / "out"
     options = ("--model", model, "--model", "pointseg", *CPU, "--on-mismatch", "ignore")
@@ -99,8 +88,8 @@ def test_what_is_written_of_a_scan_with_its_image_is_of_the_scan(
     assert run("run", image, "--scan", scan, *options, "--movable", "--static", out, *labels) == 0
     assert json.loads((out / "labels/0.json").read_text())["path"] == str(scan)
     assert (out / "0.bin").stat().st_size
-    assert run("run", image, "--scan", scan, *options, "--movable", "--static", tmp_path) == 1
-    assert "is the scan itself" in capsys.readouterr().err
+    said = shell.err("run", image, "--scan", scan, *options, "--movable", "--static", tmp_path, code=1)
+    assert "is the scan itself" in said
     assert scan.read_bytes() == before
 
 
@@ -120,11 +109,10 @@ def test_each_image_may_have_its_calibration(tmp_path: Path, model: Path) -> Non
     assert (out / "calib/0.txt").read_text() == calibration
 
 
-def test_an_image_that_fails_leaves_the_others(tmp_path: Path, model: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_image_that_fails_leaves_the_others(tmp_path: Path, model: Path, shell: Shell) -> None:
     bad, good = tmp_path / "bad.jpg", write_image(tmp_path / "good.png")
     bad.write_bytes(b"\xff\xd8\xff")
-    assert run("run", bad, good, tmp_path / "none.png", "--model", model, *CPU, "--json") == 1
-    printed = capsys.readouterr()
+    printed = shell.both("run", bad, good, tmp_path / "none.png", "--model", model, *CPU, "--json", code=1)
     failed, fine, missing = map(json.loads, printed.out.splitlines())
     assert failed["image"] == {"file": str(bad)}
     assert "cannot be read" in failed["error"]
@@ -133,7 +121,7 @@ def test_an_image_that_fails_leaves_the_others(tmp_path: Path, model: Path, caps
     assert "3 images, 2 failed" in printed.err
 
 
-def test_wrong_usage(tmp_path: Path, model: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_wrong_usage(tmp_path: Path, model: Path, shell: Shell) -> None:
     image, scan = write_image(tmp_path / "a.png"), write_scan(tmp_path / "b.bin")
     others = {"a.mp4": b"\0\0\0\x20ftypisom", "a.tif": b"II*\0", "a.las": b"LASF"}
     film, tiff, las = (tmp_path / name for name in others)
@@ -158,8 +146,7 @@ def test_wrong_usage(tmp_path: Path, model: Path, capsys: pytest.CaptureFixture[
         ((image, twin, "--scan", scan, las, "--png", *out, "--model", model), f"would both be {out[1] / 'a_scan.png'}"),
         ((photos, "--png", "--out", photos, "--model", model), "would be read with the images of its folder"),
     ):
-        assert usage_code("run", *arguments) == 2
-        assert said in capsys.readouterr().err
+        assert said in shell.err("run", *arguments)
     for arguments, said in (
         ((image, scan), "b.bin is not an image, and"),
         ((image, "--model", "pointseg"), "images need a camera model; add --model camseg"),
@@ -169,21 +156,18 @@ def test_wrong_usage(tmp_path: Path, model: Path, capsys: pytest.CaptureFixture[
         ((tiff, "--model", model), "a.tif: this is a TIFF image"),
         ((las, "--model", model), "a.las: this is a LAS or LAZ file"),
     ):
-        assert run("run", *arguments, *CPU) == 2
-        assert said in capsys.readouterr().err
+        assert said in shell.err("run", *arguments, *CPU)
     assert not (tmp_path / "out").exists()
 
 
-def test_info_of_images_and_camera_models(tmp_path: Path, model: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_info_of_images_and_camera_models(tmp_path: Path, model: Path, shell: Shell) -> None:
     image = write_image(tmp_path / "a.png")
-    assert run("info", image, model) == 0
-    said = capsys.readouterr().out
+    said = shell.out("info", image, model)
     assert "40 x 30 pixels, upright" in said
     assert "red 200, green 10, blue 20 of 255" in said
     assert "camera: 32 x 24 pixels, images are stretched to it" in said
     assert "a class for every pixel of a camera's image (3 classes)" in said
-    assert run("info", image, "--json") == 0
-    assert records(capsys)[0]["width"] == 40
+    assert shell.records("info", image)[0]["width"] == 40
     assert run("info", tmp_path / "none.jpg") == 1
 
 

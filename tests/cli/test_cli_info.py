@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cli_helpers import POINTSEG, SSADNET, networks_opened_once, run, thinned, usage_code, write_scan
+from cli_helpers import POINTSEG, SSADNET, Shell, networks_opened_once, run, thinned, write_scan
 from edgeperc import zoo
 from edgeperc.errors import ModelFileError
 from edgeperc.inference import listing, providers
@@ -71,9 +71,8 @@ def rows_of(text: str) -> dict[str, str]:
 
 @pytest.mark.usefixtures("fake_models")
 @pytest.mark.parametrize("thing", ["pointseg", "pointseg.onnx"])
-def test_info_of_a_model(thing: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run("info", thing if thing == "pointseg" else tmp_path / thing) == 0
-    rows = rows_of(capsys.readouterr().out)
+def test_info_of_a_model(thing: str, tmp_path: Path, shell: Shell) -> None:
+    rows = rows_of(shell.out("info", thing if thing == "pointseg" else tmp_path / thing))
     assert rows["model"] == "pointseg 1.2.3: a class for every point (car, pedestrian, cyclist)"
     assert rows["variants"] == "fp32 2.5 MB, int8 0.7 MB"
     assert rows["sha256"] == hashlib.sha256(bytes(2_500_000)).hexdigest()
@@ -89,27 +88,23 @@ def test_info_of_a_model(thing: str, tmp_path: Path, capsys: pytest.CaptureFixtu
 
 
 @pytest.mark.parametrize("name", zoo.shipped_models())
-def test_info_of_a_shipped_model_fits_a_screen(name: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run("info", name) == 0
-    lines = capsys.readouterr().out.splitlines()
+def test_info_of_a_shipped_model_fits_a_screen(name: str, shell: Shell) -> None:
+    lines = shell.out("info", name).splitlines()
     assert 8 < len(lines) <= 24
     assert max(map(len, lines)) <= 100
 
 
-def test_info_folds_what_is_long(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_info_folds_what_is_long(tmp_path: Path, shell: Shell, monkeypatch: pytest.MonkeyPatch) -> None:
     card = replace(POINTSEG, training={"data": "street " * 100}, classes=tuple(f"class {k}" for k in range(250)))
     monkeypatch.setattr(zoo, "resolve", lambda model: (Variant(Path(__file__), card),))
-    assert run("info", "pointseg") == 0
-    lines = capsys.readouterr().out.splitlines()
+    lines = shell.out("info", "pointseg").splitlines()
     assert len(lines) <= 24
     assert max(map(len, lines)) <= 100
     assert sum(line.endswith(" ...") for line in lines) == 3  # classes are in two rows
 
 
 @pytest.mark.usefixtures("fake_models")
-def test_info_of_a_scan(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_info_of_a_scan(tmp_path: Path, shell: Shell, monkeypatch: pytest.MonkeyPatch) -> None:
 
     checked = []
 
@@ -124,8 +119,7 @@ def test_info_of_a_scan(tmp_path: Path, capsys: pytest.CaptureFixture[str], monk
     monkeypatch.setattr(sys.modules[__name__], "POINTSEG", replace(POINTSEG, fitness={"n_beams": 64}))
     points = np.array([[3, 4, 0, 10], [0, 10, 10, 255], [-6, 0, 8, 51], [np.nan, 0, 0, 0]], np.float32)
     np.save(tmp_path / "scan.npy", points)
-    assert run("info", tmp_path / "scan.npy", "--sensor", "os1-64") == 0
-    rows = rows_of(capsys.readouterr().out)
+    rows = rows_of(shell.out("info", tmp_path / "scan.npy", "--sensor", "os1-64"))
     assert rows["points"] == "4, of which 1 are not finite"
     assert rows["extent"] == "x -6.0 .. 3.0, y 0.0 .. 10.0, z 0.0 .. 10.0 m"
     assert rows["range"] == "5.0 .. 14.1 m, median 10.0 m"
@@ -136,8 +130,7 @@ def test_info_of_a_scan(tmp_path: Path, capsys: pytest.CaptureFixture[str], monk
     ((scaled, profile, sensor),) = checked
     np.testing.assert_allclose(scaled[:3, 3], np.array([10, 255, 51]) / 255, rtol=1e-6)
     assert (profile, sensor) == ({"n_beams": 64}, "os1-64")
-    assert run("info", tmp_path / "scan.npy", "--sensor", "os1-64", "--json") == 0
-    document = json.loads(capsys.readouterr().out)
+    (document,) = shell.records("info", tmp_path / "scan.npy", "--sensor", "os1-64")
     assert document["range_m"] == pytest.approx([5.0, 10.0, 14.1421], abs=1e-4)
     assert (document["n_points"], document["n_not_finite"]) == (4, 1)
     assert document["models"] == {"pointseg": ["it has 32 beams"], "ssadnet": None}
@@ -156,26 +149,23 @@ REFUSED: dict[str, Callable[[np.ndarray], np.ndarray]] = {
 
 
 @pytest.mark.parametrize("change", ["none", *REFUSED])
-def test_info_says_what_run_does(change: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_info_says_what_run_does(change: str, tmp_path: Path, shell: Shell) -> None:
     """The same exit code, and the whole advice."""
     pytest.importorskip("onnxruntime")
     scan = urban(3, thinned()).points
     file = tmp_path / "scan.bin"
     np.ascontiguousarray(REFUSED.get(change, lambda scan: scan)(scan), np.float32).tofile(file)
     sensor = "--sensor", "hdl-64e"
-    refused = run("run", file, *sensor, "--json")
-    assert refused == (change != "none")
-    error = json.loads(capsys.readouterr().out).get("error", "")
-    assert run("info", file, *sensor) == refused
-    printed = capsys.readouterr()
+    refused = int(change != "none")
+    error = shell.records("run", file, *sensor, code=refused)[0].get("error", "")
+    printed = shell.both("info", file, *sensor, code=refused)
     shown = " ".join(line.partition(" ")[2].strip() for line in printed.out.splitlines())
     assert ("edgeperc run refuses this scan" in shown) == refused
     said = error.partition(" Results would be")[0]
     if change not in ("none", "not finite", "few points", "empty beams"):
         assert said in shown
     assert " ..." not in printed.out
-    assert run("info", file, *sensor, "--json") == refused
-    assert json.loads(capsys.readouterr().out)["refused"] is bool(refused)
+    assert shell.records("info", file, *sensor, code=refused)[0]["refused"] is bool(refused)
 
 
 @pytest.mark.parametrize("command", ["run", "info"])
@@ -189,18 +179,12 @@ def test_info_says_what_run_does(change: str, tmp_path: Path, capsys: pytest.Cap
     ],
 )
 def test_a_wrong_sensor_is_one_error_before_the_first_scan(
-    command: str,
-    option: str,
-    said: str,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
+    command: str, option: str, said: str, tmp_path: Path, shell: Shell, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
     for k in range(4):
         write_scan(tmp_path / f"{k}.bin")
-    assert run(command, *sorted(tmp_path.iterdir()), *option.split()) == 2
-    printed = capsys.readouterr()
+    printed = shell.both(command, *sorted(tmp_path.iterdir()), *option.split(), code=2)
     assert len(printed.err.splitlines()) == 1
     assert said in printed.err
     assert not printed.out
@@ -220,17 +204,15 @@ def test_info_prints_a_card_as_it_is(capsys: pytest.CaptureFixture[str]) -> None
 
 
 @pytest.mark.usefixtures("fake_models")
-def test_info_goes_on_after_what_it_does_not_know(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_info_goes_on_after_what_it_does_not_know(tmp_path: Path, shell: Shell) -> None:
     empty = tmp_path / "empty.npy"
     np.save(empty, np.zeros((0, 4), np.float32))
-    assert run("info", "nonesuch", tmp_path / "absent.bin", empty, "ssadnet") == 1
-    captured = capsys.readouterr()
+    captured = shell.both("info", "nonesuch", tmp_path / "absent.bin", empty, "ssadnet", code=1)
     assert [line.split(":")[0] for line in captured.err.splitlines()] == ["edgeperc", "edgeperc"]
     assert "0, of which 0 are not finite" in captured.out
     assert "top_view: x 6..46 m, y -10..10 m, cells of 0.1 m" in captured.out
     assert "car, van, score from 0.3" in captured.out
-    assert run("info", empty, "--sensor", "nonesuch") == 2
-    assert "nonesuch" in capsys.readouterr().err
+    assert "nonesuch" in shell.err("info", empty, "--sensor", "nonesuch")
 
 
 def test_info_and_lists_need_no_onnxruntime(tmp_path: Path) -> None:
@@ -245,51 +227,44 @@ def test_info_and_lists_need_no_onnxruntime(tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("fake_models")
-def test_models_are_listed_with_what_was_measured_here(capsys: pytest.CaptureFixture[str]) -> None:
+def test_models_are_listed_with_what_was_measured_here(shell: Shell) -> None:
     entry = {"provider": "cpu", "precision": "int8", "n_threads": 2, "p50_ms": 7.25}
     digest = zoo.digest(zoo.resolve("pointseg"))
     machine.write_settings(machine.settings_path(), machine.fingerprint(), {digest: entry})
-    assert run("models") == 0
-    heading, pointseg, ssadnet = capsys.readouterr().out.splitlines()
+    heading, pointseg, ssadnet = shell.out("models").splitlines()
     assert heading.split()[:2] == ["name", "default"]
     assert pointseg.split()[:2] == ["pointseg", "yes"]
     assert "fp32 2.5, int8 0.7" in pointseg
     assert "7.2 ms, cpu int8" in pointseg
     assert pointseg.endswith("CC0")
     assert "boxes of car, van" in ssadnet
-    assert run("models", "--json") == 0
-    first, second = map(json.loads, capsys.readouterr().out.splitlines())
+    first, second = shell.records("models")
     assert (first["name"], first["measured"], first["default"]) == ("pointseg", entry, True)
     assert first["variants"] == {"fp32": 2.5, "int8": 0.7}
     assert second["measured"] is None
 
 
-def test_sensors_are_listed(capsys: pytest.CaptureFixture[str]) -> None:
-    assert run("sensors") == 0
-    lines = capsys.readouterr().out.splitlines()
+def test_sensors_are_listed(shell: Shell) -> None:
+    lines = shell.out("sensors").splitlines()
     assert [line.split()[0] for line in lines[1:]] == [*SENSORS]
     assert [line.split()[0] for line in lines[1:] if line.split()[1] == "yes"] == ["hdl-64e"]
-    assert run("sensors", "--json") == 0
-    records = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    records = shell.records("sensors")
     assert [record["name"] for record in records] == [*SENSORS]
     assert records[0]["beams"] == 64
 
 
-def test_providers_are_listed(capsys: pytest.CaptureFixture[str]) -> None:
+def test_providers_are_listed(shell: Shell) -> None:
     pytest.importorskip("onnxruntime")
-    assert run("providers", "--json") == 0
-    records = {record["name"]: record for record in map(json.loads, capsys.readouterr().out.splitlines())}
+    records = {record["name"]: record for record in shell.records("providers")}
     assert {*records} == {*providers.PROVIDERS}
     assert records["cpu"]["available"]
-    assert run("providers") == 0
-    assert len(capsys.readouterr().out.splitlines()) == 1 + len(records)
+    assert len(shell.out("providers").splitlines()) == 1 + len(records)
 
 
-@pytest.mark.parametrize("shell", ["bash", "zsh", "fish", "tcsh"])
-def test_completion_knows_commands_options_and_names(shell: str, capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize("name", ["bash", "zsh", "fish", "tcsh"])
+def test_completion_knows_commands_options_and_names(name: str, shell: Shell) -> None:
     pytest.importorskip("shtab")
-    assert run("completion", shell) == 0
-    script = capsys.readouterr().out
+    script = shell.out("completion", name)
     for word in ("eval-tracking", "full-turn", "os1-64", "av2", "ssadnet", "openvino", "bf16"):
         assert word in script
 
@@ -305,11 +280,10 @@ def test_completion_knows_commands_options_and_names(shell: str, capsys: pytest.
         ("edgeperc info sca", {"scan.bin"}),
     ],
 )
-def test_fish_completes(typed: str, found: set[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_fish_completes(typed: str, found: set[str], tmp_path: Path, shell: Shell) -> None:
     pytest.importorskip("shtab")
-    assert run("completion", "fish") == 0
     (tmp_path / "scan.bin").touch()
-    (tmp_path / "edgeperc.fish").write_text(capsys.readouterr().out)
+    (tmp_path / "edgeperc.fish").write_text(shell.out("completion", "fish"))
     code = f"source edgeperc.fish; complete -C {shlex.quote(typed)}"
     home = {**os.environ, "HOME": str(tmp_path)}
     done = subprocess.run(["fish", "-c", code], cwd=tmp_path, env=home, capture_output=True, text=True, check=False)
@@ -330,11 +304,10 @@ def test_fish_completes(typed: str, found: set[str], tmp_path: Path, capsys: pyt
         (["eval-tracking", "--gif", "sca"], {"scan.bin"}),
     ],
 )
-def test_bash_completes(words: list[str], found: set[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_bash_completes(words: list[str], found: set[str], tmp_path: Path, shell: Shell) -> None:
     pytest.importorskip("shtab")
-    assert run("completion", "bash") == 0
     (tmp_path / "scan.bin").touch()
-    (tmp_path / "completion").write_text(capsys.readouterr().out)
+    (tmp_path / "completion").write_text(shell.out("completion", "bash"))
     code = (
         f"source ./completion; COMP_WORDS=(edgeperc {' '.join(words)}); COMP_CWORD={len(words)}; "
         '_shtab_edgeperc 2>/dev/null; printf "%s\\n" "${COMPREPLY[@]}"'
@@ -343,10 +316,9 @@ def test_bash_completes(words: list[str], found: set[str], tmp_path: Path, capsy
     assert {*done.stdout.split()} == found, done.stderr
 
 
-def test_completion_names_its_extra(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_completion_names_its_extra(shell: Shell, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "shtab", None)
-    assert run("completion", "bash") == 2
-    assert "pip install 'edgeperc[completion]'" in capsys.readouterr().err
+    assert "pip install 'edgeperc[completion]'" in shell.err("completion", "bash")
 
 
 @pytest.fixture
@@ -368,12 +340,9 @@ def in_a_turned_drive(drive: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (drive / "T.json").write_text("[[0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 1, 1.9], [0, 0, 0, 1]]")
 
 
-def test_info_prints_the_mounting_and_writes_a_profile(
-    drive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_info_prints_the_mounting_and_writes_a_profile(drive: Path, tmp_path: Path, shell: Shell) -> None:
     written = tmp_path / "mine.json"
-    assert run("info", *sorted(drive.iterdir()), "--write", written) == 1  # of a scan that run refuses
-    printed = capsys.readouterr().out
+    printed = shell.out("info", *sorted(drive.iterdir()), "--write", written, code=1)  # of a scan that run refuses
     assert printed.count("edgeperc run refuses this scan") == 1
     assert printed.count("cannot be estimated: the scan shows no ground") == 1
     assert "hdl-64e, by 2 scans" in printed
@@ -382,41 +351,34 @@ def test_info_prints_the_mounting_and_writes_a_profile(
     assert mounting.height_m == pytest.approx(2.4, abs=0.1)
     assert replace(get_sensor(written), mounting=thinned().mounting) == thinned()
 
-    assert run("info", drive / "0.bin", "--json", "--mount-height", "2.0") == 0
-    estimate = json.loads(capsys.readouterr().out)["mounting"]
+    estimate = shell.records("info", drive / "0.bin", "--mount-height", "2.0")[0]["mounting"]
     assert (estimate["mounting"]["height_m"], estimate["height_sd_m"]) == (2.0, 0.0)
     assert estimate["roll_sd_deg"] > 0.0
 
 
-def test_a_profile_replaces_no_other_file(drive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_profile_replaces_no_other_file(drive: Path, tmp_path: Path, shell: Shell) -> None:
     metadata, fit = tmp_path / "drive.json", ("--sensor", "hdl-64e", "--out")
     metadata.write_text('{"beam_altitude_angles": [1, 2]}')
     for arguments in (("info", drive / "0.bin", "--write", metadata), ("fit-sensor", drive / "0.bin", *fit, metadata)):
-        assert run(*arguments) == 2
-        assert f"{metadata} is there, and is no sensor profile" in capsys.readouterr().err
+        assert f"{metadata} is there, and is no sensor profile" in shell.err(*arguments)
     assert metadata.read_text() == '{"beam_altitude_angles": [1, 2]}'
     for _ in range(2):  # a profile replaces another
         assert run("info", drive / "0.bin", "--write", tmp_path / "mine.json") == 0
 
 
-def test_scans_of_a_recording_that_show_no_ground_are_left_out(drive: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run("info", drive, "--json") == 0
-    estimate = json.loads(capsys.readouterr().out)["mounting"]
+def test_scans_of_a_recording_that_show_no_ground_are_left_out(drive: Path, shell: Shell) -> None:
+    estimate = shell.records("info", drive)[0]["mounting"]
     assert estimate["n_scans"] == 2
     assert estimate["mounting"]["height_m"] == pytest.approx(2.4, abs=0.1)
 
 
-def test_no_profile_is_written_without_ground_or_of_two_sensors(
-    drive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_no_profile_is_written_without_ground_or_of_two_sensors(drive: Path, tmp_path: Path, shell: Shell) -> None:
     written = tmp_path / "mine.json"
-    assert run("info", drive / "1.bin", "--sensor", "hdl-64e", "--write", written) == 1
-    assert "no scan shows the ground" in capsys.readouterr().err
-    assert run("info", "pointseg", "--write", written) == 1
-    assert "the scans are of 0 sensors" in capsys.readouterr().err
+    said = shell.err("info", drive / "1.bin", "--sensor", "hdl-64e", "--write", written, code=1)
+    assert "no scan shows the ground" in said
+    assert "the scans are of 0 sensors" in shell.err("info", "pointseg", "--write", written, code=1)
     assert not written.exists()
-    assert usage_code("info", drive / "0.bin", "--write", tmp_path / "mine.txt") == 2
-    assert "ends in .json" in capsys.readouterr().err
+    assert "ends in .json" in shell.err("info", drive / "0.bin", "--write", tmp_path / "mine.txt")
 
 
 @pytest.mark.parametrize(
@@ -436,12 +398,9 @@ def test_no_profile_is_written_without_ground_or_of_two_sensors(
 )
 @pytest.mark.filterwarnings("ignore:.*which is taken:UserWarning")
 @pytest.mark.usefixtures("in_a_turned_drive")
-def test_run_uses_the_given_mounting(
-    options: list[str], mounting: dict[str, float], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_run_uses_the_given_mounting(options: list[str], mounting: dict[str, float], shell: Shell) -> None:
     arguments = ["0.bin", "--json", "--model", "pointseg", "--provider", "cpu", "--on-mismatch", "ignore"]
-    assert run("run", *arguments, *options) == 0
-    used = json.loads(capsys.readouterr().out)["mounting"]
+    used = json.loads(shell.out("run", *arguments, *options))["mounting"]
     assert {name: round(used[name], 6) for name in mounting} == mounting
 
 
@@ -458,10 +417,10 @@ def test_run_uses_the_given_mounting(
 @pytest.mark.filterwarnings("always::UserWarning")
 @pytest.mark.usefixtures("in_a_turned_drive")
 def test_options_that_contradict_an_extrinsic_are_said_once(
-    command: str, options: list[str], said: str, capsys: pytest.CaptureFixture[str]
+    command: str, options: list[str], said: str, shell: Shell
 ) -> None:
-    run(command, "0.bin", "1.bin", "--sensor", "hdl-64e", "--extrinsic", "T.json", *options)
-    warned = [line for line in capsys.readouterr().err.splitlines() if "which is taken" in line]
+    words = ("0.bin", "1.bin", "--sensor", "hdl-64e", "--extrinsic", "T.json", *options)
+    warned = [line for line in shell.err(command, *words, code=1).splitlines() if "which is taken" in line]
     assert warned == ([f"edgeperc: warning: {said}"] if said else [])
 
 
@@ -484,49 +443,39 @@ def test_impossible_mountings_are_refused(options: list[str], drive: Path, capsy
     assert "Traceback" not in error
 
 
-def test_info_finds_the_sensor_and_writes_it(
-    fake_models: None, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_info_finds_the_sensor_and_writes_it(fake_models: None, tmp_path: Path, shell: Shell) -> None:
     sensor = SensorProfile.uniform("mine", 40, 8.0, -20.0, columns=1500)
     scans = [tmp_path / f"{k}.bin" for k in range(2)]
     for k, scan in enumerate(scans):
         urban(k, sensor).points.tofile(scan)
     profile = tmp_path / "found.json"
-    assert run("info", *scans, "--write", profile) == 0
-    shown = " ".join(capsys.readouterr().out.split())
+    shown = " ".join(shell.out("info", *scans, "--write", profile).split())
     assert shown.count("40-beam: 40 beams from 8.0 to -20.0 deg, 1500 columns, found in the points") == 2
     found = get_sensor(profile)
     assert found.name == "40-beam"
     np.testing.assert_allclose(found.elevations_deg, sensor.elevations_deg, atol=0.02)
-    assert run("info", scans[0], "--sensor", profile, "--json") == 0
-    assert json.loads(capsys.readouterr().out)["sensor"] == "40-beam"
+    assert shell.records("info", scans[0], "--sensor", profile)[0]["sensor"] == "40-beam"
 
 
 @pytest.mark.parametrize("name", ["vlp-16", "os1-64", "hdl-64e"])
 @pytest.mark.parametrize("option", [[], ["--sensor", "auto"]])
 def test_info_names_the_sensor_of_scan_files(
-    fake_models: None, name: str, option: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    fake_models: None, name: str, option: list[str], tmp_path: Path, shell: Shell
 ) -> None:
     urban(3, thinned(name)).points.tofile(tmp_path / "0.bin")
-    assert run("info", tmp_path / "0.bin", *option, "--json") == 0
-    shown = json.loads(capsys.readouterr().out)
+    (shown,) = shell.records("info", tmp_path / "0.bin", *option)
     assert shown["sensor"] == name
     assert "beams found" in shown["sensor_from"]
 
 
-def test_info_says_that_a_sensor_cannot_be_told(
-    fake_models: None, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_info_says_that_a_sensor_cannot_be_told(fake_models: None, tmp_path: Path, shell: Shell) -> None:
     scan = write_scan(tmp_path / "0.bin", 5000)
-    assert run("info", scan) == 1
-    said = capsys.readouterr().err
+    said = shell.err("info", scan, code=1)
     assert f"{scan}: the sensor cannot be told from the scan" in said
     assert "pass --sensor with a name" in said
     assert "sensor=" not in said
-    assert run("info", write_scan(tmp_path / "few" / "0.bin"), "--sensor", "auto") == 1
-    assert "pass --sensor" in capsys.readouterr().err
-    assert run("info", scan, "--sensor", "hdl-64e") in (0, 1)
-    assert "cannot be told" not in capsys.readouterr().err
+    assert "pass --sensor" in shell.err("info", write_scan(tmp_path / "few" / "0.bin"), "--sensor", "auto", code=1)
+    assert "cannot be told" not in shell.err("info", scan, "--sensor", "hdl-64e", code=0)
 
 
 def write_simulated(path: Path, sensor: str, seed: int) -> Path:
@@ -541,27 +490,27 @@ def write_simulated(path: Path, sensor: str, seed: int) -> Path:
 @pytest.mark.parametrize(("sensor", "said"), [("vlp-16", "os1-64"), ("hdl-64e", "vlp-16"), ("pandar64", "hdl-64e")])
 @pytest.mark.filterwarnings("always::UserWarning")
 def test_a_sensor_whose_beams_the_points_do_not_have_is_warned_of(
-    sensor: str, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    sensor: str, said: str, tmp_path: Path, shell: Shell
 ) -> None:
     scan = write_simulated(tmp_path / "0.bin", sensor, 1)
     for name, is_warned in ((said, True), (sensor, False)):
-        run("run", scan, "--sensor", name, "--anyway", "--remission-range", "0", "1")
-        assert (f"--sensor says {name}, the points {sensor} (" in capsys.readouterr().err) == is_warned
+        error = shell.err("run", scan, "--sensor", name, "--anyway", "--remission-range", "0", "1", code=0)
+        assert (f"--sensor says {name}, the points {sensor} (" in error) == is_warned
 
 
 @pytest.mark.parametrize("sensor", ["vlp-16", "hdl-64e"])
 @pytest.mark.parametrize(("scale", "is_warned"), [(1.0, False), (np.pi / 180.0, True), (2.0, True)])
 @pytest.mark.filterwarnings("always::UserWarning")
 def test_a_profile_of_other_beams_is_warned_of(
-    sensor: str, scale: float, is_warned: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    sensor: str, scale: float, is_warned: bool, tmp_path: Path, shell: Shell
 ) -> None:
     """As in radians."""
     scan, profile = write_simulated(tmp_path / "0.bin", sensor, 1), get_sensor(sensor)
     elevations = tuple(scale * angle for angle in profile.elevations_deg)
     other = replace(profile, elevations_deg=elevations, remission_range=(0.0, 1.0))
     (tmp_path / "mine.json").write_text(other.to_json())
-    run("run", scan, "--sensor", tmp_path / "mine.json", "--anyway")
-    assert ("it is read as" in capsys.readouterr().err) == is_warned
+    error = shell.err("run", scan, "--sensor", tmp_path / "mine.json", "--anyway", code=0)
+    assert ("it is read as" in error) == is_warned
 
 
 @pytest.mark.parametrize(
@@ -574,35 +523,27 @@ def test_a_profile_of_other_beams_is_warned_of(
 )
 @pytest.mark.filterwarnings("always::UserWarning")
 def test_dense_files_without_beams_are_read_with_a_warning(
-    on_mismatch: str, code: int, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    on_mismatch: str, code: int, said: str, tmp_path: Path, shell: Shell
 ) -> None:
     """Of two sensors at once, about one of them."""
     points = urban(8, "os1-64").points
     path = tmp_path / "a.bin"
     np.concatenate([points, points + np.array([1.4, 0.3, -0.2, 0.0], np.float32)]).tofile(path)
-    assert run("run", path, "--on-mismatch", on_mismatch) == code
-    error = capsys.readouterr().err
+    error = shell.err("run", path, "--on-mismatch", on_mismatch, code=code)
     assert said.format(path) in error
     assert error.count("no beams stand out") == bool(said)
 
 
 @pytest.mark.parametrize("sensors", [("hdl-64e", "vlp-16"), ("pandar64", "os1-64", "os1-64"), ("vlp-16", "vlp-32c")])
-def test_a_folder_of_several_sensors_is_said_to_be_one(
-    sensors: Sequence[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_folder_of_several_sensors_is_said_to_be_one(sensors: Sequence[str], tmp_path: Path, shell: Shell) -> None:
     for k, sensor in enumerate(sensors):
         write_simulated(tmp_path / f"{k}.bin", sensor, k)
-    assert run("run", tmp_path) == 1
-    names = ", ".join(sorted({*sensors}))
-    assert (
-        f"the first scans are of several sensors: {names}; read those of each on their own" in capsys.readouterr().err
-    )
+    said = f"the first scans are of several sensors: {', '.join(sorted({*sensors}))}; read those of each on their own"
+    assert said in shell.err("run", tmp_path, code=1)
 
 
 @pytest.mark.parametrize("roll", [180.0, -175.0, 170.0])
-def test_a_roll_that_turns_a_scan_upside_down_is_refused(
-    roll: float, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_roll_that_turns_a_scan_upside_down_is_refused(roll: float, tmp_path: Path, shell: Shell) -> None:
     scan = write_simulated(tmp_path / "0.bin", "hdl-64e", 1)
-    assert run("run", scan, "--sensor", "hdl-64e", "--roll", str(roll)) == 1
-    assert "it does not hang upside down, or the points are turned already" in capsys.readouterr().err
+    said = shell.err("run", scan, "--sensor", "hdl-64e", "--roll", roll, code=1)
+    assert "it does not hang upside down, or the points are turned already" in said

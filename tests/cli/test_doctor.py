@@ -14,7 +14,7 @@ from typing import Any
 
 import pytest
 
-from cli_helpers import run
+from cli_helpers import Shell
 from edgeperc import zoo
 from edgeperc.cli import doctor
 from edgeperc.errors import ProviderError
@@ -34,32 +34,30 @@ def quick(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(doctor, "find_runs", lambda found: iter(()))
 
 
-def report(capsys: pytest.CaptureFixture[str]) -> tuple[int, dict[str, dict[str, str]]]:
-    """Exit code, and the findings by name."""
-    code = run("doctor", "--json")
-    found = json.loads(capsys.readouterr().out)
+def report(shell: Shell, code: int = 1) -> dict[str, dict[str, str]]:
+    """The findings by name."""
+    (found,) = shell.records("doctor", code=code)
     assert found["works"] == (code == 0)
-    return code, {finding.pop("name"): finding for finding in found["findings"]}
+    return {finding.pop("name"): finding for finding in found["findings"]}
 
 
 def broken(found: dict[str, dict[str, str]]) -> set[str]:
     return {name for name, finding in found.items() if finding["state"] == "broken"}
 
 
-def test_an_installation_that_works(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_installation_that_works(shell: Shell, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("onnxruntime")
     monkeypatch.setattr(doctor, "find_runs", RUNS)
     monkeypatch.setenv("ORT_DISABLE_TELEMETRY", "1")
-    code, found = report(capsys)
-    assert (code, broken(found)) == (0, set())
+    found = report(shell, 0)
+    assert broken(found) == set()
     assert {"python", "platform", "processor", "int8", "bf16", "numpy", "numba", "kernels", "cache folder"} <= {*found}
     assert "cpu" in found["providers"]["found"]
     assert found["telemetry"]["state"] == "ok"
     for name in zoo.DEFAULT:
         assert found[f"model {name}.onnx"]["found"].endswith("as in SHA256SUMS")
         assert name in found[f"runs {name}"]["found"]
-    assert run("doctor") == 0
-    lines = capsys.readouterr().out.splitlines()
+    lines = shell.out("doctor").splitlines()
     for name in found:  # and "compiled models", if the first report made them
         assert any(line.startswith(f"{name}  ") for line in lines), name
     assert lines[-1] == "What edgeperc needs is here and works."
@@ -86,15 +84,13 @@ def test_a_package_that_cannot_be_imported(package: str, tmp_path: Path) -> None
         assert found["model ssadnet.onnx"]["state"] == "ok"
 
 
-def test_no_onnxruntime(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_onnxruntime(shell: Shell, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
     monkeypatch.setattr(doctor, "installed", lambda prefix="": {})
-    code, found = report(capsys)
-    assert code == 1
+    found = report(shell)
     missing = {"state": "broken", "found": "not installed", "advice": "pip install 'edgeperc[cpu]'"}
     assert found["onnxruntime"] == missing
-    assert run("doctor") == 1
-    assert "BROKEN" in (out := capsys.readouterr().out)
+    assert "BROKEN" in (out := shell.out("doctor", code=1))
     assert "onnxruntime" in out.splitlines()[-1]
 
 
@@ -131,7 +127,7 @@ def test_telemetry(value: str, state: str, text: str, monkeypatch: pytest.Monkey
 
 
 def test_a_plugin_that_does_not_load_and_kernels_that_are_not_kept(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    shell: Shell, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     def broken(ort: object, short: str) -> Any:
         raise ProviderError("the plugin for provider 'webgpu' is installed but does not load: no symbol")
@@ -141,8 +137,7 @@ def test_a_plugin_that_does_not_load_and_kernels_that_are_not_kept(
     monkeypatch.setattr(KernelCache, "cache_path", None)
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("EDGEPERC_CACHE_DIR", str(tmp_path / "file" / "cache"))
-    code, found = report(capsys)
-    assert code == 1
+    found = report(shell)
     assert "does not load" in found["providers"]["found"]
     assert found["kernels"]["state"] == "note"
     assert "NUMBA_CACHE_DIR" in found["kernels"]["advice"]
@@ -152,14 +147,12 @@ def test_a_plugin_that_does_not_load_and_kernels_that_are_not_kept(
 
 
 @posix
-def test_a_cache_that_others_can_write_with_settings_that_cannot_be_read(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_cache_that_others_can_write_with_settings_that_cannot_be_read(tmp_path: Path, shell: Shell) -> None:
     (tmp_path / "cache" / "compiled").mkdir(parents=True)
     (tmp_path / "cache" / "compiled" / "blob").write_bytes(bytes(2_000_000))
     (tmp_path / "cache" / "compiled").chmod(0o777)
     (tmp_path / "cache" / "settings.json").write_text("no json")
-    _, found = report(capsys)
+    found = report(shell, 0)
     assert found["cache folder"]["state"] == "ok"
     assert "2.0 MB in 2 files, writable" in found["cache folder"]["found"]
     assert found["compiled models"]["state"] == "note"
@@ -180,7 +173,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return folder
 
 
-def test_damaged_and_missing_models_and_sums(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_damaged_and_missing_models_and_sums(folder: Path, shell: Shell) -> None:
     content = bytearray((folder / "pointseg.onnx").read_bytes())
     content[len(content) // 2] ^= 1  # among the weights: the card can still be read
     (folder / "pointseg.onnx").write_bytes(content)
@@ -188,12 +181,11 @@ def test_damaged_and_missing_models_and_sums(folder: Path, capsys: pytest.Captur
     for file in folder.glob("ssadnet*"):
         file.unlink()
     (folder / "SHA256SUMS").rename(folder / "sums")
-    _, found = report(capsys)
+    found = report(shell)
     assert found["SHA256SUMS"]["state"] == "note"
     assert found["model lodnn.onnx"]["found"].endswith("not compared")
     (folder / "sums").rename(folder / "SHA256SUMS")
-    code, found = report(capsys)
-    assert code == 1
+    found = report(shell)
     assert "not the file of this release" in found["model pointseg.onnx"]["found"]
     assert {"model pointseg.onnx", "model pointseg-int8.onnx", "model ssadnet"} <= broken(found)
     assert found["model ssadnet"]["found"] == "missing"
@@ -256,7 +248,7 @@ def test_a_package_that_pip_did_not_install(monkeypatch: pytest.MonkeyPatch) -> 
 
 @pytest.mark.parametrize("kept", ["beside", "cache", "numba", "one folder", "nothing"])
 def test_clean_leaves_nothing_of_edgeperc_and_all_of_others(
-    kept: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    kept: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, shell: Shell
 ) -> None:
     package, cache = tmp_path / "edgeperc", tmp_path / "cache"
     own = {
@@ -272,13 +264,11 @@ def test_clean_leaves_nothing_of_edgeperc_and_all_of_others(
         file.write_bytes(b"123")
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(cache / "kernels" if kept == "one folder" else tmp_path / "numba"))
     monkeypatch.setattr(doctor, "package_folders", lambda: [package])
-    assert run("doctor", "--clean") == 0
-    assert f"deleted {len(own)} file" in capsys.readouterr().out
+    assert f"deleted {len(own)} file" in shell.out("doctor", "--clean")
     left = {file for file in tmp_path.rglob("*") if file.is_file()}
     assert left == {*others}
     assert not cache.exists()
-    assert run("doctor", "--clean", "--json") == 0
-    assert json.loads(capsys.readouterr().out) == {"deleted": 0, "bytes": 0}
+    assert shell.records("doctor", "--clean")[0] == {"deleted": 0, "bytes": 0}
 
 
 def test_the_packages_are_where_they_are_imported_from() -> None:

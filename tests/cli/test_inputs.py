@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from test_captures import vlp16_packets, write_pcap
 
-from cli_helpers import run, usage_code, write_scan
+from cli_helpers import Shell, run, usage_code, write_scan
 from edgeperc import PointsError, read_points, read_scans
 
 OF_RECORDINGS = ("--topic 10.0.0.1",)
@@ -56,13 +56,12 @@ def write_inputs(folder: Path) -> dict[str, Path]:
     ],
 )
 def test_an_option_of_no_use_is_refused(
-    command: str, kind: str, options: str, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    command: str, kind: str, options: str, said: str, tmp_path: Path, shell: Shell
 ) -> None:
     if kind == "image":
         pytest.importorskip("PIL")
     path = write_inputs(tmp_path)[kind]
-    assert usage_code(command, path, *options.split()) == 2
-    shown = " ".join(capsys.readouterr().err.split())
+    shown = " ".join(shell.err(command, path, *options.split()).split())
     assert (f"{said}{path}" if said.endswith("and ") else said) in shown
     assert any(word.partition("=")[0] in shown for word in options.split() if word.startswith("--"))
 
@@ -106,10 +105,9 @@ def test_names_of_columns_that_a_file_has_itself_are_not_taken_without_a_word(su
         read_points(path, columns=("x", "y", "z", "ring"))
 
 
-def test_a_url_that_cannot_be_reached_is_named(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_url_that_cannot_be_reached_is_named(shell: Shell) -> None:
     pytest.importorskip("fsspec")
-    assert run("run", "ftp://127.0.0.1:1/a.bin") == 2
-    assert "ftp://127.0.0.1:1/a.bin: " in capsys.readouterr().err
+    assert "ftp://127.0.0.1:1/a.bin: " in shell.err("run", "ftp://127.0.0.1:1/a.bin")
 
 
 @pytest.mark.parametrize("option", ["--mcap", "--static", "--bag"])
@@ -135,8 +133,7 @@ def test_a_folder_that_cannot_be_made_is_named_with_its_option(
     ],
 )
 def test_options_of_another_model_are_refused(
-    model: str, options: str, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    model: str, options: str, said: str, tmp_path: Path, shell: Shell
 ) -> None:
     arguments = ("--model", model, "--provider", "cpu", *options.split())
-    assert run("run", write_scan(tmp_path / "a.bin"), *arguments) == 2
-    assert said in capsys.readouterr().err
+    assert said in shell.err("run", write_scan(tmp_path / "a.bin"), *arguments)

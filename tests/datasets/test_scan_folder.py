@@ -20,7 +20,8 @@ from hypothesis import strategies as st
 pytest.importorskip("tqdm")
 
 from checkout import REPOSITORY
-from edgeperc import Perceiver, cli
+from cli_helpers import Shell
+from edgeperc import Perceiver
 from edgeperc.datasets.kitti import KittiObjects, scan_hash
 from edgeperc.datasets.layout import ScanLayout, class_number, known_layouts, read_layout
 from edgeperc.datasets.scan_folder import ScanFolder
@@ -801,14 +802,13 @@ def test_the_sensor_of_a_scan_is_stored(tmp_path: Path) -> None:
         assert LabeledScan.load(tmp_path / "scan.npz").sensor == sensor
 
 
-def test_folders_are_evaluated(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_folders_are_evaluated(tmp_path: Path, shell: Shell) -> None:
     root, _ = street(tmp_path / "set", "hdl-64e", (3, 4))
     for name in ("ssadnet-sim", "pointseg-sim"):
         assert (REPOSITORY / "models/research" / f"{name}.onnx").exists()
     out = tmp_path / "figures.json"
     models = ["--model", "ssadnet", "--model", "pointseg"]
-    assert cli.main(["eval", str(root), *models, "--boxes-from", "both", "--json", str(out)]) == 0
-    printed = capsys.readouterr().out
+    printed = shell.out("eval", root, *models, "--boxes-from", "both", "--json", out)
     assert "== street: 2 scans, 1 drive ==" in printed
     figures = json.loads(out.read_text())
     assert "real" not in figures
@@ -816,25 +816,23 @@ def test_folders_are_evaluated(tmp_path: Path, capsys: pytest.CaptureFixture[str
     assert found["points"]["all"]["car"]["iou"] > 0.5
     assert found["road"]["all"]["f1"] > 0.8
     assert "pixels" not in found  # all sectors are evaluated, and only the last one's pixels are known
-    assert cli.main(["eval", str(root), "--split", "validation"]) == 2
-    assert "no scans of the validation drives" in capsys.readouterr().err
+    assert "no scans of the validation drives" in shell.err("eval", root, "--split", "validation")
     with pytest.raises(OptionError, match="mounted and road_by are for KITTI"):
         evaluate([root], ["pointseg"], mounted=Mounting(2.0, 0.0, 0.0))
 
 
 @pytest.mark.filterwarnings("default:.*the remission does not fit")
-def test_other_sensors_are_compared_by_the_same_reader(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_other_sensors_are_compared_by_the_same_reader(tmp_path: Path, shell: Shell) -> None:
     root, _ = street(tmp_path / "set", "hdl-64e")
     out = tmp_path / "figures.json"
     datasets = [str(root), f"hdl-64e={root}"]
-    assert cli.main(["eval-sensors", *datasets, "--json", str(out)]) == 0
-    assert "does not fit the range 0 to 1 of hdl-64e: that of 3 is up to 25" in capsys.readouterr().err
+    said = shell.err("eval-sensors", *datasets, "--json", out, code=0)
+    assert "does not fit the range 0 to 1 of hdl-64e: that of 3 is up to 25" in said
     figures = json.loads(out.read_text())
     assert [figures[name]["n_scans"] for name in datasets] == [1, 1]
     assert figures[datasets[0]]["both"]["iou"]["car"] > 0.5
     for source in (str(tmp_path / "set/velodyne"), f"{root}:pandar"):
-        assert cli.main(["eval-sensors", source]) == 2
-        assert "SENSOR=simulation:N" in capsys.readouterr().err
+        assert "SENSOR=simulation:N" in shell.err("eval-sensors", source)
 
 
 def test_public_sets(data_root: Callable[[str], Path]) -> None:

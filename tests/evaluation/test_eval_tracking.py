@@ -15,6 +15,7 @@ import numba
 import numpy as np
 import pytest
 
+from cli_helpers import Shell
 from edgeperc import TrackingError, cli
 from edgeperc.datasets.kitti import scan_hash
 from edgeperc.evaluation import tracking
@@ -175,9 +176,8 @@ def test_a_made_up_street_has_the_figures_of_ab3dmots_program(tmp_path: Path) ->
         assert [best[f"n_{name}"] for name in ("switches", "fragments", "false", "missed", "found")] == counts
 
 
-def test_headings_and_the_rival_are_printed(kitti: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(["eval-tracking", str(kitti), "--rules", "ab3dmot", "--rival", "ab3dmot"]) == 0
-    text = capsys.readouterr().out
+def test_headings_and_the_rival_are_printed(kitti: Path, shell: Shell) -> None:
+    text = shell.out("eval-tracking", kitti, "--rules", "ab3dmot", "--rival", "ab3dmot")
     assert "rules ab3dmot" in text
     assert text.count("AB3DMOT's method") == 3
     assert "headings within a quarter turn" in text
@@ -261,10 +261,9 @@ def test_malformed_labels_of_tracks_name_the_label(kitti: Path, text: str | byte
         tracking.read_sequence(kitti, "0000")
 
 
-def test_eval_tracking_prints_the_tables(kitti: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_eval_tracking_prints_the_tables(kitti: Path, shell: Shell) -> None:
     arguments = ["eval-tracking", str(kitti), "--json", str(kitti / "out/figures.json")]
-    assert cli.main(arguments) == 0
-    lines = capsys.readouterr().out.splitlines()
+    lines = shell.out(*arguments).splitlines()
     assert lines[0].startswith("1 sequence, given detections, 3-D IoU 0.25, rules edgeperc;")
     words = [line.split() for line in lines]
     assert ["car", "100.0"] in [line[:1] + line[4:5] for line in words if len(line) > 8]
@@ -272,11 +271,10 @@ def test_eval_tracking_prints_the_tables(kitti: Path, capsys: pytest.CaptureFixt
     figures = json.loads((kitti / "out/figures.json").read_text())
     assert figures["classes"]["cyclist"]["best"]["mota"] is None
     assert figures["command"].startswith("edgeperc eval-tracking")
-    assert cli.main(["eval-tracking", str(kitti / "calib")]) == 2
-    assert "no label_02" in capsys.readouterr().err
+    assert "no label_02" in shell.err("eval-tracking", kitti / "calib")
 
 
-def test_a_models_boxes_are_evaluated(kitti: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_models_boxes_are_evaluated(kitti: Path, shell: Shell) -> None:
     """What run --json prints takes the place of the detections, which need not be there."""
     detections = tracking.read_sequence(kitti, "0000").detections
     lines = [{"scan": "x", "boxes": [replace(one, label="van").to_dict() for one in of]} for of in detections]
@@ -292,11 +290,9 @@ def test_a_models_boxes_are_evaluated(kitti: Path, capsys: pytest.CaptureFixture
     assert figures["vehicle"]["best"]["n_truth"] == 40
     assert figures["car"]["best"]["n_missed"] == 20  # all were labeled as vans
     boxes.write_text("\n".join(map(json.dumps, lines[:-1])))
-    assert cli.main(arguments) == 2
-    assert "19 frames for 20" in capsys.readouterr().err
+    assert "19 frames for 20" in shell.err(*arguments)
     boxes.write_text('{"scan": "x"}')
-    assert cli.main(arguments) == 2
-    assert "holds no boxes" in capsys.readouterr().err
+    assert "holds no boxes" in shell.err(*arguments)
     with pytest.raises(SystemExit):
         cli.main([*arguments[:2], "--boxes", str(boxes)])
 
@@ -340,7 +336,7 @@ def test_an_object_set_with_track_ids_is_the_same_sequence(kitti: Path, drive_ro
 
 
 def test_a_drive_is_perceived_and_tracked(
-    kitti: Path, drive_root: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    kitti: Path, drive_root: Path, monkeypatch: pytest.MonkeyPatch, shell: Shell
 ) -> None:
     """From scans to the table in one command; a scan that a model was trained on is refused."""
     found = tracking.read_sequence(kitti, "0000").detections
@@ -352,14 +348,12 @@ def test_a_drive_is_perceived_and_tracked(
     perceive.cards = (card,)
     monkeypatch.setattr("edgeperc.cli.evaluation.tracking.make_perceiver", lambda *_, **__: perceive)
     arguments = ["eval-tracking", str(drive_root), "--classes", "car", "--json", str(drive_root / "f.json")]
-    assert cli.main(arguments) == 0
-    assert "1 sequence, boxes of seer 1.0" in capsys.readouterr().out
+    assert "1 sequence, boxes of seer 1.0" in shell.out(*arguments)
     best = json.loads((drive_root / "f.json").read_text())["classes"]["car"]["best"]
     assert (best["n_truth"], best["n_missed"], best["n_false"]) == (20, 0, 0)
 
     # Beside KITTI's own sequences, --model takes the place of the detections that are there.
-    assert cli.main(["eval-tracking", str(kitti), "--model", "seer"]) == 2
-    assert "no scans of 0000" in capsys.readouterr().err
+    assert "no scans of 0000" in shell.err("eval-tracking", kitti, "--model", "seer")
     (kitti / "velodyne/0000").mkdir(parents=True)
     for k, path in tracking.sequence_scans(drive_root, "my_drive").items():
         (kitti / f"velodyne/0000/{k:06}.bin").write_bytes(path.read_bytes())
@@ -367,8 +361,7 @@ def test_a_drive_is_perceived_and_tracked(
     assert cli.main(["eval-tracking", str(kitti), "--model", "seer", "--classes", "car"]) == 0
 
     card.training = {"frames": {"x": scan_hash(np.full((3, 4), 4.5, np.float32))}}
-    assert cli.main(arguments) == 2
-    assert "seer 1.0 was trained on scan 000104" in capsys.readouterr().err
+    assert "seer 1.0 was trained on scan 000104" in shell.err(*arguments)
 
 
 def test_a_coarser_sensors_drive_has_every_second_beam(drive_root: Path, tmp_path: Path) -> None:

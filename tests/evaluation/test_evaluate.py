@@ -22,6 +22,7 @@ from hypothesis import strategies as st
 
 import scenes
 from checkout import files
+from cli_helpers import Shell
 from edgeperc import cli
 from edgeperc.cli import output
 from edgeperc.cli.evaluation import scans as eval_scans
@@ -817,11 +818,10 @@ def test_a_network_agrees_with_the_perceiver() -> None:
     assert np.mean(pixels == found.require_points().labels) > 0.97
 
 
-def test_the_command_on_simulated_scans(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_on_simulated_scans(tmp_path: Path, shell: Shell) -> None:
     pytest.importorskip("matplotlib")
     out, picture = tmp_path / "deeper" / "figures.json", tmp_path / "worst.png"
-    assert cli.main(["eval", "simulation:2", "--json", str(out), "--worst", str(picture)]) == 0
-    printed = capsys.readouterr()
+    printed = shell.both("eval", "simulation:2", "--json", out, "--worst", picture)
     assert printed.err == ""
     for words in (
         "== simulated scans: 2 scans, 2 drives ==",
@@ -862,14 +862,13 @@ def test_figures_are_written_though_nobody_reads_the_table(tmp_path: Path, monke
 
 
 def test_where_figures_cannot_be_written_is_said_before_the_work(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, shell: Shell
 ) -> None:
     monkeypatch.setattr("edgeperc.evaluation.evaluate.evaluate", Mock(side_effect=AssertionError("hours of work")))
-    assert cli.main(["eval", "simulation:1", "--json", str(tmp_path)]) == 2
-    assert f"{tmp_path} is a folder; expected the name of a file" in capsys.readouterr().err
+    said = shell.err("eval", "simulation:1", "--json", tmp_path)
+    assert f"{tmp_path} is a folder; expected the name of a file" in said
     monkeypatch.setattr("os.access", lambda *_: False)
-    assert cli.main(["eval-painting", "--json", str(tmp_path / "a.json")]) == 2
-    assert "its folder is read-only" in capsys.readouterr().err
+    assert "its folder is read-only" in shell.err("eval-painting", "--json", tmp_path / "a.json")
 
 
 def test_figures_of_few_objects_are_gray_on_a_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -887,9 +886,8 @@ def test_figures_of_few_objects_are_gray_on_a_terminal(monkeypatch: pytest.Monke
     assert plain.getvalue() == "car\n"
 
 
-def test_the_command_on_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(["eval", str(tmp_path)]) == 2
-    assert "expected the root of a KITTI object set" in capsys.readouterr().err
+def test_the_command_on_nothing(tmp_path: Path, shell: Shell) -> None:
+    assert "expected the root of a KITTI object set" in shell.err("eval", tmp_path)
     with pytest.raises(SystemExit):
         cli.main(["eval", "simulation:1", "--fold", "3"])
 

@@ -6,6 +6,15 @@ from pathlib import Path
 
 import pytest
 
+from cli_helpers import Shell
+
+
+@pytest.fixture
+def shell(capsys: pytest.CaptureFixture[str]) -> Shell:
+    from edgeperc_export.cli import main
+
+    return Shell(capsys, main)
+
 
 @pytest.fixture(scope="session")
 def kitti(tmp_path_factory: pytest.TempPathFactory) -> Path:

@@ -19,6 +19,7 @@ import torch.nn.functional as F
 from torch import nn
 from training_helpers import interrupted_in_step, train
 
+from cli_helpers import Shell
 from edgeperc.errors import ImageError, PointsError, SplitError
 from edgeperc.evaluation.camvid import evaluate_images
 from edgeperc.readers.images import read_image
@@ -524,21 +525,15 @@ def test_int8_of_a_camera(trained: tuple[Path, Path], drawn: Path, tmp_path: Pat
         agree([trained[1]], kitti=drawn)
 
 
-def test_comparison_is_one_command(
-    drawn: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    from edgeperc_export.cli import main
+def test_comparison_is_one_command(drawn: Path, tmp_path: Path, shell: Shell, monkeypatch: pytest.MonkeyPatch) -> None:
     from edgeperc_export.training import camvid
 
     asked: dict[str, Any] = {}
     row = {"name": "SegNet", "parameters": 1, "miou_interval": [0.1, 0.2], **dict.fromkeys(camvid.FIGURES, 0.15)}
     monkeypatch.setattr(camvid, "ablate_camvid", lambda root, out, **given: asked.update(given) or [row])
     command = ["ablate", "camvid", str(tmp_path), "--camvid", str(drawn), "--size", "96x72", "--variant", "SegNet"]
-    assert main([*command, "--no-plots"]) == 0
-    assert "0.150 (0.486)" in capsys.readouterr().out
+    assert "0.150 (0.486)" in shell.out(*command, "--no-plots")
     assert (tmp_path / "camvid.md").read_text().startswith("| network")
     assert (asked["width"], asked["height"], asked["networks"]) == (96, 72, ["SegNet"])
-    assert main(["ablate", "camvid", str(tmp_path)]) == 2
-    assert "give --camvid" in capsys.readouterr().err
-    assert main(["ablate", "pointseg", str(tmp_path)]) == 2
-    assert "give --kitti and --simulated" in capsys.readouterr().err
+    assert "give --camvid" in shell.err("ablate", "camvid", tmp_path)
+    assert "give --kitti and --simulated" in shell.err("ablate", "pointseg", tmp_path)

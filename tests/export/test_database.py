@@ -31,6 +31,7 @@ from database_helpers import INPUT, TRAPEZIUM, drawn, plan_of, road_network
 from shapely import Polygon
 
 import twins.database
+from cli_helpers import Shell
 from edgeperc.datasets.kitti import KittiObjects
 from edgeperc.errors import CardMismatchError, MissingExtraError
 from edgeperc.inference.projection import make_projector
@@ -525,7 +526,7 @@ def alive(pid: int) -> bool:
 
 
 def test_a_broken_scene_is_left_out_and_reported(
-    out: Path, kitti: Path, model: str, polygons: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    out: Path, kitti: Path, model: str, polygons: Path, tmp_path: Path, shell: Shell
 ) -> None:
     broken = tmp_path / "kitti"
     shutil.copytree(kitti, broken)
@@ -537,8 +538,7 @@ def test_a_broken_scene_is_left_out_and_reported(
     calib.unlink()
     arguments = ["database-build", str(broken), str(tmp_path / "out"), "--road-by", model]
     arguments += ["--variations", "3", "--polygons", str(polygons), "--workers", "1"]
-    assert main(arguments) == 1
-    shown = capsys.readouterr()
+    shown = shell.both(*arguments, code=1)
     assert "5 scenes, 5 made, 0 kept, 3 left out" in shown.out
     for name in ("000002", "000003", "000004"):
         assert f"left out {name}: " in shown.err
@@ -547,8 +547,7 @@ def test_a_broken_scene_is_left_out_and_reported(
 
     for path, content in whole.items():
         path.write_bytes(content)
-    assert main(arguments) == 0
-    assert "8 scenes, 3 made, 5 kept, 0 left out" in capsys.readouterr().out
+    assert "8 scenes, 3 made, 5 kept, 0 left out" in shell.out(*arguments)
     assert contents(tmp_path / "out") == contents(out)
 
 

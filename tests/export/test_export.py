@@ -25,6 +25,7 @@ from torch import Tensor, nn
 from training_helpers import ablate, interrupted_in_step, make, train
 
 from checkout import REPOSITORY
+from cli_helpers import Shell
 from edgeperc import Perceiver
 from edgeperc.datasets.kitti import KittiObjects, scan_hash
 from edgeperc.datasets.splits import fold_of
@@ -41,7 +42,6 @@ from edgeperc.types.views import RangeImageGeometry, TopViewGeometry
 from edgeperc_export import cards
 from edgeperc_export import make as make_module
 from edgeperc_export.cards import RANGE_IMAGE, RANGE_IMAGE_INPUT, TOP_VIEW, TOP_VIEW_INPUT
-from edgeperc_export.cli import main
 from edgeperc_export.data.augment import ObjectBank
 from edgeperc_export.data.roads import DRAWN, drawn_roads
 from edgeperc_export.data.scans import LabeledScan, mirrored
@@ -828,12 +828,11 @@ def test_simulated_scans_of_another_sensor_are_not_taken_for_those_asked_for(tmp
 @pytest.mark.usefixtures("small_views")
 @pytest.mark.filterwarnings("default:no scan to train on")
 def test_a_run_tells_of_what_it_cannot_learn(
-    tmp_path: Path, simulated: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, simulated: Path, monkeypatch: pytest.MonkeyPatch, shell: Shell
 ) -> None:
     words = ["train", "pointseg", str(tmp_path), "--edge", "--simulated", str(simulated), "--n-pasted", "0"]
     monkeypatch.setattr(Points, "loss", lambda *_: torch.tensor(np.nan, requires_grad=True))
-    assert main([*words, "--batch", "1", "--threads", "1", "--classes", "background,car,pedestrain"]) == 2
-    shown = capsys.readouterr().err
+    shown = shell.err(*words, "--batch", "1", "--threads", "1", "--classes", "background,car,pedestrain")
     assert "no scan to train on has a label of pedestrain; see boxes and points" in shown
     assert "the loss is nan at step 0; lower --learning-rate" in shown
     scan = LabeledScan.load(sorted(simulated.glob("*.npz"))[0])
@@ -969,13 +968,17 @@ def third_party(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, ModelCa
     return path, card
 
 
+def card_command(folder: Path, path: Path, card: ModelCard, encoding: str = "utf-8") -> tuple[str | Path, ...]:
+    """The words that write a network with a card as out.onnx."""
+    (folder / "card.json").write_text(card.to_json(), encoding=encoding)
+    return "card", path, folder / "card.json", folder / "out.onnx"
+
+
 def test_a_third_party_network_runs_with_a_card(
-    tmp_path: Path, scans: Sequence[np.ndarray], third_party: tuple[Path, ModelCard]
+    tmp_path: Path, scans: Sequence[np.ndarray], third_party: tuple[Path, ModelCard], shell: Shell
 ) -> None:
-    path, card = third_party
-    (tmp_path / "card.json").write_text(card.to_json())
-    out = tmp_path / "carded.onnx"
-    assert main(["card", str(path), str(tmp_path / "card.json"), str(out)]) == 0
+    shell.out(*card_command(tmp_path, *third_party))
+    out = tmp_path / "out.onnx"
     answer = Perceiver(out, provider="cpu")(scans[0])
     assert answer.require_points().classes == ("nothing", "tree", "car")
     assert answer.require_points().in_view.mean() > 0.9  # all around
@@ -983,16 +986,15 @@ def test_a_third_party_network_runs_with_a_card(
 
 
 def test_a_card_that_does_not_fit_writes_nothing(
-    tmp_path: Path, third_party: tuple[Path, ModelCard], capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, third_party: tuple[Path, ModelCard], shell: Shell
 ) -> None:
     path, card = third_party
     wrong = replace(card, classes=("nothing", "car"))
     with pytest.raises(CardMismatchError, match=r"/out.onnx: 'probabilities' is .* of shape \(1, 3, 32, 1024\)"):
         write_card(onnx.load(path), wrong, tmp_path / "out.onnx")
     assert not (tmp_path / "out.onnx").exists()
-    (tmp_path / "card.json").write_text(wrong.to_json())
-    assert main(["card", str(path), str(tmp_path / "card.json"), str(tmp_path / "out.onnx")]) == 2
-    assert "'probabilities' has shape (1, 3, 32, 1024) in the graph; its card declares" in capsys.readouterr().err
+    said = shell.err(*card_command(tmp_path, path, wrong))
+    assert "'probabilities' has shape (1, 3, 32, 1024) in the graph; its card declares" in said
 
 
 def _renamed(model: onnx.ModelProto) -> None:
@@ -1024,48 +1026,43 @@ FOREIGN = {
 
 @pytest.mark.parametrize("message", FOREIGN)
 def test_a_graph_that_does_not_fit_is_told_of(
-    message: str, tmp_path: Path, third_party: tuple[Path, ModelCard], capsys: pytest.CaptureFixture[str]
+    message: str, tmp_path: Path, third_party: tuple[Path, ModelCard], shell: Shell
 ) -> None:
     """In a line that says what came and what was expected, with no trace of the program."""
     path, card = third_party
     model = onnx.load(path)
     FOREIGN[message](model)
     onnx.save(model, tmp_path / "wrong.onnx")
-    (tmp_path / "card.json").write_text(card.to_json())
-    assert main(["card", *(str(tmp_path / name) for name in ("wrong.onnx", "card.json", "out.onnx"))]) == 2
-    assert re.search(message, capsys.readouterr().err)
+    assert re.search(message, shell.err(*card_command(tmp_path, tmp_path / "wrong.onnx", card)))
 
 
 def test_weights_that_stayed_elsewhere_are_told_of(
-    tmp_path: Path, third_party: tuple[Path, ModelCard], capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, third_party: tuple[Path, ModelCard], shell: Shell
 ) -> None:
     """PyTorch writes them beside the graph, in a file that is easily left behind; that was a traceback."""
     path, card = third_party
     model = onnx.load(path)
     onnx.save(model, tmp_path / "network.onnx", save_as_external_data=True, location="weights", size_threshold=0)
-    (tmp_path / "card.json").write_text(card.to_json())
-    command = ["card", *(str(tmp_path / name) for name in ("network.onnx", "card.json", "out.onnx"))]
-    assert main(command) == 0
+    command = card_command(tmp_path, tmp_path / "network.onnx", card)
+    shell.out(*command)
     (tmp_path / "weights").unlink()
-    assert main(command) == 2
-    assert "network.onnx keeps weights in another file, which cannot be read" in capsys.readouterr().err
+    assert "network.onnx keeps weights in another file, which cannot be read" in shell.err(*command)
 
 
 @pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16"])
-def test_a_card_in_an_encoding_of_windows(encoding: str, tmp_path: Path, third_party: tuple[Path, ModelCard]) -> None:
+def test_a_card_in_an_encoding_of_windows(
+    encoding: str, tmp_path: Path, third_party: tuple[Path, ModelCard], shell: Shell
+) -> None:
     """Its shell and editors write these, such as for ``edgeperc info pointseg --json > card.json``."""
     path, card = third_party
-    (tmp_path / "card.json").write_text(replace(card, version="2é").to_json(), encoding=encoding)
-    assert main(["card", str(path), str(tmp_path / "card.json"), str(tmp_path / "out.onnx")]) == 0
+    shell.out(*card_command(tmp_path, path, replace(card, version="2é"), encoding))
     assert ModelCard.read(tmp_path / "out.onnx").version == "2é"
 
 
-def test_a_card_that_is_no_text_is_named(
-    tmp_path: Path, third_party: tuple[Path, ModelCard], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_card_that_is_no_text_is_named(tmp_path: Path, third_party: tuple[Path, ModelCard], shell: Shell) -> None:
+    command = card_command(tmp_path, *third_party)
     (tmp_path / "card.json").write_bytes('{"name": "é"}'.encode("latin-1"))
-    assert main(["card", str(third_party[0]), str(tmp_path / "card.json"), str(tmp_path / "out.onnx")]) == 2
-    assert "card.json: 'utf-8' codec can't decode byte 0xe9" in capsys.readouterr().err
+    assert "card.json: 'utf-8' codec can't decode byte 0xe9" in shell.err(*command)
 
 
 def test_weights_have_the_terms_of_their_scans() -> None:
@@ -1085,20 +1082,18 @@ def test_a_card_replaces_an_existing_one(tmp_path: Path, third_party: tuple[Path
 
 
 @pytest.mark.usefixtures("small_views")
-def test_the_command_line_from_scans_to_a_model(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_line_from_scans_to_a_model(tmp_path: Path, shell: Shell) -> None:
     data, run, model = tmp_path / "data", tmp_path / "run", tmp_path / "pointseg.onnx"
-    assert main(["simulate", str(data), "-n", "2"]) == 0
-    assert main(["simulate", str(tmp_path), "-n", "1", "--sensor", "vlp-16", "--where", "yard"]) == 0
+    shell.out("simulate", data, "-n", "2")
+    shell.out("simulate", tmp_path, "-n", "1", "--sensor", "vlp-16", "--where", "yard")
     yard = simulated_scan(0, "vlp-16", where="yard", clumped_leaves=True)
     np.testing.assert_array_equal(LabeledScan.load(tmp_path / "000000.npz").points, yard.points)
-    assert main(["simulate", str(tmp_path), "-n", "1", "--layouts", str(tmp_path), "--where", "yard"]) == 2
-    assert "layouts are those of streets, and the place is a yard; leave them out" in capsys.readouterr().err
+    said = shell.err("simulate", tmp_path, "-n", "1", "--layouts", tmp_path, "--where", "yard")
+    assert "layouts are those of streets, and the place is a yard; leave them out" in said
     arguments = ["--steps", "1", "--batch", "1", "--threads", "1", "--edge"]
-    assert main(["train", "pointseg", str(run), "--simulated", str(data), *arguments]) == 0
-    assert main(["export", str(run / "checkpoint.pt"), str(model)]) == 0
-    assert main(["verify", str(run / "checkpoint.pt"), str(model)]) == 0
-    shown = capsys.readouterr().out
-    assert "parity" in shown
+    shell.out("train", "pointseg", run, "--simulated", data, *arguments)
+    assert "parity" in shell.out("export", run / "checkpoint.pt", model)
+    shown = shell.out("verify", run / "checkpoint.pt", model)
     assert '"n_scans": 4' in shown
     assert Session(model, "cpu").card.fitness is not None
 

@@ -15,9 +15,9 @@ onnx = pytest.importorskip("onnx")
 
 from training_helpers import ablate
 
-from cli_helpers import parsers
+from cli_helpers import Shell, parsers
 from edgeperc.zoo import model_path
-from edgeperc_export.cli import build_parser, main, recipe_of
+from edgeperc_export.cli import build_parser, recipe_of
 from edgeperc_export.networks import build
 from edgeperc_export.recipe import MODELS, NETWORKS, Recipe
 
@@ -44,11 +44,8 @@ def test_every_option_has_a_help_text() -> None:
         (["train", "pointseg", "out", "--kitty", "root"], "--kitty root (did you mean --kitti?)"),
     ],
 )
-def test_mistyped_words_name_the_nearest(words: list[str], close: str, capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as caught:
-        main(words)
-    assert caught.value.code == 2
-    assert close in capsys.readouterr().err
+def test_mistyped_words_name_the_nearest(words: list[str], close: str, shell: Shell) -> None:
+    assert close in shell.err(*words)
 
 
 def test_help_and_recipes_load_no_torch() -> None:
@@ -111,22 +108,18 @@ def test_every_field_of_a_recipe_is_an_option() -> None:
         (["kulseg", "--dropout", "1"], "--dropout is 1.0; expected 0 to 0.999"),
     ],
 )
-def test_an_option_without_effect_is_refused(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], message: str
-) -> None:
-    assert main(["train", arguments[0], str(tmp_path), *arguments[1:]]) == 2
-    assert message in capsys.readouterr().err
+def test_an_option_without_effect_is_refused(tmp_path: Path, shell: Shell, arguments: list[str], message: str) -> None:
+    assert message in shell.err("train", arguments[0], tmp_path, *arguments[1:])
 
 
-def test_wrong_usage_is_reported_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_wrong_usage_is_reported_in_one_line(tmp_path: Path, shell: Shell) -> None:
     with pytest.raises(
         ValueError, match="kulseg has no network for small computers; expected lodnn or pointseg or ssadnet"
     ):
         build(Recipe("kulseg", edge=True))
     with pytest.raises(ValueError, match="network is 'yolo'; expected camseg, fcn16, fcn8, kulseg, lodnn, objects"):
         build(Recipe("yolo"))
-    assert main(["verify", str(tmp_path / "no.pt"), str(tmp_path / "no.onnx")]) == 2
-    assert "no.pt" in capsys.readouterr().err
+    assert "no.pt" in shell.err("verify", tmp_path / "no.pt", tmp_path / "no.onnx")
     arguments = {"kitti": tmp_path, "simulated": tmp_path, "start_from": None, "fold": 0, "steps": 1}
     with pytest.raises(ValueError, match="pointseg has no variant 'half'; expected one of: as shipped; nothing pasted"):
         ablate("pointseg", tmp_path, **arguments, variants=["half"])
@@ -143,10 +136,8 @@ def test_wrong_usage_is_reported_in_one_line(tmp_path: Path, capsys: pytest.Capt
         (["ablate", "camvid", "out", "--size", "0x90"], 1),
     ],
 )
-def test_counts_have_a_least_value(words: list[str], least: int, capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit):
-        main(words)
-    assert f"{words[-1].partition('x')[0]} is too small; expected {least} or more" in capsys.readouterr().err
+def test_counts_have_a_least_value(words: list[str], least: int, shell: Shell) -> None:
+    assert f"{words[-1].partition('x')[0]} is too small; expected {least} or more" in shell.err(*words)
 
 
 @pytest.mark.parametrize(

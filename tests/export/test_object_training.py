@@ -18,6 +18,7 @@ onnx = pytest.importorskip("onnx")
 from filelock import FileLock, Timeout
 from training_helpers import interrupted_in_step
 
+from cli_helpers import Shell
 from edgeperc.datasets.scan_folder import ScanFolder
 from edgeperc.errors import ModelError, PointsError
 from edgeperc.ground.planes import find_ground
@@ -34,7 +35,6 @@ from edgeperc.types.points import Floats, read_only
 from edgeperc.types.sensor import get_sensor
 from edgeperc.zoo import model_path
 from edgeperc_export.cards import OBJECT_CLASSES, OBJECT_VIEW
-from edgeperc_export.cli import main
 from edgeperc_export.data.scans import LabeledScan
 from edgeperc_export.networks import build
 from edgeperc_export.networks.objects import ObjectNet, parts_of, rejected
@@ -323,7 +323,7 @@ def test_a_run_starts_from_the_shipped_model(samples: ObjectSamples) -> None:
 
 
 def test_without_a_detector_candidates_are_groups(
-    labeled: LabeledScan, scans: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    labeled: LabeledScan, scans: Path, tmp_path: Path, shell: Shell
 ) -> None:
     """The network is exported by the command line, too; what the networks of others found is no part of it."""
     recipe = replace(RECIPE, steps=1, detector=False)
@@ -333,8 +333,7 @@ def test_without_a_detector_candidates_are_groups(
     np.testing.assert_array_equal(found.rectangles, alone.rectangles)
     assert not (tmp_path / "object-samples").exists()
     path = tmp_path / "objects.onnx"
-    assert main(["export", str(checkpoint), str(path), "--name", "mine"]) == 0
-    assert "mine 1.0.0, parity" in capsys.readouterr().out
+    assert "mine 1.0.0, parity" in shell.out("export", checkpoint, path, "--name", "mine")
     assert ModelCard.read(path).fitness is None
 
 

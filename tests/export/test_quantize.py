@@ -15,6 +15,7 @@ onnx = pytest.importorskip("onnx")
 
 from torch import Tensor, nn
 
+from cli_helpers import Shell
 from edgeperc.datasets.kitti import KittiObjects
 from edgeperc.datasets.splits import in_split
 from edgeperc.errors import ModelError, PointsError, SplitError
@@ -26,7 +27,6 @@ from edgeperc.simulation.scene import POINT_CLASSES
 from edgeperc.types.card import InputSpec, ModelCard, OutputSpec
 from edgeperc.types.views import RangeImageGeometry
 from edgeperc.zoo import model_path
-from edgeperc_export import cli
 from edgeperc_export.release import quantize as module
 from edgeperc_export.release.quantize import Calibration, LabeledSets, RefusedError, calibration_scans, quantize
 from edgeperc_export.release.to_onnx import to_graph, with_golden, write_card
@@ -295,13 +295,12 @@ def test_unpooling_is_not_rounded_on_one_side(tmp_path: Path, scans: list[np.nda
     assert fp32.noise([n.name for n in fp32.model.graph.node if "inner.weight" in n.input]) < 0.1
 
 
-def test_no_scans_is_an_error(tmp_path: Path, small: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_no_scans_is_an_error(tmp_path: Path, small: Path, shell: Shell) -> None:
     with pytest.raises(PointsError, match="no scan to calibrate on"):
         calibration_scans([])
     (tmp_path / "empty").mkdir()
     words = ["quantize", str(small), str(tmp_path / "o.onnx"), "--scans", str(tmp_path / "empty")]
-    assert cli.main(words) == 2
-    assert "no scan to calibrate on in " in capsys.readouterr().err
+    assert "no scan to calibrate on in " in shell.err(*words)
     with pytest.raises(PointsError, match="expected at least one"):
         quantize(small, tmp_path / "o.onnx", Calibration([]), LabeledSets())
 
@@ -340,23 +339,17 @@ def test_calibration_on_kitti_takes_only_training_drives(kitti_root: Path) -> No
 
 
 def test_the_command_exits_with_1_if_it_refuses_and_0_if_it_writes(
-    tmp_path: Path,
-    small: Path,
-    scans: list[np.ndarray],
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path, small: Path, scans: list[np.ndarray], monkeypatch: pytest.MonkeyPatch, shell: Shell
 ) -> None:
     out, scan = tmp_path / "int8.onnx", tmp_path / "scan.bin"
     scans[0].tofile(scan)
     arguments = ["quantize", str(small), str(out), "--scans", str(scan), "--simulated", "2", "--evaluate-on", "1"]
     monkeypatch.setattr(module.quantize, "__kwdefaults__", {**quantize.__kwdefaults__, "race": timed(5.0, 5.0)})
-    assert cli.main(arguments) == 1
-    assert "not faster here" in capsys.readouterr().err
+    assert "not faster here" in shell.err(*arguments, code=1)
     assert not out.exists()
     settings = {**quantize.__kwdefaults__, "race": FASTER, "max_noise": 9.0}
     monkeypatch.setattr(module.quantize, "__kwdefaults__", settings)
-    assert cli.main(arguments) == 0
-    printed = capsys.readouterr().out.splitlines()
+    printed = shell.out(*arguments).splitlines()
     assert "small 1.0.0, kept in fp32: " in printed[0]
     assert json.loads(printed[1])["n_scans"] == 4
 

@@ -12,8 +12,6 @@ from numpy.typing import NDArray
 
 from .running import Case
 
-__all__ = ["MUTATIONS", "base_scan", "hostile_scan"]
-
 Points = NDArray[Any]
 
 EXTREMES = np.array(

@@ -43,8 +43,6 @@ from .mutate import mutated_bytes, mutated_json, noise
 from .running import Case, check, peak_mb, reset_peak
 from .seeds import Seed, data_root, real_seeds, scan_files, synthetic_seeds
 
-__all__ = ["LIMIT_MB", "LIMIT_S", "Captures", "make"]
-
 LIMIT_S, LIMIT_MB = 65.0, 2700.0  # 60 s and 2 GiB of data for the process that decodes
 END_TO_END_EVERY = 1000
 # In place of 60 s. Some damaged .osf files never end in the library; the others take 4 ms.

@@ -38,8 +38,6 @@ from .running import Case, check, peak_mb, reset_peak
 from .scans import MadeUp, cards, perceiver_of
 from .tiny import GRAPH, model
 
-__all__ = ["LIMIT_MB", "LIMIT_S", "Commands", "make"]
-
 LIMIT_S, LIMIT_MB = 30.0, 2500.0
 CODES = {0, 1, 2, 130, 141, 143}
 MODEL = "lodnn:int8"

@@ -27,8 +27,6 @@ from .mutate import mutated_bytes, mutated_document
 from .running import Case, check, one_of
 from .scans import MadeUp, perceiver_of
 
-__all__ = ["LIMIT_MB", "LIMIT_S", "Images", "make"]
-
 LIMIT_S, LIMIT_MB = 10.0, 2000.0  # an image of 2**26 pixels takes 200 MB, decoded and converted 600 MB
 SIZES = ((32, 24), (4, 4), (60, 8), (480, 360))
 LARGEST = 2**18  # pixels of nearly all cases

@@ -27,8 +27,6 @@ from .running import Case, check, one_of
 from .scans import MadeUp, check_perception, perceiver_of
 from .tiny import CARD, GRAPH, boxed_card, image_card, model
 
-__all__ = ["LIMIT_MB", "LIMIT_S", "Models", "make"]
-
 LIMIT_S, LIMIT_MB = 40.0, 2500.0  # a first run may take 30 s
 POINTS = np.random.default_rng(5).uniform(-20.0, 20.0, (300, 4)).astype(np.float32)
 POINTS[:, 3] %= 1.0

@@ -11,17 +11,6 @@ from tiny_model import varint
 
 from .running import Case
 
-__all__ = [
-    "mutated_bytes",
-    "mutated_document",
-    "mutated_json",
-    "mutated_message",
-    "mutated_words",
-    "noise",
-    "parse",
-    "unparse",
-]
-
 MAGIC_BYTES = [0x00, 0xFF, 0x7F, 0x80, 0x01, 0x20, 0x0A]
 MAGIC_WORDS = [0, 1, 0x7F, 0x80, 0xFF, 0x100, 0x7FFF, 0x8000, 0xFFFF, 0x10000, 0x7FFFFFFF, 0x80000000, 0xFFFFFFFF]
 

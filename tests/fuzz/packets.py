@@ -28,8 +28,6 @@ from edgeperc.readers.spinning_packets import (
 from .mutate import mutated_bytes, mutated_json
 from .running import Case, check
 
-__all__ = ["LIMIT_MB", "LIMIT_S", "Packets", "make"]
-
 LIMIT_S, LIMIT_MB = 5.0, 1500.0
 N_PACKETS = 100
 THROUGH_STREAM = 10  # of them

@@ -36,8 +36,6 @@ from .mutate import mutated_bytes, mutated_words, noise
 from .running import Case, check
 from .seeds import Seed, scan_files, synthetic_seeds
 
-__all__ = ["LIMIT_MB", "LIMIT_S", "READERS", "Readers", "make"]
-
 LIMIT_S, LIMIT_MB = 20.0, 2700.0
 CAPTURES = {
     "bag1": ("bag1",), "bag2": ("bag2",), "mcap": ("mcap", "chunked"), "velodyne": ("velodyne",), "lidar": ("lidar",),

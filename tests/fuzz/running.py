@@ -32,11 +32,6 @@ import numpy as np
 from edgeperc.errors import EdgepercError
 from edgeperc.system.atomic import write_atomic
 
-__all__ = [
-    "Case", "Failure", "Kind", "State", "attempt", "check", "peak_mb", "reset_peak", "run_job", "summary_of",
-    "supervise",
-]  # fmt: skip
-
 HANG_FACTOR = 6.0  # a case that takes this many times the limit is stopped from outside
 MAX_FAILURES = 200  # kept in a state file; all are counted
 NOW = struct.Struct("<qd")  # index of the current case, -1 before the first; monotonic time at its start

@@ -28,8 +28,6 @@ from edgeperc.zoo import resolve
 from .arrays import hostile_scan, save
 from .running import Case, check
 
-__all__ = ["LIMIT_MB", "LIMIT_S", "check_perception", "check_tracks", "make", "perceiver_of"]
-
 LIMIT_S, LIMIT_MB = 10.0, 1500.0
 BLOCK = 100  # cases with one perceiver
 HONEST_EVERY, HONEST_CASES = 50, 10  # in every 50th block, ten cases have real networks, which are slow

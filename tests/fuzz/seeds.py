@@ -18,8 +18,6 @@ import test_files as file_tests
 import test_packet_messages as message_tests
 import test_pcap as pcap_tests
 
-__all__ = ["Seed", "real_seeds", "synthetic_seeds"]
-
 
 @dataclass(frozen=True)
 class Seed:

@@ -10,8 +10,6 @@ from edgeperc.types.card import CHANNELS, InputSpec, ModelCard, OutputSpec
 from edgeperc.types.views import RangeImageGeometry
 from edgeperc.zoo import resolve
 
-__all__ = ["CARD", "GRAPH", "boxed_card", "image_card", "model"]
-
 CARD = replace(tiny_model.tiny_card(), fitness=resolve("lodnn")[0].card.fitness)
 GRAPH = tiny_model.graph(tiny_model.CONVOLUTION, tiny_model.INITIALIZER)
 

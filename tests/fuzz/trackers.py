@@ -12,8 +12,6 @@ from edgeperc.errors import TrackingError
 from .running import Case
 from .scans import check_tracks
 
-__all__ = ["LIMIT_MB", "LIMIT_S", "Trackers", "make"]
-
 LIMIT_S, LIMIT_MB = 20.0, 1500.0
 FAR = [0.0, 1e-300, 1e-9, 1.0, 50.0, 1e3, 1e6, 1e9, 1e15, 1e30, 1e100, 1e154, 1e155, 1e200, 1e300, 1.7e308]
 BAD = [float("nan"), float("inf"), -float("inf"), 10**400, None, "1", True, 1j]

@@ -19,7 +19,7 @@ import pillar_networks as networks
 from pillar_networks import CENTER_HEAD, DECORATED, KINDS, STRIDE, VIEW, PillarNet, card_of
 
 import twins.decode
-from cli_helpers import run
+from cli_helpers import Shell
 from edgeperc import Perceiver, Tracker
 from edgeperc.errors import CardMismatchError, InferenceError, ProviderError
 from edgeperc.inference.detections import decode_detections
@@ -305,21 +305,16 @@ def test_clusters_alone_leave_the_detector_out(models: dict[str, Path], points: 
     assert with_detector.boxes == Perceiver("pointseg", **options)(points).boxes  # type: ignore[arg-type]
 
 
-def test_the_command_line(
-    models: dict[str, Path], points: NDArray[np.float32], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert run("info", models["anchors"]) == 0
-    shown = capsys.readouterr().out
+def test_the_command_line(models: dict[str, Path], points: NDArray[np.float32], tmp_path: Path, shell: Shell) -> None:
+    shown = shell.out("info", models["anchors"])
     for text in ("pillars: x 0..25.6 m", "anchors: Car as car", "1.73 m above", "boxes in its range"):
         assert text in shown
     points.tofile(tmp_path / "scan.bin")
-    options = ("--json", "--png", "--out", tmp_path / "out", "--anyway")
-    assert run("run", tmp_path / "scan.bin", "--model", models["anchors"], "--provider", "cpu", *options) == 0
+    words = (tmp_path / "scan.bin", "--model", models["anchors"], "--provider", "cpu", "--anyway")
+    (document,) = shell.records("run", *words, "--png", "--out", tmp_path / "out")
     assert [*(tmp_path / "out").glob("*.png")]
-    document = json.loads(capsys.readouterr().out.splitlines()[0])
     assert document["boxes"]
-    assert run("run", tmp_path / "scan.bin", "--model", models["anchors"], "--provider", "cpu", "--anyway") == 0
-    assert re.search(rf"{len(points):,} points  [\d.]+ ms  boxes: \d+ ", capsys.readouterr().out)
+    assert re.search(rf"{len(points):,} points  [\d.]+ ms  boxes: \d+ ", shell.out("run", *words))
     assert {box["label"] for box in document["boxes"]} <= {*KINDS}
 
 

@@ -15,7 +15,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 import twins.condition
-from edgeperc import Perceiver, cli
+from cli_helpers import Shell
+from edgeperc import Perceiver
 from edgeperc.datasets.kitti import scan_hash
 from edgeperc.errors import PointsError, SensorError, SplitError
 from edgeperc.evaluation.transfer import compare
@@ -497,7 +498,7 @@ def test_rendered_scan_gives_the_reference_result() -> None:
     assert changed * 10 < changed_plain
 
 
-def test_adapt_fit_writes_what_run_takes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_adapt_fit_writes_what_run_takes(tmp_path: Path, shell: Shell) -> None:
     scans, out = tmp_path / "scans", tmp_path / "profiles" / "mine.json"
     scans.mkdir()
     for k in range(2):
@@ -505,8 +506,7 @@ def test_adapt_fit_writes_what_run_takes(tmp_path: Path, capsys: pytest.CaptureF
         scan[:, 3] = np.rint(np.expm1((scan[:, 3] + 0.1) / 0.15))
         scan.tofile(scans / f"{k}.bin")
     fit = ["fit-sensor", str(scans), "--sensor", "vlp-16", "--to", "hdl-64e", "--out", str(out)]
-    assert cli.main(fit) == 0
-    found = capsys.readouterr().out.splitlines()
+    found = shell.out(*fit).splitlines()
     kinds = [line.split()[0] for line in found]
     assert kinds[0] == "logarithm"
     assert sorted(kinds) == ["linear", "logarithm", "polynomial", "power", "written"]
@@ -516,16 +516,12 @@ def test_adapt_fit_writes_what_run_takes(tmp_path: Path, capsys: pytest.CaptureF
     assert profile.remission.source == "quantiles by range and incidence of 2 scans"
     out.write_text(replace(profile, mounting=MODEL_MOUNTING).to_json())  # nothing else changes the scan
     run = ["run", str(scans / "0.bin"), "--sensor", str(out), "--model", "pointseg", "--provider", "cpu", "--json"]
-    assert cli.main([*run, "--on-mismatch", "ignore"]) == 0
-    assert "adapt" in json.loads(capsys.readouterr().out)["stage_ms"]
-    assert cli.main([*run, "--on-mismatch", "ignore", "--adapt", "none"]) == 0
-    assert "adapt" not in json.loads(capsys.readouterr().out)["stage_ms"]
+    assert "adapt" in json.loads(shell.out(*run, "--on-mismatch", "ignore"))["stage_ms"]
+    assert "adapt" not in json.loads(shell.out(*run, "--on-mismatch", "ignore", "--adapt", "none"))["stage_ms"]
     for wrong in ([*fit[:-1], str(tmp_path / "mine.txt")], [*fit[:3], "vlp-17", *fit[4:]], [*fit[:5], "x", *fit[6:]]):
-        assert cli.main(wrong) == 2
-        assert capsys.readouterr().err.startswith("edgeperc: ")
+        assert shell.err(*wrong).startswith("edgeperc: ")
     (tmp_path / "none").mkdir()
-    assert cli.main(["fit-sensor", str(tmp_path / "none"), *fit[2:]]) == 2
-    assert "no scan in this folder" in capsys.readouterr().err
+    assert "no scan in this folder" in shell.err("fit-sensor", tmp_path / "none", *fit[2:])
 
 
 def test_eval_sensors_counts_test_drives_only(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -570,7 +566,7 @@ def test_eval_sensors_finds_the_mounting_of_each_drive(tmp_path: Path) -> None:
 
 
 def test_eval_sensors_measures_points_where_the_objects_network_was_trained(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, shell: Shell
 ) -> None:
     (tmp_path / "velodyne").mkdir()
     (tmp_path / "label").mkdir()
@@ -580,13 +576,12 @@ def test_eval_sensors_measures_points_where_the_objects_network_was_trained(
     (tmp_path / "scans.json").write_text(json.dumps({"schema": 1, "sensor": "hdl-64e", "boxes": {"*": "ignore"}}))
     seen = {"objects 1": {scan_hash(scan.points)}}
     monkeypatch.setattr("edgeperc.evaluation.judge.training_scans_of", lambda cards: seen)
-    assert cli.main(["eval-sensors", str(tmp_path)]) == 0
-    printed = capsys.readouterr().out
+    printed = shell.out("eval-sensors", tmp_path)
     assert "no boxes: objects 1 was trained on scan a of drive" in printed
     assert "IoU of points" in printed
 
 
-def test_eval_sensors(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_eval_sensors(tmp_path: Path, shell: Shell) -> None:
     """Two simulated scans, and the same street as boxes and as range images."""
     scan = urban(4)
     boxes, images = tmp_path / "boxes", tmp_path / "images"
@@ -614,8 +609,7 @@ def test_eval_sensors(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Non
 
     datasets = ["os1-64=simulation:1", f"hdl-64e={boxes}", f"hdl-64e={images}"]
     out = tmp_path / "figures.json"
-    assert cli.main(["eval-sensors", *datasets, "--json", str(out)]) == 0
-    printed = capsys.readouterr().out
+    printed = shell.out("eval-sensors", *datasets, "--json", out)
     assert printed.count("none") == printed.count("both") == 3
     figures = json.loads(out.read_text())
     simulated, boxed, pictured = (figures[name] for name in datasets)
@@ -637,8 +631,7 @@ def test_eval_sensors(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Non
         assert found["both"]["iou"]["car"] > 0.5
     assert pictured["both"]["iou"]["cyclist"] is None  # two-wheelers are not found apart from their riders
     for source in ("vlp-16", "vlp-16=simulation:0", f"vlp-16={tmp_path}", "vlp-17=simulation"):
-        assert cli.main(["eval-sensors", source]) == 2
-        assert capsys.readouterr().err.startswith("edgeperc: ")
+        assert shell.err("eval-sensors", source).startswith("edgeperc: ")
 
 
 def test_a_model_without_points_is_refused() -> None:

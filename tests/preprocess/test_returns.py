@@ -16,7 +16,8 @@ from hypothesis.extra import numpy as hnp
 from numpy.typing import NDArray
 
 import twins.returns
-from edgeperc import FitnessError, Mounting, Perceiver, SensorError, cli, deskew, merge, occupancy_grid, read_points
+from cli_helpers import Shell
+from edgeperc import FitnessError, Mounting, Perceiver, SensorError, deskew, merge, occupancy_grid, read_points
 from edgeperc.errors import OptionError
 from edgeperc.preprocess.condition import condition
 from edgeperc.preprocess.ego import suggest_ego_box
@@ -269,17 +270,15 @@ def test_merged_scans_have_no_beams_without_a_return(street: Points) -> None:
         merge([points, points], poses, min_range_m=(0.5,))
 
 
-def test_info_counts_and_takes_a_box(street: Points, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_info_counts_and_takes_a_box(street: Points, tmp_path: Path, shell: Shell) -> None:
     file, profile = tmp_path / "scan.npy", tmp_path / "mine.json"
     np.save(file, np.vstack([street, on_a_ray(4400, 0.001, 0.45), np.float32([[1, 0, -1, 9]])]))
     box = ["--ego-box", "-1.5", "2", "-1", "1", "-1.5", "-0.2"]
-    assert cli.main(["info", str(file), "--sensor", "vlp-16", "--json", "--write", str(profile), *box]) == 0
-    document = json.loads(capsys.readouterr().out)
+    (document,) = shell.records("info", file, "--sensor", "vlp-16", "--write", profile, *box)
     assert (document["n_not_finite"], document["n_too_near"], document["n_ego"]) == (0, 4400, 1)
     assert document["range_m"][0] > 1.0
     assert get_sensor(profile).ego_box == BOX
-    assert cli.main(["info", str(file), "--sensor", str(profile)]) == 0
-    printed = " ".join(capsys.readouterr().out.split())
+    printed = " ".join(shell.out("info", file, "--sensor", profile).split())
     assert "4,400 at most 0.5 m from the sensor, not returns, 1 inside the box" in printed
 
 

@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from test_captures import POINTS, write_bag1, write_bag2, write_mcap
 from test_captures import ouster as ouster
 
-from cli_helpers import run
+from cli_helpers import Shell, run
 from edgeperc.errors import EdgepercError, PointsError, SensorError
 from edgeperc.live import stream
 from edgeperc.readers.captures import known_sensor, read_scans, sensor_of
@@ -355,29 +355,25 @@ def test_run_reads_each_capture_as_its_sensor(
 
 
 @pytest.mark.filterwarnings("default:.*--sensor says:UserWarning")
-def test_run_believes_the_user(tmp_path: Path, made: list[Any], capsys: pytest.CaptureFixture[str]) -> None:
+def test_run_believes_the_user(tmp_path: Path, made: list[Any], shell: Shell) -> None:
     pytest.importorskip("velodyne_decoder")
     known, unknown = (write_pcap(tmp_path / f"{k}.pcap", velodyne(k)) for k in (0x22, 0))
-    assert run("run", known, unknown, "--sensor", "os1-64") == 1
+    errors = shell.err("run", known, unknown, "--sensor", "os1-64", code=1)
     assert [get_sensor(sensor).name for sensor in made] == ["os1-64"]
-    errors = capsys.readouterr().err
     assert errors.count("warning") == 1
     assert f"{known}: --sensor says os1-64, the capture vlp-16 (named by the packets)" in errors
-    assert run("run", known, "--sensor", "vlp-16") == 1
-    assert "warning" not in capsys.readouterr().err
+    assert "warning" not in shell.err("run", known, "--sensor", "vlp-16", code=1)
 
 
-def test_info_tells_how_the_sensor_is_known(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_info_tells_how_the_sensor_is_known(tmp_path: Path, shell: Shell) -> None:
     pytest.importorskip("velodyne_decoder")
     path = write_pcap(tmp_path / "a.pcap", vlp16_packets(1.5))
-    assert run("info", path, "--json") == 0  # all of it is as far away as the walls of a hall
-    document = json.loads(capsys.readouterr().out)
+    (document,) = shell.records("info", path)  # all of it is as far away as the walls of a hall
     assert (document["sensor"], document["sensor_from"]) == ("vlp-16", "named by the packets")
-    assert run("info", write_pcap(tmp_path / "b.pcap", velodyne(0))) == 1
-    assert "do not name the model" in capsys.readouterr().err
+    assert "do not name the model" in shell.err("info", write_pcap(tmp_path / "b.pcap", velodyne(0)), code=1)
     POINTS.tofile(tmp_path / "c.bin")
-    assert run("info", tmp_path / "c.bin") == 1  # run refuses it
-    assert "hdl-64e: the default: too few points to tell" in capsys.readouterr().out
+    shown = shell.out("info", tmp_path / "c.bin", code=1)  # run refuses it
+    assert "hdl-64e: the default: too few points to tell" in shown
 
 
 def test_a_stream_warns_of_another_sensor(tmp_path: Path) -> None:

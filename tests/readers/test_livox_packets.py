@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from test_captures import error_of, read_until_error
 
 import twins.packets
-from cli_helpers import run
+from cli_helpers import Shell, run
 from edgeperc import Motion, SensorError, accumulate, deskew, read_scans, read_timed_scans, sensor_of
 from edgeperc.readers.livox_packets import LivoxStream, Points, fill_points, points_of
 from edgeperc.readers.times import TimedScan
@@ -99,15 +99,14 @@ def test_lvx2_files_that_are_cut_short(tmp_path: Path) -> None:
     assert "an .lvx file of version 1, which is not read; save it as .lvx2" in error_of(path)
 
 
-def test_a_livox_does_not_spin(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_livox_does_not_spin(tmp_path: Path, shell: Shell) -> None:
     packets = livox_packets(1, *scene(96 * 300), False)
     capture, file = write_pcap(tmp_path / "a.pcap", packets), tmp_path / "a.lvx2"
     file.write_bytes(lvx2_file(packets))
     for path in (capture, file):
         with pytest.raises(SensorError, match="of a Livox sensor, which does not spin"):
             sensor_of(path)
-        assert run("run", path) == 1
-        assert "which does not spin" in (said := capsys.readouterr().err)
+        assert "which does not spin" in (said := shell.err("run", path, code=1))
         assert "--sensor: mid-360, hap, avia" in said or "--sensor mid-360, hap, avia" in said
 
 
@@ -181,7 +180,7 @@ def street() -> tuple[np.ndarray, np.ndarray]:
 )
 def test_a_capture_without_turns_is_run_gathered(
     tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
+    shell: Shell,
     street: tuple[np.ndarray, np.ndarray],
     name: str,
     options: list[object],
@@ -193,8 +192,7 @@ def test_a_capture_without_turns_is_run_gathered(
     if name.endswith("lvx2"):
         path.write_bytes(lvx2_file(packets))
     given = ["--sensor", "mid-360", "--mount-height", 1.73, "--roll", 0, "--pitch", 0, "--json", *options]
-    assert run("run", path, *given) == 0
-    said = capsys.readouterr()
+    said = shell.both("run", path, *given)
     answers = [json.loads(line) for line in said.out.splitlines()]
     assert f"the points of the last {gathered_s:g} s are taken as seen from one place" in said.err
     expected = list(read_scans(path, accumulate_s=gathered_s))
@@ -224,12 +222,9 @@ def test_gathered_captures_are_straightened_by_poses(tmp_path: Path, street: tup
         (["--sensor", "hap", "--accumulate", "0.001"], "expected a number from 0.01 to 10"),
     ],
 )
-def test_what_is_not_gathered(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], options: list[str], said: str
-) -> None:
+def test_what_is_not_gathered(tmp_path: Path, shell: Shell, options: list[str], said: str) -> None:
     path = write_pcap(tmp_path / "a.pcap", livox_packets(1, *scene(96 * 300), False))
-    assert run("run", path, *options) == 2
-    assert said in capsys.readouterr().err
+    assert said in shell.err("run", path, *options)
 
 
 @pytest.mark.parametrize("options", [[], ["--sensor", "auto"], ["--sensor", "auto", "--live"]])

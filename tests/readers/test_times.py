@@ -22,7 +22,7 @@ from test_motion import write_tum
 
 import edgeperc
 import twins.motion
-from cli_helpers import run
+from cli_helpers import Shell, run
 from edgeperc import Motion, TimedScan, Trajectory, accumulate, deskew, read_timed_scans
 from edgeperc.cli.straighten import Straightener
 from edgeperc.errors import OptionError, PointsError, StampError
@@ -430,7 +430,7 @@ def test_a_scan_that_the_poses_do_not_cover_fails_alone(tmp_path: Path, capsys: 
 
 @pytest.mark.filterwarnings("default:--deskew")
 @pytest.mark.parametrize("by", ["--poses", "--track"])
-def test_run_with_deskew(by: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_run_with_deskew(by: str, tmp_path: Path, shell: Shell) -> None:
     pytest.importorskip("onnxruntime")
     path = drive(tmp_path / "drive.bag", [1700.0, 1700.1, 1700.2])
     times = 1699.5 + 0.1 * np.arange(10)
@@ -438,8 +438,7 @@ def test_run_with_deskew(by: str, tmp_path: Path, capsys: pytest.CaptureFixture[
     options = ["--poses", tmp_path / "poses.txt"] if by == "--poses" else ["--track"]
     options += ["--model", "pointseg", "--sensor", "hdl-64e", "--on-mismatch", "ignore"]
     options += ["--ply", "--out", tmp_path / "out"]
-    assert run("run", path, "--deskew", *options) == 0
-    assert ("first two scans" in capsys.readouterr().err) == (by == "--track")
+    assert ("first two scans" in shell.err("run", path, "--deskew", *options, code=0)) == (by == "--track")
     off = [off_the_walls(edgeperc.read_points(file)) for file in sorted((tmp_path / "out").rglob("*.ply"))]
     assert len(off) == 3
     if by == "--poses":
@@ -476,7 +475,7 @@ def test_gathered_scans_of_a_sensor_that_moves_are_straight(motion: Any, accumul
 
 @pytest.mark.compiled
 @pytest.mark.filterwarnings("default::UserWarning")
-def test_a_livox_that_moves_is_run_straight(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_livox_that_moves_is_run_straight(tmp_path: Path, shell: Shell) -> None:
     """Packets of 0.3 s in the room, gathered and straightened by poses."""
     pytest.importorskip("onnxruntime")
     times = T0_S + np.arange(96 * 625) / 200_000.0
@@ -488,8 +487,7 @@ def test_a_livox_that_moves_is_run_straight(tmp_path: Path, capsys: pytest.Captu
     write_tum(tmp_path / "poses.txt", ends, [pose_at(t - times[-1]) for t in ends])
     given = ["--sensor", "mid-360", "--accumulate", 0.2, "--on-mismatch", "ignore", "--model", "pointseg"]
     out = ["--deskew", "--poses", tmp_path / "poses.txt", "--ply", "--out", tmp_path / "out"]
-    assert run("run", path, *given, *out) == 0
-    assert "seen from one place" not in capsys.readouterr().err
+    assert "seen from one place" not in shell.err("run", path, *given, *out, code=0)
     last = edgeperc.read_points(sorted((tmp_path / "out").rglob("*.ply"))[-1])
     assert len(last) == pytest.approx(40_000, rel=0.06)
     assert off_the_walls(last) < 0.02

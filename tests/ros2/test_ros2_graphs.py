@@ -24,6 +24,7 @@ pytest.importorskip("rosbags")
 
 from ros2_helpers import MESSAGES, Perceive, cloud, odometry, scans
 
+from cli_helpers import Shell
 from edgeperc import MissingExtraError, OptionError, Perceiver, SensorError, Tracker
 from edgeperc.cli.main import main
 from edgeperc.records import PerceivedScan
@@ -483,12 +484,9 @@ def test_what_rclpy_refuses(bus: Bus, options: dict[str, Any], said: str, monkey
     ],
 )
 @pytest.mark.filterwarnings("ignore:no detections are published")
-def test_parameters_are_validated(
-    overrides: dict[str, Any], said: str, bus: Bus, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_parameters_are_validated(overrides: dict[str, Any], said: str, bus: Bus, shell: Shell) -> None:
     bus.overrides = overrides
-    assert main(["ros2", "--rclpy", "--ros-args", "-p", "sensor:=x"]) == 2
-    assert said in capsys.readouterr().err
+    assert said in shell.err("ros2", "--rclpy", "--ros-args", "-p", "sensor:=x")
     assert bus.ended == ["/edgeperc"]
 
 

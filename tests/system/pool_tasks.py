@@ -7,8 +7,6 @@ import os
 import time
 from collections.abc import Callable
 
-__all__ = ["dying", "failing", "scaled", "slowest_first", "without_pickle"]
-
 
 def scaled(factor: int, deadly: tuple[int, ...] = ()) -> Callable[[int], int]:
     """What processes make: items times a factor; of some items a process dies, and 7 and 11 cannot be scaled."""
