@@ -25,16 +25,8 @@ from .inference.pillar_network import PillarNetwork
 from .inference.session import Session
 from .objects.boxes import MIN_SCORE
 from .pipeline import Options, Parts, Pipeline, RangeImageNetwork, TopViewNetwork
+from .preprocess import findings
 from .preprocess.condition import scale
-from .preprocess.findings import (
-    Finding,
-    check_beams,
-    check_dropped,
-    check_ground,
-    check_hanging,
-    check_profiles,
-    with_raw_remission,
-)
 from .preprocess.fitness import FitnessProfile
 from .preprocess.health import Normal, check_health, findings_of, without_drops
 from .preprocess.interpolation import Interpolator
@@ -593,9 +585,9 @@ class Perceiver:
 
     def _perceive(self, scan: Points, stamp_s: float | None, watch: Stopwatch, check: bool) -> Perception:
         given, before, matcher, profile = scan, self._estimator, self._remission, self.sensor
-        hidden: tuple[Finding | None, ...] = ()
-        turned: tuple[Finding, ...] = ()
-        matched: tuple[Finding, ...] = ()
+        hidden: tuple[findings.Finding | None, ...] = ()
+        turned: tuple[findings.Finding, ...] = ()
+        matched: tuple[findings.Finding, ...] = ()
         scan, dropped = returns(given, profile, before.known.origin_m)
         if self._renders:
             self._remission, profile, matched = matcher.add(scan)
@@ -604,10 +596,12 @@ class Perceiver:
         watch.lap("adapt" if self._renders and profile.remission is not None else "check")
         roll_deg = before.known.roll_deg
         if check and roll_deg is not None:
-            turned = check_hanging(scan, near_support, share_below, before.known)
+            turned = findings.check_hanging(scan, near_support, share_below, before.known)
         if not before.is_complete and len(scan):
             if check and roll_deg is None:
-                turned = check_beams(scan, profile) or check_ground(scan, near_support, share_below, profile)
+                turned = findings.check_beams(scan, profile) or findings.check_ground(
+                    scan, near_support, share_below, profile
+                )
             try:
                 self._set_mounting(before.add(scan))
                 hidden = self._about_height(), self._about_tilt()
@@ -620,11 +614,11 @@ class Perceiver:
         if not self._frame.is_identity:
             scan = self._frame.move(scan)
             watch.lap("adapt")
-        fitness = check_dropped(given, dropped, profile) if check else ()
+        fitness = findings.check_dropped(given, dropped, profile) if check else ()
         if check and not fitness:
             ceiling_m = find_ceiling(scan, float(self._frame.eye[2]))
-            fitness = turned or check_profiles(scan, self._fitness, profile, self._frame, ceiling_m)
-            fitness = with_raw_remission(fitness, given, profile)
+            fitness = turned or findings.check_profiles(scan, self._fitness, profile, self._frame, ceiling_m)
+            fitness = findings.with_raw_remission(fitness, given, profile)
         if check and not any(finding.gross for finding in fitness):
             fitness = (*fitness, *filter(None, hidden))
         if self.on_mismatch != "ignore":
@@ -675,28 +669,28 @@ class Perceiver:
         watch.lap("check")
         return scan, health, parts or self._pipeline(scan, self._mounting, watch)
 
-    def _without_ground(self, reason: MountingError) -> Finding | None:
+    def _without_ground(self, reason: MountingError) -> findings.Finding | None:
         """What to say of a scan that does not show how the sensor is mounted, if no other scan has."""
         if self.mounting is not None:
             return None
-        return Finding(
+        return findings.Finding(
             f"The mounting of the sensor cannot be estimated ({reason}); it is taken as "
             f"{self._mounting.height_m:g} m above the road and level: pass mounting= (on the command line "
             "--mount-height or --extrinsic)."
         )
 
-    def _about_height(self) -> Finding | None:
+    def _about_height(self) -> findings.Finding | None:
         """What to say of a height that was found from little ground: that of a sensor that is high, or looks up."""
         if not self._estimator.is_height_unsure():
             return None
         found = self._estimator.estimate()
-        return Finding(
+        return findings.Finding(
             f"The sensor seems to be {found.mounting.height_m:.1f} +- {found.height_sd_m:.1f} m above the road. It "
             "sees little of the road near by, and its height may be off by a meter: pass mounting= (on the command "
             "line --mount-height)."
         )
 
-    def _about_tilt(self) -> Finding | None:
+    def _about_tilt(self) -> findings.Finding | None:
         """What to say if the scans suggest a tilt, and their ground is too uneven to be sure."""
         doubtful = self._estimator.doubtful()
         if not doubtful:
@@ -706,25 +700,25 @@ class Perceiver:
             f"{name} of {getattr(found.mounting, f'{name}_deg'):.1f} +- {getattr(found, f'{name}_sd_deg'):.1f} deg"
             for name in (name.removesuffix("_deg") for name in doubtful)
         )
-        return Finding(
+        return findings.Finding(
             f"The ground suggests a {shown}, but it is too uneven to tell a tilt of the sensor from its own slope: "
             "the sensor is taken as level until scans of other places agree. If you know its tilt, pass mounting= "
             "(on the command line --roll, --pitch or --extrinsic)."
         )
 
-    def _about_given_tilt(self, shown: Mounting | None) -> Finding | None:
+    def _about_given_tilt(self, shown: Mounting | None) -> findings.Finding | None:
         """What to say if the ground shows another tilt than was given, as where a sign is wrong."""
         if shown is None:
             return None
         used = self._mounting
-        return Finding(
+        return findings.Finding(
             f"The ground shows a roll of {shown.roll_deg:.1f} and a pitch of {shown.pitch_deg:.1f} deg, and the "
             f"mounting has {used.roll_deg:.1f} and {used.pitch_deg:.1f}: roll is positive if the left side is up, "
             "pitch if x points down. Correct them (mounting=, --roll, --pitch, --extrinsic), or leave them out to have "
             "them found. If the vehicle stands before a ramp, ignore this."
         )
 
-    def _refuse(self, fitness: tuple[Finding, ...]) -> None:
+    def _refuse(self, fitness: tuple[findings.Finding, ...]) -> None:
         """Raise FitnessError if ``on_mismatch`` asks for it."""
         if self.on_mismatch == "raise" and fitness:
             raise FitnessError(" ".join(fitness))

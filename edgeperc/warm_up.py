@@ -32,17 +32,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from .agreement import rules
 from .agreement.cells import agree_on_cells, mark_cells
-from .agreement.rules import (
-    Support,
-    agree_on_boxes,
-    agree_on_points,
-    clear_columns,
-    find_support,
-    find_voters,
-    stand_boxes,
-    without_poles,
-)
 from .errors import MountingError
 from .ground.leveling import MountingEstimator
 from .ground.planes import Ground, fill_planes, find_ground
@@ -192,7 +183,7 @@ def warm_up(
         if boxes_points:
             compile_parts(["boxes"])  # some only several boxes need
         if options.rules and objects is None and (boxes_points or (top is not None and top.card.box_classes)):
-            stand_boxes([UNCERTAIN], *_made_up())
+            rules.stand_boxes([UNCERTAIN], *_made_up())
         if top is not None:
             compile_kernels()
 
@@ -210,7 +201,9 @@ def _made_up() -> tuple[Scan, PointLabels]:
 
 def _compile_clusters() -> None:
     scan, labels = _made_up()
-    find_voters(scan, labels, Support(np.zeros(len(scan.points), np.float32), np.zeros(len(scan.points), np.uint8)))
+    rules.find_voters(
+        scan, labels, rules.Support(np.zeros(len(scan.points), np.float32), np.zeros(len(scan.points), np.uint8))
+    )
 
 
 def _compile_boxes() -> None:
@@ -225,10 +218,10 @@ def _compile_boxes() -> None:
 
 def _compile_agreement() -> None:
     scan, labels = _made_up()
-    support = find_support(scan, labels, [UNCERTAIN])
+    support = rules.find_support(scan, labels, [UNCERTAIN])
     clusters = np.where(scan.ground.mask, -1, 0).astype(np.int32)
-    agreed = agree_on_points(scan, labels, clusters, support, without_poles(scan, labels))
-    agree_on_boxes([UNCERTAIN], scan, agreed)
+    agreed = rules.agree_on_points(scan, labels, clusters, support, rules.without_poles(scan, labels))
+    rules.agree_on_boxes([UNCERTAIN], scan, agreed)
     cells = np.zeros((400, 200), np.uint8)
     view = TopView(cells, ("background", "drivable"), 0.1, (6.0, 46.0), (-10.0, 10.0), np.ones(cells.shape, np.bool_))
     agree_on_cells(view, agreed, [UNCERTAIN], [UNCERTAIN], mark_cells(view, scan, agreed))
@@ -250,7 +243,7 @@ PARTS: Mapping[str, Part] = MappingProxyType(
     {
         "clusters": Part(_compile_clusters, fill_clusters, 3.7),
         "boxes": Part(_compile_boxes, fill_rectangle, 2.7),
-        "agreement": Part(_compile_agreement, clear_columns, 2.9),
+        "agreement": Part(_compile_agreement, rules.clear_columns, 2.9),
         "road": Part(compile_kernels, merge_corners, 2.0),
         "ground": Part(_compile_ground, fill_planes, 2.2),
     }

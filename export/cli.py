@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 from edgeperc import __version__
-from edgeperc.cli.arguments import Options, count, options, positive, positive_number
+from edgeperc.cli.arguments import Options, count, keywords, options, positive, positive_number
 from edgeperc.cli.output import print_error, print_line
 from edgeperc.cli.program import Parser, run_program
 from edgeperc.errors import CardError, EdgepercError, MissingExtraError, ModelError
@@ -188,15 +188,8 @@ def _add_simulate(command: Command) -> None:
 def _simulate(args: argparse.Namespace) -> int:
     from .data.simulate import simulate
 
-    simulate(
-        args.out,
-        args.n,
-        first=args.first,
-        layouts_root=args.layouts,
-        sensor=args.sensor,
-        where=args.where,
-        n_workers=args.workers,
-    )
+    how = keywords(args, "first", "sensor", "where", layouts_root="layouts", n_workers="workers")
+    simulate(args.out, args.n, **how)
     return 0
 
 
@@ -302,10 +295,8 @@ def _export(args: argparse.Namespace) -> int:
         args.out,
         scans=parity_samples(task, args.scans),
         fitness=None if task in ("camera", "objects") else trained["fitness"] or fitness_of(args.kitti),
-        name=args.name,
-        version=args.model_version,
         metrics=metrics,
-        licence=args.licence,
+        **keywords(args, "name", "licence", version="model_version"),
     )
     print_line(f"{args.out}: {card.name} {card.version}, parity {json.dumps(dict(card.parity))}")
     return 0
@@ -451,14 +442,8 @@ def _add_agree(command: Command) -> None:
 def _agree(args: argparse.Namespace) -> int:
     from .release.agree import agree, summary
 
-    measured = agree(
-        args.models,
-        kitti=args.kitti,
-        semantickitti=args.semantickitti,
-        camvid=args.camvid,
-        split=args.split,
-        n_scans=args.scans,
-    )
+    how = keywords(args, "kitti", "semantickitti", "camvid", "split", n_scans="scans")
+    measured = agree(args.models, **how)
     for line in summary(measured):
         print_line(line)
     if "bf16" not in measured:
@@ -490,10 +475,7 @@ def _make(args: argparse.Namespace) -> int:
         args.out,
         Data(args.kitti, camvid=args.camvid, scan_sets=scan_sets, fold=args.fold),
         Run(n_threads=args.threads, n_workers=args.workers, compiled=args.compile),
-        layouts=args.layouts,
-        semantickitti=args.semantickitti,
-        steps=args.steps,
-        version=args.model_version,
+        **keywords(args, "layouts", "semantickitti", "steps", version="model_version"),
     )
     print_line(str(path))
     return 0
@@ -570,18 +552,8 @@ def _ablate_camvid(args: argparse.Namespace) -> int:
     if args.camvid is None:
         raise ValueError("no images to train on; give --camvid")
     width, height = args.size
-    rows = ablate_camvid(
-        args.camvid,
-        args.out,
-        networks=args.variant,
-        width=width,
-        height=height,
-        epochs=args.epochs,
-        batch=args.batch,
-        learning_rate=args.learning_rate,
-        n_threads=args.threads,
-        compiled=args.compile,
-    )
+    how = keywords(args, "epochs", "batch", "learning_rate", networks="variant", compiled="compile")
+    rows = ablate_camvid(args.camvid, args.out, width=width, height=height, n_threads=args.threads, **how)
     (args.out / "camvid.md").write_text(table(rows))
     for line in table(rows).splitlines():
         print_line(line)

@@ -69,6 +69,12 @@ def options(parser: argparse.ArgumentParser, title: str | None = None, **default
     return add
 
 
+def keywords(arguments: argparse.Namespace, *names: str, **renamed: str) -> dict[str, Any]:
+    """Options as arguments of a function that calls them the same, or by the parameter: ``n_threads="threads"``."""
+    same = {name: name for name in names}
+    return {name: getattr(arguments, option) for name, option in (same | renamed).items()}
+
+
 def _local(text: str) -> Path:
     path = location(text)
     if isinstance(path, Remote):  # as a path it would be a folder with the name of the protocol

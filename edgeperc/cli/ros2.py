@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from ..errors import OptionError, SensorError
 from ..types.choices import AUTO_SENSOR
-from .arguments import Commands, add_command, add_mounting, add_networks, options, positive, positive_number
+from .arguments import Commands, add_command, add_mounting, add_networks, keywords, options, positive, positive_number
 from .output import many, print_error, print_line
 from .run import make_perceiver
 from .scans import check_sensor, with_mounting
@@ -151,13 +151,10 @@ def ros2_command(arguments: argparse.Namespace) -> int:
             perceiver_for,
             topic=arguments.topic or "",
             tracker=None if arguments.no_track else Tracker(),
-            frame_id=arguments.frame,
-            grid_frame_id=arguments.grid_frame,
             prefix=arguments.prefix or "",
-            rate_hz=arguments.rate,
             outputs=arguments.publish or USUAL_OUTPUTS,
             rolling=_rolling(arguments),
-            lifecycle=arguments.lifecycle,
+            **keywords(arguments, "lifecycle", frame_id="frame", grid_frame_id="grid_frame", rate_hz="rate"),
         )
     except BaseException:
         graph.close()

@@ -28,6 +28,7 @@ from .arguments import (
     check_inputs,
     chosen_models,
     file_options,
+    keywords,
     options,
     positive_number,
 )
@@ -193,19 +194,15 @@ def make_perceiver(
     """Make a perceiver with the options of the command line."""
     from ..perceiver import Perceiver
 
+    same = keywords(arguments, "provider", "precision", "score_threshold", "boxes_from", "full_turn", "trusted")
     return Perceiver(
         chosen_models(arguments),
         sensor=sensor,
-        provider=arguments.provider,
-        precision=arguments.precision,
         n_threads=arguments.threads,
         on_mismatch=on_mismatch,
-        score_threshold=arguments.score_threshold,
         adapt=adapt,
-        boxes_from=arguments.boxes_from,
-        full_turn=arguments.full_turn,
         agree=not arguments.no_agreement,
-        trusted=arguments.trusted,
+        **same,
     )
 
 

@@ -36,18 +36,8 @@ from ..types.choices import VEHICLES
 from ..types.geometry import inside
 from ..types.perception import ROADS, Box
 from ..types.points import Bytes, Floats, Mask, Points
+from . import kitti
 from .annotations import read_datumaro, read_json, read_labelcloud, read_sustechpoints
-from .kitti import (
-    IMAGE_SIZE,
-    SEQUENCE_DRIVES,
-    WHOLE_TURN,
-    KittiCalibration,
-    KittiLabels,
-    label_lines,
-    read_drives,
-    read_labeled,
-    read_numbers,
-)
 from .layout import (
     ANY,
     BACKGROUND,
@@ -101,9 +91,9 @@ class ScanFrame:
     boxes: tuple[Box, ...] | None
     point_classes: Bytes | None
     drivable: tuple[Floats, ...] | None
-    calibration: KittiCalibration | None = None
+    calibration: kitti.KittiCalibration | None = None
     unlabeled: Floats | None = None
-    image_labels: KittiLabels | None = None
+    image_labels: kitti.KittiLabels | None = None
 
     @cached_property
     def class_names(self) -> tuple[str, ...]:
@@ -123,7 +113,7 @@ class ScanFrame:
             low, high = self.layout.labeled_deg
             return math.radians(low), math.radians(high)
         focal, middle = self.calibration.P2[0, 0], self.calibration.P2[0, 2]
-        return -math.atan2((self.layout.image_size or IMAGE_SIZE)[0] - middle, focal), math.atan2(middle, focal)
+        return -math.atan2((self.layout.image_size or kitti.IMAGE_SIZE)[0] - middle, focal), math.atan2(middle, focal)
 
     def known_at(self, places: NDArray[Any]) -> Mask:
         """Whether all objects at places (n, 3+) [m] have boxes, (n,) bool."""
@@ -135,7 +125,7 @@ class ScanFrame:
             known = np.asarray((azimuth - low) % 360.0 <= high - low, np.bool_)
             known &= np.hypot(places[:, 0], places[:, 1]) <= self.layout.labeled_m
         if self.calibration is not None and self.unlabeled is not None:
-            known &= self.calibration.labeled_at(places, self.unlabeled, self.layout.image_size or IMAGE_SIZE)
+            known &= self.calibration.labeled_at(places, self.unlabeled, self.layout.image_size or kitti.IMAGE_SIZE)
         return known
 
     def labels(self, classes: Sequence[str] = POINT_CLASSES, *, by: str | None = None) -> Bytes:
@@ -250,10 +240,12 @@ class ScanFolder:
         calibration = unlabeled = boxes = image_labels = None
         path = self._path("boxes", name)
         if path is not None and self.layout.box_format == "kitti":
-            found, unlabeled, calibration, rows = read_labeled(self.root, name, self.layout.image_size or IMAGE_SIZE)
+            found, unlabeled, calibration, rows = kitti.read_labeled(
+                self.root, name, self.layout.image_size or kitti.IMAGE_SIZE
+            )
             boxes = self._renamed(found, path)
             kinds = [k if k == "dontcare" else class_of_name(k, self.layout.boxes, path, "boxes") for k in rows.kinds]
-            image_labels = KittiLabels(tuple(kinds), rows.numbers)
+            image_labels = kitti.KittiLabels(tuple(kinds), rows.numbers)
         elif path is not None:
             boxes = self._renamed(self._read_boxes(path, name), path)
         classes, area = self._path("points", name), self._path("drivable", name)
@@ -310,13 +302,13 @@ class ScanFolder:
             )
         if self.layout.files == "semantickitti":
             sequences = {name: name.partition("/")[0] for name in labeled}
-            return {name: SEQUENCE_DRIVES.get(sequence, sequence) for name, sequence in sequences.items()}
+            return {name: kitti.SEQUENCE_DRIVES.get(sequence, sequence) for name, sequence in sequences.items()}
         if self.layout.drives == "one":
             return dict.fromkeys(labeled, self.layout.name)
         table = self.root / "frames.csv"
         if self.layout.drives == "scan" or not table.exists():
             return {name: name for name in labeled}
-        drives = {row["name"]: row["drive"] for row in read_drives(table)}
+        drives = {row["name"]: row["drive"] for row in kitti.read_drives(table)}
         if missing := [name for name in labeled if name not in drives]:
             listed = ", ".join(missing[:5])
             raise PointsError(f"{table} has no drive of {listed}; add a row, both filled in, for every labeled scan")
@@ -349,7 +341,7 @@ class ScanFolder:
         return tuple(box for box in renamed if box.label != BACKGROUND)
 
     def _read_classes(self, path: Path, n_points: int) -> Bytes:
-        raw = read_numbers(path, n_points)
+        raw = kitti.read_numbers(path, n_points)
         if self._point_numbers is None:
             self._point_numbers = self._numbers()
         numbers = np.unique(raw)
@@ -380,7 +372,7 @@ def _read_boxes(path: Path, columns: Sequence[str]) -> list[Box]:
     """Boxes of a label file, with the classes in it."""
     boxes: list[Box] = []
     place = {column: columns.index(column) for column in BOX_COLUMNS}
-    for number, line in label_lines(path):
+    for number, line in kitti.label_lines(path):
         values = line.split()
         try:
             x, y, z, length, width, height, yaw = (float(values[place[column]]) for column in BOX_COLUMNS[1:])
@@ -388,7 +380,7 @@ def _read_boxes(path: Path, columns: Sequence[str]) -> list[Box]:
             raise PointsError(f"{path}, line {number}: {line[:100]!r}; expected {' '.join(columns)}") from exc
         if not all(map(math.isfinite, (x, y, z, length, width, height, yaw))) or min(length, width, height) <= 0.0:
             raise PointsError(f"{path}, line {number}: {line[:100]!r}; expected finite numbers and sizes above 0")
-        if abs(yaw) > WHOLE_TURN:
+        if abs(yaw) > kitti.WHOLE_TURN:
             raise PointsError(f"{path}, line {number}: a yaw of {yaw:g}, as if in degrees; expected radians")
         boxes.append(Box(values[place["class"]], 1.0, (x, y, z), (length, width, height), yaw))
     return boxes

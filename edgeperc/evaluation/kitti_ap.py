@@ -16,17 +16,7 @@ import numpy as np
 from ..datasets.kitti import IMAGE_SIZE, IMAGE_SIZES, KittiCalibration, KittiLabels
 from ..types.perception import Box
 from ..types.points import Floats, Mask
-from .metrics import (
-    EVERYWHERE,
-    N_POSITIONS,
-    Listed,
-    ObjectKey,
-    box_overlaps,
-    box_rows,
-    interpolated_precision,
-    object_key,
-    recall_positions,
-)
+from . import metrics
 
 # Smallest IoU of a match, the benchmark's own and a looser one, and neighboring classes that a detector may find.
 CLASSES = {
@@ -46,7 +36,7 @@ BIRDS_EYE, IN_3D = "bird's eye", "3-D"
 class Counts:
     """Matches of one scan, for one class and one rule."""
 
-    objects: tuple[ObjectKey, ...]  # one for each object to find
+    objects: tuple[metrics.ObjectKey, ...]  # one for each object to find
     hits: tuple[float, ...]  # scores of the first pass: of the best detection of each object
     steps: tuple[tuple[float, int, int], ...]  # change of true and false positives as the threshold falls to a score
 
@@ -64,7 +54,7 @@ class FrontTruth:
 class Candidate:
     """How well the best of all candidates covers an object: IoU from above; distance from the sensor [m]."""
 
-    object: ObjectKey
+    object: metrics.ObjectKey
     label: str
     range_m: float
     iou: float
@@ -75,7 +65,7 @@ def image_size_of(drive: str) -> tuple[int, int]:
     return IMAGE_SIZES.get(drive[:10], IMAGE_SIZE)
 
 
-def count_in_image(truth: FrontTruth, boxes: Sequence[Box], drive: str) -> Listed:
+def count_in_image(truth: FrontTruth, boxes: Sequence[Box], drive: str) -> metrics.Listed:
     """Count the matches of one scan as KITTI's benchmark does. Detections that the image does not show are left out, as
     in a submission. DontCare has no 3-D boxes, so it excuses no detection from above and in 3-D.
     """
@@ -83,7 +73,7 @@ def count_in_image(truth: FrontTruth, boxes: Sequence[Box], drive: str) -> Liste
     placed = truth.calibration.sensor_boxes(numbers[:, 7:14])
     right_m = np.hypot(placed[:, 0], placed[:, 1])
     objects = [_key(drive, kind, row) for kind, row in zip(kinds, numbers, strict=True)]
-    guesses = box_rows(boxes)
+    guesses = metrics.box_rows(boxes)
     seen = truth.calibration.image_rectangles(guesses, truth.image_size)
     shown = ((seen[:, 2:] - seen[:, :2]) > 0.0).all(axis=1)
     guesses, seen, boxes = guesses[shown], seen[shown], [boxes[k] for k in np.flatnonzero(shown).tolist()]
@@ -94,13 +84,13 @@ def count_in_image(truth: FrontTruth, boxes: Sequence[Box], drive: str) -> Liste
     return _count(levels, boxes, guess_m, objects, (*kinds,), right_m, overlaps)
 
 
-def count_all_round(boxes: Sequence[Box], to_find: Sequence[Box], ignored: Sequence[Box], drive: str) -> Listed:
+def count_all_round(boxes: Sequence[Box], to_find: Sequence[Box], ignored: Sequence[Box], drive: str) -> metrics.Listed:
     """Count the matches of a scan without limits in the image; ignored, neighbors and ``ignore`` may be found."""
     every = [*to_find, *ignored]
-    guesses, rights = box_rows(boxes), box_rows(every)
+    guesses, rights = metrics.box_rows(boxes), metrics.box_rows(every)
     guess_m, right_m = (np.hypot(rows[:, 0], rows[:, 1]) for rows in (guesses, rights))
     levels = {ALL_ROUND: (np.arange(len(every)) >= len(to_find), np.zeros(len(boxes), np.bool_))}
-    objects, kinds = [object_key(drive, box) for box in every], tuple(box.label for box in every)
+    objects, kinds = [metrics.object_key(drive, box) for box in every], tuple(box.label for box in every)
     return _count(levels, boxes, guess_m, objects, kinds, right_m, _overlaps(guesses, rights), "ignore")
 
 
@@ -108,18 +98,18 @@ def _count(
     levels: Mapping[str, tuple[Mask, Mask]],
     boxes: Sequence[Box],
     guess_m: Floats,
-    objects: Sequence[ObjectKey],
+    objects: Sequence[metrics.ObjectKey],
     kinds: Sequence[str],
     right_m: Floats,
     overlaps: Mapping[str, Floats],
     *also: str,
-) -> Listed:
+) -> metrics.Listed:
     """Count the matches of one scan by class, kind of overlap with its threshold, and level or range.
 
     levels : which objects are hidden, and which detections are too small; ranges are of the last one.
     also : labels of objects that may be found, beside those of neighbors.
     """
-    table, (*_, last), labels = Listed(), levels.values(), np.array([box.label for box in boxes], np.str_)
+    table, (*_, last), labels = metrics.Listed(), levels.values(), np.array([box.label for box in boxes], np.str_)
     for label, overlap_name, least_iou, level, (near, far) in _rules(levels):
         hidden, small = levels.get(level, last)
         may_be = (label, *CLASSES[label][1], *also)
@@ -140,7 +130,7 @@ def best_candidates(truth: FrontTruth, candidates: Sequence[Box], drive: str) ->
     placed = truth.calibration.sensor_boxes(numbers[:, 7:14])
     best = np.zeros(len(kinds))
     if candidates:
-        guesses = truth.calibration.in_camera(box_rows(candidates))
+        guesses = truth.calibration.in_camera(metrics.box_rows(candidates))
         best = _overlaps(guesses, _level_rows(numbers[:, 7:14]))[BIRDS_EYE].max(axis=0)
     return [
         Candidate(_key(drive, kinds[k], numbers[k]), kinds[k], float(np.hypot(*placed[k, :2])), float(best[k]))
@@ -153,7 +143,7 @@ def count_matches(
     overlaps: Floats,
     scores: Sequence[float],
     least_iou: float,
-    objects: Sequence[ObjectKey],
+    objects: Sequence[metrics.ObjectKey],
     optional: Sequence[bool],
     small: Sequence[bool],
     excused: Sequence[bool],
@@ -220,15 +210,15 @@ def average_precisions(counts: Sequence[Counts]) -> tuple[float, float, float]:
     steps = np.array([step for count in counts for step in count.steps], np.float64).reshape(-1, 3)
     steps = steps[np.argsort(-steps[:, 0], kind="stable")]
     n_hits, n_false = np.cumsum(steps[:, 1:], axis=0).astype(np.int64).T
-    curve = np.zeros(N_POSITIONS + 1)
-    thresholds = hits[[*recall_positions(len(hits), n_truth)]]
+    curve = np.zeros(metrics.N_POSITIONS + 1)
+    thresholds = hits[[*metrics.recall_positions(len(hits), n_truth)]]
     last = np.searchsorted(-steps[:, 0], -thresholds, side="right") - 1
     curve[: len(last)] = n_hits[last] / np.maximum(n_hits[last] + n_false[last], 1)
     curve = np.maximum.accumulate(curve[::-1])[::-1]
     # Scans of equal scores change together.
     ends = np.flatnonzero(np.append(np.diff(steps[:, 0]) != 0.0, True)[: len(steps)])
-    levels = np.arange(1, N_POSITIONS + 1)
-    ap = interpolated_precision(n_hits[ends], (n_hits + n_false)[ends], n_truth, levels, N_POSITIONS)
+    levels = np.arange(1, metrics.N_POSITIONS + 1)
+    ap = metrics.interpolated_precision(n_hits[ends], (n_hits + n_false)[ends], n_truth, levels, metrics.N_POSITIONS)
     return float(curve[1:].mean()), float(curve[::4].mean()), ap
 
 
@@ -238,7 +228,7 @@ def _rules(levels: Iterable[str]) -> Iterator[tuple[str, str, float, str, tuple[
         for least_iou in least_ious:
             for overlap_name in (BIRDS_EYE, IN_3D):
                 for level in levels:
-                    yield label, overlap_name, least_iou, level, EVERYWHERE
+                    yield label, overlap_name, least_iou, level, metrics.EVERYWHERE
         for band, within_m in RANGES.items():
             yield label, BIRDS_EYE, RANGE_IOU, band, within_m
 
@@ -250,9 +240,9 @@ def _hidden(numbers: Floats, level: str) -> Mask:
     return np.asarray(hidden | (numbers[:, 6] - numbers[:, 4] <= least_px), np.bool_)
 
 
-def _key(drive: str, kind: str, numbers: Floats) -> ObjectKey:
+def _key(drive: str, kind: str, numbers: Floats) -> metrics.ObjectKey:
     height, width, length = numbers[7:10].tolist()
-    return object_key(drive, Box(kind, 1.0, (0.0, 0.0, 0.0), (length, width, height), 0.0))
+    return metrics.object_key(drive, Box(kind, 1.0, (0.0, 0.0, 0.0), (length, width, height), 0.0))
 
 
 def _level_rows(numbers: Floats) -> Floats:
@@ -263,4 +253,4 @@ def _level_rows(numbers: Floats) -> Floats:
 
 
 def _overlaps(a: Floats, b: Floats) -> Mapping[str, Floats]:
-    return dict(zip((BIRDS_EYE, IN_3D), box_overlaps(a, b), strict=True))
+    return dict(zip((BIRDS_EYE, IN_3D), metrics.box_overlaps(a, b), strict=True))

@@ -14,25 +14,17 @@ from ..types.geometry import draw_footprints
 from ..types.perception import Box
 from ..types.points import Bytes, Floats32, Labels, Mask, read_only
 from ..types.views import TopViewGeometry
-from .box_heads import (
-    MAX_PROBABILITY,
-    class_values,
-    decode_dense,
-    decode_scored_slots,
-    decode_slots,
-    fill_scores,
-    raise_not_finite,
-)
+from . import box_heads
 
 
 def decode_labels(output: Floats32, kind: str, *, model: str = "the model") -> Bytes:
     """The most probable class of every pixel, (H, W); the lower one on ties. ``model`` is named in errors."""
-    values = class_values(output, kind, model)
+    values = box_heads.class_values(output, kind, model)
     labels = np.empty(values.shape[1:], np.uint8)
     n_bad, lowest, highest = fill_labels(values, labels)
     if n_bad:
-        raise_not_finite(n_bad, values.size, kind, model)
-    if kind == "class_probabilities" and labels.size and not (lowest >= 0.0 and highest <= MAX_PROBABILITY):
+        box_heads.raise_not_finite(n_bad, values.size, kind, model)
+    if kind == "class_probabilities" and labels.size and not (lowest >= 0.0 and highest <= box_heads.MAX_PROBABILITY):
         raise InferenceError(
             f"{model}: probabilities of classes are {lowest:g} to {highest:g}; expected 0 to 1. "
             "Check the card: an output without softmax is of kind class_logits"
@@ -43,10 +35,10 @@ def decode_labels(output: Floats32, kind: str, *, model: str = "the model") -> B
 def decode_classes(output: Floats32, kind: str, *, model: str = "the model") -> tuple[Bytes, Floats32]:
     """The most probable class of every pixel, the lower one on ties, and its probability; `decode_labels` is faster."""
     labels = decode_labels(output, kind, model=model)
-    values = class_values(output, kind, model)
+    values = box_heads.class_values(output, kind, model)
     scores = values.max(axis=0)
     if kind == "class_logits":
-        fill_scores(values, scores)
+        box_heads.fill_scores(values, scores)
     return labels, scores
 
 
@@ -111,12 +103,12 @@ def decode_boxes(
     """
     kind = _class_kind(outputs)
     if "box_dense" in outputs:
-        return decode_dense(card, outputs["box_dense"], outputs[kind], kind, score_threshold, named_from)
+        return box_heads.decode_dense(card, outputs["box_dense"], outputs[kind], kind, score_threshold, named_from)
     if "box_slots" not in outputs:
         return []
     if outputs["box_slots"].shape[-1] == 5:
-        return decode_scored_slots(card, outputs["box_slots"], outputs[kind], kind, score_threshold)
-    found = decode_slots(card, outputs["box_slots"], *decode_classes(outputs[kind], kind, model=card.name))
+        return box_heads.decode_scored_slots(card, outputs["box_slots"], outputs[kind], kind, score_threshold)
+    found = box_heads.decode_slots(card, outputs["box_slots"], *decode_classes(outputs[kind], kind, model=card.name))
     return [box for box in found if box.score >= score_threshold]
 
 

@@ -9,16 +9,7 @@ import numpy as np
 from ..errors import PointsError
 from ..system.kernels import njit
 from ..types.points import Bytes, plain_name
-from .tables import (
-    MAX_HEADER_BYTES,
-    MAX_SCAN_BYTES,
-    Columns,
-    column,
-    header_lines,
-    parse_records,
-    parse_table,
-    whole_number,
-)
+from . import tables
 
 _PCD_TYPES = {f"{kind}{size}": f"<{kind.lower()}{size}" for kind in "IU" for size in (1, 2, 4, 8)} | {
     "F4": "<f4",
@@ -47,14 +38,16 @@ class _PcdHeader(NamedTuple):
 
 
 def _parse_pcd_header(head: bytes) -> _PcdHeader:
-    lines, n_bytes = header_lines(head, "DATA", "PCD")
+    lines, n_bytes = tables.header_lines(head, "DATA", "PCD")
     entries = {words[0]: words[1:] for words in lines if words and not words[0].startswith("#")}
     names = entries.get("FIELDS", entries.get("COLUMNS", []))
     try:
-        sizes = [whole_number(token) for token in entries.get("SIZE", [])]
-        counts = [whole_number(token) for token in entries.get("COUNT", ["1"] * len(names))]
-        width, height = (whole_number(entries[key][0]) if key in entries else None for key in ("WIDTH", "HEIGHT"))
-        n_points = whole_number(entries["POINTS"][0]) if "POINTS" in entries else None
+        sizes = [tables.whole_number(token) for token in entries.get("SIZE", [])]
+        counts = [tables.whole_number(token) for token in entries.get("COUNT", ["1"] * len(names))]
+        width, height = (
+            tables.whole_number(entries[key][0]) if key in entries else None for key in ("WIDTH", "HEIGHT")
+        )
+        n_points = tables.whole_number(entries["POINTS"][0]) if "POINTS" in entries else None
     except (ValueError, IndexError) as exc:
         raise PointsError(f"the PCD header has an entry that must be a number and is not ({exc})") from exc
     kinds = entries.get("TYPE", [])
@@ -65,7 +58,7 @@ def _parse_pcd_header(head: bytes) -> _PcdHeader:
         raise PointsError(
             f"the PCD header has a field of an unknown TYPE and SIZE: {' '.join(kinds)} / {' '.join(map(str, sizes))}"
         )
-    if any(not 1 <= count <= MAX_HEADER_BYTES for count in counts):
+    if any(not 1 <= count <= tables.MAX_HEADER_BYTES for count in counts):
         raise PointsError(f"the PCD header's COUNT must be at least 1, got {' '.join(map(str, counts))}")
     organized = None if width is None else width * (1 if height is None else height)
     if n_points is None and organized is not None and organized < 1 << 63:
@@ -76,7 +69,7 @@ def _parse_pcd_header(head: bytes) -> _PcdHeader:
     return _PcdHeader(tuple(names), tuple(types), tuple(counts), n_points, encoding, n_bytes)
 
 
-def parse_pcd(data: Bytes, head: bytes, remission_field: str | None) -> Columns:
+def parse_pcd(data: Bytes, head: bytes, remission_field: str | None) -> tables.Columns:
     """Parse a PCD file: ascii, binary or binary_compressed; ``head`` is its beginning, with the whole header."""
     header = _parse_pcd_header(head)
     n, body, record, n_values = header.n_points, data[header.n_bytes :], 0, 0
@@ -89,14 +82,14 @@ def parse_pcd(data: Bytes, head: bytes, remission_field: str | None) -> Columns:
         record += np.dtype(kind).itemsize * count
         n_values += count
     if header.encoding == "ascii":
-        return parse_table(body, 0, n, ranks, header.names, remission_field)
+        return tables.parse_table(body, 0, n, ranks, header.names, remission_field)
     if header.encoding == "binary":
-        return parse_records(body, n, places, record, header.names)
+        return tables.parse_records(body, n, places, record, header.names)
     if header.encoding != "binary_compressed":
         raise PointsError(f"PCD data is ascii, binary or binary_compressed, got {header.encoding!r}")
     unpacked = _unpack_pcd(body, n * record)  # field by field
-    fields = {k: column(unpacked, kind, n, n * at, np.dtype(kind).itemsize) for k, (kind, at) in places.items()}
-    return Columns(n, fields, header.names)
+    fields = {k: tables.column(unpacked, kind, n, n * at, np.dtype(kind).itemsize) for k, (kind, at) in places.items()}
+    return tables.Columns(n, fields, header.names)
 
 
 def _unpack_pcd(body: Bytes, n_bytes: int) -> Bytes:
@@ -110,8 +103,8 @@ def _unpack_pcd(body: Bytes, n_bytes: int) -> Bytes:
     # The longest LZF reference takes 3 bytes and gives 264, so a larger claim is false; check before allocating.
     if size != n_bytes or size > 88 * packed_size:
         raise PointsError(f"{packed_size} compressed bytes claim to unpack to {size}; the fields need {n_bytes}")
-    if size > MAX_SCAN_BYTES:
-        raise PointsError(f"the compressed data unpacks to {size:,} bytes; expected at most {MAX_SCAN_BYTES:,}")
+    if size > tables.MAX_SCAN_BYTES:
+        raise PointsError(f"the compressed data unpacks to {size:,} bytes; expected at most {tables.MAX_SCAN_BYTES:,}")
     unpacked = np.empty(size, dtype=np.uint8)
     if fill_unpacked_lzf(body[8 : 8 + packed_size], unpacked) != size:
         raise PointsError("the compressed data is damaged")

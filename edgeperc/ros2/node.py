@@ -20,17 +20,8 @@ from ..records import PerceivedScan
 from ..road.grid import Split, split_points
 from ..system.clock import Stamp
 from ..system.names import check_text
+from . import messages
 from .graph import TRANSITIONS, Graph, Output, State, full_name
-from .messages import (
-    CLOUD,
-    DIAGNOSTICS,
-    GROUND_POINTS,
-    LIVE_OUTPUTS,
-    OBSTACLE_POINTS,
-    OUTPUTS,
-    ROLLING,
-    RosMessages,
-)
 from .odometry import ODOMETRY, Poses, Rolling
 
 if TYPE_CHECKING:
@@ -42,7 +33,7 @@ if TYPE_CHECKING:
 
 __all__ = ["PerceptionNode"]
 
-USUAL_OUTPUTS = (*OUTPUTS, GROUND_POINTS, OBSTACLE_POINTS)
+USUAL_OUTPUTS = (*messages.OUTPUTS, messages.GROUND_POINTS, messages.OBSTACLE_POINTS)
 """What a node publishes unless it is told otherwise."""
 REPORT_EVERY_S = 1.0
 _LATENCIES = 1000  # of the last answers, for the percentiles
@@ -126,7 +117,7 @@ class PerceptionNode:
         check_rate(rate_hz)
         self._graph, self._perceiver_for = graph, perceiver_for
         self._topic, self._frame_id = topic, frame_id
-        self._messages = RosMessages(grid_frame_id=grid_frame_id, lifetime_s=5.0 / rate_hz)
+        self._messages = messages.RosMessages(grid_frame_id=grid_frame_id, lifetime_s=5.0 / rate_hz)
         self._perceiver: Perceiver | None = None
         self._cloud: Any = None
         self._cloud_frame = ""  # of the cloud that the perceiver was made for
@@ -144,7 +135,7 @@ class PerceptionNode:
         self._topics = _topics_of(outputs, prefix, rolling is not None)
         _check_distinct(topic, self._topics, graph.name.rpartition("/")[0])
         self._outputs: dict[str, Output] = {}
-        self._diagnostics = graph.advertise("/diagnostics", DIAGNOSTICS) if "diagnostics" in outputs else None
+        self._diagnostics = graph.advertise("/diagnostics", messages.DIAGNOSTICS) if "diagnostics" in outputs else None
         # The queue is empty nearly always: the stream's thread takes what comes, and keeps the newest.
         self._stream = stream(iter(self._waiting.get, None), self._perceive, tracker, rate_hz=rate_hz)
         self._state: State = "unconfigured"
@@ -207,14 +198,14 @@ class PerceptionNode:
             return
         for name, topic in self._topics.items():
             try:
-                self._outputs[name] = self._graph.advertise(topic, LIVE_OUTPUTS[name])
+                self._outputs[name] = self._graph.advertise(topic, messages.LIVE_OUTPUTS[name])
             except OptionError as exc:
                 if name != "detections":
                     raise
                 warnings.warn(f"no detections are published: {exc}", stacklevel=4)
         if self._rolling is not None:
             self._graph.subscribe(self._rolling.topic, ODOMETRY, self._poses.receive)
-        self._graph.subscribe(self._topic, CLOUD, self._receive)
+        self._graph.subscribe(self._topic, messages.CLOUD, self._receive)
         self._is_connected = True
 
     def _receive(self, data: bytes) -> None:
@@ -278,7 +269,7 @@ class PerceptionNode:
         self._points, self._stamp_ns, self._cloud = None, None, None
         if len(data) > MAX_SCAN_BYTES:
             raise PointsError(f"the cloud has {len(data):,} bytes; expected at most {MAX_SCAN_BYTES:,}")
-        cloud = self._messages.decode(data, CLOUD)
+        cloud = self._messages.decode(data, messages.CLOUD)
         if cloud.height * cloud.width > MAX_SCAN_BYTES // 16:
             raise PointsError(
                 f"the cloud declares {cloud.height:,} x {cloud.width:,} points; expected at most "
@@ -316,11 +307,11 @@ class PerceptionNode:
             return scan
         parts: Split | None = None
         for name, output in self._outputs.items():
-            if name == ROLLING or not output.is_wanted:
+            if name == messages.ROLLING or not output.is_wanted:
                 continue
-            if name in (GROUND_POINTS, OBSTACLE_POINTS):
+            if name in (messages.GROUND_POINTS, messages.OBSTACLE_POINTS):
                 parts = parts or split_points(scan.perception, scan.points, sensor=scan.sensor)
-                mask = parts.ground if name == GROUND_POINTS else parts.obstacle
+                mask = parts.ground if name == messages.GROUND_POINTS else parts.obstacle
                 message = self._messages.part(scan, self._cloud, mask, self._stamp_ns)
             else:
                 message = getattr(self._messages, name)(scan, self._stamp_ns)
@@ -344,9 +335,9 @@ class PerceptionNode:
         except TrackingError:
             self._n_unplaced += 1
             return
-        if self._outputs[ROLLING].is_wanted:
+        if self._outputs[messages.ROLLING].is_wanted:
             message = self._messages.rolling(self._rolling.grid, self._poses.frame_id, self._stamp_ns)
-            self._outputs[ROLLING].publish(self._messages.encode(message))
+            self._outputs[messages.ROLLING].publish(self._messages.encode(message))
 
     def _report_always(self) -> None:
         """Body of the thread that publishes the diagnostics, also while a scan is perceived."""
@@ -429,18 +420,20 @@ def _topics_of(outputs: Sequence[str], prefix: str, with_rolling: bool) -> dict[
     topics: dict[str, str] = {}
     for text in outputs:
         name, _, topic = text.partition("=")
-        if name not in LIVE_OUTPUTS or (topic and name == "diagnostics"):
-            raise OptionError(f"outputs has {text!r}; expected some of {', '.join(LIVE_OUTPUTS)}, or NAME=TOPIC")
+        if name not in messages.LIVE_OUTPUTS or (topic and name == "diagnostics"):
+            raise OptionError(
+                f"outputs has {text!r}; expected some of {', '.join(messages.LIVE_OUTPUTS)}, or NAME=TOPIC"
+            )
         if "=" in text:
             full_name(topic)
-        if name == ROLLING and not with_rolling:
+        if name == messages.ROLLING and not with_rolling:
             raise OptionError("the output rolling needs poses; pass rolling=, with a topic of nav_msgs/Odometry")
         full = topic or f"{prefix.rstrip('/')}/{name}"
         if topics.setdefault(name, full) != full:
             raise OptionError(f"outputs has {name} with two topics, {topics[name]} and {full}; expected one")
     topics.pop("diagnostics", None)
     if with_rolling:
-        topics.setdefault(ROLLING, f"{prefix.rstrip('/')}/{ROLLING}")
+        topics.setdefault(messages.ROLLING, f"{prefix.rstrip('/')}/{messages.ROLLING}")
     return topics
 
 

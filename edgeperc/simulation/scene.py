@@ -17,20 +17,7 @@ from ..types.points import Bytes, Floats, Ints, Labels, Points
 from ..types.rigid import rigid
 from ..types.sensor import ScanPattern, SensorProfile, get_sensor
 from ..types.views import TopViewGeometry
-from .raycast import (
-    Ground,
-    Hits,
-    Rays,
-    Receiver,
-    Shapes,
-    columns_of,
-    fill_bounds,
-    fill_cast,
-    fill_ground_kinds,
-    fill_points,
-    ground_at,
-    placed,
-)
+from . import raycast
 
 POINT_CLASSES = ("background", "car", "pedestrian", "cyclist")
 # Classes of what a street is made of; the background is what is none of the others, such as walls and fences.
@@ -97,9 +84,9 @@ class Scene:
     tile: Floats
 
     @property
-    def ground(self) -> Ground:
+    def ground(self) -> raycast.Ground:
         """The ground, as kernels take it."""
-        return Ground(self.strips, self.terrain, self.tile)
+        return raycast.Ground(self.strips, self.terrain, self.tile)
 
     def at(self, t_s: float) -> Scene:
         """Move the objects by ``t_s`` [s] on the ground, with constant speed and turn rate; return the new scene."""
@@ -116,16 +103,16 @@ class Scene:
 
     def ground_height(self, x: float, y: float) -> float:
         """Height of the ground [m] at x, y, world frame."""
-        return float(ground_at(self.ground, float(x), float(y))[0])
+        return float(raycast.ground_at(self.ground, float(x), float(y))[0])
 
     def on_road(self, x: float, y: float) -> bool:
         """Whether x, y [m], world frame, is on a road surface; parking bays are not."""
-        return bool(ground_at(self.ground, float(x), float(y))[1] < 0.0)
+        return bool(raycast.ground_at(self.ground, float(x), float(y))[1] < 0.0)
 
     def surface(self, xy: Floats) -> tuple[Bytes, Floats]:
         """Kind of the ground (0 road, 1 bay or pavement, 2 grass) and remission at places (..., 2), world frame."""
         kinds, remissions = np.empty(xy.shape[:-1], np.uint8), np.empty(xy.shape[:-1])
-        fill_ground_kinds(
+        raycast.fill_ground_kinds(
             self.ground, np.ascontiguousarray(xy).reshape(-1, 2), kinds.reshape(-1), remissions.reshape(-1)
         )
         return kinds, remissions
@@ -286,13 +273,13 @@ def simulate(
 
     shapes = place_shapes(scene, pose, _SECTORS if profile.pattern else n_columns, reach)
     shape = (n_beams, n_columns)
-    hits = Hits(np.empty(shape), np.empty(shape, np.int32), np.empty(shape), np.empty(shape))
-    rays = Rays(elevations, azimuths, reach, np.uint64(rng.integers(0, 2**63)), clumped_leaves)
-    fill_cast(shapes, scene.ground, pose, rays, hits)
-    receiver = Receiver(range_offsets, remission_offsets, profile.min_range_m, noise, noise and ego_shadow)
+    hits = raycast.Hits(np.empty(shape), np.empty(shape, np.int32), np.empty(shape), np.empty(shape))
+    rays = raycast.Rays(elevations, azimuths, reach, np.uint64(rng.integers(0, 2**63)), clumped_leaves)
+    raycast.fill_cast(shapes, scene.ground, pose, rays, hits)
+    receiver = raycast.Receiver(range_offsets, remission_offsets, profile.min_range_m, noise, noise and ego_shadow)
     points = np.empty((n_beams * n_columns, 4), dtype=np.float32)
     surfaces = np.empty(n_beams * n_columns, dtype=np.int32)
-    n = fill_points(shapes.primitives, scene.ground, pose, rays, hits, receiver, points, surfaces)
+    n = raycast.fill_points(shapes.primitives, scene.ground, pose, rays, hits, receiver, points, surfaces)
     points, surfaces = points[:n].copy(), surfaces[:n].copy()
     # Shapes that are not part of an object have a negative number; -1 is the last entry, the ground.
     objects = np.maximum([*scene.primitives[:, 19], -1.0], -1.0).astype(np.int32)[surfaces]
@@ -329,18 +316,18 @@ def _pattern_rays(
     return math.radians(pattern.width_deg) / 2.0 * across, (middle + half * up)[None]
 
 
-def place_shapes(scene: Scene, T_world_sensor: Floats, n_columns: int, reach_m: float) -> Shapes:
+def place_shapes(scene: Scene, T_world_sensor: Floats, n_columns: int, reach_m: float) -> raycast.Shapes:
     """Sort the shapes of a scene by the directions, ``n_columns`` counter-clockwise from +x, in which rays from a
     sensor may hit them. The last column of the returned primitives is their row of ``scene.primitives``.
     """
     poses = np.array([(*o.center[:2], o.center[2] - o.size[2] / 2.0, o.yaw) for o in scene.objects]).reshape(-1, 4)
-    primitives = placed(scene.primitives, poses, T_world_sensor)
+    primitives = raycast.placed(scene.primitives, poses, T_world_sensor)
     bounds = np.empty((len(primitives), 5))
-    fill_bounds(primitives, bounds)
+    raycast.fill_bounds(primitives, bounds)
     near_first = np.argsort(bounds[:, 4], kind="stable")
     primitives, bounds = np.ascontiguousarray(primitives[near_first]), np.ascontiguousarray(bounds[near_first])
     primitives[:, 19] = near_first
-    return Shapes(primitives, bounds, *columns_of(bounds, n_columns, reach_m))
+    return raycast.Shapes(primitives, bounds, *raycast.columns_of(bounds, n_columns, reach_m))
 
 
 def simulate_sequence(

@@ -22,22 +22,10 @@ from ..types.mounting import MODEL_MOUNTING, Mounting
 from ..types.perception import Box, Perception
 from ..types.points import Floats, Ints64, Records
 from ..types.rigid import rigid
+from . import lives
 from .egomotion import fit_motion
 from .imm import fill_combined, fill_interaction, fill_mode_probabilities
 from .jpda import MAX_EVENTS, Detections, Gates, Predictions, fill_association, fill_likelihoods
-from .lives import (
-    CLASS,
-    LEAST_EXISTENCE,
-    SCALARS,
-    TRACK,
-    fill_hidden,
-    fill_newborn,
-    mark_out_of_view,
-    mark_rivals,
-    update_fronts,
-    update_lives,
-    update_shapes,
-)
 from .tracks import PARAMETERS, ClassParameters, Tracks, strength_of
 from .ukf import fill_predictions, fill_updates
 
@@ -64,7 +52,7 @@ class _Session:
     number: int = 0
     stamp_s: float = 0.0
     posed: bool | None = None  # None before the first scan
-    tracks: Records = field(default_factory=lambda: np.zeros(0, TRACK))
+    tracks: Records = field(default_factory=lambda: np.zeros(0, lives.TRACK))
     T_world_sensor: Floats = field(default_factory=lambda: np.eye(4))
     # Without poses: the vehicle's speed ahead and to the left, its turn rate, and their variances.
     twist: Floats = field(default_factory=lambda: np.zeros(3))
@@ -142,7 +130,7 @@ class Tracker:
         """Delete all tracks, and reset the time, the pose and the ids."""
         self._labels: list[str] = []
         self._groups: list[str] = []
-        self.class_table = np.zeros(0, CLASS)
+        self.class_table = np.zeros(0, lives.CLASS)
         self._next_id, self._n_sessions = 1, 1
         self._session = _Session()
         self._former: _Session | None = None  # that before a jump, until the next scan confirms the jump
@@ -237,7 +225,7 @@ class Tracker:
             raise TrackingError(f"T_world_sensor has {np.abs(pose).max():g}; expected at most {FARTHEST_M:g} m")
         self._warn_of(step, stamp_s)
         if step == "late":
-            nothing, pose = np.zeros(0, TRACK), session.T_world_sensor.copy()
+            nothing, pose = np.zeros(0, lives.TRACK), session.T_world_sensor.copy()
             late = Tracks(nothing, self._labels, stamp_s, pose, len(session.tracks), 0, session.number, is_late=True)
             self._clock = clock
             return late
@@ -270,9 +258,9 @@ class Tracker:
         tracks["score"] = _scores(tracks, strength, self.class_table[tracks["label"]], pose)
 
         reported = tracks["existence"] > 0.0
-        mark_out_of_view(tracks, pose, self._right, self._width, reported)
+        lives.mark_out_of_view(tracks, pose, self._right, self._width, reported)
         strongest_first = np.argsort(-strength, kind="stable")
-        mark_rivals(tracks["state"].copy(), tracks["shape"].copy(), strongest_first, reported)
+        lives.mark_rivals(tracks["state"].copy(), tracks["shape"].copy(), strongest_first, reported)
         n_tentative = int(len(tracks) - np.count_nonzero(reported))
         shown, number = tracks[reported], session.number
         answer = Tracks(shown, self._labels, stamp_s, pose.copy(), n_tentative, n_approximated, number)
@@ -305,9 +293,9 @@ class Tracker:
             of = self._parameters.get(name) or replace(PARAMETERS["car"], group=name)
             if of.group not in self._groups:
                 self._groups = [*self._groups, of.group]  # new ones: a copy of the tracker has the former
-            row = np.zeros(1, CLASS)
+            row = np.zeros(1, lives.CLASS)
             row["group"] = self._groups.index(of.group)
-            for scalar in SCALARS:
+            for scalar in lives.SCALARS:
                 row[scalar] = getattr(of, scalar)
             row["noise"] = of.acceleration_mps2, of.turn_acceleration_rps2, of.walk_m, of.wander_rad, of.still_mps
             row["sigmas"] = of.along_m, of.across_m, of.heading_rad
@@ -364,15 +352,17 @@ class Tracker:
         own = np.flatnonzero((beta[:, 1:].sum(axis=0) < 0.5) & (detections.logits >= classes["birth_logit"]))
         if not len(own):
             return tracks
-        joined = np.zeros(len(tracks) + len(own), TRACK)  # np.concatenate takes ten times as long with named fields
+        joined = np.zeros(
+            len(tracks) + len(own), lives.TRACK
+        )  # np.concatenate takes ten times as long with named fields
         joined[: len(tracks)] = tracks
         born = Detections._make(field[own] for field in detections)
-        fill_newborn(self._next_id, born, classes[own], joined[len(tracks) :])
+        lives.fill_newborn(self._next_id, born, classes[own], joined[len(tracks) :])
         return joined
 
     def _living(self, tracks: Records) -> Records:
         """Tracks to keep: above `LEAST_EXISTENCE`, and at most ``max_tracks`` of them."""
-        stays = tracks["existence"] > LEAST_EXISTENCE
+        stays = tracks["existence"] > lives.LEAST_EXISTENCE
         if not stays.all():
             tracks = tracks[stays]
         if len(tracks) > self._max_tracks:
@@ -451,7 +441,7 @@ def _update_motion(
 def _update_shapes(tracks: Records, detections: Detections, beta: Floats, sigmas: Floats, dt: float) -> None:
     """Smooth the heights and sizes; ``sigmas`` (n, 4) are those of a detection [m]."""
     shape, variance = tracks["shape"].copy(), tracks["shape_variance"].copy()
-    update_shapes(beta, detections.shapes, sigmas, SHAPE_WALK_M * math.sqrt(dt), shape, variance)
+    lives.update_shapes(beta, detections.shapes, sigmas, SHAPE_WALK_M * math.sqrt(dt), shape, variance)
     tracks["shape"], tracks["shape_variance"] = shape, variance
 
 
@@ -462,11 +452,11 @@ def _update_evidence(
     state, fronts = tracks["state"].copy(), tracks["fronts"].copy()
     speed_sigma = np.sqrt(np.maximum(tracks["covariance"][:, 2, 2], 0.0))
     moving_mps = classes["moving_mps"].copy()
-    update_fronts(state, speed_sigma, moving_mps, beta, detections.places, detections.fronts, fronts)
+    lives.update_fronts(state, speed_sigma, moving_mps, beta, detections.places, detections.fronts, fronts)
     tracks["fronts"] = fronts
     hidden = np.zeros(len(tracks))
-    fill_hidden(state, tracks["shape"].copy(), beta[:, 0] < 0.5, pose[:2, 3].copy(), hidden)
-    update_lives(tracks, classes, beta, hidden, detections.logits, detections.kinds, dt)
+    lives.fill_hidden(state, tracks["shape"].copy(), beta[:, 0] < 0.5, pose[:2, 3].copy(), hidden)
+    lives.update_lives(tracks, classes, beta, hidden, detections.logits, detections.kinds, dt)
 
 
 def _scores(tracks: Records, strength: Floats, classes: Records, pose: Floats) -> Floats:

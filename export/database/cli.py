@@ -10,7 +10,7 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-from edgeperc.cli.arguments import options
+from edgeperc.cli.arguments import keywords, options
 from edgeperc.cli.output import print_error, print_line
 
 DATABASE = "folder of a database made by edgeperc-export database-build"
@@ -87,14 +87,8 @@ def _build(args: argparse.Namespace) -> int:
         if args.road_steps is not None:
             recipe = replace(recipe, steps=args.road_steps)
     plan = Plan(args.kitti, args.out, args.road_by, args.sensor, args.provider, args.variations)
-    report = build(
-        plan,
-        polygons=args.polygons,
-        test_drives=args.test_drive,
-        recipe=recipe,
-        engine=args.engine,
-        workers=args.workers,
-    )
+    how = keywords(args, "polygons", "engine", "workers", test_drives="test_drive")
+    report = build(plan, recipe=recipe, **how)
     for line in report.notes:
         print_error(line, "edgeperc-export")
     for name, reason in report.skipped.items():

@@ -12,17 +12,6 @@ from numpy.typing import NDArray
 
 from edgeperc import MissingExtraError, Perception
 from edgeperc_bench.peers import slam
-from edgeperc_bench.peers.slam import (
-    CELL_M,
-    Drive,
-    closure,
-    compared,
-    ghost_share,
-    look,
-    moving_boxes,
-    step_errors,
-    trajectory_error,
-)
 from scenes import box
 
 
@@ -42,15 +31,15 @@ def ways(n: int = 20, step: float = 0.8) -> NDArray[np.float64]:
 def test_the_error_of_a_trajectory_is_that_after_the_best_alignment() -> None:
     true = ways()
     moved = turned(70.0, 5.0, -3.0, 1.0) @ true
-    assert trajectory_error(true, moved) == pytest.approx(0.0, abs=1e-9)
+    assert slam.trajectory_error(true, moved) == pytest.approx(0.0, abs=1e-9)
     wrong = true.copy()
     wrong[::2, 2, 3] += 0.4  # every second pose 0.2 m above the mean, the others as much below
-    assert trajectory_error(true, wrong) == pytest.approx(0.2, abs=0.01)
+    assert slam.trajectory_error(true, wrong) == pytest.approx(0.2, abs=0.01)
     helix = true.copy()
     helix[:, 2, 3] = np.sin(np.arange(20) / 3.0)
     mirrored = helix.copy()
     mirrored[:, 1, 3] *= -1.0
-    assert trajectory_error(helix, mirrored) > 0.2  # a mirror is no rigid motion
+    assert slam.trajectory_error(helix, mirrored) > 0.2  # a mirror is no rigid motion
 
 
 def test_the_way_back_closes() -> None:
@@ -60,7 +49,7 @@ def test_the_way_back_closes() -> None:
         given.extend(len(points) for points in scans)
         return np.array([turned(0.0, 0.1 * k, 0.0, 0.0) for k in range(len(scans))])
 
-    poses, gap = closure(drifting, [np.zeros((k + 1, 4), np.float32) for k in range(4)])
+    poses, gap = slam.closure(drifting, [np.zeros((k + 1, 4), np.float32) for k in range(4)])
     assert given == [1, 2, 3, 4, 3, 2, 1]
     assert len(poses) == 4
     assert gap == pytest.approx(0.4)  # of the second scan: its poses are those of the second and the sixth
@@ -68,20 +57,20 @@ def test_the_way_back_closes() -> None:
 
 def test_errors_of_steps_are_in_the_frame_of_the_sensor() -> None:
     true = ways()
-    np.testing.assert_allclose(step_errors(true, turned(70.0, 5.0, -3.0, 1.0) @ true), 0.0, atol=1e-9)
+    np.testing.assert_allclose(slam.step_errors(true, turned(70.0, 5.0, -3.0, 1.0) @ true), 0.0, atol=1e-9)
     wrong = true.copy()
     wrong[10:, 1, 3] += 0.3  # one jump
-    np.testing.assert_allclose(step_errors(true, wrong), [0.0] * 9 + [0.3] + [0.0] * 9, atol=1e-9)
+    np.testing.assert_allclose(slam.step_errors(true, wrong), [0.0] * 9 + [0.3] + [0.0] * 9, atol=1e-9)
 
 
 def test_cells_of_a_map_with_a_moving_point_are_counted_once() -> None:
     scan = np.array([[0.1, 0.1, 0.1, 0], [0.15, 0.1, 0.1, 0], [1.1, 0.1, 0.1, 0], [2.1, 0.1, 0.1, 0]], np.float32)
     moving = np.array([False, True, True, False])
-    poses, whole = np.array([np.eye(4), turned(0.0, CELL_M, 0.0, 0.0)]), np.ones(4, np.bool_)
-    assert ghost_share([scan[:, :]] * 2, [whole] * 2, [moving] * 2, poses[[0, 0]]) == pytest.approx(2 / 3)
-    assert ghost_share([scan] * 2, [whole] * 2, [moving] * 2, poses) == pytest.approx(4 / 6)
-    assert ghost_share([scan] * 2, [~moving] * 2, [moving] * 2, poses) == 0.0
-    assert ghost_share([scan], [~whole], [moving], poses[:1]) == 0.0
+    poses, whole = np.array([np.eye(4), turned(0.0, slam.CELL_M, 0.0, 0.0)]), np.ones(4, np.bool_)
+    assert slam.ghost_share([scan[:, :]] * 2, [whole] * 2, [moving] * 2, poses[[0, 0]]) == pytest.approx(2 / 3)
+    assert slam.ghost_share([scan] * 2, [whole] * 2, [moving] * 2, poses) == pytest.approx(4 / 6)
+    assert slam.ghost_share([scan] * 2, [~moving] * 2, [moving] * 2, poses) == 0.0
+    assert slam.ghost_share([scan], [~whole], [moving], poses[:1]) == 0.0
 
 
 def test_labels_move_by_their_motion_over_ground() -> None:
@@ -92,14 +81,14 @@ def test_labels_move_by_their_motion_over_ground() -> None:
         later = 60.0 + 0.5 * max(0, k - 20) - way
         labels.append([box(12.0, 0.0), box(45.0 - way, 6.0), box(later, -4.0)])
         poses.append(turned(0.0, way, 0.0, 0.0))
-    found = moving_boxes(labels, np.array(poses))
+    found = slam.moving_boxes(labels, np.array(poses))
     assert all(labels[k][0] in boxes for k, boxes in enumerate(found))  # from the first scan on
     assert not any(labels[k][1] in boxes for k, boxes in enumerate(found))
     assert not any(labels[k][2] in boxes for k, boxes in enumerate(found[:10]))
     assert all(labels[k][2] in boxes for k, boxes in enumerate(found) if k > 24)
 
 
-def drive_with_a_car(n: int = 16) -> tuple[Drive, Any]:
+def drive_with_a_car(n: int = 16) -> tuple[slam.Drive, Any]:
     """Scans of walls and of a car that keeps its distance, with its labels; and what perceives its box."""
     rng = np.random.default_rng(0)
     wall = rng.uniform([0.0, 8.0, -1.0], [60.0, 9.0, 1.0], (400, 3))
@@ -113,7 +102,9 @@ def drive_with_a_car(n: int = 16) -> tuple[Drive, Any]:
         moving.append(np.arange(len(points)) >= 400)
     every = [np.ones(500, np.bool_)] * n
     parked = [[box(25.0 + 7.0 * i - 0.8 * k, -6.0 if i % 2 else 6.0) for i in range(4)] for k in range(n)]
-    drive = Drive("d", scans, np.array(poses), moving, every, every, [[box(12.0, 0.0), *parked[k]] for k in range(n)])
+    drive = slam.Drive(
+        "d", scans, np.array(poses), moving, every, every, [[box(12.0, 0.0), *parked[k]] for k in range(n)]
+    )
 
     def perceive(points: NDArray[np.float32], stamp_s: float) -> Perception:
         boxes = (box(12.0, 0.0), *parked[round(10.0 * stamp_s)])
@@ -124,13 +115,13 @@ def drive_with_a_car(n: int = 16) -> tuple[Drive, Any]:
 
 def test_the_rows_of_a_drive() -> None:
     drive, perceive = drive_with_a_car()
-    seen = look(perceive, drive)
+    seen = slam.look(perceive, drive)
     assert [len(masks) for masks in seen.kept.values()] == [16, 16, 16]
     assert not seen.kept["without moving"][-1][400:].any()
     assert seen.kept["without moving"][-1][:400].all()
     assert drive.poses is not None
     poses = np.concatenate([drive.poses, drive.poses[-2::-1]])
-    (whole, still, parked), motion = compared(drive, seen, lambda scans: poses)
+    (whole, still, parked), motion = slam.compared(drive, seen, lambda scans: poses)
     assert motion[:4] == ["d", "truth", "0.000 m", "0.000 m"]
     assert 0.0 < float(motion[4].removesuffix(" m")) < 0.1  # the parked cars show the motion
     assert float(motion[5].removesuffix(" m")) >= float(motion[4].removesuffix(" m"))
@@ -141,8 +132,8 @@ def test_the_rows_of_a_drive() -> None:
     assert [row[6] for row in (whole, still)] == ["0.00 %", "0.00 %"]
     assert whole[7] == "-"
     assert float(still[7]) >= 0.0
-    unknown = Drive("r", drive.scans, None, None, drive.usable, drive.known, drive.labels)
-    (labeled, first, second, _), motion = compared(unknown, seen, lambda scans: poses, second_pass=True)
+    unknown = slam.Drive("r", drive.scans, None, None, drive.usable, drive.known, drive.labels)
+    (labeled, first, second, _), motion = slam.compared(unknown, seen, lambda scans: poses, second_pass=True)
     assert motion[1:4] == ["KISS-ICP", "-", "-"]
     assert [first[1], second[1]] == ["without moving", "same, second pass"]
     assert 0.0 < float(second[5].removesuffix(" %")) <= shares[1]  # known poses leave less doubt
@@ -156,9 +147,11 @@ def test_kiss_icp_follows_a_drawn_street() -> None:
     assert drive.poses is not None
     assert drive.moving is not None
     assert any(mask.any() for mask in drive.moving)
-    poses, gap = closure(slam.kiss_icp, slam.chosen(drive, [np.ones(len(points), np.bool_) for points in drive.scans]))
+    poses, gap = slam.closure(
+        slam.kiss_icp, slam.chosen(drive, [np.ones(len(points), np.bool_) for points in drive.scans])
+    )
     assert poses.shape == (6, 4, 4)
-    assert trajectory_error(drive.poses, poses) < 0.1
+    assert slam.trajectory_error(drive.poses, poses) < 0.1
     assert gap < 0.05
 
 

@@ -219,7 +219,7 @@ def test_the_development_kit_step_by_step_gives_the_same_numbers(given_scans: li
 @settings(deadline=None, max_examples=100)
 @given(st.integers(1, 400), st.integers(0, 2**32 - 1))
 def test_thresholds_of_the_recall_positions_are_those_of_the_kit(n_truth: int, seed: int) -> None:
-    from edgeperc.evaluation.kitti_ap import recall_positions
+    from edgeperc.evaluation.metrics import recall_positions
 
     rng = np.random.default_rng(seed)
     hits: NDArray[np.float64] = np.sort(rng.random(rng.integers(0, n_truth + 1)))[::-1]

@@ -36,16 +36,9 @@ from edgeperc_export.recipe import MODELS, PAPER, Recipe
 from edgeperc_export.release.agree import agree
 from edgeperc_export.release.quantize import Calibration, LabeledSets, calibration_images, quantize
 from edgeperc_export.release.to_onnx import export, load, to_graph, verify
+from edgeperc_export.training import camvid
 from edgeperc_export.training import images as camvid_images
 from edgeperc_export.training.camera import Camera, class_weights
-from edgeperc_export.training.camvid import (
-    ELEVEN,
-    ablate_camvid,
-    figures_of,
-    plot_camvid,
-    show_camvid,
-    table,
-)
 from edgeperc_export.training.checkpoint import read_checkpoint
 from edgeperc_export.training.images import (
     augmented_images,
@@ -325,7 +318,7 @@ def test_lovasz_of_all_classes_at_once_is_the_same() -> None:
 def test_figures_follow_the_papers_equations() -> None:
     # Class 0: 5 right, 1 missed, 2 false. Class 1: 2 right, 2 missed, 1 false. Class 2 does not occur.
     counts = np.array([[5, 1, 0], [2, 2, 0], [0, 0, 0]])
-    found = figures_of(counts)
+    found = camvid.figures_of(counts)
     assert found["miou"] == pytest.approx((5 / 8 + 2 / 5) / 2)  # equation 1
     assert found["accuracy"] == pytest.approx(7 / 10)  # equation 2
     f1 = [2 * (5 / 7 * 5 / 6) / (5 / 7 + 5 / 6), 2 * (2 / 3 * 2 / 4) / (2 / 3 + 2 / 4)]  # equations 3 to 5
@@ -334,7 +327,7 @@ def test_figures_follow_the_papers_equations() -> None:
 
 
 def test_a_class_that_is_never_found_counts_as_zero() -> None:
-    found = figures_of(np.array([[5, 0], [3, 0]]))
+    found = camvid.figures_of(np.array([[5, 0], [3, 0]]))
     assert found["miou"] == pytest.approx((5 / 8) / 2)
     assert found["f1"] == pytest.approx((2 * 5 / 8 * 1 / (5 / 8 + 1)) / 2)
 
@@ -417,13 +410,13 @@ def test_images_are_needed(tmp_path: Path) -> None:
 
 
 def test_comparison_resumes_network_by_network(drawn: Path, tmp_path: Path) -> None:
-    assert len(ELEVEN) == 11
-    assert all(len(figures) == 5 for _, _, figures in ELEVEN.values())
+    assert len(camvid.ELEVEN) == 11
+    assert all(len(figures) == 5 for _, _, figures in camvid.ELEVEN.values())
     pytest.importorskip("matplotlib")
     small = {"width": 48, "height": 36, "epochs": 1, "batch": 3, "n_threads": 1}
     names = ["Small U-Net ReLU", "Small U-Net Leaky ReLU"]
-    (one,) = ablate_camvid(drawn, tmp_path, networks=names[1:], **small)  # type: ignore[arg-type]
-    first, second = ablate_camvid(drawn, tmp_path, networks=names, **small)  # type: ignore[arg-type]
+    (one,) = camvid.ablate_camvid(drawn, tmp_path, networks=names[1:], **small)  # type: ignore[arg-type]
+    first, second = camvid.ablate_camvid(drawn, tmp_path, networks=names, **small)  # type: ignore[arg-type]
     assert (first["name"], second) == (names[0], one)  # in the paper's order, and not trained again
     assert first["budget"] == second["budget"]
     assert first["budget"]["images"] == 6
@@ -431,17 +424,17 @@ def test_comparison_resumes_network_by_network(drawn: Path, tmp_path: Path) -> N
     assert low <= first["miou"] <= high
     assert not [*tmp_path.rglob("checkpoint.pt")]
     with pytest.raises(ValueError, match="results of the budget"):
-        ablate_camvid(drawn, tmp_path, networks=names, **{**small, "epochs": 2})  # type: ignore[arg-type]
+        camvid.ablate_camvid(drawn, tmp_path, networks=names, **{**small, "epochs": 2})  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="no network"):
-        ablate_camvid(drawn, tmp_path, networks=["unet"])
+        camvid.ablate_camvid(drawn, tmp_path, networks=["unet"])
 
-    text = table([first, second])
+    text = camvid.table([first, second])
     assert text.count("\n") == 4
     assert "(0.533)" in text
-    for path in plot_camvid([first, second], tmp_path):
+    for path in camvid.plot_camvid([first, second], tmp_path):
         assert read_image(path).shape[1] > 500
-    show_camvid(tmp_path / "camvid.npz", tmp_path / "own.png")
-    show_camvid(tmp_path / "camvid.npz", tmp_path / "all.png", drawn)
+    camvid.show_camvid(tmp_path / "camvid.npz", tmp_path / "own.png")
+    camvid.show_camvid(tmp_path / "camvid.npz", tmp_path / "all.png", drawn)
     assert read_image(tmp_path / "own.png").shape[1] == read_image(tmp_path / "all.png").shape[1]
     assert np.load(tmp_path / "camvid.npz")[names[0]].shape == (3, 72, 96)
 

@@ -13,6 +13,7 @@ import twins.objects
 from edgeperc.errors import CardError, InferenceError, PointsError
 from edgeperc.ground.planes import Ground
 from edgeperc.ground.scan import Scan
+from edgeperc.objects import candidates
 from edgeperc.objects.candidate_boxes import (
     SCORE,
     boxes_of_objects,
@@ -22,16 +23,6 @@ from edgeperc.objects.candidate_boxes import (
     footprints,
     merge_boxes,
     with_footprints,
-)
-from edgeperc.objects.candidates import (
-    MAX_LENGTH_M,
-    SCALES,
-    Candidates,
-    CellBuffer,
-    Cells,
-    fill_groups_of_cells,
-    find_candidates,
-    sort_into_cells,
 )
 from edgeperc.objects.crops import FEATURES, Crops, crop_candidates, fill_features, with_points
 from edgeperc.types.card import CHANNELS, InputSpec, ModelCard, OutputSpec
@@ -76,7 +67,7 @@ def some_scan(rng: np.random.Generator, n: int) -> Scan:
     return scan_of(points, height)
 
 
-def by_cell(cells: Cells) -> dict[int, list[int]]:
+def by_cell(cells: candidates.Cells) -> dict[int, list[int]]:
     return {
         int(flat): cells.rows[start:end].tolist()
         for flat, start, end in zip(cells.flat, cells.starts[:-1], cells.starts[1:], strict=True)
@@ -95,7 +86,7 @@ def scans() -> list[Scan]:
 @pytest.mark.parametrize("distance_per_m", [0.015, 0.9], ids=["near", "far"])  # far: more than 64 cells to each side
 @pytest.mark.parametrize("scan", scans(), ids=lambda scan: f"{len(scan.points)} points")
 def test_cells_and_groups_agree_with_their_twins(scan: Scan, distance_per_m: float) -> None:
-    cells = sort_into_cells(scan, RANGE_M)
+    cells = candidates.sort_into_cells(scan, RANGE_M)
     right = twins.objects.cells(scan.points, scan.ground.height_m, *RANGE_M)
     assert by_cell(cells) == right
     assert [*by_cell(cells)] == [*right]
@@ -104,11 +95,11 @@ def test_cells_and_groups_agree_with_their_twins(scan: Scan, distance_per_m: flo
     np.testing.assert_array_equal(numbers[cells.flat], np.arange(len(right)))
     around: list[set[int]] = []
     n_found = 0
-    for k, scale in enumerate(SCALES):
+    for k, scale in enumerate(candidates.SCALES):
         group, order = np.empty((2, len(right)), np.int32)
         first = np.empty(len(right) + 1, np.int32)
-        per_m = distance_per_m * scale.link_m / SCALES[0].link_m
-        n = fill_groups_of_cells(cells, k, scale.link_m, per_m, group, order, first)
+        per_m = distance_per_m * scale.link_m / candidates.SCALES[0].link_m
+        n = candidates.fill_groups_of_cells(cells, k, scale.link_m, per_m, group, order, first)
         found = [{*cells.flat[order[first[g] : first[g + 1]]].tolist()} for g in range(n)]
         expected = twins.objects.groups(right, scan.ground.height_m, scale, per_m)
         assert found == expected
@@ -119,7 +110,7 @@ def test_cells_and_groups_agree_with_their_twins(scan: Scan, distance_per_m: flo
                 scan.points, scan.ground.height_m, rows, scale, len(own), outer if k else None
             )
         around = around if k else expected
-    assert len(find_candidates(scan, cells, distance_per_m).rectangles) == n_found
+    assert len(candidates.find_candidates(scan, cells, distance_per_m).rectangles) == n_found
 
 
 @pytest.mark.kernel
@@ -132,7 +123,7 @@ def test_a_rectangle_holds_the_points_of_its_group() -> None:
         points[:, 0] = 10.0 + math.cos(yaw) * u - math.sin(yaw) * v
         points[:, 1] = 3.0 + math.sin(yaw) * u + math.cos(yaw) * v
         scan = scan_of(points, np.linspace(0.3, 1.5, 200, dtype=np.float32))
-        found = find_candidates(scan, sort_into_cells(scan, RANGE_M)).rectangles
+        found = candidates.find_candidates(scan, candidates.sort_into_cells(scan, RANGE_M)).rectangles
         assert len(found) >= 1
         x, y, length, width, turn = found[0]
         along = np.abs(math.cos(turn) * (points[:, 0] - x) + math.sin(turn) * (points[:, 1] - y))
@@ -147,10 +138,10 @@ def test_what_is_too_long_too_low_or_too_small_is_no_candidate() -> None:
         points = np.zeros((n, 4), np.float32)
         points[:, 0] = np.linspace(10.0, 10.0 + length, n)
         scan = scan_of(points, np.linspace(0.25, top, n, dtype=np.float32))
-        return len(find_candidates(scan, sort_into_cells(scan, RANGE_M)).rectangles)
+        return len(candidates.find_candidates(scan, candidates.sort_into_cells(scan, RANGE_M)).rectangles)
 
     assert n_found(4.0, 1.5, 80) >= 1
-    assert n_found(MAX_LENGTH_M + 0.5, 1.5, 200) == 0
+    assert n_found(candidates.MAX_LENGTH_M + 0.5, 1.5, 200) == 0
     assert n_found(4.0, 0.4, 80) == 0
     assert n_found(0.1, 1.5, 3) == 0
 
@@ -158,14 +149,14 @@ def test_what_is_too_long_too_low_or_too_small_is_no_candidate() -> None:
 def test_a_distance_is_in_radians() -> None:
     scan = some_scan(np.random.default_rng(1), 500)
     with pytest.raises(PointsError, match="distance_per_m=2"):
-        find_candidates(scan, sort_into_cells(scan, RANGE_M), 2.0)
+        candidates.find_candidates(scan, candidates.sort_into_cells(scan, RANGE_M), 2.0)
 
 
 def test_one_buffer_serves_one_scan_after_the_other() -> None:
-    buffer = CellBuffer()
+    buffer = candidates.CellBuffer()
     for scan in [*scans(), *reversed(scans())]:
         reused = buffer.sort(scan, RANGE_M)
-        fresh = sort_into_cells(scan, RANGE_M)
+        fresh = candidates.sort_into_cells(scan, RANGE_M)
         for a, b in zip(reused, fresh, strict=True):
             np.testing.assert_array_equal(a, b)
 
@@ -184,9 +175,9 @@ def some_places(rng: np.random.Generator, scan: Scan, n: int) -> Rows:
 @pytest.mark.parametrize("scan", scans(), ids=lambda scan: f"{len(scan.points)} points")
 def test_crops_and_features_agree_with_their_twins(scan: Scan) -> None:
     rng = np.random.default_rng(5)
-    cells = sort_into_cells(scan, RANGE_M)
+    cells = candidates.sort_into_cells(scan, RANGE_M)
     places = some_places(rng, scan, 12)
-    crops = crop_candidates(scan, Candidates(places, cells), 8, 0.8)
+    crops = crop_candidates(scan, candidates.Candidates(places, cells), 8, 0.8)
     for k, place in enumerate(places):
         points, n, level = twins.objects.crop(scan.points, scan.ground.height_m, by_cell(cells), place, 8, 0.8)
         assert crops.counts[k] == n
@@ -197,9 +188,9 @@ def test_crops_and_features_agree_with_their_twins(scan: Scan) -> None:
     fill_features(crops.points, crops.counts, places, scale, found)
     right = twins.objects.features(crops.points.astype(np.float64), crops.counts, places, scale)
     np.testing.assert_allclose(found, right, atol=1e-4)
-    (kept, _), some = with_points(Candidates(places, cells), crops)
+    (kept, _), some = with_points(candidates.Candidates(places, cells), crops)
     assert len(kept) == len(some.counts) == (crops.counts >= 3).sum()
-    nothing = crop_candidates(scan, Candidates(places[:0], cells), 8, 0.8)
+    nothing = crop_candidates(scan, candidates.Candidates(places[:0], cells), 8, 0.8)
     assert nothing.points.shape == (0, 8, 4)
 
 
@@ -220,7 +211,7 @@ def test_a_scan_and_its_candidates_may_be_turned_together() -> None:
     turned[:, 4] += angle
     other = scan_of(points, scan.ground.height_m)
     first, second = (
-        crop_candidates(s, Candidates(p, sort_into_cells(s, RANGE_M)), 512, 0.8)
+        crop_candidates(s, candidates.Candidates(p, candidates.sort_into_cells(s, RANGE_M)), 512, 0.8)
         for s, p in ((scan, places), (other, turned))
     )
     np.testing.assert_array_equal(first.counts, second.counts)
@@ -357,6 +348,6 @@ def test_the_card_describes_candidates() -> None:
 
 def test_crops_of_no_candidate_are_empty() -> None:
     empty = Crops(np.empty((0, 8, 4), np.float32), np.empty(0, np.int32), np.empty(0))
-    cells = sort_into_cells(scans()[0], RANGE_M)
-    kept, crops = with_points(Candidates(np.empty((0, 5)), cells), empty)
+    cells = candidates.sort_into_cells(scans()[0], RANGE_M)
+    kept, crops = with_points(candidates.Candidates(np.empty((0, 5)), cells), empty)
     assert len(kept.rectangles) == len(crops.counts) == 0

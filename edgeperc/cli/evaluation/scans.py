@@ -18,6 +18,7 @@ from ..arguments import (
     add_provider,
     chosen_models,
     finite_number,
+    keywords,
     options,
 )
 from ..output import FEW, lines_last, make_places, many, progress, table_lines, write_figures
@@ -121,13 +122,9 @@ def eval_command(arguments: argparse.Namespace) -> int:
             arguments.datasets,
             chosen_models(arguments),
             perceiving,
-            split=arguments.split,
-            fold=arguments.fold,
-            road_by=arguments.road_by,
             mounted=None if arguments.mounted is None else Mounting(*arguments.mounted),
-            engine=arguments.engine,
-            workers=arguments.workers,
             on_scan=show,
+            **keywords(arguments, "split", "fold", "road_by", "engine", "workers"),
         )
     with lines_last(figure_lines(figures), gray=True):
         write_figures(arguments, figures)
@@ -162,14 +159,8 @@ def _eval_images(arguments: argparse.Namespace, roots: Sequence[Path]) -> int:
     if len(models) > 1:
         arguments.usage_error(f"got {len(models)} models; images are evaluated with one --model")
     with progress("image") as show:
-        figures = evaluate_images(
-            roots,
-            models[0],
-            split=arguments.split,
-            provider=arguments.provider,
-            precision=arguments.precision,
-            on_image=show,
-        )
+        how = keywords(arguments, "split", "provider", "precision")
+        figures = evaluate_images(roots, models[0], on_image=show, **how)
     with lines_last(_image_lines(figures)):
         write_figures(arguments, figures)
     return 0

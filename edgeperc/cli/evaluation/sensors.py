@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from ..arguments import Commands, add_command, add_figures_file, add_provider, options, positive
+from ..arguments import Commands, add_command, add_figures_file, add_provider, keywords, options, positive
 from ..output import FEW, lines_last, make_places, many, progress, table_lines, write_figures
 from .box_tables import box_table_lines
 
@@ -63,14 +63,8 @@ def eval_sensors_command(arguments: argparse.Namespace) -> int:
     from ...perceiver import ADAPTATIONS
 
     with progress() as show:
-        figures = compare(
-            arguments.datasets,
-            arguments.model,
-            provider=arguments.provider,
-            precision=arguments.precision,
-            workers=arguments.workers,
-            on_scan=show,
-        )
+        how = keywords(arguments, "provider", "precision", "workers")
+        figures = compare(arguments.datasets, arguments.model, on_scan=show, **how)
     lines = [f"{arguments.model}; IoU of points in per cent, mIoU over the classes shown"]
     for name, result in figures.items():
         rows = [((kind, ""), {**result[kind]["iou"], "mean": result[kind]["mean_iou"]}) for kind in ADAPTATIONS]
