@@ -114,14 +114,7 @@ class TopViewNetwork:
         labels = decode_cells(self.card, self.index >= 0, self.session.outputs, boxes)
         observed, between_beams = self._observer.observe(near.points, self.index, mounting)
         return TopView(
-            labels,
-            self.card.classes,
-            view.cell_m,
-            view.x_range_m,
-            view.y_range_m,
-            observed,
-            mounting,
-            between_beams,
+            labels, self.card.classes, view.cell_m, view.x_range_m, view.y_range_m, observed, mounting, between_beams
         )
 
 

@@ -52,9 +52,7 @@ SHARED: Mapping[str, Mapping[str, Any]] = {
         "default": 1,
         "help": "number of processes that make the training samples (default 1)",
     },
-    "--compile": {
-        "help": "run the network through torch.compile, which needs a C++ compiler and a minute to start",
-    },
+    "--compile": {"help": "run the network through torch.compile, which needs a C++ compiler and a minute to start"},
     "--model-version MODEL_VERSION": {"default": "1.0.0", "help": "version to write into the card (default 1.0.0)"},
 }
 

@@ -112,13 +112,7 @@ def _suffix(fold: int | None) -> str:
 
 
 def finish(
-    name: str,
-    checkpoint: Path,
-    path: Path,
-    data: Data,
-    *,
-    semantickitti: Path | None = None,
-    version: str = "1.0.0",
+    name: str, checkpoint: Path, path: Path, data: Data, *, semantickitti: Path | None = None, version: str = "1.0.0"
 ) -> None:
     """Export a checkpoint as the model ``name`` to an .onnx file, evaluate it, and write the figures into its card and
     a JSON file beside it. If ``ssadnet-sim.onnx`` is in the same folder, its road is the ground truth of KITTI's scans.

@@ -143,9 +143,7 @@ class Recipe:
         1000, "after this many steps, label some training scans and draw those with false objects more often; 0: never"
     )
     class_weights: bool = _option(
-        True,
-        "weight rare classes more in the cross-entropy",
-        (*TASKS["points"], *TASKS["vehicles"], *TASKS["camera"]),
+        True, "weight rare classes more in the cross-entropy", (*TASKS["points"], *TASKS["vehicles"], *TASKS["camera"])
     )
     focal_gamma: float = _points(0.0, "focal loss exponent of the cross-entropy; 0: plain cross-entropy")
     lovasz_weight: float = _option(1.0, "weight of the Lovasz-softmax loss, added to the cross-entropy")
@@ -451,13 +449,7 @@ MODELS = {
     # Three quarters of the channels: with all of them it learned the training scans, and found 8 of 255 boxes less.
     "ssadnet": Stage(
         replace(
-            EDGE,
-            network="ssadnet",
-            height_above_ground=False,
-            front=True,
-            drawn_roads=True,
-            n_pasted=3.0,
-            width=0.75,
+            EDGE, network="ssadnet", height_above_ground=False, front=True, drawn_roads=True, n_pasted=3.0, width=0.75
         )
     ),
     "camseg": Stage(CAMSEG),

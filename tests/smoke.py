@@ -30,10 +30,7 @@ SMOKE: dict[str, tuple[list[str], list[str]]] = {
     "foxglove": (["foxglove"], ["tests/sinks/test_viewers.py", "-k", "foxglove or mcap"]),
     "geometry": (["open3d", "pypatchworkpp", "sklearn"], ["tests/bench/test_peers.py", "-k", "ground"]),
     "gpu": (["onnxruntime"], ["tests/inference/test_session.py"]),
-    "io": (
-        ["lz4", "velodyne_decoder", "zstandard"],
-        ["tests/readers/test_captures.py", "tests/readers/test_times.py"],
-    ),
+    "io": (["lz4", "velodyne_decoder", "zstandard"], ["tests/readers/test_captures.py", "tests/readers/test_times.py"]),
     "loadgen": (["mlperf_loadgen"], ["tests/bench/test_bench_measure.py", "-k", "loadgen"]),
     "openvino": (["onnxruntime"], ["tests/inference/test_session.py", "tests/cli/test_doctor.py"]),
     "ouster": (

@@ -202,11 +202,7 @@ def test_a_call_that_fails_leaves_nothing_running(
 
 @pytest.mark.parametrize("alone", ["perception", "full_turn"])
 def test_networks_run_one_after_the_other_where_no_thread_can_be_started(
-    monkeypatch: pytest.MonkeyPatch,
-    two_cores: None,
-    request: pytest.FixtureRequest,
-    scan: SimulatedScan,
-    alone: str,
+    monkeypatch: pytest.MonkeyPatch, two_cores: None, request: pytest.FixtureRequest, scan: SimulatedScan, alone: str
 ) -> None:
     known: Perception = request.getfixturevalue(alone)
     n_lanes = sum(thread.name.startswith("edgeperc-lane") for thread in threading.enumerate())

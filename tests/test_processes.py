@@ -414,8 +414,7 @@ THREADED = ("mcap", "rrd")
 
 @posix
 @pytest.mark.parametrize(
-    ("sink", "limit"),
-    [(sink, limit) for sink in WHOLE_RUN for limit in (0, 1500) if not (limit and sink in SMALL)],
+    ("sink", "limit"), [(sink, limit) for sink in WHOLE_RUN for limit in (0, 1500) if not (limit and sink in SMALL)]
 )
 @pytest.mark.filterwarnings("ignore:.*was not written to its end:RuntimeWarning")
 def test_what_cannot_be_written_is_said_and_is_no_result(

@@ -53,11 +53,7 @@ found = Perceiver(["pointseg"], on_mismatch="warn")(points)
 time.sleep(1.0)  # for threads that work later
 print(found.providers, os.environ["ORT_DISABLE_TELEMETRY"])
 """
-OPEN = {
-    "python": "import socket\nsocket.socket()",
-    "native": "ctypes.CDLL(None).socket(2, 1, 0)",
-    "none": "",
-}
+OPEN = {"python": "import socket\nsocket.socket()", "native": "ctypes.CDLL(None).socket(2, 1, 0)", "none": ""}
 
 
 def socket_call() -> int:

@@ -217,12 +217,7 @@ class BoxEvaluator:
         self._all = _Matches()
 
     def update(
-        self,
-        predicted: Iterable[Box],
-        truth: Iterable[Box],
-        *,
-        ignored: Iterable[Box] = (),
-        drive: str = "",
+        self, predicted: Iterable[Box], truth: Iterable[Box], *, ignored: Iterable[Box] = (), drive: str = ""
     ) -> list[tuple[Box | None, Box | None]]:
         """Count the boxes of a scan, but those that match ``ignored``, and pair them of any class, or with None."""
         guesses = sorted(predicted, key=lambda box: -box.score)

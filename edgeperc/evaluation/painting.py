@@ -62,10 +62,7 @@ def evaluate_painting(
 
 
 def count_painting(
-    scan: SimulatedScan,
-    image: CameraImage,
-    calibration: Calibration,
-    sensor: str | os.PathLike[str] | SensorProfile,
+    scan: SimulatedScan, image: CameraImage, calibration: Calibration, sensor: str | os.PathLike[str] | SensorProfile
 ) -> Counter[str]:
     """Numbers of points and cells of a street that get their true class, by `evaluate_painting`'s names."""
     labels = ImageLabels(image.labels, CAMERA_CLASSES)

@@ -33,12 +33,7 @@ SITTING = "person_sitting"  # label of people who sit; their points count as ped
 FEWEST_OBJECTS = 10  # figures of fewer distinct objects are marked: they say little
 
 # Ranges of the horizontal distance [m] of points, cell centers and box centers.
-BANDS = {
-    "all": (0.0, math.inf),
-    "0-15 m": (0.0, 15.0),
-    "15-30 m": (15.0, 30.0),
-    "30-46 m": (30.0, 46.0),
-}
+BANDS = {"all": (0.0, math.inf), "0-15 m": (0.0, 15.0), "15-30 m": (15.0, 30.0), "30-46 m": (30.0, 46.0)}
 Tallies = Mapping[tuple[str, ...], Any]
 
 

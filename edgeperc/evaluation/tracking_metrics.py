@@ -142,11 +142,7 @@ class _Packed:
     """All frames of one sequence concatenated, with ids from 0 and all pairs of a true box and a track in one frame."""
 
     def __init__(
-        self,
-        truth: Sequence[FrameTruth],
-        tracks: Sequence[FrameTracks],
-        iou_threshold: float,
-        as_ab3dmot: bool = False,
+        self, truth: Sequence[FrameTruth], tracks: Sequence[FrameTracks], iou_threshold: float, as_ab3dmot: bool = False
     ) -> None:
         if len(truth) != len(tracks):
             raise TrackingError(f"got {len(tracks)} frames of tracks for {len(truth)} of truth; pass one for each")

@@ -85,10 +85,7 @@ def semantickitti_truth(frame: RoadFrame, view: TopViewGeometry | None) -> Truth
 
 
 def folder_truth(
-    frame: ScanFrame,
-    mounting: Mounting,
-    view: TopViewGeometry | None,
-    classes: Sequence[str] = POINT_CLASSES,
+    frame: ScanFrame, mounting: Mounting, view: TopViewGeometry | None, classes: Sequence[str] = POINT_CLASSES
 ) -> Truth:
     """Ground truth of a scan of a `ScanFolder`, in the frame of the models with the mounting that the runtime used, in
     those of the classes that labels of the set tell apart: its cyclists are no mistakes where none are labeled.

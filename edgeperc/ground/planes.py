@@ -73,11 +73,7 @@ class Ground:
 
 
 def find_ground(
-    points: Points,
-    *,
-    mount_height_m: float = 1.73,
-    max_height_m: float = 0.125,
-    regions: bool = True,
+    points: Points, *, mount_height_m: float = 1.73, max_height_m: float = 0.125, regions: bool = True
 ) -> Ground:
     """Separate the ground from what stands on it (KUL-Seg 5.2), by planes of regions (docs/concepts/clusters.md);
     deterministic. Raises PointsError.

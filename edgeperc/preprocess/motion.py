@@ -328,11 +328,7 @@ def deskew(
         )
     moved = np.empty(rows.shape, np.float32)
     fill_deskewed(
-        seen,
-        read_only(moments - at, np.float64),
-        np.array(motion.velocity_mps),
-        np.array(motion.rate_radps),
-        moved,
+        seen, read_only(moments - at, np.float64), np.array(motion.velocity_mps), np.array(motion.rate_radps), moved
     )
     if not np.shares_memory(seen, rows):
         blank = np.isnan(seen[:, 0])

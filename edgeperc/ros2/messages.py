@@ -572,11 +572,7 @@ class RosMessages:
         return self._make(f"geometry_msgs/msg/{kind}", **dict(zip("xyz", map(float, values), strict=True)))
 
     def _pose(
-        self,
-        box: Box | None = None,
-        *,
-        center: Any = (0.0, 0.0, 0.0),
-        turned: Iterable[float] = (0.0, 0.0, 0.0, 1.0),
+        self, box: Box | None = None, *, center: Any = (0.0, 0.0, 0.0), turned: Iterable[float] = (0.0, 0.0, 0.0, 1.0)
     ) -> Any:
         if box is not None:
             center, turned = box.center, (0.0, 0.0, math.sin(box.yaw / 2.0), math.cos(box.yaw / 2.0))

@@ -120,8 +120,7 @@ class ZenohGraph:
         """Begin to publish; see `Graph.advertise`."""
         full, kind, digest = self._topic(topic, message_type)
         publisher = self._session.declare_publisher(
-            f"{self._domain}{full}/{kind}/{digest}",
-            congestion_control=self._zenoh.CongestionControl.DROP,
+            f"{self._domain}{full}/{kind}/{digest}", congestion_control=self._zenoh.CongestionControl.DROP
         )
         token = self._declare("MP", _mangled(full), kind, digest, _PUBLISHED)
         return _ZenohOutput(publisher, hashlib.sha256(token.encode()).digest()[:16])

@@ -55,11 +55,7 @@ class CameraImage:
 
 
 def forward_camera(
-    width: int = 960,
-    height: int = 720,
-    *,
-    fov_deg: float = 60.0,
-    at_m: tuple[float, float, float] = (0.27, 0.0, -0.08),
+    width: int = 960, height: int = 720, *, fov_deg: float = 60.0, at_m: tuple[float, float, float] = (0.27, 0.0, -0.08)
 ) -> Calibration:
     """Make the calibration of a camera that looks ahead.
 
@@ -80,12 +76,7 @@ def forward_camera(
 
 
 def render(
-    scene: Scene,
-    calibration: Calibration,
-    T_world_sensor: ArrayLike,
-    seed: int,
-    *,
-    max_range_m: float = 250.0,
+    scene: Scene, calibration: Calibration, T_world_sensor: ArrayLike, seed: int, *, max_range_m: float = 250.0
 ) -> CameraImage:
     """Render what the camera sees.
 

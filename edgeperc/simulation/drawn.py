@@ -128,15 +128,7 @@ def _pose(strip: Row) -> tuple[float, float, float]:
     return strip[0], strip[1], math.atan2(strip[3], strip[2])
 
 
-def _add_traffic(
-    street: Street,
-    place: str,
-    lane: float,
-    same: int,
-    oncoming: int,
-    ego_lane: int,
-    sway: float,
-) -> None:
+def _add_traffic(street: Street, place: str, lane: float, same: int, oncoming: int, ego_lane: int, sway: float) -> None:
     rng = street.rng
     density = {"urban": 0.022, "residential": 0.008, "junction": 0.022, "rural": 0.008, "highway": 0.016}[place]
     density *= rng.uniform(0.1, 1.8)

@@ -488,10 +488,7 @@ def _chair(rng: np.random.Generator) -> list[Row]:
     seat, cover = rng.uniform(0.42, 0.48), rng.uniform(0.15, 0.6)
     rows = [block(MATTE, cover, (0, 0, seat), (0.42, 0.42, 0.04))]
     rows += [post(cover, a * 0.18, b * 0.18, seat, 0.015) for a in (-1.0, 1.0) for b in (-1.0, 1.0)]
-    return [
-        *rows,
-        block(POROUS, cover, (-0.2, 0, seat + 0.25), (0.04, 0.42, 0.4), density=rng.uniform(0.4, 1.0)),
-    ]
+    return [*rows, block(POROUS, cover, (-0.2, 0, seat + 0.25), (0.04, 0.42, 0.4), density=rng.uniform(0.4, 1.0))]
 
 
 def add_parked_bicycles(street: Street, mean: float) -> None:

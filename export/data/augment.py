@@ -53,11 +53,7 @@ class ObjectBank:
 
     @classmethod
     def of(
-        cls,
-        scans: Iterable[LabeledScan],
-        fewest: int = 8,
-        classes: tuple[str, ...] = POINT_CLASSES,
-        n_workers: int = 0,
+        cls, scans: Iterable[LabeledScan], fewest: int = 8, classes: tuple[str, ...] = POINT_CLASSES, n_workers: int = 0
     ) -> ObjectBank:
         """The objects of the scans within 60 m that have at least ``fewest`` returns, and pieces of the background.
 

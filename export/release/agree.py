@@ -143,13 +143,7 @@ def record_of(own: Measured, fp32: Measured, command: str) -> dict[str, Any]:
 
 
 def _measure(
-    variant: Variant,
-    precision: str,
-    split: str,
-    n_scans: int | None,
-    *,
-    kitti: Path | None,
-    semantickitti: Path | None,
+    variant: Variant, precision: str, split: str, n_scans: int | None, *, kitti: Path | None, semantickitti: Path | None
 ) -> Measured:
     judge = Judge([variant.path], Perceiving(boxes_from="network"))
     by = _engine(judge.perceive.sessions[0], precision)

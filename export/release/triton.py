@@ -73,11 +73,7 @@ _Tensor = tuple[str, str, Sequence[int], bool]
 
 
 def _config(
-    name: str,
-    backend: str,
-    inputs: Sequence[_Tensor],
-    outputs: Sequence[_Tensor],
-    parameters: Mapping[str, str] = {},
+    name: str, backend: str, inputs: Sequence[_Tensor], outputs: Sequence[_Tensor], parameters: Mapping[str, str] = {}
 ) -> str:
     """``config.pbtxt``, a ModelConfig in protobuf's text format."""
     lines = [f"name: {quoted(name)}", f"backend: {quoted(backend)}", "max_batch_size: 0"]

@@ -70,13 +70,7 @@ SHIPPED = {"pointseg": "pointseg-full", "ssadnet": "ssadnet-full", "lodnn": "lod
 
 
 def ablate(
-    network: str,
-    out: Path,
-    data: Data,
-    run: Run,
-    *,
-    steps: int,
-    variants: Sequence[str] = (),
+    network: str, out: Path, data: Data, run: Run, *, steps: int, variants: Sequence[str] = ()
 ) -> list[dict[str, Any]]:
     """Run variants (by default all, and `PAPERS`), each of ``steps`` for the shipped batch size, from the network's
     ``-sim`` model, and add their figures to ``out/ablation.json``; those in it are not run again. Raises ValueError.

@@ -162,12 +162,7 @@ def load_samples(folder: Path, names: Sequence[str]) -> ObjectSamples:
 
 
 def samples_of(
-    labeled: LabeledScan,
-    drive: str,
-    perceive: Perceiver | None,
-    rng: np.random.Generator,
-    *,
-    real: bool,
+    labeled: LabeledScan, drive: str, perceive: Perceiver | None, rng: np.random.Generator, *, real: bool
 ) -> ObjectSamples:
     """The samples of one scan; ``perceive`` finds boxes in the top view."""
     points = read_only(labeled.points)

@@ -133,8 +133,7 @@ def test_a_window_is_bounded() -> None:
 
 
 @pytest.mark.parametrize(
-    ("sensor", "calibration", "scenes"),
-    [("hdl-64e", NEAR, (0, 1, 2)), ("hdl-64e", FAR, (0,)), ("os1-64", NEAR, (2,))],
+    ("sensor", "calibration", "scenes"), [("hdl-64e", NEAR, (0, 1, 2)), ("hdl-64e", FAR, (0,)), ("os1-64", NEAR, (2,))]
 )
 def test_points_get_the_class_of_their_surface(sensor: str, calibration: Calibration, scenes: tuple[int, ...]) -> None:
     n = counted(sensor, calibration, scenes)
@@ -321,8 +320,7 @@ def test_without_ground_no_cell_is_seen() -> None:
 
 
 @pytest.mark.parametrize(
-    "image",
-    [None, "labels", np.zeros((480, 640)), np.zeros((480, 640, 3), np.uint8), np.zeros((480, 640), bool)],
+    "image", [None, "labels", np.zeros((480, 640)), np.zeros((480, 640, 3), np.uint8), np.zeros((480, 640), bool)]
 )
 def test_what_are_no_labels_is_refused(image: object) -> None:
     points = np.zeros((1, 4), np.float32)

@@ -580,12 +580,7 @@ def test_scans_of_one_name_do_not_overwrite_each_other(tmp_path: Path) -> None:
     folders = [tmp_path / "day1" / "velodyne", tmp_path / "day2" / ".." / "day2" / "velodyne"]
     assert run("run", *folders, "--out", out, "--labels") == 0
     sizes = {file.relative_to(out).as_posix(): file.stat().st_size // 4 for file in out.rglob("*.label")}
-    assert sizes == {
-        "day1/000.label": 10,
-        "day1/001.label": 20,
-        "day2/000.label": 11,
-        "day2/001.label": 21,
-    }
+    assert sizes == {"day1/000.label": 10, "day1/001.label": 20, "day2/000.label": 11, "day2/001.label": 21}
 
 
 @pytest.mark.parametrize(

@@ -218,11 +218,7 @@ def test_a_broken_pipe_to_a_process_is_an_error(capsys: pytest.CaptureFixture[st
     assert "Broken pipe" in capsys.readouterr().err
 
 
-MAINS = {
-    "edgeperc": "edgeperc.cli",
-    "edgeperc-bench": "edgeperc_bench.cli",
-    "edgeperc-export": "edgeperc_export.cli",
-}
+MAINS = {"edgeperc": "edgeperc.cli", "edgeperc-bench": "edgeperc_bench.cli", "edgeperc-export": "edgeperc_export.cli"}
 
 
 def start(program: str, *arguments: str, before: str = "", **how: Any) -> subprocess.Popen[bytes]:

@@ -236,12 +236,7 @@ def test_boxes_of_clusters_by_hand(world: World) -> None:
     person = someone(20, -5, "pedestrian")
     points = [p for each in (car, van, person, beside, far) for p in hits(each, 3)]
     frame_of_all = frame(car, van, person, beside, far, points=points)
-    world.boxes = (
-        box(10, 0, score=0.9),
-        replace(person, score=0.8),
-        box(30, -13, score=0.7),
-        box(20, 4, score=0.6),
-    )
+    world.boxes = (box(10, 0, score=0.9), replace(person, score=0.8), box(30, -13, score=0.7), box(20, 4, score=0.6))
     # Boxes around clusters are named by their size: a van that is called a car is a false car and a missed van.
     table = evaluated(Judge(["pointseg"], Perceiving(boxes_from="clusters")), frame_of_all)["boxes"]["oriented"]["all"]
     counts = tally(table, "car", "van", "pedestrian", "vehicle")  # nobody on foot is a vehicle

@@ -40,13 +40,7 @@ from edgeperc_export.training import camvid
 from edgeperc_export.training import images as camvid_images
 from edgeperc_export.training.camera import Camera, class_weights
 from edgeperc_export.training.checkpoint import read_checkpoint
-from edgeperc_export.training.images import (
-    augmented_images,
-    camvid_samples,
-    confusions,
-    normalized,
-    read_camvid,
-)
+from edgeperc_export.training.images import augmented_images, camvid_samples, confusions, normalized, read_camvid
 from edgeperc_export.training.losses import cross_entropy, lovasz_at_once, lovasz_softmax
 from edgeperc_export.training.train import last_step
 

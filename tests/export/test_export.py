@@ -130,18 +130,10 @@ def weights(path: Path) -> dict[str, Tensor]:
 @pytest.mark.usefixtures("small_views")
 @pytest.mark.parametrize(
     ("network", "changes", "n_workers"),
-    [
-        ("lodnn", {}, 0),
-        ("pointseg", {"edge": True}, 0),
-        ("ssadnet", {"head": "slots"}, 2),
-    ],
+    [("lodnn", {}, 0), ("pointseg", {"edge": True}, 0), ("ssadnet", {"head": "slots"}, 2)],
 )
 def test_a_resumed_run_equals_an_uninterrupted_one(
-    tmp_path: Path,
-    simulated: Path,
-    network: str,
-    changes: dict[str, object],
-    n_workers: int,
+    tmp_path: Path, simulated: Path, network: str, changes: dict[str, object], n_workers: int
 ) -> None:
     recipe = small(network, steps=3, redraw_every=1, **changes)
     arguments = {"kitti": None, "simulated": simulated, "n_threads": 1, "checkpoint_every": 2}
@@ -574,11 +566,7 @@ def test_a_teacher_averages_a_scene_and_its_mirror_image() -> None:
 @pytest.mark.usefixtures("small_views")
 @pytest.mark.parametrize(
     ("network", "edge", "teacher_network"),
-    [
-        ("pointseg", True, "pointseg"),
-        ("ssadnet", True, "ssadnet"),
-        ("lodnn", False, "ssadnet"),
-    ],
+    [("pointseg", True, "pointseg"), ("ssadnet", True, "ssadnet"), ("lodnn", False, "ssadnet")],
 )
 def test_a_network_is_distilled_from_a_teacher(
     tmp_path: Path, simulated: Path, network: str, edge: bool, teacher_network: str

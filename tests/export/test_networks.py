@@ -334,8 +334,7 @@ SQUEEZESEG_STAGES = {
 
 @pytest.mark.parametrize("width", [512, 2048])
 @pytest.mark.parametrize(
-    ("make", "stages"),
-    [(PointSeg, POINTSEG_STAGES), (SqueezeSegV2, SQUEEZESEG_STAGES), (KULSeg, SQUEEZESEG_STAGES)],
+    ("make", "stages"), [(PointSeg, POINTSEG_STAGES), (SqueezeSegV2, SQUEEZESEG_STAGES), (KULSeg, SQUEEZESEG_STAGES)]
 )
 def test_networks_of_range_images_halve_only_the_width(
     make: Callable[[], torch.nn.Module], stages: dict[str, tuple[int, int]], width: int

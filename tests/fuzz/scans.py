@@ -34,10 +34,7 @@ HONEST_EVERY, HONEST_CASES = 50, 10  # in every 50th block, ten cases have real 
 AFTER = 0.3  # share of the cases whose road and tracks are computed
 DRAWN, PAGES, FILES = 0.0005, 0.01, 0.02  # shares of the cases that are drawn, written as a page, written as files
 
-VIEWS = {
-    "top_view": ("distance", "remission", "height"),
-    "range_image": ("x", "y", "z", "remission", "range"),
-}
+VIEWS = {"top_view": ("distance", "remission", "height"), "range_image": ("x", "y", "z", "remission", "range")}
 VEHICLES = {"car": (4.0, 1.8, 1.6), "van": (5.0, 2.0, 2.2)}
 
 

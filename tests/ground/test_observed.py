@@ -14,14 +14,7 @@ from numpy.typing import NDArray
 
 import twins.observed
 from edgeperc import Box, Mounting, Perceiver, PointsError, TopView, free_ahead, road_ahead
-from edgeperc.ground.observed import (
-    BRIDGE_M,
-    CLEARANCE_M,
-    Observer,
-    fill_lowest_returns,
-    follow_rays,
-    mark_cells,
-)
+from edgeperc.ground.observed import BRIDGE_M, CLEARANCE_M, Observer, fill_lowest_returns, follow_rays, mark_cells
 from edgeperc.inference.projection import TopViewProjector
 from edgeperc.simulation.samples import FIRST_SEED, simulated_scan
 from edgeperc.types.card import InputSpec

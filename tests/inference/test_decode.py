@@ -346,8 +346,7 @@ def test_one_pixel_at_the_center_does_not_decide_the_class() -> None:
     x, y = 26.05, 0.05
     row, col = pixel_of(x, y)
     logits = class_logits(
-        (slice(row - 15, row + 16), slice(col - 6, col + 7), 2, 5.0),
-        (slice(row, row + 1), slice(col, col + 1), 4, 9.0),
+        (slice(row - 15, row + 16), slice(col - 6, col + 7), 2, 5.0), (slice(row, row + 1), slice(col, col + 1), 4, 9.0)
     )
     (box,) = dense_boxes(dense_of((x, y, -1.0, 4.0, 1.6, 1.5, 0.0, 2.0)), logits)
     assert box.label == "car"

@@ -89,8 +89,7 @@ def test_points_on_edges_are_in_the_cell_that_begins_there(place: tuple[float, f
 
 @pytest.mark.kernel
 @pytest.mark.parametrize(
-    ("y_m", "row"),
-    [(-36.0, 23), (-34.08, 34), (-31.84, 49), (-29.6, 63), (13.6, 333), (38.4, 488), (39.52, 495)],
+    ("y_m", "row"), [(-36.0, 23), (-34.08, 34), (-31.84, 49), (-29.6, 63), (13.6, 333), (38.4, 488), (39.52, 495)]
 )
 def test_points_on_edges_are_where_spconv_and_mmcv_have_them(y_m: float, row: int) -> None:
     """Both divide in float32; a KITTI scan, rounded to a millimetre, has hundreds of such points (spconv 2.3.8)."""

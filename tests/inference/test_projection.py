@@ -393,10 +393,7 @@ def test_wrong_cards_are_refused() -> None:
     with pytest.raises(CardError, match="height"):
         make_projector(VIEWS["front"], InputSpec("input", ("x", "height"), (0.0, 0.0), (1.0, 1.0)))
     spec = InputSpec("input", ("x",), (0.0,), (1.0,))
-    for view in (
-        RangeImageGeometry((1.0, 1.0 - 1e-9, -1.0)),
-        RangeImageGeometry((1.0, -1.0), 60000, 46.0, 45.0),
-    ):
+    for view in (RangeImageGeometry((1.0, 1.0 - 1e-9, -1.0)), RangeImageGeometry((1.0, -1.0), 60000, 46.0, 45.0)):
         with pytest.raises(CardError, match="closer than"):
             make_projector(view, spec)
     with pytest.raises(CardError, match="at least 1 degree apart"):

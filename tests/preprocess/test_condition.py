@@ -63,12 +63,7 @@ def test_ranking_of_functions_matches_the_papers_table() -> None:
 
 
 @settings(max_examples=40, deadline=None)
-@given(
-    st.sampled_from(FUNCTIONS),
-    st.floats(-0.5, 0.5),
-    st.floats(0.01, 2.0),
-    st.integers(0, 2**32 - 1),
-)
+@given(st.sampled_from(FUNCTIONS), st.floats(-0.5, 0.5), st.floats(0.01, 2.0), st.integers(0, 2**32 - 1))
 def test_exact_pairs_recover_the_function(shape: RemissionFunction, offset: float, size: float, seed: int) -> None:
     x = np.random.default_rng(seed).uniform(0.0, 255.0, 60)
     wanted = offset + size * _value(shape, x)

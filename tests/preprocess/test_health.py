@@ -19,14 +19,7 @@ from numpy.typing import NDArray
 
 import twins.health
 from edgeperc import Mounting, Perceiver, occupancy_grid
-from edgeperc.preprocess.health import (
-    Normal,
-    check_health,
-    fill_lacking,
-    fill_sectors,
-    mark_isolated,
-    without_drops,
-)
+from edgeperc.preprocess.health import Normal, check_health, fill_lacking, fill_sectors, mark_isolated, without_drops
 from edgeperc.records import scan_record
 from edgeperc.simulation import weather
 from edgeperc.types.frame import ModelFrame

@@ -127,12 +127,7 @@ def test_a_sensor_without_a_function_gets_one(streets: list[np.ndarray]) -> None
 
 
 @settings(max_examples=25, deadline=None)
-@given(
-    name=st.sampled_from(sorted(SENSORS)),
-    gain=st.floats(0.05, 1.0),
-    power=st.floats(0.3, 4.0),
-    whole=st.booleans(),
-)
+@given(name=st.sampled_from(sorted(SENSORS)), gain=st.floats(0.05, 1.0), power=st.floats(0.3, 4.0), whole=st.booleans())
 def test_functions_keep_the_order_and_stay_in_0_to_1(
     streets: list[np.ndarray], name: str, gain: float, power: float, whole: bool
 ) -> None:

@@ -270,11 +270,7 @@ def test_sensors_without_beams_are_named_by_their_field_of_view(name: str, way: 
         estimate_sensor([scan])
 
 
-MISTAKES = {
-    "UTM": (512345, 5412345, 113, 0),
-    "ECEF": (4.1e6, 6e5, 4.8e6, 0),
-    "a local map": (-6000, 2000, 5, 0),
-}
+MISTAKES = {"UTM": (512345, 5412345, 113, 0), "ECEF": (4.1e6, 6e5, 4.8e6, 0), "a local map": (-6000, 2000, 5, 0)}
 
 
 @pytest.mark.parametrize(("name", "sensor"), [*zip(MISTAKES, ("hdl-64e", "vlp-32c", "os1-64"), strict=True)])

@@ -296,13 +296,7 @@ def damage(content: bytes, chance: random.Random, near: int) -> bytes:
 
 
 @pytest.mark.filterwarnings("ignore:.*damaged packets:UserWarning")
-@pytest.mark.parametrize(
-    "name",
-    [
-        "ouster/OS-0-128-U1_v2.3.0_1024x10",
-        "velodyne/sample_velodyne_vlp16_gps",
-    ],
-)
+@pytest.mark.parametrize("name", ["ouster/OS-0-128-U1_v2.3.0_1024x10", "velodyne/sample_velodyne_vlp16_gps"])
 def test_real_captures_that_are_damaged(data_root: Callable[[str], Path], tmp_path: Path, name: str) -> None:
     pytest.importorskip("velodyne_decoder" if name.startswith("velodyne") else "ouster.sdk.pcap")
     source = data_root("other_sensors") / name

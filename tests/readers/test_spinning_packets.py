@@ -12,18 +12,7 @@ import pytest
 from capture_writers import check_same, vlp16_packets, write_link, write_pcap
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from lidar_writers import (
-    MODELS,
-    T0_S,
-    Model,
-    blocks_of,
-    calibration,
-    difop,
-    expected,
-    packets_of,
-    ranges,
-    unit_angles,
-)
+from lidar_writers import MODELS, T0_S, Model, blocks_of, calibration, difop, expected, packets_of, ranges, unit_angles
 from numpy.typing import NDArray
 from test_captures import check_beside, error_of
 

@@ -517,7 +517,7 @@ def test_the_page_configures_nav2_for_this_node() -> None:
             *("min_clearance", "robot_height", "footprint_clearing_enabled", "enable_kpi_logging", "max_data_range"),
         },
         "nav2_costmap_2d::StaticLayer": {
-            *("enabled", "map_topic", "map_subscribe_transient_local", "subscribe_to_updates", "transform_tolerance"),
+            *("enabled", "map_topic", "map_subscribe_transient_local", "subscribe_to_updates", "transform_tolerance")
         },
         "nav2_costmap_2d::InflationLayer": {"enabled", "inflation_radius", "cost_scaling_factor"},
     }

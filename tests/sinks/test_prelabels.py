@@ -351,15 +351,7 @@ def test_degrees_of_labelcloud_are_read_by_its_file_of_classes(tmp_path: Path) -
 
 @pytest.mark.parametrize("kind", [kind for kind in KINDS if kind != "kitti"])
 @pytest.mark.parametrize(
-    "change",
-    [
-        ("4.2", "0.0"),
-        ("4.2", "NaN"),
-        ("4.2", '"long"'),
-        ("0.3", "1e999"),
-        ("[", "{"),
-        ("0.0", "1.0"),
-    ],
+    "change", [("4.2", "0.0"), ("4.2", "NaN"), ("4.2", '"long"'), ("0.3", "1e999"), ("[", "{"), ("0.0", "1.0")]
 )
 def test_a_malformed_file_is_an_error_that_names_it(tmp_path: Path, kind: str, change: tuple[str, str]) -> None:
     folder = written(tmp_path, kind, perceived("x.bin", (BOXES[0],)))

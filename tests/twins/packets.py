@@ -9,10 +9,7 @@ import numpy as np
 
 
 def ouster_turn(
-    packets: Sequence[bytes],
-    places: tuple[int, ...],
-    fields: Sequence[tuple[int, int, int]],
-    shape: tuple[int, int],
+    packets: Sequence[bytes], places: tuple[int, ...], fields: Sequence[tuple[int, int, int]], shape: tuple[int, int]
 ) -> tuple[np.ndarray, np.ndarray]:
     """Twin of `ouster_packets.fill_turn`: each pixel is one number, of which a field takes some bits."""
     header, per_packet, column_bytes, status, first, pixel_bytes = places

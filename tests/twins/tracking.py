@@ -149,10 +149,7 @@ def mode_probabilities(prior: np.ndarray, likelihoods: np.ndarray, beta: np.ndar
     """Twin of `edgeperc.tracking.imm.fill_mode_probabilities`, for one track: shares and probabilities."""
     mixture = prior @ likelihoods
     joint = np.hstack(
-        [
-            (beta[0] * prior)[:, None],
-            beta[1:] * prior[:, None] * likelihoods / np.where(mixture > 0, mixture, 1.0),
-        ]
+        [(beta[0] * prior)[:, None], beta[1:] * prior[:, None] * likelihoods / np.where(mixture > 0, mixture, 1.0)]
     )
     return joint / joint.sum(axis=1, keepdims=True), joint.sum(axis=1) / joint.sum()
 

@@ -43,11 +43,7 @@ def test_built_in_profiles() -> None:
 
 @pytest.mark.parametrize(
     ("name", "points_per_s", "width_deg", "fov_deg"),
-    [
-        ("mid-360", 200_000, 360, (-7, 52)),
-        ("hap", 452_000, 120, (-12.5, 12.5)),
-        ("avia", 240_000, 70.4, (-38.6, 38.6)),
-    ],
+    [("mid-360", 200_000, 360, (-7, 52)), ("hap", 452_000, 120, (-12.5, 12.5)), ("avia", 240_000, 70.4, (-38.6, 38.6))],
 )
 def test_sensors_without_beams_show_more_the_longer_they_gather(
     name: str, points_per_s: float, width_deg: float, fov_deg: tuple[float, float]

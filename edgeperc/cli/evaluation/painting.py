@@ -32,10 +32,7 @@ def add_parser(commands: Commands) -> None:
         "every point took the class of its pixel, hidden or not. seen: points visible to the camera that are painted. "
         "cells: seen cells of the top view, outside vehicles, that are rightly road or not. road seen: road that the "
         "camera sees. The command needs no data and no model.",
-        examples=[
-            "edgeperc eval-painting",
-            "edgeperc eval-painting --sensor os1-64 --scenes 20 --json painting.json",
-        ],
+        examples=["edgeperc eval-painting", "edgeperc eval-painting --sensor os1-64 --scenes 20 --json painting.json"],
     )
     reading = options(parser, "input")
     reading(
