@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import argparse
-import functools
 import json
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from edgeperc import cli, perceiver
+from edgeperc import cli
 from edgeperc.types.card import CHANNELS, InputSpec, ModelCard, OutputSpec
 from edgeperc.types.sensor import SensorProfile, get_sensor
 from edgeperc.types.views import ObjectGeometry, RangeImageGeometry, TopViewGeometry
@@ -75,14 +72,6 @@ def thinned(sensor: str = "hdl-64e") -> SensorProfile:
     """A built-in sensor with a third of its columns: its scans take a third of the time, and are perceived like its."""
     profile = get_sensor(sensor)
     return replace(profile, columns=profile.columns // 3)
-
-
-@contextmanager
-def networks_opened_once() -> Iterator[None]:
-    """Perceivers that answer one after the other share networks: to open them takes longer than to run them."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(perceiver, "Session", functools.cache(perceiver.Session))
-        yield
 
 
 def write_scan(path: Path, n: int = 40, first_remission: float = 0.0) -> Path:

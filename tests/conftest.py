@@ -236,6 +236,16 @@ def shell(capsys: pytest.CaptureFixture[str]) -> Any:
     return Shell(capsys)
 
 
+@pytest.fixture(scope="module")
+def networks_opened_once() -> Iterator[None]:
+    """Perceivers that answer one after the other share networks: to open them takes longer than to run them."""
+    from edgeperc import perceiver
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(perceiver, "Session", functools.cache(perceiver.Session))
+        yield
+
+
 @pytest.fixture(scope="session")
 def data_root() -> Callable[[str], Path]:
     """A function from the name of a group of real data to the folder that holds it unpacked.

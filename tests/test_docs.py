@@ -9,7 +9,6 @@ import io
 import re
 import shlex
 import sys
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from string import Template
@@ -18,7 +17,7 @@ import numpy as np
 import pytest
 
 from checkout import REPOSITORY, files
-from cli_helpers import networks_opened_once, thinned
+from cli_helpers import thinned
 from edgeperc import cli
 from edgeperc.cli.main import build_parser
 from edgeperc.simulation.camera import forward_camera, render
@@ -67,12 +66,7 @@ COMMANDS = [
 ONCE = [*{(line, block.excuse): (block, line) for block, line in COMMANDS}.values()]
 PYTHON_PAGES = [page for page in PAGES if blocks_of(page, "python")]
 
-
-@pytest.fixture(scope="module", autouse=True)
-def networks_are_opened_once() -> Iterator[None]:
-    """Each of a hundred commands asks for the same ones."""
-    with networks_opened_once():
-        yield
+pytestmark = pytest.mark.usefixtures("networks_opened_once")  # each of a hundred commands asks for the same ones
 
 
 @pytest.fixture(scope="module")

@@ -600,7 +600,7 @@ def test_scans_of_one_name_do_not_overwrite_each_other(tmp_path: Path) -> None:
         ([], []),
     ],
 )
-def testoutput_names(given: list[str], names: list[str]) -> None:
+def test_output_names(given: list[str], names: list[str]) -> None:
     assert [name.as_posix() for name in output_names([Path(scan) for scan in given])] == names
 
 

@@ -10,14 +10,14 @@ import shlex
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from cli_helpers import POINTSEG, SSADNET, Shell, networks_opened_once, run, thinned, write_scan
+from cli_helpers import POINTSEG, SSADNET, Shell, run, thinned, write_scan
 from edgeperc import zoo
 from edgeperc.errors import ModelFileError
 from edgeperc.inference import listing, providers
@@ -31,11 +31,7 @@ from edgeperc.types.sensor import SENSORS, SensorProfile, get_sensor
 from edgeperc.zoo import Variant
 from scenes import urban
 
-
-@pytest.fixture(scope="module", autouse=True)
-def networks_are_opened_once() -> Iterator[None]:
-    with networks_opened_once():
-        yield
+pytestmark = pytest.mark.usefixtures("networks_opened_once")
 
 
 @pytest.fixture

@@ -7,7 +7,7 @@ import functools
 import json
 import re
 import runpy
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from test_files import packed_pcd, pcd, text_rows
 
 from checkout import REPOSITORY
-from cli_helpers import networks_opened_once, thinned
+from cli_helpers import thinned
 from edgeperc import Box, OptionError, Perceiver
 from edgeperc.cli.cvat import OPTIONS_VARIABLE, CvatFunction, handler, init_context
 from edgeperc.zoo import DEFAULT, OPEN, resolve
@@ -33,7 +33,10 @@ CONTAINERFILE = (FOLDER / "Containerfile").read_text("utf-8")
 FUNCTION = yaml.safe_load((FOLDER / "function.yaml").read_text("utf-8"))
 LABELS = json.loads(FUNCTION["metadata"]["annotations"]["spec"])
 
-pytestmark = pytest.mark.filterwarnings("ignore::UserWarning")  # what a perceiver says of a simulated scan
+pytestmark = [
+    pytest.mark.filterwarnings("ignore::UserWarning"),  # what a perceiver says of a simulated scan
+    pytest.mark.usefixtures("networks_opened_once"),
+]
 
 
 class Reply(NamedTuple):
@@ -98,12 +101,6 @@ def post_by_sdk(payload: object) -> Reply:
     context.Response = sdk.Response
     sent = sdk.Response.from_entrypoint_output(json.dumps, handler(context, event))
     return Reply(sent["status_code"], sent["content_type"], json.loads(sent["body"]))
-
-
-@pytest.fixture(scope="module", autouse=True)
-def networks_are_opened_once() -> Iterator[None]:
-    with networks_opened_once():
-        yield
 
 
 def street(seed: int = 4, sensor: str = "hdl-64e") -> NDArray[np.float32]:

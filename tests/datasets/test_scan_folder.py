@@ -42,6 +42,7 @@ from edgeperc.types.views import TopViewGeometry
 from edgeperc.zoo import model_path
 from edgeperc_export.data.scan_sets import joined_hashes, read_scan_set, seen_by_network
 from edgeperc_export.data.scans import SURFACE, LabeledScan
+from strategies import JSON
 
 BOXES = {"Car": "car", "Van": "van", "Rider": "ignore", "Cyclist": "cyclist", "Digger": "digger", "Cone": "background"}
 NAMES = {"1": "Road", "2": "Car", "3": "Ghost", "4": "Tree"}
@@ -533,16 +534,6 @@ def test_the_description_in_the_documentation() -> None:
     assert named | {"name", "about"} == {"schema", "about", "mounting", *(field.name for field in fields(ScanLayout))}
 
 
-JSON = st.recursive(
-    st.none()
-    | st.booleans()
-    | st.integers()
-    | st.floats()
-    | st.text(max_size=6)
-    | st.sampled_from(["car", "*", "lyft"]),
-    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=6), inner, max_size=4),
-    max_leaves=8,
-)
 KEYS = st.sampled_from(
     [
         *("schema", "name", "about", "sensor", "mounting", "boxes", "box_format", "box_columns", "points"),
@@ -552,7 +543,7 @@ KEYS = st.sampled_from(
 PARTS = st.sampled_from(
     [
         *({"like": "vlp-16"}, {"height_m": 1.0}, {"Car": "car"}, {"train": ["x"]}, [-30, 30], "one", "kitti", 7),
-        {"like": "vlp-16", "elevations_deg": [1e308, 1, "x"]},
+        *({"like": "vlp-16", "elevations_deg": [1e308, 1, "x"]}, "car", "*", "lyft"),
     ]
 )
 

@@ -37,6 +37,7 @@ from edgeperc_export.database import label_page
 from edgeperc_export.database.build import build
 from edgeperc_export.database.files import TopViewDatabase
 from edgeperc_export.database.label_page import LARGEST_BODY, LARGEST_HEAD, TOKEN, LabelServer
+from strategies import JSON
 
 ROAD = json.dumps([TRAPEZIUM])
 
@@ -377,16 +378,11 @@ def test_a_wrong_body_is_explained(server: LabelServer, body: str | bytes) -> No
     assert not server.polygons.exists()
 
 
-anything = st.recursive(
-    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=3),
-    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=2), inner, max_size=2),
-    max_leaves=20,
-)
 corners = st.tuples(*[st.integers(-(10**400), 10**400) | st.floats()] * 2)
 
 
 @settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(st.binary() | anything.map(json.dumps) | st.lists(st.lists(corners, max_size=5), max_size=3).map(json.dumps))
+@given(st.binary() | JSON.map(json.dumps) | st.lists(st.lists(corners, max_size=5), max_size=3).map(json.dumps))
 def test_any_body_is_answered(server: LabelServer, body: str | bytes) -> None:
     answer = ask(server, "road/000002", body)
     assert answer.status in (200, 400)

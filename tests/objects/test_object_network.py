@@ -34,6 +34,12 @@ def scan() -> SimulatedScan:
     return simulated_scan(SEED)
 
 
+def clustered(scan: SimulatedScan) -> tuple[ObjectNetwork, Scan, Candidates]:
+    network = ObjectNetwork(Session("objects", "cpu"))
+    seen = Scan.of(scan.points, find_ground(scan.points))
+    return network, seen, network.cluster(seen, "both", 0.0)
+
+
 def near_true(perception: Perception, scan: SimulatedScan, least_returns: int = 100) -> float:
     """Share of the true cars with so many returns that have a vehicle's box within 1 m."""
     cars = [
@@ -97,9 +103,7 @@ def test_people_are_those_of_the_labels_and_of_the_network(seed: int) -> None:
 
 def test_the_parts_are_all_clusters_and_the_last_one_has_the_boxes_of_a_detector(scan: SimulatedScan) -> None:
     """Each as the network sees it alone; clusters and boxes of few points have no look."""
-    network = ObjectNetwork(Session("objects", "cpu"))
-    seen = Scan.of(scan.points, find_ground(scan.points))
-    clusters = network.cluster(seen, "both", 0.0)
+    network, seen, clusters = clustered(scan)
     nobody = replace(scan.boxes[0], center=(1.0, 60.0, -0.8))
     parts = [network.look(part, seen, clusters, [*scan.boxes, nobody] if part else ()) for part in range(PARTS)]
     every = clusters._replace(rectangles=np.concatenate([clusters.rectangles, rectangles(scan.boxes)]))
@@ -120,9 +124,7 @@ def test_what_a_look_shows_is_looked_at_from_its_other_end(
     scan: SimulatedScan, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Where a look sees nothing, the next one is at the same place."""
-    network = ObjectNetwork(Session("objects", "cpu"))
-    seen = Scan.of(scan.points, find_ground(scan.points))
-    clusters = network.cluster(seen, "both", 0.0)
+    network, seen, clusters = clustered(scan)
     first_looks = [network.look(part, seen, clusters, ()) for part in range(PARTS)]
     places, looks = [], []
 
@@ -149,9 +151,7 @@ def test_what_a_look_shows_is_looked_at_from_its_other_end(
 
 def test_a_riders_box_is_the_mean_of_that_of_the_labels_and_of_the_networks(scan: SimulatedScan) -> None:
     """It has the network's heading, whose front is known; where the network sees no rider, it stays."""
-    network = ObjectNetwork(Session("objects", "cpu"))
-    seen = Scan.of(scan.points, find_ground(scan.points))
-    clusters = network.cluster(seen, "both", 0.0)
+    network, seen, clusters = clustered(scan)
     boxes = zip(scan.boxes, scan.box_points, strict=True)
     true = next(box for box, n in boxes if box.label == "cyclist" and n > 100)
     x, y, z = true.center
@@ -177,9 +177,7 @@ def test_no_person_that_others_show_is_lost(
     scan: SimulatedScan, by_labels: bool, min_score: float, score: float
 ) -> None:
     """Where this network sees nothing, labels keep half of their score, and another network's box all of it."""
-    network = ObjectNetwork(Session("objects", "cpu"))
-    seen = Scan.of(scan.points, find_ground(scan.points))
-    clusters = network.cluster(seen, "both", 0.0)
+    network, seen, clusters = clustered(scan)
     person = Box("pedestrian", 0.9, (1.0, 60.0, -0.8), (0.8, 0.6, 1.8), 0.0)
     (kept,) = network.complete(seen, clusters, (), [person], by_labels, min_score)
     assert kept == replace(person, score=score)
@@ -187,9 +185,7 @@ def test_no_person_that_others_show_is_lost(
 
 @pytest.mark.parametrize("label", ["car", "van", "truck"])
 def test_a_vehicle_that_others_show_and_a_close_look_does_not_see_is_dropped(scan: SimulatedScan, label: str) -> None:
-    network = ObjectNetwork(Session("objects", "cpu"))
-    seen = Scan.of(scan.points, find_ground(scan.points))
-    clusters = network.cluster(seen, "both", 0.0)
+    network, seen, clusters = clustered(scan)
     far_from_all = np.array([box.center[:2] for box in scan.boxes])
     above = scan.points[seen.ground.height_m > 1.0]
     walls = [p for p in above[::97] if np.hypot(*(far_from_all - p[:2]).T).min() > 8.0][:20]

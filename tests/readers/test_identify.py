@@ -24,6 +24,7 @@ from edgeperc.live import stream
 from edgeperc.readers.captures import known_sensor, read_scans, sensor_of
 from edgeperc.readers.identify import KnownSensor, of_cloud, of_metadata
 from edgeperc.types.sensor import SENSORS, SensorProfile, get_sensor
+from strategies import JSON
 
 pytestmark = pytest.mark.usefixtures("in_this_process")
 
@@ -148,11 +149,6 @@ def test_metadata_that_names_no_known_sensor(content: dict[str, Any], error: str
     assert "os1-64" in str(caught.value)
 
 
-JSON = st.recursive(
-    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=8),
-    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=8), inner, max_size=4),
-    max_leaves=8,
-)
 KEYS = ("sensor_info", "prod_line", "beam_intrinsics", "beam_altitude_angles", "lidar_data_format", "lidar_mode")
 
 

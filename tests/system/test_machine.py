@@ -18,6 +18,7 @@ from edgeperc.inference import session
 from edgeperc.inference.session import Session
 from edgeperc.system import machine
 from edgeperc.zoo import digest, resolve
+from strategies import JSON
 
 CPU_2 = {"provider": "cpu", "precision": "int8", "n_threads": 2}
 CPU_4 = {"provider": "cpu", "precision": "fp32", "n_threads": 4}
@@ -114,11 +115,6 @@ def test_malformed_settings_are_named(tmp_path: Path, text: str) -> None:
         machine.read_setting(path, "m", "s")
 
 
-NESTED = st.recursive(
-    st.none() | st.booleans() | st.integers() | st.floats() | st.text(st.characters(), max_size=8),
-    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=3), inner, max_size=3),
-    max_leaves=6,
-)
 EDITS = st.lists(st.tuples(st.integers(0, 10_000), st.integers(0, 3), st.binary(min_size=1, max_size=6)), max_size=4)
 
 
@@ -161,7 +157,7 @@ def test_damaged_settings_have_a_typed_error(tmp_path_factory: pytest.TempPathFa
 
 
 @given(
-    NESTED,
+    JSON,
     st.sampled_from(["document", "schema", "machines", "m", "s", "provider", "precision", "n_threads", "p50_ms"]),
 )
 def test_settings_of_other_types_have_a_typed_error(
