@@ -5,7 +5,9 @@ from __future__ import annotations
 import functools
 import shutil
 import subprocess
+import sys
 from pathlib import Path
+from typing import Any
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 FOLDERS = ("edgeperc", "bench", "export", "models", "tests", "docs")
@@ -29,3 +31,11 @@ def files(suffix: str, *folders: str) -> tuple[Path, ...]:
     """Files of the project in some folders, at any depth, whose names end in ``suffix``; sorted."""
     roots = [REPOSITORY / folder for folder in folders]
     return tuple(path for path in tracked() if path.name.endswith(suffix) and any(map(path.is_relative_to, roots)))
+
+
+def printed(code: str, *arguments: object, flags: tuple[str, ...] = (), **how: Any) -> str:
+    """What code prints in a new Python; it has to end well."""
+    command = [sys.executable, *flags, "-c", code, *map(str, arguments)]
+    done = subprocess.run(command, capture_output=True, text=True, **how)
+    assert done.returncode == 0, done.stderr
+    return done.stdout

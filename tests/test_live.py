@@ -181,12 +181,10 @@ def test_waiting_no_longer_than_told(source: Source) -> None:
         assert answers.take(timeout_s=0.0) is None
         source.give(scan(3))
         answer = answers.take(timeout_s=TIMEOUT_S)
-        assert answer is not None
         assert answer.perception.n_points == 3
         later = threading.Timer(0.05, source.give, [scan(4)])
         later.start()
         answer = answers.take(timeout_s=math.inf)
-        assert answer is not None
         assert answer.perception.n_points == 4
         assert answers.take(timeout_s=0.001) is None
 
@@ -296,7 +294,6 @@ def test_a_source_that_blocks_for_ever_holds_nobody_up(source: Source, monkeypat
 def test_a_stream_that_is_forgotten_stops(source: Source) -> None:
     held = [perceive]
     answers: live.Stream | None = stream(source, lambda points, stamp_s: held[0](points, stamp_s))
-    assert answers is not None
     source.give(scan(1))
     stopped = answers.inbox.stopped
     for _ in answers:

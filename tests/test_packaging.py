@@ -17,7 +17,7 @@ import pytest
 from smoke import SMOKE
 
 import edgeperc
-from checkout import FOLDERS, REPOSITORY, files, tracked
+from checkout import FOLDERS, REPOSITORY, files, printed, tracked
 
 tomllib = pytest.importorskip("tomllib")
 yaml = pytest.importorskip("yaml")
@@ -199,10 +199,7 @@ def test_a_release_names_its_repository(repository: str, tmp_path: Path) -> None
         (tmp_path / name).symlink_to(REPOSITORY / name)
     code = "from setuptools.build_meta import prepare_metadata_for_build_wheel as made; made('.')"
     environment = {**os.environ, "EDGEPERC_REPOSITORY": repository}
-    done = subprocess.run(
-        [sys.executable, "-c", code], cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
-    )
-    assert done.returncode == 0, done.stderr[-2000:]
+    printed(code, cwd=tmp_path, env=environment)
     (file,) = tmp_path.glob("*.dist-info/METADATA")
     metadata = email.message_from_string(file.read_text("utf-8"))
     readme = str(metadata.get_payload())

@@ -82,13 +82,11 @@ def perception(perceive: Perceiver, scan: SimulatedScan) -> Perception:
 def full_turn(scan: SimulatedScan) -> Perception:
     """By one thread."""
     alone = Perceiver(["ssadnet", "pointseg"], provider="cpu", n_threads=1, on_mismatch="ignore", full_turn=True)
-    assert alone.pipeline is not None
     assert len(alone.pipeline.ranged) == 1
     return alone(scan.points)
 
 
 def test_every_point_has_a_label(perception: Perception, scan: SimulatedScan) -> None:
-    assert perception.points is not None
     assert perception.n_points == len(scan.points)
     assert perception.n_dropped == 0
     assert perception.points.labels.shape == (len(scan.points),)
@@ -227,7 +225,6 @@ def test_two_threads_share_the_sectors_of_a_full_turn(
     monkeypatch: pytest.MonkeyPatch, two_cores: None, full_turn: Perception, scan: SimulatedScan, failing: str | None
 ) -> None:
     both = Perceiver(["ssadnet", "pointseg"], provider="cpu", on_mismatch="ignore", full_turn=True)
-    assert both.pipeline is not None
     top, (ranged, aside) = both.sessions[0], (network.session for network in both.pipeline.ranged)
     of = {"aside": aside, "top view": top, "sectors": ranged}
     runs = dict.fromkeys(of, 0)
@@ -467,7 +464,6 @@ def test_a_warning_or_an_error_names_the_fault(scan: SimulatedScan, fault: str) 
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         answer = perceive(faulty(scan.points, fault))
-    assert answer.health is not None
     told = [str(w.message) for w in caught]
     assert told == [*answer.fitness, *answer.health.findings]
     assert re.search(FAULTS[fault], " ".join(answer.fitness))
@@ -731,7 +727,6 @@ def test_car_cut_by_the_views_edge_gets_a_full_box_if_it_is_seen_at_all(
         labels = points[:, 3].astype(np.uint8)
         return PointLabels(labels, labels > 0, ("background", "car", "pedestrian", "cyclist"))
 
-    assert perceive.pipeline is not None
     monkeypatch.setattr(perceive.pipeline.ranged[0], "label", label)
     (box,) = perceive.pipeline(scan, MODEL_MOUNTING, Stopwatch()).boxes
     np.testing.assert_allclose(box.center[0], 6.0, atol=0.05)
@@ -749,7 +744,6 @@ def test_boxes_all_around_the_vehicle(scan: SimulatedScan) -> None:
     # A quarter turn of the scan is a quarter turn of the answer, but for heights: the ground is found in other cells.
     behind = scan.points[:, [1, 0, 2, 3]] * np.array([1, -1, 1, 1], np.float32)  # what is left is ahead
     left = ahead(behind).points
-    assert left is not None
     fresh = left.in_view & ~in_view
     assert (every.require_points().labels[fresh] == left.labels[fresh]).mean() > 0.999
     assert any(box.center[0] < 0.0 for box in every.boxes)
@@ -803,8 +797,6 @@ def test_a_dense_scan_about_the_vehicle_is_perceived_and_the_doubt_is_told() -> 
     assert finds.sensor.name == "beamless"
     sensor = replace(get_sensor("os1-64"), remission_range=(0.0, 1.0))
     named = Perceiver("pointseg", sensor=sensor, on_mismatch="ignore")(scan)
-    assert answer.points is not None
-    assert named.points is not None
     assert np.mean(answer.points.labels == named.points.labels) > 0.97
     with pytest.raises(SensorError, match="no beams stand out"):
         Perceiver("pointseg", sensor="auto", provider="cpu", on_mismatch="raise")(scan)

@@ -505,7 +505,6 @@ def test_a_signal_leaves_whole_files_and_an_older_run_as_it_is(
         scans.append(tmp_path / f"copy{k}.bin")
         scans[-1].hardlink_to(scans[0])
     process = edgeperc_run(*scans, "--model", "pointseg", *" ".join(options).split(), cwd=out)
-    assert process.stdout is not None
     for _ in range(3):
         assert process.stdout.readline()
     time.sleep(0.05)

@@ -119,7 +119,6 @@ def test_no_object_that_points_show_is_without_a_box(full_turn: bool) -> None:
             if oriented_iou(rectangles(boxes), rectangles([scan.boxes[k]])).max(initial=0.0) >= MIN_IOU.get(kind, 0.2):
                 continue
             points = networks(scan.points).points
-            assert points is not None
             recognized = np.isin(points.labels[seen], LABELS_OF[kind]).mean()
             if recognized >= MIN_RECOGNIZED[kind]:
                 lost.append((kind, x, y, int(np.count_nonzero(seen)), round(float(recognized), 2), perception.boxes))

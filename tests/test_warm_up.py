@@ -216,7 +216,6 @@ def test_no_helper_is_left_where_construction_is_interrupted(
         interrupted()
     (process,) = processes
     assert process.returncode is not None
-    assert process.stdin is not None
     assert process.stdin.closed
 
 
@@ -336,7 +335,6 @@ def test_no_helper_outlives_a_process_that_is_killed(how: signal.Signals) -> Non
     with subprocess.Popen(
         [sys.executable, "-c", PARENT], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
     ) as parent:
-        assert parent.stdout is not None
         try:
             helper = int(parent.stdout.readline())
             assert _is_running(helper)

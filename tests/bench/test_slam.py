@@ -119,7 +119,6 @@ def test_the_rows_of_a_drive() -> None:
     assert [len(masks) for masks in seen.kept.values()] == [16, 16, 16]
     assert not seen.kept["without moving"][-1][400:].any()
     assert seen.kept["without moving"][-1][:400].all()
-    assert drive.poses is not None
     poses = np.concatenate([drive.poses, drive.poses[-2::-1]])
     (whole, still, parked), motion = slam.compared(drive, seen, lambda scans: poses)
     assert motion[:4] == ["d", "truth", "0.000 m", "0.000 m"]
@@ -144,8 +143,6 @@ def test_the_rows_of_a_drive() -> None:
 def test_kiss_icp_follows_a_drawn_street() -> None:
     pytest.importorskip("kiss_icp")
     drive = next(slam.drawn_streets(6))
-    assert drive.poses is not None
-    assert drive.moving is not None
     assert any(mask.any() for mask in drive.moving)
     poses, gap = slam.closure(
         slam.kiss_icp, slam.chosen(drive, [np.ones(len(points), np.bool_) for points in drive.scans])

@@ -245,7 +245,6 @@ def test_every_program_ends_by_a_signal_in_one_line(program: str, number: int) -
     # A shell starts programs in the background with SIGINT ignored.
     with_signals = partial(signal.signal, signal.SIGINT, signal.default_int_handler)
     with start(program, before=WAITING, preexec_fn=with_signals) as process:
-        assert process.stdout is not None
         assert process.stdout.readline() == b"runs\n"
         time.sleep(0.2)
         process.send_signal(number)
@@ -269,8 +268,6 @@ def test_every_program_is_quiet_when_nobody_reads(program: str, stream: str) -> 
     )
     with start(program, before=talking) as process:
         closed, other = (process.stdout, process.stderr) if stream == "stdout" else (process.stderr, process.stdout)
-        assert closed is not None
-        assert other is not None
         closed.close()
         assert other.read() == b""
     assert process.returncode == 141
@@ -281,8 +278,6 @@ def test_every_program_is_quiet_when_nobody_reads(program: str, stream: str) -> 
 def test_help_is_quiet_when_nobody_reads(program: str) -> None:
     buffered = {name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"}
     with start(program, "--help", env=buffered) as process:
-        assert process.stdout is not None
-        assert process.stderr is not None
         process.stdout.close()
         assert process.stderr.read() == b""
     assert process.returncode == 141

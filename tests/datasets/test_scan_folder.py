@@ -75,7 +75,6 @@ def with_classes(root: Path, numbers: list[int], dtype: type = np.uint8, **chang
 def test_boxes_and_the_labels_of_points_by_them(tmp_path: Path) -> None:
     folder = ScanFolder(folder_of(tmp_path, label__a_dot_txt=LINES + "Cone 30 9 -1 6 3 3 0\n"))
     frame = folder.frame("a")
-    assert frame.boxes is not None
     assert [box.label for box in frame.boxes] == ["car", "ignore", "cyclist", "digger"]  # a cone is background
     assert frame.boxes[0] == Box("car", 1.0, (10, 0, -1), (4, 2, 1.6), 0.0)
     assert frame.returns == (1, 0, 1, 1)
@@ -151,7 +150,6 @@ def test_classes_of_points(tmp_path: Path, dtype: type) -> None:
     assert frame.boxes is None
     assert frame.labels().tolist() == [0, 1, IGNORE, IGNORE]  # 0 is unlabeled
     road = frame.road_labels()
-    assert road is not None
     assert road.tolist() == [1, 2, IGNORE, IGNORE]
     assert not frame.known_at(PLACES).any()  # objects without boxes
 
@@ -262,7 +260,6 @@ def test_kitti_labels_of_another_camera(tmp_path: Path) -> None:
     assert frame.labels().tolist() == [1, 0, 0, IGNORE]
     assert frame.azimuths == pytest.approx((-math.atan(0.96), math.atan(0.96)))
     front = folder_truth(frame, MODEL_MOUNTING, None).front
-    assert front is not None
     assert front.image_size == (1920, 1080)
     (own_kitti := tmp_path / "set/training").mkdir(parents=True)
     for folder in ("label_2", "calib", "velodyne"):
@@ -649,7 +646,6 @@ def test_truth_lies_in_the_frame_of_the_models(tmp_path: Path) -> None:
     frame = ScanFolder(root).frame("3")
     mounting = Mounting(0.4, 0.0, MODEL_MOUNTING.pitch_deg, 0.0)
     truth = folder_truth(frame, mounting, VIEW)
-    assert frame.boxes is not None
     np.testing.assert_allclose(truth.points[:, :3], scan.points[:, :3], atol=0.02)  # raised along the pitched axis
     np.testing.assert_array_equal(truth.labels, frame.labels())
     assert truth.boxes[0].center[2] == pytest.approx(frame.boxes[0].center[2] - 1.33, abs=0.01)
@@ -674,7 +670,6 @@ def test_polygons_are_the_road_where_the_scan_sees_it(tmp_path: Path) -> None:
     (root / "drivable").mkdir()
     (root / "drivable/3.json").write_text("[[[6, -3], [46, -3], [46, 3], [6, 3]]]")
     cells = road_cells(ScanFolder(root).frame("3"), Mounting(0.4, 0.0, MODEL_MOUNTING.pitch_deg, 0.0), VIEW)
-    assert cells is not None
     seen = cells != IGNORE
     assert 0.1 < seen.mean() < 1.0
     _, y = np.broadcast_arrays(*VIEW.cell_centers())

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import subprocess
-import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -15,6 +13,7 @@ import numba
 import numpy as np
 import pytest
 
+from checkout import printed
 from cli_helpers import Shell
 from edgeperc import TrackingError, cli
 from edgeperc.datasets.kitti import scan_hash
@@ -219,8 +218,7 @@ print(*counted)
 @pytest.mark.parametrize("what", ["eval-tracking", "bench"])
 def test_nothing_is_compiled_while_the_clock_runs(kitti: Path, what: str) -> None:
     """A new process counts the compiled kernels when the clock starts, and when it stops."""
-    command = [sys.executable, "-c", COUNT, "bench" if what == "bench" else str(kitti)]
-    before, after = map(int, subprocess.run(command, check=True, capture_output=True, text=True).stdout.split())
+    before, after = map(int, printed(COUNT, "bench" if what == "bench" else kitti).split())
     assert after == before > 10
 
 

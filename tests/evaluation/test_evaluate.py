@@ -333,7 +333,6 @@ def test_classes_that_a_set_does_not_label_are_no_mistakes(world: World) -> None
     labeled = ScanFrame("1", "a", layout, points, (car, replace(van, label="car")), None, None)
     judge = Judge(["pointseg", "ssadnet"])
     record, mistakes = judge.compare(folder_truth(labeled, MODEL_MOUNTING, VIEW), judge.perceive(points))
-    assert mistakes is not None
     assert mistakes.n_errors == 0
     result = figures([record])
     cells = result["segmentation"]["vehicles from 3-D boxes"]["all"]["iou"]
@@ -768,7 +767,6 @@ def test_mistakes_are_named(world: World) -> None:
     world.boxes = (box(10, 0), box(35, 0, "truck"))
     judge = Judge(["pointseg", "ssadnet"])
     _, mistakes = judge.record(judge.kitti(frame(car, van, rider, walker, beside, beyond, points=points)))
-    assert mistakes is not None
     assert set(mistakes.found) == {car, walker}
     assert dict(mistakes.missed) == {van: 5, rider: 6, beside: 7}  # no box was to be predicted beside the view
     assert mistakes.false == (box(35, 0, "truck"),)
@@ -801,8 +799,6 @@ def test_a_network_agrees_with_the_perceiver() -> None:
     )  # the agreement removes cells that the network calls drivable
     truth = judge.simulated(FIRST_SEED)
     found = judge.perceive(truth.points)
-    assert judge.from_above is not None
-    assert judge.from_sensor is not None
     drivable = judge.from_above.probability("drivable")
     assert drivable.min() >= 0.0
     assert drivable.max() <= 1.0

@@ -484,7 +484,6 @@ def test_a_build_killed_twice_and_resumed_is_the_same(
     kills, finished = 0, []
     while kills < 2:
         with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL) as process:
-            assert process.stdout is not None
             for _ in range(rng.randint(1, 9)):  # at most eight writes of more than forty
                 assert process.stdout.readline()
             time.sleep(rng.uniform(0.0, 0.005))

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-import subprocess
-import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -15,6 +14,7 @@ onnx = pytest.importorskip("onnx")
 
 from training_helpers import ablate
 
+from checkout import printed
 from cli_helpers import Shell, parsers
 from edgeperc.zoo import model_path
 from edgeperc_export.cli import build_parser, recipe_of
@@ -62,8 +62,7 @@ for arguments in (["--help"], ["train", "--help"], ["database-build", "--help"])
         assert end.code == 0
 assert not {"torch", "numba", "onnx"} & {*sys.modules}, "--help"
 """
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
+    printed(code)
 
 
 def test_every_field_of_a_recipe_is_an_option() -> None:

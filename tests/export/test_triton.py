@@ -85,8 +85,6 @@ def stub(repository: Path) -> ModuleType:
 def loaded(repository: Path) -> Any:
     """The Python model, from its file."""
     spec = importlib.util.spec_from_file_location("model", repository / "edgeperc" / "1" / "model.py")
-    assert spec is not None
-    assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     model = module.TritonPythonModel()

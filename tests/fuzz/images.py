@@ -123,7 +123,6 @@ def check_image(perception: Perception, height: int, width: int, n_classes: int)
     """The labels are complete, in range, and can be written as JSON."""
     found = perception.image
     check(found is not None, "no labels of the image")
-    assert found is not None
     check(found.labels.shape == (height, width), f"labels of shape {found.labels.shape} for {height} x {width}")
     check(found.labels.dtype == np.uint8 and found.labels.flags.c_contiguous, "labels of another type")
     check(int(found.labels.max()) < n_classes, f"label {found.labels.max()} of {n_classes} classes")

@@ -101,7 +101,6 @@ class Packets:
             scans += [] if packet is None else stream.add(packet)
         check_scans([*scans, *stream.end()])
         whole = points_of(memoryview(self.livox[k]))
-        assert whole is not None
         content = np.ascontiguousarray(table[:, -len(whole.content) :]).ravel()
         n = len(content) // whole.kind.stride
         points, which = np.empty((n, 4), np.float32), np.empty(n, np.int64)

@@ -59,7 +59,6 @@ def scans() -> list[NDArray[np.float32]]:
 
 def seen_by(mounting: Mounting, points: NDArray[np.float32]) -> NDArray[np.float32]:
     """A scan of a level sensor, 1.73 m above the road, in the frame of a sensor mounted otherwise."""
-    assert mounting.height_m is not None
     on_road = points[:, :3] + [0.0, 0.0, 1.73]
     moved = points.copy()
     moved[:, :3] = (on_road - [0.0, 0.0, mounting.height_m]) @ mounting.rotation() + [*mounting.origin_m, 0.0]
@@ -68,7 +67,6 @@ def seen_by(mounting: Mounting, points: NDArray[np.float32]) -> NDArray[np.float
 
 @given(mountings)
 def test_matrix_and_dict_give_the_mounting_back(mounting: Mounting) -> None:
-    assert mounting.height_m is not None
     matrix = np.eye(4)
     matrix[:3, :3], matrix[2, 3] = mounting.rotation(), mounting.height_m
     again = Mounting.from_matrix(matrix)
@@ -186,7 +184,6 @@ def test_moved_points_lie_where_the_rule_says(mounting: Mounting, seed: int) -> 
     """v = R (p - origin) + height in the vehicle frame; the models' frame is the training vehicle's sensor."""
     points = np.random.default_rng(seed).normal(0.0, 20.0, (50, 4)).astype(np.float32)
     points[::7] = np.nan
-    assert mounting.height_m is not None
     vehicle = (points[:, :3] - [*mounting.origin_m, 0.0]) @ mounting.rotation().T + [0.0, 0.0, mounting.height_m]
     expected = (vehicle - [0.0, 0.0, 1.73]) @ MODEL_MOUNTING.rotation()
     moved = ModelFrame(mounting).move(points)
@@ -255,15 +252,11 @@ def test_real_scans_give_the_applied_mounting_and_an_honest_uncertainty(kitti_ro
         scan = np.fromfile(file, np.float32).reshape(-1, 4)
         own = MountingEstimator(Mounting()).add(scan).estimate()
         m = own.mounting
-        assert m.height_m is not None
-        assert m.roll_deg is not None
-        assert m.pitch_deg is not None
         sds = np.array([own.height_sd_m, own.roll_sd_deg, own.pitch_sd_deg])
         errors.append((np.array([m.height_m, m.roll_deg, m.pitch_deg]) - [1.75, -0.2, 0.66]) / sds)
         applied = Mounting(rng.uniform(0.8, 3.0), rng.uniform(-8.0, 8.0), rng.uniform(-8.0, 8.0), 0.0)
         moved = MountingEstimator(Mounting()).add(seen_by(applied, scan)).estimate().mounting
         whole = Mounting.from_matrix(np.block([[m.rotation() @ applied.rotation(), np.zeros((3, 1))], [np.eye(4)[3:]]]))
-        assert applied.height_m is not None
         raised = m.height_m + applied.height_m - 1.73
         changes.append(
             [(moved.height_m or 0.0) - raised, (moved.roll_deg or 0.0) - (whole.roll_deg or 0.0),
@@ -370,7 +363,6 @@ def test_the_mounting_is_settled_over_scans_and_refused_scans_teach_nothing(scan
     raised = seen_by(Mounting(2.6, 0.0, 0.66, 0.0), scans[0])
     for _ in range(FROZEN_AFTER):
         perceive(raised)
-    assert perceive.mounting is not None
     assert perceive.mounting.n_scans == FROZEN_AFTER
     assert perceive(scans[0]).mounting.height_m == pytest.approx(2.6, abs=0.05)
     other = Perceiver("pointseg", provider="cpu", on_mismatch="raise")
@@ -442,7 +434,6 @@ def test_a_height_that_is_found_from_afar_is_not_said_in_silence(sensor: str, he
         with warnings.catch_warnings(record=True) as shown:
             warnings.simplefilter("always")
             found = Perceiver(["ssadnet"], sensor=sensor, mounting=known)(points)
-        assert found.mounting is not None
         assert any(told in finding for finding in found.fitness) == (known.height_m is None)
         assert any(told in str(each.message) for each in shown) == (known.height_m is None)
         assert known.height_m in (None, found.mounting.height_m)

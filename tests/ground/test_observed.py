@@ -372,7 +372,6 @@ def test_an_empty_road_is_free_as_far_as_rings_remain(sensor: str) -> None:
     assert last_ring_m(sensor) == pytest.approx(last, abs=0.1)
     assert ahead.free_m == pytest.approx(last, abs=0.3)
     assert ahead.end == ("end of view" if last == 46.0 else "unknown")
-    assert view.between_beams is not None
     assert not (view.between_beams & view.observed).any()
     # Without the beams, the observed cells alone count, as in a view that comes from elsewhere.
     assert free_ahead(replace(view, between_beams=None)).free_m <= ahead.free_m

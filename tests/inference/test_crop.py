@@ -143,7 +143,6 @@ def test_buffers_grow_and_empty_scans_stay_empty() -> None:
 
 
 def pipeline_of(perceive: Perceiver) -> Pipeline:
-    assert perceive.pipeline is not None
     return perceive.pipeline
 
 

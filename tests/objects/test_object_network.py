@@ -165,7 +165,6 @@ def test_a_riders_box_is_the_mean_of_that_of_the_labels_and_of_the_networks(scan
     np.testing.assert_allclose(look, same, atol=1e-9)
     np.testing.assert_allclose(look, [true.center, true.size], atol=0.4)
     assert math.cos(rider.yaw - true.yaw) > 0.9
-    assert rider.front is not None
     assert rider.front > 0.5
     assert math.dist(rider.center[:2], (x, y)) < math.hypot(0.2, 0.1)
     nobody = replace(labeled, center=(1.0, 60.0, -0.8))
@@ -225,8 +224,6 @@ def test_boxes_of_objects_keep_and_add_labels(scan: SimulatedScan) -> None:
     without = Perceiver(["ssadnet", "pointseg"], **options)(scan.points).points
     perception = Perceiver(["ssadnet", "pointseg", "objects"], **options)(scan.points)
     labeled = perception.points
-    assert without is not None
-    assert labeled is not None
     boxed, shares = np.zeros(len(scan.points), np.bool_), []
     for box in perception.boxes:
         if box.label in ("car", "van", "truck") and box.front is not None:

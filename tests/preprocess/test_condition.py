@@ -297,7 +297,6 @@ def test_only_scans_of_a_coarser_sensor_are_interpolated() -> None:
 def test_points_that_lie_at_random_are_joined_however_the_sensor_is_mounted(name: str) -> None:
     """A wall ahead, seen by as many points as the sensor has in its time, is filled but for a few pixels."""
     sensor = get_sensor(name)
-    assert sensor.pattern is not None
     field_deg2 = sensor.pattern.width_deg * (sensor.fov_up_deg - sensor.fov_down_deg)
     n = int(90.0 * 26.0 * sensor.pattern.points_per_s * sensor.pattern.accumulate_s / field_deg2)
     rng = np.random.default_rng(0)
@@ -507,7 +506,6 @@ def test_adapt_fit_writes_what_run_takes(tmp_path: Path, shell: Shell) -> None:
     assert sorted(kinds) == ["linear", "logarithm", "polynomial", "power", "written"]
     profile = get_sensor(out)
     assert profile == replace(get_sensor("vlp-16"), remission=profile.remission)
-    assert profile.remission is not None
     assert profile.remission.source == "quantiles by range and incidence of 2 scans"
     out.write_text(replace(profile, mounting=MODEL_MOUNTING).to_json())  # nothing else changes the scan
     run = ["run", str(scans / "0.bin"), "--sensor", str(out), "--model", "pointseg", "--provider", "cpu", "--json"]

@@ -249,7 +249,6 @@ def test_fog_is_a_range_that_shrank_and_a_narrow_street_is_not(seed: int) -> Non
     normal = usual()
     health, _ = check_health(weather.fog(clear(seed), 25.0), HDL, normal)
     assert health.has_fog
-    assert health.normal_range_m is not None
     assert health.range_m < 0.6 * health.normal_range_m
     assert any("fog" in text for text in health.findings)
     x, y, z, r = clear(seed).T

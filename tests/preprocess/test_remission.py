@@ -46,7 +46,6 @@ def with_remission(scan: np.ndarray, values: np.ndarray | float) -> np.ndarray:
 
 def as_bytes(scan: np.ndarray, share: float = 1.0) -> np.ndarray:
     """The scan with the raw bytes from which the profile of the HDL-32E gives its remission, scaled by ``share``."""
-    assert BYTE.remission is not None
     a, b = BYTE.remission.coefficients
     return with_remission(scan, np.rint(share * np.clip(np.expm1((scan[:, 3] - a) / b), 0.0, 255.0)))
 
@@ -397,7 +396,6 @@ def test_kitti_scans_without_remission(kitti_root: Path) -> None:
     counts = {name: Confusion(("background", "car", "pedestrian", "cyclist")) for name in ("recorded", *perceivers)}
     for name in objects.names("validation")[::8]:
         truth = kitti_truth(objects.frame(name), None)
-        assert truth.labels is not None
         for kind, count in counts.items():
             points = truth.points if kind == "recorded" else with_remission(truth.points, 0.0)
             found = perceivers.get(kind, perceivers["both"])(points).points

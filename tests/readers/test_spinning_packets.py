@@ -83,11 +83,9 @@ def test_what_is_written_is_read(tmp_path: Path, model: Model) -> None:
         units = np.concatenate([units[units > 0] for _, units, _ in blocks])
         read = np.linalg.norm(scan.points[:, :3].astype(np.float64), axis=1) / model.unit_m
         np.testing.assert_array_equal(np.round(read).astype(np.int64), units)
-    assert scan.times_s is not None
     assert scan.stamp_s == scan.times_s.max()
     assert T0_S - 0.001 < scan.times_s.min() < scan.times_s.max() < T0_S + 1.0
     sensor = sensor_of(path)
-    assert sensor is not None
     assert sensor.name == model.name
     assert sensor.elevations_deg == tuple(sorted(unit_angles(model)[:, 0].tolist(), reverse=True))
     assert sensor.columns == round(360 / model.step_deg) * (2 if model.second == "firing" else 1)
@@ -117,7 +115,6 @@ def test_times_go_on_within_a_packet(tmp_path: Path) -> None:
         said = [difop(model, unit_angles(model))] if model.layout == ">" else []
         path = write_pcap(folder / "a.pcap", said + packets_of(model, blocks_of(model, units, units % 256)))
         (scan,) = list(read_timed_scans(path))
-        assert scan.times_s is not None
         firsts = scan.times_s.reshape(model.blocks, model.lasers)[:, 0]
         np.testing.assert_allclose(np.diff(firsts), model.step_deg / 3600, atol=1e-6)
         assert firsts[index] == pytest.approx(T0_S + 1e-6 * late_us, abs=1e-6)
@@ -177,7 +174,6 @@ def test_which_angles_are_used(tmp_path: Path) -> None:
     path, _ = capture(tmp_path, model, 24)
     (tmp_path / "drive.csv").write_text(calibration(unit_angles(model) + np.array([0.25, 1.0])))
     sensor = sensor_of(path)
-    assert sensor is not None
     assert sensor.elevations_deg[0] == 15.25
     for other in ("drive-2.csv", "drive+2.csv", "drive2.csv"):  # of other captures
         (tmp_path / other).write_text(calibration(unit_angles(model)))
@@ -257,7 +253,6 @@ def test_models_that_are_not_decoded_are_named(tmp_path: Path, name: str, packet
 def test_formats_are_told_apart(model: Model) -> None:
     (packet, *_) = packets_of(model, blocks_of(model, *ranges(model, 2 * model.blocks)))
     row = format_of(memoryview(packet))
-    assert row is not None
     same = "helios-32" if model.name == "helios-16" else model.name  # which the DIFOP tells apart
     assert row.name == same
     assert name_of(memoryview(packet)) == FORMATS[same].title
@@ -306,7 +301,6 @@ def test_damaged_packets_give_finite_points(name: str, seed: int, places: list[i
     scans += stream.end()
     for scan in scans:
         assert np.isfinite(scan.points).all()
-        assert scan.times_s is not None
         assert np.isfinite(scan.times_s).all()
 
 
@@ -315,7 +309,6 @@ def test_difop_of_any_bytes(name: str, content: bytes) -> None:
     model = MODELS[name]
     whole = difop(model, unit_angles(model))
     angles = angles_of_difop(FORMATS[name], memoryview(whole))
-    assert angles is not None
     np.testing.assert_allclose(angles.lasers_deg, unit_angles(model), atol=1e-9)
     assert angles_of_difop(FORMATS[name], memoryview(whole[:8] + bytes(1240))) is None
     assert angles_of_difop(FORMATS[name], memoryview(whole[:8] + b"\xff" * 1240)) is None

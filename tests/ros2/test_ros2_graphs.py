@@ -229,7 +229,6 @@ def test_the_command_of_the_page_answers_another_process(router: str, watch: Wat
     said = log.read_text().splitlines()
     # What the page shows, with the sensor's line shortened there.
     shown = re.search(r"^\$ edgeperc ros2 --topic /points\n(.*?)```", page, flags=re.M | re.S)
-    assert shown is not None
     for line in shown[1].splitlines():
         assert any(line in each for each in said), (line, said)
 

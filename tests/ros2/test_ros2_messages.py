@@ -144,7 +144,6 @@ def test_points_and_classes_arrive_unchanged() -> None:
     ]
     np.testing.assert_array_equal(cloud_points(cloud), POINTS)
     found = scan.perception.points
-    assert found is not None
     rows = cloud.data.reshape(-1, 20)
     np.testing.assert_array_equal(rows[:, 16], found.labels)
     np.testing.assert_array_equal(rows[:, 17], found.in_view)

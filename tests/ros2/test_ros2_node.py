@@ -266,7 +266,6 @@ def test_stamps_that_repeat_or_jump_are_answered_and_tracked_anew() -> None:
     sessions = []
     for answer in answers:
         assert isinstance(answer, PerceivedScan)
-        assert answer.tracks is not None
         sessions.append((answer.tracks.session, answer.tracks.is_late))
     assert sessions == [(0, False), (0, False), (0, True), *[(n, False) for n in (1, 1, 2, 1, 3, 1)]]
     for raw, stamp_ns in zip(graph.published["/edgeperc/points"], stamps_ns, strict=True):
@@ -440,7 +439,6 @@ def test_a_life_in_states(quick: None) -> None:
         assert graph.types.keys() == {"/diagnostics"}
         until(lambda: graph.published["/diagnostics"])
         assert (last_status(graph).level, last_status(graph).message) == (0, "unconfigured")
-        assert graph.change is not None
         graph.change("configure")
         assert node.state == "inactive"
         assert "/edgeperc/points" in graph.types

@@ -721,7 +721,6 @@ def angles_deg(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 @pytest.mark.parametrize("name", ["mid-360", "hap", "avia"])
 def test_a_pattern_fills_its_field_of_view_and_does_not_repeat(name: str) -> None:
     sensor = get_sensor(name)
-    assert sensor.pattern is not None
     first, second = patterned(name, 0.1), patterned(name, 0.1, 0.1)
     assert len(first.points) == pytest.approx(0.1 * sensor.pattern.points_per_s, rel=0.01)
     np.testing.assert_array_equal(patterned(name, 0.1).points, first.points)

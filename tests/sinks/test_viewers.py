@@ -62,7 +62,6 @@ def a_run(n: int = 8, mounting: Mounting | None = None) -> list[PerceivedScan]:
             a_perception(a_scan()), n_points=len(points), boxes=boxes[: 2 + k % 2], stamp_s=10.0 + 0.1 * k
         )
         labels = perception.points
-        assert labels is not None
         labels = replace(labels, labels=labels.labels[k:], in_view=labels.in_view[k:])
         perception = replace(perception, points=labels, mounting=mounting or perception.mounting)
         pose = np.eye(4)
@@ -167,7 +166,6 @@ def check_points(scan: PerceivedScan, message: Any, metadata: dict[str, str]) ->
     for column, name in enumerate(("x", "y", "z", "remission")):
         np.testing.assert_array_equal(rows[name], scan.points[:, column])
     found = scan.perception.points
-    assert found is not None
     np.testing.assert_array_equal(rows["class"], found.labels)
     assert json.loads(metadata["classes"]) == [*found.classes]
     colors = np.column_stack([rows[name] for name in ("red", "green", "blue")])
@@ -183,7 +181,6 @@ def check_boxes(scan: PerceivedScan, message: Any) -> None:
     assert [one.type for one in message.deletions] == [1]  # all
     assert len(message.entities) == len(boxes)
     assert len({entity.id for entity in message.entities}) == len(boxes)
-    assert scan.tracks is not None
     for k, (entity, box) in enumerate(zip(message.entities, boxes, strict=True)):
         (cube,) = entity.cubes
         assert entity.frame_id == "lidar"
@@ -200,7 +197,6 @@ def check_boxes(scan: PerceivedScan, message: Any) -> None:
 
 def check_tracks(scans: list[PerceivedScan], message: Any) -> None:
     tracks = scans[-1].tracks
-    assert tracks is not None
     assert [entity.id for entity in message.entities] == [f"track {id_}" for id_ in tracks.ids]
     for entity, track in zip(message.entities, tracks, strict=True):
         assert entity.frame_id == "odom"
@@ -217,7 +213,6 @@ def check_tracks(scans: list[PerceivedScan], message: Any) -> None:
 
 def check_drivable(scan: PerceivedScan, message: Any) -> None:
     view = scan.perception.top_view
-    assert view is not None
     assert message.frame_id == "base_link"
     cells = rows_of(message, message.cell_stride).reshape(-1, message.column_count)
     assert message.row_stride == message.cell_stride * message.column_count
@@ -244,7 +239,6 @@ def check_frames(scan: PerceivedScan, message: Any) -> None:
     in_base = turned_by(by_child["lidar"].rotation) @ p + place(by_child["lidar"].translation)
     assert_close(in_base, frame.R @ p + frame.t, atol=1e-9)
     in_world = turned_by(by_child["base_link"].rotation) @ in_base + place(by_child["base_link"].translation)
-    assert scan.tracks is not None
     assert_close(in_world, (scan.tracks.T_world_sensor @ [*p, 1.0])[:3], atol=1e-9)
 
 
@@ -466,7 +460,6 @@ def test_rrd_holds_what_went_in(tmp_path: Path, mounting: Mounting | None) -> No
         np.testing.assert_array_equal(component(points, "positions")[k], finite[:, :3])
         np.testing.assert_array_equal(component(points, "remission")[k], finite[:, 3])
         found = scan.perception.points
-        assert found is not None
         labels = found.labels[np.isfinite(scan.points).all(axis=1)]
         assert [names[id_] for id_ in component(points, "class_ids")[k]] == [found.classes[v] for v in labels]
         # A box that a track has is apart, for the view shows the track's in its place.
@@ -489,7 +482,6 @@ def test_rrd_holds_what_went_in(tmp_path: Path, mounting: Mounting | None) -> No
     mesh = entities["/world/lidar/drivable"]
     for k, scan in enumerate(scans):
         view, frame = scan.perception.top_view, ModelFrame(scan.perception.mounting)
-        assert view is not None
         corners = np.array(component(mesh, "vertex_positions")[k]) @ frame.R.T + frame.t
         triangles = corners[np.array(component(mesh, "triangle_indices")[k])]
         sides = triangles[:, 1:, :2] - triangles[:, :1, :2]
@@ -589,7 +581,6 @@ def test_a_page_plays_the_drive(tmp_path: Path) -> None:
         assert (label == names.index("pedestrian")).sum() == 100
         assert shown["name"] == scan.name
         # The boxes of tracks in place of theirs, and those of tracks that were not detected.
-        assert scan.tracks is not None
         n_coasting = int((scan.tracks.sources < 0).sum())
         assert len(shown["boxes"]) == len(scan.perception.boxes) + n_coasting
         assert sum(box["text"].startswith("#") for box in shown["boxes"]) == len(scan.tracks)

@@ -6,13 +6,13 @@ import ast
 import gc
 import itertools
 import os
-import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
 import edgeperc
+from checkout import printed
 from edgeperc.system.interpreter import kept_in_forks
 
 ROOT = str(Path(edgeperc.__file__).parent.parent)
@@ -26,9 +26,7 @@ FLAGS = ["-O", "-B", "-E", "-s", "-S", "-I", *(["-P"] if sys.version_info >= (3,
 
 
 def said(flags: list[str]) -> str:
-    done = subprocess.run([sys.executable, *flags, "-c", SAYS], capture_output=True, text=True, timeout=60)
-    assert done.returncode == 0, done.stderr
-    return done.stdout
+    return printed(SAYS, flags=(*flags,), timeout=60)
 
 
 @pytest.mark.parametrize(
@@ -46,7 +44,7 @@ def test_the_users_own_code_stays_out(tmp_path: Path) -> None:
     """A ``.pth`` file of the user's packages is code that every Python runs at its start, but not with -s."""
     environment = {**os.environ, "PYTHONUSERBASE": str(tmp_path)}
     code = "import site; print(site.getusersitepackages())"
-    folder = Path(subprocess.check_output([sys.executable, "-c", code], env=environment, text=True).strip())
+    folder = Path(printed(code, env=environment).strip())
     folder.mkdir(parents=True)
     (folder / "code.pth").write_text(f"import pathlib; pathlib.Path({str(tmp_path / 'ran')!r}).touch()\n")
     code = (
@@ -54,7 +52,7 @@ def test_the_users_own_code_stays_out(tmp_path: Path) -> None:
         "import subprocess; subprocess.run([sys.executable, *interpreter_flags(), '-c', ''], check=True)"
     )
     for flag in ("-s", "-I"):
-        subprocess.run([sys.executable, flag, "-c", code], env=environment, check=True)
+        printed(code, flags=(flag,), env=environment)
         assert not (tmp_path / "ran").exists()
 
 

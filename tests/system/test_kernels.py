@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -17,7 +16,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from checkout import REPOSITORY
+from checkout import REPOSITORY, printed
 from edgeperc.errors import MissingExtraError
 from edgeperc.system import kernels
 from edgeperc.system.kernel_stamp import code_of
@@ -223,9 +222,5 @@ print(json.dumps(toys.use()))
 def test_a_library_answers_without_numba_as_numba_does(tmp_path: Path) -> None:
     """Records, tuples, kernels that call kernels, exceptions, and division by zero as each kernel wants it."""
     (tmp_path / "toys.py").write_text(MODULE)
-    tool = str(REPOSITORY / ".ci" / "kernels")
-    subprocess.run([sys.executable, "-W", "ignore", "-c", TOYS, str(tmp_path), tool], check=True, timeout=600)
-    told = subprocess.run(
-        [sys.executable, "-c", RUN, str(tmp_path)], check=True, timeout=600, capture_output=True, text=True
-    )
-    assert json.loads(told.stdout) == json.loads((tmp_path / "expected.json").read_text())
+    printed(TOYS, tmp_path, REPOSITORY / ".ci" / "kernels", flags=("-W", "ignore"), timeout=600)
+    assert json.loads(printed(RUN, tmp_path, timeout=600)) == json.loads((tmp_path / "expected.json").read_text())

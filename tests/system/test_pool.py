@@ -86,8 +86,6 @@ def test_processes_end_with_their_driver(tmp_path: Path, is_killed: bool) -> Non
     with subprocess.Popen(
         [sys.executable, program], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     ) as driver:
-        assert driver.stdout is not None
-        assert driver.stdin is not None
         pid = int(driver.stdout.readline())
         if is_killed:
             driver.kill()

@@ -49,7 +49,6 @@ def test_sensors_without_beams_show_more_the_longer_they_gather(
     name: str, points_per_s: float, width_deg: float, fov_deg: tuple[float, float]
 ) -> None:
     profile = get_sensor(name)
-    assert profile.pattern is not None
     assert (profile.pattern.points_per_s, profile.pattern.width_deg) == (points_per_s, width_deg)
     assert (profile.fov_down_deg, profile.fov_up_deg) == fov_deg
     assert profile.accumulated(profile.pattern.accumulate_s) == profile
@@ -80,7 +79,6 @@ def test_turns_are_not_gathered(name: str) -> None:
 )
 def test_patterns_that_are_none(name: str, value: Any) -> None:
     pattern = get_sensor("avia").pattern
-    assert pattern is not None
     with pytest.raises(SensorError, match=f"pattern.{name}"):
         replace(pattern, **{name: value})
     with pytest.raises(SensorError, match="pattern is a ScanPattern or None"):
