@@ -60,8 +60,7 @@ def print_set(name: str, sensor: SensorProfile, scans: list[tuple[Points, Bytes]
         perceive = Perceiver(chosen, sensor=sensor, full_turn=True, on_mismatch="ignore")
         confusions = {place: Confusion(("other", "road")) for place in places}
         for points, cells in scans:
-            perception = perceive(points)
-            grid = occupancy_grid(perception, points, sensor=sensor, **EXTENT)
+            grid = occupancy_grid(perceive(points), points, sensor=sensor, **EXTENT)
             for place, where in places.items():
                 counted = where & grid.observed & (cells != IGNORE)
                 confusions[place].update(grid.drivable[counted], cells[counted] == 1)

@@ -348,8 +348,7 @@ def _card(args: argparse.Namespace) -> int:
             "or export the network with external_data=False"
         ) from exc
     try:
-        text = _json_text(args.card)
-        card = ModelCard.from_json(text)
+        card = ModelCard.from_json(_json_text(args.card))
     except (CardError, UnicodeDecodeError) as exc:
         raise CardError(f"{args.card}: {exc}") from exc
     card = with_golden(model, card)

@@ -142,8 +142,7 @@ def read_card(path: Path, folder: Path) -> object:
     blob = model(GRAPH, card=path.read_bytes().strip())
     found = folder / "corpus.onnx"
     found.write_bytes(blob)
-    card = ModelCard.read(found)
-    return FitnessProfile.from_dict(dict(card.fitness or {}))
+    return FitnessProfile.from_dict(dict(ModelCard.read(found).fitness or {}))
 
 
 READERS: dict[str, Callable[[Path, Path], object]] = {

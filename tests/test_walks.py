@@ -118,8 +118,7 @@ def test_no_object_that_points_show_is_without_a_box(full_turn: bool) -> None:
             # The object network turns one long truck at the edge of the top view: a box, but across it.
             if oriented_iou(rectangles(boxes), rectangles([scan.boxes[k]])).max(initial=0.0) >= MIN_IOU.get(kind, 0.2):
                 continue
-            points = networks(scan.points).points
-            recognized = np.isin(points.labels[seen], LABELS_OF[kind]).mean()
+            recognized = np.isin(networks(scan.points).points.labels[seen], LABELS_OF[kind]).mean()
             if recognized >= MIN_RECOGNIZED[kind]:
                 lost.append((kind, x, y, int(np.count_nonzero(seen)), round(float(recognized), 2), perception.boxes))
     assert n_seen > (85 if full_turn else 120)

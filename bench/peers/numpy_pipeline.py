@@ -70,8 +70,7 @@ class NumpyPipeline:
                 x_range_m, y_range_m = card.view.x_range_m, card.view.y_range_m
                 top_view = TopView(labels, card.classes, card.view.cell_m, x_range_m, y_range_m, observed)
             else:
-                found = vote(points, pixel, index, labels, len(card.classes))
-                labeled = PointLabels(found, pixel >= 0, card.classes)
+                labeled = PointLabels(vote(points, pixel, index, labels, len(card.classes)), pixel >= 0, card.classes)
         return Prediction(labeled, top_view, boxes)
 
 

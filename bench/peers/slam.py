@@ -233,8 +233,7 @@ def compared(
         ms = 1e3 * (time.process_time() - started) / (2 * len(scans) - 1)
         first = poses if first is None else first  # of all points
         if moving is None:
-            boxes = moving_boxes(drive.labels, poses)
-            moving = [on_objects(*each) for each in zip(drive.scans, boxes, strict=True)]
+            moving = [on_objects(*each) for each in zip(drive.scans, moving_boxes(drive.labels, poses), strict=True)]
         counted = [np.logical_and.reduce(masks) for masks in zip(staying, drive.known, drive.usable, strict=True)]
         still = [known & ~moves for known, moves in zip(drive.known, moving, strict=True)]
         n_still = int(np.count_nonzero(np.concatenate(still)))

@@ -194,7 +194,6 @@ def make_perceiver(
     """Make a perceiver with the options of the command line."""
     from ..perceiver import Perceiver
 
-    same = keywords(arguments, "provider", "precision", "score_threshold", "boxes_from", "full_turn", "trusted")
     return Perceiver(
         chosen_models(arguments),
         sensor=sensor,
@@ -202,7 +201,7 @@ def make_perceiver(
         on_mismatch=on_mismatch,
         adapt=adapt,
         agree=not arguments.no_agreement,
-        **same,
+        **keywords(arguments, "provider", "precision", "score_threshold", "boxes_from", "full_turn", "trusted"),
     )
 
 

@@ -226,8 +226,7 @@ class BoxEvaluator:
         spared = oriented_iou(self._rectangles(guesses), self._rectangles(spares)) >= self.iou_threshold
         excused = np.asarray(spared.any(axis=1))
         for label in dict.fromkeys(box.label for box in (*guesses, *rights)):
-            matches = self._classes.setdefault(label, _Matches())
-            self._match(matches, guesses, rights, overlap, excused, drive, {label})
+            self._match(self._classes.setdefault(label, _Matches()), guesses, rights, overlap, excused, drive, {label})
         self._match(self._all, guesses, rights, overlap, excused, drive, self.together)
         return self._match(_Matches(), guesses, rights, overlap, excused, drive)
 

@@ -95,8 +95,7 @@ def plugin_devices(ort: Any, short: str) -> list[Any]:
 
     if not devices():
         try:
-            library = import_module(PLUGINS[short]).get_library_path()
-            ort.register_execution_provider_library(name, library)
+            ort.register_execution_provider_library(name, import_module(PLUGINS[short]).get_library_path())
         except ModuleNotFoundError:
             return []
         except Exception as exc:  # onnxruntime's errors share no base but Exception

@@ -70,8 +70,7 @@ def find_place(xyz: Floats) -> tuple[float, float, float]:
     sample = np.random.default_rng(0).permutation(finite)[:_N_POINTS] - middle
     x, y = _rough_place(sample)
     place = _far_place(sample, x, y)
-    tilt = _tilt(sample, place)
-    place, _, contrast = _fine_place(sample, place, tilt)
+    place, _, contrast = _fine_place(sample, place, _tilt(sample, place))
     if not math.isfinite(contrast):
         raise _unknown("no place is one from which its elevations are those of beams")
     found = (middle + place).tolist()

@@ -317,8 +317,7 @@ def split_points(perception: Perception, points: ArrayLike, *, sensor: SensorPro
     neither are points that are not returns, drops, and reflections from more than 0.5 m below the ground. A scan
     without ground has obstacles only.
     """
-    moved = _returns_of(perception, points, sensor, ModelFrame(perception.mounting))
-    found = heights_above(perception.ground, moved)
+    found = heights_above(perception.ground, _returns_of(perception, points, sensor, ModelFrame(perception.mounting)))
     return Split(found.mask, (found.height_m > (0.0 if found.plane else -np.inf)) & ~found.mask)
 
 

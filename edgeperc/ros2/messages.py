@@ -239,8 +239,7 @@ class RosMessages:
         return self._cloud(self._header(scan, stamp_ns), fields, data, is_bigendian=False, is_dense=is_dense)
 
     def _cloud(self, header: Any, fields: Any, rows: Bytes, **kind: bool) -> Any:
-        step = rows.shape[1]
-        sizes = {"height": 1, "width": len(rows), "point_step": step, "row_step": rows.size}
+        sizes = {"height": 1, "width": len(rows), "point_step": rows.shape[1], "row_step": rows.size}
         return self._make(CLOUD, header=header, fields=fields, **sizes, data=rows.reshape(-1), **kind)
 
     def markers(self, scan: PerceivedScan, stamp_ns: int | None = None) -> Any:
@@ -292,8 +291,7 @@ class RosMessages:
         stamp_ns : int
             Stamp of the header [ns].
         """
-        fields = grid.to_occupancy_grid(frame_id, self._off_road)
-        return self._grid(self._header(None, stamp_ns, frame_id), fields)
+        return self._grid(self._header(None, stamp_ns, frame_id), grid.to_occupancy_grid(frame_id, self._off_road))
 
     def _grid(self, header: Any, fields: Mapping[str, Any], pose: Any = None) -> Any:
         """A grid; ``pose`` of its origin is by default that of the fields."""

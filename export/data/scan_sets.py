@@ -75,8 +75,7 @@ def read_scan_set(
                 f"{folder.root}: no scan of drive {frame.drive} shows the ground; give height_m, roll_deg and "
                 "pitch_deg as mounting in the description"
             )
-        missing = is_missing(frame.points)
-        sensor = replace(layout.sensor, remission=NO_REMISSION) if missing else sensors[frame.drive]
+        sensor = replace(layout.sensor, remission=NO_REMISSION) if is_missing(frame.points) else sensors[frame.drive]
         points, _ = condition(frame.points, sensor)
         scans.append(labeled_scan(frame, points, estimator.mounting(), classes))
     weights = [n_scans[frame.drive] ** -0.5 for frame in frames]

@@ -170,8 +170,7 @@ def _few(each: list[T], most: int = 64) -> list[T]:
 def calibration_images(camvid: Path) -> Calibration:
     """64 training images of CamVid, evenly spread."""
     data = LabeledImages(camvid)
-    files = data.files("train")
-    images = [data.read(file)[0] for file in _few(files)]
+    images = [data.read(file)[0] for file in _few(data.files("train"))]
     return Calibration(images, [image_hash(image) for image in images])
 
 

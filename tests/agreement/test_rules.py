@@ -138,8 +138,7 @@ def test_dense_columns_match_the_twin(seed: int) -> None:
     labels, limits = rng.integers(0, 4, n).astype(np.uint8), np.array([0.0, 0.0, 2.0, 2.2])
     found = labels.copy()
     clear_columns(read_only(points), read_only(height), limits, found)
-    right = twins.rules.columns(points, height, limits, labels)
-    np.testing.assert_array_equal(found, right)
+    np.testing.assert_array_equal(found, twins.rules.columns(points, height, limits, labels))
     assert np.count_nonzero(found != labels) > 0
 
 

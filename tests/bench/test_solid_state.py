@@ -37,8 +37,7 @@ def test_a_street_is_gathered_on_the_way() -> None:
         assert len(returns) == len(last.boxes)
         assert sum(returns) == pytest.approx(np.count_nonzero(labels), rel=0.5)
     last = driving[2]
-    again = solid_state.gathered(5, sensor, 0.2, 10.0)[0]
-    np.testing.assert_array_equal(again, driving[0])
+    np.testing.assert_array_equal(solid_state.gathered(5, sensor, 0.2, 10.0)[0], driving[0])
     assert last.T_world_sensor[0, 3] == pytest.approx(1.9, abs=0.3)
 
 

@@ -261,8 +261,7 @@ def test_a_sensor_that_is_mounted_otherwise() -> None:
     scan, image = seen(0, "hdl-64e", NEAR)
     mounting = Mounting(2.1, 1.0, 3.0, 20.0, (0.4, -0.2))
     T_here_there = np.eye(4)  # the scan as the other sensor measures it, in the vehicle's frame
-    base = MODEL_MOUNTING.rotation()
-    T_here_there[:3, :3] = mounting.rotation().T @ base
+    T_here_there[:3, :3] = mounting.rotation().T @ MODEL_MOUNTING.rotation()
     T_here_there[:3, 3] = mounting.rotation().T @ [0.0, 0.0, 1.73 - 2.1] + [0.4, -0.2, 0.0]
     points = scan.points.copy()
     points[:, :3] = scan.points[:, :3] @ T_here_there[:3, :3].T + T_here_there[:3, 3]

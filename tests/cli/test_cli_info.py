@@ -225,8 +225,7 @@ def test_info_and_lists_need_no_onnxruntime(tmp_path: Path) -> None:
 @pytest.mark.usefixtures("fake_models")
 def test_models_are_listed_with_what_was_measured_here(shell: Shell) -> None:
     entry = {"provider": "cpu", "precision": "int8", "n_threads": 2, "p50_ms": 7.25}
-    digest = zoo.digest(zoo.resolve("pointseg"))
-    machine.write_settings(machine.settings_path(), machine.fingerprint(), {digest: entry})
+    machine.write_settings(machine.settings_path(), machine.fingerprint(), {zoo.digest(zoo.resolve("pointseg")): entry})
     heading, pointseg, ssadnet = shell.out("models").splitlines()
     assert heading.split()[:2] == ["name", "default"]
     assert pointseg.split()[:2] == ["pointseg", "yes"]

@@ -149,8 +149,7 @@ def test_classes_of_points(tmp_path: Path, dtype: type) -> None:
     frame = ScanFolder(with_classes(tmp_path, numbers, dtype)).frame("a")
     assert frame.boxes is None
     assert frame.labels().tolist() == [0, 1, IGNORE, IGNORE]  # 0 is unlabeled
-    road = frame.road_labels()
-    assert road.tolist() == [1, 2, IGNORE, IGNORE]
+    assert frame.road_labels().tolist() == [1, 2, IGNORE, IGNORE]
     assert not frame.known_at(PLACES).any()  # objects without boxes
 
 
@@ -259,8 +258,7 @@ def test_kitti_labels_of_another_camera(tmp_path: Path) -> None:
     frame = ScanFolder(folder_of(tmp_path, {**own, "image_size": [1920, 1080]}, points=points, **files)).frame("a")
     assert frame.labels().tolist() == [1, 0, 0, IGNORE]
     assert frame.azimuths == pytest.approx((-math.atan(0.96), math.atan(0.96)))
-    front = folder_truth(frame, MODEL_MOUNTING, None).front
-    assert front.image_size == (1920, 1080)
+    assert folder_truth(frame, MODEL_MOUNTING, None).front.image_size == (1920, 1080)
     (own_kitti := tmp_path / "set/training").mkdir(parents=True)
     for folder in ("label_2", "calib", "velodyne"):
         (root / folder).rename(own_kitti / folder)

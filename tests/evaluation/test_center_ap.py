@@ -89,5 +89,4 @@ def test_the_steps_of_nuscenes_give_the_same_numbers(given_scans: list[tuple[lis
     table = table_of(*apart)
     for label in ("car", "pedestrian"):
         if table[label]:
-            expected = twin.scores(apart, label, CLASSES[label])
-            assert center_scores(table, label) == pytest.approx(expected, abs=1e-9)
+            assert center_scores(table, label) == pytest.approx(twin.scores(apart, label, CLASSES[label]), abs=1e-9)

@@ -382,8 +382,7 @@ def counted(objects: list[tuple[list[float], int, int]], boxes: tuple[Box, ...] 
     points = np.concatenate([places, street()])
     labels, right = np.zeros((2, len(points)), np.uint8)
     labels[: len(objects)], right[: len(objects)] = [o[1] for o in objects], [o[2] for o in objects]
-    seen = np.ones(len(points), bool)
-    tallies = count_causes(points, labels, right, right != IGNORE, seen, boxes, "a")
+    tallies = count_causes(points, labels, right, right != IGNORE, np.ones(len(points), bool), boxes, "a")
     result = figures([Record("", "a", tallies)], 0)
     return {**{what: {c: row["n_points"] for c, row in rows.items()} for what, rows in result["errors"].items()}} | {
         "bumper": result["bumper"]["all"]["n_points"],
@@ -496,8 +495,7 @@ def test_cells_under_boxes(world: World) -> None:
     world.cells["ssadnet"] = np.ones((400, 200), np.uint8)  # drivable counts as background here
     world.cells["ssadnet"][240:280, 90:110] = 2  # x 18..22, y -1..1: the car to the cell
     world.cells["ssadnet"][100:110, 100:110] = 4
-    tram = box(30, 5, "tram")
-    result = evaluated(Judge(["ssadnet"]), frame(box(20, 0), box(40, 5, "van"), tram))["segmentation"]
+    result = evaluated(Judge(["ssadnet"]), frame(box(20, 0), box(40, 5, "van"), box(30, 5, "tram")))["segmentation"]
     assert set(result) == {"vehicles from 3-D boxes"}
     row = result["vehicles from 3-D boxes"]["all"]
     vehicles = {"car": 800, "van": 800, "truck": 0, "vehicle": 1600}

@@ -230,8 +230,7 @@ def test_poles_and_walls_are_cut_out_of_the_background() -> None:
 def test_pasted_background_is_background() -> None:
     bank = augment.ObjectBank.of([pole_and_wall()])
     assert set(bank.objects) == {"pedestrian", "pole", "wall"}
-    street = flat_street()
-    out = augment.pasted(street, bank, np.random.default_rng(0), 8, augment.NEGATIVES)
+    out = augment.pasted(flat_street(), bank, np.random.default_rng(0), 8, augment.NEGATIVES)
     assert not out.boxes
     assert not out.counts
     assert not out.labels.any()

@@ -290,8 +290,7 @@ def test_a_variation_moves_image_and_mask_together() -> None:
     image = np.stack([distance, mask * 200, mask], axis=2)
     for k in range(6):
         moved, moved_mask, turn_deg, _ = varied(image, mask, "scene", k)
-        again = varied(image, mask, "scene", k)
-        np.testing.assert_array_equal(moved, again[0])
+        np.testing.assert_array_equal(moved, varied(image, mask, "scene", k)[0])
         known = moved_mask != IGNORE
         np.testing.assert_array_equal(moved[known, 2], moved_mask[known])
         assert not moved[~known].any()

@@ -402,8 +402,7 @@ def test_the_papers_recipes_match_the_papers() -> None:
     assert lodnn.n_pasted == lodnn.ema == lodnn.lovasz_weight == lodnn.simulated_share == lodnn.distil == 0.0
     assert not any(isinstance(m, nn.BatchNorm2d) for m in build(lodnn).modules())
     assert not any(isinstance(m, nn.BatchNorm2d) for m in build(ssadnet).segmentation.modules())  # type: ignore[union-attr, operator]
-    optimizer = make_optimizer(pointseg, build(pointseg))
-    assert type(optimizer) is torch.optim.Adagrad
+    assert type(make_optimizer(pointseg, build(pointseg))) is torch.optim.Adagrad
 
 
 @pytest.fixture(scope="module")
@@ -609,8 +608,7 @@ def test_an_exported_teacher_answers_with_each_sample(simulated: Path, network: 
     # The teacher reads the same channels of the same scan.
     session = Session(path, "cpu", n_threads=1)
     session.input[:] = image[0].numpy()
-    raw = session.run()
-    assert torch.allclose(torch.from_numpy(raw["class_logits"]).softmax(0), taught[0][0], atol=1e-6)
+    assert torch.allclose(torch.from_numpy(session.run()["class_logits"]).softmax(0), taught[0][0], atol=1e-6)
     outputs = build(recipe).eval()(image)
     assert torch.isfinite(task.distillation(outputs, *taught))
     twice = OnnxTeacher(path, task_of(replace(recipe, seen_twice=True)))

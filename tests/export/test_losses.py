@@ -75,8 +75,7 @@ def test_slots_of_rotated_boxes_contain_the_footprint(rng: np.random.Generator) 
 
 def test_slots_are_nearest_first_and_the_farthest_are_dropped() -> None:
     boxes = [(x, 0.0, 0.0, 4.0, 2.0, 1.5, 0.0) for x in (30.0, 10.0, 40.0, 20.0)]
-    target = paper_slot_targets(boxes, VIEW, 3)
-    np.testing.assert_allclose(target[:, 1], [0.9, 0.65, 0.4], rtol=1e-6)
+    np.testing.assert_allclose(paper_slot_targets(boxes, VIEW, 3)[:, 1], [0.9, 0.65, 0.4], rtol=1e-6)
 
 
 def test_empty_slots_are_zero() -> None:

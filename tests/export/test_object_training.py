@@ -197,8 +197,7 @@ def test_a_share_of_the_batch_is_found_again(samples: ObjectSamples) -> None:
 
 def test_boxes_of_the_training_are_those_of_the_runtime() -> None:
     task = Objects.of(RECIPE)
-    rng = np.random.default_rng(1)
-    outputs = torch.from_numpy(rng.normal(0.0, 1.0, (40, 29)).astype(np.float32))
+    outputs = torch.from_numpy(np.random.default_rng(1).normal(0.0, 1.0, (40, 29)).astype(np.float32))
     parts = parts_of(outputs, len(OBJECT_CLASSES))
     kinds = 1 + parts.classes[:, 1:].argmax(1)
     boxes = task.boxes(parts, kinds).numpy()

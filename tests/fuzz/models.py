@@ -71,8 +71,7 @@ class Models:
         self.documents = [json.loads(card.to_json()) for card in self.cards]
         self.documents += [json.loads(v.card.to_json()) for name in ("lodnn", "pointseg") for v in resolve(name)]
         self.digest = digest(resolve("lodnn"))
-        profile = SENSORS["vlp-16"]
-        self.profile = json.loads(profile.to_json())
+        self.profile = json.loads(SENSORS["vlp-16"].to_json())
         self.checkpoint: dict[str, Any] | None = None
         ways: list[tuple[int, Callable[[Case], str]]] = [
             (20, self.graph_bytes), (25, self.graph_message), (15, self.card_in_model), (15, self.card_made_up),

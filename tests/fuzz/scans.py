@@ -264,8 +264,7 @@ class Scans:
         if case.chance(PAGES):
             write_html(perception, points, case.folder / "scan.html", title="</script>\ud800")
         if case.chance(DRAWN):
-            picture = draw(perception, points)
-            check(picture[:4] == b"\x89PNG", "not a picture")
+            check(draw(perception, points)[:4] == b"\x89PNG", "not a picture")
         return (
             "answer" if any("made-up" in each for each in perception.providers.values()) else "answer of real networks"
         )

@@ -298,8 +298,7 @@ def test_a_few_scans_settle_it(scans: list[NDArray[np.float32]]) -> None:
 
 
 def no_ground(kind: str) -> NDArray[np.float32]:
-    rng = np.random.default_rng(0)
-    scan = rng.normal(0.0, 10.0, (20_000, 4)).astype(np.float32)
+    scan = np.random.default_rng(0).normal(0.0, 10.0, (20_000, 4)).astype(np.float32)
     if kind == "wall":
         scan[:, 0] = 8.0
     scan *= np.float32({"not finite": math.nan, "huge": 1e30}.get(kind, 1.0))
@@ -514,8 +513,7 @@ def bank(toward_deg: float, walls_deg: float) -> NDArray[np.float32]:
     lawn = np.column_stack([away, along, 0.25 * away - 3.2])
     azimuth = np.radians(rng.uniform(-walls_deg, walls_deg, 8000))
     walls = np.column_stack([20.0 * np.cos(azimuth), 20.0 * np.sin(azimuth), rng.uniform(0.5, 6.0, 8000)])
-    turn = Mounting(0.0, 0.0, 0.0, toward_deg).rotation()
-    xyz = np.vstack([lawn, walls]) @ turn.T
+    xyz = np.vstack([lawn, walls]) @ Mounting(0.0, 0.0, 0.0, toward_deg).rotation().T
     return np.column_stack([xyz, np.full(len(xyz), 0.3)]).astype(np.float32)
 
 

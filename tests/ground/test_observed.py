@@ -317,8 +317,7 @@ def test_large_views_have_bounded_tables() -> None:
     far = TopViewGeometry((9000.0, 9040.0), (-10.0, 10.0), cell_m=0.1)
     assert Observer(far, get_sensor("hdl-64e")).lowest.size < 100_000
     wide = TopViewGeometry((-1000.0, 1000.0), (-1000.0, 1000.0), cell_m=5.0)
-    observer = Observer(wide, get_sensor("hdl-64e"))
-    assert observer.lowest.size < 600 * 4200
+    assert Observer(wide, get_sensor("hdl-64e")).lowest.size < 600 * 4200
     no_ground = SensorProfile("up", (5.0, 3.0), 1800)
     index = np.full((16, 12), -1, np.int32)
     assert not np.any(Observer(SMALL, no_ground).observe(np.empty((0, 4), np.float32), index))

@@ -41,8 +41,7 @@ def test_a_session_gives_an_image_of_every_class(name: str) -> None:
     outputs = session.run()
     assert outputs["class_logits"].shape == (len(card.classes), card.view.height, card.view.width)
     assert session.raw["class_logits"].shape == card.output_shape("class_logits")[1:]
-    wanted = twins.blocks.pixels(session.raw["class_logits"], rows, cols)
-    np.testing.assert_array_equal(outputs["class_logits"], wanted)
+    np.testing.assert_array_equal(outputs["class_logits"], twins.blocks.pixels(session.raw["class_logits"], rows, cols))
 
 
 def test_cards_hold_blocks_and_earlier_ones_have_none() -> None:

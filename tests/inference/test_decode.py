@@ -455,8 +455,7 @@ def test_huge_footprints_are_sampled() -> None:
     rectangles = np.array([[7.5, 0.0, 15.0, 14.0, 0.3], [7.5, 0.0, 4.0, 2.0, 0.3]])
     sums = np.empty((2, 20))
     box_heads.fill_footprint_sums(values, True, rectangles, 15.0, 7.5, 0.1, sums)
-    expected = twins.decode.footprint_sums(values, True, rectangles, 15.0, 7.5, 0.1)
-    np.testing.assert_allclose(sums, expected, rtol=1e-9)
+    np.testing.assert_allclose(sums, twins.decode.footprint_sums(values, True, rectangles, 15.0, 7.5, 0.1), rtol=1e-9)
     assert sums.sum(axis=1).max() < 150 * 140 / 3  # every second row and column
     assert sums[1].sum() == pytest.approx(40 * 20, rel=0.05)
 

@@ -190,8 +190,7 @@ def test_boxes_are_in_the_frame_of_the_scan(
     """A sensor of any height and heading sees the same objects; the network sees the scan from its own height."""
     wanted = perceived(models["centers"], points).boxes
     mounting = Mounting(height_m, 1.0, -2.0, 90.0)
-    moved = ModelFrame(mounting).move_back(points)
-    found = perceived(models["centers"], moved, mounting=mounting).boxes
+    found = perceived(models["centers"], ModelFrame(mounting).move_back(points), mounting=mounting).boxes
     back = ModelFrame(mounting).move_boxes(found)
     assert [box.label for box in back] == [box.label for box in wanted]
     for box, other in zip(back, wanted, strict=True):

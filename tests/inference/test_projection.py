@@ -184,8 +184,7 @@ def test_edges_of_the_top_view() -> None:
         [np.nextafter(np.float32(6), np.float32(0)), 0.0, 0.0, 0.0], [26.0, 0.0, 0.0, 0.0],
         [26.0, 0.0, np.nextafter(np.float32(2.5), np.float32(9)), 0.0],
     ])  # fmt: skip
-    seen = check(points, VIEWS["top view"])
-    assert seen.pixel.tolist() == [399 * 200 + 199, -1, -1, 0, -1, 199 * 200 + 99, -1]
+    assert check(points, VIEWS["top view"]).pixel.tolist() == [399 * 200 + 199, -1, -1, 0, -1, 199 * 200 + 99, -1]
 
 
 def test_edges_of_the_range_image() -> None:
@@ -197,8 +196,7 @@ def test_edges_of_the_range_image() -> None:
 def test_straight_behind_is_in_a_full_turn() -> None:
     points = np.float32([[-5, 0.0, 0, 0], [-5, -0.0, 0, 0], [-5, -1e-20, 0, 0], [-5, 1e-20, 0, 0]])
     view = VIEWS["full turn, uneven"]
-    seen = check(points, view)
-    assert (seen.pixel % view.width).tolist() == [0, 0, view.width - 1, 0]
+    assert (check(points, view).pixel % view.width).tolist() == [0, 0, view.width - 1, 0]
 
 
 def test_axis_and_origin_are_out_of_view() -> None:

@@ -342,8 +342,7 @@ def test_qualcomms_plugin_runs_int8_on_the_npu(monkeypatch: pytest.MonkeyPatch) 
     assert available_providers() == ("qnn", "cpu")
     assert fake.libraries == ["onnxruntime_qnn.so"]
     monkeypatch.setattr(session_module, "cpu_features", lambda: frozenset({"asimd"}))  # no int8 on the processor
-    session = Session("pointseg", "qnn")
-    assert session.description == f"pointseg int8, {name}"
+    assert Session("pointseg", "qnn").description == f"pointseg int8, {name}"
     assert fake.chosen == [("NPU", {"htp_performance_mode": "burst"})]
     assert Session("pointseg", "qnn", precision="fp32").precision == "fp32"
     assert Session("pointseg", "auto").short == "cpu"  # it was not measured on this computer

@@ -177,8 +177,7 @@ def test_a_pedestrian_longer_than_a_stride_is_a_cyclist(away: float, alike: bool
 
 
 def test_a_board_is_no_row_of_people() -> None:
-    board = upright(15.0, 0.0, 1.6, 0.05)
-    assert boxes_of(board) == ()
+    assert boxes_of(upright(15.0, 0.0, 1.6, 0.05)) == ()
     people = boxes_of(*(person(15.0, y) for y in (-0.8, 0.0, 0.8)))
     assert len(people) == 3
 

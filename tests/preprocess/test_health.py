@@ -220,8 +220,7 @@ def test_another_sensor_after_the_first_scans_is_told(sensor: str, later: str) -
 
 @pytest.mark.parametrize("height_m", [0.0, 0.3])
 def test_beams_are_not_missing_where_the_origin_is_not_at_the_sensor(height_m: float) -> None:
-    scan = clear(3)
-    raised = scan + np.array([0.0, 0.0, 1.73 - height_m, 0.0], np.float32)
+    raised = clear(3) + np.array([0.0, 0.0, 1.73 - height_m, 0.0], np.float32)
     frame = ModelFrame(Mounting(height_m, 0.0, 0.0, 0.0))
     assert check_health(frame.move(raised), HDL, Normal(), frame.eye)[0].beams_missing == 0
 

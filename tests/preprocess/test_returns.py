@@ -250,8 +250,7 @@ def test_remission_is_matched_and_fitted_without_what_is_dropped(street: Points)
 
 
 def test_motion_does_not_move_beams_without_a_return(street: Points) -> None:
-    near = on_a_ray(50, 0.001, 0.45)
-    points = np.vstack([street, np.zeros((50, 4), np.float32), near])
+    points = np.vstack([street, np.zeros((50, 4), np.float32), on_a_ray(50, 0.001, 0.45)])
     motion, times = Motion((20.0, 0.0, 0.0)), np.linspace(0.0, 0.1, len(points))
     straight = deskew(points, times, motion, min_range_m=0.5)
     np.testing.assert_array_equal(straight[-100:], points[-100:])
@@ -317,8 +316,7 @@ def test_the_own_roof_is_suggested_and_nothing_else(drive: list[Points]) -> None
 def test_a_car_beside_is_not_suggested_while_the_street_moves(drive: list[Points]) -> None:
     # It stands beside in half of the scans: the jam moves on.
     scans = [np.vstack([p, roof(k), *([beside(k)] if k % 2 else [])]) for k, p in enumerate(drive)]
-    found = suggest_ego_box(scans, get_sensor("hdl-64e"), MODEL_MOUNTING)
-    assert found.box[1][1] < 1.5
+    assert suggest_ego_box(scans, get_sensor("hdl-64e"), MODEL_MOUNTING).box[1][1] < 1.5
 
 
 def test_a_traffic_jam_gives_no_suggestion(drive: list[Points]) -> None:

@@ -402,8 +402,7 @@ def chunked_mcap(
     path: Path, method: str, *, crc: bool = True, damaged: int | None = None, summary: bool = True
 ) -> Path:
     """MCAP with a chunk for each of three clouds; one may have a changed byte behind its checksum."""
-    typesys = pytest.importorskip("rosbags.typesys")
-    store, sent = messages(typesys, 2)
+    store, sent = messages(pytest.importorskip("rosbags.typesys"), 2)
     kind = "sensor_msgs/msg/PointCloud2"
     definition = store.generate_msgdef(kind, ros_version=2)[0].encode()
     meta, content = mcap_channel(1, LIDAR, kind, definition=definition), b""

@@ -256,8 +256,7 @@ def write_bag2(folder: Path) -> Path:
 
 def write_mcap(path: Path, profile: bytes = b"ros2") -> Path:
     """MCAP by its specification: header, schemas, channels and messages, without chunks or an index."""
-    typesys = pytest.importorskip("rosbags.typesys")
-    store, sent = messages(typesys, 2)
+    store, sent = messages(pytest.importorskip("rosbags.typesys"), 2)
     content, channels = b"", [*dict.fromkeys((topic, kind) for topic, kind, _, _ in sent)]
     for k, (topic, kind) in enumerate(channels, start=1):
         definition, _ = store.generate_msgdef(kind, ros_version=2)

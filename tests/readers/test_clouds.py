@@ -50,8 +50,7 @@ def values(message: Any) -> tuple[Any, ...]:
 @settings(max_examples=60, deadline=None)
 @pytest.mark.parametrize("ros", [1, 2])
 def test_messages_of_ros_as_rosbags_reads_them(ros: int, data: st.DataObject) -> None:
-    typesys = pytest.importorskip("rosbags.typesys")
-    store, _ = messages(typesys, ros)
+    store, _ = messages(pytest.importorskip("rosbags.typesys"), ros)
     types, text, number = store.types, st.text(max_size=9).filter(lambda t: "\0" not in t), st.integers(0, 2**32 - 1)
     stamp = types["builtin_interfaces/msg/Time"](data.draw(st.integers(0, 2**31 - 1)), data.draw(number))
     header = types["std_msgs/msg/Header"](*([3] if ros == 1 else []), stamp, data.draw(text))

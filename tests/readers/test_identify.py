@@ -120,8 +120,7 @@ def test_metadata_of_an_ouster(line: str | None, half_deg: float, n: int, name: 
     assert "x.json" in because
     if line is not None:
         # Early firmware has one level less.
-        nested = metadata(line, angles)
-        flat = {"prod_line": line, **nested["beam_intrinsics"], "lidar_mode": "512x10"}
+        flat = {"prod_line": line, **metadata(line, angles)["beam_intrinsics"], "lidar_mode": "512x10"}
         legacy, _ = of_metadata(flat, "x")
         assert (legacy.name, legacy.elevations_deg, legacy.columns) == (name, tuple(angles), 512)
 

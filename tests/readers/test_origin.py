@@ -50,8 +50,7 @@ def in_map(points: NDArray[np.float32], place: tuple[float, float, float], yaw_d
 )
 def test_the_place_of_a_level_sensor(sensor: str, place: str, yaw_deg: float) -> None:
     points = simulated_scan(len(place), sensor).points
-    found = find_place(in_map(points, PLACES[place], yaw_deg))
-    np.testing.assert_allclose(found, PLACES[place], atol=0.1)
+    np.testing.assert_allclose(find_place(in_map(points, PLACES[place], yaw_deg)), PLACES[place], atol=0.1)
 
 
 @pytest.mark.filterwarnings("error")

@@ -167,8 +167,7 @@ def test_damaged_messages(key: tuple[str, str], data: st.DataObject) -> None:
 
 def test_clouds_come_first_and_a_topic_chooses(tmp_path: Path) -> None:
     pytest.importorskip("velodyne_decoder")
-    typesys = pytest.importorskip("rosbags.typesys")
-    store, sent = messages(typesys, 2)
+    store, sent = messages(pytest.importorskip("rosbags.typesys"), 2)
     clouds = [bytes(store.serialize_cdr(m, kind)) for _, kind, _, m in sent if kind.endswith("PointCloud2")]
     packets = split(vlp16_packets(1.2), 75, ros2_message)
     both = [(LIDAR, "sensor_msgs/msg/PointCloud2", "cdr", clouds), (PACKETS, SCAN, "cdr", packets)]
@@ -268,8 +267,7 @@ def test_an_ousters_packets_give_the_turns_of_a_capture(tmp_path: Path, version:
     path = ouster_bag(tmp_path, version, [bytes(packet.buf) for packet in packets], json.dumps(METADATA))
     of_bag = check_turns(path, of_capture)
     assert [len(points) for _, points in read_scans(path, remission_field="signal")] == [len(s.points) for s in of_bag]
-    sensor = sensor_of(path)
-    assert sensor.name == "os1-8"
+    assert sensor_of(path).name == "os1-8"
 
 
 @pytest.mark.parametrize(

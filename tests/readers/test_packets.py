@@ -41,8 +41,7 @@ def test_a_velodyne_behind_any_link(tmp_path: Path, link: int, head: bytes) -> N
     pytest.importorskip("velodyne_decoder")
     path = write_link(tmp_path / "link.pcap", link, vlp16_packets(1.2), head)
     assert check_same(read_scans(path), read_scans(write_pcap(tmp_path / "a.pcap", vlp16_packets(1.2)))) == 2
-    sensor = sensor_of(path)
-    assert sensor.name == "vlp-16"
+    assert sensor_of(path).name == "vlp-16"
 
 
 def payloads_of(kind: str) -> list[bytes]:

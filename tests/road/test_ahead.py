@@ -193,8 +193,7 @@ def test_road_computed_by_hand() -> None:
 def test_lanes_of_a_slanting_road(slope: float, width: float, lanes: int) -> None:
     x, y = (46.0 - 0.1 * (np.arange(400)[:, None] + 0.5)), 10.0 - 0.1 * (np.arange(200)[None, :] + 0.5)
     cells = np.abs(y - slope * (x - 12.0)) / math.hypot(1.0, slope) < width / 2.0
-    road = road_ahead(view(cells))
-    assert road.lane_width_m * lanes == pytest.approx(width, abs=0.12)
+    assert road_ahead(view(cells)).lane_width_m * lanes == pytest.approx(width, abs=0.12)
 
 
 def test_no_drivable_cell() -> None:

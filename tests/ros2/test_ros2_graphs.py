@@ -549,8 +549,7 @@ def test_the_grid_with_memory_over_zenoh(router: str, watch: Watch) -> None:
             return [data for key, data, _ in list(watch.samples) if key.startswith("0/grid/")]
 
         until(grids)
-        raw = grids()[0]
-        grid = MESSAGES.decode(raw, LIVE_OUTPUTS["rolling"])
+        grid = MESSAGES.decode(grids()[0], LIVE_OUTPUTS["rolling"])
         assert (grid.header.frame_id, grid.info.width) == ("odom", 200)
         assert (grid.info.origin.position.x, grid.info.origin.position.y) == pytest.approx((-17.0, -16.0), abs=0.21)
         assert 100 in grid.data

@@ -217,8 +217,7 @@ def test_the_grid_lies_where_its_cells_are(mounting: Mounting) -> None:
     points[:, :3] = (points[:, :3] - frame.t) @ frame.R
     scan = perceived(points=points, mounting=mounting, boxes=())
     message = again(MESSAGES.occupancy(scan))
-    grid = occupancy_grid(scan.perception, points)
-    values = grid.values()
+    values = occupancy_grid(scan.perception, points).values()
     np.testing.assert_array_equal(message.data.reshape(message.info.height, message.info.width), values)
     assert {-1, 0, 100} == {*values.ravel().tolist()}
     assert message.info.resolution == pytest.approx(0.2)

@@ -314,8 +314,7 @@ def test_what_no_cloud_heals_is_raised() -> None:
 
 
 def test_closing_ends_the_iteration() -> None:
-    graph = FakeGraph()
-    with PerceptionNode(graph, lambda _: Perceive(), rate_hz=SLOW_HZ) as node:
+    with PerceptionNode(FakeGraph(), lambda _: Perceive(), rate_hz=SLOW_HZ) as node:
         worker = threading.Thread(target=lambda: [*node])
         worker.start()
     worker.join(TIMEOUT_S)

@@ -41,8 +41,7 @@ def test_times_without_a_pose() -> None:
         poses.receive(odometry(10**9 + k * 10**8, float(k), 0.0, 0.0))
     assert poses.at(10**9 - 1) is None
     for stamp_ns, x in ((10**9, 0.0), (1_200_000_000, 2.0), (1_400_000_000, 2.0)):
-        found = poses.at(stamp_ns)
-        assert found[0, 3] == x
+        assert poses.at(stamp_ns)[0, 3] == x
     assert poses.at(1_400_000_001) is None
 
 
@@ -77,8 +76,7 @@ def test_what_is_no_pose_is_counted(data: bytes) -> None:
 def test_where_the_sensor_is_without_a_pose_of_its_own() -> None:
     """By the frames' names: that of the cloud itself, or above the vehicle's frame as the perceiver says."""
     mounting = Mounting(2.0, 0.0, 0.0, 90.0)
-    same = Rolling().base_from_sensor("lidar", "lidar", mounting)
-    np.testing.assert_array_equal(same, np.eye(4))
+    np.testing.assert_array_equal(Rolling().base_from_sensor("lidar", "lidar", mounting), np.eye(4))
     above = Rolling().base_from_sensor("base_link", "lidar", mounting)
     np.testing.assert_allclose(above @ [3.0, 0.0, 0.0, 1.0], [0.0, 3.0, 2.0, 1.0], atol=1e-12)
     given = Rolling(sensor_pose=(1, 2, 3, 180, 0, 0)).base_from_sensor("lidar", "lidar", mounting)

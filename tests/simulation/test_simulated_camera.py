@@ -91,8 +91,7 @@ def test_the_same_seed_gives_the_same_image(scene: Scene, scan: SimulatedScan, i
 def test_a_car_is_where_its_box_is() -> None:
     box = Box("car", 1.0, (12.0, 1.0, 0.75 - 1.73), (3.9, 1.6, 1.5), 0.3)
     scene = scene_from_boxes([box], 0)
-    scan = simulate(scene, "hdl-64e", 0)
-    labels = render(scene, CAMERA, scan.T_world_sensor, 0).labels
+    labels = render(scene, CAMERA, simulate(scene, "hdl-64e", 0).T_world_sensor, 0).labels
     corners = np.column_stack([np.tile(box.corners(), (2, 1)), np.repeat([-1.73, -0.23], 4)])
     u, v, _ = CAMERA.project(corners)
     car = labels == CAMERA_CLASSES.index("Car")

@@ -417,8 +417,7 @@ def test_leaves_and_fences_let_some_rays_through(material: int, density: float) 
 
 
 def test_bare_ground() -> None:
-    scene = flat(street())
-    scan = simulate(scene, SMALL, 0, noise=False)
+    scan = simulate(flat(street()), SMALL, 0, noise=False)
     assert scan.boxes == ()
     assert (scan.objects == -1).all()
     np.testing.assert_allclose(scan.points[:, 2], -1.73, atol=2e-3)
@@ -432,8 +431,7 @@ def test_noise_drop_out_and_shadow_take_points_away() -> None:
     scene = flat(street())
     exact = simulate(scene, SMALL, 0, noise=False)
     noisy = simulate(scene, SMALL, 0, ego_shadow=False)
-    shadowed = simulate(scene, SMALL, 0)
-    assert len(shadowed.points) < len(noisy.points) < len(exact.points)
+    assert len(simulate(scene, SMALL, 0).points) < len(noisy.points) < len(exact.points)
     near = np.hypot(noisy.points[:, 0], noisy.points[:, 1]) < 10.0
     assert 0.001 < np.std(noisy.points[near, 2] + 1.73) < 0.03
 
@@ -530,8 +528,7 @@ def test_islands_are_raised_and_not_drivable() -> None:
     assert scene.ground_height(13.0, 2.0) >= 0.08
     assert scene.ground_height(13.0, 0.5) == pytest.approx(0.0, abs=1e-9)
     labels = simulate(scene, SMALL, 0, noise=False).top_view_labels()
-    view = TopViewGeometry()
-    x, y = np.broadcast_arrays(*view.cell_centers())
+    x, y = np.broadcast_arrays(*TopViewGeometry().cell_centers())
     on_island = (x > 10.0) & (x < 16.0) & (y > 1.0) & (y < 3.0)
     assert (labels[on_island] == 0).all()
     assert (labels[(y > -3.9) & (y < 0.9)] == 1).all()
@@ -558,8 +555,7 @@ def test_trams_and_trailers_belong_to_no_class() -> None:
         assert (scan.labels[scan.objects == k] == 0).all()
         assert (labels[scan.objects == k] == IGNORE).mean() > 0.95
     assert (labels[scan.objects == 2] == 2).all()
-    geometry = TopViewGeometry()
-    x, y = np.broadcast_arrays(*geometry.cell_centers())
+    x, y = np.broadcast_arrays(*TopViewGeometry().cell_centers())
     assert (view[(np.abs(x - 20.0) < 6.5) & (np.abs(y - 4.0) < 1.0)] == 0).all()
 
 
@@ -595,8 +591,7 @@ def test_scans_of_other_mountings(height_m: float, pitch_deg: float, roll_deg: f
 
 def test_the_own_vehicle_stands_clear_of_objects() -> None:
     for seed in range(30):
-        scan = simulated_scan(seed, SMALL)
-        for each in scan.boxes:
+        for each in simulated_scan(seed, SMALL).boxes:
             dx, dy = -each.center[0], -each.center[1]
             cos, sin = math.cos(each.yaw), math.sin(each.yaw)
             away = max(abs(cos * dx + sin * dy) - each.size[0] / 2, abs(cos * dy - sin * dx) - each.size[1] / 2)

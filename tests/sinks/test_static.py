@@ -81,8 +81,7 @@ def test_a_file_has_the_name_and_the_format_of_the_scans(tmp_path: Path, name: s
 def test_points_of_a_map_stay_in_the_map(tmp_path: Path, name: str) -> None:
     origin = (512345.25, 5412345.5, 113.0) if name != "7.bin" else (100.0, -50.0, 2.0)
     scan = perceived(name)
-    sink = StaticSink(tmp_path)
-    sink.write(replace(scan, perception=replace(scan.perception, origin_m=origin)))
+    StaticSink(tmp_path).write(replace(scan, perception=replace(scan.perception, origin_m=origin)))
     np.testing.assert_allclose(read_points(tmp_path / name, origin_m=origin), expected(AHEAD), atol=1e-5)
 
 

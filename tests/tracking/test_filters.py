@@ -49,8 +49,7 @@ def update(
 
 @pytest.mark.parametrize("n", [0, 1, 6])
 def test_predictions_are_those_of_the_twin(n: int) -> None:
-    rng = np.random.default_rng(n)
-    states, covariance = some_tracks(rng, n)
+    states, covariance = some_tracks(np.random.default_rng(n), n)
     noise = np.tile(NOISE, (n, 1))
     for dt in (0.0, 0.1, 1.3):
         means, predicted = predict(states, covariance, noise, dt)
@@ -292,8 +291,7 @@ def test_belief_propagation_is_its_twin_and_near_the_truth(n: int, m: int, seed:
     assert n_approximated == n
     np.testing.assert_allclose(beta.sum(axis=1), 1.0, atol=1e-9)
     assert (beta[:, 1:].sum(axis=0) < 1.0 + 1e-5).all()
-    twin = twins.tracking.propagation(weights)
-    np.testing.assert_allclose(beta, twin, atol=1e-4)
+    np.testing.assert_allclose(beta, twins.tracking.propagation(weights), atol=1e-4)
     exact = twins.tracking.association(weights)
     assert np.abs(beta - exact).max() < 0.2
     if (weights > 0).sum() < n + m - len(clusters(weights)) + 1:  # no loop: nothing is approximated

@@ -134,8 +134,7 @@ def test_suppression_of_small_rectangles_in_large_ones() -> None:
 
 
 def test_bounds_hold_the_corners_tightly() -> None:
-    rng = np.random.default_rng(3)
-    rectangles = some_rectangles(rng, 20)
+    rectangles = some_rectangles(np.random.default_rng(3), 20)
     for bounds, rectangle in zip(bounding_rectangles(rectangles), rectangles, strict=True):
         corners = twins.decode.rectangle_corners(rectangle)
         np.testing.assert_allclose(bounds[:2] + bounds[2:4] / 2.0, corners.max(axis=0), atol=1e-12)
@@ -144,8 +143,7 @@ def test_bounds_hold_the_corners_tightly() -> None:
 
 
 def test_interpreted_and_compiled_kernels_agree() -> None:
-    rng = np.random.default_rng(4)
-    a = some_rectangles(rng, 6)
+    a = some_rectangles(np.random.default_rng(4), 6)
     compiled, interpreted = np.empty((6, 6)), np.empty((6, 6))
     geometry.fill_oriented_iou(a, a, compiled)
     getattr(geometry.fill_oriented_iou, "py_func", geometry.fill_oriented_iou)(a, a, interpreted)

@@ -80,8 +80,7 @@ def test_what_is_not_rigid_is_refused(taker: str, wrong: str) -> None:
 def test_the_last_row_becomes_exact() -> None:
     given_pose = np.eye(4)
     given_pose[3] += 1e-9
-    pose = rigid("pose", given_pose, TrackingError)
-    assert pose[3].tolist() == [0.0, 0.0, 0.0, 1.0]
+    assert rigid("pose", given_pose, TrackingError)[3].tolist() == [0.0, 0.0, 0.0, 1.0]
     assert given_pose[3, 0] == 1e-9  # the caller's array is not changed
     made = Calibration(K + 1e-12, given_pose, 640, 480)
     assert made.T_camera_sensor[3].tolist() == [0.0, 0.0, 0.0, 1.0]
