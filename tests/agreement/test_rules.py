@@ -62,7 +62,6 @@ ROLES = np.array([0, 1, 2, 2], np.uint8)
 VIEW = TopViewGeometry((0.0, 20.0), (-8.0, 8.0), cell_m=0.5)
 GROUND_Z = -1.73
 BOUNDS = ["low_x", "low_y", "high_x", "high_y", "top"]  # of clusters
-patient = settings(deadline=None, max_examples=60)  # the first example compiles a kernel
 
 coordinates = st.floats(-9.0, 19.0, width=32) | st.sampled_from([0.0, -0.0, 60.0, 3e38, math.nan, math.inf, -math.inf])
 heights = st.floats(-1.0, 7.0, width=32) | st.sampled_from([0.0, 0.3, 2.0, math.nan, math.inf, -math.inf])
@@ -117,7 +116,7 @@ def top_view(seed: int = 0, view: TopViewGeometry = VIEW) -> TopView:
     return TopView(labels, names, view.cell_m, view.x_range_m, view.y_range_m, np.ones(labels.shape, np.bool_))
 
 
-@patient
+@settings(max_examples=60)
 @given(scenes)
 def test_columns_match_the_twin(given: list) -> None:
     scene, limits = Scene(given), np.array([0.0, 0.0, 2.0, 2.2])
@@ -142,7 +141,7 @@ def test_dense_columns_match_the_twin(seed: int) -> None:
     assert np.count_nonzero(found != labels) > 0
 
 
-@patient
+@settings(max_examples=60)
 @given(scenes, st.sampled_from([(0, 0), (40, 40)]))
 def test_tallies_match_the_twin(given: list, shape: tuple[int, int]) -> None:
     scene = Scene(given)
@@ -162,7 +161,7 @@ def map_read_only(arrays: tuple[NDArray, ...]) -> list[NDArray]:
     return [read_only(array, array.dtype) for array in arrays]
 
 
-@patient
+@settings(max_examples=60)
 @given(scenes, boxes_of)
 def test_boxes_around_points_match_the_twin(given: list, boxes: list[Box]) -> None:
     scene, records = Scene(given), as_rows(boxes, [k % 3 + 1 for k in range(len(boxes))])
@@ -179,7 +178,7 @@ def test_boxes_around_points_match_the_twin(given: list, boxes: list[Box]) -> No
     np.testing.assert_array_equal(sums, twins.rules.inside_sums(*scene.cloud, *masks, *labeled, records))
 
 
-@patient
+@settings(max_examples=60)
 @given(scenes, st.integers(0, 99))
 def test_verdicts_match_the_twin(given: list, seed: int) -> None:
     scene, rng = Scene(given), np.random.default_rng(seed)
@@ -196,7 +195,7 @@ def test_verdicts_match_the_twin(given: list, seed: int) -> None:
     np.testing.assert_array_equal(votes, twins.rules.votes(scene.in_view, scene.labels, ROLES, scores))
 
 
-@patient
+@settings(max_examples=60)
 @given(st.integers(0, 2**31), st.integers(0, 40), st.booleans(), st.booleans(), st.booleans())
 def test_what_becomes_of_clusters_matches_the_twin(
     seed: int, n: int, by_share: bool, by_height: bool, is_filled: bool
@@ -276,7 +275,7 @@ def test_a_forest_is_not_searched_because_of_a_few_labels() -> None:
     assert not agreed_points(points, found, ground, voters).labels.any()
 
 
-@patient
+@settings(max_examples=60)
 @given(scenes)
 def test_cleared_ground_matches_the_twin(given: list) -> None:
     scene = Scene([(round(x) if abs(x) < 99 else x, 0.1, *rest) for x, _, *rest in given])  # many in one cell
@@ -286,7 +285,7 @@ def test_cleared_ground_matches_the_twin(given: list) -> None:
     np.testing.assert_array_equal(found, twins.rules.ground(*arrays, ROLES, scene.labels))
 
 
-@patient
+@settings(max_examples=60)
 @given(scenes, st.booleans(), st.booleans(), st.booleans())
 def test_cleared_cells_match_the_twin(given: list, by_height: bool, of_road: bool, of_vehicles: bool) -> None:
     scene, cells = Scene(given), top_view().labels
@@ -301,7 +300,7 @@ def test_cleared_cells_match_the_twin(given: list, by_height: bool, of_road: boo
     np.testing.assert_array_equal(found, twins.rules.cells(*args))
 
 
-@patient
+@settings(max_examples=60)
 @given(scenes, boxes_of)
 def test_points_keep_their_view_and_meet_the_rules(given: list, boxes: list[Box]) -> None:
     scene = Scene(given)
@@ -328,7 +327,7 @@ def test_points_keep_their_view_and_meet_the_rules(given: list, boxes: list[Box]
     np.testing.assert_array_equal(agreed.labels, again.labels)
 
 
-@patient
+@settings(max_examples=60)
 @given(scenes, boxes_of)
 def test_no_cell_below_an_object_is_drivable(given: list, boxes: list[Box]) -> None:
     scene, view = Scene(given), top_view()
@@ -351,7 +350,7 @@ def test_no_cell_below_an_object_is_drivable(given: list, boxes: list[Box]) -> N
     np.testing.assert_array_equal(agreed.observed, view.observed)
 
 
-@patient
+@settings(max_examples=60)
 @given(scenes, boxes_of)
 def test_only_uncertain_boxes_without_labels_are_dropped(given: list, boxes: list[Box]) -> None:
     scene = Scene(given)

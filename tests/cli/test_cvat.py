@@ -204,7 +204,7 @@ VALUES = st.recursive(
 )
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(st.binary(max_size=50) | VALUES | st.fixed_dictionaries({"image": VALUES}, optional={"threshold": VALUES}))
 def test_no_request_ends_the_function(payload: object) -> None:
     reply = post(payload)

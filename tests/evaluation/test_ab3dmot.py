@@ -39,7 +39,7 @@ def test_generalized_iou_by_hand() -> None:
     assert generalized_iou(np.zeros((0, 7)), b).shape == (0, 7)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(st.integers(0, 10**6))
 def test_generalized_iou_has_the_hull_of_scipy(seed: int) -> None:
     spatial = pytest.importorskip("scipy.spatial")

@@ -77,7 +77,7 @@ def scans(draw: st.DrawFn) -> tuple[list[Box], list[Box]]:
     return rights, guesses
 
 
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=60)
 @given(st.lists(scans(), min_size=1, max_size=4))
 def test_the_steps_of_nuscenes_give_the_same_numbers(given_scans: list[tuple[list[Box], list[Box]]]) -> None:
     # Scores apart, because the order of equal scores in different scans is a matter of sorting.

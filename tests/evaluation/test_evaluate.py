@@ -479,7 +479,7 @@ POINT = st.tuples(
 )
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(st.lists(st.tuples(POINT, st.sampled_from([0, 2])), max_size=12))
 def test_poles_are_columns(objects: list[Any]) -> None:
     objects = [([20.0 + x, y, z], label, 0) for (x, y, z), label in objects]
@@ -635,7 +635,7 @@ LABELS = st.lists(st.tuples(st.integers(0, 3), st.sampled_from([0, 1, 2, 3, 255]
 BOXES = st.lists(st.tuples(st.integers(6, 45), st.integers(-9, 9), st.sampled_from(["car", "van"])), max_size=3)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(st.lists(st.tuples(LABELS, BOXES, BOXES, st.sampled_from("ab")), min_size=1, max_size=5))
 def test_records_put_together_say_what_one_pass_says(scans: list[Any]) -> None:
     records, together = [], Confusion(POINTS)

@@ -194,7 +194,7 @@ def submitted(boxes: list[Box]) -> list[twin.Object]:
     return found
 
 
-@settings(deadline=None, max_examples=30)
+@settings(max_examples=30)
 @given(st.lists(scans(), min_size=1, max_size=4))
 def test_the_development_kit_step_by_step_gives_the_same_numbers(given_scans: list[Scan]) -> None:
     table = table_of(*given_scans)
@@ -216,7 +216,7 @@ def test_the_development_kit_step_by_step_gives_the_same_numbers(given_scans: li
                     assert kitti_ap.average_precisions(counts)[:2] == pytest.approx((r40, r11), abs=1e-12, nan_ok=True)
 
 
-@settings(deadline=None, max_examples=100)
+@settings(max_examples=100)
 @given(st.integers(1, 400), st.integers(0, 2**32 - 1))
 def test_thresholds_of_the_recall_positions_are_those_of_the_kit(n_truth: int, seed: int) -> None:
     from edgeperc.evaluation.metrics import recall_positions

@@ -7,7 +7,7 @@ from functools import partial
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 import scenes
@@ -226,7 +226,6 @@ SOME_BOXES = st.lists(
 )
 
 
-@settings(deadline=None)
 @given(st.lists(st.tuples(SOME_BOXES, SOME_BOXES), min_size=2, max_size=4), st.integers(1, 3), st.booleans())
 def test_evaluators_put_together_say_what_one_says(
     scans: list[tuple[list[Box], list[Box]]], split: int, oriented: bool
@@ -327,7 +326,6 @@ def test_headings_by_hand() -> None:
     assert math.isnan(nobody.axis)
 
 
-@settings(deadline=None)
 @given(st.lists(st.tuples(st.integers(-700, 700), st.integers(-700, 700)), max_size=5))
 def test_headings_are_those_of_unit_vectors(degrees: list[tuple[int, int]]) -> None:
     side = {"size": (2.0, 2.0, 1.5)}

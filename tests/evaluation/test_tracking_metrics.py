@@ -54,7 +54,7 @@ def test_box_iou() -> None:
     assert box_iou(np.zeros((0, 7)), a).shape == (0, 3)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(st.integers(0, 4), st.integers(0, 4), st.integers(0, 10**6))
 def test_assignment_gains_the_most(n: int, m: int, seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -103,7 +103,7 @@ def test_matches_are_as_many_as_can_be() -> None:
     assert best.motp == pytest.approx((iou[0, 0] + iou[1, 1]) / 2.0)
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(st.lists(st.tuples(st.integers(0, 3), st.integers(-1, 2), st.booleans()), max_size=30))
 def test_breaks_are_counted_as_the_twin_does(frames: list[tuple[int, int, bool]]) -> None:
     truth, ids = (np.array([frame[k] for frame in frames], np.int64) for k in (0, 1))
@@ -129,7 +129,7 @@ def test_breaks_by_hand() -> None:
     assert count([1, 1, 2], late=True) == count([1, 1, 2]) == (1, 1)
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(st.lists(st.floats(-5.0, 5.0), max_size=120), st.integers(0, 40))
 def test_recall_thresholds_are_those_of_kittis_walk(scores: list[float], n_missed: int) -> None:
     """Rounding decides between two ranks at the same distance, as in KITTI's program, which adds up recalls."""
@@ -221,7 +221,7 @@ def test_ab3dmots_program_loses_a_track_at_its_own_threshold() -> None:
     assert evaluated(9.8585675, True).samota == lost.samota  # written as 9.858567, which loses; np.round gives 9.858568
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(st.integers(0, 10**6), st.booleans())
 def test_any_tracks_have_finite_figures_or_none(seed: int, as_ab3dmot: bool) -> None:
     rng = np.random.default_rng(seed)

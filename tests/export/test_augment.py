@@ -116,7 +116,7 @@ def test_nothing_to_paste_is_no_change(scan: LabeledScan) -> None:
     )
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_pasted_labels_are_those_of_the_boxes(scan: LabeledScan, seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -243,7 +243,7 @@ def test_pasted_objects_get_the_number_of_their_class() -> None:
     assert set(np.unique(out.labels)) == {0, 2}
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(seed=st.integers(0, 2**32 - 1), distance=st.floats(4.0, 44.0))
 def test_a_resized_person_stands_on_the_same_ground(seed: int, distance: float) -> None:
     box, points = post(distance, 0.0)

@@ -82,7 +82,7 @@ def places(scan: LabeledScan) -> dict[tuple[float, ...], int]:
 
 
 @given(st.integers(0, 2**32))
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 def test_points_labels_and_boxes_stay_together(
     scan: LabeledScan, places: dict[tuple[float, ...], int], seed: int
 ) -> None:

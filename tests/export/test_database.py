@@ -96,7 +96,7 @@ def test_a_picture_equals_its_twin(n: int) -> None:
     np.testing.assert_array_equal(picture(points), twins.database.picture(points))
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(hnp.arrays(np.float32, st.tuples(st.integers(0, 6), st.just(4)), elements=st.floats(width=32)))
 def test_a_picture_of_any_points_equals_its_twin(points: np.ndarray) -> None:
     np.testing.assert_array_equal(picture(points), twins.database.picture(points))

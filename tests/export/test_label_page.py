@@ -381,7 +381,7 @@ def test_a_wrong_body_is_explained(server: LabelServer, body: str | bytes) -> No
 corners = st.tuples(*[st.integers(-(10**400), 10**400) | st.floats()] * 2)
 
 
-@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.binary() | JSON.map(json.dumps) | st.lists(st.lists(corners, max_size=5), max_size=3).map(json.dumps))
 def test_any_body_is_answered(server: LabelServer, body: str | bytes) -> None:
     answer = ask(server, "road/000002", body)

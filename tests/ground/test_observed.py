@@ -28,7 +28,6 @@ SMALL = TopViewGeometry((2.0, 10.0), (-3.0, 3.0), cell_m=0.5)
 AROUND = TopViewGeometry((-8.0, 8.0), (-8.0, 8.0), cell_m=0.5)
 ROAD_Z = -1.73
 # The first example compiles a kernel.
-patient = settings(deadline=None, max_examples=60)
 
 coordinates = st.floats(-12.0, 12.0, width=32) | st.sampled_from([0.0, -0.0, math.nan, math.inf, -math.inf, 3e38])
 heights = st.floats(-2.5, 2.0, width=32) | st.sampled_from([ROAD_Z, -1.7, -1.6, math.nan, math.inf])
@@ -96,7 +95,7 @@ def at(mask: NDArray[np.bool_], x: tuple[float, float], y: tuple[float, float]) 
     return mask[row:last_row, first:last]
 
 
-@patient
+@settings(max_examples=60)
 @given(clouds, st.sampled_from([SMALL, AROUND, TopViewGeometry((0.0, 4.0), (-3.0, 3.0), cell_m=1.0)]))
 def test_the_kernels_agree_with_their_twins(points: NDArray[np.float32], view: TopViewGeometry) -> None:
     observer = Observer(view, get_sensor("vlp-16"))
@@ -110,7 +109,7 @@ def test_the_kernels_agree_with_their_twins(points: NDArray[np.float32], view: T
     check_cells(points, highest(points, view), observer.bin_of_cell, level, state)
 
 
-@patient
+@settings(max_examples=60)
 @given(st.integers(0, 2**32), st.floats(0.0, 0.3))
 def test_rays_over_uneven_ground_agree_with_the_twin(seed: int, missing: float) -> None:
     rng = np.random.default_rng(seed)
@@ -119,7 +118,7 @@ def test_rays_over_uneven_ground_agree_with_the_twin(seed: int, missing: float) 
     follow(lowest, np.array([0.2, 0.1, -0.44, 0.02 + missing]), rng.uniform(0.0, 0.1, 90), rng.normal(0.0, 0.05, 6))
 
 
-@patient
+@settings(max_examples=60)
 @given(st.integers(0, 2**32))
 def test_cells_of_any_states_agree_with_the_twin(seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -129,7 +128,7 @@ def test_cells_of_any_states_agree_with_the_twin(seed: int) -> None:
     check_cells(points, index, observer.bin_of_cell, level, state)
 
 
-@patient
+@settings(max_examples=60)
 @given(clouds)
 def test_low_returns_observe_their_cells_and_order_does_not_matter(points: NDArray[np.float32]) -> None:
     observed = observe(points, view=SMALL)
@@ -142,7 +141,7 @@ def test_low_returns_observe_their_cells_and_order_does_not_matter(points: NDArr
     assert observed[top <= -0.5].all()
 
 
-@patient
+@settings(max_examples=60)
 @given(clouds, st.integers(0, 2**32))
 def test_drivable_cells_are_road_and_observed(points: NDArray[np.float32], seed: int) -> None:
     labels = np.random.default_rng(seed).integers(0, 3, (16, 12)).astype(np.uint8)
@@ -454,7 +453,7 @@ def test_a_tilted_sensor_is_read_with_its_tilt(pitch_deg: float, roll_deg: float
     assert free_ahead(top_view(scan, "vlp-32c", mounting)).free_m > 40.0
 
 
-@patient
+@settings(max_examples=60)
 @given(clouds, st.integers(0, 2**32))
 def test_the_free_distance_is_the_least_of_the_distances_to_its_ends(points: NDArray[np.float32], seed: int) -> None:
     seen = Observer(SMALL, get_sensor("vlp-16")).observe(points, highest(points, SMALL))

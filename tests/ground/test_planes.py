@@ -151,7 +151,7 @@ def test_heights_agree_with_the_twin(seed: int, regions: bool) -> None:
 numbers = st.sampled_from([0.0, 1.0, -1.7, -1.73, -2.0, 3.0, 63.99999, 64.0, -64.0, 1e6, np.nan, np.inf])
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(st.lists(st.tuples(numbers, numbers, numbers), max_size=40), st.booleans())
 def test_random_scans_match_the_twin(rows: list[tuple[float, float, float]], regions: bool) -> None:
     # The floor makes sure that there is something to find.

@@ -28,7 +28,6 @@ AHEAD = RangeImageGeometry((2.0, -10.0, -24.0))
 TOP = TopViewGeometry()
 View = RangeImageGeometry | TopViewGeometry
 # The first example compiles a kernel.
-patient = settings(deadline=None, max_examples=60)
 
 coordinates = st.floats(-80.0, 80.0, width=32) | st.sampled_from([0.0, -0.0, math.nan, math.inf, -math.inf, 3e38])
 clouds = st.lists(st.tuples(coordinates, coordinates), max_size=60).map(
@@ -53,7 +52,7 @@ def rows_of(crop: Crop, points: NDArray[np.float32]) -> NDArray[np.int64]:
 
 
 @pytest.mark.kernel
-@patient
+@settings(max_examples=60)
 @given(clouds, st.lists(st.tuples(*[st.floats(-20.0, 20.0)] * 3), min_size=2, max_size=2))
 def test_rows_match_the_slow_twin(points: NDArray[np.float32], lines: list[tuple[float, float, float]]) -> None:
     rows, kept = np.empty(len(points) + 1, np.int32), np.empty((len(points) + 1, 4), np.float32)
@@ -64,7 +63,7 @@ def test_rows_match_the_slow_twin(points: NDArray[np.float32], lines: list[tuple
 
 
 @pytest.mark.kernel
-@patient
+@settings(max_examples=60)
 @given(st.lists(st.lists(st.booleans(), min_size=20, max_size=20), min_size=1, max_size=4), st.integers(0, 2**32 - 1))
 def test_spread_labels_match_the_slow_twin(parts: list[list[bool]], seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -80,7 +79,7 @@ def test_spread_labels_match_the_slow_twin(parts: list[list[bool]], seed: int) -
     assert spread([(given_parts[0][0], None)], 20) is given_parts[0][0]
 
 
-@patient
+@settings(max_examples=60)
 @given(clouds, sectors)
 def test_a_sector_and_what_is_beside_it_are_kept(points: NDArray[np.float32], view: RangeImageGeometry) -> None:
     points = points[~(np.abs(points[:, :2]) > 1e15).any(axis=1)]  # there, rounding of a sine is more than the margin
@@ -99,7 +98,7 @@ def test_a_sector_and_what_is_beside_it_are_kept(points: NDArray[np.float32], vi
             assert in_sector[row] or min(beside) <= MARGIN_M + 1e-3
 
 
-@patient
+@settings(max_examples=60)
 @given(clouds, sectors, st.floats(-7.0, 7.0))
 def test_a_turned_view_keeps_what_it_sees_of_the_turned_scan(
     points: NDArray[np.float32], view: RangeImageGeometry, turn_rad: float
@@ -112,7 +111,7 @@ def test_a_turned_view_keeps_what_it_sees_of_the_turned_scan(
     assert set(np.flatnonzero(seen)) <= set(rows)
 
 
-@patient
+@settings(max_examples=60)
 @given(clouds, rectangles)
 def test_what_an_observer_uses_is_kept(points: NDArray[np.float32], view: TopViewGeometry) -> None:
     points[:, 2] = -1.73

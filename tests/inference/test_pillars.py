@@ -20,7 +20,6 @@ VIEW = PillarGeometry((0.0, 4.0), (-2.0, 2.0), (-3.0, 1.0), 0.5, 3, 6, 0.0, 0.0,
 EVERY = CHANNELS["pillars"]
 RAW = ("x", "y", "z", "remission")
 # The first example compiles the kernels.
-patient = settings(deadline=None, max_examples=60)
 
 coordinates = st.floats(-3.0, 5.0, width=32) | st.sampled_from([0.0, -0.0, 4.0, 0.5, math.nan, math.inf, -math.inf])
 clouds = st.lists(st.tuples(coordinates, coordinates, coordinates, st.floats(0.0, 1.0, width=32)), max_size=60).map(
@@ -45,7 +44,7 @@ def maker_of(channels: tuple[str, ...]) -> Pillarizer:
 
 
 @pytest.mark.kernel
-@patient
+@settings(max_examples=60)
 @given(clouds, clouds, st.sampled_from([EVERY, RAW, EVERY[::-1], ("range",)]))
 def test_pillars_match_the_slow_twin(
     points: NDArray[np.float32], later: NDArray[np.float32], channels: tuple[str, ...]

@@ -109,7 +109,7 @@ numbers = st.one_of(
 )
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(st.lists(st.tuples(numbers, numbers, numbers, numbers), max_size=12), st.sampled_from(SMALL))
 def test_any_numbers(rows: list[tuple[float, float, float, float]], name: str) -> None:
     check(np.array(rows, np.float32).reshape(-1, 4), VIEWS[name])

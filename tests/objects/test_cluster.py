@@ -74,7 +74,7 @@ def test_clusters_match_a_test_of_every_pair(seed: int, per_m: float) -> None:
 places = st.sampled_from([0.0, 0.25, 0.5, 0.75, 1.0, 0.3, -0.2, 0.35, 5.0, -7.5, 99.9, 100.0, 200.0, np.nan, np.inf])
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=300)
 @given(st.lists(st.tuples(places, places, places), max_size=30), st.sampled_from([0.0, 0.05]), st.integers(1, 3))
 def test_random_scans_match_the_twin(rows: list[tuple[float, float, float]], per_m: float, min_points: int) -> None:
     points = as_points(np.array(rows).reshape(-1, 3))
@@ -130,7 +130,7 @@ KINDS = (
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@settings(max_examples=5, deadline=None)
+@settings(max_examples=5)
 @given(st.integers(0, 2**31), st.sampled_from([0.0, 0.014, 0.1, 1.0]))
 def test_hostile_scans_match_the_twin(kind: str, seed: int, per_m: float) -> None:
     points = as_points(hostile(kind, np.random.default_rng(seed), 160))
@@ -140,7 +140,7 @@ def test_hostile_scans_match_the_twin(kind: str, seed: int, per_m: float) -> Non
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@settings(max_examples=3, deadline=None)
+@settings(max_examples=3)
 @given(st.integers(0, 2**31), st.sampled_from([0.014, 0.1]))
 def test_the_work_on_hostile_scans_is_bounded(kind: str, seed: int, per_m: float) -> None:
     points = read_only(as_points(hostile(kind, np.random.default_rng(seed), 20_000)))
@@ -167,7 +167,7 @@ def test_a_scan_that_needs_too_many_tests_is_split_where_no_link_was_found_and_w
     assert found.tolist() == [0] * 20_000 + [1] * 20_000 + [2, 2]
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(st.integers(0, 2**31), st.floats(0.0, 1.0), st.sampled_from([0.0, 0.1]), st.sampled_from([0.0, 0.3, 0.7, 1.0]))
 def test_clusters_with_enough_seeds_are_kept(seed: int, share: float, per_m: float, min_share: float) -> None:
     rng = np.random.default_rng(seed)
@@ -187,7 +187,7 @@ def test_clusters_with_enough_seeds_are_kept(seed: int, share: float, per_m: flo
     np.testing.assert_array_equal(found, expected)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(st.integers(0, 2**31), st.sampled_from([(-1.0, -1.0), (0.3, 0.6), (0.6, 0.1), (1.0, 1.0)]))
 def test_clusters_with_enough_votes_are_kept(seed: int, min_share: tuple[float, float]) -> None:
     rng = np.random.default_rng(seed)
@@ -297,7 +297,7 @@ def test_clusters_have_their_most_frequent_class() -> None:
     np.testing.assert_allclose(shares, [0.8, 0.7, 0.5, 0.0])
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(st.integers(0, 2**31), st.integers(1, 400), st.sampled_from([2, 4, 256]))
 def test_votes_agree_with_the_twin(seed: int, n: int, n_labels: int) -> None:
     rng = np.random.default_rng(seed)
@@ -315,7 +315,7 @@ def test_no_cluster_has_no_class() -> None:
         assert classes.shape == shares.shape == (0,)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(st.integers(1, 700), st.integers(0, 2**31), st.booleans())
 def test_rectangles_agree_with_the_twin(n: int, seed: int, l_shaped: bool) -> None:
     rng = np.random.default_rng(seed)

@@ -259,7 +259,7 @@ def grouped(clusters: np.ndarray) -> Groups:
     return Groups(groups.order[: groups.starts[-1]], groups.starts)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(st.integers(0, 2**31), st.integers(0, 14))
 def test_groups_agree_with_the_twin(seed: int, n_people: int) -> None:
     points, height, labels, clusters = crowd(seed, n_people)
@@ -274,7 +274,7 @@ def test_groups_agree_with_the_twin(seed: int, n_people: int) -> None:
     assert loose[:n_loose].tolist() == others
 
 
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=80)
 @given(st.integers(0, 2**31), st.integers(0, 14), st.integers(1, 6))
 def test_persons_agree_with_the_twin(seed: int, n_people: int, min_points: int) -> None:
     points, height, labels, clusters = crowd(seed, n_people)
@@ -296,7 +296,7 @@ def test_persons_agree_with_the_twin(seed: int, n_people: int, min_points: int) 
     assert (np.minimum(turns, math.pi - turns) < 1e-4)[found[:n, 3] > found[:n, 4] + 1e-3].all()
 
 
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=80)
 @given(st.integers(0, 2**31), st.integers(0, 14))
 def test_completed_persons_agree_with_the_twin(seed: int, n_people: int) -> None:
     points, height, labels, clusters = crowd(seed, n_people, per_cluster=1, depth=0.4)

@@ -206,7 +206,7 @@ def test_point_labels_agree_with_the_twin(shape: tuple[int, int], full_turn: boo
     assert (found[pixel < 0] == 0).all()
 
 
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=60)
 @given(st.data())
 def test_any_scan_gets_labels_that_were_there(data: st.DataObject) -> None:
     height, width = data.draw(st.integers(0, 4)), data.draw(st.integers(1, 5))

@@ -62,7 +62,7 @@ def test_ranking_of_functions_matches_the_papers_table() -> None:
     assert 255.0 * np.sqrt(np.mean(errors**2)) < 11.0
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(st.sampled_from(FUNCTIONS), st.floats(-0.5, 0.5), st.floats(0.01, 2.0), st.integers(0, 2**32 - 1))
 def test_exact_pairs_recover_the_function(shape: RemissionFunction, offset: float, size: float, seed: int) -> None:
     x = np.random.default_rng(seed).uniform(0.0, 255.0, 60)
@@ -72,7 +72,7 @@ def test_exact_pairs_recover_the_function(shape: RemissionFunction, offset: floa
     np.testing.assert_allclose(_value(best, x), wanted, atol=1e-7)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(st.floats(0.12, 3.8), st.floats(0.05, 1.0), st.integers(0, 2**32 - 1))
 def test_powers_are_recovered(exponent: float, top: float, seed: int) -> None:
     """Exponents are tried in steps of 6 %."""
@@ -113,7 +113,7 @@ def plane(n: int, normal: np.ndarray, at: np.ndarray, seed: int) -> np.ndarray:
     return (at + rng.uniform(-0.39, 0.39, (n, 2)) @ along).astype(np.float32)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(hnp.arrays(np.float64, 3, elements=st.floats(-1.0, 1.0)), st.integers(0, 2**32 - 1))
 def test_incidence_on_a_plane(normal: np.ndarray, seed: int) -> None:
     if np.linalg.norm(normal) < 0.1:
@@ -353,7 +353,7 @@ def sparse_scan(seed: int, n: int) -> np.ndarray:
     return np.column_stack([xyz * range_m[:, None], rng.uniform(0.0, 1.0, n)]).astype(np.float32)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(st.integers(0, 2**32 - 1), st.integers(0, 120))
 def test_interpolation_agrees_with_the_twin_and_its_documentation(seed: int, n: int) -> None:
     points = sparse_scan(seed, n)
@@ -378,7 +378,7 @@ def test_interpolation_agrees_with_the_twin_and_its_documentation(seed: int, n: 
         assert ((new >= low) & (new <= high)).all()  # between them in every coordinate, remission included
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(st.integers(0, 2**32 - 1), st.integers(1, 120))
 def test_interpolated_point_falls_into_its_pixel(seed: int, n: int) -> None:
     """So that the image the network sees is that of a scan."""

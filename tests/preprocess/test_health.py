@@ -58,7 +58,7 @@ def counted(
     return counts, mark
 
 
-@settings(max_examples=120, deadline=None)
+@settings(max_examples=120)
 @given(scans, st.sampled_from(EYES), st.sampled_from([0.05, 0.5, math.inf]), st.sampled_from([0, 1, 3]))
 def test_isolated_points_are_those_of_the_slow_twin(
     points: Points, eye: tuple[float, float, float], wedge: float, most: int
@@ -80,7 +80,7 @@ def test_crowds_and_lonely_points_are_told_apart(seed: int, most: int) -> None:
     assert 0 < mark.sum() < len(points)
 
 
-@settings(max_examples=120, deadline=None)
+@settings(max_examples=120)
 @given(scans, st.sampled_from(EYES), st.sampled_from([1, 3]))
 def test_sectors_are_those_of_the_slow_twin(points: Points, eye: tuple[float, float, float], step: int) -> None:
     counts, ranges, tans = np.empty((72, 4)), np.empty(256), np.array([-0.3, -0.1, -0.35])
@@ -99,7 +99,7 @@ def test_sectors_are_those_of_the_slow_twin(points: Points, eye: tuple[float, fl
         assert not both.any()
 
 
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=80)
 @given(
     hnp.arrays(np.float64, (72, 4), elements=st.sampled_from([0.0, 1.0, 2.0, 20.0, 30.0])),
     hnp.arrays(np.float64, (72, 4), elements=st.sampled_from([0.0, 5.0, 25.0, math.inf])),
@@ -112,7 +112,7 @@ def test_sectors_that_lack_returns_are_those_of_the_slow_twin(
     np.testing.assert_array_equal(lacks, twins.health.lacking(counts, fewest))
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(scans, st.sampled_from(sorted(SENSORS)))
 def test_any_scan_has_a_health(points: Points, sensor: str) -> None:
     before, normal = points.copy(), Normal()

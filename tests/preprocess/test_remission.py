@@ -125,7 +125,7 @@ def test_a_sensor_without_a_function_gets_one(streets: list[np.ndarray]) -> None
     assert abs(np.median(found) - np.median(streets[5][:, 3])) < 0.06
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(name=st.sampled_from(sorted(SENSORS)), gain=st.floats(0.05, 1.0), power=st.floats(0.3, 4.0), whole=st.booleans())
 def test_functions_keep_the_order_and_stay_in_0_to_1(
     streets: list[np.ndarray], name: str, gain: float, power: float, whole: bool
@@ -264,7 +264,7 @@ def test_a_scan_without_remission_gets_a_constant(streets: list[np.ndarray]) -> 
 STRANGE = [0.0, 1.0, -1.0, 0.5, 255.0, 65535.0, 1e-40, 1e38, -1e38, np.inf, -np.inf, np.nan]
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(
     name=st.sampled_from(["hdl-64e", "hdl-32e", "os1-64"]),
     values=st.lists(st.one_of(st.sampled_from(STRANGE), st.floats(width=32)), min_size=1, max_size=4),
@@ -290,7 +290,7 @@ def test_any_remission_is_survived(
         assert (np.isnan(converted[:, 3]) | ((converted[:, 3] >= 0.0) & (converted[:, 3] <= 1.0))).all()
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(hnp.arrays(np.float32, st.tuples(st.integers(0, 40), st.just(4)), elements=st.floats(width=32)))
 def test_any_points_are_survived(points: np.ndarray) -> None:
     tiled = np.tile(points, (30, 1))

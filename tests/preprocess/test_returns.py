@@ -48,7 +48,7 @@ def on_a_ray(n: int, nearest_m: float, farthest_m: float, seed: int = 0, remissi
     return np.column_stack([ranges[:, None] * ray, np.full(n, remission)]).astype(np.float32)
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(
     scans,
     st.sampled_from([0.0, 0.3, 0.5, 2.0]),
@@ -73,7 +73,7 @@ def test_rows_are_dropped_as_the_slow_twin_drops_them(
     assert none == DroppedPoints(not_finite=dropped.total)
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(st.floats(0.05, 5.0), st.floats(-np.pi, np.pi), st.floats(-1.5, 1.5))
 def test_a_point_at_exactly_the_nearest_range_is_near(range_m: float, azimuth: float, elevation: float) -> None:
     ray = np.array([np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)])

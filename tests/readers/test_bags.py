@@ -87,7 +87,7 @@ def test_a_long_search_for_the_next_message_is_no_standstill(recording: Path) ->
     assert said or recording.suffix == ".db3"  # a small database takes too few steps
 
 
-@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(place=st.floats(0.0, 1.0), damage=st.binary(min_size=1, max_size=40))
 def test_damaged_bytes_are_typed_errors(recording: Path, tmp_path: Path, place: float, damage: bytes) -> None:
     content = bytearray(recording.read_bytes())

@@ -47,7 +47,7 @@ def values(message: Any) -> tuple[Any, ...]:
 
 
 @given(data=st.data())
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @pytest.mark.parametrize("ros", [1, 2])
 def test_messages_of_ros_as_rosbags_reads_them(ros: int, data: st.DataObject) -> None:
     store, _ = messages(pytest.importorskip("rosbags.typesys"), ros)

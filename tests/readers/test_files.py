@@ -542,14 +542,14 @@ def check_points_or_error(path: Path) -> None:
     assert points.flags.c_contiguous
 
 
-@settings(deadline=None, max_examples=400, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=400, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.sampled_from(FORMATS), st.sampled_from(PREFIXES), st.binary(max_size=300))
 @example(".npy", b"\x93NUMPY\1\0", b"\x10\0" + b"(" * 16)
 def test_any_bytes_give_points_or_points_error(tmp_path: Path, suffix: str, prefix: bytes, tail: bytes) -> None:
     check_points_or_error(save(tmp_path, f"scan{suffix}", prefix + tail))
 
 
-@settings(deadline=None, max_examples=400, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=400, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.sampled_from(sorted(FILES)), st.data())
 def test_damaged_files_give_points_or_points_error(tmp_path: Path, name: str, data: st.DataObject) -> None:
     content = bytearray(FILES[name])
@@ -566,7 +566,6 @@ def is_rounded(array: np.ndarray) -> bool:
         return bool(((np.abs(exact) > 8e4) & (np.abs(exact) < 1e8) & (exact != exact.astype(np.float32))).any())
 
 
-@settings(deadline=None)
 @example(np.full((1, 3), 83887))  # float32 holds it
 @example(np.full((2, 3), 2**24 + 1))
 @example(np.full((2, 4), 5e5 + 0.1))
@@ -587,7 +586,7 @@ def test_any_array_gives_points_or_points_error(array: np.ndarray) -> None:
             np.testing.assert_array_equal(points[:, :3], array[:, :3].astype(np.float32))
 
 
-@settings(deadline=None, max_examples=300)
+@settings(max_examples=300)
 @given(st.binary(max_size=60), st.integers(0, 200))
 @example(b"\0a\xe0\xff\0", 300)
 @example(b"\0a\x20\0", 4)
@@ -645,7 +644,7 @@ def raw_rows(seed: int, others: Sequence[str], remission: float | None, order: s
     remission=st.sampled_from([None, 0.0, 1.0, 255.0]),
     order=st.sampled_from(["rings", "shuffled", "fired"]),
 )
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_raw_files_show_how_many_values_a_point_has(seed: int, others: Any, remission: Any, order: str) -> None:
     rows = raw_rows(seed, others, remission, order)
     points = rows[:, :4]
@@ -728,7 +727,7 @@ def test_columns_of_a_stored_array_have_times_and_places(tmp_path: Path) -> None
     remission=st.sampled_from([0.0, 1.0, 255.0]),
     order=st.sampled_from(["rings", "shuffled", "fired"]),
 )
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_raw_float16_is_refused_and_stored_float16_is_exact(
     seed: int, others: list[str], remission: float, order: str
 ) -> None:
@@ -820,7 +819,7 @@ def test_an_origin_may_be_subtracted_from_float32() -> None:
     comment=st.sampled_from(["", "# made by a tool\n", "// made by a tool\n", "\ufeff"]),
     mark=st.sampled_from(["", "#", "//", "# "]),
 )
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_tables_of_text_with_names(separator: Any, names: Any, end: Any, comment: Any, mark: Any) -> None:
     values = np.round(np.random.default_rng(1).normal(0.0, 20.0, (7, 6)), 3)
     rows = [mark + separator.join(names), *(separator.join(str(v) for v in row) for row in values)]
@@ -894,7 +893,7 @@ def test_tables_as_other_programs_write_them(tmp_path: Path, name: str, encoding
     n=st.sampled_from([3, 4]),
     decimals=st.integers(1, 4),
 )
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 def test_a_comma_in_place_of_the_point(separator: Any, head: Any, n: int, decimals: int) -> None:
     """As spreadsheets write numbers in German, French and others; three columns of them were read as six."""
     values = np.random.default_rng(n).normal(0.0, 20.0, (5, n)).round(decimals)

@@ -150,7 +150,7 @@ def test_metadata_that_names_no_known_sensor(content: dict[str, Any], error: str
 KEYS = ("sensor_info", "prod_line", "beam_intrinsics", "beam_altitude_angles", "lidar_data_format", "lidar_mode")
 
 
-@settings(deadline=None, max_examples=150)
+@settings(max_examples=150)
 @given(st.dictionaries(st.sampled_from([*KEYS, "config_params", "pixels_per_column"]), JSON) | JSON)
 @example({"beam_altitude_angles": [-(2**63) - 1]})
 def test_any_metadata_is_known_or_a_typed_error(content: Any) -> None:

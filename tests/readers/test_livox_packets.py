@@ -118,7 +118,7 @@ def test_two_in_one_capture(tmp_path: Path) -> None:
     )
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(st.binary(max_size=400), st.sampled_from([(13, 4), (14, 4), (8, 2), (9, 3), (10, 3)]))
 def test_the_kernel_as_its_slow_twin(content: bytes, layout: tuple[int, int]) -> None:
     stride, kind = layout
@@ -137,7 +137,7 @@ def one_packet(kind: int, is_old: bool) -> bytes:
     return livox_packets(kind, *scene(200), is_old)[0]
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(st.lists(st.tuples(st.sampled_from(KINDS), st.integers(0, 60), st.binary(max_size=4)), max_size=8))
 def test_packets_of_any_bytes(damages: list[tuple[tuple[int, bool], int, bytes]]) -> None:
     stream, scans, n = LivoxStream(), list[TimedScan](), 0

@@ -348,7 +348,7 @@ def test_a_second_sensor_of_old_firmware_is_left_out_with_a_warning(tmp_path: Pa
     assert check_same(found, read_timed_scans(tmp_path / "1.pcap"), clock=False) == 2
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(
     st.sampled_from([*PROFILES]), st.integers(0, 5), st.integers(1, 5), st.sampled_from([1, 4, 16]), st.integers(0, 9)
 )
@@ -375,7 +375,7 @@ def test_the_kernel_as_its_slow_twin(profile: str, n_packets: int, n_beams: int,
     np.testing.assert_array_equal(stamps_ns, wanted_ns)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(st.lists(st.integers(0, 7), max_size=40), st.integers(0, 9))
 def test_any_order_of_turns_ends(turns: list[int], seed: int) -> None:
     """Packets of random bytes, in any order; each returns in one turn at most."""

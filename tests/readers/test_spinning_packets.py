@@ -260,7 +260,7 @@ def test_formats_are_told_apart(model: Model) -> None:
         assert format_of(memoryview(packet[:cut])) is None
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(st.sampled_from([*MODELS]), st.integers(0, 4), st.integers(0, 2**31))
 def test_the_kernel_as_its_slow_twin(name: str, n_packets: int, seed: int) -> None:
     """On any bytes, and blocks that are not finite."""
@@ -282,7 +282,7 @@ def test_the_kernel_as_its_slow_twin(name: str, n_packets: int, seed: int) -> No
     assert (points[n:] == 7.0).all()
 
 
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=80)
 @given(st.sampled_from([*MODELS]), st.integers(0, 2**31), st.lists(st.integers(0, 1247), max_size=30))
 def test_damaged_packets_give_finite_points(name: str, seed: int, places: list[int]) -> None:
     model, rng = MODELS[name], np.random.default_rng(seed)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 from numpy.typing import NDArray
@@ -24,8 +24,6 @@ from edgeperc.types.frame import ModelFrame
 from edgeperc.types.mounting import MODEL_MOUNTING, Mounting
 
 CLASSES = ("background", "drivable", "car", "van", "truck")
-# The first example compiles a kernel.
-patient = settings(deadline=None)
 MASKS = npst.arrays(np.bool_, npst.array_shapes(min_dims=2, max_dims=2, min_side=1, max_side=9))
 
 
@@ -40,7 +38,6 @@ def blank() -> NDArray[np.bool_]:
     return np.zeros((400, 200), np.bool_)
 
 
-@patient
 @given(MASKS)
 def test_cells_are_counted_from_the_near_edge_to_the_first_of_each_kind(cells: NDArray[np.bool_]) -> None:
     objects, road = np.roll(cells, 1, axis=0) & np.roll(cells, 1, axis=1), np.ascontiguousarray(cells[::-1])
@@ -49,7 +46,6 @@ def test_cells_are_counted_from_the_near_edge_to_the_first_of_each_kind(cells: N
     assert firsts.tolist() == twins.ahead.first_cells(objects, cells, road)
 
 
-@patient
 @given(MASKS, st.floats(-3.0, 9.0), st.floats(0.5, 9.0))
 def test_the_corridor_follows_the_largest_overlap(cells: NDArray[np.bool_], first: float, width: float) -> None:
     bounds = np.full((len(cells), 2), 99)
@@ -58,7 +54,6 @@ def test_the_corridor_follows_the_largest_overlap(cells: NDArray[np.bool_], firs
 
 
 @pytest.mark.compiled
-@patient
 @given(npst.arrays(np.bool_, npst.array_shapes(min_dims=2, max_dims=2, min_side=1, max_side=12)))
 def test_the_polygon_is_the_part_nearest_to_the_sensor(cells: NDArray[np.bool_]) -> None:
     resolve_contacts(cells, np.zeros_like(cells))

@@ -14,7 +14,7 @@ from edgeperc.types.geometry import oriented_iou, rectangles
 from edgeperc.types.perception import Box
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(st.integers(0, 2**40))
 def test_vehicles_fit_into_a_hall(seed: int) -> None:
     scene, (x, y, yaw), height_m = hall(seed)

@@ -278,7 +278,7 @@ def test_points_are_those_of_the_twin(seed: int, noise: bool) -> None:
             assert {*materials.tolist()} >= {MATTE, PAINT, GLASS, LEAVES, FACADE}
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(st.integers(0, 2**32 - 1), st.sampled_from([0, 1, 2]))
 def test_bounds_hold_every_ray_that_hits(seed: int, kind: int) -> None:
     rng = np.random.default_rng(seed)
@@ -346,7 +346,7 @@ def test_a_scan_is_consistent(environment: str) -> None:
     assert (scan.labels[scan.objects < 0] == 0).all()
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @example("truck", 1.0, 0.0, 0.0, 0.25, 0)
 @example("person_sitting", 0.0, 0.0, 0.0, 1.0, 93)
 @example("cyclist", -1.0, -1.0, -1.0, -0.43247780315099105, 19)

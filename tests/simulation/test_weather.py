@@ -30,7 +30,7 @@ def changed(scan: Points, bad: Points) -> NDArray[np.bool_]:
     return np.array([tuple(row) not in known for row in bad[:, :3].tolist()], np.bool_)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(
     hnp.arrays(np.float32, st.tuples(st.integers(0, 20), st.just(4)), elements=st.floats(0.0, 80.0, width=32)),
     st.sampled_from(sorted(KINDS)),

@@ -14,7 +14,7 @@ from edgeperc.types.geometry import oriented_iou, rectangles
 from edgeperc.types.perception import Box
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(st.integers(0, 2**40))
 def test_vehicles_of_a_yard_are_apart_and_clear_of_the_own_one(seed: int) -> None:
     scene, place = yard(seed)

@@ -119,7 +119,7 @@ def test_no_time_at_all_is_a_jump() -> None:
     assert elapsed_s(math.inf, 1.0) == 0.0
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(stamps_s())
 def test_every_scan_has_an_answer_and_no_id_comes_again(times_s: list[float]) -> None:
     session_of: dict[int, int] = {}
@@ -132,7 +132,7 @@ def test_every_scan_has_an_answer_and_no_id_comes_again(times_s: list[float]) ->
             assert session_of.setdefault(number, tracks.session) == tracks.session
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(stamps_s())
 def test_a_late_scan_changes_no_track(times_s: list[float]) -> None:
     """Without its late scans, a session has the same tracks."""

@@ -272,7 +272,7 @@ def test_likelihoods_are_those_of_the_twin(n: int, m: int) -> None:
     assert not got[:, :, :1].any()
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(st.integers(0, 4), st.integers(0, 4), st.integers(0, 10**6))
 def test_association_is_the_sum_over_all_joint_events(n: int, m: int, seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -282,7 +282,7 @@ def test_association_is_the_sum_over_all_joint_events(n: int, m: int, seed: int)
     np.testing.assert_allclose(beta, twins.tracking.association(weights), rtol=1e-9, atol=1e-12)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(st.integers(1, 4), st.integers(1, 4), st.integers(0, 10**6))
 def test_belief_propagation_is_its_twin_and_near_the_truth(n: int, m: int, seed: int) -> None:
     rng = np.random.default_rng(seed)

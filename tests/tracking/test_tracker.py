@@ -509,7 +509,7 @@ def test_a_tracker_takes_perceptions() -> None:
         tracker(perception(None))
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(st.integers(0, 10**6))
 def test_any_boxes_at_any_times_make_finite_tracks(seed: int) -> None:
     rng, tracker, stamp_s = np.random.default_rng(seed), Tracker(), 0.0

@@ -5,7 +5,7 @@ from typing import Literal
 import numpy as np
 import pytest
 import shapely
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 import twins.decode
@@ -47,7 +47,6 @@ def test_iou_agrees_with_shapely_and_with_the_twin() -> None:
     np.testing.assert_allclose(iou, oriented_iou(b, a).T, atol=1e-12)
 
 
-@settings(deadline=None)
 @given(
     st.lists(
         st.tuples(st.integers(-3, 3), st.integers(-3, 3), st.integers(0, 4), st.integers(0, 4), st.integers(-8, 8)),

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_card import TOP_VIEW_CARD, write
 from tiny_model import (
@@ -485,7 +485,7 @@ def mutated(data: st.DataObject, blob: bytes) -> bytes:
     return bytes(content)
 
 
-QUIET = settings(deadline=None, derandomize=True, database=None, suppress_health_check=[HealthCheck.too_slow])
+QUIET = settings(derandomize=True, database=None)
 
 
 @settings(QUIET, max_examples=200)

@@ -112,7 +112,7 @@ def test_the_data_of_the_page_is_complete(tmp_path: Path) -> None:
 ANY = st.characters(exclude_categories=())
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(st.text(ANY, max_size=40), st.text(ANY, min_size=1))
 def test_any_name_is_only_text(tmp_path_factory: pytest.TempPathFactory, title: str, name: str) -> None:
     scan = a_scan()[5990:6700]

@@ -433,7 +433,7 @@ wild_points = st.lists(
 
 
 @pytest.mark.usefixtures("matplotlib")
-@settings(deadline=None, max_examples=6)
+@settings(max_examples=6)
 @given(wild_points, st.lists(wild_boxes, max_size=8))
 def test_anything_is_drawn(tmp_path_factory: pytest.TempPathFactory, points: np.ndarray, boxes: list[Box]) -> None:
     folder = tmp_path_factory.mktemp("drawn")
@@ -456,7 +456,7 @@ def test_boxes_reach_behind_the_camera(scan: np.ndarray, perception: Perception)
 
 
 @pytest.mark.usefixtures("matplotlib")
-@settings(deadline=None, max_examples=30)
+@settings(max_examples=30)
 @given(st.text(max_size=120), st.floats(60.0, 900.0))
 def test_wrapped_text_is_whole_and_fits(text: str, width: float) -> None:
     figure = new_figure(1000, 100)
@@ -473,7 +473,6 @@ rectangles = st.tuples(st.floats(0, 950), st.floats(0, 550), st.floats(0.5, 300)
 )
 
 
-@settings(deadline=None)
 @given(rectangles, st.lists(rectangles, max_size=12), st.floats(5, 120), st.floats(5, 20))
 def test_free_place_is_free(area: Any, others: Any, width: float, height: float) -> None:
     half, taken = np.array([width, height]), np.array([area, *others])
